@@ -1,0 +1,113 @@
+"""Argument checks shared by the whole library: expected, got, remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import torch
+from torch import Tensor
+
+from difflcs.errors import DeviceError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
+
+FLOATS = (torch.float32, torch.float64)
+_USABLE_DEVICES = ("cpu", "cuda", "mps", "xpu")
+
+
+def describe(value: object) -> str:
+    """A short description of a value for an error message."""
+    if isinstance(value, Tensor):
+        return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')} on {value.device}"
+    return f"{type(value).__name__} {value!r}"[:120]
+
+
+def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (), finite: bool = True) -> Tensor:
+    """Check one floating-point tensor of shape (..., *dims).
+
+    Args:
+        name: what to call it in the message.
+        value: the candidate.
+        dims: names and sizes of its trailing dimensions.
+        finite: refuse NaN and infinity.
+
+    Returns:
+        The same tensor, unchanged.
+
+    Raises:
+        DTypeError: not a float32 or float64 tensor.
+        DeviceError: on a device whose values cannot be read.
+        ShapeError: wrong trailing dimensions.
+        NonFiniteError: NaN or infinity inside.
+    """
+    if not isinstance(value, Tensor):
+        raise DTypeError(f"{name}: expected a torch.Tensor, got {describe(value)}; wrap it with torch.as_tensor(...)")
+    if value.dtype not in FLOATS:
+        raise DTypeError(f"{name}: expected float32 or float64, got {describe(value)}; convert it with {name}.double()")
+    if value.device.type not in _USABLE_DEVICES:
+        raise DeviceError(f"{name}: expected a tensor with data, got {describe(value)}; move it with {name}.to('cpu')")
+    wanted = tuple(size for _, size in dims)
+    if value.ndim < len(dims) or tuple(value.shape[value.ndim - len(dims) :]) != wanted:
+        labels = ", ".join(["..."] + [f"{label}={size}" for label, size in dims])
+        raise ShapeError(f"{name}: expected shape ({labels}), got {tuple(value.shape)}; reshape it or rebuild the model")
+    if finite and not bool(torch.isfinite(value.detach()).all()):
+        bad = torch.nonzero(~torch.isfinite(value.detach()))
+        raise NonFiniteError(
+            f"{name}: expected finite numbers, got {len(bad)} NaN or infinite of {value.numel()}, "
+            f"the first at index {tuple(bad[0].tolist())}; find where they come from before solving"
+        )
+    return value
+
+
+def check_same_device(tensors: Iterable[tuple[str, Tensor]]) -> None:
+    """Refuse tensors on different devices, naming the first two that differ."""
+    first: tuple[str, Tensor] | None = None
+    for name, tensor in tensors:
+        if first is None:
+            first = (name, tensor)
+        elif tensor.device != first[1].device:
+            raise DeviceError(
+                f"{name}: expected it on {first[1].device} like {first[0]}, got {tensor.device}; "
+                f"move one of them with .to(device)"
+            )
+
+
+def check_positive_int(name: str, value: object, minimum: int = 1) -> int:
+    """Check an integer of at least `minimum`."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise DTypeError(f"{name}: expected an int, got {describe(value)}")
+    if value < minimum:
+        raise InvalidInputError(f"{name}: expected at least {minimum}, got {value}")
+    return value
+
+
+def check_number(name: str, value: object, minimum: float = 0.0, strict: bool = False) -> float:
+    """Check a finite real number, at least (`strict`: above) `minimum`."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise DTypeError(f"{name}: expected a number, got {describe(value)}")
+    too_small = value <= minimum if strict else value < minimum
+    if not (value == value and abs(value) != float("inf")) or too_small:
+        relation = "above" if strict else "at least"
+        raise InvalidInputError(f"{name}: expected a finite number {relation} {minimum:g}, got {value!r}")
+    return float(value)
+
+
+def check_choice(name: str, value: object, choices: Sequence[str]) -> str:
+    """Check one of a few words."""
+    if value not in choices:
+        raise InvalidInputError(f"{name}: expected one of {', '.join(map(repr, choices))}, got {value!r}")
+    return str(value)
+
+
+def broadcast_batch(shapes: Iterable[tuple[str, torch.Size]]) -> torch.Size:
+    """Common leading batch shape of several named ones; a clear error where they do not broadcast."""
+    result = torch.Size()
+    named = list(shapes)
+    for name, shape in named:
+        try:
+            result = torch.broadcast_shapes(result, shape)
+        except RuntimeError:
+            listing = ", ".join(f"{n} {tuple(s)}" for n, s in named)
+            raise ShapeError(
+                f"{name}: its batch dimensions {tuple(shape)} do not fit the others ({listing}); "
+                f"expected equal batch dimensions, or none for a shared value"
+            ) from None
+    return result

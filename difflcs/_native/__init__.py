@@ -1,0 +1,1 @@
+"""Native kernels: C++ without torch, one problem per SIMD lane (sources beside this file)."""

@@ -1,0 +1,27 @@
+// One double per SIMD lane, by the vector extensions of GCC and Clang: plain vector code on every CPU.
+#pragma once
+#include <cstdint>
+
+namespace difflcs::DIFFLCS_ISA {
+
+constexpr int kLanes = DIFFLCS_LANES;
+typedef double Vec __attribute__((vector_size(8 * DIFFLCS_LANES)));
+typedef int64_t Mask __attribute__((vector_size(8 * DIFFLCS_LANES)));  // 0 or -1 in each lane
+
+static inline Vec all(double a) { return Vec{} + a; }
+static inline Vec select(Mask m, Vec a, Vec b) { return m ? a : b; }
+static inline Vec max(Vec a, Vec b) { return a > b ? a : b; }
+static inline Vec min(Vec a, Vec b) { return a < b ? a : b; }
+static inline Vec abs(Vec a) { return a < 0 ? -a : a; }
+static inline Vec sqrt(Vec a) {
+  Vec r;
+  for (int l = 0; l < kLanes; l++) r[l] = __builtin_sqrt(a[l]);
+  return r;
+}
+static inline bool any(Mask m) {
+  int64_t r = 0;
+  for (int l = 0; l < kLanes; l++) r |= m[l];
+  return r != 0;
+}
+
+}  // namespace difflcs::DIFFLCS_ISA

@@ -1,0 +1,86 @@
+"""Everything difflcs raises or warns with.
+
+Every message says what was expected, what came, and how to mend it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+class DiffLCSError(Exception):
+    """Base class of every error difflcs raises on purpose."""
+
+
+class InvalidInputError(DiffLCSError, ValueError):
+    """An argument cannot be used."""
+
+
+class ShapeError(InvalidInputError):
+    """A tensor has the wrong shape."""
+
+
+class DTypeError(InvalidInputError, TypeError):
+    """A value has the wrong type or dtype."""
+
+
+class DeviceError(InvalidInputError):
+    """Tensors live on different or unusable devices."""
+
+
+class NonFiniteError(InvalidInputError):
+    """A tensor holds NaN or infinity."""
+
+
+class BoundsError(InvalidInputError):
+    """A lower bound exceeds its upper bound."""
+
+
+class NotPositiveDefiniteError(InvalidInputError):
+    """F + Fᵀ is not positive definite, so that the LCP may have no or many solutions."""
+
+
+class GammaError(InvalidInputError):
+    """The violation loss's γ is outside 0 < γ ≤ σ_min(F + Fᵀ)."""
+
+
+class MissingDependencyError(DiffLCSError, ImportError):
+    """An optional package is not installed."""
+
+
+class BackendNotFoundError(DiffLCSError, LookupError):
+    """No such MPC backend, or the package behind it is not installed."""
+
+
+class CheckpointError(DiffLCSError):
+    """A checkpoint is missing, corrupt, or was written by something else."""
+
+
+class DoubleBackwardError(DiffLCSError, RuntimeError):
+    """Second derivatives were asked of a function that has first derivatives only."""
+
+
+class SolveError(DiffLCSError, RuntimeError):
+    """Some problems of a batch were not solved.
+
+    Attributes:
+        elements: flat batch indices of the failures.
+        status: the `Status` value of each of them.
+    """
+
+    def __init__(self, message: str, elements: Sequence[int], status: Sequence[int]):
+        super().__init__(message)
+        self.elements = tuple(elements)
+        self.status = tuple(status)
+
+
+class DiffLCSWarning(UserWarning):
+    """Base class of every warning difflcs gives."""
+
+
+class SolveWarning(DiffLCSWarning):
+    """Some problems of a batch were not solved; their gradient is zero."""
+
+
+class DegenerateWarning(DiffLCSWarning):
+    """Some solutions are not classically differentiable; a regularised gradient is used."""

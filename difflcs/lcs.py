@@ -1,0 +1,347 @@
+"""Linear complementarity systems: a record of matrices, and the learnable model."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from difflcs import _files
+from difflcs._checks import (
+    broadcast_batch,
+    check_number,
+    check_positive_int,
+    check_same_device,
+    check_tensor,
+    describe,
+)
+from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, NotPositiveDefiniteError, ShapeError
+from difflcs.lcp import solve_lcp
+
+
+@dataclass(frozen=True)
+class LCSParams:
+    """The matrices of one linear complementarity system, or of one per batch element (Eq. lcs of the paper).
+
+    x₊ = A x + B u + C λ + d,  0 ≤ λ ⊥ D x + E u + F λ + c ≥ 0,  with F + Fᵀ ≻ 0, so that λ is unique.
+
+    Every field may carry leading batch dimensions, or none to be shared by the batch.
+
+    Attributes:
+        A: (..., n_x, n_x) autonomous dynamics.
+        B: (..., n_x, n_u) effect of actions.
+        C: (..., n_x, n_lam) effect of the complementarity variable (contact forces).
+        d: (..., n_x) constant drift.
+        D: (..., n_lam, n_x) gap per state.
+        E: (..., n_lam, n_u) gap per action.
+        F: (..., n_lam, n_lam) gap per force.
+        c: (..., n_lam) constant gap.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, NonFiniteError: a field does not fit the others.
+        NotPositiveDefiniteError: F + Fᵀ is not positive definite; the message gives its smallest eigenvalue.
+    """
+
+    A: Tensor
+    B: Tensor
+    C: Tensor
+    d: Tensor
+    D: Tensor
+    E: Tensor
+    F: Tensor
+    c: Tensor
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            check_tensor(f.name, getattr(self, f.name))
+        for name in "ABCDEF":
+            if getattr(self, name).ndim < 2:
+                raise ShapeError(f"{name}: expected a matrix (..., rows, columns), got {describe(getattr(self, name))}")
+        n_x, n_u, n_lam = self.n_x, self.n_u, self.n_lam
+        x, u, lam = ("n_x", n_x), ("n_u", n_u), ("n_lam", n_lam)
+        dims = {"A": [x, x], "B": [x, u], "C": [x, lam], "d": [x], "D": [lam, x], "E": [lam, u], "F": [lam, lam]}
+        dims["c"] = [lam]
+        for name, dim in dims.items():
+            check_tensor(name, getattr(self, name), dim, finite=False)
+        check_same_device([(f.name, getattr(self, f.name)) for f in fields(self)])
+        self.batch_shape  # noqa: B018  raises where the batch dimensions do not fit each other
+        check_positive_definite(self.F)
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return self.A.shape[-1]
+
+    @property
+    def n_u(self) -> int:
+        """Number of actions."""
+        return self.B.shape[-1]
+
+    @property
+    def n_lam(self) -> int:
+        """Number of complementarity variables."""
+        return self.F.shape[-1]
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Leading batch dimensions; empty when every field is shared."""
+        return broadcast_batch(
+            (f.name, getattr(self, f.name).shape[: getattr(self, f.name).ndim - (1 if f.name in "dc" else 2)])
+            for f in fields(self)
+        )
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Name → tensor, in the order of the fields."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def detach(self) -> LCSParams:
+        """The same numbers without gradient history."""
+        return replace(self, **{k: v.detach() for k, v in self.tensors().items()})
+
+    def next_state(self, x: Tensor, u: Tensor, lam: Tensor) -> Tensor:
+        """A x + B u + C λ + d, (..., n_x)."""
+        return _affine(self.d, (self.A, x), (self.B, u), (self.C, lam))
+
+    def gap(self, x: Tensor, u: Tensor, lam: Tensor | None = None) -> Tensor:
+        """D x + E u + c, plus F λ if given, (..., n_lam)."""
+        terms = [(self.D, x), (self.E, u)] + ([] if lam is None else [(self.F, lam)])
+        return _affine(self.c, *terms)
+
+
+def _affine(constant: Tensor, *terms: tuple[Tensor, Tensor]) -> Tensor:
+    # A shared matrix is one GEMM for the whole batch; a matrix per element is a batched product.
+    result = constant
+    for matrix, vector in terms:
+        result = result + (vector @ matrix.mT if matrix.ndim == 2 else (matrix @ vector.unsqueeze(-1)).squeeze(-1))
+    return result
+
+
+def check_positive_definite(F: Tensor) -> None:
+    """Refuse F whose symmetric part F + Fᵀ is not positive definite."""
+    symmetric = F.detach().double().cpu()
+    symmetric = symmetric + symmetric.mT
+    if int(torch.linalg.cholesky_ex(symmetric).info.abs().max() if symmetric.numel() else 0) == 0:
+        return
+    smallest = torch.linalg.eigvalsh(symmetric)[..., 0]
+    where = "" if F.ndim == 2 else f" at batch index {int(smallest.argmin())}"
+    raise NotPositiveDefiniteError(
+        f"F: expected F + Fᵀ positive definite, got smallest eigenvalue {float(smallest.min()):.3e}{where}; "
+        f"add to the diagonal of F (LCSModel does it by `stiffness`)"
+    )
+
+
+class LCSPrediction(NamedTuple):
+    """One step of an LCS: the next state (..., n_x) and the complementarity variable (..., n_lam)."""
+
+    x_next: Tensor
+    lam: Tensor
+
+
+class LCSModel(nn.Module):
+    """A learnable linear complementarity system (Eq. lcs), F = G Gᵀ + stiffness·I + H − Hᵀ.
+
+    The parametrisation keeps F + Fᵀ ⪰ 2·stiffness·I for any G and H, so that the LCP always has one solution.
+
+    Args:
+        n_x: number of states.
+        n_u: number of actions.
+        n_lam: number of complementarity variables (contacts).
+        stiffness: lower bound on the symmetric part of F, > 0.
+        init_scale: parameters are drawn uniformly from ±init_scale; c starts at zero.
+        learn_c: whether c is learned. The paper's experiments keep it at zero (`False`).
+        generator: random generator of the initial parameters; torch's default one if None.
+        dtype: float64 (default) or float32.
+
+    Raises:
+        InvalidInputError, DTypeError: a size below 1, a stiffness that is not positive, another dtype.
+    """
+
+    parameter_names = ("A", "B", "C", "d", "D", "E", "G", "H", "c")
+
+    def __init__(
+        self,
+        n_x: int,
+        n_u: int,
+        n_lam: int,
+        stiffness: float = 0.1,
+        *,
+        init_scale: float = 1e-3,
+        learn_c: bool = True,
+        generator: torch.Generator | None = None,
+        dtype: torch.dtype = torch.float64,
+    ):
+        super().__init__()
+        self.n_x = check_positive_int("n_x", n_x)
+        self.n_u = check_positive_int("n_u", n_u)
+        self.n_lam = check_positive_int("n_lam", n_lam)
+        self.stiffness = check_number("stiffness", stiffness, strict=True)
+        check_number("init_scale", init_scale)
+        if dtype not in (torch.float32, torch.float64):
+            raise DTypeError(f"dtype: expected torch.float32 or torch.float64, got {dtype}")
+        for name, shape in self._shapes().items():
+            draw = torch.rand(shape, generator=generator, dtype=torch.float64)
+            value = torch.zeros(shape) if name == "c" else init_scale * (2 * draw - 1)
+            self.register_parameter(name, nn.Parameter(value.to(dtype)))
+        self.c.requires_grad_(learn_c)
+
+    A: nn.Parameter
+    B: nn.Parameter
+    C: nn.Parameter
+    d: nn.Parameter
+    D: nn.Parameter
+    E: nn.Parameter
+    G: nn.Parameter
+    H: nn.Parameter
+    c: nn.Parameter
+
+    def _shapes(self) -> dict[str, tuple[int, ...]]:
+        x, u, m = self.n_x, self.n_u, self.n_lam
+        return {"A": (x, x), "B": (x, u), "C": (x, m), "d": (x,), "D": (m, x), "E": (m, u), "G": (m, m), "H": (m, m), "c": (m,)}
+
+    def extra_repr(self) -> str:
+        """What print(model) shows."""
+        return f"n_x={self.n_x}, n_u={self.n_u}, n_lam={self.n_lam}, stiffness={self.stiffness:g}"
+
+    @property
+    def F(self) -> Tensor:
+        """G Gᵀ + stiffness·I + H − Hᵀ, (n_lam, n_lam), differentiable."""
+        eye = torch.eye(self.n_lam, dtype=self.G.dtype, device=self.G.device)
+        return self.G @ self.G.mT + self.stiffness * eye + self.H - self.H.mT
+
+    def params(self) -> LCSParams:
+        """The system's matrices, differentiable with respect to the parameters."""
+        return LCSParams(self.A, self.B, self.C, self.d, self.D, self.E, self.F, self.c)
+
+    def forward(self, x: Tensor, u: Tensor) -> LCSPrediction:
+        """Predict one step through the exact LCP.
+
+        Args:
+            x: (..., n_x) states.
+            u: (..., n_u) actions; batch dimensions broadcast with those of x.
+
+        Returns:
+            x_next (..., n_x) and lam (..., n_lam), differentiable in x, u and every parameter.
+        """
+        self.check_inputs(x=x, u=u)
+        params = self.params()
+        gap = params.gap(x, u)
+        lam = solve_lcp(params.F, gap).lam
+        return LCSPrediction(params.next_state(x, u, lam), lam)
+
+    def rollout(self, x0: Tensor, u_seq: Tensor) -> Tensor:
+        """Predict a trajectory.
+
+        Args:
+            x0: (..., n_x) initial states.
+            u_seq: (..., T, n_u) actions, T ≥ 0.
+
+        Returns:
+            (..., T+1, n_x) states, x0 first.
+        """
+        check_tensor("u_seq", u_seq, [("n_u", self.n_u)])
+        if u_seq.ndim < 2:
+            raise ShapeError(f"u_seq: expected shape (..., T, n_u={self.n_u}), got {tuple(u_seq.shape)}")
+        self.check_inputs(x=x0)
+        batch = broadcast_batch([("x0", x0.shape[:-1]), ("u_seq", u_seq.shape[:-2])])
+        states = [x0.expand(*batch, self.n_x)]
+        for t in range(u_seq.shape[-2]):
+            states.append(self(states[-1], u_seq[..., t, :]).x_next)
+        return torch.stack(states, dim=-2)
+
+    def check_inputs(self, **tensors: Tensor) -> None:
+        """Check states `x…` and actions `u…` against the model's sizes, dtype-class and device."""
+        for name, tensor in tensors.items():
+            check_tensor(name, tensor, [("n_u", self.n_u)] if name.startswith("u") else [("n_x", self.n_x)])
+            if tensor.dtype != self.A.dtype:
+                raise DTypeError(
+                    f"{name}: expected {self.A.dtype} like the model, got {describe(tensor)}; "
+                    f"convert it with {name}.to({self.A.dtype}) or the model with model.to({tensor.dtype})"
+                )
+        check_same_device([("model", self.A), *tensors.items()])
+
+    @classmethod
+    def from_params(cls, params: LCSParams, stiffness: float | None = None) -> LCSModel:
+        """A learnable model that starts at given matrices.
+
+        Args:
+            params: one system, without batch dimensions.
+            stiffness: the model's stiffness; by default half the smallest eigenvalue of (F + Fᵀ)/2. A larger one than
+                that eigenvalue cannot represent F and is refused.
+
+        Returns:
+            A model whose `params()` equal the given ones up to rounding.
+        """
+        if len(params.batch_shape):
+            raise ShapeError(f"params: expected no batch dimensions, got {tuple(params.batch_shape)}; index one system")
+        params = params.detach()
+        symmetric = 0.5 * (params.F + params.F.mT).double()
+        smallest = float(torch.linalg.eigvalsh(symmetric)[0])
+        if stiffness is None:
+            stiffness = 0.5 * smallest
+        check_number("stiffness", stiffness, strict=True)
+        if stiffness >= smallest:
+            raise InvalidInputError(
+                f"stiffness: expected less than the smallest eigenvalue {smallest:.3e} of (F + Fᵀ)/2, got {stiffness:g}"
+            )
+        model = cls(params.n_x, params.n_u, params.n_lam, stiffness, dtype=params.A.dtype).to(params.A.device)
+        G = torch.linalg.cholesky(symmetric - stiffness * torch.eye(params.n_lam, dtype=torch.float64, device=symmetric.device))
+        H = torch.triu(0.5 * (params.F - params.F.mT), diagonal=1)
+        values = {**params.tensors(), "G": G, "H": H}
+        with torch.no_grad():
+            for name in cls.parameter_names:
+                getattr(model, name).copy_(values[name])
+        return model
+
+    def config(self) -> dict[str, object]:
+        """What is needed besides the parameters to build the model again (JSON types only)."""
+        return {
+            "n_x": self.n_x,
+            "n_u": self.n_u,
+            "n_lam": self.n_lam,
+            "stiffness": self.stiffness,
+            "learn_c": self.c.requires_grad,
+            "dtype": str(self.A.dtype).removeprefix("torch."),
+        }
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, object], tensors: Mapping[str, Tensor], source: str) -> LCSModel:
+        """Build a model from `config()` and a state dict; `source` names them in the error messages."""
+        wanted = {"n_x", "n_u", "n_lam", "stiffness", "learn_c", "dtype"}
+        if set(config) != wanted:
+            raise CheckpointError(
+                f"{source}: expected the fields {sorted(wanted)} of an LCSModel, got {sorted(config)}; "
+                f"was it written by LCSModel.save_pretrained?"
+            )
+        try:
+            dtype = {"float32": torch.float32, "float64": torch.float64}[str(config["dtype"])]
+            sizes = {k: config[k] for k in ("n_x", "n_u", "n_lam", "stiffness")}
+            model = cls(**sizes, learn_c=bool(config["learn_c"]), dtype=dtype)  # pyright: ignore[reportArgumentType]
+        except (InvalidInputError, KeyError) as error:
+            raise CheckpointError(f"{source}: its configuration cannot be used: {error}") from error
+        shapes = {k: tuple(v.shape) for k, v in tensors.items()}
+        if shapes != model._shapes():
+            raise CheckpointError(f"{source}: expected tensors {model._shapes()}, got {shapes}; the file is foreign or corrupt")
+        for name, tensor in tensors.items():
+            if tensor.dtype != dtype or not bool(torch.isfinite(tensor).all()):
+                raise CheckpointError(f"{source}: expected finite {dtype} values in {name}, got {describe(tensor)}")
+        model.load_state_dict(dict(tensors))
+        return model
+
+    def save_pretrained(self, directory: str | os.PathLike[str]) -> None:
+        """Write `model.safetensors` and `config.json` into a directory, atomically (created if needed)."""
+        _files.save_record(Path(directory), "LCSModel", self.config(), self.state_dict())
+
+    @classmethod
+    def from_pretrained(cls, directory: str | os.PathLike[str]) -> LCSModel:
+        """Read what `save_pretrained` wrote.
+
+        Raises:
+            CheckpointError: files are missing, corrupt or of another kind; nothing is changed.
+        """
+        config, tensors = _files.load_record(Path(directory), "LCSModel")
+        return cls.from_config(config, tensors, str(directory))
