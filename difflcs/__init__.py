@@ -1,9 +1,13 @@
 """Differentiable model predictive control through learned linear complementarity systems."""
 
+from difflcs.cost import GoalCost, QuadraticCost
 from difflcs.errors import BackendNotFoundError, DiffLCSError, SolveError
 from difflcs.lcp import LCPSolution, solve_lcp
 from difflcs.lcs import LCSModel, LCSParams
 from difflcs.losses import prediction_loss, violation_loss
+from difflcs.mpc.backends import available_backends, register_backend
+from difflcs.mpc.layer import LCSMPCLayer
+from difflcs.mpc.solution import MPCSolution
 from difflcs.status import Status
 
 __version__ = "0.1.0"
@@ -11,12 +15,18 @@ __version__ = "0.1.0"
 __all__ = [
     "BackendNotFoundError",
     "DiffLCSError",
+    "GoalCost",
     "LCPSolution",
+    "LCSMPCLayer",
     "LCSModel",
     "LCSParams",
+    "MPCSolution",
+    "QuadraticCost",
     "SolveError",
     "Status",
+    "available_backends",
     "prediction_loss",
+    "register_backend",
     "solve_lcp",
     "violation_loss",
 ]

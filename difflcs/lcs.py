@@ -20,6 +20,7 @@ from difflcs._checks import (
     check_tensor,
     describe,
 )
+from difflcs._linalg import matvec
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, NotPositiveDefiniteError, ShapeError
 from difflcs.lcp import solve_lcp
 
@@ -105,20 +106,12 @@ class LCSParams:
 
     def next_state(self, x: Tensor, u: Tensor, lam: Tensor) -> Tensor:
         """A x + B u + C λ + d, (..., n_x)."""
-        return _affine(self.d, (self.A, x), (self.B, u), (self.C, lam))
+        return matvec(self.A, x) + matvec(self.B, u) + matvec(self.C, lam) + self.d
 
     def gap(self, x: Tensor, u: Tensor, lam: Tensor | None = None) -> Tensor:
         """D x + E u + c, plus F λ if given, (..., n_lam)."""
-        terms = [(self.D, x), (self.E, u)] + ([] if lam is None else [(self.F, lam)])
-        return _affine(self.c, *terms)
-
-
-def _affine(constant: Tensor, *terms: tuple[Tensor, Tensor]) -> Tensor:
-    # A shared matrix is one GEMM for the whole batch; a matrix per element is a batched product.
-    result = constant
-    for matrix, vector in terms:
-        result = result + (vector @ matrix.mT if matrix.ndim == 2 else (matrix @ vector.unsqueeze(-1)).squeeze(-1))
-    return result
+        gap = matvec(self.D, x) + matvec(self.E, u) + self.c
+        return gap if lam is None else gap + matvec(self.F, lam)
 
 
 def check_positive_definite(F: Tensor) -> None:

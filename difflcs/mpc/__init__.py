@@ -1,0 +1,7 @@
+"""Model predictive control through a linear complementarity system (Eq. mpc_lcs)."""
+
+from difflcs.mpc.layer import LCSMPCLayer
+from difflcs.mpc.problem import MPCProblem
+from difflcs.mpc.solution import MPCSolution, Primal
+
+__all__ = ["LCSMPCLayer", "MPCProblem", "MPCSolution", "Primal"]

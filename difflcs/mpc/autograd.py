@@ -1,0 +1,40 @@
+"""The MPC as one node of the autograd graph."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from difflcs.errors import DoubleBackwardError
+from difflcs.mpc.backends.base import Backend, Result
+from difflcs.mpc.problem import INPUTS, MPCProblem
+from difflcs.mpc.solution import Primal
+from difflcs.status import Status
+
+
+class SolveMPC(torch.autograd.Function):
+    """tensors (in the order of `INPUTS`) → x, u, lam, objective, status, iterations, kkt_residual, solve_time."""
+
+    @staticmethod
+    def forward(ctx, horizon: int, relaxation: float, backend: Backend, guess: Primal | None, *tensors: Tensor):
+        values = {k: v.detach().contiguous() for k, v in zip(INPUTS, tensors, strict=True)}
+        problem = MPCProblem(**values, horizon=horizon, relaxation=relaxation)
+        result = backend.solve(problem, guess)
+        ctx.problem, ctx.backend, ctx.result = problem, backend, result
+        x, u, lam = result.primal
+        outputs = (x, u, lam, problem.objective(x, u))
+        info = (result.status, result.iterations, result.kkt_residual, result.solve_time)
+        ctx.mark_non_differentiable(*info)
+        return *outputs, *info
+
+    @staticmethod
+    def backward(ctx, *grads: Tensor):
+        if torch.is_grad_enabled():
+            raise DoubleBackwardError("LCSMPCLayer has first derivatives only; expected create_graph=False")
+        result: Result = ctx.result
+        solved = (result.status == Status.CONVERGED) | (result.status == Status.DEGENERATE)
+        # Whatever comes upstream for a failed element is dropped before it can meet the others.
+        upstream = tuple(torch.where(solved.reshape(-1, *[1] * (g.ndim - 1)), g, torch.zeros_like(g)) for g in grads[:4])
+        gradients = ctx.backend.vjp(ctx.problem, result, upstream, solved)
+        needed = ctx.needs_input_grad[4:]
+        return None, None, None, None, *(gradients[k] if n else None for k, n in zip(INPUTS, needed, strict=True))

@@ -1,0 +1,16 @@
+"""Solvers of the MPC problem."""
+
+from difflcs.mpc.backends.base import Backend, Result, available_backends, certify, get_backend, register_backend
+from difflcs.mpc.backends.ipopt import IpoptBackend
+
+register_backend(IpoptBackend)
+
+__all__ = [
+    "Backend",
+    "IpoptBackend",
+    "Result",
+    "available_backends",
+    "certify",
+    "get_backend",
+    "register_backend",
+]

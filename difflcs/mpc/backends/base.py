@@ -1,0 +1,147 @@
+"""What a solver must offer to become a backend, and the registry of the backends."""
+
+from __future__ import annotations
+
+import importlib.util
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from difflcs.errors import BackendNotFoundError, DTypeError
+from difflcs.mpc import kkt
+from difflcs.mpc.problem import MPCProblem
+from difflcs.mpc.solution import Primal
+from difflcs.status import Status
+
+
+@dataclass(frozen=True)
+class Result:
+    """A certified batch of solutions; every number is finite.
+
+    Attributes:
+        primal: x (batch, H+1, n_x), u (batch, H, n_u) inside the bounds, lam (batch, H, n_lam).
+        status: (batch,) int8 `Status`.
+        iterations: (batch,) int32.
+        kkt_residual: (batch,) see `difflcs.mpc.kkt.residual`.
+        solve_time: (batch,) seconds.
+        linearisation: the factored optimality conditions for the gradient.
+    """
+
+    primal: Primal
+    status: Tensor
+    iterations: Tensor
+    kkt_residual: Tensor
+    solve_time: Tensor
+    linearisation: kkt.Linearisation | None = None
+
+
+class Backend(ABC):
+    """A solver of `MPCProblem`s. Subclass as a frozen dataclass whose fields are its options.
+
+    Attributes:
+        name: its name in the registry.
+        exact: whether it solves the problem as stated, not an approximation of it.
+        requires: import names of the packages it needs.
+        install: the pip line that installs them.
+    """
+
+    name: ClassVar[str]
+    exact: ClassVar[bool] = True
+    requires: ClassVar[tuple[str, ...]] = ()
+    install: ClassVar[str] = "pip install difflcs"
+
+    @abstractmethod
+    def solve(self, problem: MPCProblem, guess: Primal | None) -> Result:
+        """Solve a batch; see `certify` for turning raw trajectories into a `Result`."""
+
+    def vjp(
+        self, problem: MPCProblem, result: Result, grads: tuple[Tensor, Tensor, Tensor, Tensor], solved: Tensor
+    ) -> dict[str, Tensor]:
+        """Gradients of the inputs; by default the sensitivity of the optimality conditions (`difflcs.mpc.kkt`)."""
+        linearisation = result.linearisation or kkt.linearise(problem, result.primal)
+        return kkt.vjp(problem, linearisation, grads, solved)
+
+    @classmethod
+    def missing(cls) -> tuple[str, ...]:
+        """Required packages that are not installed."""
+        return tuple(package for package in cls.requires if importlib.util.find_spec(package) is None)
+
+
+def certify(
+    problem: MPCProblem, primal: Primal, status: Tensor, iterations: Tensor, solve_time: Tensor, tol: float
+) -> Result:
+    """Judge raw trajectories by the optimality conditions themselves, whatever the solver claims.
+
+    A CONVERGED element whose residual exceeds `tol` becomes NUMERICAL; one that is not classically differentiable becomes
+    DEGENERATE. Elements that did not converge get finite numbers: their actions clipped into the bounds (zero where not
+    finite) and the trajectory that these cause.
+    """
+    status = status.clone()
+    finite = torch.stack([torch.isfinite(v).all(-1).all(-1) for v in primal]).all(0)
+    status[~finite & (status == Status.CONVERGED)] = Status.NUMERICAL
+    primal = _replace_failed(problem, primal, status != Status.CONVERGED)
+    linearisation = kkt.linearise(problem, primal)
+    residual = torch.nan_to_num(kkt.residual(problem, primal, linearisation.multipliers), nan=torch.inf)
+    status[(residual > tol) & (status == Status.CONVERGED)] = Status.NUMERICAL
+    status[linearisation.degenerate & (status == Status.CONVERGED)] = Status.DEGENERATE
+    residual = residual.clamp_max(torch.finfo(residual.dtype).max)
+    return Result(primal, status, iterations, residual, solve_time, linearisation)
+
+
+def _replace_failed(problem: MPCProblem, primal: Primal, failed: Tensor) -> Primal:
+    if not bool(failed.any()):
+        return primal
+    index = torch.nonzero(failed).squeeze(-1)
+    part = problem.select(index)
+    u = part.clip(torch.nan_to_num(primal.u[index], posinf=0.0, neginf=0.0))
+    x, lam = part.rollout(u)
+    fixed = []
+    for old, new in zip(primal, (x, u, lam), strict=True):
+        old = old.clone()
+        old[index] = torch.nan_to_num(new)
+        fixed.append(old)
+    return Primal(*fixed)
+
+
+_REGISTRY: dict[str, type[Backend]] = {}
+
+
+def register_backend(backend: type[Backend]) -> type[Backend]:
+    """Make a backend available under its `name`; usable as a class decorator.
+
+    Raises:
+        DTypeError: not a `Backend` subclass with a name.
+    """
+    if not (isinstance(backend, type) and issubclass(backend, Backend) and isinstance(getattr(backend, "name", None), str)):
+        raise DTypeError(f"backend: expected a subclass of Backend with a `name`, got {backend!r}")
+    _REGISTRY[backend.name] = backend
+    return backend
+
+
+def available_backends() -> tuple[str, ...]:
+    """Names of the backends whose packages are installed."""
+    return tuple(name for name, backend in _REGISTRY.items() if not backend.missing())
+
+
+def get_backend(backend: str | Backend) -> Backend:
+    """The backend itself, or the default instance of a named one.
+
+    Raises:
+        BackendNotFoundError: no such name, or its package is missing; the message gives the pip line.
+    """
+    if not isinstance(backend, str | Backend):
+        raise DTypeError(f"backend: expected a name or a Backend instance, got {backend!r}")
+    if isinstance(backend, str) and backend not in _REGISTRY:
+        raise BackendNotFoundError(
+            f"backend: expected one of {', '.join(map(repr, _REGISTRY))}, got {backend!r}; "
+            f"add your own with difflcs.register_backend"
+        )
+    found = _REGISTRY[backend] if isinstance(backend, str) else type(backend)
+    if found.missing():
+        raise BackendNotFoundError(
+            f"backend {found.name!r}: the package {found.missing()[0]!r} is not installed; run: {found.install}"
+        )
+    return found() if isinstance(backend, str) else backend

@@ -1,0 +1,214 @@
+"""Backend `ipopt`: the reference, CasADi + IPOPT in worker processes."""
+
+from __future__ import annotations
+
+import atexit
+import os
+import socket
+import subprocess
+import sys
+import threading
+from collections import deque
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+import torch
+
+from difflcs._checks import check_number, check_positive_int
+from difflcs.mpc import kkt
+from difflcs.mpc.backends.base import Backend, Result, certify
+from difflcs.mpc.problem import MPCProblem
+from difflcs.mpc.solution import Primal
+from difflcs.status import Status
+
+if TYPE_CHECKING:
+    from difflcs.mpc.backends._ipopt_worker import Chunk, Options, Sizes, Solved
+
+
+@dataclass(frozen=True)
+class IpoptBackend(Backend):
+    """Direct transcription over x, u, λ and s, solved by IPOPT (Posa et al.; Wächter & Biegler).
+
+    Every element is a separate IPOPT run; batches go to worker processes, which start at the first batch and stay.
+    Solutions are polished by Newton steps with the active bounds held (`difflcs.mpc.kkt.polish`).
+
+    Attributes:
+        tol: IPOPT's own tolerance.
+        max_iter: iteration limit of one solve.
+        workers: processes for a batch; the number of CPUs available if None. 1 solves in this process.
+        residual_tol: largest KKT residual that counts as converged.
+        start: value of λ and s at a cold start. 0.05 with mu_init 1e-4 takes half the iterations of λ = s = 1.
+        mu_init: IPOPT's first barrier parameter at a cold start.
+        mu_init_warm: the same when a guess is given.
+    """
+
+    name: ClassVar[str] = "ipopt"
+    requires: ClassVar[tuple[str, ...]] = ("casadi",)
+    install: ClassVar[str] = "pip install casadi"
+
+    tol: float = 1e-8
+    max_iter: int = 300
+    workers: int | None = None
+    residual_tol: float = 1e-6
+    start: float = 0.05
+    mu_init: float = 1e-4
+    mu_init_warm: float = 1e-6
+
+    def __post_init__(self) -> None:
+        check_positive_int("max_iter", self.max_iter)
+        if self.workers is not None:
+            check_positive_int("workers", self.workers)
+        for name in ("tol", "residual_tol", "start", "mu_init", "mu_init_warm"):
+            check_number(name, getattr(self, name), strict=True)
+
+    def solve(self, problem: MPCProblem, guess: Primal | None) -> Result:
+        """Solve every element; a failure, even a crash of a worker, stays with its element."""
+        from difflcs.mpc.backends._ipopt_worker import Options, Sizes, solve_chunk
+
+        sizes = Sizes(problem.n_x, problem.n_u, problem.n_lam, problem.horizon)
+        options = Options(self.tol, self.max_iter, self.mu_init if guess is None else self.mu_init_warm)
+        chunk = self._start(problem, guess, sizes)
+        workers = min(self.workers or len(os.sched_getaffinity(0)), problem.batch)
+        if workers <= 1:
+            solved = solve_chunk(sizes, options, chunk)
+        else:
+            solved = _pool().solve(sizes, options, chunk, workers)
+        x, u, lam, status, iterations, seconds = (torch.from_numpy(v) for v in solved)
+        primal = Primal(torch.cat([problem.x0.unsqueeze(1), x], 1), u, lam)
+        usable = (status == Status.CONVERGED) & torch.isfinite(u).all(-1).all(-1)
+        index = torch.nonzero(usable).squeeze(-1)
+        if len(index):
+            polished = kkt.polish(problem.select(index), Primal(*(v[index] for v in primal)))
+            for whole, part in zip(primal, polished, strict=True):
+                whole[index] = part
+        return certify(problem, primal, status, iterations, seconds, self.residual_tol)
+
+    def _start(self, problem: MPCProblem, guess: Primal | None, sizes: Sizes) -> Chunk:
+        from difflcs.mpc.backends._ipopt_worker import Chunk, parameter_shapes
+
+        batch, horizon = problem.batch, problem.horizon
+        names = [name for name in parameter_shapes(sizes) if name != "relaxation"]
+        flat = [getattr(problem, n).reshape(1 if problem.shared(n) else batch, -1).expand(batch, -1) for n in names]
+        flat.append(torch.full((batch, 1), problem.relaxation, dtype=torch.float64))
+        if guess is None:
+            x = problem.x0.unsqueeze(1).expand(batch, horizon, -1)
+            u = problem.clip(torch.zeros(batch, horizon, problem.n_u, dtype=torch.float64))
+            lam = s = torch.full((batch, horizon, problem.n_lam), self.start, dtype=torch.float64)
+        else:
+            # The guess's actions decide; the rest follows from them, so that a shifted guess starts feasible.
+            u = problem.clip(guess.u)
+            x, lam = problem.rollout(u)
+            x, s = x[:, 1:], problem.relaxation / lam.clamp_min(1e-300)
+        u_min, u_max = (v.expand(batch, problem.n_u) for v in (problem.u_min, problem.u_max))
+        return Chunk(*(np.ascontiguousarray(v.numpy()) for v in (torch.cat(flat, 1), u_min, u_max, x, u, lam, s)))
+
+
+class _Worker:
+    """One worker process and the connection to it."""
+
+    def __init__(self):
+        ours, theirs = socket.socketpair()
+        script = os.path.join(os.path.dirname(__file__), "_ipopt_worker.py")
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        # -P: the script's folder stays off sys.path, where its neighbours would shadow other packages.
+        command = [sys.executable, "-P", script, str(theirs.fileno())]
+        self.process = subprocess.Popen(
+            command, pass_fds=[theirs.fileno()], env=environment, stdin=subprocess.DEVNULL, close_fds=True
+        )
+        theirs.close()
+        self.connection = Connection(ours.detach())
+        self.task: np.ndarray = np.empty(0, int)
+
+    def close(self) -> None:
+        self.connection.close()
+        self.process.kill()
+        self.process.wait()
+
+
+class _Pool:
+    """Worker processes that persist between calls and are replaced when they crash."""
+
+    def __init__(self):
+        self.lock = threading.Lock()
+        self.workers: list[_Worker] = []
+
+    def close(self) -> None:
+        while self.workers:
+            self.workers.pop().close()
+
+    def solve(self, sizes: Sizes, options: Options, chunk: Chunk, count: int) -> Solved:
+        """Solve a batch on `count` workers; results are in the order of the batch."""
+        with self.lock:
+            try:
+                return self._solve(sizes, options, chunk, count)
+            except BaseException:
+                self.close()  # a reply may be under way: start afresh next time
+                raise
+
+    def _solve(self, sizes: Sizes, options: Options, chunk: Chunk, count: int) -> Solved:
+        from difflcs.mpc.backends._ipopt_worker import NUMERICAL, Solved
+
+        batch = len(chunk.u)
+        while len(self.workers) < count:
+            self.workers.append(_Worker())
+        # Four tasks per worker balance the load; a solve costs milliseconds, a message some 0.1 ms.
+        todo = deque(np.array_split(np.arange(batch), min(batch, 4 * count)))
+        result = Solved(
+            chunk.x.copy(), chunk.u.copy(), chunk.lam.copy(),
+            np.full(batch, NUMERICAL, np.int8), np.zeros(batch, np.int32), np.zeros(batch),
+        )  # fmt: skip
+
+        def give(slot: int) -> None:
+            self.workers[slot].task = todo.popleft()
+            part = tuple(v[self.workers[slot].task] for v in chunk)
+            self.workers[slot].connection.send((tuple(sizes), tuple(options), part))
+
+        busy: dict[Connection, int] = {}
+
+        def feed(slot: int) -> None:
+            while todo:
+                try:
+                    give(slot)
+                except (BrokenPipeError, ConnectionResetError):
+                    todo.appendleft(self.workers[slot].task)
+                    self._replace(slot)
+                    continue
+                busy[self.workers[slot].connection] = slot
+                return
+
+        for slot in range(count):
+            feed(slot)
+        while busy:
+            for connection in wait(list(busy)):
+                assert isinstance(connection, Connection)
+                slot = busy.pop(connection)
+                task = self.workers[slot].task
+                try:
+                    for whole, part in zip(result, connection.recv(), strict=True):
+                        whole[task] = part
+                except (EOFError, ConnectionResetError):
+                    # The worker died. A single problem is to blame and stays NUMERICAL; several are tried one by one.
+                    self._replace(slot)
+                    if len(task) > 1:
+                        todo.extend(np.array_split(task, len(task)))
+                feed(slot)
+        return result
+
+    def _replace(self, slot: int) -> None:
+        self.workers[slot].close()
+        self.workers[slot] = _Worker()
+
+
+_pools: dict[int, _Pool] = {}
+
+
+def _pool() -> _Pool:
+    """This process's pool: a forked child must not talk to its parent's workers."""
+    pid = os.getpid()
+    if pid not in _pools:
+        _pools.clear()
+        _pools[pid] = _Pool()
+        atexit.register(_pools[pid].close)
+    return _pools[pid]

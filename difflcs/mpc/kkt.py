@@ -1,0 +1,393 @@
+r"""Optimality conditions of the LCS-MPC, and their sensitivity. All derivative mathematics of the MPC is here.
+
+Conditions
+----------
+With s_k = D x_k + E u_k + F λ_k + c, costates p, multipliers y of λ∘s = ε and ν of the action bounds, the Lagrangian is
+
+    L = J(x, u) + Σ_k p_{k+1}ᵀ (A x_k + B u_k + C λ_k + d − x_{k+1}) + y_kᵀ (λ_k ∘ s_k − ε) + ν_kᵀ (u_k − bound).
+
+λ, s > 0 are never active because λ∘s = ε > 0. With ρ_k = y_k ∘ λ_k, stationarity gives, backwards from
+p_H = Q_final x_H + q_final,
+
+    λ_k:  (diag s_k + Fᵀ diag λ_k) y_k = −Cᵀ p_{k+1}                                     (solve for y_k)
+    u_k:  g_k + ν_k = 0   with   g_k = R u_k + r + Bᵀ p_{k+1} + Eᵀ ρ_k                  (g: reduced gradient dJ/du)
+    x_k:  p_k = Q x_k + q + Aᵀ p_{k+1} + Dᵀ ρ_k.
+
+So all multipliers follow from a primal trajectory (x, u, λ) alone, whichever backend found it.
+
+Perturbation (Büskens; Eq. dloss_dtheta of the paper)
+-----------------------------------------------------
+Write the conditions, with the active bounds held as equations, as K(z, θ) = 0 for z = (x, u, λ, p, y, ν). The implicit
+function theorem gives z' = −K_z⁻¹ K_θ. K_z is symmetric, so for an upstream gradient z̄ on the primal part
+
+    θ̄ = −wᵀ K_θ   with   K_z w = z̄,   w = (dx, du, dλ, dp, dy, dν).
+
+K_z w = z̄ is the optimality system of a linear-quadratic problem in (dx, du, dλ): the Hessian of L, the linearised
+constraints, and the linear term −z̄. It is solved stage by stage. The linearised complementarity row
+s∘dλ + λ∘ds = 0 with ds = D dx + E du + F dλ gives
+
+    dλ = Kλ (dx, du),  ds = Ks (dx, du),   Kλ = −M⁻¹ diag(b) [D E],  M = diag(a) + diag(b) F,
+    a = s/(λ+s), b = λ/(λ+s),  Ks = [D E] + F Kλ;
+
+eliminating dλ leaves dx₊ = ([A B] + C Kλ)(dx, du) with the stage Hessian blkdiag(Q, R) + Y,
+
+    Y = Σ_i y_i (Kλ_iᵀ Ks_i + Ks_iᵀ Kλ_i),
+
+which is the exact second derivative of λ. A Riccati recursion over it, rows and columns of active actions replaced by the
+identity, yields (dx, du); then dp_k = P_k dx_k + v_k from the value function, dy from the λ row, dν from the u row.
+
+Since K is the gradient of L, wᵀ K_θ is the derivative along w of ∂L/∂θ, whose every term is a product of two of
+(x, u, λ, p, ρ) and hence of their directions (dx, du, dλ, dp, dρ), dρ = dy∘λ + y∘dλ. An upstream gradient on the
+objective itself needs no solve: dJ*/dθ = ∂L/∂θ (envelope theorem); it enters as dp − J̄·p and dρ − J̄·ρ below.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from difflcs._linalg import matvec
+from difflcs.mpc.problem import INPUTS, MPCProblem
+from difflcs.mpc.solution import Primal
+
+# A bound is weakly active where both the distance to it and the Newton step across it are below this part of the range.
+_WEAK = 1e-5
+# A reduced Hessian counts as singular below this relative pivot, and is regularised up to it.
+_SINGULAR = 1e-10
+
+
+@dataclass(frozen=True)
+class Multipliers:
+    """Multipliers that stationarity assigns to a primal trajectory.
+
+    Attributes:
+        s: (batch, H, n_lam) slack of the complementarity.
+        p: (batch, H+1, n_x) costates; p[:, 0] is dJ/dx0.
+        y: (batch, H, n_lam) multipliers of λ∘s = ε.
+        rho: (batch, H, n_lam) y∘λ.
+        gradient: (batch, H, n_u) reduced gradient dJ/du.
+    """
+
+    s: Tensor
+    p: Tensor
+    y: Tensor
+    rho: Tensor
+    gradient: Tensor
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """The factored matrix K_z at one primal trajectory.
+
+    Attributes:
+        primal: the trajectory.
+        multipliers: its multipliers.
+        lower, upper: (batch, H, n_u) bool: actions held at their lower and upper bound.
+        degenerate: (batch,) bool: a bound is weakly active, or the reduced Hessian is singular or indefinite.
+        stages: one `_Stage` per step.
+    """
+
+    primal: Primal
+    multipliers: Multipliers
+    lower: Tensor
+    upper: Tensor
+    degenerate: Tensor
+    stages: list[_Stage]
+
+
+@dataclass(frozen=True)
+class _Stage:
+    M: Tensor  # LU factors and pivots of M, see the module's derivation
+    pivots: Tensor
+    size: Tensor  # λ + s
+    K_lam: Tensor  # (batch, n_lam, n_x + n_u)
+    K_s: Tensor
+    A_hat: Tensor  # (batch, n_x, n_x + n_u), [A B] + C K_lam
+    P: Tensor  # (batch, n_x, n_x), Hessian of the value function after this step
+    Q_xu: Tensor  # (batch, n_x, n_u), active columns zero
+    L: Tensor  # (batch, n_u, n_u), Cholesky factor of Q_uu with identity rows for active actions
+    free: Tensor  # (batch, n_u), 1 where the action is free
+
+
+def multipliers(problem: MPCProblem, primal: Primal) -> Multipliers:
+    """Multipliers of a trajectory by the backward recursion above."""
+    return _backward(problem, primal)[0]
+
+
+def residual(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
+    """Largest violation of the optimality conditions, (batch,).
+
+    The maximum over: dynamics [state units], |λ∘s − relaxation|, negative λ or s, actions outside their bounds, and the
+    projected gradient u − clip(u − g) [the smaller of an action and of a gradient].
+    """
+    x, u, lam = (v.transpose(0, 1) for v in primal)  # steps first, so that per-element matrices broadcast
+    s = dual.s.transpose(0, 1)
+    terms = [
+        x[1:] - problem.next_state(x[:-1], u, lam),
+        lam * s - problem.relaxation,
+        lam.clamp_max(0),
+        s.clamp_max(0),
+        u - torch.minimum(torch.maximum(u, problem.u_min), problem.u_max),
+        u - torch.minimum(torch.maximum(u - dual.gradient.transpose(0, 1), problem.u_min), problem.u_max),
+    ]
+    return torch.stack([t.abs().amax((0, 2)) for t in terms]).amax(0)
+
+
+def _backward(problem: MPCProblem, primal: Primal) -> tuple[Multipliers, list[tuple[Tensor, Tensor, Tensor]]]:
+    """Multipliers, and per stage the LU factors of M, their pivots, and λ + s."""
+    x, u, lam = primal
+    s = problem.slack(*(v.transpose(0, 1) for v in (x[:, :-1], u, lam))).transpose(0, 1)
+    size = lam + s
+    b = lam / size
+    M = torch.diag_embed(1 - b) + b.unsqueeze(-1) * (problem.F if problem.shared("F") else problem.F.unsqueeze(1))
+    factors, pivots, _ = torch.linalg.lu_factor_ex(M)
+    stages = [(factors[:, k], pivots[:, k], size[:, k]) for k in range(problem.horizon)]
+    p = [matvec(problem.Q_final, x[:, -1]) + problem.q_final]
+    ys, rhos, gradients = [], [], []
+    for k in reversed(range(problem.horizon)):
+        y = _solve_transposed(stages[k], -matvec(problem.C.mT, p[-1]))
+        rho = y * lam[:, k]
+        gradients.append(
+            matvec(problem.R, u[:, k]) + problem.r + matvec(problem.B.mT, p[-1]) + matvec(problem.E.mT, rho)
+        )
+        p.append(matvec(problem.Q, x[:, k]) + problem.q + matvec(problem.A.mT, p[-1]) + matvec(problem.D.mT, rho))
+        ys.append(y)
+        rhos.append(rho)
+    backwards = [torch.stack(v[::-1], 1) for v in (p, ys, rhos, gradients)]
+    return Multipliers(s, *backwards), stages
+
+
+def _solve_transposed(stage: tuple[Tensor, Tensor, Tensor], right: Tensor) -> Tensor:
+    """Solve (diag s + Fᵀ diag λ) y = right, which is Mᵀ diag(λ+s) y = right."""
+    factors, pivots, size = stage
+    return torch.linalg.lu_solve(factors, pivots, right.unsqueeze(-1), adjoint=True).squeeze(-1) / size
+
+
+def linearise(problem: MPCProblem, primal: Primal) -> Linearisation:
+    """Factor K_z at a trajectory: the backward Riccati sweep, with the active set found on the way.
+
+    An action is held at a bound where a Newton step along its own curvature would cross it, g > h·(u − u_min) (above:
+    −g > h·(u_max − u)); this orders the bound's multiplier against its distance, whatever the scales.
+    """
+    n_x, n_u = problem.n_x, problem.n_u
+    dual, lcp = _backward(problem, primal)
+    AB = _join(problem.A, problem.B)
+    DE = _join(problem.D, problem.E)
+    P = problem.Q_final.expand(problem.batch, n_x, n_x)
+    width = problem.u_max - problem.u_min
+    stages, lowers, uppers = [], [], []
+    degenerate = torch.zeros(problem.batch, dtype=torch.bool)
+    for k in reversed(range(problem.horizon)):
+        factors, pivots, size = lcp[k]
+        u, g = primal.u[:, k], dual.gradient[:, k]
+        b = (primal.lam[:, k] / size).unsqueeze(-1)
+        K_lam = -torch.linalg.lu_solve(factors, pivots, b * DE)
+        K_s = DE + problem.F @ K_lam
+        A_hat = AB + problem.C @ K_lam
+        weighted = dual.y[:, k].unsqueeze(-1) * K_lam
+        Y = weighted.mT @ K_s
+        hessian = A_hat.mT @ (P @ A_hat) + Y + Y.mT
+        hessian[:, :n_x, :n_x] += problem.Q
+        hessian[:, n_x:, n_x:] += problem.R
+        Q_uu = hessian[:, n_x:, n_x:]
+        h = Q_uu.diagonal(dim1=-2, dim2=-1).clamp_min(torch.finfo(torch.float64).tiny)
+        to_lower, to_upper, step = u - problem.u_min, problem.u_max - u, g / h
+        lower = (step > to_lower) | ((width <= 0) & (g >= 0))
+        upper = (-step > to_upper) | ((width <= 0) & (g < 0))
+        free = ~(lower | upper)
+        weak = (torch.minimum(to_lower, to_upper) <= _WEAK * width) & (step.abs() <= _WEAK * width) & (width > 0)
+        L, singular = _cholesky(Q_uu, free)
+        degenerate |= weak.any(-1) | singular
+        Q_xu = hessian[:, :n_x, n_x:] * free.unsqueeze(-2)
+        stages.append(_Stage(factors, pivots, size, K_lam, K_s, A_hat, P, Q_xu, L, free.to(u.dtype)))
+        Z = torch.linalg.solve_triangular(L, Q_xu.mT, upper=False)
+        P = hessian[:, :n_x, :n_x] - Z.mT @ Z
+        lowers.append(lower)
+        uppers.append(upper)
+    lower, upper = torch.stack(lowers[::-1], 1), torch.stack(uppers[::-1], 1)
+    return Linearisation(primal, dual, lower, upper, degenerate, stages[::-1])
+
+
+def _join(left: Tensor, right: Tensor) -> Tensor:
+    batch = torch.broadcast_shapes(left.shape[:-2], right.shape[:-2])
+    return torch.cat([left.expand(*batch, *left.shape[-2:]), right.expand(*batch, *right.shape[-2:])], -1)
+
+
+def _cholesky(Q_uu: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
+    """Factor Q_uu with identity rows where not free; eigenvalues below the threshold are lifted to it."""
+    mask = free.unsqueeze(-1) & free.unsqueeze(-2)
+    eye = torch.eye(Q_uu.shape[-1], dtype=Q_uu.dtype)
+    scale = Q_uu.diagonal(dim1=-2, dim2=-1).abs().amax(-1).clamp_min(torch.finfo(Q_uu.dtype).tiny)
+    # Scaled to unit size, so that the identity rows of active actions do not decide what counts as singular.
+    scaled = torch.where(mask, 0.5 * (Q_uu + Q_uu.mT) / scale[:, None, None], eye)
+    L, info = torch.linalg.cholesky_ex(scaled)
+    pivots = L.diagonal(dim1=-2, dim2=-1).square().amin(-1)
+    singular = (info != 0) | ~(pivots > _SINGULAR)
+    if bool(singular.any()):
+        bad = torch.nonzero(singular).squeeze(-1)
+        finite = torch.nan_to_num(scaled[bad], posinf=0.0, neginf=0.0)
+        values, vectors = torch.linalg.eigh(finite)
+        lifted = (vectors * values.clamp_min(10 * _SINGULAR).unsqueeze(-2)) @ vectors.mT
+        L = L.clone()
+        L[bad] = torch.linalg.cholesky_ex(lifted).L
+    return L * scale.sqrt()[:, None, None] * _where_free(free, scale), singular
+
+
+def _where_free(free: Tensor, scale: Tensor) -> Tensor:
+    # Undo the scale on identity rows: they stay identity.
+    inverse = (1 / scale.sqrt())[:, None].expand(free.shape)
+    return torch.where(free, torch.ones_like(inverse), inverse).unsqueeze(-1)
+
+
+@dataclass(frozen=True)
+class _Direction:
+    """Solution w of K_z w = z̄."""
+
+    x: Tensor
+    u: Tensor
+    lam: Tensor
+    p: Tensor
+    rho: Tensor
+    nu: Tensor
+
+
+def _solve(problem: MPCProblem, lin: Linearisation, x_bar: Tensor, u_bar: Tensor, lam_bar: Tensor) -> _Direction:
+    """Solve K_z w = z̄ for upstream gradients on x (batch, H+1, n_x; the first is ignored), u and λ."""
+    n_x, horizon = problem.n_x, problem.horizon
+    dual = lin.multipliers
+    # Backward: linear terms of the value functions, v_k, and the feedforward parts.
+    v = -x_bar[:, -1]
+    values, feedforward = [v], []
+    for k in reversed(range(horizon)):
+        stage = lin.stages[k]
+        upstream = torch.cat([x_bar[:, k], u_bar[:, k]], -1) + matvec(stage.K_lam.mT, lam_bar[:, k])
+        linear = matvec(stage.A_hat.mT, v) - upstream
+        right = (linear[:, n_x:] * stage.free).unsqueeze(-1)
+        step = -torch.cholesky_solve(right, stage.L).squeeze(-1)
+        feedforward.append(step)
+        v = linear[:, :n_x] + matvec(stage.Q_xu, step)
+        values.append(v)
+    values, feedforward = values[::-1], feedforward[::-1]
+    # Forward: the direction itself, dual part included.
+    dx = torch.zeros_like(x_bar[:, 0])
+    dxs, dus, dlams, dps, drhos, dnus = [dx], [], [], [], [], []
+    for k in range(horizon):
+        stage = lin.stages[k]
+        feedback = torch.cholesky_solve(matvec(stage.Q_xu.mT, dx).unsqueeze(-1), stage.L).squeeze(-1)
+        du = feedforward[k] - feedback
+        dw = torch.cat([dx, du], -1)
+        dlam, ds = matvec(stage.K_lam, dw), matvec(stage.K_s, dw)
+        dx = matvec(stage.A_hat, dw)
+        dp = matvec(stage.P, dx) + values[k + 1]
+        y, lam = dual.y[:, k], lin.primal.lam[:, k]
+        right = lam_bar[:, k] - matvec(problem.C.mT, dp) - y * ds - matvec(problem.F.mT, y * dlam)
+        dy = _solve_transposed((stage.M, stage.pivots, stage.size), right)
+        drho = dy * lam + y * dlam
+        dnu = u_bar[:, k] - matvec(problem.R, du) - matvec(problem.B.mT, dp) - matvec(problem.E.mT, drho)
+        for store, value in zip((dxs, dus, dlams, dps, drhos, dnus), (dx, du, dlam, dp, drho, dnu), strict=True):
+            store.append(value)
+    return _Direction(*(torch.stack(d, 1) for d in (dxs, dus, dlams, dps, drhos, dnus)))
+
+
+def vjp(
+    problem: MPCProblem, lin: Linearisation, grads: tuple[Tensor, Tensor, Tensor, Tensor], solved: Tensor
+) -> dict[str, Tensor]:
+    """Gradients of every input for upstream gradients on x, u, λ and the objective.
+
+    Args:
+        problem: the problems.
+        lin: `linearise` at their solutions.
+        grads: upstream gradients on x (batch, H+1, n_x), u (batch, H, n_u), lam (batch, H, n_lam), objective (batch,).
+        solved: (batch,) bool; elements that are not contribute exactly zero.
+
+    Returns:
+        One tensor per name in `INPUTS`, shaped like the input: summed over the batch where the input is shared.
+    """
+    x_bar, u_bar, lam_bar, objective_bar = grads
+    w = _solve(problem, lin, x_bar, u_bar, lam_bar)
+    dual = lin.multipliers
+    J = objective_bar[:, None, None]
+
+    def keep(value: Tensor) -> Tensor:
+        return torch.where(solved[:, None, None], value, torch.zeros_like(value))
+
+    x, u, lam = (keep(v) for v in lin.primal)
+    dx, du, dlam = keep(w.x), keep(w.u), keep(w.lam)
+    p, rho = keep(dual.p[:, 1:]), keep(dual.rho)
+    dp, drho = keep(w.p - J * dual.p[:, 1:]), keep(w.rho - J * dual.rho)
+    x_now, dx_now, x_end, dx_end = x[:, :-1], dx[:, :-1], x[:, -1:], dx[:, -1:]
+    J = keep(J)
+
+    def outer(name: str, *pairs: tuple[Tensor, Tensor]) -> Tensor:
+        # Σ over steps (and over the batch where shared) of left · rightᵀ.
+        left, right = (torch.cat(v, 1) for v in zip(*pairs, strict=True))
+        if problem.shared(name):
+            left, right = left.flatten(0, 1), right.flatten(0, 1)
+        return left.mT @ right
+
+    def total(name: str, value: Tensor) -> Tensor:
+        return value.sum((0, 1)) if problem.shared(name) else value.sum(1)
+
+    def symmetric(name: str, value: Tensor, direction: Tensor) -> Tensor:
+        half = outer(name, (0.5 * J * value - direction, value))
+        return 0.5 * (half + half.mT)
+
+    # Bounds: −wᵀK_θ of the rows u − bound = 0, and ∂L/∂bound = −ν = g for the objective.
+    bound = keep(w.nu + objective_bar[:, None, None] * dual.gradient)
+    x0_bar = matvec(problem.A.mT, dp[:, 0]) + matvec(problem.D.mT, drho[:, 0])
+    x0_cost = matvec(problem.Q, x[:, 0]) + problem.q
+    return {
+        "A": -outer("A", (dp, x_now), (p, dx_now)),
+        "B": -outer("B", (dp, u), (p, du)),
+        "C": -outer("C", (dp, lam), (p, dlam)),
+        "d": -total("d", dp),
+        "D": -outer("D", (drho, x_now), (rho, dx_now)),
+        "E": -outer("E", (drho, u), (rho, du)),
+        "F": -outer("F", (drho, lam), (rho, dlam)),
+        "c": -total("c", drho),
+        "Q": symmetric("Q", x_now, dx_now),
+        "R": symmetric("R", u, du),
+        "Q_final": symmetric("Q_final", x_end, dx_end),
+        "q": total("q", J * x_now - dx_now),
+        "r": total("r", J * u - du),
+        "q_final": total("q_final", J * x_end - dx_end),
+        "u_min": total("u_min", bound * lin.lower),
+        "u_max": total("u_max", bound * lin.upper),
+        "x0": torch.where(solved[:, None], x_bar[:, 0] - x0_bar + J[:, 0] * x0_cost, torch.zeros_like(x0_cost)),
+    }
+
+
+def polish(problem: MPCProblem, primal: Primal, max_iter: int = 6, tol: float = 1e-10) -> Primal:
+    """Newton steps on the conditions, active bounds held: the same local optimum to machine precision.
+
+    An interior-point solution is off by its barrier parameter, and finite differences of it and the envelope theorem are
+    only as good as that. Actions held at a bound are put onto it; then each step is the sensitivity solve with minus the
+    reduced gradient upstream. Every element keeps the best trajectory met, which may be the given one.
+
+    Args:
+        problem: the problems.
+        primal: nearly optimal trajectories.
+        max_iter: most Newton steps; two or three are the rule.
+        tol: residual at which an element is left alone.
+    """
+    zeros = torch.zeros_like(primal.x), torch.zeros_like(primal.lam)
+    lin = linearise(problem, primal)
+    best, best_residual = primal, residual(problem, primal, lin.multipliers)
+    u = primal.u
+    for step in range(max_iter + 1):
+        if not bool((best_residual > tol).any()):
+            break
+        if step > 0:
+            u = lin.primal.u + _solve(problem, lin, zeros[0], -lin.multipliers.gradient, zeros[1]).u
+        u = torch.where(lin.lower, problem.u_min.unsqueeze(-2), u)
+        u = problem.clip(torch.where(lin.upper, problem.u_max.unsqueeze(-2), u))
+        x, lam = problem.rollout(u)
+        trial = Primal(x, u, lam)
+        lin = linearise(problem, trial)
+        trial_residual = residual(problem, trial, lin.multipliers)
+        better = trial_residual < best_residual
+        best = Primal(*(torch.where(better[:, None, None], a, b) for a, b in zip(trial, best, strict=True)))
+        best_residual = torch.where(better, trial_residual, best_residual)
+    return best

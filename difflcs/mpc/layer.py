@@ -1,0 +1,231 @@
+"""LCS-MPC as a PyTorch layer: validate, call a backend, wrap."""
+
+from __future__ import annotations
+
+import warnings
+
+import torch
+from torch import Tensor, nn
+
+from difflcs._checks import (
+    broadcast_batch,
+    check_choice,
+    check_number,
+    check_positive_int,
+    check_same_device,
+    check_tensor,
+    describe,
+)
+from difflcs.cost import GoalCost, QuadraticCost
+from difflcs.errors import BoundsError, DegenerateWarning, DTypeError, ShapeError, SolveError, SolveWarning
+from difflcs.lcs import LCSModel, LCSParams
+from difflcs.mpc.autograd import SolveMPC
+from difflcs.mpc.backends import Backend, get_backend
+from difflcs.mpc.problem import INPUTS, MPCProblem
+from difflcs.mpc.solution import MPCSolution, Primal
+from difflcs.status import Status
+
+Bound = float | Tensor | nn.Parameter
+
+
+class LCSMPCLayer(nn.Module):
+    """Model predictive control through a linear complementarity system (Eq. mpc_lcs), differentiable in every input.
+
+    Solves, for each batch element, the problem of `difflcs.mpc.MPCProblem`, and differentiates its solution with respect
+    to the LCS, the cost, the bounds, x0 and the goal by perturbation of the optimality conditions (`difflcs.mpc.kkt`).
+    Everything is solved in float64 on the CPU; results come back in x0's dtype and on x0's device.
+
+    Args:
+        lcs: an `LCSModel` (its parameters become this layer's), or `LCSParams`, shared or one per batch element.
+        cost: a `GoalCost`, called with the goal, or a `QuadraticCost`.
+        horizon: H ≥ 1 steps.
+        u_min: lower bound of the actions: a number, or a tensor (n_u,) or (..., n_u); learned if an nn.Parameter.
+        u_max: upper bound, likewise.
+        backend: name of a registered backend, or an instance with options.
+        relaxation: λ·s of the relaxed complementarity, > 0.
+        on_failure: "raise" a `SolveError` when an element is not solved, or "mask" it: finite numbers inside the
+            bounds, zero gradient, one `SolveWarning` per layer.
+
+    Raises:
+        InvalidInputError and its kinds: an argument does not fit.
+        BackendNotFoundError: unknown backend, or its package is missing.
+    """
+
+    u_min: Tensor
+    u_max: Tensor
+
+    def __init__(
+        self,
+        lcs: LCSModel | LCSParams,
+        cost: GoalCost | QuadraticCost,
+        horizon: int,
+        u_min: Bound,
+        u_max: Bound,
+        backend: str | Backend = "ipopt",
+        relaxation: float = 1e-5,
+        on_failure: str = "raise",
+    ):
+        super().__init__()
+        if not isinstance(lcs, LCSModel | LCSParams):
+            raise DTypeError(f"lcs: expected LCSModel or LCSParams, got {describe(lcs)}")
+        if not isinstance(cost, GoalCost | QuadraticCost):
+            raise DTypeError(f"cost: expected GoalCost or QuadraticCost, got {describe(cost)}")
+        if (cost.n_x, cost.n_u) != (lcs.n_x, lcs.n_u):
+            raise ShapeError(
+                f"cost: expected n_x={lcs.n_x}, n_u={lcs.n_u} like the LCS, got n_x={cost.n_x}, n_u={cost.n_u}"
+            )
+        self.lcs = lcs
+        self.cost = cost
+        self.horizon = check_positive_int("horizon", horizon)
+        self.relaxation = check_number("relaxation", relaxation, strict=True)
+        self.on_failure = check_choice("on_failure", on_failure, ("raise", "mask"))
+        self.backend = get_backend(backend)
+        for name, value in (("u_min", u_min), ("u_max", u_max)):
+            value = self._bound(name, value)
+            if isinstance(value, nn.Parameter):
+                self.register_parameter(name, value)
+            else:
+                self.register_buffer(name, value, persistent=False)
+        _check_bounds(self.u_min, self.u_max)
+        self._warned = False
+
+    def extra_repr(self) -> str:
+        """What print(layer) shows."""
+        return f"horizon={self.horizon}, relaxation={self.relaxation:g}, backend={self.backend}, {self.on_failure=}"
+
+    def forward(
+        self,
+        x0: Tensor,
+        goal: Tensor | None = None,
+        *,
+        guess: MPCSolution | Primal | None = None,
+        u_min: Bound | None = None,
+        u_max: Bound | None = None,
+    ) -> MPCSolution:
+        """Plan from states.
+
+        Args:
+            x0: (..., n_x) initial states, float32 or float64.
+            goal: (..., n_goal), with a `GoalCost` only. Batch dimensions broadcast with those of x0.
+            guess: warm start for the same batch, such as `solution.shift()`.
+            u_min: bound for this call instead of the layer's.
+            u_max: likewise.
+
+        Returns:
+            `MPCSolution` with the broadcast batch dimensions.
+
+        Raises:
+            SolveError: an element was not solved and on_failure="raise".
+            InvalidInputError and its kinds: an argument does not fit; nothing was solved.
+        """
+        check_tensor("x0", x0, [("n_x", self.lcs.n_x)])
+        lcs = self.lcs.params() if isinstance(self.lcs, LCSModel) else self.lcs
+        cost = self._quadratic(goal)
+        bounds = {
+            "u_min": self.u_min if u_min is None else self._bound("u_min", u_min),
+            "u_max": self.u_max if u_max is None else self._bound("u_max", u_max),
+        }
+        if u_min is not None or u_max is not None or isinstance(self.u_min, nn.Parameter):
+            _check_bounds(bounds["u_min"], bounds["u_max"])
+        tensors = {**lcs.tensors(), **cost.fields(), **bounds, "x0": x0}
+        check_same_device(reversed(tensors.items()))
+        ndim = {name: len(dims) for name, dims in INPUTS.items()}
+        leading = [(name, tensors[name].shape[: tensors[name].ndim - ndim[name]]) for name in INPUTS]
+        batch = broadcast_batch([*reversed(leading), ("constant", cost.constant.shape)])
+        flat = []
+        for name in INPUTS:
+            tensor = tensors[name].to("cpu", torch.float64)
+            if name == "x0" or tensor.ndim > ndim[name]:
+                own = tensor.shape[tensor.ndim - ndim[name] :]
+                tensor = tensor.expand(*batch, *own).reshape(-1, *own)
+            flat.append(tensor)
+        outputs = SolveMPC.apply(self.horizon, self.relaxation, self.backend, self._guess(guess, batch), *flat)
+        *primal, objective, status, iterations, residual, seconds = outputs  # pyright: ignore[reportGeneralTypeIssues]
+        self._report(status, any(t.requires_grad for t in flat))
+        values = dict(zip(INPUTS, (t.detach() for t in flat), strict=True))
+        problem = MPCProblem(**values, horizon=self.horizon, relaxation=self.relaxation)
+
+        def shaped(value: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+            return value.reshape(*batch, *value.shape[1:]).to(x0.device, dtype or value.dtype)
+
+        return MPCSolution(
+            *(shaped(v, x0.dtype) for v in primal),
+            objective=shaped(objective, x0.dtype) + cost.constant.to(x0.dtype),
+            status=shaped(status),
+            iterations=shaped(iterations),
+            kkt_residual=shaped(residual),
+            solve_time=shaped(seconds),
+            problem=problem,
+        )
+
+    def _quadratic(self, goal: Tensor | None) -> QuadraticCost:
+        if isinstance(self.cost, QuadraticCost):
+            if goal is not None:
+                raise ShapeError("goal: expected none with a QuadraticCost, got one; use a GoalCost to plan to goals")
+            return self.cost
+        if goal is None:
+            raise ShapeError(f"goal: expected (..., n_goal={self.cost.n_goal}) with a GoalCost, got none")
+        return self.cost(goal, horizon=self.horizon)
+
+    def _bound(self, name: str, value: Bound) -> Tensor:
+        n_u = self.lcs.n_u
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            reference = next(iter(self.lcs.params().tensors().values() if isinstance(self.lcs, LCSModel) else [self.lcs.A]))
+            return check_tensor(name, torch.full((n_u,), float(value), dtype=torch.float64, device=reference.device))
+        return check_tensor(name, value, [("n_u", n_u)])
+
+    def _guess(self, guess: MPCSolution | Primal | None, batch: torch.Size) -> Primal | None:
+        if guess is None:
+            return None
+        if not isinstance(guess, MPCSolution | Primal):
+            raise DTypeError(f"guess: expected an MPCSolution or a Primal such as solution.shift(), got {describe(guess)}")
+        dims = {
+            "x": [("H+1", self.horizon + 1), ("n_x", self.lcs.n_x)],
+            "u": [("H", self.horizon), ("n_u", self.lcs.n_u)],
+            "lam": [("H", self.horizon), ("n_lam", self.lcs.n_lam)],
+        }
+        flat = []
+        for name, dim in dims.items():
+            value = check_tensor(f"guess.{name}", getattr(guess, name), dim)
+            if value.shape[:-2] != batch:
+                raise ShapeError(
+                    f"guess.{name}: expected batch dimensions {tuple(batch)} like x0, got {tuple(value.shape[:-2])}"
+                )
+            flat.append(value.detach().to("cpu", torch.float64).reshape(-1, *value.shape[-2:]))
+        return Primal(*flat)
+
+    def _report(self, status: Tensor, needs_grad: bool) -> None:
+        degenerate = int((status == Status.DEGENERATE).sum())
+        failed = torch.nonzero((status != Status.CONVERGED) & (status != Status.DEGENERATE)).squeeze(-1).tolist()
+        if degenerate and needs_grad:
+            warnings.warn(
+                f"{degenerate} of {len(status)} solutions are not classically differentiable (a weakly active bound or a "
+                f"singular reduced Hessian); their gradient is a regularised one. See MPCSolution.status",
+                DegenerateWarning,
+                stacklevel=4,
+            )
+        if not failed:
+            return
+        codes = [int(status[i]) for i in failed]
+        kinds = ", ".join(f"{codes.count(c)} {Status(c).name} ({Status(c).advice})" for c in sorted(set(codes)))
+        shown = ", ".join(map(str, failed[:10])) + (", …" if len(failed) > 10 else "")
+        message = f"{len(failed)} of {len(status)} MPC problems were not solved: {kinds}; flat batch elements {shown}"
+        if self.on_failure == "raise":
+            raise SolveError(f'{message}. Pass on_failure="mask" to go on without them', failed, codes)
+        if not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"{message}. Their actions are the last iterate inside the bounds and their gradient is zero "
+                f"(this layer warns once)",
+                SolveWarning,
+                stacklevel=4,
+            )
+
+
+def _check_bounds(u_min: Tensor, u_max: Tensor) -> None:
+    broadcast_batch([("u_min", u_min.shape), ("u_max", u_max.shape)])
+    check_same_device([("u_min", u_min), ("u_max", u_max)])
+    if bool((u_min > u_max).any()):
+        index = tuple(torch.nonzero(u_min > u_max)[0].tolist())
+        low, high = (float(v.detach().expand_as(u_min + u_max)[index]) for v in (u_min, u_max))
+        raise BoundsError(f"u_min: expected u_min <= u_max, got {low:g} > {high:g} at index {index}; swap or widen them")

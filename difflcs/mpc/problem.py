@@ -1,0 +1,159 @@
+"""The MPC problem a backend solves: numbers only, checked once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from difflcs._checks import check_number, check_positive_int
+from difflcs._linalg import matvec, quadratic
+from difflcs.errors import BoundsError, ShapeError
+from difflcs.lcp import solve_lcp_arrays
+
+# Differentiable inputs with the kind of each trailing dimension, in the order in which autograd sees them.
+INPUTS: dict[str, tuple[str, ...]] = {
+    "A": ("n_x", "n_x"),
+    "B": ("n_x", "n_u"),
+    "C": ("n_x", "n_lam"),
+    "d": ("n_x",),
+    "D": ("n_lam", "n_x"),
+    "E": ("n_lam", "n_u"),
+    "F": ("n_lam", "n_lam"),
+    "c": ("n_lam",),
+    "Q": ("n_x", "n_x"),
+    "R": ("n_u", "n_u"),
+    "Q_final": ("n_x", "n_x"),
+    "q": ("n_x",),
+    "r": ("n_u",),
+    "q_final": ("n_x",),
+    "u_min": ("n_u",),
+    "u_max": ("n_u",),
+    "x0": ("n_x",),
+}
+
+
+@dataclass(frozen=True)
+class MPCProblem:
+    """A batch of LCS-MPC problems (Eq. mpc_lcs) with relaxed complementarity:
+
+        min Σ_{k<H} ½x_kᵀQx_k + qᵀx_k + ½u_kᵀRu_k + rᵀu_k + ½x_HᵀQ_final x_H + q_finalᵀx_H
+        s.t. x_{k+1} = A x_k + B u_k + C λ_k + d,  s_k = D x_k + E u_k + F λ_k + c,
+             λ_k ∘ s_k = relaxation,  λ_k, s_k ≥ 0,  u_min ≤ u_k ≤ u_max.
+
+    Tensors are float64 on the CPU and detached. x0 is (batch, n_x); every other one is shared, with exactly the
+    dimensions named in `INPUTS`, or has the batch dimension in front.
+
+    Attributes:
+        A, B, C, d, D, E, F, c: the LCS, see `difflcs.LCSParams`.
+        Q, R, Q_final, q, r, q_final: the cost, see `difflcs.QuadraticCost`; Q, R, Q_final symmetric.
+        u_min, u_max: bounds of the actions.
+        x0: (batch, n_x) initial states.
+        horizon: H ≥ 1 steps.
+        relaxation: product λ·s > 0; the smaller, the closer to hard contact.
+
+    Raises:
+        ShapeError, BoundsError, InvalidInputError: inconsistent shapes, u_min > u_max, horizon < 1, relaxation ≤ 0.
+    """
+
+    A: Tensor
+    B: Tensor
+    C: Tensor
+    d: Tensor
+    D: Tensor
+    E: Tensor
+    F: Tensor
+    c: Tensor
+    Q: Tensor
+    R: Tensor
+    Q_final: Tensor
+    q: Tensor
+    r: Tensor
+    q_final: Tensor
+    u_min: Tensor
+    u_max: Tensor
+    x0: Tensor
+    horizon: int
+    relaxation: float
+
+    def __post_init__(self) -> None:
+        check_positive_int("horizon", self.horizon)
+        check_number("relaxation", self.relaxation, strict=True)
+        for name in INPUTS:
+            tensor, shape = getattr(self, name), self.shape(name)
+            if tuple(tensor.shape) not in ((shape, (self.batch, *shape)) if name != "x0" else ((self.batch, *shape),)):
+                raise ShapeError(f"{name}: expected {shape} or {(self.batch, *shape)}, got {tuple(tensor.shape)}")
+        if bool((self.u_min > self.u_max).any()):
+            index = torch.nonzero(torch.broadcast_tensors(self.u_min > self.u_max)[0])[0].tolist()
+            low, high = (v.expand_as(self.u_min + self.u_max)[tuple(index)].item() for v in (self.u_min, self.u_max))
+            raise BoundsError(
+                f"u_min: expected u_min <= u_max, got {low:g} > {high:g} at index {tuple(index)}; swap or widen the bounds"
+            )
+
+    @property
+    def batch(self) -> int:
+        """Number of problems."""
+        return self.x0.shape[0]
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return self.A.shape[-1]
+
+    @property
+    def n_u(self) -> int:
+        """Number of actions."""
+        return self.B.shape[-1]
+
+    @property
+    def n_lam(self) -> int:
+        """Number of complementarity variables."""
+        return self.F.shape[-1]
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Dimensions of one input without the batch."""
+        return tuple(getattr(self, dim) for dim in INPUTS[name])
+
+    def shared(self, name: str) -> bool:
+        """Whether the whole batch shares this input."""
+        return getattr(self, name).ndim == len(INPUTS[name])
+
+    def next_state(self, x: Tensor, u: Tensor, lam: Tensor) -> Tensor:
+        """A x + B u + C λ + d for (batch, n) vectors."""
+        return matvec(self.A, x) + matvec(self.B, u) + matvec(self.C, lam) + self.d
+
+    def slack(self, x: Tensor, u: Tensor, lam: Tensor) -> Tensor:
+        """S = D x + E u + F λ + c for (batch, n) vectors."""
+        return matvec(self.D, x) + matvec(self.E, u) + matvec(self.F, lam) + self.c
+
+    def objective(self, x: Tensor, u: Tensor) -> Tensor:
+        """Cost (batch,) of trajectories x (batch, H+1, n_x), u (batch, H, n_u)."""
+        total = 0.5 * quadratic(self.Q_final, x[:, -1]) + (self.q_final * x[:, -1]).sum(-1)
+        for k in range(self.horizon):
+            total = total + 0.5 * quadratic(self.Q, x[:, k]) + (self.q * x[:, k]).sum(-1)
+            total = total + 0.5 * quadratic(self.R, u[:, k]) + (self.r * u[:, k]).sum(-1)
+        return total
+
+    def rollout(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        """The trajectory that actions u (batch, H, n_u) cause: x (batch, H+1, n_x) and λ (batch, H, n_lam)."""
+        F = self.F.numpy()
+        states, forces = [self.x0], []
+        for k in range(self.horizon):
+            gap = matvec(self.D, states[-1]) + matvec(self.E, u[:, k]) + self.c
+            lam = torch.from_numpy(solve_lcp_arrays(F, gap.numpy(), self.relaxation)[0])
+            states.append(self.next_state(states[-1], u[:, k], lam))
+            forces.append(lam)
+        return torch.stack(states, 1), torch.stack(forces, 1)
+
+    def clip(self, u: Tensor) -> Tensor:
+        """Actions (batch, H, n_u) clipped into the bounds."""
+        return torch.minimum(torch.maximum(u, self.u_min.unsqueeze(-2)), self.u_max.unsqueeze(-2))
+
+    def select(self, index: Tensor) -> MPCProblem:
+        """The problems at some batch indices."""
+        chosen = {k: getattr(self, k) if self.shared(k) else getattr(self, k)[index] for k in INPUTS}
+        return MPCProblem(**chosen, horizon=self.horizon, relaxation=self.relaxation)
+
+
+assert [f.name for f in fields(MPCProblem)][: len(INPUTS)] == list(INPUTS), "INPUTS must list the fields in order"

@@ -1,0 +1,86 @@
+"""What an MPC solve returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from difflcs.mpc.problem import MPCProblem
+from difflcs.status import Status
+
+__all__ = ["MPCSolution", "Primal", "Status"]
+
+
+class Primal(NamedTuple):
+    """A trajectory: x (..., H+1, n_x), u (..., H, n_u), lam (..., H, n_lam). Usable as a guess."""
+
+    x: Tensor
+    u: Tensor
+    lam: Tensor
+
+
+@dataclass(frozen=True)
+class MPCSolution:
+    """Solutions of a batch of MPC problems; they certify themselves.
+
+    Attributes:
+        x: (..., H+1, n_x) planned states, x[..., 0, :] = x0. Differentiable, as u, lam and objective.
+        u: (..., H, n_u) planned actions.
+        lam: (..., H, n_lam) complementarity variables.
+        objective: (...) cost of the plan.
+        status: (...) `Status` as int8.
+        iterations: (...) iterations of the solver, int32.
+        kkt_residual: (...) largest violation of the optimality conditions, see `difflcs.mpc.kkt.residual`.
+        solve_time: (...) seconds spent on each problem.
+    """
+
+    x: Tensor
+    u: Tensor
+    lam: Tensor
+    objective: Tensor
+    status: Tensor
+    iterations: Tensor
+    kkt_residual: Tensor
+    solve_time: Tensor
+    problem: MPCProblem = field(repr=False)
+
+    @property
+    def action(self) -> Tensor:
+        """First action, (..., n_u): what a receding-horizon controller executes."""
+        return self.u[..., 0, :]
+
+    @property
+    def converged(self) -> Tensor:
+        """(...) bool: the plan can be used (CONVERGED or DEGENERATE)."""
+        return (self.status == Status.CONVERGED) | (self.status == Status.DEGENERATE)
+
+    def complementarity(self) -> Tensor:
+        """(...) largest |λ·s − relaxation| over the horizon."""
+        x, u, lam = self._flat()
+        slack = self.problem.slack(*_by_step(x[:, :-1], u, lam))
+        worst = (slack * lam.transpose(0, 1) - self.problem.relaxation).abs().amax((0, 2))
+        return worst.reshape(self.status.shape).to(self.status.device)
+
+    def dynamics_residual(self) -> Tensor:
+        """(...) largest |x_{k+1} − (A x_k + B u_k + C λ_k + d)| over the horizon."""
+        x, u, lam = self._flat()
+        predicted = self.problem.next_state(*_by_step(x[:, :-1], u, lam))
+        worst = (x[:, 1:].transpose(0, 1) - predicted).abs().amax((0, 2))
+        return worst.reshape(self.status.shape).to(self.status.device)
+
+    def shift(self) -> Primal:
+        """The plan one step later, its last step repeated: a guess for the next solve of a receding horizon."""
+        return Primal(*(torch.cat([v[..., 1:, :], v[..., -1:, :]], -2).detach() for v in (self.x, self.u, self.lam)))
+
+    def _flat(self) -> tuple[Tensor, Tensor, Tensor]:
+        return tuple(  # pyright: ignore[reportReturnType]
+            v.detach().to("cpu", torch.float64).reshape(-1, *v.shape[-2:]) for v in (self.x, self.u, self.lam)
+        )
+
+
+def _by_step(*trajectories: Tensor) -> tuple[Tensor, ...]:
+    # (batch, steps, n) → (steps, batch, n), so that per-element matrices broadcast over the steps.
+    return tuple(v.transpose(0, 1) for v in trajectories)
