@@ -1,0 +1,39 @@
+# Two commands matter: `make demo` and `make test`. Both set up .venv themselves; a second run starts at once.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+EXTRAS := rl,envs,viz,dev
+
+.PHONY: help demo test lint format clean
+
+help:
+	@echo "make demo   learn a contact model and push the cube with it (runs/demo)"
+	@echo "make test   run the tests"
+	@echo "make lint   ruff and pyright"
+	@echo "make format let ruff put the code in order"
+	@echo "make clean  remove .venv and build products"
+
+$(VENV)/.ready: pyproject.toml constraints.txt CMakeLists.txt $(wildcard difflcs/_native/*.?pp)
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "difflcs needs Python 3.11 or newer, got $$($(PYTHON) --version); try make PYTHON=python3.11"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[$(EXTRAS)]"
+	@touch $@
+
+demo: $(VENV)/.ready
+	$(BIN)/difflcs demo
+
+test: $(VENV)/.ready
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+format: $(VENV)/.ready
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache
