@@ -47,7 +47,9 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
     wanted = tuple(size for _, size in dims)
     if value.ndim < len(dims) or tuple(value.shape[value.ndim - len(dims) :]) != wanted:
         labels = ", ".join(["..."] + [f"{label}={size}" for label, size in dims])
-        raise ShapeError(f"{name}: expected shape ({labels}), got {tuple(value.shape)}; reshape it or rebuild the model")
+        raise ShapeError(
+            f"{name}: expected shape ({labels}), got {tuple(value.shape)}; reshape it or rebuild the model"
+        )
     if finite and not bool(torch.isfinite(value.detach()).all()):
         bad = torch.nonzero(~torch.isfinite(value.detach()))
         raise NonFiniteError(

@@ -71,7 +71,7 @@ def load_record(directory: Path, kind: str) -> tuple[dict[str, object], dict[str
         header = json.loads((directory / "config.json").read_text())
         with safe_open(directory / "model.safetensors", "pt") as file:
             metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  not a dict
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
     except FileNotFoundError as error:
         raise CheckpointError(f"{directory}: a file is missing ({error}); {remedy}") from error
     except (OSError, SafetensorError, UnicodeDecodeError, json.JSONDecodeError) as error:

@@ -6,7 +6,7 @@ from torch import Tensor
 
 
 def matvec(matrix: Tensor, vector: Tensor) -> Tensor:
-    """matrix · vector for vectors (..., columns)."""
+    """Matrix · vector for vectors (..., columns)."""
     # A shared matrix is one GEMM for the whole batch; a matrix per element is a batched product.
     return vector @ matrix.mT if matrix.ndim == 2 else (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 

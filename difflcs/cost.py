@@ -110,8 +110,8 @@ def _check_convex(name: str, matrix: Tensor) -> None:
 class GoalCost(_TensorFields):
     """Maps a goal to a `QuadraticCost` whose linear terms are linear in the goal.
 
-    cost(goal) has q = goal_to_q · goal, q_final = goal_to_q_final · goal and the constant ½ goalᵀ K goal, so that costs of
-    tracking errors (w‖x_goal − goal‖²) come out with their true value.
+    cost(goal) has q = goal_to_q · goal, q_final = goal_to_q_final · goal and the constant ½ goalᵀ K goal, so that costs
+    of tracking errors (w‖x_goal − goal‖²) come out with their true value.
 
     Args:
         Q: (n_x, n_x) stage weight.
@@ -214,7 +214,7 @@ class GoalCost(_TensorFields):
         Args:
             n_x: number of states.
             n_u: number of actions.
-            goal_weight: weight per goal component (their number is n_goal), or one number for all states (n_goal = n_x).
+            goal_weight: weight per goal component (n_goal of them), or one number for all states (n_goal = n_x).
             goal_weight_final: the same for the final state; goal_weight if None.
             input_weight: weight of the actions, > 0.
             pairs: index pairs (i, j) of states.

@@ -78,9 +78,11 @@ def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0) -> LCPSolution:
     )
 
 
-def solve_lcp_arrays(F: np.ndarray, q: np.ndarray, relaxation: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def solve_lcp_arrays(
+    F: np.ndarray, q: np.ndarray, relaxation: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The native solve on float64 arrays F (n, n) or (B, n, n) and q (B, n): λ, w (B, n) and status (B,), no NaN."""
-    from difflcs._native import _kernels
+    from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 
     F, q = np.ascontiguousarray(F), np.ascontiguousarray(q)
     lam, w = np.empty_like(q), np.empty_like(q)

@@ -194,7 +194,17 @@ class LCSModel(nn.Module):
 
     def _shapes(self) -> dict[str, tuple[int, ...]]:
         x, u, m = self.n_x, self.n_u, self.n_lam
-        return {"A": (x, x), "B": (x, u), "C": (x, m), "d": (x,), "D": (m, x), "E": (m, u), "G": (m, m), "H": (m, m), "c": (m,)}
+        return {
+            "A": (x, x),
+            "B": (x, u),
+            "C": (x, m),
+            "d": (x,),
+            "D": (m, x),
+            "E": (m, u),
+            "G": (m, m),
+            "H": (m, m),
+            "c": (m,),
+        }
 
     def extra_repr(self) -> str:
         """What print(model) shows."""
@@ -282,7 +292,9 @@ class LCSModel(nn.Module):
                 f"stiffness: expected less than the smallest eigenvalue {smallest:.3e} of (F + Fᵀ)/2, got {stiffness:g}"
             )
         model = cls(params.n_x, params.n_u, params.n_lam, stiffness, dtype=params.A.dtype).to(params.A.device)
-        G = torch.linalg.cholesky(symmetric - stiffness * torch.eye(params.n_lam, dtype=torch.float64, device=symmetric.device))
+        G = torch.linalg.cholesky(
+            symmetric - stiffness * torch.eye(params.n_lam, dtype=torch.float64, device=symmetric.device)
+        )
         H = torch.triu(0.5 * (params.F - params.F.mT), diagonal=1)
         values = {**params.tensors(), "G": G, "H": H}
         with torch.no_grad():
@@ -318,7 +330,9 @@ class LCSModel(nn.Module):
             raise CheckpointError(f"{source}: its configuration cannot be used: {error}") from error
         shapes = {k: tuple(v.shape) for k, v in tensors.items()}
         if shapes != model._shapes():
-            raise CheckpointError(f"{source}: expected tensors {model._shapes()}, got {shapes}; the file is foreign or corrupt")
+            raise CheckpointError(
+                f"{source}: expected tensors {model._shapes()}, got {shapes}; the file is foreign or corrupt"
+            )
         for name, tensor in tensors.items():
             if tensor.dtype != dtype or not bool(torch.isfinite(tensor).all()):
                 raise CheckpointError(f"{source}: expected finite {dtype} values in {name}, got {describe(tensor)}")

@@ -101,8 +101,8 @@ def _check_gamma(F: Tensor, gamma: float, refuse_large: bool) -> None:
     # The bound itself is allowed; a relative 1e-9 forgives the rounding of the eigenvalue.
     if gamma <= 0 or (refuse_large and gamma > smallest * (1 + 1e-9)):
         raise GammaError(
-            f"gamma: expected 0 < gamma <= sigma_min(F + F^T) = {smallest:.6g}, got {gamma:.6g}; lower gamma, raise the "
-            f"model's stiffness (sigma_min >= 2*stiffness), or pass check_gamma=False to keep a fixed gamma above the bound"
+            f"gamma: expected 0 < gamma <= sigma_min(F + F^T) = {smallest:.6g}, got {gamma:.6g}; lower gamma, "
+            f"raise the model's stiffness (sigma_min >= 2*stiffness), or pass check_gamma=False to keep a fixed gamma"
         )
 
 

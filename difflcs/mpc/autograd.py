@@ -13,12 +13,11 @@ from difflcs.status import Status
 
 
 class SolveMPC(torch.autograd.Function):
-    """tensors (in the order of `INPUTS`) → x, u, lam, objective, status, iterations, kkt_residual, solve_time."""
+    """Tensors (in the order of `INPUTS`) → x, u, lam, objective, status, iterations, kkt_residual, solve_time."""
 
     @staticmethod
-    def forward(ctx, horizon: int, relaxation: float, backend: Backend, guess: Primal | None, *tensors: Tensor):
-        values = {k: v.detach().contiguous() for k, v in zip(INPUTS, tensors, strict=True)}
-        problem = MPCProblem(**values, horizon=horizon, relaxation=relaxation)
+    def forward(ctx, problem: MPCProblem, backend: Backend, guess: Primal | None, *tensors: Tensor):  # noqa: D102
+        # `problem` holds the values of `tensors`; these are here only to receive gradients.
         result = backend.solve(problem, guess)
         ctx.problem, ctx.backend, ctx.result = problem, backend, result
         x, u, lam = result.primal
@@ -28,13 +27,15 @@ class SolveMPC(torch.autograd.Function):
         return *outputs, *info
 
     @staticmethod
-    def backward(ctx, *grads: Tensor):
+    def backward(ctx, *grads: Tensor):  # noqa: D102
         if torch.is_grad_enabled():
             raise DoubleBackwardError("LCSMPCLayer has first derivatives only; expected create_graph=False")
         result: Result = ctx.result
         solved = (result.status == Status.CONVERGED) | (result.status == Status.DEGENERATE)
         # Whatever comes upstream for a failed element is dropped before it can meet the others.
-        upstream = tuple(torch.where(solved.reshape(-1, *[1] * (g.ndim - 1)), g, torch.zeros_like(g)) for g in grads[:4])
+        upstream = tuple(
+            torch.where(solved.reshape(-1, *[1] * (g.ndim - 1)), g, torch.zeros_like(g)) for g in grads[:4]
+        )
         gradients = ctx.backend.vjp(ctx.problem, result, upstream, solved)
-        needed = ctx.needs_input_grad[4:]
-        return None, None, None, None, *(gradients[k] if n else None for k, n in zip(INPUTS, needed, strict=True))
+        needed = ctx.needs_input_grad[3:]
+        return None, None, None, *(gradients[k] if n else None for k, n in zip(INPUTS, needed, strict=True))

@@ -33,8 +33,8 @@ eliminating dλ leaves dx₊ = ([A B] + C Kλ)(dx, du) with the stage Hessian bl
 
     Y = Σ_i y_i (Kλ_iᵀ Ks_i + Ks_iᵀ Kλ_i),
 
-which is the exact second derivative of λ. A Riccati recursion over it, rows and columns of active actions replaced by the
-identity, yields (dx, du); then dp_k = P_k dx_k + v_k from the value function, dy from the λ row, dν from the u row.
+which is the exact second derivative of λ. A Riccati recursion over it, rows and columns of active actions replaced by
+the identity, yields (dx, du); then dp_k = P_k dx_k + v_k from the value function, dy from the λ row, dν from the u row.
 
 Since K is the gradient of L, wᵀ K_θ is the derivative along w of ∂L/∂θ, whose every term is a product of two of
 (x, u, λ, p, ρ) and hence of their directions (dx, du, dλ, dp, dρ), dρ = dy∘λ + y∘dλ. An upstream gradient on the
@@ -49,7 +49,7 @@ import torch
 from torch import Tensor
 
 from difflcs._linalg import matvec
-from difflcs.mpc.problem import INPUTS, MPCProblem
+from difflcs.mpc.problem import MPCProblem
 from difflcs.mpc.solution import Primal
 
 # A bound is weakly active where both the distance to it and the Newton step across it are below this part of the range.
@@ -171,7 +171,7 @@ def linearise(problem: MPCProblem, primal: Primal) -> Linearisation:
     An action is held at a bound where a Newton step along its own curvature would cross it, g > h·(u − u_min) (above:
     −g > h·(u_max − u)); this orders the bound's multiplier against its distance, whatever the scales.
     """
-    n_x, n_u = problem.n_x, problem.n_u
+    n_x = problem.n_x
     dual, lcp = _backward(problem, primal)
     AB = _join(problem.A, problem.B)
     DE = _join(problem.D, problem.E)
@@ -362,9 +362,9 @@ def vjp(
 def polish(problem: MPCProblem, primal: Primal, max_iter: int = 6, tol: float = 1e-10) -> Primal:
     """Newton steps on the conditions, active bounds held: the same local optimum to machine precision.
 
-    An interior-point solution is off by its barrier parameter, and finite differences of it and the envelope theorem are
-    only as good as that. Actions held at a bound are put onto it; then each step is the sensitivity solve with minus the
-    reduced gradient upstream. Every element keeps the best trajectory met, which may be the given one.
+    An interior-point solution is off by its barrier parameter, and finite differences of it and the envelope theorem
+    are only as good as that. Actions held at a bound are put onto it; then each step is the sensitivity solve with minus
+    the reduced gradient upstream. Every element keeps the best trajectory met, which may be the given one.
 
     Args:
         problem: the problems.

@@ -17,11 +17,11 @@ from difflcs._checks import (
     describe,
 )
 from difflcs.cost import GoalCost, QuadraticCost
-from difflcs.errors import BoundsError, DegenerateWarning, DTypeError, ShapeError, SolveError, SolveWarning
+from difflcs.errors import DegenerateWarning, DTypeError, ShapeError, SolveError, SolveWarning
 from difflcs.lcs import LCSModel, LCSParams
 from difflcs.mpc.autograd import SolveMPC
 from difflcs.mpc.backends import Backend, get_backend
-from difflcs.mpc.problem import INPUTS, MPCProblem
+from difflcs.mpc.problem import INPUTS, MPCProblem, check_bounds
 from difflcs.mpc.solution import MPCSolution, Primal
 from difflcs.status import Status
 
@@ -31,8 +31,8 @@ Bound = float | Tensor | nn.Parameter
 class LCSMPCLayer(nn.Module):
     """Model predictive control through a linear complementarity system (Eq. mpc_lcs), differentiable in every input.
 
-    Solves, for each batch element, the problem of `difflcs.mpc.MPCProblem`, and differentiates its solution with respect
-    to the LCS, the cost, the bounds, x0 and the goal by perturbation of the optimality conditions (`difflcs.mpc.kkt`).
+    Solves, for each batch element, the problem of `difflcs.mpc.MPCProblem`, and differentiates its solution with
+    respect to the LCS, the cost, the bounds, x0 and the goal by perturbation of the optimality conditions (`difflcs.mpc.kkt`).
     Everything is solved in float64 on the CPU; results come back in x0's dtype and on x0's device.
 
     Args:
@@ -86,7 +86,7 @@ class LCSMPCLayer(nn.Module):
                 self.register_parameter(name, value)
             else:
                 self.register_buffer(name, value, persistent=False)
-        _check_bounds(self.u_min, self.u_max)
+        check_bounds(self.u_min, self.u_max)
         self._warned = False
 
     def extra_repr(self) -> str:
@@ -125,8 +125,6 @@ class LCSMPCLayer(nn.Module):
             "u_min": self.u_min if u_min is None else self._bound("u_min", u_min),
             "u_max": self.u_max if u_max is None else self._bound("u_max", u_max),
         }
-        if u_min is not None or u_max is not None or isinstance(self.u_min, nn.Parameter):
-            _check_bounds(bounds["u_min"], bounds["u_max"])
         tensors = {**lcs.tensors(), **cost.fields(), **bounds, "x0": x0}
         check_same_device(reversed(tensors.items()))
         ndim = {name: len(dims) for name, dims in INPUTS.items()}
@@ -139,11 +137,11 @@ class LCSMPCLayer(nn.Module):
                 own = tensor.shape[tensor.ndim - ndim[name] :]
                 tensor = tensor.expand(*batch, *own).reshape(-1, *own)
             flat.append(tensor)
-        outputs = SolveMPC.apply(self.horizon, self.relaxation, self.backend, self._guess(guess, batch), *flat)
+        values = {name: tensor.detach().contiguous() for name, tensor in zip(INPUTS, flat, strict=True)}
+        problem = MPCProblem(**values, horizon=self.horizon, relaxation=self.relaxation)
+        outputs = SolveMPC.apply(problem, self.backend, self._guess(guess, batch), *flat)
         *primal, objective, status, iterations, residual, seconds = outputs  # pyright: ignore[reportGeneralTypeIssues]
         self._report(status, any(t.requires_grad for t in flat))
-        values = dict(zip(INPUTS, (t.detach() for t in flat), strict=True))
-        problem = MPCProblem(**values, horizon=self.horizon, relaxation=self.relaxation)
 
         def shaped(value: Tensor, dtype: torch.dtype | None = None) -> Tensor:
             return value.reshape(*batch, *value.shape[1:]).to(x0.device, dtype or value.dtype)
@@ -170,15 +168,16 @@ class LCSMPCLayer(nn.Module):
     def _bound(self, name: str, value: Bound) -> Tensor:
         n_u = self.lcs.n_u
         if isinstance(value, int | float) and not isinstance(value, bool):
-            reference = next(iter(self.lcs.params().tensors().values() if isinstance(self.lcs, LCSModel) else [self.lcs.A]))
-            return check_tensor(name, torch.full((n_u,), float(value), dtype=torch.float64, device=reference.device))
+            return check_tensor(name, torch.full((n_u,), float(value), dtype=torch.float64, device=self.lcs.A.device))
         return check_tensor(name, value, [("n_u", n_u)])
 
     def _guess(self, guess: MPCSolution | Primal | None, batch: torch.Size) -> Primal | None:
         if guess is None:
             return None
         if not isinstance(guess, MPCSolution | Primal):
-            raise DTypeError(f"guess: expected an MPCSolution or a Primal such as solution.shift(), got {describe(guess)}")
+            raise DTypeError(
+                f"guess: expected an MPCSolution or a Primal such as solution.shift(), got {describe(guess)}"
+            )
         dims = {
             "x": [("H+1", self.horizon + 1), ("n_x", self.lcs.n_x)],
             "u": [("H", self.horizon), ("n_u", self.lcs.n_u)],
@@ -199,8 +198,8 @@ class LCSMPCLayer(nn.Module):
         failed = torch.nonzero((status != Status.CONVERGED) & (status != Status.DEGENERATE)).squeeze(-1).tolist()
         if degenerate and needs_grad:
             warnings.warn(
-                f"{degenerate} of {len(status)} solutions are not classically differentiable (a weakly active bound or a "
-                f"singular reduced Hessian); their gradient is a regularised one. See MPCSolution.status",
+                f"{degenerate} of {len(status)} solutions are not classically differentiable (a weakly active bound or "
+                f"a singular reduced Hessian); their gradient is a regularised one. See MPCSolution.status",
                 DegenerateWarning,
                 stacklevel=4,
             )
@@ -220,12 +219,3 @@ class LCSMPCLayer(nn.Module):
                 SolveWarning,
                 stacklevel=4,
             )
-
-
-def _check_bounds(u_min: Tensor, u_max: Tensor) -> None:
-    broadcast_batch([("u_min", u_min.shape), ("u_max", u_max.shape)])
-    check_same_device([("u_min", u_min), ("u_max", u_max)])
-    if bool((u_min > u_max).any()):
-        index = tuple(torch.nonzero(u_min > u_max)[0].tolist())
-        low, high = (float(v.detach().expand_as(u_min + u_max)[index]) for v in (u_min, u_max))
-        raise BoundsError(f"u_min: expected u_min <= u_max, got {low:g} > {high:g} at index {index}; swap or widen them")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_number, check_positive_int
+from difflcs._checks import broadcast_batch, check_number, check_positive_int, check_same_device
 from difflcs._linalg import matvec, quadratic
 from difflcs.errors import BoundsError, ShapeError
 from difflcs.lcp import solve_lcp_arrays
@@ -34,9 +34,22 @@ INPUTS: dict[str, tuple[str, ...]] = {
 }
 
 
+def check_bounds(u_min: Tensor, u_max: Tensor) -> None:
+    """Refuse bounds that do not broadcast, live on different devices, or cross."""
+    broadcast_batch([("u_min", u_min.shape), ("u_max", u_max.shape)])
+    check_same_device([("u_min", u_min), ("u_max", u_max)])
+    crossed = u_min > u_max
+    if bool(crossed.any()):
+        index = tuple(torch.nonzero(crossed)[0].tolist())
+        low, high = (float(v.detach().expand_as(crossed)[index]) for v in (u_min, u_max))
+        raise BoundsError(
+            f"u_min: expected u_min <= u_max, got {low:g} > {high:g} at index {index}; swap or widen the bounds"
+        )
+
+
 @dataclass(frozen=True)
 class MPCProblem:
-    """A batch of LCS-MPC problems (Eq. mpc_lcs) with relaxed complementarity:
+    """A batch of LCS-MPC problems (Eq. mpc_lcs) with relaxed complementarity.
 
         min Σ_{k<H} ½x_kᵀQx_k + qᵀx_k + ½u_kᵀRu_k + rᵀu_k + ½x_HᵀQ_final x_H + q_finalᵀx_H
         s.t. x_{k+1} = A x_k + B u_k + C λ_k + d,  s_k = D x_k + E u_k + F λ_k + c,
@@ -84,12 +97,7 @@ class MPCProblem:
             tensor, shape = getattr(self, name), self.shape(name)
             if tuple(tensor.shape) not in ((shape, (self.batch, *shape)) if name != "x0" else ((self.batch, *shape),)):
                 raise ShapeError(f"{name}: expected {shape} or {(self.batch, *shape)}, got {tuple(tensor.shape)}")
-        if bool((self.u_min > self.u_max).any()):
-            index = torch.nonzero(torch.broadcast_tensors(self.u_min > self.u_max)[0])[0].tolist()
-            low, high = (v.expand_as(self.u_min + self.u_max)[tuple(index)].item() for v in (self.u_min, self.u_max))
-            raise BoundsError(
-                f"u_min: expected u_min <= u_max, got {low:g} > {high:g} at index {tuple(index)}; swap or widen the bounds"
-            )
+        check_bounds(self.u_min, self.u_max)
 
     @property
     def batch(self) -> int:

@@ -75,8 +75,8 @@ def certify(
 ) -> Result:
     """Judge raw trajectories by the optimality conditions themselves, whatever the solver claims.
 
-    A CONVERGED element whose residual exceeds `tol` becomes NUMERICAL; one that is not classically differentiable becomes
-    DEGENERATE. Elements that did not converge get finite numbers: their actions clipped into the bounds (zero where not
+    A CONVERGED element whose residual exceeds `tol` becomes NUMERICAL; one that is not classically differentiable
+    becomes DEGENERATE. Elements that did not converge get finite numbers: their actions clipped into the bounds (zero where not
     finite) and the trajectory that these cause.
     """
     status = status.clone()
@@ -115,7 +115,9 @@ def register_backend(backend: type[Backend]) -> type[Backend]:
     Raises:
         DTypeError: not a `Backend` subclass with a name.
     """
-    if not (isinstance(backend, type) and issubclass(backend, Backend) and isinstance(getattr(backend, "name", None), str)):
+    if not (
+        isinstance(backend, type) and issubclass(backend, Backend) and isinstance(getattr(backend, "name", None), str)
+    ):
         raise DTypeError(f"backend: expected a subclass of Backend with a `name`, got {backend!r}")
     _REGISTRY[backend.name] = backend
     return backend
