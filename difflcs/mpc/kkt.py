@@ -363,8 +363,8 @@ def polish(problem: MPCProblem, primal: Primal, max_iter: int = 6, tol: float = 
     """Newton steps on the conditions, active bounds held: the same local optimum to machine precision.
 
     An interior-point solution is off by its barrier parameter, and finite differences of it and the envelope theorem
-    are only as good as that. Actions held at a bound are put onto it; then each step is the sensitivity solve with minus
-    the reduced gradient upstream. Every element keeps the best trajectory met, which may be the given one.
+    are only as good as that. Actions held at a bound are put onto it; then each step is the sensitivity solve with
+    minus the reduced gradient upstream. Every element keeps the best trajectory met, which may be the given one.
 
     Args:
         problem: the problems.

@@ -32,8 +32,8 @@ class LCSMPCLayer(nn.Module):
     """Model predictive control through a linear complementarity system (Eq. mpc_lcs), differentiable in every input.
 
     Solves, for each batch element, the problem of `difflcs.mpc.MPCProblem`, and differentiates its solution with
-    respect to the LCS, the cost, the bounds, x0 and the goal by perturbation of the optimality conditions (`difflcs.mpc.kkt`).
-    Everything is solved in float64 on the CPU; results come back in x0's dtype and on x0's device.
+    respect to the LCS, the cost, the bounds, x0 and the goal by perturbation of the optimality conditions
+    (`difflcs.mpc.kkt`). Everything is solved in float64 on the CPU; results come back in x0's dtype and on x0's device.
 
     Args:
         lcs: an `LCSModel` (its parameters become this layer's), or `LCSParams`, shared or one per batch element.

@@ -76,8 +76,8 @@ def certify(
     """Judge raw trajectories by the optimality conditions themselves, whatever the solver claims.
 
     A CONVERGED element whose residual exceeds `tol` becomes NUMERICAL; one that is not classically differentiable
-    becomes DEGENERATE. Elements that did not converge get finite numbers: their actions clipped into the bounds (zero where not
-    finite) and the trajectory that these cause.
+    becomes DEGENERATE. Elements that did not converge get finite numbers: their actions clipped into the bounds
+    (zero where not finite) and the trajectory that these cause.
     """
     status = status.clone()
     finite = torch.stack([torch.isfinite(v).all(-1).all(-1) for v in primal]).all(0)
