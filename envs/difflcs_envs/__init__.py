@@ -1,0 +1,42 @@
+"""Gymnasium environments for contact-rich manipulation: the TriFinger robot of LCS-RL (Bui & Posa).
+
+Importing this package registers its environments:
+
+    import difflcs_envs
+    env = gymnasium.make("difflcs/TriFingerMoveCube-v0")
+
+or, in one line, `gymnasium.make("difflcs_envs:difflcs/TriFingerMoveCube-v0")`. MuJoCo is imported only when an
+environment is made.
+"""
+
+from __future__ import annotations
+
+from difflcs_envs.errors import MissingDependencyError, PhysicsWarning, RenderingError
+
+__all__ = ["MissingDependencyError", "PhysicsWarning", "RenderingError", "register_envs"]
+
+_ENTRY_POINTS = {
+    "TriFingerMoveCube-v0": "difflcs_envs.trifinger.env:TriFingerMoveCubeEnv",
+}
+
+
+def register_envs() -> None:
+    """Register every environment with Gymnasium under the namespace `difflcs/`. Calling it again changes nothing.
+
+    The episode length is an argument of the environments (`horizon`), which truncate by themselves; therefore no
+    `max_episode_steps` is registered.
+
+    Raises:
+        MissingDependencyError: Gymnasium is not installed.
+    """
+    try:
+        import gymnasium
+    except ImportError as error:
+        raise MissingDependencyError("gymnasium") from error
+    for name, entry_point in _ENTRY_POINTS.items():
+        env_id = f"difflcs/{name}"
+        if env_id not in gymnasium.registry:
+            gymnasium.register(id=env_id, entry_point=entry_point)
+
+
+register_envs()

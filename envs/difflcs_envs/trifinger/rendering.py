@@ -1,0 +1,165 @@
+"""Pictures of a MuJoCo scene, with or without a screen, and the interactive viewer."""
+
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import ctypes.util
+import os
+import sys
+from typing import Any
+
+import numpy as np
+
+from difflcs_envs.errors import RenderingError
+
+__all__ = ["SceneRenderer", "SceneViewer", "has_display", "select_gl_backend"]
+
+_APT_LINE = "apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"
+_APT_LINE_OSMESA = "apt-get install libosmesa6"
+
+
+def has_display() -> bool:
+    """Whether a window can be opened (on Linux: an X or Wayland display is announced)."""
+    if not sys.platform.startswith("linux"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def select_gl_backend() -> str:
+    """Choose how MuJoCo gets OpenGL. Call it before `import mujoco`.
+
+    Sets `MUJOCO_GL` to "egl" or "osmesa" if the user has not set it, there is no display, and the library is installed.
+
+    Returns:
+        The value of `MUJOCO_GL` in lower case; empty for MuJoCo's own choice.
+    """
+    if "MUJOCO_GL" not in os.environ and not has_display():
+        for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
+            if ctypes.util.find_library(library):
+                os.environ["MUJOCO_GL"] = backend
+                break
+    return os.environ.get("MUJOCO_GL", "").lower().strip()
+
+
+def _make_gl_context(width: int, height: int) -> Any:
+    backend = select_gl_backend()
+    try:
+        # MuJoCo binds its own GLContext when it is first imported, perhaps before the backend was chosen.
+        if backend == "egl":
+            from mujoco.egl import GLContext
+        elif backend == "osmesa":
+            from mujoco.osmesa import GLContext
+        else:
+            from mujoco import GLContext  # pyright: ignore[reportAttributeAccessIssue]
+        context = GLContext(width, height)
+        context.make_current()
+    except Exception as error:  # OpenGL raises many types: ImportError, AttributeError, GLError, RuntimeError
+        raise RenderingError(
+            f"No OpenGL context could be made (MUJOCO_GL={backend!r}, display: {has_display()}): {error}. To draw "
+            f"without a screen install EGL with '{_APT_LINE}', or OSMesa with '{_APT_LINE_OSMESA}' and "
+            "MUJOCO_GL=osmesa, and start Python again."
+        ) from error
+    return context
+
+
+class SceneRenderer:
+    """Draws a scene off screen. Without shadows and reflections, which would take ten times as long in software."""
+
+    def __init__(self, model: Any, width: int, height: int) -> None:
+        """Open an OpenGL context.
+
+        Args:
+            model: The MuJoCo model, made for pictures at least this large.
+            width: Width [pixel].
+            height: Height [pixel].
+
+        Raises:
+            RenderingError: No OpenGL on this machine. The message names the packages to install.
+        """
+        self._context = _make_gl_context(width, height)
+        import mujoco
+
+        from difflcs_envs.trifinger.model import HAND_GROUP
+
+        self._mujoco = mujoco
+        self._hand_group = HAND_GROUP
+        self._model = model
+        self._scene = mujoco.MjvScene(model, maxgeom=200)
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            self._scene.flags[flag] = False
+        self._options = mujoco.MjvOption()
+        self._rectangle = mujoco.MjrRect(0, 0, width, height)
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._gpu = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gpu)
+        self._open = True
+
+    def render(self, data: Any, camera: str = "front") -> np.ndarray:
+        """Draw the scene.
+
+        Args:
+            data: The MuJoCo data.
+            camera: "front", or "top", which hides the hand but for its lower links.
+
+        Returns:
+            A new picture, uint8 (height, width, 3).
+        """
+        mujoco = self._mujoco
+        self._context.make_current()
+        mujoco.mj_camlight(self._model, data)
+        self._camera.fixedcamid = self._model.camera(camera).id
+        self._options.geomgroup[self._hand_group] = camera != "top"
+        mujoco.mjv_updateScene(
+            self._model, data, self._options, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
+        )
+        mujoco.mjr_render(self._rectangle, self._scene, self._gpu)
+        pixels = np.empty((self._rectangle.height, self._rectangle.width, 3), dtype=np.uint8)
+        mujoco.mjr_readPixels(pixels, None, self._rectangle, self._gpu)
+        return np.ascontiguousarray(pixels[::-1])  # OpenGL counts rows from below
+
+    def close(self) -> None:
+        """Free the OpenGL context. May be called again."""
+        if self._open:
+            self._open = False
+            self._context.make_current()
+            self._gpu.free()
+            self._context.free()
+
+
+class SceneViewer:
+    """The interactive viewer of MuJoCo, for `render_mode="human"`."""
+
+    def __init__(self, model: Any, data: Any) -> None:
+        """Open the window.
+
+        Args:
+            model: The MuJoCo model.
+            data: The MuJoCo data to follow.
+
+        Raises:
+            RenderingError: The window could not be opened.
+        """
+        try:
+            import mujoco.viewer
+
+            self._viewer = mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
+        except Exception as error:  # window systems fail in many ways
+            raise RenderingError(
+                f"The viewer window could not be opened: {error}. It needs a display (and `mjpython` on macOS); "
+                'use render_mode="rgb_array" without one.'
+            ) from error
+        with self._viewer.lock():
+            self._viewer.cam.lookat[:] = (0.0, 0.0, 0.1)
+            self._viewer.cam.distance, self._viewer.cam.azimuth, self._viewer.cam.elevation = 0.75, 90.0, -35.0
+
+    def render(self) -> None:
+        """Show the current state. Does nothing once the user has closed the window."""
+        if self._viewer.is_running():
+            self._viewer.sync()
+
+    def close(self) -> None:
+        """Close the window. May be called again."""
+        self._viewer.close()

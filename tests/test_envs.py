@@ -1,0 +1,562 @@
+"""The TriFinger environment: Gymnasium's contract, the paper's numbers, physics, controller, bad input, pictures."""
+
+import copy
+import math
+import pickle
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium", reason="the environments need the extra [envs]")
+mujoco = pytest.importorskip("mujoco", reason="the environments need the extra [envs]")
+
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+
+import difflcs_envs  # noqa: E402
+from difflcs_envs.trifinger import kinematics  # noqa: E402
+from difflcs_envs.trifinger.env import TriFingerMoveCubeEnv  # noqa: E402
+from difflcs_envs.trifinger.model import FINGER_YAWS, TIP_HEIGHT  # noqa: E402
+from difflcs_envs.trifinger.rendering import SceneRenderer, has_display, select_gl_backend  # noqa: E402
+
+ENV_ID = "difflcs/TriFingerMoveCube-v0"
+OUTWARD = np.stack([-np.sin(FINGER_YAWS), np.cos(FINGER_YAWS)], axis=1)  # (3, 2)
+REST = np.zeros(6)
+
+
+def make(**arguments):
+    return TriFingerMoveCubeEnv(**{"reset_noise": 0.0, **arguments})
+
+
+def rollout(env, seed, steps=20):
+    rng = np.random.default_rng(seed)
+    observation, _ = env.reset(seed=seed)
+    states, rewards = [observation["state"]], []
+    for _ in range(steps):
+        observation, reward, *_ = env.step(rng.uniform(-0.015, 0.015, 6))
+        states.append(observation["state"])
+        rewards.append(reward)
+    return np.array(states), np.array(rewards)
+
+
+@pytest.fixture(scope="module")
+def gl():
+    """Skip where no OpenGL context can be made, and say why."""
+    env = make()
+    try:
+        SceneRenderer(env.physics.model, 32, 24).close()
+    except difflcs_envs.RenderingError as error:
+        pytest.skip(str(error))
+
+
+# --- Gymnasium's contract -------------------------------------------------------------------------
+
+
+def test_make_finds_it_without_import():
+    code = (
+        f"import gymnasium as g; env = g.make('difflcs_envs:{ENV_ID}'); assert env.spec.id == '{ENV_ID}'; env.reset()"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
+
+
+def test_import_does_not_load_mujoco():
+    code = "import sys, difflcs_envs; assert 'mujoco' not in sys.modules and 'difflcs' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_registering_again_is_harmless():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        difflcs_envs.register_envs()
+        difflcs_envs.register_envs()
+    assert ENV_ID in gymnasium.registry
+
+
+def test_missing_mujoco_names_the_install_line():
+    code = (
+        "import sys; sys.modules['mujoco'] = None\n"
+        "import difflcs_envs\n"
+        "try:\n    import difflcs_envs.trifinger.env\n"
+        "except difflcs_envs.MissingDependencyError as error:\n"
+        "    assert 'pip install \"difflcs[envs]\"' in str(error)\n"
+        "else:\n    raise SystemExit('no error')"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_check_env():
+    env = gymnasium.make(ENV_ID)
+    check_env(env.unwrapped, skip_render_check=True)
+    env.close()
+
+
+@pytest.mark.usefixtures("gl")
+@pytest.mark.skipif(has_display(), reason="would open a window for the mode 'human'")
+def test_check_env_with_rendering():
+    env = gymnasium.make(ENV_ID, render_mode="rgb_array")
+    check_env(env.unwrapped)
+    env.close()
+    env.close()
+
+
+def test_spaces_and_timing():
+    env = make()
+    assert env.action_space == gymnasium.spaces.Box(-0.015, 0.015, (6,), dtype=np.float64)
+    assert env.observation_space["state"].shape == (9,)
+    assert env.observation_space["goal"] == gymnasium.spaces.Box(
+        -np.array([0.06, 0.06, 0.5]), np.array([0.06, 0.06, 0.5]), dtype=np.float64
+    )
+    assert env.metadata["render_fps"] == 10
+    env.reset(seed=0)
+    env.step(REST)
+    assert env.physics.data.time == pytest.approx(0.1)
+    assert env.physics.model.opt.timestep == 0.002
+
+
+def test_truncates_after_20_steps_and_never_terminates():
+    env = make()
+    env.reset(seed=0)
+    flags = [env.step(REST)[2:4] for _ in range(20)]
+    assert [terminated for terminated, _ in flags] == [False] * 20
+    assert [truncated for _, truncated in flags] == [False] * 19 + [True]
+    with pytest.raises(gymnasium.error.ResetNeeded, match="reset"):
+        env.step(REST)
+
+
+def test_horizon_is_an_argument_of_make():
+    env = gymnasium.make(ENV_ID, horizon=25)
+    env.reset(seed=0)
+    assert [env.step(REST)[3] for _ in range(25)] == [False] * 24 + [True]
+
+
+# --- reward and success ---------------------------------------------------------------------------
+
+
+def test_reward_is_the_sum_of_its_terms_and_minus_the_path_cost():
+    env = make(reset_noise=0.1)
+    rng = np.random.default_rng(1)
+    observation, info = env.reset(seed=1)
+    goal = observation["goal"]
+    for step in range(20):
+        x, action = observation["state"], rng.uniform(-0.02, 0.02, 6)
+        observation, reward, _, truncated, info = env.step(action)
+        terms = {name: value for name, value in info.items() if name.startswith("reward_")}
+        assert set(terms) == {"reward_tips", "reward_position", "reward_yaw", "reward_action", "reward_completion"}
+        assert reward == pytest.approx(sum(terms.values()), abs=1e-12)
+        u = np.clip(action, -0.015, 0.015)
+        cost = (
+            10 * np.sum((x[3:].reshape(3, 2) - x[:2]) ** 2)
+            + 200 * np.sum((x[:2] - goal[:2]) ** 2)
+            + 0.3 * (x[2] - goal[2]) ** 2
+            + 200 * np.sum(u**2)
+        )
+        assert reward - info["reward_completion"] == pytest.approx(-cost, abs=1e-12)
+        y = observation["state"]
+        assert info["position_error"] == pytest.approx(np.linalg.norm(y[:2] - goal[:2]))
+        assert info["yaw_error"] == pytest.approx(abs(y[2] - goal[2]))
+        assert info["success"] == (info["position_error"] <= 0.02 and info["yaw_error"] <= 0.2)
+        assert truncated == (step == 19)
+        assert (info["reward_completion"] == -10.0) == (truncated and not info["success"])
+
+
+@pytest.mark.parametrize(
+    ("goal", "success"),
+    [([0.019, 0, 0.19], True), ([0.021, 0, 0], False), ([0, 0, 0.21], False), ([0.015, 0.015, 0], False)],
+)
+def test_success_tolerances_and_sparse_penalty(goal, success):
+    env = make(sparse_penalty=7.0)
+    _, info = env.reset(seed=0, options={"goal": goal})
+    assert info["success"] is success
+    for _ in range(20):
+        info = env.step(REST)[4]
+    assert info["success"] is success
+    assert info["reward_completion"] == (0.0 if success else -7.0)
+    assert make(position_tolerance=0.03, yaw_tolerance=0.3).reset(options={"goal": goal})[1]["success"]
+
+
+# --- start ----------------------------------------------------------------------------------------
+
+
+def test_home_posture():
+    env = make()
+    observation, _ = env.reset(seed=0)
+    state = observation["state"]
+    np.testing.assert_allclose(state[:3], 0.0, atol=1e-12)
+    np.testing.assert_allclose(state[3:].reshape(3, 2), 0.0977 * OUTWARD, atol=2e-4)
+    np.testing.assert_allclose(env.physics.data.qpos[7:].reshape(3, 3), [[0, -0.806, -1.175]] * 3, atol=2e-3)
+    np.testing.assert_array_equal(env.physics.data.qvel, 0.0)
+    np.testing.assert_allclose(env.physics.data.site_xpos[:, 2], TIP_HEIGHT, atol=1e-12)
+
+
+def test_goals_fill_the_task_space():
+    env = make()
+    goals = np.array([env.reset(seed=seed)[0]["goal"] for seed in range(300)])
+    high = np.array([0.06, 0.06, 0.5])
+    assert np.all(np.abs(goals) <= high)
+    assert np.all(goals.max(axis=0) > 0.95 * high)
+    assert np.all(goals.min(axis=0) < -0.95 * high)
+
+
+def test_reset_noise_scales_the_start():
+    for noise in (0.05, 0.2):
+        env = make(reset_noise=noise)
+        states = np.array([env.reset(seed=seed)[0]["state"] for seed in range(200)])
+        assert np.all(np.abs(states[:, :3]) <= noise * np.array([0.1, 0.1, 0.5]))
+        assert np.all(np.abs(states[:, :3]).max(axis=0) > 0.9 * noise * np.array([0.1, 0.1, 0.5]))
+        assert env.physics.max_penetration() < 1e-3
+
+
+def test_given_state_and_goal_come_back():
+    env = make(reset_noise=0.05)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        tips = (0.11 + rng.uniform(-0.01, 0.03, (3, 1))) * OUTWARD + rng.uniform(-0.02, 0.02, (3, 2))
+        state = np.concatenate([rng.uniform(-0.02, 0.02, 2), rng.uniform(-np.pi, np.pi, 1), tips.ravel()])
+        goal = rng.uniform(-0.06, 0.06, 3)
+        observation, _ = env.reset(options={"state": state, "goal": goal})
+        np.testing.assert_allclose(observation["state"], state, atol=1e-6)
+        np.testing.assert_array_equal(observation["goal"], goal)
+        np.testing.assert_array_equal(env.physics.data.qvel, 0.0)
+
+
+@pytest.mark.parametrize("yaw", [np.pi, -np.pi, np.float32(np.pi)])
+def test_half_turn_start_comes_back_with_its_sign(yaw):
+    env = make()
+    state = np.concatenate([[0.0, 0.0, yaw], (0.1 * OUTWARD).ravel()])
+    assert env.reset(options={"state": state})[0]["state"][2] == pytest.approx(yaw, abs=1e-6)
+
+
+def test_states_of_an_episode_are_good_starts():
+    env = make(reset_noise=0.05)
+    states, _ = rollout(env, seed=3)
+    for state in states:
+        np.testing.assert_allclose(env.reset(options={"state": state})[0]["state"], state, atol=1e-6)
+
+
+def test_given_goal_leaves_later_episodes_alone():
+    one, other = make(reset_noise=0.05), make(reset_noise=0.05)
+    one.reset(seed=5, options={"goal": [0, 0, 0]})
+    other.reset(seed=5)
+    np.testing.assert_array_equal(one.reset()[0]["goal"], other.reset()[0]["goal"])
+
+
+# --- determinism and copies -----------------------------------------------------------------------
+
+
+def test_same_seed_same_episode():
+    one, other = make(reset_noise=0.05), make(reset_noise=0.05)
+    rollout(other, seed=9)  # another history must not matter
+    for a, b in zip(rollout(one, seed=4), rollout(other, seed=4), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_same_seed_same_start_in_another_process():
+    code = "import gymnasium; print(gymnasium.make('difflcs_envs:{}').reset(seed=11)[0]['state'].tobytes().hex())"
+    output = subprocess.run(
+        [sys.executable, "-c", code.format(ENV_ID)], check=True, capture_output=True, text=True
+    ).stdout
+    assert output.strip() == TriFingerMoveCubeEnv().reset(seed=11)[0]["state"].tobytes().hex()
+
+
+@pytest.mark.parametrize(
+    "clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deepcopy", "pickle"]
+)
+def test_copies_continue_the_episode(clone):
+    env = make(osc_kp=2500.0, reset_noise=0.05)
+    rng = np.random.default_rng(0)
+    env.reset(seed=2)
+    for _ in range(7):
+        env.step(rng.uniform(-0.015, 0.015, 6))
+    twin = clone(env)
+    for _ in range(13):
+        action = rng.uniform(-0.015, 0.015, 6)
+        a, b = env.step(action), twin.step(action)
+        np.testing.assert_array_equal(a[0]["state"], b[0]["state"])
+        assert a[1:4] == b[1:4]
+    np.testing.assert_array_equal(env.reset()[0]["goal"], twin.reset()[0]["goal"])
+
+
+# --- physics --------------------------------------------------------------------------------------
+
+
+def test_rest_is_rest():
+    env = make(reset_noise=0.05)
+    start = env.reset(seed=0)[0]["state"]
+    for _ in range(10):
+        state = env.step(REST)[0]["state"]
+    np.testing.assert_allclose(state, start, atol=1e-4)
+    assert env.physics.max_penetration() < 1e-3
+    assert env.physics.data.qpos[2] == pytest.approx(0.03, abs=1e-4)
+
+
+def test_pushing_moves_the_cube():
+    env = make()
+    env.reset(seed=0)
+    push = np.concatenate([-0.012 * OUTWARD[0], np.zeros(4)])  # finger 0 pushes towards -y
+    for _ in range(12):
+        state = env.step(push)[0]["state"]
+    assert state[1] < -0.03
+    assert abs(state[0]) < 0.01
+
+
+def test_yaw_is_continuous_through_half_a_turn():
+    env = make()
+    start = np.concatenate([[0.0, 0.0, np.pi - 0.01], (0.0977 * OUTWARD).ravel()])
+    env.reset(options={"state": start})
+    env._state[2] = 3 * np.pi - 0.01  # as if the cube had made one more turn
+    assert env.step(REST)[0]["state"][2] == pytest.approx(3 * np.pi - 0.01, abs=1e-4)
+    info = env.reset(options={"state": start, "goal": [0, 0, 0.5]})[1]
+    assert info["yaw_error"] == pytest.approx(np.pi - 0.51, abs=1e-6)
+
+
+def test_mass_and_friction_reach_the_model():
+    model = make(object_mass=0.05, object_friction=0.7).physics.model
+    assert model.body("object").mass[0] == pytest.approx(0.05)
+    assert model.geom("object").friction[0] == model.geom("table").friction[0] == 0.7
+
+
+@pytest.mark.parametrize(
+    ("field", "index", "value"),
+    [
+        ("ctrl", 0, np.nan),
+        ("qvel", 3, np.nan),
+        ("qvel", 8, 1e12),
+        ("qpos", 0, 2.0),
+        ("qpos", 8, np.inf),
+    ],
+)
+def test_unstable_simulation_ends_the_episode_at_the_last_finite_state(field, index, value, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes MUJOCO_LOG.TXT
+    env = make()
+    env.reset(seed=0)
+    before = env.step(np.full(6, 0.01))[0]["state"]
+    apply = env.physics.controller.apply
+
+    def sabotage():
+        apply()
+        getattr(env.physics.data, field)[index] = value
+
+    monkeypatch.setattr(env.physics.controller, "apply", sabotage)
+    with pytest.warns(difflcs_envs.PhysicsWarning, match="unstable"):
+        observation, reward, terminated, truncated, info = env.step(REST)
+    assert info["physics_error"]
+    assert truncated
+    assert not terminated
+    assert math.isfinite(reward)
+    np.testing.assert_array_equal(observation["state"], before)
+    monkeypatch.undo()
+    env.reset(seed=0)
+    assert env.step(REST)[4]["physics_error"] is False
+
+
+def test_random_extreme_actions_stay_finite_and_in_the_observation_space():
+    env = make(horizon=1000)
+    rng = np.random.default_rng(0)
+    env.reset(seed=0)
+    for step in range(150):
+        if step % 10 == 0:
+            action = rng.choice([-0.015, 0.015], 6)
+        observation, reward, _, _, info = env.step(action)
+        assert observation in env.observation_space
+        assert math.isfinite(reward)
+        assert not info["physics_error"]
+
+
+# --- controller -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("kp", "part"), [(1000.0, 0.83), (2500.0, 0.96)])
+def test_part_of_a_command_reached_in_one_step(kp, part):
+    env = make(osc_kp=kp)
+    start = env.reset(seed=0)[0]["state"][3:]
+    command = np.tile([0.0, 0.015], 3)
+    moved = env.step(command)[0]["state"][3:] - start
+    np.testing.assert_allclose(moved, part * command, atol=0.02 * 0.015)
+
+
+def reference_torques(physics, target):
+    """The control law by MuJoCo's own Jacobians, the full mass matrix and a linear solver."""
+    model, data, kp = physics.model, physics.data, physics.controller.kp
+    mass = np.zeros((model.nv, model.nv))
+    for column, unit in zip(mass, np.eye(model.nv), strict=True):  # mj_fullM has another signature in MuJoCo 3
+        mujoco.mj_mulM(model, data, column, unit)
+    torques = []
+    for finger in range(3):
+        site = model.site(f"tip_{finger}").id
+        jacobian = np.zeros((3, model.nv))
+        mujoco.mj_jacSite(model, data, jacobian, None, site)
+        dofs = slice(6 + 3 * finger, 9 + 3 * finger)
+        block = jacobian[:, dofs]
+        velocity = block @ data.qvel[dofs]
+        acceleration = kp * (target[finger] - data.site_xpos[site]) - 2 * np.sqrt(kp) * velocity
+        torques.append(mass[dofs, dofs] @ np.linalg.solve(block, acceleration) + data.qfrc_bias[dofs])
+    return np.concatenate(torques)
+
+
+def test_controller_against_a_slow_reference():
+    env = make()
+    env.reset(seed=0)
+    physics = env.physics
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        physics.data.qpos[7:] = np.tile([0.0, -0.9, -1.3], 3) + rng.uniform(-0.5, 0.5, 9)
+        physics.data.qvel[6:] = rng.normal(size=9)
+        mujoco.mj_forward(physics.model, physics.data)
+        target = physics.data.site_xpos + rng.uniform(-0.02, 0.02, (3, 3))
+        physics.controller.target = target.ravel().tolist()
+        physics.controller.apply()
+        np.testing.assert_allclose(physics.data.ctrl, reference_torques(physics, target), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("posture", [[0, 0, 0], [0, -0.8, 0], [0, -0.8, -1e-3], [np.pi / 2, 0, 0], [0.3, -1.2, 0]])
+def test_controller_is_finite_in_singular_postures(posture):
+    physics = make().physics
+    physics.data.qpos[7:] = np.tile(posture, 3)
+    mujoco.mj_forward(physics.model, physics.data)
+    physics.controller.target = (physics.data.site_xpos + 0.015).ravel().tolist()
+    physics.controller.apply()
+    assert np.all(np.abs(physics.data.ctrl) < 100)
+
+
+def test_kinematics_agree_with_mujoco():
+    physics = make().physics
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        joints = np.array([0.0, -0.9, -1.3]) + rng.uniform(-0.4, 0.4, (3, 3))
+        physics.data.qpos[7:] = joints.ravel()
+        mujoco.mj_kinematics(physics.model, physics.data)
+        tips = kinematics.tip_positions(joints)
+        np.testing.assert_allclose(tips, physics.data.site_xpos, atol=1e-12)
+        np.testing.assert_allclose(kinematics.joint_angles(tips), joints, atol=1e-9)
+
+
+# --- input ----------------------------------------------------------------------------------------
+
+
+def test_action_is_clipped_and_reported():
+    one, other = make(), make()
+    one.reset(seed=0)
+    other.reset(seed=0)
+    wild = np.array([1.0, -1.0, 0.0, 0.01, -0.02, 0.015])
+    a, b = one.step(wild), other.step(np.clip(wild, -0.015, 0.015))
+    np.testing.assert_array_equal(a[0]["state"], b[0]["state"])
+    assert a[1] == b[1]
+    assert a[4]["clipped"] is True
+    assert b[4]["clipped"] is False
+    np.testing.assert_array_equal(a[4]["executed_action"], np.clip(wild, -0.015, 0.015))
+
+
+@pytest.mark.parametrize(
+    "action",
+    [np.zeros(5), np.zeros((1, 6)), 0.0, np.full(6, np.nan), np.full(6, np.inf), "push", [0, 0, None, 0, 0, 0]],
+)
+def test_bad_action(action):
+    env = make()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"Expected action = .*got"):
+        env.step(action)
+    env.step(REST)  # the episode goes on
+
+
+def home_state(**changes):
+    state = np.concatenate([np.zeros(3), (0.0977 * OUTWARD).ravel()])
+    for index, value in changes.items():
+        state[int(index[1:])] = value
+    return state
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"goal": [0.061, 0, 0]}, r"task space"),
+        ({"goal": [0, 0, -0.51]}, r"task space"),
+        ({"goal": [0, 0]}, r"shape \(3,\), got shape \(2,\)"),
+        ({"goal": [0, np.nan, 0]}, r"finite"),
+        ({"state": np.zeros(8)}, r"shape \(9,\), got shape \(8,\)"),
+        ({"state": home_state(_4=0.3)}, r"Fingertip 0 cannot reach"),
+        ({"state": home_state(_5=0.02, _6=0.0)}, r"overlap"),
+        ({"state": home_state(_2=4.0)}, r"\[-pi, pi\]"),
+        ({"state": home_state(_0=0.8)}, r"cannot stand"),
+        ({"gaol": [0, 0, 0]}, r"got also \['gaol'\]"),
+    ],
+)
+def test_bad_options(options, message):
+    with pytest.raises(ValueError, match=message):
+        make().reset(seed=0, options=options)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"render_mode": "ascii"},
+        {"osc_kp": 0.0},
+        {"osc_kp": math.inf},
+        {"position_tolerance": -0.01},
+        {"yaw_tolerance": math.nan},
+        {"horizon": 0},
+        {"horizon": 2.5},
+        {"object_mass": 0.0},
+        {"object_friction": -0.1},
+        {"reset_noise": 0.3},
+        {"sparse_penalty": "ten"},
+        {"width": 0},
+    ],
+)
+def test_bad_arguments(arguments):
+    with pytest.raises(ValueError, match=r"Expected .*, got .*\. Choose"):
+        make(**arguments)
+
+
+def test_step_needs_reset():
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        make().step(REST)
+
+
+# --- pictures -------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("gl")
+def test_picture_shows_cube_and_goal():
+    env = make(render_mode="rgb_array", width=160, height=120)
+    env.reset(seed=0, options={"goal": [0.05, 0.05, 0.4]})
+    picture = env.render()
+    assert picture.shape == (120, 160, 3)
+    assert picture.dtype == np.uint8
+    red, green, blue = picture.astype(int).transpose(2, 0, 1)
+    assert np.sum((red > 180) & (green > 120) & (blue < 100)) > 50  # the yellow cube
+    env.reset(seed=0, options={"goal": [-0.05, 0.05, 0.4]})
+    other = env.render()
+    assert np.abs(other.astype(int) - picture).max() > 50  # the goal moved
+    np.testing.assert_array_equal(env.render(), other)
+    env.close()
+    env.close()
+
+
+def test_render_without_mode_warns():
+    env = make()
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="render mode"):
+        assert env.render() is None
+
+
+@pytest.mark.skipif(has_display(), reason="this machine has a display")
+def test_human_mode_without_display_is_refused():
+    assert "human" not in TriFingerMoveCubeEnv.metadata["render_modes"]
+    with pytest.raises(difflcs_envs.RenderingError, match="rgb_array"):
+        make(render_mode="human")
+
+
+def test_user_choice_of_opengl_is_kept(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    assert select_gl_backend() == "osmesa"
+
+
+def test_broken_opengl_names_the_packages(monkeypatch):
+    env = make(render_mode="rgb_array")
+    env.reset(seed=0)
+    monkeypatch.setitem(sys.modules, "mujoco.egl", None)
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    with pytest.raises(difflcs_envs.RenderingError, match="apt-get install libegl1"):
+        env.render()
