@@ -7,23 +7,35 @@
 #include "kernels.hpp"
 
 namespace difflcs {
-namespace baseline { extern const Kernels table; }
-#ifdef DIFFLCS_HAS_avx2
-namespace avx2 { extern const Kernels table; }
+#define DIFFLCS_KERNELS(ISA, LANES)                                                                          \
+  namespace ISA {                                                                                            \
+  int64_t lcp_workspace(int64_t);                                                                            \
+  void lcp_exact(const LcpBatch&, int64_t, int64_t, void*);                                                  \
+  void lcp_relaxed(const LcpBatch&, int64_t, int64_t, void*);                                                \
+  int64_t mpc_workspace(const MpcBatch&);                                                                    \
+  void mpc_solve(const MpcBatch&, const MpcSolve&, int64_t*, void*);                                         \
+  void mpc_vjp(const MpcBatch&, const MpcGradient&, int64_t, int64_t, int64_t, void*);                       \
+  static const Kernels table = {#ISA,        LANES,         lcp_workspace, lcp_exact,                        \
+                                lcp_relaxed, mpc_workspace, mpc_solve,     mpc_vjp};                         \
+  }
+
+DIFFLCS_KERNELS(baseline, DIFFLCS_LANES_baseline)
+#ifdef DIFFLCS_LANES_avx2
+DIFFLCS_KERNELS(avx2, DIFFLCS_LANES_avx2)
 #endif
-#ifdef DIFFLCS_HAS_avx512
-namespace avx512 { extern const Kernels table; }
+#ifdef DIFFLCS_LANES_avx512
+DIFFLCS_KERNELS(avx512, DIFFLCS_LANES_avx512)
 #endif
 
 static const Kernels& choose() {
   const char* wanted = std::getenv("DIFFLCS_ISA");
   auto accept = [&](const Kernels& k) { return !wanted || !*wanted || std::strcmp(wanted, k.isa) == 0; };
-#ifdef DIFFLCS_HAS_avx512
+#ifdef DIFFLCS_LANES_avx512
   if (accept(avx512::table) && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
       __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("fma"))
     return avx512::table;
 #endif
-#ifdef DIFFLCS_HAS_avx2
+#ifdef DIFFLCS_LANES_avx2
   if (accept(avx2::table) && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) return avx2::table;
 #endif
   if (accept(baseline::table)) return baseline::table;

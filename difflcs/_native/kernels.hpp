@@ -6,7 +6,7 @@
 
 namespace difflcs {
 
-// Values are those of difflcs.mpc.solution.Status.
+// Values are those of difflcs.Status.
 enum class Status : int8_t { converged = 0, max_iter = 1, infeasible = 2, numerical = 3, degenerate = 4 };
 
 // A batch of linear complementarity problems 0 <= lam, w = F lam + q >= 0, lam_i w_i = relaxation.
@@ -23,6 +23,42 @@ struct LcpBatch {
   int32_t* iterations; // out (batch,)
 };
 
+// Inputs of an MPC problem, in the order of difflcs.mpc.problem.INPUTS.
+enum Input { kA, kB, kC, kd, kD, kE, kF, kc, kQ, kR, kQfinal, kq, kr, kqfinal, kumin, kumax, kx0, kInputs };
+
+// A batch of LCS-MPC problems (see difflcs.mpc.MPCProblem). All arrays are row-major with the batch in front.
+struct MpcBatch {
+  int64_t count, n_x, n_u, n_lam, horizon;
+  const double* input[kInputs];
+  int64_t stride[kInputs];  // distance from one element to the next; 0 when the batch shares the input
+  double relaxation;
+};
+
+// What the solver needs besides the problem, and where its results go.
+struct MpcSolve {
+  const double* u_start;    // (count, H, n_u), or null for zero
+  const double* lam_start;  // (count, H, n_lam), or null for sqrt(first_relaxation)
+  double first_relaxation;  // where the homotopy starts
+  double shrink;            // its factor per stage
+  double tol;               // on the projected gradient
+  int64_t max_iter;
+  double *x, *u, *lam, *objective, *residual;  // out; residual as difflcs.mpc.kkt.residual
+  int8_t* status;
+  int32_t* iterations;
+};
+
+// Upstream gradients of the outputs, and where the gradients of the inputs go.
+struct MpcGradient {
+  const double *x, *u, *lam;              // the solution
+  const double *x_bar, *u_bar, *lam_bar;  // upstream
+  const double* objective_bar;
+  const int8_t* solved;                   // elements that are not contribute exactly zero
+  double* per_element[kInputs];           // (count, ...) where the input is per element, else null
+  double* partial;                        // (blocks, shared_size): sums over each block of the shared inputs
+  int64_t shared_size;
+  int64_t offset[kInputs];                // position of each shared input inside a partial sum
+};
+
 struct Kernels {
   const char* isa;
   int lanes;  // problems solved side by side
@@ -30,6 +66,12 @@ struct Kernels {
   // Solve problems [begin, end); both read and write only those.
   void (*lcp_exact)(const LcpBatch& batch, int64_t begin, int64_t end, void* workspace);
   void (*lcp_relaxed)(const LcpBatch& batch, int64_t begin, int64_t end, void* workspace);
+  int64_t (*mpc_workspace)(const MpcBatch& batch);
+  // Take problems from the shared counter `next` until none is left.
+  void (*mpc_solve)(const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void* workspace);
+  // Gradients of elements [begin, end), which are block number `block`.
+  void (*mpc_vjp)(const MpcBatch& batch, const MpcGradient& gradient, int64_t begin, int64_t end, int64_t block,
+                  void* workspace);
 };
 
 // The best kernels this CPU runs, or those that the environment variable DIFFLCS_ISA names.

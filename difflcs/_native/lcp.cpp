@@ -2,6 +2,7 @@
 // reads like the solver of a single problem, and a lane's result never depends on its neighbours.
 #include "kernels.hpp"
 #include "lanes.hpp"
+#include "lu.hpp"
 
 namespace difflcs::DIFFLCS_ISA {
 namespace {
@@ -17,30 +18,11 @@ struct LcpWorkspace {
   }
 };
 
+}  // namespace
+
 int64_t lcp_workspace(int64_t n) { return static_cast<int64_t>(sizeof(Vec)) * (2 * n * n + 7 * n); }
 
-// LU without pivoting, in place. The matrices met here have positive principal minors, so the factors exist; the
-// callers refine the solution once or check its residual. The reciprocal pivots are stored on the diagonal.
-void lu_factor(int64_t n, Vec* M) {
-  for (int64_t k = 0; k < n; k++) {
-    const Vec inverse = 1.0 / M[k * n + k];
-    M[k * n + k] = inverse;
-    for (int64_t i = k + 1; i < n; i++) {
-      const Vec l = M[i * n + k] * inverse;
-      M[i * n + k] = l;
-      for (int64_t j = k + 1; j < n; j++) M[i * n + j] -= l * M[k * n + j];
-    }
-  }
-}
-
-void lu_solve(int64_t n, const Vec* M, Vec* b) {
-  for (int64_t i = 1; i < n; i++)
-    for (int64_t j = 0; j < i; j++) b[i] -= M[i * n + j] * b[j];
-  for (int64_t i = n - 1; i >= 0; i--) {
-    for (int64_t j = i + 1; j < n; j++) b[i] -= M[i * n + j] * b[j];
-    b[i] *= M[i * n + i];
-  }
-}
+namespace {
 
 // Read kLanes problems and scale them: F' = S F S with unit diagonal and q' = S q / max|S q|, so that tolerances are
 // relative whatever the units. lam = size * S lam', w = size * S^-1 w'. Lanes past `end` repeat the last problem.
@@ -89,6 +71,8 @@ void slack(int64_t n, const LcpWorkspace& ws) {
     ws.bound[i] = b;
   }
 }
+
+}  // namespace
 
 // Exact LCP by block principal pivoting (Kostreva; Judice & Pires): guess the set of positive lam, solve for them,
 // exchange every index whose lam or w came out negative. If ten exchanges do not lower the number of such indices,
@@ -237,13 +221,5 @@ void lcp_relaxed(const LcpBatch& batch, int64_t begin, int64_t end, void* memory
     store(batch, first, end, ws, size, solved, iterations);
   }
 }
-
-}  // namespace
-
-extern const Kernels table;
-const Kernels table = {
-#define DIFFLCS_STRING_(x) #x
-#define DIFFLCS_STRING(x) DIFFLCS_STRING_(x)
-    DIFFLCS_STRING(DIFFLCS_ISA), kLanes, lcp_workspace, lcp_exact, lcp_relaxed};
 
 }  // namespace difflcs::DIFFLCS_ISA

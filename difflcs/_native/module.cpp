@@ -1,6 +1,8 @@
 // Python bindings (nanobind). Arrays are checked here once more and the work is spread over threads, GIL released.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/vector.h>
 
 #include <algorithm>
 #include <atomic>
@@ -8,7 +10,9 @@
 #include <cstdlib>
 #include <memory>
 #include <new>
+#include <optional>
 #include <stdexcept>
+#include <string>
 #include <thread>
 #include <vector>
 
@@ -25,6 +29,22 @@ template <class T> using Output = nb::ndarray<T, nb::device::cpu, nb::c_contig>;
 struct AlignedDelete {
   void operator()(void* p) const { ::operator delete(p, std::align_val_t{64}); }
 };
+
+struct AlignedBuffer {
+  std::unique_ptr<void, AlignedDelete> data;
+  explicit AlignedBuffer(int64_t bytes) : data(::operator new(bytes, std::align_val_t{64})) {}
+};
+
+// Runs work(workspace) on `threads` threads; an exception in any of them is rethrown.
+template <class Work>
+void on_threads(int64_t threads, int64_t workspace_bytes, Work work) {
+  std::vector<AlignedBuffer> workspaces;
+  for (int64_t t = 0; t < threads; t++) workspaces.emplace_back(workspace_bytes);
+  std::vector<std::thread> pool;
+  for (int64_t t = 1; t < threads; t++) pool.emplace_back([&work, &workspaces, t] { work(workspaces[t].data.get()); });
+  work(workspaces[0].data.get());
+  for (auto& t : pool) t.join();
+}
 
 // Exact LCP of one problem by Murty's least-index method with a pivoted LU: slow, but finite for every P-matrix and
 // indifferent to degeneracy and to growth in an unpivoted LU. Used only where the batched kernel gave up.
@@ -82,18 +102,10 @@ void solve(const difflcs::LcpBatch& batch, int64_t count, int threads) {
   // Blocks small enough to balance the load; where a block begins does not change any result.
   const int64_t block = 16 * kernels.lanes;
   std::atomic<int64_t> next{0};
-  std::atomic<bool> out_of_memory{false};
-  auto work = [&] {
-    std::unique_ptr<void, AlignedDelete> workspace(
-        ::operator new(kernels.lcp_workspace(batch.n), std::align_val_t{64}, std::nothrow));
-    if (!workspace) return out_of_memory.store(true);
-    for (int64_t b; (b = next.fetch_add(block)) < count;) run(batch, b, std::min(b + block, count), workspace.get());
-  };
-  std::vector<std::thread> pool;
-  for (int64_t t = 1; t < std::min<int64_t>(threads, (count + block - 1) / block); t++) pool.emplace_back(work);
-  work();
-  for (auto& t : pool) t.join();
-  if (out_of_memory) throw std::bad_alloc();
+  const int64_t used = std::max<int64_t>(1, std::min<int64_t>(threads, (count + block - 1) / block));
+  on_threads(used, kernels.lcp_workspace(batch.n), [&](void* workspace) {
+    for (int64_t b; (b = next.fetch_add(block)) < count;) run(batch, b, std::min(b + block, count), workspace);
+  });
   if (batch.relaxation > 0) return;
   for (int64_t e = 0; e < count; e++) {
     if (batch.status[e] == static_cast<int8_t>(difflcs::Status::converged)) continue;
@@ -123,11 +135,118 @@ void solve_lcp(Array F, Array q, double relaxation, int64_t max_iter, int thread
   solve(batch, count, threads);
 }
 
+// ---- MPC ----
+
+using Inputs = std::vector<Array>;
+
+difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxation) {
+  using namespace difflcs;
+  if (inputs.size() != kInputs) throw std::invalid_argument("expected 17 inputs");
+  for (const Array& a : inputs)
+    if (a.ndim() < 1) throw std::invalid_argument("inputs must be vectors or matrices");
+  const Array& x0 = inputs[kx0];
+  auto last = [&](Input which) { return int64_t(inputs[which].shape(inputs[which].ndim() - 1)); };
+  MpcBatch b{};
+  b.count = int64_t(x0.shape(0)), b.n_x = last(kA), b.n_u = last(kB), b.n_lam = last(kF);
+  b.horizon = horizon, b.relaxation = relaxation;
+  const int64_t x = b.n_x, u = b.n_u, m = b.n_lam;
+  const int64_t shape[kInputs][2] = {{x, x}, {x, u}, {x, m}, {x, 0}, {m, x}, {m, u}, {m, m}, {m, 0}, {x, x},
+                                     {u, u}, {x, x}, {x, 0}, {u, 0}, {x, 0}, {u, 0}, {u, 0}, {x, 0}};
+  for (int i = 0; i < kInputs; i++) {
+    const Array& a = inputs[i];
+    const int64_t rank = shape[i][1] ? 2 : 1, size = shape[i][0] * (shape[i][1] ? shape[i][1] : 1);
+    const bool shared = int64_t(a.ndim()) == rank;
+    if (int64_t(a.size()) != (shared ? size : size * b.count) || (!shared && int64_t(a.ndim()) != rank + 1) ||
+        (i == kx0 && shared))
+      throw std::invalid_argument("inputs have inconsistent shapes");
+    b.input[i] = a.data();
+    b.stride[i] = shared ? 0 : size;
+  }
+  if (x < 1 || u < 1 || m < 1 || horizon < 1 || !(relaxation > 0))
+    throw std::invalid_argument("sizes, horizon and relaxation must be positive");
+  return b;
+}
+
+void check_size(const char* name, int64_t got, int64_t expected) {
+  if (got != expected) throw std::invalid_argument(std::string(name) + " has the wrong size");
+}
+
+void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, std::optional<Array> u_start,
+               std::optional<Array> lam_start, double first_relaxation, double shrink, double tol, int64_t max_iter,
+               int threads, Output<double> x, Output<double> u, Output<double> lam, Output<double> objective,
+               Output<double> residual, Output<int8_t> status, Output<int32_t> iterations) {
+  const difflcs::MpcBatch b = mpc_batch(inputs, horizon, relaxation);
+  const int64_t states = b.count * (horizon + 1) * b.n_x, actions = b.count * horizon * b.n_u;
+  const int64_t forces = b.count * horizon * b.n_lam;
+  check_size("x", x.size(), states), check_size("u", u.size(), actions), check_size("lam", lam.size(), forces);
+  check_size("objective", objective.size(), b.count), check_size("residual", residual.size(), b.count);
+  check_size("status", status.size(), b.count), check_size("iterations", iterations.size(), b.count);
+  if (u_start) check_size("u_start", u_start->size(), actions);
+  if (lam_start) check_size("lam_start", lam_start->size(), forces);
+  if (!(first_relaxation >= relaxation && shrink > 0 && shrink < 1))
+    throw std::invalid_argument("the homotopy must fall from first_relaxation to relaxation");
+  const difflcs::MpcSolve o{u_start ? u_start->data() : nullptr, lam_start ? lam_start->data() : nullptr,
+                            first_relaxation, shrink, tol, max_iter, x.data(), u.data(), lam.data(),
+                            objective.data(), residual.data(), status.data(), iterations.data()};
+  if (b.count == 0) return;
+  nb::gil_scoped_release release;
+  const auto& kernels = difflcs::kernels();
+  int64_t next = 0;
+  const int64_t used = std::max<int64_t>(1, std::min<int64_t>(threads, b.count / kernels.lanes));
+  on_threads(used, kernels.mpc_workspace(b), [&](void* workspace) { kernels.mpc_solve(b, o, &next, workspace); });
+}
+
+void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, Array x, Array u, Array lam, Array x_bar, Array u_bar,
+             Array lam_bar, Array objective_bar, nb::ndarray<const int8_t, nb::device::cpu, nb::c_contig> solved,
+             int threads, std::vector<Output<double>> gradients) {
+  using namespace difflcs;
+  const MpcBatch b = mpc_batch(inputs, horizon, relaxation);
+  const int64_t states = b.count * (horizon + 1) * b.n_x, actions = b.count * horizon * b.n_u;
+  const int64_t forces = b.count * horizon * b.n_lam;
+  check_size("x", x.size(), states), check_size("u", u.size(), actions), check_size("lam", lam.size(), forces);
+  check_size("x_bar", x_bar.size(), states), check_size("u_bar", u_bar.size(), actions);
+  check_size("lam_bar", lam_bar.size(), forces), check_size("objective_bar", objective_bar.size(), b.count);
+  check_size("solved", solved.size(), b.count), check_size("gradients", gradients.size(), kInputs);
+  MpcGradient o{};
+  o.x = x.data(), o.u = u.data(), o.lam = lam.data(), o.x_bar = x_bar.data(), o.u_bar = u_bar.data();
+  o.lam_bar = lam_bar.data(), o.objective_bar = objective_bar.data(), o.solved = solved.data();
+  for (int i = 0; i < kInputs; i++) {
+    check_size("gradient", gradients[i].size(), inputs[i].size());
+    std::fill_n(gradients[i].data(), gradients[i].size(), 0.0);
+    if (b.stride[i]) o.per_element[i] = gradients[i].data();
+    else o.offset[i] = o.shared_size, o.shared_size += int64_t(inputs[i].size());
+  }
+  if (b.count == 0) return;
+  nb::gil_scoped_release release;
+  const auto& kernels = difflcs::kernels();
+  // Sums of shared inputs go block by block in a fixed order, so that they do not depend on the number of threads.
+  const int64_t block = 64, blocks = (b.count + block - 1) / block;
+  std::vector<double> partial(blocks * o.shared_size);
+  o.partial = partial.data();
+  std::atomic<int64_t> next{0};
+  on_threads(std::max<int64_t>(1, std::min<int64_t>(threads, blocks)), kernels.mpc_workspace(b), [&](void* workspace) {
+    for (int64_t i; (i = next.fetch_add(1)) < blocks;)
+      kernels.mpc_vjp(b, o, i * block, std::min(b.count, (i + 1) * block), i, workspace);
+  });
+  for (int i = 0; i < kInputs; i++) {
+    if (b.stride[i]) continue;
+    double* to = gradients[i].data();
+    for (int64_t k = 0; k < blocks; k++)
+      for (int64_t j = 0; j < int64_t(inputs[i].size()); j++) to[j] += partial[k * o.shared_size + o.offset[i] + j];
+  }
+}
+
 }  // namespace
 
 NB_MODULE(_kernels, m) {
-  m.doc() = "Native kernels of difflcs. Private: use difflcs.solve_lcp and difflcs.violation_loss.";
+  m.doc() = "Native kernels of difflcs. Private: use the functions of difflcs.";
   m.def("isa", [] { return difflcs::kernels().isa; }, "Instruction set in use.");
   m.def("solve_lcp", &solve_lcp, "F"_a, "q"_a, "relaxation"_a, "max_iter"_a, "threads"_a, "lam"_a, "w"_a, "status"_a,
         "iterations"_a, "Solve a batch of LCPs into the given arrays.");
+  m.def("solve_mpc", &solve_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "u_start"_a.none(), "lam_start"_a.none(),
+        "first_relaxation"_a, "shrink"_a, "tol"_a, "max_iter"_a, "threads"_a, "x"_a, "u"_a, "lam"_a, "objective"_a,
+        "residual"_a, "status"_a, "iterations"_a, "Solve a batch of LCS-MPC problems into the given arrays.");
+  m.def("vjp_mpc", &vjp_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "x"_a, "u"_a, "lam"_a, "x_bar"_a, "u_bar"_a,
+        "lam_bar"_a, "objective_bar"_a, "solved"_a, "threads"_a, "gradients"_a,
+        "Gradients of the inputs of solved LCS-MPC problems, into the given arrays.");
 }

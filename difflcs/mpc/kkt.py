@@ -120,17 +120,19 @@ def residual(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
     """Largest violation of the optimality conditions, (batch,).
 
     The maximum over: dynamics [state units], |λ∘s − relaxation|, negative λ or s, actions outside their bounds, and the
-    projected gradient u − clip(u − g) [the smaller of an action and of a gradient].
+    projected gradient u − clip(u − g) [the smaller of an action and of a gradient], which is divided by the largest
+    costate where that exceeds 1, so that a cost in other units is judged alike.
     """
     x, u, lam = (v.transpose(0, 1) for v in primal)  # steps first, so that per-element matrices broadcast
     s = dual.s.transpose(0, 1)
+    projected = u - torch.minimum(torch.maximum(u - dual.gradient.transpose(0, 1), problem.u_min), problem.u_max)
     terms = [
         x[1:] - problem.next_state(x[:-1], u, lam),
         lam * s - problem.relaxation,
         lam.clamp_max(0),
         s.clamp_max(0),
         u - torch.minimum(torch.maximum(u, problem.u_min), problem.u_max),
-        u - torch.minimum(torch.maximum(u - dual.gradient.transpose(0, 1), problem.u_min), problem.u_max),
+        projected / dual.p.abs().amax((1, 2)).clamp_min(1.0).unsqueeze(-1),
     ]
     return torch.stack([t.abs().amax((0, 2)) for t in terms]).amax(0)
 

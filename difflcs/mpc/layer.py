@@ -61,7 +61,7 @@ class LCSMPCLayer(nn.Module):
         horizon: int,
         u_min: Bound,
         u_max: Bound,
-        backend: str | Backend = "ipopt",
+        backend: str | Backend = "batched",
         relaxation: float = 1e-5,
         on_failure: str = "raise",
     ):
@@ -144,7 +144,7 @@ class LCSMPCLayer(nn.Module):
         self._report(status, any(t.requires_grad for t in flat))
 
         def shaped(value: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-            return value.reshape(*batch, *value.shape[1:]).to(x0.device, dtype or value.dtype)
+            return value.reshape((*batch, *value.shape[1:])).to(x0.device, dtype or value.dtype)
 
         return MPCSolution(
             *(shaped(v, x0.dtype) for v in primal),
