@@ -24,17 +24,17 @@ class BatchedBackend(Backend):
     """Projected Newton on the problem with λ eliminated, one problem per SIMD lane (`difflcs/_native/mpc.cpp`).
 
     For F + Fᵀ ≻ 0 the relaxed complementarity determines λ as a smooth function of (x, u), which leaves a smooth optimal
-    control problem with box bounds. A homotopy follows λ·s from `homotopy`·relaxation down to the relaxation; each step is a
-    Riccati sweep with exact second derivatives. An element's result depends on that element alone, bit for bit on one
-    instruction set. The problem has local optima: like IPOPT's, a solution is one of them.
+    control problem with box bounds. A homotopy follows λ·s from `homotopy`·relaxation down to the relaxation; each step
+    is a Riccati sweep with exact second derivatives. An element's result depends on that element alone, bit for bit on
+    one instruction set. The problem has local optima: like IPOPT's, a solution is one of them.
 
     Attributes:
         tol: projected gradient dJ/du at which a problem is solved.
         max_iter: iteration limit of one solve.
-        restarts: number of starts; the best optimum wins. 1 starts from the guess or from zero action, further ones from
-            random actions inside the bounds, the same for every element.
+        restarts: number of starts; the best optimum wins. 1 starts from the guess or from zero action, further ones
+            from random actions inside the bounds, the same for every element.
         seed: seed of the random starts.
-        homotopy: first relaxation as a multiple of the problem's, at a cold start; a guess starts at the relaxation itself.
+        homotopy: first relaxation as a multiple of the problem's, at a cold start; a guess starts at the relaxation.
         shrink: factor of the homotopy.
         threads: threads to use; torch's number if None.
     """
@@ -81,14 +81,21 @@ class BatchedBackend(Backend):
     ) -> dict[str, Tensor]:
         """The adjoint sweep in native code; the same numbers as `difflcs.mpc.kkt.vjp`."""
         gradients = {name: torch.empty_like(getattr(problem, name)) for name in INPUTS}
+        x, u, lam, x_bar, u_bar, lam_bar, objective_bar = (_array(v) for v in (*result.primal, *grads))
         _kernels.vjp_mpc(
-            _inputs(problem),
-            problem.horizon,
-            problem.relaxation,
-            *(_array(v) for v in (*result.primal, *grads)),
-            solved.to(torch.int8).numpy(),
-            self._threads(),
-            [gradient.numpy() for gradient in gradients.values()],
+            inputs=_inputs(problem),
+            horizon=problem.horizon,
+            relaxation=problem.relaxation,
+            x=x,
+            u=u,
+            lam=lam,
+            x_bar=x_bar,
+            u_bar=u_bar,
+            lam_bar=lam_bar,
+            objective_bar=objective_bar,
+            solved=solved.to(torch.int8).numpy(),
+            threads=self._threads(),
+            gradients=[gradient.numpy() for gradient in gradients.values()],
         )
         return gradients
 
@@ -106,25 +113,19 @@ class BatchedBackend(Backend):
             torch.empty(batch, dtype=torch.int32),
             torch.empty(batch, dtype=torch.float64),
         ]
-        x_out, u_out, lam_out, objective, status, iterations, residual = (v.numpy() for v in out)
+        names = ("x", "u", "lam", "objective", "status", "iterations", "residual")
         _kernels.solve_mpc(
-            _inputs(problem),
-            horizon,
-            problem.relaxation,
-            None if u is None else _array(u),
-            None if lam is None else _array(lam),
-            first,
-            self.shrink,
-            self.tol,
-            self.max_iter,
-            self._threads(),
-            x_out,
-            u_out,
-            lam_out,
-            objective,
-            residual,
-            status,
-            iterations,
+            inputs=_inputs(problem),
+            horizon=horizon,
+            relaxation=problem.relaxation,
+            u_start=None if u is None else _array(u),
+            lam_start=None if lam is None else _array(lam),
+            first_relaxation=first,
+            shrink=self.shrink,
+            tol=self.tol,
+            max_iter=self.max_iter,
+            threads=self._threads(),
+            **{name: value.numpy() for name, value in zip(names, out, strict=True)},  # pyright: ignore[reportArgumentType]
         )
         # Failed elements: finite numbers inside the bounds.
         for value in (*out[:4], out[6]):
