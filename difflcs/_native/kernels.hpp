@@ -32,6 +32,7 @@ struct MpcBatch {
   const double* input[kInputs];
   int64_t stride[kInputs];  // distance from one element to the next; 0 when the batch shares the input
   double relaxation;
+  double barrier;  // weight of the logarithmic barrier of the action bounds
 };
 
 // What the solver needs besides the problem, and where its results go.

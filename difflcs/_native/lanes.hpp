@@ -18,6 +18,11 @@ static inline Vec sqrt(Vec a) {
   for (int l = 0; l < kLanes; l++) r[l] = __builtin_sqrt(a[l]);
   return r;
 }
+static inline Vec log(Vec a) {
+  Vec r;
+  for (int l = 0; l < kLanes; l++) r[l] = __builtin_log(a[l]);
+  return r;
+}
 static inline bool any(Mask m) {
   int64_t r = 0;
   for (int l = 0; l < kLanes; l++) r |= m[l];

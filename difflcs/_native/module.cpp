@@ -139,7 +139,7 @@ void solve_lcp(Array F, Array q, double relaxation, int64_t max_iter, int thread
 
 using Inputs = std::vector<Array>;
 
-difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxation) {
+difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxation, double barrier) {
   using namespace difflcs;
   if (inputs.size() != kInputs) throw std::invalid_argument("expected 17 inputs");
   for (const Array& a : inputs)
@@ -148,7 +148,7 @@ difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxa
   auto last = [&](Input which) { return int64_t(inputs[which].shape(inputs[which].ndim() - 1)); };
   MpcBatch b{};
   b.count = int64_t(x0.shape(0)), b.n_x = last(kA), b.n_u = last(kB), b.n_lam = last(kF);
-  b.horizon = horizon, b.relaxation = relaxation;
+  b.horizon = horizon, b.relaxation = relaxation, b.barrier = barrier;
   const int64_t x = b.n_x, u = b.n_u, m = b.n_lam;
   const int64_t shape[kInputs][2] = {{x, x}, {x, u}, {x, m}, {x, 0}, {m, x}, {m, u}, {m, m}, {m, 0}, {x, x},
                                      {u, u}, {x, x}, {x, 0}, {u, 0}, {x, 0}, {u, 0}, {u, 0}, {x, 0}};
@@ -162,8 +162,8 @@ difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxa
     b.input[i] = a.data();
     b.stride[i] = shared ? 0 : size;
   }
-  if (x < 1 || u < 1 || m < 1 || horizon < 1 || !(relaxation > 0))
-    throw std::invalid_argument("sizes, horizon and relaxation must be positive");
+  if (x < 1 || u < 1 || m < 1 || horizon < 1 || !(relaxation > 0) || !(barrier >= 0))
+    throw std::invalid_argument("sizes, horizon and relaxation must be positive, the barrier not negative");
   return b;
 }
 
@@ -171,11 +171,11 @@ void check_size(const char* name, int64_t got, int64_t expected) {
   if (got != expected) throw std::invalid_argument(std::string(name) + " has the wrong size");
 }
 
-void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, std::optional<Array> u_start,
+void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, std::optional<Array> u_start,
                std::optional<Array> lam_start, double first_relaxation, double shrink, double tol, int64_t max_iter,
                int threads, Output<double> x, Output<double> u, Output<double> lam, Output<double> objective,
                Output<double> residual, Output<int8_t> status, Output<int32_t> iterations) {
-  const difflcs::MpcBatch b = mpc_batch(inputs, horizon, relaxation);
+  const difflcs::MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier);
   const int64_t states = b.count * (horizon + 1) * b.n_x, actions = b.count * horizon * b.n_u;
   const int64_t forces = b.count * horizon * b.n_lam;
   check_size("x", x.size(), states), check_size("u", u.size(), actions), check_size("lam", lam.size(), forces);
@@ -196,11 +196,11 @@ void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, std::optional<
   on_threads(used, kernels.mpc_workspace(b), [&](void* workspace) { kernels.mpc_solve(b, o, &next, workspace); });
 }
 
-void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, Array x, Array u, Array lam, Array x_bar, Array u_bar,
+void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, Array x, Array u, Array lam, Array x_bar, Array u_bar,
              Array lam_bar, Array objective_bar, nb::ndarray<const int8_t, nb::device::cpu, nb::c_contig> solved,
              int threads, std::vector<Output<double>> gradients) {
   using namespace difflcs;
-  const MpcBatch b = mpc_batch(inputs, horizon, relaxation);
+  const MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier);
   const int64_t states = b.count * (horizon + 1) * b.n_x, actions = b.count * horizon * b.n_u;
   const int64_t forces = b.count * horizon * b.n_lam;
   check_size("x", x.size(), states), check_size("u", u.size(), actions), check_size("lam", lam.size(), forces);
@@ -243,10 +243,10 @@ NB_MODULE(_kernels, m) {
   m.def("isa", [] { return difflcs::kernels().isa; }, "Instruction set in use.");
   m.def("solve_lcp", &solve_lcp, "F"_a, "q"_a, "relaxation"_a, "max_iter"_a, "threads"_a, "lam"_a, "w"_a, "status"_a,
         "iterations"_a, "Solve a batch of LCPs into the given arrays.");
-  m.def("solve_mpc", &solve_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "u_start"_a.none(), "lam_start"_a.none(),
+  m.def("solve_mpc", &solve_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "u_start"_a.none(), "lam_start"_a.none(),
         "first_relaxation"_a, "shrink"_a, "tol"_a, "max_iter"_a, "threads"_a, "x"_a, "u"_a, "lam"_a, "objective"_a,
         "residual"_a, "status"_a, "iterations"_a, "Solve a batch of LCS-MPC problems into the given arrays.");
-  m.def("vjp_mpc", &vjp_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "x"_a, "u"_a, "lam"_a, "x_bar"_a, "u_bar"_a,
+  m.def("vjp_mpc", &vjp_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "x"_a, "u"_a, "lam"_a, "x_bar"_a, "u_bar"_a,
         "lam_bar"_a, "objective_bar"_a, "solved"_a, "threads"_a, "gradients"_a,
         "Gradients of the inputs of solved LCS-MPC problems, into the given arrays.");
 }

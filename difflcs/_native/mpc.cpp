@@ -44,6 +44,7 @@ struct Mpc {
   Vec *Kl_s, *Ks_s, *Ah_s, *M_s, *size_s, *y_s, *P_s, *v_s, *p_s, *xb, *ub, *lb, *sum;
   Mask *act, *low, *upp;
   Vec jb;
+  Vec mu;  // weight of the barrier of the bounds: follows the homotopy down to batch.barrier
 
   // Lays the arrays out in `memory`, or only counts them where it is null.
   int64_t layout(void* memory, bool adjoint) {
@@ -77,6 +78,7 @@ struct Mpc {
 
   Mpc(const MpcBatch& b, void* memory, bool adjoint) : batch(b), n(b) {
     layout(memory, adjoint);
+    mu = all(b.barrier);
     if constexpr (sizeof(T) == sizeof(double))
       if (memory) load_matrices(0, 0);
   }
@@ -208,6 +210,10 @@ struct Mpc {
     };
     Vec total = quadratic(Qf, qf, xs + n.h * nx, nx);
     for (int64_t k = 0; k < n.h; k++) total += quadratic(Q, q, xs + k * nx, nx) + quadratic(R, r, us + k * nu, nu);
+    if (batch.barrier > 0)
+      for (int64_t k = 0; k < n.h; k++)
+        for (int64_t j = 0; j < nu; j++)
+          total -= mu * log((us[k * nu + j] - lo[j]) * (hi[j] - us[k * nu + j]));
     return total;
   }
 
@@ -304,21 +310,29 @@ struct Mpc {
       for (int64_t j = 0; j < nu; j++) {
         Vec t = r[j];
         for (int64_t m = 0; m < nu; m++) t += R[j * nu + m] * uk[m];
+        const Vec below = uk[j] - lo[j], above = hi[j] - uk[j], width = hi[j] - lo[j];
+        if (batch.barrier > 0) {
+          t += mu * (1.0 / above - 1.0 / below);
+          H[(nx + j) * nw + nx + j] += mu * (1.0 / (below * below) + 1.0 / (above * above));
+        }
         Vec g = t, l = kAdjoint ? -ub[k * nu + j] : t;
         for (int64_t i = 0; i < nx; i++) g += Ah[i * nw + nx + j] * p[i], l += Ah[i * nw + nx + j] * v[i];
         if (kAdjoint)
           for (int64_t m = 0; m < nl; m++) l -= Kl[m * nw + nx + j] * lb[k * nl + m];
         lin[nx + j] = l;
-        const Vec below = uk[j] - lo[j], above = hi[j] - uk[j], width = hi[j] - lo[j];
         // Away from an optimum P, and with it H, can be indefinite: |H| is still a scale for the distance to a bound.
         const Vec gauss_newton = max(max(abs(H[(nx + j) * nw + nx + j]), all(0) + R[j * nu + j]), all(kTiny));
         const Vec clipped = max(lo[j], min(hi[j], uk[j] - g));
         out.residual = max(out.residual, abs(clipped - uk[j]));
         const Vec scaled = max(lo[j], min(hi[j], uk[j] - g / gauss_newton));
-        out.projected = max(out.projected, abs(scaled - uk[j]) * gauss_newton);
+        Vec projected = abs(scaled - uk[j]) * gauss_newton;
+        // Next to a bound the barrier is so steep that rounding u alone moves g: a step below rounding counts as none.
+        if (batch.barrier > 0) projected = select(abs(g) <= 1e-14 * width * gauss_newton, all(0), projected);
+        out.projected = max(out.projected, projected);
         const Vec curved = max(H[(nx + j) * nw + nx + j] + curvature(nx + j, nx + j), all(kTiny));
         const Vec step = g / curved;
-        out.weak |= (min(below, above) <= 1e-5 * width) & (abs(step) <= 1e-5 * width) & (width > 0);
+        if (batch.barrier == 0)
+          out.weak |= (min(below, above) <= 1e-5 * width) & (abs(step) <= 1e-5 * width) & (width > 0);
         const Mask fixed = width <= 0;
         if (kAdjoint) {
           low[k * nu + j] = (step > below) | (fixed & (g >= 0));
@@ -328,6 +342,7 @@ struct Mpc {
           low[k * nu + j] = (below <= near) & (g > 0);
           upp[k * nu + j] = (above <= near) & (g < 0);
         }
+        if (batch.barrier > 0) low[k * nu + j] = upp[k * nu + j] = Mask{};
         act[k * nu + j] = low[k * nu + j] | upp[k * nu + j] | fixed;
       }
       for (int64_t i = 0; i < nx; i++) {
@@ -446,7 +461,11 @@ struct Mpc {
         Vec t = u[k * nu + j] + step * kf[k * nu + j];
         if (k > 0)
           for (int64_t i = 0; i < nx; i++) t += K[(k * nu + j) * nx + i] * (xk[i] - x[k * nx + i]);
-        uk[j] = select(frozen, u[k * nu + j], max(lo[j], min(hi[j], t)));
+        const Vec from = u[k * nu + j];
+        Vec low_end = lo[j], high_end = hi[j];
+        if (batch.barrier > 0)  // at most nine tenths of the way to a bound
+          low_end = from - 0.9 * (from - low_end), high_end = from + 0.9 * (high_end - from);
+        uk[j] = select(frozen, from, max(low_end, min(high_end, t)));
       }
       gap_at(xk, uk, gap);
       for (int64_t j = 0; j < nl; j++) lk[j] = select(skip, lk[j], lam[k * nl + j]);
@@ -480,7 +499,8 @@ struct Mpc {
       else for (int64_t i = 0; i < h * nu; i++) put(u, i, l, 0.0);
       for (int64_t k = 0; k < h; k++)
         for (int64_t j = 0; j < nu; j++) {
-          const double a = lo[j][l], b = hi[j][l], value = u[k * nu + j][l];
+          const double margin = batch.barrier > 0 ? 0.01 * (hi[j][l] - lo[j][l]) : 0.0;
+          const double a = lo[j][l] + margin, b = hi[j][l] - margin, value = u[k * nu + j][l];
           put(u, k * nu + j, l, value < a ? a : value > b ? b : value);
         }
       if (o.lam_start) load_lane(lam, o.lam_start + e * h * nl, h * nl, l);
@@ -494,6 +514,7 @@ struct Mpc {
     while (live > 0) {
       Mask idle;
       for (int l = 0; l < kLanes; l++) idle[l] = lane[l].element < 0 ? -1 : 0;
+      mu = batch.barrier * (eps / target);
       if (any(fresh & ~idle)) {
         const Vec rolled = rollout(eps, fresh & ~idle);
         J = select(fresh, rolled, J);
@@ -668,6 +689,12 @@ void Mpc<T, S>::forward_adjoint(const MpcGradient& o, int64_t group, int64_t end
       for (int64_t i = 0; i < nu; i++) t -= R[j * nu + i] * dw[nx + i], g += R[j * nu + i] * uk[i];
       for (int64_t i = 0; i < nx; i++) t -= AB[i * nw + nx + j] * dp[i], g += AB[i * nw + nx + j] * pk[i];
       for (int64_t i = 0; i < nl; i++) t -= DE[i * nw + nx + j] * drho[i], g += DE[i * nw + nx + j] * rho[i];
+      if (batch.barrier > 0) {
+        const Vec below = uk[j] - lo[j], above = hi[j] - uk[j], du = dw[nx + j];
+        sink.add(kumin, j, mu * (du / (below * below) + jb / below));
+        sink.add(kumax, j, mu * (du / (above * above) - jb / above));
+        continue;
+      }
       t += jb * g;
       sink.add(kumin, j, select(low[k * nu + j], t, all(0)));
       sink.add(kumax, j, select(upp[k * nu + j], t, all(0)));

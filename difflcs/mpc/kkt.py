@@ -39,6 +39,9 @@ the identity, yields (dx, du); then dp_k = P_k dx_k + v_k from the value functio
 Since K is the gradient of L, wᵀ K_θ is the derivative along w of ∂L/∂θ, whose every term is a product of two of
 (x, u, λ, p, ρ) and hence of their directions (dx, du, dλ, dp, dρ), dρ = dy∘λ + y∘dλ. An upstream gradient on the
 objective itself needs no solve: dJ*/dθ = ∂L/∂θ (envelope theorem); it enters as dp − J̄·p and dρ − J̄·ρ below.
+
+A logarithmic barrier −μ Σ log(u − u_min) + log(u_max − u) adds −μ/(u − u_min) + μ/(u_max − u) to g and its derivative
+to R; no bound is then active, and the bounds get their gradients from these terms.
 """
 
 from __future__ import annotations
@@ -157,8 +160,11 @@ def _backward(problem: MPCProblem, primal: Primal) -> tuple[Multipliers, list[tu
         p.append(matvec(problem.Q, x[:, k]) + problem.q + matvec(problem.A.mT, p[-1]) + matvec(problem.D.mT, rho))
         ys.append(y)
         rhos.append(rho)
-    backwards = [torch.stack(v[::-1], 1) for v in (p, ys, rhos, gradients)]
-    return Multipliers(s, *backwards), stages
+    p, y, rho, gradient = (torch.stack(v[::-1], 1) for v in (p, ys, rhos, gradients))
+    if problem.barrier > 0:
+        below, above = problem.distances(u)
+        gradient = gradient + problem.barrier * (1 / above - 1 / below)
+    return Multipliers(s, p, y, rho, gradient), stages
 
 
 def _solve_transposed(stage: tuple[Tensor, Tensor, Tensor], right: Tensor) -> Tensor:
@@ -179,6 +185,7 @@ def linearise(problem: MPCProblem, primal: Primal) -> Linearisation:
     DE = _join(problem.D, problem.E)
     P = problem.Q_final.expand(problem.batch, n_x, n_x)
     width = problem.u_max - problem.u_min
+    curvature = barrier_curvature(problem, primal.u)
     stages, lowers, uppers = [], [], []
     degenerate = torch.zeros(problem.batch, dtype=torch.bool)
     for k in reversed(range(problem.horizon)):
@@ -192,14 +199,16 @@ def linearise(problem: MPCProblem, primal: Primal) -> Linearisation:
         Y = weighted.mT @ K_s
         hessian = A_hat.mT @ (P @ A_hat) + Y + Y.mT
         hessian[:, :n_x, :n_x] += problem.Q
-        hessian[:, n_x:, n_x:] += problem.R
+        hessian[:, n_x:, n_x:] += problem.R + torch.diag_embed(curvature[:, k])
         Q_uu = hessian[:, n_x:, n_x:]
         h = Q_uu.diagonal(dim1=-2, dim2=-1).clamp_min(torch.finfo(torch.float64).tiny)
         to_lower, to_upper, step = u - problem.u_min, problem.u_max - u, g / h
         lower = (step > to_lower) | ((width <= 0) & (g >= 0))
         upper = (-step > to_upper) | ((width <= 0) & (g < 0))
-        free = ~(lower | upper)
         weak = (torch.minimum(to_lower, to_upper) <= _WEAK * width) & (step.abs() <= _WEAK * width) & (width > 0)
+        if problem.barrier > 0:
+            lower, upper, weak = (torch.zeros_like(v) for v in (lower, upper, weak))
+        free = ~(lower | upper)
         L, singular = _cholesky(Q_uu, free)
         degenerate |= weak.any(-1) | singular
         Q_xu = hessian[:, :n_x, n_x:] * free.unsqueeze(-2)
@@ -210,6 +219,14 @@ def linearise(problem: MPCProblem, primal: Primal) -> Linearisation:
         uppers.append(upper)
     lower, upper = torch.stack(lowers[::-1], 1), torch.stack(uppers[::-1], 1)
     return Linearisation(primal, dual, lower, upper, degenerate, stages[::-1])
+
+
+def barrier_curvature(problem: MPCProblem, u: Tensor) -> Tensor:
+    """Second derivative (batch, H, n_u) of the barrier of the action bounds; zero without a barrier."""
+    if problem.barrier == 0:
+        return torch.zeros_like(u)
+    below, above = problem.distances(u)
+    return problem.barrier * (1 / below.square() + 1 / above.square())
 
 
 def _join(left: Tensor, right: Tensor) -> Tensor:
@@ -336,8 +353,15 @@ def vjp(
         half = outer(name, (0.5 * J * value - direction, value))
         return 0.5 * (half + half.mT)
 
-    # Bounds: −wᵀK_θ of the rows u − bound = 0, and ∂L/∂bound = −ν = g for the objective.
-    bound = keep(w.nu + objective_bar[:, None, None] * dual.gradient)
+    # Bounds: −wᵀK_θ of the rows u − bound = 0, and ∂L/∂bound = −ν = g for the objective. With a barrier, the same
+    # for the terms of g and of J that hold the bounds.
+    if problem.barrier > 0:
+        below, above = problem.distances(lin.primal.u)
+        lower_bar = keep(problem.barrier * (w.u / below.square() + objective_bar[:, None, None] / below))
+        upper_bar = keep(problem.barrier * (w.u / above.square() - objective_bar[:, None, None] / above))
+    else:
+        bound = keep(w.nu + objective_bar[:, None, None] * dual.gradient)
+        lower_bar, upper_bar = bound * lin.lower, bound * lin.upper
     x0_bar = matvec(problem.A.mT, dp[:, 0]) + matvec(problem.D.mT, drho[:, 0])
     x0_cost = matvec(problem.Q, x[:, 0]) + problem.q
     return {
@@ -355,8 +379,8 @@ def vjp(
         "q": total("q", J * x_now - dx_now),
         "r": total("r", J * u - du),
         "q_final": total("q_final", J * x_end - dx_end),
-        "u_min": total("u_min", bound * lin.lower),
-        "u_max": total("u_max", bound * lin.upper),
+        "u_min": total("u_min", lower_bar),
+        "u_max": total("u_max", upper_bar),
         "x0": torch.where(solved[:, None], x_bar[:, 0] - x0_bar + J[:, 0] * x0_cost, torch.zeros_like(x0_cost)),
     }
 
@@ -384,7 +408,9 @@ def polish(problem: MPCProblem, primal: Primal, max_iter: int = 6, tol: float = 
         if step > 0:
             u = lin.primal.u + _solve(problem, lin, zeros[0], -lin.multipliers.gradient, zeros[1]).u
         u = torch.where(lin.lower, problem.u_min.unsqueeze(-2), u)
-        u = problem.clip(torch.where(lin.upper, problem.u_max.unsqueeze(-2), u))
+        u = torch.where(lin.upper, problem.u_max.unsqueeze(-2), u)
+        # With a barrier a step goes at most nine tenths of the way to a bound.
+        u = problem.clip(u) if problem.barrier == 0 else problem.clip_inside(u, lin.primal.u)
         x, lam = problem.rollout(u)
         trial = Primal(x, u, lam)
         lin = linearise(problem, trial)

@@ -43,6 +43,11 @@ class LCSMPCLayer(nn.Module):
         u_max: upper bound, likewise.
         backend: name of a registered backend, or an instance with options.
         relaxation: λ·s of the relaxed complementarity, > 0.
+        training_relaxation: relaxation in training mode (`layer.train()`), if another; `layer.eval()` returns to
+            `relaxation`. A larger one gives smoother gradients across contacts.
+        barrier: weight of a logarithmic barrier of the action bounds [cost units]; 0 for none. An action at a bound has
+            zero gradient; with a barrier it keeps a small distance and a gradient. The objective includes the barrier.
+            Sensible weights are 1e-3 to 1e-1 of the objective; far smaller ones make the problem stiff.
         on_failure: "raise" a `SolveError` when an element is not solved, or "mask" it: finite numbers inside the
             bounds, zero gradient, one `SolveWarning` per layer.
 
@@ -64,6 +69,9 @@ class LCSMPCLayer(nn.Module):
         backend: str | Backend = "batched",
         relaxation: float = 1e-5,
         on_failure: str = "raise",
+        *,
+        training_relaxation: float | None = None,
+        barrier: float = 0.0,
     ):
         super().__init__()
         if not isinstance(lcs, LCSModel | LCSParams):
@@ -78,6 +86,12 @@ class LCSMPCLayer(nn.Module):
         self.cost = cost
         self.horizon = check_positive_int("horizon", horizon)
         self.relaxation = check_number("relaxation", relaxation, strict=True)
+        self.training_relaxation = (
+            None
+            if training_relaxation is None
+            else check_number("training_relaxation", training_relaxation, strict=True)
+        )
+        self.barrier = check_number("barrier", barrier)
         self.on_failure = check_choice("on_failure", on_failure, ("raise", "mask"))
         self.backend = get_backend(backend)
         for name, value in (("u_min", u_min), ("u_max", u_max)):
@@ -86,7 +100,7 @@ class LCSMPCLayer(nn.Module):
                 self.register_parameter(name, value)
             else:
                 self.register_buffer(name, value, persistent=False)
-        check_bounds(self.u_min, self.u_max)
+        check_bounds(self.u_min, self.u_max, strict=self.barrier > 0)
         self._warned = False
 
     def extra_repr(self) -> str:
@@ -138,7 +152,9 @@ class LCSMPCLayer(nn.Module):
                 tensor = tensor.expand(*batch, *own).reshape(-1, *own)
             flat.append(tensor)
         values = {name: tensor.detach().contiguous() for name, tensor in zip(INPUTS, flat, strict=True)}
-        problem = MPCProblem(**values, horizon=self.horizon, relaxation=self.relaxation)
+        smooth = self.training_relaxation if self.training else None
+        relaxation = self.relaxation if smooth is None else smooth
+        problem = MPCProblem(**values, horizon=self.horizon, relaxation=relaxation, barrier=self.barrier)
         outputs = SolveMPC.apply(problem, self.backend, self._guess(guess, batch), *flat)
         *primal, objective, status, iterations, residual, seconds = outputs  # pyright: ignore[reportGeneralTypeIssues]
         self._report(status, any(t.requires_grad for t in flat))

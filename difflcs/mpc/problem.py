@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -34,16 +34,17 @@ INPUTS: dict[str, tuple[str, ...]] = {
 }
 
 
-def check_bounds(u_min: Tensor, u_max: Tensor) -> None:
-    """Refuse bounds that do not broadcast, live on different devices, or cross."""
+def check_bounds(u_min: Tensor, u_max: Tensor, strict: bool = False) -> None:
+    """Refuse bounds that do not broadcast, live on different devices, or cross (`strict`: or touch)."""
     broadcast_batch([("u_min", u_min.shape), ("u_max", u_max.shape)])
     check_same_device([("u_min", u_min), ("u_max", u_max)])
-    crossed = u_min > u_max
+    crossed = u_min >= u_max if strict else u_min > u_max
     if bool(crossed.any()):
         index = tuple(torch.nonzero(crossed)[0].tolist())
         low, high = (float(v.detach().expand_as(crossed)[index]) for v in (u_min, u_max))
         raise BoundsError(
-            f"u_min: expected u_min <= u_max, got {low:g} > {high:g} at index {index}; swap or widen the bounds"
+            f"u_min: expected u_min {'<' if strict else '<='} u_max, got {low:g} and {high:g} at index {index}; "
+            f"swap or widen the bounds"
         )
 
 
@@ -55,6 +56,9 @@ class MPCProblem:
         s.t. x_{k+1} = A x_k + B u_k + C λ_k + d,  s_k = D x_k + E u_k + F λ_k + c,
              λ_k ∘ s_k = relaxation,  λ_k, s_k ≥ 0,  u_min ≤ u_k ≤ u_max.
 
+    With barrier > 0 the cost also has −barrier·Σ (log(u_k − u_min) + log(u_max − u_k)), which keeps actions off their
+    bounds and so makes them differentiable everywhere.
+
     Tensors are float64 on the CPU and detached. x0 is (batch, n_x); every other one is shared, with exactly the
     dimensions named in `INPUTS`, or has the batch dimension in front.
 
@@ -65,6 +69,7 @@ class MPCProblem:
         x0: (batch, n_x) initial states.
         horizon: H ≥ 1 steps.
         relaxation: product λ·s > 0; the smaller, the closer to hard contact.
+        barrier: weight ≥ 0 of the logarithmic barrier of the action bounds.
 
     Raises:
         ShapeError, BoundsError, InvalidInputError: inconsistent shapes, u_min > u_max, horizon < 1, relaxation ≤ 0.
@@ -89,15 +94,17 @@ class MPCProblem:
     x0: Tensor
     horizon: int
     relaxation: float
+    barrier: float = 0.0
 
     def __post_init__(self) -> None:
         check_positive_int("horizon", self.horizon)
         check_number("relaxation", self.relaxation, strict=True)
+        check_number("barrier", self.barrier)
         for name in INPUTS:
             tensor, shape = getattr(self, name), self.shape(name)
             if tuple(tensor.shape) not in ((shape, (self.batch, *shape)) if name != "x0" else ((self.batch, *shape),)):
                 raise ShapeError(f"{name}: expected {shape} or {(self.batch, *shape)}, got {tuple(tensor.shape)}")
-        check_bounds(self.u_min, self.u_max)
+        check_bounds(self.u_min, self.u_max, strict=self.barrier > 0)
 
     @property
     def batch(self) -> int:
@@ -141,7 +148,14 @@ class MPCProblem:
         for k in range(self.horizon):
             total = total + 0.5 * quadratic(self.Q, x[:, k]) + (self.q * x[:, k]).sum(-1)
             total = total + 0.5 * quadratic(self.R, u[:, k]) + (self.r * u[:, k]).sum(-1)
+        if self.barrier > 0:
+            below, above = self.distances(u)
+            total = total - self.barrier * (below.log() + above.log()).sum((1, 2))
         return total
+
+    def distances(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Distances u − u_min and u_max − u of actions (batch, H, n_u) to their bounds."""
+        return u - self.u_min.unsqueeze(-2), self.u_max.unsqueeze(-2) - u
 
     def rollout(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """The trajectory that actions u (batch, H, n_u) cause: x (batch, H+1, n_x) and λ (batch, H, n_lam)."""
@@ -158,10 +172,20 @@ class MPCProblem:
         """Actions (batch, H, n_u) clipped into the bounds."""
         return torch.minimum(torch.maximum(u, self.u_min.unsqueeze(-2)), self.u_max.unsqueeze(-2))
 
+    def start(self, u: Tensor) -> Tensor:
+        """Actions (batch, H, n_u) to start from: clipped, and with a barrier 1 % of the range off the bounds."""
+        margin = 0.01 * (self.u_max - self.u_min).unsqueeze(-2) if self.barrier > 0 else 0.0
+        return torch.minimum(torch.maximum(u, self.u_min.unsqueeze(-2) + margin), self.u_max.unsqueeze(-2) - margin)
+
+    def clip_inside(self, u: Tensor, inside: Tensor) -> Tensor:
+        """Actions (batch, H, n_u) moved from `inside` towards `u`, at most nine tenths of the way to a bound."""
+        below, above = self.distances(inside)
+        return torch.minimum(torch.maximum(u, inside - 0.9 * below), inside + 0.9 * above)
+
     def select(self, index: Tensor) -> MPCProblem:
         """The problems at some batch indices."""
         chosen = {k: getattr(self, k) if self.shared(k) else getattr(self, k)[index] for k in INPUTS}
-        return MPCProblem(**chosen, horizon=self.horizon, relaxation=self.relaxation)
+        return replace(self, **chosen)
 
 
 assert [f.name for f in fields(MPCProblem)][: len(INPUTS)] == list(INPUTS), "INPUTS must list the fields in order"

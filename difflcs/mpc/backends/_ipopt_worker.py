@@ -20,7 +20,8 @@ import numpy as np
 CONVERGED, MAX_ITER, INFEASIBLE, NUMERICAL = 0, 1, 2, 3  # values of difflcs.Status
 _STATUS = {
     "Solve_Succeeded": CONVERGED,
-    "Solved_To_Acceptable_Level": CONVERGED,  # the caller judges by the residual
+    "Solved_To_Acceptable_Level": CONVERGED,  # the caller judges these by the residual
+    "Search_Direction_Becomes_Too_Small": CONVERGED,
     "Maximum_Iterations_Exceeded": MAX_ITER,
     "Maximum_CpuTime_Exceeded": MAX_ITER,
     "Maximum_WallTime_Exceeded": MAX_ITER,
@@ -43,6 +44,7 @@ class Options(NamedTuple):
     tol: float
     max_iter: int
     mu_init: float
+    barrier: bool
 
 
 def parameter_shapes(sizes: Sizes) -> dict[str, tuple[int, int]]:
@@ -51,7 +53,7 @@ def parameter_shapes(sizes: Sizes) -> dict[str, tuple[int, int]]:
     return {
         "A": (x, x), "B": (x, u), "C": (x, m), "d": (x, 1), "D": (m, x), "E": (m, u), "F": (m, m), "c": (m, 1),
         "Q": (x, x), "R": (u, u), "Q_final": (x, x), "q": (x, 1), "r": (u, 1), "q_final": (x, 1),
-        "x0": (x, 1), "relaxation": (1, 1),
+        "x0": (x, 1), "relaxation": (1, 1), "barrier": (1, 1), "u_min": (u, 1), "u_max": (u, 1),
     }  # fmt: skip
 
 
@@ -69,6 +71,8 @@ def _solver(sizes: Sizes, options: Options) -> casadi.Function:
         s, x_next = casadi.SX.sym(f"s{k}", sizes.n_lam), casadi.SX.sym(f"x{k + 1}", sizes.n_x)
         cost += casadi.bilin(p["Q"], x, x) / 2 + casadi.dot(p["q"], x)
         cost += casadi.bilin(p["R"], u, u) / 2 + casadi.dot(p["r"], u)
+        if options.barrier:
+            cost -= p["barrier"] * casadi.sum1(casadi.log(u - p["u_min"]) + casadi.log(p["u_max"] - u))
         constraints += [
             p["A"] @ x + p["B"] @ u + p["C"] @ lam + p["d"] - x_next,
             p["D"] @ x + p["E"] @ u + p["F"] @ lam + p["c"] - s,

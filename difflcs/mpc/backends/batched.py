@@ -23,11 +23,10 @@ from difflcs.status import Status
 class BatchedBackend(Backend):
     """Projected Newton on the problem with λ eliminated, one problem per SIMD lane (`difflcs/_native/mpc.cpp`).
 
-    For F + Fᵀ ≻ 0 the relaxed complementarity determines λ as a smooth function of (x, u), which leaves a smooth optimal
-    control problem with box bounds. A homotopy follows λ·s from `homotopy`·relaxation down to the relaxation; each step
-    is a Riccati sweep with exact second derivatives. An element's result depends on that element alone, bit for bit on
-    one instruction set. The problem has local optima: like IPOPT's, a solution is one of them.
-
+    For F + Fᵀ ≻ 0 the relaxed complementarity determines λ as a smooth function of (x, u), which leaves a smooth
+    optimal control problem with box bounds. A homotopy follows λ·s from `homotopy`·relaxation down to the relaxation;
+    each step is a Riccati sweep with exact second derivatives. An element's result depends on that element alone, bit
+    for bit on one instruction set. The problem has local optima: like IPOPT's, a solution is one of them.
     Attributes:
         tol: projected gradient dJ/du at which a problem is solved.
         max_iter: iteration limit of one solve.
@@ -86,6 +85,7 @@ class BatchedBackend(Backend):
             inputs=_inputs(problem),
             horizon=problem.horizon,
             relaxation=problem.relaxation,
+            barrier=problem.barrier,
             x=x,
             u=u,
             lam=lam,
@@ -114,10 +114,12 @@ class BatchedBackend(Backend):
             torch.empty(batch, dtype=torch.float64),
         ]
         names = ("x", "u", "lam", "objective", "status", "iterations", "residual")
+        arrays = {name: value.numpy() for name, value in zip(names, out, strict=True)}
         _kernels.solve_mpc(
             inputs=_inputs(problem),
             horizon=horizon,
             relaxation=problem.relaxation,
+            barrier=problem.barrier,
             u_start=None if u is None else _array(u),
             lam_start=None if lam is None else _array(lam),
             first_relaxation=first,
@@ -125,7 +127,7 @@ class BatchedBackend(Backend):
             tol=self.tol,
             max_iter=self.max_iter,
             threads=self._threads(),
-            **{name: value.numpy() for name, value in zip(names, out, strict=True)},  # pyright: ignore[reportArgumentType]
+            **arrays,  # pyright: ignore[reportArgumentType]
         )
         # Failed elements: finite numbers inside the bounds.
         for value in (*out[:4], out[6]):

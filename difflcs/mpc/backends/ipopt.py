@@ -68,7 +68,9 @@ class IpoptBackend(Backend):
         from difflcs.mpc.backends._ipopt_worker import Options, Sizes, solve_chunk
 
         sizes = Sizes(problem.n_x, problem.n_u, problem.n_lam, problem.horizon)
-        options = Options(self.tol, self.max_iter, self.mu_init if guess is None else self.mu_init_warm)
+        options = Options(
+            self.tol, self.max_iter, self.mu_init if guess is None else self.mu_init_warm, problem.barrier > 0
+        )
         chunk = self._start(problem, guess, sizes)
         workers = min(self.workers or len(os.sched_getaffinity(0)), problem.batch)
         if workers <= 1:
@@ -89,16 +91,18 @@ class IpoptBackend(Backend):
         from difflcs.mpc.backends._ipopt_worker import Chunk, parameter_shapes
 
         batch, horizon = problem.batch, problem.horizon
-        names = [name for name in parameter_shapes(sizes) if name != "relaxation"]
-        flat = [getattr(problem, n).reshape(1 if problem.shared(n) else batch, -1).expand(batch, -1) for n in names]
-        flat.append(torch.full((batch, 1), problem.relaxation, dtype=torch.float64))
+        flat = []
+        for name in parameter_shapes(sizes):
+            value = torch.as_tensor(getattr(problem, name), dtype=torch.float64)
+            shared = value.ndim == 0 or problem.shared(name)
+            flat.append(value.reshape(1 if shared else batch, -1).expand(batch, -1))
         if guess is None:
             x = problem.x0.unsqueeze(1).expand(batch, horizon, -1)
-            u = problem.clip(torch.zeros(batch, horizon, problem.n_u, dtype=torch.float64))
+            u = problem.start(torch.zeros(batch, horizon, problem.n_u, dtype=torch.float64))
             lam = s = torch.full((batch, horizon, problem.n_lam), self.start, dtype=torch.float64)
         else:
             # The guess's actions decide; the rest follows from them, so that a shifted guess starts feasible.
-            u = problem.clip(guess.u)
+            u = problem.start(guess.u)
             x, lam = problem.rollout(u)
             x, s = x[:, 1:], problem.relaxation / lam.clamp_min(1e-300)
         u_min, u_max = (v.expand(batch, problem.n_u) for v in (problem.u_min, problem.u_max))
