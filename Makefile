@@ -13,7 +13,7 @@ help:
 	@echo "make format let ruff put the code in order"
 	@echo "make clean  remove .venv and build products"
 
-$(VENV)/.ready: pyproject.toml constraints.txt CMakeLists.txt $(wildcard difflcs/_native/*.?pp)
+$(VENV)/.ready: pyproject.toml constraints.txt CMakeLists.txt cmake/kernels.cmake $(wildcard difflcs/_native/*.?pp)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "difflcs needs Python 3.11 or newer, got $$($(PYTHON) --version); try make PYTHON=python3.11"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
@@ -37,3 +37,16 @@ format: $(VENV)/.ready
 
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .ruff_cache
+
+# The kernels under address, undefined-behaviour and thread sanitizers, on every instruction set this CPU has.
+SANITIZERS := address,undefined thread
+.PHONY: sanitize
+sanitize:
+	@for s in $(SANITIZERS); do \
+	  cmake -S tests/native -B build/sanitize-$$s -DSANITIZER=$$s -DCMAKE_BUILD_TYPE=None > /dev/null && \
+	  cmake --build build/sanitize-$$s --parallel 2 > /dev/null && \
+	  for isa in baseline $$(grep -o -m1 -w avx2 /proc/cpuinfo 2>/dev/null) \
+	    $$(grep -q avx512dq /proc/cpuinfo 2>/dev/null && echo avx512); do \
+	    echo "$$s:"; DIFFLCS_ISA=$$isa build/sanitize-$$s/stress || exit 1; \
+	  done || exit 1; \
+	done

@@ -1,0 +1,234 @@
+"""How fast backend `batched` is, against IPOPT in the same run: `python benchmarks/mpc.py [--smoke]`.
+
+Prints one table and writes it as JSON with machine, versions and instruction set. Every speed is also a ratio to IPOPT
+through the same layer, on the same problems, on one core; absolute times of a shared machine mean little.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import casadi
+import numpy as np
+import torch
+import tyro
+from models import ACTION_LIMIT, MODELS, pushing_model, states_and_goals
+
+import difflcs
+from difflcs import LCSModel, LCSMPCLayer, LCSParams, solve_lcp, violation_loss
+from difflcs._native import _kernels
+from difflcs.mpc.backends import BatchedBackend, IpoptBackend
+from difflcs.rl.tasks import pushing_cost
+
+
+@dataclass
+class Options:
+    """Benchmark of the MPC backends."""
+
+    batch: int = 2048
+    """Problems per call of backend batched."""
+    ipopt_batch: int = 48
+    """Problems that IPOPT solves."""
+    share: int = 10_000
+    """Problems of the convergence count, spread over the kinds of models."""
+    repeats: int = 5
+    """Timings; the best counts."""
+    out: Path = Path("benchmarks/results/mpc.json")
+    """Where the JSON goes."""
+    smoke: bool = False
+    """Everything tiny: seconds instead of minutes."""
+
+
+def best(repeats: int, work: Callable[[], object]) -> float:
+    """Shortest time [s] of several runs, after one that does not count."""
+    work()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def layer(model: LCSModel | LCSParams, backend: BatchedBackend | IpoptBackend) -> LCSMPCLayer:
+    """The paper's MPC around a model."""
+    return LCSMPCLayer(model, pushing_cost(), 5, -ACTION_LIMIT, ACTION_LIMIT, backend=backend, on_failure="mask")
+
+
+def mpc_times(n_lam: int, o: Options) -> dict[str, float]:
+    """Seconds per problem of every way to solve it, one core, tensors in, tensors out."""
+    model = LCSModel.from_params(pushing_model(n_lam, seed=0))
+    x0, goal = states_and_goals(o.batch, seed=1)
+    few = slice(0, o.ipopt_batch)
+    ours, ipopt = layer(model, BatchedBackend(threads=1)), layer(model, IpoptBackend(workers=1))
+
+    def solve(mpc: LCSMPCLayer, part: slice, guess=None):
+        with torch.no_grad():
+            return mpc(x0[part], goal[part], guess=guess)
+
+    def solve_and_differentiate(mpc: LCSMPCLayer, part: slice) -> None:
+        model.zero_grad()
+        mpc(x0[part], goal[part]).action.square().sum().backward()
+
+    every = slice(0, o.batch)
+    guess, guess_few = solve(ours, every).shift(), solve(ipopt, few).shift()
+    slow = max(1, o.repeats // 3)
+    return {
+        "cold": best(o.repeats, lambda: solve(ours, every)) / o.batch,
+        "warm": best(o.repeats, lambda: solve(ours, every, guess)) / o.batch,
+        "gradient": best(o.repeats, lambda: solve_and_differentiate(ours, every)) / o.batch,
+        "ipopt cold": best(slow, lambda: solve(ipopt, few)) / o.ipopt_batch,
+        "ipopt warm": best(slow, lambda: solve(ipopt, few, guess_few)) / o.ipopt_batch,
+        "ipopt gradient": best(slow, lambda: solve_and_differentiate(ipopt, few)) / o.ipopt_batch,
+    }
+
+
+def convergence(o: Options) -> tuple[int, int]:
+    """Problems solved to the tolerance, and their number, over learned-like, random and untrained models."""
+    solved = total = 0
+    kinds = [(make, n_lam, seed) for make in MODELS.values() for n_lam in (5, 8) for seed in range(4)]
+    count = max(1, o.share // len(kinds))
+    for make, n_lam, seed in kinds:
+        x0, goal = states_and_goals(count, seed=100 + seed)
+        with torch.no_grad():
+            plan = layer(make(n_lam, seed), BatchedBackend(tol=1e-6))(x0, goal)
+        solved += int(plan.converged.sum())
+        total += count
+    return solved, total
+
+
+def general_path(o: Options) -> dict[int, float]:
+    """Seconds per problem for n_lam 4 … 9: sizes 5 and 8 have compile-time code, the others the general one."""
+    times = {}
+    for n_lam in range(4, 10):
+        x0, goal = states_and_goals(o.batch, seed=1)
+        mpc = layer(pushing_model(n_lam, seed=0), BatchedBackend(threads=1))
+        with torch.no_grad():
+            iterations = float(mpc(x0, goal).iterations.double().mean())
+            seconds = best(o.repeats, lambda mpc=mpc, x0=x0, goal=goal: mpc(x0, goal))
+        times[n_lam] = seconds / o.batch / iterations
+    return times
+
+
+def threads(o: Options) -> float:
+    """Speed of two threads over one."""
+    x0, goal = states_and_goals(o.batch, seed=1)
+    model = pushing_model(5, seed=0)
+    one, two = (layer(model, BatchedBackend(threads=n)) for n in (1, 2))
+    with torch.no_grad():
+        return best(o.repeats, lambda: one(x0, goal)) / best(o.repeats, lambda: two(x0, goal))
+
+
+def violation_times(o: Options) -> tuple[float, float]:
+    """Seconds of `violation_loss` with its gradient on 100 transitions, and of the inner QPs alone by CasADi + qpOASES."""
+    n_lam, gamma, xi, count = 5, 0.1, 0.01, 100
+    generator = torch.Generator().manual_seed(0)
+    model = LCSModel(9, 6, n_lam, init_scale=0.3, generator=generator)
+    x, u, x_next = (torch.randn(count, n, generator=generator, dtype=torch.float64) for n in (9, 6, 9))
+
+    def ours() -> None:
+        model.zero_grad()
+        violation_loss(model, x, u, x_next, gamma, xi).backward()
+
+    p = {k: v.detach().numpy() for k, v in model.params().tensors().items()}
+    weight = 1 / (gamma * xi)
+    coupling = np.eye(n_lam) / xi - weight * p["F"].T
+    Q = np.block([[p["C"].T @ p["C"] + weight * p["F"].T @ p["F"], coupling], [coupling.T, weight * np.eye(n_lam)]])
+    free = x.numpy() @ p["A"].T + u.numpy() @ p["B"].T + p["d"] - x_next.numpy()
+    gap = x.numpy() @ p["D"].T + u.numpy() @ p["E"].T + p["c"]
+    q = np.hstack([free @ p["C"] + weight * gap @ p["F"], -weight * gap])
+    solver = casadi.conic(
+        "qp",
+        "qpoases",
+        {"h": casadi.Sparsity.dense(2 * n_lam, 2 * n_lam), "a": casadi.Sparsity(0, 2 * n_lam)},
+        {"printLevel": "none"},
+    )
+    H = casadi.DM(Q)
+
+    def peer() -> None:
+        for row in q:
+            solver(h=H, g=row, lbx=0.0)
+
+    return best(3 * o.repeats, ours), best(max(1, o.repeats // 2), peer)
+
+
+def lcp_time(o: Options) -> float:
+    """Seconds for 100 000 LCPs with n = 8, each with its own matrix."""
+    count = 2_000 if o.smoke else 100_000
+    generator = torch.Generator().manual_seed(0)
+    G = torch.randn(count, 8, 8, generator=generator, dtype=torch.float64)
+    F = G @ G.mT + 0.1 * torch.eye(8, dtype=torch.float64) + G - G.mT
+    q = torch.randn(count, 8, generator=generator, dtype=torch.float64)
+    return best(o.repeats, lambda: solve_lcp(F, q))
+
+
+def main(o: Options) -> None:
+    """Measure, print, write."""
+    if o.smoke:
+        o.batch, o.ipopt_batch, o.share, o.repeats = 64, 4, 240, 1
+    torch.set_num_threads(1)
+    rows: list[tuple[str, str, str]] = []
+    numbers: dict[str, object] = {}
+    for n_lam in (5, 8):
+        t = mpc_times(n_lam, o)
+        numbers[f"n_lam {n_lam}"] = t
+        for name, target in (("cold", 150), ("warm", 400), ("gradient", 120)):
+            # The target of the warm start is against IPOPT's cold start, as every throughput target.
+            reference = t["ipopt gradient"] if name == "gradient" else t["ipopt cold"]
+            ratio = reference / t[name]
+            label = "forward + backward" if name == "gradient" else f"forward, {name} start"
+            rows.append(
+                (f"n_lam {n_lam}, {label}", f"{1e6 * t[name]:.1f} µs", f"{ratio:.0f}× IPOPT (target {target}×)")
+            )
+            numbers[f"n_lam {n_lam} {name} ratio"] = ratio
+        ratio = t["ipopt warm"] / t["warm"]
+        rows.append((f"n_lam {n_lam}, both warm", "", f"{ratio:.0f}× IPOPT"))
+    general = general_path(o)
+    numbers["seconds per iteration by n_lam"] = general
+    worst = max(general[4] / general[5], general[6] / general[8], general[7] / general[8])
+    rows.append(
+        ("general code at n_lam 4, 6, 7 against compiled 5, 8, 8", "", f"{worst:.2f}× per iteration (limit 2×)")
+    )
+    solved, total = convergence(o)
+    numbers["converged"], numbers["converged of"] = solved, total
+    rows.append(("projected gradient < 1e-6", f"{solved} of {total}", f"{100 * solved / total:.2f} % (target 99.9 %)"))
+    numbers["two threads"] = threads(o)
+    rows.append(("two threads", "", f"{numbers['two threads']:.2f}× one (target 1.7×)"))
+    ours, peer = violation_times(o)
+    numbers["violation loss"], numbers["qpoases loop"] = ours, peer
+    rows.append(
+        ("violation_loss with gradient, 100 transitions", f"{1e3 * ours:.2f} ms", f"{peer / ours:.0f}× qpOASES loop")
+    )
+    numbers["lcp"] = lcp_time(o)
+    rows.append(("solve_lcp, 100 000 problems, n 8", f"{numbers['lcp']:.3f} s", ""))
+    versions = {"difflcs": difflcs.__version__, "torch": torch.__version__, "casadi": casadi.__version__}
+    record = {
+        "machine": {"cpu": _cpu(), "cores": os.cpu_count(), "instruction set": _kernels.isa()},
+        "versions": {"python": platform.python_version(), **versions},
+        "options": {"batch": o.batch, "ipopt_batch": o.ipopt_batch, "repeats": o.repeats},
+        "results": numbers,
+    }
+    o.out.parent.mkdir(parents=True, exist_ok=True)
+    o.out.write_text(json.dumps(record, indent=2) + "\n")
+    print(f"{record['machine']['cpu']}, {_kernels.isa()}, one core, batch {o.batch}; IPOPT on {o.ipopt_batch}")
+    for row in rows:
+        print(f"{row[0]:56s} {row[1]:>14s}   {row[2]}")
+    print(f"written to {o.out}")
+
+
+def _cpu() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

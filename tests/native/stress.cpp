@@ -1,0 +1,158 @@
+// Drives every kernel over many sizes, shared and per-element inputs, several threads and broken numbers, to be built with
+// sanitizers (`make sanitize`). It checks memory and arithmetic, not mathematics: the Python tests do that.
+#include <atomic>
+#include <cmath>
+#include <cstdio>
+#include <cstdlib>
+#include <limits>
+#include <new>
+#include <random>
+#include <thread>
+#include <vector>
+
+#include "kernels.hpp"
+
+using namespace difflcs;
+
+namespace {
+
+std::mt19937_64 generator(0);
+
+std::vector<double> normal(int64_t count, double scale) {
+  std::normal_distribution<double> draw(0.0, scale);
+  std::vector<double> v(count);
+  for (double& x : v) x = draw(generator);
+  return v;
+}
+
+struct Workspace {
+  void* data;
+  explicit Workspace(int64_t bytes) : data(::operator new(bytes, std::align_val_t{64})) {}
+  ~Workspace() { ::operator delete(data, std::align_val_t{64}); }
+};
+
+// Diagonally dominant on average, with a skew part.
+std::vector<double> lcp_matrices(int64_t count, int64_t n) {
+  std::vector<double> F(count * n * n);
+  for (int64_t e = 0; e < count; e++) {
+    const auto G = normal(n * n, 1.0);
+    for (int64_t i = 0; i < n; i++)
+      for (int64_t j = 0; j < n; j++) {
+        double t = i == j ? 0.1 : 0.0;
+        for (int64_t m = 0; m < n; m++) t += G[i * n + m] * G[j * n + m];
+        F[(e * n + i) * n + j] = t + 0.5 * (G[i * n + j] - G[j * n + i]);
+      }
+  }
+  return F;
+}
+
+int failures = 0;
+void expect(bool ok, const char* what) {
+  if (!ok) std::printf("FAILED: %s\n", what), failures++;
+}
+
+void lcp(int64_t n, int64_t count, bool shared, double relaxation, double broken) {
+  const auto F = lcp_matrices(shared ? 1 : count, n);
+  auto q = normal(count * n, 1.0);
+  if (broken != 0) q[0] = broken;
+  std::vector<double> lam(count * n), w(count * n);
+  std::vector<int8_t> status(count);
+  std::vector<int32_t> iterations(count);
+  const LcpBatch batch{n,          F.data(), shared ? 0 : n * n, q.data(),      relaxation,
+                       80,         lam.data(), w.data(),         status.data(), iterations.data()};
+  const Workspace workspace(kernels().lcp_workspace(n));
+  const auto run = relaxation > 0 ? kernels().lcp_relaxed : kernels().lcp_exact;
+  for (int64_t begin = 0; begin < count; begin += 5) run(batch, begin, std::min(count, begin + 5), workspace.data);
+  int64_t solved = 0;
+  for (const int8_t s : status) solved += s == 0;
+  expect(solved >= count - (broken != 0), "every sound LCP is solved");
+}
+
+void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count, bool shared, double barrier,
+         double broken, int threads) {
+  MpcBatch b{};
+  b.count = count, b.n_x = n_x, b.n_u = n_u, b.n_lam = n_lam, b.horizon = horizon;
+  b.relaxation = 1e-5, b.barrier = barrier;
+  const int64_t sizes[kInputs] = {n_x * n_x,   n_x * n_u, n_x * n_lam, n_x, n_lam * n_x, n_lam * n_u,
+                                  n_lam * n_lam, n_lam,   n_x * n_x,   n_u * n_u, n_x * n_x, n_x, n_u, n_x, n_u, n_u, n_x};
+  std::vector<double> data[kInputs];
+  for (int i = 0; i < kInputs; i++) {
+    const bool own = i == kx0 || !shared;
+    const int64_t copies = own ? count : 1;
+    data[i] = i == kF ? lcp_matrices(copies, n_lam) : normal(copies * sizes[i], 0.2);
+    if (i == kQ || i == kR || i == kQfinal) {
+      const int64_t n = i == kR ? n_u : n_x;
+      for (int64_t e = 0; e < copies; e++)
+        for (int64_t r = 0; r < n; r++)
+          for (int64_t c = 0; c < n; c++) data[i][(e * n + r) * n + c] = r == c ? 1.0 : 0.0;
+    }
+    if (i == kumin || i == kumax)
+      for (double& v : data[i]) v = (i == kumin ? -1 : 1) * (0.1 + std::fabs(v));
+    b.stride[i] = own ? sizes[i] : 0;
+  }
+  if (broken != 0) data[kx0][0] = broken;
+  for (int i = 0; i < kInputs; i++) b.input[i] = data[i].data();
+  std::vector<double> x(count * (horizon + 1) * n_x), u(count * horizon * n_u), lam(count * horizon * n_lam);
+  std::vector<double> objective(count), residual(count);
+  std::vector<int8_t> status(count), all_solved(count, 1);
+  std::vector<int32_t> iterations(count);
+  MpcSolve o{nullptr, nullptr, 1e-3, 0.3, 1e-8, 100, x.data(), u.data(), lam.data(), objective.data(), residual.data(),
+             status.data(), iterations.data()};
+  for (int pass = 0; pass < 2; pass++) {  // cold, then from its own solution
+    int64_t next = 0;
+    std::vector<std::thread> pool;
+    for (int t = 0; t < threads; t++)
+      pool.emplace_back([&] {
+        const Workspace workspace(kernels().mpc_workspace(b));
+        kernels().mpc_solve(b, o, &next, workspace.data);
+      });
+    for (auto& t : pool) t.join();
+    if (broken != 0) break;
+    const auto u_start = u, lam_start = lam;
+    o.u_start = u_start.data(), o.lam_start = lam_start.data(), o.first_relaxation = 1e-5;
+    int64_t solved = 0;
+    for (const int8_t s : status) solved += s == 0 || s == 4;
+    expect(solved * 10 >= count * 9, "nine of ten MPC problems are solved");
+    if (pass == 0) {
+      next = 0;
+      const Workspace workspace(kernels().mpc_workspace(b));
+      kernels().mpc_solve(b, o, &next, workspace.data);
+    }
+    o.u_start = o.lam_start = nullptr, o.first_relaxation = 1e-3;
+  }
+  MpcGradient g{};
+  const auto x_bar = normal(x.size(), 1.0), u_bar = normal(u.size(), 1.0), lam_bar = normal(lam.size(), 1.0);
+  const auto objective_bar = normal(count, 1.0);
+  g.x = x.data(), g.u = u.data(), g.lam = lam.data(), g.x_bar = x_bar.data(), g.u_bar = u_bar.data();
+  g.lam_bar = lam_bar.data(), g.objective_bar = objective_bar.data(), g.solved = all_solved.data();
+  std::vector<double> own[kInputs];
+  for (int i = 0; i < kInputs; i++) {
+    if (b.stride[i]) own[i].resize(count * sizes[i]), g.per_element[i] = own[i].data();
+    else g.offset[i] = g.shared_size, g.shared_size += sizes[i];
+  }
+  const int64_t block = 7, blocks = (count + block - 1) / block;
+  std::vector<double> partial(blocks * g.shared_size);
+  g.partial = partial.data();
+  const Workspace workspace(kernels().mpc_workspace(b));
+  for (int64_t i = 0; i < blocks; i++)
+    kernels().mpc_vjp(b, g, i * block, std::min(count, (i + 1) * block), i, workspace.data);
+}
+
+}  // namespace
+
+int main() {
+  const double huge = 1e200, nan = std::numeric_limits<double>::quiet_NaN();
+  for (int64_t n = 1; n <= 12; n++)
+    for (const bool shared : {true, false})
+      for (const double relaxation : {0.0, 1e-5})
+        for (const double broken : {0.0, huge, nan}) lcp(n, 23, shared, relaxation, broken);
+  const int64_t shapes[][4] = {{9, 6, 5, 5}, {9, 6, 8, 5}, {9, 6, 7, 5}, {2, 1, 1, 1}, {4, 2, 3, 7}, {1, 1, 1, 3}};
+  for (const auto& s : shapes)
+    for (const bool shared : {true, false})
+      for (const double barrier : {0.0, 1e-2})
+        for (const double broken : {0.0, huge, nan})
+          for (const int threads : {1, 3})
+            for (const int64_t count : {1, 29}) mpc(s[0], s[1], s[2], s[3], count, shared, barrier, broken, threads);
+  std::printf("%s kernels, %d lanes: %s\n", kernels().isa, kernels().lanes, failures ? "FAILED" : "clean");
+  return failures != 0;
+}
