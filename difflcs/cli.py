@@ -1,4 +1,7 @@
-"""The command line: `difflcs train | evaluate | render | demo`. The only file that knows the library and the environments."""
+"""The command line: `difflcs train | evaluate | render | demo`.
+
+The only file of the package that knows both the library and the environments.
+"""
 
 from __future__ import annotations
 
@@ -44,6 +47,9 @@ class Train(TrainConfig):
     smoke: bool = False
     """Finish in seconds, on too little data to learn anything."""
 
+    def __post_init__(self) -> None:
+        """Check nothing yet: `run` does, so that its errors are printed like all others."""
+
     @property
     def directory(self) -> Path:
         """The run directory."""
@@ -72,12 +78,15 @@ class Train(TrainConfig):
         for f in fields(TrainConfig):
             wanted, own = getattr(config, f.name), getattr(stored, f.name)
             if wanted not in (own, getattr(default, f.name), getattr(default.smoke(), f.name)):
+                flag = f.name.replace("_", "-")
                 raise CheckpointError(
-                    f"--{f.name.replace('_', '-')}: expected {own!r}, with which {self.directory} was started, got {wanted!r}; "
+                    f"--{flag}: expected {own!r}, as {self.directory} was started with, got {wanted!r}; "
                     f"drop the flag, or start another run with another --out"
                 )
         if self.init is not None:
-            raise CheckpointError("--init: expected it without --resume; a resumed run continues from its own checkpoint")
+            raise CheckpointError(
+                "--init: expected it without --resume; a resumed run continues from its own checkpoint"
+            )
         return stored
 
     def interrupted(self) -> str:
@@ -180,8 +189,8 @@ class Demo:
     def run(self) -> None:
         """Run the command."""
         start = time.perf_counter()
-        require("matplotlib", "imageio", "imageio_ffmpeg", "PIL")  # before four minutes of training, not after
-        config = TrainConfig(seed=self.seed, evaluate_at=(0.0, 1.0, 2.0, 4.0))
+        require("matplotlib", "imageio", "imageio_ffmpeg", "PIL")  # before the training, not after
+        config = TrainConfig(seed=self.seed, evaluate_at=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0), evaluate_goals=100)
         config = config.smoke() if self.smoke else config
         resume = (self.out / "config.json").exists()
         if resume:
@@ -189,21 +198,23 @@ class Demo:
         with _Progress() as progress:
             run = train(config, self.out, _env_factory(config.task), resume=resume, reporter=progress)
         rows = run.rows()
-        plot_learning_curve(rows, run.path / "learning_curve.png", f"{config.task}, seed {config.seed}: learning to push")
+        title = f"{config.task}, seed {config.seed}: learning to push"
+        plot_learning_curve(rows, run.path / "learning_curve.png", title)
         goals: tuple[Goal, ...] = ((0.04, 0.03, 0.3), (-0.04, 0.03, -0.3), (0.0, -0.05, 0.4), (0.05, -0.02, 0.0))
         video = self._video(run, goals[:1] if self.smoke else goals)
         evaluated = [row for row in rows if row["evaluation_goals"]]
         print(f"\nsuccess before learning: {_from_row(evaluated[0])}")
         print(f"success after {float(evaluated[-1]['minutes']):g} minutes of data: {_from_row(evaluated[-1])}")
         print(f"learning curve: {run.path / 'learning_curve.png'}\nvideo: {video}\nmodel: {run.model}")
-        print(f"goal seed {config.evaluation_seed}, training seed {config.seed}, {time.perf_counter() - start:.0f} s, {_versions()}")
+        seconds = time.perf_counter() - start
+        print(f"goal seed {config.evaluation_seed}, training seed {config.seed}, {seconds:.0f} s, {_versions()}")
 
     def _video(self, run: RunDirectory, goals: Sequence[Goal]) -> str:
         try:
-            _record(run, goals, run.path / "video.mp4", seed=0)
+            reached = _record(run, goals, run.path / "video.mp4", seed=0)
         except _NoPictureError as error:
             return f"none, {error}"  # the rest of the demo needs no OpenGL
-        return str(run.path / "video.mp4")
+        return f"{run.path / 'video.mp4'} ({sum(reached)} of {len(goals)} goals reached in it)"
 
     def interrupted(self) -> str:
         """What to do after Ctrl-C."""
@@ -264,8 +275,9 @@ def _env_factory(name: str) -> Callable[[int], VectorEnv]:
 def _registered(name: str) -> Task:
     task = get_task(name)
     require("gymnasium", "mujoco", "difflcs_envs")
-    import difflcs_envs
     import gymnasium
+
+    import difflcs_envs
 
     difflcs_envs.register_envs()
     if task.env_id not in gymnasium.registry:
@@ -279,6 +291,7 @@ def _record(run: RunDirectory, goals: Sequence[Goal], path: Path, seed: int) -> 
     task = _registered(config.task)
     require("imageio", "imageio_ffmpeg", "PIL")
     import gymnasium
+
     from difflcs_envs import RenderingError
 
     policy = task.make_policy(run.load_model(), config.backend)

@@ -157,7 +157,7 @@ class LCSMPCLayer(nn.Module):
         problem = MPCProblem(**values, horizon=self.horizon, relaxation=relaxation, barrier=self.barrier)
         outputs = SolveMPC.apply(problem, self.backend, self._guess(guess, batch), *flat)
         *primal, objective, status, iterations, residual, seconds = outputs  # pyright: ignore[reportGeneralTypeIssues]
-        self._report(status, any(t.requires_grad for t in flat))
+        self._report(status, torch.is_grad_enabled() and any(t.requires_grad for t in flat))
 
         def shaped(value: Tensor, dtype: torch.dtype | None = None) -> Tensor:
             return value.reshape((*batch, *value.shape[1:])).to(x0.device, dtype or value.dtype)

@@ -27,6 +27,7 @@ class BatchedBackend(Backend):
     optimal control problem with box bounds. A homotopy follows λ·s from `homotopy`·relaxation down to the relaxation;
     each step is a Riccati sweep with exact second derivatives. An element's result depends on that element alone, bit
     for bit on one instruction set. The problem has local optima: like IPOPT's, a solution is one of them.
+
     Attributes:
         tol: projected gradient dJ/du at which a problem is solved.
         max_iter: iteration limit of one solve.

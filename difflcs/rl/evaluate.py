@@ -1,0 +1,147 @@
+"""Success rate of a policy, with its confidence interval."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from difflcs._checks import check_positive_int
+from difflcs.errors import InvalidInputError
+from difflcs.rl.rollout import Policy, Rollouts, collect, episode_seeds, mpc_actions
+
+if TYPE_CHECKING:
+    from gymnasium.vector import VectorEnv
+
+EVALUATION_STREAM = 1
+"""Stream of `episode_seeds` for evaluation goals: never those of a training with the same seed."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Outcome of one evaluation.
+
+    Attributes:
+        success_rate: successes per goal.
+        ci_low: lower end of the Wilson 95 % interval.
+        ci_high: its upper end.
+        successes: goals reached.
+        goals: goals tried, one episode each.
+        seed: what the goals and initial states were drawn from.
+        median_position_error: [m] after the last step; None if the environment reports none.
+        median_yaw_error: [rad] after the last step; None if the environment reports none.
+        solver_failures: MPC solves that did not converge.
+        solves: MPC solves.
+        unstable: episodes in which the simulation broke down; they count as failures.
+    """
+
+    success_rate: float
+    ci_low: float
+    ci_high: float
+    successes: int
+    goals: int
+    seed: int
+    median_position_error: float | None
+    median_yaw_error: float | None
+    solver_failures: int
+    solves: int
+    unstable: int
+
+    def __str__(self) -> str:
+        return (
+            f"{100 * self.success_rate:.1f} % of {self.goals} goals "
+            f"(95 % interval {100 * self.ci_low:.1f} to {100 * self.ci_high:.1f} %)"
+        )
+
+
+def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Wilson's score interval of a binomial proportion.
+
+    (p̂ + z²/2n ± z·sqrt(p̂(1 − p̂)/n + z²/4n²)) / (1 + z²/n). Unlike p̂ ± z·sqrt(p̂(1 − p̂)/n) it stays within [0, 1] and
+    does not shrink to a point at 0 or n successes.
+
+    Args:
+        successes: 0 … trials.
+        trials: at least 1.
+        confidence: in (0, 1).
+
+    Returns:
+        Lower and upper end.
+    """
+    check_positive_int("trials", trials)
+    if not 0 <= successes <= trials:
+        raise InvalidInputError(f"successes: expected 0 to trials={trials}, got {successes}")
+    if not 0 < confidence < 1:
+        raise InvalidInputError(f"confidence: expected a number between 0 and 1, got {confidence}")
+    z2 = NormalDist().inv_cdf(0.5 + confidence / 2) ** 2
+    rate = successes / trials
+    centre = rate + z2 / (2 * trials)
+    half = math.sqrt(z2 * (rate * (1 - rate) / trials + z2 / (4 * trials**2)))
+    scale = 1 + z2 / trials
+    # Exact at the ends, where rounding would leave ±1e-17.
+    low = 0.0 if successes == 0 else (centre - half) / scale
+    high = 1.0 if successes == trials else (centre + half) / scale
+    return low, high
+
+
+def evaluate(
+    env: VectorEnv,
+    policy: Policy,
+    goals: int,
+    seed: int,
+    episode_steps: int = 20,
+    u_min: Tensor | None = None,
+    u_max: Tensor | None = None,
+    after_step: Callable[[int], object] | None = None,
+) -> Evaluation:
+    """Run one noise-free episode per goal; every solve starts cold.
+
+    Repeating it gives the same result bit for bit. A smaller evaluation uses the first goals of a larger one with the
+    same seed. Another number of environments changes the solver's rounding (1e-15, which contact may amplify).
+
+    Args:
+        env: vector of environments, stepped in lockstep.
+        policy: the MPC.
+        goals: number of episodes.
+        seed: of the goals and the initial states.
+        episode_steps: steps of one episode.
+        u_min: lower bounds (n_u,) of the MPC; the policy's own if None.
+        u_max: upper bounds (n_u,).
+        after_step: called with the number of episodes stepped, for progress bars.
+
+    Returns:
+        The success rate with its interval, and what went wrong.
+    """
+    check_positive_int("goals", goals)
+    check_positive_int("seed", seed, minimum=0)
+    act = mpc_actions(policy, u_min, u_max)
+    parts: list[Rollouts] = []
+    for first in range(0, goals, env.num_envs):
+        count = min(env.num_envs, goals - first)
+        report = None if after_step is None else lambda count=count: after_step(count)
+        parts.append(collect(env, act, episode_seeds(seed, EVALUATION_STREAM, first, count), episode_steps, report))
+    successes = int(sum(int(part.success.sum()) for part in parts))
+    low, high = wilson_interval(successes, goals)
+    return Evaluation(
+        success_rate=successes / goals,
+        ci_low=low,
+        ci_high=high,
+        successes=successes,
+        goals=goals,
+        seed=seed,
+        median_position_error=_median(parts, "position_error"),
+        median_yaw_error=_median(parts, "yaw_error"),
+        solver_failures=sum(part.solver_failures for part in parts),
+        solves=goals * episode_steps,
+        unstable=int(sum(int((~part.stable).sum()) for part in parts)),
+    )
+
+
+def _median(parts: list[Rollouts], name: str) -> float | None:
+    values = [part.errors[name].abs() for part in parts if name in part.errors]
+    return float(torch.cat(values).nanquantile(0.5)) if values else None

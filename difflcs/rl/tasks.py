@@ -1,0 +1,95 @@
+"""The tasks by name: which environment, which MPC cost, which sizes. Names only, no environment is imported here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+from difflcs.cost import GoalCost
+from difflcs.errors import InvalidInputError
+from difflcs.lcs import LCSModel
+from difflcs.mpc import LCSMPCLayer
+
+N_X = 9
+"""State of the pushing tasks: object x, y [m], yaw [rad], then x, y [m] of three fingertips."""
+N_U = 6
+"""Action: x, y displacement [m] of three fingertips in one step."""
+
+
+def pushing_cost() -> GoalCost:
+    """Cost of the MPC for pushing an object on the table (Eq. cost_function of the paper).
+
+    Stage: 10 Σ‖tip − object‖² + 200 ‖object − goal‖² + 0.3 (yaw − goal yaw)² + 200 ‖u‖²; final: 6, 200 and 1.5.
+
+    Returns:
+        A `GoalCost` of goals (x [m], y [m], yaw [rad]).
+    """
+    return GoalCost.reach(
+        N_X,
+        N_U,
+        goal_weight=(200.0, 200.0, 0.3),
+        goal_weight_final=(200.0, 200.0, 1.5),
+        input_weight=200.0,
+        pairs=[(3 + 2 * finger + axis, axis) for finger in range(3) for axis in range(2)],
+        pair_weight=10.0,
+        pair_weight_final=6.0,
+    )
+
+
+@dataclass(frozen=True)
+class Task:
+    """What training and evaluation must know about one task.
+
+    Attributes:
+        env_id: Gymnasium id of the environment.
+        env_kwargs: its keyword arguments.
+        episode_steps: steps of one episode, after which it is truncated.
+        step_seconds: duration of one step [s].
+        u_max: bound of each action component [m].
+        horizon: steps the MPC plans ahead.
+        relaxation: product λ·s of the MPC's complementarity.
+    """
+
+    env_id: str
+    env_kwargs: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    episode_steps: int = 20
+    step_seconds: float = 0.1
+    u_max: float = 0.015
+    horizon: int = 5
+    relaxation: float = 1e-5
+
+    def make_policy(self, lcs: LCSModel, backend: str = "batched") -> LCSMPCLayer:
+        """The MPC around a model; unsolved elements are masked, never raised, so that they cannot end a training."""
+        return LCSMPCLayer(
+            lcs,
+            pushing_cost(),
+            horizon=self.horizon,
+            u_min=-self.u_max,
+            u_max=self.u_max,
+            backend=backend,
+            relaxation=self.relaxation,
+            on_failure="mask",
+        )
+
+
+_OBJECTS = ("sugar_box", "fish_can", "mug", "wrench", "clamp", "banana")
+TASKS: Mapping[str, Task] = MappingProxyType(
+    {
+        "cube": Task("difflcs/TriFingerMoveCube-v0"),
+        **{name: Task("difflcs/TriFingerMoveObject-v0", MappingProxyType({"object": name})) for name in _OBJECTS},
+    }
+)
+"""Task name → `Task`."""
+
+
+def get_task(name: str) -> Task:
+    """Look a task up.
+
+    Raises:
+        InvalidInputError: no task has this name.
+    """
+    if name not in TASKS:
+        raise InvalidInputError(f"task: expected one of {', '.join(TASKS)}, got {name!r}")
+    return TASKS[name]

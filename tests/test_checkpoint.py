@@ -1,0 +1,140 @@
+"""Checkpoints and run directories: what is written comes back, and nothing else is accepted."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from difflcs import LCSModel
+from difflcs.errors import CheckpointError
+from difflcs.rl import checkpoint as module
+from difflcs.rl.checkpoint import Checkpoint, RunDirectory, load_checkpoint, save_checkpoint
+
+
+def make_checkpoint(iteration: int) -> Checkpoint:
+    model = LCSModel(2, 1, 1, generator=torch.Generator().manual_seed(iteration), init_scale=0.1)
+    state = {"rng": np.random.default_rng(iteration).bit_generator.state, "episodes": 5 * iteration}
+    return Checkpoint(iteration, model, state, {"states": torch.full((3, 2), float(iteration), dtype=torch.float64)})
+
+
+def contents(root):
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+def assert_equal(loaded: Checkpoint, saved: Checkpoint) -> None:
+    assert loaded.iteration == saved.iteration
+    assert loaded.state == saved.state
+    assert torch.equal(loaded.tensors["states"], saved.tensors["states"])
+    for name, value in saved.model.state_dict().items():
+        assert torch.equal(loaded.model.state_dict()[name], value)
+
+
+def test_round_trip_and_pruning(tmp_path):
+    for iteration in range(4):
+        save_checkpoint(tmp_path, make_checkpoint(iteration), keep=2)
+    assert_equal(load_checkpoint(tmp_path), make_checkpoint(3))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["000002", "000003", "latest.json"]
+
+
+@pytest.mark.parametrize("step", ["save_record", "write_json"])
+def test_a_crash_leaves_the_previous_checkpoint(tmp_path, monkeypatch, step):
+    save_checkpoint(tmp_path, make_checkpoint(1))
+
+    def die(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module._files, step, die)  # while writing, or between writing and switching
+        with pytest.raises(KeyboardInterrupt):
+            save_checkpoint(tmp_path, make_checkpoint(2))
+    assert_equal(load_checkpoint(tmp_path), make_checkpoint(1))
+    save_checkpoint(tmp_path, make_checkpoint(2))
+    assert_equal(load_checkpoint(tmp_path), make_checkpoint(2))
+
+
+def test_going_back_to_an_older_checkpoint(tmp_path):
+    for iteration in (5, 6, 7):
+        save_checkpoint(tmp_path, make_checkpoint(iteration), keep=2)
+    (tmp_path / "latest.json").write_text('{"checkpoint": "000006"}')
+    assert load_checkpoint(tmp_path).iteration == 6
+    save_checkpoint(tmp_path, make_checkpoint(7), keep=2)  # takes the place of the abandoned 7
+    assert load_checkpoint(tmp_path).iteration == 7
+
+
+def _flip(path):
+    data = bytearray(path.read_bytes())
+    data[-3] ^= 1
+    path.write_bytes(bytes(data))
+
+
+def _edit(path, change):
+    record = json.loads(path.read_text())
+    change(record)
+    path.write_text(json.dumps(record))
+
+
+CORRUPTIONS = {
+    "no latest": lambda root: (root / "latest.json").unlink(),
+    "latest is no JSON": lambda root: (root / "latest.json").write_text("{"),
+    "latest is foreign": lambda root: (root / "latest.json").write_text("[]"),
+    "latest leads outside": lambda root: (root / "latest.json").write_text('{"checkpoint": "../1"}'),
+    "no directory": lambda root: shutil.rmtree(root / "000002"),
+    "no tensors": lambda root: (root / "000002/model.safetensors").unlink(),
+    "no description": lambda root: (root / "000002/config.json").unlink(),
+    "a flipped bit": lambda root: _flip(root / "000002/model.safetensors"),
+    "truncated tensors": lambda root: (root / "000002/model.safetensors").write_bytes(b"\x08\x00\x00"),
+    "truncated description": lambda root: (root / "000002/config.json").write_text('{"format": 1,'),
+    "an edited counter": lambda root: _edit(
+        root / "000002/config.json", lambda r: r["config"]["state"].update(episodes=99)
+    ),
+    "another kind": lambda root: _edit(root / "000002/config.json", lambda r: r.update(kind="LCSModel")),
+    "another iteration": lambda root: (
+        (root / "000002").rename(root / "000009") and (root / "latest.json").write_text('{"checkpoint": "000009"}')
+    ),
+    "a model's directory": lambda root: make_checkpoint(3).model.save_pretrained(root / "000002"),
+}
+
+
+@pytest.mark.parametrize("corrupt", CORRUPTIONS.values(), ids=CORRUPTIONS.keys())
+def test_corrupt_checkpoints_are_refused_and_untouched(tmp_path, corrupt):
+    for iteration in (1, 2):
+        save_checkpoint(tmp_path, make_checkpoint(iteration))
+    corrupt(tmp_path)
+    before = contents(tmp_path)
+    with pytest.raises(CheckpointError, match=r"expected|match"):
+        load_checkpoint(tmp_path)
+    assert contents(tmp_path) == before
+
+
+def test_a_corrupt_checkpoint_names_the_older_one(tmp_path):
+    for iteration in (1, 2):
+        save_checkpoint(tmp_path, make_checkpoint(iteration))
+    _flip(tmp_path / "000002/model.safetensors")
+    with pytest.raises(CheckpointError, match="000001"):
+        load_checkpoint(tmp_path)
+
+
+def test_run_directory_refuses_what_is_there(tmp_path):
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(CheckpointError, match="--resume"):
+        RunDirectory.create(tmp_path, {})
+    with pytest.raises(CheckpointError, match="difflcs train"):
+        RunDirectory.open(tmp_path)
+    assert contents(tmp_path) == {"thesis.txt": b"mine"}
+
+
+def test_log_has_no_doubled_nor_broken_rows(tmp_path):
+    run = RunDirectory.create(tmp_path / "run", {"kind": "run"})
+    run.truncate_log(3)
+    for iteration in range(4):
+        run.append({"iteration": iteration, "loss": None if iteration == 0 else 0.5 * iteration})
+    with run.log.open("a") as file:
+        file.write("4,2.")  # cut off by a crash
+    run.truncate_log(2)
+    run.append({"iteration": 3, "loss": 7.0})
+    assert run.log.read_text() == "iteration,loss\n0,\n1,0.5\n2,1.0\n3,7.0\n"
+    assert [row["loss"] for row in run.rows()] == ["", "0.5", "1.0", "7.0"]
+    run.truncate_log(-1)
+    assert not run.log.exists()

@@ -1,0 +1,206 @@
+"""The command line, from outside."""
+
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from difflcs import cli
+
+
+def run(capsys, *arguments) -> tuple[int, str, str]:
+    code = cli.main([str(argument) for argument in arguments])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A finished smoke run."""
+    pytest.importorskip("mujoco")
+    path = tmp_path_factory.mktemp("cli") / "run"
+    assert cli.main(["train", "--smoke", "--out", str(path)]) == 0
+    return path
+
+
+def test_the_library_imports_none_of_this():
+    code = "import sys, difflcs; print(*sys.modules)"
+    loaded = subprocess.check_output([sys.executable, "-c", code], text=True).split()
+    assert not {"tyro", "gymnasium", "mujoco", "difflcs.rl", "difflcs.cli"} & set(loaded)
+
+
+@pytest.mark.parametrize("command", ["", "train", "evaluate", "render", "demo"])
+def test_help(capsys, command):
+    with pytest.raises(SystemExit) as exit_:
+        cli.main([*command.split(), "--help"])
+    assert exit_.value.code == 0
+    text = capsys.readouterr().out
+    wanted = {"": "demo", "train": "--warmup.noise", "evaluate": "--goals", "render": "--goal", "demo": "--smoke"}
+    assert wanted[command] in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train", "--task", "cubes"], "expected one of cube,"),
+        (["train", "--task", "mug", "--smoke"], "not available yet"),
+        (["train", "--method", "ppo"], "not available yet"),
+        (["train", "--backend", "magic", "--smoke"], "magic"),
+        (["train", "--minutes", "-1"], "minutes"),
+        (["train", "--resume"], "difflcs train"),
+        (["train", "--init", "nowhere"], "nowhere"),
+        (["evaluate", "nowhere"], "difflcs train"),
+        (["render", "nowhere"], "difflcs train"),
+    ],
+)
+def test_mistakes_get_one_clean_message(capsys, tmp_path, arguments, message):
+    pytest.importorskip("mujoco")
+    if arguments[0] == "train":
+        arguments = [*arguments, "--out", tmp_path / "run"]
+    code, out, err = run(capsys, *arguments)
+    assert code == 2
+    assert err.startswith("difflcs: ")
+    assert message in err
+    assert "Traceback" not in err + out
+
+
+def test_bad_nested_settings_are_refused(capsys):
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["train", "--warmup.noise", "-1"])
+    assert exit_.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_a_missing_package_names_the_line_that_installs_it(capsys, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "tyro" else find(name, *a))
+    code, _, err = run(capsys, "evaluate", "nowhere")
+    assert code == 2
+    assert 'pip install "difflcs[rl,envs,viz]"' in err
+
+
+def test_train_leaves_a_run(finished):
+    names = {path.name for path in finished.iterdir()}
+    assert names == {"config.json", "log.csv", "tensorboard", "checkpoints", "model"}
+    config = json.loads((finished / "config.json").read_text())
+    assert config["config"]["warmup"]["noise"] == 0.003
+    assert config["versions"]["mujoco"]
+    rows = (finished / "log.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in rows] == ["iteration", "0", "1", "2", "3"]
+
+
+def test_evaluate(capsys, finished):
+    code, out, _ = run(capsys, "evaluate", finished, "--goals", 3, "--seed", 5, "--json")
+    assert code == 0
+    first = json.loads(out)
+    assert first["goals"] == 3
+    assert first["seed"] == 5
+    assert 0 <= first["ci_low"] <= first["success_rate"] <= first["ci_high"] <= 1
+    assert first["solver_failures"] == 0
+    assert first["versions"]["difflcs"]
+    second = json.loads(run(capsys, "evaluate", finished, "--goals", 3, "--seed", 5, "--json")[1])
+    for record in (first, second):
+        del record["seconds"]
+    assert first == second
+    code, out, _ = run(capsys, "evaluate", finished, "--smoke", "--trust-region")
+    assert code == 0
+    assert "of 4 goals (95 % interval" in out
+
+
+def test_an_existing_run_is_not_overwritten(capsys, finished):
+    before = {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
+    code, _, err = run(capsys, "train", "--smoke", "--out", finished)
+    assert code == 2
+    assert "--resume" in err
+    code, _, err = run(capsys, "train", "--smoke", "--out", finished, "--resume", "--seed", 3)
+    assert code == 2
+    assert "--seed: expected 0" in err
+    assert run(capsys, "train", "--out", finished, "--resume")[0] == 0  # nothing left to do
+    assert {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()} == before
+
+
+def test_resume_after_any_crash_gives_the_same_run(capsys, finished, tmp_path, monkeypatch):
+    """Die after the checkpoint of iteration 1, then between log and checkpoint of 2, then before the final model."""
+    path = tmp_path / "run"
+
+    def die(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(cli._Progress, "iterated", die)
+        code, _, err = run(capsys, "train", "--smoke", "--out", path)
+    assert code == 130
+    assert f"difflcs train --out {path} --resume" in err
+    code, out, _ = run(capsys, "evaluate", path, "--smoke")
+    assert code == 0
+    assert "not finished" in out
+    with monkeypatch.context() as patch:
+        patch.setattr("difflcs.rl.training.save_checkpoint", die)
+        assert run(capsys, "train", "--out", path, "--resume")[0] == 130
+    with monkeypatch.context() as patch:
+        patch.setattr("difflcs.lcs.LCSModel.save_pretrained", die)
+        assert run(capsys, "train", "--out", path, "--resume")[0] == 130
+    assert run(capsys, "train", "--out", path, "--resume")[0] == 0
+    for name in ("model/model.safetensors", "checkpoints/000003/model.safetensors", "checkpoints/000003/config.json"):
+        assert (path / name).read_bytes() == (finished / name).read_bytes()
+    logs = [[_untimed(line) for line in (run / "log.csv").read_text().splitlines()] for run in (path, finished)]
+    assert logs[0] == logs[1]
+
+
+def _untimed(line: str) -> list[str]:
+    cells = line.split(",")
+    return cells[:10] + cells[12:-1]
+
+
+def test_init_starts_from_a_trained_model(capsys, finished, tmp_path):
+    for source in (finished, finished / "model"):
+        out = tmp_path / source.name
+        arguments = ["--smoke", "--minutes", 0.1, "--final-goals", 0, "--init", source, "--out", out]
+        assert run(capsys, "train", *arguments)[0] == 0
+    assert json.loads((tmp_path / "run/config.json").read_text())["init"] == str(finished)
+
+
+def test_render(capsys, finished, tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+    video = tmp_path / "new" / "video.mp4"
+    code, out, err = run(capsys, "render", finished, "--goal", 0.04, 0.03, 0.3, "--out", video)
+    if "OpenGL" in err:
+        pytest.skip(err)
+    assert code == 0
+    assert "goal 0.04 0.03 0.3: " in out
+    assert video.stat().st_size > 10_000
+    assert [path.name for path in video.parent.iterdir()] == ["video.mp4"]
+    code, _, err = run(capsys, "render", finished, "--goal", 0.4, 0.03, 0.3, "--out", video)
+    assert code == 2
+    assert "expected [-0.06" in err
+
+
+def test_demo(capsys, tmp_path):
+    pytest.importorskip("mujoco")
+    for attempt in range(2):  # the second continues, that is, only draws again
+        code, out, _ = run(capsys, "demo", "--smoke", "--out", tmp_path / "demo")
+        assert code == 0
+        assert ("continuing it" in out) == (attempt == 1)
+        assert "success before learning: " in out
+        assert "success after 0.5 minutes of data: " in out
+        assert (tmp_path / "demo/learning_curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_ctrl_c_in_a_real_process(tmp_path):
+    pytest.importorskip("mujoco")
+    path = tmp_path / "run"
+    command = [sys.executable, "-m", "difflcs.cli", "train", "--final-goals", "0", "--evaluate-at", "--out", str(path)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    deadline = time.monotonic() + 60
+    while not (path / "checkpoints/000002").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the solver's workers, too
+    _, err = process.communicate(timeout=20)
+    assert process.returncode == 130, err
+    assert "--resume" in err
+    assert "Traceback" not in err
