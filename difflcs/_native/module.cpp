@@ -79,7 +79,7 @@ bool lcp_exact_one(int64_t n, const double* F, const double* q, double* lam, dou
     for (int64_t i = 0; i < n && wrong < 0; i++) {
       double value = q[i], bound = std::fabs(q[i]);
       for (int64_t j = 0; j < n; j++) value += F[i * n + j] * x[j], bound += std::fabs(F[i * n + j] * x[j]);
-      if (active[i]) value = x[i] * F[i * n + i];
+      if (active[i]) value = x[i] * std::fabs(F[i * n + i]);
       if (!(value >= -1e-11 * bound)) wrong = i;
     }
     if (wrong < 0) {

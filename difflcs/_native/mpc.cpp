@@ -35,6 +35,9 @@ struct Mpc {
   const S n;
   // Problem: [A B], C, [D E], F, Q, R, Q_final and the vectors.
   T *AB, *C, *DE, *F, *Q, *R, *Qf;
+  // lam = scale * lam', s = s' / scale, chosen so that F' has a unit diagonal: contacts in any units converge alike. C, [D E],
+  // F, c, lam and s are kept in these units; the product lam o s does not change.
+  T* scale;
   Vec *d, *c, *q, *r, *qf, *lo, *hi, *x0;
   // Trajectory, trial trajectory, and the feedback law.
   Vec *x, *u, *lam, *s, *xt, *ut, *lamt, *st, *K, *kf;
@@ -59,7 +62,7 @@ struct Mpc {
     auto vec = [&](Vec*& a, int64_t k) { a = static_cast<Vec*>(bytes(k * int64_t(sizeof(Vec)))); };
     auto mask = [&](Mask*& a, int64_t k) { a = static_cast<Mask*>(bytes(k * int64_t(sizeof(Mask)))); };
     mat(AB, nx * nw), mat(C, nx * nl), mat(DE, nl * nw), mat(F, nl * nl), mat(Q, nx * nx), mat(R, nu * nu);
-    mat(Qf, nx * nx);
+    mat(Qf, nx * nx), mat(scale, nl);
     vec(d, nx), vec(c, nl), vec(q, nx), vec(r, nu), vec(qf, nx), vec(lo, nu), vec(hi, nu), vec(x0, nx);
     vec(x, (h + 1) * nx), vec(u, h * nu), vec(lam, h * nl), vec(s, h * nl);
     vec(xt, (h + 1) * nx), vec(ut, h * nu), vec(lamt, h * nl), vec(st, h * nl), vec(K, h * nu * nx), vec(kf, h * nu);
@@ -93,14 +96,25 @@ struct Mpc {
 
   void load_matrices(int64_t e, int lane) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nw = n.w();
-    auto block = [&](T* to, int64_t width, int64_t column, Input which, int64_t rows, int64_t columns) {
+    const double* diagonal = input(kF, e);
+    for (int64_t i = 0; i < nl; i++) {
+      const double f = diagonal[i * nl + i];
+      put(scale, i, lane, f > 0 ? 1.0 / __builtin_sqrt(f) : 1.0);
+    }
+    const auto one = [](int64_t) { return 1.0; };
+    const auto contact = [&](int64_t i) { return lane_of(scale[i], lane); };
+    auto block = [&](T* to, int64_t width, int64_t column, Input which, int64_t rows, int64_t columns, auto by_row,
+                     auto by_column) {
       const double* from = input(which, e);
       for (int64_t i = 0; i < rows; i++)
-        for (int64_t j = 0; j < columns; j++) put(to, i * width + column + j, lane, from[i * columns + j]);
+        for (int64_t j = 0; j < columns; j++)
+          put(to, i * width + column + j, lane, from[i * columns + j] * (by_row(i) * by_column(j)));
     };
-    block(AB, nw, 0, kA, nx, nx), block(AB, nw, nx, kB, nx, nu), block(C, nl, 0, kC, nx, nl);
-    block(DE, nw, 0, kD, nl, nx), block(DE, nw, nx, kE, nl, nu), block(F, nl, 0, kF, nl, nl);
-    block(Q, nx, 0, kQ, nx, nx), block(R, nu, 0, kR, nu, nu), block(Qf, nx, 0, kQfinal, nx, nx);
+    block(AB, nw, 0, kA, nx, nx, one, one), block(AB, nw, nx, kB, nx, nu, one, one);
+    block(C, nl, 0, kC, nx, nl, one, contact), block(F, nl, 0, kF, nl, nl, contact, contact);
+    block(DE, nw, 0, kD, nl, nx, contact, one), block(DE, nw, nx, kE, nl, nu, contact, one);
+    block(Q, nx, 0, kQ, nx, nx, one, one), block(R, nu, 0, kR, nu, nu, one, one);
+    block(Qf, nx, 0, kQfinal, nx, nx, one, one);
   }
 
   void load(int64_t e, int lane) {
@@ -112,7 +126,23 @@ struct Mpc {
     };
     vector(d, kd, nx), vector(c, kc, nl), vector(q, kq, nx), vector(r, kr, nu), vector(qf, kqfinal, nx);
     vector(lo, kumin, nu), vector(hi, kumax, nu), vector(x0, kx0, nx);
+    for (int64_t i = 0; i < nl; i++) put(c, i, lane, c[i][lane] * lane_of(scale[i], lane));
   }
+
+  // lam to and from the units of the caller.
+  void load_lam(Vec* to, const double* from, int lane, bool dual = false) {
+    const int64_t nl = n.l();
+    for (int64_t i = 0; i < n.h * nl; i++) {
+      const double unit = lane_of(scale[i % nl], lane);
+      put(to, i, lane, dual ? from[i] * unit : from[i] / unit);
+    }
+  }
+  void store_lam(double* to, int lane) const {
+    const int64_t nl = n.l();
+    for (int64_t i = 0; i < n.h * nl; i++) to[i] = lam[i][lane] * lane_of(scale[i % nl], lane);
+  }
+  static double lane_of(double a, int) { return a; }
+  static double lane_of(const Vec& a, int l) { return a[l]; }
 
   static void load_lane(Vec* to, const double* from, int64_t size, int lane) {
     for (int64_t i = 0; i < size; i++) put(to, i, lane, from[i]);
@@ -220,6 +250,7 @@ struct Mpc {
   // ---- backward sweep ----
   struct Sweep {
     Vec projected;  // projected gradient in units of the gradient, with the curvature as the scale of the bounds
+    Vec rounding;   // level below which rounding hides it
     Vec residual;   // difflcs.mpc.kkt.residual
     Vec decrease;   // predicted first-order decrease
     Mask weak;      // a bound is weakly active, or the reduced Hessian is singular
@@ -228,7 +259,7 @@ struct Mpc {
   template <bool kAdjoint>
   Sweep backward(Vec regularisation) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nw = n.w(), h = n.h;
-    Sweep out{all(0), all(0), all(0), Mask{}};
+    Sweep out{all(0), all(0), all(0), all(0), Mask{}};
     Vec costate = all(1);
     for (int64_t i = 0; i < nx; i++) {
       Vec t = qf[i];
@@ -240,8 +271,6 @@ struct Mpc {
       costate = max(costate, abs(t));
       v[i] = kAdjoint ? -xb[h * nx + i] : t;
     }
-    Vec R_scale = all(0);
-    for (int64_t j = 0; j < nu; j++) R_scale = max(R_scale, all(0) + R[j * nu + j]);
     for (int64_t k = h - 1; k >= 0; k--) {
       const Vec *xk = x + k * nx, *uk = u + k * nu, *lk = lam + k * nl, *sk = s + k * nl;
       if (kAdjoint) {
@@ -315,8 +344,11 @@ struct Mpc {
           t += mu * (1.0 / above - 1.0 / below);
           H[(nx + j) * nw + nx + j] += mu * (1.0 / (below * below) + 1.0 / (above * above));
         }
-        Vec g = t, l = kAdjoint ? -ub[k * nu + j] : t;
-        for (int64_t i = 0; i < nx; i++) g += Ah[i * nw + nx + j] * p[i], l += Ah[i * nw + nx + j] * v[i];
+        Vec g = t, l = kAdjoint ? -ub[k * nu + j] : t, terms = abs(t);
+        for (int64_t i = 0; i < nx; i++) {
+          const Vec part = Ah[i * nw + nx + j] * p[i];
+          g += part, terms += abs(part), l += Ah[i * nw + nx + j] * v[i];
+        }
         if (kAdjoint)
           for (int64_t m = 0; m < nl; m++) l -= Kl[m * nw + nx + j] * lb[k * nl + m];
         lin[nx + j] = l;
@@ -329,6 +361,7 @@ struct Mpc {
         // Next to a bound the barrier is so steep that rounding u alone moves g: a step below rounding counts as none.
         if (batch.barrier > 0) projected = select(abs(g) <= 1e-14 * width * gauss_newton, all(0), projected);
         out.projected = max(out.projected, projected);
+        out.rounding = max(out.rounding, 1e-12 * terms);
         const Vec curved = max(H[(nx + j) * nw + nx + j] + curvature(nx + j, nx + j), all(kTiny));
         const Vec step = g / curved;
         if (batch.barrier == 0)
@@ -355,24 +388,26 @@ struct Mpc {
         pn[i] = a, lin[i] = l;
         costate = max(costate, abs(a));
       }
+      // Curvature that action j has at least, whatever its units.
+      auto action_scale = [&](int64_t j) {
+        return max(R[j * nu + j] + 1e-6 * abs(H[(nx + j) * nw + nx + j]), all(kTiny));
+      };
       // Cholesky of H_uu + Y_uu + regularisation with identity rows for active actions. An indefinite block first drops
       // Y at this stage (Gauss-Newton), then has its pivots lifted.
       const Mask* active = act + k * nu;
-      Vec H_scale = all(kTiny);
-      for (int64_t j = 0; j < nu; j++) H_scale = max(H_scale, abs(H[(nx + j) * nw + nx + j]));
-      const Vec lift = kAdjoint ? 1e-10 * H_scale : max(0.05 * R_scale, 1e-8 * H_scale);
       Vec use = all(1);
       for (int attempt = 0; attempt < 2; attempt++) {
         Mask failed = Mask{};
         for (int64_t i = 0; i < nu; i++)
           for (int64_t j = 0; j <= i; j++) {
             Vec t = H[(nx + i) * nw + nx + j] + use * curvature(nx + i, nx + j);
-            if (i == j && !kAdjoint) t += regularisation;
+            if (i == j && !kAdjoint) t += regularisation * action_scale(j);
             Lc[i * nu + j] = select(active[i] | active[j], all(i == j), t);
           }
         for (int64_t j = 0; j < nu; j++) {
           Vec pivot = Lc[j * nu + j];
           for (int64_t m = 0; m < j; m++) pivot -= Lc[j * nu + m] * Lc[j * nu + m];
+          const Vec lift = kAdjoint ? 1e-10 * abs(H[(nx + j) * nw + nx + j]) : 0.05 * action_scale(j);
           const Mask bad = ~(pivot >= lift) & ~active[j];
           failed |= bad;
           const Vec inverse = 1.0 / sqrt(select(bad, max(abs(pivot), lift), pivot));
@@ -503,7 +538,7 @@ struct Mpc {
           const double a = lo[j][l] + margin, b = hi[j][l] - margin, value = u[k * nu + j][l];
           put(u, k * nu + j, l, value < a ? a : value > b ? b : value);
         }
-      if (o.lam_start) load_lane(lam, o.lam_start + e * h * nl, h * nl, l);
+      if (o.lam_start) load_lam(lam, o.lam_start + e * h * nl, l);
       else for (int64_t i = 0; i < h * nl; i++) put(lam, i, l, __builtin_sqrt(o.first_relaxation));
       return true;
     };
@@ -525,12 +560,15 @@ struct Mpc {
       for (int l = 0; l < kLanes; l++) {
         if (idle[l] || eps[l] > target) continue;
         Lane& a = lane[l];
-        const bool converged = sweep.projected[l] <= o.tol, broken = !(J[l] < 1e300 && J[l] > -1e300);
+        const double tol = o.tol > sweep.rounding[l] ? o.tol : sweep.rounding[l];
+        // A search that fails this close to the optimum has met the rounding of the cost.
+        const bool converged = sweep.projected[l] <= (a.failures < 7 ? tol : 1e3 * tol);
+        const bool broken = !(J[l] < 1e300 && J[l] > -1e300);
         if (!converged && !broken && a.iterations < o.max_iter && a.failures < 7) continue;
         const int64_t e = a.element;
         store_lane(o.x + e * (h + 1) * nx, x, (h + 1) * nx, l);
         store_lane(o.u + e * h * nu, u, h * nu, l);
-        store_lane(o.lam + e * h * nl, lam, h * nl, l);
+        store_lam(o.lam + e * h * nl, l);
         o.objective[e] = J[l], o.residual[e] = sweep.residual[l], o.iterations[e] = int32_t(a.iterations);
         const Status status = converged && !broken ? (sweep.weak[l] ? Status::degenerate : Status::converged)
                               : a.iterations >= o.max_iter ? Status::max_iter
@@ -561,15 +599,10 @@ struct Mpc {
         Lane& a = lane[l];
         a.iterations++, a.in_stage++;
         a.failures = moved[l] ? 0 : a.failures + 1;
-        double scale = 0;
-        for (int64_t j = 0; j < nu; j++) {
-          const double entry = lane_of(R[j * nu + j], l);
-          scale = entry > scale ? entry : scale;
-        }
-        scale = scale > 0 ? scale : 1.0;
+        // Levenberg-Marquardt, in units of each action's own curvature.
         double& reg = reinterpret_cast<double*>(&regularisation)[l];
-        if (!moved[l]) reg = reg * 8 > scale ? reg * 8 : scale;
-        else if (step[l] >= 0.3) reg = reg * 0.125 < 0.5 * scale ? 0 : reg * 0.125;
+        if (!moved[l]) reg = reg * 8 > 1 ? reg * 8 : 1;
+        else if (step[l] >= 0.3) reg = reg * 0.125 < 0.5 ? 0 : reg * 0.125;
         // Two steps per stage of the homotopy, fewer where the stage is solved.
         if (eps[l] > target && (a.in_stage >= 2 || sweep.projected[l] < 1e4 * o.tol || a.failures > 0)) {
           eps[l] = eps[l] * o.shrink > target ? eps[l] * o.shrink : target;
@@ -579,9 +612,6 @@ struct Mpc {
       }
     }
   }
-
-  static double lane_of(double a, int) { return a; }
-  static double lane_of(const Vec& a, int l) { return a[l]; }
 
   // ---- adjoint ----
   void vjp(const MpcGradient& o, int64_t begin, int64_t end, int64_t block) {
@@ -593,8 +623,8 @@ struct Mpc {
         const int64_t e = group + l < end ? group + l : end - 1;
         load(e, l);
         load_lane(x, o.x + e * (h + 1) * nx, (h + 1) * nx, l), load_lane(u, o.u + e * h * nu, h * nu, l);
-        load_lane(lam, o.lam + e * h * nl, h * nl, l), load_lane(xb, o.x_bar + e * (h + 1) * nx, (h + 1) * nx, l);
-        load_lane(ub, o.u_bar + e * h * nu, h * nu, l), load_lane(lb, o.lam_bar + e * h * nl, h * nl, l);
+        load_lam(lam, o.lam + e * h * nl, l), load_lane(xb, o.x_bar + e * (h + 1) * nx, (h + 1) * nx, l);
+        load_lane(ub, o.u_bar + e * h * nu, h * nu, l), load_lam(lb, o.lam_bar + e * h * nl, l, true);
         jb[l] = o.objective_bar[e];
         valid[l] = group + l < end && o.solved[e] ? -1 : 0;
       }
@@ -704,17 +734,18 @@ void Mpc<T, S>::forward_adjoint(const MpcGradient& o, int64_t group, int64_t end
     for (int64_t i = 0; i < nx; i++) {
       for (int64_t j = 0; j < nx; j++) sink.add(kA, i * nx + j, -(dp[i] * xk[j] + pk[i] * dw[j]));
       for (int64_t j = 0; j < nu; j++) sink.add(kB, i * nu + j, -(dp[i] * uk[j] + pk[i] * dw[nx + j]));
-      for (int64_t j = 0; j < nl; j++) sink.add(kC, i * nl + j, -(dp[i] * lk[j] + pk[i] * dlam[j]));
+      for (int64_t j = 0; j < nl; j++) sink.add(kC, i * nl + j, -scale[j] * (dp[i] * lk[j] + pk[i] * dlam[j]));
       sink.add(kd, i, -dp[i]);
       for (int64_t j = 0; j < nx; j++)
         sink.add(kQ, i * nx + j, 0.5 * (jb * xk[i] * xk[j] - dw[i] * xk[j] - dw[j] * xk[i]));
       sink.add(kq, i, jb * xk[i] - dw[i]);
     }
     for (int64_t i = 0; i < nl; i++) {
-      for (int64_t j = 0; j < nx; j++) sink.add(kD, i * nx + j, -(drho[i] * xk[j] + rho[i] * dw[j]));
-      for (int64_t j = 0; j < nu; j++) sink.add(kE, i * nu + j, -(drho[i] * uk[j] + rho[i] * dw[nx + j]));
-      for (int64_t j = 0; j < nl; j++) sink.add(kF, i * nl + j, -(drho[i] * lk[j] + rho[i] * dlam[j]));
-      sink.add(kc, i, -drho[i]);
+      for (int64_t j = 0; j < nx; j++) sink.add(kD, i * nx + j, -scale[i] * (drho[i] * xk[j] + rho[i] * dw[j]));
+      for (int64_t j = 0; j < nu; j++) sink.add(kE, i * nu + j, -scale[i] * (drho[i] * uk[j] + rho[i] * dw[nx + j]));
+      for (int64_t j = 0; j < nl; j++)
+        sink.add(kF, i * nl + j, -(scale[i] * scale[j]) * (drho[i] * lk[j] + rho[i] * dlam[j]));
+      sink.add(kc, i, -scale[i] * drho[i]);
     }
     for (int64_t i = 0; i < nu; i++) {
       for (int64_t j = 0; j < nu; j++)
