@@ -17,7 +17,7 @@ def describe(value: object) -> str:
     """A short description of a value for an error message."""
     if isinstance(value, Tensor):
         return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')} on {value.device}"
-    return f"{type(value).__name__} {value!r}"[:120]
+    return f"{type(value).__name__} {' '.join(repr(value).split())}"[:120]
 
 
 def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (), finite: bool = True) -> Tensor:
@@ -75,20 +75,20 @@ def check_same_device(tensors: Iterable[tuple[str, Tensor]]) -> None:
 def check_positive_int(name: str, value: object, minimum: int = 1) -> int:
     """Check an integer of at least `minimum`."""
     if isinstance(value, bool) or not isinstance(value, int):
-        raise DTypeError(f"{name}: expected an int, got {describe(value)}")
+        raise DTypeError(f"{name}: expected an int, got {describe(value)}; convert it with int(...)")
     if value < minimum:
-        raise InvalidInputError(f"{name}: expected at least {minimum}, got {value}")
+        raise InvalidInputError(f"{name}: expected at least {minimum}, got {value}; pass a larger one")
     return value
 
 
 def check_number(name: str, value: object, minimum: float = 0.0, strict: bool = False) -> float:
     """Check a finite real number, at least (`strict`: above) `minimum`."""
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise DTypeError(f"{name}: expected a number, got {describe(value)}")
+        raise DTypeError(f"{name}: expected a number, got {describe(value)}; convert it with float(...)")
     too_small = value <= minimum if strict else value < minimum
     if not (value == value and abs(value) != float("inf")) or too_small:
         relation = "above" if strict else "at least"
-        raise InvalidInputError(f"{name}: expected a finite number {relation} {minimum:g}, got {value!r}")
+        raise InvalidInputError(f"{name}: expected a finite number {relation} {minimum:g}, got {value!r}; change it")
     return float(value)
 
 

@@ -40,18 +40,19 @@ def write_json(path: Path, value: object) -> None:
 def save_record(directory: Path, kind: str, config: Mapping[str, object], tensors: Mapping[str, Tensor]) -> None:
     """Write `model.safetensors` and `config.json` into a directory, each atomically.
 
-    The tensor file carries a hash of its own values (safetensors alone does not notice flipped bits), so that a crash
-    between the two writes leaves two valid files.
+    The tensor file carries a hash of its values (safetensors alone does not notice flipped bits) and of the description.
+    A crash between the two writes leaves files that fit each other whenever only the values have changed.
     """
     from safetensors.torch import save
 
     values = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
-    write_atomically(directory / "model.safetensors", save(values, metadata={"sha256": _hash(values)}))
-    write_json(directory / "config.json", {"format": _FORMAT, "kind": kind, "config": dict(config)})
+    header = {"format": _FORMAT, "kind": kind, "config": dict(config)}
+    write_atomically(directory / "model.safetensors", save(values, metadata={"sha256": _hash(header, values)}))
+    write_json(directory / "config.json", header)
 
 
-def _hash(tensors: Mapping[str, Tensor]) -> str:
-    digest = hashlib.sha256()
+def _hash(header: Mapping[str, object], tensors: Mapping[str, Tensor]) -> str:
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(tensors):
         digest.update(f"{name} {tuple(tensors[name].shape)} {tensors[name].dtype}".encode())
         digest.update(tensors[name].contiguous().view(-1).numpy().tobytes())
@@ -74,7 +75,7 @@ def load_record(directory: Path, kind: str) -> tuple[dict[str, object], dict[str
             tensors = {name: file.get_tensor(name) for name in file.keys()}
     except FileNotFoundError as error:
         raise CheckpointError(f"{directory}: a file is missing ({error}); {remedy}") from error
-    except (OSError, SafetensorError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, SafetensorError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise CheckpointError(f"{directory}: corrupt or not a checkpoint ({error}); {remedy}") from error
     if not isinstance(header, dict) or header.get("kind") != kind or not isinstance(header.get("config"), dict):
         got = header.get("kind") if isinstance(header, dict) else type(header).__name__
@@ -83,6 +84,8 @@ def load_record(directory: Path, kind: str) -> tuple[dict[str, object], dict[str
         raise CheckpointError(
             f"{directory}: expected format {_FORMAT}, got {header.get('format')!r}; update difflcs or save it again"
         )
-    if metadata.get("sha256") != _hash(tensors):
-        raise CheckpointError(f"{directory}: model.safetensors does not match its checksum; copy or save it again")
+    if metadata.get("sha256") != _hash(header, tensors):
+        raise CheckpointError(
+            f"{directory}: config.json and model.safetensors do not match their checksum; copy or save them again"
+        )
     return header["config"], tensors

@@ -69,7 +69,9 @@ class QuadraticCost(_TensorFields):
         for name, value in (("Q", Q), ("R", R), ("Q_final", Q_final)):
             check_tensor(name, value)
             if value.ndim < 2 or value.shape[-1] != value.shape[-2]:
-                raise ShapeError(f"{name}: expected a square matrix (..., n, n), got {describe(value)}")
+                raise ShapeError(
+                    f"{name}: expected a square matrix (..., n, n), got {describe(value)}; pass the weight matrix"
+                )
         self.n_x, self.n_u = Q.shape[-1], R.shape[-1]
         fields = {
             "Q": Q,

@@ -70,6 +70,12 @@ class LCSParams:
         for name, dim in dims.items():
             check_tensor(name, getattr(self, name), dim, finite=False)
         check_same_device([(f.name, getattr(self, f.name)) for f in fields(self)])
+        for f in fields(self):
+            if getattr(self, f.name).dtype != self.A.dtype:
+                raise DTypeError(
+                    f"{f.name}: expected {self.A.dtype} like A, got {describe(getattr(self, f.name))}; "
+                    f"convert it with {f.name}.to({self.A.dtype})"
+                )
         self.batch_shape  # noqa: B018  raises where the batch dimensions do not fit each other
         check_positive_definite(self.F)
 
@@ -325,7 +331,9 @@ class LCSModel(nn.Module):
         try:
             dtype = {"float32": torch.float32, "float64": torch.float64}[str(config["dtype"])]
             sizes = {k: config[k] for k in ("n_x", "n_u", "n_lam", "stiffness")}
-            model = cls(**sizes, learn_c=bool(config["learn_c"]), dtype=dtype)  # pyright: ignore[reportArgumentType]
+            if not isinstance(config["learn_c"], bool):
+                raise DTypeError(f"learn_c: expected true or false, got {config['learn_c']!r}; save the model again")
+            model = cls(**sizes, learn_c=config["learn_c"], dtype=dtype)  # pyright: ignore[reportArgumentType]
         except (InvalidInputError, KeyError) as error:
             raise CheckpointError(f"{source}: its configuration cannot be used: {error}") from error
         shapes = {k: tuple(v.shape) for k, v in tensors.items()}

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_choice, check_number
+from difflcs._checks import broadcast_batch, check_choice, check_number, check_tensor
 from difflcs.errors import DoubleBackwardError, GammaError, NotPositiveDefiniteError, SolveError
 from difflcs.lcp import solve_lcp_arrays
 from difflcs.lcs import LCSModel
@@ -56,6 +56,9 @@ def violation_loss(
     check_number("xi", xi, strict=True)
     lcs.check_inputs(x=x, u=u, x_next=x_next)
     F = lcs.F
+    for name in "ABCdDEc":
+        check_tensor(name, getattr(lcs, name))
+    check_tensor("F", F)
     _check_gamma(F, gamma, check_gamma)
     batch = broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1]), ("x_next", x_next.shape[:-1])])
     x, u, x_next = (v.expand(*batch, v.shape[-1]).reshape(-1, v.shape[-1]) for v in (x, u, x_next))

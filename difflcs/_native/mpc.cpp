@@ -40,7 +40,7 @@ struct Mpc {
   T* scale;
   Vec *d, *c, *q, *r, *qf, *lo, *hi, *x0;
   // Trajectory, trial trajectory, and the feedback law.
-  Vec *x, *u, *lam, *s, *xt, *ut, *lamt, *st, *K, *kf;
+  Vec *x, *u, *lam, *s, *xt, *ut, *lamt, *st, *K, *kf, *grad;
   // Scratch of the backward sweep and of the LCP.
   Vec *P, *Pn, *v, *vn, *p, *pn, *M, *Kl, *Ks, *Ah, *PA, *H, *lin, *Lc, *Kk, *y, *size, *gap, *res, *wt, *dl;
   // Kept per stage for the adjoint.
@@ -66,6 +66,7 @@ struct Mpc {
     vec(d, nx), vec(c, nl), vec(q, nx), vec(r, nu), vec(qf, nx), vec(lo, nu), vec(hi, nu), vec(x0, nx);
     vec(x, (h + 1) * nx), vec(u, h * nu), vec(lam, h * nl), vec(s, h * nl);
     vec(xt, (h + 1) * nx), vec(ut, h * nu), vec(lamt, h * nl), vec(st, h * nl), vec(K, h * nu * nx), vec(kf, h * nu);
+    vec(grad, h * nu);
     vec(P, nx * nx), vec(Pn, nx * nx), vec(v, nx), vec(vn, nx), vec(p, nx), vec(pn, nx), vec(M, nl * nl);
     vec(Kl, nl * nw), vec(Ks, nl * nw), vec(Ah, nx * nw), vec(PA, nx * nw), vec(H, nw * nw), vec(lin, nw);
     vec(Lc, nu * nu), vec(Kk, nu * (nx + 1)), vec(y, nl), vec(size, nl), vec(gap, nl), vec(res, nl), vec(wt, nl);
@@ -252,14 +253,13 @@ struct Mpc {
     Vec projected;  // projected gradient in units of the gradient, with the curvature as the scale of the bounds
     Vec rounding;   // level below which rounding hides it
     Vec residual;   // difflcs.mpc.kkt.residual
-    Vec decrease;   // predicted first-order decrease
     Mask weak;      // a bound is weakly active, or the reduced Hessian is singular
   };
 
   template <bool kAdjoint>
   Sweep backward(Vec regularisation) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nw = n.w(), h = n.h;
-    Sweep out{all(0), all(0), all(0), all(0), Mask{}};
+    Sweep out{all(0), all(0), all(0), Mask{}};
     Vec costate = all(1);
     for (int64_t i = 0; i < nx; i++) {
       Vec t = qf[i];
@@ -351,7 +351,7 @@ struct Mpc {
         }
         if (kAdjoint)
           for (int64_t m = 0; m < nl; m++) l -= Kl[m * nw + nx + j] * lb[k * nl + m];
-        lin[nx + j] = l;
+        lin[nx + j] = l, grad[k * nu + j] = g;
         // Away from an optimum P, and with it H, can be indefinite: |H| is still a scale for the distance to a bound.
         const Vec gauss_newton = max(max(abs(H[(nx + j) * nw + nx + j]), all(0) + R[j * nu + j]), all(kTiny));
         const Vec clipped = max(lo[j], min(hi[j], uk[j] - g));
@@ -441,7 +441,6 @@ struct Mpc {
           for (int64_t j = from; j < columns; j++) Kk[i * columns + j] -= Lc[i * nu + m] * Kk[m * columns + j];
         for (int64_t j = from; j < columns; j++) Kk[i * columns + j] *= Lc[i * nu + i];
       }
-      for (int64_t i = 0; i < nu; i++) out.decrease += Kk[i * columns + nx] * Kk[i * columns + nx];
       if (k > 0) {
         for (int64_t i = 0; i < nx; i++) {
           for (int64_t j = 0; j <= i; j++) {
@@ -461,7 +460,9 @@ struct Mpc {
       }
       for (int64_t i = 0; i < nu; i++) {
         for (int64_t j = 0; j < nx; j++) K[(k * nu + i) * nx + j] = Kk[i * columns + j];
-        kf[k * nu + i] = Kk[i * columns + nx];
+        // An action held at a bound goes onto it exactly.
+        const Vec bound = select(low[k * nu + i], lo[i] - uk[i], select(upp[k * nu + i], hi[i] - uk[i], all(0)));
+        kf[k * nu + i] = kAdjoint ? Kk[i * columns + nx] : select(active[i], bound, Kk[i * columns + nx]);
       }
       for (int64_t i = 0; i < nx; i++) p[i] = pn[i];
       if (k > 0) {
@@ -583,7 +584,10 @@ struct Mpc {
       Mask accepted = frozen;
       for (int search = 0; search < 5; search++) {
         const Vec value = trial(eps, step, frozen, accepted);
-        const Mask good = (value <= J - 1e-4 * step * sweep.decrease + 1e-13 * (1.0 + abs(J))) & ~accepted;
+        // First-order change of the cost along the step as it was clipped: grad is dJ/du of the whole trajectory.
+        Vec slope = all(0);
+        for (int64_t i = 0; i < h * nu; i++) slope += grad[i] * (ut[i] - u[i]);
+        const Mask good = (value <= J + 1e-4 * min(slope, all(0)) + 1e-13 * (1.0 + abs(J))) & ~accepted;
         J_trial = select(good, value, J_trial);
         accepted |= good;
         if (!any(~accepted)) break;

@@ -178,7 +178,9 @@ class LCSMPCLayer(nn.Module):
                 raise ShapeError("goal: expected none with a QuadraticCost, got one; use a GoalCost to plan to goals")
             return self.cost
         if goal is None:
-            raise ShapeError(f"goal: expected (..., n_goal={self.cost.n_goal}) with a GoalCost, got none")
+            raise ShapeError(
+                f"goal: expected (..., n_goal={self.cost.n_goal}) with a GoalCost, got none; call mpc(x0, goal)"
+            )
         return self.cost(goal, horizon=self.horizon)
 
     def _bound(self, name: str, value: Bound) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import math
 import os
 import socket
 import subprocess
@@ -72,11 +73,12 @@ class IpoptBackend(Backend):
             self.tol, self.max_iter, self.mu_init if guess is None else self.mu_init_warm, problem.barrier > 0
         )
         chunk = self._start(problem, guess, sizes)
-        workers = min(self.workers or len(os.sched_getaffinity(0)), problem.batch)
+        workers = min(self.workers or _cpus(), problem.batch)
         if workers <= 1:
-            solved = solve_chunk(sizes, options, chunk)
+            with _locals.here:
+                solved = solve_chunk(sizes, options, chunk)
         else:
-            solved = _pool().solve(sizes, options, chunk, workers)
+            solved = _locals.pool.solve(sizes, options, chunk, workers)
         x, u, lam, status, iterations, seconds = (torch.from_numpy(v) for v in solved)
         primal = Primal(torch.cat([problem.x0.unsqueeze(1), x], 1), u, lam)
         usable = (status == Status.CONVERGED) & torch.isfinite(u).all(-1).all(-1)
@@ -95,7 +97,8 @@ class IpoptBackend(Backend):
         for name in parameter_shapes(sizes):
             value = torch.as_tensor(getattr(problem, name), dtype=torch.float64)
             shared = value.ndim == 0 or problem.shared(name)
-            flat.append(value.reshape(1 if shared else batch, -1).expand(batch, -1))
+            size = value.numel() if shared else math.prod(problem.shape(name))
+            flat.append(value.reshape(1 if shared else batch, size).expand(batch, size))
         if guess is None:
             x = problem.x0.unsqueeze(1).expand(batch, horizon, -1)
             u = problem.start(torch.zeros(batch, horizon, problem.n_u, dtype=torch.float64))
@@ -205,14 +208,20 @@ class _Pool:
         self.workers[slot] = _Worker()
 
 
-_pools: dict[int, _Pool] = {}
+def _cpus() -> int:
+    """CPUs this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _pool() -> _Pool:
-    """This process's pool: a forked child must not talk to its parent's workers."""
-    pid = os.getpid()
-    if pid not in _pools:
-        _pools.clear()
-        _pools[pid] = _Pool()
-        atexit.register(_pools[pid].close)
-    return _pools[pid]
+class _Locals:
+    """What belongs to this process alone: a forked child must neither talk to its parent's workers nor hold its locks."""
+
+    def __init__(self):
+        self.here = threading.Lock()  # IPOPT in several threads of one process crashes
+        self.pool = _Pool()
+
+
+_locals = _Locals()
+atexit.register(lambda: _locals.pool.close())
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_locals.__init__)

@@ -1,0 +1,122 @@
+"""Shared builders of small models, as fixtures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from difflcs import GoalCost, LCSModel, LCSParams, QuadraticCost
+
+
+class Build:
+    """Random but reproducible systems, costs and references; nothing here calls the code under test."""
+
+    @staticmethod
+    def normal(seed: int) -> Callable[..., Tensor]:
+        """A function shape → standard normal float64 numbers."""
+        generator = torch.Generator().manual_seed(seed)
+        return lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    @staticmethod
+    def lcs_tensors(
+        seed: int = 0, n_x: int = 4, n_u: int = 2, n_lam: int = 3, batch: tuple[int, ...] = ()
+    ) -> dict[str, Tensor]:
+        """A stable system whose contacts open and close for states and actions of size 0.1."""
+        n = Build.normal(seed)
+        G, H = 0.5 * n(*batch, n_lam, n_lam), 0.3 * n(*batch, n_lam, n_lam)
+        return {
+            "A": 0.9 * torch.eye(n_x, dtype=torch.float64) + 0.05 * n(*batch, n_x, n_x),
+            "B": 0.5 * n(*batch, n_x, n_u),
+            "C": 0.4 * n(*batch, n_x, n_lam),
+            "d": 0.005 * n(*batch, n_x),
+            "D": n(*batch, n_lam, n_x),
+            "E": n(*batch, n_lam, n_u),
+            "F": G @ G.mT + 0.4 * torch.eye(n_lam, dtype=torch.float64) + H - H.mT,
+            "c": 0.02 * n(*batch, n_lam),
+        }
+
+    @staticmethod
+    def params(seed: int = 0, **sizes) -> LCSParams:
+        return LCSParams(**Build.lcs_tensors(seed, **sizes))
+
+    @staticmethod
+    def model(
+        seed: int = 0, n_x: int = 4, n_u: int = 2, n_lam: int = 3, scale: float = 0.5, dtype=torch.float64
+    ) -> LCSModel:
+        """A model with parameters large enough for contacts to matter."""
+        model = LCSModel(n_x, n_u, n_lam, stiffness=0.2, dtype=dtype)
+        n = Build.normal(seed)
+        with torch.no_grad():
+            for parameter in model.parameters():
+                parameter.copy_(scale * n(*parameter.shape))
+        return model
+
+    @staticmethod
+    def cost_tensors(seed: int = 0, n_x: int = 4, n_u: int = 2, batch: tuple[int, ...] = ()) -> dict[str, Tensor]:
+        n = Build.normal(seed + 1000)
+
+        def definite(size: int) -> Tensor:
+            root = 0.4 * n(*batch, size, size)
+            return root @ root.mT + 0.5 * torch.eye(size, dtype=torch.float64)
+
+        return {
+            "Q": definite(n_x),
+            "R": definite(n_u),
+            "Q_final": 3 * definite(n_x),
+            "q": 0.1 * n(*batch, n_x),
+            "r": 0.1 * n(*batch, n_u),
+            "q_final": 0.1 * n(*batch, n_x),
+        }
+
+    @staticmethod
+    def cost(seed: int = 0, **sizes) -> QuadraticCost:
+        return QuadraticCost(**Build.cost_tensors(seed, **sizes))
+
+    @staticmethod
+    def paper_cost(dtype=torch.float64) -> GoalCost:
+        """Eq. cost_function of the paper: nine states (cube x, y, yaw; three fingertips), six actions."""
+        pairs = [(3, 0), (4, 1), (5, 0), (6, 1), (7, 0), (8, 1)]
+        return GoalCost.reach(9, 6, (200.0, 200.0, 0.3), (200.0, 200.0, 1.5), 200.0, pairs, 10.0, 6.0, dtype=dtype)
+
+    @staticmethod
+    def pushing(seed: int = 0, n_lam: int = 5) -> LCSParams:
+        """A synthetic pushing model of the paper's size."""
+        n = Build.normal(seed)
+        G, H = 0.5 * n(n_lam, n_lam), 0.3 * n(n_lam, n_lam)
+        B = 0.05 * n(9, 6)
+        B[3:] += torch.eye(6, dtype=torch.float64)
+        return LCSParams(
+            A=torch.eye(9, dtype=torch.float64) + 0.02 * n(9, 9),
+            B=B,
+            C=0.3 * n(9, n_lam),
+            d=0.001 * n(9),
+            D=n(n_lam, 9),
+            E=2 * n(n_lam, 6),
+            F=G @ G.mT + 0.3 * torch.eye(n_lam, dtype=torch.float64) + H - H.mT,
+            c=0.02 * n(n_lam),
+        )
+
+    @staticmethod
+    def enumerate_lcp(F: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
+        """λ, w of one P-matrix LCP: the most feasible of all 2ⁿ complementary bases, in scaled units."""
+        n = len(q)
+        scale = F.diagonal().rsqrt()
+        F = scale[:, None] * F * scale
+        size = (scale * q).abs().max().clamp_min(1e-300)
+        q = scale * q / size
+        chosen = torch.from_numpy((np.arange(2**n)[:, None] >> np.arange(n) & 1).astype(bool))
+        M = torch.where(chosen[:, :, None] & chosen[:, None, :], F, torch.eye(n, dtype=F.dtype))
+        lam = torch.linalg.solve_ex(M, torch.where(chosen, -q, 0.0))[0]
+        w = lam @ F.T + q
+        best = torch.minimum(lam, w).amin(1).nan_to_num(nan=-torch.inf).argmax()
+        lam, w = lam[best].clamp_min(0), torch.where(chosen[best], 0.0, w[best]).clamp_min(0)
+        return lam * size * scale, w * size / scale
+
+
+@pytest.fixture(scope="session")
+def build() -> type[Build]:
+    return Build

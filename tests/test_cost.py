@@ -1,0 +1,181 @@
+"""QuadraticCost and GoalCost: their value, convexity and gradients."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import re
+
+import pytest
+import torch
+from torch import nn
+
+from difflcs import GoalCost, LCSMPCLayer, QuadraticCost
+from difflcs.errors import DTypeError, InvalidInputError, ShapeError
+
+
+def evaluate(cost, x, u):
+    """The stage and final sums of a QuadraticCost, written out; x (H+1, n_x), u (H, n_u)."""
+    total = float(cost.constant)
+    for k in range(len(u)):
+        total += float(0.5 * x[k] @ cost.Q @ x[k] + cost.q @ x[k] + 0.5 * u[k] @ cost.R @ u[k] + cost.r @ u[k])
+    return total + float(0.5 * x[-1] @ cost.Q_final @ x[-1] + cost.q_final @ x[-1])
+
+
+def paper(x, u, goal):
+    """Eq. cost_function of the paper, literally: cube x, y, yaw, then three fingertips."""
+
+    def near(x, weight):
+        return weight * sum(float((x[3 + 2 * i : 5 + 2 * i] - x[:2]).square().sum()) for i in range(3))
+
+    def stage(x, u):
+        return (
+            near(x, 10.0)
+            + 200.0 * float((x[:2] - goal[:2]).square().sum())
+            + 0.3 * float((x[2] - goal[2]).square())
+            + 200.0 * float(u.square().sum())
+        )
+
+    final = (
+        near(x[-1], 6.0)
+        + 200.0 * float((x[-1, :2] - goal[:2]).square().sum())
+        + 1.5 * float((x[-1, 2] - goal[2]).square())
+    )
+    return sum(stage(x[k], u[k]) for k in range(len(u))) + final
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_reach_is_the_cost_of_the_paper_with_its_constant(build, seed):
+    n = build.normal(seed)
+    x, u, goal = n(6, 9), n(5, 6), n(3)
+    assert evaluate(build.paper_cost()(goal, horizon=5), x, u) == pytest.approx(paper(x, u, goal), rel=1e-12)
+
+
+def test_the_objective_of_a_plan_is_the_cost_of_the_paper_on_its_trajectory(build):
+    n = build.normal(1)
+    x0, goal = 0.05 * n(4, 9), 0.05 * n(4, 3)
+    solution = LCSMPCLayer(build.pushing(), build.paper_cost(), 5, -0.015, 0.015, backend="ipopt")(x0, goal)
+    for i in range(4):
+        expected = paper(solution.x[i], solution.u[i], goal[i])
+        assert float(solution.objective[i]) == pytest.approx(expected, rel=1e-10)
+
+
+def test_the_objective_of_a_quadratic_cost_is_its_value_on_the_trajectory(build):
+    cost = QuadraticCost(**build.cost_tensors(2), constant=torch.tensor(7.5, dtype=torch.float64))
+    solution = LCSMPCLayer(build.params(2), cost, 3, -0.2, 0.2, backend="ipopt")(0.2 * build.normal(2)(4))
+    assert float(solution.objective) == pytest.approx(evaluate(cost, solution.x, solution.u), rel=1e-12)
+
+
+def test_only_the_symmetric_parts_matter(build):
+    tensors = build.cost_tensors(0)
+    skew = build.normal(0)(4, 4)
+    bent = QuadraticCost(**{**tensors, "Q": tensors["Q"] + skew - skew.T})
+    torch.testing.assert_close(bent.fields()["Q"], tensors["Q"])
+
+
+def test_missing_linear_terms_are_zero(build):
+    tensors = build.cost_tensors(0)
+    cost = QuadraticCost(tensors["Q"], tensors["R"], tensors["Q_final"])
+    assert all(float(getattr(cost, k).abs().max()) == 0 for k in ("q", "r", "q_final", "constant"))
+
+
+def test_one_weight_for_all_states():
+    cost = GoalCost.reach(3, 2, goal_weight=2.0, input_weight=0.5)
+    assert cost.n_goal == 3
+    x, u, goal = torch.ones(2, 3).double(), torch.ones(1, 2).double(), torch.zeros(3).double()
+    assert evaluate(cost(goal), x, u) == pytest.approx(2 * 3 + 0.5 * 2 + 2 * 3)
+
+
+def test_goals_of_any_batch_shape(build):
+    cost, goal = build.paper_cost(), build.normal(0)(2, 5, 3)
+    mapped = cost(goal, horizon=4)
+    assert mapped.q.shape == mapped.q_final.shape == (2, 5, 9)
+    assert mapped.constant.shape == (2, 5)
+    torch.testing.assert_close(mapped.q[1, 3], cost(goal[1, 3]).q)
+
+
+def test_gradients_reach_the_goal_and_every_weight(build):
+    base = build.paper_cost()
+    cost = GoalCost(*(nn.Parameter(getattr(base, k).clone()) for k in (
+        "Q", "R", "Q_final", "goal_to_q", "goal_to_q_final", "goal_stage", "goal_final")))  # fmt: skip
+    assert len(list(cost.parameters())) == 7
+    n = build.normal(3)
+    x0, goal = 0.05 * n(3, 9), (0.05 * n(3, 3)).requires_grad_()
+    solution = LCSMPCLayer(build.pushing(), cost, 5, -0.015, 0.015, backend="ipopt")(x0, goal)
+    solution.objective.sum().backward()
+    for value in (goal, *cost.parameters()):
+        assert bool(torch.isfinite(value.grad).all())
+        assert float(value.grad.abs().max()) > 0
+    # Envelope: by hand, with the trajectory held.
+    x = solution.x.detach()
+    held = goal.detach().clone().requires_grad_()
+    again = cost(held, horizon=5)
+    value = sum((again.q * x[:, k]).sum() for k in range(5)) + (again.q_final * x[:, 5]).sum() + again.constant.sum()
+    torch.testing.assert_close(goal.grad, torch.autograd.grad(value, held)[0], rtol=1e-6, atol=1e-9)
+
+
+def test_parameters_are_learned_and_plain_tensors_are_buffers(build):
+    tensors = build.cost_tensors(0)
+    cost = QuadraticCost(**{**tensors, "Q": nn.Parameter(tensors["Q"])})
+    assert [name for name, _ in cost.named_parameters()] == ["Q"]
+    assert {name for name, _ in cost.named_buffers()} == {"R", "Q_final", "q", "r", "q_final", "constant"}
+    assert "Q(4, 4)" in repr(cost)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))])
+def test_copies_and_state_dicts_keep_the_values(build, copied):
+    for cost in (build.cost(0), build.paper_cost()):
+        twin = copied(cost)
+        assert all(torch.equal(v, twin.state_dict()[k]) for k, v in cost.state_dict().items())
+        twin.load_state_dict(cost.state_dict())
+
+
+@pytest.mark.parametrize("name", ["Q", "R", "Q_final"])
+def test_a_weight_with_a_negative_eigenvalue_is_refused(build, name):
+    tensors = build.cost_tensors(0)
+    tensors[name] = tensors[name] - 10 * torch.eye(len(tensors[name]))
+    smallest = float(torch.linalg.eigvalsh(tensors[name])[0])
+    with pytest.raises(
+        InvalidInputError, match=f"{name}: expected a positive semi-definite.*{re.escape(f'{smallest:.3e}')}"
+    ):
+        QuadraticCost(**tensors)
+
+
+def test_one_bad_weight_of_a_batch_is_refused(build):
+    tensors = build.cost_tensors(0)
+    Q = tensors["Q"].expand(3, 4, 4).clone()
+    Q[1] = -Q[1]
+    with pytest.raises(InvalidInputError, match="Q: expected a positive semi-definite"):
+        QuadraticCost(**{**tensors, "Q": Q})
+
+
+def test_semidefinite_weights_are_accepted():
+    zero = torch.zeros(3, 3, dtype=torch.float64)
+    ones = torch.ones(3, 3, dtype=torch.float64)  # rank one, eigenvalues rounded around zero
+    QuadraticCost(ones, torch.eye(2).double(), zero)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"goal_weight": (1.0, 2.0, 3.0, 4.0)}, ShapeError, "goal_weight: expected 1 to n_x=3 weights, got 4"),
+        ({"goal_weight": ()}, ShapeError, "goal_weight: expected 1 to n_x=3 weights, got 0"),
+        ({"goal_weight": -1.0}, InvalidInputError, "goal_weight: .*at least 0, got -1"),
+        ({"goal_weight": float("nan")}, InvalidInputError, "goal_weight: .*finite.*got nan"),
+        ({"goal_weight_final": (1.0, 2.0)}, ShapeError, "goal_weight_final: expected 3 weights.*got 2"),
+        ({"input_weight": 0.0}, InvalidInputError, "input_weight: .*above 0, got 0"),
+        ({"pairs": [(0, 3)], "pair_weight": 1.0}, InvalidInputError, r"pairs: .*0…2, got \(0, 3\)"),
+        ({"pairs": [(1, 1)]}, InvalidInputError, r"pairs: .*different indices.*\(1, 1\)"),
+        ({"pair_weight": -2.0}, InvalidInputError, "pair_weight: .*got -2"),
+        ({"n_x": 0}, InvalidInputError, "n_x: expected at least 1, got 0"),
+        ({"n_u": 1.5}, DTypeError, "n_u: expected an int, got float 1.5"),
+        ({"dtype": torch.float16}, DTypeError, "dtype: expected torch.float32 or torch.float64, got torch.float16"),
+    ],
+)
+def test_reach_refuses_what_it_cannot_use(change, error, message):
+    with pytest.raises(error, match=message):
+        GoalCost.reach(**{"n_x": 3, "n_u": 2, **change})
+
+
+def test_reach_in_float32():
+    assert GoalCost.reach(3, 2, dtype=torch.float32).Q.dtype == torch.float32

@@ -1,0 +1,290 @@
+"""Checkpoints: round trips, every kind of damage, and writes that leave the old file or the new."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import stat
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from difflcs import LCSModel, _files
+from difflcs.errors import CheckpointError, DiffLCSError
+
+NAMES = ("A", "B", "C", "d", "D", "E", "G", "H", "c")
+
+
+@pytest.fixture
+def model(build):
+    return build.model(seed=3)
+
+
+@pytest.fixture
+def saved(model, tmp_path):
+    model.save_pretrained(tmp_path / "saved")
+    return tmp_path / "saved"
+
+
+def contents(directory):
+    return {p.name: p.read_bytes() for p in sorted(directory.iterdir()) if p.is_file()}
+
+
+def refuse(directory, match=None):
+    """Loading fails with the typed error, names the directory, and changes no file."""
+    before = contents(directory) if directory.is_dir() else None
+    with pytest.raises(CheckpointError, match=match) as error:
+        LCSModel.from_pretrained(directory)
+    assert str(directory) in str(error.value)
+    assert isinstance(error.value, DiffLCSError)
+    if before is not None:
+        assert contents(directory) == before
+
+
+# --- round trips ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("learn_c", [True, False])
+def test_round_trip_keeps_every_bit(build, tmp_path, dtype, learn_c):
+    model = build.model(seed=3, dtype=dtype)
+    model.c.requires_grad_(learn_c)
+    model.save_pretrained(tmp_path / "deep" / "er")
+    loaded = LCSModel.from_pretrained(str(tmp_path / "deep" / "er"))
+    for name in NAMES:
+        assert torch.equal(getattr(loaded, name), getattr(model, name))
+        assert getattr(loaded, name).dtype == dtype
+        assert getattr(loaded, name).requires_grad == getattr(model, name).requires_grad
+    assert loaded.config() == model.config()
+    x, u = torch.ones(4, dtype=dtype), torch.ones(2, dtype=dtype)
+    assert torch.equal(loaded(x, u).x_next, model(x, u).x_next)
+
+
+def test_a_checkpoint_is_safetensors_and_json_alone(saved):
+    assert sorted(p.name for p in saved.iterdir()) == ["config.json", "model.safetensors"]
+    assert set(load_file(saved / "model.safetensors")) == set(NAMES)
+    assert json.loads((saved / "config.json").read_text())["kind"] == "LCSModel"
+
+
+def test_saving_again_replaces_the_old_one(build, saved):
+    other = build.model(seed=9, n_x=2, n_u=1, n_lam=1)
+    other.save_pretrained(saved)
+    assert LCSModel.from_pretrained(saved).config() == other.config()
+
+
+def test_files_are_readable_by_others(saved):
+    for path in saved.iterdir():
+        assert stat.S_IMODE(path.stat().st_mode) & 0o444 == 0o444
+
+
+def test_saving_and_loading_leave_the_model_alone(model, tmp_path):
+    before = {k: v.clone() for k, v in model.state_dict().items()}
+    model.save_pretrained(tmp_path)
+    LCSModel.from_pretrained(tmp_path)
+    assert all(torch.equal(v, before[k]) for k, v in model.state_dict().items())
+
+
+# --- damage ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_missing_directory_is_refused(tmp_path):
+    refuse(tmp_path / "nowhere", "a file is missing.*expected a directory with config.json and model.safetensors")
+
+
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
+def test_a_missing_file_is_refused(saved, name):
+    (saved / name).unlink()
+    refuse(saved, f"a file is missing.*{name}")
+
+
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
+def test_a_directory_in_the_place_of_a_file_is_refused(saved, name):
+    (saved / name).unlink()
+    (saved / name).mkdir()
+    refuse(saved)
+
+
+def test_a_file_in_the_place_of_the_directory_is_refused(tmp_path):
+    (tmp_path / "file").write_text("hello")
+    refuse(tmp_path / "file")
+
+
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
+@pytest.mark.parametrize("part", [0.0, 0.01, 0.1, 0.5, 0.9, 0.99])
+def test_a_truncated_file_is_refused(saved, name, part):
+    content = (saved / name).read_bytes()
+    (saved / name).write_bytes(content[: int(part * len(content))])
+    refuse(saved)
+
+
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
+@pytest.mark.parametrize(
+    "content",
+    [b"\x00" * 100, b"\xff\xfe garbage", b"null", b"[1, 2]", b"{}", bytes(range(256)), b"[" * 100_000],
+    ids=["zeros", "garbage", "null", "list", "object", "bytes", "nested"],
+)
+def test_a_foreign_file_is_refused(saved, name, content):
+    (saved / name).write_bytes(content)
+    refuse(saved)
+
+
+def test_a_pickle_in_disguise_is_refused_and_not_executed(saved, tmp_path):
+    torch.save({"A": torch.zeros(2)}, tmp_path / "pickle")
+    shutil.copy(tmp_path / "pickle", saved / "model.safetensors")
+    refuse(saved)
+
+
+def test_any_flipped_bit_of_the_tensor_file_is_noticed(build, tmp_path):
+    build.model(seed=3, n_x=1, n_u=1, n_lam=1).save_pretrained(tmp_path)
+    path = tmp_path / "model.safetensors"
+    content = path.read_bytes()
+    for i in range(len(content)):
+        broken = bytearray(content)
+        broken[i] ^= 1 << (i % 8)
+        path.write_bytes(broken)
+        try:
+            LCSModel.from_pretrained(tmp_path)
+        except CheckpointError:
+            continue
+        pytest.fail(f"bit {i % 8} of byte {i} of {len(content)} was flipped, and the file was loaded")
+
+
+def test_a_changed_number_in_the_configuration_is_noticed(saved):
+    """Another stiffness is another F: silently another model."""
+    path = saved / "config.json"
+    path.write_text(path.read_text().replace('"stiffness": 0.2', '"stiffness": 0.3'))
+    refuse(saved)
+
+
+def test_the_configuration_of_one_model_with_the_tensors_of_another_is_noticed(build, saved, tmp_path):
+    """What a crash between the two writes, or a half-finished copy, leaves behind."""
+    other = LCSModel(4, 2, 3, stiffness=0.7)
+    other.save_pretrained(tmp_path / "other")
+    shutil.copy(tmp_path / "other" / "model.safetensors", saved / "model.safetensors")
+    refuse(saved)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"n_x": 5},
+        {"n_x": -1},
+        {"n_x": "4"},
+        {"n_x": 4.0},
+        {"n_lam": True},
+        {"stiffness": -0.2},
+        {"stiffness": None},
+        {"dtype": "float16"},
+        {"dtype": ["float64"]},
+        {"learn_c": "no"},
+        {"extra": 1},
+    ],
+    ids=str,
+)
+def test_a_configuration_that_does_not_fit_is_refused(saved, change):
+    path = saved / "config.json"
+    header = json.loads(path.read_text())
+    header["config"].update(change)
+    path.write_text(json.dumps(header))
+    refuse(saved)
+
+
+@pytest.mark.parametrize("field", ["n_x", "stiffness", "dtype", "learn_c"])
+def test_a_configuration_with_a_field_missing_is_refused(saved, field):
+    path = saved / "config.json"
+    header = json.loads(path.read_text())
+    del header["config"][field]
+    path.write_text(json.dumps(header))
+    refuse(saved)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"kind": "PDDM"}, "expected a record of kind 'LCSModel', got 'PDDM'"),
+        ({"kind": None}, "expected a record of kind 'LCSModel', got None"),
+        ({"format": 2}, "expected format 1, got 2; update difflcs"),
+        ({"config": [1]}, "expected"),
+    ],
+)
+def test_a_record_of_another_kind_or_format_is_refused(saved, change, match):
+    path = saved / "config.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    refuse(saved, match)
+
+
+def test_tensors_of_another_program_are_refused(saved):
+    save_file({"weight": torch.zeros(3)}, saved / "model.safetensors")
+    refuse(saved, "checksum")
+
+
+def test_parameters_that_are_not_finite_are_refused(model, tmp_path):
+    with torch.no_grad():
+        model.A[1, 2] = torch.nan
+    model.save_pretrained(tmp_path)
+    refuse(tmp_path, "expected finite .* values in A")
+
+
+# --- atomic writes --------------------------------------------------------------------------------------------------
+
+
+def test_a_failing_replace_keeps_the_old_file_and_leaves_no_temporary_one(model, saved, monkeypatch):
+    before = contents(saved)
+    with torch.no_grad():
+        model.A.add_(1.0)
+
+    def fail(*args):
+        raise OSError("disk on fire")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="disk on fire"):
+        model.save_pretrained(saved)
+    monkeypatch.undo()
+    assert contents(saved) == before
+    LCSModel.from_pretrained(saved)
+
+
+@pytest.mark.parametrize("interrupt", [KeyboardInterrupt, SystemExit, MemoryError])
+def test_an_interrupt_during_a_write_leaves_the_old_file(tmp_path, monkeypatch, interrupt):
+    path = tmp_path / "file"
+    _files.write_atomically(path, b"old")
+
+    def fail(*args):
+        raise interrupt
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(interrupt):
+        _files.write_atomically(path, b"new")
+    assert contents(tmp_path) == {"file": b"old"}
+
+
+def test_a_file_is_never_seen_half_written(tmp_path, monkeypatch):
+    path, seen = tmp_path / "file", []
+    _files.write_atomically(path, b"old")
+    replace = os.replace
+
+    def watch(source, target):
+        seen.append((path.read_bytes(), os.path.getsize(source)))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", watch)
+    _files.write_atomically(path, b"newer")
+    assert seen == [(b"old", 5)]
+    assert contents(tmp_path) == {"file": b"newer"}
+
+
+def test_the_temporary_file_is_in_the_same_directory(tmp_path, monkeypatch):
+    """A rename across file systems is not atomic."""
+    sources = []
+    monkeypatch.setattr(os, "replace", lambda source, target: sources.append(source))
+    _files.write_atomically(tmp_path / "file", b"x")
+    assert os.path.dirname(sources[0]) == str(tmp_path)
+
+
+def test_json_is_written_in_a_stable_order(tmp_path):
+    _files.write_json(tmp_path / "a", {"b": 1, "a": [1.5, None]})
+    _files.write_json(tmp_path / "b", {"a": [1.5, None], "b": 1})
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    assert json.loads((tmp_path / "a").read_text()) == {"a": [1.5, None], "b": 1}

@@ -1,0 +1,290 @@
+"""Backend `ipopt`: worker processes, threads, forks, crashes and options; and the registry of the backends."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+from difflcs import BackendNotFoundError, LCSMPCLayer, SolveError, Status, available_backends, register_backend
+from difflcs.errors import DTypeError, InvalidInputError, SolveWarning
+from difflcs.mpc.backends import Backend, IpoptBackend, base, get_backend, ipopt
+
+
+@pytest.fixture
+def x0(build):
+    return 0.2 * build.normal(5)(9, 4)
+
+
+def make_layer(build, **options):
+    options = {"backend": IpoptBackend(workers=2), "relaxation": 1e-4, **options}
+    return LCSMPCLayer(build.params(3), build.cost(3), 3, -0.15, 0.15, **options)
+
+
+# --- worker processes -----------------------------------------------------------------------------------------------
+
+
+def test_workers_give_the_bits_of_this_process(build, x0):
+    alone, two, three = (make_layer(build, backend=IpoptBackend(workers=w))(x0) for w in (1, 2, 3))
+    for name in ("x", "u", "lam", "status", "iterations"):
+        assert torch.equal(getattr(alone, name), getattr(two, name))
+        assert torch.equal(getattr(alone, name), getattr(three, name))
+
+
+def test_workers_stay_between_calls(build, x0):
+    layer = make_layer(build)
+    layer(x0)
+    before = [w.process.pid for w in ipopt._locals.pool.workers]
+    layer(x0)
+    assert [w.process.pid for w in ipopt._locals.pool.workers] == before
+    assert len(before) >= 2
+
+
+@pytest.mark.parametrize("killed", [1, 2])
+def test_killed_workers_are_replaced_and_nothing_is_lost(build, x0, killed):
+    layer = make_layer(build)
+    expected = layer(x0)
+    workers = ipopt._locals.pool.workers[:killed]
+    old = [w.process.pid for w in workers]
+    for worker in workers:
+        os.kill(worker.process.pid, signal.SIGKILL)
+        worker.process.wait()
+    again = layer(x0)
+    assert torch.equal(again.u, expected.u)
+    assert bool(again.converged.all())
+    assert not set(old) & {w.process.pid for w in ipopt._locals.pool.workers}
+
+
+def test_a_worker_that_dies_during_a_solve_costs_no_result(build, x0):
+    """Stopped workers hold their tasks; killing them then makes the parent give the tasks to new ones."""
+    layer = make_layer(build)
+    expected = layer(x0)
+    workers = ipopt._locals.pool.workers[:2]
+    os.kill(workers[0].process.pid, signal.SIGSTOP)
+    killer = subprocess.Popen(["sh", "-c", f"sleep 0.3; kill -KILL {workers[0].process.pid}"])
+    again = layer(x0)
+    killer.wait()
+    assert torch.equal(again.u, expected.u)
+
+
+def run_script(code, timeout=90):
+    """A fresh process: a crash or a deadlock there is a failed test here, not a lost test run."""
+    head = """
+        import warnings; warnings.simplefilter("error")
+        import torch
+        from difflcs import LCSMPCLayer, LCSModel, QuadraticCost
+        from difflcs.mpc.backends import IpoptBackend
+        torch.manual_seed(0)
+        model = LCSModel(3, 2, 2, init_scale=0.4)
+        eye = torch.eye(3).double()
+        def layer(workers):
+            return LCSMPCLayer(model, QuadraticCost(eye, torch.eye(2).double(), 3 * eye), 3, -0.1, 0.1,
+                               backend=IpoptBackend(workers=workers), relaxation=1e-4)
+        x0 = torch.randn(6, 3).double()
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(head) + textwrap.dedent(code)],
+        capture_output=True, text=True, timeout=timeout, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout.split()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_several_threads_may_solve_at_once(workers):
+    """IPOPT in threads of one process crashes (casadi issue 3456); the backend must keep them apart."""
+    assert run_script(f"""
+        from concurrent.futures import ThreadPoolExecutor
+        mpc = layer({workers})
+        expected = [mpc(x).u.detach() for x in x0]
+        batch = mpc(x0).u.detach()
+        def work(i):
+            x = x0[i % 6].clone().requires_grad_()
+            alone = mpc(x)
+            alone.u.sum().backward()
+            assert torch.equal(alone.u.detach(), expected[i % 6]), i
+            assert bool(torch.isfinite(x.grad).all())
+            assert bool(alone.converged.all())
+            if i % 4 == 0:
+                assert torch.equal(mpc(x0).u.detach(), batch)
+        with ThreadPoolExecutor(6) as pool:
+            list(pool.map(work, range(60)))
+        print("fine")
+    """) == ["fine"]
+
+
+def test_a_forked_child_starts_its_own_workers():
+    assert run_script("""
+        import os
+        torch.set_num_threads(1)  # torch's own linear algebra hangs in a forked child otherwise
+        mpc = layer(2)
+        expected = mpc(x0).u.detach()
+        pid = os.fork()
+        if pid == 0:
+            same = torch.equal(mpc(x0).u.detach(), expected)
+            os._exit(0 if same else 3)
+        assert torch.equal(mpc(x0).u.detach(), expected)
+        _, status = os.waitpid(pid, 0)
+        assert os.waitstatus_to_exitcode(status) == 0, status
+        assert torch.equal(mpc(x0).u.detach(), expected)  # the child took nothing with it
+        print("fine")
+    """) == ["fine"]
+
+
+def test_workers_end_with_their_process():
+    pids = run_script("""
+        layer(2)(x0)
+        from difflcs.mpc.backends.ipopt import _locals
+        print(*[w.process.pid for w in _locals.pool.workers])
+    """)
+    assert len(pids) == 2
+    for pid in pids:
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(pid), 0)
+
+
+def test_a_script_without_a_main_guard_is_not_run_again(tmp_path):
+    """Workers do not import the user's main module."""
+    script = tmp_path / "user.py"
+    script.write_text(
+        textwrap.dedent("""
+        print("started")
+        import torch
+        from difflcs import LCSMPCLayer, LCSModel, QuadraticCost
+        from difflcs.mpc.backends import IpoptBackend
+        eye = torch.eye(2).double()
+        mpc = LCSMPCLayer(LCSModel(2, 2, 1), QuadraticCost(eye, eye, eye), 2, -1.0, 1.0,
+                          backend=IpoptBackend(workers=2))
+        print(tuple(mpc(torch.zeros(4, 2).double()).u.shape))
+    """)
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=90, check=True)
+    assert done.stdout.splitlines() == ["started", "(4, 2, 2)"]
+
+
+# --- options --------------------------------------------------------------------------------------------------------
+
+
+def test_too_few_iterations_are_an_honest_failure(build, x0):
+    with pytest.raises(SolveError, match=r"9 of 9 .*MAX_ITER.*max_iter") as error:
+        make_layer(build, backend=IpoptBackend(max_iter=2, workers=1))(x0)
+    assert error.value.elements == tuple(range(9))
+    assert set(error.value.status) == {Status.MAX_ITER}
+
+
+def test_too_few_iterations_are_masked(build, x0):
+    layer = make_layer(build, backend=IpoptBackend(max_iter=2, workers=1), on_failure="mask")
+    start = x0.clone().requires_grad_()
+    with pytest.warns(SolveWarning, match="9 of 9"):
+        solution = layer(start)
+    (solution.u.sum() + solution.objective.sum()).backward()
+    assert torch.equal(start.grad, torch.zeros(9, 4, dtype=torch.float64))
+    assert float(solution.u.detach().abs().max()) <= 0.15
+    assert bool(torch.isfinite(solution.x).all())
+    assert float(solution.dynamics_residual().max()) < 1e-8  # what is returned is a trajectory, even so
+    assert solution.iterations.tolist() == [2] * 9
+
+
+def test_a_limit_that_some_elements_meet_fails_the_others_only(build, x0):
+    full = make_layer(build, backend=IpoptBackend(workers=1))(x0)
+    limit = int(full.iterations.median())
+    layer = make_layer(build, backend=IpoptBackend(max_iter=limit, workers=1), on_failure="mask")
+    start = x0.clone().requires_grad_()
+    with pytest.warns(SolveWarning):
+        solution = layer(start)
+    done = solution.converged
+    assert 0 < int(done.sum()) < 9
+    torch.testing.assert_close(solution.u.detach()[done], full.u[done], rtol=1e-9, atol=1e-10)
+    solution.u.sum().backward()
+    assert float(start.grad[~done].abs().max()) == 0
+    assert float(start.grad[done].abs().amax(1).min()) > 0
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"tol": 0.0}, InvalidInputError, "tol: .*above 0, got 0"),
+        ({"tol": "small"}, DTypeError, "tol: expected a number, got str 'small'"),
+        ({"max_iter": 0}, InvalidInputError, "max_iter: expected at least 1, got 0"),
+        ({"max_iter": 2.5}, DTypeError, "max_iter: expected an int, got float 2.5"),
+        ({"workers": 0}, InvalidInputError, "workers: expected at least 1, got 0"),
+        ({"workers": True}, DTypeError, "workers: expected an int, got bool True"),
+        ({"start": -1.0}, InvalidInputError, "start: .*got -1"),
+        ({"mu_init": float("nan")}, InvalidInputError, "mu_init: .*got nan"),
+    ],
+)
+def test_options_are_checked(options, error, message):
+    with pytest.raises(error, match=message):
+        IpoptBackend(**options)
+
+
+# --- registry -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def registry(monkeypatch):
+    monkeypatch.setattr(base, "_REGISTRY", dict(base._REGISTRY))
+
+
+@dataclass(frozen=True)
+class Mine(Backend):
+    name = "mine"
+    install = "pip install 'mine[solver]'"
+    factor: int = 1
+
+    def solve(self, problem, guess):
+        return IpoptBackend(workers=1).solve(problem, guess)
+
+
+@pytest.mark.usefixtures("registry")
+def test_a_registered_backend_is_available_by_its_name(build, x0):
+    assert "mine" not in available_backends()
+    assert register_backend(Mine) is Mine
+    assert "mine" in available_backends()
+    assert get_backend("mine") == Mine(factor=1)
+    assert get_backend(Mine(factor=3)).factor == 3
+    assert bool(make_layer(build, backend="mine")(x0).converged.all())
+
+
+def test_an_unregistered_instance_works_too(build, x0):
+    assert bool(make_layer(build, backend=Mine())(x0).converged.all())
+
+
+@pytest.mark.usefixtures("registry")
+def test_a_backend_whose_package_is_missing_gives_the_pip_line(build):
+    class Absent(Mine):
+        name = "absent"
+        requires = ("torch", "no_such_package_for_difflcs")
+
+    register_backend(Absent)
+    assert "absent" not in available_backends()
+    for backend in ("absent", Absent()):
+        with pytest.raises(
+            BackendNotFoundError, match=r"'absent'.*'no_such_package_for_difflcs' is not.*pip install 'mine\[solver\]'"
+        ):
+            make_layer(build, backend=backend)
+
+
+def test_an_unknown_backend_is_refused_with_the_known_ones(build):
+    with pytest.raises(BackendNotFoundError, match=r"expected one of .*'ipopt'.*got 'iopt'.*register_backend"):
+        make_layer(build, backend="iopt")
+
+
+@pytest.mark.parametrize("backend", [None, 3, IpoptBackend])
+def test_something_that_is_no_backend_is_refused(build, backend):
+    with pytest.raises(DTypeError, match="backend: expected a name or a Backend instance"):
+        make_layer(build, backend=backend)
+
+
+@pytest.mark.parametrize("wrong", [int, "ipopt", IpoptBackend(), type("Nameless", (Backend,), {})])
+def test_only_backend_classes_with_a_name_are_registered(wrong):
+    before = available_backends()
+    with pytest.raises(DTypeError, match="subclass of Backend with a `name`"):
+        register_backend(wrong)
+    assert available_backends() == before

@@ -1,0 +1,442 @@
+"""LCSMPCLayer: what a user of PyTorch expects of a layer, and what happens when a solve fails."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import warnings
+from dataclasses import dataclass
+
+import pytest
+import torch
+from torch import nn
+
+from difflcs import LCSModel, LCSMPCLayer, LCSParams, MPCSolution, QuadraticCost, SolveError, Status
+from difflcs.errors import SolveWarning
+from difflcs.mpc import Primal
+from difflcs.mpc.backends import Backend, IpoptBackend, certify
+
+SOLVER = IpoptBackend(workers=1)
+
+
+@dataclass(frozen=True)
+class Flaky(Backend):
+    """Solves well, then gives up on chosen elements and returns NaN for them."""
+
+    name = "flaky"
+    fail: tuple[int, ...] = ()
+    garbage: float = float("nan")
+
+    def solve(self, problem, guess):
+        result = SOLVER.solve(problem, guess)
+        primal, status = Primal(*(v.clone() for v in result.primal)), result.status.clone()
+        for i in self.fail:
+            for value in primal:
+                value[i] = self.garbage
+            status[i] = Status.MAX_ITER
+        return certify(problem, primal, status, result.iterations, result.solve_time, tol=1e-6)
+
+
+@pytest.fixture
+def layer(build):
+    return LCSMPCLayer(build.model(seed=3, scale=0.4), build.cost(0), 3, -0.15, 0.15, backend=SOLVER, relaxation=1e-4)
+
+
+@pytest.fixture
+def x0(build):
+    return 0.2 * build.normal(5)(6, 4)
+
+
+def make_layer(build, seed=3, **options):
+    options = {"backend": SOLVER, "relaxation": 1e-4, **options}
+    return LCSMPCLayer(build.params(seed), build.cost(seed), 3, -0.15, 0.15, **options)
+
+
+# --- shapes ---------------------------------------------------------------------------------------------------------
+
+
+def test_unbatched_in_is_unbatched_out(layer, x0):
+    one, batch = layer(x0[0]), layer(x0)
+    assert isinstance(one, MPCSolution)
+    assert one.x.shape == (4, 4)
+    assert one.u.shape == (3, 2)
+    assert one.lam.shape == (3, 3)
+    assert one.action.shape == (2,)
+    for scalar in (one.objective, one.status, one.iterations, one.kkt_residual, one.solve_time, one.converged):
+        assert scalar.shape == ()
+    assert one.complementarity().shape == one.dynamics_residual().shape == ()
+    torch.testing.assert_close(one.u, batch.u[0], rtol=1e-6, atol=1e-8)
+    one.action.sum().backward()
+    assert bool(torch.isfinite(layer.lcs.A.grad).all())
+
+
+def test_several_leading_dimensions_are_kept(layer, x0):
+    folded, flat = layer(x0.reshape(2, 1, 3, 4)), layer(x0)
+    assert folded.x.shape == (2, 1, 3, 4, 4)
+    assert folded.status.shape == folded.objective.shape == folded.complementarity().shape == (2, 1, 3)
+    torch.testing.assert_close(folded.u.reshape(6, 3, 2), flat.u, rtol=1e-9, atol=1e-10)
+
+
+def test_goals_broadcast_with_states(build):
+    layer = LCSMPCLayer(build.pushing(), build.paper_cost(), 2, -0.015, 0.015, backend=SOLVER, relaxation=1e-4)
+    n = build.normal(2)
+    x0, goal = (0.05 * n(3, 1, 9)).requires_grad_(), (0.05 * n(2, 3)).requires_grad_()
+    solution = layer(x0, goal)
+    assert solution.u.shape == (3, 2, 2, 6)
+    for i in range(3):
+        for j in range(2):
+            alone = layer(x0[i, 0], goal[j])
+            torch.testing.assert_close(alone.u, solution.u[i, j], rtol=1e-5, atol=1e-8)
+            torch.testing.assert_close(alone.objective, solution.objective[i, j], rtol=1e-9, atol=1e-10)
+    solution.objective.sum().backward()
+    assert x0.grad.shape == x0.shape
+    assert goal.grad.shape == goal.shape
+    assert float(goal.grad.abs().min()) > 0
+    one_goal = layer(x0, goal[0])
+    assert one_goal.u.shape == (3, 1, 2, 6)
+
+
+def test_the_goals_gradient_matches_central_differences(build):
+    layer = LCSMPCLayer(build.pushing(), build.paper_cost(), 2, -0.015, 0.015, backend=SOLVER, relaxation=1e-3)
+    n, h = build.normal(2), 1e-7
+    x0, goal, direction, weight = 0.05 * n(6, 9), 0.05 * n(6, 3), n(6, 3), n(6, 2, 6)
+    leaf = goal.clone().requires_grad_()
+    solution = layer(x0, leaf)
+    (gradient,) = torch.autograd.grad((solution.u * weight).sum(), leaf)
+    above, below = (layer(x0, goal + s * h * direction, guess=solution).u for s in (1, -1))
+    quotient = (((above - below) / (2 * h)) * weight).sum((1, 2))
+    found = (gradient * direction).sum(1)
+    moved = quotient.abs() > 1e-4
+    assert int(moved.sum()) >= 3
+    assert float(((found - quotient).abs() / quotient.abs())[moved].median()) < 1e-4
+
+
+def test_float32_in_is_float32_out_solved_in_float64(build, x0):
+    wide = make_layer(build)
+    solution = wide(x0.float().requires_grad_())
+    for value in (solution.x, solution.u, solution.lam, solution.objective):
+        assert value.dtype == torch.float32
+    torch.testing.assert_close(solution.u.detach(), wide(x0.float().double()).u.float(), rtol=1e-6, atol=1e-7)
+    model = build.model(seed=3, scale=0.4, dtype=torch.float32)
+    narrow = LCSMPCLayer(model, build.cost(0), 3, -0.15, 0.15, backend=SOLVER, relaxation=1e-4)
+    start = x0.float().requires_grad_()
+    narrow(start).action.sum().backward()
+    assert start.grad.dtype == model.A.grad.dtype == torch.float32
+    assert bool(torch.isfinite(model.A.grad).all())
+
+
+def test_memory_layout_does_not_matter(build, layer):
+    wide = 0.2 * build.normal(5)(4, 12)
+    x0 = wide.T[::2]
+    assert not x0.is_contiguous()
+    assert torch.equal(layer(x0).u, layer(x0.contiguous()).u)
+
+
+def test_params_may_be_shared_or_one_per_element(build, x0):
+    tensors = build.lcs_tensors(3)
+    shared = make_layer(build)(x0)
+    each = LCSParams(**{k: v.expand(6, *v.shape) for k, v in tensors.items()})
+    options = {"backend": SOLVER, "relaxation": 1e-4}
+    per_element = LCSMPCLayer(each, build.cost(3), 3, -0.15, 0.15, **options)
+    torch.testing.assert_close(per_element(x0).u, shared.u, rtol=1e-6, atol=1e-8)
+    # Several leading dimensions of the system, one state: the state broadcasts.
+    grid = LCSParams(**{k: v.expand(2, 3, *v.shape) for k, v in tensors.items()})
+    solution = LCSMPCLayer(grid, build.cost(3), 3, -0.15, 0.15, **options)(x0[0])
+    assert solution.u.shape == (2, 3, 3, 2)
+    torch.testing.assert_close(solution.u[1, 2], shared.u[0], rtol=1e-6, atol=1e-8)
+
+
+def test_the_solution_certifies_itself(layer, x0):
+    solution = layer(x0)
+    assert bool(solution.converged.all())
+    assert torch.equal(solution.action, solution.u[:, 0])
+    assert torch.equal(solution.x[:, 0], x0)
+    assert float(solution.complementarity().max()) < 1e-10
+    assert float(solution.dynamics_residual().max()) < 1e-10
+    assert float(solution.kkt_residual.max()) < 1e-6
+    for info in (solution.status, solution.iterations, solution.kkt_residual, solution.solve_time):
+        assert not info.requires_grad
+    for value in (solution.x, solution.u, solution.lam, solution.objective):
+        assert value.requires_grad
+
+
+# --- warm start -----------------------------------------------------------------------------------------------------
+
+
+def test_shift_drops_the_first_step_and_repeats_the_last(layer, x0):
+    solution = layer(x0)
+    guess = solution.shift()
+    for name in ("x", "u", "lam"):
+        old, new = getattr(solution, name).detach(), getattr(guess, name)
+        assert torch.equal(new[:, :-1], old[:, 1:])
+        assert torch.equal(new[:, -1], old[:, -1])
+        assert not new.requires_grad
+
+
+def test_a_receding_horizon_with_warm_starts_needs_fewer_iterations(layer, x0):
+    first = layer(x0)
+    x1 = first.x[:, 1].detach()
+    warm, cold = layer(x1, guess=first.shift()), layer(x1)
+    assert bool(warm.converged.all())
+    assert float(warm.iterations.double().sum()) < float(cold.iterations.double().sum())
+
+
+def test_a_guess_has_no_gradient_and_changes_none(layer, x0):
+    guess = layer(x0)
+    layer(x0).action.sum().backward()
+    plain = layer.lcs.A.grad.clone()
+    layer.zero_grad()
+    layer(x0, guess=guess).action.sum().backward()
+    torch.testing.assert_close(layer.lcs.A.grad, plain, rtol=1e-4, atol=1e-6)
+
+
+# --- bounds ---------------------------------------------------------------------------------------------------------
+
+
+def test_bounds_of_a_call_replace_those_of_the_layer(layer, x0):
+    tight = layer(x0, u_min=-0.01, u_max=0.01)
+    assert float(tight.u.detach().abs().max()) <= 0.01
+    assert float(layer(x0).u.detach().abs().max()) > 0.01
+    each = torch.linspace(0.01, 0.06, 6, dtype=torch.float64)[:, None].expand(6, 2)
+    spread = layer(x0, u_min=-each, u_max=each)
+    assert bool((spread.u.abs() <= each[:, None]).all())
+    assert bool((spread.u.abs().amax(1)[:2] > 0.009).any())
+    assert torch.equal(layer.u_max, torch.full((2,), 0.15, dtype=torch.float64))
+
+
+def test_bounds_can_be_learned(build, x0):
+    low = nn.Parameter(torch.full((2,), -0.01, dtype=torch.float64))
+    high = nn.Parameter(torch.full((2,), 0.01, dtype=torch.float64))
+    layer = LCSMPCLayer(build.params(3), build.cost(3), 3, low, high, backend=SOLVER, relaxation=1e-4)
+    assert {name for name, _ in layer.named_parameters()} == {"u_min", "u_max"}
+    solution = layer(x0)
+    solution.u.sum().backward()
+    held = int((solution.u >= 0.01).sum() + (solution.u <= -0.01).sum())
+    assert held > 10
+    assert float(low.grad.abs().max()) > 0
+    assert float(high.grad.abs().max()) > 0
+    before = float(solution.objective.detach().sum())
+    optimiser = torch.optim.SGD([low, high], lr=1e-3)
+    optimiser.zero_grad()
+    layer(x0).objective.sum().backward()
+    optimiser.step()
+    assert float(layer(x0).objective.detach().sum()) < before  # wider bounds, lower cost
+
+
+def test_equal_bounds_fix_the_action(layer, x0):
+    fixed = torch.tensor([0.05, -0.02], dtype=torch.float64, requires_grad=True)
+    solution = layer(x0, u_min=fixed, u_max=fixed)
+    assert bool(solution.converged.all())
+    torch.testing.assert_close(solution.u.detach(), fixed.detach().expand(6, 3, 2), rtol=0, atol=1e-12)
+    (gradient,) = torch.autograd.grad(solution.action[:, 0].sum(), fixed)
+    torch.testing.assert_close(gradient, torch.tensor([6.0, 0.0], dtype=torch.float64))
+
+
+# --- gradients ------------------------------------------------------------------------------------------------------
+
+
+def test_a_learnable_model_gets_the_gradient_of_its_own_parameters(layer, x0):
+    """Through F = G Gᵀ + stiffness·I + H − Hᵀ, by central differences along one direction per parameter."""
+    x0, weight = x0[:3], torch.randn(3, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    base = layer(x0)
+    (layer(x0, guess=base).action * weight).sum().backward()
+    for name, parameter in layer.lcs.named_parameters():
+        generator = torch.Generator().manual_seed(len(name))
+        direction = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
+        values = []
+        for sign in (1, -1):
+            with torch.no_grad():
+                parameter.add_(sign * 1e-6 * direction)
+                values.append(float((layer(x0, guess=base).action * weight).sum()))
+                parameter.sub_(sign * 1e-6 * direction)
+        quotient = (values[0] - values[1]) / 2e-6
+        assert float((parameter.grad * direction).sum()) == pytest.approx(quotient, rel=1e-4, abs=1e-6), name
+
+
+@pytest.mark.parametrize("chosen", ["A", "F", "c", "Q", "q_final", "u_max", "x0"])
+def test_any_subset_may_require_the_gradient(build, x0, chosen):
+    tensors = {**build.lcs_tensors(3), **build.cost_tensors(3), "u_max": torch.full((2,), 0.15).double(), "x0": x0}
+    results = []
+    for only in (False, True):
+        leaves = {k: v.clone().requires_grad_(not only or k == chosen) for k, v in tensors.items()}
+        layer = LCSMPCLayer(
+            LCSParams(**{k: leaves[k] for k in build.lcs_tensors()}),
+            QuadraticCost(**{k: leaves[k] for k in build.cost_tensors()}),
+            3, -0.15, leaves["u_max"], backend=SOLVER, relaxation=1e-4,
+        )  # fmt: skip
+        layer(leaves["x0"]).u.sum().backward()
+        results.append(leaves[chosen].grad)
+        if only:
+            assert all(v.grad is None for k, v in leaves.items() if k != chosen)
+    torch.testing.assert_close(results[0], results[1])
+
+
+def test_no_grad_and_frozen_inputs_build_no_graph(layer, x0):
+    with torch.no_grad():
+        solution = layer(x0)
+    assert not solution.u.requires_grad
+    layer.requires_grad_(False)
+    assert not layer(x0).objective.requires_grad
+    with torch.inference_mode():
+        assert layer(x0).u.shape == (6, 3, 2)
+
+
+def test_backward_twice_through_a_retained_graph_is_the_same(layer, x0):
+    solution = layer(x0)
+    first = torch.autograd.grad(solution.u.sum(), layer.lcs.A, retain_graph=True)[0]
+    second = torch.autograd.grad(solution.u.sum(), layer.lcs.A)[0]
+    assert torch.equal(first, second)
+
+
+def test_gradient_descent_through_the_layer_lowers_a_loss(build, x0):
+    target = make_layer(build)(x0).action
+    model = LCSModel.from_params(build.params(4))
+    layer = LCSMPCLayer(model, build.cost(3), 3, -0.15, 0.15, backend=SOLVER, relaxation=1e-3)
+    optimiser, losses = torch.optim.Adam(layer.parameters(), lr=0.02), []
+    for _ in range(15):
+        loss = (layer(x0).action - target).square().sum()
+        losses.append(float(loss.detach()))
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    assert min(losses[-3:]) < 0.5 * losses[0]
+
+
+# --- failures -------------------------------------------------------------------------------------------------------
+
+
+def test_raise_names_the_elements_and_their_status(build, x0):
+    with pytest.raises(SolveError, match=r"2 of 6 .*2 MAX_ITER.*elements 1, 4.*on_failure=\"mask\"") as error:
+        make_layer(build, backend=Flaky(fail=(1, 4)))(x0)
+    assert error.value.elements == (1, 4)
+    assert error.value.status == (Status.MAX_ITER, Status.MAX_ITER)
+
+
+@pytest.mark.parametrize("garbage", [float("nan"), float("inf"), 1e300, 7.0])
+def test_mask_keeps_the_others_bitwise_and_gives_the_failed_no_gradient(build, x0, garbage):
+    whole, masked = (
+        make_layer(build, backend=Flaky(fail=fail, garbage=garbage), on_failure="mask") for fail in ((), (1, 4))
+    )
+    results = []
+    for layer in (whole, masked):
+        start = x0.clone().requires_grad_()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", SolveWarning)
+            solution = layer(start)
+        (solution.u.square().sum() + solution.objective.sum() + solution.x.sum() + solution.lam.sum()).backward()
+        results.append((solution, start.grad))
+    (good, good_grad), (bad, bad_grad) = results
+    others = [0, 2, 3, 5]
+    for name in ("x", "u", "lam", "objective", "status", "kkt_residual"):
+        assert torch.equal(getattr(bad, name)[others], getattr(good, name)[others])
+    assert torch.equal(bad_grad[others], good_grad[others])
+    assert torch.equal(bad_grad[[1, 4]], torch.zeros(2, 4, dtype=torch.float64))
+    assert bad.status.tolist() == [0, 1, 0, 0, 1, 0]
+    assert bad.converged.tolist() == [True, False, True, True, False, True]
+    for value in (bad.x, bad.u, bad.lam, bad.objective, bad.kkt_residual):
+        assert bool(torch.isfinite(value).all())
+    assert float(bad.u.detach().abs().max()) <= 0.15
+    assert torch.equal(bad.x[:, 0].detach(), x0)
+
+
+def test_masked_elements_add_nothing_to_the_gradient_of_shared_parameters(build, x0):
+    def gradient(backend, start):
+        model = build.model(seed=3, scale=0.4)
+        layer = LCSMPCLayer(model, build.cost(3), 3, -0.15, 0.15, backend=backend, relaxation=1e-4, on_failure="mask")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", SolveWarning)
+            solution = layer(start)
+        (solution.u.sum() + solution.objective.sum()).backward()
+        return {k: v.grad for k, v in model.named_parameters()}
+
+    masked, without = gradient(Flaky(fail=(1, 4)), x0), gradient(Flaky(), x0[[0, 2, 3, 5]])
+    for name, value in masked.items():
+        assert bool(torch.isfinite(value).all())
+        torch.testing.assert_close(value, without[name], rtol=1e-5, atol=1e-7)
+
+
+def test_nan_upstream_of_a_failed_element_does_not_spread(build, x0):
+    layer = make_layer(build, backend=Flaky(fail=(2,)), on_failure="mask")
+    start = x0.clone().requires_grad_()
+    with pytest.warns(SolveWarning):
+        u = layer(start).u
+    upstream = torch.ones_like(u)
+    upstream[2] = torch.nan
+    u.backward(upstream)
+    assert bool(torch.isfinite(start.grad).all())
+    assert torch.equal(start.grad[2], torch.zeros(4, dtype=torch.float64))
+
+
+def test_mask_warns_once_per_layer(build, x0):
+    layer = make_layer(build, backend=Flaky(fail=(1,)), on_failure="mask")
+    with pytest.warns(SolveWarning, match=r"1 of 6 .*MAX_ITER.*element.* 1.*gradient is zero.*warns once"):
+        layer(x0)
+    layer(x0)  # filterwarnings = error would raise here
+
+
+def test_a_batch_of_failures_only_is_masked(build, x0):
+    layer = make_layer(build, backend=Flaky(fail=tuple(range(6))), on_failure="mask")
+    start = x0.clone().requires_grad_()
+    with pytest.warns(SolveWarning, match="6 of 6"):
+        solution = layer(start)
+    solution.objective.sum().backward()
+    assert torch.equal(start.grad, torch.zeros(6, 4, dtype=torch.float64))
+    assert bool(torch.isfinite(solution.x).all())
+
+
+def test_a_backend_that_claims_success_is_judged_by_the_residual(build, x0):
+    """`certify` does not take the solver's word."""
+
+    @dataclass(frozen=True)
+    class Liar(Backend):
+        name = "liar"
+
+        def solve(self, problem, guess):
+            result = SOLVER.solve(problem, guess)
+            u = result.primal.u.clone()
+            u[3] += 0.01
+            u[5] = torch.nan
+            return certify(
+                problem, result.primal._replace(u=u), result.status, result.iterations, result.solve_time, tol=1e-6
+            )
+
+    with pytest.raises(SolveError, match=r"2 of 6 .*2 NUMERICAL.*elements 3, 5"):
+        make_layer(build, backend=Liar())(x0)
+
+
+# --- modules --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))])
+@pytest.mark.parametrize("kind", ["model", "params"])
+def test_copies_and_pickles_plan_the_same(build, layer, x0, copied, kind):
+    original = layer if kind == "model" else make_layer(build)
+    twin = copied(original)
+    assert torch.equal(twin(x0).u, original(x0).u)
+    assert twin.horizon == original.horizon
+    assert twin.backend == original.backend
+    assert set(twin.state_dict()) == set(original.state_dict())
+
+
+def test_state_dict_holds_the_model_and_the_cost(build, layer, x0):
+    assert {f"lcs.{k}" for k in "ABCdDEGHc"} <= set(layer.state_dict())
+    assert {"cost.Q", "cost.R", "cost.Q_final"} <= set(layer.state_dict())
+    other = LCSMPCLayer(build.model(seed=8), build.cost(5), 3, -0.15, 0.15, backend=SOLVER, relaxation=1e-4)
+    other.load_state_dict(layer.state_dict())
+    assert torch.equal(other(x0).u, layer(x0).u)
+
+
+def test_the_models_parameters_are_the_layers(layer):
+    assert {id(p) for p in layer.parameters()} == {id(p) for p in layer.lcs.parameters()}
+
+
+def test_the_repr_shows_the_settings(layer):
+    for part in ("horizon=3", "relaxation=0.0001", "IpoptBackend", "'raise'"):
+        assert part in repr(layer)
+
+
+def test_the_inputs_are_left_as_they_were(layer, x0):
+    kept, state = x0.clone(), {k: v.clone() for k, v in layer.state_dict().items()}
+    layer(x0).u.sum().backward()
+    assert torch.equal(x0, kept)
+    assert all(torch.equal(v, state[k]) for k, v in layer.state_dict().items())

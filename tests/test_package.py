@@ -1,0 +1,222 @@
+"""The package from outside: what an import costs, what imports what, and that the README runs."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import difflcs
+
+ROOT = Path(__file__).resolve().parent.parent
+HEAVY = (
+    "casadi", "cvxpy", "cvxpylayers", "torchrl", "tensordict", "gymnasium", "mujoco", "tyro", "scipy", "matplotlib",
+    "trimesh", "coacd", "numba", "safetensors", "tqdm", "tensorboard", "imageio", "dask",
+)  # fmt: skip
+LAYERS = [{"errors"}, {"lcs", "lcp", "losses", "cost"}, {"mpc"}, {"rl", "zoo"}, {"cli"}]
+
+
+def run(code):
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
+def sources(folder):
+    return sorted((ROOT / folder).rglob("*.py"))
+
+
+def imports(path):
+    """Modules a file imports, absolute, wherever in the file; (name, whether at import time)."""
+    tree = ast.parse(path.read_text(), str(path))
+    package = ".".join(path.relative_to(ROOT).with_suffix("").parts[:-1])
+    inside = {n for f in ast.walk(tree) if isinstance(f, ast.FunctionDef | ast.AsyncFunctionDef) for n in ast.walk(f)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield alias.name, node not in inside
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                parts = package.split(".")[: len(package.split(".")) - node.level + 1]
+                base = ".".join([*parts, base]).strip(".")
+            yield base, node not in inside
+            for alias in node.names:
+                yield f"{base}.{alias.name}", node not in inside
+
+
+# --- import ---------------------------------------------------------------------------------------------------------
+
+
+def test_import_loads_torch_and_numpy_alone():
+    code = "import sys, torch, numpy; old = set(sys.modules); import difflcs; print(*(set(sys.modules) - old))"
+    loaded = {name.split(".")[0] for name in run(code).split()}
+    assert "difflcs" in loaded
+    assert not loaded & set(HEAVY)
+
+
+def test_import_loads_none_of_the_heavy_packages_even_through_torch():
+    loaded = {name.split(".")[0] for name in run("import sys, difflcs; print(*sys.modules)").split()}
+    assert not loaded & set(HEAVY[:10])
+
+
+def test_import_takes_less_than_one_and_a_half_times_that_of_torch():
+    def seconds(module):
+        return float(run(f"import time; t = time.perf_counter(); import {module}; print(time.perf_counter() - t)"))
+
+    torch, ours = [], []
+    for _ in range(6):  # interleaved, the best of each: a noisy neighbour slows both
+        torch.append(seconds("torch"))
+        ours.append(seconds("difflcs"))
+        if len(ours) >= 2 and min(ours) < 1.3 * min(torch):
+            break
+    assert min(ours) < 1.5 * min(torch)
+
+
+def test_import_leaves_global_state_alone():
+    assert (
+        run("""
+import torch, warnings, signal, random
+import numpy as np
+before = torch.get_default_dtype(), torch.get_num_threads(), torch.initial_seed(), len(warnings.filters)
+state = torch.random.get_rng_state(), signal.getsignal(signal.SIGINT)
+import difflcs
+assert before == (torch.get_default_dtype(), torch.get_num_threads(), torch.initial_seed(), len(warnings.filters))
+assert torch.equal(state[0], torch.random.get_rng_state()) and state[1] is signal.getsignal(signal.SIGINT)
+print("same")
+""").strip()
+        == "same"
+    )
+
+
+# --- names ----------------------------------------------------------------------------------------------------------
+
+
+def test_every_exported_name_exists_and_is_documented():
+    assert sorted(set(difflcs.__all__)) == sorted(difflcs.__all__)
+    for name in difflcs.__all__:
+        value = getattr(difflcs, name)
+        assert value.__doc__, f"{name} has no docstring"
+        assert value.__module__.startswith("difflcs."), name
+
+
+def test_the_names_of_the_design_are_exported():
+    names = """LCSModel LCSParams LCSMPCLayer MPCSolution Status QuadraticCost GoalCost solve_lcp violation_loss
+        prediction_loss available_backends register_backend DiffLCSError SolveError BackendNotFoundError"""
+    assert set(names.split()) <= set(difflcs.__all__)
+
+
+def test_public_functions_and_classes_of_every_module_are_documented():
+    for path in sources("difflcs"):
+        tree = ast.parse(path.read_text(), str(path))
+        assert ast.get_docstring(tree) or not tree.body, f"{path.name} has no docstring"
+        for node in tree.body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+                assert ast.get_docstring(node), f"{path.name}: {node.name} has no docstring"
+
+
+def test_the_version_is_one_and_the_same():
+    from importlib.metadata import version
+
+    assert difflcs.__version__ == version("difflcs")
+    assert re.fullmatch(r"\d+\.\d+\.\d+.*", difflcs.__version__)
+
+
+def test_status_names_are_those_of_the_design_and_give_advice():
+    status = difflcs.Status
+    assert [s.name for s in status] == ["CONVERGED", "MAX_ITER", "INFEASIBLE", "NUMERICAL", "DEGENERATE"]
+    assert [s.name for s in status if s.solved] == ["CONVERGED", "DEGENERATE"]
+    assert all(s.advice for s in status)
+
+
+def test_the_workers_status_codes_are_those_of_the_enum():
+    worker = importlib.import_module("difflcs.mpc.backends._ipopt_worker")
+    for name in ("CONVERGED", "MAX_ITER", "INFEASIBLE", "NUMERICAL"):
+        assert getattr(worker, name) == difflcs.Status[name]
+
+
+# --- structure ------------------------------------------------------------------------------------------------------
+
+
+def layer_of(module):
+    """Index in the order errors → lcs, lcp, losses, cost → mpc → rl → cli; None for helpers and the root."""
+    parts = module.split(".")
+    if parts[0] != "difflcs" or len(parts) < 2:
+        return None
+    return next((i for i, names in enumerate(LAYERS) if parts[1] in names), None)
+
+
+@pytest.mark.parametrize("path", sources("difflcs"), ids=lambda p: str(p.relative_to(ROOT)))
+def test_imports_go_one_way(path):
+    module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    own = layer_of(module)
+    for name, _ in imports(path):
+        other = layer_of(name)
+        if own is not None and other is not None:
+            assert other <= own, f"{module} imports {name}"
+        if own is None and module != "difflcs.__init__" and other is not None:
+            assert other == 0, f"the helper {module} imports {name}"
+        if name == "difflcs_envs" or name.startswith("difflcs_envs."):
+            assert module == "difflcs.cli", f"{module} imports {name}"
+
+
+@pytest.mark.parametrize("path", sources("envs"), ids=lambda p: str(p.relative_to(ROOT)))
+def test_the_environments_never_import_the_library(path):
+    for name, _ in imports(path):
+        assert name != "difflcs"
+        assert not name.startswith("difflcs.")
+
+
+@pytest.mark.parametrize("path", sources("difflcs"), ids=lambda p: str(p.relative_to(ROOT)))
+def test_no_pickle_and_no_torch_save(path):
+    for name, _ in imports(path):
+        assert name.split(".")[0] not in ("pickle", "cloudpickle", "dill", "joblib", "shelve", "marshal")
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "torch":
+            assert node.attr not in ("save", "load")
+        if isinstance(node, ast.keyword) and node.arg == "allow_pickle":
+            assert isinstance(node.value, ast.Constant)
+            assert node.value.value is False
+
+
+def test_there_is_one_autograd_function_of_the_mpc():
+    found = [
+        path.name
+        for path in sources("difflcs/mpc")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ClassDef) and any(ast.unparse(b) == "torch.autograd.Function" for b in node.bases)
+    ]
+    assert found == ["autograd.py"]
+
+
+def test_the_layer_never_compares_names_of_backends():
+    text = (ROOT / "difflcs" / "mpc" / "layer.py").read_text()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Compare):
+            words = [n.value for n in ast.walk(node) if isinstance(n, ast.Constant) and isinstance(n.value, str)]
+            assert not set(words) & {"ipopt", "batched", "relaxed"}
+
+
+# --- README ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_readmes_example_runs_and_prints_a_gradient(tmp_path):
+    readme = ROOT / "README.md"
+    blocks = re.findall(r"```python\n(.*?)```", readme.read_text(), re.DOTALL)
+    assert blocks, "README.md has no python example"
+    script = tmp_path / "example.py"
+    script.write_text(blocks[0])
+    done = subprocess.run(
+        [sys.executable, "-W", "error", script], capture_output=True, text=True, timeout=120, check=False, cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert re.search(r"tensor\(|\d\.\d", done.stdout), "nothing was printed that looks like a gradient"
+    numbers = [float(v) for v in re.findall(r"-?\d+\.\d*(?:e[+-]?\d+)?", done.stdout)]
+    assert any(v != 0 for v in numbers)
+    assert "nan" not in done.stdout
+    assert "grad" in blocks[0]
