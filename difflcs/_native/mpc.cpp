@@ -371,9 +371,10 @@ struct Mpc {
           low[k * nu + j] = (step > below) | (fixed & (g >= 0));
           upp[k * nu + j] = (-step > above) | (fixed & (g < 0));
         } else {
-          const Vec near = 1e-12 * width;
-          low[k * nu + j] = (below <= near) & (g > 0);
-          upp[k * nu + j] = (above <= near) & (g < 0);
+          // Next to a bound that the action's own Newton step would cross it is put onto the bound (Bertsekas).
+          const Vec reach = g / gauss_newton, near = 1e-2 * width;
+          low[k * nu + j] = (below <= near) & (reach >= below) & (g > 0);
+          upp[k * nu + j] = (above <= near) & (-reach >= above) & (g < 0);
         }
         if (batch.barrier > 0) low[k * nu + j] = upp[k * nu + j] = Mask{};
         act[k * nu + j] = low[k * nu + j] | upp[k * nu + j] | fixed;
