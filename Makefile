@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-EXTRAS := rl,envs,viz,dev
+EXTRAS := relaxed,rl,envs,viz,dev
 
 .PHONY: help demo test lint format clean
 

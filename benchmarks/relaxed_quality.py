@@ -1,8 +1,9 @@
 """How good the plans of backend `relaxed` are, and how long they take.
 
 The actions of a plan are executed in the model itself (the rollout through relaxed complementarity), and the cost that
-they really have is compared with that of backend `batched` from one cold start. "second pass" is `relaxed` again with
-its first plan as guess. Times are of one thread, per problem; ratios are of the same run.
+they really have is compared with that of backend `batched` from one cold start. "guess = plan" is `relaxed` again with
+its own plan as guess, "no penalty" drops complementarity altogether, "no action" is u = 0. Times are of one thread, per
+problem; ratios are of the same run.
 
     python benchmarks/relaxed_quality.py            # the table of RelaxedBackend's docstring
     python benchmarks/relaxed_quality.py --smoke    # seconds
@@ -94,9 +95,8 @@ def main() -> None:
     }
     print(f"seeds 0…{options.seeds - 1}, {options.count} problems each, H = {HORIZON}, |u| ≤ {U_MAX}, λs = 1e-5")
     print("gap: executed cost above batched's; mean gap is of the mean costs, median and worst tenth of the ratios")
-    print(
-        f"{'n_lam':>5} {'backend':22} {'mean gap':>9} {'median':>8} {'worst 10%':>9} {'failed':>6} {'ms':>8} {'× batched':>9}"
-    )
+    head = f"{'n_lam':>5} {'backend':22} {'mean gap':>9} {'median':>8} {'worst 10%':>9} {'failed':>6} {'ms':>8}"
+    print(f"{head} {'× batched':>9} {'× ipopt':>8}")
     for n_lam in (5, 8):
         costs: dict[str, list[Tensor]] = {name: [] for name in backends}
         seconds, failed = dict.fromkeys(backends, 0.0), dict.fromkeys(backends, 0)
@@ -123,7 +123,8 @@ def main() -> None:
             each = 1e3 * seconds[name] / len(cost)
             print(
                 f"{n_lam:5d} {name:22} {mean:9.2%} {float(ratio.median()):8.2%} {float(ratio.quantile(0.9)):9.2%}"
-                f" {failed[name]:6d} {each:8.3f} {seconds[name] / seconds['batched']:9.1f}",
+                f" {failed[name]:6d} {each:8.3f} {seconds[name] / seconds['batched']:9.1f}"
+                f" {seconds[name] / seconds['ipopt']:8.2f}",
                 flush=True,
             )
 

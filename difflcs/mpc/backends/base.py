@@ -82,7 +82,7 @@ def certify(
     status = status.clone()
     finite = torch.stack([torch.isfinite(v).all(-1).all(-1) for v in primal]).all(0)
     status[~finite & (status == Status.CONVERGED)] = Status.NUMERICAL
-    primal = _replace_failed(problem, primal, status != Status.CONVERGED)
+    primal = replace_failed(problem, primal, status != Status.CONVERGED)
     linearisation = kkt.linearise(problem, primal)
     residual = torch.nan_to_num(kkt.residual(problem, primal, linearisation.multipliers), nan=torch.inf)
     status[(residual > tol) & (status == Status.CONVERGED)] = Status.NUMERICAL
@@ -91,7 +91,8 @@ def certify(
     return Result(primal, status, iterations, residual, solve_time, linearisation)
 
 
-def _replace_failed(problem: MPCProblem, primal: Primal, failed: Tensor) -> Primal:
+def replace_failed(problem: MPCProblem, primal: Primal, failed: Tensor) -> Primal:
+    """Finite numbers for failed (batch,) elements: actions clipped into the bounds, and the trajectory they cause."""
     if not bool(failed.any()):
         return primal
     index = torch.nonzero(failed).squeeze(-1)

@@ -1,0 +1,335 @@
+"""Backend `relaxed`: its convex program, gradient and failures; more of all three in test_backends.py."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import pickle
+import subprocess
+import sys
+import warnings
+
+import pytest
+import torch
+
+from difflcs import LCSMPCLayer, LCSParams, QuadraticCost, Status, available_backends
+from difflcs.errors import BackendNotFoundError, DTypeError, InvalidInputError, SolveError, SolveWarning
+from difflcs.mpc import Primal
+from difflcs.mpc.backends import RelaxedBackend, get_backend, relaxed
+
+pytestmark = pytest.mark.skipif(
+    bool(RelaxedBackend.missing()), reason="cvxpy and cvxpylayers are not installed: pip install 'difflcs[relaxed]'"
+)
+
+LCS, COST = ("A", "B", "C", "d", "D", "E", "F", "c"), ("Q", "R", "Q_final", "q", "r", "q_final")
+SHARED = (*LCS, *COST, "u_min", "u_max")
+
+
+def tensors(build, seed=0, batch=4, bound=0.15, **sizes):
+    n_x, n_u = sizes.get("n_x", 4), sizes.get("n_u", 2)
+    limit = torch.full((n_u,), bound, dtype=torch.float64)
+    cost = build.cost_tensors(seed, n_x=n_x, n_u=n_u)
+    x0 = 0.2 * build.normal(seed + 7)(batch, n_x)
+    return {**build.lcs_tensors(seed, **sizes), **cost, "u_min": -limit, "u_max": limit, "x0": x0}
+
+
+def solve(t, backend="relaxed", horizon=3, guess=None, **options):
+    layer = LCSMPCLayer(
+        LCSParams(**{k: t[k] for k in LCS}), QuadraticCost(**{k: t[k] for k in COST}, check=False),
+        horizon, t["u_min"], t["u_max"], backend=backend, relaxation=1e-4, **options,
+    )  # fmt: skip
+    return layer(t["x0"], guess=guess)
+
+
+def without_contact(build, **options):
+    t = tensors(build, **options)
+    return {**t, "C": torch.zeros_like(t["C"])}
+
+
+# --- the plan -------------------------------------------------------------------------------------------------------
+
+
+def test_it_is_registered_and_says_that_it_is_not_exact():
+    assert "relaxed" in available_backends()
+    assert get_backend("relaxed") == RelaxedBackend()
+    assert RelaxedBackend.exact is False
+
+
+@pytest.mark.parametrize("batch", [1, 5])
+def test_plans_are_feasible_for_the_convex_program(build, batch):
+    t = tensors(build, batch=batch)
+    sol = solve(t)
+    assert sol.status.tolist() == [Status.CONVERGED] * batch
+    assert float(sol.kkt_residual.max()) < 1e-6
+    assert torch.equal(sol.x[:, 0], t["x0"])
+    predicted = sol.x[:, :-1] @ t["A"].T + sol.u @ t["B"].T + sol.lam @ t["C"].T + t["d"]
+    slack = sol.x[:, :-1] @ t["D"].T + sol.u @ t["E"].T + sol.lam @ t["F"].T + t["c"]
+    torch.testing.assert_close(sol.x[:, 1:], predicted, rtol=1e-12, atol=1e-13)
+    assert float(slack.min()) > -1e-9
+    assert bool(((sol.u >= t["u_min"]) & (sol.u <= t["u_max"])).all())
+
+
+def test_forces_are_never_negative_although_many_would_pay(build):
+    """Cvxpylayers 1.2 with its MOREAU solver drops `x >= 0`: λ = −0.2 came back as solved."""
+    t = tensors(build, seed=1, batch=6)
+    t["c"] = t["c"] + 1.0  # far from contact
+    sol = solve(t, RelaxedBackend(penalties=(0.0,)))
+    assert bool(sol.converged.all())
+    assert float(sol.lam.min()) >= 0.0
+    raw = _raw_forces(t)
+    assert float(raw.min()) > -1e-6
+    # A λ at zero is held there by its bound: nothing else in this program stops it.
+    assert 0.3 < float((raw < 1e-6).double().mean()) < 1.0
+
+
+def _raw_forces(t):
+    """What cvxpylayers itself returns for λ, before anything is made exact."""
+    seen = []
+
+    class Spy(RelaxedBackend):
+        def _call(self, *args):
+            graphs = super()._call(*args)
+            seen.extend(graph.outputs[2].detach() for graph in graphs)
+            return graphs
+
+    solve(t, Spy(penalties=(0.0,)))
+    return torch.cat(seen)
+
+
+def test_without_contact_the_plan_is_the_exact_one(build):
+    for bound in (0.05, 50.0):
+        t = without_contact(build, seed=3, bound=bound)
+        mine, exact = solve(t), solve(t, "batched")
+        torch.testing.assert_close(mine.u, exact.u, rtol=0, atol=1e-4)
+        torch.testing.assert_close(mine.x, exact.x, rtol=0, atol=1e-4)
+        torch.testing.assert_close(mine.objective, exact.objective, rtol=1e-4, atol=1e-4)
+
+
+def test_a_huge_penalty_around_the_exact_plan_keeps_it(build):
+    """Linearised where it is satisfied, complementarity holds to first order; the exact plan is stationary."""
+    t = tensors(build, batch=8)
+    exact = solve(t, "batched")
+    mine = solve(t, RelaxedBackend(penalties=(1e4,)), guess=exact)
+    error = (mine.u - exact.u).abs().amax((1, 2))
+    assert float(error.median()) < 0.02 * 0.3
+    assert float(mine.complementarity().median()) < 1e-2
+
+
+def test_the_plan_does_not_depend_on_units(build):
+    t = tensors(build)
+    X, U, S = (torch.tensor(v, dtype=torch.float64) for v in ([1e2, 1e-2, 1.0, 3.0], [1e-2, 10.0], [1e2, 1e-2, 3.0]))
+    scaled = {
+        "A": X[:, None] * t["A"] / X, "B": X[:, None] * t["B"] / U, "C": X[:, None] * t["C"] * S, "d": X * t["d"],
+        "D": S[:, None] * t["D"] / X, "E": S[:, None] * t["E"] / U, "F": S[:, None] * t["F"] * S, "c": S * t["c"],
+        "Q": t["Q"] / X / X[:, None], "R": t["R"] / U / U[:, None], "Q_final": t["Q_final"] / X / X[:, None],
+        "q": t["q"] / X, "r": t["r"] / U, "q_final": t["q_final"] / X,
+        "u_min": U * t["u_min"], "u_max": U * t["u_max"], "x0": X * t["x0"],
+    }  # fmt: skip
+    torch.testing.assert_close(solve(scaled).u / U, solve(t).u, rtol=1e-6, atol=1e-8)
+
+
+def test_shared_and_per_element_inputs_give_the_same(build):
+    t = tensors(build)
+    each = {k: v if k == "x0" else v.expand(4, *v.shape).clone() for k, v in t.items()}
+    shared, own = solve(t), solve(each)
+    torch.testing.assert_close(own.u, shared.u, rtol=1e-7, atol=1e-9)
+    torch.testing.assert_close(own.lam, shared.lam, rtol=1e-7, atol=1e-9)
+
+
+def test_bounds_of_the_actions_hold_with_a_barrier_too(build):
+    t = without_contact(build, seed=3)
+    mine, exact = solve(t, barrier=1e-3), solve(t, "batched", barrier=1e-3)
+    assert bool(mine.converged.all())
+    assert float(mine.u.abs().max()) < 0.15
+    torch.testing.assert_close(mine.u, exact.u, rtol=0, atol=1e-4)
+
+
+def test_a_guess_makes_one_pass(build):
+    t = tensors(build)
+    first = solve(t)
+    assert first.iterations.tolist() == [2] * 4
+    assert solve(t, guess=first).iterations.tolist() == [1] * 4
+    wild = Primal(*(1e3 * torch.ones_like(v.detach()) for v in (first.x, first.u, first.lam)))
+    assert bool(solve(t, guess=wild).converged.all())
+
+
+def test_the_layer_of_one_size_is_built_once(build):
+    t = tensors(build)
+    solve(t)
+    before = relaxed._layer.cache_info().misses
+    solve({**t, "x0": 2 * t["x0"][:2]}, RelaxedBackend(penalties=(3.0,)))
+    assert relaxed._layer.cache_info().misses == before
+
+
+# --- the gradient ---------------------------------------------------------------------------------------------------
+
+
+def check_against_differences(build, t, tol, **options):
+    n, h = build.normal(41), 1e-6
+    leaves = {k: v.clone().requires_grad_() for k, v in t.items()}
+    sol = solve(leaves, **options)
+    weights = [n(*v.shape) for v in (sol.x, sol.u, sol.lam)]
+
+    def value(sol):
+        parts = [(w * v).sum() for w, v in zip(weights, (sol.x, sol.u, sol.lam), strict=True)]
+        return sum(parts) + sol.objective.sum()
+
+    value(sol).backward()
+    for k, v in t.items():
+        direction = 0.1 * n(*v.shape)
+        if k in ("Q", "R", "Q_final"):
+            direction = 0.5 * (direction + direction.mT)
+        moved = [float(value(solve({**t, k: v + sign * h * direction}, **options))) for sign in (1, -1)]
+        quotient, found = (moved[0] - moved[1]) / (2 * h), float((leaves[k].grad * direction).sum())
+        assert abs(found - quotient) <= tol * max(abs(quotient), 1e-2), k
+
+
+@pytest.mark.parametrize("bound", [0.05, 50.0])
+def test_without_contact_every_gradient_matches_central_differences(build, bound):
+    check_against_differences(build, without_contact(build, seed=3, bound=bound), 1e-3)
+
+
+def test_with_contact_every_gradient_is_that_of_all_passes(build):
+    check_against_differences(build, tensors(build, seed=4, batch=2), 1e-3)
+
+
+def test_gradients_with_a_guess_hold_the_guess(build):
+    t = tensors(build, seed=4, batch=2)
+    check_against_differences(build, t, 1e-3, guess=solve(t))
+
+
+def test_singular_weights_have_finite_right_gradients(build):
+    t = tensors(build, seed=5, batch=2)
+    t["Q"] = torch.diag(torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64))
+    leaf = t["Q"].clone().requires_grad_()
+    solve({**t, "Q": leaf}).u.sum().backward()
+    direction, h = torch.diag(torch.tensor([0.0, 1.0, 1.0, 1.0], dtype=torch.float64)), 1e-5
+    ahead, here = solve({**t, "Q": t["Q"] + h * direction}).u.sum(), solve(t).u.sum()
+    torch.testing.assert_close((leaf.grad * direction).sum(), (ahead - here) / h, rtol=1e-2, atol=1e-3)
+
+
+def test_shared_gradients_are_sums(build):
+    t = tensors(build)
+    shared = {k: v.clone().requires_grad_() for k, v in t.items()}
+    each = {k: (v if k == "x0" else v.expand(4, *v.shape)).clone().requires_grad_() for k, v in t.items()}
+    for leaves in (shared, each):
+        sol = solve(leaves)
+        (sol.u.sum() + sol.lam.sum() + sol.objective.sum()).backward()
+    for k in SHARED:
+        torch.testing.assert_close(shared[k].grad, each[k].grad.sum(0), rtol=1e-5, atol=1e-6, msg=lambda m, k=k: k + m)
+
+
+def test_float32_comes_back(build):
+    t = {k: v.float() for k, v in tensors(build).items()}
+    t["x0"].requires_grad_()
+    sol = solve(t)
+    assert sol.u.dtype == torch.float32
+    sol.u.sum().backward()
+    assert t["x0"].grad.dtype == torch.float32
+
+
+# --- failures -------------------------------------------------------------------------------------------------------
+
+
+class Fussy(RelaxedBackend):
+    """A solver that raises for a whole batch and for the element whose x0 is marked."""
+
+    def _call(self, layer, parameters, index):
+        def picky(*leaves, **options):
+            if len(leaves[10]) > 1 or bool((leaves[10] == 123.0).any()):
+                raise RuntimeError("Solver returned status Infeasible")
+            return layer(*leaves, **options)
+
+        return super()._call(picky, parameters, index)
+
+
+def test_a_batch_that_raises_is_solved_element_by_element(build):
+    t = tensors(build)
+    torch.testing.assert_close(solve(t, Fussy()).u, solve(t).u, rtol=1e-9, atol=1e-11)
+    leaves = [{k: v.clone().requires_grad_() for k, v in t.items()} for _ in range(2)]
+    solve(leaves[0], Fussy()).u.sum().backward()
+    solve(leaves[1]).u.sum().backward()
+    for k in t:
+        torch.testing.assert_close(leaves[0][k].grad, leaves[1][k].grad, rtol=1e-6, atol=1e-8)
+
+
+def test_a_failed_element_is_masked_and_spoils_nothing(build):
+    t = tensors(build)
+    marked = {**t, "x0": t["x0"].clone()}
+    marked["x0"][2, 0] = 123.0
+    leaves = {k: v.clone().requires_grad_() for k, v in marked.items()}
+    with pytest.warns(SolveWarning, match="1 of 4 MPC problems were not solved: 1 NUMERICAL"):
+        sol = solve(leaves, Fussy(), on_failure="mask")
+    assert sol.status.tolist() == [0, 0, Status.NUMERICAL, 0]
+    others = torch.tensor([0, 1, 3])
+    torch.testing.assert_close(sol.u[others], solve(t).u[others], rtol=1e-9, atol=1e-11)
+    for value in (sol.x, sol.u, sol.lam, sol.objective, sol.kkt_residual):
+        assert bool(torch.isfinite(value).all())
+    assert bool((sol.u[2].abs() <= 0.15).all())
+    (sol.u.sum() + sol.objective.sum()).backward()
+    assert bool(torch.isfinite(torch.cat([v.grad.flatten() for v in leaves.values()])).all())
+    assert torch.equal(leaves["x0"].grad[2], torch.zeros(4, dtype=torch.float64))
+    assert float(leaves["x0"].grad[0].abs().max()) > 0
+
+
+def test_a_failed_element_is_raised_by_name(build):
+    t = tensors(build)
+    t["x0"][1, 0] = 123.0
+    with pytest.raises(SolveError, match=r"1 of 4 MPC problems were not solved.*flat batch elements 1"):
+        solve(t, Fussy())
+
+
+def test_numbers_beyond_the_solver_spoil_nothing(build):
+    t = tensors(build)
+    t["x0"][3, 1] = 1e300
+    leaf = t["A"].clone().requires_grad_()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SolveWarning)
+        sol = solve({**t, "A": leaf}, on_failure="mask")
+    assert sol.status.tolist() == [0, 0, 0, Status.NUMERICAL]
+    assert bool(torch.isfinite(sol.u).all())
+    sol.u.sum().backward()
+    assert bool(torch.isfinite(leaf.grad).all())
+
+
+def test_a_residual_beyond_the_tolerance_is_not_converged(build):
+    with pytest.warns(SolveWarning, match="NUMERICAL"):
+        sol = solve(tensors(build), RelaxedBackend(residual_tol=1e-300), on_failure="mask")
+    assert not bool(sol.converged.any())
+
+
+def test_an_empty_batch(build):
+    t = {**tensors(build), "x0": torch.empty(0, 4, dtype=torch.float64, requires_grad=True)}
+    sol = solve(t)
+    assert sol.u.shape == (0, 3, 2)
+    sol.u.sum().backward()
+
+
+@pytest.mark.parametrize("package", ["cvxpy", "cvxpylayers"])
+def test_a_missing_package_is_named_with_its_pip_line(monkeypatch, package):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == package else find(name, *a))
+    assert "relaxed" not in available_backends()
+    for backend in ("relaxed", RelaxedBackend()):
+        with pytest.raises(
+            BackendNotFoundError, match=rf"'{package}' is not installed; run: pip install \"difflcs\[rel"
+        ):
+            get_backend(backend)
+
+
+def test_cvxpy_is_imported_on_first_use_only():
+    code = "import sys, difflcs; difflcs.available_backends(); assert not {'cvxpy', 'cvxpylayers'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_options_are_checked():
+    for wrong in ({"penalties": ()}, {"penalties": 3.0}, {"penalties": ("a",)}):
+        with pytest.raises(DTypeError, match="penalties"):
+            RelaxedBackend(**wrong)
+    for wrong in ({"penalties": (-1.0,)}, {"tol": 0.0}, {"residual_tol": -1.0}, {"threads": 0}):
+        with pytest.raises(InvalidInputError):
+            RelaxedBackend(**wrong)
+    backend = RelaxedBackend(penalties=(2.0,), threads=1)
+    assert pickle.loads(pickle.dumps(backend)) == backend
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        backend.tol = 1.0
