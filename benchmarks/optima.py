@@ -1,8 +1,8 @@
 """Which optima the backends reach: `python benchmarks/optima.py [--models RUN/model …] [--smoke]`.
 
 The LCS-MPC has local optima. Every backend solves the same problems; the best cost seen by anyone is the reference.
-Printed per backend: mean gap to it, the share of problems within 0.1 % of it, and better / equal / worse than IPOPT's cold
-start (equal: within 0.1 %). Written as JSON too.
+Printed per backend: mean gap to it, the share of problems within 0.1 % of it, and better / equal / worse than IPOPT's
+cold start (equal: within 0.1 %). Written as JSON too.
 """
 
 from __future__ import annotations
@@ -94,8 +94,9 @@ def main(o: Options) -> None:
         for name in BACKENDS:
             row = results[kind][name]
             shares = "/".join(f"{100 * row[f'{word} ipopt']:.0f}" for word in ("better than", "equal to", "worse than"))
+            near = 100 * row["within 0.1 % of best"]
             print(
-                f"  {name:20s} mean gap {100 * row['mean gap']:6.3f} %   near best {100 * row['within 0.1 % of best']:5.1f} %   "
+                f"  {name:20s} mean gap {100 * row['mean gap']:6.3f} %   near best {near:5.1f} %   "
                 f"better/equal/worse than ipopt {shares} %   failed {row['failed']}"
             )
     o.out.parent.mkdir(parents=True, exist_ok=True)
