@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import gc
 import pickle
 import warnings
+import weakref
 from dataclasses import dataclass
 
 import pytest
@@ -440,3 +442,19 @@ def test_the_inputs_are_left_as_they_were(layer, x0):
     layer(x0).u.sum().backward()
     assert torch.equal(x0, kept)
     assert all(torch.equal(v, state[k]) for k, v in layer.state_dict().items())
+
+
+@pytest.mark.parametrize("backend", ["batched", "ipopt"])
+def test_a_plan_is_freed_without_the_garbage_collector(build, x0, backend):
+    """Outputs kept by their own autograd node would form a cycle: memory would grow from call to call."""
+    layer = LCSMPCLayer(build.model(seed=3, scale=0.4), build.cost(0), 3, -0.15, 0.15, backend=backend)
+    gc.collect()
+    gc.disable()
+    try:
+        plan = layer(x0)
+        alive = weakref.ref(plan.problem)
+        plan.action.sum().backward()
+        del plan
+        assert alive() is None
+    finally:
+        gc.enable()

@@ -20,9 +20,11 @@ class SolveMPC(torch.autograd.Function):
         # `problem` holds the values of `tensors`; these are here only to receive gradients.
         result = backend.solve(problem, guess)
         ctx.problem, ctx.backend, ctx.result = problem, backend, result
-        x, u, lam = result.primal
+        # Aliases: if the outputs themselves were kept for backward, they would hold this node and it them, a cycle that
+        # only the garbage collector breaks.
+        x, u, lam = (v.detach() for v in result.primal)
         outputs = (x, u, lam, problem.objective(x, u))
-        info = (result.status, result.iterations, result.kkt_residual, result.solve_time)
+        info = tuple(v.detach() for v in (result.status, result.iterations, result.kkt_residual, result.solve_time))
         ctx.mark_non_differentiable(*info)
         return *outputs, *info
 

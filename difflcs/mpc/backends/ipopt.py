@@ -214,7 +214,7 @@ def _cpus() -> int:
 
 
 class _Locals:
-    """What belongs to this process alone: a forked child must neither talk to its parent's workers nor hold its locks."""
+    """What belongs to this process: a forked child must neither talk to its parent's workers nor hold its locks."""
 
     def __init__(self):
         self.here = threading.Lock()  # IPOPT in several threads of one process crashes
