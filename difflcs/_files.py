@@ -40,8 +40,8 @@ def write_json(path: Path, value: object) -> None:
 def save_record(directory: Path, kind: str, config: Mapping[str, object], tensors: Mapping[str, Tensor]) -> None:
     """Write `model.safetensors` and `config.json` into a directory, each atomically.
 
-    The tensor file carries a hash of its values (safetensors alone does not notice flipped bits) and of the description.
-    A crash between the two writes leaves files that fit each other whenever only the values have changed.
+    The tensor file carries a hash of its values (safetensors alone does not notice flipped bits) and of the
+    description. A crash between the two writes leaves files that fit each other whenever only the values have changed.
     """
     from safetensors.torch import save
 
