@@ -1,6 +1,9 @@
 // One double per SIMD lane, by the vector extensions of GCC and Clang: plain vector code on every CPU.
 #pragma once
 #include <cstdint>
+#if defined(__AVX__)
+#include <immintrin.h>
+#endif
 
 namespace difflcs::DIFFLCS_ISA {
 
@@ -13,10 +16,17 @@ static inline Vec select(Mask m, Vec a, Vec b) { return m ? a : b; }
 static inline Vec max(Vec a, Vec b) { return a > b ? a : b; }
 static inline Vec min(Vec a, Vec b) { return a < b ? a : b; }
 static inline Vec abs(Vec a) { return a < 0 ? -a : a; }
+// GCC does not always turn the loop into one instruction.
 static inline Vec sqrt(Vec a) {
+#if defined(__AVX512F__) && DIFFLCS_LANES == 8
+  return (Vec)_mm512_sqrt_pd((__m512d)a);
+#elif defined(__AVX__) && DIFFLCS_LANES == 4
+  return (Vec)_mm256_sqrt_pd((__m256d)a);
+#else
   Vec r;
   for (int l = 0; l < kLanes; l++) r[l] = __builtin_sqrt(a[l]);
   return r;
+#endif
 }
 static inline Vec log(Vec a) {
   Vec r;

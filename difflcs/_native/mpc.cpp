@@ -42,7 +42,7 @@ struct Mpc {
   // Trajectory, trial trajectory, and the feedback law.
   Vec *x, *u, *lam, *s, *xt, *ut, *lamt, *st, *K, *kf, *grad;
   // Scratch of the backward sweep and of the LCP.
-  Vec *P, *Pn, *v, *vn, *p, *pn, *M, *Kl, *Ks, *Ah, *PA, *H, *lin, *Lc, *Kk, *y, *size, *gap, *res, *wt, *dl;
+  Vec *P, *Pn, *v, *vn, *p, *pn, *M, *Kl, *Ks, *Ah, *PA, *H, *lin, *Lc, *Kk, *y, *size, *gap, *res, *wt, *dl, *lt, *wn, *rn, *root;
   // Kept per stage for the adjoint.
   Vec *Kl_s, *Ks_s, *Ah_s, *M_s, *size_s, *y_s, *P_s, *v_s, *p_s, *xb, *ub, *lb, *sum;
   Mask *act, *low, *upp;
@@ -70,7 +70,7 @@ struct Mpc {
     vec(P, nx * nx), vec(Pn, nx * nx), vec(v, nx), vec(vn, nx), vec(p, nx), vec(pn, nx), vec(M, nl * nl);
     vec(Kl, nl * nw), vec(Ks, nl * nw), vec(Ah, nx * nw), vec(PA, nx * nw), vec(H, nw * nw), vec(lin, nw);
     vec(Lc, nu * nu), vec(Kk, nu * (nx + 1)), vec(y, nl), vec(size, nl), vec(gap, nl), vec(res, nl), vec(wt, nl);
-    vec(dl, nl), mask(act, h * nu), mask(low, h * nu), mask(upp, h * nu);
+    vec(dl, nl), vec(lt, nl), vec(wn, nl), vec(rn, nl), vec(root, nl), mask(act, h * nu), mask(low, h * nu), mask(upp, h * nu);
     if (adjoint) {
       vec(Kl_s, h * nl * nw), vec(Ks_s, h * nl * nw), vec(Ah_s, h * nx * nw), vec(M_s, h * nl * nl);
       vec(size_s, h * nl), vec(y_s, h * nl), vec(P_s, (h + 1) * nx * nx), vec(v_s, (h + 1) * nx);
@@ -174,54 +174,61 @@ struct Mpc {
     }
   }
 
-  // lam o (F lam + gap) = eps by damped Newton on the CHKS function (see lcp.cpp) from the guess in lk. Lanes in `skip`
-  // keep lk and sk.
+  // lam o (F lam + gap) = eps by damped Newton on the CHKS function g = lam + w - root (see lcp.cpp) from the guess in lk.
+  // Lanes in `skip` keep lk and sk.
   void relaxed_lcp(Vec* lk, Vec* sk, Vec eps, Mask skip) {
     const int64_t nl = n.l();
     const Vec eps4 = 4.0 * eps;
-    Mask done = skip;
-    Vec merit, magnitude, best = all(1e300);
-    for (int iteration = 0; iteration < 50; iteration++) {
-      merit = all(0), magnitude = all(0);
+    // w, root and the squared norm of g at lk + step * dl; the next iterate starts from what the last trial computed.
+    auto evaluate = [&](Vec step, bool move) {
+      Vec merit = all(0);
+      for (int64_t i = 0; i < nl; i++) lt[i] = move ? lk[i] + step * dl[i] : lk[i];
       for (int64_t i = 0; i < nl; i++) {
         Vec t = gap[i];
-        for (int64_t j = 0; j < nl; j++) t += F[i * nl + j] * lk[j];
-        wt[i] = t;
-        const Vec diff = lk[i] - t, root = sqrt(diff * diff + eps4);
-        res[i] = root - lk[i] - t;
-        merit += res[i] * res[i];
-        magnitude = max(magnitude, abs(lk[i]) + abs(t) + abs(gap[i]));
-        const Vec ratio = diff / root, b = 1.0 + ratio;
-        for (int64_t j = 0; j < nl; j++) M[i * nl + j] = b * F[i * nl + j];
-        M[i * nl + i] += 1.0 - ratio;
+        for (int64_t j = 0; j < nl; j++) t += F[i * nl + j] * lt[j];
+        const Vec diff = lt[i] - t;
+        wn[i] = t, rn[i] = sqrt(diff * diff + eps4);
+        const Vec g = lt[i] + t - rn[i];
+        merit += g * g;
       }
+      return merit;
+    };
+    Vec merit = evaluate(all(0), false), best = all(1e300);
+    for (int64_t i = 0; i < nl; i++) wt[i] = wn[i], root[i] = rn[i];
+    Mask done = skip;
+    for (int iteration = 0; iteration < 50; iteration++) {
+      Vec magnitude = all(0);
+      for (int64_t i = 0; i < nl; i++) magnitude = max(magnitude, abs(lk[i]) + abs(wt[i]) + abs(gap[i]));
       // Converged at rounding level, or stuck just above it.
       const Vec floor = 1e-15 * magnitude;
       done |= (merit <= floor * floor) | ((merit <= 1e-24 * magnitude * magnitude) & (merit > 0.25 * best)) |
               (merit != merit);
       best = min(best, merit);
       if (!any(~done)) break;
-      for (int64_t i = 0; i < nl; i++) dl[i] = res[i];
+      for (int64_t i = 0; i < nl; i++) {
+        const Vec ratio = (lk[i] - wt[i]) / root[i], b = 1.0 + ratio;
+        for (int64_t j = 0; j < nl; j++) M[i * nl + j] = b * F[i * nl + j];
+        M[i * nl + i] += 1.0 - ratio;
+        dl[i] = root[i] - lk[i] - wt[i];
+      }
       lu_factor(nl, M);
       lu_solve(nl, M, dl);
-      Vec step = all(1);
+      Vec step = all(1), next = merit;
       for (int search = 0; search < 8; search++) {
-        Vec next = all(0);
-        for (int64_t i = 0; i < nl; i++) {
-          Vec t = gap[i];
-          for (int64_t j = 0; j < nl; j++) t += F[i * nl + j] * (lk[j] + step * dl[j]);
-          const Vec a = lk[i] + step * dl[i], diff = a - t, g = a + t - sqrt(diff * diff + eps4);
-          next += g * g;
-        }
+        next = evaluate(step, true);
         const Mask poor = (next > merit * (1.0 - 0.2 * step)) & (merit > 1e-24 * magnitude * magnitude) & ~done;
         if (!any(poor)) break;
-        step = select(poor, 0.4 * step, step);
+        if (search < 7) step = select(poor, 0.4 * step, step);
       }
-      for (int64_t i = 0; i < nl; i++) lk[i] = select(done, lk[i], lk[i] + step * dl[i]);
+      for (int64_t i = 0; i < nl; i++) {
+        lk[i] = select(done, lk[i], lt[i]);
+        wt[i] = select(done, wt[i], wn[i]);
+        root[i] = select(done, root[i], rn[i]);
+      }
+      merit = select(done, merit, next);
     }
     for (int64_t i = 0; i < nl; i++) {
-      const Vec diff = lk[i] - wt[i], root = sqrt(diff * diff + eps4);
-      const Vec larger = 0.5 * (abs(diff) + root), smaller = eps / larger;
+      const Vec diff = lk[i] - wt[i], larger = 0.5 * (abs(diff) + root[i]), smaller = eps / larger;
       lk[i] = select(skip, lk[i], select(diff > 0, larger, smaller));
       sk[i] = select(skip, sk[i], select(diff > 0, smaller, larger));
     }
