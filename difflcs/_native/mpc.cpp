@@ -42,7 +42,7 @@ struct Mpc {
   // Trajectory, trial trajectory, and the feedback law.
   Vec *x, *u, *lam, *s, *xt, *ut, *lamt, *st, *K, *kf, *grad;
   // Scratch of the backward sweep and of the LCP.
-  Vec *P, *Pn, *v, *vn, *p, *pn, *M, *Kl, *Ks, *Ah, *PA, *H, *lin, *Lc, *Kk, *y, *size, *gap, *res, *wt, *dl, *lt, *wn, *rn, *root;
+  Vec *P, *Pn, *v, *vn, *p, *pn, *M, *Mc, *Kl, *Tk, *Wk, *av, *bv, *Ah, *PA, *H, *lin, *Lc, *Kk, *y, *size, *gap, *res, *wt, *dl, *lt, *wn, *rn, *root;
   // Kept per stage for the adjoint.
   Vec *Kl_s, *Ks_s, *Ah_s, *M_s, *size_s, *y_s, *P_s, *v_s, *p_s, *xb, *ub, *lb, *sum;
   Mask *act, *low, *upp;
@@ -68,7 +68,8 @@ struct Mpc {
     vec(xt, (h + 1) * nx), vec(ut, h * nu), vec(lamt, h * nl), vec(st, h * nl), vec(K, h * nu * nx), vec(kf, h * nu);
     vec(grad, h * nu);
     vec(P, nx * nx), vec(Pn, nx * nx), vec(v, nx), vec(vn, nx), vec(p, nx), vec(pn, nx), vec(M, nl * nl);
-    vec(Kl, nl * nw), vec(Ks, nl * nw), vec(Ah, nx * nw), vec(PA, nx * nw), vec(H, nw * nw), vec(lin, nw);
+    vec(Mc, nl * nl), vec(Kl, nl * nw), vec(Tk, nl * nw), vec(Wk, nl * nw), vec(av, nl), vec(bv, nl);
+    vec(Ah, nx * nw), vec(PA, nx * nw), vec(H, nw * nw), vec(lin, nw);
     vec(Lc, nu * nu), vec(Kk, nu * (nx + 1)), vec(y, nl), vec(size, nl), vec(gap, nl), vec(res, nl), vec(wt, nl);
     vec(dl, nl), vec(lt, nl), vec(wn, nl), vec(rn, nl), vec(root, nl), mask(act, h * nu), mask(low, h * nu), mask(upp, h * nu);
     if (adjoint) {
@@ -264,7 +265,7 @@ struct Mpc {
   };
 
   template <bool kAdjoint>
-  Sweep backward(Vec regularisation) {
+  Sweep backward(Vec regularisation, Mask stubborn) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nw = n.w(), h = n.h;
     Sweep out{all(0), all(0), all(0), Mask{}};
     Vec costate = all(1);
@@ -284,27 +285,29 @@ struct Mpc {
         for (int64_t i = 0; i < nx; i++) p_s[(k + 1) * nx + i] = p[i], v_s[(k + 1) * nx + i] = v[i];
         for (int64_t i = 0; i < nx * nx; i++) P_s[(k + 1) * nx * nx + i] = P[i];
       }
-      // Linearised LCP: dlam = Kl (dx, du), ds = Ks (dx, du), dx+ = Ah (dx, du).
+      // Linearised LCP: dlam = Kl (dx, du), ds = Ks (dx, du), dx+ = Ah (dx, du). Since a dlam + b ds = 0, both follow from
+      // one T: Kl = b T, Ks = -a T with (diag(a) + F diag(b)) T = -[D E].
       for (int64_t i = 0; i < nl; i++) {
         size[i] = 1.0 / (lk[i] + sk[i]);
-        const Vec a = sk[i] * size[i], b = lk[i] * size[i];
-        for (int64_t j = 0; j < nl; j++) M[i * nl + j] = b * F[i * nl + j];
-        M[i * nl + i] += a;
-        for (int64_t j = 0; j < nw; j++) Kl[i * nw + j] = -b * DE[i * nw + j];
+        av[i] = sk[i] * size[i], bv[i] = lk[i] * size[i];
       }
-      lu_factor(nl, M);
-      lu_solve_many(nl, nw, M, Kl);
+      for (int64_t i = 0; i < nl; i++) {
+        for (int64_t j = 0; j < nl; j++) {
+          M[i * nl + j] = bv[i] * F[i * nl + j];
+          Mc[i * nl + j] = bv[j] * F[i * nl + j];
+        }
+        M[i * nl + i] += av[i], Mc[i * nl + i] += av[i];
+        for (int64_t j = 0; j < nw; j++) Tk[i * nw + j] = all(0) - DE[i * nw + j];
+      }
+      lu_factor(nl, M), lu_factor(nl, Mc);
+      lu_solve_many(nl, nw, Mc, Tk);
+      for (int64_t i = 0; i < nl; i++)
+        for (int64_t j = 0; j < nw; j++) Kl[i * nw + j] = bv[i] * Tk[i * nw + j];
       for (int64_t i = 0; i < nx; i++)
         for (int64_t j = 0; j < nw; j++) {
           Vec t = all(0) + AB[i * nw + j];
           for (int64_t m = 0; m < nl; m++) t += C[i * nl + m] * Kl[m * nw + j];
           Ah[i * nw + j] = t;
-        }
-      for (int64_t i = 0; i < nl; i++)
-        for (int64_t j = 0; j < nw; j++) {
-          Vec t = all(0) + DE[i * nw + j];
-          for (int64_t m = 0; m < nl; m++) t += F[i * nl + m] * Kl[m * nw + j];
-          Ks[i * nw + j] = t;
         }
       for (int64_t i = 0; i < nl; i++) {
         Vec t = all(0);
@@ -312,9 +315,16 @@ struct Mpc {
         y[i] = t;
       }
       lu_solve_transposed(nl, M, y);
-      for (int64_t i = 0; i < nl; i++) y[i] *= size[i];
+      for (int64_t i = 0; i < nl; i++) {
+        y[i] *= size[i];
+        for (int64_t j = 0; j < nw; j++) Wk[i * nw + j] = -2.0 * y[i] * av[i] * Kl[i * nw + j];
+      }
       if (kAdjoint) {
-        for (int64_t i = 0; i < nl * nw; i++) Kl_s[k * nl * nw + i] = Kl[i], Ks_s[k * nl * nw + i] = Ks[i];
+        for (int64_t i = 0; i < nl; i++)
+          for (int64_t j = 0; j < nw; j++) {
+            Kl_s[(k * nl + i) * nw + j] = Kl[i * nw + j];
+            Ks_s[(k * nl + i) * nw + j] = -av[i] * Tk[i * nw + j];
+          }
         for (int64_t i = 0; i < nx * nw; i++) Ah_s[k * nx * nw + i] = Ah[i];
         for (int64_t i = 0; i < nl * nl; i++) M_s[k * nl * nl + i] = M[i];
         for (int64_t i = 0; i < nl; i++) size_s[k * nl + i] = size[i], y_s[k * nl + i] = y[i];
@@ -336,10 +346,9 @@ struct Mpc {
           for (int64_t m = 0; m < nx; m++) t += Ah[m * nw + i] * PA[m * nw + j];
           H[i * nw + j] = t;
         }
-      auto curvature = [&](int64_t i, int64_t j) {  // Y_ij
+      auto curvature = [&](int64_t i, int64_t j) {  // Y_ij = sum_m y_m (Kl_mi Ks_mj + Ks_mi Kl_mj)
         Vec t = all(0);
-        for (int64_t m = 0; m < nl; m++)
-          t += y[m] * (Kl[m * nw + i] * Ks[m * nw + j] + Ks[m * nw + i] * Kl[m * nw + j]);
+        for (int64_t m = 0; m < nl; m++) t += Wk[m * nw + i] * Tk[m * nw + j];
         return t;
       };
       // Reduced gradient g, costate of the previous state, and the linear term of the stage.
@@ -401,7 +410,7 @@ struct Mpc {
         return max(R[j * nu + j] + 1e-6 * abs(H[(nx + j) * nw + nx + j]), all(kTiny));
       };
       // Cholesky of H_uu + Y_uu + regularisation with identity rows for active actions. An indefinite block first drops
-      // Y at this stage (Gauss-Newton), then has its pivots lifted.
+      // Y at this stage (Gauss-Newton), then has its pivots lifted; lanes that are `stubborn` lift them at once.
       const Mask* active = act + k * nu;
       Vec use = all(1);
       for (int attempt = 0; attempt < 2; attempt++) {
@@ -431,7 +440,7 @@ struct Mpc {
           break;
         }
         if (!any(failed) || attempt == 1) break;
-        use = select(failed, all(0), use);
+        use = select(failed & ~stubborn, all(0), use);
       }
       for (int64_t i = first; i < nw; i++)
         for (int64_t j = first; j <= i; j++)
@@ -564,7 +573,10 @@ struct Mpc {
         J = select(fresh, rolled, J);
       }
       fresh = Mask{};
-      const Sweep sweep = backward<false>(regularisation);
+      // Gauss-Newton can creep along a curved valley: after 20 steps in one stage every other one keeps the curvature.
+      Mask stubborn;
+      for (int l = 0; l < kLanes; l++) stubborn[l] = lane[l].in_stage > 20 && lane[l].in_stage % 2 ? -1 : 0;
+      const Sweep sweep = backward<false>(regularisation, stubborn);
       Mask frozen = idle;
       for (int l = 0; l < kLanes; l++) {
         if (idle[l] || eps[l] > target) continue;
@@ -648,7 +660,7 @@ struct Mpc {
           s[k * nl + i] = t;
         }
       }
-      backward<true>(all(0));
+      backward<true>(all(0), Mask{});
       forward_adjoint(o, group, end, valid);
     }
     for (int64_t i = 0; i < o.shared_size; i++) {
