@@ -27,6 +27,8 @@ struct Sizes {
 };
 
 constexpr double kTiny = 1e-300;
+// Failed searches in a row, each with 8 times the damping, before a problem is given up.
+constexpr int64_t kFailures = 12;
 
 // T is the type of a matrix entry: double where the batch shares all matrices, else Vec.
 template <class T, class S>
@@ -388,7 +390,8 @@ struct Mpc {
           upp[k * nu + j] = (-step > above) | (fixed & (g < 0));
         } else {
           // Next to a bound that the action's own Newton step would cross it is put onto the bound (Bertsekas).
-          const Vec reach = g / gauss_newton, near = 1e-2 * width;
+          // Not after a failed step: the jump is not damped, and in an unstable system it can cost more than it gains.
+          const Vec reach = g / gauss_newton, near = select(regularisation > 0, all(1e-12), all(1e-2)) * width;
           low[k * nu + j] = (below <= near) & (reach >= below) & (g > 0);
           upp[k * nu + j] = (above <= near) & (-reach >= above) & (g < 0);
         }
@@ -583,9 +586,9 @@ struct Mpc {
         Lane& a = lane[l];
         const double tol = o.tol > sweep.rounding[l] ? o.tol : sweep.rounding[l];
         // A search that fails this close to the optimum has met the rounding of the cost.
-        const bool converged = sweep.projected[l] <= (a.failures < 7 ? tol : 1e3 * tol);
+        const bool converged = sweep.projected[l] <= (a.failures < kFailures ? tol : 1e3 * tol);
         const bool broken = !(J[l] < 1e300 && J[l] > -1e300);
-        if (!converged && !broken && a.iterations < o.max_iter && a.failures < 7) continue;
+        if (!converged && !broken && a.iterations < o.max_iter && a.failures < kFailures) continue;
         const int64_t e = a.element;
         store_lane(o.x + e * (h + 1) * nx, x, (h + 1) * nx, l);
         store_lane(o.u + e * h * nu, u, h * nu, l);

@@ -1,0 +1,184 @@
+"""Backend `batched`: what it promises beyond the conformance suite."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import textwrap
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+
+from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSParams
+from difflcs._native import _kernels
+from difflcs.errors import InvalidInputError
+from difflcs.mpc import kkt
+from difflcs.mpc.backends import BatchedBackend
+from difflcs.mpc.problem import INPUTS
+
+PAIRS = [(3 + 2 * finger + axis, axis) for finger in range(3) for axis in range(2)]
+COST = GoalCost.reach(9, 6, (200.0, 200.0, 0.3), (200.0, 200.0, 1.5), 200.0, PAIRS, 10.0, 6.0)
+
+
+def pushing(build, n_lam, seed=0, **options):
+    backend = BatchedBackend(**options.pop("backend", {}))
+    return LCSMPCLayer(build.pushing(seed, n_lam), COST, 5, -0.015, 0.015, backend=backend, **options)
+
+
+def data(build, count, seed=1):
+    n = build.normal(seed)
+    return 0.05 * n(count, 9), 0.05 * n(count, 3)
+
+
+@pytest.mark.parametrize("n_lam", [5, 8, 3])
+@pytest.mark.parametrize("barrier", [0.0, 1e-2])
+@pytest.mark.parametrize("shared", [True, False])
+def test_the_native_adjoint_equals_the_reference(build, n_lam, barrier, shared):
+    """The same 17 gradients as `kkt.vjp`, to 1e-8 as promised (1e-13 in practice)."""
+    mpc = pushing(build, n_lam, barrier=barrier)
+    x0, goal = data(build, 40)
+    if not shared:
+        lcs = {k: v * (1 + 0.01 * build.normal(2)(40, *[1] * v.ndim)) for k, v in mpc.lcs.tensors().items()}
+        mpc.lcs = LCSParams(**lcs)
+    plan = mpc(x0, goal)
+    result = mpc.backend.solve(plan.problem, None)
+    n = build.normal(3)
+    grads = n(40, 6, 9), n(40, 5, 6), n(40, 5, n_lam), n(40)
+    ours = mpc.backend.vjp(plan.problem, result, grads, plan.converged)
+    reference = kkt.vjp(plan.problem, kkt.linearise(plan.problem, result.primal), grads, plan.converged)
+    for name in INPUTS:
+        scale = float(reference[name].abs().max())
+        torch.testing.assert_close(ours[name], reference[name], rtol=0, atol=1e-8 * max(scale, 1e-12))
+
+
+def test_an_element_depends_on_nothing_but_itself(build):
+    x0, goal = data(build, 70)
+    plan = pushing(build, 5)(x0, goal)
+    order = torch.randperm(70, generator=torch.Generator().manual_seed(0))
+    shuffled = pushing(build, 5)(x0[order], goal[order])
+    assert torch.equal(shuffled.u, plan.u[order])
+    assert torch.equal(shuffled.iterations, plan.iterations[order])
+    for i in (0, 13, 69):
+        assert torch.equal(pushing(build, 5)(x0[i], goal[i]).u, plan.u[i])
+    wild = x0.clone()
+    wild[7], wild[33] = 1e6, 1e150
+    beside = pushing(build, 5, on_failure="mask")
+    with pytest.warns(match="were not solved"):
+        disturbed = beside(wild, goal)
+    others = torch.ones(70, dtype=torch.bool)
+    others[[7, 33]] = False
+    assert torch.equal(disturbed.u[others], plan.u[others])
+    assert bool(disturbed.u.isfinite().all())
+
+
+def test_threads_change_nothing_not_even_summed_gradients(build):
+    model = LCSModel.from_params(build.pushing(0, 5))
+    x0, goal = data(build, 300)
+    found = []
+    for threads in (1, 2, 5):
+        model.zero_grad()
+        backend = BatchedBackend(threads=threads)
+        plan = LCSMPCLayer(model, COST, 5, -0.015, 0.015, backend=backend)(x0, goal)
+        plan.action.square().sum().backward()
+        found.append([plan.u.detach(), *(p.grad.clone() for p in model.parameters())])
+    for other in found[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
+
+
+def test_it_may_be_used_from_several_threads(build):
+    mpc = pushing(build, 5)
+    x0, goal = data(build, 16)
+    wanted = mpc(x0, goal).u
+    with ThreadPoolExecutor(4) as pool:
+        assert all(torch.equal(u, wanted) for u in pool.map(lambda _: mpc(x0, goal).u, range(20)))
+
+
+def test_restarts_are_seeded_and_never_worse(build):
+    x0, goal = data(build, 60)
+    one, four = pushing(build, 8)(x0, goal), pushing(build, 8, backend={"restarts": 4})(x0, goal)
+    again = pushing(build, 8, backend={"restarts": 4})(x0, goal)
+    other = pushing(build, 8, backend={"restarts": 4, "seed": 1})(x0, goal)
+    assert bool((four.objective <= one.objective).all())
+    assert bool((four.objective < one.objective - 1e-3).any())
+    assert torch.equal(four.u, again.u)
+    assert not torch.equal(four.u, other.u)
+
+
+@pytest.mark.parametrize("kind", ["pushing", "random", "untrained"])
+def test_nearly_every_problem_is_solved(build, kind):
+    x0, goal = data(build, 400)
+    generator = torch.Generator().manual_seed(0)
+    solved = 0
+    for n_lam in (5, 8):
+        if kind == "pushing":
+            lcs = build.pushing(1, n_lam)
+        else:
+            lcs = LCSModel(9, 6, n_lam, init_scale=0.3 if kind == "random" else 1e-3, generator=generator)
+        with torch.no_grad():
+            plan = LCSMPCLayer(lcs, COST, 5, -0.015, 0.015, on_failure="mask")(x0, goal)
+        solved += int(plan.converged.sum())
+    assert solved >= 799
+
+
+def test_a_good_guess_saves_iterations(build):
+    x0, goal = data(build, 50)
+    mpc = pushing(build, 5)
+    cold = mpc(x0, goal)
+    warm = mpc(x0, goal, guess=cold)
+    assert float(warm.iterations.double().mean()) < 0.2 * float(cold.iterations.double().mean())
+    torch.testing.assert_close(warm.u, cold.u, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("isa", ["baseline", "avx2", "avx512"])
+def test_every_instruction_set_finds_the_same_plans(isa):
+    """Other lanes, other rounding: nearly all plans agree closely, a few meet another optimum."""
+    script = """
+        import torch
+        from difflcs import GoalCost, LCSModel, LCSMPCLayer
+        from difflcs._native import _kernels
+        g = torch.Generator().manual_seed(0)
+        lcs = LCSModel(9, 6, 5, init_scale=0.3, generator=g)
+        mpc = LCSMPCLayer(lcs, GoalCost.reach(9, 6, (200.0, 200.0, 0.3), input_weight=200.0), 5, -0.015, 0.015)
+        x0 = 0.05 * torch.randn(30, 9, generator=g, dtype=torch.float64)
+        plan = mpc(x0, torch.zeros(3, dtype=torch.float64))
+        plan.action.sum().backward()
+        print(_kernels.isa(), *plan.objective.tolist(), lcs.A.grad.norm().item())
+    """
+
+    def run(name):
+        environment = {**os.environ, "DIFFLCS_ISA": name}
+        command = [sys.executable, "-c", textwrap.dedent(script)]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        return done.returncode, done.stdout.split(), done.stderr
+
+    code, words, error = run(isa)
+    if isa != "baseline" and code != 0:
+        assert "is not available" in error  # a clear refusal on a CPU without it
+        return
+    assert (code, words[0]) == (0, isa), error
+    _, reference, _ = run("")
+    values, wanted = (torch.tensor([float(w) for w in v[1:]], dtype=torch.float64) for v in (words, reference))
+    close = (values - wanted).abs() <= 1e-8 * (1 + wanted.abs())
+    assert int(close.sum()) >= 29
+
+
+def test_an_unknown_instruction_set_is_refused_with_the_known_ones():
+    command = [sys.executable, "-c", "from difflcs._native import _kernels; _kernels.isa()"]
+    environment = {**os.environ, "DIFFLCS_ISA": "mmx"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert "DIFFLCS_ISA=mmx is not available: expected baseline, avx2 or avx512" in done.stderr
+
+
+def test_the_chosen_instruction_set_has_a_name():
+    assert _kernels.isa() in ("baseline", "avx2", "avx512")
+
+
+@pytest.mark.parametrize(
+    "options", [{"restarts": 0}, {"tol": 0.0}, {"max_iter": 0}, {"shrink": 1.0}, {"homotopy": 0.5}, {"threads": 0}]
+)
+def test_options_out_of_range_are_refused(options):
+    with pytest.raises(InvalidInputError, match="expected"):
+        BatchedBackend(**options)
