@@ -13,7 +13,7 @@ help:
 	@echo "make format let ruff put the code in order"
 	@echo "make clean  remove .venv and build products"
 
-$(VENV)/.ready: pyproject.toml constraints.txt CMakeLists.txt cmake/kernels.cmake $(wildcard difflcs/_native/*.?pp)
+$(VENV)/.ready: pyproject.toml constraints.txt CMakeLists.txt cmake/kernels.cmake $(wildcard difflcs/_native/*.?pp envs/difflcs_envs/_native/*.?pp)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "difflcs needs Python 3.11 or newer, got $$($(PYTHON) --version); try make PYTHON=python3.11"; exit 1; }
 	$(PYTHON) -m venv $(VENV)

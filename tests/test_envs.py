@@ -18,7 +18,8 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 import difflcs_envs  # noqa: E402
 from difflcs_envs.trifinger import kinematics  # noqa: E402
 from difflcs_envs.trifinger.env import TriFingerMoveCubeEnv  # noqa: E402
-from difflcs_envs.trifinger.model import FINGER_YAWS, TIP_HEIGHT  # noqa: E402
+from difflcs_envs.trifinger.model import FINGER_YAWS  # noqa: E402
+from difflcs_envs.trifinger.native import NATIVE_VARIABLE  # noqa: E402
 from difflcs_envs.trifinger.rendering import SceneRenderer, has_display, select_gl_backend  # noqa: E402
 
 ENV_ID = "difflcs/TriFingerMoveCube-v0"
@@ -94,8 +95,16 @@ def test_check_env():
 
 @pytest.mark.usefixtures("gl")
 @pytest.mark.skipif(has_display(), reason="would open a window for the mode 'human'")
-def test_check_env_with_rendering():
-    env = gymnasium.make(ENV_ID, render_mode="rgb_array")
+@pytest.mark.parametrize(
+    ("env_id", "arguments"),
+    [
+        (ENV_ID, {}),
+        ("difflcs/TriFingerMoveObject-v0", {"object": "banana", "object_source": "stand_in"}),
+        ("difflcs/TriFingerTurnCube-v0", {}),
+    ],
+)
+def test_check_env_with_rendering(env_id, arguments):
+    env = gymnasium.make(env_id, render_mode="rgb_array", **arguments)
     check_env(env.unwrapped)
     env.close()
     env.close()
@@ -187,7 +196,7 @@ def test_home_posture():
     np.testing.assert_allclose(state[3:].reshape(3, 2), 0.0977 * OUTWARD, atol=2e-4)
     np.testing.assert_allclose(env.physics.data.qpos[7:].reshape(3, 3), [[0, -0.806, -1.175]] * 3, atol=2e-3)
     np.testing.assert_array_equal(env.physics.data.qvel, 0.0)
-    np.testing.assert_allclose(env.physics.data.site_xpos[:, 2], TIP_HEIGHT, atol=1e-12)
+    np.testing.assert_allclose(env.physics.data.site_xpos[:, 2], 0.03, atol=1e-12)
 
 
 def test_goals_fill_the_task_space():
@@ -329,7 +338,9 @@ def test_mass_and_friction_reach_the_model():
 )
 def test_unstable_simulation_ends_the_episode_at_the_last_finite_state(field, index, value, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes MUJOCO_LOG.TXT
+    monkeypatch.setenv(NATIVE_VARIABLE, "0")
     env = make()
+    monkeypatch.delenv(NATIVE_VARIABLE)
     env.reset(seed=0)
     before = env.step(np.full(6, 0.01))[0]["state"]
     apply = env.physics.controller.apply

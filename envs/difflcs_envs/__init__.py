@@ -11,12 +11,29 @@ environment is made.
 
 from __future__ import annotations
 
-from difflcs_envs.errors import MissingDependencyError, PhysicsWarning, RenderingError
+from difflcs_envs.errors import (
+    AssetError,
+    DifflcsEnvsError,
+    MeshError,
+    MissingDependencyError,
+    PhysicsWarning,
+    RenderingError,
+)
 
-__all__ = ["MissingDependencyError", "PhysicsWarning", "RenderingError", "register_envs"]
+__all__ = [
+    "AssetError",
+    "DifflcsEnvsError",
+    "MeshError",
+    "MissingDependencyError",
+    "PhysicsWarning",
+    "RenderingError",
+    "register_envs",
+]
 
 _ENTRY_POINTS = {
-    "TriFingerMoveCube-v0": "difflcs_envs.trifinger.env:TriFingerMoveCubeEnv",
+    "TriFingerMoveCube-v0": ("trifinger.env:TriFingerMoveCubeEnv", "vector:move_cube"),
+    "TriFingerMoveObject-v0": ("trifinger.env:TriFingerMoveObjectEnv", "vector:move_object"),
+    "TriFingerTurnCube-v0": ("trifinger.env:TriFingerTurnCubeEnv", "vector:turn_cube"),
 }
 
 
@@ -33,10 +50,12 @@ def register_envs() -> None:
         import gymnasium
     except ImportError as error:
         raise MissingDependencyError("gymnasium") from error
-    for name, entry_point in _ENTRY_POINTS.items():
+    for name, (single, vector) in _ENTRY_POINTS.items():
         env_id = f"difflcs/{name}"
         if env_id not in gymnasium.registry:
-            gymnasium.register(id=env_id, entry_point=entry_point)
+            gymnasium.register(
+                id=env_id, entry_point=f"difflcs_envs.{single}", vector_entry_point=f"difflcs_envs.{vector}"
+            )
 
 
 register_envs()

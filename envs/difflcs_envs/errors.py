@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
-__all__ = ["INSTALL_HINT", "MissingDependencyError", "PhysicsWarning", "RenderingError"]
+__all__ = [
+    "INSTALL_HINT",
+    "AssetError",
+    "DifflcsEnvsError",
+    "MeshError",
+    "MissingDependencyError",
+    "PhysicsWarning",
+    "RenderingError",
+]
 
 INSTALL_HINT = 'pip install "difflcs[envs]"'
 
 
-class MissingDependencyError(ImportError):
+class DifflcsEnvsError(Exception):
+    """Base of the errors of this package, but for plain ValueErrors about arguments."""
+
+
+class MissingDependencyError(ImportError, DifflcsEnvsError):
     """A package that the environments need is not installed."""
 
     def __init__(self, package: str) -> None:
@@ -17,8 +29,16 @@ class MissingDependencyError(ImportError):
         )
 
 
-class RenderingError(RuntimeError):
+class RenderingError(RuntimeError, DifflcsEnvsError):
     """No picture can be drawn on this machine: no display, no OpenGL library, or no OpenGL context."""
+
+
+class MeshError(ValueError, DifflcsEnvsError):
+    """A mesh is missing, broken, or not a solid of a size that the robot can push."""
+
+
+class AssetError(RuntimeError, DifflcsEnvsError):
+    """A download failed, or what was downloaded is not what it should be."""
 
 
 class PhysicsWarning(RuntimeWarning):

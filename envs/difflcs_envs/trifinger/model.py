@@ -20,7 +20,7 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 
-__all__ = ["CubeObject", "SceneObject", "build_spec"]
+__all__ = ["CubeObject", "SceneObject", "build_spec", "tip_height_for"]
 
 NUM_FINGERS = 3
 JOINTS_PER_FINGER = 3
@@ -37,7 +37,9 @@ TIP_RADIUS = 0.0095  # [m]
 FINGER_YAWS = np.deg2rad([0.0, -120.0, -240.0])  # [rad] of the finger frames; finger 0 sits on the +y axis
 JOINT_RANGES = np.array([[-1.5708, 1.5708], [-1.35263, 4.49422], [-3.00197, 3.00197]])  # [rad]
 JOINT_AXES = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-TIP_HEIGHT = 0.03  # [m] the controller keeps the tips at this height
+# The controller keeps the tips at half the height of the object, between these bounds: above the table, and low enough
+# not to topple tall objects.
+MIN_TIP_HEIGHT, MAX_TIP_HEIGHT = 0.0105, 0.04  # [m]
 
 LINK_NAMES = ("upper", "middle", "lower")
 LINK_MASSES = (0.2, 0.2, 0.03)  # [kg]; the lower link includes the tip
@@ -48,6 +50,13 @@ LINK_INERTIAS = (  # [kg m^2] principal moments; the principal axes are those of
     (8.36667e-5, 8.36667e-5, 1e-6),
 )
 
+# --- pinned objects: the pivot of Jin & Posa's turning task -----------------------------------------
+PIVOT_DAMPING = 0.01  # [N m s/rad]
+PIVOT_RANGE = 1.5008  # [rad]
+# Contact time constant [s] and damping ratio. What cannot give way is pressed harder; MuJoCo's 0.02 s lets tips sink in
+# by more than 1 mm.
+PIVOT_SOLREF = (0.005, 1.0)
+
 # --- contact --------------------------------------------------------------------------------------
 TIP_FRICTION = 0.9  # sliding friction of the fingers
 TORSIONAL_FRICTION = 0.005  # [m]
@@ -57,8 +66,9 @@ TABLE_BIT, OBJECT_BIT, FINGER_BIT = 1, 2, 4
 
 # --- memory ---------------------------------------------------------------------------------------
 # Contacts and constraints. Random extreme actions with the cube use up to 24 kB; MuJoCo's own choice would be 13 MB in
-# every environment.
+# every environment. Meshes of several convex parts touch in more points.
 ARENA_BYTES = 512 * 1024
+MESH_ARENA_BYTES = 4 * 1024 * 1024
 
 # --- looks ----------------------------------------------------------------------------------------
 TABLE_HALF_SIZE = 0.8  # [m] drawn; the plane that carries the object has no edge
@@ -69,14 +79,30 @@ GOAL_COLOR = (0.90, 0.16, 0.20, 0.35)
 SMALL_PICTURE = 320 * 240  # [pixel] larger pictures get smooth edges
 GOAL_MARGIN = 0.0004  # [m]
 HAND_GROUP = 2  # geoms that hide the table from above; the camera "top" does not show them
+COLLISION_GROUP = 3  # geoms that collide but are not drawn
+
+
+def tip_height_for(object_height: float) -> float:
+    """Height [m] at which the fingertips push an object of some height [m]."""
+    return min(max(object_height / 2, MIN_TIP_HEIGHT), MAX_TIP_HEIGHT)
 
 
 class SceneObject(Protocol):
     """What the fingers push. Anything with these members can stand in the scene."""
 
     @property
-    def rest_height(self) -> float:
-        """Height [m] of the body origin above the table when the object rests on it."""
+    def name(self) -> str:
+        """Name of the object."""
+        ...
+
+    @property
+    def source(self) -> str:
+        """Where its shape comes from: "built_in", "ycb_mesh", "mesh" or "stand_in"."""
+        ...
+
+    @property
+    def mass(self) -> float:
+        """Mass [kg]."""
         ...
 
     @property
@@ -84,11 +110,35 @@ class SceneObject(Protocol):
         """Sliding friction between object and table."""
         ...
 
-    def add_geoms(self, body: mujoco.MjsBody, contact: dict[str, Any]) -> None:
-        """Add the colliding geoms, with the mass; `contact` holds the contact keywords for `add_geom`."""
+    @property
+    def pinned(self) -> bool:
+        """Whether the object only turns, about a vertical axis through its origin."""
         ...
 
-    def add_goal_geoms(self, body: mujoco.MjsBody, appearance: dict[str, Any]) -> None:
+    @property
+    def rest_height(self) -> float:
+        """Height [m] of the body origin above the table when the object rests on it."""
+        ...
+
+    @property
+    def tip_height(self) -> float:
+        """Height [m] at which the fingertips push."""
+        ...
+
+    @property
+    def outline(self) -> np.ndarray:
+        """Points [m] around the object as seen from above, relative to its origin, (K, 2)."""
+        ...
+
+    def describe(self) -> dict[str, Any]:
+        """What this object is, in JSON types, for records of results."""
+        ...
+
+    def add_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, contact: dict[str, Any]) -> None:
+        """Add the colliding geoms and the mass; `contact` holds the contact keywords for `add_geom`."""
+        ...
+
+    def add_goal_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, appearance: dict[str, Any]) -> None:
         """Add the transparent copy that marks the goal; `appearance` holds the keywords for `add_geom`."""
         ...
 
@@ -101,18 +151,45 @@ class CubeObject:
         half_size: Half of the edge [m].
         mass: Mass [kg].
         friction: Sliding friction between cube and table.
+        pinned: Whether it only turns, about a vertical axis through its centre.
+        name: Name of the object.
+        source: Where its shape comes from.
     """
 
     half_size: float = 0.03
     mass: float = 0.01
     friction: float = 0.5
+    pinned: bool = False
+    name: str = "cube"
+    source: str = "built_in"
 
     @property
     def rest_height(self) -> float:
         """Height [m] of the centre above the table."""
         return self.half_size
 
-    def add_geoms(self, body: mujoco.MjsBody, contact: dict[str, Any]) -> None:
+    @property
+    def tip_height(self) -> float:
+        """Height [m] at which the fingertips push."""
+        return tip_height_for(2 * self.half_size)
+
+    @property
+    def outline(self) -> np.ndarray:
+        """Corners [m] as seen from above, (4, 2)."""
+        return self.half_size * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
+
+    def describe(self) -> dict[str, Any]:
+        """What this object is, for records of results."""
+        return {
+            "name": self.name,
+            "source": self.source,
+            "edge": 2 * self.half_size,
+            "mass": self.mass,
+            "friction": self.friction,
+            "pinned": self.pinned,
+        }
+
+    def add_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, contact: dict[str, Any]) -> None:
         """Add the cube to the body of the object."""
         body.add_geom(
             name="object",
@@ -123,7 +200,7 @@ class CubeObject:
             **contact,
         )
 
-    def add_goal_geoms(self, body: mujoco.MjsBody, appearance: dict[str, Any]) -> None:
+    def add_goal_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, appearance: dict[str, Any]) -> None:
         """Add the transparent cube to the body of the goal."""
         # A hair larger than the cube: faces in one plane would flicker.
         size = self.half_size + GOAL_MARGIN
@@ -131,14 +208,15 @@ class CubeObject:
 
 
 def build_spec(scene_object: SceneObject, max_picture_size: tuple[int, int] = (640, 480)) -> mujoco.MjSpec:
-    """Build the scene. Bodies in order: goal (mocap), object (free joint), then the three links of each finger.
+    """Build the scene. Bodies in order: goal (mocap), object (free or pinned), then the three links of each finger.
 
     Args:
         scene_object: The object to push.
         max_picture_size: Largest width and height [pixel] that will be rendered off screen.
 
     Returns:
-        The spec; `spec.compile()` makes the model. Degrees of freedom: 0-5 object, 6-14 fingers.
+        The spec; `spec.compile()` makes the model. Degrees of freedom: the object's 6 (1 if pinned), then the 9 of the
+        fingers.
     """
     spec = mujoco.MjSpec()
     spec.modelname = "trifinger"
@@ -156,6 +234,8 @@ def build_spec(scene_object: SceneObject, max_picture_size: tuple[int, int] = (6
     spec.visual.quality.offsamples = 4 if width * height > SMALL_PICTURE else 0
     _add_scenery(spec, scene_object.friction)
     _add_object(spec, scene_object)
+    if spec.meshes:
+        spec.memory = MESH_ARENA_BYTES
     for finger in range(NUM_FINGERS):
         _add_finger(spec, finger)
     return spec
@@ -223,12 +303,24 @@ def _look_at(position: tuple[float, float, float], target: tuple[float, float, f
 def _add_object(spec: mujoco.MjSpec, scene_object: SceneObject) -> None:
     position = [0.0, 0.0, scene_object.rest_height]
     goal = spec.worldbody.add_body(name="goal", mocap=True, pos=position)
-    scene_object.add_goal_geoms(goal, {"rgba": GOAL_COLOR, "contype": 0, "conaffinity": 0})
+    scene_object.add_goal_geoms(spec, goal, {"rgba": GOAL_COLOR, "contype": 0, "conaffinity": 0})
     body = spec.worldbody.add_body(name="object", pos=position)
-    body.add_freejoint(name="object")
+    if scene_object.pinned:
+        body.add_joint(
+            name="object",
+            type=mujoco.mjtJoint.mjJNT_HINGE,
+            axis=[0.0, 0.0, 1.0],
+            damping=PIVOT_DAMPING,
+            range=[-PIVOT_RANGE, PIVOT_RANGE],
+            limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        )
+    else:
+        body.add_freejoint(name="object")
     scene_object.add_geoms(
+        spec,
         body,
-        {
+        ({"solref": list(PIVOT_SOLREF)} if scene_object.pinned else {})
+        | {
             "friction": _friction(scene_object.friction),
             "contype": OBJECT_BIT,
             "conaffinity": TABLE_BIT | FINGER_BIT,

@@ -68,6 +68,18 @@ class OperationalSpaceController:
         self._mass = data.M[first_entry : first_entry + 6 * NUM_FINGERS]
         self._control = data.ctrl
 
+    def fields(self) -> dict[str, np.ndarray]:
+        """The views of the data that the control law reads and writes, for the compiled stepper."""
+        return {
+            "axes": self._axes,
+            "anchors": self._anchors,
+            "tips": self._tips,
+            "velocities": self._velocities,
+            "bias": self._bias,
+            "mass": self._mass,
+            "control": self._control,
+        }
+
     def apply(self) -> None:
         """Compute the torques [N m] from the current data (after `mj_step1`) and write them into `data.ctrl`."""
         axes, anchors, tips = self._axes.tolist(), self._anchors.tolist(), self._tips.tolist()

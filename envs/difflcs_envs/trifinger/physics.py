@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -13,20 +14,23 @@ import numpy as np
 from difflcs_envs.trifinger import kinematics
 from difflcs_envs.trifinger.model import (
     NUM_FINGERS,
+    PIVOT_RANGE,
     SUBSTEPS,
     TIMESTEP,
-    TIP_HEIGHT,
     SceneObject,
     build_spec,
 )
-from difflcs_envs.trifinger.osc import OperationalSpaceController
+from difflcs_envs.trifinger.native import native_lane, step_lanes
+from difflcs_envs.trifinger.osc import SINGULAR_DAMPING, SINGULAR_DETERMINANT, OperationalSpaceController
 
-__all__ = ["TriFingerPhysics"]
+__all__ = ["TriFingerPhysics", "step_all"]
 
+STATE_SIZE = 3 + 2 * NUM_FINGERS
 CONTROL_PERIOD = TIMESTEP * SUBSTEPS  # [s] one action
-# The posture before the tips go down to TIP_HEIGHT; reset noise acts on its joints.
+# The posture before the tips go down to their height; reset noise acts on its joints.
 START_POSTURE = np.tile([0.0, -1.0, -1.5], (NUM_FINGERS, 1))  # [rad]
 HOME_TIP_RADIUS = 0.0977  # [m] where the tips settle from the start posture
+START_CLEARANCE = 0.021  # [m] at least this far out from the object (tip radius 9.5 mm) do the tips start
 # An object or a tip farther out than this has left the robot's world (tips reach at most 0.36 m).
 WORKSPACE_RADIUS = 0.5  # [m]
 # Deepest overlap of two bodies that a given start state may have. Random extreme actions make up to 2.2 mm, and states
@@ -52,11 +56,15 @@ class TriFingerPhysics:
         model: The MuJoCo model.
         data: The MuJoCo data. After `reset` and `step` all positions (`xpos`, `site_xpos`, ...) are up to date.
         controller: The operational-space controller of the tips.
-        home_tips: Home positions of the tips in the plane [m], (3, 2).
+        lane: The compiled stepper of this simulation; None where Python steps.
     """
 
     def __init__(
-        self, scene_object: SceneObject, kp: float = 1000.0, max_picture_size: tuple[int, int] = (640, 480)
+        self,
+        scene_object: SceneObject,
+        kp: float = 1000.0,
+        max_picture_size: tuple[int, int] = (640, 480),
+        model: mujoco.MjModel | None = None,
     ) -> None:
         """Build the scene.
 
@@ -64,47 +72,100 @@ class TriFingerPhysics:
             scene_object: The object to push.
             kp: Stiffness of the operational-space controller [1/s^2].
             max_picture_size: Largest width and height [pixel] that will be rendered.
+            model: The model of another simulation of the same scene, to share; None builds one.
         """
-        self.rest_height = scene_object.rest_height
-        self.model: mujoco.MjModel = build_spec(scene_object, max_picture_size).compile()
+        self.object = scene_object
+        self.tip_height = scene_object.tip_height
+        self.model: mujoco.MjModel = model or build_spec(scene_object, max_picture_size).compile()
         self.data = mujoco.MjData(self.model)
         self.controller = OperationalSpaceController(self.model, self.data, kp)
-        directions = kinematics.FINGER_AXES[:, 1, :2]
-        self.home_tips = HOME_TIP_RADIUS * directions
         first_site = self.model.site("tip_0").id
-        self._tips = self.data.site_xpos[first_site : first_site + NUM_FINGERS]  # a view
+        self._tips = self.data.site_xpos[first_site : first_site + NUM_FINGERS]  # views
+        self._object_position = self.data.xpos[self.model.body("object").id]
+        self._object_quaternion = self.data.xquat[self.model.body("object").id]
         self._goal = int(self.model.body("goal").mocapid[0])
         self._object_qpos = int(self.model.joint("object").qposadr[0])
         self._finger_qpos = int(self.model.joint("joint_0_0").qposadr[0])
         self._saved = np.empty(mujoco.mj_stateSize(self.model, _STATE_SIGNATURE))
+        self._directions = kinematics.FINGER_AXES[:, 1, :2]  # outward, (3, 2)
+        self._outline = scene_object.outline
+        self.lane = native_lane(
+            self.model,
+            self.data,
+            self.controller.fields()
+            | {
+                "object_position": self._object_position,
+                "object_quaternion": self._object_quaternion,
+                "saved": self._saved,
+            },
+            _INSTABILITY_WARNINGS,
+            {
+                "kp": self.controller.kp,
+                "kd": self.controller.kd,
+                "singular_determinant": SINGULAR_DETERMINANT,
+                "singular_damping": SINGULAR_DAMPING,
+                "tip_height": self.tip_height,
+                "timestep": TIMESTEP,
+                "workspace_radius": WORKSPACE_RADIUS,
+                "substeps": SUBSTEPS,
+                "time_signature": int(mujoco.mjtState.mjSTATE_TIME),
+                "save_signature": int(_STATE_SIGNATURE),
+            },
+        )
+
+    def check_fit(self) -> None:
+        """Raise ValueError if the fingers cannot stand around the object in its home pose."""
+        heights = np.full((NUM_FINGERS, 1), self.tip_height)
+        try:
+            kinematics.joint_angles(np.hstack([self.home_tips(np.zeros(3)), heights]))
+        except ValueError as error:
+            width, depth = np.ptp(self._outline, axis=0)
+            raise ValueError(
+                f"Expected an object that the fingers can stand around, got {self.object.name} of {1e3 * width:.0f} x "
+                f"{1e3 * depth:.0f} mm, which is too large. Choose a smaller object, or another mesh_scale."
+            ) from error
 
     # --- reset ------------------------------------------------------------------------------------
 
-    def tips_from_noise(self, joint_noise: np.ndarray) -> np.ndarray:
+    def home_tips(self, object_pose: np.ndarray) -> np.ndarray:
+        """Where the tips start in the plane [m], (3, 2): at the home radius, farther out around a long object.
+
+        Args:
+            object_pose: x [m], y [m], yaw [rad] of the object.
+        """
+        x, y, yaw = (float(v) for v in object_pose)
+        cosine, sine = math.cos(yaw), math.sin(yaw)
+        turn = np.array([[cosine, -sine], [sine, cosine]])
+        # No point of the object is farther out along the ray of a finger.
+        support = (self._directions @ turn @ self._outline.T).max(axis=1) + self._directions @ (x, y)
+        return np.maximum(HOME_TIP_RADIUS, support + START_CLEARANCE)[:, None] * self._directions
+
+    def tips_from_noise(self, joint_noise: np.ndarray, object_pose: np.ndarray) -> np.ndarray:
         """Where the tips come down when the joints of the start posture are disturbed.
 
         Lowering keeps a tip's place in the plane, so it moves by what the disturbance moves it in the start posture.
 
         Args:
             joint_noise: Disturbance [rad], (3 fingers, 3 joints).
+            object_pose: x [m], y [m], yaw [rad] of the object.
 
         Returns:
             Tip positions in the plane [m], (3, 2).
         """
         shift = kinematics.tip_positions(START_POSTURE + joint_noise) - kinematics.tip_positions(START_POSTURE)
-        return self.home_tips + shift[:, :2]
+        return self.home_tips(object_pose) + shift[:, :2]
 
     def reset(self, object_pose: np.ndarray, tips: np.ndarray) -> None:
         """Put object and fingers at rest in a given pose.
 
         Args:
             object_pose: x [m], y [m], yaw [rad] of the object, which rests on the table.
-            tips: Tip positions in the plane [m], (3, 2), at the height TIP_HEIGHT.
+            tips: Tip positions in the plane [m], (3, 2), at the tips' height.
 
         Raises:
             ValueError: A tip is out of reach, or bodies would overlap.
         """
-        heights = np.full((NUM_FINGERS, 1), TIP_HEIGHT)
+        heights = np.full((NUM_FINGERS, 1), self.tip_height)
         joints = kinematics.joint_angles(np.hstack([tips, heights]))
         x, y, yaw = (float(v) for v in object_pose)
         if math.hypot(x, y) > WORKSPACE_RADIUS:
@@ -112,9 +173,18 @@ class TriFingerPhysics:
                 f"The object cannot stand at ({x:.3f}, {y:.3f}) m: expected it within {WORKSPACE_RADIUS} m of "
                 "the middle. Choose a position that the fingers can reach."
             )
+        if self.object.pinned and (max(abs(x), abs(y)) > 1e-6 or abs(yaw) > PIVOT_RANGE):
+            raise ValueError(
+                f"The object turns about the middle: expected x = y = 0 and |yaw| <= {PIVOT_RANGE} rad, got "
+                f"({x:.3f} m, {y:.3f} m, {yaw:.3f} rad). Choose such a pose."
+            )
         mujoco.mj_resetData(self.model, self.data)
         i = self._object_qpos
-        self.data.qpos[i : i + 7] = (x, y, self.rest_height, math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
+        if self.object.pinned:
+            self.data.qpos[i] = yaw
+        else:
+            height = self.object.rest_height
+            self.data.qpos[i : i + 7] = (x, y, height, math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
         # The posture of `mj_resetData` (straight legs) is singular: set the joints before the controller is asked.
         self.data.qpos[self._finger_qpos : self._finger_qpos + joints.size] = joints.ravel()
         mujoco.mj_forward(self.model, self.data)
@@ -129,28 +199,33 @@ class TriFingerPhysics:
     def set_goal(self, goal_pose: np.ndarray) -> None:
         """Move the transparent goal to x [m], y [m], yaw [rad]. It takes no part in the physics."""
         x, y, yaw = (float(v) for v in goal_pose)
-        self.data.mocap_pos[self._goal] = (x, y, self.rest_height)
+        self.data.mocap_pos[self._goal] = (x, y, self.object.rest_height)
         self.data.mocap_quat[self._goal] = (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
         mujoco.mj_kinematics(self.model, self.data)
 
     # --- step -------------------------------------------------------------------------------------
 
-    def step(self, displacement: np.ndarray) -> bool:
+    def step(self, displacement: np.ndarray) -> np.ndarray | None:
         """Pull the tips by a displacement from where they are, at constant height, for one control period (0.1 s).
 
         Args:
             displacement: x and y of every tip [m], (6,).
 
         Returns:
-            True. False if the simulation became unstable: then the state from before this step is restored.
+            The state after it, see `state`. None if the simulation became unstable: then the state from before this
+            step is restored.
         """
+        return step_all([self], displacement[None], threads=1)[0]
+
+    def step_in_python(self, displacement: np.ndarray) -> bool:
+        """The same without the compiled stepper and without restoring. Returns whether the simulation is sane."""
         model, data, control = self.model, self.data, self.controller.apply
         first_half, second_half = mujoco.mj_step1, mujoco.mj_step2
         self._save()
         end_time = data.time + CONTROL_PERIOD
         target = self._tips.copy()
         target[:, :2] += displacement.reshape(NUM_FINGERS, 2)
-        target[:, 2] = TIP_HEIGHT
+        target[:, 2] = self.tip_height
         self.controller.target = target.ravel().tolist()
         try:
             for _ in range(SUBSTEPS):
@@ -158,21 +233,16 @@ class TriFingerPhysics:
                 control()
                 second_half(model, data)
         except (OverflowError, np.linalg.LinAlgError):  # the controller met non-finite numbers
-            stable = False
-        else:
-            # Integration leaves the positions of bodies and sites one substep behind the joints.
-            mujoco.mj_kinematics(model, data)
-            stable = self._is_sane(end_time)
-        if not stable:
-            self._restore()
-        return stable
+            return False
+        # Integration leaves the positions of bodies and sites one substep behind the joints.
+        mujoco.mj_kinematics(model, data)
+        return self._is_sane(end_time)
 
     def _is_sane(self, end_time: float) -> bool:
         # MuJoCo answers NaN or huge numbers by a warning and by resetting the data, the clock with them.
         if abs(self.data.time - end_time) > 0.5 * TIMESTEP or self.data.warning.number[_INSTABILITY_WARNINGS].any():
             return False
-        i = self._object_qpos
-        positions = [*self.data.qpos[i : i + 2].tolist(), *self._tips.ravel().tolist()]
+        positions = [*self._object_position[:2].tolist(), *self._tips.ravel().tolist()]
         # Written so that NaN fails.
         return all(abs(p) <= WORKSPACE_RADIUS for p in positions)
 
@@ -180,10 +250,10 @@ class TriFingerPhysics:
 
     def state(self) -> np.ndarray:
         """Object x, y [m], yaw [rad] in (-pi, pi], then x, y [m] of tips 0, 1, 2. A new array, (9,)."""
-        i = self._object_qpos
-        x, y, _, qw, qx, qy, qz = self.data.qpos[i : i + 7].tolist()
-        state = np.empty(3 + 2 * NUM_FINGERS)
-        state[:3] = x, y, math.atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
+        qw, qx, qy, qz = self._object_quaternion.tolist()
+        state = np.empty(STATE_SIZE)
+        state[:2] = self._object_position[:2]
+        state[2] = math.atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
         state[3:] = self._tips[:, :2].ravel()
         return state
 
@@ -197,7 +267,8 @@ class TriFingerPhysics:
     def _save(self) -> None:
         mujoco.mj_getState(self.model, self.data, self._saved, _STATE_SIGNATURE)
 
-    def _restore(self) -> None:
+    def restore(self) -> None:
+        """Go back to the state before the last step."""
         mujoco.mj_resetData(self.model, self.data)
         mujoco.mj_setState(self.model, self.data, self._saved, _STATE_SIGNATURE)
         mujoco.mj_kinematics(self.model, self.data)
@@ -210,4 +281,33 @@ class TriFingerPhysics:
     def set_full_state(self, full_state: np.ndarray) -> None:
         """Go back to a state from `get_full_state`."""
         self._saved[:] = full_state
-        self._restore()
+        self.restore()
+
+
+def step_all(
+    simulations: Sequence[TriFingerPhysics], displacements: np.ndarray, threads: int
+) -> list[np.ndarray | None]:
+    """`TriFingerPhysics.step` of several simulations, in native threads where the compiled stepper is there.
+
+    Args:
+        simulations: The simulations, each once.
+        displacements: x and y of every tip [m], (n, 6).
+        threads: Most threads to use.
+
+    Returns:
+        The state after it of every simulation, None where it became unstable and was restored.
+    """
+    lanes = [simulation.lane for simulation in simulations if simulation.lane is not None]
+    stable = np.empty(len(simulations), dtype=bool)
+    if len(lanes) == len(simulations):
+        states = np.empty((len(simulations), STATE_SIZE))
+        step_lanes(lanes, np.ascontiguousarray(displacements, dtype=np.float64), states, stable, threads)
+    else:
+        for i, simulation in enumerate(simulations):
+            stable[i] = simulation.step_in_python(displacements[i])
+        states = [simulation.state() for simulation in simulations]
+    result: list[np.ndarray | None] = list(states)
+    for i in np.flatnonzero(~stable).tolist():
+        simulations[i].restore()
+        result[i] = None
+    return result

@@ -1,0 +1,119 @@
+"""The bridge to the compiled stepper: finds the loaded MuJoCo library and hands over addresses.
+
+Nothing depends on MuJoCo's headers: functions are looked up by name in the library that the Python package has loaded,
+fields by the addresses of their NumPy views. If anything is not as expected, the environments step in Python.
+"""
+
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+try:
+    from difflcs_envs._native import _stepper  # pyright: ignore[reportMissingModuleSource]
+except ImportError:  # not compiled for this Python
+    _stepper = None
+
+if TYPE_CHECKING:
+    from difflcs_envs._native._stepper import Lane  # pyright: ignore[reportMissingModuleSource]
+
+__all__ = ["NATIVE_VARIABLE", "native_lane", "step_lanes"]
+
+NATIVE_VARIABLE = "DIFFLCS_ENVS_NATIVE"  # "0" asks for Python
+
+_FUNCTIONS = ("mj_step1", "mj_step2", "mj_kinematics", "mj_getState")
+
+
+@functools.cache
+def _function_addresses() -> dict[str, int] | None:
+    """Addresses of MuJoCo's functions in the library that this process has loaded; None if it is not found."""
+    folder = Path(mujoco.__file__).parent
+    for path in sorted([*folder.glob("libmujoco*"), *folder.glob("mujoco.dll")]):
+        try:
+            # The library is loaded already; asked by the same path, the system returns that one.
+            library = ctypes.CDLL(str(path), mode=getattr(os, "RTLD_NOLOAD", 0) | getattr(os, "RTLD_NOW", 0))
+            found = {name: ctypes.cast(getattr(library, name), ctypes.c_void_p).value for name in _FUNCTIONS}
+        except (OSError, AttributeError):
+            continue
+        if all(found.values()):
+            return {name: address for name, address in found.items() if address}
+    return None
+
+
+def native_lane(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    fields: dict[str, np.ndarray],
+    warnings: Sequence[int],
+    constants: dict[str, float],
+) -> Lane | None:
+    """Bind the compiled stepper to one simulation.
+
+    Args:
+        model: The model.
+        data: The data.
+        fields: Views of the fields of `data` that the stepper reads and writes, each in one piece. The caller keeps
+            them (or `data`) alive.
+        warnings: Kinds of MuJoCo warnings that mean instability.
+        constants: Numbers for the stepper.
+
+    Returns:
+        The lane, or None where only Python can step: not compiled, another memory layout, or not wanted
+        (`DIFFLCS_ENVS_NATIVE=0`).
+    """
+    functions = _function_addresses() if os.environ.get(NATIVE_VARIABLE, "1") != "0" else None
+    if _stepper is None or functions is None or not hasattr(data, "_address"):
+        return None
+    counters = data.warning.number  # a strided view into the data
+    views = [*fields.values(), data.qpos]
+    if any(view.dtype != np.float64 or not view.flags.c_contiguous for view in views) or counters.dtype != np.int32:
+        return None
+    first, stride = counters.ctypes.data, counters.strides[0]
+    addresses: dict[str, Any] = {name: view.ctypes.data for name, view in fields.items()}
+    addresses |= {
+        "model": model._address,
+        "data": data._address,
+        "warnings": [first + stride * kind for kind in warnings],
+    }
+    lane = _stepper.make_lane(functions, addresses, constants)
+    before = data.time
+    data.time = probe = 0.123456789
+    same = lane.time == probe and _is_live(data, counters)
+    data.time = before
+    return lane if same else None
+
+
+def _is_live(data: mujoco.MjData, counters: np.ndarray) -> bool:
+    """Whether the counters are a view of the data and not a copy."""
+    kind = int(mujoco.mjtWarning.mjWARN_INERTIA)
+    before = int(data.warning[kind].number)
+    data.warning[kind].number = before + 1
+    live = int(counters[kind]) == before + 1
+    data.warning[kind].number = before
+    return live
+
+
+def step_lanes(
+    lanes: Sequence[Lane], actions: np.ndarray, states: np.ndarray, stable: np.ndarray, threads: int
+) -> None:
+    """One control period of every lane, in native threads, without the GIL.
+
+    Args:
+        lanes: The simulations, each once.
+        actions: Displacements of the tips [m], (n, 6).
+        states: Gets the states, (n, 9); rows of unstable lanes are left alone.
+        stable: Gets whether each lane is still sane, (n,) bool. Those that are not must be restored by the caller.
+        threads: Most threads to use.
+    """
+    assert _stepper is not None
+    _stepper.step_lanes(lanes, actions, states, stable, threads)

@@ -1,0 +1,303 @@
+"""The objects of the tasks: the YCB objects of the paper, their primitive stand-ins, and any mesh.
+
+The YCB meshes (Calli et al., IEEE RAM 2015) do not ship with this package. They are looked for in the folder that
+`DIFFLCS_YCB_DIR` names, then where `difflcs assets download` puts them. Without them a stand-in of boxes, cylinders and
+capsules with the size, the mass and the resting height of the object takes its place; `source` says which it is.
+"""
+
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from difflcs_envs.assets import YCB_DIR_VARIABLE, find_ycb_mesh
+from difflcs_envs.errors import MeshError
+from difflcs_envs.trifinger.meshes import LYING, Solid, check_extent, load_mesh, make_solid
+from difflcs_envs.trifinger.model import COLLISION_GROUP, GOAL_MARGIN, tip_height_for
+from difflcs_envs.ycb import YCB, YcbObject
+
+__all__ = ["MESH_SUFFIXES", "MeshObject", "StandInObject", "make_object"]
+
+DEFAULT_MASS = 0.05  # [kg] of YCB objects and meshes. The paper gives none; a tip pushes with 0.45 N at osc_kp 1000.
+MESH_SUFFIXES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".dae", ".3mf")
+COLORS = {
+    "sugar_box": (0.95, 0.80, 0.35, 1.0),
+    "fish_can": (0.45, 0.66, 0.86, 1.0),
+    "banana": (0.98, 0.83, 0.22, 1.0),
+    "mug": (0.92, 0.52, 0.40, 1.0),
+    "wrench": (0.45, 0.48, 0.55, 1.0),
+}
+OTHER_COLOR = (0.55, 0.72, 0.50, 1.0)
+
+
+@dataclass(frozen=True)
+class MeshObject:
+    """An object with the shape of a mesh.
+
+    Attributes:
+        name: Name of the object.
+        source: "ycb_mesh" or "mesh".
+        solid: Its shape in its rest pose.
+        mass: Mass [kg].
+        friction: Sliding friction between object and table.
+        pinned: Whether it only turns, about a vertical axis through its origin.
+    """
+
+    name: str
+    source: str
+    solid: Solid
+    mass: float
+    friction: float
+    pinned: bool = False
+
+    @property
+    def rest_height(self) -> float:
+        """Height [m] of the centre of mass above the table."""
+        return self.solid.rest_height
+
+    @property
+    def height(self) -> float:
+        """Height [m] of the top above the table."""
+        return float(self.solid.vertices[:, 2].max()) + self.solid.rest_height
+
+    @property
+    def tip_height(self) -> float:
+        """Height [m] at which the fingertips push."""
+        return tip_height_for(self.height)
+
+    @property
+    def outline(self) -> np.ndarray:
+        """Points [m] around the object as seen from above, (K, 2)."""
+        return np.concatenate(self.solid.parts)[:, :2]
+
+    def describe(self) -> dict[str, Any]:
+        """What this object is, for records of results."""
+        return {
+            "name": self.name,
+            "source": self.source,
+            "sha256": self.solid.digest,
+            "parts": len(self.solid.parts),
+            "mass": self.mass,
+            "friction": self.friction,
+            "rest_height": round(self.rest_height, 6),
+        }
+
+    def add_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, contact: dict[str, Any]) -> None:
+        """Add the convex parts, which collide, and the mesh, which is seen."""
+        _set_inertia(body, self.mass, self.solid.inertia)
+        for i, points in enumerate(self.solid.parts):
+            spec.add_mesh(name=f"object_part_{i}", uservert=points.ravel().tolist())
+            body.add_geom(
+                name=f"object_{i}",
+                type=mujoco.mjtGeom.mjGEOM_MESH,
+                meshname=f"object_part_{i}",
+                mass=0.0,
+                group=COLLISION_GROUP,
+                **contact,
+            )
+        self._add_visual(spec, body, "object_visual", 1.0, {"rgba": COLORS.get(self.name, OTHER_COLOR)})
+
+    def add_goal_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, appearance: dict[str, Any]) -> None:
+        """Add the transparent copy of the mesh."""
+        # A hair larger than the object: faces in one place would flicker.
+        scale = 1.0 + GOAL_MARGIN / float(self.solid.size.max() / 2)
+        self._add_visual(spec, body, "goal_visual", scale, appearance)
+
+    def _add_visual(
+        self, spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, scale: float, appearance: dict[str, Any]
+    ) -> None:
+        spec.add_mesh(
+            name=name,
+            uservert=(scale * self.solid.vertices).ravel().tolist(),
+            userface=self.solid.faces.ravel().tolist(),
+        )
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, mass=0.0, **{"contype": 0, "conaffinity": 0, **appearance}
+        )
+
+
+@dataclass(frozen=True)
+class StandInObject:
+    """Boxes, cylinders and capsules in place of a YCB object whose mesh is not on this machine.
+
+    Size, mass and resting height are those of the object, the rest is rough: a result with it is no result with the
+    object.
+
+    Attributes:
+        ycb: The object it stands in for.
+        mass: Mass [kg].
+        friction: Sliding friction between object and table.
+        source: "stand_in".
+        pinned: Whether it only turns, about a vertical axis through its origin.
+    """
+
+    ycb: YcbObject
+    mass: float
+    friction: float
+    source: str = "stand_in"
+    pinned: bool = False
+
+    @property
+    def name(self) -> str:
+        """Name of the object."""
+        return self.ycb.name
+
+    @property
+    def rest_height(self) -> float:
+        """Height [m] of the centre of mass above the table."""
+        return self.ycb.rest_height
+
+    @property
+    def height(self) -> float:
+        """Height [m] of the top above the table."""
+        return self.ycb.size[2]
+
+    @property
+    def tip_height(self) -> float:
+        """Height [m] at which the fingertips push."""
+        return tip_height_for(self.height)
+
+    @property
+    def outline(self) -> np.ndarray:
+        """Points [m] around the object as seen from above, (K, 2)."""
+        return np.concatenate([primitive.outline() for primitive in self.ycb.stand_in]) - self._middle
+
+    @property
+    def _middle(self) -> np.ndarray:
+        """Centre of mass of the primitives in the plane [m], (2,)."""
+        volumes = np.array([p.volume for p in self.ycb.stand_in])
+        return volumes @ np.array([p.center[:2] for p in self.ycb.stand_in]) / volumes.sum()
+
+    def describe(self) -> dict[str, Any]:
+        """What this object is, for records of results."""
+        return {
+            "name": self.name,
+            "source": self.source,
+            "parts": len(self.ycb.stand_in),
+            "mass": self.mass,
+            "friction": self.friction,
+            "rest_height": self.rest_height,
+        }
+
+    def add_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, contact: dict[str, Any]) -> None:
+        """Add the primitives to the body of the object."""
+        origin = np.array([*self._middle, self.rest_height])
+        volume = sum(p.volume for p in self.ycb.stand_in)
+        _set_inertia(body, self.mass, np.sum([p.inertia(origin) for p in self.ycb.stand_in], axis=0) / volume)
+        self._add(body, 0.0, {"mass": 0.0, "rgba": COLORS.get(self.name, OTHER_COLOR), **contact}, name="object")
+
+    def add_goal_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, appearance: dict[str, Any]) -> None:
+        """Add the transparent copy to the body of the goal."""
+        self._add(body, GOAL_MARGIN, appearance)
+
+    def _add(self, body: mujoco.MjsBody, margin: float, keywords: dict[str, Any], name: str = "") -> None:
+        origin = np.array([*self._middle, self.rest_height])
+        for i, primitive in enumerate(self.ycb.stand_in):
+            x, y, z, w = *primitive.axis_quat[1:], primitive.axis_quat[0]
+            body.add_geom(
+                name=f"{name}_{i}" if name else "",
+                type=getattr(mujoco.mjtGeom, f"mjGEOM_{primitive.shape.upper()}"),
+                pos=(np.array(primitive.center) - origin).tolist(),
+                quat=[w, x, y, z],
+                size=[s + margin if s else 0.0 for s in primitive.mujoco_size],
+                **keywords,
+            )
+
+
+def _set_inertia(body: mujoco.MjsBody, mass: float, unit_inertia: np.ndarray) -> None:
+    """Mass and inertia by hand: what MuJoCo adds up over overlapping parts is too much (its issue 2152)."""
+    i = mass * unit_inertia
+    body.explicitinertial = True
+    body.mass = mass
+    body.ipos = [0.0, 0.0, 0.0]
+    body.fullinertia = [i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]]
+
+
+def make_object(
+    name: str,
+    *,
+    mass: float | str | None = None,
+    friction: float = 0.5,
+    source: str = "auto",
+    rest_pose: str | int = LYING,
+    parts: int | None = None,
+    mesh_scale: float = 1.0,
+) -> MeshObject | StandInObject:
+    """Make an object by name or from a mesh file.
+
+    Args:
+        name: Name of a YCB object, or path of a mesh file.
+        mass: Mass [kg], "true" for the published mass of a YCB object, None for 0.05 kg.
+        friction: Sliding friction between object and table.
+        source: "auto": the mesh if it is there, else the stand-in; "mesh": the mesh or an error; "stand_in".
+        rest_pose: "lying", "upright", or the number of a stable pose, lowest centre of mass first.
+        parts: Most convex parts; None for a choice of ours.
+        mesh_scale: Length of one unit of the mesh file [m].
+
+    Raises:
+        ValueError: An argument has no meaning, or the object is unknown.
+        MeshError: The mesh is missing although it is asked for, or unusable.
+    """
+    if source not in ("auto", "mesh", "stand_in"):
+        raise ValueError(f"Expected object_source 'auto', 'mesh' or 'stand_in', got {source!r}. Choose one of them.")
+    entry = YCB.get(name)
+    if entry is None:
+        return _object_from_file(name, mass, friction, source, rest_pose, parts, mesh_scale)
+    kilograms = _mass(mass, entry.mass)
+    path = None if source == "stand_in" else find_ycb_mesh(entry)
+    if path is not None:
+        mesh = load_mesh(path, mesh_scale)
+        check_extent(mesh, name, entry.size, path)
+        solid = make_solid(mesh, name, entry.parts if parts is None else parts, rest_pose, entry.concavity)
+        return MeshObject(name, "ycb_mesh", solid, kilograms, friction)
+    if source == "mesh":
+        raise MeshError(
+            f"Expected the YCB mesh of {name}, found none. Get it with 'difflcs assets download {name}', let "
+            f"{YCB_DIR_VARIABLE} name a folder with {entry.code}.stl, or use object_source='stand_in'."
+        )
+    if rest_pose not in (LYING, 0):
+        raise ValueError(
+            f"Expected rest_pose 'lying' for the stand-in of {name}, got {rest_pose!r}. Other poses need the mesh: "
+            f"difflcs assets download {name}"
+        )
+    return StandInObject(entry, kilograms, friction)
+
+
+def _object_from_file(
+    name: str,
+    mass: float | str | None,
+    friction: float,
+    source: str,
+    rest_pose: str | int,
+    parts: int | None,
+    mesh_scale: float,
+) -> MeshObject:
+    path = Path(name).expanduser()
+    if path.suffix.lower() not in MESH_SUFFIXES and not path.exists():
+        raise ValueError(
+            f"Expected an object out of {', '.join(YCB)}, or the path of a mesh file, got {name!r}. Choose one of them."
+        )
+    if source == "stand_in":
+        raise ValueError(
+            "Expected object_source 'auto' or 'mesh' for a mesh file, got 'stand_in'. Only YCB objects have one."
+        )
+    solid = make_solid(load_mesh(path, mesh_scale), path.name, parts, rest_pose)
+    return MeshObject(path.stem, "mesh", solid, _mass(mass, None), friction)
+
+
+def _mass(mass: float | str | None, published: float | None) -> float:
+    if mass is None:
+        return DEFAULT_MASS
+    if isinstance(mass, str):
+        if mass == "true" and published is not None:
+            return published
+        wanted = "a mass in kg or 'true'" if published is not None else "a mass in kg (no mass is published for it)"
+        raise ValueError(f"Expected object_mass to be {wanted}, got {mass!r}. Choose such a value.")
+    return float(mass)

@@ -1,0 +1,337 @@
+"""The TriFinger tasks as Gymnasium vector environments: N simulations, stepped in native threads without the GIL.
+
+`gymnasium.make_vec("difflcs/TriFingerMoveCube-v0", num_envs=N)` makes one of these. Environment i of it does what a
+single environment with the same seed and actions does, bit for bit.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from difflcs_envs.errors import PhysicsWarning
+from difflcs_envs.trifinger.env import (
+    ACTION_LIMIT,
+    ACTION_MEANING,
+    ACTION_SIZE,
+    GOAL_SIZE,
+    STATE_SIZE,
+    UNSTABLE,
+    TriFingerEnv,
+    TriFingerMoveCubeEnv,
+    TriFingerMoveObjectEnv,
+    TriFingerTurnCubeEnv,
+    continued,
+)
+from difflcs_envs.trifinger.physics import CONTROL_PERIOD, step_all
+
+__all__ = ["TriFingerVectorEnv", "move_cube", "move_object", "turn_cube"]
+
+
+class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray]):
+    """N copies of one TriFinger environment.
+
+    The info arrays have one entry per environment: `success`, `position_error` [m], `yaw_error` [rad], after `step`
+    also every term of the reward, `executed_action`, `clipped`, `physics_error`. Entries of environments that have none
+    in this step are 0, and `info["_success"]` and so on say which have one, as everywhere in Gymnasium.
+
+    What happens to an environment whose episode has ended (`autoreset_mode`):
+
+    - NEXT_STEP: the next `step` ignores its action and resets it (reward 0). The observation returned at the end of an
+      episode is the last one of that episode.
+    - SAME_STEP: it is reset at once. `info["final_obs"]` and `info["final_info"]` hold what the episode ended with.
+    - DISABLED: `reset(options={"reset_mask": mask})` must be called before the next `step`.
+
+    Attributes:
+        envs: The single environments. They share one MuJoCo model.
+        threads: Most threads that step them.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
+        **TriFingerEnv.metadata,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        env: TriFingerEnv,
+        num_envs: int,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        threads: int | None = None,
+    ) -> None:
+        """Multiply an environment.
+
+        Args:
+            env: The first of the environments. It belongs to this object from now on.
+            num_envs: Number of environments.
+            autoreset_mode: See the class.
+            threads: Most threads that step them; None: one per CPU core.
+        """
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
+            raise ValueError(f"Expected num_envs to be a whole number >= 1, got {num_envs!r}. Choose such a number.")
+        if threads is not None and (not isinstance(threads, int) or threads < 1):
+            raise ValueError(
+                f"Expected threads to be a whole number >= 1 or None, got {threads!r}. Choose such a number."
+            )
+        self.num_envs = int(num_envs)
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}  # pyright: ignore[reportAttributeAccessIssue]
+        self.threads = available_cores() if threads is None else threads
+        self.envs = [env, *(env.sibling() for _ in range(self.num_envs - 1))]
+        self.render_mode = env.render_mode
+        self.single_observation_space = env.observation_space
+        self.single_action_space = env.action_space
+        self.observation_space = batch_space(env.observation_space, self.num_envs)
+        self.action_space = batch_space(env.action_space, self.num_envs)
+        self._states = np.zeros((self.num_envs, STATE_SIZE))
+        self._goals = np.zeros((self.num_envs, GOAL_SIZE))
+        self._steps = np.zeros(self.num_envs, dtype=np.int64)
+        self._ended = np.zeros(self.num_envs, dtype=bool)
+        self._began = False
+
+    # --- Gymnasium --------------------------------------------------------------------------------
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Start an episode in every environment.
+
+        Args:
+            seed: One seed per environment; a number s stands for s, s + 1, ...; None goes on with the current ones.
+            options: `goal` and `state` as for a single environment, for all of them; `reset_mask` (num_envs,) bool:
+                which to reset, the others stay as they are.
+
+        Returns:
+            Observations and infos.
+
+        Raises:
+            ValueError: The seeds, the mask or another option cannot be used.
+        """
+        seeds = self._seeds(seed)
+        options = dict(options or {})
+        mask = self._mask(options.pop("reset_mask", None))
+        indices = np.flatnonzero(mask).tolist()
+        for i in indices:
+            self._reset_one(i, seeds[i], options)
+        self._began = self._began or bool(mask.all())
+        return self._observations(), self._masked(self._pose_info(), mask)
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Move the fingertips of every environment for 0.1 s.
+
+        Args:
+            actions: Displacements of the fingertips [m], (num_envs, 6).
+
+        Returns:
+            Observations, rewards, terminations (all False), truncations, infos.
+
+        Raises:
+            ValueError: The actions have the wrong shape or are not finite.
+            gymnasium.error.ResetNeeded: There was no reset, or (mode DISABLED) an episode has ended.
+        """
+        given = self._checked_actions(actions)
+        if not self._began or (self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any()):
+            raise ResetNeeded(
+                "Expected a running episode in every environment, but some have ended or never began. Call reset() "
+                "before step()."
+            )
+        fresh = self._ended.copy()  # these are reset instead of stepped
+        for i in np.flatnonzero(fresh).tolist():
+            self._reset_one(i, None, {})
+        moving = np.flatnonzero(~fresh)
+        executed = given.clip(-ACTION_LIMIT, ACTION_LIMIT)
+        before = self._states.copy()
+        results = step_all([self.envs[i].physics for i in moving], executed[moving], self.threads)
+        unstable = np.zeros(self.num_envs, dtype=bool)
+        for i, after in zip(moving, results, strict=True):
+            if after is None:
+                unstable[i] = True
+            else:
+                self._states[i] = continued(before[i], after)
+        self._steps[moving] += 1
+        truncated = ~fresh & ((self._steps >= self.envs[0].horizon) | unstable)
+
+        rewards, info = self.envs[0].task.outcome(before, executed, self._states, self._goals, truncated)
+        info |= {
+            "executed_action": executed,
+            "clipped": (executed != given).any(axis=1),
+            "physics_error": unstable,
+        }
+        if fresh.any():
+            rewards = np.where(fresh, 0.0, rewards)
+        infos = self._masked(info, np.ones(self.num_envs, dtype=bool), only=~fresh)
+        self._ended = truncated.copy()
+        if unstable.any():
+            warnings.warn(
+                f"{UNSTABLE} (environments {np.flatnonzero(unstable).tolist()})", PhysicsWarning, stacklevel=2
+            )
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and truncated.any():
+            infos = self._reset_at_once(infos, truncated)
+        return self._observations(), rewards, np.zeros(self.num_envs, dtype=bool), truncated, infos
+
+    def render(self) -> tuple[np.ndarray | None, ...] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """A picture of every environment, or None without render mode."""
+        if self.render_mode is None:
+            return None
+        return tuple(env.render() for env in self.envs)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free renderers and windows."""
+        for env in self.envs:
+            env.close()
+
+    # --- copies -----------------------------------------------------------------------------------
+
+    def __getstate__(self) -> dict[str, Any]:
+        members = self.__dict__.copy()
+        first, *others = self.envs
+        members["envs"] = first, [(env._np_random, env._np_random_seed, env.physics.get_full_state()) for env in others]
+        return members
+
+    def __setstate__(self, members: dict[str, Any]) -> None:
+        self.__dict__.update(members)
+        first, others = members["envs"]
+        self.envs = [first]
+        for rng, seed, full_state in others:
+            env = first.sibling()
+            env._np_random, env._np_random_seed = rng, seed
+            env.physics.set_full_state(full_state)
+            self.envs.append(env)
+
+    # --- helpers ----------------------------------------------------------------------------------
+
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        if seed is None or isinstance(seed, int | np.integer):
+            return [None if seed is None else int(seed) + i for i in range(self.num_envs)]
+        seeds = [None if s is None else int(s) for s in seed]
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"Expected {self.num_envs} seeds, one per environment, got {len(seeds)}. Pass as many.")
+        return seeds
+
+    def _mask(self, mask: Any) -> np.ndarray:
+        if mask is None:
+            return np.ones(self.num_envs, dtype=bool)
+        mask = np.asarray(mask)
+        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+            raise ValueError(
+                f"Expected options['reset_mask'] as {self.num_envs} booleans, at least one True, got {mask.tolist()}. "
+                "Pass a NumPy array of bool."
+            )
+        return mask
+
+    def _checked_actions(self, actions: Any) -> np.ndarray:
+        expected = f"Expected actions = {ACTION_MEANING}, shape ({self.num_envs}, {ACTION_SIZE}), all finite"
+        try:
+            given = np.array(actions, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{expected}, got {actions!r}. Pass one row of numbers per environment.") from error
+        if given.shape != (self.num_envs, ACTION_SIZE):
+            raise ValueError(f"{expected}, got shape {given.shape}. Pass one row per environment.")
+        if not np.isfinite(given).all():
+            bad = np.flatnonzero(~np.isfinite(given).all(axis=1)).tolist()
+            raise ValueError(f"{expected}, got NaN or infinity in the rows {bad}. Find out where they come from.")
+        return given
+
+    def _reset_one(self, i: int, seed: int | None, options: dict[str, Any]) -> None:
+        env = self.envs[i]
+        self._ended[i] = True  # an option that is refused leaves no episode to step
+        env.reset(seed=seed, options=options)
+        self._states[i], self._goals[i] = env._state, env._goal
+        self._steps[i], self._ended[i] = 0, False
+
+    def _reset_at_once(self, infos: dict[str, Any], ended: np.ndarray) -> dict[str, Any]:
+        """Mode SAME_STEP: keep what the episodes ended with and start the next ones."""
+        last = self._observations()
+        final_obs = np.full(self.num_envs, None, dtype=object)
+        for i in np.flatnonzero(ended).tolist():
+            final_obs[i] = {name: value[i] for name, value in last.items()}
+        final_info = {name: np.copy(value) for name, value in infos.items()}
+        for name in list(final_info):
+            if name.startswith("_"):
+                final_info[name] = final_info[name] & ended
+        for i in np.flatnonzero(ended).tolist():
+            self._reset_one(i, None, {})
+        infos |= self._masked(self._pose_info(), np.ones(self.num_envs, dtype=bool))
+        for name in final_info:
+            if name.startswith("_") and name[1:] not in ("success", "position_error", "yaw_error"):
+                infos[name] = infos[name] & ~ended
+        return infos | {"final_obs": final_obs, "_final_obs": ended, "final_info": final_info, "_final_info": ended}
+
+    def _observations(self) -> dict[str, np.ndarray]:
+        observations = {"state": self._states.copy(), "goal": self._goals.copy()}
+        if "time_to_go" in self.single_observation_space.spaces:  # pyright: ignore[reportAttributeAccessIssue]
+            left = np.where(self._ended, 0, self.envs[0].horizon - self._steps)
+            observations["time_to_go"] = (left * CONTROL_PERIOD)[:, None]
+        return observations
+
+    def _pose_info(self) -> dict[str, np.ndarray]:
+        return self.envs[0].task.pose_info(self._states, self._goals)
+
+    def _masked(self, info: dict[str, np.ndarray], mask: np.ndarray, only: np.ndarray | None = None) -> dict[str, Any]:
+        """Gymnasium's form: `name` and `_name`. What is not about the pose exists for the environments `only`."""
+        result: dict[str, Any] = {}
+        for name, value in info.items():
+            has = mask
+            if only is not None and name not in ("success", "position_error", "yaw_error"):
+                has = mask & only
+                if not has.any():
+                    continue
+                if not has.all():
+                    value = np.where(has if value.ndim == 1 else has[:, None], value, np.zeros((), value.dtype))
+            result[name], result[f"_{name}"] = value, has.copy()
+        return result
+
+
+def available_cores() -> int:
+    """CPU cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _entry(
+    env: type[TriFingerEnv], num_envs: int, autoreset_mode: AutoresetMode | str, threads: int | None, arguments: Any
+) -> TriFingerVectorEnv:
+    return TriFingerVectorEnv(env(**arguments), num_envs, autoreset_mode, threads)
+
+
+def move_cube(
+    num_envs: int = 1,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    threads: int | None = None,
+    **arguments: Any,
+) -> TriFingerVectorEnv:
+    """`TriFingerMoveCube-v0`, N times; `arguments` are those of the single environment."""
+    return _entry(TriFingerMoveCubeEnv, num_envs, autoreset_mode, threads, arguments)
+
+
+def move_object(
+    num_envs: int = 1,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    threads: int | None = None,
+    **arguments: Any,
+) -> TriFingerVectorEnv:
+    """`TriFingerMoveObject-v0`, N times; `arguments` are those of the single environment."""
+    return _entry(TriFingerMoveObjectEnv, num_envs, autoreset_mode, threads, arguments)
+
+
+def turn_cube(
+    num_envs: int = 1,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    threads: int | None = None,
+    **arguments: Any,
+) -> TriFingerVectorEnv:
+    """`TriFingerTurnCube-v0`, N times; `arguments` are those of the single environment."""
+    return _entry(TriFingerTurnCubeEnv, num_envs, autoreset_mode, threads, arguments)

@@ -1,0 +1,258 @@
+"""The vector environment, TorchRL, and libraries that expect Gymnasium."""
+
+import multiprocessing
+import pickle
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium", reason="the environments need the extra [envs]")
+pytest.importorskip("mujoco", reason="the environments need the extra [envs]")
+
+from gymnasium.envs.mujoco.utils import check_mujoco_reset_state  # noqa: E402
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+from gymnasium.vector import AutoresetMode  # noqa: E402
+
+import difflcs_envs  # noqa: E402
+from difflcs_envs.vector import TriFingerVectorEnv, move_cube  # noqa: E402
+
+CUBE, OBJECT, TURN = (f"difflcs/TriFinger{name}-v0" for name in ("MoveCube", "MoveObject", "TurnCube"))
+OBJECT_ARGUMENTS = {"object": "clamp", "object_source": "stand_in"}
+TASKS = [(CUBE, {}), (OBJECT, OBJECT_ARGUMENTS), (TURN, {"observe_time": True})]
+
+
+def assert_same(one, other):
+    assert set(one) == set(other)
+    for name in one:
+        if isinstance(one[name], dict):
+            assert_same(one[name], other[name])
+        elif one[name].dtype == object:
+            for a, b in zip(one[name], other[name], strict=True):
+                assert (a is None) == (b is None)
+                if a is not None:
+                    assert_same(a, b)
+        else:
+            assert one[name].dtype == other[name].dtype, name
+            np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+
+
+@pytest.mark.parametrize(("env_id", "arguments"), TASKS)
+def test_checkers(env_id, arguments):
+    env = gymnasium.make(env_id, **arguments)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped, skip_render_check=True)
+        check_mujoco_reset_state(env.unwrapped)
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize(("env_id", "arguments"), TASKS)
+def test_same_as_single_environments_bit_for_bit(env_id, arguments, mode):
+    """Gymnasium's own vector steps single environments one by one."""
+    ours = gymnasium.make_vec(env_id, num_envs=3, autoreset_mode=mode, **arguments)
+    assert isinstance(ours, TriFingerVectorEnv)
+    assert ours.metadata["autoreset_mode"] is mode
+    theirs = gymnasium.make_vec(
+        env_id, num_envs=3, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, **arguments
+    )
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    seeds = [7, 3, 11]
+    a, b = ours.reset(seed=seeds), theirs.reset(seed=seeds)
+    assert_same(a[0], b[0])
+    assert_same(a[1], b[1])
+    rng = np.random.default_rng(0)
+    for _ in range(43):
+        actions = rng.uniform(-0.02, 0.02, (3, 6))
+        a, b = ours.step(actions), theirs.step(actions)
+        assert_same(a[0], b[0])
+        for x, y in zip(a[1:4], b[1:4], strict=True):
+            np.testing.assert_array_equal(x, y)
+            assert x.dtype == y.dtype
+        if mode is AutoresetMode.SAME_STEP:
+            assert set(b[4]) - set(a[4]) <= {"_final_info", "final_info"}
+            if a[3].any():
+                assert_same({"x": a[4]["final_obs"]}, {"x": b[4]["final_obs"]})
+                np.testing.assert_array_equal(a[4]["final_info"]["success"], b[4]["final_info"]["success"])
+                np.testing.assert_array_equal(a[4]["position_error"], b[4]["position_error"])
+        else:
+            assert_same(a[4], b[4])
+    ours.close()
+
+
+def test_threads_and_place_in_the_vector_change_nothing():
+    actions = np.random.default_rng(0).uniform(-0.015, 0.015, (20, 6))
+
+    def states(num_envs, threads, place):
+        envs = move_cube(num_envs, threads=threads)
+        seeds = [5] * num_envs
+        envs.reset(seed=seeds)
+        for action in actions:
+            batch = np.zeros((num_envs, 6))
+            batch[place] = action
+            last = envs.step(batch)[0]["state"][place]
+        return last
+
+    expected = states(1, 1, 0)
+    for num_envs, threads, place in ((3, 1, 2), (3, 4, 0), (7, 2, 5)):
+        np.testing.assert_array_equal(states(num_envs, threads, place), expected)
+
+
+def test_deterministic_across_processes():
+    code = (
+        "import gymnasium as g, numpy as np\n"
+        f"e = g.make_vec('difflcs_envs:{OBJECT}', num_envs=2, object='clamp', object_source='stand_in')\n"
+        "e.reset(seed=3)\n"
+        "for t in range(22): s = e.step(np.full((2, 6), 0.001 * (t - 10)))[0]['state']\n"
+        "print(s.tobytes().hex())"
+    )
+    first, second = (subprocess.check_output([sys.executable, "-c", code]) for _ in range(2))
+    assert first == second
+
+
+def _step_after_fork(envs, queue):
+    queue.put(envs.step(np.full((4, 6), 0.003))[0]["state"])
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="this system cannot fork")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")
+def test_threads_survive_a_fork():
+    envs = move_cube(4, threads=2)
+    envs.reset(seed=0)
+    context = multiprocessing.get_context("fork")
+    envs.step(np.zeros((4, 6)))  # the threads exist now
+    queue = context.Queue()
+    process = context.Process(target=_step_after_fork, args=(envs, queue))
+    process.start()
+    states = queue.get(timeout=20)
+    process.join(timeout=20)
+    np.testing.assert_array_equal(states, envs.step(np.full((4, 6), 0.003))[0]["state"])
+
+
+def test_autoreset_on_the_next_step():
+    envs = move_cube(2, horizon=3)
+    envs.reset(seed=0)
+    zero = np.zeros((2, 6))
+    truncated = [envs.step(zero)[3].tolist() for _ in range(3)]
+    assert truncated == [[False, False], [False, False], [True, True]]
+    observation, rewards, _, ended, infos = envs.step(zero)
+    np.testing.assert_array_equal(rewards, 0.0)
+    assert not ended.any()
+    assert "executed_action" not in infos
+    assert infos["_success"].all()
+    np.testing.assert_allclose(observation["state"][:, 3:5], [[0, 0.0977]] * 2, atol=0.005)
+
+
+def test_disabled_autoreset_needs_a_mask():
+    envs = move_cube(3, horizon=2, autoreset_mode="Disabled")
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        envs.step(np.zeros((3, 6)))
+    envs.reset(seed=0)
+    envs.step(np.full((3, 6), 0.01))
+    mask = np.array([False, True, False])
+    before = envs.step(np.full((3, 6), 0.01))[0]
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        envs.step(np.zeros((3, 6)))
+    observation, infos = envs.reset(options={"reset_mask": mask})
+    np.testing.assert_array_equal(observation["state"][~mask], before["state"][~mask])
+    assert not np.array_equal(observation["state"][1], before["state"][1])
+    assert infos["_success"].tolist() == mask.tolist()
+    for bad in ([True, True], np.zeros(3, bool), np.ones(3)):
+        with pytest.raises(ValueError, match="reset_mask"):
+            envs.reset(options={"reset_mask": bad})
+
+
+def test_goal_and_state_options_reach_every_environment():
+    envs = move_cube(2)
+    goal = [0.01, -0.02, 0.3]
+    np.testing.assert_allclose(envs.reset(seed=0, options={"goal": goal})[0]["goal"], [goal, goal])
+    with pytest.raises(ValueError, match="task space"):
+        envs.reset(options={"goal": [1, 0, 0]})
+
+
+def test_instability_stays_in_its_lane(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes MUJOCO_LOG.TXT
+    envs, calm = move_cube(3), move_cube(3)
+    for env in (envs, calm):
+        env.reset(seed=0)
+        env.step(np.zeros((3, 6)))
+    envs.envs[1].data.qvel[0] = np.nan
+    with pytest.warns(difflcs_envs.PhysicsWarning, match=r"environments \[1\]"):
+        observation, rewards, _, truncated, infos = envs.step(np.zeros((3, 6)))
+    expected = calm.step(np.zeros((3, 6)))[0]["state"]
+    np.testing.assert_array_equal(observation["state"][[0, 2]], expected[[0, 2]])
+    assert np.isfinite(observation["state"]).all()
+    assert np.isfinite(rewards).all()
+    assert infos["physics_error"].tolist() == truncated.tolist() == [False, True, False]
+    assert not envs.step(np.zeros((3, 6)))[4]["physics_error"].any()
+
+
+def test_copies_continue_alike():
+    envs = move_cube(3)
+    envs.reset(seed=0)
+    envs.step(np.full((3, 6), 0.01))
+    copied = pickle.loads(pickle.dumps(envs))
+    for _ in range(21):
+        one, other = envs.step(np.full((3, 6), -0.01)), copied.step(np.full((3, 6), -0.01))
+        assert_same(one[0], other[0])
+
+
+@pytest.mark.parametrize("arguments", [{"num_envs": 0}, {"num_envs": 2.5}, {"num_envs": 2, "threads": 0}])
+def test_bad_arguments(arguments):
+    with pytest.raises(ValueError, match=r"Expected .*got"):
+        move_cube(**arguments)
+
+
+@pytest.mark.parametrize("actions", [np.zeros(6), np.zeros((3, 6)), np.full((2, 6), np.nan), "push"])
+def test_bad_actions(actions):
+    envs = move_cube(2)
+    envs.reset(seed=0)
+    with pytest.raises(ValueError, match=r"Expected actions = .*got"):
+        envs.step(actions)
+    with pytest.raises(ValueError, match="2 seeds"):
+        envs.reset(seed=[1, 2, 3])
+
+
+def test_wrappers_of_gymnasium():
+    envs = gymnasium.make_vec(CUBE, num_envs=2)
+    envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(gymnasium.wrappers.vector.FlattenObservation(envs))
+    observation, _ = envs.reset(seed=0)
+    assert observation.shape == (2, 12)
+    for _ in range(20):
+        observation, _, _, truncated, infos = envs.step(envs.action_space.sample())
+    assert truncated.all()
+    assert infos["episode"]["l"].tolist() == [20, 20]
+
+
+def test_another_library_learns_a_little():
+    """Stable-Baselines3 where it is installed."""
+    sb3 = pytest.importorskip("stable_baselines3")
+    env = gymnasium.wrappers.FlattenObservation(gymnasium.make(CUBE))
+    sb3.PPO("MlpPolicy", env, n_steps=40, batch_size=20, n_epochs=1, device="cpu").learn(40)
+
+
+@pytest.mark.parametrize(("task", "arguments"), [("cube", {}), ("clamp", {"object_source": "stand_in"}), (TURN, {})])
+@pytest.mark.parametrize("num_envs", [None, 3])
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_torchrl(task, arguments, num_envs):
+    torchrl_envs = pytest.importorskip("torchrl.envs", reason="needs the extra [rl]")
+    from difflcs_envs.torchrl import make_env
+
+    env = make_env(task, num_envs=num_envs, **arguments)
+    torchrl_envs.check_env_specs(env)
+    env.set_seed(0)
+    rollout = env.rollout(25, break_when_any_done=False)
+    batch = [] if num_envs is None else [num_envs]
+    assert list(rollout["state"].shape) == [*batch, 25, 9]
+    assert list(rollout["goal"].shape) == [*batch, 25, 3]
+    time_to_go = rollout["time_to_go"].reshape(-1, 25)
+    np.testing.assert_allclose(time_to_go[0, :20], 0.1 * np.arange(20, 0, -1), atol=1e-12)
+    np.testing.assert_allclose(time_to_go[:, 20], 2.0)  # the next episode
+    truncated = rollout["next", "truncated"].reshape(-1, 25)
+    assert truncated[:, 19].all()
+    assert truncated.sum() == len(truncated)
+    assert not rollout["next", "terminated"].any()
+    env.close()
