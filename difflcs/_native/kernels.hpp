@@ -11,16 +11,16 @@ enum class Status : int8_t { converged = 0, max_iter = 1, infeasible = 2, numeri
 
 // A batch of linear complementarity problems 0 <= lam, w = F lam + q >= 0, lam_i w_i = relaxation.
 struct LcpBatch {
-  int64_t n;           // size of one problem
-  const double* F;     // (n, n) row-major, of problem 0
-  int64_t F_stride;    // distance from one problem's F to the next; 0 when all share one F
-  const double* q;     // (batch, n)
-  double relaxation;   // 0: exact
+  int64_t n;          // size of one problem
+  const double* F;    // (n, n) row-major, of problem 0
+  int64_t F_stride;   // distance from one problem's F to the next; 0 when all share one F
+  const double* q;    // (batch, n)
+  double relaxation;  // 0: exact
   int64_t max_iter;
-  double* lam;         // out (batch, n)
-  double* w;           // out (batch, n)
-  int8_t* status;      // out (batch,)
-  int32_t* iterations; // out (batch,)
+  double* lam;          // out (batch, n)
+  double* w;            // out (batch, n)
+  int8_t* status;       // out (batch,)
+  int32_t* iterations;  // out (batch,)
 };
 
 // Inputs of an MPC problem, in the order of difflcs.mpc.problem.INPUTS.
@@ -53,16 +53,16 @@ struct MpcGradient {
   const double *x, *u, *lam;              // the solution
   const double *x_bar, *u_bar, *lam_bar;  // upstream
   const double* objective_bar;
-  const int8_t* solved;                   // elements that are not contribute exactly zero
-  double* per_element[kInputs];           // (count, ...) where the input is per element, else null
-  double* partial;                        // (blocks, shared_size): sums over each block of the shared inputs
+  const int8_t* solved;          // elements that are not contribute exactly zero
+  double* per_element[kInputs];  // (count, ...) where the input is per element, else null
+  double* partial;               // (blocks, shared_size): sums over each block of the shared inputs
   int64_t shared_size;
-  int64_t offset[kInputs];                // position of each shared input inside a partial sum
+  int64_t offset[kInputs];  // position of each shared input inside a partial sum
 };
 
 struct Kernels {
   const char* isa;
-  int lanes;  // problems solved side by side
+  int lanes;                            // problems solved side by side
   int64_t (*lcp_workspace)(int64_t n);  // bytes, to be aligned to 64
   // Solve problems [begin, end); both read and write only those.
   void (*lcp_exact)(const LcpBatch& batch, int64_t begin, int64_t end, void* workspace);

@@ -12,7 +12,11 @@ struct LcpWorkspace {
   Mask* active;
   LcpWorkspace(int64_t n, void* memory) {
     Vec* p = static_cast<Vec*>(memory);
-    auto take = [&](int64_t count) { Vec* r = p; p += count; return r; };
+    auto take = [&](int64_t count) {
+      Vec* r = p;
+      p += count;
+      return r;
+    };
     F = take(n * n), M = take(n * n), q = take(n), lam = take(n), w = take(n), rhs = take(n), scale = take(n);
     bound = take(n), active = reinterpret_cast<Mask*>(take(n));
   }
@@ -181,9 +185,12 @@ void lcp_relaxed(const LcpBatch& batch, int64_t begin, int64_t end, void* memory
         iterations[l]++;
         // Converged at 1e-14, or at the level where rounding stops progress, if that is below 1e-10.
         if (at_target[l]) {
-          if (residual[l] <= 1e-14 * magnitude[l]) solved[l] = -1;
-          else if (residual[l] < 0.5 * smallest[l]) smallest[l] = residual[l], stalled[l] = 0;
-          else if (residual[l] <= 1e-10 * magnitude[l] && ++stalled[l] >= 2) solved[l] = -1;
+          if (residual[l] <= 1e-14 * magnitude[l])
+            solved[l] = -1;
+          else if (residual[l] < 0.5 * smallest[l])
+            smallest[l] = residual[l], stalled[l] = 0;
+          else if (residual[l] <= 1e-10 * magnitude[l] && ++stalled[l] >= 2)
+            solved[l] = -1;
         }
       }
       if (!any(~solved)) break;

@@ -24,7 +24,8 @@ using namespace nb::literals;
 namespace {
 
 using Array = nb::ndarray<const double, nb::device::cpu, nb::c_contig>;
-template <class T> using Output = nb::ndarray<T, nb::device::cpu, nb::c_contig>;
+template <class T>
+using Output = nb::ndarray<T, nb::device::cpu, nb::c_contig>;
 
 struct AlignedDelete {
   void operator()(void* p) const { ::operator delete(p, std::align_val_t{64}); }
@@ -110,27 +111,27 @@ void solve(const difflcs::LcpBatch& batch, int64_t count, int threads) {
   for (int64_t e = 0; e < count; e++) {
     if (batch.status[e] == static_cast<int8_t>(difflcs::Status::converged)) continue;
     const int64_t limit = int64_t{1} << std::min<int64_t>(batch.n + 2, 16);
-    const bool ok = lcp_exact_one(batch.n, batch.F + e * batch.F_stride, batch.q + e * batch.n,
-                                  batch.lam + e * batch.n, batch.w + e * batch.n, limit);
+    const bool ok = lcp_exact_one(batch.n, batch.F + e * batch.F_stride, batch.q + e * batch.n, batch.lam + e * batch.n,
+                                  batch.w + e * batch.n, limit);
     if (ok) batch.status[e] = static_cast<int8_t>(difflcs::Status::converged);
   }
 }
 
-void solve_lcp(Array F, Array q, double relaxation, int64_t max_iter, int threads, Output<double> lam,
-               Output<double> w, Output<int8_t> status, Output<int32_t> iterations) {
+void solve_lcp(Array F, Array q, double relaxation, int64_t max_iter, int threads, Output<double> lam, Output<double> w,
+               Output<int8_t> status, Output<int32_t> iterations) {
   if (q.ndim() != 2) throw std::invalid_argument("q must be (batch, n)");
   const int64_t count = q.shape(0), n = q.shape(1);
   const bool shared = F.ndim() == 2;
-  const bool F_ok = shared ? (int64_t(F.shape(0)) == n && int64_t(F.shape(1)) == n)
-                           : (F.ndim() == 3 && int64_t(F.shape(0)) == count && int64_t(F.shape(1)) == n &&
-                              int64_t(F.shape(2)) == n);
+  const bool F_ok =
+      shared ? (int64_t(F.shape(0)) == n && int64_t(F.shape(1)) == n)
+             : (F.ndim() == 3 && int64_t(F.shape(0)) == count && int64_t(F.shape(1)) == n && int64_t(F.shape(2)) == n);
   if (!F_ok || n < 1) throw std::invalid_argument("F must be (n, n) or (batch, n, n) with n >= 1");
   if (int64_t(lam.size()) != count * n || int64_t(w.size()) != count * n || int64_t(status.size()) != count ||
       int64_t(iterations.size()) != count)
     throw std::invalid_argument("outputs must be (batch, n), (batch, n), (batch,), (batch,)");
   if (!(relaxation >= 0)) throw std::invalid_argument("relaxation must be >= 0");
-  const difflcs::LcpBatch batch{n,        F.data(), shared ? 0 : n * n, q.data(),          relaxation,
-                                max_iter, lam.data(), w.data(),         status.data(), iterations.data()};
+  const difflcs::LcpBatch batch{n,        F.data(),   shared ? 0 : n * n, q.data(),      relaxation,
+                                max_iter, lam.data(), w.data(),           status.data(), iterations.data()};
   nb::gil_scoped_release release;
   solve(batch, count, threads);
 }
@@ -185,9 +186,19 @@ void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
   if (lam_start) check_size("lam_start", lam_start->size(), forces);
   if (!(first_relaxation >= relaxation && shrink > 0 && shrink < 1))
     throw std::invalid_argument("the homotopy must fall from first_relaxation to relaxation");
-  const difflcs::MpcSolve o{u_start ? u_start->data() : nullptr, lam_start ? lam_start->data() : nullptr,
-                            first_relaxation, shrink, tol, max_iter, x.data(), u.data(), lam.data(),
-                            objective.data(), residual.data(), status.data(), iterations.data()};
+  const difflcs::MpcSolve o{u_start ? u_start->data() : nullptr,
+                            lam_start ? lam_start->data() : nullptr,
+                            first_relaxation,
+                            shrink,
+                            tol,
+                            max_iter,
+                            x.data(),
+                            u.data(),
+                            lam.data(),
+                            objective.data(),
+                            residual.data(),
+                            status.data(),
+                            iterations.data()};
   if (b.count == 0) return;
   nb::gil_scoped_release release;
   const auto& kernels = difflcs::kernels();
@@ -196,9 +207,10 @@ void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
   on_threads(used, kernels.mpc_workspace(b), [&](void* workspace) { kernels.mpc_solve(b, o, &next, workspace); });
 }
 
-void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, Array x, Array u, Array lam, Array x_bar, Array u_bar,
-             Array lam_bar, Array objective_bar, nb::ndarray<const int8_t, nb::device::cpu, nb::c_contig> solved,
-             int threads, std::vector<Output<double>> gradients) {
+void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, Array x, Array u, Array lam,
+             Array x_bar, Array u_bar, Array lam_bar, Array objective_bar,
+             nb::ndarray<const int8_t, nb::device::cpu, nb::c_contig> solved, int threads,
+             std::vector<Output<double>> gradients) {
   using namespace difflcs;
   const MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier);
   const int64_t states = b.count * (horizon + 1) * b.n_x, actions = b.count * horizon * b.n_u;
@@ -213,8 +225,10 @@ void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, 
   for (int i = 0; i < kInputs; i++) {
     check_size("gradient", gradients[i].size(), inputs[i].size());
     std::fill_n(gradients[i].data(), gradients[i].size(), 0.0);
-    if (b.stride[i]) o.per_element[i] = gradients[i].data();
-    else o.offset[i] = o.shared_size, o.shared_size += int64_t(inputs[i].size());
+    if (b.stride[i])
+      o.per_element[i] = gradients[i].data();
+    else
+      o.offset[i] = o.shared_size, o.shared_size += int64_t(inputs[i].size());
   }
   if (b.count == 0) return;
   nb::gil_scoped_release release;
@@ -243,10 +257,11 @@ NB_MODULE(_kernels, m) {
   m.def("isa", [] { return difflcs::kernels().isa; }, "Instruction set in use.");
   m.def("solve_lcp", &solve_lcp, "F"_a, "q"_a, "relaxation"_a, "max_iter"_a, "threads"_a, "lam"_a, "w"_a, "status"_a,
         "iterations"_a, "Solve a batch of LCPs into the given arrays.");
-  m.def("solve_mpc", &solve_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "u_start"_a.none(), "lam_start"_a.none(),
-        "first_relaxation"_a, "shrink"_a, "tol"_a, "max_iter"_a, "threads"_a, "x"_a, "u"_a, "lam"_a, "objective"_a,
-        "residual"_a, "status"_a, "iterations"_a, "Solve a batch of LCS-MPC problems into the given arrays.");
-  m.def("vjp_mpc", &vjp_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "x"_a, "u"_a, "lam"_a, "x_bar"_a, "u_bar"_a,
-        "lam_bar"_a, "objective_bar"_a, "solved"_a, "threads"_a, "gradients"_a,
+  m.def("solve_mpc", &solve_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "u_start"_a.none(),
+        "lam_start"_a.none(), "first_relaxation"_a, "shrink"_a, "tol"_a, "max_iter"_a, "threads"_a, "x"_a, "u"_a,
+        "lam"_a, "objective"_a, "residual"_a, "status"_a, "iterations"_a,
+        "Solve a batch of LCS-MPC problems into the given arrays.");
+  m.def("vjp_mpc", &vjp_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "x"_a, "u"_a, "lam"_a, "x_bar"_a,
+        "u_bar"_a, "lam_bar"_a, "objective_bar"_a, "solved"_a, "threads"_a, "gradients"_a,
         "Gradients of the inputs of solved LCS-MPC problems, into the given arrays.");
 }

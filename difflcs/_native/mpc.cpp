@@ -1,10 +1,11 @@
 // The batched LCS-MPC solver and its adjoint, compiled once per instruction set (see CMakeLists.txt).
 //
-// For F + F^T positive definite the relaxed complementarity lam o s = eps has one solution, smooth in (x, u). Eliminating
-// lam leaves a smooth optimal control problem in u alone with box bounds. It is solved by projected Newton: a Riccati
-// backward sweep with the exact second derivative of lam, a feedback rollout clipped to the box with an Armijo search, and
-// a homotopy in eps from `first_relaxation` down to `relaxation`. The adjoint is the same backward sweep with the upstream
-// gradients as linear terms; difflcs/mpc/kkt.py derives it, and the names here are the names there.
+// For F + F^T positive definite the relaxed complementarity lam o s = eps has one solution, smooth in (x, u).
+// Eliminating lam leaves a smooth optimal control problem in u alone with box bounds. It is solved by projected Newton:
+// a Riccati backward sweep with the exact second derivative of lam, a feedback rollout clipped to the box with an
+// Armijo search, and a homotopy in eps from `first_relaxation` down to `relaxation`. The adjoint is the same backward
+// sweep with the upstream gradients as linear terms; difflcs/mpc/kkt.py derives it, and the names here are the names
+// there.
 //
 // One problem per SIMD lane: the code reads like the solver of a single problem. A finished lane stores its result and
 // takes the next problem. No lane's arithmetic depends on another lane: whatever iterates, iterates under a mask.
@@ -37,14 +38,15 @@ struct Mpc {
   const S n;
   // Problem: [A B], C, [D E], F, Q, R, Q_final and the vectors.
   T *AB, *C, *DE, *F, *Q, *R, *Qf;
-  // lam = scale * lam', s = s' / scale, chosen so that F' has a unit diagonal: contacts in any units converge alike. C, [D E],
-  // F, c, lam and s are kept in these units; the product lam o s does not change.
+  // lam = scale * lam', s = s' / scale, chosen so that F' has a unit diagonal: contacts in any units converge alike. C,
+  // [D E], F, c, lam and s are kept in these units; the product lam o s does not change.
   T* scale;
   Vec *d, *c, *q, *r, *qf, *lo, *hi, *x0;
   // Trajectory, trial trajectory, and the feedback law.
   Vec *x, *u, *lam, *s, *xt, *ut, *lamt, *st, *K, *kf, *grad;
   // Scratch of the backward sweep and of the LCP.
-  Vec *P, *Pn, *v, *vn, *p, *pn, *M, *Mc, *Kl, *Tk, *Wk, *av, *bv, *Ah, *PA, *H, *lin, *Lc, *Kk, *y, *size, *gap, *res, *wt, *dl, *lt, *wn, *rn, *root;
+  Vec *P, *Pn, *v, *vn, *p, *pn, *M, *Mc, *Kl, *Tk, *Wk, *av, *bv, *Ah, *PA, *H, *lin, *Lc, *Kk, *y, *size, *gap, *res,
+      *wt, *dl, *lt, *wn, *rn, *root;
   // Kept per stage for the adjoint.
   Vec *Kl_s, *Ks_s, *Ah_s, *M_s, *size_s, *y_s, *P_s, *v_s, *p_s, *xb, *ub, *lb, *sum;
   Mask *act, *low, *upp;
@@ -73,7 +75,8 @@ struct Mpc {
     vec(Mc, nl * nl), vec(Kl, nl * nw), vec(Tk, nl * nw), vec(Wk, nl * nw), vec(av, nl), vec(bv, nl);
     vec(Ah, nx * nw), vec(PA, nx * nw), vec(H, nw * nw), vec(lin, nw);
     vec(Lc, nu * nu), vec(Kk, nu * (nx + 1)), vec(y, nl), vec(size, nl), vec(gap, nl), vec(res, nl), vec(wt, nl);
-    vec(dl, nl), vec(lt, nl), vec(wn, nl), vec(rn, nl), vec(root, nl), mask(act, h * nu), mask(low, h * nu), mask(upp, h * nu);
+    vec(dl, nl), vec(lt, nl), vec(wn, nl), vec(rn, nl), vec(root, nl), mask(act, h * nu), mask(low, h * nu),
+        mask(upp, h * nu);
     if (adjoint) {
       vec(Kl_s, h * nl * nw), vec(Ks_s, h * nl * nw), vec(Ah_s, h * nx * nw), vec(M_s, h * nl * nl);
       vec(size_s, h * nl), vec(y_s, h * nl), vec(P_s, (h + 1) * nx * nx), vec(v_s, (h + 1) * nx);
@@ -94,9 +97,7 @@ struct Mpc {
   static void put(double* to, int64_t at, int, double value) { to[at] = value; }
   static void put(Vec* to, int64_t at, int lane, double value) { reinterpret_cast<double*>(to + at)[lane] = value; }
 
-  const double* input(Input which, int64_t element) const {
-    return batch.input[which] + element * batch.stride[which];
-  }
+  const double* input(Input which, int64_t element) const { return batch.input[which] + element * batch.stride[which]; }
 
   void load_matrices(int64_t e, int lane) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nw = n.w();
@@ -177,8 +178,8 @@ struct Mpc {
     }
   }
 
-  // lam o (F lam + gap) = eps by damped Newton on the CHKS function g = lam + w - root (see lcp.cpp) from the guess in lk.
-  // Lanes in `skip` keep lk and sk.
+  // lam o (F lam + gap) = eps by damped Newton on the CHKS function g = lam + w - root (see lcp.cpp) from the guess in
+  // lk. Lanes in `skip` keep lk and sk.
   void relaxed_lcp(Vec* lk, Vec* sk, Vec eps, Mask skip) {
     const int64_t nl = n.l();
     const Vec eps4 = 4.0 * eps;
@@ -253,8 +254,7 @@ struct Mpc {
     for (int64_t k = 0; k < n.h; k++) total += quadratic(Q, q, xs + k * nx, nx) + quadratic(R, r, us + k * nu, nu);
     if (batch.barrier > 0)
       for (int64_t k = 0; k < n.h; k++)
-        for (int64_t j = 0; j < nu; j++)
-          total -= mu * log((us[k * nu + j] - lo[j]) * (hi[j] - us[k * nu + j]));
+        for (int64_t j = 0; j < nu; j++) total -= mu * log((us[k * nu + j] - lo[j]) * (hi[j] - us[k * nu + j]));
     return total;
   }
 
@@ -287,8 +287,8 @@ struct Mpc {
         for (int64_t i = 0; i < nx; i++) p_s[(k + 1) * nx + i] = p[i], v_s[(k + 1) * nx + i] = v[i];
         for (int64_t i = 0; i < nx * nx; i++) P_s[(k + 1) * nx * nx + i] = P[i];
       }
-      // Linearised LCP: dlam = Kl (dx, du), ds = Ks (dx, du), dx+ = Ah (dx, du). Since a dlam + b ds = 0, both follow from
-      // one T: Kl = b T, Ks = -a T with (diag(a) + F diag(b)) T = -[D E].
+      // Linearised LCP: dlam = Kl (dx, du), ds = Ks (dx, du), dx+ = Ah (dx, du). Since a dlam + b ds = 0, both follow
+      // from one T: Kl = b T, Ks = -a T with (diag(a) + F diag(b)) T = -[D E].
       for (int64_t i = 0; i < nl; i++) {
         size[i] = 1.0 / (lk[i] + sk[i]);
         av[i] = sk[i] * size[i], bv[i] = lk[i] * size[i];
@@ -343,8 +343,10 @@ struct Mpc {
       for (int64_t i = first; i < nw; i++)
         for (int64_t j = first; j <= i; j++) {
           Vec t = all(0);
-          if (i < nx) t += Q[i * nx + j];
-          else if (j >= nx) t += R[(i - nx) * nu + j - nx];
+          if (i < nx)
+            t += Q[i * nx + j];
+          else if (j >= nx)
+            t += R[(i - nx) * nu + j - nx];
           for (int64_t m = 0; m < nx; m++) t += Ah[m * nw + i] * PA[m * nw + j];
           H[i * nw + j] = t;
         }
@@ -551,21 +553,27 @@ struct Mpc {
       eps[l] = o.first_relaxation, regularisation[l] = 0;
       if (e >= batch.count) return false;
       load(e, l);
-      if (o.u_start) load_lane(u, o.u_start + e * h * nu, h * nu, l);
-      else for (int64_t i = 0; i < h * nu; i++) put(u, i, l, 0.0);
+      if (o.u_start)
+        load_lane(u, o.u_start + e * h * nu, h * nu, l);
+      else
+        for (int64_t i = 0; i < h * nu; i++) put(u, i, l, 0.0);
       for (int64_t k = 0; k < h; k++)
         for (int64_t j = 0; j < nu; j++) {
           const double margin = batch.barrier > 0 ? 0.01 * (hi[j][l] - lo[j][l]) : 0.0;
           const double a = lo[j][l] + margin, b = hi[j][l] - margin, value = u[k * nu + j][l];
           put(u, k * nu + j, l, value < a ? a : value > b ? b : value);
         }
-      if (o.lam_start) load_lam(lam, o.lam_start + e * h * nl, l);
-      else for (int64_t i = 0; i < h * nl; i++) put(lam, i, l, __builtin_sqrt(o.first_relaxation));
+      if (o.lam_start)
+        load_lam(lam, o.lam_start + e * h * nl, l);
+      else
+        for (int64_t i = 0; i < h * nl; i++) put(lam, i, l, __builtin_sqrt(o.first_relaxation));
       return true;
     };
     for (int l = 0; l < kLanes; l++) {
-      if (take(l)) live++;
-      else if (live) load(lane[0].element, l);  // harmless numbers for a lane that never gets a problem
+      if (take(l))
+        live++;
+      else if (live)
+        load(lane[0].element, l);  // harmless numbers for a lane that never gets a problem
     }
     while (live > 0) {
       Mask idle;
@@ -594,7 +602,7 @@ struct Mpc {
         store_lane(o.u + e * h * nu, u, h * nu, l);
         store_lam(o.lam + e * h * nl, l);
         o.objective[e] = J[l], o.residual[e] = sweep.residual[l], o.iterations[e] = int32_t(a.iterations);
-        const Status status = converged && !broken ? (sweep.weak[l] ? Status::degenerate : Status::converged)
+        const Status status = converged && !broken         ? (sweep.weak[l] ? Status::degenerate : Status::converged)
                               : a.iterations >= o.max_iter ? Status::max_iter
                                                            : Status::numerical;
         o.status[e] = int8_t(status);
@@ -628,8 +636,10 @@ struct Mpc {
         a.failures = moved[l] ? 0 : a.failures + 1;
         // Levenberg-Marquardt, in units of each action's own curvature.
         double& reg = reinterpret_cast<double*>(&regularisation)[l];
-        if (!moved[l]) reg = reg * 8 > 1 ? reg * 8 : 1;
-        else if (step[l] >= 0.3) reg = reg * 0.125 < 0.5 ? 0 : reg * 0.125;
+        if (!moved[l])
+          reg = reg * 8 > 1 ? reg * 8 : 1;
+        else if (step[l] >= 0.3)
+          reg = reg * 0.125 < 0.5 ? 0 : reg * 0.125;
         // Two steps per stage of the homotopy, fewer where the stage is solved.
         if (eps[l] > target && (a.in_stage >= 2 || sweep.projected[l] < 1e4 * o.tol || a.failures > 0)) {
           eps[l] = eps[l] * o.shrink > target ? eps[l] * o.shrink : target;
@@ -697,8 +707,13 @@ struct Sink {
 template <class T, class S>
 void Mpc<T, S>::forward_adjoint(const MpcGradient& o, int64_t group, int64_t end, Mask valid) {
   const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nw = n.w(), h = n.h;
-  const Sink sink{o,  group, end, valid, sum, {nx * nx, nx * nu, nx * nl, nx, nl * nx, nl * nu, nl * nl, nl,
-                                                  nx * nx, nu * nu, nx * nx, nx, nu, nx, nu, nu, nx}};
+  const Sink sink{
+      o,
+      group,
+      end,
+      valid,
+      sum,
+      {nx * nx, nx * nu, nx * nl, nx, nl * nx, nl * nu, nl * nl, nl, nx * nx, nu * nu, nx * nx, nx, nu, nx, nu, nu, nx}};
   // Directions: dw = (dx, du), dx of the next state, dlam, ds, dp, dy. The scratch of the sweep is free again.
   Vec *dw = lin, *dxn = pn, *dlam = dl, *ds = res, *dp = vn, *dy = wt, *rho = y, *drho = gap;
   for (int64_t i = 0; i < nx; i++) dw[i] = all(0);
@@ -808,10 +823,14 @@ void dispatch(const MpcBatch& b, Function f) {
   const Input matrices[] = {kA, kB, kC, kD, kE, kF, kQ, kR, kQfinal};
   for (const Input which : matrices) shared = shared && b.stride[which] == 0;
   const bool paper = b.n_x == 9 && b.n_u == 6;
-  if (!shared) f(Variant<Vec, Sizes<0, 0, 0>>());
-  else if (paper && b.n_lam == 5) f(Variant<double, Sizes<9, 6, 5>>());
-  else if (paper && b.n_lam == 8) f(Variant<double, Sizes<9, 6, 8>>());
-  else f(Variant<double, Sizes<0, 0, 0>>());
+  if (!shared)
+    f(Variant<Vec, Sizes<0, 0, 0>>());
+  else if (paper && b.n_lam == 5)
+    f(Variant<double, Sizes<9, 6, 5>>());
+  else if (paper && b.n_lam == 8)
+    f(Variant<double, Sizes<9, 6, 8>>());
+  else
+    f(Variant<double, Sizes<0, 0, 0>>());
 }
 
 }  // namespace
@@ -828,7 +847,9 @@ void mpc_solve(const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void
 
 void mpc_vjp(const MpcBatch& batch, const MpcGradient& gradient, int64_t begin, int64_t end, int64_t block,
              void* workspace) {
-  dispatch(batch, [&](auto type) { typename decltype(type)::Solver(batch, workspace, true).vjp(gradient, begin, end, block); });
+  dispatch(batch, [&](auto type) {
+    typename decltype(type)::Solver(batch, workspace, true).vjp(gradient, begin, end, block);
+  });
 }
 
 }  // namespace difflcs::DIFFLCS_ISA

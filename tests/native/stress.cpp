@@ -1,5 +1,5 @@
-// Drives every kernel over many sizes, shared and per-element inputs, several threads and broken numbers, to be built with
-// sanitizers (`make sanitize`). It checks memory and arithmetic, not mathematics: the Python tests do that.
+// Drives every kernel over many sizes, shared and per-element inputs, several threads and broken numbers, to be built
+// with sanitizers (`make sanitize`). It checks memory and arithmetic, not mathematics: the Python tests do that.
 #include <atomic>
 #include <cmath>
 #include <cstdio>
@@ -58,8 +58,8 @@ void lcp(int64_t n, int64_t count, bool shared, double relaxation, double broken
   std::vector<double> lam(count * n), w(count * n);
   std::vector<int8_t> status(count);
   std::vector<int32_t> iterations(count);
-  const LcpBatch batch{n,          F.data(), shared ? 0 : n * n, q.data(),      relaxation,
-                       80,         lam.data(), w.data(),         status.data(), iterations.data()};
+  const LcpBatch batch{n,  F.data(),   shared ? 0 : n * n, q.data(),      relaxation,
+                       80, lam.data(), w.data(),           status.data(), iterations.data()};
   const Workspace workspace(kernels().lcp_workspace(n));
   const auto run = relaxation > 0 ? kernels().lcp_relaxed : kernels().lcp_exact;
   for (int64_t begin = 0; begin < count; begin += 5) run(batch, begin, std::min(count, begin + 5), workspace.data);
@@ -73,8 +73,9 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
   MpcBatch b{};
   b.count = count, b.n_x = n_x, b.n_u = n_u, b.n_lam = n_lam, b.horizon = horizon;
   b.relaxation = 1e-5, b.barrier = barrier;
-  const int64_t sizes[kInputs] = {n_x * n_x,   n_x * n_u, n_x * n_lam, n_x, n_lam * n_x, n_lam * n_u,
-                                  n_lam * n_lam, n_lam,   n_x * n_x,   n_u * n_u, n_x * n_x, n_x, n_u, n_x, n_u, n_u, n_x};
+  const int64_t sizes[kInputs] = {n_x * n_x,     n_x * n_u, n_x * n_lam, n_x,       n_lam * n_x, n_lam * n_u,
+                                  n_lam * n_lam, n_lam,     n_x * n_x,   n_u * n_u, n_x * n_x,   n_x,
+                                  n_u,           n_x,       n_u,         n_u,       n_x};
   std::vector<double> data[kInputs];
   for (int i = 0; i < kInputs; i++) {
     const bool own = i == kx0 || !shared;
@@ -96,8 +97,19 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
   std::vector<double> objective(count), residual(count);
   std::vector<int8_t> status(count), all_solved(count, 1);
   std::vector<int32_t> iterations(count);
-  MpcSolve o{nullptr, nullptr, 1e-3, 0.3, 1e-8, 100, x.data(), u.data(), lam.data(), objective.data(), residual.data(),
-             status.data(), iterations.data()};
+  MpcSolve o{nullptr,
+             nullptr,
+             1e-3,
+             0.3,
+             1e-8,
+             100,
+             x.data(),
+             u.data(),
+             lam.data(),
+             objective.data(),
+             residual.data(),
+             status.data(),
+             iterations.data()};
   for (int pass = 0; pass < 2; pass++) {  // cold, then from its own solution
     int64_t next = 0;
     std::vector<std::thread> pool;
@@ -127,8 +139,10 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
   g.lam_bar = lam_bar.data(), g.objective_bar = objective_bar.data(), g.solved = all_solved.data();
   std::vector<double> own[kInputs];
   for (int i = 0; i < kInputs; i++) {
-    if (b.stride[i]) own[i].resize(count * sizes[i]), g.per_element[i] = own[i].data();
-    else g.offset[i] = g.shared_size, g.shared_size += sizes[i];
+    if (b.stride[i])
+      own[i].resize(count * sizes[i]), g.per_element[i] = own[i].data();
+    else
+      g.offset[i] = g.shared_size, g.shared_size += sizes[i];
   }
   const int64_t block = 7, blocks = (count + block - 1) / block;
   std::vector<double> partial(blocks * g.shared_size);
