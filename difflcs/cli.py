@@ -1,4 +1,4 @@
-"""The command line: `difflcs train | evaluate | render | demo`.
+"""The command line: `difflcs train | evaluate | render | demo | assets`.
 
 The only file of the package that knows both the library and the environments.
 """
@@ -11,18 +11,28 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
+from difflcs._files import write_json
 from difflcs.errors import CheckpointError, DiffLCSError, InvalidInputError
 from difflcs.rl._optional import require, versions
 from difflcs.rl.checkpoint import RunDirectory, load_checkpoint
 from difflcs.rl.evaluate import Evaluation, evaluate
 from difflcs.rl.figures import plot_learning_curve, record_video
 from difflcs.rl.tasks import TASKS, Task, get_task
-from difflcs.rl.training import EVALUATION_ENVS, Reporter, TrainConfig, saved_bounds, stored_config, train
-from difflcs.rl.warmup import Iteration
+from difflcs.rl.training import (
+    EVALUATION_ENVS,
+    Report,
+    Reporter,
+    TrainConfig,
+    load_policy,
+    profile,
+    saved_bounds,
+    stored_config,
+    train,
+)
 
 if TYPE_CHECKING:
     import gymnasium
@@ -65,11 +75,13 @@ class Train(TrainConfig):
             run = train(
                 config,
                 self.directory,
-                _env_factory(config.task),
+                _env_factory(config.task, self.directory),
                 init=self.init,
                 resume=self.resume,
                 reporter=progress,
             )
+        spent = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in profile(run.rows()).items() if seconds)
+        print(f"time: {spent}")
         print(f"finished: {run.path}\nevaluate it with: difflcs evaluate {run.path}")
 
     def _resumed(self, config: TrainConfig) -> TrainConfig:
@@ -115,7 +127,7 @@ class Evaluate:
         """Run the command."""
         goals = min(self.goals, _SMOKE_GOALS) if self.smoke else self.goals
         run = RunDirectory.open(self.run_directory)
-        config, model = stored_config(run), run.load_model()
+        config, policy = stored_config(run), load_policy(run)
         task = get_task(config.task)
         checkpoint = load_checkpoint(run.checkpoints) if self.trust_region or not run.finished() else None
         bounds = saved_bounds(checkpoint) if checkpoint is not None and self.trust_region else (None, None)
@@ -123,7 +135,6 @@ class Evaluate:
         envs = _env_factory(config.task)(max(1, min(EVALUATION_ENVS, goals)))
         try:
             with _bar(goals * task.episode_steps, "evaluating") as bar:
-                policy = task.make_policy(model, config.backend)
                 result = evaluate(envs, policy, goals, self.seed, task.episode_steps, *bounds, after_step=bar.update)
         finally:
             envs.close()
@@ -135,6 +146,7 @@ class Evaluate:
                 **asdict(result),
                 "run": str(run.path),
                 "task": config.task,
+                "object": _object(envs),
                 "method": config.method,
                 "finished": run.finished(),
                 "backend": config.backend,
@@ -145,6 +157,7 @@ class Evaluate:
             print(json.dumps(record, sort_keys=True))
         else:
             print(_summary(result))
+            print(f"object: {_described(_object(envs))}")
             print(f"goal seed {result.seed}, {config.task}, backend {config.backend}, {seconds:.1f} s, {_versions()}")
 
 
@@ -196,7 +209,7 @@ class Demo:
         if resume:
             print(f"{self.out} exists: continuing it (delete it for a fresh start)")
         with _Progress() as progress:
-            run = train(config, self.out, _env_factory(config.task), resume=resume, reporter=progress)
+            run = train(config, self.out, _env_factory(config.task, self.out), resume=resume, reporter=progress)
         rows = run.rows()
         title = f"{config.task}, seed {config.seed}: learning to push"
         plot_learning_curve(rows, run.path / "learning_curve.png", title)
@@ -225,7 +238,42 @@ class _NoPictureError(DiffLCSError):
     """This machine cannot render."""
 
 
-_COMMANDS: dict[str, Callable[..., Any]] = {"train": Train, "evaluate": Evaluate, "render": Render, "demo": Demo}
+@dataclass(frozen=True)
+class Assets:
+    """Fetch the meshes of the YCB objects from the YCB site. Without them stand-ins of boxes and cylinders are used."""
+
+    action: Literal["download"]
+    """What to do."""
+    objects: tuple[str, ...]
+    """sugar_box, fish_can, banana, mug, wrench, clamp, large_clamp, extra_large_clamp; none for all."""
+    folder: Path | None = None
+    """Where to; by default where the environments look for them."""
+
+    def run(self) -> None:
+        """Run the command."""
+        require("difflcs_envs", "trimesh", "scipy")
+        from difflcs_envs import DifflcsEnvsError
+        from difflcs_envs.assets import YCB_DIR_VARIABLE, download
+
+        try:
+            download(self.objects or None, self.folder, report=print)
+        except (DifflcsEnvsError, ValueError) as error:
+            raise InvalidInputError(str(error)) from error
+        if self.folder is not None:
+            print(f"to use them: export {YCB_DIR_VARIABLE}={self.folder}")
+
+    def interrupted(self) -> str:
+        """What to do after Ctrl-C."""
+        return "run the same command again to continue"
+
+
+_COMMANDS: dict[str, Callable[..., Any]] = {
+    "train": Train,
+    "evaluate": Evaluate,
+    "render": Render,
+    "demo": Demo,
+    "assets": Assets,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -261,15 +309,41 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _env_factory(name: str) -> Callable[[int], VectorEnv]:
+def _env_factory(name: str, run: Path | None = None) -> Callable[[int], VectorEnv]:
+    """Makes the environments of a task; those of a training leave in its config.json what object they hold."""
     task = _registered(name)
 
     def make(count: int) -> VectorEnv:
         import gymnasium
 
-        return gymnasium.make_vec(task.env_id, num_envs=count, vectorization_mode="sync", **dict(task.env_kwargs))
+        from difflcs_envs import DifflcsEnvsError
+
+        try:
+            envs = gymnasium.make_vec(task.env_id, num_envs=count, **dict(task.env_kwargs))
+        except DifflcsEnvsError as error:
+            raise InvalidInputError(f"task {name}: {error}") from error
+        if run is not None:
+            _note_object(run, _object(envs))
+        return envs
 
     return make
+
+
+def _object(envs: VectorEnv) -> dict[str, Any]:
+    """What the fingers push: name, source (mesh or stand-in), mass, ..."""
+    return envs.envs[0].object.describe()  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _note_object(run: Path, found: dict[str, Any]) -> None:
+    """Record what object a run is trained on. A resumed run must find the same."""
+    config = RunDirectory.open(run).config()
+    stored = config.get("object")
+    if stored is None:
+        write_json(run / "config.json", {**config, "object": found})
+    elif stored != found:
+        raise CheckpointError(
+            f"{run}: expected the object it was started with, {stored}, got {found}; set DIFFLCS_YCB_DIR as it was then"
+        )
 
 
 def _registered(name: str) -> Task:
@@ -294,7 +368,7 @@ def _record(run: RunDirectory, goals: Sequence[Goal], path: Path, seed: int) -> 
 
     from difflcs_envs import RenderingError
 
-    policy = task.make_policy(run.load_model(), config.backend)
+    policy = load_policy(run)
     env: gymnasium.Env = gymnasium.make(task.env_id, render_mode="rgb_array", **_PICTURE, **dict(task.env_kwargs))
     try:
         return record_video(env, policy, goals, path, task.episode_steps, task.step_seconds, seed)
@@ -332,9 +406,10 @@ class _Progress(Reporter):
         if self.bar is not None:
             self.bar.update(env_steps)
 
-    def iterated(self, iteration: Iteration) -> None:
+    def iterated(self, iteration: Report) -> None:
         if self.bar is not None:
-            self.bar.set_postfix(loss=f"{iteration.loss:.1e}", success=f"{iteration.success:.2f}")
+            names = [name for name in ("loss", "kl", "success") if hasattr(iteration, name)]
+            self.bar.set_postfix({name: f"{getattr(iteration, name):.2g}" for name in names})
 
     def evaluating(self, minutes: float, goals: int) -> None:
         if self.bar is not None:
@@ -355,6 +430,10 @@ def _summary(result: Evaluation) -> str:
 def _from_row(row: dict[str, str]) -> str:
     rate, low, high = (100 * float(row[f"evaluation_{name}"]) for name in ("success_rate", "ci_low", "ci_high"))
     return f"{rate:.1f} % of {row['evaluation_goals']} goals (95 % interval {low:.1f} to {high:.1f} %)"
+
+
+def _described(thing: dict[str, Any]) -> str:
+    return f"{thing['name']} ({thing['source'].replace('_', ' ')}, {1e3 * thing['mass']:g} g)"
 
 
 def _versions() -> str:

@@ -11,6 +11,7 @@ import time
 import pytest
 
 from difflcs import cli
+from difflcs.errors import CheckpointError
 
 
 def run(capsys, *arguments) -> tuple[int, str, str]:
@@ -34,13 +35,20 @@ def test_the_library_imports_none_of_this():
     assert not {"tyro", "gymnasium", "mujoco", "difflcs.rl", "difflcs.cli"} & set(loaded)
 
 
-@pytest.mark.parametrize("command", ["", "train", "evaluate", "render", "demo"])
+@pytest.mark.parametrize("command", ["", "train", "evaluate", "render", "demo", "assets"])
 def test_help(capsys, command):
     with pytest.raises(SystemExit) as exit_:
         cli.main([*command.split(), "--help"])
     assert exit_.value.code == 0
     text = capsys.readouterr().out
-    wanted = {"": "demo", "train": "--warmup.noise", "evaluate": "--goals", "render": "--goal", "demo": "--smoke"}
+    wanted = {
+        "": "demo",
+        "train": "--warmup.noise",
+        "evaluate": "--goals",
+        "render": "--goal",
+        "demo": "--smoke",
+        "assets": "download",
+    }
     assert wanted[command] in text
 
 
@@ -48,8 +56,8 @@ def test_help(capsys, command):
     ("arguments", "message"),
     [
         (["train", "--task", "cubes"], "expected one of cube,"),
-        (["train", "--task", "mug", "--smoke"], "not available yet"),
-        (["train", "--method", "ppo"], "not available yet"),
+        (["train", "--method", "lcs-rl", "--minutes", "5"], "--minutes 30"),
+        (["train", "--method", "pddm", "--init", "nowhere"], "init: expected none"),
         (["train", "--backend", "magic", "--smoke"], "magic"),
         (["train", "--minutes", "-1"], "minutes"),
         (["train", "--resume"], "difflcs train"),
@@ -110,6 +118,46 @@ def test_evaluate(capsys, finished):
     code, out, _ = run(capsys, "evaluate", finished, "--smoke", "--trust-region")
     assert code == 0
     assert "of 4 goals (95 % interval" in out
+
+
+def test_a_run_says_which_object_it_was_trained_on(capsys, tmp_path, monkeypatch):
+    monkeypatch.delenv("DIFFLCS_YCB_DIR", raising=False)
+    monkeypatch.setenv("DIFFLCS_CACHE_DIR", str(tmp_path / "cache"))
+    path = tmp_path / "run"
+    smoke = ["--smoke", "--minutes", 0.1, "--final-goals", 0]
+    assert run(capsys, "train", "--task", "mug", *smoke, "--out", path)[0] == 0
+    stored = json.loads((path / "config.json").read_text())["object"]
+    assert (stored["name"], stored["source"], stored["mass"]) == ("mug", "stand_in", 0.05)
+    assert json.loads(run(capsys, "evaluate", path, "--smoke", "--json")[1])["object"] == stored
+    assert "object: mug (stand in, 50 g)" in run(capsys, "evaluate", path, "--smoke")[1]
+    with pytest.raises(CheckpointError, match="expected the object it was started with"):
+        cli._note_object(path, {**stored, "source": "ycb_mesh"})
+    monkeypatch.setenv("DIFFLCS_YCB_DIR", str(tmp_path))
+    code, _, err = run(capsys, "evaluate", path, "--smoke")
+    assert code == 2
+    assert "025_mug.stl" in err
+
+
+def test_assets_download(capsys, tmp_path, monkeypatch):
+    from difflcs_envs import AssetError, assets
+
+    code, _, err = run(capsys, "assets", "download", "teapot")
+    assert code == 2
+    assert "sugar_box" in err
+    calls = []
+    monkeypatch.setattr(assets, "download", lambda names, folder, report: calls.append((names, folder)))
+    assert run(capsys, "assets", "download")[0] == 0
+    code, out, _ = run(capsys, "assets", "download", "mug", "clamp", "--folder", tmp_path)
+    assert code == 0
+    assert f"DIFFLCS_YCB_DIR={tmp_path}" in out
+    assert calls == [(None, None), (("mug", "clamp"), tmp_path)]
+
+    def fail(*_, **__):
+        raise AssetError("no network")
+
+    monkeypatch.setattr(assets, "download", fail)
+    code, _, err = run(capsys, "assets", "download")
+    assert (code, err) == (2, "difflcs: no network\n")
 
 
 def test_an_existing_run_is_not_overwritten(capsys, finished):

@@ -370,8 +370,8 @@ def test_pushing_cost_is_the_papers():
     ("change", "message"),
     [
         ({"task": "cubes"}, "cube, sugar_box"),
-        ({"method": "ppo"}, "not available yet"),
         ({"method": "magic"}, "'violation'"),
+        ({"warmup_minutes": 0.0}, "warmup_minutes"),
         ({"minutes": 0.0}, "minutes"),
         ({"minutes": math.nan}, "minutes"),
         ({"seed": -1}, "seed"),
@@ -389,7 +389,7 @@ def test_bad_warmup_settings_are_refused():
         with pytest.raises(InvalidInputError, match=next(iter(change))):
             WarmupConfig(**change)
     with pytest.raises(CheckpointError, match="fields"):
-        config_from_dict({"noise": 0.0})
+        config_from_dict({"noise": 0.0}, WarmupConfig)
 
 
 def test_evaluations_fall_due_once():

@@ -1,16 +1,32 @@
 """Training and evaluation of LCS-MPC policies; needs the extra `rl`."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 from difflcs.rl.checkpoint import Checkpoint, RunDirectory, load_checkpoint, save_checkpoint
 from difflcs.rl.evaluate import Evaluation, evaluate, wilson_interval
+from difflcs.rl.pddm import PDDM, PDDMConfig
+from difflcs.rl.phases import LCSRL
+from difflcs.rl.ppo import PPO, PPOConfig
 from difflcs.rl.rollout import Rollouts, collect
 from difflcs.rl.tasks import TASKS, Task, get_task
-from difflcs.rl.training import Reporter, TrainConfig, load_model, train
+from difflcs.rl.training import Reporter, TrainConfig, load_model, load_policy, train
 from difflcs.rl.warmup import Warmup, WarmupConfig, fit, trust_region
 
+if TYPE_CHECKING:
+    from difflcs.rl.policy import LCSMPCPolicy
+
 __all__ = [
+    "LCSRL",
+    "PDDM",
+    "PPO",
     "TASKS",
     "Checkpoint",
     "Evaluation",
+    "LCSMPCPolicy",
+    "PDDMConfig",
+    "PPOConfig",
     "Reporter",
     "Rollouts",
     "RunDirectory",
@@ -24,8 +40,18 @@ __all__ = [
     "get_task",
     "load_checkpoint",
     "load_model",
+    "load_policy",
     "save_checkpoint",
     "train",
     "trust_region",
     "wilson_interval",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    # TorchRL takes seconds to import; warm-up and evaluation do without it.
+    if name == "LCSMPCPolicy":
+        from difflcs.rl.policy import LCSMPCPolicy
+
+        return LCSMPCPolicy
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

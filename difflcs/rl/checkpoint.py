@@ -41,13 +41,13 @@ class Checkpoint:
 
     Attributes:
         iteration: iterations done.
-        model: the learned system.
+        model: the learned system; None where the method learns something else, which is then among the tensors.
         state: counters and random generators, JSON types only.
         tensors: data buffer and whatever else the trainer holds.
     """
 
     iteration: int
-    model: LCSModel
+    model: LCSModel | None
     state: Mapping[str, object]
     tensors: Mapping[str, Tensor]
 
@@ -56,14 +56,16 @@ def save_checkpoint(root: Path, checkpoint: Checkpoint, keep: int = 2) -> None:
     """Write `root/<iteration>/`, make it the latest, and delete all but the newest `keep` up to it."""
     root.mkdir(parents=True, exist_ok=True)
     name = f"{checkpoint.iteration:06d}"
+    model = checkpoint.model
     temporary = Path(tempfile.mkdtemp(dir=root, prefix=f".{name}.", suffix=".tmp"))
     try:
         content = {
             "iteration": checkpoint.iteration,
-            "model": checkpoint.model.config(),
+            "model": None if model is None else model.config(),
             "state": dict(checkpoint.state),
         }
-        tensors = {f"{_MODEL}{k}": v for k, v in checkpoint.model.state_dict().items()} | dict(checkpoint.tensors)
+        parameters = {} if model is None else model.state_dict()
+        tensors = {f"{_MODEL}{k}": v for k, v in parameters.items()} | dict(checkpoint.tensors)
         _files.save_record(temporary, _KIND, {**content, "sha256": _hash(content)}, tensors)
         temporary.chmod(0o755)
         shutil.rmtree(root / name, ignore_errors=True)  # left by a crash before it became the latest
@@ -111,10 +113,10 @@ def _load(directory: Path, number: int) -> Checkpoint:
     if record.get("sha256") != _hash(content):
         raise CheckpointError(f"{directory}: config.json does not match its checksum")
     iteration, config, state = content.get("iteration"), content.get("model"), content.get("state")
-    if iteration != number or not isinstance(config, dict) or not isinstance(state, dict):
+    if iteration != number or not isinstance(config, dict | None) or not isinstance(state, dict):
         raise CheckpointError(f"{directory}: expected iteration {number} with model and state, got {sorted(content)}")
     parameters = {k.removeprefix(_MODEL): v for k, v in tensors.items() if k.startswith(_MODEL)}
-    model = LCSModel.from_config(config, parameters, str(directory))
+    model = None if config is None else LCSModel.from_config(config, parameters, str(directory))
     return Checkpoint(number, model, state, {k: v for k, v in tensors.items() if not k.startswith(_MODEL)})
 
 
@@ -195,8 +197,15 @@ class RunDirectory:
         return (self.model / "config.json").is_file()
 
     def load_model(self) -> LCSModel:
-        """The final model, or that of the latest checkpoint of an unfinished run."""
-        return LCSModel.from_pretrained(self.model) if self.finished() else load_checkpoint(self.checkpoints).model
+        """The final model, or that of the latest checkpoint of an unfinished run.
+
+        Raises:
+            CheckpointError: there is none, or the method learned something else.
+        """
+        model = LCSModel.from_pretrained(self.model) if self.finished() else load_checkpoint(self.checkpoints).model
+        if model is None:
+            raise CheckpointError(f"{self.path}: expected a run that learned an LCSModel, got one of another method")
+        return model
 
     def append(self, row: Mapping[str, object]) -> None:
         """Add one row to log.csv; None becomes an empty cell."""

@@ -119,11 +119,11 @@ def evaluate(
     """
     check_positive_int("goals", goals)
     check_positive_int("seed", seed, minimum=0)
-    act = mpc_actions(policy, u_min, u_max)
     parts: list[Rollouts] = []
     for first in range(0, goals, env.num_envs):
         count = min(env.num_envs, goals - first)
         report = None if after_step is None else lambda count=count: after_step(count)
+        act = mpc_actions(policy, u_min, u_max)
         parts.append(collect(env, act, episode_seeds(seed, EVALUATION_STREAM, first, count), episode_steps, report))
     successes = int(sum(int(part.success.sum()) for part in parts))
     low, high = wilson_interval(successes, goals)

@@ -50,6 +50,7 @@ class Rollouts:
     Attributes:
         states: (N, T+1, n_x) observed states, the reset's first.
         actions: (N, T, n_u) executed actions.
+        rewards: (N, T) rewards, without the info's "reward_completion" (the penalty for an episode that fails).
         goals: (N, n_goal).
         success: (N,) bool: at the goal after the last step.
         errors: name → (N,) errors after the last step, such as "position_error" [m] and "yaw_error" [rad].
@@ -59,6 +60,7 @@ class Rollouts:
 
     states: Tensor
     actions: Tensor
+    rewards: Tensor
     goals: Tensor
     success: Tensor
     errors: dict[str, Tensor]
@@ -81,8 +83,14 @@ def action_bounds(env: VectorEnv) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(space.low, np.float64), np.asarray(space.high, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def mpc_actions(policy: Policy, u_min: Tensor | None = None, u_max: Tensor | None = None) -> Act:
-    """Act with the MPC, solved cold; None keeps the policy's own bounds. Failed elements act by its masked output."""
+def mpc_actions(policy: Policy, u_min: Tensor | None = None, u_max: Tensor | None = None, seed: int = 0) -> Act:
+    """Act with the MPC, solved cold; None keeps the policy's own bounds. Failed elements act by its masked output.
+
+    For one call of `collect`: a planner with a memory or noise of its own has a method `begin(seed)`, called here.
+    """
+    begin = getattr(policy, "begin", None)
+    if begin is not None:
+        begin(seed)
 
     def act(state: Tensor, goal: Tensor) -> tuple[np.ndarray, int]:
         with torch.no_grad(), warnings.catch_warnings():
@@ -146,7 +154,7 @@ def collect(
     observation, _ = env.reset(seed=padded)  # pyright: ignore[reportArgumentType]  Gymnasium's vectors take a list
     state, goal = (np.array(observation[key][:n], np.float64) for key in ("state", "goal"))
     stable = np.asarray(np.isfinite(state).all(-1))
-    states, executed, failures = [state], [], 0
+    states, executed, rewards, failures = [state], [], [], 0
     infos: dict = {}
     for t in range(episode_steps):
         usable = np.where(stable[:, None], state, 0.0)  # a solver must not see NaN
@@ -154,13 +162,15 @@ def collect(
         action = np.clip(action, low, high)
         batch = np.zeros((env.num_envs, len(low)))
         batch[:n] = action
-        observation, _, terminated, truncated, infos = env.step(batch)
+        observation, reward, terminated, truncated, infos = env.step(batch)
         state = np.array(observation["state"][:n], np.float64)
         broken = np.asarray(infos.get("physics_error", np.zeros(env.num_envs)), bool)[:n]
         stable &= np.isfinite(state).all(-1) & ~broken
         failures += failed
         states.append(state)
         executed.append(action)
+        completion = infos.get("reward_completion", np.zeros(env.num_envs))
+        rewards.append((np.asarray(reward, np.float64) - np.asarray(completion, np.float64))[:n])
         ended: np.ndarray = np.asarray(terminated, bool)[:n] | np.asarray(truncated, bool)[:n]
         if bool(((ended != (t + 1 == episode_steps)) & stable).any()):
             length = f"one of {t + 1}" if t + 1 < episode_steps else "a longer one"
@@ -173,6 +183,7 @@ def collect(
     return Rollouts(
         states=torch.from_numpy(np.stack(states, 1)),
         actions=torch.from_numpy(np.stack(executed, 1)),
+        rewards=torch.from_numpy(np.stack(rewards, 1)),
         goals=torch.from_numpy(goal),
         success=torch.from_numpy(np.asarray(infos.get("success", stable), bool)[:n] & stable),
         errors=errors,

@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from difflcs.cost import GoalCost
 from difflcs.errors import InvalidInputError
 from difflcs.lcs import LCSModel
@@ -35,6 +38,34 @@ def pushing_cost() -> GoalCost:
         pairs=[(3 + 2 * finger + axis, axis) for finger in range(3) for axis in range(2)],
         pair_weight=10.0,
         pair_weight_final=6.0,
+    )
+
+
+def pushing_features(state: Tensor, goal: Tensor, elapsed: Tensor) -> Tensor:
+    """What the value network sees of a pushing task, scaled to about one.
+
+    Args:
+        state: (..., 9).
+        goal: (..., 3).
+        elapsed: (...) fraction of the episode that has passed; without it a value of truncated episodes is undefined.
+
+    Returns:
+        (..., 15): object pose, fingertips from the object, pose error, its norms, time.
+    """
+    place, yaw = state[..., :2], state[..., 2:3]
+    to_place, to_yaw = place - goal[..., :2], yaw - goal[..., 2:]
+    return torch.cat(
+        [
+            place / 0.05,
+            yaw / 0.3,
+            (state[..., 3:] - torch.cat([place] * 3, -1)) / 0.05,
+            to_place / 0.05,
+            to_yaw / 0.3,
+            to_place.norm(dim=-1, keepdim=True) / 0.05,
+            to_yaw.abs() / 0.3,
+            (2 * elapsed - 1).unsqueeze(-1),
+        ],
+        -1,
     )
 
 
@@ -74,10 +105,11 @@ class Task:
         )
 
 
-_OBJECTS = ("sugar_box", "fish_can", "mug", "wrench", "clamp", "banana")
+_OBJECTS = ("sugar_box", "fish_can", "mug", "wrench", "clamp", "banana", "large_clamp", "extra_large_clamp")
 TASKS: Mapping[str, Task] = MappingProxyType(
     {
         "cube": Task("difflcs/TriFingerMoveCube-v0"),
+        "turn_cube": Task("difflcs/TriFingerTurnCube-v0"),
         **{name: Task("difflcs/TriFingerMoveObject-v0", MappingProxyType({"object": name})) for name in _OBJECTS},
     }
 )

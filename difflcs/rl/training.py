@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +17,11 @@ from difflcs.lcs import LCSModel
 from difflcs.rl._optional import require, versions
 from difflcs.rl.checkpoint import Checkpoint, RunDirectory, load_checkpoint, save_checkpoint
 from difflcs.rl.evaluate import Evaluation, evaluate
-from difflcs.rl.tasks import N_U, N_X, Task, get_task
+from difflcs.rl.pddm import PDDM, Ensemble, PDDMConfig, PDDMIteration, Planner, ensemble_tensors
+from difflcs.rl.phases import LCSRL
+from difflcs.rl.ppo import PPO, PPOConfig, PPOIteration
+from difflcs.rl.rollout import Policy
+from difflcs.rl.tasks import N_U, N_X, Task, get_task, pushing_cost, pushing_features
 from difflcs.rl.warmup import Iteration, Warmup, WarmupConfig, config_from_dict
 
 if TYPE_CHECKING:
@@ -27,7 +32,16 @@ EnvFactory = Callable[[int], "VectorEnv"]
 EVALUATION_ENVS = 50
 """Environments of an evaluation: enough to keep the solver's workers busy, few enough to build in a second."""
 METHODS = ("violation", "lcs-rl", "ppo", "pddm")
-_AVAILABLE = ("violation",)
+Trainer = Warmup | PPO | LCSRL | PDDM
+"""What trains: objects with `step`, `checkpoint` and `restore`."""
+Report = Iteration | PPOIteration | PDDMIteration
+"""What their iterations report."""
+_REPORTS: Mapping[str, tuple[type, ...]] = {
+    "violation": (Iteration,),
+    "lcs-rl": (Iteration, PPOIteration),
+    "ppo": (PPOIteration,),
+    "pddm": (PDDMIteration,),
+}
 
 
 @dataclass(frozen=True)
@@ -37,11 +51,14 @@ class TrainConfig:
     task: str = "cube"
     """What to manipulate: cube, sugar_box, fish_can, mug, wrench, clamp or banana."""
     method: str = "violation"
-    """How to learn: violation (the warm-up phase, Algorithm 1). lcs-rl, ppo and pddm are not available yet."""
+    """How to learn: violation (the warm-up phase alone, Algorithm 1), lcs-rl (warm-up, then Algorithm 2), ppo
+    (Algorithm 2 from a random model, without warm-up), or pddm (networks and a sampling planner)."""
     minutes: float = 6.0
     """Data to collect [min of simulated time]; one minute is 600 steps of 0.1 s."""
     seed: int = 0
     """Seed of everything random in the training."""
+    warmup_minutes: float = 6.0
+    """Method lcs-rl: data of the warm-up [min], the rest of `minutes` is the main phase's (6 in the paper)."""
     n_lam: int = 8
     """Contacts (complementarity variables) of the model; ignored with --init. After 6 minutes on the cube (6 seeds,
     300 goals each): 60 to 79 %, mean 71, with 8; 61 to 76 %, mean 70, with 5."""
@@ -61,15 +78,16 @@ class TrainConfig:
     """Seed of the evaluation goals, the same for every evaluation of the run."""
     warmup: WarmupConfig = field(default_factory=WarmupConfig)
     """Settings of the warm-up phase."""
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    """Settings of the main phase, for the methods lcs-rl and ppo."""
+    pddm: PDDMConfig = field(default_factory=PDDMConfig)
+    """Settings of the method pddm."""
 
     def __post_init__(self) -> None:
         get_task(self.task)
         check_choice("method", self.method, METHODS)
-        if self.method not in _AVAILABLE:
-            raise InvalidInputError(
-                f"method: expected {' or '.join(_AVAILABLE)}, got {self.method!r}, which is not available yet"
-            )
         check_number("minutes", self.minutes, strict=True)
+        check_number("warmup_minutes", self.warmup_minutes, strict=True)
         check_number("stiffness", self.stiffness, strict=True)
         check_number("init_scale", self.init_scale)
         for name in ("n_lam", "evaluate_goals"):
@@ -87,15 +105,16 @@ class TrainConfig:
             CheckpointError: it was written by another version or by something else.
         """
         wanted = {f.name for f in fields(cls)}
-        warmup = values.get("warmup")
-        if set(values) != wanted or not isinstance(warmup, dict):
+        nested = {name: values.get(name) for name in _NESTED}
+        if set(values) != wanted or not all(isinstance(value, dict) for value in nested.values()):
             raise CheckpointError(
                 f"config.json: expected the fields {sorted(wanted)}, got {sorted(values)}; "
                 f"use the version of difflcs that wrote it"
             )
         plain = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
         try:
-            return cls(**{**plain, "warmup": config_from_dict(warmup)})  # pyright: ignore[reportArgumentType]
+            built = {name: config_from_dict(nested[name], kind) for name, kind in _NESTED.items()}  # pyright: ignore
+            return cls(**{**plain, **built})  # pyright: ignore[reportArgumentType]
         except InvalidInputError as error:
             raise CheckpointError(f"config.json: its values cannot be used: {error}") from error
 
@@ -104,11 +123,23 @@ class TrainConfig:
         return replace(
             self,
             minutes=min(self.minutes, 0.5),
+            warmup_minutes=min(self.warmup_minutes, 0.2),
             evaluate_at=tuple(v for v in self.evaluate_at if v < 0.5),
             evaluate_goals=min(self.evaluate_goals, 4),
             final_goals=min(self.final_goals, 4),
             warmup=replace(self.warmup, first_epochs=20, epochs=2),
+            ppo=replace(self.ppo, rollouts=min(self.ppo.rollouts, 5), steps=min(self.ppo.steps, 2)),
+            pddm=replace(
+                self.pddm,
+                random_rollouts=min(self.pddm.random_rollouts, 5),
+                rollouts_per_iteration=min(self.pddm.rollouts_per_iteration, 5),
+                epochs=min(self.pddm.epochs, 2),
+                samples=min(self.pddm.samples, 10),
+            ),
         )
+
+
+_NESTED: Mapping[str, type] = {"warmup": WarmupConfig, "ppo": PPOConfig, "pddm": PDDMConfig}
 
 
 class Reporter:
@@ -120,7 +151,7 @@ class Reporter:
     def stepped(self, env_steps: int) -> None:
         """Environment steps were collected for training."""
 
-    def iterated(self, iteration: Iteration) -> None:
+    def iterated(self, iteration: Report) -> None:
         """An iteration ended."""
 
     def evaluating(self, minutes: float, goals: int) -> None:
@@ -155,12 +186,21 @@ def train(
         The finished run.
 
     Raises:
-        CheckpointError: `out` holds files and `resume` is not set, or they cannot be resumed from.
+        InvalidInputError: the data is used up by the warm-up.
+        CheckpointError: `out` holds files and `resume` is not set, or they cannot be resumed from, or they cannot be
+            written; the last checkpoint is intact.
         MissingDependencyError: TensorBoard is not installed.
     """
     require("tensorboard")
     reporter = reporter or Reporter()
     task = get_task(config.task)
+    if config.method == "lcs-rl" and config.minutes <= config.warmup_minutes:
+        raise InvalidInputError(
+            f"minutes: expected more than the {config.warmup_minutes:g} of the warm-up with lcs-rl, got "
+            f"{config.minutes:g}; pass --minutes 30, or --method violation for a warm-up alone"
+        )
+    if config.method == "pddm" and init is not None:
+        raise InvalidInputError("init: expected none with method pddm, which learns networks instead of an LCSModel")
     if resume:
         run = RunDirectory.open(out)
         stored = run.config()
@@ -173,33 +213,46 @@ def train(
         source = stored.get("init")
         init = None if source is None else Path(str(source))
     else:
-        model = None if init is None else load_model(init)  # before anything is written
-        run = RunDirectory.create(
-            out,
-            {
-                "kind": "run",
-                "config": asdict(config),
-                "init": None if init is None else str(init.resolve()),
-                "versions": versions(),
-            },
-        )
-    if resume and (run.checkpoints / "latest.json").exists():
-        checkpoint = load_checkpoint(run.checkpoints)
-        model = checkpoint.model
-    else:
-        checkpoint = None
-        model = _initial_model(config) if init is None else load_model(init)
-    policy = task.make_policy(model, config.backend)
-    envs = make_envs(max(config.warmup.random_rollouts, config.warmup.rollouts_per_iteration))
+        if init is not None:
+            load_model(init)  # a clear error before anything is written
+        with _writing(out):
+            run = RunDirectory.create(
+                out,
+                {
+                    "kind": "run",
+                    "config": asdict(config),
+                    "init": None if init is None else str(init.resolve()),
+                    "versions": versions(),
+                },
+            )
+    checkpoint = load_checkpoint(run.checkpoints) if resume and (run.checkpoints / "latest.json").exists() else None
+    model = _initial_model(config) if init is None else load_model(init)
+    opened: list[VectorEnv] = []
+
+    def open_envs(count: int) -> VectorEnv:
+        opened.append(make_envs(count))
+        return opened[-1]
+
     try:
-        pretrained = init is not None
-        trainer = Warmup(model, policy, envs, config.warmup, config.seed, task.episode_steps, pretrained)
+        trainer = _make_trainer(config, task, model, open_envs, init is not None)
         if checkpoint is not None:
             trainer.restore(checkpoint)
         _loop(config, task, run, trainer, make_envs, reporter, fresh=checkpoint is None)
     finally:
-        envs.close()
+        for envs in opened:
+            envs.close()
     return run
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise CheckpointError(
+            f"{path}: expected a folder with free space that can be written, got: {error}; mend that and go on with "
+            f"--resume, or choose another --out. The last checkpoint is intact"
+        ) from error
 
 
 def stored_config(run: RunDirectory) -> TrainConfig:
@@ -221,6 +274,28 @@ def load_model(path: Path) -> LCSModel:
     return LCSModel.from_pretrained(path)
 
 
+def load_policy(run: RunDirectory) -> Policy:
+    """What a run has learned, as a policy: of a finished run the final one, else that of its latest checkpoint.
+
+    Raises:
+        CheckpointError: there is none, or it does not fit the run's configuration.
+    """
+    config = stored_config(run)
+    task = get_task(config.task)
+    if config.method != "pddm":
+        return task.make_policy(run.load_model(), config.backend)
+    if run.finished():
+        ensemble = Ensemble.from_pretrained(run.model)
+    else:
+        ensemble = Ensemble(N_X, N_U, config.pddm.networks, config.pddm.width)
+        try:
+            ensemble.load_state_dict(ensemble_tensors(load_checkpoint(run.checkpoints)))
+        except RuntimeError as error:
+            raise CheckpointError(f"{run.path}: expected an ensemble as configured, got {error}") from error
+    high = torch.full((N_U,), task.u_max, dtype=torch.float64)
+    return Planner(ensemble, pushing_cost(), config.pddm, -high, high)
+
+
 def _initial_model(config: TrainConfig) -> LCSModel:
     generator = torch.Generator().manual_seed(config.seed)
     return LCSModel(
@@ -234,11 +309,49 @@ def _initial_model(config: TrainConfig) -> LCSModel:
     )
 
 
+def _make_trainer(config: TrainConfig, task: Task, model: LCSModel, make_envs: EnvFactory, pretrained: bool) -> Trainer:
+    policy = task.make_policy(model, config.backend)
+    steps_per_minute = 60.0 / task.step_seconds
+    total_episodes = max(1, round(config.minutes * steps_per_minute / task.episode_steps))
+
+    def make_main(first_episode: int, first_iteration: int) -> PPO:
+        return PPO(
+            model,
+            policy,
+            make_envs(min(config.ppo.rollouts, max(1, total_episodes - first_episode))),
+            config.ppo,
+            config.seed,
+            features=pushing_features,
+            total_episodes=total_episodes,
+            episode_steps=task.episode_steps,
+            first_episode=first_episode,
+            first_iteration=first_iteration,
+        )
+
+    if config.method == "ppo":
+        return make_main(0, 0)
+    if config.method == "pddm":
+        needed = max(config.pddm.random_rollouts, config.pddm.rollouts_per_iteration)
+        return PDDM(
+            pushing_cost(),
+            make_envs(min(needed, total_episodes)),
+            config.pddm,
+            config.seed,
+            total_episodes=total_episodes,
+            episode_steps=task.episode_steps,
+        )
+    envs = make_envs(max(config.warmup.random_rollouts, config.warmup.rollouts_per_iteration))
+    warmup = Warmup(model, policy, envs, config.warmup, config.seed, task.episode_steps, pretrained)
+    if config.method == "violation":
+        return warmup
+    return LCSRL(warmup, round(config.warmup_minutes * steps_per_minute), make_main)
+
+
 def _loop(
     config: TrainConfig,
     task: Task,
     run: RunDirectory,
-    trainer: Warmup,
+    trainer: Trainer,
     make_envs: EnvFactory,
     reporter: Reporter,
     fresh: bool,
@@ -246,7 +359,9 @@ def _loop(
     from torch.utils.tensorboard import SummaryWriter
 
     per_minute = 60.0 / task.step_seconds
-    total = round(config.minutes * per_minute)
+    # Whole episodes: the same total as the main phase ends at.
+    total = task.episode_steps * max(1, round(config.minutes * per_minute / task.episode_steps))
+    columns = _columns(config.method)
     run.truncate_log(-1 if fresh else trainer.iteration)
     reporter.started(trainer.env_steps, total)
     evaluation_envs: list[VectorEnv] = []  # made when first needed: one second
@@ -257,17 +372,18 @@ def _loop(
         reporter.evaluating(trainer.env_steps / per_minute, goals)
         return evaluate(evaluation_envs[0], trainer.policy, goals, config.evaluation_seed, task.episode_steps)
 
-    def finish(iteration: Iteration | None, previous: int) -> None:
+    def finish(iteration: Report | None, previous: int) -> None:
         # The row first, then the checkpoint: resuming drops rows after the checkpoint, so none is lost or doubled.
         goals = goals_due(config, previous, trainer.env_steps, per_minute)
         start = time.perf_counter()
         result = measure(goals) if goals else None
-        row = _row(trainer.env_steps, per_minute, iteration, result, time.perf_counter() - start)
-        run.append(row)
-        for name, value in row.items():
-            if isinstance(value, int | float) and name not in ("iteration", "env_steps"):
-                writer.add_scalar(name, value, trainer.env_steps)
-        save_checkpoint(run.checkpoints, trainer.checkpoint())
+        row = _row(columns, trainer.env_steps, per_minute, iteration, result, time.perf_counter() - start)
+        with _writing(run.path):
+            run.append(row)
+            for name, value in row.items():
+                if isinstance(value, int | float) and name not in ("iteration", "env_steps"):
+                    writer.add_scalar(name, value, trainer.env_steps)
+            save_checkpoint(run.checkpoints, trainer.checkpoint())
         if iteration is not None:
             reporter.iterated(iteration)
         if result is not None:
@@ -280,7 +396,9 @@ def _loop(
         while trainer.env_steps < total:
             previous = trainer.env_steps
             finish(trainer.step(reporter.stepped), previous)
-        trainer.lcs.save_pretrained(run.model)
+        learned = trainer.ensemble if isinstance(trainer, PDDM) else trainer.lcs
+        with _writing(run.path):
+            learned.save_pretrained(run.model)
     finally:
         writer.close()
         for envs in evaluation_envs:
@@ -297,11 +415,20 @@ def goals_due(config: TrainConfig, previous: int, now: int, per_minute: float) -
     return config.evaluate_goals if due else 0
 
 
+def _columns(method: str) -> list[str]:
+    """Columns of log.csv: what the method's phases report, each once."""
+    return list(dict.fromkeys(f.name for report in _REPORTS[method] for f in fields(report)))
+
+
 def _row(
-    env_steps: int, per_minute: float, iteration: Iteration | None, result: Evaluation | None, seconds: float
+    names: list[str],
+    env_steps: int,
+    per_minute: float,
+    iteration: Report | None,
+    result: Evaluation | None,
+    seconds: float,
 ) -> dict[str, object]:
     """One row of log.csv; None where there is nothing to tell."""
-    names = [f.name for f in fields(Iteration)]
     known = {"iteration": 0, "env_steps": env_steps} if iteration is None else asdict(iteration)
     row: dict[str, object] = {name: known.get(name) for name in ["iteration", "minutes", *names[1:]]}
     row["minutes"] = round(env_steps / per_minute, 6)
@@ -309,6 +436,12 @@ def _row(
         row[f"evaluation_{name}"] = None if result is None else getattr(result, name)
     row["evaluation_seconds"] = None if result is None else seconds
     return row
+
+
+def profile(rows: Sequence[Mapping[str, str]]) -> dict[str, float]:
+    """Where the time of a run went: name → seconds, summed over the rows of log.csv."""
+    names = [name for name in rows[0] if name.endswith("_seconds")] if rows else []
+    return {name.removesuffix("_seconds"): sum(float(row[name] or 0) for row in rows) for name in names}
 
 
 def saved_bounds(checkpoint: Checkpoint) -> tuple[torch.Tensor, torch.Tensor]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -318,9 +319,10 @@ class Warmup:
         wanted = {"states": (steps + 1, n_x), "actions": (steps, n_u), "u_min": (n_u,), "u_max": (n_u,)}
         batched = ("states", "actions")
         shapes = {k: tuple(v.shape[1:] if k in batched else v.shape) for k, v in checkpoint.tensors.items()}
-        if shapes != wanted or checkpoint.model.config() != self.lcs.config():
+        model = checkpoint.model
+        if shapes != wanted or model is None or model.config() != self.lcs.config():
             raise CheckpointError(
-                f"checkpoint: expected {self.lcs.config()} with tensors {wanted}, got {checkpoint.model.config()} with "
+                f"checkpoint: expected {self.lcs.config()} with tensors {wanted}, got {model and model.config()} with "
                 f"{shapes}; was it written with other settings?"
             )
         try:
@@ -332,7 +334,7 @@ class Warmup:
         self._action_rng, self._minibatch_rng = generators
         self.states, self.actions = checkpoint.tensors["states"], checkpoint.tensors["actions"]
         self.bounds = (checkpoint.tensors["u_min"], checkpoint.tensors["u_max"])
-        self.lcs.load_state_dict(checkpoint.model.state_dict())
+        self.lcs.load_state_dict(model.state_dict())
 
 
 def _generator(state: object) -> np.random.Generator:
@@ -341,17 +343,20 @@ def _generator(state: object) -> np.random.Generator:
     return np.random.Generator(bits)
 
 
-def config_from_dict(values: Mapping[str, object]) -> WarmupConfig:
-    """Rebuild a configuration from JSON.
+Config = TypeVar("Config")
+
+
+def config_from_dict(values: Mapping[str, object], kind: type[Config]) -> Config:
+    """Rebuild a configuration dataclass from JSON.
 
     Raises:
-        CheckpointError: other fields than those of `WarmupConfig`.
+        CheckpointError: other fields than those of `kind`.
     """
-    wanted = {f.name for f in fields(WarmupConfig)}
+    wanted = {f.name for f in fields(kind)}  # pyright: ignore[reportArgumentType]
     if set(values) != wanted:
         raise CheckpointError(
-            f"warmup: expected the fields {sorted(wanted)}, got {sorted(values)}; "
+            f"{kind.__name__}: expected the fields {sorted(wanted)}, got {sorted(values)}; "
             f"use the version of difflcs that wrote it"
         )
     plain = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-    return WarmupConfig(**plain)  # pyright: ignore[reportArgumentType]
+    return kind(**plain)

@@ -1,0 +1,166 @@
+"""The stochastic policy: a Gaussian around the action of the MPC (Eq. stochastic_policy), as a TorchRL actor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.distributions import MultivariateNormal
+
+from difflcs._checks import check_choice, check_number, check_tensor, describe
+from difflcs.errors import DTypeError, InvalidInputError, MissingDependencyError
+from difflcs.mpc import LCSMPCLayer
+from difflcs.mpc.solution import Primal
+from difflcs.rl._optional import INSTALL
+
+try:
+    from tensordict import TensorDict, TensorDictBase
+    from tensordict.nn import InteractionType, TensorDictModuleBase
+    from torchrl.data import Composite, Unbounded
+    from torchrl.modules import ProbabilisticActor
+except ImportError as error:
+    raise MissingDependencyError(f"expected the package torchrl, not installed; run: {INSTALL}") from error
+
+PLAN = ("x", "u", "lam")
+"""Entries of the nested keys "plan" and "guess"."""
+
+
+class GaussianParameters(TensorDictModuleBase):
+    """State and goal → mean and Cholesky factor of the Gaussian, and the plan behind the mean.
+
+    Σ = L Lᵀ with L = diag(exp(log_std)) (I + strictly lower triangle of `mixing`).
+
+    Args:
+        mpc: the controller; its parameters are this module's.
+        std: (n_u,) standard deviations.
+        full: whether Σ may have off-diagonal entries.
+        learn_std: whether Σ is learned.
+        in_keys: keys of state and goal.
+    """
+
+    def __init__(self, mpc: LCSMPCLayer, std: Tensor, full: bool, learn_std: bool, in_keys: Sequence[str]):
+        super().__init__()
+        self.in_keys = list(in_keys)
+        self.out_keys = ["loc", "scale_tril", *(("plan", name) for name in PLAN), "converged"]  # pyright: ignore
+        self.mpc = mpc
+        self.log_std = nn.Parameter(std.log(), requires_grad=learn_std)
+        n_u = len(std)
+        self.mixing = nn.Parameter(torch.zeros(n_u, n_u, dtype=std.dtype), requires_grad=full and learn_std)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Solve the MPC, from the key "guess" where it is given, else cold."""
+        guess = tensordict.get("guess", None)
+        start = None if guess is None else Primal(*(guess[name] for name in PLAN))
+        state, goal = (tensordict[key] for key in self.in_keys)
+        solution = self.mpc(state, goal, guess=start)
+        plan = {name: getattr(solution, name).detach() for name in PLAN}
+        tensordict["loc"] = solution.action
+        tensordict["scale_tril"] = self.scale_tril().expand(*tensordict.batch_size, -1, -1)
+        tensordict["plan"] = TensorDict(plan, tensordict.batch_size)  # pyright: ignore[reportArgumentType]
+        tensordict["converged"] = solution.converged.unsqueeze(-1)
+        return tensordict
+
+    def scale_tril(self) -> Tensor:
+        """L, (n_u, n_u)."""
+        unit = torch.eye(len(self.log_std), dtype=self.log_std.dtype) + self.mixing.tril(-1)
+        return self.log_std.exp().unsqueeze(-1) * unit
+
+
+class LCSMPCPolicy(ProbabilisticActor):
+    """u ~ N(u_MPC(x, goal), Σ): exploration around the first action of the plan.
+
+    A TorchRL `ProbabilisticActor` on tensordicts of any batch size:
+
+    | key | read or written | shape |
+    |-----|-----------------|-------|
+    | "state", "goal" | read | (..., n_x), (..., n_goal) |
+    | ("guess", "x"), ("guess", "u"), ("guess", "lam") | read if there | start of the solver, for the same states |
+    | "action" | written | (..., n_u) the sample, *not* clipped |
+    | "action_log_prob" | written | (...) of this sample |
+    | "loc", "scale_tril" | written | (..., n_u), (..., n_u, n_u) |
+    | ("plan", "x"), ("plan", "u"), ("plan", "lam") | written | the solution; usable as "guess" |
+    | "converged" | written | (..., 1) bool |
+
+    The environment clips the action it executes. The policy does not, because a clipped Gaussian has no density, and
+    the ratio of PPO must be that of the sample. Where an environment does not clip by itself, append TorchRL's
+    `ClipTransform(in_keys_inv=["action"], low=…, high=…)`, or use `clip`.
+
+    The MPC has local optima and a plan depends on where its solver started. Re-solve from the rollout's own solution,
+    `data["guess"] = data["plan"]`, or the ratio is not 1 at unchanged parameters.
+
+    Under `torchrl.envs.utils.set_exploration_type(ExplorationType.DETERMINISTIC)` the action is the mean.
+
+    Args:
+        mpc: the controller; a learnable LCS in it is what is trained. `on_failure="mask"` keeps a batch going where
+            single solves fail.
+        std: standard deviation of each action component, a number or (n_u,) [units of the action].
+        covariance: "diagonal", or "full" to let a learned Σ have correlations.
+        learn_std: whether Σ is learned with the policy.
+        in_keys: keys of state and goal. TorchRL's `GymWrapper` renames "state" to "observation".
+
+    Raises:
+        InvalidInputError and its kinds: an argument does not fit.
+        MissingDependencyError: TorchRL is not installed.
+    """
+
+    def __init__(
+        self,
+        mpc: LCSMPCLayer,
+        std: float | Tensor = 0.005,
+        covariance: str = "diagonal",
+        learn_std: bool = False,
+        in_keys: Sequence[str] = ("state", "goal"),
+    ):
+        if not isinstance(mpc, LCSMPCLayer):
+            raise DTypeError(f"mpc: expected an LCSMPCLayer, got {describe(mpc)}")
+        n_u = mpc.lcs.n_u
+        check_choice("covariance", covariance, ("diagonal", "full"))
+        if isinstance(in_keys, str) or len(in_keys) != 2:
+            raise InvalidInputError(f"in_keys: expected two keys, of state and goal, got {in_keys!r}")
+        if covariance == "full" and not learn_std:
+            raise InvalidInputError(
+                'covariance: expected "diagonal" for a fixed Σ, got "full"; a correlation has to be learned, '
+                "pass learn_std=True"
+            )
+        parameters = GaussianParameters(mpc, _std(std, n_u), covariance == "full", learn_std, in_keys)
+        super().__init__(
+            parameters,  # pyright: ignore[reportArgumentType]
+            in_keys=["loc", "scale_tril"],
+            out_keys=["action"],
+            spec=Composite(action=Unbounded(torch.Size([n_u]), dtype=torch.float64)),
+            distribution_class=MultivariateNormal,
+            distribution_kwargs={"validate_args": False},
+            default_interaction_type=InteractionType.RANDOM,  # TorchRL's default is the mean
+            return_log_prob=True,
+        )
+        self.gaussian = parameters
+
+    @property
+    def mpc(self) -> LCSMPCLayer:
+        """The controller."""
+        return self.gaussian.mpc
+
+    @property
+    def std(self) -> Tensor:
+        """(n_u,) standard deviation of each action component."""
+        return self.gaussian.scale_tril().detach().square().sum(-1).sqrt()
+
+    def set_std(self, std: float | Tensor) -> None:
+        """Replace Σ by a diagonal one, for annealing."""
+        with torch.no_grad():
+            self.gaussian.log_std.copy_(_std(std, len(self.gaussian.log_std)).log())
+            self.gaussian.mixing.zero_()
+
+    def clip(self, action: Tensor) -> Tensor:
+        """What of a sample is executed: clipped into the controller's bounds."""
+        return torch.minimum(torch.maximum(action, self.mpc.u_min), self.mpc.u_max)
+
+
+def _std(value: float | Tensor, n_u: int) -> Tensor:
+    if isinstance(value, Tensor):
+        std = check_tensor("std", value, [("n_u", n_u)]).detach().double().clone()
+        if std.ndim != 1 or not bool((std > 0).all()):
+            raise InvalidInputError(f"std: expected ({n_u},) positive numbers, got {std.tolist()}")
+        return std
+    return torch.full((n_u,), check_number("std", value, strict=True), dtype=torch.float64)

@@ -1,0 +1,647 @@
+"""Main phase (Algorithm 2): proximal policy optimisation of the MPC's model.
+
+Episodes of the stochastic policy, advantages by GAE and the clipped objective are TorchRL's; gradients reach the LCS
+through the MPC layer. Three things are this file's own, because TorchRL has no counterpart and because they decide
+whether it learns:
+
+- The step size follows the KL divergence that an iteration has reached (`_adapt`). Large steps make PPO work here: a KL
+  of 0.005 per iteration gains little, 0.03 to 0.1 gains 15 points of success.
+- Samples whose own KL exceeds `jump_kl` are left out (`_improve`): there the MPC has jumped to another local optimum,
+  and the derivative at the new one says nothing about the old one.
+- The KL that is watched is a mean without its largest values (`_trimmed_mean`): single jumps reach 17.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from difflcs._checks import check_choice, check_number, check_positive_int
+from difflcs.errors import CheckpointError, DegenerateWarning, InvalidInputError, SolveWarning
+from difflcs.lcs import LCSModel
+from difflcs.losses import violation_loss
+from difflcs.mpc import LCSMPCLayer
+from difflcs.rl.checkpoint import Checkpoint
+from difflcs.rl.rollout import Rollouts, action_bounds, collect, episode_seeds
+from difflcs.rl.warmup import TRAINING_STREAM
+
+if TYPE_CHECKING:
+    from gymnasium.vector import VectorEnv
+    from tensordict import TensorDict, TensorDictBase
+
+_NOISE_STREAM, _VALUE_STREAM, _LOSS_STREAM = 4, 5, 6
+
+Features = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""States (..., n_x), goals (..., n_goal), elapsed fraction of the episode (...) → value network's inputs (..., n)."""
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """Settings of the main phase. "paper": given there; the others are ours, tuned on the cube."""
+
+    rollouts: int = 60
+    """Episodes per iteration, run in lockstep; the last ones share what is left of the data evenly."""
+    steps: int = 20
+    """Gradient steps per iteration, each on all of its data."""
+    learning_rate: float = 6e-4
+    """Adam's step size at the start."""
+    betas: tuple[float, float] = (0.9, 0.99)
+    """Adam's averaging factors; its moments are kept across iterations."""
+    target_kl: float = 0.1
+    """KL divergence per iteration: the step size grows below half of it and shrinks above one and a half of it."""
+    learning_rate_factor: float = 1.5
+    """Factor by which the step size grows or shrinks after an iteration."""
+    max_kl: float = 0.3
+    """KL divergence at which an iteration ends early."""
+    final_step: float = 0.3
+    """Factor on all steps, falling linearly from 1 to this over the main phase; 1 turns this off."""
+    kl_quantile: float = 0.97
+    """Fraction of the samples, those of lowest KL, whose mean is the KL divergence of an iteration."""
+    jump_kl: float = 2.0
+    """Samples with a KL divergence of their own above this are left out: the MPC has jumped to another optimum."""
+    clip: float = 0.3
+    """Epsilon of the clipped objective (Eq. explicit_ppo_loss)."""
+    gamma: float = 0.99
+    """Discount per step."""
+    zeta: float = 0.95
+    """Zeta of the advantages (Eq. adv_func), often called lambda."""
+    beta: float = 1.0
+    """Weight of the PPO loss against the violation loss (Eq. total_loss). 1 in the paper."""
+    violation_batch: int = 300
+    """Transitions of the newest episodes per step in the violation loss, where beta < 1."""
+    violation_gamma: float = 0.05
+    """Gamma of the violation loss, where beta < 1."""
+    violation_xi: float = 0.02
+    """Xi of the violation loss, where beta < 1."""
+    std: float = 0.005
+    """Standard deviation [m] of the policy."""
+    final_std: float | None = None
+    """Standard deviation [m] at the end, approached geometrically; as at the start if None."""
+    learn_std: bool = False
+    """Learn the covariance of the policy together with the model."""
+    covariance: str = "diagonal"
+    """diagonal, or full: let a learned covariance have correlations."""
+    std_learning_rate: float = 0.01
+    """Adam's step size of the logarithms of the standard deviations, where they are learned."""
+    std_range: tuple[float, float] = (0.001, 0.01)
+    """Bounds [m] of learned standard deviations."""
+    failure_penalty: float = 10.0
+    """Taken from the last reward of an episode that does not reach its goal (paper)."""
+    cost_limit: float = 3.0
+    """Rewards of single steps are at least minus this."""
+    reward_scale: float = 0.1
+    """Factor on all rewards: keeps values near one."""
+    value_width: int = 64
+    """Width of the two hidden layers of the value network."""
+    value_learning_rate: float = 2e-3
+    """Step size of AdamW for the value network."""
+    value_weight_decay: float = 1e-4
+    """Weight decay of AdamW for the value network."""
+    value_minibatch: int = 256
+    """Steps of the environment per step of AdamW."""
+    value_first_epochs: int = 80
+    """Epochs on the discounted returns of the first episodes, before the first advantages."""
+    value_epochs: int = 20
+    """Epochs at the end of each iteration."""
+    value_iterations: int = 3
+    """Newest iterations whose episodes the value network is fitted to."""
+
+    def __post_init__(self) -> None:
+        for name in ("rollouts", "steps", "violation_batch", "value_width", "value_minibatch"):
+            check_positive_int(name, getattr(self, name))
+        for name in ("value_first_epochs", "value_epochs", "value_iterations"):
+            check_positive_int(name, getattr(self, name))
+        positive = ("learning_rate", "target_kl", "max_kl", "final_step", "jump_kl", "clip", "std", "std_learning_rate")
+        for name in (*positive, "cost_limit", "reward_scale", "value_learning_rate", "violation_gamma", "violation_xi"):
+            check_number(name, getattr(self, name), strict=True)
+        for name in ("failure_penalty", "value_weight_decay"):
+            check_number(name, getattr(self, name))
+        check_number("learning_rate_factor", self.learning_rate_factor, minimum=1.0)
+        for name in ("kl_quantile", "gamma", "zeta", "beta"):
+            if not 0 <= check_number(name, getattr(self, name)) <= 1:
+                raise InvalidInputError(f"{name}: expected 0 <= {name} <= 1, got {getattr(self, name)}")
+        if self.kl_quantile == 0:
+            raise InvalidInputError("kl_quantile: expected above 0, got 0; 1 keeps every sample")
+        if self.final_std is not None:
+            check_number("final_std", self.final_std, strict=True)
+            if self.learn_std:
+                raise InvalidInputError("final_std: expected None with learn_std; a deviation is annealed or learned")
+        check_choice("covariance", self.covariance, ("diagonal", "full"))
+        if self.covariance == "full" and not self.learn_std:
+            raise InvalidInputError('covariance: expected "diagonal" without learn_std, got "full"; pass learn_std')
+        low, high = self.std_range
+        if not 0 < low <= high < math.inf:
+            raise InvalidInputError(f"std_range: expected 0 < low <= high, got {self.std_range}")
+
+
+@dataclass(frozen=True)
+class PPOIteration:
+    """Report of one iteration.
+
+    Attributes:
+        iteration: its number, those of a warm-up included.
+        env_steps: environment steps collected so far.
+        success: share of its episodes that ended at the goal, under the policy's noise.
+        mean_return: mean undiscounted return of its episodes.
+        kl: KL divergence before the last step.
+        learning_rate: Adam's step size in it.
+        std: mean standard deviation [m] of the policy that collected.
+        gradient_steps: gradient steps made.
+        skipped_steps: steps left out because a gradient was not finite.
+        clip_fraction: share of samples outside the clipping range, before the last step.
+        ignored: share of samples left out as jumps, before the last step.
+        explained_variance: of the returns by the value network, before it saw them.
+        solver_failures: MPC solves that did not converge, while collecting and while learning.
+        unstable: episodes dropped because the simulation broke down.
+        physics_seconds: wall time of the environment.
+        solve_seconds: wall time of the MPC.
+        gradient_seconds: wall time of gradients and steps.
+        value_seconds: wall time of advantages and value network.
+    """
+
+    iteration: int
+    env_steps: int
+    success: float
+    mean_return: float
+    kl: float
+    learning_rate: float
+    std: float
+    gradient_steps: int
+    skipped_steps: int
+    clip_fraction: float
+    ignored: float
+    explained_variance: float
+    solver_failures: int
+    unstable: int
+    physics_seconds: float
+    solve_seconds: float
+    gradient_seconds: float
+    value_seconds: float
+
+
+class PPO:
+    """The main phase as an object that can be stopped between iterations, saved, and resumed with the same result.
+
+    Random numbers come from generators derived from the seed and the iteration; the global ones are left as they were.
+
+    Args:
+        lcs: the model; it is trained in place.
+        mpc: the controller around the same object, with on_failure="mask".
+        env: at least `config.rollouts` environments in lockstep.
+        config: settings.
+        seed: of noise, value network, goals and initial states.
+        features: inputs of the value network.
+        total_episodes: episodes of the whole training; the main phase ends there.
+        episode_steps: steps of one episode.
+        first_episode: episodes collected before, by a warm-up.
+        first_iteration: iterations done before.
+
+    Raises:
+        InvalidInputError: an argument does not fit.
+        MissingDependencyError: TorchRL is not installed.
+    """
+
+    def __init__(
+        self,
+        lcs: LCSModel,
+        mpc: LCSMPCLayer,
+        env: VectorEnv,
+        config: PPOConfig,
+        seed: int,
+        *,
+        features: Features,
+        total_episodes: int,
+        episode_steps: int = 20,
+        first_episode: int = 0,
+        first_iteration: int = 0,
+    ):
+        # Here and not above: TorchRL takes seconds to import, which `difflcs --help` should not wait for.
+        from difflcs.rl.policy import LCSMPCPolicy
+
+        check_positive_int("seed", seed, minimum=0)
+        check_positive_int("episode_steps", episode_steps)
+        if mpc.lcs is not lcs:
+            raise InvalidInputError("mpc: expected a controller around the model that is trained, got another model")
+        if total_episodes <= first_episode:
+            raise InvalidInputError(
+                f"total_episodes: expected more than the {first_episode} collected before, got {total_episodes}; "
+                f"train for more minutes or shorten the warm-up"
+            )
+        remaining = total_episodes - first_episode
+        if env.num_envs < min(config.rollouts, remaining):
+            raise InvalidInputError(f"env: expected at least {config.rollouts} environments, got {env.num_envs}")
+        self.lcs, self.policy, self.env, self.config = lcs, mpc, env, config
+        self.seed, self.features, self.episode_steps = seed, features, episode_steps
+        self.first_episode, self.first_iteration = first_episode, first_iteration
+        self.episodes, self.iteration = first_episode, first_iteration
+        # As many iterations as `rollouts` asks for, all of the same size up to one episode.
+        count = math.ceil(remaining / config.rollouts)
+        self._sizes = [remaining // count + (k < remaining % count) for k in range(count)]
+
+        self.actor = LCSMPCPolicy(mpc, config.std, config.covariance, config.learn_std)
+        self.learning_rate = config.learning_rate
+        gaussian = self.actor.gaussian
+        self._learned = [p for p in (*lcs.parameters(), gaussian.log_std, gaussian.mixing) if p.requires_grad]
+        model_parameters = {id(p) for p in lcs.parameters()}
+        groups = [
+            {"params": [p for p in self._learned if id(p) in model_parameters]},
+            {"params": [p for p in self._learned if id(p) not in model_parameters]},
+        ]
+        self._adam = torch.optim.Adam([g for g in groups if g["params"]], config.learning_rate, config.betas)
+        _initialise(self._adam)
+
+        low, high = (torch.from_numpy(bound) for bound in action_bounds(env))
+        self.bounds = (low, high)
+        n_goal = env.single_observation_space["goal"].shape[0]  # pyright: ignore[reportIndexIssue]
+        example = features(torch.zeros(lcs.n_x).double(), torch.zeros(n_goal).double(), torch.zeros(()).double())
+        with self._random(_VALUE_STREAM):
+            width = config.value_width
+            self.value = nn.Sequential(
+                nn.Linear(len(example), width), nn.Tanh(), nn.Linear(width, width), nn.Tanh(), nn.Linear(width, 1)
+            )
+        self._value_adam = torch.optim.AdamW(
+            self.value.parameters(), config.value_learning_rate, weight_decay=config.value_weight_decay, fused=True
+        )
+        _initialise(self._value_adam)
+        # Newest iterations: inputs (N, T+1, n) of the value network and scaled rewards (N, T).
+        self._history: list[tuple[Tensor, Tensor]] = []
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps collected so far, those of a warm-up included."""
+        return self.episodes * self.episode_steps
+
+    @property
+    def done(self) -> bool:
+        """Whether all episodes are collected."""
+        return self.iteration - self.first_iteration >= len(self._sizes)
+
+    def step(self, after_step: Callable[[int], object] | None = None) -> PPOIteration:
+        """One iteration: collect, estimate advantages, improve the policy, fit the value network.
+
+        Args:
+            after_step: called with the number of episodes stepped, for progress bars.
+
+        Raises:
+            InvalidInputError: rewards that are not finite, or no episode with a stable simulation.
+        """
+        if self.done:
+            raise InvalidInputError(f"step: expected at most {len(self._sizes)} iterations, all of them are done")
+        with self._random(_LOSS_STREAM):
+            return self._step(after_step)
+
+    def _step(self, after_step: Callable[[int], object] | None) -> PPOIteration:
+        progress = sum(self._sizes[: self.iteration - self.first_iteration]) / sum(self._sizes)
+        if self.config.final_std is not None:
+            self.actor.set_std(self.config.std * (self.config.final_std / self.config.std) ** progress)
+        std = float(self.actor.std.mean())
+        rollouts, data, physics_seconds, solve_seconds = self._collect(after_step)
+        rewards = self._rewards(rollouts)
+
+        start = time.perf_counter()
+        inputs = self._inputs(rollouts)
+        returns = self._discounted(rewards)
+        if self.iteration == self.first_iteration:
+            self._fit_value(inputs[:, :-1], returns, self.config.value_first_epochs)
+        estimated = self._advantages(inputs, rewards)
+        data["advantage"] = estimated["advantage"]
+        unexplained = (returns - estimated["state_value"].squeeze(-1)).var() / returns.var().clamp_min(1e-12)
+        value_seconds = time.perf_counter() - start
+
+        learning_rate = self.learning_rate
+        improvement = self._improve(data.flatten(0, 1), rollouts, 1 - (1 - self.config.final_step) * progress)
+
+        start = time.perf_counter()
+        self._history = [*self._history, (inputs, rewards)][-self.config.value_iterations :]
+        targets = [self._advantages(*part)["value_target"].squeeze(-1) for part in self._history]
+        seen = torch.cat([inputs[:, :-1] for inputs, _ in self._history])
+        self._fit_value(seen, torch.cat(targets), self.config.value_epochs)
+        value_seconds += time.perf_counter() - start
+
+        self.iteration += 1
+        return PPOIteration(
+            iteration=self.iteration,
+            env_steps=self.env_steps,
+            success=float(rollouts.success.double().mean()),
+            mean_return=float(rewards.sum(1).mean()) / self.config.reward_scale,
+            kl=improvement.kl,
+            learning_rate=learning_rate,
+            std=std,
+            gradient_steps=improvement.steps,
+            skipped_steps=improvement.skipped,
+            clip_fraction=improvement.clip_fraction,
+            ignored=improvement.ignored,
+            explained_variance=1 - float(unexplained),
+            solver_failures=rollouts.solver_failures + improvement.solver_failures,
+            unstable=int((~rollouts.stable).sum()),
+            physics_seconds=physics_seconds,
+            solve_seconds=solve_seconds + improvement.solve_seconds,
+            gradient_seconds=improvement.gradient_seconds,
+            value_seconds=value_seconds,
+        )
+
+    # --- data ---
+
+    def _collect(self, after_step: Callable[[int], object] | None) -> tuple[Rollouts, TensorDict, float, float]:
+        """Episodes of the stochastic policy, and its tensordicts of the stable ones (N, T)."""
+        from tensordict import TensorDict
+
+        count = self._sizes[self.iteration - self.first_iteration]
+        seeds = episode_seeds(self.seed, TRAINING_STREAM, self.episodes, count)
+        seen: list[TensorDict] = []
+        solve_seconds = 0.0
+
+        def act(state: Tensor, goal: Tensor) -> tuple[np.ndarray, int]:
+            nonlocal solve_seconds
+            begun = time.perf_counter()
+            step = TensorDict({"state": state.clone(), "goal": goal.clone()}, [len(state)])
+            with torch.no_grad(), _quiet():
+                self.actor(step)  # cold: as in evaluation
+            seen.append(step)
+            solve_seconds += time.perf_counter() - begun
+            return np.asarray(step["action"]), int((~step["converged"]).sum())
+
+        start = time.perf_counter()
+        report = None if after_step is None else lambda: after_step(count)
+        with self._random(_NOISE_STREAM):
+            rollouts = collect(self.env, act, seeds, self.episode_steps, report)
+        seconds = time.perf_counter() - start
+        self.episodes += count
+        if not bool(rollouts.stable.any()):
+            raise InvalidInputError("env: expected a stable simulation, got NaN or a physics error in every episode")
+        data = TensorDict.maybe_dense_stack(seen, 1)[rollouts.stable]
+        return rollouts, data, seconds - solve_seconds, solve_seconds  # pyright: ignore[reportReturnType]
+
+    def _rewards(self, rollouts: Rollouts) -> Tensor:
+        """(N, T) scaled rewards of the stable episodes."""
+        config = self.config
+        rewards = rollouts.rewards[rollouts.stable].clamp_min(-config.cost_limit)
+        if not bool(torch.isfinite(rewards).all()):
+            raise InvalidInputError("env: expected finite rewards, got NaN or infinity; mend the environment's reward")
+        rewards[:, -1] -= config.failure_penalty * (~rollouts.success[rollouts.stable]).double()
+        return config.reward_scale * rewards
+
+    def _inputs(self, rollouts: Rollouts) -> Tensor:
+        """(N, T+1, n) inputs of the value network for the stable episodes."""
+        states = rollouts.states[rollouts.stable]
+        goals = rollouts.goals[rollouts.stable].unsqueeze(1).expand(-1, states.shape[1], -1)
+        elapsed = torch.linspace(0, 1, states.shape[1], dtype=torch.float64).expand(states.shape[:-1])
+        return self.features(states, goals, elapsed)
+
+    # --- value ---
+
+    def _discounted(self, rewards: Tensor) -> Tensor:
+        """(N, T) discounted sums of the rewards to come."""
+        total = torch.zeros(len(rewards), dtype=rewards.dtype)
+        sums = []
+        for reward in reversed(rewards.unbind(1)):
+            total = reward + self.config.gamma * total
+            sums.append(total)
+        return torch.stack(sums[::-1], 1)
+
+    def _advantages(self, inputs: Tensor, rewards: Tensor) -> TensorDictBase:
+        """TorchRL's GAE (Eq. adv_func): keys "advantage", "value_target", "state_value", (N, T, 1) each.
+
+        The rewards of an episode end with it: V(T) = 0, which the value network can know because it sees the time.
+        """
+        from tensordict import TensorDict
+        from tensordict.nn import TensorDictModule
+        from torchrl.objectives.value import GAE
+
+        n, steps = rewards.shape
+        end = torch.zeros(n, steps, 1, dtype=torch.bool)
+        end[:, -1] = True
+        following = {"inputs": inputs[:, 1:], "reward": rewards.unsqueeze(-1), "done": end, "terminated": end}
+        data = TensorDict({"inputs": inputs[:, :-1], "next": following}, [n, steps])  # pyright: ignore[reportArgumentType]
+        critic = TensorDictModule(lambda v: self.value(v.float()).double(), ["inputs"], ["state_value"])
+        gae = GAE(gamma=self.config.gamma, lmbda=self.config.zeta, value_network=critic, deactivate_vmap=True)
+        with torch.no_grad():
+            return gae(data)
+
+    def _fit_value(self, inputs: Tensor, targets: Tensor, epochs: int) -> None:
+        x, y = inputs.flatten(0, 1).float(), targets.flatten().float()
+        with self._random(_VALUE_STREAM, len(self._history) + 1):
+            for _ in range(epochs):
+                for batch in torch.randperm(len(x)).split(self.config.value_minibatch):
+                    loss = (self.value(x[batch]).squeeze(-1) - y[batch]).square().mean()
+                    self._value_adam.zero_grad()
+                    loss.backward()
+                    self._value_adam.step()
+
+    # --- policy ---
+
+    def _improve(self, data: TensorDictBase, rollouts: Rollouts, scale: float) -> _Improvement:
+        """Gradient steps on the combined loss (Eq. total_loss), until the KL divergence is used up."""
+        from tensordict.nn import ProbabilisticTensorDictSequential
+        from torchrl.objectives import ClipPPOLoss
+
+        config, outcome = self.config, _Improvement()
+        # The MPC is solved here, once per step; the loss gets its result, and only builds the distribution.
+        head = ProbabilisticTensorDictSequential(self.actor.module[-1])  # pyright: ignore
+        clipped = ClipPPOLoss(head, None, clip_epsilon=config.clip, entropy_bonus=False, critic_coeff=None)
+        advantage = data["advantage"]
+        advantage = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
+        guess = data["plan"]  # the rollout's own optimum, then each step's
+        rng = np.random.default_rng((self.seed, _LOSS_STREAM, self.iteration))
+        rates = [self.learning_rate, config.std_learning_rate]
+        for group, rate in zip(self._adam.param_groups, rates[: len(self._adam.param_groups)], strict=True):
+            group["lr"] = scale * rate
+        for _ in range(config.steps):
+            start = time.perf_counter()
+            batch = data.select("state", "goal")
+            batch["guess"] = guess
+            with _quiet():
+                self.actor.get_dist_params(batch)
+            guess = batch["plan"]
+            outcome.solver_failures += int((~batch["converged"]).sum())
+            solved = time.perf_counter()
+            outcome.solve_seconds += solved - start
+
+            kl = _kl(data, batch)
+            outcome.kl = _trimmed_mean(kl, config.kl_quantile)
+            if not outcome.kl <= config.max_kl and outcome.steps:
+                break
+            jumped = (kl > config.jump_kl).unsqueeze(-1)
+            outcome.ignored = float(jumped.double().mean())
+            batch["loc"] = torch.where(jumped, data["loc"], batch["loc"])
+            batch["action"], batch["action_log_prob"] = data["action"], data["action_log_prob"]
+            batch["advantage"] = torch.where(jumped, 0.0, advantage)
+            result = clipped(batch)
+            outcome.clip_fraction = float(result["clip_fraction"])
+            loss = config.beta * result["loss_objective"]
+            if config.beta < 1:
+                loss = loss + (1 - config.beta) * self._violation(rollouts, rng)
+            self._adam.zero_grad()
+            loss.backward()
+            if all(p.grad is None or bool(torch.isfinite(p.grad).all()) for p in self._learned):
+                self._adam.step()
+                self._bound_std()
+                outcome.steps += 1
+            else:
+                outcome.skipped += 1
+            outcome.gradient_seconds += time.perf_counter() - solved
+        self.learning_rate = self._adapt(outcome.kl / scale**2)
+        return outcome
+
+    def _adapt(self, kl: float) -> float:
+        """The next step size. KL grows with the square of a step, so the caller divides annealing out."""
+        config = self.config
+        if kl > 1.5 * config.target_kl:
+            return self.learning_rate / config.learning_rate_factor
+        return self.learning_rate * config.learning_rate_factor if kl < 0.5 * config.target_kl else self.learning_rate
+
+    def _violation(self, rollouts: Rollouts, rng: np.random.Generator) -> Tensor:
+        config, states, actions = self.config, rollouts.states[rollouts.stable], rollouts.actions[rollouts.stable]
+        x, u, x_next = (v.flatten(0, 1) for v in (states[:, :-1], actions, states[:, 1:]))
+        chosen = torch.from_numpy(rng.permutation(len(x))[: config.violation_batch])
+        return violation_loss(
+            self.lcs, x[chosen], u[chosen], x_next[chosen], config.violation_gamma, config.violation_xi
+        )
+
+    def _bound_std(self) -> None:
+        low, high = self.config.std_range
+        if self.config.learn_std:
+            with torch.no_grad():
+                self.actor.gaussian.log_std.clamp_(math.log(low), math.log(high))
+
+    @contextmanager
+    def _random(self, stream: int, part: int = 0) -> Iterator[None]:
+        """TorchRL and torch.nn draw from the global generator: seed it, and give it back as it was."""
+        key = (self.seed, stream, self.iteration, part)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(int(np.random.SeedSequence(key).generate_state(1)[0]))
+            yield
+
+    # --- checkpoints ---
+
+    def _tensors(self) -> dict[str, Tensor]:
+        """Everything besides model and history, in tensors of constant shape."""
+        gaussian = self.actor.gaussian
+        return {
+            "u_min": self.bounds[0],
+            "u_max": self.bounds[1],
+            "policy.log_std": gaussian.log_std.detach(),
+            "policy.mixing": gaussian.mixing.detach(),
+            **{f"value.{name}": value for name, value in self.value.state_dict().items()},
+            **_moments("policy_adam", self._adam),
+            **_moments("value_adam", self._value_adam),
+        }
+
+    def checkpoint(self) -> Checkpoint:
+        """Everything needed to go on with the same result."""
+        sizes = [len(rewards) for _, rewards in self._history]
+        state = {
+            "episodes": self.episodes,
+            "first_episode": self.first_episode,
+            "first_iteration": self.first_iteration,
+            "learning_rate": self.learning_rate,
+            "history": sizes,
+        }
+        history: dict[str, Tensor] = {}
+        if sizes:
+            history["history.inputs"] = torch.cat([inputs for inputs, _ in self._history])
+            history["history.rewards"] = torch.cat([rewards for _, rewards in self._history])
+        return Checkpoint(self.iteration, self.lcs, state, {**self._tensors(), **history})
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint.
+
+        Raises:
+            CheckpointError: it does not fit the settings or the model; nothing is changed.
+        """
+        own, tensors = self._tensors(), dict(checkpoint.tensors)
+        inputs, rewards = tensors.pop("history.inputs", None), tensors.pop("history.rewards", None)
+        shapes, wanted = ({k: tuple(v.shape) for k, v in part.items()} for part in (tensors, own))
+        model = checkpoint.model
+        if shapes != wanted or model is None or model.config() != self.lcs.config():
+            different = sorted({k for k in {*shapes, *wanted} if shapes.get(k) != wanted.get(k)})
+            raise CheckpointError(
+                f"checkpoint: expected {self.lcs.config()} and the tensors of this training, got "
+                f"{model and model.config()}, different in {different}; was it written with other settings?"
+            )
+        state = checkpoint.state
+        try:
+            names = ("episodes", "first_episode", "first_iteration")
+            episodes, first_episode, first_iteration = (check_positive_int(k, state[k], minimum=0) for k in names)
+            learning_rate = check_number("learning_rate", state["learning_rate"], strict=True)
+            sizes: list[int] = list(state["history"])  # pyright: ignore[reportArgumentType]
+            history = []
+            if inputs is not None and rewards is not None:
+                history = list(zip(inputs.split(sizes), rewards.split(sizes), strict=True))
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise CheckpointError(f"checkpoint: its counters or history cannot be used ({error})") from error
+        if (first_episode, first_iteration) != (self.first_episode, self.first_iteration):
+            raise CheckpointError(
+                f"checkpoint: expected a main phase that starts after {self.first_episode} episodes, got one after "
+                f"{first_episode}; was it written with other settings?"
+            )
+        self.iteration, self.episodes, self.learning_rate = checkpoint.iteration, episodes, learning_rate
+        self._history = history
+        self.lcs.load_state_dict(model.state_dict())
+        self.value.load_state_dict({k.removeprefix("value."): v for k, v in tensors.items() if k.startswith("value.")})
+        with torch.no_grad():
+            for name, value in own.items():
+                if not name.startswith(("value.", "u_")):
+                    value.copy_(tensors[name])
+
+
+@dataclass
+class _Improvement:
+    """What the gradient steps of one iteration did."""
+
+    kl: float = 0.0
+    steps: int = 0
+    skipped: int = 0
+    clip_fraction: float = 0.0
+    ignored: float = 0.0
+    solver_failures: int = 0
+    solve_seconds: float = 0.0
+    gradient_seconds: float = 0.0
+
+
+def _kl(old: TensorDictBase, new: TensorDictBase) -> Tensor:
+    """(N,) KL(old ‖ new) of the Gaussians: far less noisy than the mean of sampled log-ratios."""
+    with torch.no_grad():
+        before, after = (
+            torch.distributions.MultivariateNormal(v["loc"], scale_tril=v["scale_tril"], validate_args=False)
+            for v in (old, new)
+        )
+        return torch.distributions.kl_divergence(before, after)
+
+
+def _trimmed_mean(values: Tensor, fraction: float) -> float:
+    """Mean of the lowest `fraction` of the values, at least of one."""
+    return float(values.sort().values[: max(1, int(fraction * len(values)))].mean())
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    # Failures are counted and reported; a regularised gradient of single samples is expected here.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SolveWarning)
+        warnings.simplefilter("ignore", DegenerateWarning)
+        yield
+
+
+def _initialise(optimiser: torch.optim.Optimizer) -> None:
+    """Give every parameter its moments now, so that a checkpoint has the same tensors at any time."""
+    for group in optimiser.param_groups:
+        for p in group["params"]:
+            zero = {"exp_avg": torch.zeros_like(p), "exp_avg_sq": torch.zeros_like(p)}
+            optimiser.state[p] = {"step": torch.tensor(0.0), **zero}
+
+
+def _moments(name: str, optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """Name → the optimiser's own tensors, by the place of the parameter."""
+    parameters = [p for group in optimiser.param_groups for p in group["params"]]
+    state: Mapping[nn.Parameter, Mapping[str, Tensor]] = optimiser.state  # pyright: ignore[reportAssignmentType]
+    return {f"{name}.{i}.{key}": value for i, p in enumerate(parameters) for key, value in state[p].items()}

@@ -1,0 +1,173 @@
+"""The methods besides the warm-up from the command line: train, kill, resume, evaluate."""
+
+import errno
+import json
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+import torch
+
+from difflcs import LCSModel, _files, cli
+from difflcs.rl.checkpoint import RunDirectory
+from difflcs.rl.training import TrainConfig, profile
+
+pytest.importorskip("mujoco")
+pytest.importorskip("torchrl")
+
+METHODS = ("lcs-rl", "ppo", "pddm")
+
+
+def run(capsys, *arguments) -> tuple[int, str, str]:
+    code = cli.main([str(argument) for argument in arguments])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> dict[str, Path]:
+    """A finished smoke run of each method."""
+    root = tmp_path_factory.mktemp("methods")
+    for method in METHODS:
+        assert cli.main(["train", "--smoke", "--method", method, "--out", str(root / method)]) == 0
+    return {method: root / method for method in METHODS}
+
+
+def learned(path: Path) -> list[tuple[str, bytes]]:
+    """The final model and the last checkpoint, byte for byte."""
+    last = max(path.glob("checkpoints/0*"))
+    files = [path / "model/model.safetensors", last / "model.safetensors", last / "config.json"]
+    return [(str(file.relative_to(path)), file.read_bytes()) for file in files]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_train_and_evaluate(capsys, finished, method):
+    path = finished[method]
+    rows = RunDirectory.open(path).rows()
+    assert [row["iteration"] for row in rows] == [str(i) for i in range(len(rows))]
+    assert float(rows[-1]["minutes"]) == pytest.approx(0.5)  # the budget, met exactly
+    assert rows[-1]["evaluation_goals"] == "4"
+    spent = profile(rows)
+    wanted = {
+        "lcs-rl": {"collect", "learn", "physics", "solve", "gradient", "value"},
+        "ppo": {"physics", "solve", "gradient", "value"},
+        "pddm": {"collect", "learn"},
+    }
+    assert {name for name, seconds in spent.items() if seconds > 0} == wanted[method] | {"evaluation"}
+    records = []
+    for _ in range(2):
+        code, out, _ = run(capsys, "evaluate", path, "--goals", 3, "--json")
+        assert code == 0
+        records.append(json.loads(out))
+        del records[-1]["seconds"]
+    assert records[0] == records[1]
+    assert records[0]["method"] == method
+    if method != "pddm":
+        assert isinstance(RunDirectory.open(path).load_model(), LCSModel)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_resume_gives_the_same_run(capsys, finished, tmp_path, monkeypatch, method):
+    """Die after each iteration in turn."""
+    path = tmp_path / "run"
+
+    def die(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(cli._Progress, "iterated", die)
+        assert run(capsys, "train", "--smoke", "--method", method, "--out", path)[0] == 130
+        code, out, _ = run(capsys, "evaluate", path, "--smoke")
+        assert code == 0
+        assert "not finished" in out
+        for _ in range(5):
+            code = run(capsys, "train", "--out", path, "--resume")[0]
+            if code == 0:
+                break
+            assert code == 130
+    assert run(capsys, "train", "--out", path, "--resume")[0] == 0
+    assert learned(path) == learned(finished[method])
+
+
+def test_resume_after_kill_9(capsys, tmp_path):
+    """Killed in the warm-up, resumed, killed in the main phase, resumed."""
+    options = ["--method", "lcs-rl", "--minutes", "1.5", "--warmup-minutes", "0.4", "--ppo.rollouts", "7"]
+    options += ["--ppo.steps", "2", "--warmup.first-epochs", "20", "--final-goals", "0", "--evaluate-at", "9"]
+    through, killed = tmp_path / "through", tmp_path / "killed"
+    for resume, until in ((False, 1), (True, 4)):
+        command = [sys.executable, "-m", "difflcs.cli", "train", *options, "--out", str(killed)]
+        process = subprocess.Popen(
+            [*command, *["--resume"] * resume], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        deadline = time.monotonic() + 120
+        while not (killed / f"checkpoints/{until:06d}").exists() and time.monotonic() < deadline:
+            time.sleep(0.005)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        assert not (killed / "model").exists()
+    assert run(capsys, "train", "--out", killed, "--resume")[0] == 0
+    assert run(capsys, "train", *options, "--out", through)[0] == 0
+    assert learned(through) == learned(killed)
+
+
+def test_init_starts_from_another_run(capsys, finished, tmp_path):
+    out = tmp_path / "transfer"
+    arguments = ["--smoke", "--method", "lcs-rl", "--final-goals", 0, "--out", out, "--init"]
+    assert run(capsys, "train", *arguments, finished["ppo"])[0] == 0
+    assert json.loads((out / "config.json").read_text())["init"] == str(finished["ppo"])
+    first = RunDirectory.open(out).rows()[1]
+    assert first["env_steps"] == "100"
+    assert torch.isfinite(RunDirectory.open(out).load_model().A).all()
+    for source in (finished["pddm"], finished["pddm"] / "model"):
+        code, _, err = run(capsys, "train", "--smoke", "--out", tmp_path / "no", "--init", source)
+        assert code == 2
+        assert "PDDM" in err
+        assert not (tmp_path / "no").exists()
+
+
+def test_checkpoints_of_another_method_are_refused(capsys, finished, tmp_path):
+    path = tmp_path / "run"
+    path.mkdir()
+    for name in ("checkpoints", "config.json"):
+        source = finished["pddm" if name == "checkpoints" else "lcs-rl"] / name
+        subprocess.run(["cp", "-r", str(source), str(path)], check=True)
+    code, _, err = run(capsys, "train", "--out", path, "--resume")
+    assert code == 2
+    assert "another method" in err
+
+
+def test_a_folder_that_cannot_be_written_is_reported_first(capsys, tmp_path):
+    (tmp_path / "file").touch()
+    code, _, err = run(capsys, "train", "--smoke", "--out", tmp_path / "file/run")
+    assert code == 2
+    assert "another --out" in err
+
+
+def test_a_full_disk_leaves_the_last_checkpoint(capsys, finished, tmp_path, monkeypatch):
+    path = tmp_path / "run"
+    write, left = _files.write_atomically, [5]  # config.json, then three files per checkpoint
+
+    def full(*arguments):
+        left[0] -= 1
+        if left[0] < 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(_files, "write_atomically", full)
+        code, _, err = run(capsys, "train", "--smoke", "--method", "ppo", "--out", path)
+    assert code == 2
+    assert "No space left" in err
+    assert "--resume" in err
+    assert json.loads((path / "checkpoints/latest.json").read_text()) == {"checkpoint": "000000"}
+    assert run(capsys, "train", "--out", path, "--resume")[0] == 0
+    assert learned(path) == learned(finished["ppo"])
+
+
+def test_configuration_survives_json():
+    config = TrainConfig(method="lcs-rl", minutes=12.0)
+    assert TrainConfig.from_dict(json.loads(json.dumps(asdict(config)))) == config

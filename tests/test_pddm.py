@@ -1,0 +1,233 @@
+"""The PDDM baseline: ensemble, planner, training, on a system that needs no simulator."""
+
+import math
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from gymnasium.vector import SyncVectorEnv
+
+from difflcs import GoalCost, _files
+from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
+from difflcs.rl.evaluate import evaluate
+from difflcs.rl.pddm import PDDM, Ensemble, PDDMConfig, Planner
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Threads cost more than they bring on problems this small."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+STEPS = 6
+U_MAX = 0.1
+SMALL = PDDMConfig(
+    networks=2, width=16, random_rollouts=10, rollouts_per_iteration=5, epochs=20, minibatch=16, horizon=3, samples=80
+)
+
+
+class Slide(gymnasium.Env):
+    """x₊ = x + u."""
+
+    observation_space = spaces.Dict(
+        {"state": spaces.Box(-10.0, 10.0, (1,), np.float64), "goal": spaces.Box(-1.0, 1.0, (1,), np.float64)}
+    )
+    action_space = spaces.Box(-U_MAX, U_MAX, (1,), np.float64)
+
+    def __init__(self, breaks_at: int | None = None):
+        self.breaks_at = breaks_at
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps, self.state, self.goal = 0, np.zeros(1), self.np_random.uniform(-0.4, 0.4, 1)
+        return {"state": self.state.copy(), "goal": self.goal.copy()}, {}
+
+    def step(self, action):
+        self.state = self.state + np.asarray(action)
+        self.steps += 1
+        broken = self.steps == self.breaks_at
+        info = {"success": float(abs(self.state - self.goal)[0]) < 0.04, "physics_error": broken}
+        observation = {"state": self.state.copy(), "goal": self.goal.copy()}
+        return observation, 0.0, False, self.steps >= STEPS or broken, info
+
+
+def make_envs(count: int = 10, **kwargs) -> SyncVectorEnv:
+    return SyncVectorEnv([lambda: Slide(**kwargs)] * count)
+
+
+def make_cost() -> GoalCost:
+    return GoalCost.reach(1, 1, goal_weight=(200.0,), input_weight=0.01)
+
+
+def make_pddm(seed: int = 0, total: int = 25, env=None, **changes) -> PDDM:
+    env = make_envs() if env is None else env
+    return PDDM(make_cost(), env, replace(SMALL, **changes), seed, total_episodes=total, episode_steps=STEPS)
+
+
+def parameters(trainer: PDDM) -> list[torch.Tensor]:
+    return [value.clone() for value in trainer.ensemble.state_dict().values()]
+
+
+def same(a: list[torch.Tensor], b: list[torch.Tensor]) -> bool:
+    return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+def test_pddm_learns_to_reach():
+    trainer = make_pddm(total=20)
+    env = make_envs(20)
+    before = evaluate(env, trainer.policy, 40, 0, STEPS).success_rate
+    reports = []
+    while trainer.env_steps < 20 * STEPS:
+        reports.append(trainer.step())
+    assert before < 0.5
+    assert evaluate(env, trainer.policy, 40, 0, STEPS).success_rate > 0.9
+    assert [report.env_steps for report in reports] == [60, 90, 120]
+    with pytest.raises(InvalidInputError, match="all of them are done"):
+        trainer.step()
+
+
+def test_ensemble_learns_a_linear_system_and_its_members_differ():
+    generator = torch.Generator().manual_seed(0)
+    A = torch.tensor([[0.9, 0.2], [0.0, 1.1]], dtype=torch.float64)
+    x = 5 + 0.1 * torch.randn(400, 2, generator=generator, dtype=torch.float64)
+    u = 0.01 * torch.randn(400, 2, generator=generator, dtype=torch.float64)
+    x_next = x @ A.T + u
+    ensemble = Ensemble(2, 2, 3, 32, generator)
+    loss = ensemble.fit(x, u, x_next, PDDMConfig(epochs=60, minibatch=50, networks=3, width=32), generator)
+    assert loss < 0.02
+    with torch.no_grad():
+        predicted = ensemble(x.float().expand(3, -1, -1), u.float().expand(3, -1, -1))
+    error = (predicted - x_next).square().mean().sqrt()
+    assert error < 0.15 * (x_next - x).std()
+    assert not torch.equal(predicted[0], predicted[1])
+
+
+class Exact(Ensemble):
+    """x₊ = x + u, exactly."""
+
+    def forward(self, x, u):
+        return x + u
+
+
+def planner(cost: GoalCost | None = None, **changes) -> Planner:
+    bound = torch.full((1,), U_MAX, dtype=torch.float64)
+    return Planner(Exact(1, 1, 2, 4), cost or make_cost(), replace(SMALL, **changes), -bound, bound)
+
+
+def test_costs_are_those_of_the_mpc():
+    """Against the objective written out, up to the constant that does not depend on actions."""
+    generator = torch.Generator().manual_seed(1)
+    actions = 0.1 * torch.randn(7, 3, 1, generator=generator)
+    x0, goal = torch.tensor([0.2], dtype=torch.float64), torch.tensor([-0.3], dtype=torch.float64)
+    states = torch.cat([torch.full((7, 1), 0.2), 0.2 + actions.squeeze(-1).cumsum(1)], 1)
+    expected = 200 * (states + 0.3).square().sum(1) + 0.01 * actions.square().sum((1, 2)) - 4 * 200 * 0.3**2
+    torch.testing.assert_close(planner()._costs(x0, goal, actions), expected, rtol=1e-4, atol=1e-3)
+
+
+def test_planner_moves_toward_the_goal_within_bounds():
+    plan = planner(samples=400)
+    state = torch.zeros(3, 1, dtype=torch.float64)
+    goal = torch.tensor([[0.3], [-0.3], [0.0]], dtype=torch.float64)
+    bound = torch.full((1,), 0.02, dtype=torch.float64)
+    action = plan(state, goal).action.squeeze(-1)
+    assert action[0] > 0.05
+    assert action[1] < -0.05
+    assert abs(action[2]) < 0.03
+    assert bool((action.abs() <= U_MAX).all())
+    plan.begin()
+    assert bool((plan(state, goal, u_min=-bound, u_max=bound).action.abs() <= 0.02).all())
+
+
+def test_planner_remembers_until_it_begins_anew():
+    plan = planner()
+    state, goal = torch.zeros(2, 1, dtype=torch.float64), torch.full((2, 1), 0.3, dtype=torch.float64)
+    first = plan(state, goal).action
+    assert not torch.equal(plan(state, goal).action, first)
+    with pytest.raises(InvalidInputError, match="begin"):
+        plan(state[:1], goal[:1])
+    plan.begin()
+    assert torch.equal(plan(state, goal).action, first)
+    plan.begin(seed=1)
+    assert not torch.equal(plan(state, goal).action, first)
+
+
+def test_overflowing_predictions_do_not_spoil_the_plan():
+    plan = planner()
+
+    class Wild(Exact):
+        def forward(self, x, u):
+            return torch.where(u > 0, torch.tensor(math.nan), x + u)
+
+    plan.ensemble = Wild(1, 1, 2, 4)
+    action = plan(torch.zeros(1, 1, dtype=torch.float64), torch.full((1, 1), 0.3, dtype=torch.float64)).action
+    assert bool(torch.isfinite(action).all())
+
+
+def test_resumed_equals_uninterrupted_bitwise(tmp_path):
+    through = make_pddm()
+    for _ in range(4):
+        through.step()
+    first = make_pddm()
+    for _ in range(2):
+        first.step()
+    save_checkpoint(tmp_path, first.checkpoint())
+    first.step()  # lost by the crash
+    second = make_pddm(seed=0)
+    torch.manual_seed(7)  # the global generator must not matter
+    second.restore(load_checkpoint(tmp_path))
+    for _ in range(2):
+        second.step()
+    assert same(parameters(through), parameters(second))
+    assert torch.equal(through.states, second.states)
+
+
+def test_save_and_load(tmp_path):
+    trainer = make_pddm()
+    trainer.step()
+    trainer.ensemble.save_pretrained(tmp_path)
+    loaded = Ensemble.from_pretrained(tmp_path)
+    assert same(parameters(trainer), list(loaded.state_dict().values()))
+    config = {"n_x": 1, "n_u": 1, "networks": 2, "width": 8}  # of another width than the tensors
+    _files.save_record(tmp_path, "PDDM", config, trainer.ensemble.state_dict())
+    with pytest.raises(CheckpointError, match="expected an ensemble"):
+        Ensemble.from_pretrained(tmp_path)
+
+
+def test_restore_refuses_what_does_not_fit():
+    trainer = make_pddm()
+    trainer.step()
+    checkpoint = trainer.checkpoint()
+    other = make_pddm(width=8)
+    before = parameters(other)
+    with pytest.raises(CheckpointError, match="other settings"):
+        other.restore(checkpoint)
+    with pytest.raises(CheckpointError, match="counters"):
+        trainer.restore(replace(checkpoint, state={}))
+    assert same(before, parameters(other))
+
+
+def test_broken_episodes_are_dropped():
+    env = SyncVectorEnv([lambda: Slide(breaks_at=3), *[Slide] * 9])
+    trainer = make_pddm(env=env)
+    assert trainer.step().unstable == 1
+    assert len(trainer.states) == 9
+    with pytest.raises(InvalidInputError, match="stable simulation"):
+        make_pddm(env=make_envs(breaks_at=2)).step()
+
+
+@pytest.mark.parametrize("change", [{"samples": 0}, {"kappa": 0.0}, {"filter": 1.5}, {"noise": math.nan}])
+def test_bad_settings_are_refused(change):
+    with pytest.raises(InvalidInputError, match=next(iter(change))):
+        PDDMConfig(**change)
+
+
+def test_too_few_environments():
+    with pytest.raises(InvalidInputError, match="at least 10 environments, got 2"):
+        make_pddm(env=make_envs(2))

@@ -1,0 +1,244 @@
+"""The stochastic policy as a TorchRL actor, on the small pushing system of `conftest`."""
+
+import math
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from difflcs import GoalCost, LCSModel, LCSMPCLayer
+from difflcs.errors import DTypeError, InvalidInputError
+
+pytest.importorskip("torchrl")
+from tensordict import TensorDict
+from torchrl.data import Unbounded
+from torchrl.envs import ClipTransform, GymWrapper, TransformedEnv
+from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
+from torchrl.objectives import ClipPPOLoss
+
+from difflcs.rl.policy import LCSMPCPolicy
+
+U_MAX = 0.1
+STD = 0.02
+
+
+@pytest.fixture
+def mpc(build):
+    lcs = build.model(seed=3, n_x=2, n_u=2, n_lam=2, scale=0.3)
+    cost = GoalCost.reach(2, 2, goal_weight=(5.0,), input_weight=0.5)
+    return LCSMPCLayer(lcs, cost, horizon=4, u_min=-U_MAX, u_max=U_MAX, on_failure="mask")
+
+
+def observations(*batch: int) -> TensorDict:
+    generator = torch.Generator().manual_seed(0)
+    state = 0.1 * torch.randn(*batch, 2, generator=generator, dtype=torch.float64)
+    goal = 0.1 * torch.randn(*batch, 1, generator=generator, dtype=torch.float64)
+    return TensorDict({"state": state, "goal": goal}, batch)
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+def test_keys_shapes_and_specs(mpc, batch):
+    policy = LCSMPCPolicy(mpc, STD)
+    assert policy.in_keys == ["state", "goal"]
+    data = policy(observations(*batch))
+    assert set(policy.out_keys) <= set(data.keys(True, True))
+    shapes = {key: tuple(data[key].shape[len(batch) :]) for key in data.keys(True, True)}
+    assert shapes == {
+        "state": (2,),
+        "goal": (1,),
+        "action": (2,),
+        "action_log_prob": (),
+        "loc": (2,),
+        "scale_tril": (2, 2),
+        "converged": (1,),
+        ("plan", "x"): (5, 2),
+        ("plan", "u"): (4, 2),
+        ("plan", "lam"): (4, 2),
+    }
+    assert policy.spec["action"] == Unbounded(torch.Size([2]), dtype=torch.float64)
+    assert bool(data["converged"].all())
+
+
+def test_mean_is_the_mpcs_action_and_noise_is_gaussian(mpc):
+    policy = LCSMPCPolicy(mpc, torch.tensor([0.01, 0.03], dtype=torch.float64))
+    one = observations()
+    many = one.expand(4000).clone()
+    with torch.no_grad(), torch.random.fork_rng():
+        torch.manual_seed(0)
+        policy(many)
+    torch.testing.assert_close(many["loc"], mpc(many["state"], many["goal"]).action)
+    noise = many["action"] - many["loc"]
+    assert noise.mean(0).abs().max() < 4 * 0.03 / math.sqrt(4000)
+    torch.testing.assert_close(noise.std(0), policy.std, rtol=0.05, atol=0.0)
+    z = noise / policy.std
+    expected = -0.5 * z.square().sum(-1) - policy.std.log().sum() - math.log(2 * math.pi)
+    torch.testing.assert_close(many["action_log_prob"], expected)
+
+
+def test_deterministic_mode_is_the_mean(mpc):
+    policy = LCSMPCPolicy(mpc, STD)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        data = policy(observations(6))
+    assert torch.equal(data["action"], data["loc"])
+    assert bool((policy(observations(6))["action"] != data["loc"]).all())  # but by default it explores
+
+
+def test_log_probability_is_that_of_the_unclipped_sample(mpc):
+    policy = LCSMPCPolicy(mpc, 3 * U_MAX)
+    data = policy(observations(200))
+    clipped = policy.clip(data["action"])
+    assert bool((data["action"].abs() > U_MAX).any())
+    assert bool((clipped.abs() <= U_MAX).all())
+    inside = (data["action"].abs() <= U_MAX).all(-1)
+    assert torch.equal(clipped[inside], data["action"][inside])
+    again = policy.get_dist(observations(200)).log_prob(data["action"])
+    torch.testing.assert_close(again, data["action_log_prob"])
+    outside = ~inside
+    assert bool((policy.get_dist(observations(200)).log_prob(clipped)[outside] != again[outside]).all())
+
+
+def test_a_guess_leads_back_to_the_rollouts_optimum(mpc):
+    """Re-solved from the plan, the ratio is one and the solver has nothing to do; the guess is really used."""
+    policy = LCSMPCPolicy(mpc, STD)
+    with torch.no_grad():
+        data = policy(observations(30))
+    warm = data.select("state", "goal")
+    warm["guess"] = data["plan"]
+    log_prob = policy.get_dist(warm).log_prob(data["action"])
+    torch.testing.assert_close(log_prob, data["action_log_prob"], rtol=0, atol=1e-9)
+    seen = []
+    mpc.register_forward_hook(lambda _, __, kwargs, out: seen.append(out.iterations.max()), with_kwargs=True)
+    policy.get_dist(warm)
+    policy.get_dist(observations(30))
+    assert seen[0] < seen[1]
+
+
+def test_gradients_are_those_of_finite_differences(mpc):
+    policy = LCSMPCPolicy(mpc, STD, covariance="full", learn_std=True)
+    with torch.no_grad():
+        policy.gaussian.mixing.copy_(torch.tensor([[9.0, 9.0], [0.4, 9.0]]))  # only the entry below the diagonal counts
+        data = policy(observations(8))
+    tril = policy.gaussian.scale_tril().detach()
+    assert torch.equal(tril, tril.tril())
+
+    def log_prob():
+        warm = data.select("state", "goal")
+        warm["guess"] = data["plan"]
+        return policy.get_dist(warm).log_prob(data["action"]).sum()
+
+    log_prob().backward()
+    for parameter, index in [
+        (mpc.lcs.B, (0, 0)),
+        (mpc.lcs.A, (1, 0)),
+        (policy.gaussian.log_std, (1,)),
+        (policy.gaussian.mixing, (1, 0)),
+    ]:
+        values = []
+        for step in (1e-6, -1e-6):
+            with torch.no_grad():
+                parameter[index] += step
+                values.append(log_prob())
+                parameter[index] -= step
+        assert parameter.grad[index].item() == pytest.approx(float(values[0] - values[1]) / 2e-6, rel=1e-4, abs=1e-5)
+    assert policy.gaussian.mixing.grad[0, 1] == 0
+
+
+def test_failed_solves_are_marked_and_have_no_gradient(mpc):
+    policy = LCSMPCPolicy(mpc, STD)
+    policy.mpc.backend = type(mpc.backend)(max_iter=1)
+    with pytest.warns(UserWarning, match="not solved"):
+        data = policy(observations(20))
+    failed = ~data["converged"].squeeze(-1)
+    assert bool(failed.any())
+    assert bool((data["loc"].abs() <= U_MAX).all())
+    data["loc"][failed].sum().backward()
+    assert all(p.grad is None or not p.grad.any() for p in mpc.lcs.parameters())
+
+
+def test_what_is_learned(mpc):
+    def learned(**options) -> set[str]:
+        policy = LCSMPCPolicy(mpc, STD, **options)
+        return {name.rpartition(".")[2] for name, p in policy.named_parameters() if p.requires_grad}
+
+    model = set("ABCdDEGHc")
+    assert learned() == model
+    assert learned(learn_std=True) == model | {"log_std"}
+    assert learned(learn_std=True, covariance="full") == model | {"log_std", "mixing"}
+
+
+def test_set_std(mpc):
+    policy = LCSMPCPolicy(mpc, STD)
+    policy.set_std(0.004)
+    torch.testing.assert_close(policy.std, torch.full((2,), 0.004, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"mpc": None}, DTypeError, "LCSMPCLayer"),
+        ({"std": 0.0}, InvalidInputError, "std"),
+        ({"std": torch.tensor([0.1, -0.1])}, InvalidInputError, "positive"),
+        ({"std": torch.tensor([0.1])}, InvalidInputError, "n_u=2"),
+        ({"in_keys": ("state",)}, InvalidInputError, "two keys"),
+        ({"covariance": "round"}, InvalidInputError, "covariance"),
+        ({"covariance": "full"}, InvalidInputError, "learn_std=True"),
+    ],
+)
+def test_bad_arguments(mpc, arguments, error, message):
+    with pytest.raises(error, match=message):
+        LCSMPCPolicy(**{"mpc": mpc, **arguments})
+
+
+class Drift(gymnasium.Env):
+    """x₊ = x + u, with a strict action space."""
+
+    observation_space = spaces.Dict(
+        {"state": spaces.Box(-10.0, 10.0, (2,), np.float64), "goal": spaces.Box(-1.0, 1.0, (1,), np.float64)}
+    )
+    action_space = spaces.Box(-U_MAX, U_MAX, (2,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state, self.goal = np.zeros(2), self.np_random.uniform(-0.5, 0.5, 1)
+        return {"state": self.state, "goal": self.goal}, {}
+
+    def step(self, action):
+        assert np.abs(action).max() <= U_MAX + 1e-8  # TorchRL's ClipTransform has float32 bounds
+        self.state = self.state + action
+        return {"state": self.state, "goal": self.goal}, -abs(float(self.state[0] - self.goal[0])), False, False, {}
+
+
+def test_in_torchrls_own_loop(mpc):
+    """A TorchRL rollout through `ClipTransform`: the sample is kept, the clipped action is executed."""
+    env = TransformedEnv(GymWrapper(Drift()), ClipTransform(in_keys_inv=["action"], low=-U_MAX, high=U_MAX))
+    check_env_specs(env)
+    policy = LCSMPCPolicy(mpc, U_MAX, in_keys=("observation", "goal"))  # the names that GymWrapper gives
+    with torch.no_grad():
+        data = env.rollout(8, policy)
+    assert data.batch_size == (8,)
+    moved = data["next", "observation"] - data["observation"]
+    torch.testing.assert_close(moved, policy.clip(data["action"]), rtol=0, atol=1e-7)
+    assert not torch.equal(moved, data["action"])
+    data["advantage"] = torch.ones(8, 1, dtype=torch.float64)
+    warm = data.select("observation", "goal", "action", "action_log_prob", "advantage")
+    loss = ClipPPOLoss(policy, None, entropy_bonus=False, critic_coeff=None)
+    value = loss(warm)["loss_objective"]
+    assert float(value.detach()) == pytest.approx(-1.0)  # ratio 1, advantage 1
+    value.backward()
+
+
+def test_the_library_does_not_import_torchrl():
+    code = "import sys, difflcs, difflcs.rl; print(*sys.modules)"
+    loaded = subprocess.check_output([sys.executable, "-c", code], text=True).split()
+    assert not {"torchrl", "tensordict"} & set(loaded)
+
+
+def test_a_model_of_ones_own_stays_the_same_object():
+    lcs = LCSModel(2, 2, 1)
+    cost = GoalCost.reach(2, 2, goal_weight=(1.0,), input_weight=1.0)
+    policy = LCSMPCPolicy(LCSMPCLayer(lcs, cost, horizon=1, u_min=-1.0, u_max=1.0))
+    assert policy.mpc.lcs is lcs
