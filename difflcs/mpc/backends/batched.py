@@ -72,6 +72,7 @@ class BatchedBackend(Backend):
             low, high = (v.unsqueeze(-2) for v in (problem.u_min, problem.u_max))
             start = (low + draw * (high - low)).expand(problem.batch, -1, -1)
             best = _better(best, self._run(problem, start, None, problem.relaxation * min(self.homotopy, 10.0)))
+        best = self._second_chance(problem, best)
         x, u, lam, _, status, iterations, residual = best
         seconds = torch.full((problem.batch,), (time.perf_counter() - started) / max(problem.batch, 1))
         return Result(Primal(x, u, lam), status, iterations, residual, seconds.double())
@@ -99,6 +100,17 @@ class BatchedBackend(Backend):
             gradients=[gradient.numpy() for gradient in gradients.values()],
         )
         return gradients
+
+    def _second_chance(self, problem: MPCProblem, found: list[Tensor]) -> list[Tensor]:
+        """Solve the elements that failed (one in a thousand) once more, cold and along a longer homotopy."""
+        failed = torch.nonzero(~_solved(found)).squeeze(-1)
+        if not len(failed):
+            return found
+        again = self._run(problem.select(failed), None, None, problem.relaxation * 10 * self.homotopy)
+        chosen = _better([v[failed] for v in found], again)
+        for whole, part in zip(found, chosen, strict=True):
+            whole[failed] = part
+        return found
 
     def _threads(self) -> int:
         return self.threads or torch.get_num_threads()
@@ -144,9 +156,13 @@ def _array(value: Tensor) -> np.ndarray:
     return value.contiguous().numpy()
 
 
+def _solved(found: Sequence[Tensor]) -> Tensor:
+    return (found[4] == Status.CONVERGED) | (found[4] == Status.DEGENERATE)
+
+
 def _better(a: Sequence[Tensor], b: Sequence[Tensor]) -> list[Tensor]:
     """Per element the solved trajectory with the lower objective."""
-    solved_a, solved_b = ((v[4] == Status.CONVERGED) | (v[4] == Status.DEGENERATE) for v in (a, b))
+    solved_a, solved_b = _solved(a), _solved(b)
     take_b = solved_b & (~solved_a | (b[3] < a[3]))
     chosen = [torch.where(take_b.reshape(-1, *[1] * (v.ndim - 1)), w, v) for v, w in zip(a, b, strict=True)]
     chosen[5] = a[5] + b[5]
