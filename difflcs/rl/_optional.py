@@ -8,7 +8,7 @@ from importlib import metadata
 from difflcs.errors import MissingDependencyError
 
 INSTALL = 'pip install "difflcs[rl,envs,viz]"'
-_REPORTED = ("difflcs", "torch", "numpy", "casadi", "gymnasium", "mujoco")
+_REPORTED = ("difflcs", "torch", "numpy", "casadi", "gymnasium", "mujoco", "torchrl")
 
 
 def require(*packages: str) -> None:

@@ -49,7 +49,7 @@ class TrainConfig:
     """What is trained, on how much data, and when it is evaluated."""
 
     task: str = "cube"
-    """What to manipulate: cube, sugar_box, fish_can, mug, wrench, clamp or banana."""
+    """What to do: cube, turn_cube, sugar_box, fish_can, mug, wrench, banana, clamp, large_clamp, extra_large_clamp."""
     method: str = "violation"
     """How to learn: violation (the warm-up phase alone, Algorithm 1), lcs-rl (warm-up, then Algorithm 2), ppo
     (Algorithm 2 from a random model, without warm-up), or pddm (networks and a sampling planner)."""
