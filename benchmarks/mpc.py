@@ -36,7 +36,9 @@ class Options:
     ipopt_batch: int = 48
     """Problems that IPOPT solves."""
     share: int = 10_000
-    """Problems of the convergence count, spread over the kinds of models."""
+    """Problems of the convergence count, spread over the models."""
+    models: tuple[Path, ...] = ()
+    """Learned models to add to the convergence count: directories such as RUN/model."""
     repeats: int = 5
     """Timings; the best counts."""
     out: Path = Path("benchmarks/results/mpc.json")
@@ -101,14 +103,15 @@ def mpc_times(n_lam: int, o: Options) -> dict[str, float]:
 
 
 def convergence(o: Options) -> tuple[int, int]:
-    """Problems solved to the tolerance, and their number, over learned-like, random and untrained models."""
+    """Problems solved to the tolerance, and their number, over pushing, random, untrained and given models."""
     solved = total = 0
-    kinds = [(make, n_lam, seed) for make in MODELS.values() for n_lam in (5, 8) for seed in range(4)]
-    count = max(1, o.share // len(kinds))
-    for make, n_lam, seed in kinds:
-        x0, goal = states_and_goals(count, seed=100 + seed)
+    models = [make(n_lam, seed) for make in MODELS.values() for n_lam in (5, 8) for seed in range(4)]
+    models += [LCSModel.from_pretrained(path).params().detach() for path in o.models]
+    count = max(1, o.share // len(models))
+    for i, model in enumerate(models):
+        x0, goal = states_and_goals(count, seed=100 + i)
         with torch.no_grad():
-            plan = layer(make(n_lam, seed), BatchedBackend(tol=1e-6))(x0, goal)
+            plan = layer(model, BatchedBackend(tol=1e-6))(x0, goal)
         solved += int(plan.converged.sum())
         total += count
     return solved, total
@@ -235,7 +238,12 @@ def main(o: Options) -> None:
     record = {
         "machine": {"cpu": _cpu(), "cores": os.cpu_count(), "instruction set": _kernels.isa()},
         "versions": {"python": platform.python_version(), **versions},
-        "options": {"batch": o.batch, "ipopt_batch": o.ipopt_batch, "repeats": o.repeats},
+        "options": {
+            "batch": o.batch,
+            "ipopt_batch": o.ipopt_batch,
+            "repeats": o.repeats,
+            "learned models": len(o.models),
+        },
         "results": numbers,
     }
     o.out.parent.mkdir(parents=True, exist_ok=True)

@@ -100,13 +100,16 @@ void lcp_exact(const LcpBatch& batch, int64_t begin, int64_t end, void* memory) 
       }
       lu_factor(n, ws.M);
       lu_solve(n, ws.M, ws.lam);
-      for (int refinement = 0; refinement < 2; refinement++) {
+      // An active row has w = 0 up to rounding; refine where an ill-conditioned set leaves more.
+      for (int refinement = 0;; refinement++) {
         slack(n, ws);
-        for (int64_t i = 0; i < n; i++) ws.rhs[i] = select(ws.active[i], -ws.w[i], all(0));
+        Mask poor = Mask{};
+        for (int64_t i = 0; i < n; i++) poor |= ws.active[i] & (abs(ws.w[i]) > 1e-14 * ws.bound[i]);
+        if (refinement == 2 || !any(poor)) break;
+        for (int64_t i = 0; i < n; i++) ws.rhs[i] = select(ws.active[i] & poor, -ws.w[i], all(0));
         lu_solve(n, ws.M, ws.rhs);
         for (int64_t i = 0; i < n; i++) ws.lam[i] += ws.rhs[i];
       }
-      slack(n, ws);
       // Negative beyond rounding. The tolerance grows slowly so that ill-conditioned sets cannot cycle for ever.
       const double tolerance = 1e-13 * (it < 20 ? 1 : it < 40 ? 10 : it < 60 ? 100 : 1000);
       auto infeasible = [&](int64_t i) -> Mask {
