@@ -29,8 +29,9 @@ class BatchedBackend(Backend):
     for bit on one instruction set. The problem has local optima: like IPOPT's, a solution is one of them.
 
     Attributes:
-        tol: projected gradient dJ/du at which a problem is solved.
-        max_iter: iteration limit of one solve.
+        tol: projected gradient dJ/du at which a problem is solved, or 1e-12 of the terms that sum to it where that is
+            more.
+        max_iter: iteration limit of one solve. What fails is solved once more, cold and along a longer homotopy.
         restarts: number of starts; the best optimum wins. 1 starts from the guess or from zero action, further ones
             from random actions inside the bounds, the same for every element.
         seed: seed of the random starts.
