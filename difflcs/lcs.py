@@ -25,8 +25,45 @@ from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, NotPo
 from difflcs.lcp import solve_lcp
 
 
+class SystemMatrices:
+    """Sizes and equations of whatever holds the matrices of an LCS, shared or one per batch element."""
+
+    A: Tensor
+    B: Tensor
+    C: Tensor
+    d: Tensor
+    D: Tensor
+    E: Tensor
+    F: Tensor
+    c: Tensor
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return self.A.shape[-1]
+
+    @property
+    def n_u(self) -> int:
+        """Number of actions."""
+        return self.B.shape[-1]
+
+    @property
+    def n_lam(self) -> int:
+        """Number of complementarity variables."""
+        return self.F.shape[-1]
+
+    def next_state(self, x: Tensor, u: Tensor, lam: Tensor) -> Tensor:
+        """A x + B u + C λ + d, (..., n_x)."""
+        return matvec(self.A, x) + matvec(self.B, u) + matvec(self.C, lam) + self.d
+
+    def gap(self, x: Tensor, u: Tensor, lam: Tensor | None = None) -> Tensor:
+        """D x + E u + c, plus F λ if given, (..., n_lam)."""
+        gap = matvec(self.D, x) + matvec(self.E, u) + self.c
+        return gap if lam is None else gap + matvec(self.F, lam)
+
+
 @dataclass(frozen=True)
-class LCSParams:
+class LCSParams(SystemMatrices):
     """The matrices of one linear complementarity system, or of one per batch element (Eq. lcs of the paper).
 
     x₊ = A x + B u + C λ + d,  0 ≤ λ ⊥ D x + E u + F λ + c ≥ 0,  with F + Fᵀ ≻ 0, so that λ is unique.
@@ -80,21 +117,6 @@ class LCSParams:
         check_positive_definite(self.F)
 
     @property
-    def n_x(self) -> int:
-        """Number of states."""
-        return self.A.shape[-1]
-
-    @property
-    def n_u(self) -> int:
-        """Number of actions."""
-        return self.B.shape[-1]
-
-    @property
-    def n_lam(self) -> int:
-        """Number of complementarity variables."""
-        return self.F.shape[-1]
-
-    @property
     def batch_shape(self) -> torch.Size:
         """Leading batch dimensions; empty when every field is shared."""
         return broadcast_batch(
@@ -109,15 +131,6 @@ class LCSParams:
     def detach(self) -> LCSParams:
         """The same numbers without gradient history."""
         return replace(self, **{k: v.detach() for k, v in self.tensors().items()})
-
-    def next_state(self, x: Tensor, u: Tensor, lam: Tensor) -> Tensor:
-        """A x + B u + C λ + d, (..., n_x)."""
-        return matvec(self.A, x) + matvec(self.B, u) + matvec(self.C, lam) + self.d
-
-    def gap(self, x: Tensor, u: Tensor, lam: Tensor | None = None) -> Tensor:
-        """D x + E u + c, plus F λ if given, (..., n_lam)."""
-        gap = matvec(self.D, x) + matvec(self.E, u) + self.c
-        return gap if lam is None else gap + matvec(self.F, lam)
 
 
 def check_positive_definite(F: Tensor) -> None:

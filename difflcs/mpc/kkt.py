@@ -143,7 +143,7 @@ def residual(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
 def _backward(problem: MPCProblem, primal: Primal) -> tuple[Multipliers, list[tuple[Tensor, Tensor, Tensor]]]:
     """Multipliers, and per stage the LU factors of M, their pivots, and λ + s."""
     x, u, lam = primal
-    s = problem.slack(*(v.transpose(0, 1) for v in (x[:, :-1], u, lam))).transpose(0, 1)
+    s = problem.gap(*(v.transpose(0, 1) for v in (x[:, :-1], u, lam))).transpose(0, 1)
     size = lam + s
     b = lam / size
     M = torch.diag_embed(1 - b) + b.unsqueeze(-1) * (problem.F if problem.shared("F") else problem.F.unsqueeze(1))

@@ -105,7 +105,10 @@ class LCSMPCLayer(nn.Module):
 
     def extra_repr(self) -> str:
         """What print(layer) shows."""
-        return f"horizon={self.horizon}, relaxation={self.relaxation:g}, backend={self.backend}, {self.on_failure=}"
+        return (
+            f"horizon={self.horizon}, relaxation={self.relaxation:g}, backend={self.backend}, "
+            f"on_failure={self.on_failure!r}"
+        )
 
     def forward(
         self,

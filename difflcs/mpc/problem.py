@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_number, check_positive_int, check_same_device
-from difflcs._linalg import matvec, quadratic
+from difflcs._linalg import quadratic
 from difflcs.errors import BoundsError, ShapeError
 from difflcs.lcp import solve_lcp_arrays
+from difflcs.lcs import SystemMatrices
 
 # Differentiable inputs with the kind of each trailing dimension, in the order in which autograd sees them.
 INPUTS: dict[str, tuple[str, ...]] = {
@@ -49,7 +50,7 @@ def check_bounds(u_min: Tensor, u_max: Tensor, strict: bool = False) -> None:
 
 
 @dataclass(frozen=True)
-class MPCProblem:
+class MPCProblem(SystemMatrices):
     """A batch of LCS-MPC problems (Eq. mpc_lcs) with relaxed complementarity.
 
         min Σ_{k<H} ½x_kᵀQx_k + qᵀx_k + ½u_kᵀRu_k + rᵀu_k + ½x_HᵀQ_final x_H + q_finalᵀx_H
@@ -111,21 +112,6 @@ class MPCProblem:
         """Number of problems."""
         return self.x0.shape[0]
 
-    @property
-    def n_x(self) -> int:
-        """Number of states."""
-        return self.A.shape[-1]
-
-    @property
-    def n_u(self) -> int:
-        """Number of actions."""
-        return self.B.shape[-1]
-
-    @property
-    def n_lam(self) -> int:
-        """Number of complementarity variables."""
-        return self.F.shape[-1]
-
     def shape(self, name: str) -> tuple[int, ...]:
         """Dimensions of one input without the batch."""
         return tuple(getattr(self, dim) for dim in INPUTS[name])
@@ -133,14 +119,6 @@ class MPCProblem:
     def shared(self, name: str) -> bool:
         """Whether the whole batch shares this input."""
         return getattr(self, name).ndim == len(INPUTS[name])
-
-    def next_state(self, x: Tensor, u: Tensor, lam: Tensor) -> Tensor:
-        """A x + B u + C λ + d for (batch, n) vectors."""
-        return matvec(self.A, x) + matvec(self.B, u) + matvec(self.C, lam) + self.d
-
-    def slack(self, x: Tensor, u: Tensor, lam: Tensor) -> Tensor:
-        """S = D x + E u + F λ + c for (batch, n) vectors."""
-        return matvec(self.D, x) + matvec(self.E, u) + matvec(self.F, lam) + self.c
 
     def objective(self, x: Tensor, u: Tensor) -> Tensor:
         """Cost (batch,) of trajectories x (batch, H+1, n_x), u (batch, H, n_u)."""
@@ -162,7 +140,7 @@ class MPCProblem:
         F = self.F.numpy()
         states, forces = [self.x0], []
         for k in range(self.horizon):
-            gap = matvec(self.D, states[-1]) + matvec(self.E, u[:, k]) + self.c
+            gap = self.gap(states[-1], u[:, k])
             lam = torch.from_numpy(solve_lcp_arrays(F, gap.numpy(), self.relaxation)[0])
             states.append(self.next_state(states[-1], u[:, k], lam))
             forces.append(lam)

@@ -60,7 +60,7 @@ class MPCSolution:
     def complementarity(self) -> Tensor:
         """(...) largest |λ·s − relaxation| over the horizon."""
         x, u, lam = self._flat()
-        slack = self.problem.slack(*_by_step(x[:, :-1], u, lam))
+        slack = self.problem.gap(*_by_step(x[:, :-1], u, lam))
         worst = (slack * lam.transpose(0, 1) - self.problem.relaxation).abs().amax((0, 2))
         return worst.reshape(self.status.shape).to(self.status.device)
 

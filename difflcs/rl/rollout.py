@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs.errors import DegenerateWarning, InvalidInputError, SolveWarning
+from difflcs.errors import InvalidInputError, SolveWarning
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
@@ -95,7 +95,6 @@ def mpc_actions(policy: Policy, u_min: Tensor | None = None, u_max: Tensor | Non
     def act(state: Tensor, goal: Tensor) -> tuple[np.ndarray, int]:
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore", SolveWarning)  # failures are counted and reported instead
-            warnings.simplefilter("ignore", DegenerateWarning)  # no gradient is taken here
             solution = policy(state, goal, u_min=u_min, u_max=u_max)
         return solution.action.numpy(), int((~solution.converged).sum())
 

@@ -403,7 +403,7 @@ class _Point:
         for k in range(H):
             in_u = slice(k * n_u, (k + 1) * n_u)
             in_lam = slice(H * n_u + k * n_lam, H * n_u + (k + 1) * n_lam)
-            s, S = problem.slack(x[k], u[:, k], lam[:, k]), problem.D @ X
+            s, S = problem.gap(x[k], u[:, k], lam[:, k]), problem.D @ X
             S[:, :, in_u] += problem.E
             S[:, :, in_lam] += problem.F
             row = beta[:, k, :, None] * S
