@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-EXTRAS := relaxed,rl,envs,viz,dev
+EXTRAS := all
 
 .PHONY: help demo test lint format clean
 
