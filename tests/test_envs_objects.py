@@ -237,6 +237,21 @@ def test_objects_slide_and_turn_when_pushed(name):
     assert deepest < 0.001
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.003, 0.005])
+def test_no_deep_contact_under_noisy_pushing(noise):
+    """Commands as exploration gives them: all tips towards the cube, with noise, clipped to ±15 mm."""
+    env = TriFingerMoveCubeEnv()
+    rng = np.random.default_rng(0)
+    deepest = 0.0
+    for seed in range(20):
+        state = env.reset(seed=seed)[0]["state"]
+        for _ in range(20):
+            inwards = (state[:2] - state[3:].reshape(3, 2)).ravel()
+            state = env.step(np.clip(0.5 * inwards + noise * rng.standard_normal(6), -0.015, 0.015))[0]["state"]
+            deepest = max(deepest, env.physics.max_penetration())
+    assert 0 < deepest < 0.001
+
+
 def test_turning_needs_an_off_centre_push():
     env = stand_in("sugar_box", horizon=50)
     tips = env.physics.home_tips(np.zeros(3))
@@ -344,11 +359,11 @@ def test_the_pivot_turns_and_stays():
 
 @pytest.mark.parametrize(("kp", "force"), [(1000.0, 0.45), (2500.0, 1.07), (6000.0, 2.4)])
 def test_force_of_a_blocked_fingertip(kp, force):
-    """Against a cube that is too heavy to move."""
+    """Against a cube that is too heavy to move, when the tip has come to rest there."""
     env = TriFingerMoveCubeEnv(osc_kp=kp, object_mass=50.0, reset_noise=0.0, horizon=200)
     env.reset(seed=0)
     push = np.concatenate([-0.015 * OUTWARD[0], np.zeros(4)])
-    for _ in range(12):
+    for _ in range(80):
         env.step(push)
     import mujoco
 
@@ -358,7 +373,7 @@ def test_force_of_a_blocked_fingertip(kp, force):
             wrench = np.zeros(6)
             mujoco.mj_contactForce(env.model, env.data, i, wrench)
             total += wrench[0]
-    assert total == pytest.approx(force, rel=0.15)
+    assert total == pytest.approx(force, rel=0.11)
 
 
 def test_part_of_a_command_reached_by_the_stiffest_controller():
