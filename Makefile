@@ -4,13 +4,14 @@ VENV := .venv
 BIN := $(VENV)/bin
 EXTRAS := all
 
-.PHONY: help demo test lint format clean
+.PHONY: help demo test lint format docs clean
 
 help:
 	@echo "make demo   learn a contact model and push the cube with it (runs/demo)"
 	@echo "make test   run the tests"
 	@echo "make lint   ruff and pyright"
 	@echo "make format let ruff put the code in order"
+	@echo "make docs   build the documentation (build/docs/index.html)"
 	@echo "make clean  remove .venv and build products"
 
 $(VENV)/.ready: pyproject.toml constraints.txt CMakeLists.txt cmake/kernels.cmake $(wildcard difflcs/_native/*.?pp envs/difflcs_envs/_native/*.?pp)
@@ -34,6 +35,10 @@ lint: $(VENV)/.ready
 format: $(VENV)/.ready
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+docs: $(VENV)/.ready
+	$(BIN)/python -m sphinx -W --keep-going -q -b html -d build/doctrees docs build/docs
+	@echo "written: build/docs/index.html"
 
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .ruff_cache

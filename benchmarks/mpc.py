@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import platform
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from models import ACTION_LIMIT, MODELS, pushing_model, states_and_goals
 import difflcs
 from difflcs import LCSModel, LCSMPCLayer, LCSParams, solve_lcp, violation_loss
 from difflcs._native import _kernels
+from difflcs.bench import best, cpu
 from difflcs.mpc.backends import BatchedBackend, IpoptBackend
 from difflcs.rl.tasks import pushing_cost
 
@@ -45,17 +45,6 @@ class Options:
     """Where the JSON goes."""
     smoke: bool = False
     """Everything tiny: seconds instead of minutes."""
-
-
-def best(repeats: int, work: Callable[[], object]) -> float:
-    """Shortest time [s] of several runs, after one that does not count."""
-    work()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return min(times)
 
 
 def layer(model: LCSModel | LCSParams, backend: BatchedBackend | IpoptBackend) -> LCSMPCLayer:
@@ -236,7 +225,7 @@ def main(o: Options) -> None:
     rows.append(("solve_lcp, 100 000 problems, n 8", f"{numbers['lcp']:.3f} s", ""))
     versions = {"difflcs": difflcs.__version__, "torch": torch.__version__, "casadi": casadi.__version__}
     record = {
-        "machine": {"cpu": _cpu(), "cores": os.cpu_count(), "instruction set": _kernels.isa()},
+        "machine": {"cpu": cpu(), "cores": os.cpu_count(), "instruction set": _kernels.isa()},
         "versions": {"python": platform.python_version(), **versions},
         "options": {
             "batch": o.batch,
@@ -252,14 +241,6 @@ def main(o: Options) -> None:
     for row in rows:
         print(f"{row[0]:56s} {row[1]:>14s}   {row[2]}")
     print(f"written to {o.out}")
-
-
-def _cpu() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 if __name__ == "__main__":

@@ -1,43 +1,45 @@
-"""The command line: `difflcs train | evaluate | render | demo | assets`.
+"""The command line: `difflcs train | evaluate | render | demo | zoo | assets | bench | doctor`.
 
 The only file of the package that knows both the library and the environments.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import torch
 
+from difflcs import zoo
 from difflcs._files import write_json
 from difflcs.errors import CheckpointError, DiffLCSError, InvalidInputError
 from difflcs.rl._optional import require, versions
 from difflcs.rl.checkpoint import RunDirectory, load_checkpoint
-from difflcs.rl.evaluate import Evaluation, evaluate
+from difflcs.rl.evaluate import evaluate
 from difflcs.rl.figures import plot_learning_curve, record_video
-from difflcs.rl.tasks import TASKS, Task, get_task
+from difflcs.rl.progress import Progress as _Progress
+from difflcs.rl.progress import bar, summary
+from difflcs.rl.tasks import TASKS, Task, get_task, pushing_cost
 from difflcs.rl.training import (
     EVALUATION_ENVS,
-    Report,
-    Reporter,
     TrainConfig,
-    load_policy,
     profile,
     saved_bounds,
     stored_config,
     train,
 )
+from difflcs.zoo import Learned
 
 if TYPE_CHECKING:
     import gymnasium
     from gymnasium.vector import VectorEnv
-    from tqdm import tqdm
 
 Goal = tuple[float, float, float]
 _SMOKE_GOALS = 4
@@ -48,12 +50,14 @@ _PICTURE = {"width": 640, "height": 480}
 class Train(TrainConfig):
     """Train a model and leave a run directory: model, log, checkpoints."""
 
-    out: Path | None = None
-    """Run directory to write; runs/<task>-<method>-<seed> by default."""
+    out: Path = Path("runs/{task}-{method}-{seed}")
+    """Run directory to write; {task}, {method} and {seed} are filled in."""
     init: Path | None = None
-    """Run or model directory to start from, instead of a random model."""
+    """Run or model directory, or zoo:NAME (see `difflcs zoo`), to start from; a random model if None."""
     resume: bool = False
     """Continue the run in --out, with its own settings and to the same result as without interruption."""
+    force: bool = False
+    """Replace the run in --out. It is deleted once the new one has begun."""
     smoke: bool = False
     """Finish in seconds, on too little data to learn anything."""
 
@@ -63,7 +67,10 @@ class Train(TrainConfig):
     @property
     def directory(self) -> Path:
         """The run directory."""
-        return self.out or Path("runs") / f"{self.task}-{self.method}-{self.seed}"
+        text = str(self.out)
+        for name in ("task", "method", "seed"):
+            text = text.replace(f"{{{name}}}", str(getattr(self, name)))
+        return Path(text)
 
     def run(self) -> None:
         """Run the command."""
@@ -78,6 +85,7 @@ class Train(TrainConfig):
                 _env_factory(config.task, self.directory),
                 init=self.init,
                 resume=self.resume,
+                force=self.force,
                 reporter=progress,
             )
         spent = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in profile(run.rows()).items() if seconds)
@@ -108,10 +116,10 @@ class Train(TrainConfig):
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Success rate of a run's model, without noise, with its 95 % interval."""
+    """Success rate of a learned model, without noise, with its 95 % interval."""
 
-    run_directory: Path
-    """Run directory."""
+    model: Path
+    """Run directory, or zoo:NAME for one of the models that `difflcs zoo` lists."""
     goals: int = 1000
     """Random goals, one episode each."""
     seed: int = 0
@@ -126,51 +134,64 @@ class Evaluate:
     def run(self) -> None:
         """Run the command."""
         goals = min(self.goals, _SMOKE_GOALS) if self.smoke else self.goals
-        run = RunDirectory.open(self.run_directory)
-        config, policy = stored_config(run), load_policy(run)
-        task = get_task(config.task)
-        checkpoint = load_checkpoint(run.checkpoints) if self.trust_region or not run.finished() else None
-        bounds = saved_bounds(checkpoint) if checkpoint is not None and self.trust_region else (None, None)
+        learned = Learned.open(self.model)
+        task = get_task(learned.task)
+        bounds = (None, None)
+        if self.trust_region:
+            if learned.run is None:
+                raise InvalidInputError(
+                    f"trust-region: expected a run, whose episodes give the bounds, got {learned.name}; drop the flag"
+                )
+            bounds = saved_bounds(load_checkpoint(learned.run.checkpoints))
         start = time.perf_counter()
-        envs = _env_factory(config.task)(max(1, min(EVALUATION_ENVS, goals)))
+        envs = _env_factory(learned.task)(max(1, min(EVALUATION_ENVS, goals)))
+        _compare(learned, _object(envs))
         try:
-            with _bar(goals * task.episode_steps, "evaluating") as bar:
-                result = evaluate(envs, policy, goals, self.seed, task.episode_steps, *bounds, after_step=bar.update)
+            with bar(goals * task.episode_steps, "evaluating") as shown:
+                result = evaluate(
+                    envs, learned.policy, goals, self.seed, task.episode_steps, *bounds, after_step=shown.update
+                )
         finally:
             envs.close()
         seconds = time.perf_counter() - start
-        if not run.finished() and not self.json:
-            print(f"{run.path} is not finished: evaluated its latest checkpoint")
         if self.json:
             record = {
                 **asdict(result),
-                "run": str(run.path),
-                "task": config.task,
+                "run": learned.name,
+                "task": learned.task,
                 "object": _object(envs),
-                "method": config.method,
-                "finished": run.finished(),
-                "backend": config.backend,
+                "trained_on": learned.object,
+                "method": learned.method,
+                "finished": learned.finished,
+                "backend": learned.backend,
                 "trust_region": self.trust_region,
+                "card": None if learned.card is None else asdict(learned.card),
                 "seconds": round(seconds, 3),
                 "versions": versions(),
             }
             print(json.dumps(record, sort_keys=True))
-        else:
-            print(_summary(result))
-            print(f"object: {_described(_object(envs))}")
-            print(f"goal seed {result.seed}, {config.task}, backend {config.backend}, {seconds:.1f} s, {_versions()}")
+            return
+        if not learned.finished:
+            print(f"{learned.name} is not finished: evaluated its latest checkpoint")
+        print(summary(result))
+        if learned.card is not None:
+            print(f"its card: {learned.card.success_text}, goal seed {learned.card.evaluation_seed}")
+        print(f"object: {_described(_object(envs))}")
+        print(f"goal seed {result.seed}, {learned.task}, backend {learned.backend}, {seconds:.1f} s, {_versions()}")
 
 
 @dataclass(frozen=True)
 class Render:
-    """Video of a run's policy, one episode after another."""
+    """Video of a learned model at work, one episode per goal."""
 
-    run_directory: Path
-    """Run directory."""
+    model: Path
+    """Run directory, or zoo:NAME for one of the models that `difflcs zoo` lists."""
     goal: tuple[Goal, ...] = ((0.04, 0.03, 0.3),)
     """Goals: x [m], y [m], yaw [rad] each; within ±0.06 m and ±0.5 rad."""
     out: Path = Path("video.mp4")
-    """Video to write."""
+    """Video to write, an MP4."""
+    force: bool = False
+    """Replace the video if there is one."""
     seed: int = 0
     """Seed of the initial states."""
     smoke: bool = False
@@ -178,11 +199,16 @@ class Render:
 
     def run(self) -> None:
         """Run the command."""
-        run = RunDirectory.open(self.run_directory)
         goals = self.goal[:1] if self.smoke else self.goal
         if not goals:
             raise InvalidInputError("goal: expected at least one goal of three numbers, got none")
-        reached = _record(run, goals, self.out, self.seed)
+        if self.out.suffix.lower() != ".mp4" or self.out.is_dir():
+            raise InvalidInputError(f"out: expected the name of an MP4 file, got {self.out}; pass --out video.mp4")
+        if self.out.exists() and not self.force:
+            raise InvalidInputError(
+                f"out: expected a new file, got {self.out}, which exists; pass --force to replace it, or another --out"
+            )
+        reached = _record(Learned.open(self.model), goals, self.out, self.seed)
         for goal, ok in zip(goals, reached, strict=True):
             print(f"goal {' '.join(f'{v:g}' for v in goal)}: {'reached' if ok else 'missed'}")
         print(f"written: {self.out}")
@@ -190,7 +216,7 @@ class Render:
 
 @dataclass(frozen=True)
 class Demo:
-    """Learn to push the cube from 6 minutes of data: success before and after, learning curve and video."""
+    """Learn to push the cube from 6 minutes of data; learning curve and video."""
 
     out: Path = Path("runs/demo")
     """Run directory. An existing demo is continued, not repeated."""
@@ -224,7 +250,7 @@ class Demo:
 
     def _video(self, run: RunDirectory, goals: Sequence[Goal]) -> str:
         try:
-            reached = _record(run, goals, run.path / "video.mp4", seed=0)
+            reached = _record(Learned.open(run.path), goals, run.path / "video.mp4", seed=0)
         except _NoPictureError as error:
             return f"none, {error}"  # the rest of the demo needs no OpenGL
         return f"{run.path / 'video.mp4'} ({sum(reached)} of {len(goals)} goals reached in it)"
@@ -239,15 +265,33 @@ class _NoPictureError(DiffLCSError):
 
 
 @dataclass(frozen=True)
+class Zoo:
+    """List the learned models that come with difflcs, for use as zoo:NAME."""
+
+    names: tuple[str, ...]
+    """Models whose whole cards to show; by default a line for each model."""
+    json: bool = False
+    """Print the cards as one JSON list."""
+
+    def run(self) -> None:
+        """Run the command."""
+        cards = [zoo.card(name) for name in self.names or zoo.names()]
+        if self.json:
+            print(json.dumps([asdict(card) for card in cards], sort_keys=True))
+        else:
+            print("\n\n".join(map(str, cards)) if self.names else zoo.table(cards))
+
+
+@dataclass(frozen=True)
 class Assets:
-    """Fetch the meshes of the YCB objects from the YCB site. Without them stand-ins of boxes and cylinders are used."""
+    """Fetch the meshes of the YCB objects; without them stand-ins are used."""
 
     action: Literal["download"]
     """What to do."""
     objects: tuple[str, ...]
-    """sugar_box, fish_can, banana, mug, wrench, clamp, large_clamp, extra_large_clamp; none for all."""
+    """sugar_box, fish_can, banana, mug, wrench, clamp, large_clamp, extra_large_clamp; by default all."""
     folder: Path | None = None
-    """Where to; by default where the environments look for them."""
+    """Where to put them. By default where the environments look for them."""
 
     def run(self) -> None:
         """Run the command."""
@@ -267,13 +311,70 @@ class Assets:
         return "run the same command again to continue"
 
 
+@dataclass(frozen=True)
+class Bench:
+    """Time the MPC layer here against IPOPT, in less than half a minute."""
+
+    batch: int = 1024
+    """Problems per call of backend batched."""
+    ipopt_batch: int = 8
+    """Problems per call of backend ipopt."""
+    repeats: int = 3
+    """Timings of each; the best counts."""
+    json: bool = False
+    """Print one JSON object instead of a table."""
+    smoke: bool = False
+    """Time a few problems only."""
+
+    def run(self) -> None:
+        """Run the command."""
+        from difflcs import bench
+
+        threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        sizes = (16, 2, 1) if self.smoke else (self.batch, self.ipopt_batch, self.repeats)
+        timings = bench.measure(pushing_cost(), 5, *sizes, threads=threads)
+        if self.json:
+            record = {"timings": [{**asdict(t), "ratio": t.ratio} for t in timings], "threads": threads}
+            print(json.dumps({**record, "batch": sizes[0], "ipopt_batch": sizes[1], "machine": bench.machine()}))
+        else:
+            print(bench.table(timings, threads))
+            print(
+                f"per problem, in batches of {sizes[0]} (ipopt: {sizes[1]}): 9 states, 6 actions, 5 contacts, 5 steps"
+            )
+            print(", ".join(f"{key} {value}" for key, value in bench.machine().items()))
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Say what works here: solvers, instruction set, extras, pictures, meshes."""
+
+    json: bool = False
+    """Print one JSON object instead of text."""
+
+    def run(self) -> int:
+        """Run the command."""
+        from difflcs import doctor
+
+        return doctor.main(self.json)
+
+
 _COMMANDS: dict[str, Callable[..., Any]] = {
     "train": Train,
     "evaluate": Evaluate,
     "render": Render,
     "demo": Demo,
+    "zoo": Zoo,
     "assets": Assets,
+    "bench": Bench,
+    "doctor": Doctor,
 }
+
+
+_DESCRIPTION = """Differentiable MPC through learned linear complementarity systems.
+
+  difflcs doctor                                            what works here
+  difflcs render zoo:trifinger-cube --out cube.mp4          a learned model
+  difflcs train --task cube --method lcs-rl --minutes 30    learn one"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -283,22 +384,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: words after `difflcs`; those of the process if None.
 
     Returns:
-        Exit code: 0, 2 after an error of ours, 130 after Ctrl-C.
+        Exit code: 0, 1 if `doctor` finds the library broken, 2 after an error of ours, 130 after Ctrl-C.
     """
     command: Any = None
+    words = list(sys.argv[1:] if arguments is None else arguments)
     try:
+        if words[:1] == ["doctor"] and importlib.util.find_spec("tyro") is None:  # it is there to say such things
+            return int(Doctor("--json" in words).run())
         require("tyro")
         import tyro
 
+        # `train` has settings for which None means something.
+        plain = {k: v if k == "train" else Annotated[v, tyro.conf.DisallowNone] for k, v in _COMMANDS.items()}
         command = tyro.extras.subcommand_cli_from_dict(
-            _COMMANDS,
+            cast(Any, plain),
             prog="difflcs",
-            description="Differentiable MPC through learned linear complementarity systems.",
-            args=arguments,
-            config=(tyro.conf.PositionalRequiredArgs, tyro.conf.FlagCreatePairsOff),
+            description=_DESCRIPTION,
+            args=words,
+            config=(
+                tyro.conf.PositionalRequiredArgs,
+                tyro.conf.PositionalMetavarFromFieldName,
+                tyro.conf.FlagCreatePairsOff,
+            ),
         )
         torch.set_num_threads(1)  # tensors of 100 × 9 do not gain from threads, and the MPC's workers need the cores
-        command.run()
+        return int(command.run() or 0)
     except DiffLCSError as error:
         print(f"difflcs: {error}", file=sys.stderr)
         return 2
@@ -306,7 +416,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         advice = command.interrupted() if hasattr(command, "interrupted") else "nothing was changed"
         print(f"\ndifflcs: interrupted; {advice}", file=sys.stderr)
         return 130
-    return 0
+
+
+def _compare(learned: Learned, found: dict[str, Any]) -> None:
+    """Say so if the object of the environment is not the one that the model was trained on."""
+    if learned.object is not None and not learned.fits(found):
+        print(
+            f"difflcs: {learned.name} was trained on {_described(learned.object)}, here it is "
+            f"{_described(found)}: do not compare their success; for the meshes see: difflcs assets --help",
+            file=sys.stderr,
+        )
 
 
 def _env_factory(name: str, run: Path | None = None) -> Callable[[int], VectorEnv]:
@@ -360,71 +479,23 @@ def _registered(name: str) -> Task:
     return task
 
 
-def _record(run: RunDirectory, goals: Sequence[Goal], path: Path, seed: int) -> list[bool]:
-    config = stored_config(run)
-    task = _registered(config.task)
+def _record(learned: Learned, goals: Sequence[Goal], path: Path, seed: int) -> list[bool]:
+    task = _registered(learned.task)
     require("imageio", "imageio_ffmpeg", "PIL")
     import gymnasium
 
     from difflcs_envs import RenderingError
 
-    policy = load_policy(run)
     env: gymnasium.Env = gymnasium.make(task.env_id, render_mode="rgb_array", **_PICTURE, **dict(task.env_kwargs))
     try:
-        return record_video(env, policy, goals, path, task.episode_steps, task.step_seconds, seed)
+        _compare(learned, cast(Any, env.unwrapped).object.describe())
+        return record_video(env, learned.policy, goals, path, task.episode_steps, task.step_seconds, seed)
     except RenderingError as error:
         raise _NoPictureError(str(error)) from error
+    except OSError as error:
+        raise InvalidInputError(f"out: expected a place to write {path}, got: {error}; choose another") from error
     finally:
         env.close()
-
-
-def _bar(total: int, label: str) -> tqdm:
-    require("tqdm")
-    from tqdm import tqdm
-
-    return tqdm(total=total, desc=label, unit="step", disable=None, dynamic_ncols=True, leave=False)
-
-
-class _Progress(Reporter):
-    """A progress bar on a terminal, and a line per evaluation everywhere."""
-
-    def __init__(self) -> None:
-        self.bar: tqdm | None = None
-
-    def __enter__(self) -> _Progress:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self.bar is not None:
-            self.bar.close()
-
-    def started(self, done: int, total: int) -> None:
-        self.bar = _bar(total, "training")
-        self.bar.update(done)
-
-    def stepped(self, env_steps: int) -> None:
-        if self.bar is not None:
-            self.bar.update(env_steps)
-
-    def iterated(self, iteration: Report) -> None:
-        if self.bar is not None:
-            names = [name for name in ("loss", "kl", "success") if hasattr(iteration, name)]
-            self.bar.set_postfix({name: f"{getattr(iteration, name):.2g}" for name in names})
-
-    def evaluating(self, minutes: float, goals: int) -> None:
-        if self.bar is not None:
-            self.bar.set_description(f"evaluating {goals} goals")
-
-    def evaluated(self, minutes: float, result: Evaluation) -> None:
-        if self.bar is not None:
-            self.bar.set_description("training")
-            self.bar.clear()
-        print(f"{minutes:4.1f} min of data: {_summary(result)}", flush=True)
-
-
-def _summary(result: Evaluation) -> str:
-    failures = f"{result.solver_failures} of {result.solves} solves failed"
-    return f"success {result}, {failures}" + (f", {result.unstable} episodes unstable" if result.unstable else "")
 
 
 def _from_row(row: dict[str, str]) -> str:
@@ -432,7 +503,7 @@ def _from_row(row: dict[str, str]) -> str:
     return f"{rate:.1f} % of {row['evaluation_goals']} goals (95 % interval {low:.1f} to {high:.1f} %)"
 
 
-def _described(thing: dict[str, Any]) -> str:
+def _described(thing: Mapping[str, Any]) -> str:
     return f"{thing['name']} ({thing['source'].replace('_', ' ')}, {1e3 * thing['mass']:g} g)"
 
 

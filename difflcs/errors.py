@@ -6,10 +6,21 @@ Every message says what was expected, what came, and how to mend it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 
 class DiffLCSError(Exception):
-    """Base class of every error difflcs raises on purpose."""
+    """Base class of every error difflcs raises on purpose.
+
+    Attributes:
+        page: the page of the documentation that helps, named at the end of the message.
+    """
+
+    page: ClassVar[str | None] = None
+
+    def __str__(self) -> str:
+        message = super().__str__()
+        return f"{message} (see {self.page})" if self.page else message
 
 
 class InvalidInputError(DiffLCSError, ValueError):
@@ -19,9 +30,13 @@ class InvalidInputError(DiffLCSError, ValueError):
 class ShapeError(InvalidInputError):
     """A tensor has the wrong shape."""
 
+    page = "docs/notation.md"
+
 
 class DTypeError(InvalidInputError, TypeError):
     """A value has the wrong type or dtype."""
+
+    page = "docs/notation.md"
 
 
 class DeviceError(InvalidInputError):
@@ -39,25 +54,37 @@ class BoundsError(InvalidInputError):
 class NotPositiveDefiniteError(InvalidInputError):
     """F + Fᵀ is not positive definite, so that the LCP may have no or many solutions."""
 
+    page = "docs/theory.md"
+
 
 class GammaError(InvalidInputError):
     """The violation loss's γ is outside 0 < γ ≤ σ_min(F + Fᵀ)."""
+
+    page = "docs/theory.md"
 
 
 class MissingDependencyError(DiffLCSError, ImportError):
     """An optional package is not installed."""
 
+    page = "docs/quickstart.md"
+
 
 class BackendNotFoundError(DiffLCSError, LookupError):
     """No such MPC backend, or the package behind it is not installed."""
+
+    page = "docs/backends.md"
 
 
 class CheckpointError(DiffLCSError):
     """A checkpoint is missing, corrupt, or was written by something else."""
 
+    page = "docs/training.md"
+
 
 class DoubleBackwardError(DiffLCSError, RuntimeError):
     """Second derivatives were asked of a function that has first derivatives only."""
+
+    page = "docs/gradients.md"
 
 
 class SolveError(DiffLCSError, RuntimeError):
@@ -67,6 +94,8 @@ class SolveError(DiffLCSError, RuntimeError):
         elements: flat batch indices of the failures.
         status: the `Status` value of each of them.
     """
+
+    page = "docs/gradients.md"
 
     def __init__(self, message: str, elements: Sequence[int], status: Sequence[int]):
         super().__init__(message)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from difflcs import _files
+from difflcs import _files, _zoo
 from difflcs._checks import (
     broadcast_batch,
     check_number,
@@ -365,11 +365,17 @@ class LCSModel(nn.Module):
         _files.save_record(Path(directory), "LCSModel", self.config(), self.state_dict())
 
     @classmethod
-    def from_pretrained(cls, directory: str | os.PathLike[str]) -> LCSModel:
-        """Read what `save_pretrained` wrote.
+    def from_pretrained(cls, source: str | os.PathLike[str]) -> LCSModel:
+        """Read a model that ships with the package, or what `save_pretrained` wrote.
+
+        Args:
+            source: a directory, or a name that `difflcs zoo` lists, such as "trifinger-cube". A path that exists wins
+                over a name; "zoo:trifinger-cube" is the name in any case.
 
         Raises:
-            CheckpointError: files are missing, corrupt or of another kind; nothing is changed.
+            CheckpointError: files are missing, corrupt or of another kind, or no model has this name; nothing is
+                changed.
         """
-        config, tensors = _files.load_record(Path(directory), "LCSModel")
+        directory = _zoo.resolve(source)
+        config, tensors = _files.load_record(directory, "LCSModel")
         return cls.from_config(config, tensors, str(directory))

@@ -7,10 +7,12 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
+import torch
 
-from difflcs import cli
+from difflcs import LCSModel, cli
 from difflcs.errors import CheckpointError
 
 
@@ -35,21 +37,27 @@ def test_the_library_imports_none_of_this():
     assert not {"tyro", "gymnasium", "mujoco", "difflcs.rl", "difflcs.cli"} & set(loaded)
 
 
-@pytest.mark.parametrize("command", ["", "train", "evaluate", "render", "demo", "assets"])
-def test_help(capsys, command):
+@pytest.mark.parametrize("command", ["", *cli._COMMANDS])
+def test_help(capsys, command, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit) as exit_:
         cli.main([*command.split(), "--help"])
     assert exit_.value.code == 0
     text = capsys.readouterr().out
     wanted = {
-        "": "demo",
+        "": "zoo:trifinger-cube",
         "train": "--warmup.noise",
-        "evaluate": "--goals",
-        "render": "--goal",
+        "evaluate": "zoo:NAME",
+        "render": "--force",
         "demo": "--smoke",
-        "assets": "download",
+        "zoo": "--json",
+        "assets": "sugar_box",
+        "bench": "--ipopt-batch",
+        "doctor": "--json",
     }
     assert wanted[command] in text
+    words = [line for line in text.splitlines() if not line.startswith("usage")]
+    assert max(map(len, words)) <= 80
 
 
 @pytest.mark.parametrize(
@@ -62,6 +70,17 @@ def test_help(capsys, command):
         (["train", "--minutes", "-1"], "minutes"),
         (["train", "--resume"], "difflcs train"),
         (["train", "--init", "nowhere"], "nowhere"),
+        (["train", "--init", "zoo:teapot"], "trifinger-cube"),
+        (["train", "--minutes", "0"], "minutes"),
+        (["train", "--minutes", "nan"], "minutes"),
+        (["train", "--evaluate-goals", "0"], "evaluate_goals"),
+        (["train", "--final-goals", "-1"], "final_goals"),
+        (["train", "--method", "lcs-rl", "--minutes", "30", "--warmup-minutes", "0"], "warmup_minutes"),
+        (["evaluate", "zoo:trifinger-cube", "--goals", "0"], "goals"),
+        (["evaluate", "zoo:trifinger-cube", "--seed", "-1"], "seed"),
+        (["render", "zoo:trifinger-cube", "--goal"], "at least one goal"),
+        (["render", "zoo:trifinger-cube", "--out", "video.gif"], "MP4"),
+        (["bench", "--repeats", "0"], "repeats"),
         (["evaluate", "nowhere"], "difflcs train"),
         (["render", "nowhere"], "difflcs train"),
     ],
@@ -75,6 +94,18 @@ def test_mistakes_get_one_clean_message(capsys, tmp_path, arguments, message):
     assert err.startswith("difflcs: ")
     assert message in err
     assert "Traceback" not in err + out
+
+
+@pytest.mark.parametrize(
+    ("sizes", "dtype", "got"), [((4, 2, 3), "float64", "n_x=4"), ((9, 6, 3), "float32", "float32")]
+)
+def test_a_model_of_another_kind_is_refused_before_anything_is_written(capsys, tmp_path, sizes, dtype, got):
+    LCSModel(*sizes, dtype=getattr(torch, dtype)).save_pretrained(tmp_path / "model")
+    code, _, err = run(capsys, "train", "--smoke", "--init", tmp_path / "model", "--out", tmp_path / "run")
+    assert code == 2
+    assert "init: expected a model with n_x=9, n_u=6, float64" in err
+    assert got in err
+    assert not (tmp_path / "run").exists()
 
 
 def test_bad_nested_settings_are_refused(capsys):
@@ -172,6 +203,71 @@ def test_an_existing_run_is_not_overwritten(capsys, finished):
     assert {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()} == before
 
 
+def contents(path):
+    return {file.relative_to(path): file.read_bytes() for file in path.rglob("*") if file.is_file()}
+
+
+def test_force_replaces_a_run_once_the_new_one_has_begun(capsys, tmp_path, monkeypatch):
+    path = tmp_path / "run"
+    short = ["--smoke", "--minutes", 0.1, "--final-goals", 0, "--out", path, "--force"]
+    assert run(capsys, "train", *short)[0] == 0  # nothing there yet
+    (path / "notes.txt").write_text("mine")
+    before = contents(path)
+    for arguments, message in (
+        (["--backend", "magic"], "magic"),
+        (["--init", "nowhere"], "nowhere"),
+        (["--init", path], "outside the run"),
+        (["--init", path / "model"], "outside the run"),
+        (["--resume"], "force: expected without resume"),
+    ):
+        code, _, err = run(capsys, "train", *short, *arguments)
+        assert (code, message in err) == (2, True), err
+        assert contents(path) == before
+    with monkeypatch.context() as patch:  # interrupted before it begins
+        patch.setattr("difflcs.rl.training._make_trainer", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert run(capsys, "train", *short, "--seed", 1)[0] == 130
+    assert contents(path) == before
+    assert run(capsys, "train", *short, "--seed", 1)[0] == 0
+    assert json.loads((path / "config.json").read_text())["config"]["seed"] == 1
+    assert not (path / "notes.txt").exists()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize("content", [None, "{}", "not json", '{"kind": "LCSModel"}'])
+def test_force_never_replaces_what_is_not_a_run(capsys, tmp_path, content):
+    path = tmp_path / "thesis"
+    path.mkdir()
+    (path / "chapter.tex").write_text("years of work")
+    if content is not None:
+        (path / "config.json").write_text(content)
+    before = contents(path)
+    code, _, err = run(capsys, "train", "--smoke", "--out", path, "--force")
+    assert code == 2
+    assert "--force replaces runs only" in err
+    assert contents(path) == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["thesis"]
+    file = tmp_path / "file"
+    file.write_text("text")
+    assert run(capsys, "train", "--smoke", "--out", file, "--force")[0] == 2
+    assert file.read_text() == "text"
+
+
+def test_the_default_run_directory_says_what_is_in_it():
+    assert str(cli.Train(task="mug", method="lcs-rl", seed=7).directory) == os.path.join("runs", "mug-lcs-rl-7")
+    assert str(cli.Train(out=Path("a/{seed}/{other}"), seed=7).directory) == os.path.join("a", "7", "{other}")
+
+
+def test_bench(capsys):
+    code, out, _ = run(capsys, "bench", "--smoke")
+    assert code == 0
+    assert "forward + backward" in out
+    record = json.loads(run(capsys, "bench", "--smoke", "--json")[1])
+    for timing in record["timings"]:
+        assert timing["ratio"] == pytest.approx(timing["ipopt"] / timing["batched"])
+        assert min(timing["batched"], timing["threads"], timing["ipopt"]) > 0
+    assert [timing["work"] for timing in record["timings"]] == ["forward", "forward + backward"]
+
+
 def test_resume_after_any_crash_gives_the_same_run(capsys, finished, tmp_path, monkeypatch):
     """Die after the checkpoint of iteration 1, then between log and checkpoint of 2, then before the final model."""
     path = tmp_path / "run"
@@ -223,9 +319,21 @@ def test_render(capsys, finished, tmp_path):
     assert "goal 0.04 0.03 0.3: " in out
     assert video.stat().st_size > 10_000
     assert [path.name for path in video.parent.iterdir()] == ["video.mp4"]
-    code, _, err = run(capsys, "render", finished, "--goal", 0.4, 0.03, 0.3, "--out", video)
+    before = video.read_bytes()
+    code, _, err = run(capsys, "render", finished, "--out", video)
+    assert code == 2
+    assert "--force" in err
+    code, _, err = run(capsys, "render", finished, "--goal", 0.4, 0.03, 0.3, "--out", video, "--force")
     assert code == 2
     assert "expected [-0.06" in err
+    assert video.read_bytes() == before
+    assert run(capsys, "render", "zoo:trifinger-cube", "--smoke", "--out", video, "--force")[0] == 0
+    assert video.read_bytes() != before
+    file = tmp_path / "file"
+    file.write_text("no folder")
+    code, _, err = run(capsys, "render", finished, "--smoke", "--out", file / "video.mp4")
+    assert code == 2
+    assert "choose another" in err
 
 
 def test_demo(capsys, tmp_path):

@@ -19,7 +19,8 @@ from difflcs.rl.training import TrainConfig, profile
 pytest.importorskip("mujoco")
 pytest.importorskip("torchrl")
 
-METHODS = ("lcs-rl", "ppo", "pddm")
+METHODS = ("lcs-rl", "ppo", "ppo-mlp", "pddm")
+WITHOUT_LCS = ("ppo-mlp", "pddm")
 
 
 def run(capsys, *arguments) -> tuple[int, str, str]:
@@ -55,6 +56,7 @@ def test_train_and_evaluate(capsys, finished, method):
     wanted = {
         "lcs-rl": {"collect", "learn", "physics", "solve", "gradient", "value"},
         "ppo": {"physics", "solve", "gradient", "value"},
+        "ppo-mlp": {"physics", "solve", "gradient", "value"},
         "pddm": {"collect", "learn"},
     }
     assert {name for name, seconds in spent.items() if seconds > 0} == wanted[method] | {"evaluation"}
@@ -66,7 +68,7 @@ def test_train_and_evaluate(capsys, finished, method):
         del records[-1]["seconds"]
     assert records[0] == records[1]
     assert records[0]["method"] == method
-    if method != "pddm":
+    if method not in WITHOUT_LCS:
         assert isinstance(RunDirectory.open(path).load_model(), LCSModel)
 
 
@@ -122,11 +124,22 @@ def test_init_starts_from_another_run(capsys, finished, tmp_path):
     first = RunDirectory.open(out).rows()[1]
     assert first["env_steps"] == "100"
     assert torch.isfinite(RunDirectory.open(out).load_model().A).all()
-    for source in (finished["pddm"], finished["pddm"] / "model"):
-        code, _, err = run(capsys, "train", "--smoke", "--out", tmp_path / "no", "--init", source)
-        assert code == 2
-        assert "PDDM" in err
-        assert not (tmp_path / "no").exists()
+    for method, kind in (("pddm", "PDDM"), ("ppo-mlp", "MLP")):
+        for source in (finished[method], finished[method] / "model"):
+            code, _, err = run(capsys, "train", "--smoke", "--out", tmp_path / "no", "--init", source)
+            assert code == 2
+            assert kind in err
+            assert not (tmp_path / "no").exists()
+
+
+@pytest.mark.parametrize("method", WITHOUT_LCS)
+def test_networks_start_from_no_lcs(capsys, finished, tmp_path, method):
+    code, _, err = run(
+        capsys, "train", "--smoke", "--method", method, "--out", tmp_path / "no", "--init", finished["ppo"]
+    )
+    assert code == 2
+    assert f"none with method {method}" in err
+    assert not (tmp_path / "no").exists()
 
 
 def test_checkpoints_of_another_method_are_refused(capsys, finished, tmp_path):

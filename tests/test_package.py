@@ -18,7 +18,7 @@ HEAVY = (
     "casadi", "cvxpy", "cvxpylayers", "torchrl", "tensordict", "gymnasium", "mujoco", "tyro", "scipy", "matplotlib",
     "trimesh", "coacd", "numba", "safetensors", "tqdm", "tensorboard", "imageio", "dask",
 )  # fmt: skip
-LAYERS = [{"errors"}, {"lcs", "lcp", "losses", "cost"}, {"mpc"}, {"rl", "zoo"}, {"cli"}]
+LAYERS = [{"errors"}, {"lcs", "lcp", "losses", "cost"}, {"systems"}, {"mpc"}, {"rl", "zoo"}, {"bench", "doctor", "cli"}]
 
 
 def run(code):

@@ -1,5 +1,6 @@
 """The stochastic policy as a TorchRL actor, on the small pushing system of `conftest`."""
 
+import doctest
 import math
 import subprocess
 import sys
@@ -20,7 +21,8 @@ from torchrl.envs import ClipTransform, GymWrapper, TransformedEnv
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
 
-from difflcs.rl.policy import LCSMPCPolicy
+from difflcs.rl.mlp import MLPController
+from difflcs.rl.policy import LCSMPCPolicy, MLPPolicy
 
 U_MAX = 0.1
 STD = 0.02
@@ -231,10 +233,54 @@ def test_in_torchrls_own_loop(mpc):
     value.backward()
 
 
+@pytest.mark.filterwarnings(
+    "ignore:Creating .* which inherits from WeightUpdaterBase"
+)  # importing TorchRL's collectors
+@pytest.mark.filterwarnings("ignore:The env passed to Collector is missing transforms")  # of TorchRL 0.14 to 0.15
+def test_the_example_trains_in_plain_torchrl():
+    """The docstring's example is run: TorchRL's Collector, GAE, loss and optimiser, and our environment and policy."""
+    pytest.importorskip("mujoco")
+    found = {"torch": torch}
+    before = LCSModel(9, 6, 8).state_dict()
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        exec(doctest.script_from_examples(LCSMPCPolicy.__doc__), found)
+    data, loss, lcs = found["data"], found["loss"], found["lcs"]
+    assert data.batch_size == (4, 20)
+    assert bool(data["next", "truncated"][:, -1].all())
+    moved = data["next", "state"][..., 3:] - data["state"][..., 3:]
+    assert 0.001 < float(moved.abs().mean()) < 0.015
+    assert float(loss["kl_approx"]) == pytest.approx(0, abs=1e-9)  # re-solved from the rollout's own plans
+    assert lcs.state_dict().keys() == before.keys()
+    for name, parameter in lcs.named_parameters():
+        assert bool(torch.isfinite(parameter.grad).all()), name
+        assert bool(parameter.grad.any()), name
+        assert float(parameter.detach().abs().max()) > 1e-3 or name == "c", name  # further than any initial value
+
+
 def test_the_library_does_not_import_torchrl():
     code = "import sys, difflcs, difflcs.rl; print(*sys.modules)"
     loaded = subprocess.check_output([sys.executable, "-c", code], text=True).split()
     assert not {"torchrl", "tensordict"} & set(loaded)
+
+
+def test_a_network_instead_of_the_mpc():
+    high = torch.tensor([0.1, 0.2], dtype=torch.float64)
+    network = MLPController(
+        lambda state, goal, elapsed: torch.cat([state, goal, elapsed[..., None]], -1), 4, -high, high
+    )
+    policy = MLPPolicy(network, STD)
+    assert policy.in_keys == ["state", "goal", "elapsed"]
+    assert policy.learned is policy.controller is network
+    data = observations(500)
+    data["elapsed"] = torch.linspace(0, 1, 500, dtype=torch.float64)
+    policy(data)
+    torch.testing.assert_close(data["loc"], network.mean(data["state"], data["goal"], data["elapsed"]))
+    noise = (data["action"] - data["loc"]).detach()
+    torch.testing.assert_close(noise.std(0), policy.std, rtol=0.15, atol=0.0)
+    policy.get_dist(data.select(*policy.in_keys)).log_prob(data["action"].detach()).sum().backward()
+    assert all(bool(p.grad.any()) for p in network.parameters())
+    assert bool(policy.gaussian.log_std.grad.any())  # learned by default, as is usual for networks
 
 
 def test_a_model_of_ones_own_stays_the_same_object():

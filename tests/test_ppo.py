@@ -17,6 +17,7 @@ pytest.importorskip("torchrl")
 from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
 from difflcs.rl.evaluate import evaluate
 from difflcs.rl.phases import LCSRL
+from difflcs.rl.policy import make_actor
 from difflcs.rl.ppo import PPO, PPOConfig, _trimmed_mean
 from difflcs.rl.warmup import Warmup, WarmupConfig
 
@@ -91,14 +92,13 @@ def small_config(**changes) -> PPOConfig:
 
 
 def make_ppo(seed: int = 0, iterations: int = 4, env=None, **changes) -> PPO:
-    lcs = make_model()
     env = make_envs() if env is None else env
     total = iterations * ROLLOUTS
+    config = small_config(**changes)
     return PPO(
-        lcs,
-        make_mpc(lcs),
+        make_actor(make_mpc(make_model()), config),
         env,
-        small_config(**changes),
+        config,
         seed,
         features=features,
         total_episodes=total,
@@ -123,7 +123,8 @@ def test_ppo_learns():
     config = small_config(
         rollouts=40, steps=10, learning_rate=0.02, std=0.04, target_kl=0.2, max_kl=0.6, value_first_epochs=60
     )
-    trainer = PPO(lcs, make_mpc(lcs), env, config, 0, features=features, total_episodes=320, episode_steps=STEPS)
+    actor = make_actor(make_mpc(lcs), config)
+    trainer = PPO(actor, env, config, 0, features=features, total_episodes=320, episode_steps=STEPS)
     before = evaluate(env, trainer.policy, 60, 0, STEPS).success_rate
     reports = []
     while not trainer.done:
@@ -229,6 +230,60 @@ def test_jumps_are_left_out():
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-8)
 
 
+def test_long_gradients_of_single_samples_are_clipped():
+    """Against a loop over the samples; the deviation's gradient and the violation loss are not clipped."""
+    options = {"steps": 1, "learn_std": True, "beta": 0.7, "violation_batch": 1000}
+    trainer = make_ppo(sample_clip=1.5, **options)
+    data, rollouts = prepared(trainer)
+    trainer._improve(data, rollouts, 1.0)
+    found = {name: p.grad.clone() for name, p in trainer.lcs.named_parameters() if p.grad is not None}
+
+    other = make_ppo(**options)
+    advantage = data["advantage"].squeeze(-1)
+    advantage = (advantage - advantage.mean()) / advantage.std(correction=0)
+    parameters = {name: p for name, p in other.lcs.named_parameters() if p.requires_grad}
+    gradients = []
+    for i in range(len(data)):
+        mean = other.policy(data["state"][i], data["goal"][i]).action
+        log_prob = -0.5 * ((data["action"][i] - mean) / other.config.std).square().sum()
+        loss = -0.7 * advantage[i] * log_prob / len(data)
+        gradients.append(torch.autograd.grad(loss, parameters.values(), allow_unused=True, materialize_grads=True))
+    lengths = torch.stack([torch.cat([g.flatten() for g in sample]).norm() for sample in gradients])
+    limit = 1.5 * lengths[lengths > 0].median()
+    factors = (limit / lengths).clamp_max(1.0)
+    assert 0 < int((factors < 1).sum()) < len(data) // 2
+    (0.3 * other._violation(rollouts, np.random.default_rng(0))).backward()
+    for k, (name, p) in enumerate(parameters.items()):
+        clipped = sum(factor * sample[k] for factor, sample in zip(factors, gradients, strict=True))
+        torch.testing.assert_close(found[name], clipped + p.grad, rtol=1e-5, atol=1e-8)
+    other._improve(data, rollouts, 1.0)
+    assert torch.equal(trainer.actor.gaussian.log_std.grad, other.actor.gaussian.log_std.grad)
+    assert any(not torch.allclose(found[name], p.grad, rtol=1e-2) for name, p in parameters.items())
+
+
+def test_a_limit_that_no_sample_reaches_changes_nothing():
+    limited, free = make_ppo(sample_clip=1e9), make_ppo()
+    for trainer in (limited, free):
+        trainer.step()
+    for a, b in zip(parameters(limited), parameters(free), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize(("size", "sizes"), [(None, [72, 72, 72]), (30, [30, 30, 12]), (100, [72, 72, 72])])
+def test_minibatches(size, sizes):
+    """Every sample once before any is drawn again, each from its own last plan."""
+    trainer = make_ppo(steps=3, minibatch=size, max_kl=100.0)
+    data, rollouts = prepared(trainer)
+    seen = []
+    trainer.actor.gaussian.register_forward_hook(lambda _, inputs, __: seen.append(inputs[0].clone()))
+    assert trainer._improve(data, rollouts, 1.0).steps == 3
+    assert [len(batch) for batch in seen] == sizes
+    states = torch.cat([batch["state"] for batch in seen]).sort(0).values[:: 3 if sizes[0] == 72 else 1]
+    torch.testing.assert_close(states, data["state"].sort(0).values, rtol=0, atol=0)
+    for batch in seen:  # a guess belongs to its state
+        torch.testing.assert_close(batch["guess", "x"][:, 0], batch["state"], rtol=0, atol=1e-9)
+
+
 def test_trimmed_mean():
     assert _trimmed_mean(torch.tensor([17.0, 1.0, 2.0, 3.0]), 0.75) == 2.0
     assert _trimmed_mean(torch.tensor([17.0]), 0.5) == 17.0
@@ -297,10 +352,10 @@ def test_learned_and_annealed_deviation():
 
 
 def test_the_budget_is_met_exactly():
-    lcs = make_model()
+    actor = make_actor(make_mpc(make_model()), small_config())
     for total in (ROLLOUTS - 5, 2 * ROLLOUTS + 1, 3 * ROLLOUTS):
         trainer = PPO(
-            lcs, make_mpc(lcs), make_envs(), small_config(), 0, features=features, total_episodes=total + 7,
+            actor, make_envs(), small_config(), 0, features=features, total_episodes=total + 7,
             episode_steps=STEPS, first_episode=7,
         )  # fmt: skip
         assert sum(trainer._sizes) == total
@@ -389,6 +444,8 @@ def test_restore_refuses_what_does_not_fit():
         ({"covariance": "full"}, "learn_std"),
         ({"final_std": 0.1, "learn_std": True}, "final_std"),
         ({"learning_rate_factor": 0.5}, "learning_rate_factor"),
+        ({"minibatch": 0}, "minibatch"),
+        ({"sample_clip": 0.0}, "sample_clip"),
     ],
 )
 def test_bad_settings_are_refused(change, message):
@@ -397,14 +454,17 @@ def test_bad_settings_are_refused(change, message):
 
 
 def test_bad_arguments_are_refused():
-    lcs = make_model()
     options = {"features": features, "total_episodes": 20, "episode_steps": STEPS}
+    mpc, config = make_mpc(make_model()), small_config()
+    actor = make_actor(mpc, config)
     with pytest.raises(InvalidInputError, match="at least 12 environments, got 3"):
-        PPO(lcs, make_mpc(lcs), make_envs(3), small_config(), 0, **options)
-    with pytest.raises(InvalidInputError, match="another model"):
-        PPO(lcs, make_mpc(make_model()), make_envs(), small_config(), 0, **options)
+        PPO(actor, make_envs(3), config, 0, **options)
+    with pytest.raises(InvalidInputError, match="use an LCSModel"):
+        PPO(make_actor(make_mpc(mpc.lcs.params().detach()), config), make_envs(), config, 0, **options)
+    with pytest.raises(InvalidInputError, match="learn_std=True"):
+        PPO(actor, make_envs(), replace(config, learn_std=True), 0, **options)
     with pytest.raises(InvalidInputError, match="shorten the warm-up"):
-        PPO(lcs, make_mpc(lcs), make_envs(), small_config(), 0, **options, first_episode=20)
+        PPO(actor, make_envs(), config, 0, **options, first_episode=20)
 
 
 # --- both phases ---
@@ -420,8 +480,9 @@ def make_lcsrl(seed: int = 0) -> LCSRL:
 
     def make_main(first_episode: int, first_iteration: int) -> PPO:
         return PPO(
-            lcs, mpc, make_envs(), small_config(), seed, features=features, total_episodes=8 + 2 * ROLLOUTS,
-            episode_steps=STEPS, first_episode=first_episode, first_iteration=first_iteration,
+            make_actor(mpc, small_config()), make_envs(), small_config(), seed, features=features,
+            total_episodes=8 + 2 * ROLLOUTS, episode_steps=STEPS, first_episode=first_episode,
+            first_iteration=first_iteration,
         )  # fmt: skip
 
     return LCSRL(warmup, 8 * STEPS, make_main)

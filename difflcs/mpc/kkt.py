@@ -322,7 +322,7 @@ def vjp(
         solved: (batch,) bool; elements that are not contribute exactly zero.
 
     Returns:
-        One tensor per name in `INPUTS`, shaped like the input: summed over the batch where the input is shared.
+        One tensor per name in `INPUTS`, shaped like the input and summed over the batch where the input is shared.
     """
     x_bar, u_bar, lam_bar, objective_bar = grads
     w = _solve(problem, lin, x_bar, u_bar, lam_bar)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from difflcs.rl.checkpoint import Checkpoint, RunDirectory, load_checkpoint, save_checkpoint
 from difflcs.rl.evaluate import Evaluation, evaluate, wilson_interval
+from difflcs.rl.mlp import MLPConfig, MLPController
 from difflcs.rl.pddm import PDDM, PDDMConfig
 from difflcs.rl.phases import LCSRL
 from difflcs.rl.ppo import PPO, PPOConfig
@@ -15,7 +16,7 @@ from difflcs.rl.training import Reporter, TrainConfig, load_model, load_policy, 
 from difflcs.rl.warmup import Warmup, WarmupConfig, fit, trust_region
 
 if TYPE_CHECKING:
-    from difflcs.rl.policy import LCSMPCPolicy
+    from difflcs.rl.policy import LCSMPCPolicy, MLPPolicy, make_actor
 
 __all__ = [
     "LCSRL",
@@ -25,6 +26,9 @@ __all__ = [
     "Checkpoint",
     "Evaluation",
     "LCSMPCPolicy",
+    "MLPConfig",
+    "MLPController",
+    "MLPPolicy",
     "PDDMConfig",
     "PPOConfig",
     "Reporter",
@@ -41,6 +45,7 @@ __all__ = [
     "load_checkpoint",
     "load_model",
     "load_policy",
+    "make_actor",
     "save_checkpoint",
     "train",
     "trust_region",
@@ -50,8 +55,8 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     # TorchRL takes seconds to import; warm-up and evaluation do without it.
-    if name == "LCSMPCPolicy":
-        from difflcs.rl.policy import LCSMPCPolicy
+    if name in ("LCSMPCPolicy", "MLPPolicy", "make_actor"):
+        from difflcs.rl import policy
 
-        return LCSMPCPolicy
+        return getattr(policy, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

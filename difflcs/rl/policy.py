@@ -1,8 +1,12 @@
-"""The stochastic policy: a Gaussian around the action of the MPC (Eq. stochastic_policy), as a TorchRL actor."""
+"""Stochastic policies as TorchRL actors: Gaussians around the action of the MPC (Eq. stochastic_policy) or a network's.
+
+They write "loc", "scale_tril", "action" and "action_log_prob", and are what `difflcs.rl.PPO` trains.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -10,9 +14,14 @@ from torch.distributions import MultivariateNormal
 
 from difflcs._checks import check_choice, check_number, check_tensor, describe
 from difflcs.errors import DTypeError, InvalidInputError, MissingDependencyError
+from difflcs.lcs import LCSModel, LCSParams
 from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.solution import Primal
 from difflcs.rl._optional import INSTALL
+from difflcs.rl.mlp import MLPController
+
+if TYPE_CHECKING:
+    from difflcs.rl.ppo import PPOConfig
 
 try:
     from tensordict import TensorDict, TensorDictBase
@@ -27,38 +36,30 @@ PLAN = ("x", "u", "lam")
 
 
 class GaussianParameters(TensorDictModuleBase):
-    """State and goal → mean and Cholesky factor of the Gaussian, and the plan behind the mean.
+    """Observations → mean and Cholesky factor of a Gaussian. Subclasses compute the mean.
 
-    Σ = L Lᵀ with L = diag(exp(log_std)) (I + strictly lower triangle of `mixing`).
+    Σ = L Lᵀ with L = diag(exp(log_std)) (I + strictly lower triangle of `mixing`), the same for all observations.
 
     Args:
-        mpc: the controller; its parameters are this module's.
         std: (n_u,) standard deviations.
         full: whether Σ may have off-diagonal entries.
         learn_std: whether Σ is learned.
-        in_keys: keys of state and goal.
+        in_keys: what the mean depends on.
+        out_keys: what is written besides "loc" and "scale_tril".
     """
 
-    def __init__(self, mpc: LCSMPCLayer, std: Tensor, full: bool, learn_std: bool, in_keys: Sequence[str]):
+    def __init__(self, std: Tensor, full: bool, learn_std: bool, in_keys: Sequence[str], out_keys: Sequence = ()):
         super().__init__()
         self.in_keys = list(in_keys)
-        self.out_keys = ["loc", "scale_tril", *(("plan", name) for name in PLAN), "converged"]  # pyright: ignore
-        self.mpc = mpc
+        self.out_keys = ["loc", "scale_tril", *out_keys]  # pyright: ignore
         self.log_std = nn.Parameter(std.log(), requires_grad=learn_std)
         n_u = len(std)
         self.mixing = nn.Parameter(torch.zeros(n_u, n_u, dtype=std.dtype), requires_grad=full and learn_std)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Solve the MPC, from the key "guess" where it is given, else cold."""
-        guess = tensordict.get("guess", None)
-        start = None if guess is None else Primal(*(guess[name] for name in PLAN))
-        state, goal = (tensordict[key] for key in self.in_keys)
-        solution = self.mpc(state, goal, guess=start)
-        plan = {name: getattr(solution, name).detach() for name in PLAN}
-        tensordict["loc"] = solution.action
+    def write(self, tensordict: TensorDictBase, mean: Tensor) -> TensorDictBase:
+        """Enter the Gaussian of mean (..., n_u)."""
+        tensordict["loc"] = mean
         tensordict["scale_tril"] = self.scale_tril().expand(*tensordict.batch_size, -1, -1)
-        tensordict["plan"] = TensorDict(plan, tensordict.batch_size)  # pyright: ignore[reportArgumentType]
-        tensordict["converged"] = solution.converged.unsqueeze(-1)
         return tensordict
 
     def scale_tril(self) -> Tensor:
@@ -67,7 +68,84 @@ class GaussianParameters(TensorDictModuleBase):
         return self.log_std.exp().unsqueeze(-1) * unit
 
 
-class LCSMPCPolicy(ProbabilisticActor):
+class MPCGaussian(GaussianParameters):
+    """State and goal → Gaussian around the MPC's action, and the plan behind it; see `LCSMPCPolicy`."""
+
+    def __init__(self, mpc: LCSMPCLayer, std: Tensor, full: bool, learn_std: bool, in_keys: Sequence[str]):
+        super().__init__(std, full, learn_std, in_keys, [*(("plan", name) for name in PLAN), "converged"])
+        self.mpc = mpc
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Solve the MPC, from the key "guess" where it is given, else cold."""
+        guess = tensordict.get("guess", None)
+        start = None if guess is None else Primal(*(guess[name] for name in PLAN))
+        state, goal = (tensordict[key] for key in self.in_keys)
+        solution = self.mpc(state, goal, guess=start)
+        plan = {name: getattr(solution, name).detach() for name in PLAN}
+        tensordict["plan"] = TensorDict(plan, tensordict.batch_size)  # pyright: ignore[reportArgumentType]
+        tensordict["converged"] = solution.converged.unsqueeze(-1)
+        return self.write(tensordict, solution.action)
+
+
+class MLPGaussian(GaussianParameters):
+    """State, goal and elapsed time → Gaussian around a network's action; see `MLPPolicy`."""
+
+    def __init__(self, network: MLPController, std: Tensor, full: bool, learn_std: bool):
+        super().__init__(std, full, learn_std, ("state", "goal", "elapsed"))
+        self.network = network
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Evaluate the network."""
+        return self.write(tensordict, self.network.mean(*(tensordict[key] for key in self.in_keys)))
+
+
+class GaussianPolicy(ProbabilisticActor):
+    """A TorchRL actor that draws from a Gaussian: what `difflcs.rl.PPO` needs to know of it.
+
+    Args:
+        parameters: writes mean and Cholesky factor.
+
+    Attributes:
+        gaussian: the same module.
+    """
+
+    def __init__(self, parameters: GaussianParameters):
+        n_u = len(parameters.log_std)
+        super().__init__(
+            parameters,  # pyright: ignore[reportArgumentType]
+            in_keys=["loc", "scale_tril"],
+            out_keys=["action"],
+            spec=Composite(action=Unbounded(torch.Size([n_u]), dtype=torch.float64)),
+            distribution_class=MultivariateNormal,
+            distribution_kwargs={"validate_args": False},
+            default_interaction_type=InteractionType.RANDOM,  # TorchRL's default is the mean
+            return_log_prob=True,
+        )
+        self.gaussian = parameters
+
+    @property
+    def learned(self) -> LCSModel | LCSParams | MLPController:
+        """The model behind the mean: what is trained and saved."""
+        raise NotImplementedError
+
+    @property
+    def controller(self) -> LCSMPCLayer | MLPController:
+        """The policy without noise, for `difflcs.rl.evaluate`."""
+        raise NotImplementedError
+
+    @property
+    def std(self) -> Tensor:
+        """(n_u,) standard deviation of each action component."""
+        return self.gaussian.scale_tril().detach().square().sum(-1).sqrt()
+
+    def set_std(self, std: float | Tensor) -> None:
+        """Replace Σ by a diagonal one, for annealing."""
+        with torch.no_grad():
+            self.gaussian.log_std.copy_(_std(std, len(self.gaussian.log_std)).log())
+            self.gaussian.mixing.zero_()
+
+
+class LCSMPCPolicy(GaussianPolicy):
     """u ~ N(u_MPC(x, goal), Σ): exploration around the first action of the plan.
 
     A TorchRL `ProbabilisticActor` on tensordicts of any batch size:
@@ -90,6 +168,32 @@ class LCSMPCPolicy(ProbabilisticActor):
     `data["guess"] = data["plan"]`, or the ratio is not 1 at unchanged parameters.
 
     Under `torchrl.envs.utils.set_exploration_type(ExplorationType.DETERMINISTIC)` the action is the mean.
+
+    Example:
+        A training step in plain TorchRL, without `difflcs.rl.PPO`:
+
+        >>> from torchrl.collectors import Collector
+        >>> from torchrl.envs import ClipTransform
+        >>> from torchrl.modules import MLP, ValueOperator
+        >>> from torchrl.objectives import ClipPPOLoss
+        >>> from torchrl.objectives.value import GAE
+        >>> from difflcs import LCSModel
+        >>> from difflcs.rl import LCSMPCPolicy, get_task
+        >>> from difflcs_envs.torchrl import make_env
+        >>> env = make_env("cube", num_envs=4)
+        >>> env.append_transform(ClipTransform(in_keys_inv=["action"], low=-0.015, high=0.015))
+        >>> lcs = LCSModel(n_x=9, n_u=6, n_lam=8, init_scale=1e-3)
+        >>> policy = LCSMPCPolicy(get_task("cube").make_policy(lcs))
+        >>> value = ValueOperator(MLP(13, 1, num_cells=[64, 64]).double(), in_keys=["state", "goal", "time_to_go"])
+        >>> gae = GAE(gamma=0.99, lmbda=0.95, value_network=value)
+        >>> ppo = ClipPPOLoss(policy, value, entropy_bonus=False)
+        >>> adam = torch.optim.Adam(ppo.parameters(), 6e-4)
+        >>> for data in Collector(env, policy, frames_per_batch=80, total_frames=80):  # 4 episodes
+        ...     gae(data)
+        ...     data["guess"] = data["plan"]
+        ...     loss = ppo(data)
+        ...     (loss["loss_objective"] + loss["loss_critic"]).backward()
+        ...     adam.step()
 
     Args:
         mpc: the controller; a learnable LCS in it is what is trained. `on_failure="mask"` keeps a batch going where
@@ -123,18 +227,9 @@ class LCSMPCPolicy(ProbabilisticActor):
                 'covariance: expected "diagonal" for a fixed Σ, got "full"; a correlation has to be learned, '
                 "pass learn_std=True"
             )
-        parameters = GaussianParameters(mpc, _std(std, n_u), covariance == "full", learn_std, in_keys)
-        super().__init__(
-            parameters,  # pyright: ignore[reportArgumentType]
-            in_keys=["loc", "scale_tril"],
-            out_keys=["action"],
-            spec=Composite(action=Unbounded(torch.Size([n_u]), dtype=torch.float64)),
-            distribution_class=MultivariateNormal,
-            distribution_kwargs={"validate_args": False},
-            default_interaction_type=InteractionType.RANDOM,  # TorchRL's default is the mean
-            return_log_prob=True,
-        )
-        self.gaussian = parameters
+        super().__init__(MPCGaussian(mpc, _std(std, n_u), covariance == "full", learn_std, in_keys))
+
+    gaussian: MPCGaussian
 
     @property
     def mpc(self) -> LCSMPCLayer:
@@ -142,19 +237,63 @@ class LCSMPCPolicy(ProbabilisticActor):
         return self.gaussian.mpc
 
     @property
-    def std(self) -> Tensor:
-        """(n_u,) standard deviation of each action component."""
-        return self.gaussian.scale_tril().detach().square().sum(-1).sqrt()
+    def learned(self) -> LCSModel | LCSParams:
+        """The LCS."""
+        return self.mpc.lcs
 
-    def set_std(self, std: float | Tensor) -> None:
-        """Replace Σ by a diagonal one, for annealing."""
-        with torch.no_grad():
-            self.gaussian.log_std.copy_(_std(std, len(self.gaussian.log_std)).log())
-            self.gaussian.mixing.zero_()
+    @property
+    def controller(self) -> LCSMPCLayer:
+        """The MPC."""
+        return self.mpc
 
     def clip(self, action: Tensor) -> Tensor:
         """What of a sample is executed: clipped into the controller's bounds."""
         return torch.minimum(torch.maximum(action, self.mpc.u_min), self.mpc.u_max)
+
+
+class MLPPolicy(GaussianPolicy):
+    """u ~ N(network(x, goal, elapsed), Σ): the reference point without a model.
+
+    Keys as of `LCSMPCPolicy`, besides: "elapsed" (...), the fraction of the episode that has passed, is read; there is
+    no guess, no plan and no "converged".
+
+    Args:
+        network: the mean.
+        std: standard deviation of each action component, a number or (n_u,) [units of the action].
+        covariance: "diagonal", or "full" to let a learned Σ have correlations.
+        learn_std: whether Σ is learned with the policy.
+
+    Raises:
+        InvalidInputError and its kinds: an argument does not fit.
+    """
+
+    def __init__(
+        self,
+        network: MLPController,
+        std: float | Tensor = 0.005,
+        covariance: str = "diagonal",
+        learn_std: bool = True,
+    ):
+        check_choice("covariance", covariance, ("diagonal", "full"))
+        super().__init__(MLPGaussian(network, _std(std, len(network.u_min)), covariance == "full", learn_std))
+
+    gaussian: MLPGaussian
+
+    @property
+    def learned(self) -> MLPController:
+        """The network."""
+        return self.gaussian.network
+
+    @property
+    def controller(self) -> MLPController:
+        """The network."""
+        return self.gaussian.network
+
+
+def make_actor(controller: LCSMPCLayer | MLPController, config: PPOConfig) -> GaussianPolicy:
+    """The Gaussian around a controller, with the deviation that the settings ask for."""
+    kind = MLPPolicy if isinstance(controller, MLPController) else LCSMPCPolicy
+    return kind(controller, config.std, config.covariance, config.learn_std)  # pyright: ignore[reportArgumentType]
 
 
 def _std(value: float | Tensor, n_u: int) -> Tensor:

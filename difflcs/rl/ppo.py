@@ -1,8 +1,8 @@
-"""Main phase (Algorithm 2): proximal policy optimisation of the MPC's model.
+"""Main phase (Algorithm 2): proximal policy optimisation of the MPC's model, or of a network as a reference point.
 
 Episodes of the stochastic policy, advantages by GAE and the clipped objective are TorchRL's; gradients reach the LCS
-through the MPC layer. Three things are this file's own, because TorchRL has no counterpart and because they decide
-whether it learns:
+through the MPC layer. What only a policy with an MPC has stands in one section of `PPO`. Three things are this file's
+own, because TorchRL has no counterpart and because they decide whether it learns:
 
 - The step size follows the KL divergence that an iteration has reached (`_adapt`). Large steps make PPO work here: a KL
   of 0.005 per iteration gains little, 0.03 to 0.1 gains 15 points of success.
@@ -19,17 +19,17 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
 
 from difflcs._checks import check_choice, check_number, check_positive_int
 from difflcs.errors import CheckpointError, DegenerateWarning, InvalidInputError, SolveWarning
-from difflcs.lcs import LCSModel
+from difflcs.lcs import LCSModel, LCSParams
 from difflcs.losses import violation_loss
-from difflcs.mpc import LCSMPCLayer
 from difflcs.rl.checkpoint import Checkpoint
 from difflcs.rl.rollout import Rollouts, action_bounds, collect, episode_seeds
 from difflcs.rl.warmup import TRAINING_STREAM
@@ -38,7 +38,13 @@ if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
     from tensordict import TensorDict, TensorDictBase
 
+    from difflcs.rl.policy import GaussianPolicy
+
 _NOISE_STREAM, _VALUE_STREAM, _LOSS_STREAM = 4, 5, 6
+_LCS = "mpc.lcs."
+"""Where the LCS is in the actor's module `gaussian`."""
+_NETWORK = "network."
+"""Prefix of the learned module's tensors in a checkpoint, where it is not an LCS."""
 
 Features = Callable[[Tensor, Tensor, Tensor], Tensor]
 """States (..., n_x), goals (..., n_goal), elapsed fraction of the episode (...) → value network's inputs (..., n)."""
@@ -51,7 +57,9 @@ class PPOConfig:
     rollouts: int = 60
     """Episodes per iteration, run in lockstep; the last ones share what is left of the data evenly."""
     steps: int = 20
-    """Gradient steps per iteration, each on all of its data."""
+    """Gradient steps per iteration."""
+    minibatch: int | None = None
+    """Samples per gradient step, every sample once before any is drawn again; None: each step on all of its data."""
     learning_rate: float = 6e-4
     """Adam's step size at the start."""
     betas: tuple[float, float] = (0.9, 0.99)
@@ -68,11 +76,14 @@ class PPOConfig:
     """Fraction of the samples, those of lowest KL, whose mean is the KL divergence of an iteration."""
     jump_kl: float = 2.0
     """Samples with a KL divergence of their own above this are left out: the MPC has jumped to another optimum."""
+    sample_clip: float | None = None
+    """Longest gradient that a single sample may have, in medians of those of its batch; longer ones are scaled down.
+    None: no limit."""
     clip: float = 0.3
     """Epsilon of the clipped objective (Eq. explicit_ppo_loss)."""
     gamma: float = 0.99
     """Discount per step."""
-    zeta: float = 0.95
+    zeta: float = 0.8
     """Zeta of the advantages (Eq. adv_func), often called lambda."""
     beta: float = 1.0
     """Weight of the PPO loss against the violation loss (Eq. total_loss). 1 in the paper."""
@@ -120,6 +131,10 @@ class PPOConfig:
             check_positive_int(name, getattr(self, name))
         for name in ("value_first_epochs", "value_epochs", "value_iterations"):
             check_positive_int(name, getattr(self, name))
+        if self.minibatch is not None:
+            check_positive_int("minibatch", self.minibatch)
+        if self.sample_clip is not None:
+            check_number("sample_clip", self.sample_clip, strict=True)
         positive = ("learning_rate", "target_kl", "max_kl", "final_step", "jump_kl", "clip", "std", "std_learning_rate")
         for name in (*positive, "cost_limit", "reward_scale", "value_learning_rate", "violation_gamma", "violation_xi"):
             check_number(name, getattr(self, name), strict=True)
@@ -141,6 +156,15 @@ class PPOConfig:
         low, high = self.std_range
         if not 0 < low <= high < math.inf:
             raise InvalidInputError(f"std_range: expected 0 < low <= high, got {self.std_range}")
+
+
+def check_without_lcs(config: PPOConfig) -> None:
+    """Refuse settings that only a policy with an LCS can follow."""
+    if config.beta < 1 or config.sample_clip is not None:
+        raise InvalidInputError(
+            f"config: expected beta=1 and sample_clip=None without an LCS, got beta={config.beta:g} and "
+            f"sample_clip={config.sample_clip}; drop them"
+        )
 
 
 @dataclass(frozen=True)
@@ -194,10 +218,10 @@ class PPO:
     Random numbers come from generators derived from the seed and the iteration; the global ones are left as they were.
 
     Args:
-        lcs: the model; it is trained in place.
-        mpc: the controller around the same object, with on_failure="mask".
+        actor: the policy, from `difflcs.rl.make_actor`; what it has learned is trained in place. An MPC in it
+            needs on_failure="mask".
         env: at least `config.rollouts` environments in lockstep.
-        config: settings.
+        config: settings, those that the actor was made with.
         seed: of noise, value network, goals and initial states.
         features: inputs of the value network.
         total_episodes: episodes of the whole training; the main phase ends there.
@@ -212,8 +236,7 @@ class PPO:
 
     def __init__(
         self,
-        lcs: LCSModel,
-        mpc: LCSMPCLayer,
+        actor: GaussianPolicy,
         env: VectorEnv,
         config: PPOConfig,
         seed: int,
@@ -224,13 +247,18 @@ class PPO:
         first_episode: int = 0,
         first_iteration: int = 0,
     ):
-        # Here and not above: TorchRL takes seconds to import, which `difflcs --help` should not wait for.
-        from difflcs.rl.policy import LCSMPCPolicy
-
         check_positive_int("seed", seed, minimum=0)
         check_positive_int("episode_steps", episode_steps)
-        if mpc.lcs is not lcs:
-            raise InvalidInputError("mpc: expected a controller around the model that is trained, got another model")
+        learned, gaussian = actor.learned, actor.gaussian
+        if isinstance(learned, LCSParams):
+            raise InvalidInputError("actor: expected a model that can be learned, got fixed LCSParams; use an LCSModel")
+        if gaussian.log_std.requires_grad != config.learn_std:
+            raise InvalidInputError(
+                f"actor: expected one made with learn_std={config.learn_std}, as the settings say, got "
+                f"{gaussian.log_std.requires_grad}; use make_actor(controller, config)"
+            )
+        if not isinstance(learned, LCSModel):
+            check_without_lcs(config)
         if total_episodes <= first_episode:
             raise InvalidInputError(
                 f"total_episodes: expected more than the {first_episode} collected before, got {total_episodes}; "
@@ -239,7 +267,9 @@ class PPO:
         remaining = total_episodes - first_episode
         if env.num_envs < min(config.rollouts, remaining):
             raise InvalidInputError(f"env: expected at least {config.rollouts} environments, got {env.num_envs}")
-        self.lcs, self.policy, self.env, self.config = lcs, mpc, env, config
+        self.actor, self.learned, self.policy = actor, learned, actor.controller
+        self.lcs = learned if isinstance(learned, LCSModel) else None
+        self.env, self.config = env, config
         self.seed, self.features, self.episode_steps = seed, features, episode_steps
         self.first_episode, self.first_iteration = first_episode, first_iteration
         self.episodes, self.iteration = first_episode, first_iteration
@@ -247,22 +277,18 @@ class PPO:
         count = math.ceil(remaining / config.rollouts)
         self._sizes = [remaining // count + (k < remaining % count) for k in range(count)]
 
-        self.actor = LCSMPCPolicy(mpc, config.std, config.covariance, config.learn_std)
         self.learning_rate = config.learning_rate
-        gaussian = self.actor.gaussian
-        self._learned = [p for p in (*lcs.parameters(), gaussian.log_std, gaussian.mixing) if p.requires_grad]
-        model_parameters = {id(p) for p in lcs.parameters()}
-        groups = [
-            {"params": [p for p in self._learned if id(p) in model_parameters]},
-            {"params": [p for p in self._learned if id(p) not in model_parameters]},
-        ]
+        model, deviation = learned.parameters(), (gaussian.log_std, gaussian.mixing)
+        groups = [{"params": [p for p in part if p.requires_grad]} for part in (model, deviation)]
+        self._parameters = [p for group in groups for p in group["params"]]
         self._adam = torch.optim.Adam([g for g in groups if g["params"]], config.learning_rate, config.betas)
         _initialise(self._adam)
 
         low, high = (torch.from_numpy(bound) for bound in action_bounds(env))
         self.bounds = (low, high)
-        n_goal = env.single_observation_space["goal"].shape[0]  # pyright: ignore[reportIndexIssue]
-        example = features(torch.zeros(lcs.n_x).double(), torch.zeros(n_goal).double(), torch.zeros(()).double())
+        space = env.single_observation_space
+        sizes = (space[key].shape for key in ("state", "goal"))  # pyright: ignore[reportIndexIssue]
+        example = features(*(torch.zeros(size, dtype=torch.float64) for size in (*sizes, ())))
         with self._random(_VALUE_STREAM):
             width = config.value_width
             self.value = nn.Sequential(
@@ -363,12 +389,13 @@ class PPO:
         def act(state: Tensor, goal: Tensor) -> tuple[np.ndarray, int]:
             nonlocal solve_seconds
             begun = time.perf_counter()
-            step = TensorDict({"state": state.clone(), "goal": goal.clone()}, [len(state)])
+            elapsed = torch.full((len(state),), len(seen) / self.episode_steps, dtype=torch.float64)
+            step = TensorDict({"state": state.clone(), "goal": goal.clone(), "elapsed": elapsed}, [len(state)])
             with torch.no_grad(), _quiet():
                 self.actor(step)  # cold: as in evaluation
             seen.append(step)
             solve_seconds += time.perf_counter() - begun
-            return np.asarray(step["action"]), int((~step["converged"]).sum())
+            return np.asarray(step["action"]), _failures(step)
 
         start = time.perf_counter()
         report = None if after_step is None else lambda: after_step(count)
@@ -448,33 +475,39 @@ class PPO:
         # The MPC is solved here, once per step; the loss gets its result, and only builds the distribution.
         head = ProbabilisticTensorDictSequential(self.actor.module[-1])  # pyright: ignore
         clipped = ClipPPOLoss(head, None, clip_epsilon=config.clip, entropy_bonus=False, critic_coeff=None)
-        advantage = data["advantage"]
-        advantage = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
-        guess = data["plan"]  # the rollout's own optimum, then each step's
+        data, advantage = data.copy(), data["advantage"]
+        data["advantage"] = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
+        if "plan" in data.keys():
+            data["guess"] = data["plan"].clone()  # the rollout's own optimum, then each step's
         rng = np.random.default_rng((self.seed, _LOSS_STREAM, self.iteration))
         rates = [self.learning_rate, config.std_learning_rate]
         for group, rate in zip(self._adam.param_groups, rates[: len(self._adam.param_groups)], strict=True):
             group["lr"] = scale * rate
-        for _ in range(config.steps):
+        for chosen in self._batches(len(data), rng):
             start = time.perf_counter()
-            batch = data.select("state", "goal")
-            batch["guess"] = guess
+            old = cast("TensorDict", data[chosen])
+            batch = old.select(*self.actor.in_keys, "guess", strict=False)
+            copies = None if config.sample_clip is None else self._copies(len(batch))
             with _quiet():
-                self.actor.get_dist_params(batch)
-            guess = batch["plan"]
-            outcome.solver_failures += int((~batch["converged"]).sum())
+                if copies is None:
+                    self.actor.get_dist_params(batch)
+                else:
+                    functional_call(self.actor.gaussian, copies, (batch,))
+            if "plan" in batch.keys():
+                data["guess"][chosen] = batch["plan"]
+            outcome.solver_failures += _failures(batch)
             solved = time.perf_counter()
             outcome.solve_seconds += solved - start
 
-            kl = _kl(data, batch)
+            kl = _kl(old, batch)
             outcome.kl = _trimmed_mean(kl, config.kl_quantile)
             if not outcome.kl <= config.max_kl and outcome.steps:
                 break
             jumped = (kl > config.jump_kl).unsqueeze(-1)
             outcome.ignored = float(jumped.double().mean())
-            batch["loc"] = torch.where(jumped, data["loc"], batch["loc"])
-            batch["action"], batch["action_log_prob"] = data["action"], data["action_log_prob"]
-            batch["advantage"] = torch.where(jumped, 0.0, advantage)
+            batch["loc"] = torch.where(jumped, old["loc"], batch["loc"])
+            batch["action"], batch["action_log_prob"] = old["action"], old["action_log_prob"]
+            batch["advantage"] = torch.where(jumped, 0.0, old["advantage"])
             result = clipped(batch)
             outcome.clip_fraction = float(result["clip_fraction"])
             loss = config.beta * result["loss_objective"]
@@ -482,7 +515,9 @@ class PPO:
                 loss = loss + (1 - config.beta) * self._violation(rollouts, rng)
             self._adam.zero_grad()
             loss.backward()
-            if all(p.grad is None or bool(torch.isfinite(p.grad).all()) for p in self._learned):
+            if copies is not None:
+                self._add_clipped(copies)
+            if all(p.grad is None or bool(torch.isfinite(p.grad).all()) for p in self._parameters):
                 self._adam.step()
                 self._bound_std()
                 outcome.steps += 1
@@ -499,7 +534,25 @@ class PPO:
             return self.learning_rate / config.learning_rate_factor
         return self.learning_rate * config.learning_rate_factor if kl < 0.5 * config.target_kl else self.learning_rate
 
+    def _batches(self, samples: int, rng: np.random.Generator) -> Iterator[Tensor]:
+        """The samples of each gradient step."""
+        size, left = self.config.minibatch, self.config.steps
+        while left > 0:
+            order = torch.arange(samples) if size is None else torch.from_numpy(rng.permutation(samples))
+            parts = order.split(size or samples)[:left]
+            left -= len(parts)
+            yield from parts
+
+    def _bound_std(self) -> None:
+        low, high = self.config.std_range
+        if self.config.learn_std:
+            with torch.no_grad():
+                self.actor.gaussian.log_std.clamp_(math.log(low), math.log(high))
+
+    # --- only with an LCS ---
+
     def _violation(self, rollouts: Rollouts, rng: np.random.Generator) -> Tensor:
+        assert self.lcs is not None
         config, states, actions = self.config, rollouts.states[rollouts.stable], rollouts.actions[rollouts.stable]
         x, u, x_next = (v.flatten(0, 1) for v in (states[:, :-1], actions, states[:, 1:]))
         chosen = torch.from_numpy(rng.permutation(len(x))[: config.violation_batch])
@@ -507,11 +560,29 @@ class PPO:
             self.lcs, x[chosen], u[chosen], x_next[chosen], config.violation_gamma, config.violation_xi
         )
 
-    def _bound_std(self) -> None:
-        low, high = self.config.std_range
-        if self.config.learn_std:
-            with torch.no_grad():
-                self.actor.gaussian.log_std.clamp_(math.log(low), math.log(high))
+    def _copies(self, samples: int) -> dict[str, Tensor]:
+        """A copy of the LCS for each sample, by its names within the actor: their gradients are the samples' own."""
+        assert self.lcs is not None
+        parameters = {name: p for name, p in self.lcs.named_parameters() if p.requires_grad}
+        copies = {name: p.detach().expand(samples, *p.shape).clone() for name, p in parameters.items()}
+        return {f"{_LCS}{name}": copy.requires_grad_() for name, copy in copies.items()}
+
+    def _add_clipped(self, copies: dict[str, Tensor]) -> None:
+        """Add the samples' gradients to the model's, long ones scaled down.
+
+        The length is that over all parameters. Zeros do not count in the median: samples whose action is at its bounds
+        or whose ratio is clipped have no gradient.
+        """
+        assert self.lcs is not None
+        assert self.config.sample_clip is not None
+        gradients = {name: copy.grad.flatten(1) for name, copy in copies.items() if copy.grad is not None}
+        length = torch.cat(list(gradients.values()), 1).norm(dim=1)
+        limit = self.config.sample_clip * length[length > 0].nanmedian()
+        factor = torch.where(length > limit, limit / length, 1.0)
+        for name, p in self.lcs.named_parameters():
+            if f"{_LCS}{name}" in gradients:
+                total = (factor @ gradients[f"{_LCS}{name}"]).view_as(p)
+                p.grad = total if p.grad is None else p.grad + total
 
     @contextmanager
     def _random(self, stream: int, part: int = 0) -> Iterator[None]:
@@ -526,7 +597,9 @@ class PPO:
     def _tensors(self) -> dict[str, Tensor]:
         """Everything besides model and history, in tensors of constant shape."""
         gaussian = self.actor.gaussian
+        network = {} if self.lcs is not None else self.learned.state_dict()
         return {
+            **{f"{_NETWORK}{name}": value for name, value in network.items()},
             "u_min": self.bounds[0],
             "u_max": self.bounds[1],
             "policy.log_std": gaussian.log_std.detach(),
@@ -561,12 +634,12 @@ class PPO:
         own, tensors = self._tensors(), dict(checkpoint.tensors)
         inputs, rewards = tensors.pop("history.inputs", None), tensors.pop("history.rewards", None)
         shapes, wanted = ({k: tuple(v.shape) for k, v in part.items()} for part in (tensors, own))
-        model = checkpoint.model
-        if shapes != wanted or model is None or model.config() != self.lcs.config():
+        got, expected = (model and model.config() for model in (checkpoint.model, self.lcs))
+        if shapes != wanted or got != expected:
             different = sorted({k for k in {*shapes, *wanted} if shapes.get(k) != wanted.get(k)})
             raise CheckpointError(
-                f"checkpoint: expected {self.lcs.config()} and the tensors of this training, got "
-                f"{model and model.config()}, different in {different}; was it written with other settings?"
+                f"checkpoint: expected {expected} and the tensors of this training, got {got}, different in "
+                f"{different}; was it written with other settings?"
             )
         state = checkpoint.state
         try:
@@ -586,7 +659,8 @@ class PPO:
             )
         self.iteration, self.episodes, self.learning_rate = checkpoint.iteration, episodes, learning_rate
         self._history = history
-        self.lcs.load_state_dict(model.state_dict())
+        if self.lcs is not None and checkpoint.model is not None:
+            self.lcs.load_state_dict(checkpoint.model.state_dict())
         self.value.load_state_dict({k.removeprefix("value."): v for k, v in tensors.items() if k.startswith("value.")})
         with torch.no_grad():
             for name, value in own.items():
@@ -606,6 +680,16 @@ class _Improvement:
     solver_failures: int = 0
     solve_seconds: float = 0.0
     gradient_seconds: float = 0.0
+
+
+def network_tensors(checkpoint: Checkpoint) -> dict[str, Tensor]:
+    """The learned network's state dict in a checkpoint."""
+    return {k.removeprefix(_NETWORK): v for k, v in checkpoint.tensors.items() if k.startswith(_NETWORK)}
+
+
+def _failures(data: TensorDictBase) -> int:
+    """Solves that did not converge; a network has none."""
+    return int((~data["converged"]).sum()) if "converged" in data.keys() else 0
 
 
 def _kl(old: TensorDictBase, new: TensorDictBase) -> Tensor:

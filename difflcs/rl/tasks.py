@@ -88,7 +88,7 @@ class Task:
     episode_steps: int = 20
     step_seconds: float = 0.1
     u_max: float = 0.015
-    horizon: int = 5
+    horizon: int = 8
     relaxation: float = 1e-5
 
     def make_policy(self, lcs: LCSModel, backend: str = "batched") -> LCSMPCLayer:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,12 +17,14 @@ import torch
 from difflcs._checks import check_choice, check_number, check_positive_int
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.lcs import LCSModel
+from difflcs.mpc.backends import get_backend
 from difflcs.rl._optional import require, versions
 from difflcs.rl.checkpoint import Checkpoint, RunDirectory, load_checkpoint, save_checkpoint
 from difflcs.rl.evaluate import Evaluation, evaluate
+from difflcs.rl.mlp import MLPConfig, MLPController
 from difflcs.rl.pddm import PDDM, Ensemble, PDDMConfig, PDDMIteration, Planner, ensemble_tensors
 from difflcs.rl.phases import LCSRL
-from difflcs.rl.ppo import PPO, PPOConfig, PPOIteration
+from difflcs.rl.ppo import PPO, PPOConfig, PPOIteration, network_tensors
 from difflcs.rl.rollout import Policy
 from difflcs.rl.tasks import N_U, N_X, Task, get_task, pushing_cost, pushing_features
 from difflcs.rl.warmup import Iteration, Warmup, WarmupConfig, config_from_dict
@@ -31,15 +36,17 @@ EnvFactory = Callable[[int], "VectorEnv"]
 """Number of environments → a vector of them, stepped in lockstep."""
 EVALUATION_ENVS = 50
 """Environments of an evaluation: enough to keep the solver's workers busy, few enough to build in a second."""
-METHODS = ("violation", "lcs-rl", "ppo", "pddm")
+METHODS = ("violation", "lcs-rl", "ppo", "ppo-mlp", "pddm")
 Trainer = Warmup | PPO | LCSRL | PDDM
 """What trains: objects with `step`, `checkpoint` and `restore`."""
 Report = Iteration | PPOIteration | PDDMIteration
 """What their iterations report."""
+_WITHOUT_LCS = ("ppo-mlp", "pddm")
 _REPORTS: Mapping[str, tuple[type, ...]] = {
     "violation": (Iteration,),
     "lcs-rl": (Iteration, PPOIteration),
     "ppo": (PPOIteration,),
+    "ppo-mlp": (PPOIteration,),
     "pddm": (PDDMIteration,),
 }
 
@@ -52,7 +59,8 @@ class TrainConfig:
     """What to do: cube, turn_cube, sugar_box, fish_can, mug, wrench, banana, clamp, large_clamp, extra_large_clamp."""
     method: str = "violation"
     """How to learn: violation (the warm-up phase alone, Algorithm 1), lcs-rl (warm-up, then Algorithm 2), ppo
-    (Algorithm 2 from a random model, without warm-up), or pddm (networks and a sampling planner)."""
+    (Algorithm 2 from a random model, without warm-up), ppo-mlp (the same PPO with a network instead of an MPC), or
+    pddm (networks and a sampling planner)."""
     minutes: float = 6.0
     """Data to collect [min of simulated time]; one minute is 600 steps of 0.1 s."""
     seed: int = 0
@@ -80,6 +88,8 @@ class TrainConfig:
     """Settings of the warm-up phase."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """Settings of the main phase, for the methods lcs-rl and ppo."""
+    mlp: MLPConfig = field(default_factory=MLPConfig)
+    """Settings of the method ppo-mlp."""
     pddm: PDDMConfig = field(default_factory=PDDMConfig)
     """Settings of the method pddm."""
 
@@ -129,6 +139,7 @@ class TrainConfig:
             final_goals=min(self.final_goals, 4),
             warmup=replace(self.warmup, first_epochs=20, epochs=2),
             ppo=replace(self.ppo, rollouts=min(self.ppo.rollouts, 5), steps=min(self.ppo.steps, 2)),
+            mlp=replace(self.mlp, rollouts=min(self.mlp.rollouts, 5), steps=min(self.mlp.steps, 2)),
             pddm=replace(
                 self.pddm,
                 random_rollouts=min(self.pddm.random_rollouts, 5),
@@ -139,7 +150,7 @@ class TrainConfig:
         )
 
 
-_NESTED: Mapping[str, type] = {"warmup": WarmupConfig, "ppo": PPOConfig, "pddm": PDDMConfig}
+_NESTED: Mapping[str, type] = {"warmup": WarmupConfig, "ppo": PPOConfig, "mlp": MLPConfig, "pddm": PDDMConfig}
 
 
 class Reporter:
@@ -168,6 +179,7 @@ def train(
     *,
     init: Path | None = None,
     resume: bool = False,
+    force: bool = False,
     reporter: Reporter | None = None,
 ) -> RunDirectory:
     """Train a model and leave a run directory behind.
@@ -178,29 +190,51 @@ def train(
         config: what to train. When resuming, the run's own configuration must equal it.
         out: the run directory, new or empty unless resuming.
         make_envs: makes the environments of the task.
-        init: run or model directory to start from, instead of a random model.
+        init: run or model directory, or model of the zoo ("zoo:NAME"), to start from, instead of a random model.
         resume: continue the run in `out`.
+        force: replace the run in `out`. It is deleted once the new one has begun, and stays if that fails.
         reporter: for progress bars.
 
     Returns:
         The finished run.
 
     Raises:
-        InvalidInputError: the data is used up by the warm-up.
-        CheckpointError: `out` holds files and `resume` is not set, or they cannot be resumed from, or they cannot be
-            written; the last checkpoint is intact.
+        InvalidInputError: the data is used up by the warm-up, `init` does not fit the task, or `force` and `resume`.
+        CheckpointError: `out` holds files and neither `resume` nor `force` is set, or they cannot be resumed from, or
+            they are no run, or they cannot be written; the last checkpoint is intact.
         MissingDependencyError: TensorBoard is not installed.
     """
-    require("tensorboard")
     reporter = reporter or Reporter()
+    if not force:
+        return _train(config, out, make_envs, init, resume, reporter, begun=lambda: None)
+    if resume:
+        raise InvalidInputError("force: expected without resume, got both; one replaces a run, the other continues it")
+    if init is not None and init.resolve().is_relative_to(out.resolve()):
+        raise InvalidInputError(f"init: expected a model outside the run that is replaced, {out}, got {init}; copy it")
+    with _replacing(out) as begun:
+        return _train(config, out, make_envs, init, resume, reporter, begun)
+
+
+def _train(
+    config: TrainConfig,
+    out: Path,
+    make_envs: EnvFactory,
+    init: Path | None,
+    resume: bool,
+    reporter: Reporter,
+    begun: Callable[[], object],
+) -> RunDirectory:
+    require("tensorboard")
     task = get_task(config.task)
     if config.method == "lcs-rl" and config.minutes <= config.warmup_minutes:
         raise InvalidInputError(
             f"minutes: expected more than the {config.warmup_minutes:g} of the warm-up with lcs-rl, got "
             f"{config.minutes:g}; pass --minutes 30, or --method violation for a warm-up alone"
         )
-    if config.method == "pddm" and init is not None:
-        raise InvalidInputError("init: expected none with method pddm, which learns networks instead of an LCSModel")
+    if config.method in _WITHOUT_LCS and init is not None:
+        raise InvalidInputError(
+            f"init: expected none with method {config.method}, which learns networks instead of an LCSModel"
+        )
     if resume:
         run = RunDirectory.open(out)
         stored = run.config()
@@ -213,15 +247,16 @@ def train(
         source = stored.get("init")
         init = None if source is None else Path(str(source))
     else:
+        get_backend(config.backend)  # clear errors before anything is written
         if init is not None:
-            load_model(init)  # a clear error before anything is written
+            _check_fits(load_model(init), init, config.task)
         with _writing(out):
             run = RunDirectory.create(
                 out,
                 {
                     "kind": "run",
                     "config": asdict(config),
-                    "init": None if init is None else str(init.resolve()),
+                    "init": None if init is None else str(init.resolve() if init.exists() else init),
                     "versions": versions(),
                 },
             )
@@ -237,6 +272,7 @@ def train(
         trainer = _make_trainer(config, task, model, open_envs, init is not None)
         if checkpoint is not None:
             trainer.restore(checkpoint)
+        begun()
         _loop(config, task, run, trainer, make_envs, reporter, fresh=checkpoint is None)
     finally:
         for envs in opened:
@@ -255,6 +291,44 @@ def _writing(path: Path) -> Iterator[None]:
         ) from error
 
 
+@contextmanager
+def _replacing(out: Path) -> Iterator[Callable[[], object]]:
+    """Move the run in `out` aside; calling what is yielded deletes it, otherwise it comes back at the end."""
+    out = out.resolve()
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        yield lambda: None
+        return
+    try:
+        RunDirectory.open(out).config()
+    except CheckpointError as error:
+        raise CheckpointError(f"{error}. --force replaces runs only; choose another --out") from error
+    with _writing(out):
+        aside = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}.", suffix=".old"))
+        os.replace(out, aside / out.name)
+        out.mkdir()  # `--out` may be a link to it
+    replaced = False
+
+    def discard() -> None:
+        nonlocal replaced
+        replaced = True
+        shutil.rmtree(aside, ignore_errors=True)
+
+    try:
+        yield discard
+    finally:
+        if not replaced:
+            shutil.rmtree(out, ignore_errors=True)
+            os.replace(aside / out.name, out)
+            aside.rmdir()
+
+
+def _check_fits(model: LCSModel, source: Path, task: str) -> None:
+    got = f"n_x={model.n_x}, n_u={model.n_u}, {str(model.A.dtype).removeprefix('torch.')}"
+    wanted = f"n_x={N_X}, n_u={N_U}, float64"
+    if got != wanted:
+        raise InvalidInputError(f"init: expected a model with {wanted}, as task {task} needs, got {got} in {source}")
+
+
 def stored_config(run: RunDirectory) -> TrainConfig:
     """The configuration a run was started with.
 
@@ -268,7 +342,7 @@ def stored_config(run: RunDirectory) -> TrainConfig:
 
 
 def load_model(path: Path) -> LCSModel:
-    """The model of a run directory (finished or not), or of a directory written by `LCSModel.save_pretrained`."""
+    """The model of a run directory (finished or not), of `LCSModel.save_pretrained`, or of the zoo ("zoo:NAME")."""
     if (path / "checkpoints").is_dir() or (path / "model").is_dir():
         return RunDirectory.open(path).load_model()
     return LCSModel.from_pretrained(path)
@@ -282,8 +356,10 @@ def load_policy(run: RunDirectory) -> Policy:
     """
     config = stored_config(run)
     task = get_task(config.task)
-    if config.method != "pddm":
+    if config.method not in _WITHOUT_LCS:
         return task.make_policy(run.load_model(), config.backend)
+    if config.method == "ppo-mlp":
+        return _load_network(run, config, task)
     if run.finished():
         ensemble = Ensemble.from_pretrained(run.model)
     else:
@@ -294,6 +370,25 @@ def load_policy(run: RunDirectory) -> Policy:
             raise CheckpointError(f"{run.path}: expected an ensemble as configured, got {error}") from error
     high = torch.full((N_U,), task.u_max, dtype=torch.float64)
     return Planner(ensemble, pushing_cost(), config.pddm, -high, high)
+
+
+def _load_network(run: RunDirectory, config: TrainConfig, task: Task) -> MLPController:
+    if run.finished():
+        return MLPController.from_pretrained(run.model, pushing_features)
+    network = _initial_network(config, task)
+    try:
+        network.load_state_dict(network_tensors(load_checkpoint(run.checkpoints)))
+    except RuntimeError as error:
+        raise CheckpointError(f"{run.path}: expected a network as configured, got {error}") from error
+    return network
+
+
+def _initial_network(config: TrainConfig, task: Task) -> MLPController:
+    high = torch.full((N_U,), task.u_max, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(config.seed)
+    features = pushing_features(torch.zeros(N_X), torch.zeros(pushing_cost().n_goal), torch.zeros(()))
+    width, steps = config.mlp.width, task.episode_steps
+    return MLPController(pushing_features, len(features), -high, high, width, steps, generator)
 
 
 def _initial_model(config: TrainConfig) -> LCSModel:
@@ -315,11 +410,15 @@ def _make_trainer(config: TrainConfig, task: Task, model: LCSModel, make_envs: E
     total_episodes = max(1, round(config.minutes * steps_per_minute / task.episode_steps))
 
     def make_main(first_episode: int, first_iteration: int) -> PPO:
+        # Here and not above: TorchRL takes seconds to import, which `difflcs --help` should not wait for.
+        from difflcs.rl.policy import make_actor
+
+        mlp = config.method == "ppo-mlp"
+        settings = config.mlp if mlp else config.ppo
         return PPO(
-            model,
-            policy,
-            make_envs(min(config.ppo.rollouts, max(1, total_episodes - first_episode))),
-            config.ppo,
+            make_actor(_initial_network(config, task) if mlp else policy, settings),
+            make_envs(min(settings.rollouts, max(1, total_episodes - first_episode))),
+            settings,
             config.seed,
             features=pushing_features,
             total_episodes=total_episodes,
@@ -328,7 +427,7 @@ def _make_trainer(config: TrainConfig, task: Task, model: LCSModel, make_envs: E
             first_iteration=first_iteration,
         )
 
-    if config.method == "ppo":
+    if config.method in ("ppo", "ppo-mlp"):
         return make_main(0, 0)
     if config.method == "pddm":
         needed = max(config.pddm.random_rollouts, config.pddm.rollouts_per_iteration)
@@ -396,13 +495,18 @@ def _loop(
         while trainer.env_steps < total:
             previous = trainer.env_steps
             finish(trainer.step(reporter.stepped), previous)
-        learned = trainer.ensemble if isinstance(trainer, PDDM) else trainer.lcs
         with _writing(run.path):
-            learned.save_pretrained(run.model)
+            _learned(trainer).save_pretrained(run.model)
     finally:
         writer.close()
         for envs in evaluation_envs:
             envs.close()
+
+
+def _learned(trainer: Trainer) -> LCSModel | MLPController | Ensemble:
+    if isinstance(trainer, PDDM):
+        return trainer.ensemble
+    return trainer.learned if isinstance(trainer, PPO) else trainer.lcs
 
 
 def goals_due(config: TrainConfig, previous: int, now: int, per_minute: float) -> int:

@@ -34,7 +34,7 @@ _MINIBATCH_STREAM, _ACTION_STREAM = 2, 3
 
 @dataclass(frozen=True)
 class WarmupConfig:
-    """Settings of the warm-up. The defaults reach 60 to 79 % success on the cube after 6 minutes of data."""
+    """Settings of the warm-up. The defaults reach 69 to 83 % success on the cube after 6 minutes of data (4 seeds)."""
 
     random_rollouts: int = 5
     """Episodes of uniformly random actions before the first training; none when starting from a trained model."""
@@ -46,8 +46,8 @@ class WarmupConfig:
     """Standard deviation [m] of the Gaussian noise on executed actions. Without it success peaks at 48 to 59 %."""
     trust_region: float = 0.9
     """While collecting, actions stay within mean ± trust_region · std of the buffer's actions; 0 turns this off."""
-    trust_region_growth: float = 1.001
-    """Factor on trust_region per iteration."""
+    trust_region_growth: float = 1.03
+    """Factor on trust_region per iteration: nearly the full bounds after 6 minutes."""
     learning_rate: float = 1e-2
     """Adam's step size at the start of every training call; Adam is reset there."""
     learning_rate_decay: float = 0.99

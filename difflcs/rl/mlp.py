@@ -1,0 +1,143 @@
+"""Baseline without a model: a network trained by the same PPO as the LCS, as a reference point."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from difflcs import _files
+from difflcs._checks import check_positive_int
+from difflcs.errors import CheckpointError
+from difflcs.rl.pddm import Plan
+from difflcs.rl.ppo import Features, PPOConfig, check_without_lcs
+
+_KIND = "MLP"
+
+
+@dataclass(frozen=True)
+class MLPConfig(PPOConfig):
+    """Settings of PPO with a network: CleanRL's for continuous actions, where not marked as ours.
+
+    Every setting of the main phase is here; those that only an LCS has (beta below 1, the violation loss, sample_clip)
+    must stay at their defaults.
+    """
+
+    width: int = 64
+    """Width of the two hidden layers of the policy's network."""
+    rollouts: int = 60
+    """Episodes per iteration, run in lockstep (ours)."""
+    steps: int = 40
+    """Gradient steps per iteration: ten passes over 60 episodes of 20 steps."""
+    minibatch: int | None = 300
+    """Samples per gradient step: four per pass."""
+    learning_rate: float = 3e-4
+    """Adam's step size at the start."""
+    betas: tuple[float, float] = (0.9, 0.999)
+    """Adam's averaging factors; its moments are kept across iterations."""
+    learning_rate_factor: float = 1.0
+    """Factor by which the step size grows or shrinks after an iteration; 1: it does not follow the KL divergence."""
+    final_step: float = 0.01
+    """Factor on all steps, falling linearly from 1 to this over the training."""
+    clip: float = 0.2
+    """Epsilon of the clipped objective."""
+    zeta: float = 0.95
+    """Zeta of the advantages, often called lambda."""
+    learn_std: bool = True
+    """Learn the covariance of the policy together with the network."""
+    std_learning_rate: float = 3e-4
+    """Adam's step size of the logarithms of the standard deviations."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_positive_int("width", self.width)
+        check_without_lcs(self)
+
+
+class MLPController(nn.Module):
+    """Two hidden tanh layers from features to actions: tanh keeps them within the bounds. float64.
+
+    It is a policy for `difflcs.rl.evaluate` and counts its own steps, because actions depend on the time that is left:
+    call `begin` at every reset. After `episode_steps` it starts again from zero.
+
+    Args:
+        features: its inputs, of states, goals and the elapsed fraction of the episode.
+        n_features: how many they are.
+        u_min: (n_u,) lower bounds of the actions.
+        u_max: (n_u,) upper bounds.
+        width: width of the hidden layers.
+        episode_steps: steps of one episode.
+        generator: draws the initial weights (orthogonal; the last layer's are near zero).
+    """
+
+    u_min: Tensor
+    u_max: Tensor
+
+    def __init__(
+        self,
+        features: Features,
+        n_features: int,
+        u_min: Tensor,
+        u_max: Tensor,
+        width: int = 64,
+        episode_steps: int = 20,
+        generator: torch.Generator | None = None,
+    ):
+        super().__init__()
+        self.features, self.episode_steps = features, episode_steps
+        self.n_features, self.width = n_features, width
+        sizes = [n_features, width, width, len(u_min)]
+        gains = [math.sqrt(2), math.sqrt(2), 0.01]
+        layers: list[nn.Module] = []
+        for n_in, n_out, gain in zip(sizes[:-1], sizes[1:], gains, strict=True):
+            with torch.random.fork_rng(devices=[]):  # torch's own initial weights are replaced
+                linear = nn.Linear(n_in, n_out, dtype=torch.float64)
+            nn.init.orthogonal_(linear.weight, gain, generator)
+            nn.init.zeros_(linear.bias)
+            layers += [linear, nn.Tanh()]
+        self.layers = nn.Sequential(*layers)
+        for name, bound in (("u_min", u_min), ("u_max", u_max)):
+            self.register_buffer(name, bound.double())
+        self.begin()
+
+    def begin(self, seed: int = 0) -> None:
+        """An episode starts. `seed` is for policies that draw."""
+        self._step = 0
+
+    def mean(self, state: Tensor, goal: Tensor, elapsed: Tensor) -> Tensor:
+        """States (..., n_x), goals (..., n_goal), elapsed fractions of the episode (...) → actions (..., n_u)."""
+        middle, half = 0.5 * (self.u_max + self.u_min), 0.5 * (self.u_max - self.u_min)
+        return middle + half * self.layers(self.features(state, goal, elapsed))
+
+    def forward(self, x0: Tensor, goal: Tensor, *, u_min: Tensor | None = None, u_max: Tensor | None = None) -> Plan:
+        """Act once in states (B, n_x) towards goals (B, n_goal), one step after the last call."""
+        elapsed = torch.full(x0.shape[:-1], self._step % self.episode_steps / self.episode_steps, dtype=x0.dtype)
+        self._step += 1
+        action = self.mean(x0, goal, elapsed)
+        low, high = (self.u_min if u_min is None else u_min), (self.u_max if u_max is None else u_max)
+        return Plan(torch.minimum(torch.maximum(action, low), high), torch.ones(x0.shape[:-1], dtype=torch.bool))
+
+    def save_pretrained(self, directory: Path) -> None:
+        """Write the network into a directory, atomically. Its features are not: they are code."""
+        config = {"n_features": self.n_features, "width": self.width, "episode_steps": self.episode_steps}
+        _files.save_record(Path(directory), _KIND, config, self.state_dict())
+
+    @classmethod
+    def from_pretrained(cls, directory: Path, features: Features) -> MLPController:
+        """Read what `save_pretrained` wrote.
+
+        Raises:
+            CheckpointError: files are missing, corrupt or of another kind.
+        """
+        config, tensors = _files.load_record(Path(directory), _KIND)
+        try:
+            names = ("n_features", "width", "episode_steps")
+            n_features, width, episode_steps = (check_positive_int(name, config[name]) for name in names)
+            network = cls(features, n_features, tensors["u_min"], tensors["u_max"], width, episode_steps)
+            network.load_state_dict(tensors)
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise CheckpointError(f"{directory}: expected a network written by difflcs, got {error}") from error
+        return network

@@ -1,0 +1,394 @@
+"""Learned models that ship with the package, and what is known about each.
+
+    from difflcs import LCSModel, zoo
+    lcs = LCSModel.from_pretrained("trifinger-cube")
+    print(zoo.card("trifinger-cube").success_rate)
+
+`difflcs zoo` lists them; `difflcs evaluate`, `render` and `train --init` take them as `zoo:trifinger-cube`.
+
+A maintainer adds a finished run, which is evaluated at its end, by
+
+    python -m difflcs.zoo add RUN [NAME] [--force]
+
+in a checkout of the repository with an editable installation. A name is `trifinger-<task>`, with `-violation` or
+another method behind it unless the method is lcs-rl; without NAME it is made from the run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import shutil
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from difflcs import _files, _zoo
+from difflcs.errors import CheckpointError, DiffLCSError, InvalidInputError
+
+if TYPE_CHECKING:
+    from difflcs.rl.checkpoint import RunDirectory
+    from difflcs.rl.rollout import Policy
+
+__all__ = ["PREFIX", "Learned", "ModelCard", "add", "card", "names", "path"]
+
+PREFIX = _zoo.PREFIX
+"""Before a name it says to the command line and to `LCSModel.from_pretrained`: a model of the zoo, not a path."""
+
+_NUMBERS = ("minutes", "success_rate", "ci_low", "ci_high")
+_COUNTS = ("seed", "goals", "evaluation_seed", "solver_failures")
+_WORDS = ("name", "task", "method", "backend", "version", "command")
+
+
+@dataclass(frozen=True)
+class ModelCard:
+    """Where a model of the zoo comes from and how good it is.
+
+    Attributes:
+        name: its name in the zoo.
+        task: what it was trained for, and is evaluated on.
+        method: how it was learned, as `difflcs train --method` takes it.
+        minutes: data [min of simulated time].
+        seed: of the training.
+        success_rate: successes per goal, without noise.
+        ci_low: lower end of the Wilson 95 % interval.
+        ci_high: its upper end.
+        goals: goals of that evaluation.
+        evaluation_seed: their seed.
+        solver_failures: MPC solves of that evaluation that did not converge.
+        object: what the fingers push: name, source (built_in, ycb_mesh or stand_in), mass [kg] and more.
+        backend: MPC solver of training and evaluation.
+        version: of difflcs.
+        command: what trained it.
+        versions: of the packages that decide a result.
+        settings: every setting of the training; defaults may change, these do not.
+    """
+
+    name: str
+    task: str
+    method: str
+    minutes: float
+    seed: int
+    success_rate: float
+    ci_low: float
+    ci_high: float
+    goals: int
+    evaluation_seed: int
+    solver_failures: int
+    object: Mapping[str, Any] = field(hash=False)
+    backend: str
+    version: str
+    command: str
+    versions: Mapping[str, str | None] = field(hash=False)
+    settings: Mapping[str, Any] = field(hash=False)
+
+    @property
+    def object_source(self) -> str:
+        """Where the object's shape is from: built_in, ycb_mesh or stand_in."""
+        return str(self.object["source"])
+
+    @property
+    def object_mass(self) -> float:
+        """Mass of the object [kg]."""
+        return float(self.object["mass"])
+
+    @property
+    def success_text(self) -> str:
+        """Success rate, goals and interval, as `difflcs evaluate` prints them."""
+        rate, low, high = (100 * value for value in (self.success_rate, self.ci_low, self.ci_high))
+        return f"{rate:.1f} % of {self.goals} goals (95 % interval {low:.1f} to {high:.1f} %)"
+
+    def __str__(self) -> str:
+        lines = {
+            "task": self.task,
+            "object": f"{self.object_source.replace('_', ' ')}, {1e3 * self.object_mass:g} g",
+            "method": f"{self.method}, {self.minutes:g} min of data, seed {self.seed}, backend {self.backend}",
+            "success": f"{self.success_text}, goal seed {self.evaluation_seed}",
+            "solver": f"{self.solver_failures} solves failed in that evaluation",
+            "versions": ", ".join(f"{name} {version}" for name, version in self.versions.items() if version),
+            "trained by": self.command,
+        }
+        return "\n".join([self.name, *(f"  {name:<10} {text}" for name, text in lines.items())])
+
+
+def names() -> tuple[str, ...]:
+    """Names of the models, in alphabetical order."""
+    return _zoo.names()
+
+
+def path(name: str) -> Path:
+    """The folder of a model: what `LCSModel.save_pretrained` wrote, and card.json.
+
+    Args:
+        name: such as "trifinger-cube" or "zoo:trifinger-cube".
+
+    Raises:
+        CheckpointError: no model has this name; the message lists those there are.
+    """
+    return _zoo.find(name)
+
+
+def card(name: str) -> ModelCard:
+    """The card of a model.
+
+    Raises:
+        CheckpointError: no model has this name, or its card is damaged.
+    """
+    return _read(path(name) / "card.json")
+
+
+def table(cards: Sequence[ModelCard]) -> str:
+    """One line per model."""
+    head = ("name", "method", "data", "success", "interval", "goals", "object")
+    rows = [
+        (
+            c.name,
+            c.method,
+            f"{c.minutes:g} min",
+            f"{100 * c.success_rate:.1f} %",
+            f"{100 * c.ci_low:.1f} to {100 * c.ci_high:.1f}",
+            str(c.goals),
+            c.object_source.replace("_", " "),
+        )
+        for c in cards
+    ]
+    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+    lines = ["  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)) for row in (head, *rows)]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _read(file: Path) -> ModelCard:
+    remedy = "install difflcs again, or add the run again with `python -m difflcs.zoo add RUN --force`"
+    try:
+        values = json.loads(file.read_text())
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{file}: expected JSON, got {error}; {remedy}") from error
+    wanted = {f.name for f in fields(ModelCard)}
+    if not isinstance(values, dict) or set(values) != wanted:
+        got = sorted(values) if isinstance(values, dict) else type(values).__name__
+        raise CheckpointError(f"{file}: expected the fields {sorted(wanted)} of a card, got {got}; {remedy}")
+    kinds = dict.fromkeys(_NUMBERS, (int, float)) | dict.fromkeys(_COUNTS, (int,)) | dict.fromkeys(_WORDS, (str,))
+    kinds |= {"object": (dict,), "versions": (dict,), "settings": (dict,)}
+    for name, kind in kinds.items():
+        if not isinstance(values[name], kind) or isinstance(values[name], bool):
+            raise CheckpointError(f"{file}: expected {kind[0].__name__} for {name}, got {values[name]!r}; {remedy}")
+    return ModelCard(**values)
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What `difflcs evaluate` and `render` take: what a run has learned, or a model of the zoo.
+
+    Attributes:
+        name: the run directory, or "zoo:NAME".
+        task: what it was trained for.
+        method: how.
+        backend: MPC solver.
+        policy: from states and goals to plans.
+        finished: whether the training is.
+        object: what it was trained on, as the environment described it; None if it did not.
+        run: the run, if it is one.
+        card: the card, if it is a model of the zoo.
+    """
+
+    name: str
+    task: str
+    method: str
+    backend: str
+    policy: Policy
+    finished: bool
+    object: Mapping[str, Any] | None
+    run: RunDirectory | None = None
+    card: ModelCard | None = None
+
+    @classmethod
+    def open(cls, source: Path) -> Learned:
+        """Load it.
+
+        Args:
+            source: run directory, or "zoo:NAME".
+
+        Raises:
+            CheckpointError: there is none, or it cannot be used.
+        """
+        from difflcs.rl.checkpoint import RunDirectory
+        from difflcs.rl.tasks import get_task
+        from difflcs.rl.training import load_model, load_policy, stored_config
+
+        name = str(source)
+        if name.startswith(PREFIX):
+            known = card(name)
+            policy = get_task(known.task).make_policy(load_model(source), known.backend)
+            return cls(name, known.task, known.method, known.backend, policy, True, known.object, card=known)
+        run = RunDirectory.open(source)
+        config, found = stored_config(run), run.config().get("object")
+        found = found if isinstance(found, dict) else None
+        return cls(name, config.task, config.method, config.backend, load_policy(run), run.finished(), found, run=run)
+
+    def fits(self, found: Mapping[str, Any]) -> bool:
+        """Whether the object of an environment is the one it was trained on; True if that is not known."""
+        return self.object is None or all(
+            self.object.get(key) == found.get(key) for key in ("name", "source", "mass", "sha256")
+        )
+
+
+# --- adding models ----------------------------------------------------------------------------------------------------
+
+
+def add(run: Path, name: str | None = None, *, force: bool = False, root: Path = _zoo.ROOT) -> ModelCard:
+    """Put the model of a finished run into the zoo, all at once or not at all.
+
+    Args:
+        run: directory of `difflcs train`.
+        name: of the model; made from task and method if None.
+        force: replace a model of that name.
+        root: where the models lie.
+
+    Returns:
+        Its card.
+
+    Raises:
+        CheckpointError: the run is not finished or was not evaluated at its end, it learned no LCSModel, or there is a
+            model of that name.
+        InvalidInputError: the name does not say task and method.
+    """
+    from difflcs.rl.checkpoint import RunDirectory
+
+    directory = RunDirectory.open(run)
+    settings = directory.config().get("config")
+    if not isinstance(settings, dict) or not {"task", "method", "minutes", "seed"} <= set(settings):
+        raise CheckpointError(f"{run}: expected the settings of a training in config.json, got {settings!r}")
+    name = _checked_name(name, settings["task"], settings["method"])
+    if not directory.finished():
+        raise CheckpointError(f"{run}: expected a finished run; continue it with: difflcs train --out {run} --resume")
+    model = directory.load_model()
+    content = _card(directory, settings, name)
+    if (root / name).exists() and not force:
+        raise CheckpointError(f"{root / name}: expected no model of that name, got one; replace it with --force")
+    root.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(dir=root, prefix=f".{name}.", suffix=".tmp"))
+    try:
+        new, old = temporary / "new", temporary / "old"
+        model.save_pretrained(new)
+        _files.write_json(new / "card.json", asdict(content))
+        if (root / name).exists():
+            (root / name).rename(old)
+        try:
+            new.rename(root / name)
+        except OSError:
+            if old.exists():
+                old.rename(root / name)
+            raise
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    return content
+
+
+def _checked_name(name: str | None, task: str, method: str) -> str:
+    wanted = f"trifinger-{task.replace('_', '-')}" + ("" if method == "lcs-rl" else f"-{method}")
+    if name is not None and name.removeprefix(_zoo.PREFIX) != wanted:
+        raise InvalidInputError(
+            f"name: expected {wanted!r} for task {task} and method {method}, got {name!r}; leave it out"
+        )
+    return wanted
+
+
+def _card(run: RunDirectory, settings: Mapping[str, Any], name: str) -> ModelCard:
+    stored, rows = run.config(), run.rows()
+    last = rows[-1] if rows else {}
+    if not last.get("evaluation_goals"):
+        raise CheckpointError(
+            f"{run.path}: expected an evaluation at the end of {run.log}, got none; train with --final-goals 1000"
+        )
+    found, versions = stored.get("object"), stored.get("versions")
+    if not isinstance(found, dict) or not {"name", "source", "mass"} <= set(found) or not isinstance(versions, dict):
+        raise CheckpointError(
+            f"{run.path}: expected `object` and `versions` in config.json, got {sorted(stored)}; train it again with "
+            f"`difflcs train`, which writes them"
+        )
+    return ModelCard(
+        name=name,
+        task=settings["task"],
+        method=settings["method"],
+        minutes=settings["minutes"],
+        seed=settings["seed"],
+        success_rate=float(last["evaluation_success_rate"]),
+        ci_low=float(last["evaluation_ci_low"]),
+        ci_high=float(last["evaluation_ci_high"]),
+        goals=int(last["evaluation_goals"]),
+        evaluation_seed=settings["evaluation_seed"],
+        solver_failures=int(last["evaluation_solver_failures"]),
+        object=found,
+        backend=settings["backend"],
+        version=str(versions.get("difflcs")),
+        command=training_command(settings, stored.get("init")),
+        versions=versions,
+        settings=settings,
+    )
+
+
+def training_command(settings: Mapping[str, Any], init: object = None) -> str:
+    """The command line of a training: task, method, minutes and seed, and what differs from the defaults of today.
+
+    Args:
+        settings: `TrainConfig` as config.json of a run holds it, perhaps of another version.
+        init: what the run started from, as config.json holds it.
+    """
+    from difflcs.rl.training import TrainConfig
+
+    always = ("task", "method", "minutes", "seed")
+    words = ["difflcs", "train"]
+    for name in always:
+        words += _flag(name, settings[name])
+    usual = json.loads(json.dumps(asdict(TrainConfig())))
+    words += _differences({k: v for k, v in settings.items() if k not in always}, usual)
+    if init is not None:
+        source = Path(str(init))  # of a path the last part only: folders of one machine mean nothing elsewhere
+        source = source.parent if source.name == "model" else source
+        words += ["--init", source.name]
+    return shlex.join(words)
+
+
+def _differences(settings: Mapping[str, Any], usual: Mapping[str, Any], prefix: str = "") -> list[str]:
+    words: list[str] = []
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            words += _differences(value, usual.get(name, {}), f"{prefix}{name}.")
+        elif name not in usual or value != usual[name]:
+            words += _flag(prefix + name, value)
+    return words
+
+
+def _flag(name: str, value: object) -> list[str]:
+    name = name.replace("_", "-")
+    if isinstance(value, bool):
+        group, dot, last = name.rpartition(".")
+        return [f"--{name}" if value else f"--{group}{dot}no-{last}"]
+    values = value if isinstance(value, list) else [value]
+    return [f"--{name}", *(f"{v:g}" if isinstance(v, float) and float(f"{v:g}") == v else str(v) for v in values)]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """`python -m difflcs.zoo add RUN [NAME] [--force]`; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m difflcs.zoo", description="Add learned models to the package.")
+    commands = parser.add_subparsers(required=True, metavar="add")
+    adding = commands.add_parser("add", help="put the model of a finished run into the zoo")
+    adding.add_argument("run", type=Path, metavar="RUN", help="directory of `difflcs train`")
+    adding.add_argument("name", nargs="?", metavar="NAME", help="made from task and method by default")
+    adding.add_argument("--force", action="store_true", help="replace a model of that name")
+    options = parser.parse_args(arguments)
+    try:
+        content = add(options.run, options.name, force=options.force)
+    except (DiffLCSError, OSError) as error:
+        print(f"difflcs.zoo: {error}", file=sys.stderr)
+        return 2
+    print(f"{content}\nwritten: {_zoo.ROOT / content.name}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,303 @@
+"""What the documentation takes from the code, so that nobody copies it by hand. A Sphinx extension.
+
+A line `<!-- generated: KIND ARGUMENTS -->` of a page is replaced by Markdown that is made when the site is built:
+
+- `commands`: the command line's own help, one section per command.
+- `settings CLASS`: tables of a dataclass's fields, and of those of its groups, with defaults and docstrings.
+- `docstring OBJECT`: a docstring that is written in Markdown, as those of the environments.
+- `api MODULE [NAME ...]`: the reference of these public names of a module, or of all that are in its `__all__`.
+- `file PATH`: another Markdown file of the repository, without its title.
+
+Besides, the notebooks of tutorials/ are copied to docs/tutorials, and docstrings are mended for reStructuredText.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import importlib
+import importlib.util
+import inspect
+import io
+import os
+import re
+import shutil
+import textwrap
+from collections.abc import Callable
+from dataclasses import MISSING, Field, fields, is_dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+DOCS = Path(__file__).parent
+ROOT = DOCS.parent
+MARKER = re.compile(r"^<!-- generated: (\w+) ?(.*?) -->$", re.MULTILINE)
+
+
+# --- command line -----------------------------------------------------------------------------------------------------
+
+
+def help_text(*arguments: str) -> str:
+    """What `difflcs ARGUMENTS --help` prints, 88 columns wide."""
+    from difflcs import cli
+
+    output, before = io.StringIO(), os.environ.copy()
+    os.environ.update(COLUMNS="88", LINES="60", NO_COLOR="1")
+    try:
+        with contextlib.redirect_stdout(output), contextlib.suppress(SystemExit):
+            cli.main([*arguments, "--help"])
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
+    return re.sub(r"\x1b\[[0-9;]*m", "", output.getvalue()).rstrip()
+
+
+def command_names() -> list[str]:
+    """The subcommands, from the usage line."""
+    found = re.search(r"\{([\w,\- \n]+)\}", help_text())
+    assert found, "difflcs --help lists no subcommands"
+    return [name.strip() for name in found[1].split(",")]
+
+
+def commands() -> str:
+    """Markdown: the help of every subcommand."""
+    parts = [f"```text\n{help_text()}\n```"]
+    for name in command_names():
+        parts.append(f"## difflcs {name}\n\n```text\n{help_text(name)}\n```")
+    return "\n\n".join(parts)
+
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+
+
+def resolve(name: str) -> Any:
+    """The object of a dotted name."""
+    module, _, rest = name.rpartition(".")
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError:
+        return getattr(resolve(module), rest)
+
+
+def field_docstrings(kind: type) -> dict[str, str]:
+    """Field → the string that follows it in the class, or in a class it inherits from."""
+    found = {}
+    for owner in reversed([k for k in kind.__mro__ if is_dataclass(k)]):
+        body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0].body  # pyright: ignore
+        for field, after in pairwise(body):
+            if (
+                isinstance(field, ast.AnnAssign)
+                and isinstance(after, ast.Expr)
+                and isinstance(after.value, ast.Constant)
+            ):
+                found[field.target.id] = " ".join(inspect.cleandoc(after.value.value).split())  # pyright: ignore
+    return found
+
+
+def settings(name: str) -> str:
+    """Markdown: a table of the fields of a dataclass, then a section for each field that is a dataclass itself."""
+    kind = resolve(name)
+    documented = field_docstrings(kind)
+    parts = [settings_table(kind, documented)]
+    for field in fields(kind):
+        group = _default(field)
+        if is_dataclass(group):
+            own = type(group)
+            summary = inspect.cleandoc(own.__doc__ or "").replace("\n", " ")
+            parts.append(f"## Group {field.name}\n\n{documented[field.name]}\n\n`{own.__name__}`: {summary}")
+            parts.append(settings_table(own, field_docstrings(own), f"{field.name}."))
+    return "\n\n".join(parts)
+
+
+def settings_table(kind: type, documented: dict[str, str], prefix: str = "") -> str:
+    """Markdown: flag, default and meaning of every field that is no dataclass."""
+    rows = ["```{container} settings", "| setting | default | meaning |", "|---|---|---|"]
+    for field in fields(kind):
+        default = _default(field)
+        if is_dataclass(default):
+            continue
+        if field.name not in documented:
+            raise ValueError(f"{kind.__name__}.{field.name}: expected a docstring below the field; write what it means")
+        flag = f"--{prefix}{field.name}".replace("_", "-")
+        meaning = documented[field.name].replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
+        rows.append(f"| `{flag}` | {'required' if default is MISSING else f'`{default!r}`'} | {meaning} |")
+    return "\n".join([*rows, "```"])
+
+
+def _default(field: Field) -> Any:
+    return field.default_factory() if field.default_factory is not MISSING else field.default
+
+
+# --- docstrings -------------------------------------------------------------------------------------------------------
+
+
+def docstring(name: str) -> str:
+    """Markdown: a docstring in Markdown, its headings one level down, its summary line bold."""
+    summary, _, rest = inspect.cleandoc(resolve(name).__doc__).partition("\n\n")
+    return f"**{summary}**\n\n" + re.sub(r"^(#+) ", r"#\1 ", rest, flags=re.MULTILINE)
+
+
+def api(module: str, *names: str) -> str:
+    """Markdown: autodoc of public names; nothing where the module does not exist."""
+    if importlib.util.find_spec(module) is None:
+        return ""
+    owner = importlib.import_module(module)
+    parts = []
+    for name in names or owner.__all__:
+        value = getattr(owner, name)
+        options: list[str] = []
+        if inspect.isclass(value) and issubclass(value, BaseException):
+            kind, options = "autoexception", [":show-inheritance:"]
+        elif inspect.isclass(value):
+            kind = "autoclass"
+            if is_dataclass(value) and name.endswith("Config"):
+                options = [":exclude-members: " + ", ".join(f.name for f in fields(value))]
+            if [*getattr(value, "__members__", {})]:
+                options = [":undoc-members:"]
+        elif inspect.isroutine(value):
+            kind = "autofunction"
+        else:
+            kind = "autodata"
+            options = [":no-value:"]
+        parts += [f".. {kind}:: {module}.{name}", *(f"   {option}" for option in options), ""]
+    return "```{eval-rst}\n" + "\n".join(parts) + "```"
+
+
+def mend_docstring(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Let docstrings stay plain text: formulas become literal blocks, Markdown tables reStructuredText tables."""
+    out: list[str] = []
+    i = 0
+    while i < len(lines):
+        line = lines[i]
+        indent = len(line) - len(line.lstrip())
+        if line.lstrip().startswith("|") and line.rstrip().endswith("|"):
+            end = i
+            while end < len(lines) and lines[end].lstrip().startswith("|"):
+                end += 1
+            out += _table([row.strip() for row in lines[i:end]], " " * indent)
+            i = end
+            continue
+        starts_block = (
+            line.startswith("    ") and i >= 2 and not lines[i - 1].strip() and not lines[i - 2].startswith(" ")
+        )
+        if starts_block and lines[i - 2].strip():
+            out += ["::", ""]
+            while i < len(lines) and (lines[i].startswith("    ") or not lines[i].strip()):
+                out.append(lines[i])
+                i += 1
+            continue
+        names = re.match(r"    (\w+(?:, \w+)+): ", line)  # of several attributes at once: one word for napoleon
+        out.append(_inline(line.replace(names[1], names[1].replace(", ", ","), 1) if names else line))
+        i += 1
+    lines[:] = out
+
+
+def _inline(line: str) -> str:
+    line = re.sub(r"(?<!`)`([^`]+)`(?=\w)", r"`\1`\\ ", line)  # `MPCProblem`s
+    parts = re.split(r"(`+[^`]+`+)", line)
+    return "".join(p if p.startswith("`") else p.replace("|", r"\|") for p in parts)
+
+
+def _table(rows: list[str], indent: str) -> list[str]:
+    cells = [[c.strip() for c in re.split(r"(?<!\\)\|", row.strip("|"))] for row in rows]
+    cells = [row for row in cells if not all(re.fullmatch(r":?-+:?", c) for c in row)]
+    out = [f"{indent}.. list-table::", f"{indent}   :header-rows: 1", ""]
+    for row in cells:
+        for k, cell in enumerate(row):
+            out.append(f"{indent}   {'* -' if k == 0 else '  -'} {_inline(cell)}")
+    return [*out, ""]
+
+
+def skip_member(app: Any, what: str, name: str, obj: Any, skip: bool, options: Any) -> bool | None:
+    """Fields of a named tuple are described under its attributes; what print(module) shows interests nobody."""
+    return True if name == "extra_repr" or str(getattr(obj, "__doc__", "")).startswith("Alias for field") else None
+
+
+# --- files of the repository ------------------------------------------------------------------------------------------
+
+
+def repository_file(path: str) -> str:
+    """Markdown: a file of the repository without its title, its links changed to work in the site."""
+    file = ROOT / path
+    if not file.exists():
+        return f"`{path}` is not part of this copy."
+    text = re.sub(r"\A\s*# .*\n", "", file.read_text())
+
+    def link(found: re.Match[str]) -> str:
+        image, label, target = found.groups()
+        if re.match(r"[a-z]+:|#", target):
+            return found[0]
+        place, _, anchor = target.partition("#")
+        goal = (file.parent / place).resolve()
+        relative = os.path.relpath(goal, DOCS)
+        if image:
+            return f"![{label}]({relative})"
+        if goal.is_relative_to(DOCS) and goal.suffix in (".md", ".ipynb"):
+            return f"[{label}]({relative}{'#' + anchor if anchor else ''})"
+        name = str(goal.relative_to(ROOT)) if goal.is_relative_to(ROOT) else target
+        return label if label.strip("`") == name else f"{label} (`{name}`)"
+
+    code = re.compile(r"(^```.*?^```$|`[^`\n]+`(?!\]))", re.MULTILINE | re.DOTALL)
+    parts = code.split(text)
+    links = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)")
+    return "".join(p if k % 2 else links.sub(link, p) for k, p in enumerate(parts))
+
+
+def copy_tutorials() -> None:
+    """Copy tutorials/*.ipynb to docs/tutorials and write their contents page."""
+    target = DOCS / "tutorials"
+    target.mkdir(exist_ok=True)
+    found = sorted((ROOT / "tutorials").glob("*.ipynb"))
+    for old in target.glob("*.ipynb"):
+        if not (ROOT / "tutorials" / old.name).exists():
+            old.unlink()
+    for notebook in found:
+        copy = target / notebook.name
+        if not copy.exists() or copy.read_bytes() != notebook.read_bytes():
+            shutil.copyfile(notebook, copy)
+    names = "\n".join(notebook.stem for notebook in found)
+    contents = f"```{{toctree}}\n:maxdepth: 1\n\n{names}\n```\n" if found else "This copy has none.\n"
+    text = (
+        "# Tutorials\n\nNotebooks, one idea each, each under three minutes. They are in the folder `tutorials/` of the "
+        "repository; what they show here was computed when they were last run.\n\n" + contents
+    )
+    index = target / "index.md"
+    if not index.exists() or index.read_text() != text:
+        index.write_text(text)
+
+
+# --- Sphinx -----------------------------------------------------------------------------------------------------------
+
+KINDS: dict[str, Callable[..., str]] = {
+    "commands": commands,
+    "settings": settings,
+    "docstring": docstring,
+    "api": api,
+    "file": repository_file,
+}
+
+
+def fill(text: str) -> str:
+    """A page with its markers replaced."""
+    return MARKER.sub(lambda found: KINDS[found[1]](*found[2].split()), text)
+
+
+def read_source(app: Any, docname: str, source: list[str]) -> None:
+    """Fill a page before it is parsed."""
+    source[0] = fill(source[0])
+
+
+def always_read(app: Any, env: Any, added: set[str], changed: set[str], removed: set[str]) -> list[str]:
+    """Pages with markers are read at every build: what they depend on is not a file that Sphinx watches."""
+    pages = [name for name in env.found_docs if str(env.doc2path(name)).endswith(".md")]
+    return [name for name in pages if MARKER.search(Path(env.doc2path(name)).read_text())]
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """Called by Sphinx."""
+    copy_tutorials()
+    app.connect("source-read", read_source)
+    app.connect("env-get-outdated", always_read)
+    app.connect("autodoc-process-docstring", mend_docstring, priority=400)  # before napoleon
+    app.connect("autodoc-skip-member", skip_member)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

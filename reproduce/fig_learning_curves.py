@@ -1,0 +1,80 @@
+"""Learning curves on the cube: LCS-RL, violation loss only, PPO without warm-up, PDDM.
+
+`python reproduce/fig_learning_curves.py` draws the tracked results; `--rerun --preset smoke|quick|paper` computes them.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+import report
+from paper import CURVES
+from records import Cell, Row, select
+from report import Draw, Grid
+from runs import command_line
+from units import METHODS
+
+SETTINGS = {"noise": "warm-up with noise (ours)", "no-noise": "warm-up without noise (the paper's setting)"}
+
+
+def cells_of(rows: Sequence[Row]) -> dict[str, dict[str, Cell | None]]:
+    """Warm-up setting → method → results. Methods without a warm-up belong to both settings."""
+    return {
+        warmup: {
+            method: select(rows, "cube", method, warmup) or select(rows, "cube", method, "none") for method in METHODS
+        }
+        for warmup in SETTINGS
+    }
+
+
+def table(cells: dict[str, dict[str, Cell | None]]) -> Grid:
+    """What the text of the paper says about the figure, and ours."""
+    lines = []
+    for warmup, setting in SETTINGS.items():
+        for method, cell in cells[warmup].items():
+            if cell is None or (warmup == "no-noise" and cell.rows[0].warmup == "none"):
+                continue
+            said = CURVES[method]
+            paper = ", ".join(f"{value:g} at {minute:g} min" for minute, value in said.items())
+            label = report.NAMES[method] + ("" if cell.rows[0].warmup == "none" else f", {setting}")
+            peak = f"{report.plus_minus(report.at(cell, 'peak'))} at {cell.peak_minute:g} min"
+            numbers = [report.plus_minus(report.at(cell, when)) for when in (6.0, 26.0, "final")]
+            lines.append((label, numbers[0], peak, numbers[1], numbers[2], paper))
+    header = ("method", "6 min", "peak", "26 min", "final", "paper (from its text)")
+    return Grid("Success on the cube, mean ± standard deviation over the seeds [%]", header, tuple(lines))
+
+
+def draw(options: Draw) -> int:
+    """Compute if asked for, then write figure and table; returns the exit code."""
+    code, preset, rows, _ = report.script("fig_learning_curves", "curves", options)
+    cells = cells_of(rows)
+    found = [cell for of_methods in cells.values() for cell in of_methods.values() if cell is not None]
+    if not found:
+        raise report.nothing("fig_learning_curves", preset, options)
+    figure = report.new_figure(10.0, 4.8)
+    for axes, (warmup, setting) in zip(figure.subplots(1, 2, sharey=True), SETTINGS.items(), strict=True):
+        for method, cell in cells[warmup].items():
+            report.draw_curve(axes, cell, report.NAMES[method], report.COLORS[method])
+            if warmup == "no-noise":
+                minutes, values = zip(*CURVES[method].items(), strict=True)
+                style = {"marker": "x", "s": 60, "zorder": 5, "clip_on": False}
+                axes.scatter(minutes, values, color=report.COLORS[method], **style)
+        report.style_axes(axes, setting)
+        if warmup == "no-noise":
+            axes.scatter([], [], marker="x", color="grey", label="what the paper's text says")
+        axes.legend(fontsize=8, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)
+    name = report.stem("fig_learning_curves", preset)
+    report.write_figure(figure, options.results, name)
+    unique = {id(cell): cell for cell in found}
+    report.write_tables(options.results, name, [table(cells)], report.provenance(list(unique.values())))
+    return code
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    return command_line(Draw, draw, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,331 @@
+"""The units of work: method × object × seed, each one training with its evaluations, and the key that identifies it.
+
+Plain data and hashes; nothing here trains, and nothing here knows how units are distributed.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from difflcs.errors import InvalidInputError
+from difflcs.rl.training import TrainConfig
+from difflcs.rl.warmup import WarmupConfig
+
+OBJECTS = ("sugar_box", "fish_can", "mug", "wrench", "clamp", "banana")
+"""The objects of Table I, in its order."""
+METHODS = ("lcs-rl", "violation", "ppo", "pddm")
+WARMUPS: Mapping[str, WarmupConfig] = {"noise": WarmupConfig(), "no-noise": replace(WarmupConfig(), noise=0.0)}
+"""Settings of the warm-up: ours, with noise on the executed actions; the paper's, without."""
+STARTS = ("scratch", "cube")
+"""What a training starts from: a random model, or the final LCS-RL model of the cube with the same seed."""
+ARTEFACTS = ("table1", "curves", "transfer")
+FIRST_SEED = 10
+"""Seed of the first run of everything. The settings were tuned on the seeds 0 to 4, with other goals."""
+
+
+@dataclass(frozen=True)
+class Preset:
+    """How much is computed.
+
+    Attributes:
+        name: its name, and that of its file of results.
+        seeds: runs per method and object, with the seeds FIRST_SEED, FIRST_SEED + 1, ….
+        goals: goals of every evaluation.
+        evaluate_at: minutes of data at which to evaluate, the same for every unit; the last is the end.
+        smoke: train on so little that nothing is learned.
+    """
+
+    name: str
+    seeds: int
+    goals: int
+    evaluate_at: tuple[float, ...] = (0.0, 2.0, 4.0, 6.0, 10.0, 14.0, 18.0, 22.0, 26.0, 30.0)
+    smoke: bool = False
+
+
+PRESETS: Mapping[str, Preset] = {
+    preset.name: preset
+    for preset in (
+        Preset("smoke", seeds=1, goals=4, evaluate_at=(0.0, 0.2, 0.5), smoke=True),
+        Preset("quick", seeds=2, goals=100),
+        Preset("paper", seeds=10, goals=1000),
+    )
+}
+
+
+@dataclass(frozen=True, order=True)
+class Unit:
+    """One training.
+
+    Attributes:
+        task: "cube" or one of `OBJECTS`.
+        method: one of `METHODS`.
+        warmup: one of `WARMUPS`; "none" for methods without a warm-up.
+        seed: of the training.
+        start: one of `STARTS`.
+    """
+
+    task: str
+    method: str
+    warmup: str
+    seed: int
+    start: str = "scratch"
+
+    @property
+    def init(self) -> Unit | None:
+        """The unit whose model this one starts from."""
+        return None if self.start == "scratch" else Unit("cube", "lcs-rl", "noise", self.seed)
+
+    def __str__(self) -> str:
+        warmup = f", {self.warmup}" if self.warmup == "no-noise" else ""
+        start = "" if self.start == "scratch" else f", from the {self.start}'s model"
+        return f"{self.task} {self.method}{warmup}{start}, seed {self.seed}"
+
+
+def choose(name: str, chosen: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:
+    """The chosen names in the known order; all of them if none is chosen.
+
+    Raises:
+        InvalidInputError: a name is unknown.
+    """
+    known = tuple(known)
+    for word in chosen:
+        if word not in known:
+            raise InvalidInputError(f"{name}: expected some of {', '.join(known)}, got {word!r}; choose among these")
+    return tuple(word for word in known if word in chosen) if chosen else known
+
+
+def get_preset(name: str, seeds: int | None = None, goals: int | None = None) -> Preset:
+    """Look a preset up, with other numbers of seeds or goals where they are given.
+
+    Raises:
+        InvalidInputError: no preset has this name, or a number is below one.
+    """
+    if name not in PRESETS:
+        raise InvalidInputError(f"preset: expected one of {', '.join(PRESETS)}, got {name!r}; choose one of these")
+    for label, number in (("seeds", seeds), ("goals", goals)):
+        if number is not None and number < 1:
+            raise InvalidInputError(f"{label}: expected at least 1, got {number}; pass a larger number")
+    preset = PRESETS[name]
+    return replace(preset, seeds=seeds or preset.seeds, goals=goals or preset.goals)
+
+
+def matrix(
+    artefacts: Sequence[str],
+    seeds: int,
+    objects: Sequence[str] = (),
+    methods: Sequence[str] = (),
+    warmups: Sequence[str] = (),
+) -> list[Unit]:
+    """The units that the artefacts need, each once, ordered so that the first seeds of everything come first.
+
+    Args:
+        artefacts: some of `ARTEFACTS`; none for all.
+        seeds: runs per method and object.
+        objects: some of `OBJECTS`; none for all. The cube is not one of them.
+        methods: some of `METHODS`; none for all.
+        warmups: some of `WARMUPS`; none for what the artefact shows by default: both on the cube, ours on the objects.
+
+    Returns:
+        The units. What a unit starts from comes before it, whatever is chosen.
+
+    Raises:
+        InvalidInputError: a name is unknown, or nothing is left.
+    """
+    artefacts, objects = choose("artefacts", artefacts, ARTEFACTS), choose("objects", objects, OBJECTS)
+    methods = choose("methods", methods, METHODS)
+    on_cube, on_objects = choose("warmups", warmups, WARMUPS), choose("warmups", warmups or ["noise"], WARMUPS)
+    found: list[Unit] = []
+    for seed in range(FIRST_SEED, FIRST_SEED + seeds):
+        if "curves" in artefacts:
+            for method in methods:
+                found += [Unit("cube", method, warmup, seed) for warmup in _warmups(method, on_cube)]
+        if "table1" in artefacts:
+            for task in objects:
+                for method in (m for m in methods if m in ("lcs-rl", "violation")):
+                    found += [Unit(task, method, warmup, seed) for warmup in on_objects]
+        if "transfer" in artefacts and "lcs-rl" in methods:
+            for task in objects:
+                found += [Unit(task, "lcs-rl", "noise", seed, start) for start in STARTS]
+    if not found:
+        raise InvalidInputError(
+            f"units: expected at least one, got none from artefacts {', '.join(artefacts)} with methods "
+            f"{', '.join(methods)}; choose other methods"
+        )
+    ordered: dict[Unit, None] = {}
+    for unit in found:
+        if unit.init is not None:
+            ordered[unit.init] = None
+        ordered[unit] = None
+    return list(ordered)
+
+
+def _warmups(method: str, chosen: Sequence[str]) -> Sequence[str]:
+    return chosen if method in ("lcs-rl", "violation") else ("none",)
+
+
+def config_of(unit: Unit, preset: Preset) -> TrainConfig:
+    """The complete settings of a unit: the library's defaults but for the minutes and goals of the preset."""
+    config = TrainConfig(
+        task=unit.task,
+        method=unit.method,
+        minutes=30.0,
+        seed=unit.seed,
+        warmup=WARMUPS.get(unit.warmup, WarmupConfig()),
+    )
+    config = config.smoke() if preset.smoke else config
+    return replace(
+        config,
+        minutes=preset.evaluate_at[-1],
+        evaluate_at=preset.evaluate_at[:-1],
+        evaluate_goals=preset.goals,
+        final_goals=preset.goals,
+    )
+
+
+_UNUSED: Mapping[str, tuple[str, ...]] = {
+    "lcs-rl": ("pddm", "mlp"),
+    "violation": ("pddm", "mlp", "ppo", "warmup_minutes"),
+    "ppo": ("pddm", "mlp", "warmup", "warmup_minutes"),
+    "pddm": ("mlp", "warmup", "warmup_minutes", "ppo", "n_lam", "stiffness", "init_scale", "backend"),
+}
+"""Settings that a method never reads, which therefore do not make a unit another one."""
+_UNUSED_FROM_A_MODEL = ("n_lam", "stiffness", "init_scale")
+
+
+def settings_hash(unit: Unit, preset: Preset, sources: Mapping[str, Mapping[str, str]]) -> str:
+    """Identifies what units that differ only in their seed have in common, except the code.
+
+    Args:
+        unit: the unit.
+        preset: how much is computed.
+        sources: task → `object_source` of it.
+
+    Returns:
+        12 hexadecimal digits.
+    """
+    config: dict[str, Any] = asdict(config_of(unit, preset))
+    for name in ("seed", *_UNUSED[unit.method], *(_UNUSED_FROM_A_MODEL if unit.init else ())):
+        config.pop(name, None)
+    before = settings_hash(unit.init, preset, sources) if unit.init else None
+    return _hash({"config": config, "source": dict(sources[unit.task]), "init": before}, 12)
+
+
+def unit_key(unit: Unit, preset: Preset, sources: Mapping[str, Mapping[str, str]], code: str) -> str:
+    """Identifies a unit and its result: 16 hexadecimal digits out of its settings, its object and the code."""
+    return _hash({"settings": settings_hash(unit, preset, sources), "seed": unit.seed, "code": code}, 16)
+
+
+def _hash(value: object, digits: int) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:digits]
+
+
+def object_source(task: str) -> dict[str, str]:
+    """Where the object of a task comes from on this machine, and the hash of its mesh.
+
+    Raises:
+        InvalidInputError: DIFFLCS_YCB_DIR is set, but the mesh is not there.
+    """
+    from difflcs_envs import DifflcsEnvsError
+    from difflcs_envs.assets import find_ycb_mesh
+    from difflcs_envs.ycb import YCB
+
+    if task not in YCB:
+        return {"source": "built_in", "sha256": ""}
+    try:
+        path = find_ycb_mesh(YCB[task])
+    except DifflcsEnvsError as error:
+        raise InvalidInputError(str(error)) from error
+    if path is None:
+        return {"source": "stand_in", "sha256": ""}
+    return {"source": "ycb_mesh", "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+
+
+_ENTRIES = ("difflcs.rl.training", "difflcs_envs.vector")
+"""What a unit starts from; what these import, directly or not, is the code that decides a result."""
+_HARMLESS = frozenset(
+    {
+        "difflcs._files",
+        "difflcs.errors",
+        "difflcs.mpc.backends.ipopt",
+        "difflcs.mpc.backends.relaxed",
+        "difflcs.rl._optional",
+        "difflcs_envs.assets",
+        "difflcs_envs.errors",
+        "difflcs_envs.trifinger.rendering",
+    }
+)
+"""Imported, but without influence on a result: files, messages, pictures, other solvers."""
+
+
+def code_version() -> str:
+    """Hash of the code that decides a result: every module that a training imports, and the C++ kernels.
+
+    Python is hashed as syntax trees without docstrings: comments, documentation and formatting do not count. The C++ is
+    hashed as text where its sources lie beside the installed package (in a wheel they do not). The hash is that of one
+    minor version of Python.
+
+    Returns:
+        "<Python>.<C++>", 8 hexadecimal digits each.
+    """
+    import difflcs
+    import difflcs_envs
+
+    roots = {p.__name__: Path(str(p.__file__)).parent for p in (difflcs, difflcs_envs)}
+    trees: dict[str, str] = {}
+    waiting = list(_ENTRIES)
+    while waiting:
+        name = waiting.pop()
+        path = _module_file(name, roots)
+        if path is None or name in trees or name in _HARMLESS or name in roots:
+            continue
+        tree = ast.parse(path.read_text())
+        waiting += _imports(tree)
+        trees[name] = ast.dump(_without_docstrings(tree))
+    native = {
+        f"{name}/{path.relative_to(root)}": hashlib.sha256(path.read_bytes()).hexdigest()
+        for name, root in roots.items()
+        for path in sorted(root.rglob("*.?pp"))
+    }
+    return f"{_hash(trees, 8)}.{_hash(native, 8)}"
+
+
+def _module_file(name: str, roots: Mapping[str, Path]) -> Path | None:
+    package, _, rest = name.partition(".")
+    if package not in roots:
+        return None
+    path = roots[package] / rest.replace(".", os.sep)
+    return next((p for p in (path.with_suffix(".py"), path / "__init__.py") if p.is_file()), None)
+
+
+def _imports(tree: ast.Module) -> list[str]:
+    """Names of what may be modules: `from a import b` names both a and a.b."""
+    found: list[str] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+            found += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    return found
+
+
+def _without_docstrings(tree: ast.Module) -> ast.Module:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            # Strings that stand alone: docstrings, and those below the fields of a dataclass.
+            node.body = [
+                child
+                for child in node.body
+                if not (
+                    isinstance(child, ast.Expr)
+                    and isinstance(child.value, ast.Constant)
+                    and isinstance(child.value.value, str)
+                )
+            ]
+    return tree

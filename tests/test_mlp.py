@@ -1,0 +1,192 @@
+"""PPO with a network instead of the MPC, on a small system that needs no simulator."""
+
+import inspect
+from dataclasses import asdict, replace
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from gymnasium.vector import SyncVectorEnv
+
+from difflcs.errors import CheckpointError, InvalidInputError
+
+pytest.importorskip("torchrl")
+from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
+from difflcs.rl.evaluate import evaluate
+from difflcs.rl.mlp import MLPConfig, MLPController
+from difflcs.rl.policy import make_actor
+from difflcs.rl.ppo import PPO, PPOConfig, network_tensors
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Threads cost more than they bring on networks this small."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+STEPS = 6
+U_MAX = 0.1
+ROLLOUTS = 20
+BOUND = torch.full((1,), U_MAX, dtype=torch.float64)
+
+
+class Slide(gymnasium.Env):
+    """x₊ = x + ½u: six steps are just enough for the farthest goals."""
+
+    observation_space = spaces.Dict(
+        {"state": spaces.Box(-10.0, 10.0, (1,), np.float64), "goal": spaces.Box(-1.0, 1.0, (1,), np.float64)}
+    )
+    action_space = spaces.Box(-U_MAX, U_MAX, (1,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps, self.state, self.goal = 0, np.zeros(1), self.np_random.uniform(-0.3, 0.3, 1)
+        return {"state": self.state.copy(), "goal": self.goal.copy()}, {}
+
+    def step(self, action):
+        error = float(abs(self.state - self.goal)[0])
+        self.state = self.state + 0.5 * np.asarray(action)
+        self.steps += 1
+        success, last = float(abs(self.state - self.goal)[0]) < 0.05, self.steps >= STEPS
+        info = {"success": success, "reward_completion": -10.0 * (last and not success)}
+        reward = -20 * error + info["reward_completion"]
+        return {"state": self.state.copy(), "goal": self.goal.copy()}, reward, False, last, info
+
+
+def features(state, goal, elapsed):
+    return torch.cat([10 * (state - goal), 10 * (state - goal).abs(), elapsed.unsqueeze(-1)], -1)
+
+
+def make_network(width: int = 16, seed: int = 0) -> MLPController:
+    return MLPController(features, 3, -BOUND, BOUND, width, STEPS, torch.Generator().manual_seed(seed))
+
+
+def make_trainer(seed: int = 0, iterations: int = 3, **changes) -> PPO:
+    small = MLPConfig(rollouts=ROLLOUTS, steps=6, minibatch=50, std=0.03, std_range=(0.01, 0.1), value_first_epochs=10)
+    config = replace(small, **changes)
+    return PPO(
+        make_actor(make_network(config.width), config),
+        SyncVectorEnv([Slide] * ROLLOUTS),
+        config,
+        seed,
+        features=features,
+        total_episodes=iterations * ROLLOUTS,
+        episode_steps=STEPS,
+    )
+
+
+def test_it_learns():
+    trainer = make_trainer(iterations=12, steps=30, learning_rate=3e-3, std_learning_rate=3e-3)
+    envs = trainer.env
+    before = evaluate(envs, trainer.policy, 60, 0, STEPS).success_rate
+    while not trainer.done:
+        report = trainer.step()
+    assert before < 0.35
+    assert evaluate(envs, trainer.policy, 60, 0, STEPS).success_rate > before + 0.4
+    assert report.solver_failures == 0
+    assert report.gradient_steps == 30
+    assert report.std != pytest.approx(0.03)
+    assert trainer.checkpoint().model is None
+
+
+def test_actions_stay_within_the_bounds_and_depend_on_the_time():
+    network = make_network()
+    with torch.no_grad():
+        network.layers[-2].weight.mul_(300)
+    state, goal = torch.randn(50, 1).double(), torch.randn(50, 1).double()
+    first = network(state, goal)
+    assert bool((first.action.abs() <= U_MAX).all())
+    assert float(first.action.detach().abs().max()) > 0.9 * U_MAX
+    assert bool(first.converged.all())
+    actions = [network(state, goal).action for _ in range(STEPS)]
+    assert not torch.equal(actions[0], first.action)
+    assert torch.equal(actions[-1], first.action)  # the next episode
+    network.begin()
+    assert torch.equal(network(state, goal).action, first.action)
+    tight = network(state, goal, u_min=-0.01 * BOUND, u_max=0.01 * BOUND)
+    assert bool((tight.action.abs() <= 0.01 * U_MAX).all())
+
+
+def test_it_starts_near_the_middle_of_the_bounds():
+    low = torch.tensor([0.1, -0.3], dtype=torch.float64)
+    network = MLPController(features, 3, low, low + 0.2)
+    state = torch.randn(50, 1).double()
+    torch.testing.assert_close(network(state, -state).action, (low + 0.1).expand(50, 2), rtol=0, atol=0.01)
+
+
+def test_training_and_evaluation_see_the_same_time():
+    """The actor gets the elapsed time with the data, the controller counts its steps."""
+    trainer = make_trainer()
+    _, data, *_ = trainer._collect(None)
+    torch.testing.assert_close(data["elapsed"][0], torch.arange(STEPS).double() / STEPS)
+    trainer.policy.begin()
+    for t in range(STEPS):
+        action = trainer.policy(data["state"][:, t], data["goal"][:, t]).action
+        torch.testing.assert_close(action, data["loc"][:, t])
+
+
+def test_the_initial_weights_are_the_generators():
+    state = torch.random.get_rng_state()
+    one, two, other = make_network(seed=0), make_network(seed=0), make_network(seed=1)
+    assert torch.equal(state, torch.random.get_rng_state())
+    assert torch.equal(one.layers[0].weight, two.layers[0].weight)
+    assert not torch.equal(one.layers[0].weight, other.layers[0].weight)
+
+
+def test_resumed_equals_uninterrupted_bitwise(tmp_path):
+    through = make_trainer()
+    while not through.done:
+        through.step()
+    first = make_trainer()
+    first.step()
+    save_checkpoint(tmp_path, first.checkpoint())
+    second = make_trainer()
+    second.restore(load_checkpoint(tmp_path))
+    torch.manual_seed(7)  # the global generator must not matter
+    while not second.done:
+        second.step()
+    for name, value in through._tensors().items():
+        assert torch.equal(value, second._tensors()[name]), name
+    saved = network_tensors(through.checkpoint())
+    assert all(torch.equal(value, saved[name]) for name, value in second.learned.state_dict().items())
+    with pytest.raises(CheckpointError, match="other settings"):
+        make_trainer(width=8).restore(load_checkpoint(tmp_path))
+
+
+def test_saved_and_loaded(tmp_path):
+    network = make_network()
+    network.save_pretrained(tmp_path)
+    again = MLPController.from_pretrained(tmp_path, features)
+    state = torch.randn(5, 1).double()
+    assert torch.equal(network(state, -state).action, again(state, -state).action)
+    assert again.episode_steps == STEPS
+    (tmp_path / "config.json").unlink()
+    with pytest.raises(CheckpointError, match="missing"):
+        MLPController.from_pretrained(tmp_path, features)
+
+
+@pytest.mark.parametrize("change", [{"beta": 0.5}, {"sample_clip": 3.0}])
+def test_what_needs_an_lcs_is_refused(change):
+    with pytest.raises(InvalidInputError, match="without an LCS"):
+        MLPConfig(**change)
+    config = PPOConfig(learn_std=True, **change)
+    envs, actor = SyncVectorEnv([Slide] * ROLLOUTS), make_actor(make_network(), config)
+    with pytest.raises(InvalidInputError, match="without an LCS"):
+        PPO(actor, envs, config, 0, features=features, total_episodes=ROLLOUTS, episode_steps=STEPS)
+
+
+def test_settings():
+    with pytest.raises(InvalidInputError, match="width"):
+        MLPConfig(width=0)
+    with pytest.raises(InvalidInputError, match="rollouts"):
+        MLPConfig(rollouts=0)
+    assert set(asdict(PPOConfig())) < set(asdict(MLPConfig()))
+    source = inspect.getsource(MLPConfig)
+    for name in MLPConfig.__annotations__:
+        line = source.index(f"    {name}: ")
+        assert source[line:].split("\n")[1].strip().startswith('"""'), name

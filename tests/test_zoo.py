@@ -1,0 +1,252 @@
+"""Models that ship with the package: names, cards, how they are added, and that they are as good as their cards say."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from dataclasses import asdict, replace
+
+import pytest
+import torch
+
+from difflcs import LCSModel, _zoo, cli, zoo
+from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs.rl.checkpoint import RunDirectory
+from difflcs.rl.evaluate import wilson_interval
+from difflcs.rl.tasks import N_U, N_X, TASKS
+from difflcs.rl.training import METHODS, TrainConfig
+
+CUBE = "trifinger-cube"
+OBJECT = {"name": "mug", "source": "ycb_mesh", "mass": 0.05, "sha256": "abc"}
+
+
+def make_run(path, *, method="lcs-rl", finished=True, evaluated=True, init=None, **settings):
+    """A run directory as `difflcs train` leaves it, without the training."""
+    config = TrainConfig(task="mug", method=method, minutes=30.0, seed=3, **settings)
+    versions = {"difflcs": "0.1.0", "mujoco": None}
+    content = {"kind": "run", "config": asdict(config), "init": init, "versions": versions, "object": OBJECT}
+    run = RunDirectory.create(path, content)
+    for last in (False, True):
+        row = {"iteration": int(last), "minutes": 30.0 * last}
+        for name, value in (("success_rate", 0.9), ("ci_low", 0.88), ("ci_high", 0.92), ("goals", 1000)):
+            row[f"evaluation_{name}"] = value if evaluated and last else None
+        row["evaluation_solver_failures"] = 7 if evaluated and last else None
+        run.append(row)
+    if finished:
+        LCSModel(N_X, N_U, 2, generator=torch.Generator().manual_seed(1)).save_pretrained(run.model)
+    return run
+
+
+# --- what ships -------------------------------------------------------------------------------------------------------
+
+
+def test_the_cube_is_there_and_everything_is_small():
+    assert CUBE in zoo.names()
+    assert list(zoo.names()) == sorted(zoo.names())
+    files = [path for name in zoo.names() for path in zoo.path(name).iterdir()]
+    assert {path.name for path in files} == {"config.json", "model.safetensors", "card.json"}
+    assert sum(path.stat().st_size for path in files) < 1_000_000
+
+
+@pytest.mark.parametrize("name", _zoo.names())
+def test_every_model_fits_its_card(name):
+    card = zoo.card(name)
+    assert card.name == name == zoo._checked_name(None, card.task, card.method)
+    assert card.task in TASKS
+    assert card.method in METHODS
+    assert card.goals >= 300
+    assert (card.ci_low, card.ci_high) == pytest.approx(
+        wilson_interval(round(card.success_rate * card.goals), card.goals)
+    )
+    assert card.object_source in ("built_in", "ycb_mesh", "stand_in")
+    assert card.object_mass > 0
+    assert card.command.startswith(f"difflcs train --task {card.task} --method {card.method} ")
+    assert not re.search(r"/(home|root|tmp|work|Users)\b", (zoo.path(name) / "card.json").read_text())
+    model = LCSModel.from_pretrained(name)
+    assert (model.n_x, model.n_u, model.A.dtype) == (N_X, N_U, torch.float64)
+    assert hash(card) == hash(zoo.card(f"zoo:{name}"))
+
+
+@pytest.mark.parametrize("name", [n for n in _zoo.names() if zoo.card(n).object_source == "built_in"])
+def test_evaluation_finds_what_the_card_says(capsys, name):
+    pytest.importorskip("mujoco")
+    assert cli.main(["evaluate", f"zoo:{name}", "--goals", "40", "--json"]) == 0
+    captured = capsys.readouterr()
+    found = json.loads(captured.out)
+    low, high = wilson_interval(found["successes"], 40, confidence=0.99)
+    assert low <= zoo.card(name).success_rate <= high
+    assert found["run"] == f"zoo:{name}"
+    assert found["card"]["success_rate"] == zoo.card(name).success_rate
+    assert found["object"] == found["trained_on"]
+    assert "trained on" not in captured.err
+
+
+def test_evaluation_says_when_the_object_is_another(capsys, monkeypatch):
+    pytest.importorskip("mujoco")
+    card = zoo.card(CUBE)
+    monkeypatch.setattr(zoo, "card", lambda _: replace(card, object={**card.object, "source": "ycb_mesh"}))
+    assert cli.main(["evaluate", f"zoo:{CUBE}", "--smoke"]) == 0
+    captured = capsys.readouterr()
+    assert "was trained on cube (ycb mesh, 10 g), here it is cube (built in, 10 g)" in captured.err
+    assert f"its card: {100 * card.success_rate:.1f} % of {card.goals} goals" in captured.out
+
+
+# --- names ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_path_that_exists_wins_over_a_name_but_not_over_the_prefix(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shipped = LCSModel.from_pretrained(CUBE)
+    LCSModel(2, 1, 1).save_pretrained(CUBE)
+    assert LCSModel.from_pretrained(CUBE).n_x == 2
+    assert torch.equal(LCSModel.from_pretrained(f"zoo:{CUBE}").A, shipped.A)
+    assert torch.equal(LCSModel.from_pretrained(zoo.path(CUBE)).A, shipped.A)
+
+
+@pytest.mark.parametrize("name", ["trifinger-cub", "zoo:trifinger-cub"])
+def test_an_unknown_name_gets_the_names_there_are_and_the_nearest(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(CheckpointError, match="did you mean trifinger-cube") as error:
+        LCSModel.from_pretrained(name)
+    assert all(known in str(error.value) for known in zoo.names())
+
+
+def test_a_path_is_never_taken_for_a_name(tmp_path):
+    with pytest.raises(CheckpointError, match="a file is missing"):
+        LCSModel.from_pretrained(tmp_path / "trifinger-cub")
+    with pytest.raises(CheckpointError, match="`difflcs zoo` lists them"):
+        LCSModel.from_pretrained("zoo:../secrets")
+
+
+def test_neither_the_library_nor_the_cards_import_the_training():
+    code = "import sys, difflcs; assert 'difflcs.zoo' not in sys.modules; from difflcs import zoo; " + (
+        "zoo.card('trifinger-cube'); print(*sys.modules)"
+    )
+    loaded = subprocess.check_output([sys.executable, "-c", code], text=True).split()
+    assert not {"difflcs.rl", "safetensors", "gymnasium", "tyro"} & set(loaded)
+
+
+def test_a_damaged_card_is_reported(tmp_path):
+    good = json.loads((zoo.path(CUBE) / "card.json").read_text())
+    file = tmp_path / "card.json"
+    for content, message in (
+        ("{", "expected JSON"),
+        ("[]", "expected the fields"),
+        (json.dumps({**good, "extra": 1}), "extra"),
+        (json.dumps({**good, "goals": "many"}), "int for goals"),
+        (json.dumps({**good, "success_rate": True}), "float for success_rate|int for success_rate"),
+    ):
+        file.write_text(content)
+        with pytest.raises(CheckpointError, match=message):
+            zoo._read(file)
+    file.write_text(json.dumps(good))
+    assert zoo._read(file) == zoo.card(CUBE)
+
+
+# --- adding -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_finished_run_becomes_a_model_with_its_card(tmp_path):
+    run = make_run(tmp_path / "run", init="/home/somebody/runs/cube-7/model")
+    root = tmp_path / "zoo"
+    card = zoo.add(run.path, root=root)
+    assert _zoo.names(root) == ("trifinger-mug",)
+    assert zoo._read(root / "trifinger-mug/card.json") == card
+    assert (card.name, card.task, card.method, card.minutes, card.seed) == ("trifinger-mug", "mug", "lcs-rl", 30.0, 3)
+    assert (card.success_rate, card.ci_low, card.ci_high, card.goals) == (0.9, 0.88, 0.92, 1000)
+    assert (card.object_source, card.object_mass, card.solver_failures) == ("ycb_mesh", 0.05, 7)
+    assert card.command == "difflcs train --task mug --method lcs-rl --minutes 30 --seed 3 --init cube-7"
+    assert torch.equal(LCSModel.from_pretrained(root / "trifinger-mug").A, run.load_model().A)
+    assert "90.0 % of 1000 goals (95 % interval 88.0 to 92.0 %)" in str(card)
+    violation = zoo.add(make_run(tmp_path / "violation", method="violation").path, root=root)
+    assert violation.name == "trifinger-mug-violation"
+
+
+def test_nothing_is_overwritten_without_force(tmp_path, monkeypatch):
+    root = tmp_path / "zoo"
+    run = make_run(tmp_path / "run").path
+    zoo.add(run, root=root)
+    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    with pytest.raises(CheckpointError, match="--force"):
+        zoo.add(run, root=root)
+    with monkeypatch.context() as patch:
+        patch.setattr("difflcs._files.write_json", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+        with pytest.raises(OSError, match="disk full"):
+            zoo.add(run, root=root, force=True)
+    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+    other = make_run(tmp_path / "other", n_lam=4).path
+    assert zoo.add(other, root=root, force=True).settings["n_lam"] == 4
+    assert [path.name for path in root.iterdir()] == ["trifinger-mug"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "name", "error", "message"),
+    [
+        ({"finished": False}, None, CheckpointError, "--resume"),
+        ({"evaluated": False}, None, CheckpointError, "--final-goals 1000"),
+        ({}, "trifinger-cube", InvalidInputError, "expected 'trifinger-mug'"),
+        ({"method": "violation"}, "trifinger-mug", InvalidInputError, "expected 'trifinger-mug-violation'"),
+    ],
+)
+def test_what_cannot_be_added(tmp_path, settings, name, error, message):
+    run = make_run(tmp_path / "run", **settings)
+    with pytest.raises(error, match=message):
+        zoo.add(run.path, name, root=tmp_path / "zoo")
+    assert not (tmp_path / "zoo").exists()
+
+
+def test_the_command_of_a_maintainer(tmp_path, capsys):
+    run = make_run(tmp_path / "run", finished=False)
+    before = zoo.names()
+    assert zoo.main(["add", str(run.path)]) == 2
+    assert capsys.readouterr().err.startswith("difflcs.zoo: ")
+    assert zoo.main(["add", str(tmp_path / "nowhere")]) == 2
+    assert zoo.names() == before
+
+
+def test_the_command_on_a_card_gives_the_settings_back():
+    tyro = pytest.importorskip("tyro")
+    usual = TrainConfig()
+    config = replace(
+        usual,
+        task="mug",
+        method="ppo",
+        minutes=12.5,
+        evaluate_at=(),
+        warmup=replace(usual.warmup, noise=1e-7),
+        ppo=replace(usual.ppo, std_range=(0.002, 0.02), learn_std=not usual.ppo.learn_std),
+    )
+    words = shlex.split(zoo.training_command(json.loads(json.dumps(asdict(config)))))
+    assert words[:2] == ["difflcs", "train"]
+    markers = (tyro.conf.PositionalRequiredArgs, tyro.conf.FlagCreatePairsOff)
+    assert tyro.cli(TrainConfig, args=words[2:], config=markers) == config
+
+
+# --- command line -----------------------------------------------------------------------------------------------------
+
+
+def test_the_list(capsys):
+    assert cli.main(["zoo"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 1 + len(zoo.names())
+    assert max(map(len, lines)) <= 100
+    assert cli.main(["zoo", "--json"]) == 0
+    assert [card["name"] for card in json.loads(capsys.readouterr().out)] == list(zoo.names())
+    assert cli.main(["zoo", CUBE]) == 0
+    assert zoo.card(CUBE).command in capsys.readouterr().out
+    assert cli.main(["zoo", "teapot"]) == 2
+    assert CUBE in capsys.readouterr().err
+
+
+def test_a_training_starts_from_a_model_of_the_zoo(capsys, tmp_path):
+    pytest.importorskip("mujoco")
+    out = tmp_path / "run"
+    arguments = ["train", "--smoke", "--minutes", "0.1", "--final-goals", "0", "--out", str(out)]
+    assert cli.main([*arguments, "--init", f"zoo:{CUBE}"]) == 0
+    assert json.loads((out / "config.json").read_text())["init"] == f"zoo:{CUBE}"
+    assert cli.main(["train", "--out", str(out), "--resume"]) == 0
+    assert cli.main(["evaluate", f"zoo:{CUBE}", "--smoke", "--trust-region"]) == 2
+    assert "drop the flag" in capsys.readouterr().err
