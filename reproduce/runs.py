@@ -107,7 +107,13 @@ def compute(
 
     Returns:
         The record of every unit.
+
+    Raises:
+        InvalidInputError: what a unit starts from is missing.
     """
+    for unit in specs:
+        if unit.init is not None and unit.init not in specs:
+            raise InvalidInputError(f"units: expected {unit.init}, from which {unit} starts, among them; add it")
     found: dict[Unit, dict[str, Any]] = {}
     for unit, spec in specs.items():
         record = finished_record(Path(spec["folder"]), spec["key"])

@@ -45,7 +45,7 @@ class Preset:
     name: str
     seeds: int
     goals: int
-    evaluate_at: tuple[float, ...] = (0.0, 2.0, 4.0, 6.0, 10.0, 14.0, 18.0, 22.0, 26.0, 30.0)
+    evaluate_at: tuple[float, ...] = (0.0, 6.0, 12.0, 18.0, 24.0, 30.0)
     smoke: bool = False
 
 

@@ -35,7 +35,7 @@ from difflcs.errors import DiffLCSError, InvalidInputError, ShapeError  # noqa: 
 TINY = Preset("smoke", seeds=1, goals=2, evaluate_at=(0.2, 0.5), smoke=True)
 FIRST = units.FIRST_SEED
 CUBE = Unit("cube", "lcs-rl", "noise", FIRST)
-TRANSFER = Unit("mug", "lcs-rl", "noise", 0, "cube")
+TRANSFER = Unit("mug", "lcs-rl", "noise", FIRST, "cube")
 SOURCES = {task: {"source": "ycb_mesh", "sha256": "abc"} for task in ("cube", *OBJECTS)}
 
 
@@ -62,7 +62,7 @@ def one_thread():
 def test_matrix_holds_every_unit_once_and_what_it_starts_from_first():
     found = units.matrix((), seeds=2)
     assert len(found) == len(set(found))
-    assert {unit.seed for unit in found} == {0, 1}
+    assert {unit.seed for unit in found} == {FIRST, FIRST + 1}
     # Cube: two methods with two warm-ups each, two without; objects: two methods, and LCS-RL from the cube.
     assert len(found) == 2 * (2 * 2 + 2 + 6 * 2 + 6)
     for position, unit in enumerate(found):
@@ -246,6 +246,12 @@ def test_failures_stop_what_depends_on_them_and_nothing_else_and_are_tried_again
     assert not any(record["error"] for record in found.values())
 
 
+def test_what_a_unit_starts_from_must_be_there(tmp_path):
+    specs = runs.make_specs([CUBE, TRANSFER], TINY, tmp_path)
+    with pytest.raises(InvalidInputError, match="starts, among them"):
+        runs.compute({TRANSFER: specs[TRANSFER]}, FakePool(), lambda record: None)
+
+
 def test_the_display_tells_failures_and_the_time_left(tmp_path, monkeypatch):
     import io
 
@@ -425,7 +431,7 @@ def test_stand_ins_are_a_table_of_their_own(results, capsys):
 
 
 def test_nothing_is_mixed_or_replaced_silently(results, capsys):
-    unit = Unit("mug", "lcs-rl", "noise", FIRST)
+    unit = Unit("mug", "lcs-rl", "noise", 0)
     # Other numbers of goals stand beside each other; the larger amount is shown, and what is left out is said.
     records.add(results, "paper", unit_rows(unit, (0, 0, 0, 1), goals=300))
     cell = records.select(records.read(results / "paper.csv"), "mug", "lcs-rl", "noise")
