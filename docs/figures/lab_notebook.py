@@ -43,13 +43,8 @@ def main() -> None:
         ax.set_title(title, fontsize=10)
         ax.grid(axis="x", alpha=0.3)
     axes[1].set_xlabel("success of 1000 goals, one training each; the bar is the mean")
-    axes[0].legend(
-        handles=[
-            plt.Line2D([], [], marker="o", linestyle="", color=f"C{s - 1}", label=f"seed {s}") for s in (1, 2, 3, 4)
-        ],
-        fontsize=8,
-        loc="upper left",
-    )
+    seeds = [plt.Line2D([], [], marker="o", linestyle="", color=f"C{s - 1}", label=f"seed {s}") for s in range(1, 5)]
+    axes[0].legend(handles=seeds, fontsize=8, loc="upper left")
     fig.savefig(HERE / "lab_notebook.png", dpi=110)
 
 
