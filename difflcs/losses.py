@@ -40,7 +40,9 @@ def violation_loss(
         u: (..., n_u) actions.
         x_next: (..., n_x) observed next states.
         gamma: γ, weight of the slack; 0 < γ ≤ σ_min(F + Fᵀ).
-        xi: ξ > 0, weight of the dynamics against complementarity.
+        xi: ξ > 0, weight of the dynamics against complementarity. The default suits data of the size of meters per
+            step, as in the paper; scale it with the square of your data (about 1 for data of size one), or the loss is
+            the prediction loss for all practical purposes.
         reduction: "mean" over the batch, or "none" for one value each.
         check_gamma: refuse γ > σ_min(F + Fᵀ). False lets a fixed γ through, as the prior work does; the inner QP may
             then be non-convex, and a stationary point of it is used.

@@ -22,7 +22,6 @@ import fig_transfer  # noqa: E402
 import pools  # noqa: E402
 import records  # noqa: E402
 import report  # noqa: E402
-import runs  # noqa: E402
 import table1  # noqa: E402
 import units  # noqa: E402
 import worker  # noqa: E402
@@ -30,6 +29,7 @@ from paper import TABLE1  # noqa: E402
 from stats import compare, summarise  # noqa: E402
 from units import OBJECTS, Preset, Unit  # noqa: E402
 
+import runs  # noqa: E402
 from difflcs.errors import DiffLCSError, InvalidInputError, ShapeError  # noqa: E402
 
 TINY = Preset("smoke", seeds=1, goals=2, evaluate_at=(0.2, 0.5), smoke=True)
