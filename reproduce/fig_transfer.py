@@ -1,7 +1,7 @@
-"""Transfer: LCS-RL on six objects from scratch, against from the cube's model, at equal data of the object.
+"""Transfer: LCS-RL on six objects from scratch, against its main phase from the cube's model, at equal data.
 
-Both trainings are the same but for the model that they begin with: a random one, or the final LCS-RL model of the cube
-with the same seed, which has seen 30 minutes of the cube.
+The cube's model is the final LCS-RL model of the same seed, which has seen 30 minutes of the cube. It takes the place
+of the warm-up.
 
 `python reproduce/fig_transfer.py` draws the tracked results; `--rerun --preset smoke|quick|paper` computes them.
 """
@@ -15,7 +15,7 @@ import report
 from records import Cell, Row, select
 from report import Draw, Grid
 from runs import command_line
-from units import OBJECTS, STARTS
+from units import OBJECTS, STARTS, transfer
 
 LABELS = {"scratch": "from scratch", "cube": "from the cube's model"}
 COLORS = {"scratch": "#0072b2", "cube": "#d55e00"}
@@ -26,7 +26,11 @@ Cells = dict[str, dict[str, Cell | None]]
 
 def cells_of(rows: Sequence[Row]) -> Cells:
     """Object → start → results."""
-    return {task: {start: select(rows, task, "lcs-rl", "noise", start) for start in STARTS} for task in OBJECTS}
+    kinds = {start: transfer(OBJECTS[0], 0, start) for start in STARTS}
+    return {
+        task: {start: select(rows, task, unit.method, unit.warmup, start) for start, unit in kinds.items()}
+        for task in OBJECTS
+    }
 
 
 def table(cells: Cells) -> Grid:

@@ -88,6 +88,16 @@ class Unit:
         return f"{self.task} {self.method}{warmup}{start}, seed {self.seed}"
 
 
+def transfer(task: str, seed: int, start: str) -> Unit:
+    """A training on an object that is compared in the transfer figure.
+
+    From scratch it is LCS-RL. From the cube's model it is the main phase alone: that model takes the place of the
+    warm-up, whose violation loss on little data would first undo what PPO has taught it.
+    """
+    scratch = Unit(task, "lcs-rl", "noise", seed)
+    return scratch if start == "scratch" else Unit(task, "ppo", "none", seed, start)
+
+
 def choose(name: str, chosen: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:
     """The chosen names in the known order; all of them if none is chosen.
 
@@ -152,7 +162,7 @@ def matrix(
                     found += [Unit(task, method, warmup, seed) for warmup in on_objects]
         if "transfer" in artefacts and "lcs-rl" in methods:
             for task in objects:
-                found += [Unit(task, "lcs-rl", "noise", seed, start) for start in STARTS]
+                found += [transfer(task, seed, start) for start in STARTS]
     if not found:
         raise InvalidInputError(
             f"units: expected at least one, got none from artefacts {', '.join(artefacts)} with methods "

@@ -22,6 +22,7 @@ import fig_transfer  # noqa: E402
 import pools  # noqa: E402
 import records  # noqa: E402
 import report  # noqa: E402
+import runs  # noqa: E402
 import table1  # noqa: E402
 import units  # noqa: E402
 import worker  # noqa: E402
@@ -29,13 +30,12 @@ from paper import TABLE1  # noqa: E402
 from stats import compare, summarise  # noqa: E402
 from units import OBJECTS, Preset, Unit  # noqa: E402
 
-import runs  # noqa: E402
 from difflcs.errors import DiffLCSError, InvalidInputError, ShapeError  # noqa: E402
 
 TINY = Preset("smoke", seeds=1, goals=2, evaluate_at=(0.2, 0.5), smoke=True)
 FIRST = units.FIRST_SEED
 CUBE = Unit("cube", "lcs-rl", "noise", FIRST)
-TRANSFER = Unit("mug", "lcs-rl", "noise", FIRST, "cube")
+TRANSFER = Unit("mug", "ppo", "none", FIRST, "cube")
 SOURCES = {task: {"source": "ycb_mesh", "sha256": "abc"} for task in ("cube", *OBJECTS)}
 
 
@@ -361,7 +361,7 @@ def results(tmp_path):
                 (Unit(task, "violation", "no-noise", seed), (0, 20, 20, 20)),
             ):
                 records.add(tmp_path, "paper", unit_rows(unit, values))
-        transfer = Unit("mug", "lcs-rl", "noise", seed, "cube")
+        transfer = Unit("mug", "ppo", "none", seed, "cube")
         records.add(tmp_path, "paper", unit_rows(transfer, (30, 60, 70, 81 + shift)))
         records.add(tmp_path, "paper", unit_rows(Unit("cube", "pddm", "none", seed), (0, 1, 2, 3), goals=50))
     return tmp_path
