@@ -169,6 +169,9 @@ class LCSMPCPolicy(GaussianPolicy):
 
     Under `torchrl.envs.utils.set_exploration_type(ExplorationType.DETERMINISTIC)` the action is the mean.
 
+    Samples are reparametrised: the log-probability of a sample drawn with gradients does not depend on the mean.
+    Collect under `torch.no_grad()`, as collectors do, and let the loss compute the log-probability anew.
+
     Example:
         A training step in plain TorchRL, without `difflcs.rl.PPO`:
 
