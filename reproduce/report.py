@@ -262,14 +262,20 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def draw_curve(axes: Axes, cell: Cell | None, label: str, color: str, dashed: bool = False) -> None:
-    """Mean success against minutes of data, with the 95 % t-interval over the seeds."""
+    """Mean success against minutes of data, with the 95 % t-interval over the seeds; of two seeds, both instead.
+
+    A t-interval of two values is as wide as the axes and would hide the curves.
+    """
     if cell is None:
         return
     points = [(minute, summarise(list(cell.at(minute).values()))) for minute in cell.minutes]
     x = [minute for minute, _ in points]
     style = {"color": color, "lw": 2, "ls": "--" if dashed else "-", "marker": "o", "ms": 3}
     axes.plot(x, [found.mean for _, found in points], label=f"{label} ({count(cell)})", **style)
-    if len(cell.seeds) > 1:
+    if len(cell.seeds) == 2:
+        for seed in cell.seeds:
+            axes.plot(x, [cell.at(minute)[seed] for minute in cell.minutes], color=color, lw=0.8, alpha=0.6)
+    elif len(cell.seeds) > 2:
         low, high = ([getattr(found, end) for _, found in points] for end in ("low", "high"))
         axes.fill_between(x, low, high, color=color, alpha=0.2, lw=0)
 
