@@ -15,6 +15,7 @@ import difflcs
 from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSParams
 from difflcs._checks import check_positive_int
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
+from difflcs.mpc.backends import BatchedBackend, IpoptBackend
 
 ACTION_LIMIT = 0.015
 """Bound of each action [m], as in the pushing tasks."""
@@ -65,11 +66,10 @@ def measure(
         check_positive_int(name, value)
     model = LCSModel.from_params(pushing_model(n_lam, seed=0))
     x0, goal = states_and_goals(max(batch, ipopt_batch), seed=1)
-    backends = difflcs.mpc.backends  # pyright: ignore[reportAttributeAccessIssue]
     candidates = (
-        (backends.BatchedBackend(threads=1), batch, repeats),
-        (backends.BatchedBackend(threads=threads), batch, repeats),
-        (backends.IpoptBackend(workers=1), ipopt_batch, max(1, repeats // 3)),
+        (BatchedBackend(threads=1), batch, repeats),
+        (BatchedBackend(threads=threads), batch, repeats),
+        (IpoptBackend(workers=1), ipopt_batch, max(1, repeats // 3)),
     )
     timings = []
     for work, run in (("forward", _solve), ("forward + backward", _differentiate)):

@@ -24,8 +24,7 @@ from difflcs.rl._optional import require, versions
 from difflcs.rl.checkpoint import RunDirectory, load_checkpoint
 from difflcs.rl.evaluate import evaluate
 from difflcs.rl.figures import plot_learning_curve, record_video
-from difflcs.rl.progress import Progress as _Progress
-from difflcs.rl.progress import bar, summary
+from difflcs.rl.progress import Progress, bar, summary
 from difflcs.rl.tasks import TASKS, Task, get_task, pushing_cost
 from difflcs.rl.training import (
     EVALUATION_ENVS,
@@ -78,7 +77,7 @@ class Train(TrainConfig):
         config = config.smoke() if self.smoke else config
         if self.resume:
             config = self._resumed(config)
-        with _Progress() as progress:
+        with Progress() as progress:
             run = train(
                 config,
                 self.directory,
@@ -234,7 +233,7 @@ class Demo:
         resume = (self.out / "config.json").exists()
         if resume:
             print(f"{self.out} exists: continuing it (delete it for a fresh start)")
-        with _Progress() as progress:
+        with Progress() as progress:
             run = train(config, self.out, _env_factory(config.task, self.out), resume=resume, reporter=progress)
         rows = run.rows()
         title = f"{config.task}, seed {config.seed}: learning to push"

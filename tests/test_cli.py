@@ -276,7 +276,7 @@ def test_resume_after_any_crash_gives_the_same_run(capsys, finished, tmp_path, m
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(cli._Progress, "iterated", die)
+        patch.setattr(cli.Progress, "iterated", die)
         code, _, err = run(capsys, "train", "--smoke", "--out", path)
     assert code == 130
     assert f"difflcs train --out {path} --resume" in err

@@ -81,7 +81,7 @@ def test_resume_gives_the_same_run(capsys, finished, tmp_path, monkeypatch, meth
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(cli._Progress, "iterated", die)
+        patch.setattr(cli.Progress, "iterated", die)
         assert run(capsys, "train", "--smoke", "--method", method, "--out", path)[0] == 130
         code, out, _ = run(capsys, "evaluate", path, "--smoke")
         assert code == 0

@@ -16,15 +16,7 @@ from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
 from difflcs.rl.evaluate import evaluate
 from difflcs.rl.pddm import PDDM, Ensemble, PDDMConfig, Planner
 
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Threads cost more than they bring on problems this small."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 STEPS = 6
 U_MAX = 0.1

@@ -21,15 +21,7 @@ from difflcs.rl.policy import make_actor
 from difflcs.rl.ppo import PPO, PPOConfig, _trimmed_mean
 from difflcs.rl.warmup import Warmup, WarmupConfig
 
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Threads cost more than they bring on problems this small."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 STEPS = 6
 U_MAX = 0.1

@@ -48,14 +48,6 @@ def stand_ins(tmp_path_factory):
         yield
 
 
-@pytest.fixture
-def one_thread():
-    """Computing a unit here leaves torch on one thread."""
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
-
-
 # --- the matrix and its keys ------------------------------------------------------------------------
 
 
