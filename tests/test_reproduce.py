@@ -1,10 +1,12 @@
 """The scripts of reproduce/, from outside; they are no package, so that they are imported as their own scripts do."""
 
+import json
 import math
 import os
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -142,16 +144,24 @@ def undisturbed(tmp_path_factory):
 
 
 class Killer:
-    """Kills the process of the first unit that reports data, once."""
+    """Kills the process of the first unit that reports, once, as soon as the first iteration is on disk."""
 
-    def __init__(self):
-        self.killed = None
+    def __init__(self, folders):
+        self.folders, self.killed = folders, None
 
     def __call__(self, progress):
         for key, state in progress.items():
-            if self.killed is None and state.get("minutes", 0) > 0:
+            if self.killed is None and "pid" in state:
+                self._wait_for_checkpoint(Path(self.folders[key]) / "run" / "checkpoints" / "latest.json")
                 self.killed = key
                 os.kill(state["pid"], signal.SIGKILL)
+
+    def _wait_for_checkpoint(self, latest):
+        # Far finer than `compute` polls: the rest of the unit, TorchRL's import included, takes longer than this.
+        deadline = time.monotonic() + 60
+        while not latest.is_file() or json.loads(latest.read_text())["checkpoint"] == "000000":
+            assert time.monotonic() < deadline, "the unit wrote no checkpoint"
+            time.sleep(0.002)
 
 
 def same(record, expected):
@@ -165,7 +175,7 @@ def same(record, expected):
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # sockets of a killed Dask worker
 def test_a_killed_worker_costs_nothing_but_time(make_pool, undisturbed, tmp_path):
     specs = runs.make_specs([CUBE, TRANSFER], TINY, tmp_path)
-    killer, stored = Killer(), []
+    killer, stored = Killer({spec["key"]: spec["folder"] for spec in specs.values()}), []
     pool = make_pool()
     try:
         found = runs.compute(specs, pool, stored.append, observe=killer)
