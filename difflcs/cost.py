@@ -194,6 +194,12 @@ class GoalCost(_TensorFields):
             check=False,
         )
 
+    def stage(self, x: Tensor, u: Tensor, goal: Tensor) -> Tensor:
+        """The cost of one stage, its constant included: states (..., n_x), actions (..., n_u), goals (...) → (...)."""
+        cost = self(goal, horizon=1)
+        quadratic = 0.5 * ((x @ cost.Q) * x).sum(-1) + 0.5 * ((u @ cost.R) * u).sum(-1)
+        return quadratic + (cost.q * x).sum(-1) + 0.5 * (goal * (goal @ self.goal_stage.mT)).sum(-1)
+
     @classmethod
     def reach(
         cls,

@@ -15,29 +15,29 @@ from report import Draw, Grid
 from runs import command_line
 from units import METHODS
 
-SETTINGS = {"noise": "warm-up with noise (ours)", "no-noise": "warm-up without noise (the paper's setting)"}
+RECIPES = {"ours": "our recipe", "paper": "the paper's recipe"}
+_ONE_RECIPE = {"ppo": "paper", "pddm": "none"}
+"""Methods that are the same in both."""
 
 
 def cells_of(rows: Sequence[Row]) -> dict[str, dict[str, Cell | None]]:
-    """Warm-up setting → method → results. Methods without a warm-up belong to both settings."""
+    """Recipe → method → results. Methods that know one recipe only belong to both."""
     return {
-        warmup: {
-            method: select(rows, "cube", method, warmup) or select(rows, "cube", method, "none") for method in METHODS
-        }
-        for warmup in SETTINGS
+        recipe: {method: select(rows, "cube", method, _ONE_RECIPE.get(method, recipe)) for method in METHODS}
+        for recipe in RECIPES
     }
 
 
 def table(cells: dict[str, dict[str, Cell | None]]) -> Grid:
     """What the text of the paper says about the figure, and ours."""
     lines = []
-    for warmup, setting in SETTINGS.items():
-        for method, cell in cells[warmup].items():
-            if cell is None or (warmup == "no-noise" and cell.rows[0].warmup == "none"):
+    for recipe, name in RECIPES.items():
+        for method, cell in cells[recipe].items():
+            if cell is None or (recipe == "paper" and method in _ONE_RECIPE):
                 continue
             said = CURVES[method]
             paper = ", ".join(f"{value:g} at {minute:g} min" for minute, value in said.items())
-            label = report.NAMES[method] + ("" if cell.rows[0].warmup == "none" else f", {setting}")
+            label = report.NAMES[method] + ("" if method in _ONE_RECIPE else f", {name}")
             peak = f"{report.plus_minus(report.at(cell, 'peak'))} at {cell.peak_minute:g} min"
             numbers = [report.plus_minus(report.at(cell, when)) for when in (6.0, 24.0, "final")]
             lines.append((label, numbers[0], peak, numbers[1], numbers[2], paper))
@@ -53,15 +53,15 @@ def draw(options: Draw) -> int:
     if not found:
         raise report.nothing("fig_learning_curves", preset, options)
     figure = report.new_figure(10.0, 4.8)
-    for axes, (warmup, setting) in zip(figure.subplots(1, 2, sharey=True), SETTINGS.items(), strict=True):
-        for method, cell in cells[warmup].items():
+    for axes, (recipe, title) in zip(figure.subplots(1, 2, sharey=True), RECIPES.items(), strict=True):
+        for method, cell in cells[recipe].items():
             report.draw_curve(axes, cell, report.NAMES[method], report.COLORS[method])
-            if warmup == "no-noise":
+            if recipe == "paper":
                 minutes, values = zip(*CURVES[method].items(), strict=True)
                 style = {"marker": "x", "s": 60, "zorder": 5, "clip_on": False}
                 axes.scatter(minutes, values, color=report.COLORS[method], **style)
-        report.style_axes(axes, setting)
-        if warmup == "no-noise":
+        report.style_axes(axes, title)
+        if recipe == "paper":
             axes.scatter([], [], marker="x", color="grey", label="what the paper's text says")
         axes.legend(fontsize=8, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)
     name = report.stem("fig_learning_curves", preset)

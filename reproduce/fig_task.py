@@ -82,7 +82,7 @@ def _newest(work: Path) -> dict[str, Any] | None:
     found = []
     for path in work.glob("*/record.json"):
         record = worker.finished_record(path.parent, path.parent.name)
-        if record is not None and replace(Unit(**record["unit"]), seed=0) == Unit("cube", "lcs-rl", "noise", 0):
+        if record is not None and replace(Unit(**record["unit"]), seed=0) == Unit("cube", "lcs-rl", "ours", 0):
             found.append(record)
     return max(found, key=lambda record: (record["config"]["minutes"], record["finished"]), default=None)
 
@@ -126,7 +126,7 @@ def draw(options: DrawTask) -> int:
 
     code = 0
     if options.rerun:
-        one = replace(options, seeds=1, methods=("lcs-rl",), warmups=("noise",))
+        one = replace(options, seeds=1, methods=("lcs-rl",), recipes=("ours",))
         code = runs.run(one, ["curves"])
     policy, origin = find_policy(options)
     difflcs_envs.register_envs()

@@ -28,7 +28,7 @@ def cells_of(rows: Sequence[Row]) -> Cells:
     """Object → start → results."""
     kinds = {start: transfer(OBJECTS[0], 0, start) for start in STARTS}
     return {
-        task: {start: select(rows, task, unit.method, unit.warmup, start) for start, unit in kinds.items()}
+        task: {start: select(rows, task, unit.method, unit.recipe, start) for start, unit in kinds.items()}
         for task in OBJECTS
     }
 

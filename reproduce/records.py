@@ -23,7 +23,7 @@ from difflcs._files import write_atomically
 from difflcs.errors import DiffLCSError
 
 RESULTS = Path(__file__).parent / "results"
-FORMAT = 1
+FORMAT = 2
 """Of the CSV files."""
 
 
@@ -39,7 +39,7 @@ class Row:
         format: of the file.
         task: what the unit was, see `Unit`.
         method: likewise.
-        warmup: likewise.
+        recipe: likewise.
         start: likewise.
         seed: likewise.
         at: minutes of data asked for.
@@ -65,7 +65,7 @@ class Row:
     format: int
     task: str
     method: str
-    warmup: str
+    recipe: str
     start: str
     seed: int
     at: float
@@ -90,7 +90,7 @@ class Row:
     @property
     def unit(self) -> Unit:
         """The unit it belongs to."""
-        return Unit(self.task, self.method, self.warmup, self.seed, self.start)
+        return Unit(self.task, self.method, self.recipe, self.seed, self.start)
 
 
 _COLUMNS = [field.name for field in fields(Row)]
@@ -201,7 +201,7 @@ class Cell:
         return max(after, key=lambda minute: sum(self.at(minute).values()))
 
 
-def select(rows: Iterable[Row], task: str, method: str, warmup: str, start: str = "scratch") -> Cell | None:
+def select(rows: Iterable[Row], task: str, method: str, recipe: str, start: str = "scratch") -> Cell | None:
     """The results of one method on one object.
 
     Where there are several settings or code versions, the one with the most evaluated goals, then the newest.
@@ -211,7 +211,7 @@ def select(rows: Iterable[Row], task: str, method: str, warmup: str, start: str 
     """
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
-        if (row.task, row.method, row.warmup, row.start) == (task, method, warmup, start):
+        if (row.task, row.method, row.recipe, row.start) == (task, method, recipe, start):
             groups.setdefault((row.settings, row.code), []).append(row)
     if not groups:
         return None

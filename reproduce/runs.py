@@ -38,15 +38,15 @@ class Compute:
     """smoke (under a minute), quick (about 15 minutes a script on 2 cores) or paper (10 seeds, 1000 goals). To draw:
     the results to take, by default those of the largest preset there is."""
     seeds: int | None = None
-    """Runs per method and object, with the seeds 0, 1, …; the preset's number by default."""
+    """Runs per method and object, with the seeds 10, 11, …; the preset's number by default."""
     goals: int | None = None
     """Goals of every evaluation; the preset's number by default."""
     objects: tuple[str, ...] = ()
     """Some of sugar_box, fish_can, mug, wrench, clamp, banana; all by default."""
     methods: tuple[str, ...] = ()
     """Some of lcs-rl, violation, ppo, pddm; all by default."""
-    warmups: tuple[str, ...] = ()
-    """Some of noise (ours), no-noise (the paper's); by default both on the cube and ours on the objects."""
+    recipes: tuple[str, ...] = ()
+    """Some of ours, paper; by default both on the cube and ours on the objects."""
     workers: int | None = None
     """Processes on this machine, one core each; the number of cores by default."""
     dask: str | None = None
@@ -185,7 +185,7 @@ def run(options: Compute, artefacts: Sequence[str]) -> int:
         DiffLCSError: an option cannot be used, or results in the folder are of another version. Nothing was changed.
     """
     preset = get_preset(options.preset or "quick", options.seeds, options.goals)
-    units = matrix(artefacts, preset.seeds, options.objects, options.methods, options.warmups)
+    units = matrix(artefacts, preset.seeds, options.objects, options.methods, options.recipes)
     for stand_in in (False, True):
         records.read(records.path_of(options.results, preset.name, stand_in))  # an error now, not after hours
     specs = make_specs(units, preset, options.work, options.accept_code)

@@ -17,7 +17,7 @@ from units import OBJECTS
 
 METHODS = ("violation", "lcs-rl")
 WHEN = ("peak", "final")
-SETTINGS = {"noise": "warm-up with noise (ours)", "no-noise": "warm-up without noise (the paper's setting)"}
+RECIPES = {"ours": "our recipe", "paper": "the paper's recipe"}
 PEAK = (
     "Mean ± standard deviation over the seeds [% of the goals]. Peak: at the minute where the mean over the seeds is "
     "highest. Differences: LCS-RL − violation only, paired by seed, with 95 % t-interval and two-sided p."
@@ -25,18 +25,18 @@ PEAK = (
 
 
 def tables(rows: Sequence[Row]) -> tuple[list[Grid], list[str]]:
-    """The tables of all warm-up settings that there are results of, and notes."""
+    """The tables of all recipes that there are results of, and notes."""
     grids: list[Grid] = []
     cells: list[Cell | None] = []
-    for warmup, setting in SETTINGS.items():
-        table = {(task, method): select(rows, task, method, warmup) for task in OBJECTS for method in METHODS}
+    for recipe, name in RECIPES.items():
+        table = {(task, method): select(rows, task, method, recipe) for task in OBJECTS for method in METHODS}
         if any(table.values()):
-            grids += [_success(table, setting), _differences(table, setting)]
+            grids += [_success(table, name), _differences(table, name)]
             cells += table.values()
     return grids, [PEAK, *report.provenance(cells)]
 
 
-def _success(table: dict[tuple[str, str], Cell | None], setting: str) -> Grid:
+def _success(table: dict[tuple[str, str], Cell | None], recipe: str) -> Grid:
     header = ["object"]
     for when in WHEN:
         for method in METHODS:
@@ -49,10 +49,10 @@ def _success(table: dict[tuple[str, str], Cell | None], setting: str) -> Grid:
                 line.append(report.plus_minus(report.at(table[task, method], when)))
                 line.append(report.plus_minus(TABLE1[task][method, when]))
         lines.append(tuple(line))
-    return Grid(f"Success on six objects, {setting}", tuple(header), tuple(lines))
+    return Grid(f"Success on six objects, {recipe}", tuple(header), tuple(lines))
 
 
-def _differences(table: dict[tuple[str, str], Cell | None], setting: str) -> Grid:
+def _differences(table: dict[tuple[str, str], Cell | None], recipe: str) -> Grid:
     lines = []
     for task in OBJECTS:
         line = [task.replace("_", " ")]
@@ -60,7 +60,7 @@ def _differences(table: dict[tuple[str, str], Cell | None], setting: str) -> Gri
             line += report.difference(report.paired(table[task, "lcs-rl"], table[task, "violation"], when))
         lines.append(tuple(line))
     header = ("object", "peak: difference", "p", "final: difference", "p")
-    return Grid(f"LCS-RL − violation only, {setting}", header, tuple(lines))
+    return Grid(f"LCS-RL − violation only, {recipe}", header, tuple(lines))
 
 
 def draw(options: Draw) -> int:

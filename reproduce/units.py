@@ -16,13 +16,12 @@ from typing import Any
 
 from difflcs.errors import InvalidInputError
 from difflcs.rl.training import TrainConfig
-from difflcs.rl.warmup import WarmupConfig
 
 OBJECTS = ("sugar_box", "fish_can", "mug", "wrench", "clamp", "banana")
 """The objects of Table I, in its order."""
 METHODS = ("lcs-rl", "violation", "ppo", "pddm")
-WARMUPS: Mapping[str, WarmupConfig] = {"noise": WarmupConfig(), "no-noise": replace(WarmupConfig(), noise=0.0)}
-"""Settings of the warm-up: ours, with noise on the executed actions; the paper's, without."""
+RECIPES = ("ours", "paper")
+"""Ours: noise on the executed actions in the warm-up, imagined episodes in the main phase. The paper's: neither."""
 STARTS = ("scratch", "cube")
 """What a training starts from: a random model, or the final LCS-RL model of the cube with the same seed."""
 ARTEFACTS = ("table1", "curves", "transfer")
@@ -66,26 +65,26 @@ class Unit:
     Attributes:
         task: "cube" or one of `OBJECTS`.
         method: one of `METHODS`.
-        warmup: one of `WARMUPS`; "none" for methods without a warm-up.
+        recipe: one of `RECIPES`; "none" for PDDM, which has neither phase.
         seed: of the training.
         start: one of `STARTS`.
     """
 
     task: str
     method: str
-    warmup: str
+    recipe: str
     seed: int
     start: str = "scratch"
 
     @property
     def init(self) -> Unit | None:
         """The unit whose model this one starts from."""
-        return None if self.start == "scratch" else Unit("cube", "lcs-rl", "noise", self.seed)
+        return None if self.start == "scratch" else Unit("cube", "lcs-rl", "ours", self.seed)
 
     def __str__(self) -> str:
-        warmup = f", {self.warmup}" if self.warmup == "no-noise" else ""
+        recipe = ", the paper's recipe" if self.recipe == "paper" else ""
         start = "" if self.start == "scratch" else f", from the {self.start}'s model"
-        return f"{self.task} {self.method}{warmup}{start}, seed {self.seed}"
+        return f"{self.task} {self.method}{recipe}{start}, seed {self.seed}"
 
 
 def transfer(task: str, seed: int, start: str) -> Unit:
@@ -94,8 +93,8 @@ def transfer(task: str, seed: int, start: str) -> Unit:
     From scratch it is LCS-RL. From the cube's model it is the main phase alone: that model takes the place of the
     warm-up, whose violation loss on little data would first undo what PPO has taught it.
     """
-    scratch = Unit(task, "lcs-rl", "noise", seed)
-    return scratch if start == "scratch" else Unit(task, "ppo", "none", seed, start)
+    scratch = Unit(task, "lcs-rl", "ours", seed)
+    return scratch if start == "scratch" else Unit(task, "ppo", "ours", seed, start)
 
 
 def choose(name: str, chosen: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:
@@ -131,7 +130,7 @@ def matrix(
     seeds: int,
     objects: Sequence[str] = (),
     methods: Sequence[str] = (),
-    warmups: Sequence[str] = (),
+    recipes: Sequence[str] = (),
 ) -> list[Unit]:
     """The units that the artefacts need, each once, ordered so that the first seeds of everything come first.
 
@@ -140,7 +139,7 @@ def matrix(
         seeds: runs per method and object.
         objects: some of `OBJECTS`; none for all. The cube is not one of them.
         methods: some of `METHODS`; none for all.
-        warmups: some of `WARMUPS`; none for what the artefact shows by default: both on the cube, ours on the objects.
+        recipes: some of `RECIPES`; none for what the artefact shows by default: both on the cube, ours on the objects.
 
     Returns:
         The units. What a unit starts from comes before it, whatever is chosen.
@@ -150,16 +149,16 @@ def matrix(
     """
     artefacts, objects = choose("artefacts", artefacts, ARTEFACTS), choose("objects", objects, OBJECTS)
     methods = choose("methods", methods, METHODS)
-    on_cube, on_objects = choose("warmups", warmups, WARMUPS), choose("warmups", warmups or ["noise"], WARMUPS)
+    on_cube, on_objects = choose("recipes", recipes, RECIPES), choose("recipes", recipes or ["ours"], RECIPES)
     found: list[Unit] = []
     for seed in range(FIRST_SEED, FIRST_SEED + seeds):
         if "curves" in artefacts:
             for method in methods:
-                found += [Unit("cube", method, warmup, seed) for warmup in _warmups(method, on_cube)]
+                found += [Unit("cube", method, recipe, seed) for recipe in _recipes(method, on_cube)]
         if "table1" in artefacts:
             for task in objects:
                 for method in (m for m in methods if m in ("lcs-rl", "violation")):
-                    found += [Unit(task, method, warmup, seed) for warmup in on_objects]
+                    found += [Unit(task, method, recipe, seed) for recipe in on_objects]
         if "transfer" in artefacts and "lcs-rl" in methods:
             for task in objects:
                 found += [transfer(task, seed, start) for start in STARTS]
@@ -176,8 +175,9 @@ def matrix(
     return list(ordered)
 
 
-def _warmups(method: str, chosen: Sequence[str]) -> Sequence[str]:
-    return chosen if method in ("lcs-rl", "violation") else ("none",)
+def _recipes(method: str, chosen: Sequence[str]) -> Sequence[str]:
+    # PPO without a warm-up is the paper's baseline.
+    return chosen if method in ("lcs-rl", "violation") else ("paper" if method == "ppo" else "none",)
 
 
 def config_of(unit: Unit, preset: Preset) -> TrainConfig:
@@ -187,8 +187,13 @@ def config_of(unit: Unit, preset: Preset) -> TrainConfig:
         method=unit.method,
         minutes=30.0,
         seed=unit.seed,
-        warmup=WARMUPS.get(unit.warmup, WarmupConfig()),
     )
+    if unit.recipe == "paper":
+        config = replace(
+            config,
+            warmup=replace(config.warmup, noise=0.0),
+            imagination=replace(config.imagination, iterations=0),
+        )
     config = config.smoke() if preset.smoke else config
     return replace(
         config,
@@ -201,9 +206,9 @@ def config_of(unit: Unit, preset: Preset) -> TrainConfig:
 
 _UNUSED: Mapping[str, tuple[str, ...]] = {
     "lcs-rl": ("pddm", "mlp"),
-    "violation": ("pddm", "mlp", "ppo", "warmup_minutes"),
+    "violation": ("pddm", "mlp", "ppo", "imagination", "warmup_minutes"),
     "ppo": ("pddm", "mlp", "warmup", "warmup_minutes"),
-    "pddm": ("mlp", "warmup", "warmup_minutes", "ppo", "n_lam", "stiffness", "init_scale", "backend"),
+    "pddm": ("mlp", "warmup", "warmup_minutes", "ppo", "imagination", "n_lam", "stiffness", "init_scale", "backend"),
 }
 """Settings that a method never reads, which therefore do not make a unit another one."""
 _UNUSED_FROM_A_MODEL = ("n_lam", "stiffness", "init_scale")

@@ -237,13 +237,21 @@ def test_objects_slide_and_turn_when_pushed(name):
     assert deepest < 0.001
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.003, 0.005])
-def test_no_deep_contact_under_noisy_pushing(noise):
+@pytest.mark.parametrize(
+    ("make", "noise", "episodes"),
+    [
+        (TriFingerMoveCubeEnv, 0.0, 20),
+        (TriFingerMoveCubeEnv, 0.003, 20),
+        (TriFingerMoveCubeEnv, 0.005, 20),
+        (TriFingerTurnCubeEnv, 0.005, 60),  # rarely, three fingers jam the cube, which cannot give way
+    ],
+)
+def test_no_deep_contact_under_noisy_pushing(make, noise, episodes):
     """Commands as exploration gives them: all tips towards the cube, with noise, clipped to ±15 mm."""
-    env = TriFingerMoveCubeEnv()
+    env = make()
     rng = np.random.default_rng(0)
     deepest = 0.0
-    for seed in range(20):
+    for seed in range(episodes):
         state = env.reset(seed=seed)[0]["state"]
         for _ in range(20):
             inwards = (state[:2] - state[3:].reshape(3, 2)).ravel()

@@ -114,7 +114,7 @@ def test_it_starts_near_the_middle_of_the_bounds():
 def test_training_and_evaluation_see_the_same_time():
     """The actor gets the elapsed time with the data, the controller counts its steps."""
     trainer = make_trainer()
-    _, data, *_ = trainer._collect(None)
+    _, data, *_ = trainer._collect(trainer.env, list(range(ROLLOUTS)))
     torch.testing.assert_close(data["elapsed"][0], torch.arange(STEPS).double() / STEPS)
     trainer.policy.begin()
     for t in range(STEPS):

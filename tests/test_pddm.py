@@ -13,8 +13,9 @@ from gymnasium.vector import SyncVectorEnv
 from difflcs import GoalCost, _files
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
+from difflcs.rl.dynamics import Ensemble
 from difflcs.rl.evaluate import evaluate
-from difflcs.rl.pddm import PDDM, Ensemble, PDDMConfig, Planner
+from difflcs.rl.pddm import PDDM, PDDMConfig, Planner
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -92,7 +93,7 @@ def test_ensemble_learns_a_linear_system_and_its_members_differ():
     u = 0.01 * torch.randn(400, 2, generator=generator, dtype=torch.float64)
     x_next = x @ A.T + u
     ensemble = Ensemble(2, 2, 3, 32, generator)
-    loss = ensemble.fit(x, u, x_next, PDDMConfig(epochs=60, minibatch=50, networks=3, width=32), generator)
+    loss = ensemble.fit(x, u, x_next, epochs=60, minibatch=50, learning_rate=1e-3, generator=generator)
     assert loss < 0.02
     with torch.no_grad():
         predicted = ensemble(x.float().expand(3, -1, -1), u.float().expand(3, -1, -1))
@@ -187,7 +188,7 @@ def test_save_and_load(tmp_path):
     loaded = Ensemble.from_pretrained(tmp_path)
     assert same(parameters(trainer), list(loaded.state_dict().values()))
     config = {"n_x": 1, "n_u": 1, "networks": 2, "width": 8}  # of another width than the tensors
-    _files.save_record(tmp_path, "PDDM", config, trainer.ensemble.state_dict())
+    _files.save_record(tmp_path, "dynamics", config, trainer.ensemble.state_dict())
     with pytest.raises(CheckpointError, match="expected an ensemble"):
         Ensemble.from_pretrained(tmp_path)
 

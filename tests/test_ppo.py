@@ -16,10 +16,12 @@ from difflcs.errors import CheckpointError, InvalidInputError
 pytest.importorskip("torchrl")
 from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
 from difflcs.rl.evaluate import evaluate
+from difflcs.rl.imagination import Imagination, ImaginationConfig
 from difflcs.rl.phases import LCSRL
 from difflcs.rl.policy import make_actor
 from difflcs.rl.ppo import PPO, PPOConfig, _trimmed_mean
-from difflcs.rl.warmup import Warmup, WarmupConfig
+from difflcs.rl.rollout import episode_seeds
+from difflcs.rl.warmup import TRAINING_STREAM, Warmup, WarmupConfig
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -98,6 +100,11 @@ def make_ppo(seed: int = 0, iterations: int = 4, env=None, **changes) -> PPO:
     )
 
 
+def collected(trainer: PPO):
+    """Episodes of the seeds that the next iteration will use."""
+    return trainer._collect(trainer.env, episode_seeds(trainer.seed, TRAINING_STREAM, 0, ROLLOUTS))
+
+
 def parameters(trainer) -> list[torch.Tensor]:
     return [value.clone() for value in trainer.lcs.state_dict().values()]
 
@@ -134,7 +141,7 @@ def test_ppo_learns():
 
 def test_the_policy_explores_and_the_environment_gets_clipped_actions():
     trainer = make_ppo(std=0.2)
-    rollouts, data, *_ = trainer._collect(None)
+    rollouts, data, *_ = collected(trainer)
     noise = (data["action"] - data["loc"]).flatten()
     assert float(noise.std()) == pytest.approx(0.2, rel=0.2)
     torch.testing.assert_close(rollouts.actions, data["action"].clamp(-U_MAX, U_MAX))
@@ -144,7 +151,7 @@ def test_the_policy_explores_and_the_environment_gets_clipped_actions():
 def test_rewards_are_limited_and_end_with_the_penalty():
     trainer = make_ppo(cost_limit=1.0, failure_penalty=7.0, reward_scale=0.5)
     trainer.actor.set_std(0.1)
-    rollouts, *_ = trainer._collect(None)
+    rollouts, *_ = collected(trainer)
     rewards = trainer._rewards(rollouts)
     raw = -20 * (rollouts.states[:, :-1] - rollouts.goals.unsqueeze(1)).abs().squeeze(-1)
     expected = 0.5 * raw.clamp_min(-1.0)
@@ -160,23 +167,23 @@ def test_advantages_are_the_papers():
     generator = torch.Generator().manual_seed(0)
     inputs = torch.randn(5, STEPS + 1, 3, generator=generator, dtype=torch.float64)
     rewards = torch.randn(5, STEPS, generator=generator, dtype=torch.float64)
-    value = trainer.value(inputs.float()).detach().double().squeeze(-1)
+    value = trainer.critic.network(inputs.float()).detach().double().squeeze(-1)
     value[:, -1] = 0
     delta = rewards + 0.9 * value[:, 1:] - value[:, :-1]
     expected = torch.zeros(5, STEPS, dtype=torch.float64)
     for t in range(STEPS):
         expected[:, t] = sum((0.9 * 0.8) ** k * delta[:, t + k] for k in range(STEPS - t))
-    found = trainer._advantages(inputs, rewards)
+    found = trainer.critic.advantages(inputs, rewards)
     torch.testing.assert_close(found["advantage"].squeeze(-1), expected, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(found["value_target"].squeeze(-1), expected + value[:, :-1], rtol=1e-5, atol=1e-5)
-    returns = trainer._discounted(rewards)
+    returns = trainer.critic.returns(rewards)
     torch.testing.assert_close(returns[:, 0], sum(0.9**k * rewards[:, k] for k in range(STEPS)))
 
 
 def prepared(trainer: PPO):
     """Data of one iteration, as `_improve` gets it."""
-    rollouts, data, *_ = trainer._collect(None)
-    data["advantage"] = trainer._advantages(trainer._inputs(rollouts), trainer._rewards(rollouts))["advantage"]
+    rollouts, data, *_ = collected(trainer)
+    data["advantage"] = trainer.critic.advantages(trainer._inputs(rollouts), trainer._rewards(rollouts))["advantage"]
     return data.flatten(0, 1), rollouts
 
 
@@ -184,7 +191,7 @@ def test_the_first_gradient_is_the_policy_gradient():
     """At the rollout's own parameters all ratios are 1: the gradient is that of −mean(A log π)."""
     trainer = make_ppo(steps=1)
     data, rollouts = prepared(trainer)
-    outcome = trainer._improve(data, rollouts, 1.0)
+    outcome = trainer._improve(data, rollouts, trainer.config.steps, 1.0)
     found = [p.grad.clone() for p in trainer.lcs.parameters() if p.grad is not None]
     assert outcome.kl == pytest.approx(0, abs=1e-12)
     assert outcome.clip_fraction == 0
@@ -206,7 +213,7 @@ def test_jumps_are_left_out():
     trainer = make_ppo(steps=1, kl_quantile=1.0)
     data, rollouts = prepared(trainer)
     data["loc"][:5] += 1.0
-    outcome = trainer._improve(data, rollouts, 1.0)
+    outcome = trainer._improve(data, rollouts, trainer.config.steps, 1.0)
     assert outcome.ignored == 5 / len(data)
     found = [p.grad.clone() for p in trainer.lcs.parameters() if p.grad is not None]
     other = make_ppo(steps=1, kl_quantile=1.0)
@@ -227,7 +234,7 @@ def test_long_gradients_of_single_samples_are_clipped():
     options = {"steps": 1, "learn_std": True, "beta": 0.7, "violation_batch": 1000}
     trainer = make_ppo(sample_clip=1.5, **options)
     data, rollouts = prepared(trainer)
-    trainer._improve(data, rollouts, 1.0)
+    trainer._improve(data, rollouts, trainer.config.steps, 1.0)
     found = {name: p.grad.clone() for name, p in trainer.lcs.named_parameters() if p.grad is not None}
 
     other = make_ppo(**options)
@@ -248,7 +255,7 @@ def test_long_gradients_of_single_samples_are_clipped():
     for k, (name, p) in enumerate(parameters.items()):
         clipped = sum(factor * sample[k] for factor, sample in zip(factors, gradients, strict=True))
         torch.testing.assert_close(found[name], clipped + p.grad, rtol=1e-5, atol=1e-8)
-    other._improve(data, rollouts, 1.0)
+    other._improve(data, rollouts, other.config.steps, 1.0)
     assert torch.equal(trainer.actor.gaussian.log_std.grad, other.actor.gaussian.log_std.grad)
     assert any(not torch.allclose(found[name], p.grad, rtol=1e-2) for name, p in parameters.items())
 
@@ -268,7 +275,7 @@ def test_minibatches(size, sizes):
     data, rollouts = prepared(trainer)
     seen = []
     trainer.actor.gaussian.register_forward_hook(lambda _, inputs, __: seen.append(inputs[0].clone()))
-    assert trainer._improve(data, rollouts, 1.0).steps == 3
+    assert trainer._improve(data, rollouts, trainer.config.steps, 1.0).steps == 3
     assert [len(batch) for batch in seen] == sizes
     states = torch.cat([batch["state"] for batch in seen]).sort(0).values[:: 3 if sizes[0] == 72 else 1]
     torch.testing.assert_close(states, data["state"].sort(0).values, rtol=0, atol=0)
@@ -290,7 +297,7 @@ def test_step_size_follows_the_kl(kl, factor):
 def test_an_iteration_ends_at_the_kl_limit():
     trainer = make_ppo(max_kl=1e-6)
     data, rollouts = prepared(trainer)
-    outcome = trainer._improve(data, rollouts, 1.0)
+    outcome = trainer._improve(data, rollouts, trainer.config.steps, 1.0)
     assert outcome.steps == 1
     assert outcome.kl > 1e-6
 
@@ -325,7 +332,7 @@ def test_a_gradient_that_is_not_finite_changes_nothing():
     data, rollouts = prepared(trainer)
     data["advantage"][3] = math.nan
     before = parameters(trainer)
-    outcome = trainer._improve(data, rollouts, 1.0)
+    outcome = trainer._improve(data, rollouts, trainer.config.steps, 1.0)
     assert (outcome.steps, outcome.skipped) == (0, trainer.config.steps)
     assert same(before, parameters(trainer))
 
@@ -363,7 +370,7 @@ def test_broken_episodes_are_dropped():
     trainer = make_ppo(env=env)
     report = trainer.step()
     assert report.unstable == 1
-    assert len(trainer._history[0][1]) == ROLLOUTS - 1
+    assert len(trainer.critic.history[0][1]) == ROLLOUTS - 1
     assert all(bool(torch.isfinite(p).all()) for p in parameters(trainer))
     with pytest.raises(InvalidInputError, match="stable simulation"):
         make_ppo(env=make_envs(breaks_at=2)).step()
@@ -462,7 +469,7 @@ def test_bad_arguments_are_refused():
 # --- both phases ---
 
 
-def make_lcsrl(seed: int = 0) -> LCSRL:
+def make_lcsrl(seed: int = 0, imagine: bool = False) -> LCSRL:
     lcs = make_model()
     mpc = make_mpc(lcs)
     config = WarmupConfig(
@@ -471,10 +478,12 @@ def make_lcsrl(seed: int = 0) -> LCSRL:
     warmup = Warmup(lcs, mpc, make_envs(3), config, seed, STEPS)
 
     def make_main(first_episode: int, first_iteration: int) -> PPO:
+        settings = ImaginationConfig(iterations=1, rollouts=5, networks=2, width=8, first_epochs=2)
         return PPO(
             make_actor(mpc, small_config()), make_envs(), small_config(), seed, features=features,
             total_episodes=8 + 2 * ROLLOUTS, episode_steps=STEPS, first_episode=first_episode,
             first_iteration=first_iteration,
+            imagination=Imagination(make_envs(), reaches, settings, seed, STEPS) if imagine else None,
         )  # fmt: skip
 
     return LCSRL(warmup, 8 * STEPS, make_main)
@@ -488,17 +497,18 @@ def test_phases_follow_each_other():
     assert [report.env_steps for report in reports] == [STEPS * n for n in (2, 5, 8, 8 + ROLLOUTS, 8 + 2 * ROLLOUTS)]
 
 
+@pytest.mark.parametrize("imagine", [False, True])
 @pytest.mark.parametrize("after", [1, 3, 4])
-def test_phases_resume_bitwise(tmp_path, after):
+def test_phases_resume_bitwise(tmp_path, after, imagine):
     """Interrupted in the warm-up, right between the phases, and in the main phase."""
-    through = make_lcsrl()
+    through = make_lcsrl(imagine=imagine)
     for _ in range(5):
         through.step()
-    first = make_lcsrl()
+    first = make_lcsrl(imagine=imagine)
     for _ in range(after):
         first.step()
     save_checkpoint(tmp_path, first.checkpoint())
-    second = make_lcsrl()
+    second = make_lcsrl(imagine=imagine)
     second.restore(load_checkpoint(tmp_path))
     assert second.iteration == after
     for _ in range(5 - after):
@@ -521,3 +531,84 @@ def test_every_setting_is_documented():
     for name in asdict(PPOConfig()):
         line = source.index(f"    {name}: ")
         assert source[line:].split("\n")[1].strip().startswith('"""'), name
+
+
+# --- imagined episodes ---
+
+
+def reaches(state, action, after, goal):
+    """`Slide`'s outcome."""
+    return -20 * (state - goal).abs().squeeze(-1), (after - goal).abs().squeeze(-1) < 0.05
+
+
+def make_imagining(seed: int = 0, **changes) -> PPO:
+    config, env = small_config(), make_envs()
+    settings = ImaginationConfig(iterations=2, rollouts=10, networks=2, width=16, first_epochs=20, epochs=3)
+    settings = replace(settings, **changes)
+    return PPO(
+        make_actor(make_mpc(make_model()), config), env, config, seed, features=features,
+        total_episodes=4 * ROLLOUTS, episode_steps=STEPS,
+        imagination=Imagination(env, reaches, settings, seed, STEPS),
+    )  # fmt: skip
+
+
+def test_imagined_episodes_follow_the_first_real_ones_and_count_as_no_data():
+    trainer = make_imagining()
+    reports = [trainer.step() for _ in range(2)]
+    assert reports[0].imagined_success is None
+    assert reports[0].model_loss is None
+    assert reports[1].imagined_success is not None
+    assert 0 < reports[1].model_loss < 2
+    assert reports[1].imagination_seconds > 0
+    assert [report.env_steps for report in reports] == [STEPS * ROLLOUTS, 2 * STEPS * ROLLOUTS]
+    assert len(trainer.imagination) == 2 * ROLLOUTS
+
+
+def test_imagination_learns_from_less_data():
+    def success(trainer):
+        while not trainer.done:
+            trainer.step()
+        return evaluate(make_envs(60), trainer.policy, 60, 0, STEPS).success_rate
+
+    alone, imagining = success(make_ppo()), success(make_imagining(iterations=12, rollouts=30, first_epochs=100))
+    assert imagining > alone + 0.15
+
+
+def test_the_first_iteration_does_not_depend_on_imagination():
+    alone, imagining = make_ppo(), make_imagining()
+    for trainer in (alone, imagining):
+        trainer.step()
+    assert same(parameters(alone), parameters(imagining))
+
+
+def test_imagining_resumed_equals_uninterrupted_bitwise(tmp_path):
+    through = make_imagining()
+    while not through.done:
+        through.step()
+    first = make_imagining()
+    for _ in range(2):
+        first.step()
+    save_checkpoint(tmp_path, first.checkpoint())
+    second = make_imagining()
+    second.restore(load_checkpoint(tmp_path))
+    while not second.done:
+        second.step()
+    assert same(parameters(through), parameters(second))
+    for name, value in through.checkpoint().tensors.items():
+        assert torch.equal(value, second.checkpoint().tensors[name]), name
+
+
+def test_a_checkpoint_without_imagination_is_refused():
+    trainer = make_ppo()
+    trainer.step()
+    with pytest.raises(CheckpointError, match=r"imagination\.ensemble.*other settings"):
+        make_imagining().restore(trainer.checkpoint())
+
+
+def test_the_main_phase_remembers_the_warm_up():
+    trainer = make_lcsrl(imagine=True)
+    for _ in range(3):
+        trainer.step()
+    assert len(trainer.current.imagination) == 8
+    trainer.step()
+    assert len(trainer.current.imagination) == 8 + ROLLOUTS

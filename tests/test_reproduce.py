@@ -36,8 +36,8 @@ from difflcs.errors import DiffLCSError, InvalidInputError, ShapeError  # noqa: 
 
 TINY = Preset("smoke", seeds=1, goals=2, evaluate_at=(0.2, 0.5), smoke=True)
 FIRST = units.FIRST_SEED
-CUBE = Unit("cube", "lcs-rl", "noise", FIRST)
-TRANSFER = Unit("mug", "ppo", "none", FIRST, "cube")
+CUBE = Unit("cube", "lcs-rl", "ours", FIRST)
+TRANSFER = Unit("mug", "ppo", "ours", FIRST, "cube")
 SOURCES = {task: {"source": "ycb_mesh", "sha256": "abc"} for task in ("cube", *OBJECTS)}
 
 
@@ -57,24 +57,25 @@ def test_matrix_holds_every_unit_once_and_what_it_starts_from_first():
     found = units.matrix((), seeds=2)
     assert len(found) == len(set(found))
     assert {unit.seed for unit in found} == {FIRST, FIRST + 1}
-    # Cube: two methods with two warm-ups each, two without; objects: two methods, and LCS-RL from the cube.
+    # Cube: two methods with two recipes each, two without; objects: two methods, and LCS-RL from the cube.
     assert len(found) == 2 * (2 * 2 + 2 + 6 * 2 + 6)
     for position, unit in enumerate(found):
         assert unit.init is None or unit.init in found[:position]
 
 
 def test_matrix_of_a_part():
-    assert units.matrix(["transfer"], 1, objects=["mug"]) == [Unit("mug", "lcs-rl", "noise", FIRST), CUBE, TRANSFER]
-    table = units.matrix(["table1"], 1, objects=["banana", "mug"], methods=["violation"], warmups=["no-noise"])
-    assert table == [Unit(task, "violation", "no-noise", FIRST) for task in ("mug", "banana")]
+    assert units.matrix(["transfer"], 1, objects=["mug"]) == [Unit("mug", "lcs-rl", "ours", FIRST), CUBE, TRANSFER]
+    table = units.matrix(["table1"], 1, objects=["banana", "mug"], methods=["violation"], recipes=["paper"])
+    assert table == [Unit(task, "violation", "paper", FIRST) for task in ("mug", "banana")]
     assert {unit.method for unit in units.matrix(["curves"], 1, methods=["pddm"])} == {"pddm"}
 
 
 def test_config_is_the_default_recipe_but_for_what_the_unit_says():
-    config = units.config_of(Unit("mug", "violation", "no-noise", 3), units.PRESETS["paper"])
+    config = units.config_of(Unit("mug", "violation", "paper", 3), units.PRESETS["paper"])
     default = units.TrainConfig()
     assert (config.task, config.method, config.seed, config.minutes) == ("mug", "violation", 3, 30.0)
     assert config.warmup == replace(default.warmup, noise=0.0)
+    assert config.imagination == replace(default.imagination, iterations=0)
     assert config.ppo == default.ppo
     assert config.evaluate_goals == config.final_goals == 1000
     assert config.evaluation_seed == default.evaluation_seed  # the same goals for every unit
@@ -90,7 +91,7 @@ def test_key_changes_with_everything_that_decides_a_result_and_with_nothing_else
         key(code="1.3"),
         key(replace(CUBE, seed=1)),
         key(replace(CUBE, method="violation")),
-        key(replace(CUBE, warmup="no-noise")),
+        key(replace(CUBE, recipe="paper")),
         key(preset=replace(TINY, goals=3)),
         key(sources=other),
         key(TRANSFER),
@@ -234,7 +235,7 @@ def test_failures_stop_what_depends_on_them_and_nothing_else_and_are_tried_again
     monkeypatch.setattr(runs, "_POLL_SECONDS", 0)
     wanted = units.matrix(["transfer"], 1, objects=["mug"])
     specs = runs.make_specs(wanted, TINY, tmp_path)
-    scratch = Unit("mug", "lcs-rl", "noise", FIRST)
+    scratch = Unit("mug", "lcs-rl", "ours", FIRST)
     stored = []
     found = runs.compute(specs, FakePool(broken=["cube"]), stored.append)
     assert found[CUBE]["error"] == "it broke"
@@ -273,7 +274,7 @@ def test_the_display_tells_failures_and_the_time_left(tmp_path, monkeypatch):
 
 
 def test_an_error_in_a_unit_is_its_record(tmp_path, one_thread):
-    spec = runs.make_specs([Unit("mug", "violation", "noise", FIRST)], TINY, tmp_path).popitem()[1]
+    spec = runs.make_specs([Unit("mug", "violation", "ours", FIRST)], TINY, tmp_path).popitem()[1]
     for change, message in (
         ({"source": {"source": "ycb_mesh", "sha256": "abc"}}, "set DIFFLCS_YCB_DIR there"),
         ({"code": "00000000.00000000"}, "install the same code there"),
@@ -339,9 +340,9 @@ def test_comparison_against_scipy():
 
 def unit_rows(unit, values, source="ycb_mesh", goals=1000, **changes):
     """Rows as of a finished unit; `values` are percent at 0, 6, 10 and 30 minutes."""
-    keys = {"key": f"{unit} {goals} {changes}", "settings": f"{unit.method}{unit.warmup}{goals}", **changes}
+    keys = {"key": f"{unit} {goals} {changes}", "settings": f"{unit.method}{unit.recipe}{goals}", **changes}
     base = records.Row(
-        format=1, **asdict(unit), at=0.0, minutes=0.0, success=0.0, ci_low=0.0, ci_high=1.0, goals=goals,
+        format=records.FORMAT, **asdict(unit), at=0.0, minutes=0.0, success=0.0, ci_low=0.0, ci_high=1.0, goals=goals,
         evaluation_seed=0, solver_failures=0, source=source, mass=0.05, settings="", code="c1", key="",
         versions="difflcs=1", machine="a machine", train_seconds=20.0, evaluation_seconds=10.0,
         finished="2026-01-01T00:00:00+00:00",
@@ -358,12 +359,12 @@ def results(tmp_path):
         shift = 10 * seed
         for task in ("cube", "mug"):
             for unit, values in (
-                (Unit(task, "violation", "noise", seed), (0, 40 + shift, 30 + shift, 10 + shift)),
-                (Unit(task, "lcs-rl", "noise", seed), (0, 40 + shift, 50 + shift, 70 + shift)),
-                (Unit(task, "violation", "no-noise", seed), (0, 20, 20, 20)),
+                (Unit(task, "violation", "ours", seed), (0, 40 + shift, 30 + shift, 10 + shift)),
+                (Unit(task, "lcs-rl", "ours", seed), (0, 40 + shift, 50 + shift, 70 + shift)),
+                (Unit(task, "violation", "paper", seed), (0, 20, 20, 20)),
             ):
                 records.add(tmp_path, "paper", unit_rows(unit, values))
-        transfer = Unit("mug", "ppo", "none", seed, "cube")
+        transfer = Unit("mug", "ppo", "ours", seed, "cube")
         records.add(tmp_path, "paper", unit_rows(transfer, (30, 60, 70, 81 + shift)))
         records.add(tmp_path, "paper", unit_rows(Unit("cube", "pddm", "none", seed), (0, 1, 2, 3), goals=50))
     return tmp_path
@@ -386,7 +387,7 @@ def test_table1_shows_ours_beside_the_paper(results, capsys):
     assert "32.5 $\\pm$ 8.4" in latex
     assert "| mug | +30.0 [+30.0, +30.0] | < 0.001 | +60.0 [+60.0, +60.0] | < 0.001 |" in markdown
     assert "| banana | — | 28.4 ± 5.8 |" in markdown  # no results yet: the paper alone
-    assert "without noise" in markdown
+    assert "Success on six objects, the paper's recipe" in markdown
     assert "3 seeds × 1000 goals" in markdown
     assert "12 trainings" not in markdown  # mug only: 9
     assert "9 trainings" in markdown
@@ -422,7 +423,7 @@ def test_the_same_numbers_give_the_same_files(results, capsys):
 
 def test_stand_ins_are_a_table_of_their_own(results, capsys):
     before = records.path_of(results, "paper").read_bytes()
-    unit = Unit("banana", "lcs-rl", "noise", FIRST)
+    unit = Unit("banana", "lcs-rl", "ours", FIRST)
     path = records.add(results, "paper", unit_rows(unit, (1, 2, 3, 99), source="stand_in"))
     assert path.name == "paper-stand-in.csv"
     assert records.path_of(results, "paper").read_bytes() == before
@@ -433,10 +434,10 @@ def test_stand_ins_are_a_table_of_their_own(results, capsys):
 
 
 def test_nothing_is_mixed_or_replaced_silently(results, capsys):
-    unit = Unit("mug", "lcs-rl", "noise", 0)
+    unit = Unit("mug", "lcs-rl", "ours", 0)
     # Other numbers of goals stand beside each other; the larger amount is shown, and what is left out is said.
     records.add(results, "paper", unit_rows(unit, (0, 0, 0, 1), goals=300))
-    cell = records.select(records.read(results / "paper.csv"), "mug", "lcs-rl", "noise")
+    cell = records.select(records.read(results / "paper.csv"), "mug", "lcs-rl", "ours")
     assert (cell.seeds, cell.left_out) == ((0, 1, 2), 1)
     assert cell.at(30.0) == {0: 70.0, 1: 80.0, 2: 90.0}
     assert run_script(table1, capsys, "--results", results)[0] == 0
@@ -445,9 +446,9 @@ def test_nothing_is_mixed_or_replaced_silently(results, capsys):
     records.add(results, "paper", unit_rows(unit, (0, 0, 0, 2), code="c2"))
     rows = records.read(results / "paper.csv")
     assert sum(row.unit == unit and row.goals == 1000 for row in rows) == 4
-    assert records.select(rows, "mug", "lcs-rl", "noise").seeds == (1, 2)
+    assert records.select(rows, "mug", "lcs-rl", "ours").seeds == (1, 2)
     # Nor compared with what other code has computed.
-    both = [records.select(rows, "mug", method, "noise") for method in ("lcs-rl", "violation")]
+    both = [records.select(rows, "mug", method, "ours") for method in ("lcs-rl", "violation")]
     assert report.paired(*both, "final").difference.n == 2
     changed = replace(both[0], rows=tuple(replace(row, code="c2") for row in both[0].rows))
     assert report.paired(changed, both[1], "final") is None
@@ -529,13 +530,13 @@ def test_bad_input(script, arguments, message, tmp_path, monkeypatch, capsys):
 def test_results_of_another_version_stay_as_they_are(content, results, capsys):
     path = results / "paper.csv"
     if content == "FORMAT":
-        content = path.read_text().replace("\n1,", "\n2,")
+        content = path.read_text().replace("\n2,", "\n3,")
     path.write_text(content)
-    unit = Unit("mug", "lcs-rl", "noise", FIRST)
+    unit = Unit("mug", "lcs-rl", "ours", FIRST)
     for script, arguments in ((table1, []), (runs, ["--preset", "paper"])):
         code, _, err = run_script(script, capsys, *arguments, "--results", results, "--work", results / "work")
         assert code == 2
-        assert "paper.csv: expected results of format 1" in err
+        assert "paper.csv: expected results of format 2" in err
     with pytest.raises(records.ResultsError, match="Nothing was changed"):
         records.add(results, "paper", unit_rows(unit, (1, 2, 3, 4)))
     assert path.read_text() == content

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from difflcs.rl.checkpoint import Checkpoint, RunDirectory, load_checkpoint, save_checkpoint
+from difflcs.rl.dynamics import Ensemble
 from difflcs.rl.evaluate import Evaluation, evaluate, wilson_interval
+from difflcs.rl.imagination import Imagination, ImaginationConfig
 from difflcs.rl.mlp import MLPConfig, MLPController
 from difflcs.rl.pddm import PDDM, PDDMConfig
 from difflcs.rl.phases import LCSRL
@@ -24,7 +26,10 @@ __all__ = [
     "PPO",
     "TASKS",
     "Checkpoint",
+    "Ensemble",
     "Evaluation",
+    "Imagination",
+    "ImaginationConfig",
     "LCSMPCPolicy",
     "MLPConfig",
     "MLPController",

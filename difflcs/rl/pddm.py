@@ -10,19 +10,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from difflcs import _files
 from difflcs._checks import check_number, check_positive_int
 from difflcs.cost import GoalCost
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.rl.checkpoint import Checkpoint
+from difflcs.rl.dynamics import Ensemble
 from difflcs.rl.rollout import action_bounds, collect, episode_seeds, mpc_actions, uniform_actions
 from difflcs.rl.warmup import TRAINING_STREAM
 
@@ -30,7 +28,6 @@ if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
 
 _ACTION_STREAM, _FIT_STREAM, _PLAN_STREAM = 3, 7, 8
-_KIND = "PDDM"
 
 
 @dataclass(frozen=True)
@@ -71,90 +68,6 @@ class PDDMConfig:
             check_number(name, getattr(self, name), strict=True)
         if self.filter > 1:
             raise InvalidInputError(f"filter: expected 0 < filter <= 1, got {self.filter}")
-
-
-class Ensemble(nn.Module):
-    """Networks that predict the next state, evaluated side by side; inputs and outputs are standardised by the data.
-
-    Args:
-        n_x: states.
-        n_u: actions.
-        networks: number of networks.
-        width: width of the two hidden layers.
-        generator: draws the initial weights.
-    """
-
-    def __init__(self, n_x: int, n_u: int, networks: int, width: int, generator: torch.Generator | None = None):
-        super().__init__()
-        self.n_x, self.n_u, self.networks, self.width = n_x, n_u, networks, width
-        sizes = [n_x + n_u, width, width, n_x]
-        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
-        for n_in, n_out in pairwise(sizes):
-            bound = n_in**-0.5
-            draw = torch.rand(networks, n_in, n_out, generator=generator)
-            self.weights.append(nn.Parameter(bound * (2 * draw - 1)))
-            self.biases.append(nn.Parameter(torch.zeros(networks, 1, n_out)))
-        for name, size in (("input", n_x + n_u), ("change", n_x)):
-            self.register_buffer(f"{name}_mean", torch.zeros(size))
-            self.register_buffer(f"{name}_std", torch.ones(size))
-
-    input_mean: Tensor
-    input_std: Tensor
-    change_mean: Tensor
-    change_std: Tensor
-
-    def standardised(self, inputs: Tensor) -> Tensor:
-        """(networks, N, n_x + n_u) → (networks, N, n_x) standardised changes of the state."""
-        hidden = (inputs - self.input_mean) / self.input_std
-        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            hidden = torch.baddbmm(bias, hidden, weight).relu_()
-        return torch.baddbmm(self.biases[-1], hidden, self.weights[-1])
-
-    def forward(self, x: Tensor, u: Tensor) -> Tensor:
-        """States (networks, N, n_x), actions (networks, N, n_u) → next states, each network from its own states."""
-        return x + self.change_mean + self.change_std * self.standardised(torch.cat([x, u], -1))
-
-    def fit(self, x: Tensor, u: Tensor, x_next: Tensor, config: PDDMConfig, generator: torch.Generator) -> float:
-        """Fit every network to all transitions (N, ·), in orders of their own; returns the last epoch's loss."""
-        inputs, changes = torch.cat([x, u], -1).float(), (x_next - x).float()
-        for name, data in (("input", inputs), ("change", changes)):
-            getattr(self, f"{name}_mean").copy_(data.mean(0))
-            getattr(self, f"{name}_std").copy_(data.std(0, correction=0).clamp_min(1e-6))
-        targets = (changes - self.change_mean) / self.change_std
-        adam = torch.optim.Adam(self.parameters(), config.learning_rate, fused=True)
-        losses: list[Tensor] = []
-        for _ in range(config.epochs):
-            orders = torch.stack([torch.randperm(len(inputs), generator=generator) for _ in range(self.networks)])
-            losses = []
-            for batch in orders.split(config.minibatch, 1):
-                errors = (self.standardised(inputs[batch]) - targets[batch]).square().mean((1, 2))
-                adam.zero_grad()
-                errors.sum().backward()
-                adam.step()
-                losses.append(errors.detach().mean())
-        return float(torch.stack(losses).mean())
-
-    def save_pretrained(self, directory: Path) -> None:
-        """Write the ensemble into a directory, atomically."""
-        config = {"n_x": self.n_x, "n_u": self.n_u, "networks": self.networks, "width": self.width}
-        _files.save_record(Path(directory), _KIND, config, self.state_dict())
-
-    @classmethod
-    def from_pretrained(cls, directory: Path) -> Ensemble:
-        """Read what `save_pretrained` wrote.
-
-        Raises:
-            CheckpointError: files are missing, corrupt or of another kind.
-        """
-        config, tensors = _files.load_record(Path(directory), _KIND)
-        try:
-            names = ("n_x", "n_u", "networks", "width")
-            n_x, n_u, networks, width = (check_positive_int(name, config[name]) for name in names)
-            ensemble = cls(n_x, n_u, networks, width)
-            ensemble.load_state_dict(tensors)
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise CheckpointError(f"{directory}: expected an ensemble written by difflcs, got {error}") from error
-        return ensemble
 
 
 @dataclass(frozen=True)
@@ -331,7 +244,15 @@ class PDDM:
         collected = time.perf_counter()
         x, u, x_next = (v.flatten(0, 1) for v in (self.states[:, :-1], self.actions, self.states[:, 1:]))
         generator = torch.Generator().manual_seed(self._key(_FIT_STREAM, 1))
-        loss = self.ensemble.fit(x, u, x_next, config, generator)
+        loss = self.ensemble.fit(
+            x,
+            u,
+            x_next,
+            epochs=config.epochs,
+            minibatch=config.minibatch,
+            learning_rate=config.learning_rate,
+            generator=generator,
+        )
         self.iteration += 1
         return PDDMIteration(
             iteration=self.iteration,

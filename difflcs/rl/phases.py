@@ -49,7 +49,10 @@ class LCSRL:
 
     def _switch(self) -> None:
         if self.current is self._warmup and self.env_steps >= self._warmup_steps:
-            self.current = self._make_main(self._warmup.episodes, self._warmup.iteration)
+            warmup = self._warmup
+            self.current = self._make_main(warmup.episodes, warmup.iteration)
+            if self.current.imagination is not None:
+                self.current.imagination.add(warmup.states, warmup.actions, warmup.goals)
 
     def checkpoint(self) -> Checkpoint:
         """Everything needed to go on with the same result."""

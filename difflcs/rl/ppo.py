@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.func import functional_call
 
 from difflcs._checks import check_choice, check_number, check_positive_int
@@ -31,6 +31,8 @@ from difflcs.errors import CheckpointError, DegenerateWarning, InvalidInputError
 from difflcs.lcs import LCSModel, LCSParams
 from difflcs.losses import violation_loss
 from difflcs.rl.checkpoint import Checkpoint
+from difflcs.rl.critic import Critic, initialise_moments, moments, read_history, seeded
+from difflcs.rl.imagination import EPISODES, Imagination
 from difflcs.rl.rollout import Rollouts, action_bounds, collect, episode_seeds
 from difflcs.rl.warmup import TRAINING_STREAM
 
@@ -40,9 +42,10 @@ if TYPE_CHECKING:
 
     from difflcs.rl.policy import GaussianPolicy
 
-_NOISE_STREAM, _VALUE_STREAM, _LOSS_STREAM = 4, 5, 6
+_NOISE_STREAM, _VALUE_STREAM, _LOSS_STREAM, _IMAGINED_STREAM = 4, 5, 6, 10
 _LCS = "mpc.lcs."
 """Where the LCS is in the actor's module `gaussian`."""
+_VALUE, _IMAGINATION = "value.", "imagination."
 _NETWORK = "network."
 """Prefix of the learned module's tensors in a checkpoint, where it is not an LCS."""
 
@@ -186,10 +189,13 @@ class PPOIteration:
         explained_variance: of the returns by the value network, before it saw them.
         solver_failures: MPC solves that did not converge, while collecting and while learning.
         unstable: episodes dropped because the simulation broke down.
+        imagined_success: share of the last imagined episodes before it that ended at the goal; None without any.
+        model_loss: error of the ensemble in which they were imagined, in the last pass of its training.
         physics_seconds: wall time of the environment.
         solve_seconds: wall time of the MPC.
         gradient_seconds: wall time of gradients and steps.
         value_seconds: wall time of advantages and value network.
+        imagination_seconds: wall time of everything imagined: the ensemble's training, episodes, solves, gradients.
     """
 
     iteration: int
@@ -206,10 +212,13 @@ class PPOIteration:
     explained_variance: float
     solver_failures: int
     unstable: int
+    imagined_success: float | None
+    model_loss: float | None
     physics_seconds: float
     solve_seconds: float
     gradient_seconds: float
     value_seconds: float
+    imagination_seconds: float
 
 
 class PPO:
@@ -228,6 +237,8 @@ class PPO:
         episode_steps: steps of one episode.
         first_episode: episodes collected before, by a warm-up.
         first_iteration: iterations done before.
+        imagination: plays episodes besides those of `env`, None: real ones alone, as in the paper. Let it `add` the
+            episodes of a warm-up.
 
     Raises:
         InvalidInputError: an argument does not fit.
@@ -246,6 +257,7 @@ class PPO:
         episode_steps: int = 20,
         first_episode: int = 0,
         first_iteration: int = 0,
+        imagination: Imagination | None = None,
     ):
         check_positive_int("seed", seed, minimum=0)
         check_positive_int("episode_steps", episode_steps)
@@ -269,10 +281,11 @@ class PPO:
             raise InvalidInputError(f"env: expected at least {config.rollouts} environments, got {env.num_envs}")
         self.actor, self.learned, self.policy = actor, learned, actor.controller
         self.lcs = learned if isinstance(learned, LCSModel) else None
-        self.env, self.config = env, config
+        self.env, self.config, self.imagination = env, config, imagination
         self.seed, self.features, self.episode_steps = seed, features, episode_steps
         self.first_episode, self.first_iteration = first_episode, first_iteration
         self.episodes, self.iteration = first_episode, first_iteration
+        self._imagined = 0  # 1, 2, … in the imagined iterations before a real one: part of the seeds
         # As many iterations as `rollouts` asks for, all of the same size up to one episode.
         count = math.ceil(remaining / config.rollouts)
         self._sizes = [remaining // count + (k < remaining % count) for k in range(count)]
@@ -282,24 +295,14 @@ class PPO:
         groups = [{"params": [p for p in part if p.requires_grad]} for part in (model, deviation)]
         self._parameters = [p for group in groups for p in group["params"]]
         self._adam = torch.optim.Adam([g for g in groups if g["params"]], config.learning_rate, config.betas)
-        _initialise(self._adam)
+        initialise_moments(self._adam)
 
         low, high = (torch.from_numpy(bound) for bound in action_bounds(env))
         self.bounds = (low, high)
         space = env.single_observation_space
         sizes = (space[key].shape for key in ("state", "goal"))  # pyright: ignore[reportIndexIssue]
         example = features(*(torch.zeros(size, dtype=torch.float64) for size in (*sizes, ())))
-        with self._random(_VALUE_STREAM):
-            width = config.value_width
-            self.value = nn.Sequential(
-                nn.Linear(len(example), width), nn.Tanh(), nn.Linear(width, width), nn.Tanh(), nn.Linear(width, 1)
-            )
-        self._value_adam = torch.optim.AdamW(
-            self.value.parameters(), config.value_learning_rate, weight_decay=config.value_weight_decay, fused=True
-        )
-        _initialise(self._value_adam)
-        # Newest iterations: inputs (N, T+1, n) of the value network and scaled rewards (N, T).
-        self._history: list[tuple[Tensor, Tensor]] = []
+        self.critic = Critic(config, len(example), self._key(_VALUE_STREAM))
 
     @property
     def env_steps(self) -> int:
@@ -314,6 +317,8 @@ class PPO:
     def step(self, after_step: Callable[[int], object] | None = None) -> PPOIteration:
         """One iteration: collect, estimate advantages, improve the policy, fit the value network.
 
+        Before it, iterations on imagined episodes, if there is an imagination and it has real ones to start from.
+
         Args:
             after_step: called with the number of episodes stepped, for progress bars.
 
@@ -322,43 +327,29 @@ class PPO:
         """
         if self.done:
             raise InvalidInputError(f"step: expected at most {len(self._sizes)} iterations, all of them are done")
-        with self._random(_LOSS_STREAM):
-            return self._step(after_step)
-
-    def _step(self, after_step: Callable[[int], object] | None) -> PPOIteration:
         progress = sum(self._sizes[: self.iteration - self.first_iteration]) / sum(self._sizes)
         if self.config.final_std is not None:
             self.actor.set_std(self.config.std * (self.config.final_std / self.config.std) ** progress)
-        std = float(self.actor.std.mean())
-        rollouts, data, physics_seconds, solve_seconds = self._collect(after_step)
-        rewards = self._rewards(rollouts)
-
+        scale = 1 - (1 - self.config.final_step) * progress
         start = time.perf_counter()
-        inputs = self._inputs(rollouts)
-        returns = self._discounted(rewards)
-        if self.iteration == self.first_iteration:
-            self._fit_value(inputs[:, :-1], returns, self.config.value_first_epochs)
-        estimated = self._advantages(inputs, rewards)
-        data["advantage"] = estimated["advantage"]
-        unexplained = (returns - estimated["state_value"].squeeze(-1)).var() / returns.var().clamp_min(1e-12)
-        value_seconds = time.perf_counter() - start
+        imagined_success, model_loss = self._imagine(scale)
+        imagination_seconds = time.perf_counter() - start
 
-        learning_rate = self.learning_rate
-        improvement = self._improve(data.flatten(0, 1), rollouts, 1 - (1 - self.config.final_step) * progress)
-
-        start = time.perf_counter()
-        self._history = [*self._history, (inputs, rewards)][-self.config.value_iterations :]
-        targets = [self._advantages(*part)["value_target"].squeeze(-1) for part in self._history]
-        seen = torch.cat([inputs[:, :-1] for inputs, _ in self._history])
-        self._fit_value(seen, torch.cat(targets), self.config.value_epochs)
-        value_seconds += time.perf_counter() - start
-
+        count = self._sizes[self.iteration - self.first_iteration]
+        seeds = episode_seeds(self.seed, TRAINING_STREAM, self.episodes, count)
+        self.episodes += count
+        std, learning_rate = float(self.actor.std.mean()), self.learning_rate
+        outcome = self._iterate(self.env, seeds, self.config.steps, scale, after_step)
+        rollouts, improvement = outcome.rollouts, outcome.improvement
+        if self.imagination is not None:
+            stable = rollouts.stable
+            self.imagination.add(rollouts.states[stable], rollouts.actions[stable], rollouts.goals[stable])
         self.iteration += 1
         return PPOIteration(
             iteration=self.iteration,
             env_steps=self.env_steps,
             success=float(rollouts.success.double().mean()),
-            mean_return=float(rewards.sum(1).mean()) / self.config.reward_scale,
+            mean_return=outcome.mean_return,
             kl=improvement.kl,
             learning_rate=learning_rate,
             std=std,
@@ -366,23 +357,80 @@ class PPO:
             skipped_steps=improvement.skipped,
             clip_fraction=improvement.clip_fraction,
             ignored=improvement.ignored,
-            explained_variance=1 - float(unexplained),
+            explained_variance=outcome.explained_variance,
             solver_failures=rollouts.solver_failures + improvement.solver_failures,
             unstable=int((~rollouts.stable).sum()),
-            physics_seconds=physics_seconds,
-            solve_seconds=solve_seconds + improvement.solve_seconds,
+            imagined_success=imagined_success,
+            model_loss=model_loss,
+            physics_seconds=outcome.physics_seconds,
+            solve_seconds=outcome.solve_seconds + improvement.solve_seconds,
             gradient_seconds=improvement.gradient_seconds,
+            value_seconds=outcome.value_seconds,
+            imagination_seconds=imagination_seconds,
+        )
+
+    def _imagine(self, scale: float) -> tuple[float | None, float | None]:
+        """Iterations on imagined episodes: the success of the last ones, and the loss of the ensemble.
+
+        None before the first real one: what a warm-up has seen within its trust region says too little.
+        """
+        imagination = self.imagination
+        if imagination is None or self.iteration == self.first_iteration:
+            return None, None
+        model_loss, success = imagination.fit(), 0.0
+        for self._imagined in range(1, imagination.config.iterations + 1):
+            stream = (self.seed, _IMAGINED_STREAM, self.iteration, self._imagined)
+            seeds = [int(s) for s in np.random.SeedSequence(stream).generate_state(imagination.config.rollouts)]
+            success = float(
+                self._iterate(imagination.env, seeds, imagination.config.steps, scale).rollouts.success.double().mean()
+            )
+        self._imagined = 0
+        return success, model_loss
+
+    def _iterate(
+        self,
+        env: VectorEnv,
+        seeds: list[int],
+        steps: int,
+        scale: float,
+        after_step: Callable[[int], object] | None = None,
+    ) -> _Outcome:
+        """Collect an episode for each seed, estimate advantages, improve the policy, fit the value network.
+
+        `scale` is the factor on the gradient steps, of which there are `steps`.
+        """
+        rollouts, data, physics_seconds, solve_seconds = self._collect(env, seeds, after_step)
+        rewards = self._rewards(rollouts)
+        start = time.perf_counter()
+        critic, inputs, returns = self.critic, self._inputs(rollouts), self.critic.returns(rewards)
+        with seeded(self._key(_LOSS_STREAM)):
+            critic.begin(inputs, rewards, self._key(_VALUE_STREAM))
+            estimated = critic.advantages(inputs, rewards)
+            data["advantage"] = estimated["advantage"]
+            unexplained = (returns - estimated["state_value"].squeeze(-1)).var() / returns.var().clamp_min(1e-12)
+            value_seconds = time.perf_counter() - start
+            improvement = self._improve(data.flatten(0, 1), rollouts, steps, scale)
+            start = time.perf_counter()
+            critic.learn(inputs, rewards, self._key(_VALUE_STREAM))
+            value_seconds += time.perf_counter() - start
+        return _Outcome(
+            rollouts=rollouts,
+            improvement=improvement,
+            mean_return=float(rewards.sum(1).mean()) / self.config.reward_scale,
+            explained_variance=1 - float(unexplained),
+            physics_seconds=physics_seconds,
+            solve_seconds=solve_seconds,
             value_seconds=value_seconds,
         )
 
     # --- data ---
 
-    def _collect(self, after_step: Callable[[int], object] | None) -> tuple[Rollouts, TensorDict, float, float]:
+    def _collect(
+        self, env: VectorEnv, seeds: list[int], after_step: Callable[[int], object] | None = None
+    ) -> tuple[Rollouts, TensorDict, float, float]:
         """Episodes of the stochastic policy, and its tensordicts of the stable ones (N, T)."""
         from tensordict import TensorDict
 
-        count = self._sizes[self.iteration - self.first_iteration]
-        seeds = episode_seeds(self.seed, TRAINING_STREAM, self.episodes, count)
         seen: list[TensorDict] = []
         solve_seconds = 0.0
 
@@ -398,11 +446,10 @@ class PPO:
             return np.asarray(step["action"]), _failures(step)
 
         start = time.perf_counter()
-        report = None if after_step is None else lambda: after_step(count)
-        with self._random(_NOISE_STREAM):
-            rollouts = collect(self.env, act, seeds, self.episode_steps, report)
+        report = None if after_step is None else lambda: after_step(len(seeds))
+        with seeded(self._key(_NOISE_STREAM)):
+            rollouts = collect(env, act, seeds, self.episode_steps, report)
         seconds = time.perf_counter() - start
-        self.episodes += count
         if not bool(rollouts.stable.any()):
             raise InvalidInputError("env: expected a stable simulation, got NaN or a physics error in every episode")
         data = TensorDict.maybe_dense_stack(seen, 1)[rollouts.stable]
@@ -424,49 +471,9 @@ class PPO:
         elapsed = torch.linspace(0, 1, states.shape[1], dtype=torch.float64).expand(states.shape[:-1])
         return self.features(states, goals, elapsed)
 
-    # --- value ---
-
-    def _discounted(self, rewards: Tensor) -> Tensor:
-        """(N, T) discounted sums of the rewards to come."""
-        total = torch.zeros(len(rewards), dtype=rewards.dtype)
-        sums = []
-        for reward in reversed(rewards.unbind(1)):
-            total = reward + self.config.gamma * total
-            sums.append(total)
-        return torch.stack(sums[::-1], 1)
-
-    def _advantages(self, inputs: Tensor, rewards: Tensor) -> TensorDictBase:
-        """TorchRL's GAE (Eq. adv_func): keys "advantage", "value_target", "state_value", (N, T, 1) each.
-
-        The rewards of an episode end with it: V(T) = 0, which the value network can know because it sees the time.
-        """
-        from tensordict import TensorDict
-        from tensordict.nn import TensorDictModule
-        from torchrl.objectives.value import GAE
-
-        n, steps = rewards.shape
-        end = torch.zeros(n, steps, 1, dtype=torch.bool)
-        end[:, -1] = True
-        following = {"inputs": inputs[:, 1:], "reward": rewards.unsqueeze(-1), "done": end, "terminated": end}
-        data = TensorDict({"inputs": inputs[:, :-1], "next": following}, [n, steps])  # pyright: ignore[reportArgumentType]
-        critic = TensorDictModule(lambda v: self.value(v.float()).double(), ["inputs"], ["state_value"])
-        gae = GAE(gamma=self.config.gamma, lmbda=self.config.zeta, value_network=critic, deactivate_vmap=True)
-        with torch.no_grad():
-            return gae(data)
-
-    def _fit_value(self, inputs: Tensor, targets: Tensor, epochs: int) -> None:
-        x, y = inputs.flatten(0, 1).float(), targets.flatten().float()
-        with self._random(_VALUE_STREAM, len(self._history) + 1):
-            for _ in range(epochs):
-                for batch in torch.randperm(len(x)).split(self.config.value_minibatch):
-                    loss = (self.value(x[batch]).squeeze(-1) - y[batch]).square().mean()
-                    self._value_adam.zero_grad()
-                    loss.backward()
-                    self._value_adam.step()
-
     # --- policy ---
 
-    def _improve(self, data: TensorDictBase, rollouts: Rollouts, scale: float) -> _Improvement:
+    def _improve(self, data: TensorDictBase, rollouts: Rollouts, steps: int, scale: float) -> _Improvement:
         """Gradient steps on the combined loss (Eq. total_loss), until the KL divergence is used up."""
         from tensordict.nn import ProbabilisticTensorDictSequential
         from torchrl.objectives import ClipPPOLoss
@@ -479,11 +486,11 @@ class PPO:
         data["advantage"] = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
         if "plan" in data.keys():
             data["guess"] = data["plan"].clone()  # the rollout's own optimum, then each step's
-        rng = np.random.default_rng((self.seed, _LOSS_STREAM, self.iteration))
+        rng = np.random.default_rng(self._key(_LOSS_STREAM))
         rates = [self.learning_rate, config.std_learning_rate]
         for group, rate in zip(self._adam.param_groups, rates[: len(self._adam.param_groups)], strict=True):
             group["lr"] = scale * rate
-        for chosen in self._batches(len(data), rng):
+        for chosen in self._batches(len(data), steps, rng):
             start = time.perf_counter()
             old = cast("TensorDict", data[chosen])
             batch = old.select(*self.actor.in_keys, "guess", strict=False)
@@ -534,9 +541,9 @@ class PPO:
             return self.learning_rate / config.learning_rate_factor
         return self.learning_rate * config.learning_rate_factor if kl < 0.5 * config.target_kl else self.learning_rate
 
-    def _batches(self, samples: int, rng: np.random.Generator) -> Iterator[Tensor]:
+    def _batches(self, samples: int, steps: int, rng: np.random.Generator) -> Iterator[Tensor]:
         """The samples of each gradient step."""
-        size, left = self.config.minibatch, self.config.steps
+        size, left = self.config.minibatch, steps
         while left > 0:
             order = torch.arange(samples) if size is None else torch.from_numpy(rng.permutation(samples))
             parts = order.split(size or samples)[:left]
@@ -584,13 +591,9 @@ class PPO:
                 total = (factor @ gradients[f"{_LCS}{name}"]).view_as(p)
                 p.grad = total if p.grad is None else p.grad + total
 
-    @contextmanager
-    def _random(self, stream: int, part: int = 0) -> Iterator[None]:
-        """TorchRL and torch.nn draw from the global generator: seed it, and give it back as it was."""
-        key = (self.seed, stream, self.iteration, part)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(int(np.random.SeedSequence(key).generate_state(1)[0]))
-            yield
+    def _key(self, stream: int) -> tuple[int, ...]:
+        """Of the random numbers of one purpose in one iteration, see `seeded`."""
+        return (self.seed, stream, self.iteration, *([self._imagined] if self._imagined else []))
 
     # --- checkpoints ---
 
@@ -604,26 +607,23 @@ class PPO:
             "u_max": self.bounds[1],
             "policy.log_std": gaussian.log_std.detach(),
             "policy.mixing": gaussian.mixing.detach(),
-            **{f"value.{name}": value for name, value in self.value.state_dict().items()},
-            **_moments("policy_adam", self._adam),
-            **_moments("value_adam", self._value_adam),
+            **moments("policy_adam", self._adam),
+            **_prefixed(_VALUE, self.critic.tensors()),
+            **({} if self.imagination is None else _prefixed(_IMAGINATION, self.imagination.tensors())),
         }
 
     def checkpoint(self) -> Checkpoint:
         """Everything needed to go on with the same result."""
-        sizes = [len(rewards) for _, rewards in self._history]
         state = {
             "episodes": self.episodes,
             "first_episode": self.first_episode,
             "first_iteration": self.first_iteration,
             "learning_rate": self.learning_rate,
-            "history": sizes,
+            "history": self.critic.sizes,
+            "fits": 0 if self.imagination is None else self.imagination.fits,
         }
-        history: dict[str, Tensor] = {}
-        if sizes:
-            history["history.inputs"] = torch.cat([inputs for inputs, _ in self._history])
-            history["history.rewards"] = torch.cat([rewards for _, rewards in self._history])
-        return Checkpoint(self.iteration, self.lcs, state, {**self._tensors(), **history})
+        tensors = {**self._tensors(), **_prefixed(_VALUE, self.critic.history_tensors())}
+        return Checkpoint(self.iteration, self.lcs, state, tensors)
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint.
@@ -631,9 +631,13 @@ class PPO:
         Raises:
             CheckpointError: it does not fit the settings or the model; nothing is changed.
         """
-        own, tensors = self._tensors(), dict(checkpoint.tensors)
-        inputs, rewards = tensors.pop("history.inputs", None), tensors.pop("history.rewards", None)
-        shapes, wanted = ({k: tuple(v.shape) for k, v in part.items()} for part in (tensors, own))
+        own, state = self._tensors(), checkpoint.state
+        # The lengths of these follow from the episodes so far; who holds them checks the rest.
+        varying = {f"{_VALUE}history.{name}" for name in ("inputs", "rewards")}
+        varying |= {f"{_IMAGINATION}{name}" for name in EPISODES}
+        shapes, wanted = (
+            {k: tuple(v.shape) for k, v in part.items() if k not in varying} for part in (checkpoint.tensors, own)
+        )
         got, expected = (model and model.config() for model in (checkpoint.model, self.lcs))
         if shapes != wanted or got != expected:
             different = sorted({k for k in {*shapes, *wanted} if shapes.get(k) != wanted.get(k)})
@@ -641,31 +645,43 @@ class PPO:
                 f"checkpoint: expected {expected} and the tensors of this training, got {got}, different in "
                 f"{different}; was it written with other settings?"
             )
-        state = checkpoint.state
         try:
-            names = ("episodes", "first_episode", "first_iteration")
-            episodes, first_episode, first_iteration = (check_positive_int(k, state[k], minimum=0) for k in names)
+            names = ("episodes", "first_episode", "first_iteration", "fits")
+            episodes, first_episode, first_iteration, fits = (check_positive_int(k, state[k], minimum=0) for k in names)
             learning_rate = check_number("learning_rate", state["learning_rate"], strict=True)
             sizes: list[int] = list(state["history"])  # pyright: ignore[reportArgumentType]
-            history = []
-            if inputs is not None and rewards is not None:
-                history = list(zip(inputs.split(sizes), rewards.split(sizes), strict=True))
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(f"checkpoint: its counters or history cannot be used ({error})") from error
         if (first_episode, first_iteration) != (self.first_episode, self.first_iteration):
             raise CheckpointError(
                 f"checkpoint: expected a main phase that starts after {self.first_episode} episodes, got one after "
                 f"{first_episode}; was it written with other settings?"
             )
+        values = _of(_VALUE, checkpoint.tensors)
+        history = read_history(values, sizes)
+        if self.imagination is not None:
+            self.imagination.restore(_of(_IMAGINATION, checkpoint.tensors), fits)
+        self.critic.restore(values, history)
         self.iteration, self.episodes, self.learning_rate = checkpoint.iteration, episodes, learning_rate
-        self._history = history
         if self.lcs is not None and checkpoint.model is not None:
             self.lcs.load_state_dict(checkpoint.model.state_dict())
-        self.value.load_state_dict({k.removeprefix("value."): v for k, v in tensors.items() if k.startswith("value.")})
         with torch.no_grad():
             for name, value in own.items():
-                if not name.startswith(("value.", "u_")):
-                    value.copy_(tensors[name])
+                if not name.startswith((_VALUE, _IMAGINATION, "u_")):
+                    value.copy_(checkpoint.tensors[name])
+
+
+@dataclass
+class _Outcome:
+    """What one iteration, real or imagined, has done."""
+
+    rollouts: Rollouts
+    improvement: _Improvement
+    mean_return: float
+    explained_variance: float
+    physics_seconds: float
+    solve_seconds: float
+    value_seconds: float
 
 
 @dataclass
@@ -684,7 +700,7 @@ class _Improvement:
 
 def network_tensors(checkpoint: Checkpoint) -> dict[str, Tensor]:
     """The learned network's state dict in a checkpoint."""
-    return {k.removeprefix(_NETWORK): v for k, v in checkpoint.tensors.items() if k.startswith(_NETWORK)}
+    return _of(_NETWORK, checkpoint.tensors)
 
 
 def _failures(data: TensorDictBase) -> int:
@@ -716,16 +732,9 @@ def _quiet() -> Iterator[None]:
         yield
 
 
-def _initialise(optimiser: torch.optim.Optimizer) -> None:
-    """Give every parameter its moments now, so that a checkpoint has the same tensors at any time."""
-    for group in optimiser.param_groups:
-        for p in group["params"]:
-            zero = {"exp_avg": torch.zeros_like(p), "exp_avg_sq": torch.zeros_like(p)}
-            optimiser.state[p] = {"step": torch.tensor(0.0), **zero}
+def _prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {f"{prefix}{name}": value for name, value in tensors.items()}
 
 
-def _moments(name: str, optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """Name → the optimiser's own tensors, by the place of the parameter."""
-    parameters = [p for group in optimiser.param_groups for p in group["params"]]
-    state: Mapping[nn.Parameter, Mapping[str, Tensor]] = optimiser.state  # pyright: ignore[reportAssignmentType]
-    return {f"{name}.{i}.{key}": value for i, p in enumerate(parameters) for key, value in state[p].items()}
+def _of(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

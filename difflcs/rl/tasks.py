@@ -81,6 +81,8 @@ class Task:
         u_max: bound of each action component [m].
         horizon: steps the MPC plans ahead.
         relaxation: product λ·s of the MPC's complementarity.
+        position_tolerance: distance [m] to the goal that counts as success.
+        yaw_tolerance: angle [rad] that counts as success.
     """
 
     env_id: str
@@ -90,6 +92,25 @@ class Task:
     u_max: float = 0.015
     horizon: int = 8
     relaxation: float = 1e-5
+    position_tolerance: float = 0.02
+    yaw_tolerance: float = 0.2
+
+    def outcome(self, state: Tensor, action: Tensor, after: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """What the environment says of a step without a simulation, for imagined episodes.
+
+        Args:
+            state: (..., 9) before.
+            action: (..., 6) that is executed [m].
+            after: (..., 9) state after it.
+            goal: (..., 3).
+
+        Returns:
+            Dense reward (...), minus the stage cost of `pushing_cost`, and success (...) bool.
+        """
+        distance = (after[..., :2] - goal[..., :2]).norm(dim=-1)
+        turn = (after[..., 2] - goal[..., 2] + torch.pi) % (2 * torch.pi) - torch.pi
+        success = (distance <= self.position_tolerance) & (turn.abs() <= self.yaw_tolerance)
+        return -pushing_cost().stage(state, action, goal), success
 
     def make_policy(self, lcs: LCSModel, backend: str = "batched") -> LCSMPCLayer:
         """The MPC around a model; unsolved elements are masked, never raised, so that they cannot end a training."""
@@ -109,7 +130,7 @@ _OBJECTS = ("sugar_box", "fish_can", "mug", "wrench", "clamp", "banana", "large_
 TASKS: Mapping[str, Task] = MappingProxyType(
     {
         "cube": Task("difflcs/TriFingerMoveCube-v0"),
-        "turn_cube": Task("difflcs/TriFingerTurnCube-v0"),
+        "turn_cube": Task("difflcs/TriFingerTurnCube-v0", position_tolerance=0.001),
         **{name: Task("difflcs/TriFingerMoveObject-v0", MappingProxyType({"object": name})) for name in _OBJECTS},
     }
 )

@@ -20,9 +20,11 @@ from difflcs.lcs import LCSModel
 from difflcs.mpc.backends import get_backend
 from difflcs.rl._optional import require, versions
 from difflcs.rl.checkpoint import Checkpoint, RunDirectory, load_checkpoint, save_checkpoint
+from difflcs.rl.dynamics import Ensemble
 from difflcs.rl.evaluate import Evaluation, evaluate
+from difflcs.rl.imagination import Imagination, ImaginationConfig
 from difflcs.rl.mlp import MLPConfig, MLPController
-from difflcs.rl.pddm import PDDM, Ensemble, PDDMConfig, PDDMIteration, Planner, ensemble_tensors
+from difflcs.rl.pddm import PDDM, PDDMConfig, PDDMIteration, Planner, ensemble_tensors
 from difflcs.rl.phases import LCSRL
 from difflcs.rl.ppo import PPO, PPOConfig, PPOIteration, network_tensors
 from difflcs.rl.rollout import Policy
@@ -88,6 +90,8 @@ class TrainConfig:
     """Settings of the warm-up phase."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """Settings of the main phase, for the methods lcs-rl and ppo."""
+    imagination: ImaginationConfig = field(default_factory=ImaginationConfig)
+    """Settings of the imagined episodes in the main phase, for the methods lcs-rl and ppo."""
     mlp: MLPConfig = field(default_factory=MLPConfig)
     """Settings of the method ppo-mlp."""
     pddm: PDDMConfig = field(default_factory=PDDMConfig)
@@ -139,6 +143,14 @@ class TrainConfig:
             final_goals=min(self.final_goals, 4),
             warmup=replace(self.warmup, first_epochs=20, epochs=2),
             ppo=replace(self.ppo, rollouts=min(self.ppo.rollouts, 5), steps=min(self.ppo.steps, 2)),
+            imagination=replace(
+                self.imagination,
+                iterations=min(self.imagination.iterations, 1),
+                rollouts=min(self.imagination.rollouts, 5),
+                steps=min(self.imagination.steps, 2),
+                first_epochs=2,
+                epochs=1,
+            ),
             mlp=replace(self.mlp, rollouts=min(self.mlp.rollouts, 5), steps=min(self.mlp.steps, 2)),
             pddm=replace(
                 self.pddm,
@@ -150,7 +162,13 @@ class TrainConfig:
         )
 
 
-_NESTED: Mapping[str, type] = {"warmup": WarmupConfig, "ppo": PPOConfig, "mlp": MLPConfig, "pddm": PDDMConfig}
+_NESTED: Mapping[str, type] = {
+    "warmup": WarmupConfig,
+    "ppo": PPOConfig,
+    "imagination": ImaginationConfig,
+    "mlp": MLPConfig,
+    "pddm": PDDMConfig,
+}
 
 
 class Reporter:
@@ -415,9 +433,13 @@ def _make_trainer(config: TrainConfig, task: Task, model: LCSModel, make_envs: E
 
         mlp = config.method == "ppo-mlp"
         settings = config.mlp if mlp else config.ppo
+        envs = make_envs(min(settings.rollouts, max(1, total_episodes - first_episode)))
+        imagination = None
+        if config.imagination.iterations and not mlp:
+            imagination = Imagination(envs, task.outcome, config.imagination, config.seed, task.episode_steps)
         return PPO(
             make_actor(_initial_network(config, task) if mlp else policy, settings),
-            make_envs(min(settings.rollouts, max(1, total_episodes - first_episode))),
+            envs,
             settings,
             config.seed,
             features=pushing_features,
@@ -425,6 +447,7 @@ def _make_trainer(config: TrainConfig, task: Task, model: LCSModel, make_envs: E
             episode_steps=task.episode_steps,
             first_episode=first_episode,
             first_iteration=first_iteration,
+            imagination=imagination,
         )
 
     if config.method in ("ppo", "ppo-mlp"):

@@ -229,6 +229,7 @@ class Warmup:
         self.episodes = 0
         self.states = torch.zeros(0, episode_steps + 1, lcs.n_x, dtype=torch.float64)
         self.actions = torch.zeros(0, episode_steps, lcs.n_u, dtype=torch.float64)
+        self.goals = torch.zeros(0, *env.single_observation_space["goal"].shape, dtype=torch.float64)
         self.bounds = (self.low, self.high)
         """Action bounds of the last collected episodes."""
         self._action_rng = np.random.default_rng((seed, _ACTION_STREAM))
@@ -295,6 +296,7 @@ class Warmup:
         keep = self.config.buffer_rollouts
         self.states = torch.cat([self.states, rollouts.states[rollouts.stable]])[-keep:]
         self.actions = torch.cat([self.actions, rollouts.actions[rollouts.stable]])[-keep:]
+        self.goals = torch.cat([self.goals, rollouts.goals[rollouts.stable]])[-keep:]
         if not len(self.states):
             raise InvalidInputError("env: expected a stable simulation, got NaN or a physics error in every episode")
 
@@ -306,7 +308,7 @@ class Warmup:
             "minibatch_rng": self._minibatch_rng.bit_generator.state,
         }
         low, high = self.bounds
-        tensors = {"states": self.states, "actions": self.actions, "u_min": low, "u_max": high}
+        tensors = {"states": self.states, "actions": self.actions, "goals": self.goals, "u_min": low, "u_max": high}
         return Checkpoint(self.iteration, self.lcs, state, tensors)
 
     def restore(self, checkpoint: Checkpoint) -> None:
@@ -316,8 +318,9 @@ class Warmup:
             CheckpointError: it does not fit the settings or the model; nothing is changed.
         """
         n_x, n_u, steps = self.lcs.n_x, self.lcs.n_u, self.episode_steps
-        wanted = {"states": (steps + 1, n_x), "actions": (steps, n_u), "u_min": (n_u,), "u_max": (n_u,)}
-        batched = ("states", "actions")
+        wanted = {"states": (steps + 1, n_x), "actions": (steps, n_u), "goals": tuple(self.goals.shape[1:])}
+        wanted |= {"u_min": (n_u,), "u_max": (n_u,)}
+        batched = ("states", "actions", "goals")
         shapes = {k: tuple(v.shape[1:] if k in batched else v.shape) for k, v in checkpoint.tensors.items()}
         model = checkpoint.model
         if shapes != wanted or model is None or model.config() != self.lcs.config():
@@ -332,7 +335,7 @@ class Warmup:
             raise CheckpointError(f"checkpoint: its counters or generators cannot be used ({error})") from error
         self.iteration, self.episodes = checkpoint.iteration, episodes
         self._action_rng, self._minibatch_rng = generators
-        self.states, self.actions = checkpoint.tensors["states"], checkpoint.tensors["actions"]
+        self.states, self.actions, self.goals = (checkpoint.tensors[name] for name in batched)
         self.bounds = (checkpoint.tensors["u_min"], checkpoint.tensors["u_max"])
         self.lcs.load_state_dict(model.state_dict())
 

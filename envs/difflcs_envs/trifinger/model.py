@@ -53,6 +53,9 @@ LINK_INERTIAS = (  # [kg m^2] principal moments; the principal axes are those of
 # --- pinned objects: the pivot of Jin & Posa's turning task -----------------------------------------
 PIVOT_DAMPING = 0.01  # [N m s/rad]
 PIVOT_RANGE = 1.5008  # [rad]
+# Three fingers can jam a pinned cube, which cannot give way: contacts and stops are stiffer, or tips sink in by up to
+# 6 mm. Having priority, the cube brings the friction of the tips with it; the table carries none of its weight.
+PIVOT_SOLREF, PIVOT_SOLIMP = (0.004, 1.0), (0.99, 0.999, 0.001, 0.5, 2.0)
 
 # --- contact --------------------------------------------------------------------------------------
 # Time constant [s] and damping ratio of contacts. Under noisy commands of up to 15 mm MuJoCo's 0.02 s lets tips sink
@@ -314,18 +317,13 @@ def _add_object(spec: mujoco.MjSpec, scene_object: SceneObject) -> None:
             damping=PIVOT_DAMPING,
             range=[-PIVOT_RANGE, PIVOT_RANGE],
             limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+            solref_limit=PIVOT_SOLREF,
         )
+        contact = {"friction": _friction(TIP_FRICTION), "priority": 1, "solref": PIVOT_SOLREF, "solimp": PIVOT_SOLIMP}
     else:
         body.add_freejoint(name="object")
-    scene_object.add_geoms(
-        spec,
-        body,
-        {
-            "friction": _friction(scene_object.friction),
-            "contype": OBJECT_BIT,
-            "conaffinity": TABLE_BIT | FINGER_BIT,
-        },
-    )
+        contact = {"friction": _friction(scene_object.friction)}
+    scene_object.add_geoms(spec, body, {**contact, "contype": OBJECT_BIT, "conaffinity": TABLE_BIT | FINGER_BIT})
 
 
 def _add_finger(spec: mujoco.MjSpec, finger: int) -> None:

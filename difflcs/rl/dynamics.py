@@ -1,0 +1,122 @@
+"""An ensemble of networks that predicts the next state: PDDM plans with it, imagined episodes are played in it."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from difflcs import _files
+from difflcs._checks import check_positive_int
+from difflcs.errors import CheckpointError
+
+_KIND = "dynamics"
+
+
+class Ensemble(nn.Module):
+    """Networks that predict the next state, evaluated side by side; inputs and outputs are standardised by the data.
+
+    Args:
+        n_x: states.
+        n_u: actions.
+        networks: number of networks.
+        width: width of the two hidden layers.
+        generator: draws the initial weights.
+    """
+
+    def __init__(self, n_x: int, n_u: int, networks: int, width: int, generator: torch.Generator | None = None):
+        super().__init__()
+        self.n_x, self.n_u, self.networks, self.width = n_x, n_u, networks, width
+        sizes = [n_x + n_u, width, width, n_x]
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        for n_in, n_out in pairwise(sizes):
+            bound = n_in**-0.5
+            draw = torch.rand(networks, n_in, n_out, generator=generator)
+            self.weights.append(nn.Parameter(bound * (2 * draw - 1)))
+            self.biases.append(nn.Parameter(torch.zeros(networks, 1, n_out)))
+        for name, size in (("input", n_x + n_u), ("change", n_x)):
+            self.register_buffer(f"{name}_mean", torch.zeros(size))
+            self.register_buffer(f"{name}_std", torch.ones(size))
+
+    input_mean: Tensor
+    input_std: Tensor
+    change_mean: Tensor
+    change_std: Tensor
+
+    def standardised(self, inputs: Tensor) -> Tensor:
+        """(networks, N, n_x + n_u) → (networks, N, n_x) standardised changes of the state."""
+        hidden = (inputs - self.input_mean) / self.input_std
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            hidden = torch.baddbmm(bias, hidden, weight).relu_()
+        return torch.baddbmm(self.biases[-1], hidden, self.weights[-1])
+
+    def forward(self, x: Tensor, u: Tensor) -> Tensor:
+        """States (networks, N, n_x), actions (networks, N, n_u) → next states, each network from its own states."""
+        return x + self.change_mean + self.change_std * self.standardised(torch.cat([x, u], -1))
+
+    def fit(
+        self,
+        x: Tensor,
+        u: Tensor,
+        x_next: Tensor,
+        *,
+        epochs: int,
+        minibatch: int,
+        learning_rate: float,
+        generator: torch.Generator,
+    ) -> float:
+        """Fit every network to all transitions (N, ·), in orders of their own, from the weights that they have.
+
+        Args:
+            x: (N, n_x) states.
+            u: (N, n_u) actions.
+            x_next: (N, n_x) next states.
+            epochs: passes over the transitions.
+            minibatch: transitions per step.
+            learning_rate: step size of a new Adam.
+            generator: draws the orders.
+
+        Returns:
+            The mean loss of the last pass: squared error of the standardised changes.
+        """
+        inputs, changes = torch.cat([x, u], -1).float(), (x_next - x).float()
+        for name, data in (("input", inputs), ("change", changes)):
+            getattr(self, f"{name}_mean").copy_(data.mean(0))
+            getattr(self, f"{name}_std").copy_(data.std(0, correction=0).clamp_min(1e-6))
+        targets = (changes - self.change_mean) / self.change_std
+        adam = torch.optim.Adam(self.parameters(), learning_rate, fused=True)
+        losses: list[Tensor] = []
+        for _ in range(epochs):
+            orders = torch.stack([torch.randperm(len(inputs), generator=generator) for _ in range(self.networks)])
+            losses = []
+            for batch in orders.split(minibatch, 1):
+                errors = (self.standardised(inputs[batch]) - targets[batch]).square().mean((1, 2))
+                adam.zero_grad()
+                errors.sum().backward()
+                adam.step()
+                losses.append(errors.detach().mean())
+        return float(torch.stack(losses).mean())
+
+    def save_pretrained(self, directory: Path) -> None:
+        """Write the ensemble into a directory, atomically."""
+        names = ("n_x", "n_u", "networks", "width")
+        _files.save_record(Path(directory), _KIND, {name: getattr(self, name) for name in names}, self.state_dict())
+
+    @classmethod
+    def from_pretrained(cls, directory: Path) -> Ensemble:
+        """Read what `save_pretrained` wrote.
+
+        Raises:
+            CheckpointError: files are missing, corrupt or of another kind.
+        """
+        config, tensors = _files.load_record(Path(directory), _KIND)
+        try:
+            names = ("n_x", "n_u", "networks", "width")
+            n_x, n_u, networks, width = (check_positive_int(name, config[name]) for name in names)
+            ensemble = cls(n_x, n_u, networks, width)
+            ensemble.load_state_dict(tensors)
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise CheckpointError(f"{directory}: expected an ensemble written by difflcs, got {error}") from error
+        return ensemble
