@@ -35,7 +35,7 @@ class ImaginationConfig:
     """Iterations of PPO on imagined episodes between two on real ones; 0: none, as in the paper."""
     rollouts: int = 120
     """Imagined episodes per iteration."""
-    steps: int = 10
+    steps: int = 20
     """Gradient steps per imagined iteration."""
     networks: int = 4
     """Networks in the ensemble; every imagined step is predicted by one of them, drawn at random."""

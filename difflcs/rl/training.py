@@ -142,7 +142,7 @@ class TrainConfig:
             evaluate_goals=min(self.evaluate_goals, 4),
             final_goals=min(self.final_goals, 4),
             warmup=replace(self.warmup, first_epochs=20, epochs=2),
-            ppo=replace(self.ppo, rollouts=min(self.ppo.rollouts, 5), steps=min(self.ppo.steps, 2)),
+            ppo=replace(self.ppo, rollouts=min(self.ppo.rollouts, 3), steps=min(self.ppo.steps, 2)),
             imagination=replace(
                 self.imagination,
                 iterations=min(self.imagination.iterations, 1),
