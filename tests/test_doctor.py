@@ -125,12 +125,15 @@ class Finder:
     def find_spec(name, path=None, target=None):
         return None if name.partition(".")[0] in hidden else find(name, path, target)
 sys.meta_path[:] = [Finder if f is importlib.machinery.PathFinder else f for f in sys.meta_path]
-from difflcs import doctor, cli
+from difflcs import doctor, __main__
 doctor._version = lambda package: None
-sys.exit(cli.main(["doctor", "--json"]))
+assert __main__.main(["train"]) == 2
+sys.exit(__main__.main(["doctor", "--json"]))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stderr.count("error:") == 1
+    assert "expected the package(s) gymnasium, not installed; run: pip install" in done.stderr  # of `difflcs train`
     every = json.loads(done.stdout)["checks"]
     found = {check["name"]: check for check in every if check["group"] == "solvers"}
     assert found["ipopt"]["status"] == "ok"

@@ -18,7 +18,14 @@ HEAVY = (
     "casadi", "cvxpy", "cvxpylayers", "torchrl", "tensordict", "gymnasium", "mujoco", "tyro", "scipy", "matplotlib",
     "trimesh", "coacd", "numba", "safetensors", "tqdm", "tensorboard", "imageio", "dask",
 )  # fmt: skip
-LAYERS = [{"errors"}, {"lcs", "lcp", "losses", "cost"}, {"systems"}, {"mpc"}, {"rl", "zoo"}, {"bench", "doctor", "cli"}]
+LAYERS = [
+    {"errors"},
+    {"lcs", "lcp", "losses", "cost"},
+    {"systems"},
+    {"mpc"},
+    {"rl", "zoo"},
+    {"bench", "doctor", "cli", "__main__"},
+]
 
 
 def run(code):

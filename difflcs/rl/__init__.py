@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from difflcs.rl._optional import require
+
+require("gymnasium")  # a clear error, before the modules below import it
+
+# ruff: noqa: E402
 from difflcs.rl.checkpoint import Checkpoint, RunDirectory, load_checkpoint, save_checkpoint
 from difflcs.rl.dynamics import Ensemble
 from difflcs.rl.evaluate import Evaluation, evaluate, wilson_interval
