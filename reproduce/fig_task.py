@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -79,10 +79,10 @@ def find_policy(options: DrawTask) -> tuple[Policy, str]:
 
 def _newest(work: Path) -> dict[str, Any] | None:
     """Of the finished LCS-RL units on the cube the one with the most data, then the newest."""
-    found = []
+    found, wanted = [], asdict(Unit("cube", "lcs-rl", "ours", 0))
     for path in work.glob("*/record.json"):
         record = worker.finished_record(path.parent, path.parent.name)
-        if record is not None and replace(Unit(**record["unit"]), seed=0) == Unit("cube", "lcs-rl", "ours", 0):
+        if record is not None and {**record["unit"], "seed": 0} == wanted:
             found.append(record)
     return max(found, key=lambda record: (record["config"]["minutes"], record["finished"]), default=None)
 
