@@ -66,8 +66,8 @@ def draw(options: Draw) -> int:
         axes.legend(fontsize=8, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)
     name = report.stem("fig_learning_curves", preset)
     report.write_figure(figure, options.results, name)
-    unique = {id(cell): cell for cell in found}
-    report.write_tables(options.results, name, [table(cells)], report.provenance(list(unique.values())))
+    unique = list(dict.fromkeys(found))  # a method with one recipe is on both sides
+    report.write_tables(options.results, name, [table(cells)], report.provenance(unique))
     return code
 
 
