@@ -54,14 +54,7 @@ def test_train_and_evaluate(capsys, finished, method):
     assert rows[-1]["evaluation_goals"] == "4"
     spent = profile(rows)
     wanted = {
-        "lcs-rl": {
-            "collect",
-            "learn",
-            "physics",
-            "solve",
-            "gradient",
-            "value",
-        },  # one iteration: nothing to imagine yet
+        "lcs-rl": {"collect", "learn", "physics", "solve", "gradient", "value", "imagination"},
         "ppo": {"physics", "solve", "gradient", "value", "imagination"},
         "ppo-mlp": {"physics", "solve", "gradient", "value"},
         "pddm": {"collect", "learn"},
