@@ -356,7 +356,7 @@ def test_ctrl_c_in_a_real_process(tmp_path):
     while not (path / "checkpoints/000002").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the solver's workers, too
-    _, err = process.communicate(timeout=20)
+    _, err = process.communicate(timeout=60)  # 3 s on a busy machine
     assert process.returncode == 130, err
     assert "--resume" in err
     assert "Traceback" not in err
