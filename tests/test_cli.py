@@ -351,12 +351,18 @@ def test_ctrl_c_in_a_real_process(tmp_path):
     pytest.importorskip("mujoco")
     path = tmp_path / "run"
     command = [sys.executable, "-m", "difflcs.cli", "train", "--final-goals", "0", "--evaluate-at", "--out", str(path)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
-    deadline = time.monotonic() + 60
-    while not (path / "checkpoints/000002").exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the solver's workers, too
-    _, err = process.communicate(timeout=60)  # 3 s on a busy machine
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # ignored where the tests run under nohup
+    )  # fmt: skip
+    try:
+        deadline = time.monotonic() + 60
+        while not (path / "checkpoints/000002").exists() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the solver's workers, too
+        _, err = process.communicate(timeout=60)  # 3 s on a busy machine
+    finally:
+        process.kill()
     assert process.returncode == 130, err
     assert "--resume" in err
     assert "Traceback" not in err

@@ -159,7 +159,7 @@ class Killer:
 
     def _wait_for_checkpoint(self, latest):
         # Far finer than `compute` polls: the rest of the unit, TorchRL's import included, takes longer than this.
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 240
         while not latest.is_file() or json.loads(latest.read_text())["checkpoint"] == "000000":
             assert time.monotonic() < deadline, "the unit wrote no checkpoint"
             time.sleep(0.002)
