@@ -70,9 +70,10 @@ def make_specs(
         InvalidInputError: DIFFLCS_YCB_DIR is set, but a mesh is not there.
     """
     sources = {task: object_source(task) for task in dict.fromkeys(unit.task for unit in units)}
-    code = code_version()
+    codes = {method: code_version(method) for method in dict.fromkeys(unit.method for unit in units)}
     specs = {}
     for unit in units:
+        code = codes[unit.method]
         keys = [unit_key(unit, preset, sources, version) for version in (code, *accept)]
         done = (key for key in keys if finished_record(work / key, key) is not None)
         key = next(done, keys[0])
@@ -198,7 +199,7 @@ def run(options: Compute, artefacts: Sequence[str]) -> int:
     done = sum(finished_record(Path(spec["folder"]), spec["key"]) is not None for spec in specs.values())
     print(
         f"{preset.name}: {len(units)} units of {preset.evaluate_at[-1]:g} minutes of data, {preset.seeds} seeds, "
-        f"{preset.goals} goals; {done} finished before; code {next(iter(specs.values()))['code']}"
+        f"{preset.goals} goals; {done} finished before"
     )
     store = lambda record: records.add(options.results, preset.name, records.rows_of(record))  # noqa: E731
     if done == len(units):

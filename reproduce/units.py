@@ -277,14 +277,26 @@ _HARMLESS = frozenset(
     }
 )
 """Imported, but without influence on a result: files, messages, pictures, other solvers."""
+_MAIN_PHASE = frozenset(f"difflcs.rl.{name}" for name in ("critic", "imagination", "policy", "ppo"))
+_UNREACHED: Mapping[str, frozenset[str]] = {
+    "lcs-rl": frozenset({"difflcs.rl.mlp", "difflcs.rl.pddm"}),
+    "violation": _MAIN_PHASE | {"difflcs.rl.dynamics", "difflcs.rl.mlp", "difflcs.rl.pddm"},
+    "ppo": frozenset({"difflcs.rl.mlp", "difflcs.rl.pddm"}),
+    "pddm": _MAIN_PHASE | {"difflcs.rl.mlp"},
+}
+"""What a training imports for the other methods' sake."""
 
 
-def code_version() -> str:
-    """Hash of the code that decides a result: every module that a training imports, and the C++ kernels.
+def code_version(method: str) -> str:
+    """Hash of the code that decides a method's results: the modules that its training imports, and the C++ kernels.
 
-    Python is hashed as syntax trees without docstrings: comments, documentation and formatting do not count. The C++ is
-    hashed as text where its sources lie beside the installed package (in a wheel they do not). The hash is that of one
-    minor version of Python.
+    Python is hashed as syntax trees without docstrings: comments, documentation and formatting do not count. Nor do the
+    defaults of settings (dataclasses named …Config): their values are in `settings_hash`. The C++ is hashed as text
+    where its sources lie beside the installed package (in a wheel they do not). The hash is that of one minor version
+    of Python.
+
+    Args:
+        method: one of `METHODS`.
 
     Returns:
         "<Python>.<C++>", 8 hexadecimal digits each.
@@ -298,11 +310,11 @@ def code_version() -> str:
     while waiting:
         name = waiting.pop()
         path = _module_file(name, roots)
-        if path is None or name in trees or name in _HARMLESS or name in roots:
+        if path is None or name in trees or name in roots or name in _HARMLESS | _UNREACHED[method]:
             continue
         tree = ast.parse(path.read_text())
         waiting += _imports(tree)
-        trees[name] = ast.dump(_without_docstrings(tree))
+        trees[name] = ast.dump(_without_defaults(_without_docstrings(tree)))
     native = {
         f"{name}/{path.relative_to(root)}": hashlib.sha256(path.read_bytes()).hexdigest()
         for name, root in roots.items()
@@ -343,4 +355,13 @@ def _without_docstrings(tree: ast.Module) -> ast.Module:
                     and isinstance(child.value.value, str)
                 )
             ]
+    return tree
+
+
+def _without_defaults(tree: ast.Module) -> ast.Module:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef) and node.name.endswith("Config"):
+            for field in node.body:
+                if isinstance(field, ast.AnnAssign):
+                    field.value = None
     return tree

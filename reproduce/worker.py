@@ -126,7 +126,8 @@ def _train(spec: Spec, folder: Path, report: Report) -> dict[str, Any]:
     from difflcs.rl.tasks import get_task
     from difflcs.rl.training import profile, train
 
-    here = code_version()
+    unit, config = Unit(**spec["unit"]), TrainConfig.from_dict(spec["config"])
+    here = code_version(unit.method)
     # The C++ is compared only where its sources are installed.
     if here.partition(".")[0] != spec["code"].partition(".")[0]:
         raise UnitError(
@@ -134,7 +135,6 @@ def _train(spec: Spec, folder: Path, report: Report) -> dict[str, Any]:
             f"install the same code there, or, if it was edited meanwhile, start again"
         )
     torch.set_num_threads(1)  # of this thread only: one unit, one core
-    unit, config = Unit(**spec["unit"]), TrainConfig.from_dict(spec["config"])
     source = object_source(unit.task)
     if source != spec["source"]:
         raise UnitError(

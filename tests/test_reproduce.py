@@ -111,20 +111,31 @@ def test_key_changes_with_everything_that_decides_a_result_and_with_nothing_else
     assert changed == {"lcs-rl", "ppo"}  # only these read PPO's settings
 
 
-def test_code_version_does_not_see_comments_and_docstrings(monkeypatch):
+def test_code_version_sees_what_decides_a_method(monkeypatch):
     read = Path.read_text
 
-    def version(old="", new=""):
+    def version(file="", old="", new=""):
         def changed(path, *arguments, **keywords):
             text = read(path, *arguments, **keywords)
-            return text.replace(old, new) if path.name == "warmup.py" and old else text
+            if path.name != file:
+                return text
+            assert old in text
+            return text.replace(old, new)
 
         monkeypatch.setattr(Path, "read_text", changed)
-        return units.code_version()
+        return {method: units.code_version(method) for method in units.METHODS}
 
     known = version()
-    assert version('    """Settings of the warm-up.', '    # A comment.\n    """Other words.') == known
-    assert version("epochs: int = 15", "epochs: int = 16") != known
+
+    def differ(*change):
+        return {method for method, code in version(*change).items() if code != known[method]}
+
+    assert not differ("warmup.py", '    """Settings of the warm-up.', '    # A comment.\n    """Other words.')
+    assert not differ("warmup.py", "epochs: int = 15", "epochs: int = 16")  # in the hash of the settings
+    assert differ("ppo.py", "config.reward_scale * rewards", "rewards") == {"lcs-rl", "ppo"}
+    assert differ("dynamics.py", "relu_", "tanh_") == {"lcs-rl", "ppo", "pddm"}
+    assert differ("pddm.py", "softmax", "log_softmax") == {"pddm"}
+    assert differ("losses.py", "return ", "return 2 * ") == set(units.METHODS)
 
 
 # --- computing --------------------------------------------------------------------------------------
@@ -299,9 +310,9 @@ def test_a_process_that_always_dies_is_a_failure(tmp_path, monkeypatch):
 def test_finished_units_of_accepted_code_count(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "_POLL_SECONDS", 0)
     with monkeypatch.context() as patch:
-        patch.setattr(runs, "code_version", lambda: "old")
+        patch.setattr(runs, "code_version", lambda method: "old")
         runs.compute(runs.make_specs([CUBE], TINY, tmp_path), FakePool(), lambda record: None)
-    monkeypatch.setattr(runs, "code_version", lambda: "new")
+    monkeypatch.setattr(runs, "code_version", lambda method: "new")
     for accept, submitted in ((("old",), 0), ((), 1)):
         pool = FakePool()
         runs.compute(runs.make_specs([CUBE], TINY, tmp_path, accept), pool, lambda record: None)
