@@ -148,7 +148,7 @@ class DaskPool:
             raise MissingDependencyError(
                 'expected the package distributed, not installed; run: pip install "difflcs[reproduce]"'
             ) from error
-        for module in (units, worker):
+        for module in (sys.modules[__name__], units, worker):
             cloudpickle.register_pickle_by_value(module)
         self._cluster: Any = None
         if address.startswith("local:"):
@@ -187,7 +187,10 @@ class DaskPool:
     def submit(self, spec: Spec) -> None:
         """See `Pool`."""
         # A worker may die three times with a unit (`distributed.scheduler.allowed-failures`), as in `LocalPool`.
-        future = self._client.submit(_compute, dict(spec), key=f"{spec['key']}-{os.urandom(4).hex()}", pure=False)
+        # A lambda is pickled by value; a function with a name would be looked for in this module, on the worker.
+        future = self._client.submit(
+            lambda unit: _compute(unit), dict(spec), key=f"{spec['key']}-{os.urandom(4).hex()}", pure=False
+        )
         self._futures[spec["key"]] = (spec, future)
 
     def finished(self) -> list[dict[str, Any]]:

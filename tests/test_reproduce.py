@@ -178,7 +178,7 @@ class Killer:
 
 def same(record, expected):
     """Whether two records tell of the same result, bit for bit."""
-    return all(record[name] == expected[name] for name in ("curve", "model", "key", "settings", "object", "error"))
+    return all(record.get(name) == expected[name] for name in ("curve", "model", "key", "settings", "object", "error"))
 
 
 @pytest.mark.parametrize(
@@ -202,19 +202,45 @@ def test_a_killed_worker_costs_nothing_but_time(make_pool, undisturbed, tmp_path
     assert runs.compute(specs, runs._NoPool(), stored.append) == found
 
 
-def test_dask_workers_need_nothing_of_this_folder():
-    import cloudpickle
-
-    for module in (units, worker, pools):
-        cloudpickle.register_pickle_by_value(module)
-    code = "import sys, pickle; print(pickle.load(sys.stdin.buffer).__name__, 'worker' in sys.modules)"
+@pytest.fixture
+def cluster(tmp_path):
+    """Address of a Dask scheduler with a worker, two processes started as on a cluster: elsewhere, by its own tools."""
+    file = tmp_path / "scheduler.json"
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    commands = (
+        ["dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--no-show"],
+        ["dask_worker", "--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", str(elsewhere)],
+    )
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-m", f"distributed.cli.{name}", "--scheduler-file", str(file), *options],
+            cwd=elsewhere,
+            stderr=subprocess.DEVNULL,
+        )
+        for name, *options in commands
+    ]
     try:
-        text = subprocess.run(
-            [sys.executable, "-c", code], input=cloudpickle.dumps(pools._compute), stdout=-1, check=True, cwd="/"
-        ).stdout
+        deadline = time.monotonic() + 120
+        while not file.is_file():
+            assert time.monotonic() < deadline, "the scheduler did not start"
+            time.sleep(0.1)
+        yield json.loads(file.read_text())["address"]
     finally:
-        cloudpickle.unregister_pickle_by_value(pools)
-    assert text.split() == [b"_compute", b"False"]
+        for process in reversed(processes):
+            process.terminate()
+        for process in processes:
+            process.wait(60)
+
+
+def test_a_cluster_that_runs_already(cluster, undisturbed, tmp_path):
+    pool = runs.make_pool(runs.Compute(scheduler=cluster))
+    try:
+        found = runs.compute(runs.make_specs([CUBE, TRANSFER], TINY, tmp_path / "work"), pool, lambda record: None)
+    finally:
+        pool.close()
+    for unit, expected in undisturbed.items():
+        assert same(found[unit], expected), (found[unit]["error"], unit)
 
 
 class FakePool:
