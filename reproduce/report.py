@@ -15,7 +15,7 @@ from records import Cell, ResultsError, Row
 from rich.console import Console
 from rich.table import Table
 from stats import Comparison, Summary, compare, summarise
-from units import get_preset
+from units import get_preset, shared_code
 
 from difflcs._files import write_atomically
 from difflcs.errors import CheckpointError
@@ -157,7 +157,7 @@ def paired(a: Cell | None, b: Cell | None, when: str | float) -> Comparison | No
     """Compare a with b over the seeds that both have, each at its own `when` (see `at`).
 
     Returns:
-        None where they cannot be compared: other goals, code, or object.
+        None where they cannot be compared: other goals, another object, or other code of what they have in common.
     """
     if a is None or b is None or _conditions(a) != _conditions(b):
         return None
@@ -167,7 +167,9 @@ def paired(a: Cell | None, b: Cell | None, when: str | float) -> Comparison | No
 
 
 def _conditions(cell: Cell) -> set[tuple[object, ...]]:
-    return {(row.task, row.goals, row.evaluation_seed, row.code, row.source, row.mass) for row in cell.rows}
+    return {
+        (row.task, row.goals, row.evaluation_seed, shared_code(row.code), row.source, row.mass) for row in cell.rows
+    }
 
 
 def _values(cell: Cell | None, when: str | float) -> dict[int, float]:
@@ -191,7 +193,9 @@ def provenance(cells: Sequence[Cell | None]) -> list[str]:
         f"average, on {', '.join(_distinct(rows, 'machine'))}, until {max(row.finished for row in rows)[:10]}; "
         f"{'; '.join(_distinct(rows, 'versions'))}; code {', '.join(_distinct(rows, 'code'))}.",
     ]
-    if len(_distinct(rows, "code")) > 1 or len(amounts) > 1:
+    codes = {(row.method, row.code) for row in rows}
+    mixed = len(codes) > len({row.method for row in rows}) or len({shared_code(row.code) for row in rows}) > 1
+    if mixed or len(amounts) > 1:
         notes.append("Not everything was computed with the same code and on as many seeds and goals:")
         notes += [f"- {_name(cell)}: {len(cell.seeds)} × {cell.rows[0].goals}, {cell.rows[0].code}" for cell in found]
     notes += [

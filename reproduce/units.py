@@ -299,7 +299,7 @@ def code_version(method: str) -> str:
         method: one of `METHODS`.
 
     Returns:
-        "<Python>.<C++>", 8 hexadecimal digits each.
+        "<all methods' Python>.<the method's own>.<C++>", 8 hexadecimal digits each; see `shared_code`.
     """
     import difflcs
     import difflcs_envs
@@ -320,7 +320,14 @@ def code_version(method: str) -> str:
         for name, root in roots.items()
         for path in sorted(root.rglob("*.?pp"))
     }
-    return f"{_hash(trees, 8)}.{_hash(native, 8)}"
+    own = {name: trees.pop(name) for name in frozenset().union(*_UNREACHED.values()) & trees.keys()}
+    return ".".join(_hash(part, 8) for part in (trees, own, native))
+
+
+def shared_code(version: str) -> tuple[str, str]:
+    """What a `code_version` says of the code of all methods, environment and evaluation among it: Python, C++."""
+    first, _, rest = version.partition(".")
+    return first, rest.rpartition(".")[2]
 
 
 def _module_file(name: str, roots: Mapping[str, Path]) -> Path | None:

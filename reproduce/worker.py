@@ -129,7 +129,7 @@ def _train(spec: Spec, folder: Path, report: Report) -> dict[str, Any]:
     unit, config = Unit(**spec["unit"]), TrainConfig.from_dict(spec["config"])
     here = code_version(unit.method)
     # The C++ is compared only where its sources are installed.
-    if here.partition(".")[0] != spec["code"].partition(".")[0]:
+    if here.rpartition(".")[0] != spec["code"].rpartition(".")[0]:
         raise UnitError(
             f"code: expected version {spec['code']}, which submitted the unit, got {here} on {platform.node()}; "
             f"install the same code there, or, if it was edited meanwhile, start again"

@@ -136,6 +136,7 @@ def test_code_version_sees_what_decides_a_method(monkeypatch):
     assert differ("dynamics.py", "relu_", "tanh_") == {"lcs-rl", "ppo", "pddm"}
     assert differ("pddm.py", "softmax", "log_softmax") == {"pddm"}
     assert differ("losses.py", "return ", "return 2 * ") == set(units.METHODS)
+    assert len({units.shared_code(code) for code in known.values()}) == 1
 
 
 # --- computing --------------------------------------------------------------------------------------
@@ -314,7 +315,7 @@ def test_an_error_in_a_unit_is_its_record(tmp_path, one_thread):
     spec = runs.make_specs([Unit("mug", "violation", "ours", FIRST)], TINY, tmp_path).popitem()[1]
     for change, message in (
         ({"source": {"source": "ycb_mesh", "sha256": "abc"}}, "set DIFFLCS_YCB_DIR there"),
-        ({"code": "00000000.00000000"}, "install the same code there"),
+        ({"code": "00000000.00000000.00000000"}, "install the same code there"),
     ):
         record = worker.execute({**spec, **change})
         assert message in record["error"]
@@ -487,8 +488,17 @@ def test_nothing_is_mixed_or_replaced_silently(results, capsys):
     # Nor compared with what other code has computed.
     both = [records.select(rows, "mug", method, "ours") for method in ("lcs-rl", "violation")]
     assert report.paired(*both, "final").difference.n == 2
-    changed = replace(both[0], rows=tuple(replace(row, code="c2") for row in both[0].rows))
-    assert report.paired(changed, both[1], "final") is None
+
+    def coded(cell, code):
+        return replace(cell, rows=tuple(replace(row, code=code) for row in cell.rows))
+
+    def compared(*codes):
+        return report.paired(*(coded(cell, code) for cell, code in zip(both, codes, strict=True)), "final") is not None
+
+    # What a method has of its own may differ between methods, but not what they have in common.
+    assert compared("all.ppo.cpp", "all.warmup.cpp")
+    assert not compared("all.ppo.cpp", "other.ppo.cpp")
+    assert not compared("all.ppo.cpp", "all.ppo.other")
 
 
 def test_records_round_trip(undisturbed, tmp_path):
