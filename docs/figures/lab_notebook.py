@@ -44,7 +44,7 @@ def main() -> None:
         ax.grid(axis="x", alpha=0.3)
     axes[1].set_xlabel("success of 1000 goals, one training each; the bar is the mean")
     seeds = [plt.Line2D([], [], marker="o", linestyle="", color=f"C{s - 1}", label=f"seed {s}") for s in range(1, 5)]
-    axes[0].legend(handles=seeds, fontsize=8, loc="upper left")
+    axes[1].legend(handles=seeds, fontsize=8, loc="upper left")
     fig.savefig(HERE / "lab_notebook.png", dpi=110)
 
 
