@@ -196,7 +196,7 @@ def provenance(cells: Sequence[Cell | None]) -> list[str]:
     codes = {(row.method, row.code) for row in rows}
     mixed = len(codes) > len({row.method for row in rows}) or len({shared_code(row.code) for row in rows}) > 1
     if mixed or len(amounts) > 1:
-        notes.append("Not everything was computed with the same code and on as many seeds and goals:")
+        notes.append("Not everything was computed on as many seeds and goals, or with one code for each method:")
         notes += [f"- {_name(cell)}: {len(cell.seeds)} × {cell.rows[0].goals}, {cell.rows[0].code}" for cell in found]
     notes += [
         f"{_name(cell)}: {cell.left_out} trainings of other settings left out." for cell in found if cell.left_out
