@@ -1,5 +1,6 @@
 """The scripts of reproduce/, from outside; they are no package, so that they are imported as their own scripts do."""
 
+import contextlib
 import json
 import math
 import os
@@ -222,11 +223,13 @@ def cluster(tmp_path):
         for name, *options in commands
     ]
     try:
-        deadline = time.monotonic() + 120
-        while not file.is_file():
+        deadline, address = time.monotonic() + 120, None
+        while address is None:
             assert time.monotonic() < deadline, "the scheduler did not start"
             time.sleep(0.1)
-        yield json.loads(file.read_text())["address"]
+            with contextlib.suppress(OSError, ValueError):  # not there, or not whole yet
+                address = json.loads(file.read_text())["address"]
+        yield address
     finally:
         for process in reversed(processes):
             process.terminate()
@@ -237,6 +240,7 @@ def cluster(tmp_path):
 def test_a_cluster_that_runs_already(cluster, undisturbed, tmp_path):
     pool = runs.make_pool(runs.Compute(scheduler=cluster))
     try:
+        pool._client.wait_for_workers(1, timeout=120)
         found = runs.compute(runs.make_specs([CUBE, TRANSFER], TINY, tmp_path / "work"), pool, lambda record: None)
     finally:
         pool.close()
