@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 
 import torch
@@ -50,13 +51,18 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
         raise ShapeError(
             f"{name}: expected shape ({labels}), got {tuple(value.shape)}; reshape it or rebuild the model"
         )
-    if finite and not bool(torch.isfinite(value.detach()).all()):
+    if finite and not _all_finite(value.detach()):
         bad = torch.nonzero(~torch.isfinite(value.detach()))
         raise NonFiniteError(
             f"{name}: expected finite numbers, got {len(bad)} NaN or infinite of {value.numel()}, "
             f"the first at index {tuple(bad[0].tolist())}; find where they come from before solving"
         )
     return value
+
+
+def _all_finite(value: Tensor) -> bool:
+    # A finite sum has finite terms, and costs a third of looking at each. Large terms can overflow it.
+    return math.isfinite(value.sum()) or bool(torch.isfinite(value).all())
 
 
 def check_same_device(tensors: Iterable[tuple[str, Tensor]]) -> None:
@@ -104,7 +110,8 @@ def broadcast_batch(shapes: Iterable[tuple[str, torch.Size]]) -> torch.Size:
     result = torch.Size()
     named = list(shapes)
     for name, shape in named:
-        if shape == result or not shape:  # torch.broadcast_shapes costs 10 µs
+        if shape == result or not shape or not result:  # torch.broadcast_shapes costs 100 µs
+            result = result or shape
             continue
         try:
             result = torch.broadcast_shapes(result, shape)

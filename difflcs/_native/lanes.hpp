@@ -39,4 +39,27 @@ static inline bool any(Mask m) {
   return r != 0;
 }
 
+// Unrolls the loop behind it. Where all loops over an array are unrolled, its elements live in registers.
+#if defined(__clang__)
+#define DIFFLCS_UNROLL _Pragma("unroll")
+#else
+#define DIFFLCS_UNROLL _Pragma("GCC unroll 16")
+#endif
+
+// A small array for unrolled loops: on the stack where the size is known when compiling, else in the scratch given.
+template <int64_t N>
+struct Local {
+  Vec v[N];
+  explicit Local(Vec*) {}
+  Vec& operator[](int64_t i) { return v[i]; }
+  const Vec& operator[](int64_t i) const { return v[i]; }
+};
+template <>
+struct Local<0> {
+  Vec* v;
+  explicit Local(Vec* scratch) : v(scratch) {}
+  Vec& operator[](int64_t i) { return v[i]; }
+  const Vec& operator[](int64_t i) const { return v[i]; }
+};
+
 }  // namespace difflcs::DIFFLCS_ISA

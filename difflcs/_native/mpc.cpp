@@ -19,6 +19,7 @@ namespace {
 // Problem sizes: compile-time where the template argument is not zero.
 template <int X, int U, int L>
 struct Sizes {
+  static constexpr int64_t kX = X, kU = U, kL = L;
   int64_t rx, ru, rl, h;
   explicit Sizes(const MpcBatch& b) : rx(b.n_x), ru(b.n_u), rl(b.n_lam), h(b.horizon) {}
   int64_t x() const { return X ? X : rx; }
@@ -46,7 +47,7 @@ struct Mpc {
   Vec *x, *u, *lam, *s, *xt, *ut, *lamt, *st, *K, *kf, *grad;
   // Scratch of the backward sweep and of the LCP.
   Vec *P, *Pn, *v, *vn, *p, *pn, *M, *Mc, *Kl, *Tk, *Wk, *av, *bv, *Ah, *PA, *H, *lin, *Lc, *Kk, *y, *size, *gap, *res,
-      *wt, *dl, *lt, *wn, *rn, *root;
+      *newton, *wt, *dl;
   // Kept per stage for the adjoint.
   Vec *Kl_s, *Ks_s, *Ah_s, *M_s, *size_s, *y_s, *P_s, *v_s, *p_s, *xb, *ub, *lb, *sum;
   Mask *act, *low, *upp;
@@ -75,8 +76,7 @@ struct Mpc {
     vec(Mc, nl * nl), vec(Kl, nl * nw), vec(Tk, nl * nw), vec(Wk, nl * nw), vec(av, nl), vec(bv, nl);
     vec(Ah, nx * nw), vec(PA, nx * nw), vec(H, nw * nw), vec(lin, nw);
     vec(Lc, nu * nu), vec(Kk, nu * (nx + 1)), vec(y, nl), vec(size, nl), vec(gap, nl), vec(res, nl), vec(wt, nl);
-    vec(dl, nl), vec(lt, nl), vec(wn, nl), vec(rn, nl), vec(root, nl), mask(act, h * nu), mask(low, h * nu),
-        mask(upp, h * nu);
+    vec(dl, nl), vec(newton, 6 * nl), mask(act, h * nu), mask(low, h * nu), mask(upp, h * nu);
     if (adjoint) {
       vec(Kl_s, h * nl * nw), vec(Ks_s, h * nl * nw), vec(Ah_s, h * nx * nw), vec(M_s, h * nl * nl);
       vec(size_s, h * nl), vec(y_s, h * nl), vec(P_s, (h + 1) * nx * nx), vec(v_s, (h + 1) * nx);
@@ -183,56 +183,69 @@ struct Mpc {
   void relaxed_lcp(Vec* lk, Vec* sk, Vec eps, Mask skip) {
     const int64_t nl = n.l();
     const Vec eps4 = 4.0 * eps;
-    // w, root and the squared norm of g at lk + step * dl; the next iterate starts from what the last trial computed.
-    auto evaluate = [&](Vec step, bool move) {
+    Local<S::kL * S::kL> jacobian(M);
+    Local<S::kL> at(newton), w(newton + nl), root(newton + 2 * nl), step(dl);
+    Local<S::kL> next(newton + 3 * nl), w_next(newton + 4 * nl), root_next(newton + 5 * nl);
+    // w, root and the squared norm of g at `next`; the next iterate starts from what the last trial computed.
+    auto evaluate = [&] {
       Vec merit = all(0);
-      for (int64_t i = 0; i < nl; i++) lt[i] = move ? lk[i] + step * dl[i] : lk[i];
+      DIFFLCS_UNROLL
       for (int64_t i = 0; i < nl; i++) {
         Vec t = gap[i];
-        for (int64_t j = 0; j < nl; j++) t += F[i * nl + j] * lt[j];
-        const Vec diff = lt[i] - t;
-        wn[i] = t, rn[i] = sqrt(diff * diff + eps4);
-        const Vec g = lt[i] + t - rn[i];
+        DIFFLCS_UNROLL
+        for (int64_t j = 0; j < nl; j++) t += F[i * nl + j] * next[j];
+        const Vec diff = next[i] - t;
+        w_next[i] = t, root_next[i] = sqrt(diff * diff + eps4);
+        const Vec g = next[i] + t - root_next[i];
         merit += g * g;
       }
       return merit;
     };
-    Vec merit = evaluate(all(0), false), best = all(1e300);
-    for (int64_t i = 0; i < nl; i++) wt[i] = wn[i], root[i] = rn[i];
+    DIFFLCS_UNROLL
+    for (int64_t i = 0; i < nl; i++) at[i] = next[i] = lk[i];
+    Vec merit = evaluate(), best = all(1e300);
+    DIFFLCS_UNROLL
+    for (int64_t i = 0; i < nl; i++) w[i] = w_next[i], root[i] = root_next[i];
     Mask done = skip;
     for (int iteration = 0; iteration < 50; iteration++) {
       Vec magnitude = all(0);
-      for (int64_t i = 0; i < nl; i++) magnitude = max(magnitude, abs(lk[i]) + abs(wt[i]) + abs(gap[i]));
+      DIFFLCS_UNROLL
+      for (int64_t i = 0; i < nl; i++) magnitude = max(magnitude, abs(at[i]) + abs(w[i]) + abs(gap[i]));
       // Converged at rounding level, or stuck just above it.
       const Vec floor = 1e-15 * magnitude;
       done |= (merit <= floor * floor) | ((merit <= 1e-24 * magnitude * magnitude) & (merit > 0.25 * best)) |
               (merit != merit);
       best = min(best, merit);
       if (!any(~done)) break;
+      DIFFLCS_UNROLL
       for (int64_t i = 0; i < nl; i++) {
-        const Vec ratio = (lk[i] - wt[i]) / root[i], b = 1.0 + ratio;
-        for (int64_t j = 0; j < nl; j++) M[i * nl + j] = b * F[i * nl + j];
-        M[i * nl + i] += 1.0 - ratio;
-        dl[i] = root[i] - lk[i] - wt[i];
+        const Vec ratio = (at[i] - w[i]) / root[i], b = 1.0 + ratio;
+        DIFFLCS_UNROLL
+        for (int64_t j = 0; j < nl; j++) jacobian[i * nl + j] = b * F[i * nl + j];
+        jacobian[i * nl + i] += 1.0 - ratio;
+        step[i] = root[i] - at[i] - w[i];
       }
-      lu_factor(nl, M);
-      lu_solve(nl, M, dl);
-      Vec step = all(1), next = merit;
+      lu_eliminate(nl, jacobian, step);
+      Vec length = all(1), merit_next = merit;
       for (int search = 0; search < 8; search++) {
-        next = evaluate(step, true);
-        const Mask poor = (next > merit * (1.0 - 0.2 * step)) & (merit > 1e-24 * magnitude * magnitude) & ~done;
+        DIFFLCS_UNROLL
+        for (int64_t i = 0; i < nl; i++) next[i] = at[i] + length * step[i];
+        merit_next = evaluate();
+        const Mask poor = (merit_next > merit * (1.0 - 0.2 * length)) & (merit > 1e-24 * magnitude * magnitude) & ~done;
         if (!any(poor)) break;
-        if (search < 7) step = select(poor, 0.4 * step, step);
+        if (search < 7) length = select(poor, 0.4 * length, length);
       }
+      DIFFLCS_UNROLL
       for (int64_t i = 0; i < nl; i++) {
-        lk[i] = select(done, lk[i], lt[i]);
-        wt[i] = select(done, wt[i], wn[i]);
-        root[i] = select(done, root[i], rn[i]);
+        at[i] = select(done, at[i], next[i]);
+        w[i] = select(done, w[i], w_next[i]);
+        root[i] = select(done, root[i], root_next[i]);
       }
-      merit = select(done, merit, next);
+      merit = select(done, merit, merit_next);
     }
+    DIFFLCS_UNROLL
     for (int64_t i = 0; i < nl; i++) {
-      const Vec diff = lk[i] - wt[i], larger = 0.5 * (abs(diff) + root[i]), smaller = eps / larger;
+      const Vec diff = at[i] - w[i], larger = 0.5 * (abs(diff) + root[i]), smaller = eps / larger;
       lk[i] = select(skip, lk[i], select(diff > 0, larger, smaller));
       sk[i] = select(skip, sk[i], select(diff > 0, smaller, larger));
     }
@@ -293,24 +306,36 @@ struct Mpc {
         size[i] = 1.0 / (lk[i] + sk[i]);
         av[i] = sk[i] * size[i], bv[i] = lk[i] * size[i];
       }
+      Local<S::kL * S::kL> left(M), right(Mc);
+      DIFFLCS_UNROLL
       for (int64_t i = 0; i < nl; i++) {
-        for (int64_t j = 0; j < nl; j++) {
-          M[i * nl + j] = bv[i] * F[i * nl + j];
-          Mc[i * nl + j] = bv[j] * F[i * nl + j];
-        }
-        M[i * nl + i] += av[i], Mc[i * nl + i] += av[i];
-        for (int64_t j = 0; j < nw; j++) Tk[i * nw + j] = all(0) - DE[i * nw + j];
+        DIFFLCS_UNROLL
+        for (int64_t j = 0; j < nl; j++) left[i * nl + j] = bv[i] * F[i * nl + j];
+        left[i * nl + i] += av[i];
       }
-      lu_factor(nl, M), lu_factor(nl, Mc);
-      lu_solve_many(nl, nw, Mc, Tk);
-      for (int64_t i = 0; i < nl; i++)
-        for (int64_t j = 0; j < nw; j++) Kl[i * nw + j] = bv[i] * Tk[i * nw + j];
-      for (int64_t i = 0; i < nx; i++)
-        for (int64_t j = 0; j < nw; j++) {
-          Vec t = all(0) + AB[i * nw + j];
-          for (int64_t m = 0; m < nl; m++) t += C[i * nl + m] * Kl[m * nw + j];
-          Ah[i * nw + j] = t;
+      lu_factor(nl, left);
+      for (int64_t i = 0; i < nl * nl; i++) M[i] = left[i];
+      DIFFLCS_UNROLL
+      for (int64_t i = 0; i < nl; i++) {
+        DIFFLCS_UNROLL
+        for (int64_t j = 0; j < nl; j++) right[i * nl + j] = bv[j] * F[i * nl + j];
+        right[i * nl + i] += av[i];
+      }
+      lu_factor(nl, right);
+      for (int64_t j = 0; j < nw; j++) {
+        Local<S::kL> t(dl);
+        DIFFLCS_UNROLL
+        for (int64_t i = 0; i < nl; i++) t[i] = all(0) - DE[i * nw + j];
+        lu_solve(nl, right, t);
+        DIFFLCS_UNROLL
+        for (int64_t i = 0; i < nl; i++) Tk[i * nw + j] = t[i], Kl[i * nw + j] = t[i] = bv[i] * t[i];
+        for (int64_t i = 0; i < nx; i++) {
+          Vec sum = all(0) + AB[i * nw + j];
+          DIFFLCS_UNROLL
+          for (int64_t m = 0; m < nl; m++) sum += C[i * nl + m] * t[m];
+          Ah[i * nw + j] = sum;
         }
+      }
       for (int64_t i = 0; i < nl; i++) {
         Vec t = all(0);
         for (int64_t j = 0; j < nx; j++) t -= C[j * nl + i] * p[j];
@@ -334,22 +359,31 @@ struct Mpc {
       // Stage Hessian H = blkdiag(Q, R) + Ah^T P Ah, lower triangle; its second-derivative part Y is added below. The
       // first state is given: of stage 0 only the action block is needed.
       const int64_t first = k == 0 ? nx : 0;
-      for (int64_t i = 0; i < nx; i++)
-        for (int64_t j = first; j < nw; j++) {
+      Local<S::kX> column(vn);
+      for (int64_t j = first; j < nw; j++) {
+        DIFFLCS_UNROLL
+        for (int64_t m = 0; m < nx; m++) column[m] = Ah[m * nw + j];
+        for (int64_t i = 0; i < nx; i++) {
           Vec t = all(0);
-          for (int64_t m = 0; m < nx; m++) t += P[i * nx + m] * Ah[m * nw + j];
+          DIFFLCS_UNROLL
+          for (int64_t m = 0; m < nx; m++) t += P[i * nx + m] * column[m];
           PA[i * nw + j] = t;
         }
-      for (int64_t i = first; i < nw; i++)
+      }
+      for (int64_t i = first; i < nw; i++) {
+        DIFFLCS_UNROLL
+        for (int64_t m = 0; m < nx; m++) column[m] = Ah[m * nw + i];
         for (int64_t j = first; j <= i; j++) {
           Vec t = all(0);
           if (i < nx)
             t += Q[i * nx + j];
           else if (j >= nx)
             t += R[(i - nx) * nu + j - nx];
-          for (int64_t m = 0; m < nx; m++) t += Ah[m * nw + i] * PA[m * nw + j];
+          DIFFLCS_UNROLL
+          for (int64_t m = 0; m < nx; m++) t += column[m] * PA[m * nw + j];
           H[i * nw + j] = t;
         }
+      }
       auto curvature = [&](int64_t i, int64_t j) {  // Y_ij = sum_m y_m (Kl_mi Ks_mj + Ks_mi Kl_mj)
         Vec t = all(0);
         for (int64_t m = 0; m < nl; m++) t += Wk[m * nw + i] * Tk[m * nw + j];

@@ -122,10 +122,13 @@ class MPCProblem(SystemMatrices):
 
     def objective(self, x: Tensor, u: Tensor) -> Tensor:
         """Cost (batch,) of trajectories x (batch, H+1, n_x), u (batch, H, n_u)."""
+        # A problem's own cost (batch, ...) holds for all of its stages.
+        own = {name: getattr(self, name) for name in ("Q", "R", "q", "r")}
+        Q, R, q, r = (v if self.shared(name) else v.unsqueeze(1) for name, v in own.items())
+        stages = 0.5 * quadratic(Q, x[:, :-1]) + (q * x[:, :-1]).sum(-1) + 0.5 * quadratic(R, u) + (r * u).sum(-1)
         total = 0.5 * quadratic(self.Q_final, x[:, -1]) + (self.q_final * x[:, -1]).sum(-1)
-        for k in range(self.horizon):
-            total = total + 0.5 * quadratic(self.Q, x[:, k]) + (self.q * x[:, k]).sum(-1)
-            total = total + 0.5 * quadratic(self.R, u[:, k]) + (self.r * u[:, k]).sum(-1)
+        for k in range(self.horizon):  # one by one: the order of a sum must not depend on the batch
+            total = total + stages[:, k]
         if self.barrier > 0:
             below, above = self.distances(u)
             total = total - self.barrier * (below.log() + above.log()).sum((1, 2))
