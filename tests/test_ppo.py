@@ -19,7 +19,7 @@ from difflcs.rl.evaluate import evaluate
 from difflcs.rl.imagination import Imagination, ImaginationConfig
 from difflcs.rl.phases import LCSRL
 from difflcs.rl.policy import make_actor
-from difflcs.rl.ppo import PPO, PPOConfig, _trimmed_mean
+from difflcs.rl.ppo import PPO, PPOConfig, _Effort, _trimmed_mean
 from difflcs.rl.rollout import episode_seeds
 from difflcs.rl.warmup import TRAINING_STREAM, Warmup, WarmupConfig
 
@@ -187,11 +187,16 @@ def prepared(trainer: PPO):
     return data.flatten(0, 1), rollouts
 
 
+def improve(trainer: PPO, data, rollouts):
+    config = trainer.config
+    return trainer._improve(data, rollouts, _Effort(config.steps, config.minibatch, config.value_epochs), 1.0)
+
+
 def test_the_first_gradient_is_the_policy_gradient():
     """At the rollout's own parameters all ratios are 1: the gradient is that of −mean(A log π)."""
     trainer = make_ppo(steps=1)
     data, rollouts = prepared(trainer)
-    outcome = trainer._improve(data, rollouts, trainer.config.steps, 1.0)
+    outcome = improve(trainer, data, rollouts)
     found = [p.grad.clone() for p in trainer.lcs.parameters() if p.grad is not None]
     assert outcome.kl == pytest.approx(0, abs=1e-12)
     assert outcome.clip_fraction == 0
@@ -213,7 +218,7 @@ def test_jumps_are_left_out():
     trainer = make_ppo(steps=1, kl_quantile=1.0)
     data, rollouts = prepared(trainer)
     data["loc"][:5] += 1.0
-    outcome = trainer._improve(data, rollouts, trainer.config.steps, 1.0)
+    outcome = improve(trainer, data, rollouts)
     assert outcome.ignored == 5 / len(data)
     found = [p.grad.clone() for p in trainer.lcs.parameters() if p.grad is not None]
     other = make_ppo(steps=1, kl_quantile=1.0)
@@ -234,7 +239,7 @@ def test_long_gradients_of_single_samples_are_clipped():
     options = {"steps": 1, "learn_std": True, "beta": 0.7, "violation_batch": 1000}
     trainer = make_ppo(sample_clip=1.5, **options)
     data, rollouts = prepared(trainer)
-    trainer._improve(data, rollouts, trainer.config.steps, 1.0)
+    improve(trainer, data, rollouts)
     found = {name: p.grad.clone() for name, p in trainer.lcs.named_parameters() if p.grad is not None}
 
     other = make_ppo(**options)
@@ -255,7 +260,7 @@ def test_long_gradients_of_single_samples_are_clipped():
     for k, (name, p) in enumerate(parameters.items()):
         clipped = sum(factor * sample[k] for factor, sample in zip(factors, gradients, strict=True))
         torch.testing.assert_close(found[name], clipped + p.grad, rtol=1e-5, atol=1e-8)
-    other._improve(data, rollouts, other.config.steps, 1.0)
+    improve(other, data, rollouts)
     assert torch.equal(trainer.actor.gaussian.log_std.grad, other.actor.gaussian.log_std.grad)
     assert any(not torch.allclose(found[name], p.grad, rtol=1e-2) for name, p in parameters.items())
 
@@ -275,7 +280,7 @@ def test_minibatches(size, sizes):
     data, rollouts = prepared(trainer)
     seen = []
     trainer.actor.gaussian.register_forward_hook(lambda _, inputs, __: seen.append(inputs[0].clone()))
-    assert trainer._improve(data, rollouts, trainer.config.steps, 1.0).steps == 3
+    assert improve(trainer, data, rollouts).steps == 3
     assert [len(batch) for batch in seen] == sizes
     states = torch.cat([batch["state"] for batch in seen]).sort(0).values[:: 3 if sizes[0] == 72 else 1]
     torch.testing.assert_close(states, data["state"].sort(0).values, rtol=0, atol=0)
@@ -297,7 +302,7 @@ def test_step_size_follows_the_kl(kl, factor):
 def test_an_iteration_ends_at_the_kl_limit():
     trainer = make_ppo(max_kl=1e-6)
     data, rollouts = prepared(trainer)
-    outcome = trainer._improve(data, rollouts, trainer.config.steps, 1.0)
+    outcome = improve(trainer, data, rollouts)
     assert outcome.steps == 1
     assert outcome.kl > 1e-6
 
@@ -332,7 +337,7 @@ def test_a_gradient_that_is_not_finite_changes_nothing():
     data, rollouts = prepared(trainer)
     data["advantage"][3] = math.nan
     before = parameters(trainer)
-    outcome = trainer._improve(data, rollouts, trainer.config.steps, 1.0)
+    outcome = improve(trainer, data, rollouts)
     assert (outcome.steps, outcome.skipped) == (0, trainer.config.steps)
     assert same(before, parameters(trainer))
 

@@ -74,12 +74,12 @@ class Critic:
         if not self.history:
             self._fit(inputs[:, :-1], self.returns(rewards), self.config.value_first_epochs, (*key, 1))
 
-    def learn(self, inputs: Tensor, rewards: Tensor, key: Sequence[int]) -> None:
+    def learn(self, inputs: Tensor, rewards: Tensor, key: Sequence[int], epochs: int) -> None:
         """Take in the episodes of an iteration, and fit the network to the newest iterations."""
         self.history = [*self.history, (inputs, rewards)][-self.config.value_iterations :]
         targets = [self.advantages(*part)["value_target"].squeeze(-1) for part in self.history]
         seen = torch.cat([inputs[:, :-1] for inputs, _ in self.history])
-        self._fit(seen, torch.cat(targets), self.config.value_epochs, (*key, len(self.history) + 1))
+        self._fit(seen, torch.cat(targets), epochs, (*key, len(self.history) + 1))
 
     def _fit(self, inputs: Tensor, targets: Tensor, epochs: int, key: Sequence[int]) -> None:
         x, y = inputs.flatten(0, 1).float(), targets.flatten().float()

@@ -37,6 +37,10 @@ class ImaginationConfig:
     """Imagined episodes per iteration."""
     steps: int = 20
     """Gradient steps per imagined iteration."""
+    steps_minibatch: int | None = None
+    """Samples per gradient step, every sample once before any is drawn again; None: each step on all of them."""
+    value_epochs: int = 20
+    """Epochs of the value network at the end of an imagined iteration."""
     networks: int = 4
     """Networks in the ensemble; every imagined step is predicted by one of them, drawn at random."""
     width: int = 200
@@ -52,8 +56,10 @@ class ImaginationConfig:
 
     def __post_init__(self) -> None:
         check_positive_int("iterations", self.iterations, minimum=0)
-        for name in ("rollouts", "steps", "networks", "width", "first_epochs", "epochs", "minibatch"):
+        for name in ("rollouts", "steps", "value_epochs", "networks", "width", "first_epochs", "epochs", "minibatch"):
             check_positive_int(name, getattr(self, name))
+        if self.steps_minibatch is not None:
+            check_positive_int("steps_minibatch", self.steps_minibatch)
         check_number("learning_rate", self.learning_rate, strict=True)
 
 

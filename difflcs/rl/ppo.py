@@ -339,7 +339,8 @@ class PPO:
         seeds = episode_seeds(self.seed, TRAINING_STREAM, self.episodes, count)
         self.episodes += count
         std, learning_rate = float(self.actor.std.mean()), self.learning_rate
-        outcome = self._iterate(self.env, seeds, self.config.steps, scale, after_step)
+        effort = _Effort(self.config.steps, self.config.minibatch, self.config.value_epochs)
+        outcome = self._iterate(self.env, seeds, effort, scale, after_step)
         rollouts, improvement = outcome.rollouts, outcome.improvement
         if self.imagination is not None:
             stable = rollouts.stable
@@ -377,13 +378,14 @@ class PPO:
         imagination = self.imagination
         if imagination is None or self.iteration == self.first_iteration:
             return None, None
+        config = imagination.config
+        effort = _Effort(config.steps, config.steps_minibatch, config.value_epochs)
         model_loss, success = imagination.fit(), 0.0
-        for self._imagined in range(1, imagination.config.iterations + 1):
+        for self._imagined in range(1, config.iterations + 1):
             stream = (self.seed, _IMAGINED_STREAM, self.iteration, self._imagined)
-            seeds = [int(s) for s in np.random.SeedSequence(stream).generate_state(imagination.config.rollouts)]
-            success = float(
-                self._iterate(imagination.env, seeds, imagination.config.steps, scale).rollouts.success.double().mean()
-            )
+            seeds = [int(s) for s in np.random.SeedSequence(stream).generate_state(config.rollouts)]
+            rollouts = self._iterate(imagination.env, seeds, effort, scale).rollouts
+            success = float(rollouts.success.double().mean())
         self._imagined = 0
         return success, model_loss
 
@@ -391,13 +393,13 @@ class PPO:
         self,
         env: VectorEnv,
         seeds: list[int],
-        steps: int,
+        effort: _Effort,
         scale: float,
         after_step: Callable[[int], object] | None = None,
     ) -> _Outcome:
         """Collect an episode for each seed, estimate advantages, improve the policy, fit the value network.
 
-        `scale` is the factor on the gradient steps, of which there are `steps`.
+        `scale` is the factor on the gradient steps.
         """
         rollouts, data, physics_seconds, solve_seconds = self._collect(env, seeds, after_step)
         rewards = self._rewards(rollouts)
@@ -409,9 +411,9 @@ class PPO:
             data["advantage"] = estimated["advantage"]
             unexplained = (returns - estimated["state_value"].squeeze(-1)).var() / returns.var().clamp_min(1e-12)
             value_seconds = time.perf_counter() - start
-            improvement = self._improve(data.flatten(0, 1), rollouts, steps, scale)
+            improvement = self._improve(data.flatten(0, 1), rollouts, effort, scale)
             start = time.perf_counter()
-            critic.learn(inputs, rewards, self._key(_VALUE_STREAM))
+            critic.learn(inputs, rewards, self._key(_VALUE_STREAM), effort.value_epochs)
             value_seconds += time.perf_counter() - start
         return _Outcome(
             rollouts=rollouts,
@@ -473,7 +475,7 @@ class PPO:
 
     # --- policy ---
 
-    def _improve(self, data: TensorDictBase, rollouts: Rollouts, steps: int, scale: float) -> _Improvement:
+    def _improve(self, data: TensorDictBase, rollouts: Rollouts, effort: _Effort, scale: float) -> _Improvement:
         """Gradient steps on the combined loss (Eq. total_loss), until the KL divergence is used up."""
         from tensordict.nn import ProbabilisticTensorDictSequential
         from torchrl.objectives import ClipPPOLoss
@@ -490,7 +492,7 @@ class PPO:
         rates = [self.learning_rate, config.std_learning_rate]
         for group, rate in zip(self._adam.param_groups, rates[: len(self._adam.param_groups)], strict=True):
             group["lr"] = scale * rate
-        for chosen in self._batches(len(data), steps, rng):
+        for chosen in _batches(len(data), effort, rng):
             start = time.perf_counter()
             old = cast("TensorDict", data[chosen])
             batch = old.select(*self.actor.in_keys, "guess", strict=False)
@@ -540,15 +542,6 @@ class PPO:
         if kl > 1.5 * config.target_kl:
             return self.learning_rate / config.learning_rate_factor
         return self.learning_rate * config.learning_rate_factor if kl < 0.5 * config.target_kl else self.learning_rate
-
-    def _batches(self, samples: int, steps: int, rng: np.random.Generator) -> Iterator[Tensor]:
-        """The samples of each gradient step."""
-        size, left = self.config.minibatch, steps
-        while left > 0:
-            order = torch.arange(samples) if size is None else torch.from_numpy(rng.permutation(samples))
-            parts = order.split(size or samples)[:left]
-            left -= len(parts)
-            yield from parts
 
     def _bound_std(self) -> None:
         low, high = self.config.std_range
@@ -671,6 +664,15 @@ class PPO:
                     value.copy_(checkpoint.tensors[name])
 
 
+@dataclass(frozen=True)
+class _Effort:
+    """How much an iteration learns: gradient steps, samples per step (None: all), epochs of the value network."""
+
+    steps: int
+    minibatch: int | None
+    value_epochs: int
+
+
 @dataclass
 class _Outcome:
     """What one iteration, real or imagined, has done."""
@@ -696,6 +698,16 @@ class _Improvement:
     solver_failures: int = 0
     solve_seconds: float = 0.0
     gradient_seconds: float = 0.0
+
+
+def _batches(samples: int, effort: _Effort, rng: np.random.Generator) -> Iterator[Tensor]:
+    """The samples of each gradient step."""
+    size, left = effort.minibatch, effort.steps
+    while left > 0:
+        order = torch.arange(samples) if size is None else torch.from_numpy(rng.permutation(samples))
+        parts = order.split(size or samples)[:left]
+        left -= len(parts)
+        yield from parts
 
 
 def network_tensors(checkpoint: Checkpoint) -> dict[str, Tensor]:
