@@ -181,7 +181,10 @@ def test_restore_refuses_what_does_not_fit():
     assert not len(other)
 
 
-@pytest.mark.parametrize("change", [{"iterations": -1}, {"rollouts": 0}, {"networks": 0}, {"learning_rate": 0.0}])
+@pytest.mark.parametrize(
+    "change",
+    [{"iterations": -1}, {"rollouts": 0}, {"networks": 0}, {"learning_rate": 0.0}, {"steps_minibatch": 0}],
+)
 def test_bad_settings_are_refused(change):
     with pytest.raises(InvalidInputError, match=next(iter(change))):
         replace(SMALL, **change)

@@ -579,6 +579,20 @@ def test_imagination_learns_from_less_data():
     assert imagining > alone + 0.15
 
 
+def test_imagined_iterations_have_an_effort_of_their_own(monkeypatch):
+    trainer = make_imagining(iterations=1, rollouts=6, steps=4, steps_minibatch=STEPS * 3, value_epochs=2)
+    trainer.step()
+    batches, epochs = [], []
+    trainer.actor.gaussian.register_forward_hook(lambda _, inputs, __: batches.append(len(inputs[0])))
+    fit = trainer.critic._fit
+    monkeypatch.setattr(trainer.critic, "_fit", lambda x, y, count, key: (epochs.append(count), fit(x, y, count, key)))
+    trainer.step()
+    imagined = [6] * STEPS + [STEPS * 3] * 4  # episodes in lockstep, then gradient steps
+    real = [ROLLOUTS] * STEPS + [ROLLOUTS * STEPS] * 4
+    assert batches == imagined + real
+    assert epochs == [2, trainer.config.value_epochs]
+
+
 def test_the_first_iteration_does_not_depend_on_imagination():
     alone, imagining = make_ppo(), make_imagining()
     for trainer in (alone, imagining):
