@@ -24,7 +24,7 @@ def main() -> None:
     fig, axes = plt.subplots(
         2,
         1,
-        figsize=(7.5, 8.5),
+        figsize=(7.5, 9.5),
         sharex=True,
         gridspec_kw={"height_ratios": [6, sum(phase == "main" for phase, _ in found)]},
         layout="constrained",
