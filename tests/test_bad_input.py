@@ -19,6 +19,7 @@ from difflcs import (
     violation_loss,
 )
 from difflcs import errors as e
+from difflcs._checks import check_tensor
 from difflcs.mpc import MPCProblem, Primal
 from difflcs.mpc.backends import IpoptBackend
 
@@ -439,6 +440,12 @@ def test_problem_refuses(build, change, error, match):
     }  # fmt: skip
     MPCProblem(**fields)
     refuse(error, match, lambda: MPCProblem(**{**fields, **change}))
+
+
+def test_infinities_that_cancel_are_refused_and_finite_numbers_that_overflow_are_not():
+    largest = torch.full((3,), torch.finfo(torch.float64).max, dtype=torch.float64)
+    assert check_tensor("x", largest) is largest
+    refuse(e.NonFiniteError, "x: expected finite numbers, got 2", check_tensor, "x", torch.tensor([INF, -INF, 0.0]))
 
 
 # --- the error tree -------------------------------------------------------------------------------------------------
