@@ -39,29 +39,6 @@ inline void lu_solve(N n, const Matrix& M, Vector& b) {
   }
 }
 
-// Solves M x = b once: b is eliminated along with M, both are overwritten.
-template <class N, class Matrix, class Vector>
-inline void lu_eliminate(N n, Matrix& M, Vector& b) {
-  DIFFLCS_UNROLL
-  for (int64_t k = 0; k < n; k++) {
-    const Vec inverse = 1.0 / M[k * n + k];
-    M[k * n + k] = inverse;
-    DIFFLCS_UNROLL
-    for (int64_t i = k + 1; i < n; i++) {
-      const Vec l = M[i * n + k] * inverse;
-      DIFFLCS_UNROLL
-      for (int64_t j = k + 1; j < n; j++) M[i * n + j] -= l * M[k * n + j];
-      b[i] -= l * b[k];
-    }
-  }
-  DIFFLCS_UNROLL
-  for (int64_t j = n - 1; j >= 0; j--) {
-    b[j] *= M[j * n + j];
-    DIFFLCS_UNROLL
-    for (int64_t i = 0; i < j; i++) b[i] -= M[i * n + j] * b[j];
-  }
-}
-
 template <class N>
 inline void lu_solve_transposed(N n, const Vec* M, Vec* b) {
   for (int64_t i = 0; i < n; i++) {

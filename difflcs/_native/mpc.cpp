@@ -225,7 +225,8 @@ struct Mpc {
         jacobian[i * nl + i] += 1.0 - ratio;
         step[i] = root[i] - at[i] - w[i];
       }
-      lu_eliminate(nl, jacobian, step);
+      lu_factor(nl, jacobian);
+      lu_solve(nl, jacobian, step);
       Vec length = all(1), merit_next = merit;
       for (int search = 0; search < 8; search++) {
         DIFFLCS_UNROLL
@@ -307,21 +308,18 @@ struct Mpc {
         av[i] = sk[i] * size[i], bv[i] = lk[i] * size[i];
       }
       Local<S::kL * S::kL> left(M), right(Mc);
-      DIFFLCS_UNROLL
-      for (int64_t i = 0; i < nl; i++) {
+      auto factor = [&](auto& matrix, bool by_row) {  // diag(a) + diag(b) F, or diag(a) + F diag(b)
         DIFFLCS_UNROLL
-        for (int64_t j = 0; j < nl; j++) left[i * nl + j] = bv[i] * F[i * nl + j];
-        left[i * nl + i] += av[i];
-      }
-      lu_factor(nl, left);
+        for (int64_t i = 0; i < nl; i++) {
+          DIFFLCS_UNROLL
+          for (int64_t j = 0; j < nl; j++) matrix[i * nl + j] = bv[by_row ? i : j] * F[i * nl + j];
+          matrix[i * nl + i] += av[i];
+        }
+        lu_factor(nl, matrix);
+      };
+      factor(left, true);
       for (int64_t i = 0; i < nl * nl; i++) M[i] = left[i];
-      DIFFLCS_UNROLL
-      for (int64_t i = 0; i < nl; i++) {
-        DIFFLCS_UNROLL
-        for (int64_t j = 0; j < nl; j++) right[i * nl + j] = bv[j] * F[i * nl + j];
-        right[i * nl + i] += av[i];
-      }
-      lu_factor(nl, right);
+      factor(right, false);
       for (int64_t j = 0; j < nw; j++) {
         Local<S::kL> t(dl);
         DIFFLCS_UNROLL
