@@ -24,7 +24,7 @@ def main() -> None:
     fig, axes = plt.subplots(
         2,
         1,
-        figsize=(7.5, 9.5),
+        figsize=(8.5, 9.5),
         sharex=True,
         gridspec_kw={"height_ratios": [6, sum(phase == "main" for phase, _ in found)]},
         layout="constrained",
@@ -42,7 +42,7 @@ def main() -> None:
         ax.set_yticks(range(len(changes)), changes, fontsize=8)
         ax.set_title(title, fontsize=10)
         ax.grid(axis="x", alpha=0.3)
-    axes[1].set_xlabel("success of 1000 goals, one training each; the bar is the mean")
+    axes[1].set_xlabel("success of 1000 goals, one training each (bar: mean)")
     seeds = [plt.Line2D([], [], marker="o", linestyle="", color=f"C{s - 1}", label=f"seed {s}") for s in range(1, 5)]
     axes[1].legend(handles=seeds, fontsize=8, loc="upper left")
     fig.savefig(HERE / "lab_notebook.png", dpi=110)
