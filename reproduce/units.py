@@ -191,7 +191,9 @@ def config_of(unit: Unit, preset: Preset) -> TrainConfig:
     if unit.recipe == "paper":
         config = replace(
             config,
+            warmup_minutes=6.0,
             warmup=replace(config.warmup, noise=0.0),
+            ppo=replace(config.ppo, natural=False, steps=20, minibatch=None),
             imagination=replace(config.imagination, iterations=0),
         )
     config = config.smoke() if preset.smoke else config

@@ -276,7 +276,7 @@ def test_a_limit_that_no_sample_reaches_changes_nothing():
 @pytest.mark.parametrize(("size", "sizes"), [(None, [72, 72, 72]), (30, [30, 30, 12]), (100, [72, 72, 72])])
 def test_minibatches(size, sizes):
     """Every sample once before any is drawn again, each from its own last plan."""
-    trainer = make_ppo(steps=3, minibatch=size, max_kl=100.0)
+    trainer = make_ppo(steps=3, minibatch=size, max_kl=100.0, natural=False)
     data, rollouts = prepared(trainer)
     seen = []
     trainer.actor.gaussian.register_forward_hook(lambda _, inputs, __: seen.append(inputs[0].clone()))
@@ -312,7 +312,7 @@ def test_steps_are_annealed():
     rates = []
     while not trainer.done:
         trainer.step()
-        rates.append(trainer._adam.param_groups[0]["lr"] / trainer.config.learning_rate)
+        rates.append(trainer._optimiser.param_groups[0]["lr"] / trainer.config.natural_step)
     assert rates == pytest.approx([1.0, 0.7, 0.4])
 
 
@@ -320,7 +320,8 @@ def test_combined_loss():
     """Eq. total_loss: β = 0 is the violation loss alone, which learns the true gain; β = 1 ignores it."""
     gains = {}
     for beta in (0.0, 0.5):
-        trainer = make_ppo(iterations=2, steps=50, learning_rate=0.02, beta=beta, max_kl=100.0, std=0.1)
+        settings = {"steps": 50, "minibatch": None, "natural": False, "learning_rate": 0.02, "max_kl": 100.0}
+        trainer = make_ppo(iterations=2, beta=beta, std=0.1, **settings)
         while not trainer.done:
             trainer.step()
         gains[beta] = abs(float(trainer.lcs.B.detach()) - 0.5)
@@ -587,8 +588,8 @@ def test_imagined_iterations_have_an_effort_of_their_own(monkeypatch):
     fit = trainer.critic._fit
     monkeypatch.setattr(trainer.critic, "_fit", lambda x, y, count, key: (epochs.append(count), fit(x, y, count, key)))
     trainer.step()
-    imagined = [6] * STEPS + [STEPS * 3] * 4  # episodes in lockstep, then gradient steps
-    real = [ROLLOUTS] * STEPS + [ROLLOUTS * STEPS] * 4
+    imagined = [6] * STEPS + [6 * STEPS] + [STEPS * 3] * 4  # episodes in lockstep, the metric, gradient steps
+    real = [ROLLOUTS] * STEPS + [ROLLOUTS * STEPS] + [ROLLOUTS * STEPS] * 4
     assert batches == imagined + real
     assert epochs == [2, trainer.config.value_epochs]
 

@@ -35,11 +35,11 @@ class ImaginationConfig:
     """Iterations of PPO on imagined episodes between two on real ones; 0: none, as in the paper."""
     rollouts: int = 120
     """Imagined episodes per iteration."""
-    steps: int = 20
+    steps: int = 8
     """Gradient steps per imagined iteration."""
-    steps_minibatch: int | None = None
+    steps_minibatch: int | None = 600
     """Samples per gradient step, every sample once before any is drawn again; None: each step on all of them."""
-    value_epochs: int = 20
+    value_epochs: int = 7
     """Epochs of the value network at the end of an imagined iteration."""
     networks: int = 4
     """Networks in the ensemble; every imagined step is predicted by one of them, drawn at random."""
@@ -47,7 +47,7 @@ class ImaginationConfig:
     """Width of their two hidden layers."""
     first_epochs: int = 60
     """Passes over the data of the first training."""
-    epochs: int = 10
+    epochs: int = 3
     """Passes over all data before the imagined iterations."""
     minibatch: int = 256
     """Transitions per step."""

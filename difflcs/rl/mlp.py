@@ -22,8 +22,8 @@ _KIND = "MLP"
 class MLPConfig(PPOConfig):
     """Settings of PPO with a network: CleanRL's for continuous actions, where not marked as ours.
 
-    Every setting of the main phase is here; those that only an LCS has (beta below 1, the violation loss, sample_clip)
-    must stay at their defaults.
+    Every setting of the main phase is here; those that only an LCS has (beta below 1, the violation loss, sample_clip,
+    the natural gradient) must stay at their defaults.
     """
 
     width: int = 64
@@ -34,6 +34,8 @@ class MLPConfig(PPOConfig):
     """Gradient steps per iteration: ten passes over 60 episodes of 20 steps."""
     minibatch: int | None = 300
     """Samples per gradient step: four per pass."""
+    natural: bool = False
+    """Only for an LCS."""
     learning_rate: float = 3e-4
     """Adam's step size at the start."""
     betas: tuple[float, float] = (0.9, 0.999)

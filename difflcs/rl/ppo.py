@@ -33,6 +33,7 @@ from difflcs.losses import violation_loss
 from difflcs.rl.checkpoint import Checkpoint
 from difflcs.rl.critic import Critic, initialise_moments, moments, read_history, seeded
 from difflcs.rl.imagination import EPISODES, Imagination
+from difflcs.rl.natural import NaturalGradient
 from difflcs.rl.rollout import Rollouts, action_bounds, collect, episode_seeds
 from difflcs.rl.warmup import TRAINING_STREAM
 
@@ -59,10 +60,20 @@ class PPOConfig:
 
     rollouts: int = 60
     """Episodes per iteration, run in lockstep; the last ones share what is left of the data evenly."""
-    steps: int = 20
-    """Gradient steps per iteration."""
-    minibatch: int | None = None
+    steps: int = 8
+    """Gradient steps per iteration; Adam needs 20 or more."""
+    minibatch: int | None = 600
     """Samples per gradient step, every sample once before any is drawn again; None: each step on all of its data."""
+    natural: bool = True
+    """Natural gradient of the LCS; False: Adam, as in the training of networks."""
+    natural_step: float = 0.06
+    """Length of a natural step at the start: the root of twice the KL divergence that it makes."""
+    natural_momentum: float = 0.8
+    """Weight of the natural gradient so far against the newest one; kept across iterations."""
+    natural_damping: float = 0.1
+    """Isotropic part of the natural gradient's metric, in means of its diagonal."""
+    natural_samples: int = 600
+    """Samples per iteration that its metric is measured with."""
     learning_rate: float = 6e-4
     """Adam's step size at the start."""
     betas: tuple[float, float] = (0.9, 0.99)
@@ -130,7 +141,7 @@ class PPOConfig:
     """Newest iterations whose episodes the value network is fitted to."""
 
     def __post_init__(self) -> None:
-        for name in ("rollouts", "steps", "violation_batch", "value_width", "value_minibatch"):
+        for name in ("rollouts", "steps", "natural_samples", "violation_batch", "value_width", "value_minibatch"):
             check_positive_int(name, getattr(self, name))
         for name in ("value_first_epochs", "value_epochs", "value_iterations"):
             check_positive_int(name, getattr(self, name))
@@ -139,6 +150,7 @@ class PPOConfig:
         if self.sample_clip is not None:
             check_number("sample_clip", self.sample_clip, strict=True)
         positive = ("learning_rate", "target_kl", "max_kl", "final_step", "jump_kl", "clip", "std", "std_learning_rate")
+        positive += ("natural_step", "natural_damping")
         for name in (*positive, "cost_limit", "reward_scale", "value_learning_rate", "violation_gamma", "violation_xi"):
             check_number(name, getattr(self, name), strict=True)
         for name in ("failure_penalty", "value_weight_decay"):
@@ -147,6 +159,10 @@ class PPOConfig:
         for name in ("kl_quantile", "gamma", "zeta", "beta"):
             if not 0 <= check_number(name, getattr(self, name)) <= 1:
                 raise InvalidInputError(f"{name}: expected 0 <= {name} <= 1, got {getattr(self, name)}")
+        if not 0 <= check_number("natural_momentum", self.natural_momentum) < 1:
+            raise InvalidInputError(
+                f"natural_momentum: expected 0 <= natural_momentum < 1, got {self.natural_momentum}; 0 turns it off"
+            )
         if self.kl_quantile == 0:
             raise InvalidInputError("kl_quantile: expected above 0, got 0; 1 keeps every sample")
         if self.final_std is not None:
@@ -163,10 +179,10 @@ class PPOConfig:
 
 def check_without_lcs(config: PPOConfig) -> None:
     """Refuse settings that only a policy with an LCS can follow."""
-    if config.beta < 1 or config.sample_clip is not None:
+    if config.beta < 1 or config.sample_clip is not None or config.natural:
         raise InvalidInputError(
-            f"config: expected beta=1 and sample_clip=None without an LCS, got beta={config.beta:g} and "
-            f"sample_clip={config.sample_clip}; drop them"
+            f"config: expected beta=1, sample_clip=None and natural=False without an LCS, got beta={config.beta:g}, "
+            f"sample_clip={config.sample_clip} and natural={config.natural}; drop them"
         )
 
 
@@ -180,7 +196,7 @@ class PPOIteration:
         success: share of its episodes that ended at the goal, under the policy's noise.
         mean_return: mean undiscounted return of its episodes.
         kl: KL divergence before the last step.
-        learning_rate: Adam's step size in it.
+        learning_rate: step size in it: the length of a natural step, or Adam's.
         std: mean standard deviation [m] of the policy that collected.
         gradient_steps: gradient steps made.
         skipped_steps: steps left out because a gradient was not finite.
@@ -290,12 +306,23 @@ class PPO:
         count = math.ceil(remaining / config.rollouts)
         self._sizes = [remaining // count + (k < remaining % count) for k in range(count)]
 
-        self.learning_rate = config.learning_rate
-        model, deviation = learned.parameters(), (gaussian.log_std, gaussian.mixing)
-        groups = [{"params": [p for p in part if p.requires_grad]} for part in (model, deviation)]
-        self._parameters = [p for group in groups for p in group["params"]]
-        self._adam = torch.optim.Adam([g for g in groups if g["params"]], config.learning_rate, config.betas)
-        initialise_moments(self._adam)
+        model, deviation = (
+            [p for p in part if p.requires_grad] for part in (learned.parameters(), (gaussian.log_std, gaussian.mixing))
+        )
+        self._parameters = [*model, *deviation]
+        self.learning_rate = config.natural_step if config.natural else config.learning_rate
+        self._optimiser: NaturalGradient | torch.optim.Adam
+        if config.natural:
+            self._optimiser = NaturalGradient(
+                model, config.natural_step, config.natural_momentum, config.natural_damping
+            )
+        else:
+            self._optimiser = torch.optim.Adam(model, config.learning_rate, config.betas)
+            initialise_moments(self._optimiser)
+        self._std_adam: torch.optim.Adam | None = None
+        if deviation:
+            self._std_adam = torch.optim.Adam(deviation, config.std_learning_rate, config.betas)
+            initialise_moments(self._std_adam)
 
         low, high = (torch.from_numpy(bound) for bound in action_bounds(env))
         self.bounds = (low, high)
@@ -489,9 +516,16 @@ class PPO:
         if "plan" in data.keys():
             data["guess"] = data["plan"].clone()  # the rollout's own optimum, then each step's
         rng = np.random.default_rng(self._key(_LOSS_STREAM))
-        rates = [self.learning_rate, config.std_learning_rate]
-        for group, rate in zip(self._adam.param_groups, rates[: len(self._adam.param_groups)], strict=True):
-            group["lr"] = scale * rate
+        optimisers: list[torch.optim.Optimizer] = [self._optimiser]
+        self._optimiser.param_groups[0]["lr"] = scale * self.learning_rate
+        if self._std_adam is not None:
+            optimisers.append(self._std_adam)
+            self._std_adam.param_groups[0]["lr"] = scale * config.std_learning_rate
+        if isinstance(self._optimiser, NaturalGradient):
+            start = time.perf_counter()
+            chosen = torch.from_numpy(rng.permutation(len(data))[: config.natural_samples])
+            self._optimiser.measure(self._jacobian(cast("TensorDict", data[chosen])))
+            outcome.gradient_seconds += time.perf_counter() - start
         for chosen in _batches(len(data), effort, rng):
             start = time.perf_counter()
             old = cast("TensorDict", data[chosen])
@@ -522,12 +556,14 @@ class PPO:
             loss = config.beta * result["loss_objective"]
             if config.beta < 1:
                 loss = loss + (1 - config.beta) * self._violation(rollouts, rng)
-            self._adam.zero_grad()
+            for optimiser in optimisers:
+                optimiser.zero_grad()
             loss.backward()
             if copies is not None:
                 self._add_clipped(copies)
             if all(p.grad is None or bool(torch.isfinite(p.grad).all()) for p in self._parameters):
-                self._adam.step()
+                for optimiser in optimisers:
+                    optimiser.step()
                 self._bound_std()
                 outcome.steps += 1
             else:
@@ -567,6 +603,19 @@ class PPO:
         copies = {name: p.detach().expand(samples, *p.shape).clone() for name, p in parameters.items()}
         return {f"{_LCS}{name}": copy.requires_grad_() for name, copy in copies.items()}
 
+    def _jacobian(self, data: TensorDict) -> Tensor:
+        """(N, n_u, P) Jacobians of the mean at the samples' own plans, in standard deviations: Σ = L Lᵀ, L⁻¹ ∂u/∂θ."""
+        copies = self._copies(len(data))
+        batch = data.select(*self.actor.in_keys, "guess")
+        with _quiet():
+            functional_call(self.actor.gaussian, copies, (batch,))
+        mean = torch.linalg.solve_triangular(batch["scale_tril"].detach(), batch["loc"].unsqueeze(-1), upper=False)
+        leaves, rows = list(copies.values()), []
+        for component in mean.squeeze(-1).unbind(-1):
+            found = torch.autograd.grad(component.sum(), leaves, retain_graph=True, materialize_grads=True)
+            rows.append(torch.cat([part.flatten(1) for part in found], 1))
+        return torch.stack(rows, 1)
+
     def _add_clipped(self, copies: dict[str, Tensor]) -> None:
         """Add the samples' gradients to the model's, long ones scaled down.
 
@@ -600,10 +649,16 @@ class PPO:
             "u_max": self.bounds[1],
             "policy.log_std": gaussian.log_std.detach(),
             "policy.mixing": gaussian.mixing.detach(),
-            **moments("policy_adam", self._adam),
+            **self._optimiser_tensors(),
             **_prefixed(_VALUE, self.critic.tensors()),
             **({} if self.imagination is None else _prefixed(_IMAGINATION, self.imagination.tensors())),
         }
+
+    def _optimiser_tensors(self) -> dict[str, Tensor]:
+        own, std = self._optimiser, self._std_adam
+        natural = isinstance(own, NaturalGradient)
+        tensors = _prefixed("policy_natural.", own.tensors()) if natural else moments("policy_adam", own)
+        return {**tensors, **({} if std is None else moments("std_adam", std))}
 
     def checkpoint(self) -> Checkpoint:
         """Everything needed to go on with the same result."""

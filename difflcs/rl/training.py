@@ -67,7 +67,7 @@ class TrainConfig:
     """Data to collect [min of simulated time]; one minute is 600 steps of 0.1 s."""
     seed: int = 0
     """Seed of everything random in the training."""
-    warmup_minutes: float = 6.0
+    warmup_minutes: float = 3.0
     """Method lcs-rl: data of the warm-up [min], the rest of `minutes` is the main phase's (6 in the paper)."""
     n_lam: int = 8
     """Contacts, that is complementarity variables, of the model; ignored with --init. Models of 5 and of 8 are equally

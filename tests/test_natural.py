@@ -1,0 +1,135 @@
+"""The natural gradient: its steps, its metric, and what it does to a policy with an MPC."""
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+pytest.importorskip("torchrl")
+from difflcs.rl.natural import NaturalGradient
+from tests.test_ppo import improve, make_ppo, prepared
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def make(momentum: float = 0.0, damping: float = 0.0, lr: float = 0.3) -> tuple[list[nn.Parameter], NaturalGradient]:
+    parameters = [nn.Parameter(torch.zeros(2, dtype=torch.float64)), nn.Parameter(torch.zeros(1, 1).double())]
+    return parameters, NaturalGradient(parameters, lr, momentum, damping)
+
+
+def flat(parameters) -> torch.Tensor:
+    return torch.cat([p.detach().flatten() for p in parameters])
+
+
+def backward(parameters, gradient) -> None:
+    for p, g in zip(parameters, torch.tensor(gradient, dtype=torch.float64).split([2, 1]), strict=True):
+        p.grad = g.view_as(p).clone()
+
+
+JACOBIAN = torch.tensor([[[1.0, 2.0, 0.0], [0.0, 1.0, 1.0]], [[3.0, 0.0, 1.0], [1.0, 1.0, 1.0]]], dtype=torch.float64)
+"""Two samples of two actions, by three parameters."""
+
+
+def test_a_step_is_the_natural_gradient_of_the_given_length():
+    parameters, optimiser = make(damping=0.2)
+    optimiser.measure(JACOBIAN)
+    metric = torch.einsum("nip,niq->pq", JACOBIAN, JACOBIAN) / 2
+    torch.testing.assert_close(optimiser.metric, metric)
+    gradient = [1.0, -2.0, 0.5]
+    backward(parameters, gradient)
+    optimiser.step()
+    damped = metric + 0.2 * metric.diagonal().mean() * torch.eye(3)
+    expected = -torch.linalg.solve(damped, torch.tensor(gradient, dtype=torch.float64))
+    step = flat(parameters)
+    torch.testing.assert_close(step / step.norm(), expected / expected.norm())
+    assert float(step @ metric @ step) == pytest.approx(0.3**2)
+
+
+def test_it_does_not_depend_on_the_parametrisation():
+    """Without damping, scaled parameters take the same step in what the policy does."""
+    scale = torch.tensor([5.0, 0.1, 3.0], dtype=torch.float64)
+    moved = []
+    for factor in (torch.ones(3, dtype=torch.float64), scale):
+        parameters, optimiser = make()
+        optimiser.measure(JACOBIAN * factor)
+        backward(parameters, (torch.tensor([1.0, -2.0, 0.5]) * factor).tolist())
+        optimiser.step()
+        moved.append(flat(parameters) * factor)
+    torch.testing.assert_close(moved[0], moved[1])
+
+
+def test_gradients_and_metrics_are_averaged():
+    parameters, optimiser = make(momentum=0.8)
+    for gradient in ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]):
+        backward(parameters, gradient)
+        optimiser.step()
+    torch.testing.assert_close(optimiser.average, torch.tensor([0.16, 0.2, 0.0], dtype=torch.float64))
+    optimiser.measure(JACOBIAN)
+    first = optimiser.metric.clone()
+    optimiser.measure(2 * JACOBIAN)
+    torch.testing.assert_close(optimiser.metric, (first + 4 * first) / 2)
+
+
+@pytest.mark.parametrize("jacobian", [torch.zeros(2, 2, 3), torch.full((2, 2, 3), torch.nan), torch.zeros(0, 2, 3)])
+def test_no_step_without_a_metric(jacobian):
+    parameters, optimiser = make()
+    backward(parameters, [1.0, 1.0, 1.0])
+    optimiser.step()
+    optimiser.measure(jacobian.double())
+    optimiser.step()
+    assert not flat(parameters).any()
+    optimiser.measure(JACOBIAN)
+    optimiser.average.zero_()
+    optimiser.zero_grad()
+    optimiser.step()
+    assert not flat(parameters).any()
+
+
+def test_samples_near_a_jump_do_not_make_the_metric():
+    one = torch.cat([JACOBIAN] * 5)
+    plain, odd = make()[1], make()[1]
+    plain.measure(one)
+    odd.measure(torch.cat([one, 1e6 * JACOBIAN[:1]]))
+    assert float(odd.metric.norm()) < 3 * float(plain.metric.norm())
+
+
+def test_jacobian_of_the_mpc():
+    """Against central differences of the planned action, in standard deviations."""
+    trainer = make_ppo()
+    data, _ = prepared(trainer)
+    data = data[:6]
+    data["guess"] = data["plan"].clone()
+    found = trainer._jacobian(data)
+    learned = [p for p in trainer.lcs.parameters() if p.requires_grad]
+    columns = []
+    for p in learned:
+        for i in range(p.numel()):
+            ends = []
+            for step in (1e-5, -1e-5):
+                with torch.no_grad():
+                    p.view(-1)[i] += step
+                    ends.append(trainer.policy(data["state"], data["goal"]).action)
+                    p.view(-1)[i] -= step
+            columns.append((ends[0] - ends[1]) / 2e-5 / trainer.config.std)
+    assert bool(found.any())
+    torch.testing.assert_close(found, torch.stack(columns, -1), rtol=1e-4, atol=1e-4)
+
+
+def test_the_metric_is_the_fisher_matrix():
+    """The mean outer product of the scores of many sampled actions."""
+    trainer = make_ppo()
+    data, _ = prepared(trainer)
+    data["guess"] = data["plan"].clone()
+    jacobian = trainer._jacobian(data)
+    trainer._optimiser.measure(jacobian)
+    noise = torch.from_numpy(np.random.default_rng(0).normal(size=(4000, *jacobian.shape[:2])))
+    scores = torch.einsum("kni,nip->knp", noise, jacobian).flatten(0, 1)
+    sampled = scores.mT @ scores / len(scores)
+    torch.testing.assert_close(trainer._optimiser.metric, sampled, rtol=0.05, atol=0.02 * float(sampled.abs().max()))
+
+
+def test_the_length_of_a_step_is_its_kl_divergence():
+    trainer = make_ppo(steps=2, natural_step=0.01, minibatch=None, jump_kl=10.0, kl_quantile=1.0)
+    data, rollouts = prepared(trainer)
+    outcome = improve(trainer, data, rollouts)  # its KL is that of the first step
+    assert outcome.kl == pytest.approx(0.5 * 0.01**2, rel=0.1)
