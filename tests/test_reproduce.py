@@ -77,7 +77,9 @@ def test_config_is_the_default_recipe_but_for_what_the_unit_says():
     assert (config.task, config.method, config.seed, config.minutes) == ("mug", "violation", 3, 30.0)
     assert config.warmup == replace(default.warmup, noise=0.0)
     assert config.imagination == replace(default.imagination, iterations=0)
-    assert config.ppo == default.ppo
+    assert config.ppo == replace(default.ppo, natural=False, steps=20, minibatch=None)
+    assert config.warmup_minutes == 6.0
+    assert units.config_of(CUBE, units.PRESETS["paper"]).ppo == default.ppo
     assert config.evaluate_goals == config.final_goals == 1000
     assert config.evaluation_seed == default.evaluation_seed  # the same goals for every unit
 
