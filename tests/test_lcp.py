@@ -317,7 +317,7 @@ def test_double_backward_is_refused():
 
 @pytest.mark.parametrize("relaxation", [0.0, 1e-5])
 @pytest.mark.parametrize("shared", [True, False], ids=["shared", "per-element"])
-@pytest.mark.parametrize("n", [1, 5, 9])
+@pytest.mark.parametrize("n", [1, 5, 9, 10, 16])
 def test_batch_equals_loop_bitwise(build, relaxation, shared, n):
     F = definite(n, 0, 0.5) if shared else torch.stack([definite(n, s, 0.5) for s in range(37)])
     q = build.normal(n)(37, n)

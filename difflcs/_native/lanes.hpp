@@ -39,6 +39,14 @@ static inline bool any(Mask m) {
   return r != 0;
 }
 
+// One lane of a number; a double is the same in every lane.
+static inline double lane_of(double a, int) { return a; }
+static inline double lane_of(const Vec& a, int lane) { return a[lane]; }
+static inline void put(double* to, int64_t at, int, double value) { to[at] = value; }
+static inline void put(Vec* to, int64_t at, int lane, double value) {
+  reinterpret_cast<double*>(to + at)[lane] = value;
+}
+
 // Unrolls the loop behind it. Where all loops over an array are unrolled, its elements live in registers.
 #if defined(__clang__)
 #define DIFFLCS_UNROLL _Pragma("unroll")

@@ -94,9 +94,6 @@ struct Mpc {
   }
 
   // ---- loading ----
-  static void put(double* to, int64_t at, int, double value) { to[at] = value; }
-  static void put(Vec* to, int64_t at, int lane, double value) { reinterpret_cast<double*>(to + at)[lane] = value; }
-
   const double* input(Input which, int64_t element) const { return batch.input[which] + element * batch.stride[which]; }
 
   void load_matrices(int64_t e, int lane) {
@@ -146,8 +143,6 @@ struct Mpc {
     const int64_t nl = n.l();
     for (int64_t i = 0; i < n.h * nl; i++) to[i] = lam[i][lane] * lane_of(scale[i % nl], lane);
   }
-  static double lane_of(double a, int) { return a; }
-  static double lane_of(const Vec& a, int l) { return a[l]; }
 
   static void load_lane(Vec* to, const double* from, int64_t size, int lane) {
     for (int64_t i = 0; i < size; i++) put(to, i, lane, from[i]);
