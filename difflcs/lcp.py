@@ -15,7 +15,7 @@ from difflcs.status import Status
 
 # Block principal pivoting needs 3–10 iterations; the limit only bounds pathological inputs. The relaxed solve follows
 # its path in about 5 + 2·log10(1/relaxation) iterations.
-_MAX_ITER = {"exact": 80, "relaxed": 200}
+MAX_ITER = {"exact": 80, "relaxed": 200}
 
 
 class LCPSolution(NamedTuple):
@@ -87,7 +87,7 @@ def solve_lcp_arrays(
     F, q = np.ascontiguousarray(F), np.ascontiguousarray(q)
     lam, w = np.empty_like(q), np.empty_like(q)
     status, iterations = np.empty(len(q), np.int8), np.empty(len(q), np.int32)
-    limit = _MAX_ITER["relaxed" if relaxation > 0 else "exact"]
+    limit = MAX_ITER["relaxed" if relaxation > 0 else "exact"]
     _kernels.solve_lcp(F, q, relaxation, limit, torch.get_num_threads(), lam, w, status, iterations)
     failed = status != Status.CONVERGED
     if failed.any():

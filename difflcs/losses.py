@@ -8,7 +8,7 @@ from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_choice, check_number, check_tensor
 from difflcs.errors import DoubleBackwardError, GammaError, NotPositiveDefiniteError, SolveError
-from difflcs.lcp import solve_lcp_arrays
+from difflcs.lcp import MAX_ITER, solve_lcp_arrays
 from difflcs.lcs import LCSModel
 from difflcs.status import Status
 
@@ -56,16 +56,17 @@ def violation_loss(
     """
     check_choice("reduction", reduction, ("mean", "none"))
     check_number("xi", xi, strict=True)
-    lcs.check_inputs(x=x, u=u, x_next=x_next)
-    F = lcs.F
-    for name in "ABCdDEc":
-        check_tensor(name, getattr(lcs, name))
-    check_tensor("F", F)
-    _check_gamma(F, gamma, check_gamma)
-    batch = broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1]), ("x_next", x_next.shape[:-1])])
-    x, u, x_next = (v.expand(*batch, v.shape[-1]).reshape(-1, v.shape[-1]) for v in (x, u, x_next))
-    loss = _ViolationLoss.apply(lcs.A, lcs.B, lcs.C, lcs.d, lcs.D, lcs.E, F, lcs.c, x, u, x_next, gamma, xi)
-    return _reduce(loss, batch, reduction)  # pyright: ignore[reportArgumentType]
+    check_number("gamma", gamma)
+    F, factors = _contact_matrix(lcs)
+    system = (lcs.A, lcs.B, lcs.C, lcs.d, lcs.D, lcs.E, F, lcs.c)
+    batch = x.shape[:-1] if _plain(lcs, system, (x, u, x_next)) else None
+    if batch is None:
+        _check_numbers(lcs, system, (x, u, x_next))
+        batch = broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1]), ("x_next", x_next.shape[:-1])])
+        x, u, x_next = (v.expand(*batch, v.shape[-1]).reshape(-1, v.shape[-1]) for v in (x, u, x_next))
+    mean = reduction == "mean"
+    loss = _ViolationLoss.apply(lcs, check_gamma, mean, gamma, xi, *system, x, u, x_next, *factors)
+    return loss if mean else loss.reshape(batch)  # pyright: ignore[reportReturnType, reportAttributeAccessIssue]
 
 
 def prediction_loss(lcs: LCSModel, x: Tensor, u: Tensor, x_next: Tensor, *, reduction: str = "mean") -> Tensor:
@@ -95,8 +96,32 @@ def _reduce(loss: Tensor, batch: torch.Size, reduction: str) -> Tensor:
     return loss.sum() / max(loss.numel(), 1) if reduction == "mean" else loss.reshape(batch)
 
 
+def _contact_matrix(lcs: LCSModel) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """F, and G and H if it is their function as in `LCSModel`: the loss then passes its gradient to them itself.
+
+    Autograd would take 40 µs for the five small steps, of 190 µs for the loss of 100 transitions and its gradient.
+    """
+    if getattr(type(lcs), "F", None) is not LCSModel.F:
+        return lcs.F, ()
+    with torch.no_grad():
+        return lcs.F, (lcs.G, lcs.H)
+
+
+def _plain(lcs: LCSModel, system: tuple[Tensor, ...], data: tuple[Tensor, ...]) -> bool:
+    """Whether these are float64 matrices on the CPU that fit each other: then the kernel can look at the numbers."""
+    if not all(isinstance(v, Tensor) and v.dtype is torch.float64 and v.is_cpu for v in (*system, *data)):
+        return False
+    count = data[0].shape[0] if data[0].ndim else 0
+    return all(v.shape == (count, n) for v, n in zip(data, (lcs.n_x, lcs.n_u, lcs.n_x), strict=True))
+
+
+def _check_numbers(lcs: LCSModel, system: tuple[Tensor, ...], data: tuple[Tensor, ...]) -> None:
+    lcs.check_inputs(**dict(zip(("x", "u", "x_next"), data, strict=True)))
+    for name, value in zip("ABCdDEFc", system, strict=True):
+        check_tensor(name, value)
+
+
 def _check_gamma(F: Tensor, gamma: float, refuse_large: bool) -> None:
-    check_number("gamma", gamma)
     symmetric = (F + F.mT).detach().cpu().double().numpy()
     smallest = float(np.linalg.eigvalsh(symmetric)[0])
     if smallest <= 0:
@@ -112,18 +137,38 @@ def _check_gamma(F: Tensor, gamma: float, refuse_large: bool) -> None:
 
 
 class _ViolationLoss(torch.autograd.Function):
+    """The loss of A, B, C, d, D, E, F, c and x, u, x_next (B, ·), then G and H if F is their function.
+
+    The inner problem over z = (λ, φ) ≥ 0 is to minimise ½ zᵀQz + qᵀz, whose optimality is the LCP (Q, q):
+
+        Q = [[CᵀC + FᵀF/(γξ), (I − Fᵀ/γ)/ξ], [·, I/(γξ)]],  q = (Cᵀr + Fᵀe/(γξ), −e/(γξ)) with r and e at z = 0.
+
+    Eliminating φ leaves CᵀC + (F + Fᵀ − γI)/ξ, positive definite for γ < σ_min(F + Fᵀ).
+    """
+
     @staticmethod
-    def forward(ctx, A, B, C, d, D, E, F, c, x, u, x_next, gamma: float, xi: float):
-        with torch.no_grad():
-            free = x @ A.mT + u @ B.mT + d - x_next  # r at λ = 0
-            gap = x @ D.mT + u @ E.mT + c  # e at λ = φ = 0
-            lam, phi = _inner_qp(C, F, free, gap, gamma, xi)
-            r = free + lam @ C.mT
-            e = gap + lam @ F.mT - phi
-            loss = 0.5 * (r * r).sum(-1) + ((lam * phi).sum(-1) + (e * e).sum(-1) / (2 * gamma)) / xi
-        ctx.save_for_backward(A, B, D, E, x, u, lam, r, e)
-        ctx.weight = 1.0 / (gamma * xi)
-        return loss
+    def forward(ctx, lcs: LCSModel, refuse_large: bool, mean: bool, gamma: float, xi: float, *tensors: Tensor):
+        from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
+
+        A, B, _, _, D, E, F, c, x, u, x_next = tensors[:11]
+        arrays = [v.numpy(force=True) for v in tensors[:11]]
+        count, n = len(x), len(c)
+        Q, q, z = np.empty((2 * n, 2 * n)), np.empty((count, 2 * n)), np.empty((count, 2 * n))
+        r, e, loss = np.empty(x.shape), np.empty((count, n)), np.empty(count)
+        limit, threads = MAX_ITER["exact"], torch.get_num_threads()
+        if not _kernels.violation_loss(arrays, gamma, xi, limit, threads, Q, q, z, r, e, loss):
+            # A number that is not finite, a γ at or above its bound, or an empty batch.
+            _check_numbers(lcs, tensors[:8], (x, u, x_next))
+            _check_gamma(F, gamma, refuse_large)
+            z = _minimise_over_orthant(Q, q)
+            _kernels.violation_value(arrays, gamma, xi, z, r, e, loss)
+        ctx.mean, ctx.solution = mean, (arrays, gamma, xi, z, r, e)
+        # The arrays look into these tensors; autograd refuses them where they were changed in place.
+        x_needs, u_needs = ctx.needs_input_grad[13:15]
+        ctx.save_for_backward(x, u, *tensors[11:12], *((A, B, D, E) if x_needs or u_needs else ()))
+        value = torch.from_numpy(loss)
+        # The mean of an empty batch is zero, not NaN: no data, no loss, no gradient.
+        return (value.sum() / max(count, 1) if mean else value).to(x)
 
     @staticmethod
     def backward(ctx, *grads):
@@ -131,47 +176,23 @@ class _ViolationLoss(torch.autograd.Function):
             raise DoubleBackwardError(
                 "violation_loss has first derivatives only (envelope theorem); expected create_graph=False"
             )
-        A, B, D, E, x, u, lam, r, e = ctx.saved_tensors
-        # Envelope theorem: derivative of the objective with (λ, φ) fixed. r and e are linear in every input.
-        r = grads[0].unsqueeze(-1) * r
-        e = (ctx.weight * grads[0]).unsqueeze(-1) * e
-        need = ctx.needs_input_grad
-        return (
-            r.mT @ x,
-            r.mT @ u,
-            r.mT @ lam,
-            r.sum(0),
-            e.mT @ x,
-            e.mT @ u,
-            e.mT @ lam,
-            e.sum(0),
-            r @ A + e @ D if need[8] else None,
-            r @ B + e @ E if need[9] else None,
-            -r if need[10] else None,
-            None,
-            None,
-        )
+        from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 
-
-def _inner_qp(C: Tensor, F: Tensor, free: Tensor, gap: Tensor, gamma: float, xi: float) -> tuple[Tensor, Tensor]:
-    """Minimise over z = (λ, φ) ≥ 0 the violation objective: ½ zᵀ Q z + zᵀ q, whose optimality is the LCP (Q, q).
-
-    Q = [[CᵀC + FᵀF/(γξ), (I − Fᵀ/γ)/ξ], [·, I/(γξ)]],  q = (Cᵀ free + Fᵀ gap/(γξ), −gap/(γξ)).
-    Eliminating φ leaves CᵀC + (F + Fᵀ − γI)/ξ, positive definite for γ < σ_min(F + Fᵀ).
-    """
-    n = F.shape[0]
-    device, dtype = free.device, free.dtype
-    C_, F_, free_, gap_ = (v.cpu().double().numpy() for v in (C, F, free, gap))
-    Q, q = np.empty((2 * n, 2 * n)), np.empty((len(free_), 2 * n))
-    weight = 1.0 / (gamma * xi)
-    Q[:n, :n] = C_.T @ C_ + weight * (F_.T @ F_)
-    Q[:n, n:] = np.eye(n) / xi - weight * F_.T
-    Q[n:, :n] = Q[:n, n:].T
-    Q[n:, n:] = weight * np.eye(n)
-    q[:, :n] = free_ @ C_ + weight * (gap_ @ F_)
-    q[:, n:] = -weight * gap_
-    z = _minimise_over_orthant(Q, q)
-    return tuple(torch.from_numpy(np.ascontiguousarray(v)).to(device, dtype) for v in (z[:, :n], z[:, n:]))  # pyright: ignore[reportReturnType]
+        x, _, *rest = ctx.saved_tensors
+        arrays, gamma, xi, z, r, e = ctx.solution
+        upstream = grads[0].numpy(force=True)
+        if ctx.mean:
+            upstream = np.full(len(z), upstream / max(len(z), 1))
+        # Envelope theorem: derivative of the objective with z fixed. r and e are linear in every input.
+        system = [np.empty(v.shape) for v in arrays[:8]]
+        needs = zip(arrays[8:], ctx.needs_input_grad[13:16], strict=True)
+        data = [np.empty(v.shape) if need else None for v, need in needs]
+        _kernels.violation_gradient(arrays, gamma, xi, z, r, e, upstream, [*system, *data])
+        gradients = [*system, *data]
+        if len(ctx.needs_input_grad) > 16:  # F = G Gᵀ + stiffness·I + H − Hᵀ
+            F_bar, G = system[6], rest[0].numpy(force=True)
+            gradients += [(F_bar + F_bar.T) @ G, F_bar - F_bar.T]
+        return (None,) * 5 + tuple(g if g is None else torch.from_numpy(g).to(x) for g in gradients)
 
 
 def _minimise_over_orthant(Q: np.ndarray, q: np.ndarray, max_iter: int = 500) -> np.ndarray:

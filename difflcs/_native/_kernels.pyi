@@ -48,3 +48,35 @@ def vjp_mpc(
     threads: int,
     gradients: list[np.ndarray],
 ) -> None: ...
+def violation_loss(
+    inputs: list[np.ndarray],
+    gamma: float,
+    xi: float,
+    max_iter: int,
+    threads: int,
+    Q: np.ndarray,
+    q: np.ndarray,
+    z: np.ndarray,
+    r: np.ndarray,
+    e: np.ndarray,
+    loss: np.ndarray,
+) -> bool: ...
+def violation_value(
+    inputs: list[np.ndarray],
+    gamma: float,
+    xi: float,
+    z: np.ndarray,
+    r: np.ndarray,
+    e: np.ndarray,
+    loss: np.ndarray,
+) -> None: ...
+def violation_gradient(
+    inputs: list[np.ndarray],
+    gamma: float,
+    xi: float,
+    z: np.ndarray,
+    r: np.ndarray,
+    e: np.ndarray,
+    upstream: np.ndarray,
+    gradients: list[np.ndarray | None],
+) -> None: ...

@@ -60,6 +60,18 @@ struct MpcGradient {
   int64_t offset[kInputs];  // position of each shared input inside a partial sum
 };
 
+// Transitions and the system they are compared with, in the order of difflcs.losses. All arrays are row-major.
+enum ViolationInput { vA, vB, vC, vd, vD, vE, vF, vc, vx, vu, vx_next, kViolationInputs };
+
+// The violation loss of a batch: |r|^2 / 2 + (lam . phi + |e|^2 / (2 gamma)) / xi at the z = (lam, phi) >= 0 that
+// minimises it, with r = A x + B u + C lam + d - x_next and e = D x + E u + F lam + c - phi.
+struct ViolationBatch {
+  int64_t count, n_x, n_u, n_lam;
+  const double* input[kViolationInputs];  // the system is shared by the batch; x, u, x_next are (count, ...)
+  double gamma, xi;
+  double *r, *e;  // (count, n_x), (count, n_lam): at z = 0 from violation_qp, at the minimiser from violation_value
+};
+
 struct Kernels {
   const char* isa;
   int lanes;                            // problems solved side by side
@@ -73,6 +85,16 @@ struct Kernels {
   // Gradients of elements [begin, end), which are block number `block`.
   void (*mpc_vjp)(const MpcBatch& batch, const MpcGradient& gradient, int64_t begin, int64_t end, int64_t block,
                   void* workspace);
+  int64_t (*violation_workspace)(const ViolationBatch& batch);
+  // r and e at z = 0, and the QP min z'Qz / 2 + q'z over z >= 0: Q (2 n_lam, 2 n_lam) shared by the batch and
+  // q (count, 2 n_lam). Returns whether they are finite, F + F^T - gamma I is positive definite and Q is so by a
+  // margin.
+  bool (*violation_qp)(const ViolationBatch& batch, double* Q, double* q, void* workspace);
+  // r, e and loss (count,) at z (count, 2 n_lam), from r and e at z = 0.
+  void (*violation_value)(const ViolationBatch& batch, const double* z, double* loss, void* workspace);
+  // Gradients of sum(upstream * loss) with z held; those of x, u and x_next only where they are not null.
+  void (*violation_gradient)(const ViolationBatch& batch, const double* z, const double* upstream,
+                             double* const gradient[kViolationInputs], void* workspace);
 };
 
 // The best kernels this CPU runs, or those that the environment variable DIFFLCS_ISA names.

@@ -250,6 +250,85 @@ void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, 
   }
 }
 
+// ---- violation loss ----
+
+difflcs::ViolationBatch violation_batch(const Inputs& inputs, double gamma, double xi, Output<double>& r,
+                                        Output<double>& e) {
+  using namespace difflcs;
+  if (inputs.size() != kViolationInputs) throw std::invalid_argument("expected 11 inputs");
+  for (int i : {vA, vB, vF, vx})
+    if (inputs[i].ndim() != 2) throw std::invalid_argument("A, B, F and x must be matrices");
+  ViolationBatch b{};
+  b.count = inputs[vx].shape(0), b.n_x = inputs[vA].shape(0), b.n_u = inputs[vB].shape(1),
+  b.n_lam = inputs[vF].shape(0);
+  b.gamma = gamma, b.xi = xi, b.r = r.data(), b.e = e.data();
+  const int64_t x = b.n_x, u = b.n_u, m = b.n_lam;
+  const int64_t shape[kViolationInputs][2] = {{x, x}, {x, u}, {x, m},       {x, 0},       {m, x},      {m, u},
+                                              {m, m}, {m, 0}, {b.count, x}, {b.count, u}, {b.count, x}};
+  for (int i = 0; i < kViolationInputs; i++) {
+    const Array& a = inputs[i];
+    const size_t rank = shape[i][1] ? 2 : 1;
+    if (a.ndim() != rank || int64_t(a.shape(0)) != shape[i][0] || (rank == 2 && int64_t(a.shape(1)) != shape[i][1]))
+      throw std::invalid_argument("inputs have inconsistent shapes");
+    b.input[i] = a.data();
+  }
+  if (x < 1 || u < 1 || m < 1) throw std::invalid_argument("sizes must be positive");
+  check_size("r", r.size(), b.count * x), check_size("e", e.size(), b.count * m);
+  return b;
+}
+
+// The minimiser z and the values there. False where the inputs are not finite, the QP is not convex by a margin, there
+// are no transitions, or the solver failed: then r, e, Q and q are those at z = 0, and z and loss are not set.
+bool violation_loss(Inputs inputs, double gamma, double xi, int64_t max_iter, int threads, Output<double> Q,
+                    Output<double> q, Output<double> z, Output<double> r, Output<double> e, Output<double> loss) {
+  const difflcs::ViolationBatch b = violation_batch(inputs, gamma, xi, r, e);
+  const int64_t n = 2 * b.n_lam;
+  check_size("Q", Q.size(), n * n), check_size("q", q.size(), b.count * n), check_size("z", z.size(), b.count * n);
+  check_size("loss", loss.size(), b.count);
+  nb::gil_scoped_release release;
+  const auto& kernels = difflcs::kernels();
+  const AlignedBuffer workspace(kernels.violation_workspace(b));
+  if (!kernels.violation_qp(b, Q.data(), q.data(), workspace.data.get()) || b.count == 0) return false;
+  std::vector<double> w(b.count * n);
+  std::vector<int8_t> status(b.count);
+  std::vector<int32_t> iterations(b.count);
+  const difflcs::LcpBatch lcp{n,        Q.data(), 0,        q.data(),      0.0,
+                              max_iter, z.data(), w.data(), status.data(), iterations.data()};
+  solve(lcp, b.count, threads);
+  for (const int8_t s : status)
+    if (s != static_cast<int8_t>(difflcs::Status::converged)) return false;
+  kernels.violation_value(b, z.data(), loss.data(), workspace.data.get());
+  return true;
+}
+
+void violation_value(Inputs inputs, double gamma, double xi, Array z, Output<double> r, Output<double> e,
+                     Output<double> loss) {
+  const difflcs::ViolationBatch b = violation_batch(inputs, gamma, xi, r, e);
+  check_size("z", z.size(), 2 * b.n_lam * b.count), check_size("loss", loss.size(), b.count);
+  if (b.count == 0) return;
+  nb::gil_scoped_release release;
+  const auto& kernels = difflcs::kernels();
+  const AlignedBuffer workspace(kernels.violation_workspace(b));
+  kernels.violation_value(b, z.data(), loss.data(), workspace.data.get());
+}
+
+void violation_gradient(Inputs inputs, double gamma, double xi, Array z, Output<double> r, Output<double> e,
+                        Array upstream, std::vector<std::optional<Output<double>>> gradients) {
+  using namespace difflcs;
+  const ViolationBatch b = violation_batch(inputs, gamma, xi, r, e);
+  check_size("z", z.size(), 2 * b.n_lam * b.count), check_size("upstream", upstream.size(), b.count);
+  check_size("gradients", gradients.size(), kViolationInputs);
+  double* to[kViolationInputs] = {};
+  for (int i = 0; i < kViolationInputs; i++) {
+    if (!gradients[i] && i < vx) throw std::invalid_argument("the system's gradients are always computed");
+    if (gradients[i]) check_size("gradient", gradients[i]->size(), inputs[i].size()), to[i] = gradients[i]->data();
+  }
+  nb::gil_scoped_release release;
+  const auto& kernels = difflcs::kernels();
+  const AlignedBuffer workspace(kernels.violation_workspace(b));
+  kernels.violation_gradient(b, z.data(), upstream.data(), to, workspace.data.get());
+}
+
 }  // namespace
 
 NB_MODULE(_kernels, m) {
@@ -264,4 +343,10 @@ NB_MODULE(_kernels, m) {
   m.def("vjp_mpc", &vjp_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "x"_a, "u"_a, "lam"_a, "x_bar"_a,
         "u_bar"_a, "lam_bar"_a, "objective_bar"_a, "solved"_a, "threads"_a, "gradients"_a,
         "Gradients of the inputs of solved LCS-MPC problems, into the given arrays.");
+  m.def("violation_loss", &violation_loss, "inputs"_a, "gamma"_a, "xi"_a, "max_iter"_a, "threads"_a, "Q"_a, "q"_a,
+        "z"_a, "r"_a, "e"_a, "loss"_a, "Violation loss of a batch and what its gradient needs, into the given arrays.");
+  m.def("violation_value", &violation_value, "inputs"_a, "gamma"_a, "xi"_a, "z"_a, "r"_a, "e"_a, "loss"_a,
+        "The same at a given z, from r and e at z = 0.");
+  m.def("violation_gradient", &violation_gradient, "inputs"_a, "gamma"_a, "xi"_a, "z"_a, "r"_a, "e"_a, "upstream"_a,
+        "gradients"_a, "Gradients of the inputs, into the given arrays; None where one is not wanted.");
 }

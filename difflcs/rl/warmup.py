@@ -143,14 +143,15 @@ def fit(
     train, rest = order[:n_train], order[n_train:]
     size = min(config.minibatch, n_train)
     learned = [p for p in lcs.parameters() if p.requires_grad]
-    # fused: 66 µs per step against 157 µs, beside 480 µs for the loss and its gradient.
+    # fused: 66 µs per step against 157 µs, beside 150 µs for the loss and its gradient.
     adam = torch.optim.Adam(learned, config.learning_rate, config.betas, config.adam_eps, fused=True)
     recent: list[Tensor] = []
     steps = 0
     for _ in range(epochs):
-        shuffled = train[torch.from_numpy(rng.permutation(n_train))]
-        for batch in shuffled[: n_train - n_train % size].split(size):
-            loss = violation_loss(lcs, x[batch], u[batch], x_next[batch], config.gamma, config.xi)
+        shuffled = train[torch.from_numpy(rng.permutation(n_train))][: n_train - n_train % size]
+        batches = zip(x[shuffled].split(size), u[shuffled].split(size), x_next[shuffled].split(size), strict=True)
+        for x_batch, u_batch, next_batch in batches:
+            loss = violation_loss(lcs, x_batch, u_batch, next_batch, config.gamma, config.xi)
             adam.zero_grad()
             loss.backward()
             adam.step()

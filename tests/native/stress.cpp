@@ -152,11 +152,37 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
     kernels().mpc_vjp(b, g, i * block, std::min(count, (i + 1) * block), i, workspace.data);
 }
 
+void violation(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t count, double broken) {
+  const int64_t sizes[kViolationInputs] = {n_x * n_x,     n_x * n_u, n_x * n_lam, n_x,         n_lam * n_x, n_lam * n_u,
+                                           n_lam * n_lam, n_lam,     count * n_x, count * n_u, count * n_x};
+  std::vector<double> data[kViolationInputs], gradient[kViolationInputs];
+  ViolationBatch b{};
+  double* to[kViolationInputs];
+  for (int i = 0; i < kViolationInputs; i++) {
+    data[i] = i == vF ? lcp_matrices(1, n_lam) : normal(sizes[i], 0.5);
+    gradient[i].resize(sizes[i]);
+    b.input[i] = data[i].data(), to[i] = gradient[i].data();
+  }
+  if (broken != 0) data[vx][0] = broken;
+  const int64_t n = 2 * n_lam;
+  std::vector<double> Q(n * n), q(count * n), r(count * n_x), e(count * n_lam), loss(count);
+  b.count = count, b.n_x = n_x, b.n_u = n_u, b.n_lam = n_lam, b.gamma = 0.1, b.xi = 0.1, b.r = r.data(), b.e = e.data();
+  const Workspace workspace(kernels().violation_workspace(b));
+  const bool convex = kernels().violation_qp(b, Q.data(), q.data(), workspace.data);
+  expect(convex || std::isnan(broken), "the inner QP is convex");
+  const auto z = normal(count * n, 1.0), upstream = normal(count, 1.0);
+  kernels().violation_value(b, z.data(), loss.data(), workspace.data);
+  for (int pass = 0; pass < 2; pass++) {
+    kernels().violation_gradient(b, z.data(), upstream.data(), to, workspace.data);
+    to[vx] = to[vu] = to[vx_next] = nullptr;
+  }
+}
+
 }  // namespace
 
 int main() {
   const double huge = 1e200, nan = std::numeric_limits<double>::quiet_NaN();
-  for (int64_t n = 1; n <= 12; n++)
+  for (const int64_t n : {1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 16})
     for (const bool shared : {true, false})
       for (const double relaxation : {0.0, 1e-5})
         for (const double broken : {0.0, huge, nan}) lcp(n, 23, shared, relaxation, broken);
@@ -167,6 +193,9 @@ int main() {
         for (const double broken : {0.0, huge, nan})
           for (const int threads : {1, 3})
             for (const int64_t count : {1, 29}) mpc(s[0], s[1], s[2], s[3], count, shared, barrier, broken, threads);
+  for (const auto& s : shapes)
+    for (const double broken : {0.0, huge, nan})
+      for (const int64_t count : {1, 29}) violation(s[0], s[1], s[2], count, broken);
   std::printf("%s kernels, %d lanes: %s\n", kernels().isa, kernels().lanes, failures ? "FAILED" : "clean");
   return failures != 0;
 }

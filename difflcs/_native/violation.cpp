@@ -1,0 +1,204 @@
+// The violation loss around its inner QP, compiled once per instruction set (see CMakeLists.txt); difflcs/losses.py has
+// the mathematics, and lcp.cpp solves the QP. One transition per SIMD lane.
+#include "kernels.hpp"
+#include "lanes.hpp"
+#include "lu.hpp"
+
+namespace difflcs::DIFFLCS_ISA {
+namespace {
+
+// Whether a symmetric matrix, which is overwritten, is positive definite: all pivots are positive.
+bool positive_definite(int64_t n, double* M) {
+  lu_factor(n, M);
+  for (int64_t i = 0; i < n; i++)
+    if (!(M[i * n + i] > 0 && M[i * n + i] < 1e300)) return false;
+  return true;
+}
+
+struct Violation {
+  const ViolationBatch& batch;
+  const int64_t n_x, n_u, n_lam;
+  const double *A, *B, *C, *d, *D, *E, *F, *c;
+  const double weight;  // 1 / (gamma xi)
+  Vec *x, *u, *x_next, *z, *r, *e, *out, *sum;
+  double* matrix;
+
+  // Lays the arrays out in `memory`, or only counts them where it is null.
+  int64_t layout(void* memory) {
+    int64_t used = 0;
+    auto take = [&](int64_t count) {
+      Vec* at = memory ? static_cast<Vec*>(memory) + used : nullptr;
+      used += count;
+      return at;
+    };
+    x = take(n_x), u = take(n_u), x_next = take(n_x), z = take(2 * n_lam), r = take(n_x), e = take(n_lam);
+    out = take(n_x + n_u + 2 * n_lam), sum = take((n_x + n_lam) * (n_x + n_u + n_lam + 1));
+    matrix = reinterpret_cast<double*>(take(4 * n_lam * n_lam / kLanes + 1));
+    return used * static_cast<int64_t>(sizeof(Vec));
+  }
+
+  Violation(const ViolationBatch& b, void* memory)
+      : batch(b),
+        n_x(b.n_x),
+        n_u(b.n_u),
+        n_lam(b.n_lam),
+        A(b.input[vA]),
+        B(b.input[vB]),
+        C(b.input[vC]),
+        d(b.input[vd]),
+        D(b.input[vD]),
+        E(b.input[vE]),
+        F(b.input[vF]),
+        c(b.input[vc]),
+        weight(1.0 / (b.gamma * b.xi)) {
+    layout(memory);
+  }
+
+  // kLanes rows of a (count, size) array; lanes past the end repeat the last row and are never written back.
+  void load(Vec* to, const double* from, int64_t size, int64_t first) const {
+    for (int l = 0; l < kLanes; l++) {
+      const int64_t row = first + l < batch.count ? first + l : batch.count - 1;
+      for (int64_t i = 0; i < size; i++) put(to, i, l, from[row * size + i]);
+    }
+  }
+  void store(double* to, const Vec* from, int64_t size, int64_t first) const {
+    for (int l = 0; l < kLanes && first + l < batch.count; l++)
+      for (int64_t i = 0; i < size; i++) to[(first + l) * size + i] = lane_of(from[i], l);
+  }
+
+  // to += M v, or M^T v, with M (rows, columns).
+  static void add_product(Vec* to, const double* M, const Vec* v, int64_t rows, int64_t columns) {
+    for (int64_t i = 0; i < rows; i++)
+      for (int64_t j = 0; j < columns; j++) to[i] += M[i * columns + j] * v[j];
+  }
+  static void add_transposed(Vec* to, const double* M, const Vec* v, int64_t rows, int64_t columns) {
+    for (int64_t i = 0; i < rows; i++)
+      for (int64_t j = 0; j < columns; j++) to[j] += M[i * columns + j] * v[i];
+  }
+
+  // Q = [[C^T C + F^T F / (gamma xi), (I - F^T / gamma) / xi], [its transpose, I / (gamma xi)]].
+  bool hessian(double* Q) {
+    const int64_t n = n_lam, m = 2 * n_lam;
+    double largest = 0;
+    for (int64_t i = 0; i < n; i++)
+      for (int64_t j = 0; j < n; j++) {
+        double cc = 0, ff = 0;
+        for (int64_t k = 0; k < n_x; k++) cc += C[k * n + i] * C[k * n + j];
+        for (int64_t k = 0; k < n; k++) ff += F[k * n + i] * F[k * n + j];
+        Q[i * m + j] = cc + weight * ff;
+        Q[i * m + n + j] = Q[(n + j) * m + i] = (i == j ? 1.0 / batch.xi : 0.0) - weight * F[j * n + i];
+        Q[(n + i) * m + n + j] = i == j ? weight : 0.0;
+      }
+    for (int64_t i = 0; i < m; i++) largest = Q[i * m + i] > largest ? Q[i * m + i] : largest;
+    for (int64_t i = 0; i < m * m; i++) matrix[i] = Q[i] - (i % (m + 1) == 0 ? 1e-13 * largest : 0.0);
+    bool convex = largest < 1e300 && positive_definite(m, matrix);
+    for (int64_t i = 0; i < n; i++)
+      for (int64_t j = 0; j < n; j++) matrix[i * n + j] = F[i * n + j] + F[j * n + i] - (i == j ? batch.gamma : 0.0);
+    return convex && positive_definite(n, matrix);
+  }
+
+  // q = (C^T r + F^T e / (gamma xi), -e / (gamma xi)) with r and e at z = 0.
+  bool gradients_at_zero(double* q) {
+    Vec invalid = all(0);
+    for (int64_t first = 0; first < batch.count; first += kLanes) {
+      load(x, batch.input[vx], n_x, first), load(u, batch.input[vu], n_u, first);
+      load(x_next, batch.input[vx_next], n_x, first);
+      for (int64_t i = 0; i < n_x; i++) r[i] = d[i] - x_next[i];
+      for (int64_t i = 0; i < n_lam; i++) e[i] = all(c[i]), out[i] = all(0);
+      add_product(r, A, x, n_x, n_x), add_product(r, B, u, n_x, n_u);
+      add_product(e, D, x, n_lam, n_x), add_product(e, E, u, n_lam, n_u);
+      add_transposed(out, F, e, n_lam, n_lam);
+      for (int64_t i = 0; i < n_lam; i++) out[i] *= weight, out[n_lam + i] = -weight * e[i];
+      add_transposed(out, C, r, n_x, n_lam);
+      for (int64_t i = 0; i < 2 * n_lam; i++) invalid += 0.0 * out[i];  // NaN where anything was not finite
+      store(batch.r, r, n_x, first), store(batch.e, e, n_lam, first), store(q, out, 2 * n_lam, first);
+    }
+    return !any(invalid != 0);
+  }
+
+  void value(const double* solution, double* loss) {
+    const Vec *lam = z, *phi = z + n_lam;
+    for (int64_t first = 0; first < batch.count; first += kLanes) {
+      load(r, batch.r, n_x, first), load(e, batch.e, n_lam, first), load(z, solution, 2 * n_lam, first);
+      add_product(r, C, lam, n_x, n_lam), add_product(e, F, lam, n_lam, n_lam);
+      Vec rr = all(0), ee = all(0), product = all(0);
+      for (int64_t i = 0; i < n_x; i++) rr += r[i] * r[i];
+      for (int64_t i = 0; i < n_lam; i++) {
+        e[i] -= phi[i];
+        ee += e[i] * e[i];
+        product += lam[i] * phi[i];
+      }
+      const Vec total = 0.5 * rr + (product + ee / (2 * batch.gamma)) / batch.xi;
+      store(batch.r, r, n_x, first), store(batch.e, e, n_lam, first), store(loss, &total, 1, first);
+    }
+  }
+
+  // r and e are linear in every input, and by the envelope theorem z does not move.
+  void gradient(const double* solution, const double* upstream, double* const to[kViolationInputs]) {
+    const int64_t n_w = n_x + n_u + n_lam, rows = n_x + n_lam;
+    for (int64_t i = 0; i < rows * (n_w + 1); i++) sum[i] = all(0);
+    for (int64_t first = 0; first < batch.count; first += kLanes) {
+      Vec scale;
+      load(&scale, upstream, 1, first);
+      for (int l = 0; l < kLanes; l++)
+        if (first + l >= batch.count) scale[l] = 0;
+      load(r, batch.r, n_x, first), load(e, batch.e, n_lam, first), load(z, solution, 2 * n_lam, first);
+      load(x, batch.input[vx], n_x, first), load(u, batch.input[vu], n_u, first);
+      for (int64_t i = 0; i < n_x; i++) r[i] *= scale;
+      for (int64_t i = 0; i < n_lam; i++) e[i] *= weight * scale;
+      // One row per residual, one column for each of x, u, lam and 1.
+      for (int64_t i = 0; i < rows; i++) {
+        Vec *row = sum + i * (n_w + 1), residual = i < n_x ? r[i] : e[i - n_x];
+        for (int64_t j = 0; j < n_x; j++) row[j] += residual * x[j];
+        for (int64_t j = 0; j < n_u; j++) row[n_x + j] += residual * u[j];
+        for (int64_t j = 0; j < n_lam; j++) row[n_x + n_u + j] += residual * z[j];
+        row[n_w] += residual;
+      }
+      auto datum = [&](ViolationInput which, const double* of_r, const double* of_e, int64_t size) {
+        if (!to[which]) return;
+        for (int64_t i = 0; i < size; i++) out[i] = all(0);
+        add_transposed(out, of_r, r, n_x, size), add_transposed(out, of_e, e, n_lam, size);
+        store(to[which], out, size, first);
+      };
+      datum(vx, A, D, n_x), datum(vu, B, E, n_u);
+      if (to[vx_next]) {
+        for (int64_t i = 0; i < n_x; i++) out[i] = -r[i];
+        store(to[vx_next], out, n_x, first);
+      }
+    }
+    // Columns [from, from + columns) of the sums belong to one matrix.
+    auto reduce = [&](ViolationInput which, int64_t first_row, int64_t count, int64_t from, int64_t columns) {
+      for (int64_t i = 0; i < count; i++)
+        for (int64_t j = 0; j < columns; j++) {
+          double total = 0;
+          for (int l = 0; l < kLanes; l++) total += lane_of(sum[(first_row + i) * (n_w + 1) + from + j], l);
+          to[which][i * columns + j] = total;
+        }
+    };
+    reduce(vA, 0, n_x, 0, n_x), reduce(vB, 0, n_x, n_x, n_u), reduce(vC, 0, n_x, n_x + n_u, n_lam);
+    reduce(vd, 0, n_x, n_w, 1);
+    reduce(vD, n_x, n_lam, 0, n_x), reduce(vE, n_x, n_lam, n_x, n_u), reduce(vF, n_x, n_lam, n_x + n_u, n_lam);
+    reduce(vc, n_x, n_lam, n_w, 1);
+  }
+};
+
+}  // namespace
+
+int64_t violation_workspace(const ViolationBatch& batch) { return Violation(batch, nullptr).layout(nullptr); }
+
+bool violation_qp(const ViolationBatch& batch, double* Q, double* q, void* workspace) {
+  Violation violation(batch, workspace);
+  const bool convex = violation.hessian(Q);
+  return violation.gradients_at_zero(q) && convex;
+}
+
+void violation_value(const ViolationBatch& batch, const double* z, double* loss, void* workspace) {
+  Violation(batch, workspace).value(z, loss);
+}
+
+void violation_gradient(const ViolationBatch& batch, const double* z, const double* upstream,
+                        double* const gradient[kViolationInputs], void* workspace) {
+  Violation(batch, workspace).gradient(z, upstream, gradient);
+}
+
+}  // namespace difflcs::DIFFLCS_ISA
