@@ -39,7 +39,7 @@ class ImaginationConfig:
     """Gradient steps per imagined iteration."""
     steps_minibatch: int | None = 600
     """Samples per gradient step, every sample once before any is drawn again; None: each step on all of them."""
-    value_epochs: int = 7
+    value_epochs: int = 5
     """Epochs of the value network at the end of an imagined iteration."""
     networks: int = 4
     """Networks in the ensemble; every imagined step is predicted by one of them, drawn at random."""

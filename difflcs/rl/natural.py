@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-_MEMORY = 0.5
+_MEMORY = 0.7
 """Weight of the metric so far against that of a new measurement."""
 _LONGEST = 3.0
 """Longest Jacobian of one sample, in medians of those of its batch: samples near a jump of the MPC have huge ones."""

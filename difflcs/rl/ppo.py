@@ -72,7 +72,7 @@ class PPOConfig:
     """Weight of the natural gradient so far against the newest one; kept across iterations."""
     natural_damping: float = 0.1
     """Isotropic part of the natural gradient's metric, in means of its diagonal."""
-    natural_samples: int = 600
+    natural_samples: int = 300
     """Samples per iteration that its metric is measured with."""
     learning_rate: float = 6e-4
     """Adam's step size at the start."""
