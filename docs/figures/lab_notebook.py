@@ -24,7 +24,7 @@ def main() -> None:
     fig, axes = plt.subplots(
         2,
         1,
-        figsize=(8.5, 9.5),
+        figsize=(9.5, 1.5 + 0.165 * len(found)),
         sharex=True,
         gridspec_kw={"height_ratios": [6, sum(phase == "main" for phase, _ in found)]},
         layout="constrained",
@@ -40,6 +40,7 @@ def main() -> None:
                 ax.plot(success, y, "o", color=f"C{seed - 1}", alpha=0.8, markersize=6)
             ax.plot(mean(runs.values()), y, "|", color="black", markersize=14, markeredgewidth=2)
         ax.set_yticks(range(len(changes)), changes, fontsize=8)
+        ax.set_ylim(-1, len(changes))
         ax.set_title(title, fontsize=10)
         ax.grid(axis="x", alpha=0.3)
     axes[1].set_xlabel("success of 1000 goals, one training each (bar: mean)")
