@@ -85,6 +85,27 @@ def test_no_step_without_a_metric(jacobian):
     assert not flat(parameters).any()
 
 
+def test_nothing_runs_away_where_no_action_can_move():
+    """All actions at their bounds: no Jacobian, no gradient; what is known of the metric remains."""
+    parameters, optimiser = make(momentum=0.8)
+    optimiser.measure(JACOBIAN)
+    metric = optimiser.metric.clone()
+    backward(parameters, [1.0, -2.0, 0.5])
+    optimiser.step()
+    moved = flat(parameters)
+    for _ in range(20):
+        optimiser.measure(torch.zeros_like(JACOBIAN))
+        backward(parameters, [0.0, 0.0, 0.0])
+        optimiser.step()
+    assert torch.equal(optimiser.metric, metric)
+    assert torch.equal(flat(parameters), moved)
+
+    trainer = make_ppo(target_kl=0.08)
+    for _ in range(30):
+        trainer.learning_rate = trainer._adapt(0.0)
+    assert trainer.learning_rate == pytest.approx(0.4)
+
+
 def test_samples_near_a_jump_do_not_make_the_metric():
     one = torch.cat([JACOBIAN] * 5)
     plain, odd = make()[1], make()[1]

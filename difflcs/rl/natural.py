@@ -58,18 +58,19 @@ class NaturalGradient(torch.optim.Optimizer):
         longest = _LONGEST * length[length > 0].nanmedian()
         rows = (jacobian * torch.where(length > longest, longest / length, 1.0)[:, None, None]).flatten(0, 1)
         new = rows.mT @ rows / max(len(jacobian), 1)
-        self.metric.copy_(torch.lerp(self.metric, new, 1 - _MEMORY) if bool(self.metric.any()) else new)
+        if bool(new.any()):  # else nothing moves the actions, and what is known of the metric remains
+            self.metric.copy_(torch.lerp(self.metric, new, 1 - _MEMORY) if bool(self.metric.any()) else new)
         scale = self.metric.diagonal().mean()
         identity = torch.eye(len(self.metric), dtype=self.metric.dtype)
         self._factor = torch.linalg.cholesky(self.metric + self.damping * scale * identity) if scale > 0 else None
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:
-        """Take one step in the metric last measured; none where it or the gradient is zero."""
+        """Take one step in the metric last measured; none where it or the newest gradient is zero."""
         parameters = self._parameters
         gradient = torch.cat([(torch.zeros_like(p) if p.grad is None else p.grad).flatten() for p in parameters])
         self.average.lerp_(gradient, 1 - self.momentum)
-        if self._factor is None:
+        if self._factor is None or not bool(gradient.any()):
             return
         direction = torch.cholesky_solve(self.average.unsqueeze(-1), self._factor).squeeze(-1)
         length = (direction @ self.metric @ direction).sqrt()

@@ -573,11 +573,17 @@ class PPO:
         return outcome
 
     def _adapt(self, kl: float) -> float:
-        """The next step size. KL grows with the square of a step, so the caller divides annealing out."""
+        """The next step size. KL grows with the square of a step, so the caller divides annealing out.
+
+        No natural step is longer than the KL divergence of a whole iteration: where all actions are at their bounds
+        there is none, whatever the step.
+        """
         config = self.config
+        longest = math.sqrt(2 * config.target_kl) if config.natural else math.inf
         if kl > 1.5 * config.target_kl:
             return self.learning_rate / config.learning_rate_factor
-        return self.learning_rate * config.learning_rate_factor if kl < 0.5 * config.target_kl else self.learning_rate
+        longer = min(self.learning_rate * config.learning_rate_factor, max(longest, self.learning_rate))
+        return longer if kl < 0.5 * config.target_kl else self.learning_rate
 
     def _bound_std(self) -> None:
         low, high = self.config.std_range
