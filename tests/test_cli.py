@@ -64,7 +64,7 @@ def test_help(capsys, command, monkeypatch):
     ("arguments", "message"),
     [
         (["train", "--task", "cubes"], "expected one of cube,"),
-        (["train", "--method", "lcs-rl", "--minutes", "5"], "--minutes 30"),
+        (["train", "--method", "lcs-rl", "--minutes", "3"], "--minutes 30"),
         (["train", "--method", "pddm", "--init", "nowhere"], "init: expected none"),
         (["train", "--backend", "magic", "--smoke"], "magic"),
         (["train", "--minutes", "-1"], "minutes"),

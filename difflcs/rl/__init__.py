@@ -14,6 +14,7 @@ from difflcs.rl.dynamics import Ensemble
 from difflcs.rl.evaluate import Evaluation, evaluate, wilson_interval
 from difflcs.rl.imagination import Imagination, ImaginationConfig
 from difflcs.rl.mlp import MLPConfig, MLPController
+from difflcs.rl.natural import NaturalGradient
 from difflcs.rl.pddm import PDDM, PDDMConfig
 from difflcs.rl.phases import LCSRL
 from difflcs.rl.ppo import PPO, PPOConfig
@@ -39,6 +40,7 @@ __all__ = [
     "MLPConfig",
     "MLPController",
     "MLPPolicy",
+    "NaturalGradient",
     "PDDMConfig",
     "PPOConfig",
     "Reporter",

@@ -1,9 +1,10 @@
 """Main phase (Algorithm 2): proximal policy optimisation of the MPC's model, or of a network as a reference point.
 
 Episodes of the stochastic policy, advantages by GAE and the clipped objective are TorchRL's; gradients reach the LCS
-through the MPC layer. What only a policy with an MPC has stands in one section of `PPO`. Three things are this file's
+through the MPC layer. What only a policy with an MPC has stands in one section of `PPO`. Four things are this file's
 own, because TorchRL has no counterpart and because they decide whether it learns:
 
+- Steps follow the natural gradient (`difflcs.rl.natural`), measured with the sensitivities of the MPC.
 - The step size follows the KL divergence that an iteration has reached (`_adapt`). Large steps make PPO work here: a KL
   of 0.005 per iteration gains little, 0.03 to 0.1 gains 15 points of success.
 - Samples whose own KL exceeds `jump_kl` are left out (`_improve`): there the MPC has jumped to another local optimum,
