@@ -183,7 +183,16 @@ def test_restore_refuses_what_does_not_fit():
 
 @pytest.mark.parametrize(
     "change",
-    [{"iterations": -1}, {"rollouts": 0}, {"networks": 0}, {"learning_rate": 0.0}, {"steps_minibatch": 0}],
+    [
+        {"iterations": -1},
+        {"rollouts": 0},
+        {"networks": 0},
+        {"learning_rate": 0.0},
+        {"steps_minibatch": 0},
+        {"actions": 0},
+        {"actions": 3},
+        {"zeta": 1.1},
+    ],
 )
 def test_bad_settings_are_refused(change):
     with pytest.raises(InvalidInputError, match=next(iter(change))):

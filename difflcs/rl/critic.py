@@ -50,6 +50,10 @@ class Critic:
             sums.append(total)
         return torch.stack(sums[::-1], 1)
 
+    def values(self, inputs: Tensor) -> Tensor:
+        """(..., n_inputs) → (...)."""
+        return self.network(inputs.float()).double().squeeze(-1)
+
     def advantages(self, inputs: Tensor, rewards: Tensor) -> TensorDictBase:
         """TorchRL's GAE (Eq. adv_func): keys "advantage", "value_target", "state_value", (N, T, 1) each.
 
@@ -64,7 +68,7 @@ class Critic:
         end[:, -1] = True
         following = {"inputs": inputs[:, 1:], "reward": rewards.unsqueeze(-1), "done": end, "terminated": end}
         data = TensorDict({"inputs": inputs[:, :-1], "next": following}, [n, steps])  # pyright: ignore[reportArgumentType]
-        critic = TensorDictModule(lambda v: self.network(v.float()).double(), ["inputs"], ["state_value"])
+        critic = TensorDictModule(lambda v: self.values(v).unsqueeze(-1), ["inputs"], ["state_value"])
         gae = GAE(gamma=self.config.gamma, lmbda=self.config.zeta, value_network=critic, deactivate_vmap=True)
         with torch.no_grad():
             return gae(data)

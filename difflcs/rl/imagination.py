@@ -41,6 +41,11 @@ class ImaginationConfig:
     """Samples per gradient step, every sample once before any is drawn again; None: each step on all of them."""
     value_epochs: int = 5
     """Epochs of the value network at the end of an imagined iteration."""
+    actions: int = 8
+    """Actions that the networks judge in each imagined state, an even number (`difflcs.rl.lookahead`); 1: only the one
+    that is taken, by GAE as in real episodes."""
+    zeta: float = 0.5
+    """Zeta of the advantages where several actions are judged, that of PPO otherwise."""
     networks: int = 4
     """Networks in the ensemble; every imagined step is predicted by one of them, drawn at random."""
     width: int = 200
@@ -58,6 +63,10 @@ class ImaginationConfig:
         check_positive_int("iterations", self.iterations, minimum=0)
         for name in ("rollouts", "steps", "value_epochs", "networks", "width", "first_epochs", "epochs", "minibatch"):
             check_positive_int(name, getattr(self, name))
+        if check_positive_int("actions", self.actions) > 1 and self.actions % 2:
+            raise InvalidInputError(f"actions: expected 1 or an even number, got {self.actions}")
+        if not 0 <= check_number("zeta", self.zeta) <= 1:
+            raise InvalidInputError(f"zeta: expected 0 <= zeta <= 1, got {self.zeta}")
         if self.steps_minibatch is not None:
             check_positive_int("steps_minibatch", self.steps_minibatch)
         check_number("learning_rate", self.learning_rate, strict=True)
@@ -133,15 +142,41 @@ class ImaginedEnv(VectorEnv):
             observation, _ = self.reset()
             return observation, np.zeros(self.num_envs), nothing, nothing.copy(), {"success": nothing.copy()}
         u = torch.from_numpy(np.asarray(actions, np.float64))
-        inputs = (part.float().expand(self.ensemble.networks, -1, -1) for part in (self._state, u))
-        with torch.no_grad():
-            predicted = self.ensemble(*inputs)[self._networks[self._step], torch.arange(self.num_envs)].double()
-        predicted = torch.where(predicted.isfinite(), predicted, self._state)
-        after = torch.minimum(torch.maximum(predicted, self._low), self._high)
+        after = self._predict(self._state, u, self._networks[self._step])
         reward, success = self.outcome(self._state, u, after, self._goal)
         self._state, self._step = after, self._step + 1
         ended = np.full(self.num_envs, self._step == self.episode_steps)
         return self._observe(), reward.numpy(), nothing, ended, {"success": success.numpy()}
+
+    def foresee(self, states: Tensor, actions: Tensor, goals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What other actions would have led to in the episodes just played, by the networks that played them.
+
+        Args:
+            states: (num_envs, T, n_x) of the episodes, without the last ones.
+            actions: (num_envs, T, M, n_u) executed instead.
+            goals: (num_envs, n_goal).
+
+        Returns:
+            Next states (num_envs, T, M, n_x), dense rewards and successes (num_envs, T, M).
+        """
+        shape = actions.shape[:-1]
+        before, goals = (v.expand(*shape, -1).flatten(0, 2) for v in (states.unsqueeze(2), goals[:, None, None]))
+        actions, networks = actions.flatten(0, 2), self._networks.T.unsqueeze(2).expand(shape).flatten()
+        after = self._predict(before, actions, networks)
+        reward, success = self.outcome(before, actions, after, goals)
+        return after.view(*shape, -1), reward.view(shape), success.view(shape)
+
+    def _predict(self, states: Tensor, actions: Tensor, networks: Tensor) -> Tensor:
+        """States (B, n_x), actions (B, n_u), numbers of networks (B,) → next states (B, n_x) within the range."""
+        rows = [(networks == k).nonzero().squeeze(1) for k in range(self.ensemble.networks)]
+        padded = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)  # every network, as many rows
+        with torch.no_grad():
+            found = self.ensemble(states[padded].float(), actions[padded].float())
+        predicted = torch.empty_like(states)
+        for own, part in zip(rows, found, strict=True):
+            predicted[own] = part[: len(own)].double()
+        predicted = torch.where(predicted.isfinite(), predicted, states)
+        return torch.minimum(torch.maximum(predicted, self._low), self._high)
 
     def _observe(self) -> dict[str, np.ndarray]:
         return {"state": self._state.numpy().copy(), "goal": self._goal.numpy().copy()}

@@ -34,6 +34,7 @@ from difflcs.losses import violation_loss
 from difflcs.rl.checkpoint import Checkpoint
 from difflcs.rl.critic import Critic, initialise_moments, moments, read_history, seeded
 from difflcs.rl.imagination import EPISODES, Imagination
+from difflcs.rl.lookahead import lookahead_advantages, mirrored_actions
 from difflcs.rl.natural import NaturalGradient
 from difflcs.rl.rollout import Rollouts, action_bounds, collect, episode_seeds
 from difflcs.rl.warmup import TRAINING_STREAM
@@ -438,6 +439,8 @@ class PPO:
             estimated = critic.advantages(inputs, rewards)
             data["advantage"] = estimated["advantage"]
             unexplained = (returns - estimated["state_value"].squeeze(-1)).var() / returns.var().clamp_min(1e-12)
+            if self.imagination is not None and env is self.imagination.env and self.imagination.config.actions > 1:
+                data["judged"] = self._look_ahead(rollouts, data)
             value_seconds = time.perf_counter() - start
             improvement = self._improve(data.flatten(0, 1), rollouts, effort, scale)
             start = time.perf_counter()
@@ -487,11 +490,15 @@ class PPO:
 
     def _rewards(self, rollouts: Rollouts) -> Tensor:
         """(N, T) scaled rewards of the stable episodes."""
+        return self._scaled(rollouts.rewards[rollouts.stable], rollouts.success[rollouts.stable])
+
+    def _scaled(self, rewards: Tensor, success: Tensor) -> Tensor:
+        """Rewards (N, T, ...) and successes of the last step (N, ...) → rewards to learn from (N, T, ...)."""
         config = self.config
-        rewards = rollouts.rewards[rollouts.stable].clamp_min(-config.cost_limit)
+        rewards = rewards.clamp_min(-config.cost_limit)
         if not bool(torch.isfinite(rewards).all()):
             raise InvalidInputError("env: expected finite rewards, got NaN or infinity; mend the environment's reward")
-        rewards[:, -1] -= config.failure_penalty * (~rollouts.success[rollouts.stable]).double()
+        rewards[:, -1] -= config.failure_penalty * (~success).double()
         return config.reward_scale * rewards
 
     def _inputs(self, rollouts: Rollouts) -> Tensor:
@@ -500,6 +507,23 @@ class PPO:
         goals = rollouts.goals[rollouts.stable].unsqueeze(1).expand(-1, states.shape[1], -1)
         elapsed = torch.linspace(0, 1, states.shape[1], dtype=torch.float64).expand(states.shape[:-1])
         return self.features(states, goals, elapsed)
+
+    @torch.no_grad()
+    def _look_ahead(self, rollouts: Rollouts, data: TensorDict) -> TensorDict:
+        """(N, T, M) actions for the states of imagined episodes, see `difflcs.rl.lookahead`."""
+        assert self.imagination is not None
+        config, gamma = self.imagination.config, self.config.gamma
+        judged = mirrored_actions(data, config.actions)
+        executed = torch.clamp(judged["action"], *self.bounds)
+        after, rewards, success = self.imagination.env.foresee(rollouts.states[:, :-1], executed, rollouts.goals)
+        goals = rollouts.goals[:, None, None].expand(*after.shape[:-1], -1)
+        elapsed = torch.linspace(0, 1, after.shape[1] + 1, dtype=torch.float64)[1:, None].expand(after.shape[:-1])
+        values = self.critic.values(self.features(after, goals, elapsed))
+        values[:, -1] = 0  # an episode has ended
+        q = self._scaled(rewards, success[:, -1]) + gamma * values
+        now = self.critic.values(self._inputs(rollouts)[:, :-1])
+        judged["advantage"] = lookahead_advantages(q, now, gamma, config.zeta).unsqueeze(-1)
+        return judged
 
     # --- policy ---
 
@@ -512,8 +536,10 @@ class PPO:
         # The MPC is solved here, once per step; the loss gets its result, and only builds the distribution.
         head = ProbabilisticTensorDictSequential(self.actor.module[-1])  # pyright: ignore
         clipped = ClipPPOLoss(head, None, clip_epsilon=config.clip, entropy_bonus=False, critic_coeff=None)
-        data, advantage = data.copy(), data["advantage"]
-        data["advantage"] = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
+        data, own = data.copy(), data.select("action", "action_log_prob", "advantage").unsqueeze(-1)
+        judged = data.get("judged", own).copy()  # (N, M): M actions for each state
+        advantage = judged["advantage"]
+        judged["advantage"] = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
         if "plan" in data.keys():
             data["guess"] = data["plan"].clone()  # the rollout's own optimum, then each step's
         rng = np.random.default_rng(self._key(_LOSS_STREAM))
@@ -549,10 +575,12 @@ class PPO:
                 break
             jumped = (kl > config.jump_kl).unsqueeze(-1)
             outcome.ignored = float(jumped.double().mean())
-            batch["loc"] = torch.where(jumped, old["loc"], batch["loc"])
-            batch["action"], batch["action_log_prob"] = old["action"], old["action_log_prob"]
-            batch["advantage"] = torch.where(jumped, 0.0, old["advantage"])
-            result = clipped(batch)
+            samples = judged[chosen]
+            many = samples.batch_size
+            samples["loc"] = torch.where(jumped, old["loc"], batch["loc"]).unsqueeze(1).expand(*many, -1)
+            samples["scale_tril"] = batch["scale_tril"].unsqueeze(1).expand(*many, -1, -1)
+            samples["advantage"] = torch.where(jumped.unsqueeze(1), 0.0, samples["advantage"])
+            result = clipped(samples)
             outcome.clip_fraction = float(result["clip_fraction"])
             loss = config.beta * result["loss_objective"]
             if config.beta < 1:
