@@ -279,7 +279,9 @@ _HARMLESS = frozenset(
     }
 )
 """Imported, but without influence on a result: files, messages, pictures, other solvers."""
-_MAIN_PHASE = frozenset(f"difflcs.rl.{name}" for name in ("critic", "imagination", "natural", "policy", "ppo"))
+_MAIN_PHASE = frozenset(
+    f"difflcs.rl.{name}" for name in ("critic", "imagination", "lookahead", "natural", "policy", "ppo")
+)
 _UNREACHED: Mapping[str, frozenset[str]] = {
     "lcs-rl": frozenset({"difflcs.rl.mlp", "difflcs.rl.pddm"}),
     "violation": _MAIN_PHASE | {"difflcs.rl.dynamics", "difflcs.rl.mlp", "difflcs.rl.pddm"},

@@ -31,15 +31,15 @@ EPISODES = ("states", "actions", "goals")
 class ImaginationConfig:
     """Settings of the imagined episodes; all ours, tuned on the cube."""
 
-    iterations: int = 3
+    iterations: int = 2
     """Iterations of PPO on imagined episodes between two on real ones; 0: none, as in the paper."""
     rollouts: int = 120
     """Imagined episodes per iteration."""
-    steps: int = 8
+    steps: int = 12
     """Gradient steps per imagined iteration."""
     steps_minibatch: int | None = 600
     """Samples per gradient step, every sample once before any is drawn again; None: each step on all of them."""
-    value_epochs: int = 5
+    value_epochs: int = 20
     """Epochs of the value network at the end of an imagined iteration."""
     actions: int = 8
     """Actions that the networks judge in each imagined state, an even number (`difflcs.rl.lookahead`); 1: only the one
