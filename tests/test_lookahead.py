@@ -146,8 +146,9 @@ def looked_ahead(**changes):
     trainer.step()
     trainer.imagination.fit()
     rollouts, data, *_ = trainer._collect(trainer.imagination.env, list(range(10)))
+    now = trainer.critic.values(trainer._inputs(rollouts)[:, :-1]).detach()
     with seeded((0,)):
-        data["judged"] = trainer._look_ahead(rollouts, data)
+        data["judged"] = trainer._look_ahead(rollouts, data, now)
     return trainer, rollouts, data
 
 

@@ -440,7 +440,7 @@ class PPO:
             data["advantage"] = estimated["advantage"]
             unexplained = (returns - estimated["state_value"].squeeze(-1)).var() / returns.var().clamp_min(1e-12)
             if self.imagination is not None and env is self.imagination.env and self.imagination.config.actions > 1:
-                data["judged"] = self._look_ahead(rollouts, data)
+                data["judged"] = self._look_ahead(rollouts, data, estimated["state_value"].squeeze(-1))
             value_seconds = time.perf_counter() - start
             improvement = self._improve(data.flatten(0, 1), rollouts, effort, scale)
             start = time.perf_counter()
@@ -509,8 +509,8 @@ class PPO:
         return self.features(states, goals, elapsed)
 
     @torch.no_grad()
-    def _look_ahead(self, rollouts: Rollouts, data: TensorDict) -> TensorDict:
-        """(N, T, M) actions for the states of imagined episodes, see `difflcs.rl.lookahead`."""
+    def _look_ahead(self, rollouts: Rollouts, data: TensorDict, now: Tensor) -> TensorDict:
+        """(N, T, M) actions for the states of imagined episodes of value `now` (N, T), see `difflcs.rl.lookahead`."""
         assert self.imagination is not None
         config, gamma = self.imagination.config, self.config.gamma
         judged = mirrored_actions(data, config.actions)
@@ -521,7 +521,6 @@ class PPO:
         values = self.critic.values(self.features(after, goals, elapsed))
         values[:, -1] = 0  # an episode has ended
         q = self._scaled(rewards, success[:, -1]) + gamma * values
-        now = self.critic.values(self._inputs(rollouts)[:, :-1])
         judged["advantage"] = lookahead_advantages(q, now, gamma, config.zeta).unsqueeze(-1)
         return judged
 
