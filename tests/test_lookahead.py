@@ -10,9 +10,10 @@ pytest.importorskip("torchrl")
 from tensordict import TensorDict
 
 from difflcs.rl.critic import seeded
-from difflcs.rl.lookahead import lookahead_advantages, mirrored_actions
+from difflcs.rl.lookahead import lookahead_advantages, luck, mirrored_actions
+from difflcs.rl.ppo import _Effort
 from tests.test_imagination import N_U, N_X, STEPS, make_env, outcome
-from tests.test_ppo import improve, make_imagining, prepared
+from tests.test_ppo import ROLLOUTS, improve, make_imagining, prepared
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -112,6 +113,27 @@ def test_the_gradient_is_that_of_gae_with_less_noise():
     assert float(ahead.std()) < 0.6 * float(gae.std())
 
 
+def test_rewards_without_luck_have_the_same_returns_with_less_noise():
+    """x₊ = x + a, reward −x₊², a V that is wrong: returns of many episodes from one state, with and without."""
+    episodes, steps, std, gamma, count = 20000, 4, 0.4, 0.95, 8
+    x = torch.full((episodes,), 0.7, dtype=torch.float64)
+    plain, without = torch.zeros(episodes, dtype=torch.float64), torch.zeros(episodes, dtype=torch.float64)
+    for t in range(steps):
+        taken = TensorDict({"loc": -0.3 * x.unsqueeze(-1)}, [episodes])
+        taken["scale_tril"] = torch.full((episodes, 1, 1), std, dtype=torch.float64)
+        with seeded((4, t)):
+            taken["action"] = taken["loc"] + std * torch.randn(episodes, 1, dtype=torch.float64)
+            after = x.unsqueeze(-1) + mirrored_actions(taken, count)["action"].squeeze(-1)
+        left = steps - 1 - t
+        q = -after.square() + gamma * (-0.7 * left * after.square() + 0.5 * after * (left > 0))
+        x = after[:, 0]
+        plain += gamma**t * -x.square()
+        without += gamma**t * (-x.square() - luck(q))
+    difference = plain - without
+    assert float(difference.mean().abs()) < 4 * float(difference.std()) / episodes**0.5
+    assert float(without.std()) < 0.6 * float(plain.std())
+
+
 # --- in imagined episodes ---
 
 
@@ -148,7 +170,7 @@ def looked_ahead(**changes):
     rollouts, data, *_ = trainer._collect(trainer.imagination.env, list(range(10)))
     now = trainer.critic.values(trainer._inputs(rollouts)[:, :-1]).detach()
     with seeded((0,)):
-        data["judged"] = trainer._look_ahead(rollouts, data, now)
+        data["judged"], data["luck"] = trainer._look_ahead(rollouts, data, now)
     return trainer, rollouts, data
 
 
@@ -195,6 +217,35 @@ def test_the_first_gradient_is_that_of_all_actions():
         found = torch.zeros_like(p) if p.grad is None else p.grad
         torch.testing.assert_close(found, gradient, rtol=1e-5, atol=1e-8)
     assert any(bool(gradient.any()) for gradient in expected)
+
+
+def test_the_value_network_learns_from_rewards_without_luck(monkeypatch):
+    trainer = make_imagining()
+    trainer.step()
+    trainer.imagination.fit()
+    seen = {}
+    look_ahead, rewards = trainer._look_ahead, trainer._rewards
+
+    def remember(name, function):
+        def wrapped(*arguments):
+            seen[name] = function(*arguments)
+            return seen[name]
+
+        monkeypatch.setattr(trainer, f"_{name}", wrapped)
+
+    remember("look_ahead", look_ahead)
+    remember("rewards", rewards)
+    trainer._iterate(trainer.imagination.env, list(range(10)), _Effort(1, None, 1), 1.0)
+    _, unearned = seen["look_ahead"]
+    assert float(unearned.abs().max()) > 1e-6
+    torch.testing.assert_close(trainer.critic.history[-1][1], seen["rewards"] - unearned)
+    trainer._iterate(trainer.env, list(range(ROLLOUTS)), _Effort(1, None, 1), 1.0)
+    torch.testing.assert_close(trainer.critic.history[-1][1], seen["rewards"])  # real ones as they are
+
+
+def test_luck_is_what_the_action_taken_is_better():
+    _, _, data = looked_ahead(actions=4, zeta=0.0)
+    torch.testing.assert_close(data["luck"], data["judged", "advantage"][:, :, 0, 0])
 
 
 def test_one_action_is_plain_gae(monkeypatch):

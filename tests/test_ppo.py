@@ -570,6 +570,50 @@ def test_imagined_episodes_follow_the_first_real_ones_and_count_as_no_data():
     assert len(trainer.imagination) == 2 * ROLLOUTS
 
 
+def test_imagined_iterations_become_fewer(monkeypatch):
+    trainer = make_imagining(iterations=2, final_iterations=1)
+    counts, iterate = [], trainer._iterate
+
+    def counted(env, *arguments):
+        counts[-1] += env is trainer.imagination.env
+        return iterate(env, *arguments)
+
+    monkeypatch.setattr(trainer, "_iterate", counted)
+    while not trainer.done:
+        counts.append(0)
+        report = trainer.step()
+        assert (report.imagined_success is None) == (counts[-1] == 0)
+    assert counts == [0, 2, 1, 1]  # none before the first real episodes
+
+
+def test_iterations_can_end_before_the_main_phase():
+    trainer = make_imagining(iterations=1, final_iterations=0, real_step=0.5)
+    reports = []
+    while not trainer.done:
+        reports.append(trainer.step())
+    assert [report.imagined_success is None for report in reports] == [True, False, True, True]
+    assert [report.model_loss is None for report in reports] == [True, False, True, True]
+
+
+def test_steps_on_real_episodes_are_shorter_beside_imagined_ones(monkeypatch):
+    trainer = make_imagining(iterations=2, final_iterations=2, real_step=0.25)
+    trainer.config = replace(trainer.config, final_step=1.0)
+    scales, improve_ = [], trainer._improve
+
+    def remember(data, rollouts, effort, scale):
+        scales.append(scale)
+        outcome = improve_(data, rollouts, effort, scale)
+        if scale < 1:
+            trainer.learning_rate *= 7  # whatever the real episodes say
+        return outcome
+
+    monkeypatch.setattr(trainer, "_improve", remember)
+    for _ in range(2):
+        report = trainer.step()
+    assert scales == [1.0, 1.0, 1.0, 0.25]
+    assert trainer.learning_rate == report.learning_rate
+
+
 @pytest.mark.parametrize("actions", [1, 8])
 def test_imagination_learns_from_less_data(actions):
     def success(trainer):

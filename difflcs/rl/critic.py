@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import LinearLR
 
 from difflcs.errors import CheckpointError
 
@@ -87,6 +89,9 @@ class Critic:
 
     def _fit(self, inputs: Tensor, targets: Tensor, epochs: int, key: Sequence[int]) -> None:
         x, y = inputs.flatten(0, 1).float(), targets.flatten().float()
+        self._adam.param_groups[0]["lr"] = self.config.value_learning_rate
+        steps = epochs * math.ceil(len(x) / self.config.value_minibatch)
+        schedule = LinearLR(self._adam, 1.0, 0.0, total_iters=steps)
         with seeded(key):
             for _ in range(epochs):
                 for batch in torch.randperm(len(x)).split(self.config.value_minibatch):
@@ -94,6 +99,7 @@ class Critic:
                     self._adam.zero_grad()
                     loss.backward()
                     self._adam.step()
+                    schedule.step()
 
     # --- checkpoints ---
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import LinearLR
 
 from difflcs import _files
 from difflcs._checks import check_positive_int
@@ -66,6 +68,7 @@ class Ensemble(nn.Module):
         minibatch: int,
         learning_rate: float,
         generator: torch.Generator,
+        decay: bool = False,
     ) -> float:
         """Fit every network to all transitions (N, ·), in orders of their own, from the weights that they have.
 
@@ -77,6 +80,7 @@ class Ensemble(nn.Module):
             minibatch: transitions per step.
             learning_rate: step size of a new Adam.
             generator: draws the orders.
+            decay: let the step size fall linearly to zero. It can begin higher then: less noise stays in the weights.
 
         Returns:
             The mean loss of the last pass: squared error of the standardised changes.
@@ -87,6 +91,8 @@ class Ensemble(nn.Module):
             getattr(self, f"{name}_std").copy_(data.std(0, correction=0).clamp_min(1e-6))
         targets = (changes - self.change_mean) / self.change_std
         adam = torch.optim.Adam(self.parameters(), learning_rate, fused=True)
+        steps = epochs * math.ceil(len(inputs) / minibatch)
+        schedule = LinearLR(adam, 1.0, 0.0 if decay else 1.0, total_iters=steps)
         losses: list[Tensor] = []
         for _ in range(epochs):
             orders = torch.stack([torch.randperm(len(inputs), generator=generator) for _ in range(self.networks)])
@@ -96,6 +102,7 @@ class Ensemble(nn.Module):
                 adam.zero_grad()
                 errors.sum().backward()
                 adam.step()
+                schedule.step()
                 losses.append(errors.detach().mean())
         return float(torch.stack(losses).mean())
 

@@ -31,36 +31,42 @@ EPISODES = ("states", "actions", "goals")
 class ImaginationConfig:
     """Settings of the imagined episodes; all ours, tuned on the cube."""
 
-    iterations: int = 2
-    """Iterations of PPO on imagined episodes between two on real ones; 0: none, as in the paper."""
+    iterations: int = 5
+    """Iterations of PPO on imagined episodes between two on real ones, in the first half of the main phase; 0: none, as
+    in the paper."""
+    final_iterations: int = 2
+    """At most as many in its second half."""
     rollouts: int = 120
     """Imagined episodes per iteration."""
     steps: int = 12
     """Gradient steps per imagined iteration."""
     steps_minibatch: int | None = 600
     """Samples per gradient step, every sample once before any is drawn again; None: each step on all of them."""
-    value_epochs: int = 20
+    value_epochs: int = 10
     """Epochs of the value network at the end of an imagined iteration."""
     actions: int = 8
     """Actions that the networks judge in each imagined state, an even number (`difflcs.rl.lookahead`); 1: only the one
     that is taken, by GAE as in real episodes."""
     zeta: float = 0.5
     """Zeta of the advantages where several actions are judged, that of PPO otherwise."""
+    real_step: float = 0.3
+    """Factor on the gradient steps on real episodes once there are imagined ones: their gradient is noisier."""
     networks: int = 4
     """Networks in the ensemble; every imagined step is predicted by one of them, drawn at random."""
-    width: int = 200
+    width: int = 128
     """Width of their two hidden layers."""
     first_epochs: int = 60
     """Passes over the data of the first training."""
     epochs: int = 3
     """Passes over all data before the imagined iterations."""
-    minibatch: int = 256
+    minibatch: int = 128
     """Transitions per step."""
-    learning_rate: float = 1e-3
-    """Adam's step size; Adam is reset in each training, the networks are not."""
+    learning_rate: float = 8e-3
+    """Adam's step size at the start of each training; it falls linearly to zero. The networks are kept, Adam is not."""
 
     def __post_init__(self) -> None:
-        check_positive_int("iterations", self.iterations, minimum=0)
+        for name in ("iterations", "final_iterations"):
+            check_positive_int(name, getattr(self, name), minimum=0)
         for name in ("rollouts", "steps", "value_epochs", "networks", "width", "first_epochs", "epochs", "minibatch"):
             check_positive_int(name, getattr(self, name))
         if check_positive_int("actions", self.actions) > 1 and self.actions % 2:
@@ -69,7 +75,8 @@ class ImaginationConfig:
             raise InvalidInputError(f"zeta: expected 0 <= zeta <= 1, got {self.zeta}")
         if self.steps_minibatch is not None:
             check_positive_int("steps_minibatch", self.steps_minibatch)
-        check_number("learning_rate", self.learning_rate, strict=True)
+        for name in ("real_step", "learning_rate"):
+            check_number(name, getattr(self, name), strict=True)
 
 
 class ImaginedEnv(VectorEnv):
@@ -228,6 +235,7 @@ class Imagination:
             minibatch=config.minibatch,
             learning_rate=config.learning_rate,
             generator=torch.Generator().manual_seed(self._key(self.fits)),
+            decay=True,
         )
         self.env.remember(states, self.episodes["goals"])
         return loss

@@ -11,6 +11,8 @@ b(s_t), the same for all actions. Without them, and with many actions for each s
 
 has the policy gradient of GAE in expectation, with the same V and ζ. The sum, which corrects what V says wrongly about
 the next states, is known for the action taken only: it counts for all M of them.
+
+The bracket is also noise in the rewards that V is fitted to, and left out of them (`luck`).
 """
 
 from __future__ import annotations
@@ -67,3 +69,11 @@ def lookahead_advantages(q: Tensor, values: Tensor, gamma: float, zeta: float) -
     advantages = q - mean.unsqueeze(-1)
     advantages[..., 0] += q.shape[-1] * (correction - correction.mean())
     return advantages
+
+
+def luck(q: Tensor) -> Tensor:
+    """What the actions taken are better than the mean of those judged: (..., M), the one taken first, → (...).
+
+    Zero in expectation over the actions, so returns without it have the same mean and less noise.
+    """
+    return q[..., 0] - q.mean(-1)

@@ -34,7 +34,7 @@ from difflcs.losses import violation_loss
 from difflcs.rl.checkpoint import Checkpoint
 from difflcs.rl.critic import Critic, initialise_moments, moments, read_history, seeded
 from difflcs.rl.imagination import EPISODES, Imagination
-from difflcs.rl.lookahead import lookahead_advantages, mirrored_actions
+from difflcs.rl.lookahead import lookahead_advantages, luck, mirrored_actions
 from difflcs.rl.natural import NaturalGradient
 from difflcs.rl.rollout import Rollouts, action_bounds, collect, episode_seeds
 from difflcs.rl.warmup import TRAINING_STREAM
@@ -130,14 +130,14 @@ class PPOConfig:
     value_width: int = 64
     """Width of the two hidden layers of the value network."""
     value_learning_rate: float = 2e-3
-    """Step size of AdamW for the value network."""
+    """Step size of AdamW for the value network at the start of each fit; it falls linearly to zero."""
     value_weight_decay: float = 1e-4
     """Weight decay of AdamW for the value network."""
     value_minibatch: int = 256
     """Steps of the environment per step of AdamW."""
     value_first_epochs: int = 80
     """Epochs on the discounted returns of the first episodes, before the first advantages."""
-    value_epochs: int = 20
+    value_epochs: int = 10
     """Epochs at the end of each iteration."""
     value_iterations: int = 3
     """Newest iterations whose episodes the value network is fitted to."""
@@ -361,7 +361,7 @@ class PPO:
             self.actor.set_std(self.config.std * (self.config.final_std / self.config.std) ** progress)
         scale = 1 - (1 - self.config.final_step) * progress
         start = time.perf_counter()
-        imagined_success, model_loss = self._imagine(scale)
+        imagined_success, model_loss = self._imagine(scale, progress)
         imagination_seconds = time.perf_counter() - start
 
         count = self._sizes[self.iteration - self.first_iteration]
@@ -369,7 +369,11 @@ class PPO:
         self.episodes += count
         std, learning_rate = float(self.actor.std.mean()), self.learning_rate
         effort = _Effort(self.config.steps, self.config.minibatch, self.config.value_epochs)
-        outcome = self._iterate(self.env, seeds, effort, scale, after_step)
+        if self.imagination is None or imagined_success is None:
+            outcome = self._iterate(self.env, seeds, effort, scale, after_step)
+        else:
+            outcome = self._iterate(self.env, seeds, effort, self.imagination.config.real_step * scale, after_step)
+            self.learning_rate = learning_rate  # it follows the imagined iterations alone
         rollouts, improvement = outcome.rollouts, outcome.improvement
         if self.imagination is not None:
             stable = rollouts.stable
@@ -399,8 +403,10 @@ class PPO:
             imagination_seconds=imagination_seconds,
         )
 
-    def _imagine(self, scale: float) -> tuple[float | None, float | None]:
+    def _imagine(self, scale: float, progress: float) -> tuple[float | None, float | None]:
         """Iterations on imagined episodes: the success of the last ones, and the loss of the ensemble.
+
+        `progress` is that of the main phase, from 0 to 1.
 
         None before the first real one: what a warm-up has seen within its trust region says too little.
         """
@@ -408,9 +414,12 @@ class PPO:
         if imagination is None or self.iteration == self.first_iteration:
             return None, None
         config = imagination.config
+        count = config.iterations if progress < 0.5 else min(config.iterations, config.final_iterations)
+        if count == 0:
+            return None, None
         effort = _Effort(config.steps, config.steps_minibatch, config.value_epochs)
         model_loss, success = imagination.fit(), 0.0
-        for self._imagined in range(1, config.iterations + 1):
+        for self._imagined in range(1, count + 1):
             stream = (self.seed, _IMAGINED_STREAM, self.iteration, self._imagined)
             seeds = [int(s) for s in np.random.SeedSequence(stream).generate_state(config.rollouts)]
             rollouts = self._iterate(imagination.env, seeds, effort, scale).rollouts
@@ -438,13 +447,15 @@ class PPO:
             critic.begin(inputs, rewards, self._key(_VALUE_STREAM))
             estimated = critic.advantages(inputs, rewards)
             data["advantage"] = estimated["advantage"]
+            lasting = rewards  # what the value network learns from
             unexplained = (returns - estimated["state_value"].squeeze(-1)).var() / returns.var().clamp_min(1e-12)
             if self.imagination is not None and env is self.imagination.env and self.imagination.config.actions > 1:
-                data["judged"] = self._look_ahead(rollouts, data, estimated["state_value"].squeeze(-1))
+                data["judged"], unearned = self._look_ahead(rollouts, data, estimated["state_value"].squeeze(-1))
+                lasting = rewards - unearned
             value_seconds = time.perf_counter() - start
             improvement = self._improve(data.flatten(0, 1), rollouts, effort, scale)
             start = time.perf_counter()
-            critic.learn(inputs, rewards, self._key(_VALUE_STREAM), effort.value_epochs)
+            critic.learn(inputs, lasting, self._key(_VALUE_STREAM), effort.value_epochs)
             value_seconds += time.perf_counter() - start
         return _Outcome(
             rollouts=rollouts,
@@ -509,8 +520,11 @@ class PPO:
         return self.features(states, goals, elapsed)
 
     @torch.no_grad()
-    def _look_ahead(self, rollouts: Rollouts, data: TensorDict, now: Tensor) -> TensorDict:
-        """(N, T, M) actions for the states of imagined episodes of value `now` (N, T), see `difflcs.rl.lookahead`."""
+    def _look_ahead(self, rollouts: Rollouts, data: TensorDict, now: Tensor) -> tuple[TensorDict, Tensor]:
+        """Actions judged in imagined episodes, see `difflcs.rl.lookahead`: data of them (N, T, M) and the luck (N, T).
+
+        `now` are the values (N, T) of the states.
+        """
         assert self.imagination is not None
         config, gamma = self.imagination.config, self.config.gamma
         judged = mirrored_actions(data, config.actions)
@@ -522,7 +536,7 @@ class PPO:
         values[:, -1] = 0  # an episode has ended
         q = self._scaled(rewards, success[:, -1]) + gamma * values
         judged["advantage"] = lookahead_advantages(q, now, gamma, config.zeta).unsqueeze(-1)
-        return judged
+        return judged, luck(q)
 
     # --- policy ---
 
