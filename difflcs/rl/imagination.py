@@ -34,7 +34,7 @@ class ImaginationConfig:
     iterations: int = 5
     """Iterations of PPO on imagined episodes between two on real ones, in the first half of the main phase; 0: none, as
     in the paper."""
-    final_iterations: int = 2
+    final_iterations: int = 1
     """At most as many in its second half."""
     rollouts: int = 120
     """Imagined episodes per iteration."""
