@@ -188,6 +188,8 @@ def test_restore_refuses_what_does_not_fit():
         {"rollouts": 0},
         {"networks": 0},
         {"learning_rate": 0.0},
+        {"real_step": 0.0},
+        {"final_iterations": -1},
         {"steps_minibatch": 0},
         {"actions": 0},
         {"actions": 3},
