@@ -98,6 +98,17 @@ def check_number(name: str, value: object, minimum: float = 0.0, strict: bool = 
     return float(value)
 
 
+MAX_THREADS = 1024
+
+
+def check_threads(value: int | None) -> None:
+    """Check an optional number of threads."""
+    if value is not None and check_positive_int("threads", value) > MAX_THREADS:
+        raise InvalidInputError(
+            f"threads: expected at most {MAX_THREADS}, got {value}; None takes torch's number of threads"
+        )
+
+
 def check_choice(name: str, value: object, choices: Sequence[str]) -> str:
     """Check one of a few words."""
     if value not in choices:

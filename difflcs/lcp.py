@@ -16,6 +16,8 @@ from difflcs.status import Status
 # Block principal pivoting needs 3–10 iterations; the limit only bounds pathological inputs. The relaxed solve follows
 # its path in about 5 + 2·log10(1/relaxation) iterations.
 MAX_ITER = {"exact": 80, "relaxed": 200}
+# Largest λ and w, and reciprocal of the smallest diagonal of F, for which every gradient fits into float32.
+_FLOAT32 = 1e18
 
 
 class LCPSolution(NamedTuple):
@@ -36,7 +38,13 @@ def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0) -> LCPSolution:
     """Solve 0 ≤ λ ⊥ F λ + q ≥ 0 for a batch of P-matrices F (in particular F + Fᵀ ≻ 0).
 
     Exact problems go through block principal pivoting with Murty's finite rule as the fallback; relaxed ones,
-    λ ∘ (F λ + q) = relaxation, through damped Newton on the Chen–Harker–Kanzow–Smale function.
+    λ ∘ (F λ + q) = relaxation, through damped Newton on the Chen–Harker–Kanzow–Smale function with an interior-point
+    method as the fallback. Both fallbacks eliminate with row exchanges, which a dominant skew part of F needs.
+
+    CONVERGED is a certificate, recomputed from the λ and w that are returned: λ, w ≥ 0; λᵢwᵢ is 0, or the relaxation;
+    and |F λ + q − w|ᵢ is at most 1e-10 of the terms |qᵢ| + Σⱼ|Fᵢⱼλⱼ| that sum to it and at most 1e-8 of the largest
+    |q| (with a relaxation: plus √(relaxation·Fᵢᵢ)), in the caller's units and in those that give F a unit diagonal. So
+    an F whose smallest eigenvalue is below about 1e-8 of its entries may be refused: NUMERICAL.
 
     The gradient is that of the implicit function, M δλ = −b ∘ (δF λ + δq) with a = w/(λ+w), b = λ/(λ+w) and
     M = diag(a) + diag(b) F. Where strict complementarity fails (λᵢ = wᵢ = 0) an exact solution has a kink; index i then
@@ -49,7 +57,8 @@ def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0) -> LCPSolution:
         relaxation: 0 for the exact problem, else the product λᵢ wᵢ, in the units of λ·w.
 
     Returns:
-        `LCPSolution` with λ, w of q's dtype. float32 is solved in float64 inside.
+        `LCPSolution` with λ, w of q's dtype. float32 is solved in float64 inside; λ or w above 1e150, or 1e18 in
+        float32, is NUMERICAL, and so is an F with a diagonal below 1e-100, or 1e-18.
 
     Raises:
         ShapeError, DTypeError, DeviceError, NonFiniteError, InvalidInputError: the arguments do not fit.
@@ -64,7 +73,8 @@ def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0) -> LCPSolution:
     batch = broadcast_batch([("q", q.shape[:-1]), ("F", F.shape[:-2])])
     q_flat = q.expand(*batch, n).reshape(-1, n).double()
     F_flat = F.double() if F.ndim == 2 else F.expand(*batch, n, n).reshape(-1, n, n).double()
-    lam, w, status = _SolveLCP.apply(F_flat, q_flat, float(relaxation))  # pyright: ignore[reportGeneralTypeIssues]
+    narrow = torch.float32 in (F.dtype, q.dtype)
+    lam, w, status = _SolveLCP.apply(F_flat, q_flat, float(relaxation), narrow)  # pyright: ignore[reportGeneralTypeIssues]
     failed = int((status != Status.CONVERGED).sum())
     if failed:
         warnings.warn(
@@ -99,12 +109,20 @@ def solve_lcp_arrays(
 
 
 class _SolveLCP(torch.autograd.Function):
+    """F, q in float64 → λ, w, status. `narrow`: the caller's dtype is float32, whose range is that of a gradient."""
+
     @staticmethod
-    def forward(ctx, F: Tensor, q: Tensor, relaxation: float):
+    def forward(ctx, F: Tensor, q: Tensor, relaxation: float, narrow: bool):
         lam, w, status = (
-            torch.from_numpy(a).to(q.device)
+            torch.from_numpy(a)
             for a in solve_lcp_arrays(F.detach().cpu().numpy(), q.detach().cpu().numpy(), relaxation)
         )
+        if narrow:
+            diagonal = F.detach().cpu().diagonal(dim1=-2, dim2=-1)
+            too_large = (torch.maximum(lam, w).amax(-1) > _FLOAT32) | (diagonal < 1 / _FLOAT32).any(-1)
+            status = torch.where(too_large, int(Status.NUMERICAL), status).to(torch.int8)
+            lam, w = (torch.where(too_large.unsqueeze(-1), v.clamp_max(_FLOAT32), v) for v in (lam, w))
+        lam, w, status = (v.to(q.device) for v in (lam, w, status))
         ctx.save_for_backward(F, lam, w, status)
         ctx.mark_non_differentiable(status)
         return lam, w, status
@@ -114,17 +132,20 @@ class _SolveLCP(torch.autograd.Function):
         F, lam, w, status = ctx.saved_tensors
         if torch.is_grad_enabled():
             raise DoubleBackwardError("solve_lcp has first derivatives only; expected create_graph=False")
-        lam_bar, w_bar = grads[0], grads[1]
         solved = (status == Status.CONVERGED).unsqueeze(-1)
+        # Whatever comes upstream for a failed element is dropped before it can meet the others.
+        lam_bar, w_bar = (torch.where(solved, g, torch.zeros_like(g)) for g in grads[:2])
         total = lam + w
         # Strictly complementary: b = λ/(λ+w). At λ = w = 0 the index counts as inactive: b = 0, a = 1.
         b = torch.where(total > 0, lam / total.clamp_min(torch.finfo(lam.dtype).tiny), torch.zeros_like(lam))
         b = torch.where(solved, b, torch.zeros_like(b))
         M = torch.diag_embed(1 - b) + b.unsqueeze(-1) * F
         lam_bar = lam_bar + (w_bar.unsqueeze(-2) @ F).squeeze(-2)
-        v = torch.linalg.solve(M.mT, lam_bar)
+        v = torch.linalg.solve_ex(M.mT, lam_bar)[0]
+        # Rounding can make M singular where F is hardly positive definite: no gradient then, rather than NaN.
+        v = torch.where(torch.isfinite(v).all(-1, keepdim=True), v, torch.zeros_like(v))
         q_bar = torch.where(solved, w_bar - b * v, torch.zeros_like(v))
         if not ctx.needs_input_grad[0]:
-            return None, q_bar, None
+            return None, q_bar, None, None
         F_bar = q_bar.mT @ lam if F.ndim == 2 else q_bar.unsqueeze(-1) * lam.unsqueeze(-2)
-        return F_bar, q_bar, None
+        return F_bar, q_bar, None, None

@@ -10,11 +10,11 @@ namespace difflcs {
 #define DIFFLCS_KERNELS(ISA, LANES)                                                                    \
   namespace ISA {                                                                                      \
   int64_t lcp_workspace(int64_t);                                                                      \
-  void lcp_exact(const LcpBatch&, int64_t, int64_t, void*);                                            \
-  void lcp_relaxed(const LcpBatch&, int64_t, int64_t, void*);                                          \
+  void lcp_exact(const LcpBatch&, int64_t, int64_t, void*, Watch);                                     \
+  void lcp_relaxed(const LcpBatch&, int64_t, int64_t, void*, Watch);                                   \
   int64_t mpc_workspace(const MpcBatch&);                                                              \
-  void mpc_solve(const MpcBatch&, const MpcSolve&, int64_t*, void*);                                   \
-  void mpc_vjp(const MpcBatch&, const MpcGradient&, int64_t, int64_t, int64_t, void*);                 \
+  void mpc_solve(const MpcBatch&, const MpcSolve&, int64_t*, void*, Watch);                            \
+  void mpc_vjp(const MpcBatch&, const MpcGradient&, int64_t, int64_t, int64_t, void*, Watch);          \
   int64_t violation_workspace(const ViolationBatch&);                                                  \
   bool violation_qp(const ViolationBatch&, double*, double*, void*);                                   \
   void violation_value(const ViolationBatch&, const double*, double*, void*);                          \

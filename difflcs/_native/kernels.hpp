@@ -8,6 +8,14 @@ namespace difflcs {
 
 // Values are those of difflcs.Status.
 enum class Status : int8_t { converged = 0, max_iter = 1, infeasible = 2, numerical = 3, degenerate = 4 };
+constexpr int8_t kUnreached = -1;  // inside the native code only
+
+// Asked between two steps of long work; true: stop here. A plain function, because the kernels know neither clocks nor
+// Python.
+struct Watch {
+  bool (*stop)(void* context);
+  void* context;
+};
 
 // A batch of linear complementarity problems 0 <= lam, w = F lam + q >= 0, lam_i w_i = relaxation.
 struct LcpBatch {
@@ -23,6 +31,11 @@ struct LcpBatch {
   int32_t* iterations;  // out (batch,)
 };
 
+// What the numbers of a solved LCP have to meet; difflcs.lcp.solve_lcp states it.
+constexpr double kLcpTerms = 1e-10;  // |F lam + q - w| in parts of the terms that sum to it
+constexpr double kLcpData = 1e-8;    // the same in parts of the largest |q| (and of sqrt(relaxation F_ii))
+constexpr double kSmallest = 1e-100, kLargest = 1e150;  // range of the diagonal of F; of lam and w
+
 // Inputs of an MPC problem, in the order of difflcs.mpc.problem.INPUTS.
 enum Input { kA, kB, kC, kd, kD, kE, kF, kc, kQ, kR, kQfinal, kq, kr, kqfinal, kumin, kumax, kx0, kInputs };
 
@@ -33,6 +46,7 @@ struct MpcBatch {
   int64_t stride[kInputs];  // distance from one element to the next; 0 when the batch shares the input
   double relaxation;
   double barrier;  // weight of the logarithmic barrier of the action bounds
+  bool pivot;      // eliminate with row exchanges: slower, for F whose skew part dominates
 };
 
 // What the solver needs besides the problem, and where its results go.
@@ -43,8 +57,10 @@ struct MpcSolve {
   double shrink;            // its factor per stage
   double tol;               // on the projected gradient
   int64_t max_iter;
-  double *x, *u, *lam, *objective, *residual;  // out; residual as difflcs.mpc.kkt.residual
-  int8_t* status;
+  double certified;         // largest residual of a solved problem
+  double *x, *u, *lam, *objective, *residual;  // out; residual as difflcs.mpc.kkt.residual, from the numbers returned
+  int8_t* status;                              // out; unreached where the watch stopped before
+  int8_t* fragile;                             // out; whether elimination without row exchanges lost digits
   int32_t* iterations;
 };
 
@@ -77,14 +93,14 @@ struct Kernels {
   int lanes;                            // problems solved side by side
   int64_t (*lcp_workspace)(int64_t n);  // bytes, to be aligned to 64
   // Solve problems [begin, end); both read and write only those.
-  void (*lcp_exact)(const LcpBatch& batch, int64_t begin, int64_t end, void* workspace);
-  void (*lcp_relaxed)(const LcpBatch& batch, int64_t begin, int64_t end, void* workspace);
+  void (*lcp_exact)(const LcpBatch& batch, int64_t begin, int64_t end, void* workspace, Watch watch);
+  void (*lcp_relaxed)(const LcpBatch& batch, int64_t begin, int64_t end, void* workspace, Watch watch);
   int64_t (*mpc_workspace)(const MpcBatch& batch);
-  // Take problems from the shared counter `next` until none is left.
-  void (*mpc_solve)(const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void* workspace);
+  // Take problems from the shared counter `next` until none is left, and certify them.
+  void (*mpc_solve)(const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void* workspace, Watch watch);
   // Gradients of elements [begin, end), which are block number `block`.
   void (*mpc_vjp)(const MpcBatch& batch, const MpcGradient& gradient, int64_t begin, int64_t end, int64_t block,
-                  void* workspace);
+                  void* workspace, Watch watch);
   int64_t (*violation_workspace)(const ViolationBatch& batch);
   // r and e at z = 0, and the QP min z'Qz / 2 + q'z over z >= 0: Q (2 n_lam, 2 n_lam) shared by the batch and
   // q (count, 2 n_lam). Returns whether they are finite, F + F^T - gamma I is positive definite and Q is so by a

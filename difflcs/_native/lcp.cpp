@@ -41,8 +41,8 @@ struct Lcp {
         put(F, i * n + j, lane, from[i * n + j] * (lane_of(scale[i], lane) * lane_of(scale[j], lane)));
   }
 
-  // Read kLanes problems and scale them: F' = S F S with unit diagonal and q' = S q / max|S q|, so that tolerances are
-  // relative whatever the units. lam = unit * S lam', w = unit * S^-1 w'. Lanes past `end` repeat the last problem.
+  // Read kLanes problems and scale them: F' = S F S with unit diagonal and q' = S q / unit, where unit is the larger of
+  // max|S q| and sqrt(relaxation), so that tolerances are relative whatever the units. lam = unit * S lam', w = unit * S^-1 w'. Lanes past `end` repeat the last problem.
   // Returns the unit; a non-positive diagonal (not a P-matrix) is left unscaled and fails the residual test later.
   Vec load(int64_t first, int64_t end) {
     const int64_t n = size();
@@ -51,7 +51,7 @@ struct Lcp {
       if constexpr (sizeof(T) != sizeof(double)) load_matrix(e, l);
       for (int64_t i = 0; i < n; i++) put(q, i, l, batch.q[e * n + i] * lane_of(scale[i], l));
     }
-    Vec unit = all(0);
+    Vec unit = all(__builtin_sqrt(batch.relaxation));
     for (int64_t i = 0; i < n; i++) unit = max(unit, abs(q[i]));
     unit = select(unit > 0, unit, all(1));
     for (int64_t i = 0; i < n; i++) q[i] /= unit;
@@ -88,6 +88,9 @@ struct Lcp {
     }
   }
 
+  // Large problems look at the watch in every iteration.
+  bool halted(Watch watch) const { return size() > 32 && watch.stop(watch.context); }
+
   void solve(Vec* b) const {
     const int64_t n = size();
     Local<N> x(b);
@@ -98,22 +101,40 @@ struct Lcp {
     for (int64_t i = 0; i < n; i++) b[i] = x[i];
   }
 
-  void exact(int64_t begin, int64_t end);
-  void relaxed(int64_t begin, int64_t end);
+  // Which lanes hold a solution: lam, w and q - w + F lam as they are, by the bounds of kernels.hpp. `relaxation` is in
+  // scaled units. Call after `slack` has found w and bound for this lam; `returned` is the w that the caller will get.
+  Mask certified(const Vec* returned, Vec unit, Vec relaxation) const {
+    const int64_t n = size();
+    Vec largest = all(0);  // of q, in the caller's units
+    for (int64_t i = 0; i < n; i++) largest = max(largest, (abs(q[i]) * unit + sqrt(relaxation) * unit) / scale[i]);
+    Mask ok = ~Mask{};
+    for (int64_t i = 0; i < n; i++) {
+      const Vec missed = abs(w[i] - returned[i]), force = lam[i] * unit * scale[i], gap = returned[i] * unit / scale[i];
+      ok &= missed <= kLcpTerms * bound[i];
+      ok &= missed <= kLcpData * (1.0 + sqrt(relaxation));
+      ok &= missed * unit / scale[i] <= kLcpData * largest;
+      ok &= (force >= 0) & (force <= kLargest) & (gap >= 0) & (gap <= kLargest);
+      ok &= (all(0) + scale[i] <= 1 / __builtin_sqrt(kSmallest)) & (all(0) + scale[i] >= __builtin_sqrt(kSmallest));
+    }
+    return ok;
+  }
+
+  void exact(int64_t begin, int64_t end, Watch watch);
+  void relaxed(int64_t begin, int64_t end, Watch watch);
 };
 
 // Exact LCP by block principal pivoting (Kostreva; Judice & Pires): guess the set of positive lam, solve for them,
 // exchange every index whose lam or w came out negative. If ten exchanges do not lower the number of such indices,
 // exchange only the last one until they do, which is finite for P-matrices (Murty).
 template <class T, int N>
-void Lcp<T, N>::exact(int64_t begin, int64_t end) {
+void Lcp<T, N>::exact(int64_t begin, int64_t end, Watch watch) {
   const int64_t n = size();
-  for (int64_t first = begin; first < end; first += kLanes) {
+  for (int64_t first = begin; first < end && !watch.stop(watch.context); first += kLanes) {
     const Vec unit = load(first, end);
     Mask fewest = Mask{} + (n + 1), patience = Mask{} + 10, iterations = Mask{};
     Mask done = Mask{}, solved = Mask{};
     for (int64_t i = 0; i < n; i++) active[i] = q[i] < 0;
-    for (int64_t it = 0; it < batch.max_iter; it++) {
+    for (int64_t it = 0; it < batch.max_iter && !halted(watch); it++) {
       // Active rows of F, identity elsewhere: one LU serves every active set. Inactive lam stay exactly zero.
       for (int64_t i = 0; i < n; i++) {
         DIFFLCS_UNROLL
@@ -154,13 +175,16 @@ void Lcp<T, N>::exact(int64_t begin, int64_t end) {
       fewest = fewer ? count : fewest;
       for (int64_t i = 0; i < n; i++) active[i] ^= (block ? infeasible(i) : last == i) & ~done;
     }
+    // What rounding left below zero is put onto zero, and the slack is that of the lam that is returned.
+    Mask clipped = Mask{};
     for (int64_t i = 0; i < n; i++) {
-      // A finished active row has w = 0 up to rounding; what is left there beyond 1e-10 is a failed factorisation.
-      solved &= select(active[i], abs(w[i]), all(0)) <= 1e-10 * bound[i];
-      solved &= (lam[i] == lam[i]) & (abs(lam[i]) < 1e300);
+      clipped |= lam[i] < 0;
       lam[i] = max(lam[i], all(0));
-      w[i] = select(active[i], all(0), max(w[i], all(0)));
     }
+    if (any(clipped)) slack();
+    for (int64_t i = 0; i < n; i++) rhs[i] = select(active[i], all(0), max(w[i], all(0)));
+    solved &= certified(rhs, unit, all(0));
+    for (int64_t i = 0; i < n; i++) w[i] = rhs[i];
     store(first, end, unit, solved, iterations);
   }
 }
@@ -169,9 +193,9 @@ void Lcp<T, N>::exact(int64_t begin, int64_t end) {
 //   g_i = lam_i + w_i - sqrt((lam_i - w_i)^2 + 4 eps) = 0  <=>  lam_i > 0, w_i > 0, lam_i w_i = eps,
 // following eps from 1 (in scaled units) down to its target.
 template <class T, int N>
-void Lcp<T, N>::relaxed(int64_t begin, int64_t end) {
+void Lcp<T, N>::relaxed(int64_t begin, int64_t end, Watch watch) {
   const int64_t n = size();
-  for (int64_t first = begin; first < end; first += kLanes) {
+  for (int64_t first = begin; first < end && !watch.stop(watch.context); first += kLanes) {
     const Vec unit = load(first, end);
     const Vec target = batch.relaxation / (unit * unit);
     Vec eps = max(target, all(1));
@@ -180,7 +204,7 @@ void Lcp<T, N>::relaxed(int64_t begin, int64_t end) {
     Mask solved = Mask{};
     Vec smallest = all(1e300);  // smallest residual met at the target
     int stalled[kLanes] = {};
-    for (int64_t it = 0; it < batch.max_iter; it++) {
+    for (int64_t it = 0; it < batch.max_iter && !halted(watch); it++) {
       // Residual and generalised Jacobian M = diag(a) + diag(b) F with a = 1 - d/r, b = 1 + d/r.
       slack();
       Vec merit = all(0), magnitude = all(0);
@@ -237,9 +261,11 @@ void Lcp<T, N>::relaxed(int64_t begin, int64_t end) {
       const Vec d = lam[i] - w[i], r = sqrt(d * d + 4.0 * target);
       const Vec larger = 0.5 * (abs(d) + r), smaller = target / larger;
       lam[i] = select(d > 0, larger, smaller);
-      w[i] = select(d > 0, smaller, larger);
-      solved &= lam[i] == lam[i];
+      rhs[i] = select(d > 0, smaller, larger);
     }
+    slack();
+    solved &= certified(rhs, unit, target);
+    for (int64_t i = 0; i < n; i++) w[i] = rhs[i];
     store(first, end, unit, solved, iterations);
   }
 }
@@ -257,15 +283,15 @@ void dispatch(const LcpBatch& batch, void* memory, Function f) {
 
 int64_t lcp_workspace(int64_t n) { return static_cast<int64_t>(sizeof(Vec)) * (2 * n * n + 7 * n); }
 
-void lcp_exact(const LcpBatch& batch, int64_t begin, int64_t end, void* memory) {
+void lcp_exact(const LcpBatch& batch, int64_t begin, int64_t end, void* memory, Watch watch) {
   // Compile-time sizes for the violation loss of the paper's tasks: twice their number of contacts.
-  if (!batch.F_stride && batch.n == 10) return Lcp<double, 10>(batch, memory).exact(begin, end);
-  if (!batch.F_stride && batch.n == 16) return Lcp<double, 16>(batch, memory).exact(begin, end);
-  dispatch(batch, memory, [&](auto lcp) { lcp.exact(begin, end); });
+  if (!batch.F_stride && batch.n == 10) return Lcp<double, 10>(batch, memory).exact(begin, end, watch);
+  if (!batch.F_stride && batch.n == 16) return Lcp<double, 16>(batch, memory).exact(begin, end, watch);
+  dispatch(batch, memory, [&](auto lcp) { lcp.exact(begin, end, watch); });
 }
 
-void lcp_relaxed(const LcpBatch& batch, int64_t begin, int64_t end, void* memory) {
-  dispatch(batch, memory, [&](auto lcp) { lcp.relaxed(begin, end); });
+void lcp_relaxed(const LcpBatch& batch, int64_t begin, int64_t end, void* memory, Watch watch) {
+  dispatch(batch, memory, [&](auto lcp) { lcp.relaxed(begin, end, watch); });
 }
 
 }  // namespace difflcs::DIFFLCS_ISA

@@ -1,5 +1,6 @@
 // LU without pivoting for one small matrix per lane (or of plain numbers). The matrices met here have positive
-// principal minors, so the factors exist; the callers refine the solution or check its residual. With a compile-time
+// principal minors, so the factors exist, but a dominant skew part can make them large: the callers check the residual
+// of the solution, and fall back to row exchanges (at the end of this file) where it is poor. With a compile-time
 // size and a `Local` for M everything happens in registers.
 #pragma once
 #include "lanes.hpp"
@@ -68,6 +69,47 @@ inline void lu_solve_transposed(N n, const Vec* M, Vec* b) {
   }
   for (int64_t i = n - 2; i >= 0; i--)
     for (int64_t j = i + 1; j < n; j++) b[i] -= M[j * n + i] * b[j];
+}
+
+// The same with row exchanges, lane by lane, for the few problems where elimination without them loses digits. Like
+// LAPACK, rows[k] is the row that was exchanged with row k.
+inline void lu_factor_pivoted(int64_t n, Vec* M, Mask* rows) {
+  for (int l = 0; l < kLanes; l++) {
+    auto at = [&](int64_t i, int64_t j) -> double& { return reinterpret_cast<double*>(M + i * n + j)[l]; };
+    for (int64_t k = 0; k < n; k++) {
+      int64_t pivot = k;
+      for (int64_t i = k + 1; i < n; i++)
+        if (__builtin_fabs(at(i, k)) > __builtin_fabs(at(pivot, k))) pivot = i;
+      rows[k][l] = pivot;
+      for (int64_t j = 0; pivot != k && j < n; j++) {
+        const double t = at(k, j);
+        at(k, j) = at(pivot, j), at(pivot, j) = t;
+      }
+      const double inverse = at(k, k) = 1.0 / at(k, k);
+      for (int64_t i = k + 1; i < n; i++) {
+        const double factor = at(i, k) *= inverse;
+        for (int64_t j = k + 1; j < n; j++) at(i, j) -= factor * at(k, j);
+      }
+    }
+  }
+}
+
+inline void exchange(Vec* b, int64_t k, const Mask* rows) {
+  for (int l = 0; l < kLanes; l++) {
+    double &first = reinterpret_cast<double*>(b + k)[l], &second = reinterpret_cast<double*>(b + rows[k][l])[l];
+    const double t = first;
+    first = second, second = t;
+  }
+}
+
+inline void lu_solve_pivoted(int64_t n, const Vec* M, const Mask* rows, Vec* b) {
+  for (int64_t k = 0; k < n; k++) exchange(b, k, rows);
+  lu_solve(n, M, b);
+}
+
+inline void lu_solve_transposed_pivoted(int64_t n, const Vec* M, const Mask* rows, Vec* b) {
+  lu_solve_transposed(n, M, b);
+  for (int64_t k = n - 1; k >= 0; k--) exchange(b, k, rows);
 }
 
 }  // namespace

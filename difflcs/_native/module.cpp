@@ -6,17 +6,21 @@
 
 #include <algorithm>
 #include <atomic>
+#include <chrono>
 #include <cmath>
 #include <cstdlib>
+#include <limits>
 #include <memory>
 #include <new>
 #include <optional>
 #include <stdexcept>
 #include <string>
+#include <system_error>
 #include <thread>
 #include <vector>
 
 #include "kernels.hpp"
+#include "lcp_one.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -36,85 +40,92 @@ struct AlignedBuffer {
   explicit AlignedBuffer(int64_t bytes) : data(::operator new(bytes, std::align_val_t{64})) {}
 };
 
-// Runs work(workspace) on `threads` threads; an exception in any of them is rethrown.
-template <class Work>
-void on_threads(int64_t threads, int64_t workspace_bytes, Work work) {
-  std::vector<AlignedBuffer> workspaces;
-  for (int64_t t = 0; t < threads; t++) workspaces.emplace_back(workspace_bytes);
-  std::vector<std::thread> pool;
-  for (int64_t t = 1; t < threads; t++) pool.emplace_back([&work, &workspaces, t] { work(workspaces[t].data.get()); });
-  work(workspaces[0].data.get());
-  for (auto& t : pool) t.join();
-}
+// What ends the work of all threads of one call before its end.
+enum Ending { kGoOn, kOutOfTime, kInterrupted };
 
-// Exact LCP of one problem by Murty's least-index method with a pivoted LU: slow, but finite for every P-matrix and
-// indifferent to degeneracy and to growth in an unpivoted LU. Used only where the batched kernel gave up.
-bool lcp_exact_one(int64_t n, const double* F, const double* q, double* lam, double* w, int64_t max_iter) {
-  std::vector<char> active(n, 0);
-  std::vector<double> M(n * n), x(n);
-  for (int64_t it = 0; it < max_iter; it++) {
-    for (int64_t i = 0; i < n; i++) {
-      for (int64_t j = 0; j < n; j++) M[i * n + j] = active[i] && active[j] ? F[i * n + j] : (i == j ? 1.0 : 0.0);
-      x[i] = active[i] ? -q[i] : 0.0;
-    }
-    for (int64_t k = 0; k < n; k++) {
-      int64_t pivot = k;
-      for (int64_t i = k + 1; i < n; i++)
-        if (std::fabs(M[i * n + k]) > std::fabs(M[pivot * n + k])) pivot = i;
-      if (M[pivot * n + k] == 0.0) return false;
-      if (pivot != k) {
-        for (int64_t j = 0; j < n; j++) std::swap(M[k * n + j], M[pivot * n + j]);
-        std::swap(x[k], x[pivot]);
-      }
-      for (int64_t i = k + 1; i < n; i++) {
-        const double l = M[i * n + k] / M[k * n + k];
-        for (int64_t j = k; j < n; j++) M[i * n + j] -= l * M[k * n + j];
-        x[i] -= l * x[k];
-      }
-    }
-    for (int64_t i = n - 1; i >= 0; i--) {
-      for (int64_t j = i + 1; j < n; j++) x[i] -= M[i * n + j] * x[j];
-      x[i] /= M[i * n + i];
-    }
-    int64_t wrong = -1;
-    for (int64_t i = 0; i < n && wrong < 0; i++) {
-      double value = q[i], bound = std::fabs(q[i]);
-      for (int64_t j = 0; j < n; j++) value += F[i * n + j] * x[j], bound += std::fabs(F[i * n + j] * x[j]);
-      if (active[i]) value = x[i] * std::fabs(F[i * n + i]);
-      if (!(value >= -1e-11 * bound)) wrong = i;
-    }
-    if (wrong < 0) {
-      for (int64_t i = 0; i < n; i++) {
-        double value = q[i];
-        for (int64_t j = 0; j < n; j++) value += F[i * n + j] * x[j];
-        lam[i] = std::max(x[i], 0.0);
-        w[i] = active[i] ? 0.0 : std::max(value, 0.0);
-      }
+using Clock = std::chrono::steady_clock;
+
+struct Stop {
+  std::atomic<int> ending{kGoOn};
+  Clock::time_point deadline = Clock::time_point::max();
+  explicit Stop(double seconds = std::numeric_limits<double>::infinity()) {
+    if (seconds < 1e9) deadline = Clock::now() + std::chrono::microseconds(int64_t(1e6 * std::max(seconds, 0.0)));
+  }
+};
+
+// One thread's view of it. The thread that Python called looks for signals (Ctrl-C) every 50 ms.
+struct Lookout {
+  Stop& stop;
+  const bool caller;
+  Clock::time_point next_look = Clock::now() + std::chrono::milliseconds(50);
+
+  static bool ask(void* context) {
+    Lookout& self = *static_cast<Lookout*>(context);
+    if (self.stop.ending.load(std::memory_order_relaxed) != kGoOn) return true;
+    const auto now = Clock::now();
+    if (now >= self.stop.deadline) {
+      self.stop.ending = kOutOfTime;
       return true;
     }
-    active[wrong] ^= 1;
+    if (!self.caller || now < self.next_look) return false;
+    self.next_look = now + std::chrono::milliseconds(50);
+    nb::gil_scoped_acquire gil;
+    if (PyErr_CheckSignals() == 0) return false;
+    self.stop.ending = kInterrupted;  // Python's error is set; `on_threads` raises it
+    return true;
   }
-  return false;
+};
+
+// Runs work(workspace, watch) on at most `threads` threads, GIL released. A thread that cannot be started, or has no
+// memory, is done without. Raises what a signal handler raised.
+template <class Work>
+void on_threads(int64_t threads, int64_t workspace_bytes, Stop& stop, Work work) {
+  {
+    nb::gil_scoped_release release;
+    const AlignedBuffer own(workspace_bytes);
+    std::vector<std::thread> pool;
+    auto start = [&] {
+      auto workspace = std::make_shared<AlignedBuffer>(workspace_bytes);
+      pool.emplace_back([&work, &stop, workspace] {
+        Lookout lookout{stop, false};
+        work(workspace->data.get(), difflcs::Watch{&Lookout::ask, &lookout});
+      });
+    };
+    try {
+      pool.reserve(threads);
+      for (int64_t t = 1; t < threads; t++) start();
+    } catch (const std::system_error&) {  // the work is shared by those that run
+    } catch (const std::bad_alloc&) {
+    }
+    Lookout lookout{stop, true};
+    work(own.data.get(), difflcs::Watch{&Lookout::ask, &lookout});
+    for (auto& t : pool) t.join();
+  }
+  if (stop.ending == kInterrupted) throw nb::python_error();
 }
 
-void solve(const difflcs::LcpBatch& batch, int64_t count, int threads) {
+void solve(const difflcs::LcpBatch& batch, int64_t count, int threads, Stop& stop) {
   const auto& kernels = difflcs::kernels();
-  const auto run = batch.relaxation > 0 ? kernels.lcp_relaxed : kernels.lcp_exact;
+  const bool relaxed = batch.relaxation > 0;
+  const auto run = relaxed ? kernels.lcp_relaxed : kernels.lcp_exact;
   // Blocks small enough to balance the load; where a block begins does not change any result.
   const int64_t block = 16 * kernels.lanes;
   std::atomic<int64_t> next{0};
   const int64_t used = std::max<int64_t>(1, std::min<int64_t>(threads, (count + block - 1) / block));
-  on_threads(used, kernels.lcp_workspace(batch.n), [&](void* workspace) {
-    for (int64_t b; (b = next.fetch_add(block)) < count;) run(batch, b, std::min(b + block, count), workspace);
+  const int64_t scratch = difflcs::lcp_one_scratch(batch.n) * int64_t(sizeof(double));
+  on_threads(used, std::max(kernels.lcp_workspace(batch.n), scratch), stop, [&](void* workspace, difflcs::Watch watch) {
+    for (int64_t b; (b = next.fetch_add(block)) < count && !watch.stop(watch.context);) {
+      const int64_t end = std::min(b + block, count);
+      run(batch, b, end, workspace, watch);
+      // What the batched kernel gave up is done again, slowly and with row exchanges.
+      for (int64_t e = b; e < end; e++) {
+        if (batch.status[e] == static_cast<int8_t>(difflcs::Status::converged)) continue;
+        const auto one = relaxed ? difflcs::lcp_relaxed_one : difflcs::lcp_exact_one;
+        if (one(batch, e, static_cast<double*>(workspace), watch))
+          batch.status[e] = static_cast<int8_t>(difflcs::Status::converged);
+      }
+    }
   });
-  if (batch.relaxation > 0) return;
-  for (int64_t e = 0; e < count; e++) {
-    if (batch.status[e] == static_cast<int8_t>(difflcs::Status::converged)) continue;
-    const int64_t limit = int64_t{1} << std::min<int64_t>(batch.n + 2, 16);
-    const bool ok = lcp_exact_one(batch.n, batch.F + e * batch.F_stride, batch.q + e * batch.n, batch.lam + e * batch.n,
-                                  batch.w + e * batch.n, limit);
-    if (ok) batch.status[e] = static_cast<int8_t>(difflcs::Status::converged);
-  }
 }
 
 void solve_lcp(Array F, Array q, double relaxation, int64_t max_iter, int threads, Output<double> lam, Output<double> w,
@@ -132,15 +143,15 @@ void solve_lcp(Array F, Array q, double relaxation, int64_t max_iter, int thread
   if (!(relaxation >= 0)) throw std::invalid_argument("relaxation must be >= 0");
   const difflcs::LcpBatch batch{n,        F.data(),   shared ? 0 : n * n, q.data(),      relaxation,
                                 max_iter, lam.data(), w.data(),           status.data(), iterations.data()};
-  nb::gil_scoped_release release;
-  solve(batch, count, threads);
+  Stop stop;
+  solve(batch, count, threads, stop);
 }
 
 // ---- MPC ----
 
 using Inputs = std::vector<Array>;
 
-difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxation, double barrier) {
+difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxation, double barrier, bool pivot) {
   using namespace difflcs;
   if (inputs.size() != kInputs) throw std::invalid_argument("expected 17 inputs");
   for (const Array& a : inputs)
@@ -165,6 +176,7 @@ difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxa
   }
   if (x < 1 || u < 1 || m < 1 || horizon < 1 || !(relaxation > 0) || !(barrier >= 0))
     throw std::invalid_argument("sizes, horizon and relaxation must be positive, the barrier not negative");
+  b.pivot = pivot;
   return b;
 }
 
@@ -172,16 +184,33 @@ void check_size(const char* name, int64_t got, int64_t expected) {
   if (got != expected) throw std::invalid_argument(std::string(name) + " has the wrong size");
 }
 
+// An element that the time did not suffice for: the actions to start from, the state where it is, no forces.
+void stay_at_start(const difflcs::MpcBatch& b, const difflcs::MpcSolve& o, int64_t e) {
+  using namespace difflcs;
+  const double *lo = b.input[kumin] + e * b.stride[kumin], *hi = b.input[kumax] + e * b.stride[kumax];
+  for (int64_t i = 0; i < b.horizon * b.n_u; i++) {
+    const double start = o.u_start ? o.u_start[e * b.horizon * b.n_u + i] : 0.0;
+    o.u[e * b.horizon * b.n_u + i] = std::min(std::max(start, lo[i % b.n_u]), hi[i % b.n_u]);
+  }
+  for (int64_t i = 0; i < (b.horizon + 1) * b.n_x; i++)
+    o.x[e * (b.horizon + 1) * b.n_x + i] = b.input[kx0][e * b.n_x + i % b.n_x];
+  std::fill_n(o.lam + e * b.horizon * b.n_lam, b.horizon * b.n_lam, 0.0);
+  o.objective[e] = o.residual[e] = std::numeric_limits<double>::max();
+  o.status[e] = static_cast<int8_t>(Status::max_iter), o.fragile[e] = 0, o.iterations[e] = 0;
+}
+
 void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, std::optional<Array> u_start,
                std::optional<Array> lam_start, double first_relaxation, double shrink, double tol, int64_t max_iter,
-               int threads, Output<double> x, Output<double> u, Output<double> lam, Output<double> objective,
-               Output<double> residual, Output<int8_t> status, Output<int32_t> iterations) {
-  const difflcs::MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier);
+               double certified, bool pivot, double time_limit, int threads, Output<double> x, Output<double> u,
+               Output<double> lam, Output<double> objective, Output<double> residual, Output<int8_t> status,
+               Output<int8_t> fragile, Output<int32_t> iterations) {
+  const difflcs::MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier, pivot);
   const int64_t states = b.count * (horizon + 1) * b.n_x, actions = b.count * horizon * b.n_u;
   const int64_t forces = b.count * horizon * b.n_lam;
   check_size("x", x.size(), states), check_size("u", u.size(), actions), check_size("lam", lam.size(), forces);
   check_size("objective", objective.size(), b.count), check_size("residual", residual.size(), b.count);
   check_size("status", status.size(), b.count), check_size("iterations", iterations.size(), b.count);
+  check_size("fragile", fragile.size(), b.count);
   if (u_start) check_size("u_start", u_start->size(), actions);
   if (lam_start) check_size("lam_start", lam_start->size(), forces);
   if (!(first_relaxation >= relaxation && shrink > 0 && shrink < 1))
@@ -192,27 +221,35 @@ void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
                             shrink,
                             tol,
                             max_iter,
+                            certified,
                             x.data(),
                             u.data(),
                             lam.data(),
                             objective.data(),
                             residual.data(),
                             status.data(),
+                            fragile.data(),
                             iterations.data()};
   if (b.count == 0) return;
-  nb::gil_scoped_release release;
+  std::fill_n(o.status, b.count, difflcs::kUnreached);
   const auto& kernels = difflcs::kernels();
   int64_t next = 0;
   const int64_t used = std::max<int64_t>(1, std::min<int64_t>(threads, b.count / kernels.lanes));
-  on_threads(used, kernels.mpc_workspace(b), [&](void* workspace) { kernels.mpc_solve(b, o, &next, workspace); });
+  Stop stop(time_limit);
+  on_threads(used, kernels.mpc_workspace(b), stop, [&](void* workspace, difflcs::Watch watch) {
+    kernels.mpc_solve(b, o, &next, workspace, watch);
+  });
+  if (stop.ending == kOutOfTime)
+    for (int64_t e = 0; e < b.count; e++)
+      if (o.status[e] == difflcs::kUnreached) stay_at_start(b, o, e);
 }
 
 void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, Array x, Array u, Array lam,
              Array x_bar, Array u_bar, Array lam_bar, Array objective_bar,
-             nb::ndarray<const int8_t, nb::device::cpu, nb::c_contig> solved, int threads,
+             nb::ndarray<const int8_t, nb::device::cpu, nb::c_contig> solved, bool pivot, int threads,
              std::vector<Output<double>> gradients) {
   using namespace difflcs;
-  const MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier);
+  const MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier, pivot);
   const int64_t states = b.count * (horizon + 1) * b.n_x, actions = b.count * horizon * b.n_u;
   const int64_t forces = b.count * horizon * b.n_lam;
   check_size("x", x.size(), states), check_size("u", u.size(), actions), check_size("lam", lam.size(), forces);
@@ -231,16 +268,17 @@ void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, 
       o.offset[i] = o.shared_size, o.shared_size += int64_t(inputs[i].size());
   }
   if (b.count == 0) return;
-  nb::gil_scoped_release release;
   const auto& kernels = difflcs::kernels();
   // Sums of shared inputs go block by block in a fixed order, so that they do not depend on the number of threads.
   const int64_t block = 64, blocks = (b.count + block - 1) / block;
   std::vector<double> partial(blocks * o.shared_size);
   o.partial = partial.data();
   std::atomic<int64_t> next{0};
-  on_threads(std::max<int64_t>(1, std::min<int64_t>(threads, blocks)), kernels.mpc_workspace(b), [&](void* workspace) {
+  const int64_t used = std::max<int64_t>(1, std::min<int64_t>(threads, blocks));
+  Stop stop;
+  on_threads(used, kernels.mpc_workspace(b), stop, [&](void* workspace, Watch watch) {
     for (int64_t i; (i = next.fetch_add(1)) < blocks;)
-      kernels.mpc_vjp(b, o, i * block, std::min(b.count, (i + 1) * block), i, workspace);
+      kernels.mpc_vjp(b, o, i * block, std::min(b.count, (i + 1) * block), i, workspace, watch);
   });
   for (int i = 0; i < kInputs; i++) {
     if (b.stride[i]) continue;
@@ -285,18 +323,22 @@ bool violation_loss(Inputs inputs, double gamma, double xi, int64_t max_iter, in
   const int64_t n = 2 * b.n_lam;
   check_size("Q", Q.size(), n * n), check_size("q", q.size(), b.count * n), check_size("z", z.size(), b.count * n);
   check_size("loss", loss.size(), b.count);
-  nb::gil_scoped_release release;
   const auto& kernels = difflcs::kernels();
   const AlignedBuffer workspace(kernels.violation_workspace(b));
-  if (!kernels.violation_qp(b, Q.data(), q.data(), workspace.data.get()) || b.count == 0) return false;
+  {
+    nb::gil_scoped_release release;
+    if (!kernels.violation_qp(b, Q.data(), q.data(), workspace.data.get()) || b.count == 0) return false;
+  }
   std::vector<double> w(b.count * n);
   std::vector<int8_t> status(b.count);
   std::vector<int32_t> iterations(b.count);
   const difflcs::LcpBatch lcp{n,        Q.data(), 0,        q.data(),      0.0,
                               max_iter, z.data(), w.data(), status.data(), iterations.data()};
-  solve(lcp, b.count, threads);
+  Stop stop;
+  solve(lcp, b.count, threads, stop);
   for (const int8_t s : status)
     if (s != static_cast<int8_t>(difflcs::Status::converged)) return false;
+  nb::gil_scoped_release release;
   kernels.violation_value(b, z.data(), loss.data(), workspace.data.get());
   return true;
 }
@@ -337,11 +379,11 @@ NB_MODULE(_kernels, m) {
   m.def("solve_lcp", &solve_lcp, "F"_a, "q"_a, "relaxation"_a, "max_iter"_a, "threads"_a, "lam"_a, "w"_a, "status"_a,
         "iterations"_a, "Solve a batch of LCPs into the given arrays.");
   m.def("solve_mpc", &solve_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "u_start"_a.none(),
-        "lam_start"_a.none(), "first_relaxation"_a, "shrink"_a, "tol"_a, "max_iter"_a, "threads"_a, "x"_a, "u"_a,
-        "lam"_a, "objective"_a, "residual"_a, "status"_a, "iterations"_a,
-        "Solve a batch of LCS-MPC problems into the given arrays.");
+        "lam_start"_a.none(), "first_relaxation"_a, "shrink"_a, "tol"_a, "max_iter"_a, "certified"_a, "pivot"_a,
+        "time_limit"_a, "threads"_a, "x"_a, "u"_a, "lam"_a, "objective"_a, "residual"_a, "status"_a, "fragile"_a,
+        "iterations"_a, "Solve a batch of LCS-MPC problems into the given arrays.");
   m.def("vjp_mpc", &vjp_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "x"_a, "u"_a, "lam"_a, "x_bar"_a,
-        "u_bar"_a, "lam_bar"_a, "objective_bar"_a, "solved"_a, "threads"_a, "gradients"_a,
+        "u_bar"_a, "lam_bar"_a, "objective_bar"_a, "solved"_a, "pivot"_a, "threads"_a, "gradients"_a,
         "Gradients of the inputs of solved LCS-MPC problems, into the given arrays.");
   m.def("violation_loss", &violation_loss, "inputs"_a, "gamma"_a, "xi"_a, "max_iter"_a, "threads"_a, "Q"_a, "q"_a,
         "z"_a, "r"_a, "e"_a, "loss"_a, "Violation loss of a batch and what its gradient needs, into the given arrays.");

@@ -9,26 +9,25 @@
 //
 // One problem per SIMD lane: the code reads like the solver of a single problem. A finished lane stores its result and
 // takes the next problem. No lane's arithmetic depends on another lane: whatever iterates, iterates under a mask.
+//
+// What is stored is judged by certificate.hpp from the stored numbers alone, whatever the solver thinks of them.
+#include "certificate.hpp"
 #include "kernels.hpp"
 #include "lanes.hpp"
 #include "lu.hpp"
+#include "sizes.hpp"
 
 namespace difflcs::DIFFLCS_ISA {
 namespace {
 
-// Problem sizes: compile-time where the template argument is not zero.
-template <int X, int U, int L>
-struct Sizes {
-  static constexpr int64_t kX = X, kU = U, kL = L;
-  int64_t rx, ru, rl, h;
-  explicit Sizes(const MpcBatch& b) : rx(b.n_x), ru(b.n_u), rl(b.n_lam), h(b.horizon) {}
-  int64_t x() const { return X ? X : rx; }
-  int64_t u() const { return U ? U : ru; }
-  int64_t l() const { return L ? L : rl; }
-  int64_t w() const { return x() + u(); }
-};
-
 constexpr double kTiny = 1e-300;
+// Projected gradient, in parts of its scale (see certificate.hpp), at which a problem is solved.
+constexpr double kStationary = 1e-7;
+// Smallest curvature of an action, in parts of what would move it across its whole range: bounds Newton's step where
+// the cost is flat.
+constexpr double kFlat = 1e-3;
+// A reduced Hessian is singular below this part of an action's own curvature (difflcs.mpc.kkt has the same).
+constexpr double kSingular = 1e-10;
 // Failed searches in a row, each with 8 times the damping, before a problem is given up.
 constexpr int64_t kFailures = 12;
 
@@ -42,16 +41,20 @@ struct Mpc {
   // lam = scale * lam', s = s' / scale, chosen so that F' has a unit diagonal: contacts in any units converge alike. C,
   // [D E], F, c, lam and s are kept in these units; the product lam o s does not change.
   T* scale;
+  // The cost is kept in units of 1 / cost_unit: weights below 1e-3 are lifted to one, so that tolerances hold for them.
+  T* cost_unit;
+  T *rest, *rest_end;  // curvature of each action by the next stage's weights alone: the least scale of its gradient
   Vec *d, *c, *q, *r, *qf, *lo, *hi, *x0;
   // Trajectory, trial trajectory, and the feedback law.
   Vec *x, *u, *lam, *s, *xt, *ut, *lamt, *st, *K, *kf, *grad;
   // Scratch of the backward sweep and of the LCP.
   Vec *P, *Pn, *v, *vn, *p, *pn, *M, *Mc, *Kl, *Tk, *Wk, *av, *bv, *Ah, *PA, *H, *lin, *Lc, *Kk, *y, *size, *gap, *res,
-      *newton, *wt, *dl;
+      *newton, *wt, *dl, *flat;
   // Kept per stage for the adjoint.
   Vec *Kl_s, *Ks_s, *Ah_s, *M_s, *size_s, *y_s, *P_s, *v_s, *p_s, *xb, *ub, *lb, *sum;
-  Mask *act, *low, *upp;
+  Mask *act, *low, *upp, *rows, *rows_s;
   Vec jb;
+  const bool adjoint;
   Vec mu;  // weight of the barrier of the bounds: follows the homotopy down to batch.barrier
 
   // Lays the arrays out in `memory`, or only counts them where it is null.
@@ -67,7 +70,7 @@ struct Mpc {
     auto vec = [&](Vec*& a, int64_t k) { a = static_cast<Vec*>(bytes(k * int64_t(sizeof(Vec)))); };
     auto mask = [&](Mask*& a, int64_t k) { a = static_cast<Mask*>(bytes(k * int64_t(sizeof(Mask)))); };
     mat(AB, nx * nw), mat(C, nx * nl), mat(DE, nl * nw), mat(F, nl * nl), mat(Q, nx * nx), mat(R, nu * nu);
-    mat(Qf, nx * nx), mat(scale, nl);
+    mat(Qf, nx * nx), mat(scale, nl), mat(cost_unit, 1), mat(rest, nu), mat(rest_end, nu);
     vec(d, nx), vec(c, nl), vec(q, nx), vec(r, nu), vec(qf, nx), vec(lo, nu), vec(hi, nu), vec(x0, nx);
     vec(x, (h + 1) * nx), vec(u, h * nu), vec(lam, h * nl), vec(s, h * nl);
     vec(xt, (h + 1) * nx), vec(ut, h * nu), vec(lamt, h * nl), vec(st, h * nl), vec(K, h * nu * nx), vec(kf, h * nu);
@@ -76,17 +79,18 @@ struct Mpc {
     vec(Mc, nl * nl), vec(Kl, nl * nw), vec(Tk, nl * nw), vec(Wk, nl * nw), vec(av, nl), vec(bv, nl);
     vec(Ah, nx * nw), vec(PA, nx * nw), vec(H, nw * nw), vec(lin, nw);
     vec(Lc, nu * nu), vec(Kk, nu * (nx + 1)), vec(y, nl), vec(size, nl), vec(gap, nl), vec(res, nl), vec(wt, nl);
-    vec(dl, nl), vec(newton, 6 * nl), mask(act, h * nu), mask(low, h * nu), mask(upp, h * nu);
+    vec(dl, nl), vec(newton, 6 * nl), mask(act, h * nu), mask(low, h * nu), mask(upp, h * nu), mask(rows, nl);
+    vec(flat, nu);
     if (adjoint) {
       vec(Kl_s, h * nl * nw), vec(Ks_s, h * nl * nw), vec(Ah_s, h * nx * nw), vec(M_s, h * nl * nl);
       vec(size_s, h * nl), vec(y_s, h * nl), vec(P_s, (h + 1) * nx * nx), vec(v_s, (h + 1) * nx);
-      vec(p_s, (h + 1) * nx), vec(xb, (h + 1) * nx), vec(ub, h * nu), vec(lb, h * nl);
+      vec(p_s, (h + 1) * nx), vec(xb, (h + 1) * nx), vec(ub, h * nu), vec(lb, h * nl), mask(rows_s, h * nl);
       vec(sum, 2 * nx * nx + nu * nu + nx * nx + nx * nw + nw * nl + nl * nl + nl * nx + 5 * nx + 3 * nu + nl);
     }
     return used;
   }
 
-  Mpc(const MpcBatch& b, void* memory, bool adjoint) : batch(b), n(b) {
+  Mpc(const MpcBatch& b, void* memory, bool adjoint) : batch(b), n(b), adjoint(adjoint) {
     layout(memory, adjoint);
     mu = all(b.barrier);
     if constexpr (sizeof(T) == sizeof(double))
@@ -115,19 +119,40 @@ struct Mpc {
     block(AB, nw, 0, kA, nx, nx, one, one), block(AB, nw, nx, kB, nx, nu, one, one);
     block(C, nl, 0, kC, nx, nl, one, contact), block(F, nl, 0, kF, nl, nl, contact, contact);
     block(DE, nw, 0, kD, nl, nx, contact, one), block(DE, nw, nx, kE, nl, nu, contact, one);
-    block(Q, nx, 0, kQ, nx, nx, one, one), block(R, nu, 0, kR, nu, nu, one, one);
-    block(Qf, nx, 0, kQfinal, nx, nx, one, one);
+    put(cost_unit, 0, lane, adjoint ? 1.0 : unit_of_cost(e));
+    const auto cost = [&](int64_t) { return lane_of(cost_unit[0], lane); };
+    block(Q, nx, 0, kQ, nx, nx, one, cost), block(R, nu, 0, kR, nu, nu, one, cost);
+    block(Qf, nx, 0, kQfinal, nx, nx, one, cost);
+    curvature_at_rest(n, AB + nx, nw, Q, R, rest, lane), curvature_at_rest(n, AB + nx, nw, Qf, R, rest_end, lane);
+  }
+
+  // A power of two that brings the largest weight to about one where it is below 1e-3.
+  double unit_of_cost(int64_t e) const {
+    double largest = 0;
+    const Input weights[] = {kQ, kR, kQfinal};
+    for (const Input which : weights) {
+      const int64_t size = which == kR ? n.u() : n.x();
+      for (int64_t i = 0; i < size * size; i++) {
+        const double weight = __builtin_fabs(input(which, e)[i]);
+        largest = weight > largest ? weight : largest;
+      }
+    }
+    if (!(largest > kTiny && largest < 1e-3)) return 1.0;
+    int exponent;
+    __builtin_frexp(largest, &exponent);
+    return __builtin_ldexp(1.0, -exponent);
   }
 
   void load(int64_t e, int lane) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l();
     if constexpr (sizeof(T) != sizeof(double)) load_matrices(e, lane);
-    auto vector = [&](Vec* to, Input which, int64_t size) {
+    auto vector = [&](Vec* to, Input which, int64_t size, double unit = 1.0) {
       const double* from = input(which, e);
-      for (int64_t i = 0; i < size; i++) put(to, i, lane, from[i]);
+      for (int64_t i = 0; i < size; i++) put(to, i, lane, from[i] * unit);
     };
-    vector(d, kd, nx), vector(c, kc, nl), vector(q, kq, nx), vector(r, kr, nu), vector(qf, kqfinal, nx);
-    vector(lo, kumin, nu), vector(hi, kumax, nu), vector(x0, kx0, nx);
+    const double cost = lane_of(cost_unit[0], lane);
+    vector(d, kd, nx), vector(c, kc, nl), vector(q, kq, nx, cost), vector(r, kr, nu, cost);
+    vector(qf, kqfinal, nx, cost), vector(lo, kumin, nu), vector(hi, kumax, nu), vector(x0, kx0, nx);
     for (int64_t i = 0; i < nl; i++) put(c, i, lane, c[i][lane] * lane_of(scale[i], lane));
   }
 
@@ -149,6 +174,28 @@ struct Mpc {
   }
   static void store_lane(double* to, const Vec* from, int64_t size, int lane) {
     for (int64_t i = 0; i < size; i++) to[i] = reinterpret_cast<const double*>(from + i)[lane];
+  }
+
+  // ---- elimination of lam ----
+  template <class Matrix>
+  static void factor(int64_t size, Matrix& matrix, [[maybe_unused]] Mask* exchanged) {
+    if constexpr (S::kPivot)
+      lu_factor_pivoted(size, matrix.v, exchanged);
+    else
+      lu_factor(size, matrix);
+  }
+  template <class Matrix, class Vector>
+  static void back(int64_t size, const Matrix& matrix, [[maybe_unused]] const Mask* exchanged, Vector& b) {
+    if constexpr (S::kPivot)
+      lu_solve_pivoted(size, matrix.v, exchanged, b.v);
+    else
+      lu_solve(size, matrix, b);
+  }
+  static void back_transposed(int64_t size, const Vec* matrix, [[maybe_unused]] const Mask* exchanged, Vec* b) {
+    if constexpr (S::kPivot)
+      lu_solve_transposed_pivoted(size, matrix, exchanged, b);
+    else
+      lu_solve_transposed(size, matrix, b);
   }
 
   // ---- dynamics ----
@@ -220,8 +267,8 @@ struct Mpc {
         jacobian[i * nl + i] += 1.0 - ratio;
         step[i] = root[i] - at[i] - w[i];
       }
-      lu_factor(nl, jacobian);
-      lu_solve(nl, jacobian, step);
+      factor(nl, jacobian, rows);
+      back(nl, jacobian, rows, step);
       Vec length = all(1), merit_next = merit;
       for (int search = 0; search < 8; search++) {
         DIFFLCS_UNROLL
@@ -269,17 +316,16 @@ struct Mpc {
 
   // ---- backward sweep ----
   struct Sweep {
-    Vec projected;  // projected gradient in units of the gradient, with the curvature as the scale of the bounds
-    Vec rounding;   // level below which rounding hides it
-    Vec residual;   // difflcs.mpc.kkt.residual
-    Mask weak;      // a bound is weakly active, or the reduced Hessian is singular
+    Vec projected;   // projected gradient in units of the gradient, with the curvature as the scale of the bounds
+    Vec rounding;    // level below which rounding hides it
+    Vec stationary;  // projected gradient in parts of its scale, which sees flat directions too (certificate.hpp)
+    Mask weak;       // a bound is weakly active, or the reduced Hessian is singular
   };
 
   template <bool kAdjoint>
   Sweep backward(Vec regularisation, Mask stubborn) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nw = n.w(), h = n.h;
     Sweep out{all(0), all(0), all(0), Mask{}};
-    Vec costate = all(1);
     for (int64_t i = 0; i < nx; i++) {
       Vec t = qf[i];
       for (int64_t j = 0; j < nx; j++) {
@@ -287,7 +333,6 @@ struct Mpc {
         t += Qf[i * nx + j] * x[h * nx + j];
       }
       p[i] = t;
-      costate = max(costate, abs(t));
       v[i] = kAdjoint ? -xb[h * nx + i] : t;
     }
     for (int64_t k = h - 1; k >= 0; k--) {
@@ -303,23 +348,32 @@ struct Mpc {
         av[i] = sk[i] * size[i], bv[i] = lk[i] * size[i];
       }
       Local<S::kL * S::kL> left(M), right(Mc);
-      auto factor = [&](auto& matrix, bool by_row) {  // diag(a) + diag(b) F, or diag(a) + F diag(b)
+      auto eliminate = [&](auto& matrix, bool by_row) {  // diag(a) + diag(b) F, or diag(a) + F diag(b)
         DIFFLCS_UNROLL
         for (int64_t i = 0; i < nl; i++) {
           DIFFLCS_UNROLL
           for (int64_t j = 0; j < nl; j++) matrix[i * nl + j] = bv[by_row ? i : j] * F[i * nl + j];
           matrix[i * nl + i] += av[i];
         }
-        lu_factor(nl, matrix);
+        factor(nl, matrix, rows);
       };
-      factor(left, true);
+      eliminate(left, true);
       for (int64_t i = 0; i < nl * nl; i++) M[i] = left[i];
-      factor(right, false);
+      // y = (diag(s) + F^T diag(lam))^-1 (-C^T p), from the same factors.
+      for (int64_t i = 0; i < nl; i++) {
+        Vec t = all(0);
+        for (int64_t j = 0; j < nx; j++) t -= C[j * nl + i] * p[j];
+        y[i] = t;
+      }
+      back_transposed(nl, M, rows, y);
+      if (kAdjoint)
+        for (int64_t i = 0; i < nl; i++) rows_s[k * nl + i] = rows[i];
+      eliminate(right, false);
       for (int64_t j = 0; j < nw; j++) {
         Local<S::kL> t(dl);
         DIFFLCS_UNROLL
         for (int64_t i = 0; i < nl; i++) t[i] = all(0) - DE[i * nw + j];
-        lu_solve(nl, right, t);
+        back(nl, right, rows, t);
         DIFFLCS_UNROLL
         for (int64_t i = 0; i < nl; i++) Tk[i * nw + j] = t[i], Kl[i * nw + j] = t[i] = bv[i] * t[i];
         for (int64_t i = 0; i < nx; i++) {
@@ -329,12 +383,6 @@ struct Mpc {
           Ah[i * nw + j] = sum;
         }
       }
-      for (int64_t i = 0; i < nl; i++) {
-        Vec t = all(0);
-        for (int64_t j = 0; j < nx; j++) t -= C[j * nl + i] * p[j];
-        y[i] = t;
-      }
-      lu_solve_transposed(nl, M, y);
       for (int64_t i = 0; i < nl; i++) {
         y[i] *= size[i];
         for (int64_t j = 0; j < nw; j++) Wk[i * nw + j] = -2.0 * y[i] * av[i] * Kl[i * nw + j];
@@ -400,16 +448,26 @@ struct Mpc {
           for (int64_t m = 0; m < nl; m++) l -= Kl[m * nw + nx + j] * lb[k * nl + m];
         lin[nx + j] = l, grad[k * nu + j] = g;
         // Away from an optimum P, and with it H, can be indefinite: |H| is still a scale for the distance to a bound.
-        const Vec gauss_newton = max(max(abs(H[(nx + j) * nw + nx + j]), all(0) + R[j * nu + j]), all(kTiny));
-        const Vec clipped = max(lo[j], min(hi[j], uk[j] - g));
-        out.residual = max(out.residual, abs(clipped - uk[j]));
+        // Where the cost is flat, the range of the action is the scale: a descent leads across all of it.
+        const Vec across = select(width > 0, abs(g) / width, all(0));
+        const Vec gauss_newton =
+            max(max(abs(H[(nx + j) * nw + nx + j]), all(0) + R[j * nu + j]), max(across, all(kTiny)));
         const Vec scaled = max(lo[j], min(hi[j], uk[j] - g / gauss_newton));
         Vec projected = abs(scaled - uk[j]) * gauss_newton;
         // Next to a bound the barrier is so steep that rounding u alone moves g: a step below rounding counts as none.
         if (batch.barrier > 0) projected = select(abs(g) <= 1e-14 * width * gauss_newton, all(0), projected);
         out.projected = max(out.projected, projected);
         out.rounding = max(out.rounding, 1e-12 * terms);
-        const Vec curved = max(H[(nx + j) * nw + nx + j] + curvature(nx + j, nx + j), all(kTiny));
+        if (batch.barrier > 0)
+          terms += mu * (1.0 / below + 1.0 / above) + 1e-8 * mu * width * (1.0 / (below * below) + 1.0 / (above * above));
+        const Vec reference = max(terms, (k == h - 1 ? rest_end[j] : rest[j]) * width);
+        Vec part = select(reference > 0, abs(g) / reference, all(0));
+        part = min(part, select(g > 0, below, above) / select(width > 0, width, all(1)));
+        if (batch.barrier > 0) part = select(projected > 0, part, all(0));
+        out.stationary = max(out.stationary, part);
+        flat[j] = kFlat * across;
+        const Vec least = 1e-10 * reference / select(width > 0, width, all(1));
+        const Vec curved = max(H[(nx + j) * nw + nx + j] + curvature(nx + j, nx + j), max(least, all(kTiny)));
         const Vec step = g / curved;
         if (batch.barrier == 0)
           out.weak |= (min(below, above) <= 1e-5 * width) & (abs(step) <= 1e-5 * width) & (width > 0);
@@ -435,7 +493,6 @@ struct Mpc {
         if (kAdjoint)
           for (int64_t m = 0; m < nl; m++) l -= Kl[m * nw + i] * lb[k * nl + m];
         pn[i] = a, lin[i] = l;
-        costate = max(costate, abs(a));
       }
       // Curvature that action j has at least, whatever its units.
       auto action_scale = [&](int64_t j) {
@@ -450,16 +507,21 @@ struct Mpc {
         for (int64_t i = 0; i < nu; i++)
           for (int64_t j = 0; j <= i; j++) {
             Vec t = H[(nx + i) * nw + nx + j] + use * curvature(nx + i, nx + j);
-            if (i == j && !kAdjoint) t += regularisation * action_scale(j);
+            if (i == j && !kAdjoint) t += regularisation * action_scale(j) + flat[j];
             Lc[i * nu + j] = select(active[i] | active[j], all(i == j), t);
           }
         for (int64_t j = 0; j < nu; j++) {
           Vec pivot = Lc[j * nu + j];
           for (int64_t m = 0; m < j; m++) pivot -= Lc[j * nu + m] * Lc[j * nu + m];
-          const Vec lift = kAdjoint ? 1e-10 * abs(H[(nx + j) * nw + nx + j]) : 0.05 * action_scale(j);
-          const Mask bad = ~(pivot >= lift) & ~active[j];
+          const Vec singular = kSingular * abs(H[(nx + j) * nw + nx + j]);
+          const Vec lift = kAdjoint ? singular : 0.05 * action_scale(j);
+          const Mask bad = ~(pivot > lift) & ~active[j];
           failed |= bad;
-          const Vec inverse = 1.0 / sqrt(select(bad, max(abs(pivot), lift), pivot));
+          // What is added where the cost is flat vanishes with the gradient, and does not hide that it is.
+          if (!kAdjoint && attempt == 0) out.weak |= ~(pivot - flat[j] > singular) & ~active[j];
+          Vec inverse = 1.0 / sqrt(select(bad, max(abs(pivot), lift), pivot));
+          // The adjoint holds an action that nothing moves, and takes a negative curvature by its size.
+          if (kAdjoint) inverse = select(bad & (abs(pivot) <= lift), all(0), inverse);
           Lc[j * nu + j] = inverse;
           for (int64_t i = j + 1; i < nu; i++) {
             Vec t = Lc[i * nu + j];
@@ -519,16 +581,18 @@ struct Mpc {
         for (int64_t i = 0; i < nx * nx; i++) P[i] = Pn[i];
       }
     }
-    out.residual /= costate;
     return out;
   }
 
   // ---- solve ----
+  // Large problems look at the watch at every stage, small ones once per iteration.
+  bool halted(Watch watch) const { return n.l() > 16 && watch.stop(watch.context); }
+
   // Roll u out at eps in the lanes of `wanted`; returns the cost of every lane.
-  Vec rollout(Vec eps, Mask wanted) {
+  Vec rollout(Vec eps, Mask wanted, Watch watch) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l();
     for (int64_t i = 0; i < nx; i++) x[i] = x0[i];
-    for (int64_t k = 0; k < n.h; k++) {
+    for (int64_t k = 0; k < n.h && !halted(watch); k++) {
       gap_at(x + k * nx, u + k * nu, gap);
       relaxed_lcp(lam + k * nl, s + k * nl, eps, ~wanted);
       next_state(x + k * nx, u + k * nu, lam + k * nl, x + (k + 1) * nx);
@@ -537,10 +601,10 @@ struct Mpc {
   }
 
   // The trial trajectory with step length `step` along the feedback law; lanes in `frozen` stay where they are.
-  Vec trial(Vec eps, Vec step, Mask frozen, Mask skip) {
+  Vec trial(Vec eps, Vec step, Mask frozen, Mask skip, Watch watch) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l();
     for (int64_t i = 0; i < nx; i++) xt[i] = x0[i];
-    for (int64_t k = 0; k < n.h; k++) {
+    for (int64_t k = 0; k < n.h && !halted(watch); k++) {
       Vec *xk = xt + k * nx, *uk = ut + k * nu, *lk = lamt + k * nl;
       for (int64_t j = 0; j < nu; j++) {
         Vec t = u[k * nu + j] + step * kf[k * nu + j];
@@ -565,9 +629,21 @@ struct Mpc {
     int64_t iterations, in_stage, failures;
   };
 
-  void solve(const MpcSolve& o, int64_t* next) {
+  void solve(const MpcSolve& o, int64_t* next, void* rest_of_workspace, Watch watch) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), h = n.h;
     const double target = batch.relaxation;
+    Certificate<T, S> certificate(batch, rest_of_workspace);
+    int64_t finished[kLanes];
+    int waiting = 0;
+    auto store = [&](int l, int64_t e, Status status, double J, int64_t iterations) {
+      store_lane(o.x + e * (h + 1) * nx, x, (h + 1) * nx, l);
+      store_lane(o.u + e * h * nu, u, h * nu, l);
+      store_lam(o.lam + e * h * nl, l);
+      o.objective[e] = J / lane_of(cost_unit[0], l), o.iterations[e] = int32_t(iterations);
+      o.status[e] = int8_t(status);
+      finished[waiting++] = e;
+      if (waiting == kLanes) certificate.judge(o, finished, waiting), waiting = 0;
+    };
     Lane lane[kLanes];
     Vec eps = all(target), regularisation = all(0), J = all(0);
     int live = 0;
@@ -605,10 +681,16 @@ struct Mpc {
     while (live > 0) {
       Mask idle;
       for (int l = 0; l < kLanes; l++) idle[l] = lane[l].element < 0 ? -1 : 0;
-      mu = batch.barrier * (eps / target);
+      mu = batch.barrier * (eps / target) * cost_unit[0];
       if (any(fresh & ~idle)) {
-        const Vec rolled = rollout(eps, fresh & ~idle);
+        const Vec rolled = rollout(eps, fresh & ~idle, watch);
         J = select(fresh, rolled, J);
+      }
+      if (watch.stop(watch.context)) {
+        // What has a trajectory is stored; what has none stays unreached.
+        for (int l = 0; l < kLanes; l++)
+          if (!idle[l] && !fresh[l]) store(l, lane[l].element, Status::max_iter, J[l], lane[l].iterations);
+        break;
       }
       fresh = Mask{};
       // Gauss-Newton can creep along a curved valley: after 20 steps in one stage every other one keeps the curvature.
@@ -621,18 +703,18 @@ struct Mpc {
         Lane& a = lane[l];
         const double tol = o.tol > sweep.rounding[l] ? o.tol : sweep.rounding[l];
         // A search that fails this close to the optimum has met the rounding of the cost.
-        const bool converged = sweep.projected[l] <= (a.failures < kFailures ? tol : 1e3 * tol);
+        const double patience = a.failures < kFailures ? 1.0 : 1e3;
+        const bool converged = sweep.projected[l] <= patience * tol && sweep.stationary[l] <= patience * kStationary;
         const bool broken = !(J[l] < 1e300 && J[l] > -1e300);
         if (!converged && !broken && a.iterations < o.max_iter && a.failures < kFailures) continue;
-        const int64_t e = a.element;
-        store_lane(o.x + e * (h + 1) * nx, x, (h + 1) * nx, l);
-        store_lane(o.u + e * h * nu, u, h * nu, l);
-        store_lam(o.lam + e * h * nl, l);
-        o.objective[e] = J[l], o.residual[e] = sweep.residual[l], o.iterations[e] = int32_t(a.iterations);
+        if (converged && regularisation[l] > 0 && !broken) {  // once more without it: it hides a singular Hessian
+          regularisation[l] = 0, frozen[l] = -1;
+          continue;
+        }
         const Status status = converged && !broken         ? (sweep.weak[l] ? Status::degenerate : Status::converged)
                               : a.iterations >= o.max_iter ? Status::max_iter
                                                            : Status::numerical;
-        o.status[e] = int8_t(status);
+        store(l, a.element, status, J[l], a.iterations);
         frozen[l] = -1;
         if (!take(l)) live--;
       }
@@ -641,7 +723,8 @@ struct Mpc {
       Vec step = all(1), J_trial = J;
       Mask accepted = frozen;
       for (int search = 0; search < 5; search++) {
-        const Vec value = trial(eps, step, frozen, accepted);
+        const Vec value = trial(eps, step, frozen, accepted, watch);
+        if (halted(watch)) break;
         // First-order change of the cost along the step as it was clipped: grad is dJ/du of the whole trajectory.
         Vec slope = all(0);
         for (int64_t i = 0; i < h * nu; i++) slope += grad[i] * (ut[i] - u[i]);
@@ -675,13 +758,14 @@ struct Mpc {
         }
       }
     }
+    if (waiting) certificate.judge(o, finished, waiting);
   }
 
   // ---- adjoint ----
-  void vjp(const MpcGradient& o, int64_t begin, int64_t end, int64_t block) {
+  void vjp(const MpcGradient& o, int64_t begin, int64_t end, int64_t block, Watch watch) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), h = n.h;
     for (int64_t i = 0; i < o.shared_size; i++) sum[i] = all(0);
-    for (int64_t group = begin; group < end; group += kLanes) {
+    for (int64_t group = begin; group < end && !watch.stop(watch.context); group += kLanes) {
       Mask valid;
       for (int l = 0; l < kLanes; l++) {
         const int64_t e = group + l < end ? group + l : end - 1;
@@ -776,7 +860,7 @@ void Mpc<T, S>::forward_adjoint(const MpcGradient& o, int64_t group, int64_t end
       for (int64_t j = 0; j < nl; j++) t -= F[j * nl + i] * (yk[j] * dlam[j]);
       dy[i] = t;
     }
-    lu_solve_transposed(nl, M_s + k * nl * nl, dy);
+    back_transposed(nl, M_s + k * nl * nl, rows_s + k * nl, dy);
     for (int64_t i = 0; i < nl; i++) {
       dy[i] *= size_s[k * nl + i];
       rho[i] = yk[i] * lk[i];
@@ -846,11 +930,10 @@ struct Variant {
 // Calls f with the variant that fits: compile-time sizes for the paper's tasks, matrices shared or per element.
 template <class Function>
 void dispatch(const MpcBatch& b, Function f) {
-  bool shared = true;
-  const Input matrices[] = {kA, kB, kC, kD, kE, kF, kQ, kR, kQfinal};
-  for (const Input which : matrices) shared = shared && b.stride[which] == 0;
   const bool paper = b.n_x == 9 && b.n_u == 6;
-  if (!shared)
+  if (b.pivot)
+    f(Variant<Vec, Pivoting>());
+  else if (!shared_matrices(b))
     f(Variant<Vec, Sizes<0, 0, 0>>());
   else if (paper && b.n_lam == 5)
     f(Variant<double, Sizes<9, 6, 5>>());
@@ -860,22 +943,28 @@ void dispatch(const MpcBatch& b, Function f) {
     f(Variant<double, Sizes<0, 0, 0>>());
 }
 
+// The layout of the widest variant, adjoint included, serves all.
+int64_t solver_workspace(const MpcBatch& batch) {
+  return Mpc<Vec, Sizes<0, 0, 0>>(batch, nullptr, true).layout(nullptr, true);
+}
+
 }  // namespace
 
 int64_t mpc_workspace(const MpcBatch& batch) {
-  // The layout of the widest variant, adjoint included, serves all.
-  Mpc<Vec, Sizes<0, 0, 0>> counter(batch, nullptr, true);
-  return counter.layout(nullptr, true);
+  return solver_workspace(batch) + Certificate<Vec, Sizes<0, 0, 0>>(batch, nullptr).layout(nullptr);
 }
 
-void mpc_solve(const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void* workspace) {
-  dispatch(batch, [&](auto type) { typename decltype(type)::Solver(batch, workspace, false).solve(solve, next); });
+void mpc_solve(const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void* workspace, Watch watch) {
+  dispatch(batch, [&](auto type) {
+    void* rest = static_cast<char*>(workspace) + solver_workspace(batch);
+    typename decltype(type)::Solver(batch, workspace, false).solve(solve, next, rest, watch);
+  });
 }
 
 void mpc_vjp(const MpcBatch& batch, const MpcGradient& gradient, int64_t begin, int64_t end, int64_t block,
-             void* workspace) {
+             void* workspace, Watch watch) {
   dispatch(batch, [&](auto type) {
-    typename decltype(type)::Solver(batch, workspace, true).vjp(gradient, begin, end, block);
+    typename decltype(type)::Solver(batch, workspace, true).vjp(gradient, begin, end, block, watch);
   });
 }
 

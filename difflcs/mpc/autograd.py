@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
-from difflcs.errors import DoubleBackwardError
+from difflcs.errors import DegenerateWarning, DoubleBackwardError
 from difflcs.mpc.backends.base import Backend, Result
 from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.mpc.solution import Primal
@@ -13,31 +18,115 @@ from difflcs.status import Status
 
 
 class SolveMPC(torch.autograd.Function):
-    """Tensors (in the order of `INPUTS`) → x, u, lam, objective, status, iterations, kkt_residual, solve_time."""
+    """Tensors (in the order of `INPUTS`) → x, u, lam, objective, status, iterations, kkt_residual, solve_time.
+
+    `dtype` is that of x, u and lam; the objective stays in float64, without the cost's `constant` (batch,), which only
+    counts for what `dtype` can hold. `smallest` is the narrowest dtype in which a gradient will arrive.
+    """
 
     @staticmethod
-    def forward(ctx, problem: MPCProblem, backend: Backend, guess: Primal | None, *tensors: Tensor):  # noqa: D102
-        # `problem` holds the values of `tensors`; these are here only to receive gradients.
+    def forward(  # noqa: D102
+        ctx,
+        problem: MPCProblem,
+        backend: Backend,
+        guess: Primal | None,
+        dtype: torch.dtype,
+        smallest: torch.dtype,
+        constant: Tensor,
+        *tensors: Tensor,
+    ):
+        # `problem` holds the values of `tensors`; these are here to receive gradients, and are saved so that autograd
+        # refuses them where they were changed in place.
         result = backend.solve(problem, guess)
-        ctx.problem, ctx.backend, ctx.result = problem, backend, result
-        # Aliases: if the outputs themselves were kept for backward, they would hold this node and it them, a cycle that
-        # only the garbage collector breaks.
-        x, u, lam = (v.detach() for v in result.primal)
-        outputs = (x, u, lam, problem.objective(x, u))
+        objective = problem.objective(result.primal.x, result.primal.u)
+        result, objective = _within_range(result, objective, constant, dtype)
+        ctx.problem, ctx.backend, ctx.result, ctx.limit = problem, backend, result, torch.finfo(smallest).max
+        ctx.save_for_backward(*tensors)
+        # Copies: what the caller does with the outputs must not change the gradient.
+        x, u, lam = (v.to(dtype, copy=any(ctx.needs_input_grad)) for v in result.primal)
+        u = _inside(u, problem) if dtype != torch.float64 else u
         info = tuple(v.detach() for v in (result.status, result.iterations, result.kkt_residual, result.solve_time))
         ctx.mark_non_differentiable(*info)
-        return *outputs, *info
+        return x, u, lam, objective, *info
 
     @staticmethod
     def backward(ctx, *grads: Tensor):  # noqa: D102
         if torch.is_grad_enabled():
             raise DoubleBackwardError("LCSMPCLayer has first derivatives only; expected create_graph=False")
+        _ = ctx.saved_tensors  # raises where one was changed in place
         result: Result = ctx.result
         solved = (result.status == Status.CONVERGED) | (result.status == Status.DEGENERATE)
         # Whatever comes upstream for a failed element is dropped before it can meet the others.
         upstream = tuple(
-            torch.where(solved.reshape(-1, *[1] * (g.ndim - 1)), g, torch.zeros_like(g)) for g in grads[:4]
+            torch.where(solved.reshape(-1, *[1] * (g.ndim - 1)), g.double(), 0.0) for g in grads[:4]
         )
-        gradients = ctx.backend.vjp(ctx.problem, result, upstream, solved)
-        needed = ctx.needs_input_grad[3:]
-        return None, None, None, *(gradients[k] if n else None for k, n in zip(INPUTS, needed, strict=True))
+        gradients = _finite(lambda keep: ctx.backend.vjp(ctx.problem, result, upstream, keep), solved, ctx.limit)
+        needed = ctx.needs_input_grad[6:]
+        return *[None] * 6, *(gradients[k] if n else None for k, n in zip(INPUTS, needed, strict=True))
+
+
+def _within_range(
+    result: Result, objective: Tensor, constant: Tensor, dtype: torch.dtype
+) -> tuple[Result, Tensor]:
+    """Elements whose numbers `dtype` cannot hold become NUMERICAL; those that failed get numbers that it can."""
+    largest = torch.finfo(dtype).max
+    total = objective + constant
+    held = total.abs() <= largest
+    if dtype != torch.float64:
+        for value in result.primal:
+            held &= value.abs().amax((1, 2)) <= largest
+    solved = (result.status == Status.CONVERGED) | (result.status == Status.DEGENERATE)
+    if bool((held & solved).all()):
+        return result, objective
+    status = torch.where(solved & ~held, int(Status.NUMERICAL), result.status).to(torch.int8)
+    failed = ~(solved & held)
+    rows = failed[:, None, None]
+    primal = Primal(*(torch.where(rows, v.clamp(-largest, largest), v) for v in result.primal))
+    room = largest / 4 - constant.abs()  # the caller adds the constant
+    finite = torch.nan_to_num(objective, nan=largest)
+    objective = torch.where(failed, torch.maximum(torch.minimum(finite, room), -room), objective)
+    return replace(result, primal=primal, status=status), objective
+
+
+def _inside(u: Tensor, problem: MPCProblem) -> Tensor:
+    """Rounded actions (batch, H, n_u), inside the bounds in float64 too where a number of their dtype lies there."""
+    low, high = (v.to(u.dtype) for v in (problem.u_min, problem.u_max))
+    up, down = torch.full_like(low, torch.inf), torch.full_like(high, -torch.inf)
+    low = torch.where(low.double() < problem.u_min, torch.nextafter(low, up), low)
+    high = torch.where(high.double() > problem.u_max, torch.nextafter(high, down), high)
+    low, high = low.unsqueeze(-2), high.unsqueeze(-2)
+    return torch.where(low <= high, torch.minimum(torch.maximum(u, low), high), u)
+
+
+def _finite(vjp: Callable[[Tensor], dict[str, Tensor]], solved: Tensor, limit: float) -> dict[str, Tensor]:
+    """Gradients without the elements whose own are not finite; they are found by halving the batch."""
+    gradients = vjp(solved)
+    if _all_finite(list(gradients.values()), limit):
+        return gradients
+    total, dropped = {name: torch.zeros_like(value) for name, value in gradients.items()}, 0
+    todo = [torch.nonzero(solved).squeeze(-1)]
+    while todo:
+        index = todo.pop()
+        keep = torch.zeros_like(solved)
+        keep[index] = True
+        gradients = vjp(keep)
+        if _all_finite(list(gradients.values()), limit):
+            total = {name: value + gradients[name] for name, value in total.items()}
+        elif len(index) > 1:
+            todo += [index[: len(index) // 2], index[len(index) // 2 :]]
+        else:
+            dropped += 1
+    warnings.warn(
+        f"the gradient of {dropped} of {len(solved)} solutions is not finite and was left out; check the scale of the "
+        f"inputs and of the gradient that arrives at the layer",
+        DegenerateWarning,
+        stacklevel=2,
+    )
+    return total
+
+
+def _all_finite(values: Sequence[Tensor], limit: float) -> bool:
+    if limit < torch.finfo(torch.float64).max:
+        return all(bool((v.abs() <= limit).all()) for v in values)
+    # A finite sum has finite terms; large terms can overflow it.
+    return math.isfinite(sum(float(v.sum()) for v in values)) or all(bool(torch.isfinite(v).all()) for v in values)

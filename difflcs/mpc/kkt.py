@@ -55,9 +55,12 @@ from difflcs._linalg import matvec
 from difflcs.mpc.problem import MPCProblem
 from difflcs.mpc.solution import Primal
 
+# Largest residual of a solution: what CONVERGED means.
+CERTIFIED = 1e-6
 # A bound is weakly active where both the distance to it and the Newton step across it are below this part of the range.
 _WEAK = 1e-5
-# A reduced Hessian counts as singular below this relative pivot, and is regularised up to it.
+# A reduced Hessian counts as singular below this pivot, in units of each action's own curvature. Directions below it are
+# held: their sensitivity is zero.
 _SINGULAR = 1e-10
 
 
@@ -120,24 +123,74 @@ def multipliers(problem: MPCProblem, primal: Primal) -> Multipliers:
 
 
 def residual(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
-    """Largest violation of the optimality conditions, (batch,).
+    """Largest violation of the optimality conditions, (batch,); without units, and infinite for what is not a number.
 
-    The maximum over: dynamics [state units], |λ∘s − relaxation|, negative λ or s, actions outside their bounds, and the
-    projected gradient u − clip(u − g) [the smaller of an action and of a gradient], which is divided by the largest
-    costate where that exceeds 1, so that a cost in other units is judged alike.
+    A solution is CONVERGED where this is at most `CERTIFIED`. The maximum, over all steps and components, of
+
+    - dynamics: |x_{k+1} − (A x_k + B u_k + C λ_k + d)| in parts of Σ|terms|, the sum of the sizes of the terms of the
+      right-hand side; likewise x_0 against x0;
+    - complementarity: |λ∘s − ε| / (ε + 1e-7·λ·Σ|terms of s|), the second part being the rounding of s = Dx + Eu + Fλ + c
+      times 1e9; and 1 where λ is not positive;
+    - bounds: the distance of an action to them, in parts of its range u_max − u_min;
+    - stationarity in λ: |Cᵀp + s∘y + Fᵀρ| in parts of its Σ|terms|;
+    - stationarity in u: |u − clip(u − range·g/G)| / range, the part of its range by which the reduced gradient g would
+      still move an action. G is the scale of g: the larger of its Σ|terms| and of range·(Rⱼⱼ + BⱼᵀQBⱼ), what its weights
+      make of a step across the range. It does not vanish with the curvature, so that flat directions count.
     """
     x, u, lam = (v.transpose(0, 1) for v in primal)  # steps first, so that per-element matrices broadcast
-    s = dual.s.transpose(0, 1)
-    projected = u - torch.minimum(torch.maximum(u - dual.gradient.transpose(0, 1), problem.u_min), problem.u_max)
-    terms = [
-        x[1:] - problem.next_state(x[:-1], u, lam),
-        lam * s - problem.relaxation,
-        lam.clamp_max(0),
-        s.clamp_max(0),
-        u - torch.minimum(torch.maximum(u, problem.u_min), problem.u_max),
-        projected / dual.p.abs().amax((1, 2)).clamp_min(1.0).unsqueeze(-1),
+    p, y, rho = (v.transpose(0, 1) for v in (dual.p, dual.y, dual.rho))
+    s, g, low, high = dual.s.transpose(0, 1), dual.gradient.transpose(0, 1), problem.u_min, problem.u_max
+    P = problem
+    x_terms = _terms((P.A, x[:-1]), (P.B, u), (P.C, lam)) + P.d.abs()
+    s_terms = _terms((P.D, x[:-1]), (P.E, u), (P.F, lam)) + P.c.abs()
+    lam_row = matvec(P.C.mT, p[1:]) + s * y + matvec(P.F.mT, rho)
+    lam_terms = _terms((P.C.mT, p[1:]), (P.F.mT, rho)) + (s * y).abs()
+    u_terms = _gradient_terms(problem, primal, dual).transpose(0, 1)
+    width = high - low
+    at_rest = torch.stack([_at_rest(P, P.Q)] * (P.horizon - 1) + [_at_rest(P, P.Q_final)])
+    scale = torch.maximum(u_terms, width * (at_rest if at_rest.ndim == 3 else at_rest.unsqueeze(1)))
+    unit = torch.where(width > 0, width, torch.ones_like(width))
+    moved = torch.minimum(_parts(g, scale), torch.where(g > 0, u - low, high - u) / unit).clamp_min(0.0)
+    violations = [
+        _parts(x[0] - P.x0, P.x0.abs()).unsqueeze(0),
+        _parts(x[1:] - P.next_state(x[:-1], u, lam), x_terms),
+        (lam * s - P.relaxation).abs() / (P.relaxation + 1e-7 * lam.abs() * s_terms),
+        (~(lam > 0)).to(lam.dtype),
+        torch.maximum(low - u, u - high).clamp_min(0.0) / unit,
+        _parts(lam_row, lam_terms),
+        torch.where(width > 0, moved, torch.zeros_like(moved)) + 0 * g,
     ]
-    return torch.stack([t.abs().amax((0, 2)) for t in terms]).amax(0)
+    worst = torch.stack([v.amax((0, 2)) for v in violations]).amax(0)  # amax keeps NaN
+    return torch.nan_to_num(worst, nan=torch.inf)
+
+
+def _terms(*products: tuple[Tensor, Tensor]) -> Tensor:
+    """Σ|terms| of a sum of products of a matrix and a vector."""
+    first, *rest = (matvec(matrix.abs(), vector.abs()) for matrix, vector in products)
+    return sum(rest, first)
+
+
+def _gradient_terms(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
+    """Σ|terms| (batch, H, n_u) of the reduced gradient."""
+    u, p, rho = (v.transpose(0, 1) for v in (primal.u, dual.p[:, 1:], dual.rho))
+    terms = _terms((problem.R, u), (problem.B.mT, p), (problem.E.mT, rho)) + problem.r.abs()
+    terms = terms.transpose(0, 1)
+    if problem.barrier > 0:
+        below, above = problem.distances(primal.u)
+        terms = terms + problem.barrier * (1 / below + 1 / above)
+        # Next to a bound the barrier is so steep that rounding u moves g.
+        width = (problem.u_max - problem.u_min).unsqueeze(-2)
+        terms = terms + 1e-8 * problem.barrier * width * (below.square().reciprocal() + above.square().reciprocal())
+    return terms
+
+
+def _parts(value: Tensor, terms: Tensor) -> Tensor:
+    return value.abs() / torch.where(terms > 0, terms, torch.ones_like(terms))
+
+
+def _at_rest(problem: MPCProblem, weight: Tensor) -> Tensor:
+    """Curvature (..., n_u) of each action by its own weight and the next state's."""
+    return problem.R.diagonal(dim1=-2, dim2=-1) + (problem.B * (weight @ problem.B)).sum(-2)
 
 
 def _backward(problem: MPCProblem, primal: Primal) -> tuple[Multipliers, list[tuple[Tensor, Tensor, Tensor]]]:
@@ -188,8 +241,10 @@ def linearise(problem: MPCProblem, primal: Primal) -> Linearisation:
     curvature = barrier_curvature(problem, primal.u)
     stages, lowers, uppers = [], [], []
     degenerate = torch.zeros(problem.batch, dtype=torch.bool)
+    sizes = _gradient_terms(problem, primal, dual)
     for k in reversed(range(problem.horizon)):
         factors, pivots, size = lcp[k]
+        last = k == problem.horizon - 1
         u, g = primal.u[:, k], dual.gradient[:, k]
         b = (primal.lam[:, k] / size).unsqueeze(-1)
         K_lam = -torch.linalg.lu_solve(factors, pivots, b * DE)
@@ -201,7 +256,10 @@ def linearise(problem: MPCProblem, primal: Primal) -> Linearisation:
         hessian[:, :n_x, :n_x] += problem.Q
         hessian[:, n_x:, n_x:] += problem.R + torch.diag_embed(curvature[:, k])
         Q_uu = hessian[:, n_x:, n_x:]
-        h = Q_uu.diagonal(dim1=-2, dim2=-1).clamp_min(torch.finfo(torch.float64).tiny)
+        # The least curvature keeps rounding of a gradient apart from a reason to leave the interior.
+        reference = torch.maximum(sizes[:, k], width * (_at_rest(problem, problem.Q_final if last else problem.Q)))
+        least = 1e-10 * reference / torch.where(width > 0, width, torch.ones_like(width))
+        h = torch.maximum(Q_uu.diagonal(dim1=-2, dim2=-1), least.clamp_min(torch.finfo(torch.float64).tiny))
         to_lower, to_upper, step = u - problem.u_min, problem.u_max - u, g / h
         lower = (step > to_lower) | ((width <= 0) & (g >= 0))
         upper = (-step > to_upper) | ((width <= 0) & (g < 0))
@@ -235,29 +293,29 @@ def _join(left: Tensor, right: Tensor) -> Tensor:
 
 
 def _cholesky(Q_uu: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
-    """Factor Q_uu with identity rows where not free; eigenvalues below the threshold are lifted to it."""
-    mask = free.unsqueeze(-1) & free.unsqueeze(-2)
+    """Factor Q_uu with identity rows where not free; where it is singular or indefinite, a positive definite stand-in.
+
+    Its eigenvalues are taken in units of each action's own curvature. One near zero becomes so large that its direction
+    hardly moves; a negative one is taken by its size.
+    """
+    diagonal = Q_uu.diagonal(dim1=-2, dim2=-1)
+    unit = torch.where(free & (diagonal > 0), diagonal, torch.ones_like(diagonal)).sqrt()
     eye = torch.eye(Q_uu.shape[-1], dtype=Q_uu.dtype)
-    scale = Q_uu.diagonal(dim1=-2, dim2=-1).abs().amax(-1).clamp_min(torch.finfo(Q_uu.dtype).tiny)
-    # Scaled to unit size, so that the identity rows of active actions do not decide what counts as singular.
-    scaled = torch.where(mask, 0.5 * (Q_uu + Q_uu.mT) / scale[:, None, None], eye)
+    mask = free.unsqueeze(-1) & free.unsqueeze(-2)
+    symmetric = 0.5 * (Q_uu + Q_uu.mT) / unit.unsqueeze(-1) / unit.unsqueeze(-2)
+    scaled = torch.where(mask, symmetric, eye)
     L, info = torch.linalg.cholesky_ex(scaled)
     pivots = L.diagonal(dim1=-2, dim2=-1).square().amin(-1)
     singular = (info != 0) | ~(pivots > _SINGULAR)
     if bool(singular.any()):
         bad = torch.nonzero(singular).squeeze(-1)
-        finite = torch.nan_to_num(scaled[bad], posinf=0.0, neginf=0.0)
-        values, vectors = torch.linalg.eigh(finite)
-        lifted = (vectors * values.clamp_min(10 * _SINGULAR).unsqueeze(-2)) @ vectors.mT
+        values, vectors = torch.linalg.eigh(torch.nan_to_num(scaled[bad], posinf=0.0, neginf=0.0))
+        flat = values.abs() <= 10 * _SINGULAR * values.abs().amax(-1, keepdim=True)
+        lifted = torch.where(flat, 1 / _SINGULAR, values.abs())
         L = L.clone()
-        L[bad] = torch.linalg.cholesky_ex(lifted).L
-    return L * scale.sqrt()[:, None, None] * _where_free(free, scale), singular
+        L[bad] = torch.linalg.cholesky_ex((vectors * lifted.unsqueeze(-2)) @ vectors.mT).L
+    return L * unit.unsqueeze(-1), singular
 
-
-def _where_free(free: Tensor, scale: Tensor) -> Tensor:
-    # Undo the scale on identity rows: they stay identity.
-    inverse = (1 / scale.sqrt())[:, None].expand(free.shape)
-    return torch.where(free, torch.ones_like(inverse), inverse).unsqueeze(-1)
 
 
 @dataclass(frozen=True)

@@ -158,16 +158,20 @@ class LCSMPCLayer(nn.Module):
         smooth = self.training_relaxation if self.training else None
         relaxation = self.relaxation if smooth is None else smooth
         problem = MPCProblem(**values, horizon=self.horizon, relaxation=relaxation, barrier=self.barrier)
-        outputs = SolveMPC.apply(problem, self.backend, self._guess(guess, batch), *flat)
+        constant = cost.constant.detach().to("cpu", torch.float64).expand(batch).reshape(-1)
+        smallest = torch.float32 if any(t.dtype == torch.float32 for t in tensors.values()) else torch.float64
+        outputs = SolveMPC.apply(
+            problem, self.backend, self._guess(guess, batch), x0.dtype, smallest, constant, *flat
+        )
         *primal, objective, status, iterations, residual, seconds = outputs  # pyright: ignore[reportGeneralTypeIssues]
         self._report(status, torch.is_grad_enabled() and any(t.requires_grad for t in flat))
 
-        def shaped(value: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-            return value.reshape((*batch, *value.shape[1:])).to(x0.device, dtype or value.dtype)
+        def shaped(value: Tensor) -> Tensor:
+            return value.reshape((*batch, *value.shape[1:])).to(x0.device)
 
         return MPCSolution(
-            *(shaped(v, x0.dtype) for v in primal),
-            objective=shaped(objective, x0.dtype) + cost.constant.to(x0.dtype),
+            *(shaped(v) for v in primal),
+            objective=(shaped(objective) + cost.constant).to(x0.dtype),
             status=shaped(status),
             iterations=shaped(iterations),
             kkt_residual=shaped(residual),

@@ -25,7 +25,7 @@ class Result:
         primal: x (batch, H+1, n_x), u (batch, H, n_u) inside the bounds, lam (batch, H, n_lam).
         status: (batch,) int8 `Status`.
         iterations: (batch,) int32.
-        kkt_residual: (batch,) see `difflcs.mpc.kkt.residual`.
+        kkt_residual: (batch,) see `difflcs.mpc.kkt.residual`; the largest float where it is infinite.
         solve_time: (batch,) seconds.
         linearisation: the factored optimality conditions for the gradient.
     """
@@ -75,16 +75,17 @@ def certify(
 ) -> Result:
     """Judge raw trajectories by the optimality conditions themselves, whatever the solver claims.
 
-    A CONVERGED element whose residual exceeds `tol` becomes NUMERICAL; one that is not classically differentiable
-    becomes DEGENERATE. Elements that did not converge get finite numbers: their actions clipped into the bounds
-    (zero where not finite) and the trajectory that these cause.
+    Actions are clipped into the bounds first. A CONVERGED element whose `difflcs.mpc.kkt.residual` exceeds `tol`
+    becomes NUMERICAL; one that is not classically differentiable becomes DEGENERATE. Elements that did not converge get
+    finite numbers: their actions clipped into the bounds (zero where not finite) and the trajectory that these cause.
     """
     status = status.clone()
+    primal = primal._replace(u=problem.clip(primal.u))
     finite = torch.stack([torch.isfinite(v).all(-1).all(-1) for v in primal]).all(0)
     status[~finite & (status == Status.CONVERGED)] = Status.NUMERICAL
     primal = replace_failed(problem, primal, status != Status.CONVERGED)
     linearisation = kkt.linearise(problem, primal)
-    residual = torch.nan_to_num(kkt.residual(problem, primal, linearisation.multipliers), nan=torch.inf)
+    residual = kkt.residual(problem, primal, linearisation.multipliers)
     status[(residual > tol) & (status == Status.CONVERGED)] = Status.NUMERICAL
     status[linearisation.degenerate & (status == Status.CONVERGED)] = Status.DEGENERATE
     residual = residual.clamp_max(torch.finfo(residual.dtype).max)
@@ -93,9 +94,9 @@ def certify(
 
 def replace_failed(problem: MPCProblem, primal: Primal, failed: Tensor) -> Primal:
     """Finite numbers for failed (batch,) elements: actions clipped into the bounds, and the trajectory they cause."""
-    if not bool(failed.any()):
-        return primal
     index = torch.nonzero(failed).squeeze(-1)
+    if not len(index):
+        return primal
     part = problem.select(index)
     u = part.clip(torch.nan_to_num(primal.u[index], posinf=0.0, neginf=0.0))
     x, lam = part.rollout(u)

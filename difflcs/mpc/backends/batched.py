@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -11,12 +10,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_number, check_positive_int
+from difflcs._checks import check_number, check_positive_int, check_threads
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
+from difflcs.mpc import kkt
 from difflcs.mpc.backends.base import Backend, Result
 from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.mpc.solution import Primal
 from difflcs.status import Status
+
+
+@dataclass(frozen=True)
+class BatchedResult(Result):
+    """A `Result` that remembers how to differentiate it.
+
+    Attributes:
+        fragile: (batch,) bool: the elimination of λ needs row exchanges, because the skew part of F dominates.
+    """
+
+    fragile: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -28,10 +39,17 @@ class BatchedBackend(Backend):
     each step is a Riccati sweep with exact second derivatives. An element's result depends on that element alone, bit
     for bit on one instruction set. The problem has local optima: like IPOPT's, a solution is one of them.
 
+    Every trajectory is judged after the solve by `difflcs.mpc.kkt.residual`, recomputed from the numbers that are
+    returned (`difflcs/_native/certificate.hpp`); one that claims to be solved and is not becomes NUMERICAL. Ctrl-C ends
+    a solve within a fraction of a second.
+
     Attributes:
         tol: projected gradient dJ/du at which a problem is solved, or 1e-12 of the terms that sum to it where that is
-            more.
-        max_iter: iteration limit of one solve. What fails is solved once more, cold and along a longer homotopy.
+            more. It must also be below 1e-7 of its own scale, see `difflcs.mpc.kkt.residual`.
+        max_iter: iteration limit of one solve. What fails is solved once more, cold and along a longer homotopy; and
+            with row exchanges in the elimination of λ, where it failed for want of them.
+        time_limit: seconds for one call, None for no limit. Elements not solved by then are MAX_ITER: those under way
+            keep their iterate, those not begun stay at the actions of the guess or zero, with x = x0 and λ = 0.
         restarts: number of starts; the best optimum wins. 1 starts from the guess or from zero action, further ones
             from random actions inside the bounds, the same for every element.
         seed: seed of the random starts.
@@ -44,6 +62,7 @@ class BatchedBackend(Backend):
 
     tol: float = 1e-8
     max_iter: int = 150
+    time_limit: float | None = None
     restarts: int = 1
     seed: int = 0
     homotopy: float = 100.0
@@ -54,34 +73,55 @@ class BatchedBackend(Backend):
         check_positive_int("max_iter", self.max_iter)
         check_positive_int("restarts", self.restarts)
         check_positive_int("seed", self.seed, minimum=0)
-        if self.threads is not None:
-            check_positive_int("threads", self.threads)
+        check_threads(self.threads)
+        if self.time_limit is not None:
+            check_number("time_limit", self.time_limit, strict=True)
         check_number("tol", self.tol, strict=True)
         check_number("homotopy", self.homotopy, minimum=1.0)
         if check_number("shrink", self.shrink, strict=True) >= 1:
             check_number("1 - shrink", 1 - self.shrink, strict=True)
 
-    def solve(self, problem: MPCProblem, guess: Primal | None) -> Result:
+    def solve(self, problem: MPCProblem, guess: Primal | None) -> BatchedResult:
         """Solve every element from one start or several."""
         started = time.perf_counter()
+        ends = started + (self.time_limit or np.inf)
         first = problem.relaxation * (self.homotopy if guess is None else 1.0)
-        best = self._run(problem, guess.u if guess else None, guess.lam if guess else None, first)
+        best = self._run(problem, guess.u if guess else None, guess.lam if guess else None, first, ends)
         generator = np.random.default_rng(self.seed)
         for _ in range(1, self.restarts):
             # The homotopy of a cold start leads most starts to one optimum; a short one keeps them apart.
             draw = torch.from_numpy(generator.random((problem.horizon, problem.n_u)))
             low, high = (v.unsqueeze(-2) for v in (problem.u_min, problem.u_max))
             start = (low + draw * (high - low)).expand(problem.batch, -1, -1)
-            best = _better(best, self._run(problem, start, None, problem.relaxation * min(self.homotopy, 10.0)))
-        best = self._second_chance(problem, best)
-        x, u, lam, _, status, iterations, residual = best
+            if time.perf_counter() < ends:
+                again = self._run(problem, start, None, problem.relaxation * min(self.homotopy, 10.0), ends)
+                best = best.better(again)
+        best = self._second_chance(problem, best, ends)
         seconds = torch.full((problem.batch,), (time.perf_counter() - started) / max(problem.batch, 1))
-        return Result(Primal(x, u, lam), status, iterations, residual, seconds.double())
+        return BatchedResult(
+            best.primal(problem),
+            best.status,
+            best.iterations,
+            best.residual.clamp_max(torch.finfo(torch.float64).max),
+            seconds.double(),
+            fragile=best.fragile.bool(),
+        )
 
     def vjp(
         self, problem: MPCProblem, result: Result, grads: tuple[Tensor, Tensor, Tensor, Tensor], solved: Tensor
     ) -> dict[str, Tensor]:
         """The adjoint sweep in native code; the same numbers as `difflcs.mpc.kkt.vjp`."""
+        assert isinstance(result, BatchedResult)
+        fragile = torch.zeros_like(solved) if result.fragile is None else result.fragile & solved
+        gradients = self._vjp(problem, result, grads, solved & ~fragile, pivot=False)
+        if bool(fragile.any()):
+            exchanged = self._vjp(problem, result, grads, fragile, pivot=True)
+            gradients = {name: value + exchanged[name] for name, value in gradients.items()}
+        return gradients
+
+    def _vjp(
+        self, problem: MPCProblem, result: Result, grads: tuple[Tensor, ...], solved: Tensor, pivot: bool
+    ) -> dict[str, Tensor]:
         gradients = {name: torch.empty_like(getattr(problem, name)) for name in INPUTS}
         x, u, lam, x_bar, u_bar, lam_bar, objective_bar = (_array(v) for v in (*result.primal, *grads))
         _kernels.vjp_mpc(
@@ -97,38 +137,52 @@ class BatchedBackend(Backend):
             lam_bar=lam_bar,
             objective_bar=objective_bar,
             solved=solved.to(torch.int8).numpy(),
+            pivot=pivot,
             threads=self._threads(),
             gradients=[gradient.numpy() for gradient in gradients.values()],
         )
         return gradients
 
-    def _second_chance(self, problem: MPCProblem, found: list[Tensor]) -> list[Tensor]:
-        """Solve the elements that failed (one in a thousand) once more, cold and along a longer homotopy."""
-        failed = torch.nonzero(~_solved(found)).squeeze(-1)
-        if not len(failed):
-            return found
-        again = self._run(problem.select(failed), None, None, problem.relaxation * 10 * self.homotopy)
-        chosen = _better([v[failed] for v in found], again)
-        for whole, part in zip(found, chosen, strict=True):
-            whole[failed] = part
+    def _second_chance(self, problem: MPCProblem, found: _Found, ends: float) -> _Found:
+        """Solve the elements that failed (one in a thousand) again, cold and along a longer homotopy.
+
+        Then, where the numbers broke down and not the patience, with row exchanges in the elimination of λ.
+        """
+        for pivot in (False, True):
+            failed = ~found.solved
+            if pivot:
+                failed &= (found.status == Status.NUMERICAL) | found.fragile.bool()
+            index = torch.nonzero(failed).squeeze(-1)
+            if not len(index) or time.perf_counter() >= ends:
+                break
+            part = problem.select(index)
+            again = self._run(part, None, None, problem.relaxation * 10 * self.homotopy, ends, pivot=pivot)
+            found.replace(index, found.select(index).better(again))
         return found
 
     def _threads(self) -> int:
         return self.threads or torch.get_num_threads()
 
-    def _run(self, problem: MPCProblem, u: Tensor | None, lam: Tensor | None, first: float) -> list[Tensor]:
+    def _run(
+        self,
+        problem: MPCProblem,
+        u: Tensor | None,
+        lam: Tensor | None,
+        first: float,
+        ends: float,
+        pivot: bool = False,
+    ) -> _Found:
         batch, horizon = problem.batch, problem.horizon
-        out = [
-            torch.empty(batch, horizon + 1, problem.n_x, dtype=torch.float64),
-            torch.empty(batch, horizon, problem.n_u, dtype=torch.float64),
-            torch.empty(batch, horizon, problem.n_lam, dtype=torch.float64),
-            torch.empty(batch, dtype=torch.float64),
-            torch.empty(batch, dtype=torch.int8),
-            torch.empty(batch, dtype=torch.int32),
-            torch.empty(batch, dtype=torch.float64),
-        ]
-        names = ("x", "u", "lam", "objective", "status", "iterations", "residual")
-        arrays = {name: value.numpy() for name, value in zip(names, out, strict=True)}
+        found = _Found(
+            x=torch.empty(batch, horizon + 1, problem.n_x, dtype=torch.float64),
+            u=torch.empty(batch, horizon, problem.n_u, dtype=torch.float64),
+            lam=torch.empty(batch, horizon, problem.n_lam, dtype=torch.float64),
+            objective=torch.empty(batch, dtype=torch.float64),
+            residual=torch.empty(batch, dtype=torch.float64),
+            status=torch.empty(batch, dtype=torch.int8),
+            fragile=torch.empty(batch, dtype=torch.int8),
+            iterations=torch.empty(batch, dtype=torch.int32),
+        )
         _kernels.solve_mpc(
             inputs=_inputs(problem),
             horizon=horizon,
@@ -140,13 +194,61 @@ class BatchedBackend(Backend):
             shrink=self.shrink,
             tol=self.tol,
             max_iter=self.max_iter,
+            certified=kkt.CERTIFIED,
+            pivot=pivot,
+            time_limit=max(ends - time.perf_counter(), 0.0),
             threads=self._threads(),
-            **arrays,  # pyright: ignore[reportArgumentType]
+            **{name: value.numpy() for name, value in found.tensors().items()},  # pyright: ignore[reportArgumentType]
         )
-        # Failed elements: finite numbers inside the bounds.
-        for value in (*out[:4], out[6]):
-            torch.nan_to_num_(value, posinf=torch.finfo(value.dtype).max, neginf=0.0)
-        return out
+        return found
+
+
+@dataclass
+class _Found:
+    """What one run of the kernel returns, by the names of its arguments."""
+
+    x: Tensor
+    u: Tensor
+    lam: Tensor
+    objective: Tensor
+    residual: Tensor
+    status: Tensor
+    fragile: Tensor
+    iterations: Tensor
+
+    def tensors(self) -> dict[str, Tensor]:
+        return dict(vars(self))
+
+    @property
+    def solved(self) -> Tensor:
+        return (self.status == Status.CONVERGED) | (self.status == Status.DEGENERATE)
+
+    def select(self, index: Tensor) -> _Found:
+        return _Found(**{name: value[index] for name, value in self.tensors().items()})
+
+    def replace(self, index: Tensor, part: _Found) -> None:
+        for name, value in self.tensors().items():
+            value[index] = part.tensors()[name]
+
+    def better(self, other: _Found) -> _Found:
+        """Per element the solved trajectory with the lower objective; iterations add up."""
+        take = other.solved & (~self.solved | (other.objective < self.objective))
+        theirs = other.tensors()
+        chosen = {
+            name: torch.where(take.reshape(-1, *[1] * (value.ndim - 1)), theirs[name], value)
+            for name, value in self.tensors().items()
+        }
+        return _Found(**{**chosen, "iterations": self.iterations + other.iterations})
+
+    def primal(self, problem: MPCProblem) -> Primal:
+        """The trajectories, those that failed with finite numbers inside the bounds."""
+        failed = torch.nonzero(~self.solved).squeeze(-1)
+        if len(failed):
+            part = problem.select(failed)
+            self.u[failed] = part.clip(torch.nan_to_num(self.u[failed], posinf=0.0, neginf=0.0))
+            for value in (self.x, self.lam):
+                value[failed] = torch.nan_to_num(value[failed])
+        return Primal(self.x, self.u, self.lam)
 
 
 def _inputs(problem: MPCProblem) -> list[np.ndarray]:
@@ -155,16 +257,3 @@ def _inputs(problem: MPCProblem) -> list[np.ndarray]:
 
 def _array(value: Tensor) -> np.ndarray:
     return value.contiguous().numpy()
-
-
-def _solved(found: Sequence[Tensor]) -> Tensor:
-    return (found[4] == Status.CONVERGED) | (found[4] == Status.DEGENERATE)
-
-
-def _better(a: Sequence[Tensor], b: Sequence[Tensor]) -> list[Tensor]:
-    """Per element the solved trajectory with the lower objective."""
-    solved_a, solved_b = _solved(a), _solved(b)
-    take_b = solved_b & (~solved_a | (b[3] < a[3]))
-    chosen = [torch.where(take_b.reshape(-1, *[1] * (v.ndim - 1)), w, v) for v, w in zip(a, b, strict=True)]
-    chosen[5] = a[5] + b[5]
-    return chosen
