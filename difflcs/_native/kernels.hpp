@@ -34,6 +34,7 @@ struct LcpBatch {
 // What the numbers of a solved LCP have to meet; difflcs.lcp.solve_lcp states it.
 constexpr double kLcpTerms = 1e-10;  // |F lam + q - w| in parts of the terms that sum to it
 constexpr double kLcpData = 1e-8;    // the same in parts of the largest |q| (and of sqrt(relaxation F_ii))
+constexpr double kRounding = 4e-16;  // of a sum, in parts of its terms
 constexpr double kSmallest = 1e-100, kLargest = 1e150;  // range of the diagonal of F; of lam and w
 
 // Inputs of an MPC problem, in the order of difflcs.mpc.problem.INPUTS.

@@ -110,9 +110,10 @@ struct Lcp {
     Mask ok = ~Mask{};
     for (int64_t i = 0; i < n; i++) {
       const Vec missed = abs(w[i] - returned[i]), force = lam[i] * unit * scale[i], gap = returned[i] * unit / scale[i];
+      const Vec total = missed + kRounding * bound[i];  // what a caller may find, who adds in another order
       ok &= missed <= kLcpTerms * bound[i];
-      ok &= missed <= kLcpData * (1.0 + sqrt(relaxation));
-      ok &= missed * unit / scale[i] <= kLcpData * largest;
+      ok &= total <= kLcpData * (1.0 + sqrt(relaxation));
+      ok &= total * unit / scale[i] <= kLcpData * largest;
       ok &= (force >= 0) & (force <= kLargest) & (gap >= 0) & (gap <= kLargest);
       ok &= (all(0) + scale[i] <= 1 / __builtin_sqrt(kSmallest)) & (all(0) + scale[i] >= __builtin_sqrt(kSmallest));
     }

@@ -92,8 +92,9 @@ struct LcpOne {
       double terms;
       const double missed = __builtin_fabs(slack(i, lam, &terms) - w[i]);
       const double force = lam[i] * unit * scale[i], gap = w[i] * unit / scale[i];
-      const bool held = missed <= kLcpTerms * terms && missed <= kLcpData * (1 + root) &&
-                        missed * unit / scale[i] <= kLcpData * largest;
+      const double total = missed + kRounding * terms;
+      const bool held = missed <= kLcpTerms * terms && total <= kLcpData * (1 + root) &&
+                        total * unit / scale[i] <= kLcpData * largest;
       const bool sane = force >= 0 && force <= kLargest && gap >= 0 && gap <= kLargest &&
                         scale[i] * scale[i] * kSmallest <= 1 && scale[i] * scale[i] >= kSmallest;
       if (!held || !sane) return false;
