@@ -101,11 +101,11 @@ def check_number(name: str, value: object, minimum: float = 0.0, strict: bool = 
 MAX_THREADS = 1024
 
 
-def check_threads(value: int | None) -> None:
-    """Check an optional number of threads."""
-    if value is not None and check_positive_int("threads", value) > MAX_THREADS:
+def check_threads(value: int | None, name: str = "threads") -> None:
+    """Check an optional number of threads or processes."""
+    if value is not None and check_positive_int(name, value) > MAX_THREADS:
         raise InvalidInputError(
-            f"threads: expected at most {MAX_THREADS}, got {value}; None takes torch's number of threads"
+            f"{name}: expected at most {MAX_THREADS}, got {value}; None takes what suits the machine"
         )
 
 

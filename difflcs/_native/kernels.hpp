@@ -87,6 +87,7 @@ struct ViolationBatch {
   const double* input[kViolationInputs];  // the system is shared by the batch; x, u, x_next are (count, ...)
   double gamma, xi;
   double *r, *e;  // (count, n_x), (count, n_lam): at z = 0 from violation_qp, at the minimiser from violation_value
+  Watch watch;
 };
 
 struct Kernels {

@@ -315,20 +315,27 @@ difflcs::ViolationBatch violation_batch(const Inputs& inputs, double gamma, doub
   return b;
 }
 
+// One pass over the transitions on this thread.
+template <class Work>
+void pass(difflcs::ViolationBatch& b, Work work) {
+  Stop stop;
+  on_threads(1, difflcs::kernels().violation_workspace(b), stop, [&](void* workspace, difflcs::Watch watch) {
+    b.watch = watch;
+    work(workspace);
+  });
+}
+
 // The minimiser z and the values there. False where the inputs are not finite, the QP is not convex by a margin, there
 // are no transitions, or the solver failed: then r, e, Q and q are those at z = 0, and z and loss are not set.
 bool violation_loss(Inputs inputs, double gamma, double xi, int64_t max_iter, int threads, Output<double> Q,
                     Output<double> q, Output<double> z, Output<double> r, Output<double> e, Output<double> loss) {
-  const difflcs::ViolationBatch b = violation_batch(inputs, gamma, xi, r, e);
+  difflcs::ViolationBatch b = violation_batch(inputs, gamma, xi, r, e);
   const int64_t n = 2 * b.n_lam;
   check_size("Q", Q.size(), n * n), check_size("q", q.size(), b.count * n), check_size("z", z.size(), b.count * n);
   check_size("loss", loss.size(), b.count);
-  const auto& kernels = difflcs::kernels();
-  const AlignedBuffer workspace(kernels.violation_workspace(b));
-  {
-    nb::gil_scoped_release release;
-    if (!kernels.violation_qp(b, Q.data(), q.data(), workspace.data.get()) || b.count == 0) return false;
-  }
+  bool convex = false;
+  pass(b, [&](void* workspace) { convex = difflcs::kernels().violation_qp(b, Q.data(), q.data(), workspace); });
+  if (!convex || b.count == 0) return false;
   std::vector<double> w(b.count * n);
   std::vector<int8_t> status(b.count);
   std::vector<int32_t> iterations(b.count);
@@ -338,26 +345,22 @@ bool violation_loss(Inputs inputs, double gamma, double xi, int64_t max_iter, in
   solve(lcp, b.count, threads, stop);
   for (const int8_t s : status)
     if (s != static_cast<int8_t>(difflcs::Status::converged)) return false;
-  nb::gil_scoped_release release;
-  kernels.violation_value(b, z.data(), loss.data(), workspace.data.get());
+  pass(b, [&](void* workspace) { difflcs::kernels().violation_value(b, z.data(), loss.data(), workspace); });
   return true;
 }
 
 void violation_value(Inputs inputs, double gamma, double xi, Array z, Output<double> r, Output<double> e,
                      Output<double> loss) {
-  const difflcs::ViolationBatch b = violation_batch(inputs, gamma, xi, r, e);
+  difflcs::ViolationBatch b = violation_batch(inputs, gamma, xi, r, e);
   check_size("z", z.size(), 2 * b.n_lam * b.count), check_size("loss", loss.size(), b.count);
   if (b.count == 0) return;
-  nb::gil_scoped_release release;
-  const auto& kernels = difflcs::kernels();
-  const AlignedBuffer workspace(kernels.violation_workspace(b));
-  kernels.violation_value(b, z.data(), loss.data(), workspace.data.get());
+  pass(b, [&](void* workspace) { difflcs::kernels().violation_value(b, z.data(), loss.data(), workspace); });
 }
 
 void violation_gradient(Inputs inputs, double gamma, double xi, Array z, Output<double> r, Output<double> e,
                         Array upstream, std::vector<std::optional<Output<double>>> gradients) {
   using namespace difflcs;
-  const ViolationBatch b = violation_batch(inputs, gamma, xi, r, e);
+  ViolationBatch b = violation_batch(inputs, gamma, xi, r, e);
   check_size("z", z.size(), 2 * b.n_lam * b.count), check_size("upstream", upstream.size(), b.count);
   check_size("gradients", gradients.size(), kViolationInputs);
   double* to[kViolationInputs] = {};
@@ -365,10 +368,7 @@ void violation_gradient(Inputs inputs, double gamma, double xi, Array z, Output<
     if (!gradients[i] && i < vx) throw std::invalid_argument("the system's gradients are always computed");
     if (gradients[i]) check_size("gradient", gradients[i]->size(), inputs[i].size()), to[i] = gradients[i]->data();
   }
-  nb::gil_scoped_release release;
-  const auto& kernels = difflcs::kernels();
-  const AlignedBuffer workspace(kernels.violation_workspace(b));
-  kernels.violation_gradient(b, z.data(), upstream.data(), to, workspace.data.get());
+  pass(b, [&](void* workspace) { kernels().violation_gradient(b, z.data(), upstream.data(), to, workspace); });
 }
 
 }  // namespace

@@ -54,6 +54,9 @@ struct Violation {
     layout(memory);
   }
 
+  // Whether to stop, asked every 1024 transitions.
+  bool halted(int64_t first) const { return first % 1024 == 0 && batch.watch.stop(batch.watch.context); }
+
   // kLanes rows of a (count, size) array; lanes past the end repeat the last row and are never written back.
   void load(Vec* to, const double* from, int64_t size, int64_t first) const {
     for (int l = 0; l < kLanes; l++) {
@@ -100,7 +103,7 @@ struct Violation {
   // q = (C^T r + F^T e / (gamma xi), -e / (gamma xi)) with r and e at z = 0.
   bool gradients_at_zero(double* q) {
     Vec invalid = all(0);
-    for (int64_t first = 0; first < batch.count; first += kLanes) {
+    for (int64_t first = 0; first < batch.count && !halted(first); first += kLanes) {
       load(x, batch.input[vx], n_x, first), load(u, batch.input[vu], n_u, first);
       load(x_next, batch.input[vx_next], n_x, first);
       for (int64_t i = 0; i < n_x; i++) r[i] = d[i] - x_next[i];
@@ -118,7 +121,7 @@ struct Violation {
 
   void value(const double* solution, double* loss) {
     const Vec *lam = z, *phi = z + n_lam;
-    for (int64_t first = 0; first < batch.count; first += kLanes) {
+    for (int64_t first = 0; first < batch.count && !halted(first); first += kLanes) {
       load(r, batch.r, n_x, first), load(e, batch.e, n_lam, first), load(z, solution, 2 * n_lam, first);
       add_product(r, C, lam, n_x, n_lam), add_product(e, F, lam, n_lam, n_lam);
       Vec rr = all(0), ee = all(0), product = all(0);
@@ -137,7 +140,7 @@ struct Violation {
   void gradient(const double* solution, const double* upstream, double* const to[kViolationInputs]) {
     const int64_t n_w = n_x + n_u + n_lam, rows = n_x + n_lam;
     for (int64_t i = 0; i < rows * (n_w + 1); i++) sum[i] = all(0);
-    for (int64_t first = 0; first < batch.count; first += kLanes) {
+    for (int64_t first = 0; first < batch.count && !halted(first); first += kLanes) {
       Vec scale;
       load(&scale, upstream, 1, first);
       for (int l = 0; l < kLanes; l++)

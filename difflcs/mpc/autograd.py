@@ -45,7 +45,7 @@ class SolveMPC(torch.autograd.Function):
         # Copies: what the caller does with the outputs must not change the gradient.
         x, u, lam = (v.to(dtype, copy=any(ctx.needs_input_grad)) for v in result.primal)
         u = _inside(u, problem) if dtype != torch.float64 else u
-        info = tuple(v.detach() for v in (result.status, result.iterations, result.kkt_residual, result.solve_time))
+        info = result.status.clone(), result.iterations, result.kkt_residual, result.solve_time
         ctx.mark_non_differentiable(*info)
         return x, u, lam, objective, *info
 
@@ -57,17 +57,13 @@ class SolveMPC(torch.autograd.Function):
         result: Result = ctx.result
         solved = (result.status == Status.CONVERGED) | (result.status == Status.DEGENERATE)
         # Whatever comes upstream for a failed element is dropped before it can meet the others.
-        upstream = tuple(
-            torch.where(solved.reshape(-1, *[1] * (g.ndim - 1)), g.double(), 0.0) for g in grads[:4]
-        )
+        upstream = tuple(torch.where(solved.reshape(-1, *[1] * (g.ndim - 1)), g.double(), 0.0) for g in grads[:4])
         gradients = _finite(lambda keep: ctx.backend.vjp(ctx.problem, result, upstream, keep), solved, ctx.limit)
         needed = ctx.needs_input_grad[6:]
         return *[None] * 6, *(gradients[k] if n else None for k, n in zip(INPUTS, needed, strict=True))
 
 
-def _within_range(
-    result: Result, objective: Tensor, constant: Tensor, dtype: torch.dtype
-) -> tuple[Result, Tensor]:
+def _within_range(result: Result, objective: Tensor, constant: Tensor, dtype: torch.dtype) -> tuple[Result, Tensor]:
     """Elements whose numbers `dtype` cannot hold become NUMERICAL; those that failed get numbers that it can."""
     largest = torch.finfo(dtype).max
     total = objective + constant

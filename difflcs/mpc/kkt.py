@@ -317,7 +317,6 @@ def _cholesky(Q_uu: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
     return L * unit.unsqueeze(-1), singular
 
 
-
 @dataclass(frozen=True)
 class _Direction:
     """Solution w of K_z w = z̄."""

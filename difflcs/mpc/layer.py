@@ -160,9 +160,7 @@ class LCSMPCLayer(nn.Module):
         problem = MPCProblem(**values, horizon=self.horizon, relaxation=relaxation, barrier=self.barrier)
         constant = cost.constant.detach().to("cpu", torch.float64).expand(batch).reshape(-1)
         smallest = torch.float32 if any(t.dtype == torch.float32 for t in tensors.values()) else torch.float64
-        outputs = SolveMPC.apply(
-            problem, self.backend, self._guess(guess, batch), x0.dtype, smallest, constant, *flat
-        )
+        outputs = SolveMPC.apply(problem, self.backend, self._guess(guess, batch), x0.dtype, smallest, constant, *flat)
         *primal, objective, status, iterations, residual, seconds = outputs  # pyright: ignore[reportGeneralTypeIssues]
         self._report(status, torch.is_grad_enabled() and any(t.requires_grad for t in flat))
 

@@ -7,11 +7,15 @@ process (casadi issue 3456).
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import signal
 import sys
+import threading
 import time
+from collections.abc import Iterator
 from multiprocessing.connection import Connection
+from types import FrameType
 from typing import NamedTuple
 
 import casadi
@@ -132,7 +136,32 @@ class Solved(NamedTuple):
 
 
 def solve_chunk(sizes: Sizes, options: Options, chunk: Chunk) -> Solved:
-    """Solve one problem after the other; an exception fails its element only."""
+    """Solve one problem after the other; an exception fails its element only, Ctrl-C ends them all."""
+    with _heard_interrupts() as interrupts:
+        return _solve_chunk(sizes, options, chunk, interrupts)
+
+
+@contextlib.contextmanager
+def _heard_interrupts() -> Iterator[list[int]]:
+    """The signals of Ctrl-C that came: CasADi swallows the KeyboardInterrupt, and merely fails the problem at hand."""
+    heard: list[int] = []
+    before = signal.getsignal(signal.SIGINT)
+    if not callable(before) or threading.current_thread() is not threading.main_thread():
+        yield heard
+        return
+
+    def hear(number: int, frame: FrameType | None) -> None:
+        heard.append(number)
+        before(number, frame)
+
+    signal.signal(signal.SIGINT, hear)
+    try:
+        yield heard
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _solve_chunk(sizes: Sizes, options: Options, chunk: Chunk, interrupts: list[int]) -> Solved:
     solver = _solver(sizes, options)
     n_x, n_u, n_lam, horizon = sizes
     count = len(chunk.u)
@@ -159,6 +188,8 @@ def solve_chunk(sizes: Sizes, options: Options, chunk: Chunk) -> Solved:
         except RuntimeError:
             result.u[i], result.lam[i], result.x[i] = chunk.u[i], chunk.lam[i], chunk.x[i]
         result.seconds[i] = time.perf_counter() - started
+        if interrupts:
+            raise KeyboardInterrupt
     return result
 
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import torch
 
-from difflcs._checks import check_number, check_positive_int
+from difflcs._checks import check_number, check_positive_int, check_threads
 from difflcs.mpc import kkt
 from difflcs.mpc.backends.base import Backend, Result, certify
 from difflcs.mpc.problem import MPCProblem
@@ -59,8 +59,7 @@ class IpoptBackend(Backend):
 
     def __post_init__(self) -> None:
         check_positive_int("max_iter", self.max_iter)
-        if self.workers is not None:
-            check_positive_int("workers", self.workers)
+        check_threads(self.workers, "workers")
         for name in ("tol", "residual_tol", "start", "mu_init", "mu_init_warm"):
             check_number(name, getattr(self, name), strict=True)
 

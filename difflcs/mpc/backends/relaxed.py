@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import threading
 import time
 import warnings
 from collections.abc import Iterator, Mapping
@@ -13,7 +15,7 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_number, check_positive_int, describe
+from difflcs._checks import check_number, check_threads, describe
 from difflcs._linalg import matvec
 from difflcs.errors import DTypeError
 from difflcs.lcp import solve_lcp
@@ -118,8 +120,7 @@ class RelaxedBackend(Backend):
             check_number("penalties", value)
         for name in ("residual_tol", "tol"):
             check_number(name, getattr(self, name), strict=True)
-        if self.threads is not None:
-            check_positive_int("threads", self.threads)
+        check_threads(self.threads)
 
     def solve(self, problem: MPCProblem, guess: Primal | None) -> RelaxedResult:
         """One pass per penalty, or the last one alone with a guess."""
@@ -167,7 +168,7 @@ class RelaxedBackend(Backend):
             bars = [v.new_zeros(problem.batch, *v.shape[1:]) for v in parameters]
             for graph in step.graphs:
                 seeds = [v[graph.index] for v in upstream]
-                with _quiet():
+                with _quiet(), _interruptible():
                     found = torch.autograd.grad(graph.outputs[:3], graph.parameters, seeds, retain_graph=True)
                 for bar, value in zip(bars, found, strict=True):
                     bar[graph.index] = value
@@ -211,7 +212,7 @@ class RelaxedBackend(Backend):
             "tol_feas": self.tol,
         }
         try:
-            with torch.enable_grad(), _quiet():
+            with torch.enable_grad(), _quiet(), _interruptible():
                 outputs = layer(*leaves, solver_args=options)
         except Exception:  # whatever a solver raises stays with its elements
             return ()
@@ -227,6 +228,18 @@ def _one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """After Ctrl-C diffcp's threads finish the element they are at; an interpreter that ends before them aborts."""
+    before = set(threading.enumerate())
+    try:
+        yield
+    except KeyboardInterrupt:
+        for thread in set(threading.enumerate()) - before:
+            atexit.register(thread.join)
+        raise
 
 
 @contextmanager

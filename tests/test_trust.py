@@ -1,0 +1,387 @@
+"""Never wrong in silence: what a solve returns is judged by the numbers it returns, and nothing hangs or aborts.
+
+Each test is a failure that was once met, at its smallest; `tests/hostile` searches for more of their kind.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from difflcs import LCSMPCLayer, LCSParams, QuadraticCost, Status, solve_lcp, violation_loss
+from difflcs.errors import DegenerateWarning, InvalidInputError, SolveWarning
+from difflcs.mpc import kkt
+from difflcs.mpc.backends import BatchedBackend, IpoptBackend
+from difflcs.mpc.problem import INPUTS, MPCProblem
+
+F64 = torch.float64
+
+
+def matrix(*rows):
+    return torch.tensor(rows, dtype=F64)
+
+
+def one_action(R=1.0, r=0.0, B=1.0, C=0.0, E=0.0, Q=0.0):
+    """One state, one action, one contact that is far away."""
+    system = LCSParams(
+        A=matrix([1.0]), B=matrix([B]), C=matrix([C]), d=torch.zeros(1, dtype=F64),
+        D=matrix([0.0]), E=matrix([E]), F=matrix([1.0]), c=torch.ones(1, dtype=F64),
+    )  # fmt: skip
+    cost = QuadraticCost(matrix([Q]), matrix([R]), matrix([Q]), r=torch.tensor([r], dtype=F64))
+    return system, cost
+
+
+# --- the certificate ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("barrier", [0.0, 1e-2])
+@pytest.mark.parametrize("per_element", [False, True])
+def test_the_native_certificate_is_the_one_of_kkt(build, barrier, per_element):
+    batch = (6,) if per_element else ()
+    tensors = {**build.lcs_tensors(3, batch=batch), **build.cost_tensors(3, batch=batch)}
+    limit = torch.full((2,), 0.15, dtype=F64)
+    tensors |= {"u_min": -limit, "u_max": limit, "x0": 0.3 * build.normal(5)(6, 4)}
+    problem = MPCProblem(**{k: tensors[k] for k in INPUTS}, horizon=4, relaxation=1e-4, barrier=barrier)
+    rough = BatchedBackend(max_iter=1).solve(problem, None)
+    unsolved = rough.status == Status.MAX_ITER  # their residuals are far above rounding, so that they compare
+    assert int(unsolved.sum()) >= 5
+    dual = kkt.multipliers(problem, rough.primal)
+    torch.testing.assert_close(rough.kkt_residual, kkt.residual(problem, rough.primal, dual), rtol=1e-6, atol=1e-12)
+    assert float(rough.kkt_residual[unsolved].min()) > kkt.CERTIFIED
+    done = BatchedBackend().solve(problem, None)
+    assert bool((done.status == Status.CONVERGED).all())
+    assert 0 < float(done.kkt_residual.max()) <= kkt.CERTIFIED
+
+
+def test_a_residual_has_no_units(build):
+    from tests.test_backends import badly_scaled, contact
+
+    rough = {"max_iter": 3}
+    found = []
+    for problem in (contact(build), badly_scaled(build)):
+        values = MPCProblem(**{k: problem.tensors[k] for k in INPUTS}, horizon=3, relaxation=1e-4)
+        found.append(BatchedBackend(**rough).solve(values, None).kkt_residual)
+    assert float(found[0].max()) > kkt.CERTIFIED
+    torch.testing.assert_close(found[1], found[0], rtol=1e-6, atol=1e-10)
+
+
+def test_a_broken_element_has_a_large_residual():
+    system, cost = one_action(Q=1.0)
+    wild = LCSParams(**{**system.tensors(), "A": 1e3 * system.A})
+    with pytest.warns(SolveWarning):
+        plan = LCSMPCLayer(wild, cost, 60, -1.0, 1.0, on_failure="mask")(torch.tensor([1.0], dtype=F64))
+    assert not bool(plan.converged)
+    assert float(plan.kkt_residual) > 1
+    for value in (plan.x, plan.u, plan.lam, plan.objective, plan.kkt_residual):
+        assert bool(torch.isfinite(value).all())
+
+
+# --- LCP ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("relaxation", [0.0, 1e-5, 1e-3])
+@pytest.mark.parametrize("epsilon", [1e-4, 1e-6, 1e-8, 1e-10])
+@pytest.mark.filterwarnings("ignore::difflcs.errors.SolveWarning")
+def test_a_dominant_skew_part_is_solved_or_refused(relaxation, epsilon):
+    rng = np.random.default_rng(380)
+    K = rng.standard_normal((400, 5, 5))
+    F, q = torch.from_numpy(K - K.swapaxes(1, 2) + epsilon * np.eye(5)), torch.from_numpy(rng.standard_normal((400, 5)))
+    lam, w, status = solve_lcp(F, q, relaxation)
+    solved = status == Status.CONVERGED
+    missed = (w - (F @ lam.unsqueeze(-1)).squeeze(-1) - q).abs().amax(-1) / q.abs().amax(-1)
+    assert float(missed[solved].max()) <= 1e-7
+    assert bool((torch.minimum(lam, w) >= 0).all())
+    assert bool(torch.isfinite(lam).all() and torch.isfinite(w).all())
+    share = float(solved.double().mean())
+    assert share >= {1e-4: 1.0, 1e-6: 0.99, 1e-8: 0.4, 1e-10: 0.0}[epsilon]
+
+
+def test_an_lcp_beyond_the_range_of_numbers_is_refused_and_its_gradient_is_finite():
+    F = torch.stack([torch.eye(3, dtype=F64), 1e-300 * torch.eye(3, dtype=F64)]).requires_grad_()
+    with pytest.warns(SolveWarning):
+        solution = solve_lcp(F, -torch.ones(2, 3, dtype=F64))
+    assert solution.status.tolist() == [Status.CONVERGED, Status.NUMERICAL]
+    solution.lam.sum().backward()
+    assert bool(torch.isfinite(F.grad).all())
+    assert torch.equal(F.grad[1], torch.zeros(3, 3, dtype=F64))
+
+
+def test_float32_overflow_of_an_lcp_is_a_status():
+    F = torch.tensor([[1e-20]])
+    with pytest.warns(SolveWarning):
+        solution = solve_lcp(F, torch.tensor([[-1e30], [-1.0]]))
+    assert solution.status.tolist() == [Status.NUMERICAL, Status.NUMERICAL]
+    assert bool(torch.isfinite(solution.lam).all())
+
+
+# --- flat costs -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("R", [0.0, 1e-12, 1e-7, 1e-3])
+@pytest.mark.parametrize("scale", [1.0, 1e-9, 1e6])
+@pytest.mark.parametrize("backend", ["batched", "ipopt", "relaxed"])
+def test_a_linear_cost_ends_at_its_vertex_from_any_guess(R, scale, backend):
+    def solve(r, guess=None):
+        system, cost = one_action(R=R * scale, r=r * scale)
+        layer = LCSMPCLayer(system, cost, 3, -0.05, 0.05, backend=backend)
+        return layer(torch.zeros(1, dtype=F64), guess=guess)
+
+    low = solve(1.0)
+    torch.testing.assert_close(low.u, torch.full_like(low.u, -0.05), rtol=0, atol=1e-7)
+    high = solve(-1.0, guess=low.shift())
+    torch.testing.assert_close(high.u, torch.full_like(high.u, 0.05), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("backend", ["batched", "ipopt"])
+def test_an_action_without_cost_or_effect_is_degenerate_and_has_a_finite_gradient(backend):
+    system, cost = one_action(Q=1.0)
+    B = matrix([1.0, 0.0]).requires_grad_()
+    A = system.A.clone().requires_grad_()
+    wider = LCSParams(**{**system.tensors(), "A": A, "B": B, "E": torch.zeros(1, 2, dtype=F64)})
+    R = torch.diag(torch.tensor([1.0, 0.0], dtype=F64)).requires_grad_()
+    mpc = LCSMPCLayer(wider, QuadraticCost(cost.Q, R, cost.Q_final), 3, -1.0, 1.0, backend=backend)
+    with pytest.warns(DegenerateWarning):
+        plan = mpc(torch.tensor([[0.5], [-0.3]], dtype=F64))
+    assert bool((plan.status == Status.DEGENERATE).all())
+    plan.u.square().sum().backward()
+    for leaf in (A, B, R):
+        assert bool(torch.isfinite(leaf.grad).all())
+    # The other action's gradient is that of the problem without this one.
+    alone = A.detach().clone().requires_grad_()
+    system = LCSParams(**{**system.tensors(), "A": alone})
+    single = QuadraticCost(cost.Q, matrix([1.0]), cost.Q_final)
+    LCSMPCLayer(system, single, 3, -1.0, 1.0)(torch.tensor([[0.5], [-0.3]], dtype=F64)).u.square().sum().backward()
+    torch.testing.assert_close(A.grad, alone.grad, rtol=1e-6, atol=1e-9)
+
+
+# --- float32 --------------------------------------------------------------------------------------------------------
+
+
+def test_float32_actions_keep_float64_bounds():
+    system, cost = one_action(r=-10.0)
+    plan = LCSMPCLayer(system, cost, 3, -0.3, 0.3)(torch.zeros(1))
+    assert plan.u.dtype == torch.float32
+    assert bool((plan.u.double() <= 0.3).all())
+    assert float(plan.u.min()) > 0.2999999
+    system, cost = one_action(r=10.0)
+    plan = LCSMPCLayer(system, cost, 3, -0.1, 0.3)(torch.zeros(1))
+    assert bool((plan.u.double() >= -0.1).all())
+
+
+def test_float32_overflow_of_a_plan_is_a_status_and_spoils_no_neighbour():
+    system, cost = one_action(Q=1e-30)
+    A = (1e3 * system.A).requires_grad_()
+    layer = LCSMPCLayer(
+        LCSParams(**{**system.tensors(), "A": A}), cost, 14, -1.0, 1.0, on_failure="mask"
+    )  # x_H = 1e42 x_0
+    with pytest.warns(SolveWarning):
+        plan = layer(torch.tensor([[1.0], [0.0]]))
+    assert plan.status[0] == Status.NUMERICAL
+    for value in (plan.x, plan.u, plan.lam, plan.objective):
+        assert bool(torch.isfinite(value).all())
+    plan.x.sum().backward()
+    assert bool(torch.isfinite(A.grad).all())
+
+
+# --- autograd's own rules -------------------------------------------------------------------------------------------
+
+
+def differentiable(build, backend="batched"):
+    leaves = {k: v.clone().requires_grad_() for k, v in build.lcs_tensors(1).items()}
+    weights = {k: v.clone().requires_grad_() for k, v in build.cost_tensors(1).items()}
+    low, high = (torch.full((2,), v, dtype=F64, requires_grad=True) for v in (-0.15, 0.15))
+    x0 = (0.3 * build.normal(2)(5, 4)).requires_grad_()
+    cost = QuadraticCost(**weights)
+    layer = LCSMPCLayer(LCSParams(**leaves), cost, 3, low, high, relaxation=1e-3, backend=backend)
+    return {**leaves, "q": cost.q, "q_final": cost.q_final, "r": cost.r, "u_min": low, "u_max": high, "x0": x0}, layer
+
+
+@pytest.mark.parametrize("backend", ["batched", "ipopt", "relaxed"])
+@pytest.mark.parametrize("name", ["A", "C", "F", "c", "q", "r", "u_min", "x0"])
+def test_an_input_changed_in_place_raises_torchs_error(build, backend, name):
+    inputs, layer = differentiable(build, backend)
+    plan = layer(inputs["x0"])
+    with torch.no_grad():
+        inputs[name].mul_(2)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        plan.action.sum().backward()
+
+
+@pytest.mark.parametrize("backend", ["batched", "ipopt", "relaxed"])
+def test_an_output_changed_in_place_does_not_change_the_gradient(build, backend):
+    gradients = []
+    for change in (False, True):
+        inputs, layer = differentiable(build, backend)
+        plan = layer(inputs["x0"])
+        total = plan.action.sum() + plan.x[:, -1].sum() + plan.objective.sum()
+        if change:
+            with torch.no_grad():
+                for value in (plan.x, plan.u, plan.lam, plan.objective):
+                    value.mul_(3)
+                plan.status.fill_(int(Status.NUMERICAL))
+        total.backward()
+        gradients.append([v.grad for v in inputs.values()])
+    for plain, changed in zip(*gradients, strict=True):
+        assert torch.equal(plain, changed)
+
+
+@pytest.mark.parametrize("name", ["F", "lam"])
+def test_lcp_tensors_changed_in_place_raise_torchs_error(build, name):
+    tensors = build.lcs_tensors(0)
+    F, q = tensors["F"].requires_grad_(), build.normal(1)(6, 3)
+    solution = solve_lcp(F, q)
+    total = solution.lam.square().sum()
+    with torch.no_grad():
+        (F if name == "F" else solution.lam).mul_(2)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        total.backward()
+
+
+def test_an_upstream_gradient_that_overflows_leaves_the_others(build):
+    inputs, layer = differentiable(build)
+    plan = layer(inputs["x0"])
+    weight = torch.ones(5, dtype=F64)
+    weight[2] = 1e308
+    with pytest.warns(DegenerateWarning, match="1 of 5"):
+        (weight[:, None] * plan.x[:, -1] * 10).sum().backward()
+    for name, value in inputs.items():
+        assert bool(torch.isfinite(value.grad).all()), name
+    assert torch.equal(inputs["x0"].grad[2], torch.zeros(4, dtype=F64))
+    assert float(inputs["x0"].grad[0].abs().max()) > 0
+
+
+# --- interruptible --------------------------------------------------------------------------------------------------
+
+
+def long_batch(build, **options):
+    layer = LCSMPCLayer(
+        build.params(0, n_x=12, n_u=6, n_lam=12), build.cost(0, n_x=12, n_u=6), 12, -0.15, 0.15,
+        backend=BatchedBackend(**options), on_failure="mask",
+    )  # fmt: skip
+    return layer, 0.2 * build.normal(1)(400, 12)
+
+
+@pytest.mark.filterwarnings("ignore::difflcs.errors.SolveWarning")
+def test_a_time_limit_leaves_the_rest_at_max_iter(build):
+    layer, x0 = long_batch(build, time_limit=0.1)
+    started = time.perf_counter()
+    plan = layer(x0)
+    assert time.perf_counter() - started < 2.0  # seconds without the limit
+    assert set(plan.status.unique().tolist()) <= {Status.CONVERGED, Status.MAX_ITER, Status.DEGENERATE}
+    late = plan.status == Status.MAX_ITER
+    assert int(late.sum()) > 100
+    for value in (plan.x, plan.u, plan.lam, plan.objective, plan.kkt_residual):
+        assert bool(torch.isfinite(value).all())
+    assert bool((plan.u.abs() <= 0.15).all())
+    assert float(plan.kkt_residual[late].min()) > kkt.CERTIFIED
+
+
+def test_a_time_limit_that_suffices_changes_nothing(build):
+    tensors = build.lcs_tensors(1)
+    x0 = 0.3 * build.normal(2)(5, 4)
+    plans = [
+        LCSMPCLayer(LCSParams(**tensors), build.cost(1), 3, -0.1, 0.1, backend=BatchedBackend(time_limit=limit))(x0)
+        for limit in (None, 1e3)
+    ]
+    assert torch.equal(plans[0].u, plans[1].u)
+
+
+INTERRUPT = """
+import os, signal, sys, threading, time, warnings
+import torch
+from difflcs import LCSModel, LCSMPCLayer, GoalCost, solve_lcp, violation_loss
+from difflcs.mpc.backends import BatchedBackend, IpoptBackend
+
+torch.manual_seed(0)
+warnings.simplefilter("ignore")
+sizes = {"n_x": 12, "n_u": 6}
+model = LCSModel(**sizes, n_lam=12, init_scale=0.3)
+cost = GoalCost.reach(**sizes, goal_weight=(1.0, 1.0))
+F, q = 3 * torch.randn(60, 60).double(), torch.randn(300_000, 60).double()
+F = F @ F.T + 0.1 * torch.eye(60)
+x, u = torch.randn(1_000_000, 12).double(), torch.randn(1_000_000, 6).double()
+
+
+def plan(backend):
+    mpc = LCSMPCLayer(model.params().detach(), cost, 12, -1.0, 1.0, backend=backend, on_failure="mask")
+    with torch.no_grad():
+        mpc(x[:20_000], x[:20_000, :2])
+
+
+work = {
+    "batched": lambda: plan(BatchedBackend(threads=2)),
+    "ipopt": lambda: plan(IpoptBackend(workers=1)),
+    "lcp": lambda: solve_lcp(F, q),
+    "relaxed lcp": lambda: solve_lcp(F, q, 1e-5),
+    "violation_loss": lambda: [violation_loss(model, x, u, x, check_gamma=False, gamma=1e-3) for _ in range(100)],
+}[sys.argv[1]]
+sent = []
+
+
+def send():
+    time.sleep(1.5)
+    sent.append(time.perf_counter())
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+threading.Thread(target=send).start()
+try:
+    work()
+except KeyboardInterrupt:
+    print("interrupted after", time.perf_counter() - sent[0])
+"""
+
+
+@pytest.mark.parametrize("work", ["batched", "ipopt", "lcp", "relaxed lcp", "violation_loss"])
+def test_ctrl_c_ends_native_work(work):
+    done = subprocess.run([sys.executable, "-c", INTERRUPT, work], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("interrupted after"), done.stdout + done.stderr
+    assert float(done.stdout.split()[-1]) < 1.0  # 0.05 s on a quiet machine; the work itself takes many seconds
+
+
+def test_a_thread_that_cannot_start_costs_speed_only():
+    code = (
+        "import resource, torch\n"
+        "from difflcs import GoalCost, LCSModel, LCSMPCLayer\n"
+        "from difflcs.mpc.backends import BatchedBackend\n"
+        "torch.manual_seed(0)\n"
+        "model = LCSModel(4, 2, 3, init_scale=0.1)\n"
+        "mpc = LCSMPCLayer(model, GoalCost.reach(4, 2), 5, -1.0, 1.0, backend=BatchedBackend(threads=400))\n"
+        "x = torch.randn(20_000, 4).double()\n"
+        "mpc(x[:8], x[:8])\n"
+        "used = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (used + 300_000_000,) * 2)\n"
+        "plan = mpc(x, x)\n"
+        "plan.action.sum().backward()\n"
+        "print(bool(plan.converged.all()), bool(torch.isfinite(model.A.grad).all()))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.stdout.split() == ["True", "True"], done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("threads", [0, -1, 2**31, 10**6])
+def test_absurd_numbers_of_threads_are_refused(threads):
+    with pytest.raises(InvalidInputError, match="threads: expected at"):
+        BatchedBackend(threads=threads)
+
+
+def test_absurd_numbers_of_workers_are_refused():
+    with pytest.raises(InvalidInputError, match="workers: expected at most"):
+        IpoptBackend(workers=2**31)
+
+
+def test_violation_loss_of_a_model_changed_in_place_raises_torchs_error(build):
+    model, n = build.model(0), build.normal(3)
+    x, u, after = n(20, 4), n(20, 2), n(20, 4)
+    x.requires_grad_()
+    loss = violation_loss(model, x, u, after)
+    with torch.no_grad():
+        model.A.mul_(2)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
