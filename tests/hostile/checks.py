@@ -54,6 +54,7 @@ def judge_lcp(problem: LCP, lam: np.ndarray, w: np.ndarray, relaxation: float, s
 
     - sign: λ, w ≥ 0.
     - equation: |w − (Fλ + q)|_i ≤ 1e-9 of the terms of row i, and ≤ 1e-7·max|q| (relaxed: + sqrt(relaxation·max F_ii)).
+      What is below 1e-100 of the largest entry of q counts as zero: no float64 spans 1e-301 and 1e150.
     - complementarity: exactly λ_i = 0 or w_i = 0; relaxed: |λ_i w_i − ε| ≤ 1e-9 ε.
     """
     with np.errstate(all="ignore"):
@@ -64,6 +65,7 @@ def judge_lcp(problem: LCP, lam: np.ndarray, w: np.ndarray, relaxation: float, s
         if single:  # of w, of every λ; below 1e-38 float32 has fewer digits
             rounding = SINGLE * (terms + np.abs(w)) + 2e-45 * (1 + np.abs(F).sum(-1))
         size = np.abs(q).max(-1, keepdims=True)
+        rounding = rounding + 1e-100 * size
         product = np.abs(lam * w - relaxation)
         if relaxation > 0:
             diagonal = np.diagonal(F, axis1=-2, axis2=-1).max(-1)

@@ -155,9 +155,9 @@ def _lcp_differences(problem: LCP, relaxation: float, rng: Generator) -> tuple[n
     with quiet(), np.errstate(all="ignore"):
         solution = solve_lcp(F, q, relaxation)
         lam, w = solution.lam.detach().numpy(), solution.w.detach().numpy()
-        # Each output in units of its own size, so that no large one hides a small one.
-        sizes = [1 / np.maximum(np.abs(v).max(-1, keepdims=True), 1e-300) for v in (lam, w)]
-        seeds = [torch.from_numpy(a * b) for a, b in zip(weights, sizes, strict=True)]
+        # Each output in units of its own size, so that no large one hides a small one; all w may be zero.
+        units = [np.abs(lam).max(-1, keepdims=True), np.abs(np.concatenate([w, problem.q], -1)).max(-1, keepdims=True)]
+        seeds = [torch.from_numpy(a / np.maximum(b, 1e-300)) for a, b in zip(weights, units, strict=True)]
         torch.autograd.backward([solution.lam, solution.w], seeds)
         assert F.grad is not None
         assert q.grad is not None
@@ -364,8 +364,16 @@ def _mpc_differences(problem: MPC, backend, rng: Generator) -> tuple[np.ndarray,
             for name, seed in zip((*names, "objective"), seeds, strict=True):
                 product = seed * (getattr(high, name) - getattr(low, name))
                 change += product.reshape(count, -1).sum(-1)
-            same = solved & high.converged & low.converged
-            return (change / (2 * step)).numpy(), same.numpy()
+            same = (solved & high.converged & low.converged).numpy()
+            # Both must stay on the branch of the solution, and solve their own problems.
+            base, up, down = (_double(v.u) for v in (plan, high, low))
+            width = np.maximum(np.abs(a["u_max"] - a["u_min"])[:, None], 1e-300)
+            jump = np.abs(0.5 * (up + down) - base) > 1e-6 * width + np.abs(up - down)
+            same &= ~jump.any((1, 2))
+            for sign, found in ((1, high), (-1, low)):
+                numbers = (_double(v) for v in (found.x, found.u, found.lam, found.objective))
+                same &= np.stack(list(checks.judge_mpc(moved(sign * step), *numbers).values())).max(0) <= 1
+            return (change / (2 * step)).numpy(), same
 
         return _compare(terms, difference, 1e-5)
 
