@@ -25,7 +25,7 @@ import numpy as np
 import torch
 
 from difflcs import Status
-from tests.hostile import generators, targets
+from tests.hostile import generators, rules, targets
 from tests.hostile.targets import Outcome
 
 
@@ -65,9 +65,9 @@ class Cell:
 
 _GENERATORS = {**generators.LCP_CLASSES, **generators.MPC_CLASSES, **generators.LOSS_CLASSES}
 _TARGETS = {
-    "lcp": targets.LCP_TARGETS,
-    "mpc": {**targets.MPC_TARGETS, **targets.SLOW_TARGETS},
-    "loss": targets.LOSS_TARGETS,
+    "lcp": {**targets.LCP_TARGETS, **rules.RULE_TARGETS},
+    "mpc": {**targets.MPC_TARGETS, **targets.SLOW_TARGETS, **rules.RULE_TARGETS},
+    "loss": {**targets.LOSS_TARGETS, **rules.RULE_TARGETS},
 }
 CELLS = [
     *(Cell(p, t, 256, 1.0) for p in generators.LCP_CLASSES for t in targets.LCP_TARGETS),
@@ -75,6 +75,8 @@ CELLS = [
     *(Cell(p, "ipopt", 8, 0.01) for p in generators.MPC_CLASSES),
     *(Cell(p, "relaxed", 8, 0.005) for p in generators.MPC_CLASSES),
     *(Cell(p, t, 64, 0.25) for p in generators.LOSS_CLASSES for t in targets.LOSS_TARGETS),
+    *(Cell(p, "neighbours", 32, 0.2) for p in ("lcp-plain", "mpc-plain")),
+    *(Cell(p, t, 16, 0.02) for p in ("lcp-plain", "mpc-plain", "loss-plain") for t in ("in-place", "double backward")),
 ]
 
 
@@ -140,6 +142,17 @@ def plan(count: int, cells: list[Cell]) -> Iterator[tuple[Cell, int]]:
     chunks = {cell: max(1, round(count * cell.share / total / cell.size)) for cell in cells}
     for number in range(max(chunks.values(), default=0)):
         yield from ((cell, number) for cell in cells if number < chunks[cell])
+
+
+def line(record: Record) -> str:
+    """One line of a results file."""
+    return json.dumps(asdict(record))
+
+
+def reproduction(record: Record) -> str:
+    """The command that shows the first silent failure of a record."""
+    index = record.failures[0][0] if record.failures else 0
+    return f'python -m tests.hostile.campaign --only "{record.cell}" --seed {record.seed} --index {index}'
 
 
 def read(path: Path) -> list[Record]:
@@ -224,6 +237,8 @@ def main() -> None:
     done = {(r.cell, r.chunk) for r in records}
     todo = [(cell, number) for cell, number in plan(options.count, cells) if (cell.name, number) not in done]
     file = options.out.open("a") if options.out else None
+    if file and options.out.stat().st_size and not options.out.read_text().endswith("\n"):
+        file.write("\n")  # a kill cut the last line
     started, last = time.perf_counter(), 0.0
     # Processes of their own, one thread each: a crash of a solver ends the run with an error, never in silence.
     with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:
@@ -232,7 +247,7 @@ def main() -> None:
             record = future.result()
             records.append(record)
             if file:
-                file.write(json.dumps(asdict(record)) + "\n")
+                file.write(line(record) + "\n")
                 file.flush()
             for index, check, worst in record.failures[:3]:
                 print(f"SILENT {record.cell} --seed {record.seed} --index {index}: {check}, {worst:.3g} of its limit")

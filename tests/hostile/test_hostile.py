@@ -1,0 +1,106 @@
+"""The quick tier of the campaign: every class over every target, nothing wrong in silence, and not by refusing."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from tests.hostile import campaign, generators, targets  # noqa: E402
+
+SLOW_CLASSES = ("mpc-plain", "mpc-flat", "mpc-stiff")  # for the solvers that take 10 ms and more per problem
+CELLS = [c for c in campaign.CELLS if c.target not in targets.SLOW_TARGETS or c.problems in SLOW_CLASSES]
+
+# Least share of solved elements in the quick tier, so that refusing everything does not pass.
+FLOORS = {
+    "lcp-plain": 1.0,
+    "lcp-skew-1e-2": 0.99,
+    "lcp-nearly-singular": 0.98,
+    "lcp-graded": 0.98,
+    "lcp-degenerate": 0.98,
+    "lcp-p-matrix": 0.98,
+    "mpc-plain": 0.85,
+    "mpc-flat": 0.95,
+    "mpc-flat-tiny": 0.85,
+    "mpc-flat-contact": 0.85,
+    "mpc-no-effect": 0.9,
+    "mpc-number-bounds": 0.95,
+    "mpc-units": 0.85,
+    "mpc-cost-scale": 0.9,
+    "mpc-stuck": 0.95,
+    "loss-plain": 1.0,
+    "loss-at-bound": 1.0,
+    "loss-scales": 1.0,
+    "loss-tiny-gamma": 1.0,
+}
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize("cell", CELLS, ids=lambda c: c.name)
+def test_nothing_is_wrong_in_silence(cell, one_thread):
+    if cell.target == "relaxed":
+        pytest.importorskip("cvxpylayers")
+    record = campaign.run_chunk(cell, seed=0, number=0)
+    assert record.silent == 0, f"{record.by_check}, reproduce: {campaign.reproduction(record)}"
+    floor = FLOORS.get(cell.problems, 0.0)
+    assert record.solved_share >= floor, f"{record.flagged} of {record.tried} refused"
+
+
+def test_a_chunk_depends_on_class_seed_and_number_alone():
+    cell = next(c for c in campaign.CELLS if c.name == "mpc-plain/batched")
+    (a, _), (b, _), (c, _) = cell.chunk(3, 5), cell.chunk(3, 5), cell.chunk(3, 6)
+    assert all((a.arrays[k] == b.arrays[k]).all() for k in a.arrays)
+    assert a.arrays["x0"].shape != c.arrays["x0"].shape or (a.arrays["x0"] != c.arrays["x0"]).any()
+
+
+def test_every_generator_says_what_is_hostile():
+    for generator in (*generators.LCP_CLASSES.values(), *generators.MPC_CLASSES.values()):
+        assert generator.__doc__
+
+
+def test_the_judges_see_a_wrong_answer(one_thread):
+    """Each condition, broken by hand, is seen: a judge that accepts everything proves nothing."""
+    import numpy as np
+    from tests.hostile import checks
+
+    cell = next(c for c in campaign.CELLS if c.name == "mpc-cost-scale/batched")
+    problem, _ = cell.chunk(1, 0)
+    problem = problem.select(slice(0, 4))
+    leaves = targets.leaves_of(problem)
+    with targets.quiet():
+        plan = targets.layer_of(problem, leaves)(leaves["x0"])
+    x, u, lam, objective = (v.detach().numpy() for v in (plan.x, plan.u, plan.lam, plan.objective))
+
+    def broken(**changes) -> set[str]:
+        numbers = {"x": x, "u": u, "lam": lam, "objective": objective} | changes
+        ratios = checks.judge_mpc(problem, **numbers)
+        return {name for name, ratio in ratios.items() if ratio[0] > 1}
+
+    assert broken() <= {"stationarity"}
+    assert "start" in broken(x=x + np.eye(x.shape[1])[0][:, None] * 1e-12)
+    assert "dynamics" in broken(x=x * np.where(np.arange(x.shape[1]) == 1, 1.001, 1)[:, None])
+    assert {"bounds", "stationarity"} <= broken(u=u + 1.0)
+    assert "complementarity" in broken(lam=1.001 * lam)
+    assert "sign of lam" in broken(lam=-lam)
+    assert broken(objective=objective * (1 + 1e-6)) >= {"objective"}
+    assert "finite" in broken(u=np.full_like(u, np.nan))
+    low, high = checks.bounds_in(problem, np.float64)
+    middle = 0.5 * (low + high)
+    assert "stationarity" in broken(u=np.where(u < middle, high, low))
+
+    lcp, _ = next(c for c in campaign.CELLS if c.name == "lcp-plain/exact").chunk(0, 0)
+    zero = np.zeros_like(lcp.q)
+    ratios = checks.judge_lcp(lcp, zero, np.maximum(lcp.q, 0), 0.0, single=False)
+    assert ((ratios["equation"] > 1) == (lcp.q < 0).any(-1)).all()
+
+
+def test_records_survive_a_cut_line(tmp_path):
+    cell = next(c for c in campaign.CELLS if c.name == "lcp-plain/exact")
+    record = campaign.run_chunk(cell, 0, 0, gradients=False)
+    path = tmp_path / "results.jsonl"
+    line = campaign.line(record)
+    path.write_text(line + "\n" + line[: len(line) // 2])
+    assert [r.tried for r in campaign.read(path)] == [record.tried]
+    assert "| lcp-plain | exact | 256 | 100.0 | 0 | 0 | 0 |" in campaign.markdown(campaign.read(path))
