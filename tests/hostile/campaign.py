@@ -1,7 +1,7 @@
 """The campaign: every class of hostile problems over every target, each returned element judged.
 
     python -m tests.hostile.campaign --count 1000000 --seed 0 --out results.jsonl
-    python -m tests.hostile.campaign --markdown results.jsonl
+    python -m tests.hostile.campaign --markdown results.jsonl --fill docs/promises.md
     python -m tests.hostile.campaign --only "mpc-flat/warm" --seed 0 --index 17
 
 A run appends one line per chunk to its file and, started again, goes on from there. A chunk depends on the class, the
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+import warnings
 import zlib
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -176,30 +177,38 @@ def table(records: list[Record]) -> dict[str, Record]:
 
 
 def markdown(records: list[Record]) -> str:
-    """The table of docs/promises.md."""
-    lines = ["| problems | target | tried | solved [%] | flagged | gradients compared | silent |", "|---|---|---|---|---|---|---|"]
-    rows = table(records)
-    for name, row in rows.items():
-        problems, target = name.split("/")
-        solved = f"{100 * row.solved_share:.1f}"
-        lines.append(f"| {problems} | {target} | {row.tried} | {solved} | {row.flagged} | {row.compared} | {row.silent} |")
+    """The table of docs/promises.md: one row per class, all targets together."""
+    rows: dict[str, Record] = {}
     total = Record("all", 0)
-    for row in rows.values():
-        total.add(row)
-    solved = f"{100 * total.solved_share:.1f}"
-    lines.append(f"| all | | {total.tried} | {solved} | {total.flagged} | {total.compared} | {total.silent} |")
+    for name, record in table(records).items():
+        problems = name.split("/")[0]
+        rows.setdefault(problems, Record(problems, record.seed)).add(record)
+        total.add(record)
+    lines = ["| problems | tried | solved [%] | flagged | gradients compared | silent |", "|---|---|---|---|---|---|"]
+    for row in (*rows.values(), total):
+        solved = f"{100 * row.solved_share:.1f}"
+        lines.append(f"| {row.cell} | {row.tried} | {solved} | {row.flagged} | {row.compared} | {row.silent} |")
     return "\n".join(lines)
 
 
+BEGIN, END = "<!-- campaign: begin -->\n", "<!-- campaign: end -->\n"
+
+
+def fill(page: Path, records: list[Record]) -> None:
+    """Put the table between the marks of a page."""
+    text = page.read_text()
+    before, rest = text.split(BEGIN)
+    after = rest.split(END)[1]
+    page.write_text(f"{before}{BEGIN}{markdown(records)}\n{END}{after}")
+
+
 def _print(records: list[Record]) -> None:
-    head = f"{'class/target':34} {'tried':>8} {'conv':>8} {'degen':>7} {'flagged':>8} {'silent':>7} {'grads':>6} {'worst':>9} {'1/s':>8}"
-    print(head)
+    names = ("tried", "converged", "degenerate", "flagged", "silent", "compared", "worst", "1/s")
+    print(f"{'class/target':36}" + "".join(f"{name:>11}" for name in names))
     for name, r in table(records).items():
+        counts = (r.tried, r.converged, r.degenerate, r.flagged, r.silent, r.compared)
         rate = r.tried / max(r.seconds, 1e-9)
-        print(
-            f"{name:34} {r.tried:8} {r.converged:8} {r.degenerate:7} {r.flagged:8} {r.silent:7} {r.compared:6} "
-            f"{r.worst:9.2g} {rate:8.0f}  {r.by_check or ''}"
-        )
+        print(f"{name:36}" + "".join(f"{c:11}" for c in counts) + f"{r.worst:11.2g}{rate:11.0f}  {r.by_check or ''}")
 
 
 @cache
@@ -209,7 +218,9 @@ def _one_thread() -> None:
 
 def _work(cell: Cell, seed: int, number: int) -> Record:
     _one_thread()
-    return run_chunk(cell, seed, number)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of NumPy and cvxpylayers, about the overflows that are asked for
+        return run_chunk(cell, seed, number)
 
 
 def main() -> None:
@@ -221,9 +232,13 @@ def main() -> None:
     parser.add_argument("--index", type=int, help="show this one element of --only")
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--markdown", type=Path, help="print the table of a results file and end")
+    parser.add_argument("--fill", type=Path, help="with --markdown: put it into this page instead, docs/promises.md")
     options = parser.parse_args()
     if options.markdown:
-        print(markdown(read(options.markdown)))
+        records = read(options.markdown)
+        if options.fill:
+            fill(options.fill, records)
+        print(markdown(records))
         return
     exact = [cell for cell in CELLS if cell.name == options.only]
     cells = exact or [cell for cell in CELLS if options.only in cell.name]

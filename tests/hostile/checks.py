@@ -109,8 +109,8 @@ def judge_mpc(
     - start: x_0 is the caller's, exactly. bounds: u within them, exactly. sign: λ > 0.
     - dynamics: |x₊ − (Ax + Bu + Cλ + d)|_i ≤ 1e-6 of its terms.
     - complementarity: |λ_i s_i − ε| ≤ 1e-6 ε + 1e-13 λ_i · terms of s_i, s = Dx + Eu + Fλ + c.
-    - stationarity: a step of the whole width against the gradient, scaled by its terms, stays: |clip(u − width·g/G) − u|
-      ≤ 1e-6 width. Free of units, and blind to no flat direction.
+    - stationarity: a step of the whole width against the gradient, scaled by its terms, stays:
+      |clip(u − width·g/G) − u| ≤ 1e-6 width. Free of units, and blind to no flat direction.
     - objective: the cost of the returned trajectory, to 1e-9 (float32: 1e-5) of its terms.
     - answer: the vertex of a linear program.
     """
@@ -120,12 +120,9 @@ def judge_mpc(
         rounding = SINGLE if single else 0.0
         low, high = bounds_in(problem, dtype)
         now, after = x[:, :-1], x[:, 1:]
-        next_terms = _mv(np.abs(a["A"]), np.abs(now)) + _mv(np.abs(a["B"]), np.abs(u)) + _mv(np.abs(a["C"]), np.abs(lam))
-        next_terms = next_terms + np.abs(a["d"])[:, None]
-        step = after - (_mv(a["A"], now) + _mv(a["B"], u) + _mv(a["C"], lam) + a["d"][:, None])
-        s = _mv(a["D"], now) + _mv(a["E"], u) + _mv(a["F"], lam) + a["c"][:, None]
-        s_terms = _mv(np.abs(a["D"]), np.abs(now)) + _mv(np.abs(a["E"]), np.abs(u)) + _mv(np.abs(a["F"]), np.abs(lam))
-        s_terms = s_terms + np.abs(a["c"])[:, None]
+        predicted, next_terms = _affine(a, "ABCd", now, u, lam)
+        step = after - predicted
+        s, s_terms = _affine(a, "DEFc", now, u, lam)
         cost, cost_terms = _cost(problem, a, x, u, low, high)
         relaxation = problem.relaxation
         # Below 1e-38 float32 has fewer digits.
@@ -144,6 +141,14 @@ def judge_mpc(
             "objective": _ratio(np.abs(objective - cost), (1e-5 if single else 1e-9) * cost_terms),
             "answer": _vertex(problem, u, low, high, rounding),
         }
+
+
+def _affine(a: dict, names: str, x, u, lam) -> tuple[np.ndarray, np.ndarray]:
+    """Left x + middle u + right λ + constant by four names, and the sum of the sizes of its terms."""
+    matrices, constant = [a[k] for k in names[:3]], a[names[3]][:, None]
+    pairs = list(zip(matrices, (x, u, lam), strict=True))
+    value = sum((_mv(M, v) for M, v in pairs), constant)
+    return value, sum((_mv(np.abs(M), np.abs(v)) for M, v in pairs), np.abs(constant))
 
 
 def _cost(problem: MPC, a: dict, x, u, low, high) -> tuple[np.ndarray, np.ndarray]:
@@ -169,7 +174,7 @@ def stationarity(problem: MPC, a: dict, x, u, lam, s, s_terms, low, high, roundi
 
     With ρ = λ∘y the equation (diag s + Fᵀ diag λ) y = −Cᵀp is (diag s/λ + Fᵀ) ρ = −Cᵀp; rows are scaled by λ/(λ+s).
     """
-    count, horizon, n_u = u.shape
+    count, horizon, _ = u.shape
     width = np.broadcast_to(high - low, u.shape)
     b = lam / (lam + s)
     p = _mv(a["Q_final"], x[:, -1]) + a["q_final"]
@@ -248,16 +253,12 @@ def _vertex(problem: MPC, u, low, high, rounding: float) -> np.ndarray:
 
 
 def judge_relaxed_program(
-    problem: MPC, x: np.ndarray, u: np.ndarray, lam: np.ndarray, objective: np.ndarray
+    problem: MPC, x: np.ndarray, u: np.ndarray, lam: np.ndarray, objective: np.ndarray, dtype=np.float64
 ) -> Ratios:
     """Promises of backend `relaxed`, whose convex program keeps dynamics, bounds and signs, but not λ∘s = ε."""
     with np.errstate(all="ignore"):
-        ratios = judge_mpc(problem, x, u, lam, objective)
-        a = problem.full()
-        now = x[:, :-1]
-        s = _mv(a["D"], now) + _mv(a["E"], u) + _mv(a["F"], lam) + a["c"][:, None]
-        terms = _mv(np.abs(a["D"]), np.abs(now)) + _mv(np.abs(a["E"]), np.abs(u)) + _mv(np.abs(a["F"]), np.abs(lam))
-        terms = terms + np.abs(a["c"])[:, None]
+        ratios = judge_mpc(problem, x, u, lam, objective, dtype)
+        s, terms = _affine(problem.full(), "DEFc", x[:, :-1], u, lam)
         kept = ("finite", "start", "bounds", "dynamics", "objective", "answer")
         return {
             **{k: ratios[k] for k in kept},
@@ -266,11 +267,11 @@ def judge_relaxed_program(
         }
 
 
-# ---- violation loss ---------------------------------------------------------------------------------------------------
+# ---- violation loss -------------------------------------------------------------------------------------------------
 
 
 def judge_loss(problem: Loss, value: np.ndarray) -> Ratios:
-    """The value of each transition against an own solution of the inner QP, to 1e-6 of it and 1e-9 of its value at λ = 0.
+    """The value against an own solution of the inner QP, to 1e-6 of it and 1e-9 of its value at λ = 0.
 
     min over λ, φ ≥ 0 of ½‖r + Cλ‖² + (λᵀφ + ‖e + Fλ − φ‖²/(2γ))/ξ, as least squares under z ≥ 0 (Lawson & Hanson).
     """

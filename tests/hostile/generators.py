@@ -149,7 +149,9 @@ def skew(epsilon: float) -> Callable[..., LCP]:
         q = rng.standard_normal((count, n))
         return LCP(K - K.swapaxes(-1, -2) + epsilon * np.eye(n), q)
 
-    lcp_skew.__doc__ = f"F = K − Kᵀ + {epsilon:g}·I: F + Fᵀ is {2 * epsilon:g}·I beside a skew part of size 1; λ up to 1/ε."
+    lcp_skew.__doc__ = (
+        f"F = K − Kᵀ + {epsilon:g}·I: F + Fᵀ is {2 * epsilon:g}·I beside a skew part of size 1; λ up to 1/ε."
+    )
     return lcp_skew
 
 
@@ -309,7 +311,7 @@ def _linear_cost(problem: MPC, rng: Generator) -> MPC:
 
 
 def mpc_flat(rng: Generator, count: int, small: bool = False) -> MPC:
-    """Q = R = Q_final = 0, linear terms of size 1, without an effect of λ on the states: a linear program, known vertex."""
+    """Q = R = Q_final = 0, linear terms of size 1, no effect of λ on the states: a linear program, known vertex."""
     problem = _linear_cost(_mpc(rng, count, small), rng)
     problem = _with(problem, C=np.zeros_like(problem.arrays["C"]))
     if rng.random() < 0.5:
@@ -336,7 +338,7 @@ def mpc_flat_tiny(rng: Generator, count: int, small: bool = False) -> MPC:
 
 
 def mpc_no_effect(rng: Generator, count: int, small: bool = False) -> MPC:
-    """One action without cost or effect (columns of B, E, R zero) in half of the elements, or with a linear cost only."""
+    """One action without cost or effect (its part of B, E, R zero) in half of the elements, or with a linear cost."""
     problem = _mpc(rng, count, small).each()
     B, E, R, r = (problem.arrays[k] for k in ("B", "E", "R", "r"))
     dead = rng.random(count) < 0.5
@@ -359,7 +361,9 @@ def mpc_unstable(rng: Generator, count: int, small: bool = False) -> MPC:
     problem = _mpc(rng, count, small, horizon=horizon)
     a = rng.choice([1.5, 3.0, 10.0, 100.0, 1000.0])
     A = problem.arrays["A"]
-    return _with(problem, A=a * np.eye(A.shape[-1]) + (0.05 * rng.standard_normal(A.shape) if rng.random() < 0.5 else 0))
+    return _with(
+        problem, A=a * np.eye(A.shape[-1]) + (0.05 * rng.standard_normal(A.shape) if rng.random() < 0.5 else 0)
+    )
 
 
 def mpc_number_bounds(rng: Generator, count: int, small: bool = False) -> MPC:
@@ -439,7 +443,7 @@ def mpc_stuck(rng: Generator, count: int, small: bool = False) -> MPC:
     return _with(problem, **{k: np.zeros_like(problem.arrays[k]) for k in names})
 
 
-# ---- violation loss ---------------------------------------------------------------------------------------------------
+# ---- violation loss -------------------------------------------------------------------------------------------------
 
 
 def _loss(rng: Generator, count: int, scale: float = 1.0) -> Loss:

@@ -99,7 +99,7 @@ def _changed(problem, rng: Generator) -> bool:
             try:
                 total.backward()
             except RuntimeError as error:
-                if in_place_ and "modified by an inplace operation" in str(error) or isinstance(error, DiffLCSError):
+                if (in_place_ and "modified by an inplace operation" in str(error)) or isinstance(error, DiffLCSError):
                     return False
                 raise
         found.append(_gradients(leaves))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from tests.hostile import campaign, generators, targets  # noqa: E402
+from tests.hostile import campaign, generators, targets
 
 SLOW_CLASSES = ("mpc-plain", "mpc-flat", "mpc-stiff")  # for the solvers that take 10 ms and more per problem
 CELLS = [c for c in campaign.CELLS if c.target not in targets.SLOW_TARGETS or c.problems in SLOW_CLASSES]
@@ -63,6 +63,7 @@ def test_every_generator_says_what_is_hostile():
 def test_the_judges_see_a_wrong_answer(one_thread):
     """Each condition, broken by hand, is seen: a judge that accepts everything proves nothing."""
     import numpy as np
+
     from tests.hostile import checks
 
     cell = next(c for c in campaign.CELLS if c.name == "mpc-cost-scale/batched")
@@ -103,4 +104,10 @@ def test_records_survive_a_cut_line(tmp_path):
     line = campaign.line(record)
     path.write_text(line + "\n" + line[: len(line) // 2])
     assert [r.tried for r in campaign.read(path)] == [record.tried]
-    assert "| lcp-plain | exact | 256 | 100.0 | 0 | 0 | 0 |" in campaign.markdown(campaign.read(path))
+    assert "| lcp-plain | 256 | 100.0 | 0 | 0 | 0 |" in campaign.markdown(campaign.read(path))
+    page = tmp_path / "page.md"
+    page.write_text(f"before\n{campaign.BEGIN}old\n{campaign.END}after\n")
+    campaign.fill(page, [record])
+    assert page.read_text().startswith(f"before\n{campaign.BEGIN}| problems")
+    assert page.read_text().endswith(f"{campaign.END}after\n")
+    assert "old" not in page.read_text()
