@@ -125,6 +125,11 @@ def judge_mpc(
         s, s_terms = _affine(a, "DEFc", now, u, lam)
         cost, cost_terms = _cost(problem, a, x, u, low, high)
         relaxation = problem.relaxation
+        stationary = stationarity(problem, a, x, u, lam, s, s_terms, low, high, rounding)
+        if (stationary > 1).any():
+            # Where the terms of s are so large that their rounding is all of s, its other reading is ε/λ.
+            other = stationarity(problem, a, x, u, lam, relaxation / lam, s_terms, low, high, rounding)
+            stationary = np.minimum(stationary, other)
         # Below 1e-38 float32 has fewer digits.
         tiny = 2e-45 * (1 + s_terms) if single else 0.0
         return {
@@ -137,7 +142,7 @@ def judge_mpc(
                 np.abs(lam * s - relaxation),
                 (1e-6 + rounding) * relaxation + (1e-13 + 2 * rounding) * lam * s_terms + tiny,
             ),
-            "stationarity": stationarity(problem, a, x, u, lam, s, s_terms, low, high, rounding),
+            "stationarity": stationary,
             "objective": _ratio(np.abs(objective - cost), (1e-5 if single else 1e-9) * cost_terms),
             "answer": _vertex(problem, u, low, high, rounding),
         }
@@ -170,58 +175,59 @@ def _cost(problem: MPC, a: dict, x, u, low, high) -> tuple[np.ndarray, np.ndarra
 
 
 def stationarity(problem: MPC, a: dict, x, u, lam, s, s_terms, low, high, rounding: float) -> np.ndarray:
-    """The reduced gradient g = dJ/du by an own adjoint recursion, then the projected step in units of the width.
+    """The projected step against the reduced gradient, in units of the width, over its limit."""
+    g, terms, noise = reduced_gradient(a, x, u, lam, s, s_terms, rounding)
+    width = np.broadcast_to(high - low, u.shape)
+    last = np.concatenate([np.repeat(a["Q"][:, None], u.shape[1] - 1, 1), a["Q_final"][:, None]], 1)
+    curvature = (a["B"][:, None] * (last @ a["B"][:, None])).sum(2)
+    curvature = curvature + np.diagonal(a["R"], axis1=-2, axis2=-1)[:, None]
+    spread = 0.0
+    if problem.barrier > 0:
+        below, above = u - low, high - u
+        g = g + problem.barrier * (1 / above - 1 / below)
+        terms = terms + problem.barrier * (1 / above + 1 / below)
+        spread = problem.barrier * width / np.minimum(below, above) ** 2
+    G = np.maximum(terms, curvature * width)
+    G = np.where(G > 0, G, 1.0)
+    divisor = np.where(width > 0, width, 1.0)
+    # The action itself is rounded, by up to a part of its size; so is its distance in the terms of a barrier.
+    allowance = 1e-6 + noise / G + max(rounding, 2.0**-52) * np.abs(u) / divisor + (1e-14 + rounding) * spread / G
+    move = np.clip(u - width * (g / G), low, high) - u
+    return _ratio(np.where(width > 0, np.abs(move) / divisor, 0.0), allowance)
+
+
+def reduced_gradient(
+    a: dict, x, u, lam, s, s_terms, rounding: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The derivative dJ/du (count, H, n_u) by an own adjoint recursion, the sizes of its terms, and its rounding.
 
     With ρ = λ∘y the equation (diag s + Fᵀ diag λ) y = −Cᵀp is (diag s/λ + Fᵀ) ρ = −Cᵀp; rows are scaled by λ/(λ+s).
+    The last is a first-order bound for x, u, λ rounded to float32: each by `rounding` of its size.
     """
-    count, horizon, _ = u.shape
-    width = np.broadcast_to(high - low, u.shape)
+    size = {k: np.abs(v) for k, v in a.items()}
     b = lam / (lam + s)
     p = _mv(a["Q_final"], x[:, -1]) + a["q_final"]
-    p_noise = rounding * (_mv(np.abs(a["Q_final"]), np.abs(x[:, -1])) + np.abs(a["q_final"]))
-    worst = np.zeros(count)
-    for k in reversed(range(horizon)):
+    p_noise = rounding * (_mv(size["Q_final"], np.abs(x[:, -1])) + size["q_final"])
+    steps = []
+    for k in reversed(range(u.shape[1])):
         matrix = b[:, k, :, None] * _t(a["F"]) + np.eye(lam.shape[-1]) * (1 - b[:, k, :, None])
-        right = -b[:, k] * _mv(_t(a["C"]), p)
-        rho = _solve(matrix, right)
-        grows = [_mv(np.abs(_t(a["B"])), np.abs(p)), _mv(np.abs(_t(a["E"])), np.abs(rho))]
-        terms = _mv(np.abs(a["R"]), np.abs(u[:, k])) + np.abs(a["r"]) + grows[0] + grows[1]
+        rho = _solve(matrix, -b[:, k] * _mv(_t(a["C"]), p))
         g = _mv(a["R"], u[:, k]) + a["r"] + _mv(_t(a["B"]), p) + _mv(_t(a["E"]), rho)
-        noise = np.zeros_like(g)
-        rho_noise = np.zeros_like(rho)
-        if rounding:  # first-order bound of what the rounding of x, u, λ does to g
+        terms = _mv(size["R"], np.abs(u[:, k])) + size["r"]
+        terms = terms + _mv(_t(size["B"]), np.abs(p)) + _mv(_t(size["E"]), np.abs(rho))
+        noise, rho_noise = np.zeros_like(g), np.zeros_like(rho)
+        if rounding:
             inverse = np.abs(_solve(matrix, np.broadcast_to(np.eye(rho.shape[-1]), matrix.shape)))
-            moved = b[:, k] * _mv(np.abs(_t(a["C"])), p_noise + rounding * np.abs(p))
-            moved = moved + b[:, k] / lam[:, k] * np.abs(rho) * rounding * (s_terms[:, k] + np.abs(s[:, k]))
-            rho_noise = _mv(inverse, moved) + rounding * np.abs(rho)
-            noise = _mv(np.abs(_t(a["B"])), p_noise) + _mv(np.abs(_t(a["E"])), rho_noise) + 2 * rounding * terms
-        last = a["Q_final"] if k == horizon - 1 else a["Q"]
-        curvature = np.diagonal(a["R"], axis1=-2, axis2=-1) + np.einsum("bij,bik,bkj->bj", a["B"], last, a["B"])
-        allowance = np.full_like(g, 1e-6)
-        if problem.barrier > 0:
-            below, above = u[:, k] - low[:, 0], high[:, 0] - u[:, k]
-            g = g + problem.barrier * (1 / above - 1 / below)
-            terms = terms + problem.barrier * (1 / above + 1 / below)
-            nearest = np.minimum(below, above)
-            spread = problem.barrier * width[:, k] / nearest**2
-        G = np.maximum(terms, curvature * width[:, k])
-        safe = np.where(G > 0, G, 1.0)
-        if problem.barrier > 0:
-            allowance = allowance + (1e-14 + rounding) * spread / safe
-        allowance = allowance + noise / safe
-        move = np.clip(u[:, k] - width[:, k] * (g / safe), low[:, 0], high[:, 0]) - u[:, k]
-        violation = np.where(width[:, k] > 0, np.abs(move) / np.where(width[:, k] > 0, width[:, k], 1.0), 0.0)
-        # The action itself is rounded, by up to a part of its size.
-        allowance = allowance + max(rounding, 2.0**-52) * np.abs(u[:, k]) / np.where(width[:, k] > 0, width[:, k], 1.0)
-        worst = np.maximum(worst, _ratio(violation, allowance))
-        p_terms = _mv(np.abs(a["Q"]), np.abs(x[:, k])) + np.abs(a["q"])
-        p_noise = (
-            _mv(np.abs(_t(a["A"])), p_noise + rounding * np.abs(p))
-            + _mv(np.abs(_t(a["D"])), rho_noise)
-            + rounding * p_terms
-        )
+            moved = _mv(_t(size["C"]), p_noise + rounding * np.abs(p))
+            moved = moved + np.abs(rho) / lam[:, k] * rounding * (s_terms[:, k] + np.abs(s[:, k]))
+            rho_noise = _mv(inverse, b[:, k] * moved) + rounding * np.abs(rho)
+            noise = _mv(_t(size["B"]), p_noise) + _mv(_t(size["E"]), rho_noise) + 2 * rounding * terms
+        steps.append((g, terms, noise))
+        p_noise = _mv(_t(size["A"]), p_noise + rounding * np.abs(p)) + _mv(_t(size["D"]), rho_noise)
+        p_noise = p_noise + rounding * (_mv(size["Q"], np.abs(x[:, k])) + size["q"])
         p = _mv(a["Q"], x[:, k]) + a["q"] + _mv(_t(a["A"]), p) + _mv(_t(a["D"]), rho)
-    return worst
+    g, terms, noise = (np.stack(v[::-1], 1) for v in zip(*steps, strict=True))
+    return g, terms, noise
 
 
 def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:

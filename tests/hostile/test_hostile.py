@@ -5,10 +5,11 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from tests.hostile import campaign, generators, targets
+from tests.hostile import campaign, checks, generators, targets
 
 SLOW_CLASSES = ("mpc-plain", "mpc-flat", "mpc-stiff")  # for the solvers that take 10 ms and more per problem
 CELLS = [c for c in campaign.CELLS if c.target not in targets.SLOW_TARGETS or c.problems in SLOW_CLASSES]
@@ -62,10 +63,6 @@ def test_every_generator_says_what_is_hostile():
 
 def test_the_judges_see_a_wrong_answer(one_thread):
     """Each condition, broken by hand, is seen: a judge that accepts everything proves nothing."""
-    import numpy as np
-
-    from tests.hostile import checks
-
     cell = next(c for c in campaign.CELLS if c.name == "mpc-cost-scale/batched")
     problem, _ = cell.chunk(1, 0)
     problem = problem.select(slice(0, 4))
@@ -95,6 +92,51 @@ def test_the_judges_see_a_wrong_answer(one_thread):
     zero = np.zeros_like(lcp.q)
     ratios = checks.judge_lcp(lcp, zero, np.maximum(lcp.q, 0), 0.0, single=False)
     assert ((ratios["equation"] > 1) == (lcp.q < 0).any(-1)).all()
+
+
+def _force(F, gap, relaxation):
+    """λ of λ∘(Fλ + gap) = relaxation by damped Newton on λ + s − √((λ − s)² + 4ε), one element."""
+    lam = np.full(len(gap), np.sqrt(relaxation))
+    for k in range(200):
+        epsilon = max(relaxation, 0.5**k)
+        s = F @ lam + gap
+        root = np.sqrt((lam - s) ** 2 + 4 * epsilon)
+        slope = (lam - s) / root
+        lam = lam - 0.7 * np.linalg.solve(np.diag(1 - slope) + (1 + slope)[:, None] * F, lam + s - root)
+    return lam
+
+
+def test_the_adjoint_of_the_judge_is_the_derivative_of_the_cost():
+    """Against differences of trajectories that NumPy alone computes."""
+    problem, _ = next(c for c in campaign.CELLS if c.name == "mpc-plain/ipopt").chunk(2, 0)
+    problem = problem.select(slice(0, 2))
+    a = problem.full()
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-0.3, 0.3, (2, problem.horizon, a["B"].shape[-1]))
+
+    def trajectory(u):
+        x, lam = [a["x0"]], []
+        for k in range(problem.horizon):
+            gap = np.einsum("bij,bj->bi", a["D"], x[-1]) + np.einsum("bij,bj->bi", a["E"], u[:, k]) + a["c"]
+            lam.append(np.stack([_force(F, g, problem.relaxation) for F, g in zip(a["F"], gap, strict=True)]))
+            moved = ((a["A"], x[-1]), (a["B"], u[:, k]), (a["C"], lam[-1]))
+            x.append(sum(np.einsum("bij,bj->bi", M, v) for M, v in moved) + a["d"])
+        return np.stack(x, 1), np.stack(lam, 1)
+
+    def cost(u):
+        x, _ = trajectory(u)
+        return checks._cost(problem, a, x, u, a["u_min"][:, None], a["u_max"][:, None])[0]
+
+    x, lam = trajectory(u)
+    s, s_terms = checks._affine(a, "DEFc", x[:, :-1], u, lam)
+    assert np.abs(lam * s - problem.relaxation).max() < 1e-9 * problem.relaxation
+    gradient, terms, _ = checks.reduced_gradient(a, x, u, lam, s, s_terms)
+    for k in np.ndindex(u.shape[1:]):
+        step = np.zeros_like(u)
+        step[(slice(None), *k)] = 1e-6
+        difference = (cost(u + step) - cost(u - step)) / 2e-6
+        np.testing.assert_allclose(gradient[(slice(None), *k)], difference, rtol=1e-4, atol=1e-6)
+    assert (terms >= np.abs(gradient)).all()
 
 
 def test_records_survive_a_cut_line(tmp_path):
