@@ -303,9 +303,33 @@ def inner_minimum(problem: Loss) -> tuple[np.ndarray, np.ndarray]:
     for i in range(len(r)):
         target = solve_triangular(L, -scale * q[i], trans="T")
         z = nnls(L, target, maxiter=100 * n)[0] * scale
-        best[i] = _inner_value(a["C"], F, gamma, xi, r[i], e[i], z[:n])
+        best[i] = _descend(a["C"], F, gamma, xi, r[i], e[i], z[:n])
     still = _inner_value(a["C"], F, gamma, xi, r, e, np.zeros((len(r), n)))
     return np.minimum(best, still), still
+
+
+def _descend(C, F, gamma: float, xi: float, r, e, lam, steps: int = 8) -> float:
+    """Projected Newton steps in λ alone, φ eliminated: least squares leaves the rounding of 1/γ in its solution."""
+    best = _inner_value(C, F, gamma, xi, r, e, lam)
+    for _ in range(steps):
+        gap = e + F @ lam
+        on = (gap > gamma * lam).astype(float)  # φ > 0
+        gradient = (
+            C.T @ (r + C @ lam) + (F.T @ (on * lam) + on * (gap - gamma * lam) + F.T @ ((1 - on) * gap) / gamma) / xi
+        )
+        free = (lam > 0) | (gradient < 0)
+        if not free.any():
+            break
+        H = C.T @ C + (F.T * on + on[:, None] * F - gamma * np.diag(on) + (F.T * (1 - on)) @ F / gamma) / xi
+        step = np.zeros_like(lam)
+        step[free] = np.linalg.lstsq(H[np.ix_(free, free)], -gradient[free], rcond=1e-15)[0]
+        trials = [np.maximum(lam + 0.5**k * step, 0.0) for k in range(12)]
+        values = [_inner_value(C, F, gamma, xi, r, e, trial) for trial in trials]
+        k = int(np.argmin(values))
+        if not values[k] < best:
+            break
+        best, lam = values[k], trials[k]
+    return float(best)
 
 
 def _inner_value(C, F, gamma: float, xi: float, r, e, lam):

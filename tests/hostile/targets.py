@@ -343,11 +343,15 @@ def _mpc_differences(problem: MPC, backend, rng: Generator) -> tuple[np.ndarray,
             return np.zeros(count), 0
         names = ("x", "u", "lam")
         values = [getattr(plan, k) for k in names]
+        # Each output in units of its own size, or of what the actions can make of it where it is zero.
+        width = torch.from_numpy(np.abs(np.stack([a["u_min"], a["u_max"]])).max((0, 2)))
+        reach = width * torch.from_numpy(np.abs(a["B"]).max((1, 2)))
+        effort = width**2 * torch.from_numpy(np.abs(a["R"]).max((1, 2)))
         seeds = []
-        for v in values:
-            size = v.detach().abs().amax((1, 2), keepdim=True).clamp_min(1e-300)
-            seeds.append(torch.from_numpy(rng.standard_normal(v.shape)) / size)
-        seeds.append(0.3 / plan.objective.detach().abs().clamp_min(1e-300))
+        for v, floor in zip([*values, plan.objective], [reach, width, 0 * width, effort], strict=True):
+            size = torch.maximum(v.detach().reshape(count, -1).abs().amax(1), 1e-3 * floor).clamp_min(1e-300)
+            draw = torch.from_numpy(np.asarray(rng.standard_normal(v.shape)))
+            seeds.append(draw / size.reshape(-1, *[1] * (v.ndim - 1)))
         torch.autograd.backward([*values, plan.objective], seeds)
         terms = np.concatenate(
             [
