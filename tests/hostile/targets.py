@@ -362,7 +362,9 @@ def _mpc_differences(problem: MPC, backend, rng: Generator) -> tuple[np.ndarray,
             1,
         )
         guess = Primal(*(v.detach() for v in values))
-        solved = plan.status == Status.CONVERGED
+        solved = (plan.status == Status.CONVERGED).numpy()
+        found = (_double(v) for v in (*values, plan.objective))
+        solved &= checks.judge_mpc(problem, *found)["stationarity"] <= 1e-2  # else it is not the point of its gradient
 
         def solve(step: float):
             shifted = moved(step)
@@ -379,7 +381,7 @@ def _mpc_differences(problem: MPC, backend, rng: Generator) -> tuple[np.ndarray,
             for name, seed in zip((*names, "objective"), seeds, strict=True):
                 product = seed * (getattr(high, name) - getattr(low, name))
                 change += product.reshape(count, -1).sum(-1)
-            same = (solved & high.converged & low.converged).numpy()
+            same = solved & (high.converged & low.converged).numpy()
             # Both must stay on the branch of the solution, and solve their own problems to far less than a step.
             base, up, down = (_double(v.u) for v in (plan, high, low))
             width = np.maximum(np.abs(a["u_max"] - a["u_min"])[:, None], 1e-300)
