@@ -1,0 +1,340 @@
+"""Independent judges of what the library returns. NumPy and SciPy only: nothing here imports difflcs.
+
+Every judge recomputes the conditions in float64 from the RETURNED numbers and gives, per condition and element,
+violation / limit: above 1 is a broken promise, and what is not a number counts as infinite. `SINGLE` is the allowance
+for results that were rounded to float32: one rounding of each term.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import nnls
+
+from tests.hostile.generators import LCP, MPC, Loss
+
+Ratios = dict[str, np.ndarray]
+
+SINGLE = 2.0**-22  # two roundings to float32: of a value and of what it is compared with
+_TINY = 1e-320
+
+
+def _ratio(violation: np.ndarray, limit: np.ndarray | float) -> np.ndarray:
+    """Largest violation / limit of each element, 0 / 0 = 0, NaN = ∞."""
+    with np.errstate(all="ignore"):
+        ratio = np.where(violation <= 0, 0.0, violation / np.maximum(limit, _TINY))
+    ratio = np.where(np.isnan(violation) | np.isnan(ratio) | np.isnan(limit), np.inf, ratio)
+    return ratio.reshape(len(ratio), -1).max(1, initial=0.0)
+
+
+def finite(*values: np.ndarray) -> np.ndarray:
+    """0 where all numbers of an element are finite, else ∞."""
+    bad = np.zeros(len(values[0]), bool)
+    for v in values:
+        bad |= ~np.isfinite(v.reshape(len(v), -1)).all(1)
+    return np.where(bad, np.inf, 0.0)
+
+
+def _mv(M: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """M (count, i, j) or (i, j) times v (count, j) or (count, steps, j)."""
+    spec = "bkj" if v.ndim == 3 else "bj"
+    matrix = "bij" if M.ndim == 3 else "ij"
+    return np.einsum(f"{matrix},{spec}->{spec[:-1]}i", M, v)
+
+
+def _t(M: np.ndarray) -> np.ndarray:
+    return M.swapaxes(-1, -2)
+
+
+# ---- LCP ------------------------------------------------------------------------------------------------------------
+
+
+def judge_lcp(problem: LCP, lam: np.ndarray, w: np.ndarray, relaxation: float, single: bool) -> Ratios:
+    """Promises of `solve_lcp` for CONVERGED elements; problem and results in the caller's numbers, as float64.
+
+    - sign: λ, w ≥ 0.
+    - equation: |w − (Fλ + q)|_i ≤ 1e-9 of the terms of row i, and ≤ 1e-7·max|q| (relaxed: + sqrt(relaxation·max F_ii)).
+      What is below 1e-100 of the largest entry of q counts as zero: no float64 spans 1e-301 and 1e150.
+    - complementarity: exactly λ_i = 0 or w_i = 0; relaxed: |λ_i w_i − ε| ≤ 1e-9 ε.
+    """
+    with np.errstate(all="ignore"):
+        F, q = problem.F, problem.q
+        terms = np.abs(q) + _mv(np.abs(F), lam)
+        error = np.abs(w - (_mv(F, lam) + q))
+        rounding = np.zeros_like(terms)
+        if single:  # of w, of every λ; below 1e-38 float32 has fewer digits
+            rounding = SINGLE * (terms + np.abs(w)) + 2e-45 * (1 + np.abs(F).sum(-1))
+        size = np.abs(q).max(-1, keepdims=True)
+        rounding = rounding + 1e-100 * size
+        product = np.abs(lam * w - relaxation)
+        if relaxation > 0:
+            diagonal = np.diagonal(F, axis1=-2, axis2=-1).max(-1)
+            size = size + np.sqrt(relaxation * np.maximum(diagonal, 0.0)).reshape(-1, 1)
+            limit = (1e-9 + (SINGLE if single else 0)) * relaxation + (2e-45 * (lam + w) if single else 0)
+            complementary = _ratio(product, limit)
+        else:
+            complementary = np.where(((lam > 0) & (w > 0)).any(-1), np.inf, 0.0)
+        return {
+            "finite": finite(lam, w),
+            "sign": np.where(((lam >= 0) & (w >= 0)).all(-1), 0.0, np.inf),
+            "equation": _ratio(error, 1e-9 * terms + rounding),
+            "equation in units of q": _ratio(error, 1e-7 * size + rounding),
+            "complementarity": complementary,
+        }
+
+
+# ---- MPC ------------------------------------------------------------------------------------------------------------
+
+
+def bounds_in(problem: MPC, dtype) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds (count, 1, n_u) rounded inwards to the caller's dtype, as float64; their neighbours where that crosses."""
+    a = problem.full()
+    low, high = a["u_min"].astype(float), a["u_max"].astype(float)
+    if problem.numbers is not None:
+        low, high = np.full_like(low, problem.numbers[0]), np.full_like(high, problem.numbers[1])
+    if dtype == np.float64:
+        return low[:, None], high[:, None]
+    inner_low, inner_high = low.astype(dtype), high.astype(dtype)
+    inner_low = np.where(inner_low.astype(float) < low, np.nextafter(inner_low, dtype(np.inf)), inner_low)
+    inner_high = np.where(inner_high.astype(float) > high, np.nextafter(inner_high, dtype(-np.inf)), inner_high)
+    low, high = np.minimum(inner_low, inner_high), np.maximum(inner_low, inner_high)
+    return low.astype(float)[:, None], high.astype(float)[:, None]
+
+
+def judge_mpc(
+    problem: MPC, x: np.ndarray, u: np.ndarray, lam: np.ndarray, objective: np.ndarray, dtype=np.float64
+) -> Ratios:
+    """Promises of a solution whose status is CONVERGED or DEGENERATE.
+
+    - start: x_0 is the caller's, exactly. bounds: u within them, exactly. sign: λ > 0.
+    - dynamics: |x₊ − (Ax + Bu + Cλ + d)|_i ≤ 1e-6 of its terms.
+    - complementarity: |λ_i s_i − ε| ≤ 1e-6 ε + 1e-13 λ_i · terms of s_i, s = Dx + Eu + Fλ + c.
+    - stationarity: a step of the whole width against the gradient, scaled by its terms, stays:
+      |clip(u − width·g/G) − u| ≤ 1e-6 width. Free of units, and blind to no flat direction.
+    - objective: the cost of the returned trajectory, to 1e-9 (float32: 1e-5) of its terms.
+    - answer: the vertex of a linear program.
+    """
+    with np.errstate(all="ignore"):
+        a = {k: v.astype(float) for k, v in problem.full().items()}
+        single = dtype != np.float64
+        rounding = SINGLE if single else 0.0
+        low, high = bounds_in(problem, dtype)
+        now, after = x[:, :-1], x[:, 1:]
+        predicted, next_terms = _affine(a, "ABCd", now, u, lam)
+        step = after - predicted
+        s, s_terms = _affine(a, "DEFc", now, u, lam)
+        cost, cost_terms = _cost(problem, a, x, u, low, high)
+        relaxation = problem.relaxation
+        stationary = stationarity(problem, a, x, u, lam, s, s_terms, low, high, rounding)
+        if (stationary > 1).any():
+            # Where the terms of s are so large that their rounding is all of s, its other reading is ε/λ.
+            other = stationarity(problem, a, x, u, lam, relaxation / lam, s_terms, low, high, rounding)
+            stationary = np.minimum(stationary, other)
+        # Below 1e-38 float32 has fewer digits.
+        tiny = 2e-45 * (1 + s_terms) if single else 0.0
+        return {
+            "finite": finite(x, u, lam, objective),
+            "start": np.where((x[:, 0] == a["x0"]).all(-1), 0.0, np.inf),
+            "bounds": np.where(((u >= low) & (u <= high)).all((1, 2)), 0.0, np.inf),
+            "sign of lam": np.where((lam > 0).all((1, 2)), 0.0, np.inf),
+            "dynamics": _ratio(np.abs(step), 1e-6 * next_terms + (1e-44 if single else 0.0)),
+            "complementarity": _ratio(
+                np.abs(lam * s - relaxation),
+                (1e-6 + rounding) * relaxation + (1e-13 + 2 * rounding) * lam * s_terms + tiny,
+            ),
+            "stationarity": stationary,
+            "objective": _ratio(np.abs(objective - cost), (1e-5 if single else 1e-9) * cost_terms),
+            "answer": _vertex(problem, u, low, high, rounding),
+        }
+
+
+def _affine(a: dict, names: str, x, u, lam) -> tuple[np.ndarray, np.ndarray]:
+    """Left x + middle u + right λ + constant by four names, and the sum of the sizes of its terms."""
+    matrices, constant = [a[k] for k in names[:3]], a[names[3]][:, None]
+    pairs = list(zip(matrices, (x, u, lam), strict=True))
+    value = sum((_mv(M, v) for M, v in pairs), constant)
+    return value, sum((_mv(np.abs(M), np.abs(v)) for M, v in pairs), np.abs(constant))
+
+
+def _cost(problem: MPC, a: dict, x, u, low, high) -> tuple[np.ndarray, np.ndarray]:
+    """Cost of a trajectory and the sum of the sizes of its terms, (count,)."""
+
+    def quadratic(Q, v):
+        return (v * _mv(Q, v)).sum((1, 2)), (np.abs(v) * _mv(np.abs(Q), np.abs(v))).sum((1, 2))
+
+    total, terms = np.zeros(len(x)), np.zeros(len(x))
+    for name, linear, v in (("Q", "q", x[:, :-1]), ("R", "r", u), ("Q_final", "q_final", x[:, -1:])):
+        value, size = quadratic(a[name], v)
+        total, terms = total + 0.5 * value, terms + 0.5 * size
+        product = v * a[linear][:, None]
+        total, terms = total + product.sum((1, 2)), terms + np.abs(product).sum((1, 2))
+    if problem.barrier > 0:
+        logs = problem.barrier * (np.log(u - low) + np.log(high - u))
+        total, terms = total - logs.sum((1, 2)), terms + np.abs(logs).sum((1, 2))
+    return total, terms
+
+
+def stationarity(problem: MPC, a: dict, x, u, lam, s, s_terms, low, high, rounding: float) -> np.ndarray:
+    """The projected step against the reduced gradient, in units of the width, over its limit."""
+    g, terms, noise = reduced_gradient(a, x, u, lam, s, s_terms, rounding)
+    width = np.broadcast_to(high - low, u.shape)
+    last = np.concatenate([np.repeat(a["Q"][:, None], u.shape[1] - 1, 1), a["Q_final"][:, None]], 1)
+    curvature = (a["B"][:, None] * (last @ a["B"][:, None])).sum(2)
+    curvature = curvature + np.diagonal(a["R"], axis1=-2, axis2=-1)[:, None]
+    spread = 0.0
+    if problem.barrier > 0:
+        below, above = u - low, high - u
+        g = g + problem.barrier * (1 / above - 1 / below)
+        terms = terms + problem.barrier * (1 / above + 1 / below)
+        spread = problem.barrier * width / np.minimum(below, above) ** 2
+    G = np.maximum(terms, curvature * width)
+    G = np.where(G > 0, G, 1.0)
+    divisor = np.where(width > 0, width, 1.0)
+    # The action itself is rounded, by up to a part of its size; so is its distance in the terms of a barrier.
+    allowance = 1e-6 + noise / G + max(rounding, 2.0**-52) * np.abs(u) / divisor + (1e-14 + rounding) * spread / G
+    move = np.clip(u - width * (g / G), low, high) - u
+    return _ratio(np.where(width > 0, np.abs(move) / divisor, 0.0), allowance)
+
+
+def reduced_gradient(
+    a: dict, x, u, lam, s, s_terms, rounding: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The derivative dJ/du (count, H, n_u) by an own adjoint recursion, the sizes of its terms, and its rounding.
+
+    With ρ = λ∘y the equation (diag s + Fᵀ diag λ) y = −Cᵀp is (diag s/λ + Fᵀ) ρ = −Cᵀp; rows are scaled by λ/(λ+s).
+    The last is a first-order bound for x, u, λ rounded to float32: each by `rounding` of its size.
+    """
+    size = {k: np.abs(v) for k, v in a.items()}
+    b = lam / (lam + s)
+    p = _mv(a["Q_final"], x[:, -1]) + a["q_final"]
+    p_noise = rounding * (_mv(size["Q_final"], np.abs(x[:, -1])) + size["q_final"])
+    steps = []
+    for k in reversed(range(u.shape[1])):
+        matrix = b[:, k, :, None] * _t(a["F"]) + np.eye(lam.shape[-1]) * (1 - b[:, k, :, None])
+        rho = _solve(matrix, -b[:, k] * _mv(_t(a["C"]), p))
+        g = _mv(a["R"], u[:, k]) + a["r"] + _mv(_t(a["B"]), p) + _mv(_t(a["E"]), rho)
+        terms = _mv(size["R"], np.abs(u[:, k])) + size["r"]
+        terms = terms + _mv(_t(size["B"]), np.abs(p)) + _mv(_t(size["E"]), np.abs(rho))
+        noise, rho_noise = np.zeros_like(g), np.zeros_like(rho)
+        if rounding:
+            inverse = np.abs(_solve(matrix, np.broadcast_to(np.eye(rho.shape[-1]), matrix.shape)))
+            moved = _mv(_t(size["C"]), p_noise + rounding * np.abs(p))
+            moved = moved + np.abs(rho) / lam[:, k] * rounding * (s_terms[:, k] + np.abs(s[:, k]))
+            rho_noise = _mv(inverse, b[:, k] * moved) + rounding * np.abs(rho)
+            noise = _mv(_t(size["B"]), p_noise) + _mv(_t(size["E"]), rho_noise) + 2 * rounding * terms
+        steps.append((g, terms, noise))
+        p_noise = _mv(_t(size["A"]), p_noise + rounding * np.abs(p)) + _mv(_t(size["D"]), rho_noise)
+        p_noise = p_noise + rounding * (_mv(size["Q"], np.abs(x[:, k])) + size["q"])
+        p = _mv(a["Q"], x[:, k]) + a["q"] + _mv(_t(a["A"]), p) + _mv(_t(a["D"]), rho)
+    g, terms, noise = (np.stack(v[::-1], 1) for v in zip(*steps, strict=True))
+    return g, terms, noise
+
+
+def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Batched solve; NaN where a matrix is singular or not finite."""
+    vector = right.ndim == 2
+    ok = np.isfinite(matrix).all((1, 2)) & np.isfinite(right).reshape(len(right), -1).all(1)
+    safe = np.where(ok[:, None, None], matrix, np.eye(matrix.shape[-1]))
+    full = right[..., None] if vector else right
+    try:
+        out = np.linalg.solve(safe, full)
+    except np.linalg.LinAlgError:
+        out = np.full(full.shape, np.nan)
+        for i, (m, r) in enumerate(zip(safe, full, strict=True)):
+            try:
+                out[i] = np.linalg.solve(m, r)
+            except np.linalg.LinAlgError:
+                pass
+    out = np.where(ok[:, None, None], out, np.nan)
+    return out[..., 0] if vector else out
+
+
+def _vertex(problem: MPC, u, low, high, rounding: float) -> np.ndarray:
+    if problem.answer is None or problem.barrier > 0:
+        return np.zeros(len(u))
+    known = np.isfinite(problem.answer)
+    width = np.broadcast_to(high - low, u.shape)
+    error = np.where(known, np.abs(u - np.where(known, problem.answer, u)), 0.0)
+    return _ratio(error, 1e-5 * width + rounding * np.abs(u))
+
+
+def judge_relaxed_program(
+    problem: MPC, x: np.ndarray, u: np.ndarray, lam: np.ndarray, objective: np.ndarray, dtype=np.float64
+) -> Ratios:
+    """Promises of backend `relaxed`, whose convex program keeps dynamics, bounds and signs, but not λ∘s = ε."""
+    with np.errstate(all="ignore"):
+        ratios = judge_mpc(problem, x, u, lam, objective, dtype)
+        s, terms = _affine(problem.full(), "DEFc", x[:, :-1], u, lam)
+        kept = ("finite", "start", "bounds", "dynamics", "objective", "answer")
+        return {
+            **{k: ratios[k] for k in kept},
+            "sign of lam": np.where((lam >= 0).all((1, 2)), 0.0, np.inf),
+            "sign of s": _ratio(-s, 1e-6 * terms),
+        }
+
+
+# ---- violation loss -------------------------------------------------------------------------------------------------
+
+
+def judge_loss(problem: Loss, value: np.ndarray) -> Ratios:
+    """The value against an own solution of the inner QP, to 1e-6 of it and 1e-9 of its value at λ = 0.
+
+    min over λ, φ ≥ 0 of ½‖r + Cλ‖² + (λᵀφ + ‖e + Fλ − φ‖²/(2γ))/ξ, as least squares under z ≥ 0 (Lawson & Hanson).
+    """
+    best, still = inner_minimum(problem)
+    return {"finite": finite(value), "value": _ratio(np.abs(value - best), 1e-6 * np.abs(best) + 1e-9 * still)}
+
+
+def inner_minimum(problem: Loss) -> tuple[np.ndarray, np.ndarray]:
+    """Value of the inner QP of every transition, and the same with λ = 0."""
+    a, F, gamma, xi = problem.system, problem.F, problem.gamma, problem.xi
+    n = len(F)
+    r = problem.x @ a["A"].T + problem.u @ a["B"].T + a["d"] - problem.x_next
+    e = problem.x @ a["D"].T + problem.u @ a["E"].T + a["c"]
+    eye = np.eye(n)
+    cross = (eye - F.T / gamma) / xi
+    Q = np.block([[a["C"].T @ a["C"] + F.T @ F / (gamma * xi), cross], [cross.T, eye / (gamma * xi)]])
+    q = np.concatenate([r @ a["C"] + e @ F / (gamma * xi), -e / (gamma * xi)], 1)
+    scale = 1 / np.sqrt(np.diag(Q))
+    values, vectors = np.linalg.eigh(scale[:, None] * Q * scale)
+    low = values[-1] * 1e-15
+    L = np.linalg.qr((vectors * np.sqrt(np.maximum(values, low))).T)[1]  # Q ≈ LᵀL
+    best = np.empty(len(r))
+    for i in range(len(r)):
+        target = solve_triangular(L, -scale * q[i], trans="T")
+        z = nnls(L, target, maxiter=100 * n)[0] * scale
+        best[i] = _descend(a["C"], F, gamma, xi, r[i], e[i], z[:n])
+    still = _inner_value(a["C"], F, gamma, xi, r, e, np.zeros((len(r), n)))
+    return np.minimum(best, still), still
+
+
+def _descend(C, F, gamma: float, xi: float, r, e, lam, steps: int = 8) -> float:
+    """Projected Newton steps in λ alone, φ eliminated: least squares leaves the rounding of 1/γ in its solution."""
+    best = _inner_value(C, F, gamma, xi, r, e, lam)
+    for _ in range(steps):
+        gap = e + F @ lam
+        on = (gap > gamma * lam).astype(float)  # φ > 0
+        gradient = (
+            C.T @ (r + C @ lam) + (F.T @ (on * lam) + on * (gap - gamma * lam) + F.T @ ((1 - on) * gap) / gamma) / xi
+        )
+        free = (lam > 0) | (gradient < 0)
+        if not free.any():
+            break
+        H = C.T @ C + (F.T * on + on[:, None] * F - gamma * np.diag(on) + (F.T * (1 - on)) @ F / gamma) / xi
+        step = np.zeros_like(lam)
+        step[free] = np.linalg.lstsq(H[np.ix_(free, free)], -gradient[free], rcond=1e-15)[0]
+        trials = [np.maximum(lam + 0.5**k * step, 0.0) for k in range(12)]
+        values = [_inner_value(C, F, gamma, xi, r, e, trial) for trial in trials]
+        k = int(np.argmin(values))
+        if not values[k] < best:
+            break
+        best, lam = values[k], trials[k]
+    return float(best)
+
+
+def _inner_value(C, F, gamma: float, xi: float, r, e, lam):
+    gap = e + lam @ F.T
+    phi = np.maximum(gap - gamma * lam, 0.0)  # the best φ for this λ
+    left = gap - phi
+    moved = r + lam @ C.T
+    return 0.5 * (moved**2).sum(-1) + ((lam * phi).sum(-1) + (left**2).sum(-1) / (2 * gamma)) / xi

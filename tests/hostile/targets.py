@@ -1,0 +1,493 @@
+"""What the campaign runs: each target solves one batch, has it judged, and says what became of every element."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.random import Generator
+
+from difflcs import LCSModel, LCSMPCLayer, LCSParams, QuadraticCost, Status, solve_lcp, violation_loss
+from difflcs.errors import DiffLCSError, DiffLCSWarning
+from difflcs.mpc import Primal
+from difflcs.mpc.backends import IpoptBackend
+from tests.hostile import checks
+from tests.hostile.generators import LCP, MPC, Loss
+
+REFUSED = -1  # in place of a status: a typed error
+SYSTEM = ("A", "B", "C", "d", "D", "E", "F", "c")
+COST = ("Q", "R", "Q_final", "q", "r", "q_final")
+INPUTS = (*SYSTEM, *COST, "u_min", "u_max", "x0")
+
+
+@dataclass
+class Outcome:
+    """One batch, judged.
+
+    Attributes:
+        status: (count,) `Status`, or REFUSED.
+        ratios: check → (count,) violation / limit; above 1 is silent. Only what was promised of that element counts.
+        compared: number of gradients that were compared with differences.
+    """
+
+    status: np.ndarray
+    ratios: checks.Ratios
+    compared: int = 0
+
+    @property
+    def solved(self) -> np.ndarray:
+        return (self.status == Status.CONVERGED) | (self.status == Status.DEGENERATE)
+
+    @property
+    def worst(self) -> np.ndarray:
+        return np.stack(list(self.ratios.values())).max(0)
+
+    @staticmethod
+    def join(parts: list[Outcome]) -> Outcome:
+        names = dict.fromkeys(name for part in parts for name in part.ratios)
+        status = np.concatenate([p.status for p in parts])
+        zero = {name: [p.ratios.get(name, np.zeros(len(p.status))) for p in parts] for name in names}
+        return Outcome(status, {k: np.concatenate(v) for k, v in zero.items()}, sum(p.compared for p in parts))
+
+
+@contextmanager
+def quiet():
+    """Without the library's own warnings: they say what the status says."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DiffLCSWarning)
+        yield
+
+
+def refused_one_by_one(run: Callable[..., Outcome], problem) -> Outcome:
+    """An error ends a whole batch: halve it until only those elements that cause it are out.
+
+    A typed error is a refusal. Any other one is a failure: nobody can catch it on purpose, and it says nothing.
+    """
+    try:
+        return run(problem)
+    except Exception as error:
+        if problem.count == 1:
+            typed = isinstance(error, DiffLCSError)
+            return Outcome(np.array([REFUSED]), {"untyped error": np.array([0.0 if typed else np.inf])})
+        half = problem.count // 2
+        parts = (problem.select(slice(None, half)), problem.select(slice(half, None)))
+        return Outcome.join([refused_one_by_one(run, part) for part in parts])
+
+
+def _double(value: torch.Tensor) -> np.ndarray:
+    return value.detach().double().numpy()
+
+
+def _promised(ratios: checks.Ratios, solved: np.ndarray) -> checks.Ratios:
+    """Conditions hold for solved elements; finite numbers for all."""
+    return {k: v if k in ("finite", "finite gradient") else np.where(solved, v, 0.0) for k, v in ratios.items()}
+
+
+# ---- solve_lcp ------------------------------------------------------------------------------------------------------
+
+
+def lcp_target(relaxation: float | None, dtype=np.float64) -> Callable[[LCP, Generator, bool], Outcome]:
+    """`relaxation` None: exact or one of three, drawn."""
+
+    def target(problem: LCP, rng: Generator, gradients: bool) -> Outcome:
+        chosen = float(rng.choice([0.0, 1e-3, 1e-5, 1e-8])) if relaxation is None else relaxation
+        problem = problem.cast(dtype)
+        if not (np.isfinite(problem.F).all() and np.isfinite(problem.q).all()):  # too large for float32
+            problem = LCP(np.nan_to_num(problem.F), np.nan_to_num(problem.q))
+        done = refused_one_by_one(lambda part: _lcp(part, chosen, dtype), problem)
+        if gradients and dtype == np.float64:
+            index = np.flatnonzero(done.solved)[:8]
+            if len(index):
+                ratio, compared = _lcp_differences(problem.select(index).each(), chosen, rng)
+                done.ratios["gradient"] = np.zeros(problem.count)
+                done.ratios["gradient"][index] = ratio
+                done.compared = compared
+        return done
+
+    return target
+
+
+def _lcp(problem: LCP, relaxation: float, dtype) -> Outcome:
+    F, q = (torch.from_numpy(v).requires_grad_() for v in (problem.F, problem.q))
+    with quiet():
+        solution = solve_lcp(F, q, relaxation)
+    (solution.lam.sum() + solution.w.sum()).backward()
+    double = LCP(problem.F.astype(float), problem.q.astype(float))
+    lam, w, status = _double(solution.lam), _double(solution.w), solution.status.numpy().astype(int)
+    ratios = checks.judge_lcp(double, lam, w, relaxation, single=dtype != np.float64)
+    F_grad, q_grad = F.grad, q.grad
+    assert F_grad is not None
+    assert q_grad is not None
+    gradient = checks.finite(q_grad.numpy())
+    if F.ndim == 3:
+        gradient = np.maximum(gradient, checks.finite(F_grad.numpy()))
+    elif not bool(torch.isfinite(F_grad).all()) and not gradient.any():
+        gradient = _who(lambda part: part.each(), lambda part: _lcp(part, relaxation, dtype), problem)
+    ratios["finite gradient"] = gradient
+    return Outcome(status, _promised(ratios, status == Status.CONVERGED))
+
+
+def _who(each, run, problem) -> np.ndarray:
+    """Whose gradient made the shared one infinite: that of the elements alone; the first where only the sum is."""
+    alone = run(each(problem)).ratios["finite gradient"]
+    if not alone.any():
+        alone = alone.copy()
+        alone[0] = np.inf
+    return alone
+
+
+def _lcp_differences(problem: LCP, relaxation: float, rng: Generator) -> tuple[np.ndarray, int]:
+    """Directional derivatives against central differences, F along D F D, q along its own size."""
+    count, n = problem.q.shape
+    dF, dq = rng.standard_normal((count, n)), rng.standard_normal((count, n))
+    weights = rng.standard_normal((2, count, n))
+
+    def moved(step: float) -> LCP:
+        D = 1 + step * dF
+        return LCP(D[:, :, None] * problem.F * D[:, None], problem.q * (1 + step * dq))
+
+    def values(p: LCP) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        with quiet():
+            solution = solve_lcp(torch.from_numpy(p.F), torch.from_numpy(p.q), relaxation)
+        return solution.lam.numpy(), solution.w.numpy(), solution.status.numpy()
+
+    F, q = (torch.from_numpy(v.copy()).requires_grad_() for v in (problem.F, problem.q))
+    with quiet(), np.errstate(all="ignore"):
+        solution = solve_lcp(F, q, relaxation)
+        lam, w = solution.lam.detach().numpy(), solution.w.detach().numpy()
+        # Each output in units of its own size, so that no large one hides a small one; all w may be zero.
+        units = [np.abs(lam).max(-1, keepdims=True), np.abs(np.concatenate([w, problem.q], -1)).max(-1, keepdims=True)]
+        seeds = [torch.from_numpy(a / np.maximum(b, 1e-300)) for a, b in zip(weights, units, strict=True)]
+        torch.autograd.backward([solution.lam, solution.w], seeds)
+        assert F.grad is not None
+        assert q.grad is not None
+        direction = (dF[:, :, None] + dF[:, None]) * problem.F
+        terms = np.concatenate([(F.grad.numpy() * direction).reshape(count, -1), q.grad.numpy() * problem.q * dq], 1)
+
+        def difference(step: float) -> tuple[np.ndarray, np.ndarray]:
+            high, low = values(moved(step)), values(moved(-step))
+            change = sum((seed.numpy() * (a - b)).sum(-1) for seed, a, b in zip(seeds, high[:2], low[:2], strict=True))
+            same = (high[2] == 0) & (low[2] == 0) & (((high[0] > 0) == (low[0] > 0)).all(-1))
+            return change / (2 * step), same
+
+        return _compare(terms, difference, 1e-6)
+
+
+def _compare(terms: np.ndarray, difference, step: float) -> tuple[np.ndarray, int]:
+    """|sum of terms − difference| in units of 1e-3 of both, where two step sizes agree on the difference."""
+    with np.errstate(all="ignore"):
+        exact = terms.sum(-1)
+        (first, usable), (second, also) = difference(step), difference(step / 4)
+        size = np.abs(first) + np.abs(second) + 1e-7 * np.abs(terms).sum(-1)
+        usable = usable & also & (np.abs(first - second) <= 1e-4 * size) & np.isfinite(size)
+        error = np.where(usable, np.abs(exact - second), 0.0)
+        return np.where(usable & (error > 0), error / (1e-3 * (size + np.abs(exact)) + 1e-300), 0.0), int(usable.sum())
+
+
+# ---- LCSMPCLayer ----------------------------------------------------------------------------------------------------
+
+
+def layer_of(problem: MPC, leaves: dict[str, torch.Tensor], backend="batched") -> LCSMPCLayer:
+    low, high = problem.numbers or (leaves["u_min"], leaves["u_max"])
+    return LCSMPCLayer(
+        LCSParams(**{k: leaves[k] for k in SYSTEM}),
+        QuadraticCost(**{k: leaves[k] for k in COST}, check=False),
+        problem.horizon,
+        low,
+        high,
+        backend=backend,
+        relaxation=problem.relaxation,
+        barrier=problem.barrier,
+        on_failure="mask",
+    )
+
+
+def leaves_of(problem: MPC) -> dict[str, torch.Tensor]:
+    return {k: torch.from_numpy(np.array(problem.arrays[k])).requires_grad_() for k in INPUTS}
+
+
+def _mpc(problem: MPC, dtype, backend, guess, judge) -> Outcome:
+    leaves = leaves_of(problem)
+    with quiet():
+        layer = layer_of(problem, leaves, backend)
+        plan = layer(leaves["x0"], guess=guess(problem, layer, leaves["x0"]))
+        (plan.x.mean((-1, -2)) + plan.u.mean((-1, -2)) + plan.lam.mean((-1, -2)) + plan.objective).sum().backward()
+    x, u, lam, objective = (_double(v) for v in (plan.x, plan.u, plan.lam, plan.objective))
+    status = plan.status.numpy().astype(int)
+    ratios = judge(problem, x, u, lam, objective, dtype)
+    ratios["finite"] = np.maximum(ratios["finite"], checks.finite(plan.kkt_residual.numpy()))
+    gradient = np.zeros(problem.count)
+    shared_bad = False
+    for name, leaf in leaves.items():
+        if leaf.grad is None:
+            continue
+        if name != "x0" and problem.shared(name):
+            shared_bad |= not bool(torch.isfinite(leaf.grad).all())
+        else:
+            gradient = np.maximum(gradient, checks.finite(leaf.grad.numpy()))
+    if shared_bad and not gradient.any():
+        again = lambda part: _mpc(part, dtype, backend, guess, judge)  # noqa: E731
+        gradient = _who(lambda part: part.each(), again, problem)
+    ratios["finite gradient"] = gradient
+    outcome = Outcome(status, ratios)
+    outcome.ratios = _promised(ratios, outcome.solved)
+    return outcome
+
+
+def cold(problem: MPC, layer: LCSMPCLayer, x0: torch.Tensor):
+    return None
+
+
+def shift(problem: MPC, layer: LCSMPCLayer, x0: torch.Tensor):
+    """Its own plan, one step later."""
+    with torch.no_grad():
+        return layer(x0).shift()
+
+
+def opposite(problem: MPC, layer: LCSMPCLayer, x0: torch.Tensor):
+    """The vertex opposite to its own plan, and λ with the roles of λ and s exchanged."""
+    with torch.no_grad():
+        plan = layer(x0)
+    low, high = (torch.as_tensor(v).expand_as(plan.u[:, 0]).unsqueeze(1) for v in (layer.u_min, layer.u_max))
+    u = torch.where(plan.u - low > high - plan.u, low, high).to(plan.u.dtype)
+    return Primal(plan.x, u, (problem.relaxation / plan.lam.clamp_min(1e-30)).clamp_max(1e30))
+
+
+def interior(problem: MPC, layer: LCSMPCLayer, x0: torch.Tensor):
+    """Actions in the middle of their ranges."""
+    with torch.no_grad():
+        plan = layer(x0)
+    low, high = (torch.as_tensor(v).expand_as(plan.u[:, 0]).unsqueeze(1) for v in (layer.u_min, layer.u_max))
+    u = (0.37 * low + 0.63 * high).expand_as(plan.u).to(plan.u.dtype)
+    return Primal(plan.x, u, plan.lam)
+
+
+def mpc_target(
+    guess=cold, dtype=np.float64, barrier: float = 0.0, backend="batched", judge=checks.judge_mpc
+) -> Callable[[MPC, Generator, bool], Outcome]:
+    """`barrier` is a part of the cost of the plain problems, which is of size 1."""
+
+    def target(problem: MPC, rng: Generator, gradients: bool) -> Outcome:
+        if barrier > 0:
+            open_ = np.broadcast_to(problem.arrays["u_max"] - problem.arrays["u_min"], problem.full()["u_min"].shape)
+            keep = (open_ > 0).all(-1)  # a barrier needs a range
+            if not keep.all():
+                low, high = problem.full()["u_min"], problem.full()["u_max"]
+                high = np.where(high > low, high, low + 1.0)
+                problem = replace(problem, arrays={**problem.arrays, "u_min": low.copy(), "u_max": high})
+            problem = replace(problem, barrier=barrier * float(rng.choice([1.0, 0.1, 10.0])))
+        problem = _castable(problem, dtype)
+        chosen = interior if guess is opposite and rng.random() < 0.3 else guess
+        done = refused_one_by_one(lambda part: _mpc(part, dtype, backend, chosen, judge), problem)
+        if gradients and dtype == np.float64 and backend != "relaxed":
+            low, high = problem.full()["u_min"], problem.full()["u_max"]
+            # float64 itself resolves a range of 1e-12 beside bounds of 1 to four digits.
+            fine = ((high == low) | (high - low > 1e-8 * (np.abs(low) + np.abs(high)))).all(-1)
+            index = np.flatnonzero((done.status == Status.CONVERGED) & fine)[:4]
+            if len(index):
+                ratio, compared = _mpc_differences(problem.select(index).each(), backend, rng)
+                done.ratios["gradient"] = np.zeros(problem.count)
+                done.ratios["gradient"][index] = ratio
+                done.compared = compared
+        return done
+
+    return target
+
+
+def _castable(problem: MPC, dtype) -> MPC:
+    if dtype == np.float64:
+        return problem
+    small = problem.cast(dtype)
+    finite = {k: np.nan_to_num(v) for k, v in small.arrays.items()}
+    # Rounding must not make bounds cross.
+    finite["u_max"] = np.maximum(finite["u_max"], finite["u_min"])
+    return replace(small, arrays=finite)
+
+
+def _mpc_differences(problem: MPC, backend, rng: Generator) -> tuple[np.ndarray, int]:
+    """Directional derivatives against central differences of re-solves that start from the solution.
+
+    Matrices of the cost and F go along D M D with D = I + step·diag, which keeps them definite; bounds by a part of
+    their range; everything else by a part of its own size.
+    """
+    count = problem.count
+    a = problem.arrays
+    draws = {k: rng.standard_normal(v.shape[:2] if k in ("Q", "R", "Q_final", "F") else v.shape) for k, v in a.items()}
+
+    def moved(step: float) -> MPC:
+        new = {}
+        for k, v in a.items():
+            if k in ("Q", "R", "Q_final", "F"):
+                D = 1 + step * draws[k]
+                new[k] = D[:, :, None] * v * D[:, None]
+            elif k in ("u_min", "u_max"):
+                new[k] = v + step * draws[k] * (a["u_max"] - a["u_min"])
+            else:
+                new[k] = v * (1 + step * draws[k])
+        return replace(problem, arrays=new, answer=None)
+
+    def direction(k: str) -> np.ndarray:
+        if k in ("Q", "R", "Q_final", "F"):
+            return (draws[k][:, :, None] + draws[k][:, None]) * a[k]
+        return draws[k] * (a["u_max"] - a["u_min"] if k in ("u_min", "u_max") else a[k])
+
+    leaves = leaves_of(problem)
+    with quiet(), np.errstate(all="ignore"):
+        try:
+            plan = layer_of(problem, leaves, backend)(leaves["x0"])
+        except DiffLCSError:
+            return np.zeros(count), 0
+        names = ("x", "u", "lam")
+        values = [getattr(plan, k) for k in names]
+        # Each output in units of its own size, or of what the actions can make of it where it is zero.
+        width = torch.from_numpy(np.abs(np.stack([a["u_min"], a["u_max"]])).max((0, 2)))
+        reach = width * torch.from_numpy(np.abs(a["B"]).max((1, 2)))
+        effort = width**2 * torch.from_numpy(np.abs(a["R"]).max((1, 2)))
+        seeds = []
+        for v, floor in zip([*values, plan.objective], [reach, width, 0 * width, effort], strict=True):
+            size = torch.maximum(v.detach().reshape(count, -1).abs().amax(1), 1e-3 * floor).clamp_min(1e-300)
+            draw = torch.from_numpy(np.asarray(rng.standard_normal(v.shape)))
+            seeds.append(draw / size.reshape(-1, *[1] * (v.ndim - 1)))
+        torch.autograd.backward([*values, plan.objective], seeds)
+        terms = np.concatenate(
+            [
+                (leaf.grad.numpy() * direction(k)).reshape(count, -1)
+                for k, leaf in leaves.items()
+                if leaf.grad is not None
+            ],
+            1,
+        )
+        guess = Primal(*(v.detach() for v in values))
+        solved = (plan.status == Status.CONVERGED).numpy()
+        found = (_double(v) for v in (*values, plan.objective))
+        solved &= checks.judge_mpc(problem, *found)["stationarity"] <= 1e-2  # else it is not the point of its gradient
+
+        def solve(step: float):
+            shifted = moved(step)
+            tensors = leaves_of(shifted)
+            with torch.no_grad():
+                return layer_of(shifted, tensors, backend)(tensors["x0"], guess=guess)
+
+        def difference(step: float) -> tuple[np.ndarray, np.ndarray]:
+            try:
+                high, low = solve(step), solve(-step)
+            except DiffLCSError:
+                return np.zeros(count), np.zeros(count, bool)
+            change = torch.zeros(count, dtype=torch.float64)
+            for name, seed in zip((*names, "objective"), seeds, strict=True):
+                product = seed * (getattr(high, name) - getattr(low, name))
+                change += product.reshape(count, -1).sum(-1)
+            same = solved & (high.converged & low.converged).numpy()
+            # Both must stay on the branch of the solution, and solve their own problems to far less than a step.
+            base, up, down = (_double(v.u) for v in (plan, high, low))
+            width = np.maximum(np.abs(a["u_max"] - a["u_min"])[:, None], 1e-300)
+            jump = np.abs(0.5 * (up + down) - base) > 1e-6 * width + np.abs(up - down)
+            same &= ~jump.any((1, 2))
+            for sign, found in ((1, high), (-1, low)):
+                numbers = (_double(v) for v in (found.x, found.u, found.lam, found.objective))
+                ratios = checks.judge_mpc(moved(sign * step), *numbers)
+                same &= (np.stack(list(ratios.values())).max(0) <= 1) & (ratios["stationarity"] <= 1e-3)
+            return (change / (2 * step)).numpy(), same
+
+        return _compare(terms, difference, 1e-5)
+
+
+# ---- violation_loss -------------------------------------------------------------------------------------------------
+
+
+def model_of(problem: Loss, dtype=torch.float64) -> LCSModel:
+    n_x, n_u = problem.system["B"].shape
+    model = LCSModel(n_x, n_u, problem.system["C"].shape[-1], stiffness=problem.stiffness, dtype=dtype)
+    with torch.no_grad():
+        for name, value in problem.system.items():
+            getattr(model, name).copy_(torch.from_numpy(value))
+    return model
+
+
+def loss_target(problem: Loss, rng: Generator, gradients: bool) -> Outcome:
+    """Value against an own inner solution, gradient against differences of the own value."""
+    done = refused_one_by_one(_loss, problem)
+    index = np.flatnonzero(done.solved)[:4]
+    if gradients and len(index):
+        ratio, compared = _loss_differences(problem.select(index), rng)
+        done.ratios["gradient"] = np.zeros(problem.count)
+        done.ratios["gradient"][index] = ratio
+        done.compared = compared
+    return done
+
+
+def _loss(problem: Loss) -> Outcome:
+    model = model_of(problem)
+    data = [torch.from_numpy(v).requires_grad_() for v in (problem.x, problem.u, problem.x_next)]
+    value = violation_loss(model, *data, gamma=problem.gamma, xi=problem.xi, reduction="none")
+    value.sum().backward()
+    ratios = checks.judge_loss(problem, value.detach().numpy())
+    gradient = checks.finite(*(v.grad.numpy() for v in data if v.grad is not None))
+    if not all(p.grad is None or bool(torch.isfinite(p.grad).all()) for p in model.parameters()):
+        gradient[:] = np.inf
+    ratios["finite gradient"] = gradient
+    return Outcome(np.zeros(problem.count, int), ratios)
+
+
+def _loss_differences(problem: Loss, rng: Generator) -> tuple[np.ndarray, int]:
+    draws = {k: rng.standard_normal(v.shape) for k, v in problem.system.items()}
+    data = {k: rng.standard_normal(getattr(problem, k).shape) for k in ("x", "u", "x_next")}
+
+    def moved(step: float) -> Loss:
+        system = {k: v * (1 + step * draws[k]) for k, v in problem.system.items()}
+        return replace(problem, system=system, **{k: getattr(problem, k) * (1 + step * v) for k, v in data.items()})
+
+    def value(p: Loss) -> float:
+        with torch.no_grad():
+            tensors = (torch.from_numpy(v) for v in (p.x, p.u, p.x_next))
+            # γ is fixed, and the bound on it moves with F.
+            loss = violation_loss(model_of(p), *tensors, gamma=p.gamma, xi=p.xi, reduction="none", check_gamma=False)
+            return float((loss * weight).sum())
+
+    model = model_of(problem)
+    tensors = [torch.from_numpy(v).requires_grad_() for v in (problem.x, problem.u, problem.x_next)]
+    loss = violation_loss(model, *tensors, gamma=problem.gamma, xi=problem.xi, reduction="none")
+    weight = 1 / loss.detach().clamp_min(1e-300)
+    (loss * weight).sum().backward()
+    terms = [
+        (p.grad.numpy() * draws[k] * problem.system[k]).ravel()
+        for k, p in model.named_parameters()
+        if p.grad is not None
+    ]
+    for name, leaf in zip(data, tensors, strict=True):
+        assert leaf.grad is not None
+        terms.append((leaf.grad.numpy() * data[name] * getattr(problem, name)).ravel())
+
+    def difference(step: float) -> tuple[np.ndarray, np.ndarray]:
+        try:
+            return np.array([(value(moved(step)) - value(moved(-step))) / (2 * step)]), np.array([True])
+        except DiffLCSError:
+            return np.zeros(1), np.array([False])
+
+    ratio, compared = _compare(np.concatenate(terms)[None], difference, 1e-5)
+    return np.repeat(ratio, problem.count), compared * problem.count
+
+
+LCP_TARGETS = {
+    "exact": lcp_target(0.0),
+    "relaxed 1e-3": lcp_target(1e-3),
+    "relaxed 1e-5": lcp_target(1e-5),
+    "relaxed 1e-8": lcp_target(1e-8),
+    "float32": lcp_target(None, np.float32),
+}
+MPC_TARGETS = {
+    "batched": mpc_target(),
+    "warm": mpc_target(shift),
+    "opposite": mpc_target(opposite),
+    "float32": mpc_target(dtype=np.float32),
+    "barrier": mpc_target(barrier=1e-2),
+}
+SLOW_TARGETS = {
+    "ipopt": mpc_target(backend=IpoptBackend(workers=1)),
+    "relaxed": mpc_target(backend="relaxed", judge=checks.judge_relaxed_program),
+}
+LOSS_TARGETS = {"violation_loss": loss_target}

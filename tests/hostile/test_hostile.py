@@ -1,0 +1,155 @@
+"""The quick tier of the campaign: every class over every target, nothing wrong in silence, and not by refusing."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from tests.hostile import campaign, checks, generators, targets
+
+SLOW_CLASSES = ("mpc-plain", "mpc-flat", "mpc-stiff")  # for the solvers that take 10 ms and more per problem
+CELLS = [c for c in campaign.CELLS if c.target not in targets.SLOW_TARGETS or c.problems in SLOW_CLASSES]
+
+# Least share of solved elements in the quick tier, so that refusing everything does not pass.
+FLOORS = {
+    "lcp-plain": 1.0,
+    "lcp-skew-1e-2": 0.99,
+    "lcp-nearly-singular": 0.98,
+    "lcp-graded": 0.98,
+    "lcp-degenerate": 0.98,
+    "lcp-p-matrix": 0.98,
+    "mpc-plain": 0.85,
+    "mpc-flat": 0.95,
+    "mpc-flat-tiny": 0.85,
+    "mpc-flat-contact": 0.85,
+    "mpc-no-effect": 0.9,
+    "mpc-number-bounds": 0.95,
+    "mpc-units": 0.85,
+    "mpc-cost-scale": 0.9,
+    "mpc-stuck": 0.95,
+    "loss-plain": 1.0,
+    "loss-at-bound": 1.0,
+    "loss-scales": 1.0,
+    "loss-tiny-gamma": 1.0,
+}
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize("cell", CELLS, ids=lambda c: c.name)
+def test_nothing_is_wrong_in_silence(cell, one_thread):
+    if cell.target == "relaxed":
+        pytest.importorskip("cvxpylayers")
+    record = campaign.run_chunk(cell, seed=0, number=0)
+    assert record.silent == 0, f"{record.by_check}, reproduce: {campaign.reproduction(record)}"
+    floor = FLOORS.get(cell.problems, 0.0)
+    assert record.solved_share >= floor, f"{record.flagged} of {record.tried} refused"
+
+
+def test_a_chunk_depends_on_class_seed_and_number_alone():
+    cell = next(c for c in campaign.CELLS if c.name == "mpc-plain/batched")
+    (a, _), (b, _), (c, _) = cell.chunk(3, 5), cell.chunk(3, 5), cell.chunk(3, 6)
+    assert all((a.arrays[k] == b.arrays[k]).all() for k in a.arrays)
+    assert a.arrays["x0"].shape != c.arrays["x0"].shape or (a.arrays["x0"] != c.arrays["x0"]).any()
+
+
+def test_every_generator_says_what_is_hostile():
+    for generator in (*generators.LCP_CLASSES.values(), *generators.MPC_CLASSES.values()):
+        assert generator.__doc__
+
+
+def test_the_judges_see_a_wrong_answer(one_thread):
+    """Each condition, broken by hand, is seen: a judge that accepts everything proves nothing."""
+    cell = next(c for c in campaign.CELLS if c.name == "mpc-cost-scale/batched")
+    problem, _ = cell.chunk(1, 0)
+    problem = problem.select(slice(0, 4))
+    leaves = targets.leaves_of(problem)
+    with targets.quiet():
+        plan = targets.layer_of(problem, leaves)(leaves["x0"])
+    x, u, lam, objective = (v.detach().numpy() for v in (plan.x, plan.u, plan.lam, plan.objective))
+
+    def broken(**changes) -> set[str]:
+        numbers = {"x": x, "u": u, "lam": lam, "objective": objective} | changes
+        ratios = checks.judge_mpc(problem, **numbers)
+        return {name for name, ratio in ratios.items() if ratio[0] > 1}
+
+    assert broken() <= {"stationarity"}
+    assert "start" in broken(x=x + np.eye(x.shape[1])[0][:, None] * 1e-12)
+    assert "dynamics" in broken(x=x * np.where(np.arange(x.shape[1]) == 1, 1.001, 1)[:, None])
+    assert {"bounds", "stationarity"} <= broken(u=u + 1.0)
+    assert "complementarity" in broken(lam=1.001 * lam)
+    assert "sign of lam" in broken(lam=-lam)
+    assert broken(objective=objective * (1 + 1e-6)) >= {"objective"}
+    assert "finite" in broken(u=np.full_like(u, np.nan))
+    low, high = checks.bounds_in(problem, np.float64)
+    middle = 0.5 * (low + high)
+    assert "stationarity" in broken(u=np.where(u < middle, high, low))
+
+    lcp, _ = next(c for c in campaign.CELLS if c.name == "lcp-plain/exact").chunk(0, 0)
+    zero = np.zeros_like(lcp.q)
+    ratios = checks.judge_lcp(lcp, zero, np.maximum(lcp.q, 0), 0.0, single=False)
+    assert ((ratios["equation"] > 1) == (lcp.q < 0).any(-1)).all()
+
+
+def _force(F, gap, relaxation):
+    """λ of λ∘(Fλ + gap) = relaxation by damped Newton on λ + s − √((λ − s)² + 4ε), one element."""
+    lam = np.full(len(gap), np.sqrt(relaxation))
+    for k in range(200):
+        epsilon = max(relaxation, 0.5**k)
+        s = F @ lam + gap
+        root = np.sqrt((lam - s) ** 2 + 4 * epsilon)
+        slope = (lam - s) / root
+        lam = lam - 0.7 * np.linalg.solve(np.diag(1 - slope) + (1 + slope)[:, None] * F, lam + s - root)
+    return lam
+
+
+def test_the_adjoint_of_the_judge_is_the_derivative_of_the_cost():
+    """Against differences of trajectories that NumPy alone computes."""
+    problem, _ = next(c for c in campaign.CELLS if c.name == "mpc-plain/ipopt").chunk(2, 0)
+    problem = problem.select(slice(0, 2))
+    a = problem.full()
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-0.3, 0.3, (2, problem.horizon, a["B"].shape[-1]))
+
+    def trajectory(u):
+        x, lam = [a["x0"]], []
+        for k in range(problem.horizon):
+            gap = np.einsum("bij,bj->bi", a["D"], x[-1]) + np.einsum("bij,bj->bi", a["E"], u[:, k]) + a["c"]
+            lam.append(np.stack([_force(F, g, problem.relaxation) for F, g in zip(a["F"], gap, strict=True)]))
+            moved = ((a["A"], x[-1]), (a["B"], u[:, k]), (a["C"], lam[-1]))
+            x.append(sum(np.einsum("bij,bj->bi", M, v) for M, v in moved) + a["d"])
+        return np.stack(x, 1), np.stack(lam, 1)
+
+    def cost(u):
+        x, _ = trajectory(u)
+        return checks._cost(problem, a, x, u, a["u_min"][:, None], a["u_max"][:, None])[0]
+
+    x, lam = trajectory(u)
+    s, s_terms = checks._affine(a, "DEFc", x[:, :-1], u, lam)
+    assert np.abs(lam * s - problem.relaxation).max() < 1e-9 * problem.relaxation
+    gradient, terms, _ = checks.reduced_gradient(a, x, u, lam, s, s_terms)
+    for k in np.ndindex(u.shape[1:]):
+        step = np.zeros_like(u)
+        step[(slice(None), *k)] = 1e-6
+        difference = (cost(u + step) - cost(u - step)) / 2e-6
+        np.testing.assert_allclose(gradient[(slice(None), *k)], difference, rtol=1e-4, atol=1e-6)
+    assert (terms >= np.abs(gradient)).all()
+
+
+def test_records_survive_a_cut_line(tmp_path):
+    cell = next(c for c in campaign.CELLS if c.name == "lcp-plain/exact")
+    record = campaign.run_chunk(cell, 0, 0, gradients=False)
+    path = tmp_path / "results.jsonl"
+    line = campaign.line(record)
+    path.write_text(line + "\n" + line[: len(line) // 2])
+    assert [r.tried for r in campaign.read(path)] == [record.tried]
+    assert "| lcp-plain | 256 | 100.0 | 0 | 0 | 0 |" in campaign.markdown(campaign.read(path))
+    page = tmp_path / "page.md"
+    page.write_text(f"before\n{campaign.BEGIN}old\n{campaign.END}after\n")
+    campaign.fill(page, [record])
+    assert page.read_text().startswith(f"before\n{campaign.BEGIN}| problems")
+    assert page.read_text().endswith(f"{campaign.END}after\n")
+    assert "old" not in page.read_text()
