@@ -292,6 +292,32 @@ struct Mpc {
       lk[i] = select(skip, lk[i], select(diff > 0, larger, smaller));
       sk[i] = select(skip, sk[i], select(diff > 0, smaller, larger));
     }
+    if constexpr (S::kPivot) polish_lcp(lk, sk, eps, skip);
+  }
+
+  // The root of the CHKS function loses the smaller of lam and s where they differ by 1e16, and a large entry of F
+  // carries that into other rows. Newton on lam o (F lam + gap) = eps itself, from a point that is nearly there, does not:
+  // (diag(s) + diag(lam) F) dlam = eps - lam o (F lam + gap).
+  void polish_lcp(Vec* lk, Vec* sk, Vec eps, Mask skip) {
+    const int64_t nl = n.l();
+    Local<S::kL * S::kL> jacobian(M);
+    Local<S::kL> step(dl);
+    for (int iteration = 0; iteration < 4; iteration++) {
+      for (int64_t i = 0; i < nl; i++) {
+        Vec t = gap[i];
+        for (int64_t j = 0; j < nl; j++) t += F[i * nl + j] * lk[j], jacobian[i * nl + j] = lk[i] * F[i * nl + j];
+        jacobian[i * nl + i] += sk[i];
+        step[i] = eps - lk[i] * t;
+      }
+      factor(nl, jacobian, rows);
+      back(nl, jacobian, rows, step);
+      Mask keep = skip;  // a step that would leave the interior, or is not a number
+      for (int64_t i = 0; i < nl; i++) keep |= ~(abs(step[i]) <= 0.5 * lk[i]);
+      for (int64_t i = 0; i < nl; i++) {
+        lk[i] = select(keep, lk[i], lk[i] + step[i]);
+        sk[i] = select(keep, sk[i], eps / lk[i]);
+      }
+    }
   }
 
   // Cost of a trajectory.

@@ -59,8 +59,8 @@ from difflcs.mpc.solution import Primal
 CERTIFIED = 1e-6
 # A bound is weakly active where both the distance to it and the Newton step across it are below this part of the range.
 _WEAK = 1e-5
-# A reduced Hessian counts as singular below this pivot, in units of each action's own curvature. Directions below it are
-# held: their sensitivity is zero.
+# A reduced Hessian counts as singular below this pivot, in units of each action's own curvature. Directions below it
+# are held: their sensitivity is zero.
 _SINGULAR = 1e-10
 
 
@@ -129,13 +129,13 @@ def residual(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
 
     - dynamics: |x_{k+1} − (A x_k + B u_k + C λ_k + d)| in parts of Σ|terms|, the sum of the sizes of the terms of the
       right-hand side; likewise x_0 against x0;
-    - complementarity: |λ∘s − ε| / (ε + 1e-7·λ·Σ|terms of s|), the second part being the rounding of s = Dx + Eu + Fλ + c
-      times 1e9; and 1 where λ is not positive;
+    - complementarity: |λ∘s − ε| / (ε + 1e-7·λ·Σ|terms of s|), where the second part leaves room for the rounding of
+      s = Dx + Eu + Fλ + c; and 1 where λ is not positive;
     - bounds: the distance of an action to them, in parts of its range u_max − u_min;
     - stationarity in λ: |Cᵀp + s∘y + Fᵀρ| in parts of its Σ|terms|;
     - stationarity in u: |u − clip(u − range·g/G)| / range, the part of its range by which the reduced gradient g would
-      still move an action. G is the scale of g: the larger of its Σ|terms| and of range·(Rⱼⱼ + BⱼᵀQBⱼ), what its weights
-      make of a step across the range. It does not vanish with the curvature, so that flat directions count.
+      still move an action. G is the scale of g: the larger of its Σ|terms| and of range·(Rⱼⱼ + BⱼᵀQBⱼ), which is what
+      its weights make of a step across the range. G does not vanish with the curvature: flat directions count.
     """
     x, u, lam = (v.transpose(0, 1) for v in primal)  # steps first, so that per-element matrices broadcast
     p, y, rho = (v.transpose(0, 1) for v in (dual.p, dual.y, dual.rho))

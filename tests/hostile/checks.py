@@ -130,14 +130,15 @@ def judge_mpc(
             # Where the terms of s are so large that their rounding is all of s, its other reading is ε/λ.
             other = stationarity(problem, a, x, u, lam, relaxation / lam, s_terms, low, high, rounding)
             stationary = np.minimum(stationary, other)
-        # Below 1e-38 float32 has fewer digits.
+        # Below 1e-38 float32 has fewer digits: x, u and λ are off by 1e-45 each, times what multiplies them.
         tiny = 2e-45 * (1 + s_terms) if single else 0.0
+        least = 1e-44 * (1 + sum(np.abs(a[k]).sum(-1) for k in "ABC"))[:, None] if single else 0.0
         return {
             "finite": finite(x, u, lam, objective),
             "start": np.where((x[:, 0] == a["x0"]).all(-1), 0.0, np.inf),
             "bounds": np.where(((u >= low) & (u <= high)).all((1, 2)), 0.0, np.inf),
             "sign of lam": np.where((lam > 0).all((1, 2)), 0.0, np.inf),
-            "dynamics": _ratio(np.abs(step), 1e-6 * next_terms + (1e-44 if single else 0.0)),
+            "dynamics": _ratio(np.abs(step), 1e-6 * next_terms + least),
             "complementarity": _ratio(
                 np.abs(lam * s - relaxation),
                 (1e-6 + rounding) * relaxation + (1e-13 + 2 * rounding) * lam * s_terms + tiny,
