@@ -19,6 +19,10 @@ from difflcs.mpc.solution import Primal
 from difflcs.status import Status
 
 
+# An iteration with row exchanges takes ten times as long, and what it can mend it mends soon.
+_MAX_ITER_PIVOT = 60
+
+
 @dataclass(frozen=True)
 class BatchedResult(Result):
     """A `Result` that remembers how to differentiate it.
@@ -193,7 +197,7 @@ class BatchedBackend(Backend):
             first_relaxation=first,
             shrink=self.shrink,
             tol=self.tol,
-            max_iter=self.max_iter,
+            max_iter=min(self.max_iter, _MAX_ITER_PIVOT) if pivot else self.max_iter,
             certified=kkt.CERTIFIED,
             pivot=pivot,
             time_limit=max(ends - time.perf_counter(), 0.0),
