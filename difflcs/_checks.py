@@ -118,7 +118,7 @@ def check_number(name: str, value: object, minimum: float = 0.0, strict: bool = 
 def check_choice(name: str, value: object, choices: Sequence[str]) -> str:
     """Check one of a few words."""
     if value not in choices:
-        raise InvalidInputError(f"{name}: expected one of {', '.join(map(repr, choices))}, got {value!r}")
+        raise InvalidInputError(f"{name}: expected one of {', '.join(map(repr, choices))}, got {value!r:.200}")
     return str(value)
 
 

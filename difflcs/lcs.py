@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from difflcs import _files, _zoo
 from difflcs._checks import (
     broadcast_batch,
+    check_choice,
     check_number,
     check_positive_int,
     check_same_device,
@@ -23,6 +24,8 @@ from difflcs._checks import (
 from difflcs._linalg import matvec
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, NotPositiveDefiniteError, ShapeError
 from difflcs.lcp import solve_lcp
+
+_DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 class SystemMatrices:
@@ -338,16 +341,18 @@ class LCSModel(nn.Module):
         wanted = {"n_x", "n_u", "n_lam", "stiffness", "learn_c", "dtype"}
         if set(config) != wanted:
             raise CheckpointError(
-                f"{source}: expected the fields {sorted(wanted)} of an LCSModel, got {sorted(config)}; "
+                f"{source}: expected the fields {sorted(wanted)} of an LCSModel, got {_files.short(sorted(config))}; "
                 f"was it written by LCSModel.save_pretrained?"
             )
         try:
-            dtype = {"float32": torch.float32, "float64": torch.float64}[str(config["dtype"])]
+            dtype = _DTYPES[check_choice("dtype", config["dtype"], tuple(_DTYPES))]
             n_x, n_u, n_lam = (check_positive_int(k, config[k]) for k in ("n_x", "n_u", "n_lam"))
             stiffness = check_number("stiffness", config["stiffness"], strict=True)
             if not isinstance(config["learn_c"], bool):
-                raise DTypeError(f"learn_c: expected true or false, got {config['learn_c']!r}; save the model again")
-        except (InvalidInputError, KeyError) as error:
+                raise DTypeError(
+                    f"learn_c: expected true or false, got {describe(config['learn_c'])}; save the model again"
+                )
+        except InvalidInputError as error:
             raise CheckpointError(f"{source}: its configuration cannot be used: {error}") from error
         wanted_shapes = cls._shapes(n_x, n_u, n_lam)  # compared before anything of these sizes is made
         shapes = {k: tuple(v.shape) for k, v in tensors.items()}
