@@ -341,3 +341,9 @@ def test_an_object_that_is_none(tmp_path, found):
     write(run.path / "config.json", {**run.config(), "object": found})
     with pytest.raises(CheckpointError, match="name, source and mass"):
         zoo.Learned.open(run.path)
+
+
+def test_settings_come_back_with_and_without_json():
+    config = TrainConfig(evaluate_at=(0.2,))
+    assert TrainConfig.from_dict(asdict(config)) == config
+    assert TrainConfig.from_dict(json.loads(json.dumps(asdict(config)))) == config

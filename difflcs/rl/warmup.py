@@ -390,8 +390,8 @@ def _fits(value: object, hint: Any) -> bool:
     if origin in (Union, UnionType):
         return any(_fits(value, part) for part in parts)
     if origin is tuple:
-        inner = parts[:1] * len(value) if isinstance(value, list) and parts[-1] is Ellipsis else parts
-        return isinstance(value, list) and len(value) == len(inner) and all(map(_fits, value, inner))
+        inner = parts[:1] * len(value) if isinstance(value, list | tuple) and parts[-1] is Ellipsis else parts
+        return isinstance(value, list | tuple) and len(value) == len(inner) and all(map(_fits, value, inner))
     if hint is float:
         return isinstance(value, int | float) and not isinstance(value, bool)
     return isinstance(value, hint) and isinstance(value, bool) == (hint is bool)
