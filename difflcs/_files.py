@@ -224,12 +224,13 @@ def _read_tensors(path: Path) -> tuple[Mapping[str, str], dict[str, Tensor]]:
 
 
 def check_tensors(
-    source: object, got: Mapping[str, Tensor], wanted: Mapping[str, tuple[tuple[int, ...], torch.dtype]]
+    source: object, what: str, got: Mapping[str, Tensor], wanted: Mapping[str, tuple[tuple[int, ...], torch.dtype]]
 ) -> None:
     """Compare tensors of a file with what is to hold them, before that is built.
 
     Args:
         source: where they are from, for the message.
+        what: what they are to be, for the message.
         got: name → tensor.
         wanted: name → shape and dtype.
 
@@ -240,7 +241,7 @@ def check_tensors(
     if different := sorted(k for k in {*found, *wanted} if found.get(k) != wanted.get(k)):
         name = different[0]
         raise CheckpointError(
-            f"{source}: expected tensors that fit its configuration, got others in {short(different)}: {name} is "
+            f"{source}: expected {what} that fits its configuration, got other tensors in {short(different)}: {name} is "
             f"{found.get(name)} instead of {wanted.get(name)}; the file is foreign or corrupt"
         )
     check_finite(source, got)

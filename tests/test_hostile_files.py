@@ -316,7 +316,7 @@ def test_a_checkpoint_that_does_not_fit_the_settings(tmp_path, method):
     run = make_run(tmp_path / "run", method=method)
     tensors = {"ensemble.x": torch.zeros(2), "network.x": torch.ones(1)}
     save_checkpoint(run.checkpoints, Checkpoint(1, None, {}, tensors))
-    with pytest.raises(CheckpointError, match="fit its configuration"):
+    with pytest.raises(CheckpointError, match="fits its configuration"):
         load_policy(run)
 
 

@@ -142,7 +142,7 @@ def read_history(
     found = {name: value for name, value in tensors.items() if name in shapes and value.is_floating_point()}
     dtypes = {name: value.dtype for name, value in found.items()}
     wanted = {name: (shape, dtypes.get(name, torch.float64)) for name, shape in shapes.items()}
-    check_tensors("checkpoint", found, wanted)
+    check_tensors("checkpoint", "a history of values", found, wanted)
     inputs, rewards = (found[name].split(list(sizes)) for name in shapes)
     return list(zip(inputs, rewards, strict=True))
 

@@ -143,7 +143,9 @@ class Ensemble(nn.Module):
         for name, size in (("input", n_x + n_u), ("change", n_x)):
             shapes |= {f"{name}_mean": (size,), f"{name}_std": (size,)}
         # Compared before anything of these sizes is made.
-        _files.check_tensors(source, tensors, {name: (shape, torch.float32) for name, shape in shapes.items()})
+        _files.check_tensors(
+            source, "an ensemble", tensors, {name: (shape, torch.float32) for name, shape in shapes.items()}
+        )
         ensemble = cls(n_x, n_u, networks, width)
         ensemble.load_state_dict(dict(tensors))
         return ensemble

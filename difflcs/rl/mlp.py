@@ -159,4 +159,4 @@ def check_network(source: str, tensors: Mapping[str, Tensor], n_features: int, w
     shapes: dict[str, tuple[int, ...]] = {"u_min": (n_u,), "u_max": (n_u,)}
     for i, (n_in, n_out) in enumerate(pairwise([n_features, width, width, n_u])):
         shapes |= {f"layers.{2 * i}.weight": (n_out, n_in), f"layers.{2 * i}.bias": (n_out,)}
-    _files.check_tensors(source, tensors, {name: (shape, torch.float64) for name, shape in shapes.items()})
+    _files.check_tensors(source, "a network", tensors, {name: (shape, torch.float64) for name, shape in shapes.items()})
