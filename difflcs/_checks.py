@@ -11,6 +11,8 @@ from torch import Tensor
 from difflcs.errors import DeviceError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
 
 FLOATS = (torch.float32, torch.float64)
+MOST_ENVS, MOST_WIDTH, MOST_NETWORKS = 10_000, 10_000, 1_000
+"""Environments side by side, width of a network, networks of an ensemble: more is a slip or a foreign file."""
 _USABLE_DEVICES = ("cpu", "cuda", "mps", "xpu")
 
 
@@ -18,7 +20,11 @@ def describe(value: object) -> str:
     """A short description of a value for an error message."""
     if isinstance(value, Tensor):
         return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')} on {value.device}"
-    return f"{type(value).__name__} {' '.join(repr(value).split())}"[:120]
+    try:
+        text = repr(value)
+    except ValueError:  # Python writes no integers of more than 4300 digits
+        text = "of many digits"
+    return f"{type(value).__name__} {' '.join(text.split())}"[:120]
 
 
 def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (), finite: bool = True) -> Tensor:
@@ -78,13 +84,19 @@ def check_same_device(tensors: Iterable[tuple[str, Tensor]]) -> None:
             )
 
 
-def check_positive_int(name: str, value: object, minimum: int = 1) -> int:
-    """Check an integer of at least `minimum`."""
+def check_positive_int(name: str, value: object, minimum: int = 1, maximum: int = 2**63 - 1) -> int:
+    """Check an integer of at least `minimum` and at most `maximum`, by default the largest that torch takes."""
     if isinstance(value, bool) or not isinstance(value, int):
         raise DTypeError(f"{name}: expected an int, got {describe(value)}; convert it with int(...)")
     if value < minimum:
-        raise InvalidInputError(f"{name}: expected at least {minimum}, got {value}; pass a larger one")
+        raise InvalidInputError(f"{name}: expected at least {minimum}, got {_digits(value)}; pass a larger one")
+    if value > maximum:
+        raise InvalidInputError(f"{name}: expected at most {maximum}, got {_digits(value)}; pass a smaller one")
     return value
+
+
+def _digits(value: int) -> str:
+    return describe(value).removeprefix("int ")
 
 
 def check_number(name: str, value: object, minimum: float = 0.0, strict: bool = False) -> float:
@@ -92,10 +104,15 @@ def check_number(name: str, value: object, minimum: float = 0.0, strict: bool = 
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise DTypeError(f"{name}: expected a number, got {describe(value)}; convert it with float(...)")
     too_small = value <= minimum if strict else value < minimum
-    if not (value == value and abs(value) != float("inf")) or too_small:
+    try:
+        number = float(value)
+    except OverflowError:  # an integer that is too large
+        number = math.inf
+    if not math.isfinite(number) or too_small:
         relation = "above" if strict else "at least"
-        raise InvalidInputError(f"{name}: expected a finite number {relation} {minimum:g}, got {value!r}; change it")
-    return float(value)
+        got = repr(value) if isinstance(value, float) else _digits(value)
+        raise InvalidInputError(f"{name}: expected a finite number {relation} {minimum:g}, got {got}; change it")
+    return number
 
 
 MAX_THREADS = 1024
@@ -112,7 +129,7 @@ def check_threads(value: int | None, name: str = "threads") -> None:
 def check_choice(name: str, value: object, choices: Sequence[str]) -> str:
     """Check one of a few words."""
     if value not in choices:
-        raise InvalidInputError(f"{name}: expected one of {', '.join(map(repr, choices))}, got {value!r}")
+        raise InvalidInputError(f"{name}: expected one of {', '.join(map(repr, choices))}, got {value!r:.200}")
     return str(value)
 
 

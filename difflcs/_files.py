@@ -1,18 +1,32 @@
-"""Files: atomic writes, and records of tensors (safetensors) with a JSON description. Never pickle."""
+"""Files: atomic writes, locks, and records of tensors (safetensors) with a JSON description. Never pickle.
+
+Whatever lies in a file that is read, the error is a `CheckpointError`. Sizes are checked before anything is read.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
+import stat
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
-from difflcs.errors import CheckpointError
+from difflcs.errors import CheckpointError, InUseError
 
+LOCK = ".lock"
+"""Name of the file in a directory that says, while it is locked, that a process works there."""
+MAX_TEXT = 1 << 26
+"""Largest JSON or CSV file that is read [byte]; a training of days writes less than a megabyte."""
+MAX_TENSORS = 1 << 32
+"""Largest file of tensors that is read [byte]."""
+_MAX_DEPTH = 32
+"""Deepest nesting of JSON; ours has six levels."""
 _FORMAT = 1
 
 
@@ -37,6 +51,116 @@ def write_json(path: Path, value: object) -> None:
     write_atomically(path, (json.dumps(value, indent=2, sort_keys=True) + "\n").encode())
 
 
+def read_text(path: Path) -> str:
+    """Read a text file.
+
+    Raises:
+        FileNotFoundError: there is none.
+        CheckpointError: it is not a file, too large, not UTF-8, or cannot be read.
+    """
+    _check_size(path, MAX_TEXT)
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise
+    except (OSError, UnicodeDecodeError) as error:
+        raise CheckpointError(f"{path}: expected text that can be read, got {error}; restore it from a copy") from error
+
+
+def read_json(path: Path) -> object:
+    """Read JSON as the standard has it: no NaN, no infinity.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        CheckpointError: it is not JSON, or larger or nested more deeply than anything that difflcs writes.
+    """
+    text = read_text(path)
+    try:
+        value = json.loads(text, parse_constant=_refuse, parse_float=_finite)
+        if not _is_flat(value):
+            raise ValueError(f"more than {_MAX_DEPTH} levels")
+    except (ValueError, RecursionError) as error:
+        raise CheckpointError(f"{path}: expected JSON, got {error}; restore it from a copy") from error
+    return value
+
+
+def _refuse(constant: str) -> object:
+    raise ValueError(f"{constant}, which is no JSON")
+
+
+def _finite(text: str) -> float:
+    if abs(value := float(text)) == float("inf"):
+        raise ValueError(f"{short(text)}, which is too large")
+    return value
+
+
+def _is_flat(value: object) -> bool:
+    level = [value]
+    for _ in range(_MAX_DEPTH):
+        level = [v for part in level if isinstance(part, dict | list) for v in _children(part)]
+        if not level:
+            return True
+    return False
+
+
+def _children(part: dict | list) -> Iterable[object]:
+    return part.values() if isinstance(part, dict) else part
+
+
+def _check_size(path: Path, limit: int) -> None:
+    """Refuse what is no plain file (a pipe would never end) or too large.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        CheckpointError: see above.
+    """
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError) as error:
+        raise CheckpointError(
+            f"{path}: expected a file that can be read, got {error}; restore it from a copy"
+        ) from error
+    if not stat.S_ISREG(found.st_mode):
+        raise CheckpointError(f"{path}: expected a plain file, got another kind; restore it from a copy")
+    if found.st_size > limit:
+        raise CheckpointError(
+            f"{path}: expected at most {limit >> 20} MB, got {found.st_size >> 20} MB; difflcs did not write it"
+        )
+
+
+@contextmanager
+def locked(directory: Path) -> Iterator[None]:
+    """Let no other process work in a directory for as long as this lasts.
+
+    The operating system holds the lock: it ends with this process, however that dies.
+
+    Raises:
+        InUseError: another process, or another part of this one, works in it.
+        OSError: the lock cannot be written.
+    """
+    import filelock  # torch brings it; `import difflcs` does without
+
+    path = directory / LOCK
+    lock = filelock.FileLock(path)
+    try:
+        lock.acquire(blocking=False)
+    except filelock.Timeout:
+        raise InUseError(
+            f"{directory}: expected a run that no process works on, got one that is in use; wait until that process "
+            f"ends, or stop it, and try again, or choose another --out"
+        ) from None
+    mine = path.stat()
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            if os.path.samestat(path.stat(), mine):  # not if the directory was moved and there is a new one
+                path.unlink()  # before the release: who has opened it already sees that it is gone, and tries again
+        lock.release()
+
+
 def save_record(directory: Path, kind: str, config: Mapping[str, object], tensors: Mapping[str, Tensor]) -> None:
     """Write `model.safetensors` and `config.json` into a directory, each atomically.
 
@@ -55,7 +179,7 @@ def _hash(header: Mapping[str, object], tensors: Mapping[str, Tensor]) -> str:
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(tensors):
         digest.update(f"{name} {tuple(tensors[name].shape)} {tensors[name].dtype}".encode())
-        digest.update(tensors[name].contiguous().view(-1).numpy().tobytes())
+        digest.update(tensors[name].contiguous().view(-1).view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()
 
 
@@ -63,29 +187,78 @@ def load_record(directory: Path, kind: str) -> tuple[dict[str, object], dict[str
     """Read and check what `save_record` wrote.
 
     Raises:
-        CheckpointError: missing, corrupt, of another kind, or of a newer format.
+        CheckpointError: missing, corrupt, too large, of another kind, or of a newer format.
     """
-    from safetensors import SafetensorError, safe_open
-
     remedy = "expected a directory with config.json and model.safetensors written by difflcs"
     try:
-        header = json.loads((directory / "config.json").read_text())
-        with safe_open(directory / "model.safetensors", "pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
+        header = read_json(directory / "config.json")
+        metadata, tensors = _read_tensors(directory / "model.safetensors")
     except FileNotFoundError as error:
         raise CheckpointError(f"{directory}: a file is missing ({error}); {remedy}") from error
-    except (OSError, SafetensorError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise CheckpointError(f"{directory}: corrupt or not a checkpoint ({error}); {remedy}") from error
+    except CheckpointError as error:
+        raise CheckpointError(f"{directory}: corrupt or not a checkpoint ({error.args[0]}); {remedy}") from error
     if not isinstance(header, dict) or header.get("kind") != kind or not isinstance(header.get("config"), dict):
         got = header.get("kind") if isinstance(header, dict) else type(header).__name__
-        raise CheckpointError(f"{directory}: expected a record of kind {kind!r}, got {got!r}; {remedy}")
+        raise CheckpointError(f"{directory}: expected a record of kind {kind!r}, got {short(got)}; {remedy}")
     if header.get("format") != _FORMAT:
-        raise CheckpointError(
-            f"{directory}: expected format {_FORMAT}, got {header.get('format')!r}; update difflcs or save it again"
-        )
+        got = short(header.get("format"))
+        raise CheckpointError(f"{directory}: expected format {_FORMAT}, got {got}; update difflcs or save it again")
     if metadata.get("sha256") != _hash(header, tensors):
         raise CheckpointError(
             f"{directory}: config.json and model.safetensors do not match their checksum; copy or save them again"
         )
     return header["config"], tensors
+
+
+def _read_tensors(path: Path) -> tuple[Mapping[str, str], dict[str, Tensor]]:
+    from safetensors import safe_open
+
+    _check_size(path, MAX_TENSORS)
+    try:
+        with safe_open(path, "pt") as file:
+            return file.metadata() or {}, {name: file.get_tensor(name) for name in file.keys()}
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # the format has many ways to be wrong, and dtypes that torch does not know
+        raise CheckpointError(f"{path}: expected tensors, got {type(error).__name__}: {error}") from error
+
+
+def check_tensors(
+    source: object, what: str, got: Mapping[str, Tensor], wanted: Mapping[str, tuple[tuple[int, ...], torch.dtype]]
+) -> None:
+    """Compare tensors of a file with what is to hold them, before that is built.
+
+    Args:
+        source: where they are from, for the message.
+        what: what they are to be, for the message.
+        got: name → tensor.
+        wanted: name → shape and dtype.
+
+    Raises:
+        CheckpointError: another name, shape or dtype, or NaN or infinity.
+    """
+    found = {name: (tuple(value.shape), value.dtype) for name, value in got.items()}
+    if different := sorted(k for k in {*found, *wanted} if found.get(k) != wanted.get(k)):
+        name = different[0]
+        raise CheckpointError(
+            f"{source}: expected {what} that fits its configuration, got others in {short(different)}: {name} is "
+            f"{found.get(name)} instead of {wanted.get(name)}; the file is foreign or corrupt"
+        )
+    check_finite(source, got)
+
+
+def check_finite(source: object, tensors: Mapping[str, Tensor]) -> None:
+    """Refuse NaN and infinity.
+
+    Raises:
+        CheckpointError: a tensor holds such a value.
+    """
+    bad = sorted(name for name, value in tensors.items() if not bool(torch.isfinite(value).all()))
+    if bad:
+        raise CheckpointError(f"{source}: expected finite numbers, got NaN or infinity in {short(bad)}; save it again")
+
+
+def short(value: object) -> str:
+    """A value as it would be written, cut where it gets long."""
+    text = repr(value)
+    return text if len(text) <= 200 else f"{text[:200]}…"

@@ -29,7 +29,7 @@ from difflcs import GoalCost, LCSModel, LCSMPCLayer, _zoo, solve_lcp
 from difflcs.errors import BackendNotFoundError, DiffLCSError
 
 _TIMEOUT = 120.0  # [s] of a process; the first picture in software takes seconds
-_HARD = ("torch", "numpy", "casadi", "safetensors")
+_HARD = ("torch", "numpy", "casadi", "filelock", "safetensors")
 _OPTIONAL_BACKENDS = ("relaxed",)
 _EXTRAS = ("rl", "envs", "viz", "relaxed", "tutorials", "reproduce", "docs", "dev")
 _MARKS = {"ok": "ok", "missing": "--", "failed": "!!"}
@@ -157,10 +157,11 @@ def _python() -> str:
 
 def _hard_dependencies() -> str:
     import casadi
+    import filelock
     import numpy
     import safetensors
 
-    modules = {"torch": torch, "numpy": numpy, "casadi": casadi, "safetensors": safetensors}
+    modules = {"torch": torch, "numpy": numpy, "casadi": casadi, "filelock": filelock, "safetensors": safetensors}
     return ", ".join(f"{name} {modules[name].__version__}" for name in _HARD)
 
 

@@ -81,6 +81,10 @@ class CheckpointError(DiffLCSError):
     page = "docs/training.md"
 
 
+class InUseError(CheckpointError):
+    """Another process works in a run directory."""
+
+
 class DoubleBackwardError(DiffLCSError, RuntimeError):
     """Second derivatives were asked of a function that has first derivatives only."""
 

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from difflcs import _files, _zoo
 from difflcs._checks import (
     broadcast_batch,
+    check_choice,
     check_number,
     check_positive_int,
     check_same_device,
@@ -23,6 +24,8 @@ from difflcs._checks import (
 from difflcs._linalg import matvec
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, NotPositiveDefiniteError, ShapeError
 from difflcs.lcp import solve_lcp
+
+_DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 class SystemMatrices:
@@ -195,7 +198,7 @@ class LCSModel(nn.Module):
         check_number("init_scale", init_scale)
         if dtype not in (torch.float32, torch.float64):
             raise DTypeError(f"dtype: expected torch.float32 or torch.float64, got {dtype}")
-        for name, shape in self._shapes().items():
+        for name, shape in self._shapes(self.n_x, self.n_u, self.n_lam).items():
             draw = torch.rand(shape, generator=generator, dtype=torch.float64)
             value = torch.zeros(shape) if name == "c" else init_scale * (2 * draw - 1)
             self.register_parameter(name, nn.Parameter(value.to(dtype)))
@@ -211,8 +214,8 @@ class LCSModel(nn.Module):
     H: nn.Parameter
     c: nn.Parameter
 
-    def _shapes(self) -> dict[str, tuple[int, ...]]:
-        x, u, m = self.n_x, self.n_u, self.n_lam
+    @staticmethod
+    def _shapes(x: int, u: int, m: int) -> dict[str, tuple[int, ...]]:
         return {
             "A": (x, x),
             "B": (x, u),
@@ -338,25 +341,29 @@ class LCSModel(nn.Module):
         wanted = {"n_x", "n_u", "n_lam", "stiffness", "learn_c", "dtype"}
         if set(config) != wanted:
             raise CheckpointError(
-                f"{source}: expected the fields {sorted(wanted)} of an LCSModel, got {sorted(config)}; "
+                f"{source}: expected the fields {sorted(wanted)} of an LCSModel, got {_files.short(sorted(config))}; "
                 f"was it written by LCSModel.save_pretrained?"
             )
         try:
-            dtype = {"float32": torch.float32, "float64": torch.float64}[str(config["dtype"])]
-            sizes = {k: config[k] for k in ("n_x", "n_u", "n_lam", "stiffness")}
+            dtype = _DTYPES[check_choice("dtype", config["dtype"], tuple(_DTYPES))]
+            n_x, n_u, n_lam = (check_positive_int(k, config[k]) for k in ("n_x", "n_u", "n_lam"))
+            stiffness = check_number("stiffness", config["stiffness"], strict=True)
             if not isinstance(config["learn_c"], bool):
-                raise DTypeError(f"learn_c: expected true or false, got {config['learn_c']!r}; save the model again")
-            model = cls(**sizes, learn_c=config["learn_c"], dtype=dtype)  # pyright: ignore[reportArgumentType]
-        except (InvalidInputError, KeyError) as error:
+                raise DTypeError(
+                    f"learn_c: expected true or false, got {describe(config['learn_c'])}; save the model again"
+                )
+        except InvalidInputError as error:
             raise CheckpointError(f"{source}: its configuration cannot be used: {error}") from error
+        wanted_shapes = cls._shapes(n_x, n_u, n_lam)  # compared before anything of these sizes is made
         shapes = {k: tuple(v.shape) for k, v in tensors.items()}
-        if shapes != model._shapes():
+        if shapes != wanted_shapes:
             raise CheckpointError(
-                f"{source}: expected tensors {model._shapes()}, got {shapes}; the file is foreign or corrupt"
+                f"{source}: expected tensors {wanted_shapes}, got {shapes}; the file is foreign or corrupt"
             )
         for name, tensor in tensors.items():
             if tensor.dtype != dtype or not bool(torch.isfinite(tensor).all()):
                 raise CheckpointError(f"{source}: expected finite {dtype} values in {name}, got {describe(tensor)}")
+        model = cls(n_x, n_u, n_lam, stiffness, learn_c=config["learn_c"], dtype=dtype)
         model.load_state_dict(dict(tensors))
         return model
 

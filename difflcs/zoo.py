@@ -164,19 +164,44 @@ def table(cards: Sequence[ModelCard]) -> str:
 def _read(file: Path) -> ModelCard:
     remedy = "install difflcs again, or add the run again with `python -m difflcs.zoo add RUN --force`"
     try:
-        values = json.loads(file.read_text())
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"{file}: expected JSON, got {error}; {remedy}") from error
+        values = _files.read_json(file)
+    except (FileNotFoundError, CheckpointError) as error:
+        raise CheckpointError(f"{file}: expected a card, got: {error.args[0]}; {remedy}") from error
     wanted = {f.name for f in fields(ModelCard)}
     if not isinstance(values, dict) or set(values) != wanted:
         got = sorted(values) if isinstance(values, dict) else type(values).__name__
-        raise CheckpointError(f"{file}: expected the fields {sorted(wanted)} of a card, got {got}; {remedy}")
+        raise CheckpointError(
+            f"{file}: expected the fields {sorted(wanted)} of a card, got {_files.short(got)}; {remedy}"
+        )
     kinds = dict.fromkeys(_NUMBERS, (int, float)) | dict.fromkeys(_COUNTS, (int,)) | dict.fromkeys(_WORDS, (str,))
     kinds |= {"object": (dict,), "versions": (dict,), "settings": (dict,)}
     for name, kind in kinds.items():
         if not isinstance(values[name], kind) or isinstance(values[name], bool):
-            raise CheckpointError(f"{file}: expected {kind[0].__name__} for {name}, got {values[name]!r}; {remedy}")
+            got = _files.short(values[name])
+            raise CheckpointError(f"{file}: expected {kind[0].__name__} for {name}, got {got}; {remedy}")
+    ranges = dict.fromkeys(("success_rate", "ci_low", "ci_high"), (0, 1)) | dict.fromkeys(_COUNTS, (0, 2**63))
+    for name, (low, high) in {**ranges, "minutes": (0, 1e6)}.items():
+        if not low <= values[name] <= high:
+            raise CheckpointError(f"{file}: expected {low} to {high:g} for {name}, got {values[name]}; {remedy}")
+    check_object(values["object"], file)
+    if not all(isinstance(version, str | None) for version in values["versions"].values()):
+        raise CheckpointError(f"{file}: expected texts for versions, got {_files.short(values['versions'])}; {remedy}")
     return ModelCard(**values)
+
+
+def check_object(found: Mapping[str, Any], source: object) -> None:
+    """Check what a file says of the object that a model was trained on.
+
+    Raises:
+        CheckpointError: name or source is no text, or the mass no positive number.
+    """
+    name, kind, mass = (found.get(key) for key in ("name", "source", "mass"))
+    number = isinstance(mass, int | float) and not isinstance(mass, bool) and 0 < mass < 1e6
+    if not isinstance(name, str) or not isinstance(kind, str) or not number:
+        raise CheckpointError(
+            f"{source}: expected an object with name, source and mass [kg], got {_files.short(dict(found))}; restore "
+            f"it from a copy"
+        )
 
 
 @dataclass(frozen=True)
@@ -227,6 +252,8 @@ class Learned:
         run = RunDirectory.open(source)
         config, found = stored_config(run), run.config().get("object")
         found = found if isinstance(found, dict) else None
+        if found is not None:
+            check_object(found, source)
         return cls(name, config.task, config.method, config.backend, load_policy(run), run.finished(), found, run=run)
 
     def fits(self, found: Mapping[str, Any]) -> bool:
@@ -260,8 +287,11 @@ def add(run: Path, name: str | None = None, *, force: bool = False, root: Path =
 
     directory = RunDirectory.open(run)
     settings = directory.config().get("config")
-    if not isinstance(settings, dict) or not {"task", "method", "minutes", "seed"} <= set(settings):
-        raise CheckpointError(f"{run}: expected the settings of a training in config.json, got {settings!r}")
+    kinds = {"task": str, "method": str, "minutes": int | float, "seed": int, "evaluation_seed": int, "backend": str}
+    if not isinstance(settings, dict) or not all(isinstance(settings.get(k), kind) for k, kind in kinds.items()):
+        raise CheckpointError(
+            f"{run}: expected the settings of a training in config.json, got {_files.short(settings)}; train it again"
+        )
     name = _checked_name(name, settings["task"], settings["method"])
     if not directory.finished():
         raise CheckpointError(f"{run}: expected a finished run; continue it with: difflcs train --out {run} --resume")
@@ -305,23 +335,31 @@ def _card(run: RunDirectory, settings: Mapping[str, Any], name: str) -> ModelCar
             f"{run.path}: expected an evaluation at the end of {run.log}, got none; train with --final-goals 1000"
         )
     found, versions = stored.get("object"), stored.get("versions")
-    if not isinstance(found, dict) or not {"name", "source", "mass"} <= set(found) or not isinstance(versions, dict):
+    if not isinstance(found, dict) or not isinstance(versions, dict):
         raise CheckpointError(
             f"{run.path}: expected `object` and `versions` in config.json, got {sorted(stored)}; train it again with "
             f"`difflcs train`, which writes them"
         )
+    check_object(found, run.path)
+    try:
+        rate, low, high = (float(last[f"evaluation_{k}"]) for k in ("success_rate", "ci_low", "ci_high"))
+        goals, failures = (int(last[f"evaluation_{k}"]) for k in ("goals", "solver_failures"))
+    except (KeyError, ValueError) as error:
+        raise CheckpointError(
+            f"{run.log}: expected an evaluation in its last row, got {error!r}; train again"
+        ) from error
     return ModelCard(
         name=name,
         task=settings["task"],
         method=settings["method"],
         minutes=settings["minutes"],
         seed=settings["seed"],
-        success_rate=float(last["evaluation_success_rate"]),
-        ci_low=float(last["evaluation_ci_low"]),
-        ci_high=float(last["evaluation_ci_high"]),
-        goals=int(last["evaluation_goals"]),
+        success_rate=rate,
+        ci_low=low,
+        ci_high=high,
+        goals=goals,
         evaluation_seed=settings["evaluation_seed"],
-        solver_failures=int(last["evaluation_solver_failures"]),
+        solver_failures=failures,
         object=found,
         backend=settings["backend"],
         version=str(versions.get("difflcs")),

@@ -139,7 +139,7 @@ def read(path: Path) -> list[Row]:
             rows = [Row(**{f.name: _TYPES[str(f.type)](line[f.name]) for f in fields(Row)}) for line in reader]
         if any(row.format != FORMAT for row in rows):
             raise ValueError(f"format {next(row.format for row in rows if row.format != FORMAT)}")
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, KeyError, csv.Error) as error:
         raise ResultsError(
             f"{path}: expected results of format {FORMAT} with the columns {', '.join(_COLUMNS)}; got {error}. Nothing "
             f"was changed; use the version that wrote it, or pass another --results"

@@ -106,7 +106,7 @@ def finished_record(folder: Path, key: str) -> dict[str, Any] | None:
     """The record of a finished unit in its folder; None if there is none, or if it tells of a failure."""
     try:
         record = json.loads((folder / "record.json").read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     usable = isinstance(record, dict) and record.get("format") == FORMAT and record.get("key") == key
     return record if usable and record.get("error") is None else None

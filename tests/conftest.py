@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -129,3 +132,72 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+def _values(value: object, path: tuple = ()) -> Iterator[tuple]:
+    yield path
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, part in items:
+        yield from _values(part, (*path, key))
+
+
+def _hostile(checkpoint: Any) -> Iterator[tuple[bool, Any]]:
+    """Checkpoints with one thing wrong; whether it is a tensor, which must be noticed."""
+    state = json.loads(json.dumps(checkpoint.state))
+    for path in list(_values(state))[1:]:
+        for value in (
+            None,
+            True,
+            -1,
+            1.5,
+            10**30,
+            -(10**30),
+            "x",
+            [],
+            [-1],
+            [True],
+            ["x"],
+            [10**30],
+            {},
+            {"state": {}},
+        ):
+            changed = json.loads(json.dumps(state))
+            part = changed
+            for key in path[:-1]:
+                part = part[key]
+            part[path[-1]] = value
+            yield False, replace(checkpoint, state=changed)
+    for name, tensor in checkpoint.tensors.items():
+        rest = {k: v for k, v in checkpoint.tensors.items() if k != name}
+        others = [tensor.to(torch.complex64), tensor.to(torch.int64), tensor.unsqueeze(0), tensor.unsqueeze(-1)]
+        if tensor.ndim:
+            others += [torch.cat([tensor, tensor[:1]])] if len(tensor) else []
+            others += [tensor[:0]] if len(tensor) else []
+        for other in others:
+            yield True, replace(checkpoint, tensors={**rest, name: other})
+        yield True, replace(checkpoint, tensors=rest)
+    yield True, replace(checkpoint, tensors={**checkpoint.tensors, "another": torch.zeros(1)})
+
+
+@pytest.fixture(scope="session")
+def refuses_hostile_checkpoints() -> Callable[[Any], None]:
+    """A check: after one step, a trainer restores itself, and refuses checkpoints with anything wrong."""
+    from difflcs.errors import CheckpointError
+
+    def check(trainer: Any) -> None:
+        trainer.step()
+        whole = trainer.checkpoint()
+        tensors = {name: value.clone() for name, value in whole.tensors.items()}
+        whole = replace(whole, tensors=tensors)
+        for is_tensor, checkpoint in _hostile(whole):
+            try:
+                trainer.restore(checkpoint)
+            except CheckpointError as error:
+                message = str(error)
+            else:
+                message = ""
+            assert message or not is_tensor
+        trainer.restore(whole)
+        trainer.step()
+
+    return check

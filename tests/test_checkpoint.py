@@ -1,14 +1,18 @@
 """Checkpoints and run directories: what is written comes back, and nothing else is accepted."""
 
 import json
+import os
 import shutil
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 import torch
 
 from difflcs import LCSModel
-from difflcs.errors import CheckpointError
+from difflcs.errors import CheckpointError, InUseError
 from difflcs.rl import checkpoint as module
 from difflcs.rl.checkpoint import Checkpoint, RunDirectory, load_checkpoint, save_checkpoint
 
@@ -138,3 +142,69 @@ def test_log_has_no_doubled_nor_broken_rows(tmp_path):
     assert [row["loss"] for row in run.rows()] == ["", "0.5", "1.0", "7.0"]
     run.truncate_log(-1)
     assert not run.log.exists()
+
+
+# --- locks ------------------------------------------------------------------------------------------------------------
+
+HOLD = """
+import sys, time, pathlib
+from difflcs.rl.checkpoint import RunDirectory
+with RunDirectory(pathlib.Path(sys.argv[1])).locked():
+    print("locked", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """Another process that holds the lock of a directory."""
+    with subprocess.Popen([sys.executable, "-c", HOLD, tmp_path], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout.readline() == "locked\n"
+            yield process
+        finally:
+            process.kill()
+
+
+def test_a_run_in_use_is_refused_until_its_process_dies(tmp_path, holder):
+    run = RunDirectory(tmp_path)
+    with pytest.raises(InUseError, match=r"in use; wait until .* another --out") as error, run.locked():
+        pass
+    assert str(tmp_path) in str(error.value)
+    os.kill(holder.pid, signal.SIGKILL)
+    holder.wait()
+    assert (tmp_path / ".lock").exists()  # left behind, and no obstacle
+    with run.locked():
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_lock_is_held_against_this_process_too(tmp_path):
+    with RunDirectory(tmp_path).locked():
+        with pytest.raises(InUseError), RunDirectory(tmp_path).locked():
+            pass
+        assert (tmp_path / ".lock").exists()
+    with RunDirectory(tmp_path).locked():
+        pass
+
+
+def test_a_lock_moves_with_its_directory(tmp_path):
+    (tmp_path / "run").mkdir()
+    with RunDirectory(tmp_path / "run").locked():
+        os.replace(tmp_path / "run", tmp_path / "old")
+        (tmp_path / "run").mkdir()
+        with (
+            RunDirectory(tmp_path / "run").locked(),
+            pytest.raises(InUseError),
+            RunDirectory(tmp_path / "old").locked(),
+        ):
+            pass
+        second = RunDirectory(tmp_path / "run").locked()
+        second.__enter__()
+    assert (tmp_path / "run/.lock").exists()  # the first one leaves the lock of the second alone
+    second.__exit__(None, None, None)
+
+
+def test_a_lock_left_in_an_empty_directory_is_no_file(tmp_path):
+    (tmp_path / ".lock").touch()
+    RunDirectory.create(tmp_path, {"kind": "run"})

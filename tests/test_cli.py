@@ -14,6 +14,7 @@ import torch
 
 from difflcs import LCSModel, cli
 from difflcs.errors import CheckpointError
+from difflcs.rl.checkpoint import RunDirectory
 
 
 def run(capsys, *arguments) -> tuple[int, str, str]:
@@ -366,3 +367,47 @@ def test_ctrl_c_in_a_real_process(tmp_path):
     assert process.returncode == 130, err
     assert "--resume" in err
     assert "Traceback" not in err
+
+
+@pytest.mark.parametrize("words", [["--resume"], ["--force", "--smoke"], ["--smoke"]])
+def test_one_training_at_a_time_in_a_run(capsys, tmp_path, monkeypatch, words):
+    pytest.importorskip("mujoco")
+    path = tmp_path / "run"
+    arguments = ["train", "--smoke", "--minutes", 0.1, "--final-goals", 0, "--out", path]
+    seen = []
+
+    class Second(cli.Progress):
+        def started(self, done, total):
+            if not seen:
+                seen.append(None)
+                before = contents(path)
+                seen[0] = run(capsys, "train", "--out", path, *words)
+                assert contents(path) == before
+            super().started(done, total)
+
+    monkeypatch.setattr(cli, "Progress", Second)
+    assert run(capsys, *arguments)[0] == 0
+    code, _, err = seen[0]
+    assert code == 2
+    assert str(path) in err
+    assert ("in use" in err) == (words != ["--smoke"])
+    assert not (path / ".lock").exists()
+    assert run(capsys, "train", "--out", path, "--resume")[0] == 0  # finished: nothing to lock
+
+
+def test_two_processes_resume_one_run(capsys, tmp_path, monkeypatch):
+    pytest.importorskip("mujoco")
+    path = tmp_path / "run"
+
+    def die(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(cli.Progress, "iterated", die)
+        assert run(capsys, "train", "--smoke", "--final-goals", 0, "--out", path)[0] == 130
+    command = [sys.executable, "-m", "difflcs.cli", "train", "--out", str(path), "--resume"]
+    with RunDirectory(path).locked():
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert f"{path}: expected a run that no process works on" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -498,6 +498,16 @@ def test_bad_options(options, message):
         make().reset(seed=0, options=options)
 
 
+@pytest.mark.parametrize("options", [[0.0, 0.0, 0.0], [], "goal", 3, np.zeros(3), [("goal", [0, 0, 0])]])
+@pytest.mark.parametrize("count", [None, 2])
+def test_options_are_a_dictionary(options, count):
+    env = make() if count is None else gymnasium.make_vec("difflcs/TriFingerMoveCube-v0", num_envs=count)
+    with pytest.raises(difflcs_envs.OptionsError, match=r"Expected options as a dictionary, got .*Pass options=\{"):
+        env.reset(seed=0, options=options)
+    env.reset(seed=0, options={})
+    env.close()
+
+
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -1,10 +1,18 @@
 """Downloading the YCB meshes, from a server on this machine."""
 
+import contextlib
+import gzip
 import http.server
 import io
 import json
+import random
+import signal
+import socket
+import subprocess
+import sys
 import tarfile
 import threading
+import time
 
 import pytest
 
@@ -42,6 +50,8 @@ class Server(http.server.BaseHTTPRequestHandler):
     cuts: tuple[int, ...] = ()  # bytes after which the next connections break off
     ranges: tuple[str, ...] = ()  # what was asked for
     status = 200
+    content_range = None  # said instead of the true one
+    length = None  # said instead of the true one
 
     def do_GET(self):
         cls = type(self)
@@ -56,8 +66,9 @@ class Server(http.server.BaseHTTPRequestHandler):
             return
         self.send_response(206 if wanted else 200)
         if wanted:
-            self.send_header("Content-Range", f"bytes {start}-{len(cls.content) - 1}/{len(cls.content)}")
-        self.send_header("Content-Length", str(len(cls.content) - start))
+            true = f"bytes {start}-{len(cls.content) - 1}/{len(cls.content)}"
+            self.send_header("Content-Range", cls.content_range or true)
+        self.send_header("Content-Length", cls.length or str(len(cls.content) - start))
         self.end_headers()
         end = len(cls.content)
         if cls.cuts:
@@ -173,3 +184,243 @@ def test_local_folder(tmp_path, monkeypatch, layout):
     path.write_bytes(box_stl((0.3, 0.1, 0.1)))
     with pytest.raises(MeshError, match="45 x 92 x 176 mm, got 100 x 100 x 300 mm"):
         make_object("sugar_box")
+
+
+# --- servers that lie -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "said",
+    ["bytes 1000000000000-1000000000001/1000000000002", "bytes 0-5/6", "bytes", "bytes -", "bytes a-b/c",
+     "items 100-200/300", "bytes 100-50/300", "bytes " + "9" * 5000 + "-1/2", "bytes 99-200/*"],
+)  # fmt: skip
+def test_a_wrong_range_begins_anew(server, tmp_path, said):
+    part = tmp_path / (ARCHIVE + ".part")
+    part.write_bytes(server.content[:100])
+    server.content_range = said
+    assert fetch(server, tmp_path)[0].is_file()
+    assert server.ranges == ("bytes=100-", "")
+    assert (tmp_path / ARCHIVE).read_bytes() == server.content
+
+
+@pytest.mark.parametrize("length", ["1000000000000", "9" * 5000, "-1", "abc", ""])
+def test_a_wrong_length(server, tmp_path, monkeypatch, length):
+    monkeypatch.setattr(assets, "TIMEOUT", 1.0)
+    server.length = length or " "
+    with contextlib.suppress(AssetError):
+        fetch(server, tmp_path)
+    assert sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file()) < 10_000
+
+
+def test_more_than_an_archive_can_have_is_refused(server, tmp_path, monkeypatch):
+    monkeypatch.setattr(assets, "MAX_ARCHIVE", 1000)
+    server.content = b"x" * 100_000
+    for length in (None, "1000000000000000"):
+        server.length = length
+        with pytest.raises(AssetError, match="at most 0 MB, got"):
+            fetch(server, tmp_path)
+        assert list(tmp_path.iterdir()) == []
+
+
+@contextlib.contextmanager
+def raw_server(*answers):
+    """Sends bytes as they are, one answer for each connection, the last one again and again."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve():
+            for i in range(100):
+                try:
+                    connection, _ = listener.accept()
+                except OSError:
+                    return
+                with connection, contextlib.suppress(OSError):
+                    connection.recv(10_000)
+                    for piece in answers[min(i, len(answers) - 1)]:
+                        connection.sendall(piece)
+                    connection.shutdown(socket.SHUT_WR)
+                    connection.recv(10_000)
+
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}/{{code}}.tgz"
+        listener.shutdown(socket.SHUT_RDWR)
+        thread.join(5)
+
+
+OK = b"HTTP/1.1 200 OK\r\n"
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [b"", b"hello\r\n\r\n", b"HTTP/1.1 abc\r\n\r\n", b"HTTP/1.1 " + b"2" * 70_000,
+     OK + b"X: " + b"y" * 70_000 + b"\r\n\r\n", OK + b"X: y\r\n" * 300 + b"\r\n",
+     OK + b"Transfer-Encoding: chunked\r\n\r\nzz\r\n", OK + b"Transfer-Encoding: chunked\r\n\r\n5\r\nab",
+     b"HTTP/1.1 302 Found\r\nLocation: http://[\r\n\r\n", b"HTTP/1.1 302 Found\r\nLocation: gopher://x\r\n\r\n",
+     b"HTTP/1.1 302 Found\r\nLocation: http://a b\r\n\r\n", b"HTTP/1.1 301 Moved\r\n\r\n",
+     b"HTTP/1.1 204 No\r\n\r\n", OK + b"\r\n"],
+    ids=lambda answer: repr(answer[:40]),
+)  # fmt: skip
+def test_answers_that_are_no_http(tmp_path, answer):
+    with raw_server([answer]) as url, pytest.raises(AssetError):
+        assets.download(["sugar_box"], tmp_path, url)
+    assert {path.name for path in tmp_path.iterdir()} <= {ARCHIVE + ".part"}
+
+
+def test_random_answers(tmp_path):
+    """Seeded: an answer of a server with random damage is a mesh or a typed error."""
+    rng, content = random.Random(0), archive({MESH: box_stl()})
+    whole = OK + b"Content-Length: %d\r\nContent-Type: a/b\r\n\r\n" % len(content) + content
+    answers = []
+    for _ in range(40):
+        data = bytearray(whole)
+        for _ in range(rng.choice((1, 3, 10))):
+            data[rng.randrange(rng.choice((80, len(data))))] = rng.randrange(256)
+        answers.append([bytes(data[: rng.choice((len(data), rng.randrange(len(data))))])])
+    with raw_server(*answers) as url:
+        for i in range(12):
+            with contextlib.suppress(AssetError):
+                assets.download(["sugar_box"], tmp_path / str(i), url)
+            assert not list((tmp_path / str(i)).glob(".*"))
+
+
+def test_a_server_that_drips_is_given_up(tmp_path, monkeypatch):
+    monkeypatch.setattr(assets, "MAX_SECONDS", 0.2)
+
+    def drip():
+        yield OK + b"Content-Length: 1000000\r\n\r\n"
+        for _ in range(40):
+            time.sleep(0.05)
+            yield b"x"
+
+    start = time.monotonic()
+    with raw_server(drip(), drip(), drip()) as url, pytest.raises(AssetError, match=r"still going on after 0.2 s"):
+        assets.download(["sugar_box"], tmp_path, url)
+    assert time.monotonic() - start < 20
+
+
+@pytest.mark.parametrize("url", ["http://x/{name}.tgz", "http://x/{}.tgz", "http://x/{code", "{code.x}"])
+def test_an_address_that_is_no_pattern(tmp_path, url):
+    with pytest.raises(ValueError, match=r"Expected an address with \{code\}"):
+        assets.download(["sugar_box"], tmp_path / "new", url)
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    "url", ["nonsense", "http://[/x", "gopher://x/{code}", "http://127.0.0.1:99999/", "file:///none"]
+)
+def test_an_address_that_leads_nowhere(tmp_path, url):
+    with pytest.raises(AssetError, match="Check the network"):
+        assets.download(["sugar_box"], tmp_path, url)
+
+
+# --- archives and records that are made up ----------------------------------------------------------------------------
+
+
+def test_a_bomb_is_refused(server, tmp_path, monkeypatch):
+    monkeypatch.setattr(assets, "MAX_UNPACKED", 1 << 20)
+    server.content = gzip.compress(bytes(1 << 24))
+    with pytest.raises(AssetError, match="at most 1 MB unpacked"):
+        fetch(server, tmp_path)
+    member = tarfile.TarInfo("004_sugar_box/x")
+    member.size = 1 << 60
+    server.content = gzip.compress(member.tobuf(tarfile.GNU_FORMAT) + bytes(10_000))
+    with pytest.raises(AssetError, match="at most 1000 files of 1 MB"):
+        fetch(server, tmp_path)
+    server.content = archive({f"004_sugar_box/{i}": b"" for i in range(1001)})
+    with pytest.raises(AssetError, match="at most 1000 files of 1 MB"):
+        fetch(server, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_damaged_archives(tmp_path):
+    """Seeded: of the compressed stream, and of the tar inside it."""
+    rng, entry = random.Random(0), YCB["sugar_box"]
+    whole = archive({MESH: box_stl(), "004_sugar_box/readme.txt": b"x" * 600})
+    path = tmp_path / ARCHIVE
+    for i in range(120):
+        data = bytearray(whole if i % 2 else gzip.decompress(whole))
+        for _ in range(rng.choice((1, 3, 30))):
+            data[rng.randrange(min(len(data), rng.choice((512, 10_000))))] = rng.randrange(256)
+        path.write_bytes(data if i % 2 else gzip.compress(bytes(data), 1))
+        with contextlib.suppress(AssetError):
+            assets._unpack(path, tmp_path, entry)
+        assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"\xff", b"[]", b"3", b'{"a": 1}', b'{"a": "b"}', b'[["a", "b"]]', b"[" * 100_000, b'{"a": {}}', b"9" * 5000,
+     b" " * (1 << 21)],
+    ids=lambda content: repr(content[:12]),
+)  # fmt: skip
+def test_recorded_hashes_that_are_none(server, tmp_path, content):
+    (tmp_path / "sha256.json").write_bytes(content)
+    with pytest.raises(AssetError, match=r"sha256.json: expected recorded checksums.*Delete the file"):
+        fetch(server, tmp_path)
+    assert (tmp_path / "sha256.json").read_bytes() == content
+    assert server.ranges == ()
+
+
+def test_a_folder_that_cannot_be_written(server, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(AssetError, match="expected a folder with free space"):
+        fetch(server, tmp_path / "file")
+    (tmp_path / ARCHIVE).mkdir()
+    with pytest.raises(AssetError, match="expected a folder with free space"):
+        fetch(server, tmp_path)
+
+
+# --- several processes ------------------------------------------------------------------------------------------------
+
+DOWNLOAD = """
+import sys, pathlib
+from difflcs_envs import assets
+assets.download([sys.argv[1]], pathlib.Path(sys.argv[2]), sys.argv[3], print)
+"""
+
+
+def start(server, folder, name, program=DOWNLOAD):
+    command = [sys.executable, "-c", program, name, str(folder), server.url]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.fixture
+def objects(server):
+    """Serves three objects, slowly, each as a box of its size."""
+    names = ("sugar_box", "fish_can", "mug")
+    found = {YCB[n].code: archive({f"{YCB[n].code}/google_16k/nontextured.stl": box_stl(YCB[n].size)}) for n in names}
+    answer = server.do_GET
+
+    def do_get(self):
+        time.sleep(0.2)
+        type(self).content = found[self.path[1:].removesuffix(".tgz")]
+        answer(self)
+
+    server.do_GET = do_get
+    server.names = names
+    return server
+
+
+def test_processes_lose_nothing(objects, tmp_path):
+    """Two processes on one object and two others on others, at a time."""
+    running = [start(objects, tmp_path, name) for name in (*objects.names, objects.names[0])]
+    said = [process.communicate(timeout=60) for process in running]
+    assert [process.returncode for process in running] == [0] * 4, said
+    assert len(json.loads((tmp_path / "sha256.json").read_text())) == 3
+    assert len(objects.ranges) == 3  # the one that waited has found the archive
+    codes = {YCB[name].code for name in objects.names}
+    wanted = {*codes, *(f"{code}_google_16k.tgz" for code in codes), "sha256.json"}
+    assert {path.name for path in tmp_path.iterdir()} == wanted
+
+
+def test_a_killed_download_is_no_obstacle(server, tmp_path):
+    program = f"from difflcs_envs import assets; import time; assets._check = lambda *a: time.sleep(60)\n{DOWNLOAD}"
+    with start(server, tmp_path, "sugar_box", program) as killed:
+        deadline = time.monotonic() + 30
+        while not list(tmp_path.glob(".004_sugar_box.*/004_sugar_box")) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        killed.send_signal(signal.SIGKILL)
+        killed.communicate()
+    assert (tmp_path / ".lock").exists()
+    assert fetch(server, tmp_path)[0].is_file()
+    assert {path.name for path in tmp_path.iterdir()} == {ARCHIVE, "004_sugar_box", "sha256.json"}

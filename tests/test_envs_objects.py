@@ -2,7 +2,11 @@
 
 import json
 import math
+import os
 import pickle
+import subprocess
+import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -127,6 +131,36 @@ def test_missing_and_unreadable_files(tmp_path):
 def test_an_object_too_large_for_the_hand(stl):
     with pytest.raises(ValueError, match=r"stand around, got thing of 440 x 440 mm"):
         make(stl(trimesh.creation.box((0.44, 0.44, 0.05))))
+
+
+def test_a_mesh_that_would_take_minutes_is_refused_at_once(stl, tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=6, radius=0.03)  # 81 920 triangles: 42 s before
+    start = time.monotonic()
+    with pytest.raises(MeshError, match=r"at most 20000 triangles, got 81920: ball\..*Decimate.*face_count=5000"):
+        meshes.make_solid(ball, "ball")
+    with pytest.raises(MeshError, match=r"at most 20000 triangles, got 81920: .*thing\.stl"):
+        make(stl(ball))
+    with (tmp_path / "huge.stl").open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(MeshError, match=r"at most 32 MB, got 1048576 MB: .*huge\.stl.*Simplify"):
+        make(tmp_path / "huge.stl")
+    assert time.monotonic() - start < 10
+
+
+def test_processes_decompose_a_mesh_once(stl, tmp_path):
+    path = stl(bracket())
+    code = (
+        "import sys; from difflcs_envs.trifinger import meshes, objects; d = meshes._decompose\n"
+        "meshes._decompose = lambda *a: print('decomposed') or d(*a)\n"
+        "objects.make_object(sys.argv[1])"
+    )
+    environment = {**os.environ, "DIFFLCS_CACHE_DIR": str(tmp_path / "cache")}
+    command = [sys.executable, "-c", code, str(path)]
+    running = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    said = [process.communicate(timeout=60)[0] for process in running]
+    assert sorted(said) == ["", "decomposed\n"]
+    assert [process.returncode for process in running] == [0, 0]
+    assert [entry.name for entry in (tmp_path / "cache").iterdir()] == ["parts"]
 
 
 def test_millimetres(stl):

@@ -16,7 +16,7 @@ import difflcs
 ROOT = Path(__file__).resolve().parent.parent
 HEAVY = (
     "casadi", "cvxpy", "cvxpylayers", "torchrl", "tensordict", "gymnasium", "mujoco", "tyro", "scipy", "matplotlib",
-    "trimesh", "coacd", "numba", "safetensors", "tqdm", "tensorboard", "imageio", "dask",
+    "trimesh", "coacd", "numba", "filelock", "safetensors", "tqdm", "tensorboard", "imageio", "dask",
 )  # fmt: skip
 LAYERS = [
     {"errors"},

@@ -209,6 +209,10 @@ def test_save_and_load(tmp_path):
         Ensemble.from_pretrained(tmp_path)
 
 
+def test_restore_refuses_hostile_checkpoints(refuses_hostile_checkpoints):
+    refuses_hostile_checkpoints(make_pddm())
+
+
 def test_restore_refuses_what_does_not_fit():
     trainer = make_pddm()
     trainer.step()

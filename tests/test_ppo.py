@@ -419,6 +419,11 @@ def test_seeds_differ_and_repeat():
     assert not same(parameters(runs[0]), parameters(runs[2]))
 
 
+@pytest.mark.parametrize("make", ["make_ppo", "make_lcsrl", "make_imagining"])
+def test_restore_refuses_hostile_checkpoints(refuses_hostile_checkpoints, make):
+    refuses_hostile_checkpoints(globals()[make]())
+
+
 def test_restore_refuses_what_does_not_fit():
     trainer = make_ppo()
     trainer.step()

@@ -303,6 +303,10 @@ def test_restore_refuses_another_model(tmp_path):
     assert other.iteration == 0
 
 
+def test_restore_refuses_hostile_checkpoints(refuses_hostile_checkpoints):
+    refuses_hostile_checkpoints(make_trainer())
+
+
 def test_seeds_differ_and_repeat():
     runs = [make_trainer(seed) for seed in (0, 0, 1)]
     for trainer in runs:

@@ -6,6 +6,7 @@
     RUN/checkpoints/000012/   complete state after iteration 12: config.json, model.safetensors
     RUN/checkpoints/latest.json   names the checkpoint to resume from
     RUN/model/                the final model, for `LCSModel.from_pretrained`
+    RUN/.lock                 while a training works in it
 
 A checkpoint is written into a hidden directory, renamed to its number, and only then named by `latest.json`, which is
 replaced atomically. Whatever instant a crash comes at, `latest.json` names a complete checkpoint.
@@ -20,11 +21,12 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
-from torch import Tensor
+from torch import Tensor, dtype
 
 from difflcs import _files
 from difflcs.errors import CheckpointError
@@ -33,6 +35,8 @@ from difflcs.lcs import LCSModel
 _KIND = "training"
 _MODEL = "model."
 """Prefix of the model's tensors in a checkpoint."""
+_DIGITS = 12
+"""Longest number of a checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -85,26 +89,27 @@ def load_checkpoint(root: Path) -> Checkpoint:
     Raises:
         CheckpointError: there is none, or it is incomplete, corrupt or foreign.
     """
+    latest = root / "latest.json"
     try:
-        latest = json.loads((root / "latest.json").read_text())
-        name = latest["checkpoint"]
-        number = int(name)
+        content = _files.read_json(latest)
     except FileNotFoundError:
         raise CheckpointError(
             f"{root}: expected latest.json, found none; was this written by `difflcs train`?"
         ) from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except CheckpointError as error:
+        raise CheckpointError(f"{error.args[0]}; or write one of {sorted(_numbered(root))} into it") from error
+    name = content.get("checkpoint") if isinstance(content, dict) else None
+    if not isinstance(name, str) or not _is_number(name):
         raise CheckpointError(
-            f'{root / "latest.json"}: expected {{"checkpoint": "<number>"}}, got something else ({error}); '
+            f'{latest}: expected {{"checkpoint": "<number>"}}, got {_files.short(content)}; '
             f"write one of {sorted(_numbered(root))} into it"
-        ) from error
+        )
     try:
-        return _load(root / name, number)
+        return _load(root / name, int(name))
     except CheckpointError as error:
         older = sorted(_numbered(root) - {name})
-        latest_file = root / "latest.json"
-        remedy = f"to go back to an older one, write one of {older} into {latest_file}" if older else "start anew"
-        raise CheckpointError(f"{error}; {remedy}") from error
+        remedy = f"to go back to an older one, write one of {older} into {latest}" if older else "start anew"
+        raise CheckpointError(f"{error.args[0]}; {remedy}") from error
 
 
 def _load(directory: Path, number: int) -> Checkpoint:
@@ -115,6 +120,7 @@ def _load(directory: Path, number: int) -> Checkpoint:
     iteration, config, state = content.get("iteration"), content.get("model"), content.get("state")
     if iteration != number or not isinstance(config, dict | None) or not isinstance(state, dict):
         raise CheckpointError(f"{directory}: expected iteration {number} with model and state, got {sorted(content)}")
+    _files.check_finite(directory, tensors)
     parameters = {k.removeprefix(_MODEL): v for k, v in tensors.items() if k.startswith(_MODEL)}
     model = None if config is None else LCSModel.from_config(config, parameters, str(directory))
     return Checkpoint(number, model, state, {k: v for k, v in tensors.items() if not k.startswith(_MODEL)})
@@ -125,7 +131,16 @@ def _hash(content: Mapping[str, object]) -> str:
 
 
 def _numbered(root: Path) -> set[str]:
-    return {path.name for path in root.iterdir() if path.is_dir() and path.name.isdigit()} if root.is_dir() else set()
+    return {path.name for path in root.iterdir() if path.is_dir() and _is_number(path.name)} if root.is_dir() else set()
+
+
+def _is_number(name: str) -> bool:
+    return name.isascii() and name.isdecimal() and len(name) <= _DIGITS
+
+
+def kinds(tensors: Mapping[str, Tensor], varying: Collection[str] = ()) -> dict[str, tuple[tuple[int, ...], dtype]]:
+    """Name → shape and dtype; of the `varying` without their first dimension."""
+    return {k: (tuple(v.shape[1:] if k in varying else v.shape), v.dtype) for k, v in tensors.items()}
 
 
 def _sync(directory: Path) -> None:
@@ -135,6 +150,21 @@ def _sync(directory: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def check_episodes(episodes: Mapping[str, Tensor], empty: bool) -> None:
+    """Check that tensors of episodes have as many episodes as each other.
+
+    Args:
+        episodes: name → (N, …).
+        empty: whether there may be none.
+
+    Raises:
+        CheckpointError: the numbers differ, or there is none.
+    """
+    lengths = {name: len(value) for name, value in episodes.items()}
+    if len(set(lengths.values())) > 1 or (not empty and not all(lengths.values())):
+        raise CheckpointError(f"checkpoint: expected as many {' as '.join(lengths)}, got {lengths}; is it damaged?")
 
 
 class RunDirectory:
@@ -158,13 +188,31 @@ class RunDirectory:
         Raises:
             CheckpointError: something is there already.
         """
-        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        cls.check_free(path)
+        _files.write_json(path / "config.json", dict(config))
+        return cls(path)
+
+    @staticmethod
+    def check_free(path: Path) -> None:
+        """Refuse a path where there are files.
+
+        Raises:
+            CheckpointError: something is there already.
+        """
+        if path.exists() and (not path.is_dir() or any(entry.name != _files.LOCK for entry in path.iterdir())):
             raise CheckpointError(
                 f"{path}: expected a new or empty directory, found files; "
                 f"pass --resume to continue the run in it, or choose another --out"
             )
-        _files.write_json(path / "config.json", dict(config))
-        return cls(path)
+
+    def locked(self) -> AbstractContextManager[None]:
+        """Let no other process train in this directory meanwhile. The lock ends with this process, however that dies.
+
+        Raises:
+            InUseError: another one does.
+            OSError: the directory cannot be written.
+        """
+        return _files.locked(self.path)
 
     @classmethod
     def open(cls, path: Path) -> RunDirectory:
@@ -185,9 +233,11 @@ class RunDirectory:
         """
         file = self.path / "config.json"
         try:
-            config = json.loads(file.read_text())
-        except (OSError, ValueError) as error:
-            raise CheckpointError(f"{file}: expected JSON, got {error}; restore it from a copy") from error
+            config = _files.read_json(file)
+        except FileNotFoundError as error:
+            raise CheckpointError(
+                f"{file}: expected the config of a run, found no file; restore it from a copy"
+            ) from error
         if not isinstance(config, dict) or config.get("kind") != "run":
             raise CheckpointError(f"{file}: expected the config of a run, got something else; is {self.path} a run?")
         return config
@@ -216,15 +266,28 @@ class RunDirectory:
             os.fsync(file.fileno())
 
     def rows(self) -> list[dict[str, str]]:
-        """The complete rows of log.csv; a last line cut off by a crash is left out."""
-        if not self.log.exists():
+        """The complete rows of log.csv; a last line cut off by a crash is left out.
+
+        Raises:
+            CheckpointError: log.csv is not a table of numbers, a row for each iteration.
+        """
+        try:
+            lines = _files.read_text(self.log).splitlines(keepends=True)
+        except FileNotFoundError:
             return []
-        lines = self.log.read_text().splitlines(keepends=True)
-        return [
-            row
-            for row in csv.DictReader(line for line in lines if line.endswith("\n"))
-            if None not in row and None not in row.values()
-        ]
+        try:
+            found = csv.DictReader(line for line in lines if line.endswith("\n"))
+            rows = [row for row in found if None not in row and None not in row.values()]
+            for row in rows:
+                int(row["iteration"])
+                for cell in filter(None, row.values()):
+                    float(cell)
+        except (csv.Error, KeyError, ValueError) as error:
+            raise CheckpointError(
+                f"{self.log}: expected a table of numbers with the column iteration, got {type(error).__name__}: "
+                f"{error}; restore it from a copy, or delete it"
+            ) from error
+        return rows
 
     def truncate_log(self, iteration: int) -> None:
         """Drop the rows after an iteration, so that resuming there does not write them twice."""

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LinearLR
 
-from difflcs.errors import CheckpointError
+from difflcs._files import check_tensors
 
 if TYPE_CHECKING:
     from tensordict import TensorDictBase
@@ -30,7 +30,7 @@ class Critic:
     """
 
     def __init__(self, config: PPOConfig, n_inputs: int, key: Sequence[int]):
-        self.config = config
+        self.config, self.n_inputs = config, n_inputs
         width = config.value_width
         with seeded(key):
             self.network = nn.Sequential(
@@ -127,19 +127,24 @@ class Critic:
                 value.copy_(tensors[name])
 
 
-def read_history(tensors: Mapping[str, Tensor], sizes: Sequence[int]) -> list[tuple[Tensor, Tensor]]:
-    """The history out of `Critic.history_tensors` and `Critic.sizes`.
+def read_history(
+    tensors: Mapping[str, Tensor], sizes: Sequence[int], n_inputs: int, episode_steps: int
+) -> list[tuple[Tensor, Tensor]]:
+    """The history out of `Critic.history_tensors` and `Critic.sizes`, of episodes of `episode_steps`.
 
     Raises:
         CheckpointError: they do not fit together.
     """
     if not sizes:
         return []
-    try:
-        inputs, rewards = (tensors[name].split(list(sizes)) for name in ("history.inputs", "history.rewards"))
-        return list(zip(inputs, rewards, strict=True))
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise CheckpointError(f"checkpoint: its history of values cannot be used ({error})") from error
+    n = sum(sizes)
+    shapes = {"history.inputs": (n, episode_steps + 1, n_inputs), "history.rewards": (n, episode_steps)}
+    found = {name: value for name, value in tensors.items() if name in shapes and value.is_floating_point()}
+    dtypes = {name: value.dtype for name, value in found.items()}
+    wanted = {name: (shape, dtypes.get(name, torch.float64)) for name, shape in shapes.items()}
+    check_tensors("checkpoint", "a history of values", found, wanted)
+    inputs, rewards = (found[name].split(list(sizes)) for name in shapes)
+    return list(zip(inputs, rewards, strict=True))
 
 
 @contextmanager

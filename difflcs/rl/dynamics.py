@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from torch.optim.lr_scheduler import LinearLR
 
 from difflcs import _files
 from difflcs._checks import check_positive_int
-from difflcs.errors import CheckpointError
+from difflcs.errors import CheckpointError, InvalidInputError
 
 _KIND = "dynamics"
 
@@ -122,8 +123,29 @@ class Ensemble(nn.Module):
         try:
             names = ("n_x", "n_u", "networks", "width")
             n_x, n_u, networks, width = (check_positive_int(name, config[name]) for name in names)
-            ensemble = cls(n_x, n_u, networks, width)
-            ensemble.load_state_dict(tensors)
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        except (KeyError, InvalidInputError) as error:
             raise CheckpointError(f"{directory}: expected an ensemble written by difflcs, got {error}") from error
+        return cls.from_tensors(n_x, n_u, networks, width, tensors, str(directory))
+
+    @classmethod
+    def from_tensors(
+        cls, n_x: int, n_u: int, networks: int, width: int, tensors: Mapping[str, Tensor], source: str
+    ) -> Ensemble:
+        """Build an ensemble from its sizes and a state dict; `source` names them in the error messages.
+
+        Raises:
+            CheckpointError: they do not fit each other, or hold NaN or infinity.
+        """
+        sizes = [n_x + n_u, width, width, n_x]
+        shapes: dict[str, tuple[int, ...]] = {}
+        for i, (n_in, n_out) in enumerate(pairwise(sizes)):
+            shapes |= {f"weights.{i}": (networks, n_in, n_out), f"biases.{i}": (networks, 1, n_out)}
+        for name, size in (("input", n_x + n_u), ("change", n_x)):
+            shapes |= {f"{name}_mean": (size,), f"{name}_std": (size,)}
+        # Compared before anything of these sizes is made.
+        _files.check_tensors(
+            source, "an ensemble", tensors, {name: (shape, torch.float32) for name, shape in shapes.items()}
+        )
+        ensemble = cls(n_x, n_u, networks, width)
+        ensemble.load_state_dict(dict(tensors))
         return ensemble

@@ -16,8 +16,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from difflcs._checks import check_number, check_positive_int
+from difflcs._checks import MOST_ENVS, MOST_NETWORKS, MOST_WIDTH, check_number, check_positive_int
 from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs.rl.checkpoint import check_episodes, kinds
 from difflcs.rl.dynamics import Ensemble
 
 Outcome = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -67,9 +68,11 @@ class ImaginationConfig:
     def __post_init__(self) -> None:
         for name in ("iterations", "final_iterations"):
             check_positive_int(name, getattr(self, name), minimum=0)
-        for name in ("rollouts", "steps", "value_epochs", "networks", "width", "first_epochs", "epochs", "minibatch"):
+        for name in ("steps", "value_epochs", "first_epochs", "epochs", "minibatch"):
             check_positive_int(name, getattr(self, name))
-        if check_positive_int("actions", self.actions) > 1 and self.actions % 2:
+        for name, most in (("rollouts", MOST_ENVS), ("networks", MOST_NETWORKS), ("width", MOST_WIDTH)):
+            check_positive_int(name, getattr(self, name), maximum=most)
+        if check_positive_int("actions", self.actions, maximum=MOST_ENVS) > 1 and self.actions % 2:
             raise InvalidInputError(f"actions: expected 1 or an even number, got {self.actions}")
         if not 0 <= check_number("zeta", self.zeta) <= 1:
             raise InvalidInputError(f"zeta: expected 0 <= zeta <= 1, got {self.zeta}")
@@ -255,11 +258,13 @@ class Imagination:
         """
         own = self.tensors()
         for name in {*own, *tensors}:
-            got, wanted = ("none" if name not in part else tuple(part[name].shape) for part in (tensors, own))
-            if got != wanted and not (name in EPISODES and name in tensors and got[1:] == wanted[1:]):
+            got, wanted = (kinds(part, EPISODES).get(name) for part in (tensors, own))
+            if got != wanted:
                 raise CheckpointError(
-                    f"checkpoint: expected {name} of shape {wanted}, got {got}; was it written with other settings?"
+                    f"checkpoint: expected {name} of shape and type {wanted}, got {got}; was it written with other "
+                    f"settings?"
                 )
+        check_episodes({name: tensors[name] for name in EPISODES}, empty=True)
         self.episodes = {name: tensors[name] for name in EPISODES}
         self.ensemble.load_state_dict({k.removeprefix("ensemble."): v for k, v in tensors.items() if "." in k})
         self.fits = fits

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
 from difflcs import _files
-from difflcs._checks import check_positive_int
-from difflcs.errors import CheckpointError
+from difflcs._checks import MOST_WIDTH, check_positive_int
+from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.rl.pddm import Plan
 from difflcs.rl.ppo import Features, PPOConfig, check_without_lcs
 
@@ -55,7 +57,7 @@ class MLPConfig(PPOConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_positive_int("width", self.width)
+        check_positive_int("width", self.width, maximum=MOST_WIDTH)
         check_without_lcs(self)
 
 
@@ -138,8 +140,23 @@ class MLPController(nn.Module):
         try:
             names = ("n_features", "width", "episode_steps")
             n_features, width, episode_steps = (check_positive_int(name, config[name]) for name in names)
-            network = cls(features, n_features, tensors["u_min"], tensors["u_max"], width, episode_steps)
-            network.load_state_dict(tensors)
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            n_u = tensors["u_min"].numel()
+        except (KeyError, InvalidInputError) as error:
             raise CheckpointError(f"{directory}: expected a network written by difflcs, got {error}") from error
+        # Compared before anything of these sizes is made.
+        check_network(str(directory), tensors, n_features, width, n_u)
+        network = cls(features, n_features, tensors["u_min"], tensors["u_max"], width, episode_steps)
+        network.load_state_dict(tensors)
         return network
+
+
+def check_network(source: str, tensors: Mapping[str, Tensor], n_features: int, width: int, n_u: int) -> None:
+    """Compare the state dict of an `MLPController` with its sizes.
+
+    Raises:
+        CheckpointError: they do not fit each other, or hold NaN or infinity.
+    """
+    shapes: dict[str, tuple[int, ...]] = {"u_min": (n_u,), "u_max": (n_u,)}
+    for i, (n_in, n_out) in enumerate(pairwise([n_features, width, width, n_u])):
+        shapes |= {f"layers.{2 * i}.weight": (n_out, n_in), f"layers.{2 * i}.bias": (n_out,)}
+    _files.check_tensors(source, "a network", tensors, {name: (shape, torch.float64) for name, shape in shapes.items()})

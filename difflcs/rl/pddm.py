@@ -16,10 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_number, check_positive_int
+from difflcs._checks import MOST_ENVS, MOST_NETWORKS, MOST_WIDTH, check_number, check_positive_int
 from difflcs.cost import GoalCost
 from difflcs.errors import CheckpointError, InvalidInputError
-from difflcs.rl.checkpoint import Checkpoint
+from difflcs.rl.checkpoint import Checkpoint, check_episodes, kinds
 from difflcs.rl.dynamics import Ensemble
 from difflcs.rl.rollout import action_bounds, collect, episode_seeds, mpc_actions, uniform_actions
 from difflcs.rl.warmup import TRAINING_STREAM
@@ -60,9 +60,11 @@ class PDDMConfig:
     """Standard deviation of ε, as a fraction of the action bounds' half range."""
 
     def __post_init__(self) -> None:
-        for name in ("networks", "width", "random_rollouts", "rollouts_per_iteration", "epochs", "minibatch"):
-            check_positive_int(name, getattr(self, name))
-        for name in ("horizon", "samples"):
+        for name, most in (("networks", MOST_NETWORKS), ("width", MOST_WIDTH), ("horizon", 1000), ("samples", 10**6)):
+            check_positive_int(name, getattr(self, name), maximum=most)
+        for name in ("random_rollouts", "rollouts_per_iteration"):
+            check_positive_int(name, getattr(self, name), maximum=MOST_ENVS)
+        for name in ("epochs", "minibatch"):
             check_positive_int(name, getattr(self, name))
         for name in ("learning_rate", "kappa", "noise", "filter"):
             check_number(name, getattr(self, name), strict=True)
@@ -280,10 +282,7 @@ class PDDM:
             CheckpointError: it does not fit the settings; nothing is changed.
         """
         batched = ("states", "actions")
-        shapes, wanted = (
-            {k: tuple(v.shape[1:] if k in batched else v.shape) for k, v in source.tensors.items()}
-            for source in (checkpoint, self.checkpoint())
-        )
+        shapes, wanted = (kinds(source.tensors, batched) for source in (checkpoint, self.checkpoint()))
         if shapes != wanted or checkpoint.model is not None:
             different = sorted({k for k in {*shapes, *wanted} if shapes.get(k) != wanted.get(k)})
             raise CheckpointError(
@@ -294,6 +293,7 @@ class PDDM:
             episodes = check_positive_int("episodes", checkpoint.state["episodes"], minimum=0)
         except (KeyError, ValueError, TypeError) as error:
             raise CheckpointError(f"checkpoint: its counters cannot be used ({error})") from error
+        check_episodes({name: checkpoint.tensors[name] for name in batched}, empty=checkpoint.iteration == 0)
         self.iteration, self.episodes = checkpoint.iteration, episodes
         self.states, self.actions = checkpoint.tensors["states"], checkpoint.tensors["actions"]
         self.ensemble.load_state_dict(ensemble_tensors(checkpoint))

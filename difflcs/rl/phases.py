@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from difflcs.errors import CheckpointError
+from difflcs._checks import check_choice, check_positive_int
+from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.rl.checkpoint import Checkpoint
 from difflcs.rl.warmup import Iteration, Warmup
 
@@ -71,12 +72,15 @@ class LCSRL:
             self._warmup.restore(checkpoint)
             self.current = self._warmup
             return
-        episodes, iterations = (checkpoint.state.get(name) for name in ("first_episode", "first_iteration"))
-        if phase != _MAIN or not isinstance(episodes, int) or not isinstance(iterations, int):
+        names = ("first_episode", "first_iteration")
+        try:
+            episodes, iterations = (check_positive_int(name, checkpoint.state.get(name), minimum=0) for name in names)
+            check_choice("phase", phase, (_MAIN,))
+        except InvalidInputError as error:
             raise CheckpointError(
-                f"checkpoint: expected the state of a warm-up or a main phase, got {sorted(checkpoint.state)}; "
-                f"was it written by another method?"
-            )
+                f"checkpoint: expected the state of a warm-up or a main phase, got {sorted(checkpoint.state)} "
+                f"({error}); was it written by another method?"
+            ) from error
         main = self._make_main(episodes, iterations)
         main.restore(checkpoint)
         self.current = main

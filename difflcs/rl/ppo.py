@@ -27,11 +27,11 @@ import torch
 from torch import Tensor
 from torch.func import functional_call
 
-from difflcs._checks import check_choice, check_number, check_positive_int
+from difflcs._checks import MOST_ENVS, MOST_WIDTH, check_choice, check_number, check_positive_int
 from difflcs.errors import CheckpointError, DegenerateWarning, InvalidInputError, SolveWarning
 from difflcs.lcs import LCSModel, LCSParams
 from difflcs.losses import violation_loss
-from difflcs.rl.checkpoint import Checkpoint
+from difflcs.rl.checkpoint import Checkpoint, kinds
 from difflcs.rl.critic import Critic, initialise_moments, moments, read_history, seeded
 from difflcs.rl.imagination import EPISODES, Imagination
 from difflcs.rl.lookahead import lookahead_advantages, luck, mirrored_actions
@@ -143,7 +143,9 @@ class PPOConfig:
     """Newest iterations whose episodes the value network is fitted to."""
 
     def __post_init__(self) -> None:
-        for name in ("rollouts", "steps", "natural_samples", "violation_batch", "value_width", "value_minibatch"):
+        check_positive_int("rollouts", self.rollouts, maximum=MOST_ENVS)
+        check_positive_int("value_width", self.value_width, maximum=MOST_WIDTH)
+        for name in ("steps", "natural_samples", "violation_batch", "value_minibatch"):
             check_positive_int(name, getattr(self, name))
         for name in ("value_first_epochs", "value_epochs", "value_iterations"):
             check_positive_int(name, getattr(self, name))
@@ -174,6 +176,8 @@ class PPOConfig:
         check_choice("covariance", self.covariance, ("diagonal", "full"))
         if self.covariance == "full" and not self.learn_std:
             raise InvalidInputError('covariance: expected "diagonal" without learn_std, got "full"; pass learn_std')
+        if not all(0 <= beta < 1 for beta in self.betas):
+            raise InvalidInputError(f"betas: expected 0 <= beta < 1 for both, got {self.betas}")
         low, high = self.std_range
         if not 0 < low <= high < math.inf:
             raise InvalidInputError(f"std_range: expected 0 < low <= high, got {self.std_range}")
@@ -732,7 +736,7 @@ class PPO:
         varying = {f"{_VALUE}history.{name}" for name in ("inputs", "rewards")}
         varying |= {f"{_IMAGINATION}{name}" for name in EPISODES}
         shapes, wanted = (
-            {k: tuple(v.shape) for k, v in part.items() if k not in varying} for part in (checkpoint.tensors, own)
+            {k: kind for k, kind in kinds(part).items() if k not in varying} for part in (checkpoint.tensors, own)
         )
         got, expected = (model and model.config() for model in (checkpoint.model, self.lcs))
         if shapes != wanted or got != expected:
@@ -745,7 +749,7 @@ class PPO:
             names = ("episodes", "first_episode", "first_iteration", "fits")
             episodes, first_episode, first_iteration, fits = (check_positive_int(k, state[k], minimum=0) for k in names)
             learning_rate = check_number("learning_rate", state["learning_rate"], strict=True)
-            sizes: list[int] = list(state["history"])  # pyright: ignore[reportArgumentType]
+            sizes = [check_positive_int("history", size, minimum=0) for size in cast("list[int]", state["history"])]
         except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(f"checkpoint: its counters or history cannot be used ({error})") from error
         if (first_episode, first_iteration) != (self.first_episode, self.first_iteration):
@@ -754,7 +758,7 @@ class PPO:
                 f"{first_episode}; was it written with other settings?"
             )
         values = _of(_VALUE, checkpoint.tensors)
-        history = read_history(values, sizes)
+        history = read_history(values, sizes, self.critic.n_inputs, self.episode_steps)
         if self.imagination is not None:
             self.imagination.restore(_of(_IMAGINATION, checkpoint.tensors), fits)
         self.critic.restore(values, history)

@@ -144,5 +144,5 @@ def get_task(name: str) -> Task:
         InvalidInputError: no task has this name.
     """
     if name not in TASKS:
-        raise InvalidInputError(f"task: expected one of {', '.join(TASKS)}, got {name!r}")
+        raise InvalidInputError(f"task: expected one of {', '.join(TASKS)}, got {name!r:.200}")
     return TASKS[name]

@@ -7,7 +7,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from difflcs._checks import check_choice, check_number, check_positive_int
+from difflcs._files import short
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.lcs import LCSModel
 from difflcs.mpc.backends import get_backend
@@ -23,7 +24,7 @@ from difflcs.rl.checkpoint import Checkpoint, RunDirectory, load_checkpoint, sav
 from difflcs.rl.dynamics import Ensemble
 from difflcs.rl.evaluate import Evaluation, evaluate
 from difflcs.rl.imagination import Imagination, ImaginationConfig
-from difflcs.rl.mlp import MLPConfig, MLPController
+from difflcs.rl.mlp import MLPConfig, MLPController, check_network
 from difflcs.rl.pddm import PDDM, PDDMConfig, PDDMIteration, Planner, ensemble_tensors
 from difflcs.rl.phases import LCSRL
 from difflcs.rl.ppo import PPO, PPOConfig, PPOIteration, network_tensors
@@ -38,6 +39,8 @@ EnvFactory = Callable[[int], "VectorEnv"]
 """Number of environments → a vector of them, stepped in lockstep."""
 EVALUATION_ENVS = 50
 """Environments of an evaluation: enough to keep the solver's workers busy, few enough to build in a second."""
+_MOST_MINUTES = 1e6
+"""Longest training [min]: two years of the robot's time."""
 METHODS = ("violation", "lcs-rl", "ppo", "ppo-mlp", "pddm")
 Trainer = Warmup | PPO | LCSRL | PDDM
 """What trains: objects with `step`, `checkpoint` and `restore`."""
@@ -100,13 +103,15 @@ class TrainConfig:
     def __post_init__(self) -> None:
         get_task(self.task)
         check_choice("method", self.method, METHODS)
-        check_number("minutes", self.minutes, strict=True)
-        check_number("warmup_minutes", self.warmup_minutes, strict=True)
+        for name in ("minutes", "warmup_minutes"):
+            if check_number(name, getattr(self, name), strict=True) > _MOST_MINUTES:
+                raise InvalidInputError(f"{name}: expected at most {_MOST_MINUTES:g}, got {getattr(self, name):g}")
         check_number("stiffness", self.stiffness, strict=True)
         check_number("init_scale", self.init_scale)
-        for name in ("n_lam", "evaluate_goals"):
-            check_positive_int(name, getattr(self, name))
-        for name in ("seed", "final_goals", "evaluation_seed"):
+        check_positive_int("n_lam", self.n_lam, maximum=1000)
+        check_positive_int("evaluate_goals", self.evaluate_goals, maximum=10**6)
+        check_positive_int("final_goals", self.final_goals, minimum=0, maximum=10**6)
+        for name in ("seed", "evaluation_seed"):
             check_positive_int(name, getattr(self, name), minimum=0)
         for value in self.evaluate_at:
             check_number("evaluate_at", value)
@@ -118,19 +123,7 @@ class TrainConfig:
         Raises:
             CheckpointError: it was written by another version or by something else.
         """
-        wanted = {f.name for f in fields(cls)}
-        nested = {name: values.get(name) for name in _NESTED}
-        if set(values) != wanted or not all(isinstance(value, dict) for value in nested.values()):
-            raise CheckpointError(
-                f"config.json: expected the fields {sorted(wanted)}, got {sorted(values)}; "
-                f"use the version of difflcs that wrote it"
-            )
-        plain = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-        try:
-            built = {name: config_from_dict(nested[name], kind) for name, kind in _NESTED.items()}  # pyright: ignore
-            return cls(**{**plain, **built})  # pyright: ignore[reportArgumentType]
-        except InvalidInputError as error:
-            raise CheckpointError(f"config.json: its values cannot be used: {error}") from error
+        return config_from_dict(values, cls)
 
     def smoke(self) -> TrainConfig:
         """The same in seconds: too little data to learn anything."""
@@ -160,15 +153,6 @@ class TrainConfig:
                 samples=min(self.pddm.samples, 10),
             ),
         )
-
-
-_NESTED: Mapping[str, type] = {
-    "warmup": WarmupConfig,
-    "ppo": PPOConfig,
-    "imagination": ImaginationConfig,
-    "mlp": MLPConfig,
-    "pddm": PDDMConfig,
-}
 
 
 class Reporter:
@@ -202,7 +186,8 @@ def train(
 ) -> RunDirectory:
     """Train a model and leave a run directory behind.
 
-    It can be interrupted at any instant; resumed, it ends with the same parameters as if it had not been.
+    It can be interrupted at any instant; resumed, it ends with the same parameters as if it had not been. The run
+    directory is locked meanwhile.
 
     Args:
         config: what to train. When resuming, the run's own configuration must equal it.
@@ -220,17 +205,19 @@ def train(
         InvalidInputError: the data is used up by the warm-up, `init` does not fit the task, or `force` and `resume`.
         CheckpointError: `out` holds files and neither `resume` nor `force` is set, or they cannot be resumed from, or
             they are no run, or they cannot be written; the last checkpoint is intact.
+        InUseError: another process trains in `out`.
         MissingDependencyError: TensorBoard is not installed.
     """
     reporter = reporter or Reporter()
     if not force:
-        return _train(config, out, make_envs, init, resume, reporter, begun=lambda: None)
+        with ExitStack() as held:
+            return _train(config, out, make_envs, init, resume, reporter, lambda: None, held)
     if resume:
         raise InvalidInputError("force: expected without resume, got both; one replaces a run, the other continues it")
     if init is not None and init.resolve().is_relative_to(out.resolve()):
         raise InvalidInputError(f"init: expected a model outside the run that is replaced, {out}, got {init}; copy it")
-    with _replacing(out) as begun:
-        return _train(config, out, make_envs, init, resume, reporter, begun)
+    with _replacing(out) as begun, ExitStack() as held:
+        return _train(config, out, make_envs, init, resume, reporter, begun, held)
 
 
 def _train(
@@ -241,6 +228,7 @@ def _train(
     resume: bool,
     reporter: Reporter,
     begun: Callable[[], object],
+    held: ExitStack,
 ) -> RunDirectory:
     require("tensorboard")
     task = get_task(config.task)
@@ -255,6 +243,9 @@ def _train(
         )
     if resume:
         run = RunDirectory.open(out)
+        if not run.finished():
+            with _writing(out):
+                held.enter_context(run.locked())
         stored = run.config()
         if stored_config(run) != config:
             raise CheckpointError(
@@ -263,12 +254,17 @@ def _train(
         if run.finished():
             return run
         source = stored.get("init")
-        init = None if source is None else Path(str(source))
+        if not isinstance(source, str | None):
+            raise CheckpointError(f"{out}: expected a path as init in config.json, got {short(source)}")
+        init = None if source is None else Path(source)
     else:
         get_backend(config.backend)  # clear errors before anything is written
         if init is not None:
             _check_fits(load_model(init), init, config.task)
         with _writing(out):
+            RunDirectory.check_free(out)  # before anything is written there
+            out.mkdir(parents=True, exist_ok=True)
+            held.enter_context(RunDirectory(out).locked())
             run = RunDirectory.create(
                 out,
                 {
@@ -320,10 +316,16 @@ def _replacing(out: Path) -> Iterator[Callable[[], object]]:
         RunDirectory.open(out).config()
     except CheckpointError as error:
         raise CheckpointError(f"{error}. --force replaces runs only; choose another --out") from error
-    with _writing(out):
-        aside = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}.", suffix=".old"))
-        os.replace(out, aside / out.name)
-        out.mkdir()  # `--out` may be a link to it
+    with ExitStack() as held:
+        with _writing(out):
+            held.enter_context(RunDirectory(out).locked())
+            aside = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}.", suffix=".old"))
+            os.replace(out, aside / out.name)
+            out.mkdir()  # `--out` may be a link to it
+        yield from _moved(out, aside)
+
+
+def _moved(out: Path, aside: Path) -> Iterator[Callable[[], object]]:
     replaced = False
 
     def discard() -> None:
@@ -361,7 +363,7 @@ def stored_config(run: RunDirectory) -> TrainConfig:
 
 def load_model(path: Path) -> LCSModel:
     """The model of a run directory (finished or not), of `LCSModel.save_pretrained`, or of the zoo ("zoo:NAME")."""
-    if (path / "checkpoints").is_dir() or (path / "model").is_dir():
+    if os.path.isdir(path / "checkpoints") or os.path.isdir(path / "model"):  # False for what can be no path
         return RunDirectory.open(path).load_model()
     return LCSModel.from_pretrained(path)
 
@@ -381,11 +383,8 @@ def load_policy(run: RunDirectory) -> Policy:
     if run.finished():
         ensemble = Ensemble.from_pretrained(run.model)
     else:
-        ensemble = Ensemble(N_X, N_U, config.pddm.networks, config.pddm.width)
-        try:
-            ensemble.load_state_dict(ensemble_tensors(load_checkpoint(run.checkpoints)))
-        except RuntimeError as error:
-            raise CheckpointError(f"{run.path}: expected an ensemble as configured, got {error}") from error
+        tensors = ensemble_tensors(load_checkpoint(run.checkpoints))
+        ensemble = Ensemble.from_tensors(N_X, N_U, config.pddm.networks, config.pddm.width, tensors, str(run.path))
     high = torch.full((N_U,), task.u_max, dtype=torch.float64)
     return Planner(ensemble, pushing_cost(), config.pddm, -high, high)
 
@@ -393,20 +392,22 @@ def load_policy(run: RunDirectory) -> Policy:
 def _load_network(run: RunDirectory, config: TrainConfig, task: Task) -> MLPController:
     if run.finished():
         return MLPController.from_pretrained(run.model, pushing_features)
+    tensors = network_tensors(load_checkpoint(run.checkpoints))
+    check_network(str(run.path), tensors, _n_features(), config.mlp.width, N_U)
     network = _initial_network(config, task)
-    try:
-        network.load_state_dict(network_tensors(load_checkpoint(run.checkpoints)))
-    except RuntimeError as error:
-        raise CheckpointError(f"{run.path}: expected a network as configured, got {error}") from error
+    network.load_state_dict(tensors)
     return network
 
 
 def _initial_network(config: TrainConfig, task: Task) -> MLPController:
     high = torch.full((N_U,), task.u_max, dtype=torch.float64)
     generator = torch.Generator().manual_seed(config.seed)
-    features = pushing_features(torch.zeros(N_X), torch.zeros(pushing_cost().n_goal), torch.zeros(()))
     width, steps = config.mlp.width, task.episode_steps
-    return MLPController(pushing_features, len(features), -high, high, width, steps, generator)
+    return MLPController(pushing_features, _n_features(), -high, high, width, steps, generator)
+
+
+def _n_features() -> int:
+    return len(pushing_features(torch.zeros(N_X), torch.zeros(pushing_cost().n_goal), torch.zeros(())))
 
 
 def _initial_model(config: TrainConfig) -> LCSModel:

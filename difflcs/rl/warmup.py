@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
-from typing import TypeVar
+from dataclasses import dataclass, is_dataclass
+from types import UnionType
+from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_number, check_positive_int
+from difflcs._checks import MOST_ENVS, check_number, check_positive_int
+from difflcs._files import short
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.lcs import LCSModel
 from difflcs.losses import violation_loss
-from difflcs.rl.checkpoint import Checkpoint
+from difflcs.rl.checkpoint import Checkpoint, check_episodes, kinds
 from difflcs.rl.rollout import (
     Policy,
     Rollouts,
@@ -71,14 +73,16 @@ class WarmupConfig:
     """Xi of the violation loss."""
 
     def __post_init__(self) -> None:
-        for name in ("random_rollouts", "rollouts_per_iteration", "buffer_rollouts"):
-            check_positive_int(name, getattr(self, name))
-        for name in ("minibatch", "first_epochs", "epochs"):
+        for name in ("random_rollouts", "rollouts_per_iteration"):
+            check_positive_int(name, getattr(self, name), maximum=MOST_ENVS)
+        for name in ("buffer_rollouts", "minibatch", "first_epochs", "epochs"):
             check_positive_int(name, getattr(self, name))
         for name in ("noise", "trust_region"):
             check_number(name, getattr(self, name))
         for name in ("trust_region_growth", "learning_rate", "learning_rate_decay", "adam_eps", "gamma", "xi"):
             check_number(name, getattr(self, name), strict=True)
+        if not all(0 <= beta < 1 for beta in self.betas):
+            raise InvalidInputError(f"betas: expected 0 <= beta < 1 for both, got {self.betas}")
         if not 0 <= self.held_out < 1:
             raise InvalidInputError(f"held_out: expected 0 <= held_out < 1, got {self.held_out}")
 
@@ -319,21 +323,22 @@ class Warmup:
             CheckpointError: it does not fit the settings or the model; nothing is changed.
         """
         n_x, n_u, steps = self.lcs.n_x, self.lcs.n_u, self.episode_steps
-        wanted = {"states": (steps + 1, n_x), "actions": (steps, n_u), "goals": tuple(self.goals.shape[1:])}
-        wanted |= {"u_min": (n_u,), "u_max": (n_u,)}
+        shapes = {"states": (steps + 1, n_x), "actions": (steps, n_u), "goals": tuple(self.goals.shape[1:])}
+        shapes |= {"u_min": (n_u,), "u_max": (n_u,)}
+        wanted = {name: (shape, torch.float64) for name, shape in shapes.items()}
         batched = ("states", "actions", "goals")
-        shapes = {k: tuple(v.shape[1:] if k in batched else v.shape) for k, v in checkpoint.tensors.items()}
-        model = checkpoint.model
-        if shapes != wanted or model is None or model.config() != self.lcs.config():
+        got, model = kinds(checkpoint.tensors, batched), checkpoint.model
+        if got != wanted or model is None or model.config() != self.lcs.config():
             raise CheckpointError(
                 f"checkpoint: expected {self.lcs.config()} with tensors {wanted}, got {model and model.config()} with "
-                f"{shapes}; was it written with other settings?"
+                f"{got}; was it written with other settings?"
             )
         try:
             episodes = check_positive_int("episodes", checkpoint.state["episodes"], minimum=0)
             generators = [_generator(checkpoint.state[name]) for name in ("action_rng", "minibatch_rng")]
-        except (KeyError, TypeError, ValueError) as error:
-            raise CheckpointError(f"checkpoint: its counters or generators cannot be used ({error})") from error
+        except Exception as error:  # numpy refuses the state of a generator in many ways
+            raise CheckpointError(f"checkpoint: its counters or generators cannot be used ({error!r})") from error
+        check_episodes({name: checkpoint.tensors[name] for name in batched}, empty=checkpoint.iteration == 0)
         self.iteration, self.episodes = checkpoint.iteration, episodes
         self._action_rng, self._minibatch_rng = generators
         self.states, self.actions, self.goals = (checkpoint.tensors[name] for name in batched)
@@ -354,13 +359,39 @@ def config_from_dict(values: Mapping[str, object], kind: type[Config]) -> Config
     """Rebuild a configuration dataclass from JSON.
 
     Raises:
-        CheckpointError: other fields than those of `kind`.
+        CheckpointError: other fields than those of `kind`, or values that they cannot have.
     """
-    wanted = {f.name for f in fields(kind)}  # pyright: ignore[reportArgumentType]
-    if set(values) != wanted:
+    wanted = get_type_hints(kind)
+    if set(values) != set(wanted):
         raise CheckpointError(
-            f"{kind.__name__}: expected the fields {sorted(wanted)}, got {sorted(values)}; "
+            f"{kind.__name__}: expected the fields {sorted(wanted)}, got {short(sorted(values))}; "
             f"use the version of difflcs that wrote it"
         )
-    plain = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-    return kind(**plain)
+    plain: dict[str, Any] = {}
+    for name, hint in wanted.items():
+        value = values[name]
+        if not _fits(value, dict if is_dataclass(hint) else hint):
+            raise CheckpointError(
+                f"{kind.__name__}: expected {name} of the type {hint}, got {short(value)}; restore config.json from a "
+                f"copy"
+            )
+        plain[name] = tuple(value) if isinstance(value, list) else value
+        if is_dataclass(hint):
+            plain[name] = config_from_dict(plain[name], cast("type", hint))
+    try:
+        return kind(**plain)
+    except InvalidInputError as error:
+        raise CheckpointError(f"{kind.__name__}: its values cannot be used: {error}") from error
+
+
+def _fits(value: object, hint: Any) -> bool:
+    """Whether a value of JSON has the type that a field of a configuration says; lists stand for tuples."""
+    parts, origin = get_args(hint), get_origin(hint)
+    if origin in (Union, UnionType):
+        return any(_fits(value, part) for part in parts)
+    if origin is tuple:
+        inner = parts[:1] * len(value) if isinstance(value, list | tuple) and parts[-1] is Ellipsis else parts
+        return isinstance(value, list | tuple) and len(value) == len(inner) and all(map(_fits, value, inner))
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, hint) and isinstance(value, bool) == (hint is bool)

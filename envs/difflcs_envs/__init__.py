@@ -16,6 +16,7 @@ from difflcs_envs.errors import (
     DifflcsEnvsError,
     MeshError,
     MissingDependencyError,
+    OptionsError,
     PhysicsWarning,
     RenderingError,
 )
@@ -25,6 +26,7 @@ __all__ = [
     "DifflcsEnvsError",
     "MeshError",
     "MissingDependencyError",
+    "OptionsError",
     "PhysicsWarning",
     "RenderingError",
     "register_envs",

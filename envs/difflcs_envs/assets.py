@@ -1,34 +1,46 @@
-"""The YCB meshes on this machine: find them, or download them from the YCB site. Standard library only.
+"""The YCB meshes on this machine: find them, or download them from the YCB site.
 
 The archives are kept whole: their SHA-256 is recorded at the first download and every later download must match it.
 Nothing is ever half there. Archives grow in `NAME.part`, from where an interrupted download goes on, and are unpacked
-into a hidden folder that gets its name in one step.
+into a hidden folder that gets its name in one step. One process at a time works in a folder; the others wait. Whatever
+a server sends or an archive holds, its size is limited and the error is an `AssetError`.
 """
 
 from __future__ import annotations
 
+import contextlib
+import gzip
 import hashlib
+import http.client
 import json
 import os
+import re
 import shutil
 import tarfile
 import tempfile
+import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path, PurePosixPath
+from typing import BinaryIO
 
-from difflcs_envs.errors import AssetError, MeshError
+from difflcs_envs.errors import AssetError, MeshError, MissingDependencyError
 from difflcs_envs.ycb import YCB, YcbObject
 
 __all__ = ["YCB_DIR_VARIABLE", "YCB_URL", "download", "find_ycb_mesh", "ycb_download_directory"]
 
 YCB_URL = "https://ycb-benchmarks.s3.amazonaws.com/data/google/{code}_google_16k.tgz"
 YCB_DIR_VARIABLE = "DIFFLCS_YCB_DIR"
-TIMEOUT = 30.0  # [s]
+TIMEOUT = 30.0  # [s] without a byte
+MAX_SECONDS = 3600.0  # [s] of one request: a server that drips would keep us for days
 CHUNK = 1 << 16  # [byte]
-MAX_UNPACKED = 1 << 30  # [byte]
+MAX_ARCHIVE = 1 << 28  # [byte]; the largest of these objects has 1 << 25
+MAX_UNPACKED = 1 << 29  # [byte]
+MAX_MEMBERS = 1000  # files and folders in an archive
+MAX_RECORDS = 1 << 20  # [byte] of sha256.json
 ATTEMPTS = 3
+LOCK = ".lock"
 
 # Where the mesh of an object may lie below a folder, best first.
 _LAYOUTS = (
@@ -97,18 +109,57 @@ def download(
     for name in names:
         if name not in YCB:
             raise ValueError(f"Expected an object out of {', '.join(YCB)}, got {name!r}. Choose one of them.")
+    addresses = [_address(url, YCB[name]) for name in names]
     folder = ycb_download_directory() if folder is None else folder
-    return [_download_object(YCB[name], folder, url, report) for name in names]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with _locked(folder, report):
+            entries = zip(names, addresses, strict=True)
+            return [_download_object(YCB[name], folder, address, report) for name, address in entries]
+    except OSError as error:
+        raise AssetError(
+            f"{folder}: expected a folder with free space that can be written, got: {error}. Mend that, or choose "
+            f"another folder."
+        ) from error
 
 
-def _download_object(entry: YcbObject, folder: Path, url: str, report: Callable[[str], object]) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
+def _address(url: str, entry: YcbObject) -> str:
+    try:
+        return url.format(code=entry.code)
+    except (LookupError, ValueError, AttributeError) as error:
+        raise ValueError(
+            f"Expected an address with {{code}} for the object's name, got {url!r} ({error}). Correct it."
+        ) from error
+
+
+@contextlib.contextmanager
+def _locked(folder: Path, report: Callable[[str], object]) -> Iterator[None]:
+    """Wait until no other process downloads into a folder. The system ends the lock with its process."""
+    try:
+        import filelock
+    except ImportError as error:
+        raise MissingDependencyError("filelock") from error
+    path = folder / LOCK
+    lock = filelock.FileLock(path)
+    try:
+        lock.acquire(blocking=False)
+    except filelock.Timeout:
+        report(f"another process downloads into {folder}: waiting for it")
+        lock.acquire()
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            path.unlink()  # before the release: who has opened it already sees that it is gone, and tries again
+        lock.release()
+
+
+def _download_object(entry: YcbObject, folder: Path, address: str, report: Callable[[str], object]) -> Path:
     archive = folder / f"{entry.code}_google_16k.tgz"
-    address = url.format(code=entry.code)
+    known = _known_hashes(folder)
     if not archive.exists():
         _fetch(address, archive)
     digest = _sha256(archive)
-    known = _known_hashes(folder)
     if known.setdefault(archive.name, digest) != digest:
         archive.unlink()
         raise AssetError(
@@ -131,15 +182,15 @@ def _fetch(address: str, archive: Path) -> None:
     for attempt in range(ATTEMPTS):
         try:
             complete = _fetch_rest(address, part)
-        except (OSError, urllib.error.URLError) as error:  # HTTPError is a URLError
-            if isinstance(error, urllib.error.HTTPError) and error.code == 416:  # no such range: not our file
-                part.unlink(missing_ok=True)
+        except (OSError, http.client.HTTPException, ValueError, LookupError) as error:  # HTTPError is an OSError
+            if isinstance(error, _BadRange) or (isinstance(error, urllib.error.HTTPError) and error.code == 416):
+                part.unlink(missing_ok=True)  # not a piece of this file: from the start
             elif isinstance(error, urllib.error.HTTPError) and error.code < 500:
                 raise AssetError(
                     f"{address}: expected an archive, got the answer {error.code} {error.reason}. Look at the address; "
                     f"with meshes from elsewhere let {YCB_DIR_VARIABLE} name their folder."
                 ) from error
-            complete, reason = False, str(error)
+            complete, reason = False, f"{type(error).__name__}: {error}"
         else:
             reason = "the connection ended early"
         if complete:
@@ -152,23 +203,47 @@ def _fetch(address: str, archive: Path) -> None:
             )
 
 
+class _BadRange(ValueError):
+    """The server answered with another part of the file than the one asked for."""
+
+
 def _fetch_rest(address: str, part: Path) -> bool:
     """One request for what is missing. Returns whether the file is complete."""
     have = part.stat().st_size if part.exists() else 0
     request = urllib.request.Request(address, headers={"Range": f"bytes={have}-"} if have else {})
     with urllib.request.urlopen(request, timeout=TIMEOUT) as answer:
-        start = 0
-        if answer.status == 206:
-            start = int(answer.headers.get("Content-Range", "bytes 0-").split()[1].split("-")[0])
+        start = _start(answer.headers.get("Content-Range"), have) if answer.status == 206 else 0
         length = answer.headers.get("Content-Length")
         total = None if length is None else start + int(length)
+        _check_size(address, part, total or 0)
+        deadline = time.monotonic() + MAX_SECONDS
         with part.open("r+b" if start else "wb") as file:
             file.seek(start)
             file.truncate()
-            while chunk := answer.read(CHUNK):
+            while chunk := answer.read1(CHUNK):  # what is there, so that a server that drips is noticed
                 file.write(chunk)
+                _check_size(address, part, file.tell())
+                if time.monotonic() > deadline:
+                    raise TimeoutError(f"still going on after {MAX_SECONDS:g} s")
             size = file.tell()
     return total is None or size == total
+
+
+def _start(content_range: str | None, have: int) -> int:
+    """Where the bytes of a partial answer begin: where we asked for, or it is of no use."""
+    found = re.fullmatch(r"\s*bytes\s+(\d{1,15})-(\d{1,15})/(\d{1,15}|\*)\s*", content_range or "", re.ASCII)
+    if found is None or int(found[1]) != have or int(found[2]) < have:
+        raise _BadRange(f"expected the bytes from {have} on, got Content-Range {content_range!r}")
+    return have
+
+
+def _check_size(address: str, part: Path, size: int) -> None:
+    if size > MAX_ARCHIVE:
+        part.unlink(missing_ok=True)
+        raise AssetError(
+            f"{address}: expected an archive of at most {MAX_ARCHIVE >> 20} MB, got {size >> 20} MB or more. Look at "
+            f"the address; with meshes from elsewhere let {YCB_DIR_VARIABLE} name their folder."
+        )
 
 
 def _sha256(path: Path) -> str:
@@ -182,30 +257,33 @@ def _sha256(path: Path) -> str:
 def _known_hashes(folder: Path) -> dict[str, str]:
     path = folder / "sha256.json"
     try:
-        return dict(json.loads(path.read_text()))
+        with path.open("rb") as file:
+            text = file.read(MAX_RECORDS + 1)
+        if len(text) > MAX_RECORDS:
+            raise ValueError(f"more than {MAX_RECORDS >> 20} MB")
+        known = json.loads(text)
+        if not isinstance(known, dict) or not all(isinstance(v, str) and _HASH.fullmatch(v) for v in known.values()):
+            raise ValueError("something else")
     except FileNotFoundError:
         return {}
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise AssetError(
             f"{path}: expected recorded checksums, cannot read them ({error}). Delete the file."
         ) from error
+    return known
+
+
+_HASH = re.compile("[0-9a-f]{64}")
 
 
 def _unpack(archive: Path, folder: Path, entry: YcbObject) -> Path:
     """Unpack into `folder/code` and return the mesh. Only plain files and folders below it are accepted."""
+    for leftover in folder.glob(f".{entry.code}.*"):  # of a process that was killed: the folder is ours
+        shutil.rmtree(leftover, ignore_errors=True)
     temporary = Path(tempfile.mkdtemp(dir=folder, prefix=f".{entry.code}."))
     try:
-        with tarfile.open(archive, "r:gz") as tar:
-            members = tar.getmembers()
-            for member in members:
-                parts = PurePosixPath(member.name).parts
-                if ".." in parts or member.name.startswith("/") or not (member.isfile() or member.isdir()):
-                    raise AssetError(
-                        f"{archive.name} holds {member.name!r}, which would leave its folder or is no plain file. The "
-                        "archive is not used; report it to where it came from."
-                    )
-            if sum(member.size for member in members) > MAX_UNPACKED:
-                raise AssetError(f"{archive.name}: expected less than {MAX_UNPACKED >> 20} MB unpacked, got more.")
+        with _decompressed(archive, folder) as file, tarfile.open(fileobj=file, mode="r:") as tar:
+            members = _members(tar, archive)
             tar.extractall(temporary, members, filter="data")
         unpacked = temporary / entry.code
         if not unpacked.is_dir():
@@ -214,13 +292,52 @@ def _unpack(archive: Path, folder: Path, entry: YcbObject) -> Path:
         if mesh is None:
             raise AssetError(f"{archive.name}: expected {entry.code}/google_16k/nontextured.stl in it, found no mesh.")
         _check(mesh, entry)
-        shutil.rmtree(folder / entry.code, ignore_errors=True)
+        if (folder / entry.code).exists():
+            os.replace(folder / entry.code, temporary / "old")  # for an instant there is none
         os.replace(unpacked, folder / entry.code)
-    except (tarfile.TarError, EOFError, OSError, ValueError) as error:
-        raise AssetError(f"{archive.name} cannot be unpacked ({error}). Run the command again.") from error
+    except AssetError:
+        raise
+    except Exception as error:  # a damaged archive fails in many ways
+        raise AssetError(
+            f"{archive.name} cannot be unpacked ({type(error).__name__}: {error}). Run the command again."
+        ) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     return folder / mesh.relative_to(temporary)
+
+
+@contextlib.contextmanager
+def _decompressed(archive: Path, folder: Path) -> Iterator[BinaryIO]:
+    """The tar inside, as a temporary file: so its size is known before anything in it is believed."""
+    with tempfile.TemporaryFile(dir=folder) as file:
+        with gzip.open(archive) as compressed:
+            while chunk := compressed.read(CHUNK):
+                file.write(chunk)
+                if file.tell() > MAX_UNPACKED:
+                    raise AssetError(
+                        f"{archive.name}: expected at most {MAX_UNPACKED >> 20} MB unpacked, got more. The archive is "
+                        "not used; report it to where it came from."
+                    )
+        file.seek(0)
+        yield file
+
+
+def _members(tar: tarfile.TarFile, archive: Path) -> list[tarfile.TarInfo]:
+    members: list[tarfile.TarInfo] = []
+    for member in tar:
+        parts = PurePosixPath(member.name).parts
+        if ".." in parts or member.name.startswith("/") or not (member.isfile() or member.isdir()):
+            raise AssetError(
+                f"{archive.name} holds {member.name!r}, which would leave its folder or is no plain file. The "
+                "archive is not used; report it to where it came from."
+            )
+        members.append(member)
+        if len(members) > MAX_MEMBERS or sum(m.size for m in members) > MAX_UNPACKED:  # sparse files are small in it
+            raise AssetError(
+                f"{archive.name}: expected at most {MAX_MEMBERS} files of {MAX_UNPACKED >> 20} MB together, got more. "
+                "The archive is not used; report it to where it came from."
+            )
+    return members
 
 
 def _check(mesh: Path, entry: YcbObject) -> None:

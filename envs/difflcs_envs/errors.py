@@ -8,6 +8,7 @@ __all__ = [
     "DifflcsEnvsError",
     "MeshError",
     "MissingDependencyError",
+    "OptionsError",
     "PhysicsWarning",
     "RenderingError",
 ]
@@ -35,6 +36,10 @@ class RenderingError(RuntimeError, DifflcsEnvsError):
 
 class MeshError(ValueError, DifflcsEnvsError):
     """A mesh is missing, broken, or not a solid of a size that the robot can push."""
+
+
+class OptionsError(ValueError, TypeError, DifflcsEnvsError):
+    """The options of `reset` are no dictionary."""
 
 
 class AssetError(RuntimeError, DifflcsEnvsError):

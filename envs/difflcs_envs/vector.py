@@ -28,6 +28,7 @@ from difflcs_envs.trifinger.env import (
     TriFingerMoveCubeEnv,
     TriFingerMoveObjectEnv,
     TriFingerTurnCubeEnv,
+    checked_options,
     continued,
 )
 from difflcs_envs.trifinger.physics import CONTROL_PERIOD, step_all
@@ -118,7 +119,7 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
             ValueError: The seeds, the mask or another option cannot be used.
         """
         seeds = self._seeds(seed)
-        options = dict(options or {})
+        options = checked_options(options)
         mask = self._mask(options.pop("reset_mask", None))
         indices = np.flatnonzero(mask).tolist()
         for i in indices:
@@ -215,7 +216,12 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None or isinstance(seed, int | np.integer):
             return [None if seed is None else int(seed) + i for i in range(self.num_envs)]
-        seeds = [None if s is None else int(s) for s in seed]
+        try:
+            seeds = [None if s is None else int(s) for s in seed]
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"Expected a seed as a whole number, {self.num_envs} of them, or None, got {seed!r:.100}. Pass seed=0."
+            ) from error
         if len(seeds) != self.num_envs:
             raise ValueError(f"Expected {self.num_envs} seeds, one per environment, got {len(seeds)}. Pass as many.")
         return seeds

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +44,8 @@ FLOORS = {
 def test_nothing_is_wrong_in_silence(cell, one_thread):
     if cell.target == "relaxed":
         pytest.importorskip("cvxpylayers")
+    if cell.problems.startswith("mpc-skew"):  # what is refused there was tried three times
+        cell = replace(cell, size=min(cell.size, 32))
     record = campaign.run_chunk(cell, seed=0, number=0)
     assert record.silent == 0, f"{record.by_check}, reproduce: {campaign.reproduction(record)}"
     floor = FLOORS.get(cell.problems, 0.0)

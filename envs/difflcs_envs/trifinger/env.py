@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from difflcs_envs.errors import MissingDependencyError, PhysicsWarning, RenderingError
+from difflcs_envs.errors import MissingDependencyError, OptionsError, PhysicsWarning, RenderingError
 from difflcs_envs.trifinger.rendering import SceneRenderer, SceneViewer, has_display, select_gl_backend
 from difflcs_envs.trifinger.task import MoveTask
 from difflcs_envs.ycb import YCB
@@ -170,10 +170,11 @@ class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             Observation and info.
 
         Raises:
+            OptionsError: The options are no dictionary.
             ValueError: An option is unknown, has the wrong shape, or is outside what the robot and the task allow.
         """
+        options = checked_options(options)
         super().reset(seed=seed)
-        options = dict(options or {})
         goal, state = options.pop("goal", None), options.pop("state", None)
         if options:
             raise ValueError(
@@ -624,6 +625,22 @@ def make_task(
             for name, value in weights.items()
         },
     )
+
+
+def checked_options(options: Any) -> dict[str, Any]:
+    """A copy of the options of `reset`, empty for None.
+
+    Raises:
+        OptionsError: They are no dictionary.
+    """
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
+        raise OptionsError(
+            f"Expected options as a dictionary, got {type(options).__name__}: {options!r:.100}. Pass "
+            "options={'goal': [x, y, yaw]}."
+        )
+    return dict(options)
 
 
 def continued(before: np.ndarray, after: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ import io
 import json
 import os
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,14 +37,24 @@ CACHE_VARIABLE = "DIFFLCS_CACHE_DIR"
 # A mesh outside these bounds is most likely in other units, or nothing that the fingers can push.
 MIN_SIZE, MAX_SIZE = 0.01, 0.45  # [m] longest side
 MIN_VOLUME = 1e-8  # [m^3]
+# A torus of 20 480 triangles takes 37 s, one of 65 536 takes 94 s, a cylinder of 50 000 minutes (its hull).
+# The scans of the YCB set have 16 384.
+MAX_TRIANGLES = 20_000
+MAX_FILE = 1 << 25  # [byte]: 16 times a text file of so many triangles, or one with textures
 SIZE_TOLERANCE = 0.005, 0.05  # [m], and part of the size
 DEBRIS = 0.02  # scanned meshes carry loose fragments: smaller in area than this part of the mesh
 SUPPORT_THICKNESS = 0.001  # [m] vertices this near to the table carry the object in the rating of a rest pose
 MIN_TOPPLING_ANGLE = np.deg2rad(3.0)  # poses that fall at a smaller tilt are not offered
 SAME_POSE = np.cos(np.deg2rad(10.0))  # rest poses less than 10 degrees apart are one: a bumpy face has many
 AS_LOW = 1.1  # among rest poses that are lower than this times the lowest, lying keeps nearest to how it is stored
+BLOCK = 256  # edges of an outline whose boxes are measured at once
 KEPT_YAW = np.cos(np.deg2rad(2.0))  # a mesh stored within 2 degrees of its rest pose keeps its yaw
 
+SIMPLIFY = (
+    "Simplify it to about 5000 triangles, which is finer than the contacts: the modifier 'Decimate' of Blender, "
+    "'Quadric Edge Collapse Decimation' of MeshLab, or mesh.simplify_quadric_decimation(face_count=5000) of trimesh, "
+    "which needs: pip install fast-simplification"
+)
 LYING, UPRIGHT = "lying", "upright"
 
 # Convex decomposition. Remeshing (preprocess) inflates by 0.6 to 1.4 mm and a vertex limit (decimate) tilts what
@@ -130,7 +141,7 @@ def load_mesh(path: Path, scale: float = 1.0) -> trimesh.Trimesh:
         The mesh in metres, watertight, faces outward.
 
     Raises:
-        MeshError: The file is missing, cannot be read, is no solid, or has an unlikely size.
+        MeshError: The file is missing, too large, cannot be read, is no solid, or has an unlikely size.
         MissingDependencyError: trimesh is not installed.
     """
     trimesh = _require_trimesh()
@@ -140,6 +151,8 @@ def load_mesh(path: Path, scale: float = 1.0) -> trimesh.Trimesh:
         raise MeshError(
             f"Expected a mesh file such as .stl, .obj or .ply, got {str(path)!r}. Convert it to one of these formats."
         )
+    if (size := path.stat().st_size) > MAX_FILE:
+        raise MeshError(f"Expected a mesh file of at most {MAX_FILE >> 20} MB, got {size >> 20} MB: {path}. {SIMPLIFY}")
     try:
         mesh = trimesh.load(path, force="mesh", process=True, skip_materials=True)
     except Exception as error:  # every format fails in its own way
@@ -152,6 +165,7 @@ def load_mesh(path: Path, scale: float = 1.0) -> trimesh.Trimesh:
             f"The mesh {path} is empty or broken: expected at least 4 triangles with finite corners, got "
             f"{len(mesh.faces)} triangles. Export it again."
         )
+    _check_triangles(mesh, str(path))
     mesh.apply_scale(scale)
     size = float(mesh.extents.max())
     if not MIN_SIZE <= size <= MAX_SIZE:
@@ -166,6 +180,14 @@ def load_mesh(path: Path, scale: float = 1.0) -> trimesh.Trimesh:
             f"{path}. Close it, for instance with 'Make manifold' in Blender or MeshLab."
         )
     return mesh
+
+
+def _check_triangles(mesh: trimesh.Trimesh, name: str) -> None:
+    if len(mesh.faces) > MAX_TRIANGLES:
+        raise MeshError(
+            f"Expected a mesh of at most {MAX_TRIANGLES} triangles, got {len(mesh.faces)}: {name}. It would take "
+            f"minutes to prepare. {SIMPLIFY}"
+        )
 
 
 def _repaired(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -202,14 +224,17 @@ def rest_poses(points: np.ndarray, center: np.ndarray) -> list[RestPose]:
     hull = ConvexHull(points - center)
     normals, heights = hull.equations[:, :3], -hull.equations[:, 3]  # outward; distance of each face to the centre
     corners = hull.points[hull.vertices]
+    # The projection of the centre lies in a face if it lies in the hull. It does not if it is beyond a neighbour.
+    feet = heights[:, None] * normals
+    near = hull.neighbors
+    beyond = np.einsum("fk,fnk->fn", feet, normals[near]) - heights[near]
+    left = (beyond <= 1e-9).all(axis=1)
     poses: list[RestPose] = []
-    taken: list[np.ndarray] = []
     for face in np.argsort(heights, kind="stable"):
-        down, height = normals[face], float(heights[face])
-        # The projection of the centre lies in this face if it lies in the hull.
-        if (normals @ (height * down) - heights).max() > 1e-9 or any(down @ other > SAME_POSE for other in taken):
+        if not left[face] or (normals @ feet[face] - heights).max() > 1e-9:
             continue
-        taken.append(down)
+        down, height = normals[face], float(heights[face])
+        left &= normals @ down <= SAME_POSE
         angle = _toppling_angle(corners, down, height)
         if not poses or angle >= MIN_TOPPLING_ANGLE:  # the lowest pose always counts
             poses.append(RestPose(height, _upright_rotation(corners, down), angle))
@@ -251,12 +276,15 @@ def _upright_rotation(corners: np.ndarray, down: np.ndarray) -> np.ndarray:
     flat = (corners @ rotation.T)[:, :2]
     outline = flat[ConvexHull(flat).vertices]
     edges = np.roll(outline, -1, axis=0) - outline
+    edges /= np.linalg.norm(edges, axis=1, keepdims=True)
+    across = edges @ np.array([[0.0, 1.0], [-1.0, 0.0]])
     best_area, best = np.inf, np.eye(2)
-    for x, y in edges / np.linalg.norm(edges, axis=1, keepdims=True):  # the smallest box has a side along some edge
-        turn = np.array([[x, y], [-y, x]])
-        width, depth = np.ptp(outline @ turn.T, axis=0)
-        if width * depth < best_area * (1 - 1e-9):
-            best_area, best = width * depth, turn if width >= depth else np.array([[-y, x], [-x, -y]])
+    for start in range(0, len(edges), BLOCK):  # the smallest box has a side along some edge
+        block = slice(start, start + BLOCK)
+        sizes = np.stack([np.ptp(outline @ sides[block].T, axis=0) for sides in (edges, across)])
+        for (x, y), width, depth in zip(edges[block], *sizes, strict=True):
+            if width * depth < best_area * (1 - 1e-9):
+                best_area, best = width * depth, np.array([[x, y], [-y, x]] if width >= depth else [[-y, x], [-x, -y]])
     yaw = np.eye(3)
     yaw[:2, :2] = best
     return yaw @ rotation
@@ -314,9 +342,33 @@ def _convex_parts(mesh: trimesh.Trimesh, count: int | None, concavity: float) ->
     path = cache_directory() / "parts" / f"{key.hexdigest()[:32]}.npz"
     parts = _read_parts(path)
     if parts is None:
-        parts = _decompose(vertices, faces, count, concavity)
-        _write_parts(path, parts)
+        with _one_at_a_time(path.stem):
+            parts = _read_parts(path)  # another process may have been faster
+            if parts is None:
+                parts = _decompose(vertices, faces, count, concavity)
+                _write_parts(path, parts)
     return parts, key.hexdigest()
+
+
+@contextlib.contextmanager
+def _one_at_a_time(name: str) -> Iterator[None]:
+    """Wait for another process that decomposes the same mesh. Where no lock can be written, there is none."""
+    try:
+        import filelock
+    except ImportError as error:
+        raise MissingDependencyError("filelock") from error
+    path = cache_directory() / f".{name}.lock"
+    lock = filelock.FileLock(path)
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock.acquire()
+    try:
+        yield
+    finally:
+        if lock.is_locked:
+            with contextlib.suppress(OSError):
+                path.unlink()
+            lock.release()
 
 
 def _decompose(vertices: np.ndarray, faces: np.ndarray, count: int, concavity: float) -> tuple[np.ndarray, ...]:
@@ -383,9 +435,11 @@ def make_solid(
         The solid. The parts decide how it rests, for it is they that touch the table.
 
     Raises:
+        MeshError: It has so many triangles that this would take minutes.
         ValueError: There is no such rest pose.
         MissingDependencyError: coacd is needed and not installed.
     """
+    _check_triangles(mesh, name)
     pieces, key = _convex_parts(mesh, parts, concavity)
     center = np.array(mesh.center_mass)
     pose = _choose_pose(rest_poses(np.concatenate(pieces), center), rest_pose, name)

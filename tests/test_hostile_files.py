@@ -1,0 +1,349 @@
+"""Files that are damaged, foreign, or made up with a right checksum: a typed error, and nothing of their size."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+from dataclasses import asdict, replace
+
+import pytest
+import torch
+from safetensors.torch import load_file, save, save_file
+
+from difflcs import LCSModel, _files, zoo
+from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs.rl import checkpoint
+from difflcs.rl.checkpoint import Checkpoint, RunDirectory, load_checkpoint, save_checkpoint
+from difflcs.rl.dynamics import Ensemble
+from difflcs.rl.mlp import MLPController
+from difflcs.rl.tasks import pushing_features
+from difflcs.rl.training import TrainConfig, load_policy, stored_config
+
+VALUES = [
+    None, True, False, 0, -1, 1.5, 10**12, 10**400, -(10**30), 1e308, "", "x", "\ud800", "\0", "9" * 5000, [], [1],
+    [[]], {}, {"a": 1}, [None, True], ["x"] * 3,
+]  # fmt: skip
+TEXTS = [
+    b"", b"\xff\xfe\x00", b"\x00" * 50, b"[" * 100_000, b"[" * 300 + b"]" * 300, b'{"a":' * 40 + b"1" + b"}" * 40,
+    b"NaN", b"1" * 10_000, b"1e999", b'{"kind": "run", "config": NaN}', b'{"kind": "run", "config": -Infinity}',
+    b'"\xc3"', b"{} {}",
+]  # fmt: skip
+
+
+def small_model(seed=0):
+    return LCSModel(2, 1, 1, init_scale=0.1, generator=torch.Generator().manual_seed(seed))
+
+
+def make_run(path, **changes):
+    """An unfinished run with one checkpoint and a log."""
+    config = replace(TrainConfig(), **changes)
+    run = RunDirectory.create(path, {"kind": "run", "config": asdict(config), "init": None, "versions": {}})
+    run.append({"iteration": 0, "loss": None})
+    run.append({"iteration": 1, "loss": 0.5})
+    return run
+
+
+def write(path, content):
+    path.write_bytes(content if isinstance(content, bytes) else json.dumps(content).encode())
+
+
+def load_ensemble(path):
+    return Ensemble.from_pretrained(path)
+
+
+def load_network(path):
+    return MLPController.from_pretrained(path, pushing_features)
+
+
+RECORDS = {
+    "model": (lambda path: small_model().save_pretrained(path), LCSModel.from_pretrained),
+    "ensemble": (lambda path: Ensemble(2, 1, 2, 4).save_pretrained(path), load_ensemble),
+    "network": (
+        lambda path: MLPController(pushing_features, 15, -torch.ones(6), torch.ones(6), 4).save_pretrained(path),
+        load_network,
+    ),
+    "checkpoint": (
+        lambda path: save_checkpoint(path.parent, Checkpoint(1, small_model(), {"n": 1}, {"x": torch.zeros(3)})),
+        lambda path: load_checkpoint(path.parent),
+    ),
+}
+
+
+@pytest.fixture(params=RECORDS)
+def record(request, tmp_path):
+    """A record on disk, and what loads it."""
+    make, load = RECORDS[request.param]
+    path = tmp_path / "000001"
+    make(path)
+    load(path)
+    return path, load
+
+
+def paths_of(value, path=()):
+    """Where every value of a JSON document is."""
+    yield path
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, part in items:
+        yield from paths_of(part, (*path, key))
+
+
+def put(document, path, value):
+    """A copy of a document with another value at a path."""
+    if not path:
+        return value
+    copy = json.loads(json.dumps(document))
+    part = copy
+    for key in path[:-1]:
+        part = part[key]
+    part[path[-1]] = value
+    return copy
+
+
+def signed(path, header):
+    """Write a description, and give the tensors a checksum that fits it."""
+    tensors = load_file(path / "model.safetensors")
+    write(path / "config.json", header)
+    (path / "model.safetensors").write_bytes(save(tensors, metadata={"sha256": _files._hash(header, tensors)}))
+
+
+def loads_or_refuses(load, *arguments):
+    """A typed error that says something, or no error."""
+    try:
+        load(*arguments)
+    except CheckpointError as error:
+        message = str(error)
+    else:
+        return True
+    assert 20 < len(message) < 3000
+    return False
+
+
+# --- text -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("content", TEXTS, ids=lambda c: repr(c[:12]))
+def test_no_json_no_traceback(tmp_path, content):
+    model, run = tmp_path / "model", make_run(tmp_path / "run")
+    small_model().save_pretrained(model)
+    save_checkpoint(run.checkpoints, Checkpoint(1, small_model(), {}, {}))
+    card = tmp_path / "card.json"
+    for path in (model / "config.json", run.path / "config.json", run.checkpoints / "latest.json", card):
+        path.write_bytes(content)
+    for load in (
+        lambda: LCSModel.from_pretrained(model),
+        run.config,
+        lambda: load_checkpoint(run.checkpoints),
+        lambda: zoo._read(card),
+    ):
+        with pytest.raises(CheckpointError):
+            load()
+
+
+def test_text_that_is_too_large_is_not_read(tmp_path, monkeypatch):
+    run = make_run(tmp_path / "run")
+    with (run.path / "config.json").open("r+b") as file:
+        file.truncate(1 << 40)  # sparse
+    with pytest.raises(CheckpointError, match="at most 64 MB, got 1048576 MB"):
+        run.config()
+    shutil.copy(run.log, tmp_path / "log.csv")
+    with run.log.open("r+b") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(CheckpointError, match="at most 64 MB"):
+        run.rows()
+
+
+def test_tensors_that_are_too_large_are_not_read(tmp_path):
+    small_model().save_pretrained(tmp_path)
+    with (tmp_path / "model.safetensors").open("r+b") as file:
+        file.truncate(1 << 42)
+    with pytest.raises(CheckpointError, match="at most 4096 MB"):
+        LCSModel.from_pretrained(tmp_path)
+
+
+def test_a_pipe_does_not_hang(tmp_path):
+    small_model().save_pretrained(tmp_path)
+    (tmp_path / "config.json").unlink()
+    os.mkfifo(tmp_path / "config.json")
+    with pytest.raises(CheckpointError, match="plain file"):
+        LCSModel.from_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"iteration,loss\n0,\xff\n", b"loss\n1\n", b"iteration,loss\nx,1\n", b"iteration,loss\n1,x\n",
+     b"iteration\n" + b"9" * 200_000 + b"\n"],
+)  # fmt: skip
+def test_a_foreign_log_is_refused(tmp_path, content):
+    run = make_run(tmp_path / "run")
+    run.log.write_bytes(content)
+    for load in (run.rows, lambda: run.truncate_log(3)):
+        with pytest.raises(CheckpointError, match=r"log\.csv"):
+            load()
+    assert run.log.read_bytes() == content
+
+
+@pytest.mark.parametrize("name", [1, True, 1.0, "²", "１", " 1", "1" * 5000, "-1", "", None, ["000001"], {}])
+def test_the_name_of_the_latest_checkpoint(tmp_path, name):
+    save_checkpoint(tmp_path, Checkpoint(1, small_model(), {}, {}))
+    write(tmp_path / "latest.json", {"checkpoint": name})
+    with pytest.raises(CheckpointError, match="expected"):
+        load_checkpoint(tmp_path)
+    (tmp_path / "²").mkdir()
+    save_checkpoint(tmp_path, Checkpoint(2, small_model(), {}, {}))  # does not take it for a number
+
+
+# --- records with a right checksum ------------------------------------------------------------------------------------
+
+
+def test_any_value_in_any_field(record):
+    path, load = record
+    header = json.loads((path / "config.json").read_text())
+    for place in paths_of(header):
+        for value in VALUES:
+            changed = put(header, place, value)
+            if isinstance(changed, dict) and place[:2] != ("config", "sha256"):
+                if "sha256" in header["config"] and isinstance(changed.get("config"), dict):
+                    content = {k: v for k, v in changed["config"].items() if k != "sha256"}
+                    changed["config"]["sha256"] = checkpoint._hash(content)
+                signed(path, changed)
+            else:
+                write(path / "config.json", changed)
+            loads_or_refuses(load, path)
+
+
+def test_sizes_are_compared_before_anything_is_made(record):
+    path, load = record
+    header = json.loads((path / "config.json").read_text())
+    sizes = {"n_x", "n_u", "n_lam", "width", "networks", "n_features"}
+    for place in [p for p in paths_of(header) if sizes & set(p[-1:])]:
+        for size in (10**5, 10**9, 10**18):
+            changed = put(header, place, size)
+            if "sha256" in header["config"]:
+                content = {k: v for k, v in changed["config"].items() if k != "sha256"}
+                changed["config"]["sha256"] = checkpoint._hash(content)
+            signed(path, changed)
+            with pytest.raises(CheckpointError, match="expected"):
+                load(path)
+
+
+@pytest.mark.parametrize("name", ["float16", "bfloat16", "int64", "bool", "complex64", "float8_e5m2"])
+def test_tensors_of_another_type(record, name):
+    path, load = record
+    header = json.loads((path / "config.json").read_text())
+    tensors = {k: v.to(getattr(torch, name)) for k, v in load_file(path / "model.safetensors").items()}
+    save_file(tensors, path / "model.safetensors", metadata={"sha256": _files._hash(header, tensors)})
+    with pytest.raises(CheckpointError):
+        load(path)
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_tensors_that_are_not_finite(record, value):
+    path, load = record
+    header = json.loads((path / "config.json").read_text())
+    tensors = load_file(path / "model.safetensors")
+    for tensor in tensors.values():
+        tensor.view(-1)[0] = value
+    save_file(tensors, path / "model.safetensors", metadata={"sha256": _files._hash(header, tensors)})
+    with pytest.raises(CheckpointError, match="finite"):
+        load(path)
+
+
+def test_random_damage(record):
+    """Seeded: flipped bits, cuts, runs of random bytes, pieces swapped. The header of the tensors gets half of it."""
+    path, load = record
+    rng = random.Random(0)
+    for name in ("config.json", "model.safetensors"):
+        whole = (path / name).read_bytes()
+        for _ in range(150):
+            data = bytearray(whole)
+            end = len(data) if rng.random() < 0.5 else min(len(data), 300)
+            for _ in range(rng.choice((1, 1, 4, 40))):
+                data[rng.randrange(end)] = rng.randrange(256)
+            kind = rng.randrange(4)
+            if kind == 1:
+                del data[rng.randrange(len(data)) :]
+            elif kind == 2:
+                data[rng.randrange(end) : rng.randrange(end)] = rng.randbytes(rng.randrange(64))
+            (path / name).write_bytes(data)
+            loads_or_refuses(load, path)
+        (path / name).write_bytes(whole)
+    load(path)
+
+
+# --- settings of a run ------------------------------------------------------------------------------------------------
+
+
+def test_any_value_in_any_setting(tmp_path):
+    run = make_run(tmp_path / "run")
+    whole = run.config()
+    accepted, rng = set(), random.Random(0)
+    for place in paths_of(whole["config"], ("config",)):
+        for value in (True, *rng.sample(VALUES, 5)):
+            write(run.path / "config.json", put(whole, place, value))
+            if loads_or_refuses(stored_config, run) and value is True:
+                accepted.add(place)
+    flags = {("config", part, name) for part in ("ppo", "mlp") for name in ("natural", "learn_std")}
+    assert accepted <= flags  # true is no number
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [(("n_lam",), 10**9), (("minutes",), 1e12), (("seed",), 2**64), (("warmup", "random_rollouts"), 10**12),
+     (("ppo", "rollouts"), 10**9), (("ppo", "betas"), [0.9, 1.0]), (("ppo", "betas"), [0.9]), (("mlp", "width"), 10**9),
+     (("pddm", "width"), 10**9), (("pddm", "networks"), 10**9), (("imagination", "width"), 10**9),
+     (("evaluate_at",), "abc"), (("warmup", "held_out"), "0.2"), (("ppo", "std_range"), None)],
+)  # fmt: skip
+def test_settings_out_of_any_sane_range(tmp_path, place, value):
+    run = make_run(tmp_path / "run")
+    write(run.path / "config.json", put(run.config(), ("config", *place), value))
+    with pytest.raises(CheckpointError, match=place[-1]):
+        stored_config(run)
+
+
+def test_settings_that_are_out_of_range_are_refused_for_users_too():
+    with pytest.raises(InvalidInputError, match="n_lam: expected at most 1000"):
+        TrainConfig(n_lam=10**9)
+    with pytest.raises(InvalidInputError, match="seed: expected at most"):
+        TrainConfig(seed=10**30)
+    with pytest.raises(InvalidInputError, match="minutes: expected a finite number"):
+        TrainConfig(minutes=10**5000)
+
+
+@pytest.mark.parametrize("method", ["pddm", "ppo-mlp"])
+def test_a_checkpoint_that_does_not_fit_the_settings(tmp_path, method):
+    run = make_run(tmp_path / "run", method=method)
+    tensors = {"ensemble.x": torch.zeros(2), "network.x": torch.ones(1)}
+    save_checkpoint(run.checkpoints, Checkpoint(1, None, {}, tensors))
+    with pytest.raises(CheckpointError, match="fits its configuration"):
+        load_policy(run)
+
+
+# --- the zoo ----------------------------------------------------------------------------------------------------------
+
+
+def test_any_value_in_any_field_of_a_card(tmp_path):
+    card = json.loads((zoo.path("trifinger-cube") / "card.json").read_text())
+    for place in paths_of({k: v for k, v in card.items() if k != "settings"}):
+        for value in VALUES:
+            write(tmp_path / "card.json", put(card, place, value))
+            if loads_or_refuses(zoo._read, tmp_path / "card.json"):
+                known = zoo._read(tmp_path / "card.json")
+                assert str(known)
+                assert zoo.table([known])
+                assert known.object_mass > 0
+
+
+@pytest.mark.parametrize("found", [{}, {"name": 1}, {"name": "a", "source": "b", "mass": "heavy"}, {"mass": True}])
+def test_an_object_that_is_none(tmp_path, found):
+    run = make_run(tmp_path / "run")
+    write(run.path / "config.json", {**run.config(), "object": found})
+    with pytest.raises(CheckpointError, match="name, source and mass"):
+        zoo.Learned.open(run.path)
+
+
+def test_settings_come_back_with_and_without_json():
+    config = TrainConfig(evaluate_at=(0.2,))
+    assert TrainConfig.from_dict(asdict(config)) == config
+    assert TrainConfig.from_dict(json.loads(json.dumps(asdict(config)))) == config
