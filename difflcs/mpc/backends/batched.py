@@ -18,7 +18,6 @@ from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.mpc.solution import Primal
 from difflcs.status import Status
 
-
 # An iteration with row exchanges takes ten times as long, and what it can mend it mends soon.
 _MAX_ITER_PIVOT = 60
 
