@@ -100,7 +100,8 @@ def test_restarts_are_seeded_and_never_worse(build):
     one, four = pushing(build, 8)(x0, goal), pushing(build, 8, backend={"restarts": 4})(x0, goal)
     again = pushing(build, 8, backend={"restarts": 4})(x0, goal)
     other = pushing(build, 8, backend={"restarts": 4, "seed": 1})(x0, goal)
-    assert bool((four.objective <= one.objective).all())
+    # The kernel picks the better start, and torch reports its objective: two sums of some hundred terms, each rounded.
+    assert bool((four.objective <= one.objective * (1 + 1e-13)).all())
     assert bool((four.objective < one.objective - 1e-3).any())
     assert torch.equal(four.u, again.u)
     assert not torch.equal(four.u, other.u)

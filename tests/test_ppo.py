@@ -261,7 +261,9 @@ def test_long_gradients_of_single_samples_are_clipped():
         clipped = sum(factor * sample[k] for factor, sample in zip(factors, gradients, strict=True))
         torch.testing.assert_close(found[name], clipped + p.grad, rtol=1e-5, atol=1e-8)
     improve(other, data, rollouts)
-    assert torch.equal(trainer.actor.gaussian.log_std.grad, other.actor.gaussian.log_std.grad)
+    # One model for all samples or a copy for each: the same mathematics, by other products of matrices.
+    stds = [t.actor.gaussian.log_std.grad for t in (trainer, other)]
+    torch.testing.assert_close(*stds, rtol=1e-9, atol=0)
     assert any(not torch.allclose(found[name], p.grad, rtol=1e-2) for name, p in parameters.items())
 
 
@@ -622,12 +624,14 @@ def test_steps_on_real_episodes_are_shorter_beside_imagined_ones(monkeypatch):
 @pytest.mark.parametrize("actions", [1, 8])
 def test_imagination_learns_from_less_data(actions):
     def success(trainer):
+        # Short steps: with the usual ones rounding decides in one training of twelve whether a late step ruins it.
+        trainer.config = replace(trainer.config, target_kl=0.02)
         while not trainer.done:
             trainer.step()
         return evaluate(make_envs(60), trainer.policy, 60, 0, STEPS).success_rate
 
     settings = {"iterations": 12, "rollouts": 30, "first_epochs": 100, "actions": actions}
-    seeds = range(3)  # the last step of this small system is long: single trainings vary
+    seeds = range(3)
     alone = np.mean([success(make_ppo(seed)) for seed in seeds])
     imagining = np.mean([success(make_imagining(seed, **settings)) for seed in seeds])
     assert imagining > alone + 0.15

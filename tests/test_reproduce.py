@@ -233,10 +233,13 @@ def cluster(tmp_path):
                 address = json.loads(file.read_text())["address"]
         yield address
     finally:
-        for process in reversed(processes):
+        for process in reversed(processes):  # the worker first: it takes leave of its scheduler, and may hang without
             process.terminate()
-        for process in processes:
-            process.wait(60)
+            try:
+                process.wait(30)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
 
 def test_a_cluster_that_runs_already(cluster, undisturbed, tmp_path):
