@@ -150,8 +150,9 @@ def test_planner_moves_toward_the_goal_within_bounds():
     assert action[1] < -0.05
     assert abs(action[2]) < 0.03
     assert bool((action.abs() <= U_MAX).all())
-    plan.begin()
-    assert bool((plan(state, goal, u_min=-bound, u_max=bound).action.abs() <= 0.02).all())
+    for _ in range(30):  # it plans in single precision, which rounds half of the plans across a bound
+        plan.begin()
+        assert bool((plan(state, goal, u_min=-bound, u_max=bound).action.abs() <= 0.02).all())
 
 
 def test_planner_remembers_until_it_begins_anew():

@@ -12,7 +12,7 @@ namespace {
 template <class T, int N>
 struct Lcp {
   const LcpBatch& batch;
-  T *F, *scale;
+  T *F, *scale, *inverse;  // inverse of scale
   Vec *M, *q, *lam, *w, *rhs, *bound;
   Mask* active;
 
@@ -26,7 +26,8 @@ struct Lcp {
       p += count;
       return r;
     };
-    F = reinterpret_cast<T*>(take(n * n)), scale = reinterpret_cast<T*>(take(n)), M = take(n * n);
+    F = reinterpret_cast<T*>(take(n * n)), M = take(n * n);
+    scale = reinterpret_cast<T*>(take(n)), inverse = reinterpret_cast<T*>(take(n));
     q = take(n), lam = take(n), w = take(n), rhs = take(n), bound = take(n), active = reinterpret_cast<Mask*>(take(n));
     if constexpr (sizeof(T) == sizeof(double)) load_matrix(0, 0);
   }
@@ -34,8 +35,10 @@ struct Lcp {
   void load_matrix(int64_t e, int lane) {
     const int64_t n = size();
     const double* from = batch.F + e * batch.F_stride;
-    for (int64_t i = 0; i < n; i++)
-      put(scale, i, lane, from[i * n + i] > 0 ? 1.0 / __builtin_sqrt(from[i * n + i]) : 1.0);
+    for (int64_t i = 0; i < n; i++) {
+      const double root = from[i * n + i] > 0 ? __builtin_sqrt(from[i * n + i]) : 1.0;
+      put(scale, i, lane, 1.0 / root), put(inverse, i, lane, root);
+    }
     for (int64_t i = 0; i < n; i++)
       for (int64_t j = 0; j < n; j++)
         put(F, i * n + j, lane, from[i * n + j] * (lane_of(scale[i], lane) * lane_of(scale[j], lane)));
@@ -105,17 +108,17 @@ struct Lcp {
   // scaled units. Call after `slack` has found w and bound for this lam; `returned` is the w that the caller will get.
   Mask certified(const Vec* returned, Vec unit, Vec relaxation) const {
     const int64_t n = size();
-    Vec largest = all(0);  // of q, in the caller's units
-    for (int64_t i = 0; i < n; i++) largest = max(largest, (abs(q[i]) * unit + sqrt(relaxation) * unit) / scale[i]);
+    const Vec root = sqrt(relaxation);
+    Vec largest = all(0);  // of q, in the caller's units over `unit`
+    for (int64_t i = 0; i < n; i++) largest = max(largest, (abs(q[i]) + root) * inverse[i]);
     Mask ok = ~Mask{};
     for (int64_t i = 0; i < n; i++) {
-      const Vec missed = abs(w[i] - returned[i]), force = lam[i] * unit * scale[i], gap = returned[i] * unit / scale[i];
+      const Vec missed = abs(w[i] - returned[i]), one = all(0) + scale[i];
       const Vec total = missed + kRounding * bound[i];  // what a caller may find, who adds in another order
-      ok &= missed <= kLcpTerms * bound[i];
-      ok &= total <= kLcpData * (1.0 + sqrt(relaxation));
-      ok &= total * unit / scale[i] <= kLcpData * largest;
-      ok &= (force >= 0) & (force <= kLargest) & (gap >= 0) & (gap <= kLargest);
-      ok &= (all(0) + scale[i] <= 1 / __builtin_sqrt(kSmallest)) & (all(0) + scale[i] >= __builtin_sqrt(kSmallest));
+      ok &= (missed <= kLcpTerms * bound[i]) & (total <= kLcpData * (1.0 + root));
+      ok &= (total * inverse[i] <= kLcpData * largest) & (lam[i] >= 0) & (returned[i] >= 0);
+      ok &= (max(lam[i] * one, returned[i] * inverse[i]) * unit <= kLargest);
+      ok &= (one * __builtin_sqrt(kSmallest) <= 1) & (one >= __builtin_sqrt(kSmallest));
     }
     return ok;
   }
@@ -282,7 +285,7 @@ void dispatch(const LcpBatch& batch, void* memory, Function f) {
 
 }  // namespace
 
-int64_t lcp_workspace(int64_t n) { return static_cast<int64_t>(sizeof(Vec)) * (2 * n * n + 7 * n); }
+int64_t lcp_workspace(int64_t n) { return static_cast<int64_t>(sizeof(Vec)) * (2 * n * n + 8 * n); }
 
 void lcp_exact(const LcpBatch& batch, int64_t begin, int64_t end, void* memory, Watch watch) {
   // Compile-time sizes for the violation loss of the paper's tasks: twice their number of contacts.

@@ -108,8 +108,8 @@ class Planner:
 
     def __call__(self, x0: Tensor, goal: Tensor, *, u_min: Tensor | None = None, u_max: Tensor | None = None) -> Plan:
         """Plan from states (B, n_x) to goals (B, n_goal); the batch must not change between two `begin`."""
-        low = (self.u_min if u_min is None else u_min).float()
-        high = (self.u_max if u_max is None else u_max).float()
+        bounds = (self.u_min if u_min is None else u_min), (self.u_max if u_max is None else u_max)
+        low, high = (bound.float() for bound in bounds)
         batch, n_u, horizon = len(x0), len(low), self.config.horizon
         mean = torch.zeros(batch, horizon, n_u) if self._mean is None else self._mean
         if len(mean) != batch:
@@ -118,7 +118,8 @@ class Planner:
             planned = torch.stack([self._improve(*one, low, high) for one in zip(x0, goal, mean, strict=True)])
         # The plan one step later, its last step repeated.
         self._mean = torch.cat([planned[:, 1:], planned[:, -1:]], 1)
-        return Plan(planned[:, 0].double(), torch.ones(batch, dtype=torch.bool))
+        # A mean of single precision may leave the bounds by its rounding: 0.1 by up to 1e-8.
+        return Plan(planned[:, 0].double().clamp(*bounds), torch.ones(batch, dtype=torch.bool))
 
     def _improve(self, x0: Tensor, goal: Tensor, mean: Tensor, low: Tensor, high: Tensor) -> Tensor:
         """The next plan (horizon, n_u) of one episode. One at a time: 700 sequences fill the cache."""
