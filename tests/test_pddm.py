@@ -150,8 +150,8 @@ def test_planner_moves_toward_the_goal_within_bounds():
     assert action[1] < -0.05
     assert abs(action[2]) < 0.03
     assert bool((action.abs() <= U_MAX).all())
-    for _ in range(30):  # it plans in single precision, which rounds half of the plans across a bound
-        plan.begin()
+    for seed in range(30):  # it plans in single precision, which rounds half of the plans across a bound
+        plan.begin(seed)
         assert bool((plan(state, goal, u_min=-bound, u_max=bound).action.abs() <= 0.02).all())
 
 

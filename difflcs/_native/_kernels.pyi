@@ -23,6 +23,9 @@ def solve_mpc(
     shrink: float,
     tol: float,
     max_iter: int,
+    certified: float,
+    pivot: bool,
+    time_limit: float,
     threads: int,
     x: np.ndarray,
     u: np.ndarray,
@@ -30,6 +33,7 @@ def solve_mpc(
     objective: np.ndarray,
     residual: np.ndarray,
     status: np.ndarray,
+    fragile: np.ndarray,
     iterations: np.ndarray,
 ) -> None: ...
 def vjp_mpc(
@@ -45,6 +49,7 @@ def vjp_mpc(
     lam_bar: np.ndarray,
     objective_bar: np.ndarray,
     solved: np.ndarray,
+    pivot: bool,
     threads: int,
     gradients: list[np.ndarray],
 ) -> None: ...
