@@ -13,6 +13,9 @@ from difflcs.lcs import LCSModel
 from difflcs.status import Status
 
 
+_GAMMA_LEAST = 4e-13
+
+
 def violation_loss(
     lcs: LCSModel,
     x: Tensor,
@@ -51,7 +54,9 @@ def violation_loss(
         Scalar, or (...,) with reduction="none"; differentiable in the parameters, x, u and x_next.
 
     Raises:
-        GammaError: γ is outside its range; the message names γ and σ_min(F + Fᵀ).
+        GammaError: γ is outside its range, or γ or γξ is too small for double precision: γ σ_min(F + Fᵀ) below 4e-13
+            n_lam times the largest squared column of F loses the digits of the loss, and rounding e/(γξ) by more than
+            1e-6 of the Cᵀr that it balances those of its gradient. The message names the limits.
         ShapeError, DTypeError, DeviceError, NonFiniteError, InvalidInputError: the arguments do not fit.
     """
     check_choice("reduction", reduction, ("mean", "none"))
@@ -134,6 +139,13 @@ def _check_gamma(F: Tensor, gamma: float, refuse_large: bool) -> None:
             f"gamma: expected 0 < gamma <= sigma_min(F + F^T) = {smallest:.6g}, got {gamma:.6g}; lower gamma, "
             f"raise the model's stiffness (sigma_min >= 2*stiffness), or pass check_gamma=False to keep a fixed gamma"
         )
+    # FᵀF/γ stands beside F + Fᵀ in the inner QP: their difference has to survive the rounding.
+    least = _GAMMA_LEAST * len(F) * float(F.detach().double().square().sum(0).max()) / smallest
+    if gamma < least:
+        raise GammaError(
+            f"gamma: expected at least {least:.3g} for this F in double precision, got {gamma:.3g}; raise gamma, or the "
+            f"model's stiffness"
+        )
 
 
 class _ViolationLoss(torch.autograd.Function):
@@ -156,12 +168,18 @@ class _ViolationLoss(torch.autograd.Function):
         Q, q, z = np.empty((2 * n, 2 * n)), np.empty((count, 2 * n)), np.empty((count, 2 * n))
         r, e, loss = np.empty(x.shape), np.empty((count, n)), np.empty(count)
         limit, threads = MAX_ITER["exact"], torch.get_num_threads()
-        if not _kernels.violation_loss(arrays, gamma, xi, limit, threads, Q, q, z, r, e, loss):
+        held = _kernels.violation_loss(arrays, gamma, xi, limit, threads, Q, q, z, r, e, loss)
+        if held is None:
             # A number that is not finite, a γ at or above its bound, or an empty batch.
             _check_numbers(lcs, tensors[:8], (x, u, x_next))
             _check_gamma(F, gamma, refuse_large)
             z = _minimise_over_orthant(Q, q)
-            _kernels.violation_value(arrays, gamma, xi, z, r, e, loss)
+            held = _kernels.violation_value(arrays, gamma, xi, z, r, e, loss)
+        if not held:
+            raise GammaError(
+                f"gamma, xi: expected a product that double precision resolves for these data, got {gamma:.3g} · {xi:.3g}: "
+                f"e/(γξ) has lost the digits of the gradient; raise xi or gamma"
+            )
         ctx.mean, ctx.solution = mean, (arrays, gamma, xi, z, r, e)
         # The arrays look into these tensors; autograd refuses them where they were changed in place.
         x_needs, u_needs = ctx.needs_input_grad[13:15]
@@ -197,15 +215,16 @@ class _ViolationLoss(torch.autograd.Function):
 
 def _minimise_over_orthant(Q: np.ndarray, q: np.ndarray, max_iter: int = 500) -> np.ndarray:
     """Minimise ½ zᵀQz + qᵀz over z ≥ 0 for each row of q (B, m): exact for Q ≻ 0, else a stationary point."""
-    scale = float(np.abs(np.diag(Q)).max())
+    unit = 1 / np.sqrt(np.diag(Q))  # of each variable, so that Q has a unit diagonal
+    Q, q = unit[:, None] * Q * unit, q * unit
     smallest = float(np.linalg.eigvalsh(Q)[0])
-    if smallest > 1e-13 * scale:
+    if smallest > 1e-13:
         z, _, status = solve_lcp_arrays(Q, q)
         _require_solved(status)
-        return z
+        return z * unit
     # γ at or above its bound: Q is singular or indefinite. Proximal steps z ← argmin ½zᵀQz + qᵀz + ½ρ‖z − z₋‖²
     # decrease the objective monotonically, and each is an LCP with a positive definite matrix.
-    rho = max(1e-6 * scale, -1.1 * smallest)
+    rho = max(1e-6, -1.1 * smallest)
     proximal = Q + rho * np.eye(len(Q))
     z = np.zeros_like(q)
     for _ in range(max_iter):
@@ -213,9 +232,9 @@ def _minimise_over_orthant(Q: np.ndarray, q: np.ndarray, max_iter: int = 500) ->
         _require_solved(status)
         change = np.abs(step - z).max(initial=0.0)
         z = step
-        if rho * change <= 1e-10 * max(1.0, np.abs(q).max(initial=0.0)):
-            break
-    return z
+        if rho * change <= 1e-10 * np.abs(q).max(initial=0.0):
+            return z * unit
+    return z * unit  # a descent from zero that has not settled; only an indefinite Q needs that many steps
 
 
 def _require_solved(status: np.ndarray) -> None:

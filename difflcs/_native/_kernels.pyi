@@ -65,7 +65,7 @@ def violation_loss(
     r: np.ndarray,
     e: np.ndarray,
     loss: np.ndarray,
-) -> bool: ...
+) -> bool | None: ...
 def violation_value(
     inputs: list[np.ndarray],
     gamma: float,
@@ -74,7 +74,7 @@ def violation_value(
     r: np.ndarray,
     e: np.ndarray,
     loss: np.ndarray,
-) -> None: ...
+) -> bool: ...
 def violation_gradient(
     inputs: list[np.ndarray],
     gamma: float,

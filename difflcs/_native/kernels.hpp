@@ -77,6 +77,9 @@ struct MpcGradient {
   int64_t offset[kInputs];  // position of each shared input inside a partial sum
 };
 
+// Least gamma sigma_min(F + F^T), in parts of n_lam times the largest diagonal entry of F^T F (difflcs.losses).
+constexpr double kGammaLeast = 4e-13;
+
 // Transitions and the system they are compared with, in the order of difflcs.losses. All arrays are row-major.
 enum ViolationInput { vA, vB, vC, vd, vD, vE, vF, vc, vx, vu, vx_next, kViolationInputs };
 
@@ -106,10 +109,10 @@ struct Kernels {
   int64_t (*violation_workspace)(const ViolationBatch& batch);
   // r and e at z = 0, and the QP min z'Qz / 2 + q'z over z >= 0: Q (2 n_lam, 2 n_lam) shared by the batch and
   // q (count, 2 n_lam). Returns whether they are finite, F + F^T - gamma I is positive definite and Q is so by a
-  // margin.
+  // margin, and gamma is not too small for double precision.
   bool (*violation_qp)(const ViolationBatch& batch, double* Q, double* q, void* workspace);
-  // r, e and loss (count,) at z (count, 2 n_lam), from r and e at z = 0.
-  void (*violation_value)(const ViolationBatch& batch, const double* z, double* loss, void* workspace);
+  // r, e and loss (count,) at z (count, 2 n_lam), from r and e at z = 0. Returns whether e has digits that count.
+  bool (*violation_value)(const ViolationBatch& batch, const double* z, double* loss, void* workspace);
   // Gradients of sum(upstream * loss) with z held; those of x, u and x_next only where they are not null.
   void (*violation_gradient)(const ViolationBatch& batch, const double* z, const double* upstream,
                              double* const gradient[kViolationInputs], void* workspace);

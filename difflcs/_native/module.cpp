@@ -325,9 +325,10 @@ void pass(difflcs::ViolationBatch& b, Work work) {
   });
 }
 
-// The minimiser z and the values there. False where the inputs are not finite, the QP is not convex by a margin, there
-// are no transitions, or the solver failed: then r, e, Q and q are those at z = 0, and z and loss are not set.
-bool violation_loss(Inputs inputs, double gamma, double xi, int64_t max_iter, int threads, Output<double> Q,
+// The minimiser z and the values there. No answer where the inputs are not finite, the QP is not convex by a margin,
+// there are no transitions, or the solver failed: then r, e, Q and q are those at z = 0, and z and loss are not set.
+// Else whether double precision suffices.
+std::optional<bool> violation_loss(Inputs inputs, double gamma, double xi, int64_t max_iter, int threads, Output<double> Q,
                     Output<double> q, Output<double> z, Output<double> r, Output<double> e, Output<double> loss) {
   difflcs::ViolationBatch b = violation_batch(inputs, gamma, xi, r, e);
   const int64_t n = 2 * b.n_lam;
@@ -335,7 +336,7 @@ bool violation_loss(Inputs inputs, double gamma, double xi, int64_t max_iter, in
   check_size("loss", loss.size(), b.count);
   bool convex = false;
   pass(b, [&](void* workspace) { convex = difflcs::kernels().violation_qp(b, Q.data(), q.data(), workspace); });
-  if (!convex || b.count == 0) return false;
+  if (!convex || b.count == 0) return std::nullopt;
   std::vector<double> w(b.count * n);
   std::vector<int8_t> status(b.count);
   std::vector<int32_t> iterations(b.count);
@@ -344,17 +345,20 @@ bool violation_loss(Inputs inputs, double gamma, double xi, int64_t max_iter, in
   Stop stop;
   solve(lcp, b.count, threads, stop);
   for (const int8_t s : status)
-    if (s != static_cast<int8_t>(difflcs::Status::converged)) return false;
-  pass(b, [&](void* workspace) { difflcs::kernels().violation_value(b, z.data(), loss.data(), workspace); });
-  return true;
+    if (s != static_cast<int8_t>(difflcs::Status::converged)) return std::nullopt;
+  bool held = false;
+  pass(b, [&](void* workspace) { held = difflcs::kernels().violation_value(b, z.data(), loss.data(), workspace); });
+  return held;
 }
 
-void violation_value(Inputs inputs, double gamma, double xi, Array z, Output<double> r, Output<double> e,
+bool violation_value(Inputs inputs, double gamma, double xi, Array z, Output<double> r, Output<double> e,
                      Output<double> loss) {
   difflcs::ViolationBatch b = violation_batch(inputs, gamma, xi, r, e);
   check_size("z", z.size(), 2 * b.n_lam * b.count), check_size("loss", loss.size(), b.count);
-  if (b.count == 0) return;
-  pass(b, [&](void* workspace) { difflcs::kernels().violation_value(b, z.data(), loss.data(), workspace); });
+  bool held = true;
+  if (b.count > 0)
+    pass(b, [&](void* workspace) { held = difflcs::kernels().violation_value(b, z.data(), loss.data(), workspace); });
+  return held;
 }
 
 void violation_gradient(Inputs inputs, double gamma, double xi, Array z, Output<double> r, Output<double> e,

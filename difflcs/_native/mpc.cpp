@@ -28,6 +28,8 @@ constexpr double kStationary = 1e-7;
 constexpr double kFlat = 1e-3;
 // A reduced Hessian is singular below this part of an action's own curvature (difflcs.mpc.kkt has the same).
 constexpr double kSingular = 1e-10;
+// An action with a barrier is differentiated as one at its bound below this part of its range (kkt has the same).
+constexpr double kClose = 1e-8;
 // Failed searches in a row, each with 8 times the damping, before a problem is given up.
 constexpr int64_t kFailures = 12;
 
@@ -508,7 +510,12 @@ struct Mpc {
           low[k * nu + j] = (below <= near) & (reach >= below) & (g > 0);
           upp[k * nu + j] = (above <= near) & (-reach >= above) & (g < 0);
         }
-        if (batch.barrier > 0) low[k * nu + j] = upp[k * nu + j] = Mask{};
+        if (batch.barrier > 0) {
+          // A barrier that keeps no distance to speak of is the bound itself; its steepness is then only rounding.
+          const Vec close = max(kClose * width, 1e-3 * kClose * max(abs(lo[j]), abs(hi[j])));
+          low[k * nu + j] = kAdjoint ? (below <= close) & (below <= above) : Mask{};
+          upp[k * nu + j] = kAdjoint ? (above <= close) & (above < below) : Mask{};
+        }
         act[k * nu + j] = low[k * nu + j] | upp[k * nu + j] | fixed;
       }
       for (int64_t i = 0; i < nx; i++) {
@@ -898,15 +905,14 @@ void Mpc<T, S>::forward_adjoint(const MpcGradient& o, int64_t group, int64_t end
       for (int64_t i = 0; i < nu; i++) t -= R[j * nu + i] * dw[nx + i], g += R[j * nu + i] * uk[i];
       for (int64_t i = 0; i < nx; i++) t -= AB[i * nw + nx + j] * dp[i], g += AB[i * nw + nx + j] * pk[i];
       for (int64_t i = 0; i < nl; i++) t -= DE[i * nw + nx + j] * drho[i], g += DE[i * nw + nx + j] * rho[i];
+      t += jb * g;
+      Vec by_low = all(0), by_high = all(0);
       if (batch.barrier > 0) {
         const Vec below = uk[j] - lo[j], above = hi[j] - uk[j], du = dw[nx + j];
-        sink.add(kumin, j, mu * (du / (below * below) + jb / below));
-        sink.add(kumax, j, mu * (du / (above * above) - jb / above));
-        continue;
+        by_low = mu * (du / (below * below) + jb / below), by_high = mu * (du / (above * above) - jb / above);
       }
-      t += jb * g;
-      sink.add(kumin, j, select(low[k * nu + j], t, all(0)));
-      sink.add(kumax, j, select(upp[k * nu + j], t, all(0)));
+      sink.add(kumin, j, select(low[k * nu + j], t, by_low));
+      sink.add(kumax, j, select(upp[k * nu + j], t, by_high));
     }
     for (int64_t i = 0; i < nx; i++) dp[i] -= jb * pk[i];
     for (int64_t i = 0; i < nl; i++) drho[i] -= jb * rho[i];

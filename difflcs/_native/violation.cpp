@@ -93,11 +93,22 @@ struct Violation {
         Q[(n + i) * m + n + j] = i == j ? weight : 0.0;
       }
     for (int64_t i = 0; i < m; i++) largest = Q[i * m + i] > largest ? Q[i * m + i] : largest;
-    for (int64_t i = 0; i < m * m; i++) matrix[i] = Q[i] - (i % (m + 1) == 0 ? 1e-13 * largest : 0.0);
+    // By a margin in units of each variable's own curvature.
+    for (int64_t i = 0; i < m * m; i++) matrix[i] = Q[i] - (i % (m + 1) == 0 ? 1e-13 * Q[i] : 0.0);
     bool convex = largest < 1e300 && positive_definite(m, matrix);
-    for (int64_t i = 0; i < n; i++)
-      for (int64_t j = 0; j < n; j++) matrix[i * n + j] = F[i * n + j] + F[j * n + i] - (i == j ? batch.gamma : 0.0);
-    return convex && positive_definite(n, matrix);
+    auto above = [&](double smallest) {  // whether sigma_min(F + F^T) exceeds it
+      for (int64_t i = 0; i < n; i++)
+        for (int64_t j = 0; j < n; j++) matrix[i * n + j] = F[i * n + j] + F[j * n + i] - (i == j ? smallest : 0.0);
+      return positive_definite(n, matrix);
+    };
+    // F^T F / gamma stands beside F + F^T: their difference has to survive the rounding.
+    double squares = 0;
+    for (int64_t i = 0; i < n; i++) {
+      double sum = 0;
+      for (int64_t k = 0; k < n; k++) sum += F[k * n + i] * F[k * n + i];
+      squares = sum > squares ? sum : squares;
+    }
+    return convex && above(batch.gamma) && above(kGammaLeast * double(n) * squares / batch.gamma);
   }
 
   // q = (C^T r + F^T e / (gamma xi), -e / (gamma xi)) with r and e at z = 0.
@@ -119,21 +130,46 @@ struct Violation {
     return !any(invalid != 0);
   }
 
-  void value(const double* solution, double* loss) {
+  // Also whether rounding e, which is divided by gamma xi, leaves its digits: as the dual variable of the contacts,
+  // F^T e / (gamma xi) balances C^T r.
+  bool value(const double* solution, double* loss) {
     const Vec *lam = z, *phi = z + n_lam;
+    Mask lost = Mask{};
     for (int64_t first = 0; first < batch.count && !halted(first); first += kLanes) {
       load(r, batch.r, n_x, first), load(e, batch.e, n_lam, first), load(z, solution, 2 * n_lam, first);
+      Vec *r_terms = x, *e_terms = out, *balance = out + n_lam;
+      for (int64_t i = 0; i < n_x; i++) {
+        r_terms[i] = abs(r[i]);
+        for (int64_t j = 0; j < n_lam; j++) r_terms[i] += abs(C[i * n_lam + j] * lam[j]);
+      }
+      for (int64_t i = 0; i < n_lam; i++) {
+        e_terms[i] = abs(e[i]) + phi[i], balance[i] = all(0);
+        for (int64_t j = 0; j < n_lam; j++) e_terms[i] += abs(F[i * n_lam + j] * lam[j]);
+      }
+      for (int64_t j = 0; j < n_x; j++)
+        for (int64_t i = 0; i < n_lam; i++) balance[i] += abs(C[j * n_lam + i] * r_terms[j]);
+      Vec noise = all(0), signal = all(0);
+      for (int64_t i = 0; i < n_lam; i++) {
+        Vec rounding = all(0);
+        for (int64_t j = 0; j < n_lam; j++)
+          rounding += select(phi[j] > 0, all(0), abs(F[j * n_lam + i] * e_terms[j]));
+        noise = max(noise, select(lam[i] > 0, kRounding * weight * rounding, all(0)));
+        signal = max(signal, balance[i]);
+      }
+      lost |= (noise > 1e-6 * signal) & (signal > 0);
       add_product(r, C, lam, n_x, n_lam), add_product(e, F, lam, n_lam, n_lam);
       Vec rr = all(0), ee = all(0), product = all(0);
       for (int64_t i = 0; i < n_x; i++) rr += r[i] * r[i];
       for (int64_t i = 0; i < n_lam; i++) {
-        e[i] -= phi[i];
+        // Where phi is free, e = gamma lam by stationarity, without the rounding of a difference.
+        e[i] = select(phi[i] > 0, batch.gamma * lam[i], e[i] - phi[i]);
         ee += e[i] * e[i];
         product += lam[i] * phi[i];
       }
       const Vec total = 0.5 * rr + (product + ee / (2 * batch.gamma)) / batch.xi;
       store(batch.r, r, n_x, first), store(batch.e, e, n_lam, first), store(loss, &total, 1, first);
     }
+    return !any(lost);
   }
 
   // r and e are linear in every input, and by the envelope theorem z does not move.
@@ -195,8 +231,8 @@ bool violation_qp(const ViolationBatch& batch, double* Q, double* q, void* works
   return violation.gradients_at_zero(q) && convex;
 }
 
-void violation_value(const ViolationBatch& batch, const double* z, double* loss, void* workspace) {
-  Violation(batch, workspace).value(z, loss);
+bool violation_value(const ViolationBatch& batch, const double* z, double* loss, void* workspace) {
+  return Violation(batch, workspace).value(z, loss);
 }
 
 void violation_gradient(const ViolationBatch& batch, const double* z, const double* upstream,

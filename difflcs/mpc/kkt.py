@@ -62,6 +62,8 @@ _WEAK = 1e-5
 # A reduced Hessian counts as singular below this pivot, in units of each action's own curvature. Directions below it
 # are held: their sensitivity is zero.
 _SINGULAR = 1e-10
+# An action with a barrier is differentiated as one at its bound below this part of its range.
+_CLOSE = 1e-8
 
 
 @dataclass(frozen=True)
@@ -265,7 +267,12 @@ def linearise(problem: MPCProblem, primal: Primal) -> Linearisation:
         upper = (-step > to_upper) | ((width <= 0) & (g < 0))
         weak = (torch.minimum(to_lower, to_upper) <= _WEAK * width) & (step.abs() <= _WEAK * width) & (width > 0)
         if problem.barrier > 0:
-            lower, upper, weak = (torch.zeros_like(v) for v in (lower, upper, weak))
+            # A barrier that keeps no distance to speak of is the bound itself; its steepness is then only rounding.
+            largest = torch.maximum(problem.u_min.abs(), problem.u_max.abs())
+            close = torch.maximum(_CLOSE * width, 1e-3 * _CLOSE * largest)
+            lower = (to_lower <= close) & (to_lower <= to_upper)
+            upper = (to_upper <= close) & (to_upper < to_lower)
+            weak = torch.zeros_like(weak)
         free = ~(lower | upper)
         L, singular = _cholesky(Q_uu, free)
         degenerate |= weak.any(-1) | singular
@@ -412,13 +419,15 @@ def vjp(
 
     # Bounds: −wᵀK_θ of the rows u − bound = 0, and ∂L/∂bound = −ν = g for the objective. With a barrier, the same
     # for the terms of g and of J that hold the bounds.
+    gradient, lower_bar, upper_bar = dual.gradient, torch.zeros_like(u), torch.zeros_like(u)
     if problem.barrier > 0:
         below, above = problem.distances(lin.primal.u)
+        gradient = gradient - problem.barrier * (1 / above - 1 / below)
         lower_bar = keep(problem.barrier * (w.u / below.square() + objective_bar[:, None, None] / below))
         upper_bar = keep(problem.barrier * (w.u / above.square() - objective_bar[:, None, None] / above))
-    else:
-        bound = keep(w.nu + objective_bar[:, None, None] * dual.gradient)
-        lower_bar, upper_bar = bound * lin.lower, bound * lin.upper
+    bound = keep(w.nu + objective_bar[:, None, None] * gradient)
+    lower_bar = torch.where(lin.lower, bound, lower_bar)
+    upper_bar = torch.where(lin.upper, bound, upper_bar)
     x0_bar = matvec(problem.A.mT, dp[:, 0]) + matvec(problem.D.mT, drho[:, 0])
     x0_cost = matvec(problem.Q, x[:, 0]) + problem.q
     return {
@@ -464,8 +473,9 @@ def polish(problem: MPCProblem, primal: Primal, max_iter: int = 6, tol: float = 
             break
         if step > 0:
             u = lin.primal.u + _solve(problem, lin, zeros[0], -lin.multipliers.gradient, zeros[1]).u
-        u = torch.where(lin.lower, problem.u_min.unsqueeze(-2), u)
-        u = torch.where(lin.upper, problem.u_max.unsqueeze(-2), u)
+        if problem.barrier == 0:
+            u = torch.where(lin.lower, problem.u_min.unsqueeze(-2), u)
+            u = torch.where(lin.upper, problem.u_max.unsqueeze(-2), u)
         # With a barrier a step goes at most nine tenths of the way to a bound.
         u = problem.clip(u) if problem.barrier == 0 else problem.clip_inside(u, lin.primal.u)
         x, lam = problem.rollout(u)
