@@ -139,7 +139,9 @@ class _SolveLCP(torch.autograd.Function):
         # Strictly complementary: b = λ/(λ+w). At λ = w = 0 the index counts as inactive: b = 0, a = 1.
         b = torch.where(total > 0, lam / total.clamp_min(torch.finfo(lam.dtype).tiny), torch.zeros_like(lam))
         b = torch.where(solved, b, torch.zeros_like(b))
-        M = torch.diag_embed(1 - b) + b.unsqueeze(-1) * F
+        # a = w/(λ+w), not 1 − b, which has no digits left where λ is 1e10 times w.
+        a = torch.where(b > 0, w / total.clamp_min(torch.finfo(lam.dtype).tiny), torch.ones_like(b))
+        M = torch.diag_embed(a) + b.unsqueeze(-1) * F
         lam_bar = lam_bar + (w_bar.unsqueeze(-2) @ F).squeeze(-2)
         v = torch.linalg.solve_ex(M.mT, lam_bar)[0]
         # Rounding can make M singular where F is hardly positive definite: no gradient then, rather than NaN.

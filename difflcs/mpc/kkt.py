@@ -201,7 +201,8 @@ def _backward(problem: MPCProblem, primal: Primal) -> tuple[Multipliers, list[tu
     s = problem.gap(*(v.transpose(0, 1) for v in (x[:, :-1], u, lam))).transpose(0, 1)
     size = lam + s
     b = lam / size
-    M = torch.diag_embed(1 - b) + b.unsqueeze(-1) * (problem.F if problem.shared("F") else problem.F.unsqueeze(1))
+    # a = s/(λ+s), not 1 − b, which has no digits left where λ is 1e10 times s.
+    M = torch.diag_embed(s / size) + b.unsqueeze(-1) * (problem.F if problem.shared("F") else problem.F.unsqueeze(1))
     factors, pivots, _ = torch.linalg.lu_factor_ex(M)
     stages = [(factors[:, k], pivots[:, k], size[:, k]) for k in range(problem.horizon)]
     p = [matvec(problem.Q_final, x[:, -1]) + problem.q_final]

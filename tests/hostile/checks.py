@@ -211,7 +211,7 @@ def reduced_gradient(
     p_noise = rounding * (_mv(size["Q_final"], np.abs(x[:, -1])) + size["q_final"])
     steps = []
     for k in reversed(range(u.shape[1])):
-        matrix = b[:, k, :, None] * _t(a["F"]) + np.eye(lam.shape[-1]) * (1 - b[:, k, :, None])
+        matrix = b[:, k, :, None] * _t(a["F"]) + np.eye(lam.shape[-1]) * (s / (lam + s))[:, k, :, None]
         rho = _solve(matrix, -b[:, k] * _mv(_t(a["C"]), p))
         g = _mv(a["R"], u[:, k]) + a["r"] + _mv(_t(a["B"]), p) + _mv(_t(a["E"]), rho)
         terms = _mv(size["R"], np.abs(u[:, k])) + size["r"]

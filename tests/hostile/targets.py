@@ -389,7 +389,8 @@ def _mpc_differences(problem: MPC, backend, rng: Generator) -> tuple[np.ndarray,
             # Both must stay on the branch of the solution, and solve their own problems to far less than a step.
             base, up, down = (_double(v.u) for v in (plan, high, low))
             width = np.maximum(np.abs(a["u_max"] - a["u_min"])[:, None], 1e-300)
-            jump = np.abs(0.5 * (up + down) - base) > 1e-6 * width + np.abs(up - down)
+            scale = np.minimum(width, np.abs(base).max((1, 2), keepdims=True))  # a range of 1e8 hides another optimum
+            jump = np.abs(0.5 * (up + down) - base) > 1e-6 * scale + np.abs(up - down)
             same &= ~jump.any((1, 2))
             for sign, found in ((1, high), (-1, low)):
                 numbers = (_double(v) for v in (found.x, found.u, found.lam, found.objective))
