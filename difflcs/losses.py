@@ -12,7 +12,7 @@ from difflcs.lcp import MAX_ITER, solve_lcp_arrays
 from difflcs.lcs import LCSModel
 from difflcs.status import Status
 
-
+# Least γ σ_min(F + Fᵀ), in parts of n_lam times the largest squared column of F (kernels.hpp has the same).
 _GAMMA_LEAST = 4e-13
 
 
@@ -143,8 +143,8 @@ def _check_gamma(F: Tensor, gamma: float, refuse_large: bool) -> None:
     least = _GAMMA_LEAST * len(F) * float(F.detach().double().square().sum(0).max()) / smallest
     if gamma < least:
         raise GammaError(
-            f"gamma: expected at least {least:.3g} for this F in double precision, got {gamma:.3g}; raise gamma, or the "
-            f"model's stiffness"
+            f"gamma: expected at least {least:.3g} for this F in double precision, got {gamma:.3g}; raise gamma, or "
+            f"the model's stiffness"
         )
 
 
@@ -177,8 +177,8 @@ class _ViolationLoss(torch.autograd.Function):
             held = _kernels.violation_value(arrays, gamma, xi, z, r, e, loss)
         if not held:
             raise GammaError(
-                f"gamma, xi: expected a product that double precision resolves for these data, got {gamma:.3g} · {xi:.3g}: "
-                f"e/(γξ) has lost the digits of the gradient; raise xi or gamma"
+                f"gamma, xi: expected a product that double precision resolves for these data, got {gamma:.3g} and "
+                f"{xi:.3g}: e/(gamma xi) has lost the digits of the gradient; raise xi or gamma"
             )
         ctx.mean, ctx.solution = mean, (arrays, gamma, xi, z, r, e)
         # The arrays look into these tensors; autograd refuses them where they were changed in place.
