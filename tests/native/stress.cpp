@@ -1,5 +1,6 @@
 // Drives every kernel over many sizes, shared and per-element inputs, several threads and broken numbers, to be built
 // with sanitizers (`make sanitize`). It checks memory and arithmetic, not mathematics: the Python tests do that.
+#include <algorithm>
 #include <atomic>
 #include <cmath>
 #include <cstdio>
@@ -11,6 +12,7 @@
 #include <vector>
 
 #include "kernels.hpp"
+#include "lcp_one.hpp"
 
 using namespace difflcs;
 
@@ -46,6 +48,10 @@ std::vector<double> lcp_matrices(int64_t count, int64_t n) {
   return F;
 }
 
+// A watch that never stops, and one that stops when it has been asked `context` times.
+const Watch kNever{[](void*) { return false; }, nullptr};
+bool counts_down(void* context) { return --*static_cast<int*>(context) < 0; }
+
 int failures = 0;
 void expect(bool ok, const char* what) {
   if (!ok) std::printf("FAILED: %s\n", what), failures++;
@@ -62,17 +68,23 @@ void lcp(int64_t n, int64_t count, bool shared, double relaxation, double broken
                        80, lam.data(), w.data(),           status.data(), iterations.data()};
   const Workspace workspace(kernels().lcp_workspace(n));
   const auto run = relaxation > 0 ? kernels().lcp_relaxed : kernels().lcp_exact;
-  for (int64_t begin = 0; begin < count; begin += 5) run(batch, begin, std::min(count, begin + 5), workspace.data);
+  for (int64_t begin = 0; begin < count; begin += 5)
+    run(batch, begin, std::min(count, begin + 5), workspace.data, kNever);
+  // One at a time, with row exchanges.
+  std::vector<double> scratch(lcp_one_scratch(n));
+  for (int64_t e = 0; e < count; e++)
+    if (status[e] != 0 && (relaxation > 0 ? lcp_relaxed_one : lcp_exact_one)(batch, e, scratch.data(), kNever))
+      status[e] = 0;
   int64_t solved = 0;
   for (const int8_t s : status) solved += s == 0;
   expect(solved >= count - (broken != 0), "every sound LCP is solved");
 }
 
 void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count, bool shared, double barrier,
-         double broken, int threads) {
+         double broken, int threads, bool pivot) {
   MpcBatch b{};
   b.count = count, b.n_x = n_x, b.n_u = n_u, b.n_lam = n_lam, b.horizon = horizon;
-  b.relaxation = 1e-5, b.barrier = barrier;
+  b.relaxation = 1e-5, b.barrier = barrier, b.pivot = pivot;
   const int64_t sizes[kInputs] = {n_x * n_x,     n_x * n_u, n_x * n_lam, n_x,       n_lam * n_x, n_lam * n_u,
                                   n_lam * n_lam, n_lam,     n_x * n_x,   n_u * n_u, n_x * n_x,   n_x,
                                   n_u,           n_x,       n_u,         n_u,       n_x};
@@ -95,7 +107,7 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
   for (int i = 0; i < kInputs; i++) b.input[i] = data[i].data();
   std::vector<double> x(count * (horizon + 1) * n_x), u(count * horizon * n_u), lam(count * horizon * n_lam);
   std::vector<double> objective(count), residual(count);
-  std::vector<int8_t> status(count), all_solved(count, 1);
+  std::vector<int8_t> status(count), fragile(count), all_solved(count, 1);
   std::vector<int32_t> iterations(count);
   MpcSolve o{nullptr,
              nullptr,
@@ -103,12 +115,14 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
              0.3,
              1e-8,
              100,
+             1e-6,
              x.data(),
              u.data(),
              lam.data(),
              objective.data(),
              residual.data(),
              status.data(),
+             fragile.data(),
              iterations.data()};
   for (int pass = 0; pass < 2; pass++) {  // cold, then from its own solution
     int64_t next = 0;
@@ -116,7 +130,7 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
     for (int t = 0; t < threads; t++)
       pool.emplace_back([&] {
         const Workspace workspace(kernels().mpc_workspace(b));
-        kernels().mpc_solve(b, o, &next, workspace.data);
+        kernels().mpc_solve(b, o, &next, workspace.data, kNever);
       });
     for (auto& t : pool) t.join();
     if (broken != 0) break;
@@ -128,7 +142,11 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
     if (pass == 0) {
       next = 0;
       const Workspace workspace(kernels().mpc_workspace(b));
-      kernels().mpc_solve(b, o, &next, workspace.data);
+      int left = 7;  // stopped on the way
+      std::fill(status.begin(), status.end(), kUnreached);
+      kernels().mpc_solve(b, o, &next, workspace.data, {counts_down, &left});
+      for (const int8_t s : status) expect(s == kUnreached || (s >= 0 && s <= 4), "a status is written or is not");
+      u = u_start, lam = lam_start;
     }
     o.u_start = o.lam_start = nullptr, o.first_relaxation = 1e-3;
   }
@@ -149,7 +167,7 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
   g.partial = partial.data();
   const Workspace workspace(kernels().mpc_workspace(b));
   for (int64_t i = 0; i < blocks; i++)
-    kernels().mpc_vjp(b, g, i * block, std::min(count, (i + 1) * block), i, workspace.data);
+    kernels().mpc_vjp(b, g, i * block, std::min(count, (i + 1) * block), i, workspace.data, kNever);
 }
 
 void violation(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t count, double broken) {
@@ -167,6 +185,7 @@ void violation(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t count, double br
   const int64_t n = 2 * n_lam;
   std::vector<double> Q(n * n), q(count * n), r(count * n_x), e(count * n_lam), loss(count);
   b.count = count, b.n_x = n_x, b.n_u = n_u, b.n_lam = n_lam, b.gamma = 0.1, b.xi = 0.1, b.r = r.data(), b.e = e.data();
+  b.watch = kNever;
   const Workspace workspace(kernels().violation_workspace(b));
   const bool convex = kernels().violation_qp(b, Q.data(), q.data(), workspace.data);
   expect(convex || std::isnan(broken), "the inner QP is convex");
@@ -192,7 +211,8 @@ int main() {
       for (const double barrier : {0.0, 1e-2})
         for (const double broken : {0.0, huge, nan})
           for (const int threads : {1, 3})
-            for (const int64_t count : {1, 29}) mpc(s[0], s[1], s[2], s[3], count, shared, barrier, broken, threads);
+            for (const int64_t count : {1, 29})
+              mpc(s[0], s[1], s[2], s[3], count, shared, barrier, broken, threads, broken == 0 && !shared && threads == 1);
   for (const auto& s : shapes)
     for (const double broken : {0.0, huge, nan})
       for (const int64_t count : {1, 29}) violation(s[0], s[1], s[2], count, broken);
