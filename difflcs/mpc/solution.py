@@ -33,8 +33,8 @@ class MPCSolution:
         objective: (...) cost of the plan.
         status: (...) `Status` as int8.
         iterations: (...) iterations of the solver, int32.
-        kkt_residual: (...) largest violation of the optimality conditions by the numbers above, without units; at most 1e-6
-            where the plan is solved by an exact backend. See `difflcs.mpc.kkt.residual`.
+        kkt_residual: (...) largest violation of the optimality conditions by the numbers above, without units; at
+            most 1e-6 where an exact backend has solved the plan. See `difflcs.mpc.kkt.residual`.
         solve_time: (...) seconds spent on each problem.
     """
 
