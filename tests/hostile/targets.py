@@ -172,6 +172,9 @@ def _lcp_differences(problem: LCP, relaxation: float, rng: Generator) -> tuple[n
             high, low = values(moved(step)), values(moved(-step))
             change = sum((seed.numpy() * (a - b)).sum(-1) for seed, a, b in zip(seeds, high[:2], low[:2], strict=True))
             same = (high[2] == 0) & (low[2] == 0) & (((high[0] > 0) == (low[0] > 0)).all(-1))
+            # Where F is not definite there can be many solutions: both must stay next to this one.
+            far = 1e-6 * np.abs(lam).max(-1, keepdims=True) + np.abs(high[0] - low[0])
+            same &= (np.abs(0.5 * (high[0] + low[0]) - lam) <= far).all(-1)
             return change / (2 * step), same
 
         return _compare(terms, difference, 1e-6)
