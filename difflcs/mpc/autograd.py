@@ -58,7 +58,13 @@ class SolveMPC(torch.autograd.Function):
         solved = (result.status == Status.CONVERGED) | (result.status == Status.DEGENERATE)
         # Whatever comes upstream for a failed element is dropped before it can meet the others.
         upstream = tuple(torch.where(solved.reshape(-1, *[1] * (g.ndim - 1)), g.double(), 0.0) for g in grads[:4])
-        gradients = _finite(lambda keep: ctx.backend.vjp(ctx.problem, result, upstream, keep), solved, ctx.limit)
+
+        def vjp(keep: Tensor) -> dict[str, Tensor]:
+            return ctx.backend.vjp(ctx.problem, result, upstream, keep)
+
+        # NaN that comes from the caller goes back to the caller, as everywhere in torch; our own would be an error.
+        theirs = not _all_finite(upstream, torch.finfo(torch.float64).max)
+        gradients = vjp(solved) if theirs else _finite(vjp, solved, ctx.limit)
         needed = ctx.needs_input_grad[6:]
         return *[None] * 6, *(gradients[k] if n else None for k, n in zip(INPUTS, needed, strict=True))
 
