@@ -16,7 +16,7 @@ struct Certificate {
   const MpcBatch& batch;
   const S n;
   T *A, *B, *C, *D, *E, *F, *Q, *R, *Qf, *rest, *rest_end;
-  Vec *d, *c, *q, *r, *qf, *lo, *hi, *x0, *x, *u, *lam, *s, *size, *p, *pn, *y, *rho, *error, *N;
+  Vec *d, *c, *q, *r, *qf, *lo, *hi, *x0, *per_width, *x, *u, *lam, *s, *size, *p, *pn, *y, *rho, *error, *N;
   Mask* rows;
 
   // Lays the arrays out in `memory`, or only counts them where it is null.
@@ -31,6 +31,7 @@ struct Certificate {
     take(A, nx * nx), take(B, nx * nu), take(C, nx * nl), take(D, nl * nx), take(E, nl * nu), take(F, nl * nl);
     take(Q, nx * nx), take(R, nu * nu), take(Qf, nx * nx), take(rest, nu), take(rest_end, nu);
     take(d, nx), take(c, nl), take(q, nx), take(r, nu), take(qf, nx), take(lo, nu), take(hi, nu), take(x0, nx);
+    take(per_width, nu);
     take(x, (h + 1) * nx), take(u, h * nu), take(lam, h * nl), take(s, nl), take(size, nl), take(p, nx), take(pn, nx);
     take(y, nl), take(rho, nl), take(error, nl), take(N, nl * nl), take(rows, nl);
     return used;
@@ -134,6 +135,10 @@ struct Certificate {
       load(x, o.x + e * (h + 1) * nx, (h + 1) * nx, l), load(u, o.u + e * h * nu, h * nu, l);
       load(lam, o.lam + e * h * nl, h * nl, l);
     }
+    for (int64_t j = 0; j < nu; j++) {
+      const Vec width = hi[j] - lo[j];
+      per_width[j] = select(width > 1e-300, 1.0 / width, all(0));
+    }
     worst = poison = all(0);
     Mask fragile = Mask{};
     for (int64_t i = 0; i < nx; i++) met(Sum{x[i] - x0[i], abs(x0[i])}.relative());
@@ -173,10 +178,11 @@ struct Certificate {
           g.terms += 1e-8 * batch.barrier * width * (1.0 / (below * below) + 1.0 / (above * above));
         }
         const Vec scale = max(g.terms, width * (k == h - 1 ? rest_end[j] : rest[j]));
-        const Vec unit = select(width > 0, width, all(1));
-        const Vec part = min(abs(g.value) / select(scale > 0, scale, all(1)), select(g.value > 0, below, above) / unit);
+        const Vec reach = select(g.value > 0, below, above) * per_width[j];
+        const Vec part = min(abs(g.value) / select(scale > 0, scale, all(1)), reach);
         met(select(width > 0, max(part, all(0)), all(0)) + 0.0 * g.value);
-        met(max(max(-below, -above), all(0)) / unit);
+        const Vec outside = max(max(-below, -above), all(0));
+        met(select(width > 0, outside * per_width[j], outside));
       }
       for (int64_t i = 0; i < nx; i++) {
         Vec t = q[i];

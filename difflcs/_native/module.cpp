@@ -328,8 +328,9 @@ void pass(difflcs::ViolationBatch& b, Work work) {
 // The minimiser z and the values there. No answer where the inputs are not finite, the QP is not convex by a margin,
 // there are no transitions, or the solver failed: then r, e, Q and q are those at z = 0, and z and loss are not set.
 // Else whether double precision suffices.
-std::optional<bool> violation_loss(Inputs inputs, double gamma, double xi, int64_t max_iter, int threads, Output<double> Q,
-                    Output<double> q, Output<double> z, Output<double> r, Output<double> e, Output<double> loss) {
+std::optional<bool> violation_loss(Inputs inputs, double gamma, double xi, int64_t max_iter, int threads,
+                                   Output<double> Q, Output<double> q, Output<double> z, Output<double> r,
+                                   Output<double> e, Output<double> loss) {
   difflcs::ViolationBatch b = violation_batch(inputs, gamma, xi, r, e);
   const int64_t n = 2 * b.n_lam;
   check_size("Q", Q.size(), n * n), check_size("q", q.size(), b.count * n), check_size("z", z.size(), b.count * n);

@@ -47,6 +47,7 @@ struct Mpc {
   T* cost_unit;
   T *rest, *rest_end;  // curvature of each action by the next stage's weights alone: the least scale of its gradient
   Vec *d, *c, *q, *r, *qf, *lo, *hi, *x0;
+  Vec* per_width;  // reciprocal of each action's range, zero where that is zero
   // Trajectory, trial trajectory, and the feedback law.
   Vec *x, *u, *lam, *s, *xt, *ut, *lamt, *st, *K, *kf, *grad;
   // Scratch of the backward sweep and of the LCP.
@@ -82,7 +83,7 @@ struct Mpc {
     vec(Ah, nx * nw), vec(PA, nx * nw), vec(H, nw * nw), vec(lin, nw);
     vec(Lc, nu * nu), vec(Kk, nu * (nx + 1)), vec(y, nl), vec(size, nl), vec(gap, nl), vec(res, nl), vec(wt, nl);
     vec(dl, nl), vec(newton, 6 * nl), mask(act, h * nu), mask(low, h * nu), mask(upp, h * nu), mask(rows, nl);
-    vec(flat, nu);
+    vec(flat, nu), vec(per_width, nu);
     if (adjoint) {
       vec(Kl_s, h * nl * nw), vec(Ks_s, h * nl * nw), vec(Ah_s, h * nx * nw), vec(M_s, h * nl * nl);
       vec(size_s, h * nl), vec(y_s, h * nl), vec(P_s, (h + 1) * nx * nx), vec(v_s, (h + 1) * nx);
@@ -155,6 +156,10 @@ struct Mpc {
     const double cost = lane_of(cost_unit[0], lane);
     vector(d, kd, nx), vector(c, kc, nl), vector(q, kq, nx, cost), vector(r, kr, nu, cost);
     vector(qf, kqfinal, nx, cost), vector(lo, kumin, nu), vector(hi, kumax, nu), vector(x0, kx0, nx);
+    for (int64_t i = 0; i < nu; i++) {
+      const double width = hi[i][lane] - lo[i][lane];
+      put(per_width, i, lane, width > kTiny ? 1.0 / width : 0.0);
+    }
     for (int64_t i = 0; i < nl; i++) put(c, i, lane, c[i][lane] * lane_of(scale[i], lane));
   }
 
@@ -298,8 +303,8 @@ struct Mpc {
   }
 
   // The root of the CHKS function loses the smaller of lam and s where they differ by 1e16, and a large entry of F
-  // carries that into other rows. Newton on lam o (F lam + gap) = eps itself, from a point that is nearly there, does not:
-  // (diag(s) + diag(lam) F) dlam = eps - lam o (F lam + gap).
+  // carries that into other rows. Newton on lam o (F lam + gap) = eps itself, from a point that is nearly there, does
+  // not: (diag(s) + diag(lam) F) dlam = eps - lam o (F lam + gap).
   void polish_lcp(Vec* lk, Vec* sk, Vec eps, Mask skip) {
     const int64_t nl = n.l();
     Local<S::kL * S::kL> jacobian(M);
@@ -477,7 +482,7 @@ struct Mpc {
         lin[nx + j] = l, grad[k * nu + j] = g;
         // Away from an optimum P, and with it H, can be indefinite: |H| is still a scale for the distance to a bound.
         // Where the cost is flat, the range of the action is the scale: a descent leads across all of it.
-        const Vec across = select(width > 0, abs(g) / width, all(0));
+        const Vec across = abs(g) * per_width[j];
         const Vec gauss_newton =
             max(max(abs(H[(nx + j) * nw + nx + j]), all(0) + R[j * nu + j]), max(across, all(kTiny)));
         const Vec scaled = max(lo[j], min(hi[j], uk[j] - g / gauss_newton));
@@ -487,14 +492,15 @@ struct Mpc {
         out.projected = max(out.projected, projected);
         out.rounding = max(out.rounding, 1e-12 * terms);
         if (batch.barrier > 0)
-          terms += mu * (1.0 / below + 1.0 / above) + 1e-8 * mu * width * (1.0 / (below * below) + 1.0 / (above * above));
+          terms += mu * (1.0 / below + 1.0 / above) +
+                   1e-8 * mu * width * (1.0 / (below * below) + 1.0 / (above * above));
         const Vec reference = max(terms, (k == h - 1 ? rest_end[j] : rest[j]) * width);
         Vec part = select(reference > 0, abs(g) / reference, all(0));
-        part = min(part, select(g > 0, below, above) / select(width > 0, width, all(1)));
+        part = min(part, select(g > 0, below, above) * per_width[j]);
         if (batch.barrier > 0) part = select(projected > 0, part, all(0));
         out.stationary = max(out.stationary, part);
         flat[j] = kFlat * across;
-        const Vec least = 1e-10 * reference / select(width > 0, width, all(1));
+        const Vec least = 1e-10 * reference * per_width[j];
         const Vec curved = max(H[(nx + j) * nw + nx + j] + curvature(nx + j, nx + j), max(least, all(kTiny)));
         const Vec step = g / curved;
         if (batch.barrier == 0)

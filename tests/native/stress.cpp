@@ -212,7 +212,8 @@ int main() {
         for (const double broken : {0.0, huge, nan})
           for (const int threads : {1, 3})
             for (const int64_t count : {1, 29})
-              mpc(s[0], s[1], s[2], s[3], count, shared, barrier, broken, threads, broken == 0 && !shared && threads == 1);
+              mpc(s[0], s[1], s[2], s[3], count, shared, barrier, broken, threads,
+                  broken == 0 && !shared && threads == 1);
   for (const auto& s : shapes)
     for (const double broken : {0.0, huge, nan})
       for (const int64_t count : {1, 29}) violation(s[0], s[1], s[2], count, broken);
