@@ -120,10 +120,8 @@ MAX_THREADS = 1024
 
 def check_threads(value: int | None, name: str = "threads") -> None:
     """Check an optional number of threads or processes."""
-    if value is not None and check_positive_int(name, value) > MAX_THREADS:
-        raise InvalidInputError(
-            f"{name}: expected at most {MAX_THREADS}, got {value}; None takes what suits the machine"
-        )
+    if value is not None:
+        check_positive_int(name, value, maximum=MAX_THREADS)
 
 
 def check_choice(name: str, value: object, choices: Sequence[str]) -> str:

@@ -45,7 +45,8 @@ struct Lcp {
   }
 
   // Read kLanes problems and scale them: F' = S F S with unit diagonal and q' = S q / unit, where unit is the larger of
-  // max|S q| and sqrt(relaxation), so that tolerances are relative whatever the units. lam = unit * S lam', w = unit * S^-1 w'. Lanes past `end` repeat the last problem.
+  // max|S q| and sqrt(relaxation), so that tolerances are relative whatever the units. lam = unit * S lam',
+  // w = unit * S^-1 w'. Lanes past `end` repeat the last problem.
   // Returns the unit; a non-positive diagonal (not a P-matrix) is left unscaled and fails the residual test later.
   Vec load(int64_t first, int64_t end) {
     const int64_t n = size();

@@ -55,7 +55,7 @@ class SolveMPC(torch.autograd.Function):
             raise DoubleBackwardError("LCSMPCLayer has first derivatives only; expected create_graph=False")
         _ = ctx.saved_tensors  # raises where one was changed in place
         result: Result = ctx.result
-        solved = (result.status == Status.CONVERGED) | (result.status == Status.DEGENERATE)
+        solved = result.solved
         # Whatever comes upstream for a failed element is dropped before it can meet the others.
         upstream = tuple(torch.where(solved.reshape(-1, *[1] * (g.ndim - 1)), g.double(), 0.0) for g in grads[:4])
 
@@ -77,7 +77,7 @@ def _within_range(result: Result, objective: Tensor, constant: Tensor, dtype: to
     if dtype != torch.float64:
         for value in result.primal:
             held &= value.abs().amax((1, 2)) <= largest
-    solved = (result.status == Status.CONVERGED) | (result.status == Status.DEGENERATE)
+    solved = result.solved
     if bool((held & solved).all()):
         return result, objective
     status = torch.where(solved & ~held, int(Status.NUMERICAL), result.status).to(torch.int8)

@@ -46,6 +46,12 @@ class Outcome:
     def worst(self) -> np.ndarray:
         return np.stack(list(self.ratios.values())).max(0)
 
+    def add_gradients(self, index: np.ndarray, ratio: np.ndarray, compared: int) -> None:
+        """Judge the gradients of some elements as well."""
+        self.ratios["gradient"] = np.zeros(len(self.status))
+        self.ratios["gradient"][index] = ratio
+        self.compared = compared
+
     @staticmethod
     def join(parts: list[Outcome]) -> Outcome:
         names = dict.fromkeys(name for part in parts for name in part.ratios)
@@ -103,9 +109,7 @@ def lcp_target(relaxation: float | None, dtype=np.float64) -> Callable[[LCP, Gen
             index = np.flatnonzero(done.solved)[:8]
             if len(index):
                 ratio, compared = _lcp_differences(problem.select(index).each(), chosen, rng)
-                done.ratios["gradient"] = np.zeros(problem.count)
-                done.ratios["gradient"][index] = ratio
-                done.compared = compared
+                done.add_gradients(index, ratio, compared)
         return done
 
     return target
@@ -302,9 +306,7 @@ def mpc_target(
             index = np.flatnonzero((done.status == Status.CONVERGED) & fine & sane)[:4]
             if len(index):
                 ratio, compared = _mpc_differences(problem.select(index).each(), backend, rng)
-                done.ratios["gradient"] = np.zeros(problem.count)
-                done.ratios["gradient"][index] = ratio
-                done.compared = compared
+                done.add_gradients(index, ratio, compared)
         return done
 
     return target
@@ -427,9 +429,7 @@ def loss_target(problem: Loss, rng: Generator, gradients: bool) -> Outcome:
     index = np.flatnonzero(done.solved)[:4]
     if gradients and len(index):
         ratio, compared = _loss_differences(problem.select(index), rng)
-        done.ratios["gradient"] = np.zeros(problem.count)
-        done.ratios["gradient"][index] = ratio
-        done.compared = compared
+        done.add_gradients(index, ratio, compared)
     return done
 
 

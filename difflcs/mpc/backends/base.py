@@ -37,6 +37,11 @@ class Result:
     solve_time: Tensor
     linearisation: kkt.Linearisation | None = None
 
+    @property
+    def solved(self) -> Tensor:
+        """(batch,) bool: the trajectory can be used (CONVERGED or DEGENERATE)."""
+        return (self.status == Status.CONVERGED) | (self.status == Status.DEGENERATE)
+
 
 class Backend(ABC):
     """A solver of `MPCProblem`s. Subclass as a frozen dataclass whose fields are its options.
