@@ -7,7 +7,7 @@ from torch import nn
 
 pytest.importorskip("torchrl")
 from difflcs.rl.natural import NaturalGradient
-from tests.test_ppo import improve, make_ppo, prepared
+from tests.training.test_ppo import improve, make_ppo, prepared
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -12,8 +12,8 @@ from tensordict import TensorDict
 from difflcs.rl.critic import seeded
 from difflcs.rl.lookahead import lookahead_advantages, luck, mirrored_actions
 from difflcs.rl.ppo import _Effort
-from tests.test_imagination import N_U, N_X, STEPS, make_env, outcome
-from tests.test_ppo import ROLLOUTS, improve, make_imagining, prepared
+from tests.training.test_imagination import N_U, N_X, STEPS, make_env, outcome
+from tests.training.test_ppo import ROLLOUTS, improve, make_imagining, prepared
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

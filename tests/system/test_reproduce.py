@@ -16,7 +16,7 @@ import torch
 
 for package in ("distributed", "matplotlib", "mujoco", "rich", "scipy", "tensorboard", "tyro"):
     pytest.importorskip(package, reason="the extra [reproduce] is not installed")
-FOLDER = Path(__file__).parents[1] / "reproduce"
+FOLDER = Path(__file__).parents[2] / "reproduce"
 sys.path.insert(0, str(FOLDER))
 
 import fig_learning_curves  # noqa: E402

@@ -9,7 +9,7 @@ import pytest
 from jupyter_client import AsyncKernelManager
 from nbclient import NotebookClient
 
-FOLDER = Path(__file__).parents[1] / "tutorials"
+FOLDER = Path(__file__).parents[2] / "tutorials"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 BYTES = 1_000_000
 # What a reader's machine does not have, and what must not be published.
