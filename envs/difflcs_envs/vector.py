@@ -17,21 +17,16 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from difflcs_envs.errors import PhysicsWarning
+from difflcs_envs.trifinger.arguments import checked_options
+from difflcs_envs.trifinger.base import UNSTABLE
 from difflcs_envs.trifinger.env import (
-    ACTION_LIMIT,
-    ACTION_MEANING,
-    ACTION_SIZE,
-    GOAL_SIZE,
-    STATE_SIZE,
-    UNSTABLE,
     TriFingerEnv,
     TriFingerMoveCubeEnv,
     TriFingerMoveObjectEnv,
     TriFingerTurnCubeEnv,
-    checked_options,
-    continued,
 )
-from difflcs_envs.trifinger.physics import CONTROL_PERIOD, step_all
+from difflcs_envs.trifinger.physics import CONTROL_PERIOD, STATE_SIZE, step_all
+from difflcs_envs.trifinger.spaces import ACTION_LIMIT, ACTION_MEANING, ACTION_SIZE, GOAL_SIZE, continued
 
 __all__ = ["TriFingerVectorEnv", "move_cube", "move_object", "turn_cube"]
 
