@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import numbers
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ import numpy as np
 from difflcs_envs.errors import OptionsError
 from difflcs_envs.trifinger.task import MoveTask
 
-__all__ = ["checked_array", "checked_integer", "checked_number", "checked_options", "make_task"]
+__all__ = ["checked_array", "checked_integer", "checked_number", "checked_options", "checked_task"]
 
 REWARD_TERMS = ("tips", "position", "yaw", "action")
 
@@ -73,14 +74,10 @@ def checked_options(options: Any) -> dict[str, Any]:
     return dict(options)
 
 
-def make_task(
-    position_tolerance: float,
-    yaw_tolerance: float,
-    sparse_penalty: float,
-    reward_weights: Mapping[str, float] | None,
-    goal_high: tuple[float, float, float] = MoveTask.goal_high,
+def checked_task(
+    task: MoveTask, yaw_tolerance: float, sparse_penalty: float, reward_weights: Mapping[str, float] | None
 ) -> MoveTask:
-    """Check the arguments of a task and make it.
+    """A task with other numbers, each of them checked.
 
     Raises:
         ValueError: A number is out of range, or a reward weight has an unknown name.
@@ -90,11 +87,11 @@ def make_task(
         raise ValueError(
             f"Expected reward_weights for {', '.join(REWARD_TERMS)}, got also {unknown}. Choose among these terms."
         )
-    return MoveTask(
-        position_tolerance=checked_number("position_tolerance", position_tolerance, low=0.0),
+    return replace(
+        task,
+        position_tolerance=checked_number("position_tolerance", task.position_tolerance, low=0.0),
         yaw_tolerance=checked_number("yaw_tolerance", yaw_tolerance, low=0.0),
         sparse_penalty=checked_number("sparse_penalty", sparse_penalty, low=0.0),
-        goal_high=goal_high,
         **{
             f"{name}_weight": checked_number(f"reward_weights['{name}']", value, low=0.0)
             for name, value in weights.items()

@@ -6,7 +6,8 @@ import copy
 import math
 import time
 import warnings
-from typing import Any, ClassVar, Self
+from collections.abc import Mapping
+from typing import Any, ClassVar, Self, TypedDict
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from difflcs_envs.trifinger.arguments import (
     checked_integer,
     checked_number,
     checked_options,
+    checked_task,
 )
 from difflcs_envs.trifinger.rendering import SceneRenderer, SceneViewer, has_display, select_gl_backend
 from difflcs_envs.trifinger.task import MoveTask
@@ -46,7 +48,7 @@ except ImportError as error:
         raise
     raise MissingDependencyError("mujoco") from error
 
-__all__ = ["TriFingerEnv"]
+__all__ = ["CommonArguments", "TriFingerEnv"]
 
 UNSTABLE = (
     "The simulation became unstable (not finite, or out of the workspace). The episode is truncated at the last finite "
@@ -60,6 +62,20 @@ YAW_NOISE = 0.5  # [rad]
 # Above this the fingers could start inside the object.
 MAX_RESET_NOISE = 0.2
 MAX_OSC_KP = 1e5  # [1/s^2]; the controller with 2 ms substeps is stable below kd * dt = 2, kp = 2.5e5
+
+
+class CommonArguments(TypedDict, total=False):
+    """What every task can be told, besides `render_mode`; the defaults are those of `TriFingerEnv`."""
+
+    osc_kp: float
+    yaw_tolerance: float
+    horizon: int
+    reset_noise: float
+    sparse_penalty: float
+    reward_weights: Mapping[str, float] | None
+    observe_time: bool
+    width: int
+    height: int
 
 
 class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
@@ -81,13 +97,17 @@ class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         self,
         scene_object: SceneObject,
         task: MoveTask,
-        render_mode: str | None,
-        osc_kp: float,
-        horizon: int,
-        reset_noise: float,
-        observe_time: bool,
-        width: int,
-        height: int,
+        *,
+        render_mode: str | None = None,
+        osc_kp: float = 1000.0,
+        yaw_tolerance: float = MoveTask.yaw_tolerance,
+        horizon: int = 20,
+        reset_noise: float = 0.05,
+        sparse_penalty: float = MoveTask.sparse_penalty,
+        reward_weights: Mapping[str, float] | None = None,
+        observe_time: bool = False,
+        width: int = 320,
+        height: int = 240,
     ) -> None:
         if render_mode == "human" and not has_display():
             raise RenderingError(
@@ -100,7 +120,7 @@ class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             )
         self.render_mode = render_mode
         self.object = scene_object
-        self.task = task
+        self.task = checked_task(task, yaw_tolerance, sparse_penalty, reward_weights)
         self.osc_kp = checked_number("osc_kp", osc_kp, low=0.0, high=MAX_OSC_KP, low_open=True)
         self.horizon = checked_integer("horizon", horizon)
         self.reset_noise = checked_number("reset_noise", reset_noise, low=0.0, high=MAX_RESET_NOISE)

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from dataclasses import replace
+from typing import Unpack
 
-from difflcs_envs.trifinger.arguments import checked_integer, checked_number, make_task
-from difflcs_envs.trifinger.base import TriFingerEnv
+from difflcs_envs.trifinger.arguments import checked_integer, checked_number
+from difflcs_envs.trifinger.base import CommonArguments, TriFingerEnv
 from difflcs_envs.trifinger.model import CubeObject
 from difflcs_envs.trifinger.objects import make_object
+from difflcs_envs.trifinger.task import MOVE, TURN
 from difflcs_envs.ycb import YCB
 
 __all__ = ["TriFingerEnv", "TriFingerMoveCubeEnv", "TriFingerMoveObjectEnv", "TriFingerTurnCubeEnv"]
 
 TURN_CUBE_EDGE = 0.07  # [m] of the turning task (Jin & Posa 2024)
-TURN_YAW_HIGH = 1.5  # [rad]
 
 
 class TriFingerMoveCubeEnv(TriFingerEnv):
@@ -128,25 +129,17 @@ class TriFingerMoveCubeEnv(TriFingerEnv):
     def __init__(
         self,
         render_mode: str | None = None,
-        osc_kp: float = 1000.0,
-        position_tolerance: float = 0.02,
-        yaw_tolerance: float = 0.2,
-        horizon: int = 20,
+        *,
+        position_tolerance: float = MOVE.position_tolerance,
         object_mass: float = 0.01,
         object_friction: float = 0.5,
-        reset_noise: float = 0.05,
-        sparse_penalty: float = 10.0,
-        reward_weights: Mapping[str, float] | None = None,
-        observe_time: bool = False,
-        width: int = 320,
-        height: int = 240,
+        **common: Unpack[CommonArguments],
     ) -> None:
         cube = CubeObject(
             mass=checked_number("object_mass", object_mass, low=0.0, low_open=True),
             friction=checked_number("object_friction", object_friction, low=0.0),
         )
-        task = make_task(position_tolerance, yaw_tolerance, sparse_penalty, reward_weights)
-        super().__init__(cube, task, render_mode, osc_kp, horizon, reset_noise, observe_time, width, height)
+        super().__init__(cube, replace(MOVE, position_tolerance=position_tolerance), render_mode=render_mode, **common)
 
 
 class TriFingerMoveObjectEnv(TriFingerEnv):
@@ -211,22 +204,15 @@ class TriFingerMoveObjectEnv(TriFingerEnv):
         self,
         object: str | os.PathLike[str] = "mug",
         render_mode: str | None = None,
-        osc_kp: float = 1000.0,
-        position_tolerance: float = 0.02,
-        yaw_tolerance: float = 0.2,
-        horizon: int = 20,
+        *,
+        position_tolerance: float = MOVE.position_tolerance,
         object_mass: float | str | None = None,
         object_friction: float = 0.5,
         object_source: str = "auto",
         rest_pose: str | int = "lying",
         mesh_scale: float = 1.0,
         mesh_parts: int | None = None,
-        reset_noise: float = 0.05,
-        sparse_penalty: float = 10.0,
-        reward_weights: Mapping[str, float] | None = None,
-        observe_time: bool = False,
-        width: int = 320,
-        height: int = 240,
+        **common: Unpack[CommonArguments],
     ) -> None:
         if not isinstance(object, str | os.PathLike):
             raise ValueError(f"Expected object to be a name or a path, got {object!r}. Choose one of {', '.join(YCB)}.")
@@ -241,8 +227,8 @@ class TriFingerMoveObjectEnv(TriFingerEnv):
             parts=None if mesh_parts is None else checked_integer("mesh_parts", mesh_parts),
             mesh_scale=checked_number("mesh_scale", mesh_scale, low=0.0, low_open=True),
         )
-        task = make_task(position_tolerance, yaw_tolerance, sparse_penalty, reward_weights)
-        super().__init__(scene_object, task, render_mode, osc_kp, horizon, reset_noise, observe_time, width, height)
+        task = replace(MOVE, position_tolerance=position_tolerance)
+        super().__init__(scene_object, task, render_mode=render_mode, **common)
 
 
 class TriFingerTurnCubeEnv(TriFingerEnv):
@@ -274,17 +260,10 @@ class TriFingerTurnCubeEnv(TriFingerEnv):
     def __init__(
         self,
         render_mode: str | None = None,
-        osc_kp: float = 1000.0,
-        yaw_tolerance: float = 0.2,
-        horizon: int = 20,
+        *,
         object_mass: float = 0.01,
         object_friction: float = 0.5,
-        reset_noise: float = 0.05,
-        sparse_penalty: float = 10.0,
-        reward_weights: Mapping[str, float] | None = None,
-        observe_time: bool = False,
-        width: int = 320,
-        height: int = 240,
+        **common: Unpack[CommonArguments],
     ) -> None:
         cube = CubeObject(
             half_size=TURN_CUBE_EDGE / 2,
@@ -292,5 +271,4 @@ class TriFingerTurnCubeEnv(TriFingerEnv):
             friction=checked_number("object_friction", object_friction, low=0.0),
             pinned=True,
         )
-        task = make_task(0.001, yaw_tolerance, sparse_penalty, reward_weights, goal_high=(0.0, 0.0, TURN_YAW_HIGH))
-        super().__init__(cube, task, render_mode, osc_kp, horizon, reset_noise, observe_time, width, height)
+        super().__init__(cube, TURN, render_mode=render_mode, **common)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["MoveTask"]
+__all__ = ["MOVE", "TURN", "MoveTask"]
 
 
 @dataclass(frozen=True)
@@ -114,3 +114,9 @@ class MoveTask:
         terms = self.dense_reward_terms(state, action, goal)
         terms["reward_completion"] = np.where(ended & ~info["success"], -self.sparse_penalty, 0.0)
         return sum(terms.values(), start=np.zeros(np.shape(ended))), info | terms
+
+
+MOVE = MoveTask()
+"""Push a cube or another object."""
+TURN = MoveTask(position_tolerance=0.001, goal_high=(0.0, 0.0, 1.5))
+"""Turn a cube on its pivot: the position is as good as fixed, and the goal is a matter of the yaw."""
