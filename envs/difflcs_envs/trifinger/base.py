@@ -64,6 +64,10 @@ MAX_RESET_NOISE = 0.2
 MAX_OSC_KP = 1e5  # [1/s^2]; the controller with 2 ms substeps is stable below kd * dt = 2, kp = 2.5e5
 
 
+FullState = tuple[np.random.Generator | None, int | None, np.ndarray]
+"""Random generator, its seed, and everything that the simulation's next steps depend on."""
+
+
 class CommonArguments(TypedDict, total=False):
     """What every task can be told, besides `render_mode`; the defaults are those of `TriFingerEnv`."""
 
@@ -286,9 +290,23 @@ class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             time.sleep(max(0.0, self._last_frame_time + CONTROL_PERIOD - time.monotonic()))
             self._last_frame_time = time.monotonic()
             return None
+        return self.picture()
+
+    def picture(self, camera: str = "front") -> np.ndarray:
+        """Draw the scene off screen, whatever the render mode.
+
+        Args:
+            camera: "front", or "top", which hides the hand but for its lower links.
+
+        Returns:
+            A new picture, uint8 (height, width, 3).
+
+        Raises:
+            RenderingError: No OpenGL on this machine. The message says what to install.
+        """
         if self._renderer is None:
             self._renderer = SceneRenderer(self.physics.model, self.width, self.height)
-        return self._renderer.render(self.physics.data)
+        return self._renderer.render(self.physics.data, camera)
 
     def close(self) -> None:
         """Free the renderer and the window. May be called again."""
@@ -300,6 +318,15 @@ class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             self._viewer = None
 
     # --- copies -----------------------------------------------------------------------------------
+
+    def get_full_state(self) -> FullState:
+        """Random generator and simulation, with which a sibling goes on as this one does; not the running episode."""
+        return self._np_random, self._np_random_seed, self.physics.get_full_state()
+
+    def set_full_state(self, full_state: FullState) -> None:
+        """Go on from what `get_full_state` gave. There is no episode to step until `reset`."""
+        self._np_random, self._np_random_seed, simulation = full_state
+        self.physics.set_full_state(simulation)
 
     def __getstate__(self) -> dict[str, Any]:
         members = self.__dict__.copy()
