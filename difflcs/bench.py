@@ -52,7 +52,7 @@ def measure(
     a shared machine mean little; the ratio says more.
 
     Args:
-        cost: of the MPC; `difflcs.rl.tasks.pushing_cost()`.
+        cost: of the MPC; `difflcs.rl._trifinger.pushing_cost()`.
         n_lam: contacts.
         batch: problems per call of backend batched.
         ipopt_batch: problems per call of backend ipopt.

@@ -21,11 +21,11 @@ from difflcs import zoo
 from difflcs._files import write_json
 from difflcs.errors import CheckpointError, DiffLCSError, InvalidInputError
 from difflcs.rl._optional import require, versions
+from difflcs.rl._trifinger import TASKS, Task, get_task, pushing_cost
 from difflcs.rl.checkpoint import RunDirectory, load_checkpoint
 from difflcs.rl.evaluate import evaluate
 from difflcs.rl.figures import plot_learning_curve, record_video
 from difflcs.rl.progress import Progress, bar, summary
-from difflcs.rl.tasks import TASKS, Task, get_task, pushing_cost
 from difflcs.rl.training import (
     EVALUATION_ENVS,
     TrainConfig,

@@ -240,8 +240,8 @@ class Learned:
         Raises:
             CheckpointError: there is none, or it cannot be used.
         """
+        from difflcs.rl._trifinger import get_task
         from difflcs.rl.checkpoint import RunDirectory
-        from difflcs.rl.tasks import get_task
         from difflcs.rl.training import load_model, load_policy, stored_config
 
         name = str(source)

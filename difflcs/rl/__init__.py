@@ -9,6 +9,7 @@ from difflcs.rl._optional import require
 require("gymnasium")  # a clear error, before the modules below import it
 
 # ruff: noqa: E402
+from difflcs.rl._trifinger import TASKS, Task, get_task
 from difflcs.rl.checkpoint import Checkpoint, RunDirectory, load_checkpoint, save_checkpoint
 from difflcs.rl.dynamics import Ensemble
 from difflcs.rl.evaluate import Evaluation, evaluate, wilson_interval
@@ -19,7 +20,6 @@ from difflcs.rl.pddm import PDDM, PDDMConfig
 from difflcs.rl.phases import LCSRL
 from difflcs.rl.ppo import PPO, PPOConfig
 from difflcs.rl.rollout import Rollouts, collect
-from difflcs.rl.tasks import TASKS, Task, get_task
 from difflcs.rl.training import Reporter, TrainConfig, load_model, load_policy, train
 from difflcs.rl.warmup import Warmup, WarmupConfig, fit, trust_region
 

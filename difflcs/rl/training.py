@@ -20,6 +20,7 @@ from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.lcs import LCSModel
 from difflcs.mpc.backends import get_backend
 from difflcs.rl._optional import require, versions
+from difflcs.rl._trifinger import N_U, N_X, Task, get_task, pushing_cost, pushing_features
 from difflcs.rl.checkpoint import Checkpoint, RunDirectory, load_checkpoint, save_checkpoint
 from difflcs.rl.dynamics import Ensemble
 from difflcs.rl.evaluate import Evaluation, evaluate
@@ -29,7 +30,6 @@ from difflcs.rl.pddm import PDDM, PDDMConfig, PDDMIteration, Planner, ensemble_t
 from difflcs.rl.phases import LCSRL
 from difflcs.rl.ppo import PPO, PPOConfig, PPOIteration, network_tensors
 from difflcs.rl.rollout import Policy
-from difflcs.rl.tasks import N_U, N_X, Task, get_task, pushing_cost, pushing_features
 from difflcs.rl.warmup import Iteration, Warmup, WarmupConfig, config_from_dict
 
 if TYPE_CHECKING:
