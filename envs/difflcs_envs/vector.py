@@ -26,7 +26,8 @@ from difflcs_envs.trifinger.env import (
     TriFingerTurnCubeEnv,
 )
 from difflcs_envs.trifinger.physics import CONTROL_PERIOD, STATE_SIZE, step_all
-from difflcs_envs.trifinger.spaces import ACTION_LIMIT, ACTION_MEANING, ACTION_SIZE, GOAL_SIZE, continued
+from difflcs_envs.trifinger.spaces import ACTION_MEANING, continued
+from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE, GOAL_SIZE
 
 __all__ = ["TriFingerVectorEnv", "move_cube", "move_object", "turn_cube"]
 

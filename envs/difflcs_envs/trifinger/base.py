@@ -20,7 +20,7 @@ from difflcs_envs.trifinger.arguments import (
     checked_task,
 )
 from difflcs_envs.trifinger.rendering import SceneRenderer, SceneViewer, has_display, select_gl_backend
-from difflcs_envs.trifinger.task import MoveTask
+from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE, EPISODE_STEPS, GOAL_SIZE, MoveTask
 
 select_gl_backend()  # before the first import of MuJoCo
 try:
@@ -32,11 +32,8 @@ try:
     from difflcs_envs.trifinger.model import SceneObject
     from difflcs_envs.trifinger.physics import CONTROL_PERIOD, STATE_SIZE, TriFingerPhysics
     from difflcs_envs.trifinger.spaces import (
-        ACTION_LIMIT,
         ACTION_MEANING,
-        ACTION_SIZE,
         GOAL_MEANING,
-        GOAL_SIZE,
         STATE_MEANING,
         continued,
         make_action_space,
@@ -105,7 +102,7 @@ class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         render_mode: str | None = None,
         osc_kp: float = 1000.0,
         yaw_tolerance: float = MoveTask.yaw_tolerance,
-        horizon: int = 20,
+        horizon: int = EPISODE_STEPS,
         reset_noise: float = 0.05,
         sparse_penalty: float = MoveTask.sparse_penalty,
         reward_weights: Mapping[str, float] | None = None,

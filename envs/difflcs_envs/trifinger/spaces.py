@@ -8,14 +8,12 @@ import numpy as np
 from gymnasium import spaces
 
 from difflcs_envs.trifinger.physics import STATE_SIZE, WORKSPACE_RADIUS
+from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE
 
 __all__ = ["continued", "make_action_space", "make_observation_space", "unwrap"]
 
-ACTION_SIZE = 6  # x, y of three tips
 ACTION_MEANING = "[tip 0 x, y, tip 1 x, y, tip 2 x, y] in m"
-ACTION_LIMIT = 0.015  # [m] per component and step
 STATE_MEANING = "[object x, y, yaw, tip 0 x, y, tip 1 x, y, tip 2 x, y] in m and rad"
-GOAL_SIZE = 3  # x, y, yaw
 GOAL_MEANING = "[x, y, yaw] of the goal in m, m, rad"
 MIN_GOAL_BOUND = 1e-3  # Gymnasium wants spaces of some extent even where a goal is fixed (turning: x and y)
 # Bound of the observed yaw [rad]: four turns either way. One action turns a cube by a third of a radian at most.

@@ -14,6 +14,11 @@ import numpy as np
 
 __all__ = ["MOVE", "TURN", "MoveTask"]
 
+ACTION_SIZE = 6  # x, y of three tips
+ACTION_LIMIT = 0.015  # [m] per component and step
+GOAL_SIZE = 3  # x, y, yaw
+EPISODE_STEPS = 20
+
 Array = Any
 """A NumPy array, or a PyTorch tensor, which this file does not import."""
 
