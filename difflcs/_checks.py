@@ -11,8 +11,6 @@ from torch import Tensor
 from difflcs.errors import DeviceError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
 
 FLOATS = (torch.float32, torch.float64)
-MOST_ENVS, MOST_WIDTH, MOST_NETWORKS = 10_000, 10_000, 1_000
-"""Environments side by side, width of a network, networks of an ensemble: more is a slip or a foreign file."""
 _USABLE_DEVICES = ("cpu", "cuda", "mps", "xpu")
 
 

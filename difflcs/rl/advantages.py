@@ -34,7 +34,6 @@ from difflcs.rl.seeding import seeded
 if TYPE_CHECKING:
     from tensordict import TensorDict, TensorDictBase
 
-    from difflcs.rl.critic import Critic
     from difflcs.rl.tasks import Features
 
 SAMPLES = ("action", "action_log_prob")
@@ -138,6 +137,20 @@ def gae(
         return estimator(data)
 
 
+class ValueFunction(Protocol):
+    """What is needed of a `difflcs.rl.critic.Critic`."""
+
+    gamma: float
+
+    def values(self, inputs: Tensor) -> Tensor:
+        """(..., n) inputs → (...) values."""
+        ...
+
+    def gae(self, inputs: Tensor, rewards: Tensor) -> TensorDictBase:
+        """See `gae`, with its own discount and ζ."""
+        ...
+
+
 class GAEAdvantages:
     """GAE of the actions taken.
 
@@ -145,7 +158,7 @@ class GAEAdvantages:
         critic: the value network, with its discount and ζ.
     """
 
-    def __init__(self, critic: Critic):
+    def __init__(self, critic: ValueFunction):
         self.critic = critic
 
     def __call__(self, episodes: TensorDict, inputs: Tensor, rewards: Tensor, key: Sequence[int]) -> Estimate:
@@ -181,7 +194,7 @@ class MultiActionAdvantages:
     def __init__(
         self,
         env: Foreseeing,
-        critic: Critic,
+        critic: ValueFunction,
         features: Features,
         scale: RewardScale,
         bounds: tuple[Tensor, Tensor],
