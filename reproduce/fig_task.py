@@ -23,10 +23,10 @@ from units import Unit
 
 from difflcs import LCSModel
 from difflcs.errors import InvalidInputError
-from difflcs.rl._trifinger import get_task
 from difflcs.rl.checkpoint import RunDirectory
 from difflcs.rl.evaluate import EVALUATION_STREAM
 from difflcs.rl.rollout import Policy, episode_seeds, mpc_actions
+from difflcs.rl.tasks import get_task
 from difflcs.rl.training import load_policy, stored_config
 
 if TYPE_CHECKING:

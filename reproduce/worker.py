@@ -123,7 +123,7 @@ def _train(spec: Spec, folder: Path, report: Report) -> dict[str, Any]:
     import torch
 
     from difflcs.rl._optional import versions
-    from difflcs.rl._trifinger import get_task
+    from difflcs.rl.tasks import get_task
     from difflcs.rl.training import profile, train
 
     unit, config = Unit(**spec["unit"]), TrainConfig.from_dict(spec["config"])

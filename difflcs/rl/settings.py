@@ -169,7 +169,7 @@ class Rollouts(Settings):
 class Epochs(Settings):
     """How long something is fitted to data."""
 
-    first: int = bounded(60, minimum=1)
+    first: int = bounded(100, minimum=1)
     """Passes over the data of the first training."""
     each: int = bounded(10, minimum=1)
     """Passes in each later iteration."""

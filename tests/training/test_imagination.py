@@ -10,10 +10,10 @@ from gymnasium import spaces
 
 pytest.importorskip("gymnasium")
 from difflcs.errors import CheckpointError, InvalidInputError
-from difflcs.rl._trifinger import get_task
 from difflcs.rl.dynamics import Ensemble
 from difflcs.rl.imagination import Imagination, ImaginationConfig, ImaginedEnv
 from difflcs.rl.rollout import collect, episode_seeds, uniform_actions
+from difflcs.rl.tasks import get_task
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -15,11 +15,11 @@ from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSParams, solve_lcp, viola
 from difflcs.errors import CheckpointError, InvalidInputError, MissingDependencyError
 from difflcs.rl import TASKS, TrainConfig, Warmup, WarmupConfig, collect, evaluate, fit, trust_region, wilson_interval
 from difflcs.rl._optional import require
-from difflcs.rl._trifinger import pushing_cost
 from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
 from difflcs.rl.rollout import episode_seeds, mpc_actions, noisy_actions, uniform_actions
 from difflcs.rl.training import goals_due
 from difflcs.rl.warmup import config_from_dict
+from difflcs_envs.tasks import pushing_cost
 
 STEPS = 10
 U_MAX = 0.1
