@@ -5,14 +5,12 @@
 
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
-import difflcs_envs
 from difflcs import LCSModel
-from difflcs.rl import get_task
+from difflcs.rl.tasks import get_task
 
 PATH = Path(__file__).parent / "push.gif"
 GOALS = [(0.04, 0.03, 0.3), (-0.04, 0.03, -0.3), (0.0, -0.05, 0.4), (0.05, -0.02, 0.0)]  # x [m], y [m], yaw [rad]
@@ -22,10 +20,9 @@ FRAME_MILLISECONDS = 100  # a step of the environment: real time
 
 def main() -> None:
     """Play one episode per goal."""
-    difflcs_envs.register_envs()
     task = get_task("cube")
     policy = task.make_policy(LCSModel.from_pretrained("trifinger-cube"))
-    env = gymnasium.make(task.env_id, render_mode="rgb_array", width=WIDTH, height=HEIGHT).unwrapped
+    env = task.make_env(render_mode="rgb_array", width=WIDTH, height=HEIGHT).unwrapped
     frames: list[Image.Image] = []
     for seed, goal in enumerate(GOALS):
         observation, _ = env.reset(seed=seed, options={"goal": np.array(goal)})

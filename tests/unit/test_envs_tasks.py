@@ -125,7 +125,9 @@ def test_an_evaluation_counts_the_successes_of_the_outcome(one_thread):
     assert envs.last[-1].all()
     reward, success = task.outcome(*envs.last)
     assert found.successes == success.sum()
-    assert found.median_position_error == np.median(envs.env.envs[0].task.errors(envs.last[2], envs.last[3])[0])
+    assert found.median_errors["position_error"] == np.median(
+        envs.env.envs[0].task.errors(envs.last[2], envs.last[3])[0]
+    )
     step = [torch.from_numpy(part) for part in envs.last]
     assert int(task.outcome(*step)[1].sum()) == found.successes
     assert ((reward < -9) == ~success).all()
