@@ -278,11 +278,13 @@ def register_task(spec: TaskSpec) -> TaskSpec:
 
 @functools.cache
 def _load_entry_points() -> None:
+    own = dict(_REGISTRY)  # registered in this program: what is installed does not replace it
     for entry in metadata.entry_points(group=ENTRY_POINTS):
         try:
             entry.load()()
         except Exception as error:  # a broken package of others must not take the rest with it
             _FAILED[f"{entry.name} = {entry.value}"] = f"{type(error).__name__}: {error}"
+    _REGISTRY.update(own)
 
 
 def task_names() -> tuple[str, ...]:
