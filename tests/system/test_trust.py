@@ -1,6 +1,6 @@
 """Never wrong in silence: what a solve returns is judged by the numbers it returns, and nothing hangs or aborts.
 
-Each test is a failure that was once met, at its smallest; `tests/hostile` searches for more of their kind.
+Each test is a failure that was once met, at its smallest; `tests/conformance/hostile` searches for more of their kind.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The campaign: every class of hostile problems over every target, each returned element judged.
 
-    python -m tests.hostile.campaign --count 1000000 --seed 0 --out results.jsonl
-    python -m tests.hostile.campaign --markdown results.jsonl --fill docs/promises.md
-    python -m tests.hostile.campaign --only "mpc-flat/warm" --seed 0 --index 17
+    python -m tests.conformance.hostile.campaign --count 1000000 --seed 0 --out results.jsonl
+    python -m tests.conformance.hostile.campaign --markdown results.jsonl --fill docs/promises.md
+    python -m tests.conformance.hostile.campaign --only "mpc-flat/warm" --seed 0 --index 17
 
 A run appends one line per chunk to its file and, started again, goes on from there. A chunk depends on the class, the
 seed and its number alone, so that seed and index of an element give it back.
@@ -26,8 +26,8 @@ import numpy as np
 import torch
 
 from difflcs import Status
-from tests.hostile import generators, rules, targets
-from tests.hostile.targets import Outcome
+from tests.conformance.hostile import generators, rules, targets
+from tests.conformance.hostile.targets import Outcome
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ def line(record: Record) -> str:
 def reproduction(record: Record) -> str:
     """The command that shows the first silent failure of a record."""
     index = record.failures[0][0] if record.failures else 0
-    return f'python -m tests.hostile.campaign --only "{record.cell}" --seed {record.seed} --index {index}'
+    return f'python -m tests.conformance.hostile.campaign --only "{record.cell}" --seed {record.seed} --index {index}'
 
 
 def read(path: Path) -> list[Record]:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 
-from tests.hostile.generators import LCP, MPC, Loss
+from tests.conformance.hostile.generators import LCP, MPC, Loss
 
 Ratios = dict[str, np.ndarray]
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from tests.hostile import campaign, checks, generators, targets
+sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
+from tests.conformance.hostile import campaign, checks, generators, targets
 
 SLOW_CLASSES = ("mpc-plain", "mpc-flat", "mpc-stiff")  # for the solvers that take 10 ms and more per problem
 CELLS = [c for c in campaign.CELLS if c.target not in targets.SLOW_TARGETS or c.problems in SLOW_CLASSES]
