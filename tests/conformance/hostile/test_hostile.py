@@ -128,10 +128,10 @@ def test_the_adjoint_of_the_judge_is_the_derivative_of_the_cost():
 
     def cost(u):
         x, _ = trajectory(u)
-        return checks._cost(problem, a, x, u, a["u_min"][:, None], a["u_max"][:, None])[0]
+        return checks.cost_of(problem, a, x, u, a["u_min"][:, None], a["u_max"][:, None])[0]
 
     x, lam = trajectory(u)
-    s, s_terms = checks._affine(a, "DEFc", x[:, :-1], u, lam)
+    s, s_terms = checks.affine(a, "DEFc", x[:, :-1], u, lam)
     assert np.abs(lam * s - problem.relaxation).max() < 1e-9 * problem.relaxation
     gradient, terms, _ = checks.reduced_gradient(a, x, u, lam, s, s_terms)
     for k in np.ndindex(u.shape[1:]):
