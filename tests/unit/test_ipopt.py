@@ -229,7 +229,7 @@ def test_options_are_checked(options, error, message):
 
 @pytest.fixture
 def registry(monkeypatch):
-    monkeypatch.setattr(base, "_REGISTRY", dict(base._REGISTRY))
+    monkeypatch.setattr(base, "REGISTRY", dict(base.REGISTRY))
 
 
 @dataclass(frozen=True)
