@@ -110,10 +110,10 @@ def test_several_threads_may_solve_at_once(workers):
             assert torch.equal(alone.u.detach(), expected[i % 6]), i
             assert bool(torch.isfinite(x.grad).all())
             assert bool(alone.converged.all())
-            if i % 4 == 0:
+            if i % 2 == 0:
                 assert torch.equal(mpc(x0).u.detach(), batch)
         with ThreadPoolExecutor(6) as pool:
-            list(pool.map(work, range(60)))
+            list(pool.map(work, range(36)))
         print("fine")
     """) == ["fine"]
 
