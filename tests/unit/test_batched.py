@@ -142,6 +142,7 @@ def plans_and_gradient():
     return [*plan.objective.tolist(), lcs.A.grad.norm().item()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("isa", ["baseline", "avx2", "avx512"])
 def test_every_instruction_set_finds_the_same_plans(isa):
     """Other lanes, other rounding: nearly all plans agree closely, a few meet another optimum."""
@@ -167,6 +168,7 @@ def test_every_instruction_set_finds_the_same_plans(isa):
     assert int(close.sum()) >= 29
 
 
+@pytest.mark.slow
 def test_an_unknown_instruction_set_is_refused_with_the_known_ones():
     command = [sys.executable, "-c", "from difflcs._native import _kernels; _kernels.isa()"]
     environment = {**os.environ, "DIFFLCS_ISA": "mmx"}

@@ -93,6 +93,7 @@ def test_check_env():
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("gl")
 @pytest.mark.skipif(has_display(), reason="would open a window for the mode 'human'")
 @pytest.mark.parametrize(

@@ -400,6 +400,7 @@ def objects(server):
     return server
 
 
+@pytest.mark.slow
 def test_processes_lose_nothing(objects, tmp_path):
     """Two processes on one object and two others on others, at a time."""
     running = [start(objects, tmp_path, name) for name in (*objects.names, objects.names[0])]
@@ -412,6 +413,7 @@ def test_processes_lose_nothing(objects, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == wanted
 
 
+@pytest.mark.slow
 def test_a_killed_download_is_no_obstacle(server, tmp_path):
     # Killed when the archive is unpacked and its mesh is about to be read.
     program = f"import time, trimesh; trimesh.load = lambda *_, **__: time.sleep(60)\n{DOWNLOAD}"

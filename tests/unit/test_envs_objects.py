@@ -70,6 +70,7 @@ def stl(tmp_path):
 # --- meshes ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_any_mesh(stl):
     mesh = bracket()
     mesh.apply_transform(trimesh.transformations.rotation_matrix(1.0, [1, 2, 3], [0.1, 0.2, 0.3]))
@@ -147,6 +148,7 @@ def test_a_mesh_that_would_take_minutes_is_refused_at_once(stl, tmp_path):
     assert time.monotonic() - start < 10
 
 
+@pytest.mark.slow
 def test_processes_decompose_a_mesh_once(stl, tmp_path):
     path = stl(bracket())
     code = (
@@ -197,6 +199,7 @@ def test_unknown_rest_pose(stl):
         make(stl(trimesh.creation.box((0.06, 0.04, 0.03))), rest_pose=9)
 
 
+@pytest.mark.slow
 def test_parts_are_cached_and_a_damaged_cache_is_mended(stl, tmp_path, monkeypatch):
     monkeypatch.setenv("DIFFLCS_CACHE_DIR", str(tmp_path / "cache"))
     calls = []
@@ -218,6 +221,7 @@ def test_parts_are_cached_and_a_damaged_cache_is_mended(stl, tmp_path, monkeypat
     assert all(not p.name.startswith(".") for p in cached.parent.iterdir())
 
 
+@pytest.mark.slow
 def test_a_cache_that_cannot_be_written_is_done_without(stl, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("DIFFLCS_CACHE_DIR", str(tmp_path / "file"))
@@ -270,6 +274,7 @@ def test_objects_slide_and_turn_when_pushed(name):
     assert deepest < 0.001
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "noise", "episodes"),
     [
@@ -445,6 +450,7 @@ def test_pulling_at_the_end_of_the_reach_stays_finite():
     assert np.all(np.linalg.norm(observation["state"][3:].reshape(3, 2), axis=1) < 0.2)
 
 
+@pytest.mark.slow
 def test_gallery(tmp_path, monkeypatch):
     pytest.importorskip("imageio_ffmpeg", reason="needs the extra [viz]")
     from difflcs_envs import RenderingError, gallery

@@ -95,6 +95,7 @@ def run_script(code, timeout=90):
     return done.stdout.split()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_several_threads_may_solve_at_once(workers):
     """IPOPT in threads of one process crashes (casadi issue 3456); the backend must keep them apart."""
@@ -118,6 +119,7 @@ def test_several_threads_may_solve_at_once(workers):
     """) == ["fine"]
 
 
+@pytest.mark.slow
 def test_a_forked_child_starts_its_own_workers():
     assert run_script("""
         import os
@@ -136,6 +138,7 @@ def test_a_forked_child_starts_its_own_workers():
     """) == ["fine"]
 
 
+@pytest.mark.slow
 def test_workers_end_with_their_process():
     pids = run_script("""
         layer(2)(x0)
@@ -148,6 +151,7 @@ def test_workers_end_with_their_process():
             os.kill(int(pid), 0)
 
 
+@pytest.mark.slow
 def test_a_script_without_a_main_guard_is_not_run_again(tmp_path):
     """Workers do not import the user's main module."""
     script = tmp_path / "user.py"

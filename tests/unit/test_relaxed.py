@@ -197,15 +197,18 @@ def check_against_differences(build, t, tol, **options):
         assert abs(found - quotient) <= tol * max(abs(quotient), 1e-2), k
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bound", [0.05, 50.0])
 def test_without_contact_every_gradient_matches_central_differences(build, bound):
     check_against_differences(build, without_contact(build, seed=3, bound=bound), 1e-3)
 
 
+@pytest.mark.slow
 def test_with_contact_every_gradient_is_that_of_all_passes(build):
     check_against_differences(build, tensors(build, seed=4, batch=2), 1e-3)
 
 
+@pytest.mark.slow
 def test_gradients_with_a_guess_hold_the_guess(build):
     t = tensors(build, seed=4, batch=2)
     check_against_differences(build, t, 1e-3, guess=solve(t))

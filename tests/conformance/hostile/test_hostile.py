@@ -14,6 +14,13 @@ from tests.conformance.hostile import campaign, checks, generators, targets
 
 SLOW_CLASSES = ("mpc-plain", "mpc-flat", "mpc-stiff")  # for the solvers that take 10 ms and more per problem
 CELLS = [c for c in campaign.CELLS if c.target not in targets.SLOW_TARGETS or c.problems in SLOW_CLASSES]
+HARD_CLASSES = ("mpc-skew-1e-8", "mpc-unstable", "mpc-extreme")  # most time is spent where most is refused
+PARAMETERS = [
+    pytest.param(
+        c, id=c.name, marks=[pytest.mark.slow] * (c.target in targets.SLOW_TARGETS or c.problems in HARD_CLASSES)
+    )
+    for c in CELLS
+]
 
 # Least share of solved elements in the quick tier, so that refusing everything does not pass.
 FLOORS = {
@@ -40,7 +47,7 @@ FLOORS = {
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-@pytest.mark.parametrize("cell", CELLS, ids=lambda c: c.name)
+@pytest.mark.parametrize("cell", PARAMETERS)
 def test_nothing_is_wrong_in_silence(cell, one_thread):
     if cell.target == "relaxed":
         pytest.importorskip("cvxpylayers")
