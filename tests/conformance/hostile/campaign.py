@@ -1,6 +1,6 @@
 """The campaign: every class of hostile problems over every target, each returned element judged.
 
-    python -m tests.conformance.hostile.campaign --count 1000000 --seed 0 --out results.jsonl
+    python -m tests.conformance.hostile.campaign --count 1000000 --out results.jsonl
     python -m tests.conformance.hostile.campaign --markdown results.jsonl --fill
     python -m tests.conformance.hostile.campaign --only "mpc-flat/warm" --seed 0 --index 17
 
