@@ -1,10 +1,18 @@
-"""Shared builders of small models, as fixtures."""
+"""Shared builders of small models, as fixtures; and how many threads the tests may use."""
 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterator
 from typing import Any
+
+# With several workers of pytest-xdist at once, each takes its share of the cores: torch's number of threads is also
+# that of the kernels, of diffcp and of the processes that a test starts. Tests about threads say themselves how many
+# they want. It has to be said before NumPy and torch are loaded.
+if workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):
+    for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(variable, str(max(1, (os.cpu_count() or 1) // workers)))
 
 import numpy as np
 import pytest
