@@ -4,43 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+_COLUMNS = (("violation", "peak"), ("lcs-rl", "peak"), ("violation", "final"), ("lcs-rl", "final"))
 TABLE1: Mapping[str, Mapping[tuple[str, str], tuple[float, float]]] = {
-    "sugar_box": {
-        ("violation", "peak"): (87.5, 9.2),
-        ("lcs-rl", "peak"): (95.9, 2.4),
-        ("violation", "final"): (44.3, 26.2),
-        ("lcs-rl", "final"): (95.9, 2.4),
-    },
-    "fish_can": {
-        ("violation", "peak"): (59.1, 7.3),
-        ("lcs-rl", "peak"): (69.9, 8.1),
-        ("violation", "final"): (38.8, 13.1),
-        ("lcs-rl", "final"): (69.9, 8.1),
-    },
-    "mug": {
-        ("violation", "peak"): (32.5, 8.4),
-        ("lcs-rl", "peak"): (44.6, 3.9),
-        ("violation", "final"): (10.0, 6.3),
-        ("lcs-rl", "final"): (44.6, 3.9),
-    },
-    "wrench": {
-        ("violation", "peak"): (45.5, 8.7),
-        ("lcs-rl", "peak"): (60.0, 6.5),
-        ("violation", "final"): (11.5, 8.6),
-        ("lcs-rl", "final"): (59.5, 6.6),
-    },
-    "clamp": {
-        ("violation", "peak"): (24.7, 5.3),
-        ("lcs-rl", "peak"): (39.3, 9.7),
-        ("violation", "final"): (6.1, 5.6),
-        ("lcs-rl", "final"): (38.7, 10.2),
-    },
-    "banana": {
-        ("violation", "peak"): (28.4, 5.8),
-        ("lcs-rl", "peak"): (35.5, 5.3),
-        ("violation", "final"): (7.5, 6.6),
-        ("lcs-rl", "final"): (35.5, 5.3),
-    },
+    task: dict(zip(_COLUMNS, numbers, strict=True))
+    for task, *numbers in (
+        ("sugar_box", (87.5, 9.2), (95.9, 2.4), (44.3, 26.2), (95.9, 2.4)),
+        ("fish_can", (59.1, 7.3), (69.9, 8.1), (38.8, 13.1), (69.9, 8.1)),
+        ("mug", (32.5, 8.4), (44.6, 3.9), (10.0, 6.3), (44.6, 3.9)),
+        ("wrench", (45.5, 8.7), (60.0, 6.5), (11.5, 8.6), (59.5, 6.6)),
+        ("clamp", (24.7, 5.3), (39.3, 9.7), (6.1, 5.6), (38.7, 10.2)),
+        ("banana", (28.4, 5.8), (35.5, 5.3), (7.5, 6.6), (35.5, 5.3)),
+    )
 }
 """Table I: object → (method, when) → mean, standard deviation."""
 
@@ -56,6 +30,3 @@ What the text says; the curves themselves were not read off the figure. Violatio
 stops at about 30 %; LCS-RL has the same success at 6 minutes, reaches 65 % after 25 minutes and 71.4 % at the end; PPO
 without warm-up and PDDM end at 10 and 20 %. At 6 minutes 55 % is therefore a little too high.
 """
-
-TRANSFER = "higher final success from the cube's model in all objects except the sugar box"
-"""Fig. transfer_learning, as the text sums it up; it gives no numbers."""
