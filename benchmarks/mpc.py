@@ -24,7 +24,7 @@ from difflcs import LCSModel, LCSMPCLayer, LCSParams, solve_lcp, violation_loss
 from difflcs._native import _kernels
 from difflcs.bench import best, cpu
 from difflcs.mpc.backends import BatchedBackend, IpoptBackend
-from difflcs.rl.tasks import pushing_cost
+from difflcs_envs.tasks import pushing_cost
 
 
 @dataclass

@@ -17,7 +17,7 @@ from models import ACTION_LIMIT, pushing_model, random_model, states_and_goals
 
 from difflcs import LCSModel, LCSMPCLayer, LCSParams
 from difflcs.mpc.backends import Backend, BatchedBackend, IpoptBackend
-from difflcs.rl.tasks import pushing_cost
+from difflcs_envs.tasks import pushing_cost
 
 BACKENDS: dict[str, Backend] = {
     "ipopt": IpoptBackend(),

@@ -43,6 +43,21 @@ class Timing:
         return self.ipopt / self.batched
 
 
+def pushing_cost() -> GoalCost:
+    """A cost like that of pushing an object with three fingers: 9 states, of which 3 have a goal, and 6 actions."""
+    pairs = [(3 + 2 * finger + axis, axis) for finger in range(3) for axis in range(2)]
+    return GoalCost.reach(
+        9,
+        6,
+        goal_weight=(200.0, 200.0, 0.3),
+        goal_weight_final=(200.0, 200.0, 1.5),
+        input_weight=200.0,
+        pairs=pairs,
+        pair_weight=10.0,
+        pair_weight_final=6.0,
+    )
+
+
 def measure(
     cost: GoalCost, n_lam: int = 5, batch: int = 1024, ipopt_batch: int = 8, repeats: int = 3, threads: int = 1
 ) -> list[Timing]:
@@ -52,7 +67,7 @@ def measure(
     a shared machine mean little; the ratio says more.
 
     Args:
-        cost: of the MPC; `difflcs.rl.tasks.pushing_cost()`.
+        cost: of the MPC, such as `pushing_cost()`.
         n_lam: contacts.
         batch: problems per call of backend batched.
         ipopt_batch: problems per call of backend ipopt.

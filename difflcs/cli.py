@@ -1,6 +1,6 @@
 """The command line: `difflcs train | evaluate | render | demo | zoo | assets | bench | doctor`.
 
-The only file of the package that knows both the library and the environments.
+Tasks and methods are known by their registries only; the flags of `train` are made of the settings of its method.
 """
 
 from __future__ import annotations
@@ -11,38 +11,29 @@ import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import torch
 
 from difflcs import zoo
-from difflcs._files import write_json
+from difflcs._renamed import renamed
 from difflcs.errors import CheckpointError, DiffLCSError, InvalidInputError
 from difflcs.rl._optional import require, versions
-from difflcs.rl.checkpoint import RunDirectory, load_checkpoint
+from difflcs.rl.checkpoint import RunDirectory
 from difflcs.rl.evaluate import evaluate
-from difflcs.rl.figures import plot_learning_curve, record_video
+from difflcs.rl.figures import NoPictureError, plot_learning_curve, record_video
+from difflcs.rl.methods import get_method, method_names
 from difflcs.rl.progress import Progress, bar, summary
-from difflcs.rl.tasks import TASKS, Task, get_task, pushing_cost
-from difflcs.rl.training import (
-    EVALUATION_ENVS,
-    TrainConfig,
-    profile,
-    saved_bounds,
-    stored_config,
-    train,
-)
+from difflcs.rl.tasks import TaskSpec, get_task
+from difflcs.rl.training import EVALUATION_ENVS, TrainConfig, profile, saved_bounds, stored_config, train
 from difflcs.zoo import Learned
 
 if TYPE_CHECKING:
-    import gymnasium
-    from gymnasium.vector import VectorEnv
+    pass
 
-Goal = tuple[float, float, float]
 _SMOKE_GOALS = 4
-_PICTURE = {"width": 640, "height": 480}
 
 
 @dataclass(frozen=True)
@@ -63,43 +54,28 @@ class Train(TrainConfig):
     def __post_init__(self) -> None:
         """Check nothing yet: `run` does, so that its errors are printed like all others."""
 
-    @property
-    def directory(self) -> Path:
-        """The run directory."""
-        text = str(self.out)
-        for name in ("task", "method", "seed"):
-            text = text.replace(f"{{{name}}}", str(getattr(self, name)))
-        return Path(text)
-
     def run(self) -> None:
         """Run the command."""
         config = TrainConfig(**{f.name: getattr(self, f.name) for f in fields(TrainConfig)})
         config = config.smoke() if self.smoke else config
+        out = self.directory(self.out)
         if self.resume:
             config = self._resumed(config)
         with Progress() as progress:
-            run = train(
-                config,
-                self.directory,
-                _env_factory(config.task, self.directory),
-                init=self.init,
-                resume=self.resume,
-                force=self.force,
-                reporter=progress,
-            )
+            run = train(config, out, init=self.init, resume=self.resume, force=self.force, reporter=progress)
         spent = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in profile(run.rows()).items() if seconds)
         print(f"time: {spent}")
         print(f"finished: {run.path}\nevaluate it with: difflcs evaluate {run.path}")
 
     def _resumed(self, config: TrainConfig) -> TrainConfig:
-        stored = stored_config(RunDirectory.open(self.directory))
-        default = TrainConfig()
-        for f in fields(TrainConfig):
-            wanted, own = getattr(config, f.name), getattr(stored, f.name)
-            if wanted not in (own, getattr(default, f.name), getattr(default.smoke(), f.name)):
-                flag = f.name.replace("_", "-")
+        stored = stored_config(RunDirectory.open(self.directory(self.out)))
+        default = TrainConfig(method=type(config.method)())
+        wanted, own, usual, small = (_flat(c.to_json()) for c in (config, stored, default, default.smoke()))
+        for name, value in wanted.items():
+            if value not in (own.get(name), usual[name], small[name]):
+                flag, run = name.removeprefix("settings.").replace("_", "-"), self.directory(self.out)
                 raise CheckpointError(
-                    f"--{flag}: expected {own!r}, as {self.directory} was started with, got {wanted!r}; "
+                    f"--{flag}: expected {own.get(name)!r}, as {run} was started with, got {value!r}; "
                     f"drop the flag, or start another run with another --out"
                 )
         if self.init is not None:
@@ -110,7 +86,56 @@ class Train(TrainConfig):
 
     def interrupted(self) -> str:
         """What to do after Ctrl-C."""
-        return f"continue with: difflcs train --out {self.directory} --resume"
+        return f"continue with: difflcs train --out {self.directory(self.out)} --resume"
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by their dotted names."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return found
+
+
+def _train_command(words: Sequence[str]) -> type[Train]:
+    """`Train` with the flags of the method that the words name, or that the run to resume was started with."""
+    import tyro
+
+    name = _value(words, "--method")
+    out = _value(words, "--out")
+    if name is None and "--resume" in words and out is not None and (Path(out) / "config.json").is_file():
+        name = stored_config(RunDirectory.open(Path(out))).method.name
+    kind = get_method(name or method_names()[0])
+    for word in words:
+        flag = word.partition("=")[0].replace("_", "-")
+        if new := renamed(flag):
+            raise InvalidInputError(f"{flag}: expected a flag of today, got one of before; it is called {new} now")
+    hidden = Annotated[kind, tyro.conf.arg(name="", prefix_name=False)]
+    chosen: Any = Annotated[
+        Literal[method_names()],  # pyright: ignore[reportInvalidTypeForm]
+        tyro.conf.arg(name="method", help=_methods()),
+    ]
+    return make_dataclass(
+        "Train",
+        [("method", hidden, field(default_factory=kind)), ("method_name", chosen, field(default=kind.name))],
+        bases=(Train,),
+        frozen=True,
+        namespace={"__doc__": Train.__doc__, "__post_init__": lambda self: None},
+    )
+
+
+def _methods() -> str:
+    return "How to learn: " + "; ".join(f"{name}: {get_method(name).summary}" for name in method_names()) + "."
+
+
+def _value(words: Sequence[str], flag: str) -> str | None:
+    """What follows a flag, as `--flag value` or `--flag=value`."""
+    for word, following in zip(words, [*words[1:], None], strict=True):
+        if word == flag:
+            return following
+        if word.startswith(f"{flag}="):
+            return word.partition("=")[2]
+    return None
 
 
 @dataclass(frozen=True)
@@ -125,8 +150,8 @@ class Evaluate:
     """Seed of the goals and initial states."""
     json: bool = False
     """Print one JSON object instead of text."""
-    trust_region: bool = False
-    """Keep the action bounds of the last training episodes, instead of the task's full bounds."""
+    action_support: bool = False
+    """Keep the action bounds of the last episodes of a warm-up, instead of the task's full bounds."""
     smoke: bool = False
     """Try a few goals only."""
 
@@ -136,15 +161,15 @@ class Evaluate:
         learned = Learned.open(self.model)
         task = get_task(learned.task)
         bounds = (None, None)
-        if self.trust_region:
+        if self.action_support:
             if learned.run is None:
                 raise InvalidInputError(
-                    f"trust-region: expected a run, whose episodes give the bounds, got {learned.name}; drop the flag"
+                    f"action-support: expected a run, whose episodes give the bounds, got {learned.name}; drop the flag"
                 )
-            bounds = saved_bounds(load_checkpoint(learned.run.checkpoints))
+            bounds = saved_bounds(learned.run)
         start = time.perf_counter()
-        envs = _env_factory(learned.task)(max(1, min(EVALUATION_ENVS, goals)))
-        _compare(learned, _object(envs))
+        envs = task.make_envs(max(1, min(EVALUATION_ENVS, goals)))
+        found = _compare(learned, task, envs)
         try:
             with bar(goals * task.episode_steps, "evaluating") as shown:
                 result = evaluate(
@@ -158,12 +183,12 @@ class Evaluate:
                 **asdict(result),
                 "run": learned.name,
                 "task": learned.task,
-                "object": _object(envs),
+                "object": found,
                 "trained_on": learned.object,
                 "method": learned.method,
                 "finished": learned.finished,
                 "backend": learned.backend,
-                "trust_region": self.trust_region,
+                "action_support": self.action_support,
                 "card": None if learned.card is None else asdict(learned.card),
                 "seconds": round(seconds, 3),
                 "versions": versions(),
@@ -173,10 +198,15 @@ class Evaluate:
         if not learned.finished:
             print(f"{learned.name} is not finished: evaluated its latest checkpoint")
         print(summary(result))
+        for error in task.errors:
+            if error.name in result.median_errors:
+                print(f"median {error.name.replace('_', ' ')}: {result.median_errors[error.name]:.3g} {error.unit}")
         if learned.card is not None:
             print(f"its card: {learned.card.success_text}, goal seed {learned.card.evaluation_seed}")
-        print(f"object: {_described(_object(envs))}")
-        print(f"goal seed {result.seed}, {learned.task}, backend {learned.backend}, {seconds:.1f} s, {_versions()}")
+        if found:
+            print(f"object: {zoo.described(found)}")
+        solver = "" if learned.backend is None else f", backend {learned.backend}"
+        print(f"goal seed {result.seed}, {learned.task}{solver}, {seconds:.1f} s, {_versions()}")
 
 
 @dataclass(frozen=True)
@@ -185,8 +215,8 @@ class Render:
 
     model: Path
     """Run directory, or zoo:NAME for one of the models that `difflcs zoo` lists."""
-    goal: tuple[Goal, ...] = ((0.04, 0.03, 0.3),)
-    """Goals: x [m], y [m], yaw [rad] each; within ±0.06 m and ±0.5 rad."""
+    goal: tuple[float, ...] = ()
+    """Goals, one after another, each with the numbers that the task wants; by default an example of the task."""
     out: Path = Path("video.mp4")
     """Video to write, an MP4."""
     force: bool = False
@@ -198,25 +228,37 @@ class Render:
 
     def run(self) -> None:
         """Run the command."""
-        goals = self.goal[:1] if self.smoke else self.goal
-        if not goals:
-            raise InvalidInputError("goal: expected at least one goal of three numbers, got none")
         if self.out.suffix.lower() != ".mp4" or self.out.is_dir():
             raise InvalidInputError(f"out: expected the name of an MP4 file, got {self.out}; pass --out video.mp4")
         if self.out.exists() and not self.force:
             raise InvalidInputError(
                 f"out: expected a new file, got {self.out}, which exists; pass --force to replace it, or another --out"
             )
-        reached = _record(Learned.open(self.model), goals, self.out, self.seed)
+        learned = Learned.open(self.model)
+        task = get_task(learned.task)
+        goals = self._goals(task)
+        goals = goals[:1] if self.smoke else goals
+        reached = _record(learned, task, goals, self.out, self.seed)
         for goal, ok in zip(goals, reached, strict=True):
             print(f"goal {' '.join(f'{v:g}' for v in goal)}: {'reached' if ok else 'missed'}")
         print(f"written: {self.out}")
+
+    def _goals(self, task: TaskSpec) -> list[tuple[float, ...]]:
+        size = task.n_goal
+        if self.goal and len(self.goal) % size == 0:
+            return [self.goal[i : i + size] for i in range(0, len(self.goal), size)]
+        if not self.goal and task.example_goals:
+            return [task.example_goals[0]]
+        names = ", ".join(f"{q.name} [{q.unit}]" for q in task.goal) or f"{size} numbers"
+        raise InvalidInputError(f"goal: expected {names} for each goal of {task.name}, got {self.goal}; pass --goal")
 
 
 @dataclass(frozen=True)
 class Demo:
     """Learn to push the cube from 6 minutes of data; learning curve and video."""
 
+    task: str = TrainConfig.task
+    """What to do: the name of a task."""
     out: Path = Path("runs/demo")
     """Run directory. An existing demo is continued, not repeated."""
     seed: int = 0
@@ -228,17 +270,18 @@ class Demo:
         """Run the command."""
         start = time.perf_counter()
         require("matplotlib", "imageio", "imageio_ffmpeg", "PIL")  # before the training, not after
-        config = TrainConfig(seed=self.seed, evaluate_at=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0), evaluate_goals=100)
+        when = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
+        method = get_method("violation")()
+        config = TrainConfig(task=self.task, method=method, seed=self.seed, evaluate_at=when, evaluate_goals=100)
         config = config.smoke() if self.smoke else config
         resume = (self.out / "config.json").exists()
         if resume:
             print(f"{self.out} exists: continuing it (delete it for a fresh start)")
         with Progress() as progress:
-            run = train(config, self.out, _env_factory(config.task, self.out), resume=resume, reporter=progress)
+            run = train(config, self.out, resume=resume, reporter=progress)
         rows = run.rows()
-        title = f"{config.task}, seed {config.seed}: learning to push"
-        plot_learning_curve(rows, run.path / "learning_curve.png", title)
-        goals: tuple[Goal, ...] = ((0.04, 0.03, 0.3), (-0.04, 0.03, -0.3), (0.0, -0.05, 0.4), (0.05, -0.02, 0.0))
+        plot_learning_curve(rows, run.path / "learning_curve.png", f"{config.task}, seed {config.seed}: learning")
+        goals = get_task(config.task).example_goals
         video = self._video(run, goals[:1] if self.smoke else goals)
         evaluated = [row for row in rows if row["evaluation_goals"]]
         print(f"\nsuccess before learning: {_from_row(evaluated[0])}")
@@ -247,20 +290,17 @@ class Demo:
         seconds = time.perf_counter() - start
         print(f"goal seed {config.evaluation_seed}, training seed {config.seed}, {seconds:.0f} s, {_versions()}")
 
-    def _video(self, run: RunDirectory, goals: Sequence[Goal]) -> str:
+    def _video(self, run: RunDirectory, goals: Sequence[Sequence[float]]) -> str:
+        learned = Learned.open(run.path)
         try:
-            reached = _record(Learned.open(run.path), goals, run.path / "video.mp4", seed=0)
-        except _NoPictureError as error:
+            reached = _record(learned, get_task(learned.task), goals, run.path / "video.mp4", seed=0)
+        except NoPictureError as error:
             return f"none, {error}"  # the rest of the demo needs no OpenGL
         return f"{run.path / 'video.mp4'} ({sum(reached)} of {len(goals)} goals reached in it)"
 
     def interrupted(self) -> str:
         """What to do after Ctrl-C."""
         return "run the same command again to continue"
-
-
-class _NoPictureError(DiffLCSError):
-    """This machine cannot render."""
 
 
 @dataclass(frozen=True)
@@ -331,7 +371,7 @@ class Bench:
 
         threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         sizes = (16, 2, 1) if self.smoke else (self.batch, self.ipopt_batch, self.repeats)
-        timings = bench.measure(pushing_cost(), 5, *sizes, threads=threads)
+        timings = bench.measure(bench.pushing_cost(), 5, *sizes, threads=threads)
         if self.json:
             record = {"timings": [{**asdict(t), "ratio": t.ratio} for t in timings], "threads": threads}
             print(json.dumps({**record, "batch": sizes[0], "ipopt_batch": sizes[1], "machine": bench.machine()}))
@@ -373,7 +413,7 @@ _DESCRIPTION = """Differentiable MPC through learned linear complementarity syst
 
   difflcs doctor                                            what works here
   difflcs render zoo:trifinger-cube --out cube.mp4          a learned model
-  difflcs train --task cube --method lcs-rl --minutes 30    learn one"""
+  difflcs train --task cube --minutes 30                    learn one"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -395,6 +435,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         # `train` has settings for which None means something.
         plain = {k: v if k == "train" else Annotated[v, tyro.conf.DisallowNone] for k, v in _COMMANDS.items()}
+        if words[:1] == ["train"]:
+            plain["train"] = _train_command(words[1:])
         command = tyro.extras.subcommand_cli_from_dict(
             cast(Any, plain),
             prog="difflcs",
@@ -417,80 +459,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
 
 
-def _compare(learned: Learned, found: dict[str, Any]) -> None:
-    """Say so if the object of the environment is not the one that the model was trained on."""
+def _compare(learned: Learned, task: TaskSpec, env: Any) -> dict[str, Any]:
+    """What an environment holds; says so if it is not what the model was trained on."""
+    found = dict(task.describe(env))
     if learned.object is not None and not learned.fits(found):
         print(
-            f"difflcs: {learned.name} was trained on {_described(learned.object)}, here it is "
-            f"{_described(found)}: do not compare their success; for the meshes see: difflcs assets --help",
+            f"difflcs: {learned.name} was trained on {zoo.described(learned.object)}, here it is "
+            f"{zoo.described(found)}: do not compare their success",
             file=sys.stderr,
         )
+    return found
 
 
-def _env_factory(name: str, run: Path | None = None) -> Callable[[int], VectorEnv]:
-    """Makes the environments of a task; those of a training leave in its config.json what object they hold."""
-    task = _registered(name)
-
-    def make(count: int) -> VectorEnv:
-        import gymnasium
-
-        from difflcs_envs import DifflcsEnvsError
-
-        try:
-            envs = gymnasium.make_vec(task.env_id, num_envs=count, **dict(task.env_kwargs))
-        except DifflcsEnvsError as error:
-            raise InvalidInputError(f"task {name}: {error}") from error
-        if run is not None:
-            _note_object(run, _object(envs))
-        return envs
-
-    return make
-
-
-def _object(envs: VectorEnv) -> dict[str, Any]:
-    """What the fingers push: name, source (mesh or stand-in), mass, ..."""
-    return envs.envs[0].object.describe()  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def _note_object(run: Path, found: dict[str, Any]) -> None:
-    """Record what object a run is trained on. A resumed run must find the same."""
-    config = RunDirectory.open(run).config()
-    stored = config.get("object")
-    if stored is None:
-        write_json(run / "config.json", {**config, "object": found})
-    elif stored != found:
-        raise CheckpointError(
-            f"{run}: expected the object it was started with, {stored}, got {found}; set DIFFLCS_YCB_DIR as it was then"
-        )
-
-
-def _registered(name: str) -> Task:
-    task = get_task(name)
-    require("gymnasium", "mujoco", "difflcs_envs")
-    import gymnasium
-
-    import difflcs_envs
-
-    difflcs_envs.register_envs()
-    if task.env_id not in gymnasium.registry:
-        available = [k for k, v in TASKS.items() if v.env_id in gymnasium.registry]
-        raise InvalidInputError(f"task: {name!r} is not available yet; expected one of {', '.join(available)}")
-    return task
-
-
-def _record(learned: Learned, goals: Sequence[Goal], path: Path, seed: int) -> list[bool]:
-    task = _registered(learned.task)
+def _record(learned: Learned, task: TaskSpec, goals: Sequence[Sequence[float]], path: Path, seed: int) -> list[bool]:
     require("imageio", "imageio_ffmpeg", "PIL")
-    import gymnasium
-
-    from difflcs_envs import RenderingError
-
-    env: gymnasium.Env = gymnasium.make(task.env_id, render_mode="rgb_array", **_PICTURE, **dict(task.env_kwargs))
     try:
-        _compare(learned, cast(Any, env.unwrapped).object.describe())
-        return record_video(env, learned.policy, goals, path, task.episode_steps, task.step_seconds, seed)
-    except RenderingError as error:
-        raise _NoPictureError(str(error)) from error
+        env = task.make_env(render_mode="rgb_array")
+    except InvalidInputError as error:
+        raise NoPictureError(str(error)) from error
+    try:
+        _compare(learned, task, env)
+        return record_video(env, learned.policy, goals, path, task, seed)
     except OSError as error:
         raise InvalidInputError(f"out: expected a place to write {path}, got: {error}; choose another") from error
     finally:
@@ -500,10 +489,6 @@ def _record(learned: Learned, goals: Sequence[Goal], path: Path, seed: int) -> l
 def _from_row(row: dict[str, str]) -> str:
     rate, low, high = (100 * float(row[f"evaluation_{name}"]) for name in ("success_rate", "ci_low", "ci_high"))
     return f"{rate:.1f} % of {row['evaluation_goals']} goals (95 % interval {low:.1f} to {high:.1f} %)"
-
-
-def _described(thing: Mapping[str, Any]) -> str:
-    return f"{thing['name']} ({thing['source'].replace('_', ' ')}, {1e3 * thing['mass']:g} g)"
 
 
 def _versions() -> str:

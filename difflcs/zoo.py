@@ -10,8 +10,8 @@ A maintainer adds a finished run, which is evaluated at its end, by
 
     python -m difflcs.zoo add RUN [NAME] [--force]
 
-in a checkout of the repository with an editable installation. A name is `trifinger-<task>`, with `-violation` or
-another method behind it unless the method is lcs-rl; without NAME it is made from the run.
+in a checkout of the repository with an editable installation. A name is what the task calls its models, with the method
+behind it unless that is the default one; without NAME it is made from the run.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from difflcs.errors import CheckpointError, DiffLCSError, InvalidInputError
 if TYPE_CHECKING:
     from difflcs.rl.checkpoint import RunDirectory
     from difflcs.rl.rollout import Policy
+    from difflcs.rl.training import TrainConfig
 
 __all__ = ["PREFIX", "Learned", "ModelCard", "add", "card", "names", "path"]
 
@@ -60,7 +61,7 @@ class ModelCard:
         goals: goals of that evaluation.
         evaluation_seed: their seed.
         solver_failures: MPC solves of that evaluation that did not converge.
-        object: what the fingers push: name, source (built_in, ycb_mesh or stand_in), mass [kg] and more.
+        object: what decides whether results can be compared, as the task describes its environment.
         backend: MPC solver of training and evaluation.
         version: of difflcs.
         command: what trained it.
@@ -88,13 +89,8 @@ class ModelCard:
 
     @property
     def object_source(self) -> str:
-        """Where the object's shape is from: built_in, ycb_mesh or stand_in."""
-        return str(self.object["source"])
-
-    @property
-    def object_mass(self) -> float:
-        """Mass of the object [kg]."""
-        return float(self.object["mass"])
+        """Where the shape of the object is from, such as built_in, ycb_mesh or stand_in; "" if nobody said."""
+        return str(self.object.get("source", ""))
 
     @property
     def success_text(self) -> str:
@@ -105,7 +101,7 @@ class ModelCard:
     def __str__(self) -> str:
         lines = {
             "task": self.task,
-            "object": f"{self.object_source.replace('_', ' ')}, {1e3 * self.object_mass:g} g",
+            "object": described(self.object),
             "method": f"{self.method}, {self.minutes:g} min of data, seed {self.seed}, backend {self.backend}",
             "success": f"{self.success_text}, goal seed {self.evaluation_seed}",
             "solver": f"{self.solver_failures} solves failed in that evaluation",
@@ -193,15 +189,19 @@ def check_object(found: Mapping[str, Any], source: object) -> None:
     """Check what a file says of the object that a model was trained on.
 
     Raises:
-        CheckpointError: name or source is no text, or the mass no positive number.
+        CheckpointError: something else than texts and numbers.
     """
-    name, kind, mass = (found.get(key) for key in ("name", "source", "mass"))
-    number = isinstance(mass, int | float) and not isinstance(mass, bool) and 0 < mass < 1e6
-    if not isinstance(name, str) or not isinstance(kind, str) or not number:
+    if not all(isinstance(value, str | int | float | bool | None) for value in found.values()):
         raise CheckpointError(
-            f"{source}: expected an object with name, source and mass [kg], got {_files.short(dict(found))}; restore "
-            f"it from a copy"
+            f"{source}: expected texts and numbers that describe an object, got {_files.short(dict(found))}; "
+            f"restore it from a copy"
         )
+
+
+def described(found: Mapping[str, Any]) -> str:
+    """What decides whether results can be compared, in one line; no hashes."""
+    texts = [f"{key.replace('_', ' ')} {value}" for key, value in found.items() if key not in ("name", "sha256")]
+    return " ".join([str(found.get("name", "")), f"({', '.join(texts)})" if texts else ""]).strip() or "nothing special"
 
 
 @dataclass(frozen=True)
@@ -212,7 +212,7 @@ class Learned:
         name: the run directory, or "zoo:NAME".
         task: what it was trained for.
         method: how.
-        backend: MPC solver.
+        backend: MPC solver; None without one.
         policy: from states and goals to plans.
         finished: whether the training is.
         object: what it was trained on, as the environment described it; None if it did not.
@@ -223,7 +223,7 @@ class Learned:
     name: str
     task: str
     method: str
-    backend: str
+    backend: str | None
     policy: Policy
     finished: bool
     object: Mapping[str, Any] | None
@@ -254,13 +254,13 @@ class Learned:
         found = found if isinstance(found, dict) else None
         if found is not None:
             check_object(found, source)
-        return cls(name, config.task, config.method, config.backend, load_policy(run), run.finished(), found, run=run)
+        method = config.method
+        return cls(name, config.task, method.name, method.solver, load_policy(run), run.finished(), found, run=run)
 
     def fits(self, found: Mapping[str, Any]) -> bool:
-        """Whether the object of an environment is the one it was trained on; True if that is not known."""
-        return self.object is None or all(
-            self.object.get(key) == found.get(key) for key in ("name", "source", "mass", "sha256")
-        )
+        """Whether an environment holds what it was trained on, as far as both say; True if that is not known."""
+        own = self.object or {}
+        return all(own[key] == found[key] for key in own.keys() & found.keys())
 
 
 # --- adding models ----------------------------------------------------------------------------------------------------
@@ -284,19 +284,15 @@ def add(run: Path, name: str | None = None, *, force: bool = False, root: Path =
         InvalidInputError: the name does not say task and method.
     """
     from difflcs.rl.checkpoint import RunDirectory
+    from difflcs.rl.training import load_model, stored_config
 
     directory = RunDirectory.open(run)
-    settings = directory.config().get("config")
-    kinds = {"task": str, "method": str, "minutes": int | float, "seed": int, "evaluation_seed": int, "backend": str}
-    if not isinstance(settings, dict) or not all(isinstance(settings.get(k), kind) for k, kind in kinds.items()):
-        raise CheckpointError(
-            f"{run}: expected the settings of a training in config.json, got {_files.short(settings)}; train it again"
-        )
-    name = _checked_name(name, settings["task"], settings["method"])
+    config = stored_config(directory)
+    name = _checked_name(name, config)
     if not directory.finished():
         raise CheckpointError(f"{run}: expected a finished run; continue it with: difflcs train --out {run} --resume")
-    model = directory.load_model()
-    content = _card(directory, settings, name)
+    model = load_model(run)
+    content = _card(directory, config, name)
     if (root / name).exists() and not force:
         raise CheckpointError(f"{root / name}: expected no model of that name, got one; replace it with --force")
     root.mkdir(parents=True, exist_ok=True)
@@ -318,16 +314,20 @@ def add(run: Path, name: str | None = None, *, force: bool = False, root: Path =
     return content
 
 
-def _checked_name(name: str | None, task: str, method: str) -> str:
-    wanted = f"trifinger-{task.replace('_', '-')}" + ("" if method == "lcs-rl" else f"-{method}")
+def _checked_name(name: str | None, config: TrainConfig) -> str:
+    from difflcs.rl.methods import method_names
+    from difflcs.rl.tasks import get_task
+
+    task, method = get_task(config.task), config.method.name
+    wanted = (task.model_name or task.name) + ("" if method == method_names()[0] else f"-{method}")
     if name is not None and name.removeprefix(_zoo.PREFIX) != wanted:
         raise InvalidInputError(
-            f"name: expected {wanted!r} for task {task} and method {method}, got {name!r}; leave it out"
+            f"name: expected {wanted!r} for task {task.name} and method {method}, got {name!r}; leave it out"
         )
     return wanted
 
 
-def _card(run: RunDirectory, settings: Mapping[str, Any], name: str) -> ModelCard:
+def _card(run: RunDirectory, config: TrainConfig, name: str) -> ModelCard:
     stored, rows = run.config(), run.rows()
     last = rows[-1] if rows else {}
     if not last.get("evaluation_goals"):
@@ -350,40 +350,40 @@ def _card(run: RunDirectory, settings: Mapping[str, Any], name: str) -> ModelCar
         ) from error
     return ModelCard(
         name=name,
-        task=settings["task"],
-        method=settings["method"],
-        minutes=settings["minutes"],
-        seed=settings["seed"],
+        task=config.task,
+        method=config.method.name,
+        minutes=config.minutes,
+        seed=config.seed,
         success_rate=rate,
         ci_low=low,
         ci_high=high,
         goals=goals,
-        evaluation_seed=settings["evaluation_seed"],
+        evaluation_seed=config.evaluation_seed,
         solver_failures=failures,
         object=found,
-        backend=settings["backend"],
+        backend=config.method.solver or "",
         version=str(versions.get("difflcs")),
-        command=training_command(settings, stored.get("init")),
+        command=training_command(config, stored.get("init")),
         versions=versions,
-        settings=settings,
+        settings=json.loads(json.dumps(config.to_json())),
     )
 
 
-def training_command(settings: Mapping[str, Any], init: object = None) -> str:
+def training_command(config: TrainConfig, init: object = None) -> str:
     """The command line of a training: task, method, minutes and seed, and what differs from the defaults of today.
 
     Args:
-        settings: `TrainConfig` as config.json of a run holds it, perhaps of another version.
+        config: the training.
         init: what the run started from, as config.json holds it.
     """
     from difflcs.rl.training import TrainConfig
 
-    always = ("task", "method", "minutes", "seed")
+    own, usual = (json.loads(json.dumps(c.to_json())) for c in (config, TrainConfig(method=type(config.method)())))
     words = ["difflcs", "train"]
-    for name in always:
-        words += _flag(name, settings[name])
-    usual = json.loads(json.dumps(asdict(TrainConfig())))
-    words += _differences({k: v for k, v in settings.items() if k not in always}, usual)
+    for name in ("task", "method", "minutes", "seed"):
+        words += _flag(name, own.pop(name))
+    words += _differences(own.pop("settings"), usual.pop("settings"))
+    words += _differences(own, usual)
     if init is not None:
         source = Path(str(init))  # of a path the last part only: folders of one machine mean nothing elsewhere
         source = source.parent if source.name == "model" else source

@@ -9,19 +9,24 @@ from difflcs.rl._optional import require
 require("gymnasium")  # a clear error, before the modules below import it
 
 # ruff: noqa: E402
-from difflcs.rl.checkpoint import Checkpoint, RunDirectory, load_checkpoint, save_checkpoint
-from difflcs.rl.dynamics import Ensemble
+from difflcs.rl.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
+from difflcs.rl.critic import CriticSettings
+from difflcs.rl.dynamics import Ensemble, EnsembleSettings
 from difflcs.rl.evaluate import Evaluation, evaluate, wilson_interval
-from difflcs.rl.imagination import Imagination, ImaginationConfig
-from difflcs.rl.mlp import MLPConfig, MLPController
-from difflcs.rl.natural import NaturalGradient
-from difflcs.rl.pddm import PDDM, PDDMConfig
-from difflcs.rl.phases import LCSRL
-from difflcs.rl.ppo import PPO, PPOConfig
-from difflcs.rl.rollout import Rollouts, collect
-from difflcs.rl.tasks import TASKS, Task, get_task
+from difflcs.rl.lcs_rl import LCSRL
+from difflcs.rl.methods import LCSMethod, Method, Work, get_method, method_names, register_method
+from difflcs.rl.mlp import MLPController
+from difflcs.rl.model_rollouts import ModelRollouts, ModelRolloutSettings
+from difflcs.rl.optim import Natural, NaturalGradient
+from difflcs.rl.pddm import PDDM, PDDMSettings
+from difflcs.rl.ppo import PPO
+from difflcs.rl.ppo_settings import PPOSettings, make_ppo
+from difflcs.rl.rollout import collect
+from difflcs.rl.settings import Adam, Epochs, Rollouts, Settings, ViolationLoss, bounded, group
+from difflcs.rl.tasks import Quantity, TaskSpec, get_task, register_task, task_names
+from difflcs.rl.trainer import Trainer
 from difflcs.rl.training import Reporter, TrainConfig, load_model, load_policy, train
-from difflcs.rl.warmup import Warmup, WarmupConfig, fit, trust_region
+from difflcs.rl.warmup import Warmup, WarmupSettings, action_support, fit
 
 if TYPE_CHECKING:
     from difflcs.rl.policy import LCSMPCPolicy, MLPPolicy, make_actor
@@ -30,37 +35,54 @@ __all__ = [
     "LCSRL",
     "PDDM",
     "PPO",
-    "TASKS",
-    "Checkpoint",
+    "Adam",
+    "CriticSettings",
     "Ensemble",
+    "EnsembleSettings",
+    "Epochs",
     "Evaluation",
-    "Imagination",
-    "ImaginationConfig",
     "LCSMPCPolicy",
-    "MLPConfig",
+    "LCSMethod",
     "MLPController",
     "MLPPolicy",
+    "Method",
+    "ModelRolloutSettings",
+    "ModelRollouts",
+    "Natural",
     "NaturalGradient",
-    "PDDMConfig",
-    "PPOConfig",
+    "PDDMSettings",
+    "PPOSettings",
+    "Quantity",
     "Reporter",
     "Rollouts",
     "RunDirectory",
-    "Task",
+    "Settings",
+    "TaskSpec",
     "TrainConfig",
+    "Trainer",
+    "ViolationLoss",
     "Warmup",
-    "WarmupConfig",
+    "WarmupSettings",
+    "Work",
+    "action_support",
+    "bounded",
     "collect",
     "evaluate",
     "fit",
+    "get_method",
     "get_task",
+    "group",
     "load_checkpoint",
     "load_model",
     "load_policy",
     "make_actor",
+    "make_ppo",
+    "method_names",
+    "register_method",
+    "register_task",
     "save_checkpoint",
+    "task_names",
     "train",
-    "trust_region",
     "wilson_interval",
 ]
 

@@ -21,55 +21,30 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Collection, Mapping, Sequence
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
-from torch import Tensor, dtype
+from torch import Tensor
 
 from difflcs import _files
 from difflcs.errors import CheckpointError
-from difflcs.lcs import LCSModel
+from difflcs.rl.state import State, flatten, unflatten
 
 _KIND = "training"
-_MODEL = "model."
-"""Prefix of the model's tensors in a checkpoint."""
 _DIGITS = 12
 """Longest number of a checkpoint."""
 
 
-@dataclass(frozen=True)
-class Checkpoint:
-    """The state of a training between two iterations.
-
-    Attributes:
-        iteration: iterations done.
-        model: the learned system; None where the method learns something else, which is then among the tensors.
-        state: counters and random generators, JSON types only.
-        tensors: data buffer and whatever else the trainer holds.
-    """
-
-    iteration: int
-    model: LCSModel | None
-    state: Mapping[str, object]
-    tensors: Mapping[str, Tensor]
-
-
-def save_checkpoint(root: Path, checkpoint: Checkpoint, keep: int = 2) -> None:
-    """Write `root/<iteration>/`, make it the latest, and delete all but the newest `keep` up to it."""
+def save_checkpoint(root: Path, iteration: int, state: State, keep: int = 2) -> None:
+    """Write a state into `root/<iteration>/`, make it the latest, and delete all but the newest `keep` up to it."""
     root.mkdir(parents=True, exist_ok=True)
-    name = f"{checkpoint.iteration:06d}"
-    model = checkpoint.model
+    name = f"{iteration:06d}"
     temporary = Path(tempfile.mkdtemp(dir=root, prefix=f".{name}.", suffix=".tmp"))
     try:
-        content = {
-            "iteration": checkpoint.iteration,
-            "model": None if model is None else model.config(),
-            "state": dict(checkpoint.state),
-        }
-        parameters = {} if model is None else model.state_dict()
-        tensors = {f"{_MODEL}{k}": v for k, v in parameters.items()} | dict(checkpoint.tensors)
+        tensors, rest = flatten(state)
+        content = {"iteration": iteration, "state": rest}
         _files.save_record(temporary, _KIND, {**content, "sha256": _hash(content)}, tensors)
         temporary.chmod(0o755)
         shutil.rmtree(root / name, ignore_errors=True)  # left by a crash before it became the latest
@@ -79,12 +54,12 @@ def save_checkpoint(root: Path, checkpoint: Checkpoint, keep: int = 2) -> None:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
     _files.write_json(root / "latest.json", {"checkpoint": name})
-    for old in sorted(n for n in _numbered(root) if int(n) <= checkpoint.iteration)[:-keep]:
+    for old in sorted(n for n in _numbered(root) if int(n) <= iteration)[:-keep]:
         shutil.rmtree(root / old, ignore_errors=True)
 
 
-def load_checkpoint(root: Path) -> Checkpoint:
-    """Read the latest checkpoint below `root`; nothing is written.
+def load_checkpoint(root: Path) -> dict[str, Any]:
+    """Read the state of the latest checkpoint below `root`; nothing is written.
 
     Raises:
         CheckpointError: there is none, or it is incomplete, corrupt or foreign.
@@ -112,18 +87,16 @@ def load_checkpoint(root: Path) -> Checkpoint:
         raise CheckpointError(f"{error.args[0]}; {remedy}") from error
 
 
-def _load(directory: Path, number: int) -> Checkpoint:
+def _load(directory: Path, number: int) -> dict[str, Any]:
     record, tensors = _files.load_record(directory, _KIND)
     content = {k: v for k, v in record.items() if k != "sha256"}
     if record.get("sha256") != _hash(content):
         raise CheckpointError(f"{directory}: config.json does not match its checksum")
-    iteration, config, state = content.get("iteration"), content.get("model"), content.get("state")
-    if iteration != number or not isinstance(config, dict | None) or not isinstance(state, dict):
-        raise CheckpointError(f"{directory}: expected iteration {number} with model and state, got {sorted(content)}")
+    iteration, state = content.get("iteration"), content.get("state")
+    if iteration != number or not isinstance(state, dict):
+        raise CheckpointError(f"{directory}: expected iteration {number} with its state, got {sorted(content)}")
     _files.check_finite(directory, tensors)
-    parameters = {k.removeprefix(_MODEL): v for k, v in tensors.items() if k.startswith(_MODEL)}
-    model = None if config is None else LCSModel.from_config(config, parameters, str(directory))
-    return Checkpoint(number, model, state, {k: v for k, v in tensors.items() if not k.startswith(_MODEL)})
+    return unflatten(tensors, state)
 
 
 def _hash(content: Mapping[str, object]) -> str:
@@ -138,11 +111,6 @@ def _is_number(name: str) -> bool:
     return name.isascii() and name.isdecimal() and len(name) <= _DIGITS
 
 
-def kinds(tensors: Mapping[str, Tensor], varying: Collection[str] = ()) -> dict[str, tuple[tuple[int, ...], dtype]]:
-    """Name → shape and dtype; of the `varying` without their first dimension."""
-    return {k: (tuple(v.shape[1:] if k in varying else v.shape), v.dtype) for k, v in tensors.items()}
-
-
 def _sync(directory: Path) -> None:
     # A rename is durable only once the directory that holds it is.
     handle = os.open(directory, os.O_RDONLY)
@@ -150,21 +118,6 @@ def _sync(directory: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def check_episodes(episodes: Mapping[str, Tensor], empty: bool) -> None:
-    """Check that tensors of episodes have as many episodes as each other.
-
-    Args:
-        episodes: name → (N, …).
-        empty: whether there may be none.
-
-    Raises:
-        CheckpointError: the numbers differ, or there is none.
-    """
-    lengths = {name: len(value) for name, value in episodes.items()}
-    if len(set(lengths.values())) > 1 or (not empty and not all(lengths.values())):
-        raise CheckpointError(f"checkpoint: expected as many {' as '.join(lengths)}, got {lengths}; is it damaged?")
 
 
 class RunDirectory:
@@ -246,16 +199,21 @@ class RunDirectory:
         """Whether the final model is there."""
         return (self.model / "config.json").is_file()
 
-    def load_model(self) -> LCSModel:
-        """The final model, or that of the latest checkpoint of an unfinished run.
+    def learned(self, kind: str) -> tuple[dict[str, object], dict[str, Tensor]]:
+        """What was learned: its configuration and its tensors; of an unfinished run those of the latest checkpoint.
+
+        Args:
+            kind: of a record, as the learned class writes it.
 
         Raises:
-            CheckpointError: there is none, or the method learned something else.
+            CheckpointError: there is none, or it is of another kind.
         """
-        model = LCSModel.from_pretrained(self.model) if self.finished() else load_checkpoint(self.checkpoints).model
-        if model is None:
-            raise CheckpointError(f"{self.path}: expected a run that learned an LCSModel, got one of another method")
-        return model
+        if self.finished():
+            return _files.load_record(self.model, kind)
+        found = load_checkpoint(self.checkpoints).get("learned")
+        if not isinstance(found, dict) or not all(isinstance(found.get(k), dict) for k in ("settings", "parameters")):
+            raise CheckpointError(f"{self.checkpoints}: expected what was learned, got {_files.short(found)}")
+        return found["settings"], found["parameters"]
 
     def append(self, row: Mapping[str, object]) -> None:
         """Add one row to log.csv; None becomes an empty cell."""
@@ -303,3 +261,56 @@ def _line(cells: Sequence[object] | object) -> str:
     buffer = io.StringIO()
     csv.writer(buffer, lineterminator="\n").writerow(cells)  # pyright: ignore[reportArgumentType]
     return buffer.getvalue()
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn errors of the file system into ours.
+
+    Raises:
+        CheckpointError: something below `path` cannot be written.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise CheckpointError(
+            f"{path}: expected a folder with free space that can be written, got: {error}; mend that and go on with "
+            f"--resume, or choose another --out. The last checkpoint is intact"
+        ) from error
+
+
+@contextmanager
+def replacing(out: Path) -> Iterator[Callable[[], object]]:
+    """Move the run in `out` aside; calling what is yielded deletes it, otherwise it comes back at the end."""
+    out = out.resolve()
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        yield lambda: None
+        return
+    try:
+        RunDirectory.open(out).config()
+    except CheckpointError as error:
+        raise CheckpointError(f"{error}. --force replaces runs only; choose another --out") from error
+    with ExitStack() as held:
+        with writing(out):
+            held.enter_context(RunDirectory(out).locked())
+            aside = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}.", suffix=".old"))
+            os.replace(out, aside / out.name)
+            out.mkdir()  # `--out` may be a link to it
+        yield from _moved(out, aside)
+
+
+def _moved(out: Path, aside: Path) -> Iterator[Callable[[], object]]:
+    replaced = False
+
+    def discard() -> None:
+        nonlocal replaced
+        replaced = True
+        shutil.rmtree(aside, ignore_errors=True)
+
+    try:
+        yield discard
+    finally:
+        if not replaced:
+            shutil.rmtree(out, ignore_errors=True)
+            os.replace(aside / out.name, out)
+            aside.rmdir()

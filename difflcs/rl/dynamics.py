@@ -1,11 +1,13 @@
-"""An ensemble of networks that predicts the next state: PDDM plans with it, imagined episodes are played in it."""
+"""An ensemble of networks that predicts the next state: PDDM plans with it, model rollouts are played in it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -14,8 +16,24 @@ from torch.optim.lr_scheduler import LinearLR
 from difflcs import _files
 from difflcs._checks import check_positive_int
 from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs.rl.settings import MOST_NETWORKS, MOST_WIDTH, Epochs, Settings, bounded, group
 
 _KIND = "dynamics"
+_SIZES = ("n_x", "n_u", "networks", "width")
+
+
+@dataclass(frozen=True)
+class EnsembleSettings(Settings):
+    """Settings of an ensemble of networks and of its training."""
+
+    networks: int = bounded(4, minimum=1, maximum=MOST_NETWORKS)
+    """Networks in the ensemble."""
+    width: int = bounded(128, minimum=1, maximum=MOST_WIDTH)
+    """Width of their two hidden layers."""
+    epochs: Epochs = group(Epochs, first=60, each=3, minibatch=128)
+    """Passes over all data; the networks are kept from one training to the next."""
+    learning_rate: float = bounded(8e-3, above=0)
+    """Adam's step size at the start of each training. Adam is not kept."""
 
 
 class Ensemble(nn.Module):
@@ -107,10 +125,13 @@ class Ensemble(nn.Module):
                 losses.append(errors.detach().mean())
         return float(torch.stack(losses).mean())
 
+    def config(self) -> dict[str, Any]:
+        """Its sizes."""
+        return {name: getattr(self, name) for name in _SIZES}
+
     def save_pretrained(self, directory: Path) -> None:
         """Write the ensemble into a directory, atomically."""
-        names = ("n_x", "n_u", "networks", "width")
-        _files.save_record(Path(directory), _KIND, {name: getattr(self, name) for name in names}, self.state_dict())
+        _files.save_record(Path(directory), _KIND, self.config(), self.state_dict())
 
     @classmethod
     def from_pretrained(cls, directory: Path) -> Ensemble:
@@ -120,22 +141,19 @@ class Ensemble(nn.Module):
             CheckpointError: files are missing, corrupt or of another kind.
         """
         config, tensors = _files.load_record(Path(directory), _KIND)
-        try:
-            names = ("n_x", "n_u", "networks", "width")
-            n_x, n_u, networks, width = (check_positive_int(name, config[name]) for name in names)
-        except (KeyError, InvalidInputError) as error:
-            raise CheckpointError(f"{directory}: expected an ensemble written by difflcs, got {error}") from error
-        return cls.from_tensors(n_x, n_u, networks, width, tensors, str(directory))
+        return cls.from_config(config, tensors, str(directory))
 
     @classmethod
-    def from_tensors(
-        cls, n_x: int, n_u: int, networks: int, width: int, tensors: Mapping[str, Tensor], source: str
-    ) -> Ensemble:
-        """Build an ensemble from its sizes and a state dict; `source` names them in the error messages.
+    def from_config(cls, config: Mapping[str, object], tensors: Mapping[str, Tensor], source: str) -> Ensemble:
+        """Build an ensemble from `config()` and a state dict; `source` names them in the error messages.
 
         Raises:
             CheckpointError: they do not fit each other, or hold NaN or infinity.
         """
+        try:
+            n_x, n_u, networks, width = (check_positive_int(name, config[name]) for name in _SIZES)
+        except (KeyError, InvalidInputError) as error:
+            raise CheckpointError(f"{source}: expected an ensemble written by difflcs, got {error}") from error
         sizes = [n_x + n_u, width, width, n_x]
         shapes: dict[str, tuple[int, ...]] = {}
         for i, (n_in, n_out) in enumerate(pairwise(sizes)):

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from difflcs._checks import check_positive_int
 from difflcs.errors import InvalidInputError
-from difflcs.rl.rollout import Policy, Rollouts, collect, episode_seeds, mpc_actions
+from difflcs.rl.rollout import Policy, collect, mpc_actions
+from difflcs.rl.seeding import Stream, episode_seeds
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
-
-EVALUATION_STREAM = 1
-"""Stream of `episode_seeds` for evaluation goals: never those of a training with the same seed."""
+    from tensordict import TensorDict
 
 
 @dataclass(frozen=True)
@@ -33,8 +32,8 @@ class Evaluation:
         successes: goals reached.
         goals: goals tried, one episode each.
         seed: what the goals and initial states were drawn from.
-        median_position_error: [m] after the last step; None if the environment reports none.
-        median_yaw_error: [rad] after the last step; None if the environment reports none.
+        median_errors: name → median over the goals of what remains after the last step, of each error that the
+            environment reports, in its units.
         solver_failures: MPC solves that did not converge.
         solves: MPC solves.
         unstable: episodes in which the simulation broke down; they count as failures.
@@ -46,8 +45,7 @@ class Evaluation:
     successes: int
     goals: int
     seed: int
-    median_position_error: float | None
-    median_yaw_error: float | None
+    median_errors: Mapping[str, float]
     solver_failures: int
     solves: int
     unstable: int
@@ -119,14 +117,15 @@ def evaluate(
     """
     check_positive_int("goals", goals)
     check_positive_int("seed", seed, minimum=0)
-    parts: list[Rollouts] = []
+    parts: list[TensorDict] = []
     for first in range(0, goals, env.num_envs):
         count = min(env.num_envs, goals - first)
         report = None if after_step is None else lambda count=count: after_step(count)
         act = mpc_actions(policy, u_min, u_max)
-        parts.append(collect(env, act, episode_seeds(seed, EVALUATION_STREAM, first, count), episode_steps, report))
-    successes = int(sum(int(part.success.sum()) for part in parts))
+        parts.append(collect(env, act, episode_seeds(seed, Stream.EVALUATION, first, count), episode_steps, report))
+    successes = sum(int(part["success"].sum()) for part in parts)
     low, high = wilson_interval(successes, goals)
+    errors: Any = parts[0]["errors"]
     return Evaluation(
         success_rate=successes / goals,
         ci_low=low,
@@ -134,14 +133,12 @@ def evaluate(
         successes=successes,
         goals=goals,
         seed=seed,
-        median_position_error=_median(parts, "position_error"),
-        median_yaw_error=_median(parts, "yaw_error"),
-        solver_failures=sum(part.solver_failures for part in parts),
+        median_errors={name: _median(parts, name) for name in sorted(errors.keys())},
+        solver_failures=sum(int(part["failures"].sum()) for part in parts),
         solves=goals * episode_steps,
-        unstable=int(sum(int((~part.stable).sum()) for part in parts)),
+        unstable=sum(int((~part["stable"]).sum()) for part in parts),
     )
 
 
-def _median(parts: list[Rollouts], name: str) -> float | None:
-    values = [part.errors[name].abs() for part in parts if name in part.errors]
-    return float(torch.cat(values).nanquantile(0.5)) if values else None
+def _median(parts: list[TensorDict], name: str) -> float:
+    return float(torch.cat([part["errors", name].abs() for part in parts]).nanquantile(0.5))

@@ -11,12 +11,14 @@ import numpy as np
 import torch
 
 from difflcs._files import write_atomically
-from difflcs.errors import InvalidInputError
+from difflcs.errors import DiffLCSError, InvalidInputError
 from difflcs.rl._optional import require
 from difflcs.rl.rollout import Policy, mpc_actions
 
 if TYPE_CHECKING:
     import gymnasium
+
+    from difflcs.rl.tasks import TaskSpec
 
 # Okabe–Ito colours, distinguishable by colour-blind readers.
 _BLUE, _ORANGE, _GREY = "#0072b2", "#d55e00", "#999999"
@@ -86,25 +88,27 @@ def _column(rows: Sequence[Mapping[str, str]], *names: str) -> tuple[np.ndarray,
     return tuple(values.reshape(-1, len(names)).T)
 
 
+class NoPictureError(DiffLCSError):
+    """This machine cannot draw the environment."""
+
+
 def record_video(
     env: gymnasium.Env[Any, Any],
     policy: Policy,
     goals: Sequence[Sequence[float]],
     path: Path,
-    episode_steps: int,
-    step_seconds: float,
+    task: TaskSpec,
     seed: int = 0,
     hold_seconds: float = 1.0,
 ) -> list[bool]:
-    """Play one noise-free episode per goal into an MP4, in real time, with the errors written above.
+    """Play one noise-free episode per goal into an MP4, in real time, with the task's caption above.
 
     Args:
-        env: one environment with render_mode="rgb_array".
-        policy: the MPC.
+        env: one environment of the task with render_mode="rgb_array".
+        policy: what acts.
         goals: goals, played one after another.
         path: where to write; replaced atomically.
-        episode_steps: steps of one episode.
-        step_seconds: duration of one step [s], one frame each.
+        task: the task.
         seed: of the initial states.
         hold_seconds: how long the last picture of an episode stays [s].
 
@@ -113,6 +117,7 @@ def record_video(
 
     Raises:
         InvalidInputError: a goal is outside the goal space.
+        NoPictureError: the environment cannot be drawn here.
     """
     require("imageio", "imageio_ffmpeg", "PIL")
     import imageio.v2 as imageio
@@ -128,20 +133,21 @@ def record_video(
     act = mpc_actions(policy)
     reached: list[bool] = []
     try:
-        with cast(Any, imageio.get_writer)(temporary, fps=round(1 / step_seconds), quality=8) as video:
+        with cast(Any, imageio.get_writer)(temporary, fps=max(1, round(1 / task.step_seconds)), quality=8) as video:
             for number, goal in enumerate(chosen, 1):
                 observation, info = env.reset(seed=seed + number, options={"goal": goal})
                 title = f"goal {number} of {len(chosen)}"
-                picture = _captioned(env, title, 0.0, info, "")
+                picture = _captioned(env, f"{title}    0.0 s    {task.say(info)}", "")
                 video.append_data(picture)
-                for step in range(1, episode_steps + 1):
+                for step in range(1, task.episode_steps + 1):
                     state = torch.from_numpy(np.asarray(observation["state"], np.float64)[None])
                     action, _ = act(state, torch.from_numpy(np.asarray(goal, np.float64)[None]))
                     observation, _, _, _, info = env.step(action[0])
-                    verdict = "" if step < episode_steps else ("reached" if info["success"] else "missed")
-                    picture = _captioned(env, title, step * step_seconds, info, verdict)
+                    verdict = "" if step < task.episode_steps else ("reached" if info["success"] else "missed")
+                    text = f"{title}    {step * task.step_seconds:.1f} s    {task.say(info)}"
+                    picture = _captioned(env, text, verdict)
                     video.append_data(picture)
-                for _ in range(round(hold_seconds / step_seconds)):
+                for _ in range(round(hold_seconds / task.step_seconds)):
                     video.append_data(picture)
                 reached.append(bool(info["success"]))
         os.replace(temporary, path)
@@ -150,16 +156,16 @@ def record_video(
     return reached
 
 
-def _captioned(
-    env: gymnasium.Env[Any, Any], title: str, seconds: float, info: Mapping[str, Any], verdict: str
-) -> np.ndarray:
+def _captioned(env: gymnasium.Env[Any, Any], text: str, verdict: str) -> np.ndarray:
     from PIL import Image, ImageDraw, ImageFont
 
-    picture = Image.fromarray(np.asarray(env.render()))
+    try:
+        picture = Image.fromarray(np.asarray(env.render()))
+    except Exception as error:  # whatever a renderer of others may raise
+        raise NoPictureError(f"{type(error).__name__}: {error}") from error
     draw = ImageDraw.Draw(picture, "RGBA")
     size = max(10, picture.height // 30)
     font = ImageFont.load_default(size)
-    text = f"{title}    {seconds:.1f} s    off by {1000 * info['position_error']:.0f} mm, {info['yaw_error']:.2f} rad"
     draw.rectangle((0, 0, picture.width, 2 * size), fill=(0, 0, 0, 140))
     draw.text((size, size // 2), text, font=font, fill="white")
     if verdict:

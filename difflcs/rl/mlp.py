@@ -4,61 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from difflcs import _files
-from difflcs._checks import MOST_WIDTH, check_positive_int
+from difflcs._checks import check_positive_int
 from difflcs.errors import CheckpointError, InvalidInputError
-from difflcs.rl.pddm import Plan
-from difflcs.rl.ppo import Features, PPOConfig, check_without_lcs
+from difflcs.rl.rollout import Plan, elapsed_fractions
+from difflcs.rl.tasks import Features
 
 _KIND = "MLP"
-
-
-@dataclass(frozen=True)
-class MLPConfig(PPOConfig):
-    """Settings of PPO with a network: CleanRL's for continuous actions, where not marked as ours.
-
-    Every setting of the main phase is here; those that only an LCS has (beta below 1, the violation loss, sample_clip,
-    the natural gradient) must stay at their defaults.
-    """
-
-    width: int = 64
-    """Width of the two hidden layers of the policy's network."""
-    rollouts: int = 60
-    """Episodes per iteration, run in lockstep (ours)."""
-    steps: int = 40
-    """Gradient steps per iteration: ten passes over 60 episodes of 20 steps."""
-    minibatch: int | None = 300
-    """Samples per gradient step: four per pass."""
-    natural: bool = False
-    """Only for an LCS."""
-    learning_rate: float = 3e-4
-    """Adam's step size at the start."""
-    betas: tuple[float, float] = (0.9, 0.999)
-    """Adam's averaging factors; its moments are kept across iterations."""
-    learning_rate_factor: float = 1.0
-    """Factor by which the step size grows or shrinks after an iteration; 1: it does not follow the KL divergence."""
-    final_step: float = 0.01
-    """Factor on all steps, falling linearly from 1 to this over the training."""
-    clip: float = 0.2
-    """Epsilon of the clipped objective."""
-    zeta: float = 0.95
-    """Zeta of the advantages, often called lambda."""
-    learn_std: bool = True
-    """Learn the covariance of the policy together with the network."""
-    std_learning_rate: float = 3e-4
-    """Adam's step size of the logarithms of the standard deviations."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_positive_int("width", self.width, maximum=MOST_WIDTH)
-        check_without_lcs(self)
+_SIZES = ("n_features", "width", "episode_steps")
 
 
 class MLPController(nn.Module):
@@ -118,16 +78,19 @@ class MLPController(nn.Module):
 
     def forward(self, x0: Tensor, goal: Tensor, *, u_min: Tensor | None = None, u_max: Tensor | None = None) -> Plan:
         """Act once in states (B, n_x) towards goals (B, n_goal), one step after the last call."""
-        elapsed = torch.full(x0.shape[:-1], self._step % self.episode_steps / self.episode_steps, dtype=x0.dtype)
+        elapsed = elapsed_fractions(self.episode_steps)[self._step % self.episode_steps].expand(x0.shape[:-1])
         self._step += 1
         action = self.mean(x0, goal, elapsed)
         low, high = (self.u_min if u_min is None else u_min), (self.u_max if u_max is None else u_max)
         return Plan(torch.minimum(torch.maximum(action, low), high), torch.ones(x0.shape[:-1], dtype=torch.bool))
 
+    def config(self) -> dict[str, Any]:
+        """Its sizes."""
+        return {name: getattr(self, name) for name in _SIZES}
+
     def save_pretrained(self, directory: Path) -> None:
         """Write the network into a directory, atomically. Its features are not: they are code."""
-        config = {"n_features": self.n_features, "width": self.width, "episode_steps": self.episode_steps}
-        _files.save_record(Path(directory), _KIND, config, self.state_dict())
+        _files.save_record(Path(directory), _KIND, self.config(), self.state_dict())
 
     @classmethod
     def from_pretrained(cls, directory: Path, features: Features) -> MLPController:
@@ -137,26 +100,29 @@ class MLPController(nn.Module):
             CheckpointError: files are missing, corrupt or of another kind.
         """
         config, tensors = _files.load_record(Path(directory), _KIND)
+        return cls.from_config(config, tensors, str(directory), features)
+
+    @classmethod
+    def from_config(
+        cls, config: Mapping[str, object], tensors: Mapping[str, Tensor], source: str, features: Features
+    ) -> MLPController:
+        """Build a network from `config()` and a state dict; `source` names them in the error messages.
+
+        Raises:
+            CheckpointError: they do not fit each other, or hold NaN or infinity.
+        """
         try:
-            names = ("n_features", "width", "episode_steps")
-            n_features, width, episode_steps = (check_positive_int(name, config[name]) for name in names)
+            n_features, width, episode_steps = (check_positive_int(name, config[name]) for name in _SIZES)
             n_u = tensors["u_min"].numel()
         except (KeyError, InvalidInputError) as error:
-            raise CheckpointError(f"{directory}: expected a network written by difflcs, got {error}") from error
+            raise CheckpointError(f"{source}: expected a network written by difflcs, got {error}") from error
         # Compared before anything of these sizes is made.
-        check_network(str(directory), tensors, n_features, width, n_u)
+        shapes: dict[str, tuple[int, ...]] = {"u_min": (n_u,), "u_max": (n_u,)}
+        for i, (n_in, n_out) in enumerate(pairwise([n_features, width, width, n_u])):
+            shapes |= {f"layers.{2 * i}.weight": (n_out, n_in), f"layers.{2 * i}.bias": (n_out,)}
+        _files.check_tensors(
+            source, "a network", tensors, {name: (shape, torch.float64) for name, shape in shapes.items()}
+        )
         network = cls(features, n_features, tensors["u_min"], tensors["u_max"], width, episode_steps)
-        network.load_state_dict(tensors)
+        network.load_state_dict(dict(tensors))
         return network
-
-
-def check_network(source: str, tensors: Mapping[str, Tensor], n_features: int, width: int, n_u: int) -> None:
-    """Compare the state dict of an `MLPController` with its sizes.
-
-    Raises:
-        CheckpointError: they do not fit each other, or hold NaN or infinity.
-    """
-    shapes: dict[str, tuple[int, ...]] = {"u_min": (n_u,), "u_max": (n_u,)}
-    for i, (n_in, n_out) in enumerate(pairwise([n_features, width, width, n_u])):
-        shapes |= {f"layers.{2 * i}.weight": (n_out, n_in), f"layers.{2 * i}.bias": (n_out,)}
-    _files.check_tensors(source, "a network", tensors, {name: (shape, torch.float64) for name, shape in shapes.items()})

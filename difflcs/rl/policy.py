@@ -6,11 +6,11 @@ They write "loc", "scale_tril", "action" and "action_log_prob", and are what `di
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 from torch.distributions import MultivariateNormal
+from torch.func import functional_call
 
 from difflcs._checks import check_choice, check_number, check_tensor, describe
 from difflcs.errors import DTypeError, InvalidInputError, MissingDependencyError
@@ -19,9 +19,7 @@ from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.solution import Primal
 from difflcs.rl._optional import INSTALL
 from difflcs.rl.mlp import MLPController
-
-if TYPE_CHECKING:
-    from difflcs.rl.ppo import PPOConfig
+from difflcs.rl.rollout import quiet
 
 try:
     from tensordict import TensorDict, TensorDictBase
@@ -31,6 +29,7 @@ try:
 except ImportError as error:
     raise MissingDependencyError(f"expected the package torchrl, not installed; run: {INSTALL}") from error
 
+COVARIANCES = ("fixed", "diagonal", "full")
 PLAN = ("x", "u", "lam")
 """Entries of the nested keys "plan" and "guess"."""
 
@@ -42,19 +41,20 @@ class GaussianParameters(TensorDictModuleBase):
 
     Args:
         std: (n_u,) standard deviations.
-        full: whether Σ may have off-diagonal entries.
-        learn_std: whether Σ is learned.
+        covariance: "fixed"; or what is learned of Σ, "diagonal" or "full".
         in_keys: what the mean depends on.
         out_keys: what is written besides "loc" and "scale_tril".
     """
 
-    def __init__(self, std: Tensor, full: bool, learn_std: bool, in_keys: Sequence[str], out_keys: Sequence = ()):
+    def __init__(self, std: Tensor, covariance: str, in_keys: Sequence[str], out_keys: Sequence = ()):
         super().__init__()
+        check_choice("covariance", covariance, COVARIANCES)
+        self.covariance = covariance
         self.in_keys = list(in_keys)
         self.out_keys = ["loc", "scale_tril", *out_keys]  # pyright: ignore
-        self.log_std = nn.Parameter(std.log(), requires_grad=learn_std)
+        self.log_std = nn.Parameter(std.log(), requires_grad=covariance != "fixed")
         n_u = len(std)
-        self.mixing = nn.Parameter(torch.zeros(n_u, n_u, dtype=std.dtype), requires_grad=full and learn_std)
+        self.mixing = nn.Parameter(torch.zeros(n_u, n_u, dtype=std.dtype), requires_grad=covariance == "full")
 
     def write(self, tensordict: TensorDictBase, mean: Tensor) -> TensorDictBase:
         """Enter the Gaussian of mean (..., n_u)."""
@@ -71,8 +71,8 @@ class GaussianParameters(TensorDictModuleBase):
 class MPCGaussian(GaussianParameters):
     """State and goal → Gaussian around the MPC's action, and the plan behind it; see `LCSMPCPolicy`."""
 
-    def __init__(self, mpc: LCSMPCLayer, std: Tensor, full: bool, learn_std: bool, in_keys: Sequence[str]):
-        super().__init__(std, full, learn_std, in_keys, [*(("plan", name) for name in PLAN), "converged"])
+    def __init__(self, mpc: LCSMPCLayer, std: Tensor, covariance: str, in_keys: Sequence[str]):
+        super().__init__(std, covariance, in_keys, [*(("plan", name) for name in PLAN), "converged"])
         self.mpc = mpc
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -90,8 +90,8 @@ class MPCGaussian(GaussianParameters):
 class MLPGaussian(GaussianParameters):
     """State, goal and elapsed time → Gaussian around a network's action; see `MLPPolicy`."""
 
-    def __init__(self, network: MLPController, std: Tensor, full: bool, learn_std: bool):
-        super().__init__(std, full, learn_std, ("state", "goal", "elapsed"))
+    def __init__(self, network: MLPController, std: Tensor, covariance: str):
+        super().__init__(std, covariance, ("state", "goal", "elapsed"))
         self.network = network
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -134,15 +134,28 @@ class GaussianPolicy(ProbabilisticActor):
         raise NotImplementedError
 
     @property
+    def covariance(self) -> str:
+        """What is learned of Σ: "fixed", "diagonal" or "full"."""
+        return self.gaussian.covariance
+
+    @property
     def std(self) -> Tensor:
         """(n_u,) standard deviation of each action component."""
         return self.gaussian.scale_tril().detach().square().sum(-1).sqrt()
 
-    def set_std(self, std: float | Tensor) -> None:
-        """Replace Σ by a diagonal one, for annealing."""
-        with torch.no_grad():
-            self.gaussian.log_std.copy_(_std(std, len(self.gaussian.log_std)).log())
-            self.gaussian.mixing.zero_()
+    def solve(self, data: TensorDictBase) -> TensorDictBase:
+        """Enter mean and covariance for states (and guesses), with gradients, but no action.
+
+        Failed solves are counted by who asks ("converged"); a regularised gradient of single samples is expected.
+        """
+        with quiet():
+            self.get_dist_params(data)
+        return data
+
+    def act(self, data: TensorDictBase) -> TensorDictBase:
+        """Enter mean, covariance and a sample for states, without gradients and warnings."""
+        with torch.no_grad(), quiet():
+            return self(data)
 
 
 class LCSMPCPolicy(GaussianPolicy):
@@ -202,8 +215,7 @@ class LCSMPCPolicy(GaussianPolicy):
         mpc: the controller; a learnable LCS in it is what is trained. `on_failure="mask"` keeps a batch going where
             single solves fail.
         std: standard deviation of each action component, a number or (n_u,) [units of the action].
-        covariance: "diagonal", or "full" to let a learned Σ have correlations.
-        learn_std: whether Σ is learned with the policy.
+        covariance: "fixed"; or learned with the policy, "diagonal" or "full", that is with correlations.
         in_keys: keys of state and goal. TorchRL's `GymWrapper` renames "state" to "observation".
 
     Raises:
@@ -215,22 +227,15 @@ class LCSMPCPolicy(GaussianPolicy):
         self,
         mpc: LCSMPCLayer,
         std: float | Tensor = 0.005,
-        covariance: str = "diagonal",
-        learn_std: bool = False,
+        covariance: str = "fixed",
         in_keys: Sequence[str] = ("state", "goal"),
     ):
         if not isinstance(mpc, LCSMPCLayer):
             raise DTypeError(f"mpc: expected an LCSMPCLayer, got {describe(mpc)}")
         n_u = mpc.lcs.n_u
-        check_choice("covariance", covariance, ("diagonal", "full"))
         if isinstance(in_keys, str) or len(in_keys) != 2:
             raise InvalidInputError(f"in_keys: expected two keys, of state and goal, got {in_keys!r}")
-        if covariance == "full" and not learn_std:
-            raise InvalidInputError(
-                'covariance: expected "diagonal" for a fixed Σ, got "full"; a correlation has to be learned, '
-                "pass learn_std=True"
-            )
-        super().__init__(MPCGaussian(mpc, _std(std, n_u), covariance == "full", learn_std, in_keys))
+        super().__init__(MPCGaussian(mpc, _std(std, n_u), covariance, in_keys))
 
     gaussian: MPCGaussian
 
@@ -249,6 +254,29 @@ class LCSMPCPolicy(GaussianPolicy):
         """The MPC."""
         return self.mpc
 
+    def jacobian(self, data: TensorDictBase) -> Tensor:
+        """Jacobians of the mean with respect to what is learned of the LCS, in standard deviations.
+
+        Args:
+            data: (N,) states and goals, and plans under "guess" to start from.
+
+        Returns:
+            (N, n_u, P) L⁻¹ ∂u/∂θ with Σ = L Lᵀ.
+        """
+        # A copy of the LCS for each sample: their gradients are the samples' own.
+        of_lcs = {id(p) for p in self.mpc.lcs.parameters()}  # pyright: ignore[reportAttributeAccessIssue]
+        learned = {name: p for name, p in self.gaussian.named_parameters() if id(p) in of_lcs and p.requires_grad}
+        copies = {name: p.detach().expand(len(data), *p.shape).clone().requires_grad_() for name, p in learned.items()}
+        batch = data.select(*self.in_keys, "guess")
+        with quiet():
+            functional_call(self.gaussian, copies, (batch,))
+        mean = torch.linalg.solve_triangular(batch["scale_tril"].detach(), batch["loc"].unsqueeze(-1), upper=False)
+        leaves, rows = list(copies.values()), []
+        for component in mean.squeeze(-1).unbind(-1):
+            found = torch.autograd.grad(component.sum(), leaves, retain_graph=True, materialize_grads=True)
+            rows.append(torch.cat([part.flatten(1) for part in found], 1))
+        return torch.stack(rows, 1)
+
     def clip(self, action: Tensor) -> Tensor:
         """What of a sample is executed: clipped into the controller's bounds."""
         return torch.minimum(torch.maximum(action, self.mpc.u_min), self.mpc.u_max)
@@ -263,8 +291,7 @@ class MLPPolicy(GaussianPolicy):
     Args:
         network: the mean.
         std: standard deviation of each action component, a number or (n_u,) [units of the action].
-        covariance: "diagonal", or "full" to let a learned Σ have correlations.
-        learn_std: whether Σ is learned with the policy.
+        covariance: "fixed"; or learned with the policy, "diagonal" or "full", that is with correlations.
 
     Raises:
         InvalidInputError and its kinds: an argument does not fit.
@@ -275,10 +302,8 @@ class MLPPolicy(GaussianPolicy):
         network: MLPController,
         std: float | Tensor = 0.005,
         covariance: str = "diagonal",
-        learn_std: bool = True,
     ):
-        check_choice("covariance", covariance, ("diagonal", "full"))
-        super().__init__(MLPGaussian(network, _std(std, len(network.u_min)), covariance == "full", learn_std))
+        super().__init__(MLPGaussian(network, _std(std, len(network.u_min)), covariance))
 
     gaussian: MLPGaussian
 
@@ -293,10 +318,12 @@ class MLPPolicy(GaussianPolicy):
         return self.gaussian.network
 
 
-def make_actor(controller: LCSMPCLayer | MLPController, config: PPOConfig) -> GaussianPolicy:
-    """The Gaussian around a controller, with the deviation that the settings ask for."""
+def make_actor(
+    controller: LCSMPCLayer | MLPController, std: float | Tensor = 0.005, covariance: str = "fixed"
+) -> GaussianPolicy:
+    """The Gaussian around a controller: an `LCSMPCPolicy` or an `MLPPolicy`, see there."""
     kind = MLPPolicy if isinstance(controller, MLPController) else LCSMPCPolicy
-    return kind(controller, config.std, config.covariance, config.learn_std)  # pyright: ignore[reportArgumentType]
+    return kind(controller, std, covariance)  # pyright: ignore[reportArgumentType]
 
 
 def _std(value: float | Tensor, n_u: int) -> Tensor:

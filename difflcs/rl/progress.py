@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from difflcs.rl._optional import require
 from difflcs.rl.evaluate import Evaluation
-from difflcs.rl.training import Report, Reporter
+from difflcs.rl.training import Reporter
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -43,11 +43,11 @@ class Progress(Reporter):
         if self.bar is not None:
             self.bar.update(env_steps)
 
-    def iterated(self, iteration: Report) -> None:
+    def iterated(self, report: Any) -> None:
         """Show loss, KL divergence and success beside it."""
         if self.bar is not None:
-            names = [name for name in ("loss", "kl", "success") if hasattr(iteration, name)]
-            self.bar.set_postfix({name: f"{getattr(iteration, name):.2g}" for name in names})
+            names = [name for name in ("loss", "kl", "success") if hasattr(report, name)]
+            self.bar.set_postfix({name: f"{getattr(report, name):.2g}" for name in names})
 
     def evaluating(self, minutes: float, goals: int) -> None:
         """Say that an evaluation runs."""

@@ -1,20 +1,25 @@
-"""Episodes of a Gymnasium `VectorEnv`, stepped in lockstep."""
+"""Episodes of a Gymnasium `VectorEnv`, stepped in lockstep, in one record for all methods."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs.errors import InvalidInputError, SolveWarning
+from difflcs.errors import DegenerateWarning, InvalidInputError, SolveWarning
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
+    from tensordict import TensorDict
+
+TRANSITIONS = ("state", "action", "goal")
+"""What is kept of episodes to learn from."""
 
 
 class Solution(Protocol):
@@ -31,6 +36,19 @@ class Solution(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Plan:
+    """What policies without a solver return.
+
+    Attributes:
+        action: (B, n_u) first actions.
+        converged: (B,) True: there is nothing that could fail.
+    """
+
+    action: Tensor
+    converged: Tensor
+
+
 class Policy(Protocol):
     """What is needed of an `LCSMPCLayer`: (B, n_x) states, (B, n_goal) goals, optional bounds (n_u,) → a solution."""
 
@@ -39,48 +57,28 @@ class Policy(Protocol):
         ...
 
 
-Act = Callable[[Tensor, Tensor], tuple[np.ndarray, int]]
-"""States (B, n_x), goals (B, n_goal) → actions (B, n_u) and the number of failed solves."""
+Act = Callable[[Tensor, Tensor], tuple[np.ndarray, np.ndarray]]
+"""States (B, n_x), goals (B, n_goal) → actions (B, n_u) and whether the solve failed (B,)."""
 
 
-@dataclass(frozen=True)
-class Rollouts:
-    """Complete episodes.
-
-    Attributes:
-        states: (N, T+1, n_x) observed states, the reset's first.
-        actions: (N, T, n_u) executed actions.
-        rewards: (N, T) rewards, without the info's "reward_completion" (the penalty for an episode that fails).
-        goals: (N, n_goal).
-        success: (N,) bool: at the goal after the last step.
-        errors: name → (N,) errors after the last step, such as "position_error" [m] and "yaw_error" [rad].
-        stable: (N,) bool: False where the simulation broke down (NaN, or info "physics_error"); never a success.
-        solver_failures: failed solves.
-    """
-
-    states: Tensor
-    actions: Tensor
-    rewards: Tensor
-    goals: Tensor
-    success: Tensor
-    errors: dict[str, Tensor]
-    stable: Tensor
-    solver_failures: int
-
-
-def episode_seeds(seed: int, stream: int, first: int, count: int) -> list[int]:
-    """Reset seeds of the episodes first … first + count − 1 of one stream.
-
-    Every episode has its own seed, so that nothing of an environment has to be stored to resume a run, and the first
-    goals of an evaluation are the same whatever its size or number of environments.
-    """
-    return [int(np.random.SeedSequence((seed, stream, i)).generate_state(1)[0]) for i in range(first, first + count)]
-
-
-def action_bounds(env: VectorEnv) -> tuple[np.ndarray, np.ndarray]:
+def action_bounds(env: VectorEnv) -> tuple[Tensor, Tensor]:
     """Bounds (n_u,) of the action space, float64."""
-    space = env.single_action_space
-    return np.asarray(space.low, np.float64), np.asarray(space.high, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
+    space: Any = env.single_action_space
+    return torch.from_numpy(np.asarray(space.low, np.float64)), torch.from_numpy(np.asarray(space.high, np.float64))
+
+
+def elapsed_fractions(episode_steps: int) -> Tensor:
+    """(T + 1,) fraction of the episode that has passed at each state, from 0 to 1."""
+    return torch.linspace(0, 1, episode_steps + 1, dtype=torch.float64)
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Without the solver's warnings: failures are counted and reported instead."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SolveWarning)
+        warnings.simplefilter("ignore", DegenerateWarning)
+        yield
 
 
 def mpc_actions(policy: Policy, u_min: Tensor | None = None, u_max: Tensor | None = None, seed: int = 0) -> Act:
@@ -92,27 +90,26 @@ def mpc_actions(policy: Policy, u_min: Tensor | None = None, u_max: Tensor | Non
     if begin is not None:
         begin(seed)
 
-    def act(state: Tensor, goal: Tensor) -> tuple[np.ndarray, int]:
-        with torch.no_grad(), warnings.catch_warnings():
-            warnings.simplefilter("ignore", SolveWarning)  # failures are counted and reported instead
+    def act(state: Tensor, goal: Tensor) -> tuple[np.ndarray, np.ndarray]:
+        with torch.no_grad(), quiet():
             solution = policy(state, goal, u_min=u_min, u_max=u_max)
-        return solution.action.numpy(), int((~solution.converged).sum())
+        return solution.action.numpy(), (~solution.converged).numpy()
 
     return act
 
 
 def uniform_actions(env: VectorEnv, rng: np.random.Generator) -> Act:
     """Act uniformly at random within the action space."""
-    low, high = action_bounds(env)
-    return lambda state, goal: (rng.uniform(low, high, (len(state), len(low))), 0)
+    low, high = (bound.numpy() for bound in action_bounds(env))
+    return lambda state, goal: (rng.uniform(low, high, (len(state), len(low))), np.zeros(len(state), bool))
 
 
 def noisy_actions(act: Act, std: float, rng: np.random.Generator) -> Act:
-    """Add Gaussian noise of standard deviation `std` [m] to actions."""
+    """Add Gaussian noise of standard deviation `std` [units of the action] to actions."""
 
-    def noisy(state: Tensor, goal: Tensor) -> tuple[np.ndarray, int]:
-        action, failures = act(state, goal)
-        return action + std * rng.standard_normal(action.shape), failures
+    def noisy(state: Tensor, goal: Tensor) -> tuple[np.ndarray, np.ndarray]:
+        action, failed = act(state, goal)
+        return action + std * rng.standard_normal(action.shape), failed
 
     return noisy
 
@@ -123,7 +120,7 @@ def collect(
     seeds: Sequence[int],
     episode_steps: int,
     after_step: Callable[[], object] | None = None,
-) -> Rollouts:
+) -> TensorDict:
     """Run one episode per seed, in lockstep.
 
     Args:
@@ -134,26 +131,33 @@ def collect(
         after_step: called after every step.
 
     Returns:
-        One episode per seed.
+        One episode per seed:
+
+        | key | shape | |
+        |-----|-------|-|
+        | "state" | (N, T+1, n_x) | observed, the reset's first |
+        | "action" | (N, T, n_u) | executed |
+        | "reward" | (N, T) | as the environment gave it |
+        | "goal" | (N, n_goal) | |
+        | "success" | (N,) bool | at the goal after the last step |
+        | "stable" | (N,) bool | False where the simulation broke down (NaN, or info "physics_error"): no success |
+        | "failures" | (N,) int | failed solves |
+        | ("errors", name) | (N,) | what remains after the last step, of each entry of the info that ends in `_error` |
 
     Raises:
         InvalidInputError: too many seeds, an episode of another length, or observations that autoreset overwrites.
     """
+    from tensordict import TensorDict  # takes a second
+
     n = len(seeds)
-    if not 1 <= n <= env.num_envs:
-        raise InvalidInputError(f"seeds: expected 1 to num_envs={env.num_envs} of them, got {n}")
-    mode = getattr(env.metadata.get("autoreset_mode"), "value", None)
-    if mode != "NextStep":  # SameStep hides the last observation, Disabled cannot step beyond a broken episode
-        raise InvalidInputError(
-            f"env: expected a VectorEnv with autoreset mode NextStep, got {mode}; see gymnasium.make_vec"
-        )
-    low, high = action_bounds(env)
+    _check_env(env, n)
+    low, high = (bound.numpy() for bound in action_bounds(env))
     # A full reset with seeds clears Gymnasium's autoreset flags; surplus environments repeat the last episode, idle.
     padded = [*seeds, *[seeds[-1]] * (env.num_envs - n)]
     observation, _ = env.reset(seed=padded)  # pyright: ignore[reportArgumentType]  Gymnasium's vectors take a list
     state, goal = (np.array(observation[key][:n], np.float64) for key in ("state", "goal"))
     stable = np.asarray(np.isfinite(state).all(-1))
-    states, executed, rewards, failures = [state], [], [], 0
+    states, executed, rewards, failures = [state], [], [], np.zeros(n, np.int64)
     infos: dict = {}
     for t in range(episode_steps):
         usable = np.where(stable[:, None], state, 0.0)  # a solver must not see NaN
@@ -168,8 +172,7 @@ def collect(
         failures += failed
         states.append(state)
         executed.append(action)
-        completion = infos.get("reward_completion", np.zeros(env.num_envs))
-        rewards.append((np.asarray(reward, np.float64) - np.asarray(completion, np.float64))[:n])
+        rewards.append(np.array(reward, np.float64)[:n])
         ended: np.ndarray = np.asarray(terminated, bool)[:n] | np.asarray(truncated, bool)[:n]
         if bool(((ended != (t + 1 == episode_steps)) & stable).any()):
             length = f"one of {t + 1}" if t + 1 < episode_steps else "a longer one"
@@ -178,14 +181,62 @@ def collect(
             after_step()
     if "success" not in infos and stable.any():
         raise InvalidInputError(f"env: expected `success` in the info of a step, got {sorted(infos)}")
-    errors = {k: torch.from_numpy(np.asarray(v[:n], np.float64)) for k, v in infos.items() if k.endswith("error")}
-    return Rollouts(
-        states=torch.from_numpy(np.stack(states, 1)),
-        actions=torch.from_numpy(np.stack(executed, 1)),
-        rewards=torch.from_numpy(np.stack(rewards, 1)),
-        goals=torch.from_numpy(goal),
-        success=torch.from_numpy(np.asarray(infos.get("success", stable), bool)[:n] & stable),
-        errors=errors,
-        stable=torch.from_numpy(stable),
-        solver_failures=failures,
-    )
+    success = np.asarray(infos.get("success", stable), bool)[:n] & stable
+    reported = (k for k in infos if k.endswith("_error") and not k.startswith("_") and k != "physics_error")
+    errors = {k: torch.from_numpy(np.asarray(infos[k][:n], np.float64)) for k in reported}
+    record = {
+        "state": torch.from_numpy(np.stack(states, 1)),
+        "action": torch.from_numpy(np.stack(executed, 1)),
+        "reward": torch.from_numpy(np.stack(rewards, 1)),
+        "goal": torch.from_numpy(goal),
+        "success": torch.from_numpy(success),
+        "stable": torch.from_numpy(stable),
+        "failures": torch.from_numpy(failures),
+        "errors": TensorDict(errors, [n]),  # pyright: ignore[reportArgumentType]
+    }
+    return TensorDict(record, [n])  # pyright: ignore[reportArgumentType]
+
+
+def _check_env(env: VectorEnv, episodes: int) -> None:
+    if not 1 <= episodes <= env.num_envs:
+        raise InvalidInputError(f"seeds: expected 1 to num_envs={env.num_envs} of them, got {episodes}")
+    mode = getattr(env.metadata.get("autoreset_mode"), "value", None)
+    if mode != "NextStep":  # SameStep hides the last observation, Disabled cannot step beyond a broken episode
+        raise InvalidInputError(
+            f"env: expected a VectorEnv with autoreset mode NextStep, got {mode}; see gymnasium.make_vec"
+        )
+
+
+def no_episodes(env: VectorEnv, episode_steps: int) -> TensorDict:
+    """A record of `TRANSITIONS` without episodes, of the sizes of an environment."""
+    from tensordict import TensorDict
+
+    space: Any = env.single_observation_space
+    n_x, n_u = space["state"].shape[0], env.single_action_space.shape[0]  # pyright: ignore[reportOptionalSubscript]
+    sizes = ((episode_steps + 1, n_x), (episode_steps, n_u), space["goal"].shape)
+    empty = {name: torch.zeros(0, *size, dtype=torch.float64) for name, size in zip(TRANSITIONS, sizes, strict=True)}
+    return TensorDict(empty, [0])  # pyright: ignore[reportArgumentType]
+
+
+def extended(known: TensorDict, episodes: TensorDict, keep: int | None = None) -> TensorDict:
+    """A record of `TRANSITIONS` with those of other episodes behind it, the stable ones where that is known.
+
+    Args:
+        known: a record of `TRANSITIONS`.
+        episodes: another, or one of `collect`.
+        keep: newest episodes to keep; None: all.
+
+    Raises:
+        InvalidInputError: there is no episode in either.
+    """
+    stable = episodes[episodes["stable"]] if "stable" in episodes.keys() else episodes
+    found: Any = torch.cat([known, stable.select(*TRANSITIONS)])  # pyright: ignore[reportCallIssue, reportArgumentType]
+    if not len(found):
+        raise InvalidInputError("env: expected a stable simulation, got NaN or a physics error in every episode")
+    return found if keep is None else found[-keep:]
+
+
+def transitions(episodes: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
+    """States (N·T, n_x), actions (N·T, n_u) and next states (N·T, n_x) of a record of episodes."""
+    state = episodes["state"]
+    return state[:, :-1].flatten(0, 1), episodes["action"].flatten(0, 1), state[:, 1:].flatten(0, 1)

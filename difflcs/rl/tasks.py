@@ -1,148 +1,309 @@
-"""The tasks by name: which environment, which MPC cost, which sizes. Names only, no environment is imported here."""
+"""Tasks: what a training, an evaluation and a picture must know of an environment. Others register theirs here.
+
+    register_task(TaskSpec(name="block", env=PushBlock, make_cost=..., ...))
+    train(task="block")
+
+A package publishes its tasks without being imported first by an entry point in its pyproject.toml, a function without
+arguments that registers them:
+
+    [project.entry-points."difflcs.tasks"]
+    blocks = "my_package.tasks:register_tasks"
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib import metadata
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from difflcs._checks import check_number, check_positive_int
 from difflcs.cost import GoalCost
-from difflcs.errors import InvalidInputError
+from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.lcs import LCSModel
 from difflcs.mpc import LCSMPCLayer
+from difflcs.rl._optional import require
 
-N_X = 9
-"""State of the pushing tasks: object x, y [m], yaw [rad], then x, y [m] of three fingertips."""
-N_U = 6
-"""Action: x, y displacement [m] of three fingertips in one step."""
+if TYPE_CHECKING:
+    import gymnasium
+    from gymnasium.vector import VectorEnv
 
+ENTRY_POINTS = "difflcs.tasks"
+"""Group of entry points that register tasks."""
 
-def pushing_cost() -> GoalCost:
-    """Cost of the MPC for pushing an object on the table (Eq. cost_function of the paper).
-
-    Stage: 10 Σ‖tip − object‖² + 200 ‖object − goal‖² + 0.3 (yaw − goal yaw)² + 200 ‖u‖²; final: 6, 200 and 1.5.
-
-    Returns:
-        A `GoalCost` of goals (x [m], y [m], yaw [rad]).
-    """
-    return GoalCost.reach(
-        N_X,
-        N_U,
-        goal_weight=(200.0, 200.0, 0.3),
-        goal_weight_final=(200.0, 200.0, 1.5),
-        input_weight=200.0,
-        pairs=[(3 + 2 * finger + axis, axis) for finger in range(3) for axis in range(2)],
-        pair_weight=10.0,
-        pair_weight_final=6.0,
-    )
+Features = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""States (..., n_x), goals (..., n_goal), elapsed fractions of the episode (...) → (..., n) inputs of a network."""
 
 
-def pushing_features(state: Tensor, goal: Tensor, elapsed: Tensor) -> Tensor:
-    """What the value network sees of a pushing task, scaled to about one.
+class Outcome(Protocol):
+    """What a transition is worth, without a simulation; for arrays and tensors of any batch shape."""
 
-    Args:
-        state: (..., 9).
-        goal: (..., 3).
-        elapsed: (...) fraction of the episode that has passed; without it a value of truncated episodes is undefined.
-
-    Returns:
-        (..., 15): object pose, fingertips from the object, pose error, its norms, time.
-    """
-    place, yaw = state[..., :2], state[..., 2:3]
-    to_place, to_yaw = place - goal[..., :2], yaw - goal[..., 2:]
-    return torch.cat(
-        [
-            place / 0.05,
-            yaw / 0.3,
-            (state[..., 3:] - torch.cat([place] * 3, -1)) / 0.05,
-            to_place / 0.05,
-            to_yaw / 0.3,
-            to_place.norm(dim=-1, keepdim=True) / 0.05,
-            to_yaw.abs() / 0.3,
-            (2 * elapsed - 1).unsqueeze(-1),
-        ],
-        -1,
-    )
-
-
-@dataclass(frozen=True)
-class Task:
-    """What training and evaluation must know about one task.
-
-    Attributes:
-        env_id: Gymnasium id of the environment.
-        env_kwargs: its keyword arguments.
-        episode_steps: steps of one episode, after which it is truncated.
-        step_seconds: duration of one step [s].
-        u_max: bound of each action component [m].
-        horizon: steps the MPC plans ahead.
-        relaxation: product λ·s of the MPC's complementarity.
-        position_tolerance: distance [m] to the goal that counts as success.
-        yaw_tolerance: angle [rad] that counts as success.
-    """
-
-    env_id: str
-    env_kwargs: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
-    episode_steps: int = 20
-    step_seconds: float = 0.1
-    u_max: float = 0.015
-    horizon: int = 8
-    relaxation: float = 1e-5
-    position_tolerance: float = 0.02
-    yaw_tolerance: float = 0.2
-
-    def outcome(self, state: Tensor, action: Tensor, after: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-        """What the environment says of a step without a simulation, for imagined episodes.
+    def __call__(self, state: Any, action: Any, after: Any, goal: Any, ended: Any, /) -> tuple[Any, Any]:
+        """Judge transitions.
 
         Args:
-            state: (..., 9) before.
-            action: (..., 6) that is executed [m].
-            after: (..., 9) state after it.
-            goal: (..., 3).
+            state: (..., n_x) before.
+            action: (..., n_u) that is executed.
+            after: (..., n_x) state after it.
+            goal: (..., n_goal).
+            ended: (...) bool, or one for all: the episode ends with this step.
 
         Returns:
-            Dense reward (...), minus the stage cost of `pushing_cost`, and success (...) bool.
+            Reward (...) as the environment gives it, and success (...) bool: `after` is at the goal.
         """
-        distance = (after[..., :2] - goal[..., :2]).norm(dim=-1)
-        turn = (after[..., 2] - goal[..., 2] + torch.pi) % (2 * torch.pi) - torch.pi
-        success = (distance <= self.position_tolerance) & (turn.abs() <= self.yaw_tolerance)
-        return -pushing_cost().stage(state, action, goal), success
+        ...
+
+
+class Quantity(NamedTuple):
+    """A number with a meaning: one component of a goal, or an error that the environment reports in its info."""
+
+    name: str
+    unit: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskSpec:
+    """One task.
+
+    Attributes:
+        name: what it is called, on the command line too.
+        summary: what is to be done, in one sentence.
+        env: Gymnasium id, with its module ("my_package:Push-v0") if that registers it, or what makes one environment
+            from keyword arguments. Observations Dict(state=Box(n_x), goal=Box(n_goal)), actions Box(n_u), all float64;
+            episodes of fixed length that end by truncation; `success` in every step's info; a goal can be chosen by
+            `reset(options={"goal": …})`; everything random comes from the seed of `reset`.
+        env_kwargs: keyword arguments of the environment.
+        make_cost: makes the cost of the MPC, whose sizes are those of the task.
+        u_min: lower bounds of the action, one number or n_u of them [units of the action].
+        u_max: upper bounds of the action.
+        horizon: steps that the MPC plans ahead.
+        relaxation: product λ·s of the MPC's complementarity.
+        episode_steps: steps of one episode.
+        step_seconds: duration of one step [s].
+        features: what the value network sees, scaled to about one.
+        outcome: reward and success of a transition; the environment's own.
+        failure_penalty: what that reward loses at the end of an episode without success.
+        goal: names and units of the components of a goal.
+        errors: names and units of what remains to the goal, as the environment's info calls them.
+        caption: the info of a step → what a picture says of it; None: the errors.
+        example_goals: goals to show what was learned, the best one first.
+        describe: environment (single or vector) → what decides whether results can be compared, in JSON types, such as
+            the object and its mass. A resumed run must find the same.
+        requires: import names of the packages that the environment needs.
+        threaded: the vector environment takes the argument `threads`.
+        model_name: what its models are called in the zoo; None: as the task.
+
+    Raises:
+        InvalidInputError: a value does not fit.
+    """
+
+    name: str
+    env: str | Callable[..., gymnasium.Env]
+    make_cost: Callable[[], GoalCost]
+    u_min: float | Sequence[float]
+    u_max: float | Sequence[float]
+    horizon: int
+    episode_steps: int
+    step_seconds: float
+    features: Features
+    outcome: Outcome
+    summary: str = ""
+    env_kwargs: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}), hash=False)
+    relaxation: float = 1e-5
+    failure_penalty: float = 0.0
+    goal: tuple[Quantity, ...] = ()
+    errors: tuple[Quantity, ...] = ()
+    caption: Callable[[Mapping[str, Any]], str] | None = None
+    example_goals: tuple[tuple[float, ...], ...] = ()
+    describe: Callable[[Any], Mapping[str, Any]] = lambda env: {}
+    requires: tuple[str, ...] = ()
+    threaded: bool = False
+    model_name: str | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name.replace("_", "").replace("-", "").isalnum():
+            raise InvalidInputError(
+                f"name: expected letters, digits, '-' and '_', got {self.name!r:.100}; it becomes a part of file names"
+            )
+        for name in ("horizon", "episode_steps"):
+            check_positive_int(name, getattr(self, name), maximum=10**6)
+        for name in ("step_seconds", "relaxation"):
+            check_number(name, getattr(self, name), strict=True)
+        check_number("failure_penalty", self.failure_penalty)
+        for name in ("env", "make_cost", "features", "outcome", "describe"):
+            value = getattr(self, name)
+            if not callable(value) and not (name == "env" and isinstance(value, str)):
+                raise DTypeError(f"{name}: expected a function, got {type(value).__name__}; see difflcs.rl.TaskSpec")
+        low, high = self.bounds
+        if not bool((low < high).all()):
+            raise InvalidInputError(f"u_min: expected u_min < u_max, got {self.u_min} and {self.u_max}; swap them")
+        for label, names in (("goal", self.goal), *(("example_goals", one) for one in self.example_goals)):
+            if names and len(names) != self.n_goal:
+                raise InvalidInputError(
+                    f"{label}: expected {self.n_goal} entries, as the cost has goals of that size, got {len(names)}"
+                )
+
+    # --- sizes ---
+
+    @functools.cached_property
+    def _cost(self) -> GoalCost:
+        cost = self.make_cost()
+        if not isinstance(cost, GoalCost):
+            raise DTypeError(f"make_cost: expected it to return a GoalCost, got {type(cost).__name__}")
+        return cost
+
+    @property
+    def n_x(self) -> int:
+        """Size of a state."""
+        return self._cost.n_x
+
+    @property
+    def n_u(self) -> int:
+        """Size of an action."""
+        return self._cost.n_u
+
+    @property
+    def n_goal(self) -> int:
+        """Size of a goal."""
+        return self._cost.n_goal
+
+    @functools.cached_property
+    def n_features(self) -> int:
+        """Number of features."""
+        sizes = ((self.n_x,), (self.n_goal,), ())
+        return len(self.features(*(torch.zeros(size, dtype=torch.float64) for size in sizes)))
+
+    @property
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Lower and upper bounds (n_u,) of the action, float64."""
+        low, high = (torch.as_tensor(value, dtype=torch.float64) for value in (self.u_min, self.u_max))
+        return low.expand(self.n_u).clone(), high.expand(self.n_u).clone()
+
+    @property
+    def steps_per_minute(self) -> float:
+        """Environment steps in one minute of data."""
+        return 60.0 / self.step_seconds
+
+    # --- what is built for it ---
+
+    def make_env(self, **kwargs: Any) -> gymnasium.Env:
+        """One environment, such as with `render_mode="rgb_array"`.
+
+        Raises:
+            MissingDependencyError: a package that it needs is not installed.
+            InvalidInputError: it cannot be made.
+        """
+        with self._making() as arguments:
+            import gymnasium
+
+            make = functools.partial(gymnasium.make, self.env) if isinstance(self.env, str) else self.env
+            return make(**arguments, **kwargs)
+
+    def make_envs(self, count: int, threads: int | None = None) -> VectorEnv:
+        """A vector of environments, stepped in lockstep.
+
+        Args:
+            count: how many.
+            threads: most threads that step them, if the task knows that; None: its default.
+
+        Raises:
+            MissingDependencyError: a package that it needs is not installed.
+            InvalidInputError: they cannot be made.
+        """
+        with self._making() as arguments:
+            import gymnasium
+
+            if not isinstance(self.env, str):
+                return gymnasium.vector.SyncVectorEnv([functools.partial(self.env, **arguments)] * count)
+            if self.threaded and threads is not None:
+                arguments["threads"] = threads
+            return gymnasium.make_vec(self.env, num_envs=count, **arguments)
+
+    @contextmanager
+    def _making(self) -> Iterator[dict[str, Any]]:
+        require("gymnasium", *self.requires)
+        try:
+            yield dict(self.env_kwargs)
+        except Exception as error:  # whatever an environment of others may raise
+            raise InvalidInputError(
+                f"task {self.name}: its environment cannot be made: {type(error).__name__}: {error}"
+            ) from error
 
     def make_policy(self, lcs: LCSModel, backend: str = "batched") -> LCSMPCLayer:
         """The MPC around a model; unsolved elements are masked, never raised, so that they cannot end a training."""
+        low, high = self.bounds
         return LCSMPCLayer(
             lcs,
-            pushing_cost(),
+            self.make_cost(),
             horizon=self.horizon,
-            u_min=-self.u_max,
-            u_max=self.u_max,
+            u_min=low,
+            u_max=high,
             backend=backend,
             relaxation=self.relaxation,
             on_failure="mask",
         )
 
-
-_OBJECTS = ("sugar_box", "fish_can", "mug", "wrench", "clamp", "banana", "large_clamp", "extra_large_clamp")
-TASKS: Mapping[str, Task] = MappingProxyType(
-    {
-        "cube": Task("difflcs/TriFingerMoveCube-v0"),
-        "turn_cube": Task("difflcs/TriFingerTurnCube-v0", position_tolerance=0.001),
-        **{name: Task("difflcs/TriFingerMoveObject-v0", MappingProxyType({"object": name})) for name in _OBJECTS},
-    }
-)
-"""Task name → `Task`."""
+    def say(self, info: Mapping[str, Any]) -> str:
+        """What a picture says of a step: the caption of the task, else the errors that the info has."""
+        if self.caption is not None:
+            return self.caption(info)
+        known = [(q, info[q.name]) for q in self.errors if q.name in info]
+        return ", ".join(f"{q.name.replace('_', ' ')} {float(value):.3g} {q.unit}".strip() for q, value in known)
 
 
-def get_task(name: str) -> Task:
-    """Look a task up.
+# --- registry ---------------------------------------------------------------------------------------------------------
+
+_REGISTRY: dict[str, TaskSpec] = {}
+_FAILED: dict[str, str] = {}
+"""Entry points that could not be loaded → why."""
+
+
+def register_task(spec: TaskSpec) -> TaskSpec:
+    """Make a task available under its name, in place of one of that name.
+
+    Raises:
+        DTypeError: not a `TaskSpec`.
+    """
+    if not isinstance(spec, TaskSpec):
+        raise DTypeError(f"spec: expected a TaskSpec, got {type(spec).__name__}")
+    _REGISTRY[spec.name] = spec
+    return spec
+
+
+@functools.cache
+def _load_entry_points() -> None:
+    for entry in metadata.entry_points(group=ENTRY_POINTS):
+        try:
+            entry.load()()
+        except Exception as error:  # a broken package of others must not take the rest with it
+            _FAILED[f"{entry.name} = {entry.value}"] = f"{type(error).__name__}: {error}"
+
+
+def task_names() -> tuple[str, ...]:
+    """Names of all tasks, those of installed packages first."""
+    _load_entry_points()
+    return tuple(_REGISTRY)
+
+
+def get_task(task: str | TaskSpec) -> TaskSpec:
+    """The task itself, or the registered one of that name.
 
     Raises:
         InvalidInputError: no task has this name.
     """
-    if name not in TASKS:
-        raise InvalidInputError(f"task: expected one of {', '.join(TASKS)}, got {name!r:.200}")
-    return TASKS[name]
+    if isinstance(task, TaskSpec):
+        return task
+    known = task_names()
+    if task not in known:
+        failed = "".join(f"; the entry point {name} could not be loaded: {why}" for name, why in _FAILED.items())
+        raise InvalidInputError(
+            f"task: expected one of {', '.join(known) or 'no tasks'}, got {task!r:.200}; add your own with "
+            f"difflcs.rl.register_task{failed}"
+        )
+    return _REGISTRY[task]

@@ -34,7 +34,7 @@ def main() -> None:
             with torch.no_grad():
                 action = policy(state, target).action
             observation, _, _, _, info = env.step(action.numpy())
-            views = [env.render(), env._renderer.render(env.data, "top")]
+            views = [env.picture(), env.picture("top")]
             frame = Image.fromarray(np.concatenate(views, axis=1))
             text = f"off by {1000 * info['position_error']:.0f} mm, {info['yaw_error']:.2f} rad"
             ImageDraw.Draw(frame).text((6, 4), text, fill=(20, 20, 30), font_size=14)

@@ -29,8 +29,7 @@ def make(env_id: str, **arguments):
 
 def views(env) -> np.ndarray:
     """The scene from the front and from above, side by side."""
-    front = env.render()
-    return np.concatenate([front, env._renderer.render(env.data, "top")], axis=1)
+    return np.concatenate([env.picture(), env.picture("top")], axis=1)
 
 
 def push_in(state: np.ndarray, finger: int) -> np.ndarray:

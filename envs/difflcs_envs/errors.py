@@ -1,4 +1,4 @@
-"""Errors and warnings of the environments. This package stands alone: nothing here comes from `difflcs`."""
+"""Errors and warnings of the environments, which stand alone: `tasks.py` apart, nothing here knows `difflcs`."""
 
 from __future__ import annotations
 

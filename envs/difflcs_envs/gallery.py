@@ -61,9 +61,7 @@ def contact_sheet(path: Path, width: int = 320, height: int = 240) -> None:
     tiles = []
     for label, env in _environments(width, height):
         env.reset(seed=0, options={"goal": _goal(env)})
-        front = env.render()
-        above = env._renderer.render(env.data, "top")  # pyright: ignore[reportOptionalMemberAccess]
-        tiles.append(np.concatenate([_labelled(np.asarray(front), label), above], axis=1))
+        tiles.append(np.concatenate([_labelled(env.picture(), label), env.picture("top")], axis=1))
     if len(tiles) % 2:
         tiles.append(np.full_like(tiles[0], 255))
     rows = [np.concatenate(tiles[i : i + 2], axis=1) for i in range(0, len(tiles), 2)]
@@ -85,7 +83,7 @@ def push_video(path: Path, width: int = 320, height: int = 240, steps: int = 12)
                 action[np.arange(3) != step // 4 % 3] *= 0.3  # one finger pushes harder than the others
                 state = env.step(action.ravel())[0]["state"]
                 for _ in range(SLOWEST):
-                    video.append_data(_labelled(np.asarray(env.render()), label))  # pyright: ignore[reportAttributeAccessIssue]
+                    video.append_data(_labelled(env.picture(), label))  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -17,21 +17,17 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from difflcs_envs.errors import PhysicsWarning
+from difflcs_envs.trifinger.arguments import checked_options
+from difflcs_envs.trifinger.base import UNSTABLE
 from difflcs_envs.trifinger.env import (
-    ACTION_LIMIT,
-    ACTION_MEANING,
-    ACTION_SIZE,
-    GOAL_SIZE,
-    STATE_SIZE,
-    UNSTABLE,
     TriFingerEnv,
     TriFingerMoveCubeEnv,
     TriFingerMoveObjectEnv,
     TriFingerTurnCubeEnv,
-    checked_options,
-    continued,
 )
-from difflcs_envs.trifinger.physics import CONTROL_PERIOD, step_all
+from difflcs_envs.trifinger.physics import CONTROL_PERIOD, STATE_SIZE, step_all
+from difflcs_envs.trifinger.spaces import ACTION_MEANING, continued
+from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE, GOAL_SIZE
 
 __all__ = ["TriFingerVectorEnv", "move_cube", "move_object", "turn_cube"]
 
@@ -198,17 +194,16 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
     def __getstate__(self) -> dict[str, Any]:
         members = self.__dict__.copy()
         first, *others = self.envs
-        members["envs"] = first, [(env._np_random, env._np_random_seed, env.physics.get_full_state()) for env in others]
+        members["envs"] = first, [env.get_full_state() for env in others]
         return members
 
     def __setstate__(self, members: dict[str, Any]) -> None:
         self.__dict__.update(members)
         first, others = members["envs"]
         self.envs = [first]
-        for rng, seed, full_state in others:
+        for full_state in others:
             env = first.sibling()
-            env._np_random, env._np_random_seed = rng, seed
-            env.physics.set_full_state(full_state)
+            env.set_full_state(full_state)
             self.envs.append(env)
 
     # --- helpers ----------------------------------------------------------------------------------
@@ -253,8 +248,8 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
     def _reset_one(self, i: int, seed: int | None, options: dict[str, Any]) -> None:
         env = self.envs[i]
         self._ended[i] = True  # an option that is refused leaves no episode to step
-        env.reset(seed=seed, options=options)
-        self._states[i], self._goals[i] = env._state, env._goal
+        observation, _ = env.reset(seed=seed, options=options)
+        self._states[i], self._goals[i] = observation["state"], observation["goal"]
         self._steps[i], self._ended[i] = 0, False
 
     def _reset_at_once(self, infos: dict[str, Any], ended: np.ndarray) -> dict[str, Any]:

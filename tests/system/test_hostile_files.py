@@ -18,8 +18,8 @@ from difflcs.rl import checkpoint
 from difflcs.rl.checkpoint import Checkpoint, RunDirectory, load_checkpoint, save_checkpoint
 from difflcs.rl.dynamics import Ensemble
 from difflcs.rl.mlp import MLPController
-from difflcs.rl.tasks import pushing_features
 from difflcs.rl.training import TrainConfig, load_policy, stored_config
+from difflcs_envs.tasks import pushing_features
 
 VALUES = [
     None, True, False, 0, -1, 1.5, 10**12, 10**400, -(10**30), 1e308, "", "x", "\ud800", "\0", "9" * 5000, [], [1],

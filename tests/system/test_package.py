@@ -174,6 +174,9 @@ def test_imports_go_one_way(path):
 
 @pytest.mark.parametrize("path", sources("envs"), ids=lambda p: str(p.relative_to(ROOT)))
 def test_the_environments_never_import_the_library(path):
+    if path.name == "tasks.py":  # publishes them to the library, which finds it by an entry point
+        assert path.parent == ROOT / "envs" / "difflcs_envs"
+        return
     for name, _ in imports(path):
         assert name != "difflcs"
         assert not name.startswith("difflcs.")

@@ -14,9 +14,9 @@ import torch
 
 from difflcs import LCSModel, _zoo, cli, zoo
 from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs.rl._trifinger import N_U, N_X, TASKS
 from difflcs.rl.checkpoint import RunDirectory
 from difflcs.rl.evaluate import wilson_interval
-from difflcs.rl.tasks import N_U, N_X, TASKS
 from difflcs.rl.training import METHODS, TrainConfig
 
 CUBE = "trifinger-cube"

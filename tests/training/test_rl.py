@@ -17,9 +17,9 @@ from difflcs.rl import TASKS, TrainConfig, Warmup, WarmupConfig, collect, evalua
 from difflcs.rl._optional import require
 from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
 from difflcs.rl.rollout import episode_seeds, mpc_actions, noisy_actions, uniform_actions
-from difflcs.rl.tasks import pushing_cost
 from difflcs.rl.training import goals_due
 from difflcs.rl.warmup import config_from_dict
+from difflcs_envs.tasks import pushing_cost
 
 STEPS = 10
 U_MAX = 0.1

@@ -2,321 +2,20 @@
 
 from __future__ import annotations
 
-import copy
-import math
-import numbers
 import os
-import time
-import warnings
-from collections.abc import Mapping
-from typing import Any, ClassVar, Self
+from dataclasses import replace
+from typing import Unpack
 
-import numpy as np
-
-from difflcs_envs.errors import MissingDependencyError, OptionsError, PhysicsWarning, RenderingError
-from difflcs_envs.trifinger.rendering import SceneRenderer, SceneViewer, has_display, select_gl_backend
-from difflcs_envs.trifinger.task import MoveTask
+from difflcs_envs.trifinger.arguments import checked_integer, checked_number
+from difflcs_envs.trifinger.base import CommonArguments, TriFingerEnv
+from difflcs_envs.trifinger.model import CubeObject
+from difflcs_envs.trifinger.objects import make_object
+from difflcs_envs.trifinger.task import MOVE, TURN
 from difflcs_envs.ycb import YCB
-
-select_gl_backend()  # before the first import of MuJoCo
-try:
-    import gymnasium
-    from gymnasium import spaces
-    from gymnasium.error import ResetNeeded
-except ImportError as error:
-    raise MissingDependencyError("gymnasium") from error
-try:
-    from difflcs_envs.trifinger.model import CubeObject, SceneObject
-    from difflcs_envs.trifinger.objects import make_object
-    from difflcs_envs.trifinger.physics import CONTROL_PERIOD, STATE_SIZE, WORKSPACE_RADIUS, TriFingerPhysics
-except ImportError as error:
-    if (error.name or "").partition(".")[0] != "mujoco":
-        raise
-    raise MissingDependencyError("mujoco") from error
 
 __all__ = ["TriFingerEnv", "TriFingerMoveCubeEnv", "TriFingerMoveObjectEnv", "TriFingerTurnCubeEnv"]
 
-ACTION_SIZE = 6  # x, y of three tips
-ACTION_MEANING = "[tip 0 x, y, tip 1 x, y, tip 2 x, y] in m"
-GOAL_SIZE = 3  # x, y, yaw
-ACTION_LIMIT = 0.015  # [m] per component and step
-# Bound of the observed yaw [rad]: four turns either way. One action turns a cube by a third of a radian at most.
-YAW_LIMIT = 8 * math.pi
-
-MIN_GOAL_BOUND = 1e-3  # Gymnasium wants spaces of some extent even where a goal is fixed (turning: x and y)
-REWARD_TERMS = ("tips", "position", "yaw", "action")
 TURN_CUBE_EDGE = 0.07  # [m] of the turning task (Jin & Posa 2024)
-TURN_YAW_HIGH = 1.5  # [rad]
-UNSTABLE = (
-    "The simulation became unstable (not finite, or out of the workspace). The episode is truncated at the last finite "
-    "state. A smaller osc_kp or a heavier object makes this less likely."
-)
-
-# Reset noise of 1 disturbs by at most this much.
-JOINT_NOISE = 0.2  # [rad]
-POSITION_NOISE = 0.1  # [m]
-YAW_NOISE = 0.5  # [rad]
-# Above this the fingers could start inside the object.
-MAX_RESET_NOISE = 0.2
-MAX_OSC_KP = 1e5  # [1/s^2]; the controller with 2 ms substeps is stable below kd * dt = 2, kp = 2.5e5
-
-
-class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
-    """What the TriFinger tasks have in common. The tasks below say what they do; make one of those.
-
-    Attributes:
-        task: Goals, errors, success and reward.
-        object: What the fingers push; `object.source` says where its shape comes from.
-        physics: The simulation.
-    """
-
-    metadata: ClassVar[dict[str, Any]] = {
-        # A window is offered only where one can be opened.
-        "render_modes": ["rgb_array", "human"] if has_display() else ["rgb_array"],
-        "render_fps": round(1 / CONTROL_PERIOD),
-    }
-
-    def __init__(
-        self,
-        scene_object: SceneObject,
-        task: MoveTask,
-        render_mode: str | None,
-        osc_kp: float,
-        horizon: int,
-        reset_noise: float,
-        observe_time: bool,
-        width: int,
-        height: int,
-    ) -> None:
-        if render_mode == "human" and not has_display():
-            raise RenderingError(
-                'render_mode="human" opens a window and this machine has no display (DISPLAY and WAYLAND_DISPLAY are '
-                'unset). Use render_mode="rgb_array".'
-            )
-        if render_mode not in (None, "rgb_array", "human"):
-            raise ValueError(
-                f'Expected render_mode None, "rgb_array" or "human", got {render_mode!r}. Choose one of them.'
-            )
-        self.render_mode = render_mode
-        self.object = scene_object
-        self.task = task
-        self.osc_kp = _checked_number("osc_kp", osc_kp, low=0.0, high=MAX_OSC_KP, low_open=True)
-        self.horizon = _checked_integer("horizon", horizon)
-        self.reset_noise = _checked_number("reset_noise", reset_noise, low=0.0, high=MAX_RESET_NOISE)
-        self.observe_time = bool(observe_time)
-        self.width = _checked_integer("width", width)
-        self.height = _checked_integer("height", height)
-
-        self.action_space = spaces.Box(-ACTION_LIMIT, ACTION_LIMIT, (ACTION_SIZE,), dtype=np.float64)
-        state_high = np.full(STATE_SIZE, WORKSPACE_RADIUS)
-        state_high[2] = YAW_LIMIT
-        goal_high = np.maximum(task.goal_high, MIN_GOAL_BOUND)
-        observation: dict[str, spaces.Box] = {
-            "state": spaces.Box(-state_high, state_high, dtype=np.float64),
-            "goal": spaces.Box(-goal_high, goal_high, dtype=np.float64),
-        }
-        if self.observe_time:
-            observation["time_to_go"] = spaces.Box(0.0, self.horizon * CONTROL_PERIOD, (1,), dtype=np.float64)
-        self.observation_space = spaces.Dict(observation)  # pyright: ignore[reportAttributeAccessIssue, reportArgumentType]
-
-        self.physics = self._make_physics()
-        self.physics.check_fit()
-        self._renderer: SceneRenderer | None = None
-        self._viewer: SceneViewer | None = None
-        self._last_frame_time = 0.0
-        self._state = np.zeros(STATE_SIZE)
-        self._goal = np.zeros(GOAL_SIZE)
-        self._steps: int | None = None  # steps made in this episode; None: reset is needed
-
-    def _make_physics(self, model: Any = None) -> TriFingerPhysics:
-        return TriFingerPhysics(self.object, self.osc_kp, (self.width, self.height), model)
-
-    def sibling(self) -> Self:
-        """Another environment with the same settings, on the same MuJoCo model (building one takes long)."""
-        other = copy.copy(self)
-        other.physics = self._make_physics(self.physics.model)
-        other._np_random = other._np_random_seed = None
-        other._renderer = other._viewer = None
-        other._state, other._goal, other._steps = np.zeros(STATE_SIZE), np.zeros(GOAL_SIZE), None
-        return other
-
-    @property
-    def dt(self) -> float:
-        """Duration of one step [s]."""
-        return CONTROL_PERIOD
-
-    @property
-    def model(self) -> Any:
-        """The MuJoCo model."""
-        return self.physics.model
-
-    @property
-    def data(self) -> Any:
-        """The MuJoCo data."""
-        return self.physics.data
-
-    # --- Gymnasium --------------------------------------------------------------------------------
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Start an episode.
-
-        Args:
-            seed: Seed of the random generator; None goes on with the current one.
-            options: May hold `goal` (3,) and `state` (9,), see the class.
-
-        Returns:
-            Observation and info.
-
-        Raises:
-            OptionsError: The options are no dictionary.
-            ValueError: An option is unknown, has the wrong shape, or is outside what the robot and the task allow.
-        """
-        options = checked_options(options)
-        super().reset(seed=seed)
-        goal, state = options.pop("goal", None), options.pop("state", None)
-        if options:
-            raise ValueError(
-                f"Expected only the options 'goal' and 'state', got also {sorted(options, key=str)}. Remove them."
-            )
-        # Always the same draws, so that an option given now does not change the episodes after it.
-        joint_noise = self.np_random.uniform(-JOINT_NOISE, JOINT_NOISE, (3, 3))
-        pose_noise = self.np_random.uniform(-1.0, 1.0, 3) * (POSITION_NOISE, POSITION_NOISE, YAW_NOISE)
-        random_goal = self.task.sample_goal(self.np_random)
-
-        self._steps = None  # an option that is refused below leaves no episode to step
-        if goal is None:
-            self._goal = random_goal
-        else:
-            goal = _checked_array("options['goal']", goal, GOAL_SIZE, "[x, y, yaw] of the goal in m, m, rad")
-            self.task.check_goal(goal)
-            self._goal = np.clip(goal, -np.array(self.task.goal_high), self.task.goal_high)
-        if state is None:
-            pose = self.reset_noise * pose_noise * ((0.0, 0.0, 1.0) if self.object.pinned else 1.0)
-            tips = self.physics.tips_from_noise(self.reset_noise * joint_noise, pose)
-        else:
-            state = _checked_array(
-                "options['state']",
-                state,
-                STATE_SIZE,
-                "[object x, y, yaw, tip 0 x, y, tip 1 x, y, tip 2 x, y] in m and rad",
-            )
-            # The margin admits pi that went through float32.
-            if abs(state[2]) > math.pi + 1e-6:
-                raise ValueError(
-                    f"Expected the yaw options['state'][2] in [-pi, pi], got {state[2]}. Subtract full turns (2 pi)."
-                )
-            pose, tips = state[:3], state[3:].reshape(3, 2)
-        self.physics.reset(pose, tips)
-        self.physics.set_goal(self._goal)
-        self._state = self.physics.state()
-        self._state[2] = _unwrap(self._state[2], float(pose[2]))
-        self._steps = 0
-        if self.render_mode == "human":
-            self.render()
-        return self._observation(), self._pose_info()
-
-    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """Move the fingertips for 0.1 s.
-
-        Args:
-            action: Displacements of the fingertips [m], (6,).
-
-        Returns:
-            Observation, reward, terminated (always False), truncated, info.
-
-        Raises:
-            ValueError: The action has the wrong shape or is not finite.
-            gymnasium.error.ResetNeeded: No episode is running.
-        """
-        if self._steps is None:
-            raise ResetNeeded(
-                "Expected a running episode, but it has ended or never began. Call reset() before step()."
-            )
-        given = _checked_array("action", action, ACTION_SIZE, ACTION_MEANING)
-        executed = given.clip(-ACTION_LIMIT, ACTION_LIMIT)
-        before, after = self._state, self.physics.step(executed)
-        stable = after is not None
-        self._state = continued(before, after) if stable else before.copy()
-        self._steps += 1
-        truncated = self._steps >= self.horizon or not stable
-
-        reward, outcome = self.task.outcome(before, executed, self._state, self._goal, truncated)
-        info: dict[str, Any] = {name: value.item() for name, value in outcome.items()}
-        info["executed_action"] = executed
-        info["clipped"] = bool((executed != given).any())
-        info["physics_error"] = not stable
-        if truncated:
-            self._steps = None
-        if not stable:
-            warnings.warn(UNSTABLE, PhysicsWarning, stacklevel=2)
-        if self.render_mode == "human":
-            self.render()
-        return self._observation(), float(reward), False, truncated, info
-
-    def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Draw the scene, the goal as a transparent cube.
-
-        Returns:
-            A picture, uint8 (height, width, 3), with `render_mode="rgb_array"`; otherwise None.
-
-        Raises:
-            RenderingError: Nothing can be drawn on this machine. The message says what to install.
-        """
-        if self.render_mode is None:
-            gymnasium.logger.warn(
-                "render() was called on an environment without render mode. Make it with "
-                'gymnasium.make(..., render_mode="rgb_array").'
-            )
-            return None
-        if self.render_mode == "human":
-            if self._viewer is None:
-                self._viewer = SceneViewer(self.physics.model, self.physics.data)
-            self._viewer.render()
-            # Real time: one step, one control period.
-            time.sleep(max(0.0, self._last_frame_time + CONTROL_PERIOD - time.monotonic()))
-            self._last_frame_time = time.monotonic()
-            return None
-        if self._renderer is None:
-            self._renderer = SceneRenderer(self.physics.model, self.width, self.height)
-        return self._renderer.render(self.physics.data)
-
-    def close(self) -> None:
-        """Free the renderer and the window. May be called again."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
-        if self._viewer is not None:
-            self._viewer.close()
-            self._viewer = None
-
-    # --- copies -----------------------------------------------------------------------------------
-
-    def __getstate__(self) -> dict[str, Any]:
-        members = self.__dict__.copy()
-        # MuJoCo's objects and OpenGL stay behind: the copy builds its own and takes over the state of the simulation.
-        members["physics"] = self.physics.get_full_state()
-        members["_renderer"] = members["_viewer"] = None
-        return members
-
-    def __setstate__(self, members: dict[str, Any]) -> None:
-        self.__dict__.update(members)
-        full_state = members["physics"]
-        self.physics = self._make_physics()
-        self.physics.set_full_state(full_state)
-
-    # --- helpers ----------------------------------------------------------------------------------
-
-    def _observation(self) -> dict[str, np.ndarray]:
-        observation = {"state": self._state.copy(), "goal": self._goal.copy()}
-        if self.observe_time:
-            left = 0 if self._steps is None else self.horizon - self._steps
-            observation["time_to_go"] = np.array([left * CONTROL_PERIOD])
-        return observation
-
-    def _pose_info(self) -> dict[str, Any]:
-        return {name: value.item() for name, value in self.task.pose_info(self._state, self._goal).items()}
 
 
 class TriFingerMoveCubeEnv(TriFingerEnv):
@@ -430,25 +129,17 @@ class TriFingerMoveCubeEnv(TriFingerEnv):
     def __init__(
         self,
         render_mode: str | None = None,
-        osc_kp: float = 1000.0,
-        position_tolerance: float = 0.02,
-        yaw_tolerance: float = 0.2,
-        horizon: int = 20,
+        *,
+        position_tolerance: float = MOVE.position_tolerance,
         object_mass: float = 0.01,
         object_friction: float = 0.5,
-        reset_noise: float = 0.05,
-        sparse_penalty: float = 10.0,
-        reward_weights: Mapping[str, float] | None = None,
-        observe_time: bool = False,
-        width: int = 320,
-        height: int = 240,
+        **common: Unpack[CommonArguments],
     ) -> None:
         cube = CubeObject(
-            mass=_checked_number("object_mass", object_mass, low=0.0, low_open=True),
-            friction=_checked_number("object_friction", object_friction, low=0.0),
+            mass=checked_number("object_mass", object_mass, low=0.0, low_open=True),
+            friction=checked_number("object_friction", object_friction, low=0.0),
         )
-        task = make_task(position_tolerance, yaw_tolerance, sparse_penalty, reward_weights)
-        super().__init__(cube, task, render_mode, osc_kp, horizon, reset_noise, observe_time, width, height)
+        super().__init__(cube, replace(MOVE, position_tolerance=position_tolerance), render_mode=render_mode, **common)
 
 
 class TriFingerMoveObjectEnv(TriFingerEnv):
@@ -513,38 +204,31 @@ class TriFingerMoveObjectEnv(TriFingerEnv):
         self,
         object: str | os.PathLike[str] = "mug",
         render_mode: str | None = None,
-        osc_kp: float = 1000.0,
-        position_tolerance: float = 0.02,
-        yaw_tolerance: float = 0.2,
-        horizon: int = 20,
+        *,
+        position_tolerance: float = MOVE.position_tolerance,
         object_mass: float | str | None = None,
         object_friction: float = 0.5,
         object_source: str = "auto",
         rest_pose: str | int = "lying",
         mesh_scale: float = 1.0,
         mesh_parts: int | None = None,
-        reset_noise: float = 0.05,
-        sparse_penalty: float = 10.0,
-        reward_weights: Mapping[str, float] | None = None,
-        observe_time: bool = False,
-        width: int = 320,
-        height: int = 240,
+        **common: Unpack[CommonArguments],
     ) -> None:
         if not isinstance(object, str | os.PathLike):
             raise ValueError(f"Expected object to be a name or a path, got {object!r}. Choose one of {', '.join(YCB)}.")
         if not isinstance(object_mass, str | None):
-            object_mass = _checked_number("object_mass", object_mass, low=0.0, low_open=True)
+            object_mass = checked_number("object_mass", object_mass, low=0.0, low_open=True)
         scene_object = make_object(
             os.fspath(object),
             mass=object_mass,
-            friction=_checked_number("object_friction", object_friction, low=0.0),
+            friction=checked_number("object_friction", object_friction, low=0.0),
             source=object_source,
             rest_pose=rest_pose,
-            parts=None if mesh_parts is None else _checked_integer("mesh_parts", mesh_parts),
-            mesh_scale=_checked_number("mesh_scale", mesh_scale, low=0.0, low_open=True),
+            parts=None if mesh_parts is None else checked_integer("mesh_parts", mesh_parts),
+            mesh_scale=checked_number("mesh_scale", mesh_scale, low=0.0, low_open=True),
         )
-        task = make_task(position_tolerance, yaw_tolerance, sparse_penalty, reward_weights)
-        super().__init__(scene_object, task, render_mode, osc_kp, horizon, reset_noise, observe_time, width, height)
+        task = replace(MOVE, position_tolerance=position_tolerance)
+        super().__init__(scene_object, task, render_mode=render_mode, **common)
 
 
 class TriFingerTurnCubeEnv(TriFingerEnv):
@@ -576,118 +260,15 @@ class TriFingerTurnCubeEnv(TriFingerEnv):
     def __init__(
         self,
         render_mode: str | None = None,
-        osc_kp: float = 1000.0,
-        yaw_tolerance: float = 0.2,
-        horizon: int = 20,
+        *,
         object_mass: float = 0.01,
         object_friction: float = 0.5,
-        reset_noise: float = 0.05,
-        sparse_penalty: float = 10.0,
-        reward_weights: Mapping[str, float] | None = None,
-        observe_time: bool = False,
-        width: int = 320,
-        height: int = 240,
+        **common: Unpack[CommonArguments],
     ) -> None:
         cube = CubeObject(
             half_size=TURN_CUBE_EDGE / 2,
-            mass=_checked_number("object_mass", object_mass, low=0.0, low_open=True),
-            friction=_checked_number("object_friction", object_friction, low=0.0),
+            mass=checked_number("object_mass", object_mass, low=0.0, low_open=True),
+            friction=checked_number("object_friction", object_friction, low=0.0),
             pinned=True,
         )
-        task = make_task(0.001, yaw_tolerance, sparse_penalty, reward_weights, goal_high=(0.0, 0.0, TURN_YAW_HIGH))
-        super().__init__(cube, task, render_mode, osc_kp, horizon, reset_noise, observe_time, width, height)
-
-
-def make_task(
-    position_tolerance: float,
-    yaw_tolerance: float,
-    sparse_penalty: float,
-    reward_weights: Mapping[str, float] | None,
-    goal_high: tuple[float, float, float] = MoveTask.goal_high,
-) -> MoveTask:
-    """Check the arguments of a task and make it.
-
-    Raises:
-        ValueError: A number is out of range, or a reward weight has an unknown name.
-    """
-    weights = dict(reward_weights or {})
-    if unknown := sorted(set(weights) - set(REWARD_TERMS), key=str):
-        raise ValueError(
-            f"Expected reward_weights for {', '.join(REWARD_TERMS)}, got also {unknown}. Choose among these terms."
-        )
-    return MoveTask(
-        position_tolerance=_checked_number("position_tolerance", position_tolerance, low=0.0),
-        yaw_tolerance=_checked_number("yaw_tolerance", yaw_tolerance, low=0.0),
-        sparse_penalty=_checked_number("sparse_penalty", sparse_penalty, low=0.0),
-        goal_high=goal_high,
-        **{
-            f"{name}_weight": _checked_number(f"reward_weights['{name}']", value, low=0.0)
-            for name, value in weights.items()
-        },
-    )
-
-
-def checked_options(options: Any) -> dict[str, Any]:
-    """A copy of the options of `reset`, empty for None.
-
-    Raises:
-        OptionsError: They are no dictionary.
-    """
-    if options is None:
-        return {}
-    if not isinstance(options, Mapping):
-        raise OptionsError(
-            f"Expected options as a dictionary, got {type(options).__name__}: {options!r:.100}. Pass "
-            "options={'goal': [x, y, yaw]}."
-        )
-    return dict(options)
-
-
-def continued(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """The state after a step, its yaw on the turn nearest to that of the state before."""
-    yaw = _unwrap(after[2], before[2])
-    if abs(yaw) <= YAW_LIMIT:
-        after[2] = yaw
-    return after
-
-
-def _unwrap(angle: float, reference: float) -> float:
-    """The angle plus full turns [rad] that is nearest to a reference."""
-    return reference + math.remainder(angle - reference, 2 * math.pi)
-
-
-def _checked_array(name: str, value: Any, size: int, meaning: str) -> np.ndarray:
-    """A finite float64 array of shape (size,), or a ValueError."""
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"Expected {name} = {meaning}, shape ({size},), got {value!r}. Pass {size} numbers."
-        ) from error
-    if array.shape != (size,):
-        raise ValueError(
-            f"Expected {name} = {meaning}, shape ({size},), got shape {array.shape}. Pass {size} numbers, unbatched."
-        )
-    if not np.isfinite(array).all():
-        raise ValueError(
-            f"Expected {name} = {meaning}, all finite, got {array.tolist()}. Find out where NaN or infinity comes from."
-        )
-    return array
-
-
-def _checked_number(name: str, value: Any, low: float, high: float = math.inf, low_open: bool = False) -> float:
-    """A finite float within bounds, or a ValueError."""
-    number = float(value) if isinstance(value, numbers.Real) and not isinstance(value, bool) else math.nan
-    if not math.isfinite(number) or not low <= number <= high or (low_open and number == low):
-        bounds = f"{'>' if low_open else '>='} {low:g}" + (f" and <= {high:g}" if math.isfinite(high) else "")
-        raise ValueError(
-            f"Expected {name} to be a finite number {bounds}, got {value!r}. Choose a value in this range."
-        )
-    return number
-
-
-def _checked_integer(name: str, value: Any) -> int:
-    """A positive int, or a ValueError."""
-    if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
-        raise ValueError(f"Expected {name} to be a whole number >= 1, got {value!r}. Choose a value in this range.")
-    return int(value)
+        super().__init__(cube, TURN, render_mode=render_mode, **common)

@@ -1,15 +1,26 @@
 """The task of moving an object to a goal pose: goals, errors, success and reward. Knows no physics.
 
-All functions take states (..., 9), actions (..., 6) and goals (..., 3) with any leading batch dimensions.
+All functions take states (..., 9), actions (..., 6) and goals (..., 3) with any leading batch dimensions. What judges a
+state or a step takes NumPy arrays or PyTorch tensors and returns the like; with tensors, rewards can be differentiated.
 """
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-__all__ = ["MoveTask"]
+__all__ = ["MOVE", "TURN", "MoveTask"]
+
+ACTION_SIZE = 6  # x, y of three tips
+ACTION_LIMIT = 0.015  # [m] per component and step
+GOAL_SIZE = 3  # x, y, yaw
+EPISODE_STEPS = 20
+
+Array = Any
+"""A NumPy array, or a PyTorch tensor, which this file does not import."""
 
 
 @dataclass(frozen=True)
@@ -52,18 +63,18 @@ class MoveTask:
                 f"got {goal.tolist()}. Choose a goal inside the task space."
             )
 
-    def errors(self, state: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def errors(self, state: Array, goal: Array) -> tuple[Array, Array]:
         """Distance [m] and smallest angle [rad, 0 to pi] between the object's pose and the goal's."""
-        distance = np.hypot(state[..., 0] - goal[..., 0], state[..., 1] - goal[..., 1])
+        distance = _library(state).hypot(state[..., 0] - goal[..., 0], state[..., 1] - goal[..., 1])
         turn = state[..., 2] - goal[..., 2]
         # A full turn brings the object back to the same pose.
-        return distance, np.abs((turn + np.pi) % (2 * np.pi) - np.pi)
+        return distance, abs((turn + np.pi) % (2 * np.pi) - np.pi)
 
-    def is_success(self, position_error: np.ndarray, yaw_error: np.ndarray) -> np.ndarray:
+    def is_success(self, position_error: Array, yaw_error: Array) -> Array:
         """Whether both errors are within the tolerances."""
         return (position_error <= self.position_tolerance) & (yaw_error <= self.yaw_tolerance)
 
-    def pose_info(self, state: np.ndarray, goal: np.ndarray) -> dict[str, np.ndarray]:
+    def pose_info(self, state: Array, goal: Array) -> dict[str, Array]:
         """`success`, `position_error` [m] and `yaw_error` [rad] of a state, each of the batch shape."""
         position_error, yaw_error = self.errors(state, goal)
         return {
@@ -72,7 +83,7 @@ class MoveTask:
             "yaw_error": yaw_error,
         }
 
-    def dense_reward_terms(self, state: np.ndarray, action: np.ndarray, goal: np.ndarray) -> dict[str, np.ndarray]:
+    def dense_reward_terms(self, state: Array, action: Array, goal: Array) -> dict[str, Array]:
         """The terms of -C(x, u) by name; their sum is the dense reward.
 
         Args:
@@ -85,19 +96,19 @@ class MoveTask:
         """
         position = state[..., :2]
         # Sums over one axis, so that a batch gives the same bits as its elements.
-        arms = state[..., 3:] - np.concatenate([position, position, position], axis=-1)
+        arms = state[..., 3:] - _library(state).concatenate([position] * 3, axis=-1)
         shift = position - goal[..., :2]
         turn = state[..., 2] - goal[..., 2]
         return {
-            "reward_tips": -self.tips_weight * np.sum(arms * arms, axis=-1),
-            "reward_position": -self.position_weight * np.sum(shift * shift, axis=-1),
+            "reward_tips": -self.tips_weight * (arms * arms).sum(axis=-1),
+            "reward_position": -self.position_weight * (shift * shift).sum(axis=-1),
             "reward_yaw": -self.yaw_weight * turn * turn,
-            "reward_action": -self.action_weight * np.sum(action * action, axis=-1),
+            "reward_action": -self.action_weight * (action * action).sum(axis=-1),
         }
 
     def outcome(
-        self, state: np.ndarray, action: np.ndarray, next_state: np.ndarray, goal: np.ndarray, ended: np.ndarray | bool
-    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        self, state: Array, action: Array, next_state: Array, goal: Array, ended: Array | bool
+    ) -> tuple[Array, dict[str, Array]]:
         """Judge one step.
 
         Args:
@@ -105,12 +116,35 @@ class MoveTask:
             action: The executed action [m].
             next_state: The state after it.
             goal: The goal.
-            ended: Whether the episode ends with this step.
+            ended: Whether the episode ends with this step; one for all, or of the batch shape.
 
         Returns:
             The reward, and info: the pose info of the next state and every term of the reward.
         """
+        library = _library(state)
         info = self.pose_info(next_state, goal)
         terms = self.dense_reward_terms(state, action, goal)
-        terms["reward_completion"] = np.where(ended & ~info["success"], -self.sparse_penalty, 0.0)
-        return sum(terms.values(), start=np.zeros(np.shape(ended))), info | terms
+        failed = library.asarray(ended) & ~info["success"]
+        # Rewards have 64 bits. PyTorch would make a number of 32 bits of two Python floats.
+        zero = library.zeros_like(info["position_error"], dtype=library.float64)
+        terms["reward_completion"] = library.where(failed, -self.sparse_penalty, zero)
+        return sum(terms.values(), start=zero), info | terms
+
+    def judge(
+        self, state: Array, action: Array, next_state: Array, goal: Array, ended: Array | bool
+    ) -> tuple[Array, Array]:
+        """Reward and success of one step, see `outcome`."""
+        reward, info = self.outcome(state, action, next_state, goal, ended)
+        return reward, info["success"]
+
+
+def _library(array: Array) -> Any:
+    """PyTorch for its tensors, else NumPy. Nothing is imported: who has a tensor has PyTorch."""
+    torch = sys.modules.get("torch")
+    return torch if torch is not None and isinstance(array, torch.Tensor) else np
+
+
+MOVE = MoveTask()
+"""Push a cube or another object."""
+TURN = MoveTask(position_tolerance=0.001, goal_high=(0.0, 0.0, 1.5))
+"""Turn a cube on its pivot: the position is as good as fixed, and the goal is a matter of the yaw."""

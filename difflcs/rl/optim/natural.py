@@ -6,14 +6,33 @@ Amari, "Natural gradient works efficiently in learning", 1998; Kakade, "A natura
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+
+from difflcs.rl.settings import Settings, bounded
+from difflcs.rl.state import State
 
 _MEMORY = 0.7
 """Weight of the metric so far against that of a new measurement."""
 _LONGEST = 3.0
 """Longest Jacobian of one sample, in medians of those of its batch: samples near a jump of the MPC have huge ones."""
+
+
+@dataclass(frozen=True)
+class Natural(Settings):
+    """Settings of the natural gradient."""
+
+    step: float = bounded(0.06, above=0)
+    """Length of a step at the start: the root of twice the KL divergence that it makes."""
+    momentum: float = bounded(0.8, minimum=0, below=1)
+    """Weight of the gradient so far against the newest one; kept across iterations. 0 turns it off."""
+    damping: float = bounded(0.1, above=0)
+    """Isotropic part of the metric, in means of its diagonal."""
+    samples: int = bounded(300, minimum=1)
+    """Samples per iteration that the metric is measured with."""
 
 
 class NaturalGradient(torch.optim.Optimizer):
@@ -80,6 +99,11 @@ class NaturalGradient(torch.optim.Optimizer):
         for p, part in zip(parameters, move, strict=True):
             p -= part.view_as(p)
 
-    def tensors(self) -> dict[str, Tensor]:
-        """Everything to go on with; what is copied into them counts after the next `measure`."""
+    def state_dict(self) -> dict[str, Any]:
+        """Everything to go on with; what is loaded counts after the next `measure`."""
         return {"average": self.average, "metric": self.metric}
+
+    def load_state_dict(self, state_dict: State) -> None:
+        """Go on from what `state_dict` gave."""
+        self.average.copy_(state_dict["average"])
+        self.metric.copy_(state_dict["metric"])

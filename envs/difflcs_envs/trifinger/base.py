@@ -1,0 +1,351 @@
+"""What the TriFinger environments have in common: Gymnasium's reset, step and render around the simulation."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+import warnings
+from collections.abc import Mapping
+from typing import Any, ClassVar, Self, TypedDict
+
+import numpy as np
+
+from difflcs_envs.errors import MissingDependencyError, PhysicsWarning, RenderingError
+from difflcs_envs.trifinger.arguments import (
+    checked_array,
+    checked_integer,
+    checked_number,
+    checked_options,
+    checked_task,
+)
+from difflcs_envs.trifinger.rendering import SceneRenderer, SceneViewer, has_display, select_gl_backend
+from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE, EPISODE_STEPS, GOAL_SIZE, MoveTask
+
+select_gl_backend()  # before the first import of MuJoCo
+try:
+    import gymnasium
+    from gymnasium.error import ResetNeeded
+except ImportError as error:
+    raise MissingDependencyError("gymnasium") from error
+try:
+    from difflcs_envs.trifinger.model import SceneObject
+    from difflcs_envs.trifinger.physics import CONTROL_PERIOD, STATE_SIZE, TriFingerPhysics
+    from difflcs_envs.trifinger.spaces import (
+        ACTION_MEANING,
+        GOAL_MEANING,
+        STATE_MEANING,
+        continued,
+        make_action_space,
+        make_observation_space,
+        unwrap,
+    )
+except ImportError as error:
+    if (error.name or "").partition(".")[0] != "mujoco":
+        raise
+    raise MissingDependencyError("mujoco") from error
+
+__all__ = ["CommonArguments", "TriFingerEnv"]
+
+UNSTABLE = (
+    "The simulation became unstable (not finite, or out of the workspace). The episode is truncated at the last finite "
+    "state. A smaller osc_kp or a heavier object makes this less likely."
+)
+
+# Reset noise of 1 disturbs by at most this much.
+JOINT_NOISE = 0.2  # [rad]
+POSITION_NOISE = 0.1  # [m]
+YAW_NOISE = 0.5  # [rad]
+# Above this the fingers could start inside the object.
+MAX_RESET_NOISE = 0.2
+MAX_OSC_KP = 1e5  # [1/s^2]; the controller with 2 ms substeps is stable below kd * dt = 2, kp = 2.5e5
+
+
+FullState = tuple[np.random.Generator | None, int | None, np.ndarray]
+"""Random generator, its seed, and everything that the simulation's next steps depend on."""
+
+
+class CommonArguments(TypedDict, total=False):
+    """What every task can be told, besides `render_mode`; the defaults are those of `TriFingerEnv`."""
+
+    osc_kp: float
+    yaw_tolerance: float
+    horizon: int
+    reset_noise: float
+    sparse_penalty: float
+    reward_weights: Mapping[str, float] | None
+    observe_time: bool
+    width: int
+    height: int
+
+
+class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
+    """What the TriFinger tasks have in common. The tasks below say what they do; make one of those.
+
+    Attributes:
+        task: Goals, errors, success and reward.
+        object: What the fingers push; `object.source` says where its shape comes from.
+        physics: The simulation.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        # A window is offered only where one can be opened.
+        "render_modes": ["rgb_array", "human"] if has_display() else ["rgb_array"],
+        "render_fps": round(1 / CONTROL_PERIOD),
+    }
+
+    def __init__(
+        self,
+        scene_object: SceneObject,
+        task: MoveTask,
+        *,
+        render_mode: str | None = None,
+        osc_kp: float = 1000.0,
+        yaw_tolerance: float = MoveTask.yaw_tolerance,
+        horizon: int = EPISODE_STEPS,
+        reset_noise: float = 0.05,
+        sparse_penalty: float = MoveTask.sparse_penalty,
+        reward_weights: Mapping[str, float] | None = None,
+        observe_time: bool = False,
+        width: int = 320,
+        height: int = 240,
+    ) -> None:
+        if render_mode == "human" and not has_display():
+            raise RenderingError(
+                'render_mode="human" opens a window and this machine has no display (DISPLAY and WAYLAND_DISPLAY are '
+                'unset). Use render_mode="rgb_array".'
+            )
+        if render_mode not in (None, "rgb_array", "human"):
+            raise ValueError(
+                f'Expected render_mode None, "rgb_array" or "human", got {render_mode!r}. Choose one of them.'
+            )
+        self.render_mode = render_mode
+        self.object = scene_object
+        self.task = checked_task(task, yaw_tolerance, sparse_penalty, reward_weights)
+        self.osc_kp = checked_number("osc_kp", osc_kp, low=0.0, high=MAX_OSC_KP, low_open=True)
+        self.horizon = checked_integer("horizon", horizon)
+        self.reset_noise = checked_number("reset_noise", reset_noise, low=0.0, high=MAX_RESET_NOISE)
+        self.observe_time = bool(observe_time)
+        self.width = checked_integer("width", width)
+        self.height = checked_integer("height", height)
+
+        self.action_space = make_action_space()
+        seconds = self.horizon * CONTROL_PERIOD if self.observe_time else None
+        self.observation_space = make_observation_space(task.goal_high, seconds)  # pyright: ignore[reportAttributeAccessIssue]
+
+        self.physics = self._make_physics()
+        self.physics.check_fit()
+        self._renderer: SceneRenderer | None = None
+        self._viewer: SceneViewer | None = None
+        self._last_frame_time = 0.0
+        self._state = np.zeros(STATE_SIZE)
+        self._goal = np.zeros(GOAL_SIZE)
+        self._steps: int | None = None  # steps made in this episode; None: reset is needed
+
+    def _make_physics(self, model: Any = None) -> TriFingerPhysics:
+        return TriFingerPhysics(self.object, self.osc_kp, (self.width, self.height), model)
+
+    def sibling(self) -> Self:
+        """Another environment with the same settings, on the same MuJoCo model (building one takes long)."""
+        other = copy.copy(self)
+        other.physics = self._make_physics(self.physics.model)
+        other._np_random = other._np_random_seed = None
+        other._renderer = other._viewer = None
+        other._state, other._goal, other._steps = np.zeros(STATE_SIZE), np.zeros(GOAL_SIZE), None
+        return other
+
+    @property
+    def dt(self) -> float:
+        """Duration of one step [s]."""
+        return CONTROL_PERIOD
+
+    @property
+    def model(self) -> Any:
+        """The MuJoCo model."""
+        return self.physics.model
+
+    @property
+    def data(self) -> Any:
+        """The MuJoCo data."""
+        return self.physics.data
+
+    # --- Gymnasium --------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: Seed of the random generator; None goes on with the current one.
+            options: May hold `goal` (3,) and `state` (9,), see the class.
+
+        Returns:
+            Observation and info.
+
+        Raises:
+            OptionsError: The options are no dictionary.
+            ValueError: An option is unknown, has the wrong shape, or is outside what the robot and the task allow.
+        """
+        options = checked_options(options)
+        super().reset(seed=seed)
+        goal, state = options.pop("goal", None), options.pop("state", None)
+        if options:
+            raise ValueError(
+                f"Expected only the options 'goal' and 'state', got also {sorted(options, key=str)}. Remove them."
+            )
+        # Always the same draws, so that an option given now does not change the episodes after it.
+        joint_noise = self.np_random.uniform(-JOINT_NOISE, JOINT_NOISE, (3, 3))
+        pose_noise = self.np_random.uniform(-1.0, 1.0, 3) * (POSITION_NOISE, POSITION_NOISE, YAW_NOISE)
+        random_goal = self.task.sample_goal(self.np_random)
+
+        self._steps = None  # an option that is refused below leaves no episode to step
+        if goal is None:
+            self._goal = random_goal
+        else:
+            goal = checked_array("options['goal']", goal, GOAL_SIZE, GOAL_MEANING)
+            self.task.check_goal(goal)
+            self._goal = np.clip(goal, -np.array(self.task.goal_high), self.task.goal_high)
+        if state is None:
+            pose = self.reset_noise * pose_noise * ((0.0, 0.0, 1.0) if self.object.pinned else 1.0)
+            tips = self.physics.tips_from_noise(self.reset_noise * joint_noise, pose)
+        else:
+            state = checked_array("options['state']", state, STATE_SIZE, STATE_MEANING)
+            # The margin admits pi that went through float32.
+            if abs(state[2]) > math.pi + 1e-6:
+                raise ValueError(
+                    f"Expected the yaw options['state'][2] in [-pi, pi], got {state[2]}. Subtract full turns (2 pi)."
+                )
+            pose, tips = state[:3], state[3:].reshape(3, 2)
+        self.physics.reset(pose, tips)
+        self.physics.set_goal(self._goal)
+        self._state = self.physics.state()
+        self._state[2] = unwrap(self._state[2], float(pose[2]))
+        self._steps = 0
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), self._pose_info()
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Move the fingertips for 0.1 s.
+
+        Args:
+            action: Displacements of the fingertips [m], (6,).
+
+        Returns:
+            Observation, reward, terminated (always False), truncated, info.
+
+        Raises:
+            ValueError: The action has the wrong shape or is not finite.
+            gymnasium.error.ResetNeeded: No episode is running.
+        """
+        if self._steps is None:
+            raise ResetNeeded(
+                "Expected a running episode, but it has ended or never began. Call reset() before step()."
+            )
+        given = checked_array("action", action, ACTION_SIZE, ACTION_MEANING)
+        executed = given.clip(-ACTION_LIMIT, ACTION_LIMIT)
+        before, after = self._state, self.physics.step(executed)
+        stable = after is not None
+        self._state = continued(before, after) if stable else before.copy()
+        self._steps += 1
+        truncated = self._steps >= self.horizon or not stable
+
+        reward, outcome = self.task.outcome(before, executed, self._state, self._goal, truncated)
+        info: dict[str, Any] = {name: value.item() for name, value in outcome.items()}
+        info["executed_action"] = executed
+        info["clipped"] = bool((executed != given).any())
+        info["physics_error"] = not stable
+        if truncated:
+            self._steps = None
+        if not stable:
+            warnings.warn(UNSTABLE, PhysicsWarning, stacklevel=2)
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), float(reward), False, truncated, info
+
+    def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Draw the scene, the goal as a transparent cube.
+
+        Returns:
+            A picture, uint8 (height, width, 3), with `render_mode="rgb_array"`; otherwise None.
+
+        Raises:
+            RenderingError: Nothing can be drawn on this machine. The message says what to install.
+        """
+        if self.render_mode is None:
+            gymnasium.logger.warn(
+                "render() was called on an environment without render mode. Make it with "
+                'gymnasium.make(..., render_mode="rgb_array").'
+            )
+            return None
+        if self.render_mode == "human":
+            if self._viewer is None:
+                self._viewer = SceneViewer(self.physics.model, self.physics.data)
+            self._viewer.render()
+            # Real time: one step, one control period.
+            time.sleep(max(0.0, self._last_frame_time + CONTROL_PERIOD - time.monotonic()))
+            self._last_frame_time = time.monotonic()
+            return None
+        return self.picture()
+
+    def picture(self, camera: str = "front") -> np.ndarray:
+        """Draw the scene off screen, whatever the render mode.
+
+        Args:
+            camera: "front", or "top", which hides the hand but for its lower links.
+
+        Returns:
+            A new picture, uint8 (height, width, 3).
+
+        Raises:
+            RenderingError: No OpenGL on this machine. The message says what to install.
+        """
+        if self._renderer is None:
+            self._renderer = SceneRenderer(self.physics.model, self.width, self.height)
+        return self._renderer.render(self.physics.data, camera)
+
+    def close(self) -> None:
+        """Free the renderer and the window. May be called again."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+        if self._viewer is not None:
+            self._viewer.close()
+            self._viewer = None
+
+    # --- copies -----------------------------------------------------------------------------------
+
+    def get_full_state(self) -> FullState:
+        """Random generator and simulation, with which a sibling goes on as this one does; not the running episode."""
+        return self._np_random, self._np_random_seed, self.physics.get_full_state()
+
+    def set_full_state(self, full_state: FullState) -> None:
+        """Go on from what `get_full_state` gave. There is no episode to step until `reset`."""
+        self._np_random, self._np_random_seed, simulation = full_state
+        self.physics.set_full_state(simulation)
+
+    def __getstate__(self) -> dict[str, Any]:
+        members = self.__dict__.copy()
+        # MuJoCo's objects and OpenGL stay behind: the copy builds its own and takes over the state of the simulation.
+        members["physics"] = self.physics.get_full_state()
+        members["_renderer"] = members["_viewer"] = None
+        return members
+
+    def __setstate__(self, members: dict[str, Any]) -> None:
+        self.__dict__.update(members)
+        full_state = members["physics"]
+        self.physics = self._make_physics()
+        self.physics.set_full_state(full_state)
+
+    # --- helpers ----------------------------------------------------------------------------------
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        observation = {"state": self._state.copy(), "goal": self._goal.copy()}
+        if self.observe_time:
+            left = 0 if self._steps is None else self.horizon - self._steps
+            observation["time_to_go"] = np.array([left * CONTROL_PERIOD])
+        return observation
+
+    def _pose_info(self) -> dict[str, Any]:
+        return {name: value.item() for name, value in self.task.pose_info(self._state, self._goal).items()}

@@ -1,0 +1,156 @@
+"""A package of somebody else brings a task: every method trains on it, is evaluated and drawn, by the common commands.
+
+The package is installed for these tests into a folder of its own: its module, and beside it the `.dist-info` with entry
+points that `pip install` would leave there. That is what `importlib.metadata` reads, and needs no network and no build.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("torchrl", reason="needs the extra [rl]")
+pytest.importorskip("tyro", reason="needs the extra [rl]")
+
+from difflcs.rl.methods import method_names
+
+PACKAGE = Path(__file__).parent / "fixtures" / "block_task"
+PROGRAM = """
+import json, sys
+from difflcs.cli import main
+for words in json.loads(sys.argv[1]):
+    print(">>>", *words, flush=True)
+    code = main(words)
+    if code:
+        sys.exit(code)
+"""
+
+
+def install(folder: Path) -> None:
+    """What `pip install --target folder` does with a pure Python package, as far as Python looks."""
+    project = tomllib.loads((PACKAGE / "pyproject.toml").read_text())["project"]
+    for module in PACKAGE.glob("*.py"):
+        shutil.copy(module, folder)
+    information = folder / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
+    information.mkdir()
+    about = f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    (information / "METADATA").write_text(about)
+    groups = [
+        "\n".join([f"[{group}]", *(f"{name} = {value}" for name, value in entries.items())])
+        for group, entries in project["entry-points"].items()
+    ]
+    (information / "entry_points.txt").write_text("\n\n".join(groups) + "\n")
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("site-packages")
+    install(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def block():
+    """The package's module, in this process too; its task is not registered here."""
+    spec = importlib.util.spec_from_file_location("block_task", PACKAGE / "block_task.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def python(*arguments, folder, cwd):
+    environment = {**os.environ, "PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment, cwd=cwd)
+
+
+def difflcs(*commands, folder, cwd):
+    """The commands one after another in one process (starting Python takes longer than they do); output of each."""
+    done = python("-c", PROGRAM, json.dumps(commands), folder=folder, cwd=cwd)
+    assert done.returncode == 0, done.stderr[-3000:] + done.stdout[-1000:]
+    return [part.partition("\n")[2] for part in done.stdout.split(">>> ")[1:]]
+
+
+# --- the task ---------------------------------------------------------------------------------------------------------
+
+
+def test_it_is_found_where_it_is_installed_and_only_there(installed, tmp_path):
+    code = "from difflcs.rl.tasks import task_names; print(*task_names())"
+    for folder, there in ((installed, True), (tmp_path, False)):
+        done = python("-c", code, folder=folder, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert ("block" in done.stdout.split()) is there
+
+
+def test_its_environment_gives_its_outcome(block):
+    env = block.PushBlock()
+    rng = np.random.default_rng(0)
+    successes = 0
+    for seed in range(30):
+        before, _ = env.reset(seed=seed)
+        for _ in range(block.STEPS):
+            action = rng.uniform(-block.REACH, block.REACH, 2)
+            after, reward, _, ended, info = env.step(action)
+            step = before["state"], action, after["state"], before["goal"]
+            assert block.BLOCK.outcome(*step, ended) == (reward, info["success"])
+            found, success = block.BLOCK.outcome(*map(torch.from_numpy, step), torch.tensor(ended))
+            assert float(found) == pytest.approx(reward, abs=1e-12)
+            assert bool(success) is info["success"]
+            before = after
+        assert ended
+        successes += info["success"]
+    assert successes < 30
+
+
+# --- the commands -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", method_names())
+def test_every_method_learns_it(method, installed, tmp_path):
+    pytest.importorskip("imageio_ffmpeg", reason="needs the extra [viz]")
+    run = tmp_path / "run"
+    _, told, drawn = difflcs(
+        ["train", "--task", "block", "--method", method, "--smoke", "--out", str(run)],
+        ["evaluate", str(run), "--goals", "6", "--json"],
+        ["render", str(run), "--out", str(tmp_path / "video.mp4")],
+        folder=installed,
+        cwd=tmp_path,
+    )
+    record = json.loads(told)
+    assert (record["task"], record["method"], record["goals"], record["finished"]) == ("block", method, 6, True)
+    assert 0 <= record["success_rate"] <= 1
+    assert "goal 0.1: " in drawn
+    assert (tmp_path / "video.mp4").stat().st_size > 1000
+    rows = (run / "log.csv").read_text().splitlines()
+    assert len(rows) > 2
+    assert json.loads((run / "config.json").read_text())["config"]["task"] == "block"
+
+
+def test_lcs_rl_succeeds_more_often_than_by_chance(installed, tmp_path):
+    """Half a minute of data: twenty episodes, and it pushes the block."""
+    _, told = difflcs(
+        ["train", "--task", "block", "--method", "violation", "--minutes", "1.5", "--n-lam", "2", "--out", "run",
+         "--evaluate-at", "0", "--final-goals", "100"],
+        ["evaluate", "run", "--goals", "200", "--json"],
+        folder=installed,
+        cwd=tmp_path,
+    )  # fmt: skip
+    assert json.loads(told)["success_rate"] > 0.5
+
+
+def test_what_cannot_be_said_of_it_is_refused_in_its_own_words(installed, tmp_path):
+    done = python("-m", "difflcs", "train", "--task", "blok", "--smoke", folder=installed, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "block" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())

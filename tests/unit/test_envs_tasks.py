@@ -1,0 +1,146 @@
+"""What the environments publish to the library: every number of a task is that of its environment."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+gymnasium = pytest.importorskip("gymnasium", reason="the environments need the extra [envs]")
+pytest.importorskip("mujoco", reason="the environments need the extra [envs]")
+
+from difflcs import LCSModel  # noqa: E402
+from difflcs.rl.evaluate import evaluate  # noqa: E402
+from difflcs.rl.tasks import get_task, task_names  # noqa: E402
+from difflcs_envs.tasks import caption, pushing_cost  # noqa: E402
+from difflcs_envs.ycb import YCB  # noqa: E402
+
+NAMES = ("cube", "turn_cube", *YCB)
+FEW = ("cube", "turn_cube", "mug")
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path_factory, monkeypatch):
+    """No test sees the user's meshes."""
+    monkeypatch.setenv("DIFFLCS_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "difflcs-cache"))
+    monkeypatch.delenv("DIFFLCS_YCB_DIR", raising=False)
+
+
+def test_all_are_found_without_mujoco():
+    code = (
+        "import sys; from difflcs.rl.tasks import get_task, task_names\n"
+        "print(*task_names()); get_task('cube'); assert 'mujoco' not in sys.modules"
+    )
+    found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
+    assert set(NAMES) <= set(found)
+    assert set(NAMES) <= set(task_names())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_sizes_bounds_and_times_are_those_of_the_environment(name):
+    task = get_task(name)
+    env = task.make_env()
+    inner = env.unwrapped
+    assert env.observation_space["state"].shape == (task.n_x,)
+    assert env.observation_space["goal"].shape == (task.n_goal,) == (len(task.goal),)
+    assert env.action_space.shape == (task.n_u,)
+    for bound, own in zip(task.bounds, (env.action_space.low, env.action_space.high), strict=True):
+        np.testing.assert_array_equal(bound, own)
+    assert (task.episode_steps, task.step_seconds) == (inner.horizon, inner.dt)
+    assert task.failure_penalty == inner.task.sparse_penalty
+    assert task.model_name == f"trifinger-{name.replace('_', '-')}"
+    assert task.summary.endswith(".")
+    assert [q.name for q in task.goal] == ["x", "y", "yaw"]
+    for goal in task.example_goals:
+        observation, info = env.reset(seed=0, options={"goal": goal})
+        np.testing.assert_array_equal(observation["goal"], goal)
+        assert {q.name for q in task.errors} <= set(info)
+        assert task.say(info) == caption(info)
+    env.close()
+
+
+@pytest.mark.parametrize("name", FEW)
+def test_the_outcome_is_the_environments(name):
+    task = get_task(name)
+    env = task.make_env(reset_noise=0.1)
+    rng = np.random.default_rng(0)
+    before, _ = env.reset(seed=0)
+    for _ in range(task.episode_steps):
+        after, reward, _, truncated, info = env.step(rng.uniform(-0.02, 0.02, task.n_u))
+        step = before["state"], info["executed_action"], after["state"], before["goal"]
+        assert task.outcome(*step, truncated) == (reward, info["success"])
+        found, success = task.outcome(*map(torch.from_numpy, step), truncated)
+        assert float(found) == pytest.approx(reward, abs=1e-11)
+        assert bool(success) is info["success"]
+        before = after
+    assert truncated
+
+
+def random_tensors(count, task):
+    generator = torch.Generator().manual_seed(0)
+    sizes = (task.n_x, task.n_u, task.n_x, task.n_goal)
+    state, action, after, goal = (0.05 * torch.randn(count, n, generator=generator, dtype=torch.float64) for n in sizes)
+    return state, action, after, torch.where(torch.arange(count)[:, None] % 2 == 0, after[:, :3] + 0.001, goal)
+
+
+@pytest.mark.parametrize("name", ["cube", "turn_cube"])
+def test_tensors_are_rewarded_by_the_cost_of_the_mpc(name):
+    task = get_task(name)
+    step = random_tensors(200, task)
+    ended = torch.arange(200) % 3 == 0
+    reward, success = task.outcome(*step, ended)
+    assert 0 < int(success.sum()) < 200 or name == "turn_cube"
+    dense = -pushing_cost().stage(*step[:2], step[3])
+    assert torch.equal(reward, dense - 10.0 * (ended & ~success))
+    for one in (False, True):
+        assert torch.equal(task.outcome(*step, one)[0], dense - 10.0 * (one & ~success))
+    arrays = task.outcome(*(part.numpy() for part in step), ended.numpy())
+    np.testing.assert_allclose(reward, arrays[0], rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(success, arrays[1])
+
+
+class Recorder(gymnasium.vector.VectorWrapper):
+    """Keeps the last transition of every environment."""
+
+    def reset(self, **kwargs):
+        observation, info = super().reset(**kwargs)
+        self.now = observation
+        return observation, info
+
+    def step(self, actions):
+        before = self.now
+        self.now, *rest = super().step(actions)
+        self.last = before["state"], rest[-1]["executed_action"], self.now["state"], before["goal"], rest[2]
+        return self.now, *rest
+
+
+def test_an_evaluation_counts_the_successes_of_the_outcome(one_thread):
+    task = get_task("cube")
+    envs = Recorder(task.make_envs(30, threads=1))
+    policy = task.make_policy(LCSModel.from_pretrained("trifinger-cube"))
+    found = evaluate(envs, policy, goals=30, seed=0, episode_steps=task.episode_steps)
+    assert 0 < found.successes < 30
+    assert envs.last[-1].all()
+    reward, success = task.outcome(*envs.last)
+    assert found.successes == success.sum()
+    assert found.median_position_error == np.median(envs.env.envs[0].task.errors(envs.last[2], envs.last[3])[0])
+    step = [torch.from_numpy(part) for part in envs.last]
+    assert int(task.outcome(*step)[1].sum()) == found.successes
+    assert ((reward < -9) == ~success).all()
+    envs.close()
+
+
+@pytest.mark.parametrize("name", FEW)
+def test_what_is_pushed_can_be_described_through_wrappers_and_vectors(name):
+    task = get_task(name)
+    env = task.make_env()
+    expected = env.unwrapped.object.describe()
+    assert expected["mass"] > 0
+    assert json.loads(json.dumps(expected)) == expected
+    vectors = [task.make_envs(2), gymnasium.vector.SyncVectorEnv([task.make_env] * 2)]
+    wrapped = gymnasium.wrappers.vector.RecordEpisodeStatistics(task.make_envs(2))
+    for one in (env, env.unwrapped, *vectors, wrapped):
+        assert task.describe(one) == expected
+        one.close()
