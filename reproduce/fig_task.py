@@ -4,10 +4,8 @@
 `--run RUN`; `--rerun --preset smoke|quick|paper` trains one.
 """
 
-from __future__ import annotations
-
 import sys
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,25 +13,21 @@ import numpy as np
 import records
 import report
 import torch
-import units
 from matplotlib.figure import Figure
 from runs import command_line, run
-from units import Unit
 
 from difflcs.errors import InvalidInputError
-from difflcs.rl.checkpoint import RunDirectory
-from difflcs.rl.evaluate import EVALUATION_STREAM
-from difflcs.rl.rollout import Policy, episode_seeds, mpc_actions
-from difflcs.rl.training import load_policy, stored_config
+from difflcs.rl import RunDirectory, get_task, load_policy
+from difflcs.rl.rollout import Policy, mpc_actions
+from difflcs.rl.seeding import Stream, episode_seeds
+from difflcs.rl.training import stored_config
 
 STEPS = (1, 5, 8, 13, 17, 20)
 """Those that the paper shows."""
 SIZE = (1280, 960)
 """Width and height of the pictures [pixel]."""
-TRIES = 20
-"""Goals tried until one needs a real push and is reached."""
-LEAST_WAY, LEAST_TURN = 0.04, 0.2
-"""[m] and [rad] by which the cube has to move in the trajectory that is shown."""
+TRIES, LEAST_WAY, LEAST_TURN = 20, 0.04, 0.2
+"""Goals tried until one is so far away [m], [rad] and reached."""
 
 
 @dataclass(frozen=True)
@@ -44,53 +38,41 @@ class DrawTask(report.Draw):
     """Run directory of `difflcs train --task cube` whose model to take."""
 
 
-def find_run(options: DrawTask) -> Path:
-    """The run whose model is shown: the one asked for, or of the finished LCS-RL units on the cube the newest.
-
-    Raises:
-        InvalidInputError: there is none.
-    """
-    if options.run is not None:
-        task = stored_config(RunDirectory.open(options.run)).task
-        if task != "cube":
-            raise InvalidInputError(f"run: expected a run of the cube, got one of {task}; pass another")
-        return options.run
-    wanted = asdict(Unit("cube", "lcs-rl", "ours", 0)) | {"seed": "*"}
-    found = {
-        path.parent / "run": records.read(path)
-        for path in options.work.glob("-".join((*map(str, wanted.values()), "*/result.csv")))
-    }
-    if not found:
+def find_run(options: DrawTask) -> RunDirectory:
+    """The run asked for; else of the finished LCS-RL units on the cube that with the most data, then the newest."""
+    finished = {path.parent / "run": records.read(path) for path in options.work.glob("cube-lcs-rl-ours-*/result.csv")}
+    newest = max(finished, key=lambda run: (finished[run]["at"].max(), finished[run].finished.max()), default=None)
+    chosen = options.run or newest
+    if chosen is None:
         raise InvalidInputError(
             f"{options.work}: expected an LCS-RL model of the cube, found none; pass --run RUN, a directory of "
-            f"`difflcs train --task cube --method lcs-rl --minutes 30`, or train one with: python "
-            f"reproduce/fig_task.py --rerun --preset quick"
+            f"`difflcs train --task cube --minutes 30`, or train one with: python reproduce/fig_task.py --rerun"
         )
-    return max(found, key=lambda run: (found[run]["at"].max(), found[run].finished.max()))  # the most data, the newest
+    directory = RunDirectory.open(chosen)
+    if (task := stored_config(directory).task) != "cube":
+        raise InvalidInputError(f"run: expected a run of the cube, got one of {task}; pass another")
+    return directory
 
 
 def trajectory(policy: Policy) -> tuple[np.ndarray, dict[int, np.ndarray], bool]:
-    """One noise-free episode to an evaluation goal, with pictures.
+    """One noise-free episode: the scene at its start from the front, `STEPS` from above, whether the goal was reached.
 
-    Returns:
-        The scene at the start from the front; the `STEPS` from above; whether the goal was reached. It is the first
-        goal that is far enough away and reached, or the last one tried.
+    It is to the first evaluation goal that is far enough away and reached, or the last one tried.
     """
     from difflcs_envs.trifinger.rendering import SceneRenderer
 
-    env = units.make_env("cube", width=SIZE[0], height=SIZE[1])
+    env: Any = get_task("cube").make_env(width=SIZE[0], height=SIZE[1]).unwrapped
     renderer, scene, pictures, reached = SceneRenderer(env.model, *SIZE), np.zeros(0), {}, False
     try:
-        for seed in episode_seeds(0, EVALUATION_STREAM, 0, TRIES):
+        for seed in episode_seeds(0, Stream.EVALUATION, 0, TRIES):
             observation, _ = env.reset(seed=seed)
             goal, state = observation["goal"], observation["state"]
             far = np.hypot(*(goal[:2] - state[:2])) > LEAST_WAY and abs(goal[2] - state[2]) > LEAST_TURN
             if reached or not far:
                 continue
-            scene, pictures = renderer.render(env.data, "front"), {}
-            act = mpc_actions(policy)
+            scene, pictures, act = renderer.render(env.data, "front"), {}, mpc_actions(policy)
             for step in range(1, STEPS[-1] + 1):
-                action, _ = act(torch.from_numpy(state[None].copy()), torch.from_numpy(goal[None].copy()))
+                action, _ = act(*(torch.tensor(value, dtype=torch.float64)[None] for value in (state, goal)))
                 observation, _, _, _, info = env.step(action[0])
                 state, reached = observation["state"], bool(info["success"])
                 if step in STEPS:
@@ -103,25 +85,24 @@ def trajectory(policy: Policy) -> tuple[np.ndarray, dict[int, np.ndarray], bool]
 
 def draw(options: DrawTask) -> int:
     """Train if asked for, then write the figure; returns the exit code."""
-    one = replace(options, seeds=1, methods=("lcs-rl",), recipes=("ours",))
-    code = run(one, ["curves"]) if options.rerun else 0
-    path = find_run(options)
-    scene, pictures, reached = trajectory(load_policy(RunDirectory.open(path)))
+    code = run(replace(options, seeds=1, methods=("lcs-rl",), recipes=("ours",)), ["curves"]) if options.rerun else 0
+    directory = find_run(options)
+    scene, pictures, reached = trajectory(load_policy(directory))
+    outcome = f"goal {'reached' if reached else 'missed'}"
     figure = Figure((11.0, 4.4), dpi=150, layout="constrained")
     left, right = cast(Any, figure.subfigures(1, 2, width_ratios=(1.15, 1.0)))
-    axes = left.subplots()
-    axes.imshow(scene)
-    axes.set_title("(a) the task: push the cube to the transparent pose", fontsize=10)
-    axes.axis("off")
-    right.suptitle(f"(b) a trajectory of LCS-RL, goal {'reached' if reached else 'missed'}", fontsize=10)
-    for part, (step, picture) in zip(right.subplots(2, 3).flat, pictures.items(), strict=True):
-        side = int(0.65 * min(picture.shape[:2]))  # the rest is empty table
-        top, start = ((size - side) // 2 for size in picture.shape[:2])
-        part.imshow(picture[top : top + side, start : start + side])
-        part.set_title(f"step {step}", fontsize=9)
-        part.axis("off")
+    right.suptitle(f"(b) a trajectory of LCS-RL, {outcome}", fontsize=10)
+    side = int(0.65 * min(SIZE))  # the rest is empty table
+    top, start = ((size - side) // 2 for size in reversed(SIZE))
+    shown = [(left.subplots(), "(a) the task: push the cube to the transparent pose", scene)]
+    for axes, (step, picture) in zip(right.subplots(2, 3).flat, pictures.items(), strict=True):
+        shown.append((axes, f"step {step}", picture[top : top + side, start : start + side]))
+    for axes, title, picture in shown:
+        axes.imshow(picture)
+        axes.set_title(title, fontsize=10 if picture is scene else 9)
+        axes.axis("off")
     report.write_figure(figure, options.results, "fig_task")
-    print(f"model: {path}; goal {'reached' if reached else 'missed'}")
+    print(f"model: {directory.path}; {outcome}")
     return code
 
 

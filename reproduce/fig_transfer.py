@@ -1,12 +1,7 @@
 """Transfer: LCS-RL on six objects from scratch, against its main phase from the cube's model, at equal data.
 
-The cube's model is the final LCS-RL model of the same seed, which has seen 30 minutes of the cube. It takes the place
-of the warm-up.
-
 `python reproduce/fig_transfer.py` draws the tracked results; `--rerun --preset smoke|quick|paper` computes them.
 """
-
-from __future__ import annotations
 
 import sys
 from functools import partial
@@ -16,7 +11,8 @@ import pandas as pd
 import report
 from matplotlib.figure import Figure
 from records import Cell, select
-from units import OBJECTS, STARTS, transfer
+from report import say
+from units import OBJECTS, TRANSFER
 
 LABELS = {"scratch": "from scratch", "cube": "from the cube's model"}
 COLORS = {"scratch": "#0072b2", "cube": "#d55e00"}
@@ -28,23 +24,20 @@ Cells = dict[str, dict[str, Cell | None]]
 
 def table(cells: Cells) -> pd.DataFrame:
     """Success from either start, and the paired difference."""
-    header = ["object", "cube's model, no data"]
-    for label in WHEN:
-        header += [f"{label}: from scratch", "from the cube", "difference", "p"]
-    lines = []
-    for task, starts in cells.items():
-        line = [task.replace("_", " "), report.say(report.at(starts["cube"], 0.0))]
-        for when in WHEN.values():
-            line += [report.say(report.at(starts[start], when)) for start in STARTS]
-            line += report.say_difference(report.paired(starts["cube"], starts["scratch"], when))
-        lines.append(line)
-    return pd.DataFrame(lines, columns=header)
+    columns = {"object": [task.replace("_", " ") for task in cells]}
+    columns["cube's model, no data"] = [say(report.at(starts["cube"], 0.0)) for starts in cells.values()]
+    for label, when in WHEN.items():
+        for start in TRANSFER:
+            columns[f"{label}: {LABELS[start]}"] = [say(report.at(starts[start], when)) for starts in cells.values()]
+        found = [report.paired(starts["cube"], starts["scratch"], when) for starts in cells.values()]
+        means, ps = zip(*map(report.say_difference, found), strict=True)
+        columns |= {f"{label}: difference": list(means), f"{label}: p": list(ps)}
+    return pd.DataFrame(columns)
 
 
 def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
     """Write figure and table."""
-    kinds = [transfer(OBJECTS[0], 0, start) for start in STARTS]
-    cells = {task: {u.start: select(rows, task, u.method, u.recipe, u.start) for u in kinds} for task in OBJECTS}
+    cells = {task: {start: select(rows, task, m, "ours", start) for start, m in TRANSFER.items()} for task in OBJECTS}
     found = [cell for starts in cells.values() for cell in starts.values() if cell is not None]
     if not found:
         return False

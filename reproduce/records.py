@@ -7,9 +7,7 @@ A row is replaced only by a newly computed result of the same unit with the same
 one version and one key, see `select`.
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping
+from collections.abc import Hashable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,10 +16,10 @@ import filelock
 import pandas as pd
 
 from difflcs._files import write_atomically
-from difflcs.errors import DiffLCSError
+from difflcs.errors import CheckpointError
 
 RESULTS = Path(__file__).parent / "results"
-COLUMNS: Mapping[str, type] = {
+COLUMNS: dict[Hashable, Any] = {
     **{"task": str, "method": str, "recipe": str, "start": str, "seed": int},  # the unit
     **{"at": float, "minutes": float},  # of data: asked for; really: the end of an iteration
     **{"success": float, "ci_low": float, "ci_high": float},  # share of goals reached, and its Wilson 95 % interval
@@ -38,31 +36,23 @@ IDENTITY = ["task", "method", "recipe", "start", "seed", "key"]
 """Columns that tell the results of one training from those of others."""
 
 
-class ResultsError(DiffLCSError):
-    """Results are missing, or cannot be used."""
-
-
 def path_of(folder: Path, preset: str, stand_in: bool = False) -> Path:
     """The file of a preset's results."""
     return folder / f"{preset}{'-stand-in' if stand_in else ''}.csv"
 
 
 def read(path: Path) -> pd.DataFrame:
-    """The rows of a file; none if there is no file.
-
-    Raises:
-        ResultsError: it was written by another version, or by something else.
-    """
+    """The rows of a file, none if there is no file; `CheckpointError` if another version or something else wrote it."""
     if not path.exists():
         return pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in COLUMNS.items()})
     try:
-        rows = pd.read_csv(path, dtype=dict(COLUMNS), keep_default_na=False)
+        rows = pd.read_csv(path, dtype=COLUMNS, keep_default_na=False)
         if list(rows.columns) != list(COLUMNS):
             raise ValueError(f"the columns {', '.join(rows.columns)}")
     except (OSError, ValueError) as error:
-        raise ResultsError(
-            f"{path}: expected results with the columns {', '.join(COLUMNS)}; got {error}. Nothing was changed; use "
-            f"the version that wrote it, or pass another --results"
+        raise CheckpointError(
+            f"{path}: expected results with the columns {', '.join(map(str, COLUMNS))}; got {error}. Nothing was "
+            f"changed; use the version that wrote it, or pass another --results"
         ) from error
     return rows
 
@@ -78,22 +68,18 @@ def add(folder: Path, preset: str, new: pd.DataFrame) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     with filelock.FileLock(folder / ".lock"):
         old = read(path)
-        kept = old[(old[IDENTITY] != new.loc[0, IDENTITY]).any(axis=1)]
-        write(path, (pd.concat([kept, new]) if len(kept) else new).sort_values([*IDENTITY, "at"]))
+        kept: Any = old[(old[IDENTITY] != new.loc[0, IDENTITY]).any(axis=1)]
+        write(path, (pd.concat([kept, new]) if len(kept) else new).sort_values(by=[*IDENTITY, "at"]))
     return path
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """All seeds of one method on one object, of one version and one key.
-
-    Attributes:
-        rows: theirs.
-        left_out: how many trainings of other versions or settings there are, which are not in it.
-    """
+    """All seeds of one method on one object, of one version and one key."""
 
     rows: pd.DataFrame
     left_out: int
+    """Trainings of other versions or settings, which are not in it."""
 
     @property
     def first(self) -> Any:
@@ -101,8 +87,8 @@ class Cell:
         return self.rows.iloc[0]
 
     @property
-    def scores(self) -> pd.DataFrame:
-        """Success [%] by seed (rows) and minutes of data (columns)."""
+    def scores(self) -> Any:
+        """Success [%] by seed (rows) and minutes of data (columns), a DataFrame."""
         return 100 * self.rows.pivot(index="seed", columns="at", values="success")
 
     @property
@@ -126,7 +112,7 @@ def select(rows: pd.DataFrame, task: str, method: str, recipe: str, start: str =
 
     Where there are several versions or settings, those with the most evaluated goals, then the newest.
     """
-    found = rows[(rows[IDENTITY[:4]] == [task, method, recipe, start]).all(axis=1)]
+    found: Any = rows[(rows[IDENTITY[:4]] == [task, method, recipe, start]).all(axis=1)]
     if found.empty:
         return None
     groups = [group for _, group in found.groupby(["version", "key"])]

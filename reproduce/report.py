@@ -1,7 +1,5 @@
 """What the tables and figures share: which results, how numbers are said, and how they are written."""
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Callable, Sequence
@@ -13,11 +11,12 @@ import records
 import runs
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from records import Cell, ResultsError
-from stats import Estimate, bootstrap, iqm, p_value, wilson
+from records import Cell
+from stats import IQM, Estimate, bootstrap, p_value, wilson
 from units import PRESETS
 
 from difflcs._files import write_atomically
+from difflcs.errors import CheckpointError
 
 README = Path(__file__).parent / "README.md"
 NAMES = {"lcs-rl": "LCS-RL", "violation": "violation only", "ppo": "PPO without warm-up", "pddm": "PDDM"}
@@ -31,6 +30,8 @@ INTERVALS = (
 )
 Tables = dict[str, pd.DataFrame]
 """Title → table of text."""
+Drawing = Callable[[pd.DataFrame, Path, str], bool]
+"""Draws rows into files of a folder and a name; returns whether there was something to draw."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,6 @@ class Draw(runs.Compute):
 
     rerun: bool = False
     """Compute what is missing, with the amounts of --preset; then draw."""
-
-
-Drawing = Callable[[pd.DataFrame, Path, str], bool]
-"""Draws rows into files of a folder and a name; returns whether there was something to draw."""
 
 
 def main(name: str, artefact: str, draw: Drawing, words: Sequence[str] | None = None) -> int:
@@ -60,15 +57,12 @@ def main(name: str, artefact: str, draw: Drawing, words: Sequence[str] | None = 
                 drawn |= draw(rows, options.results, stem)
             if drawn:
                 return code
-        raise ResultsError(
+        raise CheckpointError(
             f"{options.results}: expected results of {' or '.join(wanted)} for {name}, found none; compute them with: "
             f"python reproduce/{name}.py --rerun --preset {preset or 'quick'}"
         )
 
     return runs.command_line(Draw, action, words)
-
-
-# --- numbers ----------------------------------------------------------------------------------------------------------
 
 
 def at(cell: Cell | None, when: str | float) -> Estimate | None:
@@ -81,7 +75,7 @@ def at(cell: Cell | None, when: str | float) -> Estimate | None:
 
 def over_objects(cells: Sequence[Cell | None], when: str | float) -> Estimate | None:
     """Interquartile mean over objects and seeds; None if an object is missing."""
-    return bootstrap([list(cell.at(when)) for cell in cells if cell is not None], iqm) if all(cells) else None
+    return bootstrap([list(cell.at(when)) for cell in cells if cell is not None], IQM) if all(cells) else None
 
 
 def paired(a: Cell | None, b: Cell | None, when: str | float) -> list[float]:
@@ -126,15 +120,12 @@ def provenance(cells: Sequence[Cell | None]) -> list[str]:
     tasks: dict[str, list[str]] = {}
     for cell in found:
         first = cell.first
-        details = [RECIPES.get(first.recipe), None if first.start == "scratch" else f"from the {first.start}'s model"]
+        start = None if first.start == "scratch" else f"from the {first.start}'s model"
+        label = ", ".join(filter(None, [NAMES[first.method], RECIPES.get(first.recipe), start]))
         left_out = f"; {cell.left_out} trainings of others left out" if cell.left_out else ""
-        label = ", ".join(filter(None, [NAMES[first.method], *details]))
-        version = f"{label}: version {first.version}, {cell.amount}{left_out}"
-        tasks.setdefault(version, []).append(first.task.replace("_", " "))
-    return notes + [f"- {version} ({', '.join(names)})" for version, names in tasks.items()]
-
-
-# --- files ------------------------------------------------------------------------------------------------------------
+        line = f"{label}: version {first.version}, {cell.amount}{left_out}"
+        tasks.setdefault(line, []).append(first.task.replace("_", " "))
+    return notes + [f"- {line} ({', '.join(names)})" for line, names in tasks.items()]
 
 
 def write_tables(folder: Path, name: str, tables: Tables, notes: Sequence[str]) -> None:
@@ -167,7 +158,7 @@ def update_readme(name: str, markdown: str, readme: Path | None = None) -> None:
     before, mark, rest = text.partition(f"<!-- results: {name} -->\n")
     _, end, after = rest.partition("<!-- end -->")
     if mark and not end:
-        raise ResultsError(f"{readme}: expected <!-- end --> after {mark.strip()}, found none; put it back")
+        raise CheckpointError(f"{readme}: expected <!-- end --> after {mark.strip()}, found none; put it back")
     new = f"{before}{mark}\n{markdown}\n{end}{after}"
     if mark and new != text:
         write_atomically(readme, new.encode())

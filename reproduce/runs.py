@@ -12,6 +12,7 @@ import logging
 import os
 import sys
 import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 import records
+import tyro
 import units
 import worker
 from rich.progress import Progress, TaskID, TimeElapsedColumn
@@ -27,17 +29,11 @@ from units import Artefact, Method, Object, Preset, PresetName, Recipe, Unit
 from worker import Files, Job
 
 from difflcs._checks import check_positive_int
+from difflcs._files import write_atomically
 from difflcs.errors import DiffLCSError, InvalidInputError
 
 if TYPE_CHECKING:
     from distributed import Client
-
-ATTEMPTS = 4
-"""How often a unit is begun whose worker dies; it goes on from its last checkpoint."""
-FAILED = 1
-"""Exit code where units have failed."""
-_POLL_SECONDS = 0.25
-_CONNECT_SECONDS = 5.0
 
 
 @dataclass(frozen=True)
@@ -70,8 +66,9 @@ class Compute:
         for name in ("seeds", "goals", "workers"):
             if getattr(self, name) is not None:
                 check_positive_int(name, getattr(self, name))
-        if self.scheduler is not None and self.workers is not None:
-            raise InvalidInputError("scheduler: expected it without workers, which are of this machine, got both")
+        if self.scheduler is not None and (self.workers is not None or "://" not in self.scheduler):
+            got = f"{self.scheduler!r} and {self.workers} workers of this machine"
+            raise InvalidInputError(f"scheduler: expected an address tcp://host:port alone, got {got}")
 
 
 def make_jobs(wanted: Sequence[Unit], preset: Preset, work: Path) -> list[Job]:
@@ -85,14 +82,14 @@ def make_jobs(wanted: Sequence[Unit], preset: Preset, work: Path) -> list[Job]:
 
 def compute(
     jobs: Sequence[Job],
-    client: Client,
+    client: Any,
     store: Callable[[pd.DataFrame], object],
     show: Progress,
     execute: Callable[[Job], tuple[pd.DataFrame, Files]] = worker.execute,
 ) -> dict[Unit, str]:
     """Compute the units that are not finished, a unit after the one that it starts from, which is among `jobs`.
 
-    The results of each are handed to `store` as they come. Returns the units that failed, and why.
+    `client` is of Dask. The results of each are handed to `store` as they come. Returns which failed, and why.
     """
     by_unit = {job.unit: job for job in jobs}
     waiting = [job for job in jobs if job.result() is None]
@@ -102,7 +99,8 @@ def compute(
 
     def end(job: Job, outcome: str) -> None:
         show.advance(done)
-        show.console.print(f"{job.unit}: {outcome}", markup=False, highlight=False, soft_wrap=True)  # an error may hold brackets
+        # Without markup: an error may hold brackets.
+        show.console.print(f"{job.unit}: {outcome}", markup=False, highlight=False, soft_wrap=True)
 
     def fail(job: Job, error: str) -> None:
         failed[job.unit] = error
@@ -122,13 +120,14 @@ def compute(
                 # A closure is pickled by value, with all it refers to: workers need not have this folder.
                 future = client.submit(lambda ready=ready: execute(ready), pure=False)
                 running[future] = job, show.add_task(str(job.unit), total=None)
-        time.sleep(_POLL_SECONDS)
+        time.sleep(0.1)
         for future in [future for future in running if future.done()]:
             job, bar = running.pop(future)
             show.remove_task(bar)
             try:
                 rows, files = future.result()
             except Exception as error:  # whatever a unit, its worker or Dask may raise
+                write_atomically(job.folder / "error.txt", traceback.format_exc().encode())
                 fail(job, f"{type(error).__name__}: {error}")
                 continue
             if job.result() is None:  # the worker has another disk
@@ -141,9 +140,11 @@ def compute(
 
 @contextlib.contextmanager
 def connect(workers: int | None = None, scheduler: str | None = None) -> Iterator[Client]:
-    """A client of a scheduler, or of worker processes on this machine, which end with this one however that ends."""
+    """A client of a scheduler, or of worker processes on this machine, which end with this one however that ends.
+
+    A unit whose worker dies goes on from its last checkpoint, as often as Dask allows (`allowed-failures`, 3).
+    """
     import cloudpickle
-    import dask
     from distributed import Client, LocalCluster
 
     for module in (sys.modules[__name__], records, units, worker):
@@ -151,15 +152,14 @@ def connect(workers: int | None = None, scheduler: str | None = None) -> Iterato
     with contextlib.ExitStack() as held:
         address: Any = scheduler
         if address is None:
-            held.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": ATTEMPTS - 1}))
-            options: Any = {"memory_limit": None, "dashboard_address": None, "silence_logs": logging.CRITICAL}
+            options: Any = {"memory_limit": None, "dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
             count = workers or len(os.sched_getaffinity(0))
             address = held.enter_context(LocalCluster(n_workers=count, threads_per_worker=1, **options))
-        yield held.enter_context(Client(address, timeout=_CONNECT_SECONDS))
+        yield held.enter_context(Client(address))
 
 
 def run(options: Compute, artefacts: Sequence[str]) -> int:
-    """Compute what artefacts (none: all) need; returns the exit code, 0 or `FAILED` if units have failed."""
+    """Compute what artefacts (none: all) need; returns the exit code, 1 if units have failed."""
     preset = units.PRESETS[options.preset or "quick"]
     preset = replace(preset, seeds=options.seeds or preset.seeds, goals=options.goals or preset.goals)
     wanted = units.matrix(artefacts, preset.seeds, options.objects, options.methods, options.recipes)
@@ -185,13 +185,11 @@ def run(options: Compute, artefacts: Sequence[str]) -> int:
             print(f"failed: {job.unit}: {failed[job.unit]}\n        its files: {job.folder}")
     if failed:
         print(f"{len(failed)} of {len(jobs)} units failed; the same command tries them again and computes nothing else")
-    return FAILED if failed else 0
+    return 1 if failed else 0
 
 
 def command_line(kind: type[Any], action: Callable[[Any], int], arguments: Sequence[str] | None = None) -> int:
     """Run a script with its options, a dataclass: its exit code, 2 after an error of the user, 130 after Ctrl-C."""
-    import tyro
-
     from difflcs_envs import DifflcsEnvsError
 
     try:

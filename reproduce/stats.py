@@ -5,11 +5,10 @@ statistical precipice, 2021): seeds are drawn anew within each object. Their pac
 generator whatever generator it is given, and fails to import with pandas 3; SciPy's bootstrap does the same.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -29,9 +28,8 @@ def wilson(success: float, goals: int) -> Estimate:
     return Estimate(success, 100 * interval.low, 100 * interval.high)
 
 
-def iqm(values: np.ndarray, axis: int = -1) -> np.ndarray:
-    """Interquartile mean: of the middle half, which one failed or lucky run does not move."""
-    return stats.trim_mean(values, 0.25, axis=axis)
+IQM = partial(stats.trim_mean, proportiontocut=0.25)
+"""Interquartile mean: of the middle half, which one failed or lucky run does not move."""
 
 
 def bootstrap(strata: Sequence[Sequence[float]], statistic: Callable[..., np.ndarray] = np.mean) -> Estimate:
@@ -52,6 +50,7 @@ def bootstrap(strata: Sequence[Sequence[float]], statistic: Callable[..., np.nda
 def p_value(differences: Sequence[float]) -> float:
     """Two-sided p of the paired t-test; NaN for one seed."""
     rounded = np.round(differences, 6)  # or it would test rounding
-    if len(rounded) > 1 and np.ptp(rounded) == 0:  # every seed differs by the same
-        return float(rounded[0] == 0)
-    return float(stats.ttest_1samp(rounded, 0.0).pvalue) if len(rounded) > 1 else math.nan
+    if len(rounded) < 2 or np.ptp(rounded) == 0:  # every seed differs by the same
+        return math.nan if len(rounded) < 2 else float(rounded[0] == 0)
+    test: Any = stats.ttest_1samp(rounded, 0.0)
+    return float(test.pvalue)

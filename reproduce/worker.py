@@ -1,13 +1,10 @@
 """Computes one unit, on whatever worker of Dask. Workers need difflcs, but neither this folder nor a common disk."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import platform
 import re
 import shutil
-import traceback
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -21,19 +18,10 @@ import units
 from units import Preset, Unit
 
 from difflcs._files import write_atomically
-from difflcs.errors import InvalidInputError
+from difflcs.errors import CheckpointError, InvalidInputError
 
 Files = Mapping[str, bytes]
 """Path within a folder → content."""
-_EVALUATION = {
-    "minutes": "minutes",
-    "evaluation_success_rate": "success",
-    "evaluation_ci_low": "ci_low",
-    "evaluation_ci_high": "ci_high",
-    "evaluation_goals": "goals",
-    "evaluation_solver_failures": "solver_failures",
-}
-"""Column of log.csv → column of the results."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +45,9 @@ class Job:
     def result(self) -> pd.DataFrame | None:
         """Its evaluations, see `records.COLUMNS`, if its folder holds those of this unit with this key, and the run."""
         mine = {**asdict(self.unit), "key": self.key}
-        with contextlib.suppress(records.ResultsError):
+        with contextlib.suppress(CheckpointError):
             rows = records.read(self.folder / "result.csv")
-            known = len(rows) > 0 and (rows[list(mine)] == list(mine.values())).all(axis=None)
+            known = len(rows) > 0 and (rows[list(mine)] == list(mine.values())).to_numpy().all()
             return rows if known and (self.folder / "run" / "config.json").is_file() else None
 
     def keep(self, rows: pd.DataFrame) -> None:
@@ -68,36 +56,28 @@ class Job:
 
 
 def execute(job: Job) -> tuple[pd.DataFrame, Files]:
-    """Compute a unit, or go on with it, or take what is there if it is finished: its evaluations, and its run.
-
-    Only one process at a time works on a unit; another waits for it and returns the same.
-    """
+    """Compute a unit, or go on with it, or take what is there if it is finished: its evaluations, and its run."""
     job.folder.mkdir(parents=True, exist_ok=True)
-    with filelock.FileLock(job.folder / ".lock"):  # ends with the process that holds it, however that dies
+    with filelock.FileLock(job.folder / ".lock"):  # another process waits; it ends with the one that holds it
         rows = job.result()
         if rows is None:
-            try:
-                rows = _train(job)
-                job.keep(rows)
-            except Exception:
-                with contextlib.suppress(OSError):  # a full disk
-                    write_atomically(job.folder / "error.txt", traceback.format_exc().encode())
-                raise
+            rows = _train(job)
+            job.keep(rows)
         return rows, read_files(job.folder / "run")
 
 
 def _train(job: Job) -> pd.DataFrame:
     import torch
 
-    unit, run, init = job.unit, job.folder / "run", None
     torch.set_num_threads(1)  # of this thread only: one unit, one core
+    unit, run, init, config = job.unit, job.folder / "run", None, units.config_of(job.unit, job.preset)
     objects = {one.task: units.describe_object(one.task) for one in (unit, unit.init) if one is not None}
     key = units.key_of(unit, job.preset, objects)
     if key != job.key:
         raise InvalidInputError(
             f"key: expected {job.key}, as where the unit was submitted, got {key} on {platform.node()}, where "
-            f"{unit.method} has version {units.version_of(unit.method)} and the object is {objects[unit.task]}; "
-            f"install the same version of difflcs there, and set DIFFLCS_YCB_DIR to the same meshes"
+            f"{unit.method} has version {config.method.version} and the object is {objects[unit.task]}; install the "
+            f"same version of difflcs there, and set DIFFLCS_YCB_DIR to the same meshes"
         )
     if not (run / "config.json").is_file():
         shutil.rmtree(run, ignore_errors=True)  # killed before it began
@@ -106,19 +86,20 @@ def _train(job: Job) -> pd.DataFrame:
         write_files(init, job.init)
     finished = units.train_unit(unit, job.preset, run, init)
     log = pd.read_csv(finished.log)
-    evaluated = log[list(_EVALUATION)].dropna().rename(columns=_EVALUATION)
+    evaluated = log.dropna(subset="evaluation_goals").filter(regex="^(minutes$|evaluation_)")
+    evaluated.columns = [name.removeprefix("evaluation_").replace("_rate", "") for name in evaluated.columns]
     # Iterations have lengths of their own: the first evaluation at a minute or, if need be, a little after it.
     at = list(job.preset.evaluate_at)
-    rows = pd.DataFrame([evaluated[evaluated.minutes > minute - 1e-6].iloc[0] for minute in at])
-    seconds = log.filter(regex="_seconds$").sum()
+    rows: Any = pd.DataFrame([evaluated[evaluated.minutes > minute - 1e-6].iloc[0] for minute in at])
+    seconds: Any = log.filter(regex="_seconds$").sum()
     packages: dict[str, Any] = {**cast(Any, finished.config()["versions"]), "python": platform.python_version()}
-    rows = rows.reset_index().assign(
+    rows = rows.assign(
         **asdict(unit),
         at=at,
-        evaluation_seed=units.config_of(unit, job.preset).evaluation_seed,
+        evaluation_seed=config.evaluation_seed,
         source=objects[unit.task]["source"],
         mass=objects[unit.task]["mass"],
-        version=str(units.version_of(unit.method)),
+        version=str(config.method.version),
         key=key,
         versions=" ".join(f"{name}={version}" for name, version in sorted(packages.items()) if version),
         machine=machine(),
@@ -128,7 +109,7 @@ def _train(job: Job) -> pd.DataFrame:
     )
     for folder in (finished.checkpoints, finished.tensorboard):
         shutil.rmtree(folder, ignore_errors=True)  # megabytes that nobody needs any more
-    return rows[list(records.COLUMNS)].astype(records.COLUMNS).round(6)
+    return rows[list(records.COLUMNS)].astype(records.COLUMNS).round(6).reset_index(drop=True)
 
 
 def read_files(folder: Path) -> Files:
