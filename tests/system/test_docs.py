@@ -55,7 +55,9 @@ def run_code(code: list[str], folder: Path) -> None:
     pytest.importorskip("torchrl")
     script = folder / "page.py"
     script.write_text("import torch\n\ntorch.set_num_threads(1)\n" + "\n".join(code))
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=600, check=False, cwd=folder)
+    done = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, timeout=600, check=False, cwd=folder
+    )
     assert done.returncode == 0, done.stderr[-3000:]
     for line in done.stderr.splitlines():
         assert "difflcs" not in line, f"a warning that the page does not mention: {line}"
@@ -88,9 +90,7 @@ def test_the_map_of_the_house_has_every_file_of_the_library():
         for file in (ROOT / folder).glob("*.py")
         if not file.name.startswith("_") and file.name not in library
     ]
-    gone = [
-        found for found in re.findall(r"\w+\.py", library) if not [*(ROOT / "difflcs").rglob(found)]
-    ]
+    gone = [found for found in re.findall(r"\w+\.py", library) if not [*(ROOT / "difflcs").rglob(found)]]
     assert (missing, gone) == ([], [])
 
 
@@ -196,12 +196,15 @@ def test_every_setting_is_explained(generated):
             yield from flags(value, f"{flag}.") if is_dataclass(value) else [(f"--{flag}", value)]
 
     text = generated.fill((DOCS / "settings.md").read_text())
-    for flag, _ in flags(TrainConfig(), "")  :
+    for flag, _ in flags(TrainConfig(), ""):
         assert f"`{flag}`" in text or flag.startswith(("--method.",)), flag
     for name in method_names():
         assert f"## {name}\n" in text
         for flag, value in flags(get_method(name)()):
-            assert re.search(rf"^\| `{re.escape(flag)}` \|.*`{re.escape(repr(value))}`", text, re.MULTILINE), (name, flag)
+            assert re.search(rf"^\| `{re.escape(flag)}` \|.*`{re.escape(repr(value))}`", text, re.MULTILINE), (
+                name,
+                flag,
+            )
 
 
 def test_the_command_line_page_has_every_command(generated):
