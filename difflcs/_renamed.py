@@ -15,6 +15,7 @@ _RENAMED: Mapping[str, str] = {
     "--warmup.betas": "--warmup.adam.betas",
     "--warmup.minibatch": "--warmup.epochs.minibatch",
     "--warmup.first-epochs": "--warmup.epochs.first",
+    "--warmup.epochs": "--warmup.epochs.each",
     "--warmup.gamma": "--warmup.loss.gamma",
     "--warmup.xi": "--warmup.loss.xi",
     "--ppo.natural": "--ppo.update natural",
@@ -43,6 +44,7 @@ _RENAMED: Mapping[str, str] = {
     "--imagination.epochs": "--models.ensemble.epochs.each",
     "--imagination.minibatch": "--models.ensemble.epochs.minibatch",
     "--imagination.learning-rate": "--models.ensemble.learning-rate",
+    "--imagination.steps-minibatch": "--ppo.minibatch",
     "--imagination.": "--models.",
     "--mlp.width": "--width",
     "--mlp.": "--ppo.",
@@ -51,17 +53,14 @@ _RENAMED: Mapping[str, str] = {
     "--pddm.random-rollouts": "--pddm.rollouts.first",
     "--pddm.rollouts-per-iteration": "--pddm.rollouts.each",
     "--pddm.learning-rate": "--pddm.ensemble.learning-rate",
+    "--pddm.epochs": "--pddm.ensemble.epochs.each",
     "--pddm.minibatch": "--pddm.ensemble.epochs.minibatch",
 }
 """Flags of before → those of now; with a dot at the end, all that begin so."""
-_GROUPS = ("--warmup.epochs", "--pddm.epochs")
-"""Flags of before that are groups now."""
 
 
 def renamed(flag: str) -> str | None:
     """What a flag of `difflcs train` or `evaluate` of before is called now; None if it is none."""
-    if flag in _GROUPS:
-        return f"{flag}.each"
     for old, new in _RENAMED.items():
         if flag == old:
             return new

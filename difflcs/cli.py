@@ -6,6 +6,7 @@ Tasks and methods are known by their registries only; the flags of `train` are m
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import json
 import os
 import sys
@@ -106,10 +107,6 @@ def _train_command(words: Sequence[str]) -> type[Train]:
     if name is None and "--resume" in words and out is not None and (Path(out) / "config.json").is_file():
         name = stored_config(RunDirectory.open(Path(out))).method.name
     kind = get_method(name or method_names()[0])
-    for word in words:
-        flag = word.partition("=")[0].replace("_", "-")
-        if new := renamed(flag):
-            raise InvalidInputError(f"{flag}: expected a flag of today, got one of before; it is called {new} now")
     hidden = Annotated[kind, tyro.conf.arg(name="", prefix_name=False)]
     chosen: Any = Annotated[
         Literal[method_names()],  # pyright: ignore[reportInvalidTypeForm]
@@ -124,13 +121,20 @@ def _train_command(words: Sequence[str]) -> type[Train]:
     )
 
 
+def _refuse_renamed(words: Sequence[str]) -> None:
+    for word in words:
+        flag = word.partition("=")[0].replace("_", "-")
+        if new := renamed(flag):
+            raise InvalidInputError(f"{flag}: expected a flag of today, got one of before; it is called {new} now")
+
+
 def _methods() -> str:
     return "How to learn: " + "; ".join(f"{name}: {get_method(name).summary}" for name in method_names()) + "."
 
 
 def _value(words: Sequence[str], flag: str) -> str | None:
     """What follows a flag, as `--flag value` or `--flag=value`."""
-    for word, following in zip(words, [*words[1:], None], strict=True):
+    for word, following in itertools.zip_longest(words, words[1:]):
         if word == flag:
             return following
         if word.startswith(f"{flag}="):
@@ -435,6 +439,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         # `train` has settings for which None means something.
         plain = {k: v if k == "train" else Annotated[v, tyro.conf.DisallowNone] for k, v in _COMMANDS.items()}
+        if words[:1] in (["train"], ["evaluate"]):
+            _refuse_renamed(words[1:])
         if words[:1] == ["train"]:
             plain["train"] = _train_command(words[1:])
         command = tyro.extras.subcommand_cli_from_dict(

@@ -3,7 +3,8 @@
 A line `<!-- generated: KIND ARGUMENTS -->` of a page is replaced by Markdown that is made when the site is built:
 
 - `commands`: the command line's own help, one section per command.
-- `settings CLASS`: tables of a dataclass's fields, and of those of its groups, with defaults and docstrings.
+- `settings CLASS`: a table of a dataclass's own fields with their defaults and docstrings.
+- `methods`: a section for each method that is registered, with tables of its settings and of their groups.
 - `docstring OBJECT`: a docstring that is written in Markdown, as those of the environments.
 - `api MODULE [NAME ...]`: the reference of these public names of a module, or of all that are in its `__all__`.
 - `file PATH`: another Markdown file of the repository, without its title.
@@ -24,7 +25,7 @@ import re
 import shutil
 import textwrap
 from collections.abc import Callable
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -95,37 +96,81 @@ def field_docstrings(kind: type) -> dict[str, str]:
 
 
 def settings(name: str) -> str:
-    """Markdown: a table of the fields of a dataclass, then a section for each field that is a dataclass itself."""
+    """Markdown: a table of the fields of a dataclass that are no groups."""
     kind = resolve(name)
-    documented = field_docstrings(kind)
-    parts = [settings_table(kind, documented)]
-    for field in fields(kind):
-        group = _default(field)
-        if is_dataclass(group):
-            own = type(group)
-            summary = inspect.cleandoc(own.__doc__ or "").replace("\n", " ")
-            parts.append(f"## Group {field.name}\n\n{documented[field.name]}\n\n`{own.__name__}`: {summary}")
-            parts.append(settings_table(own, field_docstrings(own), f"{field.name}."))
-    return "\n\n".join(parts)
+    return settings_table([row for row in setting_rows(kind()) if "." not in row[0]])
 
 
-def settings_table(kind: type, documented: dict[str, str], prefix: str = "") -> str:
-    """Markdown: flag, default and meaning of every field that is no dataclass."""
-    rows = ["```{container} settings", "| setting | default | meaning |", "|---|---|---|"]
-    for field in fields(kind):
-        default = _default(field)
-        if is_dataclass(default):
-            continue
+def setting_rows(group: Any, prefix: str = "--") -> list[tuple[str, str, str]]:
+    """Flag, default and meaning of every field; before those of a group, one row with `.*` that says what it is."""
+    documented, rows = field_docstrings(type(group)), []
+    for field in fields(group):
+        value, flag = getattr(group, field.name), f"{prefix}{field.name}".replace("_", "-")
         if field.name not in documented:
-            raise ValueError(f"{kind.__name__}.{field.name}: expected a docstring below the field; write what it means")
-        flag = f"--{prefix}{field.name}".replace("_", "-")
-        meaning = documented[field.name].replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
-        rows.append(f"| `{flag}` | {'required' if default is MISSING else f'`{default!r}`'} | {meaning} |")
-    return "\n".join([*rows, "```"])
+            where = f"{type(group).__name__}.{field.name}"
+            raise ValueError(f"{where}: expected a docstring below the field; write what it means")
+        if is_dataclass(value):
+            rows += [(f"{flag}.*", "", documented[field.name]), *setting_rows(value, f"{flag}.")]
+        else:
+            rows.append((flag, f"`{value!r}`", documented[field.name]))
+    return rows
 
 
-def _default(field: Field) -> Any:
-    return field.default_factory() if field.default_factory is not MISSING else field.default
+def settings_table(rows: list[tuple[str, str, str]]) -> str:
+    """Markdown: a table of such rows."""
+    lines = ["```{container} settings", "| setting | default | meaning |", "|---|---|---|"]
+    for flag, default, meaning in rows:
+        text = meaning.replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
+        group = flag.endswith(".*")
+        lines.append(f"| {f'**`{flag}`**' if group else f'`{flag}`'} | {default} | {f'*{text}*' if group else text} |")
+    return "\n".join([*lines, "```"])
+
+
+def methods() -> str:
+    """Markdown: how many settings each method has, then a section for each. What was shown before is not repeated."""
+    from difflcs.rl import get_method, method_names
+
+    every = {name: setting_rows(get_method(name)()) for name in method_names()}
+    common = sum(not row[0].startswith("--method") for row in setting_rows(resolve("difflcs.rl.TrainConfig")()))
+    counts = {name: sum(bool(row[1]) for row in rows) for name, rows in every.items()}
+    distinct = common + len({row[0] for rows in every.values() for row in rows if row[1]})
+    told = ", ".join(f"[{name}](#{name}) {count}" for name, count in counts.items())
+    parts = [
+        f"All methods share the {common} settings above. Besides, each has its own: {told}. A group of the same name "
+        f"has the same settings in each of them, so that there are {distinct} flags in all."
+    ]
+    shown: dict[str, tuple[str, dict[str, tuple[str, str, str]]]] = {}  # of a group: where, and its rows by flag
+    for name, rows in every.items():
+        kind = get_method(name)
+        only = "The method for which no `--method` is needed. " if name == method_names()[0] else ""
+        parts.append(
+            f'## {name}\n\n{kind.summary[0].upper()}{kind.summary[1:]}. {only}In Python: `get_method("{name}")`.'
+        )
+        own = {row[0]: row for row in rows if "." not in row[0]}
+        if own and all(flag in shown for flag in own):
+            parts.append(
+                f"{', '.join(f'`{flag}`' for flag in own)}: as with [{shown[min(own)][0]}](#{shown[min(own)][0]})."
+            )
+        elif own:
+            parts.append(settings_table([*own.values()]))
+        shown |= {flag: (name, {flag: row}) for flag, row in own.items() if flag not in shown}
+        for flag, _, meaning in rows:
+            if flag.count(".") != 1 or not flag.endswith(".*"):
+                continue
+            inside = {row[0]: row for row in rows if row[0].startswith(flag[:-1]) and row[0] != flag}
+            title = f"### {name}: `{flag}`\n\n"
+            if flag not in shown:
+                shown[flag] = name, inside
+                about = inspect.cleandoc(type(getattr(kind(), flag[2:-2])).__doc__ or meaning).replace("\n", " ")
+                parts += [title + about, settings_table([*inside.values()])]
+                continue
+            where, before = shown[flag]
+            changed = [row for key, row in inside.items() if row != before[key]]
+            parts.append(
+                f"{title}{meaning} As with [{where}](#{where}){', but for these defaults:' if changed else '.'}"
+            )
+            parts += [settings_table(changed)] * bool(changed)
+    return "\n\n".join(parts)
 
 
 # --- docstrings -------------------------------------------------------------------------------------------------------
@@ -150,7 +195,9 @@ def api(module: str, *names: str) -> str:
             kind, options = "autoexception", [":show-inheritance:"]
         elif inspect.isclass(value):
             kind = "autoclass"
-            if is_dataclass(value) and name.endswith("Config"):
+            if is_dataclass(value) and issubclass(
+                value, resolve("difflcs.rl.Settings")
+            ):  # they have a page of their own
                 options = [":exclude-members: " + ", ".join(f.name for f in fields(value))]
             if [*getattr(value, "__members__", {})]:
                 options = [":undoc-members:"]
@@ -271,6 +318,7 @@ def copy_tutorials() -> None:
 KINDS: dict[str, Callable[..., str]] = {
     "commands": commands,
     "settings": settings,
+    "methods": methods,
     "docstring": docstring,
     "api": api,
     "file": repository_file,
