@@ -153,6 +153,7 @@ _WRONG_VALUES = (
     True,
     -1,
     1.5,
+    -1.5,
     10**30,
     -(10**30),
     "x",
@@ -218,10 +219,11 @@ def _same_state(a: Any, b: Any) -> bool:
 
 @pytest.fixture(scope="session")
 def refuses_hostile_checkpoints() -> Callable[[Any], None]:
-    """A check: after one step, a trainer loads its own state, and refuses states with anything wrong.
+    """A check: a trainer goes back to a state of its own, and refuses such states with anything wrong.
 
-    A refusal changes nothing. What is accepted is taken as it is: a number that could have been written, such as
-    another step size, or one that is equal to its own. A wrong tensor is never accepted.
+    A refusal changes nothing: it stays where it was, one step further. What is accepted is taken as it is: a number
+    that could have been written, such as another step size, or one that is equal to its own. A wrong tensor is never
+    accepted.
     """
     from difflcs.errors import CheckpointError
     from difflcs.rl.state import copy_state
@@ -232,8 +234,6 @@ def refuses_hostile_checkpoints() -> Callable[[Any], None]:
         trainer.step()
         following = copy_state(trainer.state_dict())
         assert not _same_state(whole, following)
-        trainer.load(whole)
-        assert _same_state(trainer.state_dict(), whole)
         for is_tensor, state in _hostile(whole):
             try:
                 trainer.load(state)
@@ -242,8 +242,10 @@ def refuses_hostile_checkpoints() -> Callable[[Any], None]:
             else:
                 assert not is_tensor
                 assert _same_state(trainer.state_dict(), state)
-                trainer.load(whole)
-            assert _same_state(trainer.state_dict(), whole)
+                trainer.load(following)
+            assert _same_state(trainer.state_dict(), following)
+        trainer.load(whole)
+        assert _same_state(trainer.state_dict(), whole)
         trainer.step()  # by what a state does not hold, too, nothing has changed
         assert _same_state(trainer.state_dict(), following)
 

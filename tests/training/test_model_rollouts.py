@@ -37,7 +37,7 @@ def small(width: int = 16, first: int = 3, minibatch: int = 8) -> ModelRolloutSe
 
 
 def make_rollouts(**changes) -> ModelRollouts:
-    return ModelRollouts(SPACES, outcome, small(**changes), 0, STEPS)  # type: ignore[arg-type]
+    return ModelRollouts(SPACES, outcome, small(**changes), 0, STEPS)
 
 
 def outcome(x, u, after, goal, ended):
