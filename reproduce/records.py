@@ -92,9 +92,9 @@ class Cell:
         return 100 * self.rows.pivot(index="seed", columns="at", values="success")
 
     @property
-    def amount(self) -> str:
-        """How many seeds and goals it has."""
-        return f"{len(self.scores)} seed{'s' * (len(self.scores) > 1)} × {self.first.goals} goals"
+    def seeds(self) -> str:
+        """How many it has."""
+        return f"{len(self.scores)} seed{'s' * (len(self.scores) > 1)}"
 
     def minute(self, when: str | float) -> float:
         """The minute given; "final", the last; or "peak", where the mean over the seeds is highest after the start."""

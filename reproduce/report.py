@@ -123,7 +123,7 @@ def provenance(cells: Sequence[Cell | None]) -> list[str]:
         start = None if first.start == "scratch" else f"from the {first.start}'s model"
         label = ", ".join(filter(None, [NAMES[first.method], RECIPES.get(first.recipe), start]))
         left_out = f"; {cell.left_out} trainings of others left out" if cell.left_out else ""
-        line = f"{label}: version {first.version}, {cell.amount}{left_out}"
+        line = f"{label}: version {first.version}, {cell.seeds} × {first.goals} goals{left_out}"
         tasks.setdefault(line, []).append(first.task.replace("_", " "))
     return notes + [f"- {line} ({', '.join(names)})" for line, names in tasks.items()]
 
@@ -168,9 +168,9 @@ def draw_curves(axes: Axes, title: str, curves: Sequence[tuple[Cell | None, str,
     """Success against minutes of data with its interval, of cells with their labels and colours."""
     for cell, label, color in curves:
         if cell is not None:
-            points = pd.DataFrame([at(cell, minute) for minute in cell.scores], index=cell.scores.columns)
-            axes.plot(points.index, points.value, label=f"{label} ({cell.amount})", color=color, lw=2, marker="o", ms=3)
-            axes.fill_between(points.index, points.low, points.high, color=color, alpha=0.2, lw=0)
+            minutes, points = cell.scores.columns, pd.DataFrame([at(cell, minute) for minute in cell.scores])
+            axes.plot(minutes, points.value, label=f"{label} ({cell.seeds})", color=color, lw=2, marker="o", ms=3)
+            axes.fill_between(minutes, points.low, points.high, color=color, alpha=0.2, lw=0)
     axes.set(title=title, xlabel="data [min]", ylabel="success [%]", ylim=(0, 102))
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
