@@ -4,11 +4,16 @@ VENV := .venv
 BIN := $(VENV)/bin
 EXTRAS := all
 
-.PHONY: help demo test lint format docs clean
+# One worker per core; a file stays in one worker, which computes its shared fixtures once; long files come first.
+PARALLEL := -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+TIMED := tests/system/test_time.py
+
+.PHONY: help demo check test lint format docs clean
 
 help:
 	@echo "make demo   learn a contact model and push the cube with it (runs/demo)"
-	@echo "make test   run the tests"
+	@echo "make check  while you work: ruff and the fast tests of the parts, in a minute"
+	@echo "make test   run all tests, in parallel"
 	@echo "make lint   ruff and pyright"
 	@echo "make format let ruff put the code in order"
 	@echo "make docs   build the documentation (build/docs/index.html)"
@@ -24,8 +29,15 @@ $(VENV)/.ready: pyproject.toml constraints.txt CMakeLists.txt cmake/kernels.cmak
 demo: $(VENV)/.ready
 	$(BIN)/difflcs demo
 
+check: $(VENV)/.ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/python -m pytest $(PARALLEL) -q -m "not slow" tests/unit tests/conformance
+
+# What measures time comes last, when nothing else runs.
 test: $(VENV)/.ready
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(PARALLEL) --ignore $(TIMED)
+	$(BIN)/python -m pytest $(TIMED)
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .

@@ -171,16 +171,17 @@ def save_record(directory: Path, kind: str, config: Mapping[str, object], tensor
 
     values = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
     header = {"format": _FORMAT, "kind": kind, "config": dict(config)}
-    write_atomically(directory / "model.safetensors", save(values, metadata={"sha256": _hash(header, values)}))
+    write_atomically(directory / "model.safetensors", save(values, metadata={"sha256": digest(header, values)}))
     write_json(directory / "config.json", header)
 
 
-def _hash(header: Mapping[str, object], tensors: Mapping[str, Tensor]) -> str:
-    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+def digest(header: Mapping[str, object], tensors: Mapping[str, Tensor]) -> str:
+    """SHA-256 of a record: its description and the names, shapes, types and values of its tensors."""
+    total = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(tensors):
-        digest.update(f"{name} {tuple(tensors[name].shape)} {tensors[name].dtype}".encode())
-        digest.update(tensors[name].contiguous().view(-1).view(torch.uint8).numpy().tobytes())
-    return digest.hexdigest()
+        total.update(f"{name} {tuple(tensors[name].shape)} {tensors[name].dtype}".encode())
+        total.update(tensors[name].contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+    return total.hexdigest()
 
 
 def load_record(directory: Path, kind: str) -> tuple[dict[str, object], dict[str, Tensor]]:
@@ -203,7 +204,7 @@ def load_record(directory: Path, kind: str) -> tuple[dict[str, object], dict[str
     if header.get("format") != _FORMAT:
         got = short(header.get("format"))
         raise CheckpointError(f"{directory}: expected format {_FORMAT}, got {got}; update difflcs or save it again")
-    if metadata.get("sha256") != _hash(header, tensors):
+    if metadata.get("sha256") != digest(header, tensors):
         raise CheckpointError(
             f"{directory}: config.json and model.safetensors do not match their checksum; copy or save them again"
         )

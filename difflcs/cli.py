@@ -480,7 +480,7 @@ def _compare(learned: Learned, task: TaskSpec, env: Any) -> dict[str, Any]:
 def _record(learned: Learned, task: TaskSpec, goals: Sequence[Sequence[float]], path: Path, seed: int) -> list[bool]:
     require("imageio", "imageio_ffmpeg", "PIL")
     try:
-        env = task.make_env(render_mode="rgb_array")
+        env = task.make_env(render_mode="rgb_array", **task.picture)
     except InvalidInputError as error:
         raise NoPictureError(str(error)) from error
     try:

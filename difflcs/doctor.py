@@ -28,7 +28,11 @@ import difflcs
 from difflcs import GoalCost, LCSModel, LCSMPCLayer, _zoo, solve_lcp
 from difflcs.errors import BackendNotFoundError, DiffLCSError
 
-_TIMEOUT = 120.0  # [s] of a process; the first picture in software takes seconds
+GROUPS = ("library", "solvers", "machine", "extras", "environments")
+"""What can be examined, in the order of the report."""
+TIMEOUT = 120.0
+"""Seconds that a process of its own may take; the first picture in software takes some."""
+
 _HARD = ("torch", "numpy", "casadi", "filelock", "safetensors")
 _OPTIONAL_BACKENDS = ("relaxed",)
 _EXTRAS = ("rl", "envs", "viz", "relaxed", "tutorials", "reproduce", "docs", "dev")
@@ -99,16 +103,20 @@ class _MissingError(Exception):
         self.remedy = remedy
 
 
-def examine() -> list[Check]:
-    """Look at everything; takes some seconds."""
-    checks = [_check("library", name, work, core=True) for name, work in _LIBRARY.items()]
-    checks += [
-        _check("solvers", name, lambda name=name: _solves(name), core=name not in _OPTIONAL_BACKENDS)
-        for name in dict.fromkeys(("batched", "ipopt", *_OPTIONAL_BACKENDS, *difflcs.available_backends()))
-    ]
-    checks += [_check("machine", name, work) for name, work in _MACHINE.items()]
-    checks += [_check("extras", name, lambda name=name: _extra(name)) for name in _EXTRAS]
-    return checks + _environments()
+def examine(groups: Sequence[str] = GROUPS) -> list[Check]:
+    """Look at everything; takes some seconds.
+
+    Args:
+        groups: what to look at, of `GROUPS`.
+    """
+    look = {
+        "library": lambda: [_check("library", name, work, core=True) for name, work in _LIBRARY.items()],
+        "solvers": _solvers,
+        "machine": lambda: [_check("machine", name, work) for name, work in _MACHINE.items()],
+        "extras": lambda: [_check("extras", name, lambda name=name: _extra(name)) for name in _EXTRAS],
+        "environments": _environments,
+    }
+    return [check for group in groups for check in look[group]()]
 
 
 def healthy(checks: Sequence[Check]) -> bool:
@@ -195,6 +203,13 @@ def _models() -> str:
 
 def _tiny_model() -> LCSModel:
     return LCSModel(2, 1, 1, init_scale=0.1, generator=torch.Generator().manual_seed(0))
+
+
+def _solvers() -> list[Check]:
+    return [
+        _check("solvers", name, lambda name=name: _solves(name), core=name not in _OPTIONAL_BACKENDS)
+        for name in dict.fromkeys(("batched", "ipopt", *_OPTIONAL_BACKENDS, *difflcs.available_backends()))
+    ]
 
 
 def _solves(name: str) -> str:
@@ -313,9 +328,9 @@ def _in_process(code: str) -> dict[str, Any]:
         raise _MissingError("without gymnasium and mujoco", 'pip install "difflcs[envs]"')
     command = [sys.executable, "-c", code]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, check=False)
     except subprocess.TimeoutExpired:
-        raise RuntimeError(f"no answer within {_TIMEOUT:g} s") from None
+        raise RuntimeError(f"no answer within {TIMEOUT:g} s") from None
     if done.returncode != 0:
         lines = [line for line in done.stderr.splitlines() if line.strip()]
         raise RuntimeError(lines[-1] if lines else f"the process ended with code {done.returncode}")

@@ -1,39 +1,37 @@
-"""What the tables and figures share: which results, how they are written, and the numbers in README.md."""
-
-from __future__ import annotations
+"""What the tables and figures share: which results, how numbers are said, and how they are written."""
 
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import pandas as pd
 import records
 import runs
-from records import Cell, ResultsError, Row
-from rich.console import Console
-from rich.table import Table
-from stats import Comparison, Summary, compare, summarise
-from units import get_preset, shared_code
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from records import Cell
+from stats import IQM, Estimate, bootstrap, p_value, wilson
+from units import PRESETS
 
 from difflcs._files import write_atomically
 from difflcs.errors import CheckpointError
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 README = Path(__file__).parent / "README.md"
-NAMES: Mapping[str, str] = {
-    "lcs-rl": "LCS-RL",
-    "violation": "violation only",
-    "ppo": "PPO without warm-up",
-    "pddm": "PDDM",
-}
-COLORS: Mapping[str, str] = {"lcs-rl": "#d55e00", "violation": "#0072b2", "ppo": "#e69f00", "pddm": "#009e73"}
+NAMES = {"lcs-rl": "LCS-RL", "violation": "violation only", "ppo": "PPO without warm-up", "pddm": "PDDM"}
+COLORS = {"lcs-rl": "#d55e00", "violation": "#0072b2", "ppo": "#e69f00", "pddm": "#009e73"}
 """Okabe–Ito: red, blue, orange, green as in the paper, told apart by colour-blind readers."""
+RECIPES = {"ours": "our recipe", "paper": "the paper's recipe"}
 MISSING = "—"
+INTERVALS = (
+    "In brackets 95 % intervals: over the seeds by the bootstrap, which for three seeds says little more than their "
+    "range; of a single seed Wilson's, over its goals."
+)
+Tables = dict[str, pd.DataFrame]
+"""Title → table of text."""
+Drawing = Callable[[pd.DataFrame, Path, str], bool]
+"""Draws rows into files of a folder and a name; returns whether there was something to draw."""
 
 
 @dataclass(frozen=True)
@@ -44,202 +42,113 @@ class Draw(runs.Compute):
     """Compute what is missing, with the amounts of --preset; then draw."""
 
 
-def load(options: Draw, script: str) -> tuple[str, list[Row], list[Row]]:
-    """The results to draw.
+def main(name: str, artefact: str, draw: Drawing, words: Sequence[str] | None = None) -> int:
+    """What every drawing script does: compute if that is asked for, then draw, stand-ins apart; the exit code."""
 
-    Args:
-        options: of the script.
-        script: its name, for the error.
+    def action(options: Draw) -> int:
+        code = runs.run(options, [artefact]) if options.rerun else 0
+        preset = options.preset or ("quick" if options.rerun else None)
+        wanted = [preset] if preset else list(PRESETS)
+        for one in wanted:
+            drawn = False
+            for stand_in in (False, True):
+                rows = records.read(records.path_of(options.results, one, stand_in))
+                stem = name + ("" if one == "paper" else f"-{one}") + ("-stand-in" if stand_in else "")
+                drawn |= draw(rows, options.results, stem)
+            if drawn:
+                return code
+        raise CheckpointError(
+            f"{options.results}: expected results of {' or '.join(wanted)} for {name}, found none; compute them with: "
+            f"python reproduce/{name}.py --rerun --preset {preset or 'quick'}"
+        )
 
-    Returns:
-        Name of the preset, rows with meshes (and the cube), rows with stand-ins.
-
-    Raises:
-        ResultsError: there are none, or they are of another version.
-    """
-    wanted = ["paper", "quick", "smoke"] if options.preset is None else [get_preset(options.preset).name]
-    for name in wanted:
-        rows, stand_ins = (records.read(records.path_of(options.results, name, flag)) for flag in (False, True))
-        if rows or stand_ins:
-            return name, rows, stand_ins
-    raise nothing(script, " or ".join(wanted), options)
-
-
-def nothing(script: str, preset: str, options: Draw) -> ResultsError:
-    """The error where there are no results to draw."""
-    return ResultsError(
-        f"{options.results}: expected results of {preset} for {script}, found none; compute them with: python "
-        f"reproduce/{script}.py --rerun --preset {options.preset or 'quick'}"
-    )
+    return runs.command_line(Draw, action, words)
 
 
-@dataclass(frozen=True)
-class Grid:
-    """A table of text.
-
-    Attributes:
-        title: what it shows.
-        header: names of the columns.
-        rows: the cells.
-    """
-
-    title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-    def terminal(self) -> Table:
-        """For the terminal."""
-        table = Table(title=self.title, title_justify="left", box=None, padding=(0, 1))
-        for number, name in enumerate(self.header):
-            table.add_column(name, justify="right" if number else "left")
-        for row in self.rows:
-            table.add_row(*row)
-        return table
-
-    def markdown(self) -> str:
-        """For Markdown."""
-        lines = [self.header, ("---",) * len(self.header), *self.rows]
-        return f"**{self.title}**\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
-
-    def latex(self) -> str:
-        """For LaTeX, with the package booktabs."""
-        lines = [" & ".join(map(_latex, row)) + r" \\" for row in (self.header, *self.rows)]
-        columns = "l" + "c" * (len(self.header) - 1)
-        body = "\n".join(["\\toprule", lines[0], "\\midrule", *lines[1:], "\\bottomrule"])
-        return f"% {self.title}\n\\begin{{tabular}}{{{columns}}}\n{body}\n\\end{{tabular}}\n"
-
-
-def _latex(text: str) -> str:
-    for old, new in (("%", r"\%"), ("_", r"\_"), ("±", r"$\pm$"), ("−", "$-$"), ("×", r"$\times$"), ("<", "$<$")):
-        text = text.replace(old, new)
-    return text.replace(MISSING, "---")
-
-
-def plus_minus(values: Summary | tuple[float, float] | None) -> str:
-    """Mean ± standard deviation, as in the paper."""
-    if values is None:
-        return MISSING
-    mean, sd = (values.mean, values.sd) if isinstance(values, Summary) else values
-    return f"{mean:.1f}" if math.isnan(sd) else f"{mean:.1f} ± {sd:.1f}"
-
-
-def difference(comparison: Comparison | None) -> tuple[str, str]:
-    """Mean difference with its 95 % interval, and the p-value."""
-    if comparison is None:
-        return MISSING, MISSING
-    found = comparison.difference
-    mean = _signed(found.mean)
-    if found.n < 2:
-        return f"{mean} (one seed)", MISSING
-    p = "< 0.001" if comparison.p < 0.001 else f"{comparison.p:.3f}"
-    return f"{mean} [{_signed(found.low)}, {_signed(found.high)}]", p
-
-
-def _signed(value: float) -> str:
-    return f"{value:+.1f}".replace("-", "−")
-
-
-def at(cell: Cell | None, when: str | float) -> Summary | None:
-    """Success [%] over the seeds after some minutes of data.
-
-    Args:
-        cell: one method on one object.
-        when: "peak" (where the mean over the seeds is highest), "final", or minutes of data.
-
-    Returns:
-        None if there is no such evaluation.
-    """
-    values = _values(cell, when)
-    return summarise(list(values.values())) if values else None
-
-
-def paired(a: Cell | None, b: Cell | None, when: str | float) -> Comparison | None:
-    """Compare a with b over the seeds that both have, each at its own `when` (see `at`).
-
-    Returns:
-        None where they cannot be compared: other goals, another object, or other code of what they have in common.
-    """
-    if a is None or b is None or _conditions(a) != _conditions(b):
+def at(cell: Cell | None, when: str | float) -> Estimate | None:
+    """Success [%] at some minute, see `Cell.minute`; None if there is no such evaluation."""
+    values = [] if cell is None else list(cell.at(when))
+    if cell is None or not values:
         return None
-    ours, theirs = _values(a, when), _values(b, when)
-    seeds = sorted(set(ours) & set(theirs))
-    return compare([ours[seed] for seed in seeds], [theirs[seed] for seed in seeds]) if seeds else None
+    return wilson(values[0], cell.first.goals) if len(values) == 1 else bootstrap([values])
 
 
-def _conditions(cell: Cell) -> set[tuple[object, ...]]:
-    return {
-        (row.task, row.goals, row.evaluation_seed, shared_code(row.code), row.source, row.mass) for row in cell.rows
-    }
+def over_objects(cells: Sequence[Cell | None], when: str | float) -> Estimate | None:
+    """Interquartile mean over objects and seeds; None if an object is missing."""
+    return bootstrap([list(cell.at(when)) for cell in cells if cell is not None], IQM) if all(cells) else None
 
 
-def _values(cell: Cell | None, when: str | float) -> dict[int, float]:
-    if cell is None:
-        return {}
-    minute = cell.peak_minute if when == "peak" else max(cell.minutes) if when == "final" else float(when)
-    return cell.at(minute)
+def paired(a: Cell | None, b: Cell | None, when: str | float) -> list[float]:
+    """Success of a − b [%] for each seed of both; none where they differ in goals or object."""
+    conditions = ["task", "goals", "evaluation_seed", "source", "mass"]
+    if a is None or b is None or any(a.first[name] != b.first[name] for name in conditions):
+        return []
+    return list((a.at(when) - b.at(when)).dropna())
+
+
+def say(estimate: Estimate | None, signed: bool = False) -> str:
+    """A number with its interval."""
+    if estimate is None:
+        return MISSING
+    value, low, high = (f"{x:{'+' if signed else ''}.1f}".replace("-", "−") for x in estimate)
+    return value if math.isnan(estimate.low) else f"{value} [{low}, {high}]"
+
+
+def say_difference(differences: Sequence[float]) -> tuple[str, str]:
+    """The mean difference with its interval, and the p-value."""
+    if not differences:
+        return MISSING, MISSING
+    p = p_value(differences)
+    text = MISSING if math.isnan(p) else "< 0.001" if p < 0.001 else f"{p:.3f}"
+    return say(bootstrap([differences]), signed=True), text
 
 
 def provenance(cells: Sequence[Cell | None]) -> list[str]:
-    """Where the numbers come from, and what is not as it should be; one sentence each."""
+    """Where the numbers come from: how much was computed, on what, and by which version of each method."""
     found = [cell for cell in cells if cell is not None]
-    rows = [row for cell in found for row in cell.rows]
-    units = {row.key: row for row in rows}.values()
-    amounts = sorted({f"{count(cell)} × {cell.rows[0].goals} goals" for cell in found})
-    objects = sorted({f"{row.source.replace('_', ' ')} {1000 * row.mass:g} g" for row in rows})
-    seconds = sum(row.train_seconds + row.evaluation_seconds for row in units)
+    rows = pd.concat([cell.rows for cell in found])
+    units = rows.drop_duplicates(records.IDENTITY)
+    seconds = units.train_seconds + units.evaluation_seconds
+    objects = (units.source.str.replace("_", " ") + units.mass.map(" {:g} kg".format)).unique()
     notes = [
-        f"Ours: {', '.join(amounts)}, the same goals for all; objects: {', '.join(objects)}.",
-        f"Computed: {len(units)} trainings in {seconds / 3600:.1f} core hours, {seconds / len(units):.0f} s each on "
-        f"average, on {', '.join(_distinct(rows, 'machine'))}, until {max(row.finished for row in rows)[:10]}; "
-        f"{'; '.join(_distinct(rows, 'versions'))}; code {', '.join(_distinct(rows, 'code'))}.",
+        INTERVALS,
+        f"Computed: {len(units)} trainings in {seconds.sum() / 3600:.1f} core hours, {seconds.mean():.0f} s each on "
+        f"average, on {', '.join(units.machine.unique())}, until {units.finished.max()[:10]}; "
+        f"{'; '.join(units.versions.unique())}; objects: {', '.join(objects)}; the same goals for all.",
+        "Every number is of one version of its method:",
     ]
-    codes = {(row.method, row.code) for row in rows}
-    mixed = len(codes) > len({row.method for row in rows}) or len({shared_code(row.code) for row in rows}) > 1
-    if mixed or len(amounts) > 1:
-        notes.append("Not everything was computed on as many seeds and goals, or with one code for each method:")
-        notes += [f"- {_name(cell)}: {len(cell.seeds)} × {cell.rows[0].goals}, {cell.rows[0].code}" for cell in found]
-    notes += [
-        f"{_name(cell)}: {cell.left_out} trainings of other settings left out." for cell in found if cell.left_out
-    ]
-    return notes
+    tasks: dict[str, list[str]] = {}
+    for cell in found:
+        first = cell.first
+        start = None if first.start == "scratch" else f"from the {first.start}'s model"
+        label = ", ".join(filter(None, [NAMES[first.method], RECIPES.get(first.recipe), start]))
+        left_out = f"; {cell.left_out} trainings of others left out" if cell.left_out else ""
+        line = f"{label}: version {first.version}, {cell.amount}{left_out}"
+        tasks.setdefault(line, []).append(first.task.replace("_", " "))
+    return notes + [f"- {line} ({', '.join(names)})" for line, names in tasks.items()]
 
 
-def _distinct(rows: Sequence[Row], name: str) -> list[str]:
-    return sorted({str(getattr(row, name)) for row in rows})
-
-
-def _name(cell: Cell) -> str:
-    unit = cell.rows[0].unit
-    return str(unit).rpartition(", seed")[0]
-
-
-def count(cell: Cell) -> str:
-    """How many seeds it has."""
-    return "1 seed" if len(cell.seeds) == 1 else f"{len(cell.seeds)} seeds"
-
-
-def stem(script: str, preset: str, stand_in: bool = False) -> str:
-    """Name of an output: plain for the paper's amounts, with the preset's name otherwise."""
-    return script + ("" if preset == "paper" else f"-{preset}") + ("-stand-in" if stand_in else "")
-
-
-def write_tables(folder: Path, name: str, grids: Sequence[Grid], notes: Sequence[str]) -> None:
+def write_tables(folder: Path, name: str, tables: Tables, notes: Sequence[str]) -> None:
     """Print tables with their notes; write them as Markdown and LaTeX, and into README.md where they belong there."""
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=160)
-    for grid in grids:
-        console.print(grid.terminal())
-        console.print()
-    for note in notes:
-        console.print(note, markup=False, highlight=False)
-    markdown = "\n".join([grid.markdown() for grid in grids]) + "\n" + "\n".join(notes) + "\n"
-    latex = "\n".join([grid.latex() for grid in grids] + [f"% {note}" for note in notes]) + "\n"
+    blocks = [
+        f"**{title}**\n\n{table.to_markdown(index=False, tablefmt='github', disable_numparse=True)}\n"
+        for title, table in tables.items()
+    ]
+    markdown = "\n".join(blocks) + "\n" + "\n".join(notes) + "\n"
+    print(markdown)
     write_atomically(folder / f"{name}.md", markdown.encode())
-    write_atomically(folder / f"{name}.tex", latex.encode())
+    latex = "\n".join(f"% {title}\n{_latex(table)}" for title, table in tables.items())
+    write_atomically(folder / f"{name}.tex", (latex + "\n" + "".join(f"% {note}\n" for note in notes)).encode())
     print(f"written: {folder / name}.md, .tex")
     if folder.resolve() == records.RESULTS.resolve():
         update_readme(name, markdown)
+
+
+def _latex(table: pd.DataFrame) -> str:
+    text = table.to_latex(index=False, escape=True, column_format="l" + "c" * (table.shape[1] - 1))
+    for old, new in (("±", r"$\pm$"), ("−", "$-$"), ("<", "$<$"), (MISSING, "---")):
+        text = text.replace(old, new)
+    return text
 
 
 def update_readme(name: str, markdown: str, readme: Path | None = None) -> None:
@@ -249,43 +158,19 @@ def update_readme(name: str, markdown: str, readme: Path | None = None) -> None:
     before, mark, rest = text.partition(f"<!-- results: {name} -->\n")
     _, end, after = rest.partition("<!-- end -->")
     if mark and not end:
-        raise ResultsError(f"{readme}: expected <!-- end --> after {mark.strip()}, found none; put it back")
+        raise CheckpointError(f"{readme}: expected <!-- end --> after {mark.strip()}, found none; put it back")
     new = f"{before}{mark}\n{markdown}\n{end}{after}"
     if mark and new != text:
         write_atomically(readme, new.encode())
 
 
-def new_figure(width: float, height: float) -> Figure:
-    """A figure [inch] that needs no screen."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def draw_curve(axes: Axes, cell: Cell | None, label: str, color: str, dashed: bool = False) -> None:
-    """Mean success against minutes of data, with the 95 % t-interval over the seeds; of two seeds, both instead.
-
-    A t-interval of two values is as wide as the axes and would hide the curves.
-    """
-    if cell is None:
-        return
-    points = [(minute, summarise(list(cell.at(minute).values()))) for minute in cell.minutes]
-    x = [minute for minute, _ in points]
-    style = {"color": color, "lw": 2, "ls": "--" if dashed else "-", "marker": "o", "ms": 3}
-    axes.plot(x, [found.mean for _, found in points], label=f"{label} ({count(cell)})", **style)
-    if len(cell.seeds) == 2:
-        for seed in cell.seeds:
-            axes.plot(x, [cell.at(minute)[seed] for minute in cell.minutes], color=color, lw=0.8, alpha=0.6)
-    elif len(cell.seeds) > 2:
-        low, high = ([getattr(found, end) for _, found in points] for end in ("low", "high"))
-        axes.fill_between(x, low, high, color=color, alpha=0.2, lw=0)
-
-
-def style_axes(axes: Axes, title: str) -> None:
-    """Percent against minutes."""
+def draw_curves(axes: Axes, title: str, curves: Sequence[tuple[Cell | None, str, str]]) -> None:
+    """Success against minutes of data with its interval, of cells with their labels and colours."""
+    for cell, label, color in curves:
+        if cell is not None:
+            points = pd.DataFrame([at(cell, minute) for minute in cell.scores], index=cell.scores.columns)
+            axes.plot(points.index, points.value, label=f"{label} ({cell.amount})", color=color, lw=2, marker="o", ms=3)
+            axes.fill_between(points.index, points.low, points.high, color=color, alpha=0.2, lw=0)
     axes.set(title=title, xlabel="data [min]", ylabel="success [%]", ylim=(0, 102))
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
@@ -296,21 +181,5 @@ def write_figure(figure: Figure, folder: Path, name: str) -> None:
     for suffix, metadata in (("png", {"Software": None}), ("pdf", {"CreationDate": None})):
         buffer = io.BytesIO()
         figure.savefig(buffer, format=suffix, metadata=metadata)
-        try:
-            write_atomically(folder / f"{name}.{suffix}", buffer.getvalue())
-        except OSError as error:
-            raise CheckpointError(f"{folder}: expected a folder that can be written, got: {error}") from error
+        write_atomically(folder / f"{name}.{suffix}", buffer.getvalue())
     print(f"written: {folder / name}.png, .pdf")
-
-
-def script(name: str, artefact: str, options: Draw) -> tuple[int, str, list[Row], list[Row]]:
-    """What every drawing script begins with: compute if that is asked for, then load.
-
-    Returns:
-        Exit code of the computation, name of the preset, rows with meshes, rows with stand-ins.
-    """
-    code = 0
-    if options.rerun:
-        code = runs.run(options, [artefact])
-        options = Draw(preset=options.preset or "quick", results=options.results)
-    return code, *load(options, name)

@@ -1,264 +1,200 @@
 """Compute the runs behind the tables and figures: `python reproduce/runs.py --preset paper`.
 
-A unit of work is one training with its evaluations (`units.py`). What is finished is never computed again; what was
-interrupted goes on; a failure is kept and shown, does not stop the rest, and is tried again next time. Results go to
-`reproduce/results/`, everything else (models, logs) to `runs/reproduce/`.
+Workers of Dask compute the units of work (`units.py`), on this machine or on a cluster. What is finished is never
+computed again; what was interrupted goes on; a failure is shown, does not stop the rest, and is tried again next time.
+Results go to `reproduce/results/`, everything else (models, logs) to `runs/reproduce/`.
 """
 
 from __future__ import annotations
 
+import contextlib
+import logging
+import os
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import pools
+import pandas as pd
 import records
-from pools import DaskPool, LocalPool, Pool
-from progress import Display
-from units import Preset, Unit, code_version, config_of, get_preset, matrix, object_source, settings_hash, unit_key
-from worker import failure, finished_record
+import tyro
+import units
+import worker
+from rich.progress import Progress, TaskID, TimeElapsedColumn
+from units import Artefact, Method, Object, Preset, PresetName, Recipe, Unit
+from worker import Files, Job
 
-from difflcs._files import write_json
+from difflcs._checks import check_positive_int
+from difflcs._files import write_atomically
 from difflcs.errors import DiffLCSError, InvalidInputError
 
-WORK = Path("runs") / "reproduce"
-_POLL_SECONDS = 0.25
-FAILED = 1
-"""Exit code where units have failed."""
+if TYPE_CHECKING:
+    from distributed import Client
 
 
 @dataclass(frozen=True)
 class Compute:
     """What to compute, and where. Without --preset and --rerun the scripts only draw what is there."""
 
-    preset: str | None = None
-    """smoke (under a minute), quick (about 15 minutes a script on 2 cores) or paper (10 seeds, 1000 goals). To draw:
+    preset: PresetName | None = None
+    """smoke (about a minute), quick (about 15 minutes a script on 2 cores) or paper (10 seeds, 1000 goals). To draw:
     the results to take, by default those of the largest preset there is."""
     seeds: int | None = None
     """Runs per method and object, with the seeds 10, 11, …; the preset's number by default."""
     goals: int | None = None
     """Goals of every evaluation; the preset's number by default."""
-    objects: tuple[str, ...] = ()
-    """Some of sugar_box, fish_can, mug, wrench, clamp, banana; all by default."""
-    methods: tuple[str, ...] = ()
-    """Some of lcs-rl, violation, ppo, pddm; all by default."""
-    recipes: tuple[str, ...] = ()
-    """Some of ours, paper; by default both on the cube and ours on the objects."""
+    objects: tuple[Object, ...] = ()
+    """All by default."""
+    methods: tuple[Method, ...] = ()
+    """All by default."""
+    recipes: tuple[Recipe, ...] = ()
+    """By default both on the cube and ours on the objects."""
     workers: int | None = None
     """Processes on this machine, one core each; the number of cores by default."""
-    dask: str | None = None
-    """local:N computes on N Dask workers on this machine."""
     scheduler: str | None = None
-    """Address of a Dask scheduler, tcp://host:port, whose workers compute."""
-    work: Path = WORK
+    """Address of a Dask scheduler, tcp://host:port, whose workers compute instead."""
+    work: Path = Path("runs") / "reproduce"
     """Folder for models, logs and checkpoints."""
     results: Path = records.RESULTS
     """Folder of results."""
-    accept_code: tuple[str, ...] = ()
-    """Versions of the code (column `code` of the results) whose finished units count as finished."""
+
+    def __post_init__(self) -> None:
+        for name in ("seeds", "goals", "workers"):
+            if getattr(self, name) is not None:
+                check_positive_int(name, getattr(self, name))
+        if self.scheduler is not None and (self.workers is not None or "://" not in self.scheduler):
+            got = f"{self.scheduler!r} and {self.workers} workers of this machine"
+            raise InvalidInputError(f"scheduler: expected an address tcp://host:port alone, got {got}")
 
 
-def make_specs(
-    units: Sequence[Unit], preset: Preset, work: Path, accept: Sequence[str] = ()
-) -> dict[Unit, dict[str, Any]]:
-    """What workers need to know of the units; `init` is filled in when the model is there.
-
-    Raises:
-        InvalidInputError: DIFFLCS_YCB_DIR is set, but a mesh is not there.
-    """
-    sources = {task: object_source(task) for task in dict.fromkeys(unit.task for unit in units)}
-    codes = {method: code_version(method) for method in dict.fromkeys(unit.method for unit in units)}
-    specs = {}
-    for unit in units:
-        code = codes[unit.method]
-        keys = [unit_key(unit, preset, sources, version) for version in (code, *accept)]
-        done = (key for key in keys if finished_record(work / key, key) is not None)
-        key = next(done, keys[0])
-        specs[unit] = {
-            "key": key,
-            "unit": asdict(unit),
-            "config": asdict(config_of(unit, preset)),
-            "settings": settings_hash(unit, preset, sources),
-            "source": sources[unit.task],
-            "code": code,
-            "init": None,
-            "folder": str((work / key).resolve()),
-        }
-    return specs
+def make_jobs(wanted: Sequence[Unit], preset: Preset, work: Path) -> list[Job]:
+    """The jobs of units, in their order."""
+    objects = {task: units.describe_object(task) for task in dict.fromkeys(unit.task for unit in wanted)}
+    stand_ins = [task for task, described in objects.items() if described["source"] == "stand_in"]
+    if stand_ins:
+        print(f"no YCB meshes of {', '.join(stand_ins)} (`difflcs assets download`): stand-ins, with results apart")
+    return [Job(unit, preset, units.key_of(unit, preset, objects), work.resolve()) for unit in wanted]
 
 
 def compute(
-    specs: Mapping[Unit, dict[str, Any]],
-    pool: Pool,
-    store: Callable[[dict[str, Any]], object],
-    display: Display | None = None,
-    observe: Callable[[Mapping[str, dict[str, Any]]], object] = lambda progress: None,
-) -> dict[Unit, dict[str, Any]]:
-    """Compute the units that are not finished, a unit after the one that it starts from.
+    jobs: Sequence[Job],
+    client: Any,
+    store: Callable[[pd.DataFrame], object],
+    show: Progress,
+    execute: Callable[[Job], tuple[pd.DataFrame, Files]] = worker.execute,
+) -> dict[Unit, str]:
+    """Compute the units that are not finished, a unit after the one that it starts from, which is among `jobs`.
 
-    Args:
-        specs: the units.
-        pool: what computes.
-        store: called with the record of every finished unit, also of those finished before.
-        display: shows what goes on.
-        observe: called with the progress of the running units, by key.
-
-    Returns:
-        The record of every unit.
-
-    Raises:
-        InvalidInputError: what a unit starts from is missing.
+    `client` is of Dask. The results of each are handed to `store` as they come. Returns which failed, and why.
     """
-    for unit in specs:
-        if unit.init is not None and unit.init not in specs:
-            raise InvalidInputError(f"units: expected {unit.init}, from which {unit} starts, among them; add it")
-    found: dict[Unit, dict[str, Any]] = {}
-    for unit, spec in specs.items():
-        record = finished_record(Path(spec["folder"]), spec["key"])
-        if record is not None:
-            found[unit] = record
-            store(record)
-    waiting = [unit for unit in specs if unit not in found]
-    running: dict[str, Unit] = {}
+    by_unit = {job.unit: job for job in jobs}
+    waiting = [job for job in jobs if job.result() is None]
+    running: dict[Any, tuple[Job, TaskID]] = {}
+    failed: dict[Unit, str] = {}
+    done = show.add_task("units", total=len(waiting))
 
-    def end(unit: Unit, record: dict[str, Any]) -> None:
-        found[unit] = record
-        if record["error"] is None:
-            path = Path(specs[unit]["folder"]) / "record.json"
-            if not path.exists():  # the worker has another disk
-                write_json(path, record)
-            store(record)
-        if display is not None:
-            display.end(unit, record)
+    def end(job: Job, outcome: str) -> None:
+        show.advance(done)
+        # Without markup: an error may hold brackets.
+        show.console.print(f"{job.unit}: {outcome}", markup=False, highlight=False, soft_wrap=True)
+
+    def fail(job: Job, error: str) -> None:
+        failed[job.unit] = error
+        end(job, f"FAILED: {error}")
 
     while waiting or running:
-        for unit in list(waiting):
-            first = found.get(unit.init) if unit.init is not None else None
-            if first is not None and first["error"] is not None:
-                waiting.remove(unit)
-                end(unit, failure(specs[unit], f"it starts from {unit.init}, which failed"))
-            elif len(running) < pool.slots and (unit.init is None or first is not None):
-                waiting.remove(unit)
-                pool.submit({**specs[unit], "init": None if first is None else first["model"]})
-                running[specs[unit]["key"]] = unit
-        for record in pool.finished():
-            end(running.pop(record["key"]), record)
-        progress = pool.progress()
-        observe(progress)
-        if display is not None:
-            display.update({unit: progress.get(key, {}) for key, unit in running.items()}, waiting, pool.slots)
-        if running:
-            time.sleep(_POLL_SECONDS)
-    return found
+        # Not more than there are threads: a worker that dies would take the blame for units that only waited there.
+        slots = max(1, sum(client.nthreads().values()))
+        for job in list(waiting):
+            first = by_unit[job.unit.init] if job.unit.init else None
+            if first is not None and first.unit in failed:
+                waiting.remove(job)
+                fail(job, f"it starts from {first.unit}, which failed")
+            elif len(running) < slots and (first is None or first.result() is not None):
+                waiting.remove(job)
+                ready = job if first is None else replace(job, init=worker.read_files(first.folder / "run"))
+                # A closure is pickled by value, with all it refers to: workers need not have this folder.
+                future = client.submit(lambda ready=ready: execute(ready), pure=False)
+                running[future] = job, show.add_task(str(job.unit), total=None)
+        time.sleep(0.1)
+        for future in [future for future in running if future.done()]:
+            job, bar = running.pop(future)
+            show.remove_task(bar)
+            try:
+                rows, files = future.result()
+            except Exception as error:  # whatever a unit, its worker or Dask may raise
+                write_atomically(job.folder / "error.txt", traceback.format_exc().encode())
+                fail(job, f"{type(error).__name__}: {error}")
+                continue
+            if job.result() is None:  # the worker has another disk
+                worker.write_files(job.folder / "run", files)
+                job.keep(rows)
+            store(rows)
+            end(job, f"{100 * rows.success.iloc[-1]:.1f} % of {rows.goals.iloc[-1]} goals")
+    return failed
 
 
-def make_pool(options: Compute) -> Pool:
-    """The pool that the options ask for.
+@contextlib.contextmanager
+def connect(workers: int | None = None, scheduler: str | None = None) -> Iterator[Client]:
+    """A client of a scheduler, or of worker processes on this machine, which end with this one however that ends.
 
-    Raises:
-        InvalidInputError: two kinds are asked for, or an address makes no sense.
-        SchedulerError: the scheduler does not answer.
+    A unit whose worker dies goes on from its last checkpoint, as often as Dask allows (`allowed-failures`, 3).
     """
-    if options.dask is not None and options.scheduler is not None:
-        raise InvalidInputError(
-            "expected --dask or --scheduler, got both; --scheduler uses a cluster that runs already"
-        )
-    if options.dask is not None and not options.dask.startswith("local:"):
-        raise InvalidInputError(f"dask: expected local:N, got {options.dask!r}; an address goes to --scheduler")
-    address = options.dask or options.scheduler
-    return LocalPool(options.workers) if address is None else DaskPool(address)
+    import cloudpickle
+    from distributed import Client, LocalCluster
+
+    for module in (sys.modules[__name__], records, units, worker):
+        cloudpickle.register_pickle_by_value(module)
+    with contextlib.ExitStack() as held:
+        address: Any = scheduler
+        if address is None:
+            options: Any = {"memory_limit": None, "dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
+            count = workers or len(os.sched_getaffinity(0))
+            address = held.enter_context(LocalCluster(n_workers=count, threads_per_worker=1, **options))
+        yield held.enter_context(Client(address))
 
 
 def run(options: Compute, artefacts: Sequence[str]) -> int:
-    """Compute what artefacts need.
-
-    Args:
-        options: what, how much and where.
-        artefacts: some of `units.ARTEFACTS`; none for all.
-
-    Returns:
-        Exit code: 0, or 1 if units have failed.
-
-    Raises:
-        DiffLCSError: an option cannot be used, or results in the folder are of another version. Nothing was changed.
-    """
-    preset = get_preset(options.preset or "quick", options.seeds, options.goals)
-    units = matrix(artefacts, preset.seeds, options.objects, options.methods, options.recipes)
+    """Compute what artefacts (none: all) need; returns the exit code, 1 if units have failed."""
+    preset = units.PRESETS[options.preset or "quick"]
+    preset = replace(preset, seeds=options.seeds or preset.seeds, goals=options.goals or preset.goals)
+    wanted = units.matrix(artefacts, preset.seeds, options.objects, options.methods, options.recipes)
     for stand_in in (False, True):
         records.read(records.path_of(options.results, preset.name, stand_in))  # an error now, not after hours
-    specs = make_specs(units, preset, options.work, options.accept_code)
-    stand_ins = sorted({unit.task for unit in units if specs[unit]["source"]["source"] == "stand_in"})
-    if stand_ins:
-        print(
-            f"no meshes of {', '.join(stand_ins)}: computing with stand-ins, whose results are kept apart. For the YCB "
-            f"objects set DIFFLCS_YCB_DIR, or run `difflcs assets download`"
-        )
-    done = sum(finished_record(Path(spec["folder"]), spec["key"]) is not None for spec in specs.values())
+    jobs = make_jobs(wanted, preset, options.work)
+    finished = [rows for job in jobs if (rows := job.result()) is not None]
+    store = partial(records.add, options.results, preset.name)
+    for rows in finished:
+        store(rows)
     print(
-        f"{preset.name}: {len(units)} units of {preset.evaluate_at[-1]:g} minutes of data, {preset.seeds} seeds, "
-        f"{preset.goals} goals; {done} finished before"
+        f"{preset.name}: {len(jobs)} units of {preset.evaluate_at[-1]:g} minutes of data, {preset.seeds} seeds, "
+        f"{preset.goals} goals; {len(finished)} finished before"
     )
-    store = lambda record: records.add(options.results, preset.name, records.rows_of(record))  # noqa: E731
-    if done == len(units):
-        found = compute(specs, _NoPool(), store)
-    else:
-        pool = make_pool(options)
-        try:
-            with Display(len(units) - done, preset.evaluate_at[-1]) as display:
-                found = compute(specs, pool, store, display)
-        finally:
-            pool.close()
-    failed = {unit: record for unit, record in found.items() if record["error"] is not None}
-    for unit, record in failed.items():
-        print(f"failed: {unit}: {record['error']}\n        its files: {specs[unit]['folder']}")
+    if len(finished) == len(jobs):
+        return 0
+    columns = (*Progress.get_default_columns(), TimeElapsedColumn())
+    bars = Progress(*columns, disable=not sys.stdout.isatty())  # the lines of units that have ended are printed anyway
+    with connect(options.workers, options.scheduler) as client, bars:
+        failed = compute(jobs, client, store, bars)
+    for job in jobs:
+        if job.unit in failed:
+            print(f"failed: {job.unit}: {failed[job.unit]}\n        its files: {job.folder}")
     if failed:
-        print(
-            f"{len(failed)} of {len(units)} units failed; the same command tries them again and computes nothing else"
-        )
-    return FAILED if failed else 0
-
-
-class _NoPool:
-    """Where nothing is left to compute."""
-
-    slots = 0
-
-    def submit(self, spec: pools.Spec) -> None:
-        """See `Pool`."""
-
-    def finished(self) -> list[dict[str, Any]]:
-        """See `Pool`."""
-        return []
-
-    def progress(self) -> Mapping[str, dict[str, Any]]:
-        """See `Pool`."""
-        return {}
-
-    def close(self) -> None:
-        """See `Pool`."""
+        print(f"{len(failed)} of {len(jobs)} units failed; the same command tries them again and computes nothing else")
+    return 1 if failed else 0
 
 
 def command_line(kind: type[Any], action: Callable[[Any], int], arguments: Sequence[str] | None = None) -> int:
-    """Run a script's `action` with the options that its command line gives.
-
-    Args:
-        kind: dataclass of the options.
-        action: what the script does; returns the exit code.
-        arguments: words of the command line; those of the process if None.
-
-    Returns:
-        The exit code: that of the action, 2 after an error of ours, 130 after Ctrl-C.
-    """
-    import tyro
-
+    """Run a script with its options, a dataclass: its exit code, 2 after an error of the user, 130 after Ctrl-C."""
     from difflcs_envs import DifflcsEnvsError
 
     try:
         return action(tyro.cli(kind, args=arguments, config=(tyro.conf.FlagCreatePairsOff,)))
-    except (DiffLCSError, DifflcsEnvsError) as error:
+    except (DiffLCSError, DifflcsEnvsError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -270,14 +206,9 @@ def command_line(kind: type[Any], action: Callable[[Any], int], arguments: Seque
 class Runs(Compute):
     """Compute runs for tables and figures. Interrupt it at any time; the same command goes on."""
 
-    artefacts: tuple[str, ...] = ()
-    """Some of table1, curves, transfer; all by default."""
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
-    return command_line(Runs, lambda options: run(options, options.artefacts), arguments)
+    artefacts: tuple[Artefact, ...] = ()
+    """All by default."""
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(command_line(Runs, lambda options: run(options, options.artefacts)))

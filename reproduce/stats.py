@@ -1,75 +1,56 @@
-"""Statistics over seeds: mean, standard deviation, t-interval, paired comparison."""
+"""Intervals of 95 % that stay within 0 and 100 %, over goals, seeds and objects.
 
-from __future__ import annotations
+Over seeds and objects it is the stratified bootstrap of Agarwal et al. (Deep reinforcement learning at the edge of the
+statistical precipice, 2021): seeds are drawn anew within each object. Their package rliable draws from NumPy's global
+generator whatever generator it is given, and fails to import with pandas 3; SciPy's bootstrap does the same.
+"""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import t as student_t
-
-from difflcs.errors import ShapeError
+from scipy import stats
 
 
-@dataclass(frozen=True)
-class Summary:
-    """What several seeds say about one number.
+class Estimate(NamedTuple):
+    """A number and its interval; NaN where one seed says nothing about others."""
 
-    Attributes:
-        n: seeds.
-        mean: their mean.
-        sd: their standard deviation (n − 1); NaN for one seed.
-        low: lower end of the 95 % t-interval of the mean; NaN for one seed.
-        high: its upper end.
-    """
-
-    n: int
-    mean: float
-    sd: float
-    low: float
-    high: float
+    value: float
+    low: float = math.nan
+    high: float = math.nan
 
 
-def summarise(values: Sequence[float], confidence: float = 0.95) -> Summary:
-    """Mean, standard deviation and t-interval: mean ± t(n − 1)·sd/√n."""
-    n, mean = len(values), float(np.mean(values))
-    if n < 2:
-        return Summary(n, mean, math.nan, math.nan, math.nan)
-    sd = float(np.std(values, ddof=1))
-    half = float(student_t.ppf(0.5 + confidence / 2, n - 1)) * sd / math.sqrt(n)
-    return Summary(n, mean, sd, mean - half, mean + half)
+def wilson(success: float, goals: int) -> Estimate:
+    """Success [%] of one run, with Wilson's interval: what other goals would have given."""
+    interval = stats.binomtest(round(success / 100 * goals), goals).proportion_ci(method="wilson")
+    return Estimate(success, 100 * interval.low, 100 * interval.high)
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Paired t-test of a − b over seeds.
-
-    Attributes:
-        difference: the differences, summarised.
-        p: two-sided p-value; NaN for one seed.
-    """
-
-    difference: Summary
-    p: float
+IQM = partial(stats.trim_mean, proportiontocut=0.25)
+"""Interquartile mean: of the middle half, which one failed or lucky run does not move."""
 
 
-def compare(a: Sequence[float], b: Sequence[float]) -> Comparison:
-    """Compare two methods that were run with the same seeds.
+def bootstrap(strata: Sequence[Sequence[float]], statistic: Callable[..., np.ndarray] = np.mean) -> Estimate:
+    """A statistic over all values, one per seed of each object, and what other seeds would have given."""
+    value = float(statistic(np.concatenate(strata), axis=-1))
+    if min(map(len, strata)) < 2:
+        return Estimate(value)
+    interval = stats.bootstrap(
+        tuple(map(np.asarray, strata)),
+        lambda *samples, axis: statistic(np.concatenate(samples, axis), axis=axis),
+        n_resamples=5000,
+        method="percentile",
+        rng=np.random.default_rng(0),  # the same numbers give the same files
+    ).confidence_interval
+    return Estimate(value, float(interval.low), float(interval.high))
 
-    Args:
-        a: one number per seed.
-        b: those of the other method, in the same order.
 
-    Raises:
-        ShapeError: they are not as many.
-    """
-    if len(a) != len(b):
-        raise ShapeError(f"b: expected as many seeds as a, {len(a)}, got {len(b)}; pair them by seed")
-    difference = summarise(np.subtract(a, b).tolist())
-    if difference.n < 2:
-        return Comparison(difference, math.nan)
-    if difference.sd == 0:  # every seed differs by the same
-        return Comparison(difference, 1.0 if difference.mean == 0 else 0.0)
-    t = difference.mean / (difference.sd / math.sqrt(difference.n))
-    return Comparison(difference, 2 * float(student_t.sf(abs(t), difference.n - 1)))
+def p_value(differences: Sequence[float]) -> float:
+    """Two-sided p of the paired t-test; NaN for one seed."""
+    rounded = np.round(differences, 6)  # or it would test rounding
+    if len(rounded) < 2 or np.ptp(rounded) == 0:  # every seed differs by the same
+        return math.nan if len(rounded) < 2 else float(rounded[0] == 0)
+    test: Any = stats.ttest_1samp(rounded, 0.0)
+    return float(test.pvalue)

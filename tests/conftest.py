@@ -1,11 +1,18 @@
-"""Shared builders of small models, as fixtures."""
+"""Shared builders of small models, as fixtures; and how many threads the tests may use."""
 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any
+
+# With several workers of pytest-xdist at once, each takes its share of the cores: torch's number of threads is also
+# that of the kernels, of diffcp and of the processes that a test starts. Tests about threads say themselves how many
+# they want. It has to be said before NumPy and torch are loaded.
+if workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):
+    for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(variable, str(max(1, (os.cpu_count() or 1) // workers)))
 
 import numpy as np
 import pytest
@@ -141,63 +148,103 @@ def _values(value: object, path: tuple = ()) -> Iterator[tuple]:
         yield from _values(part, (*path, key))
 
 
-def _hostile(checkpoint: Any) -> Iterator[tuple[bool, Any]]:
-    """Checkpoints with one thing wrong; whether it is a tensor, which must be noticed."""
-    state = json.loads(json.dumps(checkpoint.state))
-    for path in list(_values(state))[1:]:
-        for value in (
-            None,
-            True,
-            -1,
-            1.5,
-            10**30,
-            -(10**30),
-            "x",
-            [],
-            [-1],
-            [True],
-            ["x"],
-            [10**30],
-            {},
-            {"state": {}},
-        ):
-            changed = json.loads(json.dumps(state))
-            part = changed
-            for key in path[:-1]:
-                part = part[key]
-            part[path[-1]] = value
-            yield False, replace(checkpoint, state=changed)
-    for name, tensor in checkpoint.tensors.items():
-        rest = {k: v for k, v in checkpoint.tensors.items() if k != name}
-        others = [tensor.to(torch.complex64), tensor.to(torch.int64), tensor.unsqueeze(0), tensor.unsqueeze(-1)]
-        if tensor.ndim:
-            others += [torch.cat([tensor, tensor[:1]])] if len(tensor) else []
-            others += [tensor[:0]] if len(tensor) else []
-        for other in others:
-            yield True, replace(checkpoint, tensors={**rest, name: other})
-        yield True, replace(checkpoint, tensors=rest)
-    yield True, replace(checkpoint, tensors={**checkpoint.tensors, "another": torch.zeros(1)})
+_WRONG_VALUES = (
+    None,
+    True,
+    -1,
+    1.5,
+    10**30,
+    -(10**30),
+    "x",
+    [],
+    [-1],
+    [True],
+    ["x"],
+    [10**30],
+    {},
+    {"state": {}},
+)
+
+
+def _wrong_tensors(tensor: Tensor) -> Iterator[Tensor]:
+    """Tensors of another type, shape or length, or with NaN."""
+    yield from (tensor.to(dtype) for dtype in (torch.complex64, torch.int64, torch.float16) if dtype != tensor.dtype)
+    yield from (tensor.unsqueeze(0), tensor.unsqueeze(-1))
+    if tensor.ndim and len(tensor):
+        yield from (torch.cat([tensor, tensor[:1]]), tensor[:0])
+    if tensor.is_floating_point() and tensor.numel():
+        broken = tensor.clone()
+        broken.view(-1)[-1] = torch.nan
+        yield broken
+
+
+def _hostile(state: Any) -> Iterator[tuple[bool, Any]]:
+    """States with one thing wrong; whether it is a tensor, which must be noticed."""
+    from difflcs.rl.state import flatten, unflatten
+
+    tensors, rest = flatten(state)
+
+    def changed(path: tuple, change: Callable[[Any, Any], None]) -> Any:
+        copy = json.loads(json.dumps(rest))
+        part = copy
+        for key in path[:-1]:
+            part = part[key]
+        change(part, path[-1])
+        return unflatten(tensors, copy)
+
+    for path in list(_values(rest))[1:]:
+        for value in _WRONG_VALUES:
+            yield False, changed(path, lambda part, key, value=value: part.__setitem__(key, value))
+        yield False, changed(path, lambda part, key: part.pop(key))
+        yield False, changed((*path[:-1], "another"), lambda part, key: part.__setitem__(key, 1))
+    for name, tensor in tensors.items():
+        others = {path: value for path, value in tensors.items() if path != name}
+        for wrong in _wrong_tensors(tensor):
+            yield True, unflatten({**others, name: wrong}, rest)
+        yield True, unflatten(others, rest)
+        yield True, unflatten({**tensors, f"{name}x": torch.zeros(1)}, rest)
+    yield True, unflatten({**tensors, "another": torch.zeros(1)}, rest)
+    yield True, unflatten({**tensors, "nowhere/another": torch.zeros(1)}, rest)
+
+
+def _same_state(a: Any, b: Any) -> bool:
+    """Whether two states are the same to the bit."""
+    from difflcs.rl.state import flatten
+
+    (tensors, rest), (others, other_rest) = flatten(a), flatten(b)
+    alike = tensors.keys() == others.keys() and rest == other_rest
+    return alike and all(v.dtype == others[name].dtype and torch.equal(v, others[name]) for name, v in tensors.items())
 
 
 @pytest.fixture(scope="session")
 def refuses_hostile_checkpoints() -> Callable[[Any], None]:
-    """A check: after one step, a trainer restores itself, and refuses checkpoints with anything wrong."""
+    """A check: after one step, a trainer loads its own state, and refuses states with anything wrong.
+
+    A refusal changes nothing. What is accepted is taken as it is: a number that could have been written, such as
+    another step size, or one that is equal to its own. A wrong tensor is never accepted.
+    """
     from difflcs.errors import CheckpointError
+    from difflcs.rl.state import copy_state
 
     def check(trainer: Any) -> None:
         trainer.step()
-        whole = trainer.checkpoint()
-        tensors = {name: value.clone() for name, value in whole.tensors.items()}
-        whole = replace(whole, tensors=tensors)
-        for is_tensor, checkpoint in _hostile(whole):
-            try:
-                trainer.restore(checkpoint)
-            except CheckpointError as error:
-                message = str(error)
-            else:
-                message = ""
-            assert message or not is_tensor
-        trainer.restore(whole)
+        whole = copy_state(trainer.state_dict())
         trainer.step()
+        following = copy_state(trainer.state_dict())
+        assert not _same_state(whole, following)
+        trainer.load(whole)
+        assert _same_state(trainer.state_dict(), whole)
+        for is_tensor, state in _hostile(whole):
+            try:
+                trainer.load(state)
+            except CheckpointError:
+                pass
+            else:
+                assert not is_tensor
+                assert _same_state(trainer.state_dict(), state)
+                trainer.load(whole)
+            assert _same_state(trainer.state_dict(), whole)
+        trainer.step()  # by what a state does not hold, too, nothing has changed
+        assert _same_state(trainer.state_dict(), following)
 
     return check

@@ -81,15 +81,15 @@ class RewardScale:
     def __init__(self, cost_limit: float, failure_penalty: float, factor: float):
         self.cost_limit, self.failure_penalty, self.factor = cost_limit, failure_penalty, factor
 
-    def __call__(self, rewards: Tensor) -> Tensor:
-        """(N, T, ...) → (N, T, ...).
+    def __call__(self, rewards: Tensor, success: Tensor) -> Tensor:
+        """Rewards (N, T, ...) and successes of the last step (N, ...) bool → (N, T, ...).
 
         Raises:
             InvalidInputError: rewards that are not finite.
         """
-        limit = torch.full((rewards.shape[1],), -self.cost_limit, dtype=rewards.dtype)
-        limit[-1] -= self.failure_penalty
-        rewards = torch.maximum(rewards, limit.view(-1, *[1] * (rewards.ndim - 2)))
+        limit = torch.full_like(rewards, -self.cost_limit)
+        limit[:, -1] -= self.failure_penalty * (~success).to(rewards.dtype)
+        rewards = torch.maximum(rewards, limit)
         if not bool(torch.isfinite(rewards).all()):
             raise InvalidInputError("env: expected finite rewards, got NaN or infinity; mend the environment's reward")
         return self.factor * rewards
@@ -173,8 +173,8 @@ class GAEAdvantages:
 class Foreseeing(Protocol):
     """What can tell what other actions would have led to: see `difflcs.rl.model_rollouts.ModelEnv.foresee`."""
 
-    def foresee(self, states: Tensor, actions: Tensor, goals: Tensor) -> tuple[Tensor, Tensor]:
-        """States (N, T, n_x), actions (N, T, M, n_u), goals → next states (N, T, M, n_x), rewards (N, T, M)."""
+    def foresee(self, states: Tensor, actions: Tensor, goals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """States (N, T, n_x), actions (N, T, M, n_u), goals → next states, rewards and successes (N, T, M, ·)."""
         ...
 
 
@@ -211,12 +211,12 @@ class MultiActionAdvantages:
         with seeded(key):
             judged = mirrored_actions(episodes["policy"], self.actions)
         executed = torch.clamp(judged["action"], *self.bounds)
-        after, seen = self.env.foresee(episodes["state"][:, :-1], executed, episodes["goal"])
+        after, seen, success = self.env.foresee(episodes["state"][:, :-1], executed, episodes["goal"])
         goals = episodes["goal"][:, None, None].expand(*after.shape[:-1], -1)
         elapsed = elapsed_fractions(after.shape[1])[1:, None].expand(after.shape[:-1])
         values = self.critic.values(self.features(after, goals, elapsed))
         values[:, -1] = 0  # an episode has ended
-        q = self.scale(seen) + self.critic.gamma * values
+        q = self.scale(seen, success[:, -1]) + self.critic.gamma * values
         judged["advantage"] = multi_action_advantages(q, now, self.critic.gamma, self.zeta).unsqueeze(-1)
         return Estimate(judged, now, rewards - action_advantage(q))
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LinearLR
 
+from difflcs.errors import CheckpointError
 from difflcs.rl.advantages import gae, returns
 from difflcs.rl.seeding import seeded
 from difflcs.rl.settings import MOST_WIDTH, Epochs, Settings, bounded, group
@@ -124,9 +125,19 @@ class Critic:
         }
 
     def load_state_dict(self, state: State) -> None:
-        """Go on from what `state_dict` gave."""
+        """Go on from what `state_dict` gave.
+
+        Raises:
+            CheckpointError: iterations that are not numbered from the oldest one, or more than are kept.
+        """
+        episodes = state["episodes"]
+        ages, counts = torch.unique_consecutive(episodes["iteration"], return_counts=True)
+        if not torch.equal(ages, torch.arange(len(ages))) or len(ages) > self.settings.iterations:
+            raise CheckpointError(
+                f"checkpoint: expected at most {self.settings.iterations} iterations of episodes, numbered from 0, got "
+                f"{ages[:9].tolist()}; is it damaged?"
+            )
         self.network.load_state_dict(state["network"])
         load_moments(self._adam, state["adam"])
-        episodes = state["episodes"]
-        sizes = torch.unique_consecutive(episodes["iteration"], return_counts=True)[1].tolist()
+        sizes = counts.tolist()
         self.history = list(zip(episodes["inputs"].split(sizes), episodes["rewards"].split(sizes), strict=True))

@@ -137,7 +137,7 @@ class ModelEnv(VectorEnv):
         self._state, self._step = after, self._step + 1
         return self._observe(), reward.numpy(), nothing, ended, {"success": success.numpy()}
 
-    def foresee(self, states: Tensor, actions: Tensor, goals: Tensor) -> tuple[Tensor, Tensor]:
+    def foresee(self, states: Tensor, actions: Tensor, goals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """What other actions would have led to in the episodes just played, by the networks that played them.
 
         Args:
@@ -146,15 +146,15 @@ class ModelEnv(VectorEnv):
             goals: (num_envs, n_goal).
 
         Returns:
-            Next states (num_envs, T, M, n_x) and rewards (num_envs, T, M).
+            Next states (num_envs, T, M, n_x), rewards and successes (num_envs, T, M).
         """
         shape = actions.shape[:-1]
         before, goals = (v.expand(*shape, -1).flatten(0, 2) for v in (states.unsqueeze(2), goals[:, None, None]))
         actions, networks = actions.flatten(0, 2), self._networks.T.unsqueeze(2).expand(shape).flatten()
         ended = (torch.arange(1, shape[1] + 1) == self.episode_steps).view(1, -1, 1).expand(shape).flatten()
         after = self._predict(before, actions, networks)
-        reward, _ = self.outcome(before, actions, after, goals, ended)
-        return after.view(*shape, -1), reward.view(shape)
+        reward, success = self.outcome(before, actions, after, goals, ended)
+        return after.view(*shape, -1), reward.view(shape), success.view(shape)
 
     def _predict(self, states: Tensor, actions: Tensor, networks: Tensor) -> Tensor:
         """States (B, n_x), actions (B, n_u), numbers of networks (B,) → next states (B, n_x) within the range."""

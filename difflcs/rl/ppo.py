@@ -290,7 +290,7 @@ class PPO(Trainer):
 
         episodes, physics_seconds, solve_seconds = self._collect(source.env, seeds, key(Stream.NOISE), after_step)
         stable = cast("TensorDict", episodes[episodes["stable"]])
-        rewards = self.scale(stable["reward"])
+        rewards = self.scale(stable["reward"], stable["success"])
         start = time.perf_counter()
         inputs, sums = self._inputs(stable), returns(rewards, self.critic.gamma)
         self.critic.begin(inputs, rewards, key(Stream.VALUE))

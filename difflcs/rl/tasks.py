@@ -94,6 +94,7 @@ class TaskSpec:
         errors: names and units of what remains to the goal, as the environment's info calls them: with `_error` at the
             end.
         caption: the info of a step → what a picture says of it; None: the errors.
+        picture: keyword arguments that the environment takes for pictures to be looked at, such as their size.
         example_goals: goals to show what was learned, the best one first.
         describe: environment (single or vector) → what decides whether results can be compared, in JSON types, such as
             the object and its mass. A resumed run must find the same.
@@ -123,6 +124,7 @@ class TaskSpec:
     goal: tuple[Quantity, ...] = ()
     errors: tuple[Quantity, ...] = ()
     caption: Callable[[Mapping[str, Any]], str] | None = None
+    picture: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}), hash=False)
     example_goals: tuple[tuple[float, ...], ...] = ()
     describe: Callable[[Any], Mapping[str, Any]] = lambda env: {}
     requires: tuple[str, ...] = ()
@@ -281,11 +283,13 @@ def register_task(spec: TaskSpec) -> TaskSpec:
 
 @functools.cache
 def _load_entry_points() -> None:
+    own = dict(_REGISTRY)  # registered in this program: what is installed does not replace it
     for entry in metadata.entry_points(group=ENTRY_POINTS):
         try:
             entry.load()()
         except Exception as error:  # a broken package of others must not take the rest with it
             _FAILED[f"{entry.name} = {entry.value}"] = f"{type(error).__name__}: {error}"
+    _REGISTRY.update(own)
 
 
 def task_names() -> tuple[str, ...]:

@@ -117,6 +117,7 @@ def trifinger_task(
         goal=(Quantity("x", "m"), Quantity("y", "m"), Quantity("yaw", "rad")),
         errors=(Quantity("position_error", "m"), Quantity("yaw_error", "rad")),
         caption=caption,
+        picture={"width": 640, "height": 480},
         example_goals=goals,
         describe=describe,
         requires=("mujoco",),

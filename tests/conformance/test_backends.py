@@ -181,6 +181,10 @@ PROBLEMS = {
 every_problem = pytest.mark.parametrize("name", PROBLEMS)
 every_backend = pytest.mark.parametrize("backend", BACKENDS)
 every_exact = pytest.mark.parametrize("backend", EXACT)
+# 34 copies of every problem: seconds for a solver that takes milliseconds for one.
+every_exact_on_copies = pytest.mark.parametrize(
+    "backend", [pytest.param(name, marks=[pytest.mark.slow] * (name == "ipopt")) for name in EXACT]
+)
 
 
 @pytest.fixture(scope="module")
@@ -555,7 +559,7 @@ def moves(build, solutions):
 
 
 @every_problem
-@every_exact
+@every_exact_on_copies
 def test_a_warm_start_next_to_a_solution_is_solved(moves, name, backend):
     """Where nearly nothing is left to gain, rounding must not be taken for a failure."""
     _, _, moved = moves(name, backend)
@@ -563,7 +567,7 @@ def test_a_warm_start_next_to_a_solution_is_solved(moves, name, backend):
 
 
 @every_problem
-@every_exact
+@every_exact_on_copies
 def test_gradient_of_every_input_matches_central_differences(build, solutions, moves, name, backend):
     """All inputs at once: their perturbed copies are one large batch of problems."""
     problem, base = solutions(name, backend)

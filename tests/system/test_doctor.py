@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
+from importlib import metadata
 
 import pytest
 
 from difflcs import available_backends, cli, doctor
-from difflcs._native import _kernels
 
 OPTIONAL = (
     "gymnasium", "mujoco", "torchrl", "tensordict", "tensorboard", "tqdm", "tyro", "cvxpy", "cvxpylayers", "trimesh",
@@ -26,10 +27,24 @@ def by_name(checks):
     return {check.name: check for check in checks}
 
 
+@pytest.fixture
+def versions(monkeypatch):
+    """Other versions of packages than those installed; None is missing."""
+    found, changed = metadata.version, {}
+
+    def version(package):
+        if changed.get(package, "") is None:
+            raise metadata.PackageNotFoundError(package)
+        return changed.get(package) or found(package)
+
+    monkeypatch.setattr(metadata, "version", version)
+    return changed
+
+
 def test_this_machine(checks):
     found = by_name(checks)
     assert doctor.healthy(checks)
-    assert _kernels.isa() in found["kernels"].text
+    assert re.search(r"instruction set (baseline|avx2|avx512) ", found["kernels"].text)
     assert all(found[name].status == "ok" for name in ("packages", "kernels", "files", "zoo", "batched", "ipopt"))
     assert set(available_backends()) <= set(found)
     assert {check.status for check in checks} <= {"ok", "missing", "failed"}
@@ -60,12 +75,12 @@ def test_text_and_json(checks, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("error", [RuntimeError("no such instruction set"), ImportError("libc"), ValueError()])
-def test_a_broken_core_is_exit_code_1(capsys, monkeypatch, error):
-    def fail():
+def test_a_broken_core_is_exit_code_1(capsys, monkeypatch, versions, error):
+    def fail(*_):
         raise error
 
-    monkeypatch.setitem(doctor._LIBRARY, "kernels", fail)
-    monkeypatch.setattr(doctor, "_environments", list)
+    versions.update(mujoco=None)  # the environments are not tried
+    monkeypatch.setattr(doctor, "solve_lcp", fail)
     assert cli.main(["doctor"]) == 1
     text = capsys.readouterr().out
     assert "!!  kernels" in text
@@ -73,44 +88,60 @@ def test_a_broken_core_is_exit_code_1(capsys, monkeypatch, error):
     assert str(error) in text
 
 
-def test_missing_extras_are_no_failure_and_say_what_to_install(monkeypatch):
-    monkeypatch.setattr(doctor, "_version", lambda _: None)
-    found = by_name([doctor._check("extras", "rl", lambda: doctor._extra("rl")), *doctor._environments()])
+def test_missing_extras_are_no_failure_and_say_what_to_install(versions):
+    versions.update(dict.fromkeys(("torchrl", "gymnasium", "mujoco", "imageio-ffmpeg")))
+    found = by_name(doctor.examine(("extras", "environments")))
     for name, extra in (("rl", "rl"), ("simulation", "envs"), ("pictures", "envs"), ("video", "viz")):
         assert (found[name].status, found[name].remedy) == ("missing", f'pip install "difflcs[{extra}]"')
     assert "torchrl" in found["rl"].text
     assert doctor.healthy(list(found.values()))
 
 
-def test_a_package_that_is_too_old_is_named(monkeypatch):
-    monkeypatch.setattr(doctor, "_version", lambda package: "0.1.5")
-    with pytest.raises(doctor._MissingError, match=r"torchrl >= [\d.]+ \(found 0\.1\.5\)"):
-        doctor._extra("rl")
-    assert doctor._release("2.13.0+cpu") > doctor._release("2.4")
+@pytest.mark.parametrize(("version", "status"), [("0.1.5", "missing"), ("0.13.0+cpu", "ok")])
+def test_a_package_that_is_too_old_is_named(versions, version, status):
+    """By numbers, not by letters: 0.13 is newer than 0.9."""
+    versions.update(torchrl=version)
+    check = by_name(doctor.examine(["extras"]))["rl"]
+    assert check.status == status
+    assert bool(re.search(r"torchrl >= 0\.9 \(found 0\.1\.5\)", check.text)) == (status == "missing")
 
 
 @pytest.mark.parametrize(
-    ("state", "status", "words"),
+    ("lacking", "chosen", "status", "words"),
     [
-        ({"mug": True, "clamp": True}, "ok", "all 2"),
-        ({"mug": True, "clamp": False}, "missing", "stand-ins for clamp"),
-        ({"mug": True, "clamp": None}, "missing", "lacks clamp"),
+        ((), True, "ok", "all 8 in DIFFLCS_YCB_DIR={}"),
+        (("clamp",), False, "missing", "stand-ins for clamp"),
+        (("clamp",), True, "missing", "DIFFLCS_YCB_DIR={} lacks clamp"),
     ],
 )
-def test_meshes(state, status, words):
-    check = doctor._check("environments", "YCB meshes", lambda: doctor._meshes(state, "FOLDER"))
+def test_meshes(tmp_path, monkeypatch, lacking, chosen, status, words):
+    """In the folder that the user has chosen, or where downloads go."""
+    ycb = pytest.importorskip("difflcs_envs.ycb")
+    folder = tmp_path if chosen else tmp_path / "ycb"
+    for name in set(ycb.YCB) - set(lacking):
+        mesh = folder / ycb.YCB[name].code / "google_16k" / "nontextured.stl"
+        mesh.parent.mkdir(parents=True)
+        mesh.touch()
+    monkeypatch.setenv("DIFFLCS_CACHE_DIR", str(tmp_path))
+    monkeypatch.delenv("DIFFLCS_YCB_DIR", raising=False)
+    if chosen:
+        monkeypatch.setenv("DIFFLCS_YCB_DIR", str(folder))
+    check = by_name(doctor.examine(["environments"]))["YCB meshes"]
     assert check.status == status
-    assert words in check.text
+    assert words.format(folder) in check.text
     assert ("difflcs assets download clamp" in check.remedy) == (status == "missing")
 
 
-def test_a_crash_or_a_hang_in_the_other_process_is_reported(monkeypatch):
+@pytest.mark.parametrize("code", ["import os; os.abort()", "import time; time.sleep(60)"])
+def test_a_crash_or_a_hang_in_the_other_process_is_reported(tmp_path, monkeypatch, code):
     pytest.importorskip("mujoco")
-    crash = doctor._check("environments", "pictures", lambda: str(doctor._in_process("import os; os.abort()")))
-    assert crash.status == "failed"
-    monkeypatch.setattr(doctor, "_TIMEOUT", 0.2)
-    hang = doctor._check("environments", "pictures", lambda: str(doctor._in_process("import time; time.sleep(60)")))
-    assert (hang.status, hang.text) == ("failed", "no answer within 0.2 s")
+    (tmp_path / "gymnasium.py").write_text(code)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(doctor, "TIMEOUT", 0.5 if "sleep" in code else 60.0)
+    said = "no answer within 0.5 s" if "sleep" in code else "the process ended with code -6"
+    found = by_name(doctor.examine(["environments"]))
+    for name in ("simulation", "pictures"):
+        assert (found[name].status, found[name].text) == ("failed", said)
 
 
 def test_it_works_with_nothing_but_the_hard_dependencies():
@@ -125,8 +156,11 @@ class Finder:
     def find_spec(name, path=None, target=None):
         return None if name.partition(".")[0] in hidden else find(name, path, target)
 sys.meta_path[:] = [Finder if f is importlib.machinery.PathFinder else f for f in sys.meta_path]
-from difflcs import doctor, __main__
-doctor._version = lambda package: None
+from importlib import metadata
+def version(package):
+    raise metadata.PackageNotFoundError(package)
+metadata.version = version
+from difflcs import __main__
 assert __main__.main(["train"]) == 2
 sys.exit(__main__.main(["doctor", "--json"]))
 """

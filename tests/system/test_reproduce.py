@@ -1,45 +1,55 @@
 """The scripts of reproduce/, from outside; they are no package, so that they are imported as their own scripts do."""
 
 import contextlib
+import io
 import json
 import math
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 import torch
 
-for package in ("distributed", "matplotlib", "mujoco", "rich", "scipy", "tensorboard", "tyro"):
+for package in ("distributed", "matplotlib", "mujoco", "pandas", "rich", "scipy", "tensorboard", "tyro"):
     pytest.importorskip(package, reason="the extra [reproduce] is not installed")
 FOLDER = Path(__file__).parents[2] / "reproduce"
 sys.path.insert(0, str(FOLDER))
 
+import dask  # noqa: E402
+import distributed  # noqa: E402
 import fig_learning_curves  # noqa: E402
 import fig_task  # noqa: E402
 import fig_transfer  # noqa: E402
-import pools  # noqa: E402
 import records  # noqa: E402
 import report  # noqa: E402
 import runs  # noqa: E402
+import stats  # noqa: E402
 import table1  # noqa: E402
 import units  # noqa: E402
 import worker  # noqa: E402
-from paper import TABLE1  # noqa: E402
-from stats import compare, summarise  # noqa: E402
+from rich.console import Console  # noqa: E402
+from rich.progress import Progress  # noqa: E402
 from units import OBJECTS, Preset, Unit  # noqa: E402
 
-from difflcs.errors import DiffLCSError, InvalidInputError, ShapeError  # noqa: E402
+from difflcs.errors import CheckpointError, InvalidInputError  # noqa: E402
+from difflcs.rl import TrainConfig, get_method, wilson_interval  # noqa: E402
 
 TINY = Preset("smoke", seeds=1, goals=2, evaluate_at=(0.2, 0.5), smoke=True)
 FIRST = units.FIRST_SEED
 CUBE = Unit("cube", "lcs-rl", "ours", FIRST)
+SCRATCH = Unit("mug", "lcs-rl", "ours", FIRST)
 TRANSFER = Unit("mug", "ppo", "ours", FIRST, "cube")
-SOURCES = {task: {"source": "ycb_mesh", "sha256": "abc"} for task in ("cube", *OBJECTS)}
+KNOWN = {task: {"name": task, "source": "ycb_mesh", "sha256": "abc", "mass": 0.05} for task in ("cube", *OBJECTS)}
+TIMES = ["machine", "train_seconds", "evaluation_seconds", "finished"]
+"""Columns in which two results of the same unit may differ."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -49,6 +59,29 @@ def stand_ins(tmp_path_factory):
         patch.delenv("DIFFLCS_YCB_DIR", raising=False)
         patch.setenv("DIFFLCS_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+def quietly(terminal=False):
+    """A display, and the text that it shows."""
+    stream = io.StringIO()
+    return Progress(console=Console(file=stream, force_terminal=terminal, width=200), disable=not terminal), stream
+
+
+def run_script(main, capsys, *arguments):
+    try:
+        code = main([str(argument) for argument in arguments])
+    except SystemExit as exit:  # of tyro: a word that is no choice
+        code = exit.code
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def run_runs(arguments):
+    return runs.command_line(runs.Runs, lambda options: runs.run(options, options.artefacts), arguments)
+
+
+def run_fig_task(arguments):
+    return runs.command_line(fig_task.DrawTask, fig_task.draw, arguments)
 
 
 # --- the matrix and its keys ------------------------------------------------------------------------
@@ -65,145 +98,131 @@ def test_matrix_holds_every_unit_once_and_what_it_starts_from_first():
 
 
 def test_matrix_of_a_part():
-    assert units.matrix(["transfer"], 1, objects=["mug"]) == [Unit("mug", "lcs-rl", "ours", FIRST), CUBE, TRANSFER]
+    assert units.matrix(["transfer"], 1, objects=["mug"]) == [SCRATCH, CUBE, TRANSFER]
     table = units.matrix(["table1"], 1, objects=["banana", "mug"], methods=["violation"], recipes=["paper"])
     assert table == [Unit(task, "violation", "paper", FIRST) for task in ("mug", "banana")]
     assert {unit.method for unit in units.matrix(["curves"], 1, methods=["pddm"])} == {"pddm"}
+    curves = units.matrix(["curves"], 1, recipes=["ours"])
+    assert [(unit.method, unit.recipe) for unit in curves] == [
+        ("pddm", "none"), ("ppo", "paper"), ("violation", "ours"), ("lcs-rl", "ours"),
+    ]  # fmt: skip
 
 
 def test_config_is_the_default_recipe_but_for_what_the_unit_says():
-    config = units.config_of(Unit("mug", "violation", "paper", 3), units.PRESETS["paper"])
-    default = units.TrainConfig()
-    assert (config.task, config.method, config.seed, config.minutes) == ("mug", "violation", 3, 30.0)
-    assert config.warmup == replace(default.warmup, noise=0.0)
-    assert config.imagination == replace(default.imagination, iterations=0)
-    assert config.ppo == replace(default.ppo, natural=False, steps=20, minibatch=None)
-    assert config.warmup_minutes == 6.0
-    assert units.config_of(CUBE, units.PRESETS["paper"]).ppo == default.ppo
-    assert config.evaluate_goals == config.final_goals == 1000
-    assert config.evaluation_seed == default.evaluation_seed  # the same goals for every unit
+    default = {name: get_method(name)() for name in units.METHODS}
+    for method, wanted in (
+        ("violation", replace(default["violation"], warmup=replace(default["violation"].warmup, noise=0.0))),
+        (
+            "lcs-rl",
+            replace(
+                default["lcs-rl"],
+                warmup_minutes=6.0,
+                warmup=replace(default["lcs-rl"].warmup, noise=0.0),
+                ppo=replace(default["lcs-rl"].ppo, update="adam", steps=20, minibatch=None),
+                models=replace(default["lcs-rl"].models, iterations=0),
+            ),
+        ),
+    ):
+        config = units.config_of(Unit("mug", method, "paper", 3), units.PRESETS["paper"])
+        assert config.method == wanted
+        assert (config.task, config.seed, config.minutes) == ("mug", 3, 30.0)
+        assert config.evaluate_goals == config.final_goals == 1000
+        assert config.evaluation_seed == TrainConfig().evaluation_seed  # the same goals for every unit
+    assert units.config_of(CUBE, units.PRESETS["paper"]).method == default["lcs-rl"]
+    assert (
+        units.config_of(replace(CUBE, method="pddm", recipe="none"), units.PRESETS["quick"]).method == default["pddm"]
+    )
 
 
 def test_key_changes_with_everything_that_decides_a_result_and_with_nothing_else(monkeypatch):
-    def key(unit=CUBE, preset=TINY, sources=SOURCES, code="1.2"):
-        return units.unit_key(unit, preset, sources, code)
+    def key(unit=CUBE, preset=TINY, objects=KNOWN):
+        return units.key_of(unit, preset, objects)
 
-    other = {**SOURCES, "cube": {"source": "stand_in", "sha256": ""}}
+    other = {**KNOWN, "cube": {**KNOWN["cube"], "mass": 0.06}}
     different = [
         key(),
-        key(code="1.3"),
-        key(replace(CUBE, seed=1)),
         key(replace(CUBE, method="violation")),
         key(replace(CUBE, recipe="paper")),
         key(preset=replace(TINY, goals=3)),
-        key(sources=other),
+        key(objects=other),
         key(TRANSFER),
-        key(TRANSFER, sources=other),  # the object is the same, but not what it starts from
+        key(replace(TRANSFER, start="scratch")),
+        key(TRANSFER, objects=other),  # the object is the same, but not what it starts from
     ]
+    before = {method: key(replace(CUBE, method=method)) for method in units.METHODS}
+    transferred = key(TRANSFER)
+    with monkeypatch.context() as patch:
+        patch.setattr(get_method("lcs-rl"), "version", 1001)
+        changed = {method for method, old in before.items() if key(replace(CUBE, method=method)) != old}
+        assert changed == {"lcs-rl"}
+        different += [key(), key(TRANSFER)]  # its own method is the same, but not what it starts from
     assert len(set(different)) == len(different)
-    assert units.settings_hash(CUBE, TINY, SOURCES) == units.settings_hash(replace(CUBE, seed=1), TINY, SOURCES)
-    before = {method: key(replace(CUBE, method=method)) for method in ("lcs-rl", "violation", "ppo", "pddm")}
-    of_unit = units.config_of
-
-    def tuned(unit, preset):
-        config = of_unit(unit, preset)
-        return replace(config, ppo=replace(config.ppo, clip=0.123))
-
-    monkeypatch.setattr(units, "config_of", tuned)
-    changed = {method for method, old in before.items() if key(replace(CUBE, method=method)) != old}
-    assert changed == {"lcs-rl", "ppo"}  # only these read PPO's settings
-
-
-def test_code_version_sees_what_decides_a_method(monkeypatch):
-    read = Path.read_text
-
-    def version(file="", old="", new=""):
-        def changed(path, *arguments, **keywords):
-            text = read(path, *arguments, **keywords)
-            if path.name != file:
-                return text
-            assert old in text
-            return text.replace(old, new)
-
-        monkeypatch.setattr(Path, "read_text", changed)
-        return {method: units.code_version(method) for method in units.METHODS}
-
-    known = version()
-
-    def differ(*change):
-        return {method for method, code in version(*change).items() if code != known[method]}
-
-    assert not differ("warmup.py", '    """Settings of the warm-up.', '    # A comment.\n    """Other words.')
-    assert not differ("warmup.py", "epochs: int = 15", "epochs: int = 16")  # in the hash of the settings
-    assert differ("ppo.py", "config.reward_scale * rewards", "rewards") == {"lcs-rl", "ppo"}
-    assert differ("dynamics.py", "relu_", "tanh_") == {"lcs-rl", "ppo", "pddm"}
-    assert differ("pddm.py", "softmax", "log_softmax") == {"pddm"}
-    assert differ("losses.py", "return ", "return 2 * ") == set(units.METHODS)
-    assert len({units.shared_code(code) for code in known.values()}) == 1
+    assert key(replace(CUBE, seed=1)) == key()
+    assert key(TRANSFER) == transferred
 
 
 # --- computing --------------------------------------------------------------------------------------
 
 
+def make_jobs(wanted, work, preset=TINY):
+    return {job.unit: job for job in runs.make_jobs(wanted, preset, work)}
+
+
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
-    """Records of two units, one starting from the other, computed in this process without interruption."""
+    """Results and runs of two units, one starting from the other, computed in this process without interruption."""
     threads = torch.get_num_threads()
-    work = tmp_path_factory.mktemp("undisturbed")
-    specs = runs.make_specs([CUBE, TRANSFER], TINY, work)
-    first = worker.execute(specs[CUBE])
-    second = worker.execute({**specs[TRANSFER], "init": first["model"]})
+    jobs = make_jobs([CUBE, TRANSFER], tmp_path_factory.mktemp("undisturbed"))
+    first = worker.execute(jobs[CUBE])
+    second = worker.execute(replace(jobs[TRANSFER], init=first[1]))
     torch.set_num_threads(threads)
-    assert first["error"] is None, first
-    assert second["error"] is None, second
-    return {CUBE: first, TRANSFER: second}
+    return {CUBE: first, TRANSFER: second}, jobs
 
 
-class Killer:
-    """Kills the process of the first unit that reports, once, as soon as the first iteration is on disk."""
-
-    def __init__(self, folders):
-        self.folders, self.killed = folders, None
-
-    def __call__(self, progress):
-        for key, state in progress.items():
-            if self.killed is None and "pid" in state:
-                self._wait_for_checkpoint(Path(self.folders[key]) / "run" / "checkpoints" / "latest.json")
-                self.killed = key
-                os.kill(state["pid"], signal.SIGKILL)
-
-    def _wait_for_checkpoint(self, latest):
-        # Far finer than `compute` polls: the rest of the unit, TorchRL's import included, takes longer than this.
-        deadline = time.monotonic() + 240
-        while not latest.is_file() or json.loads(latest.read_text())["checkpoint"] == "000000":
-            assert time.monotonic() < deadline, "the unit wrote no checkpoint"
-            time.sleep(0.002)
+def assert_same(jobs, undisturbed):
+    """Whether what lies in the folders of units is, bit for bit, what was computed without interruption."""
+    for unit, (rows, files) in undisturbed[0].items():
+        pd.testing.assert_frame_equal(jobs[unit].result().drop(columns=TIMES), rows.drop(columns=TIMES))
+        found = worker.read_files(jobs[unit].folder / "run")
+        models = [name for name in files if name.startswith("model")]
+        assert models
+        assert {name: found[name] for name in models} == {name: files[name] for name in models}
 
 
-def same(record, expected):
-    """Whether two records tell of the same result, bit for bit."""
-    return all(record.get(name) == expected[name] for name in ("curve", "model", "key", "settings", "object", "error"))
+@pytest.fixture(scope="module")
+def local():
+    """A client of one worker process, which may die twice of a unit."""
+    with dask.config.set({"distributed.scheduler.allowed-failures": 1}), runs.connect(workers=1) as client:
+        yield client
 
 
-@pytest.mark.parametrize(
-    "make_pool", [lambda: pools.LocalPool(1), lambda: pools.DaskPool("local:1")], ids=["local", "dask"]
-)
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # sockets of a killed Dask worker
-def test_a_killed_worker_costs_nothing_but_time(make_pool, undisturbed, tmp_path):
-    specs = runs.make_specs([CUBE, TRANSFER], TINY, tmp_path)
-    killer, stored = Killer({spec["key"]: spec["folder"] for spec in specs.values()}), []
-    pool = make_pool()
-    try:
-        found = runs.compute(specs, pool, stored.append, observe=killer)
-    finally:
-        pool.close()
-    assert killer.killed == specs[CUBE]["key"]
-    assert found[CUBE]["resumed"]
-    for unit, expected in undisturbed.items():
-        assert same(found[unit], expected), (found[unit]["error"], unit)
-    assert [Unit(**record["unit"]) for record in stored] == [CUBE, TRANSFER]
+def test_a_killed_worker_costs_nothing_but_time(local, undisturbed, tmp_path):
+    jobs, stored, created = make_jobs([CUBE, TRANSFER], tmp_path), [], []
+
+    def kill(pid):
+        # As soon as the first iteration is on disk. The rest of the unit, TorchRL's import included, takes longer.
+        run, deadline = jobs[CUBE].folder / "run", time.monotonic() + 240
+        latest = run / "checkpoints" / "latest.json"
+        while not latest.is_file() or json.loads(latest.read_text())["checkpoint"] == "000000":
+            if time.monotonic() > deadline:
+                return
+            time.sleep(0.002)
+        created.append((run / "config.json").stat().st_mtime_ns)
+        os.kill(pid, signal.SIGKILL)
+
+    (pid,) = local.run(os.getpid).values()
+    killer = threading.Thread(target=kill, args=[pid])
+    killer.start()
+    failed = runs.compute(list(jobs.values()), local, stored.append, quietly()[0])
+    killer.join()
+    assert not failed
+    assert created == [(jobs[CUBE].folder / "run" / "config.json").stat().st_mtime_ns]  # resumed, not begun again
+    assert_same(jobs, undisturbed)
+    assert [rows.task[0] for rows in stored] == ["cube", "mug"]
     # All is finished: nothing is computed again.
-    assert runs.compute(specs, runs._NoPool(), stored.append) == found
+    assert not runs.compute(list(jobs.values()), local, stored.append, quietly()[0], execute=None)
+    assert len(stored) == 2
 
 
 @pytest.fixture
@@ -243,143 +262,192 @@ def cluster(tmp_path):
 
 
 def test_a_cluster_that_runs_already(cluster, undisturbed, tmp_path):
-    pool = runs.make_pool(runs.Compute(scheduler=cluster))
-    try:
-        pool._client.wait_for_workers(1, timeout=120)
-        found = runs.compute(runs.make_specs([CUBE, TRANSFER], TINY, tmp_path / "work"), pool, lambda record: None)
-    finally:
-        pool.close()
-    for unit, expected in undisturbed.items():
-        assert same(found[unit], expected), (found[unit]["error"], unit)
+    jobs = make_jobs([CUBE, TRANSFER], tmp_path / "work")
+    with runs.connect(scheduler=cluster) as client:
+        client.wait_for_workers(1, timeout=120)
+        assert not runs.compute(list(jobs.values()), client, lambda rows: None, quietly()[0])
+    assert_same(jobs, undisturbed)
 
 
-class FakePool:
-    """Ends every unit at once; those of `broken` methods with a failure."""
-
-    slots = 2
-
-    def __init__(self, broken=()):
-        self.broken, self.ended, self.order = broken, [], []
-
-    def submit(self, spec):
-        self.order.append(Unit(**spec["unit"]))
-        record = {"format": worker.FORMAT, "key": spec["key"], "unit": spec["unit"], "error": None, "model": {"a": "b"}}
-        record = worker.failure(spec, "it broke") if self.order[-1].task in self.broken else record
-        self.ended.append({**record, "received": spec["init"], "curve": [{"success": 0.5, "goals": 2}]})
-
-    def finished(self):
-        ended, self.ended = self.ended, []
-        return ended
-
-    def progress(self):
-        return {}
-
-    def close(self):
-        pass
+@pytest.fixture
+def in_process():
+    """A client of a Dask cluster in this process, for work that is only played."""
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, dashboard_address="127.0.0.1:0"
+    ) as cluster, distributed.Client(cluster) as client:  # fmt: skip
+        yield client
 
 
-def test_failures_stop_what_depends_on_them_and_nothing_else_and_are_tried_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(runs, "_POLL_SECONDS", 0)
-    wanted = units.matrix(["transfer"], 1, objects=["mug"])
-    specs = runs.make_specs(wanted, TINY, tmp_path)
-    scratch = Unit("mug", "lcs-rl", "ours", FIRST)
-    stored = []
-    found = runs.compute(specs, FakePool(broken=["cube"]), stored.append)
-    assert found[CUBE]["error"] == "it broke"
-    assert "starts from cube lcs-rl" in found[TRANSFER]["error"]
-    assert found[scratch]["error"] is None
-    assert len(stored) == 1
-    pool = FakePool()
-    found = runs.compute(specs, pool, stored.append)
-    assert pool.order == [CUBE, TRANSFER]  # the other one is finished
-    assert found[TRANSFER]["received"] == {"a": "b"}  # the model of what it starts from
-    assert not any(record["error"] for record in found.values())
+def played(broken=()):
+    """Ends every unit at once; those on `broken` objects with a failure. The worker's disk is another one."""
+
+    def execute(job):
+        if job.unit.task in broken:
+            raise ValueError("it [broke]")
+        rows = unit_rows(job.unit, (0, 10, 20, 50), key=job.key, goals=2)
+        return rows, {"config.json": b"{}", "received": repr(job.init and sorted(job.init)).encode()}
+
+    return execute
 
 
-def test_what_a_unit_starts_from_must_be_there(tmp_path):
-    specs = runs.make_specs([CUBE, TRANSFER], TINY, tmp_path)
-    with pytest.raises(InvalidInputError, match="starts, among them"):
-        runs.compute({TRANSFER: specs[TRANSFER]}, FakePool(), lambda record: None)
+def test_failures_stop_what_depends_on_them_and_nothing_else_and_are_tried_again(in_process, tmp_path):
+    jobs, stored = make_jobs(units.matrix(["transfer"], 1, objects=["mug"]), tmp_path), []
+    display, text = quietly()
+    failed = runs.compute(list(jobs.values()), in_process, stored.append, display, played(broken=["cube"]))
+    assert "it [broke]" in (jobs[CUBE].folder / "error.txt").read_text()
+    assert failed == {CUBE: "ValueError: it [broke]", TRANSFER: f"it starts from {CUBE}, which failed"}
+    assert [rows.task[0] for rows in stored] == ["mug"]
+    assert f"{CUBE}: FAILED: ValueError: it [broke]" in text.getvalue()
+    assert f"{SCRATCH}: 50.0 % of 2 goals" in text.getvalue()
+    display, text = quietly(terminal=True)
+    with display:
+        assert not runs.compute(list(jobs.values()), in_process, stored.append, display, played())
+    assert [(rows.task[0], rows.start[0]) for rows in stored[1:]] == [("cube", "scratch"), ("mug", "cube")]
+    assert "units" in text.getvalue()
+    received = (jobs[TRANSFER].folder / "run" / "received").read_text()
+    assert received == "['config.json', 'received']"  # the run of what it starts from
 
 
-def test_the_display_tells_failures_and_the_time_left(tmp_path, monkeypatch):
-    import io
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # sockets of a killed Dask worker
+def test_a_worker_that_always_dies_is_a_failure_of_its_unit_alone(local, tmp_path):
+    jobs = make_jobs([CUBE, SCRATCH], tmp_path)
+    good = played()
 
-    from progress import Display
-    from rich.console import Console
+    def execute(job):
+        if job.unit.task == "cube":
+            os._exit(7)
+        return good(job)
 
-    monkeypatch.setattr(runs, "_POLL_SECONDS", 0)
-    for terminal in (True, False):
-        stream = io.StringIO()
-        specs = runs.make_specs(units.matrix(["transfer"], 1, objects=["mug"]), TINY, tmp_path / str(terminal))
-        with Display(3, 0.5, Console(file=stream, force_terminal=terminal, width=200)) as display:
-            runs.compute(specs, FakePool(broken=["cube"]), lambda record: None, display)
-            display.durations = {"lcs-rl": [10.0, 20.0]}
-            assert display._left({}, [CUBE, CUBE], slots=2) == 15.0
-        assert "FAILED: it broke" in stream.getvalue()
-        assert "50.0 % of 2 goals" in stream.getvalue()
+    failed = runs.compute(list(jobs.values()), local, lambda rows: None, quietly()[0], execute)
+    assert set(failed) == {CUBE}
+    assert "KilledWorker" in failed[CUBE]
+    assert len(jobs[SCRATCH].result()) == 4
 
 
-def test_an_error_in_a_unit_is_its_record(tmp_path, one_thread):
-    spec = runs.make_specs([Unit("mug", "violation", "ours", FIRST)], TINY, tmp_path).popitem()[1]
-    for change, message in (
-        ({"source": {"source": "ycb_mesh", "sha256": "abc"}}, "set DIFFLCS_YCB_DIR there"),
-        ({"code": "00000000.00000000.00000000"}, "install the same code there"),
+def test_a_worker_that_would_compute_something_else_refuses(tmp_path, one_thread):
+    job = make_jobs([SCRATCH], tmp_path)[SCRATCH]
+    other = replace(job, key="0123456789ab")  # as where other versions, settings or meshes are
+    with pytest.raises(InvalidInputError, match="install the same version of difflcs there") as caught:
+        worker.execute(other)
+    assert "set DIFFLCS_YCB_DIR" in str(caught.value)
+    assert other.result() is None
+
+
+def test_what_is_stale_or_foreign_is_not_taken_for_a_result(tmp_path, monkeypatch):
+    job = make_jobs([CUBE], tmp_path)[CUBE]
+    rows, files = played()(job)
+    worker.write_files(job.folder / "run", files)
+    job.keep(rows)
+    assert job.result() is not None
+    with monkeypatch.context() as patch:  # another version of the method is computed anew, elsewhere
+        patch.setattr(get_method("lcs-rl"), "version", 1001)
+        newer = make_jobs([CUBE], tmp_path)[CUBE]
+        assert newer.result() is None
+        assert newer.folder != job.folder
+    for content in (
+        "",
+        "rubbish",
+        (job.folder / "result.csv").read_text().replace(job.key, "0123456789ab"),
+        (job.folder / "result.csv").read_text().replace("lcs-rl", "ppo"),
     ):
-        record = worker.execute({**spec, **change})
-        assert message in record["error"]
-        assert worker.finished_record(Path(spec["folder"]), spec["key"]) is None
-        assert (Path(spec["folder"]) / "record.json").is_file()
+        job.keep(rows)
+        (job.folder / "result.csv").write_text(content)
+        assert job.result() is None
+    job.keep(rows)
+    (job.folder / "run" / "config.json").unlink()
+    assert job.result() is None
 
 
-def test_a_process_that_always_dies_is_a_failure(tmp_path, monkeypatch):
-    script = tmp_path / "dies.py"
-    script.write_text("import sys; print('last words', flush=True); sys.exit(7)")
-    monkeypatch.setattr(pools.worker, "__file__", str(script))
-    specs = runs.make_specs([CUBE], TINY, tmp_path)
-    pool = pools.LocalPool(1)
-    found = runs.compute(specs, pool, lambda record: None)
-    assert "exit code 7" in found[CUBE]["error"]
-    assert found[CUBE]["traceback"].count("last words") == pools.ATTEMPTS
+def test_workers_end_with_the_process_that_wants_them():
+    code = (
+        "import os, sys, time; sys.path.insert(0, sys.argv[1]); import runs\n"
+        "if __name__ == '__main__':\n"
+        "    with runs.connect(workers=1) as client:\n"
+        "        print(*client.run(os.getpid).values(), flush=True)\n"
+        "        time.sleep(600)\n"
+    )
+    script = [sys.executable, "-c", code, str(FOLDER)]
+    with subprocess.Popen(script, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        pid = int(process.stdout.readline())
+        process.kill()
+    deadline = time.monotonic() + 30
+    while Path(f"/proc/{pid}").exists() and "State:\tZ" not in Path(f"/proc/{pid}/status").read_text():
+        assert time.monotonic() < deadline, "the worker lives on"
+        time.sleep(0.05)
 
 
-def test_finished_units_of_accepted_code_count(tmp_path, monkeypatch):
-    monkeypatch.setattr(runs, "_POLL_SECONDS", 0)
-    with monkeypatch.context() as patch:
-        patch.setattr(runs, "code_version", lambda method: "old")
-        runs.compute(runs.make_specs([CUBE], TINY, tmp_path), FakePool(), lambda record: None)
-    monkeypatch.setattr(runs, "code_version", lambda method: "new")
-    for accept, submitted in ((("old",), 0), ((), 1)):
-        pool = FakePool()
-        runs.compute(runs.make_specs([CUBE], TINY, tmp_path, accept), pool, lambda record: None)
-        assert len(pool.order) == submitted
+def test_ctrl_c_says_how_to_go_on(monkeypatch, tmp_path, capsys):
+    def interrupt(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(runs, "compute", interrupt)
+    monkeypatch.setattr(runs, "connect", lambda *arguments: contextlib.nullcontext())
+    code, _, err = run_script(run_runs, capsys, "--methods", "pddm", "--work", tmp_path, "--results", tmp_path)
+    assert code == 130
+    assert "the same command goes on" in err
+
+
+def test_a_script_computes_and_draws(local, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(runs, "connect", lambda workers, scheduler: contextlib.nullcontext(local))
+    options = ["--rerun", "--preset", "smoke", "--objects", "mug", "--methods", "violation"]
+    folders = ["--work", tmp_path / "work", "--results", tmp_path]
+    code, out, err = run_script(table1.main, capsys, *options, *folders)
+    assert code == 0, err
+    assert "smoke: 1 units of 0.5 minutes of data, 1 seeds, 4 goals; 0 finished before" in out
+    rows = records.read(tmp_path / "smoke-stand-in.csv")
+    assert list(rows["at"]) == [0.0, 0.2, 0.5]
+    assert set(rows.version) == {str(get_method("violation").version)}
+    # One seed: the interval is Wilson's, of its goals.
+    line = next(line for line in (tmp_path / "table1-smoke-stand-in.md").read_text().splitlines() if "| mug" in line)
+    last = rows.iloc[-1]
+    assert f"{100 * last.success:.1f} [{100 * last.ci_low:.1f}, {100 * last.ci_high:.1f}]" in line
+    code, out, _ = run_script(table1.main, capsys, *options, *folders)
+    assert "1 finished before" in out
 
 
 # --- statistics -------------------------------------------------------------------------------------
 
 
-def test_summary_against_numbers_by_hand():
-    found = summarise([50.0, 60.0, 70.0])
-    # t(0.975, 2 degrees of freedom) = 4.302653; 10 / sqrt(3) = 5.773503
-    assert (found.n, found.mean, found.sd) == (3, 60.0, 10.0)
-    assert found.low == pytest.approx(60 - 4.302653 * 5.773503, abs=1e-4)
-    assert found.high == pytest.approx(60 + 4.302653 * 5.773503, abs=1e-4)
-    assert summarise([3.0]).mean == 3.0
-    assert math.isnan(summarise([3.0]).sd)
+@pytest.mark.parametrize(("reached", "goals"), [(0, 4), (1, 4), (4, 4), (299, 300)])
+def test_wilson_is_that_of_the_library(reached, goals):
+    found = stats.wilson(100 * reached / goals, goals)
+    assert [found.low / 100, found.high / 100] == pytest.approx(wilson_interval(reached, goals))
+    assert 0 <= found.low <= found.value <= found.high <= 100
 
 
-def test_comparison_against_scipy():
+def test_intervals_stay_within_what_is_possible():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        strata = [100 * rng.beta(0.2, 0.2, size=rng.integers(2, 6)).round(2) for _ in range(rng.integers(1, 4))]
+        for statistic in (np.mean, stats.IQM):
+            found = stats.bootstrap(strata, statistic)
+            assert 0 <= found.low <= found.value <= found.high <= 100
+            assert found == stats.bootstrap(strata, statistic)  # the same numbers give the same files
+
+
+def test_bootstrap_against_numbers_by_hand():
+    # Of two seeds the mean of a resample is 40, 50, 50 or 60.
+    assert stats.bootstrap([[40.0, 60.0]]) == (50.0, 40.0, 60.0)
+    assert stats.bootstrap([[50.0] * 3]) == (50.0, 50.0, 50.0)
+    # Seeds are drawn within each object: between two objects there is nothing to draw.
+    assert stats.bootstrap([[10.0, 10.0], [90.0, 90.0]]) == (50.0, 50.0, 50.0)
+    assert stats.bootstrap([[0.0, 40.0], [50.0, 100.0]], stats.IQM).value == 45.0
+    found = stats.bootstrap([[3.0]])
+    assert found.value == 3.0
+    assert math.isnan(found.low)
+    many = np.random.default_rng(0).normal(50.0, 10.0, 400)
+    found = stats.bootstrap([many])
+    assert found.high - found.low == pytest.approx(2 * 1.96 * many.std() / 20, rel=0.1)
+
+
+def test_p_value_against_scipy():
     from scipy.stats import ttest_rel
 
-    a, b = [80.1, 85.3, 91.0, 78.2], [60.3, 70.9, 55.1, 72.4]
-    found, expected = compare(a, b), ttest_rel(a, b)
-    interval = expected.confidence_interval()
-    assert found.p == pytest.approx(expected.pvalue)
-    assert (found.difference.low, found.difference.high) == pytest.approx((interval.low, interval.high))
-    assert compare([1.0, 2.0], [1.0, 2.0]).p == 1.0
-    assert math.isnan(compare([1.0], [2.0]).p)
-    with pytest.raises(ShapeError, match="as many seeds"):
-        compare([1.0, 2.0], [1.0])
+    a, b = np.array([80.1, 85.3, 91.0, 78.2]), np.array([60.3, 70.9, 55.1, 72.4])
+    assert stats.p_value(a - b) == pytest.approx(ttest_rel(a, b).pvalue)
+    assert stats.p_value([0.0, 0.0]) == 1.0
+    assert stats.p_value([100 * 0.7 - 100 * 0.4, 30.0]) == 0.0  # but for rounding the same
+    assert math.isnan(stats.p_value([1.0]))
 
 
 # --- results ----------------------------------------------------------------------------------------
@@ -387,16 +455,14 @@ def test_comparison_against_scipy():
 
 def unit_rows(unit, values, source="ycb_mesh", goals=1000, **changes):
     """Rows as of a finished unit; `values` are percent at 0, 6, 10 and 30 minutes."""
-    keys = {"key": f"{unit} {goals} {changes}", "settings": f"{unit.method}{unit.recipe}{goals}", **changes}
-    base = records.Row(
-        format=records.FORMAT, **asdict(unit), at=0.0, minutes=0.0, success=0.0, ci_low=0.0, ci_high=1.0, goals=goals,
-        evaluation_seed=0, solver_failures=0, source=source, mass=0.05, settings="", code="c1", key="",
-        versions="difflcs=1", machine="a machine", train_seconds=20.0, evaluation_seconds=10.0,
-        finished="2026-01-01T00:00:00+00:00",
+    base = dict(
+        **asdict(unit), ci_low=0.0, ci_high=1.0, goals=goals, evaluation_seed=0, solver_failures=0, source=source,
+        mass=0.05, version="1", key=f"{unit.method}{unit.recipe}{goals}", versions="difflcs=1", machine="a machine",
+        train_seconds=20.0, evaluation_seconds=10.0, finished="2026-01-01T00:00:00+00:00",
     )  # fmt: skip
-    base = replace(base, **keys)
     points = zip((0.0, 6.0, 10.0, 30.0), values, strict=True)
-    return [replace(base, at=at, minutes=at, success=value / 100) for at, value in points]
+    rows = [{**base, "at": at, "minutes": at, "success": value / 100, **changes} for at, value in points]
+    return pd.DataFrame(rows)[list(records.COLUMNS)].astype(records.COLUMNS)
 
 
 @pytest.fixture
@@ -412,56 +478,68 @@ def results(tmp_path):
             ):
                 records.add(tmp_path, "paper", unit_rows(unit, values))
         transfer = Unit("mug", "ppo", "ours", seed, "cube")
-        records.add(tmp_path, "paper", unit_rows(transfer, (30, 60, 70, 81 + shift)))
+        records.add(tmp_path, "paper", unit_rows(transfer, (30, 60, 70, 79 + shift)))
         records.add(tmp_path, "paper", unit_rows(Unit("cube", "pddm", "none", seed), (0, 1, 2, 3), goals=50))
     return tmp_path
 
 
-def run_script(script, capsys, *arguments):
-    code = script.main([str(argument) for argument in arguments])
-    captured = capsys.readouterr()
-    return code, captured.out, captured.err
+def cells_of(path, task):
+    """The cells of the lines of a table that begin with an object."""
+    lines = [line for line in path.read_text().splitlines() if line.startswith(f"| {task}")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
 def test_table1_shows_ours_beside_the_paper(results, capsys):
-    code, out, _ = run_script(table1, capsys, "--results", results)
+    code, out, _ = run_script(table1.main, capsys, "--results", results)
     assert code == 0
-    markdown, latex = ((results / f"table1.{suffix}").read_text() for suffix in ("md", "tex"))
-    line = next(line for line in markdown.splitlines() if line.startswith("| mug"))
-    assert line.split(" | ")[1:5] == ["50.0 ± 10.0", "32.5 ± 8.4", "80.0 ± 10.0", "44.6 ± 3.9"]  # peak
-    assert line.split(" | ")[5:] == ["20.0 ± 10.0", "10.0 ± 6.3", "80.0 ± 10.0", "44.6 ± 3.9 |"]  # final
-    assert "50.0 ± 10.0" in out
-    assert "32.5 $\\pm$ 8.4" in latex
-    assert "| mug | +30.0 [+30.0, +30.0] | < 0.001 | +60.0 [+60.0, +60.0] | < 0.001 |" in markdown
-    assert "| banana | — | 28.4 ± 5.8 |" in markdown  # no results yet: the paper alone
+    success, differences, other, _ = cells_of(results / "table1.md", "mug")
+    assert success[1:5] == ["50.0 [40.0, 60.0]", "32.5 ± 8.4", "80.0 [70.0, 90.0]", "44.6 ± 3.9"]  # peak
+    assert success[5:] == ["20.0 [10.0, 30.0]", "10.0 ± 6.3", "80.0 [70.0, 90.0]", "44.6 ± 3.9"]  # final
+    assert differences[1:] == ["+30.0 [+30.0, +30.0]", "< 0.001", "+60.0 [+60.0, +60.0]", "< 0.001"]
+    assert other[1] == "20.0 [20.0, 20.0]"
+    assert "50.0 [40.0, 60.0]" in out
+    assert "32.5 $\\pm$ 8.4" in (results / "table1.tex").read_text()
+    assert cells_of(results / "table1.md", "banana")[0][1:3] == ["—", "28.4 ± 5.8"]  # no results yet: the paper alone
+    assert cells_of(results / "table1.md", "all six")[0][1:3] == ["—", "—"]
+    markdown = (results / "table1.md").read_text()
     assert "Success on six objects, the paper's recipe" in markdown
-    assert "3 seeds × 1000 goals" in markdown
-    assert "12 trainings" not in markdown  # mug only: 9
-    assert "9 trainings" in markdown
+    assert "LCS-RL, our recipe: version 1, 3 seeds × 1000 goals (mug)" in markdown
+    assert "Computed: 9 trainings" in markdown  # mug only
+
+
+def test_over_all_objects_the_middle_half_counts(tmp_path, capsys):
+    for task, value in zip(OBJECTS, (0, 50, 60, 60, 70, 100), strict=True):
+        for seed in range(2):
+            for method, gain in (("violation", 0), ("lcs-rl", -5 if task == "banana" else 10)):
+                percent = value + gain if value else 0
+                records.add(tmp_path, "paper", unit_rows(Unit(task, method, "ours", seed), (0, 0, 0, percent)))
+    assert run_script(table1.main, capsys, "--results", tmp_path)[0] == 0
+    success, differences = cells_of(tmp_path / "table1.md", "all six")
+    assert success[5] == "60.0 [60.0, 60.0]"  # not 56.7, the mean
+    assert differences[1].startswith("+5.8 [")
 
 
 def test_learning_curves_are_drawn(results, capsys):
-    code, out, _ = run_script(fig_learning_curves, capsys, "--results", results)
+    code, out, _ = run_script(fig_learning_curves.main, capsys, "--results", results)
     assert code == 0
     assert "55 at 7 min, 30 at 30 min" in out
-    assert "3.0 ± 0.0" in out  # PDDM
-    assert "3 seeds × 50 goals" in out  # an unequal number of goals is said
+    assert "3.0 [3.0, 3.0]" in out  # PDDM
+    assert "PDDM: version 1, 3 seeds × 50 goals" in out  # an unequal number of goals is said
 
 
 def test_transfer_is_compared_at_equal_data(results, capsys):
-    assert run_script(fig_transfer, capsys, "--results", results)[0] == 0
-    line = next(line for line in (results / "fig_transfer.md").read_text().splitlines() if line.startswith("| mug"))
-    cells = line.strip("| ").split(" | ")
-    assert cells[1] == "30.0 ± 0.0"  # the cube's model without any data
-    assert cells[2:6] == ["50.0 ± 10.0", "60.0 ± 0.0", "+10.0 [−14.8, +34.8]", "0.225"]  # 6 min
-    assert cells[6:] == ["80.0 ± 10.0", "91.0 ± 10.0", "+11.0 [+11.0, +11.0]", "< 0.001"]  # final
+    assert run_script(fig_transfer.main, capsys, "--results", results)[0] == 0
+    cells = cells_of(results / "fig_transfer.md", "mug")[0]
+    assert cells[1] == "30.0 [30.0, 30.0]"  # the cube's model without any data
+    assert cells[2:6] == ["50.0 [40.0, 60.0]", "60.0 [60.0, 60.0]", "+10.0 [+0.0, +20.0]", "0.225"]  # 6 min
+    assert cells[6:] == ["80.0 [70.0, 90.0]", "89.0 [79.0, 99.0]", "+9.0 [+9.0, +9.0]", "< 0.001"]  # final
 
 
 def test_the_same_numbers_give_the_same_files(results, capsys):
     files = [results / f"fig_learning_curves.{suffix}" for suffix in ("png", "pdf", "md", "tex")]
     written = []
     for _ in range(2):
-        assert run_script(fig_learning_curves, capsys, "--results", results)[0] == 0
+        assert run_script(fig_learning_curves.main, capsys, "--results", results)[0] == 0
         written.append([path.read_bytes() for path in files])
     assert written[0] == written[1]
     assert written[0][0].startswith(b"\x89PNG")
@@ -474,7 +552,7 @@ def test_stand_ins_are_a_table_of_their_own(results, capsys):
     path = records.add(results, "paper", unit_rows(unit, (1, 2, 3, 99), source="stand_in"))
     assert path.name == "paper-stand-in.csv"
     assert records.path_of(results, "paper").read_bytes() == before
-    assert run_script(table1, capsys, "--results", results)[0] == 0
+    assert run_script(table1.main, capsys, "--results", results)[0] == 0
     assert "99.0" not in (results / "table1.md").read_text()
     assert "99.0" in (results / "table1-stand-in.md").read_text()
     assert "STAND-INS" in (results / "table1-stand-in.md").read_text()
@@ -485,40 +563,50 @@ def test_nothing_is_mixed_or_replaced_silently(results, capsys):
     # Other numbers of goals stand beside each other; the larger amount is shown, and what is left out is said.
     records.add(results, "paper", unit_rows(unit, (0, 0, 0, 1), goals=300))
     cell = records.select(records.read(results / "paper.csv"), "mug", "lcs-rl", "ours")
-    assert (cell.seeds, cell.left_out) == ((0, 1, 2), 1)
-    assert cell.at(30.0) == {0: 70.0, 1: 80.0, 2: 90.0}
-    assert run_script(table1, capsys, "--results", results)[0] == 0
-    assert "1 trainings of other settings left out" in (results / "table1.md").read_text()
-    # The same unit computed by other code replaces itself alone, and is not averaged with the others.
-    records.add(results, "paper", unit_rows(unit, (0, 0, 0, 2), code="c2"))
+    assert (list(cell.scores.index), cell.left_out) == ([0, 1, 2], 1)
+    assert list(cell.at("final")) == [70.0, 80.0, 90.0]
+    # The same unit computed by another version is not averaged with the others either, and replaces nothing.
+    records.add(results, "paper", unit_rows(unit, (0, 0, 0, 2), version="2", key="another"))
+    assert run_script(table1.main, capsys, "--results", results)[0] == 0
+    markdown = (results / "table1.md").read_text()
+    assert "LCS-RL, our recipe: version 1, 3 seeds × 1000 goals; 2 trainings of others left out (mug)" in markdown
+    # Computed again, a unit replaces itself alone.
+    records.add(results, "paper", unit_rows(unit, (0, 0, 0, 3)))
     rows = records.read(results / "paper.csv")
-    assert sum(row.unit == unit and row.goals == 1000 for row in rows) == 4
-    assert records.select(rows, "mug", "lcs-rl", "ours").seeds == (1, 2)
-    # Nor compared with what other code has computed.
-    both = [records.select(rows, "mug", method, "ours") for method in ("lcs-rl", "violation")]
-    assert report.paired(*both, "final").difference.n == 2
-
-    def coded(cell, code):
-        return replace(cell, rows=tuple(replace(row, code=code) for row in cell.rows))
-
-    def compared(*codes):
-        return report.paired(*(coded(cell, code) for cell, code in zip(both, codes, strict=True)), "final") is not None
-
-    # What a method has of its own may differ between methods, but not what they have in common.
-    assert compared("all.ppo.cpp", "all.warmup.cpp")
-    assert not compared("all.ppo.cpp", "other.ppo.cpp")
-    assert not compared("all.ppo.cpp", "all.ppo.other")
+    cell = records.select(rows, "mug", "lcs-rl", "ours")
+    assert list(cell.at("final")) == [3.0, 80.0, 90.0]
+    assert len(rows[(rows.task == "mug") & (rows.method == "lcs-rl") & (rows.seed == 0)]) == 3 * 4
+    # As soon as a newer version has as much, it is the one that is shown.
+    for seed in range(3):
+        unit = replace(unit, seed=seed)
+        newer = unit_rows(unit, (0, 0, 0, 4), version="2", key="another", finished="2026-01-02T00:00:00+00:00")
+        records.add(results, "paper", newer)
+    cell = records.select(records.read(results / "paper.csv"), "mug", "lcs-rl", "ours")
+    assert list(cell.at("final")) == [4.0, 4.0, 4.0]
+    assert cell.left_out == 4
 
 
-def test_records_round_trip(undisturbed, tmp_path):
-    rows = records.rows_of(undisturbed[TRANSFER])
+def test_only_what_can_be_compared_is(results):
+    rows = records.read(results / "paper.csv")
+    a, b = (records.select(rows, "mug", method, "ours") for method in ("lcs-rl", "violation"))
+    assert report.paired(a, b, "final") == pytest.approx([60.0, 60.0, 60.0])
+    assert len(report.paired(a, replace(b, rows=b.rows[b.rows.seed > 0]), "final")) == 2
+    for column, value in (("goals", 300), ("evaluation_seed", 1), ("source", "stand_in"), ("mass", 0.1)):
+        other = replace(b, rows=b.rows.assign(**{column: value}))
+        assert report.paired(a, other, "final") == []
+    assert report.paired(a, records.select(rows, "cube", "violation", "ours"), "final") == []
+    assert report.paired(a, None, "final") == []
+
+
+def test_results_round_trip(undisturbed, tmp_path):
+    rows = undisturbed[0][TRANSFER][0]
     path = records.add(tmp_path, "smoke", rows)
-    assert records.read(path) == rows
-    assert [row.at for row in rows] == [0.2, 0.5]
-    assert rows[0].source == "stand_in"
-    assert rows[0].unit == TRANSFER
-    assert rows[-1].goals == TINY.goals
-    assert rows[0].minutes >= rows[0].at
+    pd.testing.assert_frame_equal(records.read(path), rows)
+    assert list(rows["at"]) == [0.2, 0.5]
+    assert set(rows.source) == {"stand_in"}
+    assert set(rows.key) == {undisturbed[1][TRANSFER].key}
+    assert set(rows.goals) == {TINY.goals}
+    assert (rows.minutes >= rows["at"]).all()
 
 
 def test_readme_is_filled_between_its_marks_only(tmp_path):
@@ -528,23 +616,24 @@ def test_readme_is_filled_between_its_marks_only(tmp_path):
     report.update_readme("table1-quick", "quick\n", readme)
     assert readme.read_text() == "before\n<!-- results: table1 -->\n\nnew\n\n<!-- end -->\nafter\n"
     readme.write_text("<!-- results: table1 -->\nold\n")
-    with pytest.raises(records.ResultsError, match="put it back"):
+    with pytest.raises(CheckpointError, match="put it back"):
         report.update_readme("table1", "new\n", readme)
 
 
 def test_the_tracked_readme_and_tables_are_those_of_the_tracked_results(tmp_path, monkeypatch, capsys):
     names = {"table1": table1, "fig_learning_curves": fig_learning_curves, "fig_transfer": fig_transfer}
-    text = (FOLDER / "README.md").read_text()
-    for name in names:
-        assert f"<!-- results: {name} -->" in text
+    text, tracked = (FOLDER / "README.md").read_text(), records.RESULTS
     readme = tmp_path / "README.md"
     readme.write_text(text)
-    for path in records.RESULTS.glob("paper*.csv"):
+    for path in tracked.glob("paper*.csv"):
         (tmp_path / path.name).write_bytes(path.read_bytes())
     monkeypatch.setattr(report, "README", readme)
     monkeypatch.setattr(records, "RESULTS", tmp_path)
-    for script in names.values():
-        assert script.main(["--results", str(tmp_path), "--preset", "paper"]) in (0, 2)  # 2: no results of it yet
+    for name, script in names.items():
+        assert f"<!-- results: {name} -->" in text
+        assert run_script(script.main, capsys, "--results", tmp_path, "--preset", "paper")[0] == 0
+        for suffix in ("md", "tex"):
+            assert (tmp_path / f"{name}.{suffix}").read_text() == (tracked / f"{name}.{suffix}").read_text()
     assert readme.read_text() == text, "run the scripts of reproduce/ to bring README.md up to date"
 
 
@@ -552,64 +641,56 @@ def test_the_tracked_readme_and_tables_are_those_of_the_tracked_results(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("script", "arguments", "message"),
+    ("main", "arguments", "message"),
     [
-        (table1, ["--rerun", "--preset", "papers"], "preset: expected one of smoke, quick, paper, got 'papers'"),
-        (table1, ["--preset", "papers"], "preset: expected one of"),
-        (table1, ["--rerun", "--objects", "teapot"], "objects: expected some of sugar_box"),
-        (runs, ["--methods", "sac"], "methods: expected some of lcs-rl"),
-        (runs, ["--artefacts", "table2"], "artefacts: expected some of table1"),
-        (runs, ["--artefacts", "transfer", "--methods", "pddm"], "units: expected at least one"),
-        (runs, ["--seeds", "0"], "seeds: expected at least 1"),
-        (runs, ["--workers", "0"], "workers: expected at least 1"),
-        (runs, ["--dask", "remote"], "dask: expected local:N"),
-        (runs, ["--dask", "local:x"], "dask: expected local:N"),
-        (runs, ["--dask", "local:1", "--scheduler", "tcp://x:1"], "got both"),
-        (runs, ["--scheduler", "somewhere"], "scheduler: expected an address"),
-        (runs, ["--scheduler", "tcp://127.0.0.1:9"], "expected a Dask scheduler at tcp://127.0.0.1:9"),
-        (table1, [], "compute them with: python reproduce/table1.py --rerun --preset quick"),
-        (fig_transfer, ["--preset", "paper"], "reproduce/fig_transfer.py --rerun --preset paper"),
-        (fig_task, [], "reproduce/fig_task.py --rerun"),
-        (fig_task, ["--run", "nowhere"], "nowhere"),
+        (table1.main, ["--rerun", "--preset", "papers"], "invalid choice 'papers'"),
+        (table1.main, ["--preset", "papers"], "invalid choice 'papers'"),
+        (table1.main, ["--rerun", "--objects", "teapot"], "invalid choice 'teapot'"),
+        (run_runs, ["--methods", "sac"], "invalid choice 'sac'"),
+        (run_runs, ["--artefacts", "table2"], "invalid choice 'table2'"),
+        (run_runs, ["--artefacts", "transfer", "--methods", "pddm"], "units: expected at least one"),
+        (run_runs, ["--seeds", "0"], "seeds: expected"),
+        (run_runs, ["--goals", "-1"], "goals: expected"),
+        (run_runs, ["--workers", "0"], "workers: expected"),
+        (run_runs, ["--workers", "1", "--scheduler", "tcp://x:1"], "alone, got"),
+        (run_runs, ["--methods", "pddm", "--scheduler", "somewhere"], "expected an address"),
+        (run_runs, ["--methods", "pddm", "--scheduler", "tcp://127.0.0.1:9"], "tcp://127.0.0.1:9"),
+        (table1.main, [], "python reproduce/table1.py --rerun --preset quick"),
+        (fig_transfer.main, ["--preset", "paper"], "reproduce/fig_transfer.py --rerun --preset paper"),
+        (run_fig_task, [], "reproduce/fig_task.py --rerun"),
+        (run_fig_task, ["--run", "nowhere"], "nowhere"),
     ],
 )
-def test_bad_input(script, arguments, message, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(pools, "_CONNECT_SECONDS", 0.5)
+def test_bad_input(main, arguments, message, tmp_path, capsys):
     folder = tmp_path / "results"
-    code, _, err = run_script(script, capsys, *arguments, "--results", folder, "--work", tmp_path / "work")
+    with dask.config.set({"distributed.comm.timeouts.connect": "500ms"}):
+        code, _, err = run_script(main, capsys, *arguments, "--results", folder, "--work", tmp_path / "work")
     assert code == 2
     assert message in err
     assert not folder.exists()  # nothing written
 
 
-@pytest.mark.parametrize("content", ["", "format,other\n1,2\n", "FORMAT"])
+@pytest.mark.parametrize("content", ["", "format,other\n1,2\n", "an older one"])
 def test_results_of_another_version_stay_as_they_are(content, results, capsys):
     path = results / "paper.csv"
-    if content == "FORMAT":
-        content = path.read_text().replace("\n2,", "\n3,")
+    if content == "an older one":
+        content = path.read_text().replace("version,key", "settings,code")
     path.write_text(content)
     unit = Unit("mug", "lcs-rl", "ours", FIRST)
-    for script, arguments in ((table1, []), (runs, ["--preset", "paper"])):
-        code, _, err = run_script(script, capsys, *arguments, "--results", results, "--work", results / "work")
+    for main, arguments in ((table1.main, []), (run_runs, ["--preset", "paper"])):
+        code, _, err = run_script(main, capsys, *arguments, "--results", results, "--work", results / "work")
         assert code == 2
-        assert "paper.csv: expected results of format 2" in err
-    with pytest.raises(records.ResultsError, match="Nothing was changed"):
+        assert "paper.csv: expected results with the columns task, method" in err
+    with pytest.raises(CheckpointError, match="Nothing was changed"):
         records.add(results, "paper", unit_rows(unit, (1, 2, 3, 4)))
     assert path.read_text() == content
     assert not (results / "table1.md").exists()
 
 
-def test_errors_are_ours():
-    for kind in (records.ResultsError, pools.SchedulerError, worker.UnitError):
-        assert issubclass(kind, DiffLCSError)
-    with pytest.raises(InvalidInputError):
-        units.get_preset("large")
-
-
 def test_the_paper_is_complete():
-    assert set(TABLE1) == set(OBJECTS)
-    assert TABLE1["wrench"]["lcs-rl", "final"] == (59.5, 6.6)
-    assert all(len(cells) == 4 for cells in TABLE1.values())
+    assert set(table1.PAPER) == set(OBJECTS)
+    assert table1.PAPER["wrench"]["lcs-rl", "final"] == (59.5, 6.6)
+    assert all(len(cells) == 4 for cells in table1.PAPER.values())
 
 
 # --- the task's figure ------------------------------------------------------------------------------
@@ -618,16 +699,14 @@ def test_the_paper_is_complete():
 def test_the_task_is_drawn(undisturbed, tmp_path, capsys):
     from difflcs_envs import RenderingError
 
-    record = undisturbed[CUBE]
-    folder = tmp_path / "work" / record["key"]
-    worker.write_json(folder / "record.json", record)
     try:
         from difflcs_envs.trifinger.rendering import _make_gl_context
 
         _make_gl_context(64, 64).free()
     except RenderingError as error:
         pytest.skip(f"needs OpenGL: {error}")
-    code, out, err = run_script(fig_task, capsys, "--results", tmp_path, "--work", tmp_path / "work")
+    job = undisturbed[1][CUBE]
+    code, out, err = run_script(run_fig_task, capsys, "--results", tmp_path, "--work", job.work)
     assert code == 0, err
-    assert f"model: cube lcs-rl, seed {FIRST}" in out
+    assert f"model: {job.folder / 'run'}" in out
     assert (tmp_path / "fig_task.png").stat().st_size > 50_000

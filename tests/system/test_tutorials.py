@@ -1,13 +1,16 @@
 """Every notebook in `tutorials/` runs, is committed with its outputs, and keeps the form that readers know."""
 
+from __future__ import annotations
+
 import asyncio
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import nbformat
 import pytest
-from jupyter_client import AsyncKernelManager
-from nbclient import NotebookClient
+
+if TYPE_CHECKING:
+    import nbformat
 
 FOLDER = Path(__file__).parents[2] / "tutorials"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
@@ -19,6 +22,8 @@ SECONDS = 300  # of one cell; a notebook takes about five on a free machine
 
 
 def read(path: Path) -> nbformat.NotebookNode:
+    import nbformat  # takes seconds; collecting the tests does without
+
     return nbformat.read(path, as_version=4)
 
 
@@ -28,6 +33,9 @@ def code(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
 
 def execute(path: Path, folder: Path) -> nbformat.NotebookNode:
     """Run a notebook in a folder, over sockets in that folder instead of TCP ports."""
+    from jupyter_client import AsyncKernelManager
+    from nbclient import NotebookClient
+
     notebook = read(path)
     manager = AsyncKernelManager(kernel_name="python3", transport="ipc", ip=str(folder / "kernel"))
     client = NotebookClient(

@@ -13,17 +13,17 @@ from gymnasium.vector import SyncVectorEnv
 from difflcs import GoalCost, _files
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
-from difflcs.rl.dynamics import Ensemble
+from difflcs.rl.dynamics import Ensemble, EnsembleSettings
 from difflcs.rl.evaluate import evaluate
-from difflcs.rl.pddm import PDDM, PDDMConfig, Planner
+from difflcs.rl.pddm import PDDM, PDDMSettings, Planner
+from difflcs.rl.settings import Epochs, Rollouts
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 STEPS = 6
 U_MAX = 0.1
-SMALL = PDDMConfig(
-    networks=2, width=16, random_rollouts=10, rollouts_per_iteration=5, epochs=20, minibatch=16, horizon=3, samples=80
-)
+NETWORKS = EnsembleSettings(networks=2, width=16, epochs=Epochs(20, 20, 16), learning_rate=1e-3)
+SMALL = PDDMSettings(rollouts=Rollouts(first=10, each=5), ensemble=NETWORKS, horizon=3, samples=80)
 
 
 class Slide(gymnasium.Env):
@@ -130,14 +130,27 @@ def planner(cost: GoalCost | None = None, **changes) -> Planner:
     return Planner(Exact(1, 1, 2, 4), cost or make_cost(), replace(SMALL, **changes), -bound, bound)
 
 
+class Asked(Exact):
+    """Says which action sequences it was asked about."""
+
+    def forward(self, x, u):
+        self.asked.append(u[0].clone())
+        return super().forward(x, u)
+
+
 def test_costs_are_those_of_the_mpc():
-    """Against the objective written out, up to the constant that does not depend on actions."""
-    generator = torch.Generator().manual_seed(1)
-    actions = 0.1 * torch.randn(7, 3, 1, generator=generator)
-    x0, goal = torch.tensor([0.2], dtype=torch.float64), torch.tensor([-0.3], dtype=torch.float64)
-    states = torch.cat([torch.full((7, 1), 0.2), 0.2 + actions.squeeze(-1).cumsum(1)], 1)
-    expected = 200 * (states + 0.3).square().sum(1) + 0.01 * actions.square().sum((1, 2)) - 4 * 200 * 0.3**2
-    torch.testing.assert_close(planner()._costs(x0, goal, actions), expected, rtol=1e-4, atol=1e-3)
+    """The plan is the mean of the sequences it tried, weighted by the objective written out."""
+    plan, model = planner(kappa=0.02), Asked(1, 1, 2, 4)  # so that more than the best sequence counts
+    plan.ensemble, model.asked = model, []
+    x0, goal = torch.tensor([[0.2]], dtype=torch.float64), torch.tensor([[-0.3]], dtype=torch.float64)
+    found = plan(x0, goal).action
+    actions = torch.stack(model.asked, 1).double()  # (samples, horizon, 1)
+    assert actions.shape == (SMALL.samples, SMALL.horizon, 1)
+    states = torch.cat([torch.full((SMALL.samples, 1), 0.2), 0.2 + actions.squeeze(-1).cumsum(1)], 1)
+    cost = 200 * (states + 0.3).square().sum(1) + 0.01 * actions.square().sum((1, 2))
+    weight = torch.softmax(-0.02 * cost, 0)
+    torch.testing.assert_close(found[0, 0], (weight * actions[:, 0, 0]).sum(), rtol=1e-4, atol=1e-6)
+    assert float(weight.max()) < 0.99
 
 
 def test_planner_moves_toward_the_goal_within_bounds():
@@ -187,15 +200,15 @@ def test_resumed_equals_uninterrupted_bitwise(tmp_path):
     first = make_pddm()
     for _ in range(2):
         first.step()
-    save_checkpoint(tmp_path, first.checkpoint())
+    save_checkpoint(tmp_path, first.iteration, first.state_dict())
     first.step()  # lost by the crash
     second = make_pddm(seed=0)
     torch.manual_seed(7)  # the global generator must not matter
-    second.restore(load_checkpoint(tmp_path))
+    second.load(load_checkpoint(tmp_path))
     for _ in range(2):
         second.step()
     assert same(parameters(through), parameters(second))
-    assert torch.equal(through.states, second.states)
+    assert torch.equal(through.buffer["state"], second.buffer["state"])
 
 
 def test_save_and_load(tmp_path):
@@ -217,13 +230,13 @@ def test_restore_refuses_hostile_checkpoints(refuses_hostile_checkpoints):
 def test_restore_refuses_what_does_not_fit():
     trainer = make_pddm()
     trainer.step()
-    checkpoint = trainer.checkpoint()
-    other = make_pddm(width=8)
+    state = trainer.state_dict()
+    other = make_pddm(ensemble=replace(NETWORKS, width=8))
     before = parameters(other)
     with pytest.raises(CheckpointError, match="other settings"):
-        other.restore(checkpoint)
-    with pytest.raises(CheckpointError, match="counters"):
-        trainer.restore(replace(checkpoint, state={}))
+        other.load(state)
+    with pytest.raises(CheckpointError, match="another method"):
+        trainer.load({"learned": state["learned"]})
     assert same(before, parameters(other))
 
 
@@ -231,7 +244,7 @@ def test_broken_episodes_are_dropped():
     env = SyncVectorEnv([lambda: Slide(breaks_at=3), *[Slide] * 9])
     trainer = make_pddm(env=env)
     assert trainer.step().unstable == 1
-    assert len(trainer.states) == 9
+    assert len(trainer.buffer) == 9
     with pytest.raises(InvalidInputError, match="stable simulation"):
         make_pddm(env=make_envs(breaks_at=2)).step()
 
@@ -239,7 +252,7 @@ def test_broken_episodes_are_dropped():
 @pytest.mark.parametrize("change", [{"samples": 0}, {"kappa": 0.0}, {"filter": 1.5}, {"noise": math.nan}])
 def test_bad_settings_are_refused(change):
     with pytest.raises(InvalidInputError, match=next(iter(change))):
-        PDDMConfig(**change)
+        PDDMSettings(**change)
 
 
 def test_too_few_environments():

@@ -6,65 +6,78 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from difflcs import LCSModel
+from difflcs import LCSModel, _files
 from difflcs.errors import CheckpointError, InUseError
-from difflcs.rl import checkpoint as module
-from difflcs.rl.checkpoint import Checkpoint, RunDirectory, load_checkpoint, save_checkpoint
+from difflcs.rl.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
+from difflcs.rl.state import flatten
 
 
-def make_checkpoint(iteration: int) -> Checkpoint:
-    model = LCSModel(2, 1, 1, generator=torch.Generator().manual_seed(iteration), init_scale=0.1)
-    state = {"rng": np.random.default_rng(iteration).bit_generator.state, "episodes": 5 * iteration}
-    return Checkpoint(iteration, model, state, {"states": torch.full((3, 2), float(iteration), dtype=torch.float64)})
+def make_model(seed: int) -> LCSModel:
+    return LCSModel(2, 1, 1, generator=torch.Generator().manual_seed(seed), init_scale=0.1)
+
+
+def make_state(iteration: int) -> dict[str, Any]:
+    return {
+        "random": {"noise": np.random.default_rng(iteration).bit_generator.state},
+        "collected": 5 * iteration,
+        "learned": dict(make_model(iteration).state_dict()),
+        "episodes": {"state": torch.full((3, 2), float(iteration), dtype=torch.float64)},
+    }
+
+
+def save(root: Path, iteration: int, **options: int) -> None:
+    save_checkpoint(root, iteration, make_state(iteration), **options)
 
 
 def contents(root):
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
-def assert_equal(loaded: Checkpoint, saved: Checkpoint) -> None:
-    assert loaded.iteration == saved.iteration
-    assert loaded.state == saved.state
-    assert torch.equal(loaded.tensors["states"], saved.tensors["states"])
-    for name, value in saved.model.state_dict().items():
-        assert torch.equal(loaded.model.state_dict()[name], value)
+def assert_equal(loaded: Mapping[str, Any], iteration: int) -> None:
+    (tensors, rest), (own, other) = flatten(loaded), flatten(make_state(iteration))
+    assert rest == other
+    assert tensors.keys() == own.keys()
+    assert all(torch.equal(tensors[name], own[name]) for name in own)
 
 
 def test_round_trip_and_pruning(tmp_path):
     for iteration in range(4):
-        save_checkpoint(tmp_path, make_checkpoint(iteration), keep=2)
-    assert_equal(load_checkpoint(tmp_path), make_checkpoint(3))
+        save(tmp_path, iteration, keep=2)
+    assert_equal(load_checkpoint(tmp_path), 3)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["000002", "000003", "latest.json"]
 
 
 @pytest.mark.parametrize("step", ["save_record", "write_json"])
 def test_a_crash_leaves_the_previous_checkpoint(tmp_path, monkeypatch, step):
-    save_checkpoint(tmp_path, make_checkpoint(1))
+    save(tmp_path, 1)
 
     def die(*_):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(module._files, step, die)  # while writing, or between writing and switching
+        patch.setattr(_files, step, die)  # while writing, or between writing and switching
         with pytest.raises(KeyboardInterrupt):
-            save_checkpoint(tmp_path, make_checkpoint(2))
-    assert_equal(load_checkpoint(tmp_path), make_checkpoint(1))
-    save_checkpoint(tmp_path, make_checkpoint(2))
-    assert_equal(load_checkpoint(tmp_path), make_checkpoint(2))
+            save(tmp_path, 2)
+    assert_equal(load_checkpoint(tmp_path), 1)
+    save(tmp_path, 2)
+    assert_equal(load_checkpoint(tmp_path), 2)
 
 
 def test_going_back_to_an_older_checkpoint(tmp_path):
     for iteration in (5, 6, 7):
-        save_checkpoint(tmp_path, make_checkpoint(iteration), keep=2)
+        save(tmp_path, iteration, keep=2)
     (tmp_path / "latest.json").write_text('{"checkpoint": "000006"}')
-    assert load_checkpoint(tmp_path).iteration == 6
-    save_checkpoint(tmp_path, make_checkpoint(7), keep=2)  # takes the place of the abandoned 7
-    assert load_checkpoint(tmp_path).iteration == 7
+    assert load_checkpoint(tmp_path)["collected"] == 5 * 6
+    save(tmp_path, 7, keep=2)  # takes the place of the abandoned 7
+    assert load_checkpoint(tmp_path)["collected"] == 5 * 7
 
 
 def _flip(path):
@@ -91,20 +104,20 @@ CORRUPTIONS = {
     "truncated tensors": lambda root: (root / "000002/model.safetensors").write_bytes(b"\x08\x00\x00"),
     "truncated description": lambda root: (root / "000002/config.json").write_text('{"format": 1,'),
     "an edited counter": lambda root: _edit(
-        root / "000002/config.json", lambda r: r["config"]["state"].update(episodes=99)
+        root / "000002/config.json", lambda r: r["config"]["state"].update(collected=99)
     ),
     "another kind": lambda root: _edit(root / "000002/config.json", lambda r: r.update(kind="LCSModel")),
     "another iteration": lambda root: (
         (root / "000002").rename(root / "000009") and (root / "latest.json").write_text('{"checkpoint": "000009"}')
     ),
-    "a model's directory": lambda root: make_checkpoint(3).model.save_pretrained(root / "000002"),
+    "a model's directory": lambda root: make_model(3).save_pretrained(root / "000002"),
 }
 
 
 @pytest.mark.parametrize("corrupt", CORRUPTIONS.values(), ids=CORRUPTIONS.keys())
 def test_corrupt_checkpoints_are_refused_and_untouched(tmp_path, corrupt):
     for iteration in (1, 2):
-        save_checkpoint(tmp_path, make_checkpoint(iteration))
+        save(tmp_path, iteration)
     corrupt(tmp_path)
     before = contents(tmp_path)
     with pytest.raises(CheckpointError, match=r"expected|match"):
@@ -114,7 +127,7 @@ def test_corrupt_checkpoints_are_refused_and_untouched(tmp_path, corrupt):
 
 def test_a_corrupt_checkpoint_names_the_older_one(tmp_path):
     for iteration in (1, 2):
-        save_checkpoint(tmp_path, make_checkpoint(iteration))
+        save(tmp_path, iteration)
     _flip(tmp_path / "000002/model.safetensors")
     with pytest.raises(CheckpointError, match="000001"):
         load_checkpoint(tmp_path)

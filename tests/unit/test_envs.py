@@ -93,6 +93,7 @@ def test_check_env():
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("gl")
 @pytest.mark.skipif(has_display(), reason="would open a window for the mode 'human'")
 @pytest.mark.parametrize(
@@ -314,7 +315,10 @@ def test_yaw_is_continuous_through_half_a_turn():
     env = make()
     start = np.concatenate([[0.0, 0.0, np.pi - 0.01], (0.0977 * OUTWARD).ravel()])
     env.reset(options={"state": start})
-    env._state[2] = 3 * np.pi - 0.01  # as if the cube had made one more turn
+    for part in range(1, 7):  # one more turn
+        yaw = np.pi - 0.01 + part * np.pi / 3
+        env.data.qpos[3:7] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
+        assert env.step(REST)[0]["state"][2] == pytest.approx(yaw, abs=1e-4)
     assert env.step(REST)[0]["state"][2] == pytest.approx(3 * np.pi - 0.01, abs=1e-4)
     info = env.reset(options={"state": start, "goal": [0, 0, 0.5]})[1]
     assert info["yaw_error"] == pytest.approx(np.pi - 0.51, abs=1e-6)

@@ -11,7 +11,7 @@ import difflcs_envs
 from difflcs_envs.trifinger import native
 from difflcs_envs.trifinger.env import TriFingerMoveCubeEnv, TriFingerMoveObjectEnv, TriFingerTurnCubeEnv
 
-pytestmark = pytest.mark.skipif(native._stepper is None, reason="the stepper is not compiled for this Python")
+pytestmark = pytest.mark.skipif(native.stepper is None, reason="the stepper is not compiled for this Python")
 ENVS = [
     (TriFingerMoveCubeEnv, {}),
     (TriFingerMoveObjectEnv, {"object": "banana", "object_source": "stand_in"}),
@@ -89,7 +89,7 @@ def test_instability_in_the_first_step_is_noticed(tmp_path, monkeypatch):
 
 
 def test_falls_back_to_python(monkeypatch):
-    monkeypatch.setattr(native, "_stepper", None)
+    monkeypatch.setattr(native, "stepper", None)
     env = TriFingerMoveCubeEnv()
     assert env.physics.lane is None
     env.reset(seed=0)

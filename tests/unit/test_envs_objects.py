@@ -70,6 +70,7 @@ def stl(tmp_path):
 # --- meshes ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_any_mesh(stl):
     mesh = bracket()
     mesh.apply_transform(trimesh.transformations.rotation_matrix(1.0, [1, 2, 3], [0.1, 0.2, 0.3]))
@@ -147,11 +148,12 @@ def test_a_mesh_that_would_take_minutes_is_refused_at_once(stl, tmp_path):
     assert time.monotonic() - start < 10
 
 
+@pytest.mark.slow
 def test_processes_decompose_a_mesh_once(stl, tmp_path):
     path = stl(bracket())
     code = (
-        "import sys; from difflcs_envs.trifinger import meshes, objects; d = meshes._decompose\n"
-        "meshes._decompose = lambda *a: print('decomposed') or d(*a)\n"
+        "import sys, coacd; from difflcs_envs.trifinger import objects; run = coacd.run_coacd\n"
+        "coacd.run_coacd = lambda *a, **k: print('decomposed') or run(*a, **k)\n"
         "objects.make_object(sys.argv[1])"
     )
     environment = {**os.environ, "DIFFLCS_CACHE_DIR": str(tmp_path / "cache")}
@@ -197,11 +199,12 @@ def test_unknown_rest_pose(stl):
         make(stl(trimesh.creation.box((0.06, 0.04, 0.03))), rest_pose=9)
 
 
+@pytest.mark.slow
 def test_parts_are_cached_and_a_damaged_cache_is_mended(stl, tmp_path, monkeypatch):
     monkeypatch.setenv("DIFFLCS_CACHE_DIR", str(tmp_path / "cache"))
     calls = []
-    decompose = meshes._decompose
-    monkeypatch.setattr(meshes, "_decompose", lambda *a: calls.append(a) or decompose(*a))
+    decompose = coacd.run_coacd
+    monkeypatch.setattr(coacd, "run_coacd", lambda *a, **k: calls.append(a) or decompose(*a, **k))
     path = stl(bracket())
     first = make(path).object.describe()
     (cached,) = (tmp_path / "cache" / "parts").iterdir()
@@ -218,6 +221,7 @@ def test_parts_are_cached_and_a_damaged_cache_is_mended(stl, tmp_path, monkeypat
     assert all(not p.name.startswith(".") for p in cached.parent.iterdir())
 
 
+@pytest.mark.slow
 def test_a_cache_that_cannot_be_written_is_done_without(stl, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("DIFFLCS_CACHE_DIR", str(tmp_path / "file"))
@@ -256,8 +260,7 @@ def test_stand_ins_have_size_mass_and_rest(name):
 @pytest.mark.parametrize("name", list(YCB))
 def test_objects_slide_and_turn_when_pushed(name):
     env = stand_in(name, horizon=100, osc_kp=2500.0)
-    env.reset(seed=0)
-    state, start = env._state, env._state
+    state = start = env.reset(seed=0)[0]["state"]
     deepest = 0.0
     for step in range(25):
         action = np.zeros((3, 2))
@@ -271,6 +274,7 @@ def test_objects_slide_and_turn_when_pushed(name):
     assert deepest < 0.001
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "noise", "episodes"),
     [
@@ -429,8 +433,8 @@ def test_tips_keep_their_height_and_rest_where_they_are():
     env = stand_in("mug")
     state = env.reset(seed=0)[0]["state"]
     for _ in range(10):
-        env.step(REST)
-    np.testing.assert_allclose(env._state[3:], state[3:], atol=1e-4)
+        last = env.step(REST)[0]["state"]
+    np.testing.assert_allclose(last[3:], state[3:], atol=1e-4)
     np.testing.assert_allclose(env.data.site_xpos[:, 2], 0.04, atol=1e-4)
 
 
@@ -446,6 +450,7 @@ def test_pulling_at_the_end_of_the_reach_stays_finite():
     assert np.all(np.linalg.norm(observation["state"][3:].reshape(3, 2), axis=1) < 0.2)
 
 
+@pytest.mark.slow
 def test_gallery(tmp_path, monkeypatch):
     pytest.importorskip("imageio_ffmpeg", reason="needs the extra [viz]")
     from difflcs_envs import RenderingError, gallery

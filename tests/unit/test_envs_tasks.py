@@ -38,6 +38,16 @@ def test_all_are_found_without_mujoco():
     assert set(NAMES) <= set(task_names())
 
 
+def test_what_a_program_registers_itself_is_not_replaced_by_what_is_installed():
+    code = (
+        "from difflcs.rl.tasks import get_task, register_task, task_names\n"
+        "from difflcs_envs.tasks import MOVE, trifinger_task\n"
+        "mine = register_task(trifinger_task('cube', 'TriFingerMoveCube-v0', MOVE, 'Mine.', ()))\n"
+        "assert get_task('cube') is mine and 'mug' in task_names()"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_sizes_bounds_and_times_are_those_of_the_environment(name):
     task = get_task(name)

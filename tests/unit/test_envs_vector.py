@@ -101,6 +101,7 @@ def test_threads_and_place_in_the_vector_change_nothing():
         np.testing.assert_array_equal(states(num_envs, threads, place), expected)
 
 
+@pytest.mark.slow
 def test_deterministic_across_processes():
     code = (
         "import gymnasium as g, numpy as np\n"

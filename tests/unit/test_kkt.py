@@ -174,6 +174,7 @@ class Dense:
                 for k, a, b in zip(t, direct, implicit, strict=True)}  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("upstream", "bound", "per_element"),
     [(upstream, 0.15, False) for upstream in ("x", "u", "lam", "objective")]

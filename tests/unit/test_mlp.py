@@ -1,7 +1,7 @@
 """PPO with a network instead of the MPC, on a small system that needs no simulator."""
 
-import inspect
-from dataclasses import asdict, replace
+from dataclasses import replace
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -14,10 +14,17 @@ from difflcs.errors import CheckpointError, InvalidInputError
 
 pytest.importorskip("torchrl")
 from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
+from difflcs.rl.critic import CriticSettings
 from difflcs.rl.evaluate import evaluate
-from difflcs.rl.mlp import MLPConfig, MLPController
+from difflcs.rl.methods import get_method
+from difflcs.rl.mlp import MLPController
 from difflcs.rl.policy import make_actor
-from difflcs.rl.ppo import PPO, PPOConfig, network_tensors
+from difflcs.rl.ppo import PPO
+from difflcs.rl.ppo_settings import PPOSettings, make_ppo
+from difflcs.rl.rollout import collect, elapsed_fractions, mpc_actions
+from difflcs.rl.seeding import Stream, episode_seeds
+from difflcs.rl.settings import Adam, Epochs
+from difflcs.rl.state import flatten
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -58,23 +65,34 @@ def make_network(width: int = 16, seed: int = 0) -> MLPController:
     return MLPController(features, 3, -BOUND, BOUND, width, STEPS, torch.Generator().manual_seed(seed))
 
 
-def make_trainer(seed: int = 0, iterations: int = 3, **changes) -> PPO:
-    small = MLPConfig(rollouts=ROLLOUTS, steps=6, minibatch=50, std=0.03, std_range=(0.01, 0.1), value_first_epochs=10)
-    config = replace(small, **changes)
-    return PPO(
-        make_actor(make_network(config.width), config),
+SETTINGS: PPOSettings = replace(
+    get_method("ppo-mlp")().ppo,
+    rollouts=ROLLOUTS,
+    steps=6,
+    minibatch=50,
+    std=0.03,
+    std_range=(0.01, 0.1),
+    critic=CriticSettings(epochs=Epochs(first=10, each=10, minibatch=256)),
+)
+
+
+def make_trainer(seed: int = 0, iterations: int = 3, width: int = 64, **changes: Any) -> PPO:
+    settings = replace(SETTINGS, **changes)
+    return make_ppo(
+        make_actor(make_network(width), settings.std, settings.covariance),
         SyncVectorEnv([Slide] * ROLLOUTS),
-        config,
+        settings,
         seed,
         features=features,
         total_episodes=iterations * ROLLOUTS,
         episode_steps=STEPS,
+        failure_penalty=10.0,
     )
 
 
 def test_it_learns():
-    trainer = make_trainer(iterations=12, steps=30, learning_rate=3e-3, std_learning_rate=3e-3)
-    envs = trainer.env
+    trainer = make_trainer(iterations=12, steps=30, adam=Adam(3e-3, (0.9, 0.999)), std_learning_rate=3e-3)
+    envs = trainer.robot.env
     before = evaluate(envs, trainer.policy, 60, 0, STEPS).success_rate
     while not trainer.done:
         report = trainer.step()
@@ -83,7 +101,7 @@ def test_it_learns():
     assert report.solver_failures == 0
     assert report.gradient_steps == 30
     assert report.std != pytest.approx(0.03)
-    assert trainer.checkpoint().model is None
+    assert trainer.learned is trainer.policy
 
 
 def test_actions_stay_within_the_bounds_and_depend_on_the_time():
@@ -112,14 +130,19 @@ def test_it_starts_near_the_middle_of_the_bounds():
 
 
 def test_training_and_evaluation_see_the_same_time():
-    """The actor gets the elapsed time with the data, the controller counts its steps."""
-    trainer = make_trainer()
-    _, data, *_ = trainer._collect(trainer.env, list(range(ROLLOUTS)))
-    torch.testing.assert_close(data["elapsed"][0], torch.arange(STEPS).double() / STEPS)
-    trainer.policy.begin()
-    for t in range(STEPS):
-        action = trainer.policy(data["state"][:, t], data["goal"][:, t]).action
-        torch.testing.assert_close(action, data["loc"][:, t])
+    """The actor gets the elapsed time with the data, the controller counts its steps: without noise they agree."""
+    trainer = make_trainer(std=1e-9)
+    seen = []
+    inner = trainer.robot.env.step
+    trainer.robot.env.step = lambda actions: (seen.append(actions.copy()), inner(actions))[1]
+    seeds = episode_seeds(0, Stream.TRAINING, 0, ROLLOUTS)
+    wanted = collect(SyncVectorEnv([Slide] * ROLLOUTS), mpc_actions(trainer.policy), seeds, STEPS)["action"]
+    trainer.step()
+    torch.testing.assert_close(torch.from_numpy(np.stack(seen, 1)), wanted, rtol=0, atol=1e-7)
+    elapsed = elapsed_fractions(STEPS)
+    torch.testing.assert_close(elapsed, torch.arange(STEPS + 1).double() / STEPS)
+    mean = torch.stack([make_network(64).mean(torch.zeros(1), torch.zeros(1), t) for t in elapsed])
+    assert len(set(mean.flatten().tolist())) == STEPS + 1  # it does depend on the time
 
 
 def test_the_initial_weights_are_the_generators():
@@ -136,18 +159,19 @@ def test_resumed_equals_uninterrupted_bitwise(tmp_path):
         through.step()
     first = make_trainer()
     first.step()
-    save_checkpoint(tmp_path, first.checkpoint())
+    save_checkpoint(tmp_path, first.iteration, first.state_dict())
     second = make_trainer()
-    second.restore(load_checkpoint(tmp_path))
+    second.load(load_checkpoint(tmp_path))
     torch.manual_seed(7)  # the global generator must not matter
     while not second.done:
         second.step()
-    for name, value in through._tensors().items():
-        assert torch.equal(value, second._tensors()[name]), name
-    saved = network_tensors(through.checkpoint())
-    assert all(torch.equal(value, saved[name]) for name, value in second.learned.state_dict().items())
+    (tensors, rest), (own, other) = flatten(through.state_dict()), flatten(second.state_dict())
+    assert rest == other
+    assert tensors.keys() == own.keys()
+    for name, value in tensors.items():
+        assert torch.equal(value, own[name]), name
     with pytest.raises(CheckpointError, match="other settings"):
-        make_trainer(width=8).restore(load_checkpoint(tmp_path))
+        make_trainer(width=8).load(load_checkpoint(tmp_path))
 
 
 def test_saved_and_loaded(tmp_path):
@@ -162,23 +186,14 @@ def test_saved_and_loaded(tmp_path):
         MLPController.from_pretrained(tmp_path, features)
 
 
-@pytest.mark.parametrize("change", [{"beta": 0.5}, {"sample_clip": 3.0}])
+@pytest.mark.parametrize("change", [{"beta": 0.5}, {"update": "natural"}])
 def test_what_needs_an_lcs_is_refused(change):
     with pytest.raises(InvalidInputError, match="without an LCS"):
-        MLPConfig(**change)
-    config = PPOConfig(learn_std=True, **change)
-    envs, actor = SyncVectorEnv([Slide] * ROLLOUTS), make_actor(make_network(), config)
-    with pytest.raises(InvalidInputError, match="without an LCS"):
-        PPO(actor, envs, config, 0, features=features, total_episodes=ROLLOUTS, episode_steps=STEPS)
+        make_trainer(**change)
 
 
 def test_settings():
     with pytest.raises(InvalidInputError, match="width"):
-        MLPConfig(width=0)
+        get_method("ppo-mlp")(width=0)
     with pytest.raises(InvalidInputError, match="rollouts"):
-        MLPConfig(rollouts=0)
-    assert set(asdict(PPOConfig())) < set(asdict(MLPConfig()))
-    source = inspect.getsource(MLPConfig)
-    for name in MLPConfig.__annotations__:
-        line = source.index(f"    {name}: ")
-        assert source[line:].split("\n")[1].strip().startswith('"""'), name
+        replace(SETTINGS, rollouts=0)

@@ -290,6 +290,7 @@ def test_backward_twice_through_a_retained_graph_is_the_same(layer, x0):
     assert torch.equal(first, second)
 
 
+@pytest.mark.slow
 def test_gradient_descent_through_the_layer_lowers_a_loss(build, x0):
     target = make_layer(build)(x0).action
     model = LCSModel.from_params(build.params(4))
@@ -444,6 +445,7 @@ def test_the_inputs_are_left_as_they_were(layer, x0):
     assert all(torch.equal(v, state[k]) for k, v in layer.state_dict().items())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["batched", "ipopt"])
 def test_a_plan_is_freed_without_the_garbage_collector(build, x0, backend):
     """Outputs kept by their own autograd node would form a cycle: memory would grow from call to call."""

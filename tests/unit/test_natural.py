@@ -6,10 +6,13 @@ import torch
 from torch import nn
 
 pytest.importorskip("torchrl")
-from difflcs.rl.natural import NaturalGradient
-from tests.training.test_ppo import improve, make_ppo, prepared
+from difflcs.rl.optim import NaturalGradient, StepSize
+from difflcs.rl.policy import make_actor
+from tests.training.slide import drawn, make_model, make_mpc
 
 pytestmark = pytest.mark.usefixtures("one_thread")
+
+STD = 0.03
 
 
 def make(momentum: float = 0.0, damping: float = 0.0, lr: float = 0.3) -> tuple[list[nn.Parameter], NaturalGradient]:
@@ -100,10 +103,10 @@ def test_nothing_runs_away_where_no_action_can_move():
     assert torch.equal(optimiser.metric, metric)
     assert torch.equal(flat(parameters), moved)
 
-    trainer = make_ppo(target_kl=0.08)
+    size = StepSize(0.06, target_kl=0.08, factor=1.5, longest=0.4)
     for _ in range(30):
-        trainer.learning_rate = trainer._adapt(0.0)
-    assert trainer.learning_rate == pytest.approx(0.4)
+        size.adapt(0.0)
+    assert size.value == pytest.approx(0.4)
 
 
 def test_samples_near_a_jump_do_not_make_the_metric():
@@ -116,12 +119,10 @@ def test_samples_near_a_jump_do_not_make_the_metric():
 
 def test_jacobian_of_the_mpc():
     """Against central differences of the planned action, in standard deviations."""
-    trainer = make_ppo()
-    data, _ = prepared(trainer)
-    data = data[:6]
-    data["guess"] = data["plan"].clone()
-    found = trainer._jacobian(data)
-    learned = [p for p in trainer.lcs.parameters() if p.requires_grad]
+    actor = make_actor(make_mpc(make_model()), STD)
+    data = drawn(actor, 6)
+    found = actor.jacobian(data)
+    learned = [p for p in actor.learned.parameters() if p.requires_grad]
     columns = []
     for p in learned:
         for i in range(p.numel()):
@@ -129,28 +130,20 @@ def test_jacobian_of_the_mpc():
             for step in (1e-5, -1e-5):
                 with torch.no_grad():
                     p.view(-1)[i] += step
-                    ends.append(trainer.policy(data["state"], data["goal"]).action)
+                    ends.append(actor.mpc(data["state"], data["goal"]).action)
                     p.view(-1)[i] -= step
-            columns.append((ends[0] - ends[1]) / 2e-5 / trainer.config.std)
+            columns.append((ends[0] - ends[1]) / 2e-5 / STD)
     assert bool(found.any())
     torch.testing.assert_close(found, torch.stack(columns, -1), rtol=1e-4, atol=1e-4)
 
 
 def test_the_metric_is_the_fisher_matrix():
     """The mean outer product of the scores of many sampled actions."""
-    trainer = make_ppo()
-    data, _ = prepared(trainer)
-    data["guess"] = data["plan"].clone()
-    jacobian = trainer._jacobian(data)
-    trainer._optimiser.measure(jacobian)
+    actor = make_actor(make_mpc(make_model()), STD)
+    jacobian = actor.jacobian(drawn(actor, 72))
+    optimiser = NaturalGradient([p for p in actor.learned.parameters() if p.requires_grad], 0.1, 0.0, 0.1)
+    optimiser.measure(jacobian)
     noise = torch.from_numpy(np.random.default_rng(0).normal(size=(4000, *jacobian.shape[:2])))
     scores = torch.einsum("kni,nip->knp", noise, jacobian).flatten(0, 1)
     sampled = scores.mT @ scores / len(scores)
-    torch.testing.assert_close(trainer._optimiser.metric, sampled, rtol=0.05, atol=0.02 * float(sampled.abs().max()))
-
-
-def test_the_length_of_a_step_is_its_kl_divergence():
-    trainer = make_ppo(steps=2, natural_step=0.01, minibatch=None, jump_kl=10.0, kl_quantile=1.0)
-    data, rollouts = prepared(trainer)
-    outcome = improve(trainer, data, rollouts)  # its KL is that of the first step
-    assert outcome.kl == pytest.approx(0.5 * 0.01**2, rel=0.1)
+    torch.testing.assert_close(optimiser.metric, sampled, rtol=0.05, atol=0.02 * float(sampled.abs().max()))

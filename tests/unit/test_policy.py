@@ -120,7 +120,7 @@ def test_a_guess_leads_back_to_the_rollouts_optimum(mpc):
 
 
 def test_gradients_are_those_of_finite_differences(mpc):
-    policy = LCSMPCPolicy(mpc, STD, covariance="full", learn_std=True)
+    policy = LCSMPCPolicy(mpc, STD, covariance="full")
     with torch.no_grad():
         policy.gaussian.mixing.copy_(torch.tensor([[9.0, 9.0], [0.4, 9.0]]))  # only the entry below the diagonal counts
         data = policy(observations(8))
@@ -168,14 +168,8 @@ def test_what_is_learned(mpc):
 
     model = set("ABCdDEGHc")
     assert learned() == model
-    assert learned(learn_std=True) == model | {"log_std"}
-    assert learned(learn_std=True, covariance="full") == model | {"log_std", "mixing"}
-
-
-def test_set_std(mpc):
-    policy = LCSMPCPolicy(mpc, STD)
-    policy.set_std(0.004)
-    torch.testing.assert_close(policy.std, torch.full((2,), 0.004, dtype=torch.float64))
+    assert learned(covariance="diagonal") == model | {"log_std"}
+    assert learned(covariance="full") == model | {"log_std", "mixing"}
 
 
 @pytest.mark.parametrize(
@@ -187,7 +181,6 @@ def test_set_std(mpc):
         ({"std": torch.tensor([0.1])}, InvalidInputError, "n_u=2"),
         ({"in_keys": ("state",)}, InvalidInputError, "two keys"),
         ({"covariance": "round"}, InvalidInputError, "covariance"),
-        ({"covariance": "full"}, InvalidInputError, "learn_std=True"),
     ],
 )
 def test_bad_arguments(mpc, arguments, error, message):

@@ -113,7 +113,8 @@ def replace_failed(problem: MPCProblem, primal: Primal, failed: Tensor) -> Prima
     return Primal(*fixed)
 
 
-_REGISTRY: dict[str, type[Backend]] = {}
+REGISTRY: dict[str, type[Backend]] = {}
+"""Every registered backend by its name, whether its packages are installed or not."""
 
 
 def register_backend(backend: type[Backend]) -> type[Backend]:
@@ -126,13 +127,13 @@ def register_backend(backend: type[Backend]) -> type[Backend]:
         isinstance(backend, type) and issubclass(backend, Backend) and isinstance(getattr(backend, "name", None), str)
     ):
         raise DTypeError(f"backend: expected a subclass of Backend with a `name`, got {backend!r}")
-    _REGISTRY[backend.name] = backend
+    REGISTRY[backend.name] = backend
     return backend
 
 
 def available_backends() -> tuple[str, ...]:
     """Names of the backends whose packages are installed."""
-    return tuple(name for name, backend in _REGISTRY.items() if not backend.missing())
+    return tuple(name for name, backend in REGISTRY.items() if not backend.missing())
 
 
 def get_backend(backend: str | Backend) -> Backend:
@@ -143,12 +144,12 @@ def get_backend(backend: str | Backend) -> Backend:
     """
     if not isinstance(backend, str | Backend):
         raise DTypeError(f"backend: expected a name or a Backend instance, got {backend!r}")
-    if isinstance(backend, str) and backend not in _REGISTRY:
+    if isinstance(backend, str) and backend not in REGISTRY:
         raise BackendNotFoundError(
-            f"backend: expected one of {', '.join(map(repr, _REGISTRY))}, got {backend!r}; "
+            f"backend: expected one of {', '.join(map(repr, REGISTRY))}, got {backend!r}; "
             f"add your own with difflcs.register_backend"
         )
-    found = _REGISTRY[backend] if isinstance(backend, str) else type(backend)
+    found = REGISTRY[backend] if isinstance(backend, str) else type(backend)
     if found.missing():
         raise BackendNotFoundError(
             f"backend {found.name!r}: the package {found.missing()[0]!r} is not installed; run: {found.install}"

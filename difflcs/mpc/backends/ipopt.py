@@ -212,6 +212,11 @@ def _cpus() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def worker_pids() -> tuple[int, ...]:
+    """Process ids of the workers of this process, in the order in which they are used."""
+    return tuple(worker.process.pid for worker in _locals.pool.workers)
+
+
 class _Locals:
     """What belongs to this process: a forked child must neither talk to its parent's workers nor hold its locks."""
 

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from difflcs.errors import CheckpointError
+from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs.lcs import LCSParams
 from difflcs.rl.optim.natural import Natural, NaturalGradient
 from difflcs.rl.settings import Adam
 from difflcs.rl.state import State, initialise_moments, load_moments, moments
@@ -142,8 +143,15 @@ class UpdateRule:
 
 
 def learned_parameters(actor: GaussianPolicy) -> list[nn.Parameter]:
-    """What is learned of the model behind the mean of a policy."""
-    return [p for p in actor.learned.parameters() if p.requires_grad]  # pyright: ignore[reportAttributeAccessIssue]
+    """What is learned of the model behind the mean of a policy.
+
+    Raises:
+        InvalidInputError: the model is fixed.
+    """
+    learned = actor.learned
+    if isinstance(learned, LCSParams):
+        raise InvalidInputError("actor: expected a model that can be learned, got fixed LCSParams; use an LCSModel")
+    return [p for p in learned.parameters() if p.requires_grad]
 
 
 class AdamUpdate(UpdateRule):

@@ -20,9 +20,9 @@ import mujoco
 import numpy as np
 
 try:
-    from difflcs_envs._native import _stepper  # pyright: ignore[reportMissingModuleSource]
+    from difflcs_envs._native import _stepper as stepper  # pyright: ignore[reportMissingModuleSource]
 except ImportError:  # not compiled for this Python
-    _stepper = None
+    stepper = None
 
 if TYPE_CHECKING:
     from difflcs_envs._native._stepper import Lane  # pyright: ignore[reportMissingModuleSource]
@@ -72,7 +72,7 @@ def native_lane(
         (`DIFFLCS_ENVS_NATIVE=0`).
     """
     functions = _function_addresses() if os.environ.get(NATIVE_VARIABLE, "1") != "0" else None
-    if _stepper is None or functions is None or not hasattr(data, "_address"):
+    if stepper is None or functions is None or not hasattr(data, "_address"):
         return None
     counters = data.warning.number  # a strided view into the data
     views = [*fields.values(), data.qpos]
@@ -85,7 +85,7 @@ def native_lane(
         "data": data._address,
         "warnings": [first + stride * kind for kind in warnings],
     }
-    lane = _stepper.make_lane(functions, addresses, constants)
+    lane = stepper.make_lane(functions, addresses, constants)
     before = data.time
     data.time = probe = 0.123456789
     same = lane.time == probe and _is_live(data, counters)
@@ -115,5 +115,5 @@ def step_lanes(
         stable: Gets whether each lane is still sane, (n,) bool. Those that are not must be restored by the caller.
         threads: Most threads to use.
     """
-    assert _stepper is not None
-    _stepper.step_lanes(lanes, actions, states, stable, threads)
+    assert stepper is not None
+    stepper.step_lanes(lanes, actions, states, stable, threads)

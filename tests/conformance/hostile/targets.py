@@ -15,8 +15,8 @@ from difflcs import LCSModel, LCSMPCLayer, LCSParams, QuadraticCost, Status, sol
 from difflcs.errors import DiffLCSError, DiffLCSWarning
 from difflcs.mpc import Primal
 from difflcs.mpc.backends import IpoptBackend
-from tests.hostile import checks
-from tests.hostile.generators import LCP, MPC, Loss
+from tests.conformance.hostile import checks
+from tests.conformance.hostile.generators import LCP, MPC, Loss
 
 REFUSED = -1  # in place of a status: a typed error
 SYSTEM = ("A", "B", "C", "d", "D", "E", "F", "c")

@@ -11,8 +11,8 @@ from numpy.random import Generator
 
 from difflcs import solve_lcp, violation_loss
 from difflcs.errors import DiffLCSError, DoubleBackwardError
-from tests.hostile.generators import LCP, MPC, Loss
-from tests.hostile.targets import INPUTS, REFUSED, Outcome, layer_of, leaves_of, model_of, quiet
+from tests.conformance.hostile.generators import LCP, MPC, Loss
+from tests.conformance.hostile.targets import INPUTS, REFUSED, Outcome, layer_of, leaves_of, model_of, quiet
 
 Tensors = dict[str, torch.Tensor]
 # Leaves → named outputs, and what is a function of them.

@@ -1,8 +1,8 @@
 """The campaign: every class of hostile problems over every target, each returned element judged.
 
-    python -m tests.hostile.campaign --count 1000000 --seed 0 --out results.jsonl
-    python -m tests.hostile.campaign --markdown results.jsonl --fill docs/promises.md
-    python -m tests.hostile.campaign --only "mpc-flat/warm" --seed 0 --index 17
+    python -m tests.conformance.hostile.campaign --count 1000000 --out results.jsonl
+    python -m tests.conformance.hostile.campaign --markdown results.jsonl --fill
+    python -m tests.conformance.hostile.campaign --only "mpc-flat/warm" --seed 0 --index 17
 
 A run appends one line per chunk to its file and, started again, goes on from there. A chunk depends on the class, the
 seed and its number alone, so that seed and index of an element give it back.
@@ -26,8 +26,8 @@ import numpy as np
 import torch
 
 from difflcs import Status
-from tests.hostile import generators, rules, targets
-from tests.hostile.targets import Outcome
+from tests.conformance.hostile import generators, rules, targets
+from tests.conformance.hostile.targets import Outcome
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ def line(record: Record) -> str:
 def reproduction(record: Record) -> str:
     """The command that shows the first silent failure of a record."""
     index = record.failures[0][0] if record.failures else 0
-    return f'python -m tests.hostile.campaign --only "{record.cell}" --seed {record.seed} --index {index}'
+    return f'python -m tests.conformance.hostile.campaign --only "{record.cell}" --seed {record.seed} --index {index}'
 
 
 def read(path: Path) -> list[Record]:
@@ -191,6 +191,7 @@ def markdown(records: list[Record]) -> str:
     return "\n".join(lines)
 
 
+PAGE = Path("docs/promises.md")
 BEGIN, END = "<!-- campaign: begin -->\n", "<!-- campaign: end -->\n"
 
 
@@ -232,7 +233,9 @@ def main() -> None:
     parser.add_argument("--index", type=int, help="show this one element of --only")
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--markdown", type=Path, help="print the table of a results file and end")
-    parser.add_argument("--fill", type=Path, help="with --markdown: put it into this page instead, docs/promises.md")
+    parser.add_argument(
+        "--fill", type=Path, nargs="?", const=PAGE, help=f"with --markdown: put it into this page instead, {PAGE}"
+    )
     options = parser.parse_args()
     if options.markdown:
         records = read(options.markdown)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 
-from tests.hostile.generators import LCP, MPC, Loss
+from tests.conformance.hostile.generators import LCP, MPC, Loss
 
 Ratios = dict[str, np.ndarray]
 
@@ -120,10 +120,10 @@ def judge_mpc(
         rounding = SINGLE if single else 0.0
         low, high = bounds_in(problem, dtype)
         now, after = x[:, :-1], x[:, 1:]
-        predicted, next_terms = _affine(a, "ABCd", now, u, lam)
+        predicted, next_terms = affine(a, "ABCd", now, u, lam)
         step = after - predicted
-        s, s_terms = _affine(a, "DEFc", now, u, lam)
-        cost, cost_terms = _cost(problem, a, x, u, low, high)
+        s, s_terms = affine(a, "DEFc", now, u, lam)
+        cost, cost_terms = cost_of(problem, a, x, u, low, high)
         relaxation = problem.relaxation
         stationary = stationarity(problem, a, x, u, lam, s, s_terms, low, high, rounding)
         if (stationary > 1).any():
@@ -149,7 +149,7 @@ def judge_mpc(
         }
 
 
-def _affine(a: dict, names: str, x, u, lam) -> tuple[np.ndarray, np.ndarray]:
+def affine(a: dict, names: str, x, u, lam) -> tuple[np.ndarray, np.ndarray]:
     """Left x + middle u + right λ + constant by four names, and the sum of the sizes of its terms."""
     matrices, constant = [a[k] for k in names[:3]], a[names[3]][:, None]
     pairs = list(zip(matrices, (x, u, lam), strict=True))
@@ -157,7 +157,7 @@ def _affine(a: dict, names: str, x, u, lam) -> tuple[np.ndarray, np.ndarray]:
     return value, sum((_mv(np.abs(M), np.abs(v)) for M, v in pairs), np.abs(constant))
 
 
-def _cost(problem: MPC, a: dict, x, u, low, high) -> tuple[np.ndarray, np.ndarray]:
+def cost_of(problem: MPC, a: dict, x, u, low, high) -> tuple[np.ndarray, np.ndarray]:
     """Cost of a trajectory and the sum of the sizes of its terms, (count,)."""
 
     def quadratic(Q, v):
@@ -265,7 +265,7 @@ def judge_relaxed_program(
     """Promises of backend `relaxed`, whose convex program keeps dynamics, bounds and signs, but not λ∘s = ε."""
     with np.errstate(all="ignore"):
         ratios = judge_mpc(problem, x, u, lam, objective, dtype)
-        s, terms = _affine(problem.full(), "DEFc", x[:, :-1], u, lam)
+        s, terms = affine(problem.full(), "DEFc", x[:, :-1], u, lam)
         kept = ("finite", "start", "bounds", "dynamics", "objective", "answer")
         return {
             **{k: ratios[k] for k in kept},

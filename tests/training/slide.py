@@ -1,0 +1,166 @@
+"""A small pushing system that needs no simulator, and trainers on it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.vector import SyncVectorEnv
+from tensordict import TensorDict
+from torch import Tensor
+
+from difflcs import GoalCost, LCSModel, LCSMPCLayer
+from difflcs.rl import (
+    CriticSettings,
+    EnsembleSettings,
+    Epochs,
+    ModelRollouts,
+    ModelRolloutSettings,
+    PPOSettings,
+    ppo_settings,
+)
+from difflcs.rl.policy import GaussianPolicy, make_actor
+from difflcs.rl.ppo import PPO
+
+STEPS = 6
+U_MAX = 0.1
+ROLLOUTS = 12
+PENALTY = 10.0
+
+
+class Slide(gymnasium.Env):
+    """x₊ = x + gain·u: what a model with another B must find out."""
+
+    observation_space = spaces.Dict(
+        {"state": spaces.Box(-10.0, 10.0, (1,), np.float64), "goal": spaces.Box(-1.0, 1.0, (1,), np.float64)}
+    )
+    action_space = spaces.Box(-U_MAX, U_MAX, (1,), np.float64)
+
+    def __init__(self, breaks_at: int | None = None, reward: float | None = None, penalty: float = PENALTY):
+        self.breaks_at, self.reward, self.penalty = breaks_at, reward, penalty
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps, self.state, self.goal = 0, np.zeros(1), self.np_random.uniform(-0.3, 0.3, 1)
+        return {"state": self.state.copy(), "goal": self.goal.copy()}, {}
+
+    def step(self, action):
+        error = float(abs(self.state - self.goal)[0])
+        self.state = self.state + 0.5 * np.asarray(action)
+        self.steps += 1
+        broken = self.steps == self.breaks_at
+        success = float(abs(self.state - self.goal)[0]) < 0.05
+        last = self.steps >= STEPS
+        info = {"success": success, "physics_error": broken}
+        reward = -20 * error - self.penalty * (last and not success) if self.reward is None else self.reward
+        return {"state": self.state.copy(), "goal": self.goal.copy()}, reward, False, last or broken, info
+
+
+def outcome(state, action, after, goal, ended):
+    """`Slide`'s, for model rollouts."""
+    success = (after - goal).abs().squeeze(-1) < 0.05
+    return -20 * (state - goal).abs().squeeze(-1) - PENALTY * (ended & ~success), success
+
+
+def features(state, goal, elapsed):
+    return torch.cat([10 * (state - goal), 10 * (state - goal).abs(), elapsed.unsqueeze(-1)], -1)
+
+
+def make_envs(count: int = ROLLOUTS, **kwargs) -> SyncVectorEnv:
+    return SyncVectorEnv([lambda: Slide(**kwargs)] * count)
+
+
+def make_model(seed: int = 0) -> LCSModel:
+    """x₊ = 0.97 x + 0.1 u: the effect of an action is underestimated five times, so that the MPC hardly acts."""
+    lcs = LCSModel(1, 1, 1, init_scale=0.01, learn_c=False, generator=torch.Generator().manual_seed(seed))
+    with torch.no_grad():
+        lcs.A.fill_(0.97)
+        lcs.B.fill_(0.1)
+    return lcs
+
+
+def make_mpc(lcs: LCSModel) -> LCSMPCLayer:
+    cost = GoalCost.reach(1, 1, goal_weight=(1.0,), input_weight=3.0)
+    return LCSMPCLayer(lcs, cost, horizon=3, u_min=-U_MAX, u_max=U_MAX, on_failure="mask")
+
+
+def small_settings(**changes: Any) -> PPOSettings:
+    critic = CriticSettings(epochs=Epochs(first=10, each=3, minibatch=256))
+    return replace(PPOSettings(rollouts=ROLLOUTS, steps=4, std=0.03, critic=critic), **changes)
+
+
+def slide_actor(settings: PPOSettings, lcs: LCSModel | None = None) -> GaussianPolicy:
+    return make_actor(make_mpc(make_model() if lcs is None else lcs), settings.std, settings.covariance)
+
+
+def make_ppo(
+    seed: int = 0,
+    iterations: int = 4,
+    env: SyncVectorEnv | None = None,
+    models: ModelRollouts | None = None,
+    penalty: float = PENALTY,
+    **changes: Any,
+) -> PPO:
+    settings = small_settings(**changes)
+    return ppo_settings.make_ppo(
+        slide_actor(settings),
+        make_envs(penalty=penalty) if env is None else env,
+        settings,
+        seed,
+        features=features,
+        total_episodes=iterations * ROLLOUTS,
+        episode_steps=STEPS,
+        failure_penalty=penalty,
+        models=models,
+    )
+
+
+def make_models(seed: int = 0, first_epochs: int = 20, **changes: Any) -> ModelRollouts:
+    epochs = Epochs(first=first_epochs, each=3, minibatch=128)
+    ensemble = EnsembleSettings(networks=2, width=16, epochs=epochs)
+    settings = replace(ModelRolloutSettings(iterations=2, rollouts=10, ensemble=ensemble), **changes)
+    return ModelRollouts(make_envs(), outcome, settings, seed, STEPS)
+
+
+class Recording:
+    """A part of a trainer that notes what it was called with and what it gave."""
+
+    def __init__(self, part: Any):
+        self.part, self.calls, self.results = part, [], []
+
+    def __call__(self, *arguments: Any) -> Any:
+        self.calls.append(arguments)
+        self.results.append(self.part(*arguments))
+        return self.results[-1]
+
+
+def recorded(trainer: PPO, source: str = "robot") -> Recording:
+    """Note what the advantages of a trainer are asked for: (episodes, inputs, rewards, key) → `Estimate`."""
+    part = getattr(trainer, source)
+    recording = Recording(part.advantages)
+    setattr(trainer, source, replace(part, advantages=recording))
+    return recording
+
+
+def drawn(actor: GaussianPolicy, count: int = 60, seed: int = 0) -> TensorDict:
+    """(count,) what a policy draws at random states, with its own plans as guesses."""
+    generator = torch.Generator().manual_seed(seed)
+    state, goal = (0.3 * (2 * torch.rand(count, 1, generator=generator, dtype=torch.float64) - 1) for _ in range(2))
+    data = TensorDict({"state": state, "goal": goal, "elapsed": torch.zeros(count).double()}, [count])
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        actor.act(data)
+    data["guess"] = data["plan"].clone()
+    return data
+
+
+def parameters(trainer: Any) -> list[Tensor]:
+    return [value.clone() for value in trainer.learned.state_dict().values()]
+
+
+def same(a: list[Tensor], b: list[Tensor]) -> bool:
+    return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))

@@ -1,0 +1,319 @@
+"""Model rollouts: the environment that an ensemble plays, its data, and the outcomes of tasks against MuJoCo."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+pytest.importorskip("torchrl")
+from tensordict import TensorDict
+
+from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs.rl import EnsembleSettings, Epochs, ModelRollouts, ModelRolloutSettings
+from difflcs.rl.dynamics import Ensemble
+from difflcs.rl.model_rollouts import ModelEnv
+from difflcs.rl.rollout import collect, uniform_actions
+from difflcs.rl.seeding import Stream, episode_seeds
+from difflcs.rl.state import flatten, restore
+from difflcs.rl.tasks import get_task
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+STEPS, N_X, N_U = 5, 2, 2
+SPACES = SimpleNamespace(
+    single_observation_space=spaces.Dict(
+        {"state": spaces.Box(-9.0, 9.0, (N_X,), np.float64), "goal": spaces.Box(-1.0, 1.0, (1,), np.float64)}
+    ),
+    single_action_space=spaces.Box(-0.1, 0.1, (N_U,), np.float64),
+)
+
+
+def small(width: int = 16, first: int = 3, minibatch: int = 8) -> ModelRolloutSettings:
+    ensemble = EnsembleSettings(networks=2, width=width, epochs=Epochs(first=first, each=2, minibatch=minibatch))
+    return ModelRolloutSettings(iterations=1, rollouts=4, ensemble=ensemble)
+
+
+def make_rollouts(**changes) -> ModelRollouts:
+    return ModelRollouts(SPACES, outcome, small(**changes), 0, STEPS)  # type: ignore[arg-type]
+
+
+def outcome(x, u, after, goal, ended):
+    success = (after[:, :1] - goal).abs().squeeze(-1) < 0.5
+    return -x[:, 0].abs() - u.square().sum(-1) - 3.0 * (ended & ~success), success
+
+
+class Drift(Ensemble):
+    """x₊ = x + u + 0.01 · (number of the network)."""
+
+    def forward(self, x, u):
+        number = torch.arange(self.networks, dtype=x.dtype).view(-1, 1, 1)
+        return x + u + 0.01 * number
+
+
+def make_env(ensemble: Ensemble | None = None, num_envs: int = 3) -> ModelEnv:
+    ensemble = ensemble or Drift(N_X, N_U, 2, 4)
+    env = ModelEnv(ensemble, outcome, num_envs, STEPS, SPACES.single_observation_space, SPACES.single_action_space)
+    real = episodes()
+    env.remember(real["state"], real["goal"])
+    return env
+
+
+def episodes(count: int = 6, seed: int = 0) -> TensorDict:
+    """Of x₊ = x + u."""
+    generator = torch.Generator().manual_seed(seed)
+    goals = torch.rand(count, 1, generator=generator, dtype=torch.float64)
+    actions = 0.2 * torch.rand(count, STEPS, N_U, generator=generator, dtype=torch.float64) - 0.1
+    states = [torch.randn(count, N_X, generator=generator, dtype=torch.float64)]
+    for k in range(STEPS):
+        states.append(states[-1] + actions[:, k])
+    return TensorDict({"state": torch.stack(states, 1), "action": actions, "goal": goals}, [count])
+
+
+def drawn(seed: int) -> np.ndarray:
+    """(STEPS,) the networks that predict the episode of a seed, which draws start and goal before them."""
+    rng = np.random.default_rng(seed)
+    rng.integers(6), rng.integers(6)
+    return rng.integers(2, size=STEPS)
+
+
+# --- the environment --------------------------------------------------------------------------------
+
+
+def test_steps_are_those_of_the_drawn_networks():
+    env = make_env()
+    observation, info = env.reset(seed=[4, 5, 6])
+    networks = np.stack([drawn(seed) for seed in (4, 5, 6)])
+    assert set(networks[:, :2].flatten()) == {0, 1}
+    assert info == {}
+    action = np.full((3, N_U), 0.1)
+    first, reward, terminated, truncated, info = env.step(action)
+    moved = first["state"] - observation["state"]
+    np.testing.assert_allclose(moved, 0.1 + 0.01 * networks[:, :1].repeat(2, 1), atol=1e-6)
+    np.testing.assert_allclose(reward, -abs(observation["state"][:, 0]) - 0.02, atol=1e-6)
+    np.testing.assert_array_equal(info["success"], abs(first["state"][:, :1] - first["goal"])[:, 0] < 0.5)
+    assert not terminated.any()
+    assert not truncated.any()
+    second = env.step(np.zeros((3, N_U)))[0]["state"] - first["state"]
+    np.testing.assert_allclose(second, 0.01 * networks[:, 1:2].repeat(2, 1), atol=1e-6)
+
+
+def test_starts_and_goals_are_real_ones():
+    real = episodes()
+    observation, _ = make_env(num_envs=40).reset(seed=0)
+    starts = {tuple(row) for row in real["state"][:, 0].tolist()}
+    assert {tuple(row) for row in observation["state"].tolist()} <= starts
+    assert {row[0] for row in observation["goal"].tolist()} <= {row[0] for row in real["goal"].tolist()}
+    assert len({tuple(row) for row in observation["state"].tolist()}) > 3
+
+
+def test_an_episode_depends_on_its_seed_only():
+    def play(seeds):
+        env = make_env(num_envs=len(seeds))
+        seen = [env.reset(seed=seeds)[0]["state"]]
+        seen += [env.step(np.full((len(seeds), N_U), 0.05))[0]["state"] for _ in range(STEPS)]
+        return np.stack(seen, 1)
+
+    together, other = play([11, 12, 13]), play([13, 11])
+    np.testing.assert_array_equal(together[[2, 0]], other)
+    assert not np.array_equal(together[0], together[1])
+
+
+def test_episodes_end_together_and_begin_anew():
+    env = make_env()
+    env.reset(seed=1)
+    ends = [env.step(np.zeros((3, N_U)))[3].all() for _ in range(STEPS)]
+    assert ends == [False] * (STEPS - 1) + [True]
+    observation, reward, _, truncated, _ = env.step(np.ones((3, N_U)))  # the action is ignored
+    assert not reward.any()
+    assert not truncated.any()
+    starts = episodes()["state"][:, 0].tolist()
+    assert all(row in starts for row in observation["state"].tolist())
+
+
+def test_collect_plays_it():
+    env = make_env()
+    played = collect(env, uniform_actions(env, np.random.default_rng(0)), [1, 2], STEPS)
+    assert played["state"].shape == (2, STEPS + 1, N_X)
+    assert bool(played["stable"].all())
+
+
+def test_predictions_stay_near_the_data_and_finite():
+    class Broken(Ensemble):
+        def forward(self, x, u):
+            return torch.stack([torch.full_like(x[0], float("nan")), x[1] + 1e9])
+
+    env = make_env(Broken(N_X, N_U, 2, 4), num_envs=20)
+    start, _ = env.reset(seed=list(range(20)))
+    state = env.step(np.zeros((20, N_U)))[0]["state"]
+    networks = np.array([drawn(seed)[0] for seed in range(20)])
+    np.testing.assert_array_equal(state[networks == 0], start["state"][networks == 0])
+    seen = episodes()["state"].flatten(0, 1)
+    high = 2 * seen.amax(0) - seen.amin(0)
+    np.testing.assert_allclose(state[networks == 1], high.expand(20, -1)[networks == 1])
+
+
+def test_nothing_can_be_played_from_nothing():
+    env = make_rollouts().env
+    with pytest.raises(InvalidInputError, match="expected real episodes, got none"):
+        env.reset(seed=0)
+
+
+def test_only_the_last_step_holds_the_penalty():
+    """What `outcome` is told of the end of an episode, and what of it is foreseen."""
+    count = 20
+    env = make_env(num_envs=count)
+    state, rewards = torch.from_numpy(env.reset(seed=8)[0]["state"]), []
+    states = [state]
+    for _ in range(STEPS):
+        observation, reward, _, _, info = env.step(np.zeros((count, N_U)))
+        rewards.append(reward + abs(states[-1][:, 0].numpy()))
+        states.append(torch.from_numpy(observation["state"]))
+    np.testing.assert_allclose(np.stack(rewards[:-1]), 0.0, atol=1e-12)
+    np.testing.assert_allclose(rewards[-1], -3.0 * ~info["success"], atol=1e-12)
+    assert 0 < info["success"].sum() < count
+    goals, still = torch.from_numpy(observation["goal"]), torch.zeros(count, STEPS, 1, N_U).double()
+    _, reward, _ = env.foresee(torch.stack(states[:-1], 1), still, goals)
+    dense = reward.squeeze(2) + torch.stack(states[:-1], 1)[..., 0].abs()
+    torch.testing.assert_close(dense, torch.from_numpy(np.stack(rewards, 1)))
+
+
+def test_foreseen_is_what_was_played():
+    env = make_env()
+    state = torch.from_numpy(env.reset(seed=[4, 5, 6])[0]["state"])
+    generator = torch.Generator().manual_seed(0)
+    actions = 0.2 * torch.rand(3, STEPS, 2, N_U, generator=generator, dtype=torch.float64) - 0.1
+    states, rewards, successes = [state], [], []
+    for k in range(STEPS):
+        observation, reward, _, _, info = env.step(actions[:, k, 0].numpy())
+        states.append(torch.from_numpy(observation["state"]))
+        rewards.append(torch.from_numpy(reward))
+        successes.append(torch.from_numpy(info["success"]))
+    played = torch.stack(states, 1)
+    goals = torch.from_numpy(observation["goal"])
+    after, reward, success = env.foresee(played[:, :-1], actions, goals)
+    assert after.shape == (3, STEPS, 2, N_X)
+    torch.testing.assert_close(after[:, :, 0], played[:, 1:])
+    torch.testing.assert_close(reward[:, :, 0], torch.stack(rewards, 1))
+    assert torch.equal(success[:, :, 0], torch.stack(successes, 1))
+    moved = after[:, :, 1] - after[:, :, 0]  # by the same network, from the same state
+    torch.testing.assert_close(moved, actions[:, :, 1] - actions[:, :, 0], rtol=0, atol=1e-6)
+    ended = (torch.arange(STEPS) == STEPS - 1).expand(3, -1).flatten()
+    other = (part.flatten(0, 1) for part in (played[:, :-1], actions[:, :, 1], after[:, :, 1]))
+    expected, reached = outcome(*other, goals.repeat_interleave(STEPS, 0), ended)
+    torch.testing.assert_close(reward[:, :, 1].flatten(), expected)
+    assert torch.equal(success[:, :, 1].flatten(), reached)
+
+
+# --- data and ensemble ------------------------------------------------------------------------------
+
+
+def test_the_ensemble_learns_the_episodes():
+    rollouts = make_rollouts(width=64, first=150, minibatch=32)
+    rollouts.add(episodes(60))
+    rollouts.fit()
+    other = episodes(20, seed=5)
+    states, inputs = other["state"], (other["state"][:, :-1], other["action"])
+    with torch.no_grad():
+        predicted = rollouts.ensemble(*(v.flatten(0, 1).float().expand(2, -1, -1) for v in inputs)).mean(0)
+    changes = (states[:, 1:] - states[:, :-1]).flatten(0, 1)
+    error = predicted - states[:, 1:].flatten(0, 1)
+    assert float(error.square().mean()) < 0.05 * float(changes.square().mean())
+
+
+def test_unstable_episodes_are_not_learned_from():
+    rollouts, real = make_rollouts(), episodes()
+    real["stable"] = torch.tensor([True, False, True, True, False, True])
+    rollouts.add(real)
+    assert torch.equal(rollouts.episodes["state"], real["state"][real["stable"]])
+
+
+def test_restored_goes_on_the_same():
+    first, second = make_rollouts(), make_rollouts()
+    first.add(episodes())
+    first.fit()
+    restore(second, first.state_dict())
+    assert len(second) == 6
+    for rollouts in (first, second):
+        rollouts.add(episodes(3, seed=9))
+        rollouts.fit()
+    (a, rest), (b, other) = (flatten(rollouts.state_dict()) for rollouts in (first, second))
+    assert rest == other
+    assert a.keys() == b.keys()
+    assert all(torch.equal(a[name], b[name]) for name in a)
+    np.testing.assert_array_equal(first.env.reset(seed=2)[0]["state"], second.env.reset(seed=2)[0]["state"])
+
+
+def test_restore_refuses_what_does_not_fit():
+    rollouts = make_rollouts()
+    rollouts.add(episodes())
+    other, state = make_rollouts(width=8), rollouts.state_dict()
+    with pytest.raises(CheckpointError, match="other settings"):
+        restore(other, state)
+    with pytest.raises(CheckpointError, match="goal"):
+        restore(rollouts, {**state, "episodes": {k: v for k, v in state["episodes"].items() if k != "goal"}})
+    with pytest.raises(CheckpointError, match="as many of each"):
+        restore(rollouts, {**state, "episodes": {**state["episodes"], "goal": state["episodes"]["goal"][:-1]}})
+    assert not len(other)
+    assert len(rollouts) == 6
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"iterations": -1},
+        {"rollouts": 0},
+        {"real_step": 0.0},
+        {"final_iterations": -1},
+        {"steps": 0},
+        {"value_epochs": 0},
+        {"actions": 0},
+        {"actions": 3},
+        {"zeta": 1.1},
+    ],
+)
+def test_bad_settings_are_refused(change):
+    with pytest.raises(InvalidInputError, match=next(iter(change))):
+        replace(small(), **change)
+
+
+@pytest.mark.parametrize("change", [{"networks": 0}, {"width": 0}, {"learning_rate": 0.0}])
+def test_bad_settings_of_the_ensemble_are_refused(change):
+    with pytest.raises(InvalidInputError, match=next(iter(change))):
+        EnsembleSettings(**change)
+
+
+# --- the tasks --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["cube", "turn_cube", "mug"])
+def test_outcomes_are_those_of_the_simulation(name, monkeypatch):
+    """In every step, the last one with its penalty; for tensors, as in model rollouts, and for arrays."""
+    pytest.importorskip("mujoco", reason="the extra [envs] is not installed")
+    monkeypatch.delenv("DIFFLCS_YCB_DIR", raising=False)
+    task = get_task(name)
+    env = task.make_envs(20)
+    seeds = episode_seeds(3, Stream.TRAINING, 0, 20)
+    seen = collect(env, uniform_actions(env, np.random.default_rng(0)), seeds, task.episode_steps)
+    env.close()
+    goals = seen["goal"].unsqueeze(1).expand(-1, task.episode_steps, -1)
+    ended = (torch.arange(1, task.episode_steps + 1) == task.episode_steps).expand(20, -1)
+    arguments = (seen["state"][:, :-1], seen["action"], seen["state"][:, 1:], goals, ended)
+    reward, success = task.outcome(*arguments)
+    torch.testing.assert_close(reward, seen["reward"], rtol=1e-9, atol=1e-12)
+    assert torch.equal(success[:, -1], seen["success"])
+    as_arrays, reached = task.outcome(*(part.numpy() for part in arguments))
+    np.testing.assert_array_equal(as_arrays, seen["reward"].numpy())
+    np.testing.assert_array_equal(reached, success.numpy())
+    one, _ = task.outcome(*(part[:, -1] for part in arguments[:-1]), True)  # one for all
+    torch.testing.assert_close(one, reward[:, -1], rtol=0, atol=0)
+    dense, _ = task.outcome(*arguments[:-1], torch.zeros_like(ended))
+    penalties = dense - reward
+    assert not bool(penalties[:, :-1].any())
+    torch.testing.assert_close(penalties[:, -1], task.failure_penalty * (~seen["success"]).double())
+    assert task.failure_penalty > 0
+    assert bool((~seen["success"]).any())
+    if name == "turn_cube":
+        assert bool(seen["success"].any())  # or the comparison says little

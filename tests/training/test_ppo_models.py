@@ -1,0 +1,168 @@
+"""PPO on model rollouts between the real episodes, on a small pushing system that needs no simulator."""
+
+import functools
+
+import pytest
+import torch
+
+from difflcs.errors import CheckpointError
+
+pytest.importorskip("torchrl")
+from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
+from difflcs.rl.evaluate import evaluate
+from difflcs.rl.optim import UpdateRule
+from difflcs.rl.state import flatten
+from tests.training.slide import ROLLOUTS, STEPS, make_envs, make_models, make_ppo, parameters, recorded, same
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def make_imagining(seed: int = 0, first_epochs: int = 20, models: dict | None = None, **changes):
+    return make_ppo(seed, models=make_models(seed, first_epochs, **(models or {})), **changes)
+
+
+def test_model_rollouts_follow_the_first_real_episodes_and_count_as_no_data():
+    trainer = make_imagining()
+    reports = [trainer.step() for _ in range(2)]
+    assert reports[0].model_success is None
+    assert reports[0].model_loss is None
+    assert reports[1].model_success is not None
+    assert 0 < reports[1].model_loss < 2
+    assert reports[1].model_seconds > 0
+    assert [report.env_steps for report in reports] == [STEPS * ROLLOUTS, 2 * STEPS * ROLLOUTS]
+    assert len(trainer.models) == 2 * ROLLOUTS
+
+
+@pytest.mark.parametrize(
+    ("models", "expected"),
+    [
+        ({"iterations": 2, "final_iterations": 1}, [0, 2, 1, 1]),  # none before the first real episodes
+        ({"iterations": 1, "final_iterations": 3}, [0, 1, 1, 1]),
+        ({"iterations": 1, "final_iterations": 0, "real_step": 0.5}, [0, 1, 0, 0]),
+    ],
+)
+def test_iterations_on_model_rollouts_become_fewer(models, expected):
+    trainer, counts = make_imagining(models=models), []
+    seen = recorded(trainer, "practice")
+    while not trainer.done:
+        before = len(seen.calls)
+        report = trainer.step()
+        counts.append(len(seen.calls) - before)
+        assert (report.model_success is None) == (report.model_loss is None) == (counts[-1] == 0)
+    assert counts == expected
+
+
+class Noting(UpdateRule):
+    """A rule that notes the factors on its steps, and moves nothing."""
+
+    def __init__(self, rule):
+        super().__init__(rule.parameters, rule.optimiser, rule.size, rule.deviation)
+        self.scales = []
+
+    def step(self, loss, scale):
+        self.scales.append(scale)
+        return True
+
+
+def test_steps_on_real_episodes_are_shorter_beside_model_rollouts():
+    models = {"iterations": 2, "final_iterations": 2, "real_step": 0.25, "steps": 1}
+    trainer = make_imagining(models=models, final_step=1.0, steps=1)
+    trainer.update = Noting(trainer.update)
+    sizes = iter([1.0, 2.0, 3.0, 21.0])  # whatever the real episodes say
+    trainer.update.size.adapt = lambda kl: setattr(trainer.update.size, "value", next(sizes))
+    for _ in range(2):
+        report = trainer.step()
+    assert trainer.update.scales == [1.0, 1.0, 1.0, 0.25]
+    assert trainer.update.size.value == 3.0 == report.learning_rate
+
+
+def success(trainer) -> float:
+    while not trainer.done:
+        trainer.step()
+    return evaluate(make_envs(60), trainer.policy, 60, 0, STEPS).success_rate
+
+
+SHORT = {"target_kl": 0.02}
+"""Short steps: with the usual ones rounding decides in one training of twelve whether a late step ruins it."""
+
+
+@functools.cache
+def success_alone() -> float:
+    return sum(success(make_ppo(seed, **SHORT)) for seed in range(3)) / 3
+
+
+@pytest.mark.parametrize("actions", [1, 8])
+def test_model_rollouts_learn_from_less_data(actions):
+    models = {"iterations": 12, "rollouts": 30, "actions": actions}
+    both = sum(success(make_imagining(seed, 100, models, **SHORT)) for seed in range(3)) / 3
+    assert both > success_alone() + 0.15
+
+
+def test_iterations_on_model_rollouts_have_an_effort_of_their_own():
+    trainer = make_imagining(
+        models={"iterations": 1, "rollouts": 6, "steps": 5, "value_epochs": 2}, minibatch=STEPS * 4
+    )
+    trainer.step()
+    batches, epochs = [], []
+    trainer.actor.gaussian.register_forward_hook(lambda _, inputs, __: batches.append(len(inputs[0])))
+    learn = trainer.critic.learn
+    trainer.critic.learn = lambda *arguments: (epochs.append(arguments[-1]), learn(*arguments))
+    trainer.step()
+    steps, size = STEPS, STEPS * 4
+    played = [6] * steps + [6 * steps] + [size, 12, size, 12, size]  # in lockstep, the metric, gradient steps
+    real = [ROLLOUTS] * steps + [ROLLOUTS * steps] + [size] * 4
+    assert batches == played + real
+    assert epochs == [2, 3]
+
+
+@pytest.mark.parametrize("actions", [1, 4])
+def test_the_value_network_learns_from_what_the_estimator_says(actions):
+    """From rewards without the action advantage in model rollouts, from real ones as they are."""
+    trainer = make_imagining(models={"iterations": 1, "actions": actions})
+    seen = [recorded(trainer, "robot"), recorded(trainer, "practice")]
+    for _ in range(2):
+        trainer.step()
+    (_, _, rewards, _), estimate = seen[1].calls[0], seen[1].results[0]
+    assert estimate.samples.batch_size == (10, STEPS, actions)
+    torch.testing.assert_close(trainer.critic.history[1][1], estimate.rewards, rtol=0, atol=0)
+    assert torch.equal(estimate.rewards, rewards) == (actions == 1)
+    assert torch.equal(trainer.critic.history[2][1], seen[0].calls[1][2])
+
+
+def test_the_first_iteration_does_not_depend_on_models():
+    alone, imagining = make_ppo(), make_imagining()
+    for trainer in (alone, imagining):
+        trainer.step()
+    assert same(parameters(alone), parameters(imagining))
+
+
+def test_resumed_equals_uninterrupted_bitwise(tmp_path):
+    through = make_imagining()
+    while not through.done:
+        through.step()
+    first = make_imagining()
+    for _ in range(2):
+        first.step()
+    save_checkpoint(tmp_path, first.iteration, first.state_dict())
+    second = make_imagining()
+    second.load(load_checkpoint(tmp_path))
+    while not second.done:
+        second.step()
+    (a, rest), (b, other) = (flatten(trainer.state_dict()) for trainer in (through, second))
+    assert rest == other
+    assert a.keys() == b.keys()
+    for name, value in a.items():
+        assert torch.equal(value, b[name]), name
+
+
+def test_load_refuses_hostile_states(refuses_hostile_checkpoints):
+    refuses_hostile_checkpoints(make_imagining())
+
+
+def test_a_state_without_models_is_refused():
+    trainer = make_ppo()
+    trainer.step()
+    with pytest.raises(CheckpointError, match=r"models.*other settings"):
+        make_imagining().load(trainer.state_dict())
+    with pytest.raises(CheckpointError, match=r"models.*other settings"):
+        trainer.load(make_imagining().state_dict())

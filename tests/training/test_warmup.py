@@ -1,0 +1,183 @@
+"""The warm-up, on a small contact system that needs no simulator."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import SyncVectorEnv
+
+from difflcs import GoalCost, LCSModel, LCSMPCLayer, violation_loss
+from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
+from difflcs.rl.evaluate import evaluate
+from difflcs.rl.rollout import collect, uniform_actions
+from difflcs.rl.rollout import transitions as transitions_of
+from difflcs.rl.seeding import episode_seeds
+from difflcs.rl.settings import Epochs, Rollouts
+from difflcs.rl.warmup import Warmup, WarmupSettings, action_support, fit
+from tests.training.pusher import STEPS, U_MAX, PusherEnv, Reach, make_envs
+
+
+def small_settings(rollouts: Rollouts | None = None, epochs: Epochs | None = None, **changes: Any) -> WarmupSettings:
+    base = WarmupSettings(
+        rollouts=rollouts or Rollouts(first=2, each=3), noise=0.02, epochs=epochs or Epochs(20, 3, 16)
+    )
+    return replace(base, **changes)
+
+
+def make_trainer(seed=0, **changes) -> Warmup:
+    lcs = LCSModel(2, 1, 1, init_scale=1e-2, learn_c=False, generator=torch.Generator().manual_seed(seed))
+    return Warmup(lcs, Reach(lcs), make_envs(3), small_settings(**changes), seed, STEPS)
+
+
+def test_action_support():
+    actions = torch.tensor([[[0.0, 0.09]], [[0.02, 0.09]], [[0.04, 0.06]]], dtype=torch.float64)
+    limit = torch.full((2,), 0.1, dtype=torch.float64)
+    low, high = action_support(actions, 0.9, -limit, limit)
+    std = math.sqrt((0.02**2 + 0.02**2) / 3)  # population
+    assert low[0].item() == pytest.approx(0.02 - 0.9 * std)
+    assert high[0].item() == pytest.approx(0.02 + 0.9 * std)
+    assert action_support(actions, 100.0, -limit, limit)[1].tolist() == limit.tolist()
+    low, high = action_support(limit.expand(5, 2), 0.9, -limit, limit)  # one action: a point, not an empty box
+    assert low.tolist() == pytest.approx(limit.tolist())
+    assert bool((low <= high).all())
+
+
+def test_bounds_while_collecting():
+    trainer = make_trainer(action_support=0.5, action_support_growth=2.0)
+    trainer.step()
+    assert trainer.policy.bounds == []  # random actions
+    seen = trainer.buffer["action"].clone()
+    for growth in (1.0, 2.0):
+        expected = action_support(seen, 0.5 * growth, trainer.low, trainer.high)
+        trainer.policy.bounds.clear()
+        trainer.step()
+        assert all(torch.equal(a, b) for a, b in zip(trainer.policy.bounds[0], expected, strict=True))
+        seen = trainer.buffer["action"].clone()
+    off = make_trainer(action_support=0.0)
+    off.step()
+    off.step()
+    assert off.bounds == (off.low, off.high)
+
+
+def test_a_pretrained_model_skips_the_random_episodes():
+    lcs = LCSModel(2, 1, 1)
+    trainer = Warmup(lcs, Reach(lcs), make_envs(3), small_settings(), 0, STEPS, pretrained=True)
+    assert trainer.step().env_steps == 3 * STEPS
+    assert len(trainer.policy.bounds) == STEPS
+
+
+def test_buffer_keeps_the_newest():
+    trainer = make_trainer(buffer=4)
+    for _ in range(3):
+        trainer.step()
+    assert len(trainer.buffer) == 4
+    assert trainer.env_steps == (2 + 3 + 3) * STEPS
+
+
+def parameters(trainer: Warmup) -> list[torch.Tensor]:
+    return [value.clone() for value in trainer.lcs.state_dict().values()]
+
+
+def test_resumed_equals_uninterrupted_bitwise(tmp_path):
+    through = make_trainer()
+    for _ in range(4):
+        through.step()
+    first = make_trainer()
+    for _ in range(2):
+        first.step()
+    save_checkpoint(tmp_path, first.iteration, first.state_dict())
+    first.step()  # lost by the crash
+
+    second = make_trainer(seed=0)
+    np.random.seed(7)  # noqa: NPY002  the global generators must not matter
+    torch.manual_seed(7)
+    second.load(load_checkpoint(tmp_path))
+    for _ in range(2):
+        second.step()
+    assert all(torch.equal(a, b) for a, b in zip(parameters(through), parameters(second), strict=True))
+    assert torch.equal(through.buffer["state"], second.buffer["state"])
+    assert all(torch.equal(a, b) for a, b in zip(through.bounds, second.bounds, strict=True))
+
+
+def test_restore_refuses_another_model(tmp_path):
+    trainer = make_trainer()
+    trainer.step()
+    state = trainer.state_dict()
+    lcs = LCSModel(2, 1, 3)
+    other = Warmup(lcs, Reach(lcs), make_envs(3), small_settings(), 0, STEPS)
+    before = parameters(other)
+    with pytest.raises(CheckpointError, match="other settings"):
+        other.load(state)
+    with pytest.raises(CheckpointError, match="another method"):
+        trainer.load({**state, "random": {}})
+    assert all(torch.equal(a, b) for a, b in zip(before, parameters(other), strict=True))
+    assert other.iteration == 0
+
+
+def test_restore_refuses_hostile_checkpoints(refuses_hostile_checkpoints):
+    refuses_hostile_checkpoints(make_trainer())
+
+
+def test_seeds_differ_and_repeat():
+    runs = [make_trainer(seed) for seed in (0, 0, 1)]
+    for trainer in runs:
+        trainer.step()
+    assert torch.equal(runs[0].buffer["state"], runs[1].buffer["state"])
+    assert not torch.equal(runs[0].buffer["state"], runs[2].buffer["state"])
+
+
+def transitions(episodes: int, seed: int) -> list[torch.Tensor]:
+    """States, actions and next states of uniformly random episodes."""
+    envs = make_envs(episodes)
+    seeds = episode_seeds(seed, 0, 0, episodes)
+    return [*transitions_of(collect(envs, uniform_actions(envs, np.random.default_rng(seed)), seeds, STEPS))]
+
+
+def make_pusher_model(seed: int) -> LCSModel:
+    # One contact would do; spare ones avoid local minima (of seeds 0 to 3, some stall with 1 or 2, none with 3).
+    return LCSModel(2, 1, 3, init_scale=1e-3, learn_c=False, generator=torch.Generator().manual_seed(seed))
+
+
+def test_fit_learns_contact():
+    data = transitions(20, seed=0)
+    lcs = make_pusher_model(0)
+    settings = WarmupSettings(learning_rate_decay=0.998)
+    before = float(violation_loss(lcs, *data, settings.loss.gamma, settings.loss.xi).detach())
+    outcome = fit(lcs, *data, settings, epochs=300, rng=np.random.default_rng(0))
+    assert outcome.steps == 300 * (160 // 100)  # 200 transitions, 20 % held out, whole minibatches
+    assert outcome.held_out_loss is not None
+    assert max(outcome.loss, outcome.held_out_loss) < before / 100
+
+
+def test_warmup_learns_to_push():
+    """The whole loop with the real MPC, from a random model to one that pushes the block where it should be."""
+    cost = GoalCost.reach(2, 1, goal_weight=(50.0,), input_weight=0.1, pairs=[(0, 1)], pair_weight=0.1)
+    lcs = make_pusher_model(0)
+    policy = LCSMPCLayer(lcs, cost, horizon=5, u_min=-U_MAX, u_max=U_MAX, backend="ipopt", on_failure="mask")
+    settings = small_settings(Rollouts(first=4, each=3), Epochs(300, 60, 50), learning_rate_decay=0.998)
+    trainer = Warmup(lcs, policy, make_envs(4), settings, 0, STEPS)
+    unseen = transitions(8, seed=1)
+    before = float(violation_loss(lcs, *unseen, settings.loss.gamma, settings.loss.xi).detach())
+    for _ in range(5):
+        assert math.isfinite(trainer.step().loss)
+    assert float(violation_loss(lcs, *unseen, settings.loss.gamma, settings.loss.xi).detach()) < before / 100
+    assert evaluate(make_envs(8), policy, 16, 0, STEPS).successes >= 14
+
+
+def test_a_broken_episode_is_left_out():
+    lcs = LCSModel(2, 1, 1, init_scale=1e-2)
+    envs = SyncVectorEnv([lambda: PusherEnv(breaks_at=4), *[PusherEnv] * 2])
+    trainer = Warmup(lcs, Reach(lcs), envs, small_settings(), 0, STEPS)
+    assert trainer.step().unstable == 1
+    assert bool(torch.isfinite(trainer.buffer["state"]).all())
+    assert len(trainer.buffer) == 1
+
+
+def test_too_few_environments():
+    lcs = LCSModel(2, 1, 1)
+    with pytest.raises(InvalidInputError, match="at least 3 environments, got 2"):
+        Warmup(lcs, Reach(lcs), make_envs(2), small_settings(), 0, STEPS)

@@ -1,0 +1,343 @@
+"""Rewards to learn from, GAE, and advantages of many actions: their gradient is GAE's with less noise."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from torch.distributions import MultivariateNormal
+
+pytest.importorskip("torchrl")
+from tensordict import TensorDict
+
+from difflcs.errors import InvalidInputError
+from difflcs.rl import CriticSettings
+from difflcs.rl.advantages import (
+    SAMPLES,
+    GAEAdvantages,
+    MultiActionAdvantages,
+    RewardScale,
+    action_advantage,
+    mirrored_actions,
+    multi_action_advantages,
+    returns,
+)
+from difflcs.rl.critic import Critic
+from difflcs.rl.rollout import elapsed_fractions
+from difflcs.rl.seeding import seeded
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+STEPS = 6
+
+
+# --- rewards ---
+
+
+@st.composite
+def rewarded(draw):
+    """Dense rewards (N, T, ...), successes (N, ...), and the numbers of a `RewardScale`."""
+    shape = draw(st.tuples(st.integers(1, 4), st.integers(1, 5), *draw(st.sampled_from([(), (st.integers(1, 3),)]))))
+    positive = st.floats(1e-3, 1e3, allow_subnormal=False)
+    count = int(np.prod(shape))
+    dense = draw(st.lists(st.floats(-1e4, 1e4), min_size=count, max_size=count))
+    ends = (shape[0], *shape[2:])
+    success = draw(st.lists(st.booleans(), min_size=int(np.prod(ends)), max_size=int(np.prod(ends))))
+    numbers = (draw(positive), draw(st.just(0.0) | positive), draw(positive))
+    return torch.tensor(dense, dtype=torch.float64).view(shape), torch.tensor(success).view(ends), numbers
+
+
+@settings(deadline=None, max_examples=200)
+@given(rewarded())
+@example((torch.tensor([[-1.0, -5.0]]).double(), torch.tensor([True]), (3.0, 10.0, 0.1)))
+@example((torch.tensor([[-1.0, -5.0]]).double(), torch.tensor([False]), (3.0, 10.0, 0.1)))
+@example((torch.tensor([[-1.0, -0.3]]).double(), torch.tensor([False]), (3.0, 10.0, 0.1)))
+def test_rewards_are_those_of_the_rule(case):
+    """The dense ones limited, less the penalty in the last step of a failed episode, all scaled: bit for bit.
+
+    The environment's last reward holds the penalty already, so the limit is applied to the sum.
+    """
+    dense, success, (cost_limit, penalty, factor) = case
+    expected = dense.clamp_min(-cost_limit)
+    expected[:, -1] -= penalty * (~success).double()
+    given_ = dense.clone()
+    given_[:, -1] -= penalty * (~success).double()
+    before = given_.clone()
+    assert torch.equal(RewardScale(cost_limit, penalty, factor)(given_, success), factor * expected)
+    assert torch.equal(given_, before)
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_rewards_that_are_not_finite_are_refused(bad):
+    rewards = torch.zeros(2, 3).double()
+    rewards[1, 1] = bad
+    with pytest.raises(InvalidInputError, match="finite rewards"):
+        RewardScale(3.0, 10.0, 0.1)(rewards, torch.ones(2, dtype=torch.bool))
+
+
+# --- GAE ---
+
+
+def make_critic(gamma: float = 0.9, zeta: float = 0.8) -> Critic:
+    return Critic(CriticSettings(), 3, STEPS, gamma, zeta, (0, 5))
+
+
+def some(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def test_advantages_are_the_papers():
+    """Eq. adv_func written out, with a value of zero at the end of an episode."""
+    critic, inputs, rewards = make_critic(), some(5, STEPS + 1, 3), some(5, STEPS, seed=1)
+    value = critic.network(inputs.float()).detach().double().squeeze(-1)
+    value[:, -1] = 0
+    delta = rewards + 0.9 * value[:, 1:] - value[:, :-1]
+    expected = torch.zeros(5, STEPS, dtype=torch.float64)
+    for t in range(STEPS):
+        expected[:, t] = sum((0.9 * 0.8) ** k * delta[:, t + k] for k in range(STEPS - t))
+    found = critic.gae(inputs, rewards)
+    torch.testing.assert_close(found["advantage"].squeeze(-1), expected, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(found["value_target"].squeeze(-1), expected + value[:, :-1], rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(found["state_value"].squeeze(-1), value[:, :-1], rtol=1e-5, atol=1e-5)
+    assert not found["advantage"].requires_grad
+    torch.testing.assert_close(returns(rewards, 0.9)[:, 0], sum(0.9**k * rewards[:, k] for k in range(STEPS)))
+    torch.testing.assert_close(returns(rewards, 0.9)[:, -1], rewards[:, -1])
+
+
+def test_gae_judges_the_actions_taken():
+    critic, inputs, rewards = make_critic(), some(5, STEPS + 1, 3), some(5, STEPS, seed=1)
+    taken = gaussian(5, STEPS)
+    taken["action_log_prob"] = some(5, STEPS, seed=2)
+    found = GAEAdvantages(critic)(TensorDict({"policy": taken}, [5]), inputs, rewards, (0,))
+    plain = critic.gae(inputs, rewards)
+    assert found.samples.batch_size == (5, STEPS, 1)
+    for name in SAMPLES:
+        assert torch.equal(found.samples[name].squeeze(2), taken[name])
+    assert torch.equal(found.samples["advantage"].squeeze(2), plain["advantage"])
+    assert torch.equal(found.values, plain["state_value"].squeeze(-1))
+    assert torch.equal(found.rewards, rewards)  # as they are
+
+
+# --- many actions ---
+
+
+def gaussian(*shape: int, n_u: int = 3, seed: int = 0) -> TensorDict:
+    """Samples of a Gaussian with a full covariance."""
+    generator = torch.Generator().manual_seed(seed)
+    mean = torch.randn(*shape, n_u, generator=generator, dtype=torch.float64)
+    factor = torch.randn(n_u, n_u, generator=generator, dtype=torch.float64).tril(-1) + 0.5 * torch.eye(n_u)
+    noise = torch.randn(*shape, n_u, generator=generator, dtype=torch.float64)
+    taken = {"action": mean + noise @ factor.mT, "loc": mean, "scale_tril": factor.expand(*shape, -1, -1)}
+    return TensorDict(taken, shape)
+
+
+def test_actions_come_in_mirrored_pairs_the_one_taken_first():
+    taken = gaussian(5, 4)
+    with seeded((1,)):
+        drawn = mirrored_actions(taken, 6)
+    assert drawn.batch_size == (5, 4, 6)
+    action, mean = drawn["action"], taken["loc"].unsqueeze(2)
+    torch.testing.assert_close(action[:, :, 0], taken["action"], rtol=0, atol=1e-14)
+    torch.testing.assert_close(0.5 * (action[:, :, ::2] + action[:, :, 1::2]), mean.expand(5, 4, 3, 3))
+    density = MultivariateNormal(mean, scale_tril=taken["scale_tril"].unsqueeze(2))
+    torch.testing.assert_close(drawn["action_log_prob"], density.log_prob(action))
+    assert len(action.flatten(0, 2).unique(dim=0)) == 5 * 4 * 6
+
+
+def test_the_others_are_drawn_from_the_policy():
+    taken = gaussian(1).expand(20000)
+    with seeded((2,)):
+        offsets = mirrored_actions(taken, 4)["action"][:, 2] - taken["loc"]
+    factor = taken["scale_tril"][0]
+    torch.testing.assert_close(offsets.T.cov(), factor @ factor.mT, rtol=0.05, atol=0.03)
+    assert float(offsets.mean(0).abs().max()) < 0.05
+
+
+def test_two_actions_are_the_one_taken_and_its_image():
+    taken = gaussian(3)
+    action = mirrored_actions(taken, 2)["action"]
+    torch.testing.assert_close(action[:, 1], 2 * taken["loc"] - taken["action"])
+
+
+def test_advantages_are_those_of_the_formula():
+    generator = torch.Generator().manual_seed(0)
+    q = torch.randn(7, 5, 4, generator=generator, dtype=torch.float64)
+    values = torch.randn(7, 5, generator=generator, dtype=torch.float64)
+    found = multi_action_advantages(q, values, 0.9, 0.7)
+    residual = q.mean(-1) - values
+    corrections = torch.zeros(7, 5, dtype=torch.float64)
+    for t in range(5):
+        for later in range(t + 1, 5):
+            corrections[:, t] += 0.63 ** (later - t) * residual[:, later]
+    expected = q - q.mean(-1, keepdim=True)
+    expected[..., 0] += 4 * (corrections - corrections.mean())
+    torch.testing.assert_close(found, expected)
+    immediate = multi_action_advantages(q, values, 0.9, 0.0)
+    torch.testing.assert_close(immediate, q - q.mean(-1, keepdim=True))
+
+
+def test_the_gradient_is_that_of_gae_with_less_noise():
+    """x₊ = x + a, a ~ N(θ x, σ²), reward −x₊², and a V that is wrong: gradients of many episodes, by both."""
+    episodes, steps, std, gamma, zeta, count = 40000, 4, 0.4, 0.95, 0.8, 4
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(episodes, generator=generator, dtype=torch.float64)
+    states, means, actions = [x], [], []
+    for _ in range(steps):
+        means.append(-0.3 * x)
+        actions.append(means[-1] + std * torch.randn(episodes, generator=generator, dtype=torch.float64))
+        x = x + actions[-1]
+        states.append(x)
+    state, mean, action = torch.stack(states, 1), torch.stack(means, 1), torch.stack(actions, 1)
+
+    def value(x, left):
+        return torch.where(left > 0, -0.7 * left * x.square() + 0.5 * x, 0.0)
+
+    left = torch.arange(steps, -1, -1, dtype=torch.float64)
+    values = value(state, left)
+    errors = -state[:, 1:].square() + gamma * values[:, 1:] - values[:, :-1]
+    advantage = torch.zeros(episodes, steps, dtype=torch.float64)
+    for t in range(steps):
+        advantage[:, t] = sum((gamma * zeta) ** k * errors[:, t + k] for k in range(steps - t))
+    score = state[:, :-1] * (action - mean) / std**2  # of θ
+    gae = (score * advantage).mean(1)
+
+    factor = torch.full((episodes, steps, 1, 1), std, dtype=torch.float64)
+    taken = {"action": action.unsqueeze(-1), "loc": mean.unsqueeze(-1), "scale_tril": factor}
+    with seeded((3,)):
+        judged = mirrored_actions(TensorDict(taken, [episodes, steps]), count)["action"].squeeze(-1)
+    after = state[:, :-1, None] + judged
+    q = -after.square() + gamma * value(after, left[1:, None])
+    scores = state[:, :-1, None] * (judged - mean.unsqueeze(-1)) / std**2
+    ahead = (scores * multi_action_advantages(q, values[:, :-1], gamma, zeta)).mean((1, 2))
+
+    difference = gae - ahead
+    assert float(difference.mean().abs()) < 4 * float(difference.std()) / episodes**0.5
+    assert float(ahead.mean().abs()) > 20 * float(difference.std()) / episodes**0.5
+    assert float(ahead.std()) < 0.6 * float(gae.std())
+
+
+def test_rewards_without_it_have_the_same_returns_with_less_noise():
+    """x₊ = x + a, reward −x₊², a V that is wrong: returns of many episodes from one state, with and without."""
+    episodes, steps, std, gamma, count = 20000, 4, 0.4, 0.95, 8
+    x = torch.full((episodes,), 0.7, dtype=torch.float64)
+    plain, without = torch.zeros(episodes, dtype=torch.float64), torch.zeros(episodes, dtype=torch.float64)
+    for t in range(steps):
+        taken = TensorDict({"loc": -0.3 * x.unsqueeze(-1)}, [episodes])
+        taken["scale_tril"] = torch.full((episodes, 1, 1), std, dtype=torch.float64)
+        with seeded((4, t)):
+            taken["action"] = taken["loc"] + std * torch.randn(episodes, 1, dtype=torch.float64)
+            after = x.unsqueeze(-1) + mirrored_actions(taken, count)["action"].squeeze(-1)
+        left = steps - 1 - t
+        q = -after.square() + gamma * (-0.7 * left * after.square() + 0.5 * after * (left > 0))
+        x = after[:, 0]
+        plain += gamma**t * -x.square()
+        without += gamma**t * (-x.square() - action_advantage(q))
+    difference = plain - without
+    assert float(difference.mean().abs()) < 4 * float(difference.std()) / episodes**0.5
+    assert float(without.std()) < 0.6 * float(plain.std())
+
+
+# --- in episodes whose alternatives are known ---
+
+
+BOUND = 0.5
+
+
+class World:
+    """x₊ = x + a, reward −x₊² − 3 in the last step off the goal: knows what other actions would have led to."""
+
+    def foresee(self, states, actions, goals):
+        assert bool((actions.abs() <= BOUND).all())  # what is executed
+        after = states.unsqueeze(2) + actions
+        success = (after - goals[:, None, None]).abs().squeeze(-1) < 0.4
+        reward = -after.square().squeeze(-1)
+        reward[:, -1] -= 3.0 * (~success[:, -1]).double()
+        return after, reward, success
+
+
+def inputs_of(state, goal, elapsed):
+    return torch.cat([state, goal.expand_as(state), elapsed.unsqueeze(-1)], -1)
+
+
+def judged(actions: int = 4, zeta: float = 0.0, gamma: float = 0.9):
+    """Episodes played in the world, the estimator, and its estimate."""
+    count, state = 10, some(10, 1)
+    goal, steps, states = 0.3 * some(count, 1, seed=3), [], [state]
+    for t in range(STEPS):
+        step = TensorDict({"loc": -0.3 * state, "scale_tril": torch.full((count, 1, 1), 0.4).double()}, [count])
+        step["action"] = step["loc"] + 0.4 * some(count, 1, seed=10 + t)
+        step["action_log_prob"] = torch.zeros(count).double()
+        state = state + step["action"].clamp(-BOUND, BOUND)
+        steps.append(step)
+        states.append(state)
+    episodes = TensorDict({"state": torch.stack(states, 1), "goal": goal}, [count])
+    episodes["policy"] = torch.stack(steps, 1)
+    bound = torch.full((1,), BOUND).double()
+    scale = RewardScale(1.0, 3.0, 0.5)
+    estimator = MultiActionAdvantages(
+        World(), make_critic(gamma), inputs_of, scale, (-bound, bound), actions=actions, zeta=zeta
+    )
+    inputs = inputs_of(
+        episodes["state"], goal.unsqueeze(1).expand(-1, STEPS + 1, -1), elapsed_fractions(STEPS).expand(count, -1)
+    )
+    executed = episodes["policy", "action"].clamp(-BOUND, BOUND).unsqueeze(2)
+    _, reward, success = World().foresee(episodes["state"][:, :-1], executed, goal)
+    rewards = scale(reward.squeeze(2), success[:, -1, 0])
+    return episodes, inputs, rewards, estimator, estimator(episodes, inputs, rewards, (0, 6))
+
+
+def quality(estimator, episodes, action: torch.Tensor) -> torch.Tensor:
+    """(N, T) r + γ V of the next state after other actions (N, T, 1), step by step."""
+    columns = []
+    for t in range(STEPS):
+        after = episodes["state"][:, t] + action[:, t].clamp(-BOUND, BOUND)
+        failed = (after - episodes["goal"]).abs().squeeze(-1) >= 0.4
+        reward = (-after.square().squeeze(-1)).clamp_min(-1.0) - 3.0 * (failed & (t == STEPS - 1))
+        value = torch.zeros(len(after)).double()
+        if t < STEPS - 1:
+            elapsed = torch.full((len(after),), (t + 1) / STEPS, dtype=torch.float64)
+            value = estimator.critic.values(inputs_of(after, episodes["goal"], elapsed)).detach()
+        columns.append(0.5 * reward + 0.9 * value)
+    return torch.stack(columns, 1)
+
+
+def test_the_action_taken_is_judged_by_what_it_led_to():
+    episodes, inputs, rewards, estimator, found = judged()
+    following = estimator.critic.values(inputs[:, 1:]).detach()
+    following[:, -1] = 0
+    advantage = found.samples["advantage"].squeeze(-1)
+    assert advantage.shape == (10, STEPS, 4)
+    torch.testing.assert_close(advantage.mean(-1), torch.zeros(10, STEPS).double(), rtol=0, atol=1e-12)
+    taken = quality(estimator, episodes, episodes["policy", "action"])
+    torch.testing.assert_close(taken, rewards + 0.9 * following, rtol=1e-5, atol=1e-6)
+    # Up to the mean over the four, which is the state's: with a pair of actions it is half of their difference.
+    episodes, _, _, estimator, found = judged(actions=2)
+    image = quality(estimator, episodes, found.samples["action"][:, :, 1])
+    expected = 0.5 * (taken - image)
+    torch.testing.assert_close(found.samples["advantage"][:, :, 0, 0], expected, rtol=1e-5, atol=1e-6)
+
+
+def test_all_actions_are_judged_and_corrected_by_later_values():
+    """The formula, with q of each action computed on its own."""
+    episodes, inputs, _, estimator, found = judged(zeta=0.7)
+    q = torch.stack([quality(estimator, episodes, action) for action in found.samples["action"].unbind(2)], 2)
+    values = estimator.critic.values(inputs[:, :-1]).detach()
+    torch.testing.assert_close(found.values, values, rtol=1e-5, atol=1e-6)
+    expected = multi_action_advantages(q, values, 0.9, 0.7)
+    torch.testing.assert_close(found.samples["advantage"].squeeze(-1), expected, rtol=1e-5, atol=1e-5)
+    assert bool((found.samples["action"].abs() > BOUND).any())  # judged as executed, but not clipped
+
+
+def test_rewards_to_fit_values_to_are_without_the_action_advantage():
+    *_, rewards, _, found = judged()
+    advantage = found.samples["advantage"][:, :, 0, 0]
+    assert float(advantage.abs().max()) > 1e-3
+    torch.testing.assert_close(found.rewards, rewards - advantage)
+
+
+def test_judged_actions_depend_on_the_key_alone():
+    episodes, inputs, rewards, estimator, found = judged()
+    torch.manual_seed(5)
+    again = estimator(episodes, inputs, rewards, (0, 6)).samples["action"]
+    assert torch.equal(again, found.samples["action"])
+    assert not torch.equal(estimator(episodes, inputs, rewards, (0, 7)).samples["action"], again)

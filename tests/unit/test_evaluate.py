@@ -1,0 +1,78 @@
+"""Success rates and their intervals, on a small contact system that needs no simulator."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from gymnasium.vector import SyncVectorEnv
+
+from difflcs.errors import InvalidInputError
+from difflcs.rl.evaluate import evaluate, wilson_interval
+from difflcs.rl.rollout import collect, mpc_actions
+from difflcs.rl.seeding import Stream, episode_seeds
+from tests.training.pusher import STEPS, PusherEnv, Reach, make_envs
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "low", "high"),
+    # Newcombe (1998), Table I, method 3.
+    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
+)
+def test_wilson_interval_known_values(successes, trials, low, high):
+    assert wilson_interval(successes, trials) == pytest.approx((low, high), abs=5e-5)
+
+
+def test_wilson_interval_equals_scipy():
+    stats = pytest.importorskip("scipy.stats")
+    for successes, trials in [(0, 1), (1, 1), (13, 300), (195, 300), (300, 300)]:
+        for confidence in (0.9, 0.95):
+            reference = stats.binomtest(successes, trials).proportion_ci(confidence, "wilson")
+            ours = wilson_interval(successes, trials, confidence)
+            assert ours == pytest.approx((reference.low, reference.high), abs=1e-12)
+            assert ours == pytest.approx(
+                tuple(1 - v for v in wilson_interval(trials - successes, trials, confidence))[::-1]
+            )
+    with pytest.raises(InvalidInputError, match="trials=3"):
+        wilson_interval(4, 3)
+
+
+def test_evaluation_does_not_depend_on_the_number_of_environments():
+    progress = []
+    results = [evaluate(make_envs(n), Reach(), 7, 3, STEPS, after_step=progress.append) for n in (2, 7)]
+    assert replace(results[0], solver_failures=0) == replace(results[1], solver_failures=0)
+    assert results[0].goals == 7
+    assert results[0].success_rate == results[0].successes / 7
+    assert set(results[0].median_errors) == {"position_error"}
+    assert sum(progress) == 2 * 7 * STEPS
+
+
+def test_evaluation_bounds():
+    policy = Reach()
+    bound = torch.tensor([0.01], dtype=torch.float64)
+    evaluate(make_envs(2), policy, 2, 0, STEPS, -bound, bound)
+    assert policy.bounds[0] == (-bound, bound)
+
+
+def test_broken_episodes_count_as_failures():
+    result = evaluate(make_envs(2, breaks_at=4), Reach(), 2, 0, STEPS)
+    assert result.unstable == 2
+    assert result.successes == 0
+    mixed = evaluate(SyncVectorEnv([lambda: PusherEnv(breaks_at=4), PusherEnv]), Reach(), 2, 0, STEPS)
+    assert mixed.unstable == 1
+
+
+def test_what_is_counted_is_what_the_episodes_say():
+    seeds = episode_seeds(3, Stream.EVALUATION, 0, 7)
+    episodes = collect(make_envs(7), mpc_actions(Reach()), seeds, STEPS)
+    result = evaluate(make_envs(7), Reach(), 7, 3, STEPS)
+    assert result.successes == int(episodes["success"].sum())
+    assert result.median_errors["position_error"] == float(episodes["errors", "position_error"].quantile(0.5))
+    assert result.solver_failures == int(episodes["failures"].sum())
+    assert result.solves == 7 * STEPS
+    assert f"{100 * result.success_rate:.1f} % of 7 goals" in str(result)
+
+
+@pytest.mark.parametrize(("goals", "seed", "name"), [(0, 0, "goals"), (2, -1, "seed"), (True, 0, "goals")])
+def test_bad_numbers_are_refused(goals, seed, name):
+    with pytest.raises(InvalidInputError, match=name):
+        evaluate(make_envs(2), Reach(), goals, seed, STEPS)

@@ -1,0 +1,64 @@
+"""Settings of the main phase, and PPO put together by them."""
+
+import inspect
+from dataclasses import fields, replace
+
+import pytest
+import torch
+
+from difflcs.errors import InvalidInputError
+
+pytest.importorskip("torchrl")
+from difflcs.rl import Adam, PPOSettings, ppo_settings
+from difflcs.rl.mlp import MLPController
+from difflcs.rl.policy import make_actor
+from tests.training.slide import STEPS, U_MAX, features, make_envs, make_model, make_mpc, small_settings
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rollouts": 0}, "rollouts"),
+        ({"beta": 1.5}, "beta"),
+        ({"kl_quantile": 0.0}, "kl_quantile"),
+        ({"std": 0.0}, "std"),
+        ({"std_range": (0.2, 0.1)}, "std_range"),
+        ({"covariance": "all"}, "covariance"),
+        ({"step_factor": 0.5}, "step_factor"),
+        ({"minibatch": 0}, "minibatch"),
+        ({"update": "sgd"}, "update"),
+    ],
+)
+def test_bad_settings_are_refused(change, message):
+    with pytest.raises(InvalidInputError, match=message):
+        PPOSettings(**change)
+    with pytest.raises(InvalidInputError, match="learning_rate"):
+        Adam(learning_rate=-1.0)
+
+
+def test_bad_arguments_are_refused():
+    options = {"features": features, "total_episodes": 20, "episode_steps": STEPS}
+    mpc, settings = make_mpc(make_model()), small_settings()
+    actor, make = make_actor(mpc, settings.std), ppo_settings.make_ppo
+    with pytest.raises(InvalidInputError, match="at least 12 environments, got 3"):
+        make(actor, make_envs(3), settings, 0, **options)
+    with pytest.raises(InvalidInputError, match="use an LCSModel"):
+        make(make_actor(make_mpc(mpc.lcs.params().detach()), settings.std), make_envs(), settings, 0, **options)
+    with pytest.raises(InvalidInputError, match="covariance='diagonal'"):
+        make(actor, make_envs(), replace(settings, covariance="diagonal"), 0, **options)
+    with pytest.raises(InvalidInputError, match="shorten the warm-up"):
+        make(actor, make_envs(), settings, 0, **options, first_episode=20)
+    bound = torch.full((1,), U_MAX)
+    network = make_actor(MLPController(features, 3, -bound, bound, 4, STEPS), settings.std)
+    for changes in ({}, {"update": "adam", "beta": 0.5}):
+        with pytest.raises(InvalidInputError, match="without an LCS"):
+            make(network, make_envs(), replace(settings, **changes), 0, **options)
+    make(network, make_envs(), replace(settings, update="adam"), 0, **options)
+
+
+def test_every_setting_is_documented():
+    """`difflcs train --help` shows the docstring below each field."""
+    source = inspect.getsource(PPOSettings)
+    for field in fields(PPOSettings):
+        line = source.index(f"    {field.name}: ")
+        assert source[line:].split("\n")[1].strip().startswith('"""'), field.name

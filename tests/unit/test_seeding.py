@@ -1,0 +1,68 @@
+"""Random numbers: one stream for each purpose, and nothing drawn from the global generators."""
+
+import numpy as np
+import pytest
+import torch
+
+from difflcs.rl.seeding import Stream, episode_seeds, generator, number, numbers, seeded
+
+
+def test_streams_are_as_they_were():
+    """A purpose that got another number would change every result that was ever published."""
+    assert {stream.name: stream.value for stream in Stream} == {
+        "TRAINING": 0,
+        "EVALUATION": 1,
+        "MINIBATCH": 2,
+        "ACTION": 3,
+        "NOISE": 4,
+        "VALUE": 5,
+        "LOSS": 6,
+        "FIT": 7,
+        "PLAN": 8,
+        "MODEL": 9,
+        "MODEL_ROLLOUT": 10,
+    }
+    values = [stream.value for stream in Stream.__members__.values()]  # aliases too
+    assert len(set(values)) == len(values)
+
+
+def test_numbers_are_as_they_were():
+    """Those of NumPy's SeedSequence, which promises to keep them."""
+    assert number(3, Stream.NOISE, 7) == int(np.random.SeedSequence((3, 4, 7)).generate_state(1)[0])
+    assert numbers(3, 3, Stream.MODEL_ROLLOUT, 7, 1) == np.random.SeedSequence((3, 10, 7, 1)).generate_state(3).tolist()
+    assert (number(0, 0, 0), number(3, 4, 7)) == (2968811710, 3376495404)
+    assert torch.equal(
+        torch.rand(4, generator=generator(3, Stream.MODEL, 2)),
+        torch.rand(4, generator=torch.Generator().manual_seed(number(3, 9, 2))),
+    )
+
+
+def test_streams_and_seeds_differ():
+    keys = [(seed, stream, part) for seed in range(3) for stream in Stream for part in range(20)]
+    assert len({number(*key) for key in keys}) == len(keys)
+
+
+def test_an_episode_has_the_same_seed_however_many_there_are():
+    together = episode_seeds(5, Stream.TRAINING, 2, 6)
+    assert together == [episode_seeds(5, Stream.TRAINING, 2 + i, 1)[0] for i in range(6)]
+    assert not set(together) & set(episode_seeds(5, Stream.EVALUATION, 2, 6))
+
+
+def test_the_global_generator_is_given_back():
+    torch.manual_seed(1)
+    before = torch.random.get_rng_state()
+    with seeded((3, Stream.LOSS)):
+        first = torch.rand(3)
+    assert torch.equal(torch.random.get_rng_state(), before)
+    torch.manual_seed(2)
+    with seeded((3, Stream.LOSS)):
+        assert torch.equal(torch.rand(3), first)  # whatever it was before
+
+    def fail():
+        with seeded((3, Stream.LOSS)):
+            torch.rand(3)
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert torch.equal(torch.random.get_rng_state(), torch.Generator().manual_seed(2).get_state())

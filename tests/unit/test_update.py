@@ -1,0 +1,237 @@
+"""How PPO moves a policy: sizes of steps, learned deviations, Adam and the natural gradient as update rules."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("torchrl")
+from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs.rl import Adam, Natural
+from difflcs.rl.optim import AdamUpdate, NaturalUpdate, StepSize
+from difflcs.rl.optim.update import Deviation
+from difflcs.rl.policy import make_actor
+from difflcs.rl.surrogate import Surrogate, gaussian_kl
+from tests.training.slide import drawn, make_model, make_mpc
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+STD = 0.03
+ADAM = Adam(learning_rate=0.02, betas=(0.9, 0.99))
+
+
+def make(kind: str, covariance: str = "fixed", std_learning_rate: float = 0.01, **settings):
+    """The policy and a rule that moves it."""
+    actor = make_actor(make_mpc(make_model()), STD, covariance)
+    deviation = Deviation(actor, std_learning_rate, (0.9, 0.99), (0.01, 0.05))
+    if kind == "adam":
+        return actor, AdamUpdate(actor, ADAM, 0.1, 1.5, deviation)
+    return actor, NaturalUpdate(actor, Natural(**settings), 0.1, 1.5, deviation)
+
+
+def loss_of(actor, data=None) -> torch.Tensor:
+    """Some loss that depends on mean and covariance."""
+    data = drawn(actor) if data is None else data
+    new = actor.solve(data.select(*actor.in_keys, "guess"))
+    return (new["loc"] * torch.linspace(-1, 2, len(data)).double().unsqueeze(-1)).sum() + new["scale_tril"].sum()
+
+
+def values(actor) -> list[torch.Tensor]:
+    gaussian = actor.gaussian
+    return [p.detach().clone() for p in (*actor.learned.parameters(), gaussian.log_std, gaussian.mixing)]
+
+
+def same(a, b) -> bool:
+    return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+# --- sizes of steps ---
+
+
+@pytest.mark.parametrize(("kl", "factor"), [(0.04, 1.5), (0.06, 1.0), (0.14, 1.0), (0.16, 1 / 1.5), (math.nan, 1.0)])
+def test_step_size_follows_the_kl(kl, factor):
+    size = StepSize(0.06, target_kl=0.1, factor=1.5)
+    size.adapt(kl)
+    assert size.value == pytest.approx(factor * 0.06)
+
+
+def test_step_size_grows_up_to_the_longest():
+    size = StepSize(0.06, 0.08, 1.5, longest=0.4)
+    for _ in range(30):
+        size.adapt(0.0)
+    assert size.value == 0.4
+    beyond = StepSize(0.7, 0.08, 1.5, longest=0.4)  # as the settings say, but not more
+    beyond.adapt(0.0)
+    assert beyond.value == 0.7
+    beyond.adapt(1.0)
+    assert beyond.value == pytest.approx(0.7 / 1.5)
+
+
+def test_a_factor_of_one_keeps_the_step_size():
+    size = StepSize(0.06, 0.1, 1.0)
+    for kl in (0.0, 7.0):
+        size.adapt(kl)
+    assert size.value == 0.06
+
+
+def test_no_natural_step_is_longer_than_the_kl_of_an_iteration():
+    sizes = {kind: make(kind)[1].size for kind in ("natural", "adam")}
+    assert sizes["natural"].value == Natural().step
+    assert sizes["natural"].longest == pytest.approx(math.sqrt(2 * 0.1))
+    assert sizes["adam"].value == ADAM.learning_rate
+    assert sizes["adam"].longest == math.inf
+
+
+# --- steps ---
+
+
+@pytest.mark.parametrize("covariance", ["fixed", "diagonal", "full"])
+def test_adam_update_is_adam(covariance):
+    """Those of the covariance have a step size of their own; all of them have the factor of the annealing."""
+    actor, rule = make("adam", covariance)
+    other, _ = make("adam", covariance)
+    gaussian = other.gaussian
+    learned = [p for p in other.learned.parameters() if p.requires_grad]
+    deviation = [p for p in (gaussian.log_std, gaussian.mixing) if p.requires_grad]
+    assert len(deviation) == ("fixed", "diagonal", "full").index(covariance)
+    groups = [{"params": learned, "lr": 0.02}, *([{"params": deviation, "lr": 0.01}] if deviation else [])]
+    adam, data = torch.optim.Adam(groups, betas=(0.9, 0.99)), drawn(actor)
+    for scale in (1.0, 0.25):
+        assert rule.step(loss_of(actor, data), scale)
+        for group, size in zip(adam.param_groups, (0.02, 0.01), strict=False):
+            group["lr"] = scale * size
+        adam.zero_grad()
+        loss_of(other, data).backward()
+        adam.step()
+    assert same(values(actor), values(other))
+
+
+def test_natural_update_takes_steps_of_its_size():
+    """Of the length size · scale in the metric that it measured."""
+    for scale in (1.0, 0.25):
+        actor, rule = make("natural", momentum=0.0, step=0.05)
+        data = drawn(actor)
+        rule.measure(data, np.random.default_rng(0))
+        before = torch.cat([p.detach().flatten().clone() for p in rule.parameters])
+        assert rule.step(loss_of(actor, data), scale)
+        move = torch.cat([p.detach().flatten() for p in rule.parameters]) - before
+        metric = rule.optimiser.metric
+        assert float((move @ metric @ move).sqrt()) == pytest.approx(0.05 * scale)
+
+
+def test_the_kl_of_a_natural_step_is_its_length():
+    """A step of length l changes the policy by a KL divergence of ½ l²."""
+    actor, rule = make("natural", step=0.01, damping=0.1)
+    data = drawn(actor, 200)
+    rule.measure(data, np.random.default_rng(0))
+    samples = data.select("action", "action_log_prob").unsqueeze(-1)
+    samples["advantage"] = torch.randn(200, 1, 1, generator=torch.Generator().manual_seed(0)).double()
+    new = actor.solve(data.select(*actor.in_keys, "guess"))
+    surrogate = Surrogate(actor, 0.3, 10.0, 1.0, None)
+    rule.step(surrogate(new, data, gaussian_kl(data, new), samples, data, np.random.default_rng(0)), 1.0)
+    kl = gaussian_kl(data, actor.solve(data.select(*actor.in_keys, "guess")))
+    assert float(kl.mean()) == pytest.approx(0.5 * 0.01**2, rel=0.1)
+
+
+def test_the_metric_is_measured_with_some_of_the_samples():
+    actor, rule = make("natural", samples=7)
+    data, asked, jacobian = drawn(actor), [], actor.jacobian
+    actor.jacobian = lambda part: (asked.append(part["state"]), jacobian(part))[1]
+    rule.measure(data, np.random.default_rng(3))
+    assert torch.equal(asked[0], data["state"][np.random.default_rng(3).permutation(len(data))[:7]])
+    torch.testing.assert_close(
+        rule.optimiser.metric, make_metric(jacobian(data[np.random.default_rng(3).permutation(len(data))[:7]]))
+    )
+
+
+def make_metric(jacobian: torch.Tensor) -> torch.Tensor:
+    """Mean of Jᵀ J, those longer than three medians scaled down."""
+    length = jacobian.flatten(1).norm(dim=1)
+    limit = 3 * length[length > 0].median()
+    shortened = jacobian * (limit / length).clamp_max(1.0).nan_to_num(1.0)[:, None, None]
+    return torch.einsum("nip,niq->pq", shortened, shortened) / len(jacobian)
+
+
+@pytest.mark.parametrize("kind", ["adam", "natural"])
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_gradient_that_is_not_finite_changes_nothing(kind, bad):
+    actor, rule = make(kind, "full")
+    data = drawn(actor)
+    rule.measure(data, np.random.default_rng(0))
+    rule.step(loss_of(actor, data), 1.0)
+    before, state = values(actor), [p.clone() for p in _tensors(rule.state_dict())]
+    assert not rule.step(loss_of(actor, data) * bad, 1.0)
+    assert same(before, values(actor))
+    assert same(state, _tensors(rule.state_dict()))
+    one = loss_of(actor, data) + bad * actor.gaussian.log_std.sum()  # of the covariance alone
+    assert not rule.step(one, 1.0)
+    assert same(before, values(actor))
+    assert rule.step(loss_of(actor, data), 1.0)
+    assert not same(before, values(actor))
+
+
+def _tensors(state) -> list[torch.Tensor]:
+    from difflcs.rl.state import flatten
+
+    return list(flatten(state)[0].values())
+
+
+# --- the covariance ---
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_deviations_stay_within_their_limits(sign):
+    actor, rule = make("adam", "diagonal", std_learning_rate=0.5)
+    for _ in range(5):
+        rule.step(sign * loss_of(actor), 1.0)
+        assert 0.01 - 1e-12 <= float(actor.std) <= 0.05 + 1e-12
+    assert float(actor.std) == pytest.approx(0.01 if sign > 0 else 0.05)
+
+
+def test_a_fixed_covariance_stays():
+    actor, rule = make("adam")
+    assert rule.deviation.parameters == []
+    assert rule.deviation.state_dict() == {}
+    rule.step(loss_of(actor), 1.0)
+    assert float(actor.std) == pytest.approx(STD, rel=1e-15)
+
+
+# --- states ---
+
+
+@pytest.mark.parametrize("covariance", ["fixed", "full"])
+@pytest.mark.parametrize("kind", ["adam", "natural"])
+def test_a_loaded_rule_goes_on_the_same(kind, covariance):
+    first, second = make(kind, covariance), make(kind, covariance)
+    data = drawn(first[0])
+    first[1].measure(data, np.random.default_rng(0))
+    first[1].step(loss_of(first[0], data), 1.0)
+    first[1].size.adapt(0.0)
+    with torch.no_grad():
+        for p, other in zip(second[1].parameters, first[1].parameters, strict=True):
+            p.copy_(other)
+    second[1].load_state_dict(first[1].state_dict())
+    assert second[1].size.value == first[1].size.value != StepSize(0.06, 0.1, 1.5).value
+    for actor, rule in (first, second):
+        rule.measure(data, np.random.default_rng(1))
+        rule.step(loss_of(actor, data), 0.5)
+    assert same(values(first[0]), values(second[0]))
+    assert same(_tensors(first[1].state_dict()), _tensors(second[1].state_dict()))
+
+
+@pytest.mark.parametrize("size", [0.0, -1.0, math.nan])
+def test_a_step_size_that_is_not_positive_is_refused(size):
+    _, rule = make("adam")
+    state = rule.state_dict()
+    with pytest.raises(CheckpointError, match="positive step size"):
+        rule.load_state_dict({**state, "step_size": size})
+    assert rule.size.value == ADAM.learning_rate
+
+
+@pytest.mark.parametrize("kind", [AdamUpdate, NaturalUpdate])
+def test_a_fixed_model_is_refused(kind):
+    actor = make_actor(make_mpc(make_model().params().detach()), STD)
+    deviation = Deviation(actor, 0.01, (0.9, 0.99), (0.01, 0.05))
+    with pytest.raises(InvalidInputError, match="use an LCSModel"):
+        kind(actor, ADAM if kind is AdamUpdate else Natural(), 0.1, 1.5, deviation)
