@@ -76,12 +76,25 @@ class Critic:
         return gae(self.values, inputs, rewards, self.gamma, self.zeta)
 
     def begin(self, inputs: Tensor, rewards: Tensor, key: Sequence[int]) -> None:
-        """Fit the network to the returns of the first episodes, before the first advantages; later do nothing."""
+        """Fit the network to the returns of the first episodes, before the first advantages; later do nothing.
+
+        Args:
+            inputs: (N, T+1, n_inputs).
+            rewards: (N, T).
+            key: of random numbers.
+        """
         if not self.history:
             self._fit(inputs[:, :-1], returns(rewards, self.gamma), self.settings.epochs.first, (*key, 1))
 
     def learn(self, inputs: Tensor, rewards: Tensor, key: Sequence[int], epochs: int) -> None:
-        """Take in the episodes of an iteration, and fit the network to the newest iterations."""
+        """Take in the episodes of an iteration, and fit the network to the newest iterations.
+
+        Args:
+            inputs: (N, T+1, n_inputs).
+            rewards: (N, T) to be predicted.
+            key: of random numbers.
+            epochs: passes over the episodes.
+        """
         self.history = [*self.history, (inputs, rewards)][-self.settings.iterations :]
         targets = [self.gae(*part)["value_target"].squeeze(-1) for part in self.history]
         seen = torch.cat([inputs[:, :-1] for inputs, _ in self.history])

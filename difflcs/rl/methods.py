@@ -2,15 +2,16 @@
 
     @register_method
     @dataclass(frozen=True)
-    class Mine(Method):
+    class Mine(LCSMethod):
         name, version, summary, reports = "mine", 1, "…", (MyReport,)
         epochs: int = bounded(10, minimum=1)
 
         def trainer(self, work): ...
 
-A method is a frozen dataclass whose fields are its settings; the default instance is the method as it is meant. Then
-`difflcs train --method mine --epochs 20`, `evaluate`, `render` and `train(...)` know it, and the conformance suite of
-the methods tests it.
+A method is a frozen dataclass whose fields are its settings; the default instance is the method as it is meant. Where
+this was imported, `train(...)` and the command line know it: `difflcs train --method mine --epochs 20`, `evaluate`,
+`render`; and the conformance suite of the methods tests it. `LCSMethod` is the base of those that learn an `LCSModel`,
+`Method` of all others.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ class Method(Settings, ABC):
 
     @abstractmethod
     def trainer(self, work: Work) -> Trainer:
-        """What learns."""
+        """What learns: one iteration at a time, with reports of the types in `reports`."""
 
     @abstractmethod
     def rebuild(self, task: TaskSpec, config: Mapping[str, object], tensors: Mapping[str, Tensor], source: str) -> Any:
@@ -102,7 +103,7 @@ class Method(Settings, ABC):
 
     @property
     def solver(self) -> str | None:
-        """Name of the MPC solver; None without one."""
+        """Name of the MPC's backend; None where there is no MPC."""
         return None
 
     def check(self, minutes: float) -> None:

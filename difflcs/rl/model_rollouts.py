@@ -69,7 +69,7 @@ class ModelEnv(VectorEnv):
 
     Args:
         ensemble: predicts the next state.
-        outcome: the task.
+        outcome: reward and success of a transition, the task's own.
         num_envs: episodes side by side.
         episode_steps: steps of one episode.
         observation_space: Dict(state, goal) of one real environment.
@@ -177,7 +177,7 @@ class ModelRollouts:
 
     Args:
         env: the real environments.
-        outcome: the task: what its rewards and successes are.
+        outcome: reward and success of a transition, the task's own.
         settings: settings.
         seed: of the networks' initial weights and minibatches.
         episode_steps: steps of one episode.

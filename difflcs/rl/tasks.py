@@ -1,7 +1,7 @@
 """Tasks: what a training, an evaluation and a picture must know of an environment. Others register theirs here.
 
     register_task(TaskSpec(name="block", env=PushBlock, make_cost=..., ...))
-    train(task="block")
+    train(TrainConfig(task="block"))
 
 A package publishes its tasks without being imported first by an entry point in its pyproject.toml, a function without
 arguments that registers them:
@@ -86,11 +86,13 @@ class TaskSpec:
         relaxation: product λ·s of the MPC's complementarity.
         episode_steps: steps of one episode.
         step_seconds: duration of one step [s].
-        features: what the value network sees, scaled to about one.
-        outcome: reward and success of a transition; the environment's own.
-        failure_penalty: what that reward loses at the end of an episode without success.
+        features: what the value network sees, scaled to about one; a function as `Features` says.
+        outcome: reward and success of a transition, the environment's own; a function as `Outcome` says.
+        failure_penalty: what that reward has lost in the last step of an episode without success. Nothing is subtracted
+            here: PPO must know how much of that one reward is no cost of a step, see `RewardScale`.
         goal: names and units of the components of a goal.
-        errors: names and units of what remains to the goal, as the environment's info calls them.
+        errors: names and units of what remains to the goal, as the environment's info calls them: with `_error` at the
+            end.
         caption: the info of a step → what a picture says of it; None: the errors.
         picture: keyword arguments that the environment takes for pictures to be looked at, such as their size.
         example_goals: goals to show what was learned, the best one first.
@@ -102,6 +104,7 @@ class TaskSpec:
 
     Raises:
         InvalidInputError: a value does not fit.
+        DTypeError: something else where a function is wanted.
     """
 
     name: str

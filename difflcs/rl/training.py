@@ -158,7 +158,8 @@ def train(
         The finished run.
 
     Raises:
-        InvalidInputError: the data is used up by the warm-up, `init` does not fit the task, or `force` and `resume`.
+        InvalidInputError: no task has this name, its environment cannot be made, the data is used up by the warm-up,
+            `init` does not fit the task, or `force` and `resume`.
         CheckpointError: `out` holds files and neither `resume` nor `force` is set, or they cannot be resumed from, or
             they are no run, or they cannot be written; the last checkpoint is intact.
         InUseError: another process trains in `out`.

@@ -117,7 +117,10 @@ def fit(
         rng: draws the split and the minibatches.
 
     Returns:
-        Losses.
+        Losses and the number of steps.
+
+    Raises:
+        GammaError: gamma of the loss is too large for this model.
     """
     gamma, xi = settings.loss.gamma, settings.loss.xi
     order = torch.from_numpy(rng.permutation(len(x)))
@@ -187,6 +190,9 @@ class Warmup(Trainer):
         seed: of noise, minibatches, goals and initial states.
         episode_steps: steps of one episode.
         pretrained: the model is already useful: skip the random episodes and the long first training.
+
+    Raises:
+        InvalidInputError: too few environments.
     """
 
     def __init__(

@@ -13,7 +13,6 @@ from difflcs import LCSModel
 from difflcs.rl.tasks import get_task
 
 PATH = Path(__file__).parent / "push.gif"
-GOALS = [(0.04, 0.03, 0.3), (-0.04, 0.03, -0.3), (0.0, -0.05, 0.4), (0.05, -0.02, 0.0)]  # x [m], y [m], yaw [rad]
 WIDTH, HEIGHT = 300, 225
 FRAME_MILLISECONDS = 100  # a step of the environment: real time
 
@@ -24,7 +23,7 @@ def main() -> None:
     policy = task.make_policy(LCSModel.from_pretrained("trifinger-cube"))
     env = task.make_env(render_mode="rgb_array", width=WIDTH, height=HEIGHT).unwrapped
     frames: list[Image.Image] = []
-    for seed, goal in enumerate(GOALS):
+    for seed, goal in enumerate(task.example_goals):
         observation, _ = env.reset(seed=seed, options={"goal": np.array(goal)})
         for _ in range(task.episode_steps):
             state, target = (torch.from_numpy(np.asarray(observation[key], np.float64)) for key in ("state", "goal"))
@@ -33,8 +32,7 @@ def main() -> None:
             observation, _, _, _, info = env.step(action.numpy())
             views = [env.picture(), env.picture("top")]
             frame = Image.fromarray(np.concatenate(views, axis=1))
-            text = f"off by {1000 * info['position_error']:.0f} mm, {info['yaw_error']:.2f} rad"
-            ImageDraw.Draw(frame).text((6, 4), text, fill=(20, 20, 30), font_size=14)
+            ImageDraw.Draw(frame).text((6, 4), task.say(info), fill=(20, 20, 30), font_size=14)
             frames.append(frame)
         frames += [frames[-1]] * 5
     palette = frames[0].quantize(64, dither=Image.Dither.NONE)
