@@ -179,7 +179,8 @@ def _hash(header: Mapping[str, object], tensors: Mapping[str, Tensor]) -> str:
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(tensors):
         digest.update(f"{name} {tuple(tensors[name].shape)} {tensors[name].dtype}".encode())
-        digest.update(tensors[name].contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+        whole = tensors[name].clone(memory_format=torch.contiguous_format)  # one element may have a stride of 0
+        digest.update(whole.view(-1).view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()
 
 
