@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+
+from difflcs.errors import InvalidInputError
 
 _RENAMED: Mapping[str, str] = {
     "--trust-region": "--action-support",
@@ -91,3 +93,20 @@ def renamed(flag: str) -> str | None:
             rest = flag.removeprefix(old)
             return renamed(f"{new}{rest}") or f"{new}{rest}"
     return None
+
+
+def refuse_flags_of_before(words: Sequence[str]) -> None:
+    """Say what became of flags of before.
+
+    Args:
+        words: of the command line, after the command.
+
+    Raises:
+        InvalidInputError: one of them is such a flag.
+    """
+    for word in words:
+        flag = word.partition("=")[0].replace("_", "-")
+        if reason := gone(flag):
+            raise InvalidInputError(f"{flag}: expected a flag of today, got one of before, which is gone: {reason}")
+        if new := renamed(flag):
+            raise InvalidInputError(f"{flag}: expected a flag of today, got one of before; it is called {new} now")

@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal, cast
 import torch
 
 from difflcs import zoo
-from difflcs._renamed import gone, renamed
+from difflcs._renamed import refuse_flags_of_before
 from difflcs.errors import CheckpointError, DiffLCSError, InvalidInputError
 from difflcs.rl._optional import require, versions
 from difflcs.rl.checkpoint import RunDirectory
@@ -116,15 +116,6 @@ def _train_command(words: Sequence[str]) -> type[Train]:
         frozen=True,
         namespace={"__doc__": Train.__doc__, "__post_init__": lambda self: None},
     )
-
-
-def _refuse_flags_of_before(words: Sequence[str]) -> None:
-    for word in words:
-        flag = word.partition("=")[0].replace("_", "-")
-        if reason := gone(flag):
-            raise InvalidInputError(f"{flag}: expected a flag of today, got one of before, which is gone: {reason}")
-        if new := renamed(flag):
-            raise InvalidInputError(f"{flag}: expected a flag of today, got one of before; it is called {new} now")
 
 
 def _methods() -> str:
@@ -439,7 +430,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # `train` has settings for which None means something.
         plain = {k: v if k == "train" else Annotated[v, tyro.conf.DisallowNone] for k, v in _COMMANDS.items()}
         if words[:1] in (["train"], ["evaluate"]):
-            _refuse_flags_of_before(words[1:])
+            refuse_flags_of_before(words[1:])
         if words[:1] == ["train"]:
             plain["train"] = _train_command(words[1:])
         command = tyro.extras.subcommand_cli_from_dict(

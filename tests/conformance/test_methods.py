@@ -226,8 +226,9 @@ def test_a_run_is_not_continued_with_the_checkpoints_of_another_method(name, fin
     files = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
     with pytest.raises(CheckpointError, match="another method"):
         train(make_config(name), run.path, task=TOY, resume=True)
-    with pytest.raises(CheckpointError):
-        load_policy(run, TOY)
+    if make_config(other).method.kind != make_config(name).method.kind:
+        with pytest.raises(CheckpointError):
+            load_policy(run, TOY)
     assert {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()} == files
 
 
