@@ -180,7 +180,8 @@ def digest(header: Mapping[str, object], tensors: Mapping[str, Tensor]) -> str:
     total = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(tensors):
         total.update(f"{name} {tuple(tensors[name].shape)} {tensors[name].dtype}".encode())
-        total.update(tensors[name].contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+        whole = tensors[name].clone(memory_format=torch.contiguous_format)  # one element may have a stride of 0
+        total.update(whole.view(-1).view(torch.uint8).numpy().tobytes())
     return total.hexdigest()
 
 

@@ -1,8 +1,10 @@
-"""Flags of the command line that have another name now, so that the error can say which."""
+"""Flags of the command line that have another name now, or are gone, so that the error can say so."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+
+from difflcs.errors import InvalidInputError
 
 _RENAMED: Mapping[str, str] = {
     "--trust-region": "--action-support",
@@ -29,6 +31,7 @@ _RENAMED: Mapping[str, str] = {
     "--ppo.learning-rate-factor": "--ppo.step-factor",
     "--ppo.jump-kl": "--ppo.outlier-kl",
     "--ppo.learn-std": "--ppo.covariance diagonal",
+    "--ppo.no-learn-std": "--ppo.covariance fixed",
     "--ppo.violation-gamma": "--ppo.violation.gamma",
     "--ppo.violation-xi": "--ppo.violation.xi",
     "--ppo.value-width": "--ppo.critic.width",
@@ -59,6 +62,27 @@ _RENAMED: Mapping[str, str] = {
 """Flags of before → those of now; with a dot at the end, all that begin so."""
 
 
+_GONE: Mapping[str, str] = {
+    "--warmup.adam-eps": "it is always 1e-6, as no recipe had another",
+    "--ppo.sample-clip": "single samples have no limit of their own, as in all recipes; see --ppo.outlier-kl",
+    "--ppo.final-std": "the policy's deviation no longer falls by a schedule; learn it by --ppo.covariance diagonal",
+    "--ppo.failure-penalty": "it is a number of the task, `failure_penalty` of its TaskSpec",
+    "--ppo.violation-batch": "it is always 300, as no recipe had another",
+    "--imagination.steps-minibatch": "steps on model rollouts have as many samples as those on real ones, "
+    "--ppo.minibatch",
+    **{
+        f"--mlp.{name}": "the natural gradient needs a policy with an MPC, which a network is not"
+        for name in ("natural", "no-natural", "natural-step", "natural-momentum", "natural-damping", "natural-samples")
+    },
+}
+"""Flags of before that nothing is in the place of → why."""
+
+
+def gone(flag: str) -> str | None:
+    """Why a flag of `difflcs train` of before is there no more; None if it is none."""
+    return _GONE.get(flag) or _GONE.get(flag.replace("--mlp.", "--ppo."))
+
+
 def renamed(flag: str) -> str | None:
     """What a flag of `difflcs train` or `evaluate` of before is called now; None if it is none."""
     for old, new in _RENAMED.items():
@@ -68,3 +92,20 @@ def renamed(flag: str) -> str | None:
             rest = flag.removeprefix(old)
             return renamed(f"{new}{rest}") or f"{new}{rest}"
     return None
+
+
+def refuse_flags_of_before(words: Sequence[str]) -> None:
+    """Say what became of flags of before.
+
+    Args:
+        words: of the command line, after the command.
+
+    Raises:
+        InvalidInputError: one of them is such a flag.
+    """
+    for word in words:
+        flag = word.partition("=")[0].replace("_", "-")
+        if reason := gone(flag):
+            raise InvalidInputError(f"{flag}: expected a flag of today, got one of before, which is gone: {reason}")
+        if new := renamed(flag):
+            raise InvalidInputError(f"{flag}: expected a flag of today, got one of before; it is called {new} now")

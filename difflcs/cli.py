@@ -6,20 +6,20 @@ Tasks and methods are known by their registries only; the flags of `train` are m
 from __future__ import annotations
 
 import importlib.util
-import itertools
 import json
 import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, make_dataclass
+from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import torch
 
 from difflcs import zoo
-from difflcs._renamed import renamed
+from difflcs._renamed import refuse_flags_of_before
 from difflcs.errors import CheckpointError, DiffLCSError, InvalidInputError
 from difflcs.rl._optional import require, versions
 from difflcs.rl.checkpoint import RunDirectory
@@ -30,9 +30,6 @@ from difflcs.rl.progress import Progress, bar, summary
 from difflcs.rl.tasks import TaskSpec, get_task
 from difflcs.rl.training import EVALUATION_ENVS, TrainConfig, profile, saved_bounds, stored_config, train
 from difflcs.zoo import Learned
-
-if TYPE_CHECKING:
-    pass
 
 _SMOKE_GOALS = 4
 
@@ -121,20 +118,13 @@ def _train_command(words: Sequence[str]) -> type[Train]:
     )
 
 
-def _refuse_renamed(words: Sequence[str]) -> None:
-    for word in words:
-        flag = word.partition("=")[0].replace("_", "-")
-        if new := renamed(flag):
-            raise InvalidInputError(f"{flag}: expected a flag of today, got one of before; it is called {new} now")
-
-
 def _methods() -> str:
     return "How to learn: " + "; ".join(f"{name}: {get_method(name).summary}" for name in method_names()) + "."
 
 
 def _value(words: Sequence[str], flag: str) -> str | None:
     """What follows a flag, as `--flag value` or `--flag=value`."""
-    for word, following in itertools.zip_longest(words, words[1:]):
+    for word, following in zip_longest(words, words[1:]):
         if word == flag:
             return following
         if word.startswith(f"{flag}="):
@@ -219,7 +209,7 @@ class Render:
 
     model: Path
     """Run directory, or zoo:NAME for one of the models that `difflcs zoo` lists."""
-    goal: tuple[float, ...] = ()
+    goal: tuple[float, ...] | None = None
     """Goals, one after another, each with the numbers that the task wants; by default an example of the task."""
     out: Path = Path("video.mp4")
     """Video to write, an MP4."""
@@ -251,7 +241,7 @@ class Render:
         size = task.n_goal
         if self.goal and len(self.goal) % size == 0:
             return [self.goal[i : i + size] for i in range(0, len(self.goal), size)]
-        if not self.goal and task.example_goals:
+        if self.goal is None and task.example_goals:
             return [task.example_goals[0]]
         names = ", ".join(f"{q.name} [{q.unit}]" for q in task.goal) or f"{size} numbers"
         raise InvalidInputError(f"goal: expected {names} for each goal of {task.name}, got {self.goal}; pass --goal")
@@ -440,7 +430,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # `train` has settings for which None means something.
         plain = {k: v if k == "train" else Annotated[v, tyro.conf.DisallowNone] for k, v in _COMMANDS.items()}
         if words[:1] in (["train"], ["evaluate"]):
-            _refuse_renamed(words[1:])
+            refuse_flags_of_before(words[1:])
         if words[:1] == ["train"]:
             plain["train"] = _train_command(words[1:])
         command = tyro.extras.subcommand_cli_from_dict(

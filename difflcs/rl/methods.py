@@ -35,7 +35,7 @@ from difflcs.rl.pddm import PDDM, PDDMReport, PDDMSettings, Planner
 from difflcs.rl.ppo import PPO, PPOReport
 from difflcs.rl.ppo_settings import PPOSettings, make_ppo
 from difflcs.rl.rollout import Policy
-from difflcs.rl.settings import MOST_WIDTH, Adam, Rollouts, Settings, bounded, group
+from difflcs.rl.settings import MOST_WIDTH, Adam, Epochs, Rollouts, Settings, bounded, group
 from difflcs.rl.tasks import TaskSpec
 from difflcs.rl.trainer import Trainer
 from difflcs.rl.warmup import Warmup, WarmupReport, WarmupSettings
@@ -261,8 +261,12 @@ def _few(settings: Rollouts) -> Rollouts:
     return replace(settings, first=min(settings.first, 5), each=min(settings.each, 5))
 
 
+def _short(settings: Epochs, first: int, each: int) -> Epochs:
+    return replace(settings, first=min(settings.first, first), each=min(settings.each, each))
+
+
 def _short_warmup(settings: WarmupSettings) -> WarmupSettings:
-    return replace(settings, rollouts=_few(settings.rollouts), epochs=replace(settings.epochs, first=20, each=2))
+    return replace(settings, rollouts=_few(settings.rollouts), epochs=_short(settings.epochs, 20, 2))
 
 
 def _short_main(settings: PPOSettings, rollouts: int = 3) -> PPOSettings:
@@ -275,7 +279,7 @@ def _short_models(settings: ModelRolloutSettings) -> ModelRolloutSettings:
         iterations=min(settings.iterations, 1),
         rollouts=min(settings.rollouts, 5),
         steps=min(settings.steps, 2),
-        ensemble=replace(settings.ensemble, epochs=replace(settings.ensemble.epochs, first=2, each=1)),
+        ensemble=replace(settings.ensemble, epochs=_short(settings.ensemble.epochs, 2, 1)),
     )
 
 
@@ -470,13 +474,12 @@ class PDDMMethod(Method):
     def smoke(self) -> Self:
         """See `Method`."""
         ensemble, own = self.pddm.ensemble, self.pddm
-        epochs = replace(ensemble.epochs, first=min(ensemble.epochs.first, 2), each=min(ensemble.epochs.each, 2))
         return replace(
             self,
             pddm=replace(
                 own,
                 rollouts=_few(own.rollouts),
                 samples=min(own.samples, 10),
-                ensemble=replace(ensemble, epochs=epochs),
+                ensemble=replace(ensemble, epochs=_short(ensemble.epochs, 2, 2)),
             ),
         )

@@ -1,20 +1,29 @@
 """The command line, from outside."""
 
+import contextlib
 import importlib.util
+import io
 import json
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import get_type_hints
 
 import pytest
 import torch
 
 from difflcs import LCSModel, cli
-from difflcs.errors import CheckpointError
 from difflcs.rl.checkpoint import RunDirectory
+from difflcs.rl.methods import LCSRLMethod, get_method, method_names
+from difflcs.rl.training import TrainConfig
 
 
 def run(capsys, *arguments) -> tuple[int, str, str]:
@@ -28,7 +37,7 @@ def finished(tmp_path_factory):
     """A finished smoke run."""
     pytest.importorskip("mujoco")
     path = tmp_path_factory.mktemp("cli") / "run"
-    assert cli.main(["train", "--smoke", "--out", str(path)]) == 0
+    assert cli.main(["train", "--method", "violation", "--smoke", "--out", str(path)]) == 0
     return path
 
 
@@ -38,33 +47,186 @@ def test_the_library_imports_none_of_this():
     assert not {"tyro", "gymnasium", "mujoco", "difflcs.rl", "difflcs.cli"} & set(loaded)
 
 
-@pytest.mark.parametrize("command", ["", *cli._COMMANDS])
+HELP = {
+    "": "zoo:trifinger-cube",
+    "train": "--warmup.noise",
+    "evaluate": "zoo:NAME",
+    "render": "--force",
+    "demo": "--smoke",
+    "zoo": "--json",
+    "assets": "sugar_box",
+    "bench": "--ipopt-batch",
+    "doctor": "--json",
+}
+
+
+def printed(capsys, *arguments) -> str:
+    with pytest.raises(SystemExit) as exit_:
+        cli.main([*arguments, "--help"])
+    assert exit_.value.code == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", HELP)
 def test_help(capsys, command, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    with pytest.raises(SystemExit) as exit_:
-        cli.main([*command.split(), "--help"])
-    assert exit_.value.code == 0
-    text = capsys.readouterr().out
-    wanted = {
-        "": "zoo:trifinger-cube",
-        "train": "--warmup.noise",
-        "evaluate": "zoo:NAME",
-        "render": "--force",
-        "demo": "--smoke",
-        "zoo": "--json",
-        "assets": "sugar_box",
-        "bench": "--ipopt-batch",
-        "doctor": "--json",
-    }
-    assert wanted[command] in text
+    text = printed(capsys, *command.split())
+    assert HELP[command] in text
     words = [line for line in text.splitlines() if not line.startswith("usage")]
     assert max(map(len, words)) <= 80
+
+
+def test_every_command_has_a_test_of_its_help(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["nonsense"])
+    err = capsys.readouterr().err
+    assert all(command in err for command in HELP)
+
+
+# --- the flags of train -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def flags():
+    """Flags of `difflcs train` by method."""
+    found = {}
+    for method in method_names():
+        with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as text:
+            patch.setenv("COLUMNS", "80")
+            with pytest.raises(SystemExit):
+                cli.main(["train", "--method", method, "--help"])
+        found[method] = set(re.findall(r"^\W (--[a-z.-]+)", text.getvalue(), re.MULTILINE))
+    return found
+
+
+def settings_of(kind: type, prefix: str = "") -> Iterator[str]:
+    for f in fields(kind):
+        hint = get_type_hints(kind)[f.name]
+        if is_dataclass(hint):
+            yield from settings_of(hint, f"{prefix}{f.name}.")
+        else:
+            yield f"--{prefix}{f.name}".replace("_", "-")
+
+
+@pytest.mark.parametrize("method", method_names())
+def test_each_methods_settings_show_with_that_method_only(flags, method):
+    own = {name: set(settings_of(get_method(name))) for name in method_names()}
+    common = {flag for flag in settings_of(TrainConfig) if not flag.startswith("--method")} | {"--method"}
+    assert flags[method] == own[method] | common | {"--out", "--init", "--resume", "--force", "--smoke"}
+    for other in own:
+        assert not (own[other] - own[method]) & flags[method]
+
+
+def test_the_default_is_lcs_rl_on_the_cube(capsys, flags, monkeypatch, tmp_path):
+    seen = []
+    monkeypatch.setattr(cli, "train", lambda config, out, **_: seen.append((config, out)) or run_of(out))
+    assert run(capsys, "train", "--task", "cube")[0] == 0
+    assert run(capsys, "train")[0] == 0
+    config, out = seen[0]
+    assert config == seen[1][0] == TrainConfig() == TrainConfig(task="cube", method=LCSRLMethod())
+    assert config.method.name == "lcs-rl"
+    assert out == Path("runs/cube-lcs-rl-0")
+    assert set(settings_of(LCSRLMethod)) <= flags["lcs-rl"]
+
+
+def run_of(out: Path) -> SimpleNamespace:
+    return SimpleNamespace(path=out, rows=lambda: [])
+
+
+def test_settings_reach_the_method(capsys, monkeypatch):
+    seen = []
+    monkeypatch.setattr(cli, "train", lambda config, out, **_: seen.append(config) or run_of(out))
+    words = ["--method", "ppo-mlp", "--width", 32, "--ppo.critic.epochs.first", 7, "--ppo.adam.betas", 0.5, 0.6]
+    assert run(capsys, "train", "--seed", 4, *words)[0] == 0
+    usual = get_method("ppo-mlp")()
+    assert seen[0].method == replace(
+        usual,
+        width=32,
+        ppo=replace(
+            usual.ppo,
+            adam=replace(usual.ppo.adam, betas=(0.5, 0.6)),
+            critic=replace(usual.ppo.critic, epochs=replace(usual.ppo.critic.epochs, first=7)),
+        ),
+    )
+    assert seen[0].seed == 4
+
+
+# `difflcs train --help` before tasks and methods had registries.
+FLAGS_OF_BEFORE = """
+--backend --evaluate-at --evaluate-goals --evaluation-seed --final-goals --force --imagination.actions
+--imagination.epochs --imagination.final-iterations --imagination.first-epochs --imagination.iterations
+--imagination.learning-rate --imagination.minibatch --imagination.networks --imagination.real-step
+--imagination.rollouts --imagination.steps --imagination.steps-minibatch --imagination.value-epochs
+--imagination.width --imagination.zeta --init --init-scale --method --minutes --mlp.beta --mlp.betas --mlp.clip
+--mlp.cost-limit --mlp.covariance --mlp.failure-penalty --mlp.final-std --mlp.final-step --mlp.gamma --mlp.jump-kl
+--mlp.kl-quantile --mlp.learning-rate --mlp.learning-rate-factor --mlp.max-kl --mlp.minibatch --mlp.natural
+--mlp.natural-damping --mlp.natural-momentum --mlp.natural-samples --mlp.natural-step --mlp.no-learn-std
+--mlp.reward-scale --mlp.rollouts --mlp.sample-clip --mlp.std --mlp.std-learning-rate --mlp.std-range --mlp.steps
+--mlp.target-kl --mlp.value-epochs --mlp.value-first-epochs --mlp.value-iterations --mlp.value-learning-rate
+--mlp.value-minibatch --mlp.value-weight-decay --mlp.value-width --mlp.violation-batch --mlp.violation-gamma
+--mlp.violation-xi --mlp.width --mlp.zeta --n-lam --out --pddm.epochs --pddm.filter --pddm.horizon --pddm.kappa
+--pddm.learning-rate --pddm.minibatch --pddm.networks --pddm.noise --pddm.random-rollouts
+--pddm.rollouts-per-iteration --pddm.samples --pddm.width --ppo.beta --ppo.betas --ppo.clip --ppo.cost-limit
+--ppo.covariance --ppo.failure-penalty --ppo.final-std --ppo.final-step --ppo.gamma --ppo.jump-kl --ppo.kl-quantile
+--ppo.learn-std --ppo.learning-rate --ppo.learning-rate-factor --ppo.max-kl --ppo.minibatch --ppo.natural-damping
+--ppo.natural-momentum --ppo.natural-samples --ppo.natural-step --ppo.no-natural --ppo.reward-scale --ppo.rollouts
+--ppo.sample-clip --ppo.std --ppo.std-learning-rate --ppo.std-range --ppo.steps --ppo.target-kl --ppo.value-epochs
+--ppo.value-first-epochs --ppo.value-iterations --ppo.value-learning-rate --ppo.value-minibatch
+--ppo.value-weight-decay --ppo.value-width --ppo.violation-batch --ppo.violation-gamma --ppo.violation-xi --ppo.zeta
+--resume --seed --smoke --stiffness --task --warmup-minutes --warmup.adam-eps --warmup.betas --warmup.buffer-rollouts
+--warmup.epochs --warmup.first-epochs --warmup.gamma --warmup.held-out --warmup.learning-rate
+--warmup.learning-rate-decay --warmup.minibatch --warmup.noise --warmup.random-rollouts
+--warmup.rollouts-per-iteration --warmup.trust-region --warmup.trust-region-growth --warmup.xi
+--ppo.natural --ppo.no-learn-std --mlp.no-natural --mlp.learn-std
+""".split()
+GONE = {
+    "warmup.adam-eps", "ppo.sample-clip", "ppo.final-std", "ppo.failure-penalty", "ppo.violation-batch",
+    "imagination.steps-minibatch", "mlp.sample-clip", "mlp.final-std", "mlp.failure-penalty", "mlp.violation-batch",
+    "mlp.natural", "mlp.no-natural", "mlp.natural-step", "mlp.natural-momentum", "mlp.natural-damping",
+    "mlp.natural-samples",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("flag", FLAGS_OF_BEFORE)
+def test_flags_of_before_exist_or_say_what_became_of_them(capsys, flags, flag):
+    known = set().union(*flags.values())
+    for word in (flag, flag.replace("-", "_").replace("__", "--", 1)):
+        if flag in known:
+            assert flag.removeprefix("--") not in GONE
+            continue
+        code, out, err = run(capsys, "train", word, "1")
+        assert code == 2
+        assert err.startswith(f"difflcs: {flag}: expected a flag of today")
+        assert "Traceback" not in out + err
+        if flag.removeprefix("--") in GONE:
+            assert "which is gone: " in err
+        else:
+            new = re.search(r"it is called (--[a-z.-]+)(?: [a-z]+)? now", err)
+            assert new is not None
+            assert new[1] in known
+            if flag.startswith("--mlp."):
+                assert new[1] in flags["ppo-mlp"]
+
+
+def test_the_renamed_flag_of_evaluate(capsys):
+    code, _, err = run(capsys, "evaluate", "zoo:trifinger-cube", "--trust-region")
+    assert (code, "--action-support" in err) == (2, True)
+
+
+def test_flags_of_another_method_are_refused(capsys):
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["train", "--method", "pddm", "--n-lam", "5"])
+    assert exit_.value.code == 2
+    assert "--n-lam" in capsys.readouterr().err
+
+
+# --- mistakes ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["train", "--task", "cubes"], "expected one of cube,"),
+        (["train", "--task", "cubes"], "expected one of "),
         (["train", "--method", "lcs-rl", "--minutes", "3"], "--minutes 30"),
         (["train", "--method", "pddm", "--init", "nowhere"], "init: expected none"),
         (["train", "--backend", "magic", "--smoke"], "magic"),
@@ -79,7 +241,9 @@ def test_help(capsys, command, monkeypatch):
         (["train", "--method", "lcs-rl", "--minutes", "30", "--warmup-minutes", "0"], "warmup_minutes"),
         (["evaluate", "zoo:trifinger-cube", "--goals", "0"], "goals"),
         (["evaluate", "zoo:trifinger-cube", "--seed", "-1"], "seed"),
-        (["render", "zoo:trifinger-cube", "--goal"], "at least one goal"),
+        (["render", "zoo:trifinger-cube", "--goal"], "expected x [m], y [m], yaw [rad] for each goal"),
+        (["render", "zoo:trifinger-cube", "--goal", "0.1"], "expected x [m], y [m], yaw [rad] for each goal"),
+        (["train", "--method", "magic"], "expected one of lcs-rl, violation"),
         (["render", "zoo:trifinger-cube", "--out", "video.gif"], "MP4"),
         (["bench", "--repeats", "0"], "repeats"),
         (["evaluate", "nowhere"], "difflcs train"),
@@ -128,7 +292,7 @@ def test_train_leaves_a_run(finished):
     names = {path.name for path in finished.iterdir()}
     assert names == {"config.json", "log.csv", "tensorboard", "checkpoints", "model"}
     config = json.loads((finished / "config.json").read_text())
-    assert config["config"]["warmup"]["noise"] == 0.003
+    assert config["config"]["settings"]["warmup"]["noise"] == 0.003
     assert config["versions"]["mujoco"]
     rows = (finished / "log.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in rows] == ["iteration", "0", "1", "2", "3"]
@@ -147,7 +311,7 @@ def test_evaluate(capsys, finished):
     for record in (first, second):
         del record["seconds"]
     assert first == second
-    code, out, _ = run(capsys, "evaluate", finished, "--smoke", "--trust-region")
+    code, out, _ = run(capsys, "evaluate", finished, "--smoke", "--action-support")
     assert code == 0
     assert "of 4 goals (95 % interval" in out
 
@@ -156,14 +320,18 @@ def test_a_run_says_which_object_it_was_trained_on(capsys, tmp_path, monkeypatch
     monkeypatch.delenv("DIFFLCS_YCB_DIR", raising=False)
     monkeypatch.setenv("DIFFLCS_CACHE_DIR", str(tmp_path / "cache"))
     path = tmp_path / "run"
-    smoke = ["--smoke", "--minutes", 0.1, "--final-goals", 0]
+    smoke = ["--method", "violation", "--smoke", "--minutes", 0.1, "--final-goals", 0]
     assert run(capsys, "train", "--task", "mug", *smoke, "--out", path)[0] == 0
     stored = json.loads((path / "config.json").read_text())["object"]
     assert (stored["name"], stored["source"], stored["mass"]) == ("mug", "stand_in", 0.05)
     assert json.loads(run(capsys, "evaluate", path, "--smoke", "--json")[1])["object"] == stored
-    assert "object: mug (stand in, 50 g)" in run(capsys, "evaluate", path, "--smoke")[1]
-    with pytest.raises(CheckpointError, match="expected the object it was started with"):
-        cli._note_object(path, {**stored, "source": "ycb_mesh"})
+    assert "object: mug (source stand_in, mass 0.05" in run(capsys, "evaluate", path, "--smoke")[1]
+    shutil.copytree(path, tmp_path / "other")
+    config = json.loads((path / "config.json").read_text())
+    (tmp_path / "other/config.json").write_text(json.dumps({**config, "object": {**stored, "source": "ycb_mesh"}}))
+    shutil.rmtree(tmp_path / "other/model")
+    code, _, err = run(capsys, "train", "--out", tmp_path / "other", "--resume")
+    assert (code, "expected the environment it was started with" in err) == (2, True)
     monkeypatch.setenv("DIFFLCS_YCB_DIR", str(tmp_path))
     code, _, err = run(capsys, "evaluate", path, "--smoke")
     assert code == 2
@@ -194,7 +362,7 @@ def test_assets_download(capsys, tmp_path, monkeypatch):
 
 def test_an_existing_run_is_not_overwritten(capsys, finished):
     before = {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
-    code, _, err = run(capsys, "train", "--smoke", "--out", finished)
+    code, _, err = run(capsys, "train", "--method", "violation", "--smoke", "--out", finished)
     assert code == 2
     assert "--resume" in err
     code, _, err = run(capsys, "train", "--smoke", "--out", finished, "--resume", "--seed", 3)
@@ -210,7 +378,7 @@ def contents(path):
 
 def test_force_replaces_a_run_once_the_new_one_has_begun(capsys, tmp_path, monkeypatch):
     path = tmp_path / "run"
-    short = ["--smoke", "--minutes", 0.1, "--final-goals", 0, "--out", path, "--force"]
+    short = ["--method", "violation", "--smoke", "--minutes", 0.1, "--final-goals", 0, "--out", path, "--force"]
     assert run(capsys, "train", *short)[0] == 0  # nothing there yet
     (path / "notes.txt").write_text("mine")
     before = contents(path)
@@ -225,7 +393,7 @@ def test_force_replaces_a_run_once_the_new_one_has_begun(capsys, tmp_path, monke
         assert (code, message in err) == (2, True), err
         assert contents(path) == before
     with monkeypatch.context() as patch:  # interrupted before it begins
-        patch.setattr("difflcs.rl.training._make_trainer", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr("difflcs.rl.methods.ViolationMethod.trainer", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         assert run(capsys, "train", *short, "--seed", 1)[0] == 130
     assert contents(path) == before
     assert run(capsys, "train", *short, "--seed", 1)[0] == 0
@@ -254,8 +422,9 @@ def test_force_never_replaces_what_is_not_a_run(capsys, tmp_path, content):
 
 
 def test_the_default_run_directory_says_what_is_in_it():
-    assert str(cli.Train(task="mug", method="lcs-rl", seed=7).directory) == os.path.join("runs", "mug-lcs-rl-7")
-    assert str(cli.Train(out=Path("a/{seed}/{other}"), seed=7).directory) == os.path.join("a", "7", "{other}")
+    config = TrainConfig(task="mug", method="ppo", seed=7)
+    assert config.directory() == Path("runs/mug-ppo-7")
+    assert config.directory("a/{seed}/{other}") == Path("a/7/{other}")
 
 
 def test_bench(capsys):
@@ -278,7 +447,7 @@ def test_resume_after_any_crash_gives_the_same_run(capsys, finished, tmp_path, m
 
     with monkeypatch.context() as patch:
         patch.setattr(cli.Progress, "iterated", die)
-        code, _, err = run(capsys, "train", "--smoke", "--out", path)
+        code, _, err = run(capsys, "train", "--method", "violation", "--smoke", "--out", path)
     assert code == 130
     assert f"difflcs train --out {path} --resume" in err
     code, out, _ = run(capsys, "evaluate", path, "--smoke")
@@ -293,19 +462,19 @@ def test_resume_after_any_crash_gives_the_same_run(capsys, finished, tmp_path, m
     assert run(capsys, "train", "--out", path, "--resume")[0] == 0
     for name in ("model/model.safetensors", "checkpoints/000003/model.safetensors", "checkpoints/000003/config.json"):
         assert (path / name).read_bytes() == (finished / name).read_bytes()
-    logs = [[_untimed(line) for line in (run / "log.csv").read_text().splitlines()] for run in (path, finished)]
+    logs = [[_untimed(row) for row in RunDirectory.open(run).rows()] for run in (path, finished)]
     assert logs[0] == logs[1]
 
 
-def _untimed(line: str) -> list[str]:
-    cells = line.split(",")
-    return cells[:10] + cells[12:-1]
+def _untimed(row: dict[str, str]) -> dict[str, str]:
+    return {name: cell for name, cell in row.items() if not name.endswith("_seconds")}
 
 
 def test_init_starts_from_a_trained_model(capsys, finished, tmp_path):
     for source in (finished, finished / "model"):
         out = tmp_path / source.name
-        arguments = ["--smoke", "--minutes", 0.1, "--final-goals", 0, "--init", source, "--out", out]
+        arguments = ["--method", "violation", "--smoke", "--minutes", 0.1, "--final-goals", 0]
+        arguments += ["--init", source, "--out", out]
         assert run(capsys, "train", *arguments)[0] == 0
     assert json.loads((tmp_path / "run/config.json").read_text())["init"] == str(finished)
 
@@ -351,7 +520,8 @@ def test_demo(capsys, tmp_path):
 def test_ctrl_c_in_a_real_process(tmp_path):
     pytest.importorskip("mujoco")
     path = tmp_path / "run"
-    command = [sys.executable, "-m", "difflcs.cli", "train", "--final-goals", "0", "--evaluate-at", "--out", str(path)]
+    command = [sys.executable, "-m", "difflcs.cli", "train", "--method", "violation", "--final-goals", "0"]
+    command += ["--evaluate-at", "--out", str(path)]
     process = subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, start_new_session=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # ignored where the tests run under nohup
@@ -373,7 +543,7 @@ def test_ctrl_c_in_a_real_process(tmp_path):
 def test_one_training_at_a_time_in_a_run(capsys, tmp_path, monkeypatch, words):
     pytest.importorskip("mujoco")
     path = tmp_path / "run"
-    arguments = ["train", "--smoke", "--minutes", 0.1, "--final-goals", 0, "--out", path]
+    arguments = ["train", "--method", "violation", "--smoke", "--minutes", 0.1, "--final-goals", 0, "--out", path]
     seen = []
 
     class Second(cli.Progress):
@@ -404,7 +574,7 @@ def test_two_processes_resume_one_run(capsys, tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(cli.Progress, "iterated", die)
-        assert run(capsys, "train", "--smoke", "--final-goals", 0, "--out", path)[0] == 130
+        assert run(capsys, "train", "--method", "violation", "--smoke", "--final-goals", 0, "--out", path)[0] == 130
     command = [sys.executable, "-m", "difflcs.cli", "train", "--out", str(path), "--resume"]
     with RunDirectory(path).locked():
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)

@@ -1,0 +1,405 @@
+"""What every method has in common: it trains, goes on after any crash, refuses what is not its own, and repeats itself.
+
+The methods of the library and one that is registered here, on a task of one's own, by the common code.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("torchrl", reason="needs the extra [rl]")
+pytest.importorskip("tyro", reason="needs the extra [rl]")
+
+from difflcs import LCSModel, cli
+from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
+from difflcs.rl.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
+from difflcs.rl.evaluate import evaluate
+from difflcs.rl.methods import Method, Work, get_method, method_names, register_method
+from difflcs.rl.state import copy_state, flatten
+from difflcs.rl.tasks import register_task
+from difflcs.rl.trainer import Trainer
+from difflcs.rl.training import Reporter, TrainConfig, load_model, load_policy, profile, stored_config, train
+from tests.conformance.toy import STEPS, SearchMethod, make_task
+
+pytestmark = pytest.mark.usefixtures("one_thread", "registered")
+
+NAMES = (*method_names(), SearchMethod.name)
+TOY = make_task()
+LARGER = make_task(size=3)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def registered() -> None:
+    """Not while the tests are collected: no other file is to find these among the registered ones."""
+    register_task(TOY)
+    register_method(SearchMethod)
+
+
+@pytest.fixture(params=NAMES)
+def name(request) -> str:
+    return request.param
+
+
+def make_config(name: str, **changes: Any) -> TrainConfig:
+    kind = SearchMethod if name == SearchMethod.name else get_method(name)
+    return replace(TrainConfig(task="toy", method=kind(), final_goals=4, evaluate_goals=3).smoke(), **changes)
+
+
+def same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    (tensors, rest), (others, other_rest) = flatten(one), flatten(other)
+    equal = all(torch.equal(value, others[key]) for key, value in tensors.items() if key in others)
+    return tensors.keys() == others.keys() and rest == other_rest and equal
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Any:
+    """A finished run of each method, trained when it is first asked for."""
+    runs: dict[str, RunDirectory] = {}
+
+    def get(name: str) -> RunDirectory:
+        if name not in runs:
+            runs[name] = train(make_config(name), tmp_path_factory.mktemp(name) / "run", task=TOY)
+        return runs[name]
+
+    return get
+
+
+class Trainers:
+    """Trainers of smoke settings; their environments are closed at the end."""
+
+    def __init__(self) -> None:
+        self.opened: list[gymnasium.vector.VectorEnv] = []
+
+    def __call__(self, name: str, seed: int = 0, task=TOY) -> Trainer:
+        def make_envs(count: int) -> gymnasium.vector.VectorEnv:
+            self.opened.append(task.make_envs(count))
+            return self.opened[-1]
+
+        config = make_config(name)
+        episodes = round(config.minutes * task.steps_per_minute / STEPS)
+        return config.method.trainer(Work(task, seed, episodes, make_envs))
+
+
+@pytest.fixture
+def make_trainer():
+    made = Trainers()
+    yield made
+    for envs in made.opened:
+        envs.close()
+
+
+# --- training ---------------------------------------------------------------------------------------------------------
+
+
+def test_it_trains_and_says_what_it_did(name, finished):
+    run = finished(name)
+    rows = run.rows()
+    method = stored_config(run).method
+    assert method == make_config(name).method
+    assert [row["iteration"] for row in rows] == [str(i) for i in range(len(rows))]
+    assert len(rows) >= 3
+    wanted = list(dict.fromkeys(f.name for report in method.reports for f in fields(report)))
+    found = [column for column in rows[0] if column != "minutes" and not column.startswith("evaluation_")]
+    assert found == wanted
+    for column in found:
+        assert any(row[column] for row in rows) or column in ("model_success", "model_loss"), column
+    assert float(rows[-1]["minutes"]) >= 0.5
+    steps = [int(row["env_steps"]) for row in rows]
+    assert steps == sorted(steps)
+    assert all(count % STEPS == 0 for count in steps)
+    assert rows[-1]["evaluation_goals"] == "4"
+    spent = profile(rows)
+    assert set(spent) == {c.removesuffix("_seconds") for c in rows[0] if c.endswith("_seconds")}
+    files = {path.name for path in run.path.iterdir()}
+    assert files == {"config.json", "log.csv", "tensorboard", "checkpoints", "model"}
+    assert run.finished()
+    stored = run.config()
+    assert stored["config"]["method"] == name
+    assert isinstance(method.version, int)
+
+
+def test_an_iteration_returns_one_of_its_reports_and_counts(name, make_trainer):
+    trainer = make_trainer(name)
+    counted = []
+    assert (trainer.iteration, trainer.env_steps) == (0, 0)
+    report = trainer.step(counted.append)
+    assert type(report) in make_config(name).method.reports
+    assert trainer.iteration == report.iteration == 1
+    assert trainer.env_steps == report.env_steps == sum(counted) == trainer.episodes * STEPS
+
+
+def test_the_global_generators_stay_as_they_were(name, make_trainer):
+    before = torch.random.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
+    trainer = make_trainer(name)
+    for _ in range(2):
+        trainer.step()
+    assert torch.equal(before[0], torch.random.get_rng_state())
+    assert np.array_equal(before[1], np.random.get_state()[1])  # noqa: NPY002
+
+
+class Dies(Reporter):
+    """Interrupts after each iteration."""
+
+    def iterated(self, report: Any) -> None:
+        raise KeyboardInterrupt
+
+
+def test_resumed_after_every_iteration_it_is_the_same_bit_for_bit(name, finished, tmp_path):
+    whole, path, interrupted = finished(name), tmp_path / "run", 0
+    for attempt in range(20):
+        torch.manual_seed(attempt)
+        try:
+            train(make_config(name), path, task=TOY, resume=attempt > 0, reporter=Dies())
+            break
+        except KeyboardInterrupt:
+            interrupted += 1
+    run = RunDirectory.open(path)
+    assert interrupted == len(whole.rows()) - 1
+    assert same(load_checkpoint(run.checkpoints), load_checkpoint(whole.checkpoints))
+    assert (run.model / "model.safetensors").read_bytes() == (whole.model / "model.safetensors").read_bytes()
+    assert (run.model / "config.json").read_bytes() == (whole.model / "config.json").read_bytes()
+    timeless = [
+        [{key: cell for key, cell in row.items() if not key.endswith("_seconds")} for row in one.rows()]
+        for one in (run, whole)
+    ]
+    assert timeless[0] == timeless[1]
+
+
+def test_a_state_can_be_loaded_by_a_trainer_of_another_seed_of_numbers(name, make_trainer):
+    """Whatever a trainer did before, a state decides everything that follows."""
+    one, other = make_trainer(name), make_trainer(name)
+    one.step()
+    state = copy_state(one.state_dict())
+    other.step()
+    other.step()
+    other.load(state)
+    assert same(other.state_dict(), state)
+    one.step()
+    other.step()
+    assert same(one.state_dict(), other.state_dict())
+
+
+def test_the_seed_decides(name, finished, tmp_path):
+    model = (finished(name).model / "model.safetensors").read_bytes()
+    again = train(make_config(name), tmp_path / "again", task=TOY)
+    other = train(make_config(name, seed=1), tmp_path / "other", task=TOY)
+    assert (again.model / "model.safetensors").read_bytes() == model
+    assert (other.model / "model.safetensors").read_bytes() != model
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+
+def test_foreign_checkpoints_are_refused_and_change_nothing(name, make_trainer, finished):
+    trainer = make_trainer(name)
+    trainer.step()
+    before = copy_state(trainer.state_dict())
+    foreign = {other: load_checkpoint(finished(other).checkpoints) for other in NAMES if other != name}
+    larger = make_trainer(name, task=LARGER)
+    larger.step()
+    if name != SearchMethod.name:  # its state has no sizes
+        foreign["of other sizes"] = copy_state(larger.state_dict())
+    foreign["nothing"] = {}
+    for source, state in foreign.items():
+        with pytest.raises(CheckpointError, match="expected"):
+            trainer.load(state)
+        assert same(trainer.state_dict(), before), source
+
+
+def test_a_run_is_not_continued_with_the_checkpoints_of_another_method(name, finished, tmp_path):
+    other = NAMES[NAMES.index(name) - 1]
+    run = RunDirectory.create(tmp_path / "run", finished(name).config())
+    run.checkpoints.mkdir()
+    state = load_checkpoint(finished(other).checkpoints)
+    save_checkpoint(run.checkpoints, state["iteration"], state)
+    files = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
+    with pytest.raises(CheckpointError, match="another method"):
+        train(make_config(name), run.path, task=TOY, resume=True)
+    if make_config(other).method.kind != make_config(name).method.kind:
+        with pytest.raises(CheckpointError):
+            load_policy(run, TOY)
+    assert {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()} == files
+
+
+def test_a_run_is_not_continued_with_another_configuration_or_environment(name, finished, tmp_path):
+    for change in ({"seed": 1}, {"minutes": 3.5}, {"evaluate_goals": 2}):
+        with pytest.raises(CheckpointError, match="drop the changes"):
+            train(make_config(name, **change), finished(name).path, task=TOY, resume=True)
+    described = make_task(describe=lambda env: {"mass": 1.0})
+    with pytest.raises(KeyboardInterrupt):
+        train(make_config(name), tmp_path / "run", task=described, reporter=Dies())
+    other = make_task(describe=lambda env: {"mass": 2.0})
+    with pytest.raises(CheckpointError, match="the environment it was started with"):
+        train(make_config(name), tmp_path / "run", task=other, resume=True)
+
+
+@pytest.mark.parametrize("minutes", [0.0, -1.0, float("nan"), float("inf"), 1e9])
+def test_minutes_that_make_no_sense_are_refused(name, minutes):
+    with pytest.raises(InvalidInputError, match="minutes"):
+        make_config(name, minutes=minutes)
+
+
+def test_a_model_to_start_from_is_taken_or_refused(name, tmp_path):
+    sizes = {"right": (2, 1, 1), "wrong": (3, 1, 1)}
+    for which, (n_x, n_u, n_lam) in sizes.items():
+        LCSModel(n_x, n_u, n_lam, init_scale=0.01).save_pretrained(tmp_path / which)
+    takes = make_config(name).method.takes_init
+    for which, error in (("right", None), ("wrong", "init: expected a model with n_x=2")):
+        out = tmp_path / f"from-{which}"
+        if takes and error is None:
+            run = train(make_config(name), out, task=TOY, init=tmp_path / which)
+            assert load_model(run.path).n_lam == 1
+            continue
+        with pytest.raises(InvalidInputError, match=error if takes else f"none with method {name}"):
+            train(make_config(name), out, task=TOY, init=tmp_path / which)
+        assert not out.exists()
+
+
+def test_only_what_learned_a_model_gives_one(name, finished):
+    run = finished(name)
+    if make_config(name).method.takes_init:
+        model = load_model(run.path)
+        assert (model.n_x, model.n_u) == (TOY.n_x, TOY.n_u)
+        assert all(bool(torch.isfinite(value).all()) for value in model.state_dict().values())
+    else:
+        for path in (run.path, run.model):
+            with pytest.raises(CheckpointError):
+                load_model(path)
+
+
+def test_what_was_learned_of_other_sizes_is_refused(name, finished):
+    if name == SearchMethod.name:
+        pytest.skip("its gain fits every task")
+    with pytest.raises(CheckpointError, match="expected"):
+        load_policy(finished(name), LARGER)
+
+
+# --- evaluation -------------------------------------------------------------------------------------------------------
+
+
+def test_an_evaluation_repeats_bit_for_bit(name, finished):
+    envs = TOY.make_envs(3)
+    results = [evaluate(envs, load_policy(finished(name), TOY), 7, 5, STEPS) for _ in range(2)]
+    policy = load_policy(finished(name), TOY)
+    results += [evaluate(envs, policy, 7, 5, STEPS) for _ in range(2)]
+    assert all(result == results[0] for result in results)
+    assert results[0].goals == 7
+    envs.close()
+
+
+def test_an_unfinished_run_gives_the_policy_of_its_trainer(name, make_trainer, tmp_path):
+    trainer = make_trainer(name)
+    config = make_config(name)
+    run = RunDirectory.create(tmp_path / "run", {"kind": "run", "config": config.to_json(), "init": None})
+    envs = TOY.make_envs(4)
+    for _ in range(2):
+        trainer.step()
+        save_checkpoint(run.checkpoints, trainer.iteration, trainer.state_dict())
+        assert not run.finished()
+        found = evaluate(envs, load_policy(run, TOY), 8, 0, STEPS)
+        assert found == evaluate(envs, trainer.policy, 8, 0, STEPS)
+    envs.close()
+
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+
+
+def leaves(settings: Any, prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for f in fields(settings):
+        value = getattr(settings, f.name)
+        found |= leaves(value, f"{prefix}{f.name}.") if is_dataclass(value) else {f"{prefix}{f.name}": value}
+    return found
+
+
+def test_smoke_is_valid_and_small(name):
+    method = make_config(name).method
+    usual, small = type(method)(), type(method)().smoke()
+    assert type(small) is type(usual)
+    assert small.smoke() == small
+    before, after = leaves(usual), leaves(small)
+    for key, value in after.items():
+        if value != before[key]:
+            assert 0 < value < before[key], key
+    tiny = TrainConfig(task="toy", method=usual, minutes=0.1 if name != "lcs-rl" else 5.0)
+    assert tiny.smoke().minutes <= tiny.minutes
+
+
+def test_its_configuration_survives_json(name):
+    config = make_config(name, minutes=12.0)
+    plain = json.loads(json.dumps(config.to_json()))
+    assert TrainConfig.from_json(plain) == config
+    assert plain["settings"] == json.loads(json.dumps(asdict(config.method)))
+
+
+def test_lcs_rl_needs_more_data_than_its_warmup():
+    with pytest.raises(InvalidInputError, match=r"--minutes 30, or --method violation"):
+        get_method("lcs-rl")().check(3.0)
+    get_method("lcs-rl")().check(3.5)
+
+
+@pytest.mark.parametrize("method", [None, 3, Method, type("Nameless", (SearchMethod,), {"name": None})])
+def test_what_is_no_method_is_not_registered(method):
+    before = method_names()
+    with pytest.raises(DTypeError, match="subclass of Method"):
+        register_method(method)
+    assert method_names() == before
+
+
+def test_an_unknown_method_gets_the_names_there_are():
+    with pytest.raises(InvalidInputError, match=r"lcs-rl, violation, ppo.*register_method"):
+        get_method("magic")
+    with pytest.raises(InvalidInputError, match="magic"):
+        TrainConfig(method="magic")
+
+
+# --- a method of one's own, by the command line -----------------------------------------------------------------------
+
+
+def printed(*words: str) -> str:
+    with contextlib.redirect_stdout(io.StringIO()) as text, pytest.raises(SystemExit):
+        cli.main(["train", *words, "--help"])
+    return text.getvalue()
+
+
+def test_its_settings_show_with_it_only(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    assert "--spread FLOAT" in printed("--method", "search")
+    assert "--n-lam" not in printed("--method", "search")
+    for other in method_names():
+        assert ("--spread" in printed("--method", other)) == (other == "search")
+    assert SearchMethod.summary in " ".join(printed().replace("│", " ").split())
+
+
+def test_the_commands_know_it(capsys, tmp_path):
+    out = tmp_path / "run"
+    words = ["train", "--task", "toy", "--method", "search", "--spread", "0.25", "--smoke", "--out", str(out)]
+    assert cli.main(words) == 0
+    assert cli.main(["train", "--out", str(out), "--resume"]) == 0
+    assert stored_config(RunDirectory.open(out)).method == SearchMethod(spread=0.25)
+    capsys.readouterr()
+    assert cli.main(["evaluate", str(out), "--goals", "5", "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert (record["method"], record["task"], record["backend"], record["goals"]) == ("search", "toy", None, 5)
+    with contextlib.suppress(SystemExit):
+        assert cli.main(["train", "--method", "search", "--spread", "-1", "--out", str(tmp_path / "no")]) == 2
+    told = capsys.readouterr()
+    assert "spread" in told.out + told.err
+    assert not (tmp_path / "no").exists()
+
+
+def test_it_learns(tmp_path):
+    run = train(make_config("search", minutes=20.0), Path(tmp_path / "run"), task=TOY)
+    errors = [float(row["best_error"]) for row in run.rows() if row["best_error"]]
+    assert errors[-1] < 0.5 * errors[0]

@@ -1,0 +1,163 @@
+"""What imports what, and how long files and classes are, read from the sources."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = {"difflcs": ROOT / "difflcs", "difflcs_envs": ROOT / "envs" / "difflcs_envs"}
+MOST_LINES, MOST_CLASS_LINES = 500, 300
+
+
+def module_name(package: str, path: Path) -> str:
+    parts = path.relative_to(PACKAGES[package]).with_suffix("").parts
+    return ".".join([package, *(parts[:-1] if parts[-1] == "__init__" else parts)])
+
+
+SOURCES = {
+    module_name(package, path): path for package, folder in PACKAGES.items() for path in sorted(folder.rglob("*.py"))
+}
+
+
+def is_type_checking(node: ast.stmt) -> bool:
+    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+
+
+def imports(tree: ast.Module) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
+    """Import statements that are run, and whether that is when the module is imported."""
+
+    def walk(nodes: list[ast.stmt], top: bool) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
+        for node in nodes:
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                yield node, top
+                continue
+            inside = top and not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+            for field in ("body", "orelse", "finalbody"):
+                if not (field == "body" and is_type_checking(node)):
+                    yield from walk(getattr(node, field, []), inside)
+            for handler in (*getattr(node, "handlers", []), *getattr(node, "cases", [])):
+                yield from walk(handler.body, inside)
+
+    return walk(tree.body, True)
+
+
+def targets(node: ast.Import | ast.ImportFrom, module: str) -> Iterator[str]:
+    """Modules of ours that a statement imports; names in a package that are modules are these."""
+    if isinstance(node, ast.Import):
+        yield from (alias.name for alias in node.names)
+        return
+    base = node.module or ""
+    if node.level:
+        is_package = SOURCES[module].name == "__init__.py"
+        parents = module.split(".")[: len(module.split(".")) - node.level + is_package]
+        base = ".".join([*parents, *([node.module] if node.module else [])])
+    submodules = [f"{base}.{alias.name}" for alias in node.names]
+    found = [name for name in submodules if name in SOURCES]
+    yield from found
+    if len(found) < len(submodules):
+        yield base
+
+
+def graph(*, functions: bool) -> dict[str, set[str]]:
+    """Module → the modules of ours that it imports, at module level or in functions."""
+    edges: dict[str, set[str]] = {}
+    for module, path in SOURCES.items():
+        tree = ast.parse(path.read_text())
+        edges[module] = {
+            target
+            for node, top in imports(tree)
+            if top is not functions
+            for target in targets(node, module)
+            if target in SOURCES and target != module
+        }
+    return edges
+
+
+def cycles(edges: dict[str, set[str]]) -> list[list[str]]:
+    """One circle through each module that is found twice on a path."""
+    found: list[list[str]] = []
+    done: set[str] = set()
+
+    def visit(module: str, path: list[str]) -> None:
+        if module in path:
+            found.append([*path[path.index(module) :], module])
+            return
+        if module in done:
+            return
+        for target in sorted(edges[module]):
+            visit(target, [*path, module])
+        done.add(module)
+
+    for module in sorted(edges):
+        visit(module, [])
+    return found
+
+
+def packages_of(edges: dict[str, set[str]], package: str, other: str) -> dict[str, set[str]]:
+    return {
+        module: {target for target in found if target.split(".")[0] == other}
+        for module, found in edges.items()
+        if module.split(".")[0] == package and any(target.split(".")[0] == other for target in found)
+    }
+
+
+# --- the reader -------------------------------------------------------------------------------------------------------
+
+
+def test_the_graph_has_what_is_known_to_be_in_it():
+    edges = graph(functions=False)
+    assert "difflcs.errors" in edges["difflcs.lcs"]
+    assert {"difflcs.rl.tasks", "difflcs.rl.settings"} <= edges["difflcs.rl.methods"]
+    assert "difflcs.zoo" in edges["difflcs.cli"]
+    assert "difflcs.rl.policy" in graph(functions=True)["difflcs.rl.methods"]
+    assert "difflcs.rl.policy" not in edges["difflcs.rl.methods"]  # TorchRL takes seconds
+    assert "difflcs.rl.critic" not in edges["difflcs.rl.advantages"]
+
+
+def test_a_circle_would_be_found():
+    assert cycles({"a": {"b"}, "b": {"c"}, "c": set()}) == []
+    assert cycles({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == [["b", "c", "b"]]
+    code = "if TYPE_CHECKING:\n    import a\nelse:\n    import b\ndef f():\n    import c\n"
+    code += "try:\n    import d\nexcept ImportError:\n    import e\n"
+    found = {(node.names[0].name, top) for node, top in imports(ast.parse(code))}
+    assert found == {("b", True), ("c", False), ("d", True), ("e", True)}
+
+
+# --- what holds -------------------------------------------------------------------------------------------------------
+
+
+def test_no_circle_of_imports():
+    assert cycles(graph(functions=False)) == []
+
+
+def test_the_library_knows_no_environment():
+    assert packages_of(graph(functions=False), "difflcs", "difflcs_envs") == {}
+    known = packages_of(graph(functions=True), "difflcs", "difflcs_envs")
+    assert set(known) <= {"difflcs.cli", "difflcs.doctor"}  # the command `assets`, and what works here
+
+
+def test_one_file_of_the_environments_knows_the_library():
+    assert set(packages_of(graph(functions=False), "difflcs_envs", "difflcs")) == {"difflcs_envs.tasks"}
+    assert set(packages_of(graph(functions=True), "difflcs_envs", "difflcs")) <= {"difflcs_envs.tasks"}
+
+
+def test_the_core_knows_no_training():
+    edges = graph(functions=False)
+    core = [module for module in edges if module.startswith("difflcs") and ".rl" not in module]
+    for module in core:
+        if module.split(".")[0] == "difflcs" and module not in ("difflcs.cli", "difflcs.__main__"):
+            assert not [target for target in edges[module] if target.startswith("difflcs.rl")], module
+
+
+@pytest.mark.parametrize("module", SOURCES)
+def test_files_and_classes_are_short(module):
+    text = SOURCES[module].read_text()
+    assert len(text.splitlines()) <= MOST_LINES
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ClassDef):
+            assert node.end_lineno is not None
+            assert node.end_lineno - node.lineno + 1 <= MOST_CLASS_LINES, node.name
