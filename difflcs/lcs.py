@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple, get_type_hints
 
 import torch
 from torch import Tensor, nn
@@ -28,17 +28,24 @@ from difflcs.lcp import solve_lcp
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
+def dimensions(record: type) -> dict[str, tuple[str, ...]]:
+    """The fields of a record that are tensors, each with the kinds of its trailing dimensions, as annotated there."""
+    hints = get_type_hints(record, include_extras=True)
+    return {f.name: hints[f.name].__metadata__ for f in fields(record) if hasattr(hints[f.name], "__metadata__")}
+
+
+@dataclass(frozen=True)
 class SystemMatrices:
     """Sizes and equations of whatever holds the matrices of an LCS, shared or one per batch element."""
 
-    A: Tensor
-    B: Tensor
-    C: Tensor
-    d: Tensor
-    D: Tensor
-    E: Tensor
-    F: Tensor
-    c: Tensor
+    A: Annotated[Tensor, "n_x", "n_x"]
+    B: Annotated[Tensor, "n_x", "n_u"]
+    C: Annotated[Tensor, "n_x", "n_lam"]
+    d: Annotated[Tensor, "n_x"]
+    D: Annotated[Tensor, "n_lam", "n_x"]
+    E: Annotated[Tensor, "n_lam", "n_u"]
+    F: Annotated[Tensor, "n_lam", "n_lam"]
+    c: Annotated[Tensor, "n_lam"]
 
     @property
     def n_x(self) -> int:
@@ -88,27 +95,14 @@ class LCSParams(SystemMatrices):
         NotPositiveDefiniteError: F + Fᵀ is not positive definite; the message gives its smallest eigenvalue.
     """
 
-    A: Tensor
-    B: Tensor
-    C: Tensor
-    d: Tensor
-    D: Tensor
-    E: Tensor
-    F: Tensor
-    c: Tensor
-
     def __post_init__(self) -> None:
         for f in fields(self):
             check_tensor(f.name, getattr(self, f.name))
-        for name in "ABCDEF":
-            if getattr(self, name).ndim < 2:
+        for name, dims in SYSTEM.items():
+            if getattr(self, name).ndim < 2 and len(dims) == 2:
                 raise ShapeError(f"{name}: expected a matrix (..., rows, columns), got {describe(getattr(self, name))}")
-        n_x, n_u, n_lam = self.n_x, self.n_u, self.n_lam
-        x, u, lam = ("n_x", n_x), ("n_u", n_u), ("n_lam", n_lam)
-        dims = {"A": [x, x], "B": [x, u], "C": [x, lam], "d": [x], "D": [lam, x], "E": [lam, u], "F": [lam, lam]}
-        dims["c"] = [lam]
-        for name, dim in dims.items():
-            check_tensor(name, getattr(self, name), dim, finite=False)
+        for name, dims in SYSTEM.items():
+            check_tensor(name, getattr(self, name), [(dim, getattr(self, dim)) for dim in dims], finite=False)
         check_same_device([(f.name, getattr(self, f.name)) for f in fields(self)])
         for f in fields(self):
             if getattr(self, f.name).dtype != self.A.dtype:
@@ -123,8 +117,7 @@ class LCSParams(SystemMatrices):
     def batch_shape(self) -> torch.Size:
         """Leading batch dimensions; empty when every field is shared."""
         return broadcast_batch(
-            (f.name, getattr(self, f.name).shape[: getattr(self, f.name).ndim - (1 if f.name in "dc" else 2)])
-            for f in fields(self)
+            (name, getattr(self, name).shape[: getattr(self, name).ndim - len(dims)]) for name, dims in SYSTEM.items()
         )
 
     def tensors(self) -> dict[str, Tensor]:
@@ -134,6 +127,10 @@ class LCSParams(SystemMatrices):
     def detach(self) -> LCSParams:
         """The same numbers without gradient history."""
         return replace(self, **{k: v.detach() for k, v in self.tensors().items()})
+
+
+# Name → kinds of its dimensions, in the order of every list of these matrices.
+SYSTEM = dimensions(SystemMatrices)
 
 
 def check_positive_definite(F: Tensor) -> None:
@@ -216,17 +213,9 @@ class LCSModel(nn.Module):
 
     @staticmethod
     def _shapes(x: int, u: int, m: int) -> dict[str, tuple[int, ...]]:
-        return {
-            "A": (x, x),
-            "B": (x, u),
-            "C": (x, m),
-            "d": (x,),
-            "D": (m, x),
-            "E": (m, u),
-            "G": (m, m),
-            "H": (m, m),
-            "c": (m,),
-        }
+        sizes = {"n_x": x, "n_u": u, "n_lam": m}
+        dims = {**SYSTEM, "G": SYSTEM["F"], "H": SYSTEM["F"]}
+        return {name: tuple(sizes[dim] for dim in dims[name]) for name in LCSModel.parameter_names}
 
     def extra_repr(self) -> str:
         """What print(model) shows."""

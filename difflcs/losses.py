@@ -9,7 +9,7 @@ from torch import Tensor
 from difflcs._checks import broadcast_batch, check_choice, check_number, check_tensor
 from difflcs.errors import DoubleBackwardError, GammaError, NotPositiveDefiniteError, SolveError
 from difflcs.lcp import MAX_ITER, solve_lcp_arrays
-from difflcs.lcs import LCSModel
+from difflcs.lcs import SYSTEM, LCSModel
 from difflcs.status import Status
 
 # Least γ σ_min(F + Fᵀ), in parts of n_lam times the largest squared column of F (kernels.hpp has the same).
@@ -122,7 +122,7 @@ def _plain(lcs: LCSModel, system: tuple[Tensor, ...], data: tuple[Tensor, ...]) 
 
 def _check_numbers(lcs: LCSModel, system: tuple[Tensor, ...], data: tuple[Tensor, ...]) -> None:
     lcs.check_inputs(**dict(zip(("x", "u", "x_next"), data, strict=True)))
-    for name, value in zip("ABCdDEFc", system, strict=True):
+    for name, value in zip(SYSTEM, system, strict=True):
         check_tensor(name, value)
 
 

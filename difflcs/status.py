@@ -4,15 +4,21 @@ from __future__ import annotations
 
 from enum import IntEnum
 
+from torch import Tensor
+
+from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
+
+_CODES = _kernels.status_codes()
+
 
 class Status(IntEnum):
     """How the solve of one batch element ended; `advice` says what to do about it."""
 
-    CONVERGED = 0
-    MAX_ITER = 1
-    INFEASIBLE = 2
-    NUMERICAL = 3
-    DEGENERATE = 4
+    CONVERGED = _CODES["CONVERGED"]
+    MAX_ITER = _CODES["MAX_ITER"]
+    INFEASIBLE = _CODES["INFEASIBLE"]
+    NUMERICAL = _CODES["NUMERICAL"]
+    DEGENERATE = _CODES["DEGENERATE"]
 
     @property
     def solved(self) -> bool:
@@ -23,6 +29,11 @@ class Status(IntEnum):
     def advice(self) -> str:
         """One sentence for the user."""
         return _ADVICE[self]
+
+
+def solved(status: Tensor) -> Tensor:
+    """`Status.solved` of a tensor of codes, as bool."""
+    return (status == Status.CONVERGED) | (status == Status.DEGENERATE)
 
 
 _ADVICE = {

@@ -4,7 +4,8 @@
 #pragma once
 #include "kernels.hpp"
 #include "lanes.hpp"
-#include "lu.hpp"
+#include "lu_lanes.hpp"
+#include "matrix.hpp"
 #include "sizes.hpp"
 
 namespace difflcs::DIFFLCS_ISA {
@@ -19,28 +20,19 @@ struct Certificate {
   Vec *d, *c, *q, *r, *qf, *lo, *hi, *x0, *per_width, *x, *u, *lam, *s, *size, *p, *pn, *y, *rho, *error, *N;
   Mask* rows;
 
-  // Lays the arrays out in `memory`, or only counts them where it is null.
-  int64_t layout(void* memory) {
+  explicit Certificate(const MpcBatch& b) : batch(b), n(b) {}
+
+  void layout(Arena& arena) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), h = n.h;
-    int64_t used = 0;
-    auto take = [&](auto*& to, int64_t count) {
-      void* at = memory ? static_cast<char*>(memory) + used : nullptr;
-      to = static_cast<decltype(+to)>(at);
-      used += (count * int64_t(sizeof(*to)) + 63) / 64 * 64;
-    };
+    auto take = [&](auto*& to, int64_t count) { arena.take(to, count); };
     take(A, nx * nx), take(B, nx * nu), take(C, nx * nl), take(D, nl * nx), take(E, nl * nu), take(F, nl * nl);
     take(Q, nx * nx), take(R, nu * nu), take(Qf, nx * nx), take(rest, nu), take(rest_end, nu);
     take(d, nx), take(c, nl), take(q, nx), take(r, nu), take(qf, nx), take(lo, nu), take(hi, nu), take(x0, nx);
     take(per_width, nu);
     take(x, (h + 1) * nx), take(u, h * nu), take(lam, h * nl), take(s, nl), take(size, nl), take(p, nx), take(pn, nx);
     take(y, nl), take(rho, nl), take(error, nl), take(N, nl * nl), take(rows, nl);
-    return used;
-  }
-
-  Certificate(const MpcBatch& b, void* memory) : batch(b), n(b) {
-    layout(memory);
     if constexpr (sizeof(T) == sizeof(double))
-      if (memory) load_matrices(0, 0);
+      if (arena.memory) load_matrices(0, 0);
   }
 
   template <class Entry>
@@ -48,15 +40,14 @@ struct Certificate {
     for (int64_t i = 0; i < count; i++) put(to, i, lane, from[i]);
   }
   template <class Entry>
-  void load(Entry* to, Input which, int64_t count, int64_t e, int lane) {
-    load(to, batch.input[which] + e * batch.stride[which], count, lane);
+  void load(Entry* to, Input which, int64_t e, int lane) {
+    load(to, batch.input[which] + e * batch.stride[which], extent(batch, kMpcFields[which]), lane);
   }
 
   void load_matrices(int64_t e, int lane) {
-    const int64_t nx = n.x(), nu = n.u(), nl = n.l();
-    load(A, kA, nx * nx, e, lane), load(B, kB, nx * nu, e, lane), load(C, kC, nx * nl, e, lane);
-    load(D, kD, nl * nx, e, lane), load(E, kE, nl * nu, e, lane), load(F, kF, nl * nl, e, lane);
-    load(Q, kQ, nx * nx, e, lane), load(R, kR, nu * nu, e, lane), load(Qf, kQfinal, nx * nx, e, lane);
+    const int64_t nu = n.u();
+    load(A, kA, e, lane), load(B, kB, e, lane), load(C, kC, e, lane), load(D, kD, e, lane), load(E, kE, e, lane);
+    load(F, kF, e, lane), load(Q, kQ, e, lane), load(R, kR, e, lane), load(Qf, kQ_final, e, lane);
     curvature_at_rest(n, B, nu, Q, R, rest, lane), curvature_at_rest(n, B, nu, Qf, R, rest_end, lane);
   }
 
@@ -130,8 +121,8 @@ struct Certificate {
     for (int l = 0; l < kLanes; l++) {
       const int64_t e = elements[l < count ? l : 0];
       if constexpr (sizeof(T) != sizeof(double)) load_matrices(e, l);
-      load(d, kd, nx, e, l), load(c, kc, nl, e, l), load(q, kq, nx, e, l), load(r, kr, nu, e, l);
-      load(qf, kqfinal, nx, e, l), load(lo, kumin, nu, e, l), load(hi, kumax, nu, e, l), load(x0, kx0, nx, e, l);
+      load(d, kd, e, l), load(c, kc, e, l), load(q, kq, e, l), load(r, kr, e, l), load(qf, kq_final, e, l);
+      load(lo, ku_min, e, l), load(hi, ku_max, e, l), load(x0, kx0, e, l);
       load(x, o.x + e * (h + 1) * nx, (h + 1) * nx, l), load(u, o.u + e * h * nu, h * nu, l);
       load(lam, o.lam + e * h * nl, h * nl, l);
     }
@@ -196,8 +187,7 @@ struct Certificate {
       const int64_t e = elements[l];
       const double residual = poison[l] == 0 ? worst[l] : __builtin_inf();
       o.residual[e] = residual, o.fragile[e] = fragile[l] != 0;
-      const bool solved = o.status[e] == int8_t(Status::converged) || o.status[e] == int8_t(Status::degenerate);
-      if (solved && !(residual <= o.certified)) o.status[e] = int8_t(Status::numerical);
+      if (solved(o.status[e]) && !(residual <= o.certified)) o.status[e] = int8_t(Status::numerical);
     }
   }
 };

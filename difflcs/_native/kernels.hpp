@@ -4,11 +4,9 @@
 #pragma once
 #include <cstdint>
 
-namespace difflcs {
+#include "fields.hpp"
 
-// Values are those of difflcs.Status.
-enum class Status : int8_t { converged = 0, max_iter = 1, infeasible = 2, numerical = 3, degenerate = 4 };
-constexpr int8_t kUnreached = -1;  // inside the native code only
+namespace difflcs {
 
 // Asked between two steps of long work; true: stop here. A plain function, because the kernels know neither clocks nor
 // Python.
@@ -36,9 +34,6 @@ constexpr double kLcpTerms = 1e-10;  // |F lam + q - w| in parts of the terms th
 constexpr double kLcpData = 1e-8;    // the same in parts of the largest |q| (and of sqrt(relaxation F_ii))
 constexpr double kRounding = 4e-16;  // of a sum, in parts of its terms
 constexpr double kSmallest = 1e-100, kLargest = 1e150;  // range of the diagonal of F; of lam and w
-
-// Inputs of an MPC problem, in the order of difflcs.mpc.problem.INPUTS.
-enum Input { kA, kB, kC, kd, kD, kE, kF, kc, kQ, kR, kQfinal, kq, kr, kqfinal, kumin, kumax, kx0, kInputs };
 
 // A batch of LCS-MPC problems (see difflcs.mpc.MPCProblem). All arrays are row-major with the batch in front.
 struct MpcBatch {
@@ -79,9 +74,6 @@ struct MpcGradient {
 
 // Least gamma sigma_min(F + F^T), in parts of n_lam times the largest diagonal entry of F^T F (difflcs.losses).
 constexpr double kGammaLeast = 4e-13;
-
-// Transitions and the system they are compared with, in the order of difflcs.losses. All arrays are row-major.
-enum ViolationInput { vA, vB, vC, vd, vD, vE, vF, vc, vx, vu, vx_next, kViolationInputs };
 
 // The violation loss of a batch: |r|^2 / 2 + (lam . phi + |e|^2 / (2 gamma)) / xi at the z = (lam, phi) >= 0 that
 // minimises it, with r = A x + B u + C lam + d - x_next and e = D x + E u + F lam + c - phi.

@@ -2,7 +2,9 @@
 // reads like the solver of a single problem, and a lane's result never depends on its neighbours.
 #include "kernels.hpp"
 #include "lanes.hpp"
-#include "lu.hpp"
+#include "lu_lanes.hpp"
+#include "matrix.hpp"
+#include "relaxed_lcp.hpp"
 
 namespace difflcs::DIFFLCS_ISA {
 namespace {
@@ -13,23 +15,26 @@ template <class T, int N>
 struct Lcp {
   const LcpBatch& batch;
   T *F, *scale, *inverse;  // inverse of scale
-  Vec *M, *q, *lam, *w, *rhs, *bound;
-  Mask* active;
+  Vec *M, *q, *lam, *w, *rhs, *bound, *newton;
+  Mask *active, *rows;
 
   int64_t size() const { return N ? N : batch.n; }
 
-  Lcp(const LcpBatch& b, void* memory) : batch(b) {
+  // Lays the arrays out in `memory`, or only counts them where it is null.
+  int64_t layout(void* memory) {
     const int64_t n = size();
-    Vec* p = static_cast<Vec*>(memory);
-    auto take = [&](int64_t count) {
-      Vec* r = p;
-      p += count;
-      return r;
-    };
-    F = reinterpret_cast<T*>(take(n * n)), M = take(n * n);
-    scale = reinterpret_cast<T*>(take(n)), inverse = reinterpret_cast<T*>(take(n));
-    q = take(n), lam = take(n), w = take(n), rhs = take(n), bound = take(n), active = reinterpret_cast<Mask*>(take(n));
-    if constexpr (sizeof(T) == sizeof(double)) load_matrix(0, 0);
+    Arena arena{memory};
+    arena.take(F, n * n), arena.take(scale, n), arena.take(inverse, n);
+    arena.take(q, n), arena.take(lam, n), arena.take(w, n), arena.take(rhs, n), arena.take(bound, n);
+    arena.take(active, n), arena.take(rows, n), arena.take(newton, RelaxedLcp<T, N, false>::scratch(n));
+    M = newton;  // of the exact solver, which is another's turn; n * n of them
+    return arena.used;
+  }
+
+  Lcp(const LcpBatch& b, void* memory) : batch(b) {
+    layout(memory);
+    if constexpr (sizeof(T) == sizeof(double))
+      if (memory) load_matrix(0, 0);
   }
 
   void load_matrix(int64_t e, int lane) {
@@ -76,21 +81,7 @@ struct Lcp {
     }
   }
 
-  // w = F lam + q, and bound_i = |q_i| + sum_j |F_ij lam_j|, the size of the terms whose rounding w_i carries.
-  void slack() {
-    const int64_t n = size();
-    for (int64_t i = 0; i < n; i++) {
-      Vec sum = q[i], b = abs(sum);
-      DIFFLCS_UNROLL
-      for (int64_t j = 0; j < n; j++) {
-        const Vec t = F[i * n + j] * lam[j];
-        sum += t;
-        b += abs(t);
-      }
-      w[i] = sum;
-      bound[i] = b;
-    }
-  }
+  void slack() { lcp_slack(size(), F, q, lam, w, bound); }
 
   // Large problems look at the watch in every iteration.
   bool halted(Watch watch) const { return size() > 32 && watch.stop(watch.context); }
@@ -194,83 +185,17 @@ void Lcp<T, N>::exact(int64_t begin, int64_t end, Watch watch) {
   }
 }
 
-// Relaxed LCP lam o w = eps by damped Newton on the smoothed complementarity function of Chen-Harker-Kanzow-Smale,
-//   g_i = lam_i + w_i - sqrt((lam_i - w_i)^2 + 4 eps) = 0  <=>  lam_i > 0, w_i > 0, lam_i w_i = eps,
-// following eps from 1 (in scaled units) down to its target.
 template <class T, int N>
 void Lcp<T, N>::relaxed(int64_t begin, int64_t end, Watch watch) {
-  const int64_t n = size();
   for (int64_t first = begin; first < end && !watch.stop(watch.context); first += kLanes) {
     const Vec unit = load(first, end);
     const Vec target = batch.relaxation / (unit * unit);
-    Vec eps = max(target, all(1));
-    for (int64_t i = 0; i < n; i++) lam[i] = sqrt(eps);
+    RelaxedLcp<T, N, false> path(size(), F, q, newton, rows);
     Mask iterations = Mask{};
-    Mask solved = Mask{};
-    Vec smallest = all(1e300);  // smallest residual met at the target
-    int stalled[kLanes] = {};
-    for (int64_t it = 0; it < batch.max_iter && !halted(watch); it++) {
-      // Residual and generalised Jacobian M = diag(a) + diag(b) F with a = 1 - d/r, b = 1 + d/r.
-      slack();
-      Vec merit = all(0), magnitude = all(0);
-      for (int64_t i = 0; i < n; i++) {
-        const Vec d = lam[i] - w[i], r = sqrt(d * d + 4.0 * eps);
-        const Vec b = 1.0 + d / r;
-        rhs[i] = r - lam[i] - w[i];
-        merit += rhs[i] * rhs[i];
-        magnitude = max(magnitude, max(bound[i], abs(lam[i])));
-        for (int64_t j = 0; j < n; j++) M[i * n + j] = b * F[i * n + j];
-        M[i * n + i] += 1.0 - d / r;
-      }
-      const Vec residual = sqrt(merit);
-      const Mask at_target = eps <= target;
-      for (int l = 0; l < kLanes; l++) {
-        if (solved[l]) continue;
-        iterations[l]++;
-        // Converged at 1e-14, or at the level where rounding stops progress, if that is below 1e-10.
-        if (at_target[l]) {
-          if (residual[l] <= 1e-14 * magnitude[l])
-            solved[l] = -1;
-          else if (residual[l] < 0.5 * smallest[l])
-            smallest[l] = residual[l], stalled[l] = 0;
-          else if (residual[l] <= 1e-10 * magnitude[l] && ++stalled[l] >= 2)
-            solved[l] = -1;
-        }
-      }
-      if (!any(~solved)) break;
-      lu_factor(n, M);
-      lu_solve(n, M, rhs);
-      Vec step = all(1);
-      for (int search = 0; search < 8; search++) {
-        Vec next = all(0);
-        for (int64_t i = 0; i < n; i++) {
-          Vec w_next = q[i];
-          for (int64_t j = 0; j < n; j++) w_next += F[i * n + j] * (lam[j] + step * rhs[j]);
-          const Vec lam_next = lam[i] + step * rhs[i], d = lam_next - w_next;
-          const Vec g = lam_next + w_next - sqrt(d * d + 4.0 * eps);
-          next += g * g;
-        }
-        // Near the rounding level the merit cannot fall further; the full step is right there.
-        const Mask poor = (next > merit * (1.0 - 0.2 * step)) & (merit > 1e-24 * magnitude * magnitude);
-        if (!any(poor)) break;
-        step = select(poor, 0.4 * step, step);
-      }
-      for (int64_t i = 0; i < n; i++) lam[i] = select(solved, lam[i], lam[i] + step * rhs[i]);
-      // Shrink eps once the current point is near the path.
-      const Mask near = (residual <= 0.5 * sqrt(eps)) & ~solved;
-      eps = select(near, max(target, 0.1 * eps), eps);
-    }
-    // Positive exactly: the larger of (lam, w) from the smoothed function, the smaller as eps / larger.
-    slack();
-    for (int64_t i = 0; i < n; i++) {
-      const Vec d = lam[i] - w[i], r = sqrt(d * d + 4.0 * target);
-      const Vec larger = 0.5 * (abs(d) + r), smaller = target / larger;
-      lam[i] = select(d > 0, larger, smaller);
-      rhs[i] = select(d > 0, smaller, larger);
-    }
+    Mask solved = path.follow(lam, rhs, bound, target, batch.max_iter, iterations, [&] { return halted(watch); });
     slack();
     solved &= certified(rhs, unit, target);
-    for (int64_t i = 0; i < n; i++) w[i] = rhs[i];
+    for (int64_t i = 0; i < size(); i++) w[i] = rhs[i];
     store(first, end, unit, solved, iterations);
   }
 }
@@ -286,7 +211,11 @@ void dispatch(const LcpBatch& batch, void* memory, Function f) {
 
 }  // namespace
 
-int64_t lcp_workspace(int64_t n) { return static_cast<int64_t>(sizeof(Vec)) * (2 * n * n + 8 * n); }
+int64_t lcp_workspace(int64_t n) {
+  LcpBatch batch{};
+  batch.n = n;
+  return Lcp<Vec, 0>(batch, nullptr).layout(nullptr);
+}
 
 void lcp_exact(const LcpBatch& batch, int64_t begin, int64_t end, void* memory, Watch watch) {
   // Compile-time sizes for the violation loss of the paper's tasks: twice their number of contacts.

@@ -6,9 +6,11 @@
 
 #include <algorithm>
 #include <atomic>
+#include <cctype>
 #include <chrono>
 #include <cmath>
 #include <cstdlib>
+#include <iterator>
 #include <limits>
 #include <memory>
 #include <new>
@@ -119,7 +121,7 @@ void solve(const difflcs::LcpBatch& batch, int64_t count, int threads, Stop& sto
       run(batch, b, end, workspace, watch);
       // What the batched kernel gave up is done again, slowly and with row exchanges.
       for (int64_t e = b; e < end; e++) {
-        if (batch.status[e] == static_cast<int8_t>(difflcs::Status::converged)) continue;
+        if (difflcs::solved(batch.status[e])) continue;
         const auto one = relaxed ? difflcs::lcp_relaxed_one : difflcs::lcp_exact_one;
         if (one(batch, e, static_cast<double*>(workspace), watch))
           batch.status[e] = static_cast<int8_t>(difflcs::Status::converged);
@@ -151,9 +153,15 @@ void solve_lcp(Array F, Array q, double relaxation, int64_t max_iter, int thread
 
 using Inputs = std::vector<Array>;
 
+void check_size(const char* name, int64_t got, int64_t expected) {
+  if (got != expected) throw std::invalid_argument(std::string(name) + " has the wrong size");
+}
+
+int64_t rank_of(const difflcs::Field& field) { return field.columns == difflcs::Size::one ? 1 : 2; }
+
 difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxation, double barrier, bool pivot) {
   using namespace difflcs;
-  if (inputs.size() != kInputs) throw std::invalid_argument("expected 17 inputs");
+  check_size("inputs", inputs.size(), kInputs);
   for (const Array& a : inputs)
     if (a.ndim() < 1) throw std::invalid_argument("inputs must be vectors or matrices");
   const Array& x0 = inputs[kx0];
@@ -161,33 +169,26 @@ difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxa
   MpcBatch b{};
   b.count = int64_t(x0.shape(0)), b.n_x = last(kA), b.n_u = last(kB), b.n_lam = last(kF);
   b.horizon = horizon, b.relaxation = relaxation, b.barrier = barrier;
-  const int64_t x = b.n_x, u = b.n_u, m = b.n_lam;
-  const int64_t shape[kInputs][2] = {{x, x}, {x, u}, {x, m}, {x, 0}, {m, x}, {m, u}, {m, m}, {m, 0}, {x, x},
-                                     {u, u}, {x, x}, {x, 0}, {u, 0}, {x, 0}, {u, 0}, {u, 0}, {x, 0}};
   for (int i = 0; i < kInputs; i++) {
     const Array& a = inputs[i];
-    const int64_t rank = shape[i][1] ? 2 : 1, size = shape[i][0] * (shape[i][1] ? shape[i][1] : 1);
+    const int64_t rank = rank_of(kMpcFields[i]), size = extent(b, kMpcFields[i]);
     const bool shared = int64_t(a.ndim()) == rank;
     if (int64_t(a.size()) != (shared ? size : size * b.count) || (!shared && int64_t(a.ndim()) != rank + 1) ||
         (i == kx0 && shared))
-      throw std::invalid_argument("inputs have inconsistent shapes");
+      throw std::invalid_argument(std::string(kMpcFields[i].name) + " has the wrong shape");
     b.input[i] = a.data();
     b.stride[i] = shared ? 0 : size;
   }
-  if (x < 1 || u < 1 || m < 1 || horizon < 1 || !(relaxation > 0) || !(barrier >= 0))
+  if (b.n_x < 1 || b.n_u < 1 || b.n_lam < 1 || horizon < 1 || !(relaxation > 0) || !(barrier >= 0))
     throw std::invalid_argument("sizes, horizon and relaxation must be positive, the barrier not negative");
   b.pivot = pivot;
   return b;
 }
 
-void check_size(const char* name, int64_t got, int64_t expected) {
-  if (got != expected) throw std::invalid_argument(std::string(name) + " has the wrong size");
-}
-
 // An element that the time did not suffice for: the actions to start from, the state where it is, no forces.
 void stay_at_start(const difflcs::MpcBatch& b, const difflcs::MpcSolve& o, int64_t e) {
   using namespace difflcs;
-  const double *lo = b.input[kumin] + e * b.stride[kumin], *hi = b.input[kumax] + e * b.stride[kumax];
+  const double *lo = b.input[ku_min] + e * b.stride[ku_min], *hi = b.input[ku_max] + e * b.stride[ku_max];
   for (int64_t i = 0; i < b.horizon * b.n_u; i++) {
     const double start = o.u_start ? o.u_start[e * b.horizon * b.n_u + i] : 0.0;
     o.u[e * b.horizon * b.n_u + i] = std::min(std::max(start, lo[i % b.n_u]), hi[i % b.n_u]);
@@ -293,25 +294,24 @@ void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, 
 difflcs::ViolationBatch violation_batch(const Inputs& inputs, double gamma, double xi, Output<double>& r,
                                         Output<double>& e) {
   using namespace difflcs;
-  if (inputs.size() != kViolationInputs) throw std::invalid_argument("expected 11 inputs");
+  check_size("inputs", inputs.size(), kViolationInputs);
   for (int i : {vA, vB, vF, vx})
     if (inputs[i].ndim() != 2) throw std::invalid_argument("A, B, F and x must be matrices");
   ViolationBatch b{};
   b.count = inputs[vx].shape(0), b.n_x = inputs[vA].shape(0), b.n_u = inputs[vB].shape(1),
   b.n_lam = inputs[vF].shape(0);
   b.gamma = gamma, b.xi = xi, b.r = r.data(), b.e = e.data();
-  const int64_t x = b.n_x, u = b.n_u, m = b.n_lam;
-  const int64_t shape[kViolationInputs][2] = {{x, x}, {x, u}, {x, m},       {x, 0},       {m, x},      {m, u},
-                                              {m, m}, {m, 0}, {b.count, x}, {b.count, u}, {b.count, x}};
   for (int i = 0; i < kViolationInputs; i++) {
     const Array& a = inputs[i];
-    const size_t rank = shape[i][1] ? 2 : 1;
-    if (a.ndim() != rank || int64_t(a.shape(0)) != shape[i][0] || (rank == 2 && int64_t(a.shape(1)) != shape[i][1]))
-      throw std::invalid_argument("inputs have inconsistent shapes");
+    const Field& field = kViolationFields[i];
+    const int64_t rank = rank_of(field);
+    if (int64_t(a.ndim()) != rank || int64_t(a.shape(0)) != extent(b, field.rows) ||
+        (rank == 2 && int64_t(a.shape(1)) != extent(b, field.columns)))
+      throw std::invalid_argument(std::string(field.name) + " has the wrong shape");
     b.input[i] = a.data();
   }
-  if (x < 1 || u < 1 || m < 1) throw std::invalid_argument("sizes must be positive");
-  check_size("r", r.size(), b.count * x), check_size("e", e.size(), b.count * m);
+  if (b.n_x < 1 || b.n_u < 1 || b.n_lam < 1) throw std::invalid_argument("sizes must be positive");
+  check_size("r", r.size(), b.count * b.n_x), check_size("e", e.size(), b.count * b.n_lam);
   return b;
 }
 
@@ -346,7 +346,7 @@ std::optional<bool> violation_loss(Inputs inputs, double gamma, double xi, int64
   Stop stop;
   solve(lcp, b.count, threads, stop);
   for (const int8_t s : status)
-    if (s != static_cast<int8_t>(difflcs::Status::converged)) return std::nullopt;
+    if (!difflcs::solved(s)) return std::nullopt;
   bool held = false;
   pass(b, [&](void* workspace) { held = difflcs::kernels().violation_value(b, z.data(), loss.data(), workspace); });
   return held;
@@ -376,11 +376,44 @@ void violation_gradient(Inputs inputs, double gamma, double xi, Array z, Output<
   pass(b, [&](void* workspace) { kernels().violation_gradient(b, z.data(), upstream.data(), to, workspace); });
 }
 
+// ---- tables ----
+
+// Fields of an MPC problem with the kinds of their dimensions, as difflcs.mpc.problem.INPUTS has them.
+nb::dict fields(const difflcs::Field* begin, const difflcs::Field* end) {
+  nb::dict table;
+  auto name = [](difflcs::Size size) { return nb::str(difflcs::kSizeNames[int(size)]); };
+  for (const difflcs::Field* f = begin; f != end; f++) {
+    if (rank_of(*f) == 1)
+      table[f->name] = nb::make_tuple(name(f->rows));
+    else
+      table[f->name] = nb::make_tuple(name(f->rows), name(f->columns));
+  }
+  return table;
+}
+
+nb::dict status_codes() {
+  nb::dict codes;
+  int code = 0;
+  for (std::string name : difflcs::kStatusNames) {
+    for (char& c : name) c = char(std::toupper(c));
+    codes[name.c_str()] = code++;
+  }
+  return codes;
+}
+
 }  // namespace
 
 NB_MODULE(_kernels, m) {
   m.doc() = "Native kernels of difflcs. Private: use the functions of difflcs.";
   m.def("isa", [] { return difflcs::kernels().isa; }, "Instruction set in use.");
+  m.def(
+      "mpc_fields", [] { return fields(std::begin(difflcs::kMpcFields), std::end(difflcs::kMpcFields)); },
+      "Inputs of an MPC problem in their order, with the dimensions of each.");
+  m.def(
+      "violation_fields",
+      [] { return fields(std::begin(difflcs::kViolationFields), std::end(difflcs::kViolationFields)); },
+      "The same of the violation loss.");
+  m.def("status_codes", &status_codes, "How a solve can end: name and code.");
   m.def("solve_lcp", &solve_lcp, "F"_a, "q"_a, "relaxation"_a, "max_iter"_a, "threads"_a, "lam"_a, "w"_a, "status"_a,
         "iterations"_a, "Solve a batch of LCPs into the given arrays.");
   m.def("solve_mpc", &solve_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "u_start"_a.none(),

@@ -2,14 +2,15 @@
 #pragma once
 #include "kernels.hpp"
 #include "lanes.hpp"
+#include "matrix.hpp"
 
 namespace difflcs::DIFFLCS_ISA {
 namespace {
 
-// Compile-time where the template argument is not zero.
+// n_x, n_u, n_lam, n_x + n_u and the horizon; compile-time where the template argument is not zero.
 template <int X, int U, int L>
 struct Sizes {
-  static constexpr int64_t kX = X, kU = U, kL = L;
+  static constexpr int64_t kX = X, kU = U, kL = L, kW = X && U ? X + U : 0;
   static constexpr bool kPivot = false;
   int64_t rx, ru, rl, h;
   explicit Sizes(const MpcBatch& b) : rx(b.n_x), ru(b.n_u), rl(b.n_lam), h(b.horizon) {}
@@ -26,9 +27,8 @@ struct Pivoting : Sizes<0, 0, 0> {
 };
 
 inline bool shared_matrices(const MpcBatch& b) {
-  const Input matrices[] = {kA, kB, kC, kD, kE, kF, kQ, kR, kQfinal};
   bool shared = true;
-  for (const Input which : matrices) shared = shared && b.stride[which] == 0;
+  for (int i = 0; i < kInputs; i++) shared = shared && (kMpcFields[i].columns == Size::one || b.stride[i] == 0);
   return shared;
 }
 

@@ -3,6 +3,7 @@
 #include "kernels.hpp"
 #include "lanes.hpp"
 #include "lu.hpp"
+#include "matrix.hpp"
 
 namespace difflcs::DIFFLCS_ISA {
 namespace {
@@ -25,16 +26,12 @@ struct Violation {
 
   // Lays the arrays out in `memory`, or only counts them where it is null.
   int64_t layout(void* memory) {
-    int64_t used = 0;
-    auto take = [&](int64_t count) {
-      Vec* at = memory ? static_cast<Vec*>(memory) + used : nullptr;
-      used += count;
-      return at;
-    };
-    x = take(n_x), u = take(n_u), x_next = take(n_x), z = take(2 * n_lam), r = take(n_x), e = take(n_lam);
-    out = take(n_x + n_u + 2 * n_lam), sum = take((n_x + n_lam) * (n_x + n_u + n_lam + 1));
-    matrix = reinterpret_cast<double*>(take(4 * n_lam * n_lam / kLanes + 1));
-    return used * static_cast<int64_t>(sizeof(Vec));
+    Arena arena{memory};
+    auto take = [&](auto*& to, int64_t count) { arena.take(to, count); };
+    take(x, n_x), take(u, n_u), take(x_next, n_x), take(z, 2 * n_lam), take(r, n_x), take(e, n_lam);
+    take(out, n_x + n_u + 2 * n_lam), take(sum, (n_x + n_lam) * (n_x + n_u + n_lam + 1));
+    take(matrix, 4 * n_lam * n_lam);
+    return arena.used;
   }
 
   Violation(const ViolationBatch& b, void* memory)

@@ -23,7 +23,7 @@ from difflcs.mpc.autograd import SolveMPC
 from difflcs.mpc.backends import Backend, get_backend
 from difflcs.mpc.problem import INPUTS, MPCProblem, check_bounds
 from difflcs.mpc.solution import MPCSolution, Primal
-from difflcs.status import Status
+from difflcs.status import Status, solved
 
 Bound = float | Tensor | nn.Parameter
 
@@ -218,7 +218,7 @@ class LCSMPCLayer(nn.Module):
 
     def _report(self, status: Tensor, needs_grad: bool) -> None:
         degenerate = int((status == Status.DEGENERATE).sum())
-        failed = torch.nonzero((status != Status.CONVERGED) & (status != Status.DEGENERATE)).squeeze(-1).tolist()
+        failed = torch.nonzero(~solved(status)).squeeze(-1).tolist()
         if degenerate and needs_grad:
             warnings.warn(
                 f"{degenerate} of {len(status)} solutions are not classically differentiable (a weakly active bound or "

@@ -2,37 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_number, check_positive_int, check_same_device
 from difflcs._linalg import quadratic
+from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.errors import BoundsError, ShapeError
 from difflcs.lcp import solve_lcp_arrays
-from difflcs.lcs import SystemMatrices
-
-# Differentiable inputs with the kind of each trailing dimension, in the order in which autograd sees them.
-INPUTS: dict[str, tuple[str, ...]] = {
-    "A": ("n_x", "n_x"),
-    "B": ("n_x", "n_u"),
-    "C": ("n_x", "n_lam"),
-    "d": ("n_x",),
-    "D": ("n_lam", "n_x"),
-    "E": ("n_lam", "n_u"),
-    "F": ("n_lam", "n_lam"),
-    "c": ("n_lam",),
-    "Q": ("n_x", "n_x"),
-    "R": ("n_u", "n_u"),
-    "Q_final": ("n_x", "n_x"),
-    "q": ("n_x",),
-    "r": ("n_u",),
-    "q_final": ("n_x",),
-    "u_min": ("n_u",),
-    "u_max": ("n_u",),
-    "x0": ("n_x",),
-}
+from difflcs.lcs import SystemMatrices, dimensions
 
 
 def check_bounds(u_min: Tensor, u_max: Tensor, strict: bool = False) -> None:
@@ -61,7 +42,7 @@ class MPCProblem(SystemMatrices):
     bounds and so makes them differentiable everywhere.
 
     Tensors are float64 on the CPU and detached. x0 is (batch, n_x); every other one is shared, with exactly the
-    dimensions named in `INPUTS`, or has the batch dimension in front.
+    dimensions that its annotation names, or has the batch dimension in front.
 
     Attributes:
         A, B, C, d, D, E, F, c: the LCS, see `difflcs.LCSParams`.
@@ -76,23 +57,15 @@ class MPCProblem(SystemMatrices):
         ShapeError, BoundsError, InvalidInputError: inconsistent shapes, u_min > u_max, horizon < 1, relaxation ≤ 0.
     """
 
-    A: Tensor
-    B: Tensor
-    C: Tensor
-    d: Tensor
-    D: Tensor
-    E: Tensor
-    F: Tensor
-    c: Tensor
-    Q: Tensor
-    R: Tensor
-    Q_final: Tensor
-    q: Tensor
-    r: Tensor
-    q_final: Tensor
-    u_min: Tensor
-    u_max: Tensor
-    x0: Tensor
+    Q: Annotated[Tensor, "n_x", "n_x"]
+    R: Annotated[Tensor, "n_u", "n_u"]
+    Q_final: Annotated[Tensor, "n_x", "n_x"]
+    q: Annotated[Tensor, "n_x"]
+    r: Annotated[Tensor, "n_u"]
+    q_final: Annotated[Tensor, "n_x"]
+    u_min: Annotated[Tensor, "n_u"]
+    u_max: Annotated[Tensor, "n_u"]
+    x0: Annotated[Tensor, "n_x"]
     horizon: int
     relaxation: float
     barrier: float = 0.0
@@ -169,4 +142,12 @@ class MPCProblem(SystemMatrices):
         return replace(self, **chosen)
 
 
-assert [f.name for f in fields(MPCProblem)][: len(INPUTS)] == list(INPUTS), "INPUTS must list the fields in order"
+# Differentiable inputs with the kind of each trailing dimension, in the order in which autograd and the kernels take
+# them.
+INPUTS: dict[str, tuple[str, ...]] = dimensions(MPCProblem)
+
+if list(INPUTS.items()) != list(_kernels.mpc_fields().items()):
+    raise ImportError(
+        "difflcs: the compiled kernels were built for other fields of the MPC problem than those of this version; "
+        "build them again, in a checkout by `pip install -e .`"
+    )

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from difflcs.mpc.problem import MPCProblem
-from difflcs.status import Status
+from difflcs.status import Status, solved
 
 __all__ = ["MPCSolution", "Primal", "Status"]
 
@@ -56,7 +56,7 @@ class MPCSolution:
     @property
     def converged(self) -> Tensor:
         """(...) bool: the plan can be used (CONVERGED or DEGENERATE)."""
-        return (self.status == Status.CONVERGED) | (self.status == Status.DEGENERATE)
+        return solved(self.status)
 
     def complementarity(self) -> Tensor:
         """(...) largest |λ·s − relaxation| over the horizon."""

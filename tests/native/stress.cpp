@@ -73,11 +73,9 @@ void lcp(int64_t n, int64_t count, bool shared, double relaxation, double broken
   // One at a time, with row exchanges.
   std::vector<double> scratch(lcp_one_scratch(n));
   for (int64_t e = 0; e < count; e++)
-    if (status[e] != 0 && (relaxation > 0 ? lcp_relaxed_one : lcp_exact_one)(batch, e, scratch.data(), kNever))
-      status[e] = 0;
-  int64_t solved = 0;
-  for (const int8_t s : status) solved += s == 0;
-  expect(solved >= count - (broken != 0), "every sound LCP is solved");
+    if (!solved(status[e]) && (relaxation > 0 ? lcp_relaxed_one : lcp_exact_one)(batch, e, scratch.data(), kNever))
+      status[e] = int8_t(Status::converged);
+  expect(std::count_if(status.begin(), status.end(), solved) >= count - (broken != 0), "every sound LCP is solved");
 }
 
 void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count, bool shared, double barrier,
@@ -85,22 +83,21 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
   MpcBatch b{};
   b.count = count, b.n_x = n_x, b.n_u = n_u, b.n_lam = n_lam, b.horizon = horizon;
   b.relaxation = 1e-5, b.barrier = barrier, b.pivot = pivot;
-  const int64_t sizes[kInputs] = {n_x * n_x,     n_x * n_u, n_x * n_lam, n_x,       n_lam * n_x, n_lam * n_u,
-                                  n_lam * n_lam, n_lam,     n_x * n_x,   n_u * n_u, n_x * n_x,   n_x,
-                                  n_u,           n_x,       n_u,         n_u,       n_x};
+  int64_t sizes[kInputs];
+  for (int i = 0; i < kInputs; i++) sizes[i] = extent(b, kMpcFields[i]);
   std::vector<double> data[kInputs];
   for (int i = 0; i < kInputs; i++) {
     const bool own = i == kx0 || !shared;
     const int64_t copies = own ? count : 1;
     data[i] = i == kF ? lcp_matrices(copies, n_lam) : normal(copies * sizes[i], 0.2);
-    if (i == kQ || i == kR || i == kQfinal) {
+    if (i == kQ || i == kR || i == kQ_final) {
       const int64_t n = i == kR ? n_u : n_x;
       for (int64_t e = 0; e < copies; e++)
         for (int64_t r = 0; r < n; r++)
           for (int64_t c = 0; c < n; c++) data[i][(e * n + r) * n + c] = r == c ? 1.0 : 0.0;
     }
-    if (i == kumin || i == kumax)
-      for (double& v : data[i]) v = (i == kumin ? -1 : 1) * (0.1 + std::fabs(v));
+    if (i == ku_min || i == ku_max)
+      for (double& v : data[i]) v = (i == ku_min ? -1 : 1) * (0.1 + std::fabs(v));
     b.stride[i] = own ? sizes[i] : 0;
   }
   if (broken != 0) data[kx0][0] = broken;
@@ -136,16 +133,15 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
     if (broken != 0) break;
     const auto u_start = u, lam_start = lam;
     o.u_start = u_start.data(), o.lam_start = lam_start.data(), o.first_relaxation = 1e-5;
-    int64_t solved = 0;
-    for (const int8_t s : status) solved += s == 0 || s == 4;
-    expect(solved * 10 >= count * 9, "nine of ten MPC problems are solved");
+    expect(std::count_if(status.begin(), status.end(), solved) * 10 >= count * 9, "nine of ten MPC problems are solved");
     if (pass == 0) {
       next = 0;
       const Workspace workspace(kernels().mpc_workspace(b));
       int left = 7;  // stopped on the way
       std::fill(status.begin(), status.end(), kUnreached);
       kernels().mpc_solve(b, o, &next, workspace.data, {counts_down, &left});
-      for (const int8_t s : status) expect(s == kUnreached || (s >= 0 && s <= 4), "a status is written or is not");
+      for (const int8_t s : status)
+        expect(s >= kUnreached && s <= int8_t(Status::degenerate), "a status is written or is not");
       u = u_start, lam = lam_start;
     }
     o.u_start = o.lam_start = nullptr, o.first_relaxation = 1e-3;
@@ -171,20 +167,20 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
 }
 
 void violation(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t count, double broken) {
-  const int64_t sizes[kViolationInputs] = {n_x * n_x,     n_x * n_u, n_x * n_lam, n_x,         n_lam * n_x, n_lam * n_u,
-                                           n_lam * n_lam, n_lam,     count * n_x, count * n_u, count * n_x};
   std::vector<double> data[kViolationInputs], gradient[kViolationInputs];
   ViolationBatch b{};
+  b.count = count, b.n_x = n_x, b.n_u = n_u, b.n_lam = n_lam;
   double* to[kViolationInputs];
   for (int i = 0; i < kViolationInputs; i++) {
-    data[i] = i == vF ? lcp_matrices(1, n_lam) : normal(sizes[i], 0.5);
-    gradient[i].resize(sizes[i]);
+    const int64_t size = extent(b, kViolationFields[i]);
+    data[i] = i == vF ? lcp_matrices(1, n_lam) : normal(size, 0.5);
+    gradient[i].resize(size);
     b.input[i] = data[i].data(), to[i] = gradient[i].data();
   }
   if (broken != 0) data[vx][0] = broken;
   const int64_t n = 2 * n_lam;
   std::vector<double> Q(n * n), q(count * n), r(count * n_x), e(count * n_lam), loss(count);
-  b.count = count, b.n_x = n_x, b.n_u = n_u, b.n_lam = n_lam, b.gamma = 0.1, b.xi = 0.1, b.r = r.data(), b.e = e.data();
+  b.gamma = 0.1, b.xi = 0.1, b.r = r.data(), b.e = e.data();
   b.watch = kNever;
   const Workspace workspace(kernels().violation_workspace(b));
   const bool convex = kernels().violation_qp(b, Q.data(), q.data(), workspace.data);

@@ -21,25 +21,21 @@ from typing import NamedTuple
 import casadi
 import numpy as np
 
-CONVERGED, MAX_ITER, INFEASIBLE, NUMERICAL = 0, 1, 2, 3  # values of difflcs.Status
-_STATUS = {
-    "Solve_Succeeded": CONVERGED,
-    "Solved_To_Acceptable_Level": CONVERGED,  # the caller judges these by the residual
-    "Search_Direction_Becomes_Too_Small": CONVERGED,
-    "Maximum_Iterations_Exceeded": MAX_ITER,
-    "Maximum_CpuTime_Exceeded": MAX_ITER,
-    "Maximum_WallTime_Exceeded": MAX_ITER,
-    "Infeasible_Problem_Detected": INFEASIBLE,
-}
-
 
 class Sizes(NamedTuple):
-    """What decides the symbolic program."""
+    """What decides the symbolic program.
+
+    Attributes:
+        n_x, n_u, n_lam, horizon: sizes of the problem.
+        parameters: name, rows and columns of each parameter of the program in their packed order; each is packed
+            row-major.
+    """
 
     n_x: int
     n_u: int
     n_lam: int
     horizon: int
+    parameters: tuple[tuple[str, int, int], ...]
 
 
 class Options(NamedTuple):
@@ -51,22 +47,12 @@ class Options(NamedTuple):
     barrier: bool
 
 
-def parameter_shapes(sizes: Sizes) -> dict[str, tuple[int, int]]:
-    """Parameters of the program in their packed order; each is packed row-major."""
-    x, u, m = sizes.n_x, sizes.n_u, sizes.n_lam
-    return {
-        "A": (x, x), "B": (x, u), "C": (x, m), "d": (x, 1), "D": (m, x), "E": (m, u), "F": (m, m), "c": (m, 1),
-        "Q": (x, x), "R": (u, u), "Q_final": (x, x), "q": (x, 1), "r": (u, 1), "q_final": (x, 1),
-        "x0": (x, 1), "relaxation": (1, 1), "barrier": (1, 1), "u_min": (u, 1), "u_max": (u, 1),
-    }  # fmt: skip
-
-
 @functools.lru_cache(maxsize=32)
 def _solver(sizes: Sizes, options: Options) -> casadi.Function:
     """Direct transcription of Eq. mpc_lcs over (u_k, λ_k, s_k, x_{k+1}), k = 0 … H−1."""
-    packed = casadi.SX.sym("p", sum(r * c for r, c in parameter_shapes(sizes).values()))
+    packed = casadi.SX.sym("p", sum(rows * columns for _, rows, columns in sizes.parameters))
     p, at = {}, 0
-    for name, (rows, columns) in parameter_shapes(sizes).items():
+    for name, rows, columns in sizes.parameters:
         p[name] = casadi.reshape(packed[at : at + rows * columns], columns, rows).T
         at += rows * columns
     x, variables, constraints, cost = p["x0"], [], [], casadi.SX(0)
@@ -108,7 +94,7 @@ class Chunk(NamedTuple):
     """Some problems of a batch, as arrays with the problems in front.
 
     Attributes:
-        parameters: (m, …) packed as `parameter_shapes` says.
+        parameters: (m, …) packed as `Sizes.parameters` says.
         u_min, u_max: (m, n_u).
         x: (m, H, n_x) start of x_1 … x_H.
         u: (m, H, n_u) start of the actions.
@@ -125,7 +111,7 @@ class Chunk(NamedTuple):
 
 
 class Solved(NamedTuple):
-    """Result of a chunk: x_1 … x_H, u, λ, status, iterations and seconds of each problem."""
+    """Result of a chunk: x_1 … x_H, u, λ, IPOPT's word for how it ended, iterations and seconds of each problem."""
 
     x: np.ndarray
     u: np.ndarray
@@ -133,6 +119,11 @@ class Solved(NamedTuple):
     status: np.ndarray
     iterations: np.ndarray
     seconds: np.ndarray
+
+
+def no_words(count: int) -> np.ndarray:
+    """The statuses of problems that IPOPT has said nothing about."""
+    return np.full(count, "", "U64")
 
 
 def solve_chunk(sizes: Sizes, options: Options, chunk: Chunk) -> Solved:
@@ -163,13 +154,13 @@ def _heard_interrupts() -> Iterator[list[int]]:
 
 def _solve_chunk(sizes: Sizes, options: Options, chunk: Chunk, interrupts: list[int]) -> Solved:
     solver = _solver(sizes, options)
-    n_x, n_u, n_lam, horizon = sizes
+    n_x, n_u, n_lam, horizon, _ = sizes
     count = len(chunk.u)
     ends = np.cumsum([n_u, n_lam, n_lam, n_x])
     constraint = np.zeros(horizon * (n_x + 2 * n_lam))
     result = Solved(
         np.zeros((count, horizon, n_x)), np.zeros((count, horizon, n_u)), np.zeros((count, horizon, n_lam)),
-        np.full(count, NUMERICAL, np.int8), np.zeros(count, np.int32), np.zeros(count),
+        no_words(count), np.zeros(count, np.int32), np.zeros(count),
     )  # fmt: skip
     free = np.full(n_x, np.inf)
     for i in range(count):
@@ -183,7 +174,7 @@ def _solve_chunk(sizes: Sizes, options: Options, chunk: Chunk, interrupts: list[
             stats = solver.stats()
             z = np.asarray(out["x"]).reshape(horizon, -1)
             result.u[i], result.lam[i], _, result.x[i] = np.split(z, ends[:-1], axis=1)
-            result.status[i] = _STATUS.get(stats["return_status"], NUMERICAL)
+            result.status[i] = stats["return_status"]
             result.iterations[i] = stats["iter_count"]
         except RuntimeError:
             result.u[i], result.lam[i], result.x[i] = chunk.u[i], chunk.lam[i], chunk.x[i]

@@ -14,7 +14,7 @@ from difflcs.errors import BackendNotFoundError, DTypeError
 from difflcs.mpc import kkt
 from difflcs.mpc.problem import MPCProblem
 from difflcs.mpc.solution import Primal
-from difflcs.status import Status
+from difflcs.status import Status, solved
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Result:
     @property
     def solved(self) -> Tensor:
         """(batch,) bool: the trajectory can be used (CONVERGED or DEGENERATE)."""
-        return (self.status == Status.CONVERGED) | (self.status == Status.DEGENERATE)
+        return solved(self.status)
 
 
 class Backend(ABC):

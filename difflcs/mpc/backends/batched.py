@@ -16,7 +16,7 @@ from difflcs.mpc import kkt
 from difflcs.mpc.backends.base import Backend, Result
 from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.mpc.solution import Primal
-from difflcs.status import Status
+from difflcs.status import Status, solved
 
 # An iteration with row exchanges takes ten times as long, and what it can mend it mends soon.
 _MAX_ITER_PIVOT = 60
@@ -224,7 +224,7 @@ class _Found:
 
     @property
     def solved(self) -> Tensor:
-        return (self.status == Status.CONVERGED) | (self.status == Status.DEGENERATE)
+        return solved(self.status)
 
     def select(self, index: Tensor) -> _Found:
         return _Found(**{name: value[index] for name, value in self.tensors().items()})

@@ -20,12 +20,23 @@ import torch
 from difflcs._checks import check_number, check_positive_int, check_threads
 from difflcs.mpc import kkt
 from difflcs.mpc.backends.base import Backend, Result, certify
-from difflcs.mpc.problem import MPCProblem
+from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.mpc.solution import Primal
 from difflcs.status import Status
 
 if TYPE_CHECKING:
     from difflcs.mpc.backends._ipopt_worker import Chunk, Options, Sizes, Solved
+
+# What IPOPT says; anything else is NUMERICAL.
+_STATUS = {
+    "Solve_Succeeded": Status.CONVERGED,
+    "Solved_To_Acceptable_Level": Status.CONVERGED,  # these are judged by the residual
+    "Search_Direction_Becomes_Too_Small": Status.CONVERGED,
+    "Maximum_Iterations_Exceeded": Status.MAX_ITER,
+    "Maximum_CpuTime_Exceeded": Status.MAX_ITER,
+    "Maximum_WallTime_Exceeded": Status.MAX_ITER,
+    "Infeasible_Problem_Detected": Status.INFEASIBLE,
+}
 
 
 @dataclass(frozen=True)
@@ -67,18 +78,21 @@ class IpoptBackend(Backend):
         """Solve every element; a failure, even a crash of a worker, stays with its element."""
         from difflcs.mpc.backends._ipopt_worker import Options, Sizes, solve_chunk
 
-        sizes = Sizes(problem.n_x, problem.n_u, problem.n_lam, problem.horizon)
+        sizes = Sizes(problem.n_x, problem.n_u, problem.n_lam, problem.horizon, _parameters(problem))
         options = Options(
             self.tol, self.max_iter, self.mu_init if guess is None else self.mu_init_warm, problem.barrier > 0
         )
-        chunk = self._start(problem, guess, sizes)
+        chunk = self._start(problem, guess)
         workers = min(self.workers or _cpus(), problem.batch)
         if workers <= 1:
             with _locals.here:
                 solved = solve_chunk(sizes, options, chunk)
         else:
             solved = _locals.pool.solve(sizes, options, chunk, workers)
-        x, u, lam, status, iterations, seconds = (torch.from_numpy(v) for v in solved)
+        words = [_STATUS.get(str(word), Status.NUMERICAL) for word in solved.status]
+        status = torch.tensor(words, dtype=torch.int8)
+        x, u, lam = (torch.from_numpy(v) for v in (solved.x, solved.u, solved.lam))
+        iterations, seconds = torch.from_numpy(solved.iterations), torch.from_numpy(solved.seconds)
         primal = Primal(torch.cat([problem.x0.unsqueeze(1), x], 1), u, lam)
         usable = (status == Status.CONVERGED) & torch.isfinite(u).all(-1).all(-1)
         index = torch.nonzero(usable).squeeze(-1)
@@ -88,12 +102,12 @@ class IpoptBackend(Backend):
                 whole[index] = part
         return certify(problem, primal, status, iterations, seconds, self.residual_tol)
 
-    def _start(self, problem: MPCProblem, guess: Primal | None, sizes: Sizes) -> Chunk:
-        from difflcs.mpc.backends._ipopt_worker import Chunk, parameter_shapes
+    def _start(self, problem: MPCProblem, guess: Primal | None) -> Chunk:
+        from difflcs.mpc.backends._ipopt_worker import Chunk
 
         batch, horizon = problem.batch, problem.horizon
         flat = []
-        for name in parameter_shapes(sizes):
+        for name, _, _ in _parameters(problem):
             value = torch.as_tensor(getattr(problem, name), dtype=torch.float64)
             shared = value.ndim == 0 or problem.shared(name)
             size = value.numel() if shared else math.prod(problem.shape(name))
@@ -109,6 +123,12 @@ class IpoptBackend(Backend):
             x, s = x[:, 1:], problem.relaxation / lam.clamp_min(1e-300)
         u_min, u_max = (v.expand(batch, problem.n_u) for v in (problem.u_min, problem.u_max))
         return Chunk(*(np.ascontiguousarray(v.numpy()) for v in (torch.cat(flat, 1), u_min, u_max, x, u, lam, s)))
+
+
+def _parameters(problem: MPCProblem) -> tuple[tuple[str, int, int], ...]:
+    """Name, rows and columns of what the program takes: every input of the problem, and its two numbers."""
+    shapes = {**{name: problem.shape(name) for name in INPUTS}, "relaxation": (1,), "barrier": (1,)}
+    return tuple((name, shape[0], math.prod(shape[1:])) for name, shape in shapes.items())
 
 
 class _Worker:
@@ -154,7 +174,7 @@ class _Pool:
                 raise
 
     def _solve(self, sizes: Sizes, options: Options, chunk: Chunk, count: int) -> Solved:
-        from difflcs.mpc.backends._ipopt_worker import NUMERICAL, Solved
+        from difflcs.mpc.backends._ipopt_worker import Solved, no_words
 
         batch = len(chunk.u)
         while len(self.workers) < count:
@@ -163,7 +183,7 @@ class _Pool:
         todo = deque(np.array_split(np.arange(batch), min(batch, 4 * count)))
         result = Solved(
             chunk.x.copy(), chunk.u.copy(), chunk.lam.copy(),
-            np.full(batch, NUMERICAL, np.int8), np.zeros(batch, np.int32), np.zeros(batch),
+            no_words(batch), np.zeros(batch, np.int32), np.zeros(batch),
         )  # fmt: skip
 
         def give(slot: int) -> None:

@@ -1,0 +1,106 @@
+// One stage of the MPC around a trajectory, with lam eliminated: dlam = K_lam (dx, du), ds = K_s (dx, du) and
+// dx+ = A_hat (dx, du), and the second derivative of lam. difflcs/mpc/kkt.py derives it.
+#pragma once
+#include "lanes.hpp"
+#include "lu_lanes.hpp"
+#include "matrix.hpp"
+#include "mpc_problem.hpp"
+
+namespace difflcs::DIFFLCS_ISA {
+namespace {
+
+// What the adjoint needs again of each stage.
+template <class S>
+struct Stage {
+  Matrix<Vec, S::kL, S::kL> M;  // LU factors of diag(a) + diag(b) F, and the row exchanges
+  Mask* rows;
+  Vec *size, *y;                         // 1 / (lam + s), and the multiplier of lam o s = eps
+  Matrix<Vec, S::kL, S::kW> K_lam, K_s;  // K_s in the adjoint only
+  Matrix<Vec, S::kX, S::kW> A_hat;
+};
+
+template <class T, class S>
+class Linearisation {
+  static constexpr int64_t kX = S::kX, kL = S::kL, kW = S::kW;
+  using Lu = Elimination<S::kPivot>;
+  const Problem<T, S>& problem;
+  const S n;
+  const bool kept;  // every stage is kept; else each takes the place of the one before it
+  Stages<Matrix<Vec, kL, kL>> M;
+  Stages<Matrix<Vec, kL, kW>> K_lam, K_s;
+  Stages<Matrix<Vec, kX, kW>> A_hat;
+  Matrix<Vec, 0, kL> size, y;
+  Mask *rows, *right_rows;
+  Vec *a, *b, *right_factors, *column;
+  Matrix<Vec, kL, kW> slopes, weighted;
+
+ public:
+  Linearisation(const Problem<T, S>& problem, bool kept) : problem(problem), n(problem.n), kept(kept) {}
+
+  void layout(Arena& arena) {
+    const int64_t nx = n.x(), nl = n.l(), nw = n.w(), count = kept ? n.h : 1;
+    arena.take(M, count, nl, nl), arena.take(K_lam, count, nl, nw), arena.take(A_hat, count, nx, nw);
+    arena.take(K_s, kept ? count : 0, nl, nw), arena.take(size, count, nl), arena.take(y, count, nl);
+    arena.take(rows, count * nl), arena.take(right_rows, nl), arena.take(a, nl), arena.take(b, nl),
+        arena.take(right_factors, nl * nl);
+    arena.take(column, nl), arena.take(slopes, nl, nw), arena.take(weighted, nl, nw);
+  }
+
+  Stage<S> stage(int64_t k) const {
+    if (!kept) k = 0;
+    return {M[k], rows + k * n.l(), size[k], y[k], K_lam[k], K_s[k], A_hat[k]};
+  }
+
+  // Stage k at lam and s, with p the costate of the next state.
+  Stage<S> at(int64_t k, const Vec* lam, const Vec* s, const Vec* p) {
+    const int64_t nx = n.x(), nl = n.l(), nw = n.w();
+    const Stage<S> stage = this->stage(k);
+    const auto F = problem.F;
+    const auto C = problem.C;
+    for (int64_t i = 0; i < nl; i++) {
+      stage.size[i] = 1.0 / (lam[i] + s[i]);
+      a[i] = s[i] * stage.size[i], b[i] = lam[i] * stage.size[i];
+    }
+    Local<kL * kL> left(stage.M.entries), right(right_factors);
+    // diag(a) + diag(b) F, or diag(a) + F diag(b)
+    auto eliminate = [&](auto& matrix, Mask* exchanged, bool by_row) {
+      DIFFLCS_UNROLL
+      for (int64_t i = 0; i < nl; i++) {
+        DIFFLCS_UNROLL
+        for (int64_t j = 0; j < nl; j++) matrix[i * nl + j] = b[by_row ? i : j] * F(i, j);
+        matrix[i * nl + i] += a[i];
+      }
+      Lu::factor(nl, matrix, exchanged);
+    };
+    eliminate(left, stage.rows, true);
+    for (int64_t i = 0; i < nl * nl; i++) stage.M.entries[i] = left[i];
+    // y = (diag(s) + F^T diag(lam))^-1 (-C^T p), from the same factors.
+    for (int64_t i = 0; i < nl; i++) stage.y[i] = all(0) - C.column(i) * p;
+    Lu::solve_transposed(nl, stage.M.entries, stage.rows, stage.y);
+    // Since a dlam + b ds = 0, both follow from one T: K_lam = b T, K_s = -a T with (diag(a) + F diag(b)) T = -[D E].
+    eliminate(right, right_rows, false);
+    for (int64_t j = 0; j < nw; j++) {
+      Local<kL> t(column);
+      DIFFLCS_UNROLL
+      for (int64_t i = 0; i < nl; i++) t[i] = all(0) - problem.DE(i, j);
+      Lu::solve(nl, right, right_rows, t);
+      DIFFLCS_UNROLL
+      for (int64_t i = 0; i < nl; i++) slopes(i, j) = t[i], stage.K_lam(i, j) = t[i] = b[i] * t[i];
+      for (int64_t i = 0; i < nx; i++) stage.A_hat(i, j) = all(0) + problem.AB(i, j) + C.row(i) * t;
+    }
+    for (int64_t i = 0; i < nl; i++) {
+      stage.y[i] *= stage.size[i];
+      for (int64_t j = 0; j < nw; j++) weighted(i, j) = -2.0 * stage.y[i] * a[i] * stage.K_lam(i, j);
+    }
+    if (kept)
+      for (int64_t i = 0; i < nl; i++)
+        for (int64_t j = 0; j < nw; j++) stage.K_s(i, j) = -a[i] * slopes(i, j);
+    return stage;
+  }
+
+  // Y_ij = sum_m y_m (K_lam_mi K_s_mj + K_s_mi K_lam_mj) of the stage that was linearised last.
+  Vec curvature(int64_t i, int64_t j) const { return all(0) + weighted.column(i) * slopes.column(j); }
+};
+
+}  // namespace
+}  // namespace difflcs::DIFFLCS_ISA

@@ -1,0 +1,304 @@
+// The Riccati sweep of the MPC with lam eliminated: reduced gradient, active bounds, and the feedback law that solves
+// the quadratic problem around a trajectory. The adjoint is the same sweep with upstream gradients as linear terms
+// (difflcs/mpc/kkt.py: `linearise` and the backward half of `_solve`).
+#pragma once
+#include "lanes.hpp"
+#include "linearisation.hpp"
+#include "matrix.hpp"
+#include "mpc_problem.hpp"
+
+namespace difflcs::DIFFLCS_ISA {
+namespace {
+
+// Smallest curvature of an action, in parts of what would move it across its whole range: bounds Newton's step where
+// the cost is flat.
+constexpr double kFlat = 1e-3;
+// A reduced Hessian is singular below this part of an action's own curvature (difflcs.mpc.kkt has the same).
+constexpr double kSingular = 1e-10;
+// An action with a barrier is differentiated as one at its bound below this part of its range (kkt has the same).
+constexpr double kClose = 1e-8;
+
+// What a sweep finds besides the feedback law.
+struct Sweep {
+  Vec projected;   // projected gradient in units of the gradient, with the curvature as the scale of the bounds
+  Vec rounding;    // level below which rounding hides it
+  Vec stationary;  // projected gradient in parts of its scale, which sees flat directions too (certificate.hpp)
+  Mask weak;       // a bound is weakly active, or the reduced Hessian is singular
+};
+
+// Upstream gradients of x, u and lam.
+template <class S>
+struct Upstream {
+  Matrix<Vec, 0, S::kX> x;
+  Matrix<Vec, 0, S::kU> u;
+  Matrix<Vec, 0, S::kL> lam;
+};
+
+// Value function of the steps from one on: Hessian, costate, and linear term.
+template <class S>
+struct Value {
+  Matrix<Vec, S::kX, S::kX> P;
+  Vec *p, *v;
+};
+
+template <class T, class S, bool kAdjoint>
+class Riccati {
+  static constexpr int64_t kX = S::kX, kU = S::kU, kW = S::kW, kLaw = kX ? kX + 1 : 0;
+  const Problem<T, S>& problem;
+  const S n;
+  Linearisation<T, S> linearisation;
+  Stages<Matrix<Vec, kX, kX>> P;
+  Matrix<Vec, 0, kX> p, v;
+  Matrix<Vec, kW, kW> H;
+  Matrix<Vec, kX, kW> PA;
+  Matrix<Vec, kU, kU> L;
+  Matrix<Vec, kU, kLaw> law;
+  Vec *linear, *flat, *column;
+  Mask* active;
+  Sweep found;
+
+ public:
+  Matrix<Vec, 0, kU> gradient, feedforward;
+  Stages<Matrix<Vec, kU, kX>> feedback;
+  Matrix<Mask, 0, kU> lower, upper;  // actions held at a bound
+
+  explicit Riccati(const Problem<T, S>& problem) : problem(problem), n(problem.n), linearisation(problem, kAdjoint) {}
+
+  void layout(Arena& arena) {
+    const int64_t nx = n.x(), nu = n.u(), nw = n.w(), h = n.h, values = kAdjoint ? h + 1 : 2;
+    linearisation.layout(arena);
+    arena.take(P, values, nx, nx), arena.take(p, values, nx), arena.take(v, values, nx);
+    arena.take(H, nw, nw), arena.take(PA, nx, nw), arena.take(L, nu, nu), arena.take(law, nu, nx + 1);
+    arena.take(linear, nw), arena.take(flat, nu), arena.take(column, nx), arena.take(active, nu);
+    arena.take(gradient, h, nu), arena.take(feedforward, h, nu), arena.take(feedback, h, nu, nx);
+    arena.take(lower, h, nu), arena.take(upper, h, nu);
+  }
+
+  Stage<S> stage(int64_t k) const { return linearisation.stage(k); }
+
+  // The adjoint keeps all of them, the solver this stage's and the next's.
+  Value<S> value(int64_t k) const {
+    const int64_t at = kAdjoint ? k : k % 2;
+    return {P[at], p[at], v[at]};
+  }
+
+  // Around the trajectory `at`. The solver adds `regularisation` to the curvature of each action; lanes that are
+  // `stubborn` keep the second derivative of lam where the Hessian is indefinite.
+  Sweep sweep(const Trajectory<S>& at, const Upstream<S>& upstream, Vec regularisation, Mask stubborn) {
+    found = {all(0), all(0), all(0), Mask{}};
+    terminal(at.x[n.h], kAdjoint ? upstream.x[n.h] : nullptr);
+    for (int64_t k = n.h - 1; k >= 0; k--) {
+      const Value<S> next = value(k + 1);
+      const Stage<S> stage = linearisation.at(k, at.lam[k], at.s[k], next.p);
+      stage_hessian(k, stage, next.P);
+      const Vec* lam_bar = kAdjoint ? upstream.lam[k] : nullptr;
+      actions(k, stage, next, at.u[k], kAdjoint ? upstream.u[k] : nullptr, lam_bar, regularisation);
+      states(k, stage, next, at.x[k], kAdjoint ? upstream.x[k] : nullptr, lam_bar);
+      const Vec use = factor(regularisation, stubborn);
+      feedback_law(k, use, at.u[k]);
+    }
+    return found;
+  }
+
+ private:
+  void terminal(const Vec* x, const Vec* x_bar) {
+    const int64_t nx = n.x();
+    const Value<S> end = value(n.h);
+    for (int64_t i = 0; i < nx; i++) {
+      for (int64_t j = 0; j < nx; j++) end.P(i, j) = all(0) + problem.Q_final(i, j);
+      end.p[i] = problem.q_final[i] + problem.Q_final.row(i) * x;
+      end.v[i] = kAdjoint ? -x_bar[i] : end.p[i];
+    }
+  }
+
+  // H = blkdiag(Q, R) + A_hat^T P A_hat, lower triangle; its second-derivative part Y is added later. The first state
+  // is given: of stage 0 only the action block is needed.
+  void stage_hessian(int64_t k, const Stage<S>& stage, const Matrix<Vec, kX, kX>& P) {
+    const int64_t nx = n.x(), nw = n.w(), first = k == 0 ? nx : 0;
+    Local<kX> of_A(column);
+    for (int64_t j = first; j < nw; j++) {
+      DIFFLCS_UNROLL
+      for (int64_t m = 0; m < nx; m++) of_A[m] = stage.A_hat(m, j);
+      for (int64_t i = 0; i < nx; i++) PA(i, j) = all(0) + P.row(i) * of_A;
+    }
+    for (int64_t i = first; i < nw; i++) {
+      DIFFLCS_UNROLL
+      for (int64_t m = 0; m < nx; m++) of_A[m] = stage.A_hat(m, i);
+      for (int64_t j = first; j <= i; j++) {
+        Vec t = all(0);
+        if (i < nx)
+          t += problem.Q(i, j);
+        else if (j >= nx)
+          t += problem.R(i - nx, j - nx);
+        H(i, j) = t + PA.column(j) * of_A;
+      }
+    }
+  }
+
+  // Reduced gradient of the actions of stage k, linear terms, and which actions are held at a bound.
+  void actions(int64_t k, const Stage<S>& stage, const Value<S>& next, const Vec* u, const Vec* u_bar,
+               const Vec* lam_bar, Vec regularisation) {
+    const int64_t nx = n.x(), nu = n.u();
+    const double& barrier = problem.batch.barrier;  // a reference: from a copy GCC 12 makes two loops, and fails on one
+    const Vec mu = problem.mu;
+    const T* rest = k == n.h - 1 ? problem.rest_final : problem.rest;
+    for (int64_t j = 0; j < nu; j++) {
+      const Vec lo = problem.u_min[j], hi = problem.u_max[j], per_width = problem.per_width[j];
+      const Vec below = u[j] - lo, above = hi - u[j], width = hi - lo;
+      Vec t = problem.r[j] + problem.R.row(j) * u;
+      if (barrier > 0) {
+        t += mu * (1.0 / above - 1.0 / below);
+        H(nx + j, nx + j) += mu * (1.0 / (below * below) + 1.0 / (above * above));
+      }
+      Vec g = t, l = kAdjoint ? -u_bar[j] : t, terms = abs(t);
+      for (int64_t i = 0; i < nx; i++) {
+        const Vec part = stage.A_hat(i, nx + j) * next.p[i];
+        g += part, terms += abs(part), l += stage.A_hat(i, nx + j) * next.v[i];
+      }
+      if (kAdjoint) l = l - stage.K_lam.column(nx + j) * lam_bar;
+      linear[nx + j] = l, gradient(k, j) = g;
+      // Away from an optimum P, and with it H, can be indefinite: |H| is still a scale for the distance to a bound.
+      // Where the cost is flat, the range of the action is the scale: a descent leads across all of it.
+      const Vec across = abs(g) * per_width;
+      const Vec gauss_newton = max(max(abs(H(nx + j, nx + j)), all(0) + problem.R(j, j)), max(across, all(kTiny)));
+      const Vec scaled = max(lo, min(hi, u[j] - g / gauss_newton));
+      Vec projected = abs(scaled - u[j]) * gauss_newton;
+      // Next to a bound the barrier is so steep that rounding u alone moves g: a step below rounding counts as none.
+      if (barrier > 0) projected = select(abs(g) <= 1e-14 * width * gauss_newton, all(0), projected);
+      found.projected = max(found.projected, projected);
+      found.rounding = max(found.rounding, 1e-12 * terms);
+      if (barrier > 0)
+        terms += mu * (1.0 / below + 1.0 / above) + 1e-8 * mu * width * (1.0 / (below * below) + 1.0 / (above * above));
+      const Vec reference = max(terms, rest[j] * width);
+      Vec part = select(reference > 0, abs(g) / reference, all(0));
+      part = min(part, select(g > 0, below, above) * per_width);
+      if (barrier > 0) part = select(projected > 0, part, all(0));
+      found.stationary = max(found.stationary, part);
+      flat[j] = kFlat * across;
+      const Vec least = 1e-10 * reference * per_width;
+      const Vec curved = max(H(nx + j, nx + j) + linearisation.curvature(nx + j, nx + j), max(least, all(kTiny)));
+      const Vec step = g / curved;
+      if (barrier == 0) found.weak |= (min(below, above) <= 1e-5 * width) & (abs(step) <= 1e-5 * width) & (width > 0);
+      const Mask fixed = width <= 0;
+      if (kAdjoint) {
+        lower(k, j) = (step > below) | (fixed & (g >= 0));
+        upper(k, j) = (-step > above) | (fixed & (g < 0));
+      } else {
+        // Next to a bound that the action's own Newton step would cross it is put onto the bound (Bertsekas).
+        // Not after a failed step: the jump is not damped, and in an unstable system it can cost more than it gains.
+        const Vec reach = g / gauss_newton, near = select(regularisation > 0, all(1e-12), all(1e-2)) * width;
+        lower(k, j) = (below <= near) & (reach >= below) & (g > 0);
+        upper(k, j) = (above <= near) & (-reach >= above) & (g < 0);
+      }
+      if (barrier > 0) {
+        // A barrier that keeps no distance to speak of is the bound itself; its steepness is then only rounding.
+        const Vec close = max(kClose * width, 1e-3 * kClose * max(abs(lo), abs(hi)));
+        lower(k, j) = kAdjoint ? (below <= close) & (below <= above) : Mask{};
+        upper(k, j) = kAdjoint ? (above <= close) & (above < below) : Mask{};
+      }
+      active[j] = lower(k, j) | upper(k, j) | fixed;
+    }
+  }
+
+  // Costate of state k, and its linear term.
+  void states(int64_t k, const Stage<S>& stage, const Value<S>& next, const Vec* x, const Vec* x_bar,
+              const Vec* lam_bar) {
+    Vec* p = value(k).p;
+    for (int64_t i = 0; i < n.x(); i++) {
+      const Vec t = problem.q[i] + problem.Q.row(i) * x;
+      Vec l = (kAdjoint ? -x_bar[i] : t) + stage.A_hat.column(i) * next.v;
+      if (kAdjoint) l = l - stage.K_lam.column(i) * lam_bar;
+      p[i] = t + stage.A_hat.column(i) * next.p, linear[i] = l;
+    }
+  }
+
+  // Curvature that action j has at least, whatever its units.
+  Vec action_scale(int64_t j) const {
+    const int64_t nx = n.x();
+    return max(problem.R(j, j) + 1e-6 * abs(H(nx + j, nx + j)), all(kTiny));
+  }
+
+  // Cholesky of H_uu + Y_uu + regularisation with identity rows for active actions, reciprocal pivots on the diagonal.
+  // An indefinite block first drops Y at this stage (Gauss-Newton), then has its pivots lifted; lanes that are
+  // `stubborn` lift them at once. Returns the part of Y that was used.
+  Vec factor(Vec regularisation, Mask stubborn) {
+    const int64_t nx = n.x(), nu = n.u();
+    Vec use = all(1);
+    for (int attempt = 0; attempt < 2; attempt++) {
+      Mask failed = Mask{};
+      for (int64_t i = 0; i < nu; i++)
+        for (int64_t j = 0; j <= i; j++) {
+          Vec t = H(nx + i, nx + j) + use * linearisation.curvature(nx + i, nx + j);
+          if (i == j && !kAdjoint) t += regularisation * action_scale(j) + flat[j];
+          L(i, j) = select(active[i] | active[j], all(i == j), t);
+        }
+      for (int64_t j = 0; j < nu; j++) {
+        Vec pivot = L(j, j);
+        for (int64_t m = 0; m < j; m++) pivot -= L(j, m) * L(j, m);
+        const Vec singular = kSingular * abs(H(nx + j, nx + j));
+        const Vec lift = kAdjoint ? singular : 0.05 * action_scale(j);
+        const Mask bad = ~(pivot > lift) & ~active[j];
+        failed |= bad;
+        // What is added where the cost is flat vanishes with the gradient, and does not hide that it is.
+        if (!kAdjoint && attempt == 0) found.weak |= ~(pivot - flat[j] > singular) & ~active[j];
+        Vec inverse = 1.0 / sqrt(select(bad, max(abs(pivot), lift), pivot));
+        // The adjoint holds an action that nothing moves, and takes a negative curvature by its size.
+        if (kAdjoint) inverse = select(bad & (abs(pivot) <= lift), all(0), inverse);
+        L(j, j) = inverse;
+        for (int64_t i = j + 1; i < nu; i++) {
+          Vec t = L(i, j);
+          for (int64_t m = 0; m < j; m++) t -= L(i, m) * L(j, m);
+          L(i, j) = t * inverse;
+        }
+      }
+      if (kAdjoint) {
+        found.weak |= failed;
+        break;
+      }
+      if (!any(failed) || attempt == 1) break;
+      use = select(failed & ~stubborn, all(0), use);
+    }
+    return use;
+  }
+
+  // (feedback | feedforward) = -H_uu^-1 (H_ux | linear_u), rows of active actions zero; and the value function of
+  // stage k.
+  void feedback_law(int64_t k, Vec use, const Vec* u) {
+    const int64_t nx = n.x(), nu = n.u(), nw = n.w(), first = k == 0 ? nx : 0, columns = nx + 1;
+    for (int64_t i = first; i < nw; i++)
+      for (int64_t j = first; j <= i; j++)
+        if (i >= nx ? j < nx : true) H(i, j) += use * linearisation.curvature(i, j);
+    for (int64_t i = 0; i < nu; i++) {
+      for (int64_t j = 0; j < nx; j++) law(i, j) = k == 0 ? all(0) : select(active[i], all(0), -H(nx + i, j));
+      law(i, nx) = select(active[i], all(0), -linear[nx + i]);
+    }
+    for (int64_t i = 0; i < nu; i++) {
+      for (int64_t m = 0; m < i; m++)
+        for (int64_t j = first; j < columns; j++) law(i, j) -= L(i, m) * law(m, j);
+      for (int64_t j = first; j < columns; j++) law(i, j) *= L(i, i);
+    }
+    if (k > 0) {
+      const Value<S> here = value(k);
+      for (int64_t i = 0; i < nx; i++) {
+        for (int64_t j = 0; j <= i; j++) here.P(i, j) = here.P(j, i) = H(i, j) - law.column(i) * law.column(j);
+        here.v[i] = linear[i] - law.column(i) * law.column(nx);
+      }
+    }
+    for (int64_t i = nu - 1; i >= 0; i--) {
+      for (int64_t m = i + 1; m < nu; m++)
+        for (int64_t j = first; j < columns; j++) law(i, j) -= L(m, i) * law(m, j);
+      for (int64_t j = first; j < columns; j++) law(i, j) *= L(i, i);
+    }
+    const Matrix<Vec, kU, kX> K = feedback[k];
+    for (int64_t i = 0; i < nu; i++) {
+      for (int64_t j = 0; j < nx; j++) K(i, j) = law(i, j);
+      // The solver puts an action held at a bound onto it exactly.
+      const Vec to_bound =
+          select(lower(k, i), problem.u_min[i] - u[i], select(upper(k, i), problem.u_max[i] - u[i], all(0)));
+      feedforward(k, i) = kAdjoint ? law(i, nx) : select(active[i], to_bound, law(i, nx));
+    }
+  }
+};
+
+}  // namespace
+}  // namespace difflcs::DIFFLCS_ISA

@@ -1,0 +1,258 @@
+// The MPC solver: projected Newton on the actions, with a feedback rollout clipped to the box, an Armijo search, and a
+// homotopy in eps from `first_relaxation` down to `relaxation`.
+#pragma once
+#include "certificate.hpp"
+#include "kernels.hpp"
+#include "lanes.hpp"
+#include "matrix.hpp"
+#include "mpc_problem.hpp"
+#include "relaxed_lcp.hpp"
+#include "riccati.hpp"
+
+namespace difflcs::DIFFLCS_ISA {
+namespace {
+
+// Projected gradient, in parts of its scale (see certificate.hpp), at which a problem is solved.
+constexpr double kStationary = 1e-7;
+// Failed searches in a row, each with 8 times the damping, before a problem is given up.
+constexpr int64_t kFailures = 12;
+
+template <class T, class S>
+class Solver {
+  const MpcBatch& batch;
+  const S n;
+  Problem<T, S> problem;
+  Riccati<T, S, false> riccati;
+  Certificate<T, S> certificate;
+  Trajectory<S> at, next;  // the iterate and the trial
+  Vec *gap, *newton;
+  Mask* rows;
+
+ public:
+  Solver(const MpcBatch& b, void* memory) : batch(b), n(b), problem(b, false), riccati(problem), certificate(b) {
+    layout(memory);
+  }
+
+  // Lays the arrays out in `memory`, or only counts them where it is null.
+  int64_t layout(void* memory) {
+    Arena arena{memory};
+    problem.layout(arena), at.layout(arena, n), next.layout(arena, n);
+    arena.take(gap, n.l()), arena.take(newton, Lcp::scratch(n.l())), arena.take(rows, n.l());
+    riccati.layout(arena), certificate.layout(arena);
+    return arena.used;
+  }
+
+  void solve(const MpcSolve& o, int64_t* counter, Watch watch);
+
+ private:
+  using Lcp = RelaxedLcp<T, S::kL, S::kPivot>;
+
+  // The problems in the lanes, and how far each has come.
+  struct Lane {
+    int64_t element;  // -1: idle
+    int64_t iterations, in_stage, failures;
+  };
+  Lane lane[kLanes];
+  Vec eps, regularisation, J;
+  Mask fresh;  // without a trajectory at its eps
+  // Elements that are finished but not certified yet.
+  int64_t finished[kLanes];
+  int waiting;
+
+  // Large problems look at the watch at every stage, small ones once per iteration.
+  bool halted(Watch watch) const { return n.l() > 16 && watch.stop(watch.context); }
+
+  // lam and s of one stage, from the guess in `lam`; lanes in `skip` keep both.
+  void contacts(const Vec* x, const Vec* u, Vec* lam, Vec* s, Mask skip) {
+    problem.gap(x, u, gap);
+    Lcp(n.l(), problem.F.entries, gap, newton, rows).solve(lam, s, eps, skip);
+  }
+
+  // Roll u out at eps in the lanes of `wanted`; returns the cost of every lane.
+  Vec rollout(Mask wanted, Watch watch) {
+    for (int64_t i = 0; i < n.x(); i++) at.x(0, i) = problem.x0[i];
+    for (int64_t k = 0; k < n.h && !halted(watch); k++) {
+      contacts(at.x[k], at.u[k], at.lam[k], at.s[k], ~wanted);
+      problem.next_state(at.x[k], at.u[k], at.lam[k], at.x[k + 1]);
+    }
+    return problem.cost(at);
+  }
+
+  // The trial trajectory with step length `step` along the feedback law; lanes in `frozen` stay where they are, those
+  // in `skip` keep their trial.
+  Vec trial(Vec step, Mask frozen, Mask skip, Watch watch) {
+    const int64_t nx = n.x(), nu = n.u(), nl = n.l();
+    for (int64_t i = 0; i < nx; i++) next.x(0, i) = problem.x0[i];
+    for (int64_t k = 0; k < n.h && !halted(watch); k++) {
+      const Matrix<Vec, S::kU, S::kX> K = riccati.feedback[k];
+      for (int64_t j = 0; j < nu; j++) {
+        const Vec from = at.u(k, j);
+        Vec to = from + step * riccati.feedforward(k, j);
+        if (k > 0)
+          for (int64_t i = 0; i < nx; i++) to += K(j, i) * (next.x(k, i) - at.x(k, i));
+        Vec low = problem.u_min[j], high = problem.u_max[j];
+        if (batch.barrier > 0)  // at most nine tenths of the way to a bound
+          low = from - 0.9 * (from - low), high = from + 0.9 * (high - from);
+        next.u(k, j) = select(frozen, from, max(low, min(high, to)));
+      }
+      for (int64_t j = 0; j < nl; j++) next.lam(k, j) = select(skip, next.lam(k, j), at.lam(k, j));
+      contacts(next.x[k], next.u[k], next.lam[k], next.s[k], skip);
+      problem.next_state(next.x[k], next.u[k], next.lam[k], next.x[k + 1]);
+    }
+    return problem.cost(next);
+  }
+
+  // Take the next problem into a lane; an exhausted queue leaves the lane idle with whatever it held.
+  bool take(const MpcSolve& o, int64_t* counter, int l) {
+    const int64_t e = __atomic_fetch_add(counter, int64_t{1}, __ATOMIC_RELAXED);
+    const int64_t nu = n.u(), actions = n.h * nu, forces = n.h * n.l();
+    lane[l] = {e < batch.count ? e : -1, 0, 0, 0};
+    fresh[l] = -1;
+    eps[l] = o.first_relaxation, regularisation[l] = 0;
+    if (e >= batch.count) return false;
+    problem.load(e, l);
+    for (int64_t i = 0; i < actions; i++) {
+      const double low = problem.u_min[i % nu][l], high = problem.u_max[i % nu][l];
+      const double margin = batch.barrier > 0 ? 0.01 * (high - low) : 0.0;
+      const double a = low + margin, b = high - margin, value = o.u_start ? o.u_start[e * actions + i] : 0.0;
+      put(at.u.entries, i, l, value < a ? a : value > b ? b : value);
+    }
+    if (o.lam_start)
+      problem.load_lam(at.lam.entries, o.lam_start + e * forces, l);
+    else
+      for (int64_t i = 0; i < forces; i++) put(at.lam.entries, i, l, __builtin_sqrt(o.first_relaxation));
+    return true;
+  }
+
+  void store(const MpcSolve& o, int l, Status status) {
+    const int64_t e = lane[l].element, states = at.x.size(), actions = at.u.size(), forces = at.lam.size();
+    problem.store(o.x + e * states, at.x.entries, states, l);
+    problem.store(o.u + e * actions, at.u.entries, actions, l);
+    problem.store_lam(o.lam + e * forces, at.lam.entries, l);
+    o.objective[e] = J[l] / lane_of(problem.cost_unit[0], l), o.iterations[e] = int32_t(lane[l].iterations);
+    o.status[e] = int8_t(status);
+    finished[waiting++] = e;
+    if (waiting == kLanes) certificate.judge(o, finished, waiting), waiting = 0;
+  }
+
+  // Stores the lanes that are done and gives them other problems. Returns the lanes that make no step now.
+  Mask finish(const MpcSolve& o, const Sweep& sweep, int64_t* counter, Mask idle, int& live) {
+    Mask frozen = idle;
+    for (int l = 0; l < kLanes; l++) {
+      if (idle[l] || eps[l] > batch.relaxation) continue;
+      const Lane& a = lane[l];
+      const double tol = o.tol > sweep.rounding[l] ? o.tol : sweep.rounding[l];
+      // A search that fails this close to the optimum has met the rounding of the cost.
+      const double patience = a.failures < kFailures ? 1.0 : 1e3;
+      const bool converged = sweep.projected[l] <= patience * tol && sweep.stationary[l] <= patience * kStationary;
+      const bool broken = !(J[l] < 1e300 && J[l] > -1e300);
+      if (!converged && !broken && a.iterations < o.max_iter && a.failures < kFailures) continue;
+      frozen[l] = -1;
+      if (converged && regularisation[l] > 0 && !broken) {  // once more without it: it hides a singular Hessian
+        regularisation[l] = 0;
+        continue;
+      }
+      store(o, l,
+            converged && !broken         ? (sweep.weak[l] ? Status::degenerate : Status::converged)
+            : a.iterations >= o.max_iter ? Status::max_iter
+                                         : Status::numerical);
+      if (!take(o, counter, l)) live--;
+    }
+    return frozen;
+  }
+
+  // Armijo search along the feedback law. An accepted lane keeps its trial while the others shorten their step. Returns
+  // the lanes that moved, `step` how far.
+  Mask search(Mask frozen, Vec& step, Watch watch) {
+    Vec J_trial = J;
+    Mask accepted = frozen;
+    step = all(1);
+    for (int search = 0; search < 5; search++) {
+      const Vec value = trial(step, frozen, accepted, watch);
+      if (halted(watch)) break;
+      // First-order change of the cost along the step as it was clipped: the gradient is dJ/du of the whole trajectory.
+      Vec slope = all(0);
+      for (int64_t i = 0; i < at.u.size(); i++)
+        slope += riccati.gradient.entries[i] * (next.u.entries[i] - at.u.entries[i]);
+      const Mask good = (value <= J + 1e-4 * min(slope, all(0)) + 1e-13 * (1.0 + abs(J))) & ~accepted;
+      J_trial = select(good, value, J_trial);
+      accepted |= good;
+      if (!any(~accepted)) break;
+      step = select(accepted, step, step * (search < 2 ? 0.5 : 0.25));
+    }
+    const Mask moved = accepted & ~frozen;
+    auto move = [&](auto& to, const auto& from) {
+      for (int64_t i = 0; i < to.size(); i++) to.entries[i] = select(moved, from.entries[i], to.entries[i]);
+    };
+    move(at.u, next.u), move(at.x, next.x), move(at.lam, next.lam), move(at.s, next.s);
+    J = select(moved, J_trial, J);
+    return moved;
+  }
+
+  // Damping and homotopy after a step.
+  void advance(const MpcSolve& o, const Sweep& sweep, Mask frozen, Mask moved, Vec step) {
+    const double target = batch.relaxation;
+    for (int l = 0; l < kLanes; l++) {
+      if (frozen[l]) continue;
+      Lane& a = lane[l];
+      a.iterations++, a.in_stage++;
+      a.failures = moved[l] ? 0 : a.failures + 1;
+      // Levenberg-Marquardt, in units of each action's own curvature.
+      double& reg = reinterpret_cast<double*>(&regularisation)[l];
+      if (!moved[l])
+        reg = reg * 8 > 1 ? reg * 8 : 1;
+      else if (step[l] >= 0.3)
+        reg = reg * 0.125 < 0.5 ? 0 : reg * 0.125;
+      // Two steps per stage of the homotopy, fewer where the stage is solved.
+      if (eps[l] > target && (a.in_stage >= 2 || sweep.projected[l] < 1e4 * o.tol || a.failures > 0)) {
+        eps[l] = eps[l] * o.shrink > target ? eps[l] * o.shrink : target;
+        a.in_stage = 0, a.failures = 0;
+        fresh[l] = -1;
+      }
+    }
+  }
+};
+
+// Takes problems from the shared counter until none is left.
+template <class T, class S>
+void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
+  eps = all(batch.relaxation), regularisation = J = all(0);
+  fresh = Mask{};
+  waiting = 0;
+  int live = 0;
+  for (int l = 0; l < kLanes; l++) {
+    if (take(o, counter, l))
+      live++;
+    else if (live)
+      problem.load(lane[0].element, l);  // harmless numbers for a lane that never gets a problem
+  }
+  while (live > 0) {
+    Mask idle;
+    for (int l = 0; l < kLanes; l++) idle[l] = lane[l].element < 0 ? -1 : 0;
+    problem.mu = batch.barrier * (eps / batch.relaxation) * problem.cost_unit[0];
+    if (any(fresh & ~idle)) {
+      const Vec rolled = rollout(fresh & ~idle, watch);
+      J = select(fresh, rolled, J);
+    }
+    if (watch.stop(watch.context)) {
+      // What has a trajectory is stored; what has none stays unreached.
+      for (int l = 0; l < kLanes; l++)
+        if (!idle[l] && !fresh[l]) store(o, l, Status::max_iter);
+      break;
+    }
+    fresh = Mask{};
+    // Gauss-Newton can creep along a curved valley: after 20 steps in one stage every other one keeps the curvature.
+    Mask stubborn;
+    for (int l = 0; l < kLanes; l++) stubborn[l] = lane[l].in_stage > 20 && lane[l].in_stage % 2 ? -1 : 0;
+    const Sweep sweep = riccati.sweep(at, {}, regularisation, stubborn);
+    const Mask frozen = finish(o, sweep, counter, idle, live);
+    if (live == 0) break;
+    Vec step;
+    const Mask moved = search(frozen, step, watch);
+    advance(o, sweep, frozen, moved, step);
+  }
+  if (waiting) certificate.judge(o, finished, waiting);
+}
+
+}  // namespace
+}  // namespace difflcs::DIFFLCS_ISA
