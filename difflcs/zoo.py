@@ -334,7 +334,7 @@ def _card(run: RunDirectory, config: TrainConfig, name: str) -> ModelCard:
         raise CheckpointError(
             f"{run.path}: expected an evaluation at the end of {run.log}, got none; train with --final-goals 1000"
         )
-    found, versions = stored.get("object"), stored.get("versions")
+    found, versions = stored.get("object", {}), stored.get("versions")
     if not isinstance(found, dict) or not isinstance(versions, dict):
         raise CheckpointError(
             f"{run.path}: expected `object` and `versions` in config.json, got {sorted(stored)}; train it again with "

@@ -14,7 +14,19 @@ from difflcs.rl.critic import CriticSettings
 from difflcs.rl.dynamics import Ensemble, EnsembleSettings
 from difflcs.rl.evaluate import Evaluation, evaluate, wilson_interval
 from difflcs.rl.lcs_rl import LCSRL
-from difflcs.rl.methods import LCSMethod, Method, Work, get_method, method_names, register_method
+from difflcs.rl.methods import (
+    LCSMethod,
+    LCSRLMethod,
+    Method,
+    PDDMMethod,
+    PPOMethod,
+    PPOMLPMethod,
+    ViolationMethod,
+    Work,
+    get_method,
+    method_names,
+    register_method,
+)
 from difflcs.rl.mlp import MLPController
 from difflcs.rl.model_rollouts import ModelRollouts, ModelRolloutSettings
 from difflcs.rl.optim import Natural, NaturalGradient
@@ -43,6 +55,7 @@ __all__ = [
     "Evaluation",
     "LCSMPCPolicy",
     "LCSMethod",
+    "LCSRLMethod",
     "MLPController",
     "MLPPolicy",
     "Method",
@@ -50,7 +63,10 @@ __all__ = [
     "ModelRollouts",
     "Natural",
     "NaturalGradient",
+    "PDDMMethod",
     "PDDMSettings",
+    "PPOMLPMethod",
+    "PPOMethod",
     "PPOSettings",
     "Quantity",
     "Reporter",
@@ -61,6 +77,7 @@ __all__ = [
     "TrainConfig",
     "Trainer",
     "ViolationLoss",
+    "ViolationMethod",
     "Warmup",
     "WarmupSettings",
     "Work",

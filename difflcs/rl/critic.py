@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from tensordict import TensorDictBase
 
 
+_WEIGHT_DECAY = 1e-4
+"""Of AdamW."""
+
+
 @dataclass(frozen=True)
 class CriticSettings(Settings):
     """Settings of the value network."""
@@ -29,8 +33,6 @@ class CriticSettings(Settings):
     """Width of its two hidden layers."""
     learning_rate: float = bounded(2e-3, above=0)
     """Step size of AdamW at the start of each fit; it falls linearly to zero."""
-    weight_decay: float = bounded(1e-4, minimum=0)
-    """Weight decay of AdamW."""
     epochs: Epochs = group(Epochs, first=80, each=10, minibatch=256)
     """Passes over its data: on the discounted returns of the first episodes, before the first advantages; and at the
     end of each iteration."""
@@ -60,7 +62,7 @@ class Critic:
                 nn.Linear(n_inputs, width), nn.Tanh(), nn.Linear(width, width), nn.Tanh(), nn.Linear(width, 1)
             )
         self._adam = torch.optim.AdamW(
-            self.network.parameters(), settings.learning_rate, weight_decay=settings.weight_decay, fused=True
+            self.network.parameters(), settings.learning_rate, weight_decay=_WEIGHT_DECAY, fused=True
         )
         initialise_moments(self._adam)
         self._none = (torch.zeros(0, episode_steps + 1, n_inputs).double(), torch.zeros(0, episode_steps).double())

@@ -40,6 +40,14 @@ class LCSRL(Trainer):
             self.current.remember(warmup.buffer)
         self.iteration, self.episodes = self.current.iteration, self.current.episodes
 
+    def _main(self, episodes: int, iterations: int) -> PPO:
+        """The main phase that begins there: the current one if it did."""
+        current = self.current
+        begun = None if isinstance(current, Warmup) else (current.first_episode, current.first_iteration)
+        if not isinstance(current, Warmup) and begun == (episodes, iterations):
+            return current
+        return self._make_main(episodes, iterations)
+
     def step(self, after_step: AfterStep | None = None) -> WarmupReport | PPOReport:
         """One iteration of the current phase."""
         report = self.current.step(after_step)
@@ -62,7 +70,7 @@ class LCSRL(Trainer):
             if check_choice("phase", state.get("phase"), (_WARMUP, _MAIN)) == _MAIN:
                 names = ("first_episode", "first_iteration")
                 before = [check_positive_int(name, inner["settings"][name], minimum=0) for name in names]
-                current = self._make_main(*before)
+                current = self._main(*before)
         except (InvalidInputError, KeyError, TypeError) as error:
             raise CheckpointError(
                 f"checkpoint: expected the state of a warm-up or a main phase, got {sorted(state)} ({error}); was it "

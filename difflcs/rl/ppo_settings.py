@@ -52,8 +52,6 @@ class PPOSettings(Settings):
     """KL divergence at which an iteration ends early."""
     final_step: float = bounded(0.3, above=0)
     """Factor on all steps, falling linearly from 1 to this over the main phase; 1 turns this off."""
-    kl_quantile: float = bounded(0.97, above=0, maximum=1)
-    """Fraction of the samples, those of lowest KL, whose mean is the KL divergence of an iteration."""
     outlier_kl: float = bounded(2.0, above=0)
     """Samples with a KL divergence of their own above this are left out: the MPC has jumped to another optimum."""
     clip: float = bounded(0.3, above=0)
@@ -164,7 +162,6 @@ def make_ppo(
         first_episode=first_episode,
         first_iteration=first_iteration,
         max_kl=settings.max_kl,
-        kl_quantile=settings.kl_quantile,
         final_step=settings.final_step,
         models=models,
         practice=practice,

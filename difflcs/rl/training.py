@@ -132,7 +132,7 @@ def train(
     config: TrainConfig | None = None,
     out: Path | None = None,
     *,
-    task: TaskSpec | None = None,
+    task: TaskSpec | str | None = None,
     make_envs: EnvFactory | None = None,
     init: Path | None = None,
     resume: bool = False,
@@ -147,7 +147,7 @@ def train(
     Args:
         config: what to train; LCS-RL on `task` by default. When resuming, the run's own configuration must equal it.
         out: the run directory, new or empty unless resuming; runs/<task>-<method>-<seed> if None.
-        task: the task, if it is not to be looked up by its name.
+        task: the task or its name, if the configuration does not say it or it is not registered.
         make_envs: makes the environments; those of the task if None.
         init: run or model directory, or model of the zoo ("zoo:NAME"), to start from, instead of a random model.
         resume: continue the run in `out`.
@@ -165,9 +165,8 @@ def train(
         InUseError: another process trains in `out`.
         MissingDependencyError: TensorBoard is not installed.
     """
-    if config is None:
-        config = TrainConfig() if task is None else TrainConfig(task=task.name)
-    spec = get_task(config.task if task is None else task)
+    spec = get_task(task or (TrainConfig() if config is None else config).task)
+    config = TrainConfig(task=spec.name) if config is None else config
     if spec.name != config.task:
         raise InvalidInputError(f"task: expected {config.task!r}, as the configuration says, got {spec.name!r}")
     out = config.directory() if out is None else out

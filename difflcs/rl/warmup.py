@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from tensordict import TensorDict
 
 _ADAM_EPS = 1e-6
+HELD_OUT = 0.2
+"""Fraction of the transitions that a training call leaves out, drawn anew for each call."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +60,6 @@ class WarmupSettings(Settings):
     """Factor on the step size per step."""
     epochs: Epochs = group(Epochs, first=400, each=15, minibatch=100)
     """Passes over the data of the random episodes, and in each later iteration."""
-    held_out: float = bounded(0.2, minimum=0, below=1)
-    """Fraction of the transitions that a training call leaves out, drawn anew for each call."""
     loss: ViolationLoss = group(ViolationLoss)
     """The loss."""
 
@@ -124,7 +124,7 @@ def fit(
     """
     gamma, xi = settings.loss.gamma, settings.loss.xi
     order = torch.from_numpy(rng.permutation(len(x)))
-    n_train = max(1, int((1 - settings.held_out) * len(x)))
+    n_train = max(1, int((1 - HELD_OUT) * len(x)))
     train, rest = order[:n_train], order[n_train:]
     size = min(settings.epochs.minibatch, n_train)
     learned = [p for p in lcs.parameters() if p.requires_grad]

@@ -20,7 +20,7 @@ from tests.training.slide import STEPS, U_MAX, features, make_envs, make_model, 
     [
         ({"rollouts": 0}, "rollouts"),
         ({"beta": 1.5}, "beta"),
-        ({"kl_quantile": 0.0}, "kl_quantile"),
+        ({"max_kl": 0.0}, "max_kl"),
         ({"std": 0.0}, "std"),
         ({"std_range": (0.2, 0.1)}, "std_range"),
         ({"covariance": "all"}, "covariance"),

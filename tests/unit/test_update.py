@@ -21,13 +21,13 @@ STD = 0.03
 ADAM = Adam(learning_rate=0.02, betas=(0.9, 0.99))
 
 
-def make(kind: str, covariance: str = "fixed", std_learning_rate: float = 0.01, **settings):
+def make(kind: str, covariance: str = "fixed", std_learning_rate: float = 0.01, samples: int = 300, **settings):
     """The policy and a rule that moves it."""
     actor = make_actor(make_mpc(make_model()), STD, covariance)
     deviation = Deviation(actor, std_learning_rate, (0.9, 0.99), (0.01, 0.05))
     if kind == "adam":
         return actor, AdamUpdate(actor, ADAM, 0.1, 1.5, deviation)
-    return actor, NaturalUpdate(actor, Natural(**settings), 0.1, 1.5, deviation)
+    return actor, NaturalUpdate(actor, Natural(**settings), 0.1, 1.5, deviation, samples)
 
 
 def loss_of(actor, data=None) -> torch.Tensor:

@@ -31,8 +31,6 @@ class Natural(Settings):
     """Weight of the gradient so far against the newest one; kept across iterations. 0 turns it off."""
     damping: float = bounded(0.1, above=0)
     """Isotropic part of the metric, in means of its diagonal."""
-    samples: int = bounded(300, minimum=1)
-    """Samples per iteration that the metric is measured with."""
 
 
 class NaturalGradient(torch.optim.Optimizer):

@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from difflcs.rl.policy import GaussianPolicy, LCSMPCPolicy
 
 
+METRIC_SAMPLES = 300
+"""Samples per iteration that the metric of the natural gradient is measured with."""
+
+
 class StepSize:
     """A step size that grows below half of a KL divergence and shrinks above one and a half of it.
 
@@ -184,17 +188,26 @@ class NaturalUpdate(UpdateRule):
         target_kl: see `StepSize`.
         factor: see `StepSize`.
         deviation: moves the covariance.
+        samples: samples per iteration that the metric is measured with.
     """
 
     optimiser: NaturalGradient
 
-    def __init__(self, actor: LCSMPCPolicy, settings: Natural, target_kl: float, factor: float, deviation: Deviation):
+    def __init__(
+        self,
+        actor: LCSMPCPolicy,
+        settings: Natural,
+        target_kl: float,
+        factor: float,
+        deviation: Deviation,
+        samples: int = METRIC_SAMPLES,
+    ):
         learned = learned_parameters(actor)
         natural = NaturalGradient(learned, settings.step, settings.momentum, settings.damping)
         super().__init__(
             learned, natural, StepSize(settings.step, target_kl, factor, math.sqrt(2 * target_kl)), deviation
         )
-        self.actor, self.samples = actor, settings.samples
+        self.actor, self.samples = actor, samples
 
     def measure(self, data: TensorDict, rng: np.random.Generator) -> None:
         """Measure the metric at some of the samples."""
