@@ -54,10 +54,11 @@ _RENAMED: Mapping[str, str] = {
     "--pddm.random-rollouts": "--pddm.rollouts.first",
     "--pddm.rollouts-per-iteration": "--pddm.rollouts.each",
     "--pddm.learning-rate": "--pddm.ensemble.learning-rate",
+    "--pddm.epochs": "--pddm.ensemble.epochs.each",
     "--pddm.minibatch": "--pddm.ensemble.epochs.minibatch",
 }
 """Flags of before → those of now; with a dot at the end, all that begin so."""
-_GROUPS = ("--warmup.epochs", "--pddm.epochs")
+_GROUPS = ("--warmup.epochs",)
 """Flags of before that are groups now."""
 
 
