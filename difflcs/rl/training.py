@@ -203,8 +203,11 @@ def load_model(path: Path) -> LCSModel:
     if not (os.path.isdir(path / "checkpoints") or os.path.isdir(path / "model")):  # False for what can be no path
         return LCSModel.from_pretrained(path)
     run = RunDirectory.open(path)
-    if not stored_config(run).method.takes_init:
-        raise CheckpointError(f"{path}: expected a run that learned an LCSModel, got one of another method")
+    method = stored_config(run).method
+    if not method.takes_init:
+        raise CheckpointError(
+            f"{path}: expected a run that learned an LCSModel, got one of {method.name}: {method.kind}"
+        )
     return LCSModel.from_config(*run.learned(LCSMethod.kind), str(path))
 
 

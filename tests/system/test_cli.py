@@ -95,7 +95,7 @@ def flags():
             patch.setenv("COLUMNS", "80")
             with pytest.raises(SystemExit):
                 cli.main(["train", "--method", method, "--help"])
-        found[method] = set(re.findall(r"^\W (--[a-z.-]+)", text.getvalue(), re.MULTILINE))
+        found[method] = set(re.findall(r"^\W (--[a-z][a-z.-]*)", text.getvalue(), re.MULTILINE))
     return found
 
 
@@ -326,7 +326,9 @@ def test_a_run_says_which_object_it_was_trained_on(capsys, tmp_path, monkeypatch
     stored = json.loads((path / "config.json").read_text())["object"]
     assert (stored["name"], stored["source"], stored["mass"]) == ("mug", "stand_in", 0.05)
     assert json.loads(run(capsys, "evaluate", path, "--smoke", "--json")[1])["object"] == stored
-    assert "object: mug (source stand_in, mass 0.05" in run(capsys, "evaluate", path, "--smoke")[1]
+    told = run(capsys, "evaluate", path, "--smoke")[1].partition("object: mug (")[2]
+    assert "source stand_in" in told
+    assert "mass 0.05" in told
     shutil.copytree(path, tmp_path / "other")
     config = json.loads((path / "config.json").read_text())
     (tmp_path / "other/config.json").write_text(json.dumps({**config, "object": {**stored, "source": "ycb_mesh"}}))

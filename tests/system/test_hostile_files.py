@@ -18,6 +18,7 @@ from difflcs.rl.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
 from difflcs.rl.dynamics import Ensemble
 from difflcs.rl.methods import get_method, method_names
 from difflcs.rl.mlp import MLPController
+from difflcs.rl.state import check_state
 from difflcs.rl.training import TrainConfig, load_policy, stored_config
 from difflcs_envs.tasks import pushing_features
 
@@ -57,6 +58,7 @@ def load_network(path):
     return MLPController.from_pretrained(path, pushing_features)
 
 
+CHECKPOINT = {"n": 1, "inner": dict(small_model().state_dict())}
 RECORDS = {
     "model": (lambda path: small_model().save_pretrained(path), LCSModel.from_pretrained),
     "ensemble": (lambda path: Ensemble(2, 1, 2, 4).save_pretrained(path), load_ensemble),
@@ -65,10 +67,8 @@ RECORDS = {
         load_network,
     ),
     "checkpoint": (
-        lambda path: save_checkpoint(
-            path.parent, 1, {"n": 1, "learned": dict(small_model().state_dict()), "x": torch.zeros(3)}
-        ),
-        lambda path: load_checkpoint(path.parent),
+        lambda path: save_checkpoint(path.parent, 1, CHECKPOINT),
+        lambda path: check_state(CHECKPOINT, load_checkpoint(path.parent)),
     ),
 }
 

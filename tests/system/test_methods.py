@@ -1,4 +1,4 @@
-"""The methods besides the warm-up from the command line: train, kill, resume, evaluate."""
+"""Trainings in processes that are killed, on disks that are full; the rest is in tests/conformance/test_methods.py."""
 
 import errno
 import json
@@ -6,21 +6,19 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 import torch
 
-from difflcs import LCSModel, _files, cli
+from difflcs import _files, cli
 from difflcs.rl.checkpoint import RunDirectory
-from difflcs.rl.training import TrainConfig, profile
+from difflcs.rl.training import load_model
 
 pytest.importorskip("mujoco")
 pytest.importorskip("torchrl")
 
-METHODS = ("lcs-rl", "ppo", "ppo-mlp", "pddm")
-WITHOUT_LCS = ("ppo-mlp", "pddm")
+METHODS = ("ppo", "ppo-mlp", "pddm")
 
 
 def run(capsys, *arguments) -> tuple[int, str, str]:
@@ -45,60 +43,10 @@ def learned(path: Path) -> list[tuple[str, bytes]]:
     return [(str(file.relative_to(path)), file.read_bytes()) for file in files]
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_train_and_evaluate(capsys, finished, method):
-    path = finished[method]
-    rows = RunDirectory.open(path).rows()
-    assert [row["iteration"] for row in rows] == [str(i) for i in range(len(rows))]
-    assert float(rows[-1]["minutes"]) == pytest.approx(0.5)  # the budget, met exactly
-    assert rows[-1]["evaluation_goals"] == "4"
-    spent = profile(rows)
-    wanted = {
-        "lcs-rl": {"collect", "learn", "physics", "solve", "gradient", "value", "imagination"},
-        "ppo": {"physics", "solve", "gradient", "value", "imagination"},
-        "ppo-mlp": {"physics", "solve", "gradient", "value"},
-        "pddm": {"collect", "learn"},
-    }
-    assert {name for name, seconds in spent.items() if seconds > 1e-3} == wanted[method] | {"evaluation"}
-    records = []
-    for _ in range(2):
-        code, out, _ = run(capsys, "evaluate", path, "--goals", 3, "--json")
-        assert code == 0
-        records.append(json.loads(out))
-        del records[-1]["seconds"]
-    assert records[0] == records[1]
-    assert records[0]["method"] == method
-    if method not in WITHOUT_LCS:
-        assert isinstance(RunDirectory.open(path).load_model(), LCSModel)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_resume_gives_the_same_run(capsys, finished, tmp_path, monkeypatch, method):
-    """Die after each iteration in turn."""
-    path = tmp_path / "run"
-
-    def die(*_):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(cli.Progress, "iterated", die)
-        assert run(capsys, "train", "--smoke", "--method", method, "--out", path)[0] == 130
-        code, out, _ = run(capsys, "evaluate", path, "--smoke")
-        assert code == 0
-        assert "not finished" in out
-        for _ in range(5):
-            code = run(capsys, "train", "--out", path, "--resume")[0]
-            if code == 0:
-                break
-            assert code == 130
-    assert run(capsys, "train", "--out", path, "--resume")[0] == 0
-    assert learned(path) == learned(finished[method])
-
-
 def test_resume_after_kill_9(capsys, tmp_path):
     """Killed in the warm-up, resumed, killed in the main phase, resumed."""
     options = ["--method", "lcs-rl", "--minutes", "1.5", "--warmup-minutes", "0.4", "--ppo.rollouts", "7"]
-    options += ["--ppo.steps", "2", "--warmup.first-epochs", "20", "--final-goals", "0", "--evaluate-at", "9"]
+    options += ["--ppo.steps", "2", "--warmup.epochs.first", "20", "--final-goals", "0", "--evaluate-at", "9"]
     through, killed = tmp_path / "through", tmp_path / "killed"
     for resume, until in ((False, 1), (True, 4)):
         command = [sys.executable, "-m", "difflcs.cli", "train", *options, "--out", str(killed)]
@@ -123,34 +71,13 @@ def test_init_starts_from_another_run(capsys, finished, tmp_path):
     assert json.loads((out / "config.json").read_text())["init"] == str(finished["ppo"])
     first = RunDirectory.open(out).rows()[1]
     assert first["env_steps"] == "100"
-    assert torch.isfinite(RunDirectory.open(out).load_model().A).all()
+    assert torch.isfinite(load_model(out).A).all()
     for method, kind in (("pddm", "dynamics"), ("ppo-mlp", "MLP")):
         for source in (finished[method], finished[method] / "model"):
             code, _, err = run(capsys, "train", "--smoke", "--out", tmp_path / "no", "--init", source)
             assert code == 2
             assert kind in err
             assert not (tmp_path / "no").exists()
-
-
-@pytest.mark.parametrize("method", WITHOUT_LCS)
-def test_networks_start_from_no_lcs(capsys, finished, tmp_path, method):
-    code, _, err = run(
-        capsys, "train", "--smoke", "--method", method, "--out", tmp_path / "no", "--init", finished["ppo"]
-    )
-    assert code == 2
-    assert f"none with method {method}" in err
-    assert not (tmp_path / "no").exists()
-
-
-def test_checkpoints_of_another_method_are_refused(capsys, finished, tmp_path):
-    path = tmp_path / "run"
-    path.mkdir()
-    for name in ("checkpoints", "config.json"):
-        source = finished["pddm" if name == "checkpoints" else "lcs-rl"] / name
-        subprocess.run(["cp", "-r", str(source), str(path)], check=True)
-    code, _, err = run(capsys, "train", "--out", path, "--resume")
-    assert code == 2
-    assert "another method" in err
 
 
 def test_a_folder_that_cannot_be_written_is_reported_first(capsys, tmp_path):
@@ -179,8 +106,3 @@ def test_a_full_disk_leaves_the_last_checkpoint(capsys, finished, tmp_path, monk
     assert json.loads((path / "checkpoints/latest.json").read_text()) == {"checkpoint": "000000"}
     assert run(capsys, "train", "--out", path, "--resume")[0] == 0
     assert learned(path) == learned(finished["ppo"])
-
-
-def test_configuration_survives_json():
-    config = TrainConfig(method="lcs-rl", minutes=12.0)
-    assert TrainConfig.from_dict(json.loads(json.dumps(asdict(config)))) == config

@@ -1,0 +1,265 @@
+"""Settings: types, bounds and groups; what `difflcs train` takes, all of it documented and bounded."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+import math
+import textwrap
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from typing import Any, Literal, get_args, get_type_hints
+
+import pytest
+
+from difflcs.errors import BackendNotFoundError, CheckpointError, DTypeError, InvalidInputError, MissingDependencyError
+from difflcs.rl._optional import require
+from difflcs.rl.methods import LCSMethod, get_method, method_names
+from difflcs.rl.settings import Adam, Epochs, Rollouts, Settings, bounded, from_json, group
+from difflcs.rl.training import TrainConfig, goals_due
+from difflcs.rl.warmup import WarmupSettings
+
+
+@dataclass(frozen=True)
+class Inner(Settings):
+    count: int = bounded(3, minimum=1, maximum=9)
+    share: float = bounded(0.5, above=0, below=1)
+
+
+@dataclass(frozen=True)
+class Outer(Settings):
+    inner: Inner = group(Inner, count=4)
+    pair: tuple[float, float] = bounded((0.1, 0.2), minimum=0, below=1)
+    many: tuple[int, ...] = bounded((), minimum=1)
+    maybe: int | None = bounded(None, minimum=1)
+    kind: Literal["a", "b"] = "a"
+    flag: bool = False
+    text: str = ""
+    size: int = bounded(0, minimum=0)
+
+
+def test_the_defaults_of_a_group_can_be_others():
+    assert Outer().inner == Inner(count=4)
+    assert Inner().count == 3
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"count": 1}, {"count": 9}, {"share": 1e-9}, {"share": 0.999}],
+)
+def test_bounds_that_are_reached(values):
+    assert asdict(Inner(**values)).items() >= values.items()
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        (Inner, {"count": 0}),
+        (Inner, {"count": 10}),
+        (Inner, {"share": 0.0}),
+        (Inner, {"share": 1.0}),
+        (Inner, {"share": math.nan}),
+        (Inner, {"share": math.inf}),
+        (Inner, {"count": 10**5000}),
+        (Outer, {"pair": (0.5, 1.0)}),
+        (Outer, {"pair": (-0.1, 0.5)}),
+        (Outer, {"many": (1, 0)}),
+        (Outer, {"maybe": 0}),
+        (Outer, {"size": 2**63}),
+    ],
+)
+def test_numbers_outside_their_bounds_are_refused_by_name(kind, values):
+    name = next(iter(values))
+    with pytest.raises(InvalidInputError, match=rf"{name}: expected a finite .*{name}"):
+        kind(**values)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"inner": 3},
+        {"inner": {"count": 3}},
+        {"pair": (0.1,)},
+        {"pair": (0.1, 0.2, 0.3)},
+        {"pair": 0.1},
+        {"pair": ("a", "b")},
+        {"many": (1.5,)},
+        {"maybe": 1.5},
+        {"maybe": True},
+        {"kind": "c"},
+        {"kind": None},
+        {"flag": 1},
+        {"text": 1},
+        {"size": 1.0},
+        {"size": True},
+        {"size": "1"},
+    ],
+)
+def test_values_of_another_type_are_refused_by_name(values):
+    with pytest.raises(DTypeError, match=next(iter(values))):
+        Outer(**values)
+
+
+def test_integers_stand_for_floats_and_none_where_it_is_declared():
+    assert Outer(pair=(0, 0)).pair == (0, 0)
+    assert Outer(maybe=None).maybe is None
+    assert Outer(maybe=2**63 - 1, size=2**63 - 1).size == 2**63 - 1
+
+
+def test_settings_come_back_from_json():
+    own = Outer(inner=Inner(7, 0.25), pair=(0.3, 0.4), many=(1, 2), maybe=None, kind="b", flag=True, text="x", size=5)
+    assert from_json(json.loads(json.dumps(asdict(own))), Outer) == own
+    assert from_json(asdict(own), Outer) == own
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"inner": {"count": 3}}, "fields"),
+        ({"inner": {"count": 3, "share": 0.5, "more": 1}}, "fields"),
+        ({"inner": {"count": 0, "share": 0.5}}, "count"),
+        ({"inner": [3, 0.5]}, "inner"),
+        ({"inner": None}, "inner"),
+        ({"another": 1}, "fields"),
+        ({"pair": [0.1]}, "pair"),
+        ({"pair": [0.1, 2.0]}, "pair"),
+        ({"kind": "c"}, "kind"),
+        ({"flag": 1}, "flag"),
+        ({"size": "5"}, "size"),
+    ],
+)
+def test_json_that_does_not_fit_is_refused(change, message):
+    plain = json.loads(json.dumps(asdict(Outer())))
+    with pytest.raises(CheckpointError, match=message):
+        from_json({**plain, **change}, Outer)
+    del plain["size"]
+    with pytest.raises(CheckpointError, match="fields"):
+        from_json(plain, Outer)
+
+
+def test_groups_that_methods_share():
+    for change in ({"learning_rate": 0.0}, {"betas": (0.9, 1.0)}, {"betas": (0.9,)}):
+        with pytest.raises(InvalidInputError, match=next(iter(change))):
+            Adam(**change)
+    for change in ({"noise": -1.0}, {"held_out": 1.0}, {"learning_rate_decay": 0.0}, {"buffer": 0}):
+        with pytest.raises(InvalidInputError, match=next(iter(change))):
+            WarmupSettings(**change)
+    for kind in (Epochs, Rollouts):
+        with pytest.raises(InvalidInputError, match="first"):
+            kind(first=0)
+
+
+# --- everything that a training takes ---------------------------------------------------------------------------------
+
+
+def groups(kind: type[Any]) -> Iterator[type[Any]]:
+    """A dataclass of settings and those in it."""
+    yield kind
+    for hint in get_type_hints(kind).values():
+        if is_dataclass(hint) and isinstance(hint, type) and hint is not kind:
+            yield from groups(hint)
+
+
+def all_groups() -> list[type[Any]]:
+    found = dict.fromkeys(one for name in method_names() for one in groups(get_method(name)))
+    return [TrainConfig, *found]
+
+
+def described(kind: type[Any]) -> set[str]:
+    """Fields with a docstring below them, in this class or one that it inherits from."""
+    found: set[str] = set()
+    for base in kind.__mro__:
+        if not is_dataclass(base) or base.__module__ == __name__:
+            continue
+        body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
+        assert isinstance(body, ast.ClassDef)
+        for node, below in zip(body.body, body.body[1:], strict=False):
+            text = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+            if isinstance(node, ast.AnnAssign) and text and str(below.value.value).strip():
+                found.add(ast.unparse(node.target))
+    return found
+
+
+def numbers_in(hint: Any) -> bool:
+    return hint in (int, float) or any(numbers_in(part) for part in get_args(hint) if not isinstance(part, str))
+
+
+@pytest.mark.parametrize("kind", all_groups(), ids=lambda kind: kind.__name__)
+def test_every_setting_says_what_it_is_and_has_bounds_where_it_is_a_number(kind):
+    assert issubclass(kind, Settings)
+    hints, known = get_type_hints(kind), described(kind)
+    for f in fields(kind):
+        assert f.name in known, f"{kind.__name__}.{f.name} has no docstring"
+        if numbers_in(hints[f.name]):
+            assert any(bound is not None for bound in f.metadata.values()), f"{kind.__name__}.{f.name} has no bounds"
+
+
+def test_there_are_few_of_them():
+    """Those of a group count once, wherever it is used: that is how many there are to learn."""
+    counted = set()
+    for kind in all_groups():
+        hints = get_type_hints(kind)
+        for f in fields(kind):
+            if not is_dataclass(hints[f.name]):
+                owner = next(base for base in reversed(kind.__mro__) if f.name in inspect.get_annotations(base))
+                counted.add((owner.__name__, f.name))
+    print(f"{len(counted)} settings")
+    assert len(counted) <= 75, sorted(counted)
+
+
+# --- the configuration of a training ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"method": "magic"}, "lcs-rl, violation"),
+        ({"method": None}, "method"),
+        ({"task": 3}, "task"),
+        ({"minutes": 0.0}, "minutes"),
+        ({"minutes": math.nan}, "minutes"),
+        ({"seed": -1}, "seed"),
+        ({"evaluate_goals": 0}, "evaluate_goals"),
+        ({"final_goals": -1}, "final_goals"),
+        ({"evaluate_at": (-1.0,)}, "evaluate_at"),
+    ],
+)
+def test_bad_settings_of_a_training_are_refused(change, message):
+    with pytest.raises(InvalidInputError, match=message):
+        TrainConfig(**change)
+
+
+def test_bad_settings_of_a_method_are_refused():
+    with pytest.raises(InvalidInputError, match="warmup_minutes"):
+        get_method("lcs-rl")(warmup_minutes=0.0)
+    with pytest.raises(InvalidInputError, match="n_lam"):
+        get_method("violation")(n_lam=0)
+    with pytest.raises(BackendNotFoundError, match="magic"):
+        get_method("violation")(backend="magic").check(6.0)
+
+
+def test_a_method_stands_for_its_name():
+    assert TrainConfig(method="ppo") == TrainConfig(method=get_method("ppo")())  # pyright: ignore[reportArgumentType]
+    assert TrainConfig().method == get_method(method_names()[0])()
+    assert isinstance(TrainConfig().method, LCSMethod)
+
+
+@pytest.mark.parametrize(
+    "change", [{"method": None}, {"method": "magic"}, {"settings": None}, {"settings": {}}, {"minutes": -1}, {"x": 1}]
+)
+def test_a_stored_configuration_that_does_not_fit_is_refused(change):
+    with pytest.raises(CheckpointError):
+        TrainConfig.from_json({**TrainConfig().to_json(), **change})
+
+
+def test_evaluations_fall_due_once():
+    config = TrainConfig(minutes=2.0, evaluate_at=(0.0, 0.5, 1.0, 1.1), evaluate_goals=60, final_goals=300)
+    due = {now: goals_due(config, now - 100, now, 600.0) for now in range(0, 1300, 100)}
+    assert {k: v for k, v in due.items() if v} == {0: 300, 300: 60, 600: 60, 700: 60, 1200: 300}
+
+
+def test_missing_packages_name_the_line_that_installs_them():
+    require("torch")
+    with pytest.raises(MissingDependencyError, match=r'pip install "difflcs\[rl,envs,viz\]"'):
+        require("torch", "no_such_package")

@@ -1,0 +1,184 @@
+"""Tasks: what they are made of, what is refused, and how they are found."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+from difflcs import GoalCost, LCSModel
+from difflcs.errors import DTypeError, InvalidInputError, MissingDependencyError
+from difflcs.rl.tasks import ENTRY_POINTS, Quantity, get_task, register_task, task_names
+from tests.conformance.toy import STEPS, U_MAX, Slide, make_task
+
+TOY = make_task()
+
+
+def test_sizes_are_those_of_the_cost():
+    assert (TOY.n_x, TOY.n_u, TOY.n_goal, TOY.n_features) == (2, 1, 1, 4)
+    assert make_task(size=3).n_x == 3
+    assert TOY.steps_per_minute == 120
+
+
+def test_bounds_are_a_number_or_one_for_each_action():
+    low, high = TOY.bounds
+    assert (low.tolist(), high.tolist(), low.dtype) == ([-U_MAX], [U_MAX], torch.float64)
+
+    def make_cost() -> GoalCost:
+        return GoalCost.reach(2, 2, goal_weight=(1.0,), input_weight=1.0)
+
+    low, high = make_task(make_cost=make_cost, u_min=(-1, -2), u_max=3).bounds
+    assert (low.tolist(), high.tolist()) == ([-1.0, -2.0], [3.0, 3.0])
+    low[0] = 9.0
+    assert make_task().bounds[0].tolist() == [-U_MAX]
+
+
+def test_an_environment_of_a_callable():
+    env = TOY.make_env()
+    assert isinstance(env, Slide)
+    assert env.size == 2
+    envs = TOY.make_envs(3, threads=2)
+    assert envs.num_envs == 3
+    assert envs.metadata["autoreset_mode"].value == "NextStep"
+    envs.close()
+
+
+def test_an_environment_of_an_id():
+    gymnasium.register("difflcs-tests/Slide-v0", entry_point=Slide)
+    task = make_task(env="difflcs-tests/Slide-v0", env_kwargs={"size": 2})
+    assert isinstance(task.make_env().unwrapped, Slide)
+    envs = task.make_envs(2)
+    assert envs.reset(seed=[0, 1])[0]["state"].shape == (2, 2)
+    envs.close()
+
+
+def test_environments_that_cannot_be_made_say_why():
+    def broken(**_):
+        raise RuntimeError("no light")
+
+    for task, why in (
+        (make_task(env=broken), "RuntimeError: no light"),
+        (make_task(env="nowhere/None-v0"), "nowhere"),
+        (make_task(env="no_such_module:None-v0"), "no_such_module"),
+        (make_task(env_kwargs={"color": "red"}), "color"),
+    ):
+        for make in (task.make_env, lambda task=task: task.make_envs(2)):
+            with pytest.raises(InvalidInputError, match=f"task toy: its environment cannot be made.*{why}"):
+                make()
+    with pytest.raises(MissingDependencyError, match="no_such_package"):
+        make_task(requires=("no_such_package",)).make_env()
+
+
+def test_the_mpc_is_the_tasks():
+    policy = TOY.make_policy(LCSModel(2, 1, 1, init_scale=0.1), "batched")
+    assert (policy.horizon, policy.u_min.tolist(), policy.u_max.tolist()) == (3, [-U_MAX], [U_MAX])
+    assert policy.on_failure == "mask"
+    assert policy(torch.zeros(4, 2).double(), torch.ones(4, 1).double()).action.shape == (4, 1)
+
+
+def test_what_a_picture_says():
+    assert TOY.say({"position_error": 0.12345, "other": 1}) == "position error 0.123 m"
+    assert TOY.say({}) == ""
+    assert make_task(caption=lambda info: f"{info['a']}!").say({"a": 1}) == "1!"
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"name": ""}, InvalidInputError, "name"),
+        ({"name": "a/b"}, InvalidInputError, "file names"),
+        ({"name": 3}, InvalidInputError, "name"),
+        ({"horizon": 0}, InvalidInputError, "horizon"),
+        ({"horizon": 2.5}, InvalidInputError, "horizon"),
+        ({"episode_steps": 0}, InvalidInputError, "episode_steps"),
+        ({"step_seconds": 0.0}, InvalidInputError, "step_seconds"),
+        ({"step_seconds": float("nan")}, InvalidInputError, "step_seconds"),
+        ({"relaxation": 0.0}, InvalidInputError, "relaxation"),
+        ({"failure_penalty": -1.0}, InvalidInputError, "failure_penalty"),
+        ({"env": 3}, DTypeError, "env"),
+        ({"make_cost": None}, DTypeError, "make_cost"),
+        ({"make_cost": lambda: 3}, DTypeError, "GoalCost"),
+        ({"features": None}, DTypeError, "features"),
+        ({"outcome": None}, DTypeError, "outcome"),
+        ({"describe": None}, DTypeError, "describe"),
+        ({"u_min": 0.2}, InvalidInputError, "u_min"),
+        ({"u_min": 0.3}, InvalidInputError, "swap them"),
+        ({"u_max": float("nan")}, InvalidInputError, "u_min"),
+        ({"goal": (Quantity("x", "m"), Quantity("y", "m"))}, InvalidInputError, "goal: expected 1 entries"),
+        ({"example_goals": ((0.1, 0.2),)}, InvalidInputError, "example_goals: expected 1 entries"),
+    ],
+)
+def test_bad_values_are_refused(change, error, message):
+    with pytest.raises(error, match=message):
+        make_task(**change)
+
+
+# --- registry ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_registered_task_is_found_and_replaced_by_its_name():
+    assert get_task(TOY) is TOY  # registered or not
+    mine = make_task("unit-toy")
+    assert register_task(mine) is mine
+    assert get_task("unit-toy") is mine
+    assert "unit-toy" in task_names()
+    other = register_task(replace(mine, horizon=4))
+    assert get_task("unit-toy") is other
+    assert task_names().count("unit-toy") == 1
+
+
+def test_what_is_no_task_is_not_registered():
+    with pytest.raises(DTypeError, match="TaskSpec"):
+        register_task({"name": "x"})
+
+
+@pytest.mark.parametrize("name", ["no-such-task", "", "a" * 1000])
+def test_an_unknown_name_gets_those_there_are(name):
+    with pytest.raises(InvalidInputError, match=r"expected one of .*register_task") as error:
+        get_task(name)
+    assert len(str(error.value)) < 2000
+
+
+PACKAGES = {"good": "def register():\n    from tests.conformance.toy import make_task\n"
+            "    from difflcs.rl.tasks import register_task\n    register_task(make_task('good'))\n",
+            "raises": "def register():\n    raise RuntimeError('out of order')\n",
+            "breaks": "import no_such_module_at_all\n"}  # fmt: skip
+
+
+def test_a_broken_entry_point_is_named_and_disturbs_no_other(tmp_path):
+    for package, code in PACKAGES.items():
+        (tmp_path / f"{package}_tasks.py").write_text(code)
+        information = tmp_path / f"{package}_tasks-1.0.dist-info"
+        information.mkdir()
+        (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}-tasks\nVersion: 1.0\n")
+        (information / "entry_points.txt").write_text(f"[{ENTRY_POINTS}]\n{package} = {package}_tasks:register\n")
+    code = (
+        "from difflcs.rl.tasks import get_task, task_names\n"
+        "assert get_task('good').name == 'good'; print(*task_names())\n"
+        "try:\n    get_task('raises')\nexcept Exception as error:\n    print(error)\n"
+    )
+    path = os.pathsep.join([str(tmp_path), os.getcwd(), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env={**os.environ, "PYTHONPATH": path}
+    )
+    names, _, message = done.stdout.partition("\n")
+    assert {"good", "cube"} <= set(names.split())
+    assert "raises = raises_tasks:register could not be loaded: RuntimeError: out of order" in message
+    assert "breaks = breaks_tasks:register could not be loaded: ModuleNotFoundError" in message
+
+
+def test_the_toy_keeps_its_own_promises():
+    env = TOY.make_env()
+    before, _ = env.reset(seed=0, options={"goal": (0.25,)})
+    assert before["goal"].tolist() == [0.25]
+    for step in range(STEPS):
+        after, reward, _, ended, info = env.step(np.array([0.1]))
+        assert TOY.outcome(before["state"], None, after["state"], before["goal"], ended) == (reward, info["success"])
+        assert ended == (step + 1 == STEPS)
+        before = after
