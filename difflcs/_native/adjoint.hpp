@@ -3,7 +3,7 @@
 #pragma once
 #include "kernels.hpp"
 #include "lanes.hpp"
-#include "lu_lanes.hpp"
+#include "lu.hpp"
 #include "matrix.hpp"
 #include "mpc_problem.hpp"
 #include "riccati.hpp"

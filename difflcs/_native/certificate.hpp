@@ -4,7 +4,7 @@
 #pragma once
 #include "kernels.hpp"
 #include "lanes.hpp"
-#include "lu_lanes.hpp"
+#include "lu.hpp"
 #include "matrix.hpp"
 #include "sizes.hpp"
 

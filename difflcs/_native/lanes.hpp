@@ -1,8 +1,6 @@
 // One double per SIMD lane, by the vector extensions of GCC and Clang: plain vector code on every CPU.
 #pragma once
 #include <cstdint>
-
-#include "unroll.hpp"
 #if defined(__AVX__)
 #include <immintrin.h>
 #endif
@@ -49,6 +47,16 @@ static inline void put(double* to, int64_t at, int, double value) { to[at] = val
 static inline void put(Vec* to, int64_t at, int lane, double value) {
   reinterpret_cast<double*>(to + at)[lane] = value;
 }
+
+// Unrolls the loop behind it. Where all loops over an array are unrolled, its elements live in registers.
+#if defined(__clang__)
+#define DIFFLCS_UNROLL _Pragma("unroll")
+#else
+#define DIFFLCS_UNROLL _Pragma("GCC unroll 16")
+#endif
+
+// A function that is handed such an array has to become part of its caller.
+#define DIFFLCS_INLINE __attribute__((always_inline)) inline
 
 // A small array for unrolled loops: on the stack where the size is known when compiling, else in the scratch given.
 template <int64_t N>

@@ -2,7 +2,7 @@
 // reads like the solver of a single problem, and a lane's result never depends on its neighbours.
 #include "kernels.hpp"
 #include "lanes.hpp"
-#include "lu_lanes.hpp"
+#include "lu.hpp"
 #include "matrix.hpp"
 #include "relaxed_lcp.hpp"
 

@@ -1,7 +1,6 @@
 // One LCP at a time, slowly, with row exchanges: where the batched kernel (lcp.cpp) gave up. Plain doubles, no lanes.
 #pragma once
 #include "kernels.hpp"
-#include "lu.hpp"
 
 namespace difflcs {
 namespace {
@@ -11,8 +10,7 @@ inline int64_t lcp_one_scratch(int64_t n) { return 2 * n * n + 10 * n; }
 // One problem in scaled units: F' = S F S with unit diagonal, q' = S q / unit, lam = unit S lam', w = unit S^-1 w'.
 struct LcpOne {
   const int64_t n;
-  double *F, *M, *scale, *q, *lam, *w, *x, *y, *step, *active;
-  int64_t* rows;
+  double *F, *M, *scale, *q, *lam, *w, *x, *y, *step, *rows, *active;
   double unit, relaxation;  // relaxation in scaled units
 
   LcpOne(const LcpBatch& batch, int64_t e, double* memory) : n(batch.n) {
@@ -22,7 +20,7 @@ struct LcpOne {
       return at;
     };
     F = take(n * n), M = take(n * n), scale = take(n), q = take(n), lam = take(n), w = take(n), x = take(n);
-    y = take(n), step = take(n), active = take(n), rows = reinterpret_cast<int64_t*>(take(n));
+    y = take(n), step = take(n), rows = take(n), active = take(n);
     const double *from = batch.F + e * batch.F_stride, *right = batch.q + e * n;
     unit = __builtin_sqrt(batch.relaxation);
     for (int64_t i = 0; i < n; i++) {
@@ -39,10 +37,38 @@ struct LcpOne {
     relaxation = batch.relaxation / unit / unit;
   }
 
-  bool factor() { return lu_factor_pivoted<1>(n, M, rows); }  // of M, in place
+  // LU of M, in place. Not that of lu.hpp: it divides by the pivots, which is one rounding less than to multiply by their
+  // reciprocals, and the violation loss of a model under training is solved here often enough for that to show.
+  bool factor() {
+    for (int64_t k = 0; k < n; k++) {
+      int64_t pivot = k;
+      for (int64_t i = k + 1; i < n; i++)
+        if (__builtin_fabs(M[i * n + k]) > __builtin_fabs(M[pivot * n + k])) pivot = i;
+      rows[k] = double(pivot);
+      if (!(__builtin_fabs(M[pivot * n + k]) > 0)) return false;
+      for (int64_t j = 0; pivot != k && j < n; j++) {
+        const double t = M[k * n + j];
+        M[k * n + j] = M[pivot * n + j], M[pivot * n + j] = t;
+      }
+      for (int64_t i = k + 1; i < n; i++) {
+        const double l = M[i * n + k] /= M[k * n + k];
+        for (int64_t j = k + 1; j < n; j++) M[i * n + j] -= l * M[k * n + j];
+      }
+    }
+    return true;
+  }
   void back(double* b) const {
-    for (int64_t k = 0; k < n; k++) lu_exchange<1>(k, rows, b);
-    lu_solve(n, M, b);
+    for (int64_t k = 0; k < n; k++) {
+      const int64_t other = int64_t(rows[k]);
+      const double t = b[k];
+      b[k] = b[other], b[other] = t;
+    }
+    for (int64_t i = 0; i < n; i++)
+      for (int64_t j = 0; j < i; j++) b[i] -= M[i * n + j] * b[j];
+    for (int64_t i = n - 1; i >= 0; i--) {
+      for (int64_t j = i + 1; j < n; j++) b[i] -= M[i * n + j] * b[j];
+      b[i] /= M[i * n + i];
+    }
   }
 
   // F' v + q' in row i, and the sizes of its terms.

@@ -2,7 +2,7 @@
 // dx+ = A_hat (dx, du), and the second derivative of lam. difflcs/mpc/kkt.py derives it.
 #pragma once
 #include "lanes.hpp"
-#include "lu_lanes.hpp"
+#include "lu.hpp"
 #include "matrix.hpp"
 #include "mpc_problem.hpp"
 

@@ -6,7 +6,7 @@
 #pragma once
 #include "kernels.hpp"
 #include "lanes.hpp"
-#include "lu_lanes.hpp"
+#include "lu.hpp"
 
 namespace difflcs::DIFFLCS_ISA {
 namespace {

@@ -96,7 +96,7 @@ def test_the_parameters_of_ipopt_are_the_fields_and_the_two_numbers(build):
     eye = torch.eye(9, dtype=torch.float64)
     mpc = LCSMPCLayer(build.pushing(0, 5), QuadraticCost(eye, eye[:6, :6], eye), 2, -1.0, 1.0)
     problem = mpc(torch.zeros(1, 9, dtype=torch.float64)).problem
-    table = ipopt._parameters(problem)
+    table = ipopt.parameters(problem)
     assert [name for name, _, _ in table] == [*INPUTS, "relaxation", "barrier"]
     assert {name: (rows, columns) for name, rows, columns in table}["E"] == (5, 6)
 

@@ -78,7 +78,7 @@ class IpoptBackend(Backend):
         """Solve every element; a failure, even a crash of a worker, stays with its element."""
         from difflcs.mpc.backends._ipopt_worker import Options, Sizes, solve_chunk
 
-        sizes = Sizes(problem.n_x, problem.n_u, problem.n_lam, problem.horizon, _parameters(problem))
+        sizes = Sizes(problem.n_x, problem.n_u, problem.n_lam, problem.horizon, parameters(problem))
         options = Options(
             self.tol, self.max_iter, self.mu_init if guess is None else self.mu_init_warm, problem.barrier > 0
         )
@@ -107,7 +107,7 @@ class IpoptBackend(Backend):
 
         batch, horizon = problem.batch, problem.horizon
         flat = []
-        for name, _, _ in _parameters(problem):
+        for name, _, _ in parameters(problem):
             value = torch.as_tensor(getattr(problem, name), dtype=torch.float64)
             shared = value.ndim == 0 or problem.shared(name)
             size = value.numel() if shared else math.prod(problem.shape(name))
@@ -125,7 +125,7 @@ class IpoptBackend(Backend):
         return Chunk(*(np.ascontiguousarray(v.numpy()) for v in (torch.cat(flat, 1), u_min, u_max, x, u, lam, s)))
 
 
-def _parameters(problem: MPCProblem) -> tuple[tuple[str, int, int], ...]:
+def parameters(problem: MPCProblem) -> tuple[tuple[str, int, int], ...]:
     """Name, rows and columns of what the program takes: every input of the problem, and its two numbers."""
     shapes = {**{name: problem.shape(name) for name in INPUTS}, "relaxation": (1,), "barrier": (1,)}
     return tuple((name, shape[0], math.prod(shape[1:])) for name, shape in shapes.items())
