@@ -176,7 +176,7 @@ def test_resumed_after_every_iteration_it_is_the_same_bit_for_bit(name, finished
     assert timeless[0] == timeless[1]
 
 
-def test_a_state_can_be_loaded_by_a_trainer_of_another_seed_of_numbers(name, make_trainer):
+def test_a_state_decides_everything_that_follows(name, make_trainer):
     """Whatever a trainer did before, a state decides everything that follows."""
     one, other = make_trainer(name), make_trainer(name)
     one.step()
