@@ -7,7 +7,6 @@ environment is imported here, and no simulation.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 import torch
@@ -112,7 +111,7 @@ def trifinger_task(
         episode_steps=EPISODE_STEPS,
         step_seconds=STEP_SECONDS,
         features=pushing_features,
-        outcome=partial(_judge, task),
+        outcome=task.judge,
         failure_penalty=task.sparse_penalty,
         goal=(Quantity("x", "m"), Quantity("y", "m"), Quantity("yaw", "rad")),
         errors=(Quantity("position_error", "m"), Quantity("yaw_error", "rad")),
@@ -124,14 +123,6 @@ def trifinger_task(
         threaded=True,
         model_name=f"trifinger-{name.replace('_', '-')}",
     )
-
-
-def _judge(task: MoveTask, state: Any, action: Any, after: Any, goal: Any, ended: Any) -> tuple[Any, Any]:
-    """Reward and success. Tensors are rewarded by the MPC's cost, which has the task's weights and other rounding."""
-    if not isinstance(state, Tensor):
-        return task.judge(state, action, after, goal, ended)
-    success = task.pose_info(after, goal)["success"]
-    return -pushing_cost().stage(state, action, goal) - task.sparse_penalty * (ended & ~success), success
 
 
 def register_tasks() -> None:
