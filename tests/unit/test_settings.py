@@ -142,7 +142,7 @@ def test_groups_that_methods_share():
     for change in ({"learning_rate": 0.0}, {"betas": (0.9, 1.0)}, {"betas": (0.9,)}):
         with pytest.raises(InvalidInputError, match=next(iter(change))):
             Adam(**change)
-    for change in ({"noise": -1.0}, {"held_out": 1.0}, {"learning_rate_decay": 0.0}, {"buffer": 0}):
+    for change in ({"noise": -1.0}, {"learning_rate_decay": 0.0}, {"buffer": 0}):
         with pytest.raises(InvalidInputError, match=next(iter(change))):
             WarmupSettings(**change)
     for kind in (Epochs, Rollouts):
