@@ -37,8 +37,8 @@ struct LcpOne {
     relaxation = batch.relaxation / unit / unit;
   }
 
-  // LU of M, in place. Not that of lu.hpp: it divides by the pivots, which is one rounding less than to multiply by their
-  // reciprocals, and the violation loss of a model under training is solved here often enough for that to show.
+  // LU of M, in place. Not that of lu.hpp: it divides by the pivots, which is one rounding less than to multiply by
+  // their reciprocals, and the violation loss of a model under training is solved here often enough for that to show.
   bool factor() {
     for (int64_t k = 0; k < n; k++) {
       int64_t pivot = k;

@@ -133,7 +133,8 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
     if (broken != 0) break;
     const auto u_start = u, lam_start = lam;
     o.u_start = u_start.data(), o.lam_start = lam_start.data(), o.first_relaxation = 1e-5;
-    expect(std::count_if(status.begin(), status.end(), solved) * 10 >= count * 9, "nine of ten MPC problems are solved");
+    expect(std::count_if(status.begin(), status.end(), solved) * 10 >= count * 9,
+           "nine of ten MPC problems are solved");
     if (pass == 0) {
       next = 0;
       const Workspace workspace(kernels().mpc_workspace(b));

@@ -17,12 +17,12 @@ from tests.training.slide import ROLLOUTS, STEPS, make_envs, make_models, make_p
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def make_imagining(seed: int = 0, first_epochs: int = 20, models: dict | None = None, **changes):
+def make_practising(seed: int = 0, first_epochs: int = 20, models: dict | None = None, **changes):
     return make_ppo(seed, models=make_models(seed, first_epochs, **(models or {})), **changes)
 
 
 def test_model_rollouts_follow_the_first_real_episodes_and_count_as_no_data():
-    trainer = make_imagining()
+    trainer = make_practising()
     reports = [trainer.step() for _ in range(2)]
     assert reports[0].model_success is None
     assert reports[0].model_loss is None
@@ -42,7 +42,7 @@ def test_model_rollouts_follow_the_first_real_episodes_and_count_as_no_data():
     ],
 )
 def test_iterations_on_model_rollouts_become_fewer(models, expected):
-    trainer, counts = make_imagining(models=models), []
+    trainer, counts = make_practising(models=models), []
     seen = recorded(trainer, "practice")
     while not trainer.done:
         before = len(seen.calls)
@@ -66,7 +66,7 @@ class Noting(UpdateRule):
 
 def test_steps_on_real_episodes_are_shorter_beside_model_rollouts():
     models = {"iterations": 2, "final_iterations": 2, "real_step": 0.25, "steps": 1}
-    trainer = make_imagining(models=models, final_step=1.0, steps=1)
+    trainer = make_practising(models=models, final_step=1.0, steps=1)
     trainer.update = Noting(trainer.update)
     sizes = iter([1.0, 2.0, 3.0, 21.0])  # whatever the real episodes say
     trainer.update.size.adapt = lambda kl: setattr(trainer.update.size, "value", next(sizes))
@@ -94,12 +94,12 @@ def success_alone() -> float:
 @pytest.mark.parametrize("actions", [1, 8])
 def test_model_rollouts_learn_from_less_data(actions):
     models = {"iterations": 12, "rollouts": 30, "actions": actions}
-    both = sum(success(make_imagining(seed, 100, models, **SHORT)) for seed in range(3)) / 3
+    both = sum(success(make_practising(seed, 100, models, **SHORT)) for seed in range(3)) / 3
     assert both > success_alone() + 0.15
 
 
 def test_iterations_on_model_rollouts_have_an_effort_of_their_own():
-    trainer = make_imagining(
+    trainer = make_practising(
         models={"iterations": 1, "rollouts": 6, "steps": 5, "value_epochs": 2}, minibatch=STEPS * 4
     )
     trainer.step()
@@ -118,7 +118,7 @@ def test_iterations_on_model_rollouts_have_an_effort_of_their_own():
 @pytest.mark.parametrize("actions", [1, 4])
 def test_the_value_network_learns_from_what_the_estimator_says(actions):
     """From rewards without the action advantage in model rollouts, from real ones as they are."""
-    trainer = make_imagining(models={"iterations": 1, "actions": actions})
+    trainer = make_practising(models={"iterations": 1, "actions": actions})
     seen = [recorded(trainer, "robot"), recorded(trainer, "practice")]
     for _ in range(2):
         trainer.step()
@@ -130,21 +130,21 @@ def test_the_value_network_learns_from_what_the_estimator_says(actions):
 
 
 def test_the_first_iteration_does_not_depend_on_models():
-    alone, imagining = make_ppo(), make_imagining()
-    for trainer in (alone, imagining):
+    alone, practising = make_ppo(), make_practising()
+    for trainer in (alone, practising):
         trainer.step()
-    assert same(parameters(alone), parameters(imagining))
+    assert same(parameters(alone), parameters(practising))
 
 
 def test_resumed_equals_uninterrupted_bitwise(tmp_path):
-    through = make_imagining()
+    through = make_practising()
     while not through.done:
         through.step()
-    first = make_imagining()
+    first = make_practising()
     for _ in range(2):
         first.step()
     save_checkpoint(tmp_path, first.iteration, first.state_dict())
-    second = make_imagining()
+    second = make_practising()
     second.load(load_checkpoint(tmp_path))
     while not second.done:
         second.step()
@@ -156,13 +156,13 @@ def test_resumed_equals_uninterrupted_bitwise(tmp_path):
 
 
 def test_load_refuses_hostile_states(refuses_hostile_checkpoints):
-    refuses_hostile_checkpoints(make_imagining())
+    refuses_hostile_checkpoints(make_practising())
 
 
 def test_a_state_without_models_is_refused():
     trainer = make_ppo()
     trainer.step()
     with pytest.raises(CheckpointError, match=r"models.*other settings"):
-        make_imagining().load(trainer.state_dict())
+        make_practising().load(trainer.state_dict())
     with pytest.raises(CheckpointError, match=r"models.*other settings"):
-        trainer.load(make_imagining().state_dict())
+        trainer.load(make_practising().state_dict())

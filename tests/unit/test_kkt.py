@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.autograd.functional import jacobian
 
-from difflcs import solve_lcp
+from difflcs import Status, solve_lcp
 from difflcs.mpc import MPCProblem, Primal, kkt
 from difflcs.mpc.backends import IpoptBackend
 from difflcs.mpc.problem import INPUTS
@@ -277,6 +277,6 @@ def test_equal_bounds_hold_the_action_without_degeneracy(build):
         u_max=torch.tensor([0.02, 0.15], dtype=torch.float64),
     )
     result = solved(fixed)
-    assert bool((result.status == 0).all())
+    assert bool((result.status == Status.CONVERGED).all())
     assert float((result.primal.u[..., 0] - 0.02).abs().max()) == 0
     assert float(result.kkt_residual.max()) < 1e-8
