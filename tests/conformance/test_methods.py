@@ -23,6 +23,7 @@ pytest.importorskip("tyro", reason="needs the extra [rl]")
 
 from difflcs import LCSModel, cli
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
+from difflcs.rl import training
 from difflcs.rl.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
 from difflcs.rl.evaluate import evaluate
 from difflcs.rl.methods import Method, Work, get_method, method_names, register_method
@@ -174,6 +175,27 @@ def test_resumed_after_every_iteration_it_is_the_same_bit_for_bit(name, finished
         for one in (run, whole)
     ]
     assert timeless[0] == timeless[1]
+
+
+def test_a_row_whose_checkpoint_was_lost_is_not_written_twice(name, finished, tmp_path, monkeypatch):
+    """Die between the row of an iteration and its checkpoint, twice at the same place."""
+    whole, path, saved = finished(name), tmp_path / "run", []
+
+    def dies(root, iteration, state):
+        if iteration == 1 and len(saved) < 3:
+            saved.append("lost")
+            raise KeyboardInterrupt
+        saved.append("kept")
+        save_checkpoint(root, iteration, state)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "save_checkpoint", dies)
+        for attempt in range(2):
+            with pytest.raises(KeyboardInterrupt):
+                train(make_config(name), path, task=TOY, resume=attempt > 0)
+    assert saved == ["kept", "lost", "lost"]
+    rows = train(make_config(name), path, task=TOY, resume=True).rows()
+    assert [row["iteration"] for row in rows] == [row["iteration"] for row in whole.rows()]
 
 
 def test_a_state_decides_everything_that_follows(name, make_trainer):
