@@ -181,7 +181,7 @@ PROBLEMS = {
 every_problem = pytest.mark.parametrize("name", PROBLEMS)
 every_backend = pytest.mark.parametrize("backend", BACKENDS)
 every_exact = pytest.mark.parametrize("backend", EXACT)
-# 34 copies of every problem: seconds for a solver that takes milliseconds for one.
+# 34 copies of every problem, or as many differences: seconds for a solver that takes milliseconds for one.
 every_exact_on_copies = pytest.mark.parametrize(
     "backend", [pytest.param(name, marks=[pytest.mark.slow] * (name == "ipopt")) for name in EXACT]
 )
@@ -623,7 +623,7 @@ def test_gradient_of_an_approximation_is_roughly_that_of_its_own_solve(build, so
 
 
 @pytest.mark.parametrize("k", INPUTS)
-@every_exact
+@every_exact_on_copies
 def test_gradcheck_in_each_input(build, k, backend):
     problem = make(build, seed=20, batch=1, n_x=2, n_u=1, n_lam=2, horizon=2, bound=0.12, relaxation=1e-3)
     t = problem.tensors
@@ -749,7 +749,7 @@ def test_a_barrier_keeps_actions_off_their_bounds_and_gives_them_a_gradient(buil
 
 
 @pytest.mark.parametrize("k", ["A", "F", "c", "Q", "r", "u_min", "u_max", "x0"])
-@every_exact
+@every_exact_on_copies
 def test_gradcheck_with_a_barrier(build, k, backend):
     problem = make(build, seed=20, batch=1, n_x=2, n_u=1, n_lam=2, horizon=2, bound=0.12, relaxation=1e-3)
     precise = get_backend(backend)

@@ -27,6 +27,7 @@ from difflcs.rl import training
 from difflcs.rl.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
 from difflcs.rl.evaluate import evaluate
 from difflcs.rl.methods import Method, Work, get_method, method_names, register_method
+from difflcs.rl.ppo import PPOReport
 from difflcs.rl.state import copy_state, flatten
 from difflcs.rl.tasks import register_task
 from difflcs.rl.trainer import Trainer
@@ -47,7 +48,11 @@ def registered() -> None:
     register_method(SearchMethod)
 
 
-@pytest.fixture(params=NAMES)
+SLOW = [method.name for method in map(get_method, method_names()) if PPOReport in method.reports]
+"""Methods that import TorchRL, and take longer."""
+
+
+@pytest.fixture(params=[pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in NAMES])
 def name(request) -> str:
     return request.param
 

@@ -179,6 +179,7 @@ def holder(tmp_path):
             process.kill()
 
 
+@pytest.mark.slow
 def test_a_run_in_use_is_refused_until_its_process_dies(tmp_path, holder):
     run = RunDirectory(tmp_path)
     with pytest.raises(InUseError, match=r"in use; wait until .* another --out") as error, run.locked():

@@ -28,6 +28,7 @@ def own_cache(tmp_path_factory, monkeypatch):
     monkeypatch.delenv("DIFFLCS_YCB_DIR", raising=False)
 
 
+@pytest.mark.slow
 def test_all_are_found_without_mujoco():
     code = (
         "import sys; from difflcs.rl.tasks import get_task, task_names\n"
@@ -38,6 +39,7 @@ def test_all_are_found_without_mujoco():
     assert set(NAMES) <= set(task_names())
 
 
+@pytest.mark.slow
 def test_what_a_program_registers_itself_is_not_replaced_by_what_is_installed():
     code = (
         "from difflcs.rl.tasks import get_task, register_task, task_names\n"

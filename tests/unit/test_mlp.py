@@ -90,6 +90,7 @@ def make_trainer(seed: int = 0, iterations: int = 3, width: int = 64, **changes:
     )
 
 
+@pytest.mark.slow
 def test_it_learns():
     trainer = make_trainer(iterations=12, steps=30, adam=Adam(3e-3, (0.9, 0.999)), std_learning_rate=3e-3)
     envs = trainer.robot.env

@@ -29,6 +29,7 @@ def test_the_fields_of_a_problem_are_those_of_the_kernels_in_their_order():
     assert dimensions(MPCProblem) == INPUTS
 
 
+@pytest.mark.slow
 def test_the_kernels_of_another_version_are_refused(monkeypatch):
     problem = importlib.import_module("difflcs.mpc.problem")
     fields = {name: dims for name, dims in INPUTS.items() if name != "q_final"}

@@ -251,6 +251,7 @@ def test_the_example_trains_in_plain_torchrl():
         assert float(parameter.detach().abs().max()) > 1e-3 or name == "c", name  # further than any initial value
 
 
+@pytest.mark.slow
 def test_the_library_does_not_import_torchrl():
     code = "import sys, difflcs, difflcs.rl; print(*sys.modules)"
     loaded = subprocess.check_output([sys.executable, "-c", code], text=True).split()

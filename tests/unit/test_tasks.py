@@ -151,6 +151,7 @@ PACKAGES = {"good": "def register():\n    from tests.conformance.toy import make
             "breaks": "import no_such_module_at_all\n"}  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_broken_entry_point_is_named_and_disturbs_no_other(tmp_path):
     for package, code in PACKAGES.items():
         (tmp_path / f"{package}_tasks.py").write_text(code)
