@@ -189,7 +189,8 @@ GONE = {
 
 
 @pytest.mark.parametrize("flag", FLAGS_OF_BEFORE)
-def test_flags_of_before_exist_or_say_what_became_of_them(capsys, flags, flag):
+def test_flags_of_before_exist_or_say_what_became_of_them(capsys, flags, flag, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # nothing is to be left where the tests run
     known = set().union(*flags.values())
     for word in (flag, flag.replace("-", "_").replace("__", "--", 1)):
         if flag in known:
