@@ -20,7 +20,7 @@ from torch import Tensor
 from difflcs._checks import check_positive_int
 from difflcs.errors import InvalidInputError
 from difflcs.rl.dynamics import Ensemble, EnsembleSettings
-from difflcs.rl.rollout import TRANSITIONS, extended, no_episodes, transitions
+from difflcs.rl.rollout import episodes_from, episodes_state, extended, no_episodes, transitions
 from difflcs.rl.seeding import Stream, generator
 from difflcs.rl.settings import MOST_ENVS, Settings, bounded, group
 from difflcs.rl.state import State
@@ -218,15 +218,11 @@ class ModelRollouts:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything to go on with, the episodes included."""
-        episodes = {name: self.episodes[name] for name in TRANSITIONS}
-        return {"fits": self.fits, "episodes": episodes, "ensemble": self.ensemble.state_dict()}
+        return {"fits": self.fits, "episodes": episodes_state(self.episodes), "ensemble": self.ensemble.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
         """Go on from what `state_dict` gave."""
-        from tensordict import TensorDict
-
-        count = len(state["episodes"]["state"])
-        self.fits, self.episodes = state["fits"], TensorDict(dict(state["episodes"]), [count])
+        self.fits, self.episodes = state["fits"], episodes_from(state["episodes"])
         self.ensemble.load_state_dict(state["ensemble"])
-        if count:
+        if len(self):
             self.env.remember(self.episodes["state"], self.episodes["goal"])

@@ -20,10 +20,11 @@ from difflcs.cost import GoalCost
 from difflcs.errors import InvalidInputError
 from difflcs.rl.dynamics import Ensemble, EnsembleSettings
 from difflcs.rl.rollout import (
-    TRANSITIONS,
     Plan,
     action_bounds,
     collect,
+    episodes_from,
+    episodes_state,
     extended,
     mpc_actions,
     no_episodes,
@@ -228,11 +229,9 @@ class PDDM(Trainer):
 
     def state_dict(self) -> dict[str, Any]:
         """See `Trainer`."""
-        return {**super().state_dict(), "episodes": {name: self.buffer[name] for name in TRANSITIONS}}
+        return {**super().state_dict(), "episodes": episodes_state(self.buffer)}
 
     def load_state_dict(self, state: State) -> None:
         """See `Trainer`."""
-        from tensordict import TensorDict
-
         super().load_state_dict(state)
-        self.buffer = TensorDict(dict(state["episodes"]), [len(state["episodes"]["state"])])
+        self.buffer = episodes_from(state["episodes"])

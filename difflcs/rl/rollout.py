@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
@@ -234,6 +234,18 @@ def extended(known: TensorDict, episodes: TensorDict, keep: int | None = None) -
     if not len(found):
         raise InvalidInputError("env: expected a stable simulation, got NaN or a physics error in every episode")
     return found if keep is None else found[-keep:]
+
+
+def episodes_state(episodes: TensorDict) -> dict[str, Tensor]:
+    """A record of `TRANSITIONS` as a part of a state, see `difflcs.rl.state`."""
+    return {name: episodes[name] for name in TRANSITIONS}
+
+
+def episodes_from(state: Mapping[str, Tensor]) -> TensorDict:
+    """The record that `episodes_state` took apart."""
+    from tensordict import TensorDict
+
+    return TensorDict(dict(state), [len(state["state"])])  # pyright: ignore[reportArgumentType]
 
 
 def transitions(episodes: TensorDict) -> tuple[Tensor, Tensor, Tensor]:

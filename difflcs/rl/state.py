@@ -143,8 +143,9 @@ def restore(part: Stateful, state: State, where: str = "checkpoint") -> None:
     Raises:
         CheckpointError: the state is not one of this object.
     """
-    check_state(part.state_dict(), state, where)
-    before = copy_state(part.state_dict())
+    own = part.state_dict()
+    check_state(own, state, where)
+    before = copy_state(own)
     try:
         part.load_state_dict(state)
     except Exception as error:  # numpy and torch refuse values in many ways

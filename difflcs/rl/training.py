@@ -245,12 +245,15 @@ class _Training:
             raise InvalidInputError(
                 f"init: expected none with method {method.name}, which learns networks instead of an LCSModel"
             )
+        reopened = None
         if resume:
-            run, init = self._reopen(held)
-            if run.finished():
-                return run
-        else:
-            run = self._create(init, held)
+            reopened, init = self._reopen(held)
+            if reopened.finished():
+                return reopened
+        model = None if init is None else load_model(init)
+        if model is not None:
+            check_fits(model, self.task, init)
+        run = self._create(init, held) if reopened is None else reopened
         started = resume and (run.checkpoints / "latest.json").exists()
         state = load_checkpoint(run.checkpoints) if started else None
 
@@ -259,7 +262,6 @@ class _Training:
             _note(run, self.task.describe(self.opened[-1]))
             return self.opened[-1]
 
-        model = None if init is None else load_model(init)
         try:
             trainer = method.trainer(Work(self.task, self.config.seed, self.total_episodes, open_envs, model))
             if state is not None:
@@ -272,8 +274,6 @@ class _Training:
         return run
 
     def _create(self, init: Path | None, held: ExitStack) -> RunDirectory:
-        if init is not None:
-            check_fits(load_model(init), self.task, init)
         out = self.out
         with writing(out):
             RunDirectory.check_free(out)  # before anything is written there

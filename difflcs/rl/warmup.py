@@ -14,10 +14,11 @@ from difflcs.errors import InvalidInputError
 from difflcs.lcs import LCSModel
 from difflcs.losses import violation_loss
 from difflcs.rl.rollout import (
-    TRANSITIONS,
     Policy,
     action_bounds,
     collect,
+    episodes_from,
+    episodes_state,
     extended,
     mpc_actions,
     no_episodes,
@@ -263,18 +264,16 @@ class Warmup(Trainer):
         generators = {"actions": self._actions, "minibatches": self._minibatches}
         return {
             **super().state_dict(),
-            "episodes": {name: self.buffer[name] for name in TRANSITIONS},
+            "episodes": episodes_state(self.buffer),
             "bounds": {"low": self.bounds[0], "high": self.bounds[1]},
             "random": {name: generator.bit_generator.state for name, generator in generators.items()},
         }
 
     def load_state_dict(self, state: State) -> None:
         """See `Trainer`."""
-        from tensordict import TensorDict
-
         super().load_state_dict(state)
         self._actions, self._minibatches = (_generator(state["random"][k]) for k in ("actions", "minibatches"))
-        self.buffer = TensorDict(dict(state["episodes"]), [len(state["episodes"]["state"])])
+        self.buffer = episodes_from(state["episodes"])
         self.bounds = (state["bounds"]["low"], state["bounds"]["high"])
 
 

@@ -307,7 +307,7 @@ def test_only_what_learned_a_model_gives_one(name, finished):
 
 def test_what_was_learned_of_other_sizes_is_refused(name, finished):
     if name == SearchMethod.name:
-        pytest.skip("its gain fits every task")
+        pytest.skip("this method learns one number, which fits a task of any size")
     with pytest.raises(CheckpointError, match="expected"):
         load_policy(finished(name), LARGER)
 
