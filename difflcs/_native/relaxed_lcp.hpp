@@ -7,6 +7,7 @@
 #include "kernels.hpp"
 #include "lanes.hpp"
 #include "lu.hpp"
+#include "matrix.hpp"
 
 namespace difflcs::DIFFLCS_ISA {
 namespace {
@@ -33,7 +34,7 @@ template <class T, int64_t N, bool kPivot>
 class RelaxedLcp {
   using Lu = Elimination<kPivot>;
   const int64_t given;
-  const T* const F;
+  const Matrix<const T, N, N> F;
   const Vec* const q;
   Mask* const rows;
   Local<N * N> jacobian;
@@ -49,7 +50,7 @@ class RelaxedLcp {
   // `memory`: scratch(n) numbers; `exchanged`: n row numbers.
   DIFFLCS_INLINE RelaxedLcp(int64_t n, const T* F, const Vec* q, Vec* memory, Mask* exchanged)
       : given(n),
-        F(F),
+        F{F, {n}, {n}, {n}},
         q(q),
         rows(exchanged),
         jacobian(memory),
@@ -90,7 +91,8 @@ class RelaxedLcp {
 
   // From eps = 1 down to `target`. Returns the lanes that converged and counts their iterations; `bound` is scratch.
   template <class Halted>
-  Mask follow(Vec* lam_out, Vec* w_out, Vec* bound, Vec target, int64_t max_iter, Mask& iterations, Halted halted) {
+  DIFFLCS_INLINE Mask follow(Vec* lam_out, Vec* w_out, Vec* bound, Vec target, int64_t max_iter, Mask& iterations,
+                             Halted halted) {
     const int64_t n = size();
     Vec eps = max(target, all(1)), smallest = all(1e300);  // smallest residual met at the target
     Mask solved = Mask{};
@@ -131,9 +133,7 @@ class RelaxedLcp {
     Vec sum = all(0);
     DIFFLCS_UNROLL
     for (int64_t i = 0; i < n; i++) {
-      Vec t = q[i];
-      DIFFLCS_UNROLL
-      for (int64_t j = 0; j < n; j++) t += F[i * n + j] * next[j];
+      const Vec t = q[i] + F.row(i) * next;
       const Vec diff = next[i] - t;
       w_next[i] = t, root_next[i] = sqrt(diff * diff + eps4);
       const Vec g = next[i] + t - root_next[i];
@@ -145,7 +145,7 @@ class RelaxedLcp {
   // The same at the iterate for another eps, with the rounding of w in view.
   DIFFLCS_INLINE void refresh(Vec eps, Vec* bound) {
     const int64_t n = size();
-    lcp_slack(n, F, q, lam, w, bound);
+    lcp_slack(n, F.entries, q, lam, w, bound);
     merit = magnitude = all(0);
     for (int64_t i = 0; i < n; i++) {
       const Vec diff = lam[i] - w[i];
@@ -164,7 +164,7 @@ class RelaxedLcp {
     for (int64_t i = 0; i < n; i++) {
       const Vec ratio = (lam[i] - w[i]) / root[i], b = 1.0 + ratio;
       DIFFLCS_UNROLL
-      for (int64_t j = 0; j < n; j++) jacobian[i * n + j] = b * F[i * n + j];
+      for (int64_t j = 0; j < n; j++) jacobian[i * n + j] = b * F(i, j);
       jacobian[i * n + i] += 1.0 - ratio;
       step[i] = root[i] - lam[i] - w[i];
     }
@@ -208,7 +208,7 @@ class RelaxedLcp {
     for (int iteration = 0; iteration < 4; iteration++) {
       for (int64_t i = 0; i < n; i++) {
         Vec t = q[i];
-        for (int64_t j = 0; j < n; j++) t += F[i * n + j] * lam_out[j], jacobian[i * n + j] = lam_out[i] * F[i * n + j];
+        for (int64_t j = 0; j < n; j++) t += F(i, j) * lam_out[j], jacobian[i * n + j] = lam_out[i] * F(i, j);
         jacobian[i * n + i] += w_out[i];
         step[i] = eps - lam_out[i] * t;
       }
