@@ -6,54 +6,64 @@
 
 namespace difflcs {
 
-// FIELD(name, rows, columns); a vector has one column. The order is that of every list of arrays that the kernels take.
+// FIELD(name, rows, columns, stages); a vector has one column. A field may be given by stage: for each of the H steps,
+// or for each of the H + 1 nodes. The order is that of every list of arrays that the kernels take.
 #define DIFFLCS_SYSTEM_FIELDS(FIELD) \
-  FIELD(A, n_x, n_x)                 \
-  FIELD(B, n_x, n_u)                 \
-  FIELD(C, n_x, n_lam)               \
-  FIELD(d, n_x, one)                 \
-  FIELD(D, n_lam, n_x)               \
-  FIELD(E, n_lam, n_u)               \
-  FIELD(F, n_lam, n_lam)             \
-  FIELD(c, n_lam, one)
+  FIELD(A, n_x, n_x, steps)          \
+  FIELD(B, n_x, n_u, steps)          \
+  FIELD(C, n_x, n_lam, steps)        \
+  FIELD(d, n_x, one, steps)          \
+  FIELD(D, n_lam, n_x, steps)        \
+  FIELD(E, n_lam, n_u, steps)        \
+  FIELD(F, n_lam, n_lam, steps)      \
+  FIELD(c, n_lam, one, steps)
 
 #define DIFFLCS_MPC_FIELDS(FIELD) \
   DIFFLCS_SYSTEM_FIELDS(FIELD)    \
-  FIELD(Q, n_x, n_x)              \
-  FIELD(R, n_u, n_u)              \
-  FIELD(Q_final, n_x, n_x)        \
-  FIELD(q, n_x, one)              \
-  FIELD(r, n_u, one)              \
-  FIELD(q_final, n_x, one)        \
-  FIELD(u_min, n_u, one)          \
-  FIELD(u_max, n_u, one)          \
-  FIELD(x0, n_x, one)
+  FIELD(Q, n_x, n_x, steps)       \
+  FIELD(R, n_u, n_u, steps)       \
+  FIELD(S, n_x, n_u, steps)       \
+  FIELD(Q_final, n_x, n_x, once)  \
+  FIELD(q, n_x, one, steps)       \
+  FIELD(r, n_u, one, steps)       \
+  FIELD(q_final, n_x, one, once)  \
+  FIELD(u_min, n_u, one, steps)   \
+  FIELD(u_max, n_u, one, steps)   \
+  FIELD(G_x, n_c, n_x, nodes)     \
+  FIELD(G_u, n_c, n_u, steps)     \
+  FIELD(g, n_c, one, nodes)       \
+  FIELD(price, n_c, one, nodes)   \
+  FIELD(x0, n_x, one, once)
 
-// Transitions, and the system that they are compared with.
+// Transitions, and the system that they are compared with, which has no stages here.
 #define DIFFLCS_VIOLATION_FIELDS(FIELD) \
   DIFFLCS_SYSTEM_FIELDS(FIELD)          \
-  FIELD(x, count, n_x)                  \
-  FIELD(u, count, n_u)                  \
-  FIELD(x_next, count, n_x)
+  FIELD(x, count, n_x, once)            \
+  FIELD(u, count, n_u, once)            \
+  FIELD(x_next, count, n_x, once)
 
-enum class Size { one, n_x, n_u, n_lam, count };
-constexpr const char* kSizeNames[] = {"one", "n_x", "n_u", "n_lam", "count"};
+enum class Size { one, n_x, n_u, n_lam, n_c, count };
+constexpr const char* kSizeNames[] = {"one", "n_x", "n_u", "n_lam", "n_c", "count"};
+
+enum class Given { once, steps, nodes };
+constexpr const char* kGivenNames[] = {"", "H", "H+1"};
 
 struct Field {
   const char* name;
   Size rows, columns;
+  Given stages;
 };
 
-#define DIFFLCS_FIELD(name, rows, columns) {#name, Size::rows, Size::columns},
+#define DIFFLCS_FIELD(name, rows, columns, stages) {#name, Size::rows, Size::columns, Given::stages},
 constexpr Field kMpcFields[] = {DIFFLCS_MPC_FIELDS(DIFFLCS_FIELD)};
 constexpr Field kViolationFields[] = {DIFFLCS_VIOLATION_FIELDS(DIFFLCS_FIELD)};
 #undef DIFFLCS_FIELD
 
 // Positions in these tables: kA, kB, ... of an MPC problem, vA, vB, ... of the violation loss.
-#define DIFFLCS_FIELD(name, rows, columns) k##name,
+#define DIFFLCS_FIELD(name, rows, columns, stages) k##name,
 enum Input { DIFFLCS_MPC_FIELDS(DIFFLCS_FIELD) kInputs };
 #undef DIFFLCS_FIELD
-#define DIFFLCS_FIELD(name, rows, columns) v##name,
+#define DIFFLCS_FIELD(name, rows, columns, stages) v##name,
 enum ViolationInput { DIFFLCS_VIOLATION_FIELDS(DIFFLCS_FIELD) kViolationInputs };
 #undef DIFFLCS_FIELD
 
@@ -69,6 +79,8 @@ inline int64_t extent(const Batch& batch, Size size) {
       return batch.n_u;
     case Size::n_lam:
       return batch.n_lam;
+    case Size::n_c:
+      return batch.n_c;
     case Size::count:
       return batch.count;
     case Size::one:

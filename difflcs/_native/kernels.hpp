@@ -37,9 +37,10 @@ constexpr double kSmallest = 1e-100, kLargest = 1e150;  // range of the diagonal
 
 // A batch of LCS-MPC problems (see difflcs.mpc.MPCProblem). All arrays are row-major with the batch in front.
 struct MpcBatch {
-  int64_t count, n_x, n_u, n_lam, horizon;
+  int64_t count, n_x, n_u, n_lam, n_c, horizon;
   const double* input[kInputs];
   int64_t stride[kInputs];  // distance from one element to the next; 0 when the batch shares the input
+  int64_t step[kInputs];    // distance from one stage to the next; 0 when all stages share the input
   double relaxation;
   double barrier;  // weight of the logarithmic barrier of the action bounds
   bool pivot;      // eliminate with row exchanges: slower, for F whose skew part dominates
@@ -78,7 +79,7 @@ constexpr double kGammaLeast = 4e-13;
 // The violation loss of a batch: |r|^2 / 2 + (lam . phi + |e|^2 / (2 gamma)) / xi at the z = (lam, phi) >= 0 that
 // minimises it, with r = A x + B u + C lam + d - x_next and e = D x + E u + F lam + c - phi.
 struct ViolationBatch {
-  int64_t count, n_x, n_u, n_lam;
+  int64_t count, n_x, n_u, n_lam, n_c;
   const double* input[kViolationInputs];  // the system is shared by the batch; x, u, x_next are (count, ...)
   double gamma, xi;
   double *r, *e;  // (count, n_x), (count, n_lam): at z = 0 from violation_qp, at the minimiser from violation_value

@@ -159,6 +159,12 @@ void check_size(const char* name, int64_t got, int64_t expected) {
 
 int64_t rank_of(const difflcs::Field& field) { return field.columns == difflcs::Size::one ? 1 : 2; }
 
+// How many stages a field has where it is given by stage.
+int64_t stages_of(const difflcs::MpcBatch& b, const difflcs::Field& field) {
+  using difflcs::Given;
+  return field.stages == Given::once ? 0 : field.stages == Given::steps ? b.horizon : b.horizon + 1;
+}
+
 difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxation, double barrier, bool pivot) {
   using namespace difflcs;
   check_size("inputs", inputs.size(), kInputs);
@@ -167,20 +173,22 @@ difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxa
   const Array& x0 = inputs[kx0];
   auto last = [&](Input which) { return int64_t(inputs[which].shape(inputs[which].ndim() - 1)); };
   MpcBatch b{};
-  b.count = int64_t(x0.shape(0)), b.n_x = last(kA), b.n_u = last(kB), b.n_lam = last(kF);
+  b.count = int64_t(x0.shape(0)), b.n_x = last(kA), b.n_u = last(kB), b.n_lam = last(kF), b.n_c = last(kg);
   b.horizon = horizon, b.relaxation = relaxation, b.barrier = barrier;
+  if (b.n_x < 1 || b.n_u < 1 || horizon < 1 || !(relaxation > 0) || !(barrier >= 0))
+    throw std::invalid_argument("sizes, horizon and relaxation must be positive, the barrier not negative");
   for (int i = 0; i < kInputs; i++) {
     const Array& a = inputs[i];
-    const int64_t rank = rank_of(kMpcFields[i]), size = extent(b, kMpcFields[i]);
-    const bool shared = int64_t(a.ndim()) == rank;
-    if (int64_t(a.size()) != (shared ? size : size * b.count) || (!shared && int64_t(a.ndim()) != rank + 1) ||
-        (i == kx0 && shared))
+    const int64_t rank = rank_of(kMpcFields[i]), size = extent(b, kMpcFields[i]), own = int64_t(a.ndim()) - rank;
+    const int64_t stages = stages_of(b, kMpcFields[i]);
+    const bool shared = own == 0 || (own == 2 && a.shape(0) == 1);
+    const int64_t whole = (own == 2 ? stages * size : size) * (shared ? 1 : b.count);
+    if (own < 0 || own > (stages ? 2 : 1) || int64_t(a.size()) != whole || (i == kx0 && own != 1))
       throw std::invalid_argument(std::string(kMpcFields[i].name) + " has the wrong shape");
     b.input[i] = a.data();
-    b.stride[i] = shared ? 0 : size;
+    b.step[i] = own == 2 ? size : 0;
+    b.stride[i] = shared ? 0 : own == 2 ? stages * size : size;
   }
-  if (b.n_x < 1 || b.n_u < 1 || b.n_lam < 1 || horizon < 1 || !(relaxation > 0) || !(barrier >= 0))
-    throw std::invalid_argument("sizes, horizon and relaxation must be positive, the barrier not negative");
   b.pivot = pivot;
   return b;
 }
@@ -391,6 +399,13 @@ nb::dict fields(const difflcs::Field* begin, const difflcs::Field* end) {
   return table;
 }
 
+// The stages of each: "" for none, H or H+1.
+nb::dict stages() {
+  nb::dict table;
+  for (const difflcs::Field& f : difflcs::kMpcFields) table[f.name] = nb::str(difflcs::kGivenNames[int(f.stages)]);
+  return table;
+}
+
 nb::dict status_codes() {
   nb::dict codes;
   int code = 0;
@@ -409,6 +424,7 @@ NB_MODULE(_kernels, m) {
   m.def(
       "mpc_fields", [] { return fields(std::begin(difflcs::kMpcFields), std::end(difflcs::kMpcFields)); },
       "Inputs of an MPC problem in their order, with the dimensions of each.");
+  m.def("mpc_stages", &stages, "How many stages each has where it is given by stage.");
   m.def(
       "violation_fields",
       [] { return fields(std::begin(difflcs::kViolationFields), std::end(difflcs::kViolationFields)); },

@@ -18,7 +18,7 @@ from difflcs.status import Status
 
 
 class SolveMPC(torch.autograd.Function):
-    """Tensors (in the order of `INPUTS`) → x, u, lam, objective, status, iterations, kkt_residual, solve_time.
+    """Tensors (in the order of `INPUTS`) → x, u, lam, mu, objective, status, iterations, kkt_residual, solve_time.
 
     `dtype` is that of x, u and lam; the objective stays in float64, without the cost's `constant` (batch,), which only
     counts for what `dtype` can hold. `smallest` is the narrowest dtype in which a gradient will arrive.
@@ -43,11 +43,12 @@ class SolveMPC(torch.autograd.Function):
         ctx.problem, ctx.backend, ctx.result, ctx.limit = problem, backend, result, torch.finfo(smallest).max
         ctx.save_for_backward(*tensors)
         # Copies: what the caller does with the outputs must not change the gradient.
-        x, u, lam = (v.to(dtype, copy=any(ctx.needs_input_grad)) for v in result.primal)
+        x, u, lam, mu = (v.to(dtype, copy=any(ctx.needs_input_grad)) for v in result.primal)
         u = _inside(u, problem) if dtype != torch.float64 else u
-        info = result.status.clone(), result.iterations, result.kkt_residual, result.solve_time
-        ctx.mark_non_differentiable(*info)
-        return x, u, lam, objective, *info
+        violation = problem.violation(result.primal.x, result.primal.u).to(dtype)
+        info = result.status.clone(), result.iterations, result.kkt_residual, result.solve_time, violation
+        ctx.mark_non_differentiable(mu, *info)
+        return x, u, lam, mu, objective, *info
 
     @staticmethod
     def backward(ctx, *grads: Tensor):  # noqa: D102
@@ -57,7 +58,9 @@ class SolveMPC(torch.autograd.Function):
         result: Result = ctx.result
         solved = result.solved
         # Whatever comes upstream for a failed element is dropped before it can meet the others.
-        upstream = tuple(torch.where(solved.reshape(-1, *[1] * (g.ndim - 1)), g.double(), 0.0) for g in grads[:4])
+        upstream = tuple(
+            torch.where(solved.reshape(-1, *[1] * (g.ndim - 1)), g.double(), 0.0) for g in (*grads[:3], grads[4])
+        )
 
         def vjp(keep: Tensor) -> dict[str, Tensor]:
             return ctx.backend.vjp(ctx.problem, result, upstream, keep)
@@ -76,7 +79,7 @@ def _within_range(result: Result, objective: Tensor, constant: Tensor, dtype: to
     held = total.abs() <= largest
     if dtype != torch.float64:
         for value in result.primal:
-            held &= value.abs().amax((1, 2)) <= largest
+            held &= (value.abs() <= largest).flatten(1).all(1)
     solved = result.solved
     if bool((held & solved).all()):
         return result, objective
@@ -92,11 +95,11 @@ def _within_range(result: Result, objective: Tensor, constant: Tensor, dtype: to
 
 def _inside(u: Tensor, problem: MPCProblem) -> Tensor:
     """Rounded actions (batch, H, n_u), inside the bounds in float64 too where a number of their dtype lies there."""
-    low, high = (v.to(u.dtype) for v in (problem.u_min, problem.u_max))
+    u_min, u_max = problem.bounds()
+    low, high = u_min.to(u.dtype), u_max.to(u.dtype)
     up, down = torch.full_like(low, torch.inf), torch.full_like(high, -torch.inf)
-    low = torch.where(low.double() < problem.u_min, torch.nextafter(low, up), low)
-    high = torch.where(high.double() > problem.u_max, torch.nextafter(high, down), high)
-    low, high = low.unsqueeze(-2), high.unsqueeze(-2)
+    low = torch.where(low.double() < u_min, torch.nextafter(low, up), low)
+    high = torch.where(high.double() > u_max, torch.nextafter(high, down), high)
     return torch.where(low <= high, torch.minimum(torch.maximum(u, low), high), u)
 
 

@@ -139,7 +139,7 @@ def residual(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
       still move an action. G is the scale of g: the larger of its Σ|terms| and of range·(Rⱼⱼ + BⱼᵀQBⱼ), which is what
       its weights make of a step across the range. G does not vanish with the curvature: flat directions count.
     """
-    x, u, lam = (v.transpose(0, 1) for v in primal)  # steps first, so that per-element matrices broadcast
+    x, u, lam = (v.transpose(0, 1) for v in primal[:3])  # steps first, so that per-element matrices broadcast
     p, y, rho = (v.transpose(0, 1) for v in (dual.p, dual.y, dual.rho))
     s, g, low, high = dual.s.transpose(0, 1), dual.gradient.transpose(0, 1), problem.u_min, problem.u_max
     P = problem
@@ -197,7 +197,7 @@ def _at_rest(problem: MPCProblem, weight: Tensor) -> Tensor:
 
 def _backward(problem: MPCProblem, primal: Primal) -> tuple[Multipliers, list[tuple[Tensor, Tensor, Tensor]]]:
     """Multipliers, and per stage the LU factors of M, their pivots, and λ + s."""
-    x, u, lam = primal
+    x, u, lam, _ = primal
     s = problem.gap(*(v.transpose(0, 1) for v in (x[:, :-1], u, lam))).transpose(0, 1)
     size = lam + s
     b = lam / size
@@ -397,7 +397,7 @@ def vjp(
     def keep(value: Tensor) -> Tensor:
         return torch.where(solved[:, None, None], value, torch.zeros_like(value))
 
-    x, u, lam = (keep(v) for v in lin.primal)
+    x, u, lam = (keep(v) for v in lin.primal[:3])
     dx, du, dlam = keep(w.x), keep(w.u), keep(w.lam)
     p, rho = keep(dual.p[:, 1:]), keep(dual.rho)
     dp, drho = keep(w.p - J * dual.p[:, 1:]), keep(w.rho - J * dual.rho)
@@ -442,6 +442,7 @@ def vjp(
         "c": -total("c", drho),
         "Q": symmetric("Q", x_now, dx_now),
         "R": symmetric("R", u, du),
+        **{name: torch.zeros_like(getattr(problem, name)) for name in ("S", "G_x", "G_u", "g", "price")},
         "Q_final": symmetric("Q_final", x_end, dx_end),
         "q": total("q", J * x_now - dx_now),
         "r": total("r", J * u - du),
@@ -480,7 +481,7 @@ def polish(problem: MPCProblem, primal: Primal, max_iter: int = 6, tol: float = 
         # With a barrier a step goes at most nine tenths of the way to a bound.
         u = problem.clip(u) if problem.barrier == 0 else problem.clip_inside(u, lin.primal.u)
         x, lam = problem.rollout(u)
-        trial = Primal(x, u, lam)
+        trial = Primal(x, u, lam, primal.mu)
         lin = linearise(problem, trial)
         trial_residual = residual(problem, trial, lin.multipliers)
         better = trial_residual < best_residual

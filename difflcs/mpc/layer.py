@@ -142,7 +142,10 @@ class LCSMPCLayer(nn.Module):
             "u_min": self.u_min if u_min is None else self._bound("u_min", u_min),
             "u_max": self.u_max if u_max is None else self._bound("u_max", u_max),
         }
-        tensors = {**lcs.tensors(), **cost.fields(), **bounds, "x0": x0}
+        nothing = x0.new_zeros(0)
+        none = {"G_x": x0.new_zeros(0, lcs.n_x), "G_u": x0.new_zeros(0, lcs.n_u), "g": nothing, "price": nothing}
+        fields = {**cost.fields(), "S": x0.new_zeros(lcs.n_x, lcs.n_u), **none}
+        tensors = {**lcs.tensors(), **fields, **bounds, "x0": x0}
         check_same_device(reversed(tensors.items()))
         ndim = {name: len(dims) for name, dims in INPUTS.items()}
         leading = [(name, tensors[name].shape[: tensors[name].ndim - ndim[name]]) for name in INPUTS]
@@ -161,7 +164,7 @@ class LCSMPCLayer(nn.Module):
         constant = cost.constant.detach().to("cpu", torch.float64).expand(batch).reshape(-1)
         smallest = torch.float32 if any(t.dtype == torch.float32 for t in tensors.values()) else torch.float64
         outputs = SolveMPC.apply(problem, self.backend, self._guess(guess, batch), x0.dtype, smallest, constant, *flat)
-        *primal, objective, status, iterations, residual, seconds = outputs  # pyright: ignore[reportGeneralTypeIssues]
+        *primal, objective, status, iterations, residual, seconds, violation = outputs  # pyright: ignore[reportGeneralTypeIssues]
         self._report(status, torch.is_grad_enabled() and any(t.requires_grad for t in flat))
 
         def shaped(value: Tensor) -> Tensor:
@@ -174,6 +177,7 @@ class LCSMPCLayer(nn.Module):
             iterations=shaped(iterations),
             kkt_residual=shaped(residual),
             solve_time=shaped(seconds),
+            violation=shaped(violation),
             problem=problem,
         )
 
@@ -214,7 +218,7 @@ class LCSMPCLayer(nn.Module):
                     f"guess.{name}: expected batch dimensions {tuple(batch)} like x0, got {tuple(value.shape[:-2])}"
                 )
             flat.append(value.detach().to("cpu", torch.float64).reshape(-1, *value.shape[-2:]))
-        return Primal(*flat)
+        return Primal(*flat, torch.zeros(len(flat[0]), self.horizon + 1, 0, dtype=torch.float64))
 
     def _report(self, status: Tensor, needs_grad: bool) -> None:
         degenerate = int((status == Status.DEGENERATE).sum())

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import torch
 from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_number, check_positive_int, check_same_device
-from difflcs._linalg import quadratic
+from difflcs._linalg import matvec, quadratic
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
-from difflcs.errors import BoundsError, ShapeError
+from difflcs.errors import BoundsError, InvalidInputError, ShapeError
 from difflcs.lcp import solve_lcp_arrays
 from difflcs.lcs import SystemMatrices, dimensions
 
 
 def check_bounds(u_min: Tensor, u_max: Tensor, strict: bool = False) -> None:
-    """Refuse bounds that do not broadcast, live on different devices, or cross (`strict`: or touch)."""
+    """Refuse bounds that do not broadcast, live on different devices, or cross (`strict`: or touch, or are infinite)."""
     broadcast_batch([("u_min", u_min.shape), ("u_max", u_max.shape)])
     check_same_device([("u_min", u_min), ("u_max", u_max)])
     crossed = u_min >= u_max if strict else u_min > u_max
@@ -28,43 +28,86 @@ def check_bounds(u_min: Tensor, u_max: Tensor, strict: bool = False) -> None:
             f"u_min: expected u_min {'<' if strict else '<='} u_max, got {low:g} and {high:g} at index {index}; "
             f"swap or widen the bounds"
         )
+    if strict and bool((torch.isinf(u_min) | torch.isinf(u_max)).any()):
+        raise BoundsError("u_min, u_max: expected finite bounds with a barrier, got infinite ones; pass barrier=0")
+    for name, value, wrong in (("u_min", u_min, torch.inf), ("u_max", u_max, -torch.inf)):
+        if bool((value == wrong).any()):
+            raise BoundsError(f"{name}: expected at least one action that it allows, got {wrong}; change its sign")
+
+
+@dataclass(frozen=True)
+class StageData(SystemMatrices):
+    """What varies by stage, at one stage or at all of them: system, cost, bounds and constraints.
+
+    Of one stage every field broadcasts with (batch, ...); of all of them with (H, batch, ...), or (H+1, batch, ...)
+    for G_x, g and price. The names are those of `MPCProblem`.
+    """
+
+    Q: Annotated[Tensor, "n_x", "n_x"]
+    R: Annotated[Tensor, "n_u", "n_u"]
+    S: Annotated[Tensor, "n_x", "n_u"]
+    q: Annotated[Tensor, "n_x"]
+    r: Annotated[Tensor, "n_u"]
+    u_min: Annotated[Tensor, "n_u"]
+    u_max: Annotated[Tensor, "n_u"]
+    G_x: Annotated[Tensor, "n_c", "n_x"]
+    G_u: Annotated[Tensor, "n_c", "n_u"]
+    g: Annotated[Tensor, "n_c"]
+    price: Annotated[Tensor, "n_c"]
+
+    def constraint(self, x: Tensor, u: Tensor | None = None) -> Tensor:
+        """G_x x + G_u u − g, (..., n_c); without actions at the last stage."""
+        value = matvec(self.G_x, x) - self.g
+        return value if u is None else value + matvec(self.G_u, u)
 
 
 @dataclass(frozen=True)
 class MPCProblem(SystemMatrices):
     """A batch of LCS-MPC problems (Eq. mpc_lcs) with relaxed complementarity.
 
-        min Σ_{k<H} ½x_kᵀQx_k + qᵀx_k + ½u_kᵀRu_k + rᵀu_k + ½x_HᵀQ_final x_H + q_finalᵀx_H
+        min Σ_{k<H} ½x_kᵀQx_k + qᵀx_k + ½u_kᵀRu_k + rᵀu_k + x_kᵀSu_k + ½x_HᵀQ_final x_H + q_finalᵀx_H
+            + Σ_{k≤H} Σ_i price_i·max(0, (G_x x_k + G_u u_k − g)_i)       (rows with a finite price)
         s.t. x_{k+1} = A x_k + B u_k + C λ_k + d,  s_k = D x_k + E u_k + F λ_k + c,
-             λ_k ∘ s_k = relaxation,  λ_k, s_k ≥ 0,  u_min ≤ u_k ≤ u_max.
+             λ_k ∘ s_k = relaxation,  λ_k, s_k ≥ 0,  u_min ≤ u_k ≤ u_max,
+             G_x x_k + G_u u_k ≤ g for k ≤ H, without actions at k = H   (rows with an infinite price).
 
     With barrier > 0 the cost also has −barrier·Σ (log(u_k − u_min) + log(u_max − u_k)), which keeps actions off their
     bounds and so makes them differentiable everywhere.
 
-    Tensors are float64 on the CPU and detached. x0 is (batch, n_x); every other one is shared, with exactly the
-    dimensions that its annotation names, or has the batch dimension in front.
+    Tensors are float64 on the CPU and detached. x0 is (batch, n_x). Every other one has, in front of the dimensions that
+    its annotation names, none (shared by batch and stages), the batch (shared by the stages), or the batch and the
+    stages, where a batch of 1 is shared. `STAGES` says how many stages a field has: H, or H + 1 for G_x, g and price;
+    Q_final, q_final and x0 have none.
 
     Attributes:
         A, B, C, d, D, E, F, c: the LCS, see `difflcs.LCSParams`.
-        Q, R, Q_final, q, r, q_final: the cost, see `difflcs.QuadraticCost`; Q, R, Q_final symmetric.
-        u_min, u_max: bounds of the actions.
+        Q, R, S, Q_final, q, r, q_final: the cost, see `difflcs.QuadraticCost`; Q, R, Q_final symmetric; S zero if left
+            out.
+        u_min, u_max: bounds of the actions; infinite for none.
+        G_x, G_u, g, price: constraints, n_c rows; none if left out. g = ∞: none at this stage. price = ∞: hard.
         x0: (batch, n_x) initial states.
         horizon: H ≥ 1 steps.
         relaxation: product λ·s > 0; the smaller, the closer to hard contact.
         barrier: weight ≥ 0 of the logarithmic barrier of the action bounds.
 
     Raises:
-        ShapeError, BoundsError, InvalidInputError: inconsistent shapes, u_min > u_max, horizon < 1, relaxation ≤ 0.
+        ShapeError, BoundsError, InvalidInputError: inconsistent shapes, u_min > u_max, horizon < 1, relaxation ≤ 0, a
+            price that is not positive.
     """
 
     Q: Annotated[Tensor, "n_x", "n_x"]
     R: Annotated[Tensor, "n_u", "n_u"]
+    S: Annotated[Tensor, "n_x", "n_u"] = field(default=None, kw_only=True)  # pyright: ignore
     Q_final: Annotated[Tensor, "n_x", "n_x"]
     q: Annotated[Tensor, "n_x"]
     r: Annotated[Tensor, "n_u"]
     q_final: Annotated[Tensor, "n_x"]
     u_min: Annotated[Tensor, "n_u"]
     u_max: Annotated[Tensor, "n_u"]
+    G_x: Annotated[Tensor, "n_c", "n_x"] = field(default=None, kw_only=True)  # pyright: ignore
+    G_u: Annotated[Tensor, "n_c", "n_u"] = field(default=None, kw_only=True)  # pyright: ignore
+    g: Annotated[Tensor, "n_c"] = field(default=None, kw_only=True)  # pyright: ignore
+    price: Annotated[Tensor, "n_c"] = field(default=None, kw_only=True)  # pyright: ignore
     x0: Annotated[Tensor, "n_x"]
     horizon: int
     relaxation: float
@@ -74,62 +117,145 @@ class MPCProblem(SystemMatrices):
         check_positive_int("horizon", self.horizon)
         check_number("relaxation", self.relaxation, strict=True)
         check_number("barrier", self.barrier)
+        if self.g is None:
+            object.__setattr__(self, "g", self.x0.new_zeros(0))
+        for name in ("S", "G_x", "G_u", "price"):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, self.x0.new_zeros(self.shape(name)))
+        batch = self.batch
         for name in INPUTS:
-            tensor, shape = getattr(self, name), self.shape(name)
-            if tuple(tensor.shape) not in ((shape, (self.batch, *shape)) if name != "x0" else ((self.batch, *shape),)):
-                raise ShapeError(f"{name}: expected {shape} or {(self.batch, *shape)}, got {tuple(tensor.shape)}")
-        check_bounds(self.u_min, self.u_max, strict=self.barrier > 0)
+            shape, stages = self.shape(name), self.stages(name)
+            allowed = [(batch, *shape)] if name == "x0" else [shape, (batch, *shape)]
+            if stages:
+                allowed += [(1, stages, *shape), (batch, stages, *shape)]
+            found = tuple(getattr(self, name).shape)
+            if found not in allowed:
+                raise ShapeError(f"{name}: expected {' or '.join(map(str, allowed))}, got {found}")
+        check_bounds(*self.bounds(), strict=self.barrier > 0)
+        if self.n_c and not bool((self.price > 0).all()):
+            raise InvalidInputError(
+                f"price: expected a positive price of a violation, or infinity for a hard constraint, got "
+                f"{float(self.price.min()):g}; leave out constraints that do not count"
+            )
 
     @property
     def batch(self) -> int:
         """Number of problems."""
         return self.x0.shape[0]
 
+    @property
+    def n_c(self) -> int:
+        """Number of constraints of a stage."""
+        return self.g.shape[-1]
+
     def shape(self, name: str) -> tuple[int, ...]:
-        """Dimensions of one input without the batch."""
+        """Dimensions of one input without the batch and the stages."""
         return tuple(getattr(self, dim) for dim in INPUTS[name])
+
+    def stages(self, name: str) -> int:
+        """How many stages one input has where it is given by stage; 0 where it has none."""
+        return {"": 0, "H": self.horizon, "H+1": self.horizon + 1}[STAGES[name]]
+
+    def by_stage(self, name: str) -> bool:
+        """Whether this input is given by stage."""
+        return getattr(self, name).ndim == len(INPUTS[name]) + 2
 
     def shared(self, name: str) -> bool:
         """Whether the whole batch shares this input."""
-        return getattr(self, name).ndim == len(INPUTS[name])
+        value = getattr(self, name)
+        return value.ndim == len(INPUTS[name]) or (self.by_stage(name) and value.shape[0] == 1)
+
+    def stage(self, k: int) -> StageData:
+        """The data of stage k, broadcasting with (batch, ...). At k = H only G_x, g and price mean something."""
+        at = {"H": min(k, self.horizon - 1), "H+1": k}
+        return StageData(
+            **{name: v[:, at[STAGES[name]]] if self.by_stage(name) else v for name, v in self._stagewise().items()}
+        )
+
+    def steps(self) -> StageData:
+        """The data of all stages, stages first: broadcasting with (H, batch, ...), see `StageData`."""
+        return StageData(
+            **{name: v.transpose(0, 1) if self.by_stage(name) else v for name, v in self._stagewise().items()}
+        )
+
+    def _stagewise(self) -> dict[str, Tensor]:
+        return {name: getattr(self, name) for name, stages in STAGES.items() if stages}
+
+    def _batch_first(self, name: str) -> Tensor:
+        """One input, broadcasting with (batch, H, ...)."""
+        value = getattr(self, name)
+        return value.unsqueeze(1) if value.ndim == len(INPUTS[name]) + 1 else value
+
+    def no_multipliers(self) -> Tensor:
+        """Multipliers of the constraints that are all zero, (batch, H+1, n_c)."""
+        return torch.zeros(self.batch, self.horizon + 1, self.n_c, dtype=torch.float64)
 
     def objective(self, x: Tensor, u: Tensor) -> Tensor:
         """Cost (batch,) of trajectories x (batch, H+1, n_x), u (batch, H, n_u)."""
-        # A problem's own cost (batch, ...) holds for all of its stages.
-        own = {name: getattr(self, name) for name in ("Q", "R", "q", "r")}
-        Q, R, q, r = (v if self.shared(name) else v.unsqueeze(1) for name, v in own.items())
+        Q, R, q, r = (self._batch_first(name) for name in ("Q", "R", "q", "r"))
         stages = 0.5 * quadratic(Q, x[:, :-1]) + (q * x[:, :-1]).sum(-1) + 0.5 * quadratic(R, u) + (r * u).sum(-1)
+        if bool(self.S.any()):
+            stages = stages + (x[:, :-1] * matvec(self._batch_first("S"), u)).sum(-1)
         total = 0.5 * quadratic(self.Q_final, x[:, -1]) + (self.q_final * x[:, -1]).sum(-1)
         for k in range(self.horizon):  # one by one: the order of a sum must not depend on the batch
             total = total + stages[:, k]
         if self.barrier > 0:
             below, above = self.distances(u)
             total = total - self.barrier * (below.log() + above.log()).sum((1, 2))
+        return total + self._fines(x, u) if self.n_c else total
+
+    def constraints(self, x: Tensor, u: Tensor) -> Tensor:
+        """G_x x + G_u u − g of trajectories, (batch, H+1, n_c); −∞ where there is no constraint."""
+        value = matvec(self._batch_first("G_x"), x) - self._batch_first("g")
+        value[:, :-1] += matvec(self._batch_first("G_u"), u)
+        return value
+
+    def violation(self, x: Tensor, u: Tensor) -> Tensor:
+        """Largest violation (batch,) of the constraints, soft ones too; 0 where they hold."""
+        if self.n_c == 0:
+            return torch.zeros_like(x[:, 0, 0])
+        return self.constraints(x, u).clamp_min(0.0).amax((1, 2))
+
+    def _fines(self, x: Tensor, u: Tensor) -> Tensor:
+        price = self._batch_first("price")
+        fines = torch.where(torch.isinf(price), 0.0, price) * self.constraints(x, u).clamp_min(0.0)
+        total = fines[:, self.horizon].sum(-1)
+        for k in range(self.horizon):
+            total = total + fines[:, k].sum(-1)
         return total
+
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """u_min and u_max, broadcasting with (batch, H, n_u)."""
+        low, high = (self._batch_first(name) for name in ("u_min", "u_max"))
+        return low, high
 
     def distances(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Distances u − u_min and u_max − u of actions (batch, H, n_u) to their bounds."""
-        return u - self.u_min.unsqueeze(-2), self.u_max.unsqueeze(-2) - u
+        low, high = self.bounds()
+        return u - low, high - u
 
     def rollout(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """The trajectory that actions u (batch, H, n_u) cause: x (batch, H+1, n_x) and λ (batch, H, n_lam)."""
-        F = self.F.numpy()
         states, forces = [self.x0], []
         for k in range(self.horizon):
-            gap = self.gap(states[-1], u[:, k])
-            lam = torch.from_numpy(solve_lcp_arrays(F, gap.numpy(), self.relaxation)[0])
-            states.append(self.next_state(states[-1], u[:, k], lam))
+            stage = self.stage(k)
+            gap = stage.gap(states[-1], u[:, k])
+            F = stage.F[0] if stage.F.ndim == 3 and len(stage.F) == 1 else stage.F
+            lam = torch.from_numpy(solve_lcp_arrays(F.numpy(), gap.numpy(), self.relaxation)[0]) if self.n_lam else gap
+            states.append(stage.next_state(states[-1], u[:, k], lam))
             forces.append(lam)
         return torch.stack(states, 1), torch.stack(forces, 1)
 
     def clip(self, u: Tensor) -> Tensor:
         """Actions (batch, H, n_u) clipped into the bounds."""
-        return torch.minimum(torch.maximum(u, self.u_min.unsqueeze(-2)), self.u_max.unsqueeze(-2))
+        low, high = self.bounds()
+        return torch.minimum(torch.maximum(u, low), high)
 
     def start(self, u: Tensor) -> Tensor:
         """Actions (batch, H, n_u) to start from: clipped, and with a barrier 1 % of the range off the bounds."""
-        margin = 0.01 * (self.u_max - self.u_min).unsqueeze(-2) if self.barrier > 0 else 0.0
-        return torch.minimum(torch.maximum(u, self.u_min.unsqueeze(-2) + margin), self.u_max.unsqueeze(-2) - margin)
+        low, high = self.bounds()
+        margin = 0.01 * (high - low) if self.barrier > 0 else 0.0
+        return torch.minimum(torch.maximum(u, low + margin), high - margin)
 
     def clip_inside(self, u: Tensor, inside: Tensor) -> Tensor:
         """Actions (batch, H, n_u) moved from `inside` towards `u`, at most nine tenths of the way to a bound."""
@@ -143,10 +269,14 @@ class MPCProblem(SystemMatrices):
 
 
 # Differentiable inputs with the kind of each trailing dimension, in the order in which autograd and the kernels take
-# them.
+# them; and how many stages each has where it is given by stage.
 INPUTS: dict[str, tuple[str, ...]] = dimensions(MPCProblem)
+STAGES: dict[str, str] = {
+    name: "H+1" if name in ("G_x", "g", "price") else "" if name in ("Q_final", "q_final", "x0") else "H"
+    for name in INPUTS
+}
 
-if list(INPUTS.items()) != list(_kernels.mpc_fields().items()):
+if list(INPUTS.items()) != list(_kernels.mpc_fields().items()) or _kernels.mpc_stages() != STAGES:
     raise ImportError(
         "difflcs: the compiled kernels were built for other fields of the MPC problem than those of this version; "
         "build them again, in a checkout by `pip install -e .`"

@@ -15,11 +15,15 @@ __all__ = ["MPCSolution", "Primal", "Status"]
 
 
 class Primal(NamedTuple):
-    """A trajectory: x (..., H+1, n_x), u (..., H, n_u), lam (..., H, n_lam). Usable as a guess."""
+    """A trajectory: x (..., H+1, n_x), u (..., H, n_u), lam (..., H, n_lam). Usable as a guess.
+
+    mu (..., H+1, n_c) are the multipliers of the constraints. A guess may leave them out; solvers always return them.
+    """
 
     x: Tensor
     u: Tensor
     lam: Tensor
+    mu: Tensor = None  # pyright: ignore[reportAssignmentType]
 
 
 @dataclass(frozen=True)
@@ -30,22 +34,27 @@ class MPCSolution:
         x: (..., H+1, n_x) planned states, x[..., 0, :] = x0. Differentiable, as u, lam and objective.
         u: (..., H, n_u) planned actions.
         lam: (..., H, n_lam) complementarity variables.
+        mu: (..., H+1, n_c) multipliers of the constraints: what a unit more of g would save. Detached.
         objective: (...) cost of the plan.
         status: (...) `Status` as int8.
         iterations: (...) iterations of the solver, int32.
         kkt_residual: (...) largest violation of the optimality conditions by the numbers above, without units; at
             most 1e-6 where an exact backend has solved the plan. See `difflcs.mpc.kkt.residual`.
         solve_time: (...) seconds spent on each problem.
+        violation: (...) largest violation of a constraint over the stages, soft ones too [its units]; 0 without any. Of
+            an INFEASIBLE problem it is what remains at a plan that violates as little as can be.
     """
 
     x: Tensor
     u: Tensor
     lam: Tensor
+    mu: Tensor
     objective: Tensor
     status: Tensor
     iterations: Tensor
     kkt_residual: Tensor
     solve_time: Tensor
+    violation: Tensor
     problem: MPCProblem = field(repr=False)
 
     @property
@@ -61,25 +70,32 @@ class MPCSolution:
     def complementarity(self) -> Tensor:
         """(...) largest |λ·s − relaxation| over the horizon."""
         x, u, lam = self._flat()
-        slack = self.problem.gap(*_by_step(x[:, :-1], u, lam))
-        worst = (slack * lam.transpose(0, 1) - self.problem.relaxation).abs().amax((0, 2))
+        slack = self.problem.steps().gap(*_by_step(x[:, :-1], u, lam))
+        worst = largest((slack * lam.transpose(0, 1) - self.problem.relaxation).abs())
         return worst.reshape(self.status.shape).to(self.status.device)
 
     def dynamics_residual(self) -> Tensor:
         """(...) largest |x_{k+1} − (A x_k + B u_k + C λ_k + d)| over the horizon."""
         x, u, lam = self._flat()
-        predicted = self.problem.next_state(*_by_step(x[:, :-1], u, lam))
-        worst = (x[:, 1:].transpose(0, 1) - predicted).abs().amax((0, 2))
+        predicted = self.problem.steps().next_state(*_by_step(x[:, :-1], u, lam))
+        worst = largest((x[:, 1:].transpose(0, 1) - predicted).abs())
         return worst.reshape(self.status.shape).to(self.status.device)
 
     def shift(self) -> Primal:
         """The plan one step later, its last step repeated: a guess for the next solve of a receding horizon."""
-        return Primal(*(torch.cat([v[..., 1:, :], v[..., -1:, :]], -2).detach() for v in (self.x, self.u, self.lam)))
+        parts = (self.x, self.u, self.lam, self.mu)
+        return Primal(*(torch.cat([v[..., 1:, :], v[..., -1:, :]], -2).detach() for v in parts))
 
     def _flat(self) -> tuple[Tensor, Tensor, Tensor]:
         return tuple(  # pyright: ignore[reportReturnType]
             v.detach().to("cpu", torch.float64).reshape(-1, *v.shape[-2:]) for v in (self.x, self.u, self.lam)
         )
+
+
+def largest(values: Tensor) -> Tensor:
+    """Largest of (steps, batch, n) per element of the batch, (batch,); 0 where there is none, NaN where one is."""
+    values = values.transpose(0, 1).flatten(1)
+    return values.amax(1) if values.shape[1] else values.new_zeros(len(values))
 
 
 def _by_step(*trajectories: Tensor) -> tuple[Tensor, ...]:

@@ -22,7 +22,7 @@ class Result:
     """A certified batch of solutions; every number is finite.
 
     Attributes:
-        primal: x (batch, H+1, n_x), u (batch, H, n_u) inside the bounds, lam (batch, H, n_lam).
+        primal: x (batch, H+1, n_x), u (batch, H, n_u) inside the bounds, lam (batch, H, n_lam), mu (batch, H+1, n_c).
         status: (batch,) int8 `Status`.
         iterations: (batch,) int32.
         kkt_residual: (batch,) see `difflcs.mpc.kkt.residual`; the largest float where it is infinite.
@@ -106,7 +106,7 @@ def replace_failed(problem: MPCProblem, primal: Primal, failed: Tensor) -> Prima
     u = part.clip(torch.nan_to_num(primal.u[index], posinf=0.0, neginf=0.0))
     x, lam = part.rollout(u)
     fixed = []
-    for old, new in zip(primal, (x, u, lam), strict=True):
+    for old, new in zip(primal, (x, u, lam, torch.zeros_like(primal.mu[index])), strict=True):
         old = old.clone()
         old[index] = torch.nan_to_num(new)
         fixed.append(old)

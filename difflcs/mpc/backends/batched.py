@@ -94,7 +94,7 @@ class BatchedBackend(Backend):
         for _ in range(1, self.restarts):
             # The homotopy of a cold start leads most starts to one optimum; a short one keeps them apart.
             draw = torch.from_numpy(generator.random((problem.horizon, problem.n_u)))
-            low, high = (v.unsqueeze(-2) for v in (problem.u_min, problem.u_max))
+            low, high = problem.bounds()
             start = (low + draw * (high - low)).expand(problem.batch, -1, -1)
             if time.perf_counter() < ends:
                 again = self._run(problem, start, None, problem.relaxation * min(self.homotopy, 10.0), ends)
@@ -126,7 +126,7 @@ class BatchedBackend(Backend):
         self, problem: MPCProblem, result: Result, grads: tuple[Tensor, ...], solved: Tensor, pivot: bool
     ) -> dict[str, Tensor]:
         gradients = {name: torch.empty_like(getattr(problem, name)) for name in INPUTS}
-        x, u, lam, x_bar, u_bar, lam_bar, objective_bar = (_array(v) for v in (*result.primal, *grads))
+        x, u, lam, x_bar, u_bar, lam_bar, objective_bar = (_array(v) for v in (*result.primal[:3], *grads))
         _kernels.vjp_mpc(
             inputs=_inputs(problem),
             horizon=problem.horizon,
@@ -251,7 +251,7 @@ class _Found:
             self.u[failed] = part.clip(torch.nan_to_num(self.u[failed], posinf=0.0, neginf=0.0))
             for value in (self.x, self.lam):
                 value[failed] = torch.nan_to_num(value[failed])
-        return Primal(self.x, self.u, self.lam)
+        return Primal(self.x, self.u, self.lam, problem.no_multipliers())
 
 
 def _inputs(problem: MPCProblem) -> list[np.ndarray]:

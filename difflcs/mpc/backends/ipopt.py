@@ -93,7 +93,7 @@ class IpoptBackend(Backend):
         status = torch.tensor(words, dtype=torch.int8)
         x, u, lam = (torch.from_numpy(v) for v in (solved.x, solved.u, solved.lam))
         iterations, seconds = torch.from_numpy(solved.iterations), torch.from_numpy(solved.seconds)
-        primal = Primal(torch.cat([problem.x0.unsqueeze(1), x], 1), u, lam)
+        primal = Primal(torch.cat([problem.x0.unsqueeze(1), x], 1), u, lam, problem.no_multipliers())
         usable = (status == Status.CONVERGED) & torch.isfinite(u).all(-1).all(-1)
         index = torch.nonzero(usable).squeeze(-1)
         if len(index):

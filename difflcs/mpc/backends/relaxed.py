@@ -184,7 +184,9 @@ class RelaxedBackend(Backend):
         start = problem.start(nominal)
         x, lam = problem.rollout(start)
         inputs = {name: getattr(problem, name) for name in INPUTS}
-        parameters = _parameters(inputs, nominal, problem.relaxation, penalty, Primal(x, start, lam))
+        parameters = _parameters(
+            inputs, nominal, problem.relaxation, penalty, Primal(x, start, lam, problem.no_multipliers())
+        )
         layer = _layer(problem.n_x, problem.n_u, problem.n_lam, problem.horizon, problem.barrier)
         usable = torch.stack([torch.isfinite(v).flatten(1).all(1) for v in parameters]).all(0)
         index = torch.nonzero(usable).squeeze(-1)
@@ -448,7 +450,17 @@ class _Point:
         projected = z - (z - gradient + matvec(S.mT, mu)).clamp(low, high)
         worst = torch.cat([projected, torch.minimum(s, mu)], 1).abs().amax(-1) / size
         residual = torch.maximum(worst, (-s).amax(-1))
-        return cls(Primal(torch.stack(x, 1), u, lam), mu, s, S, gradient, hessian, low, high, residual)
+        return cls(
+            Primal(torch.stack(x, 1), u, lam, problem.no_multipliers()),
+            mu,
+            s,
+            S,
+            gradient,
+            hessian,
+            low,
+            high,
+            residual,
+        )
 
     def newton(self, problem: MPCProblem) -> tuple[Tensor, Tensor, Tensor]:
         """U, λ and multiplier of s ≥ 0 that solve the program if its active constraints are those of this point."""
