@@ -7,17 +7,20 @@
 namespace difflcs::DIFFLCS_ISA {
 namespace {
 
-// n_x, n_u, n_lam, n_x + n_u and the horizon; compile-time where the template argument is not zero.
+constexpr double kTiny = 1e-300;
+
+// n_x, n_u, n_lam, n_x + n_u, n_c and the horizon; compile-time where the template argument is not zero.
 template <int X, int U, int L>
 struct Sizes {
   static constexpr int64_t kX = X, kU = U, kL = L, kW = X && U ? X + U : 0;
   static constexpr bool kPivot = false;
-  int64_t rx, ru, rl, h;
-  explicit Sizes(const MpcBatch& b) : rx(b.n_x), ru(b.n_u), rl(b.n_lam), h(b.horizon) {}
+  int64_t rx, ru, rl, rc, h;
+  explicit Sizes(const MpcBatch& b) : rx(b.n_x), ru(b.n_u), rl(b.n_lam), rc(b.n_c), h(b.horizon) {}
   int64_t x() const { return X ? X : rx; }
   int64_t u() const { return U ? U : ru; }
   int64_t l() const { return L ? L : rl; }
   int64_t w() const { return x() + u(); }
+  int64_t c() const { return rc; }
 };
 
 // Any sizes, and elimination with row exchanges.
