@@ -120,7 +120,7 @@ class Adjoint {
       for (int64_t i = 0; i < nc; i++) {
         const Vec m = problem.multiplier(k, i);
         riccati.force(k, i) = m, dm(k, i) = all(0);
-        riccati.stiffness(k, i) = select((m > 0) & (m < problem.price[k][i]), all(kHold) * weight[0], all(0));
+        riccati.stiffness(k, i) = select((m > 0) & (m < kAtPrice * problem.price[k][i]), all(kHold) * weight[0], all(0));
       }
     for (int pass = 0; pass < 8; pass++) {
       for (int64_t k = 0; k <= n.h; k++) {
@@ -308,7 +308,7 @@ class Adjoint {
       sink.add(kg, k, i, unit * change);
       // At its price a row is a cost, price times violation.
       const Vec fined = (objective_bar * data.constraint(i, x, u) - along(k, i)) / unit;
-      sink.add(kprice, k, i, select((m > 0) & (m >= data.price[i]), fined, all(0)));
+      sink.add(kprice, k, i, select((m > 0) & (m >= kAtPrice * data.price[i]), fined, all(0)));
     }
   }
 

@@ -252,9 +252,9 @@ struct Certificate {
         const Vec m = mu[k * nc + i], value = select(given, sum.value, all(-kHuge));
         row[k * nc + i] = value;
         row_terms[i] = max(row_terms[i], sum.terms), row_force[i] = max(row_force[i], m);
-        const Vec held = select(m < price[i], abs(value), max(-value, all(0)));
+        const Vec held = select(m < kAtPrice * price[i], abs(value), max(-value, all(0)));
         row_missed[i] = max(row_missed[i], select(m > 0, held, max(value, all(0))));
-        met(select((m >= 0) & (m <= price[i]), all(0), all(1)) + 0.0 * m);
+        met(select((m >= 0) & (m * kAtPrice <= price[i]), all(0), all(1)) + 0.0 * m);
         poison += 0.0 * sum.value;
       }
     }
@@ -265,8 +265,8 @@ struct Certificate {
         Vec acts = all(k > 0);  // what nothing moves is not weakly active
         for (int64_t j = 0; j < nu && k == 0; j++) acts += abs(all(0) + G_u[i * nu + j]);
         const Vec m = mu[k * nc + i], value = row[k * nc + i], close = 1e-5 * row_terms[i];
-        const Mask at_zero = ~(m > 0) & (value >= -close), at_price = (m >= vector[kprice][k][i]) & (value <= close);
-        const Mask between = (m > 0) & (m < vector[kprice][k][i]) & (m <= 1e-5 * row_force[i]);
+        const Mask at_zero = ~(m > 0) & (value >= -close), at_price = (m >= kAtPrice * vector[kprice][k][i]) & (value <= close);
+        const Mask between = (m > 0) & (m < kAtPrice * vector[kprice][k][i]) & (m <= 1e-5 * row_force[i]);
         weak |= (at_zero | at_price | between) & (acts > 0);
       }
     }

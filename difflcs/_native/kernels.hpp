@@ -34,6 +34,7 @@ constexpr double kLcpTerms = 1e-10;  // |F lam + q - w| in parts of the terms th
 constexpr double kLcpData = 1e-8;    // the same in parts of the largest |q| (and of sqrt(relaxation F_ii))
 constexpr double kRounding = 4e-16;  // of a sum, in parts of its terms
 constexpr double kHuge = 1e300;              // beyond it a bound is infinite
+constexpr double kAtPrice = 1.0 - 1e-12;     // a multiplier above this part of its price is the price, but for rounding
 constexpr double kSmallest = 1e-100, kLargest = 1e150;  // range of the diagonal of F; of lam and w
 
 // A batch of LCS-MPC problems (see difflcs.mpc.MPCProblem). All arrays are row-major with the batch in front.

@@ -14,13 +14,15 @@ namespace {
 
 // Projected gradient, in parts of its scale (see certificate.hpp), at which a problem is solved.
 constexpr double kStationary = 1e-7;
-// Violation of a constraint, in parts of the sizes of its terms, at which it is met.
-constexpr double kMet = 1e-10;
-// Weight of the augmented Lagrangian in parts of the largest weight of the cost: at first, and at most. A problem whose
-// constraints are not met by the largest is infeasible.
-constexpr double kPenalty = 1e2, kLargestPenalty = 1e9;
-// A violation that a multiplier step leaves larger than this part of itself asks for ten times the weight.
-constexpr double kSlow = 0.1;
+// Violation of a constraint, in parts of the sizes of its terms, at which it is met; and where more is rounding.
+constexpr double kMet = 1e-9, kMetRounded = 1e-7;
+// Weight of the augmented Lagrangian, in parts of the largest weight of the cost: at first, and where a violation that
+// three steps of the multipliers in a row have not halved means that the problem is infeasible.
+constexpr double kPenalty = 10.0, kLargestPenalty = 1e7;
+// A step of the multipliers is due where the projected gradient is below this part of the change that it would make.
+constexpr double kDue = 0.03;
+// A violation that is more than a tenth of the one before asks for ten times the weight, one that stays for more.
+constexpr double kSlow = 0.1, kStays = 0.9, kRaise = 10.0, kRaiseMore = 30.0;
 // Failed searches in a row, each with 8 times the damping, before a problem is given up.
 constexpr int64_t kFailures = 12;
 
@@ -59,6 +61,7 @@ class Solver {
     int64_t element;  // -1: idle
     int64_t iterations, in_stage, failures;
     double violated;  // at the last step of the multipliers
+    int64_t stalled;  // steps of the multipliers in a row that hardly helped
   };
   Lane lane[kLanes];
   Vec eps, regularisation, J;
@@ -117,7 +120,7 @@ class Solver {
   bool take(const MpcSolve& o, int64_t* counter, int l) {
     const int64_t e = __atomic_fetch_add(counter, int64_t{1}, __ATOMIC_RELAXED);
     const int64_t nu = n.u(), actions = n.h * nu, forces = n.h * n.l();
-    lane[l] = {e < batch.count ? e : -1, 0, 0, 0, 1e300};
+    lane[l] = {e < batch.count ? e : -1, 0, 0, 0, 1e300, 0};
     fresh[l] = -1;
     eps[l] = o.first_relaxation, regularisation[l] = 0;
     if (e >= batch.count) return false;
@@ -162,15 +165,19 @@ class Solver {
     repriced |= which;
   }
 
+  // Whether the constraints of a lane are met, but for what no step of the multipliers diminishes any more.
+  bool met(const Sweep& sweep, int l) const { return sweep.violated[l] <= (lane[l].stalled > 0 ? kMetRounded : kMet); }
+
   // Whether the constraints of a lane at the target ask for other multipliers, which it then gets, or for more weight.
   bool owes(const Sweep& sweep, int l, bool stationary) {
     const double violated = sweep.violated[l];
-    if (violated <= kMet || !(stationary || sweep.projected[l] <= 0.1 * sweep.owing[l])) return false;
+    if (met(sweep, l) || !(stationary || sweep.projected[l] <= kDue * sweep.owing[l])) return false;
     Mask which = Mask{};
     which[l] = -1;
     pay(which);
     double& rho = reinterpret_cast<double*>(&problem.rho)[l];
-    if (violated > kSlow * lane[l].violated) rho *= 10;
+    lane[l].stalled = violated > 0.5 * lane[l].violated ? lane[l].stalled + 1 : 0;
+    if (violated > kSlow * lane[l].violated) rho *= violated > kStays * lane[l].violated ? kRaiseMore : kRaise;
     lane[l].violated = violated, lane[l].iterations++, lane[l].failures = 0;
     return true;
   }
@@ -185,10 +192,10 @@ class Solver {
       // A search that fails this close to the optimum has met the rounding of the cost.
       const double patience = a.failures < kFailures ? 1.0 : 1e3;
       const bool stationary = sweep.projected[l] <= patience * tol && sweep.stationary[l] <= patience * kStationary;
-      const bool converged = stationary && sweep.violated[l] <= kMet;
+      const bool converged = stationary && met(sweep, l);
       const bool broken = !(J[l] < 1e300 && J[l] > -1e300);
       const double largest = kLargestPenalty * lane_of(problem.weight[0], l);
-      const bool infeasible = stationary && !converged && problem.rho[l] >= largest;
+      const bool infeasible = sweep.violated[l] > o.certified && problem.rho[l] >= largest && a.stalled >= 3;
       if (!infeasible && !broken && a.iterations < o.max_iter && n.c() > 0 && owes(sweep, l, stationary)) {
         frozen[l] = -1;
         continue;
