@@ -59,10 +59,9 @@ struct Certificate {
   void load_matrices(int64_t e, int lane) {
     for (int i = 0; i < kInputs; i++)
       if (kMpcFields[i].columns != Size::one) load(matrix[i], i, e, lane);
-    for (int64_t k = 0; k < n.h; k++) {
-      const T* weights = k == n.h - 1 ? matrix[kQ_final][0] : matrix[kQ][k + 1];
-      curvature_at_rest(n, matrix[kB][k], n.u(), weights, matrix[kR][k], rest[k], lane);
-    }
+    const bool alike = matrix[kB].count == 1 && matrix[kQ].count == 1 && matrix[kR].count == 1;
+    const auto entries = [&](Input which) { return [this, which](int64_t k) { return matrix[which][k]; }; };
+    curvature_at_rest(n, entries(kB), n.u(), entries(kQ), matrix[kQ_final][0], entries(kR), alike, rest, lane);
   }
 
   // Goes to stage k; at the last only the constraints mean something.

@@ -184,16 +184,9 @@ struct Problem {
     for (int64_t k = 0; k < Q.count; k++)
       matrix(Q[k], kQ, k, one, cost), matrix(R[k], kR, k, one, cost), matrix(cross[k], kS, k, one, cost);
     matrix(Q_final, kQ_final, 0, one, cost);
-    // With one system and one cost, every stage but the last has the same.
-    const bool alike = scale.count == 1 && Q.count == 1;
-    for (int64_t k = 0; k < n.h; k++) {
-      if (alike && k > 0 && k < n.h - 1) {
-        for (int64_t j = 0; j < n.u(); j++) put(rest[k], j, lane, lane_of(rest[0][j], lane));
-        continue;
-      }
-      const T* weights = k == n.h - 1 ? Q_final.entries : Q[k + 1].entries;
-      curvature_at_rest(n, stage(k).B().entries, nw, weights, R[k].entries, rest[k], lane);
-    }
+    curvature_at_rest(
+        n, [&](int64_t k) { return stage(k).B().entries; }, nw, [&](int64_t k) { return Q[k].entries; },
+        Q_final.entries, [&](int64_t k) { return R[k].entries; }, scale.count == 1 && Q.count == 1, rest, lane);
     for (int64_t k = 0; k < G.count && nc > 0; k++) {
       const StageData<T, S> to = k < n.h ? stage(k) : last();
       const double *G_x = input(kG_x, e, k), *G_u = input(kG_u, e, k);

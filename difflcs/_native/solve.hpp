@@ -15,7 +15,7 @@ namespace {
 // Projected gradient, in parts of its scale (see certificate.hpp), at which a problem is solved.
 constexpr double kStationary = 1e-7;
 // Violation of a constraint, in parts of the sizes of its terms, at which it is met; and where more is rounding.
-constexpr double kMet = 1e-9, kMetRounded = 1e-7;
+constexpr double kMet = 1e-12, kMetRounded = 1e-7;
 // Weight of the augmented Lagrangian, in parts of the largest weight of the cost: at first, and where a violation that
 // three steps of the multipliers in a row have not halved means that the problem is infeasible.
 constexpr double kPenalty = 10.0, kLargestPenalty = 1e7;
