@@ -1,6 +1,7 @@
 """Differentiable model predictive control through learned linear complementarity systems."""
 
-from difflcs.cost import GoalCost, QuadraticCost
+from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds
+from difflcs.cost import CostSequence, GoalCost, QuadraticCost
 from difflcs.errors import BackendNotFoundError, DiffLCSError, SolveError
 from difflcs.lcp import LCPSolution, solve_lcp
 from difflcs.lcs import LCSModel, LCSParams
@@ -14,15 +15,19 @@ __version__ = "0.1.0"
 
 __all__ = [
     "BackendNotFoundError",
+    "ConstraintSequence",
+    "CostSequence",
     "DiffLCSError",
     "GoalCost",
     "LCPSolution",
     "LCSMPCLayer",
     "LCSModel",
     "LCSParams",
+    "LinearConstraints",
     "MPCSolution",
     "QuadraticCost",
     "SolveError",
+    "StageBounds",
     "Status",
     "available_backends",
     "prediction_loss",

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 import torch
 from torch import Tensor
 
+from difflcs._functorch import is_wrapped
 from difflcs.errors import DeviceError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
 
 FLOATS = (torch.float32, torch.float64)
@@ -32,7 +33,8 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
         name: what to call it in the message.
         value: the candidate.
         dims: names and sizes of its trailing dimensions.
-        finite: refuse NaN and infinity.
+        finite: refuse NaN and infinity. Inside `torch.func` transforms numbers cannot be read: they are refused where
+            they can, in the autograd function that works on them.
 
     Returns:
         The same tensor, unchanged.
@@ -55,7 +57,7 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
         raise ShapeError(
             f"{name}: expected shape ({labels}), got {tuple(value.shape)}; reshape it or rebuild the model"
         )
-    if finite and not _all_finite(value.detach()):
+    if finite and not is_wrapped(value) and not _all_finite(value.detach()):
         bad = torch.nonzero(~torch.isfinite(value.detach()))
         raise NonFiniteError(
             f"{name}: expected finite numbers, got {len(bad)} NaN or infinite of {value.numel()}, "
