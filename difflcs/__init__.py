@@ -3,7 +3,7 @@
 from difflcs.cost import GoalCost, QuadraticCost
 from difflcs.errors import BackendNotFoundError, DiffLCSError, SolveError
 from difflcs.lcp import LCPSolution, solve_lcp
-from difflcs.lcs import LCSModel, LCSParams
+from difflcs.lcs import LCSModel, LCSModule, LCSParams, LCSSequence
 from difflcs.losses import prediction_loss, violation_loss
 from difflcs.mpc.backends import available_backends, register_backend
 from difflcs.mpc.layer import LCSMPCLayer
@@ -19,7 +19,9 @@ __all__ = [
     "LCPSolution",
     "LCSMPCLayer",
     "LCSModel",
+    "LCSModule",
     "LCSParams",
+    "LCSSequence",
     "MPCSolution",
     "QuadraticCost",
     "SolveError",

@@ -53,7 +53,7 @@ def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0) -> LCPSolution:
 
     Args:
         F: (..., n, n), or (n, n) shared by the batch.
-        q: (..., n).
+        q: (..., n), n ≥ 0.
         relaxation: 0 for the exact problem, else the product λᵢ wᵢ, in the units of λ·w.
 
     Returns:
@@ -65,12 +65,15 @@ def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0) -> LCPSolution:
     """
     check_number("relaxation", relaxation)
     check_tensor("q", q)
-    if q.ndim < 1 or q.shape[-1] < 1:
-        raise ShapeError(f"q: expected shape (..., n) with n ≥ 1, got {tuple(q.shape)}")
+    if q.ndim < 1:
+        raise ShapeError(f"q: expected shape (..., n), got {tuple(q.shape)}; add the dimension of the variables")
     n = q.shape[-1]
     check_tensor("F", F, [("n", n), ("n", n)])
     check_same_device([("q", q), ("F", F)])
     batch = broadcast_batch([("q", q.shape[:-1]), ("F", F.shape[:-2])])
+    if n == 0:  # no contacts: nothing to solve
+        lam = (F.to(q.dtype) @ q.unsqueeze(-1)).squeeze(-1).expand(*batch, 0)
+        return LCPSolution(lam, lam + q, torch.full(batch, int(Status.CONVERGED), dtype=torch.int8, device=q.device))
     q_flat = q.expand(*batch, n).reshape(-1, n).double()
     F_flat = F.double() if F.ndim == 2 else F.expand(*batch, n, n).reshape(-1, n, n).double()
     narrow = torch.float32 in (F.dtype, q.dtype)
