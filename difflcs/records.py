@@ -85,6 +85,7 @@ class _Record(SystemMatrices):
     # Dimensions of every field between those of the batch and its own.
     _STAGES: ClassVar[tuple[str, ...]] = ()
 
+    @runs_eagerly
     def __post_init__(self) -> None:
         tensors = self.tensors()
         for name, value in tensors.items():
