@@ -4,7 +4,7 @@ from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBoun
 from difflcs.cost import CostSequence, GoalCost, QuadraticCost
 from difflcs.errors import BackendNotFoundError, DiffLCSError, SolveError
 from difflcs.lcp import LCPSolution, solve_lcp
-from difflcs.lcs import LCSModel, LCSParams
+from difflcs.lcs import LCSModel, LCSModule, LCSParams, LCSSequence
 from difflcs.losses import prediction_loss, violation_loss
 from difflcs.mpc.backends import available_backends, register_backend
 from difflcs.mpc.layer import LCSMPCLayer
@@ -22,7 +22,9 @@ __all__ = [
     "LCPSolution",
     "LCSMPCLayer",
     "LCSModel",
+    "LCSModule",
     "LCSParams",
+    "LCSSequence",
     "LinearConstraints",
     "MPCSolution",
     "QuadraticCost",

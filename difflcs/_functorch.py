@@ -1,13 +1,13 @@
-"""Functions that are computed outside autograd, made to work under `torch.func`, vectorised jacobians and `torch.compile`.
+"""Functions that are computed outside autograd, for `torch.func`, vectorised jacobians and `torch.compile`.
 
-A `Solver` says how to solve, and how to pull a gradient back, for real numbers with one batch dimension. `solve` makes of
-it a node of the graph. Whatever transform is active, both are only ever called with plain tensors:
+A `Solver` says how to solve, and how to pull a gradient back, for real numbers with one batch dimension. `solve` makes
+of it a node of the graph. Whatever transform is active, both are only ever called with plain tensors:
 
 - `torch.func.vmap` folds the dimension that it adds into the batch, in the solve and in its pullback;
-- the pullback is a function of its own, so that `torch.func.grad`, which records every backward pass, can record it. Its
-  own backward refuses: there are no second derivatives;
-- `is_grads_batched`, and with it `torch.autograd.functional.jacobian(vectorize=True)`, maps the backward pass by an older
-  vmap, which no rule of ours can reach; there the batched gradients are unwrapped by hand.
+- the pullback is a function of its own, so that `torch.func.grad`, which records every backward pass, can record it.
+  Its own backward refuses: there are no second derivatives;
+- `is_grads_batched`, and with it `torch.autograd.functional.jacobian(vectorize=True)`, maps the backward pass by an
+  older vmap, which no rule of ours can reach; there the batched gradients are unwrapped by hand.
 """
 
 from __future__ import annotations
@@ -233,7 +233,7 @@ def _pull_back_legacy(
         batched = functorch.is_legacy_batchedtensor(value)
         dims.append(0 if batched else None)
         if batched:
-            values[i] = torch._remove_batch_dim(value, level, 1, 0)
+            values[i] = torch._remove_batch_dim(value, level, 1, 0)  # pyright: ignore[reportPrivateImportUsage]
             count = values[i].shape[0]
     gradients = _pull_back_many(count, dims, solver, len(tensors), len(outputs), values)
-    return [torch._add_batch_dim(g, 0, level) for g in gradients]
+    return [torch._add_batch_dim(g, 0, level) for g in gradients]  # pyright: ignore[reportPrivateImportUsage]
