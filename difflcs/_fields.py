@@ -81,11 +81,6 @@ def check_stages(values: dict[str, tuple[Tensor, int, int]]) -> int:
     return horizon
 
 
-def stage_dims(name: str, by_stage: frozenset[str], stages: int) -> list[tuple[str, int]]:
-    """The dimension of stages for `check_tensor`, if the field has one."""
-    return [("stages", stages)] if name in by_stage else []
-
-
 def check_not_nan(name: str, value: object, dims: Iterable[tuple[str, int]] = ()) -> Tensor:
     """As `check_tensor`, for numbers that may be infinite."""
     tensor = check_tensor(name, value, list(dims), finite=False)

@@ -10,7 +10,7 @@ from torch import Tensor
 from difflcs._checks import broadcast_batch, check_same_device, check_tensor, describe
 from difflcs._fields import TensorFields, check_by_stage, check_not_nan, check_stages
 from difflcs._functorch import is_wrapped
-from difflcs.errors import BoundsError, DTypeError, InvalidInputError, ShapeError
+from difflcs.errors import BoundsError, InvalidInputError, ShapeError
 
 _OWN = {"G": 2, "g": 1, "E": 2, "weight": 1}
 _EXTRA = {"G": 1, "g": 1, "E": 0, "weight": 1}  # stages beyond H
@@ -204,10 +204,3 @@ class ConstraintSequence(_Constraints):
         given = [name for name, value in values.items() if isinstance(value, Tensor)]
         self.by_stage = check_by_stage(by_stage, _OWN, given)
         self._fill(G, g, E, weight)
-
-
-def check_kind(name: str, value: object, kinds: tuple[type, ...]) -> None:
-    """Refuse a value that is none of some classes."""
-    if not isinstance(value, kinds):
-        expected = " or ".join(kind.__name__ for kind in kinds)
-        raise DTypeError(f"{name}: expected {expected}, got {describe(value)}; build one from your tensors")
