@@ -322,7 +322,7 @@ class GoalCost(TensorFields):
         }
 
     def _weights(self) -> dict[str, Tensor]:
-        return {"Q": self.Q, "R": self.R, "Q_final": self.Q_final}
+        return {"Q": self.Q, "R": self.R, "Q_final": self.Q_final, "r": self.R.new_zeros(self.n_u)}
 
     def _goal(self, name: str, value: Tensor, stages: list[tuple[str, int]]) -> Tensor:
         check_tensor(name, value, [*stages, ("n_goal", self.n_goal)])
