@@ -100,7 +100,7 @@ class Plan:
         device = tensors[_X0].device  # pyright: ignore[reportOptionalMemberAccess]
         if device.type != "cpu":
             outputs = tuple(v.to(device) for v in outputs)
-        return outputs if len(self.batch) == 1 else tuple(v.reshape(*self.batch, *v.shape[1:]) for v in outputs)
+        return outputs if len(self.batch) == 1 else tuple(v.reshape((*self.batch, *v.shape[1:])) for v in outputs)
 
     @property
     def _size(self) -> int:
@@ -207,8 +207,8 @@ class Plan:
             rank = self.rank(name)
             lead, own = shape[: len(shape) - rank], shape[len(shape) - rank :]
             ones = [1] * (len(self.batch) - kept - len(lead))
-            gradient = gradient.reshape(*self.batch, *own).sum_to_size(*front, *ones, *lead, *own)
-        return gradient.reshape(*front, *shape).to(target.device, target.dtype)
+            gradient = gradient.reshape((*self.batch, *own)).sum_to_size((*front, *ones, *lead, *own))
+        return gradient.reshape((*front, *shape)).to(target.device, target.dtype)
 
 
 _X0 = ARGUMENTS.index("x0")
