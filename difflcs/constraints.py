@@ -53,6 +53,7 @@ class StageBounds(TensorFields):
     Args:
         u_min: (..., H, n_u) lower bounds by stage; a number for all of them; None or −∞ for none.
         u_max: (..., H, n_u) upper bounds, likewise. Either is learned if it is an nn.Parameter.
+        by_stage: names of the bounds that change, "u_min", "u_max"; a tensor that does not is (..., n_u).
 
     Raises:
         ShapeError, DTypeError, DeviceError, NonFiniteError: a bound does not fit the other.
@@ -63,19 +64,30 @@ class StageBounds(TensorFields):
     u_min: Tensor
     u_max: Tensor
 
-    def __init__(self, u_min: Tensor | float | None = None, u_max: Tensor | float | None = None):
+    def __init__(
+        self,
+        u_min: Tensor | float | None = None,
+        u_max: Tensor | float | None = None,
+        *,
+        by_stage: Collection[str] = ("u_min", "u_max"),
+    ):
         super().__init__()
         given = {name: value for name, value in (("u_min", u_min), ("u_max", u_max)) if isinstance(value, Tensor)}
-        self.by_stage = check_by_stage(("u_min", "u_max"), ("u_min", "u_max"), given)
+        self.by_stage = check_by_stage(by_stage, ("u_min", "u_max"), given)
         for name, value in given.items():
             check_not_nan(name, value)
-        self.horizon = check_stages({name: (value, 1, 0) for name, value in given.items()})
-        like = next(iter(given.values()))
+        self.horizon = check_stages({name: (given[name], 1, 0) for name in sorted(self.by_stage)})
+        like = given[min(self.by_stage)]
         self.n_u = like.shape[-1]
         for name, value, none in (("u_min", u_min, -torch.inf), ("u_max", u_max, torch.inf)):
-            dims = [("H", self.horizon), ("n_u", self.n_u)]
+            dims = [("H", self.horizon)] * (name in self.by_stage) + [("n_u", self.n_u)]
             self._register(name, as_bound(name, none if value is None else value, dims, like), persistent=False)
-        check_bounds(self.u_min, self.u_max)
+        check_bounds(*self.by_steps())
+
+    def by_steps(self) -> tuple[Tensor, Tensor]:
+        """Lower and upper bounds, broadcasting with (..., H, n_u)."""
+        low, high = (v if k in self.by_stage else v.unsqueeze(-2) for k, v in self.tensors().items())
+        return low, high
 
     def tensors(self) -> dict[str, Tensor]:
         """Name → tensor."""

@@ -119,8 +119,8 @@ class LCSMPCLayer(nn.Module):
         inputs.add_constraints(self.constraints)
         if self.bounds is not None:
             inputs.add_bounds(self.bounds)
-        low, high = (self.u_min, self.u_max) if self.bounds is None else (self.bounds.u_min, self.bounds.u_max)
-        check_bounds(low, high, strict=self.barrier > 0)
+        limits = (self.u_min, self.u_max) if self.bounds is None else self.bounds.by_steps()
+        check_bounds(*limits, strict=self.barrier > 0)
 
     def extra_repr(self) -> str:
         """What print(layer) shows."""
