@@ -26,52 +26,98 @@ class Sizes(NamedTuple):
     """What decides the symbolic program.
 
     Attributes:
-        n_x, n_u, n_lam, horizon: sizes of the problem.
-        parameters: name, rows and columns of each parameter of the program in their packed order; each is packed
-            row-major.
+        n_x, n_u, n_lam, n_c, horizon: sizes of the problem.
+        parameters: name, rows, columns and copies of each parameter of the program in their packed order; each is
+            packed row-major. One copy serves all stages, several are those of the stages.
     """
 
     n_x: int
     n_u: int
     n_lam: int
+    n_c: int
     horizon: int
-    parameters: tuple[tuple[str, int, int], ...]
+    parameters: tuple[tuple[str, int, int, int], ...]
 
 
 class Options(NamedTuple):
-    """What decides the solver besides `Sizes`."""
+    """What decides the solver besides `Sizes`.
+
+    Attributes:
+        tol, max_iter, mu_init: IPOPT's own.
+        barrier: whether the cost has a barrier of the action bounds.
+        slack: whether a constraint may be violated, by a variable v ≥ 0 at its price.
+        elastic: whether Σ v² / 2 is the whole cost.
+    """
 
     tol: float
     max_iter: int
     mu_init: float
     barrier: bool
+    slack: bool
+    elastic: bool
+
+
+def _unpack(packed: casadi.SX, sizes: Sizes) -> dict[str, list[casadi.SX]]:
+    """Each parameter by its name, as a list of its copies."""
+    found, at = {}, 0
+    for name, rows, columns, copies in sizes.parameters:
+        found[name] = []
+        for _ in range(copies):
+            found[name].append(casadi.reshape(packed[at : at + rows * columns], columns, rows).T)
+            at += rows * columns
+    return found
 
 
 @functools.lru_cache(maxsize=32)
 def _solver(sizes: Sizes, options: Options) -> casadi.Function:
-    """Direct transcription of Eq. mpc_lcs over (u_k, λ_k, s_k, x_{k+1}), k = 0 … H−1."""
-    packed = casadi.SX.sym("p", sum(rows * columns for _, rows, columns in sizes.parameters))
-    p, at = {}, 0
-    for name, rows, columns in sizes.parameters:
-        p[name] = casadi.reshape(packed[at : at + rows * columns], columns, rows).T
-        at += rows * columns
-    x, variables, constraints, cost = p["x0"], [], [], casadi.SX(0)
+    """Direct transcription of Eq. mpc_lcs over (u_k, λ_k, s_k, x_{k+1}), k = 0 … H−1, and v_k, k = 0 … H.
+
+    Of the functions g the equations come first, stage by stage, then the constraints of the stages 0 … H.
+    """
+    packed = casadi.SX.sym("p", sum(rows * columns * copies for _, rows, columns, copies in sizes.parameters))
+    copies = _unpack(packed, sizes)
+    variables, slacks, equations, limits, cost = [], [], [], [], casadi.SX(0)
+
+    def limit(k: int, value: casadi.SX) -> None:
+        nonlocal cost
+        v = casadi.SX.sym(f"v{k}", sizes.n_c) if options.slack else casadi.SX(sizes.n_c, 1)
+        if options.slack:
+            slacks.append(v)
+            cost += casadi.sumsqr(v) / 2 if options.elastic else casadi.dot(at(k, "price"), v)
+        limits.append(value - at(k, "g") - v)
+
+    def at(k: int, name: str) -> casadi.SX:
+        return copies[name][k if len(copies[name]) > 1 else 0]
+
+    x = at(0, "x0")
     for k in range(sizes.horizon):
+        p = {name: at(k, name) for name in copies}
         u, lam = casadi.SX.sym(f"u{k}", sizes.n_u), casadi.SX.sym(f"lam{k}", sizes.n_lam)
         s, x_next = casadi.SX.sym(f"s{k}", sizes.n_lam), casadi.SX.sym(f"x{k + 1}", sizes.n_x)
-        cost += casadi.bilin(p["Q"], x, x) / 2 + casadi.dot(p["q"], x)
-        cost += casadi.bilin(p["R"], u, u) / 2 + casadi.dot(p["r"], u)
-        if options.barrier:
+        if not options.elastic:
+            cost += casadi.bilin(p["Q"], x, x) / 2 + casadi.dot(p["q"], x)
+            cost += casadi.bilin(p["R"], u, u) / 2 + casadi.dot(p["r"], u) + casadi.bilin(p["S"], x, u)
+        if options.barrier and not options.elastic:
             cost -= p["barrier"] * casadi.sum1(casadi.log(u - p["u_min"]) + casadi.log(p["u_max"] - u))
-        constraints += [
+        equations += [
             p["A"] @ x + p["B"] @ u + p["C"] @ lam + p["d"] - x_next,
             p["D"] @ x + p["E"] @ u + p["F"] @ lam + p["c"] - s,
             lam * s - p["relaxation"],
         ]
         variables += [u, lam, s, x_next]
+        if sizes.n_c:
+            limit(k, p["G_x"] @ x + p["G_u"] @ u)
         x = x_next
-    cost += casadi.bilin(p["Q_final"], x, x) / 2 + casadi.dot(p["q_final"], x)
-    program = {"x": casadi.vertcat(*variables), "p": packed, "f": cost, "g": casadi.vertcat(*constraints)}
+    if sizes.n_c:
+        limit(sizes.horizon, at(sizes.horizon, "G_x") @ x)
+    if not options.elastic:
+        cost += casadi.bilin(at(0, "Q_final"), x, x) / 2 + casadi.dot(at(0, "q_final"), x)
+    program = {
+        "x": casadi.vertcat(*variables, *slacks),
+        "p": packed,
+        "f": cost,
+        "g": casadi.vertcat(*equations, *limits),
+    }
     return casadi.nlpsol(
         "lcs_mpc",
         "ipopt",
@@ -95,35 +141,50 @@ class Chunk(NamedTuple):
 
     Attributes:
         parameters: (m, …) packed as `Sizes.parameters` says.
-        u_min, u_max: (m, n_u).
+        u_min, u_max: (m, H, n_u).
+        row_max: (m, H+1, n_c) largest G_x x + G_u u − g − v: 0, or infinite where there is no constraint.
+        v_max: (m, H+1, n_c) largest v: 0 where a constraint is hard, else infinite.
         x: (m, H, n_x) start of x_1 … x_H.
         u: (m, H, n_u) start of the actions.
         lam, s: (m, H, n_lam) start of λ and s.
+        v: (m, H+1, n_c) start of v.
     """
 
     parameters: np.ndarray
     u_min: np.ndarray
     u_max: np.ndarray
+    row_max: np.ndarray
+    v_max: np.ndarray
     x: np.ndarray
     u: np.ndarray
     lam: np.ndarray
     s: np.ndarray
+    v: np.ndarray
 
 
 class Solved(NamedTuple):
-    """Result of a chunk: x_1 … x_H, u, λ, IPOPT's word for how it ended, iterations and seconds of each problem."""
+    """Result of a chunk.
+
+    Of each problem x_1 … x_H, u, λ, the multipliers of the constraints, IPOPT's word for how it ended, iterations and
+    seconds.
+    """
 
     x: np.ndarray
     u: np.ndarray
     lam: np.ndarray
+    mu: np.ndarray
     status: np.ndarray
     iterations: np.ndarray
     seconds: np.ndarray
 
-
-def no_words(count: int) -> np.ndarray:
-    """The statuses of problems that IPOPT has said nothing about."""
-    return np.full(count, "", "U64")
+    @classmethod
+    def start(cls, chunk: Chunk) -> Solved:
+        """The start of a chunk, about which IPOPT has said nothing."""
+        count = len(chunk.u)
+        return cls(
+            chunk.x.copy(), chunk.u.copy(), chunk.lam.copy(), np.zeros(chunk.v.shape),
+            np.full(count, "", "U64"), np.zeros(count, np.int32), np.zeros(count),
+        )  # fmt: skip
 
 
 def solve_chunk(sizes: Sizes, options: Options, chunk: Chunk) -> Solved:
@@ -154,30 +215,34 @@ def _heard_interrupts() -> Iterator[list[int]]:
 
 def _solve_chunk(sizes: Sizes, options: Options, chunk: Chunk, interrupts: list[int]) -> Solved:
     solver = _solver(sizes, options)
-    n_x, n_u, n_lam, horizon, _ = sizes
-    count = len(chunk.u)
+    n_x, n_u, n_lam, n_c, horizon, _ = sizes
     ends = np.cumsum([n_u, n_lam, n_lam, n_x])
-    constraint = np.zeros(horizon * (n_x + 2 * n_lam))
-    result = Solved(
-        np.zeros((count, horizon, n_x)), np.zeros((count, horizon, n_u)), np.zeros((count, horizon, n_lam)),
-        no_words(count), np.zeros(count, np.int32), np.zeros(count),
-    )  # fmt: skip
-    free = np.full(n_x, np.inf)
-    for i in range(count):
+    equations = horizon * (n_x + 2 * n_lam)
+    rows = (horizon + 1) * n_c
+    least = np.concatenate([np.zeros(equations), np.full(rows, -np.inf)])
+    free, positive = np.full((horizon, n_x), np.inf), np.zeros((horizon, 2 * n_lam))
+    result = Solved.start(chunk)
+
+    def join(*stages: np.ndarray, v: np.ndarray) -> np.ndarray:
+        whole = np.concatenate(stages, axis=1).ravel()
+        return np.concatenate([whole, v.ravel()]) if options.slack else whole
+
+    for i in range(len(chunk.u)):
         started = time.perf_counter()
-        positive = np.zeros(2 * n_lam)
-        lower = np.tile(np.concatenate([chunk.u_min[i], positive, -free]), horizon)
-        upper = np.tile(np.concatenate([chunk.u_max[i], positive + np.inf, free]), horizon)
-        start = np.concatenate([chunk.u[i], chunk.lam[i], chunk.s[i], chunk.x[i]], axis=1).ravel()
+        lower = join(chunk.u_min[i], positive, -free, v=np.zeros(rows))
+        upper = join(chunk.u_max[i], positive + np.inf, free, v=chunk.v_max[i])
+        start = join(chunk.u[i], chunk.lam[i], chunk.s[i], chunk.x[i], v=chunk.v[i])
+        most = np.concatenate([np.zeros(equations), chunk.row_max[i].ravel()])
         try:
-            out = solver(x0=start, p=chunk.parameters[i], lbx=lower, ubx=upper, lbg=constraint, ubg=constraint)
+            out = solver(x0=start, p=chunk.parameters[i], lbx=lower, ubx=upper, lbg=least, ubg=most)
             stats = solver.stats()
-            z = np.asarray(out["x"]).reshape(horizon, -1)
+            z = np.asarray(out["x"]).ravel()[: horizon * ends[-1]].reshape(horizon, -1)
             result.u[i], result.lam[i], _, result.x[i] = np.split(z, ends[:-1], axis=1)
+            result.mu[i] = np.asarray(out["lam_g"]).ravel()[equations:].reshape(horizon + 1, n_c)
             result.status[i] = stats["return_status"]
             result.iterations[i] = stats["iter_count"]
         except RuntimeError:
-            result.u[i], result.lam[i], result.x[i] = chunk.u[i], chunk.lam[i], chunk.x[i]
+            pass  # the start stays
         result.seconds[i] = time.perf_counter() - started
         if interrupts:
             raise KeyboardInterrupt

@@ -58,6 +58,13 @@ class Backend(ABC):
     requires: ClassVar[tuple[str, ...]] = ()
     install: ClassVar[str] = "pip install difflcs"
 
+    def check(self, problem: MPCProblem) -> None:  # noqa: B027  most have nothing to refuse
+        """Refuse a problem that this backend cannot solve, before anything is solved.
+
+        Raises:
+            InvalidInputError: what it cannot do, and which backend can.
+        """
+
     @abstractmethod
     def solve(self, problem: MPCProblem, guess: Primal | None) -> Result:
         """Solve a batch; see `certify` for turning raw trajectories into a `Result`."""
@@ -80,12 +87,15 @@ def certify(
 ) -> Result:
     """Judge raw trajectories by the optimality conditions themselves, whatever the solver claims.
 
-    Actions are clipped into the bounds first. A CONVERGED element whose `difflcs.mpc.kkt.residual` exceeds `tol`
+    Actions are clipped into the bounds first, multipliers of the constraints into [0, price]; a solver without them may
+    leave these out. A CONVERGED element whose `difflcs.mpc.kkt.residual` exceeds `tol`
     becomes NUMERICAL; one that is not classically differentiable becomes DEGENERATE. Elements that did not converge get
     finite numbers: their actions clipped into the bounds (zero where not finite) and the trajectory that these cause.
+    So an INFEASIBLE element keeps the plan that its solver ended with.
     """
     status = status.clone()
-    primal = primal._replace(u=problem.clip(primal.u))
+    primal = kkt.complete(problem, primal)
+    primal = primal._replace(u=problem.clip(primal.u), mu=kkt.within_prices(problem, primal.mu))
     finite = torch.stack([torch.isfinite(v).all(-1).all(-1) for v in primal]).all(0)
     status[~finite & (status == Status.CONVERGED)] = Status.NUMERICAL
     primal = replace_failed(problem, primal, status != Status.CONVERGED)
@@ -99,7 +109,7 @@ def certify(
 
 def replace_failed(problem: MPCProblem, primal: Primal, failed: Tensor) -> Primal:
     """Finite numbers for failed (batch,) elements: actions clipped into the bounds, and the trajectory they cause."""
-    index = torch.nonzero(failed).squeeze(-1)
+    primal, index = kkt.complete(problem, primal), torch.nonzero(failed).squeeze(-1)
     if not len(index):
         return primal
     part = problem.select(index)

@@ -44,7 +44,10 @@ class IpoptBackend(Backend):
     """Direct transcription over x, u, λ and s, solved by IPOPT (Posa et al.; Wächter & Biegler).
 
     Every element is a separate IPOPT run; batches go to worker processes, which start at the first batch and stay.
-    Solutions are polished by Newton steps with the active bounds held (`difflcs.mpc.kkt.polish`).
+    Solutions are polished by Newton steps with the active bounds and constraints held (`difflcs.mpc.kkt.polish`).
+
+    Where an element with hard constraints fails, a second run minimises the sum of their squared violations alone. What
+    still violates them is INFEASIBLE, and this plan is what it returns.
 
     Attributes:
         tol: IPOPT's own tolerance.
@@ -76,13 +79,31 @@ class IpoptBackend(Backend):
 
     def solve(self, problem: MPCProblem, guess: Primal | None) -> Result:
         """Solve every element; a failure, even a crash of a worker, stays with its element."""
+        found = self._run(problem, guess, warm=guess is not None)
+        if problem.n_c and bool((torch.isinf(problem.price) & torch.isfinite(problem.g)).any()):
+            failed = torch.nonzero(found.status != Status.CONVERGED).squeeze(-1)
+            if len(failed):
+                part = problem.select(failed)
+                found.replace(failed, self._least_violation(part, found.select(failed)))
+        primal = Primal(found.x, found.u, found.lam, found.mu)
+        usable = (found.status == Status.CONVERGED) & torch.isfinite(found.u).all(-1).all(-1)
+        index = torch.nonzero(usable).squeeze(-1)
+        if len(index):
+            polished = kkt.polish(problem.select(index), Primal(*(v[index] for v in primal)))
+            for whole, part in zip(primal, polished, strict=True):
+                whole[index] = part
+        return certify(problem, primal, found.status, found.iterations, found.seconds, self.residual_tol)
+
+    def _run(self, problem: MPCProblem, guess: Primal | None, warm: bool, elastic: bool = False) -> _Found:
+        """One IPOPT run per element."""
         from difflcs.mpc.backends._ipopt_worker import Options, Sizes, solve_chunk
 
-        sizes = Sizes(problem.n_x, problem.n_u, problem.n_lam, problem.horizon, parameters(problem))
-        options = Options(
-            self.tol, self.max_iter, self.mu_init if guess is None else self.mu_init_warm, problem.barrier > 0
-        )
-        chunk = self._start(problem, guess)
+        P = problem
+        sizes = Sizes(P.n_x, P.n_u, P.n_lam, P.n_c, P.horizon, parameters(P))
+        slack = P.n_c > 0 and (elastic or bool(torch.isfinite(P.price).any()))
+        mu_init = self.mu_init_warm if warm else self.mu_init
+        options = Options(self.tol, self.max_iter, mu_init, P.barrier > 0, slack, elastic)
+        chunk = self._start(problem, guess, elastic)
         workers = min(self.workers or _cpus(), problem.batch)
         if workers <= 1:
             with _locals.here:
@@ -90,45 +111,114 @@ class IpoptBackend(Backend):
         else:
             solved = _locals.pool.solve(sizes, options, chunk, workers)
         words = [_STATUS.get(str(word), Status.NUMERICAL) for word in solved.status]
-        status = torch.tensor(words, dtype=torch.int8)
-        x, u, lam = (torch.from_numpy(v) for v in (solved.x, solved.u, solved.lam))
-        iterations, seconds = torch.from_numpy(solved.iterations), torch.from_numpy(solved.seconds)
-        primal = Primal(torch.cat([problem.x0.unsqueeze(1), x], 1), u, lam, problem.no_multipliers())
-        usable = (status == Status.CONVERGED) & torch.isfinite(u).all(-1).all(-1)
-        index = torch.nonzero(usable).squeeze(-1)
-        if len(index):
-            polished = kkt.polish(problem.select(index), Primal(*(v[index] for v in primal)))
-            for whole, part in zip(primal, polished, strict=True):
-                whole[index] = part
-        return certify(problem, primal, status, iterations, seconds, self.residual_tol)
+        x, u, lam, mu = (torch.from_numpy(v) for v in (solved.x, solved.u, solved.lam, solved.mu))
+        return _Found(
+            torch.cat([problem.x0.unsqueeze(1), x], 1),
+            u,
+            lam,
+            kkt.within_prices(problem, mu),
+            torch.tensor(words, dtype=torch.int8),
+            torch.from_numpy(solved.iterations),
+            torch.from_numpy(solved.seconds),
+        )
 
-    def _start(self, problem: MPCProblem, guess: Primal | None) -> Chunk:
+    def _least_violation(self, problem: MPCProblem, failed: _Found) -> _Found:
+        """Say whether problems that failed can be solved at all: minimise the squared violations alone.
+
+        What remains violated is INFEASIBLE and keeps the plan with the least violation; where next to nothing does, the
+        problem is tried once more from there.
+        """
+        start = Primal(failed.x, torch.nan_to_num(failed.u, posinf=0.0, neginf=0.0), failed.lam, failed.mu)
+        found = self._run(problem, start, warm=False, elastic=True)
+        u = problem.clip(torch.nan_to_num(found.u, posinf=0.0, neginf=0.0))
+        x, lam = problem.rollout(u)
+        plan = Primal(x, u, lam, problem.no_multipliers())
+        excess = kkt.excess(problem, plan)
+        sure = found.status == Status.CONVERGED
+        spent = failed.iterations + found.iterations, failed.seconds + found.seconds
+        status = torch.where(sure & (excess > self.residual_tol), int(Status.INFEASIBLE), failed.status)
+        # IPOPT took it for infeasible, and it is not.
+        mistaken = sure & (excess <= self.residual_tol) & (failed.status == Status.INFEASIBLE)
+        status = torch.where(mistaken, int(Status.NUMERICAL), status).to(torch.int8)
+        taken = (sure & (status == Status.INFEASIBLE))[:, None, None]
+        kept = Primal(*(torch.where(taken, a, b) for a, b in zip(plan, start, strict=True)))
+        result = _Found(kept.x, kept.u, kept.lam, kept.mu, status, *spent)
+        again = torch.nonzero(sure & (excess <= _NEARLY)).squeeze(-1)
+        if len(again):
+            part = problem.select(again)
+            second = self._run(part, Primal(*(v[again] for v in plan)), warm=True)
+            better = again[second.status == Status.CONVERGED]
+            second = second.select(second.status == Status.CONVERGED)
+            second.iterations += result.iterations[better]
+            second.seconds += result.seconds[better]
+            result.replace(better, second)
+        return result
+
+    def _start(self, problem: MPCProblem, guess: Primal | None, elastic: bool) -> Chunk:
         from difflcs.mpc.backends._ipopt_worker import Chunk
 
         batch, horizon = problem.batch, problem.horizon
         flat = []
-        for name, _, _ in parameters(problem):
+        for name, rows, columns, copies in parameters(problem):
             value = torch.as_tensor(getattr(problem, name), dtype=torch.float64)
+            # What is infinite is told by the bounds of variables and rows.
+            value = torch.where(torch.isinf(value), torch.zeros_like(value), value) if name in _OPEN else value
             shared = value.ndim == 0 or problem.shared(name)
-            size = value.numel() if shared else math.prod(problem.shape(name))
+            size = rows * columns * copies
             flat.append(value.reshape(1 if shared else batch, size).expand(batch, size))
         if guess is None:
-            x = problem.x0.unsqueeze(1).expand(batch, horizon, -1)
+            x = problem.x0.unsqueeze(1).expand(batch, horizon + 1, -1)
             u = problem.start(torch.zeros(batch, horizon, problem.n_u, dtype=torch.float64))
             lam = s = torch.full((batch, horizon, problem.n_lam), self.start, dtype=torch.float64)
         else:
             # The guess's actions decide; the rest follows from them, so that a shifted guess starts feasible.
             u = problem.start(guess.u)
             x, lam = problem.rollout(u)
-            x, s = x[:, 1:], problem.relaxation / lam.clamp_min(1e-300)
-        u_min, u_max = (v.expand(batch, problem.n_u) for v in (problem.u_min, problem.u_max))
-        return Chunk(*(np.ascontiguousarray(v.numpy()) for v in (torch.cat(flat, 1), u_min, u_max, x, u, lam, s)))
+            s = problem.relaxation / lam.clamp_min(1e-300)
+        u_min, u_max = (v.expand(batch, horizon, problem.n_u) for v in problem.bounds())
+        hard = torch.isinf(kkt.prices(problem))
+        c = problem.constraints(x, u)
+        none = torch.isinf(c) if not elastic else torch.isinf(c) | ~hard
+        row_max, v_max = (torch.where(v, torch.inf, torch.zeros_like(c)) for v in (none, hard if elastic else ~hard))
+        arrays = torch.cat(flat, 1), u_min, u_max, row_max, v_max, x[:, 1:], u, lam, s, c.clamp_min(0.0)
+        return Chunk(*(np.ascontiguousarray(v.numpy()) for v in arrays))
 
 
-def parameters(problem: MPCProblem) -> tuple[tuple[str, int, int], ...]:
-    """Name, rows and columns of what the program takes: every input of the problem, and its two numbers."""
-    shapes = {**{name: problem.shape(name) for name in INPUTS}, "relaxation": (1,), "barrier": (1,)}
-    return tuple((name, shape[0], math.prod(shape[1:])) for name, shape in shapes.items())
+# Inputs that may be infinite.
+_OPEN = ("u_min", "u_max", "g", "price")
+# Violation, in parts of a row's unit, up to which a problem is tried again from the plan with the least violation: at
+# the boundary of what can be met IPOPT knows it to the root of its tolerance.
+_NEARLY = 1e-3
+
+
+@dataclass
+class _Found:
+    """What one run returns for each element."""
+
+    x: torch.Tensor
+    u: torch.Tensor
+    lam: torch.Tensor
+    mu: torch.Tensor
+    status: torch.Tensor
+    iterations: torch.Tensor
+    seconds: torch.Tensor
+
+    def select(self, index: torch.Tensor) -> _Found:
+        return _Found(*(v[index] for v in vars(self).values()))
+
+    def replace(self, index: torch.Tensor, part: _Found) -> None:
+        for whole, new in zip(vars(self).values(), vars(part).values(), strict=True):
+            whole[index] = new
+
+
+def parameters(problem: MPCProblem) -> tuple[tuple[str, int, int, int], ...]:
+    """Name, rows, columns and copies of what the program takes: every input of the problem, and its two numbers.
+
+    An input that is given by stage has a copy for each.
+    """
+    table = [(name, problem.shape(name), problem.stages(name) if problem.by_stage(name) else 1) for name in INPUTS]
+    table += [("relaxation", (1,), 1), ("barrier", (1,), 1)]
+    return tuple((name, shape[0], math.prod(shape[1:]), copies) for name, shape, copies in table)
 
 
 class _Worker:
@@ -174,17 +264,14 @@ class _Pool:
                 raise
 
     def _solve(self, sizes: Sizes, options: Options, chunk: Chunk, count: int) -> Solved:
-        from difflcs.mpc.backends._ipopt_worker import Solved, no_words
+        from difflcs.mpc.backends._ipopt_worker import Solved
 
         batch = len(chunk.u)
         while len(self.workers) < count:
             self.workers.append(_Worker())
         # Four tasks per worker balance the load; a solve costs milliseconds, a message some 0.1 ms.
         todo = deque(np.array_split(np.arange(batch), min(batch, 4 * count)))
-        result = Solved(
-            chunk.x.copy(), chunk.u.copy(), chunk.lam.copy(),
-            no_words(batch), np.zeros(batch, np.int32), np.zeros(batch),
-        )  # fmt: skip
+        result = Solved.start(chunk)
 
         def give(slot: int) -> None:
             self.workers[slot].task = todo.popleft()

@@ -1,0 +1,265 @@
+"""Optimality conditions of the LCS-MPC: the multipliers of a trajectory, and how far it violates them.
+
+The derivation stands in `difflcs.mpc.kkt`, which offers the names of this file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from difflcs._linalg import matvec
+from difflcs.mpc.problem import STAGES, MPCProblem, StageData
+from difflcs.mpc.solution import Primal, largest
+
+# Largest residual of a solution: what CONVERGED means.
+CERTIFIED = 1e-6
+
+
+@dataclass(frozen=True)
+class Multipliers:
+    """Multipliers that stationarity assigns to a primal trajectory.
+
+    Attributes:
+        s: (batch, H, n_lam) slack of the complementarity.
+        p: (batch, H+1, n_x) costates; p[:, 0] is dJ/dx0.
+        y: (batch, H, n_lam) multipliers of λ∘s = ε.
+        rho: (batch, H, n_lam) y∘λ.
+        gradient: (batch, H, n_u) reduced gradient of the cost and the constraints with their multipliers.
+    """
+
+    s: Tensor
+    p: Tensor
+    y: Tensor
+    rho: Tensor
+    gradient: Tensor
+
+
+@dataclass(frozen=True)
+class Contact:
+    """The LU factors of M at one stage, see the derivation; `size` is λ + s."""
+
+    factors: Tensor
+    pivots: Tensor
+    size: Tensor
+
+    def solve(self, right: Tensor) -> Tensor:
+        """M⁻¹ right for matrices."""
+        return torch.linalg.lu_solve(self.factors, self.pivots, right)
+
+    def solve_transposed(self, right: Tensor) -> Tensor:
+        """Solve (diag s + Fᵀ diag λ) y = right, which is Mᵀ diag(λ+s) y = right."""
+        return torch.linalg.lu_solve(self.factors, self.pivots, right.unsqueeze(-1), adjoint=True).squeeze(-1) / (
+            self.size
+        )
+
+
+def complete(problem: MPCProblem, primal: Primal) -> Primal:
+    """A trajectory with multipliers of the constraints, zero where it has none."""
+    return primal if primal.mu is not None else primal._replace(mu=problem.no_multipliers())
+
+
+def stages_of(problem: MPCProblem) -> list[StageData]:
+    """The data of the stages 0 … H; one record for all where nothing varies."""
+    if any(problem.by_stage(name) for name, stages in STAGES.items() if stages):
+        return [problem.stage(k) for k in range(problem.horizon + 1)]
+    return [problem.stage(0)] * (problem.horizon + 1)
+
+
+def multipliers(problem: MPCProblem, primal: Primal) -> Multipliers:
+    """Multipliers of a trajectory by the backward recursion of the derivation."""
+    return backward(problem, complete(problem, primal))[0]
+
+
+def backward(problem: MPCProblem, primal: Primal) -> tuple[Multipliers, list[Contact]]:
+    """Multipliers, and what eliminates λ at each stage."""
+    x, u, lam, mu = primal
+    steps, data = problem.steps(), stages_of(problem)
+    s = steps.gap(*(v.transpose(0, 1) for v in (x[:, :-1], u, lam)))
+    force = lam.transpose(0, 1)
+    size = force + s
+    b = force / size
+    # a = s/(λ+s), not 1 − b, which has no digits left where λ is 1e10 times s.
+    M = torch.diag_embed(s / size) + b.unsqueeze(-1) * steps.F
+    factors, pivots, _ = torch.linalg.lu_factor_ex(M)
+    contacts = [Contact(factors[k], pivots[k], size[k]) for k in range(problem.horizon)]
+    crossed = bool(problem.S.any())
+    p = [matvec(problem.Q_final, x[:, -1]) + problem.q_final]
+    if problem.n_c:
+        p[0] = p[0] + matvec(data[-1].G_x.mT, mu[:, -1])
+    ys, rhos, gradients = [], [], []
+    for k in reversed(range(problem.horizon)):
+        at = data[k]
+        y = contacts[k].solve_transposed(-matvec(at.C.mT, p[-1]))
+        rho = y * lam[:, k]
+        gradient = matvec(at.R, u[:, k]) + at.r + matvec(at.B.mT, p[-1]) + matvec(at.E.mT, rho)
+        costate = matvec(at.Q, x[:, k]) + at.q + matvec(at.A.mT, p[-1]) + matvec(at.D.mT, rho)
+        if crossed:
+            gradient = gradient + matvec(at.S.mT, x[:, k])
+            costate = costate + matvec(at.S, u[:, k])
+        if problem.n_c:
+            gradient = gradient + matvec(at.G_u.mT, mu[:, k])
+            costate = costate + matvec(at.G_x.mT, mu[:, k])
+        gradients.append(gradient)
+        p.append(costate)
+        ys.append(y)
+        rhos.append(rho)
+    p, y, rho, gradient = (torch.stack(v[::-1], 1) for v in (p, ys, rhos, gradients))
+    if problem.barrier > 0:
+        below, above = problem.distances(u)
+        gradient = gradient + problem.barrier * (1 / above - 1 / below)
+    return Multipliers(s.transpose(0, 1), p, y, rho, gradient), contacts
+
+
+def residual(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
+    """Largest violation of the optimality conditions, (batch,); without units, and infinite for what is not a number.
+
+    A solution is CONVERGED where this is at most `CERTIFIED`. The maximum, over all steps and components, of
+
+    - dynamics: |x_{k+1} − (A x_k + B u_k + C λ_k + d)| in parts of Σ|terms|, the sum of the sizes of the terms of the
+      right-hand side; likewise x_0 against x0;
+    - complementarity: |λ∘s − ε| / (ε + 1e-7·λ·Σ|terms of s|), where the second part leaves room for the rounding of
+      s = Dx + Eu + Fλ + c; and 1 where λ is not positive;
+    - bounds: the distance of an action to them, in parts of its range u_max − u_min;
+    - stationarity in λ: |Cᵀp + s∘y + Fᵀρ| in parts of its Σ|terms|;
+    - stationarity in u: |u − clip(u − range·g/G)| / range, the part of its range by which the reduced gradient g would
+      still move an action. G is the scale of g: the larger of its Σ|terms| and of range·(Rⱼⱼ + BⱼᵀQBⱼ), which is what
+      its weights make of a step across the range. G does not vanish with the curvature: flat directions count;
+    - constraints: with c = G_x x + G_u u − g and its multiplier m, the size of c where 0 < m < price, that of its
+      positive part where m = 0 and of its negative part where m = price, in parts of the row's unit, the largest
+      Σ|terms of c| over the stages; and 1 where m is outside [0, price].
+
+    An action with an infinite bound has no range; see `ranges` for what stands in its place.
+    """
+    primal = complete(problem, primal)
+    x, u, lam = (v.transpose(0, 1) for v in primal[:3])  # steps first, so that per-element matrices broadcast
+    p, y, rho = (v.transpose(0, 1) for v in (dual.p, dual.y, dual.rho))
+    s, g = dual.s.transpose(0, 1), dual.gradient.transpose(0, 1)
+    low, high = (v.expand_as(primal.u).transpose(0, 1) for v in problem.bounds())
+    P = problem.steps()
+    x_terms = _terms((P.A, x[:-1]), (P.B, u), (P.C, lam)) + P.d.abs()
+    s_terms = _terms((P.D, x[:-1]), (P.E, u), (P.F, lam)) + P.c.abs()
+    lam_row = matvec(P.C.mT, p[1:]) + s * y + matvec(P.F.mT, rho)
+    lam_terms = _terms((P.C.mT, p[1:]), (P.F.mT, rho)) + (s * y).abs()
+    u_terms = gradient_terms(problem, primal, dual).transpose(0, 1)
+    width, fixed = ranges(problem, primal.u).transpose(0, 1), high <= low
+    scale = torch.maximum(u_terms, width * at_rest(problem))
+    unit = torch.where(width > 0, width, torch.ones_like(width))
+    moved = torch.minimum(_parts(g, scale), torch.where(g > 0, u - low, high - u) / unit).clamp_min(0.0)
+    violations = [
+        _parts(x[0] - problem.x0, problem.x0.abs()).unsqueeze(0),
+        _parts(x[1:] - P.next_state(x[:-1], u, lam), x_terms),
+        (lam * s - problem.relaxation).abs() / (problem.relaxation + 1e-7 * lam.abs() * s_terms),
+        (~(lam > 0)).to(lam.dtype),
+        torch.maximum(low - u, u - high).clamp_min(0.0) / unit,
+        _parts(lam_row, lam_terms),
+        torch.where(fixed, torch.zeros_like(moved), moved) + 0 * g,
+    ]
+    if problem.n_c:
+        violations += _row_violations(problem, primal)
+    worst = torch.stack([largest(v) for v in violations]).amax(0)  # amax keeps NaN
+    return torch.nan_to_num(worst, nan=torch.inf)
+
+
+def _row_violations(problem: MPCProblem, primal: Primal) -> list[Tensor]:
+    mu, price = primal.mu.transpose(0, 1), problem.steps().price
+    c = problem.constraints(primal.x, primal.u).transpose(0, 1)
+    off = torch.where(mu <= 0, c.clamp_min(0.0), torch.where(mu >= price, (-c).clamp_min(0.0), c.abs()))
+    return [_parts(off, row_units(problem, primal)) + 0 * mu, ((mu < 0) | (mu > price)).to(mu.dtype)]
+
+
+def row_units(problem: MPCProblem, primal: Primal) -> Tensor:
+    """What the violation of each constraint is measured by, (batch, n_c): the largest Σ|terms| over the stages."""
+    P, x, u = problem.steps(), primal.x.transpose(0, 1), primal.u.transpose(0, 1)
+    terms = _terms((P.G_x, x)) + P.g.abs()
+    terms[:-1] += _terms((P.G_u, u))
+    return torch.where(torch.isinf(P.g), torch.zeros_like(terms), terms).amax(0)
+
+
+def excess(problem: MPCProblem, primal: Primal) -> Tensor:
+    """Largest violation (batch,) of the hard constraints, in parts of their rows' units; 0 where they hold."""
+    if problem.n_c == 0:
+        return torch.zeros(problem.batch, dtype=torch.float64)
+    over = torch.where(torch.isinf(prices(problem)), problem.constraints(primal.x, primal.u), 0.0).clamp_min(0.0)
+    return largest(_parts(over.transpose(0, 1), row_units(problem, primal)))
+
+
+def moved_rows(problem: MPCProblem, dx: Tensor, du: Tensor) -> Tensor:
+    """G_x dx + G_u du of every constraint, (batch, H+1, n_c)."""
+    moved = matvec(problem._batch_first("G_x"), dx)
+    moved[:, :-1] += matvec(problem._batch_first("G_u"), du)
+    return moved
+
+
+def prices(problem: MPCProblem) -> Tensor:
+    """Price of a violation of each constraint, (batch, H+1, n_c)."""
+    return problem._batch_first("price").expand(problem.batch, problem.horizon + 1, problem.n_c)
+
+
+def within_prices(problem: MPCProblem, mu: Tensor) -> Tensor:
+    """Multipliers of the constraints (batch, H+1, n_c) clipped into [0, price]."""
+    return torch.minimum(mu.clamp_min(0.0), prices(problem))
+
+
+def ranges(problem: MPCProblem, u: Tensor) -> Tensor:
+    """Range of each action, (batch, H, n_u): u_max − u_min.
+
+    Where that is infinite it is the largest size over the stages of the action itself and of its finite bounds.
+    """
+    low, high = problem.bounds()
+    width = high - low
+    if not bool(torch.isinf(width).any()):
+        return width.expand_as(u)
+    finite = [torch.where(torch.isinf(v), torch.zeros_like(v), v).abs() for v in (low, high)]
+    size = torch.maximum(u.abs(), torch.maximum(*finite)).amax(1, keepdim=True)
+    return torch.where(torch.isinf(width), size, width).expand_as(u)
+
+
+def gradient_terms(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
+    """Σ|terms| (batch, H, n_u) of the reduced gradient."""
+    P = problem.steps()
+    u, p, rho = (v.transpose(0, 1) for v in (primal.u, dual.p[:, 1:], dual.rho))
+    terms = _terms((P.R, u), (P.B.mT, p), (P.E.mT, rho)) + P.r.abs()
+    if bool(problem.S.any()):
+        terms = terms + _terms((P.S.mT, primal.x[:, :-1].transpose(0, 1)))
+    if problem.n_c:
+        terms = terms + _terms((P.G_u.mT, primal.mu[:, :-1].transpose(0, 1)))
+    terms = terms.transpose(0, 1)
+    if problem.barrier > 0:
+        below, above = problem.distances(primal.u)
+        terms = terms + problem.barrier * (1 / below + 1 / above)
+        # Next to a bound the barrier is so steep that rounding u moves g.
+        width = ranges(problem, primal.u)
+        terms = terms + 1e-8 * problem.barrier * width * (below.square().reciprocal() + above.square().reciprocal())
+    return terms
+
+
+def at_rest(problem: MPCProblem) -> Tensor:
+    """Curvature of each action by its own weight and the next state's, broadcasting with (H, batch, n_u)."""
+    data = stages_of(problem)
+
+    def curvature(k: int) -> Tensor:
+        at, weight = data[k], problem.Q_final if k == problem.horizon - 1 else data[k + 1].Q
+        return at.R.diagonal(dim1=-2, dim2=-1) + (at.B * (weight @ at.B)).sum(-2)
+
+    if data[0] is data[-1]:
+        return _stack([curvature(0)] * (problem.horizon - 1) + [curvature(problem.horizon - 1)])
+    return _stack([curvature(k) for k in range(problem.horizon)])
+
+
+def _stack(values: list[Tensor]) -> Tensor:
+    """Stages (n,) or (batch, n) → (H, 1 or batch, n)."""
+    values = [v if v.ndim == 2 else v.unsqueeze(0) for v in values]
+    return torch.stack(torch.broadcast_tensors(*values))
+
+
+def _terms(*products: tuple[Tensor, Tensor]) -> Tensor:
+    """Σ|terms| of a sum of products of a matrix and a vector."""
+    first, *rest = (matvec(matrix.abs(), vector.abs()) for matrix, vector in products)
+    return sum(rest, first)
+
+
+def _parts(value: Tensor, terms: Tensor) -> Tensor:
+    return value.abs() / torch.where(terms > 0, terms, torch.ones_like(terms))

@@ -1,0 +1,438 @@
+"""The Riccati sweeps of the sensitivity: K_z factored at a trajectory, and solved for upstream gradients.
+
+The derivation stands in `difflcs.mpc.kkt`, which offers the names of this file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from difflcs._linalg import matvec
+from difflcs.mpc.conditions import (
+    Contact,
+    Multipliers,
+    at_rest,
+    backward,
+    complete,
+    gradient_terms,
+    moved_rows,
+    prices,
+    ranges,
+    row_units,
+    stages_of,
+)
+from difflcs.mpc.problem import MPCProblem, StageData
+from difflcs.mpc.solution import Primal
+
+# A bound is weakly active where both the distance to it and the Newton step across it are below this part of the range;
+# a constraint likewise, in parts of its row's unit.
+_WEAK = 1e-5
+# A reduced Hessian counts as singular below this pivot, in units of each action's own curvature. Directions below it
+# are held: their sensitivity is zero.
+_SINGULAR = 1e-10
+# An action with a barrier is differentiated as one at its bound below this part of its range.
+_CLOSE = 1e-8
+# Weight of a held constraint in the augmented Hessian, in units of the row's own curvature; each pass of the refinement
+# divides what is left of the row by it. The digits that it costs the other directions are those of its size.
+_HOLD = 1e5
+# Most passes, and what may be left of a held row in parts of the terms that sum to it. Rows that depend on each other
+# leave far more than `_DEPENDENT` of some right-hand side.
+_PASSES = 10
+_LEFT = 1e-14
+_DEPENDENT = 1e-3
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """The factored matrix K_z at one primal trajectory.
+
+    Attributes:
+        primal: the trajectory.
+        multipliers: its multipliers.
+        lower, upper: (batch, H, n_u) bool: actions held at their lower and upper bound.
+        degenerate: (batch,) bool: a bound or a constraint is weakly active, the constraints held depend on each other,
+            or the reduced Hessian is singular or indefinite.
+        held: (batch, H+1, n_c) bool: constraints held with equality.
+        fined: (batch, H+1, n_c) bool: soft constraints that are violated, at their price.
+        stages: one `_Stage` per step.
+    """
+
+    primal: Primal
+    multipliers: Multipliers
+    lower: Tensor
+    upper: Tensor
+    degenerate: Tensor
+    held: Tensor
+    fined: Tensor
+    stages: list[_Stage]
+    weight: Tensor  # (batch, H+1, n_c), of held constraints in the augmented Hessian
+
+    def settled(self, problem: MPCProblem) -> Tensor:
+        """The multipliers of the constraints, (batch, H+1, n_c): zero where inactive, the price where fined."""
+        price = prices(problem)
+        return torch.where(self.held, self.primal.mu, torch.where(self.fined, price, torch.zeros_like(price)))
+
+
+class _Eliminated(NamedTuple):
+    """One stage with λ eliminated: what does not depend on the stages after it."""
+
+    contact: Contact
+    K_lam: Tensor  # (batch, n_lam, n_x + n_u)
+    K_s: Tensor
+    A_hat: Tensor  # (batch, n_x, n_x + n_u), [A B] + C K_lam
+    hessian: Tensor  # (batch, n_x + n_u, n_x + n_u), of the stage's own terms
+
+
+@dataclass(frozen=True)
+class _Stage:
+    own: _Eliminated
+    P: Tensor  # (batch, n_x, n_x), Hessian of the value function after this step
+    Q_xu: Tensor  # (batch, n_x, n_u), active columns zero
+    L: Tensor  # (batch, n_u, n_u), Cholesky factor of Q_uu with identity rows for active actions
+    free: Tensor  # (batch, n_u), 1 where the action is free
+
+
+def linearise(problem: MPCProblem, primal: Primal) -> Linearisation:
+    """Factor K_z at a trajectory: the backward Riccati sweep, with the active set found on the way.
+
+    An action is held at a bound where a Newton step along its own curvature would cross it, g > h·(u − u_min) (above:
+    −g > h·(u_max − u)); this orders the bound's multiplier against its distance, whatever the scales. In the same way a
+    constraint is held where 0 < m + c/V < price, with V = a K⁻¹ aᵀ the curvature that the problem without constraints
+    gives the row a = [G_x G_u]: how far a unit more of its multiplier m moves it. Above the price it is fined.
+    """
+    primal = complete(problem, primal)
+    dual, contacts = backward(problem, primal)
+    data = stages_of(problem)
+    own = _eliminate(problem, primal, dual, contacts, data)
+    bounds = _Bounds.at(problem, primal, dual)
+    stages, singular = _sweep(problem, own, data, bounds)
+    weak = torch.stack(bounds.weak).any(0)
+    none = torch.zeros(primal.mu.shape, dtype=torch.bool)
+    lower, upper = torch.stack(bounds.lower[::-1], 1), torch.stack(bounds.upper[::-1], 1)
+    lin = Linearisation(primal, dual, lower, upper, weak, none, none, stages, torch.zeros_like(primal.mu))
+    return _hold_rows(problem, lin, data, singular) if problem.n_c else replace(lin, degenerate=weak | singular)
+
+
+def _eliminate(
+    problem: MPCProblem, primal: Primal, dual: Multipliers, contacts: list[Contact], data: list[StageData]
+) -> list[_Eliminated]:
+    n_x, crossed = problem.n_x, bool(problem.S.any())
+    curvature = barrier_curvature(problem, primal.u)
+    stages: list[_Eliminated] = []
+    for k, contact in enumerate(contacts):
+        at = data[k]
+        if k == 0 or data[k] is not data[k - 1]:
+            AB, DE = _join(at.A, at.B), _join(at.D, at.E)
+        b = (primal.lam[:, k] / contact.size).unsqueeze(-1)
+        K_lam = -contact.solve(b * DE)
+        K_s = DE + at.F @ K_lam
+        weighted = dual.y[:, k].unsqueeze(-1) * K_lam
+        Y = weighted.mT @ K_s
+        hessian = Y + Y.mT
+        hessian[:, :n_x, :n_x] += at.Q
+        hessian[:, n_x:, n_x:] += at.R + torch.diag_embed(curvature[:, k])
+        if crossed:
+            hessian[:, :n_x, n_x:] += at.S
+            hessian[:, n_x:, :n_x] += at.S.mT
+        stages.append(_Eliminated(contact, K_lam, K_s, AB + at.C @ K_lam, hessian))
+    return stages
+
+
+class _Bounds:
+    """Which actions are held at their bounds; found stage by stage from the last, as their curvature becomes known."""
+
+    def __init__(self, problem: MPCProblem, primal: Primal, gradient: Tensor, width: Tensor, least: Tensor):
+        self.problem, self.u, self.gradient, self.width, self.least = problem, primal.u, gradient, width, least
+        self.low, self.high = (v.expand_as(primal.u) for v in problem.bounds())
+        self.lower: list[Tensor] = []
+        self.upper: list[Tensor] = []
+        self.weak: list[Tensor] = []
+
+    @classmethod
+    def at(cls, problem: MPCProblem, primal: Primal, dual: Multipliers) -> _Bounds:
+        width = ranges(problem, primal.u)
+        # The least curvature keeps rounding of a gradient apart from a reason to leave the interior.
+        reference = torch.maximum(gradient_terms(problem, primal, dual), width * at_rest(problem).transpose(0, 1))
+        least = 1e-10 * reference / torch.where(width > 0, width, torch.ones_like(width))
+        return cls(problem, primal, dual.gradient, width, least.clamp_min(torch.finfo(torch.float64).tiny))
+
+    def free(self, k: int, Q_uu: Tensor) -> Tensor:
+        """The actions (batch, n_u) that are free at stage k, by their curvature."""
+        u, g, width, low, high = (v[:, k] for v in (self.u, self.gradient, self.width, self.low, self.high))
+        h = torch.maximum(Q_uu.diagonal(dim1=-2, dim2=-1), self.least[:, k])
+        to_lower, to_upper, step, fixed = u - low, high - u, g / h, high <= low
+        lower = (step > to_lower) | (fixed & (g >= 0))
+        upper = (-step > to_upper) | (fixed & (g < 0))
+        weak = (torch.minimum(to_lower, to_upper) <= _WEAK * width) & (step.abs() <= _WEAK * width) & ~fixed
+        if self.problem.barrier > 0:
+            # A barrier that keeps no distance to speak of is the bound itself; its steepness is then only rounding.
+            close = torch.maximum(_CLOSE * width, 1e-3 * _CLOSE * torch.maximum(low.abs(), high.abs()))
+            lower = (to_lower <= close) & (to_lower <= to_upper)
+            upper = (to_upper <= close) & (to_upper < to_lower)
+            weak = torch.zeros_like(weak)
+        self.lower.append(lower)
+        self.upper.append(upper)
+        self.weak.append(weak.any(-1))
+        return ~(lower | upper)
+
+
+def _sweep(
+    problem: MPCProblem,
+    own: list[_Eliminated],
+    data: list[StageData],
+    bounds: _Bounds | list[Tensor],
+    weight: Tensor | None = None,
+) -> tuple[list[_Stage], Tensor]:
+    """The backward Riccati sweep, and where (batch,) a reduced Hessian is singular or indefinite.
+
+    Args:
+        problem: the problems.
+        own: the stages with λ eliminated.
+        data: the stages as given.
+        bounds: what decides which actions are free, or these themselves, (batch, n_u) per stage.
+        weight: (batch, H+1, n_c) of each constraint in the Hessian; none if None.
+    """
+    n_x = problem.n_x
+    P = problem.Q_final.expand(problem.batch, n_x, n_x)
+    if weight is not None:
+        P = P + data[-1].G_x.mT @ (weight[:, -1].unsqueeze(-1) * data[-1].G_x)
+    stages: list[_Stage] = []
+    degenerate = torch.zeros(problem.batch, dtype=torch.bool)
+    for k in reversed(range(problem.horizon)):
+        A_hat = own[k].A_hat
+        hessian = A_hat.mT @ (P @ A_hat) + own[k].hessian
+        if weight is not None:
+            row = _join(data[k].G_x, data[k].G_u)
+            hessian = hessian + row.mT @ (weight[:, k].unsqueeze(-1) * row)
+        Q_uu = hessian[:, n_x:, n_x:]
+        free = bounds.free(k, Q_uu) if isinstance(bounds, _Bounds) else bounds[k]
+        L, singular = _cholesky(Q_uu, free)
+        degenerate |= singular
+        Q_xu = hessian[:, :n_x, n_x:] * free.unsqueeze(-2)
+        stages.append(_Stage(own[k], P, Q_xu, L, free.to(L.dtype)))
+        Z = torch.linalg.solve_triangular(L, Q_xu.mT, upper=False)
+        P = hessian[:, :n_x, :n_x] - Z.mT @ Z
+    return stages[::-1], degenerate
+
+
+def _hold_rows(problem: MPCProblem, lin: Linearisation, data: list[StageData], singular: Tensor) -> Linearisation:
+    """The same with the constraints: which of them are held, and the sweep that holds them.
+
+    Where none is, `singular` (batch,) says whether the Hessian is; else only along the rows it must not be.
+    """
+    mu, price = lin.primal.mu, prices(problem)
+    c = problem.constraints(lin.primal.x, lin.primal.u)
+    spread = _spread(lin, data)
+    above = mu * spread + c
+    most = torch.where(torch.isinf(price), torch.inf, price * spread)  # not ∞·0
+    fined = above >= most
+    held = (above > 0) & ~fined & (spread > 0)
+    # Weakly active: c, and what the multiplier is off its end in the same unit, are both near zero.
+    close = _WEAK * row_units(problem, lin.primal).unsqueeze(1)
+    off_end = torch.minimum(mu * spread, torch.where(torch.isinf(price), torch.inf, (price - mu) * spread)).abs()
+    weak = ((c.abs() <= close) & (off_end <= close) & (close > 0)).flatten(1).any(1)
+    weak |= lin.degenerate
+    lin = replace(lin, held=held, fined=fined, degenerate=weak | singular)
+    if not bool(held.any()):
+        return lin
+    weight = torch.where(held, _HOLD / torch.where(held, spread, torch.ones_like(spread)), torch.zeros_like(spread))
+    free = [stage.free > 0 for stage in lin.stages]
+    stages, along = _sweep(problem, [stage.own for stage in lin.stages], data, free, weight)
+    singular = torch.where(held.flatten(1).any(1), along, singular)
+    lin = replace(lin, stages=stages, weight=weight)
+    return replace(lin, degenerate=weak | singular | _dependent(problem, lin, spread))
+
+
+def _spread(lin: Linearisation, data: list[StageData]) -> Tensor:
+    """V = diag(a K⁻¹ aᵀ) of every constraint, (batch, H+1, n_c), of the problem without constraints.
+
+    K⁻¹ is the covariance of (dx, du) where each Q_uu is the inverse covariance of the actions around their feedback.
+    """
+    batch, _, n_x = lin.primal.x.shape
+    moved = torch.zeros(batch, n_x, n_x, dtype=torch.float64)
+    found = []
+    for at, stage in zip(data, lin.stages, strict=False):
+        feedback = -torch.cholesky_solve(stage.Q_xu.mT, stage.L)
+        A, B = stage.own.A_hat.split([n_x, feedback.shape[-2]], -1)
+        by_state, by_action = at.G_x + at.G_u @ feedback, _scaled(at.G_u, stage)
+        found.append((by_state * (by_state @ moved)).sum(-1) + by_action.square().sum(-2))
+        closed, root = A + B @ feedback, _scaled(B, stage)
+        moved = closed @ moved @ closed.mT + root.mT @ root
+    found.append((data[-1].G_x * (data[-1].G_x @ moved)).sum(-1))
+    return torch.stack(found, 1)
+
+
+def _scaled(matrix: Tensor, stage: _Stage) -> Tensor:
+    """L⁻¹ matrixᵀ for a matrix that acts on the free actions."""
+    return torch.linalg.solve_triangular(stage.L, (matrix * stage.free.unsqueeze(-2)).mT, upper=False)
+
+
+def _dependent(problem: MPCProblem, lin: Linearisation, spread: Tensor) -> Tensor:
+    """Where (batch,) the held rows depend on each other: some right-hand side of theirs cannot be met."""
+    spots = torch.arange(lin.held[0].numel(), dtype=torch.float64).reshape(lin.held.shape[1:])
+    target = torch.where(lin.held, (1.5 + spots.cos()) * spread.clamp_min(0.0).sqrt(), 0.0)
+    x_bar, u_bar, lam_bar, _ = (torch.zeros_like(v) for v in lin.primal)
+    found = solve(problem, lin, x_bar, u_bar, lam_bar, target)
+    left = _along(problem, lin, found) - target
+    return (left.abs() > _DEPENDENT * target).flatten(1).any(1)
+
+
+def barrier_curvature(problem: MPCProblem, u: Tensor) -> Tensor:
+    """Second derivative (batch, H, n_u) of the barrier of the action bounds; zero without a barrier."""
+    if problem.barrier == 0:
+        return torch.zeros_like(u)
+    below, above = problem.distances(u)
+    return problem.barrier * (1 / below.square() + 1 / above.square())
+
+
+def _join(left: Tensor, right: Tensor) -> Tensor:
+    batch = torch.broadcast_shapes(left.shape[:-2], right.shape[:-2])
+    return torch.cat([left.expand(*batch, *left.shape[-2:]), right.expand(*batch, *right.shape[-2:])], -1)
+
+
+def _cholesky(Q_uu: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
+    """Factor Q_uu with identity rows where not free; where it is singular or indefinite, a positive definite stand-in.
+
+    Its eigenvalues are taken in units of each action's own curvature. One near zero becomes so large that its direction
+    hardly moves; a negative one is taken by its size.
+    """
+    diagonal = Q_uu.diagonal(dim1=-2, dim2=-1)
+    unit = torch.where(free & (diagonal > 0), diagonal, torch.ones_like(diagonal)).sqrt()
+    eye = torch.eye(Q_uu.shape[-1], dtype=Q_uu.dtype)
+    mask = free.unsqueeze(-1) & free.unsqueeze(-2)
+    symmetric = 0.5 * (Q_uu + Q_uu.mT) / unit.unsqueeze(-1) / unit.unsqueeze(-2)
+    scaled = torch.where(mask, symmetric, eye)
+    L, info = torch.linalg.cholesky_ex(scaled)
+    pivots = L.diagonal(dim1=-2, dim2=-1).square().amin(-1)
+    singular = (info != 0) | ~(pivots > _SINGULAR)
+    if bool(singular.any()):
+        bad = torch.nonzero(singular).squeeze(-1)
+        values, vectors = torch.linalg.eigh(torch.nan_to_num(scaled[bad], posinf=0.0, neginf=0.0))
+        flat = values.abs() <= 10 * _SINGULAR * values.abs().amax(-1, keepdim=True)
+        lifted = torch.where(flat, 1 / _SINGULAR, values.abs())
+        L = L.clone()
+        L[bad] = torch.linalg.cholesky_ex((vectors * lifted.unsqueeze(-2)) @ vectors.mT).L
+    return L * unit.unsqueeze(-1), singular
+
+
+class Direction(NamedTuple):
+    """Solution w of K_z w = z̄: x (batch, H+1, n_x), u, lam, p of x_1 … x_H, rho, nu and mu (batch, H+1, n_c)."""
+
+    x: Tensor
+    u: Tensor
+    lam: Tensor
+    p: Tensor
+    rho: Tensor
+    nu: Tensor
+    mu: Tensor
+
+
+def solve(
+    problem: MPCProblem,
+    lin: Linearisation,
+    x_bar: Tensor,
+    u_bar: Tensor,
+    lam_bar: Tensor,
+    target: Tensor | None = None,
+) -> Direction:
+    """Solve K_z w = z̄ for upstream gradients on x, u and λ.
+
+    Args:
+        problem: the problems.
+        lin: `linearise` at a trajectory.
+        x_bar: (batch, H+1, n_x); the first is ignored.
+        u_bar: (batch, H, n_u).
+        lam_bar: (batch, H, n_lam).
+        target: (batch, H+1, n_c) what G_x dx + G_u du of the held constraints shall be; zero if None.
+    """
+    if not bool(lin.held.any()):
+        return _solve(problem, lin, x_bar, u_bar, lam_bar)
+    G_x, G_u = problem._batch_first("G_x"), problem._batch_first("G_u")
+    target = torch.zeros_like(lin.weight) if target is None else torch.where(lin.held, target, 0.0)
+    mu, best = torch.zeros_like(lin.weight), None
+    left_before = torch.full((problem.batch,), torch.inf, dtype=torch.float64)
+    for _ in range(_PASSES):
+        force = mu - lin.weight * target
+        found = _solve(
+            problem,
+            lin,
+            x_bar - matvec(G_x.mT, force),
+            u_bar - matvec(G_u.mT, force[:, :-1]),
+            lam_bar,
+        )
+        along = _along(problem, lin, found)
+        # The multiplier that belongs to this direction; ν does not know of the part in the augmented Hessian.
+        mu = force + lin.weight * along
+        nu = found.nu - matvec(G_u.mT, (lin.weight * along)[:, :-1])
+        found = found._replace(mu=mu, nu=nu)
+        left = ((along - target).abs() / _along_terms(problem, lin, found, target)).flatten(1).amax(1)
+        better = left < left_before
+        best = found if best is None else _choose(better, found, best)
+        left_before = torch.where(better, left, left_before)
+        if not bool((better & (left > _LEFT)).any()):
+            break
+    assert best is not None
+    return best
+
+
+def _choose(mask: Tensor, left: Direction, right: Direction) -> Direction:
+    return Direction(*(torch.where(mask[:, None, None], a, b) for a, b in zip(left, right, strict=True)))
+
+
+def _along(problem: MPCProblem, lin: Linearisation, w: Direction) -> Tensor:
+    """G_x dx + G_u du of the held constraints, (batch, H+1, n_c), zero elsewhere."""
+    moved = moved_rows(problem, w.x, w.u)
+    return torch.where(lin.held, moved, torch.zeros_like(moved))
+
+
+def _along_terms(problem: MPCProblem, lin: Linearisation, w: Direction, target: Tensor) -> Tensor:
+    """Largest Σ|terms| of the same over the stages and rows, (batch, 1, 1), and 1 where there is nothing."""
+    G_x, G_u = problem._batch_first("G_x"), problem._batch_first("G_u")
+    terms = matvec(G_x.abs(), w.x.abs()) + target.abs()
+    terms[:, :-1] += matvec(G_u.abs(), w.u.abs())
+    terms = torch.where(lin.held, terms, torch.zeros_like(terms)).amax((1, 2), keepdim=True)
+    return torch.where(terms > 0, terms, torch.ones_like(terms))
+
+
+def _solve(problem: MPCProblem, lin: Linearisation, x_bar: Tensor, u_bar: Tensor, lam_bar: Tensor) -> Direction:
+    """One backward and one forward sweep; constraints count by their weight in the Hessian alone."""
+    n_x, horizon = problem.n_x, problem.horizon
+    dual, data = lin.multipliers, stages_of(problem)
+    crossed = bool(problem.S.any())
+    # Backward: linear terms of the value functions, v_k, and the feedforward parts.
+    v = -x_bar[:, -1]
+    values, feedforward = [v], []
+    for k in reversed(range(horizon)):
+        stage = lin.stages[k]
+        upstream = torch.cat([x_bar[:, k], u_bar[:, k]], -1) + matvec(stage.own.K_lam.mT, lam_bar[:, k])
+        linear = matvec(stage.own.A_hat.mT, v) - upstream
+        right = (linear[:, n_x:] * stage.free).unsqueeze(-1)
+        step = -torch.cholesky_solve(right, stage.L).squeeze(-1)
+        feedforward.append(step)
+        v = linear[:, :n_x] + matvec(stage.Q_xu, step)
+        values.append(v)
+    values, feedforward = values[::-1], feedforward[::-1]
+    # Forward: the direction itself, dual part included.
+    dx = torch.zeros_like(x_bar[:, 0])
+    dxs, dus, dlams, dps, drhos, dnus = [dx], [], [], [], [], []
+    for k in range(horizon):
+        stage, own, at = lin.stages[k], lin.stages[k].own, data[k]
+        feedback = torch.cholesky_solve(matvec(stage.Q_xu.mT, dx).unsqueeze(-1), stage.L).squeeze(-1)
+        du = feedforward[k] - feedback
+        dw = torch.cat([dx, du], -1)
+        dlam, ds = matvec(own.K_lam, dw), matvec(own.K_s, dw)
+        across = matvec(at.S.mT, dx) if crossed else 0.0
+        dx = matvec(own.A_hat, dw)
+        dp = matvec(stage.P, dx) + values[k + 1]
+        y, lam = dual.y[:, k], lin.primal.lam[:, k]
+        right = lam_bar[:, k] - matvec(at.C.mT, dp) - y * ds - matvec(at.F.mT, y * dlam)
+        drho = own.contact.solve_transposed(right) * lam + y * dlam
+        dnu = u_bar[:, k] - matvec(at.R, du) - matvec(at.B.mT, dp) - matvec(at.E.mT, drho) - across
+        for store, value in zip((dxs, dus, dlams, dps, drhos, dnus), (dx, du, dlam, dp, drho, dnu), strict=True):
+            store.append(value)
+    parts = [torch.stack(d, 1) for d in (dxs, dus, dlams, dps, drhos, dnus)]
+    return Direction(*parts, mu=torch.zeros_like(lin.weight))
