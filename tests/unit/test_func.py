@@ -136,7 +136,7 @@ def test_failures_are_reported_inside(layer, x0):
         warnings.simplefilter("ignore", e.SolveWarning)
         found = vmap(grad(lambda x: layer(x).u.sum()))(bad)
     assert torch.equal(found[1], torch.zeros(4, dtype=torch.float64))
-    assert float(found[[0, 2]].abs().amax(1).min()) > 0
+    assert float(found[[0, 2]].detach().abs().amax(1).min()) > 0
 
 
 # --- gradients ------------------------------------------------------------------------------------------------------
@@ -297,7 +297,7 @@ def test_importing_the_library_does_not_import_the_compiler():
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.filterwarnings("default")  # where warnings are errors, the compiler trips over one that it hides
 def test_compiled_code_that_contains_a_layer_is_eager_code(build, layer, x0):
     def loss(x):
         return (2 * layer(torch.sin(x)).action).square()
