@@ -8,6 +8,7 @@ from difflcs.losses import prediction_loss, violation_loss
 from difflcs.mpc.backends import available_backends, register_backend
 from difflcs.mpc.layer import LCSMPCLayer
 from difflcs.mpc.solution import MPCSolution
+from difflcs.scales import ScaledLCS, Scales, suggest_scales
 from difflcs.status import Status
 
 __version__ = "0.1.0"
@@ -24,11 +25,14 @@ __all__ = [
     "LCSSequence",
     "MPCSolution",
     "QuadraticCost",
+    "ScaledLCS",
+    "Scales",
     "SolveError",
     "Status",
     "available_backends",
     "prediction_loss",
     "register_backend",
     "solve_lcp",
+    "suggest_scales",
     "violation_loss",
 ]

@@ -48,9 +48,10 @@ def violation_loss(
         gamma: γ, weight of the slack; 0 < γ ≤ σ_min(F + Fᵀ) of every transition. "auto" takes 0.999 times the smallest
             of these bounds at each call, as a constant that is not differentiated: at the bound itself the inner QP
             can be singular, a thousandth below it is well solved. It grows with F where a fixed γ stays behind.
-        xi: ξ > 0, weight of the dynamics against complementarity. The default suits data of the size of meters per
-            step, as in the paper; scale it with the square of your data (about 1 for data of size one), or the loss is
-            the prediction loss for all practical purposes. `suggest_scales` takes it from data.
+        xi: ξ > 0, weight of the dynamics against complementarity. With a small ξ the loss is the prediction loss, with
+            a large one the contact law is broken for free. It compares squared states with forces times gaps: the
+            default suits states, forces and gaps of like units. A common unit of all of them changes nothing, as the
+            loss grows with its square whatever ξ. `suggest_scales` finds such units.
         context: (..., n_context) passed on to the `params` of an `LCSModule`.
         reduction: "mean" over the batch, or "none" for one value each.
         check_gamma: refuse γ > σ_min(F + Fᵀ). False lets a fixed γ through, as the prior work does; the inner QP may
