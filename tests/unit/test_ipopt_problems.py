@@ -12,6 +12,8 @@ from difflcs.mpc import MPCProblem, Primal, kkt
 from difflcs.mpc.backends import IpoptBackend, base
 from difflcs.mpc.problem import INPUTS, STAGES
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 BATCH, HORIZON = 3, 4
 SOLVER = IpoptBackend(workers=1)
 CONVERGED, DEGENERATE = int(Status.CONVERGED), int(Status.DEGENERATE)

@@ -13,6 +13,8 @@ from difflcs.mpc import MPCProblem, Primal, kkt
 from difflcs.mpc.backends import IpoptBackend
 from difflcs.mpc.problem import INPUTS
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 BATCH, HORIZON, RELAXATION = 4, 3, 1e-4
 N_C = 3
 
