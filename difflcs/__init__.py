@@ -1,9 +1,10 @@
 """Differentiable model predictive control through learned linear complementarity systems."""
 
-from difflcs.cost import GoalCost, QuadraticCost
+from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds
+from difflcs.cost import CostSequence, GoalCost, QuadraticCost
 from difflcs.errors import BackendNotFoundError, DiffLCSError, SolveError
 from difflcs.lcp import LCPSolution, solve_lcp
-from difflcs.lcs import LCSModel, LCSParams
+from difflcs.lcs import LCSModel, LCSModule, LCSParams, LCSSequence
 from difflcs.losses import prediction_loss, violation_loss
 from difflcs.mpc.backends import available_backends, register_backend
 from difflcs.mpc.layer import LCSMPCLayer
@@ -14,15 +15,21 @@ __version__ = "0.1.0"
 
 __all__ = [
     "BackendNotFoundError",
+    "ConstraintSequence",
+    "CostSequence",
     "DiffLCSError",
     "GoalCost",
     "LCPSolution",
     "LCSMPCLayer",
     "LCSModel",
+    "LCSModule",
     "LCSParams",
+    "LCSSequence",
+    "LinearConstraints",
     "MPCSolution",
     "QuadraticCost",
     "SolveError",
+    "StageBounds",
     "Status",
     "available_backends",
     "prediction_loss",

@@ -8,7 +8,15 @@ from collections.abc import Iterable, Sequence
 import torch
 from torch import Tensor
 
-from difflcs.errors import DeviceError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
+from difflcs._functorch import is_wrapped
+from difflcs.errors import (
+    DeviceError,
+    DTypeError,
+    InvalidInputError,
+    NonFiniteError,
+    NotPositiveDefiniteError,
+    ShapeError,
+)
 
 FLOATS = (torch.float32, torch.float64)
 _USABLE_DEVICES = ("cpu", "cuda", "mps", "xpu")
@@ -32,7 +40,8 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
         name: what to call it in the message.
         value: the candidate.
         dims: names and sizes of its trailing dimensions.
-        finite: refuse NaN and infinity.
+        finite: refuse NaN and infinity. Inside `torch.func` transforms numbers cannot be read: they are refused where
+            they can, in the autograd function that works on them.
 
     Returns:
         The same tensor, unchanged.
@@ -55,7 +64,7 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
         raise ShapeError(
             f"{name}: expected shape ({labels}), got {tuple(value.shape)}; reshape it or rebuild the model"
         )
-    if finite and not _all_finite(value.detach()):
+    if finite and not is_wrapped(value) and not _all_finite(value.detach()):
         bad = torch.nonzero(~torch.isfinite(value.detach()))
         raise NonFiniteError(
             f"{name}: expected finite numbers, got {len(bad)} NaN or infinite of {value.numel()}, "
@@ -67,6 +76,31 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
 def _all_finite(value: Tensor) -> bool:
     # A finite sum has finite terms, and costs a third of looking at each. Large terms can overflow it.
     return math.isfinite(value.sum()) or bool(torch.isfinite(value).all())
+
+
+def check_positive_definite(F: Tensor) -> None:
+    """Refuse F (..., n, n) whose symmetric part F + Fᵀ is not positive definite, where its numbers can be read."""
+    if is_wrapped(F) or not F.numel():
+        return
+    symmetric = F.detach().double().cpu()
+    symmetric = symmetric + symmetric.mT
+    if not int(torch.linalg.cholesky_ex(symmetric).info.max()):
+        return
+    smallest = torch.linalg.eigvalsh(symmetric)[..., 0]
+    where = f" at batch index {batch_index(smallest.shape, int(smallest.argmin()))}" if F.ndim > 2 else ""
+    raise NotPositiveDefiniteError(
+        f"F: expected F + Fᵀ positive definite, got smallest eigenvalue {float(smallest.min()):.3e}{where}; "
+        f"add to the diagonal of F (LCSModel does it by `stiffness`)"
+    )
+
+
+def batch_index(shape: Sequence[int], flat: int) -> str:
+    """The element of a batch that a flat index means, as one writes it: 3, or (1, 0)."""
+    index = []
+    for size in reversed(shape):
+        flat, i = divmod(flat, size)
+        index.insert(0, i)
+    return str(index[0]) if len(index) == 1 else str(tuple(index))
 
 
 def check_same_device(tensors: Iterable[tuple[str, Tensor]]) -> None:
@@ -82,10 +116,16 @@ def check_same_device(tensors: Iterable[tuple[str, Tensor]]) -> None:
             )
 
 
-def check_positive_int(name: str, value: object, minimum: int = 1, maximum: int = 2**63 - 1) -> int:
-    """Check an integer of at least `minimum` and at most `maximum`, by default the largest that torch takes."""
+def check_integer(name: str, value: object) -> int:
+    """Check an integer of either sign."""
     if isinstance(value, bool) or not isinstance(value, int):
         raise DTypeError(f"{name}: expected an int, got {describe(value)}; convert it with int(...)")
+    return value
+
+
+def check_positive_int(name: str, value: object, minimum: int = 1, maximum: int = 2**63 - 1) -> int:
+    """Check an integer of at least `minimum` and at most `maximum`, by default the largest that torch takes."""
+    value = check_integer(name, value)
     if value < minimum:
         raise InvalidInputError(f"{name}: expected at least {minimum}, got {_digits(value)}; pass a larger one")
     if value > maximum:
@@ -131,18 +171,28 @@ def check_choice(name: str, value: object, choices: Sequence[str]) -> str:
 
 def broadcast_batch(shapes: Iterable[tuple[str, torch.Size]]) -> torch.Size:
     """Common leading batch shape of several named ones; a clear error where they do not broadcast."""
-    result = torch.Size()
+    result: tuple[int, ...] = ()
     named = list(shapes)
     for name, shape in named:
-        if shape == result or not shape or not result:  # torch.broadcast_shapes costs 100 µs
-            result = result or shape
-            continue
-        try:
-            result = torch.broadcast_shapes(result, shape)
-        except RuntimeError:
+        wide = _broadcast(result, shape)
+        if wide is None:
             listing = ", ".join(f"{n} {tuple(s)}" for n, s in named)
             raise ShapeError(
                 f"{name}: its batch dimensions {tuple(shape)} do not fit the others ({listing}); "
                 f"expected equal batch dimensions, or none for a shared value"
-            ) from None
-    return result
+            )
+        result = wide
+    return torch.Size(result)
+
+
+def _broadcast(left: tuple[int, ...], right: tuple[int, ...]) -> tuple[int, ...] | None:
+    """What both shapes broadcast to, or None; `torch.broadcast_shapes` costs 100 µs."""
+    if left == right or not right:
+        return left
+    if len(left) < len(right):
+        left, right = right, left
+    kept = len(left) - len(right)
+    pairs = list(zip(left[kept:], right, strict=True))
+    if any(a != b and a != 1 and b != 1 for a, b in pairs):
+        return None
+    return (*left[:kept], *(b if a == 1 else a for a, b in pairs))

@@ -1,49 +1,24 @@
-"""Quadratic costs of the MPC, plain or mapped from a goal."""
+"""Quadratic costs of the MPC: plain, by stage, or mapped from a goal or a reference to follow."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from difflcs._checks import check_number, check_positive_int, check_same_device, check_tensor, describe
+from difflcs._fields import TensorFields, check_by_stage, check_stages
+from difflcs._functorch import is_wrapped
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 
-
-class _TensorFields(nn.Module):
-    """A module whose tensors are registered by kind: nn.Parameter as parameter, any other tensor as buffer."""
-
-    def _register(self, name: str, value: Tensor) -> None:
-        if isinstance(value, nn.Parameter):
-            self.register_parameter(name, value)
-        else:
-            self.register_buffer(name, value)
-
-    def extra_repr(self) -> str:
-        names = [*dict(self.named_parameters(recurse=False)), *dict(self.named_buffers(recurse=False))]
-        return ", ".join(f"{name}{tuple(getattr(self, name).shape)}" for name in names)
+# Number of the own dimensions of each field, behind those of the batch and of the stages.
+_OWN = {"Q": 2, "R": 2, "Q_final": 2, "q": 1, "r": 1, "q_final": 1, "constant": 0, "S": 2}
+_STAGES = ("Q", "R", "q", "r", "S")
 
 
-class QuadraticCost(_TensorFields):
-    """Convex quadratic cost: stage ½xᵀQx + qᵀx + ½uᵀRu + rᵀu, final ½xᵀQ_final x + q_finalᵀx.
-
-    Every field is shared by the batch or has leading batch dimensions; it is learned if it requires grad (an
-    nn.Parameter is registered as one). Only the symmetric parts of Q, R and Q_final matter.
-
-    Args:
-        Q: (..., n_x, n_x) ⪰ 0.
-        R: (..., n_u, n_u) ⪰ 0; ≻ 0 makes every action unique.
-        Q_final: (..., n_x, n_x) ⪰ 0.
-        q: (..., n_x), zero if None.
-        r: (..., n_u), zero if None.
-        q_final: (..., n_x), zero if None.
-        constant: (...) added to the objective, zero if None; it changes no action.
-
-    Raises:
-        ShapeError, DTypeError, DeviceError, NonFiniteError: a field does not fit the others.
-        InvalidInputError: Q, R or Q_final has a negative eigenvalue.
-    """
+class _Quadratic(TensorFields):
+    """What costs that are quadratic in states and actions have in common."""
 
     Q: Tensor
     R: Tensor
@@ -52,20 +27,20 @@ class QuadraticCost(_TensorFields):
     r: Tensor
     q_final: Tensor
     constant: Tensor
+    S: Tensor | None
 
-    def __init__(
+    def _fill(
         self,
         Q: Tensor,
         R: Tensor,
         Q_final: Tensor,
-        q: Tensor | None = None,
-        r: Tensor | None = None,
-        q_final: Tensor | None = None,
-        constant: Tensor | None = None,
-        *,
-        check: bool = True,
-    ):
-        super().__init__()
+        q: Tensor | None,
+        r: Tensor | None,
+        q_final: Tensor | None,
+        constant: Tensor | None,
+        S: Tensor | None,
+        check: bool,
+    ) -> None:
         for name, value in (("Q", Q), ("R", R), ("Q_final", Q_final)):
             check_tensor(name, value)
             if value.ndim < 2 or value.shape[-1] != value.shape[-2]:
@@ -84,36 +59,160 @@ class QuadraticCost(_TensorFields):
         }
         x, u = ("n_x", self.n_x), ("n_u", self.n_u)
         dims = {"Q_final": [x, x], "q": [x], "r": [u], "q_final": [x], "constant": []}
+        if S is None:
+            self.register_buffer("S", None)
+        else:
+            fields["S"], dims["S"] = S, [x, u]
         for name, dim in dims.items():
             check_tensor(name, fields[name], dim)
         check_same_device(fields.items())
+        if self.by_stage:
+            check_stages({k: (fields[k], _OWN[k], 0) for k in _STAGES if k in self.by_stage})
         if check:
-            for name in ("Q", "R", "Q_final"):
+            for name in ("Q", "R", "Q_final") if S is None else ("Q_final",):
                 _check_convex(name, fields[name])
+            if S is not None:
+                _check_convex("[[Q, S], [Sᵀ, R]]", self._stage_hessian(fields))
         for name, value in fields.items():
             self._register(name, value)
 
+    def _stage_hessian(self, fields: dict[str, Tensor]) -> Tensor:
+        blocks = []
+        for name in ("Q", "S", "R"):
+            value = fields[name].detach()
+            staged = not self.by_stage or name in self.by_stage
+            blocks.append(value if staged else value.unsqueeze(-3))
+        try:
+            batch = torch.broadcast_shapes(*(block.shape[:-2] for block in blocks))
+        except RuntimeError:
+            shapes = ", ".join(f"{name} {tuple(fields[name].shape)}" for name in ("Q", "S", "R"))
+            raise ShapeError(f"S: expected batch dimensions that fit those of Q and R, got {shapes}") from None
+        Q, S, R = (block.expand(*batch, *block.shape[-2:]) for block in blocks)
+        return torch.cat([torch.cat([Q, S], -1), torch.cat([S.mT, R], -1)], -2)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Name → tensor as it was given, with the constant; S where there is one."""
+        fields = {name: getattr(self, name) for name in _OWN}
+        if fields["S"] is None:
+            del fields["S"]
+        return fields
+
     def fields(self) -> dict[str, Tensor]:
-        """Name → tensor, with symmetric Q, R and Q_final, without the constant."""
-        symmetric = {k: 0.5 * (v + v.mT) for k, v in (("Q", self.Q), ("R", self.R), ("Q_final", self.Q_final))}
-        return {**symmetric, "q": self.q, "r": self.r, "q_final": self.q_final}
+        """Name → tensor, with symmetric Q, R and Q_final, without the constant; S where there is one."""
+        fields = self.tensors()
+        del fields["constant"]
+        return {k: 0.5 * (v + v.mT) if k in ("Q", "R", "Q_final") else v for k, v in fields.items()}
+
+
+class QuadraticCost(_Quadratic):
+    """Convex quadratic cost: stage ½xᵀQx + qᵀx + ½uᵀRu + rᵀu + xᵀSu, final ½xᵀQ_final x + q_finalᵀx.
+
+    Every field is shared by the batch or has leading batch dimensions; it is learned if it requires grad (an
+    nn.Parameter is registered as one). Only the symmetric parts of Q, R and Q_final matter.
+
+    Args:
+        Q: (..., n_x, n_x) ⪰ 0.
+        R: (..., n_u, n_u) ⪰ 0; ≻ 0 makes every action unique.
+        Q_final: (..., n_x, n_x) ⪰ 0.
+        q: (..., n_x), zero if None.
+        r: (..., n_u), zero if None.
+        q_final: (..., n_x), zero if None.
+        constant: (...) added to the objective, zero if None; it changes no action.
+        S: (..., n_x, n_u), zero if None; [[Q, S], [Sᵀ, R]] ⪰ 0.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, NonFiniteError: a field does not fit the others.
+        InvalidInputError: Q_final, or Q and R with S, has a negative eigenvalue.
+    """
+
+    def __init__(
+        self,
+        Q: Tensor,
+        R: Tensor,
+        Q_final: Tensor,
+        q: Tensor | None = None,
+        r: Tensor | None = None,
+        q_final: Tensor | None = None,
+        constant: Tensor | None = None,
+        S: Tensor | None = None,
+        *,
+        check: bool = True,
+    ):
+        super().__init__()
+        self._fill(Q, R, Q_final, q, r, q_final, constant, S, check)
+
+
+class CostSequence(_Quadratic):
+    """One convex quadratic cost per stage: the terms of `QuadraticCost`, with weights that change over the horizon.
+
+    Every field that is given has the dimension H of the stages before its own, and before that any batch dimensions, or
+    none to be shared by the batch. Q_final, q_final and the constant have no stages.
+
+    Args:
+        Q: (..., H, n_x, n_x) ⪰ 0.
+        R: (..., H, n_u, n_u) ⪰ 0; ≻ 0 makes every action unique.
+        Q_final: (..., n_x, n_x) ⪰ 0.
+        q: (..., H, n_x), zero if None.
+        r: (..., H, n_u), zero if None.
+        q_final: (..., n_x), zero if None.
+        constant: (...) added to the objective, zero if None; it changes no action.
+        S: (..., H, n_x, n_u), zero if None; [[Q, S], [Sᵀ, R]] ⪰ 0 at each stage.
+        by_stage: names of the fields that change; the others are as in a `QuadraticCost`. A constant Q is solved
+            faster than H copies of it: `CostSequence(Q, R, Q_final, q=..., by_stage=("q",))`.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, NonFiniteError: a field does not fit the others.
+        InvalidInputError: Q_final, or Q and R with S, has a negative eigenvalue; no field is by stage.
+    """
+
+    def __init__(
+        self,
+        Q: Tensor,
+        R: Tensor,
+        Q_final: Tensor,
+        q: Tensor | None = None,
+        r: Tensor | None = None,
+        q_final: Tensor | None = None,
+        constant: Tensor | None = None,
+        S: Tensor | None = None,
+        *,
+        by_stage: Collection[str] = _STAGES,
+        check: bool = True,
+    ):
+        super().__init__()
+        given = [name for name, value in (("Q", Q), ("R", R), ("q", q), ("r", r), ("S", S)) if value is not None]
+        self.by_stage = check_by_stage(by_stage, _STAGES, given)
+        self._fill(Q, R, Q_final, q, r, q_final, constant, S, check)
+
+    @property
+    def horizon(self) -> int:
+        """H, the number of stages."""
+        name = min(self.by_stage)
+        return getattr(self, name).shape[-1 - _OWN[name]]
 
 
 def _check_convex(name: str, matrix: Tensor) -> None:
+    if is_wrapped(matrix) or not matrix.numel():
+        return
     symmetric = 0.5 * (matrix + matrix.mT).detach().double().cpu()
+    # Most weights are found in order by a factorisation, a tenth of the cost of their eigenvalues.
+    shift = 0.5e-9 * symmetric.diagonal(dim1=-2, dim2=-1).amax(-1, keepdim=True)
+    factored = torch.linalg.cholesky_ex(symmetric + torch.diag_embed(shift.expand(symmetric.shape[:-1])))
+    if not bool(factored.info.any()):
+        return
     eigenvalues = torch.linalg.eigvalsh(symmetric)
-    if eigenvalues.numel() and bool((eigenvalues[..., 0] < -1e-9 * eigenvalues.abs().amax(-1)).any()):
+    if bool((eigenvalues[..., 0] < -1e-9 * eigenvalues.abs().amax(-1)).any()):
         raise InvalidInputError(
             f"{name}: expected a positive semi-definite matrix, got smallest eigenvalue "
             f"{float(eigenvalues[..., 0].min()):.3e}; a negative weight makes the cost unbounded"
         )
 
 
-class GoalCost(_TensorFields):
+class GoalCost(TensorFields):
     """Maps a goal to a `QuadraticCost` whose linear terms are linear in the goal.
 
     cost(goal) has q = goal_to_q · goal, q_final = goal_to_q_final · goal and the constant ½ goalᵀ K goal, so that costs
-    of tracking errors (w‖x_goal − goal‖²) come out with their true value.
+    of tracking errors (w‖x_goal − goal‖²) come out with their true value. `follow` maps a goal per stage.
 
     Args:
         Q: (n_x, n_x) stage weight.
@@ -179,20 +278,57 @@ class GoalCost(_TensorFields):
         Returns:
             A `QuadraticCost` with q, q_final (..., n_x) and constant (...), differentiable in the goal and the weights.
         """
-        check_tensor("goal", goal, [("n_goal", self.n_goal)])
-        if goal.device != self.Q.device:
-            check_same_device([("cost", self.Q), ("goal", goal)])
-        goal = goal.to(self.Q.dtype)
+        return QuadraticCost(**self.at(goal, horizon), check=False)
+
+    def follow(self, reference: Tensor) -> CostSequence:
+        """The cost of goals that move: stage k is drawn to its own goal, the final state to the last.
+
+        Args:
+            reference: (..., H+1, n_goal) one goal for each state of the plan, the first for x0.
+
+        Returns:
+            A `CostSequence` of which q (..., H, n_x) alone varies by stage, differentiable in the reference and the
+            weights.
+        """
+        return CostSequence(**self.along(reference), by_stage=("q",), check=False)
+
+    def at(self, goal: Tensor, horizon: int) -> dict[str, Tensor]:
+        """The fields of the cost of one goal."""
+        goal = self._goal("goal", goal, [])
         weight = horizon * self.goal_stage + self.goal_final
-        return QuadraticCost(
-            self.Q,
-            self.R,
-            self.Q_final,
-            q=goal @ self.goal_to_q.mT,
-            q_final=goal @ self.goal_to_q_final.mT,
-            constant=0.5 * (goal * (goal @ weight.mT)).sum(-1),
-            check=False,
-        )
+        return {
+            **self._weights(),
+            "q": goal @ self.goal_to_q.mT,
+            "q_final": goal @ self.goal_to_q_final.mT,
+            "constant": 0.5 * (goal * (goal @ weight.mT)).sum(-1),
+        }
+
+    def along(self, reference: Tensor, horizon: int | None = None) -> dict[str, Tensor]:
+        """The fields of the cost of a reference; q has the stages, H of them if the horizon is given."""
+        stages = [] if horizon is None else [("H+1", horizon + 1)]
+        reference = self._goal("reference", reference, stages)
+        if reference.ndim < 2 or reference.shape[-2] < 2:
+            raise ShapeError(
+                f"reference: expected shape (..., H+1, n_goal={self.n_goal}) with H ≥ 1, got {tuple(reference.shape)}; "
+                f"give one goal for each state of the plan"
+            )
+        stage, last = reference[..., :-1, :], reference[..., -1, :]
+        tracked = (stage * (stage @ self.goal_stage.mT)).sum((-1, -2))
+        return {
+            **self._weights(),
+            "q": stage @ self.goal_to_q.mT,
+            "q_final": last @ self.goal_to_q_final.mT,
+            "constant": 0.5 * (tracked + (last * (last @ self.goal_final.mT)).sum(-1)),
+        }
+
+    def _weights(self) -> dict[str, Tensor]:
+        return {"Q": self.Q, "R": self.R, "Q_final": self.Q_final, "r": self.R.new_zeros(self.n_u)}
+
+    def _goal(self, name: str, value: Tensor, stages: list[tuple[str, int]]) -> Tensor:
+        check_tensor(name, value, [*stages, ("n_goal", self.n_goal)])
+        if value.device != self.Q.device:
+            check_same_device([("cost", self.Q), (name, value)])
+        return value.to(self.Q.dtype)
 
     def stage(self, x: Tensor, u: Tensor, goal: Tensor) -> Tensor:
         """The cost of one stage, its constant included: states (..., n_x), actions (..., n_u), goals (...) → (...)."""

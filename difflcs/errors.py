@@ -33,6 +33,10 @@ class ShapeError(InvalidInputError):
     page = "docs/notation.md"
 
 
+class BatchIndexError(ShapeError, IndexError):
+    """A record of matrices was indexed where it has no batch dimension, no such element, or no such stage."""
+
+
 class DTypeError(InvalidInputError, TypeError):
     """A value has the wrong type or dtype."""
 

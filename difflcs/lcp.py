@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +12,8 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_number, check_same_device, check_tensor
-from difflcs.errors import DoubleBackwardError, ShapeError, SolveWarning
+from difflcs._functorch import Solver, is_wrapped, runs_eagerly, solve
+from difflcs.errors import ShapeError, SolveWarning
 from difflcs.status import Status
 
 # Block principal pivoting needs 3–10 iterations; the limit only bounds pathological inputs. The relaxed solve follows
@@ -34,6 +37,7 @@ class LCPSolution(NamedTuple):
     status: Tensor
 
 
+@runs_eagerly
 def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0) -> LCPSolution:
     """Solve 0 ≤ λ ⊥ F λ + q ≥ 0 for a batch of P-matrices F (in particular F + Fᵀ ≻ 0).
 
@@ -53,7 +57,7 @@ def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0) -> LCPSolution:
 
     Args:
         F: (..., n, n), or (n, n) shared by the batch.
-        q: (..., n).
+        q: (..., n), n ≥ 0.
         relaxation: 0 for the exact problem, else the product λᵢ wᵢ, in the units of λ·w.
 
     Returns:
@@ -65,24 +69,21 @@ def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0) -> LCPSolution:
     """
     check_number("relaxation", relaxation)
     check_tensor("q", q)
-    if q.ndim < 1 or q.shape[-1] < 1:
-        raise ShapeError(f"q: expected shape (..., n) with n ≥ 1, got {tuple(q.shape)}")
+    if q.ndim < 1:
+        raise ShapeError(f"q: expected shape (..., n), got {tuple(q.shape)}; add the dimension of the variables")
     n = q.shape[-1]
     check_tensor("F", F, [("n", n), ("n", n)])
     check_same_device([("q", q), ("F", F)])
     batch = broadcast_batch([("q", q.shape[:-1]), ("F", F.shape[:-2])])
+    if n == 0:  # no contacts: nothing to solve
+        lam = (F.to(q.dtype) @ q.unsqueeze(-1)).squeeze(-1).expand(*batch, 0)
+        return LCPSolution(lam, lam + q, torch.full(batch, int(Status.CONVERGED), dtype=torch.int8, device=q.device))
     q_flat = q.expand(*batch, n).reshape(-1, n).double()
     F_flat = F.double() if F.ndim == 2 else F.expand(*batch, n, n).reshape(-1, n, n).double()
     narrow = torch.float32 in (F.dtype, q.dtype)
-    lam, w, status = _SolveLCP.apply(F_flat, q_flat, float(relaxation), narrow)  # pyright: ignore[reportGeneralTypeIssues]
-    failed = int((status != Status.CONVERGED).sum())
-    if failed:
-        warnings.warn(
-            f"{failed} of {status.numel()} LCPs were not solved; their gradient is zero. Expected P-matrices: check "
-            f"that F + Fᵀ is positive definite, and read .status",
-            SolveWarning,
-            stacklevel=2,
-        )
+    lam, w, status = solve(_Problems(float(relaxation), narrow), F_flat, q_flat)
+    if not is_wrapped(status):
+        _warn_of_failures(status, stacklevel=4)
     return LCPSolution(
         lam.reshape(*batch, n).to(q.dtype), w.reshape(*batch, n).to(q.dtype), status.reshape(batch).to(q.device)
     )
@@ -108,33 +109,53 @@ def solve_lcp_arrays(
     return lam, w, status
 
 
-class _SolveLCP(torch.autograd.Function):
+def _warn_of_failures(status: Tensor, stacklevel: int) -> None:
+    failed = int((status != Status.CONVERGED).sum())
+    if failed:
+        warnings.warn(
+            f"{failed} of {status.numel()} LCPs were not solved; their gradient is zero. Expected P-matrices: check "
+            f"that F + Fᵀ is positive definite, and read .status",
+            SolveWarning,
+            stacklevel=stacklevel,
+        )
+
+
+@dataclass(frozen=True)
+class _Problems(Solver):
     """F, q in float64 → λ, w, status. `narrow`: the caller's dtype is float32, whose range is that of a gradient."""
 
-    @staticmethod
-    def forward(ctx, F: Tensor, q: Tensor, relaxation: float, narrow: bool):
+    relaxation: float
+    narrow: bool
+
+    name = "solve_lcp"
+    ranks = (2, 1)
+    differentiable = 2
+
+    def solve(self, tensors: Sequence[Tensor], transformed: bool) -> tuple[Tensor, ...]:
+        F, q = tensors
+        if transformed:
+            check_tensor("q", q)
+            check_tensor("F", F)
         lam, w, status = (
             torch.from_numpy(a)
-            for a in solve_lcp_arrays(F.detach().cpu().numpy(), q.detach().cpu().numpy(), relaxation)
+            for a in solve_lcp_arrays(F.detach().cpu().numpy(), q.detach().cpu().numpy(), self.relaxation)
         )
-        if narrow:
+        if self.narrow:
             diagonal = F.detach().cpu().diagonal(dim1=-2, dim2=-1)
             too_large = (torch.maximum(lam, w).amax(-1) > _FLOAT32) | (diagonal < 1 / _FLOAT32).any(-1)
             status = torch.where(too_large, int(Status.NUMERICAL), status).to(torch.int8)
             lam, w = (torch.where(too_large.unsqueeze(-1), v.clamp_max(_FLOAT32), v) for v in (lam, w))
-        lam, w, status = (v.to(q.device) for v in (lam, w, status))
-        ctx.save_for_backward(F, lam, w, status)
-        ctx.mark_non_differentiable(status)
-        return lam, w, status
+        if transformed:
+            _warn_of_failures(status, stacklevel=2)
+        return lam.to(q.device), w.to(q.device), status.to(q.device)
 
-    @staticmethod
-    def backward(ctx, *grads):
-        F, lam, w, status = ctx.saved_tensors
-        if torch.is_grad_enabled():
-            raise DoubleBackwardError("solve_lcp has first derivatives only; expected create_graph=False")
+    def pullback(
+        self, tensors: Sequence[Tensor], outputs: Sequence[Tensor], grads: Sequence[Tensor], needs: Sequence[bool]
+    ) -> Sequence[Tensor | None]:
+        (F, _), (lam, w, status) = tensors, outputs
         solved = (status == Status.CONVERGED).unsqueeze(-1)
         # Whatever comes upstream for a failed element is dropped before it can meet the others.
-        lam_bar, w_bar = (torch.where(solved, g, torch.zeros_like(g)) for g in grads[:2])
+        lam_bar, w_bar = (torch.where(solved, g, torch.zeros_like(g)) for g in grads)
         total = lam + w
         # Strictly complementary: b = λ/(λ+w). At λ = w = 0 the index counts as inactive: b = 0, a = 1.
         b = torch.where(total > 0, lam / total.clamp_min(torch.finfo(lam.dtype).tiny), torch.zeros_like(lam))
@@ -147,7 +168,7 @@ class _SolveLCP(torch.autograd.Function):
         # Rounding can make M singular where F is hardly positive definite: no gradient then, rather than NaN.
         v = torch.where(torch.isfinite(v).all(-1, keepdim=True), v, torch.zeros_like(v))
         q_bar = torch.where(solved, w_bar - b * v, torch.zeros_like(v))
-        if not ctx.needs_input_grad[0]:
-            return None, q_bar, None, None
+        if not needs[0]:
+            return None, q_bar
         F_bar = q_bar.mT @ lam if F.ndim == 2 else q_bar.unsqueeze(-1) * lam.unsqueeze(-2)
-        return F_bar, q_bar, None, None
+        return F_bar, q_bar

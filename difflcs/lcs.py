@@ -1,157 +1,42 @@
-"""Linear complementarity systems: a record of matrices, and the learnable model."""
+"""The learnable linear complementarity system. The records of its matrices are in `difflcs.records`."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, NamedTuple, get_type_hints
 
 import torch
 from torch import Tensor, nn
 
 from difflcs import _files, _zoo
-from difflcs._checks import (
-    broadcast_batch,
-    check_choice,
-    check_number,
-    check_positive_int,
-    check_same_device,
-    check_tensor,
-    describe,
+from difflcs._checks import broadcast_batch, check_choice, check_number, check_positive_int, describe
+from difflcs._functorch import runs_eagerly
+from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, ShapeError
+from difflcs.records import (
+    SYSTEM,
+    LCSModule,
+    LCSParams,
+    LCSPrediction,
+    LCSSequence,
+    SystemMatrices,
+    advance,
+    check_inputs,
+    dimensions,
 )
-from difflcs._linalg import matvec
-from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, NotPositiveDefiniteError, ShapeError
-from difflcs.lcp import solve_lcp
+
+__all__ = [
+    "SYSTEM",
+    "LCSModel",
+    "LCSModule",
+    "LCSParams",
+    "LCSPrediction",
+    "LCSSequence",
+    "SystemMatrices",
+    "dimensions",
+]
 
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
-
-
-def dimensions(record: type) -> dict[str, tuple[str, ...]]:
-    """The fields of a record that are tensors, each with the kinds of its trailing dimensions, as annotated there."""
-    hints = get_type_hints(record, include_extras=True)
-    return {f.name: hints[f.name].__metadata__ for f in fields(record) if hasattr(hints[f.name], "__metadata__")}
-
-
-@dataclass(frozen=True)
-class SystemMatrices:
-    """Sizes and equations of whatever holds the matrices of an LCS, shared or one per batch element."""
-
-    A: Annotated[Tensor, "n_x", "n_x"]
-    B: Annotated[Tensor, "n_x", "n_u"]
-    C: Annotated[Tensor, "n_x", "n_lam"]
-    d: Annotated[Tensor, "n_x"]
-    D: Annotated[Tensor, "n_lam", "n_x"]
-    E: Annotated[Tensor, "n_lam", "n_u"]
-    F: Annotated[Tensor, "n_lam", "n_lam"]
-    c: Annotated[Tensor, "n_lam"]
-
-    @property
-    def n_x(self) -> int:
-        """Number of states."""
-        return self.A.shape[-1]
-
-    @property
-    def n_u(self) -> int:
-        """Number of actions."""
-        return self.B.shape[-1]
-
-    @property
-    def n_lam(self) -> int:
-        """Number of complementarity variables."""
-        return self.F.shape[-1]
-
-    def next_state(self, x: Tensor, u: Tensor, lam: Tensor) -> Tensor:
-        """A x + B u + C λ + d, (..., n_x)."""
-        return matvec(self.A, x) + matvec(self.B, u) + matvec(self.C, lam) + self.d
-
-    def gap(self, x: Tensor, u: Tensor, lam: Tensor | None = None) -> Tensor:
-        """D x + E u + c, plus F λ if given, (..., n_lam)."""
-        gap = matvec(self.D, x) + matvec(self.E, u) + self.c
-        return gap if lam is None else gap + matvec(self.F, lam)
-
-
-@dataclass(frozen=True)
-class LCSParams(SystemMatrices):
-    """The matrices of one linear complementarity system, or of one per batch element (Eq. lcs of the paper).
-
-    x₊ = A x + B u + C λ + d,  0 ≤ λ ⊥ D x + E u + F λ + c ≥ 0,  with F + Fᵀ ≻ 0, so that λ is unique.
-
-    Every field may carry leading batch dimensions, or none to be shared by the batch.
-
-    Attributes:
-        A: (..., n_x, n_x) autonomous dynamics.
-        B: (..., n_x, n_u) effect of actions.
-        C: (..., n_x, n_lam) effect of the complementarity variable (contact forces).
-        d: (..., n_x) constant drift.
-        D: (..., n_lam, n_x) gap per state.
-        E: (..., n_lam, n_u) gap per action.
-        F: (..., n_lam, n_lam) gap per force.
-        c: (..., n_lam) constant gap.
-
-    Raises:
-        ShapeError, DTypeError, DeviceError, NonFiniteError: a field does not fit the others.
-        NotPositiveDefiniteError: F + Fᵀ is not positive definite; the message gives its smallest eigenvalue.
-    """
-
-    def __post_init__(self) -> None:
-        for f in fields(self):
-            check_tensor(f.name, getattr(self, f.name))
-        for name, dims in SYSTEM.items():
-            if getattr(self, name).ndim < 2 and len(dims) == 2:
-                raise ShapeError(f"{name}: expected a matrix (..., rows, columns), got {describe(getattr(self, name))}")
-        for name, dims in SYSTEM.items():
-            check_tensor(name, getattr(self, name), [(dim, getattr(self, dim)) for dim in dims], finite=False)
-        check_same_device([(f.name, getattr(self, f.name)) for f in fields(self)])
-        for f in fields(self):
-            if getattr(self, f.name).dtype != self.A.dtype:
-                raise DTypeError(
-                    f"{f.name}: expected {self.A.dtype} like A, got {describe(getattr(self, f.name))}; "
-                    f"convert it with {f.name}.to({self.A.dtype})"
-                )
-        self.batch_shape  # noqa: B018  raises where the batch dimensions do not fit each other
-        check_positive_definite(self.F)
-
-    @property
-    def batch_shape(self) -> torch.Size:
-        """Leading batch dimensions; empty when every field is shared."""
-        return broadcast_batch(
-            (name, getattr(self, name).shape[: getattr(self, name).ndim - len(dims)]) for name, dims in SYSTEM.items()
-        )
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Name → tensor, in the order of the fields."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
-
-    def detach(self) -> LCSParams:
-        """The same numbers without gradient history."""
-        return replace(self, **{k: v.detach() for k, v in self.tensors().items()})
-
-
-# Name → kinds of its dimensions, in the order of every list of these matrices.
-SYSTEM = dimensions(SystemMatrices)
-
-
-def check_positive_definite(F: Tensor) -> None:
-    """Refuse F whose symmetric part F + Fᵀ is not positive definite."""
-    symmetric = F.detach().double().cpu()
-    symmetric = symmetric + symmetric.mT
-    if int(torch.linalg.cholesky_ex(symmetric).info.abs().max() if symmetric.numel() else 0) == 0:
-        return
-    smallest = torch.linalg.eigvalsh(symmetric)[..., 0]
-    where = "" if F.ndim == 2 else f" at batch index {int(smallest.argmin())}"
-    raise NotPositiveDefiniteError(
-        f"F: expected F + Fᵀ positive definite, got smallest eigenvalue {float(smallest.min()):.3e}{where}; "
-        f"add to the diagonal of F (LCSModel does it by `stiffness`)"
-    )
-
-
-class LCSPrediction(NamedTuple):
-    """One step of an LCS: the next state (..., n_x) and the complementarity variable (..., n_lam)."""
-
-    x_next: Tensor
-    lam: Tensor
 
 
 class LCSModel(nn.Module):
@@ -162,7 +47,7 @@ class LCSModel(nn.Module):
     Args:
         n_x: number of states.
         n_u: number of actions.
-        n_lam: number of complementarity variables (contacts).
+        n_lam: number of complementarity variables (contacts); 0 for a linear system.
         stiffness: lower bound on the symmetric part of F, > 0.
         init_scale: parameters are drawn uniformly from ±init_scale; c starts at zero.
         learn_c: whether c is learned. The paper's experiments keep it at zero (`False`).
@@ -170,7 +55,7 @@ class LCSModel(nn.Module):
         dtype: float64 (default) or float32.
 
     Raises:
-        InvalidInputError, DTypeError: a size below 1, a stiffness that is not positive, another dtype.
+        InvalidInputError, DTypeError: a size that is too small, a stiffness that is not positive, another dtype.
     """
 
     parameter_names = ("A", "B", "C", "d", "D", "E", "G", "H", "c")
@@ -190,7 +75,7 @@ class LCSModel(nn.Module):
         super().__init__()
         self.n_x = check_positive_int("n_x", n_x)
         self.n_u = check_positive_int("n_u", n_u)
-        self.n_lam = check_positive_int("n_lam", n_lam)
+        self.n_lam = check_positive_int("n_lam", n_lam, minimum=0)
         self.stiffness = check_number("stiffness", stiffness, strict=True)
         check_number("init_scale", init_scale)
         if dtype not in (torch.float32, torch.float64):
@@ -227,10 +112,12 @@ class LCSModel(nn.Module):
         eye = torch.eye(self.n_lam, dtype=self.G.dtype, device=self.G.device)
         return self.G @ self.G.mT + self.stiffness * eye + self.H - self.H.mT
 
-    def params(self) -> LCSParams:
-        """The system's matrices, differentiable with respect to the parameters."""
+    @runs_eagerly
+    def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
+        """The system's matrices, differentiable with respect to the parameters; the same for all x and contexts."""
         return LCSParams(self.A, self.B, self.C, self.d, self.D, self.E, self.F, self.c)
 
+    @runs_eagerly
     def forward(self, x: Tensor, u: Tensor) -> LCSPrediction:
         """Predict one step through the exact LCP.
 
@@ -242,11 +129,10 @@ class LCSModel(nn.Module):
             x_next (..., n_x) and lam (..., n_lam), differentiable in x, u and every parameter.
         """
         self.check_inputs(x=x, u=u)
-        params = self.params()
-        gap = params.gap(x, u)
-        lam = solve_lcp(params.F, gap).lam
-        return LCSPrediction(params.next_state(x, u, lam), lam)
+        broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1])])
+        return advance(self.params(), x, u)
 
+    @runs_eagerly
     def rollout(self, x0: Tensor, u_seq: Tensor) -> Tensor:
         """Predict a trajectory.
 
@@ -257,26 +143,12 @@ class LCSModel(nn.Module):
         Returns:
             (..., T+1, n_x) states, x0 first.
         """
-        check_tensor("u_seq", u_seq, [("n_u", self.n_u)])
-        if u_seq.ndim < 2:
-            raise ShapeError(f"u_seq: expected shape (..., T, n_u={self.n_u}), got {tuple(u_seq.shape)}")
-        self.check_inputs(x=x0)
-        batch = broadcast_batch([("x0", x0.shape[:-1]), ("u_seq", u_seq.shape[:-2])])
-        states = [x0.expand(*batch, self.n_x)]
-        for t in range(u_seq.shape[-2]):
-            states.append(self(states[-1], u_seq[..., t, :]).x_next)
-        return torch.stack(states, dim=-2)
+        self.check_inputs(x0=x0)
+        return self.params().rollout(x0, u_seq)
 
     def check_inputs(self, **tensors: Tensor) -> None:
         """Check states `x…` and actions `u…` against the model's sizes, dtype-class and device."""
-        for name, tensor in tensors.items():
-            check_tensor(name, tensor, [("n_u", self.n_u)] if name.startswith("u") else [("n_x", self.n_x)])
-            if tensor.dtype != self.A.dtype:
-                raise DTypeError(
-                    f"{name}: expected {self.A.dtype} like the model, got {describe(tensor)}; "
-                    f"convert it with {name}.to({self.A.dtype}) or the model with model.to({tensor.dtype})"
-                )
-        check_same_device([("model", self.A), *tensors.items()])
+        check_inputs(self.n_x, self.n_u, self.A, tensors, owner="model")
 
     @classmethod
     def from_params(cls, params: LCSParams, stiffness: float | None = None) -> LCSModel:
@@ -284,8 +156,8 @@ class LCSModel(nn.Module):
 
         Args:
             params: one system, without batch dimensions.
-            stiffness: the model's stiffness; by default half the smallest eigenvalue of (F + Fᵀ)/2. A larger one than
-                that eigenvalue cannot represent F and is refused.
+            stiffness: the model's stiffness; by default half the smallest eigenvalue of (F + Fᵀ)/2, or 0.1 without
+                contacts. A larger one than that eigenvalue cannot represent F and is refused.
 
         Returns:
             A model whose `params()` equal the given ones up to rounding.
@@ -294,9 +166,9 @@ class LCSModel(nn.Module):
             raise ShapeError(f"params: expected no batch dimensions, got {tuple(params.batch_shape)}; index one system")
         params = params.detach()
         symmetric = 0.5 * (params.F + params.F.mT).double()
-        smallest = float(torch.linalg.eigvalsh(symmetric)[0])
+        smallest = float(torch.linalg.eigvalsh(symmetric)[0]) if params.n_lam else float("inf")
         if stiffness is None:
-            stiffness = 0.5 * smallest
+            stiffness = 0.5 * smallest if params.n_lam else 0.1
         check_number("stiffness", stiffness, strict=True)
         if stiffness >= smallest:
             raise InvalidInputError(
@@ -335,7 +207,8 @@ class LCSModel(nn.Module):
             )
         try:
             dtype = _DTYPES[check_choice("dtype", config["dtype"], tuple(_DTYPES))]
-            n_x, n_u, n_lam = (check_positive_int(k, config[k]) for k in ("n_x", "n_u", "n_lam"))
+            n_x, n_u = (check_positive_int(k, config[k]) for k in ("n_x", "n_u"))
+            n_lam = check_positive_int("n_lam", config["n_lam"], minimum=0)
             stiffness = check_number("stiffness", config["stiffness"], strict=True)
             if not isinstance(config["learn_c"], bool):
                 raise DTypeError(

@@ -11,6 +11,9 @@
 namespace difflcs::DIFFLCS_ISA {
 namespace {
 
+// Weight on held constraints, in parts of the largest weight of the cost: each sweep refines by about as much.
+constexpr double kHold = 1e6;
+
 // Adds products to gradients: into the lanes' sums where the input is shared, else into each element's own.
 struct Sink {
   const MpcBatch& batch;
@@ -19,7 +22,8 @@ struct Sink {
   Mask valid;
   Vec* sum;
 
-  void add(Input which, int64_t at, Vec value) const {
+  void add(Input which, int64_t k, int64_t at, Vec value) const {
+    at += k * batch.step[which];
     if (double* own = o.per_element[which]) {
       for (int l = 0; l < kLanes && group + l < end; l++)
         if (valid[l]) own[(group + l) * batch.stride[which] + at] += value[l];
@@ -38,7 +42,8 @@ class Adjoint {
   Problem<T, S> problem;
   Riccati<T, S, true> riccati;
   Trajectory<S> at;
-  Upstream<S> upstream;
+  Upstream<S> upstream, shifted;  // shifted by the multipliers' directions along the rows of held constraints
+  Matrix<Vec, 0, 0> dm;           // directions of the multipliers of the constraints
   Vec objective_bar;
   Vec* sum;  // of the shared inputs' gradients
   // Directions w of K_z w = z_bar: dw = (dx, du), dx of the next state, dlam, ds, dp, dy; and rho = y o lam.
@@ -53,10 +58,11 @@ class Adjoint {
     Arena arena{memory};
     problem.layout(arena), at.layout(arena, n), riccati.layout(arena);
     arena.take(upstream.x, h + 1, nx), arena.take(upstream.u, h, nu), arena.take(upstream.lam, h, nl);
+    arena.take(shifted.x, h + 1, nx), arena.take(shifted.u, h, nu), arena.take(dm, h + 1, n.c());
     arena.take(gap, nl), arena.take(dw, nw), arena.take(dx_next, nx), arena.take(dlam, nl), arena.take(ds, nl);
     arena.take(dp, nx), arena.take(dy, nl), arena.take(rho, nl), arena.take(drho, nl);
     int64_t inputs = 0;
-    for (const Field& field : kMpcFields) inputs += extent(batch, field);
+    for (int i = 0; i < kInputs; i++) inputs += extent(batch, kMpcFields[i]) * (batch.step[i] ? h + 1 : 1);
     arena.take(sum, inputs);
     return arena.used;
   }
@@ -66,7 +72,10 @@ class Adjoint {
     for (int64_t i = 0; i < o.shared_size; i++) sum[i] = all(0);
     for (int64_t group = begin; group < end && !watch.stop(watch.context); group += kLanes) {
       const Mask valid = load(o, group, end);
-      riccati.sweep(at, upstream, all(0), Mask{});
+      if (n.c() > 0)
+        hold_constraints();
+      else
+        riccati.sweep(at, upstream, all(0), Mask{});
       forward({batch, o, group, end, valid, sum});
     }
     for (int64_t i = 0; i < o.shared_size; i++) {
@@ -90,14 +99,64 @@ class Adjoint {
       problem.load(upstream.x.entries, o.x_bar + e * states, states, l);
       problem.load(upstream.u.entries, o.u_bar + e * actions, actions, l);
       problem.load_lam(upstream.lam.entries, o.lam_bar + e * forces, l, true);
+      problem.load_multipliers(o.mu + e * (n.h + 1) * n.c(), l);
       objective_bar[l] = o.objective_bar[e];
       valid[l] = group + l < end && o.solved[e] ? -1 : 0;
     }
     for (int64_t k = 0; k < n.h; k++) {
-      problem.gap(at.x[k], at.u[k], gap);
-      for (int64_t i = 0; i < n.l(); i++) at.s(k, i) = gap[i] + problem.F.row(i) * at.lam[k];
+      const StageData<T, S> data = problem.stage(k);
+      data.gap(at.x[k], at.u[k], gap);
+      for (int64_t i = 0; i < n.l(); i++) at.s(k, i) = gap[i] + data.F.row(i) * at.lam[k];
     }
     return valid;
+  }
+
+  // The sweep with held constraints as equations a (dx, du) = 0: a weight on them, and their multipliers' directions dm,
+  // which repeated sweeps refine. Rows whose multiplier is zero or the price are not held.
+  void hold_constraints() {
+    const int64_t nx = n.x(), nu = n.u(), nc = n.c();
+    T* weight = problem.weight;
+    for (int64_t k = 0; k <= n.h; k++)
+      for (int64_t i = 0; i < nc; i++) {
+        const Vec m = problem.multiplier(k, i);
+        riccati.force(k, i) = m, dm(k, i) = all(0);
+        riccati.stiffness(k, i) = select((m > 0) & (m < kAtPrice * problem.price[k][i]), all(kHold) * weight[0], all(0));
+      }
+    for (int pass = 0; pass < 8; pass++) {
+      for (int64_t k = 0; k <= n.h; k++) {
+        const auto G = problem.G[k];
+        for (int64_t i = 0; i < nx; i++) {
+          shifted.x(k, i) = upstream.x(k, i);
+          for (int64_t r = 0; r < nc; r++) shifted.x(k, i) -= G(r, i) * dm(k, r);
+        }
+        for (int64_t j = 0; j < nu && k < n.h; j++) {
+          shifted.u(k, j) = upstream.u(k, j);
+          for (int64_t r = 0; r < nc; r++) shifted.u(k, j) -= G(r, nx + j) * dm(k, r);
+        }
+      }
+      shifted.lam = upstream.lam;
+      riccati.sweep(at, shifted, all(0), Mask{});
+      Vec largest = all(0), change = all(0);
+      for (int64_t i = 0; i < nx; i++) dw[i] = all(0);
+      for (int64_t k = 0; k <= n.h; k++) {
+        if (k < n.h) primal_direction(k);
+        for (int64_t r = 0; r < nc; r++) {
+          const Vec more = riccati.stiffness(k, r) * along(k, r);
+          dm(k, r) += more;
+          change = max(change, abs(more)), largest = max(largest, abs(dm(k, r)));
+        }
+        for (int64_t i = 0; i < nx && k < n.h; i++) dw[i] = dx_next[i];
+      }
+      if (!any(change > 1e-12 * largest)) break;
+    }
+  }
+
+  // a (dx, du) of row r at stage k.
+  Vec along(int64_t k, int64_t r) const {
+    const auto G = problem.G[k];
+    Vec t = all(0);
+    for (int64_t j = 0; j < (k < n.h ? n.w() : n.x()); j++) t += G(r, j) * dw[j];
+    return t;
   }
 
   void forward(const Sink& sink) {
@@ -111,37 +170,48 @@ class Adjoint {
       for (int64_t i = 0; i < nx; i++) dp[i] -= objective_bar * p[i];
       for (int64_t i = 0; i < n.l(); i++) drho[i] -= objective_bar * rho[i];
       system_gradients(sink, k);
-      weight_gradients(sink, kQ, kq, at.x[k], dw, nx);
-      weight_gradients(sink, kR, kr, at.u[k], dw + nx, n.u());
+      weight_gradients(sink, k, kQ, kq, at.x[k], dw, nx);
+      weight_gradients(sink, k, kR, kr, at.u[k], dw + nx, n.u());
+      cross_gradients(sink, k);
+      if (n.c() > 0) constraint_gradients(sink, k);
       if (k == 0) initial_state(sink);
       for (int64_t i = 0; i < nx; i++) dw[i] = dx_next[i];
     }
-    weight_gradients(sink, kQ_final, kq_final, at.x[n.h], dw, nx);
+    weight_gradients(sink, 0, kQ_final, kq_final, at.x[n.h], dw, nx);
+    if (n.c() > 0) constraint_gradients(sink, n.h);
   }
 
-  // The directions of stage k from dx in dw.
-  void direction(int64_t k) {
-    const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nw = n.w();
+  // du and the next dx from dx in dw.
+  void primal_direction(int64_t k) {
+    const int64_t nx = n.x(), nu = n.u(), nw = n.w();
     const Stage<S> stage = riccati.stage(k);
-    const Value<S> next = riccati.value(k + 1);
     const Matrix<Vec, kU, kX> K = riccati.feedback[k];
-    const auto C = problem.C;
-    const auto F = problem.F;
-    const Vec *y = stage.y, *lam = at.lam[k];
     for (int64_t j = 0; j < nu; j++) {
       Vec t = riccati.feedforward(k, j);
       if (k > 0) t = t + K.row(j) * dw;
       dw[nx + j] = t;
     }
-    for (int64_t i = 0; i < nl; i++) {
-      Vec a = all(0), b = all(0);
-      for (int64_t j = 0; j < nw; j++) a += stage.K_lam(i, j) * dw[j], b += stage.K_s(i, j) * dw[j];
-      dlam[i] = a, ds[i] = b;
-    }
     for (int64_t i = 0; i < nx; i++) {
       Vec t = all(0);
       for (int64_t j = 0; j < nw; j++) t += stage.A_hat(i, j) * dw[j];
       dx_next[i] = t;
+    }
+  }
+
+  // The directions of stage k from dx in dw.
+  void direction(int64_t k) {
+    const int64_t nx = n.x(), nl = n.l(), nw = n.w();
+    const Stage<S> stage = riccati.stage(k);
+    const Value<S> next = riccati.value(k + 1);
+    const StageData<T, S> data = problem.stage(k);
+    const auto C = data.C;
+    const auto F = data.F;
+    const Vec *y = stage.y, *lam = at.lam[k];
+    primal_direction(k);
+    for (int64_t i = 0; i < nl; i++) {
+      Vec a = all(0), b = all(0);
+      for (int64_t j = 0; j < nw; j++) a += stage.K_lam(i, j) * dw[j], b += stage.K_s(i, j) * dw[j];
+      dlam[i] = a, ds[i] = b;
     }
     for (int64_t i = 0; i < nx; i++) dp[i] = next.v[i] + next.P.row(i) * dx_next;
     for (int64_t i = 0; i < nl; i++) {
@@ -160,64 +230,99 @@ class Adjoint {
   // Before dp and drho take up the objective's part.
   void bounds(const Sink& sink, int64_t k) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l();
-    const auto B = problem.B();
-    const auto E = problem.E();
+    const StageData<T, S> data = problem.stage(k);
+    const auto B = data.B();
+    const auto E = data.E();
     const Vec *u = at.u[k], *p = riccati.value(k + 1).p, *du = dw + nx;
     for (int64_t j = 0; j < nu; j++) {
-      Vec t = upstream.u(k, j), g = problem.r[j];
-      for (int64_t i = 0; i < nu; i++) t -= problem.R(j, i) * du[i], g += problem.R(j, i) * u[i];
+      Vec t = upstream.u(k, j), g = data.r[j];
+      for (int64_t i = 0; i < nu; i++) t -= data.R(j, i) * du[i], g += data.R(j, i) * u[i];
+      if (batch.crossed)
+        for (int64_t i = 0; i < nx; i++) t -= data.cross(i, j) * dw[i], g += data.cross(i, j) * at.x(k, i);
+      for (int64_t i = 0; i < n.c(); i++)
+        t -= data.G(i, nx + j) * dm(k, i), g += data.G(i, nx + j) * riccati.force(k, i);
       for (int64_t i = 0; i < nx; i++) t -= B(i, j) * dp[i], g += B(i, j) * p[i];
       for (int64_t i = 0; i < nl; i++) t -= E(i, j) * drho[i], g += E(i, j) * rho[i];
       t += objective_bar * g;
       Vec by_low = all(0), by_high = all(0);
       if (batch.barrier > 0) {
-        const Vec below = u[j] - problem.u_min[j], above = problem.u_max[j] - u[j], mu = problem.mu;
+        const Vec below = u[j] - data.u_min[j], above = data.u_max[j] - u[j], mu = problem.mu;
         by_low = mu * (du[j] / (below * below) + objective_bar / below);
         by_high = mu * (du[j] / (above * above) - objective_bar / above);
       }
-      sink.add(ku_min, j, select(riccati.lower(k, j), t, by_low));
-      sink.add(ku_max, j, select(riccati.upper(k, j), t, by_high));
+      sink.add(ku_min, k, j, select(riccati.lower(k, j), t, by_low));
+      sink.add(ku_max, k, j, select(riccati.upper(k, j), t, by_high));
     }
   }
 
   void system_gradients(const Sink& sink, int64_t k) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l();
-    const T* scale = problem.scale;
+    const T* scale = problem.scale[k];
     const Vec *x = at.x[k], *u = at.u[k], *lam = at.lam[k], *p = riccati.value(k + 1).p, *dx = dw, *du = dw + nx;
     for (int64_t i = 0; i < nx; i++) {
-      for (int64_t j = 0; j < nx; j++) sink.add(kA, i * nx + j, -(dp[i] * x[j] + p[i] * dx[j]));
-      for (int64_t j = 0; j < nu; j++) sink.add(kB, i * nu + j, -(dp[i] * u[j] + p[i] * du[j]));
-      for (int64_t j = 0; j < nl; j++) sink.add(kC, i * nl + j, -scale[j] * (dp[i] * lam[j] + p[i] * dlam[j]));
-      sink.add(kd, i, -dp[i]);
+      for (int64_t j = 0; j < nx; j++) sink.add(kA, k, i * nx + j, -(dp[i] * x[j] + p[i] * dx[j]));
+      for (int64_t j = 0; j < nu; j++) sink.add(kB, k, i * nu + j, -(dp[i] * u[j] + p[i] * du[j]));
+      for (int64_t j = 0; j < nl; j++) sink.add(kC, k, i * nl + j, -scale[j] * (dp[i] * lam[j] + p[i] * dlam[j]));
+      sink.add(kd, k, i, -dp[i]);
     }
     for (int64_t i = 0; i < nl; i++) {
-      for (int64_t j = 0; j < nx; j++) sink.add(kD, i * nx + j, -scale[i] * (drho[i] * x[j] + rho[i] * dx[j]));
-      for (int64_t j = 0; j < nu; j++) sink.add(kE, i * nu + j, -scale[i] * (drho[i] * u[j] + rho[i] * du[j]));
+      for (int64_t j = 0; j < nx; j++) sink.add(kD, k, i * nx + j, -scale[i] * (drho[i] * x[j] + rho[i] * dx[j]));
+      for (int64_t j = 0; j < nu; j++) sink.add(kE, k, i * nu + j, -scale[i] * (drho[i] * u[j] + rho[i] * du[j]));
       for (int64_t j = 0; j < nl; j++)
-        sink.add(kF, i * nl + j, -(scale[i] * scale[j]) * (drho[i] * lam[j] + rho[i] * dlam[j]));
-      sink.add(kc, i, -scale[i] * drho[i]);
+        sink.add(kF, k, i * nl + j, -(scale[i] * scale[j]) * (drho[i] * lam[j] + rho[i] * dlam[j]));
+      sink.add(kc, k, i, -scale[i] * drho[i]);
     }
   }
 
   // Gradients of a weight on z, which is symmetric, and of the linear term beside it.
-  void weight_gradients(const Sink& sink, Input weight, Input term, const Vec* z, const Vec* dz, int64_t size) {
+  void weight_gradients(const Sink& sink, int64_t k, Input weight, Input term, const Vec* z, const Vec* dz,
+                        int64_t size) {
     const Vec J = objective_bar;
     for (int64_t i = 0; i < size; i++) {
       const Vec Jz = J * z[i];
       for (int64_t j = 0; j < size; j++)
-        sink.add(weight, i * size + j, 0.5 * (Jz * z[j] - dz[i] * z[j] - dz[j] * z[i]));
-      sink.add(term, i, Jz - dz[i]);
+        sink.add(weight, k, i * size + j, 0.5 * (Jz * z[j] - dz[i] * z[j] - dz[j] * z[i]));
+      sink.add(term, k, i, Jz - dz[i]);
+    }
+  }
+
+  // Of S, the weight of x'Su.
+  void cross_gradients(const Sink& sink, int64_t k) {
+    const int64_t nx = n.x(), nu = n.u();
+    const Vec *x = at.x[k], *u = at.u[k], *dx = dw, *du = dw + nx;
+    for (int64_t i = 0; i < nx; i++)
+      for (int64_t j = 0; j < nu; j++)
+        sink.add(kS, k, i * nu + j, objective_bar * x[i] * u[j] - (dx[i] * u[j] + x[i] * du[j]));
+  }
+
+  void constraint_gradients(const Sink& sink, int64_t k) {
+    const int64_t nx = n.x(), nu = n.u();
+    const bool last = k == n.h;
+    const StageData<T, S> data = last ? problem.last() : problem.stage(k);
+    const Vec *x = at.x[k], *u = last ? nullptr : at.u[k], *dx = dw, *du = dw + nx;
+    for (int64_t i = 0; i < n.c(); i++) {
+      const T unit = data.row_scale[i];
+      const Vec m = riccati.force(k, i), change = dm(k, i) - objective_bar * m;
+      for (int64_t j = 0; j < nx; j++) sink.add(kG_x, k, i * nx + j, -unit * (change * x[j] + m * dx[j]));
+      for (int64_t j = 0; j < nu && !last; j++) sink.add(kG_u, k, i * nu + j, -unit * (change * u[j] + m * du[j]));
+      sink.add(kg, k, i, unit * change);
+      // At its price a row is a cost, price times violation.
+      const Vec fined = (objective_bar * data.constraint(i, x, u) - along(k, i)) / unit;
+      sink.add(kprice, k, i, select((m > 0) & (m >= kAtPrice * data.price[i]), fined, all(0)));
     }
   }
 
   void initial_state(const Sink& sink) {
-    const int64_t nx = n.x();
-    const auto A = problem.A();
-    const auto D = problem.D();
+    const int64_t nx = n.x(), nu = n.u();
+    const StageData<T, S> data = problem.stage(0);
+    const auto A = data.A();
+    const auto D = data.D();
     for (int64_t j = 0; j < nx; j++) {
-      Vec t = upstream.x(0, j) + objective_bar * problem.q[j];
-      for (int64_t i = 0; i < nx; i++) t += objective_bar * problem.Q(j, i) * at.x(0, i) - A(i, j) * dp[i];
-      sink.add(kx0, j, t - D.column(j) * drho);
+      Vec t = upstream.x(0, j) + objective_bar * data.q[j];
+      for (int64_t i = 0; i < nx; i++) t += objective_bar * data.Q(j, i) * at.x(0, i) - A(i, j) * dp[i];
+      for (int64_t i = 0; i < nu; i++) t += data.cross(j, i) * (objective_bar * at.u(0, i) - dw[nx + i]);
+      for (int64_t i = 0; i < n.c(); i++) t -= data.G(i, j) * (dm(0, i) - objective_bar * riccati.force(0, i));
+      sink.add(kx0, 0, j, t - D.column(j) * drho);
     }
   }
 };

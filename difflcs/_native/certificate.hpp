@@ -16,21 +16,33 @@ template <class T, class S>
 struct Certificate {
   const MpcBatch& batch;
   const S n;
-  T *A, *B, *C, *D, *E, *F, *Q, *R, *Qf, *rest, *rest_end;
-  Vec *d, *c, *q, *r, *qf, *lo, *hi, *x0, *per_width, *x, *u, *lam, *s, *size, *p, *pn, *y, *rho, *error, *N;
+  Steps<T> matrix[kInputs];    // as the caller gave them: matrices here,
+  Steps<Vec> vector[kInputs];  // vectors here
+  Steps<T> rest;
+  // Of the stage at hand.
+  T *A, *B, *C, *D, *E, *F, *Q, *R, *cross, *G_x, *G_u;
+  Vec *d, *c, *q, *r, *lo, *hi;
+  Vec *x, *u, *lam, *mu, *s, *size, *p, *pn, *y, *rho, *error, *N;
+  Vec *row, *row_terms, *row_missed, *row_force;  // values of the constraints; of each the largest over the stages
   Mask* rows;
 
   explicit Certificate(const MpcBatch& b) : batch(b), n(b) {}
 
   void layout(Arena& arena) {
-    const int64_t nx = n.x(), nu = n.u(), nl = n.l(), h = n.h;
+    const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nc = n.c(), h = n.h;
     auto take = [&](auto*& to, int64_t count) { arena.take(to, count); };
-    take(A, nx * nx), take(B, nx * nu), take(C, nx * nl), take(D, nl * nx), take(E, nl * nu), take(F, nl * nl);
-    take(Q, nx * nx), take(R, nu * nu), take(Qf, nx * nx), take(rest, nu), take(rest_end, nu);
-    take(d, nx), take(c, nl), take(q, nx), take(r, nu), take(qf, nx), take(lo, nu), take(hi, nu), take(x0, nx);
-    take(per_width, nu);
-    take(x, (h + 1) * nx), take(u, h * nu), take(lam, h * nl), take(s, nl), take(size, nl), take(p, nx), take(pn, nx);
-    take(y, nl), take(rho, nl), take(error, nl), take(N, nl * nl), take(rows, nl);
+    for (int i = 0; i < kInputs; i++) {
+      const Field& field = kMpcFields[i];
+      const int64_t stages = batch.step[i] == 0 ? 1 : field.stages == Given::nodes ? h + 1 : h;
+      if (field.columns == Size::one)
+        arena.take(vector[i], stages, extent(batch, field));
+      else
+        arena.take(matrix[i], stages, extent(batch, field));
+    }
+    arena.take(rest, h, nu);
+    take(x, (h + 1) * nx), take(u, h * nu), take(lam, h * nl), take(mu, (h + 1) * nc), take(s, nl), take(size, nl);
+    take(p, nx), take(pn, nx), take(y, nl), take(rho, nl), take(error, nl), take(N, nl * nl), take(rows, nl);
+    take(row, (h + 1) * nc), take(row_terms, nc), take(row_missed, nc), take(row_force, nc);
     if constexpr (sizeof(T) == sizeof(double))
       if (arena.memory) load_matrices(0, 0);
   }
@@ -40,15 +52,26 @@ struct Certificate {
     for (int64_t i = 0; i < count; i++) put(to, i, lane, from[i]);
   }
   template <class Entry>
-  void load(Entry* to, Input which, int64_t e, int lane) {
-    load(to, batch.input[which] + e * batch.stride[which], extent(batch, kMpcFields[which]), lane);
+  void load(const Steps<Entry>& to, int which, int64_t e, int lane) {
+    load(to.first, batch.input[which] + e * batch.stride[which], to.count * to.size, lane);
   }
 
   void load_matrices(int64_t e, int lane) {
-    const int64_t nu = n.u();
-    load(A, kA, e, lane), load(B, kB, e, lane), load(C, kC, e, lane), load(D, kD, e, lane), load(E, kE, e, lane);
-    load(F, kF, e, lane), load(Q, kQ, e, lane), load(R, kR, e, lane), load(Qf, kQ_final, e, lane);
-    curvature_at_rest(n, B, nu, Q, R, rest, lane), curvature_at_rest(n, B, nu, Qf, R, rest_end, lane);
+    for (int i = 0; i < kInputs; i++)
+      if (kMpcFields[i].columns != Size::one) load(matrix[i], i, e, lane);
+    const bool alike = matrix[kB].count == 1 && matrix[kQ].count == 1 && matrix[kR].count == 1;
+    const auto entries = [&](Input which) { return [this, which](int64_t k) { return matrix[which][k]; }; };
+    curvature_at_rest(n, entries(kB), n.u(), entries(kQ), matrix[kQ_final][0], entries(kR), alike, rest, lane);
+  }
+
+  // Goes to stage k; at the last only the constraints mean something.
+  void enter(int64_t k) {
+    G_x = matrix[kG_x][k];
+    if (k == n.h) return;
+    A = matrix[kA][k], B = matrix[kB][k], C = matrix[kC][k], D = matrix[kD][k], E = matrix[kE][k], F = matrix[kF][k];
+    Q = matrix[kQ][k], R = matrix[kR][k], cross = matrix[kS][k], G_u = matrix[kG_u][k];
+    d = vector[kd][k], c = vector[kc][k], q = vector[kq][k], r = vector[kr][k];
+    lo = vector[ku_min][k], hi = vector[ku_max][k];
   }
 
   // Largest residual so far; what is not a number is infinite.
@@ -115,31 +138,32 @@ struct Certificate {
   }
 
   // Judges at most kLanes elements by what is stored of them; a solved one whose residual is too large becomes
-  // numerical.
+  // numerical, and one with a weakly active constraint degenerate.
   void judge(const MpcSolve& o, const int64_t* elements, int count) {
-    const int64_t nx = n.x(), nu = n.u(), nl = n.l(), h = n.h;
+    const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nc = n.c(), h = n.h;
     for (int l = 0; l < kLanes; l++) {
       const int64_t e = elements[l < count ? l : 0];
       if constexpr (sizeof(T) != sizeof(double)) load_matrices(e, l);
-      load(d, kd, e, l), load(c, kc, e, l), load(q, kq, e, l), load(r, kr, e, l), load(qf, kq_final, e, l);
-      load(lo, ku_min, e, l), load(hi, ku_max, e, l), load(x0, kx0, e, l);
+      for (int i = 0; i < kInputs; i++)
+        if (kMpcFields[i].columns == Size::one) load(vector[i], i, e, l);
       load(x, o.x + e * (h + 1) * nx, (h + 1) * nx, l), load(u, o.u + e * h * nu, h * nu, l);
-      load(lam, o.lam + e * h * nl, h * nl, l);
-    }
-    for (int64_t j = 0; j < nu; j++) {
-      const Vec width = hi[j] - lo[j];
-      per_width[j] = select(width > 1e-300, 1.0 / width, all(0));
+      load(lam, o.lam + e * h * nl, h * nl, l), load(mu, o.mu + e * (h + 1) * nc, (h + 1) * nc, l);
     }
     worst = poison = all(0);
     Mask fragile = Mask{};
-    for (int64_t i = 0; i < nx; i++) met(Sum{x[i] - x0[i], abs(x0[i])}.relative());
+    for (int64_t i = 0; i < nx; i++) met(Sum{x[i] - vector[kx0][0][i], abs(vector[kx0][0][i])}.relative());
+    const Mask weak = constraints();
+    enter(h);
     for (int64_t i = 0; i < nx; i++) {
-      Vec t = qf[i];
-      for (int64_t j = 0; j < nx; j++) t += Qf[i * nx + j] * x[h * nx + j];
+      const T* weights = matrix[kQ_final][0];
+      Vec t = vector[kq_final][0][i];
+      for (int64_t j = 0; j < nx; j++) t += weights[i * nx + j] * x[h * nx + j];
+      for (int64_t m = 0; m < nc; m++) t += G_x[m * nx + i] * mu[h * nc + m];
       p[i] = t;
     }
     for (int64_t k = h - 1; k >= 0; k--) {
-      const Vec *xk = x + k * nx, *uk = u + k * nu, *lk = lam + k * nl, *next = x + (k + 1) * nx;
+      enter(k);
+      const Vec *xk = x + k * nx, *uk = u + k * nu, *lk = lam + k * nl, *next = x + (k + 1) * nx, *mk = mu + k * nc;
       for (int64_t i = 0; i < nx; i++) {
         Sum sum{d[i], abs(d[i])};
         for (int64_t j = 0; j < nx; j++) sum.add(A[i * nx + j] * xk[j]);
@@ -161,24 +185,20 @@ struct Certificate {
       for (int64_t j = 0; j < nu; j++) {
         Sum g{r[j], abs(r[j])};
         for (int64_t m = 0; m < nu; m++) g.add(R[j * nu + m] * uk[m]);
+        if (batch.crossed)
+          for (int64_t i = 0; i < nx; i++) g.add(cross[i * nu + j] * xk[i]);
         for (int64_t i = 0; i < nx; i++) g.add(B[i * nu + j] * p[i]);
         for (int64_t i = 0; i < nl; i++) g.add(E[i * nu + j] * rho[i]);
-        const Vec below = uk[j] - lo[j], above = hi[j] - uk[j], width = hi[j] - lo[j];
-        if (batch.barrier > 0) {
-          g.add(-batch.barrier / below), g.add(batch.barrier / above);
-          g.terms += 1e-8 * batch.barrier * width * (1.0 / (below * below) + 1.0 / (above * above));
-        }
-        const Vec scale = max(g.terms, width * (k == h - 1 ? rest_end[j] : rest[j]));
-        const Vec reach = select(g.value > 0, below, above) * per_width[j];
-        const Vec part = min(abs(g.value) / select(scale > 0, scale, all(1)), reach);
-        met(select(width > 0, max(part, all(0)), all(0)) + 0.0 * g.value);
-        const Vec outside = max(max(-below, -above), all(0));
-        met(select(width > 0, outside * per_width[j], outside));
+        for (int64_t m = 0; m < nc; m++) g.add(G_u[m * nu + j] * mk[m]);
+        action(k, j, uk[j], g);
       }
       for (int64_t i = 0; i < nx; i++) {
         Vec t = q[i];
         for (int64_t j = 0; j < nx; j++) t += Q[i * nx + j] * xk[j] + A[j * nx + i] * p[j];
         for (int64_t j = 0; j < nl; j++) t += D[j * nx + i] * rho[j];
+        if (batch.crossed)
+          for (int64_t j = 0; j < nu; j++) t += cross[i * nu + j] * uk[j];
+        for (int64_t m = 0; m < nc; m++) t += G_x[m * nx + i] * mk[m];
         pn[i] = t;
       }
       for (int64_t i = 0; i < nx; i++) p[i] = pn[i];
@@ -188,7 +208,68 @@ struct Certificate {
       const double residual = poison[l] == 0 ? worst[l] : __builtin_inf();
       o.residual[e] = residual, o.fragile[e] = fragile[l] != 0;
       if (solved(o.status[e]) && !(residual <= o.certified)) o.status[e] = int8_t(Status::numerical);
+      if (weak[l] && o.status[e] == int8_t(Status::converged)) o.status[e] = int8_t(Status::degenerate);
     }
+  }
+
+ private:
+  // Stationarity of one action with the reduced gradient g, and its bounds.
+  void action(int64_t k, int64_t j, Vec at, Sum g) {
+    const Vec below = at - lo[j], above = hi[j] - at;
+    Vec width = hi[j] - lo[j];
+    if (batch.barrier > 0) {
+      g.add(-batch.barrier / below), g.add(batch.barrier / above);
+      g.terms += 1e-8 * batch.barrier * width * (1.0 / (below * below) + 1.0 / (above * above));
+    }
+    const Mask fixed = width <= 0;
+    // In place of a range without end stands the size of the action, or of its finite bound.
+    const Vec own = max(abs(at), max(select(lo[j] > -kHuge, abs(lo[j]), all(0)), select(hi[j] < kHuge, abs(hi[j]), all(0))));
+    width = select(width > kHuge, own, width);
+    const Vec per_width = select(width > kTiny, 1.0 / width, all(0));
+    const Vec scale = max(g.terms, width * rest[k][j]);
+    const Vec distance = select(g.value > 0, below, above);
+    const Vec reach = select(distance > kHuge, distance, distance * per_width);
+    const Vec part = min(abs(g.value) / select(scale > 0, scale, all(1)), reach);
+    met(select(fixed, all(0), max(part, all(0))) + 0.0 * g.value);
+    const Vec outside = max(max(-below, -above), all(0));
+    met(select(width > kTiny, outside * per_width, outside));
+  }
+
+  // The constraints and their multipliers; returns where one is weakly active.
+  Mask constraints() {
+    const int64_t nx = n.x(), nu = n.u(), nc = n.c(), h = n.h;
+    Mask weak = Mask{};
+    for (int64_t i = 0; i < nc; i++) row_terms[i] = row_missed[i] = row_force[i] = all(0);
+    for (int64_t k = 0; k <= h && nc > 0; k++) {
+      enter(k);
+      const Vec *g = vector[kg][k], *price = vector[kprice][k];
+      for (int64_t i = 0; i < nc; i++) {
+        const Mask given = g[i] < kHuge;
+        Sum sum{select(given, -g[i], all(0)), select(given, abs(g[i]), all(0))};
+        for (int64_t j = 0; j < nx; j++) sum.add(G_x[i * nx + j] * x[k * nx + j]);
+        for (int64_t j = 0; j < nu && k < h; j++) sum.add(G_u[i * nu + j] * u[k * nu + j]);
+        const Vec m = mu[k * nc + i], value = select(given, sum.value, all(-kHuge));
+        row[k * nc + i] = value;
+        row_terms[i] = max(row_terms[i], sum.terms), row_force[i] = max(row_force[i], m);
+        const Vec held = select(m < kAtPrice * price[i], abs(value), max(-value, all(0)));
+        row_missed[i] = max(row_missed[i], select(m > 0, held, max(value, all(0))));
+        met(select((m >= 0) & (m * kAtPrice <= price[i]), all(0), all(1)) + 0.0 * m);
+        poison += 0.0 * sum.value;
+      }
+    }
+    for (int64_t i = 0; i < nc; i++) met(row_missed[i] / select(row_terms[i] > 0, row_terms[i], all(1)));
+    for (int64_t k = 0; k <= h && nc > 0; k++) {
+      enter(k);
+      for (int64_t i = 0; i < nc; i++) {
+        Vec acts = all(k > 0);  // what nothing moves is not weakly active
+        for (int64_t j = 0; j < nu && k == 0; j++) acts += abs(all(0) + G_u[i * nu + j]);
+        const Vec m = mu[k * nc + i], value = row[k * nc + i], close = 1e-5 * row_terms[i];
+        const Mask at_zero = ~(m > 0) & (value >= -close), at_price = (m >= kAtPrice * vector[kprice][k][i]) & (value <= close);
+        const Mask between = (m > 0) & (m < kAtPrice * vector[kprice][k][i]) & (m <= 1e-5 * row_force[i]);
+        weak |= (at_zero | at_price | between) & (acts > 0);
+      }
+    }
+    return weak;
   }
 };
 

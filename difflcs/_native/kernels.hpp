@@ -33,6 +33,8 @@ struct LcpBatch {
 constexpr double kLcpTerms = 1e-10;  // |F lam + q - w| in parts of the terms that sum to it
 constexpr double kLcpData = 1e-8;    // the same in parts of the largest |q| (and of sqrt(relaxation F_ii))
 constexpr double kRounding = 4e-16;  // of a sum, in parts of its terms
+constexpr double kHuge = 1e300;              // beyond it a bound is infinite
+constexpr double kAtPrice = 1.0 - 1e-12;     // a multiplier above this part of its price is the price, but for rounding
 constexpr double kSmallest = 1e-100, kLargest = 1e150;  // range of the diagonal of F; of lam and w
 
 // A batch of LCS-MPC problems (see difflcs.mpc.MPCProblem). All arrays are row-major with the batch in front.
@@ -43,6 +45,8 @@ struct MpcBatch {
   int64_t step[kInputs];    // distance from one stage to the next; 0 when all stages share the input
   double relaxation;
   double barrier;  // weight of the logarithmic barrier of the action bounds
+  bool crossed;    // S is not zero
+  bool unbounded;  // some bound of an action is infinite
   bool pivot;      // eliminate with row exchanges: slower, for F whose skew part dominates
 };
 
@@ -50,12 +54,13 @@ struct MpcBatch {
 struct MpcSolve {
   const double* u_start;    // (count, H, n_u), or null for zero
   const double* lam_start;  // (count, H, n_lam), or null for sqrt(first_relaxation)
+  const double* mu_start;   // (count, H + 1, n_c), or null for zero
   double first_relaxation;  // where the homotopy starts
   double shrink;            // its factor per stage
   double tol;               // on the projected gradient
   int64_t max_iter;
   double certified;         // largest residual of a solved problem
-  double *x, *u, *lam, *objective, *residual;  // out; residual as difflcs.mpc.kkt.residual, from the numbers returned
+  double *x, *u, *lam, *mu, *objective, *residual;  // out; residual as difflcs.mpc.kkt.residual, from the numbers returned
   int8_t* status;                              // out; unreached where the watch stopped before
   int8_t* fragile;                             // out; whether elimination without row exchanges lost digits
   int32_t* iterations;
@@ -63,7 +68,7 @@ struct MpcSolve {
 
 // Upstream gradients of the outputs, and where the gradients of the inputs go.
 struct MpcGradient {
-  const double *x, *u, *lam;              // the solution
+  const double *x, *u, *lam, *mu;         // the solution
   const double *x_bar, *u_bar, *lam_bar;  // upstream
   const double* objective_bar;
   const int8_t* solved;          // elements that are not contribute exactly zero

@@ -55,8 +55,9 @@ class Linearisation {
   Stage<S> at(int64_t k, const Vec* lam, const Vec* s, const Vec* p) {
     const int64_t nx = n.x(), nl = n.l(), nw = n.w();
     const Stage<S> stage = this->stage(k);
-    const auto F = problem.F;
-    const auto C = problem.C;
+    const StageData<T, S> data = problem.stage(k);
+    const auto F = data.F;
+    const auto C = data.C;
     for (int64_t i = 0; i < nl; i++) {
       stage.size[i] = 1.0 / (lam[i] + s[i]);
       a[i] = s[i] * stage.size[i], b[i] = lam[i] * stage.size[i];
@@ -82,11 +83,11 @@ class Linearisation {
     for (int64_t j = 0; j < nw; j++) {
       Local<kL> t(column);
       DIFFLCS_UNROLL
-      for (int64_t i = 0; i < nl; i++) t[i] = all(0) - problem.DE(i, j);
+      for (int64_t i = 0; i < nl; i++) t[i] = all(0) - data.DE(i, j);
       Lu::solve(nl, right, right_rows, t);
       DIFFLCS_UNROLL
       for (int64_t i = 0; i < nl; i++) slopes(i, j) = t[i], stage.K_lam(i, j) = t[i] = b[i] * t[i];
-      for (int64_t i = 0; i < nx; i++) stage.A_hat(i, j) = all(0) + problem.AB(i, j) + C.row(i) * t;
+      for (int64_t i = 0; i < nx; i++) stage.A_hat(i, j) = all(0) + data.AB(i, j) + C.row(i) * t;
     }
     for (int64_t i = 0; i < nl; i++) {
       stage.y[i] *= stage.size[i];

@@ -82,15 +82,24 @@ struct Matrix {
   }
 };
 
-// Matrices of one size, one per stage.
+// Matrices of one size, one per stage, or one for all stages.
 template <class M>
 struct Stages {
   M first;
+  int64_t count, step;
   M operator[](int64_t k) const {
     M matrix = first;
-    matrix.entries += k * first.size();
+    matrix.entries += k * step;
     return matrix;
   }
+};
+
+// The same of vectors.
+template <class T>
+struct Steps {
+  T* first;
+  int64_t size, count, step;
+  T* operator[](int64_t k) const { return first + k * step; }
 };
 
 // Hands out the memory of a workspace piece by piece, or only counts it where there is none.
@@ -115,6 +124,11 @@ struct Arena {
   template <class T, int64_t R, int64_t C>
   void take(Stages<Matrix<T, R, C>>& to, int64_t stages, int64_t rows, int64_t columns) {
     to.first = {take<T>(stages * rows * columns), {rows}, {columns}, {columns}};
+    to.count = stages, to.step = stages > 1 ? to.first.size() : 0;
+  }
+  template <class T>
+  void take(Steps<T>& to, int64_t stages, int64_t size) {
+    to = {take<T>(stages * size), size, stages, stages > 1 ? size : 0};
   }
 };
 

@@ -190,42 +190,53 @@ difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxa
     b.stride[i] = shared ? 0 : own == 2 ? stages * size : size;
   }
   b.pivot = pivot;
+  auto any = [&](Input which, auto test) {
+    return std::any_of(b.input[which], b.input[which] + inputs[which].size(), test);
+  };
+  b.crossed = any(kS, [](double v) { return v != 0; });
+  b.unbounded = any(ku_min, [](double v) { return v < -kHuge; }) || any(ku_max, [](double v) { return v > kHuge; });
   return b;
 }
 
 // An element that the time did not suffice for: the actions to start from, the state where it is, no forces.
 void stay_at_start(const difflcs::MpcBatch& b, const difflcs::MpcSolve& o, int64_t e) {
   using namespace difflcs;
-  const double *lo = b.input[ku_min] + e * b.stride[ku_min], *hi = b.input[ku_max] + e * b.stride[ku_max];
   for (int64_t i = 0; i < b.horizon * b.n_u; i++) {
+    const int64_t k = i / b.n_u;
+    const double* lo = b.input[ku_min] + e * b.stride[ku_min] + k * b.step[ku_min];
+    const double* hi = b.input[ku_max] + e * b.stride[ku_max] + k * b.step[ku_max];
     const double start = o.u_start ? o.u_start[e * b.horizon * b.n_u + i] : 0.0;
     o.u[e * b.horizon * b.n_u + i] = std::min(std::max(start, lo[i % b.n_u]), hi[i % b.n_u]);
   }
   for (int64_t i = 0; i < (b.horizon + 1) * b.n_x; i++)
     o.x[e * (b.horizon + 1) * b.n_x + i] = b.input[kx0][e * b.n_x + i % b.n_x];
   std::fill_n(o.lam + e * b.horizon * b.n_lam, b.horizon * b.n_lam, 0.0);
+  std::fill_n(o.mu + e * (b.horizon + 1) * b.n_c, (b.horizon + 1) * b.n_c, 0.0);
   o.objective[e] = o.residual[e] = std::numeric_limits<double>::max();
   o.status[e] = static_cast<int8_t>(Status::max_iter), o.fragile[e] = 0, o.iterations[e] = 0;
 }
 
 void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, std::optional<Array> u_start,
-               std::optional<Array> lam_start, double first_relaxation, double shrink, double tol, int64_t max_iter,
+               std::optional<Array> lam_start, std::optional<Array> mu_start, double first_relaxation, double shrink, double tol, int64_t max_iter,
                double certified, bool pivot, double time_limit, int threads, Output<double> x, Output<double> u,
-               Output<double> lam, Output<double> objective, Output<double> residual, Output<int8_t> status,
+               Output<double> lam, Output<double> mu, Output<double> objective, Output<double> residual, Output<int8_t> status,
                Output<int8_t> fragile, Output<int32_t> iterations) {
   const difflcs::MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier, pivot);
   const int64_t states = b.count * (horizon + 1) * b.n_x, actions = b.count * horizon * b.n_u;
-  const int64_t forces = b.count * horizon * b.n_lam;
+  const int64_t forces = b.count * horizon * b.n_lam, rows = b.count * (horizon + 1) * b.n_c;
   check_size("x", x.size(), states), check_size("u", u.size(), actions), check_size("lam", lam.size(), forces);
+  check_size("mu", mu.size(), rows);
   check_size("objective", objective.size(), b.count), check_size("residual", residual.size(), b.count);
   check_size("status", status.size(), b.count), check_size("iterations", iterations.size(), b.count);
   check_size("fragile", fragile.size(), b.count);
   if (u_start) check_size("u_start", u_start->size(), actions);
   if (lam_start) check_size("lam_start", lam_start->size(), forces);
+  if (mu_start) check_size("mu_start", mu_start->size(), rows);
   if (!(first_relaxation >= relaxation && shrink > 0 && shrink < 1))
     throw std::invalid_argument("the homotopy must fall from first_relaxation to relaxation");
   const difflcs::MpcSolve o{u_start ? u_start->data() : nullptr,
                             lam_start ? lam_start->data() : nullptr,
+                            mu_start ? mu_start->data() : nullptr,
                             first_relaxation,
                             shrink,
                             tol,
@@ -234,6 +245,7 @@ void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
                             x.data(),
                             u.data(),
                             lam.data(),
+                            mu.data(),
                             objective.data(),
                             residual.data(),
                             status.data(),
@@ -254,19 +266,20 @@ void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
 }
 
 void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, Array x, Array u, Array lam,
-             Array x_bar, Array u_bar, Array lam_bar, Array objective_bar,
+             Array mu, Array x_bar, Array u_bar, Array lam_bar, Array objective_bar,
              nb::ndarray<const int8_t, nb::device::cpu, nb::c_contig> solved, bool pivot, int threads,
              std::vector<Output<double>> gradients) {
   using namespace difflcs;
   const MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier, pivot);
   const int64_t states = b.count * (horizon + 1) * b.n_x, actions = b.count * horizon * b.n_u;
-  const int64_t forces = b.count * horizon * b.n_lam;
+  const int64_t forces = b.count * horizon * b.n_lam, rows = b.count * (horizon + 1) * b.n_c;
   check_size("x", x.size(), states), check_size("u", u.size(), actions), check_size("lam", lam.size(), forces);
+  check_size("mu", mu.size(), rows);
   check_size("x_bar", x_bar.size(), states), check_size("u_bar", u_bar.size(), actions);
   check_size("lam_bar", lam_bar.size(), forces), check_size("objective_bar", objective_bar.size(), b.count);
   check_size("solved", solved.size(), b.count), check_size("gradients", gradients.size(), kInputs);
   MpcGradient o{};
-  o.x = x.data(), o.u = u.data(), o.lam = lam.data(), o.x_bar = x_bar.data(), o.u_bar = u_bar.data();
+  o.x = x.data(), o.u = u.data(), o.lam = lam.data(), o.mu = mu.data(), o.x_bar = x_bar.data(), o.u_bar = u_bar.data();
   o.lam_bar = lam_bar.data(), o.objective_bar = objective_bar.data(), o.solved = solved.data();
   for (int i = 0; i < kInputs; i++) {
     check_size("gradient", gradients[i].size(), inputs[i].size());
@@ -433,10 +446,10 @@ NB_MODULE(_kernels, m) {
   m.def("solve_lcp", &solve_lcp, "F"_a, "q"_a, "relaxation"_a, "max_iter"_a, "threads"_a, "lam"_a, "w"_a, "status"_a,
         "iterations"_a, "Solve a batch of LCPs into the given arrays.");
   m.def("solve_mpc", &solve_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "u_start"_a.none(),
-        "lam_start"_a.none(), "first_relaxation"_a, "shrink"_a, "tol"_a, "max_iter"_a, "certified"_a, "pivot"_a,
-        "time_limit"_a, "threads"_a, "x"_a, "u"_a, "lam"_a, "objective"_a, "residual"_a, "status"_a, "fragile"_a,
+        "lam_start"_a.none(), "mu_start"_a.none(), "first_relaxation"_a, "shrink"_a, "tol"_a, "max_iter"_a, "certified"_a, "pivot"_a,
+        "time_limit"_a, "threads"_a, "x"_a, "u"_a, "lam"_a, "mu"_a, "objective"_a, "residual"_a, "status"_a, "fragile"_a,
         "iterations"_a, "Solve a batch of LCS-MPC problems into the given arrays.");
-  m.def("vjp_mpc", &vjp_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "x"_a, "u"_a, "lam"_a, "x_bar"_a,
+  m.def("vjp_mpc", &vjp_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "x"_a, "u"_a, "lam"_a, "mu"_a, "x_bar"_a,
         "u_bar"_a, "lam_bar"_a, "objective_bar"_a, "solved"_a, "pivot"_a, "threads"_a, "gradients"_a,
         "Gradients of the inputs of solved LCS-MPC problems, into the given arrays.");
   m.def("violation_loss", &violation_loss, "inputs"_a, "gamma"_a, "xi"_a, "max_iter"_a, "threads"_a, "Q"_a, "q"_a,

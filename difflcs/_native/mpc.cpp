@@ -31,6 +31,10 @@ void dispatch(const MpcBatch& b, Function f) {
   const bool paper = b.n_x == 9 && b.n_u == 6;
   if (b.pivot)
     f(Variant<Vec, Pivoting>());
+  else if (!shared_matrices(b) && paper && b.n_lam == 5)
+    f(Variant<Vec, Sizes<9, 6, 5>>());
+  else if (!shared_matrices(b) && paper && b.n_lam == 8)
+    f(Variant<Vec, Sizes<9, 6, 8>>());
   else if (!shared_matrices(b))
     f(Widest());
   else if (paper && b.n_lam == 5)

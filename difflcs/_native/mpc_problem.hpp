@@ -9,8 +9,6 @@
 namespace difflcs::DIFFLCS_ISA {
 namespace {
 
-constexpr double kTiny = 1e-300;
-
 // A trajectory: x[k], u[k], lam[k] and s[k] are those of stage k.
 template <class S>
 struct Trajectory {
@@ -23,85 +21,204 @@ struct Trajectory {
   }
 };
 
-// T is the type of a matrix entry: double where the batch shares all matrices, else Vec.
+// The data of one stage. T is the type of a matrix entry: double where the batch shares all matrices, else Vec.
+template <class T, class S>
+struct StageData {
+  static constexpr int64_t kX = S::kX, kU = S::kU, kL = S::kL, kW = S::kW;
+  Matrix<T, kX, kW> AB;
+  Matrix<T, kX, kL> C;
+  Matrix<T, kL, kW> DE;
+  Matrix<T, kL, kL> F;
+  Matrix<T, kX, kX> Q;
+  Matrix<T, kU, kU> R;
+  Matrix<T, kX, kU> cross;  // S; the letter stands for the sizes here
+  Matrix<T, 0, kW> G;       // [G_x G_u]
+  T *scale, *row_scale, *rest;
+  Vec *d, *c, *q, *r, *u_min, *u_max, *per_width, *g, *price;
+
+  Matrix<T, kX, kX, kW> A() const { return AB.block(0, Dim<kX>{Q.rows}); }
+  Matrix<T, kX, kU, kW> B() const { return AB.block(Q.rows, Dim<kU>{R.rows}); }
+  Matrix<T, kL, kX, kW> D() const { return DE.block(0, Dim<kX>{Q.rows}); }
+  Matrix<T, kL, kU, kW> E() const { return DE.block(Q.rows, Dim<kU>{R.rows}); }
+  Matrix<T, 0, kX, kW> G_x() const { return G.block(0, Dim<kX>{Q.rows}); }
+  Matrix<T, 0, kU, kW> G_u() const { return G.block(Q.rows, Dim<kU>{R.rows}); }
+
+  void gap(const Vec* x, const Vec* u, Vec* out) const {
+    const auto D = this->D();
+    const auto E = this->E();
+    for (int64_t i = 0; i < D.rows; i++) out[i] = c[i] + D.row(i) * x + E.row(i) * u;
+  }
+
+  void next_state(const Vec* x, const Vec* u, const Vec* lam, Vec* out) const {
+    const auto A = this->A();
+    const auto B = this->B();
+    for (int64_t i = 0; i < A.rows; i++) out[i] = d[i] + A.row(i) * x + B.row(i) * u + C.row(i) * lam;
+  }
+
+  // Row i of G_x x + G_u u - g; the last stage has no actions.
+  Vec constraint(int64_t i, const Vec* x, const Vec* u) const {
+    const Vec value = -g[i] + G_x().row(i) * x;
+    return u ? value + G_u().row(i) * u : value;
+  }
+};
+
+// The multipliers of constraints that an augmented Lagrangian with weight rho gives to the value c of a row whose
+// multiplier was `before`: it lies in [0, price].
+struct Force {
+  Vec value;
+  Mask held;  // between 0 and the price: the row is an equation
+  Force(Vec c, Vec before, Vec rho, Vec price) {
+    const Vec free = before + rho * c;
+    value = max(all(0), min(free, price));
+    held = (free > 0) & (free < price);
+  }
+  // Its part of the cost.
+  static Vec cost(Vec c, Vec before, Vec rho, Vec price) {
+    const Vec m = Force(c, before, rho, price).value;
+    // c is -inf where there is no constraint: there m = 0.
+    return select(m > 0, m * c, all(0)) - 0.5 * (m - before) * (m - before) / rho;
+  }
+};
+
 template <class T, class S>
 struct Problem {
   static constexpr int64_t kX = S::kX, kU = S::kU, kL = S::kL, kW = S::kW;
   const MpcBatch& batch;
   const S n;
   const bool caller_units;  // of the cost: the adjoint differentiates it as it is
-  Matrix<T, kX, kW> AB;
-  Matrix<T, kX, kL> C;
-  Matrix<T, kL, kW> DE;
-  Matrix<T, kL, kL> F;
-  Matrix<T, kX, kX> Q, Q_final;
-  Matrix<T, kU, kU> R;
+  Stages<Matrix<T, kX, kW>> AB;
+  Stages<Matrix<T, kX, kL>> C;
+  Stages<Matrix<T, kL, kW>> DE;
+  Stages<Matrix<T, kL, kL>> F;
+  Stages<Matrix<T, kX, kX>> Q;
+  Stages<Matrix<T, kU, kU>> R;
+  Stages<Matrix<T, kX, kU>> cross;
+  Stages<Matrix<T, 0, kW>> G;
+  Matrix<T, kX, kX> Q_final;
   // lam = scale * lam', s = s' / scale, chosen so that F' has a unit diagonal: contacts in any units converge alike. C,
   // [D E], F, c, lam and s are kept in these units; the product lam o s does not change.
-  T* scale;
+  Steps<T> scale;
+  // Rows of constraints have length one: [G g]' = row_scale [G g], and their multipliers are divided by it.
+  Steps<T> row_scale;
   // The cost is kept in units of 1 / cost_unit: weights below 1e-3 are lifted to one, so that tolerances hold for them.
   T* cost_unit;
-  T *rest, *rest_final;  // curvature of each action by the next stage's weights alone: the least scale of its gradient
-  Vec *d, *c, *q, *r, *q_final, *u_min, *u_max, *x0;
-  Vec* per_width;  // reciprocal of each action's range, zero where that is zero
-  Vec mu;          // weight of the barrier of the bounds: follows the homotopy down to batch.barrier
+  T* weight;      // largest weight of the cost
+  Steps<T> rest;  // curvature of each action by the next stage's weights alone: the least scale of its gradient
+  Steps<Vec> d, c, q, r, u_min, u_max, g, price;
+  Steps<Vec> per_width;  // reciprocal of each action's range, zero where that is zero or infinite
+  Vec *q_final, *x0;
+  Vec mu;                      // weight of the barrier of the bounds: follows the homotopy down to batch.barrier
+  Matrix<Vec, 0, 0> multiplier;  // of the constraints, and the weight of the augmented Lagrangian
+  Vec rho;
 
-  Problem(const MpcBatch& b, bool caller_units) : batch(b), n(b), caller_units(caller_units), mu(all(b.barrier)) {}
+  Problem(const MpcBatch& b, bool caller_units)
+      : batch(b),
+        n(b),
+        caller_units(caller_units),
+        mu(all(b.barrier)),
+        rho(all(1)) {}
 
   void layout(Arena& arena) {
-    const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nw = n.w();
-    arena.take(AB, nx, nw), arena.take(C, nx, nl), arena.take(DE, nl, nw), arena.take(F, nl, nl);
-    arena.take(Q, nx, nx), arena.take(R, nu, nu), arena.take(Q_final, nx, nx);
-    arena.take(scale, nl), arena.take(cost_unit, 1), arena.take(rest, nu), arena.take(rest_final, nu);
-    arena.take(d, nx), arena.take(c, nl), arena.take(q, nx), arena.take(r, nu), arena.take(q_final, nx);
-    arena.take(u_min, nu), arena.take(u_max, nu), arena.take(x0, nx), arena.take(per_width, nu);
+    const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nw = n.w(), nc = n.c(), h = n.h;
+    const int64_t systems = by_stage(kA, kB, kC, kD, kE, kF) ? h : 1, costs = by_stage(kQ, kR, kS) ? h : 1;
+    const int64_t bounds = by_stage(ku_min, ku_max) ? h : 1;
+    const int64_t rows = nc && by_stage(kG_x, kG_u, kg, kprice) ? h + 1 : 1;
+    arena.take(AB, systems, nx, nw), arena.take(C, systems, nx, nl), arena.take(DE, systems, nl, nw);
+    arena.take(F, systems, nl, nl), arena.take(scale, systems, nl);
+    arena.take(Q, costs, nx, nx), arena.take(R, costs, nu, nu), arena.take(cross, costs, nx, nu);
+    arena.take(Q_final, nx, nx), arena.take(cost_unit, 1), arena.take(weight, 1), arena.take(rest, h, nu);
+    arena.take(G, rows, nc, nw), arena.take(row_scale, rows, nc), arena.take(g, rows, nc), arena.take(price, rows, nc);
+    arena.take(d, by_stage(kd) ? h : 1, nx), arena.take(c, systems > 1 || by_stage(kc) ? h : 1, nl);
+    arena.take(q, by_stage(kq) ? h : 1, nx), arena.take(r, by_stage(kr) ? h : 1, nu);
+    arena.take(u_min, bounds, nu), arena.take(u_max, bounds, nu), arena.take(per_width, bounds, nu);
+    arena.take(q_final, nx), arena.take(x0, nx), arena.take(multiplier, h + 1, nc);
     if constexpr (sizeof(T) == sizeof(double))
       if (arena.memory) load_matrices(0, 0);
   }
 
-  Matrix<T, kX, kX, kW> A() const { return AB.block(0, Dim<kX>{n.x()}); }
-  Matrix<T, kX, kU, kW> B() const { return AB.block(n.x(), Dim<kU>{n.u()}); }
-  Matrix<T, kL, kX, kW> D() const { return DE.block(0, Dim<kX>{n.x()}); }
-  Matrix<T, kL, kU, kW> E() const { return DE.block(n.x(), Dim<kU>{n.u()}); }
+  StageData<T, S> stage(int64_t k) const {
+    return {AB[k],    C[k],  DE[k], F[k], Q[k], R[k],     cross[k], G[k],         scale[k], row_scale[k],
+            rest[k], d[k], c[k], q[k], r[k], u_min[k], u_max[k], per_width[k], g[k],     price[k]};
+  }
+  // Only the constraints mean something there.
+  StageData<T, S> last() const {
+    StageData<T, S> data = stage(0);
+    data.G = G[n.h], data.row_scale = row_scale[n.h], data.g = g[n.h], data.price = price[n.h];
+    return data;
+  }
 
   // ---- loading ----
-  const double* input(Input which, int64_t element) const { return batch.input[which] + element * batch.stride[which]; }
+  template <class... Inputs>
+  bool by_stage(Inputs... which) const {
+    return ((batch.step[which] > 0) || ...);
+  }
+
+  const double* input(Input which, int64_t element, int64_t k = 0) const {
+    return batch.input[which] + element * batch.stride[which] + k * batch.step[which];
+  }
 
   void load_matrices(int64_t e, int lane) {
-    const int64_t nl = n.l();
-    const double* diagonal = input(kF, e);
-    for (int64_t i = 0; i < nl; i++) {
-      const double f = diagonal[i * nl + i];
-      put(scale, i, lane, f > 0 ? 1.0 / __builtin_sqrt(f) : 1.0);
-    }
-    put(cost_unit, 0, lane, caller_units ? 1.0 : unit_of_cost(e));
+    const int64_t nl = n.l(), nx = n.x(), nw = n.w(), nc = n.c();
     const auto one = [](int64_t) { return 1.0; };
-    const auto contact = [&](int64_t i) { return lane_of(scale[i], lane); };
-    const auto cost = [&](int64_t) { return lane_of(cost_unit[0], lane); };
-    auto matrix = [&](auto to, Input which, auto by_row, auto by_column) {
-      const double* from = input(which, e);
+    auto matrix = [&](auto to, Input which, int64_t k, auto by_row, auto by_column) {
+      const double* from = input(which, e, k);
       for (int64_t i = 0; i < to.rows; i++)
         for (int64_t j = 0; j < to.columns; j++)
           put(to[i], j, lane, from[i * to.columns + j] * (by_row(i) * by_column(j)));
     };
-    matrix(A(), kA, one, one), matrix(B(), kB, one, one), matrix(C, kC, one, contact);
-    matrix(D(), kD, contact, one), matrix(E(), kE, contact, one), matrix(F, kF, contact, contact);
-    matrix(Q, kQ, one, cost), matrix(R, kR, one, cost), matrix(Q_final, kQ_final, one, cost);
-    curvature_at_rest(n, B().entries, n.w(), Q.entries, R.entries, rest, lane);
-    curvature_at_rest(n, B().entries, n.w(), Q_final.entries, R.entries, rest_final, lane);
+    put(weight, 0, lane, largest_weight(e));
+    put(cost_unit, 0, lane, caller_units ? 1.0 : unit_of(lane_of(weight[0], lane)));
+    const auto cost = [&](int64_t) { return lane_of(cost_unit[0], lane); };
+    put(weight, 0, lane, lane_of(weight[0], lane) > kTiny ? lane_of(weight[0], lane) * cost(0) : 1.0);
+    for (int64_t k = 0; k < scale.count; k++) {
+      const double* diagonal = input(kF, e, k);
+      for (int64_t i = 0; i < nl; i++) {
+        const double f = diagonal[i * nl + i];
+        put(scale[k], i, lane, f > 0 ? 1.0 / __builtin_sqrt(f) : 1.0);
+      }
+      const auto contact = [&](int64_t i) { return lane_of(scale[k][i], lane); };
+      const StageData<T, S> to = stage(k);
+      matrix(to.A(), kA, k, one, one), matrix(to.B(), kB, k, one, one), matrix(to.C, kC, k, one, contact);
+      matrix(to.D(), kD, k, contact, one), matrix(to.E(), kE, k, contact, one), matrix(to.F, kF, k, contact, contact);
+    }
+    for (int64_t k = 0; k < Q.count; k++)
+      matrix(Q[k], kQ, k, one, cost), matrix(R[k], kR, k, one, cost), matrix(cross[k], kS, k, one, cost);
+    matrix(Q_final, kQ_final, 0, one, cost);
+    curvature_at_rest(
+        n, [&](int64_t k) { return stage(k).B().entries; }, nw, [&](int64_t k) { return Q[k].entries; },
+        Q_final.entries, [&](int64_t k) { return R[k].entries; }, scale.count == 1 && Q.count == 1, rest, lane);
+    for (int64_t k = 0; k < G.count && nc > 0; k++) {
+      const StageData<T, S> to = k < n.h ? stage(k) : last();
+      const double *G_x = input(kG_x, e, k), *G_u = input(kG_u, e, k);
+      for (int64_t i = 0; i < nc; i++) {
+        // The last stage has no actions.
+        const auto entry = [&](int64_t j) { return j < nx ? G_x[i * nx + j] : k < n.h ? G_u[i * (nw - nx) + j - nx] : 0.0; };
+        double square = 0;
+        for (int64_t j = 0; j < nw; j++) square += entry(j) * entry(j);
+        const double unit = square > kTiny ? 1.0 / __builtin_sqrt(square) : 1.0;
+        for (int64_t j = 0; j < nw; j++) put(to.G[i], j, lane, entry(j) * unit);
+        put(to.row_scale, i, lane, unit);
+      }
+    }
+  }
+
+  double largest_weight(int64_t e) const {
+    double largest = 0;
+    const Input weights[] = {kQ, kR, kQ_final};
+    for (const Input which : weights)
+      for (int64_t k = 0; k < (batch.step[which] ? n.h : 1); k++) {
+        const int64_t size = extent(batch, kMpcFields[which]);
+        const double* entries = input(which, e, k);
+        for (int64_t i = 0; i < size; i++) {
+          const double entry = __builtin_fabs(entries[i]);
+          largest = entry > largest ? entry : largest;
+        }
+      }
+    return largest;
   }
 
   // A power of two that brings the largest weight to about one where it is below 1e-3.
-  double unit_of_cost(int64_t e) const {
-    double largest = 0;
-    const Input weights[] = {kQ, kR, kQ_final};
-    for (const Input which : weights) {
-      const int64_t size = extent(batch, kMpcFields[which]);
-      for (int64_t i = 0; i < size; i++) {
-        const double weight = __builtin_fabs(input(which, e)[i]);
-        largest = weight > largest ? weight : largest;
-      }
-    }
+  static double unit_of(double largest) {
     if (!(largest > kTiny && largest < 1e-3)) return 1.0;
     int exponent;
     __builtin_frexp(largest, &exponent);
@@ -111,18 +228,31 @@ struct Problem {
   // Puts problem `e` into a lane.
   void load(int64_t e, int lane) {
     if constexpr (sizeof(T) != sizeof(double)) load_matrices(e, lane);
-    auto vector = [&](Vec* to, Input which, double unit = 1.0) {
-      const double* from = input(which, e);
-      for (int64_t i = 0; i < extent(batch, kMpcFields[which]); i++) put(to, i, lane, from[i] * unit);
+    auto vector = [&](const Steps<Vec>& to, Input which, double unit = 1.0) {
+      for (int64_t k = 0; k < to.count; k++) {
+        const double* from = input(which, e, k);
+        for (int64_t i = 0; i < to.size; i++) put(to[k], i, lane, from[i] * unit);
+      }
     };
     const double cost = lane_of(cost_unit[0], lane);
-    vector(d, kd), vector(c, kc), vector(q, kq, cost), vector(r, kr, cost), vector(q_final, kq_final, cost);
-    vector(u_min, ku_min), vector(u_max, ku_max), vector(x0, kx0);
-    for (int64_t i = 0; i < n.u(); i++) {
-      const double width = u_max[i][lane] - u_min[i][lane];
-      put(per_width, i, lane, width > kTiny ? 1.0 / width : 0.0);
+    vector(d, kd), vector(c, kc), vector(q, kq, cost), vector(r, kr, cost), vector(u_min, ku_min), vector(u_max, ku_max);
+    for (int64_t i = 0; i < n.x(); i++) {
+      put(q_final, i, lane, input(kq_final, e)[i] * cost);
+      put(x0, i, lane, input(kx0, e)[i]);
     }
-    for (int64_t i = 0; i < n.l(); i++) put(c, i, lane, c[i][lane] * lane_of(scale[i], lane));
+    for (int64_t k = 0; k < per_width.count; k++)
+      for (int64_t i = 0; i < n.u(); i++) {
+        const double width = u_max[k][i][lane] - u_min[k][i][lane];
+        put(per_width[k], i, lane, width > kTiny && width < kHuge ? 1.0 / width : 0.0);
+      }
+    for (int64_t k = 0; k < c.count; k++)
+      for (int64_t i = 0; i < n.l(); i++) put(c[k], i, lane, c[k][i][lane] * lane_of(scale[k][i], lane));
+    for (int64_t k = 0; k < g.count; k++)
+      for (int64_t i = 0; i < n.c(); i++) {
+        const double unit = lane_of(row_scale[k][i], lane);
+        put(g[k], i, lane, input(kg, e, k)[i] * unit);
+        put(price[k], i, lane, input(kprice, e, k)[i] * (cost / unit));
+      }
   }
 
   // One lane of an array from and to the caller's, lam from and to the caller's units.
@@ -134,40 +264,76 @@ struct Problem {
   }
   void load_lam(Vec* to, const double* from, int lane, bool dual = false) const {
     const int64_t nl = n.l();
-    for (int64_t i = 0; i < n.h * nl; i++) {
-      const double unit = lane_of(scale[i % nl], lane);
-      put(to, i, lane, dual ? from[i] * unit : from[i] / unit);
-    }
+    for (int64_t k = 0; k < n.h; k++)
+      for (int64_t i = 0; i < nl; i++) {
+        const double unit = lane_of(scale[k][i], lane), value = from[k * nl + i];
+        put(to, k * nl + i, lane, dual ? value * unit : value / unit);
+      }
   }
   void store_lam(double* to, const Vec* from, int lane) const {
     const int64_t nl = n.l();
-    for (int64_t i = 0; i < n.h * nl; i++) to[i] = from[i][lane] * lane_of(scale[i % nl], lane);
+    for (int64_t k = 0; k < n.h; k++)
+      for (int64_t i = 0; i < nl; i++) to[k * nl + i] = from[k * nl + i][lane] * lane_of(scale[k][i], lane);
+  }
+  // The same of the multipliers of constraints; null for none.
+  void load_multipliers(const double* from, int lane) const {
+    const int64_t nc = n.c();
+    for (int64_t k = 0; k <= n.h; k++)
+      for (int64_t i = 0; i < nc; i++) {
+        const double unit = lane_of(row_scale[k][i], lane) / lane_of(cost_unit[0], lane);
+        put(multiplier[k], i, lane, from ? from[k * nc + i] / unit : 0.0);
+      }
+  }
+  void store_multipliers(double* to, const Vec* from, int lane) const {
+    const int64_t nc = n.c();
+    for (int64_t k = 0; k <= n.h; k++)
+      for (int64_t i = 0; i < nc; i++)
+        to[k * nc + i] = from[k * nc + i][lane] * (lane_of(row_scale[k][i], lane) / lane_of(cost_unit[0], lane));
   }
 
-  // ---- dynamics and cost ----
-  void gap(const Vec* x, const Vec* u, Vec* out) const {
-    const auto D = this->D();
-    const auto E = this->E();
-    for (int64_t i = 0; i < n.l(); i++) out[i] = c[i] + D.row(i) * x + E.row(i) * u;
-  }
-
-  void next_state(const Vec* x, const Vec* u, const Vec* lam, Vec* out) const {
-    const auto A = this->A();
-    const auto B = this->B();
-    for (int64_t i = 0; i < n.x(); i++) out[i] = d[i] + A.row(i) * x + B.row(i) * u + C.row(i) * lam;
-  }
-
+  // ---- cost ----
   Vec cost(const Trajectory<S>& at) const {
+    Vec total = plain_cost(at);
+    for (int64_t k = 0; k <= n.h && n.c() > 0; k++) {
+      const StageData<T, S> here = k < n.h ? stage(k) : last();
+      const Vec* before = multiplier[k];
+      for (int64_t i = 0; i < n.c(); i++)
+        total += Force::cost(here.constraint(i, at.x[k], k < n.h ? at.u[k] : nullptr), before[i], rho, here.price[i]);
+    }
+    return total;
+  }
+
+  // The objective: with what soft constraints cost, in place of the augmented Lagrangian.
+  Vec objective(const Trajectory<S>& at) const {
+    Vec total = plain_cost(at);
+    for (int64_t k = 0; k <= n.h; k++) {
+      const StageData<T, S> here = k < n.h ? stage(k) : last();
+      for (int64_t i = 0; i < n.c(); i++) {
+        const Vec violation = max(here.constraint(i, at.x[k], k < n.h ? at.u[k] : nullptr), all(0));
+        total += select((violation > 0) & (here.price[i] < kHuge), here.price[i] * violation, all(0));
+      }
+    }
+    return total;
+  }
+
+ private:
+  Vec plain_cost(const Trajectory<S>& at) const {
     auto quadratic = [](const auto& W, const Vec* linear, const Vec* z) {
       Vec total = all(0);
       for (int64_t i = 0; i < W.rows; i++) total += z[i] * (0.5 * (all(0) + W.row(i) * z) + linear[i]);
       return total;
     };
     Vec total = quadratic(Q_final, q_final, at.x[n.h]);
-    for (int64_t k = 0; k < n.h; k++) total += quadratic(Q, q, at.x[k]) + quadratic(R, r, at.u[k]);
+    for (int64_t k = 0; k < n.h; k++) {
+      const StageData<T, S> here = stage(k);
+      total += quadratic(here.Q, here.q, at.x[k]) + quadratic(here.R, here.r, at.u[k]);
+      if (batch.crossed)
+        for (int64_t i = 0; i < n.x(); i++) total += at.x(k, i) * (all(0) + here.cross.row(i) * at.u[k]);
+    }
     if (batch.barrier > 0)
       for (int64_t k = 0; k < n.h; k++)
-        for (int64_t j = 0; j < n.u(); j++) total -= mu * log((at.u(k, j) - u_min[j]) * (u_max[j] - at.u(k, j)));
+        for (int64_t j = 0; j < n.u(); j++)
+          total -= mu * log((at.u(k, j) - u_min[k][j]) * (u_max[k][j] - at.u(k, j)));
     return total;
   }
 };

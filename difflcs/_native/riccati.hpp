@@ -23,6 +23,8 @@ struct Sweep {
   Vec projected;   // projected gradient in units of the gradient, with the curvature as the scale of the bounds
   Vec rounding;    // level below which rounding hides it
   Vec stationary;  // projected gradient in parts of its scale, which sees flat directions too (certificate.hpp)
+  Vec violated;    // by how much constraints are not met or not complementary, in parts of the sizes of their terms
+  Vec owing;       // largest change of their multipliers that the augmented Lagrangian calls for
   Mask weak;       // a bound is weakly active, or the reduced Hessian is singular
 };
 
@@ -54,6 +56,7 @@ class Riccati {
   Matrix<Vec, kU, kU> L;
   Matrix<Vec, kU, kLaw> law;
   Vec *linear, *flat, *column;
+  Vec *row_terms, *row_violation;  // of each constraint, the largest over the stages
   Mask* active;
   Sweep found;
 
@@ -61,6 +64,8 @@ class Riccati {
   Matrix<Vec, 0, kU> gradient, feedforward;
   Stages<Matrix<Vec, kU, kX>> feedback;
   Matrix<Mask, 0, kU> lower, upper;  // actions held at a bound
+  // Of each constraint: its multiplier, and what it adds to the curvature along its row. The adjoint is given both.
+  Matrix<Vec, 0, 0> force, stiffness;
 
   explicit Riccati(const Problem<T, S>& problem) : problem(problem), n(problem.n), linearisation(problem, kAdjoint) {}
 
@@ -72,6 +77,9 @@ class Riccati {
     arena.take(linear, nw), arena.take(flat, nu), arena.take(column, nx), arena.take(active, nu);
     arena.take(gradient, h, nu), arena.take(feedforward, h, nu), arena.take(feedback, h, nu, nx);
     arena.take(lower, h, nu), arena.take(upper, h, nu);
+    const int64_t nc = n.c();
+    arena.take(force, h + 1, nc), arena.take(stiffness, h + 1, nc);
+    arena.take(row_terms, nc), arena.take(row_violation, nc);
   }
 
   Stage<S> stage(int64_t k) const { return linearisation.stage(k); }
@@ -85,18 +93,23 @@ class Riccati {
   // Around the trajectory `at`. The solver adds `regularisation` to the curvature of each action; lanes that are
   // `stubborn` keep the second derivative of lam where the Hessian is indefinite.
   Sweep sweep(const Trajectory<S>& at, const Upstream<S>& upstream, Vec regularisation, Mask stubborn) {
-    found = {all(0), all(0), all(0), Mask{}};
+    found = {all(0), all(0), all(0), all(0), all(0), Mask{}};
+    for (int64_t i = 0; i < n.c(); i++) row_terms[i] = row_violation[i] = all(0);
     terminal(at.x[n.h], kAdjoint ? upstream.x[n.h] : nullptr);
     for (int64_t k = n.h - 1; k >= 0; k--) {
+      const StageData<T, S> data = problem.stage(k);
       const Value<S> next = value(k + 1);
       const Stage<S> stage = linearisation.at(k, at.lam[k], at.s[k], next.p);
-      stage_hessian(k, stage, next.P);
+      constraints(k, data, at.x[k], at.u[k]);
+      stage_hessian(k, data, stage, next.P);
       const Vec* lam_bar = kAdjoint ? upstream.lam[k] : nullptr;
-      actions(k, stage, next, at.u[k], kAdjoint ? upstream.u[k] : nullptr, lam_bar, regularisation);
-      states(k, stage, next, at.x[k], kAdjoint ? upstream.x[k] : nullptr, lam_bar);
-      const Vec use = factor(regularisation, stubborn);
-      feedback_law(k, use, at.u[k]);
+      actions(k, data, stage, next, at.x[k], at.u[k], kAdjoint ? upstream.u[k] : nullptr, lam_bar, regularisation);
+      states(k, data, stage, next, at.x[k], at.u[k], kAdjoint ? upstream.x[k] : nullptr, lam_bar);
+      const Vec use = factor(data, regularisation, stubborn);
+      feedback_law(k, data, use, at.u[k]);
     }
+    for (int64_t i = 0; i < n.c(); i++)
+      found.violated = max(found.violated, row_violation[i] / select(row_terms[i] > 0, row_terms[i], all(1)));
     return found;
   }
 
@@ -107,13 +120,41 @@ class Riccati {
     for (int64_t i = 0; i < nx; i++) {
       for (int64_t j = 0; j < nx; j++) end.P(i, j) = all(0) + problem.Q_final(i, j);
       end.p[i] = problem.q_final[i] + problem.Q_final.row(i) * x;
-      end.v[i] = kAdjoint ? -x_bar[i] : end.p[i];
+    }
+    if (n.c() > 0) {
+      const StageData<T, S> data = problem.last();
+      constraints(n.h, data, x, nullptr);
+      for (int64_t r = 0; r < n.c(); r++) {
+        const Vec stiff = stiffness(n.h, r);
+        for (int64_t i = 0; i < nx; i++) {
+          end.p[i] += data.G(r, i) * force(n.h, r);
+          for (int64_t j = 0; j < nx; j++) end.P(i, j) += stiff * data.G(r, i) * data.G(r, j);
+        }
+      }
+    }
+    for (int64_t i = 0; i < nx; i++) end.v[i] = kAdjoint ? -x_bar[i] : end.p[i];
+  }
+
+  // What the constraints of stage k add to gradient and curvature, in the solver; without actions at the last stage.
+  void constraints(int64_t k, const StageData<T, S>& data, const Vec* x, const Vec* u) {
+    if (kAdjoint) return;
+    const int64_t nx = n.x(), nw = n.w();
+    for (int64_t i = 0; i < n.c(); i++) {
+      const Vec c = data.constraint(i, x, u), before = problem.multiplier(k, i), price = data.price[i];
+      const Force now(c, before, problem.rho, price);
+      force(k, i) = now.value, stiffness(k, i) = select(now.held, problem.rho, all(0));
+      found.owing = max(found.owing, abs(now.value - before));
+      Vec terms = select(data.g[i] < kHuge, abs(data.g[i]), all(0));
+      for (int64_t j = 0; j < (u ? nw : nx); j++) terms += abs(data.G(i, j) * (j < nx ? x[j] : u[j - nx]));
+      row_terms[i] = max(row_terms[i], terms);
+      const Vec missed = select(now.held, abs(c), select(now.value > 0, max(-c, all(0)), max(c, all(0))));
+      row_violation[i] = max(row_violation[i], missed);
     }
   }
 
   // H = blkdiag(Q, R) + A_hat^T P A_hat, lower triangle; its second-derivative part Y is added later. The first state
   // is given: of stage 0 only the action block is needed.
-  void stage_hessian(int64_t k, const Stage<S>& stage, const Matrix<Vec, kX, kX>& P) {
+  void stage_hessian(int64_t k, const StageData<T, S>& data, const Stage<S>& stage, const Matrix<Vec, kX, kX>& P) {
     const int64_t nx = n.x(), nw = n.w(), first = k == 0 ? nx : 0;
     Local<kX> of_A(column);
     for (int64_t j = first; j < nw; j++) {
@@ -127,30 +168,53 @@ class Riccati {
       for (int64_t j = first; j <= i; j++) {
         Vec t = all(0);
         if (i < nx)
-          t += problem.Q(i, j);
+          t += data.Q(i, j);
         else if (j >= nx)
-          t += problem.R(i - nx, j - nx);
+          t += data.R(i - nx, j - nx);
         H(i, j) = t + PA.column(j) * of_A;
+      }
+    }
+    if (problem.batch.crossed && k > 0)
+      for (int64_t i = nx; i < nw; i++)
+        for (int64_t j = 0; j < nx; j++) H(i, j) += data.cross(j, i - nx);
+    for (int64_t r = 0; r < n.c(); r++) {
+      const Vec stiff = stiffness(k, r);
+      if (!any(stiff > 0)) continue;
+      for (int64_t i = first; i < nw; i++) {
+        const Vec row = stiff * data.G(r, i);
+        for (int64_t j = first; j <= i; j++) H(i, j) += row * data.G(r, j);
       }
     }
   }
 
   // Reduced gradient of the actions of stage k, linear terms, and which actions are held at a bound.
-  void actions(int64_t k, const Stage<S>& stage, const Value<S>& next, const Vec* u, const Vec* u_bar,
-               const Vec* lam_bar, Vec regularisation) {
+  void actions(int64_t k, const StageData<T, S>& data, const Stage<S>& stage, const Value<S>& next, const Vec* x,
+               const Vec* u, const Vec* u_bar, const Vec* lam_bar, Vec regularisation) {
     const int64_t nx = n.x(), nu = n.u();
     const double& barrier = problem.batch.barrier;  // a reference: from a copy GCC 12 makes two loops, and fails on one
     const Vec mu = problem.mu;
-    const T* rest = k == n.h - 1 ? problem.rest_final : problem.rest;
+    const T* rest = data.rest;
     for (int64_t j = 0; j < nu; j++) {
-      const Vec lo = problem.u_min[j], hi = problem.u_max[j], per_width = problem.per_width[j];
-      const Vec below = u[j] - lo, above = hi - u[j], width = hi - lo;
-      Vec t = problem.r[j] + problem.R.row(j) * u;
+      const Vec lo = data.u_min[j], hi = data.u_max[j];
+      const Vec below = u[j] - lo, above = hi - u[j];
+      Vec width = hi - lo, per_width = data.per_width[j];
+      const Mask fixed = width <= 0;
+      if (problem.batch.unbounded) {
+        width = range(u[j], lo, hi);
+        per_width = select(width > kTiny, 1.0 / width, all(0));
+      }
+      Vec t = data.r[j] + data.R.row(j) * u;
+      if (problem.batch.crossed) t = t + data.cross.column(j) * x;
       if (barrier > 0) {
         t += mu * (1.0 / above - 1.0 / below);
         H(nx + j, nx + j) += mu * (1.0 / (below * below) + 1.0 / (above * above));
       }
-      Vec g = t, l = kAdjoint ? -u_bar[j] : t, terms = abs(t);
+      Vec terms = abs(t);
+      for (int64_t i = 0; i < n.c(); i++) {
+        const Vec part = data.G(i, nx + j) * force(k, i);
+        t += part, terms += abs(part);
+      }
+      Vec g = t, l = kAdjoint ? -u_bar[j] : t;
       for (int64_t i = 0; i < nx; i++) {
         const Vec part = stage.A_hat(i, nx + j) * next.p[i];
         g += part, terms += abs(part), l += stage.A_hat(i, nx + j) * next.v[i];
@@ -159,8 +223,9 @@ class Riccati {
       linear[nx + j] = l, gradient(k, j) = g;
       // Away from an optimum P, and with it H, can be indefinite: |H| is still a scale for the distance to a bound.
       // Where the cost is flat, the range of the action is the scale: a descent leads across all of it.
-      const Vec across = abs(g) * per_width;
-      const Vec gauss_newton = max(max(abs(H(nx + j, nx + j)), all(0) + problem.R(j, j)), max(across, all(kTiny)));
+      // Without bounds it is what the action is now, or one.
+      const Vec across = abs(g) * (problem.batch.unbounded ? select(width > kTiny, per_width, all(1)) : per_width);
+      const Vec gauss_newton = max(max(abs(H(nx + j, nx + j)), all(0) + data.R(j, j)), max(across, all(kTiny)));
       const Vec scaled = max(lo, min(hi, u[j] - g / gauss_newton));
       Vec projected = abs(scaled - u[j]) * gauss_newton;
       // Next to a bound the barrier is so steep that rounding u alone moves g: a step below rounding counts as none.
@@ -171,7 +236,8 @@ class Riccati {
         terms += mu * (1.0 / below + 1.0 / above) + 1e-8 * mu * width * (1.0 / (below * below) + 1.0 / (above * above));
       const Vec reference = max(terms, rest[j] * width);
       Vec part = select(reference > 0, abs(g) / reference, all(0));
-      part = min(part, select(g > 0, below, above) * per_width);
+      const Vec reach = select(g > 0, below, above);
+      part = min(part, problem.batch.unbounded ? select(reach > kHuge, reach, reach * per_width) : reach * per_width);
       if (barrier > 0) part = select(projected > 0, part, all(0));
       found.stationary = max(found.stationary, part);
       flat[j] = kFlat * across;
@@ -179,16 +245,15 @@ class Riccati {
       const Vec curved = max(H(nx + j, nx + j) + linearisation.curvature(nx + j, nx + j), max(least, all(kTiny)));
       const Vec step = g / curved;
       if (barrier == 0) found.weak |= (min(below, above) <= 1e-5 * width) & (abs(step) <= 1e-5 * width) & (width > 0);
-      const Mask fixed = width <= 0;
       if (kAdjoint) {
         lower(k, j) = (step > below) | (fixed & (g >= 0));
         upper(k, j) = (-step > above) | (fixed & (g < 0));
       } else {
         // Next to a bound that the action's own Newton step would cross it is put onto the bound (Bertsekas).
         // Not after a failed step: the jump is not damped, and in an unstable system it can cost more than it gains.
-        const Vec reach = g / gauss_newton, near = select(regularisation > 0, all(1e-12), all(1e-2)) * width;
-        lower(k, j) = (below <= near) & (reach >= below) & (g > 0);
-        upper(k, j) = (above <= near) & (-reach >= above) & (g < 0);
+        const Vec step = g / gauss_newton, near = select(regularisation > 0, all(1e-12), all(1e-2)) * width;
+        lower(k, j) = (below <= near) & (step >= below) & (g > 0);
+        upper(k, j) = (above <= near) & (-step >= above) & (g < 0);
       }
       if (barrier > 0) {
         // A barrier that keeps no distance to speak of is the bound itself; its steepness is then only rounding.
@@ -201,27 +266,35 @@ class Riccati {
   }
 
   // Costate of state k, and its linear term.
-  void states(int64_t k, const Stage<S>& stage, const Value<S>& next, const Vec* x, const Vec* x_bar,
-              const Vec* lam_bar) {
+  void states(int64_t k, const StageData<T, S>& data, const Stage<S>& stage, const Value<S>& next, const Vec* x,
+              const Vec* u, const Vec* x_bar, const Vec* lam_bar) {
     Vec* p = value(k).p;
     for (int64_t i = 0; i < n.x(); i++) {
-      const Vec t = problem.q[i] + problem.Q.row(i) * x;
+      Vec t = data.q[i] + data.Q.row(i) * x;
+      if (problem.batch.crossed) t = t + data.cross.row(i) * u;
+      for (int64_t r = 0; r < n.c(); r++) t += data.G(r, i) * force(k, r);
       Vec l = (kAdjoint ? -x_bar[i] : t) + stage.A_hat.column(i) * next.v;
       if (kAdjoint) l = l - stage.K_lam.column(i) * lam_bar;
       p[i] = t + stage.A_hat.column(i) * next.p, linear[i] = l;
     }
   }
 
+  // The range of an action; where it has no end, the size of the action and of its finite bound.
+  static Vec range(Vec u, Vec lo, Vec hi) {
+    const Vec size = max(abs(u), max(select(lo > -kHuge, abs(lo), all(0)), select(hi < kHuge, abs(hi), all(0))));
+    return select(hi - lo > kHuge, size, hi - lo);
+  }
+
   // Curvature that action j has at least, whatever its units.
-  Vec action_scale(int64_t j) const {
+  Vec action_scale(const StageData<T, S>& data, int64_t j) const {
     const int64_t nx = n.x();
-    return max(problem.R(j, j) + 1e-6 * abs(H(nx + j, nx + j)), all(kTiny));
+    return max(data.R(j, j) + 1e-6 * abs(H(nx + j, nx + j)), all(kTiny));
   }
 
   // Cholesky of H_uu + Y_uu + regularisation with identity rows for active actions, reciprocal pivots on the diagonal.
   // An indefinite block first drops Y at this stage (Gauss-Newton), then has its pivots lifted; lanes that are
   // `stubborn` lift them at once. Returns the part of Y that was used.
-  Vec factor(Vec regularisation, Mask stubborn) {
+  Vec factor(const StageData<T, S>& data, Vec regularisation, Mask stubborn) {
     const int64_t nx = n.x(), nu = n.u();
     Vec use = all(1);
     for (int attempt = 0; attempt < 2; attempt++) {
@@ -229,14 +302,14 @@ class Riccati {
       for (int64_t i = 0; i < nu; i++)
         for (int64_t j = 0; j <= i; j++) {
           Vec t = H(nx + i, nx + j) + use * linearisation.curvature(nx + i, nx + j);
-          if (i == j && !kAdjoint) t += regularisation * action_scale(j) + flat[j];
+          if (i == j && !kAdjoint) t += regularisation * action_scale(data, j) + flat[j];
           L(i, j) = select(active[i] | active[j], all(i == j), t);
         }
       for (int64_t j = 0; j < nu; j++) {
         Vec pivot = L(j, j);
         for (int64_t m = 0; m < j; m++) pivot -= L(j, m) * L(j, m);
         const Vec singular = kSingular * abs(H(nx + j, nx + j));
-        const Vec lift = kAdjoint ? singular : 0.05 * action_scale(j);
+        const Vec lift = kAdjoint ? singular : 0.05 * action_scale(data, j);
         const Mask bad = ~(pivot > lift) & ~active[j];
         failed |= bad;
         // What is added where the cost is flat vanishes with the gradient, and does not hide that it is.
@@ -263,7 +336,7 @@ class Riccati {
 
   // (feedback | feedforward) = -H_uu^-1 (H_ux | linear_u), rows of active actions zero; and the value function of
   // stage k.
-  void feedback_law(int64_t k, Vec use, const Vec* u) {
+  void feedback_law(int64_t k, const StageData<T, S>& data, Vec use, const Vec* u) {
     const int64_t nx = n.x(), nu = n.u(), nw = n.w(), first = k == 0 ? nx : 0, columns = nx + 1;
     for (int64_t i = first; i < nw; i++)
       for (int64_t j = first; j <= i; j++)
@@ -294,7 +367,7 @@ class Riccati {
       for (int64_t j = 0; j < nx; j++) K(i, j) = law(i, j);
       // The solver puts an action held at a bound onto it exactly.
       const Vec to_bound =
-          select(lower(k, i), problem.u_min[i] - u[i], select(upper(k, i), problem.u_max[i] - u[i], all(0)));
+          select(lower(k, i), data.u_min[i] - u[i], select(upper(k, i), data.u_max[i] - u[i], all(0)));
       feedforward(k, i) = kAdjoint ? law(i, nx) : select(active[i], to_bound, law(i, nx));
     }
   }

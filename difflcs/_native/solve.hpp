@@ -14,6 +14,15 @@ namespace {
 
 // Projected gradient, in parts of its scale (see certificate.hpp), at which a problem is solved.
 constexpr double kStationary = 1e-7;
+// Violation of a constraint, in parts of the sizes of its terms, at which it is met; and where more is rounding.
+constexpr double kMet = 1e-12, kMetRounded = 1e-7;
+// Weight of the augmented Lagrangian, in parts of the largest weight of the cost: at first, and where a violation that
+// three steps of the multipliers in a row have not halved means that the problem is infeasible.
+constexpr double kPenalty = 10.0, kLargestPenalty = 1e7;
+// A step of the multipliers is due where the projected gradient is below this part of the change that it would make.
+constexpr double kDue = 0.03;
+// A violation that is more than a tenth of the one before asks for ten times the weight, one that stays for more.
+constexpr double kSlow = 0.1, kStays = 0.9, kRaise = 10.0, kRaiseMore = 30.0;
 // Failed searches in a row, each with 8 times the damping, before a problem is given up.
 constexpr int64_t kFailures = 12;
 
@@ -51,10 +60,13 @@ class Solver {
   struct Lane {
     int64_t element;  // -1: idle
     int64_t iterations, in_stage, failures;
+    double violated;  // at the last step of the multipliers
+    int64_t stalled;  // steps of the multipliers in a row that hardly helped
   };
   Lane lane[kLanes];
   Vec eps, regularisation, J;
-  Mask fresh;  // without a trajectory at its eps
+  Mask fresh;     // without a trajectory at its eps
+  Mask repriced;  // with multipliers that J does not know yet
   // Elements that are finished but not certified yet.
   int64_t finished[kLanes];
   int waiting;
@@ -63,17 +75,18 @@ class Solver {
   bool halted(Watch watch) const { return n.l() > 16 && watch.stop(watch.context); }
 
   // lam and s of one stage, from the guess in `lam`; lanes in `skip` keep both.
-  void contacts(const Vec* x, const Vec* u, Vec* lam, Vec* s, Mask skip) {
-    problem.gap(x, u, gap);
-    Lcp(n.l(), problem.F.entries, gap, newton, rows).solve(lam, s, eps, skip);
+  void contacts(const StageData<T, S>& data, const Vec* x, const Vec* u, Vec* lam, Vec* s, Mask skip) {
+    data.gap(x, u, gap);
+    Lcp(n.l(), data.F.entries, gap, newton, rows).solve(lam, s, eps, skip);
   }
 
   // Roll u out at eps in the lanes of `wanted`; returns the cost of every lane.
   Vec rollout(Mask wanted, Watch watch) {
     for (int64_t i = 0; i < n.x(); i++) at.x(0, i) = problem.x0[i];
     for (int64_t k = 0; k < n.h && !halted(watch); k++) {
-      contacts(at.x[k], at.u[k], at.lam[k], at.s[k], ~wanted);
-      problem.next_state(at.x[k], at.u[k], at.lam[k], at.x[k + 1]);
+      const StageData<T, S> data = problem.stage(k);
+      contacts(data, at.x[k], at.u[k], at.lam[k], at.s[k], ~wanted);
+      data.next_state(at.x[k], at.u[k], at.lam[k], at.x[k + 1]);
     }
     return problem.cost(at);
   }
@@ -84,20 +97,21 @@ class Solver {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l();
     for (int64_t i = 0; i < nx; i++) next.x(0, i) = problem.x0[i];
     for (int64_t k = 0; k < n.h && !halted(watch); k++) {
+      const StageData<T, S> data = problem.stage(k);
       const Matrix<Vec, S::kU, S::kX> K = riccati.feedback[k];
       for (int64_t j = 0; j < nu; j++) {
         const Vec from = at.u(k, j);
         Vec to = from + step * riccati.feedforward(k, j);
         if (k > 0)
           for (int64_t i = 0; i < nx; i++) to += K(j, i) * (next.x(k, i) - at.x(k, i));
-        Vec low = problem.u_min[j], high = problem.u_max[j];
+        Vec low = data.u_min[j], high = data.u_max[j];
         if (batch.barrier > 0)  // at most nine tenths of the way to a bound
           low = from - 0.9 * (from - low), high = from + 0.9 * (high - from);
         next.u(k, j) = select(frozen, from, max(low, min(high, to)));
       }
       for (int64_t j = 0; j < nl; j++) next.lam(k, j) = select(skip, next.lam(k, j), at.lam(k, j));
-      contacts(next.x[k], next.u[k], next.lam[k], next.s[k], skip);
-      problem.next_state(next.x[k], next.u[k], next.lam[k], next.x[k + 1]);
+      contacts(data, next.x[k], next.u[k], next.lam[k], next.s[k], skip);
+      data.next_state(next.x[k], next.u[k], next.lam[k], next.x[k + 1]);
     }
     return problem.cost(next);
   }
@@ -106,13 +120,15 @@ class Solver {
   bool take(const MpcSolve& o, int64_t* counter, int l) {
     const int64_t e = __atomic_fetch_add(counter, int64_t{1}, __ATOMIC_RELAXED);
     const int64_t nu = n.u(), actions = n.h * nu, forces = n.h * n.l();
-    lane[l] = {e < batch.count ? e : -1, 0, 0, 0};
+    lane[l] = {e < batch.count ? e : -1, 0, 0, 0, 1e300, 0};
     fresh[l] = -1;
     eps[l] = o.first_relaxation, regularisation[l] = 0;
     if (e >= batch.count) return false;
     problem.load(e, l);
+    problem.load_multipliers(o.mu_start ? o.mu_start + e * (n.h + 1) * n.c() : nullptr, l);
+    put(&problem.rho, 0, l, kPenalty * lane_of(problem.weight[0], l));
     for (int64_t i = 0; i < actions; i++) {
-      const double low = problem.u_min[i % nu][l], high = problem.u_max[i % nu][l];
+      const double low = problem.u_min[i / nu][i % nu][l], high = problem.u_max[i / nu][i % nu][l];
       const double margin = batch.barrier > 0 ? 0.01 * (high - low) : 0.0;
       const double a = low + margin, b = high - margin, value = o.u_start ? o.u_start[e * actions + i] : 0.0;
       put(at.u.entries, i, l, value < a ? a : value > b ? b : value);
@@ -124,15 +140,46 @@ class Solver {
     return true;
   }
 
-  void store(const MpcSolve& o, int l, Status status) {
+  void store(const MpcSolve& o, int l, Status status, const Matrix<Vec, 0, 0>& multipliers) {
     const int64_t e = lane[l].element, states = at.x.size(), actions = at.u.size(), forces = at.lam.size();
     problem.store(o.x + e * states, at.x.entries, states, l);
     problem.store(o.u + e * actions, at.u.entries, actions, l);
     problem.store_lam(o.lam + e * forces, at.lam.entries, l);
-    o.objective[e] = J[l] / lane_of(problem.cost_unit[0], l), o.iterations[e] = int32_t(lane[l].iterations);
+    problem.store_multipliers(o.mu + e * (n.h + 1) * n.c(), multipliers.entries, l);
+    o.objective[e] = (n.c() > 0 ? problem.objective(at) : J)[l] / lane_of(problem.cost_unit[0], l), o.iterations[e] = int32_t(lane[l].iterations);
     o.status[e] = int8_t(status);
     finished[waiting++] = e;
     if (waiting == kLanes) certificate.judge(o, finished, waiting), waiting = 0;
+  }
+
+  // A step of the multipliers: those that the augmented Lagrangian has at the iterate.
+  void pay(Mask which) {
+    for (int64_t k = 0; k <= n.h; k++) {
+      const StageData<T, S> data = k < n.h ? problem.stage(k) : problem.last();
+      for (int64_t i = 0; i < n.c(); i++) {
+        Vec& multiplier = problem.multiplier(k, i);
+        const Vec c = data.constraint(i, at.x[k], k < n.h ? at.u[k] : nullptr);
+        multiplier = select(which, Force(c, multiplier, problem.rho, data.price[i]).value, multiplier);
+      }
+    }
+    repriced |= which;
+  }
+
+  // Whether the constraints of a lane are met, but for what no step of the multipliers diminishes any more.
+  bool met(const Sweep& sweep, int l) const { return sweep.violated[l] <= (lane[l].stalled > 0 ? kMetRounded : kMet); }
+
+  // Whether the constraints of a lane at the target ask for other multipliers, which it then gets, or for more weight.
+  bool owes(const Sweep& sweep, int l, bool stationary) {
+    const double violated = sweep.violated[l];
+    if (met(sweep, l) || !(stationary || sweep.projected[l] <= kDue * sweep.owing[l])) return false;
+    Mask which = Mask{};
+    which[l] = -1;
+    pay(which);
+    double& rho = reinterpret_cast<double*>(&problem.rho)[l];
+    lane[l].stalled = violated > 0.5 * lane[l].violated ? lane[l].stalled + 1 : 0;
+    if (violated > kSlow * lane[l].violated) rho *= violated > kStays * lane[l].violated ? kRaiseMore : kRaise;
+    lane[l].violated = violated, lane[l].iterations++, lane[l].failures = 0;
+    return true;
   }
 
   // Stores the lanes that are done and gives them other problems. Returns the lanes that make no step now.
@@ -144,9 +191,16 @@ class Solver {
       const double tol = o.tol > sweep.rounding[l] ? o.tol : sweep.rounding[l];
       // A search that fails this close to the optimum has met the rounding of the cost.
       const double patience = a.failures < kFailures ? 1.0 : 1e3;
-      const bool converged = sweep.projected[l] <= patience * tol && sweep.stationary[l] <= patience * kStationary;
+      const bool stationary = sweep.projected[l] <= patience * tol && sweep.stationary[l] <= patience * kStationary;
+      const bool converged = stationary && met(sweep, l);
       const bool broken = !(J[l] < 1e300 && J[l] > -1e300);
-      if (!converged && !broken && a.iterations < o.max_iter && a.failures < kFailures) continue;
+      const double largest = kLargestPenalty * lane_of(problem.weight[0], l);
+      const bool infeasible = sweep.violated[l] > o.certified && problem.rho[l] >= largest && a.stalled >= 3;
+      if (!infeasible && !broken && a.iterations < o.max_iter && n.c() > 0 && owes(sweep, l, stationary)) {
+        frozen[l] = -1;
+        continue;
+      }
+      if (!infeasible && !converged && !broken && a.iterations < o.max_iter && a.failures < kFailures) continue;
       frozen[l] = -1;
       if (converged && regularisation[l] > 0 && !broken) {  // once more without it: it hides a singular Hessian
         regularisation[l] = 0;
@@ -154,8 +208,10 @@ class Solver {
       }
       store(o, l,
             converged && !broken         ? (sweep.weak[l] ? Status::degenerate : Status::converged)
+            : infeasible                 ? Status::infeasible
             : a.iterations >= o.max_iter ? Status::max_iter
-                                         : Status::numerical);
+                                         : Status::numerical,
+            riccati.force);
       if (!take(o, counter, l)) live--;
     }
     return frozen;
@@ -192,6 +248,7 @@ class Solver {
   // Damping and homotopy after a step.
   void advance(const MpcSolve& o, const Sweep& sweep, Mask frozen, Mask moved, Vec step) {
     const double target = batch.relaxation;
+    Mask next_stage = Mask{};
     for (int l = 0; l < kLanes; l++) {
       if (frozen[l]) continue;
       Lane& a = lane[l];
@@ -207,9 +264,11 @@ class Solver {
       if (eps[l] > target && (a.in_stage >= 2 || sweep.projected[l] < 1e4 * o.tol || a.failures > 0)) {
         eps[l] = eps[l] * o.shrink > target ? eps[l] * o.shrink : target;
         a.in_stage = 0, a.failures = 0;
-        fresh[l] = -1;
+        next_stage[l] = -1;
       }
     }
+    fresh |= next_stage;
+    if (n.c() > 0 && any(next_stage)) pay(next_stage);
   }
 };
 
@@ -217,7 +276,7 @@ class Solver {
 template <class T, class S>
 void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
   eps = all(batch.relaxation), regularisation = J = all(0);
-  fresh = Mask{};
+  fresh = repriced = Mask{};
   waiting = 0;
   int live = 0;
   for (int l = 0; l < kLanes; l++) {
@@ -237,10 +296,11 @@ void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
     if (watch.stop(watch.context)) {
       // What has a trajectory is stored; what has none stays unreached.
       for (int l = 0; l < kLanes; l++)
-        if (!idle[l] && !fresh[l]) store(o, l, Status::max_iter);
+        if (!idle[l] && !fresh[l]) store(o, l, Status::max_iter, problem.multiplier);
       break;
     }
-    fresh = Mask{};
+    if (any(repriced)) J = select(repriced, problem.cost(at), J);
+    fresh = repriced = Mask{};
     // Gauss-Newton can creep along a curved valley: after 20 steps in one stage every other one keeps the curvature.
     Mask stubborn;
     for (int l = 0; l < kLanes; l++) stubborn[l] = lane[l].in_stage > 20 && lane[l].in_stage % 2 ? -1 : 0;

@@ -1,75 +1,349 @@
-"""The MPC as one node of the autograd graph."""
+"""The MPC as one node of the autograd graph, and its pullback as another.
+
+`Plan` holds one call: how to solve, and, once it is solved, what a gradient needs. Its tensors are the inputs as the
+caller gave them, with any batch dimensions. They become numbers (flat batch, float64, CPU) inside the node, where they
+are real ones under every transform: `torch.func.vmap` makes of its dimension one more batch dimension in front, and of
+a backward pass that it maps over several gradients a loop over them.
+"""
 
 from __future__ import annotations
 
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from difflcs._checks import check_positive_definite, check_tensor
+from difflcs._fields import check_not_nan
+from difflcs._functorch import transforms_active
 from difflcs.errors import DegenerateWarning, DoubleBackwardError
 from difflcs.mpc.backends.base import Backend, Result
 from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.mpc.solution import Primal
 from difflcs.status import Status
 
+# What a call gives to the node, in this order; None for what it leaves out.
+ARGUMENTS = (*INPUTS, "constant", *(f"guess.{name}" for name in Primal._fields))
+_COUNT = len(INPUTS) + 1  # those that are differentiable
+_RANKS = {**{name: len(dims) for name, dims in INPUTS.items()}, "constant": 0}
+_SYMMETRIC = ("Q", "R", "Q_final")
+_COST = ("Q", "R", "S", "Q_final", "q", "r", "q_final", "constant")
+_MAY_BE_INFINITE = ("u_min", "u_max", "g", "price")
 
-class SolveMPC(torch.autograd.Function):
-    """Tensors (in the order of `INPUTS`) → x, u, lam, mu, objective, status, iterations, kkt_residual, solve_time.
 
-    `dtype` is that of x, u and lam; the objective stays in float64, without the cost's `constant` (batch,), which only
-    counts for what `dtype` can hold. `smallest` is the narrowest dtype in which a gradient will arrive.
+class Target(NamedTuple):
+    """What the gradient of one input must look like."""
+
+    name: str
+    shape: torch.Size
+    dtype: torch.dtype
+    device: torch.device
+
+
+@dataclass
+class Plan:
+    """One call of the layer: how to solve it, and what was found.
+
+    Attributes:
+        backend, horizon, relaxation, barrier: see `MPCProblem` and `Backend`.
+        by_stage: names of the inputs with a dimension of stages.
+        dtype: of x, u, lam and the objective.
+        smallest: the narrowest dtype in which a gradient will arrive.
+        batch: batch dimensions that all inputs broadcast to; vmap adds its own in front.
+        own: whether the outputs must have memory of their own, because a backward pass may follow.
+        unseen: whether nothing has looked at the numbers yet, because the inputs were made under a transform.
+        problem, result: what was solved, and how; once it is.
     """
 
-    @staticmethod
-    def forward(  # noqa: D102
-        ctx,
-        problem: MPCProblem,
-        backend: Backend,
-        guess: Primal | None,
-        dtype: torch.dtype,
-        smallest: torch.dtype,
-        constant: Tensor,
-        *tensors: Tensor,
-    ):
-        # `problem` holds the values of `tensors`; these are here to receive gradients, and are saved so that autograd
-        # refuses them where they were changed in place.
-        result = backend.solve(problem, guess)
-        objective = problem.objective(result.primal.x, result.primal.u)
-        result, objective = _within_range(result, objective, constant, dtype)
-        ctx.problem, ctx.backend, ctx.result, ctx.limit = problem, backend, result, torch.finfo(smallest).max
-        ctx.save_for_backward(*tensors)
-        # Copies: what the caller does with the outputs must not change the gradient.
-        x, u, lam, mu = (v.to(dtype, copy=any(ctx.needs_input_grad)) for v in result.primal)
-        u = _inside(u, problem) if dtype != torch.float64 else u
-        violation = problem.violation(result.primal.x, result.primal.u).to(dtype)
-        info = result.status.clone(), result.iterations, result.kkt_residual, result.solve_time, violation
-        ctx.mark_non_differentiable(mu, *info)
-        return x, u, lam, mu, objective, *info
+    backend: Backend
+    horizon: int
+    relaxation: float
+    barrier: float
+    by_stage: frozenset[str]
+    dtype: torch.dtype
+    smallest: torch.dtype
+    batch: tuple[int, ...]
+    own: bool
+    unseen: bool
+    problem: MPCProblem = field(init=False)
+    result: Result = field(init=False)
 
-    @staticmethod
-    def backward(ctx, *grads: Tensor):  # noqa: D102
-        if torch.is_grad_enabled():
-            raise DoubleBackwardError("LCSMPCLayer has first derivatives only; expected create_graph=False")
-        _ = ctx.saved_tensors  # raises where one was changed in place
-        result: Result = ctx.result
-        solved = result.solved
-        # Whatever comes upstream for a failed element is dropped before it can meet the others.
-        upstream = tuple(
-            torch.where(solved.reshape(-1, *[1] * (g.ndim - 1)), g.double(), 0.0) for g in (*grads[:3], grads[4])
+    def solve(self, tensors: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
+        """x, u, lam, mu, objective, status, iterations, kkt_residual, solve_time, violation; and an empty tensor.
+
+        Each has the batch dimensions first. Tensors in the order of `ARGUMENTS`, none of them wrapped.
+        """
+        values = self._values(tensors[:_COUNT])
+        constant = values.pop("constant").expand(self._size).contiguous()
+        self.problem = problem = MPCProblem(
+            **values, horizon=self.horizon, relaxation=self.relaxation, barrier=self.barrier
         )
+        result = self.backend.solve(problem, self._guess(tensors[_COUNT:]))
+        objective = problem.objective(result.primal.x, result.primal.u)
+        violation = problem.violation(result.primal.x, result.primal.u)
+        self.result, objective = _within_range(result, objective, constant, self.dtype)
+        result = self.result
+        # Copies: what the caller does with the outputs must not change the gradient.
+        x, u, lam, mu = (v.to(self.dtype, copy=self.own) for v in result.primal)
+        u = _inside(u, problem) if self.dtype != torch.float64 else u
+        status = result.status.clone()
+        floats = objective + constant, status, result.iterations, result.kkt_residual, result.solve_time, violation
+        objective, status, iterations, residual, seconds, violation = floats
+        outputs = (
+            x, u, lam, mu, objective.to(self.dtype), status, iterations, residual, seconds, violation.to(self.dtype),
+            x.new_empty((self._size, 0)),
+        )  # fmt: skip
+        device = tensors[_X0].device  # pyright: ignore[reportOptionalMemberAccess]
+        if device.type != "cpu":
+            outputs = tuple(v.to(device) for v in outputs)
+        return outputs if len(self.batch) == 1 else tuple(v.reshape((*self.batch, *v.shape[1:])) for v in outputs)
+
+    @property
+    def _size(self) -> int:
+        return math.prod(self.batch)
+
+    def rank(self, name: str) -> int:
+        """Number of dimensions of an input behind those of the batch."""
+        return _RANKS[name] + (name in self.by_stage)
+
+    def _values(self, tensors: Sequence[Tensor | None]) -> dict[str, Tensor]:
+        """Name → numbers as `MPCProblem` wants them; checked, as far as nobody did before."""
+        values, size = {}, self._size
+        for name, tensor in zip(ARGUMENTS, tensors, strict=False):
+            if tensor is None:
+                continue
+            value = tensor.detach()
+            if value.dtype != torch.float64 or value.device.type != "cpu":
+                value = value.to("cpu", torch.float64)
+            lead = value.shape[: value.ndim - self.rank(name)]
+            if lead or name == "x0":
+                own = value.shape[len(lead) :]
+                if math.prod(lead) == 1 and name != "x0":
+                    value = value.reshape(own)  # shared
+                elif lead == self.batch:
+                    value = value.reshape(size, *own) if len(lead) != 1 else value
+                else:
+                    value = value.expand(*self.batch, *own).reshape(size, *own)
+            if name in self.by_stage and value.ndim == self.rank(name):
+                value = value.unsqueeze(0)
+            if name in _SYMMETRIC:
+                value = 0.5 * (value + value.mT)
+            if name in _MAY_BE_INFINITE:
+                if self.unseen or tensor.requires_grad:
+                    check_not_nan(name, value)
+            elif self.unseen or name in _COST:
+                check_tensor(name, value)
+            values[name] = value.contiguous()
+        if self.unseen:
+            check_positive_definite(values["F"])
+        return values
+
+    def _guess(self, tensors: Sequence[Tensor | None]) -> Primal | None:
+        if tensors[0] is None:
+            return None
+        flat = []
+        for tensor in tensors:
+            if tensor is None:  # no multipliers
+                flat.append(self.problem.no_multipliers())
+                continue
+            value = tensor.detach().to("cpu", torch.float64)
+            if self.unseen:
+                check_tensor("guess", value)
+            flat.append(value.expand(*self.batch, *value.shape[-2:]).reshape(self._size, *value.shape[-2:]))
+        return Primal(*flat)
+
+    def pull_back(self, targets: Sequence[Target], kept: int, grads: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
+        """Gradients of some inputs from those of x, u, lam and the objective.
+
+        Args:
+            targets: what each gradient must look like, but for the dimensions that are kept.
+            kept: how many dimensions of the batch, from the first, each gradient has in front, unsummed.
+            grads: with the batch dimensions; None for zero.
+        """
+        result, solved = self.result, self.result.solved
+        upstream = tuple(self._upstream(i, g) for i, g in enumerate(grads))
+        wanted = {target.name for target in targets} - {"constant"}
+        problem = self.problem if kept == 0 else self._apart(wanted)
 
         def vjp(keep: Tensor) -> dict[str, Tensor]:
-            return ctx.backend.vjp(ctx.problem, result, upstream, keep)
+            return self.backend.vjp(problem, result, upstream, keep)  # pyright: ignore[reportArgumentType]
 
-        # NaN that comes from the caller goes back to the caller, as everywhere in torch; our own would be an error.
-        theirs = not _all_finite(upstream, torch.finfo(torch.float64).max)
-        gradients = vjp(solved) if theirs else _finite(vjp, solved, ctx.limit)
-        needed = ctx.needs_input_grad[6:]
-        return *[None] * 6, *(gradients[k] if n else None for k, n in zip(INPUTS, needed, strict=True))
+        gradients = {}
+        if wanted:
+            # NaN that comes from the caller goes back to the caller, as everywhere in torch; our own would be an error.
+            theirs = not _all_finite(upstream, torch.finfo(torch.float64).max)
+            gradients = vjp(solved) if theirs else _finite(vjp, solved, torch.finfo(self.smallest).max)
+        gradients["constant"] = upstream[3]
+        return tuple(self._shaped(target, gradients[target.name], kept) for target in targets)
+
+    def _upstream(self, index: int, grad: Tensor | None) -> Tensor:
+        """Gradient of one output, flat; what comes for a failed element is dropped before it can meet the others."""
+        like = self.result.primal[index] if index < 3 else self.result.kkt_residual
+        if grad is None:
+            return torch.zeros_like(like)
+        flat = grad.to("cpu", torch.float64).reshape(like.shape)
+        return torch.where(self.result.solved.reshape(-1, *[1] * (like.ndim - 1)), flat, 0.0)
+
+    def _apart(self, names: set[str]) -> MPCProblem:
+        """The problem with some inputs given for each element, so that each gets a gradient of its own."""
+        changed = {}
+        for name in names:
+            value = getattr(self.problem, name)
+            if self.problem.shared(name):
+                own = value.shape[value.ndim - self.rank(name) :]
+                changed[name] = value.reshape(1, *own).expand(self._size, *own).contiguous()
+        return replace(self.problem, **changed)
+
+    def _shaped(self, target: Target, gradient: Tensor, kept: int) -> Tensor:
+        """A gradient summed to the shape, and in the dtype and on the device, of its input."""
+        name, shape, front = target.name, target.shape, self.batch[:kept]
+        if name in _SYMMETRIC:
+            gradient = 0.5 * (gradient + gradient.mT)
+        if kept or gradient.numel() != math.prod(shape):
+            rank = self.rank(name)
+            lead, own = shape[: len(shape) - rank], shape[len(shape) - rank :]
+            ones = [1] * (len(self.batch) - kept - len(lead))
+            gradient = gradient.reshape((*self.batch, *own)).sum_to_size((*front, *ones, *lead, *own))
+        return gradient.reshape((*front, *shape)).to(target.device, target.dtype)
+
+
+_X0 = ARGUMENTS.index("x0")
+
+
+def solve(plan: Plan, tensors: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
+    """The outputs of `Plan.solve`, as nodes of the graph, without the empty one."""
+    # The style with `setup_context`, which transforms need, costs 20 µs more a call: it reads a signature each time.
+    function = _Transformed if transforms_active() else _Eager
+    return function.apply(plan, *tensors)[:-1]  # pyright: ignore[reportOptionalSubscript]
+
+
+def _keep(ctx: Any, plan: Plan, tensors: Sequence[Tensor | None], outputs: Sequence[Tensor]) -> None:
+    ctx.plan = plan
+    # Saved so that autograd refuses what was changed in place; the last output knows which transforms it has met.
+    ctx.save_for_backward(*tensors[:_COUNT], outputs[-1])
+    ctx.mark_non_differentiable(outputs[3], *outputs[5:])
+    ctx.set_materialize_grads(False)
+
+
+class _Eager(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, plan: Plan, *tensors: Tensor | None):
+        outputs = plan.solve(tensors)
+        _keep(ctx, plan, tensors, outputs)
+        return outputs
+
+    @staticmethod
+    def backward(ctx, *grads: Tensor | None):
+        *inputs, witness = ctx.saved_tensors
+        needs = ctx.needs_input_grad[1 : 1 + _COUNT]
+        grads = (*grads[:3], grads[4])
+        none = [None] * (len(ARGUMENTS) - _COUNT)
+        if all(g is None for g in grads):
+            return None, *[None] * _COUNT, *none
+        return None, *_pull_back(ctx.plan, inputs, needs, witness, grads), *none
+
+
+class _Transformed(torch.autograd.Function):
+    @staticmethod
+    def forward(plan: Plan, *tensors: Tensor | None):
+        return plan.solve(tensors)
+
+    @staticmethod
+    def setup_context(ctx, inputs: tuple, output: tuple[Tensor, ...]) -> None:
+        _keep(ctx, inputs[0], inputs[1:], output)
+
+    backward = _Eager.backward
+
+    @staticmethod
+    def vmap(info, in_dims: tuple, plan: Plan, *tensors: Tensor | None):
+        moved = []
+        for name, tensor, dim in zip(ARGUMENTS, tensors, in_dims[1:], strict=True):
+            if tensor is not None and dim is not None:
+                tensor = tensor.movedim(dim, 0)
+                rank = 2 if name.startswith("guess") else plan.rank(name)
+                lead = tensor.shape[1 : tensor.ndim - rank]
+                ones = [1] * (len(plan.batch) - len(lead))  # so that its dimension is the first of the batch
+                tensor = tensor.reshape(tensor.shape[0], *ones, *tensor.shape[1:])
+            moved.append(tensor)
+        plan.batch = (info.batch_size, *plan.batch)
+        outputs = _Transformed.apply(plan, *moved)
+        return outputs, (0,) * len(outputs)  # pyright: ignore[reportArgumentType]
+
+
+def _pull_back(
+    plan: Plan, inputs: Sequence[Tensor | None], needs: Sequence[bool], witness: Tensor, grads: Sequence[Tensor | None]
+) -> list[Tensor | None]:
+    """The pullback, whatever transform it runs in."""
+    named = zip(ARGUMENTS, inputs, needs, strict=False)
+    targets = tuple(Target(k, v.shape, v.dtype, v.device) for k, v, needed in named if needed and v is not None)
+    legacy = torch._C._functorch.is_legacy_batchedtensor  # pyright: ignore[reportAttributeAccessIssue]
+    if transforms_active():
+        # Inside a transform of torch.func every backward pass is recorded; it is refused when it is differentiated.
+        found = _Pullback.apply(plan, targets, 0, witness, *grads, *inputs)
+    elif torch.is_grad_enabled():
+        _refuse()
+    elif any(g is not None and legacy(g) for g in grads):
+        found = _pull_back_legacy(plan, targets, grads)
+    else:
+        found = plan.pull_back(targets, 0, grads)
+    rest = iter(found)  # pyright: ignore
+    return [next(rest) if needed else None for needed in needs]
+
+
+def _refuse() -> None:
+    raise DoubleBackwardError("LCSMPCLayer has first derivatives only; expected create_graph=False")
+
+
+class _Pullback(torch.autograd.Function):
+    """`Plan.pull_back`. The inputs are here so that its result is known to depend on them."""
+
+    @staticmethod
+    def forward(plan: Plan, targets: tuple[Target, ...], kept: int, witness: Tensor, *tensors: Tensor | None):
+        return plan.pull_back(targets, kept, tensors[:4])
+
+    @staticmethod
+    def setup_context(ctx, inputs: tuple, output: tuple[Tensor, ...]) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx, *_: Tensor):
+        _refuse()
+
+    @staticmethod
+    def vmap(info, in_dims: tuple, plan: Plan, targets: tuple, kept: int, witness: Tensor, *tensors: Tensor | None):
+        grads, inputs, dims = tensors[:4], tensors[4:], in_dims[4:8]
+        if in_dims[3] is not None:  # the solve has met this dimension: it is the first of its batch
+            front = []
+            for grad, dim in zip(grads, dims, strict=True):
+                if grad is not None:
+                    grad = grad.expand(info.batch_size, *grad.shape) if dim is None else grad.movedim(dim, 0)
+                front.append(grad)
+            found = _Pullback.apply(plan, targets, kept + 1, witness.movedim(in_dims[3], 0), *front, *inputs)
+        else:  # several gradients of one solve
+            each = []
+            for i in range(info.batch_size):
+                one = [g if g is None or dim is None else g.select(dim, i) for g, dim in zip(grads, dims, strict=True)]
+                each.append(_Pullback.apply(plan, targets, kept, witness, *one, *inputs))
+            found = tuple(torch.stack(parts) for parts in zip(*each, strict=True))
+        return found, (0,) * len(targets)
+
+
+def _pull_back_legacy(plan: Plan, targets: Sequence[Target], grads: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
+    """`is_grads_batched` and `jacobian(vectorize=True)` map the backward pass by an older vmap without rules."""
+    level = torch._C._vmapmode_increment_nesting() - 1  # pyright: ignore[reportAttributeAccessIssue]
+    torch._C._vmapmode_decrement_nesting()  # pyright: ignore[reportAttributeAccessIssue]
+    # What does not have its dimension gets one of size 1.
+    rows = [None if g is None else torch._remove_batch_dim(g, level, 1, 0) for g in grads]  # pyright: ignore
+    count = max(len(row) for row in rows if row is not None)
+    each = []
+    for i in range(count):
+        one = [None if row is None else row[min(i, len(row) - 1)] for row in rows]
+        each.append(plan.pull_back(targets, 0, one))
+    return tuple(torch._add_batch_dim(torch.stack(parts), 0, level) for parts in zip(*each, strict=True))  # pyright: ignore
 
 
 def _within_range(result: Result, objective: Tensor, constant: Tensor, dtype: torch.dtype) -> tuple[Result, Tensor]:

@@ -2,54 +2,63 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 
 import torch
 from torch import Tensor, nn
 
-from difflcs._checks import (
-    broadcast_batch,
-    check_choice,
-    check_number,
-    check_positive_int,
-    check_same_device,
-    check_tensor,
-    describe,
-)
-from difflcs.cost import GoalCost, QuadraticCost
-from difflcs.errors import DegenerateWarning, DTypeError, ShapeError, SolveError, SolveWarning
-from difflcs.lcs import LCSModel, LCSParams
-from difflcs.mpc.autograd import SolveMPC
+from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor
+from difflcs._functorch import runs_eagerly, transforms_active
+from difflcs.constraints import StageBounds, as_bound, check_bounds
+from difflcs.cost import CostSequence
+from difflcs.errors import DegenerateWarning, SolveError, SolveWarning
+from difflcs.lcs import LCSSequence
+from difflcs.mpc.autograd import Plan, solve
 from difflcs.mpc.backends import Backend, get_backend
-from difflcs.mpc.problem import INPUTS, MPCProblem, check_bounds
+from difflcs.mpc.gather import (
+    Bound,
+    Constraints,
+    Cost,
+    Inputs,
+    System,
+    check_constraints,
+    check_cost,
+    check_stage_bounds,
+    check_system,
+)
+from difflcs.mpc.problem import INPUTS
 from difflcs.mpc.solution import MPCSolution, Primal
 from difflcs.status import Status, solved
-
-Bound = float | Tensor | nn.Parameter
 
 
 class LCSMPCLayer(nn.Module):
     """Model predictive control through a linear complementarity system (Eq. mpc_lcs), differentiable in every input.
 
     Solves, for each batch element, the problem of `difflcs.mpc.MPCProblem`, and differentiates its solution with
-    respect to the LCS, the cost, the bounds, x0 and the goal by perturbation of the optimality conditions
-    (`difflcs.mpc.kkt`). Everything is solved in float64 on the CPU; results come back in x0's dtype and on x0's device.
+    respect to the LCS, the cost, the bounds, the constraints, x0 and the goal by perturbation of the optimality
+    conditions (`difflcs.mpc.kkt`). Everything is solved in float64 on the CPU; results come back in x0's dtype and on
+    x0's device. What the layer is built with is the default of each call.
 
     Args:
-        lcs: an `LCSModel` (its parameters become this layer's), or `LCSParams`, shared or one per batch element.
-        cost: a `GoalCost`, called with the goal, or a `QuadraticCost`.
+        lcs: an `LCSModel` or any other `LCSModule`, asked for its system at each call (parameters of an nn.Module
+            become this layer's); or `LCSParams`, shared or one per batch element; or an `LCSSequence`, one per stage.
+        cost: a `GoalCost`, called with the goal or along a reference; or a `QuadraticCost` or `CostSequence`.
         horizon: H ≥ 1 steps.
-        u_min: lower bound of the actions: a number, or a tensor (n_u,) or (..., n_u); learned if an nn.Parameter.
+        u_min: lower bound of the actions: a number, or a tensor (n_u,) or (..., n_u), −∞ where there is none; learned
+            if an nn.Parameter. None: no bound.
         u_max: upper bound, likewise.
         backend: name of a registered backend, or an instance with options.
         relaxation: λ·s of the relaxed complementarity, > 0.
+        on_failure: "raise" a `SolveError` when an element is not solved, or "mask" it: finite numbers inside the
+            bounds, zero gradient, one `SolveWarning` per layer.
+        bounds: `StageBounds`, instead of u_min and u_max.
+        constraints: `LinearConstraints` or a `ConstraintSequence`, hard or soft.
         training_relaxation: relaxation in training mode (`layer.train()`), if another; `layer.eval()` returns to
             `relaxation`. A larger one gives smoother gradients across contacts.
         barrier: weight of a logarithmic barrier of the action bounds [cost units]; 0 for none. An action at a bound has
             zero gradient; with a barrier it keeps a small distance and a gradient. The objective includes the barrier.
             Sensible weights are 1e-3 to 1e-1 of the objective; far smaller ones make the problem stiff.
-        on_failure: "raise" a `SolveError` when an element is not solved, or "mask" it: finite numbers inside the
-            bounds, zero gradient, one `SolveWarning` per layer.
 
     Raises:
         InvalidInputError and its kinds: an argument does not fit.
@@ -61,29 +70,23 @@ class LCSMPCLayer(nn.Module):
 
     def __init__(
         self,
-        lcs: LCSModel | LCSParams,
-        cost: GoalCost | QuadraticCost,
+        lcs: System,
+        cost: Cost,
         horizon: int,
-        u_min: Bound,
-        u_max: Bound,
+        u_min: Bound | None = None,
+        u_max: Bound | None = None,
         backend: str | Backend = "batched",
         relaxation: float = 1e-5,
         on_failure: str = "raise",
         *,
+        bounds: StageBounds | None = None,
+        constraints: Constraints | None = None,
         training_relaxation: float | None = None,
         barrier: float = 0.0,
     ):
         super().__init__()
-        if not isinstance(lcs, LCSModel | LCSParams):
-            raise DTypeError(f"lcs: expected LCSModel or LCSParams, got {describe(lcs)}")
-        if not isinstance(cost, GoalCost | QuadraticCost):
-            raise DTypeError(f"cost: expected GoalCost or QuadraticCost, got {describe(cost)}")
-        if (cost.n_x, cost.n_u) != (lcs.n_x, lcs.n_u):
-            raise ShapeError(
-                f"cost: expected n_x={lcs.n_x}, n_u={lcs.n_u} like the LCS, got n_x={cost.n_x}, n_u={cost.n_u}"
-            )
-        self.lcs = lcs
-        self.cost = cost
+        self.lcs = check_system(lcs)
+        self.cost = check_cost(cost)
         self.horizon = check_positive_int("horizon", horizon)
         self.relaxation = check_number("relaxation", relaxation, strict=True)
         self.training_relaxation = (
@@ -94,14 +97,30 @@ class LCSMPCLayer(nn.Module):
         self.barrier = check_number("barrier", barrier)
         self.on_failure = check_choice("on_failure", on_failure, ("raise", "mask"))
         self.backend = get_backend(backend)
-        for name, value in (("u_min", u_min), ("u_max", u_max)):
-            value = self._bound(name, value)
+        self.constraints = None if constraints is None else check_constraints(constraints)
+        self.bounds = None if bounds is None else check_stage_bounds(bounds, u_min=u_min, u_max=u_max)
+        for name, value, none in (("u_min", u_min, -torch.inf), ("u_max", u_max, torch.inf)):
+            value = as_bound(name, none if value is None else value, [("n_u", lcs.n_u)], cost.Q)
             if isinstance(value, nn.Parameter):
                 self.register_parameter(name, value)
             else:
                 self.register_buffer(name, value, persistent=False)
-        check_bounds(self.u_min, self.u_max, strict=self.barrier > 0)
+        self._check_parts()
         self._warned = False
+
+    def _check_parts(self) -> None:
+        """What does not depend on a call is refused before the first one."""
+        inputs = Inputs(self.horizon, sizes={name: getattr(self.lcs, name) for name in ("n_x", "n_u", "n_lam")})
+        if isinstance(self.lcs, LCSSequence):
+            inputs.check_horizon("lcs", self.lcs.horizon)
+        inputs.check_sizes("cost", n_x=self.cost.n_x, n_u=self.cost.n_u)
+        if isinstance(self.cost, CostSequence):
+            inputs.check_horizon("cost", self.cost.horizon)
+        inputs.add_constraints(self.constraints)
+        if self.bounds is not None:
+            inputs.add_bounds(self.bounds)
+        limits = (self.u_min, self.u_max) if self.bounds is None else self.bounds.by_steps()
+        check_bounds(*limits, strict=self.barrier > 0)
 
     def extra_repr(self) -> str:
         """What print(layer) shows."""
@@ -110,23 +129,37 @@ class LCSMPCLayer(nn.Module):
             f"on_failure={self.on_failure!r}"
         )
 
+    @runs_eagerly
     def forward(
         self,
         x0: Tensor,
         goal: Tensor | None = None,
         *,
+        reference: Tensor | None = None,
         guess: MPCSolution | Primal | None = None,
         u_min: Bound | None = None,
         u_max: Bound | None = None,
+        bounds: StageBounds | None = None,
+        lcs: System | None = None,
+        cost: Cost | None = None,
+        constraints: Constraints | None = None,
+        context: Tensor | None = None,
     ) -> MPCSolution:
         """Plan from states.
 
         Args:
             x0: (..., n_x) initial states, float32 or float64.
             goal: (..., n_goal), with a `GoalCost` only. Batch dimensions broadcast with those of x0.
+            reference: (..., H+1, n_goal), with a `GoalCost` only and instead of a goal: one goal for each state of the
+                plan, see `GoalCost.follow`.
             guess: warm start for the same batch, such as `solution.shift()`.
             u_min: bound for this call instead of the layer's.
             u_max: likewise.
+            bounds: `StageBounds` for this call.
+            lcs: system, or module that is asked for one, for this call.
+            cost: cost for this call.
+            constraints: constraints for this call.
+            context: (..., n_context) whatever the system depends on besides x0; given to the module.
 
         Returns:
             `MPCSolution` with the broadcast batch dimensions.
@@ -135,90 +168,42 @@ class LCSMPCLayer(nn.Module):
             SolveError: an element was not solved and on_failure="raise".
             InvalidInputError and its kinds: an argument does not fit; nothing was solved.
         """
-        check_tensor("x0", x0, [("n_x", self.lcs.n_x)])
-        lcs = self.lcs.params() if isinstance(self.lcs, LCSModel) else self.lcs
-        cost = self._quadratic(goal)
-        bounds = {
-            "u_min": self.u_min if u_min is None else self._bound("u_min", u_min),
-            "u_max": self.u_max if u_max is None else self._bound("u_max", u_max),
-        }
-        nothing = x0.new_zeros(0)
-        none = {"G_x": x0.new_zeros(0, lcs.n_x), "G_u": x0.new_zeros(0, lcs.n_u), "g": nothing, "price": nothing}
-        fields = {**cost.fields(), "S": x0.new_zeros(lcs.n_x, lcs.n_u), **none}
-        tensors = {**lcs.tensors(), **fields, **bounds, "x0": x0}
-        check_same_device(reversed(tensors.items()))
-        ndim = {name: len(dims) for name, dims in INPUTS.items()}
-        leading = [(name, tensors[name].shape[: tensors[name].ndim - ndim[name]]) for name in INPUTS]
-        batch = broadcast_batch([*reversed(leading), ("constant", cost.constant.shape)])
-        flat = []
-        for name in INPUTS:
-            tensor = tensors[name].to("cpu", torch.float64)
-            if name == "x0" or tensor.ndim > ndim[name]:
-                own = tensor.shape[tensor.ndim - ndim[name] :]
-                tensor = tensor.expand(*batch, *own).reshape(-1, *own)
-            flat.append(tensor)
-        values = {name: tensor.detach().contiguous() for name, tensor in zip(INPUTS, flat, strict=True)}
+        system = self.lcs if lcs is None else check_system(lcs)
+        check_tensor("x0", x0, [("n_x", system.n_x)])
+        inputs = Inputs(self.horizon)
+        inputs.add_system(system, x0, context)
+        inputs.add_cost(self.cost if cost is None else check_cost(cost), goal, reference)
+        bounds = self.bounds if bounds is None else check_stage_bounds(bounds, u_min=u_min, u_max=u_max)
+        if bounds is None:
+            inputs.tensors |= {"u_min": self.u_min, "u_max": self.u_max}
+        else:
+            inputs.add_bounds(bounds)
+        inputs.replace_bound("u_min", u_min)
+        inputs.replace_bound("u_max", u_max)
+        inputs.add_constraints(self.constraints if constraints is None else check_constraints(constraints))
+        inputs.tensors["x0"] = x0
+        tensors = inputs.tensors
+        batch = inputs.batch()
+        start = inputs.guess(guess, batch)
+        values = tensors.values()
         smooth = self.training_relaxation if self.training else None
-        relaxation = self.relaxation if smooth is None else smooth
-        problem = MPCProblem(**values, horizon=self.horizon, relaxation=relaxation, barrier=self.barrier)
-        constant = cost.constant.detach().to("cpu", torch.float64).expand(batch).reshape(-1)
-        smallest = torch.float32 if any(t.dtype == torch.float32 for t in tensors.values()) else torch.float64
-        outputs = SolveMPC.apply(problem, self.backend, self._guess(guess, batch), x0.dtype, smallest, constant, *flat)
-        *primal, objective, status, iterations, residual, seconds, violation = outputs  # pyright: ignore[reportGeneralTypeIssues]
-        self._report(status, torch.is_grad_enabled() and any(t.requires_grad for t in flat))
-
-        def shaped(value: Tensor) -> Tensor:
-            return value.reshape((*batch, *value.shape[1:])).to(x0.device)
-
-        return MPCSolution(
-            *(shaped(v) for v in primal),
-            objective=(shaped(objective) + cost.constant).to(x0.dtype),
-            status=shaped(status),
-            iterations=shaped(iterations),
-            kkt_residual=shaped(residual),
-            solve_time=shaped(seconds),
-            violation=shaped(violation),
-            problem=problem,
+        unseen = transforms_active()
+        needs_grad = torch.is_grad_enabled() and (unseen or any(t.requires_grad for t in values))
+        plan = Plan(
+            backend=self.backend,
+            horizon=self.horizon,
+            relaxation=self.relaxation if smooth is None else smooth,
+            barrier=self.barrier,
+            by_stage=frozenset(inputs.by_stage),
+            dtype=x0.dtype,
+            smallest=torch.float32 if any(t.dtype == torch.float32 for t in values) else torch.float64,
+            batch=batch,
+            own=needs_grad,
+            unseen=unseen,
         )
-
-    def _quadratic(self, goal: Tensor | None) -> QuadraticCost:
-        if isinstance(self.cost, QuadraticCost):
-            if goal is not None:
-                raise ShapeError("goal: expected none with a QuadraticCost, got one; use a GoalCost to plan to goals")
-            return self.cost
-        if goal is None:
-            raise ShapeError(
-                f"goal: expected (..., n_goal={self.cost.n_goal}) with a GoalCost, got none; call mpc(x0, goal)"
-            )
-        return self.cost(goal, horizon=self.horizon)
-
-    def _bound(self, name: str, value: Bound) -> Tensor:
-        n_u = self.lcs.n_u
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            return check_tensor(name, torch.full((n_u,), float(value), dtype=torch.float64, device=self.lcs.A.device))
-        return check_tensor(name, value, [("n_u", n_u)])
-
-    def _guess(self, guess: MPCSolution | Primal | None, batch: torch.Size) -> Primal | None:
-        if guess is None:
-            return None
-        if not isinstance(guess, MPCSolution | Primal):
-            raise DTypeError(
-                f"guess: expected an MPCSolution or a Primal such as solution.shift(), got {describe(guess)}"
-            )
-        dims = {
-            "x": [("H+1", self.horizon + 1), ("n_x", self.lcs.n_x)],
-            "u": [("H", self.horizon), ("n_u", self.lcs.n_u)],
-            "lam": [("H", self.horizon), ("n_lam", self.lcs.n_lam)],
-        }
-        flat = []
-        for name, dim in dims.items():
-            value = check_tensor(f"guess.{name}", getattr(guess, name), dim)
-            if value.shape[:-2] != batch:
-                raise ShapeError(
-                    f"guess.{name}: expected batch dimensions {tuple(batch)} like x0, got {tuple(value.shape[:-2])}"
-                )
-            flat.append(value.detach().to("cpu", torch.float64).reshape(-1, *value.shape[-2:]))
-        return Primal(*flat, torch.zeros(len(flat[0]), self.horizon + 1, 0, dtype=torch.float64))
+        outputs = solve(plan, [*(tensors.get(name) for name in INPUTS), tensors["constant"], *start])
+        self._report(plan.result.status, needs_grad)
+        return MPCSolution(*outputs, problem=plan.problem)
 
     def _report(self, status: Tensor, needs_grad: bool) -> None:
         degenerate = int((status == Status.DEGENERATE).sum())
@@ -228,7 +213,7 @@ class LCSMPCLayer(nn.Module):
                 f"{degenerate} of {len(status)} solutions are not classically differentiable (a weakly active bound or "
                 f"a singular reduced Hessian); their gradient is a regularised one. See MPCSolution.status",
                 DegenerateWarning,
-                stacklevel=4,
+                stacklevel=_stacklevel(),
             )
         if not failed:
             return
@@ -244,5 +229,13 @@ class LCSMPCLayer(nn.Module):
                 f"{message}. Their actions are the last iterate inside the bounds and their gradient is zero "
                 f"(this layer warns once)",
                 SolveWarning,
-                stacklevel=4,
+                stacklevel=_stacklevel(),
             )
+
+
+def _stacklevel() -> int:
+    """Where a warning points to: the line that called the layer, outside this package and torch."""
+    level, frame = 1, sys._getframe(1)
+    while frame.f_back and frame.f_globals.get("__name__", "").split(".")[0] in ("difflcs", "torch"):
+        level, frame = level + 1, frame.f_back
+    return level

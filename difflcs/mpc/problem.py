@@ -8,31 +8,13 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_number, check_positive_int, check_same_device
+from difflcs._checks import check_number, check_positive_int
 from difflcs._linalg import matvec, quadratic
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
-from difflcs.errors import BoundsError, InvalidInputError, ShapeError
+from difflcs.constraints import check_bounds
+from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.lcp import solve_lcp_arrays
 from difflcs.lcs import SystemMatrices, dimensions
-
-
-def check_bounds(u_min: Tensor, u_max: Tensor, strict: bool = False) -> None:
-    """Refuse bounds that do not broadcast, live on different devices, or cross (`strict`: or touch, or are infinite)."""
-    broadcast_batch([("u_min", u_min.shape), ("u_max", u_max.shape)])
-    check_same_device([("u_min", u_min), ("u_max", u_max)])
-    crossed = u_min >= u_max if strict else u_min > u_max
-    if bool(crossed.any()):
-        index = tuple(torch.nonzero(crossed)[0].tolist())
-        low, high = (float(v.detach().expand_as(crossed)[index]) for v in (u_min, u_max))
-        raise BoundsError(
-            f"u_min: expected u_min {'<' if strict else '<='} u_max, got {low:g} and {high:g} at index {index}; "
-            f"swap or widen the bounds"
-        )
-    if strict and bool((torch.isinf(u_min) | torch.isinf(u_max)).any()):
-        raise BoundsError("u_min, u_max: expected finite bounds with a barrier, got infinite ones; pass barrier=0")
-    for name, value, wrong in (("u_min", u_min, torch.inf), ("u_max", u_max, -torch.inf)):
-        if bool((value == wrong).any()):
-            raise BoundsError(f"{name}: expected at least one action that it allows, got {wrong}; change its sign")
 
 
 @dataclass(frozen=True)

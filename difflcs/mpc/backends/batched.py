@@ -89,15 +89,15 @@ class BatchedBackend(Backend):
         started = time.perf_counter()
         ends = started + (self.time_limit or np.inf)
         first = problem.relaxation * (self.homotopy if guess is None else 1.0)
-        best = self._run(problem, guess.u if guess else None, guess.lam if guess else None, first, ends)
+        best = self._run(problem, guess, first, ends)
         generator = np.random.default_rng(self.seed)
         for _ in range(1, self.restarts):
             # The homotopy of a cold start leads most starts to one optimum; a short one keeps them apart.
             draw = torch.from_numpy(generator.random((problem.horizon, problem.n_u)))
-            low, high = problem.bounds()
+            low, high = _span(problem, best)
             start = (low + draw * (high - low)).expand(problem.batch, -1, -1)
             if time.perf_counter() < ends:
-                again = self._run(problem, start, None, problem.relaxation * min(self.homotopy, 10.0), ends)
+                again = self._run(problem, start, problem.relaxation * min(self.homotopy, 10.0), ends)
                 best = best.better(again)
         best = self._second_chance(problem, best, ends)
         seconds = torch.full((problem.batch,), (time.perf_counter() - started) / max(problem.batch, 1))
@@ -126,7 +126,7 @@ class BatchedBackend(Backend):
         self, problem: MPCProblem, result: Result, grads: tuple[Tensor, ...], solved: Tensor, pivot: bool
     ) -> dict[str, Tensor]:
         gradients = {name: torch.empty_like(getattr(problem, name)) for name in INPUTS}
-        x, u, lam, x_bar, u_bar, lam_bar, objective_bar = (_array(v) for v in (*result.primal[:3], *grads))
+        x, u, lam, mu, x_bar, u_bar, lam_bar, objective_bar = (_array(v) for v in (*result.primal, *grads))
         _kernels.vjp_mpc(
             inputs=_inputs(problem),
             horizon=problem.horizon,
@@ -135,6 +135,7 @@ class BatchedBackend(Backend):
             x=x,
             u=u,
             lam=lam,
+            mu=mu,
             x_bar=x_bar,
             u_bar=u_bar,
             lam_bar=lam_bar,
@@ -159,7 +160,7 @@ class BatchedBackend(Backend):
             if not len(index) or time.perf_counter() >= ends:
                 break
             part = problem.select(index)
-            again = self._run(part, None, None, problem.relaxation * 10 * self.homotopy, ends, pivot=pivot)
+            again = self._run(part, None, problem.relaxation * 10 * self.homotopy, ends, pivot=pivot)
             found.replace(index, found.select(index).better(again))
         return found
 
@@ -169,17 +170,20 @@ class BatchedBackend(Backend):
     def _run(
         self,
         problem: MPCProblem,
-        u: Tensor | None,
-        lam: Tensor | None,
+        start: Primal | Tensor | None,
         first: float,
         ends: float,
         pivot: bool = False,
     ) -> _Found:
+        """One run of the kernel from a guess, from actions alone, or from zero actions."""
         batch, horizon = problem.batch, problem.horizon
+        guess = start if isinstance(start, Primal) else None
+        u = guess.u if guess else start
         found = _Found(
             x=torch.empty(batch, horizon + 1, problem.n_x, dtype=torch.float64),
             u=torch.empty(batch, horizon, problem.n_u, dtype=torch.float64),
             lam=torch.empty(batch, horizon, problem.n_lam, dtype=torch.float64),
+            mu=torch.empty(batch, horizon + 1, problem.n_c, dtype=torch.float64),
             objective=torch.empty(batch, dtype=torch.float64),
             residual=torch.empty(batch, dtype=torch.float64),
             status=torch.empty(batch, dtype=torch.int8),
@@ -192,7 +196,8 @@ class BatchedBackend(Backend):
             relaxation=problem.relaxation,
             barrier=problem.barrier,
             u_start=None if u is None else _array(u),
-            lam_start=None if lam is None else _array(lam),
+            lam_start=None if guess is None else _array(guess.lam),
+            mu_start=None if guess is None else _array(guess.mu),
             first_relaxation=first,
             shrink=self.shrink,
             tol=self.tol,
@@ -213,6 +218,7 @@ class _Found:
     x: Tensor
     u: Tensor
     lam: Tensor
+    mu: Tensor
     objective: Tensor
     residual: Tensor
     status: Tensor
@@ -249,9 +255,18 @@ class _Found:
         if len(failed):
             part = problem.select(failed)
             self.u[failed] = part.clip(torch.nan_to_num(self.u[failed], posinf=0.0, neginf=0.0))
-            for value in (self.x, self.lam):
+            for value in (self.x, self.lam, self.mu):
                 value[failed] = torch.nan_to_num(value[failed])
-        return Primal(self.x, self.u, self.lam, problem.no_multipliers())
+        return Primal(self.x, self.u, self.lam, self.mu)
+
+
+def _span(problem: MPCProblem, found: _Found) -> tuple[Tensor, Tensor]:
+    """Where random starts lie: the bounds, or as far around the actions found as these are large where there is none."""
+    low, high = problem.bounds()
+    if bool(torch.isfinite(low).all()) and bool(torch.isfinite(high).all()):
+        return low, high
+    reach = 1.0 + found.u.abs().nan_to_num(posinf=0.0).amax((1, 2), keepdim=True)
+    return torch.maximum(low, -reach), torch.minimum(high, reach)
 
 
 def _inputs(problem: MPCProblem) -> list[np.ndarray]:

@@ -1,0 +1,92 @@
+"""Modules that hold the tensors of a problem, each constant over the horizon or given by stage."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+
+import torch
+from torch import Tensor, nn
+
+from difflcs._checks import check_tensor, describe
+from difflcs._functorch import is_wrapped
+from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
+
+
+class TensorFields(nn.Module):
+    """A module whose tensors are registered by kind: nn.Parameter as parameter, any other tensor as buffer.
+
+    Attributes:
+        by_stage: names of the fields that have a dimension of stages in front of their own; the others hold at all.
+    """
+
+    by_stage: frozenset[str] = frozenset()
+
+    def _register(self, name: str, value: Tensor, persistent: bool = True) -> None:
+        if isinstance(value, nn.Parameter):
+            self.register_parameter(name, value)
+        else:
+            self.register_buffer(name, value, persistent=persistent)
+
+    def extra_repr(self) -> str:
+        names = [*dict(self.named_parameters(recurse=False)), *dict(self.named_buffers(recurse=False))]
+        return ", ".join(f"{name}{tuple(getattr(self, name).shape)}" for name in names)
+
+
+def check_by_stage(by_stage: Collection[str], names: Iterable[str], given: Iterable[str]) -> frozenset[str]:
+    """Which of the given fields have a dimension of stages."""
+    names = tuple(names)
+    if isinstance(by_stage, str) or not isinstance(by_stage, Collection):
+        raise DTypeError(
+            f"by_stage: expected names such as {names[:2]}, got {describe(by_stage)}; pass a tuple of them"
+        )
+    for name in by_stage:
+        if name not in names:
+            raise InvalidInputError(
+                f"by_stage: expected names among {', '.join(names)}, got {describe(name)}; leave it out"
+            )
+    found = frozenset(by_stage) & frozenset(given)
+    if not found:
+        raise InvalidInputError(
+            f"by_stage: expected at least one field by stage, got none of {', '.join(names)}; use the class without "
+            f"stages for what is constant"
+        )
+    return found
+
+
+def check_stages(values: dict[str, tuple[Tensor, int, int]]) -> int:
+    """The horizon that fields by stage agree on.
+
+    Args:
+        values: name → tensor, number of its own dimensions behind the stages, and how many stages it has beyond H.
+    """
+    horizon, first = 0, ""
+    for name, (value, own, extra) in values.items():
+        if value.ndim <= own:
+            raise ShapeError(
+                f"{name}: expected a dimension of stages before its own {own}, got {describe(value)}; say by by_stage "
+                f"which fields have one"
+            )
+        found = value.shape[-1 - own] - extra
+        if found < 1:
+            raise ShapeError(
+                f"{name}: expected at least {1 + extra} stages, got {found + extra} in {describe(value)}; give one per "
+                f"stage"
+            )
+        if first and found != horizon:
+            raise ShapeError(
+                f"{name}: expected {horizon + extra} stages, for a horizon of {horizon} like {first}, got "
+                f"{found + extra} in {describe(value)}; give as many for each field"
+            )
+        horizon, first = found, first or name
+    return horizon
+
+
+def check_not_nan(name: str, value: object, dims: Iterable[tuple[str, int]] = ()) -> Tensor:
+    """As `check_tensor`, for numbers that may be infinite."""
+    tensor = check_tensor(name, value, list(dims), finite=False)
+    if not is_wrapped(tensor) and bool(torch.isnan(tensor.detach()).any()):
+        raise NonFiniteError(
+            f"{name}: expected numbers or infinity, got {int(torch.isnan(tensor).sum())} NaN of {tensor.numel()}; find "
+            f"where they come from before solving"
+        )
+    return tensor

@@ -1,0 +1,218 @@
+"""Bounds of the actions by stage, and linear constraints of states and actions."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import torch
+from torch import Tensor
+
+from difflcs._checks import broadcast_batch, check_same_device, check_tensor, describe
+from difflcs._fields import TensorFields, check_by_stage, check_not_nan, check_stages
+from difflcs._functorch import is_wrapped
+from difflcs.errors import BoundsError, InvalidInputError, ShapeError
+
+_OWN = {"G": 2, "g": 1, "E": 2, "weight": 1}
+_EXTRA = {"G": 1, "g": 1, "E": 0, "weight": 1}  # stages beyond H
+# What each field is called in a problem (`difflcs.mpc.MPCProblem`).
+_NAMES = {"G": "G_x", "E": "G_u", "g": "g", "weight": "price"}
+
+
+def check_bounds(u_min: Tensor, u_max: Tensor, strict: bool = False) -> None:
+    """Refuse bounds that do not broadcast, are on different devices, or cross (`strict`: or touch, or are infinite)."""
+    broadcast_batch([("u_min", u_min.shape), ("u_max", u_max.shape)])
+    check_same_device([("u_min", u_min), ("u_max", u_max)])
+    if is_wrapped(u_min) or is_wrapped(u_max):
+        return
+    crossed = u_min >= u_max if strict else u_min > u_max
+    if bool(crossed.any()):
+        index = tuple(torch.nonzero(crossed)[0].tolist())
+        low, high = (float(v.detach().expand_as(crossed)[index]) for v in (u_min, u_max))
+        raise BoundsError(
+            f"u_min: expected u_min {'<' if strict else '<='} u_max, got {low:g} and {high:g} at index {index}; "
+            f"swap or widen the bounds"
+        )
+    if strict and bool((torch.isinf(u_min) | torch.isinf(u_max)).any()):
+        raise BoundsError("u_min, u_max: expected finite bounds with a barrier, got infinite ones; pass barrier=0")
+    for name, value, wrong in (("u_min", u_min, torch.inf), ("u_max", u_max, -torch.inf)):
+        if bool((value == wrong).any()):
+            raise BoundsError(f"{name}: expected at least one action that it allows, got {wrong}; change its sign")
+
+
+def as_bound(name: str, value: object, dims: list[tuple[str, int]], like: Tensor) -> Tensor:
+    """A bound as a tensor: a number holds for every action; of tensors `dims` are the trailing dimensions."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        value = torch.full((dims[-1][1],), float(value), dtype=torch.float64, device=like.device)
+        dims = []
+    return check_not_nan(name, value, dims)
+
+
+class StageBounds(TensorFields):
+    """Bounds of the actions that change over the horizon.
+
+    Args:
+        u_min: (..., H, n_u) lower bounds by stage; a number for all of them; None or −∞ for none.
+        u_max: (..., H, n_u) upper bounds, likewise. Either is learned if it is an nn.Parameter.
+        by_stage: names of the bounds that change, "u_min", "u_max"; a tensor that does not is (..., n_u).
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, NonFiniteError: a bound does not fit the other.
+        BoundsError: they cross.
+        InvalidInputError: neither is a tensor by stage.
+    """
+
+    u_min: Tensor
+    u_max: Tensor
+
+    def __init__(
+        self,
+        u_min: Tensor | float | None = None,
+        u_max: Tensor | float | None = None,
+        *,
+        by_stage: Collection[str] = ("u_min", "u_max"),
+    ):
+        super().__init__()
+        given = {name: value for name, value in (("u_min", u_min), ("u_max", u_max)) if isinstance(value, Tensor)}
+        self.by_stage = check_by_stage(by_stage, ("u_min", "u_max"), given)
+        for name, value in given.items():
+            check_not_nan(name, value)
+        self.horizon = check_stages({name: (given[name], 1, 0) for name in sorted(self.by_stage)})
+        like = given[min(self.by_stage)]
+        self.n_u = like.shape[-1]
+        for name, value, none in (("u_min", u_min, -torch.inf), ("u_max", u_max, torch.inf)):
+            dims = [("H", self.horizon)] * (name in self.by_stage) + [("n_u", self.n_u)]
+            self._register(name, as_bound(name, none if value is None else value, dims, like), persistent=False)
+        check_bounds(*self.by_steps())
+
+    def by_steps(self) -> tuple[Tensor, Tensor]:
+        """Lower and upper bounds, broadcasting with (..., H, n_u)."""
+        low, high = (v if k in self.by_stage else v.unsqueeze(-2) for k, v in self.tensors().items())
+        return low, high
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Name → tensor."""
+        return {"u_min": self.u_min, "u_max": self.u_max}
+
+
+class _Constraints(TensorFields):
+    """What constraints have in common, whether they change over the horizon or not."""
+
+    G: Tensor
+    g: Tensor
+    E: Tensor | None
+    weight: Tensor | None
+
+    def _fill(self, G: Tensor, g: Tensor, E: Tensor | None, weight: Tensor | float | None) -> None:
+        check_tensor("G", G)
+        if G.ndim < 2:
+            raise ShapeError(f"G: expected a matrix (..., n_c, n_x), got {describe(G)}; pass one row per constraint")
+        self.n_c, self.n_x = G.shape[-2:]
+        rows = ("n_c", self.n_c)
+        fields = {"G": G, "g": check_not_nan("g", g, [rows])}
+        self.n_u = None
+        if E is not None:
+            check_tensor("E", E)
+            if E.ndim < 2 or E.shape[-2] != self.n_c:
+                raise ShapeError(
+                    f"E: expected a matrix (..., n_c={self.n_c}, n_u), got {describe(E)}; pass one row per constraint"
+                )
+            fields["E"], self.n_u = E, E.shape[-1]
+        if isinstance(weight, int | float) and not isinstance(weight, bool):
+            weight = torch.full((self.n_c,), float(weight), dtype=torch.float64, device=G.device)
+        if weight is not None:
+            fields["weight"] = check_not_nan("weight", weight, [rows])
+        check_same_device(fields.items())
+        if self.by_stage:
+            self.horizon = check_stages({k: (fields[k], _OWN[k], _EXTRA[k]) for k in _OWN if k in self.by_stage})
+        check_constraints(fields["g"], fields.get("weight"))
+        for name in _OWN:
+            if name in fields:
+                self._register(name, fields[name])
+            else:
+                self.register_buffer(name, None)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Name in a problem → tensor: G_x, g, price, and G_u where the actions count."""
+        fields = {inside: getattr(self, name) for name, inside in _NAMES.items()}
+        if fields["G_u"] is None:
+            del fields["G_u"]
+        if fields["price"] is None:
+            fields["price"] = self.g.new_full((self.n_c,), torch.inf)
+        return fields
+
+    @property
+    def staged(self) -> frozenset[str]:
+        """Names in a problem of the fields by stage."""
+        return frozenset(_NAMES[name] for name in self.by_stage)
+
+
+def check_constraints(g: Tensor, weight: Tensor | None) -> None:
+    """Refuse limits that nothing can meet and prices that are not positive."""
+    if not is_wrapped(g) and bool((g == -torch.inf).any()):
+        raise InvalidInputError("g: expected limits above −∞, got −∞; +∞ says that there is no constraint")
+    if weight is not None and not is_wrapped(weight) and not bool((weight > 0).all()):
+        raise InvalidInputError(
+            f"weight: expected a positive price of a violation, or infinity for a hard constraint, got "
+            f"{float(weight.detach().min()):g}; leave out constraints that do not count"
+        )
+
+
+class LinearConstraints(_Constraints):
+    """G x_k + E u_k ≤ g at every stage k = 0 … H; at stage H, where there is no action, G x_H ≤ g.
+
+    Hard, or soft with a price: violations then cost `weight` per unit, and a price above the constraint's multiplier
+    keeps it as if it were hard. Every field is shared by the batch or has leading batch dimensions; it is learned if it
+    requires grad (an nn.Parameter is registered as one). What the first state alone violates cannot be met: such a
+    problem is INFEASIBLE.
+
+    Args:
+        G: (..., n_c, n_x).
+        g: (..., n_c); +∞ where a row does not count.
+        E: (..., n_c, n_u), zero if None.
+        weight: (..., n_c) or a number > 0: price per unit of violation [cost per unit of g]; ∞ or None: hard.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, NonFiniteError: a field does not fit the others.
+        InvalidInputError: g is −∞, or a weight is not positive.
+    """
+
+    def __init__(self, G: Tensor, g: Tensor, E: Tensor | None = None, weight: Tensor | float | None = None):
+        super().__init__()
+        self._fill(G, g, E, weight)
+
+
+class ConstraintSequence(_Constraints):
+    """Linear constraints that change over the horizon: G_k x_k + E_k u_k ≤ g_k at the stages k = 0 … H.
+
+    As `LinearConstraints`, with the dimension of the stages before each field's own: H+1 of them, and H of E. A
+    constraint of the final state alone has g = +∞ before it.
+
+    Args:
+        G: (..., H+1, n_c, n_x).
+        g: (..., H+1, n_c); +∞ where a row does not count.
+        E: (..., H, n_c, n_u), zero if None.
+        weight: (..., H+1, n_c), or one number > 0 for all; ∞ or None: hard.
+        by_stage: names of the fields that change; the others are as in `LinearConstraints`. Half-planes that move keep
+            their G: `ConstraintSequence(G, g, by_stage=("g",))`.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, NonFiniteError: a field does not fit the others.
+        InvalidInputError: g is −∞, or a weight is not positive; no field is by stage.
+    """
+
+    def __init__(
+        self,
+        G: Tensor,
+        g: Tensor,
+        E: Tensor | None = None,
+        weight: Tensor | float | None = None,
+        *,
+        by_stage: Collection[str] = tuple(_OWN),
+    ):
+        super().__init__()
+        values = {"G": G, "g": g, "E": E, "weight": weight}
+        for name in ("G", "g"):
+            check_not_nan(name, values[name])
+        given = [name for name, value in values.items() if isinstance(value, Tensor)]
+        self.by_stage = check_by_stage(by_stage, _OWN, given)
+        self._fill(G, g, E, weight)

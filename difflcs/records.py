@@ -1,0 +1,394 @@
+"""Records of matrices: one linear complementarity system, one per batch element, one per stage of a horizon."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, Self, get_type_hints, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from difflcs._checks import (
+    broadcast_batch,
+    check_integer,
+    check_positive_definite,
+    check_same_device,
+    check_tensor,
+    describe,
+)
+from difflcs._functorch import runs_eagerly
+from difflcs._linalg import matvec
+from difflcs.errors import BatchIndexError, DTypeError, InvalidInputError, ShapeError
+from difflcs.lcp import solve_lcp
+
+
+def dimensions(record: type) -> dict[str, tuple[str, ...]]:
+    """The fields of a record that are tensors, each with the kinds of its trailing dimensions, as annotated there."""
+    hints = get_type_hints(record, include_extras=True)
+    return {f.name: hints[f.name].__metadata__ for f in fields(record) if hasattr(hints[f.name], "__metadata__")}
+
+
+@dataclass(frozen=True)
+class SystemMatrices:
+    """Sizes and equations of whatever holds the matrices of an LCS, shared or one per batch element."""
+
+    A: Annotated[Tensor, "n_x", "n_x"]
+    B: Annotated[Tensor, "n_x", "n_u"]
+    C: Annotated[Tensor, "n_x", "n_lam"]
+    d: Annotated[Tensor, "n_x"]
+    D: Annotated[Tensor, "n_lam", "n_x"]
+    E: Annotated[Tensor, "n_lam", "n_u"]
+    F: Annotated[Tensor, "n_lam", "n_lam"]
+    c: Annotated[Tensor, "n_lam"]
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return self.A.shape[-1]
+
+    @property
+    def n_u(self) -> int:
+        """Number of actions."""
+        return self.B.shape[-1]
+
+    @property
+    def n_lam(self) -> int:
+        """Number of complementarity variables."""
+        return self.F.shape[-1]
+
+    def next_state(self, x: Tensor, u: Tensor, lam: Tensor) -> Tensor:
+        """A x + B u + C λ + d, (..., n_x)."""
+        return matvec(self.A, x) + matvec(self.B, u) + matvec(self.C, lam) + self.d
+
+    def gap(self, x: Tensor, u: Tensor, lam: Tensor | None = None) -> Tensor:
+        """D x + E u + c, plus F λ if given, (..., n_lam)."""
+        gap = matvec(self.D, x) + matvec(self.E, u) + self.c
+        return gap if lam is None else gap + matvec(self.F, lam)
+
+
+# Name → kinds of its dimensions, in the order of every list of these matrices.
+SYSTEM = dimensions(SystemMatrices)
+
+
+class LCSPrediction(NamedTuple):
+    """One step of an LCS: the next state (..., n_x) and the complementarity variable (..., n_lam)."""
+
+    x_next: Tensor
+    lam: Tensor
+
+
+@dataclass(frozen=True)
+class _Record(SystemMatrices):
+    """What records of matrices have in common: they are checked when made, and behave like one tensor."""
+
+    # Dimensions of every field between those of the batch and its own.
+    _STAGES: ClassVar[tuple[str, ...]] = ()
+
+    @runs_eagerly
+    def __post_init__(self) -> None:
+        tensors = self.tensors()
+        for name, value in tensors.items():
+            check_tensor(name, value)
+        rank = len(self._STAGES)
+        for name, dims in SYSTEM.items():
+            if tensors[name].ndim < rank + len(dims):
+                labels = ", ".join(("...", *self._STAGES, *(("rows", "columns") if len(dims) == 2 else dims)))
+                kind = "a matrix" if len(dims) == 2 else "a vector"
+                raise ShapeError(
+                    f"{name}: expected {kind} ({labels}), got {describe(tensors[name])}; add the missing dimensions"
+                )
+        sizes = {dim: getattr(self, dim) for dim in ("n_x", "n_u", "n_lam")}
+        stages = [("H", self.A.shape[-3])] if rank else []
+        if stages and not stages[0][1]:
+            raise ShapeError(f"A: expected at least one stage, got {describe(self.A)}; give H ≥ 1 matrices")
+        for name, dims in SYSTEM.items():
+            check_tensor(name, tensors[name], [*stages, *((dim, sizes[dim]) for dim in dims)], finite=False)
+        check_same_device(tensors.items())
+        for name, value in tensors.items():
+            if value.dtype != self.A.dtype:
+                raise DTypeError(
+                    f"{name}: expected {self.A.dtype} like A, got {describe(value)}; "
+                    f"convert it with {name}.to({self.A.dtype})"
+                )
+        self.batch_shape  # noqa: B018  raises where the batch dimensions do not fit each other
+        check_positive_definite(self.F)
+
+    def _own(self, name: str) -> int:
+        """Number of a field's own dimensions: those of stages, rows and columns."""
+        return len(self._STAGES) + len(SYSTEM[name])
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """Leading batch dimensions; empty when every field is shared."""
+        return broadcast_batch((k, v.shape[: v.ndim - self._own(k)]) for k, v in self.tensors().items())
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Name → tensor, in the order of the fields."""
+        return {name: getattr(self, name) for name in SYSTEM}
+
+    def detach(self) -> Self:
+        """The same numbers without gradient history."""
+        return self._map(lambda v: v.detach())
+
+    def to(self, *args: Any, **kwargs: Any) -> Self:
+        """The same system in another dtype or on another device; the arguments are those of `torch.Tensor.to`."""
+        return self._map(lambda v: v.to(*args, **kwargs))
+
+    def _map(self, function: Callable[[Tensor], Tensor]) -> Self:
+        return replace(self, **{k: function(v) for k, v in self.tensors().items()})
+
+    def __getitem__(self, index: Any) -> Self:
+        """Some systems of a batch: an integer, slice, tensor, or a tuple of these, of the batch dimensions alone.
+
+        A field that is shared by the batch stays shared. Broadcast dimensions are indexed as if they were expanded.
+
+        Raises:
+            BatchIndexError: there are no batch dimensions, or not these.
+        """
+        batch, values = self.batch_shape, {}
+        if not batch:
+            raise BatchIndexError(
+                f"{type(self).__name__}: expected an index of a batch dimension, got {describe(index)} where "
+                f"every field is shared by the batch; build it from tensors with leading batch dimensions"
+            )
+        key = index if isinstance(index, tuple) else (index,)
+        for name, value in self.tensors().items():
+            own = self._own(name)
+            if value.ndim > own:
+                value = value.expand(*batch, *value.shape[value.ndim - own :])
+                try:
+                    value = value[(*key, *[slice(None)] * own)]
+                except (IndexError, TypeError) as error:
+                    raise BatchIndexError(
+                        f"{type(self).__name__}: expected an index of the batch dimensions {tuple(batch)}, got "
+                        f"{describe(index)}: {error}; index the systems, and a tensor of one of them by its name"
+                    ) from error
+            values[name] = value
+        return type(self)(**values)
+
+    def __iter__(self) -> Iterator[Self]:
+        """The systems along the first batch dimension."""
+        if not self.batch_shape:
+            self[0]  # raises: without this, a loop over one system would do nothing
+        return (self[i] for i in range(self.batch_shape[0]))
+
+    def check_inputs(self, **tensors: Tensor) -> None:
+        """Check states `x…` and actions `u…` against the sizes, dtype and device of the matrices."""
+        check_inputs(self.n_x, self.n_u, self.A, tensors)
+
+
+@dataclass(frozen=True)
+class LCSParams(_Record):
+    """The matrices of one linear complementarity system, or of one per batch element (Eq. lcs of the paper).
+
+    x₊ = A x + B u + C λ + d,  0 ≤ λ ⊥ D x + E u + F λ + c ≥ 0,  with F + Fᵀ ≻ 0, so that λ is unique.
+
+    Every field may carry leading batch dimensions, or none to be shared by the batch. A system without contacts has
+    n_lam = 0. `params[i]` are some systems of a batch, `params.to(torch.float32)` is the record in another dtype.
+
+    Attributes:
+        A: (..., n_x, n_x) autonomous dynamics.
+        B: (..., n_x, n_u) effect of actions.
+        C: (..., n_x, n_lam) effect of the complementarity variable (contact forces).
+        d: (..., n_x) constant drift.
+        D: (..., n_lam, n_x) gap per state.
+        E: (..., n_lam, n_u) gap per action.
+        F: (..., n_lam, n_lam) gap per force.
+        c: (..., n_lam) constant gap.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, NonFiniteError: a field does not fit the others.
+        NotPositiveDefiniteError: F + Fᵀ is not positive definite; the message gives its smallest eigenvalue. Under
+            `torch.func.vmap` and its like, numbers cannot be read here; they are where an LCP or a loss is solved.
+    """
+
+    @runs_eagerly
+    def step(self, x: Tensor, u: Tensor) -> LCSPrediction:
+        """Predict one step through the exact LCP.
+
+        Args:
+            x: (..., n_x) states.
+            u: (..., n_u) actions; batch dimensions broadcast with those of x and of the matrices.
+
+        Returns:
+            x_next (..., n_x) and lam (..., n_lam), differentiable in x, u and every matrix.
+        """
+        self.check_inputs(x=x, u=u)
+        self._fits(x=x.shape[:-1], u=u.shape[:-1])
+        return advance(self, x, u)
+
+    def _fits(self, **batches: torch.Size) -> torch.Size:
+        return broadcast_batch([("the system", self.batch_shape), *batches.items()])
+
+    @runs_eagerly
+    def rollout(self, x0: Tensor, u_seq: Tensor) -> Tensor:
+        """Predict a trajectory.
+
+        Args:
+            x0: (..., n_x) initial states.
+            u_seq: (..., T, n_u) actions, T ≥ 0.
+
+        Returns:
+            (..., T+1, n_x) states, x0 first; batch dimensions of x0, u_seq and the matrices broadcast.
+        """
+        batch = self._fits(**check_rollout(self, x0, u_seq))
+        states = [x0.expand(*batch, self.n_x)]
+        for t in range(u_seq.shape[-2]):
+            states.append(advance(self, states[-1], u_seq[..., t, :]).x_next)
+        return torch.stack(states, dim=-2)
+
+
+@dataclass(frozen=True)
+class LCSSequence(_Record):
+    """One linear complementarity system per stage of a horizon H, e.g. linearised along a trajectory.
+
+    x_{k+1} = A_k x_k + B_k u_k + C_k λ_k + d_k,  0 ≤ λ_k ⊥ D_k x_k + E_k u_k + F_k λ_k + c_k ≥ 0,  k = 0 … H − 1.
+
+    Every field has the dimension H of the stages before its own, and before that any batch dimensions, or none to be
+    shared by the batch. `next_state` and `gap` take all stages at once: x (..., H, n_x).
+
+    Attributes:
+        A: (..., H, n_x, n_x) autonomous dynamics.
+        B: (..., H, n_x, n_u) effect of actions.
+        C: (..., H, n_x, n_lam) effect of the complementarity variable (contact forces).
+        d: (..., H, n_x) constant drift.
+        D: (..., H, n_lam, n_x) gap per state.
+        E: (..., H, n_lam, n_u) gap per action.
+        F: (..., H, n_lam, n_lam) gap per force.
+        c: (..., H, n_lam) constant gap.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, NonFiniteError, NotPositiveDefiniteError: as for `LCSParams`.
+    """
+
+    _STAGES: ClassVar[tuple[str, ...]] = ("H",)
+
+    @property
+    def horizon(self) -> int:
+        """H, the number of stages."""
+        return self.A.shape[-3]
+
+    @classmethod
+    def stack(cls, systems: Sequence[LCSParams]) -> LCSSequence:
+        """A sequence from one system per stage, in their order; batch dimensions of each field broadcast.
+
+        Raises:
+            InvalidInputError, DTypeError, ShapeError: no systems, something else, or of different sizes.
+        """
+        systems = list(systems)
+        if not systems:
+            raise InvalidInputError("systems: expected at least one LCSParams, got none; give one for each stage")
+        for k, system in enumerate(systems):
+            if not isinstance(system, LCSParams):
+                raise DTypeError(f"systems[{k}]: expected LCSParams, got {describe(system)}; build one for each stage")
+            sizes, wanted = ((s.n_x, s.n_u, s.n_lam) for s in (system, systems[0]))
+            if sizes != wanted:
+                raise ShapeError(
+                    f"systems[{k}]: expected n_x, n_u, n_lam = {wanted} like systems[0], got {sizes}; a contact that a "
+                    f"stage lacks gets zeros in C, D and E, and ones in c and the diagonal of F"
+                )
+        values = {}
+        for name, dims in SYSTEM.items():
+            each = [getattr(system, name) for system in systems]
+            batch = broadcast_batch((f"systems[{k}].{name}", v.shape[: v.ndim - len(dims)]) for k, v in enumerate(each))
+            own = each[0].shape[each[0].ndim - len(dims) :]
+            check_same_device((f"systems[{k}].{name}", v) for k, v in enumerate(each))
+            values[name] = torch.stack([v.expand(*batch, *own) for v in each], dim=-1 - len(dims))
+        return cls(**values)
+
+    def stage(self, k: int) -> LCSParams:
+        """The system of stage k, 0 ≤ k < H; negative ones count from the end."""
+        check_integer("k", k)
+        if not -self.horizon <= k < self.horizon:
+            raise BatchIndexError(f"k: expected a stage of 0 … {self.horizon - 1}, got {k}; choose another")
+        return LCSParams(**{n: v.select(v.ndim - self._own(n), k) for n, v in self.tensors().items()})
+
+    @runs_eagerly
+    def rollout(self, x0: Tensor, u_seq: Tensor) -> Tensor:
+        """Predict a trajectory through the stages.
+
+        Args:
+            x0: (..., n_x) initial states.
+            u_seq: (..., H, n_u) actions, one per stage.
+
+        Returns:
+            (..., H+1, n_x) states, x0 first; batch dimensions of x0, u_seq and the matrices broadcast.
+        """
+        batches = check_rollout(self, x0, u_seq)
+        if u_seq.shape[-2] != self.horizon:
+            raise ShapeError(
+                f"u_seq: expected shape (..., H={self.horizon}, n_u={self.n_u}), got {tuple(u_seq.shape)}; give one "
+                f"action for each stage"
+            )
+        batch = broadcast_batch([("the system", self.batch_shape), *batches.items()])
+        states = [x0.expand(*batch, self.n_x)]
+        for k in range(self.horizon):
+            states.append(advance(self.stage(k), states[-1], u_seq[..., k, :]).x_next)
+        return torch.stack(states, dim=-2)
+
+
+@runtime_checkable
+class LCSModule(Protocol):
+    """Whatever says which system holds where: a learned model, or one made from physics, states and a context.
+
+    Layers, losses and training take any; most are `torch.nn.Module`s. `isinstance(value, LCSModule)` asks for the four
+    names.
+    """
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        ...
+
+    @property
+    def n_u(self) -> int:
+        """Number of actions."""
+        ...
+
+    @property
+    def n_lam(self) -> int:
+        """Number of complementarity variables."""
+        ...
+
+    def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams | LCSSequence:
+        """The system at some states.
+
+        Args:
+            x: (..., n_x) states, where the caller has them. A module whose system depends on them says so if they lack.
+            context: (..., n_context) whatever else it depends on.
+
+        Returns:
+            The matrices, shared, or with leading batch dimensions that broadcast with those of x; differentiable in
+            what the module learns.
+        """
+        ...
+
+
+def advance(system: SystemMatrices, x: Tensor, u: Tensor) -> LCSPrediction:
+    """One step of a system for states and actions that were checked."""
+    lam = solve_lcp(system.F, system.gap(x, u)).lam
+    return LCSPrediction(system.next_state(x, u, lam), lam)
+
+
+def check_inputs(n_x: int, n_u: int, like: Tensor, tensors: Mapping[str, Tensor], owner: str = "system") -> None:
+    """Check states `x…` and actions `u…` against sizes, and the dtype and device of another tensor."""
+    for name, tensor in tensors.items():
+        check_tensor(name, tensor, [("n_u", n_u)] if name.startswith("u") else [("n_x", n_x)])
+        if tensor.dtype != like.dtype:
+            raise DTypeError(
+                f"{name}: expected {like.dtype} like the {owner}, got {describe(tensor)}; "
+                f"convert it with {name}.to({like.dtype}) or the {owner} with {owner}.to({tensor.dtype})"
+            )
+    check_same_device([(owner, like), *tensors.items()])
+
+
+def check_rollout(system: SystemMatrices, x0: Tensor, u_seq: Tensor) -> dict[str, torch.Size]:
+    """Check the start and the actions of a rollout; their batch dimensions."""
+    check_tensor("u_seq", u_seq, [("n_u", system.n_u)])
+    if u_seq.ndim < 2:
+        raise ShapeError(
+            f"u_seq: expected shape (..., T, n_u={system.n_u}), got {tuple(u_seq.shape)}; add a dimension of steps"
+        )
+    check_inputs(system.n_x, system.n_u, system.A, {"x0": x0, "u_seq": u_seq})
+    return {"x0": x0.shape[:-1], "u_seq": u_seq.shape[:-2]}

@@ -1,0 +1,361 @@
+"""LCSParams and LCSSequence as records that behave like tensors, and what counts as an LCSModule."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from difflcs import LCSModel, LCSModule, LCSParams, LCSSequence, solve_lcp
+from difflcs.errors import (
+    BatchIndexError,
+    DiffLCSError,
+    DTypeError,
+    InvalidInputError,
+    NonFiniteError,
+    NotPositiveDefiniteError,
+    ShapeError,
+)
+
+NAMES = ["A", "B", "C", "d", "D", "E", "F", "c"]
+
+
+def sequence_tensors(build, horizon=5, batch=()):
+    """Matrices of all stages, each stage another system."""
+    return build.lcs_tensors(seed=7, batch=(*batch, horizon))
+
+
+@pytest.fixture
+def sequence(build):
+    return LCSSequence(**sequence_tensors(build))
+
+
+def assert_same(left, right):
+    assert type(left) is type(right)
+    for name in NAMES:
+        assert torch.equal(getattr(left, name), getattr(right, name)), name
+
+
+# --- like tensors ---------------------------------------------------------------------------------------------------
+
+
+def test_to_changes_the_dtype_of_every_field_and_keeps_the_gradient(build):
+    model = build.model(seed=1)
+    narrow = model.params().to(torch.float32)
+    assert all(v.dtype == torch.float32 for v in narrow.tensors().values())
+    torch.cat([v.reshape(-1) for v in narrow.tensors().values()]).sum().backward()
+    assert all(p.grad is not None for p in model.parameters())
+    params = build.params()
+    assert params.to(torch.float64).A is params.A
+    assert params.to("cpu", torch.float32, copy=True).A.dtype == torch.float32
+
+
+def test_a_sequence_goes_to_another_dtype_and_drops_its_gradient(build):
+    tensors = {k: v.requires_grad_() for k, v in sequence_tensors(build, batch=(2,)).items()}
+    sequence = LCSSequence(**tensors)
+    assert sequence.to(torch.float32).F.dtype == torch.float32
+    assert not any(v.requires_grad for v in sequence.detach().tensors().values())
+    assert list(sequence.tensors()) == NAMES
+
+
+@pytest.mark.parametrize("index", [2, -1, slice(1, 3), torch.tensor([3, 0]), [1, 1], torch.tensor([True, False] * 2)])
+def test_an_index_is_one_of_the_batch_of_every_field_that_has_it(build, index):
+    tensors = build.lcs_tensors(batch=(4,))
+    tensors["A"], tensors["c"] = tensors["A"][0], tensors["c"][0]
+    found = LCSParams(**tensors)[index]
+    for name, value in tensors.items():
+        assert torch.equal(getattr(found, name), value if name in "Ac" else value[index]), name
+    assert found.A is tensors["A"]
+
+
+@pytest.mark.parametrize("index", [1, (1, 2), (slice(None), 0), (..., 3), (0, [1, 2]), (None, 1)])
+def test_broadcast_batches_are_indexed_as_if_they_were_expanded(build, index):
+    tensors = build.lcs_tensors()
+    own = {name: tuple(v.shape) for name, v in tensors.items()}
+    tensors["d"] = build.normal(1)(4, 4)  # batch (4,)
+    tensors["C"] = build.normal(2)(2, 1, 4, 3)  # batch (2, 1)
+    found = LCSParams(**tensors)[index]
+    for name in "dC":
+        whole = tensors[name].expand(2, 4, *own[name])
+        picked = torch.arange(8).reshape(2, 4)[index]
+        expected = whole.reshape(8, *own[name])[picked]
+        assert torch.equal(getattr(found, name), expected), name
+    assert found.A.shape == (4, 4)
+
+
+def test_the_gradient_of_an_indexed_system_arrives_at_its_place(build):
+    tensors = {k: v.requires_grad_() for k, v in build.lcs_tensors(batch=(3,)).items()}
+    x, u = build.normal(1)(4), build.normal(2)(2)
+    LCSParams(**tensors)[1].step(x, u).x_next.sum().backward()
+    assert float(tensors["A"].grad[1].abs().max()) > 0
+    assert float(tensors["A"].grad[[0, 2]].abs().max()) == 0
+
+
+def test_a_loop_goes_through_the_systems(build):
+    params = build.params(batch=(3,))
+    found = list(params)
+    assert len(found) == 3
+    for i, one in enumerate(found):
+        assert_same(one, params[i])
+
+
+def test_one_system_has_no_index(build, sequence):
+    for record in (build.params(), sequence):
+        message = r"expected an index of a batch dimension, got int 0 where every field is shared.*; build it from"
+        with pytest.raises(IndexError, match=message) as caught:
+            record[0]
+        assert isinstance(caught.value, DiffLCSError)
+        with pytest.raises(BatchIndexError, match=message):
+            list(record)
+
+
+@pytest.mark.parametrize("index", [4, -5, (0, 0), (0, ..., 0), torch.tensor([4]), "A", 1.0, torch.tensor([True] * 3)])
+def test_an_index_that_is_none_of_the_batch_is_refused(build, index):
+    for record in (build.params(batch=(4,)), LCSSequence(**sequence_tensors(build, batch=(4,)))):
+        with pytest.raises(
+            BatchIndexError, match=r"expected an index of the batch dimensions \(4,\), got .*; index the"
+        ):
+            record[index]
+
+
+# --- one step, many steps -------------------------------------------------------------------------------------------
+
+
+def test_a_step_of_each_system_is_that_of_its_equations(build):
+    params, n = build.params(batch=(6,)), build.normal(1)
+    x, u = n(6, 4), n(6, 2)
+    x_next, lam = params.step(x, u)
+    touching = 0
+    for i in range(6):
+        p = {k: v[i] for k, v in params.tensors().items()}
+        expected, _ = build.enumerate_lcp(p["F"], p["D"] @ x[i] + p["E"] @ u[i] + p["c"])
+        touching += int((expected > 0).sum())
+        torch.testing.assert_close(lam[i], expected, rtol=1e-9, atol=1e-10)
+        by_hand = p["A"] @ x[i] + p["B"] @ u[i] + p["C"] @ expected + p["d"]
+        torch.testing.assert_close(x_next[i], by_hand, rtol=1e-9, atol=1e-10)
+    assert 3 < touching < 18
+
+
+def test_a_step_broadcasts_systems_states_and_actions(build):
+    params, n = build.params(batch=(3, 1)), build.normal(1)
+    x, u = n(4), n(5, 2)
+    x_next, lam = params.step(x, u)
+    assert x_next.shape == (3, 5, 4)
+    assert lam.shape == (3, 5, 3)
+    torch.testing.assert_close(x_next[2, 4], params[2, 0].step(x, u[4]).x_next)
+    assert params.rollout(x, n(5, 7, 2)).shape == (3, 5, 8, 4)
+
+
+def test_a_step_is_differentiable_in_every_matrix(build):
+    tensors = [v.requires_grad_() for v in build.lcs_tensors(seed=2, n_x=2, n_lam=2, batch=(3,)).values()]
+    x, u = build.normal(4)(3, 2).requires_grad_(), build.normal(5)(3, 2).requires_grad_()
+    lam = LCSParams(*tensors).step(x, u).lam
+    assert 0 < int((lam > 1e-3).sum()) < 6
+    assert torch.autograd.gradcheck(lambda x, u, *t: tuple(LCSParams(*t).step(x, u)), (x, u, *tensors), eps=1e-7,
+                                    atol=1e-6, rtol=1e-5)  # fmt: skip
+
+
+def test_a_model_and_its_params_predict_the_same(build):
+    model, n = build.model(seed=3), build.normal(6)
+    x, u = n(5, 4), 0.3 * n(5, 7, 2)
+    assert torch.equal(model(x, u[:, 0]).x_next, model.params().step(x, u[:, 0]).x_next)
+    assert torch.equal(model.rollout(x, u), model.params().rollout(x, u))
+
+
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_a_rollout_through_stages_takes_each_in_its_turn(build, batch):
+    sequence, n = LCSSequence(**sequence_tensors(build, 5, batch)), build.normal(6)
+    x0, u = n(3, 4), 0.3 * n(5, 2)
+    xs = sequence.rollout(x0, u)
+    assert xs.shape == (3, 6, 4)
+    x = x0
+    for k in range(5):
+        x = sequence.stage(k).step(x, u[k]).x_next
+        assert torch.equal(xs[:, k + 1], x)
+    # All stages at once are what each is.
+    lam = torch.stack([solve_lcp(sequence.stage(k).F, sequence.stage(k).gap(xs[:, k], u[k])).lam for k in range(5)], 1)
+    torch.testing.assert_close(sequence.next_state(xs[:, :5], u, lam), xs[:, 1:])
+
+
+def test_a_sequence_of_equal_stages_rolls_out_like_its_system(build):
+    params, n = build.params(batch=(3,)), build.normal(6)
+    x0, u = n(3, 4), 0.3 * n(3, 5, 2)
+    assert torch.equal(LCSSequence.stack([params] * 5).rollout(x0, u), params.rollout(x0, u))
+
+
+# --- stages ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_stack_has_its_systems_as_stages(build):
+    systems = [build.params(seed=s) for s in range(4)]
+    sequence = LCSSequence.stack(systems)
+    assert sequence.horizon == 4
+    assert sequence.batch_shape == ()
+    assert (sequence.n_x, sequence.n_u, sequence.n_lam) == (4, 2, 3)
+    for k, system in enumerate(systems):
+        assert_same(sequence.stage(k), system)
+    assert_same(sequence.stage(-1), systems[3])
+
+
+def test_a_stack_broadcasts_each_field_over_its_batch(build):
+    shared, each = build.params(seed=1), build.params(seed=2, batch=(3,))
+    mixed = LCSParams(**{**each.tensors(), "A": each.A[0]})
+    sequence = LCSSequence.stack([shared, mixed])
+    assert sequence.A.shape == (2, 4, 4)
+    assert sequence.c.shape == (3, 2, 3)
+    assert sequence.batch_shape == (3,)
+    for i in range(3):
+        assert_same(sequence[i].stage(0), shared)
+        assert_same(sequence[i].stage(1), mixed[i])
+    assert sequence[1:].batch_shape == (2,)
+    assert sequence[1:].horizon == 2
+
+
+def test_a_stack_passes_the_gradient_to_its_systems(build):
+    model = build.model(seed=3)
+    LCSSequence.stack([model.params(), build.params(seed=1)]).rollout(
+        build.normal(0)(20, 4), build.normal(1)(2, 2)
+    ).sum().backward()
+    assert all(float(p.grad.abs().max()) > 0 for p in model.parameters())
+
+
+def test_a_stack_refuses_what_does_not_fit(build):
+    with pytest.raises(InvalidInputError, match="expected at least one LCSParams, got none; give"):
+        LCSSequence.stack([])
+    with pytest.raises(DTypeError, match=r"systems\[1\]: expected LCSParams, got LCSModel.*; build"):
+        LCSSequence.stack([build.params(), build.model()])
+    with pytest.raises(ShapeError, match=r"systems\[1\]: expected .*\(4, 2, 3\) like .*, got \(4, 2, 2\); a contact"):
+        LCSSequence.stack([build.params(), build.params(n_lam=2)])
+    with pytest.raises(ShapeError, match=r"systems\[1\].A: its batch dimensions \(2,\).*systems\[0\].A \(3,\)"):
+        LCSSequence.stack([build.params(batch=(3,)), build.params(batch=(2,))])
+
+
+@pytest.mark.parametrize("k", [5, -6])
+def test_there_is_no_stage_beyond_the_horizon(sequence, k):
+    with pytest.raises(BatchIndexError, match=rf"k: expected a stage of 0 … 4, got {k}; choose"):
+        sequence.stage(k)
+    with pytest.raises(DTypeError, match="k: expected an int"):
+        sequence.stage(1.0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_field_needs_its_stages(build, name):
+    tensors = sequence_tensors(build)
+    short = {**tensors, name: tensors[name][:4]}
+    match = "expected shape" if name == "A" else rf"{name}: expected shape \(\.\.\., H=5, .*, got \(4, .*; reshape"
+    with pytest.raises(ShapeError, match=match):
+        LCSSequence(**short)
+    with pytest.raises(ShapeError, match=rf"{name}: expected a (matrix|vector) \(\.\.\., H, .*; add the missing"):
+        LCSSequence(**{**tensors, name: tensors[name][0]})
+
+
+def test_a_sequence_has_a_stage(build):
+    with pytest.raises(ShapeError, match=r"expected at least one stage, got .*; give"):
+        LCSSequence(**{k: v[:0] for k, v in sequence_tensors(build).items()})
+
+
+def test_the_numbers_of_every_stage_are_checked(build):
+    tensors = sequence_tensors(build, 3, (2,))
+    tensors["F"][1, 2] = -torch.eye(3)
+    with pytest.raises(NotPositiveDefiniteError, match=r"got smallest eigenvalue -2\.000e\+00 at batch index \(1, 2\)"):
+        LCSSequence(**tensors)
+    tensors = sequence_tensors(build, 3)
+    tensors["E"][2, 0, 0] = torch.nan
+    with pytest.raises(NonFiniteError, match=r"E: expected finite numbers, got 1 .* at index \(2, 0, 0\)"):
+        LCSSequence(**tensors)
+
+
+def test_a_sequence_wants_one_action_a_stage(build, sequence):
+    n = build.normal(0)
+    with pytest.raises(ShapeError, match=r"u_seq: expected shape \(\.\.\., H=5, n_u=2\), got \(4, 2\); give one"):
+        sequence.rollout(n(4), n(4, 2))
+    with pytest.raises(ShapeError, match=r"x0: its batch dimensions|u_seq: its batch dimensions \(2,\).*x0 \(3,\)"):
+        sequence.rollout(n(3, 4), n(2, 5, 2))
+
+
+@pytest.mark.parametrize("call", ["step", "rollout"])
+def test_states_and_actions_that_do_not_fit_are_named(build, call):
+    params, n = build.params(batch=(3,)), build.normal(0)
+    u = n(2) if call == "step" else n(6, 2)
+    function = getattr(params, call)
+    with pytest.raises(ShapeError, match=r"x0?: expected shape \(\.\.\., n_x=4\), got \(5,\)"):
+        function(n(5), u)
+    with pytest.raises(DTypeError, match=r"x0?: expected torch.float64 like the system, got .*float32.*; convert"):
+        function(n(4).float(), u)
+    with pytest.raises(ShapeError, match=r"batch dimensions \(2,\) do not fit the others.*system \(3,\)"):
+        function(n(2, 4), u)
+
+
+# --- without contacts -----------------------------------------------------------------------------------------------
+
+
+def test_a_system_without_contacts_is_linear(build):
+    n = build.normal(0)
+    params, x, u = build.params(n_lam=0), n(6, 4), n(6, 2)
+    x_next, lam = params.step(x, u)
+    assert lam.shape == (6, 0)
+    torch.testing.assert_close(x_next, x @ params.A.T + u @ params.B.T + params.d)
+    sequence = LCSSequence.stack([params] * 2)
+    assert sequence.rollout(x, u.expand(2, 6, 2).mT.mT.transpose(0, 1)).shape == (6, 3, 4)
+    assert build.params(n_lam=0, batch=(5,))[2].n_lam == 0
+
+
+def test_a_model_without_contacts_is_kept_and_learns(build, tmp_path):
+    model, n = build.model(n_lam=0), build.normal(0)
+    x, u = n(6, 4), n(6, 2)
+    model(x, u).x_next.square().sum().backward()
+    assert all(float(getattr(model, k).grad.abs().max()) > 0 for k in "ABd")
+    assert all(p.grad is not None for p in model.parameters())
+    model.save_pretrained(tmp_path)
+    again = LCSModel.from_pretrained(tmp_path)
+    assert again.n_lam == 0
+    assert torch.equal(again(x, u).x_next, model(x, u).x_next)
+    assert torch.equal(LCSModel.from_params(model.params())(x, u).x_next, model(x, u).x_next)
+    assert LCSModel.from_params(model.params(), stiffness=0.7).stiffness == 0.7
+
+
+def test_an_lcp_without_variables_is_solved(build):
+    F, q = torch.zeros(0, 0, dtype=torch.float64), torch.zeros(3, 5, 0, dtype=torch.float64)
+    for relaxation in (0.0, 1e-5):
+        lam, w, status = solve_lcp(F, q.requires_grad_(), relaxation)
+        assert lam.shape == w.shape == (3, 5, 0)
+        assert status.shape == (3, 5)
+        assert int(status.abs().max()) == 0
+        (lam.sum() + w.sum()).backward()
+        assert q.grad is not None
+    assert solve_lcp(F.expand(2, 1, 0, 0), q.detach()[0]).lam.shape == (2, 5, 0)
+
+
+# --- modules --------------------------------------------------------------------------------------------------------
+
+
+class Made(torch.nn.Module):
+    """A system that depends on the state, made without LCSModel."""
+
+    def __init__(self, params):
+        super().__init__()
+        self.base = params
+        self.n_x, self.n_u, self.n_lam = params.n_x, params.n_u, params.n_lam
+
+    def params(self, x=None, context=None):
+        return self.base
+
+
+def test_what_counts_as_a_module(build):
+    assert isinstance(build.model(), LCSModule)
+    assert isinstance(Made(build.params()), LCSModule)
+    assert not isinstance(build.params(), LCSModule)
+    assert not isinstance(torch.nn.Linear(2, 2), LCSModule)
+
+
+def test_a_model_takes_states_and_context_and_ignores_both(build):
+    model, n = build.model(), build.normal(0)
+    expected = model.params()
+    for found in (model.params(n(5, 4), n(5, 2)), model.params(x=n(4)), model.params(context=n(1))):
+        assert_same(found, expected)
+
+
+def test_a_model_names_batches_that_do_not_fit(build):
+    with pytest.raises(
+        ShapeError, match=r"u: its batch dimensions \(3,\) do not fit the others \(x \(2,\), u \(3,\)\)"
+    ):
+        build.model()(build.normal(0)(2, 4), build.normal(0)(3, 2))
