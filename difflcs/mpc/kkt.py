@@ -191,7 +191,7 @@ def vjp(
     }
 
 
-def polish(problem: MPCProblem, primal: Primal, max_iter: int = 6, tol: float = 1e-10) -> Primal:
+def polish(problem: MPCProblem, primal: Primal, max_iter: int | None = None, tol: float = 1e-10) -> Primal:
     """Newton steps on the conditions, active bounds and constraints held: the same local optimum to machine precision.
 
     An interior-point solution is off by its barrier parameter, and finite differences of it and the envelope theorem
@@ -202,7 +202,8 @@ def polish(problem: MPCProblem, primal: Primal, max_iter: int = 6, tol: float = 
     Args:
         problem: the problems.
         primal: nearly optimal trajectories.
-        max_iter: most Newton steps; two or three are the rule.
+        max_iter: most Newton steps, 6 if None, and 12 with constraints; two or three are the rule, more where a
+            constraint is hardly active.
         tol: residual at which an element is left alone.
     """
     primal = complete(problem, primal)
@@ -211,7 +212,8 @@ def polish(problem: MPCProblem, primal: Primal, max_iter: int = 6, tol: float = 
     lin = linearise(problem, primal)
     best, best_residual = primal, residual(problem, primal, lin.multipliers)
     u, mu = primal.u, primal.mu
-    for step in range(max_iter + 1):
+    steps = max_iter if max_iter is not None else 12 if problem.n_c else 6
+    for step in range(steps + 1):
         if not bool((best_residual > tol).any()):
             break
         if step > 0:

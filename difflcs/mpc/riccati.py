@@ -154,11 +154,14 @@ class _Bounds:
 
     @classmethod
     def at(cls, problem: MPCProblem, primal: Primal, dual: Multipliers) -> _Bounds:
-        width = ranges(problem, primal.u)
+        width, rest = ranges(problem, primal.u), at_rest(problem).transpose(0, 1)
         # The least curvature keeps rounding of a gradient apart from a reason to leave the interior.
-        reference = torch.maximum(gradient_terms(problem, primal, dual), width * at_rest(problem).transpose(0, 1))
+        reference = torch.maximum(gradient_terms(problem, primal, dual), width * rest)
         least = 1e-10 * reference / torch.where(width > 0, width, torch.ones_like(width))
-        return cls(problem, primal, dual.gradient, width, least.clamp_min(torch.finfo(torch.float64).tiny))
+        least = least.clamp_min(torch.finfo(torch.float64).tiny)
+        # With constraints the curvature may be negative at a solution: only along them it is not.
+        least = torch.maximum(least, rest) if problem.n_c else least
+        return cls(problem, primal, dual.gradient, width, least)
 
     def free(self, k: int, Q_uu: Tensor) -> Tensor:
         """The actions (batch, n_u) that are free at stage k, by their curvature."""

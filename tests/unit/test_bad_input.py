@@ -460,6 +460,16 @@ def test_a_learned_bound_that_crossed_is_refused_by_the_layer(build):
         ({"relaxation": 0.0}, e.InvalidInputError, "relaxation: .*above 0, got 0"),
         ({"x0": torch.zeros(4).double()}, e.ShapeError, "x0: expected"),
         ({"E": torch.zeros(3, 3).double()}, e.ShapeError, r"E: expected \(3, 2\) or \(5, 3, 2\) or .*, got \(3, 3\)"),
+        (
+            {"E": torch.zeros(5, 3, 3, 2).double()},
+            e.ShapeError,
+            r"E: expected .* or \(5, 2, 3, 2\), got \(5, 3, 3, 2\)",
+        ),
+        ({"S": torch.zeros(2, 4).double()}, e.ShapeError, r"S: expected \(4, 2\) or .*, got \(2, 4\)"),
+        ({"g": torch.ones(3).double(), "G_x": torch.ones(2, 4).double()}, e.ShapeError, r"G_x: expected \(3, 4\) or"),
+        ({"g": torch.ones(1).double(), "price": -torch.ones(1).double()}, e.InvalidInputError, "price: .*got -1; "),
+        ({"u_min": torch.full((2,), INF).double()}, e.BoundsError, "u_min"),
+        ({"u_max": torch.full((2,), INF).double(), "barrier": 0.1}, e.BoundsError, "finite bounds with a barrier"),
         ({"u_min": torch.ones(2).double()}, e.BoundsError, "u_min <= u_max, got 1.*0.1"),
     ],
 )

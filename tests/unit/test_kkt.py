@@ -13,6 +13,8 @@ from difflcs.mpc import MPCProblem, Primal, kkt
 from difflcs.mpc.backends import IpoptBackend
 from difflcs.mpc.problem import INPUTS
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 BATCH, HORIZON, RELAXATION = 4, 3, 1e-4
 N_C = 3
 
@@ -38,7 +40,7 @@ def make_problem(build, seed=0, bound=0.15, batch=BATCH, per_element=False, by_s
     return with_limits(build, problem) if rows else problem
 
 
-def with_limits(build, problem, price=0.05):
+def with_limits(build, problem):
     """Constraints that the plan without them violates here and there; of the rows the second is soft.
 
     The third is one of the states only, from the second stage on.
@@ -46,13 +48,13 @@ def with_limits(build, problem, price=0.05):
     G_u = problem.G_u.clone()
     G_u[..., 2, :] = 0.0
     everywhere = torch.full((problem.batch, HORIZON + 1, N_C), 50.0, dtype=torch.float64)
-    fined = torch.tensor([torch.inf, price, torch.inf], dtype=torch.float64)
-    loose = dataclasses.replace(problem, G_u=G_u, g=everywhere, price=fined)
-    plan = solved(loose).primal
-    value = loose.constraints(plan.x, plan.u) + 50.0
-    generator = torch.Generator().manual_seed(5)
-    tight = torch.rand(value.shape, generator=generator) < 0.3
-    g = torch.where(tight, value - 0.02, value + 0.5)
+    price = torch.tensor([[torch.inf, cheap, torch.inf] for cheap in (0.05, 5.0, 0.05, 5.0)], dtype=torch.float64)
+    loose = dataclasses.replace(problem, G_u=G_u, g=everywhere, price=price)
+    plan, n = solved(loose).primal, build.normal(5)
+    u = loose.clip(0.8 * plan.u + 0.02 * n(*plan.u.shape))  # a plan that all constraints allow
+    best, other = (loose.constraints(x, u) + 50.0 for x, u in ((plan.x, plan.u), (loose.rollout(u)[0], u)))
+    tight = (other < best) & (n(*best.shape) < -0.2)
+    g = torch.where(tight, 0.5 * (best + other), torch.maximum(best, other) + 0.3)
     g[:, 0, 2] = torch.inf
     return dataclasses.replace(loose, g=g)
 

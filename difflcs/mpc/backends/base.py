@@ -10,9 +10,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from difflcs.errors import BackendNotFoundError, DTypeError
+from difflcs.errors import BackendNotFoundError, DTypeError, InvalidInputError
 from difflcs.mpc import kkt
-from difflcs.mpc.problem import MPCProblem
+from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.mpc.solution import Primal
 from difflcs.status import Status, solved
 
@@ -121,6 +121,30 @@ def replace_failed(problem: MPCProblem, primal: Primal, failed: Tensor) -> Prima
         old[index] = torch.nan_to_num(new)
         fixed.append(old)
     return Primal(*fixed)
+
+
+def check_plain(problem: MPCProblem, name: str) -> None:
+    """Refuse a problem that varies by stage, or has S, constraints, infinite bounds or no contact.
+
+    For a backend `name` that takes one system, cost and bounds for all stages only; see `Backend.check`.
+
+    Raises:
+        InvalidInputError: the problem has one of these; the message says which.
+    """
+    wrong = [(field, "the same at every stage", "one per stage") for field in INPUTS if problem.by_stage(field)]
+    for field in ("u_min", "u_max"):
+        if bool(torch.isinf(getattr(problem, field)).any()):
+            wrong.append((field, "finite bounds", "infinite ones"))
+    if bool(problem.S.any()):
+        wrong.append(("S", "zero", "another"))
+    if problem.n_c:
+        wrong.append(("constraints", "none", f"{problem.n_c} at each stage"))
+    if problem.n_lam == 0:
+        wrong.append(("n_lam", "at least 1", "0"))
+    for field, expected, got in wrong[:1]:
+        raise InvalidInputError(
+            f"{field}: expected {expected} with backend {name!r}, got {got}; use backend='batched' or 'ipopt'"
+        )
 
 
 REGISTRY: dict[str, type[Backend]] = {}

@@ -19,7 +19,7 @@ from difflcs._checks import check_number, check_threads, describe
 from difflcs._linalg import matvec
 from difflcs.errors import DTypeError
 from difflcs.lcp import solve_lcp
-from difflcs.mpc.backends.base import Backend, Result, replace_failed
+from difflcs.mpc.backends.base import Backend, Result, check_plain, replace_failed
 from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.mpc.solution import Primal
 from difflcs.status import Status
@@ -78,6 +78,8 @@ class RelaxedBackend(Backend):
     as ū the plan before it. With a guess there is one pass, the last, with the guess's actions as ū: `mpc(x0,
     guess=solution)` is one more pass.
 
+    It takes one system and cost for all stages, finite bounds, n_lam ≥ 1, no S, no constraints. S gets gradient zero.
+
     Its plans are not those of the exact backends (`exact` is False): x and λ solve the program, not the LCS.
     `python benchmarks/relaxed_quality.py` (seeds 0 to 9, 12 problems each, n_x 9, n_u 6, H 5) executes its actions in
     synthetic pushing models: 2.9 % above the cost of `batched` at n_lam 5 (median 0.9 %, worst tenth 7.3 %), 3.6 % at
@@ -122,8 +124,17 @@ class RelaxedBackend(Backend):
             check_number(name, getattr(self, name), strict=True)
         check_threads(self.threads)
 
+    def check(self, problem: MPCProblem) -> None:
+        """Refuse what the convex program does not have."""
+        check_plain(problem, self.name)
+
     def solve(self, problem: MPCProblem, guess: Primal | None) -> RelaxedResult:
-        """One pass per penalty, or the last one alone with a guess."""
+        """One pass per penalty, or the last one alone with a guess.
+
+        Raises:
+            InvalidInputError: the problem has what this backend cannot do, see `check`.
+        """
+        self.check(problem)
         started = time.perf_counter()
         batch = problem.batch
         zero = torch.zeros(batch, problem.horizon, problem.n_u, dtype=torch.float64)
