@@ -76,10 +76,9 @@ class Recorder(Backend):
     def vjp(self, problem, result, grads, solved):
         """One per element and entry, so that a gradient says how many elements share an input."""
         count = float(solved.sum())
-        return {
-            k: torch.full_like(v, count if problem.shared(k) else 1.0)
-            for k, v in ((k, getattr(problem, k)) for k in INPUTS)
-        }
+        values = {k: getattr(problem, k) for k in INPUTS}
+        gradients = {k: torch.full_like(v, count if problem.shared(k) else 1.0) for k, v in values.items()}
+        return gradients | {"Q": gradients["Q"].triu()}
 
     @property
     def problem(self) -> MPCProblem:
@@ -237,6 +236,9 @@ def test_a_guess_has_no_gradient_and_changes_none(layer, x0):
     layer.zero_grad()
     layer(x0, guess=guess).action.sum().backward()
     torch.testing.assert_close(layer.lcs.A.grad, plain, rtol=1e-4, atol=1e-6)
+    layer.requires_grad_(False)
+    assert guess.u.requires_grad
+    assert not layer(x0, guess=guess).u.requires_grad
 
 
 # --- bounds ---------------------------------------------------------------------------------------------------------
@@ -525,9 +527,11 @@ def test_gradients_come_back_in_the_shape_of_each_input(build):
     solution = layer(x0)
     assert solution.u.shape == (5, 2, 3, 2)
     (solution.u.sum() + solution.objective.sum()).backward()
-    for leaf, count in ((A, 2), (B, 10), (c, 5), (d, 10), (Q, 10), (x0, 1), (g, 2), (weights["constant"], 2)):
+    for leaf, count in ((A, 2), (B, 10), (c, 5), (d, 10), (x0, 1), (g, 2), (weights["constant"], 2)):
         assert leaf.grad.dtype == leaf.dtype
         assert torch.equal(leaf.grad, torch.full_like(leaf, float(count)))
+    # Only the symmetric part of Q matters, whatever a backend says.
+    assert torch.equal(Q.grad, 5 * torch.ones(4, 4) + 5 * torch.eye(4))
 
 
 @pytest.mark.parametrize("name", ["lcs", "cost", "constraints", "bounds"])
@@ -550,6 +554,10 @@ def test_one_plain_bound_of_a_call_replaces_that_of_the_stages(build, x0):
     layer(x0, u_max=0.5)
     assert torch.equal(backend.problem.u_min[0], bounds.u_min)
     assert torch.equal(backend.problem.u_max, torch.full((2,), 0.5).double())
+    each = torch.linspace(0.1, 0.6, 6).double()[:, None].expand(6, 2)
+    layer(x0, u_max=each)
+    assert torch.equal(backend.problem.u_max, each)
+    assert not backend.problem.by_stage("u_max")
 
 
 # --- modules that say the system ------------------------------------------------------------------------------------
