@@ -16,6 +16,8 @@ from difflcs.mpc.solution import Primal, largest
 
 # Largest residual of a solution: what CONVERGED means.
 CERTIFIED = 1e-6
+# A multiplier above this part of its price is the price, but for rounding.
+_AT_PRICE = 1 - 1e-12
 
 
 @dataclass(frozen=True)
@@ -166,8 +168,8 @@ def residual(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
 def _row_violations(problem: MPCProblem, primal: Primal) -> list[Tensor]:
     mu, price = primal.mu.transpose(0, 1), problem.steps().price
     c = problem.constraints(primal.x, primal.u).transpose(0, 1)
-    off = torch.where(mu <= 0, c.clamp_min(0.0), torch.where(mu >= price, (-c).clamp_min(0.0), c.abs()))
-    return [_parts(off, row_units(problem, primal)) + 0 * mu, ((mu < 0) | (mu > price)).to(mu.dtype)]
+    off = torch.where(mu <= 0, c.clamp_min(0.0), torch.where(mu >= _AT_PRICE * price, (-c).clamp_min(0.0), c.abs()))
+    return [_parts(off, row_units(problem, primal)) + 0 * mu, ((mu < 0) | (mu * _AT_PRICE > price)).to(mu.dtype)]
 
 
 def row_units(problem: MPCProblem, primal: Primal) -> Tensor:
