@@ -208,14 +208,14 @@ def within_prices(problem: MPCProblem, mu: Tensor) -> Tensor:
 def ranges(problem: MPCProblem, u: Tensor) -> Tensor:
     """Range of each action, (batch, H, n_u): u_max − u_min.
 
-    Where that is infinite it is the largest size over the stages of the action itself and of its finite bounds.
+    Where that is infinite it is the largest size of the action over the stages, or that of its finite bound.
     """
     low, high = problem.bounds()
     width = high - low
     if not bool(torch.isinf(width).any()):
         return width.expand_as(u)
     finite = [torch.where(torch.isinf(v), torch.zeros_like(v), v).abs() for v in (low, high)]
-    size = torch.maximum(u.abs(), torch.maximum(*finite)).amax(1, keepdim=True)
+    size = torch.maximum(u.abs().amax(1, keepdim=True), torch.maximum(*finite))
     return torch.where(torch.isinf(width), size, width).expand_as(u)
 
 
