@@ -22,7 +22,7 @@ struct Certificate {
   // Of the stage at hand.
   T *A, *B, *C, *D, *E, *F, *Q, *R, *cross, *G_x, *G_u;
   Vec *d, *c, *q, *r, *lo, *hi;
-  Vec *x, *u, *lam, *mu, *s, *size, *p, *pn, *y, *rho, *error, *N;
+  Vec *x, *u, *lam, *mu, *s, *size, *p, *pn, *y, *rho, *error, *N, *largest_action;
   Vec *row, *row_terms, *row_missed, *row_force;  // values of the constraints; of each the largest over the stages
   Mask* rows;
 
@@ -41,7 +41,7 @@ struct Certificate {
     }
     arena.take(rest, h, nu);
     take(x, (h + 1) * nx), take(u, h * nu), take(lam, h * nl), take(mu, (h + 1) * nc), take(s, nl), take(size, nl);
-    take(p, nx), take(pn, nx), take(y, nl), take(rho, nl), take(error, nl), take(N, nl * nl), take(rows, nl);
+    take(p, nx), take(pn, nx), take(y, nl), take(rho, nl), take(error, nl), take(N, nl * nl), take(rows, nl), take(largest_action, nu);
     take(row, (h + 1) * nc), take(row_terms, nc), take(row_missed, nc), take(row_force, nc);
     if constexpr (sizeof(T) == sizeof(double))
       if (arena.memory) load_matrices(0, 0);
@@ -149,6 +149,10 @@ struct Certificate {
       load(x, o.x + e * (h + 1) * nx, (h + 1) * nx, l), load(u, o.u + e * h * nu, h * nu, l);
       load(lam, o.lam + e * h * nl, h * nl, l), load(mu, o.mu + e * (h + 1) * nc, (h + 1) * nc, l);
     }
+    for (int64_t j = 0; j < nu; j++) {
+      largest_action[j] = all(0);
+      for (int64_t k = 0; k < h; k++) largest_action[j] = max(largest_action[j], abs(u[k * nu + j]));
+    }
     worst = poison = all(0);
     Mask fragile = Mask{};
     for (int64_t i = 0; i < nx; i++) met(Sum{x[i] - vector[kx0][0][i], abs(vector[kx0][0][i])}.relative());
@@ -222,9 +226,7 @@ struct Certificate {
       g.terms += 1e-8 * batch.barrier * width * (1.0 / (below * below) + 1.0 / (above * above));
     }
     const Mask fixed = width <= 0;
-    // In place of a range without end stands the size of the action, or of its finite bound.
-    const Vec own = max(abs(at), max(select(lo[j] > -kHuge, abs(lo[j]), all(0)), select(hi[j] < kHuge, abs(hi[j]), all(0))));
-    width = select(width > kHuge, own, width);
+    width = range(largest_action[j], lo[j], hi[j]);
     const Vec per_width = select(width > kTiny, 1.0 / width, all(0));
     const Vec scale = max(g.terms, width * rest[k][j]);
     const Vec distance = select(g.value > 0, below, above);

@@ -284,11 +284,14 @@ struct Problem {
         put(multiplier[k], i, lane, from ? from[k * nc + i] / unit : 0.0);
       }
   }
-  void store_multipliers(double* to, const Vec* from, int lane) const {
+  void store_multipliers(double* to, const Vec* from, int64_t e, int lane) const {
     const int64_t nc = n.c();
     for (int64_t k = 0; k <= n.h; k++)
-      for (int64_t i = 0; i < nc; i++)
-        to[k * nc + i] = from[k * nc + i][lane] * (lane_of(row_scale[k][i], lane) / lane_of(cost_unit[0], lane));
+      for (int64_t i = 0; i < nc; i++) {
+        const double unit = lane_of(row_scale[k][i], lane) / lane_of(cost_unit[0], lane);
+        const double value = from[k * nc + i][lane] * unit, limit = input(kprice, e, k)[i];
+        to[k * nc + i] = value < kAtPrice * limit ? value : limit;
+      }
   }
 
   // ---- cost ----

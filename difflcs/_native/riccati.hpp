@@ -56,6 +56,7 @@ class Riccati {
   Matrix<Vec, kU, kU> L;
   Matrix<Vec, kU, kLaw> law;
   Vec *linear, *flat, *column;
+  Vec* largest_action;             // of each action, over the stages
   Vec *row_terms, *row_violation;  // of each constraint, the largest over the stages
   Mask* active;
   Sweep found;
@@ -79,7 +80,7 @@ class Riccati {
     arena.take(lower, h, nu), arena.take(upper, h, nu);
     const int64_t nc = n.c();
     arena.take(force, h + 1, nc), arena.take(stiffness, h + 1, nc);
-    arena.take(row_terms, nc), arena.take(row_violation, nc);
+    arena.take(row_terms, nc), arena.take(row_violation, nc), arena.take(largest_action, nu);
   }
 
   Stage<S> stage(int64_t k) const { return linearisation.stage(k); }
@@ -95,6 +96,10 @@ class Riccati {
   Sweep sweep(const Trajectory<S>& at, const Upstream<S>& upstream, Vec regularisation, Mask stubborn) {
     found = {all(0), all(0), all(0), all(0), all(0), Mask{}};
     for (int64_t i = 0; i < n.c(); i++) row_terms[i] = row_violation[i] = all(0);
+    for (int64_t j = 0; j < n.u() && problem.batch.unbounded; j++) {
+      largest_action[j] = all(0);
+      for (int64_t k = 0; k < n.h; k++) largest_action[j] = max(largest_action[j], abs(at.u(k, j)));
+    }
     terminal(at.x[n.h], kAdjoint ? upstream.x[n.h] : nullptr);
     for (int64_t k = n.h - 1; k >= 0; k--) {
       const StageData<T, S> data = problem.stage(k);
@@ -200,7 +205,7 @@ class Riccati {
       Vec width = hi - lo, per_width = data.per_width[j];
       const Mask fixed = width <= 0;
       if (problem.batch.unbounded) {
-        width = range(u[j], lo, hi);
+        width = range(largest_action[j], lo, hi);
         per_width = select(width > kTiny, 1.0 / width, all(0));
       }
       Vec t = data.r[j] + data.R.row(j) * u;
@@ -277,12 +282,6 @@ class Riccati {
       if (kAdjoint) l = l - stage.K_lam.column(i) * lam_bar;
       p[i] = t + stage.A_hat.column(i) * next.p, linear[i] = l;
     }
-  }
-
-  // The range of an action; where it has no end, the size of the action and of its finite bound.
-  static Vec range(Vec u, Vec lo, Vec hi) {
-    const Vec size = max(abs(u), max(select(lo > -kHuge, abs(lo), all(0)), select(hi < kHuge, abs(hi), all(0))));
-    return select(hi - lo > kHuge, size, hi - lo);
   }
 
   // Curvature that action j has at least, whatever its units.

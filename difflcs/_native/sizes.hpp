@@ -58,5 +58,11 @@ void curvature_at_rest(const S& n, const Effects& B, int64_t width, const Weight
   }
 }
 
+// The range of an action; where it has no end, the larger of the actions' size and of a finite bound's.
+inline Vec range(Vec largest_action, Vec lo, Vec hi) {
+  const Vec finite = max(select(lo > -kHuge, abs(lo), all(0)), select(hi < kHuge, abs(hi), all(0)));
+  return select(hi - lo > kHuge, max(largest_action, finite), hi - lo);
+}
+
 }  // namespace
 }  // namespace difflcs::DIFFLCS_ISA

@@ -145,7 +145,7 @@ class Solver {
     problem.store(o.x + e * states, at.x.entries, states, l);
     problem.store(o.u + e * actions, at.u.entries, actions, l);
     problem.store_lam(o.lam + e * forces, at.lam.entries, l);
-    problem.store_multipliers(o.mu + e * (n.h + 1) * n.c(), multipliers.entries, l);
+    problem.store_multipliers(o.mu + e * (n.h + 1) * n.c(), multipliers.entries, e, l);
     o.objective[e] = (n.c() > 0 ? problem.objective(at) : J)[l] / lane_of(problem.cost_unit[0], l), o.iterations[e] = int32_t(lane[l].iterations);
     o.status[e] = int8_t(status);
     finished[waiting++] = e;

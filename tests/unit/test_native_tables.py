@@ -14,11 +14,12 @@ import pytest
 import torch
 
 import difflcs
-from difflcs import LCSMPCLayer, QuadraticCost, Status
+from difflcs import LCSMPCLayer, LinearConstraints, QuadraticCost, Status
 from difflcs._native import _kernels
 from difflcs.lcs import SYSTEM, LCSParams, dimensions
 from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.status import solved
+from tests.problems import Kind, random_problem
 
 SOURCE = Path(difflcs.__file__).parent
 
@@ -60,21 +61,24 @@ def test_a_layer_finds_every_field_in_its_system_cost_and_bounds(build):
     lcs = build.pushing(0, 5)
     eye = torch.eye(9, dtype=torch.float64)
     cost = QuadraticCost(eye, eye[:6, :6], eye)
-    assert [*lcs.tensors(), *cost.fields(), "u_min", "u_max", "x0"] == list(INPUTS)
-    sizes = {"n_x": 9, "n_u": 6, "n_lam": 5}
-    for name, value in {**lcs.tensors(), **cost.fields()}.items():
+    rows = LinearConstraints(eye[:2], eye[:2, 0], E=eye[:2, :6])
+    problem = LCSMPCLayer(lcs, cost, 2, -1.0, 1.0, constraints=rows)(torch.zeros(9, dtype=torch.float64)).problem
+    found = {**lcs.tensors(), **cost.fields()}
+    limits = {"u_min", "u_max", "G_x", "G_u", "g", "price", "x0"}
+    assert {*found, *limits, "S"} == set(INPUTS)
+    sizes = {"n_x": 9, "n_u": 6, "n_lam": 5, "n_c": 2}
+    for name in INPUTS:
+        value = getattr(problem, name) if name != "x0" else problem.x0[0]
         assert tuple(value.shape) == tuple(sizes[dim] for dim in INPUTS[name]), name
 
 
 @pytest.mark.parametrize("name", INPUTS)
-def test_the_kernels_name_the_field_that_does_not_fit(build, name):
-    eye = torch.eye(9, dtype=torch.float64)
-    mpc = LCSMPCLayer(build.pushing(0, 5), QuadraticCost(eye, eye[:6, :6], eye), 2, -1.0, 1.0)
-    problem = mpc(torch.zeros(1, 9, dtype=torch.float64)).problem
+def test_the_kernels_name_the_field_that_does_not_fit(name):
+    problem = random_problem(0, Kind(horizon=2, batch=1, rows=2))
     arrays = {k: getattr(problem, k).numpy() for k in INPUTS}
     arrays[name] = np.concatenate([arrays[name], arrays[name]])
-    sizes = {"x": (1, 3, 9), "u": (1, 2, 6), "lam": (1, 2, 5)}
-    solution = {k: np.zeros(size) for k, size in sizes.items()}
+    sizes = {"x": (1, 3, 4), "u": (1, 2, 2), "lam": (1, 2, 3)}
+    solution = {k: np.zeros(size) for k, size in {**sizes, "mu": (1, 3, 2)}.items()}
     upstream = {f"{k}_bar": np.zeros(size) for k, size in sizes.items()}
     with pytest.raises(ValueError, match=r"wrong (shape|size)|inconsistent"):
         _kernels.vjp_mpc(
