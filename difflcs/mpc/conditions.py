@@ -161,7 +161,7 @@ def residual(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
     ]
     if problem.n_c:
         violations += _row_violations(problem, primal)
-    worst = torch.stack([largest(v) for v in violations]).amax(0)  # amax keeps NaN
+    worst = torch.stack([v.amax((0, 2)) for v in violations if v.shape[2]]).amax(0)  # amax keeps NaN
     return torch.nan_to_num(worst, nan=torch.inf)
 
 
