@@ -113,7 +113,8 @@ class MPCProblem(SystemMatrices):
             found = tuple(getattr(self, name).shape)
             if found not in allowed:
                 raise ShapeError(f"{name}: expected {' or '.join(map(str, allowed))}, got {found}")
-        check_bounds(*self.bounds(), strict=self.barrier > 0)
+        limits = self.bounds() if self.by_stage("u_min") or self.by_stage("u_max") else (self.u_min, self.u_max)
+        check_bounds(*limits, strict=self.barrier > 0)
         if self.n_c and not bool((self.price > 0).all()):
             raise InvalidInputError(
                 f"price: expected a positive price of a violation, or infinity for a hard constraint, got "

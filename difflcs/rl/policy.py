@@ -247,7 +247,7 @@ class LCSMPCPolicy(GaussianPolicy):
     @property
     def learned(self) -> LCSModel | LCSParams:
         """The LCS."""
-        return self.mpc.lcs
+        return self.mpc.lcs  # pyright: ignore[reportReturnType]  a layer takes any module; PPO does not yet
 
     @property
     def controller(self) -> LCSMPCLayer:
