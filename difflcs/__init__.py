@@ -9,6 +9,7 @@ from difflcs.losses import prediction_loss, violation_loss
 from difflcs.mpc.backends import available_backends, register_backend
 from difflcs.mpc.layer import LCSMPCLayer
 from difflcs.mpc.solution import MPCSolution
+from difflcs.scales import ScaledLCS, Scales, suggest_scales
 from difflcs.status import Status
 
 __version__ = "0.1.0"
@@ -28,6 +29,8 @@ __all__ = [
     "LinearConstraints",
     "MPCSolution",
     "QuadraticCost",
+    "ScaledLCS",
+    "Scales",
     "SolveError",
     "StageBounds",
     "Status",
@@ -35,5 +38,6 @@ __all__ = [
     "prediction_loss",
     "register_backend",
     "solve_lcp",
+    "suggest_scales",
     "violation_loss",
 ]

@@ -22,6 +22,7 @@ from difflcs.records import (
     SystemMatrices,
     advance,
     check_inputs,
+    check_sequence,
     dimensions,
 )
 
@@ -130,7 +131,7 @@ class LCSModel(nn.Module):
         """
         self.check_inputs(x=x, u=u)
         broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1])])
-        return advance(self.params(), x, u)
+        return advance(self.params(x), x, u)
 
     @runs_eagerly
     def rollout(self, x0: Tensor, u_seq: Tensor) -> Tensor:
@@ -143,8 +144,13 @@ class LCSModel(nn.Module):
         Returns:
             (..., T+1, n_x) states, x0 first.
         """
-        self.check_inputs(x0=x0)
-        return self.params().rollout(x0, u_seq)
+        check_sequence(self.n_u, u_seq)
+        self.check_inputs(x0=x0, u_seq=u_seq)
+        batch = broadcast_batch([("x0", x0.shape[:-1]), ("u_seq", u_seq.shape[:-2])])
+        states = [x0.expand(*batch, self.n_x)]
+        for t in range(u_seq.shape[-2]):
+            states.append(self(states[-1], u_seq[..., t, :]).x_next)
+        return torch.stack(states, dim=-2)
 
     def check_inputs(self, **tensors: Tensor) -> None:
         """Check states `x…` and actions `u…` against the model's sizes, dtype-class and device."""

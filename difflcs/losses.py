@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
+from typing import Literal, TypeGuard
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_choice, check_number, check_tensor
-from difflcs.errors import DoubleBackwardError, GammaError, NotPositiveDefiniteError, SolveError
-from difflcs.lcp import MAX_ITER, solve_lcp_arrays
-from difflcs.lcs import SYSTEM, LCSModel
-from difflcs.status import Status
-
-# Least γ σ_min(F + Fᵀ), in parts of n_lam times the largest squared column of F (kernels.hpp has the same).
-_GAMMA_LEAST = 4e-13
+from difflcs._checks import broadcast_batch, check_choice, check_number, check_tensor, describe
+from difflcs._functorch import is_wrapped, pull_back, runs_eagerly, solve, transforms_active
+from difflcs._violation import Transitions, check_gamma_range, largest_gamma, minimise_over_orthant
+from difflcs.errors import DTypeError, GammaError, InvalidInputError
+from difflcs.lcp import MAX_ITER
+from difflcs.lcs import SYSTEM, LCSModel, LCSModule, LCSParams
 
 
+@runs_eagerly
 def violation_loss(
-    lcs: LCSModel,
+    lcs: LCSModule | LCSParams,
     x: Tensor,
     u: Tensor,
     x_next: Tensor,
-    gamma: float = 0.1,
+    gamma: float | Literal["auto"] = 0.1,
     xi: float = 0.01,
     *,
+    context: Tensor | None = None,
     reduction: str = "mean",
     check_gamma: bool = True,
 ) -> Tensor:
@@ -38,14 +40,19 @@ def violation_loss(
     solve. The prior work's loss ‖r‖² + (λᵀφ + ‖e‖²/γ')/ξ' is 2·`violation_loss` with γ = γ'/2 and ξ = 2ξ'.
 
     Args:
-        lcs: the model.
+        lcs: the model; any `LCSModule`, which is asked for `params(x, context)`; or `LCSParams`. The system may be
+            shared, or one per transition: its batch dimensions broadcast with those of the data.
         x: (..., n_x) states.
         u: (..., n_u) actions.
         x_next: (..., n_x) observed next states.
-        gamma: γ, weight of the slack; 0 < γ ≤ σ_min(F + Fᵀ).
-        xi: ξ > 0, weight of the dynamics against complementarity. The default suits data of the size of meters per
-            step, as in the paper; scale it with the square of your data (about 1 for data of size one), or the loss is
-            the prediction loss for all practical purposes.
+        gamma: γ, weight of the slack; 0 < γ ≤ σ_min(F + Fᵀ) of every transition. "auto" takes 0.999 times the smallest
+            of these bounds at each call, as a constant that is not differentiated: at the bound itself the inner QP
+            can be singular, a thousandth below it is well solved. It grows with F where a fixed γ stays behind.
+        xi: ξ > 0, weight of the dynamics against complementarity. With a small ξ the loss is the prediction loss, with
+            a large one the contact law is broken for free. It compares squared states with forces times gaps: the
+            default suits states, forces and gaps of like units. A common unit of all of them changes nothing, as the
+            loss grows with its square whatever ξ. `suggest_scales` finds such units.
+        context: (..., n_context) passed on to the `params` of an `LCSModule`.
         reduction: "mean" over the batch, or "none" for one value each.
         check_gamma: refuse γ > σ_min(F + Fᵀ). False lets a fixed γ through, as the prior work does; the inner QP may
             then be non-convex, and a stationary point of it is used.
@@ -61,44 +68,133 @@ def violation_loss(
     """
     check_choice("reduction", reduction, ("mean", "none"))
     check_number("xi", xi, strict=True)
-    check_number("gamma", gamma)
-    F, factors = _contact_matrix(lcs)
-    system = (lcs.A, lcs.B, lcs.C, lcs.d, lcs.D, lcs.E, F, lcs.c)
-    batch = x.shape[:-1] if _plain(lcs, system, (x, u, x_next)) else None
-    if batch is None:
-        _check_numbers(lcs, system, (x, u, x_next))
-        batch = broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1]), ("x_next", x_next.shape[:-1])])
-        x, u, x_next = (v.expand(*batch, v.shape[-1]).reshape(-1, v.shape[-1]) for v in (x, u, x_next))
-    mean = reduction == "mean"
-    loss = _ViolationLoss.apply(lcs, check_gamma, mean, gamma, xi, *system, x, u, x_next, *factors)
-    return loss if mean else loss.reshape(batch)  # pyright: ignore[reportReturnType, reportAttributeAccessIssue]
+    if not (isinstance(gamma, str) and gamma == "auto"):
+        check_number("gamma", gamma)
+    if _has_the_models_params(lcs) and lcs.n_lam and not transforms_active():
+        F, factors = _contact_matrix(lcs)
+        system = (lcs.A, lcs.B, lcs.C, lcs.d, lcs.D, lcs.E, F, lcs.c)
+        batch = x.shape[:-1] if _plain(lcs, system, (x, u, x_next)) else None
+        if batch is None:
+            _check_numbers(lcs, system, (x, u, x_next))
+            batch = broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1]), ("x_next", x_next.shape[:-1])])
+            x, u, x_next = (v.expand(*batch, v.shape[-1]).reshape(-1, v.shape[-1]) for v in (x, u, x_next))
+        return _shared(lcs, system, (x, u, x_next), gamma, xi, check_gamma, reduction, batch, factors)
+    params = _params(lcs, x, u, x_next, context)
+    if not params.n_lam:
+        return _prediction_loss(params, x, u, x_next, reduction)
+    batch = _batch(params, x, u, x_next)
+    count = batch.numel()
+    x, u, x_next = (v.expand(*batch, v.shape[-1]).reshape(count, v.shape[-1]) for v in (x, u, x_next))
+    system = tuple(_for_each(v, batch, len(SYSTEM[name])) for name, v in params.tensors().items())
+    if all(v.ndim == len(dims) for v, dims in zip(system, SYSTEM.values(), strict=True)) and not transforms_active():
+        return _shared(params, system, (x, u, x_next), gamma, xi, check_gamma, reduction, batch)
+    if isinstance(gamma, str):
+        rate = largest_gamma(params.F)
+    else:
+        rate = torch.tensor(float(gamma), dtype=torch.float64, device=x.device)
+    loss = solve(Transitions(xi, check_gamma), *system, x, u, x_next, rate)[0]
+    return _reduce(loss, batch, reduction)
 
 
-def prediction_loss(lcs: LCSModel, x: Tensor, u: Tensor, x_next: Tensor, *, reduction: str = "mean") -> Tensor:
+@runs_eagerly
+def prediction_loss(
+    lcs: LCSModule | LCSParams,
+    x: Tensor,
+    u: Tensor,
+    x_next: Tensor,
+    *,
+    context: Tensor | None = None,
+    reduction: str = "mean",
+) -> Tensor:
     """½‖x̂ − x_next‖² with x̂ predicted through the exact LCP, for comparison with `violation_loss`.
 
     Its gradient vanishes where contacts are wrongly inactive, which is what the violation loss mends.
 
     Args:
-        lcs: the model.
+        lcs: the model, any `LCSModule`, or `LCSParams`, shared or one per transition, as for `violation_loss`.
         x: (..., n_x) states.
         u: (..., n_u) actions.
         x_next: (..., n_x) observed next states.
+        context: (..., n_context) passed on to the `params` of an `LCSModule`.
         reduction: "mean" over the batch, or "none" for one value each.
 
     Returns:
         Scalar, or (...,) with reduction="none"; differentiable in the parameters, x, u and x_next.
     """
     check_choice("reduction", reduction, ("mean", "none"))
-    lcs.check_inputs(x=x, u=u, x_next=x_next)
-    broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1]), ("x_next", x_next.shape[:-1])])
-    loss = 0.5 * (lcs(x, u).x_next - x_next).square().sum(-1)
+    return _prediction_loss(_params(lcs, x, u, x_next, context), x, u, x_next, reduction)
+
+
+def _prediction_loss(params: LCSParams, x: Tensor, u: Tensor, x_next: Tensor, reduction: str) -> Tensor:
+    _batch(params, x, u, x_next)
+    loss = 0.5 * (params.step(x, u).x_next - x_next).square().sum(-1)
     return _reduce(loss.reshape(-1), loss.shape, reduction)
 
 
 def _reduce(loss: Tensor, batch: torch.Size, reduction: str) -> Tensor:
     # The mean of an empty batch is zero, not NaN: no data, no loss, no gradient.
     return loss.sum() / max(loss.numel(), 1) if reduction == "mean" else loss.reshape(batch)
+
+
+def _params(lcs: LCSModule | LCSParams, x: Tensor, u: Tensor, x_next: Tensor, context: Tensor | None) -> LCSParams:
+    """The system of some transitions, which are checked against it."""
+    if context is not None:
+        check_tensor("context", context)
+    if isinstance(lcs, LCSParams):
+        if context is not None:
+            raise InvalidInputError(
+                f"context: expected None beside LCSParams, which depend on nothing, got {describe(context)}; leave it "
+                f"out, or pass an LCSModule"
+            )
+        params = lcs
+    elif isinstance(lcs, LCSModule):
+        check_tensor("x", x, [("n_x", lcs.n_x)])
+        params = lcs.params(x, context)
+        if not isinstance(params, LCSParams):
+            raise DTypeError(
+                f"{type(lcs).__name__}.params: expected LCSParams for transitions, which have no stages, got "
+                f"{type(params).__name__}; give the system of each transition by batch dimensions"
+            )
+    else:
+        raise DTypeError(
+            f"lcs: expected an LCSModel, another LCSModule or LCSParams, got {describe(lcs)}; the stages of a "
+            f"sequence become a batch by LCSParams(**sequence.tensors())"
+        )
+    params.check_inputs(x=x, u=u, x_next=x_next)
+    return params
+
+
+def _batch(params: LCSParams, x: Tensor, u: Tensor, x_next: Tensor) -> torch.Size:
+    named = {"x": x, "u": u, "x_next": x_next}
+    return broadcast_batch([("the system", params.batch_shape), *((k, v.shape[:-1]) for k, v in named.items())])
+
+
+def _for_each(value: Tensor, batch: torch.Size, rank: int) -> Tensor:
+    """A field that is shared, or (count, …) of each transition."""
+    own = value.shape[value.ndim - rank :]
+    return value if value.ndim == rank else value.expand(*batch, *own).reshape(batch.numel(), *own)
+
+
+def _has_the_models_params(lcs: object) -> TypeGuard[LCSModel]:
+    return isinstance(lcs, LCSModel) and type(lcs).params is LCSModel.params
+
+
+def _shared(
+    lcs: LCSModel | LCSParams,
+    system: tuple[Tensor, ...],
+    data: tuple[Tensor, ...],
+    gamma: float | str,
+    xi: float,
+    check_gamma: bool,
+    reduction: str,
+    batch: torch.Size,
+    factors: tuple[Tensor, ...] = (),
+) -> Tensor:
+    """The loss with one system for all transitions, data (count, ·): in C++."""
+    mean = reduction == "mean"
+    rate = float(largest_gamma(system[6])) if isinstance(gamma, str) else gamma
+    loss = _ViolationLoss.apply(lcs, check_gamma, mean, rate, xi, *system, *data, *factors)
+    return loss if mean else loss.reshape(batch)  # pyright: ignore[reportReturnType, reportAttributeAccessIssue]
 
 
 def _contact_matrix(lcs: LCSModel) -> tuple[Tensor, tuple[Tensor, ...]]:
@@ -120,46 +216,22 @@ def _plain(lcs: LCSModel, system: tuple[Tensor, ...], data: tuple[Tensor, ...]) 
     return all(v.shape == (count, n) for v, n in zip(data, (lcs.n_x, lcs.n_u, lcs.n_x), strict=True))
 
 
-def _check_numbers(lcs: LCSModel, system: tuple[Tensor, ...], data: tuple[Tensor, ...]) -> None:
+def _check_numbers(lcs: LCSModel | LCSParams, system: tuple[Tensor, ...], data: tuple[Tensor, ...]) -> None:
     lcs.check_inputs(**dict(zip(("x", "u", "x_next"), data, strict=True)))
     for name, value in zip(SYSTEM, system, strict=True):
         check_tensor(name, value)
 
 
-def _check_gamma(F: Tensor, gamma: float, refuse_large: bool) -> None:
-    symmetric = (F + F.mT).detach().cpu().double().numpy()
-    smallest = float(np.linalg.eigvalsh(symmetric)[0])
-    if smallest <= 0:
-        raise NotPositiveDefiniteError(
-            f"F: expected F + Fᵀ positive definite, got smallest eigenvalue {smallest:.3e}; raise the model's stiffness"
-        )
-    # The bound itself is allowed; a relative 1e-9 forgives the rounding of the eigenvalue.
-    if gamma <= 0 or (refuse_large and gamma > smallest * (1 + 1e-9)):
-        raise GammaError(
-            f"gamma: expected 0 < gamma <= sigma_min(F + F^T) = {smallest:.6g}, got {gamma:.6g}; lower gamma, "
-            f"raise the model's stiffness (sigma_min >= 2*stiffness), or pass check_gamma=False to keep a fixed gamma"
-        )
-    # FᵀF/γ stands beside F + Fᵀ in the inner QP: their difference has to survive the rounding.
-    least = _GAMMA_LEAST * len(F) * float(F.detach().double().square().sum(0).max()) / smallest
-    if gamma < least:
-        raise GammaError(
-            f"gamma: expected at least {least:.3g} for this F in double precision, got {gamma:.3g}; raise gamma, or "
-            f"the model's stiffness"
-        )
-
-
 class _ViolationLoss(torch.autograd.Function):
     """The loss of A, B, C, d, D, E, F, c and x, u, x_next (B, ·), then G and H if F is their function.
 
-    The inner problem over z = (λ, φ) ≥ 0 is to minimise ½ zᵀQz + qᵀz, whose optimality is the LCP (Q, q):
-
-        Q = [[CᵀC + FᵀF/(γξ), (I − Fᵀ/γ)/ξ], [·, I/(γξ)]],  q = (Cᵀr + Fᵀe/(γξ), −e/(γξ)) with r and e at z = 0.
-
-    Eliminating φ leaves CᵀC + (F + Fᵀ − γI)/ξ, positive definite for γ < σ_min(F + Fᵀ).
+    The mathematics is that of `Transitions`, in C++ for a system that all transitions share.
     """
 
     @staticmethod
-    def forward(ctx, lcs: LCSModel, refuse_large: bool, mean: bool, gamma: float, xi: float, *tensors: Tensor):
+    def forward(
+        ctx, lcs: LCSModel | LCSParams, refuse_large: bool, mean: bool, gamma: float, xi: float, *tensors: Tensor
+    ):
         from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 
         A, B, _, _, D, E, F, c, x, u, x_next = tensors[:11]
@@ -172,8 +244,8 @@ class _ViolationLoss(torch.autograd.Function):
         if held is None:
             # A number that is not finite, a γ at or above its bound, or an empty batch.
             _check_numbers(lcs, tensors[:8], (x, u, x_next))
-            _check_gamma(F, gamma, refuse_large)
-            z = _minimise_over_orthant(Q, q)
+            check_gamma_range(F.detach().cpu().double().numpy(), gamma, refuse_large)
+            z = minimise_over_orthant(Q, q)
             held = _kernels.violation_value(arrays, gamma, xi, z, r, e, loss)
         if not held:
             raise GammaError(
@@ -190,10 +262,8 @@ class _ViolationLoss(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *grads):
-        if torch.is_grad_enabled():
-            raise DoubleBackwardError(
-                "violation_loss has first derivatives only (envelope theorem); expected create_graph=False"
-            )
+        if is_wrapped(grads[0]) or torch.is_grad_enabled():
+            return _pull_back_transformed(ctx, grads[0])
         from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 
         x, _, *rest = ctx.saved_tensors
@@ -213,36 +283,18 @@ class _ViolationLoss(torch.autograd.Function):
         return (None,) * 5 + tuple(g if g is None else torch.from_numpy(g).to(x) for g in gradients)
 
 
-def _minimise_over_orthant(Q: np.ndarray, q: np.ndarray, max_iter: int = 500) -> np.ndarray:
-    """Minimise ½ zᵀQz + qᵀz over z ≥ 0 for each row of q (B, m): exact for Q ≻ 0, else a stationary point."""
-    unit = 1 / np.sqrt(np.diag(Q))  # of each variable, so that Q has a unit diagonal
-    Q, q = unit[:, None] * Q * unit, q * unit
-    smallest = float(np.linalg.eigvalsh(Q)[0])
-    if smallest > 1e-13:
-        z, _, status = solve_lcp_arrays(Q, q)
-        _require_solved(status)
-        return z * unit
-    # γ at or above its bound: Q is singular or indefinite. Proximal steps z ← argmin ½zᵀQz + qᵀz + ½ρ‖z − z₋‖²
-    # decrease the objective monotonically, and each is an LCP with a positive definite matrix.
-    rho = max(1e-6, -1.1 * smallest)
-    proximal = Q + rho * np.eye(len(Q))
-    z = np.zeros_like(q)
-    for _ in range(max_iter):
-        step, _, status = solve_lcp_arrays(proximal, q - rho * z)
-        _require_solved(status)
-        change = np.abs(step - z).max(initial=0.0)
-        z = step
-        if rho * change <= 1e-10 * np.abs(q).max(initial=0.0):
-            return z * unit
-    return z * unit  # a descent from zero that has not settled; only an indefinite Q needs that many steps
-
-
-def _require_solved(status: np.ndarray) -> None:
-    failed = np.flatnonzero(status != Status.CONVERGED)
-    if len(failed):
-        raise SolveError(
-            f"violation_loss: the inner QP failed on {len(failed)} of {len(status)} transitions (first: {failed[0]}); "
-            f"check the scale of the data and of the parameters",
-            failed.tolist(),
-            status[failed].tolist(),
-        )
+def _pull_back_transformed(ctx, upstream: Tensor):
+    """The gradient for an upstream that a transform wraps: NumPy's, of as many problems as it has. None to record."""
+    x, _, *rest = ctx.saved_tensors
+    arrays, gamma, xi, z, r, e = ctx.solution
+    count = len(z)
+    if ctx.mean:
+        upstream = (upstream / max(count, 1)).expand(count)
+    tensors = [*(torch.from_numpy(v) for v in arrays), torch.tensor(gamma, dtype=torch.float64)]
+    outputs = [torch.empty(count, dtype=torch.float64), *(torch.from_numpy(v) for v in (z, r, e))]
+    gradients = list(pull_back(Transitions(xi, False), tensors, outputs, [upstream], [True] * 12))[:11]
+    if len(ctx.needs_input_grad) > 16:  # F = G Gᵀ + stiffness·I + H − Hᵀ
+        F_bar = gradients[6]
+        assert F_bar is not None
+        gradients += [(F_bar + F_bar.mT) @ rest[0].detach().double(), F_bar - F_bar.mT]
+    return (None,) * 5 + tuple(g if g is None else g.to(x) for g in gradients)

@@ -177,6 +177,14 @@ class _Record(SystemMatrices):
         """Check states `x…` and actions `u…` against the sizes, dtype and device of the matrices."""
         check_inputs(self.n_x, self.n_u, self.A, tensors)
 
+    def _fits(self, **batches: torch.Size) -> torch.Size:
+        return broadcast_batch([("the system", self.batch_shape), *batches.items()])
+
+    def _check_rollout(self, x0: Tensor, u_seq: Tensor) -> torch.Size:
+        check_sequence(self.n_u, u_seq)
+        self.check_inputs(x0=x0, u_seq=u_seq)
+        return self._fits(x0=x0.shape[:-1], u_seq=u_seq.shape[:-2])
+
 
 @dataclass(frozen=True)
 class LCSParams(_Record):
@@ -218,9 +226,6 @@ class LCSParams(_Record):
         self._fits(x=x.shape[:-1], u=u.shape[:-1])
         return advance(self, x, u)
 
-    def _fits(self, **batches: torch.Size) -> torch.Size:
-        return broadcast_batch([("the system", self.batch_shape), *batches.items()])
-
     @runs_eagerly
     def rollout(self, x0: Tensor, u_seq: Tensor) -> Tensor:
         """Predict a trajectory.
@@ -232,7 +237,7 @@ class LCSParams(_Record):
         Returns:
             (..., T+1, n_x) states, x0 first; batch dimensions of x0, u_seq and the matrices broadcast.
         """
-        batch = self._fits(**check_rollout(self, x0, u_seq))
+        batch = self._check_rollout(x0, u_seq)
         states = [x0.expand(*batch, self.n_x)]
         for t in range(u_seq.shape[-2]):
             states.append(advance(self, states[-1], u_seq[..., t, :]).x_next)
@@ -315,13 +320,12 @@ class LCSSequence(_Record):
         Returns:
             (..., H+1, n_x) states, x0 first; batch dimensions of x0, u_seq and the matrices broadcast.
         """
-        batches = check_rollout(self, x0, u_seq)
+        batch = self._check_rollout(x0, u_seq)
         if u_seq.shape[-2] != self.horizon:
             raise ShapeError(
                 f"u_seq: expected shape (..., H={self.horizon}, n_u={self.n_u}), got {tuple(u_seq.shape)}; give one "
                 f"action for each stage"
             )
-        batch = broadcast_batch([("the system", self.batch_shape), *batches.items()])
         states = [x0.expand(*batch, self.n_x)]
         for k in range(self.horizon):
             states.append(advance(self.stage(k), states[-1], u_seq[..., k, :]).x_next)
@@ -383,12 +387,10 @@ def check_inputs(n_x: int, n_u: int, like: Tensor, tensors: Mapping[str, Tensor]
     check_same_device([(owner, like), *tensors.items()])
 
 
-def check_rollout(system: SystemMatrices, x0: Tensor, u_seq: Tensor) -> dict[str, torch.Size]:
-    """Check the start and the actions of a rollout; their batch dimensions."""
-    check_tensor("u_seq", u_seq, [("n_u", system.n_u)])
+def check_sequence(n_u: int, u_seq: Tensor) -> None:
+    """Check that a tensor is a sequence of actions."""
+    check_tensor("u_seq", u_seq, [("n_u", n_u)])
     if u_seq.ndim < 2:
         raise ShapeError(
-            f"u_seq: expected shape (..., T, n_u={system.n_u}), got {tuple(u_seq.shape)}; add a dimension of steps"
+            f"u_seq: expected shape (..., T, n_u={n_u}), got {tuple(u_seq.shape)}; add a dimension of steps"
         )
-    check_inputs(system.n_x, system.n_u, system.A, {"x0": x0, "u_seq": u_seq})
-    return {"x0": x0.shape[:-1], "u_seq": u_seq.shape[:-2]}

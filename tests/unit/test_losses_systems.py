@@ -1,0 +1,390 @@
+"""The losses with systems other than one LCSModel: LCSParams, one per transition, modules; and gamma="auto"."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from difflcs import LCSModel, LCSParams, LCSSequence, prediction_loss, violation_loss
+from difflcs.errors import (
+    DoubleBackwardError,
+    DTypeError,
+    GammaError,
+    InvalidInputError,
+    NonFiniteError,
+    NotPositiveDefiniteError,
+    ShapeError,
+)
+
+NAMES = ("A", "B", "C", "d", "D", "E", "F", "c")
+COUNT = 8
+
+
+@pytest.fixture
+def data(build):
+    n = build.normal(5)
+    return n(COUNT, 4), n(COUNT, 2), n(COUNT, 4)
+
+
+@pytest.fixture
+def each(build):
+    """A system of its own for each transition."""
+    return build.params(seed=3, batch=(COUNT,))
+
+
+def sigma(F):
+    return torch.linalg.eigvalsh((F + F.mT).detach())[..., 0]
+
+
+def learnable(params):
+    return LCSParams(**{k: v.detach().clone().requires_grad_() for k, v in params.tensors().items()})
+
+
+def by_enumeration(params, x, u, x_next, gamma, xi):
+    """The loss of one transition from all active sets of its inner problem, written as least squares in (λ, φ)."""
+    p = {k: v.detach().numpy() for k, v in params.tensors().items()}
+    n = len(p["c"])
+    r = p["A"] @ x.numpy() + p["B"] @ u.numpy() + p["d"] - x_next.numpy()
+    e = p["D"] @ x.numpy() + p["E"] @ u.numpy() + p["c"]
+    Jr, Je = np.hstack([p["C"], 0 * p["C"]]), np.hstack([p["F"], -np.eye(n)])
+    cross = np.block([[np.zeros((n, n)), np.eye(n)], [np.eye(n), np.zeros((n, n))]])
+    Q = Jr.T @ Jr + (cross + Je.T @ Je / gamma) / xi
+    q = Jr.T @ r + Je.T @ e / (gamma * xi)
+    least = np.inf
+    for chosen in itertools.product([False, True], repeat=2 * n):
+        free, z = np.flatnonzero(chosen), np.zeros(2 * n)
+        z[free] = np.linalg.lstsq(Q[np.ix_(free, free)], -q[free], rcond=None)[0]
+        if z.min() >= -1e-12:
+            least = min(least, 0.5 * z @ Q @ z + q @ z)
+    return least + 0.5 * r @ r + e @ e / (2 * gamma * xi)
+
+
+# --- one system per transition --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("part", [0.05, 0.5, 0.99])
+@pytest.mark.parametrize("xi", [1e-3, 0.3])
+def test_each_transition_has_the_loss_of_its_own_system(each, data, part, xi):
+    gamma = part * float(sigma(each.F).min())
+    found = violation_loss(each, *data, gamma, xi, reduction="none")
+    expected = [by_enumeration(each[i], *(v[i] for v in data), gamma, xi) for i in range(COUNT)]
+    torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), rtol=1e-8, atol=1e-8)
+    assert float(found.min()) > 0.01
+
+
+@pytest.mark.parametrize("gamma", [0.1, "auto"])
+def test_systems_that_are_equal_have_the_loss_and_gradient_of_one(build, data, gamma):
+    shared = learnable(build.params(seed=3))
+    repeated = learnable(LCSParams(**{k: v.expand(COUNT, *v.shape) for k, v in shared.tensors().items()}))
+    found = violation_loss(repeated, *data, gamma, 0.3)
+    expected = violation_loss(shared, *data, gamma, 0.3)
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+    found.backward()
+    expected.backward()
+    for name in NAMES:
+        left, right = getattr(repeated, name).grad, getattr(shared, name).grad
+        assert left.shape == (COUNT, *right.shape)
+        torch.testing.assert_close(left.sum(0), right, rtol=1e-9, atol=1e-11)
+
+
+def test_params_of_a_model_have_its_loss_bit_for_bit(build, data):
+    model = build.model(seed=3)
+    assert torch.equal(violation_loss(model.params(), *data), violation_loss(model, *data))
+    left = torch.autograd.grad(violation_loss(model.params(), *data), list(model.parameters()))
+    right = torch.autograd.grad(violation_loss(model, *data), list(model.parameters()))
+    for a, b in zip(left, right, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-13)
+    assert torch.equal(prediction_loss(model.params(), *data), prediction_loss(model, *data))
+
+
+@pytest.mark.parametrize("function", [violation_loss, prediction_loss])
+@pytest.mark.parametrize("own", [NAMES, ("A", "F"), ("C",), ("c", "d")], ids="-".join)
+def test_the_gradient_is_that_of_finite_differences_in_every_input(build, function, own):
+    tensors = build.lcs_tensors(seed=2, n_x=2, n_u=1, n_lam=2, batch=(3,))
+    tensors = {k: (v if k in own else v[0]).requires_grad_() for k, v in tensors.items()}
+    n = build.normal(4)
+    data = [n(3, 2).requires_grad_(), n(3, 1).requires_grad_(), n(3, 2).requires_grad_()]
+    extra = {"gamma": 0.1, "xi": 0.5} if function is violation_loss else {}
+
+    def loss(x, u, x_next, *values):
+        return function(LCSParams(*values), x, u, x_next, reduction="none", **extra)
+
+    assert gradcheck(loss, (*data, *tensors.values()), eps=1e-6, atol=1e-5, rtol=1e-5)
+
+
+def test_a_field_that_is_shared_gets_the_sum_of_the_gradients(each, data):
+    whole = learnable(each)
+    mixed = learnable(LCSParams(**{**each.tensors(), "A": each.A[0], "c": each.c[0]}))
+    expanded = {**mixed.detach().tensors(), "A": each.A[0].expand(COUNT, 4, 4), "c": each.c[0].expand(COUNT, 3)}
+    whole = learnable(LCSParams(**expanded))
+    violation_loss(mixed, *data, 0.05).backward()
+    violation_loss(whole, *data, 0.05).backward()
+    for name in NAMES:
+        left, right = getattr(mixed, name).grad, getattr(whole, name).grad
+        torch.testing.assert_close(left, right.sum(0) if name in "Ac" else right, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("function", [violation_loss, prediction_loss])
+def test_batch_dimensions_of_systems_and_data_broadcast(build, function):
+    params, n = build.params(batch=(3, 1)), build.normal(1)
+    x, u, x_next = n(5, 4), n(2), n(3, 5, 4)
+    extra = {"gamma": 0.01} if function is violation_loss else {}
+    found = function(params, x, u, x_next, reduction="none", **extra)
+    assert found.shape == (3, 5)
+    alone = function(params[2, 0], x[4], u, x_next[2, 4], reduction="none", **extra)
+    torch.testing.assert_close(found[2, 4], alone, rtol=1e-9, atol=1e-11)
+    with pytest.raises(ShapeError, match=r"x_?n?e?x?t?: its batch dimensions .* do not fit the others"):
+        function(params, x, u, n(2, 5, 4), **extra)
+
+
+@pytest.mark.parametrize("function", [violation_loss, prediction_loss])
+def test_an_empty_batch_of_systems_has_no_loss(build, function):
+    params = learnable(build.params(batch=(0,)))
+    x, u = torch.zeros(0, 4, dtype=torch.float64), torch.zeros(0, 2, dtype=torch.float64)
+    loss = function(params, x, u, x)
+    assert float(loss.detach()) == 0
+    loss.backward()
+    assert function(params, x, u, x, reduction="none").shape == (0,)
+    if function is violation_loss:
+        assert float(violation_loss(params, x, u, x, "auto").detach()) == 0
+
+
+def test_float32_systems_give_float32_losses(each, data):
+    narrow = learnable(each.to(torch.float32))
+    loss = violation_loss(narrow, *(v.float() for v in data), 0.05)
+    assert loss.dtype == torch.float32
+    torch.testing.assert_close(loss.detach().double(), violation_loss(each, *data, 0.05), rtol=1e-3, atol=1e-5)
+    loss.backward()
+    assert all(v.grad.dtype == torch.float32 for v in narrow.tensors().values())
+
+
+def test_what_the_gradient_of_systems_needs_cannot_be_changed_in_place_before_it(each, data):
+    params = learnable(each)
+    loss = violation_loss(params, *data, 0.05)
+    with torch.no_grad():
+        params.F.add_(1.0)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+
+
+def test_double_backward_through_systems_is_refused(each, data):
+    params = learnable(each)
+    with pytest.raises(DoubleBackwardError, match=r"violation_loss has first derivatives only.*create_graph=False"):
+        torch.autograd.grad(violation_loss(params, *data, 0.05), params.A, create_graph=True)
+
+
+# --- without contacts -----------------------------------------------------------------------------------------------
+
+
+def test_without_contacts_both_losses_are_half_the_squared_error(build, data):
+    model = build.model(n_lam=0)
+    x, u, x_next = data
+    r = x @ model.A.T + u @ model.B.T + model.d - x_next
+    for function in (violation_loss, prediction_loss):
+        for lcs in (model, model.params()):
+            found = function(lcs, *data, reduction="none")
+            torch.testing.assert_close(found, 0.5 * r.square().sum(-1))
+        model.zero_grad()
+        function(model, *data).backward()
+        torch.testing.assert_close(model.A.grad, (r.T @ x / COUNT).detach())
+    torch.testing.assert_close(violation_loss(model, *data, "auto"), prediction_loss(model, *data))
+    batch = LCSParams(**{k: v.expand(COUNT, *v.shape) for k, v in model.params().detach().tensors().items()})
+    torch.testing.assert_close(violation_loss(batch, *data), prediction_loss(model, *data).detach())
+
+
+# --- gamma ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+def test_auto_gamma_is_a_thousandth_below_its_bound(build, data, scale):
+    model = build.model(seed=3, scale=scale)
+    gamma = 0.999 * float(sigma(model.F))
+    torch.testing.assert_close(violation_loss(model, *data, "auto"), violation_loss(model, *data, gamma), rtol=1e-9,
+                               atol=0)  # fmt: skip
+    left, right = (torch.autograd.grad(violation_loss(model, *data, g), model.G)[0] for g in ("auto", gamma))
+    torch.testing.assert_close(left, right, rtol=1e-7, atol=1e-12)
+
+
+def test_auto_gamma_is_that_of_the_stiffest_transition_for_all(each, data):
+    gamma = 0.999 * float(sigma(each.F).min())
+    assert float(sigma(each.F).max()) > 1.1 * gamma
+    found = violation_loss(each, *data, "auto", reduction="none")
+    assert torch.equal(found, violation_loss(each, *data, gamma, reduction="none"))
+    assert not torch.allclose(found, violation_loss(each, *data, 0.9 * gamma, reduction="none"), rtol=1e-4)
+
+
+@pytest.mark.parametrize("xi", [1e-4, 0.01, 1.0])
+def test_the_inner_problem_is_solved_at_auto_gamma_where_it_is_nearly_singular(build, data, xi):
+    """C = 0 and F = 0.2·I: at the bound itself the inner Hessian is singular in every contact."""
+    tensors = build.lcs_tensors(seed=3)
+    tensors["C"], tensors["F"] = torch.zeros(4, 3).double(), 0.2 * torch.eye(3).double()
+    params = LCSParams(**tensors)
+    batch = LCSParams(**{**tensors, "F": tensors["F"].expand(COUNT, 3, 3)})
+    expected = [by_enumeration(params, *(v[i] for v in data), 0.999 * 0.4, xi) for i in range(COUNT)]
+    for system in (params, batch):
+        found = violation_loss(system, *data, "auto", xi, reduction="none")
+        torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), rtol=1e-9, atol=1e-9)
+
+
+def test_auto_gamma_follows_a_module_whose_contacts_stiffen(build, data):
+    model = build.model(seed=3, scale=0.1)
+    before = violation_loss(model, *data, "auto")
+    assert torch.equal(before, violation_loss(model, *data, 0.999 * float(sigma(model.F))))
+    with torch.no_grad():
+        model.G.copy_(3 * torch.eye(3))
+    with pytest.raises(GammaError):  # what was allowed is too little or too much once F has changed
+        violation_loss(model, *data, 1.01 * float(sigma(model.F)))
+    torch.testing.assert_close(violation_loss(model, *data, "auto"),
+                               violation_loss(model, *data, 0.999 * float(sigma(model.F))))  # fmt: skip
+
+
+@pytest.mark.parametrize("gamma", ["Auto", "0.1", None, True, torch.tensor(0.1)])
+def test_other_words_for_gamma_are_refused(build, data, gamma):
+    with pytest.raises(DTypeError, match="gamma: expected a number, got"):
+        violation_loss(build.model(), *data, gamma)
+
+
+def test_gamma_above_the_bound_of_one_transition_names_it(each, data):
+    bounds = sigma(each.F)
+    worst = int(bounds.argmin())
+    others = sorted(bounds.tolist())
+    gamma = 0.5 * (others[0] + others[1])
+    with pytest.raises(GammaError) as error:
+        violation_loss(each, *data, gamma)
+    for part in (f"{float(bounds[worst]):.6g}", f"{gamma:.6g} at batch index {worst}", "gamma='auto'"):
+        assert part in str(error.value)
+    loss = violation_loss(each, *data, gamma, check_gamma=False, reduction="none")
+    fine = [i for i in range(COUNT) if i != worst]
+    alone = violation_loss(each[fine], *(v[fine] for v in data), gamma, reduction="none")
+    torch.testing.assert_close(loss[fine], alone, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.5, 20.0])
+def test_a_fixed_gamma_is_let_through_for_every_transition_on_request(each, data, factor):
+    gamma = factor * float(sigma(each.F).max())
+    params = learnable(each)
+    loss = violation_loss(params, *data, gamma, check_gamma=False, reduction="none")
+    assert bool(torch.isfinite(loss).all())
+    one_by_one = [violation_loss(each[i], *(v[i] for v in data), gamma, check_gamma=False) for i in range(COUNT)]
+    torch.testing.assert_close(loss.detach(), torch.stack(one_by_one), rtol=1e-5, atol=1e-8)
+    loss.sum().backward()
+    assert all(bool(torch.isfinite(v.grad).all()) for v in params.tensors().values())
+
+
+def test_gamma_zero_is_refused_for_systems_too(each, data):
+    for check in (True, False):
+        with pytest.raises(GammaError, match="0 < gamma"):
+            violation_loss(each, *data, 0.0, check_gamma=check)
+
+
+def test_a_gamma_that_double_precision_cannot_resolve_is_refused(each, data):
+    with pytest.raises(GammaError, match=r"gamma: expected at least .* in double precision.*batch index \d"):
+        violation_loss(each, *data, 1e-14)
+    with pytest.raises(
+        GammaError, match=r"gamma, xi: expected a product that double precision resolves.*at batch index"
+    ):
+        violation_loss(each, *data, 1e-9, 1e-9)
+    shared = each[0]
+    with pytest.raises(GammaError, match="gamma, xi: expected a product"):
+        violation_loss(shared, *data, 1e-9, 1e-9)
+
+
+def test_an_F_that_was_spoiled_after_its_check_is_named(each, data):
+    with torch.no_grad():
+        each.F[5] = -torch.eye(3)
+    with pytest.raises(NotPositiveDefiniteError, match=r"got smallest eigenvalue -2\.000e\+00 at batch index 5"):
+        violation_loss(each, *data, 0.05)
+
+
+# --- modules --------------------------------------------------------------------------------------------------------
+
+
+class Moving(torch.nn.Module):
+    """An LCSModule whose drift depends on the state, and on a context if there is one."""
+
+    def __init__(self, build, per_transition=True):
+        super().__init__()
+        self.inner = build.model(seed=3)
+        self.n_x, self.n_u, self.n_lam = 4, 2, 3
+        self.mass = torch.nn.Parameter(torch.ones((), dtype=torch.float64))
+        self.per_transition, self.seen = per_transition, []
+
+    def params(self, x=None, context=None):
+        self.seen.append((x, context))
+        fields = self.inner.params().tensors()
+        if self.per_transition:
+            fields["d"] = fields["d"] + self.mass * x.square() + (0 if context is None else context)
+        return LCSParams(**fields)
+
+
+@pytest.mark.parametrize("function", [violation_loss, prediction_loss])
+def test_a_module_is_asked_for_the_system_of_the_states(build, data, function):
+    module, context = Moving(build), build.normal(9)(COUNT, 1)
+    loss = function(module, *data, context=context, reduction="none")
+    assert len(module.seen) == 1
+    assert module.seen[0][0] is data[0]
+    assert module.seen[0][1] is context
+    by_hand = function(module.params(data[0], context), *data, reduction="none")
+    assert torch.equal(loss, by_hand)
+    assert not torch.allclose(loss, function(module, *data, reduction="none"))
+    loss.sum().backward()
+    assert float(module.mass.grad.abs()) > 0
+    assert all(float(p.grad.abs().max()) > 0 for p in module.inner.parameters())
+
+
+def test_the_gradient_of_a_module_is_that_of_finite_differences(build, data):
+    module = Moving(build)
+
+    def loss(mass):
+        with torch.no_grad():
+            module.mass.fill_(mass)
+        return violation_loss(module, *data, xi=0.5)
+
+    loss(1.0).backward()
+    quotient = float((loss(1.0 + 1e-6) - loss(1.0 - 1e-6)).detach() / 2e-6)
+    assert float(module.mass.grad) == pytest.approx(quotient, rel=1e-6)
+
+
+def test_a_module_with_one_system_for_all_is_like_its_model(build, data):
+    module = Moving(build, per_transition=False)
+    assert torch.equal(violation_loss(module, *data), violation_loss(module.inner, *data))
+
+
+def test_a_model_with_params_of_its_own_is_asked_for_them(build, data):
+    class Shifted(LCSModel):
+        def params(self, x=None, context=None):
+            fields = super().params().tensors()
+            return LCSParams(**{**fields, "d": fields["d"] + x})
+
+    shifted = Shifted(4, 2, 3)
+    shifted.load_state_dict(build.model(seed=3).state_dict())
+    for function in (violation_loss, prediction_loss):
+        found = function(shifted, *data, reduction="none")
+        assert torch.equal(found, function(shifted.params(data[0]), *data, reduction="none"))
+    x, u, _ = data
+    assert torch.equal(shifted(x, u).x_next, shifted.params(x).step(x, u).x_next)
+    assert torch.equal(shifted.rollout(x, u[:, None])[:, 1], shifted(x, u).x_next)
+
+
+@pytest.mark.parametrize("function", [violation_loss, prediction_loss])
+def test_what_is_no_system_is_refused(build, each, data, function):
+    sequence = LCSSequence(**each.tensors())
+    for value in (None, "model", torch.nn.Linear(2, 2), sequence):
+        with pytest.raises(
+            DTypeError, match=r"lcs: expected an LCSModel, another LCSModule or LCSParams, got .*; the st"
+        ):
+            function(value, *data)
+    module = Moving(build)
+    module.params = lambda x=None, context=None: sequence
+    with pytest.raises(DTypeError, match=r"Moving.params: expected LCSParams for transitions.*got LCSSequence; give"):
+        function(module, *data)
+    with pytest.raises(InvalidInputError, match=r"context: expected None beside LCSParams.*; leave it out"):
+        function(each, *data, context=data[0])
+    with pytest.raises(NonFiniteError, match="context: expected finite numbers"):
+        function(Moving(build), *data, context=torch.full((1,), torch.nan))
+    with pytest.raises(ShapeError, match=r"x: expected shape \(\.\.\., n_x=4\), got \(8, 2\)"):
+        function(Moving(build), data[1], *data[1:])

@@ -1,0 +1,244 @@
+"""Units suggested from data: the same whatever the units of the data, and a model learns as well in any."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from difflcs import LCSModel, LCSModule, LCSParams, LCSSequence, ScaledLCS, suggest_scales, violation_loss
+from difflcs.errors import DeviceError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
+
+
+@pytest.fixture
+def data(build):
+    """Transitions of a model, with states far from zero and of unlike sizes."""
+    n = build.normal(5)
+    x, u = n(200, 4), n(200, 2)
+    x_next = build.model(seed=3)(x, u).x_next.detach()
+    size, origin = torch.tensor([300.0, 1e-3, 1.0, 40.0]).double(), torch.tensor([1e4, -2.0, 0.0, 7.0]).double()
+    return x * size + origin, 1e-2 * u, x_next * size + origin
+
+
+def block(count, seed):
+    """A block between two fingers of 1 cm radius, as docs/own_system.md has it: x, u, x_next in metres."""
+    random = np.random.default_rng(seed)
+    block = random.uniform(-0.1, 0.1, count)
+    left, right = block - random.uniform(0, 0.06, count), block + random.uniform(0, 0.06, count)
+    u = random.uniform(-0.05, 0.05, (count, 2))
+    new_left, new_right = left + u[:, 0], right + u[:, 1]
+    middle, crossed = (new_left + new_right) / 2, new_left > new_right
+    new_left, new_right = np.where(crossed, middle, new_left), np.where(crossed, middle, new_right)
+    new_block = np.minimum(np.maximum(block, new_left), new_right)
+    radius = np.array([0, -0.01, 0.01])
+    x, x_next = (np.stack(v, 1) + radius for v in ((block, left, right), (new_block, new_left, new_right)))
+    return tuple(torch.from_numpy(v) for v in (x, u, x_next))
+
+
+def in_units(data, size, origin):
+    x, u, x_next = data
+    return size * (x + origin), size * u, size * (x_next + origin)
+
+
+# --- what is suggested ----------------------------------------------------------------------------------------------
+
+
+def test_states_and_actions_are_about_one_in_the_suggested_units(data):
+    scales = suggest_scales(*data)
+    x, u, x_next = scales.normalise(*data)
+    both = torch.cat([x, x_next])
+    torch.testing.assert_close(both.mean(0), torch.zeros(4).double(), rtol=0, atol=1e-9)
+    torch.testing.assert_close(both.square().mean(0), torch.ones(4).double())
+    torch.testing.assert_close(u.square().mean(0), torch.ones(2).double())
+    step = (x_next - x).square().mean(0).max()
+    assert scales.relaxation == pytest.approx(0.05 * float(step), rel=1e-12)
+    assert scales.xi == 0.01
+
+
+def test_units_of_the_data_do_not_change_the_data_in_the_suggested_ones(data):
+    expected = suggest_scales(*data)
+    size, origin = torch.tensor([1e3, 1e-2, 57.3, 2.0]).double(), torch.tensor([5.0, 0.1, -1.0, 0.0]).double()
+    x, u, x_next = data
+    other = size * (x + origin), 0.3 * u, size * (x_next + origin)
+    found = suggest_scales(*other)
+    torch.testing.assert_close(found.state, size * expected.state)
+    torch.testing.assert_close(found.action, 0.3 * expected.action)
+    torch.testing.assert_close(found.center, size * (expected.center + origin))
+    assert found.xi == expected.xi
+    assert found.relaxation == pytest.approx(expected.relaxation, rel=1e-9)
+    for left, right in zip(found.normalise(*other), expected.normalise(*data), strict=True):
+        torch.testing.assert_close(left, right, rtol=1e-8, atol=1e-8)
+
+
+def test_the_relaxation_is_about_the_default_for_fingers_like_the_papers():
+    """Displacements of up to 1.5 cm a step: the layer's default of 1e-5 m²."""
+    random = np.random.default_rng(0)
+    x = torch.from_numpy(random.uniform(-0.05, 0.05, (2000, 2)))
+    u = torch.from_numpy(random.uniform(-0.015, 0.015, (2000, 2)))
+    scales = suggest_scales(x, u, x + u)
+    in_square_metres = scales.relaxation * float(scales.state.max()) ** 2
+    assert 2e-6 < in_square_metres < 2e-5
+
+
+def test_a_state_that_never_changes_and_an_action_that_is_never_used_keep_their_unit(data):
+    x, u, x_next = (v.clone() for v in data)
+    x[:, 1] = x_next[:, 1] = 0.1
+    u[:, 0] = 0
+    scales = suggest_scales(x, u, x_next)
+    assert float(scales.state[1]) == 1
+    assert float(scales.action[0]) == 1
+    assert float(scales.center[1]) == pytest.approx(0.1)
+    assert all(bool(torch.isfinite(v).all()) for v in scales.normalise(x, u, x_next))
+
+
+def test_leading_dimensions_dtypes_and_gradients_of_the_data_do_not_matter(data):
+    expected = suggest_scales(*data)
+    shaped = suggest_scales(*(v.reshape(4, 50, -1).requires_grad_() for v in data))
+    narrow = suggest_scales(*(v.float() for v in data))
+    for name in ("center", "state", "action"):
+        assert torch.equal(getattr(shaped, name), getattr(expected, name))
+        assert not getattr(shaped, name).requires_grad
+        torch.testing.assert_close(getattr(narrow, name), getattr(expected, name), rtol=1e-4, atol=1e-5)
+    assert expected.normalise(*(v.float() for v in data))[0].dtype == torch.float32
+
+
+def test_scales_are_a_frozen_record(data):
+    scales = suggest_scales(*data)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        scales.xi = 1.0
+
+
+# --- there and back -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("batch", [(), (200,)])
+def test_a_system_that_is_brought_back_predicts_the_same_in_the_units_of_the_data(build, data, batch):
+    scales = suggest_scales(*data)
+    inner = build.params(seed=3, batch=batch)
+    x, u, _ = scales.normalise(*data)
+    expected = inner.step(x, u)
+    found = scales.params(inner).step(*data[:2])
+    assert 10 < int((expected.lam > 0).sum()) < 500
+    torch.testing.assert_close(scales.states(found.x_next), expected.x_next, rtol=1e-7, atol=1e-7)
+    torch.testing.assert_close(found.lam, expected.lam, rtol=1e-7, atol=1e-7)
+    assert torch.equal(scales.params(inner).F, inner.F)
+
+
+def test_a_sequence_is_brought_back_stage_by_stage(build, data):
+    scales, systems = suggest_scales(*data), [build.params(seed=s) for s in range(3)]
+    sequence = scales.params(LCSSequence.stack(systems))
+    for k, system in enumerate(systems):
+        for name, value in scales.params(system).tensors().items():
+            torch.testing.assert_close(getattr(sequence.stage(k), name), value)
+
+
+def test_a_scaled_module_is_a_module_in_the_units_of_the_data(build, data):
+    scales, model = suggest_scales(*data), build.model(seed=3)
+    scaled = ScaledLCS(model, scales)
+    assert isinstance(scaled, LCSModule)
+    assert (scaled.n_x, scaled.n_u, scaled.n_lam) == (4, 2, 3)
+    found = scaled.params(data[0]).step(*data[:2]).x_next
+    expected = model(*scales.normalise(*data)[:2]).x_next
+    torch.testing.assert_close(scales.states(found), expected, rtol=1e-7, atol=1e-7)
+    found.sum().backward()
+    assert all(float(p.grad.abs().max()) > 0 for p in model.parameters())
+    assert list(scaled.parameters()) == list(model.parameters())
+
+
+def test_a_scaled_module_asks_with_states_in_its_own_units(build, data):
+    scales, seen = suggest_scales(*data), []
+
+    class Asked(LCSModel):
+        def params(self, x=None, context=None):
+            seen.append((x, context))
+            return super().params()
+
+    scaled = ScaledLCS(Asked(4, 2, 3), scales)
+    context = torch.ones(2)
+    scaled.params(data[0], context)
+    scaled.params()
+    torch.testing.assert_close(seen[0][0], scales.normalise(*data)[0])
+    assert seen[0][1] is context
+    assert seen[1] == (None, None)
+
+
+def test_the_loss_grows_with_the_square_of_a_unit_of_everything_whatever_xi(build):
+    """Why ξ does not follow the data."""
+    n, s = build.normal(1), 1000.0
+    params, x, u, x_next = build.params(seed=3), n(20, 4), n(20, 2), n(20, 4)
+    other = LCSParams(**{**params.tensors(), "c": s * params.c, "d": s * params.d})
+    for xi in (1e-3, 0.01, 1.0):
+        small = violation_loss(params, x, u, x_next, 0.1, xi)
+        torch.testing.assert_close(violation_loss(other, s * x, s * u, s * x_next, 0.1, xi), s**2 * small, rtol=1e-9,
+                                   atol=0)  # fmt: skip
+
+
+def fit(data, **options):
+    generator = torch.Generator().manual_seed(0)
+    model = LCSModel(3, 2, 2, init_scale=0.1, generator=generator)
+    optimiser = torch.optim.Adam(model.parameters(), lr=0.02)
+    for _ in range(400):
+        rows = torch.randint(len(data[0]), (100,), generator=generator)
+        optimiser.zero_grad()
+        violation_loss(model, *(v[rows] for v in data), **options).backward()
+        optimiser.step()
+    return model.params().detach()
+
+
+@pytest.mark.slow
+def test_a_model_learns_as_well_from_millimetres_as_from_metres(one_thread):
+    """From a corner 30 cm away, in any unit: with the suggested units alike, with the defaults twice as badly."""
+    errors = {}
+    for unit in (1.0, 1000.0):
+        data, unseen = (in_units(block(2000, seed), unit, 0.3) for seed in (0, 1))
+        scales = suggest_scales(*data)
+        learned = scales.params(fit(scales.normalise(*data), gamma="auto", xi=scales.xi))
+        for name, params in (("suggested", learned), ("defaults", fit(data))):
+            x, u, x_next = unseen
+            errors[name, unit] = float((params.step(x, u).x_next - x_next).norm() / (x_next - x).norm())
+    assert errors["suggested", 1000.0] == pytest.approx(errors["suggested", 1.0], rel=0.01)
+    assert errors["suggested", 1000.0] < 0.3
+    assert errors["defaults", 1000.0] > 1.5 * errors["suggested", 1000.0]
+
+
+# --- bad input ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["x", "u", "x_next"])
+def test_transitions_that_cannot_be_used_are_refused(data, name):
+    good = dict(zip(("x", "u", "x_next"), data, strict=True))
+
+    def refuse(error, match, value):
+        with pytest.raises(error, match=match):
+            suggest_scales(**{**good, name: value})
+
+    refuse(DTypeError, f"{name}: expected float32 or float64, got .*int64.*; convert", good[name].long())
+    refuse(DTypeError, rf"{name}: expected a torch.Tensor, got list.*; wrap", good[name][:2].tolist())
+    refuse(DeviceError, f"{name}: expected a tensor with data.*; move", good[name].to("meta"))
+    bad = good[name].clone()
+    bad[3, 1] = torch.nan
+    refuse(NonFiniteError, rf"{name}: expected finite numbers, got 1 .* at index \(3, 1\).*; find", bad)
+    refuse(InvalidInputError, rf"{name}: expected shape \(\.\.\., n\) of many.*; give a batch", good[name][0])
+    refuse(ShapeError, "batch dimensions .* do not fit the others", good[name][:7])
+
+
+def test_too_little_data_and_states_that_never_move_are_refused(data):
+    x, u, x_next = data
+    with pytest.raises(InvalidInputError, match="expected at least two transitions, got 1; give more data"):
+        suggest_scales(x[:1], u[:1], x_next[:1])
+    with pytest.raises(InvalidInputError, match="x_next: expected states that change, got x itself; give"):
+        suggest_scales(x, u, x)
+    with pytest.raises(ShapeError, match=r"x_next: expected shape \(\.\.\., n_x=4\), got \(200, 3\)"):
+        suggest_scales(x, u, x_next[:, :3])
+
+
+def test_systems_and_data_of_other_sizes_are_refused(build, data):
+    scales = suggest_scales(*data)
+    with pytest.raises(InvalidInputError, match=r"params: expected n_x=4 and n_u=2 like the data.*got 3 and 2; ask"):
+        scales.params(build.params(n_x=3))
+    with pytest.raises(ShapeError, match=r"u: expected shape \(\.\.\., n_u=2\), got \(200, 4\)"):
+        scales.normalise(data[0], data[0], data[2])
+    with pytest.raises(ShapeError, match=r"x_next: expected shape \(\.\.\., n_x=4\), got \(200, 2\)"):
+        scales.normalise(*data[:2], data[1])

@@ -1,0 +1,379 @@
+"""solve_lcp, the losses and the records under torch.func, vectorised jacobians and torch.compile."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+import torch
+from torch.autograd.functional import jacobian
+from torch.func import functional_call, grad, jacrev, vmap
+
+from difflcs import LCSParams, LCSSequence, Status, prediction_loss, solve_lcp, violation_loss
+from difflcs.errors import DoubleBackwardError, GammaError, NonFiniteError, NotPositiveDefiniteError, SolveWarning
+
+COUNT = 6
+exact_and_relaxed = pytest.mark.parametrize("relaxation", [0.0, 1e-3])
+
+
+@pytest.fixture
+def lcps(build):
+    """F (6, 4, 4) and q (6, 4); contacts open and closed, none at a kink."""
+    F, q = build.params(seed=1, n_lam=4, batch=(COUNT,)).F, build.normal(2)(COUNT, 4)
+    lam, w, _ = solve_lcp(F, q)
+    assert float(torch.maximum(lam, w).min()) > 1e-4
+    assert 5 < int((lam > 0).sum()) < 20
+    return F, q
+
+
+@pytest.fixture
+def data(build):
+    n = build.normal(5)
+    return n(COUNT, 4), n(COUNT, 2), n(COUNT, 4)
+
+
+def lam_of(relaxation):
+    return lambda F, q: solve_lcp(F, q, relaxation).lam
+
+
+# --- solve_lcp ------------------------------------------------------------------------------------------------------
+
+
+@exact_and_relaxed
+@pytest.mark.parametrize("in_dims", [(0, 0), (None, 0), (0, None), (2, 1)])
+def test_vmap_solves_what_a_loop_solves(lcps, relaxation, in_dims):
+    F, q = lcps
+    at = [F if in_dims[0] is not None else F[0], q if in_dims[1] is not None else q[0]]
+    moved = [v if dim is None else v.movedim(0, dim) for v, dim in zip(at, in_dims, strict=True)]
+    found = vmap(lambda F, q: tuple(solve_lcp(F, q, relaxation)), in_dims)(*moved)
+    for i in range(COUNT):
+        one = solve_lcp(*(v if dim is None else v[i] for v, dim in zip(at, in_dims, strict=True)), relaxation)
+        for value, expected in zip(found, one, strict=True):
+            assert torch.equal(value[i], expected)
+
+
+@exact_and_relaxed
+def test_vmap_over_batches_that_broadcast_inside(lcps, relaxation):
+    F, q = lcps
+    every = vmap(lambda F: solve_lcp(F, q, relaxation).lam)(F)
+    assert every.shape == (COUNT, COUNT, 4)
+    nested = vmap(lambda F: vmap(lambda q: solve_lcp(F, q, relaxation).lam)(q))(F)
+    assert torch.equal(nested, every)
+    assert torch.equal(every[2], solve_lcp(F[2], q, relaxation).lam)
+    assert vmap(lambda F: solve_lcp(F, q[:0]).lam)(F).shape == (COUNT, 0, 4)
+    assert vmap(lambda q: solve_lcp(F[:, None], q).lam)(q).shape == (COUNT, COUNT, 1, 4)
+
+
+@exact_and_relaxed
+@pytest.mark.parametrize("argument", [0, 1])
+def test_every_way_to_a_jacobian_gives_the_same(lcps, relaxation, argument):
+    F, q = lcps
+    f = lam_of(relaxation)
+
+    def of(value):
+        return f(*((value, q) if argument == 0 else (F[0], value)))
+
+    at = F[0] if argument == 0 else q
+    expected = jacobian(of, at)
+    assert float(expected.abs().max()) > 0.1
+    for found in (jacobian(of, at, vectorize=True), jacrev(of)(at)):
+        torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-14)
+
+
+@exact_and_relaxed
+def test_a_jacobian_for_each_problem_of_a_batch(lcps, relaxation):
+    F, q = lcps
+    found_F, found_q = vmap(jacrev(lam_of(relaxation), (0, 1)))(F, q)
+    for i in range(COUNT):
+        expected = jacobian(lam_of(relaxation), (F[i], q[i]))
+        torch.testing.assert_close((found_F[i], found_q[i]), expected, rtol=1e-12, atol=1e-14)
+
+
+@exact_and_relaxed
+def test_grad_is_the_gradient_of_backward(lcps, relaxation):
+    F, q = lcps
+
+    def total(F, q):
+        lam, w, _ = solve_lcp(F, q, relaxation)
+        return (lam.square() + 3 * w.sin()).sum()
+
+    def mapped(F, q):
+        return vmap(total, (None, 0))(F, q).sum()
+
+    shared, points = F[0].clone().requires_grad_(), q.clone().requires_grad_()
+    total(shared, points).backward()
+    for function in (total, mapped):
+        found = grad(function, (0, 1))(F[0], q)
+        torch.testing.assert_close(found, (shared.grad, points.grad), rtol=1e-12, atol=1e-14)
+    each = vmap(grad(total), (None, 0))(F[0], q)  # gradients of each problem for the F that they share
+    torch.testing.assert_close(each.sum(0), shared.grad, rtol=1e-12, atol=1e-14)
+    alone = vmap(grad(total, (0, 1)))(F, q)
+    for i in range(COUNT):
+        torch.testing.assert_close(tuple(v[i] for v in alone), grad(total, (0, 1))(F[i], q[i]), rtol=1e-12, atol=1e-14)
+
+
+def test_batched_gradients_of_a_graph_that_was_made_before(lcps):
+    F, q = lcps[0].requires_grad_(), lcps[1].requires_grad_()
+    lam, w, _ = solve_lcp(F, q)
+    upstream = torch.eye(COUNT * 4, dtype=torch.float64).reshape(-1, COUNT, 4)
+    many = torch.autograd.grad((lam, w), (F, q), (upstream, 2 * upstream), is_grads_batched=True, retain_graph=True)
+    for k in (0, 7, 23):
+        one = torch.autograd.grad((lam, w), (F, q), (upstream[k], 2 * upstream[k]), retain_graph=True)
+        for left, right in zip(many, one, strict=True):
+            torch.testing.assert_close(left[k], right, rtol=1e-12, atol=1e-14)
+
+
+def test_a_gradient_inside_an_outer_graph_is_a_gradient_of_it(lcps):
+    """torch.func.grad inside code that is differentiated for something else, on which the inner gradient is linear."""
+    F, q = lcps
+    scale = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
+    inner = grad(lambda q: solve_lcp(F, q).lam.sum())(q)
+    (scale * inner.sum()).backward()
+    assert scale.grad is not None
+    assert float(scale.grad) == pytest.approx(float(inner.sum()))
+
+
+REFUSED = {
+    "grad of grad": lambda f, z: grad(lambda z: grad(lambda z: f(z).square().sum())(z).sum())(z),
+    "jacobian of jacobian": lambda f, z: jacrev(jacrev(f))(z),
+    "mapped": lambda f, z: vmap(grad(lambda z: grad(lambda z: f(z).square().sum())(z).sum()))(z.expand(2, *z.shape)),
+    "Hessian": lambda f, z: torch.autograd.functional.hessian(lambda z: f(z).square().sum(), z),
+    "vectorised, recorded": lambda f, z: jacobian(f, z.requires_grad_(), vectorize=True, create_graph=True),
+    "backward through grad": lambda f, z: grad(lambda z: f(z).square().sum())(z.requires_grad_()).sum().backward(),
+    "create_graph": lambda f, z: torch.autograd.grad(f(z.requires_grad_()).sum(), z, create_graph=True),
+}
+
+
+@pytest.mark.parametrize("how", REFUSED)
+@pytest.mark.parametrize("what", ["solve_lcp", "violation_loss", "each"])
+def test_second_derivatives_are_refused_everywhere(build, lcps, data, what, how):
+    F, q = lcps
+    x, u, x_next = data
+    systems = {"violation_loss": build.model(seed=3), "each": build.params(seed=3, batch=(COUNT,))}
+    if what == "solve_lcp":
+        function, at = (lambda q: solve_lcp(F, q).lam), q.clone()
+    else:
+        at = x.clone()
+
+        def function(x):
+            return violation_loss(systems[what], x, u, x_next, 0.02, reduction="none")
+
+    name = "solve_lcp" if what == "solve_lcp" else "violation_loss"
+    with pytest.raises(DoubleBackwardError, match=rf"{name} has first derivatives only; expected create_graph=False"):
+        REFUSED[how](function, at)
+
+
+def test_numbers_that_are_hidden_from_the_checks_are_checked_by_the_solver(lcps):
+    F, q = lcps
+    q = q.clone()
+    q[3, 1] = torch.nan
+    with pytest.raises(NonFiniteError, match=r"q: expected finite numbers, got 1 .* at index \(3, 1\)"):
+        vmap(lambda q: solve_lcp(F[0], q).lam)(q)
+    F = F.clone()
+    F[1, 0, 0] = torch.inf
+    with pytest.raises(NonFiniteError, match="F: expected finite numbers, got 1"):
+        grad(lambda F: solve_lcp(F, lcps[1]).lam.sum())(F)
+
+
+def test_a_failure_under_vmap_warns_and_has_no_gradient(lcps):
+    F, q = lcps[0].clone(), lcps[1].clone()
+    F[2], q[2] = -torch.eye(4), -1.0
+    with pytest.warns(SolveWarning, match="1 of 6 LCPs were not solved"):
+        status = vmap(lambda F, q: solve_lcp(F, q).status)(F, q)
+    assert (status != Status.CONVERGED).tolist() == [i == 2 for i in range(COUNT)]
+    with pytest.warns(SolveWarning):
+        found = vmap(grad(lambda q, F: solve_lcp(F, q).lam.sum()))(q, F)
+    assert float(found[2].abs().max()) == 0
+    assert torch.equal(found[1], grad(lambda q: solve_lcp(F[1], q).lam.sum())(q[1]))
+
+
+def test_float32_stays_float32_under_transforms(lcps):
+    F, q = (v.float() for v in lcps)
+    assert vmap(lambda F, q: solve_lcp(F, q).lam)(F, q).dtype == torch.float32
+    found = vmap(jacrev(lambda q, F: solve_lcp(F, q).lam))(q, F)
+    assert found.dtype == torch.float32
+    expected = vmap(jacrev(lambda q, F: solve_lcp(F, q).lam))(q.double(), F.double())
+    torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-4)
+
+
+# --- losses ---------------------------------------------------------------------------------------------------------
+
+
+class Loss(torch.nn.Module):
+    """A loss of a model, for functional_call."""
+
+    def __init__(self, lcs, function, **options):
+        super().__init__()
+        self.lcs, self.function, self.options = lcs, function, options
+
+    def forward(self, *data):
+        return self.function(self.lcs, *data, **self.options)
+
+
+LOSSES = {
+    "violation": (violation_loss, {"gamma": 0.1, "xi": 0.3}),
+    "auto": (violation_loss, {"gamma": "auto", "xi": 0.3}),
+    "fixed": (violation_loss, {"gamma": 5.0, "xi": 0.3, "check_gamma": False}),
+    "prediction": (prediction_loss, {}),
+}
+
+
+@pytest.mark.parametrize("which", LOSSES)
+def test_gradients_of_a_model_by_functional_call(build, data, which):
+    function, options = LOSSES[which]
+    model = build.model(seed=3)
+    loss = Loss(model, function, **options)
+    values = {k: p.detach().clone() for k, p in loss.named_parameters()}
+
+    def of(values, *data):
+        return functional_call(loss, values, data)
+
+    eager = loss(*data)
+    eager.backward()
+    expected = {f"lcs.{k}": p.grad for k, p in model.named_parameters()}
+    torch.testing.assert_close(grad(of)(values, *data), expected, rtol=1e-9, atol=1e-12)
+    each = vmap(of, (None, 0, 0, 0))(values, *data)
+    torch.testing.assert_close(each.mean(), eager.detach(), rtol=1e-12, atol=1e-14)
+    per_sample = vmap(grad(of), (None, 0, 0, 0))(values, *data)
+    torch.testing.assert_close({k: v.mean(0) for k, v in per_sample.items()}, expected, rtol=1e-9, atol=1e-12)
+    for i in (0, 4):
+        alone = grad(of)(values, *(v[i : i + 1] for v in data))
+        torch.testing.assert_close({k: v[i] for k, v in per_sample.items()}, alone, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("gamma", [0.05, "auto"])
+def test_an_ensemble_of_models_is_mapped(build, data, gamma):
+    """Each member its own γ, as in a loop, where "auto" is asked."""
+    models = [build.model(seed=s) for s in range(3)]
+    stacked = {f"lcs.{k}": torch.stack([m.state_dict()[k] for m in models]) for k in models[0].state_dict()}
+    loss = Loss(models[0], violation_loss, gamma=gamma)
+    found = vmap(lambda values: functional_call(loss, values, data))(stacked)
+    expected = torch.stack([violation_loss(m, *data, gamma).detach() for m in models])
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("which", ["model", "shared", "each"])
+def test_every_way_to_a_jacobian_of_the_loss_gives_the_same(build, data, which):
+    x, u, x_next = data
+    model = build.model(seed=3)
+    lcs = {"model": model, "shared": model.params().detach(), "each": build.params(seed=3, batch=(COUNT,))}[which]
+
+    def of(x):
+        return violation_loss(lcs, x, u, x_next, 0.02, 0.3, reduction="none")
+
+    expected = jacobian(of, x)
+    assert float(expected.abs().max()) > 0.1
+    for found in (jacobian(of, x, vectorize=True), jacrev(of)(x)):
+        torch.testing.assert_close(found.detach(), expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("reduction", ["mean", "none"])
+def test_batched_gradients_of_every_parameter_of_a_loss(build, data, reduction):
+    model = build.model(seed=3)
+    inputs = [*model.parameters(), *(v.requires_grad_() for v in data)]
+    loss = violation_loss(model, *data, reduction=reduction)
+    upstream = build.normal(1)(5, *loss.shape)
+    many = torch.autograd.grad(loss, inputs, upstream, is_grads_batched=True, retain_graph=True)
+    for k in range(5):
+        one = torch.autograd.grad(loss, inputs, upstream[k], retain_graph=True)
+        for left, right in zip(many, one, strict=True):
+            torch.testing.assert_close(left[k], right, rtol=1e-9, atol=1e-12)
+
+
+def test_a_jacobian_for_a_field_that_is_shared_and_one_that_is_not(build, data):
+    params = build.params(seed=3, batch=(COUNT,))
+    for name, value in (("A", params.A[0]), ("F", params.F), ("c", params.c[:1]), ("d", params.d)):
+
+        def of(value, name=name):
+            fields = {**params.tensors(), name: value}
+            return violation_loss(LCSParams(**fields), *data, 0.02, 0.3, reduction="none")
+
+        expected = jacobian(of, value)
+        for found in (jacobian(of, value, vectorize=True), jacrev(of)(value)):
+            torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_what_vmap_hides_from_the_records_is_checked_by_the_loss(build, data):
+    params = build.params(seed=3)
+    F = torch.stack([params.F, -params.F, params.F])
+
+    def of(F):
+        return violation_loss(LCSParams(**{**params.tensors(), "F": F}), *data, 0.05)
+
+    with pytest.raises(NotPositiveDefiniteError, match="expected F \\+ Fᵀ positive definite"):
+        vmap(of)(F)
+    with pytest.raises(GammaError, match="0 < gamma <= sigma_min"):
+        vmap(lambda F: violation_loss(LCSParams(**{**params.tensors(), "F": F}), *data, 1e3))(F[[0, 2]])
+    x = data[0].clone()
+    x[2, 3] = torch.nan
+    with pytest.raises(NonFiniteError, match="x: expected finite numbers, got 1"):
+        vmap(lambda x, u, y: violation_loss(params, x, u, y))(x, *data[1:])
+
+
+# --- records --------------------------------------------------------------------------------------------------------
+
+
+def test_steps_and_rollouts_of_records_are_mapped(build):
+    n = build.normal(1)
+    params = build.params(batch=(COUNT,))
+    x, u = n(COUNT, 4), n(COUNT, 5, 2)
+
+    def of(fields, x, u):
+        system = LCSParams(**fields)
+        sequence = LCSSequence.stack([system] * 5)
+        return system.rollout(x, u), sequence.rollout(x, u), system.step(x, u[0]).lam
+
+    rolled, staged, lam = vmap(of)(params.tensors(), x, u)
+    assert torch.equal(rolled, params.rollout(x, u))
+    assert torch.equal(staged, rolled)
+    assert torch.equal(lam, params.step(x, u[:, 0]).lam)
+    x0 = x[0].clone().requires_grad_()
+    params[0].rollout(x0, u[0]).square().sum().backward()
+    found = grad(lambda x: of(params[0].tensors(), x, u[0])[0].square().sum())(x[0])
+    torch.testing.assert_close(found, x0.grad, rtol=1e-9, atol=1e-12)
+
+
+# --- torch.compile --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+# Where warnings are errors, the compiler trips over one of its own, which it otherwise hides.
+@pytest.mark.filterwarnings("ignore:The .grad attribute", "ignore::DeprecationWarning")
+@pytest.mark.parametrize("what", ["solve_lcp", "model", "rollout", "record", "violation", "each", "prediction"])
+def test_compiled_code_gives_the_result_and_gradient_of_eager_code(build, lcps, data, what):
+    model, params = build.model(seed=3), build.params(seed=3, batch=(COUNT,))
+    fields = params.tensors()
+    F, q = lcps
+    x, u, x_next = data
+    functions = {
+        "solve_lcp": (lambda q: (2 * solve_lcp(F, 1.5 * q).lam).sin(), q),
+        "model": (lambda x: model(2 * x, u).x_next.sin(), x),
+        "rollout": (lambda x: model.rollout(2 * x, u[:, None]).sin() + model.params().A.sum(), x),
+        "record": (lambda x: LCSParams(**fields)[1:3].to(torch.float64).step(2 * x[1:3], u[1:3]).x_next.sin(), x),
+        "violation": (lambda x: 2 * violation_loss(model, 2 * x, u, x_next), x),
+        "each": (lambda x: 2 * violation_loss(params, 2 * x, u, x_next, "auto"), x),
+        "prediction": (lambda x: 2 * prediction_loss(model, 2 * x, u, x_next), x),
+    }
+    function, at = functions[what]
+    torch.compiler.reset()
+    left, right = at.clone().requires_grad_(), at.clone().requires_grad_()
+    found, expected = torch.compile(function, backend="aot_eager")(left), function(right)
+    torch.testing.assert_close(found, expected, rtol=1e-14, atol=1e-14)
+    found.sum().backward()
+    expected.sum().backward()
+    torch.testing.assert_close(left.grad, right.grad, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.slow
+def test_the_compiler_is_not_imported_by_the_library_nor_by_a_call():
+    code = (
+        "import sys, torch, difflcs\n"
+        "m = difflcs.LCSModel(2, 1, 1)\n"
+        "x, u = torch.zeros(3, 2).double(), torch.zeros(3, 1).double()\n"
+        "difflcs.violation_loss(m, x, u, x).backward()\n"
+        "m(x, u).x_next.sum().backward()\n"
+        "assert 'torch._dynamo' not in sys.modules\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
