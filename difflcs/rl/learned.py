@@ -59,6 +59,13 @@ def check_module(lcs: object, env: VectorEnv | None = None, name: str = "lcs") -
     return lcs
 
 
+def check_learned(learned: object, env: VectorEnv | None = None, name: str = "actor") -> nn.Module:
+    """The same for what is behind a policy, where a network is no system and needs no sizes."""
+    if isinstance(learned, nn.Module) and not isinstance(learned, LCSModule):
+        return learned
+    return check_module(learned, env, name)
+
+
 def check_depends(loss: Tensor) -> None:
     """Refuse a loss that no parameter has a part in, where torch would speak of a grad_fn."""
     if not loss.requires_grad:

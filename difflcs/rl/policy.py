@@ -100,8 +100,8 @@ class MLPGaussian(GaussianParameters):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Evaluate the network."""
-        seen = [tensordict[key] for key in self.in_keys]
-        return self.write(tensordict, self.network.mean(*seen, tensordict.get(CONTEXT, None)))
+        seen = (tensordict[key] for key in self.in_keys)
+        return self.write(tensordict, self.network.mean(*seen, context=tensordict.get(CONTEXT, None)))
 
 
 class GaussianPolicy(ProbabilisticActor):
@@ -343,8 +343,8 @@ def make_actor(
 
 def _is_plain(lcs: object) -> bool:
     """Whether its matrices are its parameters as they are, so that those may have batch dimensions."""
-    kind = type(lcs)
-    return isinstance(lcs, LCSModel) and kind.params is LCSModel.params and kind.F is LCSModel.F
+    own = ((getattr(type(lcs), name, None), getattr(LCSModel, name)) for name in ("params", "F"))
+    return isinstance(lcs, LCSModel) and all(mine is plain for mine, plain in own)
 
 
 def _std(value: float | Tensor, n_u: int) -> Tensor:

@@ -19,10 +19,9 @@ import torch
 from torch import Tensor
 
 from difflcs.errors import InvalidInputError
-from difflcs.lcs import LCSModule, LCSParams, LCSSequence
 from difflcs.rl.advantages import Advantages, RewardScale, returns
 from difflcs.rl.critic import Critic
-from difflcs.rl.learned import check_module
+from difflcs.rl.learned import check_learned
 from difflcs.rl.model_rollouts import ModelRollouts
 from difflcs.rl.optim import UpdateRule
 from difflcs.rl.rollout import CONTEXT, collect, elapsed_fractions
@@ -165,9 +164,7 @@ class PPO(Trainer):
         models: ModelRollouts | None = None,
         practice: Source | None = None,
     ):
-        learned = actor.learned
-        if isinstance(learned, LCSModule | LCSParams | LCSSequence):
-            check_module(learned, robot.env, "actor")
+        learned = check_learned(actor.learned, robot.env)
         if total_episodes <= first_episode:
             raise InvalidInputError(
                 f"total_episodes: expected more than the {first_episode} collected before, got {total_episodes}; "
@@ -444,9 +441,8 @@ def _inputs(features: Features, episodes: TensorDict) -> Tensor:
     goals = episodes["goal"].unsqueeze(1).expand(-1, steps, -1)
     elapsed = elapsed_fractions(steps - 1).expand(states.shape[:-1])
     context = episodes.get(CONTEXT, None)
-    return see(
-        features, states, goals, elapsed, None if context is None else context.unsqueeze(1).expand(-1, steps, -1)
-    )
+    context = None if context is None else context.unsqueeze(1).expand(-1, steps, -1)
+    return see(features, states, goals, elapsed, context)
 
 
 def _batches(samples: int, steps: int, size: int | None, rng: np.random.Generator) -> Iterator[Tensor]:

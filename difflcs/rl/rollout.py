@@ -203,7 +203,7 @@ def collect(
     success = np.asarray(infos.get("success", stable), bool)[:n] & stable
     reported = (k for k in infos if k.endswith("_error") and not k.startswith("_") and k != "physics_error")
     errors = {k: torch.from_numpy(np.asarray(infos[k][:n], np.float64)) for k in reported}
-    record = {
+    record: dict[str, Any] = {
         "state": torch.from_numpy(np.stack(states, 1)),
         "action": torch.from_numpy(np.stack(executed, 1)),
         "reward": torch.from_numpy(np.stack(rewards, 1)),
@@ -215,7 +215,7 @@ def collect(
     }
     if context is not None:
         record[CONTEXT] = torch.from_numpy(context)
-    return TensorDict(record, [n])  # pyright: ignore[reportArgumentType]
+    return TensorDict(record, [n])
 
 
 def _check_env(env: VectorEnv, episodes: int) -> None:
@@ -235,7 +235,7 @@ def no_episodes(env: VectorEnv, episode_steps: int) -> TensorDict:
     space: Any = env.single_observation_space
     n_x, n_u = space["state"].shape[0], env.single_action_space.shape[0]  # pyright: ignore[reportOptionalSubscript]
     sizes = ((episode_steps + 1, n_x), (episode_steps, n_u), space["goal"].shape)
-    shapes = dict(zip(TRANSITIONS, sizes, strict=True))
+    shapes: dict[str, Any] = dict(zip(TRANSITIONS, sizes, strict=True))
     if has_context(env):
         shapes[CONTEXT] = space[CONTEXT].shape
     empty = {name: torch.zeros(0, *size, dtype=torch.float64) for name, size in shapes.items()}

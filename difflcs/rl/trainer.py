@@ -90,9 +90,9 @@ def learned_state(learned: Learned) -> dict[str, Any]:
 
 def configuration(learned: Learned) -> dict[str, Any]:
     """What tells it from others besides its tensors: its `config()`, or the name of its class and its sizes."""
-    config = getattr(learned, "config", None)
+    config: Any = getattr(learned, "config", None)
     if callable(config):
-        return dict(config())
+        return config()  # pyright: ignore[reportReturnType]
     sizes = {name: getattr(learned, name) for name in ("n_x", "n_u", "n_lam") if hasattr(learned, name)}
     return {"class": type(learned).__name__, **sizes}
 

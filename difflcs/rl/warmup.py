@@ -144,8 +144,8 @@ def fit(
         shuffled = train[torch.from_numpy(rng.permutation(n_train))][: n_train - n_train % size]
         parts = [v[shuffled].split(size) for v in (x, u, x_next)]
         given = [None] * len(parts[0]) if context is None else context[shuffled].split(size)
-        for *batch, context_batch in zip(*parts, given, strict=True):
-            loss = violation_loss(lcs, *batch, gamma, xi, context=context_batch)
+        for x_batch, u_batch, next_batch, context_batch in zip(*parts, given, strict=True):
+            loss = violation_loss(lcs, x_batch, u_batch, next_batch, gamma, xi, context=context_batch)
             check_depends(loss)
             adam.zero_grad()
             loss.backward()

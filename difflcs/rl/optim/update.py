@@ -15,8 +15,7 @@ import torch
 from torch import nn
 
 from difflcs.errors import CheckpointError
-from difflcs.lcs import LCSModule, LCSParams, LCSSequence
-from difflcs.rl.learned import check_depends, check_module
+from difflcs.rl.learned import check_depends, check_learned
 from difflcs.rl.optim.natural import Natural, NaturalGradient
 from difflcs.rl.settings import Adam
 from difflcs.rl.state import State, initialise_moments, load_moments, moments
@@ -154,10 +153,7 @@ def learned_parameters(actor: GaussianPolicy) -> list[nn.Parameter]:
     Raises:
         InvalidInputError, DTypeError: the model is fixed, or no `torch.nn.Module`.
     """
-    learned: Any = actor.learned
-    if isinstance(learned, LCSModule | LCSParams | LCSSequence):
-        check_module(learned, name="actor")
-    return [p for p in learned.parameters() if p.requires_grad]
+    return [p for p in check_learned(actor.learned).parameters() if p.requires_grad]
 
 
 class AdamUpdate(UpdateRule):
