@@ -463,7 +463,7 @@ class PDDMMethod(Method):
     ) -> Ensemble:
         """See `Method`."""
         ensemble = Ensemble.from_config(config, tensors, source)
-        if (ensemble.n_x, ensemble.n_u) != (task.n_x, task.n_u):
+        if (ensemble.n_x, ensemble.n_u) != (task.n_x + task.n_context, task.n_u):
             raise CheckpointError(f"{source}: expected networks of the sizes of {task.name}, got others")
         return ensemble
 

@@ -290,6 +290,17 @@ def contexts(episodes: TensorDict) -> Tensor | None:
     return episodes[CONTEXT].unsqueeze(1).expand(-1, episodes["action"].shape[1], -1).flatten(0, 1)
 
 
+def observed_transitions(episodes: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
+    """`transitions` for networks: of the states with the contexts behind them, where there are any."""
+    (state, action, after), context = transitions(episodes), contexts(episodes)
+    return beside(state, context), action, beside(after, context)
+
+
+def beside(state: Tensor, context: Tensor | None) -> Tensor:
+    """States (..., n_x) with their contexts behind them, for networks: (..., n_x + n_context)."""
+    return state if context is None else torch.cat([state, context], -1)
+
+
 def has_context(env: VectorEnv) -> bool:
     """Whether the observations of an environment have a context."""
     space: Any = env.single_observation_space
