@@ -110,7 +110,7 @@ def acting_constraints(mpc: LCSMPCLayer, x0: torch.Tensor, goal: torch.Tensor, r
     G, E = sign[:, None] * G, sign[:, None] * E
     with torch.no_grad():
         limit = largest(mpc(x0, 0.5 * goal))
-    return LinearConstraints(G, limit + 1e-4, E=E)
+    return LinearConstraints(G, limit + 1e-2 * limit.abs(), E=E)
 
 
 def measure(n_lam: int, horizon: int, o: Options) -> dict[str, object]:
