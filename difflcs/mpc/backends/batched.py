@@ -178,7 +178,7 @@ class BatchedBackend(Backend):
         """One run of the kernel from a guess, from actions alone, or from zero actions."""
         batch, horizon = problem.batch, problem.horizon
         guess = start if isinstance(start, Primal) else None
-        u = guess.u if guess else start
+        u = start.u if isinstance(start, Primal) else start
         found = _Found(
             x=torch.empty(batch, horizon + 1, problem.n_x, dtype=torch.float64),
             u=torch.empty(batch, horizon, problem.n_u, dtype=torch.float64),
