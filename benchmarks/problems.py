@@ -1,8 +1,8 @@
 """What more general problems cost: `python benchmarks/problems.py [--smoke]`.
 
-Every line is the time of a solve and of its gradient as a ratio to the constant problem of the paper's form (one system,
-one cost, bounds on the actions) of the same size, in the same run, on one thread; the best of several repetitions.
-The same problem stated by stage must end in the same plan, bit for bit. Written as JSON too.
+Every line is the time of a solve and of its gradient as a ratio to the constant problem of the paper's form (one
+system, one cost, bounds on the actions) of the same size, in the same run, on one thread; the best of several
+repetitions. The same problem stated by stage must end in the same plan, bit for bit. Written as JSON too.
 
 Constraints are random rows on states and actions that a known plan meets and the unconstrained plan does not: so they
 can be met, and they act.

@@ -261,7 +261,7 @@ class _Found:
 
 
 def _span(problem: MPCProblem, found: _Found) -> tuple[Tensor, Tensor]:
-    """Where random starts lie: the bounds, or as far around the actions found as these are large where there is none."""
+    """Where random starts lie: within the bounds; where there are none, as far out as the actions found are large."""
     low, high = problem.bounds()
     if bool(torch.isfinite(low).all()) and bool(torch.isfinite(high).all()):
         return low, high
