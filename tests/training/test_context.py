@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from gymnasium.vector import SyncVectorEnv
 from torch import nn
 
 from benchmarks.context import FORCE, HeavyBlock, Network, Physics, imitation, learners, make_mpc, prediction
-from difflcs import GoalCost, LCSModel, LCSParams, LCSSequence
+from difflcs import LCSModel, LCSParams, LCSSequence
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
 
 pytest.importorskip("torchrl")
@@ -23,24 +22,15 @@ from difflcs.rl import (
     Adam,
     CriticSettings,
     Epochs,
-    Reporter,
     Rollouts,
-    TaskSpec,
-    TrainConfig,
     ViolationLoss,
-    ViolationMethod,
     Warmup,
     WarmupSettings,
     collect,
     evaluate,
     fit,
-    get_method,
-    load_policy,
     make_actor,
     make_ppo,
-    method_names,
-    register_method,
-    train,
 )
 from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
 from difflcs.rl.ppo import PPO
@@ -60,11 +50,6 @@ def make_envs(count: int = 4, kind: Any = HeavyBlock) -> SyncVectorEnv:
     return SyncVectorEnv([kind] * count)
 
 
-def outcome(state, action, after, goal, ended):
-    error = abs(after[..., 0] - goal[..., 0])
-    return -10 * error, error < 0.03
-
-
 def make_warmup(lcs: Any = None, env: SyncVectorEnv | None = None, **changes: Any) -> Warmup:
     lcs = Physics(**OFF) if lcs is None else lcs
     settings = WarmupSettings(
@@ -77,7 +62,10 @@ class Gains(slide.Slide):
     """`Slide` with another gain in each episode, which is known: x₊ = x + gain·u."""
 
     observation_space = spaces.Dict(
-        {**slide.Slide.observation_space, "context": spaces.Box(0.0, 1.0, (1,), np.float64)}
+        {
+            key: spaces.Box(low, high, (1,), np.float64)
+            for key, low, high in (("state", -10.0, 10.0), ("goal", -1.0, 1.0), ("context", 0.0, 1.0))
+        }
     )
 
     def __init__(self, drifts: bool = False):
@@ -121,7 +109,7 @@ def features(state, goal, elapsed, context):
     return torch.cat([slide.features(state, goal, elapsed), context], -1)
 
 
-def make_trainer(lcs: nn.Module, seed: int = 0, iterations: int = 4, kind: Any = Gains, **changes: Any) -> PPO:
+def make_trainer(lcs: Any, seed: int = 0, iterations: int = 4, kind: Any = Gains, **changes: Any) -> PPO:
     settings = slide.small_settings(**{"violation": LOSS, **changes})
     return make_ppo(
         make_actor(slide.make_mpc(lcs), settings.std, settings.covariance),
@@ -140,12 +128,16 @@ def make_trainer(lcs: nn.Module, seed: int = 0, iterations: int = 4, kind: Any =
 
 def test_the_warmup_finds_the_unknown_numbers():
     """Known physics whose system depends on the context: three numbers, from wrong ones to the true ones."""
-    warmup = make_warmup(learning_rate_decay=0.998)
-    before = np.array([float(p.detach().exp()) for p in warmup.lcs.parameters()])
+
+    def numbers(lcs: Physics) -> np.ndarray:
+        return np.array([float(p.detach().exp()) for p in lcs.parameters()])
+
+    lcs = Physics(**OFF)
+    before, truth = numbers(lcs), numbers(Physics())
+    warmup = make_warmup(lcs, learning_rate_decay=0.998)
     for _ in range(8):
         warmup.step()
-    learned = np.array([float(p.detach().exp()) for p in warmup.lcs.parameters()])
-    truth = np.array([float(p.detach().exp()) for p in Physics().parameters()])
+    learned = numbers(lcs)
     assert abs(before / truth - 1).min() > 0.4
     np.testing.assert_allclose(learned, truth, rtol=0.1)
 
@@ -415,86 +407,3 @@ def test_a_sequence_is_no_system_of_transitions():
     x = torch.zeros(4, 1, dtype=torch.float64)
     with pytest.raises(DTypeError, match="expected LCSParams for transitions"):
         fit(Stages(1, 1, 1), x, x, x, WarmupSettings(), 1, np.random.default_rng(0))
-
-
-# --- a method and a task of ones own ----------------------------------------------------------------------------------
-
-TASK = TaskSpec(
-    name="heavy-block",
-    env=HeavyBlock,
-    make_cost=lambda: GoalCost.reach(2, 1, goal_weight=(20.0,), input_weight=0.002),
-    u_min=-FORCE,
-    u_max=FORCE,
-    horizon=6,
-    episode_steps=STEPS,
-    step_seconds=0.1,
-    n_context=1,
-    features=lambda state, goal, elapsed, context: torch.cat(
-        [5 * (state[..., :1] - goal), state[..., 1:], context.log1p(), elapsed.unsqueeze(-1)], -1
-    ),
-    outcome=outcome,
-)
-
-
-@dataclass(frozen=True)
-class PhysicsMethod(ViolationMethod):
-    """The warm-up of known physics with unknown numbers."""
-
-    name: ClassVar[str] = "physics"
-    version: ClassVar[int] = 1
-    summary: ClassVar[str] = "the warm-up of known physics with unknown numbers"
-    kind: ClassVar[str] = "Physics"
-    takes_init: ClassVar[bool] = False
-
-    def initial(self, work):
-        return Physics(**OFF)
-
-    def rebuild(self, task, config, tensors, source):
-        found = Physics()
-        found.load_state_dict(dict(tensors))
-        return found
-
-
-@pytest.fixture
-def registered():
-    register_method(PhysicsMethod)
-    return PhysicsMethod(warmup=WarmupSettings(rollouts=Rollouts(4, 4), epochs=Epochs(8, 4, 20), noise=0.1, loss=LOSS))
-
-
-class Stopped(Exception):
-    """Raised to break a training off."""
-
-
-class Stop(Reporter):
-    def iterated(self, report):
-        if report.iteration == 2:
-            raise Stopped
-
-
-def test_a_method_that_learns_a_module_of_ones_own(registered, tmp_path):
-    """Its run directory, resumed, is that of an uninterrupted run, and acts as what was trained."""
-    config = TrainConfig(task="heavy-block", method=registered, minutes=0.3, evaluate_at=(), final_goals=4)
-    whole = train(config, tmp_path / "whole", task=TASK)
-    with pytest.raises(Stopped):
-        train(config, tmp_path / "parts", task=TASK, reporter=Stop())
-    parts = train(config, tmp_path / "parts", task=TASK, resume=True)
-    results = [run.learned("Physics") for run in (whole, parts)]
-    assert results[0][0] == results[1][0] == {"class": "Physics", "n_x": 2, "n_u": 1, "n_lam": 1}
-    assert same([*results[0][1].values()], [*results[1][1].values()])
-    policy: Any = load_policy(whole, TASK)
-    assert same(parameters_of(policy.lcs), [results[0][1][name] for name in policy.lcs.state_dict()])
-    assert float(whole.rows()[-1]["evaluation_success_rate"]) >= 0
-
-
-def parameters_of(module: nn.Module) -> list[torch.Tensor]:
-    return [*module.state_dict().values()]
-
-
-@pytest.mark.parametrize("method", method_names())
-def test_every_method_trains_a_task_with_a_context(method, tmp_path):
-    config = replace(TrainConfig(task="heavy-block", method=get_method(method)()).smoke(), minutes=0.6)
-    run = train(config, tmp_path / "run", task=TASK)
-    policy = load_policy(run, TASK)
-    envs = TASK.make_envs(4)
-    again = evaluate(envs, policy, 4, 0, STEPS)
-    assert again.success_rate == pytest.approx(float(run.rows()[-1]["evaluation_success_rate"]))
