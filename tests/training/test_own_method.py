@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
+import numpy as np
 import pytest
 import torch
 
@@ -13,7 +14,10 @@ from difflcs import GoalCost
 
 pytest.importorskip("torchrl")
 from difflcs.rl import (
+    EnsembleSettings,
     Epochs,
+    ModelRollouts,
+    ModelRolloutSettings,
     Reporter,
     Rollouts,
     TaskSpec,
@@ -21,6 +25,7 @@ from difflcs.rl import (
     ViolationLoss,
     ViolationMethod,
     WarmupSettings,
+    collect,
     evaluate,
     get_method,
     load_policy,
@@ -28,6 +33,7 @@ from difflcs.rl import (
     register_method,
     train,
 )
+from difflcs.rl.rollout import beside, contexts, transitions, uniform_actions
 from tests.training.slide import same
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -117,3 +123,34 @@ def test_every_method_trains_a_task_with_a_context(method, tmp_path):
     envs = TASK.make_envs(4)
     again = evaluate(envs, policy, 4, 0, STEPS)
     assert again.success_rate == pytest.approx(float(run.rows()[-1]["evaluation_success_rate"]))
+
+
+def test_networks_see_the_context():
+    """Model rollouts have the context of their start, and predict by it."""
+    env = TASK.make_envs(40)
+    rng = np.random.default_rng(0)
+    episodes, unseen = (collect(env, uniform_actions(env, rng), range(first, first + 40), STEPS) for first in (0, 100))
+    ensemble = EnsembleSettings(networks=1, width=32, epochs=Epochs(80, 3, 64))
+    models = ModelRollouts(env, outcome, ModelRolloutSettings(rollouts=10, ensemble=ensemble), 0, STEPS)
+    models.add(episodes)
+    models.fit()
+    start, _ = models.env.reset(seed=3)
+    known = {tuple(x): c for x, c in zip(episodes["state"][:, 0].tolist(), episodes["context"].tolist(), strict=True)}
+    assert [known[tuple(x)] for x in start["state"].tolist()] == start["context"].tolist()
+
+    actions = rng.uniform(-FORCE, FORCE, (10, 1))
+    after, _, _, _, _ = models.env.step(actions)
+    np.testing.assert_array_equal(after["context"], start["context"])
+    before, taken = torch.from_numpy(start["state"]).unsqueeze(1), torch.from_numpy(actions)[:, None, None]
+    seen = [v.expand(-1, STEPS, *v.shape[2:]) for v in (before, taken)]
+    foreseen, _, _ = models.env.foresee(*seen, torch.from_numpy(start["goal"]))
+    np.testing.assert_allclose(foreseen[:, 0, 0], after["state"], rtol=0, atol=1e-6)
+
+    (x, u, x_next), context = transitions(unseen), contexts(unseen)
+    assert context is not None
+    errors = []
+    for given in (context, context.flip(0)):
+        with torch.no_grad():
+            found = models.ensemble(beside(x, given).float().unsqueeze(0), u.float().unsqueeze(0))[0, :, :2]
+        errors.append(float((found - x_next).square().mean().sqrt()))
+    assert errors[0] < 0.5 * errors[1]
