@@ -314,6 +314,23 @@ def test_resumed_equals_uninterrupted_bitwise(make, tmp_path):
     assert same_state(second, through)
 
 
+class Tied(Physics):
+    """One parameter under two names."""
+
+    def __init__(self, **numbers: float):
+        super().__init__(**numbers)
+        self.again = self.logarithms["damping"]
+
+
+def test_tied_parameters_are_saved(tmp_path):
+    first, second = make_warmup(Tied(**OFF)), make_warmup(Tied(**OFF))
+    first.step()
+    save_checkpoint(tmp_path, first.iteration, first.state_dict())
+    second.load(load_checkpoint(tmp_path))
+    assert same_state(first, second)
+    assert len(list(second.learned.parameters())) == 3  # pyright: ignore[reportAttributeAccessIssue]
+
+
 def test_load_refuses_hostile_states(refuses_hostile_checkpoints):
     refuses_hostile_checkpoints(make_warmup())
 
