@@ -4,7 +4,8 @@ A block of a mass between 0.3 and 3 kg is pushed along a line, with a soft wall 
 is known, and another one in every episode. Three systems are learned: a constant `LCSModel`, which begins as the true
 system of a middle mass; known physics with three unknown numbers; and a network that turns the mass into matrices.
 
-- Prediction: fitted by the violation loss to transitions with many masses. Error of the predicted velocity.
+- Prediction: fitted by the violation loss to transitions with many masses, observed with some noise. Error of the
+  predicted velocity.
 - Imitation: fitted through the MPC to the actions of an expert that knows the true system. Error of the first action.
 
 Each error is that of unseen states and masses, and printed as a ratio: that of the constant system over that of each
@@ -36,6 +37,7 @@ DAMPING, STIFFNESS, ADDED_MASS = 0.8, 100.0, 0.2  # [N s/m], of the wall [N/m], 
 DT = 0.1  # [s]
 FORCE = 5.0  # bound of the action [N]
 HORIZON = 6
+NOISE = 0.001, 0.01  # of the observed next states [m], [m/s]
 LOG_MASSES = math.log(MASSES[0]), math.log(MASSES[1])
 MIDDLE = math.sqrt(MASSES[0] * MASSES[1])
 LOSS = ViolationLoss(gamma="auto", xi=0.1)
@@ -205,7 +207,8 @@ def prediction(lcs: LCSModule, seed: int, transitions: int, epochs: int) -> tupl
         return float((found - seen).square().mean().sqrt())
 
     before = error()
-    x_next = true_system(mass[:, 0]).step(x, u).x_next
+    noise = torch.from_numpy(np.random.default_rng(seed + 1).normal(size=x.shape)) * torch.tensor(NOISE)
+    x_next = true_system(mass[:, 0]).step(x, u).x_next + noise
     fit(lcs, x, u, x_next, settings, epochs, np.random.default_rng(seed), context=mass)
     return before, error()
 

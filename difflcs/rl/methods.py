@@ -19,7 +19,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 import torch
 from torch import Tensor
@@ -184,7 +184,10 @@ def check_fits(lcs: LCSModel, task: TaskSpec, source: object, error: type[Except
 _REGISTRY: dict[str, type[Method]] = {}
 
 
-def register_method(method: type[Method]) -> type[Method]:
+Registered = TypeVar("Registered", bound=type[Method])
+
+
+def register_method(method: Registered) -> Registered:
     """Make a method available under its `name`; usable as a class decorator.
 
     Raises:
