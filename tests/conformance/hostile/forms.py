@@ -12,7 +12,17 @@ import numpy as np
 import torch
 from numpy.random import Generator
 
-from difflcs import ConstraintSequence, CostSequence, LCSMPCLayer, LCSParams, LCSSequence, StageBounds, Status
+from difflcs import (
+    ConstraintSequence,
+    CostSequence,
+    LCSMPCLayer,
+    LCSParams,
+    LCSSequence,
+    LinearConstraints,
+    QuadraticCost,
+    StageBounds,
+    Status,
+)
 from difflcs.errors import DiffLCSError
 from difflcs.mpc.problem import INPUTS
 from tests.conformance.hostile import checks
@@ -171,21 +181,30 @@ def layer_of(form: Form, leaves: dict[str, torch.Tensor], backend="batched") -> 
         lcs = LCSSequence(**stages)
     else:
         lcs = LCSParams(**system)
-    cost = CostSequence(**{k: leaves[k] for k in COST}, by_stage=staged(COST), check=False)
-    bounds = StageBounds(leaves["u_min"], leaves["u_max"], by_stage=staged(("u_min", "u_max")))
-    kind = None
+    weights = {k: leaves[k] for k in COST}
+    by_stage = staged(COST)
+    cost = (
+        CostSequence(**weights, by_stage=by_stage, check=False) if by_stage else QuadraticCost(**weights, check=False)
+    )
+    limits = {k: leaves[k] for k in ("u_min", "u_max")}
+    by_stage = staged(limits)
+    options = {"bounds": StageBounds(**limits, by_stage=by_stage)} if by_stage else limits
     if "g" in leaves:
+        table = {ROWS[k]: leaves[k] for k in ROWS}
         by_stage = tuple(ROWS[k] for k in staged(ROWS))
-        kind = ConstraintSequence(**{ROWS[k]: leaves[k] for k in ROWS}, by_stage=by_stage)
+        options["constraints"] = (
+            ConstraintSequence(**table, by_stage=by_stage) if by_stage else LinearConstraints(**table)
+        )
     return LCSMPCLayer(
-        lcs, cost, case.horizon, bounds=bounds, constraints=kind, backend=backend, relaxation=case.relaxation,
-        on_failure="mask",
-    )  # fmt: skip
+        lcs, cost, case.horizon, backend=backend, relaxation=case.relaxation, on_failure="mask", **options
+    )
 
 
 def leaves_of(form: Form) -> dict[str, torch.Tensor]:
     """Every input as a tensor that requires a gradient."""
-    return {k: torch.from_numpy(np.array(form.case.arrays[k])).requires_grad_() for k in INPUTS if k in form.case.arrays}
+    return {
+        k: torch.from_numpy(np.array(form.case.arrays[k])).requires_grad_() for k in INPUTS if k in form.case.arrays
+    }
 
 
 def _solve(form: Form, backend: str, warm: bool) -> Outcome:
@@ -250,9 +269,10 @@ def _judge(form: Form, status, x, u, lam, mu, cost, violation) -> checks.Ratios:
 def _size(case: Case, i: int, x, u) -> float:
     """The sum of the sizes of the terms of the cost."""
     sizes = {k: np.abs(v) for k, v in case.arrays.items()}
-    c, _ = rows(case, i, x, u)
+    c, terms = rows(case, i, x, u)
     price = np.stack([case.at("price", i, k) for k in range(len(x))]) if "price" in sizes else np.zeros_like(c)
-    fines = np.where(np.isfinite(price) & (c > 0), price * np.where(np.isfinite(c), c, 0.0), 0.0).sum()
+    # A price of 1e30 makes 1e14 of the rounding of a row that is held.
+    fines = np.where(np.isfinite(price) & np.isfinite(c), price * (np.maximum(c, 0) + 1e-6 * terms), 0.0).sum()
     absolute = replace(case, arrays={k: v for k, v in sizes.items() if k not in ROWS})
     return float(objective(absolute, i, np.abs(x), np.abs(u)) + fines)
 

@@ -1,7 +1,7 @@
 """Random problems of every form: `batched` against `ipopt`, an own judge of both, and gradients against differences.
 
-    python -m tests.conformance.varied.campaign --first 0 --count 100
-    python -m tests.conformance.varied.campaign --first 17 --count 1 --verbose
+python -m tests.conformance.varied.campaign --first 0 --count 100
+python -m tests.conformance.varied.campaign --first 17 --count 1 --verbose
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ def _direction(name: str, value: np.ndarray, rng) -> np.ndarray:
     return z * (size if name not in ("Q", "R", "Q_final") else 1.0)
 
 
-def _differences(report: Report, case: Case, seed: int, index, grads, rng, step: float = 1e-6) -> None:
+def _differences(report: Report, case: Case, seed: int, index, grads, rng, step: float = 1e-5) -> None:
     own = case.own()
     part = replace(own, arrays={k: v[index.numpy()] for k, v in own.arrays.items()}, witness=None)
     problem = part.problem()

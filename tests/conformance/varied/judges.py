@@ -15,7 +15,7 @@ SYSTEM = ("A", "B", "C", "d", "D", "E", "F", "c")
 
 def conditions(case: Case, i: int, x, u, lam, mu) -> dict[str, float]:
     """Largest violation of each condition of element i, in parts of the sizes of the terms that make it up."""
-    H, n_u = u.shape
+    H = len(u)
     dynamics = complementarity = sign = 0.0
     for k in range(H):
         A, B, C, d, D, E, F, c = (case.at(name, i, k) for name in SYSTEM)
@@ -110,7 +110,9 @@ def reduced_gradient(case: Case, i: int, x, u, lam, mu) -> tuple[np.ndarray, np.
         s = D @ x[k] + E @ u[k] + F @ lam[k] + c
         # s dλ + λ ds = 0 with ds = D dx + E du + F dλ; rows are divided by λ + s.
         size = lam[k] + s
-        L = -np.linalg.solve(np.diag(s / size) + (lam[k] / size)[:, None] * F, (lam[k] / size)[:, None] * (D @ T + E @ U))
+        L = -np.linalg.solve(
+            np.diag(s / size) + (lam[k] / size)[:, None] * F, (lam[k] / size)[:, None] * (D @ T + E @ U)
+        )
         T = A @ T + B @ U + C @ L
     add(T, case.at("Q_final", i, 0) @ x[-1])
     add(T, case.at("q_final", i, 0))
