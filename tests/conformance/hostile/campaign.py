@@ -26,7 +26,7 @@ import numpy as np
 import torch
 
 from difflcs import Status
-from tests.conformance.hostile import generators, rules, targets
+from tests.conformance.hostile import forms, generators, rules, targets
 from tests.conformance.hostile.targets import Outcome
 
 
@@ -64,11 +64,12 @@ class Cell:
         return self.problems.split("-")[0]
 
 
-_GENERATORS = {**generators.LCP_CLASSES, **generators.MPC_CLASSES, **generators.LOSS_CLASSES}
+_GENERATORS = {**generators.LCP_CLASSES, **generators.MPC_CLASSES, **generators.LOSS_CLASSES, **forms.FORM_CLASSES}
 _TARGETS = {
     "lcp": {**targets.LCP_TARGETS, **rules.RULE_TARGETS},
     "mpc": {**targets.MPC_TARGETS, **targets.SLOW_TARGETS, **rules.RULE_TARGETS},
     "loss": {**targets.LOSS_TARGETS, **rules.RULE_TARGETS},
+    "form": forms.FORM_TARGETS,
 }
 CELLS = [
     *(Cell(p, t, 256, 2.0) for p in generators.LCP_CLASSES for t in targets.LCP_TARGETS),
@@ -76,6 +77,7 @@ CELLS = [
     *(Cell(p, "ipopt", 8, 0.01) for p in generators.MPC_CLASSES),
     *(Cell(p, "relaxed", 8, 0.005) for p in generators.MPC_CLASSES),
     *(Cell(p, t, 64, 0.25) for p in generators.LOSS_CLASSES for t in targets.LOSS_TARGETS),
+    *(Cell(p, t, 24, 0.05) for p in forms.FORM_CLASSES for t in forms.FORM_TARGETS),
     *(Cell(p, "neighbours", 32, 0.2) for p in ("lcp-plain", "mpc-plain")),
     *(Cell(p, t, 16, 0.02) for p in ("lcp-plain", "mpc-plain", "loss-plain") for t in ("in-place", "double backward")),
 ]

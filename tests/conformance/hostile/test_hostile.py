@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
-from tests.conformance.hostile import campaign, checks, generators, targets
+from tests.conformance.hostile import campaign, checks, forms, generators, targets
 
 SLOW_CLASSES = ("mpc-plain", "mpc-flat", "mpc-stiff")  # for the solvers that take 10 ms and more per problem
 CELLS = [c for c in campaign.CELLS if c.target not in targets.SLOW_TARGETS or c.problems in SLOW_CLASSES]
@@ -43,6 +43,9 @@ FLOORS = {
     "loss-at-bound": 1.0,
     "loss-scales": 1.0,
     "loss-tiny-gamma": 1.0,
+    "form-plain": 0.7,
+    "form-no-contact": 0.9,
+    "form-prices": 0.6,
 }
 
 
@@ -67,7 +70,8 @@ def test_a_chunk_depends_on_class_seed_and_number_alone():
 
 
 def test_every_generator_says_what_is_hostile():
-    for generator in (*generators.LCP_CLASSES.values(), *generators.MPC_CLASSES.values()):
+    classes = (generators.LCP_CLASSES, generators.MPC_CLASSES, forms.FORM_CLASSES)
+    for generator in (f for table in classes for f in table.values()):
         assert generator.__doc__
 
 
@@ -163,3 +167,13 @@ def test_records_survive_a_cut_line(tmp_path):
     assert page.read_text().startswith(f"before\n{campaign.BEGIN}| problems")
     assert page.read_text().endswith(f"{campaign.END}after\n")
     assert "old" not in page.read_text()
+
+
+def test_a_batch_of_no_problems_of_any_form_is_solved(one_thread):
+    rng = np.random.default_rng(0)
+    form = forms.plain(rng, 4).select(slice(0, 0))
+    leaves = forms.leaves_of(form)
+    plan = forms.layer_of(form, leaves)(leaves["x0"])
+    assert plan.u.shape[0] == plan.mu.shape[0] == plan.violation.shape[0] == 0
+    plan.objective.sum().backward()
+    assert leaves["x0"].grad is not None

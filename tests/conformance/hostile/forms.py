@@ -1,0 +1,331 @@
+"""Hostile problems of every form: stages, constraints, open bounds, xᵀSu, no contact; judged as the others are.
+
+The batches come from `tests.conformance.varied`, each element with inputs of its own, and are then spoilt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.random import Generator
+
+from difflcs import (
+    ConstraintSequence,
+    CostSequence,
+    LCSMPCLayer,
+    LCSParams,
+    LCSSequence,
+    LinearConstraints,
+    QuadraticCost,
+    StageBounds,
+    Status,
+)
+from difflcs.errors import DiffLCSError
+from difflcs.mpc.problem import INPUTS
+from tests.conformance.hostile import checks
+from tests.conformance.hostile.targets import REFUSED, Outcome, quiet, refused_one_by_one
+from tests.conformance.varied.generators import RANKS, Case, random_case
+from tests.conformance.varied.judges import conditions, objective, rows
+
+SYSTEM, COST = ("A", "B", "C", "d", "D", "E", "F", "c"), ("Q", "R", "S", "Q_final", "q", "r", "q_final")
+ROWS = {"G_x": "G", "G_u": "E", "g": "g", "price": "weight"}
+INF = np.inf
+
+
+@dataclass(frozen=True)
+class Form:
+    """A batch of problems, and which elements are impossible or possible for sure."""
+
+    case: Case
+    impossible: np.ndarray
+    possible: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """Number of problems."""
+        return self.case.batch
+
+    def select(self, index) -> Form:
+        """Some of them."""
+        arrays = {k: v[index] for k, v in self.case.arrays.items()}
+        return Form(replace(self.case, arrays=arrays, witness=None), self.impossible[index], self.possible[index])
+
+    def with_(self, **arrays) -> Form:
+        """Other inputs: nothing is known about what is possible."""
+        never = np.zeros(self.count, bool)
+        return Form(replace(self.case, arrays={**self.case.arrays, **arrays}), never, never)
+
+
+def plain(rng: Generator, count: int, small: bool = False) -> Form:
+    """Nothing hostile: any size, form and constraint."""
+    return _form(rng, count)
+
+
+def _form(rng: Generator, count: int, need_rows: bool = False, **options) -> Form:
+    while True:
+        case = random_case(int(rng.integers(1 << 30)), count, **options)
+        if case.horizon <= 12 and ("g" in case.arrays or not need_rows):
+            break
+    known = np.full(count, case.witness is not None or "g" not in case.arrays)
+    return Form(replace(case.own(), witness=None), np.zeros(count, bool), known)
+
+
+def _staged_rows(rng: Generator, count: int) -> tuple[Form, dict[str, np.ndarray]]:
+    """A form whose rows are all given by stage."""
+    form = _form(rng, count, need_rows=True)
+    arrays = {}
+    for name in ROWS:
+        value, stages = form.case.arrays[name], form.case.horizon + (name != "G_u")
+        if value.ndim == RANKS[name] + 1:
+            value = np.repeat(value[:, None], stages, 1)
+        arrays[name] = value.copy()
+    return form, arrays
+
+
+def zero_rows(rng: Generator, count: int, small: bool = False) -> Form:
+    """Rows of zeros: 0 ≤ g says nothing, 0 ≤ −g is impossible, and costs price·g where it is soft."""
+    form, a = _staged_rows(rng, count)
+    j = int(rng.integers(a["g"].shape[-1]))
+    a["G_x"][..., j, :] = 0.0
+    a["G_u"][..., j, :] = 0.0
+    a["g"][..., j] = rng.choice([0.0, 1e-3, 1.0, INF], (count, 1))
+    bad = rng.random(count) < 0.3
+    a["g"][bad, -1, j] = -1e-2
+    done = form.with_(**a)
+    return replace(done, impossible=bad & np.isinf(a["price"][:, -1, j]))
+
+
+def opposite_rows(rng: Generator, count: int, small: bool = False) -> Form:
+    """Rows twice, rows with both signs (an equation), and rows that contradict each other by 1e-9 … 1."""
+    form, a = _staged_rows(rng, count)
+    kind, gap = rng.integers(0, 3, count), 10.0 ** rng.uniform(-9, 0, count)
+    sign = np.where(kind == 0, 1.0, -1.0)[:, None, None]
+    shift = np.where(kind == 2, gap, 0.0)[:, None, None]
+    twice = {k: np.concatenate([v, sign[..., None] * v if k in ("G_x", "G_u") else v], 2) for k, v in a.items()}
+    second = np.where(np.isinf(a["g"]), INF, sign * a["g"] - shift)
+    return form.with_(**{**twice, "g": np.concatenate([a["g"], second], 2)})
+
+
+def prices(rng: Generator, count: int, small: bool = False) -> Form:
+    """Prices of 1e-300, 1e-30, 1e30, 1e300 and hard ones beside each other."""
+    form, a = _staged_rows(rng, count)
+    return form.with_(price=rng.choice([1e-300, 1e-30, 1.0, 1e8, 1e30, 1e300, INF], a["price"].shape))
+
+
+def limits(rng: Generator, count: int, small: bool = False) -> Form:
+    """Limits of ±1e300, ±1e30 and none beside each other."""
+    form, a = _staged_rows(rng, count)
+    spoilt = rng.random(a["g"].shape) < 0.2
+    return form.with_(g=np.where(spoilt, rng.choice([1e300, -1e300, 1e30, -1e30, INF, 0.0], spoilt.shape), a["g"]))
+
+
+def first_stage(rng: Generator, count: int, small: bool = False) -> Form:
+    """Constraints at stage 0 alone, about x0 and the first actions: met or not whatever follows."""
+    form, a = _staged_rows(rng, count)
+    a["g"][:, 1:] = INF
+    there = np.einsum("bij,bj->bi", a["G_x"][:, 0], form.case.arrays["x0"])
+    a["g"][:, 0] = there + rng.choice([-1.0, -1e-8, 0.0, 1e-8, 1.0], there.shape)
+    blind = rng.random() < 0.5
+    if blind:
+        a["G_u"][:] = 0.0
+    done = form.with_(**a)
+    beyond = (there - a["g"][:, 0] > 1e-2) & np.isinf(a["price"][:, 0])
+    return replace(done, impossible=beyond.any(1) if blind else np.zeros(count, bool))
+
+
+def not_numbers(rng: Generator, count: int, small: bool = False) -> Form:
+    """NaN or −∞ in one input of some elements, ∞ where none is allowed: to be refused before anything is solved."""
+    form = _form(rng, count)
+    arrays = {k: v.copy() for k, v in form.case.arrays.items()}
+    name = str(rng.choice([k for k, v in arrays.items() if v[0].size]))
+    chosen = rng.random(count) < 0.3
+    value = np.nan if name in ("u_min", "u_max", "g", "price") else rng.choice([np.nan, INF, -INF])
+    flat = arrays[name].reshape(count, -1)
+    flat[chosen, rng.integers(flat.shape[1])] = value
+    return form.with_(**{name: flat.reshape(arrays[name].shape)})
+
+
+def extreme(rng: Generator, count: int, small: bool = False) -> Form:
+    """One input times 1e±(50 … 300) in some elements."""
+    form = _form(rng, count)
+    name = str(rng.choice(list(form.case.arrays)))
+    value = form.case.arrays[name].copy()
+    factor = 10.0 ** (rng.uniform(50, 300) * rng.choice([-1, 1]))
+    chosen = rng.random(count) < 0.5
+    with np.errstate(over="ignore"):
+        value[chosen] = value[chosen] * factor
+    if name == "price":
+        value = np.maximum(value, 1e-300)
+    return form.with_(**{name: value})
+
+
+def no_contact(rng: Generator, count: int, small: bool = False) -> Form:
+    """n_lam = 0: a quadratic program, of which INFEASIBLE must be true."""
+    return _form(rng, count, n_lam=0)
+
+
+def layer_of(form: Form, leaves: dict[str, torch.Tensor], backend="batched") -> LCSMPCLayer:
+    """The layer of a form, through the public records."""
+    case = form.case
+
+    def staged(names) -> tuple[str, ...]:
+        return tuple(name for name in names if name in leaves and leaves[name].ndim == RANKS[name] + 2)
+
+    system = {k: leaves[k] for k in SYSTEM}
+    if staged(SYSTEM):
+        stages = {k: v if k in staged(SYSTEM) else v.unsqueeze(1).expand(-1, case.horizon, *v.shape[1:])
+                  for k, v in system.items()}  # fmt: skip
+        lcs = LCSSequence(**stages)
+    else:
+        lcs = LCSParams(**system)
+    weights = {k: leaves[k] for k in COST}
+    by_stage = staged(COST)
+    cost = (
+        CostSequence(**weights, by_stage=by_stage, check=False) if by_stage else QuadraticCost(**weights, check=False)
+    )
+    limits = {k: leaves[k] for k in ("u_min", "u_max")}
+    by_stage = staged(limits)
+    options = {"bounds": StageBounds(**limits, by_stage=by_stage)} if by_stage else limits
+    if "g" in leaves:
+        table = {ROWS[k]: leaves[k] for k in ROWS}
+        by_stage = tuple(ROWS[k] for k in staged(ROWS))
+        options["constraints"] = (
+            ConstraintSequence(**table, by_stage=by_stage) if by_stage else LinearConstraints(**table)
+        )
+    return LCSMPCLayer(
+        lcs, cost, case.horizon, backend=backend, relaxation=case.relaxation, on_failure="mask", **options
+    )
+
+
+def leaves_of(form: Form) -> dict[str, torch.Tensor]:
+    """Every input as a tensor that requires a gradient."""
+    return {
+        k: torch.from_numpy(np.array(form.case.arrays[k])).requires_grad_() for k in INPUTS if k in form.case.arrays
+    }
+
+
+def _solve(form: Form, backend: str, warm: bool) -> Outcome:
+    leaves = leaves_of(form)
+    with quiet(), np.errstate(all="ignore"):
+        layer = layer_of(form, leaves, backend)
+        guess = None
+        if warm:
+            with torch.no_grad():
+                guess = layer(leaves["x0"]).shift()
+        plan = layer(leaves["x0"], guess=guess)
+        (plan.x.mean((-1, -2)) + plan.u.mean((-1, -2)) + plan.lam.sum((-1, -2)) + plan.objective).sum().backward()
+        names = ("x", "u", "lam", "mu", "objective", "violation", "kkt_residual")
+        x, u, lam, mu, cost, violation, residual = (getattr(plan, k).detach().numpy() for k in names)
+        status = plan.status.numpy().astype(int)
+        ratios = _judge(form, status, x, u, lam, mu, cost, violation)
+    ratios["finite"] = checks.finite(x, u, lam, mu, cost, violation, residual)
+    grads = [leaf.grad.numpy() for leaf in leaves.values() if leaf.grad is not None]
+    ratios["finite gradient"] = checks.finite(*grads)
+    return Outcome(status, ratios)
+
+
+# Of every condition of `varied.judges` how much a solution may be off: what the library promises, and as much again
+# for what the own judge measures otherwise.
+LIMITS = {"start": 0.0, "sign": 0.0, "price": 0.0, "bounds": 0.0}
+
+
+def _judge(form: Form, status, x, u, lam, mu, cost, violation) -> checks.Ratios:
+    count, solved = form.count, (status == Status.CONVERGED) | (status == Status.DEGENERATE)
+    found: checks.Ratios = {}
+
+    def put(name: str, i: int, ratio: float) -> None:
+        found.setdefault(name, np.zeros(count))[i] = np.inf if np.isnan(ratio) else ratio
+
+    for i in range(count):
+        case = form.case
+        low, high = (np.stack([case.at(k, i, n) for n in range(case.horizon)]) for k in ("u_min", "u_max"))
+        put("bounds", i, 0.0 if ((u[i] >= low) & (u[i] <= high)).all() else np.inf)
+        put("false INFEASIBLE of a convex program", i, 0.0)
+        if status[i] == Status.INFEASIBLE and form.possible[i] and lam.shape[-1] == 0:
+            put("false INFEASIBLE of a convex program", i, np.inf)
+        if not solved[i]:
+            continue
+        if form.impossible[i]:
+            put("solved what is impossible", i, np.inf)
+        try:
+            parts = conditions(case, i, x[i], u[i], lam[i], mu[i])
+        except np.linalg.LinAlgError:
+            continue  # float64 does not hold its products
+        for name, value in parts.items():
+            limit = LIMITS.get(name, 2e-6)
+            put(name, i, value / limit if limit else (0.0 if value <= 0 else np.inf))
+        mine = objective(case, i, x[i], u[i])
+        put("objective", i, abs(mine - cost[i]) / (1e-8 * (1 + _size(case, i, x[i], u[i]))))
+        c, size = rows(case, i, x[i], u[i])
+        worst = np.maximum(np.where(np.isfinite(c), c, 0.0), 0.0).max(initial=0.0)
+        room = 1e-9 * (1e-9 + np.where(np.isfinite(size), size, 0.0).max(initial=0.0))
+        put("violation", i, abs(worst - violation[i]) / room)
+    return found
+
+
+def _size(case: Case, i: int, x, u) -> float:
+    """The sum of the sizes of the terms of the cost."""
+    sizes = {k: np.abs(v) for k, v in case.arrays.items()}
+    c, terms = rows(case, i, x, u)
+    price = np.stack([case.at("price", i, k) for k in range(len(x))]) if "price" in sizes else np.zeros_like(c)
+    # A price of 1e30 makes 1e14 of the rounding of a row that is held.
+    fines = np.where(np.isfinite(price) & np.isfinite(c), price * (np.maximum(c, 0) + 1e-6 * terms), 0.0).sum()
+    absolute = replace(case, arrays={k: v for k, v in sizes.items() if k not in ROWS})
+    return float(objective(absolute, i, np.abs(x), np.abs(u)) + fines)
+
+
+def form_target(backend: str = "batched", warm: bool = False) -> Callable[[Form, Generator, bool], Outcome]:
+    """Solve, differentiate and judge."""
+
+    def target(form: Form, rng: Generator, gradients: bool) -> Outcome:
+        return refused_one_by_one(lambda part: _solve(part, backend, warm), form)
+
+    return target
+
+
+def untouched(form: Form, rng: Generator, gradients: bool) -> Outcome:
+    """What becomes of some elements leaves the others as they are, bit for bit, gradients of x0 included."""
+    spoilt = np.zeros(form.count, bool)
+    spoilt[rng.permutation(form.count)[: max(1, form.count // 3)]] = True
+    arrays = {k: v.copy() for k, v in form.case.arrays.items()}
+    kind = rng.integers(4)
+    with np.errstate(over="ignore"):
+        if kind == 0 and "g" in arrays:
+            arrays["g"][spoilt] = -1e3
+        elif kind == 1 and "price" in arrays:
+            arrays["price"][spoilt] = rng.choice([1e-300, 1e300])
+        elif kind == 2:
+            arrays["x0"][spoilt] *= 1e300
+        else:
+            arrays["B"][spoilt] *= 1e200
+    both = []
+    for case in (form.case, replace(form.case, arrays=arrays)):
+        leaves = leaves_of(Form(case, form.impossible, form.possible))
+        with quiet(), np.errstate(all="ignore"):
+            try:
+                plan = layer_of(Form(case, form.impossible, form.possible), leaves)(leaves["x0"])
+            except DiffLCSError:
+                return Outcome(np.full(form.count, REFUSED), {"untouched": np.zeros(form.count)})
+            (plan.u.sum() + plan.objective.sum()).backward()
+        both.append([v.detach().numpy() for v in (plan.x, plan.u, plan.lam, plan.mu, plan.status, leaves["x0"].grad)])
+    changed = np.zeros(form.count, bool)
+    for a, b in zip(*both, strict=True):
+        changed |= (a != b).reshape(form.count, -1).any(1)
+    return Outcome(both[0][4].astype(int), {"untouched": np.where(changed & ~spoilt, np.inf, 0.0)})
+
+
+FORM_CLASSES: dict[str, Callable[..., Form]] = {
+    "form-plain": plain,
+    "form-no-contact": no_contact,
+    "form-zero-rows": zero_rows,
+    "form-opposite-rows": opposite_rows,
+    "form-prices": prices,
+    "form-limits": limits,
+    "form-first-stage": first_stage,
+    "form-not-numbers": not_numbers,
+    "form-extreme": extreme,
+}
+FORM_TARGETS = {"batched": form_target(), "warm": form_target(warm=True), "untouched": untouched}

@@ -1,0 +1,125 @@
+"""An own recomputation of all optimality conditions, element by element, in NumPy: nothing here calls the library.
+
+Stationarity is judged by the derivative of the Lagrangian along the trajectory, forwards from the actions, where
+`difflcs.mpc.kkt` goes backwards by costates.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tests.conformance.varied.generators import Case
+
+SYSTEM = ("A", "B", "C", "d", "D", "E", "F", "c")
+
+
+def conditions(case: Case, i: int, x, u, lam, mu) -> dict[str, float]:
+    """Largest violation of each condition of element i, in parts of the sizes of the terms that make it up."""
+    H = len(u)
+    dynamics = complementarity = sign = 0.0
+    for k in range(H):
+        A, B, C, d, D, E, F, c = (case.at(name, i, k) for name in SYSTEM)
+        predicted = A @ x[k] + B @ u[k] + C @ lam[k] + d
+        terms = abs(A) @ abs(x[k]) + abs(B) @ abs(u[k]) + abs(C) @ abs(lam[k]) + abs(d)
+        dynamics = max(dynamics, _part(x[k + 1] - predicted, terms))
+        s = D @ x[k] + E @ u[k] + F @ lam[k] + c
+        if len(s):
+            s_terms = abs(D) @ abs(x[k]) + abs(E) @ abs(u[k]) + abs(F) @ abs(lam[k]) + abs(c)
+            complementarity = max(
+                complementarity, _part(lam[k] * s - case.relaxation, case.relaxation + 1e-7 * lam[k] * s_terms)
+            )
+            sign = max(sign, float((lam[k] <= 0).any()))
+    low, high = (np.stack([case.at(name, i, k) for k in range(H)]) for name in ("u_min", "u_max"))
+    c, size = rows(case, i, x, u)
+    price = np.stack([case.at("price", i, k) for k in range(H + 1)]) if "price" in case.arrays else np.zeros((H + 1, 0))
+    unit = np.where(np.isfinite(c), size, 0.0).max(0, initial=0.0)
+    unit = np.where(unit > 0, unit, 1.0)
+    off = np.where(mu <= 0, np.maximum(c, 0), np.where(mu >= price, np.maximum(-c, 0), abs(c)))
+    gradient, terms = reduced_gradient(case, i, x, u, lam, mu)
+    free = np.where(gradient > 0, u > low, u < high) & (high > low)
+    # A bound that is so near that the step to it is rounding is met.
+    near = np.where(gradient > 0, u - low, high - u) <= 1e-6 * np.where(np.isfinite(high - low), high - low, 1 + abs(u))
+    return {
+        "start": float(abs(x[0] - case.arrays["x0"][i]).max()),
+        "dynamics": dynamics,
+        "complementarity": complementarity,
+        "sign": sign,
+        "bounds": float(np.maximum(low - u, u - high).clip(0).max()),
+        "rows": float((off / unit).max(initial=0.0)),
+        "price": float(((mu < 0) | (mu > price)).any()),
+        "stationarity": float(np.where(free & ~near, abs(gradient) / terms, 0.0).max()),
+    }
+
+
+def rows(case: Case, i: int, x, u) -> tuple[np.ndarray, np.ndarray]:
+    """G_x x + G_u u − g of element i, (H+1, n_c), and the sizes of its terms."""
+    if "g" not in case.arrays:
+        return np.zeros((len(x), 0)), np.zeros((len(x), 0))
+    values, sizes = [], []
+    for k in range(len(x)):
+        G, g = case.at("G_x", i, k), case.at("g", i, k)
+        value, size = G @ x[k] - g, abs(G) @ abs(x[k]) + abs(g)
+        if k < len(u):
+            E = case.at("G_u", i, k)
+            value, size = value + E @ u[k], size + abs(E) @ abs(u[k])
+        values.append(value)
+        sizes.append(size)
+    return np.stack(values), np.stack(sizes)
+
+
+def objective(case: Case, i: int, x, u) -> float:
+    """The cost with the price of violations of soft rows."""
+    total = 0.0
+    for k in range(len(u)):
+        Q, R, S, q, r = (case.at(name, i, k) for name in ("Q", "R", "S", "q", "r"))
+        total += x[k] @ (0.5 * Q @ x[k] + q + S @ u[k]) + u[k] @ (0.5 * R @ u[k] + r)
+    total += x[-1] @ (0.5 * case.at("Q_final", i, 0) @ x[-1] + case.at("q_final", i, 0))
+    c, _ = rows(case, i, x, u)
+    for k in range(len(x)):
+        for j in range(c.shape[1]):
+            price = case.at("price", i, k)[j]
+            total += price * max(c[k, j], 0.0) if np.isfinite(price) else 0.0
+    return float(total)
+
+
+def reduced_gradient(case: Case, i: int, x, u, lam, mu) -> tuple[np.ndarray, np.ndarray]:
+    """d(J + Σ mᵀc)/du (H, n_u) along the trajectory that the actions cause, and the sizes of its terms."""
+    H, n_u = u.shape
+    T = np.zeros((x.shape[1], H * n_u))  # dx_k/du
+    gradient, terms = np.zeros(H * n_u), np.zeros(H * n_u)
+
+    def add(direction, weight):
+        nonlocal gradient, terms
+        gradient = gradient + direction.T @ weight
+        terms = terms + abs(direction).T @ abs(weight)
+
+    for k in range(H):
+        A, B, C, _, D, E, F, c = (case.at(name, i, k) for name in SYSTEM)
+        Q, R, S, q, r = (case.at(name, i, k) for name in ("Q", "R", "S", "q", "r"))
+        U = np.zeros((n_u, H * n_u))
+        U[:, k * n_u : (k + 1) * n_u] = np.eye(n_u)
+        add(T, Q @ x[k])
+        add(T, q)
+        add(T, S @ u[k])
+        add(U, R @ u[k])
+        add(U, r)
+        add(U, S.T @ x[k])
+        if mu.shape[1]:
+            add(T, case.at("G_x", i, k).T @ mu[k])
+            add(U, case.at("G_u", i, k).T @ mu[k])
+        s = D @ x[k] + E @ u[k] + F @ lam[k] + c
+        # s dλ + λ ds = 0 with ds = D dx + E du + F dλ; rows are divided by λ + s.
+        size = lam[k] + s
+        L = -np.linalg.solve(
+            np.diag(s / size) + (lam[k] / size)[:, None] * F, (lam[k] / size)[:, None] * (D @ T + E @ U)
+        )
+        T = A @ T + B @ U + C @ L
+    add(T, case.at("Q_final", i, 0) @ x[-1])
+    add(T, case.at("q_final", i, 0))
+    if mu.shape[1]:
+        add(T, case.at("G_x", i, H).T @ mu[H])
+    return gradient.reshape(H, n_u), np.where(terms > 0, terms, 1.0).reshape(H, n_u)
+
+
+def _part(value, terms) -> float:
+    return float((abs(value) / np.where(terms > 0, terms, 1.0)).max(initial=0.0))
