@@ -179,17 +179,20 @@ class Adjoint {
         riccati.force(k, i) = m, dm(k, i) = all(0);
         riccati.stiffness(k, i) = select((m > 0) & (m < kAtPrice * problem.price[k][i]), all(kHold) * weight[0], all(0));
       }
+    const auto pull = [&](int64_t k, int64_t r) {
+      return distance ? dm(k, r) - riccati.stiffness(k, r) * (*distance)(k, r) : dm(k, r);
+    };
     for (int pass = 0; pass < 8; pass++) {
       for (int64_t k = 0; k <= n.h; k++) {
         const auto G = problem.G[k];
         for (int64_t i = 0; i < nx; i++) {
           Vec t = upstream.x(k, i);
-          for (int64_t r = 0; r < nc; r++) t -= G(r, i) * dm(k, r);
+          for (int64_t r = 0; r < nc; r++) t -= G(r, i) * pull(k, r);
           shifted.x(k, i) = select(going, t, shifted.x(k, i));
         }
         for (int64_t j = 0; j < nu && k < n.h; j++) {
           Vec t = upstream.u(k, j);
-          for (int64_t r = 0; r < nc; r++) t -= G(r, nx + j) * dm(k, r);
+          for (int64_t r = 0; r < nc; r++) t -= G(r, nx + j) * pull(k, r);
           shifted.u(k, j) = select(going, t, shifted.u(k, j));
         }
       }
