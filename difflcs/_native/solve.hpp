@@ -19,7 +19,8 @@ constexpr double kMet = 1e-12, kMetRounded = 1e-7;
 // Weight of the augmented Lagrangian, in parts of the largest weight of the cost: at first, and where a violation that
 // three steps of the multipliers in a row have not halved means that the problem is infeasible.
 constexpr double kPenalty = 10.0, kLargestPenalty = 1e7;
-// A step of the multipliers is due where the projected gradient is below this part of the change that it would make.
+// A step of the multipliers is due where the projected gradient is below this part of what the step before left, and of
+// the change that it would make. The first counts where constraints are far from the actions that they act through.
 constexpr double kDue = 0.03;
 // A violation that is more than a tenth of the one before (a hundredth, where it is small) asks for ten times the
 // weight, one that stays for more.
@@ -62,6 +63,7 @@ class Solver {
     int64_t element;  // -1: idle
     int64_t iterations, in_stage, failures;
     double violated;  // at the last step of the multipliers
+    double left;      // projected gradient after that; 0 where it is not known yet
     int64_t stalled;  // steps of the multipliers in a row that hardly helped
   };
   Lane lane[kLanes];
@@ -121,7 +123,7 @@ class Solver {
   bool take(const MpcSolve& o, int64_t* counter, int l) {
     const int64_t e = __atomic_fetch_add(counter, int64_t{1}, __ATOMIC_RELAXED);
     const int64_t nu = n.u(), actions = n.h * nu, forces = n.h * n.l();
-    lane[l] = {e < batch.count ? e : -1, 0, 0, 0, 1e300, 0};
+    lane[l] = {e < batch.count ? e : -1, 0, 0, 0, 1e300, 0, 0};
     fresh[l] = -1;
     eps[l] = o.first_relaxation, regularisation[l] = 0;
     if (e >= batch.count) return false;
@@ -173,7 +175,10 @@ class Solver {
   // Whether the constraints of a lane at the target ask for other multipliers, which it then gets, or for more weight.
   bool owes(const Sweep& sweep, int l, bool stationary) {
     const double violated = sweep.violated[l];
-    if (met(sweep, l) || !(stationary || sweep.projected[l] <= kDue * sweep.owing[l])) return false;
+    if (lane[l].left == 0) lane[l].left = sweep.projected[l];
+    const double due = kDue * (lane[l].left < sweep.owing[l] ? lane[l].left : sweep.owing[l]);
+    if (met(sweep, l) || !(stationary || sweep.projected[l] <= due)) return false;
+    lane[l].left = 0;
     Mask which = Mask{};
     which[l] = -1;
     pay(which);
