@@ -1,8 +1,8 @@
 """What more general problems cost: `python benchmarks/problems.py [--smoke]`.
 
-Every line is the time of a solve and of its gradient as a ratio to the constant problem of the paper's form (one system,
-one cost, bounds on the actions) of the same size, in the same run, on one thread; the best of several repetitions.
-The same problem stated by stage must end in the same plan, bit for bit. Written as JSON too.
+Every line is the time of a solve and of its gradient as a ratio to the constant problem of the paper's form (one
+system, one cost, bounds on the actions) of the same size, in the same run, on one thread; the best of several
+repetitions. The same problem stated by stage must end in the same plan, bit for bit. Written as JSON too.
 
 Constraints are random rows on states and actions that a known plan meets and the unconstrained plan does not: so they
 can be met, and they act.
@@ -110,7 +110,7 @@ def acting_constraints(mpc: LCSMPCLayer, x0: torch.Tensor, goal: torch.Tensor, r
     G, E = sign[:, None] * G, sign[:, None] * E
     with torch.no_grad():
         limit = largest(mpc(x0, 0.5 * goal))
-    return LinearConstraints(G, limit + 1e-4, E=E)
+    return LinearConstraints(G, limit + 1e-2 * limit.abs(), E=E)
 
 
 def measure(n_lam: int, horizon: int, o: Options) -> dict[str, object]:

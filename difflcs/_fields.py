@@ -36,9 +36,7 @@ def check_by_stage(by_stage: Collection[str], names: Iterable[str], given: Itera
     """Which of the given fields have a dimension of stages."""
     names = tuple(names)
     if isinstance(by_stage, str) or not isinstance(by_stage, Collection):
-        raise DTypeError(
-            f"by_stage: expected names such as {names[:2]}, got {describe(by_stage)}; pass a tuple of them"
-        )
+        raise DTypeError(f"by_stage: expected a tuple of names like {names[:2]}, got {describe(by_stage)}; add a comma")
     for name in by_stage:
         if name not in names:
             raise InvalidInputError(

@@ -169,7 +169,12 @@ def save_record(directory: Path, kind: str, config: Mapping[str, object], tensor
     """
     from safetensors.torch import save
 
-    values = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
+    values: dict[str, Tensor] = {}
+    for name, tensor in tensors.items():
+        value = tensor.detach().cpu().contiguous()
+        # safetensors refuses memory that two names share, as tied parameters do.
+        tied = any(value.untyped_storage().data_ptr() == v.untyped_storage().data_ptr() for v in values.values())
+        values[name] = value.clone() if tied and value.numel() else value
     header = {"format": _FORMAT, "kind": kind, "config": dict(config)}
     write_atomically(directory / "model.safetensors", save(values, metadata={"sha256": digest(header, values)}))
     write_json(directory / "config.json", header)

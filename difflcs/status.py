@@ -39,7 +39,7 @@ def solved(status: Tensor) -> Tensor:
 _ADVICE = {
     Status.CONVERGED: "the solution meets the tolerance",
     Status.MAX_ITER: "the iteration limit was reached: raise max_iter, pass a guess, or check the scale of the inputs",
-    Status.INFEASIBLE: "no feasible point was found: check the bounds and that F + Fᵀ is positive definite",
+    Status.INFEASIBLE: "no plan that meets the constraints was found: see `violation`, and give some a weight",
     Status.NUMERICAL: "the numbers broke down: check the scale of the inputs and the conditioning of F",
     Status.DEGENERATE: "solved, but not classically differentiable there: its gradient is one of several valid ones",
 }

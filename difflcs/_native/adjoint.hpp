@@ -13,6 +13,9 @@ namespace {
 
 // Weight on held constraints, in parts of the largest weight of the cost: each sweep refines by about as much.
 constexpr double kHold = 1e6;
+// Rows that miss their moved limits by more than this part depend on each other. A row is weakly active whose multiplier
+// this part of its unit would take away.
+constexpr double kMissed = 1e-3, kWeakRow = 1e-5;
 
 // Adds products to gradients: into the lanes' sums where the input is shared, else into each element's own.
 struct Sink {
@@ -43,6 +46,7 @@ class Adjoint {
   Riccati<T, S, true> riccati;
   Trajectory<S> at;
   Upstream<S> upstream, shifted;  // shifted by the multipliers' directions along the rows of held constraints
+  Matrix<Vec, 0, 0> distance;     // by which the limits of the constraints are moved
   Matrix<Vec, 0, 0> dm;           // directions of the multipliers of the constraints
   Vec objective_bar;
   Vec* sum;  // of the shared inputs' gradients
@@ -59,6 +63,7 @@ class Adjoint {
     problem.layout(arena), at.layout(arena, n), riccati.layout(arena);
     arena.take(upstream.x, h + 1, nx), arena.take(upstream.u, h, nu), arena.take(upstream.lam, h, nl);
     arena.take(shifted.x, h + 1, nx), arena.take(shifted.u, h, nu), arena.take(dm, h + 1, n.c());
+    arena.take(distance, h + 1, n.c());
     arena.take(gap, nl), arena.take(dw, nw), arena.take(dx_next, nx), arena.take(dlam, nl), arena.take(ds, nl);
     arena.take(dp, nx), arena.take(dy, nl), arena.take(rho, nl), arena.take(drho, nl);
     int64_t inputs = 0;
@@ -73,7 +78,7 @@ class Adjoint {
     for (int64_t group = begin; group < end && !watch.stop(watch.context); group += kLanes) {
       const Mask valid = load(o, group, end);
       if (n.c() > 0)
-        hold_constraints();
+        (void)hold_constraints();
       else
         riccati.sweep(at, upstream, all(0), Mask{});
       forward({batch, o, group, end, valid, sum});
@@ -85,37 +90,89 @@ class Adjoint {
     }
   }
 
+  // Solutions with constraints that depend on each other, or whose multiplier a small change of the limits would take
+  // away, are degenerate. Both show where the limits are moved by parts of their units.
+  void judge_constraints(const MpcSolve& o, int64_t begin, int64_t end, Watch watch) {
+    for (int64_t group = begin; group < end && !watch.stop(watch.context); group += kLanes) {
+      load_solutions(o, group, end);
+      for (int64_t i = 0; i < upstream.x.size(); i++) upstream.x.entries[i] = all(0);
+      for (int64_t i = 0; i < upstream.u.size(); i++) upstream.u.entries[i] = all(0);
+      for (int64_t i = 0; i < upstream.lam.size(); i++) upstream.lam.entries[i] = all(0);
+      move_limits();
+      Mask weak = ~(hold_constraints(&distance) <= kMissed);
+      for (int64_t k = 0; k <= n.h; k++)
+        for (int64_t i = 0; i < n.c(); i++)
+          weak |= (riccati.stiffness(k, i) > 0) & (riccati.force(k, i) <= kWeakRow * abs(dm(k, i)));
+      for (int l = 0; l < kLanes && group + l < end; l++) {
+        int8_t& status = o.status[group + l];
+        if (status == int8_t(Status::converged) && weak[l]) status = int8_t(Status::degenerate);
+      }
+    }
+  }
+
  private:
-  // Solutions and upstream gradients of kLanes elements; lanes past `end` repeat the last one. Returns which count.
-  Mask load(const MpcGradient& o, int64_t group, int64_t end) {
+  // Solutions of kLanes elements; lanes past `end` repeat the last one.
+  template <class Solutions>
+  void load_solutions(const Solutions& o, int64_t group, int64_t end) {
     const int64_t states = at.x.size(), actions = at.u.size(), forces = at.lam.size();
-    Mask valid;
     for (int l = 0; l < kLanes; l++) {
       const int64_t e = group + l < end ? group + l : end - 1;
       problem.load(e, l);
       problem.load(at.x.entries, o.x + e * states, states, l);
       problem.load(at.u.entries, o.u + e * actions, actions, l);
       problem.load_lam(at.lam.entries, o.lam + e * forces, l);
-      problem.load(upstream.x.entries, o.x_bar + e * states, states, l);
-      problem.load(upstream.u.entries, o.u_bar + e * actions, actions, l);
-      problem.load_lam(upstream.lam.entries, o.lam_bar + e * forces, l, true);
       problem.load_multipliers(o.mu + e * (n.h + 1) * n.c(), l);
-      objective_bar[l] = o.objective_bar[e];
-      valid[l] = group + l < end && o.solved[e] ? -1 : 0;
     }
     for (int64_t k = 0; k < n.h; k++) {
       const StageData<T, S> data = problem.stage(k);
       data.gap(at.x[k], at.u[k], gap);
       for (int64_t i = 0; i < n.l(); i++) at.s(k, i) = gap[i] + data.F.row(i) * at.lam[k];
     }
+  }
+
+  // The same with upstream gradients. Returns which lanes count.
+  Mask load(const MpcGradient& o, int64_t group, int64_t end) {
+    const int64_t states = at.x.size(), actions = at.u.size(), forces = at.lam.size();
+    load_solutions(o, group, end);
+    Mask valid;
+    for (int l = 0; l < kLanes; l++) {
+      const int64_t e = group + l < end ? group + l : end - 1;
+      problem.load(upstream.x.entries, o.x_bar + e * states, states, l);
+      problem.load(upstream.u.entries, o.u_bar + e * actions, actions, l);
+      problem.load_lam(upstream.lam.entries, o.lam_bar + e * forces, l, true);
+      objective_bar[l] = o.objective_bar[e];
+      valid[l] = group + l < end && o.solved[e] ? -1 : 0;
+    }
     return valid;
+  }
+
+  // A distance for each row: its unit, the largest sum of the sizes of its terms, times numbers without a pattern.
+  void move_limits() {
+    const int64_t nx = n.x();
+    for (int64_t i = 0; i < n.c(); i++) {
+      Vec unit = all(kTiny);
+      for (int64_t k = 0; k <= n.h; k++) {
+        const auto G = problem.G[k];
+        const Vec g = problem.g[k][i];
+        Vec terms = select(g < kHuge, abs(g), all(0));
+        for (int64_t j = 0; j < (k < n.h ? n.w() : nx); j++) terms += abs(G(i, j) * (j < nx ? at.x(k, j) : at.u(k, j - nx)));
+        unit = max(unit, terms);
+      }
+      for (int64_t k = 0; k <= n.h; k++) {
+        const int64_t odd = (k * n.c() + i) * 7 % 11;
+        distance(k, i) = unit * (odd % 2 ? 0.5 + 0.1 * double(odd) : -0.4 - 0.1 * double(odd));
+      }
+    }
   }
 
   // The sweep with held constraints as equations a (dx, du) = 0: a weight on them, and their multipliers' directions dm,
   // which repeated sweeps refine. Rows whose multiplier is zero or the price are not held.
-  void hold_constraints() {
+  // With `distance` the equations are a (dx, du) = distance instead. Returns by how much they are missed, in parts of it.
+  Vec hold_constraints(const Matrix<Vec, 0, 0>* distance = nullptr) {
     const int64_t nx = n.x(), nu = n.u(), nc = n.c();
     T* weight = problem.weight;
+    Vec missed = all(0);
+    Mask going = ~Mask{};
     for (int64_t k = 0; k <= n.h; k++)
       for (int64_t i = 0; i < nc; i++) {
         const Vec m = problem.multiplier(k, i);
@@ -126,29 +183,39 @@ class Adjoint {
       for (int64_t k = 0; k <= n.h; k++) {
         const auto G = problem.G[k];
         for (int64_t i = 0; i < nx; i++) {
-          shifted.x(k, i) = upstream.x(k, i);
-          for (int64_t r = 0; r < nc; r++) shifted.x(k, i) -= G(r, i) * dm(k, r);
+          Vec t = upstream.x(k, i);
+          for (int64_t r = 0; r < nc; r++) t -= G(r, i) * dm(k, r);
+          shifted.x(k, i) = select(going, t, shifted.x(k, i));
         }
         for (int64_t j = 0; j < nu && k < n.h; j++) {
-          shifted.u(k, j) = upstream.u(k, j);
-          for (int64_t r = 0; r < nc; r++) shifted.u(k, j) -= G(r, nx + j) * dm(k, r);
+          Vec t = upstream.u(k, j);
+          for (int64_t r = 0; r < nc; r++) t -= G(r, nx + j) * dm(k, r);
+          shifted.u(k, j) = select(going, t, shifted.u(k, j));
         }
       }
       shifted.lam = upstream.lam;
       riccati.sweep(at, shifted, all(0), Mask{});
       Vec largest = all(0), change = all(0);
+      Vec worst = all(0);
       for (int64_t i = 0; i < nx; i++) dw[i] = all(0);
       for (int64_t k = 0; k <= n.h; k++) {
         if (k < n.h) primal_direction(k);
         for (int64_t r = 0; r < nc; r++) {
-          const Vec more = riccati.stiffness(k, r) * along(k, r);
+          const Mask held = riccati.stiffness(k, r) > 0;
+          const Vec off = distance ? along(k, r) - (*distance)(k, r) : along(k, r);
+          const Vec more = select(going, riccati.stiffness(k, r) * off, all(0));
           dm(k, r) += more;
           change = max(change, abs(more)), largest = max(largest, abs(dm(k, r)));
+          if (distance) worst = max(worst, select(held, abs(off / (*distance)(k, r)), all(0)));
         }
         for (int64_t i = 0; i < nx && k < n.h; i++) dw[i] = dx_next[i];
       }
-      if (!any(change > 1e-12 * largest)) break;
+      missed = select(going, worst, missed);
+      // What is done stays as it is: an element depends on nothing but itself.
+      going &= change > 1e-12 * largest;
+      if (!any(going)) break;
     }
+    return missed;
   }
 
   // a (dx, du) of row r at stage k.

@@ -23,7 +23,7 @@ struct Certificate {
   T *A, *B, *C, *D, *E, *F, *Q, *R, *cross, *G_x, *G_u;
   Vec *d, *c, *q, *r, *lo, *hi;
   Vec *x, *u, *lam, *mu, *s, *size, *p, *pn, *y, *rho, *error, *N, *largest_action;
-  Vec *row, *row_terms, *row_missed, *row_force;  // values of the constraints; of each the largest over the stages
+  Vec *row, *row_terms, *row_missed;  // values of the constraints; of each the largest over the stages
   Mask* rows;
 
   explicit Certificate(const MpcBatch& b) : batch(b), n(b) {}
@@ -42,7 +42,7 @@ struct Certificate {
     arena.take(rest, h, nu);
     take(x, (h + 1) * nx), take(u, h * nu), take(lam, h * nl), take(mu, (h + 1) * nc), take(s, nl), take(size, nl);
     take(p, nx), take(pn, nx), take(y, nl), take(rho, nl), take(error, nl), take(N, nl * nl), take(rows, nl), take(largest_action, nu);
-    take(row, (h + 1) * nc), take(row_terms, nc), take(row_missed, nc), take(row_force, nc);
+    take(row, (h + 1) * nc), take(row_terms, nc), take(row_missed, nc);
     if constexpr (sizeof(T) == sizeof(double))
       if (arena.memory) load_matrices(0, 0);
   }
@@ -241,7 +241,7 @@ struct Certificate {
   Mask constraints() {
     const int64_t nx = n.x(), nu = n.u(), nc = n.c(), h = n.h;
     Mask weak = Mask{};
-    for (int64_t i = 0; i < nc; i++) row_terms[i] = row_missed[i] = row_force[i] = all(0);
+    for (int64_t i = 0; i < nc; i++) row_terms[i] = row_missed[i] = all(0);
     for (int64_t k = 0; k <= h && nc > 0; k++) {
       enter(k);
       const Vec *g = vector[kg][k], *price = vector[kprice][k];
@@ -252,7 +252,7 @@ struct Certificate {
         for (int64_t j = 0; j < nu && k < h; j++) sum.add(G_u[i * nu + j] * u[k * nu + j]);
         const Vec m = mu[k * nc + i], value = select(given, sum.value, all(-kHuge));
         row[k * nc + i] = value;
-        row_terms[i] = max(row_terms[i], sum.terms), row_force[i] = max(row_force[i], m);
+        row_terms[i] = max(row_terms[i], sum.terms);
         const Vec held = select(m < kAtPrice * price[i], abs(value), max(-value, all(0)));
         row_missed[i] = max(row_missed[i], select(m > 0, held, max(value, all(0))));
         met(select((m >= 0) & (m * kAtPrice <= price[i]), all(0), all(1)) + 0.0 * m);
@@ -267,8 +267,7 @@ struct Certificate {
         for (int64_t j = 0; j < nu && k == 0; j++) acts += abs(all(0) + G_u[i * nu + j]);
         const Vec m = mu[k * nc + i], value = row[k * nc + i], close = 1e-5 * row_terms[i];
         const Mask at_zero = ~(m > 0) & (value >= -close), at_price = (m >= kAtPrice * vector[kprice][k][i]) & (value <= close);
-        const Mask between = (m > 0) & (m < kAtPrice * vector[kprice][k][i]) & (m <= 1e-5 * row_force[i]);
-        weak |= (at_zero | at_price | between) & (acts > 0);
+        weak |= (at_zero | at_price) & (acts > 0);
       }
     }
     return weak;

@@ -101,6 +101,9 @@ struct Kernels {
   int64_t (*mpc_workspace)(const MpcBatch& batch);
   // Take problems from the shared counter `next` until none is left, and certify them.
   void (*mpc_solve)(const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void* workspace, Watch watch);
+  // Which of the solved elements [begin, end) have constraints that make them degenerate.
+  void (*mpc_constraints)(const MpcBatch& batch, const MpcSolve& solve, int64_t begin, int64_t end, void* workspace,
+                          Watch watch);
   // Gradients of elements [begin, end), which are block number `block`.
   void (*mpc_vjp)(const MpcBatch& batch, const MpcGradient& gradient, int64_t begin, int64_t end, int64_t block,
                   void* workspace, Watch watch);

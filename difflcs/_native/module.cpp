@@ -260,6 +260,16 @@ void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
   on_threads(used, kernels.mpc_workspace(b), stop, [&](void* workspace, difflcs::Watch watch) {
     kernels.mpc_solve(b, o, &next, workspace, watch);
   });
+  if (b.n_c > 0) {
+    const int64_t block = 64, blocks = (b.count + block - 1) / block;
+    std::atomic<int64_t> first{0};
+    Stop judged;
+    on_threads(std::max<int64_t>(1, std::min<int64_t>(threads, blocks)), kernels.mpc_workspace(b), judged,
+               [&](void* workspace, difflcs::Watch watch) {
+                 for (int64_t i; (i = first.fetch_add(1)) < blocks;)
+                   kernels.mpc_constraints(b, o, i * block, std::min(b.count, (i + 1) * block), workspace, watch);
+               });
+  }
   if (stop.ending == kOutOfTime)
     for (int64_t e = 0; e < b.count; e++)
       if (o.status[e] == difflcs::kUnreached) stay_at_start(b, o, e);

@@ -61,6 +61,14 @@ void mpc_solve(const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void
   });
 }
 
+void mpc_constraints(const MpcBatch& batch, const MpcSolve& solve, int64_t begin, int64_t end, void* workspace,
+                     Watch watch) {
+  dispatch(batch, [&](auto variant) {
+    using V = decltype(variant);
+    Adjoint<typename V::T, typename V::S>(batch, workspace).judge_constraints(solve, begin, end, watch);
+  });
+}
+
 void mpc_vjp(const MpcBatch& batch, const MpcGradient& gradient, int64_t begin, int64_t end, int64_t block,
              void* workspace, Watch watch) {
   dispatch(batch, [&](auto variant) {

@@ -21,8 +21,9 @@ constexpr double kMet = 1e-12, kMetRounded = 1e-7;
 constexpr double kPenalty = 10.0, kLargestPenalty = 1e7;
 // A step of the multipliers is due where the projected gradient is below this part of the change that it would make.
 constexpr double kDue = 0.03;
-// A violation that is more than a tenth of the one before asks for ten times the weight, one that stays for more.
-constexpr double kSlow = 0.1, kStays = 0.9, kRaise = 10.0, kRaiseMore = 30.0;
+// A violation that is more than a tenth of the one before (a hundredth, where it is small) asks for ten times the
+// weight, one that stays for more.
+constexpr double kSlow = 0.1, kSlowEnd = 0.01, kSmall = 1e-4, kStays = 0.9, kRaise = 10.0, kRaiseMore = 30.0;
 // Failed searches in a row, each with 8 times the damping, before a problem is given up.
 constexpr int64_t kFailures = 12;
 
@@ -152,7 +153,8 @@ class Solver {
     if (waiting == kLanes) certificate.judge(o, finished, waiting), waiting = 0;
   }
 
-  // A step of the multipliers: those that the augmented Lagrangian has at the iterate.
+  // A step of the multipliers, at the target of the homotopy: before, they would follow plans that come to nothing. They
+  // become those that the augmented Lagrangian has at the iterate.
   void pay(Mask which) {
     for (int64_t k = 0; k <= n.h; k++) {
       const StageData<T, S> data = k < n.h ? problem.stage(k) : problem.last();
@@ -177,7 +179,7 @@ class Solver {
     pay(which);
     double& rho = reinterpret_cast<double*>(&problem.rho)[l];
     lane[l].stalled = violated > 0.5 * lane[l].violated ? lane[l].stalled + 1 : 0;
-    if (violated > kSlow * lane[l].violated) rho *= violated > kStays * lane[l].violated ? kRaiseMore : kRaise;
+    if (violated > (violated < kSmall ? kSlowEnd : kSlow) * lane[l].violated) rho *= violated > kStays * lane[l].violated ? kRaiseMore : kRaise;
     lane[l].violated = violated, lane[l].iterations++, lane[l].failures = 0;
     return true;
   }
@@ -248,7 +250,6 @@ class Solver {
   // Damping and homotopy after a step.
   void advance(const MpcSolve& o, const Sweep& sweep, Mask frozen, Mask moved, Vec step) {
     const double target = batch.relaxation;
-    Mask next_stage = Mask{};
     for (int l = 0; l < kLanes; l++) {
       if (frozen[l]) continue;
       Lane& a = lane[l];
@@ -264,11 +265,9 @@ class Solver {
       if (eps[l] > target && (a.in_stage >= 2 || sweep.projected[l] < 1e4 * o.tol || a.failures > 0)) {
         eps[l] = eps[l] * o.shrink > target ? eps[l] * o.shrink : target;
         a.in_stage = 0, a.failures = 0;
-        next_stage[l] = -1;
+        fresh[l] = -1;
       }
     }
-    fresh |= next_stage;
-    if (n.c() > 0 && any(next_stage)) pay(next_stage);
   }
 };
 

@@ -16,6 +16,8 @@ from difflcs.mpc.solution import Primal, largest
 
 # Largest residual of a solution: what CONVERGED means.
 CERTIFIED = 1e-6
+# A multiplier above this part of its price is the price, but for rounding.
+_AT_PRICE = 1 - 1e-12
 
 
 @dataclass(frozen=True)
@@ -159,15 +161,15 @@ def residual(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
     ]
     if problem.n_c:
         violations += _row_violations(problem, primal)
-    worst = torch.stack([largest(v) for v in violations]).amax(0)  # amax keeps NaN
+    worst = torch.stack([v.amax((0, 2)) for v in violations if v.shape[2]]).amax(0)  # amax keeps NaN
     return torch.nan_to_num(worst, nan=torch.inf)
 
 
 def _row_violations(problem: MPCProblem, primal: Primal) -> list[Tensor]:
     mu, price = primal.mu.transpose(0, 1), problem.steps().price
     c = problem.constraints(primal.x, primal.u).transpose(0, 1)
-    off = torch.where(mu <= 0, c.clamp_min(0.0), torch.where(mu >= price, (-c).clamp_min(0.0), c.abs()))
-    return [_parts(off, row_units(problem, primal)) + 0 * mu, ((mu < 0) | (mu > price)).to(mu.dtype)]
+    off = torch.where(mu <= 0, c.clamp_min(0.0), torch.where(mu >= _AT_PRICE * price, (-c).clamp_min(0.0), c.abs()))
+    return [_parts(off, row_units(problem, primal)) + 0 * mu, ((mu < 0) | (mu * _AT_PRICE > price)).to(mu.dtype)]
 
 
 def row_units(problem: MPCProblem, primal: Primal) -> Tensor:
@@ -206,14 +208,14 @@ def within_prices(problem: MPCProblem, mu: Tensor) -> Tensor:
 def ranges(problem: MPCProblem, u: Tensor) -> Tensor:
     """Range of each action, (batch, H, n_u): u_max − u_min.
 
-    Where that is infinite it is the largest size over the stages of the action itself and of its finite bounds.
+    Where that is infinite it is the largest size of the action over the stages, or that of its finite bound.
     """
     low, high = problem.bounds()
     width = high - low
     if not bool(torch.isinf(width).any()):
         return width.expand_as(u)
     finite = [torch.where(torch.isinf(v), torch.zeros_like(v), v).abs() for v in (low, high)]
-    size = torch.maximum(u.abs(), torch.maximum(*finite)).amax(1, keepdim=True)
+    size = torch.maximum(u.abs().amax(1, keepdim=True), torch.maximum(*finite))
     return torch.where(torch.isinf(width), size, width).expand_as(u)
 
 

@@ -178,7 +178,7 @@ class Inputs:
                     f"guess.{name}: expected batch dimensions {tuple(batch)} like x0, got {tuple(value.shape[:-2])}; "
                     f"expand or index it"
                 )
-            found.append(value)
+            found.append(value.detach())
         return tuple(found)
 
     def check_sizes(self, name: str, **found: int) -> None:

@@ -125,7 +125,6 @@ def vjp(
     p, rho = keep(dual.p[:, 1:]), keep(dual.rho)
     dp, drho, dm = keep(w.p - J * dual.p[:, 1:]), keep(w.rho - J * dual.rho), keep(w.mu - J * lin.primal.mu)
     x_now, dx_now, x_end, dx_end = x[:, :-1], dx[:, :-1], x[:, -1:], dx[:, -1:]
-    m_now, dm_now = m[:, :-1], dm[:, :-1]
     J = keep(J)
 
     def outer(name: str, *pairs: tuple[Tensor, Tensor]) -> Tensor:
@@ -160,10 +159,18 @@ def vjp(
     bound = keep(w.nu + objective_bar[:, None, None] * gradient)
     lower_bar = torch.where(lin.lower, bound, lower_bar)
     upper_bar = torch.where(lin.upper, bound, upper_bar)
-    # Of a fined constraint price·c is in the objective, of any other nothing.
-    fine = keep(J * problem.constraints(lin.primal.x, lin.primal.u) - moved_rows(problem, w.x, w.u))
     x0_bar = matvec(first.A.mT, dp[:, 0]) + matvec(first.D.mT, drho[:, 0]) + matvec(first.S, du[:, 0])
-    x0_bar = x0_bar + matvec(first.G_x.mT, dm[:, 0])
+    rows = {name: torch.zeros_like(getattr(problem, name)) for name in ("G_x", "G_u", "g", "price")}
+    if problem.n_c:
+        x0_bar = x0_bar + matvec(first.G_x.mT, dm[:, 0])
+        # Of a fined constraint price·c is in the objective, of any other nothing.
+        fine = keep(J * problem.constraints(lin.primal.x, lin.primal.u) - moved_rows(problem, w.x, w.u))
+        rows = {
+            "G_x": -outer("G_x", (dm, x), (m, dx)),
+            "G_u": -outer("G_u", (dm[:, :-1], u), (m[:, :-1], du)),
+            "g": total("g", dm),
+            "price": total("price", torch.where(lin.fined, fine, torch.zeros_like(fine))),
+        }
     x0_cost = matvec(first.Q, x[:, 0]) + first.q + matvec(first.S, u[:, 0])
     return {
         "A": -outer("A", (dp, x_now), (p, dx_now)),
@@ -183,10 +190,7 @@ def vjp(
         "q_final": total("q_final", J * x_end - dx_end),
         "u_min": total("u_min", lower_bar),
         "u_max": total("u_max", upper_bar),
-        "G_x": -outer("G_x", (dm, x), (m, dx)),
-        "G_u": -outer("G_u", (dm_now, u), (m_now, du)),
-        "g": total("g", dm),
-        "price": total("price", torch.where(lin.fined, fine, torch.zeros_like(fine))),
+        **rows,
         "x0": torch.where(solved[:, None], x_bar[:, 0] - x0_bar + J[:, 0] * x0_cost, torch.zeros_like(x0_cost)),
     }
 

@@ -56,8 +56,8 @@ class MPCProblem(SystemMatrices):
     With barrier > 0 the cost also has −barrier·Σ (log(u_k − u_min) + log(u_max − u_k)), which keeps actions off their
     bounds and so makes them differentiable everywhere.
 
-    Tensors are float64 on the CPU and detached. x0 is (batch, n_x). Every other one has, in front of the dimensions that
-    its annotation names, none (shared by batch and stages), the batch (shared by the stages), or the batch and the
+    Tensors are float64 on the CPU and detached. x0 is (batch, n_x). Every other one has, in front of the dimensions
+    that its annotation names, none (shared by batch and stages), the batch (shared by the stages), or the batch and the
     stages, where a batch of 1 is shared. `STAGES` says how many stages a field has: H, or H + 1 for G_x, g and price;
     Q_final, q_final and x0 have none.
 
@@ -113,7 +113,8 @@ class MPCProblem(SystemMatrices):
             found = tuple(getattr(self, name).shape)
             if found not in allowed:
                 raise ShapeError(f"{name}: expected {' or '.join(map(str, allowed))}, got {found}")
-        check_bounds(*self.bounds(), strict=self.barrier > 0)
+        limits = self.bounds() if self.by_stage("u_min") or self.by_stage("u_max") else (self.u_min, self.u_max)
+        check_bounds(*limits, strict=self.barrier > 0)
         if self.n_c and not bool((self.price > 0).all()):
             raise InvalidInputError(
                 f"price: expected a positive price of a violation, or infinity for a hard constraint, got "

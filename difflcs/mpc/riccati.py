@@ -39,10 +39,10 @@ _CLOSE = 1e-8
 # Weight of a held constraint in the augmented Hessian, in units of the row's own curvature; each pass of the refinement
 # divides what is left of the row by it. The digits that it costs the other directions are those of its size.
 _HOLD = 1e5
-# Most passes, and what may be left of a held row in parts of the terms that sum to it. Rows that depend on each other
-# leave far more than `_DEPENDENT` of some right-hand side.
+# Most passes, and the change of the multipliers, in parts of themselves, at which they end. Rows that depend on each
+# other leave far more than `_DEPENDENT` of some right-hand side.
 _PASSES = 10
-_LEFT = 1e-14
+_LEFT = 1e-13
 _DEPENDENT = 1e-3
 
 
@@ -357,9 +357,11 @@ def solve(
     G_x, G_u = problem._batch_first("G_x"), problem._batch_first("G_u")
     target = torch.zeros_like(lin.weight) if target is None else torch.where(lin.held, target, 0.0)
     mu, best = torch.zeros_like(lin.weight), None
-    left_before = torch.full((problem.batch,), torch.inf, dtype=torch.float64)
+    # √V, in units of which multipliers of different rows compare.
+    unit = torch.where(lin.held, _HOLD / torch.where(lin.held, lin.weight, 1.0), 0.0).sqrt()
+    least = torch.full((problem.batch,), torch.inf, dtype=torch.float64)
     for _ in range(_PASSES):
-        force = mu - lin.weight * target
+        force, before = mu - lin.weight * target, mu
         found = _solve(
             problem,
             lin,
@@ -367,16 +369,15 @@ def solve(
             u_bar - matvec(G_u.mT, force[:, :-1]),
             lam_bar,
         )
-        along = _along(problem, lin, found)
+        along = lin.weight * _along(problem, lin, found)
         # The multiplier that belongs to this direction; ν does not know of the part in the augmented Hessian.
-        mu = force + lin.weight * along
-        nu = found.nu - matvec(G_u.mT, (lin.weight * along)[:, :-1])
-        found = found._replace(mu=mu, nu=nu)
-        left = ((along - target).abs() / _along_terms(problem, lin, found, target)).flatten(1).amax(1)
-        better = left < left_before
+        mu = force + along
+        found = found._replace(mu=mu, nu=found.nu - matvec(G_u.mT, along[:, :-1]))
+        change, size = (((v.abs() * unit).flatten(1).amax(1)) for v in (mu - before, mu))
+        better = change < least
         best = found if best is None else _choose(better, found, best)
-        left_before = torch.where(better, left, left_before)
-        if not bool((better & (left > _LEFT)).any()):
+        least = torch.where(better, change, least)
+        if not bool((better & (change > _LEFT * size)).any()):
             break
     assert best is not None
     return best
@@ -390,15 +391,6 @@ def _along(problem: MPCProblem, lin: Linearisation, w: Direction) -> Tensor:
     """G_x dx + G_u du of the held constraints, (batch, H+1, n_c), zero elsewhere."""
     moved = moved_rows(problem, w.x, w.u)
     return torch.where(lin.held, moved, torch.zeros_like(moved))
-
-
-def _along_terms(problem: MPCProblem, lin: Linearisation, w: Direction, target: Tensor) -> Tensor:
-    """Largest Σ|terms| of the same over the stages and rows, (batch, 1, 1), and 1 where there is nothing."""
-    G_x, G_u = problem._batch_first("G_x"), problem._batch_first("G_u")
-    terms = matvec(G_x.abs(), w.x.abs()) + target.abs()
-    terms[:, :-1] += matvec(G_u.abs(), w.u.abs())
-    terms = torch.where(lin.held, terms, torch.zeros_like(terms)).amax((1, 2), keepdim=True)
-    return torch.where(terms > 0, terms, torch.ones_like(terms))
 
 
 def _solve(problem: MPCProblem, lin: Linearisation, x_bar: Tensor, u_bar: Tensor, lam_bar: Tensor) -> Direction:

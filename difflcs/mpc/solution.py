@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, fields
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import register_pytree_node
 
 from difflcs.mpc.problem import MPCProblem
 from difflcs.status import Status, solved
@@ -101,3 +103,23 @@ def largest(values: Tensor) -> Tensor:
 def _by_step(*trajectories: Tensor) -> tuple[Tensor, ...]:
     # (batch, steps, n) → (steps, batch, n), so that per-element matrices broadcast over the steps.
     return tuple(v.transpose(0, 1) for v in trajectories)
+
+
+class _Kept:
+    """A problem that a tree of tensors carries along; equal to itself alone, where comparing tensors would fail."""
+
+    def __init__(self, problem: MPCProblem):
+        self.problem = problem
+
+
+def _flatten(solution: MPCSolution) -> tuple[list[Tensor], _Kept]:
+    return [getattr(solution, name) for name in _TENSORS], _Kept(solution.problem)
+
+
+def _unflatten(tensors: Iterable[Tensor], kept: _Kept) -> MPCSolution:
+    return MPCSolution(*tensors, problem=kept.problem)
+
+
+# So that `torch.func.vmap(layer)(x0)` returns a solution.
+_TENSORS = tuple(f.name for f in fields(MPCSolution) if f.name != "problem")
+register_pytree_node(MPCSolution, _flatten, _unflatten)

@@ -28,13 +28,12 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from difflcs.errors import InvalidInputError
-from difflcs.rl.rollout import elapsed_fractions
+from difflcs.rl.rollout import CONTEXT, elapsed_fractions
 from difflcs.rl.seeding import seeded
+from difflcs.rl.tasks import Features, see
 
 if TYPE_CHECKING:
     from tensordict import TensorDict, TensorDictBase
-
-    from difflcs.rl.tasks import Features
 
 SAMPLES = ("action", "action_log_prob")
 
@@ -214,7 +213,10 @@ class MultiActionAdvantages:
         after, seen, success = self.env.foresee(episodes["state"][:, :-1], executed, episodes["goal"])
         goals = episodes["goal"][:, None, None].expand(*after.shape[:-1], -1)
         elapsed = elapsed_fractions(after.shape[1])[1:, None].expand(after.shape[:-1])
-        values = self.critic.values(self.features(after, goals, elapsed))
+        context = episodes.get(CONTEXT, None)
+        if context is not None:
+            context = context[:, None, None].expand(*after.shape[:-1], -1)
+        values = self.critic.values(see(self.features, after, goals, elapsed, context))
         values[:, -1] = 0  # an episode has ended
         q = self.scale(seen, success[:, -1]) + self.critic.gamma * values
         judged["advantage"] = multi_action_advantages(q, now, self.critic.gamma, self.zeta).unsqueeze(-1)

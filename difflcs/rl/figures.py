@@ -13,7 +13,7 @@ import torch
 from difflcs._files import write_atomically
 from difflcs.errors import DiffLCSError, InvalidInputError
 from difflcs.rl._optional import require
-from difflcs.rl.rollout import Policy, mpc_actions
+from difflcs.rl.rollout import CONTEXT, Policy, mpc_actions
 
 if TYPE_CHECKING:
     import gymnasium
@@ -141,7 +141,9 @@ def record_video(
                 video.append_data(picture)
                 for step in range(1, task.episode_steps + 1):
                     state = torch.from_numpy(np.asarray(observation["state"], np.float64)[None])
-                    action, _ = act(state, torch.from_numpy(np.asarray(goal, np.float64)[None]))
+                    context = [observation[CONTEXT]] if CONTEXT in observation else []
+                    given = [torch.from_numpy(np.asarray(value, np.float64)[None]) for value in (goal, *context)]
+                    action, _ = act(state, *given)
                     observation, _, _, _, info = env.step(action[0])
                     verdict = "" if step < task.episode_steps else ("reached" if info["success"] else "missed")
                     text = f"{title}    {step * task.step_seconds:.1f} s    {task.say(info)}"

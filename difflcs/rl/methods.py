@@ -19,13 +19,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 import torch
 from torch import Tensor
 
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
-from difflcs.lcs import LCSModel
+from difflcs.lcs import LCSModel, LCSModule
 from difflcs.mpc.backends import get_backend
 from difflcs.rl.dynamics import Ensemble
 from difflcs.rl.lcs_rl import LCSRL
@@ -146,18 +146,18 @@ class LCSMethod(Method):
 
     def rebuild(
         self, task: TaskSpec, config: Mapping[str, object], tensors: Mapping[str, Tensor], source: str
-    ) -> LCSModel:
+    ) -> LCSModule:
         """See `Method`."""
         lcs = LCSModel.from_config(config, tensors, source)
         check_fits(lcs, task, source, CheckpointError)
         return lcs
 
-    def policy(self, task: TaskSpec, learned: LCSModel) -> LCSMPCLayer:
+    def policy(self, task: TaskSpec, learned: LCSModule) -> LCSMPCLayer:
         """See `Method`."""
         return task.make_policy(learned, self.backend)
 
-    def initial(self, work: Work) -> LCSModel:
-        """The model to start from."""
+    def initial(self, work: Work) -> LCSModule:
+        """The model to start from. Override it, with `kind` and `rebuild`, to learn a module of your own."""
         if work.init is not None:
             return work.init
         return LCSModel(
@@ -184,7 +184,10 @@ def check_fits(lcs: LCSModel, task: TaskSpec, source: object, error: type[Except
 _REGISTRY: dict[str, type[Method]] = {}
 
 
-def register_method(method: type[Method]) -> type[Method]:
+Registered = TypeVar("Registered", bound=type[Method])
+
+
+def register_method(method: Registered) -> Registered:
     """Make a method available under its `name`; usable as a class decorator.
 
     Raises:
@@ -221,7 +224,7 @@ def get_method(name: str) -> type[Method]:
 # --- the methods of the paper and their reference points --------------------------------------------------------------
 
 
-def _warmup(work: Work, lcs: LCSModel, policy: Policy, settings: WarmupSettings) -> Warmup:
+def _warmup(work: Work, lcs: LCSModule, policy: Policy, settings: WarmupSettings) -> Warmup:
     envs = work.make_envs(max(settings.rollouts.first, settings.rollouts.each))
     return Warmup(lcs, policy, envs, settings, work.seed, work.task.episode_steps, work.init is not None)
 
@@ -463,7 +466,7 @@ class PDDMMethod(Method):
     ) -> Ensemble:
         """See `Method`."""
         ensemble = Ensemble.from_config(config, tensors, source)
-        if (ensemble.n_x, ensemble.n_u) != (task.n_x, task.n_u):
+        if (ensemble.n_x, ensemble.n_u) != (task.n_x + task.n_context, task.n_u):
             raise CheckpointError(f"{source}: expected networks of the sizes of {task.name}, got others")
         return ensemble
 

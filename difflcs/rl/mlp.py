@@ -15,7 +15,7 @@ from difflcs import _files
 from difflcs._checks import check_positive_int
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.rl.rollout import Plan, elapsed_fractions
-from difflcs.rl.tasks import Features
+from difflcs.rl.tasks import Features, see
 
 _KIND = "MLP"
 _SIZES = ("n_features", "width", "episode_steps")
@@ -71,16 +71,34 @@ class MLPController(nn.Module):
         """An episode starts. `seed` is for policies that draw."""
         self._step = 0
 
-    def mean(self, state: Tensor, goal: Tensor, elapsed: Tensor) -> Tensor:
-        """States (..., n_x), goals (..., n_goal), elapsed fractions of the episode (...) → actions (..., n_u)."""
-        middle, half = 0.5 * (self.u_max + self.u_min), 0.5 * (self.u_max - self.u_min)
-        return middle + half * self.layers(self.features(state, goal, elapsed))
+    def mean(self, state: Tensor, goal: Tensor, elapsed: Tensor, context: Tensor | None = None) -> Tensor:
+        """What it does, without noise.
 
-    def forward(self, x0: Tensor, goal: Tensor, *, u_min: Tensor | None = None, u_max: Tensor | None = None) -> Plan:
+        Args:
+            state: (..., n_x).
+            goal: (..., n_goal).
+            elapsed: (...) fraction of the episode that has passed.
+            context: (..., n_context), the fourth argument of the features where there is one.
+
+        Returns:
+            (..., n_u) actions.
+        """
+        middle, half = 0.5 * (self.u_max + self.u_min), 0.5 * (self.u_max - self.u_min)
+        return middle + half * self.layers(see(self.features, state, goal, elapsed, context))
+
+    def forward(
+        self,
+        x0: Tensor,
+        goal: Tensor,
+        *,
+        u_min: Tensor | None = None,
+        u_max: Tensor | None = None,
+        context: Tensor | None = None,
+    ) -> Plan:
         """Act once in states (B, n_x) towards goals (B, n_goal), one step after the last call."""
         elapsed = elapsed_fractions(self.episode_steps)[self._step % self.episode_steps].expand(x0.shape[:-1])
         self._step += 1
-        action = self.mean(x0, goal, elapsed)
+        action = self.mean(x0, goal, elapsed, context)
         low, high = (self.u_min if u_min is None else u_min), (self.u_max if u_max is None else u_max)
         return Plan(torch.minimum(torch.maximum(action, low), high), torch.ones(x0.shape[:-1], dtype=torch.bool))
 

@@ -20,7 +20,15 @@ from torch import Tensor
 from difflcs._checks import check_positive_int
 from difflcs.errors import InvalidInputError
 from difflcs.rl.dynamics import Ensemble, EnsembleSettings
-from difflcs.rl.rollout import episodes_from, episodes_state, extended, no_episodes, transitions
+from difflcs.rl.rollout import (
+    CONTEXT,
+    beside,
+    episodes_from,
+    episodes_state,
+    extended,
+    no_episodes,
+    observed_transitions,
+)
 from difflcs.rl.seeding import Stream, generator
 from difflcs.rl.settings import MOST_ENVS, Settings, bounded, group
 from difflcs.rl.state import State
@@ -68,11 +76,11 @@ class ModelEnv(VectorEnv):
     its seed only, as that of a real environment.
 
     Args:
-        ensemble: predicts the next state.
+        ensemble: predicts the next state, of the state with its context behind it where there is one.
         outcome: reward and success of a transition, the task's own.
         num_envs: episodes side by side.
         episode_steps: steps of one episode.
-        observation_space: Dict(state, goal) of one real environment.
+        observation_space: Dict(state, goal), or Dict(state, goal, context), of one real environment.
         action_space: of one real environment.
     """
 
@@ -86,11 +94,19 @@ class ModelEnv(VectorEnv):
         self.observation_space = batch_space(observation_space, num_envs)
         self.action_space = batch_space(action_space, num_envs)
         self._starts = self._goals = self._low = self._high = torch.zeros(0, ensemble.n_x)
+        self._contexts: Tensor | None = None
+        self._context: Tensor | None = None
         self._rng = np.random.default_rng(0)
 
-    def remember(self, states: Tensor, goals: Tensor) -> None:
-        """Replace what starts, goals and the range of states are taken from: real states (N, T+1, n_x), goals."""
-        self._starts, self._goals = states[:, 0], goals
+    def remember(self, states: Tensor, goals: Tensor, contexts: Tensor | None = None) -> None:
+        """Replace what starts, goals and the range of states are taken from.
+
+        Args:
+            states: (N, T+1, n_x) of real episodes.
+            goals: (N, n_goal).
+            contexts: (N, n_context) where there are any; an episode has that of its start.
+        """
+        self._starts, self._goals, self._contexts = states[:, 0], goals, contexts
         low, high = states.flatten(0, 1).amin(0), states.flatten(0, 1).amax(0)
         self._low, self._high = low - (high - low), high + (high - low)
 
@@ -118,6 +134,7 @@ class ModelEnv(VectorEnv):
         choices = [rng.integers(self.ensemble.networks, size=self.episode_steps) for rng in generators]
         self._networks = torch.from_numpy(np.stack(choices, 1))
         self._state, self._goal, self._step = self._starts[starts], self._goals[goals], 0
+        self._context = None if self._contexts is None else self._contexts[starts]
         return self._observe(), {}
 
     def step(self, actions: np.ndarray):
@@ -131,7 +148,7 @@ class ModelEnv(VectorEnv):
             observation, _ = self.reset()
             return observation, np.zeros(self.num_envs), nothing, nothing.copy(), {"success": nothing.copy()}
         u = torch.from_numpy(np.asarray(actions, np.float64))
-        after = self._predict(self._state, u, self._networks[self._step])
+        after = self._predict(self._state, u, self._networks[self._step], self._context)
         ended = np.full(self.num_envs, self._step + 1 == self.episode_steps)
         reward, success = self.outcome(self._state, u, after, self._goal, torch.from_numpy(ended))
         self._state, self._step = after, self._step + 1
@@ -150,18 +167,22 @@ class ModelEnv(VectorEnv):
         """
         shape = actions.shape[:-1]
         before, goals = (v.expand(*shape, -1).flatten(0, 2) for v in (states.unsqueeze(2), goals[:, None, None]))
+        context = self._context
+        if context is not None:
+            context = context[:, None, None].expand(*shape, -1).flatten(0, 2)
         actions, networks = actions.flatten(0, 2), self._networks.T.unsqueeze(2).expand(shape).flatten()
         ended = (torch.arange(1, shape[1] + 1) == self.episode_steps).view(1, -1, 1).expand(shape).flatten()
-        after = self._predict(before, actions, networks)
+        after = self._predict(before, actions, networks, context)
         reward, success = self.outcome(before, actions, after, goals, ended)
         return after.view(*shape, -1), reward.view(shape), success.view(shape)
 
-    def _predict(self, states: Tensor, actions: Tensor, networks: Tensor) -> Tensor:
-        """States (B, n_x), actions (B, n_u), numbers of networks (B,) → next states (B, n_x) within the range."""
+    def _predict(self, states: Tensor, actions: Tensor, networks: Tensor, context: Tensor | None) -> Tensor:
+        """States (B, n_x), actions (B, n_u), numbers of networks (B,), contexts → next states (B, n_x) in range."""
+        seen = beside(states, context)
         rows = [(networks == k).nonzero().squeeze(1) for k in range(self.ensemble.networks)]
         padded = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)  # every network, as many rows
         with torch.no_grad():
-            found = self.ensemble(states[padded].float(), actions[padded].float())
+            found = self.ensemble(seen[padded].float(), actions[padded].float())[..., : states.shape[-1]]
         predicted = torch.empty_like(states)
         for own, part in zip(rows, found, strict=True):
             predicted[own] = part[: len(own)].double()
@@ -169,7 +190,10 @@ class ModelEnv(VectorEnv):
         return torch.minimum(torch.maximum(predicted, self._low), self._high)
 
     def _observe(self) -> dict[str, np.ndarray]:
-        return {"state": self._state.numpy().copy(), "goal": self._goal.numpy().copy()}
+        seen = {"state": self._state, "goal": self._goal}
+        if self._context is not None:
+            seen[CONTEXT] = self._context
+        return {name: value.numpy().copy() for name, value in seen.items()}
 
 
 class ModelRollouts:
@@ -189,7 +213,8 @@ class ModelRollouts:
         """Real episodes, a record of `TRANSITIONS`."""
         n_x, n_u = self.episodes["state"].shape[-1], self.episodes["action"].shape[-1]
         sizes = (settings.ensemble.networks, settings.ensemble.width)
-        self.ensemble = Ensemble(n_x, n_u, *sizes, generator(seed, Stream.MODEL, 0))
+        n_context = self.episodes[CONTEXT].shape[-1] if CONTEXT in self.episodes.keys() else 0
+        self.ensemble = Ensemble(n_x + n_context, n_u, *sizes, generator(seed, Stream.MODEL, 0))
         spaces = (env.single_observation_space, env.single_action_space)
         self.env = ModelEnv(self.ensemble, outcome, settings.rollouts, episode_steps, *spaces)
         self.fits = 0
@@ -206,15 +231,18 @@ class ModelRollouts:
         settings = self.settings.ensemble
         self.fits += 1
         loss = self.ensemble.fit(
-            *transitions(self.episodes),
+            *observed_transitions(self.episodes),
             epochs=settings.epochs.first if self.fits == 1 else settings.epochs.each,
             minibatch=settings.epochs.minibatch,
             learning_rate=settings.learning_rate,
             generator=generator(self.seed, Stream.MODEL, self.fits),
             decay=True,
         )
-        self.env.remember(self.episodes["state"], self.episodes["goal"])
+        self._remember()
         return loss
+
+    def _remember(self) -> None:
+        self.env.remember(self.episodes["state"], self.episodes["goal"], self.episodes.get(CONTEXT, None))
 
     def state_dict(self) -> dict[str, Any]:
         """Everything to go on with, the episodes included."""
@@ -225,4 +253,4 @@ class ModelRollouts:
         self.fits, self.episodes = state["fits"], episodes_from(state["episodes"])
         self.ensemble.load_state_dict(state["ensemble"])
         if len(self):
-            self.env.remember(self.episodes["state"], self.episodes["goal"])
+            self._remember()

@@ -20,15 +20,18 @@ from difflcs.cost import GoalCost
 from difflcs.errors import InvalidInputError
 from difflcs.rl.dynamics import Ensemble, EnsembleSettings
 from difflcs.rl.rollout import (
+    CONTEXT,
     Plan,
     action_bounds,
+    beside,
     collect,
     episodes_from,
     episodes_state,
     extended,
+    has_context,
     mpc_actions,
     no_episodes,
-    transitions,
+    observed_transitions,
     uniform_actions,
 )
 from difflcs.rl.seeding import Stream, episode_seeds, generator, number
@@ -87,11 +90,20 @@ class Planner:
         self._mean: Tensor | None = None
         self._generator = torch.Generator().manual_seed(seed)
 
-    def __call__(self, x0: Tensor, goal: Tensor, *, u_min: Tensor | None = None, u_max: Tensor | None = None) -> Plan:
+    def __call__(
+        self,
+        x0: Tensor,
+        goal: Tensor,
+        *,
+        u_min: Tensor | None = None,
+        u_max: Tensor | None = None,
+        context: Tensor | None = None,
+    ) -> Plan:
         """Plan from states (B, n_x) to goals (B, n_goal); the batch must not change between two `begin`."""
         bounds = (self.u_min if u_min is None else u_min), (self.u_max if u_max is None else u_max)
         low, high = (bound.float() for bound in bounds)
         batch, n_u, horizon = len(x0), len(low), self.settings.horizon
+        x0 = beside(x0, context)
         mean = torch.zeros(batch, horizon, n_u) if self._mean is None else self._mean
         if len(mean) != batch:
             raise InvalidInputError(f"x0: expected {len(mean)} states as before, got {batch}; call begin() at a reset")
@@ -121,11 +133,11 @@ class Planner:
         cost = {name: value.float() for name, value in self.cost(goal).fields().items()}
         u = actions.expand(self.ensemble.networks, *actions.shape)
         x = x0.float().expand(*u.shape[:2], -1)
-        total = torch.zeros(u.shape[:2])
+        total, n_x = torch.zeros(u.shape[:2]), self.cost.n_x
         for k in range(u.shape[2]):
-            total += _quadratic(x, cost["Q"], cost["q"]) + _quadratic(u[:, :, k], cost["R"], cost["r"])
+            total += _quadratic(x[..., :n_x], cost["Q"], cost["q"]) + _quadratic(u[:, :, k], cost["R"], cost["r"])
             x = self.ensemble(x, u[:, :, k])
-        total += _quadratic(x, cost["Q_final"], cost["q_final"])
+        total += _quadratic(x[..., :n_x], cost["Q_final"], cost["q_final"])
         return total.mean(0).nan_to_num(nan=3e38, posinf=3e38).clamp_max(1e30)
 
 
@@ -184,7 +196,9 @@ class PDDM(Trainer):
             raise InvalidInputError(f"env: expected at least {needed} environments, got {env.num_envs}")
         sizes = (settings.ensemble.networks, settings.ensemble.width)
         check_positive_int("seed", seed, minimum=0)
-        self.ensemble = Ensemble(cost.n_x, cost.n_u, *sizes, generator(seed, Stream.FIT, 0, 0))
+        space: Any = env.single_observation_space
+        n_seen = cost.n_x + (space[CONTEXT].shape[0] if has_context(env) else 0)
+        self.ensemble = Ensemble(n_seen, cost.n_u, *sizes, generator(seed, Stream.FIT, 0, 0))
         planner = Planner(self.ensemble, cost, settings, *action_bounds(env))
         super().__init__(self.ensemble, planner, seed, episode_steps)
         self.env, self.settings, self.total_episodes = env, settings, total_episodes
@@ -210,7 +224,7 @@ class PDDM(Trainer):
         self.buffer = extended(self.buffer, episodes)
         collected = time.perf_counter()
         loss = self.ensemble.fit(
-            *transitions(self.buffer),
+            *observed_transitions(self.buffer),
             epochs=settings.ensemble.epochs.first if first else settings.ensemble.epochs.each,
             minibatch=settings.ensemble.epochs.minibatch,
             learning_rate=settings.ensemble.learning_rate,

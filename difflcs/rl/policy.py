@@ -14,12 +14,13 @@ from torch.func import functional_call
 
 from difflcs._checks import check_choice, check_number, check_tensor, describe
 from difflcs.errors import DTypeError, InvalidInputError, MissingDependencyError
-from difflcs.lcs import LCSModel, LCSParams
+from difflcs.lcs import LCSModel, LCSModule, LCSParams, LCSSequence
 from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.solution import Primal
 from difflcs.rl._optional import INSTALL
+from difflcs.rl.learned import check_module, system_jacobian
 from difflcs.rl.mlp import MLPController
-from difflcs.rl.rollout import quiet
+from difflcs.rl.rollout import CONTEXT, quiet
 
 try:
     from tensordict import TensorDict, TensorDictBase
@@ -69,7 +70,7 @@ class GaussianParameters(TensorDictModuleBase):
 
 
 class MPCGaussian(GaussianParameters):
-    """State and goal → Gaussian around the MPC's action, and the plan behind it; see `LCSMPCPolicy`."""
+    """State, goal and context → Gaussian around the MPC's action, and the plan behind it; see `LCSMPCPolicy`."""
 
     def __init__(self, mpc: LCSMPCLayer, std: Tensor, covariance: str, in_keys: Sequence[str]):
         super().__init__(std, covariance, in_keys, [*(("plan", name) for name in PLAN), "converged"])
@@ -77,14 +78,17 @@ class MPCGaussian(GaussianParameters):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Solve the MPC, from the key "guess" where it is given, else cold."""
-        guess = tensordict.get("guess", None)
-        start = None if guess is None else Primal(*(guess[name] for name in PLAN))
         state, goal = (tensordict[key] for key in self.in_keys)
-        solution = self.mpc(state, goal, guess=start)
+        solution = self.mpc(state, goal, guess=_guess(tensordict), context=tensordict.get(CONTEXT, None))
         plan = {name: getattr(solution, name).detach() for name in PLAN}
         tensordict["plan"] = TensorDict(plan, tensordict.batch_size)  # pyright: ignore[reportArgumentType]
         tensordict["converged"] = solution.converged.unsqueeze(-1)
         return self.write(tensordict, solution.action)
+
+
+def _guess(tensordict: TensorDictBase) -> Primal | None:
+    guess = tensordict.get("guess", None)
+    return None if guess is None else Primal(*(guess[name] for name in PLAN))
 
 
 class MLPGaussian(GaussianParameters):
@@ -96,7 +100,8 @@ class MLPGaussian(GaussianParameters):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Evaluate the network."""
-        return self.write(tensordict, self.network.mean(*(tensordict[key] for key in self.in_keys)))
+        seen = (tensordict[key] for key in self.in_keys)
+        return self.write(tensordict, self.network.mean(*seen, context=tensordict.get(CONTEXT, None)))
 
 
 class GaussianPolicy(ProbabilisticActor):
@@ -124,7 +129,7 @@ class GaussianPolicy(ProbabilisticActor):
         self.gaussian = parameters
 
     @property
-    def learned(self) -> LCSModel | LCSParams | MLPController:
+    def learned(self) -> LCSModule | LCSParams | LCSSequence | MLPController:
         """The model behind the mean: what is trained and saved."""
         raise NotImplementedError
 
@@ -166,6 +171,7 @@ class LCSMPCPolicy(GaussianPolicy):
     | key | read or written | shape |
     |-----|-----------------|-------|
     | "state", "goal" | read | (..., n_x), (..., n_goal) |
+    | "context" | read if there | (..., n_context) what the system depends on besides the state |
     | ("guess", "x"), ("guess", "u"), ("guess", "lam") | read if there | start of the solver, for the same states |
     | "action" | written | (..., n_u) the sample, *not* clipped |
     | "action_log_prob" | written | (...) of this sample |
@@ -212,8 +218,8 @@ class LCSMPCPolicy(GaussianPolicy):
         ...     adam.step()
 
     Args:
-        mpc: the controller; a learnable LCS in it is what is trained. `on_failure="mask"` keeps a batch going where
-            single solves fail.
+        mpc: the controller; a learnable LCS in it is what is trained, an `LCSModel` or any other `LCSModule` that is a
+            `torch.nn.Module`. `on_failure="mask"` keeps a batch going where single solves fail.
         std: standard deviation of each action component, a number or (n_u,) [units of the action].
         covariance: "fixed"; or learned with the policy, "diagonal" or "full", that is with correlations.
         in_keys: keys of state and goal. TorchRL's `GymWrapper` renames "state" to "observation".
@@ -245,9 +251,9 @@ class LCSMPCPolicy(GaussianPolicy):
         return self.gaussian.mpc
 
     @property
-    def learned(self) -> LCSModel | LCSParams:
+    def learned(self) -> LCSModule | LCSParams | LCSSequence:
         """The LCS."""
-        return self.mpc.lcs
+        return self.mpc.lcs  # pyright: ignore[reportReturnType]  a layer takes any module; PPO does not yet
 
     @property
     def controller(self) -> LCSMPCLayer:
@@ -258,13 +264,22 @@ class LCSMPCPolicy(GaussianPolicy):
         """Jacobians of the mean with respect to what is learned of the LCS, in standard deviations.
 
         Args:
-            data: (N,) states and goals, and plans under "guess" to start from.
+            data: (N,) states and goals, contexts where there are any, and plans under "guess" to start from.
 
         Returns:
-            (N, n_u, P) L⁻¹ ∂u/∂θ with Σ = L Lᵀ.
+            (N, n_u, P) L⁻¹ ∂u/∂θ with Σ = L Lᵀ, P parameters of the LCS that require a gradient.
+
+        Raises:
+            InvalidInputError, DTypeError: the LCS has none, or is no `torch.nn.Module`.
         """
+        lcs = check_module(self.mpc.lcs, name="actor")
+        if not _is_plain(lcs):
+            state, goal = (data[key] for key in self.in_keys)
+            with quiet():
+                found = system_jacobian(self.mpc, state, goal, _guess(data), data.get(CONTEXT, None))
+            return torch.linalg.solve_triangular(self.gaussian.scale_tril().detach(), found, upper=False)
         # A copy of the LCS for each sample: their gradients are the samples' own.
-        of_lcs = {id(p) for p in self.mpc.lcs.parameters()}  # pyright: ignore[reportAttributeAccessIssue]
+        of_lcs = {id(p) for p in lcs.parameters()}
         learned = {name: p for name, p in self.gaussian.named_parameters() if id(p) in of_lcs and p.requires_grad}
         copies = {name: p.detach().expand(len(data), *p.shape).clone().requires_grad_() for name, p in learned.items()}
         batch = data.select(*self.in_keys, "guess")
@@ -324,6 +339,12 @@ def make_actor(
     """The Gaussian around a controller: an `LCSMPCPolicy` or an `MLPPolicy`, see there."""
     kind = MLPPolicy if isinstance(controller, MLPController) else LCSMPCPolicy
     return kind(controller, std, covariance)  # pyright: ignore[reportArgumentType]
+
+
+def _is_plain(lcs: object) -> bool:
+    """Whether its matrices are its parameters as they are, so that those may have batch dimensions."""
+    own = ((getattr(type(lcs), name, None), getattr(LCSModel, name)) for name in ("params", "F"))
+    return isinstance(lcs, LCSModel) and all(mine is plain for mine, plain in own)
 
 
 def _std(value: float | Tensor, n_u: int) -> Tensor:

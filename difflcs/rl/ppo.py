@@ -19,16 +19,16 @@ import torch
 from torch import Tensor
 
 from difflcs.errors import InvalidInputError
-from difflcs.lcs import LCSParams
 from difflcs.rl.advantages import Advantages, RewardScale, returns
 from difflcs.rl.critic import Critic
+from difflcs.rl.learned import check_learned
 from difflcs.rl.model_rollouts import ModelRollouts
 from difflcs.rl.optim import UpdateRule
-from difflcs.rl.rollout import collect, elapsed_fractions
+from difflcs.rl.rollout import CONTEXT, collect, elapsed_fractions
 from difflcs.rl.seeding import Stream, episode_seeds, numbers, seeded
 from difflcs.rl.state import State
 from difflcs.rl.surrogate import Surrogate, gaussian_kl, trimmed_mean
-from difflcs.rl.tasks import Features
+from difflcs.rl.tasks import Features, see
 from difflcs.rl.trainer import AfterStep, Trainer
 
 if TYPE_CHECKING:
@@ -118,8 +118,8 @@ class PPO(Trainer):
     """The main phase, see `Trainer`; `make_ppo` puts one together.
 
     Args:
-        actor: the policy, from `difflcs.rl.make_actor`; what it has learned is trained in place. An MPC in it
-            needs on_failure="mask".
+        actor: the policy, from `difflcs.rl.make_actor`; what it has learned is trained in place: an `LCSModel`, any
+            other `LCSModule` that is a `torch.nn.Module`, or a network. An MPC in it needs on_failure="mask".
         robot: the real episodes.
         critic: the value network.
         surrogate: the loss.
@@ -164,9 +164,7 @@ class PPO(Trainer):
         models: ModelRollouts | None = None,
         practice: Source | None = None,
     ):
-        learned = actor.learned
-        if isinstance(learned, LCSParams):
-            raise InvalidInputError("actor: expected a model that can be learned, got fixed LCSParams; use an LCSModel")
+        learned = check_learned(actor.learned, robot.env)
         if total_episodes <= first_episode:
             raise InvalidInputError(
                 f"total_episodes: expected more than the {first_episode} collected before, got {total_episodes}; "
@@ -292,7 +290,7 @@ class PPO(Trainer):
         stable = cast("TensorDict", episodes[episodes["stable"]])
         rewards = self.scale(stable["reward"], stable["success"])
         start = time.perf_counter()
-        inputs, sums = self._inputs(stable), returns(rewards, self.critic.gamma)
+        inputs, sums = _inputs(self.features, stable), returns(rewards, self.critic.gamma)
         self.critic.begin(inputs, rewards, key(Stream.VALUE))
         estimate = source.advantages(stable, inputs, rewards, key(Stream.LOSS))
         unexplained = (sums - estimate.values).var() / sums.var().clamp_min(1e-12)
@@ -321,11 +319,13 @@ class PPO(Trainer):
         seen: list[TensorDict] = []
         solve_seconds = 0.0
 
-        def act(state: Tensor, goal: Tensor) -> tuple[np.ndarray, np.ndarray]:
+        def act(state: Tensor, goal: Tensor, context: Tensor | None = None) -> tuple[np.ndarray, np.ndarray]:
             nonlocal solve_seconds
             begun = time.perf_counter()
             now = elapsed[len(seen)].repeat(len(state))
             step = TensorDict({"state": state.clone(), "goal": goal.clone(), "elapsed": now}, [len(state)])
+            if context is not None:
+                step[CONTEXT] = context.clone()
             self.actor.act(step)  # cold: as in evaluation
             seen.append(step)
             solve_seconds += time.perf_counter() - begun
@@ -340,13 +340,6 @@ class PPO(Trainer):
             raise InvalidInputError("env: expected a stable simulation, got NaN or a physics error in every episode")
         episodes["policy"] = TensorDict.maybe_dense_stack(seen, 1)
         return episodes, seconds - solve_seconds, solve_seconds
-
-    def _inputs(self, episodes: TensorDict) -> Tensor:
-        """(N, T+1, n) inputs of the value network."""
-        states = episodes["state"]
-        goals = episodes["goal"].unsqueeze(1).expand(-1, states.shape[1], -1)
-        elapsed = elapsed_fractions(states.shape[1] - 1).expand(states.shape[:-1])
-        return self.features(states, goals, elapsed)
 
     def _improve(
         self, source: Source, episodes: TensorDict, samples: TensorDict, scale: float, key: Sequence[int]
@@ -366,7 +359,8 @@ class PPO(Trainer):
         for chosen in _batches(len(data), source.steps, source.minibatch, rng):
             start = time.perf_counter()
             old = cast("TensorDict", data[chosen])
-            new = cast("TensorDict", self.actor.solve(old.select(*self.actor.in_keys, "guess", strict=False)))
+            asked = old.select(*self.actor.in_keys, "guess", CONTEXT, strict=False)
+            new = cast("TensorDict", self.actor.solve(asked))
             if "plan" in new.keys():
                 data["guess"][chosen] = new["plan"]
             outcome.solver_failures += int(_failed(new).sum())
@@ -438,6 +432,17 @@ class _Outcome:
     physics_seconds: float
     solve_seconds: float
     value_seconds: float
+
+
+def _inputs(features: Features, episodes: TensorDict) -> Tensor:
+    """(N, T+1, n) inputs of the value network."""
+    states = episodes["state"]
+    steps = states.shape[1]
+    goals = episodes["goal"].unsqueeze(1).expand(-1, steps, -1)
+    elapsed = elapsed_fractions(steps - 1).expand(states.shape[:-1])
+    context = episodes.get(CONTEXT, None)
+    context = None if context is None else context.unsqueeze(1).expand(-1, steps, -1)
+    return see(features, states, goals, elapsed, context)
 
 
 def _batches(samples: int, steps: int, size: int | None, rng: np.random.Generator) -> Iterator[Tensor]:

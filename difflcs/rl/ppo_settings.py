@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from difflcs.errors import InvalidInputError
-from difflcs.lcs import LCSModel, LCSParams
+from difflcs.lcs import LCSModule, LCSParams, LCSSequence
 from difflcs.rl.advantages import GAEAdvantages, MultiActionAdvantages, RewardScale
 from difflcs.rl.critic import Critic, CriticSettings
 from difflcs.rl.model_rollouts import ModelRollouts
 from difflcs.rl.optim import AdamUpdate, Natural, NaturalUpdate, UpdateRule
 from difflcs.rl.optim.update import Deviation
 from difflcs.rl.ppo import PPO, Source
-from difflcs.rl.rollout import action_bounds
+from difflcs.rl.rollout import CONTEXT, action_bounds, has_context
 from difflcs.rl.seeding import Stream
 from difflcs.rl.settings import MOST_ENVS, Adam, Settings, ViolationLoss, bounded, group
 from difflcs.rl.surrogate import Surrogate
@@ -120,8 +120,8 @@ def make_ppo(
         InvalidInputError: an argument does not fit.
         MissingDependencyError: TorchRL is not installed.
     """
-    lcs = isinstance(actor.learned, LCSModel)
-    if not lcs and not isinstance(actor.learned, LCSParams) and (settings.beta < 1 or settings.update == "natural"):
+    lcs = isinstance(actor.learned, LCSModule | LCSParams | LCSSequence)
+    if not lcs and (settings.beta < 1 or settings.update == "natural"):
         raise InvalidInputError(
             f'settings: expected beta=1 and update="adam" without an LCS, got beta={settings.beta:g} and '
             f"update={settings.update!r}; drop them"
@@ -132,7 +132,9 @@ def make_ppo(
             f"{actor.covariance!r}; use make_actor(controller, settings.std, settings.covariance)"
         )
     space: Any = env.single_observation_space
-    sizes = (space["state"].shape, space["goal"].shape, ())
+    sizes = [space["state"].shape, space["goal"].shape, ()]
+    if has_context(env):
+        sizes.append(space[CONTEXT].shape)
     example = features(*(torch.zeros(size, dtype=torch.float64) for size in sizes))
     key = (seed, Stream.VALUE, first_iteration)
     critic = Critic(settings.critic, len(example), episode_steps, settings.gamma, settings.zeta, key)

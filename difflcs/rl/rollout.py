@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from tensordict import TensorDict
 
 TRANSITIONS = ("state", "action", "goal")
-"""What is kept of episodes to learn from."""
+"""What is kept of episodes to learn from, with `CONTEXT` where the environment gives one."""
+CONTEXT = "context"
+"""Key of what the system depends on besides its state, the same for a whole episode: a mass, a gain."""
 
 
 class Solution(Protocol):
@@ -50,15 +52,21 @@ class Plan:
 
 
 class Policy(Protocol):
-    """What is needed of an `LCSMPCLayer`: (B, n_x) states, (B, n_goal) goals, optional bounds (n_u,) → a solution."""
+    """What is needed of an `LCSMPCLayer`: (B, n_x) states, (B, n_goal) goals, optional bounds (n_u,) → a solution.
+
+    Where the environment gives a context, (B, n_context), it comes by the keyword `context`.
+    """
 
     def __call__(self, x0: Tensor, goal: Tensor, *, u_min: Tensor | None, u_max: Tensor | None) -> Solution:
         """Solve a batch."""
         ...
 
 
-Act = Callable[[Tensor, Tensor], tuple[np.ndarray, np.ndarray]]
-"""States (B, n_x), goals (B, n_goal) → actions (B, n_u) and whether the solve failed (B,)."""
+Act = Callable[..., tuple[np.ndarray, np.ndarray]]
+"""States (B, n_x), goals (B, n_goal) → actions (B, n_u) and whether the solve failed (B,).
+
+Where the environment gives a context, (B, n_context), it is the third argument.
+"""
 
 
 def action_bounds(env: VectorEnv) -> tuple[Tensor, Tensor]:
@@ -90,9 +98,10 @@ def mpc_actions(policy: Policy, u_min: Tensor | None = None, u_max: Tensor | Non
     if begin is not None:
         begin(seed)
 
-    def act(state: Tensor, goal: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    def act(state: Tensor, goal: Tensor, context: Tensor | None = None) -> tuple[np.ndarray, np.ndarray]:
+        given: Any = {} if context is None else {CONTEXT: context}
         with torch.no_grad(), quiet():
-            solution = policy(state, goal, u_min=u_min, u_max=u_max)
+            solution = policy(state, goal, u_min=u_min, u_max=u_max, **given)
         return solution.action.numpy(), (~solution.converged).numpy()
 
     return act
@@ -101,14 +110,14 @@ def mpc_actions(policy: Policy, u_min: Tensor | None = None, u_max: Tensor | Non
 def uniform_actions(env: VectorEnv, rng: np.random.Generator) -> Act:
     """Act uniformly at random within the action space."""
     low, high = (bound.numpy() for bound in action_bounds(env))
-    return lambda state, goal: (rng.uniform(low, high, (len(state), len(low))), np.zeros(len(state), bool))
+    return lambda state, *_: (rng.uniform(low, high, (len(state), len(low))), np.zeros(len(state), bool))
 
 
 def noisy_actions(act: Act, std: float, rng: np.random.Generator) -> Act:
     """Add Gaussian noise of standard deviation `std` [units of the action] to actions."""
 
-    def noisy(state: Tensor, goal: Tensor) -> tuple[np.ndarray, np.ndarray]:
-        action, failed = act(state, goal)
+    def noisy(*observed: Tensor) -> tuple[np.ndarray, np.ndarray]:
+        action, failed = act(*observed)
         return action + std * rng.standard_normal(action.shape), failed
 
     return noisy
@@ -124,7 +133,8 @@ def collect(
     """Run one episode per seed, in lockstep.
 
     Args:
-        env: vector of environments with observation Dict(state, goal) and info "success"; at least as many as seeds.
+        env: vector of environments with observation Dict(state, goal), or Dict(state, goal, context), and info
+            "success"; at least as many as seeds.
         act: chooses actions; they are clipped into the action space before they are executed and stored.
         seeds: reset seed of each episode; the environment draws the initial state and the goal from it.
         episode_steps: T, the length of every episode.
@@ -139,13 +149,15 @@ def collect(
         | "action" | (N, T, n_u) | executed |
         | "reward" | (N, T) | as the environment gave it |
         | "goal" | (N, n_goal) | |
+        | "context" | (N, n_context) | where the environment gives one |
         | "success" | (N,) bool | at the goal after the last step |
         | "stable" | (N,) bool | False where the simulation broke down (NaN, or info "physics_error"): no success |
         | "failures" | (N,) int | failed solves |
         | ("errors", name) | (N,) | what remains after the last step, of each entry of the info that ends in `_error` |
 
     Raises:
-        InvalidInputError: too many seeds, an episode of another length, or observations that autoreset overwrites.
+        InvalidInputError: too many seeds, an episode of another length, observations that autoreset overwrites, or a
+            context that changes during an episode.
     """
     from tensordict import TensorDict  # takes a second
 
@@ -156,12 +168,14 @@ def collect(
     padded = [*seeds, *[seeds[-1]] * (env.num_envs - n)]
     observation, _ = env.reset(seed=padded)  # pyright: ignore[reportArgumentType]  Gymnasium's vectors take a list
     state, goal = (np.array(observation[key][:n], np.float64) for key in ("state", "goal"))
+    context = np.array(observation[CONTEXT][:n], np.float64) if CONTEXT in observation else None
+    given = [torch.from_numpy(value) for value in (goal, context) if value is not None]
     stable = np.asarray(np.isfinite(state).all(-1))
     states, executed, rewards, failures = [state], [], [], np.zeros(n, np.int64)
     infos: dict = {}
     for t in range(episode_steps):
         usable = np.where(stable[:, None], state, 0.0)  # a solver must not see NaN
-        action, failed = act(torch.from_numpy(usable), torch.from_numpy(goal))
+        action, failed = act(torch.from_numpy(usable), *given)
         action = np.clip(action, low, high)
         batch = np.zeros((env.num_envs, len(low)))
         batch[:n] = action
@@ -177,6 +191,11 @@ def collect(
         if bool(((ended != (t + 1 == episode_steps)) & stable).any()):
             length = f"one of {t + 1}" if t + 1 < episode_steps else "a longer one"
             raise InvalidInputError(f"episode_steps: expected episodes of {episode_steps} steps, got {length}")
+        if context is not None and (np.asarray(observation[CONTEXT])[:n] != context)[stable].any():
+            raise InvalidInputError(
+                f"env: expected the same context in a whole episode, got another in step {t + 1}; what changes belongs "
+                f"into the state"
+            )
         if after_step is not None:
             after_step()
     if "success" not in infos and stable.any():
@@ -184,7 +203,7 @@ def collect(
     success = np.asarray(infos.get("success", stable), bool)[:n] & stable
     reported = (k for k in infos if k.endswith("_error") and not k.startswith("_") and k != "physics_error")
     errors = {k: torch.from_numpy(np.asarray(infos[k][:n], np.float64)) for k in reported}
-    record = {
+    record: dict[str, Any] = {
         "state": torch.from_numpy(np.stack(states, 1)),
         "action": torch.from_numpy(np.stack(executed, 1)),
         "reward": torch.from_numpy(np.stack(rewards, 1)),
@@ -194,7 +213,9 @@ def collect(
         "failures": torch.from_numpy(failures),
         "errors": TensorDict(errors, [n]),  # pyright: ignore[reportArgumentType]
     }
-    return TensorDict(record, [n])  # pyright: ignore[reportArgumentType]
+    if context is not None:
+        record[CONTEXT] = torch.from_numpy(context)
+    return TensorDict(record, [n])
 
 
 def _check_env(env: VectorEnv, episodes: int) -> None:
@@ -208,13 +229,16 @@ def _check_env(env: VectorEnv, episodes: int) -> None:
 
 
 def no_episodes(env: VectorEnv, episode_steps: int) -> TensorDict:
-    """A record of `TRANSITIONS` without episodes, of the sizes of an environment."""
+    """A record of `TRANSITIONS` without episodes, of the sizes of an environment; with its context, if it has one."""
     from tensordict import TensorDict
 
     space: Any = env.single_observation_space
     n_x, n_u = space["state"].shape[0], env.single_action_space.shape[0]  # pyright: ignore[reportOptionalSubscript]
     sizes = ((episode_steps + 1, n_x), (episode_steps, n_u), space["goal"].shape)
-    empty = {name: torch.zeros(0, *size, dtype=torch.float64) for name, size in zip(TRANSITIONS, sizes, strict=True)}
+    shapes: dict[str, Any] = dict(zip(TRANSITIONS, sizes, strict=True))
+    if has_context(env):
+        shapes[CONTEXT] = space[CONTEXT].shape
+    empty = {name: torch.zeros(0, *size, dtype=torch.float64) for name, size in shapes.items()}
     return TensorDict(empty, [0])  # pyright: ignore[reportArgumentType]
 
 
@@ -230,7 +254,8 @@ def extended(known: TensorDict, episodes: TensorDict, keep: int | None = None) -
         InvalidInputError: there is no episode in either.
     """
     stable = episodes[episodes["stable"]] if "stable" in episodes.keys() else episodes
-    found: Any = torch.cat([known, stable.select(*TRANSITIONS)])  # pyright: ignore[reportCallIssue, reportArgumentType]
+    names = _kept(known)
+    found: Any = torch.cat([known, stable.select(*names)])  # pyright: ignore[reportCallIssue, reportArgumentType]
     if not len(found):
         raise InvalidInputError("env: expected a stable simulation, got NaN or a physics error in every episode")
     return found if keep is None else found[-keep:]
@@ -238,7 +263,11 @@ def extended(known: TensorDict, episodes: TensorDict, keep: int | None = None) -
 
 def episodes_state(episodes: TensorDict) -> dict[str, Tensor]:
     """A record of `TRANSITIONS` as a part of a state, see `difflcs.rl.state`."""
-    return {name: episodes[name] for name in TRANSITIONS}
+    return {name: episodes[name] for name in _kept(episodes)}
+
+
+def _kept(episodes: TensorDict) -> list[str]:
+    return [name for name in (*TRANSITIONS, CONTEXT) if name in episodes.keys()]
 
 
 def episodes_from(state: Mapping[str, Tensor]) -> TensorDict:
@@ -252,3 +281,27 @@ def transitions(episodes: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
     """States (N·T, n_x), actions (N·T, n_u) and next states (N·T, n_x) of a record of episodes."""
     state = episodes["state"]
     return state[:, :-1].flatten(0, 1), episodes["action"].flatten(0, 1), state[:, 1:].flatten(0, 1)
+
+
+def contexts(episodes: TensorDict) -> Tensor | None:
+    """(N·T, n_context) the contexts of the `transitions` of a record of episodes; None where it has none."""
+    if CONTEXT not in episodes.keys():
+        return None
+    return episodes[CONTEXT].unsqueeze(1).expand(-1, episodes["action"].shape[1], -1).flatten(0, 1)
+
+
+def observed_transitions(episodes: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
+    """`transitions` for networks: of the states with the contexts behind them, where there are any."""
+    (state, action, after), context = transitions(episodes), contexts(episodes)
+    return beside(state, context), action, beside(after, context)
+
+
+def beside(state: Tensor, context: Tensor | None) -> Tensor:
+    """States (..., n_x) with their contexts behind them, for networks: (..., n_x + n_context)."""
+    return state if context is None else torch.cat([state, context], -1)
+
+
+def has_context(env: VectorEnv) -> bool:
+    """Whether the observations of an environment have a context."""
+    space: Any = env.single_observation_space
+    return CONTEXT in space.keys()

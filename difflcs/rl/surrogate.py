@@ -16,13 +16,13 @@ import torch
 from torch import Tensor
 
 from difflcs.losses import violation_loss
-from difflcs.rl.rollout import transitions
+from difflcs.rl.rollout import contexts, transitions
 from difflcs.rl.settings import ViolationLoss
 
 if TYPE_CHECKING:
     from tensordict import TensorDict, TensorDictBase
 
-    from difflcs.lcs import LCSModel
+    from difflcs.lcs import LCSModule
     from difflcs.rl.policy import GaussianPolicy
 
 _VIOLATION_BATCH = 300
@@ -84,10 +84,12 @@ class Surrogate:
         loss = self.beta * result["loss_objective"]
         if self.beta < 1 and self.violation is not None:
             x, u, x_next = transitions(seen)
+            context = contexts(seen)
             chosen = torch.from_numpy(rng.permutation(len(x))[:_VIOLATION_BATCH])
-            lcs = cast("LCSModel", self.lcs)
+            lcs = cast("LCSModule", self.lcs)
             part = (x[chosen], u[chosen], x_next[chosen], self.violation.gamma, self.violation.xi)
-            loss = loss + (1 - self.beta) * violation_loss(lcs, *part)
+            given = None if context is None else context[chosen]
+            loss = loss + (1 - self.beta) * violation_loss(lcs, *part, context=given)
         return loss
 
 

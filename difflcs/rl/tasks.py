@@ -26,7 +26,7 @@ from torch import Tensor
 from difflcs._checks import check_number, check_positive_int
 from difflcs.cost import GoalCost
 from difflcs.errors import DTypeError, InvalidInputError
-from difflcs.lcs import LCSModel
+from difflcs.lcs import LCSModule
 from difflcs.mpc import LCSMPCLayer
 from difflcs.rl._optional import require
 
@@ -37,8 +37,17 @@ if TYPE_CHECKING:
 ENTRY_POINTS = "difflcs.tasks"
 """Group of entry points that register tasks."""
 
-Features = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""States (..., n_x), goals (..., n_goal), elapsed fractions of the episode (...) → (..., n) inputs of a network."""
+Features = Callable[..., Tensor]
+"""States (..., n_x), goals (..., n_goal), elapsed fractions of the episode (...) → (..., n) inputs of a network.
+
+Contexts (..., n_context) are the fourth argument where the environment gives any.
+"""
+
+
+def see(features: Features, state: Tensor, goal: Tensor, elapsed: Tensor, context: Tensor | None) -> Tensor:
+    """Features of states, and of their contexts where there are any."""
+    seen = (state, goal, elapsed)
+    return features(*seen) if context is None else features(*seen, context)
 
 
 class Outcome(Protocol):
@@ -88,6 +97,8 @@ class TaskSpec:
         step_seconds: duration of one step [s].
         features: what the value network sees, scaled to about one; a function as `Features` says.
         outcome: reward and success of a transition, the environment's own; a function as `Outcome` says.
+        n_context: size of the context, such as the mass of a block, that the environment gives in its observations
+            Dict(state, goal, context=Box(n_context)), the same for a whole episode; 0: it gives none.
         failure_penalty: what that reward has lost in the last step of an episode without success. Nothing is subtracted
             here: PPO must know how much of that one reward is no cost of a step, see `RewardScale`.
         goal: names and units of the components of a goal.
@@ -117,6 +128,7 @@ class TaskSpec:
     step_seconds: float
     features: Features
     outcome: Outcome
+    n_context: int = 0
     summary: str = ""
     env_kwargs: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}), hash=False)
     relaxation: float = 1e-5
@@ -138,6 +150,7 @@ class TaskSpec:
             )
         for name in ("horizon", "episode_steps"):
             check_positive_int(name, getattr(self, name), maximum=10**6)
+        check_positive_int("n_context", self.n_context, minimum=0, maximum=10**6)
         for name in ("step_seconds", "relaxation"):
             check_number(name, getattr(self, name), strict=True)
         check_number("failure_penalty", self.failure_penalty)
@@ -181,7 +194,7 @@ class TaskSpec:
     @functools.cached_property
     def n_features(self) -> int:
         """Number of features."""
-        sizes = ((self.n_x,), (self.n_goal,), ())
+        sizes = [(self.n_x,), (self.n_goal,), (), *([(self.n_context,)] if self.n_context else [])]
         return len(self.features(*(torch.zeros(size, dtype=torch.float64) for size in sizes)))
 
     @property
@@ -240,7 +253,7 @@ class TaskSpec:
                 f"task {self.name}: its environment cannot be made: {type(error).__name__}: {error}"
             ) from error
 
-    def make_policy(self, lcs: LCSModel, backend: str = "batched") -> LCSMPCLayer:
+    def make_policy(self, lcs: LCSModule, backend: str = "batched") -> LCSMPCLayer:
         """The MPC around a model; unsolved elements are masked, never raised, so that they cannot end a training."""
         low, high = self.bounds
         return LCSMPCLayer(

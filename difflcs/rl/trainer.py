@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
+from difflcs import _files
 from difflcs._checks import check_positive_int
 from difflcs.rl.rollout import Policy
 from difflcs.rl.state import State, restore
@@ -18,11 +19,11 @@ AfterStep = Callable[[int], object]
 
 
 class Learned(Protocol):
-    """What a training learns and leaves behind: an `LCSModel`, a network, an ensemble of them."""
+    """What a training learns and leaves behind: an `LCSModel`, any other module, an ensemble of networks.
 
-    def config(self) -> dict[str, Any]:
-        """What is needed besides the tensors to build it again (JSON types only)."""
-        ...
+    Besides the two methods it may have `config()`, what is needed besides the tensors to build it again (JSON types
+    only), and `save_pretrained(directory)`, which writes it into a directory, atomically.
+    """
 
     def state_dict(self) -> Any:
         """Its tensors by name."""
@@ -30,10 +31,6 @@ class Learned(Protocol):
 
     def load_state_dict(self, state: Mapping[str, Tensor], /) -> Any:
         """Replace them."""
-        ...
-
-    def save_pretrained(self, directory: Path, /) -> None:
-        """Write it into a directory, atomically."""
         ...
 
 
@@ -88,4 +85,22 @@ class Trainer(ABC):
 
 def learned_state(learned: Learned) -> dict[str, Any]:
     """What was learned, as a part of a state."""
-    return {"settings": learned.config(), "parameters": dict(learned.state_dict())}
+    return {"settings": configuration(learned), "parameters": dict(learned.state_dict())}
+
+
+def configuration(learned: Learned) -> dict[str, Any]:
+    """What tells it from others besides its tensors: its `config()`, or the name of its class and its sizes."""
+    config: Any = getattr(learned, "config", None)
+    if callable(config):
+        return config()  # pyright: ignore[reportReturnType]
+    sizes = {name: getattr(learned, name) for name in ("n_x", "n_u", "n_lam") if hasattr(learned, name)}
+    return {"class": type(learned).__name__, **sizes}
+
+
+def save_learned(learned: Learned, directory: Path) -> None:
+    """Write it into a directory, atomically: by its `save_pretrained`, else as a record named like its class."""
+    save = getattr(learned, "save_pretrained", None)
+    if callable(save):
+        save(directory)
+    else:
+        _files.save_record(directory, type(learned).__name__, configuration(learned), learned.state_dict())

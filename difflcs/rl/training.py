@@ -22,7 +22,7 @@ from difflcs.rl.methods import LCSMethod, LCSRLMethod, Method, Work, check_fits,
 from difflcs.rl.rollout import Policy
 from difflcs.rl.settings import Settings, bounded, from_json
 from difflcs.rl.tasks import TaskSpec, get_task
-from difflcs.rl.trainer import Trainer
+from difflcs.rl.trainer import Trainer, save_learned
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
@@ -342,7 +342,7 @@ class _Training:
                 previous = trainer.env_steps
                 finish(trainer.step(reporter.stepped), previous)
             with writing(run.path):
-                trainer.learned.save_pretrained(run.model)
+                save_learned(trainer.learned, run.model)
         finally:
             writer.close()
 

@@ -11,12 +11,14 @@ import torch
 from torch import Tensor
 
 from difflcs.errors import InvalidInputError
-from difflcs.lcs import LCSModel
+from difflcs.lcs import LCSModule
 from difflcs.losses import violation_loss
+from difflcs.rl.learned import check_depends, check_module
 from difflcs.rl.rollout import (
     Policy,
     action_bounds,
     collect,
+    contexts,
     episodes_from,
     episodes_state,
     extended,
@@ -98,46 +100,53 @@ class Fit:
 
 
 def fit(
-    lcs: LCSModel,
+    lcs: LCSModule,
     x: Tensor,
     u: Tensor,
     x_next: Tensor,
     settings: WarmupSettings,
     epochs: int,
     rng: np.random.Generator,
+    *,
+    context: Tensor | None = None,
 ) -> Fit:
     """Fit a model to transitions by the violation loss, with a fresh Adam.
 
     Args:
-        lcs: changed in place.
+        lcs: an `LCSModel` or any other `LCSModule` that is a `torch.nn.Module`; changed in place.
         x: (N, n_x) states.
         u: (N, n_u) actions.
         x_next: (N, n_x) next states.
         settings: step size, minibatch, loss.
         epochs: passes over the data.
         rng: draws the split and the minibatches.
+        context: (N, n_context) given to the module, where its system depends on one.
 
     Returns:
         Losses and the number of steps.
 
     Raises:
         GammaError: gamma of the loss is too large for this model.
+        InvalidInputError: there is nothing to learn in the module, or its system does not depend on it.
     """
+    module = check_module(lcs)
     gamma, xi = settings.loss.gamma, settings.loss.xi
     order = torch.from_numpy(rng.permutation(len(x)))
     n_train = max(1, int((1 - HELD_OUT) * len(x)))
     train, rest = order[:n_train], order[n_train:]
     size = min(settings.epochs.minibatch, n_train)
-    learned = [p for p in lcs.parameters() if p.requires_grad]
+    learned = [p for p in module.parameters() if p.requires_grad]
     # fused: 66 µs per step against 157 µs, beside 150 µs for the loss and its gradient.
     adam = torch.optim.Adam(learned, settings.adam.learning_rate, settings.adam.betas, _ADAM_EPS, fused=True)
     recent: list[Tensor] = []
     steps = 0
     for _ in range(epochs):
         shuffled = train[torch.from_numpy(rng.permutation(n_train))][: n_train - n_train % size]
-        batches = zip(x[shuffled].split(size), u[shuffled].split(size), x_next[shuffled].split(size), strict=True)
-        for x_batch, u_batch, next_batch in batches:
-            loss = violation_loss(lcs, x_batch, u_batch, next_batch, gamma, xi)
+        parts = [v[shuffled].split(size) for v in (x, u, x_next)]
+        given = [None] * len(parts[0]) if context is None else context[shuffled].split(size)
+        for x_batch, u_batch, next_batch, context_batch in zip(*parts, given, strict=True):
+            loss = violation_loss(lcs, x_batch, u_batch, next_batch, gamma, xi, context=context_batch)
+            check_depends(loss)
             adam.zero_grad()
             loss.backward()
             adam.step()
@@ -145,7 +154,9 @@ def fit(
             recent = [*recent[-9:], loss.detach()]
             steps += 1
     with torch.no_grad():
-        left_out = violation_loss(lcs, x[rest], u[rest], x_next[rest], gamma, xi) if len(rest) else None
+        held_out = (x[rest], u[rest], x_next[rest], gamma, xi)
+        given = None if context is None else context[rest]
+        left_out = violation_loss(lcs, *held_out, context=given) if len(rest) else None
     return Fit(float(torch.stack(recent).mean()), None if left_out is None else float(left_out), steps)
 
 
@@ -184,21 +195,24 @@ class Warmup(Trainer):
     """The warm-up phase, see `Trainer`.
 
     Args:
-        lcs: the model; it is trained in place, and `policy` must use the same object.
+        lcs: the model, an `LCSModel` or any other `LCSModule` that is a `torch.nn.Module`; it is trained in place, and
+            `policy` must use the same object.
         policy: the MPC around it.
-        env: as many environments in lockstep as an iteration has episodes, or more.
+        env: as many environments in lockstep as an iteration has episodes, or more. A "context" in their observations
+            is given to the model, in the MPC and in the loss.
         settings: settings.
         seed: of noise, minibatches, goals and initial states.
         episode_steps: steps of one episode.
         pretrained: the model is already useful: skip the random episodes and the long first training.
 
     Raises:
-        InvalidInputError: too few environments.
+        InvalidInputError: too few environments, or a model that has nothing to learn or other sizes than they.
+        DTypeError: something else instead of a model.
     """
 
     def __init__(
         self,
-        lcs: LCSModel,
+        lcs: LCSModule,
         policy: Policy,
         env: VectorEnv,
         settings: WarmupSettings,
@@ -206,7 +220,7 @@ class Warmup(Trainer):
         episode_steps: int = 20,
         pretrained: bool = False,
     ):
-        super().__init__(lcs, policy, seed, episode_steps)
+        super().__init__(check_module(lcs, env), policy, seed, episode_steps)
         needed = max(settings.rollouts.first, settings.rollouts.each)
         if env.num_envs < needed:
             raise InvalidInputError(f"env: expected at least {needed} environments, got {env.num_envs}")
@@ -227,7 +241,8 @@ class Warmup(Trainer):
         self.buffer = extended(self.buffer, episodes, self.settings.buffer)
         first = self.iteration == 0 and not self.pretrained
         epochs = self.settings.epochs.first if first else self.settings.epochs.each
-        outcome = fit(self.lcs, *transitions(self.buffer), self.settings, epochs, self._minibatches)
+        data, context = transitions(self.buffer), contexts(self.buffer)
+        outcome = fit(self.lcs, *data, self.settings, epochs, self._minibatches, context=context)
         self.iteration += 1
         return WarmupReport(
             iteration=self.iteration,

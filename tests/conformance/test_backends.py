@@ -583,10 +583,10 @@ def test_gradient_of_every_input_matches_central_differences(build, solutions, m
     gradients = dict(zip(INPUTS, gradients, strict=True))
 
     # A difference quotient needs more digits than a user: a few Newton steps onto the same optimum.
-    x, u, lam = kkt.polish(moved.problem, Primal(moved.x, moved.u, moved.lam), tol=1e-14)
+    x, u, lam, _ = kkt.polish(moved.problem, Primal(moved.x, moved.u, moved.lam), tol=1e-14)
     objective = moved.problem.objective(x, u)
     times = 2 * len(INPUTS)
-    values = (Primal(x, u, lam), [w.repeat(times, *[1] * (w.ndim - 1)) for w in weights])
+    values = ((x, u, lam), [w.repeat(times, *[1] * (w.ndim - 1)) for w in weights])
     values = sum((w * v).sum((1, 2)) for v, w in zip(*values, strict=False)) + weights[3].repeat(times) * objective
     values = values.reshape(len(INPUTS), 2, B)
     low, high = stacked["u_min"][:, None], stacked["u_max"][:, None]

@@ -331,7 +331,7 @@ def test_constraints_hold_or_are_paid_for(solutions, name, backend):
         assert float(sol.violation[i]) == pytest.approx(float(value.max().clamp_min(0.0)), abs=1e-9)
         hard = price == INF
         assert float(value[hard].max() if hard.any() else 0.0) <= 1e-7
-        assert bool((mu >= 0).all() and (mu <= price).all())
+        assert bool((mu >= 0).all() and (mu <= price * (1 + 1e-12)).all())
         free, paid = mu <= 1e-9, mu >= price * (1 - 1e-9)
         assert float(value[~paid].max()) <= 1e-6
         assert float(value[~free].min() if (~free).any() else 0.0) >= -1e-6

@@ -45,7 +45,7 @@ def test_the_native_certificate_is_the_one_of_kkt(build, barrier, per_element):
     tensors = {**build.lcs_tensors(3, batch=batch), **build.cost_tensors(3, batch=batch)}
     limit = torch.full((2,), 0.15, dtype=F64)
     tensors |= {"u_min": -limit, "u_max": limit, "x0": 0.3 * build.normal(5)(6, 4)}
-    problem = MPCProblem(**{k: tensors[k] for k in INPUTS}, horizon=4, relaxation=1e-4, barrier=barrier)
+    problem = MPCProblem(**tensors, horizon=4, relaxation=1e-4, barrier=barrier)
     rough = BatchedBackend(max_iter=1).solve(problem, None)
     unsolved = rough.status == Status.MAX_ITER  # their residuals are far above rounding, so that they compare
     assert int(unsolved.sum()) >= 5
@@ -65,7 +65,7 @@ def test_a_residual_has_no_units(build):
     rough = {"max_iter": 3}
     found = []
     for problem in (contact(build), badly_scaled(build)):
-        values = MPCProblem(**{k: problem.tensors[k] for k in INPUTS}, horizon=3, relaxation=1e-4)
+        values = MPCProblem(**{k: v for k, v in problem.tensors.items() if k in INPUTS}, horizon=3, relaxation=1e-4)
         found.append(BatchedBackend(**rough).solve(values, None).kkt_residual)
     assert float(found[0].max()) > kkt.CERTIFIED
     torch.testing.assert_close(found[1], found[0], rtol=1e-6, atol=1e-10)

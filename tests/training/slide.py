@@ -13,7 +13,7 @@ from gymnasium.vector import SyncVectorEnv
 from tensordict import TensorDict
 from torch import Tensor
 
-from difflcs import GoalCost, LCSModel, LCSMPCLayer
+from difflcs import GoalCost, LCSModel, LCSModule, LCSMPCLayer
 from difflcs.rl import (
     CriticSettings,
     EnsembleSettings,
@@ -83,7 +83,7 @@ def make_model(seed: int = 0) -> LCSModel:
     return lcs
 
 
-def make_mpc(lcs: LCSModel) -> LCSMPCLayer:
+def make_mpc(lcs: LCSModule) -> LCSMPCLayer:
     cost = GoalCost.reach(1, 1, goal_weight=(1.0,), input_weight=3.0)
     return LCSMPCLayer(lcs, cost, horizon=3, u_min=-U_MAX, u_max=U_MAX, on_failure="mask")
 

@@ -289,16 +289,39 @@ def bound(name):
     return torch.full((2,), -0.1 if name == "u_min" else 0.1, dtype=torch.float64)
 
 
-@bad_tensors_for(["u_min", "u_max"])
+# None is no bound, and so is infinity on the right side; other tests are about the wrong side, and NaN.
+UNBOUNDED = [(bad, name) for bad in ("none", "inf", "nan") for name in ("u_min", "u_max")]
+
+
+@bad_tensors_for(["u_min", "u_max"], allowed=UNBOUNDED)
 def test_layer_refuses_bounds(build, bad, name):
     check(bad, name, lambda change: layer(build, **{name: change(bound(name))}))
 
 
-# None keeps the layer's bounds.
-@bad_tensors_for(["u_min", "u_max"], allowed=[("none", "u_min"), ("none", "u_max")])
+@bad_tensors_for(["u_min", "u_max"], allowed=UNBOUNDED)
 def test_layer_refuses_bounds_of_a_call(build, bad, name):
     x0 = torch.zeros(4, dtype=torch.float64)
     check(bad, name, lambda change: layer(build)(x0, **{name: change(bound(name))}))
+
+
+@pytest.mark.parametrize("name", ["u_min", "u_max"])
+def test_layer_refuses_bounds_that_are_nan_or_allow_nothing(build, name):
+    x0, mpc = torch.zeros(4, dtype=torch.float64), layer(build, u_min=None, u_max=None)
+    broken, nowhere = spoil(bound(name), NAN), INF if name == "u_min" else -INF
+    for function in (lambda v: layer(build, **{"u_min": None, "u_max": None, name: v}), lambda v: mpc(x0, **{name: v})):
+        refuse(e.NonFiniteError, f"{name}: expected numbers or infinity, got 1 NaN of 2; ", function, broken)
+        refuse(e.NonFiniteError, f"{name}: expected numbers or infinity, got 2 NaN of 2; ", function, NAN)
+        refuse(e.BoundsError, f"{name}: expected at least one action that it allows", function, nowhere)
+    learned = nn.Parameter(bound(name))
+    mpc = layer(build, **{name: learned})
+    with torch.no_grad():
+        learned[1] = NAN
+    refuse(e.NonFiniteError, f"{name}: expected numbers or infinity, got 1 NaN", mpc, x0)
+
+
+@pytest.mark.parametrize("name", ["u_min", "u_max"])
+def test_a_barrier_refuses_bounds_that_are_infinite(build, name):
+    refuse(e.BoundsError, "expected finite bounds with a barrier.*barrier=0", layer, build, barrier=0.1, **{name: None})
 
 
 @every_bad_tensor
@@ -376,8 +399,13 @@ def test_layer_refuses_another_word_for_on_failure(build):
 
 
 def test_layer_refuses_what_is_no_lcs_or_no_cost(build):
-    refuse(e.DTypeError, "lcs: expected LCSModel or LCSParams, got Linear", layer, build, lcs=nn.Linear(2, 2))
-    refuse(e.DTypeError, "cost: expected GoalCost or QuadraticCost, got function", layer, build, cost=lambda x: x)
+    lcs = r"lcs: expected LCSModel, LCSParams, LCSSequence or another LCSModule, got Linear.*; a module needs"
+    cost = "cost: expected GoalCost, QuadraticCost or CostSequence, got function.*; build one"
+    refuse(e.DTypeError, lcs, layer, build, lcs=nn.Linear(2, 2))
+    refuse(e.DTypeError, cost, layer, build, cost=lambda x: x)
+    x0 = torch.zeros(4, dtype=torch.float64)
+    refuse(e.DTypeError, lcs, layer(build), x0, lcs=nn.Linear(2, 2))
+    refuse(e.DTypeError, cost, layer(build), x0, cost=lambda x: x)
 
 
 def test_layer_refuses_a_cost_of_another_size(build):

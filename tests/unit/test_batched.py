@@ -11,12 +11,10 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSParams
+from difflcs import GoalCost, LCSModel, LCSMPCLayer
 from difflcs._native import _kernels
 from difflcs.errors import InvalidInputError
-from difflcs.mpc import kkt
 from difflcs.mpc.backends import BatchedBackend
-from difflcs.mpc.problem import INPUTS
 
 PAIRS = [(3 + 2 * finger + axis, axis) for finger in range(3) for axis in range(2)]
 COST = GoalCost.reach(9, 6, (200.0, 200.0, 0.3), (200.0, 200.0, 1.5), 200.0, PAIRS, 10.0, 6.0)

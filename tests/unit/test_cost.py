@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import nn
 
-from difflcs import GoalCost, LCSMPCLayer, QuadraticCost
+from difflcs import CostSequence, GoalCost, LCSMPCLayer, QuadraticCost
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 
 
@@ -179,3 +179,148 @@ def test_reach_refuses_what_it_cannot_use(change, error, message):
 
 def test_reach_in_float32():
     assert GoalCost.reach(3, 2, dtype=torch.float32).Q.dtype == torch.float32
+
+
+# --- cross terms ----------------------------------------------------------------------------------------------------
+
+
+def test_without_cross_terms_there_is_no_field_for_them(build):
+    cost = build.cost(0)
+    assert cost.S is None
+    assert "S" not in cost.state_dict() | cost.fields() | cost.tensors()
+    learned = QuadraticCost(**build.cost_tensors(0), S=nn.Parameter(0.1 * build.normal(1)(4, 2)))
+    assert [name for name, _ in learned.named_parameters()] == ["S"]
+    assert "S" in learned.fields()
+
+
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_cross_terms_that_make_the_cost_indefinite_are_refused(build, batch):
+    tensors = build.cost_tensors(0, batch=batch)
+    S = 0.1 * build.normal(1)(4, 2)  # shared where the others are not
+    QuadraticCost(**tensors, S=S)
+    Q, R = (tensors[k].reshape(-1, *tensors[k].shape[-2:])[-1] for k in ("Q", "R"))
+    whole = torch.cat([torch.cat([Q, 30 * S], -1), torch.cat([30 * S.T, R], -1)], -2)
+    assert float(torch.linalg.eigvalsh(whole)[0]) < -1
+    with pytest.raises(InvalidInputError, match=r"\[\[Q, S\], \[Sᵀ, R\]\]: expected a positive semi-definite.*-\d"):
+        QuadraticCost(**tensors, S=30 * S)
+    QuadraticCost(**tensors, S=30 * S, check=False)
+
+
+@pytest.mark.parametrize(
+    ("S", "error", "message"),
+    [
+        (torch.zeros(2, 4).double(), ShapeError, r"S: expected shape \(\.\.\., n_x=4, n_u=2\), got \(2, 4\)"),
+        ([[0.0]], DTypeError, "S: expected a torch.Tensor, got list"),
+        (torch.full((4, 2), torch.nan).double(), InvalidInputError, "S: expected finite numbers, got 8 NaN"),
+    ],
+)
+def test_cross_terms_are_checked(build, S, error, message):
+    with pytest.raises(error, match=message):
+        QuadraticCost(**build.cost_tensors(0), S=S)
+
+
+def test_semidefinite_weights_with_cross_terms_are_accepted():
+    """‖x + u‖², whose Hessian is singular."""
+    eye = torch.eye(2, dtype=torch.float64)
+    QuadraticCost(eye, eye, eye, S=eye)
+    with pytest.raises(InvalidInputError, match=r"smallest eigenvalue -1\.000e-06"):
+        QuadraticCost(eye, eye, eye, S=(1 + 1e-6) * eye)
+
+
+# --- costs by stage ---------------------------------------------------------------------------------------------------
+
+
+def by_stage(build, horizon=3, **more):
+    each = [build.cost_tensors(k) for k in range(horizon)]
+    fields = {name: torch.stack([t[name] for t in each]) for name in ("Q", "R", "q", "r")}
+    return {**fields, **{k: each[0][k] for k in ("Q_final", "q_final")}, **more}
+
+
+def test_a_sequence_knows_its_stages(build):
+    cost = CostSequence(**by_stage(build))
+    assert cost.horizon == 3
+    assert (cost.n_x, cost.n_u) == (4, 2)
+    assert cost.by_stage == {"Q", "R", "q", "r"}
+    assert cost.fields()["Q"].shape == (3, 4, 4)
+    partly = CostSequence(**{**build.cost_tensors(0), "q": torch.zeros(5, 4).double()}, by_stage=("q",))
+    assert partly.horizon == 5
+    assert partly.by_stage == {"q"}
+    learned = CostSequence(**{**by_stage(build), "r": nn.Parameter(torch.zeros(3, 2).double())})
+    assert [name for name, _ in learned.named_parameters()] == ["r"]
+    twin = pickle.loads(pickle.dumps(cost))
+    assert twin.by_stage == cost.by_stage
+    assert torch.equal(twin.Q, cost.Q)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        (
+            {"q": torch.zeros(4).double()},
+            ShapeError,
+            r"q: expected a dimension of stages .*got \(4,\).*; say by by_stage",
+        ),
+        ({"q": torch.zeros(5, 4).double()}, ShapeError, r"q: expected 3 stages, .* like Q, got 5.*; give as many"),
+        (
+            {"by_stage": ("Q_final",)},
+            InvalidInputError,
+            "by_stage: expected names among Q, R, q, r, S, got str 'Q_final'",
+        ),
+        ({"by_stage": "q"}, DTypeError, "by_stage: expected a tuple of names .*got str .q.; add a comma"),
+        (
+            {"by_stage": ()},
+            InvalidInputError,
+            "by_stage: expected at least one field by stage, got none.*; use the class",
+        ),
+        ({"Q": -torch.ones(3, 4, 4).double()}, InvalidInputError, "Q: expected a positive semi-definite"),
+        ({"S": torch.zeros(3, 2, 4).double()}, ShapeError, r"S: expected shape \(\.\.\., n_x=4, n_u=2\)"),
+    ],
+)
+def test_a_sequence_refuses_what_does_not_fit(build, change, error, message):
+    with pytest.raises(error, match=message):
+        CostSequence(**by_stage(build, **change))
+
+
+def test_cross_terms_of_one_stage_are_checked(build):
+    tensors = by_stage(build)
+    S = torch.zeros(3, 4, 2).double()
+    CostSequence(**tensors, S=S)
+    S[1, 0, 0] = 30.0
+    with pytest.raises(InvalidInputError, match=r"\[\[Q, S\]"):
+        CostSequence(**tensors, S=S)
+
+
+# --- references ---------------------------------------------------------------------------------------------------
+
+
+def test_following_a_reference_is_tracking_each_goal(build):
+    cost, n = build.paper_cost(), build.normal(4)
+    x, u, reference = n(6, 9), n(5, 6), n(2, 6, 3)
+    followed = cost.follow(reference)
+    assert isinstance(followed, CostSequence)
+    assert followed.by_stage == {"q"}  # a preview does not multiply the weights
+    assert followed.q.shape == (2, 5, 9)
+    assert followed.horizon == 5
+    for i in range(2):
+        expected = sum(float(cost.stage(x[k], u[k], reference[i, k])) for k in range(5))
+        final = cost(reference[i, -1], horizon=0)
+        expected += float(0.5 * x[-1] @ final.Q_final @ x[-1] + final.q_final @ x[-1] + final.constant)
+        value = float(followed.constant[i])
+        for k in range(5):
+            value += float(0.5 * x[k] @ followed.Q @ x[k] + followed.q[i, k] @ x[k] + 0.5 * u[k] @ followed.R @ u[k])
+        value += float(0.5 * x[-1] @ followed.Q_final @ x[-1] + followed.q_final[i] @ x[-1])
+        assert value == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_reference_that_stands_still_is_a_goal(build):
+    cost, goal = build.paper_cost(), build.normal(2)(4, 3)
+    still, once = cost.follow(goal[:, None].expand(4, 6, 3)), cost(goal, horizon=5)
+    torch.testing.assert_close(still.q, once.q[:, None].expand(4, 5, 9))
+    torch.testing.assert_close(still.q_final, once.q_final)
+    torch.testing.assert_close(still.constant, once.constant)
+
+
+@pytest.mark.parametrize("shape", [(3,), (1, 3), (6, 2)])
+def test_references_of_other_shapes_are_refused(build, shape):
+    with pytest.raises(ShapeError, match=r"reference: expected .*n_goal=3"):
+        build.paper_cost().follow(torch.zeros(shape, dtype=torch.float64))

@@ -94,6 +94,45 @@ def test_the_gradient_of_every_input_is_that_of_finite_differences(build, by_sta
         assert abs(found - quotient) <= 1e-6 * max(abs(quotient), 1.0), (name, found, quotient)
 
 
+def test_with_a_barrier_and_constraints_the_gradient_is_that_of_finite_differences(build):
+    problem = contact_problem(build)
+    problem = dataclasses.replace(problem, u_min=tensor(-0.2, -0.3), u_max=tensor(0.2, 0.3), barrier=1e-3)
+    result = SOLVER.solve(problem, None)
+    assert result.status.tolist() == [CONVERGED] * BATCH
+    assert bool(result.linearisation.held.any())
+    n = build.normal(3)
+    weight = n(*result.primal.u.shape)
+    upstream = (
+        torch.zeros_like(result.primal.x),
+        weight,
+        torch.zeros_like(result.primal.lam),
+        torch.zeros(BATCH).double(),
+    )
+    gradients = SOLVER.vjp(problem, result, upstream, result.solved)
+    for name in ("u_max", "g", "x0", "B"):
+        direction = n(*getattr(problem, name).shape) * torch.isfinite(getattr(problem, name))
+        ends = [
+            SOLVER.solve(dataclasses.replace(problem, **{name: getattr(problem, name) + h * direction}), result.primal)
+            for h in (1e-6, -1e-6)
+        ]
+        quotient = float((weight * (ends[0].primal.u - ends[1].primal.u)).sum()) / 2e-6
+        assert float((gradients[name] * direction).sum()) == pytest.approx(quotient, rel=1e-5, abs=1e-6), name
+
+
+@pytest.mark.parametrize("batch", [0, 1])
+def test_no_problem_and_one_step_are_problems_too(build, batch):
+    eye = torch.eye(2, dtype=torch.float64)
+    problem = reach(build, torch.zeros(batch, 2, dtype=torch.float64))
+    short = dataclasses.replace(problem, g=problem.g[:, -2:], horizon=1)
+    for each in (problem, short):
+        result = SOLVER.solve(each, None)
+        assert len(result.status) == batch
+        grads = (*(torch.ones_like(v) for v in result.primal[:3]), torch.ones(batch, dtype=torch.float64))
+        found = SOLVER.vjp(each, result, grads, result.solved)
+        assert all(found[name].shape == getattr(each, name).shape for name in INPUTS)
+        torch.testing.assert_close(found["R"], torch.zeros_like(eye), rtol=0, atol=1e-9)
+
+
 def test_a_multiplier_is_what_a_unit_of_its_constraint_saves(build):
     problem = contact_problem(build)
     result = SOLVER.solve(problem, None)

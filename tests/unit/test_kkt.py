@@ -296,7 +296,7 @@ def test_vjp_equals_a_dense_solve_with_the_kkt_matrix(build, kind, bound, upstre
             expected = expected.sum(1)
         if problem.shared(name):
             expected = expected.sum(0, keepdim=problem.by_stage(name))
-        torch.testing.assert_close(found[name], expected, rtol=1e-5, atol=1e-6 * float(_size(expected) + 1e-3))
+        torch.testing.assert_close(found[name], expected, rtol=1e-7, atol=1e-8 * float(_size(expected) + 1e-3))
 
 
 def _size(value):

@@ -7,16 +7,33 @@ import gc
 import pickle
 import warnings
 import weakref
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import pytest
 import torch
 from torch import nn
 
-from difflcs import LCSModel, LCSMPCLayer, LCSParams, MPCSolution, QuadraticCost, SolveError, Status
-from difflcs.errors import SolveWarning
-from difflcs.mpc import Primal
+from difflcs import (
+    ConstraintSequence,
+    CostSequence,
+    GoalCost,
+    LCSModel,
+    LCSModule,
+    LCSMPCLayer,
+    LCSParams,
+    LCSSequence,
+    LinearConstraints,
+    MPCSolution,
+    QuadraticCost,
+    SolveError,
+    StageBounds,
+    Status,
+)
+from difflcs.errors import BoundsError, DTypeError, ShapeError, SolveWarning
+from difflcs.mpc import MPCProblem, Primal
 from difflcs.mpc.backends import Backend, IpoptBackend, certify
+from difflcs.mpc.backends.base import Result
+from difflcs.mpc.problem import INPUTS
 
 SOLVER = IpoptBackend(workers=1)
 
@@ -37,6 +54,35 @@ class Flaky(Backend):
                 value[i] = self.garbage
             status[i] = Status.MAX_ITER
         return certify(problem, primal, status, result.iterations, result.solve_time, tol=1e-6)
+
+
+@dataclass(frozen=True)
+class Recorder(Backend):
+    """Solves nothing, and keeps what it was asked."""
+
+    name = "recorder"
+    seen: list = field(default_factory=list)
+
+    def solve(self, problem, guess):
+        self.seen.append((problem, guess))
+        B, H = problem.batch, problem.horizon
+        primal = Primal(
+            torch.zeros(B, H + 1, problem.n_x).double(), torch.zeros(B, H, problem.n_u).double(),
+            torch.zeros(B, H, problem.n_lam).double(), problem.no_multipliers(),
+        )  # fmt: skip
+        zeros = torch.zeros(B, dtype=torch.float64)
+        return Result(primal, zeros.to(torch.int8), zeros.to(torch.int32), zeros, zeros)
+
+    def vjp(self, problem, result, grads, solved):
+        """One per element and entry, so that a gradient says how many elements share an input."""
+        count = float(solved.sum())
+        values = {k: getattr(problem, k) for k in INPUTS}
+        gradients = {k: torch.full_like(v, count if problem.shared(k) else 1.0) for k, v in values.items()}
+        return gradients | {"Q": gradients["Q"].triu()}
+
+    @property
+    def problem(self) -> MPCProblem:
+        return self.seen[-1][0]
 
 
 @pytest.fixture
@@ -190,6 +236,9 @@ def test_a_guess_has_no_gradient_and_changes_none(layer, x0):
     layer.zero_grad()
     layer(x0, guess=guess).action.sum().backward()
     torch.testing.assert_close(layer.lcs.A.grad, plain, rtol=1e-4, atol=1e-6)
+    layer.requires_grad_(False)
+    assert guess.u.requires_grad
+    assert not layer(x0, guess=guess).u.requires_grad
 
 
 # --- bounds ---------------------------------------------------------------------------------------------------------
@@ -406,6 +455,290 @@ def test_a_backend_that_claims_success_is_judged_by_the_residual(build, x0):
 
     with pytest.raises(SolveError, match=r"2 of 6 .*2 NUMERICAL.*elements 3, 5"):
         make_layer(build, backend=Liar())(x0)
+
+
+# --- what a problem may be ------------------------------------------------------------------------------------------
+
+
+def recording(build, **options):
+    backend = Recorder()
+    options = {"lcs": build.params(3), "cost": build.cost(3), "horizon": 3, **options}
+    return LCSMPCLayer(**options, backend=backend), backend
+
+
+def test_without_bounds_there_are_none(build, x0):
+    layer, backend = recording(build)
+    layer(x0)
+    assert torch.equal(backend.problem.u_min, torch.full((2,), -torch.inf).double())
+    assert torch.equal(backend.problem.u_max, torch.full((2,), torch.inf).double())
+    assert backend.problem.n_c == 0
+    layer(x0, u_max=1.0)
+    assert torch.equal(backend.problem.u_max, torch.ones(2).double())
+
+
+def test_what_is_constant_reaches_the_problem_as_constant(build, x0):
+    layer, backend = recording(build, cost=GoalCost.reach(4, 2, 1.0))
+    reference = build.normal(1)(6, 4, 4)
+    layer(x0, reference=reference)
+    problem = backend.problem
+    assert {k for k in INPUTS if problem.by_stage(k)} == {"q"}
+    assert {k for k in INPUTS if not problem.shared(k)} == {"q", "q_final", "x0"}
+    assert problem.q.shape == (6, 3, 4)
+    torch.testing.assert_close(problem.q, -2 * reference[:, :-1])
+    layer(x0, reference=reference[0])
+    assert backend.problem.q.shape == (1, 3, 4)
+
+
+def test_every_input_by_stage_reaches_the_problem(build, x0):
+    n = build.normal(4)
+    sequence = LCSSequence.stack([build.params(s) for s in (3, 4, 5)])
+    each = [build.cost_tensors(s) for s in (3, 4, 5)]
+    weights = {k: torch.stack([t[k] for t in each]) for k in ("Q", "R", "q", "r")}
+    cost = CostSequence(**weights, Q_final=each[0]["Q_final"], S=0.01 * n(6, 3, 4, 2))
+    bounds = StageBounds(-torch.rand(6, 3, 2).double(), 1.0)
+    rows = ConstraintSequence(n(4, 2, 4), n(6, 4, 2), n(3, 2, 2), torch.ones(4, 2).double())
+    layer, backend = recording(build, lcs=sequence, cost=cost, bounds=bounds, constraints=rows)
+    layer(x0)
+    problem = backend.problem
+    constant = {"u_max", "Q_final", "q_final", "x0"}
+    assert {k for k in INPUTS if not problem.by_stage(k)} == constant
+    assert {k for k in INPUTS if not problem.shared(k)} == {"S", "u_min", "g", "x0"}
+    for name, value in (("A", sequence.A), ("Q", weights["Q"]), ("G_u", rows.E), ("price", rows.weight)):
+        assert torch.equal(getattr(problem, name)[0], value)
+    assert torch.equal(problem.g, rows.g)
+    assert torch.equal(problem.u_min, bounds.u_min)
+
+
+def test_gradients_come_back_in_the_shape_of_each_input(build):
+    """The recorder's gradient counts the elements: shapes, sums over shared dimensions, dtypes."""
+    n = build.normal(4)
+    t = build.lcs_tensors(3)
+    A = t["A"].expand(5, 1, 4, 4).clone().requires_grad_()  # one for each of 5, shared by the 2
+    B = t["B"].clone().requires_grad_()
+    c = t["c"].expand(2, 3).clone().requires_grad_()  # aligned with the last batch dimension
+    d = t["d"].expand(1, 1, 4).clone().requires_grad_()
+    Q = build.cost_tensors(3)["Q"].float().requires_grad_()
+    weights = {**build.cost_tensors(3), "Q": Q, "constant": torch.zeros(5, 1).double().requires_grad_()}
+    x0 = n(5, 2, 4).requires_grad_()
+    g = n(5, 1, 4, 2).requires_grad_()
+    system = LCSParams(**{**t, "A": A, "B": B, "c": c, "d": d})
+    rows = ConstraintSequence(n(2, 4), g, by_stage=("g",))
+    layer, _ = recording(build, lcs=system, cost=QuadraticCost(**weights), constraints=rows)
+    solution = layer(x0)
+    assert solution.u.shape == (5, 2, 3, 2)
+    (solution.u.sum() + solution.objective.sum()).backward()
+    for leaf, count in ((A, 2), (B, 10), (c, 5), (d, 10), (x0, 1), (g, 2), (weights["constant"], 2)):
+        assert leaf.grad.dtype == leaf.dtype
+        assert torch.equal(leaf.grad, torch.full_like(leaf, float(count)))
+    # Only the symmetric part of Q matters, whatever a backend says.
+    assert torch.equal(Q.grad, 5 * torch.ones(4, 4) + 5 * torch.eye(4))
+
+
+@pytest.mark.parametrize("name", ["lcs", "cost", "constraints", "bounds"])
+def test_what_a_call_is_given_replaces_the_layers_own(build, x0, name):
+    n = build.normal(7)
+    rows = [LinearConstraints(n(2, 4), torch.full((2,), g).double(), weight=1.0) for g in (1.0, 0.02)]
+    bounds = [StageBounds(torch.full((3, 2), -b).double(), 0.1) for b in (0.1, 0.02)]
+    first = {"lcs": build.params(3), "cost": build.cost(3), "constraints": rows[0], "bounds": bounds[0]}
+    other = {"lcs": build.params(4), "cost": build.cost(4), "constraints": rows[1], "bounds": bounds[1]}[name]
+    options = {"horizon": 3, "backend": SOLVER, "relaxation": 1e-4}
+    layer, built = LCSMPCLayer(**first, **options), LCSMPCLayer(**{**first, name: other}, **options)
+    assert torch.equal(layer(x0, **{name: other}).u, built(x0).u)
+    assert not torch.equal(layer(x0).u, built(x0).u)
+    assert torch.equal(layer(x0).u, LCSMPCLayer(**first, **options)(x0).u)
+
+
+def test_one_plain_bound_of_a_call_replaces_that_of_the_stages(build, x0):
+    bounds = StageBounds(torch.full((3, 2), -0.1).double(), torch.full((3, 2), 0.2).double())
+    layer, backend = recording(build, bounds=bounds)
+    layer(x0, u_max=0.5)
+    assert torch.equal(backend.problem.u_min[0], bounds.u_min)
+    assert torch.equal(backend.problem.u_max, torch.full((2,), 0.5).double())
+    each = torch.linspace(0.1, 0.6, 6).double()[:, None].expand(6, 2)
+    layer(x0, u_max=each)
+    assert torch.equal(backend.problem.u_max, each)
+    assert not backend.problem.by_stage("u_max")
+
+
+# --- modules that say the system ------------------------------------------------------------------------------------
+
+
+class Mass(nn.Module):
+    """A block whose mass is the context, and whose friction depends on where it is."""
+
+    n_x, n_u, n_lam = 4, 2, 3
+
+    def __init__(self, build, stages=0):
+        super().__init__()
+        self.base, self.stages = build.lcs_tensors(3), stages
+        self.gain = nn.Parameter(torch.tensor(1.0, dtype=torch.float64))
+        self.seen = []
+
+    def params(self, x=None, context=None):
+        self.seen.append((x, context))
+        B = self.base["B"] * self.gain / (1.0 if context is None else context[..., None])
+        c = self.base["c"] if x is None else self.base["c"] + 0.01 * x[..., :1]
+        system = LCSParams(**{**self.base, "B": B, "c": c})
+        return LCSSequence.stack([system] * self.stages) if self.stages else system
+
+
+@pytest.mark.parametrize("stages", [0, 3])
+def test_a_module_is_asked_at_each_call(build, x0, stages):
+    module = Mass(build, stages)
+    assert isinstance(module, LCSModule)
+    layer = LCSMPCLayer(module, build.cost(3), 3, -0.15, 0.15, relaxation=1e-4)
+    assert {name for name, _ in layer.named_parameters()} == {"lcs.gain"}
+    context = torch.linspace(0.5, 2.0, 6, dtype=torch.float64)[:, None].requires_grad_()
+    solution = layer(x0, context=context)
+    assert module.seen[-1][0] is x0
+    assert module.seen[-1][1] is context
+    plain = LCSMPCLayer(module.params(x0, context), build.cost(3), 3, -0.15, 0.15, relaxation=1e-4)
+    assert torch.equal(plain(x0).u, solution.u)
+    solution.u.square().sum().backward()
+    assert float(module.gain.grad.abs()) > 0
+    assert float(context.grad.abs().min()) > 0
+    assert not torch.equal(layer(x0).u, solution.u)  # without a context
+    again = LCSMPCLayer(build.params(3), build.cost(3), 3, -0.15, 0.15, relaxation=1e-4)
+    assert torch.equal(again(x0, lcs=module, context=context).u, solution.u)
+
+
+def test_any_object_with_the_right_names_is_a_module(build, x0):
+    class Plain:
+        n_x, n_u, n_lam = 4, 2, 3
+
+        def params(self, x=None, context=None):
+            return build.params(3)
+
+    layer = LCSMPCLayer(Plain(), build.cost(3), 3, -0.15, 0.15, relaxation=1e-4)
+    same = LCSMPCLayer(build.params(3), build.cost(3), 3, -0.15, 0.15, relaxation=1e-4)
+    assert torch.equal(layer(x0).u, same(x0).u)
+
+    class Wrong(Plain):
+        def params(self, x=None, context=None):
+            return {"A": torch.eye(4)}
+
+    with pytest.raises(
+        DTypeError, match=r"lcs: expected LCSParams or LCSSequence from Wrong.params, got dict.*; return"
+    ):
+        layer(x0, lcs=Wrong())
+
+
+@pytest.mark.parametrize(
+    ("options", "call", "error", "message"),
+    [
+        ({}, {"context": torch.ones(2).double()}, ShapeError, "context: expected none with LCSParams, .*; pass lcs="),
+        ({}, {"reference": torch.ones(4, 4).double()}, ShapeError, "reference: expected none with a QuadraticCost"),
+        ({"goal": 1}, {}, ShapeError, r"goal: expected .*got none; call mpc\(x0, goal\) or mpc\(x0, reference=...\)"),
+        ({"goal": 1}, {"goal": torch.ones(4).double(), "reference": torch.ones(4, 4).double()}, ShapeError, "got both"),
+        (
+            {"goal": 1},
+            {"reference": torch.ones(3, 4).double()},
+            ShapeError,
+            r"reference: .*H\+1=4, n_goal=4\), got \(3, 4",
+        ),
+        ({}, {"bounds": (-1, 1)}, DTypeError, r"bounds: expected StageBounds, got tuple \(-1, 1\); pass constant"),
+        ({}, {"bounds": "stage", "u_min": 0.0}, ShapeError, "u_min: expected none with bounds, got float 0.0; put it"),
+        (
+            {},
+            {"bounds": "long"},
+            ShapeError,
+            "bounds: expected 3 stages, the layer's horizon, got 5; give one for each",
+        ),
+        ({}, {"bounds": "wide"}, ShapeError, "bounds: expected n_u=2 like the LCS, got n_u=3"),
+        ({}, {"lcs": "long"}, ShapeError, "lcs: expected 3 stages, the layer's horizon, got 2"),
+        ({}, {"lcs": "wide"}, ShapeError, r"x0: expected shape \(\.\.\., n_x=5\), got \(6, 4\)"),
+        (
+            {},
+            {"constraints": [1]},
+            DTypeError,
+            "constraints: expected LinearConstraints or ConstraintSequence, got list",
+        ),
+        ({}, {"constraints": "wide"}, ShapeError, "constraints: expected n_x=4 like the LCS, got n_x=5"),
+        ({}, {"constraints": "actions"}, ShapeError, "constraints: expected n_u=2 like the LCS, got n_u=3"),
+        ({}, {"constraints": "long"}, ShapeError, "constraints: expected 3 stages, .* got 4"),
+        ({}, {"cost": "long"}, ShapeError, "cost: expected 3 stages, .* got 4"),
+        ({}, {"constraints": "batch"}, ShapeError, r"batch dimensions .* do not fit.*x0 \(6,\)"),
+    ],
+)
+def test_calls_that_do_not_fit_are_refused(build, x0, options, call, error, message):
+    n = build.normal(0)
+    made = {
+        ("bounds", "stage"): lambda: StageBounds(-torch.ones(3, 2).double(), 1.0),
+        ("bounds", "long"): lambda: StageBounds(-torch.ones(5, 2).double(), 1.0),
+        ("bounds", "wide"): lambda: StageBounds(-torch.ones(3, 3).double(), 1.0),
+        ("lcs", "long"): lambda: LCSSequence.stack([build.params(3)] * 2),
+        ("lcs", "wide"): lambda: build.params(3, n_x=5),
+        ("constraints", "wide"): lambda: LinearConstraints(n(2, 5), n(2)),
+        ("constraints", "actions"): lambda: LinearConstraints(n(2, 4), n(2), n(2, 3)),
+        ("constraints", "long"): lambda: ConstraintSequence(n(2, 4), n(5, 2), by_stage=("g",)),
+        ("constraints", "batch"): lambda: LinearConstraints(n(2, 4), n(5, 2)),
+        ("cost", "long"): lambda: CostSequence(**{**build.cost_tensors(3), "q": n(4, 4)}, by_stage=("q",)),
+    }
+    layer, backend = recording(build, cost=GoalCost.reach(4, 2, 1.0) if options else build.cost(3))
+    call = {k: made[k, v]() if isinstance(v, str) else v for k, v in call.items()}
+    with pytest.raises(error, match=message) as caught:
+        layer(x0, **call)
+    assert ";" in str(caught.value)
+    assert not backend.seen
+    if (
+        call
+        and set(call) <= {"bounds", "lcs", "cost", "constraints"}
+        and "batch" not in message
+        and call.keys() != {"lcs"}
+    ):
+        with pytest.raises(error):
+            recording(build, **call)
+
+
+def test_bounds_are_given_once(build):
+    with pytest.raises(ShapeError, match=r"u_max: expected none with bounds, got float 1\.0"):
+        recording(build, u_max=1.0, bounds=StageBounds(-torch.ones(3, 2).double()))
+    with pytest.raises(BoundsError, match="finite bounds with a barrier"):
+        recording(build, bounds=StageBounds(-torch.ones(3, 2).double()), barrier=0.1)
+
+
+def test_a_guess_may_leave_out_the_multipliers(build, x0):
+    rows = LinearConstraints(build.normal(0)(2, 4), torch.ones(2).double())
+    layer, backend = recording(build, constraints=rows)
+    full = layer(x0)
+    assert full.mu.shape == (6, 4, 2)
+    none = torch.zeros(6, 4, 2).double()
+    for guess, mu in (
+        (Primal(full.x, full.u, full.lam), none),
+        (Primal(full.x, full.u, full.lam, none + 1), none + 1),
+        (recording(build)[0](x0), none),  # a plan without constraints
+    ):
+        layer(x0, guess=guess)
+        assert torch.equal(backend.seen[-1][1].mu, mu)
+    with pytest.raises(ShapeError, match=r"guess.mu: expected shape \(\.\.\., H\+1=4, n_c=2\), got \(6, 4, 3\)"):
+        layer(x0, guess=Primal(full.x, full.u, full.lam, torch.zeros(6, 4, 3).double()))
+
+
+def test_learned_bounds_and_constraints_are_saved_and_old_states_are_read(build, x0):
+    def make(g, low):
+        bounds = StageBounds(nn.Parameter(torch.full((3, 2), low).double()), 0.1)
+        rows = LinearConstraints(build.normal(0)(2, 4), nn.Parameter(torch.full((2,), g).double()))
+        return recording(build, lcs=build.model(3), bounds=bounds, constraints=rows)
+
+    (layer, backend), (other, _) = make(1.0, -0.1), make(2.0, -0.2)
+    assert {"bounds.u_min", "constraints.g", "constraints.G"} <= set(layer.state_dict())
+    layer.load_state_dict(other.state_dict())
+    layer(x0)
+    assert torch.equal(backend.problem.g, torch.full((2,), 2.0).double())
+    assert torch.equal(backend.problem.u_min[0], torch.full((3, 2), -0.2).double())
+    plain = recording(build, lcs=build.model(3), u_min=-0.1, u_max=0.1)[0]
+    before = {f"lcs.{k}" for k in "ABCdDEGHc"} | {f"cost.{k}" for k in INPUTS if k in build.cost_tensors()}
+    assert set(plain.state_dict()) == before | {"cost.constant"}  # as in the first version
+
+
+def test_a_single_layer_moves_with_its_parts(build, x0):
+    rows = LinearConstraints(build.normal(0)(2, 4), torch.ones(2).double(), weight=1.0)
+    layer, backend = recording(build, lcs=build.model(3), constraints=rows, bounds=StageBounds(-torch.ones(3, 2), 1.0))
+    layer.float()
+    assert layer.constraints.G.dtype == layer.bounds.u_min.dtype == torch.float32
+    solution = layer(x0.float())
+    assert solution.mu.dtype == solution.violation.dtype == torch.float32
+    assert backend.problem.G_x.dtype == torch.float64
 
 
 # --- modules --------------------------------------------------------------------------------------------------------

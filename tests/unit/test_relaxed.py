@@ -12,7 +12,7 @@ import torch
 
 from difflcs import LCSMPCLayer, LCSParams, QuadraticCost, Status, available_backends
 from difflcs.errors import BackendNotFoundError, DTypeError, InvalidInputError, SolveError, SolveWarning
-from difflcs.mpc import Primal
+from difflcs.mpc import MPCProblem, Primal
 from difflcs.mpc.backends import RelaxedBackend, get_backend
 
 pytestmark = pytest.mark.skipif(
@@ -330,6 +330,39 @@ def test_an_empty_batch(build):
     sol = solve(t)
     assert sol.u.shape == (0, 3, 2)
     sol.u.sum().backward()
+
+
+def no_contact(t):
+    sizes = {"C": (4, 0), "D": (0, 4), "E": (0, 2), "F": (0, 0), "c": (0,)}
+    return {name: torch.zeros(size, dtype=torch.float64) for name, size in sizes.items()}
+
+
+ROW = {
+    name: torch.ones(size, dtype=torch.float64)
+    for name, size in {"G_x": (1, 4), "G_u": (1, 2), "g": 1, "price": 1}.items()
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (
+            lambda t: {"B": t["B"].expand(1, 3, 4, 2)},
+            "B: expected the same at every stage with .*'relaxed', got one per",
+        ),
+        (lambda t: {"u_max": t["u_max"].expand(4, 3, 2)}, "u_max: expected the same at every stage"),
+        (lambda t: {"u_min": t["u_min"] - torch.inf}, "u_min: expected finite bounds"),
+        (lambda t: {"S": torch.ones(4, 2).double()}, "S: expected zero"),
+        (lambda t: ROW, "constraints: expected none"),
+        (no_contact, "n_lam: expected at least 1"),
+    ],
+)
+def test_what_the_program_does_not_have_is_refused(build, calls, change, match):
+    calls(lambda call, *_: pytest.fail("something was solved"))
+    t = tensors(build)
+    problem = MPCProblem(**{**t, **change(t)}, horizon=3, relaxation=1e-4)
+    with pytest.raises(InvalidInputError, match=match + r".*; use backend='batched' or 'ipopt'"):
+        RelaxedBackend().solve(problem, None)
 
 
 @pytest.mark.parametrize("package", ["cvxpy", "cvxpylayers"])

@@ -178,7 +178,7 @@ class BatchedBackend(Backend):
         """One run of the kernel from a guess, from actions alone, or from zero actions."""
         batch, horizon = problem.batch, problem.horizon
         guess = start if isinstance(start, Primal) else None
-        u = guess.u if guess else start
+        u = start.u if isinstance(start, Primal) else start
         found = _Found(
             x=torch.empty(batch, horizon + 1, problem.n_x, dtype=torch.float64),
             u=torch.empty(batch, horizon, problem.n_u, dtype=torch.float64),
@@ -261,7 +261,7 @@ class _Found:
 
 
 def _span(problem: MPCProblem, found: _Found) -> tuple[Tensor, Tensor]:
-    """Where random starts lie: the bounds, or as far around the actions found as these are large where there is none."""
+    """Where random starts lie: within the bounds; where there are none, as far out as the actions found are large."""
     low, high = problem.bounds()
     if bool(torch.isfinite(low).all()) and bool(torch.isfinite(high).all()):
         return low, high

@@ -80,7 +80,7 @@ class IpoptBackend(Backend):
     def solve(self, problem: MPCProblem, guess: Primal | None) -> Result:
         """Solve every element; a failure, even a crash of a worker, stays with its element."""
         found = self._run(problem, guess, warm=guess is not None)
-        if problem.n_c and bool((torch.isinf(kkt.prices(problem)) & torch.isfinite(problem._batch_first("g"))).any()):
+        if problem.n_c and bool(torch.isinf(problem.price).any()):
             failed = torch.nonzero(found.status != Status.CONVERGED).squeeze(-1)
             if len(failed):
                 part = problem.select(failed)

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from difflcs.errors import CheckpointError, InvalidInputError
-from difflcs.lcs import LCSParams
+from difflcs.errors import CheckpointError
+from difflcs.rl.learned import check_depends, check_learned
 from difflcs.rl.optim.natural import Natural, NaturalGradient
 from difflcs.rl.settings import Adam
 from difflcs.rl.state import State, initialise_moments, load_moments, moments
@@ -111,6 +111,7 @@ class UpdateRule:
 
     def step(self, loss: torch.Tensor, scale: float) -> bool:
         """Take one step down a loss, or none where a gradient is not finite; says which."""
+        check_depends(loss)
         for p in self.parameters:
             p.grad = None
         loss.backward()
@@ -150,12 +151,9 @@ def learned_parameters(actor: GaussianPolicy) -> list[nn.Parameter]:
     """What is learned of the model behind the mean of a policy.
 
     Raises:
-        InvalidInputError: the model is fixed.
+        InvalidInputError, DTypeError: the model is fixed, or no `torch.nn.Module`.
     """
-    learned = actor.learned
-    if isinstance(learned, LCSParams):
-        raise InvalidInputError("actor: expected a model that can be learned, got fixed LCSParams; use an LCSModel")
-    return [p for p in learned.parameters() if p.requires_grad]
+    return [p for p in check_learned(actor.learned).parameters() if p.requires_grad]
 
 
 class AdamUpdate(UpdateRule):

@@ -1,0 +1,303 @@
+"""What a system that depends on a context gains over a constant one: `python benchmarks/context.py [--smoke]`.
+
+A block of a mass between 0.3 and 3 kg is pushed along a line, with a soft wall at its end. The mass is the context: it
+is known, and another one in every episode. Three systems are learned: a constant `LCSModel`, which begins as the true
+system of a middle mass; known physics with three unknown numbers; and a network that turns the mass into matrices.
+
+- Prediction: fitted by the violation loss to transitions with many masses, observed with some noise. Error of the
+  predicted velocity.
+- Imitation: fitted through the MPC to the actions of an expert that knows the true system. Error of the first action.
+
+Each error is that of unseen states and masses, and printed as a ratio: that of the constant system over that of each
+other, so that 10 means a tenth of the error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from torch import Tensor, nn
+
+from difflcs import GoalCost, LCSModel, LCSModule, LCSMPCLayer, LCSParams
+from difflcs.errors import DegenerateWarning, InvalidInputError
+from difflcs.rl import Epochs, ViolationLoss, WarmupSettings, fit
+
+MASSES = (0.3, 3.0)  # [kg]
+DAMPING, STIFFNESS, ADDED_MASS = 0.8, 100.0, 0.2  # [N s/m], of the wall [N/m], of the finger that moves along [kg]
+DT = 0.1  # [s]
+FORCE = 5.0  # bound of the action [N]
+HORIZON = 6
+NOISE = 0.001, 0.01  # of the observed next states [m], [m/s]
+LOG_MASSES = math.log(MASSES[0]), math.log(MASSES[1])
+MIDDLE = math.sqrt(MASSES[0] * MASSES[1])
+LOSS = ViolationLoss(gamma="auto", xi=0.1)
+
+
+# --- systems ----------------------------------------------------------------------------------------------------------
+
+
+def block(mass: Tensor, damping: Tensor, stiffness: Tensor, added_mass: Tensor) -> LCSParams:
+    """A block at p ≥ 0 that a force u pushes along a line, and a wall at p = 0 with a spring in front of it.
+
+    v₊ = v + h/M (u + λ − b v),  p₊ = p + h v₊,  0 ≤ λ ⊥ p₊ + λ/k ≥ 0,  M = mass + added mass.
+
+    Args:
+        mass: (...) [kg].
+        damping: b [N s/m], a number.
+        stiffness: k [N/m], a number.
+        added_mass: [kg], a number.
+
+    Returns:
+        Systems (...) with the state (p [m], v [m/s]), the action u [N] and λ [N]; n_x 2, n_u 1, n_lam 1.
+    """
+    mobility = DT / (mass + added_mass)
+    zero, one = torch.zeros_like(mobility), torch.ones_like(mobility)
+    kept = 1 - mobility * damping
+    A = torch.stack([torch.stack([one, DT * kept], -1), torch.stack([zero, kept], -1)], -2)
+    B = torch.stack([DT * mobility, mobility], -1).unsqueeze(-1)
+    d = torch.zeros_like(B.squeeze(-1))
+    F = B[..., :1, :] + 1 / stiffness
+    return LCSParams(A=A, B=B, C=B, d=d, D=A[..., :1, :], E=B[..., :1, :], F=F, c=torch.zeros_like(d[..., :1]))
+
+
+def _mass(context: Tensor | None) -> Tensor:
+    if context is None:
+        raise InvalidInputError("context: expected the mass (..., 1) [kg], got none; pass context=")
+    return context[..., 0]
+
+
+class Physics(nn.Module):
+    """`block` with three unknown numbers, each learned by its logarithm, which keeps it positive."""
+
+    n_x, n_u, n_lam = 2, 1, 1
+
+    def __init__(self, damping: float = DAMPING, stiffness: float = STIFFNESS, added_mass: float = ADDED_MASS):
+        super().__init__()
+        self.logarithms = nn.ParameterDict(
+            {
+                name: nn.Parameter(torch.tensor(math.log(value), dtype=torch.float64))
+                for name, value in {"damping": damping, "stiffness": stiffness, "added_mass": added_mass}.items()
+            }
+        )
+
+    def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
+        """The systems of masses (..., 1) [kg]."""
+        return block(_mass(context), **{name: value.exp() for name, value in self.logarithms.items()})
+
+
+class Network(nn.Module):
+    """A network turns the mass into matrices: those of a middle mass, and what it adds to each number."""
+
+    n_x, n_u, n_lam = 2, 1, 1
+    stiffness = 1e-3  # least F
+
+    def __init__(self, generator: torch.Generator, width: int = 16):
+        super().__init__()
+        middle = LCSModel.from_params(true_system(), stiffness=self.stiffness)
+        self.names = [name for name in middle.parameter_names if name != "H"]
+        self.middle = nn.ParameterDict({name: getattr(middle, name).detach().clone() for name in self.names})
+        self.slopes = nn.Parameter(2 * torch.randn(width, generator=generator, dtype=torch.float64))
+        self.offsets = nn.Parameter(torch.randn(width, generator=generator, dtype=torch.float64))
+        size = sum(value.numel() for value in self.middle.values())
+        self.weights = nn.Parameter(torch.zeros(width, size, dtype=torch.float64))
+
+    def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
+        """The systems of masses (..., 1) [kg]."""
+        where = (_mass(context) / MIDDLE).log().unsqueeze(-1)
+        added = torch.tanh(self.slopes * where + self.offsets) @ self.weights
+        parts = added.split([self.middle[name].numel() for name in self.names], -1)
+        found = {
+            name: self.middle[name] + part.unflatten(-1, self.middle[name].shape)
+            for name, part in zip(self.names, parts, strict=True)
+        }
+        G = found.pop("G")
+        return LCSParams(**found, F=G @ G.mT + self.stiffness * torch.eye(1, dtype=torch.float64))
+
+
+def true_system(mass: Tensor | None = None) -> LCSParams:
+    """The system of masses (...) [kg]; a middle one if None."""
+    mass = torch.tensor(MIDDLE, dtype=torch.float64) if mass is None else mass
+    return block(mass, *(torch.tensor(v, dtype=torch.float64) for v in (DAMPING, STIFFNESS, ADDED_MASS)))
+
+
+def learners(seed: int) -> dict[str, LCSModule]:
+    """What is to be learned, the constant system first."""
+    generator = torch.Generator().manual_seed(seed)
+    off = [float(v) for v in torch.exp(2 * torch.rand(3, generator=generator, dtype=torch.float64) - 1)]
+    return {
+        "constant": LCSModel.from_params(true_system(), stiffness=1e-3),
+        "physics": Physics(DAMPING * off[0], STIFFNESS * off[1], ADDED_MASS * off[2]),
+        "network": Network(generator),
+    }
+
+
+# --- data -------------------------------------------------------------------------------------------------------------
+
+
+def draw(count: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """States (count, 2), actions (count, 1), masses (count, 1) [kg], evenly in the mass's logarithm."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform([0.0, -1.0], [0.4, 1.0], (count, 2))
+    u = rng.uniform(-FORCE, FORCE, (count, 1))
+    mass = np.exp(rng.uniform(*LOG_MASSES, (count, 1)))
+    return torch.from_numpy(x), torch.from_numpy(u), torch.from_numpy(mass)
+
+
+class HeavyBlock(gymnasium.Env):
+    """Push a block of a known mass to a place: an environment whose observations have a context."""
+
+    STEPS = 12
+    observation_space = spaces.Dict(
+        {key: spaces.Box(-10.0, 10.0, (n,), np.float64) for key, n in (("state", 2), ("goal", 1), ("context", 1))}
+    )
+    action_space = spaces.Box(-FORCE, FORCE, (1,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        """Draw the state, the goal and the mass."""
+        super().reset(seed=seed)
+        self.steps = 0
+        self.state = self.np_random.uniform([0.0, -0.5], [0.3, 0.5])
+        self.goal = self.np_random.uniform([0.0], [0.3])
+        self.context = np.exp(self.np_random.uniform(*LOG_MASSES, 1))
+        return self._observe(), {"success": False}
+
+    def step(self, action):
+        """One step of the true system."""
+        system = true_system(torch.tensor(self.context[0]))
+        self.state = system.step(torch.from_numpy(self.state), torch.from_numpy(np.asarray(action))).x_next.numpy()
+        self.steps += 1
+        error = float(abs(self.state[0] - self.goal[0]))
+        info = {"success": error < 0.03, "position_error": error}
+        return self._observe(), -10 * error, False, self.steps == self.STEPS, info
+
+    def _observe(self):
+        return {"state": self.state.copy(), "goal": self.goal.copy(), "context": self.context.copy()}
+
+
+# --- what is measured -------------------------------------------------------------------------------------------------
+
+
+def make_mpc(lcs: LCSModule) -> LCSMPCLayer:
+    """Bring the block to a goal, whatever its mass."""
+    cost = GoalCost.reach(2, 1, goal_weight=(20.0,), input_weight=0.002)
+    return LCSMPCLayer(lcs, cost, HORIZON, -FORCE, FORCE, on_failure="mask")
+
+
+def prediction(lcs: LCSModule, seed: int, transitions: int, epochs: int) -> tuple[float, float]:
+    """Root mean square error of the predicted velocity [m/s], before and after the violation loss."""
+    x, u, mass = draw(transitions, seed)
+    settings = WarmupSettings(epochs=Epochs(minibatch=100), loss=LOSS, learning_rate_decay=1 - 3 / (8 * epochs))
+
+    def error() -> float:
+        unseen = draw(1000, seed + 10_000)
+        with torch.no_grad():
+            system, wanted = lcs.params(unseen[0], unseen[2]), true_system(unseen[2][:, 0])
+            assert isinstance(system, LCSParams)
+            found, seen = (s.step(*unseen[:2]).x_next[:, 1] for s in (system, wanted))
+        return float((found - seen).square().mean().sqrt())
+
+    before = error()
+    noise = torch.from_numpy(np.random.default_rng(seed + 1).normal(size=x.shape)) * torch.tensor(NOISE)
+    x_next = true_system(mass[:, 0]).step(x, u).x_next + noise
+    fit(lcs, x, u, x_next, settings, epochs, np.random.default_rng(seed), context=mass)
+    return before, error()
+
+
+def imitation(lcs: LCSModule, seed: int, samples: int, steps: int) -> tuple[float, float]:
+    """Root mean square error of the first action [N], before and after imitating an expert."""
+    mpc, expert = make_mpc(lcs), make_mpc(Physics())
+
+    def drawn(count: int, seed: int) -> tuple[Tensor, ...]:
+        x, _, mass = draw(count, seed)
+        goal = 0.3 * torch.from_numpy(np.random.default_rng(seed + 1).uniform(size=(count, 1)))
+        with torch.no_grad():
+            return x, goal, mass, expert(x, goal, context=mass).action
+
+    def error() -> float:
+        x, goal, mass, wanted = drawn(1000, seed + 10_000)
+        with torch.no_grad():
+            return float((mpc(x, goal, context=mass).action - wanted).square().mean().sqrt())
+
+    before = error()
+    data = drawn(samples, seed)
+    # Logarithms take larger steps than matrices, whose entries are down to 0.01 here.
+    adam = torch.optim.Adam(mpc.parameters(), 0.02 if isinstance(lcs, Physics) else 0.001)
+    schedule = torch.optim.lr_scheduler.LinearLR(adam, 1.0, 0.05, steps)
+    generator = torch.Generator().manual_seed(seed)
+    for _ in range(steps):
+        chosen = torch.randperm(samples, generator=generator)[:100]
+        x, goal, mass, wanted = (v[chosen] for v in data)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DegenerateWarning)  # of single samples, with the force at its bound
+            loss = (mpc(x, goal, context=mass).action - wanted).square().mean()
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+        schedule.step()
+    return before, error()
+
+
+def measure(seeds: int, transitions: int, epochs: int, samples: int, steps: int) -> dict[str, dict[str, list[float]]]:
+    """Errors after learning by task and learner, one of each seed."""
+    sizes: dict[str, tuple[Measure, int, int]] = {
+        "prediction": (prediction, transitions, epochs),
+        "imitation": (imitation, samples, steps),
+    }
+    found: dict[str, dict[str, list[float]]] = {name: {} for name in sizes}
+    for seed in range(seeds):
+        for task, (learn, *size) in sizes.items():
+            for name, lcs in learners(seed).items():
+                before, after = learn(lcs, seed, *size)
+                found[task].setdefault(name, []).append(after)
+                print(f"{task}, seed {seed}, {name}: {before:.4f} before, {after:.4f} after", file=sys.stderr)
+    return found
+
+
+Measure = Callable[[LCSModule, int, int, int], tuple[float, float]]
+
+
+def ratios(found: dict[str, dict[str, list[float]]]) -> dict[str, dict[str, list[float]]]:
+    """The constant system's error over that of each other, one of each seed."""
+    return {
+        task: {
+            name: [ours / theirs for ours, theirs in zip(errors["constant"], own, strict=True)]
+            for name, own in errors.items()
+            if name != "constant"
+        }
+        for task, errors in found.items()
+    }
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description="A system that depends on a context against a constant one.")
+    parser.add_argument("--smoke", action="store_true", help="in seconds: one seed, little data")
+    parser.add_argument("--out", type=Path, help="write the numbers there, as JSON")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    small = {"seeds": 1, "transitions": 500, "epochs": 20, "samples": 200, "steps": 40}
+    full = {"seeds": 5, "transitions": 2000, "epochs": 60, "samples": 1000, "steps": 300}
+    found = measure(**(small if arguments.smoke else full))
+    units = {"prediction": "m/s", "imitation": "N"}
+    for task, by_name in ratios(found).items():
+        print(f"{task}: constant {np.median(found[task]['constant']):.3g} {units[task]}")
+        for name, values in by_name.items():
+            error = np.median(found[task][name])
+            print(f"  {name}: {error:.3g} {units[task]}, ratio {np.median(values):.1f}, at least {min(values):.1f}")
+    if arguments.out:
+        content = {"sizes": small if arguments.smoke else full, "errors": found, "ratios": ratios(found)}
+        arguments.out.write_text(json.dumps(content, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,426 @@
+"""Any `LCSModule` in warm-up and PPO, and a context on its way from the environment to model, loss and critic."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from gymnasium.vector import SyncVectorEnv
+from torch import nn
+
+from benchmarks.context import FORCE, HeavyBlock, Network, Physics, imitation, learners, make_mpc, prediction
+from difflcs import LCSModel, LCSParams, LCSSequence
+from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
+
+pytest.importorskip("torchrl")
+from tensordict import TensorDict
+
+from difflcs.rl import (
+    Adam,
+    CriticSettings,
+    Epochs,
+    Rollouts,
+    ViolationLoss,
+    Warmup,
+    WarmupSettings,
+    collect,
+    evaluate,
+    fit,
+    make_actor,
+    make_ppo,
+)
+from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
+from difflcs.rl.ppo import PPO
+from difflcs.rl.rollout import contexts, mpc_actions, no_episodes, transitions
+from difflcs.rl.state import flatten
+from tests.training import slide
+from tests.training.slide import parameters, recorded, same
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+STEPS = HeavyBlock.STEPS
+LOSS = ViolationLoss(gamma="auto", xi=0.1)
+OFF = {"damping": 2.0, "stiffness": 50.0, "added_mass": 0.6}
+
+
+def make_envs(count: int = 4, kind: Any = HeavyBlock) -> SyncVectorEnv:
+    return SyncVectorEnv([kind] * count)
+
+
+def make_warmup(lcs: Any = None, env: SyncVectorEnv | None = None, **changes: Any) -> Warmup:
+    lcs = Physics(**OFF) if lcs is None else lcs
+    settings = WarmupSettings(
+        rollouts=Rollouts(first=4, each=3), epochs=Epochs(20, 10, 20), noise=0.1, loss=LOSS, **changes
+    )
+    return Warmup(lcs, make_mpc(lcs), make_envs() if env is None else env, settings, 0, STEPS)
+
+
+class Gains(slide.Slide):
+    """`Slide` with another gain in each episode, which is known: x₊ = x + gain·u."""
+
+    observation_space = spaces.Dict(
+        {
+            key: spaces.Box(low, high, (1,), np.float64)
+            for key, low, high in (("state", -10.0, 10.0), ("goal", -1.0, 1.0), ("context", 0.0, 1.0))
+        }
+    )
+
+    def __init__(self, drifts: bool = False):
+        super().__init__()
+        self.drifts = drifts
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = super().reset(seed=seed)
+        self.context = self.np_random.uniform(0.3, 0.7, 1)
+        return {**observation, "context": self.context.copy()}, info
+
+    def step(self, action):
+        observation, *rest = super().step(np.asarray(action) * self.context / 0.5)
+        self.context = self.context + 0.01 * self.drifts
+        return {**observation, "context": self.context.copy()}, *rest
+
+
+class Gain(nn.Module):
+    """x₊ = a x + effect·gain·u without contacts; the effect is underestimated, so that the MPC hardly acts."""
+
+    n_x, n_u, n_lam = 1, 1, 0
+
+    def __init__(self, effect: float = 0.2):
+        super().__init__()
+        self.a, self.effect = (nn.Parameter(torch.tensor(v, dtype=torch.float64)) for v in (0.97, effect))
+        self.unused = nn.Parameter(torch.zeros(2, dtype=torch.float64))
+        self.seen = []
+
+    def params(self, x=None, context=None):
+        assert context is not None
+        self.seen.append(context.detach().clone())
+        B = (self.effect * context).unsqueeze(-1)
+        empty = {name: torch.zeros(shape, dtype=B.dtype) for name, shape in zip("CDEFc", _EMPTY, strict=True)}
+        return LCSParams(A=self.a.view(1, 1), B=B, d=torch.zeros(1, dtype=B.dtype), **empty)
+
+
+_EMPTY = (1, 0), (0, 1), (0, 1), (0, 0), (0,)
+
+
+def features(state, goal, elapsed, context):
+    return torch.cat([slide.features(state, goal, elapsed), context], -1)
+
+
+def make_trainer(lcs: Any, seed: int = 0, iterations: int = 4, kind: Any = Gains, **changes: Any) -> PPO:
+    settings = slide.small_settings(**{"violation": LOSS, **changes})
+    return make_ppo(
+        make_actor(slide.make_mpc(lcs), settings.std, settings.covariance),
+        make_envs(settings.rollouts, kind),
+        settings,
+        seed,
+        features=features,
+        total_episodes=iterations * settings.rollouts,
+        episode_steps=slide.STEPS,
+        failure_penalty=slide.PENALTY,
+    )
+
+
+# --- learning ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_warmup_finds_the_unknown_numbers():
+    """Known physics whose system depends on the context: three numbers, from wrong ones to the true ones."""
+
+    def numbers(lcs: Physics) -> np.ndarray:
+        return np.array([float(p.detach().exp()) for p in lcs.parameters()])
+
+    lcs = Physics(**OFF)
+    before, truth = numbers(lcs), numbers(Physics())
+    warmup = make_warmup(lcs, learning_rate_decay=0.998)
+    for _ in range(8):
+        warmup.step()
+    learned = numbers(lcs)
+    assert abs(before / truth - 1).min() > 0.4
+    np.testing.assert_allclose(learned, truth, rtol=0.1)
+
+
+def test_a_context_makes_the_difference():
+    """A fast version of benchmarks/context.py, where a constant system fails by both losses."""
+    for learn, sizes, least in ((prediction, (400, 40), (5, 2)), (imitation, (300, 100), (3, 2))):
+        errors = {name: learn(lcs, 0, *sizes)[1] for name, lcs in learners(0).items()}
+        assert errors["constant"] > least[0] * errors["physics"]
+        assert errors["constant"] > least[1] * errors["network"]
+
+
+def test_ppo_improves_a_module_of_ones_own():
+    lcs = Gain()
+    critic = CriticSettings(epochs=Epochs(first=60, each=3, minibatch=256))
+    trainer = make_trainer(lcs, 0, 8, rollouts=40, steps=10, std=0.04, target_kl=0.2, max_kl=0.6, critic=critic)
+    before = evaluate(trainer.robot.env, trainer.policy, 60, 0, slide.STEPS).success_rate
+    while not trainer.done:
+        assert trainer.step().solver_failures == 0
+    after = evaluate(trainer.robot.env, trainer.policy, 60, 0, slide.STEPS).success_rate
+    assert before < 0.35
+    assert after > before + 0.4
+    assert not lcs.unused.any()
+
+
+def test_the_violation_loss_beside_ppo_gets_the_context():
+    """Eq. total_loss with β = 0 is the violation loss alone, which finds the true effect."""
+    adam = Adam(learning_rate=0.02, betas=(0.9, 0.99))
+    lcs = Gain()
+    trainer = make_trainer(
+        lcs, iterations=2, beta=0.0, std=0.1, steps=60, minibatch=None, update="adam", adam=adam, max_kl=100.0
+    )
+    while not trainer.done:
+        trainer.step()
+    assert float(lcs.effect.detach()) == pytest.approx(1.0, abs=0.05)
+
+
+# --- the way of a context ---------------------------------------------------------------------------------------------
+
+
+def test_episodes_keep_their_context():
+    env = make_envs(3)
+    record = collect(env, mpc_actions(make_mpc(Physics())), [1, 2], STEPS)
+    first = [HeavyBlock().reset(seed=seed)[0]["context"] for seed in (1, 2)]
+    np.testing.assert_array_equal(record["context"], first)
+    flat = contexts(record)
+    assert flat is not None
+    assert torch.equal(flat, record["context"].repeat_interleave(STEPS, 0))
+    assert len(flat) == len(transitions(record)[0])
+    assert contexts(record.select("state", "action")) is None
+    assert no_episodes(env, STEPS)["context"].shape == (0, 1)
+
+
+def test_each_part_of_ppo_sees_the_context_of_its_own_sample():
+    trainer = make_trainer(Gain(), steps=2, minibatch=30)
+    seen, solved = recorded(trainer), []
+    trainer.actor.gaussian.register_forward_hook(lambda _, inputs, __: solved.append(inputs[0].clone()))
+    cold = slide.make_mpc(Gain())
+    trainer.step()
+    episodes, inputs, _, _ = seen.calls[0]
+    context = episodes["context"].unsqueeze(1).expand(-1, slide.STEPS + 1, -1)
+    assert len(context.unique()) == slide.ROLLOUTS
+    assert torch.equal(inputs[..., -1:], context)
+    data = episodes["policy"].flatten(0, 1)
+    assert torch.equal(data["context"], context[:, 1:].flatten(0, 1))
+    with torch.no_grad():
+        expected = cold(data["state"], data["goal"], context=data["context"]).action
+    torch.testing.assert_close(data["loc"], expected, rtol=0, atol=1e-9)
+    of_goal = dict(zip(episodes["goal"].squeeze(-1).tolist(), episodes["context"].squeeze(-1).tolist(), strict=True))
+    for batch in solved:
+        assert [of_goal[goal] for goal in batch["goal"].squeeze(-1).tolist()] == batch["context"].squeeze(-1).tolist()
+
+
+def test_a_context_that_changes_is_refused():
+    env = SyncVectorEnv([lambda: Gains(drifts=True)] * 2)
+    with pytest.raises(InvalidInputError, match="same context in a whole episode, got another in step 1"):
+        collect(env, mpc_actions(slide.make_mpc(Gain())), [1, 2], slide.STEPS)
+
+
+def test_a_constant_model_takes_no_notice():
+    record = collect(make_envs(2), mpc_actions(make_mpc(learners(0)["constant"])), [1, 2], STEPS)
+    assert not record["failures"].any()
+    assert "context" in record.keys()
+
+
+# --- the Jacobian -----------------------------------------------------------------------------------------------------
+
+
+class Plain(LCSModel):
+    """An `LCSModel` that nobody knows to be one."""
+
+    def params(self, x=None, context=None):
+        return super().params(x, context)
+
+
+class Stages(Plain):
+    """The same system at each stage, by stage."""
+
+    def params(self, x=None, context=None):
+        return LCSSequence.stack([super().params(x, context)] * 3)
+
+
+@pytest.mark.parametrize("kind", [Plain, Stages])
+def test_any_module_has_the_jacobian_of_a_model(kind):
+    lcs = slide.make_model()
+    other = kind(1, 1, 1, learn_c=False)
+    other.load_state_dict(lcs.state_dict())
+    actors = [make_actor(slide.make_mpc(module), slide.small_settings().std) for module in (lcs, other)]
+    data = slide.drawn(actors[0], 20)
+    wanted, found = (actor.jacobian(data) for actor in actors)
+    assert bool(wanted.any())
+    torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("lcs", [Physics(**OFF), Network(torch.Generator().manual_seed(1), width=2)], ids=["3", "n"])
+def test_jacobian_of_a_system_for_each_sample(lcs):
+    """Against central differences of the planned action, over more samples than are differentiated together."""
+    actor = make_actor(make_mpc(lcs), 0.5, "full")
+    with torch.no_grad():
+        actor.gaussian.log_std.fill_(np.log(0.25))
+    generator = torch.Generator().manual_seed(0)
+    state, goal, context = (torch.rand(20, n, generator=generator, dtype=torch.float64) for n in (2, 1, 1))
+    data = TensorDict({"state": 0.3 * state, "goal": 0.1 * goal, "context": 0.3 + 2 * context}, [20])
+    actor.act(data)
+    data["guess"] = data["plan"].clone()
+    found = actor.jacobian(data)
+    columns = []
+    for p in lcs.parameters():
+        for i in range(p.numel()):
+            ends = []
+            for step in (1e-5, -1e-5):
+                with torch.no_grad():
+                    p.view(-1)[i] += step
+                    ends.append(actor.mpc(data["state"], data["goal"], context=data["context"]).action)
+                    p.view(-1)[i] -= step
+            columns.append((ends[0] - ends[1]) / 2e-5 / 0.25)
+    inside = (data["loc"].abs() < 0.99 * FORCE).squeeze(-1)
+    assert int(inside.sum()) > 5
+    assert bool(found[inside].any())
+    torch.testing.assert_close(found[inside], torch.stack(columns, -1)[inside], rtol=1e-3, atol=1e-3)
+
+
+# --- resuming ---------------------------------------------------------------------------------------------------------
+
+
+def same_state(a: Any, b: Any) -> bool:
+    (tensors, rest), (others, other_rest) = flatten(a.state_dict()), flatten(b.state_dict())
+    alike = rest == other_rest and tensors.keys() == others.keys()
+    return alike and all(torch.equal(value, others[name]) for name, value in tensors.items())
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        make_warmup,
+        lambda: make_warmup(Network(torch.Generator().manual_seed(0))),
+        lambda: make_trainer(Gain(), beta=0.7, covariance="diagonal"),
+        lambda: make_trainer(Gain(), update="adam", minibatch=30),
+    ],
+    ids=["warm-up", "network", "natural", "adam"],
+)
+def test_resumed_equals_uninterrupted_bitwise(make, tmp_path):
+    through, first, second = make(), make(), make()
+    for _ in range(3):
+        through.step()
+    first.step()
+    save_checkpoint(tmp_path, first.iteration, first.state_dict())
+    first.step()  # lost by the crash
+    second.load(load_checkpoint(tmp_path))
+    for _ in range(2):
+        second.step()
+    assert not same(parameters(first), parameters(through))
+    assert same(parameters(second), parameters(through))
+    assert same_state(second, through)
+
+
+class Tied(Physics):
+    """One parameter under two names."""
+
+    def __init__(self, **numbers: float):
+        super().__init__(**numbers)
+        self.again = self.logarithms["damping"]
+
+
+def test_tied_parameters_are_saved(tmp_path):
+    first, second = make_warmup(Tied(**OFF)), make_warmup(Tied(**OFF))
+    first.step()
+    save_checkpoint(tmp_path, first.iteration, first.state_dict())
+    second.load(load_checkpoint(tmp_path))
+    assert same_state(first, second)
+    assert len(list(second.learned.parameters())) == 3  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_load_refuses_hostile_states(refuses_hostile_checkpoints):
+    refuses_hostile_checkpoints(make_warmup())
+
+
+def test_load_refuses_another_module():
+    class Other(Physics):
+        pass
+
+    state = make_warmup().state_dict()
+    assert state["learned"]["settings"] == {"class": "Physics", "n_x": 2, "n_u": 1, "n_lam": 1}
+    with pytest.raises(CheckpointError, match="other settings"):
+        make_warmup(Other(**OFF)).load(state)
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------
+
+
+class Nothing(Gain):
+    """No parameter that requires a gradient."""
+
+    def __init__(self):
+        super().__init__()
+        self.requires_grad_(False)
+
+
+class Detached(Gain):
+    """Its system does not depend on its parameters."""
+
+    def params(self, x=None, context=None):
+        return super().params(x, context).detach()
+
+
+class Wide(Gain):
+    """Sizes of another environment."""
+
+    n_u = 2
+
+
+class NotAModule:
+    """An `LCSModule`, but no `torch.nn.Module`."""
+
+    n_x, n_u, n_lam = 1, 1, 0
+    params = Gain.params
+
+
+FIXED = LCSModel(1, 1, 1).params().detach()
+BAD = [
+    (Nothing(), InvalidInputError, "parameter that requires a gradient in Nothing, got 3"),
+    (FIXED, InvalidInputError, "got fixed LCSParams"),
+    (NotAModule(), DTypeError, r"torch\.nn\.Module with n_x, n_u, n_lam and params"),
+]
+
+
+def slide_warmup(lcs: Any) -> Warmup:
+    settings = WarmupSettings(rollouts=Rollouts(2, 2), epochs=Epochs(2, 2, 20), loss=LOSS)
+    return Warmup(lcs, None, make_envs(2, Gains), settings, 0, slide.STEPS)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(("lcs", "error", "message"), BAD)
+def test_what_cannot_be_learned_is_refused(lcs, error, message):
+    with pytest.raises(error, match=message):
+        slide_warmup(lcs)
+    with pytest.raises(error, match=message):
+        make_trainer(lcs)
+    with pytest.raises(error, match=message):
+        make_trainer(lcs, update="adam")
+
+
+def test_other_sizes_than_the_environments_are_refused():
+    with pytest.raises(InvalidInputError, match=r"n_x=1, n_u=1 like the states and actions .* n_u=2 of Wide"):
+        slide_warmup(Wide())
+    with pytest.raises(InvalidInputError, match=r"lcs: expected n_x=1, n_u=1 .* got n_x=2"):
+        slide_warmup(Physics())
+    settings = slide.small_settings()
+    with pytest.raises(InvalidInputError, match=r"actor: expected n_x=2, n_u=1 .* got n_x=1"):
+        make_ppo(
+            make_actor(slide.make_mpc(Gain()), settings.std), make_envs(12), settings, 0, features=features,
+            total_episodes=12,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("update", ["natural", "adam"])
+def test_a_system_without_gradient_is_refused(update):
+    with pytest.raises(InvalidInputError, match="depends on the module's parameters"):
+        slide_warmup(Detached()).step()
+    with pytest.raises(InvalidInputError, match="depends on the module's parameters"):
+        make_trainer(Detached(), update=update).step()
+
+
+def test_a_sequence_is_no_system_of_transitions():
+    x = torch.zeros(4, 1, dtype=torch.float64)
+    with pytest.raises(DTypeError, match="expected LCSParams for transitions"):
+        fit(Stages(1, 1, 1), x, x, x, WarmupSettings(), 1, np.random.default_rng(0))

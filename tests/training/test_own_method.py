@@ -1,0 +1,156 @@
+"""A task with a context, and a method that learns a module of one's own, by the common code of all trainings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.context import FORCE, HeavyBlock, Physics
+from difflcs import GoalCost
+
+pytest.importorskip("torchrl")
+from difflcs.rl import (
+    EnsembleSettings,
+    Epochs,
+    ModelRollouts,
+    ModelRolloutSettings,
+    Reporter,
+    Rollouts,
+    TaskSpec,
+    TrainConfig,
+    ViolationLoss,
+    ViolationMethod,
+    WarmupSettings,
+    collect,
+    evaluate,
+    get_method,
+    load_policy,
+    method_names,
+    register_method,
+    train,
+)
+from difflcs.rl.rollout import beside, contexts, transitions, uniform_actions
+from tests.training.slide import same
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+STEPS = HeavyBlock.STEPS
+LOSS = ViolationLoss(gamma="auto", xi=0.1)
+OFF = {"damping": 2.0, "stiffness": 50.0, "added_mass": 0.6}
+
+
+def outcome(state, action, after, goal, ended):
+    error = abs(after[..., 0] - goal[..., 0])
+    return -10 * error, error < 0.03
+
+
+TASK = TaskSpec(
+    name="heavy-block",
+    env=HeavyBlock,
+    make_cost=lambda: GoalCost.reach(2, 1, goal_weight=(20.0,), input_weight=0.002),
+    u_min=-FORCE,
+    u_max=FORCE,
+    horizon=6,
+    episode_steps=STEPS,
+    step_seconds=0.1,
+    n_context=1,
+    features=lambda state, goal, elapsed, context: torch.cat(
+        [5 * (state[..., :1] - goal), state[..., 1:], context.log1p(), elapsed.unsqueeze(-1)], -1
+    ),
+    outcome=outcome,
+)
+
+
+@dataclass(frozen=True)
+class PhysicsMethod(ViolationMethod):
+    """The warm-up of known physics with unknown numbers."""
+
+    name: ClassVar[str] = "physics"
+    version: ClassVar[int] = 1
+    summary: ClassVar[str] = "the warm-up of known physics with unknown numbers"
+    kind: ClassVar[str] = "Physics"
+    takes_init: ClassVar[bool] = False
+
+    def initial(self, work):
+        return Physics(**OFF)
+
+    def rebuild(self, task, config, tensors, source):
+        found = Physics()
+        found.load_state_dict(dict(tensors))
+        return found
+
+
+@pytest.fixture
+def registered():
+    register_method(PhysicsMethod)
+    return PhysicsMethod(warmup=WarmupSettings(rollouts=Rollouts(4, 4), epochs=Epochs(8, 4, 20), noise=0.1, loss=LOSS))
+
+
+class Stopped(Exception):
+    """Raised to break a training off."""
+
+
+class Stop(Reporter):
+    def iterated(self, report):
+        if report.iteration == 2:
+            raise Stopped
+
+
+def test_a_method_that_learns_a_module_of_ones_own(registered, tmp_path):
+    """Its run directory, resumed, is that of an uninterrupted run, and acts as what was trained."""
+    config = TrainConfig(task="heavy-block", method=registered, minutes=0.3, evaluate_at=(), final_goals=4)
+    whole = train(config, tmp_path / "whole", task=TASK)
+    with pytest.raises(Stopped):
+        train(config, tmp_path / "parts", task=TASK, reporter=Stop())
+    parts = train(config, tmp_path / "parts", task=TASK, resume=True)
+    results = [run.learned("Physics") for run in (whole, parts)]
+    assert results[0][0] == results[1][0] == {"class": "Physics", "n_x": 2, "n_u": 1, "n_lam": 1}
+    assert same([*results[0][1].values()], [*results[1][1].values()])
+    policy: Any = load_policy(whole, TASK)
+    assert same([*policy.lcs.state_dict().values()], [results[0][1][name] for name in policy.lcs.state_dict()])
+    assert float(whole.rows()[-1]["evaluation_success_rate"]) >= 0
+
+
+@pytest.mark.parametrize("method", method_names())
+def test_every_method_trains_a_task_with_a_context(method, tmp_path):
+    config = replace(TrainConfig(task="heavy-block", method=get_method(method)()).smoke(), minutes=0.6)
+    run = train(config, tmp_path / "run", task=TASK)
+    policy = load_policy(run, TASK)
+    envs = TASK.make_envs(4)
+    again = evaluate(envs, policy, 4, 0, STEPS)
+    assert again.success_rate == pytest.approx(float(run.rows()[-1]["evaluation_success_rate"]))
+
+
+def test_networks_see_the_context():
+    """Model rollouts have the context of their start, and predict by it."""
+    env = TASK.make_envs(40)
+    rng = np.random.default_rng(0)
+    episodes, unseen = (collect(env, uniform_actions(env, rng), range(first, first + 40), STEPS) for first in (0, 100))
+    ensemble = EnsembleSettings(networks=1, width=32, epochs=Epochs(80, 3, 64))
+    models = ModelRollouts(env, outcome, ModelRolloutSettings(rollouts=10, ensemble=ensemble), 0, STEPS)
+    models.add(episodes)
+    models.fit()
+    start, _ = models.env.reset(seed=3)
+    known = {tuple(x): c for x, c in zip(episodes["state"][:, 0].tolist(), episodes["context"].tolist(), strict=True)}
+    assert [known[tuple(x)] for x in start["state"].tolist()] == start["context"].tolist()
+
+    actions = rng.uniform(-FORCE, FORCE, (10, 1))
+    after, _, _, _, _ = models.env.step(actions)
+    np.testing.assert_array_equal(after["context"], start["context"])
+    before, taken = torch.from_numpy(start["state"]).unsqueeze(1), torch.from_numpy(actions)[:, None, None]
+    seen = [v.expand(-1, STEPS, *v.shape[2:]) for v in (before, taken)]
+    foreseen, _, _ = models.env.foresee(*seen, torch.from_numpy(start["goal"]))
+    np.testing.assert_allclose(foreseen[:, 0, 0], after["state"], rtol=0, atol=1e-6)
+
+    (x, u, x_next), context = transitions(unseen), contexts(unseen)
+    assert context is not None
+    errors = []
+    for given in (context, context.flip(0)):
+        with torch.no_grad():
+            found = models.ensemble(beside(x, given).float().unsqueeze(0), u.float().unsqueeze(0))[0, :, :2]
+        errors.append(float((found - x_next).square().mean().sqrt()))
+    assert errors[0] < 0.5 * errors[1]

@@ -1,0 +1,141 @@
+"""StageBounds, LinearConstraints and ConstraintSequence: what they hold, and what they refuse."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import pytest
+import torch
+from torch import nn
+
+from difflcs import ConstraintSequence, LinearConstraints, StageBounds
+from difflcs.errors import BoundsError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
+
+F64, INF, NAN = torch.float64, float("inf"), float("nan")
+
+
+def full(value, *shape):
+    return torch.full(shape, value, dtype=F64)
+
+
+def test_stage_bounds_hold_numbers_tensors_and_nothing():
+    bounds = StageBounds(full(-0.1, 3, 2), 0.2)
+    assert (bounds.horizon, bounds.n_u) == (3, 2)
+    assert bounds.by_stage == {"u_min"}
+    assert torch.equal(bounds.u_max, full(0.2, 2))
+    open_above = StageBounds(u_min=nn.Parameter(full(-0.1, 5, 3, 2)))
+    assert torch.equal(open_above.u_max, full(INF, 2))
+    assert [name for name, _ in open_above.named_parameters()] == ["u_min"]
+    assert set(open_above.state_dict()) == {"u_min"}
+    each = StageBounds(full(-0.1, 4, 2), full(0.1, 3, 4, 2), by_stage=("u_min", "u_max"))
+    assert [tuple(v.shape) for v in each.by_steps()] == [(4, 2), (3, 4, 2)]
+    mixed = StageBounds(full(-0.1, 4, 2), full(0.1, 3, 2), by_stage=("u_min",))
+    assert [tuple(v.shape) for v in mixed.by_steps()] == [(4, 2), (3, 1, 2)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ((full(0.1, 3, 2), full(-0.1, 3, 2)), BoundsError, r"u_min <= u_max, got 0.1 and -0.1 at index \(0, 0\)"),
+        ((full(0.1, 3, 2), 0.0), BoundsError, "u_min <= u_max, got 0.1 and 0"),
+        ((full(INF, 3, 2), None), BoundsError, "u_min: expected at least one action that it allows"),
+        ((full(-1, 2), full(1, 3, 2)), ShapeError, r"u_min: expected a dimension of stages.*got \(2,\)"),
+        ((full(-1, 4, 2), full(1, 3, 2)), ShapeError, "u_min: expected 3 stages.*like u_max, got 4"),
+        ((full(-1, 3, 2), full(1, 3, 3)), ShapeError, r"u_m..: expected shape \(\.\.\., H=3, n_u="),
+        ((full(NAN, 3, 2), None), NonFiniteError, "u_min: expected numbers or infinity, got 6 NaN of 6"),
+        ((-1.0, 1.0), InvalidInputError, "by_stage: expected at least one field by stage"),
+        ((torch.zeros(3, 2, dtype=torch.int64), None), DTypeError, "u_min: expected float32 or float64"),
+        ((full(-1, 3, 2), "1"), DTypeError, "u_max: expected a torch.Tensor, got str"),
+    ],
+)
+def test_stage_bounds_refuse(arguments, error, message):
+    with pytest.raises(error, match=message):
+        StageBounds(*arguments)
+
+
+def rows(build, **changes):
+    n = build.normal(0)
+    return {"G": n(3, 4), "g": n(3), "E": n(3, 2), "weight": full(2.0, 3), **changes}
+
+
+def test_constraints_hold_their_fields(build):
+    hard = LinearConstraints(*list(rows(build).values())[:2])
+    assert (hard.n_c, hard.n_x, hard.n_u) == (3, 4, None)
+    assert torch.equal(hard.tensors()["price"], full(INF, 3))
+    assert set(hard.tensors()) == {"G_x", "g", "price"}
+    assert set(hard.state_dict()) == {"G", "g"}
+    soft = LinearConstraints(**rows(build, weight=5.0))
+    assert soft.n_u == 2
+    assert torch.equal(soft.tensors()["price"], full(5.0, 3))
+    assert set(soft.tensors()) == {"G_x", "G_u", "g", "price"}
+    learned = LinearConstraints(**rows(build, g=nn.Parameter(full(1.0, 3))))
+    assert [name for name, _ in learned.named_parameters()] == ["g"]
+    assert "G(3, 4)" in repr(learned)
+    assert learned.to(torch.float32).G.dtype == torch.float32
+    assert not hard.staged
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))])
+def test_copies_keep_the_values(build, copied):
+    sequence = ConstraintSequence(build.normal(0)(3, 4), full(1.0, 5, 3), by_stage=("g",))
+    for constraints in (LinearConstraints(**rows(build)), sequence):
+        twin = copied(constraints)
+        assert twin.by_stage == constraints.by_stage
+        assert all(torch.equal(v, twin.tensors()[k]) for k, v in constraints.tensors().items())
+
+
+def test_a_sequence_knows_its_stages(build):
+    n = build.normal(0)
+    sequence = ConstraintSequence(n(4, 3, 5), n(4, 3), n(3, 3, 2), full(1.0, 4, 3))
+    assert (sequence.horizon, sequence.n_c, sequence.n_x, sequence.n_u) == (3, 3, 5, 2)
+    assert sequence.staged == {"G_x", "G_u", "g", "price"}
+    moving = ConstraintSequence(n(3, 5), n(7, 4, 3), weight=2.0, by_stage=("g",))
+    assert moving.horizon == 3
+    assert moving.staged == {"g"}
+    assert torch.equal(moving.tensors()["price"], full(2.0, 3))
+
+
+BAD_ROWS = [
+    ({"G": full(1.0, 4)}, ShapeError, r"G: expected a matrix \(\.\.\., n_c, n_x\), got \(4,\)"),
+    ({"g": full(1.0, 2)}, ShapeError, r"g: expected shape \(\.\.\., n_c=3\), got \(2,\)"),
+    ({"E": full(1.0, 2, 2)}, ShapeError, r"E: expected a matrix \(\.\.\., n_c=3, n_u\), got \(2, 2\)"),
+    ({"weight": full(1.0, 4)}, ShapeError, r"weight: expected shape \(\.\.\., n_c=3\), got \(4,\)"),
+    ({"g": full(-INF, 3)}, InvalidInputError, "g: expected limits above −∞, got −∞; "),
+    ({"weight": 0.0}, InvalidInputError, "weight: expected a positive price .*got 0; leave out"),
+    ({"weight": -1}, InvalidInputError, "weight: expected a positive price .*got -1"),
+    ({"weight": NAN}, NonFiniteError, "weight: expected numbers or infinity, got 3 NaN"),
+    ({"weight": True}, DTypeError, "weight: expected a torch.Tensor, got bool"),
+    ({"G": full(NAN, 3, 4)}, NonFiniteError, "G: expected finite numbers, got 12"),
+    ({"G": full(INF, 3, 4)}, NonFiniteError, "G: expected finite numbers, got 12"),
+    ({"E": full(INF, 3, 2)}, NonFiniteError, "E: expected finite numbers, got 6"),
+    ({"g": full(NAN, 3)}, NonFiniteError, "g: expected numbers or infinity, got 3 NaN"),
+    ({"g": [1.0, 1.0, 1.0]}, DTypeError, "g: expected a torch.Tensor, got list"),
+    ({"G": torch.ones(3, 4, dtype=torch.int64)}, DTypeError, "G: expected float32 or float64"),
+    ({"G": None}, DTypeError, "G: expected a torch.Tensor, got NoneType"),
+]
+
+
+@pytest.mark.parametrize(("change", "error", "message"), BAD_ROWS)
+def test_constraints_refuse(build, change, error, message):
+    with pytest.raises(error, match=message) as caught:
+        LinearConstraints(**rows(build, **change))
+    assert ";" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"g": full(1.0, 3)}, ShapeError, r"g: expected a dimension of stages .*got \(3,\)"),
+        ({"g": full(1.0, 5, 3)}, ShapeError, r"g: expected 4 stages, for a horizon of 3 like G, got 5"),
+        ({"E": full(1.0, 4, 3, 2)}, ShapeError, r"E: expected 3 stages, for a horizon of 3 like G, got 4"),
+        ({"G": full(1.0, 1, 3, 4)}, ShapeError, "G: expected at least 2 stages, got 1"),
+        ({"by_stage": ("h",)}, InvalidInputError, "by_stage: expected names among G, g, E, weight, got str 'h'"),
+        ({"g": full(-INF, 4, 3)}, InvalidInputError, "g: expected limits above −∞"),
+    ],
+)
+def test_sequences_refuse(change, error, message):
+    arguments = {"G": full(1.0, 4, 3, 4), "g": full(1.0, 4, 3), "E": full(1.0, 3, 3, 2), "weight": 1.0}
+    ConstraintSequence(**arguments)
+    with pytest.raises(error, match=message):
+        ConstraintSequence(**{**arguments, **change})

@@ -1,0 +1,320 @@
+"""The layer under torch.func, vectorised jacobians and torch.compile: the numbers of plain calls, or a clear error."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+
+import pytest
+import torch
+from torch import Tensor
+from torch.autograd.functional import hessian, jacobian
+from torch.func import functional_call, grad, jacrev, vmap
+
+from difflcs import LCSMPCLayer, LCSParams, MPCSolution, Status
+from difflcs import errors as e
+from difflcs.mpc import Primal
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture
+def layer(build):
+    return LCSMPCLayer(build.model(seed=3, scale=0.4), build.cost(0), 3, -0.15, 0.15, relaxation=1e-4)
+
+
+@pytest.fixture
+def x0(build):
+    return 0.2 * build.normal(5)(6, 4)
+
+
+@pytest.fixture
+def systems(build):
+    """One system per element."""
+    n = build.normal(1)
+    return {k: v.expand(6, *v.shape) + 1e-2 * n(6, *v.shape) for k, v in build.lcs_tensors(3).items() if k != "F"} | {
+        "F": build.lcs_tensors(3)["F"].expand(6, 3, 3).clone()
+    }
+
+
+def close(found, expected):
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-11, check_stride=False)
+
+
+def jacobian_by_rows(layer, x):
+    """d action / d x of each element, (B, n_u, n_x), by one backward pass per action."""
+    leaf = x.clone().requires_grad_()
+    action = layer(leaf).action
+    found = [torch.autograd.grad(action[:, j].sum(), leaf, retain_graph=True)[0] for j in range(action.shape[1])]
+    return torch.stack(found, 1)
+
+
+# --- vmap -----------------------------------------------------------------------------------------------------------
+
+
+def test_vmap_is_a_batch(layer, x0):
+    plain = layer(x0)
+    close(vmap(lambda x: layer(x).u)(x0), plain.u)
+    close(vmap(lambda x: layer(x).objective, in_dims=1)(x0.T), plain.objective)
+    close(vmap(lambda x: layer(x).u, out_dims=1)(x0), plain.u.transpose(0, 1))
+    assert torch.equal(vmap(lambda x: layer(x).status)(x0), plain.status)
+    close(vmap(vmap(lambda x: layer(x).u))(x0.reshape(2, 3, 4)), plain.u.reshape(2, 3, 3, 2))
+    close(vmap(lambda x: layer(x).u, chunk_size=4)(x0), plain.u)
+    close(vmap(lambda x: layer(x).u)(x0.reshape(2, 3, 4)), plain.u.reshape(2, 3, 3, 2))
+
+
+def test_vmap_returns_a_whole_solution(layer, x0):
+    plain, mapped = layer(x0), vmap(layer)(x0)
+    assert isinstance(mapped, MPCSolution)
+    for name in ("x", "u", "lam", "mu", "objective", "status", "iterations", "violation"):
+        close(getattr(mapped, name), getattr(plain, name))
+    assert mapped.complementarity().shape == (6,)
+    assert float(mapped.dynamics_residual().max()) < 1e-10
+    assert bool(mapped.converged.all())
+
+
+def test_vmap_over_systems_states_and_both(build, layer, x0, systems):
+    own = LCSMPCLayer(build.params(3), build.cost(3), 3, -0.15, 0.15, relaxation=1e-4)
+
+    def plan(system, x):
+        return own(x, lcs=LCSParams(**system)).u
+
+    close(vmap(plan)(systems, x0), own(x0, lcs=LCSParams(**systems)).u)
+    one = {k: v[2] for k, v in systems.items()}
+    close(vmap(plan, in_dims=(None, 0))(one, x0), own(x0, lcs=LCSParams(**one)).u)
+    close(vmap(plan, in_dims=(0, None))(systems, x0[1]), own(x0[1], lcs=LCSParams(**systems)).u)
+    # Every system with every state: a mapped dimension beside one of the batch.
+    grid = vmap(plan, in_dims=(0, None))(systems, x0)
+    for i in (0, 4):
+        close(grid[i], own(x0, lcs=LCSParams(**{k: v[i] for k, v in systems.items()})).u)
+
+
+def test_vmap_over_guesses_bounds_and_goals(build, layer, x0):
+    limit = torch.linspace(0.01, 0.1, 6, dtype=torch.float64)[:, None].expand(6, 2)
+    close(vmap(lambda x, b: layer(x, u_min=-b, u_max=b).u)(x0, limit), layer(x0, u_min=-limit, u_max=limit).u)
+    sol = layer(x0)
+    warm = vmap(lambda x, *g: layer(x, guess=Primal(*g)).iterations)(x0, sol.x, sol.u, sol.lam)
+    assert torch.equal(warm, layer(x0, guess=sol).iterations)
+    assert int(warm.sum()) < int(sol.iterations.sum())
+    pusher = LCSMPCLayer(build.pushing(), build.paper_cost(), 2, -0.015, 0.015, relaxation=1e-4)
+    n = build.normal(2)
+    x, goal, reference = 0.05 * n(3, 9), 0.05 * n(4, 3), 0.05 * n(4, 3, 3)
+    close(vmap(lambda g: pusher(x, g).u)(goal), pusher(x, goal[:, None]).u)
+    close(vmap(lambda r: pusher(x, reference=r).u)(reference), pusher(x, reference=reference[:, None]).u)
+
+
+def test_numbers_that_no_check_could_read_before_are_refused_inside(build, layer, x0, systems):
+    def plan(system, x):
+        return layer(x, lcs=LCSParams(**system)).u
+
+    for change, error, match in (
+        ({"A": systems["A"] * torch.nan}, e.NonFiniteError, "A: expected finite numbers, got 96 NaN"),
+        ({"F": -systems["F"]}, e.NotPositiveDefiniteError, r"F \+ Fᵀ positive definite"),
+    ):
+        with pytest.raises(error, match=match):
+            vmap(plan)({**systems, **change}, x0)
+    with pytest.raises(e.NonFiniteError, match="x0: expected finite numbers"):
+        vmap(lambda x: layer(x).u)(x0 * torch.inf)
+    with pytest.raises(e.BoundsError, match="u_min <= u_max"):
+        vmap(lambda b: layer(x0, u_min=b, u_max=-b).u)(torch.full((3, 2), 0.1).double())
+    with pytest.raises(e.NonFiniteError, match="u_max: expected numbers or infinity"):
+        vmap(lambda b: layer(x0, u_max=b).u)(torch.full((3, 2), torch.nan).double())
+
+
+def test_failures_are_reported_inside(layer, x0):
+    far = torch.full((4,), 1e200, dtype=torch.float64)
+    bad = torch.stack([x0[0], far, x0[2]])
+    with pytest.raises(e.SolveError, match=r"1 of 3 MPC problems were not solved.*elements 1") as error:
+        vmap(lambda x: layer(x).u)(bad)
+    assert error.value.elements == (1,)
+    layer.on_failure = "mask"
+    with pytest.warns(e.SolveWarning, match="1 of 3"):
+        status = vmap(lambda x: layer(x).status)(bad)
+    assert status[0] == status[2] == Status.CONVERGED != status[1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", e.SolveWarning)
+        found = vmap(grad(lambda x: layer(x).u.sum()))(bad)
+    assert torch.equal(found[1], torch.zeros(4, dtype=torch.float64))
+    assert float(found[[0, 2]].detach().abs().amax(1).min()) > 0
+
+
+# --- gradients ------------------------------------------------------------------------------------------------------
+
+
+def test_grad_is_backward(layer, x0):
+    leaf = x0.clone().requires_grad_()
+
+    def loss(x):
+        solution = layer(x)
+        return solution.u.square().sum() + solution.objective.sum() + solution.x.sum() + solution.lam.sum()
+
+    (plain,) = torch.autograd.grad(loss(leaf), leaf)
+    close(grad(loss)(x0), plain)
+    close(vmap(grad(loss))(x0), plain)
+    close(grad(lambda x: vmap(loss)(x).sum())(x0), plain)
+    mapped = vmap(loss)(leaf).sum()
+    close(torch.autograd.grad(mapped, leaf)[0], plain)
+    close(vmap(vmap(grad(loss)))(x0.reshape(3, 2, 4)), plain.reshape(3, 2, 4))
+    close(vmap(grad(loss), in_dims=1, out_dims=1)(x0.T), plain.T)
+
+
+def test_gradients_of_each_sample_by_the_shared_parameters(layer, x0):
+    parameters = dict(layer.named_parameters())
+
+    def loss(values: dict[str, Tensor], x: Tensor):
+        return functional_call(layer, values, (x,)).action.square().sum()
+
+    each = vmap(grad(loss), in_dims=(None, 0))(parameters, x0)
+    for i in (0, 3):
+        plain = torch.autograd.grad(loss(parameters, x0[i]), list(parameters.values()))
+        for name, gradient in zip(parameters, plain, strict=True):
+            torch.testing.assert_close(each[name][i], gradient, rtol=1e-7, atol=1e-10)
+    pairs = vmap(grad(loss), in_dims=(None, 0))(parameters, x0.reshape(3, 2, 4))
+    for name, gradient in pairs.items():
+        torch.testing.assert_close(gradient, each[name].reshape(3, 2, *gradient.shape[1:]).sum(1), rtol=1e-7, atol=1e-9)
+
+
+def test_gradients_of_systems_beside_a_batch(build, layer, x0, systems):
+    def loss(system, x):
+        return layer(x, lcs=LCSParams(**system)).u.square().sum()
+
+    found = vmap(grad(loss), in_dims=(0, None))(systems, x0)
+    for i in (1, 5):
+        leaves = {k: v[i].clone().requires_grad_() for k, v in systems.items()}
+        loss(leaves, x0).backward()
+        for name, leaf in leaves.items():
+            torch.testing.assert_close(found[name][i], leaf.grad, rtol=1e-7, atol=1e-10)
+
+
+@pytest.mark.parametrize("vectorize", [False, True])
+def test_jacobians(layer, x0, vectorize):
+    plain = jacobian_by_rows(layer, x0)
+    close(jacrev(lambda x: layer(x).action)(x0[0]), plain[0])
+    close(vmap(jacrev(lambda x: layer(x).action))(x0), plain)
+    whole = jacrev(lambda x: layer(x).action)(x0)
+    old = jacobian(lambda x: layer(x).action, x0, vectorize=vectorize)
+    for jac in (whole, old):
+        for i in range(6):
+            close(jac[i, :, i], plain[i])
+            assert float(jac[i, :, (i + 1) % 6].detach().abs().max()) == 0
+    state, objective = jacobian(lambda x: (layer(x).x, layer(x).objective), x0[1], vectorize=vectorize)
+    assert state.shape == (4, 4, 4)
+    close(state[0], torch.eye(4, dtype=torch.float64))
+    assert objective.shape == (4,)
+
+
+def test_a_batch_of_gradients_at_once(layer, x0):
+    leaf = x0.clone().requires_grad_()
+    solution = layer(leaf)
+    vectors = torch.eye(2, dtype=torch.float64)[:, None].expand(2, 6, 2)
+    (found,) = torch.autograd.grad(solution.action, leaf, vectors, is_grads_batched=True, retain_graph=True)
+    close(found.transpose(0, 1), jacobian_by_rows(layer, x0))
+    both = (solution.action, solution.objective)
+    right = (vectors, torch.ones(2, 6, dtype=torch.float64))
+    (found,) = torch.autograd.grad(both, leaf, right, is_grads_batched=True)
+    envelope = torch.autograd.grad(layer(leaf).objective.sum(), leaf)[0]
+    close(found.transpose(0, 1), jacobian_by_rows(layer, x0) + envelope[:, None])
+
+
+def test_jacobians_by_parameters(layer, x0):
+    weight = layer.lcs.B.detach().clone()
+
+    def action(B):
+        return functional_call(layer, {"lcs.B": B}, (x0[:2],)).action
+
+    rows = jacrev(action)(weight)
+    assert rows.shape == (2, 2, 4, 2)
+    leaf = weight.clone().requires_grad_()
+    for i in range(2):
+        (plain,) = torch.autograd.grad(action(leaf)[i, 1], leaf)
+        torch.testing.assert_close(rows[i, 1], plain, rtol=1e-7, atol=1e-10)
+
+
+def test_float32_stays_float32(build, x0):
+    narrow = LCSMPCLayer(build.model(3, scale=0.4, dtype=torch.float32), build.cost(0), 3, -0.15, 0.15, relaxation=1e-4)
+    found = vmap(grad(lambda x: narrow(x).u.sum()))(x0.float())
+    assert found.dtype == torch.float32
+    leaf = x0.float().requires_grad_()
+    narrow(leaf).u.sum().backward()
+    torch.testing.assert_close(found, leaf.grad)
+
+
+# --- second derivatives ---------------------------------------------------------------------------------------------
+
+
+def test_second_derivatives_are_refused(layer, x0):
+    def loss(x):
+        return layer(x).u.square().sum()
+
+    refusal = pytest.raises(e.DoubleBackwardError, match=r"LCSMPCLayer has first derivatives only.*create_graph=False")
+    for function in (
+        lambda: jacrev(jacrev(loss))(x0[0]),
+        lambda: grad(lambda x: grad(loss)(x).sum())(x0),
+        lambda: vmap(grad(lambda x: grad(loss)(x).sum()))(x0),
+        lambda: hessian(loss, x0[0]),
+        lambda: hessian(loss, x0[0], vectorize=True),
+        lambda: torch.autograd.grad(loss(x0.clone().requires_grad_()), layer.lcs.A, create_graph=True),
+    ):
+        with refusal:
+            function()
+
+
+def test_a_gradient_inside_a_loss_is_refused_even_where_the_loss_is_linear(layer, x0):
+    """The gradient of the objective does not move linearly with x0; a constant would be wrong in silence."""
+    with pytest.raises(e.DoubleBackwardError):
+        grad(lambda x: grad(lambda y: layer(y).objective)(x).sum())(x0[0])
+
+
+# --- in-place changes -----------------------------------------------------------------------------------------------
+
+
+def test_inputs_changed_in_place_are_noticed(layer, x0):
+    leaf = x0.clone()
+    solution = layer(leaf)
+    leaf.add_(1.0)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        solution.u.sum().backward()
+
+
+def test_outputs_changed_in_place_change_no_gradient(layer, x0):
+    leaf = x0.clone().requires_grad_()
+    (plain,) = torch.autograd.grad(layer(leaf).action.sum(), leaf)
+    solution = layer(leaf)
+    weight = solution.action.sum()
+    for value in (solution.x, solution.u, solution.lam, solution.status, solution.kkt_residual, solution.mu):
+        value.detach().zero_()
+    (found,) = torch.autograd.grad(weight, leaf)
+    assert torch.equal(found, plain)
+
+
+# --- torch.compile --------------------------------------------------------------------------------------------------
+
+
+def test_importing_the_library_does_not_import_the_compiler():
+    code = "import sys, difflcs; sys.exit('torch._dynamo' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.slow
+# Where warnings are errors, the compiler trips over one of its own, which it otherwise hides.
+@pytest.mark.filterwarnings("ignore:The .grad attribute", "ignore::DeprecationWarning")
+def test_compiled_code_that_contains_a_layer_is_eager_code(build, layer, x0):
+    def loss(x):
+        return (2 * layer(torch.sin(x)).action).square()
+
+    plain, compiled = x0.clone().requires_grad_(), x0.clone().requires_grad_()
+    expected = loss(plain)
+    expected.sum().backward()
+    weights = {k: p.grad.clone() for k, p in layer.named_parameters()}
+    layer.zero_grad()
+    found = torch.compile(loss, backend="eager")(compiled)
+    found.sum().backward()
+    assert torch.equal(found, expected)
+    assert torch.equal(compiled.grad, plain.grad)
+    assert all(torch.equal(p.grad, weights[k]) for k, p in layer.named_parameters())
+    whole = torch.compile(layer, backend="eager")
+    solution = whole(x0, u_max=0.05)
+    assert isinstance(solution, MPCSolution)
+    assert torch.equal(solution.u, layer(x0, u_max=0.05).u)
+    torch.compiler.reset()
