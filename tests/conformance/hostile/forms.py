@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -188,7 +189,7 @@ def layer_of(form: Form, leaves: dict[str, torch.Tensor], backend="batched") -> 
     )
     limits = {k: leaves[k] for k in ("u_min", "u_max")}
     by_stage = staged(limits)
-    options = {"bounds": StageBounds(**limits, by_stage=by_stage)} if by_stage else limits
+    options: dict[str, Any] = {"bounds": StageBounds(**limits, by_stage=by_stage)} if by_stage else limits
     if "g" in leaves:
         table = {ROWS[k]: leaves[k] for k in ROWS}
         by_stage = tuple(ROWS[k] for k in staged(ROWS))
