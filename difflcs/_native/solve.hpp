@@ -25,6 +25,10 @@ constexpr double kDue = 0.03;
 // A violation that is more than a tenth of the one before (a hundredth, where it is small) asks for ten times the
 // weight, one that stays for more.
 constexpr double kSlow = 0.1, kSlowEnd = 0.01, kSmall = 1e-4, kStays = 0.9, kRaise = 10.0, kRaiseMore = 30.0;
+// Steps after which the multipliers move in any case where little is violated: actions that constraints couple can take
+// turns next to their bounds, and other multipliers end that.
+constexpr int64_t kPatience = 20;
+constexpr double kLittle = 1e-6;
 // Failed searches in a row, each with 8 times the damping, before a problem is given up.
 constexpr int64_t kFailures = 12;
 
@@ -177,15 +181,17 @@ class Solver {
     const double violated = sweep.violated[l];
     if (lane[l].left == 0) lane[l].left = sweep.projected[l];
     const double due = kDue * (lane[l].left < sweep.owing[l] ? lane[l].left : sweep.owing[l]);
-    if (met(sweep, l) || !(stationary || sweep.projected[l] <= due)) return false;
+    const bool impatient = lane[l].in_stage >= kPatience && violated <= kLittle && sweep.owing[l] > 0;
+    if (!impatient && (met(sweep, l) || !(stationary || sweep.projected[l] <= due))) return false;
     lane[l].left = 0;
     Mask which = Mask{};
     which[l] = -1;
     pay(which);
     double& rho = reinterpret_cast<double*>(&problem.rho)[l];
     lane[l].stalled = violated > 0.5 * lane[l].violated ? lane[l].stalled + 1 : 0;
-    if (violated > (violated < kSmall ? kSlowEnd : kSlow) * lane[l].violated) rho *= violated > kStays * lane[l].violated ? kRaiseMore : kRaise;
-    lane[l].violated = violated, lane[l].iterations++, lane[l].failures = 0;
+    if (violated > (violated < kSmall ? kSlowEnd : kSlow) * lane[l].violated)
+      rho *= violated > kStays * lane[l].violated ? kRaiseMore : kRaise;
+    lane[l].violated = violated, lane[l].iterations++, lane[l].failures = lane[l].in_stage = 0;
     return true;
   }
 
@@ -202,7 +208,8 @@ class Solver {
       const bool converged = stationary && met(sweep, l);
       const bool broken = !(J[l] < 1e300 && J[l] > -1e300);
       const double largest = kLargestPenalty * lane_of(problem.weight[0], l);
-      const bool infeasible = sweep.violated[l] > o.certified && problem.rho[l] >= largest && a.stalled >= 3;
+      const bool infeasible =
+          sweep.violated[l] > o.certified && a.stalled >= 3 && (problem.rho[l] >= largest || a.iterations >= o.max_iter);
       if (!infeasible && !broken && a.iterations < o.max_iter && n.c() > 0 && owes(sweep, l, stationary)) {
         frozen[l] = -1;
         continue;
