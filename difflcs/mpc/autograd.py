@@ -84,7 +84,9 @@ class Plan:
         )
         result = self.backend.solve(problem, self._guess(tensors[_COUNT:]))
         objective = problem.objective(result.primal.x, result.primal.u)
+        # Of a failed element the numbers can be so large that products of them are none.
         violation = problem.violation(result.primal.x, result.primal.u)
+        violation = violation.nan_to_num(nan=torch.finfo(self.dtype).max, posinf=torch.finfo(self.dtype).max)
         self.result, objective = _within_range(result, objective, constant, self.dtype)
         result = self.result
         # Copies: what the caller does with the outputs must not change the gradient.

@@ -7,10 +7,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from difflcs import GoalCost, LCSMPCLayer, LCSParams, Status
+from difflcs import GoalCost, LCSMPCLayer, LCSParams, LinearConstraints, QuadraticCost, Status
 from difflcs.mpc import kkt
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.mpc.problem import INPUTS, MPCProblem
+from difflcs.systems import cart_pole_between_walls
 from tests.problems import KINDS, Kind, random_problem, stated_by_stage
 
 BATCHED = BatchedBackend(threads=1)
@@ -143,6 +144,22 @@ def test_a_soft_constraint_with_a_high_price_is_a_hard_one():
     near = (one.primal.u - other.primal.u).abs().flatten(1).amax(1) < 1e-6
     # The others ended in another local optimum.
     assert int((both & near).sum()) >= 0.8 * int(both.sum()) >= 10
+
+
+@pytest.mark.parametrize("weight", [None, 1e2, 1e4])
+@pytest.mark.parametrize("limit", [0.05, 0.03])
+def test_limits_far_from_the_actions_that_they_act_through_are_met(weight, limit):
+    """The position of a cart answers to a force by the square of the time step; costs by IPOPT."""
+    eye = torch.diag(torch.tensor([10.0, 10.0, 1.0, 1.0], dtype=torch.float64))
+    cost = QuadraticCost(eye, 0.1 * torch.ones(1, 1, dtype=torch.float64), 10 * eye)
+    row = torch.tensor([[1.0, 0, 0, 0], [-1.0, 0, 0, 0]], dtype=torch.float64)
+    rows = LinearConstraints(row, torch.full((2,), limit, dtype=torch.float64), weight=weight)
+    mpc = LCSMPCLayer(cart_pole_between_walls(), cost, 25, -2.0, 2.0, constraints=rows)
+    plan = mpc(torch.tensor([0.0, 0.1, 0.0, 0.7], dtype=torch.float64))
+    assert bool(plan.mu.any())
+    expected = {0.05: 12.038, 0.03: 13.954 if weight == 1e2 else 13.958}[limit]
+    assert float(plan.objective) == pytest.approx(expected, abs=2e-3)
+    assert int(plan.iterations) < 100
 
 
 def test_a_warm_start_takes_the_multipliers_along():
