@@ -13,8 +13,8 @@ namespace {
 
 // Weight on held constraints, in parts of the largest weight of the cost: each sweep refines by about as much.
 constexpr double kHold = 1e6;
-// Rows that miss their moved limits by more than this part depend on each other. A row is weakly active whose multiplier
-// this part of its unit would take away.
+// Rows that miss their moved limits by more than this part depend on each other. A row is weakly active whose
+// multiplier this part of its unit would take away.
 constexpr double kMissed = 1e-3, kWeakRow = 1e-5;
 
 // Adds products to gradients: into the lanes' sums where the input is shared, else into each element's own.
@@ -155,7 +155,8 @@ class Adjoint {
         const auto G = problem.G[k];
         const Vec g = problem.g[k][i];
         Vec terms = select(g < kHuge, abs(g), all(0));
-        for (int64_t j = 0; j < (k < n.h ? n.w() : nx); j++) terms += abs(G(i, j) * (j < nx ? at.x(k, j) : at.u(k, j - nx)));
+        for (int64_t j = 0; j < (k < n.h ? n.w() : nx); j++)
+          terms += abs(G(i, j) * (j < nx ? at.x(k, j) : at.u(k, j - nx)));
         unit = max(unit, terms);
       }
       for (int64_t k = 0; k <= n.h; k++) {
@@ -165,9 +166,9 @@ class Adjoint {
     }
   }
 
-  // The sweep with held constraints as equations a (dx, du) = 0: a weight on them, and their multipliers' directions dm,
-  // which repeated sweeps refine. Rows whose multiplier is zero or the price are not held.
-  // With `distance` the equations are a (dx, du) = distance instead. Returns by how much they are missed, in parts of it.
+  // The sweep with held constraints as equations a (dx, du) = 0: a weight on them, and their multipliers' directions
+  // dm, which repeated sweeps refine. Rows whose multiplier is zero or the price are not held. With `distance` the
+  // equations are a (dx, du) = distance instead. Returns by how much they are missed, in parts of it.
   Vec hold_constraints(const Matrix<Vec, 0, 0>* distance = nullptr) {
     const int64_t nx = n.x(), nu = n.u(), nc = n.c();
     T* weight = problem.weight;
@@ -177,7 +178,8 @@ class Adjoint {
       for (int64_t i = 0; i < nc; i++) {
         const Vec m = problem.multiplier(k, i);
         riccati.force(k, i) = m, dm(k, i) = all(0);
-        riccati.stiffness(k, i) = select((m > 0) & (m < kAtPrice * problem.price[k][i]), all(kHold) * weight[0], all(0));
+        riccati.stiffness(k, i) =
+            select((m > 0) & (m < kAtPrice * problem.price[k][i]), all(kHold) * weight[0], all(0));
       }
     const auto pull = [&](int64_t k, int64_t r) {
       return distance ? dm(k, r) - riccati.stiffness(k, r) * (*distance)(k, r) : dm(k, r);

@@ -41,7 +41,8 @@ struct Certificate {
     }
     arena.take(rest, h, nu);
     take(x, (h + 1) * nx), take(u, h * nu), take(lam, h * nl), take(mu, (h + 1) * nc), take(s, nl), take(size, nl);
-    take(p, nx), take(pn, nx), take(y, nl), take(rho, nl), take(error, nl), take(N, nl * nl), take(rows, nl), take(largest_action, nu);
+    take(p, nx), take(pn, nx), take(y, nl), take(rho, nl), take(error, nl), take(N, nl * nl), take(rows, nl),
+        take(largest_action, nu);
     take(row, (h + 1) * nc), take(row_terms, nc), take(row_missed, nc);
     if constexpr (sizeof(T) == sizeof(double))
       if (arena.memory) load_matrices(0, 0);
@@ -266,7 +267,8 @@ struct Certificate {
         Vec acts = all(k > 0);  // what nothing moves is not weakly active
         for (int64_t j = 0; j < nu && k == 0; j++) acts += abs(all(0) + G_u[i * nu + j]);
         const Vec m = mu[k * nc + i], value = row[k * nc + i], close = 1e-5 * row_terms[i];
-        const Mask at_zero = ~(m > 0) & (value >= -close), at_price = (m >= kAtPrice * vector[kprice][k][i]) & (value <= close);
+        const Mask at_zero = ~(m > 0) & (value >= -close),
+                   at_price = (m >= kAtPrice * vector[kprice][k][i]) & (value <= close);
         weak |= (at_zero | at_price) & (acts > 0);
       }
     }

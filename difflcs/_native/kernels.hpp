@@ -30,11 +30,11 @@ struct LcpBatch {
 };
 
 // What the numbers of a solved LCP have to meet; difflcs.lcp.solve_lcp states it.
-constexpr double kLcpTerms = 1e-10;  // |F lam + q - w| in parts of the terms that sum to it
-constexpr double kLcpData = 1e-8;    // the same in parts of the largest |q| (and of sqrt(relaxation F_ii))
-constexpr double kRounding = 4e-16;  // of a sum, in parts of its terms
-constexpr double kHuge = 1e300;              // beyond it a bound is infinite
-constexpr double kAtPrice = 1.0 - 1e-12;     // a multiplier above this part of its price is the price, but for rounding
+constexpr double kLcpTerms = 1e-10;       // |F lam + q - w| in parts of the terms that sum to it
+constexpr double kLcpData = 1e-8;         // the same in parts of the largest |q| (and of sqrt(relaxation F_ii))
+constexpr double kRounding = 4e-16;       // of a sum, in parts of its terms
+constexpr double kHuge = 1e300;           // beyond it a bound is infinite
+constexpr double kAtPrice = 1.0 - 1e-12;  // a multiplier above this part of its price is the price, but for rounding
 constexpr double kSmallest = 1e-100, kLargest = 1e150;  // range of the diagonal of F; of lam and w
 
 // A batch of LCS-MPC problems (see difflcs.mpc.MPCProblem). All arrays are row-major with the batch in front.
@@ -59,10 +59,11 @@ struct MpcSolve {
   double shrink;            // its factor per stage
   double tol;               // on the projected gradient
   int64_t max_iter;
-  double certified;         // largest residual of a solved problem
-  double *x, *u, *lam, *mu, *objective, *residual;  // out; residual as difflcs.mpc.kkt.residual, from the numbers returned
-  int8_t* status;                              // out; unreached where the watch stopped before
-  int8_t* fragile;                             // out; whether elimination without row exchanges lost digits
+  double certified;  // largest residual of a solved problem
+  double *x, *u, *lam, *mu, *objective,
+      *residual;    // out; residual as difflcs.mpc.kkt.residual, from the numbers returned
+  int8_t* status;   // out; unreached where the watch stopped before
+  int8_t* fragile;  // out; whether elimination without row exchanges lost digits
   int32_t* iterations;
 };
 

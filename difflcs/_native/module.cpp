@@ -217,10 +217,10 @@ void stay_at_start(const difflcs::MpcBatch& b, const difflcs::MpcSolve& o, int64
 }
 
 void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, std::optional<Array> u_start,
-               std::optional<Array> lam_start, std::optional<Array> mu_start, double first_relaxation, double shrink, double tol, int64_t max_iter,
-               double certified, bool pivot, double time_limit, int threads, Output<double> x, Output<double> u,
-               Output<double> lam, Output<double> mu, Output<double> objective, Output<double> residual, Output<int8_t> status,
-               Output<int8_t> fragile, Output<int32_t> iterations) {
+               std::optional<Array> lam_start, std::optional<Array> mu_start, double first_relaxation, double shrink,
+               double tol, int64_t max_iter, double certified, bool pivot, double time_limit, int threads,
+               Output<double> x, Output<double> u, Output<double> lam, Output<double> mu, Output<double> objective,
+               Output<double> residual, Output<int8_t> status, Output<int8_t> fragile, Output<int32_t> iterations) {
   const difflcs::MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier, pivot);
   const int64_t states = b.count * (horizon + 1) * b.n_x, actions = b.count * horizon * b.n_u;
   const int64_t forces = b.count * horizon * b.n_lam, rows = b.count * (horizon + 1) * b.n_c;
@@ -257,9 +257,8 @@ void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
   int64_t next = 0;
   const int64_t used = std::max<int64_t>(1, std::min<int64_t>(threads, b.count / kernels.lanes));
   Stop stop(time_limit);
-  on_threads(used, kernels.mpc_workspace(b), stop, [&](void* workspace, difflcs::Watch watch) {
-    kernels.mpc_solve(b, o, &next, workspace, watch);
-  });
+  on_threads(used, kernels.mpc_workspace(b), stop,
+             [&](void* workspace, difflcs::Watch watch) { kernels.mpc_solve(b, o, &next, workspace, watch); });
   if (b.n_c > 0) {
     const int64_t block = 64, blocks = (b.count + block - 1) / block;
     std::atomic<int64_t> first{0};
@@ -275,8 +274,8 @@ void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
       if (o.status[e] == difflcs::kUnreached) stay_at_start(b, o, e);
 }
 
-void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, Array x, Array u, Array lam,
-             Array mu, Array x_bar, Array u_bar, Array lam_bar, Array objective_bar,
+void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, Array x, Array u, Array lam, Array mu,
+             Array x_bar, Array u_bar, Array lam_bar, Array objective_bar,
              nb::ndarray<const int8_t, nb::device::cpu, nb::c_contig> solved, bool pivot, int threads,
              std::vector<Output<double>> gradients) {
   using namespace difflcs;
@@ -456,11 +455,12 @@ NB_MODULE(_kernels, m) {
   m.def("solve_lcp", &solve_lcp, "F"_a, "q"_a, "relaxation"_a, "max_iter"_a, "threads"_a, "lam"_a, "w"_a, "status"_a,
         "iterations"_a, "Solve a batch of LCPs into the given arrays.");
   m.def("solve_mpc", &solve_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "u_start"_a.none(),
-        "lam_start"_a.none(), "mu_start"_a.none(), "first_relaxation"_a, "shrink"_a, "tol"_a, "max_iter"_a, "certified"_a, "pivot"_a,
-        "time_limit"_a, "threads"_a, "x"_a, "u"_a, "lam"_a, "mu"_a, "objective"_a, "residual"_a, "status"_a, "fragile"_a,
-        "iterations"_a, "Solve a batch of LCS-MPC problems into the given arrays.");
-  m.def("vjp_mpc", &vjp_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "x"_a, "u"_a, "lam"_a, "mu"_a, "x_bar"_a,
-        "u_bar"_a, "lam_bar"_a, "objective_bar"_a, "solved"_a, "pivot"_a, "threads"_a, "gradients"_a,
+        "lam_start"_a.none(), "mu_start"_a.none(), "first_relaxation"_a, "shrink"_a, "tol"_a, "max_iter"_a,
+        "certified"_a, "pivot"_a, "time_limit"_a, "threads"_a, "x"_a, "u"_a, "lam"_a, "mu"_a, "objective"_a,
+        "residual"_a, "status"_a, "fragile"_a, "iterations"_a,
+        "Solve a batch of LCS-MPC problems into the given arrays.");
+  m.def("vjp_mpc", &vjp_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "x"_a, "u"_a, "lam"_a, "mu"_a,
+        "x_bar"_a, "u_bar"_a, "lam_bar"_a, "objective_bar"_a, "solved"_a, "pivot"_a, "threads"_a, "gradients"_a,
         "Gradients of the inputs of solved LCS-MPC problems, into the given arrays.");
   m.def("violation_loss", &violation_loss, "inputs"_a, "gamma"_a, "xi"_a, "max_iter"_a, "threads"_a, "Q"_a, "q"_a,
         "z"_a, "r"_a, "e"_a, "loss"_a, "Violation loss of a batch and what its gradient needs, into the given arrays.");

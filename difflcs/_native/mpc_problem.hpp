@@ -107,16 +107,12 @@ struct Problem {
   Steps<Vec> d, c, q, r, u_min, u_max, g, price;
   Steps<Vec> per_width;  // reciprocal of each action's range, zero where that is zero or infinite
   Vec *q_final, *x0;
-  Vec mu;                      // weight of the barrier of the bounds: follows the homotopy down to batch.barrier
+  Vec mu;                        // weight of the barrier of the bounds: follows the homotopy down to batch.barrier
   Matrix<Vec, 0, 0> multiplier;  // of the constraints, and the weight of the augmented Lagrangian
   Vec rho;
 
   Problem(const MpcBatch& b, bool caller_units)
-      : batch(b),
-        n(b),
-        caller_units(caller_units),
-        mu(all(b.barrier)),
-        rho(all(1)) {}
+      : batch(b), n(b), caller_units(caller_units), mu(all(b.barrier)), rho(all(1)) {}
 
   void layout(Arena& arena) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nw = n.w(), nc = n.c(), h = n.h;
@@ -137,8 +133,8 @@ struct Problem {
   }
 
   StageData<T, S> stage(int64_t k) const {
-    return {AB[k],    C[k],  DE[k], F[k], Q[k], R[k],     cross[k], G[k],         scale[k], row_scale[k],
-            rest[k], d[k], c[k], q[k], r[k], u_min[k], u_max[k], per_width[k], g[k],     price[k]};
+    return {AB[k],   C[k], DE[k], F[k], Q[k], R[k],     cross[k], G[k],         scale[k], row_scale[k],
+            rest[k], d[k], c[k],  q[k], r[k], u_min[k], u_max[k], per_width[k], g[k],     price[k]};
   }
   // Only the constraints mean something there.
   StageData<T, S> last() const {
@@ -192,7 +188,9 @@ struct Problem {
       const double *G_x = input(kG_x, e, k), *G_u = input(kG_u, e, k);
       for (int64_t i = 0; i < nc; i++) {
         // The last stage has no actions.
-        const auto entry = [&](int64_t j) { return j < nx ? G_x[i * nx + j] : k < n.h ? G_u[i * (nw - nx) + j - nx] : 0.0; };
+        const auto entry = [&](int64_t j) {
+          return j < nx ? G_x[i * nx + j] : k < n.h ? G_u[i * (nw - nx) + j - nx] : 0.0;
+        };
         double square = 0;
         for (int64_t j = 0; j < nw; j++) square += entry(j) * entry(j);
         const double unit = square > kTiny ? 1.0 / __builtin_sqrt(square) : 1.0;
@@ -235,7 +233,8 @@ struct Problem {
       }
     };
     const double cost = lane_of(cost_unit[0], lane);
-    vector(d, kd), vector(c, kc), vector(q, kq, cost), vector(r, kr, cost), vector(u_min, ku_min), vector(u_max, ku_max);
+    vector(d, kd), vector(c, kc), vector(q, kq, cost), vector(r, kr, cost), vector(u_min, ku_min),
+        vector(u_max, ku_max);
     for (int64_t i = 0; i < n.x(); i++) {
       put(q_final, i, lane, input(kq_final, e)[i] * cost);
       put(x0, i, lane, input(kx0, e)[i]);
@@ -335,8 +334,7 @@ struct Problem {
     }
     if (batch.barrier > 0)
       for (int64_t k = 0; k < n.h; k++)
-        for (int64_t j = 0; j < n.u(); j++)
-          total -= mu * log((at.u(k, j) - u_min[k][j]) * (u_max[k][j] - at.u(k, j)));
+        for (int64_t j = 0; j < n.u(); j++) total -= mu * log((at.u(k, j) - u_min[k][j]) * (u_max[k][j] - at.u(k, j)));
     return total;
   }
 };

@@ -365,8 +365,7 @@ class Riccati {
     for (int64_t i = 0; i < nu; i++) {
       for (int64_t j = 0; j < nx; j++) K(i, j) = law(i, j);
       // The solver puts an action held at a bound onto it exactly.
-      const Vec to_bound =
-          select(lower(k, i), data.u_min[i] - u[i], select(upper(k, i), data.u_max[i] - u[i], all(0)));
+      const Vec to_bound = select(lower(k, i), data.u_min[i] - u[i], select(upper(k, i), data.u_max[i] - u[i], all(0)));
       feedforward(k, i) = kAdjoint ? law(i, nx) : select(active[i], to_bound, law(i, nx));
     }
   }

@@ -153,14 +153,15 @@ class Solver {
     problem.store(o.u + e * actions, at.u.entries, actions, l);
     problem.store_lam(o.lam + e * forces, at.lam.entries, l);
     problem.store_multipliers(o.mu + e * (n.h + 1) * n.c(), multipliers.entries, e, l);
-    o.objective[e] = (n.c() > 0 ? problem.objective(at) : J)[l] / lane_of(problem.cost_unit[0], l), o.iterations[e] = int32_t(lane[l].iterations);
+    o.objective[e] = (n.c() > 0 ? problem.objective(at) : J)[l] / lane_of(problem.cost_unit[0], l),
+    o.iterations[e] = int32_t(lane[l].iterations);
     o.status[e] = int8_t(status);
     finished[waiting++] = e;
     if (waiting == kLanes) certificate.judge(o, finished, waiting), waiting = 0;
   }
 
-  // A step of the multipliers, at the target of the homotopy: before, they would follow plans that come to nothing. They
-  // become those that the augmented Lagrangian has at the iterate.
+  // A step of the multipliers, at the target of the homotopy: before, they would follow plans that come to nothing.
+  // They become those that the augmented Lagrangian has at the iterate.
   void pay(Mask which) {
     for (int64_t k = 0; k <= n.h; k++) {
       const StageData<T, S> data = k < n.h ? problem.stage(k) : problem.last();
@@ -208,8 +209,8 @@ class Solver {
       const bool converged = stationary && met(sweep, l);
       const bool broken = !(J[l] < 1e300 && J[l] > -1e300);
       const double largest = kLargestPenalty * lane_of(problem.weight[0], l);
-      const bool infeasible =
-          sweep.violated[l] > o.certified && a.stalled >= 3 && (problem.rho[l] >= largest || a.iterations >= o.max_iter);
+      const bool infeasible = sweep.violated[l] > o.certified && a.stalled >= 3 &&
+                              (problem.rho[l] >= largest || a.iterations >= o.max_iter);
       if (!infeasible && !broken && a.iterations < o.max_iter && n.c() > 0 && owes(sweep, l, stationary)) {
         frozen[l] = -1;
         continue;
