@@ -46,7 +46,7 @@ class Adjoint {
   Riccati<T, S, true> riccati;
   Trajectory<S> at;
   Upstream<S> upstream, shifted;  // shifted by the multipliers' directions along the rows of held constraints
-  Matrix<Vec, 0, 0> distance;     // by which the limits of the constraints are moved
+  Matrix<Vec, 0, 0> target;       // by which the limits of the constraints are moved
   Matrix<Vec, 0, 0> dm;           // directions of the multipliers of the constraints
   Vec objective_bar;
   Vec* sum;  // of the shared inputs' gradients
@@ -63,7 +63,7 @@ class Adjoint {
     problem.layout(arena), at.layout(arena, n), riccati.layout(arena);
     arena.take(upstream.x, h + 1, nx), arena.take(upstream.u, h, nu), arena.take(upstream.lam, h, nl);
     arena.take(shifted.x, h + 1, nx), arena.take(shifted.u, h, nu), arena.take(dm, h + 1, n.c());
-    arena.take(distance, h + 1, n.c());
+    arena.take(target, h + 1, n.c());
     arena.take(gap, nl), arena.take(dw, nw), arena.take(dx_next, nx), arena.take(dlam, nl), arena.take(ds, nl);
     arena.take(dp, nx), arena.take(dy, nl), arena.take(rho, nl), arena.take(drho, nl);
     int64_t inputs = 0;
@@ -78,7 +78,7 @@ class Adjoint {
     for (int64_t group = begin; group < end && !watch.stop(watch.context); group += kLanes) {
       const Mask valid = load(o, group, end);
       if (n.c() > 0)
-        (void)hold_constraints();
+        (void)hold_constraints(false);
       else
         riccati.sweep(at, upstream, all(0), Mask{});
       forward({batch, o, group, end, valid, sum});
@@ -93,13 +93,18 @@ class Adjoint {
   // Solutions with constraints that depend on each other, or whose multiplier a small change of the limits would take
   // away, are degenerate. Both show where the limits are moved by parts of their units.
   void judge_constraints(const MpcSolve& o, int64_t begin, int64_t end, Watch watch) {
+    const int64_t rows = (n.h + 1) * n.c();
     for (int64_t group = begin; group < end && !watch.stop(watch.context); group += kLanes) {
+      bool acting = false;  // without a multiplier there is nothing to judge
+      for (int64_t i = group * rows; i < (group + kLanes < end ? group + kLanes : end) * rows; i++)
+        acting = acting || o.mu[i] > 0;
+      if (!acting) continue;
       load_solutions(o, group, end);
       for (int64_t i = 0; i < upstream.x.size(); i++) upstream.x.entries[i] = all(0);
       for (int64_t i = 0; i < upstream.u.size(); i++) upstream.u.entries[i] = all(0);
       for (int64_t i = 0; i < upstream.lam.size(); i++) upstream.lam.entries[i] = all(0);
       move_limits();
-      Mask weak = ~(hold_constraints(&distance) <= kMissed);
+      Mask weak = ~(hold_constraints(true) <= kMissed);
       for (int64_t k = 0; k <= n.h; k++)
         for (int64_t i = 0; i < n.c(); i++)
           weak |= (riccati.stiffness(k, i) > 0) & (riccati.force(k, i) <= kWeakRow * abs(dm(k, i)));
@@ -148,28 +153,21 @@ class Adjoint {
 
   // A distance for each row: its unit, the largest sum of the sizes of its terms, times numbers without a pattern.
   void move_limits() {
-    const int64_t nx = n.x();
     for (int64_t i = 0; i < n.c(); i++) {
       Vec unit = all(kTiny);
-      for (int64_t k = 0; k <= n.h; k++) {
-        const auto G = problem.G[k];
-        const Vec g = problem.g[k][i];
-        Vec terms = select(g < kHuge, abs(g), all(0));
-        for (int64_t j = 0; j < (k < n.h ? n.w() : nx); j++)
-          terms += abs(G(i, j) * (j < nx ? at.x(k, j) : at.u(k, j - nx)));
-        unit = max(unit, terms);
-      }
+      for (int64_t k = 0; k < n.h; k++) unit = max(unit, problem.stage(k).constraint_terms(i, at.x[k], at.u[k]));
+      unit = max(unit, problem.last().constraint_terms(i, at.x[n.h], nullptr));
       for (int64_t k = 0; k <= n.h; k++) {
         const int64_t odd = (k * n.c() + i) * 7 % 11;
-        distance(k, i) = unit * (odd % 2 ? 0.5 + 0.1 * double(odd) : -0.4 - 0.1 * double(odd));
+        target(k, i) = unit * (odd % 2 ? 0.5 + 0.1 * double(odd) : -0.4 - 0.1 * double(odd));
       }
     }
   }
 
   // The sweep with held constraints as equations a (dx, du) = 0: a weight on them, and their multipliers' directions
-  // dm, which repeated sweeps refine. Rows whose multiplier is zero or the price are not held. With `distance` the
-  // equations are a (dx, du) = distance instead. Returns by how much they are missed, in parts of it.
-  Vec hold_constraints(const Matrix<Vec, 0, 0>* distance = nullptr) {
+  // dm, which repeated sweeps refine. Rows whose multiplier is zero or the price are not held. With `moved` the
+  // equations are a (dx, du) = target instead. Returns by how much they are missed, in parts of it.
+  Vec hold_constraints(bool moved) {
     const int64_t nx = n.x(), nu = n.u(), nc = n.c();
     T* weight = problem.weight;
     Vec missed = all(0);
@@ -182,7 +180,7 @@ class Adjoint {
             select((m > 0) & (m < kAtPrice * problem.price[k][i]), all(kHold) * weight[0], all(0));
       }
     const auto pull = [&](int64_t k, int64_t r) {
-      return distance ? dm(k, r) - riccati.stiffness(k, r) * (*distance)(k, r) : dm(k, r);
+      return moved ? dm(k, r) - riccati.stiffness(k, r) * target(k, r) : dm(k, r);
     };
     for (int pass = 0; pass < 8; pass++) {
       for (int64_t k = 0; k <= n.h; k++) {
@@ -207,11 +205,11 @@ class Adjoint {
         if (k < n.h) primal_direction(k);
         for (int64_t r = 0; r < nc; r++) {
           const Mask held = riccati.stiffness(k, r) > 0;
-          const Vec off = distance ? along(k, r) - (*distance)(k, r) : along(k, r);
+          const Vec off = moved ? along(k, r) - target(k, r) : along(k, r);
           const Vec more = select(going, riccati.stiffness(k, r) * off, all(0));
           dm(k, r) += more;
           change = max(change, abs(more)), largest = max(largest, abs(dm(k, r)));
-          if (distance) worst = max(worst, select(held, abs(off / (*distance)(k, r)), all(0)));
+          if (moved) worst = max(worst, select(held, abs(off / target(k, r)), all(0)));
         }
         for (int64_t i = 0; i < nx && k < n.h; i++) dw[i] = dx_next[i];
       }

@@ -33,7 +33,7 @@ struct Certificate {
     auto take = [&](auto*& to, int64_t count) { arena.take(to, count); };
     for (int i = 0; i < kInputs; i++) {
       const Field& field = kMpcFields[i];
-      const int64_t stages = batch.step[i] == 0 ? 1 : field.stages == Given::nodes ? h + 1 : h;
+      const int64_t stages = batch.step[i] == 0 ? 1 : stages_of(batch, field);
       if (field.columns == Size::one)
         arena.take(vector[i], stages, extent(batch, field));
       else

@@ -93,6 +93,12 @@ inline int64_t extent(const Batch& batch, const Field& field) {
   return extent(batch, field.rows) * extent(batch, field.columns);
 }
 
+// How many stages a field has where it is given by stage; 0 where it cannot be.
+template <class Batch>
+inline int64_t stages_of(const Batch& batch, const Field& field) {
+  return field.stages == Given::once ? 0 : field.stages == Given::steps ? batch.horizon : batch.horizon + 1;
+}
+
 }  // namespace
 
 // How a solve can end.

@@ -159,12 +159,6 @@ void check_size(const char* name, int64_t got, int64_t expected) {
 
 int64_t rank_of(const difflcs::Field& field) { return field.columns == difflcs::Size::one ? 1 : 2; }
 
-// How many stages a field has where it is given by stage.
-int64_t stages_of(const difflcs::MpcBatch& b, const difflcs::Field& field) {
-  using difflcs::Given;
-  return field.stages == Given::once ? 0 : field.stages == Given::steps ? b.horizon : b.horizon + 1;
-}
-
 difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxation, double barrier, bool pivot) {
   using namespace difflcs;
   check_size("inputs", inputs.size(), kInputs);

@@ -60,6 +60,14 @@ struct StageData {
     const Vec value = -g[i] + G_x().row(i) * x;
     return u ? value + G_u().row(i) * u : value;
   }
+
+  // The sum of the sizes of its terms; a limit that is infinite is none.
+  Vec constraint_terms(int64_t i, const Vec* x, const Vec* u) const {
+    const int64_t nx = Q.rows, nw = u ? nx + R.rows : nx;
+    Vec terms = select(g[i] < kHuge, abs(g[i]), all(0));
+    for (int64_t j = 0; j < nw; j++) terms += abs(G(i, j) * (j < nx ? x[j] : u[j - nx]));
+    return terms;
+  }
 };
 
 // The multipliers of constraints that an augmented Lagrangian with weight rho gives to the value c of a row whose

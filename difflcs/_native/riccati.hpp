@@ -143,15 +143,12 @@ class Riccati {
   // What the constraints of stage k add to gradient and curvature, in the solver; without actions at the last stage.
   void constraints(int64_t k, const StageData<T, S>& data, const Vec* x, const Vec* u) {
     if (kAdjoint) return;
-    const int64_t nx = n.x(), nw = n.w();
     for (int64_t i = 0; i < n.c(); i++) {
       const Vec c = data.constraint(i, x, u), before = problem.multiplier(k, i), price = data.price[i];
       const Force now(c, before, problem.rho, price);
       force(k, i) = now.value, stiffness(k, i) = select(now.held, problem.rho, all(0));
       found.owing = max(found.owing, abs(now.value - before));
-      Vec terms = select(data.g[i] < kHuge, abs(data.g[i]), all(0));
-      for (int64_t j = 0; j < (u ? nw : nx); j++) terms += abs(data.G(i, j) * (j < nx ? x[j] : u[j - nx]));
-      row_terms[i] = max(row_terms[i], terms);
+      row_terms[i] = max(row_terms[i], data.constraint_terms(i, x, u));
       const Vec missed = select(now.held, abs(c), select(now.value > 0, max(-c, all(0)), max(c, all(0))));
       row_violation[i] = max(row_violation[i], missed);
     }
