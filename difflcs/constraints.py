@@ -150,10 +150,16 @@ def check_constraints(g: Tensor, weight: Tensor | None) -> None:
     """Refuse limits that nothing can meet and prices that are not positive."""
     if not is_wrapped(g) and bool((g == -torch.inf).any()):
         raise InvalidInputError("g: expected limits above −∞, got −∞; +∞ says that there is no constraint")
-    if weight is not None and not is_wrapped(weight) and not bool((weight > 0).all()):
+    if weight is not None and not is_wrapped(weight):
+        check_prices("weight", weight)
+
+
+def check_prices(name: str, prices: Tensor) -> None:
+    """Refuse prices of violations that are not positive."""
+    if not bool((prices > 0).all()):
         raise InvalidInputError(
-            f"weight: expected a positive price of a violation, or infinity for a hard constraint, got "
-            f"{float(weight.detach().min()):g}; leave out constraints that do not count"
+            f"{name}: expected a positive price of a violation, or infinity for a hard constraint, got "
+            f"{float(prices.detach().min()):g}; leave out constraints that do not count"
         )
 
 

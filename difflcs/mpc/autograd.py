@@ -22,7 +22,7 @@ from difflcs._fields import check_not_nan
 from difflcs._functorch import transforms_active
 from difflcs.errors import DegenerateWarning, DoubleBackwardError
 from difflcs.mpc.backends.base import Backend, Result
-from difflcs.mpc.problem import INPUTS, MPCProblem
+from difflcs.mpc.problem import INPUTS, MAY_BE_INFINITE, MPCProblem
 from difflcs.mpc.solution import Primal
 from difflcs.status import Status
 
@@ -32,7 +32,6 @@ _COUNT = len(INPUTS) + 1  # those that are differentiable
 _RANKS = {**{name: len(dims) for name, dims in INPUTS.items()}, "constant": 0}
 _SYMMETRIC = ("Q", "R", "Q_final")
 _COST = ("Q", "R", "S", "Q_final", "q", "r", "q_final", "constant")
-_MAY_BE_INFINITE = ("u_min", "u_max", "g", "price")
 
 
 class Target(NamedTuple):
@@ -134,7 +133,7 @@ class Plan:
                 value = value.unsqueeze(0)
             if name in _SYMMETRIC:
                 value = 0.5 * (value + value.mT)
-            if name in _MAY_BE_INFINITE:
+            if name in MAY_BE_INFINITE:
                 if self.unseen or tensor.requires_grad:
                     check_not_nan(name, value)
             elif self.unseen or name in _COST:

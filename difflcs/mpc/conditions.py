@@ -188,16 +188,9 @@ def excess(problem: MPCProblem, primal: Primal) -> Tensor:
     return largest(_parts(over.transpose(0, 1), row_units(problem, primal)))
 
 
-def moved_rows(problem: MPCProblem, dx: Tensor, du: Tensor) -> Tensor:
-    """G_x dx + G_u du of every constraint, (batch, H+1, n_c)."""
-    moved = matvec(problem._batch_first("G_x"), dx)
-    moved[:, :-1] += matvec(problem._batch_first("G_u"), du)
-    return moved
-
-
 def prices(problem: MPCProblem) -> Tensor:
     """Price of a violation of each constraint, (batch, H+1, n_c)."""
-    return problem._batch_first("price").expand(problem.batch, problem.horizon + 1, problem.n_c)
+    return problem.batch_first("price").expand(problem.batch, problem.horizon + 1, problem.n_c)
 
 
 def within_prices(problem: MPCProblem, mu: Tensor) -> Tensor:

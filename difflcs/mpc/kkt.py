@@ -70,7 +70,6 @@ from difflcs.mpc.conditions import (
     Multipliers,
     complete,
     excess,
-    moved_rows,
     multipliers,
     prices,
     residual,
@@ -164,7 +163,7 @@ def vjp(
     if problem.n_c:
         x0_bar = x0_bar + matvec(first.G_x.mT, dm[:, 0])
         # Of a fined constraint price·c is in the objective, of any other nothing.
-        fine = keep(J * problem.constraints(lin.primal.x, lin.primal.u) - moved_rows(problem, w.x, w.u))
+        fine = keep(J * problem.constraints(lin.primal.x, lin.primal.u) - problem.rows(w.x, w.u))
         rows = {
             "G_x": -outer("G_x", (dm, x), (m, dx)),
             "G_u": -outer("G_u", (dm[:, :-1], u), (m[:, :-1], du)),

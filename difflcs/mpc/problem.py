@@ -11,8 +11,8 @@ from torch import Tensor
 from difflcs._checks import check_number, check_positive_int
 from difflcs._linalg import matvec, quadratic
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
-from difflcs.constraints import check_bounds
-from difflcs.errors import InvalidInputError, ShapeError
+from difflcs.constraints import check_bounds, check_prices
+from difflcs.errors import ShapeError
 from difflcs.lcp import solve_lcp_arrays
 from difflcs.lcs import SystemMatrices, dimensions
 
@@ -36,11 +36,6 @@ class StageData(SystemMatrices):
     G_u: Annotated[Tensor, "n_c", "n_u"]
     g: Annotated[Tensor, "n_c"]
     price: Annotated[Tensor, "n_c"]
-
-    def constraint(self, x: Tensor, u: Tensor | None = None) -> Tensor:
-        """G_x x + G_u u − g, (..., n_c); without actions at the last stage."""
-        value = matvec(self.G_x, x) - self.g
-        return value if u is None else value + matvec(self.G_u, u)
 
 
 @dataclass(frozen=True)
@@ -115,11 +110,7 @@ class MPCProblem(SystemMatrices):
                 raise ShapeError(f"{name}: expected {' or '.join(map(str, allowed))}, got {found}")
         limits = self.bounds() if self.by_stage("u_min") or self.by_stage("u_max") else (self.u_min, self.u_max)
         check_bounds(*limits, strict=self.barrier > 0)
-        if self.n_c and not bool((self.price > 0).all()):
-            raise InvalidInputError(
-                f"price: expected a positive price of a violation, or infinity for a hard constraint, got "
-                f"{float(self.price.min()):g}; leave out constraints that do not count"
-            )
+        check_prices("price", self.price)
 
     @property
     def batch(self) -> int:
@@ -164,7 +155,7 @@ class MPCProblem(SystemMatrices):
     def _stagewise(self) -> dict[str, Tensor]:
         return {name: getattr(self, name) for name, stages in STAGES.items() if stages}
 
-    def _batch_first(self, name: str) -> Tensor:
+    def batch_first(self, name: str) -> Tensor:
         """One input, broadcasting with (batch, H, ...)."""
         value = getattr(self, name)
         return value.unsqueeze(1) if value.ndim == len(INPUTS[name]) + 1 else value
@@ -175,10 +166,10 @@ class MPCProblem(SystemMatrices):
 
     def objective(self, x: Tensor, u: Tensor) -> Tensor:
         """Cost (batch,) of trajectories x (batch, H+1, n_x), u (batch, H, n_u)."""
-        Q, R, q, r = (self._batch_first(name) for name in ("Q", "R", "q", "r"))
+        Q, R, q, r = (self.batch_first(name) for name in ("Q", "R", "q", "r"))
         stages = 0.5 * quadratic(Q, x[:, :-1]) + (q * x[:, :-1]).sum(-1) + 0.5 * quadratic(R, u) + (r * u).sum(-1)
         if bool(self.S.any()):
-            stages = stages + (x[:, :-1] * matvec(self._batch_first("S"), u)).sum(-1)
+            stages = stages + (x[:, :-1] * matvec(self.batch_first("S"), u)).sum(-1)
         total = 0.5 * quadratic(self.Q_final, x[:, -1]) + (self.q_final * x[:, -1]).sum(-1)
         for k in range(self.horizon):  # one by one: the order of a sum must not depend on the batch
             total = total + stages[:, k]
@@ -189,8 +180,12 @@ class MPCProblem(SystemMatrices):
 
     def constraints(self, x: Tensor, u: Tensor) -> Tensor:
         """G_x x + G_u u − g of trajectories, (batch, H+1, n_c); −∞ where there is no constraint."""
-        value = matvec(self._batch_first("G_x"), x) - self._batch_first("g")
-        value[:, :-1] += matvec(self._batch_first("G_u"), u)
+        return self.rows(x, u) - self.batch_first("g")
+
+    def rows(self, x: Tensor, u: Tensor) -> Tensor:
+        """G_x x + G_u u of trajectories or of directions of them, (batch, H+1, n_c)."""
+        value = matvec(self.batch_first("G_x"), x)
+        value[:, :-1] += matvec(self.batch_first("G_u"), u)
         return value
 
     def violation(self, x: Tensor, u: Tensor) -> Tensor:
@@ -200,7 +195,7 @@ class MPCProblem(SystemMatrices):
         return self.constraints(x, u).clamp_min(0.0).amax((1, 2))
 
     def _fines(self, x: Tensor, u: Tensor) -> Tensor:
-        price = self._batch_first("price")
+        price = self.batch_first("price")
         fines = torch.where(torch.isinf(price), 0.0, price) * self.constraints(x, u).clamp_min(0.0)
         total = fines[:, self.horizon].sum(-1)
         for k in range(self.horizon):
@@ -209,7 +204,7 @@ class MPCProblem(SystemMatrices):
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         """u_min and u_max, broadcasting with (batch, H, n_u)."""
-        low, high = (self._batch_first(name) for name in ("u_min", "u_max"))
+        low, high = (self.batch_first(name) for name in ("u_min", "u_max"))
         return low, high
 
     def distances(self, u: Tensor) -> tuple[Tensor, Tensor]:
@@ -258,6 +253,8 @@ STAGES: dict[str, str] = {
     name: "H+1" if name in ("G_x", "g", "price") else "" if name in ("Q_final", "q_final", "x0") else "H"
     for name in INPUTS
 }
+# Those that may be infinite: no bound, no constraint, a hard one.
+MAY_BE_INFINITE = ("u_min", "u_max", "g", "price")
 
 if list(INPUTS.items()) != list(_kernels.mpc_fields().items()) or _kernels.mpc_stages() != STAGES:
     raise ImportError(

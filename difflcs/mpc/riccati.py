@@ -19,7 +19,6 @@ from difflcs.mpc.conditions import (
     backward,
     complete,
     gradient_terms,
-    moved_rows,
     prices,
     ranges,
     row_units,
@@ -354,7 +353,7 @@ def solve(
     """
     if not bool(lin.held.any()):
         return _solve(problem, lin, x_bar, u_bar, lam_bar)
-    G_x, G_u = problem._batch_first("G_x"), problem._batch_first("G_u")
+    G_x, G_u = problem.batch_first("G_x"), problem.batch_first("G_u")
     target = torch.zeros_like(lin.weight) if target is None else torch.where(lin.held, target, 0.0)
     mu, best = torch.zeros_like(lin.weight), None
     # √V, in units of which multipliers of different rows compare.
@@ -389,7 +388,7 @@ def _choose(mask: Tensor, left: Direction, right: Direction) -> Direction:
 
 def _along(problem: MPCProblem, lin: Linearisation, w: Direction) -> Tensor:
     """G_x dx + G_u du of the held constraints, (batch, H+1, n_c), zero elsewhere."""
-    moved = moved_rows(problem, w.x, w.u)
+    moved = problem.rows(w.x, w.u)
     return torch.where(lin.held, moved, torch.zeros_like(moved))
 
 

@@ -253,7 +253,7 @@ class LCSMPCPolicy(GaussianPolicy):
     @property
     def learned(self) -> LCSModule | LCSParams | LCSSequence:
         """The LCS."""
-        return self.mpc.lcs  # pyright: ignore[reportReturnType]  a layer takes any module; PPO does not yet
+        return self.mpc.lcs
 
     @property
     def controller(self) -> LCSMPCLayer:

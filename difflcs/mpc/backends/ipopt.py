@@ -20,7 +20,7 @@ import torch
 from difflcs._checks import check_number, check_positive_int, check_threads
 from difflcs.mpc import kkt
 from difflcs.mpc.backends.base import Backend, Result, certify
-from difflcs.mpc.problem import INPUTS, MPCProblem
+from difflcs.mpc.problem import INPUTS, MAY_BE_INFINITE, MPCProblem
 from difflcs.mpc.solution import Primal
 from difflcs.status import Status
 
@@ -162,7 +162,9 @@ class IpoptBackend(Backend):
         for name, rows, columns, copies in parameters(problem):
             value = torch.as_tensor(getattr(problem, name), dtype=torch.float64)
             # What is infinite is told by the bounds of variables and rows.
-            value = torch.where(torch.isinf(value), torch.zeros_like(value), value) if name in _OPEN else value
+            value = (
+                torch.where(torch.isinf(value), torch.zeros_like(value), value) if name in MAY_BE_INFINITE else value
+            )
             shared = value.ndim == 0 or problem.shared(name)
             size = rows * columns * copies
             flat.append(value.reshape(1 if shared else batch, size).expand(batch, size))
@@ -184,8 +186,6 @@ class IpoptBackend(Backend):
         return Chunk(*(np.ascontiguousarray(v.numpy()) for v in arrays))
 
 
-# Inputs that may be infinite.
-_OPEN = ("u_min", "u_max", "g", "price")
 # Violation, in parts of a row's unit, up to which a problem is tried again from the plan with the least violation: at
 # the boundary of what can be met IPOPT knows it to the root of its tolerance.
 _NEARLY = 1e-3
