@@ -50,7 +50,7 @@ def global_gaps(
         table["seconds"] += found["times"]
         for name, plan in ours.items():
             cost = hard_cost(mpc, mpc.clip(plan(problem)))[proved].numpy()
-            gap = (cost - best) / np.maximum(np.abs(best), 0.01 * np.abs(best).mean())
+            gap = (cost - best) / (best + np.broadcast_to(problem.constant, problem.count)[proved])
             table["gaps"].setdefault(name, []).extend(float(v) for v in gap)
     for family, table in families.items():
         if "error" in table:

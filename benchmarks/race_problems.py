@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from models import ACTION_LIMIT, pushing_model, states_and_goals
+from models import ACTION_LIMIT, chain_of_carts, pushing_model, states_and_goals
 from rivals.problem import Problem
 
 from difflcs import LCSModel, LCSParams, QuadraticCost
@@ -17,32 +17,17 @@ from difflcs.systems import block_along_wall, cart_pole_between_walls
 RELAXATION = 1e-5
 
 
-def chain_of_carts(carts: int, dt: float = 0.05, stiffness: float = 100.0) -> LCSParams:
-    """Carts of 1 kg, 0.2 m apart, between walls 1 m away; the first is pushed, the others are hit by their neighbours.
-
-    States are displacements [m] and velocities [m/s]; n_lam = carts + 1 gaps, semi-implicit as in `difflcs.systems`.
-    """
-    eye = torch.eye(carts, dtype=torch.float64)
-    gaps = torch.cat([eye[:1], eye[1:] - eye[:-1], -eye[-1:]])
-    c = torch.full((carts + 1,), 0.2, dtype=torch.float64)
-    c[[0, -1]] = 1.0
-    A = torch.cat([torch.cat([eye, dt * eye], 1), torch.cat([0 * eye, eye], 1)])
-    B, C = torch.cat([dt * dt * eye[:, :1], dt * eye[:, :1]]), torch.cat([dt * dt * gaps.T, dt * gaps.T])
-    measured = torch.cat([gaps, 0 * gaps], 1)
-    F = measured @ C + torch.eye(carts + 1, dtype=torch.float64) / stiffness
-    zero = torch.zeros(2 * carts, dtype=torch.float64)
-    return LCSParams(A=A, B=B, C=C, d=zero, D=measured @ A, E=measured @ B, F=F, c=c)
-
-
 def problem(lcs: LCSParams, cost: QuadraticCost, x0: torch.Tensor, horizon: int, limit: float, seed: int) -> Problem:
     """Arrays of it, as the rivals take them."""
     arrays = {name: value.detach().double().numpy() for name, value in lcs.tensors().items()}
     arrays |= {n: getattr(cost, n).detach().double().numpy() for n in ("Q", "R", "Q_final", "q", "r", "q_final")}
     bound = np.full(lcs.n_u, limit)
     weight = np.random.default_rng(seed).standard_normal(lcs.n_u)
+    constant = np.asarray(0.0 if cost.constant is None else cost.constant.detach().numpy())
     return Problem(
-        **arrays, u_min=-bound, u_max=bound, x0=x0.numpy(), horizon=horizon, relaxation=RELAXATION, weight=weight
-    )
+        **arrays, u_min=-bound, u_max=bound, x0=x0.numpy(), horizon=horizon, relaxation=RELAXATION,
+        constant=constant, weight=weight,
+    )  # fmt: skip
 
 
 def pushing(lcs: LCSParams, count: int, seed: int, horizon: int = 5) -> Problem:
@@ -74,7 +59,9 @@ def chain(count: int, carts: int, horizon: int, seed: int) -> Problem:
     q = torch.zeros(2 * carts, dtype=torch.float64)
     q[carts - 1] = -3.0
     R = 1e-4 * torch.eye(1, dtype=torch.float64)
-    cost = QuadraticCost(Q=torch.diag(weight), R=R, Q_final=10 * torch.diag(weight), q=q, q_final=10 * q)
+    missed = torch.tensor(0.5 * 10.0 * 0.3**2 * (horizon + 10), dtype=torch.float64)
+    Q = torch.diag(weight)
+    cost = QuadraticCost(Q=Q, R=R, Q_final=10 * Q, q=q, q_final=10 * q, constant=missed)
     x0 = uniform([0.3] * carts + [0.5] * carts, count, seed)
     return problem(chain_of_carts(carts), cost, x0, horizon, 50.0, seed)
 
@@ -86,7 +73,7 @@ def with_contact(count: int, seeds: int) -> dict[str, list[Problem]]:
     found = {f"pushing, n_lam {n}": [pushing(pushing_model(n, s), count, s) for s in every] for n in (5, 8)}
     found["learned cube"] = [pushing(cube, count, 10 + s) for s in every]
     found |= {f"cart-pole, H {h}": [cart_pole(count, h, h + s) for s in every] for h in (10, 20, 30)}
-    found |= {f"chain of {n}, H {h}": [chain(count, n, h, n + s) for s in every] for n, h in ((4, 10), (10, 20))}
+    found |= {f"chain of {n}, H {h}": [chain(count, n, h, n + s) for s in every] for n, h in ((4, 10), (10, 10))}
     return found
 
 
@@ -98,7 +85,7 @@ def without_contact(count: int, seeds: int) -> dict[str, list[Problem]]:
         return replace(p, **none)
 
     def one_goal(p: Problem) -> Problem:
-        return replace(p, q=p.q[0], q_final=p.q_final[0])
+        return replace(p, q=p.q[0], q_final=p.q_final[0], constant=p.constant[0])
 
     every = range(seeds)
     return {
@@ -128,7 +115,8 @@ def block(count: int, horizon: int, seed: int) -> Problem:
     weight = torch.diag(torch.tensor([100.0, 10.0, 0.0, 0.0], dtype=torch.float64))
     q = torch.tensor([-5.0, 0.0, 0.0, 0.0], dtype=torch.float64)
     eye = torch.eye(2, dtype=torch.float64)
-    cost = QuadraticCost(Q=weight, R=eye, Q_final=10 * weight, q=q, q_final=10 * q)
+    missed = torch.tensor(0.5 * 100.0 * 0.05**2 * (horizon + 10), dtype=torch.float64)
+    cost = QuadraticCost(Q=weight, R=eye, Q_final=10 * weight, q=q, q_final=10 * q, constant=missed)
     x0 = uniform([0.02, 0.01, 0.02, 0.02], count, seed)
     x0[:, 1] = x0[:, 1].abs()
     x0[:, 2] -= 0.04

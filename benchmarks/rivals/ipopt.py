@@ -64,7 +64,9 @@ def _solver(sizes: tuple, contact: str, slack: bool, options: tuple, jit: bool) 
         "F": (n_lam, n_lam), "c": (n_lam,), "Q": (n_x, n_x), "R": (n_u, n_u), "Q_final": (n_x, n_x), "q": (n_x,),
         "r": (n_u,), "q_final": (n_x,), "u_min": (n_u,), "u_max": (n_u,), "x0": (1, n_x), "weight": (n_u,),
     }  # fmt: skip
-    empty = Problem(**{k: np.zeros(v) for k, v in shapes.items()}, horizon=horizon, relaxation=1.0)
+    empty = Problem(
+        **{k: np.zeros(v) for k, v in shapes.items()}, horizon=horizon, relaxation=1.0, constant=np.zeros(())
+    )
     p = Program.of(empty, contact, slack, 1.0)
     settings = {"print_time": False, "error_on_fail": False, "calc_lam_p": False}
     settings |= {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.max_iter": 500}

@@ -18,6 +18,7 @@ class Problem:
         x0: (count, n_x) initial states; any other field may have the count in front, too.
         horizon: steps.
         relaxation: λ·s.
+        constant: added to the objective, which is then a sum of squares.
         weight: (n_u,) the gradient asked for is that of weight · u_0 with respect to x0.
     """
 
@@ -40,6 +41,7 @@ class Problem:
     x0: np.ndarray
     horizon: int
     relaxation: float
+    constant: np.ndarray
     weight: np.ndarray
 
     @classmethod
@@ -81,7 +83,7 @@ class Problem:
 
     def only(self, i: int) -> dict[str, np.ndarray]:
         """All fields of one problem by name."""
-        return {f.name: self.at(i, f.name) for f in fields(self) if f.name not in ("horizon", "relaxation")}
+        return {f.name: self.at(i, f.name) for f in fields(self) if f.name not in ("horizon", "relaxation", "constant")}
 
 
 @dataclass

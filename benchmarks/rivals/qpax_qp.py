@@ -39,7 +39,8 @@ class Solver(Rival):
             return found[0], found[4]
 
         def action(x0):
-            z = qpax.solve_qp_primal(H, G @ x0 + h, none, nothing, *box)
+            # kappa smooths the gradient; its default 1e-3 is much in units of these problems
+            z = qpax.solve_qp_primal(H, G @ x0 + h, none, nothing, *box, solver_tol=1e-8, target_kappa=1e-8)
             return weight @ z[:n_u], z
 
         self.plan, self.many = jax.jit(plan), jax.jit(jax.vmap(plan))
