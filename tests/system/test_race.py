@@ -11,6 +11,8 @@ import torch
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
+COUNT = 5
+
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
@@ -29,7 +31,7 @@ def pushing(race):
     from models import pushing_model
     from race_problems import pushing
 
-    return pushing(pushing_model(5, 0), count=2, seed=0)
+    return pushing(pushing_model(5, 0), count=COUNT, seed=0)
 
 
 def test_a_rival_that_is_not_there_is_reported(race, tmp_path):
@@ -40,23 +42,27 @@ def test_a_rival_that_is_not_there_is_reported(race, tmp_path):
     broken.close()
 
 
-def test_a_rival_solves_and_is_judged_by_the_optimality_conditions(race, pushing, tmp_path):
+def test_a_rival_solves_and_is_judged_by_the_optimality_conditions(race, tmp_path):
+    from race_problems import cart_pole
+
+    problem = cart_pole(COUNT, horizon=10, seed=0)
     process = race.Process(race.CONTACT[2], tmp_path, str(tmp_path))
     assert not process.missing
-    pushing.save(f"{tmp_path}/0.npz")
-    answer = process.ask(problem=f"{tmp_path}/0.npz", out=f"{tmp_path}/out.npz", seconds=100.0, few=2)
+    problem.save(f"{tmp_path}/0.npz")
+    answer = process.ask(problem=f"{tmp_path}/0.npz", out=f"{tmp_path}/out.npz", seconds=100.0, few=COUNT)
     process.close()
-    assert answer["solved"] == [True, True]
+    assert answer["solved"] == [True] * COUNT
     assert min(answer["times"]) > 0
     u = np.load(f"{tmp_path}/out.npz")["u"]
-    good = race.judge(pushing, u, np.array([True, True]), None)
-    assert good.solved.tolist() == [True, True]
+    said = np.ones(COUNT, bool)
+    good = race.judge(problem, u, said, None)
+    assert good.solved.all()
     assert float(np.nanmax(good.gradient_error)) < 1e-2
     # Neither other actions pass, nor the solver's own word alone, nor good actions against its word.
-    assert race.judge(pushing, 0 * u, np.array([True, True]), None).solved.tolist() == [False, False]
-    assert race.judge(pushing, u, np.array([True, False]), None).solved.tolist() == [True, False]
-    wrong = np.ones((2, pushing.n_x))
-    assert float(np.nanmin(race.judge(pushing, u, np.array([True, True]), wrong).gradient_error)) > 0.1
+    assert not race.judge(problem, 0 * u, said, None).solved.any()
+    assert race.judge(problem, u, np.arange(COUNT) > 0, None).solved.tolist() == [False] + [True] * (COUNT - 1)
+    wrong = np.ones((COUNT, problem.n_x))
+    assert float(np.nanmin(race.judge(problem, u, said, wrong).gradient_error)) > 0.1
 
 
 def test_both_quadratic_programs_are_the_linear_mpc(race, pushing):
@@ -81,7 +87,7 @@ def test_hard_cost_is_that_of_the_exact_contact(race, pushing):
     from race_global import hard_cost
 
     mpc = race.as_mpc(pushing)
-    u = mpc.clip(0.01 * torch.ones(2, mpc.horizon, mpc.n_u, dtype=torch.float64))
+    u = mpc.clip(0.01 * torch.ones(COUNT, mpc.horizon, mpc.n_u, dtype=torch.float64))
     sharp = dataclasses.replace(mpc, relaxation=1e-12)
     torch.testing.assert_close(hard_cost(mpc, u), sharp.objective(sharp.rollout(u)[0], u), rtol=1e-5, atol=1e-6)
     assert float((hard_cost(mpc, u) - mpc.objective(mpc.rollout(u)[0], u)).abs().max()) > 0
