@@ -75,9 +75,9 @@ CONTACT = (
 COMPILED = Entry("IPOPT, tuned, JIT", "ipopt", {"start": 0.1, "options": TUNED, "jit": True})
 LINEAR = (
     Entry("difflcs `batched`", "layer"),
-    Entry("DAQP", "quadratic", {"solver": "daqp"}, "rivals", ("daqp",)),
+    Entry("DAQP", "daqp_qp", {}, "rivals", ("daqp",)),
     Entry("acados (HPIPM)", "acados_ocp", {}, "acados", ("comma-deps-acados", "numpy")),
-    Entry("Clarabel", "quadratic", {"solver": "clarabel"}, "rivals", ("clarabel", "scipy")),
+    Entry("Clarabel", "clarabel_qp", {}, "rivals", ("clarabel", "scipy")),
     Entry("Moreau, active set", "moreau_qp", {"solver": "active_set"}, "rivals", ("moreau",)),
     Entry("Moreau, interior point", "moreau_qp", {"solver": "ipm"}, "rivals"),
     Entry("qpax", "qpax_qp", {}, "rivals", ("qpax",)),
@@ -471,17 +471,17 @@ def main(o: Options) -> None:
     if o.smoke:
         o.problems, o.batch, o.small_problems, o.seeds, o.rounds, o.nodes = 2, 3, 1, 1, 1, 300
     torch.set_num_threads(1)
+    machine = {"cpu": cpu(), "instruction set": _kernels.isa(), "python": platform.python_version()}
+    options = {n: getattr(o, n) for n in ("problems", "batch", "small_problems", "seeds", "rounds", "nodes")}
     results = json.loads(o.out.read_text())["results"] if o.out.exists() else {}
+    o.out.parent.mkdir(parents=True, exist_ok=True)
     for name in o.parts:
         if name == "global":
             results["global"] = globally(o)
         else:
             results |= dict(race(name, o))
-    machine = {"cpu": cpu(), "instruction set": _kernels.isa(), "python": platform.python_version()}
-    options = {n: getattr(o, n) for n in ("problems", "batch", "small_problems", "seeds", "rounds", "nodes")}
-    o.out.parent.mkdir(parents=True, exist_ok=True)
-    record = {"machine": machine, "options": options, "results": results}
-    o.out.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n")
+        record = {"machine": machine, "options": options, "results": results}
+        o.out.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n")
     print(f"written to {o.out}")
 
 
