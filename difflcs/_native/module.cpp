@@ -21,6 +21,7 @@
 #include <thread>
 #include <vector>
 
+#include "bind_controller.hpp"
 #include "kernels.hpp"
 #include "lcp_one.hpp"
 
@@ -462,4 +463,5 @@ NB_MODULE(_kernels, m) {
         "The same at a given z, from r and e at z = 0.");
   m.def("violation_gradient", &violation_gradient, "inputs"_a, "gamma"_a, "xi"_a, "z"_a, "r"_a, "e"_a, "upstream"_a,
         "gradients"_a, "Gradients of the inputs, into the given arrays; None where one is not wanted.");
+  bind_controller(m);
 }
