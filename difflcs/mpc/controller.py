@@ -1,4 +1,4 @@
-"""The controller of one robot: the solver of backend `batched` with NumPy in and out, warm, and never without an action.
+"""The controller of one robot: the solver of backend `batched` with NumPy in and out, and an action for every step.
 
 The work is done by the C++ class of `difflcs/_native/controller.hpp`, the same as in the C library.
 """
@@ -81,8 +81,8 @@ class MPCController:
         on_failure: the action of a step that is not solved. "hold": what the last solved plan has for this time, for
             at most H−1 steps in a row, then zero; "zero"; an action (n_u,); or "raise" a `SolveError`. An action is
             clipped into the bounds.
-        time_limit: seconds from the begin of a step until the solver is stopped, which it notices at its next iteration;
-            that of the backend if None.
+        time_limit: seconds from the begin of a step until the solver is stopped, which it notices at its next
+            iteration; that of the backend if None.
 
     Raises:
         InvalidInputError and its kinds: an argument does not fit.
