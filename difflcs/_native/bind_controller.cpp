@@ -36,7 +36,8 @@ class Use {
  public:
   explicit Use(Guarded& guarded) : guarded_(guarded) {
     if (guarded.busy.test_and_set(std::memory_order_acquire))
-      throw std::runtime_error("the controller is in use by another thread; make one for each");
+      throw std::runtime_error(
+          "controller: expected one thread at a time, got a call while another is under way; make one for each thread");
   }
   ~Use() { guarded_.busy.clear(std::memory_order_release); }
   difflcs::Controller* operator->() const { return &guarded_.controller; }

@@ -77,7 +77,7 @@ class Reader {
   }
 
   double number(const char* name, double least, double most = 1e300) {
-    const double value = take(name, 1).get()[0];
+    const double value = take(name, 1, false).get()[0];
     if (!(value >= least && value <= most))
       refuse(std::string(name) + ": expected a number from " + std::to_string(least) + " to " + std::to_string(most) +
              ", got " + std::to_string(value));

@@ -180,18 +180,16 @@ class MPCController:
             InvalidInputError and its kinds: an argument does not fit; the plan is as it was.
         """
         x = _numbers("x", x, (self.n_x,))
-        follow = reference is not None
-        targets = None
-        if self.n_goal and (goal is None) == (reference is None):
-            raise ShapeError(
-                f"goal: expected (n_goal={self.n_goal},), or a reference in its place, got "
-                f"{'both' if follow else 'none'}; call step(x, goal) or step(x, reference=...)"
-            )
-        if follow:
-            targets = _numbers("reference", reference, (self.horizon + 1, self.n_goal))
-        elif goal is not None:
-            targets = _numbers("goal", goal, (self.n_goal,))
-        if targets is not None and not self.n_goal:
+        targets, follow = None, reference is not None
+        if self.n_goal:
+            if follow == (goal is not None):
+                raise ShapeError(
+                    f"goal: expected (n_goal={self.n_goal},), or a reference in its place, got "
+                    f"{'both' if follow else 'none'}; call step(x, goal) or step(x, reference=...)"
+                )
+            shape = (self.horizon + 1, self.n_goal) if follow else (self.n_goal,)
+            targets = _numbers("reference" if follow else "goal", reference if follow else goal, shape)
+        elif follow or goal is not None:
             raise ShapeError(
                 f"{'reference' if follow else 'goal'}: expected none with a cost without goals, got one; use a GoalCost"
             )
