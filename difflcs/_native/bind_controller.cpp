@@ -65,6 +65,7 @@ nb::dict sizes(const Guarded& self) {
   nb::dict found;
   found["n_x"] = d.n_x, found["n_u"] = d.n_u, found["n_lam"] = d.n_lam, found["n_c"] = d.n_c;
   found["n_goal"] = d.n_goal, found["horizon"] = d.horizon, found["step_seconds"] = d.step_seconds;
+  found["isa"] = self.controller.kernels().isa;
   return found;
 }
 
@@ -88,7 +89,7 @@ void plan(Guarded& self, Output x, Output u, Output lam, Output mu) {
 
 void set_fallback(Guarded& self, int kind, std::optional<Array> given) {
   const Use controller(self);
-  expect(kind >= 0 && kind <= 2, "the kind must be 0, 1 or 2");
+  expect(kind >= 0 && kind <= 3, "the kind must be from 0 to 3");
   expect(kind != 2 || (given && int64_t(given->size()) == controller->data().n_u), "the action must be (n_u,)");
   controller->set_fallback(difflcs::Fallback(kind), given ? given->data() : nullptr);
 }

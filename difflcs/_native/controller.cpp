@@ -61,7 +61,9 @@ void shift(const Numbers& from, int64_t rows, Numbers& to) {
 }  // namespace
 
 Controller::Controller(const void* bytes, size_t size)
-    : data_(read_controller(bytes, size)), time_limit_(std::numeric_limits<double>::infinity()) {
+    : kernels_(kernels_for_one()),
+      data_(read_controller(bytes, size)),
+      time_limit_(std::numeric_limits<double>::infinity()) {
   const int64_t nx = data_.n_x, nu = data_.n_u, nl = data_.n_lam, nc = data_.n_c, h = data_.horizon;
   x0_ = Numbers(nx), q_ = Numbers(h * nx), q_final_ = Numbers(nx), given_ = Numbers(nu);
   found_ = {Numbers((h + 1) * nx), Numbers(h * nu), Numbers(h * nl), Numbers((h + 1) * nc)};
@@ -81,11 +83,10 @@ Controller::Controller(const void* bytes, size_t size)
   batch_.crossed = any(kS, [](double v) { return v != 0; });
   batch_.unbounded =
       any(ku_min, [](double v) { return v < -kHuge; }) || any(ku_max, [](double v) { return v > kHuge; });
-  const Kernels& kernels = difflcs::kernels();
-  int64_t needed = kernels.mpc_workspace(batch_);
+  int64_t needed = kernels_.mpc_workspace(batch_);
   if (data_.n_goal > 0) {
     batch_.input[kq] = q_.get(), batch_.input[kq_final] = q_final_.get(), batch_.step[kq] = h > 1 ? nx : 0;
-    needed = std::max(needed, kernels.mpc_workspace(batch_));
+    needed = std::max(needed, kernels_.mpc_workspace(batch_));
   }
   workspace_ = Numbers(needed / int64_t(sizeof(double)) + 1);
 }
@@ -93,7 +94,7 @@ Controller::Controller(const void* bytes, size_t size)
 const Outcome& Controller::step(const double* x, const double* targets, bool follow, double* u) {
   const auto begun = Clock::now();
   const int64_t aims = data_.n_goal * (follow ? data_.horizon + 1 : 1);
-  outcome_ = Outcome{};
+  outcome_ = Outcome{}, unfinished_ = false;
   if (all_finite(x, data_.n_x) && all_finite(targets, aims)) {
     std::copy_n(x, data_.n_x, x0_.get());
     if (data_.n_goal > 0) aim(targets, follow);
@@ -103,12 +104,12 @@ const Outcome& Controller::step(const double* x, const double* targets, bool fol
     outcome_.objective = outcome_.residual = std::numeric_limits<double>::max();
     wait();
   }
-  if (solved(int8_t(outcome_.status))) {
+  outcome_.fallback = !solved(int8_t(outcome_.status));
+  if (!outcome_.fallback || (fallback_ == Fallback::unfinished && unfinished_)) {
     std::copy_n(found_.u.get(), data_.n_u, u);
     shift(found_.u, data_.horizon, next_u_);
     planned_ = data_.horizon - 1;
   } else {
-    outcome_.fallback = true;
     fall_back(u);
   }
   return outcome_;
@@ -143,7 +144,7 @@ void Controller::solve(Clock::time_point begun) {
   if (time_limit_ < 1e9) deadline.ends = begun + std::chrono::nanoseconds(int64_t(1e9 * std::max(time_limit_, 0.0)));
   int64_t next = 0;
   const auto started = Clock::now();
-  kernels().mpc_solve(batch_, o, &next, workspace_.get(), {&Deadline::ask, &deadline});
+  kernels_.mpc_solve(batch_, o, &next, workspace_.get(), {&Deadline::ask, &deadline});
   outcome_.solve_seconds = seconds_since(started);
   outcome_.late = deadline.late;
   outcome_.status = status == kUnreached ? Status::max_iter : Status(status);
@@ -152,8 +153,9 @@ void Controller::solve(Clock::time_point begun) {
     if (status == kUnreached || !std::isfinite(*value)) *value = std::numeric_limits<double>::max();
   if (status == kUnreached) return wait();
   const bool usable = make_finite();
-  // What the time did not suffice for goes on in the next step. What failed for another reason begins anew there.
-  guessed_ = solved(status) || (deadline.late && usable);
+  // What the time or the iterations did not suffice for goes on in the next step. What failed otherwise begins anew there.
+  unfinished_ = usable && outcome_.status == Status::max_iter;
+  guessed_ = solved(status) || unfinished_;
   if (!guessed_) return;
   const int64_t h = data_.horizon;
   shift(found_.u, h, guess_u_), shift(found_.lam, h, guess_lam_), shift(found_.mu, h + 1, guess_mu_);
@@ -179,7 +181,7 @@ bool Controller::make_finite() {
 }
 
 void Controller::fall_back(double* u) {
-  const bool holding = fallback_ == Fallback::hold && planned_ > 0;
+  const bool holding = (fallback_ == Fallback::hold || fallback_ == Fallback::unfinished) && planned_ > 0;
   for (int64_t j = 0; j < data_.n_u; j++)
     u[j] = clipped(j, fallback_ == Fallback::given ? given_.get()[j] : holding ? next_u_.get()[j] : 0.0);
   shift(next_u_, data_.horizon, next_u_);

@@ -12,9 +12,10 @@ namespace difflcs {
 
 // The action of a step that is not solved.
 enum class Fallback {
-  hold,   // that of the last plan for this time, while it lasts; then zero
-  zero,   // zero
-  given,  // one that the caller has set
+  hold,        // that of the last plan for this time, while it lasts; then zero
+  zero,        // zero
+  given,       // one that the caller has set
+  unfinished,  // that of the plan which the solver had reached when the time or the iterations were over; else `hold`
 };
 
 // How a step went.
@@ -41,6 +42,7 @@ class Controller {
   Controller& operator=(const Controller&) = delete;
 
   const ControllerData& data() const { return data_; }
+  const Kernels& kernels() const { return kernels_; }
 
   // Plans from the state x (n_x) and writes the action u (n_u), which is always finite and inside the bounds of the
   // first stage. With a goal, `targets` is (n_goal), or (H + 1, n_goal) where `follow`; else it is not looked at. A
@@ -71,13 +73,15 @@ class Controller {
   void fall_back(double* u);
   double clipped(int64_t i, double value) const;
 
+  const Kernels& kernels_;
   ControllerData data_;
   MpcBatch batch_{};
   Numbers x0_, q_, q_final_, workspace_, given_;
   Trace found_;
   Numbers next_u_, guess_u_, guess_lam_, guess_mu_;
-  int64_t planned_ = 0;   // steps that next_u_, the rest of the last plan that was solved, still lasts
-  bool guessed_ = false;  // the guess is one
+  int64_t planned_ = 0;      // steps that next_u_, the rest of the last plan that was solved, still lasts
+  bool guessed_ = false;     // the guess is one
+  bool unfinished_ = false;  // what was found is a trajectory, but not solved
   double goal_constant_ = 0;
   double time_limit_;
   Fallback fallback_ = Fallback::hold;

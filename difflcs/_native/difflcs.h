@@ -41,9 +41,12 @@ typedef enum difflcs_status {
 
 /* The action of a step that is not solved (neither CONVERGED nor DEGENERATE). It is clipped into the bounds. */
 typedef enum difflcs_fallback {
-  DIFFLCS_HOLD = 0, /* what the last solved plan has for this time, for at most H - 1 steps in a row; then zero */
-  DIFFLCS_ZERO = 1, /* zero */
-  DIFFLCS_GIVEN = 2 /* the action that difflcs_set_fallback was given */
+  DIFFLCS_HOLD = 0,  /* what the last solved plan has for this time, for at most H - 1 steps in a row; then zero */
+  DIFFLCS_ZERO = 1,  /* zero */
+  DIFFLCS_GIVEN = 2, /* the action that difflcs_set_fallback was given */
+  DIFFLCS_UNFINISHED =
+      3 /* that of the plan which the solver had reached, where the time or the iterations were over and
+           it had one; else as HOLD. Such a plan obeys the model and the bounds, but may be poor. */
 } difflcs_fallback;
 
 typedef struct difflcs_sizes {
@@ -109,7 +112,7 @@ DIFFLCS_API difflcs_status difflcs_set_fallback(difflcs_controller* controller, 
 
 /* "CONVERGED" and so on. */
 DIFFLCS_API const char* difflcs_status_name(difflcs_status status);
-/* The instruction set in use: "baseline", "avx2" or "avx512"; the environment variable DIFFLCS_ISA chooses another one.
+/* The instruction set in use: "baseline" or "avx2"; or that of the environment variable DIFFLCS_ISA, also "avx512".
  * "none" where it names one that this processor has not. */
 DIFFLCS_API const char* difflcs_isa(void);
 

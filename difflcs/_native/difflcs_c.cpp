@@ -120,7 +120,8 @@ void difflcs_set_time_limit(difflcs_controller* c, double seconds) {
 }
 
 difflcs_status difflcs_set_fallback(difflcs_controller* c, difflcs_fallback kind, const double* action) {
-  if (!c || kind < DIFFLCS_HOLD || kind > DIFFLCS_GIVEN || (kind == DIFFLCS_GIVEN && !action)) return DIFFLCS_INVALID;
+  if (!c || kind < DIFFLCS_HOLD || kind > DIFFLCS_UNFINISHED || (kind == DIFFLCS_GIVEN && !action))
+    return DIFFLCS_INVALID;
   for (int64_t j = 0; kind == DIFFLCS_GIVEN && j < c->controller.data().n_u; j++)
     if (!std::isfinite(action[j])) return DIFFLCS_INVALID;
   c->controller.set_fallback(difflcs::Fallback(int(kind)), action);
@@ -147,7 +148,7 @@ const char* difflcs_status_name(difflcs_status status) {
 
 const char* difflcs_isa(void) {
   try {
-    return difflcs::kernels().isa;
+    return difflcs::kernels_for_one().isa;
   } catch (...) {
     return "none";
   }

@@ -26,7 +26,7 @@ from difflcs.status import Status
 if TYPE_CHECKING:
     from difflcs.mpc.layer import LCSMPCLayer
 
-_FALLBACKS = {"hold": 0, "zero": 1, "raise": 0}
+_FALLBACKS = {"hold": 0, "zero": 1, "unfinished": 3, "raise": 0}
 _GIVEN = 2
 _FLOAT = np.dtype(np.float64)
 
@@ -79,8 +79,8 @@ class MPCController:
         mpc: the layer, with backend `batched`; nothing in it has a batch dimension. Its own `on_failure` and
             `training_relaxation` do not count.
         on_failure: the action of a step that is not solved. "hold": what the last solved plan has for this time, for
-            at most H−1 steps in a row, then zero; "zero"; an action (n_u,); or "raise" a `SolveError`. An action is
-            clipped into the bounds.
+            at most H−1 steps in a row, then zero; "unfinished": what the solver had reached where the time was over,
+            else as "hold"; "zero"; an action (n_u,); or "raise" a `SolveError`. An action is clipped into the bounds.
         time_limit: seconds from the begin of a step until the solver is stopped, which it notices at its next
             iteration; that of the backend if None.
 
@@ -113,7 +113,8 @@ class MPCController:
             self._fallback = _FALLBACKS[on_failure]
         else:
             raise InvalidInputError(
-                f"on_failure: expected 'hold', 'zero', 'raise' or an action, got {on_failure!r:.100}; choose one"
+                f"on_failure: expected one of {', '.join(map(repr, _FALLBACKS))}, or an action, got {on_failure!r:.100}; "
+                f"choose one"
             )
         self._time_limit = _limit(time_limit)
 

@@ -210,7 +210,7 @@ class LCSMPCLayer(nn.Module):
         """A controller of one robot with this layer's problem as it is now: NumPy in and out, warm, microseconds.
 
         Args:
-            on_failure: "hold", "zero", "raise" or an action (n_u,), see `MPCController`.
+            on_failure: "hold", "unfinished", "zero", "raise" or an action (n_u,), see `MPCController`.
             time_limit: seconds of one step, that of the backend if None.
         """
         return MPCController(self, on_failure, time_limit)

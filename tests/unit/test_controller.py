@@ -239,6 +239,31 @@ def test_a_deadline_ends_the_step_with_the_fallback(plain):
     assert not np.array_equal(controller.plan.u, planned) or controller.plan.iterations == 0
 
 
+def test_what_is_unfinished_goes_on_in_the_next_step_and_can_be_acted_by(build):
+    params, cost, x = build.params(0), build.cost(0), 0.3 * np.ones(4)
+    assert LCSMPCLayer(params, cost, H, -0.5, 0.5)(torch.from_numpy(x)).iterations > 8
+    few = LCSMPCLayer(params, cost, H, -0.5, 0.5, backend=BatchedBackend(max_iter=8))
+    held, acting = few.controller(), few.controller("unfinished")
+    assert held.step(x).tolist() == [0, 0]
+    u, plan = acting.step(x), acting.plan
+    assert u.any()
+    assert (np.abs(u) <= 0.5).all()
+    assert np.array_equal(u, plan.u[0])
+    assert plan.fallback
+    assert not plan.late
+    assert plan.status == acting.status == Status.MAX_ITER
+    planned = [plan.u[k] for k in range(1, H)]
+    for wanted in [*planned, np.zeros(2)]:  # without a new plan it follows the unfinished one
+        assert np.array_equal(acting.step(NAN), wanted)
+    acting.reset()
+    found = []
+    for _ in range(5):
+        acting.step(x)
+        found.append(acting.status.solved)
+    assert not found[0]
+    assert any(found)
+
+
 def test_the_time_limit_of_the_backend_counts(build):
     backend = BatchedBackend(time_limit=1e-9)
     mpc = LCSMPCLayer(build.params(0), build.cost(0), H, -0.3, 0.3, backend=backend)
