@@ -113,7 +113,7 @@ class MPCController:
             self._fallback = _FALLBACKS[on_failure]
         else:
             raise InvalidInputError(
-                f"on_failure: expected one of {', '.join(map(repr, _FALLBACKS))}, or an action, got {on_failure!r:.100}; "
+                f"on_failure: expected {', '.join(map(repr, _FALLBACKS))} or an action, got {on_failure!r:.100}; "
                 f"choose one"
             )
         self._time_limit = _limit(time_limit)

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 MAGIC = b"\x89LCS\r\n\x1a\n"
 VERSION = 1
+_MAPS = ("at", "along")
 _SYMMETRIC = ("Q", "R", "Q_final")
 
 
@@ -59,6 +60,11 @@ def controller_bytes(mpc: LCSMPCLayer, system: LCSParams | LCSSequence, step_sec
         raise InvalidInputError(
             f"backend: expected 'batched', whose solver a controller uses, got {backend.name!r}; build the layer with "
             f"backend='batched'"
+        )
+    if isinstance(mpc.cost, GoalCost) and any(getattr(type(mpc.cost), k) is not getattr(GoalCost, k) for k in _MAPS):
+        raise InvalidInputError(
+            f"cost: expected a GoalCost, whose terms are linear in the goal, got the subclass {type(mpc.cost).__name__} "
+            f"with a map of its own; give a controller the plain one"
         )
     problem, constant = _problem(mpc, system)
     sizes = {"n_x": problem.n_x, "n_u": problem.n_u, "n_lam": problem.n_lam, "n_c": problem.n_c}

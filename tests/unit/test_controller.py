@@ -415,6 +415,13 @@ def test_goals_without_a_goal_cost(plain):
         plain.controller().step(np.zeros(4), reference=np.zeros((H + 1, 2)))
 
 
+class Curved(GoalCost):
+    """Not linear in the goal."""
+
+    def at(self, goal, horizon):
+        return super().at(goal**2, horizon)
+
+
 def test_layers_and_options_that_it_does_not_take(build, plain):
     params, cost = build.params(0), build.cost(0)
     with pytest.raises(InvalidInputError, match="on_failure: expected 'hold'"):
@@ -432,6 +439,8 @@ def test_layers_and_options_that_it_does_not_take(build, plain):
         LCSMPCLayer(build.params(0, batch=(3,)), cost, H, -0.3, 0.3).controller()
     with pytest.raises(ShapeError, match="Q: expected no batch dimension"):
         LCSMPCLayer(params, build.cost(0, batch=(3,)), H, -0.3, 0.3).controller()
+    with pytest.raises(InvalidInputError, match="got the subclass Curved"):
+        LCSMPCLayer(params, Curved.reach(4, 2), H, -0.3, 0.3).controller()
     alone = LCSMPCLayer(build.params(0, batch=(1,)), cost, H, -0.3, 0.3).controller()
     assert alone.step(np.zeros(4)).shape == (2,)
 
