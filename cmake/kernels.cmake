@@ -5,10 +5,10 @@ set(DIFFLCS_ISAS "all" CACHE STRING "instruction sets to compile beside the base
 
 function(difflcs_add_kernels target)
   target_include_directories(${target} PRIVATE ${DIFFLCS_NATIVE})
-  target_sources(${target} PRIVATE ${DIFFLCS_NATIVE}/dispatch.cpp ${DIFFLCS_NATIVE}/controller.cpp
-                 ${DIFFLCS_NATIVE}/controller_file.cpp)
-  # So that the controller computes the same in Python and in C, whatever else differs between the two builds.
-  set_source_files_properties(${DIFFLCS_NATIVE}/controller.cpp PROPERTIES COMPILE_OPTIONS
+  set(sources ${DIFFLCS_NATIVE}/driver.cpp ${DIFFLCS_NATIVE}/controller.cpp ${DIFFLCS_NATIVE}/controller_file.cpp)
+  target_sources(${target} PRIVATE ${DIFFLCS_NATIVE}/dispatch.cpp ${sources})
+  # So that they compute the same in Python and in C, whatever else differs between the two builds.
+  set_source_files_properties(${sources} PROPERTIES COMPILE_OPTIONS
                               $<$<NOT:$<CXX_COMPILER_ID:MSVC>>:-ffp-contract=off>)
   difflcs_add_instruction_set(${target} baseline 2)
   if(CMAKE_SYSTEM_PROCESSOR MATCHES "^(x86_64|AMD64|amd64)$")

@@ -10,16 +10,26 @@ namespace {
 
 using Clock = std::chrono::steady_clock;
 
-// Stops the solver when the time is over.
-struct Deadline {
-  Clock::time_point ends;
-  bool late = false;
+// Runs the work on this thread, in the memory of the controller, until the time is over.
+class Alone final : public Runner {
+ public:
+  Alone(void* workspace, Clock::time_point ends) : workspace_(workspace), ends_(ends) {}
 
-  static bool ask(void* context) {
-    Deadline& self = *static_cast<Deadline*>(context);
-    if (!self.late && Clock::now() >= self.ends) self.late = true;
-    return self.late;
+  void run(int64_t, int64_t, bool to_the_end, Work work, void* context) override {
+    work(context, workspace_, {to_the_end ? [](void*) { return false; } : &Alone::ask, this});
   }
+  bool stopped() const override { return late_; }
+
+ private:
+  static bool ask(void* context) {
+    Alone& self = *static_cast<Alone*>(context);
+    if (!self.late_ && Clock::now() >= self.ends_) self.late_ = true;
+    return self.late_;
+  }
+
+  void* workspace_;
+  Clock::time_point ends_;
+  bool late_ = false;
 };
 
 double seconds_since(Clock::time_point begun) { return std::chrono::duration<double>(Clock::now() - begun).count(); }
@@ -63,6 +73,7 @@ void shift(const Numbers& from, int64_t rows, Numbers& to) {
 Controller::Controller(const void* bytes, size_t size)
     : kernels_(kernels_for_one()),
       data_(read_controller(bytes, size)),
+      driver_(kernels_),
       time_limit_(std::numeric_limits<double>::infinity()) {
   const int64_t nx = data_.n_x, nu = data_.n_u, nl = data_.n_lam, nc = data_.n_c, h = data_.horizon;
   x0_ = Numbers(nx), q_ = Numbers(h * nx), q_final_ = Numbers(nx), given_ = Numbers(nu);
@@ -88,6 +99,7 @@ Controller::Controller(const void* bytes, size_t size)
     batch_.input[kq] = q_.get(), batch_.input[kq_final] = q_final_.get(), batch_.step[kq] = h > 1 ? nx : 0;
     needed = std::max(needed, kernels_.mpc_workspace(batch_));
   }
+  driver_.reserve(batch_, std::max(data_.starts, data_.starts_guessed));
   workspace_ = Numbers(needed / int64_t(sizeof(double)) + 1);
 }
 
@@ -132,28 +144,33 @@ void Controller::aim(const double* targets, bool follow) {
 // The one place that knows the solver; what it finds is the guess of the next step.
 void Controller::solve(Clock::time_point begun) {
   int8_t status = kUnreached, fragile = 0;
-  MpcSolve o{};
-  o.u_start = guessed_ ? guess_u_.get() : nullptr, o.lam_start = guessed_ ? guess_lam_.get() : nullptr;
-  o.mu_start = guessed_ ? guess_mu_.get() : nullptr;
-  o.first_relaxation = data_.relaxation * (guessed_ ? 1.0 : data_.homotopy);
-  o.shrink = data_.shrink, o.tol = data_.tol, o.max_iter = int64_t(data_.max_iter), o.certified = data_.certified;
-  o.x = found_.x.get(), o.u = found_.u.get(), o.lam = found_.lam.get(), o.mu = found_.mu.get();
-  o.objective = &outcome_.objective, o.residual = &outcome_.residual, o.iterations = &outcome_.iterations;
-  o.status = &status, o.fragile = &fragile;
-  Deadline deadline{Clock::time_point::max()};
-  if (time_limit_ < 1e9) deadline.ends = begun + std::chrono::nanoseconds(int64_t(1e9 * std::max(time_limit_, 0.0)));
-  int64_t next = 0;
+  const MpcGuess guess = guessed_ ? MpcGuess{guess_u_.get(), guess_lam_.get(), guess_mu_.get()} : MpcGuess{};
+  const MpcEffort effort{guessed_ ? data_.starts_guessed : data_.starts,
+                         data_.homotopy,
+                         data_.shrink,
+                         data_.tol,
+                         data_.max_iter,
+                         data_.certified,
+                         uint64_t(data_.seed)};
+  const MpcPlans out{found_.x.get(),     found_.u.get(), found_.lam.get(), found_.mu.get(),     &outcome_.objective,
+                     &outcome_.residual, &status,        &fragile,         &outcome_.iterations};
+  auto ends = Clock::time_point::max();
+  if (time_limit_ < 1e9) ends = begun + std::chrono::nanoseconds(int64_t(1e9 * std::max(time_limit_, 0.0)));
+  Alone runner(workspace_.get(), ends);
   const auto started = Clock::now();
-  kernels_.mpc_solve(batch_, o, &next, workspace_.get(), {&Deadline::ask, &deadline});
+  driver_.solve(batch_, guess, effort, out, runner);
   outcome_.solve_seconds = seconds_since(started);
-  outcome_.late = deadline.late;
-  outcome_.status = status == kUnreached ? Status::max_iter : Status(status);
-  outcome_.objective += data_.constant + goal_constant_;
+  outcome_.late = runner.stopped();
+  outcome_.status = Status(status);
+  // The driver's sign of a problem for which the time did not suffice even to begin.
+  const bool begun_at_all = outcome_.objective != std::numeric_limits<double>::max();
+  if (begun_at_all) outcome_.objective += data_.constant + goal_constant_;
   for (double* value : {&outcome_.objective, &outcome_.residual})
-    if (status == kUnreached || !std::isfinite(*value)) *value = std::numeric_limits<double>::max();
-  if (status == kUnreached) return wait();
+    if (!std::isfinite(*value)) *value = std::numeric_limits<double>::max();
+  if (!begun_at_all) return wait();
   const bool usable = make_finite();
-  // What the time or the iterations did not suffice for goes on in the next step. What failed otherwise begins anew there.
+  // What the time or the iterations did not suffice for goes on in the next step. What failed otherwise begins anew
+  // there.
   unfinished_ = usable && outcome_.status == Status::max_iter;
   guessed_ = solved(status) || unfinished_;
   if (!guessed_) return;

@@ -6,6 +6,7 @@
 #include <cstdint>
 
 #include "controller_file.hpp"
+#include "driver.hpp"
 #include "kernels.hpp"
 
 namespace difflcs {
@@ -75,6 +76,7 @@ class Controller {
 
   const Kernels& kernels_;
   ControllerData data_;
+  MpcDriver driver_;
   MpcBatch batch_{};
   Numbers x0_, q_, q_final_, workspace_, given_;
   Trace found_;

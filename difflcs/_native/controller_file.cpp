@@ -15,6 +15,8 @@ constexpr unsigned char kMagic[] = {0x89, 'L', 'C', 'S', '\r', '\n', 0x1a, '\n'}
 constexpr size_t kHeader = 24, kName = 16;
 // Sizes above it are made up: their products would not fit into 64 bits.
 constexpr int64_t kLargestSize = 100000;
+// A double holds every whole number up to it.
+constexpr int64_t kLargestCount = int64_t{1} << 53;
 
 [[noreturn]] void refuse(const std::string& what) { throw std::runtime_error(what + "; export the controller again"); }
 
@@ -84,8 +86,8 @@ class Reader {
     return value;
   }
 
-  int64_t size(const char* name, int64_t least) {
-    const double value = number(name, double(least), double(kLargestSize));
+  int64_t size(const char* name, int64_t least, int64_t most = kLargestSize) {
+    const double value = number(name, double(least), double(most));
     if (value != std::floor(value)) refuse(std::string(name) + ": expected a whole number");
     return int64_t(value);
   }
@@ -134,8 +136,10 @@ ControllerData read_controller(const void* bytes, size_t size) {
   constexpr double kSmallestNumber = std::numeric_limits<double>::min();
   data.relaxation = reader.number("relaxation", kSmallestNumber), data.barrier = reader.number("barrier", 0);
   data.tol = reader.number("tol", kSmallestNumber), data.certified = reader.number("certified", kSmallestNumber);
-  data.max_iter = reader.number("max_iter", 1, 1e15), data.homotopy = reader.number("homotopy", 1);
+  data.homotopy = reader.number("homotopy", 0);
   data.shrink = reader.number("shrink", kSmallestNumber, 1 - 1e-12);
+  data.max_iter = reader.size("max_iter", 1, kLargestCount), data.seed = reader.size("seed", 0, kLargestCount);
+  data.starts = reader.size("starts", 1), data.starts_guessed = reader.size("starts_guessed", 1);
   data.step_seconds = reader.number("step_seconds", 0);
   for (int i = 0; i < kInputs; i++) {
     if (i == kx0) continue;

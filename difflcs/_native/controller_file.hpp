@@ -38,14 +38,15 @@ class Numbers {
   std::unique_ptr<double, Free> data_;
 };
 
-// One problem, and how to solve it. The names are those of MpcBatch, MpcSolve and GoalCost (difflcs/cost.py).
+// One problem, and how to solve it. The names are those of MpcBatch, MpcEffort and GoalCost (difflcs/cost.py).
 struct ControllerData {
   int64_t n_x, n_u, n_lam, n_c, horizon;
   int64_t n_goal;  // 0: the cost knows no goal
   double relaxation, barrier, tol, certified;
-  double max_iter, homotopy, shrink;
-  double step_seconds;     // time from one step to the next [s]; 0 where it is not known
-  Numbers field[kInputs];  // all but x0
+  double homotopy, shrink;
+  int64_t max_iter, seed, starts, starts_guessed;  // without a guess, and with one
+  double step_seconds;                             // time from one step to the next [s]; 0 where it is not known
+  Numbers field[kInputs];                          // all but x0
   bool by_stage[kInputs];
   Numbers goal_to_q, goal_to_q_final;  // (n_x, n_goal)
   Numbers goal_stage, goal_final;      // (n_goal, n_goal)

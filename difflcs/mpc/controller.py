@@ -243,6 +243,11 @@ class MPCController:
             self._native.set_time_limit(self._time_limit or 0.0)
 
     @property
+    def isa(self) -> str | None:
+        """The instruction set in use, for one problem at a time; None before a module was asked for its system."""
+        return None if self._native is None else self._native.sizes()["isa"]
+
+    @property
     def plan(self) -> ControllerPlan | None:
         """What the solver has found last, also where it was not solved; copies. None before the first step."""
         if self._status is None:

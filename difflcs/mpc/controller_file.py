@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from difflcs._checks import check_number, describe
+from difflcs._checks import check_number, check_positive_int, describe
 from difflcs.cost import GoalCost
 from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.lcs import LCSModel, LCSParams, LCSSequence
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 MAGIC = b"\x89LCS\r\n\x1a\n"
 VERSION = 1
+_LARGEST = 2**53  # of whole numbers, so that a double holds it
 _MAPS = ("at", "along")
 _SYMMETRIC = ("Q", "R", "Q_final")
 
@@ -63,9 +64,11 @@ def controller_bytes(mpc: LCSMPCLayer, system: LCSParams | LCSSequence, step_sec
         )
     if isinstance(mpc.cost, GoalCost) and any(getattr(type(mpc.cost), k) is not getattr(GoalCost, k) for k in _MAPS):
         raise InvalidInputError(
-            f"cost: expected a GoalCost, whose terms are linear in the goal, got the subclass {type(mpc.cost).__name__} "
-            f"with a map of its own; give a controller the plain one"
+            f"cost: expected a GoalCost, whose terms are linear in the goal, got the subclass "
+            f"{type(mpc.cost).__name__} with a map of its own; give a controller the plain one"
         )
+    for name, value in (("seed", backend.seed), ("max_iter", backend.max_iter)):
+        check_positive_int(name, value, minimum=0, maximum=_LARGEST)
     problem, constant = _problem(mpc, system)
     sizes = {"n_x": problem.n_x, "n_u": problem.n_u, "n_lam": problem.n_lam, "n_c": problem.n_c}
     cost, n_x = mpc.cost, problem.n_x
@@ -75,9 +78,12 @@ def controller_bytes(mpc: LCSMPCLayer, system: LCSParams | LCSSequence, step_sec
         "barrier": problem.barrier,
         "tol": backend.tol,
         "certified": kkt.CERTIFIED,
-        "max_iter": backend.max_iter,
-        "homotopy": backend.homotopy,
+        "homotopy": backend.homotopy or 0.0,
         "shrink": backend.shrink,
+        "max_iter": backend.max_iter,
+        "seed": backend.seed,
+        "starts": backend.starts(guessed=False),
+        "starts_guessed": backend.starts(guessed=True),
         "step_seconds": step_seconds,
     }
     numbers = {**sizes, "horizon": problem.horizon, "n_goal": n_goal, **options}

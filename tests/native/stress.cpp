@@ -112,7 +112,10 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
   std::vector<int32_t> iterations(count);
   double no_multipliers;
   MpcSolve o{};
-  o.first_relaxation = 1e-3, o.shrink = 0.3, o.tol = 1e-8, o.max_iter = 100, o.certified = 1e-6;
+  const std::vector<MpcStart> cold(count, {true, 1.0, 1e-5}), warm(count, {false, 0.0, 1e-5});
+  std::vector<double> scale(count), gained(count);
+  o.start = cold.data(), o.shrink = 0.3, o.steps = 1, o.tol = 1e-8, o.max_iter = 100, o.certified = 1e-6;
+  o.scale = scale.data(), o.gained = gained.data();
   o.x = x.data(), o.u = u.data(), o.lam = lam.data(), o.mu = &no_multipliers;
   o.objective = objective.data(), o.residual = residual.data(), o.status = status.data();
   o.fragile = fragile.data(), o.iterations = iterations.data();
@@ -127,7 +130,7 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
     for (auto& t : pool) t.join();
     if (broken != 0) break;
     const auto u_start = u, lam_start = lam;
-    o.u_start = u_start.data(), o.lam_start = lam_start.data(), o.first_relaxation = 1e-5;
+    o.u_start = u_start.data(), o.lam_start = lam_start.data(), o.start = warm.data();
     expect(std::count_if(status.begin(), status.end(), solved) * 10 >= count * 9,
            "nine of ten MPC problems are solved");
     if (pass == 0) {
@@ -140,7 +143,7 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
         expect(s >= kUnreached && s <= int8_t(Status::degenerate), "a status is written or is not");
       u = u_start, lam = lam_start;
     }
-    o.u_start = o.lam_start = nullptr, o.first_relaxation = 1e-3;
+    o.u_start = o.lam_start = nullptr, o.start = cold.data();
   }
   MpcGradient g{};
   const auto x_bar = normal(x.size(), 1.0), u_bar = normal(u.size(), 1.0), lam_bar = normal(lam.size(), 1.0);
@@ -220,10 +223,23 @@ void controller(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t h, int64_t n_c,
   MpcBatch b{};
   b.count = 1, b.n_x = n_x, b.n_u = n_u, b.n_lam = n_lam, b.n_c = n_c, b.horizon = h;
   File file;
-  const std::pair<const char*, double> numbers[] = {
-      {"n_x", n_x},       {"n_u", n_u},         {"n_lam", n_lam}, {"n_c", n_c},       {"horizon", h},
-      {"n_goal", n_goal}, {"relaxation", 1e-5}, {"barrier", 0},   {"tol", 1e-8},      {"certified", 1e-6},
-      {"max_iter", 150},  {"homotopy", 100},    {"shrink", 0.3},  {"step_seconds", 0}};
+  const std::pair<const char*, double> numbers[] = {{"n_x", n_x},
+                                                    {"n_u", n_u},
+                                                    {"n_lam", n_lam},
+                                                    {"n_c", n_c},
+                                                    {"horizon", h},
+                                                    {"n_goal", n_goal},
+                                                    {"relaxation", 1e-5},
+                                                    {"barrier", 0},
+                                                    {"tol", 1e-8},
+                                                    {"certified", 1e-6},
+                                                    {"homotopy", 0},
+                                                    {"shrink", 0.3},
+                                                    {"max_iter", 150},
+                                                    {"seed", 0},
+                                                    {"starts", staged ? 16 : 3},
+                                                    {"starts_guessed", staged ? 16 : 1},
+                                                    {"step_seconds", 0}};
   for (const auto& number : numbers) file.put(number.first, {double(number.second)});
   for (int i = 0; i < kx0; i++) {
     const int64_t copies = staged && stages_of(b, kMpcFields[i]) ? stages_of(b, kMpcFields[i]) : 1;

@@ -538,6 +538,7 @@ def test_forging_does_nothing_by_itself(saved):
         ("relaxation", [0.0], "relaxation"),
         ("shrink", [1.0], "shrink"),
         ("max_iter", [np.inf], "max_iter"),
+        ("starts", [0.0], "starts"),
         ("step_seconds", [-1.0], "step_seconds"),
         ("tol", [], "tol: expected 1 numbers, got 0"),
         ("Q", [np.nan] * 16, "Q: expected finite numbers"),
