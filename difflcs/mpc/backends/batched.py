@@ -16,7 +16,7 @@ from difflcs.mpc import kkt
 from difflcs.mpc.backends.base import Backend, Result
 from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.mpc.solution import Primal
-from difflcs.status import Status, solved
+from difflcs.status import solved
 
 Effort = Literal["fast", "default", "best"]
 _STARTS: dict[str, int] = {"fast": 1, "default": 3, "best": 16}
