@@ -239,11 +239,15 @@ def test_a_deadline_ends_the_step_with_the_fallback(plain):
     assert not np.array_equal(controller.plan.u, planned) or controller.plan.iterations == 0
 
 
-def test_what_is_unfinished_goes_on_in_the_next_step_and_can_be_acted_by(build):
-    params, cost, x = build.params(0), build.cost(0), 0.3 * np.ones(4)
-    assert LCSMPCLayer(params, cost, H, -0.5, 0.5)(torch.from_numpy(x)).iterations > 8
-    few = LCSMPCLayer(params, cost, H, -0.5, 0.5, backend=BatchedBackend(max_iter=8))
-    held, acting = few.controller(), few.controller("unfinished")
+def few(build, max_iter):
+    """A layer whose iterations do not suffice for a cold start."""
+    backend = BatchedBackend(effort="fast", max_iter=max_iter)
+    return LCSMPCLayer(build.params(0), build.cost(0), H, -0.5, 0.5, backend=backend)
+
+
+def test_what_is_unfinished_can_be_acted_by(build):
+    x = 0.3 * np.ones(4)
+    held, acting = few(build, 2).controller(), few(build, 2).controller("unfinished")
     assert held.step(x).tolist() == [0, 0]
     u, plan = acting.step(x), acting.plan
     assert u.any()
@@ -255,13 +259,18 @@ def test_what_is_unfinished_goes_on_in_the_next_step_and_can_be_acted_by(build):
     planned = [plan.u[k] for k in range(1, H)]
     for wanted in [*planned, np.zeros(2)]:  # without a new plan it follows the unfinished one
         assert np.array_equal(acting.step(NAN), wanted)
-    acting.reset()
-    found = []
-    for _ in range(5):
-        acting.step(x)
-        found.append(acting.status.solved)
-    assert not found[0]
-    assert any(found)
+
+
+def test_what_is_unfinished_goes_on_in_the_next_step(build):
+    """For some number of iterations that does not suffice for one step: a cold start at each would never end."""
+    x, steps = 0.3 * np.ones(4), {}
+    for max_iter in range(1, 13):
+        controller = few(build, max_iter).controller()
+        steps[max_iter] = next(
+            (i for i in range(10) if controller.step(x) is not None and controller.status.solved), 10
+        )
+    assert steps[1] > 0
+    assert any(0 < taken < 10 for taken in steps.values()), steps
 
 
 def test_the_time_limit_of_the_backend_counts(build):
