@@ -85,7 +85,7 @@ def _bound(value: torch.Tensor) -> list[Any]:
 
 @dataclass(frozen=True)
 class Export:
-    """Write the controller of a learned model for the C library, which needs no Python."""
+    """Write the controller of a learned model for the C library."""
 
     model: Path
     """Run directory, or zoo:NAME for one of the models that `difflcs zoo` lists."""
