@@ -92,37 +92,11 @@ void stay_at_start(const MpcBatch& b, const MpcGuess& guess, const MpcPlans& out
 }
 
 struct Solving {
+  const Kernels& kernels;
   const MpcBatch& batch;
   const MpcSolve& solve;
   int64_t next;
 };
-
-// One call of the kernel for every problem of a batch.
-void run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner) {
-  std::fill_n(solve.status, batch.count, kUnreached), std::fill_n(solve.iterations, batch.count, 0);
-  Solving context{batch, solve, 0};
-  runner.run(
-      batch.count, kernels().mpc_workspace(batch), false,
-      [](void* context, void* workspace, Watch watch) {
-        auto& c = *static_cast<Solving*>(context);
-        kernels().mpc_solve(c.batch, c.solve, &c.next, workspace, watch);
-      },
-      &context);
-}
-
-// Which of the solved problems have constraints that make them degenerate.
-void judge_constraints(const MpcBatch& batch, const MpcSolve& results, Runner& runner) {
-  Solving context{batch, results, 0};
-  runner.run(
-      batch.count, kernels().mpc_workspace(batch), true,
-      [](void* context, void* workspace, Watch watch) {
-        auto& c = *static_cast<Solving*>(context);
-        constexpr int64_t block = 64;
-        for (int64_t i; (i = __atomic_fetch_add(&c.next, block, __ATOMIC_RELAXED)) < c.batch.count;)
-          kernels().mpc_constraints(c.batch, c.solve, i, std::min(c.batch.count, i + block), workspace, watch);
-      },
-      &context);
-}
 
 MpcSolve with(const MpcEffort& effort, const MpcPlans& out) {
   MpcSolve o{};
@@ -152,6 +126,38 @@ void MpcDriver::Store::resize(const MpcBatch& batch, int64_t count) {
 MpcPlans MpcDriver::Store::plans() {
   return {x.data(),        u.data(),      lam.data(),     mu.data(),        objective.data(),
           residual.data(), status.data(), fragile.data(), iterations.data()};
+}
+
+void MpcDriver::reserve(const MpcBatch& batch, int64_t starts) {
+  const int64_t jobs = starts * batch.count;
+  tried.resize(batch, jobs), finished.resize(batch, jobs), best.reserve(batch.count), origin.reserve(jobs);
+}
+
+// One call of the kernel for every problem of a batch.
+void MpcDriver::run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner) const {
+  std::fill_n(solve.status, batch.count, kUnreached), std::fill_n(solve.iterations, batch.count, 0);
+  Solving context{kernels, batch, solve, 0};
+  runner.run(
+      batch.count, kernels.mpc_workspace(batch), false,
+      [](void* context, void* workspace, Watch watch) {
+        auto& c = *static_cast<Solving*>(context);
+        c.kernels.mpc_solve(c.batch, c.solve, &c.next, workspace, watch);
+      },
+      &context);
+}
+
+// Which of the solved problems have constraints that make them degenerate.
+void MpcDriver::judge_constraints(const MpcBatch& batch, const MpcSolve& results, Runner& runner) const {
+  Solving context{kernels, batch, results, 0};
+  runner.run(
+      batch.count, kernels.mpc_workspace(batch), true,
+      [](void* context, void* workspace, Watch watch) {
+        auto& c = *static_cast<Solving*>(context);
+        constexpr int64_t block = 64;
+        for (int64_t i; (i = __atomic_fetch_add(&c.next, block, __ATOMIC_RELAXED)) < c.batch.count;)
+          c.kernels.mpc_constraints(c.batch, c.solve, i, std::min(c.batch.count, i + block), workspace, watch);
+      },
+      &context);
 }
 
 void MpcDriver::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
