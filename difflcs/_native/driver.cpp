@@ -12,22 +12,22 @@ enum class Actions { none, best, mirrored, random };
 
 struct Start {
   Actions actions;
-  bool released;  // see MpcStart
-  double first;   // first relaxation, in parts of the square of the problem's scale
+  bool released, gauss_newton;  // see MpcStart
+  double first;                 // first relaxation, in parts of the square of the problem's scale
 };
 
 // The sequence of starts. A long homotopy leads most actions to one optimum, which is often the best; a short one stays
 // near where it begins. What lies opposite of the best plan so far, in the middle of the bounds mirrored, is another
 // way round the contacts more often than random actions are.
 Start start_of(int64_t i) {
-  constexpr Start first[] = {{Actions::none, true, 1.0},
-                             {Actions::none, true, 1e-3},
-                             {Actions::mirrored, false, 0.01},
-                             {Actions::best, false, 1.0}};
-  constexpr Start then[] = {{Actions::random, false, 0.03},
-                            {Actions::random, false, 1.0},
-                            {Actions::mirrored, false, 0.1},
-                            {Actions::best, false, 10.0}};
+  constexpr Start first[] = {{Actions::none, true, false, 1.0},
+                             {Actions::none, true, true, 1e-3},
+                             {Actions::mirrored, false, false, 0.01},
+                             {Actions::best, false, false, 1.0}};
+  constexpr Start then[] = {{Actions::random, false, false, 0.03},
+                            {Actions::random, false, false, 1.0},
+                            {Actions::mirrored, false, false, 0.1},
+                            {Actions::best, false, false, 10.0}};
   return i < 4 ? first[i] : then[i % 4];
 }
 
@@ -176,7 +176,7 @@ void MpcDriver::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start,
   const Sizes n(b);
   const Start s = start_of(start);
   const double least = b.relaxation * std::max(effort.homotopy, 1.0);
-  tried.start[job] = {s.released, effort.homotopy > 0 ? 0.0 : s.first, least};
+  tried.start[job] = {s.released, s.gauss_newton, effort.homotopy > 0 ? 0.0 : s.first, least};
   double* u = tried.u.data() + job * n.u;
   const double* from = best >= 0 ? tried.u.data() + best * n.u : nullptr;
   double reach = 1.0;  // of actions without bounds
@@ -221,7 +221,7 @@ void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
     const double least = batch.relaxation * (guessed ? 1.0 : std::max(effort.homotopy, 1.0));
     for (int64_t e = 0; e < count; e++) {
       tried.element[e] = element(e);
-      tried.start[e] = {!guessed && s.released, guessed || effort.homotopy > 0 ? 0.0 : s.first, least};
+      tried.start[e] = {!guessed && s.released, false, guessed || effort.homotopy > 0 ? 0.0 : s.first, least};
     }
     MpcBatch jobs = batch;
     jobs.count = count, jobs.element = tried.element.data();
@@ -247,7 +247,7 @@ void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
     for (int64_t j = begun * count; j < end * count; j++) {
       const int64_t e = j % count;
       if (from_guess) {
-        tried.start[j] = {false, 0.0, batch.relaxation};
+        tried.start[j] = {false, false, 0.0, batch.relaxation};
         std::copy_n(guess.u + (first + e) * n.u, n.u, tried.u.data() + j * n.u);
         if (whole) std::copy_n(guess.lam + (first + e) * n.lam, n.lam, tried.lam.data() + j * n.lam);
         if (whole) std::copy_n(guess.mu + (first + e) * n.mu, n.mu, tried.mu.data() + j * n.mu);
@@ -279,7 +279,8 @@ void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
   for (int64_t j = 0; j < effort.starts * count; j++) {
     if (tried.status[j] == kUnreached || !promising(batch, j, best[j % count])) continue;
     copy_plan(n, tried.plans(), j, finished.plans(), kept);
-    origin[kept] = j, finished.element[kept] = tried.element[j], finished.start[kept] = {false, 0.0, batch.relaxation};
+    origin[kept] = j, finished.element[kept] = tried.element[j],
+    finished.start[kept] = {false, false, 0.0, batch.relaxation};
     kept++;
   }
   MpcBatch jobs = batch;
@@ -338,7 +339,7 @@ void MpcDriver::again(const MpcBatch& batch, const MpcEffort& effort, const MpcP
   tried.resize(batch, count);
   for (int64_t i = 0; i < count; i++) {
     tried.element[i] = batch.element ? batch.element[origin[i]] : origin[i];
-    tried.start[i] = {false, 0.0, batch.relaxation * kLonger * std::max(effort.homotopy / 100.0, 1.0)};
+    tried.start[i] = {false, false, 0.0, batch.relaxation * kLonger * std::max(effort.homotopy / 100.0, 1.0)};
   }
   MpcBatch jobs = batch;
   jobs.count = count, jobs.element = tried.element.data(), jobs.pivot = pivot;

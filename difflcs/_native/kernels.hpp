@@ -60,7 +60,8 @@ struct MpcBatch {
 struct MpcStart {
   // Whether the actions are first replaced by the feedback law of the problem without contact, rolled out with it.
   bool released;
-  double first;  // first relaxation, in parts of the square of the problem's own scale; never below `at_least`
+  bool gauss_newton;  // without the second derivative of the forces
+  double first;       // first relaxation, in parts of the square of the problem's own scale; never below `at_least`
   double at_least;
 };
 
