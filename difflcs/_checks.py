@@ -56,21 +56,25 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
         raise DTypeError(f"{name}: expected a torch.Tensor, got {describe(value)}; wrap it with torch.as_tensor(...)")
     if value.dtype not in FLOATS:
         raise DTypeError(f"{name}: expected float32 or float64, got {describe(value)}; convert it with {name}.double()")
-    if value.device.type not in _USABLE_DEVICES:
+    if not value.is_cpu and value.device.type not in _USABLE_DEVICES:
         raise DeviceError(f"{name}: expected a tensor with data, got {describe(value)}; move it with {name}.to('cpu')")
-    wanted = tuple(size for _, size in dims)
-    if value.ndim < len(dims) or tuple(value.shape[value.ndim - len(dims) :]) != wanted:
+    if dims and not _ends_in(value.shape, dims):
         labels = ", ".join(["..."] + [f"{label}={size}" for label, size in dims])
         raise ShapeError(
             f"{name}: expected shape ({labels}), got {tuple(value.shape)}; reshape it or rebuild the model"
         )
-    if finite and not is_wrapped(value) and not _all_finite(value.detach()):
+    if finite and not is_wrapped(value) and not _all_finite(value.detach() if value.requires_grad else value):
         bad = torch.nonzero(~torch.isfinite(value.detach()))
         raise NonFiniteError(
             f"{name}: expected finite numbers, got {len(bad)} NaN or infinite of {value.numel()}, "
             f"the first at index {tuple(bad[0].tolist())}; find where they come from before solving"
         )
     return value
+
+
+def _ends_in(shape: torch.Size, dims: Sequence[tuple[str, int]]) -> bool:
+    own = len(shape) - len(dims)
+    return own >= 0 and all(shape[own + i] == size for i, (_, size) in enumerate(dims))
 
 
 def _all_finite(value: Tensor) -> bool:

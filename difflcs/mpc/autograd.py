@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -22,14 +22,14 @@ from difflcs._fields import check_not_nan
 from difflcs._functorch import transforms_active
 from difflcs.errors import DegenerateWarning, DoubleBackwardError
 from difflcs.mpc.backends.base import Backend, Result
+from difflcs.mpc.gather import RANKS
 from difflcs.mpc.problem import INPUTS, MAY_BE_INFINITE, MPCProblem
 from difflcs.mpc.solution import Primal
-from difflcs.status import Status
+from difflcs.status import Status, all_converged
 
 # What a call gives to the node, in this order; None for what it leaves out.
 ARGUMENTS = (*INPUTS, "constant", *(f"guess.{name}" for name in Primal._fields))
 _COUNT = len(INPUTS) + 1  # those that are differentiable
-_RANKS = {**{name: len(dims) for name, dims in INPUTS.items()}, "constant": 0}
 _SYMMETRIC = ("Q", "R", "Q_final")
 _COST = ("Q", "R", "S", "Q_final", "q", "r", "q_final", "constant")
 
@@ -55,6 +55,9 @@ class Plan:
         batch: batch dimensions that all inputs broadcast to; vmap adds its own in front.
         own: whether the outputs must have memory of their own, because a backward pass may follow.
         unseen: whether nothing has looked at the numbers yet, because the inputs were made under a transform.
+        before: a problem that shares the numbers of the inputs `known` with this one.
+        known: names of inputs that need not be looked at.
+        private: names of inputs whose numbers the problem copies, so that nobody can change them.
         problem, result: what was solved, and how; once it is.
     """
 
@@ -68,6 +71,9 @@ class Plan:
     batch: tuple[int, ...]
     own: bool
     unseen: bool
+    before: MPCProblem | None = None
+    known: Collection[str] = ()
+    private: Collection[str] = ()
     problem: MPCProblem = field(init=False)
     result: Result = field(init=False)
 
@@ -78,9 +84,11 @@ class Plan:
         """
         values = self._values(tensors[:_COUNT])
         constant = values.pop("constant").expand(self._size).contiguous()
-        self.problem = problem = MPCProblem(
-            **values, horizon=self.horizon, relaxation=self.relaxation, barrier=self.barrier
-        )
+        if self.before is None:
+            problem = MPCProblem(**values, horizon=self.horizon, relaxation=self.relaxation, barrier=self.barrier)
+        else:
+            problem = self.before.changed(values)
+        self.problem = problem
         result = self.backend.solve(problem, self._guess(tensors[_COUNT:]))
         objective = problem.objective(result.primal.x, result.primal.u)
         # Of a failed element the numbers can be so large that products of them are none.
@@ -109,13 +117,13 @@ class Plan:
 
     def rank(self, name: str) -> int:
         """Number of dimensions of an input behind those of the batch."""
-        return _RANKS[name] + (name in self.by_stage)
+        return RANKS[name] + (name in self.by_stage)
 
     def _values(self, tensors: Sequence[Tensor | None]) -> dict[str, Tensor]:
         """Name → numbers as `MPCProblem` wants them; checked, as far as nobody did before."""
         values, size = {}, self._size
         for name, tensor in zip(ARGUMENTS, tensors, strict=False):
-            if tensor is None:
+            if tensor is None or name in self.known:
                 continue
             value = tensor.detach()
             if value.dtype != torch.float64 or value.device.type != "cpu":
@@ -138,7 +146,7 @@ class Plan:
                     check_not_nan(name, value)
             elif self.unseen or name in _COST:
                 check_tensor(name, value)
-            values[name] = value.contiguous()
+            values[name] = value.clone() if name in self.private else value.contiguous()
         if self.unseen:
             check_positive_definite(values["F"])
         return values
@@ -216,7 +224,9 @@ _X0 = ARGUMENTS.index("x0")
 
 
 def solve(plan: Plan, tensors: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
-    """The outputs of `Plan.solve`, as nodes of the graph, without the empty one."""
+    """The outputs of `Plan.solve`, as nodes of the graph if there is one, without the empty one."""
+    if not plan.own and not plan.unseen:
+        return plan.solve(tensors)[:-1]
     # The style with `setup_context`, which transforms need, costs 20 µs more a call: it reads a signature each time.
     function = _Transformed if transforms_active() else _Eager
     return function.apply(plan, *tensors)[:-1]  # pyright: ignore[reportOptionalSubscript]
@@ -351,6 +361,8 @@ def _within_range(result: Result, objective: Tensor, constant: Tensor, dtype: to
     """Elements whose numbers `dtype` cannot hold become NUMERICAL; those that failed get numbers that it can."""
     largest = torch.finfo(dtype).max
     total = objective + constant
+    if dtype == torch.float64 and all_converged(result.status) and math.isfinite(total.sum()):
+        return result, objective
     held = total.abs() <= largest
     if dtype != torch.float64:
         for value in result.primal:

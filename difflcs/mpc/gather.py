@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_same_device, check_tensor, describe
+from difflcs._recall import Recall, worth_keeping
 from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds, as_bound
 from difflcs.cost import CostSequence, GoalCost, QuadraticCost
 from difflcs.errors import DTypeError, ShapeError
 from difflcs.lcs import SYSTEM, LCSModule, LCSParams, LCSSequence
-from difflcs.mpc.problem import INPUTS
+from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.mpc.solution import MPCSolution, Primal
+
+RANKS = {**{name: len(dims) for name, dims in INPUTS.items()}, "constant": 0}
+"""Number of dimensions of each input of a call behind those of the batch and of the stages."""
 
 Bound = float | Tensor
 System = LCSModule | LCSParams | LCSSequence
@@ -62,14 +67,36 @@ def check_stage_bounds(bounds: object, **plain: object) -> StageBounds:
     return bounds
 
 
+@dataclass(frozen=True)
+class Planned:
+    """A problem that was planned before.
+
+    Attributes:
+        form: settings of the layer, and what its inputs were without their numbers.
+        problem: its numbers, in memory of its own.
+    """
+
+    form: tuple
+    problem: MPCProblem
+
+
 @dataclass
 class Inputs:
-    """The tensors of one call by the names of `MPCProblem`, with the cost's constant; and which are by stage."""
+    """The tensors of one call by the names of `MPCProblem`, with the cost's constant; and which are by stage.
+
+    Attributes:
+        horizon: stages of the plan.
+        tensors: name → tensor as the caller gave it.
+        by_stage: names of the inputs with a dimension of stages.
+        sizes: n_x, n_u, n_lam, n_c.
+        known: name → copy, of the inputs whose numbers are those of an earlier problem, see `recall`.
+    """
 
     horizon: int
     tensors: dict[str, Tensor] = field(default_factory=dict)
     by_stage: set[str] = field(default_factory=set)
     sizes: dict[str, int] = field(default_factory=dict)
+    known: Mapping[str, Tensor] = field(default_factory=dict)
 
     def add_system(self, lcs: System, x0: Tensor, context: Tensor | None) -> None:
         """The matrices, asked for at these states if it is a module."""
@@ -149,14 +176,44 @@ class Inputs:
         self.sizes["n_c"] = constraints.n_c
         self.tensors.update(constraints.tensors())
 
+    def recall(self, planned: Recall[Planned], settings: tuple) -> MPCProblem | None:
+        """An earlier problem with the same settings, some of whose inputs are these; `known` becomes which."""
+        kept, same = planned.find(self.tensors)
+        if kept is None or kept.value.form != self._form(settings):
+            return None
+        self.known = {name: kept.copies[name] for name in same}
+        return kept.value.problem
+
+    def keep(self, planned: Recall[Planned], settings: tuple, problem: MPCProblem, new: Mapping[str, Tensor]) -> None:
+        """Keep a problem for `recall`, of the inputs that are known and of new ones."""
+        planned.keep(Planned(self._form(settings), problem), new, self.known)
+
+    def new(self) -> dict[str, Tensor]:
+        """Inputs that are not known and might be at the next call: small, shared by the batch, not at the state."""
+        return {
+            name: tensor
+            for name, tensor in self._fresh().items()
+            if name not in ("x0", "constant") and not self._lead(name, tensor) and worth_keeping(tensor)
+        }
+
     def batch(self) -> torch.Size:
         """Common batch dimensions; a clear error where devices or batch dimensions do not fit."""
+        fresh = self._fresh()  # what is known is on the CPU and shared
+        found = {self._lead(name, tensor) for name, tensor in fresh.items()} - {torch.Size()}
+        if len(found) <= 1 and all(tensor.is_cpu for tensor in fresh.values()):
+            return found.pop() if found else torch.Size()
         check_same_device(reversed(self.tensors.items()))
-        leading = []
-        for name, tensor in self.tensors.items():
-            own = len(INPUTS.get(name, ())) + (name in self.by_stage)
-            leading.append((name, tensor.shape[: tensor.ndim - own]))
-        return broadcast_batch(reversed(leading))
+        return broadcast_batch((name, self._lead(name, tensor)) for name, tensor in reversed(self.tensors.items()))
+
+    def _fresh(self) -> dict[str, Tensor]:
+        return {name: tensor for name, tensor in self.tensors.items() if name not in self.known}
+
+    def _lead(self, name: str, tensor: Tensor) -> torch.Size:
+        """Batch dimensions of an input."""
+        return tensor.shape[: tensor.ndim - RANKS[name] - (name in self.by_stage)]
+
+    def _form(self, settings: tuple) -> tuple:
+        return (*settings, tuple(self.tensors), frozenset(self.by_stage))
 
     def guess(self, guess: MPCSolution | Primal | None, batch: torch.Size) -> tuple[Tensor | None, ...]:
         """x, u, lam and mu of a guess; mu where it has some."""

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor
 from difflcs._functorch import runs_eagerly, transforms_active
+from difflcs._recall import Recall
 from difflcs.constraints import StageBounds, as_bound, check_bounds
 from difflcs.cost import CostSequence
 from difflcs.errors import DegenerateWarning, SolveError, SolveWarning
@@ -21,6 +22,7 @@ from difflcs.mpc.gather import (
     Constraints,
     Cost,
     Inputs,
+    Planned,
     System,
     check_constraints,
     check_cost,
@@ -29,7 +31,7 @@ from difflcs.mpc.gather import (
 )
 from difflcs.mpc.problem import INPUTS
 from difflcs.mpc.solution import MPCSolution, Primal
-from difflcs.status import Status, solved
+from difflcs.status import Status, all_converged, solved
 
 
 class LCSMPCLayer(nn.Module):
@@ -107,6 +109,7 @@ class LCSMPCLayer(nn.Module):
                 self.register_buffer(name, value, persistent=False)
         self._check_parts()
         self._warned = False
+        self._planned: Recall[Planned] = Recall()
 
     def _check_parts(self) -> None:
         """What does not depend on a call is refused before the first one."""
@@ -183,29 +186,37 @@ class LCSMPCLayer(nn.Module):
         inputs.add_constraints(self.constraints if constraints is None else check_constraints(constraints))
         inputs.tensors["x0"] = x0
         tensors = inputs.tensors
+        smooth = self.training_relaxation if self.training else None
+        settings = (self.horizon, self.relaxation if smooth is None else smooth, self.barrier)
+        unseen = transforms_active()
+        needs_grad = torch.is_grad_enabled() and (unseen or any(t.requires_grad for t in tensors.values()))
+        before = None if unseen else inputs.recall(self._planned, settings)
         batch = inputs.batch()
         start = inputs.guess(guess, batch)
-        values = tensors.values()
-        smooth = self.training_relaxation if self.training else None
-        unseen = transforms_active()
-        needs_grad = torch.is_grad_enabled() and (unseen or any(t.requires_grad for t in values))
+        # With gradients the inputs change from call to call, so that nothing is worth keeping.
+        new = {} if needs_grad or unseen else inputs.new()
         plan = Plan(
-            backend=self.backend,
-            horizon=self.horizon,
-            relaxation=self.relaxation if smooth is None else smooth,
-            barrier=self.barrier,
+            self.backend,
+            *settings,
             by_stage=frozenset(inputs.by_stage),
             dtype=x0.dtype,
-            smallest=torch.float32 if any(t.dtype == torch.float32 for t in values) else torch.float64,
+            smallest=torch.float32 if any(t.dtype == torch.float32 for t in tensors.values()) else torch.float64,
             batch=batch,
             own=needs_grad,
             unseen=unseen,
+            before=before,
+            known=inputs.known,
+            private=new,
         )
         outputs = solve(plan, [*(tensors.get(name) for name in INPUTS), tensors["constant"], *start])
+        if new:
+            inputs.keep(self._planned, settings, plan.problem, new)
         self._report(plan.result.status, needs_grad)
         return MPCSolution(*outputs, problem=plan.problem)
 
     def _report(self, status: Tensor, needs_grad: bool) -> None:
+        if all_converged(status):
+            return
         degenerate = int((status == Status.DEGENERATE).sum())
         failed = torch.nonzero(~solved(status)).squeeze(-1).tolist()
         if degenerate and needs_grad:

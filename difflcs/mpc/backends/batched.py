@@ -14,9 +14,9 @@ from difflcs._checks import check_number, check_positive_int, check_threads
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.mpc import kkt
 from difflcs.mpc.backends.base import Backend, Result
-from difflcs.mpc.problem import INPUTS, MPCProblem
+from difflcs.mpc.problem import INPUTS, MPCProblem, array
 from difflcs.mpc.solution import Primal
-from difflcs.status import Status, solved
+from difflcs.status import Status, all_converged, solved
 
 # An iteration with row exchanges takes ten times as long, and what it can mend it mends soon.
 _MAX_ITER_PIVOT = 60
@@ -90,6 +90,20 @@ class BatchedBackend(Backend):
         ends = started + (self.time_limit or np.inf)
         first = problem.relaxation * (self.homotopy if guess is None else 1.0)
         best = self._run(problem, guess, first, ends)
+        if self.restarts > 1:
+            best = self._from_other_starts(problem, best, ends)
+        best = self._second_chance(problem, best, ends)
+        seconds = (time.perf_counter() - started) / max(problem.batch, 1)
+        return BatchedResult(
+            best.primal(problem),
+            best.status,
+            best.iterations,
+            best.residual.clamp_max(torch.finfo(torch.float64).max),
+            torch.full((problem.batch,), seconds, dtype=torch.float64),
+            fragile=best.fragile.bool(),
+        )
+
+    def _from_other_starts(self, problem: MPCProblem, best: _Found, ends: float) -> _Found:
         generator = np.random.default_rng(self.seed)
         for _ in range(1, self.restarts):
             # The homotopy of a cold start leads most starts to one optimum; a short one keeps them apart.
@@ -99,16 +113,7 @@ class BatchedBackend(Backend):
             if time.perf_counter() < ends:
                 again = self._run(problem, start, problem.relaxation * min(self.homotopy, 10.0), ends)
                 best = best.better(again)
-        best = self._second_chance(problem, best, ends)
-        seconds = torch.full((problem.batch,), (time.perf_counter() - started) / max(problem.batch, 1))
-        return BatchedResult(
-            best.primal(problem),
-            best.status,
-            best.iterations,
-            best.residual.clamp_max(torch.finfo(torch.float64).max),
-            seconds.double(),
-            fragile=best.fragile.bool(),
-        )
+        return best
 
     def vjp(
         self, problem: MPCProblem, result: Result, grads: tuple[Tensor, Tensor, Tensor, Tensor], solved: Tensor
@@ -126,9 +131,9 @@ class BatchedBackend(Backend):
         self, problem: MPCProblem, result: Result, grads: tuple[Tensor, ...], solved: Tensor, pivot: bool
     ) -> dict[str, Tensor]:
         gradients = {name: torch.empty_like(getattr(problem, name)) for name in INPUTS}
-        x, u, lam, mu, x_bar, u_bar, lam_bar, objective_bar = (_array(v) for v in (*result.primal, *grads))
+        x, u, lam, mu, x_bar, u_bar, lam_bar, objective_bar = (array(v) for v in (*result.primal, *grads))
         _kernels.vjp_mpc(
-            inputs=_inputs(problem),
+            inputs=problem.arrays,
             horizon=problem.horizon,
             relaxation=problem.relaxation,
             barrier=problem.barrier,
@@ -153,6 +158,8 @@ class BatchedBackend(Backend):
         Then, where the numbers broke down and not the patience, with row exchanges in the elimination of λ.
         """
         for pivot in (False, True):
+            if all_converged(found.status):
+                break
             failed = ~found.solved
             if pivot:
                 failed &= (found.status == Status.NUMERICAL) | found.fragile.bool()
@@ -179,25 +186,25 @@ class BatchedBackend(Backend):
         batch, horizon = problem.batch, problem.horizon
         guess = start if isinstance(start, Primal) else None
         u = start.u if isinstance(start, Primal) else start
-        found = _Found(
-            x=torch.empty(batch, horizon + 1, problem.n_x, dtype=torch.float64),
-            u=torch.empty(batch, horizon, problem.n_u, dtype=torch.float64),
-            lam=torch.empty(batch, horizon, problem.n_lam, dtype=torch.float64),
-            mu=torch.empty(batch, horizon + 1, problem.n_c, dtype=torch.float64),
-            objective=torch.empty(batch, dtype=torch.float64),
-            residual=torch.empty(batch, dtype=torch.float64),
-            status=torch.empty(batch, dtype=torch.int8),
-            fragile=torch.empty(batch, dtype=torch.int8),
-            iterations=torch.empty(batch, dtype=torch.int32),
-        )
+        outputs = {
+            "x": np.empty((batch, horizon + 1, problem.n_x)),
+            "u": np.empty((batch, horizon, problem.n_u)),
+            "lam": np.empty((batch, horizon, problem.n_lam)),
+            "mu": np.empty((batch, horizon + 1, problem.n_c)),
+            "objective": np.empty(batch),
+            "residual": np.empty(batch),
+            "status": np.empty(batch, np.int8),
+            "fragile": np.empty(batch, np.int8),
+            "iterations": np.empty(batch, np.int32),
+        }
         _kernels.solve_mpc(
-            inputs=_inputs(problem),
+            inputs=problem.arrays,
             horizon=horizon,
             relaxation=problem.relaxation,
             barrier=problem.barrier,
-            u_start=None if u is None else _array(u),
-            lam_start=None if guess is None else _array(guess.lam),
-            mu_start=None if guess is None else _array(guess.mu),
+            u_start=None if u is None else array(u),
+            lam_start=None if guess is None else array(guess.lam),
+            mu_start=None if guess is None else array(guess.mu),
             first_relaxation=first,
             shrink=self.shrink,
             tol=self.tol,
@@ -206,9 +213,9 @@ class BatchedBackend(Backend):
             pivot=pivot,
             time_limit=max(ends - time.perf_counter(), 0.0),
             threads=self._threads(),
-            **{name: value.numpy() for name, value in found.tensors().items()},  # pyright: ignore[reportArgumentType]
+            **outputs,
         )
-        return found
+        return _Found(**{name: torch.from_numpy(value) for name, value in outputs.items()})
 
 
 @dataclass
@@ -251,7 +258,7 @@ class _Found:
 
     def primal(self, problem: MPCProblem) -> Primal:
         """The trajectories, those that failed with finite numbers inside the bounds."""
-        failed = torch.nonzero(~self.solved).squeeze(-1)
+        failed = [] if all_converged(self.status) else torch.nonzero(~self.solved).squeeze(-1)
         if len(failed):
             part = problem.select(failed)
             self.u[failed] = part.clip(torch.nan_to_num(self.u[failed], posinf=0.0, neginf=0.0))
@@ -267,11 +274,3 @@ def _span(problem: MPCProblem, found: _Found) -> tuple[Tensor, Tensor]:
         return low, high
     reach = 1.0 + found.u.abs().nan_to_num(posinf=0.0).amax((1, 2), keepdim=True)
     return torch.maximum(low, -reach), torch.minimum(high, reach)
-
-
-def _inputs(problem: MPCProblem) -> list[np.ndarray]:
-    return [_array(getattr(problem, name)) for name in INPUTS]
-
-
-def _array(value: Tensor) -> np.ndarray:
-    return value.contiguous().numpy()
