@@ -92,15 +92,18 @@ class BatchedBackend(Backend):
         best = self._run(problem, guess, first, ends)
         if self.restarts > 1:
             best = self._from_other_starts(problem, best, ends)
-        best = self._second_chance(problem, best, ends)
+        if not all_converged(best.status):
+            best = self._second_chance(problem, best, ends)
+            best.mend(problem)
         seconds = (time.perf_counter() - started) / max(problem.batch, 1)
         return BatchedResult(
-            best.primal(problem),
+            Primal(best.x, best.u, best.lam, best.mu),
             best.status,
             best.iterations,
-            best.residual.clamp_max(torch.finfo(torch.float64).max),
+            best.residual,
             torch.full((problem.batch,), seconds, dtype=torch.float64),
-            fragile=best.fragile.bool(),
+            objective=best.objective,
+            fragile=best.fragile,
         )
 
     def _from_other_starts(self, problem: MPCProblem, best: _Found, ends: float) -> _Found:
@@ -158,11 +161,9 @@ class BatchedBackend(Backend):
         Then, where the numbers broke down and not the patience, with row exchanges in the elimination of λ.
         """
         for pivot in (False, True):
-            if all_converged(found.status):
-                break
             failed = ~found.solved
             if pivot:
-                failed &= (found.status == Status.NUMERICAL) | found.fragile.bool()
+                failed &= (found.status == Status.NUMERICAL) | found.fragile
             index = torch.nonzero(failed).squeeze(-1)
             if not len(index) or time.perf_counter() >= ends:
                 break
@@ -215,7 +216,9 @@ class BatchedBackend(Backend):
             threads=self._threads(),
             **outputs,
         )
-        return _Found(**{name: torch.from_numpy(value) for name, value in outputs.items()})
+        found = _Found(**{name: torch.from_numpy(value) for name, value in outputs.items()})
+        found.fragile = found.fragile.view(torch.bool)  # zeros and ones
+        return found
 
 
 @dataclass
@@ -256,15 +259,15 @@ class _Found:
         }
         return _Found(**{**chosen, "iterations": self.iterations + other.iterations})
 
-    def primal(self, problem: MPCProblem) -> Primal:
-        """The trajectories, those that failed with finite numbers inside the bounds."""
-        failed = [] if all_converged(self.status) else torch.nonzero(~self.solved).squeeze(-1)
-        if len(failed):
-            part = problem.select(failed)
-            self.u[failed] = part.clip(torch.nan_to_num(self.u[failed], posinf=0.0, neginf=0.0))
-            for value in (self.x, self.lam, self.mu):
-                value[failed] = torch.nan_to_num(value[failed])
-        return Primal(self.x, self.u, self.lam, self.mu)
+    def mend(self, problem: MPCProblem) -> None:
+        """Finite numbers for what failed, actions inside the bounds."""
+        failed = torch.nonzero(~self.solved).squeeze(-1)
+        if not len(failed):
+            return
+        self.u[failed] = problem.select(failed).clip(torch.nan_to_num(self.u[failed], posinf=0.0, neginf=0.0))
+        for value in (self.x, self.lam, self.mu):
+            value[failed] = torch.nan_to_num(value[failed])
+        self.residual = self.residual.clamp_max(torch.finfo(torch.float64).max)
 
 
 def _span(problem: MPCProblem, found: _Found) -> tuple[Tensor, Tensor]:
