@@ -73,8 +73,14 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
 
 
 def _ends_in(shape: torch.Size, dims: Sequence[tuple[str, int]]) -> bool:
-    own = len(shape) - len(dims)
-    return own >= 0 and all(shape[own + i] == size for i, (_, size) in enumerate(dims))
+    at = len(shape) - len(dims)
+    if at < 0:
+        return False
+    for _, size in dims:
+        if shape[at] != size:
+            return False
+        at += 1
+    return True
 
 
 def _all_finite(value: Tensor) -> bool:

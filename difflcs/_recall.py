@@ -16,40 +16,60 @@ import torch
 from torch import Tensor
 
 T = TypeVar("T")
+_NONE: Mapping[str, Tensor] = MappingProxyType({})
 
 MOST_NUMBERS = 4096
 """Of a tensor that is kept: it would take as long to compare larger ones as to check and prepare them again."""
 
 
 class Kept(NamedTuple, Generic[T]):
-    """A value, copies of the tensors that it was made of, and whether that was in inference mode."""
+    """A value with the numbers that it was made of.
+
+    Attributes:
+        value: what was made.
+        copies: name → copy of a tensor that it was made of.
+        inference: whether that was in inference mode.
+    """
 
     value: T
     copies: Mapping[str, Tensor]
     inference: bool
 
+    def same(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Name → copy of those tensors that hold the same numbers as then."""
+        return {
+            name: copy
+            for name, copy in self.copies.items()
+            if name in tensors
+            and (tensor := tensors[name]).dtype == copy.dtype
+            and tensor.is_cpu
+            and torch.equal(tensor, copy)
+        }
+
+    def holds(self, tensors: Mapping[str, Tensor]) -> bool:
+        """Whether all of these tensors hold the same numbers as then."""
+        return len(self.same(tensors)) == len(tensors)
+
 
 class Recall(Generic[T]):
-    """The last value that was kept, and the numbers that it was made of. Copies of a `Recall`, and files, are empty."""
+    """The last value that was kept. Copies of a `Recall`, and files, are empty."""
 
     def __init__(self) -> None:
         self._kept: Kept[T] | None = None
 
-    def find(self, tensors: Mapping[str, Tensor]) -> tuple[Kept[T] | None, set[str]]:
-        """What was kept, and the names of the tensors whose numbers are the same as then."""
-        kept = self._kept  # another thread may replace it meanwhile
-        # Tensors that were made in inference mode are of no use outside of it.
-        if kept is None or kept.inference != torch.is_inference_mode_enabled():
-            return None, set()
-        return kept, {name for name, copy in kept.copies.items() if name in tensors and _same(tensors[name], copy)}
+    @property
+    def kept(self) -> Kept[T] | None:
+        """What was kept, if it can be used now: what was made in inference mode is of no use outside of it."""
+        kept = self._kept
+        return None if kept is None or kept.inference != torch.is_inference_mode_enabled() else kept
 
-    def keep(self, value: T, tensors: Mapping[str, Tensor], copies: Mapping[str, Tensor] = MappingProxyType({})) -> None:
+    def keep(self, value: T, tensors: Mapping[str, Tensor], copies: Mapping[str, Tensor] = _NONE) -> None:
         """Keep a value.
 
         Args:
             value: what was made.
-            tensors: what it was made of.
-            copies: of further tensors that it was made of; those of an earlier value.
+            tensors: what it was made of, each `worth_keeping`.
+            copies: of further tensors that it was made of, from an earlier value.
         """
         own = {name: tensor.detach().clone() for name, tensor in tensors.items()}
         self._kept = Kept(value, {**copies, **own}, torch.is_inference_mode_enabled())
@@ -61,7 +81,3 @@ class Recall(Generic[T]):
 def worth_keeping(tensor: Tensor) -> bool:
     """Whether its numbers can be compared, and quickly."""
     return tensor.is_cpu and tensor.numel() <= MOST_NUMBERS
-
-
-def _same(tensor: Tensor, copy: Tensor) -> bool:
-    return tensor.dtype == copy.dtype and tensor.is_cpu and torch.equal(tensor, copy)

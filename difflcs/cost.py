@@ -297,7 +297,7 @@ class GoalCost(TensorFields):
         goal = self._goal("goal", goal, [])
         weight = horizon * self.goal_stage + self.goal_final
         return {
-            **self._weights(),
+            **self.weights(),
             "q": goal @ self.goal_to_q.mT,
             "q_final": goal @ self.goal_to_q_final.mT,
             "constant": 0.5 * (goal * (goal @ weight.mT)).sum(-1),
@@ -315,14 +315,20 @@ class GoalCost(TensorFields):
         stage, last = reference[..., :-1, :], reference[..., -1, :]
         tracked = (stage * (stage @ self.goal_stage.mT)).sum((-1, -2))
         return {
-            **self._weights(),
+            **self.weights(),
             "q": stage @ self.goal_to_q.mT,
             "q_final": last @ self.goal_to_q_final.mT,
             "constant": 0.5 * (tracked + (last * (last @ self.goal_final.mT)).sum(-1)),
         }
 
-    def _weights(self) -> dict[str, Tensor]:
-        return {"Q": self.Q, "R": self.R, "Q_final": self.Q_final, "r": self.R.new_zeros(self.n_u)}
+    def weights(self) -> dict[str, Tensor]:
+        """The fields of the cost that no goal changes."""
+        R = self.R
+        return {"Q": self.Q, "R": R, "Q_final": self.Q_final, "r": R.new_zeros(self.n_u)}
+
+    def maps(self) -> dict[str, Tensor]:
+        """What makes the other fields of a goal."""
+        return {name: getattr(self, name) for name in ("goal_to_q", "goal_to_q_final", "goal_stage", "goal_final")}
 
     def _goal(self, name: str, value: Tensor, stages: list[tuple[str, int]]) -> Tensor:
         check_tensor(name, value, [*stages, ("n_goal", self.n_goal)])

@@ -31,7 +31,7 @@ from difflcs.mpc.gather import (
 )
 from difflcs.mpc.problem import INPUTS
 from difflcs.mpc.solution import MPCSolution, Primal
-from difflcs.status import Status, all_converged, solved
+from difflcs.status import Status, solved
 
 
 class LCSMPCLayer(nn.Module):
@@ -173,7 +173,8 @@ class LCSMPCLayer(nn.Module):
         """
         system = self.lcs if lcs is None else check_system(lcs)
         check_tensor("x0", x0, [("n_x", system.n_x)])
-        inputs = Inputs(self.horizon)
+        unseen = transforms_active()
+        inputs = Inputs(self.horizon, earlier=None if unseen else self._planned.kept)
         inputs.add_system(system, x0, context)
         inputs.add_cost(self.cost if cost is None else check_cost(cost), goal, reference)
         bounds = self.bounds if bounds is None else check_stage_bounds(bounds, u_min=u_min, u_max=u_max)
@@ -188,9 +189,8 @@ class LCSMPCLayer(nn.Module):
         tensors = inputs.tensors
         smooth = self.training_relaxation if self.training else None
         settings = (self.horizon, self.relaxation if smooth is None else smooth, self.barrier)
-        unseen = transforms_active()
+        before = inputs.recall(settings)
         needs_grad = torch.is_grad_enabled() and (unseen or any(t.requires_grad for t in tensors.values()))
-        before = None if unseen else inputs.recall(self._planned, settings)
         batch = inputs.batch()
         start = inputs.guess(guess, batch)
         # With gradients the inputs change from call to call, so that nothing is worth keeping.
@@ -208,15 +208,14 @@ class LCSMPCLayer(nn.Module):
             known=inputs.known,
             private=new,
         )
-        outputs = solve(plan, [*(tensors.get(name) for name in INPUTS), tensors["constant"], *start])
+        outputs = solve(plan, [*(tensors.get(name) for name in INPUTS), tensors.get("constant"), *start])
         if new:
-            inputs.keep(self._planned, settings, plan.problem, new)
-        self._report(plan.result.status, needs_grad)
+            inputs.keep(self._planned, settings, new, plan.problem, plan.constant)
+        if not plan.result.all_converged:
+            self._report(plan.result.status, needs_grad)
         return MPCSolution(*outputs, problem=plan.problem)
 
     def _report(self, status: Tensor, needs_grad: bool) -> None:
-        if all_converged(status):
-            return
         degenerate = int((status == Status.DEGENERATE).sum())
         failed = torch.nonzero(~solved(status)).squeeze(-1).tolist()
         if degenerate and needs_grad:

@@ -219,7 +219,7 @@ class MPCProblem(SystemMatrices):
     def violation(self, x: Tensor, u: Tensor) -> Tensor:
         """Largest violation (batch,) of the constraints, soft ones too; 0 where they hold."""
         if self.n_c == 0:
-            return torch.zeros_like(x[:, 0, 0])
+            return x.new_zeros(len(x))
         return self.constraints(x, u).clamp_min(0.0).amax((1, 2))
 
     def _fines(self, x: Tensor, u: Tensor) -> Tensor:
