@@ -33,7 +33,9 @@ constexpr double kSlow = 0.1, kSlowEnd = 0.01, kSmall = 1e-4, kStays = 0.9, kRai
 // turns next to their bounds, and other multipliers end that.
 constexpr int64_t kPatience = 20;
 constexpr double kLittle = 1e-6;
-// Failed searches in a row, each with 8 times the damping, before a problem is given up.
+// The least damping that is tried, in parts of what bounds the kink of every contact.
+constexpr double kLeastDamping = 0.25;
+// Failed searches in a row, each with 4 times the damping, before a problem is given up.
 constexpr int64_t kFailures = 12;
 
 template <class T, class S>
@@ -277,11 +279,12 @@ class Solver {
   }
 
   // Armijo search along the feedback law. An accepted lane keeps its trial while the others shorten their step. Returns
-  // the lanes that moved, `step` how far.
-  Mask search(Mask frozen, Vec& step, Watch watch) {
+  // the lanes that moved, `step` how far, and `gain`, the change of the cost in parts of what a quadratic model with
+  // its minimum at the end of a full step promises.
+  Mask search(Mask frozen, Vec& step, Vec& gain, Watch watch) {
     Vec J_trial = J;
     Mask accepted = frozen;
-    step = all(1);
+    step = all(1), gain = all(0);
     for (int search = 0; search < 5; search++) {
       const Vec value = trial(step, frozen, accepted, watch);
       if (halted(watch)) break;
@@ -290,7 +293,7 @@ class Solver {
       for (int64_t i = 0; i < at.u.size(); i++)
         slope += riccati.gradient.entries[i] * (next.u.entries[i] - at.u.entries[i]);
       const Mask good = (released | (value <= J + 1e-4 * min(slope, all(0)) + 1e-13 * (1.0 + abs(J)))) & ~accepted;
-      J_trial = select(good, value, J_trial);
+      J_trial = select(good, value, J_trial), gain = select(good & (slope < 0), 2.0 * (value - J) / slope, gain);
       accepted |= good;
       if (!any(~accepted)) break;
       step = select(accepted, step, step * (search < 2 ? 0.5 : 0.25));
@@ -307,19 +310,21 @@ class Solver {
   }
 
   // Damping and homotopy after a step.
-  void advance(const MpcSolve& o, const Sweep& sweep, Mask frozen, Mask moved, Vec step) {
+  void advance(const MpcSolve& o, const Sweep& sweep, Mask frozen, Mask moved, Vec step, Vec gain) {
     const double target = batch.relaxation;
     for (int l = 0; l < kLanes; l++) {
       if (frozen[l] || released[l]) continue;
       Lane& a = lane[l];
       a.iterations++, a.in_stage++;
       a.failures = moved[l] ? 0 : a.failures + 1;
-      // Levenberg-Marquardt, in units of each action's own curvature.
+      // Levenberg-Marquardt on the kinks of the contacts (linearisation.hpp): a failed step asks for more damping, one
+      // that had to be shortened too, and one that gained what its model promised for less.
       double& reg = reinterpret_cast<double*>(&regularisation)[l];
-      if (!moved[l])
-        reg = reg * 8 > 1 ? reg * 8 : 1;
-      else if (step[l] >= 0.3)
-        reg = reg * 0.125 < 0.5 ? 0 : reg * 0.125;
+      const bool shortened = step[l] < 0.3;
+      if (!moved[l] || shortened)
+        reg = reg > 0 ? reg * (moved[l] ? 2 : 4) : kLeastDamping;
+      else if (gain[l] > 0.8 && (reg *= 0.3) < 0.2 * kLeastDamping)
+        reg = 0;
       // `steps` steps per stage of the homotopy, fewer where the stage is solved.
       if (eps[l] > target && (a.in_stage >= o.steps || sweep.projected[l] < 1e4 * o.tol || a.failures > 0)) {
         eps[l] = eps[l] * o.shrink > target ? eps[l] * o.shrink : target;
@@ -365,9 +370,9 @@ void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
     const Sweep sweep = riccati.sweep(at, {}, regularisation, stubborn);
     const Mask frozen = finish(o, sweep, counter, idle, live);
     if (live == 0) break;
-    Vec step;
-    const Mask moved = search(frozen, step, watch);
-    advance(o, sweep, frozen, moved, step);
+    Vec step, gain;
+    const Mask moved = search(frozen, step, gain, watch);
+    advance(o, sweep, frozen, moved, step, gain);
     if (any(released & ~frozen)) touch(o, released & ~frozen);
   }
   if (waiting) certificate.judge(o, finished, waiting);
