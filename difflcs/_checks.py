@@ -63,7 +63,7 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
         raise ShapeError(
             f"{name}: expected shape ({labels}), got {tuple(value.shape)}; reshape it or rebuild the model"
         )
-    if finite and not is_wrapped(value) and not _all_finite(value.detach() if value.requires_grad else value):
+    if finite and not is_wrapped(value) and not all_finite(value.detach() if value.requires_grad else value):
         bad = torch.nonzero(~torch.isfinite(value.detach()))
         raise NonFiniteError(
             f"{name}: expected finite numbers, got {len(bad)} NaN or infinite of {value.numel()}, "
@@ -83,9 +83,10 @@ def _ends_in(shape: torch.Size, dims: Sequence[tuple[str, int]]) -> bool:
     return True
 
 
-def _all_finite(value: Tensor) -> bool:
+def all_finite(value: Tensor) -> bool:
+    """Whether no number is NaN or infinite."""
     # A finite sum has finite terms, and costs a third of looking at each. Large terms can overflow it.
-    return math.isfinite(value.sum()) or bool(torch.isfinite(value).all())
+    return math.isfinite(value.sum() if value.numel() != 1 else value) or bool(torch.isfinite(value).all())
 
 
 def check_positive_definite(F: Tensor) -> None:

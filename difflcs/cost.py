@@ -92,7 +92,7 @@ class _Quadratic(TensorFields):
 
     def tensors(self) -> dict[str, Tensor]:
         """Name → tensor as it was given, with the constant; S where there is one."""
-        fields = {name: getattr(self, name) for name in _OWN}
+        fields = self._held(_OWN)
         if fields["S"] is None:
             del fields["S"]
         return fields
@@ -323,12 +323,12 @@ class GoalCost(TensorFields):
 
     def weights(self) -> dict[str, Tensor]:
         """The fields of the cost that no goal changes."""
-        R = self.R
-        return {"Q": self.Q, "R": R, "Q_final": self.Q_final, "r": R.new_zeros(self.n_u)}
+        held = self._held(("Q", "R", "Q_final"))
+        return {**held, "r": held["R"].new_zeros(self.n_u)}
 
     def maps(self) -> dict[str, Tensor]:
         """What makes the other fields of a goal."""
-        return {name: getattr(self, name) for name in ("goal_to_q", "goal_to_q_final", "goal_stage", "goal_final")}
+        return self._held(("goal_to_q", "goal_to_q_final", "goal_stage", "goal_final"))
 
     def _goal(self, name: str, value: Tensor, stages: list[tuple[str, int]]) -> Tensor:
         check_tensor(name, value, [*stages, ("n_goal", self.n_goal)])

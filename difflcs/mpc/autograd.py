@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_positive_definite, check_tensor
+from difflcs._checks import all_finite, check_positive_definite, check_tensor
 from difflcs._fields import check_not_nan
 from difflcs._functorch import transforms_active
 from difflcs.errors import DegenerateWarning, DoubleBackwardError
@@ -167,7 +167,7 @@ class Plan:
             if tensor is None:  # no multipliers
                 flat.append(self.problem.no_multipliers())
                 continue
-            value = tensor.detach()
+            value = tensor.detach() if tensor.requires_grad else tensor
             if value.dtype != torch.float64 or not value.is_cpu:
                 value = value.to("cpu", torch.float64)
             if self.unseen:
@@ -382,7 +382,7 @@ def _within_range(result: Result, objective: Tensor, constant: Tensor, dtype: to
     """
     largest = torch.finfo(dtype).max
     total = objective + constant
-    if dtype == torch.float64 and result.all_converged and math.isfinite(total.sum()):
+    if dtype == torch.float64 and result.all_converged and all_finite(total):
         return result, total
     held = total.abs() <= largest
     if dtype != torch.float64:

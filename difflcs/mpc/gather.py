@@ -261,8 +261,10 @@ class Inputs:
             if name == "mu" and (value is None or (isinstance(value, Tensor) and not value.numel())):
                 found.append(None)  # a plan without constraints is a guess for one with them
                 continue
-            check_tensor(f"guess.{name}", value, (("H+1" if stages > H else "H", stages), (size, self.sizes[size])))
-            if value.shape[:-2] != batch:
+            fits = isinstance(value, Tensor) and value.shape == (*batch, stages, self.sizes[size])
+            dims = [] if fits else [("H+1" if stages > H else "H", stages), (size, self.sizes[size])]
+            check_tensor(f"guess.{name}", value, dims)
+            if not fits:
                 raise ShapeError(
                     f"guess.{name}: expected batch dimensions {tuple(batch)} like x0, got {tuple(value.shape[:-2])}; "
                     f"expand or index it"

@@ -200,7 +200,9 @@ class LCSMPCLayer(nn.Module):
             *settings,
             by_stage=frozenset(inputs.by_stage),
             dtype=x0.dtype,
-            smallest=torch.float32 if any(t.dtype == torch.float32 for t in tensors.values()) else torch.float64,
+            smallest=torch.float32
+            if needs_grad and any(t.dtype == torch.float32 for t in tensors.values())
+            else torch.float64,
             batch=batch,
             own=needs_grad,
             unseen=unseen,

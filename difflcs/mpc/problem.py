@@ -131,7 +131,9 @@ class MPCProblem(SystemMatrices):
         other = object.__new__(MPCProblem)
         own = vars(other)
         own.update(vars(self), **values)
-        own["arrays"] = [array(values[n]) if n in values else old for n, old in zip(INPUTS, self.arrays, strict=True)]
+        own["arrays"] = arrays = self.arrays.copy()
+        for name, value in values.items():
+            arrays[_ORDER[name]] = array(value)
         other._check_numbers(values)
         return other
 
@@ -282,6 +284,7 @@ def array(value: Tensor) -> np.ndarray:
 # Differentiable inputs with the kind of each trailing dimension, in the order in which autograd and the kernels take
 # them; and how many stages each has where it is given by stage.
 INPUTS: dict[str, tuple[str, ...]] = dimensions(MPCProblem)
+_ORDER = {name: i for i, name in enumerate(INPUTS)}
 STAGES: dict[str, str] = {
     name: "H+1" if name in ("G_x", "g", "price") else "" if name in ("Q_final", "q_final", "x0") else "H"
     for name in INPUTS

@@ -113,6 +113,7 @@ class BatchedBackend(Backend):
             "fragile": np.empty(batch, np.int8),
             "iterations": np.empty(batch, np.int32),
         }
+        found = {name: torch.from_numpy(value) for name, value in outputs.items()}
         _kernels.solve_mpc(
             inputs=problem.arrays,
             horizon=horizon,
@@ -133,7 +134,6 @@ class BatchedBackend(Backend):
             **outputs,  # pyright: ignore[reportArgumentType]
         )
         seconds = np.full(batch, (time.perf_counter() - started) / max(batch, 1))
-        found = {name: torch.from_numpy(value) for name, value in outputs.items()}
         primal, status = Primal(found["x"], found["u"], found["lam"], found["mu"]), found["status"]
         if not all_converged(status):
             _make_presentable(problem, primal, status)
