@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -78,12 +78,13 @@ class Plan:
     constant: Tensor = field(init=False)
     result: Result = field(init=False)
 
-    def solve(self, tensors: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
+    def solve(self, tensors: Mapping[str, Tensor], guess: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
         """x, u, lam, mu, objective, status, iterations, kkt_residual, solve_time, violation.
 
-        Each has the batch dimensions first. Tensors in the order of `ARGUMENTS`, none of them wrapped.
+        Each has the batch dimensions first. `tensors` are the inputs by their names, `guess` is one or None four times;
+        none of them is wrapped.
         """
-        values = self._values(tensors[:_COUNT])
+        values = self._values(tensors)
         if self.before is None:
             constant = values.pop("constant")
             problem = MPCProblem(**values, horizon=self.horizon, relaxation=self.relaxation, barrier=self.barrier)
@@ -91,7 +92,7 @@ class Plan:
             constant = values.pop("constant", self.before.constant)
             problem = self.before.problem.changed(values)
         self.problem, self.constant = problem, constant
-        result = self.backend.solve(problem, self._guess(tensors[_COUNT:]))
+        result = self.backend.solve(problem, self._guess(guess))
         violation = problem.violation(result.primal.x, result.primal.u)
         if problem.n_c:  # of a failed element the numbers can be so large that products of them are none
             largest = torch.finfo(self.dtype).max
@@ -105,7 +106,7 @@ class Plan:
             primal, floats = (tuple(v.to(self.dtype) for v in values) for values in (primal, floats))
             primal = (primal[0], _inside(primal[1], problem), *primal[2:])
         outputs = (*primal, floats[0], status, result.iterations, result.kkt_residual, result.solve_time, floats[1])
-        device = tensors[_X0].device  # pyright: ignore[reportOptionalMemberAccess]
+        device = tensors["x0"].device
         if device.type != "cpu":
             outputs = tuple(v.to(device) for v in outputs)
         return outputs if len(self.batch) == 1 else tuple(v.reshape((*self.batch, *v.shape[1:])) for v in outputs)
@@ -127,11 +128,11 @@ class Plan:
         """Number of dimensions of an input behind those of the batch."""
         return RANKS[name] + (name in self.by_stage)
 
-    def _values(self, tensors: Sequence[Tensor | None]) -> dict[str, Tensor]:
+    def _values(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Name → numbers as `MPCProblem` wants them; checked, as far as nobody did before."""
         values, size = {}, self._size
-        for name, tensor in zip(ARGUMENTS, tensors, strict=False):
-            if tensor is None or name in self.known:
+        for name, tensor in tensors.items():
+            if name in self.known:
                 continue
             value = tensor.detach()
             if value.dtype != torch.float64 or value.device.type != "cpu":
@@ -232,16 +233,14 @@ class Plan:
         return gradient.reshape((*front, *shape)).to(target.device, target.dtype)
 
 
-_X0 = ARGUMENTS.index("x0")
-
-
-def solve(plan: Plan, tensors: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
+def solve(plan: Plan, tensors: Mapping[str, Tensor], guess: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
     """The outputs of `Plan.solve`, as nodes of the graph if there is one."""
     if not plan.own and not plan.unseen:
-        return plan.solve(tensors)
+        return plan.solve(tensors, guess)
     # The style with `setup_context`, which transforms need, costs 20 µs more a call: it reads a signature each time.
     function = _Transformed if transforms_active() else _Eager
-    return function.apply(plan, *tensors)[:-1]  # pyright: ignore[reportOptionalSubscript]
+    inputs = (tensors.get(name) for name in ARGUMENTS[:_COUNT])
+    return function.apply(plan, *inputs, *guess)[:-1]  # pyright: ignore[reportOptionalSubscript]
 
 
 def _keep(ctx: Any, plan: Plan, tensors: Sequence[Tensor | None], outputs: Sequence[Tensor]) -> None:
@@ -254,7 +253,8 @@ def _keep(ctx: Any, plan: Plan, tensors: Sequence[Tensor | None], outputs: Seque
 
 def _witnessed(plan: Plan, tensors: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
     """What was found, and an empty tensor."""
-    outputs = plan.solve(tensors)
+    named = {name: v for name, v in zip(ARGUMENTS, tensors[:_COUNT], strict=False) if v is not None}
+    outputs = plan.solve(named, tensors[_COUNT:])
     return *outputs, outputs[0].new_empty((*plan.batch, 0))
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_same_device, check_tensor, describe
-from difflcs._recall import Kept, Recall, worth_keeping
+from difflcs._recall import Kept, Numbers, Recall, worth_keeping
 from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds, as_bound
 from difflcs.cost import CostSequence, GoalCost, QuadraticCost
 from difflcs.errors import DTypeError, ShapeError
@@ -97,7 +97,7 @@ class Inputs:
         by_stage: names of the inputs with a dimension of stages.
         sizes: n_x, n_u, n_lam, n_c.
         goal: a goal and what maps it to a cost, where that alone makes the fields `OF_GOAL`.
-        known: name → copy, of the tensors above whose numbers the earlier problem has. Where the goal is among them,
+        known: name → numbers, of the tensors above whose numbers the earlier problem has. Where the goal is among them,
             `OF_GOAL` are not among the tensors.
     """
 
@@ -107,7 +107,7 @@ class Inputs:
     by_stage: set[str] = field(default_factory=set)
     sizes: dict[str, int] = field(default_factory=dict)
     goal: dict[str, Tensor] = field(default_factory=dict)
-    known: dict[str, Tensor] = field(default_factory=dict)
+    known: dict[str, Numbers] = field(default_factory=dict)
     _each_time: tuple[str, ...] = ("x0",)
     _late: Callable[[], dict[str, Tensor]] = dict
 

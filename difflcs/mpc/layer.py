@@ -29,7 +29,6 @@ from difflcs.mpc.gather import (
     check_stage_bounds,
     check_system,
 )
-from difflcs.mpc.problem import INPUTS
 from difflcs.mpc.solution import MPCSolution, Primal
 from difflcs.status import Status, solved
 
@@ -210,7 +209,7 @@ class LCSMPCLayer(nn.Module):
             known=inputs.known,
             private=new,
         )
-        outputs = solve(plan, [*(tensors.get(name) for name in INPUTS), tensors.get("constant"), *start])
+        outputs = solve(plan, tensors, start)
         if new:
             inputs.keep(self._planned, settings, new, plan.problem, plan.constant)
         if not plan.result.all_converged:
