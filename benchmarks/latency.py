@@ -1,7 +1,7 @@
 """How long one robot waits for its action: `python benchmarks/latency.py [--smoke]`.
 
 A loop is closed on the LCS itself, with a disturbance, and a new start and goal for each episode, so that states vary.
-At each state every way to plan takes its turn on the same problem with the same warm start, the shifted plan:
+Every way to plan then takes its turn at the same problems with the same warm starts, the shifted plans, episode by episode:
 
 - kernel: the native solver alone, its arguments ready;
 - layer: `LCSMPCLayer` without gradient, tensors in, tensors out;
@@ -20,7 +20,8 @@ import json
 import os
 import platform
 import time
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,10 +32,11 @@ import tyro
 from torch import Tensor
 
 import difflcs
-from difflcs import LCSModel, LCSMPCLayer, MPCSolution, QuadraticCost
+from difflcs import DegenerateWarning, LCSModel, LCSMPCLayer, LCSParams, MPCSolution, QuadraticCost
 from difflcs._native import _kernels
 from difflcs.bench import ACTION_LIMIT, cpu, pushing_cost, states_and_goals
 from difflcs.mpc.backends import batched
+from difflcs.mpc.solution import Primal
 from difflcs.systems import cart_pole_between_walls
 
 EPISODE = 20  # steps from one start to the next
@@ -44,10 +46,10 @@ EPISODE = 20  # steps from one start to the next
 class Options:
     """Latency of a call for one robot."""
 
-    calls: int = 5000
-    """Warm calls of each way, for each problem."""
-    warm_up: int = 100
-    """Calls before, which do not count."""
+    episodes: int = 250
+    """Episodes of 20 warm calls of each way, for each problem."""
+    warm_up: int = 5
+    """Episodes before, which do not count."""
     seed: int = 0
     """Seed of starts, goals and disturbances."""
     out: Path = Path("benchmarks/results/latency.json")
@@ -58,9 +60,10 @@ class Options:
 
 @dataclass
 class Case:
-    """One robot: its layer, starts (N, n_x), goals (N, n_goal) or None, and the disturbance of a step."""
+    """One robot: its layer and system, starts (N, n_x), goals (N, n_goal) or None, and the disturbance of a step."""
 
     mpc: LCSMPCLayer
+    lcs: LCSParams
     starts: Tensor
     goals: Tensor | None
     disturbance: float
@@ -71,17 +74,18 @@ def cart_pole(horizon: int, count: int, seed: int) -> Case:
     generator = torch.Generator().manual_seed(seed)
     weight = torch.diag(torch.tensor([10.0, 50.0, 1.0, 1.0], dtype=torch.float64))
     cost = QuadraticCost(weight, torch.eye(1, dtype=torch.float64), 5 * weight)
-    mpc = LCSMPCLayer(LCSModel.from_params(cart_pole_between_walls()), cost, horizon, -10.0, 10.0, on_failure="mask")
+    lcs = cart_pole_between_walls()
+    mpc = LCSMPCLayer(LCSModel.from_params(lcs), cost, horizon, -10.0, 10.0, on_failure="mask")
     size = torch.tensor([0.05, 0.1, 0.2, 0.2], dtype=torch.float64)
     starts = size * (2 * torch.rand(count, 4, generator=generator, dtype=torch.float64) - 1)
-    return Case(mpc, starts, None, 2e-3)
+    return Case(mpc, lcs, starts, None, 2e-3)
 
 
 def cube(horizon: int, count: int, seed: int) -> Case:
     """Push the cube with the model of the zoo, 1 mm of disturbance."""
     lcs = LCSModel.from_pretrained("trifinger-cube")
     mpc = LCSMPCLayer(lcs, pushing_cost(), horizon, -ACTION_LIMIT, ACTION_LIMIT, on_failure="mask")
-    return Case(mpc, *states_and_goals(count, seed), 1e-3)
+    return Case(mpc, lcs.params().detach(), *states_and_goals(count, seed), 1e-3)
 
 
 CASES: dict[str, Callable[[int, int], Case]] = {
@@ -108,7 +112,7 @@ class Recorder:
         return call
 
 
-def kernel_call(mpc: LCSMPCLayer, inputs: tuple[Tensor, ...], guess: Any) -> Callable[[], object]:
+def kernel_call(mpc: LCSMPCLayer, inputs: tuple[Tensor, ...], guess: Primal) -> Callable[[], object]:
     """The call of the native solver that the layer makes for a problem."""
     recorder = Recorder()
     batched._kernels = recorder  # pyright: ignore[reportAttributeAccessIssue]
@@ -119,40 +123,56 @@ def kernel_call(mpc: LCSMPCLayer, inputs: tuple[Tensor, ...], guess: Any) -> Cal
     return recorder.again
 
 
-def ways(case: Case, inputs: tuple[Tensor, ...], plan: MPCSolution, controller: Any) -> dict[str, Callable[[], Any]]:
-    """Name → call, at one state; `plan` is that of the state before."""
-    mpc, guess = case.mpc, plan.shift()
-    x = inputs[0].clone().requires_grad_()
+@dataclass
+class Step:
+    """One state of an episode: what the layer is called with, the plan of the state before, and the one found here."""
 
-    def with_gradient() -> None:
-        with torch.enable_grad():
-            mpc(x, *inputs[1:], guess=guess).action.square().sum().backward()
+    inputs: tuple[Tensor, ...]
+    before: MPCSolution
+    guess: Primal
+    plan: MPCSolution
+    kernel: Callable[[], object]
 
-    found: dict[str, Callable[[], Any]] = {
-        "kernel": kernel_call(mpc, inputs, guess),
-        "layer": lambda: mpc(*inputs, guess=guess),
-        "shift": plan.shift,
+
+def play(case: Case, episode: int, plan: MPCSolution | None, generator: torch.Generator) -> list[Step]:
+    """An episode in closed loop, after one that ended with a plan."""
+    x, steps = case.starts[episode : episode + 1].clone(), []
+    goal = () if case.goals is None else (case.goals[episode : episode + 1].clone(),)
+    for _ in range(EPISODE):
+        before = case.mpc(x, *goal) if plan is None else plan
+        guess = before.shift()
+        plan = case.mpc(x, *goal, guess=guess)
+        steps.append(Step((x, *goal), before, guess, plan, kernel_call(case.mpc, (x, *goal), guess)))
+        noise = torch.randn(x.shape, generator=generator, dtype=torch.float64)
+        x = case.lcs.step(x, plan.action).x_next + case.disturbance * noise
+    return steps
+
+
+def ways(mpc: LCSMPCLayer, controller: Any) -> dict[str, Callable[[Step], Callable[[], Any]]]:
+    """Name → the call to be timed, at a step."""
+
+    def with_gradient(step: Step) -> Callable[[], Any]:
+        x = step.inputs[0].clone().requires_grad_()
+
+        def work() -> None:
+            with torch.enable_grad():
+                mpc(x, *step.inputs[1:], guess=step.guess).action.square().sum().backward()
+
+        return work
+
+    def with_controller(step: Step) -> Callable[[], Any]:
+        arrays = [value[0].numpy() for value in step.inputs]
+        return lambda: controller.step(*arrays)
+
+    found: dict[str, Callable[[Step], Callable[[], Any]]] = {
+        "kernel": lambda step: step.kernel,
+        "layer": lambda step: lambda: mpc(*step.inputs, guess=step.guess),
+        "shift": lambda step: step.before.shift,
         "layer and gradient": with_gradient,
     }
     if controller is not None:
-        arrays = [value[0].numpy() for value in inputs]
-        found["controller"] = lambda: controller.step(*arrays)
+        found["controller"] = with_controller
     return found
-
-
-def states(case: Case, o: Options) -> Iterator[tuple[tuple[Tensor, ...], Callable[[MPCSolution], None]]]:
-    """Inputs of the layer, step by step, and what tells the plant which plan is executed."""
-    generator = torch.Generator().manual_seed(o.seed + 1)
-    lcs, x = case.mpc.lcs.params(), case.starts[:1]  # pyright: ignore[reportCallIssue]
-    for k in range(o.warm_up + o.calls):
-        episode = k // EPISODE
-        if k % EPISODE == 0:
-            x = case.starts[episode : episode + 1].clone()
-        goal = () if case.goals is None else (case.goals[episode : episode + 1].clone(),)
-        executed: list[MPCSolution] = []
-        yield (x, *goal), executed.append
-        noise = torch.randn(x.shape, generator=generator, dtype=torch.float64)
-        x = lcs.step(x, executed[0].action).x_next + case.disturbance * noise
 
 
 def timed(work: Callable[[], Any]) -> tuple[int, int, Any]:
@@ -170,24 +190,24 @@ def measure(case: Case, o: Options) -> dict[str, dict[str, float]]:
     make = getattr(mpc, "controller", None)
     if make is None:
         print("this version has no LCSMPCLayer.controller: left out")
-    controller = None if make is None else make()
-    times: dict[str, list[tuple[int, int]]] = {}
+    calls = ways(mpc, None if make is None else make())
+    times: dict[str, list[tuple[int, int]]] = {name: [] for name in calls}
     apart, unsolved, iterations, plan = 0.0, 0, [], None
-    for k, (inputs, execute) in enumerate(states(case, o)):
-        if plan is None:
-            plan = mpc(*inputs)
-        results = {}
-        for name, work in ways(case, inputs, plan, controller).items():
-            used, wall, results[name] = timed(work)
-            if k >= o.warm_up:
-                times.setdefault(name, []).append((used, wall))
-        plan = results["layer"]
-        mpc.zero_grad()
-        execute(plan)
-        unsolved += int(not bool(plan.converged))
-        iterations.append(int(plan.iterations))
-        if controller is not None and k > 0:
-            apart = max(apart, float(np.abs(results["controller"] - plan.action[0].numpy()).max()))
+    generator = torch.Generator().manual_seed(o.seed + 1)
+    for episode in range(o.warm_up + o.episodes):
+        steps = play(case, episode, plan, generator)
+        plan = steps[-1].plan
+        for name, call in calls.items():
+            for step in steps:
+                used, wall, result = timed(call(step))
+                if episode >= o.warm_up:
+                    times[name].append((used, wall))
+                    if name == "controller":
+                        apart = max(apart, float(np.abs(result - step.plan.action[0].numpy()).max()))
+            mpc.zero_grad()
+        if episode >= o.warm_up:
+            unsolved += sum(not bool(step.plan.converged) for step in steps)
+            iterations += [int(step.plan.iterations) for step in steps]
     kernel = np.array(times["kernel"]) / 1e3
     figures: dict[str, dict[str, float]] = {}
     for name, found in times.items():
@@ -207,14 +227,15 @@ def measure(case: Case, o: Options) -> dict[str, dict[str, float]]:
 def main(o: Options) -> None:
     """Measure, print, write."""
     if o.smoke:
-        o.calls, o.warm_up = 30, 10
+        o.episodes, o.warm_up = 2, 1
     torch.set_num_threads(1)
-    count = (o.calls + o.warm_up) // EPISODE + 1
+    warnings.simplefilter("ignore", DegenerateWarning)
+    count, total = o.episodes + o.warm_up, o.episodes * EPISODE
     results = {}
     for name, make in CASES.items():
         results[name] = figures = measure(make(count, o.seed), o)
         plans = figures["plans"]
-        print(f"{name}: {plans['iterations']:.1f} iterations, {plans['unsolved']:.0f} of {o.calls} not solved")
+        print(f"{name}: {plans['iterations']:.1f} iterations, {plans['unsolved']:.0f} of {total} not solved")
         for way, row in figures.items():
             if way != "plans":
                 print(
@@ -224,7 +245,7 @@ def main(o: Options) -> None:
     record = {
         "machine": {"cpu": cpu(), "cores": os.cpu_count(), "instruction set": _kernels.isa()},
         "versions": {"python": platform.python_version(), "torch": torch.__version__, "difflcs": difflcs.__version__},
-        "options": {"calls": o.calls, "warm_up": o.warm_up, "seed": o.seed},
+        "options": {"calls": total, "episodes": o.episodes, "warm_up": o.warm_up, "seed": o.seed},
         "results": results,
     }
     o.out.parent.mkdir(parents=True, exist_ok=True)

@@ -49,8 +49,9 @@ def late_actions(act: Act, n_u: int, steps: int = 1, predict: Predict | None = N
     def late(state: Tensor, goal: Tensor, *context: Tensor) -> tuple[np.ndarray, np.ndarray]:
         if not under_way:
             under_way.extend([np.zeros((len(state), n_u))] * steps)
-        for action in under_way if predict is not None else ():
-            state = predict(state, torch.from_numpy(action), *context)
+        if predict is not None:
+            for action in under_way:
+                state = predict(state, torch.from_numpy(action), *context)
         planned, failed = act(state, goal, *context)
         under_way.append(planned)
         return under_way.popleft(), failed
