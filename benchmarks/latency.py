@@ -1,7 +1,7 @@
 """How long one robot waits for its action: `python benchmarks/latency.py [--smoke]`.
 
 A loop is closed on the LCS itself, with a disturbance, and a new start and goal for each episode, so that states vary.
-Every way to plan then takes its turn at the same problems with the same warm starts, the shifted plans, episode by episode:
+Episode by episode, every way to plan takes its turn at the same problems, with the shifted plans as warm starts:
 
 - kernel: the native solver alone, its arguments ready;
 - layer: `LCSMPCLayer` without gradient, tensors in, tensors out;
@@ -32,9 +32,10 @@ import tyro
 from torch import Tensor
 
 import difflcs
-from difflcs import DegenerateWarning, LCSModel, LCSMPCLayer, LCSParams, MPCSolution, QuadraticCost
+from difflcs import LCSModel, LCSMPCLayer, LCSParams, MPCSolution, QuadraticCost
 from difflcs._native import _kernels
 from difflcs.bench import ACTION_LIMIT, cpu, pushing_cost, states_and_goals
+from difflcs.errors import DegenerateWarning
 from difflcs.mpc.backends import batched
 from difflcs.mpc.solution import Primal
 from difflcs.systems import cart_pole_between_walls
@@ -141,10 +142,10 @@ def play(case: Case, episode: int, plan: MPCSolution | None, generator: torch.Ge
     for _ in range(EPISODE):
         before = case.mpc(x, *goal) if plan is None else plan
         guess = before.shift()
-        plan = case.mpc(x, *goal, guess=guess)
-        steps.append(Step((x, *goal), before, guess, plan, kernel_call(case.mpc, (x, *goal), guess)))
+        found = plan = case.mpc(x, *goal, guess=guess)
+        steps.append(Step((x, *goal), before, guess, found, kernel_call(case.mpc, (x, *goal), guess)))
         noise = torch.randn(x.shape, generator=generator, dtype=torch.float64)
-        x = case.lcs.step(x, plan.action).x_next + case.disturbance * noise
+        x = case.lcs.step(x, found.action).x_next + case.disturbance * noise
     return steps
 
 
