@@ -37,8 +37,9 @@ def solved(status: Tensor) -> Tensor:
 
 
 def all_converged(status: Tensor) -> bool:
-    """Whether every one of some codes is CONVERGED: the quick question, before asking which are not."""
-    return not bool(status.any()) if _CONVERGED == 0 else bool((status == _CONVERGED).all())
+    """Whether every one of some codes on the CPU is CONVERGED: the quick question, before asking which are not."""
+    codes = status.numpy().tobytes()  # a tenth of the time of a reduction, where there are few
+    return codes.count(_CONVERGED) == len(codes)
 
 
 # Plain integers: torch takes 5 µs longer to compare with a member of an enumeration.

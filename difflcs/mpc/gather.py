@@ -269,7 +269,7 @@ class Inputs:
                     f"guess.{name}: expected batch dimensions {tuple(batch)} like x0, got {tuple(value.shape[:-2])}; "
                     f"expand or index it"
                 )
-            found.append(value.detach())
+            found.append(value.detach() if value.requires_grad else value)
         return tuple(found)
 
     def check_sizes(self, name: str, **found: int) -> None:

@@ -16,7 +16,7 @@ from difflcs.mpc import kkt
 from difflcs.mpc.backends.base import Backend, Result
 from difflcs.mpc.problem import INPUTS, MPCProblem, array
 from difflcs.mpc.solution import Primal
-from difflcs.status import all_converged, solved
+from difflcs.status import solved
 
 Effort = Literal["fast", "default", "best"]
 _STARTS: dict[str, int] = {"fast": 1, "default": 3, "best": 16}
@@ -113,7 +113,17 @@ class BatchedBackend(Backend):
             "fragile": np.empty(batch, np.int8),
             "iterations": np.empty(batch, np.int32),
         }
-        found = {name: torch.from_numpy(value) for name, value in outputs.items()}
+        # Whatever can be done before the kernel is: after it, Python's own code and data are no more in the cache.
+        found, seconds = {name: torch.from_numpy(value) for name, value in outputs.items()}, np.empty(batch)
+        result = BatchedResult(
+            Primal(found["x"], found["u"], found["lam"], found["mu"]),
+            found["status"],
+            found["iterations"],
+            found["residual"],
+            torch.from_numpy(seconds),
+            objective=found["objective"],
+            fragile=found["fragile"].view(torch.bool),  # zeros and ones
+        )
         _kernels.solve_mpc(
             inputs=problem.arrays,
             horizon=horizon,
@@ -133,20 +143,11 @@ class BatchedBackend(Backend):
             threads=self._threads(),
             **outputs,  # pyright: ignore[reportArgumentType]
         )
-        seconds = np.full(batch, (time.perf_counter() - started) / max(batch, 1))
-        primal, status = Primal(found["x"], found["u"], found["lam"], found["mu"]), found["status"]
-        if not all_converged(status):
-            _make_presentable(problem, primal, status)
-            found["residual"].clamp_max_(torch.finfo(torch.float64).max)
-        return BatchedResult(
-            primal,
-            status,
-            found["iterations"],
-            found["residual"],
-            torch.from_numpy(seconds),
-            objective=found["objective"],
-            fragile=found["fragile"].view(torch.bool),  # zeros and ones
-        )
+        seconds.fill((time.perf_counter() - started) / max(batch, 1))
+        if not result.all_converged:
+            _make_presentable(problem, result.primal, result.status)
+            result.kkt_residual.clamp_max_(torch.finfo(torch.float64).max)
+        return result
 
     def starts(self, guessed: bool) -> int:
         """How many starts each element gets; a guess is the first of them."""
