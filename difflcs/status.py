@@ -33,8 +33,17 @@ class Status(IntEnum):
 
 def solved(status: Tensor) -> Tensor:
     """`Status.solved` of a tensor of codes, as bool."""
-    return (status == Status.CONVERGED) | (status == Status.DEGENERATE)
+    return (status == _CONVERGED) | (status == _DEGENERATE)
 
+
+def all_converged(status: Tensor) -> bool:
+    """Whether every one of some codes on the CPU is CONVERGED: the quick question, before asking which are not."""
+    codes = status.numpy().tobytes()  # a tenth of the time of a reduction, where there are few
+    return codes.count(_CONVERGED) == len(codes)
+
+
+# Plain integers: torch takes 5 µs longer to compare with a member of an enumeration.
+_CONVERGED, _DEGENERATE = int(Status.CONVERGED), int(Status.DEGENERATE)
 
 _ADVICE = {
     Status.CONVERGED: "the solution meets the tolerance",
