@@ -6,6 +6,7 @@ from enum import IntEnum
 
 from torch import Tensor
 
+from difflcs._functorch import is_wrapped
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 
 _CODES = _kernels.status_codes()
@@ -38,6 +39,8 @@ def solved(status: Tensor) -> Tensor:
 
 def all_converged(status: Tensor) -> bool:
     """Whether every one of some codes on the CPU is CONVERGED: the quick question, before asking which are not."""
+    if is_wrapped(status):
+        return bool((status == _CONVERGED).all())
     codes = status.numpy().tobytes()  # a tenth of the time of a reduction, where there are few
     return codes.count(_CONVERGED) == len(codes)
 

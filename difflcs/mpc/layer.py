@@ -213,7 +213,7 @@ class LCSMPCLayer(nn.Module):
         outputs = solve(plan, tensors, start)
         if new:
             inputs.keep(self._planned, settings, new, plan.problem, plan.constant)
-        if not plan.result.all_converged:
+        if unseen or not plan.result.all_converged:
             self._report(plan.result.status, needs_grad)
         return MPCSolution(*outputs, problem=plan.problem)
 
