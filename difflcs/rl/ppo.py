@@ -346,9 +346,9 @@ class PPO(Trainer):
     ) -> _Improvement:
         """Gradient steps on the combined loss (Eq. total_loss), until the KL divergence is used up."""
         outcome = _Improvement()
-        policy = episodes["policy"].flatten(0, 1)
+        policy: Any = episodes["policy"].flatten(0, 1)
         # What is indexed in every step; the rest of what the policy has entered would cost as much as the loss.
-        data: Any = policy.select(*self.actor.in_keys, CONTEXT, "action", "loc", "scale_tril", strict=False)
+        data = policy.select(*self.actor.in_keys, CONTEXT, "action", "loc", "scale_tril", strict=False)
         samples = cast("TensorDict", samples.flatten(0, 1))
         advantage = samples["advantage"]
         samples["advantage"] = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
