@@ -1,19 +1,36 @@
-"""Problems the benchmarks solve: synthetic pushing models, random models and untrained ones."""
+"""Problems the benchmarks solve: synthetic pushing models, random and untrained ones, the zoo, a cart-pole, carts."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
 import torch
+from torch import Tensor
 
-from difflcs import LCSModel, LCSParams
+from difflcs import LCSModel, LCSParams, QuadraticCost
 from difflcs.bench import ACTION_LIMIT, pushing_model, states_and_goals
+from difflcs.systems import cart_pole_between_walls
+from difflcs_envs.tasks import pushing_cost
 
-__all__ = ["ACTION_LIMIT", "MODELS", "pushing_model", "random_model", "states_and_goals", "untrained_model"]
+__all__ = [
+    "ACTION_LIMIT",
+    "FAMILIES",
+    "MODELS",
+    "Instance",
+    "chain_of_carts",
+    "pushing_model",
+    "random_model",
+    "states_and_goals",
+    "untrained_model",
+]
 
 
-def random_model(n_lam: int, seed: int) -> LCSParams:
+def random_model(n_lam: int, seed: int, n_x: int = 9, n_u: int = 6) -> LCSParams:
     """An `LCSModel` with parameters of size 0.3: no structure at all."""
     generator = torch.Generator().manual_seed(seed)
-    return LCSModel(9, 6, n_lam, init_scale=0.3, generator=generator).params().detach()
+    return LCSModel(n_x, n_u, n_lam, init_scale=0.3, generator=generator).params().detach()
 
 
 def untrained_model(n_lam: int, seed: int) -> LCSParams:
@@ -23,3 +40,92 @@ def untrained_model(n_lam: int, seed: int) -> LCSParams:
 
 
 MODELS = {"pushing": pushing_model, "random": random_model, "untrained": untrained_model}
+
+
+def chain_of_carts(carts: int, dt: float = 0.05, stiffness: float = 100.0) -> LCSParams:
+    """Carts of 1 kg, 0.2 m apart, between walls 1 m away; the first is pushed, the others are hit by their neighbours.
+
+    States are displacements [m] and velocities [m/s]; n_lam = carts + 1 gaps, semi-implicit as in `difflcs.systems`.
+    """
+    eye = torch.eye(carts, dtype=torch.float64)
+    gaps = torch.cat([eye[:1], eye[1:] - eye[:-1], -eye[-1:]])
+    c = torch.full((carts + 1,), 0.2, dtype=torch.float64)
+    c[[0, -1]] = 1.0
+    A = torch.cat([torch.cat([eye, dt * eye], 1), torch.cat([0 * eye, eye], 1)])
+    B, C = torch.cat([dt * dt * eye[:, :1], dt * eye[:, :1]]), torch.cat([dt * dt * gaps.T, dt * gaps.T])
+    measured = torch.cat([gaps, 0 * gaps], 1)
+    F = measured @ C + torch.eye(carts + 1, dtype=torch.float64) / stiffness
+    zero = torch.zeros(2 * carts, dtype=torch.float64)
+    return LCSParams(A=A, B=B, C=C, d=zero, D=measured @ A, E=measured @ B, F=F, c=c)
+
+
+@dataclass(frozen=True)
+class Instance:
+    """A batch of problems: what `LCSMPCLayer` is built with, and what it is called with."""
+
+    layer: dict[str, Any]
+    call: tuple[Tensor, ...]
+
+
+def _uniform(size: list[float], count: int, seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    half = torch.tensor(size, dtype=torch.float64)
+    return half * (2 * torch.rand(count, len(size), generator=generator, dtype=torch.float64) - 1)
+
+
+def _diagonal(*weights: float) -> Tensor:
+    return torch.diag(torch.tensor(weights, dtype=torch.float64))
+
+
+def _pushing(lcs: LCSParams, count: int, seed: int) -> Instance:
+    layer = {"lcs": lcs, "cost": pushing_cost(), "horizon": 5, "u_min": -ACTION_LIMIT, "u_max": ACTION_LIMIT}
+    return Instance(layer, states_and_goals(count, seed))
+
+
+def _zoo(name: str) -> LCSParams:
+    return LCSModel.from_pretrained(f"zoo:trifinger-{name}").params().detach()
+
+
+def _random(lcs: LCSParams, horizon: int, count: int, seed: int) -> Instance:
+    eye = torch.eye(lcs.n_x, dtype=torch.float64)
+    cost = QuadraticCost(eye, 0.1 * torch.eye(lcs.n_u, dtype=torch.float64), 10 * eye)
+    x0 = torch.randn(count, lcs.n_x, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return Instance({"lcs": lcs, "cost": cost, "horizon": horizon, "u_min": -1.0, "u_max": 1.0}, (x0,))
+
+
+def _cart_pole(horizon: int, dt: float, stiffness: float, count: int) -> Instance:
+    """Stay upright, or lean on a wall."""
+    lcs = cart_pole_between_walls(dt=dt, wall_stiffness=stiffness)
+    cost = QuadraticCost(_diagonal(1, 1, 0.1, 0.1), _diagonal(0.01), _diagonal(100, 100, 1, 1))
+    x0 = _uniform([0.02, 0.05, 0.1, 0.3], count, horizon)
+    return Instance({"lcs": lcs, "cost": cost, "horizon": horizon, "u_min": -10.0, "u_max": 10.0}, (x0,))
+
+
+def _chain(carts: int, horizon: int, dt: float, stiffness: float, count: int) -> Instance:
+    """Push the last cart 0.3 m further, through all others."""
+    weight = torch.full((2 * carts,), 0.01, dtype=torch.float64)
+    weight[:carts] = 0.0
+    weight[0], weight[carts - 1] = 0.1, 10.0
+    q = torch.zeros(2 * carts, dtype=torch.float64)
+    q[carts - 1] = -0.3 * 10.0
+    missed = torch.tensor(0.5 * 10.0 * 0.3**2 * (horizon + 10), dtype=torch.float64)
+    Q = torch.diag(weight)
+    cost = QuadraticCost(Q, _diagonal(1e-4), 10 * Q, q=q, q_final=10 * q, constant=missed)
+    x0 = _uniform([0.3] * carts + [0.5] * carts, count, carts + horizon)
+    lcs = chain_of_carts(carts, dt, stiffness)
+    return Instance({"lcs": lcs, "cost": cost, "horizon": horizon, "u_min": -50.0, "u_max": 50.0}, (x0,))
+
+
+OBJECTS = ("cube", "mug", "wrench", "banana")
+
+# `count` problems of each of a family's models.
+FAMILIES: dict[str, Callable[[int], list[Instance]]] = {
+    "pushing, n_lam 5": lambda count: [_pushing(pushing_model(5, seed), count, seed) for seed in range(4)],
+    "pushing, n_lam 8": lambda count: [_pushing(pushing_model(8, seed), count, seed) for seed in range(4)],
+    "zoo": lambda count: [_pushing(_zoo(name), count, 10 + i) for i, name in enumerate(OBJECTS)],
+    "random, n_lam 5, H 10": lambda count: [_random(random_model(5, seed), 10, count, seed) for seed in range(4)],
+    "cart-pole, H 30": lambda count: [_cart_pole(30, 0.04, stiffness, count) for stiffness in (10.0, 100.0)],
+    "cart-pole, H 50": lambda count: [_cart_pole(50, 0.02, stiffness, count) for stiffness in (10.0, 100.0)],
+    "4 carts": lambda count: [_chain(4, 20, 0.05, 100.0, count), _chain(4, 10, 0.1, 1000.0, count)],
+    "10 carts": lambda count: [_chain(10, 20, 0.1, 100.0, count), _chain(10, 10, 0.1, 1000.0, count)],
+}

@@ -54,7 +54,7 @@ struct Certificate {
   }
   template <class Entry>
   void load(const Steps<Entry>& to, int which, int64_t e, int lane) {
-    load(to.first, batch.input[which] + e * batch.stride[which], to.count * to.size, lane);
+    load(to.first, batch.at(which, e), to.count * to.size, lane);
   }
 
   void load_matrices(int64_t e, int lane) {

@@ -40,6 +40,7 @@ constexpr double kSmallest = 1e-100, kLargest = 1e150;  // range of the diagonal
 // A batch of LCS-MPC problems (see difflcs.mpc.MPCProblem). All arrays are row-major with the batch in front.
 struct MpcBatch {
   int64_t count, n_x, n_u, n_lam, n_c, horizon;
+  const int64_t* element;  // whose data each of the `count` problems has, or null: problem i has those of element i
   const double* input[kInputs];
   int64_t stride[kInputs];  // distance from one element to the next; 0 when the batch shares the input
   int64_t step[kInputs];    // distance from one stage to the next; 0 when all stages share the input
@@ -48,20 +49,37 @@ struct MpcBatch {
   bool crossed;    // S is not zero
   bool unbounded;  // some bound of an action is infinite
   bool pivot;      // eliminate with row exchanges: slower, for F whose skew part dominates
+
+  // Field `which` of a problem at stage k.
+  const double* at(int which, int64_t problem, int64_t k = 0) const {
+    return input[which] + (element ? element[problem] : problem) * stride[which] + k * step[which];
+  }
+};
+
+// Where the homotopy of a problem starts.
+struct MpcStart {
+  // Whether the actions are first replaced by the feedback law of the problem without contact, rolled out with it.
+  bool released;
+  double first;  // first relaxation, in parts of the square of the problem's own scale; never below `at_least`
+  double at_least;
 };
 
 // What the solver needs besides the problem, and where its results go.
 struct MpcSolve {
   const double* u_start;    // (count, H, n_u), or null for zero
-  const double* lam_start;  // (count, H, n_lam), or null for sqrt(first_relaxation)
+  const double* lam_start;  // (count, H, n_lam), or null for the root of the first relaxation
   const double* mu_start;   // (count, H + 1, n_c), or null for zero
-  double first_relaxation;  // where the homotopy starts
-  double shrink;            // its factor per stage
+  const MpcStart* start;    // (count,)
+  double shrink;            // factor of the homotopy per stage
+  int64_t steps;            // most Newton steps of one stage
   double tol;               // on the projected gradient
   int64_t max_iter;
+  int64_t explore;   // Newton steps at the target after which a problem is left as it is, as MAX_ITER; 0: never
   double certified;  // largest residual of a solved problem
   double *x, *u, *lam, *mu, *objective,
       *residual;    // out; residual as difflcs.mpc.kkt.residual, from the numbers returned
+  double* scale;    // (count,) mean gap of the contacts in the units of the solver: out where released, else in
+  double* gained;   // (count,) out: what the last step at the target has saved
   int8_t* status;   // out; unreached where the watch stopped before
   int8_t* fragile;  // out; whether elimination without row exchanges lost digits
   int32_t* iterations;

@@ -32,6 +32,7 @@ class Linearisation {
   Matrix<Vec, 0, kL> size, y;
   Mask *rows, *right_rows;
   Vec *a, *b, *right_factors, *column;
+  Vec *bend, *damped;  // of each contact: curvature of the cost along lam - s, exact, and what damping adds
   Matrix<Vec, kL, kW> slopes, weighted;
 
  public:
@@ -42,7 +43,7 @@ class Linearisation {
     arena.take(M, count, nl, nl), arena.take(K_lam, count, nl, nw), arena.take(A_hat, count, nx, nw);
     arena.take(K_s, kept ? count : 0, nl, nw), arena.take(size, count, nl), arena.take(y, count, nl);
     arena.take(rows, count * nl), arena.take(right_rows, nl), arena.take(a, nl), arena.take(b, nl),
-        arena.take(right_factors, nl * nl);
+        arena.take(right_factors, nl * nl), arena.take(bend, nl), arena.take(damped, nl);
     arena.take(column, nl), arena.take(slopes, nl, nw), arena.take(weighted, nl, nw);
   }
 
@@ -51,8 +52,8 @@ class Linearisation {
     return {M[k], rows + k * n.l(), size[k], y[k], K_lam[k], K_s[k], A_hat[k]};
   }
 
-  // Stage k at lam and s, with p the costate of the next state.
-  Stage<S> at(int64_t k, const Vec* lam, const Vec* s, const Vec* p) {
+  // Stage k at lam and s, with p the costate of the next state. `damping` adds to the curvature, see `curvature`.
+  Stage<S> at(int64_t k, const Vec* lam, const Vec* s, const Vec* p, Vec damping) {
     const int64_t nx = n.x(), nl = n.l(), nw = n.w();
     const Stage<S> stage = this->stage(k);
     const StageData<T, S> data = problem.stage(k);
@@ -91,7 +92,8 @@ class Linearisation {
     }
     for (int64_t i = 0; i < nl; i++) {
       stage.y[i] *= stage.size[i];
-      for (int64_t j = 0; j < nw; j++) weighted(i, j) = -2.0 * stage.y[i] * a[i] * stage.K_lam(i, j);
+      bend[i] = -2.0 * stage.y[i] * a[i] * b[i], damped[i] = 0.5 * damping * abs(stage.y[i]);
+      weigh(i, bend[i] + damped[i]);
     }
     if (kept)
       for (int64_t i = 0; i < nl; i++)
@@ -99,8 +101,22 @@ class Linearisation {
     return stage;
   }
 
-  // Y_ij = sum_m y_m (K_lam_mi K_s_mj + K_s_mi K_lam_mj) of the stage that was linearised last.
+  // Y_ij = sum_m y_m (K_lam_mi K_s_mj + K_s_mi K_lam_mj) of the stage that was linearised last, the second derivative
+  // of lam in the cost. With z = lam - s, of which lam and s are smoothed positive and negative parts, it is
+  // sum_m bend_m dz_m dz_m'. It knows of a contact's kink only next to it. Damping adds what bounds a kink that lies
+  // lam + s away: |y| / (2 (lam + s)) is the curvature of the parabola that touches y |z| / 2 and lies above it, so
+  // that with a damping of one a contact that opens or closes on the way costs no more than the model says.
   Vec curvature(int64_t i, int64_t j) const { return all(0) + weighted.column(i) * slopes.column(j); }
+
+  // Drops what is negative in Y.
+  void make_convex(Mask which) {
+    for (int64_t i = 0; i < n.l(); i++) weigh(i, select(which, max(bend[i], all(0)), bend[i]) + damped[i]);
+  }
+
+ private:
+  void weigh(int64_t i, Vec weight) {
+    for (int64_t j = 0; j < n.w(); j++) weighted(i, j) = weight * slopes(i, j);
+  }
 };
 
 }  // namespace

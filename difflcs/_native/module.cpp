@@ -21,6 +21,7 @@
 #include <thread>
 #include <vector>
 
+#include "driver.hpp"
 #include "kernels.hpp"
 #include "lcp_one.hpp"
 
@@ -192,30 +193,27 @@ difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxa
   return b;
 }
 
-// An element that the time did not suffice for: the actions to start from, the state where it is, no forces.
-void stay_at_start(const difflcs::MpcBatch& b, const difflcs::MpcSolve& o, int64_t e) {
-  using namespace difflcs;
-  for (int64_t i = 0; i < b.horizon * b.n_u; i++) {
-    const int64_t k = i / b.n_u;
-    const double* lo = b.input[ku_min] + e * b.stride[ku_min] + k * b.step[ku_min];
-    const double* hi = b.input[ku_max] + e * b.stride[ku_max] + k * b.step[ku_max];
-    const double start = o.u_start ? o.u_start[e * b.horizon * b.n_u + i] : 0.0;
-    o.u[e * b.horizon * b.n_u + i] = std::min(std::max(start, lo[i % b.n_u]), hi[i % b.n_u]);
+// The threads of one call.
+struct Threads final : difflcs::Runner {
+  const int64_t most;
+  Stop stop;
+  Threads(int64_t most, double time_limit) : most(most), stop(time_limit) {}
+  void run(int64_t problems, int64_t workspace_bytes, bool to_the_end, Work work, void* context) override {
+    Stop never;
+    const int64_t used = std::max<int64_t>(1, std::min<int64_t>(most, problems / difflcs::kernels().lanes));
+    on_threads(used, workspace_bytes, to_the_end ? never : stop,
+               [&](void* workspace, difflcs::Watch watch) { work(context, workspace, watch); });
   }
-  for (int64_t i = 0; i < (b.horizon + 1) * b.n_x; i++)
-    o.x[e * (b.horizon + 1) * b.n_x + i] = b.input[kx0][e * b.n_x + i % b.n_x];
-  std::fill_n(o.lam + e * b.horizon * b.n_lam, b.horizon * b.n_lam, 0.0);
-  std::fill_n(o.mu + e * (b.horizon + 1) * b.n_c, (b.horizon + 1) * b.n_c, 0.0);
-  o.objective[e] = o.residual[e] = std::numeric_limits<double>::max();
-  o.status[e] = static_cast<int8_t>(Status::max_iter), o.fragile[e] = 0, o.iterations[e] = 0;
-}
+  bool stopped() const override { return stop.ending != kGoOn; }
+};
 
 void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, std::optional<Array> u_start,
-               std::optional<Array> lam_start, std::optional<Array> mu_start, double first_relaxation, double shrink,
-               double tol, int64_t max_iter, double certified, bool pivot, double time_limit, int threads,
-               Output<double> x, Output<double> u, Output<double> lam, Output<double> mu, Output<double> objective,
-               Output<double> residual, Output<int8_t> status, Output<int8_t> fragile, Output<int32_t> iterations) {
-  const difflcs::MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier, pivot);
+               std::optional<Array> lam_start, std::optional<Array> mu_start, int64_t starts, uint64_t seed,
+               double homotopy, double shrink, double tol, int64_t max_iter, double certified, double time_limit,
+               int threads, Output<double> x, Output<double> u, Output<double> lam, Output<double> mu,
+               Output<double> objective, Output<double> residual, Output<int8_t> status, Output<int8_t> fragile,
+               Output<int32_t> iterations) {
+  const difflcs::MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier, false);
   const int64_t states = b.count * (horizon + 1) * b.n_x, actions = b.count * horizon * b.n_u;
   const int64_t forces = b.count * horizon * b.n_lam, rows = b.count * (horizon + 1) * b.n_c;
   check_size("x", x.size(), states), check_size("u", u.size(), actions), check_size("lam", lam.size(), forces);
@@ -226,46 +224,17 @@ void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
   if (u_start) check_size("u_start", u_start->size(), actions);
   if (lam_start) check_size("lam_start", lam_start->size(), forces);
   if (mu_start) check_size("mu_start", mu_start->size(), rows);
-  if (!(first_relaxation >= relaxation && shrink > 0 && shrink < 1))
-    throw std::invalid_argument("the homotopy must fall from first_relaxation to relaxation");
-  const difflcs::MpcSolve o{u_start ? u_start->data() : nullptr,
-                            lam_start ? lam_start->data() : nullptr,
-                            mu_start ? mu_start->data() : nullptr,
-                            first_relaxation,
-                            shrink,
-                            tol,
-                            max_iter,
-                            certified,
-                            x.data(),
-                            u.data(),
-                            lam.data(),
-                            mu.data(),
-                            objective.data(),
-                            residual.data(),
-                            status.data(),
-                            fragile.data(),
-                            iterations.data()};
+  if (!(starts >= 1 && homotopy >= 0 && shrink > 0 && shrink < 1))
+    throw std::invalid_argument("starts must be at least 1, the homotopy must fall");
+  if (lam_start && !(u_start && mu_start)) throw std::invalid_argument("lam_start needs u_start and mu_start");
   if (b.count == 0) return;
-  std::fill_n(o.status, b.count, difflcs::kUnreached);
-  const auto& kernels = difflcs::kernels();
-  int64_t next = 0;
-  const int64_t used = std::max<int64_t>(1, std::min<int64_t>(threads, b.count / kernels.lanes));
-  Stop stop(time_limit);
-  on_threads(used, kernels.mpc_workspace(b), stop,
-             [&](void* workspace, difflcs::Watch watch) { kernels.mpc_solve(b, o, &next, workspace, watch); });
-  if (b.n_c > 0) {
-    const int64_t block = 64, blocks = (b.count + block - 1) / block;
-    std::atomic<int64_t> first{0};
-    Stop judged;
-    on_threads(std::max<int64_t>(1, std::min<int64_t>(threads, blocks)), kernels.mpc_workspace(b), judged,
-               [&](void* workspace, difflcs::Watch watch) {
-                 for (int64_t i; (i = first.fetch_add(1)) < blocks;)
-                   kernels.mpc_constraints(b, o, i * block, std::min(b.count, (i + 1) * block), workspace, watch);
-               });
-  }
-  if (stop.ending == kOutOfTime)
-    for (int64_t e = 0; e < b.count; e++)
-      if (o.status[e] == difflcs::kUnreached) stay_at_start(b, o, e);
+  const difflcs::MpcGuess guess{u_start ? u_start->data() : nullptr, lam_start ? lam_start->data() : nullptr,
+                                mu_start ? mu_start->data() : nullptr};
+  const difflcs::MpcEffort effort{starts, homotopy, shrink, tol, max_iter, certified, seed};
+  const difflcs::MpcPlans out{x.data(),        u.data(),      lam.data(),     mu.data(),        objective.data(),
+                              residual.data(), status.data(), fragile.data(), iterations.data()};
+  Threads runner(threads, time_limit);
+  difflcs::MpcDriver().solve(b, guess, effort, out, runner);
 }
 
 void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, Array x, Array u, Array lam, Array mu,
@@ -449,8 +418,8 @@ NB_MODULE(_kernels, m) {
   m.def("solve_lcp", &solve_lcp, "F"_a, "q"_a, "relaxation"_a, "max_iter"_a, "threads"_a, "lam"_a, "w"_a, "status"_a,
         "iterations"_a, "Solve a batch of LCPs into the given arrays.");
   m.def("solve_mpc", &solve_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "u_start"_a.none(),
-        "lam_start"_a.none(), "mu_start"_a.none(), "first_relaxation"_a, "shrink"_a, "tol"_a, "max_iter"_a,
-        "certified"_a, "pivot"_a, "time_limit"_a, "threads"_a, "x"_a, "u"_a, "lam"_a, "mu"_a, "objective"_a,
+        "lam_start"_a.none(), "mu_start"_a.none(), "starts"_a, "seed"_a, "homotopy"_a, "shrink"_a, "tol"_a,
+        "max_iter"_a, "certified"_a, "time_limit"_a, "threads"_a, "x"_a, "u"_a, "lam"_a, "mu"_a, "objective"_a,
         "residual"_a, "status"_a, "fragile"_a, "iterations"_a,
         "Solve a batch of LCS-MPC problems into the given arrays.");
   m.def("vjp_mpc", &vjp_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "x"_a, "u"_a, "lam"_a, "mu"_a,

@@ -158,7 +158,7 @@ struct Problem {
   }
 
   const double* input(Input which, int64_t element, int64_t k = 0) const {
-    return batch.input[which] + element * batch.stride[which] + k * batch.step[which];
+    return batch.at(which, element, k);
   }
 
   void load_matrices(int64_t e, int lane) {

@@ -13,6 +13,9 @@ namespace {
 // Smallest curvature of an action, in parts of what would move it across its whole range: bounds Newton's step where
 // the cost is flat.
 constexpr double kFlat = 1e-3;
+// Damping of the actions beside that of the contacts, in units of each action's own curvature: what bends the cost is
+// damped where it bends, the actions only lest nothing is.
+constexpr double kActionDamping = 0.01;
 // A reduced Hessian is singular below this part of an action's own curvature (difflcs.mpc.kkt has the same).
 constexpr double kSingular = 1e-10;
 // An action with a barrier is differentiated as one at its bound below this part of its range (kkt has the same).
@@ -53,9 +56,9 @@ class Riccati {
   Matrix<Vec, 0, kX> p, v;
   Matrix<Vec, kW, kW> H;
   Matrix<Vec, kX, kW> PA;
-  Matrix<Vec, kU, kU> L;
+  Matrix<Vec, kU, kU> H_uu, L;
   Matrix<Vec, kU, kLaw> law;
-  Vec *linear, *flat, *column;
+  Vec *linear, *flat, *column, *toward, *share;
   Vec* largest_action;             // of each action, over the stages
   Vec *row_terms, *row_violation;  // of each constraint, the largest over the stages
   Mask* active;
@@ -74,8 +77,10 @@ class Riccati {
     const int64_t nx = n.x(), nu = n.u(), nw = n.w(), h = n.h, values = kAdjoint ? h + 1 : 2;
     linearisation.layout(arena);
     arena.take(P, values, nx, nx), arena.take(p, values, nx), arena.take(v, values, nx);
-    arena.take(H, nw, nw), arena.take(PA, nx, nw), arena.take(L, nu, nu), arena.take(law, nu, nx + 1);
-    arena.take(linear, nw), arena.take(flat, nu), arena.take(column, nx), arena.take(active, nu);
+    arena.take(H, nw, nw), arena.take(PA, nx, nw), arena.take(H_uu, nu, nu), arena.take(L, nu, nu),
+        arena.take(law, nu, nx + 1);
+    arena.take(linear, nw), arena.take(flat, nu), arena.take(column, nx), arena.take(active, nu),
+        arena.take(toward, nu), arena.take(share, nu);
     arena.take(gradient, h, nu), arena.take(feedforward, h, nu), arena.take(feedback, h, nu, nx);
     arena.take(lower, h, nu), arena.take(upper, h, nu);
     const int64_t nc = n.c();
@@ -91,8 +96,8 @@ class Riccati {
     return {P[at], p[at], v[at]};
   }
 
-  // Around the trajectory `at`. The solver adds `regularisation` to the curvature of each action; lanes that are
-  // `stubborn` keep the second derivative of lam where the Hessian is indefinite.
+  // Around the trajectory `at`. The solver adds `regularisation` to the curvature of contacts and actions; lanes that
+  // are `stubborn` keep the second derivative of lam where the Hessian is indefinite.
   Sweep sweep(const Trajectory<S>& at, const Upstream<S>& upstream, Vec regularisation, Mask stubborn) {
     found = {all(0), all(0), all(0), all(0), all(0), Mask{}};
     for (int64_t i = 0; i < n.c(); i++) row_terms[i] = row_violation[i] = all(0);
@@ -104,14 +109,15 @@ class Riccati {
     for (int64_t k = n.h - 1; k >= 0; k--) {
       const StageData<T, S> data = problem.stage(k);
       const Value<S> next = value(k + 1);
-      const Stage<S> stage = linearisation.at(k, at.lam[k], at.s[k], next.p);
+      const Stage<S> stage = linearisation.at(k, at.lam[k], at.s[k], next.p, regularisation);
       constraints(k, data, at.x[k], at.u[k]);
       stage_hessian(k, data, stage, next.P);
       const Vec* lam_bar = kAdjoint ? upstream.lam[k] : nullptr;
       actions(k, data, stage, next, at.x[k], at.u[k], kAdjoint ? upstream.u[k] : nullptr, lam_bar, regularisation);
       states(k, data, stage, next, at.x[k], at.u[k], kAdjoint ? upstream.x[k] : nullptr, lam_bar);
-      const Vec use = factor(data, regularisation, stubborn);
-      feedback_law(k, data, use, at.u[k]);
+      factor(data, regularisation, stubborn);
+      if (!kAdjoint) step_within_bounds(k, data, at.u[k]);
+      feedback_law(k);
     }
     for (int64_t i = 0; i < n.c(); i++)
       found.violated = max(found.violated, row_violation[i] / select(row_terms[i] > 0, row_terms[i], all(1)));
@@ -287,56 +293,103 @@ class Riccati {
     return max(data.R(j, j) + 1e-6 * abs(H(nx + j, nx + j)), all(kTiny));
   }
 
-  // Cholesky of H_uu + Y_uu + regularisation with identity rows for active actions, reciprocal pivots on the diagonal.
-  // An indefinite block first drops Y at this stage (Gauss-Newton), then has its pivots lifted; lanes that are
-  // `stubborn` lift them at once. Returns the part of Y that was used.
-  Vec factor(const StageData<T, S>& data, Vec regularisation, Mask stubborn) {
+  // Cholesky of H_uu + Y_uu + regularisation with identity rows for active actions. An indefinite block first drops
+  // what is negative in Y at this stage, then has its pivots lifted; lanes that are `stubborn` lift them at once.
+  void factor(const StageData<T, S>& data, Vec regularisation, Mask stubborn) {
     const int64_t nx = n.x(), nu = n.u();
-    Vec use = all(1);
     for (int attempt = 0; attempt < 2; attempt++) {
-      Mask failed = Mask{};
       for (int64_t i = 0; i < nu; i++)
         for (int64_t j = 0; j <= i; j++) {
-          Vec t = H(nx + i, nx + j) + use * linearisation.curvature(nx + i, nx + j);
-          if (i == j && !kAdjoint) t += regularisation * action_scale(data, j) + flat[j];
-          L(i, j) = select(active[i] | active[j], all(i == j), t);
+          Vec t = H(nx + i, nx + j) + linearisation.curvature(nx + i, nx + j);
+          if (i == j && !kAdjoint) t += kActionDamping * regularisation * action_scale(data, j) + flat[j];
+          H_uu(i, j) = t;
         }
-      for (int64_t j = 0; j < nu; j++) {
-        Vec pivot = L(j, j);
-        for (int64_t m = 0; m < j; m++) pivot -= L(j, m) * L(j, m);
-        const Vec singular = kSingular * abs(H(nx + j, nx + j));
-        const Vec lift = kAdjoint ? singular : 0.05 * action_scale(data, j);
-        const Mask bad = ~(pivot > lift) & ~active[j];
-        failed |= bad;
-        // What is added where the cost is flat vanishes with the gradient, and does not hide that it is.
-        if (!kAdjoint && attempt == 0) found.weak |= ~(pivot - flat[j] > singular) & ~active[j];
-        Vec inverse = 1.0 / sqrt(select(bad, max(abs(pivot), lift), pivot));
-        // The adjoint holds an action that nothing moves, and takes a negative curvature by its size.
-        if (kAdjoint) inverse = select(bad & (abs(pivot) <= lift), all(0), inverse);
-        L(j, j) = inverse;
-        for (int64_t i = j + 1; i < nu; i++) {
-          Vec t = L(i, j);
-          for (int64_t m = 0; m < j; m++) t -= L(i, m) * L(j, m);
-          L(i, j) = t * inverse;
-        }
-      }
-      if (kAdjoint) {
-        found.weak |= failed;
-        break;
-      }
-      if (!any(failed) || attempt == 1) break;
-      use = select(failed & ~stubborn, all(0), use);
+      const Mask failed = cholesky(data, attempt == 0);
+      if (kAdjoint) found.weak |= failed;
+      if (kAdjoint || !any(failed) || attempt == 1) break;
+      linearisation.make_convex(failed & ~stubborn);
     }
-    return use;
   }
 
-  // (feedback | feedforward) = -H_uu^-1 (H_ux | linear_u), rows of active actions zero; and the value function of
-  // stage k.
-  void feedback_law(int64_t k, const StageData<T, S>& data, Vec use, const Vec* u) {
-    const int64_t nx = n.x(), nu = n.u(), nw = n.w(), first = k == 0 ? nx : 0, columns = nx + 1;
-    for (int64_t i = first; i < nw; i++)
+  // The factor L of H_uu, with reciprocal pivots on the diagonal. Returns where a pivot was lifted.
+  Mask cholesky(const StageData<T, S>& data, bool judged) {
+    const int64_t nx = n.x(), nu = n.u();
+    Mask failed = Mask{};
+    for (int64_t i = 0; i < nu; i++)
+      for (int64_t j = 0; j <= i; j++) L(i, j) = select(active[i] | active[j], all(i == j), H_uu(i, j));
+    for (int64_t j = 0; j < nu; j++) {
+      Vec pivot = L(j, j);
+      for (int64_t m = 0; m < j; m++) pivot -= L(j, m) * L(j, m);
+      const Vec singular = kSingular * abs(H(nx + j, nx + j));
+      const Vec lift = kAdjoint ? singular : 0.05 * action_scale(data, j);
+      const Mask bad = ~(pivot > lift) & ~active[j];
+      failed |= bad;
+      // What is added where the cost is flat vanishes with the gradient, and does not hide that it is.
+      if (!kAdjoint && judged) found.weak |= ~(pivot - flat[j] > singular) & ~active[j];
+      Vec inverse = 1.0 / sqrt(select(bad, max(abs(pivot), lift), pivot));
+      // The adjoint holds an action that nothing moves, and takes a negative curvature by its size.
+      if (kAdjoint) inverse = select(bad & (abs(pivot) <= lift), all(0), inverse);
+      L(j, j) = inverse;
+      for (int64_t i = j + 1; i < nu; i++) {
+        Vec t = L(i, j);
+        for (int64_t m = 0; m < j; m++) t -= L(i, m) * L(j, m);
+        L(i, j) = t * inverse;
+      }
+    }
+    return failed;
+  }
+
+  // The step of the actions that minimises the model of stage k within the bounds, by the primal active-set method:
+  // towards the minimum over the actions that are free, up to the first bound on the way, which then holds. Clipping
+  // the free minimum instead can lead uphill (Tassa, Mansard & Todorov, "Control-limited DDP", ICRA 2014).
+  void step_within_bounds(int64_t k, const StageData<T, S>& data, const Vec* u) {
+    const int64_t nx = n.x(), nu = n.u();
+    const bool bounded = problem.batch.barrier == 0;  // a barrier has its own rule in the rollout
+    Vec* d = feedforward[k];
+    // An action held at a bound is put onto it exactly.
+    for (int64_t i = 0; i < nu; i++)
+      d[i] = select(lower(k, i), data.u_min[i] - u[i], select(upper(k, i), data.u_max[i] - u[i], all(0)));
+    Mask open = ~Mask{};
+    for (int64_t pass = 0; pass <= nu; pass++) {
+      for (int64_t i = 0; i < nu; i++) {
+        Vec t = linear[nx + i];
+        for (int64_t j = 0; j < nu; j++) t += H_uu(i > j ? i : j, i > j ? j : i) * d[j];
+        toward[i] = select(active[i], all(0), -t);
+      }
+      for (int64_t i = 0; i < nu; i++) {
+        for (int64_t m = 0; m < i; m++) toward[i] -= L(i, m) * toward[m];
+        toward[i] *= L(i, i);
+      }
+      for (int64_t i = nu - 1; i >= 0; i--) {
+        for (int64_t m = i + 1; m < nu; m++) toward[i] -= L(m, i) * toward[m];
+        toward[i] *= L(i, i);
+      }
+      Vec length = all(1);
+      for (int64_t i = 0; i < nu; i++) {
+        const Vec room = select(toward[i] > 0, data.u_max[i], data.u_min[i]) - u[i] - d[i];
+        const Mask crosses = bounded ? (abs(toward[i]) > abs(room)) & ~active[i] : Mask{};
+        share[i] = select(crosses, room / toward[i], all(2));
+        length = min(length, share[i]);
+      }
+      Mask blocked = Mask{};
+      for (int64_t i = 0; i < nu; i++) {
+        const Mask hits = open & (share[i] <= length);
+        d[i] = select(open, d[i] + length * toward[i], d[i]);
+        active[i] |= hits, blocked |= hits;
+      }
+      open &= blocked;
+      if (!any(open)) break;
+      cholesky(data, false);
+    }
+  }
+
+  // Feedback -H_uu^-1 H_ux, rows of active actions zero, and the value function of stage k; in the adjoint the
+  // feedforward too, -H_uu^-1 linear_u, which the solver has from `step_within_bounds`.
+  void feedback_law(int64_t k) {
+    const int64_t nx = n.x(), nu = n.u(), nw = n.w(), first = k == 0 ? nx : 0, columns = kAdjoint ? nx + 1 : nx;
+    for (int64_t i = 0; i < nw; i++)
       for (int64_t j = first; j <= i; j++)
-        if (i >= nx ? j < nx : true) H(i, j) += use * linearisation.curvature(i, j);
+        if (i < nx || j < nx) H(i, j) += linearisation.curvature(i, j);
     for (int64_t i = 0; i < nu; i++) {
       for (int64_t j = 0; j < nx; j++) law(i, j) = k == 0 ? all(0) : select(active[i], all(0), -H(nx + i, j));
       law(i, nx) = select(active[i], all(0), -linear[nx + i]);
@@ -350,7 +403,12 @@ class Riccati {
       const Value<S> here = value(k);
       for (int64_t i = 0; i < nx; i++) {
         for (int64_t j = 0; j <= i; j++) here.P(i, j) = here.P(j, i) = H(i, j) - law.column(i) * law.column(j);
-        here.v[i] = linear[i] - law.column(i) * law.column(nx);
+        Vec v = linear[i];
+        if (kAdjoint)
+          v = v - law.column(i) * law.column(nx);
+        else
+          for (int64_t j = 0; j < nu; j++) v += H(nx + j, i) * feedforward(k, j);
+        here.v[i] = v;
       }
     }
     for (int64_t i = nu - 1; i >= 0; i--) {
@@ -361,9 +419,7 @@ class Riccati {
     const Matrix<Vec, kU, kX> K = feedback[k];
     for (int64_t i = 0; i < nu; i++) {
       for (int64_t j = 0; j < nx; j++) K(i, j) = law(i, j);
-      // The solver puts an action held at a bound onto it exactly.
-      const Vec to_bound = select(lower(k, i), data.u_min[i] - u[i], select(upper(k, i), data.u_max[i] - u[i], all(0)));
-      feedforward(k, i) = kAdjoint ? law(i, nx) : select(active[i], to_bound, law(i, nx));
+      if (kAdjoint) feedforward(k, i) = law(i, nx);
     }
   }
 };

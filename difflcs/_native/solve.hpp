@@ -1,5 +1,9 @@
 // The MPC solver: projected Newton on the actions, with a feedback rollout clipped to the box, an Armijo search, and a
-// homotopy in eps from `first_relaxation` down to `relaxation`.
+// homotopy in eps down to `relaxation`.
+//
+// A released problem begins without contact: one Riccati sweep from its first actions gives the feedback law of the
+// free plant, which is rolled out with contact and clipped to the bounds. An unstable plant has fallen over where its
+// actions alone are rolled out. The gaps along it also tell the scale of the problem, from which the homotopy starts.
 #pragma once
 #include "certificate.hpp"
 #include "kernels.hpp"
@@ -29,7 +33,9 @@ constexpr double kSlow = 0.1, kSlowEnd = 0.01, kSmall = 1e-4, kStays = 0.9, kRai
 // turns next to their bounds, and other multipliers end that.
 constexpr int64_t kPatience = 20;
 constexpr double kLittle = 1e-6;
-// Failed searches in a row, each with 8 times the damping, before a problem is given up.
+// The least damping that is tried, in parts of what bounds the kink of every contact.
+constexpr double kLeastDamping = 0.25;
+// Failed searches in a row, each with 4 times the damping, before a problem is given up.
 constexpr int64_t kFailures = 12;
 
 template <class T, class S>
@@ -69,10 +75,12 @@ class Solver {
     double violated;  // at the last step of the multipliers
     double left;      // projected gradient after that; 0 where it is not known yet
     int64_t stalled;  // steps of the multipliers in a row that hardly helped
+    double gained;    // by the last step
   };
   Lane lane[kLanes];
   Vec eps, regularisation, J;
   Mask fresh;     // without a trajectory at its eps
+  Mask released;  // without contact yet
   Mask repriced;  // with multipliers that J does not know yet
   // Elements that are finished but not certified yet.
   int64_t finished[kLanes];
@@ -92,10 +100,34 @@ class Solver {
     for (int64_t i = 0; i < n.x(); i++) at.x(0, i) = problem.x0[i];
     for (int64_t k = 0; k < n.h && !halted(watch); k++) {
       const StageData<T, S> data = problem.stage(k);
-      contacts(data, at.x[k], at.u[k], at.lam[k], at.s[k], ~wanted);
+      contacts(data, at.x[k], at.u[k], at.lam[k], at.s[k], ~wanted | released);
       data.next_state(at.x[k], at.u[k], at.lam[k], at.x[k + 1]);
     }
     return problem.cost(at);
+  }
+
+  // After the first step of the lanes that were released: the scale of their problems, and where the homotopy starts.
+  void touch(const MpcSolve& o, Mask which) {
+    Vec sum = all(0);
+    for (int64_t k = 0; k < n.h; k++) {
+      problem.stage(k).gap(at.x[k], at.u[k], gap);
+      for (int64_t i = 0; i < n.l(); i++) sum += abs(gap[i]);
+    }
+    for (int l = 0; l < kLanes; l++) {
+      if (!which[l]) continue;
+      const int64_t e = lane[l].element, count = n.h * n.l();
+      const double mean = count ? sum[l] / double(count) : 0;
+      if (o.scale) o.scale[e] = mean;
+      put(&eps, 0, l, first_relaxation(o.start[e], mean));
+      lane[l].iterations++, fresh[l] = -1;
+    }
+    released &= ~which;
+  }
+
+  double first_relaxation(const MpcStart& start, double scale) const {
+    const double own = start.first * scale * scale;
+    const double least = start.at_least > batch.relaxation ? start.at_least : batch.relaxation;
+    return own > least && own < kHuge ? own : least;
   }
 
   // The trial trajectory with step length `step` along the feedback law; lanes in `frozen` stay where they are, those
@@ -127,10 +159,12 @@ class Solver {
   bool take(const MpcSolve& o, int64_t* counter, int l) {
     const int64_t e = __atomic_fetch_add(counter, int64_t{1}, __ATOMIC_RELAXED);
     const int64_t nu = n.u(), actions = n.h * nu, forces = n.h * n.l();
-    lane[l] = {e < batch.count ? e : -1, 0, 0, 0, 1e300, 0, 0};
-    fresh[l] = -1;
-    eps[l] = o.first_relaxation, regularisation[l] = 0;
+    lane[l] = {e < batch.count ? e : -1, 0, 0, 0, 1e300, 0, 0, 0};
+    fresh[l] = -1, released[l] = 0;
+    eps[l] = batch.relaxation, regularisation[l] = 0;
     if (e >= batch.count) return false;
+    released[l] = o.start[e].released ? -1 : 0;
+    if (!released[l]) eps[l] = first_relaxation(o.start[e], o.scale ? o.scale[e] : 0);
     problem.load(e, l);
     problem.load_multipliers(o.mu_start ? o.mu_start + e * (n.h + 1) * n.c() : nullptr, l);
     put(&problem.rho, 0, l, kPenalty * lane_of(problem.weight[0], l));
@@ -140,22 +174,32 @@ class Solver {
       const double a = low + margin, b = high - margin, value = o.u_start ? o.u_start[e * actions + i] : 0.0;
       put(at.u.entries, i, l, value < a ? a : value > b ? b : value);
     }
-    if (o.lam_start)
+    if (o.lam_start && !released[l])
       problem.load_lam(at.lam.entries, o.lam_start + e * forces, l);
     else
-      for (int64_t i = 0; i < forces; i++) put(at.lam.entries, i, l, __builtin_sqrt(o.first_relaxation));
+      for (int64_t i = 0; i < forces; i++) {
+        put(at.lam.entries, i, l, released[l] ? 0.0 : __builtin_sqrt(eps[l]));
+        put(at.s.entries, i, l, 1.0);
+      }
     return true;
   }
 
-  void store(const MpcSolve& o, int l, Status status, const Matrix<Vec, 0, 0>& multipliers) {
+  // `unfinished`: left as it is, for others to go on from; the objective is then what the solver itself descends on.
+  void store(const MpcSolve& o, int l, Status status, const Matrix<Vec, 0, 0>& multipliers, bool unfinished = false) {
     const int64_t e = lane[l].element, states = at.x.size(), actions = at.u.size(), forces = at.lam.size();
     problem.store(o.x + e * states, at.x.entries, states, l);
     problem.store(o.u + e * actions, at.u.entries, actions, l);
     problem.store_lam(o.lam + e * forces, at.lam.entries, l);
     problem.store_multipliers(o.mu + e * (n.h + 1) * n.c(), multipliers.entries, e, l);
-    o.objective[e] = (n.c() > 0 ? problem.objective(at) : J)[l] / lane_of(problem.cost_unit[0], l),
+    const double unit = lane_of(problem.cost_unit[0], l);
+    o.objective[e] = (n.c() > 0 && !unfinished ? problem.objective(at) : J)[l] / unit;
+    if (o.gained) o.gained[e] = lane[l].gained / unit;
     o.iterations[e] = int32_t(lane[l].iterations);
     o.status[e] = int8_t(status);
+    if (unfinished) {
+      o.residual[e] = kHuge, o.fragile[e] = 0;
+      return;
+    }
     finished[waiting++] = e;
     if (waiting == kLanes) certificate.judge(o, finished, waiting), waiting = 0;
   }
@@ -200,7 +244,7 @@ class Solver {
   Mask finish(const MpcSolve& o, const Sweep& sweep, int64_t* counter, Mask idle, int& live) {
     Mask frozen = idle;
     for (int l = 0; l < kLanes; l++) {
-      if (idle[l] || eps[l] > batch.relaxation) continue;
+      if (idle[l] || released[l] || eps[l] > batch.relaxation) continue;
       const Lane& a = lane[l];
       const double tol = o.tol > sweep.rounding[l] ? o.tol : sweep.rounding[l];
       // A search that fails this close to the optimum has met the rounding of the cost.
@@ -215,29 +259,32 @@ class Solver {
         frozen[l] = -1;
         continue;
       }
-      if (!infeasible && !converged && !broken && a.iterations < o.max_iter && a.failures < kFailures) continue;
+      const bool explored = o.explore > 0 && a.in_stage >= o.explore && !infeasible && !converged && !broken;
+      if (!infeasible && !converged && !broken && !explored && a.iterations < o.max_iter && a.failures < kFailures)
+        continue;
       frozen[l] = -1;
       if (converged && regularisation[l] > 0 && !broken) {  // once more without it: it hides a singular Hessian
         regularisation[l] = 0;
         continue;
       }
       store(o, l,
-            converged && !broken         ? (sweep.weak[l] ? Status::degenerate : Status::converged)
-            : infeasible                 ? Status::infeasible
-            : a.iterations >= o.max_iter ? Status::max_iter
-                                         : Status::numerical,
-            riccati.force);
+            converged && !broken                     ? (sweep.weak[l] ? Status::degenerate : Status::converged)
+            : infeasible                             ? Status::infeasible
+            : a.iterations >= o.max_iter || explored ? Status::max_iter
+                                                     : Status::numerical,
+            riccati.force, explored);
       if (!take(o, counter, l)) live--;
     }
     return frozen;
   }
 
   // Armijo search along the feedback law. An accepted lane keeps its trial while the others shorten their step. Returns
-  // the lanes that moved, `step` how far.
-  Mask search(Mask frozen, Vec& step, Watch watch) {
+  // the lanes that moved, `step` how far, and `gain`, the change of the cost in parts of what a quadratic model with
+  // its minimum at the end of a full step promises.
+  Mask search(Mask frozen, Vec& step, Vec& gain, Watch watch) {
     Vec J_trial = J;
     Mask accepted = frozen;
-    step = all(1);
+    step = all(1), gain = all(0);
     for (int search = 0; search < 5; search++) {
       const Vec value = trial(step, frozen, accepted, watch);
       if (halted(watch)) break;
@@ -245,8 +292,8 @@ class Solver {
       Vec slope = all(0);
       for (int64_t i = 0; i < at.u.size(); i++)
         slope += riccati.gradient.entries[i] * (next.u.entries[i] - at.u.entries[i]);
-      const Mask good = (value <= J + 1e-4 * min(slope, all(0)) + 1e-13 * (1.0 + abs(J))) & ~accepted;
-      J_trial = select(good, value, J_trial);
+      const Mask good = (released | (value <= J + 1e-4 * min(slope, all(0)) + 1e-13 * (1.0 + abs(J)))) & ~accepted;
+      J_trial = select(good, value, J_trial), gain = select(good & (slope < 0), 2.0 * (value - J) / slope, gain);
       accepted |= good;
       if (!any(~accepted)) break;
       step = select(accepted, step, step * (search < 2 ? 0.5 : 0.25));
@@ -256,26 +303,30 @@ class Solver {
       for (int64_t i = 0; i < to.size(); i++) to.entries[i] = select(moved, from.entries[i], to.entries[i]);
     };
     move(at.u, next.u), move(at.x, next.x), move(at.lam, next.lam), move(at.s, next.s);
+    for (int l = 0; l < kLanes; l++)
+      if (moved[l]) lane[l].gained = J[l] - J_trial[l];
     J = select(moved, J_trial, J);
     return moved;
   }
 
   // Damping and homotopy after a step.
-  void advance(const MpcSolve& o, const Sweep& sweep, Mask frozen, Mask moved, Vec step) {
+  void advance(const MpcSolve& o, const Sweep& sweep, Mask frozen, Mask moved, Vec step, Vec gain) {
     const double target = batch.relaxation;
     for (int l = 0; l < kLanes; l++) {
-      if (frozen[l]) continue;
+      if (frozen[l] || released[l]) continue;
       Lane& a = lane[l];
       a.iterations++, a.in_stage++;
       a.failures = moved[l] ? 0 : a.failures + 1;
-      // Levenberg-Marquardt, in units of each action's own curvature.
+      // Levenberg-Marquardt on the kinks of the contacts (linearisation.hpp): a failed step asks for more damping, one
+      // that had to be shortened too, and one that gained what its model promised for less.
       double& reg = reinterpret_cast<double*>(&regularisation)[l];
-      if (!moved[l])
-        reg = reg * 8 > 1 ? reg * 8 : 1;
-      else if (step[l] >= 0.3)
-        reg = reg * 0.125 < 0.5 ? 0 : reg * 0.125;
-      // Two steps per stage of the homotopy, fewer where the stage is solved.
-      if (eps[l] > target && (a.in_stage >= 2 || sweep.projected[l] < 1e4 * o.tol || a.failures > 0)) {
+      const bool shortened = step[l] < 0.3;
+      if (!moved[l] || shortened)
+        reg = reg > 0 ? reg * (moved[l] ? 2 : 4) : kLeastDamping;
+      else if (gain[l] > 0.8 && (reg *= 0.3) < 0.2 * kLeastDamping)
+        reg = 0;
+      // `steps` steps per stage of the homotopy, fewer where the stage is solved.
+      if (eps[l] > target && (a.in_stage >= o.steps || sweep.projected[l] < 1e4 * o.tol || a.failures > 0)) {
         eps[l] = eps[l] * o.shrink > target ? eps[l] * o.shrink : target;
         a.in_stage = 0, a.failures = 0;
         fresh[l] = -1;
@@ -288,7 +339,7 @@ class Solver {
 template <class T, class S>
 void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
   eps = all(batch.relaxation), regularisation = J = all(0);
-  fresh = repriced = Mask{};
+  fresh = repriced = released = Mask{};
   waiting = 0;
   int live = 0;
   for (int l = 0; l < kLanes; l++) {
@@ -308,7 +359,7 @@ void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
     if (watch.stop(watch.context)) {
       // What has a trajectory is stored; what has none stays unreached.
       for (int l = 0; l < kLanes; l++)
-        if (!idle[l] && !fresh[l]) store(o, l, Status::max_iter, problem.multiplier);
+        if (!idle[l] && !fresh[l] && !released[l]) store(o, l, Status::max_iter, problem.multiplier);
       break;
     }
     if (any(repriced)) J = select(repriced, problem.cost(at), J);
@@ -319,9 +370,10 @@ void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
     const Sweep sweep = riccati.sweep(at, {}, regularisation, stubborn);
     const Mask frozen = finish(o, sweep, counter, idle, live);
     if (live == 0) break;
-    Vec step;
-    const Mask moved = search(frozen, step, watch);
-    advance(o, sweep, frozen, moved, step);
+    Vec step, gain;
+    const Mask moved = search(frozen, step, gain, watch);
+    advance(o, sweep, frozen, moved, step, gain);
+    if (any(released & ~frozen)) touch(o, released & ~frozen);
   }
   if (waiting) certificate.judge(o, finished, waiting);
 }

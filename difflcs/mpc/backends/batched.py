@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_number, check_positive_int, check_threads
+from difflcs._checks import check_choice, check_number, check_positive_int, check_threads
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.mpc import kkt
 from difflcs.mpc.backends.base import Backend, Result
 from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.mpc.solution import Primal
-from difflcs.status import Status, solved
+from difflcs.status import solved
 
-# An iteration with row exchanges takes ten times as long, and what it can mend it mends soon.
-_MAX_ITER_PIVOT = 60
+Effort = Literal["fast", "default", "best"]
+_STARTS: dict[str, int] = {"fast": 1, "default": 3, "best": 16}
+# A guess is taken to be near the optimum that is wanted.
+_STARTS_GUESSED: dict[str, int] = {"fast": 1, "default": 1, "best": 16}
 
 
 @dataclass(frozen=True)
@@ -38,77 +40,113 @@ class BatchedBackend(Backend):
     """Projected Newton on the problem with λ eliminated, one problem per SIMD lane (`difflcs/_native/mpc.cpp`).
 
     For F + Fᵀ ≻ 0 the relaxed complementarity determines λ as a smooth function of (x, u), which leaves a smooth
-    optimal control problem with box bounds. A homotopy follows λ·s from `homotopy`·relaxation down to the relaxation;
-    each step is a Riccati sweep with exact second derivatives. An element's result depends on that element alone, bit
-    for bit on one instruction set. The problem has local optima: like IPOPT's, a solution is one of them.
+    optimal control problem with box bounds. A homotopy follows λ·s down to the relaxation; each step is a Riccati sweep
+    with exact second derivatives. An element's result depends on that element alone, bit for bit on one instruction
+    set.
+
+    The problem has local optima. `effort` says how many starts are tried: the feedback law of the plant without
+    contact, along a long homotopy and a short one; the opposite of the best plan so far; that plan once more from far
+    up the homotopy; random actions. Starts are compared after two steps at the relaxation, and only those that may
+    still win are solved to the end. The starts of an element lie side by side in the lanes of a vector, so that one
+    problem with several starts takes little longer than with one; a batch pays for each.
 
     Every trajectory is judged after the solve by `difflcs.mpc.kkt.residual`, recomputed from the numbers that are
     returned (`difflcs/_native/certificate.hpp`); one that claims to be solved and is not becomes NUMERICAL. Ctrl-C ends
     a solve within a fraction of a second.
 
     Attributes:
+        effort: "fast", one start; "default", three; "best", sixteen. A guess is the first start, and the only one but
+            for "best".
+        restarts: number of starts, whatever the effort; None: what the effort says.
         tol: projected gradient dJ/du at which a problem is solved, or 1e-12 of the terms that sum to it where that is
             more. It must also be below 1e-7 of its own scale, see `difflcs.mpc.kkt.residual`.
         max_iter: iteration limit of one solve. What fails is solved once more, cold and along a longer homotopy; and
             with row exchanges in the elimination of λ, where it failed for want of them.
         time_limit: seconds for one call, None for no limit. Elements not solved by then are MAX_ITER: those under way
             keep their iterate, those not begun stay at the actions of the guess or zero, with x = x0 and λ = 0.
-        restarts: number of starts; the best optimum wins. 1 starts from the guess or from zero action, further ones
-            from random actions inside the bounds, the same for every element.
-        seed: seed of the random starts.
-        homotopy: first relaxation as a multiple of the problem's, at a cold start; a guess starts at the relaxation.
+        seed: seed of the random starts, which are the same for every element.
+        homotopy: λ·s at which a cold start begins, as a multiple of the relaxation; None: the square of the mean gap
+            of the contacts, in the units in which F has a unit diagonal. A guess starts at the relaxation.
         shrink: factor of the homotopy.
         threads: threads to use; torch's number if None.
     """
 
     name: ClassVar[str] = "batched"
 
+    effort: Effort = "default"
+    restarts: int | None = None
     tol: float = 1e-8
     max_iter: int = 150
     time_limit: float | None = None
-    restarts: int = 1
     seed: int = 0
-    homotopy: float = 100.0
+    homotopy: float | None = None
     shrink: float = 0.3
     threads: int | None = None
 
     def __post_init__(self) -> None:
+        check_choice("effort", self.effort, tuple(_STARTS))
         check_positive_int("max_iter", self.max_iter)
-        check_positive_int("restarts", self.restarts)
+        if self.restarts is not None:
+            check_positive_int("restarts", self.restarts)
         check_positive_int("seed", self.seed, minimum=0)
         check_threads(self.threads)
         if self.time_limit is not None:
             check_number("time_limit", self.time_limit, strict=True)
         check_number("tol", self.tol, strict=True)
-        check_number("homotopy", self.homotopy, minimum=1.0)
+        if self.homotopy is not None:
+            check_number("homotopy", self.homotopy, minimum=1.0)
         if check_number("shrink", self.shrink, strict=True) >= 1:
             check_number("1 - shrink", 1 - self.shrink, strict=True)
 
     def solve(self, problem: MPCProblem, guess: Primal | None) -> BatchedResult:
         """Solve every element from one start or several."""
         started = time.perf_counter()
-        ends = started + (self.time_limit or np.inf)
-        first = problem.relaxation * (self.homotopy if guess is None else 1.0)
-        best = self._run(problem, guess, first, ends)
-        generator = np.random.default_rng(self.seed)
-        for _ in range(1, self.restarts):
-            # The homotopy of a cold start leads most starts to one optimum; a short one keeps them apart.
-            draw = torch.from_numpy(generator.random((problem.horizon, problem.n_u)))
-            low, high = _span(problem, best)
-            start = (low + draw * (high - low)).expand(problem.batch, -1, -1)
-            if time.perf_counter() < ends:
-                again = self._run(problem, start, problem.relaxation * min(self.homotopy, 10.0), ends)
-                best = best.better(again)
-        best = self._second_chance(problem, best, ends)
-        seconds = torch.full((problem.batch,), (time.perf_counter() - started) / max(problem.batch, 1))
-        return BatchedResult(
-            best.primal(problem),
-            best.status,
-            best.iterations,
-            best.residual.clamp_max(torch.finfo(torch.float64).max),
-            seconds.double(),
-            fragile=best.fragile.bool(),
+        batch, horizon = problem.batch, problem.horizon
+        number = {"dtype": torch.float64}
+        x = torch.empty(batch, horizon + 1, problem.n_x, **number)
+        u = torch.empty(batch, horizon, problem.n_u, **number)
+        lam = torch.empty(batch, horizon, problem.n_lam, **number)
+        mu = torch.empty(batch, horizon + 1, problem.n_c, **number)
+        objective, residual = torch.empty(batch, **number), torch.empty(batch, **number)
+        status, fragile = torch.empty(batch, dtype=torch.int8), torch.empty(batch, dtype=torch.int8)
+        iterations = torch.empty(batch, dtype=torch.int32)
+        _kernels.solve_mpc(
+            inputs=_inputs(problem),
+            horizon=horizon,
+            relaxation=problem.relaxation,
+            barrier=problem.barrier,
+            u_start=None if guess is None else _array(guess.u),
+            lam_start=None if guess is None else _array(guess.lam),
+            mu_start=None if guess is None else _array(guess.mu),
+            starts=self.starts(guess is not None),
+            seed=self.seed,
+            homotopy=self.homotopy or 0.0,
+            shrink=self.shrink,
+            tol=self.tol,
+            max_iter=self.max_iter,
+            certified=kkt.CERTIFIED,
+            time_limit=self.time_limit or np.inf,
+            threads=self._threads(),
+            x=x.numpy(),
+            u=u.numpy(),
+            lam=lam.numpy(),
+            mu=mu.numpy(),
+            objective=objective.numpy(),
+            residual=residual.numpy(),
+            status=status.numpy(),
+            fragile=fragile.numpy(),
+            iterations=iterations.numpy(),
         )
+        seconds = torch.full((batch,), (time.perf_counter() - started) / max(batch, 1), **number)
+        primal = _presentable(problem, Primal(x, u, lam, mu), status)
+        residual.clamp_max_(torch.finfo(torch.float64).max)
+        return BatchedResult(primal, status, iterations, residual, seconds, fragile=fragile.bool())
+
+    def starts(self, guessed: bool) -> int:
+        """How many starts each element gets; a guess is the first of them."""
+        if self.restarts is not None:
+            return self.restarts
+        return (_STARTS_GUESSED if guessed else _STARTS)[self.effort]
 
     def vjp(
         self, problem: MPCProblem, result: Result, grads: tuple[Tensor, Tensor, Tensor, Tensor], solved: Tensor
@@ -147,126 +185,19 @@ class BatchedBackend(Backend):
         )
         return gradients
 
-    def _second_chance(self, problem: MPCProblem, found: _Found, ends: float) -> _Found:
-        """Solve the elements that failed (one in a thousand) again, cold and along a longer homotopy.
-
-        Then, where the numbers broke down and not the patience, with row exchanges in the elimination of λ.
-        """
-        for pivot in (False, True):
-            failed = ~found.solved
-            if pivot:
-                failed &= (found.status == Status.NUMERICAL) | found.fragile.bool()
-            index = torch.nonzero(failed).squeeze(-1)
-            if not len(index) or time.perf_counter() >= ends:
-                break
-            part = problem.select(index)
-            again = self._run(part, None, problem.relaxation * 10 * self.homotopy, ends, pivot=pivot)
-            found.replace(index, found.select(index).better(again))
-        return found
-
     def _threads(self) -> int:
         return self.threads or torch.get_num_threads()
 
-    def _run(
-        self,
-        problem: MPCProblem,
-        start: Primal | Tensor | None,
-        first: float,
-        ends: float,
-        pivot: bool = False,
-    ) -> _Found:
-        """One run of the kernel from a guess, from actions alone, or from zero actions."""
-        batch, horizon = problem.batch, problem.horizon
-        guess = start if isinstance(start, Primal) else None
-        u = start.u if isinstance(start, Primal) else start
-        found = _Found(
-            x=torch.empty(batch, horizon + 1, problem.n_x, dtype=torch.float64),
-            u=torch.empty(batch, horizon, problem.n_u, dtype=torch.float64),
-            lam=torch.empty(batch, horizon, problem.n_lam, dtype=torch.float64),
-            mu=torch.empty(batch, horizon + 1, problem.n_c, dtype=torch.float64),
-            objective=torch.empty(batch, dtype=torch.float64),
-            residual=torch.empty(batch, dtype=torch.float64),
-            status=torch.empty(batch, dtype=torch.int8),
-            fragile=torch.empty(batch, dtype=torch.int8),
-            iterations=torch.empty(batch, dtype=torch.int32),
-        )
-        _kernels.solve_mpc(
-            inputs=_inputs(problem),
-            horizon=horizon,
-            relaxation=problem.relaxation,
-            barrier=problem.barrier,
-            u_start=None if u is None else _array(u),
-            lam_start=None if guess is None else _array(guess.lam),
-            mu_start=None if guess is None else _array(guess.mu),
-            first_relaxation=first,
-            shrink=self.shrink,
-            tol=self.tol,
-            max_iter=min(self.max_iter, _MAX_ITER_PIVOT) if pivot else self.max_iter,
-            certified=kkt.CERTIFIED,
-            pivot=pivot,
-            time_limit=max(ends - time.perf_counter(), 0.0),
-            threads=self._threads(),
-            **{name: value.numpy() for name, value in found.tensors().items()},  # pyright: ignore[reportArgumentType]
-        )
-        return found
 
-
-@dataclass
-class _Found:
-    """What one run of the kernel returns, by the names of its arguments."""
-
-    x: Tensor
-    u: Tensor
-    lam: Tensor
-    mu: Tensor
-    objective: Tensor
-    residual: Tensor
-    status: Tensor
-    fragile: Tensor
-    iterations: Tensor
-
-    def tensors(self) -> dict[str, Tensor]:
-        return dict(vars(self))
-
-    @property
-    def solved(self) -> Tensor:
-        return solved(self.status)
-
-    def select(self, index: Tensor) -> _Found:
-        return _Found(**{name: value[index] for name, value in self.tensors().items()})
-
-    def replace(self, index: Tensor, part: _Found) -> None:
-        for name, value in self.tensors().items():
-            value[index] = part.tensors()[name]
-
-    def better(self, other: _Found) -> _Found:
-        """Per element the solved trajectory with the lower objective; iterations add up."""
-        take = other.solved & (~self.solved | (other.objective < self.objective))
-        theirs = other.tensors()
-        chosen = {
-            name: torch.where(take.reshape(-1, *[1] * (value.ndim - 1)), theirs[name], value)
-            for name, value in self.tensors().items()
-        }
-        return _Found(**{**chosen, "iterations": self.iterations + other.iterations})
-
-    def primal(self, problem: MPCProblem) -> Primal:
-        """The trajectories, those that failed with finite numbers inside the bounds."""
-        failed = torch.nonzero(~self.solved).squeeze(-1)
-        if len(failed):
-            part = problem.select(failed)
-            self.u[failed] = part.clip(torch.nan_to_num(self.u[failed], posinf=0.0, neginf=0.0))
-            for value in (self.x, self.lam, self.mu):
-                value[failed] = torch.nan_to_num(value[failed])
-        return Primal(self.x, self.u, self.lam, self.mu)
-
-
-def _span(problem: MPCProblem, found: _Found) -> tuple[Tensor, Tensor]:
-    """Where random starts lie: within the bounds; where there are none, as far out as the actions found are large."""
-    low, high = problem.bounds()
-    if bool(torch.isfinite(low).all()) and bool(torch.isfinite(high).all()):
-        return low, high
-    reach = 1.0 + found.u.abs().nan_to_num(posinf=0.0).amax((1, 2), keepdim=True)
-    return torch.maximum(low, -reach), torch.minimum(high, reach)
+def _presentable(problem: MPCProblem, primal: Primal, status: Tensor) -> Primal:
+    """The trajectories, those that failed with finite numbers inside the bounds."""
+    failed = torch.nonzero(~solved(status)).squeeze(-1)
+    if len(failed):
+        part = problem.select(failed)
+        primal.u[failed] = part.clip(torch.nan_to_num(primal.u[failed], posinf=0.0, neginf=0.0))
+        for value in (primal.x, primal.lam, primal.mu):
+            value[failed] = torch.nan_to_num(value[failed])
+    return primal
 
 
 def _inputs(problem: MPCProblem) -> list[np.ndarray]:

@@ -1,0 +1,350 @@
+#include "driver.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+namespace difflcs {
+namespace {
+
+// The actions that a start begins with.
+enum class Actions { none, best, mirrored, random };
+
+struct Start {
+  Actions actions;
+  bool released;  // see MpcStart
+  double first;   // first relaxation, in parts of the square of the problem's scale
+};
+
+// The sequence of starts. A long homotopy leads most actions to one optimum, which is often the best; a short one stays
+// near where it begins. What lies opposite of the best plan so far, in the middle of the bounds mirrored, is another
+// way round the contacts more often than random actions are.
+Start start_of(int64_t i) {
+  constexpr Start first[] = {{Actions::none, true, 1.0},
+                             {Actions::none, true, 1e-3},
+                             {Actions::mirrored, false, 0.01},
+                             {Actions::best, false, 1.0}};
+  constexpr Start then[] = {{Actions::random, false, 0.03},
+                            {Actions::random, false, 1.0},
+                            {Actions::mirrored, false, 0.1},
+                            {Actions::best, false, 10.0}};
+  return i < 4 ? first[i] : then[i % 4];
+}
+
+// Starts of one round know the best of the rounds before. A round is no wider than the lanes of one vector.
+int64_t end_of_round(int64_t begin) { return begin < 4 ? begin + 2 : begin + 4; }
+
+// Steps at the target of the homotopy after which starts are compared.
+constexpr int64_t kExplore = 2;
+// Actions that differ by less than this part of their range lead to the same optimum.
+constexpr double kSame = 0.02;
+// The homotopy makes one step per stage, and two where a problem is tried again along one that starts this many
+// relaxations up.
+constexpr int64_t kSteps = 1, kStepsAgain = 2;
+constexpr double kLonger = 1000.0;
+// An iteration with row exchanges takes ten times as long, and what it can mend it mends soon.
+constexpr int64_t kMaxIterPivot = 60;
+// Elements are searched in chunks, so that what is kept of all starts stays small.
+constexpr int64_t kJobs = 8192, kChunk = 64;
+
+// A number in [0, 1) for every triple: splitmix64.
+double uniform(uint64_t seed, int64_t start, int64_t position) {
+  uint64_t z = seed * 0x9e3779b97f4a7c15u + uint64_t(start) * 0xbf58476d1ce4e5b9u + uint64_t(position);
+  for (int i = 0; i < 2; i++) {
+    z += 0x9e3779b97f4a7c15u;
+    z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9u;
+    z = (z ^ (z >> 27)) * 0x94d049bb133111ebu;
+    z ^= z >> 31;
+  }
+  return double(z >> 11) * 0x1p-53;
+}
+
+struct Sizes {
+  int64_t x, u, lam, mu;  // numbers of one plan
+  explicit Sizes(const MpcBatch& b)
+      : x((b.horizon + 1) * b.n_x), u(b.horizon * b.n_u), lam(b.horizon * b.n_lam), mu((b.horizon + 1) * b.n_c) {}
+};
+
+struct Bound {
+  double low, high;
+  Bound(const MpcBatch& b, int64_t element, int64_t i)
+      : low(b.at(ku_min, element, i / b.n_u)[i % b.n_u]), high(b.at(ku_max, element, i / b.n_u)[i % b.n_u]) {}
+  bool finite() const { return low > -kHuge && high < kHuge; }
+  double clip(double u) const { return std::min(std::max(u, low), high); }
+};
+
+void copy_plan(const Sizes& n, const MpcPlans& from, int64_t i, const MpcPlans& to, int64_t j) {
+  std::copy_n(from.x + i * n.x, n.x, to.x + j * n.x), std::copy_n(from.u + i * n.u, n.u, to.u + j * n.u);
+  std::copy_n(from.lam + i * n.lam, n.lam, to.lam + j * n.lam);
+  std::copy_n(from.mu + i * n.mu, n.mu, to.mu + j * n.mu);
+  to.objective[j] = from.objective[i], to.residual[j] = from.residual[i];
+  to.status[j] = from.status[i], to.fragile[j] = from.fragile[i];
+}
+
+// An element that the time did not suffice for: the actions to start from, the state where it is, no forces.
+void stay_at_start(const MpcBatch& b, const MpcGuess& guess, const MpcPlans& out, int64_t e) {
+  const Sizes n(b);
+  for (int64_t i = 0; i < n.u; i++) out.u[e * n.u + i] = Bound(b, e, i).clip(guess.u ? guess.u[e * n.u + i] : 0.0);
+  for (int64_t i = 0; i < n.x; i++) out.x[e * n.x + i] = b.at(kx0, e)[i % b.n_x];
+  std::fill_n(out.lam + e * n.lam, n.lam, 0.0), std::fill_n(out.mu + e * n.mu, n.mu, 0.0);
+  out.objective[e] = out.residual[e] = std::numeric_limits<double>::max();
+  out.status[e] = int8_t(Status::max_iter), out.fragile[e] = 0;
+}
+
+struct Solving {
+  const MpcBatch& batch;
+  const MpcSolve& solve;
+  int64_t next;
+};
+
+// One call of the kernel for every problem of a batch.
+void run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner) {
+  std::fill_n(solve.status, batch.count, kUnreached), std::fill_n(solve.iterations, batch.count, 0);
+  Solving context{batch, solve, 0};
+  runner.run(
+      batch.count, kernels().mpc_workspace(batch), false,
+      [](void* context, void* workspace, Watch watch) {
+        auto& c = *static_cast<Solving*>(context);
+        kernels().mpc_solve(c.batch, c.solve, &c.next, workspace, watch);
+      },
+      &context);
+}
+
+// Which of the solved problems have constraints that make them degenerate.
+void judge_constraints(const MpcBatch& batch, const MpcSolve& results, Runner& runner) {
+  Solving context{batch, results, 0};
+  runner.run(
+      batch.count, kernels().mpc_workspace(batch), true,
+      [](void* context, void* workspace, Watch watch) {
+        auto& c = *static_cast<Solving*>(context);
+        constexpr int64_t block = 64;
+        for (int64_t i; (i = __atomic_fetch_add(&c.next, block, __ATOMIC_RELAXED)) < c.batch.count;)
+          kernels().mpc_constraints(c.batch, c.solve, i, std::min(c.batch.count, i + block), workspace, watch);
+      },
+      &context);
+}
+
+MpcSolve with(const MpcEffort& effort, const MpcPlans& out) {
+  MpcSolve o{};
+  o.shrink = effort.shrink, o.steps = kSteps, o.tol = effort.tol, o.max_iter = effort.max_iter;
+  o.certified = effort.certified;
+  o.x = out.x, o.u = out.u, o.lam = out.lam, o.mu = out.mu, o.objective = out.objective, o.residual = out.residual;
+  o.status = out.status, o.fragile = out.fragile, o.iterations = out.iterations;
+  return o;
+}
+
+MpcPlans shifted(const MpcBatch& b, MpcPlans p, int64_t by) {
+  const Sizes n(b);
+  p.x += by * n.x, p.u += by * n.u, p.lam += by * n.lam, p.mu += by * n.mu, p.objective += by, p.residual += by;
+  p.status += by, p.fragile += by, p.iterations += by;
+  return p;
+}
+
+}  // namespace
+
+void MpcDriver::Store::resize(const MpcBatch& batch, int64_t count) {
+  const Sizes n(batch);
+  x.resize(count * n.x), u.resize(count * n.u), lam.resize(count * n.lam), mu.resize(count * n.mu);
+  for (auto* v : {&objective, &residual, &scale, &gained}) v->resize(count);
+  status.resize(count), fragile.resize(count), iterations.resize(count), element.resize(count), start.resize(count);
+}
+
+MpcPlans MpcDriver::Store::plans() {
+  return {x.data(),        u.data(),      lam.data(),     mu.data(),        objective.data(),
+          residual.data(), status.data(), fragile.data(), iterations.data()};
+}
+
+void MpcDriver::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
+                      Runner& runner) {
+  if (batch.count == 0) return;
+  const int64_t chunk = std::max(kChunk, kJobs / effort.starts);
+  for (int64_t first = 0; first < batch.count; first += chunk)
+    search(batch, guess, effort, out, runner, first, std::min(chunk, batch.count - first));
+  for (const bool pivot : {false, true})
+    if (!runner.stopped()) again(batch, effort, out, runner, pivot);
+  if (batch.n_c > 0) judge_constraints(batch, with(effort, out), runner);
+}
+
+// The first actions of a job: the best plan of its element so far is that of job `best`.
+void MpcDriver::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start, int64_t job, int64_t best) {
+  const Sizes n(b);
+  const Start s = start_of(start);
+  const double least = b.relaxation * std::max(effort.homotopy, 1.0);
+  tried.start[job] = {s.released, effort.homotopy > 0 ? 0.0 : s.first, least};
+  double* u = tried.u.data() + job * n.u;
+  const double* from = best >= 0 ? tried.u.data() + best * n.u : nullptr;
+  double reach = 1.0;  // of actions without bounds
+  for (int64_t i = 0; from && i < n.u; i++) reach = std::max(reach, 1.0 + std::abs(from[i]));
+  for (int64_t i = 0; i < n.u; i++) {
+    const Bound bound(b, tried.element[job], i);
+    const double low = std::max(bound.low, -reach), high = std::min(bound.high, reach);
+    if (s.actions == Actions::random)
+      u[i] = low + uniform(effort.seed, start, i) * (high - low);
+    else if (s.actions == Actions::none || !from)
+      u[i] = 0.0;
+    else
+      u[i] = s.actions == Actions::best ? from[i] : (bound.finite() ? bound.low + bound.high : 0.0) - from[i];
+    u[i] = bound.clip(u[i]);
+  }
+}
+
+// Runs jobs [first, first + count) to where starts are compared.
+void MpcDriver::explore(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, int64_t first, int64_t count,
+                        bool guessed) {
+  const Sizes n(batch);
+  MpcBatch jobs = batch;
+  jobs.count = count, jobs.element = tried.element.data() + first;
+  MpcSolve o = with(effort, shifted(batch, tried.plans(), first));
+  o.u_start = o.u, o.start = tried.start.data() + first, o.explore = kExplore;
+  if (guessed) o.lam_start = o.lam, o.mu_start = o.mu;
+  o.scale = tried.scale.data() + first, o.gained = tried.gained.data() + first;
+  run(jobs, o, runner);
+}
+
+void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
+                       Runner& runner, int64_t first, int64_t count) {
+  const Sizes n(batch);
+  const bool guessed = guess.u, whole = guess.lam;  // by actions alone, or by forces too
+  const int64_t starts = effort.starts;
+  const MpcPlans to = shifted(batch, out, first);
+  auto element = [&](int64_t e) { return batch.element ? batch.element[first + e] : first + e; };
+
+  if (starts == 1) {
+    tried.resize(batch, 0), tried.element.resize(count), tried.start.resize(count);
+    const Start s = start_of(0);
+    const double least = batch.relaxation * (guessed ? 1.0 : std::max(effort.homotopy, 1.0));
+    for (int64_t e = 0; e < count; e++) {
+      tried.element[e] = element(e);
+      tried.start[e] = {!guessed && s.released, guessed || effort.homotopy > 0 ? 0.0 : s.first, least};
+    }
+    MpcBatch jobs = batch;
+    jobs.count = count, jobs.element = tried.element.data();
+    MpcSolve o = with(effort, to);
+    o.start = tried.start.data();
+    if (guessed) o.u_start = guess.u + first * n.u;
+    if (whole) o.lam_start = guess.lam + first * n.lam, o.mu_start = guess.mu + first * n.mu;
+    run(jobs, o, runner);
+    for (int64_t e = 0; e < count; e++)
+      if (to.status[e] == kUnreached) stay_at_start(jobs, {o.u_start, nullptr, nullptr}, to, e);
+    return;
+  }
+
+  // Job s * count + e is start s of element e.
+  tried.resize(batch, starts * count), best.assign(count, -1);
+  std::fill(tried.status.begin(), tried.status.end(), kUnreached);
+  std::fill(tried.iterations.begin(), tried.iterations.end(), 0);
+  for (int64_t j = 0; j < starts * count; j++) tried.element[j] = element(j % count);
+  for (int64_t begun = 0; begun < starts && !runner.stopped();) {
+    const bool from_guess = guessed && begun == 0;
+    const int64_t shift = guessed ? 1 : 0;
+    const int64_t end = from_guess ? 1 : std::min(starts, end_of_round(begun - shift) + shift);
+    for (int64_t j = begun * count; j < end * count; j++) {
+      const int64_t e = j % count;
+      if (from_guess) {
+        tried.start[j] = {false, 0.0, batch.relaxation};
+        std::copy_n(guess.u + (first + e) * n.u, n.u, tried.u.data() + j * n.u);
+        if (whole) std::copy_n(guess.lam + (first + e) * n.lam, n.lam, tried.lam.data() + j * n.lam);
+        if (whole) std::copy_n(guess.mu + (first + e) * n.mu, n.mu, tried.mu.data() + j * n.mu);
+        continue;
+      }
+      begin(batch, effort, j / count - shift, j, best[e]);
+      // The scale is that of the first start that was released.
+      if (!tried.start[j].released) tried.scale[j] = tried.scale[shift * count + e];
+    }
+    explore(batch, effort, runner, begun * count, (end - begun) * count, from_guess && whole);
+    for (int64_t j = begun * count; j < end * count; j++) {
+      int64_t& b = best[j % count];
+      if (tried.status[j] == kUnreached) continue;
+      if (b < 0 || !(tried.objective[b] <= tried.objective[j])) b = j;
+    }
+    begun = end;
+  }
+
+  finish(batch, guess, effort, to, runner, first, count);
+}
+
+// Solves to the end what may still become the best of its element; a start whose last step saved less than it lies
+// behind, or that is on its way to the same plan, is given up.
+void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
+                       Runner& runner, int64_t first, int64_t count) {
+  const Sizes n(batch);
+  finished.resize(batch, effort.starts * count), origin.resize(effort.starts * count);
+  int64_t kept = 0;
+  for (int64_t j = 0; j < effort.starts * count; j++) {
+    if (tried.status[j] == kUnreached || !promising(batch, j, best[j % count])) continue;
+    copy_plan(n, tried.plans(), j, finished.plans(), kept);
+    origin[kept] = j, finished.element[kept] = tried.element[j], finished.start[kept] = {false, 0.0, batch.relaxation};
+    kept++;
+  }
+  MpcBatch jobs = batch;
+  jobs.count = kept, jobs.element = finished.element.data();
+  MpcSolve o = with(effort, finished.plans());
+  o.u_start = o.u, o.lam_start = o.lam, o.mu_start = o.mu, o.start = finished.start.data();
+  if (kept) run(jobs, o, runner);
+
+  std::fill_n(out.status, count, kUnreached), std::fill_n(out.iterations, count, 0);
+  for (int64_t j = 0; j < effort.starts * count; j++) out.iterations[j % count] += tried.iterations[j];
+  for (int64_t i = 0; i < kept; i++) {
+    const int64_t e = origin[i] % count;
+    out.iterations[e] += finished.iterations[i];
+    if (finished.status[i] == kUnreached) continue;
+    const bool better =
+        solved(finished.status[i]) && (!solved(out.status[e]) || finished.objective[i] < out.objective[e]);
+    if (out.status[e] == kUnreached || better) copy_plan(n, finished.plans(), i, out, e);
+  }
+  for (int64_t e = 0; e < count; e++) {
+    if (out.status[e] != kUnreached) continue;
+    if (best[e] >= 0) {  // out of time after its starts were compared
+      copy_plan(n, tried.plans(), best[e], out, e);
+      out.status[e] = int8_t(Status::max_iter);
+    } else {
+      MpcBatch own = batch;
+      own.element = tried.element.data();
+      stay_at_start(own, {guess.u ? guess.u + first * n.u : nullptr, nullptr, nullptr}, out, e);
+    }
+  }
+}
+
+bool MpcDriver::promising(const MpcBatch& batch, int64_t job, int64_t best) const {
+  if (job == best) return true;
+  if (!(tried.objective[job] - tried.gained[job] <= tried.objective[best])) return false;
+  const Sizes n(batch);
+  for (int64_t i = 0; i < n.u; i++) {
+    const Bound bound(batch, tried.element[job], i);
+    const double here = tried.u[job * n.u + i], there = tried.u[best * n.u + i];
+    const double range = bound.finite() ? bound.high - bound.low : 1.0 + std::abs(there);
+    if (std::abs(here - there) > kSame * range) return true;
+  }
+  return false;
+}
+
+// Solves the elements that failed (one in a thousand) once more, from no action along a longer homotopy; then, where
+// the numbers broke down and not the patience, with row exchanges in the elimination of the forces.
+void MpcDriver::again(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, bool pivot) {
+  const Sizes n(batch);
+  origin.clear();
+  for (int64_t e = 0; e < batch.count; e++) {
+    const bool broken = out.status[e] == int8_t(Status::numerical) || out.fragile[e];
+    if (!solved(out.status[e]) && (!pivot || broken)) origin.push_back(e);
+  }
+  const int64_t count = int64_t(origin.size());
+  if (count == 0) return;
+  tried.resize(batch, count);
+  for (int64_t i = 0; i < count; i++) {
+    tried.element[i] = batch.element ? batch.element[origin[i]] : origin[i];
+    tried.start[i] = {false, 0.0, batch.relaxation * kLonger * std::max(effort.homotopy / 100.0, 1.0)};
+  }
+  MpcBatch jobs = batch;
+  jobs.count = count, jobs.element = tried.element.data(), jobs.pivot = pivot;
+  MpcSolve o = with(effort, tried.plans());
+  o.start = tried.start.data(), o.steps = kStepsAgain;
+  if (pivot) o.max_iter = std::min(o.max_iter, kMaxIterPivot);
+  run(jobs, o, runner);
+  for (int64_t i = 0; i < count; i++) {
+    const int64_t e = origin[i];
+    out.iterations[e] += tried.iterations[i];
+    if (solved(tried.status[i])) copy_plan(n, tried.plans(), i, out, e);
+  }
+}
+
+}  // namespace difflcs

@@ -1,0 +1,79 @@
+// How the optimum of an LCS-MPC problem is searched: from which starts, what is kept of them, and what is tried where
+// all fail. Shared by the Python module and the C library, so that both give the same bits; independent of the
+// instruction set.
+#pragma once
+#include <cstdint>
+#include <vector>
+
+#include "kernels.hpp"
+
+namespace difflcs {
+
+// How hard to try.
+struct MpcEffort {
+  int64_t starts;   // at least one; driver.cpp states their sequence. A guess is the first of them.
+  double homotopy;  // first relaxation as a multiple of the problem's; 0: the problem's own scale decides
+  double shrink;    // factor of the homotopy
+  double tol;       // on the projected gradient
+  int64_t max_iter;
+  double certified;  // largest residual of a solved problem
+  uint64_t seed;     // of the random starts
+};
+
+// What to begin with, (count, ...) each: actions alone, or with forces and multipliers. Null: nothing.
+struct MpcGuess {
+  const double *u, *lam, *mu;
+};
+
+// Where the results of a batch go.
+struct MpcPlans {
+  double *x, *u, *lam, *mu, *objective, *residual;
+  int8_t *status, *fragile;
+  int32_t* iterations;
+};
+
+// Runs work on one thread or on several, each with a workspace of its own, until it is done or the time is over.
+// `to_the_end`: whatever the time.
+struct Runner {
+  using Work = void (*)(void* context, void* workspace, Watch watch);
+  virtual void run(int64_t problems, int64_t workspace_bytes, bool to_the_end, Work work, void* context) = 0;
+  virtual bool stopped() const = 0;
+
+ protected:
+  ~Runner() = default;
+};
+
+class MpcDriver {
+ public:
+  // Solves a batch. A second call for a batch of the same size allocates nothing.
+  void solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
+             Runner& runner);
+
+ private:
+  // The plans of several problems, and how each began.
+  struct Store {
+    std::vector<double> x, u, lam, mu, objective, residual, scale, gained;
+    std::vector<int8_t> status, fragile;
+    std::vector<int32_t> iterations;
+    std::vector<int64_t> element;
+    std::vector<MpcStart> start;
+    void resize(const MpcBatch& batch, int64_t count);
+    MpcPlans plans();
+  };
+
+  void search(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
+              Runner& runner, int64_t first, int64_t count);
+  void explore(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, int64_t first, int64_t count,
+               bool guessed);
+  void begin(const MpcBatch& batch, const MpcEffort& effort, int64_t start, int64_t job, int64_t best);
+  void finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
+              Runner& runner, int64_t first, int64_t count);
+  bool promising(const MpcBatch& batch, int64_t job, int64_t best) const;
+  void again(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, bool pivot);
+
+  Store tried, finished;
+  std::vector<int64_t> best;    // of the jobs tried for each element
+  std::vector<int64_t> origin;  // the job, or the element, that each of some problems comes from
+};
+
+}  // namespace difflcs

@@ -1,0 +1,96 @@
+"""Starts of the batched backend: which optima they reach."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from difflcs import GoalCost, LCSMPCLayer, QuadraticCost
+from difflcs.errors import InvalidInputError
+from difflcs.mpc.backends import BatchedBackend
+from difflcs.systems import cart_pole_between_walls
+
+PAIRS = [(3 + 2 * finger + axis, axis) for finger in range(3) for axis in range(2)]
+COST = GoalCost.reach(9, 6, (200.0, 200.0, 0.3), (200.0, 200.0, 1.5), 200.0, PAIRS, 10.0, 6.0)
+
+
+def costs(layer, call, **options):
+    mpc = LCSMPCLayer(**layer, backend=BatchedBackend(**options), on_failure="mask")
+    with torch.no_grad():
+        plan = mpc(*call)
+    assert bool(plan.converged.all())
+    return plan.objective
+
+
+@pytest.mark.parametrize("n_lam", [5, 8])
+def test_more_effort_finds_better_optima(build, n_lam):
+    layer = {"lcs": build.pushing(2, n_lam), "cost": COST, "horizon": 5, "u_min": -0.015, "u_max": 0.015}
+    generator = torch.Generator().manual_seed(3)
+    x0 = 0.05 * torch.randn(64, 9, generator=generator, dtype=torch.float64)
+    goal = 0.05 * torch.randn(64, 3, generator=generator, dtype=torch.float64)
+    found = {effort: costs(layer, (x0, goal), effort=effort) for effort in ("fast", "default", "best")}
+    best = torch.minimum(torch.stack(list(found.values())).amin(0), costs(layer, (x0, goal), restarts=32))
+    gap = {effort: float(((cost - best) / best.abs()).mean()) for effort, cost in found.items()}
+    assert gap["best"] <= gap["default"] <= gap["fast"]
+    assert gap["default"] < 0.8 * gap["fast"]
+    assert gap["best"] < 0.003
+
+
+def test_an_unstable_plant_starts_from_its_feedback_law():
+    """Without action the pole falls onto a wall, and from there every step leads to leaning on it."""
+
+    def diagonal(*weights):
+        return torch.diag(torch.tensor(weights, dtype=torch.float64))
+
+    cost = QuadraticCost(diagonal(1, 1, 0.1, 0.1), diagonal(0.01), diagonal(100, 100, 1, 1))
+    layer = {"lcs": cart_pole_between_walls(), "cost": cost, "horizon": 50, "u_min": -10.0, "u_max": 10.0}
+    generator = torch.Generator().manual_seed(0)
+    size = torch.tensor([0.02, 0.05, 0.1, 0.3], dtype=torch.float64)
+    x0 = size * (2 * torch.rand(32, 4, generator=generator, dtype=torch.float64) - 1)
+    ours, best = costs(layer, (x0,)), costs(layer, (x0,), restarts=32)
+    assert float((ours <= 1.001 * best).double().mean()) >= 0.9
+
+
+def test_the_scale_of_the_problem_starts_the_homotopy(build):
+    """The same problem in millimetres has the same plan: the starts do not depend on the units."""
+    lcs = build.pushing(1, 5)
+    generator = torch.Generator().manual_seed(1)
+    x0 = 0.05 * torch.randn(24, 9, generator=generator, dtype=torch.float64)
+    goal = 0.05 * torch.randn(24, 3, generator=generator, dtype=torch.float64)
+    stated = COST(goal, 5)
+    unit = 1024.0  # a power of two: the numbers are the same to the last bit
+    small = type(lcs)(
+        lcs.A, lcs.B, lcs.C, lcs.d * unit, lcs.D, lcs.E, lcs.F, lcs.c * unit
+    )  # lengths, actions and forces in parts of 1/1024
+    other = QuadraticCost(
+        stated.Q / unit**2,
+        stated.R / unit**2,
+        stated.Q_final / unit**2,
+        stated.q / unit,
+        stated.r / unit,
+        stated.q_final / unit,
+    )
+    one = LCSMPCLayer(lcs, stated, 5, -0.015, 0.015, relaxation=1e-5)(x0)
+    two = LCSMPCLayer(small, other, 5, -0.015 * unit, 0.015 * unit, relaxation=1e-5 * unit**2)(x0 * unit)
+    assert bool(((two.u / unit - one.u).abs().amax((1, 2)) < 1e-6).double().mean() >= 0.95)
+
+
+def test_a_guess_is_the_only_start_unless_the_best_is_wanted(build):
+    assert [BatchedBackend(effort=e).starts(guessed=True) for e in ("fast", "default", "best")] == [1, 1, 16]
+    assert [BatchedBackend(effort=e).starts(guessed=False) for e in ("fast", "default", "best")] == [1, 3, 16]
+    assert BatchedBackend(restarts=5).starts(guessed=True) == BatchedBackend(restarts=5).starts(guessed=False) == 5
+    layer = {"lcs": build.pushing(1, 8), "cost": COST, "horizon": 5, "u_min": -0.015, "u_max": 0.015}
+    generator = torch.Generator().manual_seed(4)
+    x0 = 0.05 * torch.randn(32, 9, generator=generator, dtype=torch.float64)
+    goal = 0.05 * torch.randn(32, 3, generator=generator, dtype=torch.float64)
+    poor = LCSMPCLayer(**layer, backend=BatchedBackend(effort="fast"))(x0, goal)
+    stays = LCSMPCLayer(**layer)(x0, goal, guess=poor)
+    moves = LCSMPCLayer(**layer, backend=BatchedBackend(effort="best"))(x0, goal, guess=poor)
+    assert torch.allclose(stays.objective, poor.objective, rtol=1e-9, atol=0)
+    assert bool((moves.objective <= poor.objective * (1 + 1e-9)).all())
+    assert bool((moves.objective < poor.objective * (1 - 1e-3)).any())
+
+
+def test_an_effort_that_is_none_is_refused():
+    with pytest.raises(InvalidInputError, match="effort: expected one of 'fast', 'default', 'best', got 'huge'"):
+        BatchedBackend(effort="huge")  # pyright: ignore[reportArgumentType]
