@@ -153,8 +153,11 @@ class LCSMethod(Method):
         return lcs
 
     def policy(self, task: TaskSpec, learned: LCSModule) -> LCSMPCLayer:
-        """See `Method`. One start of the solver: others find better plans in a model in one state of seven, but what
-        is learned is how these plans do on the robot, and they take twice as long."""
+        """See `Method`.
+
+        The solver tries one start. With three it finds another plan in one state of seven and takes twice as long; what
+        is learned is how those of one start do on the robot.
+        """
         backend = get_backend(self.backend)
         if isinstance(backend, BatchedBackend):
             backend = replace(backend, effort="fast")
