@@ -16,6 +16,7 @@ from difflcs.errors import DegenerateWarning, SolveError, SolveWarning
 from difflcs.lcs import LCSSequence
 from difflcs.mpc.autograd import Plan, solve
 from difflcs.mpc.backends import Backend, get_backend
+from difflcs.mpc.controller import MPCController, OnFailure
 from difflcs.mpc.gather import (
     Bound,
     Constraints,
@@ -204,6 +205,15 @@ class LCSMPCLayer(nn.Module):
         outputs = solve(plan, [*(tensors.get(name) for name in INPUTS), tensors["constant"], *start])
         self._report(plan.result.status, needs_grad)
         return MPCSolution(*outputs, problem=plan.problem)
+
+    def controller(self, on_failure: OnFailure = "hold", time_limit: float | None = None) -> MPCController:
+        """A controller of one robot with this layer's problem as it is now: NumPy in and out, warm, microseconds.
+
+        Args:
+            on_failure: "hold", "unfinished", "zero", "raise" or an action (n_u,), see `MPCController`.
+            time_limit: seconds of one step, that of the backend if None.
+        """
+        return MPCController(self, on_failure, time_limit)
 
     def _report(self, status: Tensor, needs_grad: bool) -> None:
         degenerate = int((status == Status.DEGENERATE).sum())
