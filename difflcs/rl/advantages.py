@@ -19,7 +19,7 @@ and left out of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -33,7 +33,7 @@ from difflcs.rl.seeding import seeded
 from difflcs.rl.tasks import Features, see
 
 if TYPE_CHECKING:
-    from tensordict import TensorDict, TensorDictBase
+    from tensordict import TensorDict
 
 SAMPLES = ("action", "action_log_prob")
 
@@ -104,36 +104,36 @@ def returns(rewards: Tensor, gamma: float) -> Tensor:
     return torch.stack(sums[::-1], 1)
 
 
-def gae(
-    values: Callable[[Tensor], Tensor], inputs: Tensor, rewards: Tensor, gamma: float, zeta: float
-) -> TensorDictBase:
-    """TorchRL's GAE (Eq. adv_func).
+@dataclass(frozen=True)
+class GAE:
+    """What generalised advantage estimation says of episodes.
+
+    Attributes:
+        values: (N, T) of the states, by the value network.
+        advantages: (N, T).
+        targets: (N, T) what the value network is to be fitted to: their sum.
+    """
+
+    values: Tensor
+    advantages: Tensor
+    targets: Tensor
+
+
+def gae(values: Tensor, rewards: Tensor, gamma: float, zeta: float) -> GAE:
+    """Generalised advantage estimation (Eq. adv_func).
 
     The rewards of an episode end with it: V(T) = 0, which the value network can know because it sees the time.
 
     Args:
-        values: (..., n) inputs → (...) values.
-        inputs: (N, T+1, n).
+        values: (N, T+1) of the states, the last of which does not count.
         rewards: (N, T).
         gamma: discount per step.
         zeta: ζ, often called lambda.
-
-    Returns:
-        Keys "advantage", "value_target", "state_value", (N, T, 1) each.
     """
-    from tensordict import TensorDict
-    from tensordict.nn import TensorDictModule
-    from torchrl.objectives.value import GAE
-
-    n, steps = rewards.shape
-    end = torch.zeros(n, steps, 1, dtype=torch.bool)
-    end[:, -1] = True
-    following = {"inputs": inputs[:, 1:], "reward": rewards.unsqueeze(-1), "done": end, "terminated": end}
-    data = TensorDict({"inputs": inputs[:, :-1], "next": following}, [n, steps])  # pyright: ignore[reportArgumentType]
-    network = TensorDictModule(lambda v: values(v).unsqueeze(-1), ["inputs"], ["state_value"])
-    estimator = GAE(gamma=gamma, lmbda=zeta, value_network=network, deactivate_vmap=True)
-    with torch.no_grad():
-        return estimator(data)
+    now, following = values[:, :-1], values[:, 1:].clone()
+    following[:, -1] = 0
+    advantages = returns(rewards + gamma * following - now, gamma * zeta)
+    return GAE(now, advantages, advantages + now)
 
 
 class ValueFunction(Protocol):
@@ -145,7 +145,7 @@ class ValueFunction(Protocol):
         """(..., n) inputs → (...) values."""
         ...
 
-    def gae(self, inputs: Tensor, rewards: Tensor) -> TensorDictBase:
+    def gae(self, inputs: Tensor, rewards: Tensor) -> GAE:
         """See `gae`, with its own discount and ζ."""
         ...
 
@@ -165,8 +165,8 @@ class GAEAdvantages:
         found = self.critic.gae(inputs, rewards)
         taken: Any = episodes["policy"]
         samples = taken.select(*SAMPLES).unsqueeze(-1)
-        samples["advantage"] = found["advantage"].unsqueeze(-1)
-        return Estimate(samples, found["state_value"].squeeze(-1), rewards)
+        samples["advantage"] = found.advantages[..., None, None]
+        return Estimate(samples, found.values, rewards)
 
 
 class Foreseeing(Protocol):
@@ -206,7 +206,7 @@ class MultiActionAdvantages:
     @torch.no_grad()
     def __call__(self, episodes: TensorDict, inputs: Tensor, rewards: Tensor, key: Sequence[int]) -> Estimate:
         """See `Advantages`."""
-        now = self.critic.gae(inputs, rewards)["state_value"].squeeze(-1)
+        now = self.critic.values(inputs[:, :-1])
         with seeded(key):
             judged = mirrored_actions(episodes["policy"], self.actions)
         executed = torch.clamp(judged["action"], *self.bounds)

@@ -5,21 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim.lr_scheduler import LinearLR
 
 from difflcs.errors import CheckpointError
-from difflcs.rl.advantages import gae, returns
+from difflcs.rl.advantages import GAE, gae, returns
+from difflcs.rl.least_squares import FlatAdam, gradients, tanh
 from difflcs.rl.seeding import seeded
 from difflcs.rl.settings import MOST_WIDTH, Epochs, Settings, bounded, group
-from difflcs.rl.state import State, initialise_moments, load_moments, moments
-
-if TYPE_CHECKING:
-    from tensordict import TensorDictBase
-
+from difflcs.rl.state import State
 
 _WEIGHT_DECAY = 1e-4
 """Of AdamW."""
@@ -61,21 +57,19 @@ class Critic:
             self.network = nn.Sequential(
                 nn.Linear(n_inputs, width), nn.Tanh(), nn.Linear(width, width), nn.Tanh(), nn.Linear(width, 1)
             )
-        self._adam = torch.optim.AdamW(
-            self.network.parameters(), settings.learning_rate, weight_decay=_WEIGHT_DECAY, fused=True
-        )
-        initialise_moments(self._adam)
+        self._adam = FlatAdam(self.network, _WEIGHT_DECAY)
         self._none = (torch.zeros(0, episode_steps + 1, n_inputs).double(), torch.zeros(0, episode_steps).double())
         self.history: list[tuple[Tensor, Tensor]] = []
         """Newest iterations: inputs (N, T+1, n_inputs) and rewards (N, T)."""
 
+    @torch.no_grad()
     def values(self, inputs: Tensor) -> Tensor:
-        """(..., n_inputs) → (...)."""
+        """(..., n_inputs) → (...), without gradients."""
         return self.network(inputs.float()).double().squeeze(-1)
 
-    def gae(self, inputs: Tensor, rewards: Tensor) -> TensorDictBase:
+    def gae(self, inputs: Tensor, rewards: Tensor) -> GAE:
         """See `difflcs.rl.advantages.gae`."""
-        return gae(self.values, inputs, rewards, self.gamma, self.zeta)
+        return gae(self.values(inputs), rewards, self.gamma, self.zeta)
 
     def begin(self, inputs: Tensor, rewards: Tensor, key: Sequence[int]) -> None:
         """Fit the network to the returns of the first episodes, before the first advantages; later do nothing.
@@ -98,22 +92,22 @@ class Critic:
             epochs: passes over the episodes.
         """
         self.history = [*self.history, (inputs, rewards)][-self.settings.iterations :]
-        targets = [self.gae(*part)["value_target"].squeeze(-1) for part in self.history]
+        targets = [self.gae(*part).targets for part in self.history]
         seen = torch.cat([inputs[:, :-1] for inputs, _ in self.history])
         self._fit(seen, torch.cat(targets), epochs, (*key, len(self.history) + 1))
 
     def _fit(self, inputs: Tensor, targets: Tensor, epochs: int, key: Sequence[int]) -> None:
         x, y, minibatch = inputs.flatten(0, 1).float(), targets.flatten().float(), self.settings.epochs.minibatch
-        self._adam.param_groups[0]["lr"] = self.settings.learning_rate
-        schedule = LinearLR(self._adam, 1.0, 0.0, total_iters=epochs * math.ceil(len(x) / minibatch))
+        linear = [layer for layer in self.network if isinstance(layer, nn.Linear)]
+        layers = [(layer.weight.detach().mT.unsqueeze(0), layer.bias.detach().expand(1, 1, -1)) for layer in linear]
+        done, steps = 0, epochs * math.ceil(len(x) / minibatch)
         with seeded(key):
             for _ in range(epochs):
                 for batch in torch.randperm(len(x)).split(minibatch):
-                    loss = (self.network(x[batch]).squeeze(-1) - y[batch]).square().mean()
-                    self._adam.zero_grad()
-                    loss.backward()
-                    self._adam.step()
-                    schedule.step()
+                    _, found = gradients(layers, tanh, x[batch].unsqueeze(0), y[batch].view(1, -1, 1))
+                    parts = [part for weight, bias in found for part in (weight.mT.flatten(), bias.flatten())]
+                    self._adam.step(torch.cat(parts), self.settings.learning_rate * (1 - done / steps))
+                    done += 1
 
     def state_dict(self) -> dict[str, Any]:
         """Network, moments, and the newest iterations, one after another."""
@@ -122,7 +116,7 @@ class Critic:
         place = torch.cat([torch.zeros(0, dtype=torch.int64), *ages])
         return {
             "network": self.network.state_dict(),
-            "adam": moments(self._adam),
+            "adam": self._adam.state_dict(),
             "episodes": {"inputs": inputs, "rewards": rewards, "iteration": place},
         }
 
@@ -140,6 +134,6 @@ class Critic:
                 f"{ages[:9].tolist()}; is it damaged?"
             )
         self.network.load_state_dict(state["network"])
-        load_moments(self._adam, state["adam"])
+        self._adam.load_state_dict(state["adam"])
         sizes = counts.tolist()
         self.history = list(zip(episodes["inputs"].split(sizes), episodes["rewards"].split(sizes), strict=True))

@@ -11,11 +11,11 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim.lr_scheduler import LinearLR
 
 from difflcs import _files
 from difflcs._checks import check_positive_int
 from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs.rl.least_squares import gradients
 from difflcs.rl.settings import MOST_NETWORKS, MOST_WIDTH, Epochs, Settings, bounded, group
 
 _KIND = "dynamics"
@@ -109,20 +109,23 @@ class Ensemble(nn.Module):
             getattr(self, f"{name}_mean").copy_(data.mean(0))
             getattr(self, f"{name}_std").copy_(data.std(0, correction=0).clamp_min(1e-6))
         targets = (changes - self.change_mean) / self.change_std
+        inputs = (inputs - self.input_mean) / self.input_std
         adam = torch.optim.Adam(self.parameters(), learning_rate, fused=True)
-        steps = epochs * math.ceil(len(inputs) / minibatch)
-        schedule = LinearLR(adam, 1.0, 0.0 if decay else 1.0, total_iters=steps)
+        layers = [(w.detach(), b.detach()) for w, b in zip(self.weights, self.biases, strict=True)]
+        done, steps = 0, epochs * math.ceil(len(inputs) / minibatch)
         losses: list[Tensor] = []
         for _ in range(epochs):
             orders = torch.stack([torch.randperm(len(inputs), generator=generator) for _ in range(self.networks)])
             losses = []
             for batch in orders.split(minibatch, 1):
-                errors = (self.standardised(inputs[batch]) - targets[batch]).square().mean((1, 2))
-                adam.zero_grad()
-                errors.sum().backward()
+                errors, found = gradients(layers, torch.relu_, inputs[batch], targets[batch])
+                for weight, bias, gradient in zip(self.weights, self.biases, found, strict=True):
+                    weight.grad, bias.grad = gradient
+                if decay:
+                    adam.param_groups[0]["lr"] = learning_rate * (1 - done / steps)
                 adam.step()
-                schedule.step()
-                losses.append(errors.detach().mean())
+                done += 1
+                losses.append(errors.mean())
         return float(torch.stack(losses).mean())
 
     def config(self) -> dict[str, Any]:

@@ -2,8 +2,8 @@
 
 What PPO is made of is handed in: where episodes come from (`Source`: the robot, or model rollouts), how their actions
 are judged (`difflcs.rl.advantages`), the loss (`difflcs.rl.surrogate`), and how it moves the policy
-(`difflcs.rl.optim`). `difflcs.rl.make_ppo` puts the parts together by the settings. GAE and the clipped objective are
-TorchRL's; gradients reach the LCS through the MPC layer.
+(`difflcs.rl.optim`). `difflcs.rl.make_ppo` puts the parts together by the settings. Gradients reach the LCS through the
+MPC layer.
 """
 
 from __future__ import annotations
@@ -346,12 +346,14 @@ class PPO(Trainer):
     ) -> _Improvement:
         """Gradient steps on the combined loss (Eq. total_loss), until the KL divergence is used up."""
         outcome = _Improvement()
-        data: Any = episodes["policy"].flatten(0, 1)
+        policy: Any = episodes["policy"].flatten(0, 1)
+        # What is indexed in every step; the rest of what the policy has entered would cost as much as the loss.
+        data = policy.select(*self.actor.in_keys, CONTEXT, "action", "loc", "scale_tril", strict=False)
         samples = cast("TensorDict", samples.flatten(0, 1))
         advantage = samples["advantage"]
         samples["advantage"] = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
-        if "plan" in data.keys():
-            data["guess"] = data["plan"].clone()  # the rollout's own optimum, then each step's
+        if "plan" in policy.keys():
+            data["guess"] = policy["plan"].clone()  # the rollout's own optimum, then each step's
         rng = np.random.default_rng(key)
         start = time.perf_counter()
         self.update.measure(data, rng)

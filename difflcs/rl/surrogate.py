@@ -9,7 +9,8 @@ Two things are our own, because they decide whether it learns:
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+import math
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
@@ -30,7 +31,7 @@ _VIOLATION_BATCH = 300
 
 
 class Surrogate:
-    """The loss: TorchRL's clipped objective over the samples that are no outliers, and the violation loss beside it.
+    """The loss: the clipped objective over the samples that are no outliers, and the violation loss beside it.
 
     Args:
         actor: the policy.
@@ -43,13 +44,7 @@ class Surrogate:
     def __init__(
         self, actor: GaussianPolicy, clip: float, outlier_kl: float, beta: float, violation: ViolationLoss | None
     ):
-        from tensordict.nn import ProbabilisticTensorDictSequential
-        from torchrl.objectives import ClipPPOLoss
-
-        # The MPC is solved by PPO, once per step; the loss gets its result, and only builds the distribution.
-        parts: Any = actor.module
-        head = ProbabilisticTensorDictSequential(parts[-1])
-        self.clipped = ClipPPOLoss(head, None, clip_epsilon=clip, entropy_bonus=False, critic_coeff=None)
+        self.clip = clip
         self.lcs, self.outlier_kl, self.beta, self.violation = actor.learned, outlier_kl, beta, violation
         self.clip_fraction = self.outliers = 0.0
         """Shares of the samples of the last call."""
@@ -75,13 +70,13 @@ class Surrogate:
         """
         outlier = (kl > self.outlier_kl).unsqueeze(-1)
         self.outliers = float(outlier.double().mean())
-        many = samples.batch_size
-        samples["loc"] = torch.where(outlier, old["loc"], new["loc"]).unsqueeze(1).expand(*many, -1)
-        samples["scale_tril"] = new["scale_tril"].unsqueeze(1).expand(*many, -1, -1)
-        samples["advantage"] = torch.where(outlier.unsqueeze(1), 0.0, samples["advantage"])
-        result = self.clipped(samples)
-        self.clip_fraction = float(result["clip_fraction"])
-        loss = self.beta * result["loss_objective"]
+        mean = torch.where(outlier, old["loc"], new["loc"])
+        log_ratio = log_prob(samples["action"], mean, new["scale_tril"]) - samples["action_log_prob"]
+        advantage = torch.where(outlier, 0.0, samples["advantage"].squeeze(-1))
+        clipped = log_ratio.clamp(math.log1p(-self.clip), math.log1p(self.clip))
+        self.clip_fraction = float((clipped != log_ratio).double().mean())
+        # The MPC is solved by PPO, once per step: here its result becomes the objective.
+        loss = -self.beta * torch.minimum(log_ratio.exp() * advantage, clipped.exp() * advantage).mean()
         if self.beta < 1 and self.violation is not None:
             x, u, x_next = transitions(seen)
             context = contexts(seen)
@@ -93,14 +88,31 @@ class Surrogate:
         return loss
 
 
+def log_prob(actions: Tensor, mean: Tensor, factor: Tensor) -> Tensor:
+    """(B, M) log densities of actions (B, M, n) under Gaussians of mean (B, n) and Cholesky factor (B, n, n)."""
+    offsets = (actions - mean.unsqueeze(-2)) @ _inverse(factor).mT
+    constant = 0.5 * mean.shape[-1] * math.log(2 * math.pi)
+    return -0.5 * offsets.square().sum(-1) - (_log_det(factor) + constant).unsqueeze(-1)
+
+
+@torch.no_grad()
 def gaussian_kl(old: TensorDictBase, new: TensorDictBase) -> Tensor:
     """(N,) KL(old ‖ new) of the Gaussians: far less noisy than the mean of sampled log-ratios."""
-    with torch.no_grad():
-        before, after = (
-            torch.distributions.MultivariateNormal(v["loc"], scale_tril=v["scale_tril"], validate_args=False)
-            for v in (old, new)
-        )
-        return torch.distributions.kl_divergence(before, after)
+    inverse, n = _inverse(new["scale_tril"]), old["loc"].shape[-1]
+    offsets = (inverse @ (old["loc"] - new["loc"]).unsqueeze(-1)).flatten(-2)
+    spread = (inverse @ old["scale_tril"]).square().flatten(-2).sum(-1)
+    ratio = _log_det(new["scale_tril"]) - _log_det(old["scale_tril"])
+    return ratio + 0.5 * (spread + offsets.square().sum(-1) - n)
+
+
+def _inverse(factor: Tensor) -> Tensor:
+    """Inverses (B, n, n) of lower triangles; one of (n, n) where all are the same by their memory."""
+    one = factor[0] if factor.stride(0) == 0 else factor
+    return torch.linalg.solve_triangular(one, torch.eye(factor.shape[-1], dtype=factor.dtype), upper=False)
+
+
+def _log_det(factor: Tensor) -> Tensor:
+    return factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
 def trimmed_mean(values: Tensor, fraction: float) -> float:

@@ -28,6 +28,7 @@ from difflcs.cost import GoalCost
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.lcs import LCSModule
 from difflcs.mpc import LCSMPCLayer
+from difflcs.mpc.backends import Backend
 from difflcs.rl._optional import require
 
 if TYPE_CHECKING:
@@ -253,7 +254,7 @@ class TaskSpec:
                 f"task {self.name}: its environment cannot be made: {type(error).__name__}: {error}"
             ) from error
 
-    def make_policy(self, lcs: LCSModule, backend: str = "batched") -> LCSMPCLayer:
+    def make_policy(self, lcs: LCSModule, backend: str | Backend = "batched") -> LCSMPCLayer:
         """The MPC around a model; unsolved elements are masked, never raised, so that they cannot end a training."""
         low, high = self.bounds
         return LCSMPCLayer(

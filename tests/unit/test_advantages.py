@@ -96,10 +96,10 @@ def test_advantages_are_the_papers():
     for t in range(STEPS):
         expected[:, t] = sum((0.9 * 0.8) ** k * delta[:, t + k] for k in range(STEPS - t))
     found = critic.gae(inputs, rewards)
-    torch.testing.assert_close(found["advantage"].squeeze(-1), expected, rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(found["value_target"].squeeze(-1), expected + value[:, :-1], rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(found["state_value"].squeeze(-1), value[:, :-1], rtol=1e-5, atol=1e-5)
-    assert not found["advantage"].requires_grad
+    torch.testing.assert_close(found.advantages, expected, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(found.targets, expected + value[:, :-1], rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(found.values, value[:, :-1], rtol=1e-5, atol=1e-5)
+    assert not found.advantages.requires_grad
     torch.testing.assert_close(returns(rewards, 0.9)[:, 0], sum(0.9**k * rewards[:, k] for k in range(STEPS)))
     torch.testing.assert_close(returns(rewards, 0.9)[:, -1], rewards[:, -1])
 
@@ -113,8 +113,8 @@ def test_gae_judges_the_actions_taken():
     assert found.samples.batch_size == (5, STEPS, 1)
     for name in SAMPLES:
         assert torch.equal(found.samples[name].squeeze(2), taken[name])
-    assert torch.equal(found.samples["advantage"].squeeze(2), plain["advantage"])
-    assert torch.equal(found.values, plain["state_value"].squeeze(-1))
+    assert torch.equal(found.samples["advantage"].flatten(2), plain.advantages.unsqueeze(-1))
+    assert torch.equal(found.values, plain.values)
     assert torch.equal(found.rewards, rewards)  # as they are
 
 

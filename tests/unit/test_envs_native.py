@@ -100,3 +100,16 @@ def test_rows_must_fit():
     physics = TriFingerMoveCubeEnv().physics
     with pytest.raises(ValueError, match="one row"):
         native.step_lanes([physics.lane], np.zeros((2, 6)), np.zeros((1, 9)), np.zeros(1, bool), 1)
+
+
+def test_mujocos_stopwatches_run_again_after_a_step():
+    """The compiled stepper does without them; who steps by hand has them as before."""
+    env = TriFingerMoveCubeEnv()
+    env.reset(seed=0)
+    timer = env.data.timer[mujoco.mjtTimer.mjTIMER_POSITION]
+    assert env.physics.lane is not None
+    before = timer.duration
+    env.step(np.zeros(6))
+    assert timer.duration == before
+    mujoco.mj_step(env.model, env.data)
+    assert timer.duration > before

@@ -1,0 +1,79 @@
+"""Gradients of small networks and Adam written by hand: the same as autograd's and torch's."""
+
+import copy
+from itertools import pairwise
+
+import pytest
+import torch
+from torch import nn
+
+from difflcs.rl.least_squares import BACKWARD, FlatAdam, gradients, tanh
+
+REFERENCE = {torch.relu_: torch.relu, tanh: torch.tanh}
+
+
+def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def layers_of(networks: int, sizes: tuple[int, ...]) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    pairs = enumerate(pairwise(sizes))
+    return [(drawn(networks, a, b, seed=i), drawn(networks, 1, b, seed=i + 9)) for i, (a, b) in pairs]
+
+
+@pytest.mark.parametrize("activation", list(BACKWARD))
+@pytest.mark.parametrize(("networks", "sizes"), [(1, (3, 5, 1)), (3, (4, 6, 7, 2)), (2, (3, 2))])
+def test_gradients_are_those_of_autograd(activation, networks, sizes):
+    layers, inputs = layers_of(networks, sizes), drawn(networks, 11, sizes[0], seed=3)
+    targets = drawn(networks, 11, sizes[-1], seed=4)
+    before = [part.clone() for part in (inputs, targets, *(part for layer in layers for part in layer))]
+    errors, found = gradients(layers, activation, inputs, targets)
+    leaves = [part.clone().requires_grad_() for layer in layers for part in layer]
+    hidden = inputs
+    for weight, bias in zip(leaves[:-2:2], leaves[1:-2:2], strict=True):
+        hidden = REFERENCE[activation](hidden @ weight + bias)
+    expected = (hidden @ leaves[-2] + leaves[-1] - targets).square().mean((1, 2))
+    torch.testing.assert_close(errors, expected.detach())
+    wanted = torch.autograd.grad(expected.sum(), leaves)
+    for a, b in zip([part for layer in found for part in layer], wanted, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
+        assert bool(b.any())
+    after = (inputs, targets, *(part for layer in layers for part in layer))
+    assert all(torch.equal(a, b) for a, b in zip(after, before, strict=True))
+
+
+def test_tanh_is_that_of_torch():
+    x = torch.linspace(-20, 20, 4001)
+    torch.testing.assert_close(tanh(x), torch.tanh(x), rtol=0, atol=3e-7)
+    assert torch.equal(x, torch.linspace(-20, 20, 4001))
+
+
+def test_flat_adam_is_adamw():
+    torch.manual_seed(0)
+    module = nn.Sequential(nn.Linear(3, 4), nn.Tanh(), nn.Linear(4, 1))
+    twin = copy.deepcopy(module)
+    mine, theirs = FlatAdam(module, 1e-2), torch.optim.AdamW(twin.parameters(), weight_decay=1e-2)
+    for step in range(20):
+        theirs.param_groups[0]["lr"] = size = 0.1 / (step + 1)
+        for k, p in enumerate(twin.parameters()):
+            p.grad = drawn(*p.shape, seed=100 * step + k)
+        theirs.step()
+        mine.step(torch.cat([p.grad.flatten() for p in twin.parameters()]), size)
+    for a, b in zip(module.parameters(), twin.parameters(), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
+
+
+def test_flat_adam_goes_on_where_it_stopped():
+    """With what `load_state_dict` gave, of the module and of Adam."""
+    whole = nn.Linear(2, 2)
+    adam = FlatAdam(whole, 1e-4)
+    adam.step(drawn(6), 0.1)
+    other = nn.Linear(2, 2)
+    again = FlatAdam(other, 1e-4)
+    other.load_state_dict(whole.state_dict())
+    again.load_state_dict(adam.state_dict())
+    for one in (adam, again):
+        one.step(drawn(6, seed=1), 0.1)
+    assert torch.equal(whole.weight, other.weight)
+    assert torch.equal(whole.bias, other.bias)
+    assert again.steps == 2
