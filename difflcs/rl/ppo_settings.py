@@ -36,7 +36,7 @@ class PPOSettings(Settings):
     """Episodes per iteration, run in lockstep; the last ones share what is left of the data evenly."""
     steps: int = bounded(8, minimum=1)
     """Gradient steps per iteration; Adam needs 20 or more."""
-    minibatch: int | None = bounded(400, minimum=1)
+    minibatch: int | None = bounded(600, minimum=1)
     """Samples per gradient step, every sample once before any is drawn again; None: each step on all of its data."""
     update: Literal["natural", "adam"] = "natural"
     """What moves the policy: the natural gradient, for a policy with an MPC, or Adam."""

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from difflcs.rl.policy import GaussianPolicy, LCSMPCPolicy
 
 
-METRIC_SAMPLES = 150
+METRIC_SAMPLES = 300
 """Samples per iteration that the metric of the natural gradient is measured with."""
 
 
