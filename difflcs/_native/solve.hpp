@@ -37,6 +37,11 @@ constexpr double kLittle = 1e-6;
 constexpr double kLeastDamping = 0.25;
 // Failed searches in a row, each with 4 times the damping, before a problem is given up.
 constexpr int64_t kFailures = 12;
+// Steps in a row that gain no more than rounding, after which a tenth of the accuracy is let go, and again after as
+// many more: where the system is stiff, the gradient at the optimum is rounding too. Part of the cost that counts as
+// rounding.
+constexpr int64_t kStill = 8;
+constexpr double kNothing = 1e-12;
 
 template <class T, class S>
 class Solver {
@@ -77,6 +82,7 @@ class Solver {
     double left;      // projected gradient after that; 0 where it is not known yet
     int64_t stalled;  // steps of the multipliers in a row that hardly helped
     double gained;    // by the last step
+    int64_t still;    // steps at the target in a row that gained no more than the rounding of the cost
   };
   Lane lane[kLanes];
   Vec eps, regularisation, J;
@@ -167,7 +173,7 @@ class Solver {
   bool take(const MpcSolve& o, int64_t* counter, int l) {
     const int64_t e = __atomic_fetch_add(counter, int64_t{1}, __ATOMIC_RELAXED);
     const int64_t nu = n.u(), actions = n.h * nu, forces = n.h * n.l();
-    lane[l] = {e < batch.count ? e : -1, 0, 0, 0, 1e300, 0, 0, 0};
+    lane[l] = {e < batch.count ? e : -1, 0, 0, 0, 1e300, 0, 0, 0, 0};
     fresh[l] = -1, released[l] = plain[l] = 0;
     eps[l] = batch.relaxation, regularisation[l] = 0;
     if (e >= batch.count) return false;
@@ -245,7 +251,7 @@ class Solver {
     lane[l].stalled = violated > 0.5 * lane[l].violated ? lane[l].stalled + 1 : 0;
     if (violated > (violated < kSmall ? kSlowEnd : kSlow) * lane[l].violated)
       rho *= violated > kStays * lane[l].violated ? kRaiseMore : kRaise;
-    lane[l].violated = violated, lane[l].iterations++, lane[l].failures = lane[l].in_stage = 0;
+    lane[l].violated = violated, lane[l].iterations++, lane[l].failures = lane[l].in_stage = lane[l].still = 0;
     return true;
   }
 
@@ -257,7 +263,11 @@ class Solver {
       const Lane& a = lane[l];
       const double tol = o.tol > sweep.rounding[l] ? o.tol : sweep.rounding[l];
       // A search that fails this close to the optimum has met the rounding of the cost.
-      const double patience = a.failures < kFailures ? 1.0 : 1e3;
+      const bool stuck = a.failures >= kFailures || a.still >= 4 * kStill;
+      const double patience = stuck || a.still >= 3 * kStill ? 1e3
+                              : a.still >= 2 * kStill        ? 1e2
+                              : a.still >= kStill            ? 10.0
+                                                             : 1.0;
       const bool stationary = sweep.projected[l] <= patience * tol && sweep.stationary[l] <= patience * kStationary;
       const bool converged = stationary && met(sweep, l);
       const bool broken = !(J[l] < 1e300 && J[l] > -1e300);
@@ -269,8 +279,7 @@ class Solver {
         continue;
       }
       const bool explored = o.explore > 0 && a.in_stage >= o.explore && !infeasible && !converged && !broken;
-      if (!infeasible && !converged && !broken && !explored && a.iterations < o.max_iter && a.failures < kFailures)
-        continue;
+      if (!infeasible && !converged && !broken && !explored && a.iterations < o.max_iter && !stuck) continue;
       frozen[l] = -1;
       if (converged && regularisation[l] > 0 && !broken) {  // once more without it: it hides a singular Hessian
         regularisation[l] = 0;
@@ -326,6 +335,8 @@ class Solver {
       Lane& a = lane[l];
       a.iterations++, a.in_stage++;
       a.failures = moved[l] ? 0 : a.failures + 1;
+      const bool gains = eps[l] > target || (moved[l] && a.gained > kNothing * (1.0 + __builtin_fabs(J[l])));
+      a.still = gains ? 0 : a.still + 1;
       // Levenberg-Marquardt on the kinks of the contacts (linearisation.hpp): a failed step asks for more damping, one
       // that had to be shortened too, and one that gained what its model promised for less.
       double& reg = reinterpret_cast<double*>(&regularisation)[l];

@@ -194,12 +194,13 @@ def stored_config(run: RunDirectory) -> TrainConfig:
     return TrainConfig.from_json(values)
 
 
-def load_model(path: Path) -> LCSModel:
+def load_model(path: Path | str) -> LCSModel:
     """The model of a run directory (finished or not), of `LCSModel.save_pretrained`, or of the zoo ("zoo:NAME").
 
     Raises:
         CheckpointError: there is none, or the method learned something else.
     """
+    path = Path(path)
     if not (os.path.isdir(path / "checkpoints") or os.path.isdir(path / "model")):  # False for what can be no path
         return LCSModel.from_pretrained(path)
     run = RunDirectory.open(path)
