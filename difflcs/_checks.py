@@ -56,15 +56,14 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
         raise DTypeError(f"{name}: expected a torch.Tensor, got {describe(value)}; wrap it with torch.as_tensor(...)")
     if value.dtype not in FLOATS:
         raise DTypeError(f"{name}: expected float32 or float64, got {describe(value)}; convert it with {name}.double()")
-    if value.device.type not in _USABLE_DEVICES:
+    if not value.is_cpu and value.device.type not in _USABLE_DEVICES:
         raise DeviceError(f"{name}: expected a tensor with data, got {describe(value)}; move it with {name}.to('cpu')")
-    wanted = tuple(size for _, size in dims)
-    if value.ndim < len(dims) or tuple(value.shape[value.ndim - len(dims) :]) != wanted:
+    if dims and not _ends_in(value.shape, dims):
         labels = ", ".join(["..."] + [f"{label}={size}" for label, size in dims])
         raise ShapeError(
             f"{name}: expected shape ({labels}), got {tuple(value.shape)}; reshape it or rebuild the model"
         )
-    if finite and not is_wrapped(value) and not _all_finite(value.detach()):
+    if finite and not is_wrapped(value) and not all_finite(value.detach() if value.requires_grad else value):
         bad = torch.nonzero(~torch.isfinite(value.detach()))
         raise NonFiniteError(
             f"{name}: expected finite numbers, got {len(bad)} NaN or infinite of {value.numel()}, "
@@ -73,9 +72,21 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
     return value
 
 
-def _all_finite(value: Tensor) -> bool:
+def _ends_in(shape: torch.Size, dims: Sequence[tuple[str, int]]) -> bool:
+    at = len(shape) - len(dims)
+    if at < 0:
+        return False
+    for _, size in dims:
+        if shape[at] != size:
+            return False
+        at += 1
+    return True
+
+
+def all_finite(value: Tensor) -> bool:
+    """Whether no number is NaN or infinite."""
     # A finite sum has finite terms, and costs a third of looking at each. Large terms can overflow it.
-    return math.isfinite(value.sum()) or bool(torch.isfinite(value).all())
+    return math.isfinite(value.sum() if value.numel() != 1 else value) or bool(torch.isfinite(value).all())
 
 
 def check_positive_definite(F: Tensor) -> None:

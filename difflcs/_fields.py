@@ -27,6 +27,11 @@ class TensorFields(nn.Module):
         else:
             self.register_buffer(name, value, persistent=persistent)
 
+    def _held(self, names: Iterable[str]) -> dict[str, Tensor]:
+        """Some fields by their names; faster than one attribute after the other."""
+        held = {**self._buffers, **self._parameters}
+        return {name: held[name] if name in held else getattr(self, name) for name in names}  # pyright: ignore
+
     def extra_repr(self) -> str:
         names = [*dict(self.named_parameters(recurse=False)), *dict(self.named_buffers(recurse=False))]
         return ", ".join(f"{name}{tuple(getattr(self, name).shape)}" for name in names)

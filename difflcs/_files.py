@@ -67,6 +67,24 @@ def read_text(path: Path) -> str:
         raise CheckpointError(f"{path}: expected text that can be read, got {error}; restore it from a copy") from error
 
 
+def read_bytes(path: Path) -> bytes:
+    """Read a file of numbers.
+
+    Raises:
+        FileNotFoundError: there is none.
+        CheckpointError: it is not a file, too large, or cannot be read.
+    """
+    _check_size(path, MAX_TENSORS)
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise CheckpointError(
+            f"{path}: expected a file that can be read, got {error}; restore it from a copy"
+        ) from error
+
+
 def read_json(path: Path) -> object:
     """Read JSON as the standard has it: no NaN, no infinity.
 

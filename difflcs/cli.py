@@ -1,4 +1,4 @@
-"""The command line: `difflcs train | evaluate | render | demo | zoo | assets | bench | doctor`.
+"""The command line: `difflcs train | evaluate | render | export | demo | zoo | assets | bench | doctor`.
 
 Tasks and methods are known by their registries only; the flags of `train` are made of the settings of its method.
 """
@@ -21,6 +21,7 @@ import torch
 from difflcs import zoo
 from difflcs._renamed import refuse_flags_of_before
 from difflcs.errors import CheckpointError, DiffLCSError, InvalidInputError
+from difflcs.export import Export
 from difflcs.rl._optional import require, versions
 from difflcs.rl.checkpoint import RunDirectory
 from difflcs.rl.evaluate import evaluate
@@ -395,6 +396,7 @@ _COMMANDS: dict[str, Callable[..., Any]] = {
     "train": Train,
     "evaluate": Evaluate,
     "render": Render,
+    "export": Export,
     "demo": Demo,
     "zoo": Zoo,
     "assets": Assets,

@@ -92,7 +92,7 @@ class _Quadratic(TensorFields):
 
     def tensors(self) -> dict[str, Tensor]:
         """Name → tensor as it was given, with the constant; S where there is one."""
-        fields = {name: getattr(self, name) for name in _OWN}
+        fields = self._held(_OWN)
         if fields["S"] is None:
             del fields["S"]
         return fields
@@ -297,7 +297,7 @@ class GoalCost(TensorFields):
         goal = self._goal("goal", goal, [])
         weight = horizon * self.goal_stage + self.goal_final
         return {
-            **self._weights(),
+            **self.weights(),
             "q": goal @ self.goal_to_q.mT,
             "q_final": goal @ self.goal_to_q_final.mT,
             "constant": 0.5 * (goal * (goal @ weight.mT)).sum(-1),
@@ -315,14 +315,20 @@ class GoalCost(TensorFields):
         stage, last = reference[..., :-1, :], reference[..., -1, :]
         tracked = (stage * (stage @ self.goal_stage.mT)).sum((-1, -2))
         return {
-            **self._weights(),
+            **self.weights(),
             "q": stage @ self.goal_to_q.mT,
             "q_final": last @ self.goal_to_q_final.mT,
             "constant": 0.5 * (tracked + (last * (last @ self.goal_final.mT)).sum(-1)),
         }
 
-    def _weights(self) -> dict[str, Tensor]:
-        return {"Q": self.Q, "R": self.R, "Q_final": self.Q_final, "r": self.R.new_zeros(self.n_u)}
+    def weights(self) -> dict[str, Tensor]:
+        """The fields of the cost that no goal changes."""
+        held = self._held(("Q", "R", "Q_final"))
+        return {**held, "r": held["R"].new_zeros(self.n_u)}
+
+    def maps(self) -> dict[str, Tensor]:
+        """What makes the other fields of a goal."""
+        return self._held(("goal_to_q", "goal_to_q_final", "goal_stage", "goal_final"))
 
     def _goal(self, name: str, value: Tensor, stages: list[tuple[str, int]]) -> Tensor:
         check_tensor(name, value, [*stages, ("n_goal", self.n_goal)])

@@ -114,6 +114,13 @@ class _Record(SystemMatrices):
         self.batch_shape  # noqa: B018  raises where the batch dimensions do not fit each other
         check_positive_definite(self.F)
 
+    @classmethod
+    def of_checked(cls, tensors: Mapping[str, Tensor]) -> Self:
+        """A record of tensors that have been checked, all of them and together; nothing is checked here."""
+        record = object.__new__(cls)
+        vars(record).update(tensors)
+        return record
+
     def _own(self, name: str) -> int:
         """Number of a field's own dimensions: those of stages, rows and columns."""
         return len(self._STAGES) + len(SYSTEM[name])

@@ -6,6 +6,7 @@ from enum import IntEnum
 
 from torch import Tensor
 
+from difflcs._functorch import is_wrapped
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 
 _CODES = _kernels.status_codes()
@@ -33,8 +34,19 @@ class Status(IntEnum):
 
 def solved(status: Tensor) -> Tensor:
     """`Status.solved` of a tensor of codes, as bool."""
-    return (status == Status.CONVERGED) | (status == Status.DEGENERATE)
+    return (status == _CONVERGED) | (status == _DEGENERATE)
 
+
+def all_converged(status: Tensor) -> bool:
+    """Whether every one of some codes on the CPU is CONVERGED: the quick question, before asking which are not."""
+    if is_wrapped(status):
+        return bool((status == _CONVERGED).all())
+    codes = status.numpy().tobytes()  # a tenth of the time of a reduction, where there are few
+    return codes.count(_CONVERGED) == len(codes)
+
+
+# Plain integers: torch takes 5 µs longer to compare with a member of an enumeration.
+_CONVERGED, _DEGENERATE = int(Status.CONVERGED), int(Status.DEGENERATE)
 
 _ADVICE = {
     Status.CONVERGED: "the solution meets the tolerance",

@@ -55,4 +55,13 @@ const Kernels& kernels() {
   return chosen;
 }
 
+const Kernels& kernels_for_one() {
+#ifdef DIFFLCS_LANES_avx2
+  const char* wanted = std::getenv("DIFFLCS_ISA");
+  if ((!wanted || !*wanted) && kernels().lanes > avx2::table.lanes && __builtin_cpu_supports("avx2"))
+    return avx2::table;
+#endif
+  return kernels();
+}
+
 }  // namespace difflcs

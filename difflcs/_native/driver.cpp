@@ -12,22 +12,22 @@ enum class Actions { none, best, mirrored, random };
 
 struct Start {
   Actions actions;
-  bool released;  // see MpcStart
-  double first;   // first relaxation, in parts of the square of the problem's scale
+  bool released, gauss_newton;  // see MpcStart
+  double first;                 // first relaxation, in parts of the square of the problem's scale
 };
 
 // The sequence of starts. A long homotopy leads most actions to one optimum, which is often the best; a short one stays
 // near where it begins. What lies opposite of the best plan so far, in the middle of the bounds mirrored, is another
 // way round the contacts more often than random actions are.
 Start start_of(int64_t i) {
-  constexpr Start first[] = {{Actions::none, true, 1.0},
-                             {Actions::none, true, 1e-3},
-                             {Actions::mirrored, false, 0.01},
-                             {Actions::best, false, 1.0}};
-  constexpr Start then[] = {{Actions::random, false, 0.03},
-                            {Actions::random, false, 1.0},
-                            {Actions::mirrored, false, 0.1},
-                            {Actions::best, false, 10.0}};
+  constexpr Start first[] = {{Actions::none, true, false, 1.0},
+                             {Actions::none, true, true, 1e-3},
+                             {Actions::mirrored, false, false, 0.01},
+                             {Actions::best, false, false, 1.0}};
+  constexpr Start then[] = {{Actions::random, false, false, 0.03},
+                            {Actions::random, false, false, 1.0},
+                            {Actions::mirrored, false, false, 0.1},
+                            {Actions::best, false, false, 10.0}};
   return i < 4 ? first[i] : then[i % 4];
 }
 
@@ -92,37 +92,11 @@ void stay_at_start(const MpcBatch& b, const MpcGuess& guess, const MpcPlans& out
 }
 
 struct Solving {
+  const Kernels& kernels;
   const MpcBatch& batch;
   const MpcSolve& solve;
   int64_t next;
 };
-
-// One call of the kernel for every problem of a batch.
-void run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner) {
-  std::fill_n(solve.status, batch.count, kUnreached), std::fill_n(solve.iterations, batch.count, 0);
-  Solving context{batch, solve, 0};
-  runner.run(
-      batch.count, kernels().mpc_workspace(batch), false,
-      [](void* context, void* workspace, Watch watch) {
-        auto& c = *static_cast<Solving*>(context);
-        kernels().mpc_solve(c.batch, c.solve, &c.next, workspace, watch);
-      },
-      &context);
-}
-
-// Which of the solved problems have constraints that make them degenerate.
-void judge_constraints(const MpcBatch& batch, const MpcSolve& results, Runner& runner) {
-  Solving context{batch, results, 0};
-  runner.run(
-      batch.count, kernels().mpc_workspace(batch), true,
-      [](void* context, void* workspace, Watch watch) {
-        auto& c = *static_cast<Solving*>(context);
-        constexpr int64_t block = 64;
-        for (int64_t i; (i = __atomic_fetch_add(&c.next, block, __ATOMIC_RELAXED)) < c.batch.count;)
-          kernels().mpc_constraints(c.batch, c.solve, i, std::min(c.batch.count, i + block), workspace, watch);
-      },
-      &context);
-}
 
 MpcSolve with(const MpcEffort& effort, const MpcPlans& out) {
   MpcSolve o{};
@@ -154,6 +128,38 @@ MpcPlans MpcDriver::Store::plans() {
           residual.data(), status.data(), fragile.data(), iterations.data()};
 }
 
+void MpcDriver::reserve(const MpcBatch& batch, int64_t starts) {
+  const int64_t jobs = starts * batch.count;
+  tried.resize(batch, jobs), finished.resize(batch, jobs), best.reserve(batch.count), origin.reserve(jobs);
+}
+
+// One call of the kernel for every problem of a batch.
+void MpcDriver::run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner) const {
+  std::fill_n(solve.status, batch.count, kUnreached), std::fill_n(solve.iterations, batch.count, 0);
+  Solving context{kernels, batch, solve, 0};
+  runner.run(
+      batch.count, kernels.mpc_workspace(batch), false,
+      [](void* context, void* workspace, Watch watch) {
+        auto& c = *static_cast<Solving*>(context);
+        c.kernels.mpc_solve(c.batch, c.solve, &c.next, workspace, watch);
+      },
+      &context);
+}
+
+// Which of the solved problems have constraints that make them degenerate.
+void MpcDriver::judge_constraints(const MpcBatch& batch, const MpcSolve& results, Runner& runner) const {
+  Solving context{kernels, batch, results, 0};
+  runner.run(
+      batch.count, kernels.mpc_workspace(batch), true,
+      [](void* context, void* workspace, Watch watch) {
+        auto& c = *static_cast<Solving*>(context);
+        constexpr int64_t block = 64;
+        for (int64_t i; (i = __atomic_fetch_add(&c.next, block, __ATOMIC_RELAXED)) < c.batch.count;)
+          c.kernels.mpc_constraints(c.batch, c.solve, i, std::min(c.batch.count, i + block), workspace, watch);
+      },
+      &context);
+}
+
 void MpcDriver::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
                       Runner& runner) {
   if (batch.count == 0) return;
@@ -170,7 +176,7 @@ void MpcDriver::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start,
   const Sizes n(b);
   const Start s = start_of(start);
   const double least = b.relaxation * std::max(effort.homotopy, 1.0);
-  tried.start[job] = {s.released, effort.homotopy > 0 ? 0.0 : s.first, least};
+  tried.start[job] = {s.released, s.gauss_newton, effort.homotopy > 0 ? 0.0 : s.first, least};
   double* u = tried.u.data() + job * n.u;
   const double* from = best >= 0 ? tried.u.data() + best * n.u : nullptr;
   double reach = 1.0;  // of actions without bounds
@@ -215,7 +221,7 @@ void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
     const double least = batch.relaxation * (guessed ? 1.0 : std::max(effort.homotopy, 1.0));
     for (int64_t e = 0; e < count; e++) {
       tried.element[e] = element(e);
-      tried.start[e] = {!guessed && s.released, guessed || effort.homotopy > 0 ? 0.0 : s.first, least};
+      tried.start[e] = {!guessed && s.released, false, guessed || effort.homotopy > 0 ? 0.0 : s.first, least};
     }
     MpcBatch jobs = batch;
     jobs.count = count, jobs.element = tried.element.data();
@@ -241,7 +247,7 @@ void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
     for (int64_t j = begun * count; j < end * count; j++) {
       const int64_t e = j % count;
       if (from_guess) {
-        tried.start[j] = {false, 0.0, batch.relaxation};
+        tried.start[j] = {false, false, 0.0, batch.relaxation};
         std::copy_n(guess.u + (first + e) * n.u, n.u, tried.u.data() + j * n.u);
         if (whole) std::copy_n(guess.lam + (first + e) * n.lam, n.lam, tried.lam.data() + j * n.lam);
         if (whole) std::copy_n(guess.mu + (first + e) * n.mu, n.mu, tried.mu.data() + j * n.mu);
@@ -273,7 +279,8 @@ void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
   for (int64_t j = 0; j < effort.starts * count; j++) {
     if (tried.status[j] == kUnreached || !promising(batch, j, best[j % count])) continue;
     copy_plan(n, tried.plans(), j, finished.plans(), kept);
-    origin[kept] = j, finished.element[kept] = tried.element[j], finished.start[kept] = {false, 0.0, batch.relaxation};
+    origin[kept] = j, finished.element[kept] = tried.element[j],
+    finished.start[kept] = {false, false, 0.0, batch.relaxation};
     kept++;
   }
   MpcBatch jobs = batch;
@@ -332,7 +339,7 @@ void MpcDriver::again(const MpcBatch& batch, const MpcEffort& effort, const MpcP
   tried.resize(batch, count);
   for (int64_t i = 0; i < count; i++) {
     tried.element[i] = batch.element ? batch.element[origin[i]] : origin[i];
-    tried.start[i] = {false, 0.0, batch.relaxation * kLonger * std::max(effort.homotopy / 100.0, 1.0)};
+    tried.start[i] = {false, false, 0.0, batch.relaxation * kLonger * std::max(effort.homotopy / 100.0, 1.0)};
   }
   MpcBatch jobs = batch;
   jobs.count = count, jobs.element = tried.element.data(), jobs.pivot = pivot;

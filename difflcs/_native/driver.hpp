@@ -45,7 +45,12 @@ struct Runner {
 
 class MpcDriver {
  public:
-  // Solves a batch. A second call for a batch of the same size allocates nothing.
+  explicit MpcDriver(const Kernels& kernels) : kernels(kernels) {}
+
+  // Takes the memory that a batch of this size needs, whatever happens: after it `solve` allocates nothing.
+  void reserve(const MpcBatch& batch, int64_t starts);
+
+  // Solves a batch.
   void solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
              Runner& runner);
 
@@ -61,6 +66,8 @@ class MpcDriver {
     MpcPlans plans();
   };
 
+  void run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner) const;
+  void judge_constraints(const MpcBatch& batch, const MpcSolve& results, Runner& runner) const;
   void search(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
               Runner& runner, int64_t first, int64_t count);
   void explore(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, int64_t first, int64_t count,
@@ -71,6 +78,7 @@ class MpcDriver {
   bool promising(const MpcBatch& batch, int64_t job, int64_t best) const;
   void again(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, bool pivot);
 
+  const Kernels& kernels;
   Store tried, finished;
   std::vector<int64_t> best;    // of the jobs tried for each element
   std::vector<int64_t> origin;  // the job, or the element, that each of some problems comes from

@@ -25,7 +25,7 @@ class Linearisation {
   using Lu = Elimination<S::kPivot>;
   const Problem<T, S>& problem;
   const S n;
-  const bool kept;  // every stage is kept; else each takes the place of the one before it
+  const bool kept;  // every stage is kept; else each takes the place of the one before it, but for K_lam
   Stages<Matrix<Vec, kL, kL>> M;
   Stages<Matrix<Vec, kL, kW>> K_lam, K_s;
   Stages<Matrix<Vec, kX, kW>> A_hat;
@@ -40,7 +40,7 @@ class Linearisation {
 
   void layout(Arena& arena) {
     const int64_t nx = n.x(), nl = n.l(), nw = n.w(), count = kept ? n.h : 1;
-    arena.take(M, count, nl, nl), arena.take(K_lam, count, nl, nw), arena.take(A_hat, count, nx, nw);
+    arena.take(M, count, nl, nl), arena.take(K_lam, n.h, nl, nw), arena.take(A_hat, count, nx, nw);
     arena.take(K_s, kept ? count : 0, nl, nw), arena.take(size, count, nl), arena.take(y, count, nl);
     arena.take(rows, count * nl), arena.take(right_rows, nl), arena.take(a, nl), arena.take(b, nl),
         arena.take(right_factors, nl * nl), arena.take(bend, nl), arena.take(damped, nl);
@@ -48,8 +48,17 @@ class Linearisation {
   }
 
   Stage<S> stage(int64_t k) const {
-    if (!kept) k = 0;
-    return {M[k], rows + k * n.l(), size[k], y[k], K_lam[k], K_s[k], A_hat[k]};
+    const int64_t own = kept ? k : 0;
+    return {M[own], rows + own * n.l(), size[own], y[own], K_lam[k], K_s[own], A_hat[own]};
+  }
+
+  // What lam of stage k becomes for a change of state and action, to first order.
+  Vec change(int64_t k, int64_t i, const Vec* dx, const Vec* du) const {
+    const Matrix<Vec, kL, kW> K = K_lam[k];
+    Vec sum = all(0);
+    for (int64_t j = 0; j < n.x(); j++) sum += K(i, j) * dx[j];
+    for (int64_t j = 0; j < n.u(); j++) sum += K(i, n.x() + j) * du[j];
+    return sum;
   }
 
   // Stage k at lam and s, with p the costate of the next state. `damping` adds to the curvature, see `curvature`.
@@ -107,6 +116,14 @@ class Linearisation {
   // lam + s away: |y| / (2 (lam + s)) is the curvature of the parabola that touches y |z| / 2 and lies above it, so
   // that with a damping of one a contact that opens or closes on the way costs no more than the model says.
   Vec curvature(int64_t i, int64_t j) const { return all(0) + weighted.column(i) * slopes.column(j); }
+
+  // Drops Y (Gauss-Newton).
+  void drop(Mask which) {
+    for (int64_t i = 0; i < n.l(); i++) {
+      bend[i] = select(which, all(0), bend[i]);
+      weigh(i, bend[i] + damped[i]);
+    }
+  }
 
   // Drops what is negative in Y.
   void make_convex(Mask which) {

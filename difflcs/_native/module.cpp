@@ -21,6 +21,7 @@
 #include <thread>
 #include <vector>
 
+#include "bind_controller.hpp"
 #include "driver.hpp"
 #include "kernels.hpp"
 #include "lcp_one.hpp"
@@ -234,7 +235,7 @@ void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
   const difflcs::MpcPlans out{x.data(),        u.data(),      lam.data(),     mu.data(),        objective.data(),
                               residual.data(), status.data(), fragile.data(), iterations.data()};
   Threads runner(threads, time_limit);
-  difflcs::MpcDriver().solve(b, guess, effort, out, runner);
+  difflcs::MpcDriver(difflcs::kernels()).solve(b, guess, effort, out, runner);
 }
 
 void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, Array x, Array u, Array lam, Array mu,
@@ -431,4 +432,5 @@ NB_MODULE(_kernels, m) {
         "The same at a given z, from r and e at z = 0.");
   m.def("violation_gradient", &violation_gradient, "inputs"_a, "gamma"_a, "xi"_a, "z"_a, "r"_a, "e"_a, "upstream"_a,
         "gradients"_a, "Gradients of the inputs, into the given arrays; None where one is not wanted.");
+  bind_controller(m);
 }

@@ -98,6 +98,7 @@ class Riccati {
 
   // Around the trajectory `at`. The solver adds `regularisation` to the curvature of contacts and actions; lanes that
   // are `stubborn` keep the second derivative of lam where the Hessian is indefinite.
+  Mask unbounded{}, gauss_newton{};
   Sweep sweep(const Trajectory<S>& at, const Upstream<S>& upstream, Vec regularisation, Mask stubborn) {
     found = {all(0), all(0), all(0), all(0), all(0), Mask{}};
     for (int64_t i = 0; i < n.c(); i++) row_terms[i] = row_violation[i] = all(0);
@@ -122,6 +123,11 @@ class Riccati {
     for (int64_t i = 0; i < n.c(); i++)
       found.violated = max(found.violated, row_violation[i] / select(row_terms[i] > 0, row_terms[i], all(1)));
     return found;
+  }
+
+  // What contact i of stage k answers to a change of state and action, to first order.
+  Vec force_change(int64_t k, int64_t i, const Vec* dx, const Vec* du) const {
+    return linearisation.change(k, i, dx, du);
   }
 
  private:
@@ -297,6 +303,7 @@ class Riccati {
   // what is negative in Y at this stage, then has its pivots lifted; lanes that are `stubborn` lift them at once.
   void factor(const StageData<T, S>& data, Vec regularisation, Mask stubborn) {
     const int64_t nx = n.x(), nu = n.u();
+    if (!kAdjoint && any(gauss_newton)) linearisation.drop(gauss_newton);
     for (int attempt = 0; attempt < 2; attempt++) {
       for (int64_t i = 0; i < nu; i++)
         for (int64_t j = 0; j <= i; j++) {
@@ -367,7 +374,7 @@ class Riccati {
       Vec length = all(1);
       for (int64_t i = 0; i < nu; i++) {
         const Vec room = select(toward[i] > 0, data.u_max[i], data.u_min[i]) - u[i] - d[i];
-        const Mask crosses = bounded ? (abs(toward[i]) > abs(room)) & ~active[i] : Mask{};
+        const Mask crosses = bounded ? (abs(toward[i]) > abs(room)) & ~active[i] & ~unbounded : Mask{};
         share[i] = select(crosses, room / toward[i], all(2));
         length = min(length, share[i]);
       }

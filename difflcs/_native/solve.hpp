@@ -46,7 +46,7 @@ class Solver {
   Riccati<T, S, false> riccati;
   Certificate<T, S> certificate;
   Trajectory<S> at, next;  // the iterate and the trial
-  Vec *gap, *newton;
+  Vec *gap, *newton, *dx, *du;
   Mask* rows;
 
  public:
@@ -59,6 +59,7 @@ class Solver {
     Arena arena{memory};
     problem.layout(arena), at.layout(arena, n), next.layout(arena, n);
     arena.take(gap, n.l()), arena.take(newton, Lcp::scratch(n.l())), arena.take(rows, n.l());
+    arena.take(dx, n.x()), arena.take(du, n.u());
     riccati.layout(arena), certificate.layout(arena);
     return arena.used;
   }
@@ -81,6 +82,7 @@ class Solver {
   Vec eps, regularisation, J;
   Mask fresh;     // without a trajectory at its eps
   Mask released;  // without contact yet
+  Mask plain;     // by Gauss-Newton
   Mask repriced;  // with multipliers that J does not know yet
   // Elements that are finished but not certified yet.
   int64_t finished[kLanes];
@@ -148,7 +150,13 @@ class Solver {
           low = from - 0.9 * (from - low), high = from + 0.9 * (high - from);
         next.u(k, j) = select(frozen, from, max(low, min(high, to)));
       }
-      for (int64_t j = 0; j < nl; j++) next.lam(k, j) = select(skip, next.lam(k, j), at.lam(k, j));
+      // The forces are near what the linearisation says, which must not leave the interior.
+      for (int64_t i = 0; i < nx; i++) dx[i] = next.x(k, i) - at.x(k, i);
+      for (int64_t j = 0; j < nu; j++) du[j] = next.u(k, j) - at.u(k, j);
+      for (int64_t j = 0; j < nl; j++) {
+        const Vec near = max(at.lam(k, j) + riccati.force_change(k, j, dx, du), 0.1 * at.lam(k, j));
+        next.lam(k, j) = select(skip, next.lam(k, j), near);
+      }
       contacts(data, next.x[k], next.u[k], next.lam[k], next.s[k], skip);
       data.next_state(next.x[k], next.u[k], next.lam[k], next.x[k + 1]);
     }
@@ -160,10 +168,11 @@ class Solver {
     const int64_t e = __atomic_fetch_add(counter, int64_t{1}, __ATOMIC_RELAXED);
     const int64_t nu = n.u(), actions = n.h * nu, forces = n.h * n.l();
     lane[l] = {e < batch.count ? e : -1, 0, 0, 0, 1e300, 0, 0, 0};
-    fresh[l] = -1, released[l] = 0;
+    fresh[l] = -1, released[l] = plain[l] = 0;
     eps[l] = batch.relaxation, regularisation[l] = 0;
     if (e >= batch.count) return false;
     released[l] = o.start[e].released ? -1 : 0;
+    plain[l] = o.start[e].gauss_newton ? -1 : 0;
     if (!released[l]) eps[l] = first_relaxation(o.start[e], o.scale ? o.scale[e] : 0);
     problem.load(e, l);
     problem.load_multipliers(o.mu_start ? o.mu_start + e * (n.h + 1) * n.c() : nullptr, l);
@@ -343,7 +352,7 @@ class Solver {
 template <class T, class S>
 void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
   eps = all(batch.relaxation), regularisation = J = all(0);
-  fresh = repriced = released = Mask{};
+  fresh = repriced = released = plain = Mask{};
   waiting = 0;
   int live = 0;
   for (int l = 0; l < kLanes; l++) {
@@ -371,6 +380,7 @@ void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
     // Gauss-Newton can creep along a curved valley: after 20 steps in one stage every other one keeps the curvature.
     Mask stubborn;
     for (int l = 0; l < kLanes; l++) stubborn[l] = lane[l].in_stage > 20 && lane[l].in_stage % 2 ? -1 : 0;
+    riccati.unbounded = released, riccati.gauss_newton = plain;
     const Sweep sweep = riccati.sweep(at, {}, regularisation, stubborn);
     const Mask frozen = finish(o, sweep, counter, idle, live);
     if (live == 0) break;

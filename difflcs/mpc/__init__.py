@@ -1,7 +1,8 @@
 """Model predictive control through a linear complementarity system (Eq. mpc_lcs)."""
 
+from difflcs.mpc.controller import ControllerPlan, MPCController
 from difflcs.mpc.layer import LCSMPCLayer
 from difflcs.mpc.problem import MPCProblem
 from difflcs.mpc.solution import MPCSolution, Primal
 
-__all__ = ["LCSMPCLayer", "MPCProblem", "MPCSolution", "Primal"]
+__all__ = ["ControllerPlan", "LCSMPCLayer", "MPCController", "MPCProblem", "MPCSolution", "Primal"]

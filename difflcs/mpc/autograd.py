@@ -10,18 +10,19 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_positive_definite, check_tensor
+from difflcs._checks import all_finite, check_positive_definite, check_tensor
 from difflcs._fields import check_not_nan
 from difflcs._functorch import transforms_active
 from difflcs.errors import DegenerateWarning, DoubleBackwardError
 from difflcs.mpc.backends.base import Backend, Result
+from difflcs.mpc.gather import RANKS, Planned
 from difflcs.mpc.problem import INPUTS, MAY_BE_INFINITE, MPCProblem
 from difflcs.mpc.solution import Primal
 from difflcs.status import Status
@@ -29,7 +30,6 @@ from difflcs.status import Status
 # What a call gives to the node, in this order; None for what it leaves out.
 ARGUMENTS = (*INPUTS, "constant", *(f"guess.{name}" for name in Primal._fields))
 _COUNT = len(INPUTS) + 1  # those that are differentiable
-_RANKS = {**{name: len(dims) for name, dims in INPUTS.items()}, "constant": 0}
 _SYMMETRIC = ("Q", "R", "Q_final")
 _COST = ("Q", "R", "S", "Q_final", "q", "r", "q_final", "constant")
 
@@ -55,7 +55,10 @@ class Plan:
         batch: batch dimensions that all inputs broadcast to; vmap adds its own in front.
         own: whether the outputs must have memory of their own, because a backward pass may follow.
         unseen: whether nothing has looked at the numbers yet, because the inputs were made under a transform.
-        problem, result: what was solved, and how; once it is.
+        before: what was planned before, with the same numbers in the inputs `known` and in those that are left out.
+        known: names of inputs that need not be looked at.
+        private: names of inputs whose numbers the problem copies, so that nobody can change them.
+        problem, constant, result: what was solved, and how; once it is.
     """
 
     backend: Backend
@@ -68,40 +71,54 @@ class Plan:
     batch: tuple[int, ...]
     own: bool
     unseen: bool
+    before: Planned | None = None
+    known: Collection[str] = ()
+    private: Collection[str] = ()
     problem: MPCProblem = field(init=False)
+    constant: Tensor = field(init=False)
     result: Result = field(init=False)
 
-    def solve(self, tensors: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
-        """x, u, lam, mu, objective, status, iterations, kkt_residual, solve_time, violation; and an empty tensor.
+    def solve(self, tensors: Mapping[str, Tensor], guess: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
+        """x, u, lam, mu, objective, status, iterations, kkt_residual, solve_time, violation.
 
-        Each has the batch dimensions first. Tensors in the order of `ARGUMENTS`, none of them wrapped.
+        Each has the batch dimensions first. `tensors` are the inputs by their names, `guess` is one or None four times;
+        none of them is wrapped.
         """
-        values = self._values(tensors[:_COUNT])
-        constant = values.pop("constant").expand(self._size).contiguous()
-        self.problem = problem = MPCProblem(
-            **values, horizon=self.horizon, relaxation=self.relaxation, barrier=self.barrier
-        )
-        result = self.backend.solve(problem, self._guess(tensors[_COUNT:]))
-        objective = problem.objective(result.primal.x, result.primal.u)
-        # Of a failed element the numbers can be so large that products of them are none.
+        values = self._values(tensors)
+        if self.before is None:
+            constant = values.pop("constant")
+            problem = MPCProblem(**values, horizon=self.horizon, relaxation=self.relaxation, barrier=self.barrier)
+        else:
+            constant = values.pop("constant", self.before.constant)
+            problem = self.before.problem.changed(values)
+        self.problem, self.constant = problem, constant
+        result = self.backend.solve(problem, self._guess(guess))
         violation = problem.violation(result.primal.x, result.primal.u)
-        violation = violation.nan_to_num(nan=torch.finfo(self.dtype).max, posinf=torch.finfo(self.dtype).max)
-        self.result, objective = _within_range(result, objective, constant, self.dtype)
+        if problem.n_c:  # of a failed element the numbers can be so large that products of them are none
+            largest = torch.finfo(self.dtype).max
+            violation = violation.nan_to_num(nan=largest, posinf=largest)
+        self.result, objective = _within_range(result, self._objective(result), constant.expand(self._size), self.dtype)
         result = self.result
-        # Copies: what the caller does with the outputs must not change the gradient.
-        x, u, lam, mu = (v.to(self.dtype, copy=self.own) for v in result.primal)
-        u = _inside(u, problem) if self.dtype != torch.float64 else u
-        status = result.status.clone()
-        floats = objective + constant, status, result.iterations, result.kkt_residual, result.solve_time, violation
-        objective, status, iterations, residual, seconds, violation = floats
-        outputs = (
-            x, u, lam, mu, objective.to(self.dtype), status, iterations, residual, seconds, violation.to(self.dtype),
-            x.new_empty((self._size, 0)),
-        )  # fmt: skip
-        device = tensors[_X0].device  # pyright: ignore[reportOptionalMemberAccess]
+        primal, status, floats = result.primal, result.status, (objective, violation)
+        if self.own:  # copies: what the caller does with the outputs must not change the gradient
+            primal, status = tuple(v.clone() for v in primal), status.clone()
+        if self.dtype != torch.float64:
+            primal, floats = (tuple(v.to(self.dtype) for v in values) for values in (primal, floats))
+            primal = (primal[0], _inside(primal[1], problem), *primal[2:])
+        outputs = (*primal, floats[0], status, result.iterations, result.kkt_residual, result.solve_time, floats[1])
+        device = tensors["x0"].device
         if device.type != "cpu":
             outputs = tuple(v.to(device) for v in outputs)
         return outputs if len(self.batch) == 1 else tuple(v.reshape((*self.batch, *v.shape[1:])) for v in outputs)
+
+    def _objective(self, result: Result) -> Tensor:
+        """The cost of the plans (batch,), by the solver where it says it."""
+        if result.objective is not None and result.all_converged:
+            return result.objective
+        objective = self.problem.objective(result.primal.x, result.primal.u)
+        if result.objective is None:
+            return objective
+        return torch.where(result.status == int(Status.CONVERGED), result.objective, objective)
 
     @property
     def _size(self) -> int:
@@ -109,13 +126,13 @@ class Plan:
 
     def rank(self, name: str) -> int:
         """Number of dimensions of an input behind those of the batch."""
-        return _RANKS[name] + (name in self.by_stage)
+        return RANKS[name] + (name in self.by_stage)
 
-    def _values(self, tensors: Sequence[Tensor | None]) -> dict[str, Tensor]:
+    def _values(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Name → numbers as `MPCProblem` wants them; checked, as far as nobody did before."""
         values, size = {}, self._size
-        for name, tensor in zip(ARGUMENTS, tensors, strict=False):
-            if tensor is None:
+        for name, tensor in tensors.items():
+            if name in self.known:
                 continue
             value = tensor.detach()
             if value.dtype != torch.float64 or value.device.type != "cpu":
@@ -138,7 +155,7 @@ class Plan:
                     check_not_nan(name, value)
             elif self.unseen or name in _COST:
                 check_tensor(name, value)
-            values[name] = value.contiguous()
+            values[name] = value.clone() if name in self.private else value.contiguous()
         if self.unseen:
             check_positive_definite(values["F"])
         return values
@@ -151,10 +168,14 @@ class Plan:
             if tensor is None:  # no multipliers
                 flat.append(self.problem.no_multipliers())
                 continue
-            value = tensor.detach().to("cpu", torch.float64)
+            value = tensor.detach() if tensor.requires_grad else tensor
+            if value.dtype != torch.float64 or not value.is_cpu:
+                value = value.to("cpu", torch.float64)
             if self.unseen:
                 check_tensor("guess", value)
-            flat.append(value.expand(*self.batch, *value.shape[-2:]).reshape(self._size, *value.shape[-2:]))
+            if len(self.batch) != 1 or value.ndim != 3:
+                value = value.expand(*self.batch, *value.shape[-2:]).reshape(self._size, *value.shape[-2:])
+            flat.append(value)
         return Primal(*flat)
 
     def pull_back(self, targets: Sequence[Target], kept: int, grads: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
@@ -212,14 +233,14 @@ class Plan:
         return gradient.reshape((*front, *shape)).to(target.device, target.dtype)
 
 
-_X0 = ARGUMENTS.index("x0")
-
-
-def solve(plan: Plan, tensors: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
-    """The outputs of `Plan.solve`, as nodes of the graph, without the empty one."""
+def solve(plan: Plan, tensors: Mapping[str, Tensor], guess: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
+    """The outputs of `Plan.solve`, as nodes of the graph if there is one."""
+    if not plan.own and not plan.unseen:
+        return plan.solve(tensors, guess)
     # The style with `setup_context`, which transforms need, costs 20 µs more a call: it reads a signature each time.
     function = _Transformed if transforms_active() else _Eager
-    return function.apply(plan, *tensors)[:-1]  # pyright: ignore[reportOptionalSubscript]
+    inputs = (tensors.get(name) for name in ARGUMENTS[:_COUNT])
+    return function.apply(plan, *inputs, *guess)[:-1]  # pyright: ignore[reportOptionalSubscript]
 
 
 def _keep(ctx: Any, plan: Plan, tensors: Sequence[Tensor | None], outputs: Sequence[Tensor]) -> None:
@@ -230,10 +251,17 @@ def _keep(ctx: Any, plan: Plan, tensors: Sequence[Tensor | None], outputs: Seque
     ctx.set_materialize_grads(False)
 
 
+def _witnessed(plan: Plan, tensors: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
+    """What was found, and an empty tensor."""
+    named = {name: v for name, v in zip(ARGUMENTS, tensors[:_COUNT], strict=False) if v is not None}
+    outputs = plan.solve(named, tensors[_COUNT:])
+    return *outputs, outputs[0].new_empty((*plan.batch, 0))
+
+
 class _Eager(torch.autograd.Function):
     @staticmethod
     def forward(ctx, plan: Plan, *tensors: Tensor | None):
-        outputs = plan.solve(tensors)
+        outputs = _witnessed(plan, tensors)
         _keep(ctx, plan, tensors, outputs)
         return outputs
 
@@ -251,7 +279,7 @@ class _Eager(torch.autograd.Function):
 class _Transformed(torch.autograd.Function):
     @staticmethod
     def forward(plan: Plan, *tensors: Tensor | None):
-        return plan.solve(tensors)
+        return _witnessed(plan, tensors)
 
     @staticmethod
     def setup_context(ctx, inputs: tuple, output: tuple[Tensor, ...]) -> None:
@@ -348,24 +376,29 @@ def _pull_back_legacy(plan: Plan, targets: Sequence[Target], grads: Sequence[Ten
 
 
 def _within_range(result: Result, objective: Tensor, constant: Tensor, dtype: torch.dtype) -> tuple[Result, Tensor]:
-    """Elements whose numbers `dtype` cannot hold become NUMERICAL; those that failed get numbers that it can."""
+    """The objective with its constant; elements whose numbers `dtype` cannot hold become NUMERICAL.
+
+    Those that failed get numbers that it can hold.
+    """
     largest = torch.finfo(dtype).max
     total = objective + constant
+    if dtype == torch.float64 and result.all_converged and all_finite(total):
+        return result, total
     held = total.abs() <= largest
     if dtype != torch.float64:
         for value in result.primal:
             held &= (value.abs() <= largest).flatten(1).all(1)
     solved = result.solved
     if bool((held & solved).all()):
-        return result, objective
+        return result, total
     status = torch.where(solved & ~held, int(Status.NUMERICAL), result.status).to(torch.int8)
     failed = ~(solved & held)
     rows = failed[:, None, None]
     primal = Primal(*(torch.where(rows, v.clamp(-largest, largest), v) for v in result.primal))
-    room = largest / 4 - constant.abs()  # the caller adds the constant
+    room = largest / 4 - constant.abs()
     finite = torch.nan_to_num(objective, nan=largest)
     objective = torch.where(failed, torch.maximum(torch.minimum(finite, room), -room), objective)
-    return replace(result, primal=primal, status=status), objective
+    return replace(result, primal=primal, status=status), objective + constant
 
 
 def _inside(u: Tensor, problem: MPCProblem) -> Tensor:

@@ -10,24 +10,26 @@ from torch import Tensor, nn
 
 from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor
 from difflcs._functorch import runs_eagerly, transforms_active
+from difflcs._recall import Recall
 from difflcs.constraints import StageBounds, as_bound, check_bounds
 from difflcs.cost import CostSequence
 from difflcs.errors import DegenerateWarning, SolveError, SolveWarning
 from difflcs.lcs import LCSSequence
 from difflcs.mpc.autograd import Plan, solve
 from difflcs.mpc.backends import Backend, get_backend
+from difflcs.mpc.controller import MPCController, OnFailure
 from difflcs.mpc.gather import (
     Bound,
     Constraints,
     Cost,
     Inputs,
+    Planned,
     System,
     check_constraints,
     check_cost,
     check_stage_bounds,
     check_system,
 )
-from difflcs.mpc.problem import INPUTS
 from difflcs.mpc.solution import MPCSolution, Primal
 from difflcs.status import Status, solved
 
@@ -107,6 +109,7 @@ class LCSMPCLayer(nn.Module):
                 self.register_buffer(name, value, persistent=False)
         self._check_parts()
         self._warned = False
+        self._planned: Recall[Planned] = Recall()
 
     def _check_parts(self) -> None:
         """What does not depend on a call is refused before the first one."""
@@ -170,7 +173,8 @@ class LCSMPCLayer(nn.Module):
         """
         system = self.lcs if lcs is None else check_system(lcs)
         check_tensor("x0", x0, [("n_x", system.n_x)])
-        inputs = Inputs(self.horizon)
+        unseen = transforms_active()
+        inputs = Inputs(self.horizon, earlier=None if unseen else self._planned.kept)
         inputs.add_system(system, x0, context)
         inputs.add_cost(self.cost if cost is None else check_cost(cost), goal, reference)
         bounds = self.bounds if bounds is None else check_stage_bounds(bounds, u_min=u_min, u_max=u_max)
@@ -183,27 +187,44 @@ class LCSMPCLayer(nn.Module):
         inputs.add_constraints(self.constraints if constraints is None else check_constraints(constraints))
         inputs.tensors["x0"] = x0
         tensors = inputs.tensors
+        smooth = self.training_relaxation if self.training else None
+        settings = (self.horizon, self.relaxation if smooth is None else smooth, self.barrier)
+        before = inputs.recall(settings)
+        needs_grad = torch.is_grad_enabled() and (unseen or any(t.requires_grad for t in tensors.values()))
         batch = inputs.batch()
         start = inputs.guess(guess, batch)
-        values = tensors.values()
-        smooth = self.training_relaxation if self.training else None
-        unseen = transforms_active()
-        needs_grad = torch.is_grad_enabled() and (unseen or any(t.requires_grad for t in values))
+        # With gradients the inputs change from call to call, so that nothing is worth keeping.
+        new = {} if needs_grad or unseen else inputs.new()
         plan = Plan(
-            backend=self.backend,
-            horizon=self.horizon,
-            relaxation=self.relaxation if smooth is None else smooth,
-            barrier=self.barrier,
+            self.backend,
+            *settings,
             by_stage=frozenset(inputs.by_stage),
             dtype=x0.dtype,
-            smallest=torch.float32 if any(t.dtype == torch.float32 for t in values) else torch.float64,
+            smallest=torch.float32
+            if needs_grad and any(t.dtype == torch.float32 for t in tensors.values())
+            else torch.float64,
             batch=batch,
             own=needs_grad,
             unseen=unseen,
+            before=before,
+            known=inputs.known,
+            private=new,
         )
-        outputs = solve(plan, [*(tensors.get(name) for name in INPUTS), tensors["constant"], *start])
-        self._report(plan.result.status, needs_grad)
+        outputs = solve(plan, tensors, start)
+        if new:
+            inputs.keep(self._planned, settings, new, plan.problem, plan.constant)
+        if unseen or not plan.result.all_converged:
+            self._report(plan.result.status, needs_grad)
         return MPCSolution(*outputs, problem=plan.problem)
+
+    def controller(self, on_failure: OnFailure = "hold", time_limit: float | None = None) -> MPCController:
+        """A controller of one robot with this layer's problem as it is now: NumPy in and out, warm, microseconds.
+
+        Args:
+            on_failure: "hold", "unfinished", "zero", "raise" or an action (n_u,), see `MPCController`.
+            time_limit: seconds of one step, that of the backend if None.
+        """
+        return MPCController(self, on_failure, time_limit)
 
     def _report(self, status: Tensor, needs_grad: bool) -> None:
         degenerate = int((status == Status.DEGENERATE).sum())

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -108,9 +111,36 @@ class MPCProblem(SystemMatrices):
             found = tuple(getattr(self, name).shape)
             if found not in allowed:
                 raise ShapeError(f"{name}: expected {' or '.join(map(str, allowed))}, got {found}")
-        limits = self.bounds() if self.by_stage("u_min") or self.by_stage("u_max") else (self.u_min, self.u_max)
-        check_bounds(*limits, strict=self.barrier > 0)
-        check_prices("price", self.price)
+        self._check_numbers(INPUTS)
+
+    def _check_numbers(self, names: Iterable[str]) -> None:
+        if "u_min" in names or "u_max" in names:
+            limits = self.bounds() if self.by_stage("u_min") or self.by_stage("u_max") else (self.u_min, self.u_max)
+            check_bounds(*limits, strict=self.barrier > 0)
+        if "price" in names:
+            check_prices("price", self.price)
+
+    def changed(self, values: Mapping[str, Tensor]) -> MPCProblem:
+        """The problem with other inputs, of which alone the shapes and numbers are checked.
+
+        Raises:
+            ShapeError, BoundsError, InvalidInputError: they do not fit the others.
+        """
+        if any(value.shape != getattr(self, name).shape for name, value in values.items()):
+            return replace(self, **values)
+        other = object.__new__(MPCProblem)
+        own = vars(other)
+        own.update(vars(self), **values)
+        own["arrays"] = arrays = self.arrays.copy()
+        for name, value in values.items():
+            arrays[_ORDER[name]] = array(value)
+        other._check_numbers(values)
+        return other
+
+    @functools.cached_property
+    def arrays(self) -> list[np.ndarray]:
+        """The inputs in their order, for the kernels."""
+        return [array(getattr(self, name)) for name in INPUTS]
 
     @property
     def batch(self) -> int:
@@ -171,8 +201,8 @@ class MPCProblem(SystemMatrices):
         if bool(self.S.any()):
             stages = stages + (x[:, :-1] * matvec(self.batch_first("S"), u)).sum(-1)
         total = 0.5 * quadratic(self.Q_final, x[:, -1]) + (self.q_final * x[:, -1]).sum(-1)
-        for k in range(self.horizon):  # one by one: the order of a sum must not depend on the batch
-            total = total + stages[:, k]
+        # A running sum, from the first stage to the last: the order of a sum must not depend on the batch.
+        total = torch.cat([total.unsqueeze(1), stages], 1).cumsum(1)[:, -1]
         if self.barrier > 0:
             below, above = self.distances(u)
             total = total - self.barrier * (below.log() + above.log()).sum((1, 2))
@@ -191,7 +221,7 @@ class MPCProblem(SystemMatrices):
     def violation(self, x: Tensor, u: Tensor) -> Tensor:
         """Largest violation (batch,) of the constraints, soft ones too; 0 where they hold."""
         if self.n_c == 0:
-            return torch.zeros_like(x[:, 0, 0])
+            return x.new_zeros(len(x))
         return self.constraints(x, u).clamp_min(0.0).amax((1, 2))
 
     def _fines(self, x: Tensor, u: Tensor) -> Tensor:
@@ -246,9 +276,15 @@ class MPCProblem(SystemMatrices):
         return replace(self, **chosen)
 
 
+def array(value: Tensor) -> np.ndarray:
+    """The memory of a tensor on the CPU, or of a contiguous copy of it."""
+    return value.contiguous().numpy()
+
+
 # Differentiable inputs with the kind of each trailing dimension, in the order in which autograd and the kernels take
 # them; and how many stages each has where it is given by stage.
 INPUTS: dict[str, tuple[str, ...]] = dimensions(MPCProblem)
+_ORDER = {name: i for i, name in enumerate(INPUTS)}
 STAGES: dict[str, str] = {
     name: "H+1" if name in ("G_x", "g", "price") else "" if name in ("Q_final", "q_final", "x0") else "H"
     for name in INPUTS

@@ -13,7 +13,9 @@ from torch import Tensor
 
 from difflcs._checks import check_positive_int
 from difflcs.errors import InvalidInputError
-from difflcs.rl.rollout import Policy, collect, mpc_actions
+from difflcs.lcs import LCSModule, LCSParams
+from difflcs.rl.delay import late_actions, predicted_by
+from difflcs.rl.rollout import Policy, action_bounds, collect, mpc_actions
 from difflcs.rl.seeding import Stream, episode_seeds
 
 if TYPE_CHECKING:
@@ -96,6 +98,8 @@ def evaluate(
     u_min: Tensor | None = None,
     u_max: Tensor | None = None,
     after_step: Callable[[int], object] | None = None,
+    delay: int = 0,
+    model: LCSModule | LCSParams | None = None,
 ) -> Evaluation:
     """Run one noise-free episode per goal; every solve starts cold.
 
@@ -111,17 +115,24 @@ def evaluate(
         u_min: lower bounds (n_u,) of the MPC; the policy's own if None.
         u_max: upper bounds (n_u,).
         after_step: called with the number of episodes stepped, for progress bars.
+        delay: steps by which actions come late, see `difflcs.rl.delay`.
+        model: predicts the state at which a late action will be executed, such as `policy.lcs`; None: plans begin at
+            the state as observed.
 
     Returns:
         The success rate with its interval, and what went wrong.
     """
     check_positive_int("goals", goals)
     check_positive_int("seed", seed, minimum=0)
+    check_positive_int("delay", delay, minimum=0)
     parts: list[TensorDict] = []
     for first in range(0, goals, env.num_envs):
         count = min(env.num_envs, goals - first)
         report = None if after_step is None else lambda count=count: after_step(count)
         act = mpc_actions(policy, u_min, u_max)
+        if delay:
+            n_u = len(action_bounds(env)[0])
+            act = late_actions(act, n_u, delay, None if model is None else predicted_by(model))
         parts.append(collect(env, act, episode_seeds(seed, Stream.EVALUATION, first, count), episode_steps, report))
     successes = sum(int(part["success"].sum()) for part in parts)
     low, high = wilson_interval(successes, goals)

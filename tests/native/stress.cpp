@@ -5,12 +5,16 @@
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
+#include <cstring>
 #include <limits>
 #include <new>
 #include <random>
+#include <stdexcept>
+#include <string>
 #include <thread>
 #include <vector>
 
+#include "controller.hpp"
 #include "kernels.hpp"
 #include "lcp_one.hpp"
 
@@ -106,21 +110,15 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
   std::vector<double> objective(count), residual(count);
   std::vector<int8_t> status(count), fragile(count), all_solved(count, 1);
   std::vector<int32_t> iterations(count);
-  MpcSolve o{nullptr,
-             nullptr,
-             1e-3,
-             0.3,
-             1e-8,
-             100,
-             1e-6,
-             x.data(),
-             u.data(),
-             lam.data(),
-             objective.data(),
-             residual.data(),
-             status.data(),
-             fragile.data(),
-             iterations.data()};
+  double no_multipliers;
+  MpcSolve o{};
+  const std::vector<MpcStart> cold(count, {true, 1.0, 1e-5}), warm(count, {false, 0.0, 1e-5});
+  std::vector<double> scale(count), gained(count);
+  o.start = cold.data(), o.shrink = 0.3, o.steps = 1, o.tol = 1e-8, o.max_iter = 100, o.certified = 1e-6;
+  o.scale = scale.data(), o.gained = gained.data();
+  o.x = x.data(), o.u = u.data(), o.lam = lam.data(), o.mu = &no_multipliers;
+  o.objective = objective.data(), o.residual = residual.data(), o.status = status.data();
+  o.fragile = fragile.data(), o.iterations = iterations.data();
   for (int pass = 0; pass < 2; pass++) {  // cold, then from its own solution
     int64_t next = 0;
     std::vector<std::thread> pool;
@@ -132,7 +130,7 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
     for (auto& t : pool) t.join();
     if (broken != 0) break;
     const auto u_start = u, lam_start = lam;
-    o.u_start = u_start.data(), o.lam_start = lam_start.data(), o.first_relaxation = 1e-5;
+    o.u_start = u_start.data(), o.lam_start = lam_start.data(), o.start = warm.data();
     expect(std::count_if(status.begin(), status.end(), solved) * 10 >= count * 9,
            "nine of ten MPC problems are solved");
     if (pass == 0) {
@@ -145,7 +143,7 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
         expect(s >= kUnreached && s <= int8_t(Status::degenerate), "a status is written or is not");
       u = u_start, lam = lam_start;
     }
-    o.u_start = o.lam_start = nullptr, o.first_relaxation = 1e-3;
+    o.u_start = o.lam_start = nullptr, o.start = cold.data();
   }
   MpcGradient g{};
   const auto x_bar = normal(x.size(), 1.0), u_bar = normal(u.size(), 1.0), lam_bar = normal(lam.size(), 1.0);
@@ -194,6 +192,103 @@ void violation(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t count, double br
   }
 }
 
+// The bytes of a controller file, see controller_file.hpp.
+class File {
+ public:
+  void put(const char* name, std::vector<double> values) {
+    char padded[16] = {};
+    std::strncpy(padded, name, sizeof padded);
+    const uint64_t count = values.size();
+    append(padded, sizeof padded), append(&count, sizeof count), append(values.data(), count * sizeof(double));
+  }
+  std::string bytes() const {
+    const uint64_t size = 24 + body_.size();
+    const std::string tail = std::string(reinterpret_cast<const char*>(&size), 8) + body_;
+    uint32_t crc = 0xffffffff;
+    for (const unsigned char c : tail) {
+      crc ^= c;
+      for (int bit = 0; bit < 8; bit++) crc = crc >> 1 ^ (crc & 1 ? 0xedb88320 : 0);
+    }
+    const uint32_t head[2] = {kControllerVersion, ~crc};
+    return std::string("\x89LCS\r\n\x1a\n") + std::string(reinterpret_cast<const char*>(head), 8) + tail;
+  }
+
+ private:
+  void append(const void* from, size_t size) { body_.append(static_cast<const char*>(from), size); }
+  std::string body_;
+};
+
+void controller(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t h, int64_t n_c, int64_t n_goal, bool staged,
+                double broken) {
+  MpcBatch b{};
+  b.count = 1, b.n_x = n_x, b.n_u = n_u, b.n_lam = n_lam, b.n_c = n_c, b.horizon = h;
+  File file;
+  const std::pair<const char*, double> numbers[] = {{"n_x", n_x},
+                                                    {"n_u", n_u},
+                                                    {"n_lam", n_lam},
+                                                    {"n_c", n_c},
+                                                    {"horizon", h},
+                                                    {"n_goal", n_goal},
+                                                    {"relaxation", 1e-5},
+                                                    {"barrier", 0},
+                                                    {"tol", 1e-8},
+                                                    {"certified", 1e-6},
+                                                    {"homotopy", 0},
+                                                    {"shrink", 0.3},
+                                                    {"max_iter", 150},
+                                                    {"seed", 0},
+                                                    {"starts", staged ? 16 : 3},
+                                                    {"starts_guessed", staged ? 16 : 1},
+                                                    {"step_seconds", 0}};
+  for (const auto& number : numbers) file.put(number.first, {double(number.second)});
+  for (int i = 0; i < kx0; i++) {
+    const int64_t copies = staged && stages_of(b, kMpcFields[i]) ? stages_of(b, kMpcFields[i]) : 1;
+    std::vector<double> values;
+    for (int64_t k = 0; k < copies; k++) {
+      const int64_t size = extent(b, kMpcFields[i]);
+      auto own = i == kF ? lcp_matrices(1, n_lam) : normal(size, 0.3);
+      for (int64_t j = 0; j < size; j++) {
+        if (i == ku_min) own[j] = -0.5;
+        if (i == ku_max || i == kprice) own[j] = 0.5;
+        if (i == kQ || i == kQ_final) own[j] = j % (n_x + 1) == 0;
+        if (i == kR) own[j] = j % (n_u + 1) == 0;
+        if (i == kS) own[j] *= 0.1;
+      }
+      values.insert(values.end(), own.begin(), own.end());
+    }
+    file.put(kMpcFields[i].name, values);
+  }
+  file.put("goal_to_q", normal(n_x * n_goal, 1)), file.put("goal_to_q_final", normal(n_x * n_goal, 1));
+  file.put("goal_stage", normal(n_goal * n_goal, 1)), file.put("goal_final", normal(n_goal * n_goal, 1));
+  file.put("constant", {1.0});
+  const std::string bytes = file.bytes();
+  Controller own(bytes.data(), bytes.size());
+  std::vector<double> u(n_u);
+  const auto given = normal(n_u, 1);
+  for (int i = 0; i < 12; i++) {
+    const bool follow = i % 2 && n_goal > 0;
+    auto x = normal(n_x, 0.3), targets = normal((follow ? h + 1 : 1) * n_goal, 0.3);
+    if (i % 4 == 3) x[0] = broken;
+    own.set_time_limit(i % 5 == 4 ? 1e-9 : std::numeric_limits<double>::infinity());
+    own.set_fallback(Fallback(i % 4), given.data());
+    own.step(x.data(), targets.data(), follow, u.data());
+    for (const double a : u) expect(a >= -0.5 && a <= 0.5, "every action is inside the bounds");
+  }
+  // What is damaged is refused, in whatever way.
+  int refused = 0;
+  const int tries = 40;
+  for (int i = 0; i < tries; i++) {
+    std::string damaged = bytes.substr(0, i % 2 ? bytes.size() : generator() % bytes.size());
+    if (i % 2) damaged[generator() % damaged.size()] ^= char(1 << generator() % 8);
+    try {
+      Controller(damaged.data(), damaged.size());
+    } catch (const std::runtime_error&) {
+      refused++;
+    }
+  }
+  expect(refused == tries, "a damaged file is refused");
+}
+
 }  // namespace
 
 int main() {
@@ -214,6 +309,12 @@ int main() {
   for (const auto& s : shapes)
     for (const double broken : {0.0, huge, nan})
       for (const int64_t count : {1, 29}) violation(s[0], s[1], s[2], count, broken);
+  for (const auto& s : shapes)
+    for (const int64_t n_c : {0, 2})
+      for (const int64_t n_goal : {0, 3})
+        for (const double broken : {0.0, huge, nan})
+          controller(s[0], s[1], s[2], s[3], n_c, n_goal, n_goal > 0, broken);
+  controller(3, 2, 0, 1, 1, 2, false, nan);
   std::printf("%s kernels, %d lanes: %s\n", kernels().isa, kernels().lanes, failures ? "FAILED" : "clean");
   return failures != 0;
 }

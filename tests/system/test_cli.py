@@ -52,6 +52,7 @@ HELP = {
     "train": "--warmup.noise",
     "evaluate": "zoo:NAME",
     "render": "--force",
+    "export": "controller.difflcs",
     "demo": "--smoke",
     "zoo": "--json",
     "assets": "sugar_box",

@@ -22,7 +22,7 @@ LAYERS = [
     {"lcs", "lcp", "records", "losses", "_violation", "scales", "cost", "constraints"},
     {"systems"},
     {"mpc"},
-    {"rl", "zoo"},
+    {"rl", "zoo", "export"},
     {"bench", "doctor", "cli", "__main__"},
 ]
 

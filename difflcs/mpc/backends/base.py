@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from difflcs.errors import BackendNotFoundError, DTypeError, InvalidInputError
 from difflcs.mpc import kkt
 from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.mpc.solution import Primal
-from difflcs.status import Status, solved
+from difflcs.status import Status, all_converged, solved
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,8 @@ class Result:
         kkt_residual: (batch,) see `difflcs.mpc.kkt.residual`; the largest float where it is infinite.
         solve_time: (batch,) seconds.
         linearisation: the factored optimality conditions for the gradient.
+        objective: (batch,) the cost of the plans that are CONVERGED, if the solver says it; up to rounding it is
+            `MPCProblem.objective`.
     """
 
     primal: Primal
@@ -36,6 +39,12 @@ class Result:
     kkt_residual: Tensor
     solve_time: Tensor
     linearisation: kkt.Linearisation | None = None
+    objective: Tensor | None = None
+
+    @functools.cached_property
+    def all_converged(self) -> bool:
+        """Whether every plan is CONVERGED: the quick question before all others."""
+        return all_converged(self.status)
 
     @property
     def solved(self) -> Tensor:

@@ -1,0 +1,128 @@
+// The binding of the controller (controller.hpp). Arrays have been checked in Python (difflcs/mpc/controller.py) and
+// are checked here once more.
+#include "bind_controller.hpp"
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/vector.h>
+
+#include <algorithm>
+#include <atomic>
+#include <initializer_list>
+#include <limits>
+#include <optional>
+#include <stdexcept>
+#include <vector>
+
+#include "controller.hpp"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace {
+
+using Array = nb::ndarray<const double, nb::device::cpu, nb::c_contig>;
+using Output = nb::ndarray<double, nb::device::cpu, nb::c_contig>;
+
+// A controller that refuses a second thread.
+struct Guarded {
+  difflcs::Controller controller;
+  std::atomic_flag busy = ATOMIC_FLAG_INIT;
+  Guarded(const void* bytes, size_t size) : controller(bytes, size) {}
+};
+
+class Use {
+ public:
+  explicit Use(Guarded& guarded) : guarded_(guarded) {
+    if (guarded.busy.test_and_set(std::memory_order_acquire))
+      throw std::runtime_error(
+          "controller: expected one thread at a time, got a call while another is under way; make one for each thread");
+  }
+  ~Use() { guarded_.busy.clear(std::memory_order_release); }
+  difflcs::Controller* operator->() const { return &guarded_.controller; }
+
+ private:
+  Guarded& guarded_;
+};
+
+void expect(bool ok, const char* what) {
+  if (!ok) throw std::invalid_argument(what);
+}
+
+int step(Guarded& self, Array x, std::optional<Array> targets, bool follow, Output u) {
+  const Use controller(self);
+  const difflcs::ControllerData& d = controller->data();
+  const int64_t aims = d.n_goal * (follow ? d.horizon + 1 : 1);
+  expect(int64_t(x.size()) == d.n_x && int64_t(u.size()) == d.n_u, "x must be (n_x,) and u (n_u,)");
+  expect((targets ? int64_t(targets->size()) : 0) == aims, "targets must be (n_goal,) or (H + 1, n_goal)");
+  const nb::gil_scoped_release release;
+  return int(controller->step(x.data(), targets ? targets->data() : nullptr, follow, u.data()).status);
+}
+
+nb::dict sizes(const Guarded& self) {
+  const difflcs::ControllerData& d = self.controller.data();
+  nb::dict found;
+  found["n_x"] = d.n_x, found["n_u"] = d.n_u, found["n_lam"] = d.n_lam, found["n_c"] = d.n_c;
+  found["n_goal"] = d.n_goal, found["horizon"] = d.horizon, found["step_seconds"] = d.step_seconds;
+  found["isa"] = self.controller.kernels().isa;
+  return found;
+}
+
+nb::tuple outcome(Guarded& self) {
+  const Use controller(self);
+  const difflcs::Outcome& o = controller->outcome();
+  return nb::make_tuple(int(o.status), o.fallback, o.late, o.iterations, o.objective, o.residual, o.solve_seconds);
+}
+
+void plan(Guarded& self, Output x, Output u, Output lam, Output mu) {
+  const Use controller(self);
+  const difflcs::Trace& found = controller->plan();
+  const difflcs::Numbers* from[] = {&found.x, &found.u, &found.lam, &found.mu};
+  int i = 0;
+  for (const Output* to : {&x, &u, &lam, &mu}) {
+    expect(int64_t(to->size()) == from[i]->count(), "x, u, lam and mu must be those of a plan");
+    std::copy_n(from[i]->get(), from[i]->count(), to->data());
+    i++;
+  }
+}
+
+void set_fallback(Guarded& self, int kind, std::optional<Array> given) {
+  const Use controller(self);
+  expect(kind >= 0 && kind <= 3, "the kind must be from 0 to 3");
+  expect(kind != 2 || (given && int64_t(given->size()) == controller->data().n_u), "the action must be (n_u,)");
+  controller->set_fallback(difflcs::Fallback(kind), given ? given->data() : nullptr);
+}
+
+void set_system(Guarded& self, std::vector<Array> matrices) {
+  const Use controller(self);
+  expect(matrices.size() == 8, "a system has eight fields");
+  const double* from[8];
+  for (int i = 0; i < 8; i++) {
+    expect(int64_t(matrices[i].size()) == controller->data().field[i].count(),
+           "the system must have the sizes of the first");
+    from[i] = matrices[i].data();
+  }
+  controller->set_system(from);
+}
+
+}  // namespace
+
+void bind_controller(nb::module_& m) {
+  nb::class_<Guarded>(m, "Controller", "A controller from the bytes of its file.")
+      .def("__init__", [](Guarded* self, nb::bytes content) { new (self) Guarded(content.c_str(), content.size()); })
+      .def("sizes", &sizes)
+      .def("step", &step, "x"_a, "targets"_a.none(), "follow"_a, "u"_a, "Plans, writes the action, returns the status.")
+      .def("outcome", &outcome,
+           "Status, fallback, late, iterations, objective, residual, solve_seconds of the last step.")
+      .def("plan", &plan, "x"_a, "u"_a, "lam"_a, "mu"_a, "Writes the last plan.")
+      .def("reset", [](Guarded& self) { Use(self)->reset(); })
+      .def(
+          "set_time_limit",
+          [](Guarded& self, double seconds) {
+            Use(self)->set_time_limit(seconds > 0 ? seconds : std::numeric_limits<double>::infinity());
+          },
+          "seconds"_a)
+      .def("set_fallback", &set_fallback, "kind"_a, "given"_a.none())
+      .def("set_system", &set_system, "matrices"_a);
+}

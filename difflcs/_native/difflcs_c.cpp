@@ -1,0 +1,157 @@
+// The C interface: difflcs.h says what it does. No exception leaves it.
+#include <cmath>
+#include <cstdio>
+#include <cstring>
+#include <exception>
+#include <limits>
+#include <memory>
+#include <new>
+#include <stdexcept>
+#include <vector>
+
+#include "controller.hpp"
+#include "difflcs.h"
+
+using difflcs::Controller;
+
+struct difflcs_controller {
+  Controller controller;
+};
+
+namespace {
+
+static_assert(int(difflcs::Status::converged) == DIFFLCS_CONVERGED &&
+                  int(difflcs::Status::max_iter) == DIFFLCS_MAX_ITER &&
+                  int(difflcs::Status::infeasible) == DIFFLCS_INFEASIBLE &&
+                  int(difflcs::Status::numerical) == DIFFLCS_NUMERICAL &&
+                  int(difflcs::Status::degenerate) == DIFFLCS_DEGENERATE,
+              "the codes of difflcs.h are those of fields.hpp");
+
+// A file of more is none of ours [byte].
+constexpr long kLargestFile = 1L << 30;
+
+void write_error(char* error, size_t size, const char* what) {
+  if (error && size > 0) std::snprintf(error, size, "%s", what);
+}
+
+difflcs_status step(difflcs_controller* c, const double* x, const double* targets, bool follow, double* u) {
+  if (!c || !x || !u || (!targets && c->controller.data().n_goal > 0) || (follow && c->controller.data().n_goal == 0))
+    return DIFFLCS_INVALID;
+  return difflcs_status(int(c->controller.step(x, targets, follow, u).status));
+}
+
+}  // namespace
+
+extern "C" {
+
+difflcs_controller* difflcs_load_bytes(const void* bytes, size_t count, char* error, size_t size) {
+  try {
+    if (!bytes) throw std::runtime_error("expected the bytes of a controller file, got a null pointer");
+    return new difflcs_controller{{bytes, count}};
+  } catch (const std::bad_alloc&) {
+    write_error(error, size, "not enough memory for the controller");
+  } catch (const std::exception& e) {
+    write_error(error, size, e.what());
+  } catch (...) {
+    write_error(error, size, "unknown error");
+  }
+  return nullptr;
+}
+
+difflcs_controller* difflcs_load(const char* path, char* error, size_t size) {
+  const auto fail = [&](const char* what) -> difflcs_controller* {
+    if (error && size > 0) std::snprintf(error, size, "%s: %s", path ? path : "(null)", what);
+    return nullptr;
+  };
+  if (!path) return fail("expected the name of a controller file");
+  const std::unique_ptr<std::FILE, int (*)(std::FILE*)> file(std::fopen(path, "rb"), &std::fclose);
+  if (!file) return fail("expected a file that can be read");
+  if (std::fseek(file.get(), 0, SEEK_END) != 0) return fail("expected a plain file");
+  const long length = std::ftell(file.get());
+  if (length < 0 || length > kLargestFile) return fail("expected a controller file, got a larger one");
+  std::rewind(file.get());
+  try {
+    std::vector<unsigned char> bytes(static_cast<size_t>(length) + 1);
+    const size_t count = std::fread(bytes.data(), 1, bytes.size(), file.get());
+    if (std::ferror(file.get())) return fail("expected a file that can be read");
+    char what[256] = "";
+    difflcs_controller* controller = difflcs_load_bytes(bytes.data(), count, what, sizeof what);
+    return controller ? controller : fail(what);
+  } catch (const std::bad_alloc&) {
+    return fail("not enough memory");
+  }
+}
+
+void difflcs_free(difflcs_controller* c) { delete c; }
+
+difflcs_sizes difflcs_get_sizes(const difflcs_controller* c) {
+  if (!c) return {};
+  const difflcs::ControllerData& d = c->controller.data();
+  return {size_t(d.n_x),    size_t(d.n_u),     size_t(d.n_lam), size_t(d.n_c),
+          size_t(d.n_goal), size_t(d.horizon), d.step_seconds};
+}
+
+difflcs_status difflcs_step(difflcs_controller* c, const double* x, const double* goal, double* u) {
+  return step(c, x, goal, false, u);
+}
+
+difflcs_status difflcs_follow(difflcs_controller* c, const double* x, const double* reference, double* u) {
+  return step(c, x, reference, true, u);
+}
+
+void difflcs_reset(difflcs_controller* c) {
+  if (c) c->controller.reset();
+}
+
+difflcs_outcome difflcs_get_outcome(const difflcs_controller* c) {
+  if (!c) return {DIFFLCS_INVALID, 0, 0, 0, 0, 0, 0};
+  const difflcs::Outcome& o = c->controller.outcome();
+  return {difflcs_status(int(o.status)), o.fallback, o.late, o.iterations, o.objective, o.residual, o.solve_seconds};
+}
+
+difflcs_plan difflcs_get_plan(const difflcs_controller* c) {
+  if (!c) return {};
+  const difflcs::Trace& plan = c->controller.plan();
+  return {plan.x.get(), plan.u.get(), plan.lam.get(), plan.mu.get()};
+}
+
+void difflcs_set_time_limit(difflcs_controller* c, double seconds) {
+  if (c) c->controller.set_time_limit(seconds > 0 ? seconds : std::numeric_limits<double>::infinity());
+}
+
+difflcs_status difflcs_set_fallback(difflcs_controller* c, difflcs_fallback kind, const double* action) {
+  if (!c || kind < DIFFLCS_HOLD || kind > DIFFLCS_UNFINISHED || (kind == DIFFLCS_GIVEN && !action))
+    return DIFFLCS_INVALID;
+  for (int64_t j = 0; kind == DIFFLCS_GIVEN && j < c->controller.data().n_u; j++)
+    if (!std::isfinite(action[j])) return DIFFLCS_INVALID;
+  c->controller.set_fallback(difflcs::Fallback(int(kind)), action);
+  return DIFFLCS_CONVERGED;
+}
+
+const char* difflcs_status_name(difflcs_status status) {
+  switch (status) {
+    case DIFFLCS_CONVERGED:
+      return "CONVERGED";
+    case DIFFLCS_MAX_ITER:
+      return "MAX_ITER";
+    case DIFFLCS_INFEASIBLE:
+      return "INFEASIBLE";
+    case DIFFLCS_NUMERICAL:
+      return "NUMERICAL";
+    case DIFFLCS_DEGENERATE:
+      return "DEGENERATE";
+    case DIFFLCS_INVALID:
+      return "INVALID";
+  }
+  return "unknown";
+}
+
+const char* difflcs_isa(void) {
+  try {
+    return difflcs::kernels_for_one().isa;
+  } catch (...) {
+    return "none";
+  }
+}
+
+}  // extern "C"

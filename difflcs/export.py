@@ -1,0 +1,125 @@
+"""What a robot without Python needs of a learned model: the file of its controller, and what the numbers in it mean."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from difflcs import __version__, _files
+from difflcs._checks import describe
+from difflcs.errors import InvalidInputError
+from difflcs.mpc import LCSMPCLayer
+from difflcs.mpc.controller_file import VERSION, constant_system, controller_bytes
+
+CONTROLLER, DESCRIPTION = "controller.difflcs", "controller.json"
+
+
+def export_controller(
+    mpc: LCSMPCLayer,
+    out: str | os.PathLike[str],
+    *,
+    step_seconds: float = 0.0,
+    about: Mapping[str, Any] | None = None,
+) -> Path:
+    """Write the controller of a layer for the C library: system, cost, bounds, constraints, options of the solver.
+
+    Args:
+        mpc: the layer, with backend `batched`; nothing in it has a batch dimension.
+        out: directory to write `controller.difflcs` and `controller.json` into, each atomically; made if needed.
+        step_seconds: time from one step to the next [s]; 0 if that is not known.
+        about: what else `controller.json` is to say, in JSON types.
+
+    Returns:
+        The path of `controller.difflcs`.
+
+    Raises:
+        InvalidInputError and its kinds: the layer cannot be written, such as one whose system depends on the state.
+    """
+    if not isinstance(mpc, LCSMPCLayer):
+        raise InvalidInputError(f"mpc: expected an LCSMPCLayer, got {describe(mpc)}; pass the layer of the controller")
+    system = constant_system(mpc.lcs)
+    if system is None:
+        raise InvalidInputError(
+            f"lcs: expected an LCSModel or matrices, got {describe(mpc.lcs)}, whose system may depend on the state; "
+            f"build a layer with lcs=module.params(x, context)"
+        )
+    content = controller_bytes(mpc, system, step_seconds)
+    low, high = (mpc.u_min, mpc.u_max) if mpc.bounds is None else mpc.bounds.by_steps()
+    description = {
+        **(about or {}),
+        "format": VERSION,
+        "difflcs": __version__,
+        "file": CONTROLLER,
+        "bytes": len(content),
+        "n_x": system.n_x,
+        "n_u": system.n_u,
+        "n_lam": system.n_lam,
+        "n_c": 0 if mpc.constraints is None else mpc.constraints.n_c,
+        "n_goal": getattr(mpc.cost, "n_goal", 0),
+        "horizon": mpc.horizon,
+        "relaxation": mpc.relaxation,
+        "step_seconds": step_seconds,
+        "u_min": _bound(low),
+        "u_max": _bound(high),
+    }
+    directory = Path(out)
+    try:
+        _files.write_atomically(directory / CONTROLLER, content)
+        _files.write_json(directory / DESCRIPTION, description)
+    except OSError as error:
+        raise InvalidInputError(f"out: expected a place to write {out}, got: {error}; choose another") from error
+    return directory / CONTROLLER
+
+
+def _bound(value: torch.Tensor) -> list[Any]:
+    """A bound as JSON has it: null where there is none."""
+    flat = value.detach().double().reshape(-1, value.shape[-1]).tolist()
+    rows = [[v if abs(v) < float("inf") else None for v in row] for row in flat]
+    return rows[0] if len(rows) == 1 else rows
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write the controller of a learned model for the C library."""
+
+    model: Path
+    """Run directory, or zoo:NAME for one of the models that `difflcs zoo` lists."""
+    out: Path = Path("export")
+    """Directory to write controller.difflcs and controller.json into."""
+    force: bool = False
+    """Replace a controller that is there."""
+
+    def run(self) -> None:
+        """Run the command."""
+        from difflcs.rl.tasks import get_task
+        from difflcs.zoo import Learned
+
+        if (self.out / CONTROLLER).exists() and not self.force:
+            raise InvalidInputError(
+                f"out: expected no controller in {self.out}, got one; pass --force to replace it, or another --out"
+            )
+        learned = Learned.open(self.model)
+        task = get_task(learned.task)
+        if not isinstance(learned.policy, LCSMPCLayer):
+            raise InvalidInputError(
+                f"model: expected one that acts by the MPC, got {learned.name} of method {learned.method}; export a "
+                f"run of another method"
+            )
+        quantities = {"goal": task.goal, "errors": task.errors}
+        about = {
+            "model": learned.name,
+            "task": task.name,
+            "method": learned.method,
+            "finished": learned.finished,
+            "object": None if learned.object is None else dict(learned.object),
+            **{name: [{"name": q.name, "unit": q.unit} for q in known] for name, known in quantities.items()},
+        }
+        path = export_controller(learned.policy, self.out, step_seconds=task.step_seconds, about=about)
+        if not learned.finished:
+            print(f"{learned.name} is not finished: exported its latest checkpoint")
+        print(f"written: {path}\nits numbers: {self.out / DESCRIPTION}")

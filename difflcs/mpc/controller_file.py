@@ -1,0 +1,139 @@
+"""The file of a controller: one problem with the options of its solver, which Python and C read by the same code.
+
+`difflcs/_native/controller_file.hpp` says how its bytes lie.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from difflcs._checks import check_number, check_positive_int, describe
+from difflcs.cost import GoalCost
+from difflcs.errors import InvalidInputError, ShapeError
+from difflcs.lcs import LCSModel, LCSParams, LCSSequence
+from difflcs.mpc import kkt
+from difflcs.mpc.backends import BatchedBackend
+from difflcs.mpc.gather import Inputs
+from difflcs.mpc.problem import INPUTS, MPCProblem
+from difflcs.scales import ScaledLCS
+
+if TYPE_CHECKING:
+    from difflcs.mpc.layer import LCSMPCLayer
+
+MAGIC = b"\x89LCS\r\n\x1a\n"
+VERSION = 1
+_LARGEST = 2**53  # of whole numbers, so that a double holds it
+_MAPS = ("at", "along")
+_SYMMETRIC = ("Q", "R", "Q_final")
+
+
+def constant_system(lcs: object) -> LCSParams | LCSSequence | None:
+    """The system of an LCS whose matrices are the same for all states and contexts; None for any other module."""
+    if isinstance(lcs, LCSParams | LCSSequence):
+        return lcs.detach()
+    inner = lcs
+    while isinstance(inner, ScaledLCS):
+        inner = inner.lcs
+    with torch.no_grad():
+        return lcs.params().detach() if isinstance(inner, LCSModel) else None  # pyright: ignore
+
+
+def controller_bytes(mpc: LCSMPCLayer, system: LCSParams | LCSSequence, step_seconds: float = 0.0) -> bytes:
+    """The file of the controller of a layer, with its cost, bounds and constraints as they are now.
+
+    Args:
+        mpc: the layer; its backend is `batched`, and nothing in it has a batch dimension.
+        system: the system to plan with, without batch dimensions.
+        step_seconds: time from one step to the next [s]; 0 if that is not known.
+
+    Raises:
+        InvalidInputError and its kinds: another backend, a batch, or parts that do not fit each other.
+    """
+    check_number("step_seconds", step_seconds)
+    backend = mpc.backend
+    if not isinstance(backend, BatchedBackend):
+        raise InvalidInputError(
+            f"backend: expected 'batched', whose solver a controller uses, got {backend.name!r}; build the layer with "
+            f"backend='batched'"
+        )
+    if isinstance(mpc.cost, GoalCost) and any(getattr(type(mpc.cost), k) is not getattr(GoalCost, k) for k in _MAPS):
+        raise InvalidInputError(
+            f"cost: expected a GoalCost, whose terms are linear in the goal, got the subclass "
+            f"{type(mpc.cost).__name__} with a map of its own; give a controller the plain one"
+        )
+    for name, value in (("seed", backend.seed), ("max_iter", backend.max_iter)):
+        check_positive_int(name, value, minimum=0, maximum=_LARGEST)
+    problem, constant = _problem(mpc, system)
+    sizes = {"n_x": problem.n_x, "n_u": problem.n_u, "n_lam": problem.n_lam, "n_c": problem.n_c}
+    cost, n_x = mpc.cost, problem.n_x
+    n_goal = cost.n_goal if isinstance(cost, GoalCost) else 0
+    options = {
+        "relaxation": problem.relaxation,
+        "barrier": problem.barrier,
+        "tol": backend.tol,
+        "certified": kkt.CERTIFIED,
+        "homotopy": backend.homotopy or 0.0,
+        "shrink": backend.shrink,
+        "max_iter": backend.max_iter,
+        "seed": backend.seed,
+        "starts": backend.starts(guessed=False),
+        "starts_guessed": backend.starts(guessed=True),
+        "step_seconds": step_seconds,
+    }
+    numbers = {**sizes, "horizon": problem.horizon, "n_goal": n_goal, **options}
+    entries: list[tuple[str, np.ndarray]] = [(name, np.array([value], np.float64)) for name, value in numbers.items()]
+    entries += [(name, getattr(problem, name).numpy()) for name in INPUTS if name != "x0"]
+    for name, shape in (
+        ("goal_to_q", (n_x, n_goal)),
+        ("goal_to_q_final", (n_x, n_goal)),
+        ("goal_stage", (n_goal, n_goal)),
+        ("goal_final", (n_goal, n_goal)),
+    ):
+        value = getattr(cost, name).detach().to("cpu", torch.float64).numpy() if n_goal else np.zeros(shape)
+        entries.append((name, value))
+    entries.append(("constant", np.array([constant], np.float64)))
+    return _pack(entries)
+
+
+def _problem(mpc: LCSMPCLayer, system: LCSParams | LCSSequence) -> tuple[MPCProblem, float]:
+    """The problem of one state, zero, and of one goal, zero; and the constant of its cost."""
+    x0 = torch.zeros(1, system.n_x, dtype=torch.float64)
+    inputs = Inputs(mpc.horizon)
+    inputs.add_system(system, x0, None)
+    goal = torch.zeros(mpc.cost.n_goal, dtype=torch.float64) if isinstance(mpc.cost, GoalCost) else None
+    inputs.add_cost(mpc.cost, None if goal is None else goal.to(mpc.cost.Q), None)
+    if mpc.bounds is None:
+        inputs.tensors |= {"u_min": mpc.u_min, "u_max": mpc.u_max}
+    else:
+        inputs.add_bounds(mpc.bounds)
+    inputs.add_constraints(mpc.constraints)
+    values: dict[str, torch.Tensor] = {}
+    for name, tensor in inputs.tensors.items():
+        value = tensor.detach().to("cpu", torch.float64)
+        rank = len(INPUTS.get(name, ())) + (name in inputs.by_stage)
+        if value.shape[: value.ndim - rank].numel() != 1:
+            raise ShapeError(
+                f"{name}: expected no batch dimension, as a controller is for one robot, got "
+                f"{describe(value)}; index it"
+            )
+        value = value.reshape(value.shape[value.ndim - rank :])
+        value = 0.5 * (value + value.mT) if name in _SYMMETRIC else value
+        values[name] = (value.unsqueeze(0) if name in inputs.by_stage else value).contiguous()
+    constant = float(values.pop("constant"))
+    problem = MPCProblem(**values, x0=x0, horizon=mpc.horizon, relaxation=mpc.relaxation, barrier=mpc.barrier)
+    return problem, constant
+
+
+def _pack(entries: Iterable[tuple[str, np.ndarray]]) -> bytes:
+    body = b"".join(
+        struct.pack("<16sQ", name.encode(), value.size) + np.ascontiguousarray(value, "<f8").tobytes()
+        for name, value in entries
+    )
+    size = struct.pack("<Q", len(MAGIC) + 16 + len(body))
+    return MAGIC + struct.pack("<II", VERSION, zlib.crc32(size + body)) + size + body

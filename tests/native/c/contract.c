@@ -1,0 +1,132 @@
+/* Checks of difflcs.h that need C: arguments that are null, no allocation after loading, two controllers at once, and a
+ * controller under deadlines. Usage: contract controller.difflcs; ends with 0 if all holds. */
+#include <difflcs.h>
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+static int failures = 0;
+#define EXPECT(what) ((what) ? (void)0 : (void)(failures++, printf("line %d: expected %s\n", __LINE__, #what)))
+
+/* In glibc these take the place of its own, in the whole process; operator new comes here too. */
+static long allocations = 0;
+#ifdef __GLIBC__
+extern void *__libc_malloc(size_t), *__libc_calloc(size_t, size_t), *__libc_realloc(void*, size_t);
+extern void* __libc_memalign(size_t, size_t);
+extern void __libc_free(void*);
+void* malloc(size_t n) { return allocations++, __libc_malloc(n); }
+void* calloc(size_t n, size_t size) { return allocations++, __libc_calloc(n, size); }
+void* realloc(void* p, size_t n) { return allocations++, __libc_realloc(p, n); }
+void* aligned_alloc(size_t to, size_t n) { return allocations++, __libc_memalign(to, n); }
+void* memalign(size_t to, size_t n) { return allocations++, __libc_memalign(to, n); }
+int posix_memalign(void** p, size_t to, size_t n) { return allocations++, !(*p = __libc_memalign(to, n)); }
+void free(void* p) { allocations += p != NULL, __libc_free(p); }
+#endif
+
+static double state[64], goal[64], reference[64 * 64], action[64], other[64], ignored[64], given[64];
+
+static void null_pointers(const char* path) {
+  char error[64];
+  EXPECT(!difflcs_load(NULL, error, sizeof error) && strstr(error, "expected"));
+  EXPECT(!difflcs_load("no/such.file", error, sizeof error) && strstr(error, "no/such.file"));
+  EXPECT(!difflcs_load("no/such.file", NULL, 0));
+  EXPECT(!difflcs_load("no/such.file", error, 4) && strlen(error) == 3);
+  EXPECT(!difflcs_load_bytes(NULL, 5, error, sizeof error));
+  EXPECT(!difflcs_load_bytes("short", 5, error, sizeof error) && strstr(error, "5 bytes"));
+  difflcs_free(NULL), difflcs_reset(NULL), difflcs_set_time_limit(NULL, 1);
+  EXPECT(difflcs_step(NULL, state, goal, action) == DIFFLCS_INVALID);
+  EXPECT(difflcs_get_sizes(NULL).n_x == 0 && difflcs_get_plan(NULL).x == NULL);
+  EXPECT(difflcs_get_outcome(NULL).status == DIFFLCS_INVALID);
+  difflcs_controller* c = difflcs_load(path, error, sizeof error);
+  EXPECT(c != NULL);
+  if (!c) return;
+  EXPECT(difflcs_step(c, NULL, goal, action) == DIFFLCS_INVALID);
+  EXPECT(difflcs_step(c, state, NULL, action) == DIFFLCS_INVALID);
+  EXPECT(difflcs_step(c, state, goal, NULL) == DIFFLCS_INVALID);
+  EXPECT(difflcs_follow(c, state, NULL, action) == DIFFLCS_INVALID);
+  EXPECT(difflcs_set_fallback(c, DIFFLCS_GIVEN, NULL) == DIFFLCS_INVALID);
+  EXPECT(difflcs_set_fallback(c, (difflcs_fallback)7, given) == DIFFLCS_INVALID);
+  EXPECT(strcmp(difflcs_status_name((difflcs_status)99), "unknown") == 0);
+  difflcs_free(c);
+}
+
+/* A circle of all that one can ask of a loaded controller. */
+static void circle(difflcs_controller* c, difflcs_sizes n, int times) {
+  for (int i = 0; i < times; i++) {
+    for (size_t j = 0; j < n.n_x; j++) state[j] = 0.02 * sin(0.3 * i + (double)j);
+    difflcs_set_time_limit(c, i % 7 == 3 ? 1e-9 : 0);
+    difflcs_step(c, state, goal, ignored);
+    difflcs_follow(c, state, reference, ignored);
+    if (i % 5 == 4) state[0] = NAN, difflcs_step(c, state, goal, ignored);
+    difflcs_set_fallback(c, (difflcs_fallback)(i % 3), given);
+    if (i % 11 == 10) difflcs_reset(c);
+    difflcs_get_outcome(c), difflcs_get_plan(c), difflcs_get_sizes(c), difflcs_isa();
+  }
+}
+
+static void no_allocation(difflcs_controller* c, difflcs_sizes n) {
+  circle(c, n, 1); /* the C library's clock may set itself up */
+  const long before = allocations;
+#ifdef __GLIBC__
+  EXPECT(before > 0);
+#endif
+  circle(c, n, 200);
+  EXPECT(allocations == before);
+}
+
+static void deadline_and_fallback(difflcs_controller* c, difflcs_sizes n) {
+  difflcs_reset(c), memset(state, 0, sizeof state);
+  difflcs_set_fallback(c, DIFFLCS_GIVEN, given);
+  difflcs_set_time_limit(c, 1e-9);
+  EXPECT(difflcs_step(c, state, goal, action) == DIFFLCS_MAX_ITER);
+  EXPECT(difflcs_get_outcome(c).late == 1 && difflcs_get_outcome(c).fallback == 1);
+  for (size_t j = 0; j < n.n_u; j++) EXPECT(action[j] == given[j]);
+  difflcs_set_time_limit(c, 0), difflcs_set_fallback(c, DIFFLCS_HOLD, NULL), difflcs_reset(c);
+  EXPECT(difflcs_step(c, state, goal, action) == DIFFLCS_CONVERGED);
+  EXPECT(difflcs_get_outcome(c).late == 0 && difflcs_get_outcome(c).fallback == 0);
+  memcpy(other, difflcs_get_plan(c).u + n.n_u, n.n_u * sizeof(double));
+  state[0] = NAN;
+  EXPECT(difflcs_step(c, state, goal, action) == DIFFLCS_NUMERICAL);
+  EXPECT(memcmp(action, other, n.n_u * sizeof(double)) == 0);
+  state[0] = 0;
+}
+
+static void ten_steps(difflcs_controller* c, difflcs_controller* disturbing, difflcs_sizes n, double* u) {
+  difflcs_set_time_limit(c, 0), difflcs_reset(c);
+  for (int i = 0; i < 10; i++) {
+    memset(state, 0, sizeof state), state[1] = 0.01 * i;
+    difflcs_step(c, state, goal, u);
+    if (disturbing) circle(disturbing, n, 2);
+  }
+}
+
+/* Two controllers of one file: steps of one are none of the other. And a reset forgets all. */
+static void independent(const char* path, difflcs_controller* first, difflcs_sizes n) {
+  difflcs_controller* second = difflcs_load(path, NULL, 0);
+  EXPECT(second != NULL);
+  if (!second) return;
+  ten_steps(first, second, n, action);
+  ten_steps(second, NULL, n, other);
+  EXPECT(memcmp(action, other, n.n_u * sizeof(double)) == 0);
+  difflcs_free(second);
+}
+
+int main(int argc, char** argv) {
+  char error[256];
+  if (argc != 2) return 2;
+  null_pointers(argv[1]);
+  difflcs_controller* c = difflcs_load(argv[1], error, sizeof error);
+  if (!c) return printf("%s\n", error), 1;
+  const difflcs_sizes n = difflcs_get_sizes(c);
+  if (n.n_x > 64 || n.n_u > 64 || n.n_goal > 64 || n.horizon > 63) return 2;
+  for (size_t j = 0; j < n.n_goal; j++) goal[j] = 0.05 / (double)(j + 1);
+  for (size_t k = 0; k <= n.horizon; k++) memcpy(reference + k * n.n_goal, goal, n.n_goal * sizeof(double));
+  for (size_t j = 0; j < n.n_u; j++) given[j] = 0.001 * (double)j;
+  no_allocation(c, n);
+  deadline_and_fallback(c, n);
+  independent(argv[1], c, n);
+  difflcs_free(c);
+  printf(failures ? "%d failures\n" : "all holds\n", failures);
+  return failures != 0;
+}

@@ -1,0 +1,218 @@
+"""The C library from outside: built and installed without Python, found by CMake, and bit-equal to Python."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from difflcs import LCSModel, LCSMPCLayer, cli
+from difflcs.errors import InvalidInputError
+from difflcs.export import export_controller
+from difflcs.mpc import MPCController
+
+ROOT = Path(__file__).resolve().parents[2]
+TOOLS = ("cmake", "cc", "c++")
+needs_tools = pytest.mark.skipif(
+    any(shutil.which(tool) is None for tool in TOOLS),
+    reason="building C needs cmake, cc and c++, which are not all here",
+)
+# One instruction set is compiled, and Python takes the same one.
+BASELINE = {**os.environ, "DIFFLCS_ISA": "baseline"}
+
+
+def call(*command, **kwargs):
+    done = subprocess.run(
+        [str(c) for c in command], capture_output=True, text=True, timeout=900, check=False, env=BASELINE, **kwargs
+    )
+    assert done.returncode == 0, f"{command}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """The cube's controller, and a trajectory of states and goals that it saw."""
+    pytest.importorskip("mujoco")
+    folder = tmp_path_factory.mktemp("export")
+    assert cli.main(["export", "zoo:trifinger-cube", "--out", str(folder)]) == 0
+    rng = np.random.default_rng(0)
+    lcs = LCSModel.from_pretrained("trifinger-cube")
+    controller = MPCController.load(folder / "controller.difflcs")
+    rows, x, goal = [], np.zeros(9), np.zeros(3)
+    for k in range(60):
+        if k % 20 == 0:
+            goal = rng.uniform([-0.05, -0.05, -0.5], [0.05, 0.05, 0.5])
+        rows.append([*x, *goal])
+        controller.step(x, goal)
+        x = controller.plan.x[1] + 1e-3 * rng.normal(size=9)
+    rows[30][4] = float("nan")  # a sensor that failed once
+    with (folder / "trajectory.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([f"x{i}" for i in range(lcs.n_x)] + [f"goal{i}" for i in range(3)])
+        writer.writerows([[repr(float(v)) for v in row] for row in rows])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """Where the C library was installed; it was built by the documented commands, for the baseline alone."""
+    folder = tmp_path_factory.mktemp("library")
+    build, prefix = folder / "build", folder / "prefix"
+    options = ["-DDIFFLCS_C_LIBRARY=ON", "-DDIFFLCS_ISAS=none", "-DPython_EXECUTABLE=none"]
+    call("cmake", "-S", ROOT, "-B", build, *options)
+    call("cmake", "--build", build)
+    call("cmake", "--install", build, "--prefix", prefix)
+    return prefix
+
+
+@pytest.fixture(scope="module")
+def project(installed, tmp_path_factory):
+    """Builds a project that finds the library."""
+
+    def make(source):
+        folder = tmp_path_factory.mktemp("project")
+        call("cmake", "-S", ROOT / source, "-B", folder, f"-DCMAKE_PREFIX_PATH={installed}")
+        call("cmake", "--build", folder)
+        return folder
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def robot(project):
+    """The example."""
+    return project("examples/c") / "robot"
+
+
+PYTHON = """
+import csv, sys
+import numpy as np
+from difflcs.mpc import MPCController
+controller = MPCController.load(sys.argv[1])
+rows = np.array([[float(v) for v in row] for row in list(csv.reader(open(sys.argv[2])))[1:]])
+for row in rows:
+    u = controller.step(row[:9], row[9:])
+    print(controller.status.name, *(v.hex() for v in u), sep=",")
+"""
+
+
+@pytest.mark.slow
+@needs_tools
+def test_the_example_closes_the_loop_bit_equal_to_python(exported, robot):
+    files = exported / "controller.difflcs", exported / "trajectory.csv"
+    names, *rows = csv.reader(call(robot, *files).splitlines())
+    assert names == ["status", *(f"u{j}" for j in range(6))]
+    ours = [(row[0], *(float(v).hex() for v in row[1:])) for row in rows]
+    theirs = [tuple(line.split(",")) for line in call(sys.executable, "-c", PYTHON, *files).splitlines()]
+    assert ours == theirs
+    assert len(ours) == 60
+    statuses = [row[0] for row in ours]
+    assert statuses[30] == "NUMERICAL"
+    assert statuses.count("CONVERGED") + statuses.count("DEGENERATE") >= 58
+    assert len({row[1:] for row in ours}) > 50  # the robot moves
+
+
+@pytest.mark.slow
+@needs_tools
+def test_what_the_header_promises(exported, project):
+    folder = project("tests/native/c")
+    for kind in ("difflcs", "difflcs_static"):
+        assert call(folder / f"contract_{kind}", exported / "controller.difflcs") == "all holds\n"
+
+
+@pytest.mark.slow
+@needs_tools
+def test_the_example_measures_itself(exported, robot):
+    text = call(robot, exported / "controller.difflcs", exported / "trajectory.csv", "--bench", "300")
+    assert text.startswith("300 steps, baseline, ")
+    whole, solver = (
+        [float(v) for v in re.findall(r"\d+\.\d+", line)] for line in text.splitlines()[1:] if "p50" in line
+    )
+    assert 0 < solver[0] <= whole[0] <= whole[1] <= whole[2]
+
+
+@pytest.mark.slow
+@needs_tools
+def test_a_damaged_file_is_an_error_in_words(exported, robot, tmp_path):
+    content = (exported / "controller.difflcs").read_bytes()
+    for damaged, message in ((content[:-9], "the file was cut"), (content[:-1] + b"!", "the file is damaged")):
+        (tmp_path / "c").write_bytes(damaged)
+        done = subprocess.run(
+            [robot, tmp_path / "c", exported / "trajectory.csv"],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            env=BASELINE,
+        )
+        assert done.returncode == 1
+        assert message in done.stderr
+    unknown = {**BASELINE, "DIFFLCS_ISA": "of-tomorrow"}
+    done = subprocess.run(
+        [robot, exported / "controller.difflcs", "x"], capture_output=True, text=True, timeout=60, env=unknown
+    )
+    assert done.returncode == 1
+    assert "DIFFLCS_ISA=of-tomorrow is not available" in done.stderr
+
+
+@pytest.mark.slow
+@needs_tools
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="symbols are listed on Linux")
+def test_nothing_but_the_header_is_to_be_seen(installed):
+    if shutil.which("nm") is None:
+        pytest.skip("nm is not here")
+    (library,) = installed.rglob("libdifflcs.so")
+    symbols = {line.split()[-1] for line in call("nm", "-D", "--defined-only", library).splitlines()}
+    header = next(installed.rglob("difflcs.h")).read_text()
+    declared = set(re.findall(r"^DIFFLCS_API [^;(]*?\b(difflcs_\w+)\(", header, re.MULTILINE))
+    assert symbols == declared
+    assert len(declared) >= 12
+
+
+# --- difflcs export ---------------------------------------------------------------------------------------------------
+
+
+def test_what_export_writes(exported, capsys):
+    described = json.loads((exported / "controller.json").read_text())
+    assert described["task"] == "cube"
+    assert described["step_seconds"] == 0.1
+    assert described["goal"] == [{"name": n, "unit": u} for n, u in (("x", "m"), ("y", "m"), ("yaw", "rad"))]
+    assert (described["n_x"], described["n_u"], described["n_goal"], described["horizon"]) == (9, 6, 3, 8)
+    assert described["u_max"] == [0.015] * 6
+    assert described["bytes"] == (exported / described["file"]).stat().st_size
+    assert cli.main(["export", "zoo:trifinger-cube", "--out", str(exported)]) == 2
+    assert "--force" in capsys.readouterr().err
+    assert cli.main(["export", "zoo:trifinger-cube", "--out", str(exported), "--force"]) == 0
+
+
+def test_the_exported_controller_is_that_of_the_model(exported):
+    from difflcs.rl.tasks import get_task
+
+    mpc = get_task("cube").make_policy(LCSModel.from_pretrained("trifinger-cube"))
+    one, two = mpc.controller(), MPCController.load(exported / "controller.difflcs")
+    for x in 0.02 * np.random.default_rng(0).normal(size=(5, 9)):
+        assert np.array_equal(one.step(x, np.zeros(3)), two.step(x, np.zeros(3)))
+
+
+def test_layers_are_exported_too(build, tmp_path):
+    mpc = LCSMPCLayer(build.params(0), build.cost(0), 5, u_max=0.3)
+    path = export_controller(mpc, tmp_path / "new" / "folder", step_seconds=0.02, about={"robot": "of mine"})
+    described = json.loads((path.parent / "controller.json").read_text())
+    assert described["robot"] == "of mine"
+    assert described["u_min"] == [None, None]
+    assert described["u_max"] == [0.3, 0.3]
+    assert described["step_seconds"] == 0.02
+    u = MPCController.load(path).step(np.full(4, 0.1))
+    assert np.array_equal(u, mpc.controller().step(np.full(4, 0.1)))
+    with pytest.raises(InvalidInputError, match="expected an LCSMPCLayer"):
+        export_controller(mpc.lcs, tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InvalidInputError, match="expected a place to write"):
+        export_controller(mpc, tmp_path / "file")

@@ -1,0 +1,594 @@
+"""The controller of one robot: the same plans as the layer's, an action for every step, files that are checked."""
+
+from __future__ import annotations
+
+import struct
+import threading
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from difflcs import (
+    ConstraintSequence,
+    CostSequence,
+    GoalCost,
+    LCSMPCLayer,
+    LCSParams,
+    LCSSequence,
+    LinearConstraints,
+    QuadraticCost,
+    SolveError,
+    StageBounds,
+    Status,
+)
+from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
+from difflcs.export import export_controller
+from difflcs.mpc import MPCController
+from difflcs.mpc.backends import BatchedBackend
+
+H = 5
+
+
+def states(count, n_x=4, seed=0):
+    return 0.1 * np.random.default_rng(seed).normal(size=(count, n_x))
+
+
+def eye(n):
+    return torch.eye(n, dtype=torch.float64)
+
+
+@pytest.fixture
+def plain(build):
+    return LCSMPCLayer(build.params(0), build.cost(0), H, -0.3, 0.3)
+
+
+@pytest.fixture
+def reaching(build):
+    return LCSMPCLayer(build.params(0), GoalCost.reach(4, 2, (10.0, 10.0), 20.0 * np.ones(2), 1.0), H, -0.3, 0.3)
+
+
+def layers(build):
+    """Layers of every kind, by name."""
+    n = build.normal(7)
+    params, cost, weights = build.params(0), build.cost(0), build.cost_tensors(0)
+    stages = LCSSequence.stack([build.params(k) for k in range(H)])
+    weights_by_stage = {**weights, "q": 0.1 * n(H, 4), "Q": weights["Q"].expand(H, 4, 4) * torch.rand(H, 1, 1)}
+    changing = StageBounds(-0.2 - torch.rand(H, 2).double(), 0.2 + torch.rand(H, 2).double())
+    row = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    limit = torch.full((H + 1, 1), torch.inf, dtype=torch.float64)
+    limit[-1] = 0.02
+    return {
+        "plain": LCSMPCLayer(params, cost, H, -0.3, 0.3),
+        "one step": LCSMPCLayer(params, cost, 1, -0.3, 0.3),
+        "model": LCSMPCLayer(build.model(3), cost, H, -0.3, 0.3),
+        "by stage": LCSMPCLayer(stages, CostSequence(**weights_by_stage, by_stage=("q", "Q")), H, bounds=changing),
+        "cross": LCSMPCLayer(params, QuadraticCost(**weights, S=0.05 * n(4, 2), constant=torch.tensor(2.0)), H, -0.3),
+        "no contacts": LCSMPCLayer(build.params(0, n_lam=0), cost, H, -0.3, 0.3),
+        "barrier": LCSMPCLayer(params, cost, H, -0.3, 0.3, barrier=0.01),
+        "hard": LCSMPCLayer(params, cost, H, -0.5, 0.5, constraints=LinearConstraints(row, limit[-1] + 1)),
+        "soft": LCSMPCLayer(params, cost, H, -0.5, 0.5, constraints=LinearConstraints(row, limit[-1], weight=0.3)),
+        "at the end": LCSMPCLayer(
+            params, cost, H, -0.5, 0.5, constraints=ConstraintSequence(row, limit, weight=0.3, by_stage=("g",))
+        ),
+    }
+
+
+KINDS = ("plain", "one step", "model", "by stage", "cross", "no contacts", "barrier", "hard", "soft", "at the end")
+
+
+# --- the same plans ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_its_plans_are_those_of_the_layer_bit_for_bit(build, kind):
+    mpc = layers(build)[kind]
+    controller, solution = mpc.controller(), None
+    for x in states(8):
+        solution = mpc(torch.from_numpy(x), guess=None if solution is None else solution.shift())
+        u, plan = controller.step(x), controller.plan
+        for name in ("x", "u", "lam", "mu"):
+            assert np.array_equal(getattr(plan, name), getattr(solution, name).detach().numpy()), name
+        assert np.array_equal(u, solution.action.detach().numpy())
+        assert controller.status.solved
+        assert plan.iterations == int(solution.iterations)
+        assert plan.kkt_residual == float(solution.kkt_residual)
+        assert plan.objective == pytest.approx(float(solution.objective.detach()), rel=1e-12)
+        assert not plan.fallback
+        assert not plan.late
+
+
+def test_the_table_of_kinds_is_whole(build):
+    assert tuple(layers(build)) == KINDS
+
+
+def test_goals_and_references(reaching):
+    controller, solution = reaching.controller(), None
+    rng = np.random.default_rng(1)
+    for i, x in enumerate(states(10)):
+        guess = None if solution is None else solution.shift()
+        if i % 2:
+            goal = 0.1 * rng.normal(size=2)
+            solution = reaching(torch.from_numpy(x), torch.from_numpy(goal), guess=guess)
+            u = controller.step(x, goal)
+        else:
+            reference = 0.1 * rng.normal(size=(H + 1, 2))
+            solution = reaching(torch.from_numpy(x), reference=torch.from_numpy(reference), guess=guess)
+            u = controller.step(x, reference=reference)
+        assert u == pytest.approx(solution.action.detach().numpy(), rel=1e-9, abs=1e-12)
+        assert controller.plan.objective == pytest.approx(float(solution.objective.detach()), rel=1e-12)
+
+
+def test_the_controller_keeps_the_model_that_it_was_made_with(build):
+    mpc = LCSMPCLayer(build.model(3), build.cost(0), H, -0.3, 0.3)
+    controller, x = mpc.controller(), states(1)[0]
+    before = controller.step(x)
+    with torch.no_grad():
+        mpc.lcs.B.mul_(2)
+    controller.reset()
+    assert np.array_equal(controller.step(x), before)
+    assert not np.array_equal(mpc.controller().step(x), before)
+
+
+class Leaning(torch.nn.Module):
+    """A system whose offset grows with the state, and whose matrices with a mass."""
+
+    n_x, n_u, n_lam = 4, 2, 3
+
+    def __init__(self, params):
+        super().__init__()
+        self.base = params
+
+    def params(self, x=None, context=None):
+        base = self.base
+        d = base.d + 0.1 * x
+        B = base.B if context is None else base.B * context.unsqueeze(-1)
+        return LCSParams(base.A, B, base.C, d, base.D, base.E, base.F, base.c)
+
+
+def test_a_module_is_asked_at_each_step(build):
+    mpc = LCSMPCLayer(Leaning(build.params(0)), build.cost(0), H, -0.3, 0.3)
+    controller, solution = mpc.controller(time_limit=100.0), None
+    for i, x in enumerate(states(6)):
+        context = torch.tensor([1.0 + 0.1 * i], dtype=torch.float64)
+        guess = None if solution is None else solution.shift()
+        solution = mpc(torch.from_numpy(x), guess=guess, context=context)
+        assert np.array_equal(controller.step(x, context=context), solution.action.numpy())
+    assert controller.step(np.full(4, np.nan), context=context).shape == (2,)
+    assert controller.status == Status.NUMERICAL
+    with pytest.raises(InvalidInputError, match="may depend on the state"):
+        controller.save("never.difflcs")
+    with pytest.raises(InvalidInputError, match="may depend on the state"):
+        export_controller(mpc, "never")
+    assert not Path("never").exists()
+
+
+# --- a step that is not solved ----------------------------------------------------------------------------------------
+
+NAN = np.full(4, np.nan)
+
+
+def test_hold_follows_the_last_plan_and_then_is_zero(plain):
+    controller = plain.controller(on_failure="hold")
+    controller.step(states(1)[0])
+    planned = controller.plan.u
+    assert np.abs(planned).min() > 0
+    for k in range(1, H):
+        assert np.array_equal(controller.step(NAN), planned[k])
+        assert controller.status == Status.NUMERICAL
+        assert controller.plan.fallback
+    for _ in range(3):
+        assert np.array_equal(controller.step(NAN), np.zeros(2))
+    x = states(2)[1]
+    assert np.abs(controller.step(x) - plain.controller().step(x)).max() < 1e-6
+    assert controller.status.solved
+
+
+def test_zero_a_given_action_and_raise(build, plain):
+    x = states(1)[0]
+    for on_failure, wanted in (("zero", [0, 0]), ([0.1, -0.2], [0.1, -0.2]), (np.array([9.0, -9.0]), [0.3, -0.3])):
+        controller = plain.controller(on_failure=on_failure)
+        controller.step(x)
+        assert controller.step(NAN).tolist() == wanted
+    controller = plain.controller(on_failure="raise")
+    controller.step(x)
+    with pytest.raises(SolveError, match="NUMERICAL") as caught:
+        controller.step(NAN)
+    assert caught.value.status == (Status.NUMERICAL,)
+    assert controller.step(x).shape == (2,)
+    above = LCSMPCLayer(build.params(0), build.cost(0), H, 0.1, 0.3).controller(on_failure="zero")
+    assert above.step(NAN).tolist() == [0.1, 0.1]
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_no_number_that_is_none_reaches_the_solver(reaching, bad):
+    controller, goal = reaching.controller(), np.array([0.1, 0.1])
+    x = states(1)[0]
+    first = controller.step(x, goal)
+    wrong_state, wrong_goal = x.copy(), goal.copy()
+    wrong_state[2], wrong_goal[1] = bad, bad
+    for arguments in ((wrong_state, goal), (x, wrong_goal)):
+        assert np.isfinite(controller.step(*arguments)).all()
+        assert controller.status == Status.NUMERICAL
+        assert controller.plan.iterations == 0
+    controller.step(x, reference=np.full((H + 1, 2), bad))
+    assert controller.status == Status.NUMERICAL
+    controller.reset()
+    assert np.array_equal(controller.step(x, goal), first)
+
+
+def test_a_deadline_ends_the_step_with_the_fallback(plain):
+    controller = plain.controller(on_failure=[0.05, 0.06], time_limit=1e-9)
+    for x in states(3):
+        assert controller.step(x).tolist() == [0.05, 0.06]
+        assert controller.status == Status.MAX_ITER
+        assert controller.plan.late
+        assert controller.plan.fallback
+    controller.time_limit = None
+    controller.reset()
+    controller.step(states(1)[0])
+    assert controller.status == Status.CONVERGED
+    assert not controller.plan.late
+    controller.time_limit = 1e-9
+    planned = controller.plan.u
+    controller.step(states(1)[0])
+    assert controller.time_limit == 1e-9
+    assert controller.plan.late
+    assert not np.array_equal(controller.plan.u, planned) or controller.plan.iterations == 0
+
+
+def few(build, max_iter):
+    """A layer whose iterations do not suffice for a cold start."""
+    backend = BatchedBackend(effort="fast", max_iter=max_iter)
+    return LCSMPCLayer(build.params(0), build.cost(0), H, -0.5, 0.5, backend=backend)
+
+
+def test_what_is_unfinished_can_be_acted_by(build):
+    x = 0.3 * np.ones(4)
+    held, acting = few(build, 2).controller(), few(build, 2).controller("unfinished")
+    assert held.step(x).tolist() == [0, 0]
+    u, plan = acting.step(x), acting.plan
+    assert u.any()
+    assert (np.abs(u) <= 0.5).all()
+    assert np.array_equal(u, plan.u[0])
+    assert plan.fallback
+    assert not plan.late
+    assert plan.status == acting.status == Status.MAX_ITER
+    planned = [plan.u[k] for k in range(1, H)]
+    for wanted in [*planned, np.zeros(2)]:  # without a new plan it follows the unfinished one
+        assert np.array_equal(acting.step(NAN), wanted)
+
+
+def test_what_is_unfinished_goes_on_in_the_next_step(build):
+    """For some number of iterations that does not suffice for one step: a cold start at each would never end."""
+    x, steps = 0.3 * np.ones(4), {}
+    for max_iter in range(1, 13):
+        controller = few(build, max_iter).controller()
+        steps[max_iter] = next(
+            (i for i in range(10) if controller.step(x) is not None and controller.status.solved), 10
+        )
+    assert steps[1] > 0
+    assert any(0 < taken < 10 for taken in steps.values()), steps
+
+
+def test_the_time_limit_of_the_backend_counts(build):
+    backend = BatchedBackend(time_limit=1e-9)
+    mpc = LCSMPCLayer(build.params(0), build.cost(0), H, -0.3, 0.3, backend=backend)
+    assert mpc.controller().time_limit == 1e-9
+    assert mpc.controller(time_limit=1.0).time_limit == 1.0
+
+
+def test_large_numbers_end_with_a_status(plain):
+    controller = plain.controller()
+    for size in (1e5, 1e50, 1e150, 1e300, 1.7e308):
+        u = controller.step(np.array([size, -size, size, -size]))
+        assert (np.abs(u) <= 0.3).all()
+        assert controller.status in tuple(Status)
+        plan = controller.plan
+        assert all(np.isfinite(v).all() for v in (plan.x, plan.u, plan.lam, plan.mu, plan.objective))
+
+
+def test_infeasible(build):
+    row = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64)
+    limits = LinearConstraints(row, torch.tensor([-5.0], dtype=torch.float64))
+    mpc = LCSMPCLayer(build.params(0), build.cost(0), H, -0.3, 0.3, constraints=limits)
+    controller = mpc.controller(on_failure="zero")
+    assert controller.step(np.zeros(4)).tolist() == [0, 0]
+    assert controller.status == Status.INFEASIBLE
+    assert np.isfinite(controller.plan.x).all()
+
+
+def test_the_fallback_is_inside_the_bounds_of_the_first_stage(build):
+    low = torch.tensor([[-0.01, -0.02]] + [[-1.0, -1.0]] * (H - 1), dtype=torch.float64)
+    mpc = LCSMPCLayer(build.params(0), build.cost(0), H, bounds=StageBounds(low, -low))
+    controller = mpc.controller(on_failure="hold")
+    controller.step(states(1)[0])
+    assert np.abs(controller.plan.u[1]).max() > 0.02
+    held = controller.step(NAN)
+    assert (np.abs(held) <= [0.01, 0.02]).all()
+    assert held.any()
+
+
+# --- more than one ----------------------------------------------------------------------------------------------------
+
+
+def test_controllers_are_independent_and_a_reset_is_a_fresh_one(plain):
+    alone, one, two = plain.controller(), plain.controller(), plain.controller()
+    for x in states(6):
+        wanted = alone.step(x)
+        two.step(-x), two.step(NAN)
+        assert np.array_equal(one.step(x), wanted)
+    one.reset(), two.reset()
+    assert one.status is None
+    assert one.plan is None
+    fresh = plain.controller()
+    for x in states(6, seed=3):
+        wanted = fresh.step(x)
+        assert np.array_equal(one.step(x), wanted)
+        assert np.array_equal(two.step(x), wanted)
+
+
+def test_actions_and_plans_are_the_callers(plain):
+    controller, (x, y) = plain.controller(), states(2)
+    u = controller.step(x)
+    plan, kept = controller.plan, u.copy()
+    first = plan.u.copy()
+    u[:] = 7
+    plan.u[:] = 8
+    assert np.array_equal(controller.plan.u, first)
+    assert np.array_equal(controller.plan.u[0], kept)
+    controller.step(y)
+    assert u.tolist() == [7, 7]
+
+
+def test_a_second_thread_is_refused(build):
+    mpc = LCSMPCLayer(build.params(0, n_x=12, n_u=6, n_lam=12), build.cost(0, n_x=12, n_u=6), 30, -0.15, 0.15)
+    controller = mpc.controller()
+    controller.step(np.zeros(12))
+    stop, failed = threading.Event(), []
+
+    def work():
+        while not stop.is_set():
+            try:
+                controller.step(0.2 * np.ones(12))
+            except RuntimeError:
+                pass
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        for _ in range(100000):
+            try:
+                _ = controller.plan
+            except RuntimeError as error:
+                failed.append(str(error))
+                break
+    finally:
+        stop.set()
+        thread.join()
+    assert failed
+    assert "one thread at a time" in failed[0]
+
+
+# --- arguments --------------------------------------------------------------------------------------------------------
+
+
+def test_arrays_of_every_kind(plain):
+    wanted = plain.controller().step(np.array([0.5, 0.25, -0.5, 0.125]))
+    wide = np.zeros((4, 3))
+    wide[:, 1] = [0.5, 0.25, -0.5, 0.125]
+    frozen = np.array([0.5, 0.25, -0.5, 0.125])
+    frozen.flags.writeable = False
+    for x in (
+        [0.5, 0.25, -0.5, 0.125],
+        np.array([0.5, 0.25, -0.5, 0.125], np.float32),
+        np.array([0.5, 0.25, -0.5, 0.125], ">f8"),
+        torch.tensor([0.5, 0.25, -0.5, 0.125], requires_grad=True),
+        wide[:, 1],
+        frozen,
+    ):
+        assert np.array_equal(plain.controller().step(x), wanted)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        (dict(x=np.zeros(5), goal=np.zeros(2)), ShapeError, r"x: expected shape \(4,\)"),
+        (dict(x=np.zeros((1, 4)), goal=np.zeros(2)), ShapeError, "without a batch"),
+        (dict(x="far", goal=np.zeros(2)), DTypeError, "x: expected real numbers"),
+        (dict(x=np.zeros(4, complex), goal=np.zeros(2)), DTypeError, "x: expected real numbers"),
+        (dict(x=None, goal=np.zeros(2)), DTypeError, "x: expected real numbers"),
+        (dict(x=[[1], [1, 2]], goal=np.zeros(2)), DTypeError, "x: expected numbers"),
+        (dict(x=np.zeros(4), goal=np.zeros(3)), ShapeError, "goal: expected shape"),
+        (dict(x=np.zeros(4)), ShapeError, "goal: expected .* got none"),
+        (dict(x=np.zeros(4), goal=np.zeros(2), reference=np.zeros((6, 2))), ShapeError, "got both"),
+        (dict(x=np.zeros(4), reference=np.zeros((5, 2))), ShapeError, "reference: expected shape"),
+        (dict(x=np.zeros(4), goal=np.zeros(2), context=torch.zeros(1)), ShapeError, "context: expected none"),
+    ],
+)
+def test_arguments_that_do_not_fit(reaching, arguments, error, message):
+    controller = reaching.controller()
+    controller.step(np.zeros(4), np.zeros(2))
+    before = controller.plan
+    with pytest.raises(error, match=message):
+        controller.step(**arguments)
+    assert np.array_equal(controller.plan.u, before.u)
+
+
+def test_goals_without_a_goal_cost(plain):
+    with pytest.raises(ShapeError, match="goal: expected none"):
+        plain.controller().step(np.zeros(4), np.zeros(2))
+    with pytest.raises(ShapeError, match="reference: expected none"):
+        plain.controller().step(np.zeros(4), reference=np.zeros((H + 1, 2)))
+
+
+class Curved(GoalCost):
+    """Not linear in the goal."""
+
+    def at(self, goal, horizon):
+        return super().at(goal**2, horizon)
+
+
+def test_layers_and_options_that_it_does_not_take(build, plain):
+    params, cost = build.params(0), build.cost(0)
+    with pytest.raises(InvalidInputError, match="on_failure: expected 'hold'"):
+        plain.controller(on_failure="stop")
+    with pytest.raises(ShapeError, match="on_failure: expected shape"):
+        plain.controller(on_failure=np.zeros(3))
+    with pytest.raises(NonFiniteError, match="on_failure"):
+        plain.controller(on_failure=[np.nan, 0.0])
+    for wrong in (0.0, -1.0, np.inf):
+        with pytest.raises(InvalidInputError, match="time_limit"):
+            plain.controller(time_limit=wrong)
+    with pytest.raises(InvalidInputError, match="backend: expected 'batched'"):
+        LCSMPCLayer(params, cost, H, -0.3, 0.3, backend="ipopt").controller()
+    with pytest.raises(ShapeError, match="A: expected no batch dimension"):
+        LCSMPCLayer(build.params(0, batch=(3,)), cost, H, -0.3, 0.3).controller()
+    with pytest.raises(ShapeError, match="Q: expected no batch dimension"):
+        LCSMPCLayer(params, build.cost(0, batch=(3,)), H, -0.3, 0.3).controller()
+    with pytest.raises(InvalidInputError, match="got the subclass Curved"):
+        LCSMPCLayer(params, Curved.reach(4, 2), H, -0.3, 0.3).controller()
+    alone = LCSMPCLayer(build.params(0, batch=(1,)), cost, H, -0.3, 0.3).controller()
+    assert alone.step(np.zeros(4)).shape == (2,)
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def saved(plain, tmp_path):
+    path = tmp_path / "controller.difflcs"
+    plain.controller().save(path)
+    return path
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_file_gives_the_same_bits(build, kind, tmp_path):
+    mpc = layers(build)[kind]
+    mpc.controller().save(tmp_path / "c")
+    one, two = mpc.controller(), MPCController.load(tmp_path / "c", on_failure="zero", time_limit=60.0)
+    assert repr(two) == repr(one).replace("time_limit=None", "time_limit=60.0")
+    for x in states(4):
+        assert np.array_equal(one.step(x), two.step(x))
+    two.save(tmp_path / "again")
+    assert (tmp_path / "again").read_bytes() == (tmp_path / "c").read_bytes()
+
+
+def test_every_cut_and_every_flipped_bit_is_found(saved):
+    content = saved.read_bytes()
+    rng = np.random.default_rng(0)
+    for size in [*range(0, 40), *rng.integers(64, len(content), 20)]:
+        saved.write_bytes(content[:size])
+        with pytest.raises(CheckpointError):
+            MPCController.load(saved)
+    for at in [*range(0, 40), *rng.integers(64, len(content), 40)]:
+        damaged = bytearray(content)
+        damaged[at] ^= 1 << int(rng.integers(8))
+        saved.write_bytes(damaged)
+        with pytest.raises(CheckpointError):
+            MPCController.load(saved)
+    saved.write_bytes(content + b"\0")
+    with pytest.raises(CheckpointError, match="the file was cut"):
+        MPCController.load(saved)
+    saved.write_bytes(content)
+    assert MPCController.load(saved).n_x == 4
+
+
+def test_what_is_no_controller(tmp_path):
+    for content, message in ((b"", "0 bytes"), (b"A" * 100, "another kind of file")):
+        (tmp_path / "wrong").write_bytes(content)
+        with pytest.raises(CheckpointError, match=message):
+            MPCController.load(tmp_path / "wrong")
+    with pytest.raises(CheckpointError, match="none"):
+        MPCController.load(tmp_path / "none")
+    with pytest.raises(CheckpointError, match="plain file"):
+        MPCController.load(tmp_path)
+
+
+def entries(content):
+    """Name → numbers of a file, in order."""
+    at, found = 24, {}
+    while at < len(content):
+        name, count = struct.unpack_from("<16sQ", content, at)
+        found[name.rstrip(b"\0").decode()] = list(struct.unpack_from(f"<{count}d", content, at + 24))
+        at += 24 + 8 * count
+    return found
+
+
+def forged(values, version=1):
+    """A file with a checksum that matches, whatever is in it."""
+    body = b"".join(
+        struct.pack(f"<16sQ{len(v)}d", name.encode(), len(v), *v) if isinstance(v, list) else v
+        for name, v in values.items()
+    )
+    size = struct.pack("<Q", 24 + len(body))
+    return b"\x89LCS\r\n\x1a\n" + struct.pack("<II", version, zlib.crc32(size + body)) + size + body
+
+
+def test_forging_does_nothing_by_itself(saved):
+    content = saved.read_bytes()
+    assert forged(entries(content)) == content
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("n_x", [0.0], "n_x: expected a number from 1"),
+        ("n_x", [4.5], "n_x: expected a whole number"),
+        ("n_x", [np.nan], "n_x: expected a number"),
+        ("n_x", [1e18], "n_x: expected a number"),
+        ("n_x", [5.0], "A: expected 25 numbers, got 16"),
+        ("n_x", [99999.0], "A: expected"),
+        ("n_lam", [-1.0], "n_lam"),
+        ("horizon", [0.0], "horizon"),
+        ("n_goal", [2.0], "goal_to_q: expected 8 numbers, got 0"),
+        ("relaxation", [0.0], "relaxation"),
+        ("shrink", [1.0], "shrink"),
+        ("max_iter", [np.inf], "max_iter"),
+        ("starts", [0.0], "starts"),
+        ("step_seconds", [-1.0], "step_seconds"),
+        ("tol", [], "tol: expected 1 numbers, got 0"),
+        ("Q", [np.nan] * 16, "Q: expected finite numbers"),
+        ("F", [np.inf] * 9, "F: expected finite numbers"),
+        ("u_min", [0.5, 0.5], "u_min: expected at most u_max"),
+        ("u_min", [np.inf, 0.0], "u_min: expected limits that can be met"),
+        ("u_max", [np.nan, 1.0], "u_max: expected limits that can be met"),
+        ("constant", [np.nan], "constant"),
+        ("more", [1.0], "expected the end of the file"),
+        ("B", struct.pack("<16sQ", b"B", 2**63), "B: expected its numbers, got the end"),
+        ("C", b"", "expected the entry C, got another one"),
+        ("constant", b"", "expected the entry constant, got the end"),
+    ],
+)
+def test_numbers_that_no_controller_has(saved, name, value, message):
+    values = entries(saved.read_bytes())
+    values[name] = value
+    saved.write_bytes(forged(values))
+    with pytest.raises(CheckpointError, match=message):
+        MPCController.load(saved)
+
+
+def test_another_version_says_so(saved):
+    saved.write_bytes(forged(entries(saved.read_bytes()), version=2))
+    with pytest.raises(CheckpointError, match="expected version 1 of the format, got 2"):
+        MPCController.load(saved)
+
+
+def test_forged_numbers_that_are_allowed_end_with_a_status(saved):
+    """F is not positive definite and the cost not convex: whatever comes, it is inside the bounds."""
+    values = entries(saved.read_bytes())
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        name = str(rng.choice(["A", "B", "C", "D", "E", "F", "Q", "R", "Q_final", "q", "d", "c", "u_max"]))
+        scale = 10.0 ** rng.uniform(-300, 300)
+        wild = {
+            **values,
+            name: [float(abs(v) if name == "u_max" else v) for v in scale * rng.normal(size=len(values[name]))],
+        }
+        saved.write_bytes(forged(wild))
+        controller = MPCController.load(saved)
+        for x in states(2):
+            assert (controller.step(x) >= -0.3).all()
+            assert controller.status in tuple(Status)

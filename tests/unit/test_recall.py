@@ -1,0 +1,319 @@
+"""What a layer and a model remember of an earlier call: no change of a number goes unnoticed, however it is made."""
+
+import copy
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+from torch.func import functional_call
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
+
+from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSParams, LinearConstraints, QuadraticCost, StageBounds
+from difflcs.errors import BoundsError, NonFiniteError, NotPositiveDefiniteError, ShapeError
+
+HORIZON = 4
+
+
+def make_model(seed=0):
+    return LCSModel(4, 2, 3, init_scale=0.3, generator=torch.Generator().manual_seed(seed))
+
+
+def make_cost():
+    return GoalCost.reach(4, 2, goal_weight=(10.0, 5.0), input_weight=0.1)
+
+
+def make_layer(model=None, cost=None, **kwargs):
+    limits = (
+        {}
+        if "bounds" in kwargs
+        else {"u_min": torch.full((2,), -0.5).double(), "u_max": torch.full((2,), 0.5).double()}
+    )
+    return LCSMPCLayer(make_model() if model is None else model, cost or make_cost(), HORIZON, **limits, **kwargs)
+
+
+def draw(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+X, GOAL = 0.3 * draw(1, 4, seed=1), 0.3 * draw(1, 2, seed=2)
+FIELDS = ("x", "u", "lam", "mu", "objective", "status", "kkt_residual", "violation")
+
+
+def plan(layer, *inputs, **kwargs):
+    with torch.no_grad():
+        return layer(*inputs, **kwargs)
+
+
+def assert_same(found, expected):
+    for name in FIELDS:
+        assert torch.equal(getattr(found, name), getattr(expected, name)), name
+
+
+def assert_as_fresh(layer, *inputs, **kwargs):
+    """A layer that was used before gives what one without a memory gives, bit for bit."""
+    assert_same(plan(layer, *inputs, **kwargs), plan(copy.deepcopy(layer), *inputs, **kwargs))
+
+
+def transpose_data(p):
+    p.data = p.data.T
+
+
+def add_to_one(p):
+    p.data[(0,) * (p.ndim - 1) + (-1,) * (p.ndim > 0)] += 0.01
+
+
+CHANGES = {
+    "in place": lambda p: p.mul_(1.5),
+    "in place of data": lambda p: p.data.mul_(1.5),
+    "other data": lambda p: setattr(p, "data", 1.5 * p.data),
+    "data that was changed back": lambda p: (p.data.mul_(1.5), p.data.mul_(1 / 1.5)),
+    "one number": add_to_one,
+    "as an array": lambda p: np.multiply(p.detach().numpy(), 1.5, out=p.detach().numpy()),
+    "transposed": lambda p: transpose_data(p) if p.ndim == 2 and p.shape[0] == p.shape[1] else p.data.mul_(1.5),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("name", ["A", "B", "C", "d", "D", "E", "G", "H", "c"])
+def test_a_changed_model_is_noticed(change, name):
+    layer = make_layer()
+    before = plan(layer, X, GOAL)
+    with torch.no_grad():
+        CHANGES[change](getattr(layer.lcs, name))
+    assert_as_fresh(layer, X, GOAL)
+    if change not in ("data that was changed back",) and name != "c":
+        assert not torch.equal(plan(layer, X, GOAL).x, before.x)
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("name", ["Q", "R", "Q_final", "goal_to_q", "goal_to_q_final", "goal_stage", "goal_final"])
+def test_a_changed_cost_is_noticed(change, name):
+    layer = make_layer()
+    before = plan(layer, X, GOAL)
+    with torch.no_grad():
+        CHANGES[change](getattr(layer.cost, name))
+    assert_as_fresh(layer, X, GOAL)
+    if change in ("in place of data", "as an array"):
+        assert plan(layer, X, GOAL).objective != before.objective
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("name", ["Q", "R", "Q_final", "q", "r", "q_final", "constant"])
+def test_a_changed_plain_cost_is_noticed(change, name):
+    eye = torch.eye(4).double()
+    cost = QuadraticCost(eye, eye[:2, :2], 2 * eye, draw(4), draw(2), draw(4), torch.ones(()).double())
+    layer = make_layer(cost=cost)
+    before = plan(layer, X)
+    with torch.no_grad():
+        CHANGES[change](getattr(layer.cost, name))
+    assert_as_fresh(layer, X)
+    if change in ("in place of data", "as an array"):
+        assert plan(layer, X).objective != before.objective
+
+
+@pytest.mark.parametrize("change", ["in place", "in place of data", "other data", "as an array"])
+@pytest.mark.parametrize("name", ["u_min", "u_max"])
+def test_a_changed_bound_is_noticed(change, name):
+    layer = make_layer()
+    before = plan(layer, 3 * X, 3 * GOAL)
+    CHANGES[change](getattr(layer, name))
+    assert_as_fresh(layer, 3 * X, 3 * GOAL)
+    assert not torch.equal(plan(layer, 3 * X, 3 * GOAL).u, before.u)
+
+
+@pytest.mark.parametrize("name", ["G", "g", "E", "weight"])
+def test_changed_constraints_are_noticed(name):
+    constraints = LinearConstraints(
+        draw(2, 4), 0.1 * draw(2).abs(), E=draw(2, 2, seed=4), weight=torch.ones(2).double()
+    )
+    layer = make_layer(constraints=constraints)
+    before = plan(layer, X, GOAL)
+    getattr(constraints, name).data.mul_(1.5)
+    assert_as_fresh(layer, X, GOAL)
+    assert not torch.equal(plan(layer, X, GOAL).x, before.x)
+    assert_as_fresh(layer, X, GOAL, constraints=LinearConstraints(draw(1, 4), 0.1 * draw(1).abs(), weight=2.0))
+
+
+def test_changed_goals_and_states_are_noticed():
+    layer, goal, x = make_layer(), GOAL.clone(), X.clone()
+    for i in range(4):
+        assert_as_fresh(layer, x, goal)
+        (goal if i % 2 else x).mul_(1.2)
+    assert_as_fresh(layer, x[0], goal[0])
+    assert_as_fresh(layer, x, goal[0])
+    assert_as_fresh(layer, x[0], goal)
+    assert plan(layer, x[0], goal).u.shape == (1, HORIZON, 2)
+    assert plan(layer, x[0], goal[0]).u.shape == (HORIZON, 2)
+    assert plan(layer, x[None], goal).u.shape == (1, 1, HORIZON, 2)
+    assert_as_fresh(layer, x.expand(3, -1), goal)
+    assert_as_fresh(layer, 0.1 * draw(3, 4), 0.1 * draw(3, 2))
+    assert_as_fresh(layer, x, reference=0.1 * draw(1, HORIZON + 1, 2))
+    assert_as_fresh(layer, x.float(), goal.float())
+    assert_as_fresh(layer, x, goal.float())
+
+
+def test_settings_and_arguments_of_a_call_are_noticed():
+    layer = make_layer(training_relaxation=1e-2)
+    for change in (layer.eval, layer.train, layer.eval):
+        change()
+        assert_as_fresh(layer, X, GOAL)
+    layer.relaxation = 1e-4
+    assert_as_fresh(layer, X, GOAL)
+    layer.barrier = 1e-3
+    assert_as_fresh(layer, X, GOAL)
+    other, limit = make_model(seed=5), 0.2 * torch.ones(HORIZON, 2).double()
+    for kwargs in (
+        {"lcs": other},
+        {"lcs": LCSModel(4, 2, 5, init_scale=0.3, generator=torch.Generator().manual_seed(6))},
+        {"lcs": other.params().detach()},
+        {"u_max": 0.1},
+        {"bounds": StageBounds(-limit, limit)},
+        {"cost": GoalCost.reach(4, 2, goal_weight=(1.0, 5.0), input_weight=0.2)},
+        {},
+    ):
+        assert_as_fresh(layer, X, GOAL, **kwargs)
+    layer.horizon = HORIZON + 1
+    assert_as_fresh(layer, X, GOAL)
+    layer.lcs.stiffness = 0.7
+    assert_as_fresh(layer, X, GOAL)
+
+
+def test_parameters_from_a_vector_and_by_functional_call():
+    layer, other = make_layer(), make_model(seed=3)
+    for scale in (1.0, 1.1, 1.0, 1.2):
+        vector_to_parameters(scale * parameters_to_vector(layer.lcs.parameters()).detach(), layer.lcs.parameters())
+        assert_as_fresh(layer, X, GOAL)
+    values = {f"lcs.{name}": p for name, p in other.named_parameters()}
+    with torch.no_grad():
+        expected = make_layer(other)(X, GOAL)
+        assert_same(functional_call(layer, values, (X, GOAL)), expected)
+        for p in other.parameters():
+            p.mul_(0.5)
+        assert_as_fresh(layer, X, GOAL)  # its own parameters, although the others were changed since
+
+
+def test_tensors_that_equalled_others_may_change_afterwards():
+    """What is kept has memory of its own."""
+    layer = make_layer()
+    params = layer.lcs.params().detach()
+    twin = LCSParams(**{name: value.clone() for name, value in params.tensors().items()})
+    expected = plan(layer, X, GOAL, lcs=params)
+    assert_same(plan(layer, X, GOAL, lcs=twin), expected)
+    for value in params.tensors().values():
+        value.mul_(0.5)
+    assert_same(plan(layer, X, GOAL, lcs=twin), expected)
+
+
+def test_what_a_caller_does_with_results_changes_nothing():
+    layer = make_layer()
+    guess = plan(layer, X, GOAL).shift()
+    expected = plan(copy.deepcopy(layer), X, GOAL, guess=guess)
+    for _ in range(2):
+        found = plan(layer, X, GOAL, guess=guess)
+        assert_same(found, expected)
+        for name in FIELDS:
+            getattr(found, name).zero_()
+        with torch.no_grad():
+            layer.lcs.params().F.zero_()
+            made = layer.cost(GOAL)
+            made.q.zero_()
+            made.constant.zero_()
+
+
+def test_errors_are_those_of_a_first_call():
+    def refused(kind, match, change, *inputs):
+        layer = make_layer()
+        for used in (layer, copy.deepcopy(layer)):
+            if used is layer:
+                plan(used, X, GOAL)
+            with torch.no_grad():
+                change(used)
+                with pytest.raises(kind, match=match):
+                    used(*inputs)
+
+    refused(NonFiniteError, "^x0", lambda layer: None, X * torch.nan, GOAL)
+    refused(NonFiniteError, "^goal", lambda layer: None, X, GOAL * torch.inf)
+    refused(NonFiniteError, "^A", lambda layer: layer.lcs.A.data.fill_(torch.nan), X, GOAL)
+    refused(NonFiniteError, "^Q", lambda layer: layer.cost.Q.fill_(torch.nan), X, GOAL)
+    refused(NonFiniteError, "^q", lambda layer: layer.cost.goal_to_q.fill_(torch.inf), X, GOAL)
+    refused(BoundsError, "u_min", lambda layer: layer.u_max.fill_(-1.0), X, GOAL)
+    refused(ShapeError, "batch dimensions", lambda layer: None, X.expand(2, -1), GOAL.expand(3, -1))
+    refused(NotPositiveDefiniteError, "^F", lambda layer: setattr(layer.lcs, "stiffness", -9.0), X, GOAL)
+
+
+def test_gradients_after_calls_without():
+    layer, fresh = make_layer(), make_layer()
+    plan(layer, X, GOAL)
+    for used in (layer, fresh):
+        solution = used(X, GOAL)
+        (solution.action.sum() + solution.objective.sum()).backward()
+    for one, two in zip(layer.parameters(), fresh.parameters(), strict=True):
+        assert torch.equal(one.grad, two.grad)
+    goal = GOAL.clone().requires_grad_()
+    layer(X, goal).action.sum().backward()
+    assert goal.grad is not None
+
+
+def test_a_module_of_ones_own_is_asked_each_time():
+    class Scaled(LCSModel):
+        gain = 1.0
+
+        @property
+        def F(self):
+            return self.gain * super().F
+
+    class Offset(GoalCost):
+        def at(self, goal, horizon):
+            return super().at(goal + self.offset, horizon)
+
+    model = Scaled(4, 2, 3, init_scale=0.3, generator=torch.Generator().manual_seed(0))
+    cost = Offset(**{name: getattr(make_cost(), name) for name in (*"QR", "Q_final", "goal_to_q", "goal_to_q_final")})
+    cost.offset = 0.0
+    layer = make_layer(model, cost)
+    first = plan(layer, X, GOAL)
+    model.gain = 2.0
+    second = plan(layer, X, GOAL)
+    assert not torch.equal(first.x, second.x)
+    cost.offset = 0.1
+    assert not torch.equal(second.x, plan(layer, X, GOAL).x)
+    assert_as_fresh(layer, X, GOAL)
+
+
+def test_inference_mode_and_no_grad_take_turns():
+    layer = make_layer()
+    expected = plan(make_layer(), X, GOAL)
+    for _ in range(2):
+        with torch.inference_mode():
+            assert_same(layer(X, GOAL), expected)
+        assert_same(plan(layer, X, GOAL), expected)
+        with torch.no_grad():
+            params = layer.lcs.params()
+        u = torch.zeros(1, 2, dtype=torch.float64, requires_grad=True)
+        params.step(X, u).x_next.sum().backward()  # F may be saved for a backward pass
+        layer(X, GOAL).objective.sum().backward()
+
+
+def test_copies_and_files_of_a_module_have_no_memory():
+    layer = make_layer()
+    size = len(pickle.dumps(layer))
+    plan(layer, X, GOAL)
+    assert len(pickle.dumps(layer)) == size
+    assert_same(plan(pickle.loads(pickle.dumps(layer)), X, GOAL), plan(layer, X, GOAL))
+    assert set(layer.state_dict()) == set(make_layer().state_dict())
+
+
+def test_threads_share_a_layer():
+    layer = make_layer()
+    models = [make_model(seed) for seed in range(4)]
+    expected = [plan(make_layer(model), X, GOAL) for model in models]
+
+    def work(i):
+        with torch.no_grad():
+            return [layer(X, GOAL, lcs=models[(i + k) % 4]) for k in range(40)]
+
+    with ThreadPoolExecutor(4) as pool:
+        for i, found in enumerate(pool.map(work, range(4))):
+            for k, solution in enumerate(found):
+                assert_same(solution, expected[(i + k) % 4])
