@@ -8,6 +8,7 @@ A line `<!-- generated: KIND ARGUMENTS -->` of a page is replaced by Markdown th
 - `docstring OBJECT`: a docstring that is written in Markdown, as those of the environments.
 - `api MODULE [NAME ...]`: the reference of these public names of a module, or of all that are in its `__all__`.
 - `file PATH`: another Markdown file of the repository, without its title.
+- `race PART`: a table of `benchmarks/results/race.json`; race_tables.py says which parts there are.
 
 Besides, the notebooks of tutorials/ are copied to docs/tutorials, and docstrings are mended for reStructuredText.
 """
@@ -20,6 +21,7 @@ import importlib
 import importlib.util
 import inspect
 import io
+import json
 import os
 import re
 import shutil
@@ -290,6 +292,17 @@ def repository_file(path: str) -> str:
     return "".join(p if k % 2 else links.sub(link, p) for k, p in enumerate(parts))
 
 
+def race(part: str) -> str:
+    """Markdown: a table of the race."""
+    place = DOCS / "race_tables.py"
+    spec = importlib.util.spec_from_file_location("race_tables", place)
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.TABLES[part](json.loads((ROOT / "benchmarks" / "results" / "race.json").read_text()))
+
+
 def copy_tutorials() -> None:
     """Copy tutorials/*.ipynb to docs/tutorials and write their contents page."""
     target = DOCS / "tutorials"
@@ -322,6 +335,7 @@ KINDS: dict[str, Callable[..., str]] = {
     "docstring": docstring,
     "api": api,
     "file": repository_file,
+    "race": race,
 }
 
 

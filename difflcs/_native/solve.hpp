@@ -335,8 +335,12 @@ class Solver {
       else if (gain[l] > 0.8 && (reg *= 0.3) < 0.2 * kLeastDamping)
         reg = 0;
       // `steps` steps per stage of the homotopy, fewer where the stage is solved.
-      if (eps[l] > target && (a.in_stage >= o.steps || sweep.projected[l] < 1e4 * o.tol || a.failures > 0)) {
-        eps[l] = eps[l] * o.shrink > target ? eps[l] * o.shrink : target;
+      const bool solved = sweep.projected[l] < 1e4 * o.tol;
+      if (eps[l] > target && (a.in_stage >= o.steps || solved || a.failures > 0)) {
+        // A stage that was solved before its first step leads on as far as four.
+        double shrink = o.shrink;
+        if (a.in_stage == 1 && solved) shrink *= shrink, shrink *= shrink;
+        eps[l] = eps[l] * shrink > target ? eps[l] * shrink : target;
         a.in_stage = 0, a.failures = 0;
         fresh[l] = -1;
       }

@@ -194,13 +194,18 @@ def vjp(
     }
 
 
+# Residual below which a Newton step either halves it or has met rounding.
+_NEARLY_ROUNDED = 1e-8
+
+
 def polish(problem: MPCProblem, primal: Primal, max_iter: int | None = None, tol: float = 1e-10) -> Primal:
     """Newton steps on the conditions, active bounds and constraints held: the same local optimum to machine precision.
 
     An interior-point solution is off by its barrier parameter, and finite differences of it and the envelope theorem
     are only as good as that. Actions held at a bound are put onto it, and constraints that are not held get their
     multiplier, zero or the price; then each step is the sensitivity solve with minus the reduced gradient upstream and
-    minus the constraint where it is held. Every element keeps the best trajectory met, which may be the given one.
+    minus the constraint where it is held. Every element keeps the best trajectory met, which may be the given one, and
+    is left alone once its residual is below 1e-8 and a step no longer halves it: that is rounding.
 
     Args:
         problem: the problems.
@@ -216,8 +221,10 @@ def polish(problem: MPCProblem, primal: Primal, max_iter: int | None = None, tol
     best, best_residual = primal, residual(problem, primal, lin.multipliers)
     u, mu = primal.u, primal.mu
     steps = max_iter if max_iter is not None else 12 if problem.n_c else 6
+    open_ = torch.ones_like(best_residual, dtype=torch.bool)
     for step in range(steps + 1):
-        if not bool((best_residual > tol).any()):
+        open_ &= best_residual > tol
+        if not bool(open_.any()):
             break
         if step > 0:
             off = -problem.constraints(lin.primal.x, lin.primal.u)
@@ -237,7 +244,9 @@ def polish(problem: MPCProblem, primal: Primal, max_iter: int | None = None, tol
             trial = trial._replace(mu=settled)
             lin = linearise(problem, trial)
         trial_residual = residual(problem, trial, lin.multipliers)
-        better = trial_residual < best_residual
+        better = open_ & (trial_residual < best_residual)
+        if step > 0:
+            open_ &= (best_residual > _NEARLY_ROUNDED) | (trial_residual < 0.5 * best_residual)
         best = Primal(*(torch.where(better[:, None, None], a, b) for a, b in zip(trial, best, strict=True)))
         best_residual = torch.where(better, trial_residual, best_residual)
     return best

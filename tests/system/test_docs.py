@@ -239,6 +239,21 @@ def test_the_figures_of_the_backends_are_those_measured():
         assert cells == [f"{100 * found[n]['within 0.1 % of best']:.0f}" for n in names], kind
 
 
+def test_the_tables_of_the_race_are_those_measured(generated):
+    text = generated.fill((DOCS / "race.md").read_text())
+    found = json.loads((ROOT / "benchmarks" / "results" / "race.json").read_text())["results"]
+    assert "generated:" not in text
+    for part in ("contact", "linear"):
+        for family, rows in found[part].items():
+            assert f" {family} |" in text
+            assert all(f"| {label} |" in text for label in rows)
+    mean = found["contact, best rival"]["geometric mean, batch"]["ratio"]
+    assert f"**{mean:.0f}×**" in text
+    assert all(
+        f"| {family} | {row['proved']} of {row['problems']} |" in text for family, row in found["global"].items()
+    )
+
+
 def test_links_of_included_files_work_in_the_site(generated, tmp_path, monkeypatch):
     (tmp_path / "docs").mkdir()
     (tmp_path / "part").mkdir()

@@ -174,6 +174,16 @@ def test_a_script_without_a_main_guard_is_not_run_again(tmp_path):
 # --- options --------------------------------------------------------------------------------------------------------
 
 
+def test_by_way_of_the_inequality_it_is_the_same_problem(build, x0):
+    plain, ahead = (make_layer(build, backend=IpoptBackend(contact=c, workers=1)) for c in ("equation", "inequality"))
+    one, other = plain(x0), ahead(x0)
+    assert bool(other.converged.all())
+    assert float(other.kkt_residual.max()) <= 1e-6
+    assert float(other.complementarity().max()) <= 1e-9
+    assert float((other.objective - one.objective).abs().max()) < 1e-3
+    assert bool((other.iterations > one.iterations).all())
+
+
 def test_too_few_iterations_are_an_honest_failure(build, x0):
     with pytest.raises(SolveError, match=r"9 of 9 .*MAX_ITER.*max_iter") as error:
         make_layer(build, backend=IpoptBackend(max_iter=2, workers=1))(x0)
@@ -220,6 +230,8 @@ def test_a_limit_that_some_elements_meet_fails_the_others_only(build, x0):
         ({"workers": True}, DTypeError, "workers: expected an int, got bool True"),
         ({"start": -1.0}, InvalidInputError, "start: .*got -1"),
         ({"mu_init": float("nan")}, InvalidInputError, "mu_init: .*got nan"),
+        ({"mu_strategy": "fast"}, InvalidInputError, "mu_strategy: expected one of 'adaptive', 'monotone', got 'fast'"),
+        ({"contact": "hard"}, InvalidInputError, "contact: expected one of 'equation', 'inequality', got 'hard'"),
     ],
 )
 def test_options_are_checked(options, error, message):

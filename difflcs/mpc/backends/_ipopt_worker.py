@@ -44,6 +44,8 @@ class Options(NamedTuple):
 
     Attributes:
         tol, max_iter, mu_init: IPOPT's own.
+        adaptive: whether IPOPT chooses its barrier parameter anew in each iteration.
+        inequality: whether the contact is λ·s ≤ ε, not =.
         barrier: whether the cost has a barrier of the action bounds.
         slack: whether a constraint may be violated, by a variable v ≥ 0 at its price.
         elastic: whether Σ v² / 2 is the whole cost.
@@ -52,6 +54,8 @@ class Options(NamedTuple):
     tol: float
     max_iter: int
     mu_init: float
+    adaptive: bool
+    inequality: bool
     barrier: bool
     slack: bool
     elastic: bool
@@ -118,22 +122,23 @@ def _solver(sizes: Sizes, options: Options) -> casadi.Function:
         "f": cost,
         "g": casadi.vertcat(*equations, *limits),
     }
-    return casadi.nlpsol(
-        "lcs_mpc",
-        "ipopt",
-        program,
-        {
-            "print_time": False,
-            "error_on_fail": False,
-            "calc_lam_p": False,
-            "ipopt.print_level": 0,
-            "ipopt.sb": "yes",
-            "ipopt.tol": options.tol,
-            "ipopt.max_iter": options.max_iter,
-            "ipopt.mu_init": options.mu_init,
-            "ipopt.bound_relax_factor": 0.0,
-        },
-    )
+    settings = {
+        "print_time": False,
+        "error_on_fail": False,
+        "calc_lam_p": False,
+        "ipopt.print_level": 0,
+        "ipopt.sb": "yes",
+        "ipopt.tol": options.tol,
+        "ipopt.max_iter": options.max_iter,
+        "ipopt.mu_init": options.mu_init,
+        "ipopt.mu_strategy": "adaptive" if options.adaptive else "monotone",
+        "ipopt.bound_relax_factor": 0.0,
+        # 15 % faster: another order of pivots, and no check of each step's residual: the certificate judges the end.
+        # Compiled functions (CasADi's JIT) would save 3 to 15 % more and take 10 to 50 s to compile.
+        "ipopt.fast_step_computation": "yes",
+        "ipopt.mumps_pivot_order": 0,
+    }
+    return casadi.nlpsol("lcs_mpc", "ipopt", program, settings)
 
 
 class Chunk(NamedTuple):
@@ -219,7 +224,8 @@ def _solve_chunk(sizes: Sizes, options: Options, chunk: Chunk, interrupts: list[
     ends = np.cumsum([n_u, n_lam, n_lam, n_x])
     equations = horizon * (n_x + 2 * n_lam)
     rows = (horizon + 1) * n_c
-    least = np.concatenate([np.zeros(equations), np.full(rows, -np.inf)])
+    stage = np.concatenate([np.zeros(n_x + n_lam), np.full(n_lam, -np.inf if options.inequality else 0.0)])
+    least = np.concatenate([np.tile(stage, horizon), np.full(rows, -np.inf)])
     free, positive = np.full((horizon, n_x), np.inf), np.zeros((horizon, 2 * n_lam))
     result = Solved.start(chunk)
 

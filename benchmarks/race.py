@@ -1,0 +1,489 @@
+"""A race against the strongest solvers at hand: `python benchmarks/race.py [--smoke]`. The page is docs/race.md.
+
+The same problems, cold, for everybody, one core, CPU time, set-up excluded. Every rival is a process in an environment
+of its own (`--venvs`, folders made by `--install`); rivals that are not there are reported as missing. Objectives are
+those of executing a rival's own actions in the LCS; the reference is the best that anyone found, and our solver from 32
+random starts. Written as JSON, from which the page's tables are rendered when the site is built.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from race_global import global_gaps
+from race_problems import small, with_contact, without_contact
+from rivals.problem import Problem
+
+from difflcs import LCSMPCLayer, LCSParams, QuadraticCost
+from difflcs._native import _kernels
+from difflcs.bench import cpu
+from difflcs.mpc import kkt
+from difflcs.mpc.backends import BatchedBackend, IpoptBackend
+from difflcs.mpc.problem import MPCProblem
+from difflcs.mpc.solution import Primal
+
+HERE = Path(__file__).parent
+EQUAL = 1e-3  # relative difference of objectives that counts as one
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A line of the tables.
+
+    Attributes:
+        label: its name there.
+        module: file in `rivals/`.
+        settings: arguments of its `Solver`.
+        venv: the environment with its packages; "" for this one.
+        packages: what `--install` puts there.
+    """
+
+    label: str
+    module: str
+    settings: dict[str, object] = field(default_factory=dict)
+    venv: str = ""
+    packages: tuple[str, ...] = ()
+
+
+PLAIN = {"bound_relax_factor": 0.0}
+TUNED = {"tol": 1e-6, "mu_init": 1e-4, "bound_relax_factor": 0.0}
+TUNED |= {"fast_step_computation": "yes", "mumps_pivot_order": 0}
+ADAPTIVE = {**TUNED, "mu_strategy": "adaptive"}
+POUNCE = {"tol": 1e-6, "mu_init": 1e-4}
+CONTACT = (
+    Entry("difflcs `batched`", "layer"),
+    Entry("difflcs `ipopt`", "layer", {"backend": "ipopt"}),
+    Entry("IPOPT, λ = s = 1", "ipopt", {"start": 1.0, "options": PLAIN}),
+    Entry("IPOPT, tuned", "ipopt", {"start": 0.1, "options": TUNED}),
+    Entry("IPOPT, tuned, adaptive", "ipopt", {"start": 0.1, "options": ADAPTIVE}),
+    Entry("FATROP, λ = 1", "fatrop", {"start": 1.0}),
+    Entry("FATROP, tuned", "fatrop", {"start": 0.1, "options": {"tol": 1e-5, "mu_init": 1e-2, "max_iter": 1000}}),
+    Entry("POUNCE, tuned", "pounce", {"start": 0.1, "options": POUNCE}, "rivals", ("pounce-solver", "casadi")),
+    Entry("pympcc", "pympcc", {}, "rivals", ("pympcc", "cyipopt-wheels")),
+)
+COMPILED = Entry("IPOPT, tuned, JIT", "ipopt", {"start": 0.1, "options": TUNED, "jit": True})
+LINEAR = (
+    Entry("difflcs `batched`", "layer"),
+    Entry("DAQP", "daqp_qp", {}, "rivals", ("daqp",)),
+    Entry("acados (HPIPM)", "acados_ocp", {}, "acados", ("comma-deps-acados", "numpy")),
+    Entry("Clarabel", "clarabel_qp", {}, "rivals", ("clarabel", "scipy")),
+    Entry("Moreau, active set", "moreau_qp", {"solver": "active_set"}, "rivals", ("moreau",)),
+    Entry("Moreau, interior point", "moreau_qp", {"solver": "ipm"}, "rivals"),
+    Entry("qpax", "qpax_qp", {}, "rivals", ("qpax",)),
+    Entry("mpc.pytorch", "mpc_pytorch", {}, "mpc", ("torch==2.13.0", "mpc")),
+    Entry("cvxpylayers", "cvxpylayers_qp"),
+)
+
+
+@dataclass
+class Options:
+    """The race."""
+
+    problems: int = 5
+    """Problems of an entry that are solved one by one."""
+    batch: int = 256
+    """Problems of an entry that are solved in one call, by who can."""
+    small_problems: int = 4
+    """Problems of an entry of the comparison with global optima."""
+    seeds: int = 3
+    """Models, or seeds of initial states, of a family."""
+    rounds: int = 2
+    """How often everybody solves everything, taking turns; the shortest time of each problem counts."""
+    seconds: float = 1.0
+    """CPU seconds of a rival for an entry and round; after at least two problems it stops there."""
+    nodes: int = 20_000
+    """Quadratic programs of a branch and bound before it gives up."""
+    venvs: Path = Path("/tmp/difflcs-race")
+    """Where the environments of the rivals are."""
+    install: bool = False
+    """Make these environments, from the package index, and end."""
+    parts: tuple[str, ...] = ("contact", "linear", "global")
+    """What to run; the others stay as they are in the file."""
+    out: Path = Path("benchmarks/results/race.json")
+    """Where the JSON goes."""
+    jit: bool = False
+    """Also IPOPT with compiled functions; each size takes up to a minute to compile."""
+    smoke: bool = False
+    """Everything tiny."""
+
+
+# --- environments and processes ---------------------------------------------------------------------------------------
+
+
+def install(venvs: Path) -> None:
+    """One environment for each group of rivals whose packages agree; what fails is said and left out."""
+    wanted: dict[str, list[str]] = {}
+    for entry in (*CONTACT, *LINEAR):
+        wanted.setdefault(entry.venv, []).extend(entry.packages)
+    for name, packages in wanted.items():
+        if not name:
+            continue
+        python = venvs / name / "bin" / "python"
+        subprocess.run([sys.executable, "-m", "venv", str(venvs / name)], check=True)
+        for package in packages:
+            done = subprocess.run([python, "-m", "pip", "install", "-q", package], check=False)
+            print(f"{name}: {package} {'installed' if done.returncode == 0 else 'COULD NOT BE INSTALLED'}", flush=True)
+
+
+class Process:
+    """A rival that waits for jobs."""
+
+    def __init__(self, entry: Entry, venvs: Path, folder: str):
+        self.entry = entry
+        python = str(venvs / entry.venv / "bin" / "python") if entry.venv else sys.executable
+        one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS"), "1")
+        flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+        self.missing, self.version = "", ""
+        if entry.venv and not Path(python).exists():
+            self.missing = f"no environment {entry.venv}; run with --install"
+            return
+        command = [python, "-P", str(HERE.resolve() / "rivals" / "run.py"), entry.module, json.dumps(entry.settings)]
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+            env={**os.environ, **one, "XLA_FLAGS": flags}, cwd=folder,
+        )  # fmt: skip
+        hello = self._answer()
+        self.version, self.missing = hello.get("version", ""), hello.get("missing", hello.get("error", ""))
+
+    def _answer(self) -> dict:
+        assert self.process.stdout
+        line = self.process.stdout.readline()
+        return json.loads(line) if line else {"error": f"the process ended with code {self.process.wait()}"}
+
+    def ask(self, **job: object) -> dict:
+        """One job, and its answer."""
+        assert self.process.stdin
+        if self.process.poll() is not None:
+            return {"error": f"the process ended with code {self.process.returncode}"}
+        self.process.stdin.write(json.dumps(job) + "\n")
+        self.process.stdin.flush()
+        return self._answer()
+
+    def close(self) -> None:
+        """End it."""
+        if hasattr(self, "process"):
+            self.process.communicate()
+
+
+def start(entries: tuple[Entry, ...], venvs: Path, folder: str) -> list[Process]:
+    """All that are there, and a word about those that are not."""
+    found = [Process(entry, venvs, folder) for entry in entries]
+    for process in found:
+        print(f"  {process.entry.label:24s} {'MISSING: ' + process.missing if process.missing else process.version}")
+    return found
+
+
+# --- judging ----------------------------------------------------------------------------------------------------------
+
+
+def as_mpc(problem: Problem, few: slice | None = None) -> MPCProblem:
+    """The problem as difflcs's own, or some of it."""
+    data = {}
+    for name in ("A", "B", "C", "d", "D", "E", "F", "c", "Q", "R", "Q_final", "q", "r", "q_final", "u_min", "u_max"):
+        value = torch.from_numpy(np.ascontiguousarray(getattr(problem, name)))
+        own = 2 if name in ("A", "B", "C", "D", "E", "F", "Q", "R", "Q_final") else 1
+        data[name] = value[few] if few is not None and value.ndim > own else value
+    x0 = torch.from_numpy(problem.x0 if few is None else problem.x0[few])
+    return MPCProblem(**data, x0=x0, horizon=problem.horizon, relaxation=problem.relaxation)
+
+
+def best_known(problem: Problem, few: slice) -> torch.Tensor:
+    """Objective of our solver from 32 starts, along a long homotopy."""
+    mpc = as_mpc(problem, few)
+    found = BatchedBackend(effort="best", restarts=32, max_iter=600).solve(mpc, None)
+    objective = mpc.objective(found.primal.x, found.primal.u)
+    return torch.where(found.solved, objective, torch.inf)
+
+
+@dataclass
+class Judged:
+    """What a rival's actions are worth: objective of executing them, whether they are a certified optimum to 0.1 %."""
+
+    objective: np.ndarray
+    solved: np.ndarray
+    gradient_error: np.ndarray
+
+
+def judge(problem: Problem, u: np.ndarray, said: np.ndarray, gradient: np.ndarray | None) -> Judged:
+    """Execute the actions, polish them by Newton steps, certify, and compare gradients at this very optimum.
+
+    A rival without gradients of its own is given those of the optimality conditions at its unpolished plan.
+    """
+    mpc = as_mpc(problem, slice(len(u)))
+    plan = mpc.clip(torch.from_numpy(np.nan_to_num(u)))
+    x, lam = mpc.rollout(plan)
+    raw = Primal(x, plan, lam, mpc.no_multipliers())
+    exact = kkt.polish(mpc, raw)
+    linear = kkt.linearise(mpc, exact)
+    residual = kkt.residual(mpc, exact, linear.multipliers)
+    objective, polished = mpc.objective(x, plan), mpc.objective(exact.x, exact.u)
+    near = (objective - polished).abs() <= EQUAL * polished.abs()
+    solved = torch.from_numpy(said) & (residual <= 1e-6) & near
+    true = _sensitivity(mpc, linear, problem.weight)
+    found = _sensitivity(mpc, kkt.linearise(mpc, raw), problem.weight)
+    if gradient is not None:
+        found = torch.from_numpy(gradient[: len(u)].copy())
+    size = true.norm(dim=1)
+    error = torch.where(solved & (size > 1e-9), (found - true).norm(dim=1) / size, torch.nan)
+    return Judged(objective.numpy(), solved.numpy(), error.numpy())
+
+
+def _sensitivity(mpc: MPCProblem, linear: kkt.Linearisation, weight: np.ndarray) -> torch.Tensor:
+    zeros = (torch.zeros_like(v) for v in linear.primal[:3])
+    x, u, lam = zeros
+    u[:, 0] = torch.from_numpy(weight)
+    every = torch.ones(mpc.batch, dtype=torch.bool)
+    return kkt.vjp(mpc, linear, (x, u, lam, torch.zeros(mpc.batch, dtype=torch.float64)), every)["x0"]
+
+
+def finite_differences(problem: Problem, step: float = 1e-6) -> float:
+    """Median relative difference of the layer's gradient to central differences of its own plan, warm-started."""
+    mpc = as_mpc(problem, slice(32))
+    lcs = LCSParams(**{name: getattr(mpc, name) for name in ("A", "B", "C", "d", "D", "E", "F", "c")})
+    cost = QuadraticCost(**{name: getattr(mpc, name) for name in ("Q", "R", "Q_final", "q", "r", "q_final")})
+    layer = LCSMPCLayer(lcs, cost, mpc.horizon, mpc.u_min, mpc.u_max, relaxation=mpc.relaxation, on_failure="mask")
+    weight = torch.from_numpy(problem.weight)
+    x0 = mpc.x0.clone().requires_grad_()
+    plan = layer(x0)
+    (plan.u[:, 0] @ weight).sum().backward()
+    assert x0.grad is not None
+    quotient = torch.zeros_like(x0)
+    with torch.no_grad():
+        guess = layer(mpc.x0)
+        for k in range(mpc.n_x):
+            e = step * torch.eye(mpc.n_x, dtype=torch.float64)[k]
+            ends = [layer(mpc.x0 + sign * e, guess=guess).u[:, 0] @ weight for sign in (1, -1)]
+            quotient[:, k] = (ends[0] - ends[1]) / (2 * step)
+    size = quotient.norm(dim=1)
+    moving = plan.converged & (size > 1e-6)
+    if not bool(moving.any()):
+        return 0.0
+    return float(((x0.grad - quotient).norm(dim=1) / size)[moving].median())
+
+
+# --- the race ---------------------------------------------------------------------------------------------------------
+
+
+def run(problem: Problem, processes: list[Process], o: Options, folder: str) -> dict[str, dict]:
+    """One entry: everybody solves it in turns, `rounds` times."""
+    path, out = f"{folder}/{len(os.listdir(folder))}.npz", f"{folder}/answer.npz"  # rivals know a problem by its path
+    problem.save(path)
+    best: dict[str, dict] = {}
+    for _ in range(o.rounds):
+        for process in [p for p in processes if not p.missing]:
+            label = process.entry.label
+            if "error" in best.get(label, {}):
+                continue
+            answer = process.ask(problem=path, out=out, seconds=o.seconds, few=o.problems)
+            if "error" in answer:
+                best[label] = answer
+                continue
+            with np.load(out) as file:
+                arrays = dict(file)
+            if label not in best:
+                best[label] = {**answer, **arrays}
+                continue
+            old, n = best[label], min(len(best[label]["times"]), len(answer["times"]))
+            old["times"] = [min(a, b) for a, b in zip(old["times"][:n], answer["times"], strict=False)]
+            for name in ("batch", "with_gradient"):
+                if name in answer:
+                    old[name] = min(old[name], answer[name])
+    constant = np.broadcast_to(problem.constant, problem.count)[: o.problems]
+    reference = np.full(o.problems, np.inf)
+    if problem.n_lam:
+        reference = best_known(problem, slice(o.problems)).numpy() + constant
+    judged = {}
+    for label, found in best.items():
+        if "error" not in found:
+            n = len(found["times"])
+            judged[label] = judge(problem, found["u"][:n], np.array(found["solved"][:n]), found.get("gradient"))
+            judged[label].objective += constant[:n]
+            solved = np.where(judged[label].solved, judged[label].objective, np.inf)
+            reference[:n] = np.minimum(reference[:n], solved)
+    rows = {}
+    for label, found in best.items():
+        if "error" in found:
+            rows[label] = {"error": found["error"]}
+            continue
+        j, n = judged[label], len(found["times"])
+        gap = (j.objective - reference[:n]) / reference[:n]
+        rows[label] = {
+            "setup": found["setup"],
+            "seconds": float(np.mean(found["times"])),
+            "times": [float(t) for t in found["times"]],
+            "solved": int(j.solved.sum()),
+            "of": n,
+            "gap": [float(v) for v in gap[j.solved]],
+            "gradient error": [float(v) for v in j.gradient_error[np.isfinite(j.gradient_error)]],
+        }
+        for name in ("batch", "with_gradient"):
+            if name in found:
+                rows[label][name] = found[name] / problem.count
+    return rows
+
+
+def ratio(row: dict, ours: dict) -> float:
+    """Time of a rival over ours, on the problems that it came to."""
+    return sum(row["times"]) / sum(ours["times"][: len(row["times"])])
+
+
+def summary(entries: list[dict[str, dict]]) -> dict[str, dict]:
+    """A family's rows: geometric mean and range over its entries of times and ratios, gap and share solved."""
+    ours = [entry["difflcs `batched`"] for entry in entries]
+    table = {}
+    for label in entries[0]:
+        rows = [entry[label] for entry in entries]
+        errors = [row["error"] for row in rows if "error" in row]
+        if errors:
+            table[label] = {"error": errors[0]}
+            continue
+        one = np.array([ratio(row, mine) for row, mine in zip(rows, ours, strict=True)])
+        in_batch = np.array([row["seconds"] / mine["batch"] for row, mine in zip(rows, ours, strict=True)])
+        gaps = np.concatenate([row["gap"] for row in rows])
+        errors = np.concatenate([row["gradient error"] for row in rows])
+        table[label] = {
+            "seconds": geometric([row["seconds"] for row in rows]),
+            "ratio": [geometric(one), float(one.min()), float(one.max())],
+            "ratio to batch": [geometric(in_batch), float(in_batch.min()), float(in_batch.max())],
+            "solved": sum(row["solved"] for row in rows),
+            "of": sum(row["of"] for row in rows),
+            "mean gap": float(gaps.mean()) if len(gaps) else None,
+            "near": float((gaps <= EQUAL).mean()) if len(gaps) else None,
+            "gradient error": float(np.median(errors)) if len(errors) else None,
+            "setup": geometric([row["setup"] for row in rows]),
+        }
+        for name in ("batch", "with_gradient"):
+            if name in rows[0]:
+                table[label][name] = geometric([row[name] for row in rows])
+    return table
+
+
+def geometric(values: list[float] | np.ndarray) -> float:
+    """Geometric mean."""
+    return float(np.exp(np.mean(np.log(np.maximum(values, 1e-9)))))
+
+
+def best_rival(families: dict[str, dict]) -> dict[str, dict]:
+    """For each family the fastest rival that solved everything, and its ratio to ours; their geometric mean."""
+    found = {}
+    for family, table in families.items():
+        whole = {
+            label: row
+            for label, row in table.items()
+            if not label.startswith("difflcs") and "error" not in row and row["solved"] == row["of"]
+        }
+        if whole:
+            label = min(whole, key=lambda name: whole[name]["ratio"][0])
+            found[family] = {"rival": label, "one": whole[label]["ratio"], "batch": whole[label]["ratio to batch"]}
+    for kind in ("one", "batch"):
+        values = [row[kind][0] for row in found.values() if isinstance(row, dict) and "rival" in row]
+        if values:
+            found[f"geometric mean, {kind}"] = {"ratio": geometric(values), "range": [min(values), max(values)]}
+    return found
+
+
+def race(name: str, o: Options) -> Iterator[tuple[str, object]]:
+    """One part of the race, as the entries of the JSON that belong to it."""
+    entries = (*CONTACT, *([COMPILED] if o.jit else [])) if name == "contact" else LINEAR
+    problems = (with_contact if name == "contact" else without_contact)(max(o.batch, o.problems), o.seeds)
+    with tempfile.TemporaryDirectory() as folder:
+        processes = start(entries, o.venvs, folder)
+        families = {}
+        for family, members in problems.items():
+            families[family] = summary([run(problem, processes, o, folder) for problem in members])
+            show(family, families[family])
+        differences = {family: finite_differences(members[0]) for family, members in problems.items()}
+        for process in processes:
+            process.close()
+    yield name, families
+    yield f"{name}, finite differences", differences
+    yield f"{name}, best rival", best_rival(families)
+    yield f"{name}, versions", {p.entry.label: p.version for p in processes if not p.missing}
+    yield f"{name}, missing", {p.entry.label: p.missing for p in processes if p.missing}
+
+
+def show(family: str, table: dict[str, dict]) -> None:
+    """A family as text."""
+    print(family)
+    for label, row in table.items():
+        if "error" in row:
+            print(f"  {label:24s} failed: {row['error']}", flush=True)
+            continue
+        mean, low, high = row["ratio"]
+        gap = "" if row["mean gap"] is None else f"gap {100 * row['mean gap']:7.3f} %  near {100 * row['near']:3.0f} %"
+        error = "" if row["gradient error"] is None else f"gradient {row['gradient error']:.0e}"
+        batch = f"  in a batch {1e6 * row['batch']:.0f} µs" if "batch" in row else ""
+        print(
+            f"  {label:24s} {1e6 * row['seconds']:9.0f} µs  {mean:7.2f}× ({low:.2f} … {high:.2f})  "
+            f"solved {row['solved']}/{row['of']}  {gap}  {error}{batch}",
+            flush=True,
+        )
+
+
+def globally(o: Options) -> dict[str, dict]:
+    """Our plans on small problems against global optima with hard contact."""
+    branch = Entry("branch and bound", "global_optimum", {"nodes": o.nodes}, "rivals", ("daqp",))
+    backends = {
+        "`batched`": BatchedBackend(),
+        "`best`": BatchedBackend(effort="best"),
+        "`ipopt`": IpoptBackend(workers=1),
+    }
+    ours = {
+        name: lambda problem, backend=backend: backend.solve(as_mpc(problem), None).primal.u
+        for name, backend in backends.items()
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        (process,) = start((branch,), o.venvs, folder)
+        if process.missing:
+            return {"missing": {"error": process.missing}}
+
+        def optimum(problem: Problem) -> dict:
+            path = f"{folder}/{len(os.listdir(folder))}.npz"
+            problem.save(path)
+            job = {"problem": path, "out": f"{folder}/answer.npz", "few": problem.count}
+            answer = process.ask(**job, seconds=1e9)
+            if "error" not in answer:
+                with np.load(job["out"]) as file:
+                    answer |= dict(file)
+            return answer
+
+        found = global_gaps(small(o.small_problems, o.seeds), optimum, ours, as_mpc)
+        process.close()
+    return found
+
+
+def main(o: Options) -> None:
+    """Race, print, write."""
+    if o.install:
+        install(o.venvs)
+        return
+    if o.smoke:
+        o.problems, o.batch, o.small_problems, o.seeds, o.rounds, o.nodes = 2, 3, 1, 1, 1, 300
+    torch.set_num_threads(1)
+    machine = {"cpu": cpu(), "instruction set": _kernels.isa(), "python": platform.python_version()}
+    options = {n: getattr(o, n) for n in ("problems", "batch", "small_problems", "seeds", "rounds", "nodes")}
+    results = json.loads(o.out.read_text())["results"] if o.out.exists() else {}
+    o.out.parent.mkdir(parents=True, exist_ok=True)
+    for name in o.parts:
+        if name == "global":
+            results["global"] = globally(o)
+        else:
+            results |= dict(race(name, o))
+        record = {"machine": machine, "options": options, "results": results}
+        o.out.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n")
+    print(f"written to {o.out}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

@@ -1,0 +1,123 @@
+"""The problems of the race: with contact, without, and small enough for a global optimum."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import torch
+from models import ACTION_LIMIT, chain_of_carts, pushing_model, states_and_goals
+from rivals.problem import Problem
+
+from difflcs import LCSModel, LCSParams, QuadraticCost
+from difflcs.bench import pushing_cost
+from difflcs.systems import block_along_wall, cart_pole_between_walls
+
+RELAXATION = 1e-5
+
+
+def problem(lcs: LCSParams, cost: QuadraticCost, x0: torch.Tensor, horizon: int, limit: float, seed: int) -> Problem:
+    """Arrays of it, as the rivals take them."""
+    arrays = {name: value.detach().double().numpy() for name, value in lcs.tensors().items()}
+    arrays |= {n: getattr(cost, n).detach().double().numpy() for n in ("Q", "R", "Q_final", "q", "r", "q_final")}
+    bound = np.full(lcs.n_u, limit)
+    weight = np.random.default_rng(seed).standard_normal(lcs.n_u)
+    constant = np.asarray(0.0 if cost.constant is None else cost.constant.detach().numpy())
+    return Problem(
+        **arrays, u_min=-bound, u_max=bound, x0=x0.numpy(), horizon=horizon, relaxation=RELAXATION,
+        constant=constant, weight=weight,
+    )  # fmt: skip
+
+
+def pushing(lcs: LCSParams, count: int, seed: int, horizon: int = 5) -> Problem:
+    """A hand around an object, a goal for each problem."""
+    x0, goal = states_and_goals(count, seed)
+    return problem(lcs, pushing_cost()(goal, horizon), x0, horizon, ACTION_LIMIT, seed)
+
+
+def uniform(size: list[float], count: int, seed: int) -> torch.Tensor:
+    """States between −size and size."""
+    half = torch.tensor(size, dtype=torch.float64)
+    draw = torch.rand(count, len(size), generator=torch.Generator().manual_seed(seed + 77), dtype=torch.float64)
+    return (2 * draw - 1) * half
+
+
+def cart_pole(count: int, horizon: int, seed: int) -> Problem:
+    """The cart-pole between soft walls, pushed with up to 20 N."""
+    weight = torch.diag(torch.tensor([1.0, 10.0, 0.1, 0.1], dtype=torch.float64))
+    cost = QuadraticCost(Q=weight, R=0.01 * torch.eye(1, dtype=torch.float64), Q_final=10 * weight)
+    x0 = uniform([0.3, 0.4, 1.0, 2.0], count, seed)
+    return problem(cart_pole_between_walls(), cost, x0, horizon, 20.0, seed)
+
+
+def chain(count: int, carts: int, horizon: int, seed: int) -> Problem:
+    """Push the last cart 0.3 m further, through all others, with up to 50 N."""
+    weight = torch.full((2 * carts,), 0.01, dtype=torch.float64)
+    weight[1:carts] = 0.0
+    weight[0], weight[carts - 1] = 0.1, 10.0
+    q = torch.zeros(2 * carts, dtype=torch.float64)
+    q[carts - 1] = -3.0
+    R = 1e-4 * torch.eye(1, dtype=torch.float64)
+    missed = torch.tensor(0.5 * 10.0 * 0.3**2 * (horizon + 10), dtype=torch.float64)
+    Q = torch.diag(weight)
+    cost = QuadraticCost(Q=Q, R=R, Q_final=10 * Q, q=q, q_final=10 * q, constant=missed)
+    x0 = uniform([0.3] * carts + [0.5] * carts, count, seed)
+    return problem(chain_of_carts(carts), cost, x0, horizon, 50.0, seed)
+
+
+def with_contact(count: int, seeds: int) -> dict[str, list[Problem]]:
+    """Families of the race, one entry for each model or seed of initial states."""
+    every = range(seeds)
+    cube = LCSModel.from_pretrained("zoo:trifinger-cube").params().detach()
+    found = {f"pushing, n_lam {n}": [pushing(pushing_model(n, s), count, s) for s in every] for n in (5, 8)}
+    found["learned cube"] = [pushing(cube, count, 10 + s) for s in every]
+    found |= {f"cart-pole, H {h}": [cart_pole(count, h, h + s) for s in every] for h in (10, 20, 30)}
+    found |= {f"chain of {n}, H {h}": [chain(count, n, h, n + s) for s in every] for n, h in ((4, 10), (10, 10))}
+    return found
+
+
+def without_contact(count: int, seeds: int) -> dict[str, list[Problem]]:
+    """Linear MPC with bounds on the actions: n_lam = 0. All problems of an entry differ in x0 alone."""
+
+    def drop(p: Problem) -> Problem:
+        none = {"C": p.C[..., :0], "D": p.D[:0], "E": p.E[:0], "F": p.F[:0, :0], "c": p.c[:0]}
+        return replace(p, **none)
+
+    def one_goal(p: Problem) -> Problem:
+        return replace(p, q=p.q[0], q_final=p.q_final[0], constant=p.constant[0])
+
+    every = range(seeds)
+    return {
+        "pushing, H 5": [drop(one_goal(pushing(pushing_model(5, s), count, s))) for s in every],
+        "pushing, H 20": [drop(one_goal(pushing(pushing_model(5, s), count, s, horizon=20))) for s in every],
+        "cart-pole, H 30": [drop(cart_pole(count, 30, 30 + s)) for s in every],
+        "carts, n_x 20, H 20": [drop(chain(count, 10, 20, s)) for s in every],
+    }
+
+
+def small(count: int, seeds: int) -> Iterator[tuple[str, Problem]]:
+    """Problems whose modes a branch and bound can go through."""
+    for s in range(seeds):
+        yield "cart-pole, H 10 (2^20 modes)", cart_pole(count, 10, 10 + s)
+    for s in range(seeds):
+        yield "pushing, n_lam 5, H 3 (2^15)", pushing(pushing_model(5, s), count, s, horizon=3)
+    for s in range(seeds):
+        yield "pushing, n_lam 5, H 5 (2^25)", pushing(pushing_model(5, s), count, s)
+    for s in range(seeds):
+        yield "pushing, n_lam 8, H 5 (2^40)", pushing(pushing_model(8, s), count, s)
+    for s in range(seeds):
+        yield "block along a wall, H 4 (2^20)", block(count, 4, s)
+
+
+def block(count: int, horizon: int, seed: int) -> Problem:
+    """Push the block 5 cm along the wall."""
+    weight = torch.diag(torch.tensor([100.0, 10.0, 0.0, 0.0], dtype=torch.float64))
+    q = torch.tensor([-5.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    eye = torch.eye(2, dtype=torch.float64)
+    missed = torch.tensor(0.5 * 100.0 * 0.05**2 * (horizon + 10), dtype=torch.float64)
+    cost = QuadraticCost(Q=weight, R=eye, Q_final=10 * weight, q=q, q_final=10 * q, constant=missed)
+    x0 = uniform([0.02, 0.01, 0.02, 0.02], count, seed)
+    x0[:, 1] = x0[:, 1].abs()
+    x0[:, 2] -= 0.04
+    return problem(block_along_wall(), cost, x0, horizon, 0.05, seed)

@@ -1,0 +1,33 @@
+"""DAQP: a dual active-set method, for the dense program in the actions alone; n_lam = 0."""
+
+from __future__ import annotations
+
+from importlib.metadata import version as version_of
+
+import daqp
+import numpy as np
+
+from rivals.problem import Answer, Condensed, Problem, Rival
+
+
+def version() -> str:
+    """Of DAQP."""
+    return f"daqp {version_of('daqp')}"
+
+
+class Solver(Rival):
+    """Its workspace: the factors of the Hessian are set-up, a new linear term and a solve are timed."""
+
+    def __init__(self, problem: Problem):
+        super().__init__(problem)
+        self.condensed = c = Condensed.of(problem)
+        self.model = daqp.Model()
+        empty = np.zeros((0, len(c.low)))
+        self.model.setup(c.H, c.h.copy(), empty, c.high, c.low, np.zeros(len(c.low), np.int32))
+
+    def one(self, i: int) -> Answer:
+        """One program."""
+        c = self.condensed
+        self.model.update(f=c.G @ self.problem.x0[i] + c.h)
+        z, _, flag, _ = self.model.solve()
+        return Answer(np.array(z).reshape(1, self.problem.horizon, -1), np.array([flag >= 1]))

@@ -1,0 +1,181 @@
+"""What a rival is given and what it must offer. Needs numpy alone: rivals run in environments without difflcs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+
+@dataclass
+class Problem:
+    """Problems of one size: the LCS-MPC of `difflcs.mpc.MPCProblem` with bounds on the actions and no constraints.
+
+    Attributes:
+        A, B, C, d, D, E, F, c: the system.
+        Q, R, Q_final, q, r, q_final: the cost.
+        u_min, u_max: bounds of the actions.
+        x0: (count, n_x) initial states; any other field may have the count in front, too.
+        horizon: steps.
+        relaxation: λ·s.
+        constant: added to the objective, which is then a sum of squares.
+        weight: (n_u,) the gradient asked for is that of weight · u_0 with respect to x0.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    d: np.ndarray
+    D: np.ndarray
+    E: np.ndarray
+    F: np.ndarray
+    c: np.ndarray
+    Q: np.ndarray
+    R: np.ndarray
+    Q_final: np.ndarray
+    q: np.ndarray
+    r: np.ndarray
+    q_final: np.ndarray
+    u_min: np.ndarray
+    u_max: np.ndarray
+    x0: np.ndarray
+    horizon: int
+    relaxation: float
+    constant: np.ndarray
+    weight: np.ndarray
+
+    @classmethod
+    def load(cls, path: str) -> Problem:
+        """What `save` wrote."""
+        with np.load(path) as file:
+            found = {field.name: file[field.name] for field in fields(cls)}
+        return cls(**{**found, "horizon": int(found["horizon"]), "relaxation": float(found["relaxation"])})
+
+    def save(self, path: str) -> None:
+        """Write a .npz file."""
+        np.savez(path, **{field.name: getattr(self, field.name) for field in fields(self)})
+
+    @property
+    def count(self) -> int:
+        """Number of problems."""
+        return len(self.x0)
+
+    @property
+    def n_x(self) -> int:
+        """States."""
+        return self.x0.shape[1]
+
+    @property
+    def n_u(self) -> int:
+        """Actions."""
+        return self.B.shape[-1]
+
+    @property
+    def n_lam(self) -> int:
+        """Contacts."""
+        return self.C.shape[-1]
+
+    def at(self, i: int, name: str) -> np.ndarray:
+        """One field of one problem."""
+        value = getattr(self, name)
+        matrix = name in ("A", "B", "C", "D", "E", "F", "Q", "R", "Q_final")
+        return value if value.ndim == (2 if matrix else 1) else value[i]
+
+    def only(self, i: int) -> dict[str, np.ndarray]:
+        """All fields of one problem by name."""
+        return {f.name: self.at(i, f.name) for f in fields(self) if f.name not in ("horizon", "relaxation", "constant")}
+
+
+@dataclass
+class Answer:
+    """Plans for some problems.
+
+    Attributes:
+        u: (m, horizon, n_u).
+        solved: (m,) what the solver itself says.
+        gradient: (m, n_x) of weight · u_0 by x0, where it was asked for.
+    """
+
+    u: np.ndarray
+    solved: np.ndarray
+    gradient: np.ndarray | None = None
+
+
+class Rival:
+    """A solver with its settings. What `__init__` and the first call do is set-up, which no time of the race includes.
+
+    Attributes:
+        batches: whether one call for many problems is more than a loop.
+        differentiates: whether it has gradients of its own.
+    """
+
+    batches = False
+    differentiates = False
+
+    def __init__(self, problem: Problem):
+        self.problem = problem
+
+    def one(self, i: int) -> Answer:
+        """Plan for problem i, cold."""
+        raise NotImplementedError
+
+    def all(self) -> Answer:
+        """Plans for all problems in one call, cold."""
+        raise NotImplementedError
+
+    def gradient(self) -> Answer:
+        """Plans for all problems with their gradients."""
+        raise NotImplementedError
+
+
+@dataclass
+class Condensed:
+    """A linear MPC as a quadratic program in the actions alone: min ½ zᵀHz + (G x0 + h)ᵀ z, z = (u_0, …, u_{H−1})."""
+
+    H: np.ndarray
+    G: np.ndarray
+    h: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    @classmethod
+    def of(cls, problem: Problem) -> Condensed:
+        """Of problems that differ in x0 alone."""
+        p, horizon, n_x, n_u = problem, problem.horizon, problem.n_x, problem.n_u
+        # x_k = M x0 + N z + n, stage by stage
+        M, N, n = np.eye(n_x), np.zeros((n_x, horizon * n_u)), np.zeros(n_x)
+        H, G, h = np.zeros((horizon * n_u,) * 2), np.zeros((horizon * n_u, n_x)), np.zeros(horizon * n_u)
+        for k in range(horizon + 1):
+            Q, q = (p.Q, p.q) if k < horizon else (p.Q_final, p.q_final)
+            H += N.T @ Q @ N
+            G += N.T @ Q @ M
+            h += N.T @ (Q @ n + q)
+            if k < horizon:
+                own = slice(k * n_u, (k + 1) * n_u)
+                H[own, own] += p.R
+                h[own] += p.r
+                M, N, n = p.A @ M, p.A @ N, p.A @ n + p.d
+                N[:, own] += p.B
+        return cls(0.5 * (H + H.T), G, h, np.tile(p.u_min, horizon), np.tile(p.u_max, horizon))
+
+
+def sparse_program(problem: Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A linear MPC over z = (u_0, x_1, u_1, …, x_H): min ½ zᵀPz + qᵀz with A z = b.
+
+    Returns:
+        P, q, A, b, and where the actions are in z. The first n_x entries of b are those for x0 = 0: add A x0.
+    """
+    p, horizon, n_x, n_u = problem, problem.horizon, problem.n_x, problem.n_u
+    step = n_x + n_u
+    P, q = np.zeros((horizon * step,) * 2), np.zeros(horizon * step)
+    A, b = np.zeros((horizon * n_x, horizon * step)), np.zeros(horizon * n_x)
+    for k in range(horizon):
+        u, x = slice(k * step, k * step + n_u), slice(k * step + n_u, (k + 1) * step)
+        P[u, u], q[u] = p.R, p.r
+        P[x, x], q[x] = (p.Q, p.q) if k + 1 < horizon else (p.Q_final, p.q_final)
+        rows = slice(k * n_x, (k + 1) * n_x)
+        A[rows, u], A[rows, x], b[rows] = -p.B, np.eye(n_x), p.d
+        if k:
+            A[rows, k * step - n_x : k * step] = -p.A
+    where = (np.arange(horizon)[:, None] * step + np.arange(n_u)).ravel()
+    return P, q, A, b, where

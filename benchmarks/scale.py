@@ -1,0 +1,180 @@
+"""Whether the solver copes with large problems: `python benchmarks/scale.py [--problems 16] [--smoke]`.
+
+Two families, both solved with the default settings from nothing:
+
+- "random": `random_model` of any size, two actions for three states, |u| ≤ 1, x0 ~ N(0, 1). Nothing in it is like a
+  robot: contacts couple everything, and larger ones are unstable.
+- "carts": a chain of carts between two walls whose first cart must push the last one.
+
+Printed per size: the share of problems solved, iterations, and CPU time per problem and per iteration on one thread;
+then by which power of H, and of n where all sizes grow together, the time of an iteration grows. Iterations are those
+of all starts of a problem. Written as JSON too.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+import warnings
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from models import chain_of_carts, random_model
+
+from difflcs import LCSMPCLayer, LCSParams, QuadraticCost
+from difflcs.errors import SolveWarning
+from difflcs.mpc import MPCProblem
+from difflcs.mpc.backends import BatchedBackend
+
+# n_x, n_lam, H
+RANDOM = [
+    *[(9, n_lam, 10) for n_lam in (2, 5, 8, 12, 20, 30)],
+    *[(20, 8, 10), (40, 8, 10), (9, 8, 20), (9, 8, 40), (20, 5, 20), (20, 20, 20), (40, 30, 10), (40, 30, 40)],
+]
+CARTS = [(carts, horizon) for carts in (2, 4, 10, 20) for horizon in (10, 20, 40)]
+# Where times of an iteration are compared: the horizon grows, or all other sizes.
+HORIZONS = [(9, 8, horizon) for horizon in (10, 20, 40, 80)]
+SIZES = [(n, n // 2, 10) for n in (10, 20, 40)]
+
+
+@dataclass
+class Options:
+    """Convergence, iterations and time per iteration by size."""
+
+    problems: int = 16
+    """Problems per model."""
+    seeds: int = 4
+    """Models of each size; the carts have one."""
+    out: Path = Path("benchmarks/results/scale.json")
+    """Where the JSON goes."""
+    smoke: bool = False
+    """Everything tiny."""
+
+
+@dataclass
+class Row:
+    """What was measured at one size; times are in seconds of CPU."""
+
+    family: str
+    n_x: int
+    n_u: int
+    n_lam: int
+    horizon: int
+    problems: int
+    solved: float
+    iterations: float
+    per_problem: float
+    per_iteration: float
+
+
+def posed(lcs: LCSParams, cost: QuadraticCost, horizon: int, limit: float, x0: torch.Tensor) -> MPCProblem:
+    """The problem that the layer would hand to a backend."""
+    mpc = LCSMPCLayer(
+        lcs, cost, horizon, -limit, limit, backend=BatchedBackend(effort="fast", max_iter=1), on_failure="mask"
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SolveWarning)  # only the problem is wanted
+        return mpc(x0).problem
+
+
+def random_problem(n_x: int, n_lam: int, horizon: int, count: int, seed: int) -> MPCProblem:
+    """A random model, to be brought to rest."""
+    lcs = random_model(n_lam, seed, n_x, n_u=2 * n_x // 3)
+    eye = torch.eye(n_x, dtype=torch.float64)
+    cost = QuadraticCost(eye, 0.1 * torch.eye(lcs.n_u, dtype=torch.float64), eye)
+    x0 = torch.randn(count, n_x, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return posed(lcs, cost, horizon, 1.0, x0)
+
+
+def carts_problem(carts: int, horizon: int, count: int) -> MPCProblem:
+    """Push the last cart 0.3 m further, through all others."""
+    lcs = chain_of_carts(carts, dt=0.1)
+    weight = torch.full((2 * carts,), 0.01, dtype=torch.float64)
+    weight[:carts], weight[carts - 1] = 0.1, 10.0
+    q = torch.zeros(2 * carts, dtype=torch.float64)
+    q[carts - 1] = -0.3 * 10.0
+    Q = torch.diag(weight)
+    cost = QuadraticCost(Q, 1e-4 * torch.eye(1, dtype=torch.float64), 10 * Q, q=q, q_final=10 * q)
+    draw = torch.rand(count, 2 * carts, generator=torch.Generator().manual_seed(carts), dtype=torch.float64)
+    x0 = (2 * draw - 1) * torch.tensor([0.3] * carts + [0.5] * carts, dtype=torch.float64)
+    return posed(lcs, cost, horizon, 50.0, x0)
+
+
+def measure(family: str, problems: list[MPCProblem]) -> Row:
+    """Solve problems of one size."""
+    backend = BatchedBackend(threads=1)
+    started = time.process_time()
+    results = [backend.solve(problem, None) for problem in problems]
+    spent = time.process_time() - started
+    solved = torch.cat([result.solved for result in results])
+    iterations = torch.cat([result.iterations for result in results]).double()
+    p = problems[0]
+    return Row(
+        family=family,
+        n_x=p.n_x,
+        n_u=p.n_u,
+        n_lam=p.n_lam,
+        horizon=p.horizon,
+        problems=len(solved),
+        solved=float(solved.double().mean()),
+        iterations=float(iterations.mean()),
+        per_problem=spent / len(solved),
+        per_iteration=spent / float(iterations.sum()),
+    )
+
+
+def show(row: Row) -> None:
+    """Print one line."""
+    print(
+        f"{row.family:7s} n_x {row.n_x:2d}  n_u {row.n_u:2d}  n_lam {row.n_lam:2d}  H {row.horizon:2d}: "
+        f"{100 * row.solved:6.2f} % of {row.problems} solved, {row.iterations:6.1f} iterations, "
+        f"{1e3 * row.per_problem:9.3f} ms per problem, {1e6 * row.per_iteration:7.1f} us per iteration",
+        flush=True,
+    )
+
+
+def exponent(sizes: list[int], rows: list[Row]) -> float:
+    """The power by which the time of an iteration grows."""
+    return float(np.polyfit(np.log(sizes), np.log([row.per_iteration for row in rows]), 1)[0])
+
+
+def main(o: Options) -> None:
+    """Measure, print, write."""
+    random, carts, horizons, sizes = RANDOM, CARTS, HORIZONS, SIZES
+    if o.smoke:
+        o.problems, o.seeds = 4, 1
+        random, carts, horizons, sizes = random[:1], carts[:1], horizons[:2], [(4, 2, 10), (8, 4, 10)]
+
+    def randoms(size: tuple[int, int, int]) -> list[MPCProblem]:
+        return [random_problem(*size, o.problems, seed) for seed in range(o.seeds)]
+
+    rows = []
+    for size in random:
+        rows.append(measure("random", randoms(size)))
+        show(rows[-1])
+    for size in carts:
+        rows.append(measure("carts", [carts_problem(*size, o.problems * o.seeds)]))
+        show(rows[-1])
+    # Whole vectors of lanes, so that none idles.
+    o.problems = max(8, o.problems)
+    by_horizon = exponent([size[2] for size in horizons], [measure("random", randoms(size)) for size in horizons])
+    by_size = exponent([size[0] for size in sizes], [measure("random", randoms(size)) for size in sizes])
+    print(f"time per iteration grows as H^{by_horizon:.2f}, and as n^{by_size:.2f} where all sizes grow together")
+    solved = sum(row.solved * row.problems for row in rows) / sum(row.problems for row in rows)
+    print(f"solved in all: {100 * solved:.2f} %")
+    o.out.parent.mkdir(parents=True, exist_ok=True)
+    result = {
+        "exponent of H": by_horizon,
+        "exponent of n": by_size,
+        "solved": solved,
+        "rows": [asdict(r) for r in rows],
+    }
+    o.out.write_text(json.dumps(result, indent=2) + "\n")
+    print(f"written to {o.out}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

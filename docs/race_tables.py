@@ -1,0 +1,157 @@
+"""Tables of the page race.md, from what `benchmarks/race.py` wrote."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+Row = dict[str, object]
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """Markdown."""
+    head = list(head)
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def number(value: float) -> str:
+    """Two digits, never in powers of ten."""
+    return f"{value:.0f}" if value >= 9.95 else f"{value:.1f}" if value >= 0.995 else f"{value:.2g}"
+
+
+def duration(seconds: float) -> str:
+    """With its unit."""
+    return f"{number(1e3 * seconds)} ms" if seconds >= 1e-3 else f"{number(1e6 * seconds)} µs"
+
+
+def spread(values: list[float]) -> str:
+    """Geometric mean and range of ratios."""
+    mean, low, high = values
+    return f"{number(mean)}× ({number(low)}–{number(high)})"
+
+
+def percent(value: float | None) -> str:
+    """Of a relative gap."""
+    return "" if value is None else f"{100 * value:.2g} %" if abs(value) >= 5e-6 else "0 %"
+
+
+def times(part: str) -> Callable[[dict], str]:
+    """Solvers by families: time one by one as ratio to ours; in brackets how many problems were not solved."""
+
+    def make(record: dict) -> str:
+        families = record["results"][part]
+        labels = next(iter(families.values()))
+        rows = []
+        for label in labels:
+            cells = []
+            for family in families.values():
+                row = family[label]
+                if "error" in row:
+                    cells.append("failed")
+                elif label == "difflcs `batched`":
+                    cells.append(f"{duration(row['seconds'])}; {duration(row['batch'])} in a batch")
+                else:
+                    failed = row["of"] - row["solved"]
+                    cells.append(spread(row["ratio"]) + (f" [{failed} of {row['of']} failed]" if failed else ""))
+            rows.append([label, *cells])
+        return table(["", *families], rows)
+
+    return make
+
+
+def optima(record: dict) -> str:
+    """Solvers by families: mean gap to the best known objective, share within 0.1 % of it."""
+    families = record["results"]["contact"]
+    rows = []
+    for label in next(iter(families.values())):
+        cells = []
+        for family in families.values():
+            row = family[label]
+            some = "error" not in row and row["solved"]
+            cells.append(f"{percent(row['mean gap'])} ({100 * row['near']:.0f} %)" if some else "—")
+        rows.append([label, *cells])
+    return table(["", *families], rows)
+
+
+def gradients(part: str) -> Callable[[dict], str]:
+    """Solvers by families: median relative error of the gradient, and time of a plan with its gradient in a batch."""
+
+    def make(record: dict) -> str:
+        families = record["results"][part]
+        rows = []
+        for label in next(iter(families.values())):
+            cells = []
+            for family in families.values():
+                row = family[label]
+                error = row.get("gradient error")
+                own = f", {duration(row['with_gradient'])}" if "with_gradient" in row else ""
+                cells.append("—" if error is None else f"{error:.0e}{own}")
+            rows.append([label, *cells])
+        differences = record["results"][f"{part}, finite differences"]
+        rows.append(["`batched` against differences", *(f"{differences[name]:.0e}" for name in families)])
+        return table(["", *families], rows)
+
+    return make
+
+
+def best(part: str) -> Callable[[dict], str]:
+    """For each family the fastest rival that solved everything."""
+
+    def make(record: dict) -> str:
+        found = record["results"][f"{part}, best rival"]
+        rows = [
+            [name, row["rival"], spread(row["one"]), spread(row["batch"])]
+            for name, row in found.items()
+            if "rival" in row
+        ]
+        mean = [found[f"geometric mean, {kind}"] for kind in ("one", "batch")]
+        last = [f"**{number(v['ratio'])}×** ({number(v['range'][0])}–{number(v['range'][1])})" for v in mean]
+        rows.append(["**geometric mean**", "", *last])
+        return table(["problems", "fastest that solved all", "one problem a call", "ours in a batch"], rows)
+
+    return make
+
+
+def hard(record: dict) -> str:
+    """Gap to the global optimum with hard contact."""
+    families = {name: row for name, row in record["results"]["global"].items() if "error" not in row}
+    if not families:
+        return "The race was run without DAQP, which the branch and bound needs."
+    names = list(next(iter(families.values()))["gaps"])
+    rows = [
+        [name, f"{row['proved']} of {row['problems']}", duration(row["seconds"])]
+        + [f"{percent(row['gaps'][n]['mean'])} ({percent(row['gaps'][n]['worst'])})" for n in names]
+        for name, row in families.items()
+    ]
+    return table(["problems", "proved", "time of the search", *names], rows)
+
+
+def versions(record: dict) -> str:
+    """Who took part, and who did not."""
+    lines = []
+    for part in ("contact", "linear"):
+        lines += [f"- {label}: {version}" for label, version in record["results"][f"{part}, versions"].items()]
+        lines += [f"- {label}: missing ({why})" for label, why in record["results"][f"{part}, missing"].items()]
+    return "\n".join(dict.fromkeys(lines))
+
+
+def machine(record: dict) -> str:
+    """Where and how much."""
+    at, o = record["machine"], record["options"]
+    return (
+        f"Measured on {at['cpu']}, instruction set {at['instruction set']}: {o['seeds']} models or seeds of a family, "
+        f"{o['problems']} problems of each one by one and {o['batch']} in a call, the best of {o['rounds']} rounds."
+    )
+
+
+TABLES: dict[str, Callable[[dict], str]] = {
+    "times": times("contact"),
+    "optima": optima,
+    "gradients": gradients("contact"),
+    "best": best("contact"),
+    "linear": times("linear"),
+    "linear-gradients": gradients("linear"),
+    "global": hard,
+    "versions": versions,
+    "machine": machine,
+}

@@ -1,0 +1,93 @@
+"""The race in `benchmarks/`: what its rivals are given, who is missing, and how an answer is judged."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+
+COUNT = 5
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture
+def race(monkeypatch):
+    pytest.importorskip("tyro")
+    pytest.importorskip("mujoco")
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import race
+
+    return race
+
+
+@pytest.fixture
+def pushing(race):
+    from models import pushing_model
+    from race_problems import pushing
+
+    return pushing(pushing_model(5, 0), count=COUNT, seed=0)
+
+
+def test_a_rival_that_is_not_there_is_reported(race, tmp_path):
+    absent = race.Process(race.Entry("absent", "layer", venv="nowhere"), tmp_path, str(tmp_path))
+    assert "--install" in absent.missing
+    broken = race.Process(race.Entry("broken", "no_such_rival"), tmp_path, str(tmp_path))
+    assert "no_such_rival" in broken.missing
+    broken.close()
+
+
+def test_a_rival_solves_and_is_judged_by_the_optimality_conditions(race, tmp_path):
+    from race_problems import cart_pole
+
+    problem = cart_pole(COUNT, horizon=10, seed=0)
+    process = race.Process(race.CONTACT[2], tmp_path, str(tmp_path))
+    assert not process.missing
+    problem.save(f"{tmp_path}/0.npz")
+    answer = process.ask(problem=f"{tmp_path}/0.npz", out=f"{tmp_path}/out.npz", seconds=100.0, few=COUNT)
+    process.close()
+    assert answer["solved"] == [True] * COUNT
+    assert min(answer["times"]) > 0
+    u = np.load(f"{tmp_path}/out.npz")["u"]
+    said = np.ones(COUNT, bool)
+    good = race.judge(problem, u, said, None)
+    assert good.solved.all()
+    assert float(np.nanmax(good.gradient_error)) < 1e-2
+    # Neither other actions pass, nor the solver's own word alone, nor good actions against its word.
+    assert not race.judge(problem, 0 * u, said, None).solved.any()
+    assert race.judge(problem, u, np.arange(COUNT) > 0, None).solved.tolist() == [False] + [True] * (COUNT - 1)
+    wrong = np.ones((COUNT, problem.n_x))
+    assert float(np.nanmin(race.judge(problem, u, said, wrong).gradient_error)) > 0.1
+
+
+def test_both_quadratic_programs_are_the_linear_mpc(race, pushing):
+    from rivals.problem import Condensed, sparse_program
+
+    none = {"C": pushing.C[:, :0], "D": pushing.D[:0], "E": pushing.E[:0], "F": pushing.F[:0, :0], "c": pushing.c[:0]}
+    wide = {"u_min": np.full(6, -9.0), "u_max": np.full(6, 9.0), "q": pushing.q[0], "q_final": pushing.q_final[0]}
+    linear = dataclasses.replace(pushing, **none, **wide)
+    dense = Condensed.of(linear)
+    z = np.linalg.solve(dense.H, -(dense.G @ linear.x0[1] + dense.h))
+    P, q, A, b, where = sparse_program(linear)
+    b[: linear.n_x] += linear.A @ linear.x0[1]
+    zero = np.zeros((len(b), len(b)))
+    both = np.linalg.solve(np.block([[P, A.T], [A, zero]]), np.concatenate([-q, b]))
+    np.testing.assert_allclose(both[where], z, rtol=0, atol=1e-9)
+    found = race.BatchedBackend().solve(race.as_mpc(linear), None)
+    assert bool(found.solved.all())
+    np.testing.assert_allclose(found.primal.u[1].flatten(), z, rtol=0, atol=1e-7)
+
+
+def test_hard_cost_is_that_of_the_exact_contact(race, pushing):
+    from race_global import hard_cost
+
+    mpc = race.as_mpc(pushing)
+    u = mpc.clip(0.01 * torch.ones(COUNT, mpc.horizon, mpc.n_u, dtype=torch.float64))
+    sharp = dataclasses.replace(mpc, relaxation=1e-12)
+    torch.testing.assert_close(hard_cost(mpc, u), sharp.objective(sharp.rollout(u)[0], u), rtol=1e-5, atol=1e-6)
+    assert float((hard_cost(mpc, u) - mpc.objective(mpc.rollout(u)[0], u)).abs().max()) > 0
