@@ -30,6 +30,7 @@ from torch import Tensor, nn
 
 from difflcs import GoalCost, LCSModel, LCSModule, LCSMPCLayer, LCSParams
 from difflcs.errors import DegenerateWarning, InvalidInputError
+from difflcs.mpc.backends import BatchedBackend
 from difflcs.rl import Epochs, ViolationLoss, WarmupSettings, fit
 
 MASSES = (0.3, 3.0)  # [kg]
@@ -190,7 +191,9 @@ class HeavyBlock(gymnasium.Env):
 def make_mpc(lcs: LCSModule) -> LCSMPCLayer:
     """Bring the block to a goal, whatever its mass."""
     cost = GoalCost.reach(2, 1, goal_weight=(20.0,), input_weight=0.002)
-    return LCSMPCLayer(lcs, cost, HORIZON, -FORCE, FORCE, on_failure="mask")
+    # One start and a short homotopy: a plan that is learned from should change little when the system does.
+    backend = BatchedBackend(effort="fast", homotopy=100.0, tol=1e-10)
+    return LCSMPCLayer(lcs, cost, HORIZON, -FORCE, FORCE, backend=backend, on_failure="mask")
 
 
 def prediction(lcs: LCSModule, seed: int, transitions: int, epochs: int) -> tuple[float, float]:

@@ -42,6 +42,8 @@ constexpr int64_t kFailures = 12;
 // rounding.
 constexpr int64_t kStill = 8;
 constexpr double kNothing = 1e-12;
+// The least projected gradient that is asked for then.
+constexpr double kInVain = 1e-8;
 
 template <class T, class S>
 class Solver {
@@ -261,13 +263,14 @@ class Solver {
     for (int l = 0; l < kLanes; l++) {
       if (idle[l] || released[l] || eps[l] > batch.relaxation) continue;
       const Lane& a = lane[l];
-      const double tol = o.tol > sweep.rounding[l] ? o.tol : sweep.rounding[l];
+      double tol = o.tol > sweep.rounding[l] ? o.tol : sweep.rounding[l];
       // A search that fails this close to the optimum has met the rounding of the cost.
       const bool stuck = a.failures >= kFailures || a.still >= 4 * kStill;
       const double patience = stuck || a.still >= 3 * kStill ? 1e3
                               : a.still >= 2 * kStill        ? 1e2
                               : a.still >= kStill            ? 10.0
                                                              : 1.0;
+      if (patience > 1 && tol < kInVain) tol = kInVain;
       const bool stationary = sweep.projected[l] <= patience * tol && sweep.stationary[l] <= patience * kStationary;
       const bool converged = stationary && met(sweep, l);
       const bool broken = !(J[l] < 1e300 && J[l] > -1e300);

@@ -155,12 +155,13 @@ class LCSMethod(Method):
     def policy(self, task: TaskSpec, learned: LCSModule) -> LCSMPCLayer:
         """See `Method`.
 
-        The solver tries one start. With three it finds another plan in one state of seven and takes twice as long; what
-        is learned is how those of one start do on the robot.
+        The solver tries one start, along a short homotopy. With three it finds another plan in one state of seven and
+        takes twice as long; what is learned is how those of one start do on the robot, and plans that jump from optimum
+        to optimum when the system changes a little teach little.
         """
         backend = get_backend(self.backend)
         if isinstance(backend, BatchedBackend):
-            backend = replace(backend, effort="fast")
+            backend = replace(backend, effort="fast", homotopy=backend.homotopy or 100.0)
         return task.make_policy(learned, backend)
 
     def initial(self, work: Work) -> LCSModule:
