@@ -133,8 +133,8 @@ def _solver(sizes: Sizes, options: Options) -> casadi.Function:
         "ipopt.mu_init": options.mu_init,
         "ipopt.mu_strategy": "adaptive" if options.adaptive else "monotone",
         "ipopt.bound_relax_factor": 0.0,
-        # Another order of the pivots is 10 % faster. Steps without a check of their residual would be, too, and blur which
-        # constraints act. Compiled functions (CasADi's JIT) would save 3 to 15 % and take 10 to 50 s to compile.
+        # Another order of the pivots is 10 % faster. Steps without a check of their residual would be, too, and blur
+        # which constraints act. Compiled functions (CasADi's JIT) would save 3 to 15 % and take 10 to 50 s to compile.
         "ipopt.mumps_pivot_order": 0,
     }
     return casadi.nlpsol("lcs_mpc", "ipopt", program, settings)
