@@ -94,7 +94,7 @@ class Options:
     """Problems of an entry that are solved one by one."""
     batch: int = 256
     """Problems of an entry with contact that are solved in one call, by who can."""
-    linear_batch: int = 64
+    linear_batch: int = 32
     """The same without contact."""
     small_problems: int = 4
     """Problems of an entry of the comparison with global optima."""
