@@ -93,7 +93,9 @@ class Options:
     problems: int = 5
     """Problems of an entry that are solved one by one."""
     batch: int = 256
-    """Problems of an entry that are solved in one call, by who can."""
+    """Problems of an entry with contact that are solved in one call, by who can."""
+    linear_batch: int = 32
+    """The same without contact."""
     small_problems: int = 4
     """Problems of an entry of the comparison with global optima."""
     seeds: int = 3
@@ -396,7 +398,8 @@ def best_rival(families: dict[str, dict]) -> dict[str, dict]:
 def race(name: str, o: Options) -> Iterator[tuple[str, object]]:
     """One part of the race, as the entries of the JSON that belong to it."""
     entries = (*CONTACT, *([COMPILED] if o.jit else [])) if name == "contact" else LINEAR
-    problems = (with_contact if name == "contact" else without_contact)(max(o.batch, o.problems), o.seeds)
+    batch, make = (o.batch, with_contact) if name == "contact" else (o.linear_batch, without_contact)
+    problems = make(max(batch, o.problems), o.seeds)
     with tempfile.TemporaryDirectory() as folder:
         processes = start(entries, o.venvs, folder)
         families = {}
@@ -469,10 +472,12 @@ def main(o: Options) -> None:
         install(o.venvs)
         return
     if o.smoke:
-        o.problems, o.batch, o.small_problems, o.seeds, o.rounds, o.nodes = 2, 3, 1, 1, 1, 300
+        o.problems, o.batch, o.linear_batch, o.small_problems, o.seeds, o.rounds, o.nodes = 2, 3, 3, 1, 1, 1, 300
     torch.set_num_threads(1)
     machine = {"cpu": cpu(), "instruction set": _kernels.isa(), "python": platform.python_version()}
-    options = {n: getattr(o, n) for n in ("problems", "batch", "small_problems", "seeds", "rounds", "nodes")}
+    options = {
+        n: getattr(o, n) for n in ("problems", "batch", "linear_batch", "small_problems", "seeds", "rounds", "nodes")
+    }
     results = json.loads(o.out.read_text())["results"] if o.out.exists() else {}
     o.out.parent.mkdir(parents=True, exist_ok=True)
     for name in o.parts:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-Row = dict[str, object]
+NOT_RUN = "This part of the race has not been run."
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -32,14 +32,18 @@ def spread(values: list[float]) -> str:
 
 def percent(value: float | None) -> str:
     """Of a relative gap."""
-    return "" if value is None else f"{100 * value:.2g} %" if abs(value) >= 5e-6 else "0 %"
+    if value is None:
+        return ""
+    return f"{100 * value:.0f} %" if value >= 0.0995 else f"{100 * value:.2g} %" if abs(value) >= 5e-6 else "0 %"
 
 
 def times(part: str) -> Callable[[dict], str]:
     """Solvers by families: time one by one as ratio to ours; in brackets how many problems were not solved."""
 
     def make(record: dict) -> str:
-        families = record["results"][part]
+        families = record["results"].get(part)
+        if not families:
+            return NOT_RUN
         labels = next(iter(families.values()))
         rows = []
         for label in labels:
@@ -77,7 +81,9 @@ def gradients(part: str) -> Callable[[dict], str]:
     """Solvers by families: median relative error of the gradient, and time of a plan with its gradient in a batch."""
 
     def make(record: dict) -> str:
-        families = record["results"][part]
+        families = record["results"].get(part)
+        if not families:
+            return NOT_RUN
         rows = []
         for label in next(iter(families.values())):
             cells = []
@@ -128,10 +134,10 @@ def hard(record: dict) -> str:
 
 def versions(record: dict) -> str:
     """Who took part, and who did not."""
-    lines = []
+    lines, found = [], record["results"]
     for part in ("contact", "linear"):
-        lines += [f"- {label}: {version}" for label, version in record["results"][f"{part}, versions"].items()]
-        lines += [f"- {label}: missing ({why})" for label, why in record["results"][f"{part}, missing"].items()]
+        lines += [f"- {label}: {version}" for label, version in found.get(f"{part}, versions", {}).items()]
+        lines += [f"- {label}: missing ({why})" for label, why in found.get(f"{part}, missing", {}).items()]
     return "\n".join(dict.fromkeys(lines))
 
 

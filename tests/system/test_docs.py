@@ -244,7 +244,7 @@ def test_the_tables_of_the_race_are_those_measured(generated):
     found = json.loads((ROOT / "benchmarks" / "results" / "race.json").read_text())["results"]
     assert "generated:" not in text
     for part in ("contact", "linear"):
-        for family, rows in found[part].items():
+        for family, rows in found.get(part, {}).items():
             assert f" {family} |" in text
             assert all(f"| {label} |" in text for label in rows)
     mean = found["contact, best rival"]["geometric mean, batch"]["ratio"]

@@ -54,8 +54,8 @@ class IpoptBackend(Backend):
         max_iter: iteration limit of one solve.
         workers: processes for a batch; the number of CPUs available if None. 1 solves in this process.
         residual_tol: largest KKT residual that counts as converged.
-        start: value of λ and s at a cold start. 0.1 takes half the iterations of λ = s = 1 and finds better optima. The
-            states start at x0: a rollout is a worse start where the system is unstable.
+        start: value of λ and s at a cold start. 0.05 takes half the iterations of λ = s = 1 and finds better optima.
+            The states start at x0: a rollout is a worse start where the system is unstable.
         mu_init: IPOPT's first barrier parameter at a cold start.
         mu_init_warm: the same when a guess is given.
         mu_strategy: IPOPT's: "monotone", or "adaptive": better optima on contact-rich pushing, up to three times slower
@@ -72,7 +72,7 @@ class IpoptBackend(Backend):
     max_iter: int = 300
     workers: int | None = None
     residual_tol: float = 1e-6
-    start: float = 0.1
+    start: float = 0.05
     mu_init: float = 1e-4
     mu_init_warm: float = 1e-6
     mu_strategy: str = "monotone"
