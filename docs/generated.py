@@ -8,6 +8,7 @@ A line `<!-- generated: KIND ARGUMENTS -->` of a page is replaced by Markdown th
 - `docstring OBJECT`: a docstring that is written in Markdown, as those of the environments.
 - `api MODULE [NAME ...]`: the reference of these public names of a module, or of all that are in its `__all__`.
 - `file PATH`: another Markdown file of the repository, without its title.
+- `optima`: a table of `benchmarks/results/optima.json`.
 - `race PART`: a table of `benchmarks/results/race.json`; race_tables.py says which parts there are.
 
 Besides, the notebooks of tutorials/ are copied to docs/tutorials, and docstrings are mended for reStructuredText.
@@ -303,6 +304,20 @@ def race(part: str) -> str:
     return module.TABLES[part](json.loads((ROOT / "benchmarks" / "results" / "race.json").read_text()))
 
 
+def optima() -> str:
+    """Markdown: which optima each effort of the batched backend reaches."""
+    found = json.loads((ROOT / "benchmarks" / "results" / "optima.json").read_text())["results"]
+    efforts = ("fast", "default", "best")
+    lines = ["| problems | " + " | ".join(f'`"{effort}"`' for effort in efforts) + " |", "|---" * 4 + "|"]
+    for kind, row in found.items():
+        cells = (
+            f"{100 * row[e]['mean gap']:.2g} % ({100 * row[e]['within 0.1 % of best']:.0f} %), {row[e]['time']:.1f}×"
+            for e in efforts
+        )
+        lines.append(f"| {kind} ({row['problems']}) | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
 def copy_tutorials() -> None:
     """Copy tutorials/*.ipynb to docs/tutorials and write their contents page."""
     target = DOCS / "tutorials"
@@ -336,6 +351,7 @@ KINDS: dict[str, Callable[..., str]] = {
     "api": api,
     "file": repository_file,
     "race": race,
+    "optima": optima,
 }
 
 
