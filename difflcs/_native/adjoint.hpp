@@ -80,7 +80,7 @@ class Adjoint {
       if (n.c() > 0)
         (void)hold_constraints(false);
       else
-        riccati.sweep(at, upstream, all(0), Mask{});
+        riccati.sweep(at, upstream);
       forward({batch, o, group, end, valid, sum});
     }
     for (int64_t i = 0; i < o.shared_size; i++) {
@@ -197,7 +197,7 @@ class Adjoint {
         }
       }
       shifted.lam = upstream.lam;
-      riccati.sweep(at, shifted, all(0), Mask{});
+      riccati.sweep(at, shifted);
       Vec largest = all(0), change = all(0);
       Vec worst = all(0);
       for (int64_t i = 0; i < nx; i++) dw[i] = all(0);

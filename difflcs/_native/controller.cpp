@@ -87,13 +87,7 @@ Controller::Controller(const void* bytes, size_t size)
     batch_.step[i] = data_.by_stage[i] ? extent(batch_, kMpcFields[i]) : 0;
   }
   batch_.input[kx0] = x0_.get();
-  const auto any = [&](Input which, auto test) {
-    const Numbers& values = data_.field[which];
-    return std::any_of(values.get(), values.get() + values.count(), test);
-  };
-  batch_.crossed = any(kS, [](double v) { return v != 0; });
-  batch_.unbounded =
-      any(ku_min, [](double v) { return v < -kHuge; }) || any(ku_max, [](double v) { return v > kHuge; });
+  look_at_inputs(batch_, data_.field[kS].count(), data_.field[ku_min].count(), data_.field[ku_max].count());
   int64_t needed = kernels_.mpc_workspace(batch_);
   if (data_.n_goal > 0) {
     batch_.input[kq] = q_.get(), batch_.input[kq_final] = q_final_.get(), batch_.step[kq] = h > 1 ? nx : 0;

@@ -107,6 +107,14 @@ MpcSolve with(const MpcEffort& effort, const MpcPlans& out) {
   return o;
 }
 
+// A problem that begins where its homotopy ends, as a guess does.
+MpcStart at_target(const MpcBatch& b) { return {false, false, 0.0, b.relaxation}; }
+
+MpcStart beginning(const Start& s, const MpcBatch& b, const MpcEffort& effort) {
+  return {s.released, s.gauss_newton, effort.homotopy > 0 ? 0.0 : s.first,
+          b.relaxation * std::max(effort.homotopy, 1.0)};
+}
+
 MpcPlans shifted(const MpcBatch& b, MpcPlans p, int64_t by) {
   const Sizes n(b);
   p.x += by * n.x, p.u += by * n.u, p.lam += by * n.lam, p.mu += by * n.mu, p.objective += by, p.residual += by;
@@ -115,6 +123,15 @@ MpcPlans shifted(const MpcBatch& b, MpcPlans p, int64_t by) {
 }
 
 }  // namespace
+
+void look_at_inputs(MpcBatch& b, int64_t S, int64_t low, int64_t high) {
+  const auto any = [&](Input which, int64_t count, auto test) {
+    return std::any_of(b.input[which], b.input[which] + count, test);
+  };
+  b.crossed = any(kS, S, [](double v) { return v != 0; });
+  b.unbounded =
+      any(ku_min, low, [](double v) { return v < -kHuge; }) || any(ku_max, high, [](double v) { return v > kHuge; });
+}
 
 void MpcDriver::Store::resize(const MpcBatch& batch, int64_t count) {
   const Sizes n(batch);
@@ -163,9 +180,10 @@ void MpcDriver::judge_constraints(const MpcBatch& batch, const MpcSolve& results
 void MpcDriver::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
                       Runner& runner) {
   if (batch.count == 0) return;
+  const auto way = effort.starts == 1 ? &MpcDriver::solve_once : &MpcDriver::search;
   const int64_t chunk = std::max(kChunk, kJobs / effort.starts);
   for (int64_t first = 0; first < batch.count; first += chunk)
-    search(batch, guess, effort, out, runner, first, std::min(chunk, batch.count - first));
+    (this->*way)(batch, guess, effort, out, runner, first, std::min(chunk, batch.count - first));
   for (const bool pivot : {false, true})
     if (!runner.stopped()) again(batch, effort, out, runner, pivot);
   if (batch.n_c > 0) judge_constraints(batch, with(effort, out), runner);
@@ -175,8 +193,7 @@ void MpcDriver::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEff
 void MpcDriver::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start, int64_t job, int64_t best) {
   const Sizes n(b);
   const Start s = start_of(start);
-  const double least = b.relaxation * std::max(effort.homotopy, 1.0);
-  tried.start[job] = {s.released, s.gauss_newton, effort.homotopy > 0 ? 0.0 : s.first, least};
+  tried.start[job] = beginning(s, b, effort);
   double* u = tried.u.data() + job * n.u;
   const double* from = best >= 0 ? tried.u.data() + best * n.u : nullptr;
   double reach = 1.0;  // of actions without bounds
@@ -207,6 +224,26 @@ void MpcDriver::explore(const MpcBatch& batch, const MpcEffort& effort, Runner& 
   run(jobs, o, runner);
 }
 
+// Elements [first, first + count) from one start.
+void MpcDriver::solve_once(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
+                           Runner& runner, int64_t first, int64_t count) {
+  const Sizes n(batch);
+  const MpcPlans to = shifted(batch, out, first);
+  tried.resize(batch, 0), tried.element.resize(count);
+  tried.start.assign(count, guess.u ? at_target(batch) : beginning(start_of(0), batch, effort));
+  for (int64_t e = 0; e < count; e++) tried.element[e] = batch.element ? batch.element[first + e] : first + e;
+  MpcBatch jobs = batch;
+  jobs.count = count, jobs.element = tried.element.data();
+  MpcSolve o = with(effort, to);
+  o.start = tried.start.data();
+  if (guess.u) o.u_start = guess.u + first * n.u;
+  if (guess.lam) o.lam_start = guess.lam + first * n.lam, o.mu_start = guess.mu + first * n.mu;
+  run(jobs, o, runner);
+  for (int64_t e = 0; e < count; e++)
+    if (to.status[e] == kUnreached) stay_at_start(jobs, {o.u_start, nullptr, nullptr}, to, e);
+}
+
+// The same from several, of which the best counts.
 void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
                        Runner& runner, int64_t first, int64_t count) {
   const Sizes n(batch);
@@ -214,26 +251,6 @@ void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
   const int64_t starts = effort.starts;
   const MpcPlans to = shifted(batch, out, first);
   auto element = [&](int64_t e) { return batch.element ? batch.element[first + e] : first + e; };
-
-  if (starts == 1) {
-    tried.resize(batch, 0), tried.element.resize(count), tried.start.resize(count);
-    const Start s = start_of(0);
-    const double least = batch.relaxation * (guessed ? 1.0 : std::max(effort.homotopy, 1.0));
-    for (int64_t e = 0; e < count; e++) {
-      tried.element[e] = element(e);
-      tried.start[e] = {!guessed && s.released, false, guessed || effort.homotopy > 0 ? 0.0 : s.first, least};
-    }
-    MpcBatch jobs = batch;
-    jobs.count = count, jobs.element = tried.element.data();
-    MpcSolve o = with(effort, to);
-    o.start = tried.start.data();
-    if (guessed) o.u_start = guess.u + first * n.u;
-    if (whole) o.lam_start = guess.lam + first * n.lam, o.mu_start = guess.mu + first * n.mu;
-    run(jobs, o, runner);
-    for (int64_t e = 0; e < count; e++)
-      if (to.status[e] == kUnreached) stay_at_start(jobs, {o.u_start, nullptr, nullptr}, to, e);
-    return;
-  }
 
   // Job s * count + e is start s of element e.
   tried.resize(batch, starts * count), best.assign(count, -1);
@@ -247,7 +264,7 @@ void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
     for (int64_t j = begun * count; j < end * count; j++) {
       const int64_t e = j % count;
       if (from_guess) {
-        tried.start[j] = {false, false, 0.0, batch.relaxation};
+        tried.start[j] = at_target(batch);
         std::copy_n(guess.u + (first + e) * n.u, n.u, tried.u.data() + j * n.u);
         if (whole) std::copy_n(guess.lam + (first + e) * n.lam, n.lam, tried.lam.data() + j * n.lam);
         if (whole) std::copy_n(guess.mu + (first + e) * n.mu, n.mu, tried.mu.data() + j * n.mu);
@@ -279,8 +296,7 @@ void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
   for (int64_t j = 0; j < effort.starts * count; j++) {
     if (tried.status[j] == kUnreached || !promising(batch, j, best[j % count])) continue;
     copy_plan(n, tried.plans(), j, finished.plans(), kept);
-    origin[kept] = j, finished.element[kept] = tried.element[j],
-    finished.start[kept] = {false, false, 0.0, batch.relaxation};
+    origin[kept] = j, finished.element[kept] = tried.element[j], finished.start[kept] = at_target(batch);
     kept++;
   }
   MpcBatch jobs = batch;

@@ -43,6 +43,10 @@ struct Runner {
   ~Runner() = default;
 };
 
+// Says of a batch whether S, of `S` numbers, is zero and whether the bounds of the actions, `low` and `high` numbers,
+// are finite.
+void look_at_inputs(MpcBatch& batch, int64_t S, int64_t low, int64_t high);
+
 class MpcDriver {
  public:
   explicit MpcDriver(const Kernels& kernels) : kernels(kernels) {}
@@ -68,6 +72,8 @@ class MpcDriver {
 
   void run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner) const;
   void judge_constraints(const MpcBatch& batch, const MpcSolve& results, Runner& runner) const;
+  void solve_once(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
+                  Runner& runner, int64_t first, int64_t count);
   void search(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
               Runner& runner, int64_t first, int64_t count);
   void explore(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, int64_t first, int64_t count,

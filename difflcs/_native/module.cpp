@@ -186,11 +186,7 @@ difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxa
     b.stride[i] = shared ? 0 : own == 2 ? stages * size : size;
   }
   b.pivot = pivot;
-  auto any = [&](Input which, auto test) {
-    return std::any_of(b.input[which], b.input[which] + inputs[which].size(), test);
-  };
-  b.crossed = any(kS, [](double v) { return v != 0; });
-  b.unbounded = any(ku_min, [](double v) { return v < -kHuge; }) || any(ku_max, [](double v) { return v > kHuge; });
+  look_at_inputs(b, inputs[kS].size(), inputs[ku_min].size(), inputs[ku_max].size());
   return b;
 }
 

@@ -21,6 +21,14 @@ constexpr double kSingular = 1e-10;
 // An action with a barrier is differentiated as one at its bound below this part of its range (kkt has the same).
 constexpr double kClose = 1e-8;
 
+// How the solver's step is taken.
+struct Newton {
+  Vec regularisation{};  // added to the curvature of contacts and actions
+  Mask stubborn{};       // keeps the second derivative of lam where the Hessian is indefinite
+  Mask gauss_newton{};   // never has it
+  Mask unbounded{};      // knows no bounds
+};
+
 // What a sweep finds besides the feedback law.
 struct Sweep {
   Vec projected;   // projected gradient in units of the gradient, with the curvature as the scale of the bounds
@@ -62,6 +70,7 @@ class Riccati {
   Vec* largest_action;             // of each action, over the stages
   Vec *row_terms, *row_violation;  // of each constraint, the largest over the stages
   Mask* active;
+  Newton newton;
   Sweep found;
 
  public:
@@ -96,10 +105,9 @@ class Riccati {
     return {P[at], p[at], v[at]};
   }
 
-  // Around the trajectory `at`. The solver adds `regularisation` to the curvature of contacts and actions; lanes that
-  // are `stubborn` keep the second derivative of lam where the Hessian is indefinite.
-  Mask unbounded{}, gauss_newton{};
-  Sweep sweep(const Trajectory<S>& at, const Upstream<S>& upstream, Vec regularisation, Mask stubborn) {
+  // Around the trajectory `at`.
+  Sweep sweep(const Trajectory<S>& at, const Upstream<S>& upstream, const Newton& how = {}) {
+    newton = how;
     found = {all(0), all(0), all(0), all(0), all(0), Mask{}};
     for (int64_t i = 0; i < n.c(); i++) row_terms[i] = row_violation[i] = all(0);
     for (int64_t j = 0; j < n.u() && problem.batch.unbounded; j++) {
@@ -110,13 +118,13 @@ class Riccati {
     for (int64_t k = n.h - 1; k >= 0; k--) {
       const StageData<T, S> data = problem.stage(k);
       const Value<S> next = value(k + 1);
-      const Stage<S> stage = linearisation.at(k, at.lam[k], at.s[k], next.p, regularisation);
+      const Stage<S> stage = linearisation.at(k, at.lam[k], at.s[k], next.p, newton.regularisation);
       constraints(k, data, at.x[k], at.u[k]);
       stage_hessian(k, data, stage, next.P);
       const Vec* lam_bar = kAdjoint ? upstream.lam[k] : nullptr;
-      actions(k, data, stage, next, at.x[k], at.u[k], kAdjoint ? upstream.u[k] : nullptr, lam_bar, regularisation);
+      actions(k, data, stage, next, at.x[k], at.u[k], kAdjoint ? upstream.u[k] : nullptr, lam_bar);
       states(k, data, stage, next, at.x[k], at.u[k], kAdjoint ? upstream.x[k] : nullptr, lam_bar);
-      factor(data, regularisation, stubborn);
+      factor(data);
       if (!kAdjoint) step_within_bounds(k, data, at.u[k]);
       feedback_law(k);
     }
@@ -203,7 +211,7 @@ class Riccati {
 
   // Reduced gradient of the actions of stage k, linear terms, and which actions are held at a bound.
   void actions(int64_t k, const StageData<T, S>& data, const Stage<S>& stage, const Value<S>& next, const Vec* x,
-               const Vec* u, const Vec* u_bar, const Vec* lam_bar, Vec regularisation) {
+               const Vec* u, const Vec* u_bar, const Vec* lam_bar) {
     const int64_t nx = n.x(), nu = n.u();
     const double& barrier = problem.batch.barrier;  // a reference: from a copy GCC 12 makes two loops, and fails on one
     const Vec mu = problem.mu;
@@ -265,7 +273,7 @@ class Riccati {
       } else {
         // Next to a bound that the action's own Newton step would cross it is put onto the bound (Bertsekas).
         // Not after a failed step: the jump is not damped, and in an unstable system it can cost more than it gains.
-        const Vec step = g / gauss_newton, near = select(regularisation > 0, all(1e-12), all(1e-2)) * width;
+        const Vec step = g / gauss_newton, near = select(newton.regularisation > 0, all(1e-12), all(1e-2)) * width;
         lower(k, j) = (below <= near) & (step >= below) & (g > 0);
         upper(k, j) = (above <= near) & (-step >= above) & (g < 0);
       }
@@ -301,20 +309,20 @@ class Riccati {
 
   // Cholesky of H_uu + Y_uu + regularisation with identity rows for active actions. An indefinite block first drops
   // what is negative in Y at this stage, then has its pivots lifted; lanes that are `stubborn` lift them at once.
-  void factor(const StageData<T, S>& data, Vec regularisation, Mask stubborn) {
+  void factor(const StageData<T, S>& data) {
     const int64_t nx = n.x(), nu = n.u();
-    if (!kAdjoint && any(gauss_newton)) linearisation.drop(gauss_newton);
+    if (!kAdjoint && any(newton.gauss_newton)) linearisation.drop(newton.gauss_newton);
     for (int attempt = 0; attempt < 2; attempt++) {
       for (int64_t i = 0; i < nu; i++)
         for (int64_t j = 0; j <= i; j++) {
           Vec t = H(nx + i, nx + j) + linearisation.curvature(nx + i, nx + j);
-          if (i == j && !kAdjoint) t += kActionDamping * regularisation * action_scale(data, j) + flat[j];
+          if (i == j && !kAdjoint) t += kActionDamping * newton.regularisation * action_scale(data, j) + flat[j];
           H_uu(i, j) = t;
         }
       const Mask failed = cholesky(data, attempt == 0);
       if (kAdjoint) found.weak |= failed;
       if (kAdjoint || !any(failed) || attempt == 1) break;
-      linearisation.make_convex(failed & ~stubborn);
+      linearisation.make_convex(failed & ~newton.stubborn);
     }
   }
 
@@ -374,7 +382,7 @@ class Riccati {
       Vec length = all(1);
       for (int64_t i = 0; i < nu; i++) {
         const Vec room = select(toward[i] > 0, data.u_max[i], data.u_min[i]) - u[i] - d[i];
-        const Mask crosses = bounded ? (abs(toward[i]) > abs(room)) & ~active[i] & ~unbounded : Mask{};
+        const Mask crosses = bounded ? (abs(toward[i]) > abs(room)) & ~active[i] & ~newton.unbounded : Mask{};
         share[i] = select(crosses, room / toward[i], all(2));
         length = min(length, share[i]);
       }

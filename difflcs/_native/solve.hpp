@@ -42,6 +42,7 @@ constexpr int64_t kFailures = 12;
 // rounding.
 constexpr int64_t kStill = 8;
 constexpr double kNothing = 1e-12;
+constexpr double kLetGo[] = {1.0, 10.0, 100.0, 1000.0};
 // The least projected gradient that is asked for then.
 constexpr double kInVain = 1e-8;
 
@@ -78,13 +79,13 @@ class Solver {
 
   // The problems in the lanes, and how far each has come.
   struct Lane {
-    int64_t element;  // -1: idle
-    int64_t iterations, in_stage, failures;
-    double violated;  // at the last step of the multipliers
-    double left;      // projected gradient after that; 0 where it is not known yet
-    int64_t stalled;  // steps of the multipliers in a row that hardly helped
-    double gained;    // by the last step
-    int64_t still;    // steps at the target in a row that gained no more than the rounding of the cost
+    int64_t element = -1;  // -1: idle
+    int64_t iterations = 0, in_stage = 0, failures = 0;
+    double violated = 1e300;  // at the last step of the multipliers
+    double left = 0;          // projected gradient after that; 0 where it is not known yet
+    int64_t stalled = 0;      // steps of the multipliers in a row that hardly helped
+    double gained = 0;        // by the last step
+    int64_t still = 0;        // steps at the target in a row that gained no more than the rounding of the cost
   };
   Lane lane[kLanes];
   Vec eps, regularisation, J;
@@ -175,10 +176,11 @@ class Solver {
   bool take(const MpcSolve& o, int64_t* counter, int l) {
     const int64_t e = __atomic_fetch_add(counter, int64_t{1}, __ATOMIC_RELAXED);
     const int64_t nu = n.u(), actions = n.h * nu, forces = n.h * n.l();
-    lane[l] = {e < batch.count ? e : -1, 0, 0, 0, 1e300, 0, 0, 0, 0};
+    lane[l] = {};
     fresh[l] = -1, released[l] = plain[l] = 0;
     eps[l] = batch.relaxation, regularisation[l] = 0;
     if (e >= batch.count) return false;
+    lane[l].element = e;
     released[l] = o.start[e].released ? -1 : 0;
     plain[l] = o.start[e].gauss_newton ? -1 : 0;
     if (!released[l]) eps[l] = first_relaxation(o.start[e], o.scale ? o.scale[e] : 0);
@@ -266,10 +268,7 @@ class Solver {
       double tol = o.tol > sweep.rounding[l] ? o.tol : sweep.rounding[l];
       // A search that fails this close to the optimum has met the rounding of the cost.
       const bool stuck = a.failures >= kFailures || a.still >= 4 * kStill;
-      const double patience = stuck || a.still >= 3 * kStill ? 1e3
-                              : a.still >= 2 * kStill        ? 1e2
-                              : a.still >= kStill            ? 10.0
-                                                             : 1.0;
+      const double patience = kLetGo[stuck ? 3 : a.still / kStill];
       if (patience > 1 && tol < kInVain) tol = kInVain;
       const bool stationary = sweep.projected[l] <= patience * tol && sweep.stationary[l] <= patience * kStationary;
       const bool converged = stationary && met(sweep, l);
@@ -394,8 +393,7 @@ void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
     // Gauss-Newton can creep along a curved valley: after 20 steps in one stage every other one keeps the curvature.
     Mask stubborn;
     for (int l = 0; l < kLanes; l++) stubborn[l] = lane[l].in_stage > 20 && lane[l].in_stage % 2 ? -1 : 0;
-    riccati.unbounded = released, riccati.gauss_newton = plain;
-    const Sweep sweep = riccati.sweep(at, {}, regularisation, stubborn);
+    const Sweep sweep = riccati.sweep(at, {}, {regularisation, stubborn, plain, released});
     const Mask frozen = finish(o, sweep, counter, idle, live);
     if (live == 0) break;
     Vec step, gain;
