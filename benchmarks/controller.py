@@ -9,7 +9,6 @@ compares what on_failure does. At real-time priority (`chrt -f 50 python …`) o
 from __future__ import annotations
 
 import csv
-import json
 import re
 import subprocess
 import tempfile
@@ -22,7 +21,7 @@ import torch
 import tyro
 
 from difflcs import LCSModel
-from difflcs.bench import cpu
+from difflcs.bench import cpu, save
 from difflcs.export import export_controller
 from difflcs.mpc import MPCController
 from difflcs.rl.tasks import get_task
@@ -147,7 +146,7 @@ def main(o: Options) -> None:
             print(f"  {on_failure:10} deadline {limit}: squared error {result['error']:.1f}, "
                   f"{100 * result['unsolved']:.0f} % of the steps not solved")  # fmt: skip
     if not o.smoke:
-        o.out.write_text(json.dumps(found, indent=2) + "\n")
+        save(o.out, found)
 
 
 if __name__ == "__main__":

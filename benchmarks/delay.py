@@ -13,7 +13,6 @@ share of what "late" loses against "on time" that each way gives back. Written a
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Callable
@@ -25,9 +24,7 @@ import torch
 import tyro
 from torch import Tensor
 
-import difflcs
-from difflcs._native import _kernels
-from difflcs.bench import cpu
+from difflcs.bench import machine, save
 from difflcs.rl import collect, get_task, wilson_interval
 from difflcs.rl.delay import late_actions, predicted_by
 from difflcs.rl.rollout import Act, mpc_actions
@@ -138,14 +135,11 @@ def main(o: Options) -> None:
             f"{1e3 * row.median_position_error:.1f} mm, {row.median_yaw_error:.3f} rad"
         )
     record = {
-        "machine": {"cpu": cpu(), "cores": os.cpu_count(), "instruction set": _kernels.isa()},
-        "version": difflcs.__version__,
+        "machine": {**machine(), "cores": os.cpu_count()},
         "options": {"model": str(o.model), "goals": o.goals, "seed": o.seed, "delay": o.delay, "envs": o.envs},
         "results": {name: asdict(row) for name, row in rows.items()},
     }
-    o.out.parent.mkdir(parents=True, exist_ok=True)
-    o.out.write_text(json.dumps(record, indent=2) + "\n")
-    print(f"written to {o.out}")
+    save(o.out, record)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ needs an idle machine.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import platform
 import sys
@@ -25,6 +24,7 @@ import mujoco
 import numpy as np
 
 import difflcs_envs
+from difflcs.bench import save
 from difflcs_envs.trifinger.env import TriFingerEnv
 from difflcs_envs.trifinger.native import NATIVE_VARIABLE
 from difflcs_envs.trifinger.physics import SUBSTEPS
@@ -161,9 +161,7 @@ def main() -> None:
     if record["render_ms"] is not None:
         print(f"picture of 320 x 240: {record['render_ms']:.1f} ms")
     if not options.smoke:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(json.dumps(record, indent=1) + "\n")
-        print(f"written: {options.out}")
+        save(options.out, record)
 
 
 if __name__ == "__main__":

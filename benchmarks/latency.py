@@ -16,9 +16,7 @@ time too.
 
 from __future__ import annotations
 
-import json
 import os
-import platform
 import time
 import warnings
 from collections.abc import Callable
@@ -31,10 +29,9 @@ import torch
 import tyro
 from torch import Tensor
 
-import difflcs
 from difflcs import LCSModel, LCSMPCLayer, LCSParams, MPCSolution, QuadraticCost
 from difflcs._native import _kernels
-from difflcs.bench import ACTION_LIMIT, cpu, pushing_cost, states_and_goals
+from difflcs.bench import ACTION_LIMIT, machine, pushing_cost, save, states_and_goals
 from difflcs.errors import DegenerateWarning
 from difflcs.mpc.backends import batched
 from difflcs.mpc.solution import Primal
@@ -244,14 +241,11 @@ def main(o: Options) -> None:
                     f"{row['p50 to kernel']:6.2f} × kernel   {row['over kernel µs']:+7.0f} µs"
                 )
     record = {
-        "machine": {"cpu": cpu(), "cores": os.cpu_count(), "instruction set": _kernels.isa()},
-        "versions": {"python": platform.python_version(), "torch": torch.__version__, "difflcs": difflcs.__version__},
+        "machine": {**machine(), "cores": os.cpu_count()},
         "options": {"calls": total, "episodes": o.episodes, "warm_up": o.warm_up, "seed": o.seed},
         "results": results,
     }
-    o.out.parent.mkdir(parents=True, exist_ok=True)
-    o.out.write_text(json.dumps(record, indent=2, ensure_ascii=False) + "\n")
-    print(f"written to {o.out}")
+    save(o.out, record)
 
 
 if __name__ == "__main__":

@@ -19,10 +19,13 @@ __all__ = [
     "FAMILIES",
     "MODELS",
     "Instance",
+    "cart_states",
     "chain_of_carts",
+    "push_the_last_cart",
     "pushing_model",
     "random_model",
     "states_and_goals",
+    "uniform",
     "untrained_model",
 ]
 
@@ -59,6 +62,23 @@ def chain_of_carts(carts: int, dt: float = 0.05, stiffness: float = 100.0) -> LC
     return LCSParams(A=A, B=B, C=C, d=zero, D=measured @ A, E=measured @ B, F=F, c=c)
 
 
+def push_the_last_cart(carts: int, horizon: int, others: float = 0.0) -> QuadraticCost:
+    """Cost of the last cart's distance to 0.3 m further, with little on the first and `others` on those between."""
+    weight = torch.full((2 * carts,), 0.01, dtype=torch.float64)
+    weight[1:carts] = others
+    weight[0], weight[carts - 1] = 0.1, 10.0
+    q = torch.zeros(2 * carts, dtype=torch.float64)
+    q[carts - 1] = -0.3 * 10.0
+    missed = torch.tensor(0.5 * 10.0 * 0.3**2 * (horizon + 10), dtype=torch.float64)
+    Q = torch.diag(weight)
+    return QuadraticCost(Q, _diagonal(1e-4), 10 * Q, q=q, q_final=10 * q, constant=missed)
+
+
+def cart_states(carts: int, count: int, seed: int) -> Tensor:
+    """States of a chain of carts, some of which touch or overlap."""
+    return uniform([0.3] * carts + [0.5] * carts, count, seed)
+
+
 @dataclass(frozen=True)
 class Instance:
     """A batch of problems: what `LCSMPCLayer` is built with, and what it is called with."""
@@ -67,7 +87,8 @@ class Instance:
     call: tuple[Tensor, ...]
 
 
-def _uniform(size: list[float], count: int, seed: int) -> Tensor:
+def uniform(size: list[float], count: int, seed: int) -> Tensor:
+    """States (count, n_x) between −size and size."""
     generator = torch.Generator().manual_seed(seed)
     half = torch.tensor(size, dtype=torch.float64)
     return half * (2 * torch.rand(count, len(size), generator=generator, dtype=torch.float64) - 1)
@@ -97,21 +118,14 @@ def _cart_pole(horizon: int, dt: float, stiffness: float, count: int) -> Instanc
     """Stay upright, or lean on a wall."""
     lcs = cart_pole_between_walls(dt=dt, wall_stiffness=stiffness)
     cost = QuadraticCost(_diagonal(1, 1, 0.1, 0.1), _diagonal(0.01), _diagonal(100, 100, 1, 1))
-    x0 = _uniform([0.02, 0.05, 0.1, 0.3], count, horizon)
+    x0 = uniform([0.02, 0.05, 0.1, 0.3], count, horizon)
     return Instance({"lcs": lcs, "cost": cost, "horizon": horizon, "u_min": -10.0, "u_max": 10.0}, (x0,))
 
 
 def _chain(carts: int, horizon: int, dt: float, stiffness: float, count: int) -> Instance:
     """Push the last cart 0.3 m further, through all others."""
-    weight = torch.full((2 * carts,), 0.01, dtype=torch.float64)
-    weight[:carts] = 0.0
-    weight[0], weight[carts - 1] = 0.1, 10.0
-    q = torch.zeros(2 * carts, dtype=torch.float64)
-    q[carts - 1] = -0.3 * 10.0
-    missed = torch.tensor(0.5 * 10.0 * 0.3**2 * (horizon + 10), dtype=torch.float64)
-    Q = torch.diag(weight)
-    cost = QuadraticCost(Q, _diagonal(1e-4), 10 * Q, q=q, q_final=10 * q, constant=missed)
-    x0 = _uniform([0.3] * carts + [0.5] * carts, count, carts + horizon)
+    cost = push_the_last_cart(carts, horizon)
+    x0 = cart_states(carts, count, carts + horizon)
     lcs = chain_of_carts(carts, dt, stiffness)
     return Instance({"lcs": lcs, "cost": cost, "horizon": horizon, "u_min": -50.0, "u_max": 50.0}, (x0,))
 

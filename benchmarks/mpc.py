@@ -6,7 +6,6 @@ through the same layer, on the same problems, on one core; absolute times of a s
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 from collections.abc import Callable
@@ -22,7 +21,7 @@ from models import ACTION_LIMIT, MODELS, pushing_model, states_and_goals
 import difflcs
 from difflcs import LCSModel, LCSMPCLayer, LCSParams, solve_lcp, violation_loss
 from difflcs._native import _kernels
-from difflcs.bench import best, cpu
+from difflcs.bench import best, cpu, save
 from difflcs.mpc.backends import BatchedBackend, IpoptBackend
 from difflcs_envs.tasks import pushing_cost
 
@@ -235,12 +234,10 @@ def main(o: Options) -> None:
         },
         "results": numbers,
     }
-    o.out.parent.mkdir(parents=True, exist_ok=True)
-    o.out.write_text(json.dumps(record, indent=2) + "\n")
     print(f"{record['machine']['cpu']}, {_kernels.isa()}, one core, batch {o.batch}; IPOPT on {o.ipopt_batch}")
     for row in rows:
         print(f"{row[0]:56s} {row[1]:>14s}   {row[2]}")
-    print(f"written to {o.out}")
+    save(o.out, record)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ within 0.1 % of it, what failed, and the CPU time as a ratio to one start. Writt
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ import tyro
 from models import FAMILIES, Instance
 
 from difflcs import LCSMPCLayer
+from difflcs.bench import machine, save
 from difflcs.mpc.backends import Backend, BatchedBackend
 
 EFFORTS: dict[str, Backend] = {
@@ -104,9 +104,7 @@ def main(o: Options) -> None:
                 f"  {name:8s} mean gap {100 * row['mean gap']:7.3f} %   within 0.1 % of best "
                 f"{100 * row['within 0.1 % of best']:5.1f} %   failed {row['failed']}   time {row['time']:.2f}×"
             )
-    o.out.parent.mkdir(parents=True, exist_ok=True)
-    o.out.write_text(json.dumps({"problems per model": o.problems, "results": results}, indent=2) + "\n")
-    print(f"written to {o.out}")
+    save(o.out, {"machine": machine(), "problems per model": o.problems, "results": results})
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ can be met, and they act.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -31,7 +30,7 @@ from difflcs import (
     QuadraticCost,
     StageBounds,
 )
-from difflcs.bench import pushing_cost
+from difflcs.bench import pushing_cost, save
 from difflcs.mpc.backends import BatchedBackend
 
 
@@ -167,9 +166,7 @@ def main(o: Options) -> None:
             print(f"  {name:30s}" + "".join(f"  {kind} {value:5.2f}" for kind, value in ratio.items()))
         for name, found in results[size]["constraints"].items():
             print(f"  {name}: {', '.join(f'{kind} {value:.3g}' for kind, value in found.items())}")
-    o.out.parent.mkdir(parents=True, exist_ok=True)
-    o.out.write_text(json.dumps({"problems": o.problems, "results": results}, indent=2) + "\n")
-    print(f"written to {o.out}")
+    save(o.out, {"problems": o.problems, "results": results})
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import subprocess
 import sys
 import tempfile
@@ -26,8 +25,7 @@ from race_problems import small, with_contact, without_contact
 from rivals.problem import Problem
 
 from difflcs import LCSMPCLayer, LCSParams, QuadraticCost
-from difflcs._native import _kernels
-from difflcs.bench import cpu
+from difflcs.bench import machine, save
 from difflcs.mpc import kkt
 from difflcs.mpc.backends import BatchedBackend, IpoptBackend
 from difflcs.mpc.problem import MPCProblem
@@ -474,20 +472,17 @@ def main(o: Options) -> None:
     if o.smoke:
         o.problems, o.batch, o.linear_batch, o.small_problems, o.seeds, o.rounds, o.nodes = 2, 3, 3, 1, 1, 1, 300
     torch.set_num_threads(1)
-    machine = {"cpu": cpu(), "instruction set": _kernels.isa(), "python": platform.python_version()}
     options = {
         n: getattr(o, n) for n in ("problems", "batch", "linear_batch", "small_problems", "seeds", "rounds", "nodes")
     }
     results = json.loads(o.out.read_text())["results"] if o.out.exists() else {}
-    o.out.parent.mkdir(parents=True, exist_ok=True)
     for name in o.parts:
         if name == "global":
             results["global"] = globally(o)
         else:
             results |= dict(race(name, o))
-        record = {"machine": machine, "options": options, "results": results}
-        o.out.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n")
-    print(f"written to {o.out}")
+        record = {"machine": machine(), "options": options, "results": results}
+        save(o.out, record)
 
 
 if __name__ == "__main__":

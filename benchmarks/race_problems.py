@@ -7,7 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from models import ACTION_LIMIT, chain_of_carts, pushing_model, states_and_goals
+from models import (
+    ACTION_LIMIT,
+    cart_states,
+    chain_of_carts,
+    push_the_last_cart,
+    pushing_model,
+    states_and_goals,
+    uniform,
+)
 from rivals.problem import Problem
 
 from difflcs import LCSModel, LCSParams, QuadraticCost
@@ -15,6 +23,7 @@ from difflcs.bench import pushing_cost
 from difflcs.systems import block_along_wall, cart_pole_between_walls
 
 RELAXATION = 1e-5
+STATES = 77  # what is added to a seed for the states, so that they are not drawn as the models are
 
 
 def problem(lcs: LCSParams, cost: QuadraticCost, x0: torch.Tensor, horizon: int, limit: float, seed: int) -> Problem:
@@ -36,33 +45,18 @@ def pushing(lcs: LCSParams, count: int, seed: int, horizon: int = 5) -> Problem:
     return problem(lcs, pushing_cost()(goal, horizon), x0, horizon, ACTION_LIMIT, seed)
 
 
-def uniform(size: list[float], count: int, seed: int) -> torch.Tensor:
-    """States between −size and size."""
-    half = torch.tensor(size, dtype=torch.float64)
-    draw = torch.rand(count, len(size), generator=torch.Generator().manual_seed(seed + 77), dtype=torch.float64)
-    return (2 * draw - 1) * half
-
-
 def cart_pole(count: int, horizon: int, seed: int) -> Problem:
     """The cart-pole between soft walls, pushed with up to 20 N."""
     weight = torch.diag(torch.tensor([1.0, 10.0, 0.1, 0.1], dtype=torch.float64))
     cost = QuadraticCost(Q=weight, R=0.01 * torch.eye(1, dtype=torch.float64), Q_final=10 * weight)
-    x0 = uniform([0.3, 0.4, 1.0, 2.0], count, seed)
+    x0 = uniform([0.3, 0.4, 1.0, 2.0], count, seed + STATES)
     return problem(cart_pole_between_walls(), cost, x0, horizon, 20.0, seed)
 
 
 def chain(count: int, carts: int, horizon: int, seed: int) -> Problem:
     """Push the last cart 0.3 m further, through all others, with up to 50 N."""
-    weight = torch.full((2 * carts,), 0.01, dtype=torch.float64)
-    weight[1:carts] = 0.0
-    weight[0], weight[carts - 1] = 0.1, 10.0
-    q = torch.zeros(2 * carts, dtype=torch.float64)
-    q[carts - 1] = -3.0
-    R = 1e-4 * torch.eye(1, dtype=torch.float64)
-    missed = torch.tensor(0.5 * 10.0 * 0.3**2 * (horizon + 10), dtype=torch.float64)
-    Q = torch.diag(weight)
-    cost = QuadraticCost(Q=Q, R=R, Q_final=10 * Q, q=q, q_final=10 * q, constant=missed)
-    x0 = uniform([0.3] * carts + [0.5] * carts, count, seed)
+    cost = push_the_last_cart(carts, horizon)
+    x0 = cart_states(carts, count, seed + STATES)
     return problem(chain_of_carts(carts), cost, x0, horizon, 50.0, seed)
 
 
@@ -117,7 +111,7 @@ def block(count: int, horizon: int, seed: int) -> Problem:
     eye = torch.eye(2, dtype=torch.float64)
     missed = torch.tensor(0.5 * 100.0 * 0.05**2 * (horizon + 10), dtype=torch.float64)
     cost = QuadraticCost(Q=weight, R=eye, Q_final=10 * weight, q=q, q_final=10 * q, constant=missed)
-    x0 = uniform([0.02, 0.01, 0.02, 0.02], count, seed)
+    x0 = uniform([0.02, 0.01, 0.02, 0.02], count, seed + STATES)
     x0[:, 1] = x0[:, 1].abs()
     x0[:, 2] -= 0.04
     return problem(block_along_wall(), cost, x0, horizon, 0.05, seed)

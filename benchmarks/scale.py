@@ -13,22 +13,21 @@ of all starts of a problem. Written as JSON too.
 
 from __future__ import annotations
 
-import json
 import time
-import warnings
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 import tyro
-from models import chain_of_carts, random_model
+from models import cart_states, chain_of_carts, push_the_last_cart, random_model
 
-from difflcs import LCSMPCLayer, LCSParams, QuadraticCost
-from difflcs.errors import SolveWarning
+from difflcs import LCSParams, QuadraticCost
+from difflcs.bench import save
 from difflcs.mpc import MPCProblem
 from difflcs.mpc.backends import BatchedBackend
 
+RELAXATION = 1e-5
 # n_x, n_lam, H
 RANDOM = [
     *[(9, n_lam, 10) for n_lam in (2, 5, 8, 12, 20, 30)],
@@ -72,12 +71,11 @@ class Row:
 
 def posed(lcs: LCSParams, cost: QuadraticCost, horizon: int, limit: float, x0: torch.Tensor) -> MPCProblem:
     """The problem that the layer would hand to a backend."""
-    mpc = LCSMPCLayer(
-        lcs, cost, horizon, -limit, limit, backend=BatchedBackend(effort="fast", max_iter=1), on_failure="mask"
+    bound = torch.full((lcs.n_u,), limit, dtype=torch.float64)
+    fields = {name: getattr(cost, name) for name in ("Q", "R", "Q_final", "q", "r", "q_final")}
+    return MPCProblem(
+        **lcs.tensors(), **fields, u_min=-bound, u_max=bound, x0=x0, horizon=horizon, relaxation=RELAXATION
     )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", SolveWarning)  # only the problem is wanted
-        return mpc(x0).problem
 
 
 def random_problem(n_x: int, n_lam: int, horizon: int, count: int, seed: int) -> MPCProblem:
@@ -92,14 +90,8 @@ def random_problem(n_x: int, n_lam: int, horizon: int, count: int, seed: int) ->
 def carts_problem(carts: int, horizon: int, count: int) -> MPCProblem:
     """Push the last cart 0.3 m further, through all others."""
     lcs = chain_of_carts(carts, dt=0.1)
-    weight = torch.full((2 * carts,), 0.01, dtype=torch.float64)
-    weight[:carts], weight[carts - 1] = 0.1, 10.0
-    q = torch.zeros(2 * carts, dtype=torch.float64)
-    q[carts - 1] = -0.3 * 10.0
-    Q = torch.diag(weight)
-    cost = QuadraticCost(Q, 1e-4 * torch.eye(1, dtype=torch.float64), 10 * Q, q=q, q_final=10 * q)
-    draw = torch.rand(count, 2 * carts, generator=torch.Generator().manual_seed(carts), dtype=torch.float64)
-    x0 = (2 * draw - 1) * torch.tensor([0.3] * carts + [0.5] * carts, dtype=torch.float64)
+    cost = push_the_last_cart(carts, horizon, others=0.1)
+    x0 = cart_states(carts, count, carts)
     return posed(lcs, cost, horizon, 50.0, x0)
 
 
@@ -165,15 +157,13 @@ def main(o: Options) -> None:
     print(f"time per iteration grows as H^{by_horizon:.2f}, and as n^{by_size:.2f} where all sizes grow together")
     solved = sum(row.solved * row.problems for row in rows) / sum(row.problems for row in rows)
     print(f"solved in all: {100 * solved:.2f} %")
-    o.out.parent.mkdir(parents=True, exist_ok=True)
     result = {
         "exponent of H": by_horizon,
         "exponent of n": by_size,
         "solved": solved,
         "rows": [asdict(r) for r in rows],
     }
-    o.out.write_text(json.dumps(result, indent=2) + "\n")
-    print(f"written to {o.out}")
+    save(o.out, result)
 
 
 if __name__ == "__main__":

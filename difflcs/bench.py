@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import platform
 import time
 from collections.abc import Callable, Sequence
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 
 import difflcs
-from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSParams
+from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSParams, _files
 from difflcs._checks import check_positive_int
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.mpc.backends import BatchedBackend, IpoptBackend
@@ -130,6 +131,12 @@ def best(repeats: int, work: Callable[[], object]) -> float:
         work()
         times.append(time.perf_counter() - start)
     return min(times)
+
+
+def save(path: Path, record: dict) -> None:
+    """Write what a benchmark has measured as JSON, atomically; its keys stay in their order."""
+    _files.write_atomically(path, (json.dumps(record, indent=2, ensure_ascii=False) + "\n").encode())
+    print(f"written to {path}")
 
 
 def machine() -> dict[str, str]:
