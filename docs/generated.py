@@ -8,8 +8,7 @@ A line `<!-- generated: KIND ARGUMENTS -->` of a page is replaced by Markdown th
 - `docstring OBJECT`: a docstring that is written in Markdown, as those of the environments.
 - `api MODULE [NAME ...]`: the reference of these public names of a module, or of all that are in its `__all__`.
 - `file PATH`: another Markdown file of the repository, without its title.
-- `optima`: a table of `benchmarks/results/optima.json`.
-- `race PART`: a table of `benchmarks/results/race.json`; race_tables.py says which parts there are.
+- `table RECORD PART`: a table of `benchmarks/results/RECORD.json`; tables.py says which there are.
 
 Besides, the notebooks of tutorials/ are copied to docs/tutorials, and docstrings are mended for reStructuredText.
 """
@@ -293,29 +292,16 @@ def repository_file(path: str) -> str:
     return "".join(p if k % 2 else links.sub(link, p) for k, p in enumerate(parts))
 
 
-def race(part: str) -> str:
-    """Markdown: a table of the race."""
-    place = DOCS / "race_tables.py"
-    spec = importlib.util.spec_from_file_location("race_tables", place)
+def table(record: str, part: str) -> str:
+    """Markdown: a table of what a benchmark has measured."""
+    place = DOCS / "tables.py"
+    spec = importlib.util.spec_from_file_location("tables", place)
     assert spec
     assert spec.loader
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return module.TABLES[part](json.loads((ROOT / "benchmarks" / "results" / "race.json").read_text()))
-
-
-def optima() -> str:
-    """Markdown: which optima each effort of the batched backend reaches."""
-    found = json.loads((ROOT / "benchmarks" / "results" / "optima.json").read_text())["results"]
-    efforts = ("fast", "default", "best")
-    lines = ["| problems | " + " | ".join(f'`"{effort}"`' for effort in efforts) + " |", "|---" * 4 + "|"]
-    for kind, row in found.items():
-        cells = (
-            f"{100 * row[e]['mean gap']:.2g} % ({100 * row[e]['within 0.1 % of best']:.0f} %), {row[e]['time']:.1f}×"
-            for e in efforts
-        )
-        lines.append(f"| {kind} ({row['problems']}) | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+    found = json.loads((ROOT / "benchmarks" / "results" / f"{record}.json").read_text())
+    return module.TABLES[record][part](found)
 
 
 def copy_tutorials() -> None:
@@ -350,8 +336,7 @@ KINDS: dict[str, Callable[..., str]] = {
     "docstring": docstring,
     "api": api,
     "file": repository_file,
-    "race": race,
-    "optima": optima,
+    "table": table,
 }
 
 

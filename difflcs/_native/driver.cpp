@@ -306,15 +306,15 @@ void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
   if (kept) run(jobs, o, runner);
 
   std::fill_n(out.status, count, kUnreached), std::fill_n(out.iterations, count, 0);
-  for (int64_t j = 0; j < effort.starts * count; j++) out.iterations[j % count] += tried.iterations[j];
-  for (int64_t i = 0; i < kept; i++) {
-    const int64_t e = origin[i] % count;
-    out.iterations[e] += finished.iterations[i];
-    if (finished.status[i] == kUnreached) continue;
-    const bool better =
-        solved(finished.status[i]) && (!solved(out.status[e]) || finished.objective[i] < out.objective[e]);
-    if (out.status[e] == kUnreached || better) copy_plan(n, finished.plans(), i, out, e);
-  }
+  const auto consider = [&](const MpcPlans& from, int64_t i, int64_t e, bool only_solved) {
+    out.iterations[e] += from.iterations[i];
+    const bool better = solved(from.status[i]) && (!solved(out.status[e]) || from.objective[i] < out.objective[e]);
+    const bool some = out.status[e] == kUnreached && from.status[i] != kUnreached && !only_solved;
+    if (better || some) copy_plan(n, from, i, out, e);
+  };
+  for (int64_t i = 0; i < kept; i++) consider(finished.plans(), i, origin[i] % count, false);
+  // Some were solved before they were compared.
+  for (int64_t j = 0; j < effort.starts * count; j++) consider(tried.plans(), j, j % count, true);
   for (int64_t e = 0; e < count; e++) {
     if (out.status[e] != kUnreached) continue;
     if (best[e] >= 0) {  // out of time after its starts were compared

@@ -167,7 +167,7 @@ def test_a_damaged_file_is_an_error_in_words(exported, robot, tmp_path):
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="symbols are listed on Linux")
 def test_nothing_but_the_header_is_to_be_seen(installed):
     if shutil.which("nm") is None:
-        pytest.skip("nm is not here")
+        pytest.skip("the symbols of a library are listed by nm, of binutils, which is not here")
     (library,) = installed.rglob("libdifflcs.so")
     symbols = {line.split()[-1] for line in call("nm", "-D", "--defined-only", library).splitlines()}
     header = next(installed.rglob("difflcs.h")).read_text()

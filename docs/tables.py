@@ -1,4 +1,4 @@
-"""Tables of the page race.md, from what `benchmarks/race.py` wrote."""
+"""Tables of the documentation, from what the benchmarks wrote into benchmarks/results."""
 
 from __future__ import annotations
 
@@ -150,7 +150,80 @@ def machine(record: dict) -> str:
     )
 
 
-TABLES: dict[str, Callable[[dict], str]] = {
+def efforts(record: dict) -> str:
+    """Which optima each effort of the batched backend reaches: mean gap, share within 0.1 %, time in parts of one start's."""
+    names = ("fast", "default", "best")
+    rows = [
+        [f"{kind} ({row['problems']})"]
+        + [
+            f"{100 * row[e]['mean gap']:.2g} % ({100 * row[e]['within 0.1 % of best']:.0f} %), {row[e]['time']:.1f}×"
+            for e in names
+        ]
+        for kind, row in record["results"].items()
+    ]
+    return table(["problems", *(f'`"{name}"`' for name in names)], rows)
+
+
+def sizes(record: dict) -> str:
+    """Share of problems solved, and iterations, by size and horizon."""
+    horizons = sorted({row["horizon"] for row in record["rows"]})
+    found: dict[str, dict[int, str]] = {}
+    for row in record["rows"]:
+        label = f"{row['family']}, n_x {row['n_x']}, n_lam {row['n_lam']}"
+        cell = f"{100 * row['solved']:.0f} %, {row['iterations']:.0f}"
+        found.setdefault(label, {})[row["horizon"]] = cell
+    rows = [[label, *(cells.get(h, "") for h in horizons)] for label, cells in found.items()]
+    return table(["problems", *(f"H {h}" for h in horizons)], rows)
+
+
+WAYS = {
+    "kernel": "the kernel alone",
+    "controller": "controller",
+    "layer": "layer, no gradient",
+    "layer and gradient": "layer and gradient",
+}
+
+
+def latency(record: dict) -> str:
+    """Median and 99th percentile of a call, and the median as a multiple of the kernel's."""
+    robots = record["results"]
+    rows = []
+    for way, label in WAYS.items():
+        cells = []
+        for robot in robots.values():
+            row = robot[way]
+            ratio = "" if way == "kernel" else f", {number(row['p50 to kernel'])}×"
+            cells.append(f"{row['p50 µs']:.0f} / {row['p99 µs']:.0f} µs{ratio}")
+        rows.append([label, *cells])
+    return table(["", *robots], rows)
+
+
+LATE = {
+    "on time": "on time",
+    "idle first": "on time, but idle in the first step",
+    "late": "one step late",
+    "late, predicted": "one step late, planned from the predicted state",
+}
+
+
+def delay(record: dict) -> str:
+    """Success of actions that come late, and how far it is from that of late ones."""
+    rows = []
+    for way, label in LATE.items():
+        row = record["results"][way]
+        more, half = (100 * v for v in row["to_late"])
+        rows.append(
+            [
+                label,
+                f"{100 * row['success_rate']:.1f} %",
+                f"{100 * row['ci_low']:.1f} to {100 * row['ci_high']:.1f}",
+                "" if way == "late" else f"{more:+.1f} ± {half:.1f} points",
+            ]
+        )
+    return table(["", "success", "95 % interval", "against late"], rows)
+
+
+RACE: dict[str, Callable[[dict], str]] = {
     "times": times("contact"),
     "optima": optima,
     "gradients": gradients("contact"),
@@ -160,4 +233,13 @@ TABLES: dict[str, Callable[[dict], str]] = {
     "global": hard,
     "versions": versions,
     "machine": machine,
+}
+
+# Record → part → table.
+TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
+    "race": RACE,
+    "optima": {"efforts": efforts},
+    "scale": {"sizes": sizes},
+    "latency": {"ways": latency},
+    "delay": {"ways": delay},
 }
