@@ -151,7 +151,7 @@ def machine(record: dict) -> str:
 
 
 def efforts(record: dict) -> str:
-    """Which optima each effort of the batched backend reaches: mean gap, share within 0.1 %, time in parts of one start's."""
+    """Optima that each effort of the batched backend reaches: mean gap, share within 0.1 %, time in parts of one start."""
     names = ("fast", "default", "best")
     rows = [
         [f"{kind} ({row['problems']})"]

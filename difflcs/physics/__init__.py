@@ -1,0 +1,22 @@
+"""Linear complementarity systems from known physics: shapes in the plane, MuJoCo models, and what of it is learned."""
+
+from difflcs.physics.contacts import Contacts, FreeMotion, contact_lcs
+from difflcs.physics.planar import ForceDrive, Inertia, PDDrive, PlanarPushing, PositionDrive
+from difflcs.physics.shapes import Circle, Distance, Polygon, Shape, Union, box
+
+__all__ = [
+    "Circle",
+    "Contacts",
+    "Distance",
+    "ForceDrive",
+    "FreeMotion",
+    "Inertia",
+    "PDDrive",
+    "PlanarPushing",
+    "Polygon",
+    "PositionDrive",
+    "Shape",
+    "Union",
+    "box",
+    "contact_lcs",
+]

@@ -1,0 +1,219 @@
+"""From gaps and contact Jacobians to a linear complementarity system: what every kind of contact physics has in common.
+
+A step without contact is linear, x₊ = A x + B u + d. Contact forces λ along the rows of J change it by W Jᵀ λ, where W
+says what a force does to the state. With the gap after the step linearised, the step is an LCS:
+
+    x₊ = A x + B u + d + W Jᵀ λ,    0 ≤ λ ⊥ φ + J (x₊ − x̄) + R λ ≥ 0,
+
+with gaps φ and their derivatives J at the state x̄, and the compliance R of the contacts, which makes F + Fᵀ ≻ 0 and λ
+unique. Two models of dry friction are offered:
+
+- Anitescu: the rows of J are the extreme rays n ± μ t of the friction cone. F is symmetric. A contact that slides opens
+  by μ times the distance that it slides, an error that vanishes with the step.
+  (M. Anitescu, "Optimization-based simulation of nonsmooth rigid multibody dynamics", Math. Program. 105, 2006.)
+- Stewart-Trinkle: normal force, friction in each direction and sliding distance each have a complementarity condition.
+  (D. Stewart, J. Trinkle, "An implicit time-stepping scheme for rigid body dynamics with inelastic collisions and
+  Coulomb friction", Int. J. Numer. Methods Eng. 39, 1996.)
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from difflcs._checks import check_choice, check_number, check_tensor
+from difflcs._linalg import matvec
+from difflcs.errors import InvalidInputError, ShapeError
+from difflcs.records import LCSParams
+
+__all__ = ["Cone", "Contacts", "FreeMotion", "contact_lcs", "count_forces"]
+
+Cone = Literal["anitescu", "stewart-trinkle"]
+
+
+class Contacts(NamedTuple):
+    """What may touch, at some states.
+
+    Attributes:
+        gap: (..., n_contacts) signed distances, negative in penetration [length].
+        normal: (..., n_contacts, n_x) derivative of each gap with respect to the state.
+        tangent: (..., n_contacts, n_tangents, n_x) derivative of how far the contact slides along each tangent with
+            respect to the state; one tangent in the plane, two in space, none where there is no friction.
+    """
+
+    gap: Tensor
+    normal: Tensor
+    tangent: Tensor
+
+
+class FreeMotion(NamedTuple):
+    """One step without contact, x₊ = A x + B u + d, and what a force adds to it.
+
+    A quasi-static body has its mobility as `response`; what a controller holds to its path has zeros there. For a state
+    of positions and velocities, and mass matrix M, it is [[h M⁻¹, 0], [M⁻¹, 0]] over a step of h: a force is then an
+    impulse.
+
+    Attributes:
+        A: (..., n_x, n_x).
+        B: (..., n_x, n_u).
+        d: (..., n_x).
+        response: (..., n_x, n_x) change of the next state for a force that is dual to the state: Jᵀ λ.
+    """
+
+    A: Tensor
+    B: Tensor
+    d: Tensor
+    response: Tensor
+
+
+def count_forces(n_contacts: int, n_tangents: int, cone: Cone = "anitescu") -> int:
+    """n_lam of the system for so many contacts."""
+    if n_tangents == 0:
+        return n_contacts
+    return n_contacts * (2 * n_tangents if cone == "anitescu" else 2 * n_tangents + 2)
+
+
+def contact_lcs(
+    contacts: Contacts,
+    free: FreeMotion,
+    x: Tensor,
+    *,
+    friction: float | Tensor,
+    compliance: float | Tensor,
+    cone: Cone = "anitescu",
+    length: float = 1.0,
+    force: float | None = None,
+) -> LCSParams:
+    """One step with contact as a linear complementarity system, linearised at some states.
+
+    Args:
+        contacts: gaps and their derivatives at x.
+        free: the step without contact.
+        x: (..., n_x) states.
+        friction: coefficient μ ≥ 0, one or (..., n_contacts); without tangents it does nothing.
+        compliance: gap that a unit of force closes, > 0, one or (..., n_contacts) [length per force].
+        cone: model of friction, see above.
+        length: unit in which the system counts gaps. The relaxation of the MPC, λ·s, is counted in units of
+            length · force, so that with a typical length it does not depend on whether x is in metres or in pixels.
+        force: unit in which it counts forces; None: the number of `length`, right for a quasi-static body of mobility
+            1.
+
+    Returns:
+        The system, one per state: n_lam = n_contacts without tangents, 2 n_tangents per contact with the cone of
+        Anitescu, 2 n_tangents + 2 with that of Stewart and Trinkle. In this order, contact by contact: the rays
+        n + μ t, n − μ t of each tangent; or the normal force, friction along t and −t of each, the sliding distance.
+
+    Raises:
+        InvalidInputError and its kinds: an argument does not fit.
+    """
+    check_choice("cone", cone, ("anitescu", "stewart-trinkle"))
+    length = check_number("length", length, strict=True)
+    force = length if force is None else check_number("force", force, strict=True)
+    n_x, n_contacts, n_tangents = x.shape[-1], contacts.gap.shape[-1], contacts.tangent.shape[-2]
+    _check_shapes(contacts, free, n_x, n_contacts, n_tangents)
+    mu = _each("friction", friction, contacts.gap, strict=False)
+    soft = _each("compliance", compliance, contacts.gap, strict=True) * (force / length)
+    if n_tangents == 0:
+        rows, gap, softness = contacts.normal, contacts.gap, soft
+    elif cone == "anitescu":
+        rows, gap, softness = _rays(contacts, mu, soft)
+    else:
+        return _stewart_trinkle(contacts, free, x, mu, soft, length, force)
+    C = (free.response @ rows.mT) * force
+    rows = rows / length
+    F = rows @ C
+    F = 0.5 * (F + F.mT) + torch.diag_embed(softness.expand(F.shape[:-1]))
+    c = gap / length + matvec(rows, free.d - x)
+    return LCSParams(A=free.A, B=free.B, C=C, d=free.d, D=rows @ free.A, E=rows @ free.B, F=F, c=c)
+
+
+def _check_shapes(contacts: Contacts, free: FreeMotion, n_x: int, n_contacts: int, n_tangents: int) -> None:
+    of_contacts, of_state = ("n_contacts", n_contacts), ("n_x", n_x)
+    check_tensor("contacts.gap", contacts.gap)
+    check_tensor("contacts.normal", contacts.normal, [of_contacts, of_state])
+    check_tensor("contacts.tangent", contacts.tangent, [of_contacts, ("n_tangents", n_tangents), of_state])
+    if free.B.ndim < 2:
+        raise ShapeError(f"free.B: expected shape (..., n_x={n_x}, n_u), got {tuple(free.B.shape)}; add dimensions")
+    check_tensor("free.B", free.B, [of_state, ("n_u", free.B.shape[-1])])
+    for name in ("A", "response"):
+        check_tensor(f"free.{name}", getattr(free, name), [of_state, of_state])
+    check_tensor("free.d", free.d, [of_state])
+
+
+def _each(name: str, value: float | Tensor, gap: Tensor, strict: bool) -> Tensor:
+    """A coefficient of each contact."""
+    value = torch.as_tensor(value, dtype=gap.dtype, device=gap.device)
+    bad = value <= 0 if strict else value < 0
+    if bool(bad.any()) or not bool(torch.isfinite(value).all()):
+        limit = "above 0" if strict else "of at least 0"
+        raise InvalidInputError(
+            f"{name}: expected finite numbers {limit}, got {float(value.min()):g}; give one for all contacts "
+            f"or one for each"
+        )
+    if value.ndim and value.shape[-1] not in (1, gap.shape[-1]):
+        raise ShapeError(
+            f"{name}: expected one number or (..., n_contacts={gap.shape[-1]}), got {tuple(value.shape)}; give one for "
+            f"each contact"
+        )
+    return value.expand(torch.broadcast_shapes(value.shape, gap.shape[-1:]))
+
+
+def _rays(contacts: Contacts, mu: Tensor, soft: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Extreme rays n ± μ t of each contact; their gaps and compliances."""
+    per = 2 * contacts.tangent.shape[-2]
+    normal, slide = contacts.normal.unsqueeze(-2), mu[..., None, None] * contacts.tangent
+    rays = torch.stack([normal + slide, normal - slide], -2)  # (..., n_contacts, n_tangents, 2, n_x)
+    return rays.flatten(-4, -2), contacts.gap.repeat_interleave(per, -1), soft.repeat_interleave(per, -1)
+
+
+def _stewart_trinkle(
+    contacts: Contacts, free: FreeMotion, x: Tensor, mu: Tensor, soft: Tensor, length: float, force: float
+) -> LCSParams:
+    # Forces of a contact: normal, then along ± each tangent; then σ, the distance that it slides:
+    #   0 ≤ λ_n ⊥ gap after the step ≥ 0,  0 ≤ β ⊥ σ ± t·slide ≥ 0,  0 ≤ σ ⊥ μ λ_n − Σ β + ε σ ≥ 0.
+    # μ λ_n without its transpose makes F + Fᵀ indefinite; ε is what it takes, and not more: friction grows by ε σ.
+    n_contacts, n_tangents = contacts.tangent.shape[-3:-1]
+    per = 2 * n_tangents + 1
+    both = torch.stack([contacts.tangent, -contacts.tangent], -2).flatten(-3, -2)
+    rows = torch.cat([contacts.normal.unsqueeze(-2), both], -2).flatten(-3, -2)  # (..., n_contacts · per, n_x)
+    C = (free.response @ rows.mT) * force
+    rows = rows / length
+    W = rows @ C
+    W = 0.5 * (W + W.mT) + torch.diag_embed(soft.repeat_interleave(per, -1).expand(W.shape[:-1]))
+    normals = torch.arange(n_contacts) * per
+    inverse = torch.linalg.inv(W)[..., normals[:, None], normals]
+    bound = 0.25 * torch.linalg.matrix_norm(mu.unsqueeze(-1) * inverse * mu.unsqueeze(-2))
+    batch, like = W.shape[:-2], {"dtype": W.dtype, "device": W.device}
+
+    size, sigma = per + 1, torch.arange(n_contacts) * (per + 1) + per
+    forces = torch.tensor([i * size + j for i in range(n_contacts) for j in range(per)], dtype=torch.long)
+    F = torch.zeros(*batch, n_contacts * size, n_contacts * size, **like)
+    F[..., forces[:, None], forces] = W
+    F[..., sigma, sigma] = (1.05 * bound + 1e-9).unsqueeze(-1).expand(*batch, n_contacts)
+    F[..., sigma, sigma - per] = mu.expand(*batch, n_contacts)
+    for j in range(1, per):
+        F[..., sigma - per + j, sigma] = 1.0
+        F[..., sigma, sigma - per + j] = -1.0
+
+    def spread(values: Tensor, dim: int) -> Tensor:
+        """Values of the forces, with zeros where a sliding distance has its place."""
+        shape = list(values.shape)
+        shape[dim] = n_contacts * size
+        return values.new_zeros(shape).index_copy(dim, forces.to(values.device), values)
+
+    is_normal = torch.zeros(per, **like)
+    is_normal[0] = 1.0
+    gap = (contacts.gap.unsqueeze(-1) * is_normal).flatten(-2) / length
+    c = gap + matvec(rows, free.d - x)
+    return LCSParams(
+        A=free.A,
+        B=free.B,
+        C=spread(C, -1),
+        d=free.d,
+        D=spread(rows @ free.A, -2),
+        E=spread(rows @ free.B, -2),
+        F=F,
+        c=spread(c, -1),
+    )

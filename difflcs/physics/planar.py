@@ -1,0 +1,365 @@
+"""A body on a plane, pushed by discs: a linear complementarity system at each state, from shapes alone.
+
+The body moves only while it is pushed (quasi-static), or keeps its velocity (`Inertia`). Discs follow their own drive:
+to a place, by a PD controller, or by forces. With m discs the state is
+
+    x, y, yaw of the body | x, y of each disc | velocities of the discs, if their drive has any
+    | velocities of the body, if it has inertia
+
+and the action two numbers for each disc. Everything is differentiable in the state, the shape and every number here.
+
+Quasi-static: the body moves by its mobility times the force, diag(1, 1, 1/ρ²) about its centre of mass, with the radius
+of gyration ρ of the pressure under it; only this ratio matters where discs go where they are told. (K. Lynch, M. Mason,
+"Stable pushing: mechanics, controllability, and planning", Int. J. Robot. Res. 15, 1996.)
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor, describe
+from difflcs.errors import DTypeError, InvalidInputError, ShapeError
+from difflcs.physics.contacts import Cone, Contacts, FreeMotion, contact_lcs, count_forces
+from difflcs.physics.shapes import Shape
+from difflcs.records import LCSParams
+
+__all__ = ["Drive", "ForceDrive", "Inertia", "PDDrive", "PlanarPushing", "PositionDrive"]
+
+
+class DriveStep(NamedTuple):
+    """One step of the discs, each coordinate for itself: (position, velocity)₊ = A (position, velocity) + b u.
+
+    `response` is what an impulse on the coordinate adds. Leading dimensions are (n_discs, 2) or those that broadcast;
+    k is 1 without velocities, else 2.
+
+    Attributes:
+        A: (..., k, k).
+        b: (..., k).
+        response: (..., k).
+    """
+
+    A: Tensor
+    b: Tensor
+    response: Tensor
+
+
+class Drive(ABC):
+    """How discs follow their action."""
+
+    order: int
+    """1: the state has positions of the discs; 2: velocities too."""
+
+    @abstractmethod
+    def step(self) -> DriveStep:
+        """One step."""
+
+
+@dataclass(frozen=True, eq=False)
+class PositionDrive(Drive):
+    """A disc goes where it is told, whatever it meets: p₊ = p + gain · u.
+
+    Attributes:
+        gain: part of the commanded increment that it makes in a step; a number, (2,) or (n_discs, 2).
+    """
+
+    gain: float | Tensor = 1.0
+    order = 1
+
+    def step(self) -> DriveStep:
+        """See `Drive`."""
+        gain = _number("gain", self.gain)
+        return DriveStep(gain.new_ones(1, 1), gain.unsqueeze(-1), gain.new_zeros(1))
+
+
+@dataclass(frozen=True, eq=False)
+class PDDrive(Drive):
+    """A disc is led by a PD controller to a place relative to where it is: u = target − p; nothing pushes it back.
+
+    In each of `substeps` of `substep` seconds: v ← v + (stiffness · (target − p) − damping · v) · substep, then
+    p ← p + v · substep, with the target held.
+
+    Attributes:
+        stiffness: [1/s²].
+        damping: [1/s].
+        substep: [s].
+        substeps: in one step of the system.
+    """
+
+    stiffness: float | Tensor
+    damping: float | Tensor
+    substep: float
+    substeps: int
+    order = 2
+
+    def step(self) -> DriveStep:
+        """See `Drive`."""
+        kp, kv, h = _number("stiffness", self.stiffness), _number("damping", self.damping), self.substep
+        one, zero = torch.ones_like(kp), torch.zeros_like(kp)
+        # (p, v, target)₊ = M (p, v, target), for one substep.
+        M = torch.stack(
+            [
+                torch.stack([1 - kp * h * h, h * (1 - kv * h), kp * h * h], -1),
+                torch.stack([-kp * h, 1 - kv * h, kp * h], -1),
+                torch.stack([zero, zero, one], -1),
+            ],
+            -2,
+        )
+        M = torch.linalg.matrix_power(M, self.substeps)
+        # target = p + u, and p moves with the target where both are shifted.
+        return DriveStep(M[..., :2, :2] + _outer_first(M[..., :2, 2]), M[..., :2, 2], torch.zeros_like(M[..., :2, 2]))
+
+
+def _outer_first(b: Tensor) -> Tensor:
+    """A matrix whose first column is b, to add an action's effect of p where u = target − p."""
+    return torch.stack([b, torch.zeros_like(b)], -1)
+
+
+@dataclass(frozen=True, eq=False)
+class ForceDrive(Drive):
+    """A disc of some mass is driven by a force u, and pushed back by what it touches.
+
+    Attributes:
+        mass: [kg].
+        seconds: of a step.
+        damping: rate at which its velocity decays [1/s].
+    """
+
+    mass: float | Tensor
+    seconds: float
+    damping: float | Tensor = 0.0
+    order = 2
+
+    def step(self) -> DriveStep:
+        """See `Drive`."""
+        mass, h = _number("mass", self.mass), self.seconds
+        decay = torch.exp(-_number("damping", self.damping) * h).expand(mass.shape)
+        one, zero = torch.ones_like(mass), torch.zeros_like(mass)
+        A = torch.stack([torch.stack([one, h * decay], -1), torch.stack([zero, decay], -1)], -2)
+        impulse = torch.stack([h / mass, 1 / mass], -1)
+        return DriveStep(A, impulse * h, impulse)
+
+
+@dataclass(frozen=True, eq=False)
+class Inertia:
+    """The body keeps its velocity: its state has velocities, and contact forces are impulses.
+
+    Attributes:
+        mass: [kg].
+        seconds: of a step.
+        damping: rate at which its velocities decay [1/s].
+    """
+
+    mass: float | Tensor
+    seconds: float
+    damping: float | Tensor = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class PlanarPushing:
+    """A body on a plane, pushed by discs; an `LCSModule` whose system depends on the state.
+
+    Attributes:
+        shape: outline of the body in its own coordinates.
+        radius: of the discs, a number or (n_discs,) [length].
+        n_discs: how many there are.
+        drive: how they follow their action.
+        center_of_mass: (2,) in coordinates of the body; None: the centre of the shape's area.
+        gyration: radius of gyration about it [length]; None: that of the shape's area.
+        friction: between discs and body, a number or (n_discs,); 0 (a number) for none, which halves n_lam.
+        compliance: gap that a unit of force closes, > 0, a number or (n_discs,) [length per force].
+        inertia: None for quasi-static motion.
+        cone: model of friction, see `difflcs.physics.contacts`.
+        length: unit of gaps for the relaxation of the MPC, see `contact_lcs`; None: the radius of gyration.
+
+    Raises:
+        InvalidInputError and its kinds: a value does not fit.
+    """
+
+    shape: Shape
+    radius: float | Tensor
+    n_discs: int = 1
+    drive: Drive = PositionDrive()
+    center_of_mass: Tensor | Sequence[float] | None = None
+    gyration: float | Tensor | None = None
+    friction: float | Tensor = 0.0
+    compliance: float | Tensor = 0.02
+    inertia: Inertia | None = None
+    cone: Cone = "anitescu"
+    length: float | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.shape, Shape):
+            raise DTypeError(f"shape: expected a Shape, got {describe(self.shape)}; give Circle, Polygon or Union")
+        if not isinstance(self.drive, Drive):
+            raise DTypeError(f"drive: expected a Drive, got {describe(self.drive)}; give PositionDrive(), for example")
+        check_positive_int("n_discs", self.n_discs)
+        check_choice("cone", self.cone, ("anitescu", "stewart-trinkle"))
+        values: dict[str, Any] = {name: self._of_discs(name, getattr(self, name)) for name in ("radius", "compliance")}
+        values["friction"] = 0.0 if self.frictionless else self._of_discs("friction", self.friction)
+        center = self.shape.centroid if self.center_of_mass is None else self.center_of_mass
+        values["center_of_mass"] = _number("center_of_mass", center)
+        if values["center_of_mass"].shape != (2,):
+            got = tuple(values["center_of_mass"].shape)
+            raise ShapeError(f"center_of_mass: expected (2,), got {got}; give x and y in coordinates of the body")
+        values["gyration"] = _number("gyration", self._default_gyration() if self.gyration is None else self.gyration)
+        if not float(values["gyration"].detach()) > 0:
+            raise InvalidInputError(f"gyration: expected a number above 0, got {self.gyration}; give it as a length")
+        length = float(values["gyration"].detach()) if self.length is None else self.length
+        values["length"] = check_number("length", length, strict=True)
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    def _default_gyration(self) -> Tensor:
+        area, centroid, polar = self.shape.moments()
+        offset = _number("center_of_mass", centroid if self.center_of_mass is None else self.center_of_mass) - centroid
+        return (polar / area + offset.square().sum()).sqrt()
+
+    def _of_discs(self, name: str, value: float | Tensor) -> Tensor:
+        number = _number(name, value)
+        if number.shape not in ((), (self.n_discs,)):
+            raise ShapeError(
+                f"{name}: expected a number or ({self.n_discs},), got {tuple(number.shape)}; give one for each disc"
+            )
+        return number.expand(self.n_discs)
+
+    @property
+    def frictionless(self) -> bool:
+        """Whether contacts have one force each, along the normal."""
+        return not isinstance(self.friction, Tensor) and self.friction == 0
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return 3 + 2 * self.n_discs * self.drive.order + (0 if self.inertia is None else 3)
+
+    @property
+    def n_u(self) -> int:
+        """Number of actions."""
+        return 2 * self.n_discs
+
+    @property
+    def n_lam(self) -> int:
+        """Number of contact forces."""
+        return count_forces(self.n_discs * self.shape.n_parts, 0 if self.frictionless else 1, self.cone)
+
+    def replace(self, **values: Any) -> PlanarPushing:
+        """The same with other values."""
+        return replace(self, **values)
+
+    def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
+        """The system at states x (..., n_x); there is no context.
+
+        Raises:
+            InvalidInputError and its kinds: no state, or of another size.
+        """
+        if x is None:
+            raise InvalidInputError(
+                "x: expected states (..., n_x), as contacts depend on where things are, got None; pass x"
+            )
+        check_tensor("x", x, [("n_x", self.n_x)])
+        friction = 0.0 if self.frictionless else self._by_contact(self.friction)
+        return contact_lcs(
+            self.contacts(x),
+            self._free_motion(x),
+            x,
+            friction=friction,
+            compliance=self._by_contact(self.compliance),
+            cone=self.cone,
+            length=self.length or 1.0,
+            force=self._unit_of_force(),
+        )
+
+    def _by_contact(self, value: Any) -> Tensor:
+        return value.repeat_interleave(self.shape.n_parts)
+
+    def _unit_of_force(self) -> float | None:
+        if self.inertia is None:
+            return None
+        mass = float(_number("mass", self.inertia.mass).detach())
+        return (self.length or 1.0) * mass / self.inertia.seconds
+
+    def to_body(self, x: Tensor, points: Tensor) -> Tensor:
+        """Points (..., n, 2) of the plane in coordinates of the body at states x (..., n_x)."""
+        cos, sin = x[..., 2:3].cos(), x[..., 2:3].sin()
+        dx, dy = (points - x[..., None, :2]).unbind(-1)
+        return torch.stack([cos * dx + sin * dy, cos * dy - sin * dx], -1)
+
+    def contacts(self, x: Tensor) -> Contacts:
+        """Gaps of all discs, and their derivatives; each disc has as many contacts as the shape has parts."""
+        m, parts, batch = self.n_discs, self.shape.n_parts, x.shape[:-1]
+        discs = x[..., 3 : 3 + 2 * m].reshape(*batch, m, 2)
+        found = self.shape.distance(self.to_body(x, discs))
+        gap = found.distance - self._of_discs("radius", self.radius).unsqueeze(-1)
+        cos, sin = x[..., 2].cos()[..., None, None], x[..., 2].sin()[..., None, None]
+
+        def turn(v: Tensor) -> tuple[Tensor, Tensor]:
+            return cos * v[..., 0] - sin * v[..., 1], sin * v[..., 0] + cos * v[..., 1]
+
+        (nx, ny), (rx, ry) = turn(found.normal), turn(found.point)
+        tx, ty = -ny, nx
+
+        def rows(vx: Tensor, vy: Tensor) -> Tensor:
+            """Derivative of (disc − point of the body beside it) along v by the state: (..., m · parts, n_x)."""
+            of_body = torch.stack([-vx, -vy, rx * -vy + ry * vx], -1).reshape(*batch, m * parts, 3)
+            own = torch.zeros(*batch, m, parts, m, 2, dtype=x.dtype, device=x.device)
+            each = torch.arange(m)
+            own[..., each, :, each, :] = torch.stack([vx, vy], -1).movedim(-3, 0)
+            rest = x.new_zeros(*batch, m * parts, self.n_x - 3 - 2 * m)
+            return torch.cat([of_body, own.reshape(*batch, m * parts, 2 * m), rest], -1)
+
+        normal = rows(nx, ny)
+        tangent = normal.new_zeros(*normal.shape[:-1], 0, self.n_x) if self.frictionless else rows(tx, ty).unsqueeze(-2)
+        return Contacts(gap.reshape(*batch, m * parts), normal, tangent)
+
+    def _mobility(self, x: Tensor) -> Tensor:
+        """What a force and a torque, dual to the pose, do to the pose: (..., 3, 3), for mass 1."""
+        center: Any = self.center_of_mass
+        cos, sin = x[..., 2].cos(), x[..., 2].sin()
+        cx, cy = cos * center[0] - sin * center[1], sin * center[0] + cos * center[1]
+        # The pose is that of the body's origin, which turns about the centre of mass.
+        turn = torch.stack([cy, -cx, torch.ones_like(cx)], -1)
+        gyration: Any = self.gyration
+        plane = torch.diag(x.new_tensor([1.0, 1.0, 0.0]))
+        return plane + turn.unsqueeze(-1) * turn.unsqueeze(-2) / gyration.square()
+
+    def _free_motion(self, x: Tensor) -> FreeMotion:
+        m, n_x, batch = self.n_discs, self.n_x, x.shape[:-1]
+        like = {"dtype": x.dtype, "device": x.device}
+        step, k = self.drive.step(), self.drive.order
+        A, B = torch.eye(n_x, **like), torch.zeros(n_x, 2 * m, **like)
+        response = torch.zeros(*batch, n_x, n_x, **like)
+        places = 3 + torch.arange(2 * m)
+        of = [places + 2 * m * i for i in range(k)]  # positions, then velocities
+        for i in range(k):
+            for j in range(k):
+                A[of[i], of[j]] = step.A[..., i, j].to(x).expand(m, 2).reshape(-1)
+            B[of[i], torch.arange(2 * m)] = step.b[..., i].to(x).expand(m, 2).reshape(-1)
+            response[..., of[i], places] = step.response[..., i].to(x).expand(m, 2).reshape(-1)
+        mobility = self._mobility(x)
+        if self.inertia is None:
+            response[..., :3, :3] = mobility
+        else:
+            h, mass = self.inertia.seconds, _number("mass", self.inertia.mass).to(x)
+            decay = torch.exp(-_number("damping", self.inertia.damping).to(x) * h)
+            speed = n_x - 3 + torch.arange(3)
+            A[torch.arange(3), speed] = h * decay.expand(3)
+            A[speed, speed] = decay.expand(3)
+            response[..., :3, :3] = h * mobility / mass
+            response[..., n_x - 3 :, :3] = mobility / mass
+        return FreeMotion(A, B, x.new_zeros(n_x), response)
+
+
+def _number(name: str, value: Any) -> Tensor:
+    """A number or tensor as a finite float64 tensor, or as the tensor that it is."""
+    if not isinstance(value, Tensor):
+        try:
+            value = torch.tensor(value, dtype=torch.float64)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise DTypeError(f"{name}: expected a number or a tensor, got {describe(value)}; {error}") from error
+    return check_tensor(name, value)

@@ -1,0 +1,290 @@
+"""Shapes in the plane: signed distance, outward normal and nearest point, differentiable in the shape.
+
+    outline = Polygon([[-0.03, -0.03], [0.03, -0.03], [0.03, 0.03], [-0.03, 0.03]])
+    distance, normal, point = outline.distance(points)
+
+A `Union` keeps its parts apart, so that each is a contact of its own: a corner between two of them is touched at both
+sides. A polygon need not be convex; its nearest point is one contact.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from difflcs._checks import check_tensor, describe
+from difflcs.errors import DTypeError, InvalidInputError, ShapeError
+
+__all__ = ["Circle", "Distance", "Polygon", "Shape", "Union", "box"]
+
+
+class Distance(NamedTuple):
+    """What is nearest to some points on each part of a shape.
+
+    Attributes:
+        distance: (..., n_parts) signed, negative inside.
+        normal: (..., n_parts, 2) outward unit vector, the derivative of the distance with respect to the point.
+        point: (..., n_parts, 2) nearest point of the outline.
+    """
+
+    distance: Tensor
+    normal: Tensor
+    point: Tensor
+
+
+class Moments(NamedTuple):
+    """Area, centroid (2,), and polar second moment of area about the centroid."""
+
+    area: Tensor
+    centroid: Tensor
+    polar: Tensor
+
+
+class Shape(ABC):
+    """A closed outline in coordinates of its body."""
+
+    @property
+    @abstractmethod
+    def n_parts(self) -> int:
+        """Parts, each of which is a contact."""
+
+    @abstractmethod
+    def distance(self, points: Tensor) -> Distance:
+        """Nearest to points (..., 2) in coordinates of the body."""
+
+    @abstractmethod
+    def moments(self) -> Moments:
+        """Of the area, where parts count twice if they overlap."""
+
+    @property
+    @abstractmethod
+    def radius(self) -> float:
+        """The largest distance of the outline from the origin of the body."""
+
+    @property
+    def centroid(self) -> Tensor:
+        """(2,) centre of the area."""
+        return self.moments().centroid
+
+    @property
+    def gyration(self) -> Tensor:
+        """Radius of gyration of the area about its centroid."""
+        area, _, polar = self.moments()
+        return (polar / area).sqrt()
+
+    def contains(self, points: Tensor) -> Tensor:
+        """(...) bool: which of the points (..., 2) are inside."""
+        return (self.distance(points).distance < 0).any(-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Polygon(Shape):
+    """A simple polygon, convex or not.
+
+    Attributes:
+        vertices: (n, 2) corners in order, counterclockwise; clockwise ones are reversed. A tensor, which may require a
+            gradient, or numbers.
+
+    Raises:
+        ShapeError, InvalidInputError: not at least three corners, no area, or two corners at one place in succession.
+    """
+
+    vertices: Tensor
+
+    def __post_init__(self) -> None:
+        vertices = _tensor("vertices", self.vertices)
+        if vertices.ndim != 2 or vertices.shape[1] != 2 or len(vertices) < 3:
+            raise ShapeError(
+                f"vertices: expected (n, 2) with at least 3 corners, got {tuple(vertices.shape)}; give one row "
+                f"for each corner"
+            )
+        sides = (vertices.detach().roll(-1, 0) - vertices.detach()).norm(dim=1)
+        if not float(sides.min()) > 0:
+            raise InvalidInputError(
+                f"vertices: expected every corner apart from the next, got corner {int(sides.argmin())} twice; leave "
+                f"one of them out, the last need not repeat the first"
+            )
+        area = float(_shoelace(vertices.detach()).sum()) / 2
+        if not abs(area) > 1e-12 * float(sides.max()) ** 2:
+            raise InvalidInputError(f"vertices: expected a polygon with an area, got {area:g}; move the corners apart")
+        object.__setattr__(self, "vertices", vertices.flip(0) if area < 0 else vertices)
+
+    @property
+    def n_parts(self) -> int:
+        """See `Shape`."""
+        return 1
+
+    @property
+    def radius(self) -> float:
+        """See `Shape`."""
+        return float(self.vertices.detach().norm(dim=1).max())
+
+    def distance(self, points: Tensor) -> Distance:
+        """See `Shape`. Ties go to the side that comes first."""
+        check_tensor("points", points, [("2", 2)])
+        start, end = self.vertices, self.vertices.roll(-1, 0)
+        with torch.no_grad():
+            nearest, inside = _nearest_side(points, start, end)
+        a, b = start[nearest], end[nearest]
+        side = b - a
+        along = ((points - a) * side).sum(-1) / side.square().sum(-1)
+        t = along.clamp(0.0, 1.0)
+        point = a + t.unsqueeze(-1) * side
+        outward = torch.stack([side[..., 1], -side[..., 0]], -1)
+        outward = outward / outward.norm(dim=-1, keepdim=True)
+        apart = points - point
+        size = apart.norm(dim=-1)
+        sign = torch.where(inside, -1.0, 1.0).to(points.dtype)
+        # Beside a side its own normal serves, on the outline too, where the direction to it is none; round a corner
+        # the direction from the corner.
+        beside = ((along > 0) & (along < 1)) | (size.detach() == 0)
+        safe = torch.where(beside, torch.ones_like(size), size)
+        normal = torch.where(beside.unsqueeze(-1), outward, (sign / safe).unsqueeze(-1) * apart)
+        distance = torch.where(beside, (apart * outward).sum(-1), sign * torch.where(beside, 1.0, size))
+        return Distance(distance.unsqueeze(-1), normal.unsqueeze(-2), point.unsqueeze(-2))
+
+    def moments(self) -> Moments:
+        """See `Shape`."""
+        p, n = self.vertices, self.vertices.roll(-1, 0)
+        cross = _shoelace(p)
+        area = cross.sum() / 2
+        centroid = ((p + n) * cross.unsqueeze(-1)).sum(0) / (6 * area)
+        about_origin = (cross * (p.square() + p * n + n.square()).sum(-1)).sum() / 12
+        return Moments(area, centroid, about_origin - area * centroid.square().sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Circle(Shape):
+    """A disc.
+
+    Attributes:
+        r: radius, above 0, a number or a tensor.
+        center: (2,) in coordinates of the body.
+    """
+
+    r: Tensor
+    center: Tensor = (0.0, 0.0)  # pyright: ignore[reportAssignmentType]
+
+    def __post_init__(self) -> None:
+        r, center = _tensor("r", self.r), _tensor("center", self.center)
+        if r.ndim or not float(r.detach()) > 0:
+            raise InvalidInputError(f"r: expected one number above 0, got {describe(self.r)}; give the radius")
+        if center.shape != (2,):
+            raise ShapeError(f"center: expected (2,), got {tuple(center.shape)}; give x and y")
+        object.__setattr__(self, "r", r)
+        object.__setattr__(self, "center", center)
+
+    @property
+    def n_parts(self) -> int:
+        """See `Shape`."""
+        return 1
+
+    @property
+    def radius(self) -> float:
+        """See `Shape`."""
+        return float(self.r.detach() + self.center.detach().norm())
+
+    def distance(self, points: Tensor) -> Distance:
+        """See `Shape`. In the very centre the normal points along x."""
+        check_tensor("points", points, [("2", 2)])
+        apart = points - self.center
+        at_center = apart.detach().square().sum(-1) == 0
+        apart = torch.where(at_center.unsqueeze(-1), apart.new_tensor([1.0, 0.0]), apart)
+        size = apart.norm(dim=-1)
+        normal = apart / size.unsqueeze(-1)
+        distance = torch.where(at_center, torch.zeros_like(size), size) - self.r
+        return Distance(distance.unsqueeze(-1), normal.unsqueeze(-2), (self.center + self.r * normal).unsqueeze(-2))
+
+    def moments(self) -> Moments:
+        """See `Shape`."""
+        area = math.pi * self.r.square()
+        return Moments(area, self.center, 0.5 * area * self.r.square())
+
+
+@dataclass(frozen=True, eq=False)
+class Union(Shape):
+    """Several shapes on one body, each a contact of its own.
+
+    Attributes:
+        parts: the shapes; unions among them are taken apart.
+    """
+
+    parts: tuple[Shape, ...]
+
+    def __post_init__(self) -> None:
+        parts = []
+        for part in self.parts:
+            if not isinstance(part, Shape):
+                raise DTypeError(f"parts: expected shapes, got {describe(part)}; give Circle, Polygon or Union")
+            parts += part.parts if isinstance(part, Union) else [part]
+        if not parts:
+            raise InvalidInputError("parts: expected at least one shape, got none; give Circle or Polygon")
+        object.__setattr__(self, "parts", tuple(parts))
+
+    @property
+    def n_parts(self) -> int:
+        """See `Shape`."""
+        return len(self.parts)
+
+    @property
+    def radius(self) -> float:
+        """See `Shape`."""
+        return max(part.radius for part in self.parts)
+
+    def distance(self, points: Tensor) -> Distance:
+        """See `Shape`."""
+        found = [part.distance(points) for part in self.parts]
+        distance, normal, point = zip(*found, strict=True)
+        return Distance(torch.cat(distance, -1), torch.cat(normal, -2), torch.cat(point, -2))
+
+    def moments(self) -> Moments:
+        """See `Shape`."""
+        found = [part.moments() for part in self.parts]
+        area = torch.stack([m.area for m in found])
+        centers = torch.stack([m.centroid for m in found])
+        centroid = (area.unsqueeze(-1) * centers).sum(0) / area.sum()
+        polar = torch.stack([m.polar for m in found]) + area * (centers - centroid).square().sum(-1)
+        return Moments(area.sum(), centroid, polar.sum())
+
+
+def box(x_min: float, x_max: float, y_min: float, y_max: float) -> Polygon:
+    """A rectangle along the axes of its body."""
+    if not (x_min < x_max and y_min < y_max):
+        raise InvalidInputError(
+            f"box: expected x_min < x_max and y_min < y_max, got {(x_min, x_max, y_min, y_max)}; exchange them"
+        )
+    return Polygon(torch.tensor([[x_min, y_min], [x_max, y_min], [x_max, y_max], [x_min, y_max]], dtype=torch.float64))
+
+
+def _tensor(name: str, value: Any | Sequence) -> Tensor:
+    """Numbers as float64; a tensor as it is."""
+    if not isinstance(value, Tensor):
+        try:
+            value = torch.tensor(value, dtype=torch.float64)
+        except (TypeError, ValueError) as error:
+            raise DTypeError(f"{name}: expected numbers or a tensor, got {describe(value)}; {error}") from error
+    return check_tensor(name, value)
+
+
+def _shoelace(vertices: Tensor) -> Tensor:
+    following = vertices.roll(-1, 0)
+    return vertices[:, 0] * following[:, 1] - vertices[:, 1] * following[:, 0]
+
+
+def _nearest_side(points: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
+    """Which side is nearest to each point, and which points are inside: a ray from them crosses sides an odd time."""
+    side, to = end - start, points.unsqueeze(-2) - start
+    t = ((to * side).sum(-1) / side.square().sum(-1)).clamp(0.0, 1.0)
+    nearest = (to - t.unsqueeze(-1) * side).square().sum(-1).argmin(-1)
+    y = points[..., 1:]
+    spans = (start[:, 1] > y) != (end[:, 1] > y)
+    # x of the point against that of the side at its height, both multiplied by the side's height.
+    height = side[:, 1]
+    left = to[..., 0] * height.abs() < to[..., 1] * side[:, 0] * height.sign()
+    return nearest, ((spans & left).sum(-1) % 2).bool()
