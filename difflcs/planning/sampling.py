@@ -1,10 +1,10 @@
 """Sampling-based contact MPC: push from here, or go to where pushing is worth more.
 
-An MPC that linearises contact at one state sees the surface next to it as an infinite plane: it pushes well, and does not
-find the way round a corner. So the same MPC is solved, as one batch, from where the robot is and from many places where
-its end effectors could be. The gain of a place is what its plan saves against standing still there. The robot pushes
-where it is while the gain there is near the best; else it travels, free of collision, to the place with the best gain
-after the price of the way, and pushes from there.
+An MPC that linearises contact at one state sees the surface next to it as an infinite plane: it pushes well, and does
+not find the way round a corner. So the same MPC is solved, as one batch, from where the robot is and from many places
+where its end effectors could be. The gain of a place is what its plan saves against standing still there. The robot
+pushes where it is while the gain there is near the best; else it travels, free of collision, to the place with the best
+gain after the price of the way, and pushes from there.
 
 Source: S. Venkatesh, B. Bianchini, A. Aydinoglu, W. Yang, M. Posa, "Approximating Global Contact-Implicit MPC via
 Sampling and Local Complementarity" (arXiv:2505.13350), called sampling C3. It compares whole costs, with the cost of
@@ -12,8 +12,8 @@ travelling added, by C3 as the local controller and re-decides at each step; her
 `LCSMPCLayer`, gains are compared as parts of the cost of standing still, and a journey that has begun is finished.
 
 What it cannot do: it sees one push ahead, not two (a detour whose first push costs more than standing still is found
-only within the horizon); a place is judged as if the robot were there already; the body is taken to rest while the robot
-travels, and several end effectors not to collide with each other on the way.
+only within the horizon); a place is judged as if the robot were there already; the body is taken to rest while the
+robot travels, and several end effectors not to collide with each other on the way.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import enum
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -123,8 +123,8 @@ class SamplingPolicy:
     must be relative to the robot: with u = 0 it stands still.
 
     Args:
-        mpc: a layer around any `LCSModule`, which is asked for the system at a batch of states (1 + n_places, n_x); with
-            on_failure="mask", as one place without a solution must not stop the others.
+        mpc: a layer around any `LCSModule`, which is asked for the system at a batch of states (1 + n_places, n_x);
+            with on_failure="mask", as one place without a solution must not stop the others.
         places: where the end effectors could be, see `Places`.
         travel: how they get there, see `Travel`.
         settings: when to push and when to travel.
@@ -160,7 +160,6 @@ class SamplingPolicy:
 
     def reset(self) -> None:
         """Forget the mode, as at the begin of an episode."""
-        self._mode: Mode | None = None
         self._decision: Decision | None = None
         self._place: Tensor | None = None
         self._steps = 0
@@ -184,4 +183,74 @@ class SamplingPolicy:
         Raises:
             InvalidInputError and its kinds: an argument does not fit.
         """
-        raise NotImplementedError
+        state, target = self._inputs(x, goal)
+        with torch.no_grad():
+            place = self._place
+            if place is not None:
+                self._steps += 1
+                towards = self.places.states(state, place.unsqueeze(0))[0]
+                if self._steps <= self.settings.patience and not self.travel.arrived(state, towards):
+                    return self._go_on(state, towards)
+            return self._decide(state, target, context, stay=place is not None)
+
+    def _inputs(self, x: ArrayLike, goal: ArrayLike | None) -> tuple[Tensor, Tensor | None]:
+        state = check_tensor("x", torch.as_tensor(x, dtype=torch.float64).detach(), [("n_x", self.mpc.lcs.n_x)])
+        if state.ndim != 1:
+            raise ShapeError(f"x: expected shape ({self.mpc.lcs.n_x},), got {tuple(state.shape)}; give one robot's")
+        if goal is None:
+            return state, None
+        target = check_tensor("goal", torch.as_tensor(goal, dtype=torch.float64).detach().clone())
+        if target.ndim != 1 or any(index >= len(target) for index in self.angles):
+            raise ShapeError(
+                f"goal: expected one vector that has the angles {self.angles}, got shape {tuple(target.shape)}; "
+                f"give one robot's goal"
+            )
+        for index in self.angles:
+            target[index] += 2 * math.pi * torch.round((state[index] - target[index]) / (2 * math.pi))
+        return state, target
+
+    def _go_on(self, state: Tensor, towards: Tensor) -> NDArray[np.float64]:
+        """The next step of a journey."""
+        assert self._decision is not None
+        self._decision = replace(self._decision, mode=Mode.TRAVEL, began=False, target=towards)
+        return self.travel.action(state, towards).numpy()
+
+    def _decide(self, state: Tensor, goal: Tensor | None, context: Tensor | None, stay: bool) -> NDArray[np.float64]:
+        """Compare all places. `stay`: a journey has just ended, and at least one push comes first."""
+        places = self.places.sample(state)
+        states = torch.cat([state.unsqueeze(0), self.places.states(state, places)])
+        allowed = self.places.allowed(states)
+        allowed[0] = True
+        solution = self._solve(states, goal, context)
+        gains, standing = _gains(solution)
+        gains = torch.where(allowed & solution.converged, gains, -math.inf)
+        scale, own = max(standing, 0.0), self.settings
+        price = own.switch_price + own.travel_price * self.travel.distance(state, states[1:])
+        scores = torch.cat([gains[:1], gains[1:] - scale * price])
+        best, here = float(scores.max()), float(gains[0])
+        pushes = self.places.near(state) and here > own.smallest_gain * scale and here >= own.keep * best
+        chosen = 0
+        if not stay and not pushes and bool(torch.isfinite(scores[1:]).any()):
+            chosen = 1 + int(scores[1:].argmax())
+        self._place, self._steps = (places[chosen - 1].clone(), 0) if chosen else (None, 0)
+        target = states[chosen] if chosen else None
+        mode = Mode.TRAVEL if chosen else Mode.PUSH
+        self._decision = Decision(mode, bool(chosen), chosen, target, states, gains, scores, standing, solution)
+        if target is not None:
+            return self.travel.action(state, target).numpy()
+        return solution.action[0].numpy()
+
+    def _solve(self, states: Tensor, goal: Tensor | None, context: Tensor | None) -> MPCSolution:
+        low, high = (None, None) if self.bounds is None else self.bounds(states)
+        with warnings.catch_warnings():  # what was not solved is in the decision
+            warnings.simplefilter("ignore", SolveWarning)
+            return self.mpc(states, goal, u_min=low, u_max=high, context=context)
+
+
+def _gains(solution: MPCSolution) -> tuple[Tensor, float]:
+    """What each plan (n,) saves against standing still, and the cost of standing still at the first state."""
+    problem = solution.problem
+    planned = problem.objective(solution.x, solution.u)
+    standing = problem.objective(solution.x[:, :1].expand_as(solution.x), torch.zeros_like(solution.u))
+    constant = solution.objective - planned
+    return standing - planned, float(standing[0] + constant[0])
