@@ -1,33 +1,32 @@
 """Push-T, the environment of others (gym-pusht): its physics as a `PlanarPushing`, and a policy that solves it.
 
-A disc of 15 px pushes a T of four squares by 30 px, made of two boxes, to a pose on a plane of 512 px. An action is the
-target of the disc's PD controller, which is given ten substeps of 0.01 s. The disc is kinematic: nothing pushes it back.
-Velocities are damped away in each substep, so the T moves only while it is pushed. Friction between disc and T is zero:
-what the environment sets is an attribute that pymunk does not read. Lengths here are in units of 100 px.
+A disc of radius 15 px pushes a T, made of two boxes of 30 by 120 and 30 by 90 px, to a pose on a plane of 512 px. An
+action is the target of the disc's PD controller, for ten substeps of 0.01 s. The disc is kinematic: nothing pushes it
+back. Velocities are damped away in each substep, so the T moves only while it is pushed. Friction between disc and T is
+zero: what the environment sets is an attribute that pymunk does not read. Lengths here are in units of 100 px.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections import deque
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
 
-from difflcs._checks import check_tensor
+from difflcs._checks import check_positive_int
 from difflcs.cost import GoalCost
 from difflcs.mpc.layer import LCSMPCLayer
+from difflcs.physics.contact import ContactLCS
 from difflcs.physics.planar import PDDrive, PlanarPushing
 from difflcs.physics.shapes import Polygon, Shape, Union
 from difflcs.planning.places import DiscPlaces, Workspace
-from difflcs.planning.sampling import Decision, SamplingPolicy, SamplingSettings
+from difflcs.planning.sampling import SamplingPolicy, SamplingSettings
 from difflcs.planning.travel import PlanarTravel
-from difflcs.records import LCSModule
 
-__all__ = ["GOAL", "PIXELS", "RADIUS", "PushTPolicy", "tee", "tee_pushing"]
+__all__ = ["GOAL", "PIXELS", "PushTPolicy", "tee", "tee_pushing"]
 
 PIXELS = 100.0
 """Pixels in a unit of length."""
@@ -39,6 +38,9 @@ CENTER_OF_MASS = (0.0, 0.45)
 """From the T's origin, the middle of its upper edge, to the mean of the centres of its boxes."""
 GYRATION = math.sqrt(3000.0) / PIXELS
 """As the environment sums it: twice the moment of the bar about the origin, with a mass of 1."""
+DRIVE = PDDrive(stiffness=100.0, damping=20.0, substep=0.01, substeps=10)
+SIDE = 5.12
+"""Of the square that actions are in."""
 
 
 def tee(scale: float = 1.0) -> Shape:
@@ -58,7 +60,7 @@ def tee_pushing(**changes: Any) -> PlanarPushing:
     own: dict[str, Any] = {
         "shape": tee(),
         "radius": RADIUS,
-        "drive": PDDrive(stiffness=100.0, damping=20.0, substep=0.01, substeps=10),
+        "drive": DRIVE,
         "center_of_mass": (0.0, 0.0),
         "gyration": GYRATION,
         "friction": 0.0,
@@ -80,27 +82,31 @@ class PushTPolicy:
     The velocity of the disc, which the observation lacks, comes from the drive: what was sent is known.
 
     Args:
-        system: of which the MPC plans; `tee_pushing()` if None.
-        predict: brings a state (n_x,) forward by an action (n_u,) where actions come a step late; None: they do not.
+        system: of which the MPC plans: state and action as in `tee_pushing`, which it is if None.
+        shape: round which places and ways are laid; that of the system if None.
+        delay: steps by which actions come late. The plan begins at the state that the system predicts for then.
         places: round the T.
         horizon: of the plans [steps].
+
+    Attributes:
+        sampling: the policy inside, with its `decision`.
     """
 
     def __init__(
         self,
-        system: LCSModule | None = None,
+        system: PlanarPushing | ContactLCS | None = None,
         *,
-        predict: Callable[[Tensor, Tensor], Tensor] | None = None,
         shape: Shape | None = None,
-        places: int = 96,
+        delay: int = 0,
+        places: int = 64,
         horizon: int = 10,
     ):
-        system = tee_pushing() if system is None else system
-        shape = tee() if shape is None else shape
-        workspace = Workspace((0.0, 0.0), (5.12, 5.12), step=0.6)
-        cost = GoalCost.reach(
-            7, 2, goal_weight=(1.0, 1.0, 0.3), goal_weight_final=(4.0, 4.0, 1.2), input_weight=0.01
-        )
+        self.system = system = tee_pushing() if system is None else system
+        if shape is None:
+            shape = system.shape if isinstance(system, PlanarPushing) else system.physics.shape
+        self.delay = check_positive_int("delay", delay, minimum=0)
+        workspace = Workspace((0.0, 0.0), (SIDE, SIDE), step=0.6)
+        cost = GoalCost.reach(7, 2, goal_weight=(1.0, 1.0, 0.3), goal_weight_final=(4.0, 4.0, 1.2), input_weight=0.01)
         self.sampling = SamplingPolicy(
             LCSMPCLayer(system, cost, horizon, relaxation=1e-5, on_failure="mask"),
             DiscPlaces(shape, RADIUS, places, gap=0.02, reach=0.12, workspace=workspace, margin=0.2),
@@ -109,22 +115,15 @@ class PushTPolicy:
             bounds=workspace.bounds,
             angles=(2,),
         )
-        self.goal = pose_of_center(np.array(GOAL))
-        step = PDDrive(stiffness=100.0, damping=20.0, substep=0.01, substeps=10).step()
+        step = DRIVE.step()
         self._keeps, self._gives = float(step.A[1, 1]), float(step.b[1])
-        self._predict = predict
         self.reset()
 
     def reset(self) -> None:
         """The begin of an episode."""
         self.sampling.reset()
         self._velocity = np.zeros(2)
-        self._sent: NDArray[np.float64] | None = None
-
-    @property
-    def decision(self) -> Decision | None:
-        """What was decided last."""
-        return self.sampling.decision
+        self._under_way: deque[NDArray[np.float64]] = deque()
 
     def act(self, observation: ArrayLike) -> NDArray[np.float64]:
         """An action.
@@ -137,15 +136,26 @@ class PushTPolicy:
         """
         seen = np.asarray(observation, np.float64)
         disc = seen[:2] / PIXELS
-        state = np.concatenate([pose_of_center(seen[2:]), disc, self._velocity])
-        u = self.sampling.act(state, self.goal)
-        target = np.clip(disc + u, 0.0, 5.12)
-        self._velocity = self._keeps * self._velocity + self._gives * (target - disc)
+        state = np.concatenate([from_origin(seen[2:]), disc, self._velocity])
+        if self.delay and not self._under_way:
+            self._under_way.extend([disc] * self.delay)
+        for target in self._under_way:
+            state = self._predict(state, target)
+        target = np.clip(state[3:5] + self.sampling.act(state, from_origin(GOAL)), 0.0, SIDE)
+        self._under_way.append(target)
+        self._velocity = self._keeps * self._velocity + self._gives * (self._under_way.popleft() - disc)
         return target * PIXELS
 
+    def _predict(self, state: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The state one step later."""
+        with torch.no_grad():
+            x, u = torch.from_numpy(state), torch.from_numpy(target - state[3:5])
+            return self.system.params(x).step(x, u).x_next.numpy()
 
-def pose_of_center(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pose (3,) of the centre of mass in units of length, from that of the T's origin in pixels."""
-    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+
+def from_origin(pose: ArrayLike) -> NDArray[np.float64]:
+    """Pose (3,) of the T's centre of mass in units of length, from that of its origin in pixels."""
+    x, y, yaw = np.asarray(pose, np.float64)
+    cos, sin = math.cos(yaw), math.sin(yaw)
     cx, cy = CENTER_OF_MASS
-    return np.array([pose[0] / PIXELS + cos * cx - sin * cy, pose[1] / PIXELS + sin * cx + cos * cy, pose[2]])
+    return np.array([x / PIXELS + cos * cx - sin * cy, y / PIXELS + sin * cx + cos * cy, yaw])
