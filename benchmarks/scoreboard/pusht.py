@@ -20,7 +20,6 @@ import json
 import os
 import re
 import time
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,11 +32,10 @@ import tyro
 from difflcs import _files
 from difflcs._checks import check_positive_int
 from difflcs.bench import machine
-from difflcs.errors import InvalidInputError, MissingDependencyError
-from difflcs.planning.pusht import GYRATION, PIXELS, PushTPolicy, tee, tee_pushing
+from difflcs.errors import InvalidInputError
+from difflcs.planning.pusht import GYRATION, PIXELS, STEPS, PushTPolicy, make_env, tee, tee_pushing
 from difflcs.rl import wilson_interval
 
-STEPS = 300
 EVERY = 10
 """Episodes between two writings."""
 
@@ -61,7 +59,7 @@ def learned(seed: int) -> PushTPolicy:
     """With what two minutes of pushing teach."""
     from learn_pusht import learn
 
-    return PushTPolicy(learn(seed).model)
+    return PushTPolicy(learn(make_env(), seed).physics)
 
 
 VARIANTS = {
@@ -112,24 +110,6 @@ class Episode:
     coverage: float
     milliseconds: float
     longest: float
-
-
-def make_env() -> Any:
-    """The environment, unmodified.
-
-    Raises:
-        MissingDependencyError: gym-pusht is not installed.
-    """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # pygame's, about pkg_resources
-            import gym_pusht  # noqa: F401
-            import gymnasium
-    except ImportError as error:
-        raise MissingDependencyError(
-            f'expected gym-pusht, not installed ({error}); run: pip install "difflcs[rl,scoreboard]"'
-        ) from error
-    return gymnasium.make("gym_pusht/PushT-v0", obs_type="state", max_episode_steps=STEPS)
 
 
 def play(env: Any, policy: PushTPolicy, seed: int, variant: Variant, limit: int = STEPS) -> Episode:

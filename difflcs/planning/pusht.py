@@ -9,6 +9,7 @@ zero: what the environment sets is an attribute that pymunk does not read. Lengt
 from __future__ import annotations
 
 import math
+import warnings
 from collections import deque
 from typing import Any
 
@@ -18,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from difflcs._checks import check_positive_int
 from difflcs.cost import GoalCost
+from difflcs.errors import MissingDependencyError
 from difflcs.mpc.layer import LCSMPCLayer
 from difflcs.physics.contact import ContactLCS
 from difflcs.physics.planar import PDDrive, PlanarPushing
@@ -26,7 +28,7 @@ from difflcs.planning.places import DiscPlaces, Workspace
 from difflcs.planning.sampling import SamplingPolicy, SamplingSettings
 from difflcs.planning.travel import PlanarTravel
 
-__all__ = ["GOAL", "PIXELS", "PushTPolicy", "tee", "tee_pushing"]
+__all__ = ["GOAL", "PIXELS", "STEPS", "PushTPolicy", "make_env", "tee", "tee_pushing"]
 
 PIXELS = 100.0
 """Pixels in a unit of length."""
@@ -43,6 +45,8 @@ GYRATION = math.sqrt(3000.0) / PIXELS
 DRIVE = PDDrive(stiffness=100.0, damping=20.0, substep=0.01, substeps=10)
 SIDE = 5.12
 """Of the square that actions are in."""
+STEPS = 300
+"""Of 0.1 s, the limit of an episode."""
 
 
 def tee(scale: float = 1.0) -> Shape:
@@ -69,6 +73,27 @@ def tee_pushing(**changes: Any) -> PlanarPushing:
     return PlanarPushing(**(own | changes))
 
 
+def make_env(**options: Any) -> Any:
+    """The environment as its authors publish it, with obs_type="state".
+
+    Args:
+        options: for `gymnasium.make`.
+
+    Raises:
+        MissingDependencyError: gym-pusht is not installed.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of pygame, about pkg_resources
+            import gym_pusht  # noqa: F401
+            import gymnasium
+    except ImportError as error:
+        raise MissingDependencyError(
+            f'expected the package gym-pusht, not installed ({error}); run: pip install "difflcs[scoreboard]"'
+        ) from error
+    return gymnasium.make("gym_pusht/PushT-v0", obs_type="state", max_episode_steps=STEPS, **options)
+
+
 class PushTPolicy:
     """Sampling-based contact MPC for gym-pusht: its observation of obs_type="state" to its action.
 
@@ -86,6 +111,7 @@ class PushTPolicy:
         delay: steps by which actions come late. The plan begins at the state that the system predicts for then.
         places: round the T.
         horizon: of the plans [steps].
+        margin: by how much farther than usual from the T places and ways are laid [100 px].
 
     Attributes:
         sampling: the policy inside, with its `decision`.
