@@ -157,7 +157,7 @@ def _each(name: str, value: float | Tensor, gap: Tensor, strict: bool) -> Tensor
             f"{name}: expected one number or (..., n_contacts={gap.shape[-1]}), got {tuple(value.shape)}; give one for "
             f"each contact"
         )
-    return value.expand(torch.broadcast_shapes(value.shape, gap.shape[-1:]))
+    return value if value.ndim and value.shape[-1] == gap.shape[-1] else value.expand(*value.shape[:-1], gap.shape[-1])
 
 
 def _rays(contacts: Contacts, mu: Tensor, soft: Tensor) -> tuple[Tensor, Tensor, Tensor]:
