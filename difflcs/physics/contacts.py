@@ -14,6 +14,10 @@ unique. Two models of dry friction are offered:
 - Stewart-Trinkle: normal force, friction in each direction and sliding distance each have a complementarity condition.
   (D. Stewart, J. Trinkle, "An implicit time-stepping scheme for rigid body dynamics with inelastic collisions and
   Coulomb friction", Int. J. Numer. Methods Eng. 39, 1996.)
+  By itself its F + Fᵀ is indefinite. What makes it definite is a drag: friction is at most μ λ_n + ε σ for a sliding
+  distance σ, in an open contact too, with the smallest ε that suffices. For one contact ε is about μ²/4 over the
+  mobility. Where several contacts share a load it grows as one over their compliance, and little is left of the law:
+  use Anitescu's there.
 """
 
 from __future__ import annotations
