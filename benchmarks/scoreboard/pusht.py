@@ -1,0 +1,213 @@
+"""Push-T of gym-pusht by sampling-based contact MPC: `python benchmarks/scoreboard/pusht.py --episodes 500 --json`.
+
+The environment is as its authors publish it: its own start, success flag (more than 95 % of the goal covered by the T)
+and limit (300 steps of 0.1 s). The policy is given the state (place of the disc, pose of the T) and, by variant:
+
+- known: geometry, mass and drive as they are;
+- learned: what is learned from two minutes of random pushing, see `learn_pusht.py`;
+- inertia, friction, outline: one of them wrong by 20 % (friction, which is zero, is taken for 0.2);
+- noise: every coordinate observed with a standard deviation of 2 px, the angle with that of 2 px at the T's radius of
+  gyration;
+- delay: actions come one step late, and the plan begins where the system predicts that it will be.
+
+Times are CPU times of the policy, on one core. With `--out FILE`, episodes are written as they end, and those that are
+in the file already are not played again. `--variant all` plays every one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+
+from difflcs import _files
+from difflcs._checks import check_positive_int
+from difflcs.bench import machine
+from difflcs.errors import InvalidInputError
+from difflcs.planning.pusht import GYRATION, PIXELS, STEPS, PushTPolicy, make_env, tee, tee_pushing
+from difflcs.rl import wilson_interval
+
+EVERY = 10
+"""Episodes between two writings."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What the policy is told and how it observes and acts.
+
+    Attributes:
+        policy: makes it; its argument is the seed.
+        noise: standard deviation of every observed coordinate [px].
+        delay: steps by which its actions come late.
+    """
+
+    policy: Callable[[int], PushTPolicy] = lambda seed: PushTPolicy()
+    noise: float = 0.0
+    delay: int = 0
+
+
+def learned(seed: int) -> PushTPolicy:
+    """With what two minutes of pushing teach."""
+    from learn_pusht import learn
+
+    return PushTPolicy(learn(make_env(), seed).physics)
+
+
+VARIANTS = {
+    "known": Variant(),
+    "learned": Variant(learned),
+    "inertia -20 %": Variant(lambda seed: PushTPolicy(tee_pushing(gyration=GYRATION * 0.8**0.5))),
+    "inertia +20 %": Variant(lambda seed: PushTPolicy(tee_pushing(gyration=GYRATION * 1.2**0.5))),
+    "friction 0.2": Variant(lambda seed: PushTPolicy(tee_pushing(friction=torch.tensor(0.2, dtype=torch.float64)))),
+    "outline -20 %": Variant(lambda seed: PushTPolicy(tee_pushing(shape=tee(0.8)))),
+    "outline +20 %": Variant(lambda seed: PushTPolicy(tee_pushing(shape=tee(1.2)))),
+    "noise 2 px": Variant(noise=2.0),
+    "one step late": Variant(lambda seed: PushTPolicy(delay=1), delay=1),
+}
+
+
+@dataclass
+class Options:
+    """Push-T by sampling-based contact MPC."""
+
+    episodes: int = 500
+    """Episodes, of seeds `seed`, `seed` + 1, …"""
+    seed: int = 0
+    """Seed of the first episode."""
+    variant: str = "known"
+    """One of the variants, or "all"."""
+    json: bool = False
+    """Print one line of JSON for each variant, and nothing else."""
+    out: Path | None = None
+    """Where the episodes are recorded, to go on from there; nowhere if not given."""
+    smoke: bool = False
+    """Two episodes of a few steps."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode.
+
+    Attributes:
+        success: the environment's own flag.
+        steps: until success or the limit.
+        coverage: largest part of the goal that the T has covered.
+        milliseconds: CPU time of the policy, of all steps.
+        longest: of one step.
+    """
+
+    success: bool
+    steps: int
+    coverage: float
+    milliseconds: float
+    longest: float
+
+
+def play(env: Any, policy: PushTPolicy, seed: int, variant: Variant, limit: int = STEPS) -> Episode:
+    """One episode of a seed."""
+    noise = np.random.default_rng([seed, 2])
+    spread = variant.noise * np.array([1.0, 1.0, 1.0, 1.0, 1.0 / (GYRATION * PIXELS)])
+    observation, _ = env.reset(seed=seed)
+    policy.reset()
+    late = [observation[:2].copy()] * variant.delay
+    times, best, success = [], 0.0, False
+    for _ in range(limit):
+        seen = observation + spread * noise.standard_normal(5)
+        start = time.process_time()
+        late.append(policy.act(seen))
+        times.append(1e3 * (time.process_time() - start))
+        observation, _, success, truncated, info = env.step(late.pop(0))
+        best = max(best, float(info["coverage"]))
+        if success or truncated:
+            break
+    return Episode(bool(success), len(times), best, sum(times), max(times))
+
+
+def summary(episodes: list[list[float]]) -> dict[str, float]:
+    """The figures of a variant."""
+    success, steps, coverage, milliseconds, longest = np.array(episodes, float).T
+    low, high = wilson_interval(int(success.sum()), len(success))
+    return {
+        "success_rate": float(success.mean()),
+        "ci_low": low,
+        "ci_high": high,
+        "episodes": len(success),
+        "mean_steps": float(steps.mean()),
+        "milliseconds_per_step": float(milliseconds.sum() / steps.sum()),
+        "coverage": float(coverage.mean()),
+        "longest_milliseconds": float(np.percentile(longest, 99)),
+    }
+
+
+def measure(name: str, o: Options, env: Any, record: dict[str, Any]) -> dict[str, float]:
+    """Play the episodes of a variant that are not in the record yet."""
+    variant = VARIANTS[name]
+    row = record["results"].setdefault(name, {"rows": []})
+    rows: list[list[float]] = row["rows"]
+    policy = variant.policy(o.seed) if len(rows) < o.episodes else None
+    for i in range(len(rows), o.episodes):
+        assert policy is not None
+        found = play(env, policy, o.seed + i, variant, 5 if o.smoke else STEPS)
+        rows.append([int(found.success), found.steps, *(round(v, 4) for v in list(vars(found).values())[2:])])
+        if o.out is not None and ((i + 1) % EVERY == 0 or i + 1 == o.episodes):
+            row.update(summary(rows))
+            keep(o.out, record)
+        if not o.json:
+            print(f"{name}: seed {o.seed + i}, {'solved' if found.success else 'not solved'}, {found.steps} steps")
+    return summary(rows[: o.episodes])
+
+
+def keep(path: Path, record: dict[str, Any]) -> None:
+    """Write the record atomically, an episode a line."""
+    text = json.dumps(record, indent=2, ensure_ascii=False)
+    text = re.sub(r"\[([^\[\]]*)\]", lambda inner: f"[{' '.join(inner[1].split())}]", text)
+    _files.write_atomically(path, (text + "\n").encode())
+
+
+def begin(o: Options) -> dict[str, Any]:
+    """The record to go on with: that of the file where it is of the same seed, or an empty one."""
+    options = {"seed": o.seed, "steps": STEPS, "smoke": o.smoke}
+    empty = {"machine": {**machine(), "cores": os.cpu_count()}, "options": options, "results": {}}
+    if o.out is None or not o.out.exists():
+        return empty
+    found: Any = _files.read_json(o.out)
+    if found["options"] != options:
+        raise InvalidInputError(
+            f"out: expected a record of {options}, got one of {found['options']} in {o.out}; name another file"
+        )
+    return found
+
+
+def main(o: Options) -> None:
+    """Play, print, write."""
+    if o.variant not in (*VARIANTS, "all"):
+        raise InvalidInputError(f"variant: expected one of {', '.join(VARIANTS)}, or all, got {o.variant!r}")
+    check_positive_int("episodes", o.episodes)
+    if o.smoke:
+        o.episodes = min(o.episodes, 2)
+    torch.set_num_threads(1)
+    env, record = make_env(), begin(o)
+    for name in VARIANTS if o.variant == "all" else (o.variant,):
+        found = measure(name, o, env, record)
+        if o.json:
+            print(json.dumps({"variant": name, **found}))
+            continue
+        print(
+            f"{name}: {100 * found['success_rate']:.1f} % of {found['episodes']} ({100 * found['ci_low']:.1f} to "
+            f"{100 * found['ci_high']:.1f}), {found['mean_steps']:.1f} steps, coverage {found['coverage']:.3f}, "
+            f"{found['milliseconds_per_step']:.1f} ms a step"
+        )
+    env.close()
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
