@@ -171,8 +171,7 @@ def pushing(count: int, random: np.random.Generator) -> list[Case]:
 def settled(model: Any) -> float:
     """Height of the box at rest."""
     data = mujoco.MjData(model)
-    data.qpos[-2:] = 0.5
-    data.ctrl[:] = 0.5
+    data.qpos[7:], data.ctrl[:] = 0.5, 0.5  # the pusher, out of the way
     for _ in range(1000):
         mujoco.mj_step(model, data)
     return float(data.qpos[2])

@@ -176,7 +176,7 @@ class Dynamic:
     def finish(
         self, arrays: tuple[Array, Array, Array, Array], x: Array, tangent: Array | None, found: Found
     ) -> FreeMotion:
-        """The motion at states x (n, 2 nv) with these contacts."""
+        """The motion at states x (n, 2 nv), with these contacts."""
         n, nv, h = len(x), self.model.nv, self.seconds
         acceleration, A, B, inverse_mass = arrays
         K, D, B = A[:, nv:, :nv], A[:, nv:, nv:] - np.eye(nv), B[:, nv:]
@@ -198,7 +198,8 @@ class Dynamic:
         impulse = np.linalg.solve(np.eye(nv) - h * D - h * h * K, inverse_mass)
         response = np.zeros((n, 2 * nv, 2 * nv))
         response[:, :, :nv] = to_x @ np.concatenate([h * impulse, impulse], 1) @ to_x[:, :nv, :nv].swapaxes(-1, -2)
-        return FreeMotion(*(torch.from_numpy(v) for v in (A_x, to_x @ step[:, :, 2 * nv : -1], d, response)))
+        tensors = (torch.from_numpy(v) for v in (A_x, to_x @ step[:, :, 2 * nv : -1], d, response))
+        return FreeMotion(*tensors)
 
     def _solve(self, K: Array, D: Array, B: Array, load: Array) -> Array:
         """(ζ, ν) after the step as a matrix (n, 2 nv, 2 nv + nu + 1) of ζ, ν, u and 1."""
