@@ -151,7 +151,7 @@ def machine(record: dict) -> str:
 
 
 def efforts(record: dict) -> str:
-    """Optima that each effort of the batched backend reaches: mean gap, share within 0.1 %, time in parts of one start."""
+    """Optima that each effort of the batched backend reaches: mean gap, share within 0.1 %, time over one start."""
     names = ("fast", "default", "best")
     rows = [
         [f"{kind} ({row['problems']})"]

@@ -1,11 +1,13 @@
 """Linear complementarity systems from known physics: shapes in the plane, MuJoCo models, and what of it is learned."""
 
+from difflcs.physics.contact import ContactLCS
 from difflcs.physics.contacts import Contacts, FreeMotion, contact_lcs
 from difflcs.physics.planar import ForceDrive, Inertia, PDDrive, PlanarPushing, PositionDrive
 from difflcs.physics.shapes import Circle, Distance, Polygon, Shape, Union, box
 
 __all__ = [
     "Circle",
+    "ContactLCS",
     "Contacts",
     "Distance",
     "ForceDrive",

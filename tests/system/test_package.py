@@ -22,6 +22,8 @@ LAYERS = [
     {"lcs", "lcp", "records", "losses", "_violation", "scales", "cost", "constraints"},
     {"systems"},
     {"mpc"},
+    {"physics"},
+    {"planning"},
     {"rl", "zoo", "export"},
     {"bench", "doctor", "cli", "__main__"},
 ]

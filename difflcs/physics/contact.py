@@ -1,0 +1,162 @@
+"""ContactLCS: contact physics whose numbers are learned."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from difflcs._checks import describe
+from difflcs.errors import DTypeError, InvalidInputError
+from difflcs.physics.planar import PlanarPushing, PositionDrive
+from difflcs.physics.shapes import Circle, Polygon, Shape, Union
+from difflcs.records import LCSParams
+
+__all__ = ["LEARNABLE", "ContactLCS"]
+
+LEARNABLE = ("center_of_mass", "gyration", "friction", "compliance", "radius", "gain", "outline")
+"""What a `ContactLCS` can learn."""
+
+
+class ContactLCS(nn.Module):
+    """A body pushed by discs whose physics is learned: a dozen parameters, where an `LCSModel` has hundreds.
+
+    It is an `LCSModule`. Its system follows the state: contacts are where the shapes are. So it is learned from little
+    data, by `violation_loss` or `prediction_loss` from transitions, or through an `LCSMPCLayer` by PPO.
+
+    All parameters are without units and of one scale, so that one learning rate serves: logarithms of what is positive,
+    and distances in parts of `length`. They start at zero, where the physics is as it was given.
+
+    Args:
+        physics: what is known or guessed.
+        learn: what is learned of it, of `center_of_mass` (2), `gyration` (1), `friction` (one for each disc),
+            `compliance` (one for each disc), `radius` of each disc, `gain` of a `PositionDrive` (each disc and axis),
+            and `outline`: each side of a polygon moves along its normal, each circle has another radius.
+
+    Raises:
+        DTypeError, InvalidInputError: no `PlanarPushing`, an unknown name, one named twice, the gain of another drive,
+            or friction where there is none.
+    """
+
+    def __init__(self, physics: PlanarPushing, learn: Sequence[str] = LEARNABLE[:-1]):
+        super().__init__()
+        if not isinstance(physics, PlanarPushing):
+            raise DTypeError(f"physics: expected a PlanarPushing, got {describe(physics)}; build one from shapes")
+        self.learn = tuple(learn)
+        unknown = [name for name in self.learn if name not in LEARNABLE]
+        if unknown or len(set(self.learn)) < len(self.learn) or isinstance(learn, str):
+            raise InvalidInputError(
+                f"learn: expected some of {', '.join(LEARNABLE)}, each once, got {learn!r:.200}; name what is uncertain"
+            )
+        if "friction" in self.learn and physics.frictionless:
+            raise InvalidInputError(
+                "learn: expected friction above 0 where it is learned, got friction 0 in the physics; guess a value, "
+                "or leave it out"
+            )
+        if "gain" in self.learn and not isinstance(physics.drive, PositionDrive):
+            raise InvalidInputError(
+                f"learn: expected a PositionDrive where its gain is learned, got {type(physics.drive).__name__}; leave "
+                f"it out"
+            )
+        self.guess = physics
+        discs = physics.n_discs
+        sizes = {
+            "center_of_mass": (2,),
+            "gyration": (),
+            "friction": (discs,),
+            "compliance": (discs,),
+            "radius": (discs,),
+            "gain": (discs, 2),
+            "outline": (_count_sides(physics.shape),),
+        }
+        self.change = nn.ParameterDict(
+            {name: nn.Parameter(torch.zeros(sizes[name], dtype=torch.float64)) for name in self.learn}
+        )
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return self.guess.n_x
+
+    @property
+    def n_u(self) -> int:
+        """Number of actions."""
+        return self.guess.n_u
+
+    @property
+    def n_lam(self) -> int:
+        """Number of contact forces."""
+        return self.guess.n_lam
+
+    @property
+    def physics(self) -> PlanarPushing:
+        """The physics as it is now, differentiable in what is learned."""
+        guess, change = self.guess, self.change
+        length = guess.length or 1.0
+        values: dict[str, Any] = {
+            name: getattr(guess, name) * change[name].exp()
+            for name in ("gyration", "friction", "compliance", "radius")
+            if name in change
+        }
+        if "center_of_mass" in change:
+            values["center_of_mass"] = guess.center_of_mass + length * change["center_of_mass"]
+        if "gain" in change:
+            gain = torch.as_tensor(guess.drive.gain, dtype=torch.float64)  # pyright: ignore[reportAttributeAccessIssue]
+            values["drive"] = PositionDrive(gain * change["gain"].exp())
+        if "outline" in change:
+            values["shape"] = _moved(guess.shape, iter(length * change["outline"]))
+        return guess.replace(**values) if values else guess
+
+    def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
+        """The system at states x (..., n_x); there is no context."""
+        return self.physics.params(x, context)
+
+    def summary(self) -> dict[str, Any]:
+        """What is learned, as numbers in the units of the physics."""
+        now = self.physics
+        found: dict[str, Any] = {}
+        for name in self.learn:
+            value: Any
+            if name == "gain":
+                value = now.drive.gain  # pyright: ignore[reportAttributeAccessIssue]
+            elif name == "outline":
+                value = (now.length or 1.0) * self.change["outline"]
+            else:
+                value = getattr(now, name)
+            found[name] = value.detach().tolist()
+        return found
+
+
+def _count_sides(shape: Shape) -> int:
+    if isinstance(shape, Union):
+        return sum(_count_sides(part) for part in shape.parts)
+    return len(shape.vertices) if isinstance(shape, Polygon) else 1
+
+
+def _moved(shape: Shape, outward: Any) -> Shape:
+    """A shape whose sides have moved by the next numbers, each along its normal."""
+    if isinstance(shape, Union):
+        return Union(tuple(_moved(part, outward) for part in shape.parts))
+    if isinstance(shape, Circle):
+        return Circle(shape.r + next(outward), shape.center)
+    if not isinstance(shape, Polygon):
+        raise InvalidInputError(
+            f"learn: expected Circle, Polygon or Union where the outline is learned, got {type(shape).__name__}; leave "
+            f"the outline out"
+        )
+    vertices = shape.vertices
+    side = vertices.roll(-1, 0) - vertices
+    normal = torch.stack([side[:, 1], -side[:, 0]], -1) / side.norm(dim=1, keepdim=True)
+    by = torch.stack([next(outward) for _ in range(len(vertices))])
+    # A corner stays on both of its sides: n₁·δ = h₁, n₀·δ = h₀. Where they are nearly parallel, on their mean.
+    before, own = normal.roll(1, 0), normal
+    cosine = (before * own).sum(-1)
+    h0, h1 = by.roll(1, 0), by
+    across = 1 - cosine.square()
+    straight = across < 0.05
+    safe = torch.where(straight, torch.ones_like(across), across)
+    sharp = ((h0 - cosine * h1) / safe).unsqueeze(-1) * before + ((h1 - cosine * h0) / safe).unsqueeze(-1) * own
+    flat = (0.5 * (h0 + h1)).unsqueeze(-1) * (before + own) / (1 + cosine).clamp_min(0.5).unsqueeze(-1)
+    return Polygon(vertices + torch.where(straight.unsqueeze(-1), flat, sharp))

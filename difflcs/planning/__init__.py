@@ -1,0 +1,18 @@
+"""Where to touch next: contact MPC from many places at once, as a policy."""
+
+from difflcs.planning.places import DiscPlaces, Places, Workspace
+from difflcs.planning.sampling import Decision, Mode, SamplingPolicy, SamplingSettings
+from difflcs.planning.travel import LiftTravel, PlanarTravel, Travel
+
+__all__ = [
+    "Decision",
+    "DiscPlaces",
+    "LiftTravel",
+    "Mode",
+    "Places",
+    "PlanarTravel",
+    "SamplingPolicy",
+    "SamplingSettings",
+    "Travel",
+    "Workspace",
+]

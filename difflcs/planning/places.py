@@ -1,0 +1,185 @@
+"""Places where end effectors could be, in coordinates of the body, and the states that they mean."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from difflcs._checks import check_number, check_positive_int, check_tensor
+from difflcs.errors import InvalidInputError, ShapeError
+from difflcs.physics.shapes import Shape
+from difflcs.planning.outline import clearance, ring
+
+__all__ = ["DiscPlaces", "Places", "Workspace", "from_body", "to_body"]
+
+
+class Places(Protocol):
+    """Where the end effectors could be. A place is a row of numbers that moves with the body, in a form of its own."""
+
+    def sample(self, x: Tensor) -> Tensor:
+        """Places (n_places, n_place) to compare at a state x (n_x,); the same at each call, or drawn anew."""
+        ...
+
+    def states(self, x: Tensor, places: Tensor) -> Tensor:
+        """States (n_places, n_x) with end effectors at places (n_places, n_place), the body as in x, at rest."""
+        ...
+
+    def allowed(self, states: Tensor) -> Tensor:
+        """Which of the states (n_places, n_x) the robot may be in, (n_places,) bool."""
+        ...
+
+    def near(self, x: Tensor) -> bool:
+        """Whether the robot at x is so near the body that the system linearised there means something."""
+        ...
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """A rectangle that the targets of discs may not leave, and how far one may be sent in a step.
+
+    Attributes:
+        low: (x, y) of its lower corner [length].
+        high: (x, y) of its upper corner.
+        step: largest |u| of each component [length], > 0.
+        n_discs: discs, whose places are x[3 : 3 + 2 · n_discs] as in `difflcs.physics.PlanarPushing`.
+
+    Raises:
+        InvalidInputError and its kinds: a value does not fit.
+    """
+
+    low: Sequence[float]
+    high: Sequence[float]
+    step: float
+    n_discs: int = 1
+
+    def __post_init__(self) -> None:
+        check_number("step", self.step, strict=True)
+        check_positive_int("n_discs", self.n_discs)
+        for name in ("low", "high"):
+            if len(getattr(self, name)) != 2:
+                raise ShapeError(f"{name}: expected x and y, got {len(getattr(self, name))} numbers; give a corner")
+        if not all(a < b for a, b in zip(self.low, self.high, strict=True)):
+            raise InvalidInputError(
+                f"low: expected less than high in x and y, got {tuple(self.low)} and {tuple(self.high)}; exchange them"
+            )
+
+    def bounds(self, states: Tensor) -> tuple[Tensor, Tensor]:
+        """u_min and u_max (..., 2 · n_discs) of relative actions at states (..., n_x).
+
+        A disc that is outside is sent no further out.
+        """
+        discs = states[..., 3 : 3 + 2 * self.n_discs]
+        low, high = (discs.new_tensor(corner).repeat(self.n_discs) - discs for corner in (self.low, self.high))
+        return low.clamp(-self.step, 0.0), high.clamp(0.0, self.step)
+
+    def contains(self, points: Tensor, margin: float = 0.0) -> Tensor:
+        """(...) bool: which points (..., 2) are inside, and `margin` away from the border [length]."""
+        low, high = points.new_tensor(self.low) + margin, points.new_tensor(self.high) - margin
+        return ((points >= low) & (points <= high)).all(-1)
+
+
+def to_body(x: Tensor, points: Tensor) -> Tensor:
+    """Points (..., 2) of the plane in coordinates of the body whose pose begins the state x (n_x,)."""
+    return (points - x[:2]) @ _rotation(x)
+
+
+def from_body(x: Tensor, points: Tensor) -> Tensor:
+    """Points (..., 2) in coordinates of the body whose pose begins the state x (n_x,), in the plane."""
+    return points @ _rotation(x).mT + x[:2]
+
+
+def _rotation(x: Tensor) -> Tensor:
+    cos, sin = float(x[2].cos()), float(x[2].sin())
+    return x.new_tensor([[cos, -sin], [sin, cos]])
+
+
+class DiscPlaces:
+    """Discs round a body on a plane, as in `difflcs.physics.PlanarPushing`: on a ring round its shape.
+
+    Each disc in turn goes to each place of the ring while the others stay; with several discs, `together` random
+    choices of places for all of them come on top. Places where discs overlap are not allowed.
+
+    Args:
+        shape: outline of the body in its own coordinates.
+        radius: of the discs [length], > 0.
+        n_places: on the ring, at equal distances along it.
+        gap: between a disc on the ring and the body [length]; None: a tenth of the radius.
+        reach: gap up to which pushing from where a disc is may be thought of [length]; None: the radius.
+        n_discs: how many there are.
+        together: choices of places for all discs at once, other ones at each call.
+        workspace: that a disc on a place must be inside of; None: everywhere.
+        margin: between a place and the border of the workspace [length].
+        seed: of those choices.
+
+    Raises:
+        InvalidInputError and its kinds: an argument does not fit.
+    """
+
+    def __init__(
+        self,
+        shape: Shape,
+        radius: float,
+        n_places: int = 64,
+        *,
+        gap: float | None = None,
+        reach: float | None = None,
+        n_discs: int = 1,
+        together: int = 0,
+        workspace: Workspace | None = None,
+        margin: float = 0.0,
+        seed: int = 0,
+    ):
+        self.shape = shape
+        self.radius = check_number("radius", radius, strict=True)
+        self.n_discs = check_positive_int("n_discs", n_discs)
+        self.together = check_positive_int("together", together, minimum=0)
+        self.reach = radius if reach is None else check_number("reach", reach)
+        self.workspace, self.margin = workspace, check_number("margin", margin)
+        gap = 0.1 * radius if gap is None else check_number("gap", gap, strict=True)
+        self.ring = ring(shape, radius + gap, n_places)
+        self._generator = torch.Generator().manual_seed(seed)
+
+    def sample(self, x: Tensor) -> Tensor:
+        """See `Places`: (n, 2 · n_discs) in coordinates of the body."""
+        if self.n_discs == 1:
+            return self.ring
+        here = to_body(x, self._discs(x))
+        each, n = len(self.ring), self.n_discs
+        alone = here.expand(n, each, n, 2).clone()
+        disc = torch.arange(n)
+        alone[disc, :, disc] = self.ring
+        choice = torch.randint(each, (self.together, n), generator=self._generator)
+        return torch.cat([alone.reshape(n * each, 2 * n), self.ring[choice].reshape(self.together, 2 * n)])
+
+    def states(self, x: Tensor, places: Tensor) -> Tensor:
+        """See `Places`."""
+        check_tensor("places", places, [("2 n_discs", 2 * self.n_discs)])
+        states = x.expand(len(places), -1).clone()
+        end = 3 + 2 * self.n_discs
+        states[:, 3:end] = from_body(x, places.reshape(-1, 2)).reshape(len(places), end - 3)
+        # Behind the places come velocities, if there are any, of discs and body: by then both are at rest.
+        states[:, end:] = 0.0
+        return states
+
+    def allowed(self, states: Tensor) -> Tensor:
+        """See `Places`."""
+        discs = states[:, 3 : 3 + 2 * self.n_discs].reshape(len(states), self.n_discs, 2)
+        allowed = torch.ones(len(states), dtype=torch.bool)
+        if self.workspace is not None:
+            allowed &= self.workspace.contains(discs, self.margin).all(-1)
+        if self.n_discs > 1:
+            i, j = torch.triu_indices(self.n_discs, self.n_discs, offset=1)
+            allowed &= ((discs[:, i] - discs[:, j]).norm(dim=-1) > 2 * self.radius).all(-1)
+        return allowed
+
+    def near(self, x: Tensor) -> bool:
+        """See `Places`."""
+        gap = clearance(self.shape, to_body(x, self._discs(x))) - self.radius
+        return bool((gap < self.reach).any())
+
+    def _discs(self, x: Tensor) -> Tensor:
+        return x[3 : 3 + 2 * self.n_discs].reshape(self.n_discs, 2)

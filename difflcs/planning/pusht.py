@@ -1,0 +1,161 @@
+"""Push-T, the environment of others (gym-pusht): its physics as a `PlanarPushing`, and a policy that solves it.
+
+A disc of radius 15 px pushes a T, made of two boxes of 30 by 120 and 30 by 90 px, to a pose on a plane of 512 px. An
+action is the target of the disc's PD controller, for ten substeps of 0.01 s. The disc is kinematic: nothing pushes it
+back. Velocities are damped away in each substep, so the T moves only while it is pushed. Friction between disc and T is
+zero: what the environment sets is an attribute that pymunk does not read. Lengths here are in units of 100 px.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from difflcs._checks import check_positive_int
+from difflcs.cost import GoalCost
+from difflcs.mpc.layer import LCSMPCLayer
+from difflcs.physics.contact import ContactLCS
+from difflcs.physics.planar import PDDrive, PlanarPushing
+from difflcs.physics.shapes import Polygon, Shape, Union
+from difflcs.planning.places import DiscPlaces, Workspace
+from difflcs.planning.sampling import SamplingPolicy, SamplingSettings
+from difflcs.planning.travel import PlanarTravel
+
+__all__ = ["GOAL", "PIXELS", "PushTPolicy", "tee", "tee_pushing"]
+
+PIXELS = 100.0
+"""Pixels in a unit of length."""
+RADIUS = 0.15
+"""Of the disc."""
+GOAL = (256.0, 256.0, math.pi / 4)
+"""Pose of the T's origin [px, px, rad]."""
+CENTER_OF_MASS = (0.0, 0.45)
+"""From the T's origin, the middle of its upper edge, to the mean of the centres of its boxes."""
+GYRATION = math.sqrt(3000.0) / PIXELS
+"""As the environment sums it: twice the moment of the bar about the origin, with a mass of 1."""
+DRIVE = PDDrive(stiffness=100.0, damping=20.0, substep=0.01, substeps=10)
+SIDE = 5.12
+"""Of the square that actions are in."""
+
+
+def tee(scale: float = 1.0) -> Shape:
+    """The T about its centre of mass; `scale` makes it larger or smaller about that."""
+    boxes = ((-0.6, 0.6, 0.0, 0.3), (-0.15, 0.15, 0.3, 1.2))
+    cx, cy = CENTER_OF_MASS
+    corners = [[[a - cx, c - cy], [b - cx, c - cy], [b - cx, d - cy], [a - cx, d - cy]] for a, b, c, d in boxes]
+    return Union(tuple(Polygon(scale * torch.tensor(box, dtype=torch.float64)) for box in corners))
+
+
+def tee_pushing(**changes: Any) -> PlanarPushing:
+    """The T and the disc: state (x, y, yaw of the T about its centre of mass, x, y of the disc, its velocity).
+
+    Args:
+        changes: fields of `PlanarPushing` to have other values.
+    """
+    own: dict[str, Any] = {
+        "shape": tee(),
+        "radius": RADIUS,
+        "drive": DRIVE,
+        "center_of_mass": (0.0, 0.0),
+        "gyration": GYRATION,
+        "friction": 0.0,
+        "compliance": 0.02,
+        "length": 1.0,
+    }
+    return PlanarPushing(**(own | changes))
+
+
+class PushTPolicy:
+    """Sampling-based contact MPC for gym-pusht: its observation of obs_type="state" to its action.
+
+        policy = PushTPolicy()
+        observation, _ = env.reset(seed=0)
+        policy.reset()
+        ...
+        observation, *_ = env.step(policy.act(observation))
+
+    The velocity of the disc, which the observation lacks, comes from the drive: what was sent is known.
+
+    Args:
+        system: of which the MPC plans: state and action as in `tee_pushing`, which it is if None.
+        shape: round which places and ways are laid; that of the system if None.
+        delay: steps by which actions come late. The plan begins at the state that the system predicts for then.
+        places: round the T.
+        horizon: of the plans [steps].
+
+    Attributes:
+        sampling: the policy inside, with its `decision`.
+    """
+
+    def __init__(
+        self,
+        system: PlanarPushing | ContactLCS | None = None,
+        *,
+        shape: Shape | None = None,
+        delay: int = 0,
+        places: int = 64,
+        horizon: int = 10,
+    ):
+        self.system = system = tee_pushing() if system is None else system
+        if shape is None:
+            shape = system.shape if isinstance(system, PlanarPushing) else system.physics.shape
+        self.delay = check_positive_int("delay", delay, minimum=0)
+        workspace = Workspace((0.0, 0.0), (SIDE, SIDE), step=0.6)
+        cost = GoalCost.reach(7, 2, goal_weight=(1.0, 1.0, 0.3), goal_weight_final=(4.0, 4.0, 1.2), input_weight=0.01)
+        self.sampling = SamplingPolicy(
+            LCSMPCLayer(system, cost, horizon, relaxation=1e-5, on_failure="mask"),
+            DiscPlaces(shape, RADIUS, places, gap=0.02, reach=0.12, workspace=workspace, margin=0.2),
+            PlanarTravel(shape, RADIUS, step=1.2, clearance=0.08, tolerance=0.08),
+            SamplingSettings(keep=0.6, smallest_gain=0.02, switch_price=0.02, travel_price=0.04),
+            bounds=workspace.bounds,
+            angles=(2,),
+        )
+        step = DRIVE.step()
+        self._keeps, self._gives = float(step.A[1, 1]), float(step.b[1])
+        self.reset()
+
+    def reset(self) -> None:
+        """The begin of an episode."""
+        self.sampling.reset()
+        self._velocity = np.zeros(2)
+        self._under_way: deque[NDArray[np.float64]] = deque()
+
+    def act(self, observation: ArrayLike) -> NDArray[np.float64]:
+        """An action.
+
+        Args:
+            observation: (5,) x, y of the disc, x, y [px] and angle [rad] of the T's origin.
+
+        Returns:
+            (2,) the target of the disc [px].
+        """
+        seen = np.asarray(observation, np.float64)
+        disc = seen[:2] / PIXELS
+        state = np.concatenate([from_origin(seen[2:]), disc, self._velocity])
+        if self.delay and not self._under_way:
+            self._under_way.extend([disc] * self.delay)
+        for target in self._under_way:
+            state = self._predict(state, target)
+        target = np.clip(state[3:5] + self.sampling.act(state, from_origin(GOAL)), 0.0, SIDE)
+        self._under_way.append(target)
+        self._velocity = self._keeps * self._velocity + self._gives * (self._under_way.popleft() - disc)
+        return target * PIXELS
+
+    def _predict(self, state: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The state one step later."""
+        with torch.no_grad():
+            x, u = torch.from_numpy(state), torch.from_numpy(target - state[3:5])
+            return self.system.params(x).step(x, u).x_next.numpy()
+
+
+def from_origin(pose: ArrayLike) -> NDArray[np.float64]:
+    """Pose (3,) of the T's centre of mass in units of length, from that of its origin in pixels."""
+    x, y, yaw = np.asarray(pose, np.float64)
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    cx, cy = CENTER_OF_MASS
+    return np.array([x / PIXELS + cos * cx - sin * cy, y / PIXELS + sin * cx + cos * cy, yaw])

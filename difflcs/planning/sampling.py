@@ -1,0 +1,256 @@
+"""Sampling-based contact MPC: push from here, or go to where pushing is worth more.
+
+An MPC that linearises contact at one state sees the surface next to it as an infinite plane: it pushes well, and does
+not find the way round a corner. So the same MPC is solved, as one batch, from where the robot is and from many places
+where its end effectors could be. The gain of a place is what its plan saves against standing still there. The robot
+pushes where it is while the gain there is near the best; else it travels, free of collision, to the place with the best
+gain after the price of the way, and pushes from there.
+
+Source: S. Venkatesh, B. Bianchini, A. Aydinoglu, W. Yang, M. Posa, "Approximating Global Contact-Implicit MPC via
+Sampling and Local Complementarity" (arXiv:2505.13350), called sampling C3. It compares whole costs, with the cost of
+travelling added, by C3 as the local controller and re-decides at each step; here the local controller is an
+`LCSMPCLayer`, gains are compared as parts of the cost of standing still, and a journey that has begun is finished.
+
+What it cannot do: it sees one push ahead, not two (a detour whose first push costs more than standing still is found
+only within the horizon); a place is judged as if the robot were there already; the body is taken to rest while the
+robot travels, and several end effectors not to collide with each other on the way.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from difflcs._checks import check_number, check_positive_int, check_tensor, describe
+from difflcs.errors import DTypeError, InvalidInputError, ShapeError, SolveWarning
+from difflcs.mpc.layer import LCSMPCLayer
+from difflcs.mpc.solution import MPCSolution
+from difflcs.planning.places import Places
+from difflcs.planning.travel import Travel
+
+__all__ = ["Decision", "Mode", "SamplingPolicy", "SamplingSettings"]
+
+Bounds = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""States (n, n_x) → u_min and u_max (n, n_u), where the bounds of an action depend on the state."""
+
+
+class Mode(enum.StrEnum):
+    """What the robot does."""
+
+    PUSH = "push"
+    TRAVEL = "travel"
+
+
+@dataclass(frozen=True)
+class SamplingSettings:
+    """When to push and when to travel. Gains and prices are parts of the cost of standing still.
+
+    Attributes:
+        keep: it goes on pushing while the gain here is at least this part of the best score, in [0, 1]: hysteresis.
+        smallest_gain: a gain below this is none: it looks for another place.
+        switch_price: price of any journey.
+        travel_price: price of a journey by its length [1/length].
+        patience: steps after which a journey ends wherever it is.
+    """
+
+    keep: float = 0.6
+    smallest_gain: float = 0.02
+    switch_price: float = 0.02
+    travel_price: float = 0.0
+    patience: int = 40
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if field.name != "patience":
+                check_number(field.name, getattr(self, field.name))
+        if self.keep > 1:
+            raise InvalidInputError(f"keep: expected at most 1, got {self.keep:g}; it is a part of the best score")
+        check_positive_int("patience", self.patience)
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What the policy decided in one step, and why.
+
+    Row 0 is where the robot is, the others are the places. While it travels nothing is compared: then what follows
+    `target` is that of the step in which the journey began.
+
+    Attributes:
+        mode: what it does.
+        began: whether it began a journey in this step.
+        chosen: row of the target, or 0.
+        target: (n_x,) state to which it travels, with the body where it is now; None where it pushes.
+        states: (1 + n_places, n_x) the states that were compared.
+        gains: (1 + n_places,) what each plan saves; −∞ where the place is not allowed or its problem was not solved.
+        scores: (1 + n_places,) gains less the price of the way.
+        standing: cost of standing still where the robot is.
+        solution: the plans of all states.
+    """
+
+    mode: Mode
+    began: bool
+    chosen: int
+    target: Tensor | None
+    states: Tensor
+    gains: Tensor
+    scores: Tensor
+    standing: float
+    solution: MPCSolution
+
+    @property
+    def gain(self) -> float:
+        """Gain where the robot is, as a part of the cost of standing still."""
+        return float(self.gains[0]) / max(self.standing, 1e-300)
+
+
+class SamplingPolicy:
+    """Sampling-based contact MPC, see `difflcs.planning.sampling`: `u = policy.act(x, goal)`.
+
+        policy = SamplingPolicy(mpc, DiscPlaces(shape, radius), PlanarTravel(shape, radius, step=0.02), angles=(2,))
+        policy.reset()
+        while ...:
+            u = policy.act(x, goal)
+
+    It keeps its mode from step to step: one policy for each robot, and `reset` at the begin of an episode. An action
+    must be relative to the robot: with u = 0 it stands still.
+
+    Args:
+        mpc: a layer around any `LCSModule`, which is asked for the system at a batch of states (1 + n_places, n_x);
+            with on_failure="mask", as one place without a solution must not stop the others.
+        places: where the end effectors could be, see `Places`.
+        travel: how they get there, see `Travel`.
+        settings: when to push and when to travel.
+        bounds: bounds of the actions at some states, instead of the layer's; `Workspace.bounds`, for example.
+        angles: components of the goal that are angles [rad]; the state has each at the same index. Of all turns that
+            mean the same, that next to the state is the goal.
+
+    Raises:
+        InvalidInputError and its kinds: an argument does not fit.
+    """
+
+    def __init__(
+        self,
+        mpc: LCSMPCLayer,
+        places: Places,
+        travel: Travel,
+        settings: SamplingSettings | None = None,
+        *,
+        bounds: Bounds | None = None,
+        angles: Sequence[int] = (),
+    ):
+        if not isinstance(mpc, LCSMPCLayer):
+            raise DTypeError(f"mpc: expected an LCSMPCLayer, got {describe(mpc)}; build one around your LCSModule")
+        if mpc.on_failure != "mask":
+            raise InvalidInputError(
+                'mpc: expected a layer with on_failure="mask", got "raise"; one place without a solution must not stop '
+                "the others"
+            )
+        self.mpc, self.places, self.travel, self.bounds = mpc, places, travel, bounds
+        self.settings = SamplingSettings() if settings is None else settings
+        self.angles = list(angles)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the mode, as at the begin of an episode."""
+        self._decision: Decision | None = None
+        self._place: Tensor | None = None
+        self._steps = 0
+
+    @property
+    def decision(self) -> Decision | None:
+        """What was decided last; None before the first step."""
+        return self._decision
+
+    def act(self, x: ArrayLike, goal: ArrayLike | None = None, *, context: Tensor | None = None) -> NDArray[np.float64]:
+        """Decide and plan from a state.
+
+        Args:
+            x: (n_x,) the state.
+            goal: (n_goal,), with a `GoalCost`.
+            context: (n_context,) whatever the system depends on besides x; given to the module.
+
+        Returns:
+            (n_u,) the action, inside the bounds where it pushes; what `travel` says where it travels.
+
+        Raises:
+            InvalidInputError and its kinds: an argument does not fit.
+        """
+        state, target = self._inputs(x, goal)
+        with torch.no_grad():
+            place = self._place
+            if place is not None:
+                self._steps += 1
+                towards = self.places.states(state, place.unsqueeze(0))[0]
+                if self._steps <= self.settings.patience and not self.travel.arrived(state, towards):
+                    return self._go_on(state, towards)
+            return self._decide(state, target, context, stay=place is not None)
+
+    def _inputs(self, x: ArrayLike, goal: ArrayLike | None) -> tuple[Tensor, Tensor | None]:
+        state = check_tensor("x", torch.as_tensor(x, dtype=torch.float64).detach(), [("n_x", self.mpc.lcs.n_x)])
+        if state.ndim != 1:
+            raise ShapeError(f"x: expected shape ({self.mpc.lcs.n_x},), got {tuple(state.shape)}; give one robot's")
+        if goal is None:
+            return state, None
+        target = check_tensor("goal", torch.as_tensor(goal, dtype=torch.float64).detach().clone())
+        if target.ndim != 1 or any(index >= len(target) for index in self.angles):
+            raise ShapeError(
+                f"goal: expected one vector that has the angles {self.angles}, got shape {tuple(target.shape)}; "
+                f"give one robot's goal"
+            )
+        for index in self.angles:
+            target[index] += 2 * math.pi * torch.round((state[index] - target[index]) / (2 * math.pi))
+        return state, target
+
+    def _go_on(self, state: Tensor, towards: Tensor) -> NDArray[np.float64]:
+        """The next step of a journey."""
+        assert self._decision is not None
+        self._decision = replace(self._decision, mode=Mode.TRAVEL, began=False, target=towards)
+        return self.travel.action(state, towards).numpy()
+
+    def _decide(self, state: Tensor, goal: Tensor | None, context: Tensor | None, stay: bool) -> NDArray[np.float64]:
+        """Compare all places. `stay`: a journey has just ended, and at least one push comes first."""
+        places = self.places.sample(state)
+        states = torch.cat([state.unsqueeze(0), self.places.states(state, places)])
+        allowed = self.places.allowed(states)
+        allowed[0] = True
+        solution = self._solve(states, goal, context)
+        gains, standing = _gains(solution)
+        gains = torch.where(allowed & solution.converged, gains, -math.inf)
+        scale, own = max(standing, 0.0), self.settings
+        price = own.switch_price + own.travel_price * self.travel.distance(state, states[1:])
+        scores = torch.cat([gains[:1], gains[1:] - scale * price])
+        best, here = float(scores.max()), float(gains[0])
+        pushes = self.places.near(state) and here > own.smallest_gain * scale and here >= own.keep * best
+        chosen = 0
+        if not stay and not pushes and bool(torch.isfinite(scores[1:]).any()):
+            chosen = 1 + int(scores[1:].argmax())
+        self._place, self._steps = (places[chosen - 1].clone(), 0) if chosen else (None, 0)
+        target = states[chosen] if chosen else None
+        mode = Mode.TRAVEL if chosen else Mode.PUSH
+        self._decision = Decision(mode, bool(chosen), chosen, target, states, gains, scores, standing, solution)
+        if target is not None:
+            return self.travel.action(state, target).numpy()
+        return solution.action[0].numpy()
+
+    def _solve(self, states: Tensor, goal: Tensor | None, context: Tensor | None) -> MPCSolution:
+        low, high = (None, None) if self.bounds is None else self.bounds(states)
+        with warnings.catch_warnings():  # what was not solved is in the decision
+            warnings.simplefilter("ignore", SolveWarning)
+            return self.mpc(states, goal, u_min=low, u_max=high, context=context)
+
+
+def _gains(solution: MPCSolution) -> tuple[Tensor, float]:
+    """What each plan (n,) saves against standing still, and the cost of standing still at the first state."""
+    problem = solution.problem
+    planned = problem.objective(solution.x, solution.u)
+    standing = problem.objective(solution.x[:, :1].expand_as(solution.x), torch.zeros_like(solution.u))
+    constant = solution.objective - planned
+    return standing - planned, float(standing[0] + constant[0])

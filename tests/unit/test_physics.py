@@ -1,0 +1,379 @@
+"""Shapes, contacts, a body pushed by discs, and what is learned of it."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.autograd.functional import jacobian
+
+from difflcs import LCSModule, LCSMPCLayer, QuadraticCost, prediction_loss, violation_loss
+from difflcs.errors import DTypeError, InvalidInputError, ShapeError
+from difflcs.physics import (
+    Circle,
+    ContactLCS,
+    Contacts,
+    ForceDrive,
+    FreeMotion,
+    Inertia,
+    PDDrive,
+    PlanarPushing,
+    Polygon,
+    Union,
+    box,
+    contact_lcs,
+)
+from difflcs.physics.contact import LEARNABLE
+
+F64 = torch.float64
+L_SHAPE = [[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 3.0]]
+
+
+def tensor(values):
+    return torch.tensor(values, dtype=F64)
+
+
+# --- shapes -----------------------------------------------------------------------------------------------------------
+
+
+def test_distances_to_a_box_are_those_of_geometry():
+    found = box(-1, 1, -2, 2).distance(tensor([[3.0, 0.0], [0.5, 0.0], [4.0, 6.0], [1.0, 0.3], [1.0, 2.0]]))
+    torch.testing.assert_close(found.distance[:, 0], tensor([2.0, -0.5, 5.0, 0.0, 0.0]))
+    torch.testing.assert_close(found.normal[:3, 0], tensor([[1.0, 0.0], [1.0, 0.0], [0.6, 0.8]]))
+    torch.testing.assert_close(found.point[:3, 0], tensor([[1.0, 0.0], [1.0, 0.0], [1.0, 2.0]]))
+    torch.testing.assert_close(found.normal.norm(dim=-1), torch.ones(5, 1, dtype=F64))
+
+
+def test_a_polygon_need_not_be_convex_nor_counterclockwise():
+    outline = Polygon(tensor(L_SHAPE).flip(0))
+    inside = tensor([[0.5, 0.5], [1.5, 0.5], [0.5, 2.5]])
+    outside = tensor([[1.5, 1.5], [-0.1, 0.5], [2.5, 3.0], [1.2, 2.0]])
+    assert outline.contains(inside).all()
+    assert not outline.contains(outside).any()
+    torch.testing.assert_close(outline.distance(outside).distance[0, 0], tensor(0.5))
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(-4, 4), min_size=2, max_size=2), st.integers(0, 2))
+def test_the_normal_is_the_gradient_of_the_distance(place, which):
+    shape = (Polygon(L_SHAPE), Circle(0.7, (0.3, 0.1)), Union((box(-1, 1, 0, 1), Circle(0.5))))[which]
+    point = tensor(place)
+    found = shape.distance(point)
+    if bool((found.distance.abs() < 1e-3).any()):
+        return
+    # Where two sides are equally near, the distance has a kink.
+    near = shape.distance(point + 1e-4 * torch.randn(20, 2, dtype=F64, generator=torch.Generator().manual_seed(0)))
+    if bool(((near.normal - found.normal).norm(dim=-1) > 1e-2).any()):
+        return
+    gradient = jacobian(lambda p: shape.distance(p).distance, point)
+    torch.testing.assert_close(gradient, found.normal, rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(found.point + found.distance.unsqueeze(-1) * found.normal, point.expand_as(found.point))
+
+
+def test_moments_of_what_is_known():
+    area, centroid, polar = box(0, 2, 0, 4).moments()
+    torch.testing.assert_close(area, tensor(8.0))
+    torch.testing.assert_close(centroid, tensor([1.0, 2.0]))
+    torch.testing.assert_close(polar, tensor(8.0 * (4 + 16) / 12))
+    torch.testing.assert_close(Circle(2.0).gyration, tensor(math.sqrt(2.0)))
+    whole, halves = box(0, 2, 0, 4), Union((box(0, 2, 0, 1), Union((box(0, 2, 1, 4),))))
+    torch.testing.assert_close(halves.gyration, whole.gyration)
+    torch.testing.assert_close(halves.centroid, whole.centroid)
+    assert halves.n_parts == 2
+
+
+@pytest.mark.parametrize(
+    ("vertices", "error"),
+    [([[0.0, 0.0], [1.0, 0.0]], ShapeError), ([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]], InvalidInputError),
+     ([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0], [0.0, 1.0]], InvalidInputError), ("a square", DTypeError)],
+)  # fmt: skip
+def test_what_is_no_polygon_is_refused(vertices, error):
+    with pytest.raises(error, match="vertices: expected"):
+        Polygon(vertices)
+
+
+def test_other_bad_shapes_are_refused():
+    with pytest.raises(InvalidInputError, match="r: expected"):
+        Circle(0.0)
+    with pytest.raises(DTypeError, match="parts: expected shapes"):
+        Union(("circle",))
+    with pytest.raises(InvalidInputError, match="at least one shape"):
+        Union(())
+    with pytest.raises(InvalidInputError, match="x_min < x_max"):
+        box(1, 0, 0, 1)
+
+
+# --- contacts ---------------------------------------------------------------------------------------------------------
+
+
+def sliding_block(cone, compliance=1e-6):
+    """A point of mass 1 on the floor; state (x, z, speeds), steps of 0.1, gravity and a push along x as action."""
+    h, eye, zero = 0.1, torch.eye(2, dtype=F64), torch.zeros(2, 2, dtype=F64)
+    A = torch.cat([torch.cat([eye, h * eye], 1), torch.cat([zero, eye], 1)])
+    B = tensor([[h * h, 0.0], [0.0, h * h], [h, 0.0], [0.0, h]])
+    response = torch.cat([torch.cat([h * eye, zero], 1), torch.cat([eye, zero], 1)])
+    free = FreeMotion(A, B, B @ tensor([0.0, -9.81]), response)
+    contacts = Contacts(tensor([0.0]), tensor([[0.0, 1.0, 0.0, 0.0]]), tensor([[[1.0, 0.0, 0.0, 0.0]]]))
+    x = torch.zeros(4, dtype=F64)
+    return contact_lcs(contacts, free, x, friction=0.5, compliance=compliance, cone=cone), x
+
+
+@pytest.mark.parametrize("cone", ["anitescu", "stewart-trinkle"])
+def test_a_push_within_the_cone_moves_nothing(cone):
+    lcs, x = sliding_block(cone)
+    after = lcs.step(x, tensor([4.0, 0.0])).x_next  # friction carries up to 4.9
+    torch.testing.assert_close(after, x, rtol=0, atol=2e-5)
+
+
+def test_sliding_friction():
+    # Coulomb: 6 − 0.5 · 9.81 = 1.095. Anitescu's contact opens as it slides, by μ times the distance: it pushes harder.
+    lcs, x = sliding_block("stewart-trinkle", 1e-3)
+    after = lcs.step(x, tensor([6.0, 0.0])).x_next
+    assert abs(float(after[2]) - 0.1095) < 0.01
+    assert abs(float(after[1])) < 2e-3
+    lcs, x = sliding_block("anitescu")
+    after = lcs.step(x, tensor([6.0, 0.0])).x_next
+    torch.testing.assert_close(after[1], 0.5 * after[0], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("cone", ["anitescu", "stewart-trinkle"])
+def test_units_change_nothing_but_the_forces(cone):
+    lcs, x = sliding_block(cone)
+    h, eye, zero = 0.1, torch.eye(2, dtype=F64), torch.zeros(2, 2, dtype=F64)
+    response = torch.cat([torch.cat([h * eye, zero], 1), torch.cat([eye, zero], 1)])
+    free = FreeMotion(lcs.A, lcs.B, lcs.d, response)
+    contacts = Contacts(tensor([0.0]), tensor([[0.0, 1.0, 0.0, 0.0]]), tensor([[[1.0, 0.0, 0.0, 0.0]]]))
+    other = contact_lcs(contacts, free, x, friction=0.5, compliance=1e-6, cone=cone, length=0.03, force=7.0)
+    u = tensor([6.0, -1.0])
+    torch.testing.assert_close(other.step(x, u).x_next, lcs.step(x, u).x_next, rtol=1e-6, atol=1e-9)
+
+
+def test_bad_contacts_are_refused():
+    free = FreeMotion(*(torch.eye(2, dtype=F64) for _ in range(2)), torch.zeros(2, dtype=F64), torch.eye(2, dtype=F64))
+    contacts = Contacts(tensor([0.0]), tensor([[1.0, 0.0]]), torch.zeros(1, 0, 2, dtype=F64))
+    x = torch.zeros(2, dtype=F64)
+    for wrong, match in (
+        ({"compliance": 0.0}, "compliance: expected finite numbers above 0"),
+        ({"friction": -1.0}, "friction: expected"),
+        ({"friction": tensor([0.1, 0.2])}, "friction: expected one number"),
+        ({"cone": "round"}, "cone: expected one of"),
+        ({"length": 0.0}, "length"),
+    ):
+        with pytest.raises(InvalidInputError, match=match):
+            contact_lcs(contacts, free, x, **({"friction": 0.5, "compliance": 0.1} | wrong))
+    with pytest.raises(ShapeError, match=r"contacts\.normal: expected"):
+        contact_lcs(contacts._replace(normal=tensor([[1.0]])), free, x, friction=0.0, compliance=0.1)
+
+
+# --- a body pushed by discs -------------------------------------------------------------------------------------------
+
+
+def pushing(**values):
+    return PlanarPushing(
+        box(-0.03, 0.03, -0.03, 0.03), **({"radius": 0.01, "friction": 0.5, "compliance": 1e-6} | values)
+    )
+
+
+DRIVES = {
+    "position": {},
+    "pd": {"drive": PDDrive(100.0, 20.0, 0.01, 10)},
+    "force": {"drive": ForceDrive(0.2, 0.05, 1.0), "inertia": Inertia(0.1, 0.05, 2.0)},
+}
+
+
+@pytest.mark.parametrize("name", DRIVES)
+@pytest.mark.parametrize("cone", ["anitescu", "stewart-trinkle"])
+def test_derivatives_of_gaps_are_those_of_autograd(build, name, cone):
+    system = pushing(n_discs=2, cone=cone, **DRIVES[name])
+    x = 0.05 * build.normal(0)(20, system.n_x)
+    x[:, 3:7] += 0.06
+    assert isinstance(system, LCSModule)
+    found = system.contacts(x)
+    gaps = jacobian(lambda x: system.contacts(x).gap.sum(0), x).movedim(0, 1)
+    torch.testing.assert_close(found.normal, gaps)
+    params = system.params(x)
+    assert (params.n_x, params.n_u, params.n_lam) == (system.n_x, system.n_u, system.n_lam)
+    # The gap of the system, without action and force, is the gap where the free motion leads.
+    still = x.clone()
+    still[:, 7:] = 0
+    start = system.params(still)
+    each = {"anitescu": [0, 2], "stewart-trinkle": [0, 4]}[cone]
+    gap = start.gap(still, torch.zeros(20, 4, dtype=F64))[:, each]
+    if cone == "stewart-trinkle" or name == "position":
+        torch.testing.assert_close(system.length * gap, system.contacts(still).gap, rtol=1e-9, atol=1e-12)
+
+
+def test_a_central_push_moves_the_body_as_far_as_the_disc():
+    system = pushing()
+    x = tensor([0.0, 0.0, 0.0, -0.042, 0.0])
+    after = system.params(x).step(x, tensor([0.01, 0.0])).x_next
+    torch.testing.assert_close(after, tensor([0.008, 0.0, 0.0, -0.032, 0.0]), rtol=0, atol=1e-6)
+
+
+def test_a_push_beside_the_centre_turns_the_body_as_its_mobility_says():
+    system = pushing(friction=0.0)
+    lever, rho = 0.02, float(system.gyration)
+    x = tensor([0.0, 0.0, 0.0, -0.04, lever])
+    after = system.params(x).step(x, tensor([0.01, 0.0])).x_next
+    # One force f along x at y = lever: x = f, yaw = −f lever/ρ², and the touched point moves by 1 cm.
+    f = 0.01 / (1 + lever**2 / rho**2)
+    torch.testing.assert_close(after[:3], tensor([f, 0.0, -f * lever / rho**2]), rtol=1e-4, atol=1e-7)
+
+
+def test_a_body_turns_about_its_centre_of_mass():
+    # A push through the centre of mass, which is not in the middle, turns nothing; one through the middle does.
+    system = pushing(center_of_mass=(0.0, 0.01), friction=0.0)
+    x = tensor([[0.0, 0.0, 0.0, -0.04, 0.01], [0.0, 0.0, 0.0, -0.04, 0.0]])
+    after = system.params(x).step(x, tensor([0.01, 0.0])).x_next
+    torch.testing.assert_close(after[0, :3], tensor([0.01, 0.0, 0.0]), rtol=0, atol=1e-6)
+    assert float(after[1, 2]) > 0.05
+    # Its yaw turned by itself, its place is that of the origin: both descriptions agree about the centre of mass.
+    turned = x.clone()
+    turned[:, 2] = math.pi / 2
+    turned[:, 3:] = tensor([[-0.01, -0.04], [0.0, -0.04]])
+    other = system.params(turned).step(turned, tensor([0.0, 0.01])).x_next
+    torch.testing.assert_close(other[:, 2] - math.pi / 2, after[:, 2], rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(other[:, 1], after[:, 0], rtol=1e-6, atol=1e-9)
+
+
+def test_friction_carries_a_body_along():
+    x = tensor([0.0, 0.0, 0.0, -0.04, 0.0])
+    sideways = [float(pushing(friction=f).params(x).step(x, tensor([0.005, 0.002])).x_next[1]) for f in (0.0, 0.5)]
+    assert abs(sideways[0]) < 1e-6
+    assert sideways[1] > 5e-4
+
+
+def test_the_pd_drive_is_its_own_simulation():
+    drive, target = PDDrive(100.0, 20.0, 0.01, 10), 0.3
+    step = drive.step()
+    p, v = 0.1, 0.5
+    got = step.A @ tensor([p, v]) + step.b * (target - p)
+    for _ in range(10):
+        v += (100 * (target - p) - 20 * v) * 0.01
+        p += v * 0.01
+    torch.testing.assert_close(got, tensor([p, v]))
+
+
+def test_discs_with_mass_are_pushed_back():
+    system = pushing(**DRIVES["force"], n_discs=1)
+    x = torch.zeros(system.n_x, dtype=F64)
+    x[3], x[5] = -0.0401, 0.5  # a disc that flies at the body with 0.5 m/s
+    after = system.params(x).step(x, torch.zeros(2, dtype=F64)).x_next
+    body, disc = float(after[-3]), float(after[5])
+    assert body > 0.1
+    assert abs(body - disc) < 0.01  # an inelastic collision
+    # Momentum, but for the damping of a step: the disc loses 0.2 (e^-0.05 · 0.5 − v), the body gains 0.1 v.
+    torch.testing.assert_close(tensor(0.2 * (math.exp(-0.05) * 0.5 - disc)), tensor(0.1 * body), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error", "match"),
+    [({"radius": tensor([0.1, 0.1, 0.1])}, ShapeError, "radius: expected a number or"),
+     ({"gyration": 0.0}, InvalidInputError, "gyration: expected"),
+     ({"center_of_mass": (0.0,)}, ShapeError, "center_of_mass"),
+     ({"drive": "fast"}, DTypeError, "drive: expected a Drive"),
+     ({"cone": "flat"}, InvalidInputError, "cone: expected"),
+     ({"friction": "much"}, DTypeError, "friction: expected a number"),
+     ({"n_discs": 0}, InvalidInputError, "n_discs")],
+)  # fmt: skip
+def test_a_wrong_description_is_refused(wrong, error, match):
+    with pytest.raises(error, match=match):
+        pushing(**wrong)
+    with pytest.raises(InvalidInputError, match="x: expected states"):
+        pushing().params()
+    with pytest.raises(DTypeError, match="shape: expected a Shape"):
+        PlanarPushing("box", 0.01)
+
+
+def test_gradients_by_the_physics(build):
+    """Of a step with contact, by everything that a ContactLCS can learn."""
+    system = ContactLCS(pushing(n_discs=2, compliance=0.1), LEARNABLE)
+    x = 0.05 * build.normal(0)(3, system.n_x)
+    u = 0.02 * build.normal(1)(3, system.n_u)
+
+    def step(*values):
+        changes = dict(zip(system.change, values, strict=True))
+        found = torch.func.functional_call(system, {f"change.{k}": v for k, v in changes.items()}, (x, u))
+        return found * 100
+
+    system.forward = lambda x, u: system.params(x).step(x, u).x_next
+    values = [0.1 * build.normal(2)(max(v.numel(), 1)).reshape(v.shape) for v in system.change.values()]
+    assert torch.autograd.gradcheck(step, [v.requires_grad_() for v in values], atol=1e-5, rtol=1e-3)
+
+
+@pytest.mark.parametrize("loss", [violation_loss, prediction_loss])
+def test_physics_is_learned_from_a_few_pushes(build, loss):
+    true = pushing(n_discs=2, compliance=0.05, friction=0.3, gyration=0.03, center_of_mass=(0.004, 0.0))
+    model = ContactLCS(pushing(n_discs=2, compliance=0.05), ("center_of_mass", "gyration", "friction"))
+    rng = build.normal(0)
+    x, u = torch.zeros(100, true.n_x, dtype=F64), 0.01 * rng(100, true.n_u)
+    angle = 2 * math.pi * torch.rand(100, 2, dtype=F64, generator=torch.Generator().manual_seed(1))
+    x[:, 3:] = (0.045 * torch.stack([angle.cos(), angle.sin()], -1)).flatten(1)
+    with torch.no_grad():
+        x_next = true.params(x).step(x, u).x_next
+    units = tensor([100.0, 100.0, 3.0, *[1.0] * 4])
+    optimizer = torch.optim.Adam(model.parameters(), 0.1)
+    assert abs(float(model.physics.gyration.detach()) - 0.03) > 0.004
+
+    class Scaled:  # the loss weighs what the units make large: millimetres here
+        n_x, n_u, n_lam = model.n_x, model.n_u, model.n_lam
+
+        def params(self, z, context=None):
+            p = model.params(z / units)
+            return type(p)(A=p.A, B=units[:, None] * p.B, C=units[:, None] * p.C, d=units * p.d, D=p.D / units, E=p.E,
+                           F=p.F, c=p.c)  # fmt: skip
+
+    for _ in range(50):
+        optimizer.zero_grad()
+        value = loss(Scaled(), x * units, u, x_next * units)
+        value.backward()
+        optimizer.step()
+    learned = model.physics
+    torch.testing.assert_close(learned.gyration.detach(), tensor(0.03), rtol=0.03, atol=0)
+    torch.testing.assert_close(learned.friction.detach(), tensor([0.3, 0.3]), rtol=0.1, atol=0)
+    torch.testing.assert_close(learned.center_of_mass.detach(), tensor([0.004, 0.0]), rtol=0, atol=5e-4)
+    assert set(model.summary()) == {"center_of_mass", "gyration", "friction"}
+
+
+def test_a_moved_outline_keeps_its_directions():
+    model = ContactLCS(PlanarPushing(Union((Polygon(L_SHAPE), Circle(1.0))), 0.1, length=1.0), ("outline",))
+    with torch.no_grad():
+        model.change["outline"].copy_(tensor([0.1, 0.2, 0.3, 0.1, 0.0, -0.1, 0.5]))
+    polygon, circle = model.physics.shape.parts
+    wanted = [[0.1, -0.1], [2.2, -0.1], [2.2, 1.3], [1.1, 1.3], [1.1, 3.0], [0.1, 3.0]]
+    torch.testing.assert_close(polygon.vertices.detach(), tensor(wanted))
+    assert float(circle.r.detach()) == 1.5
+
+
+def test_what_cannot_be_learned_is_refused():
+    for physics, learn, match in (
+        (pushing(friction=0.0), ("friction",), "friction above 0"),
+        (pushing(**DRIVES["pd"]), ("gain",), "PositionDrive"),
+        (pushing(), ("mass",), "learn: expected some of"),
+        (pushing(), ("friction", "friction"), "each once"),
+    ):
+        with pytest.raises(InvalidInputError, match=match):
+            ContactLCS(physics, learn)
+    with pytest.raises(DTypeError, match="PlanarPushing"):
+        ContactLCS("physics")
+
+
+def test_a_layer_plans_through_it():
+    """A box one centimetre from its goal, pushed there by a disc that starts two centimetres away."""
+    system = PlanarPushing(box(-0.5, 0.5, -0.5, 0.5), 0.2, friction=0.3)
+    goal = tensor([0.3, 0.0, 0.0, 0.0, 0.0])
+    Q = torch.diag(tensor([1.0, 1.0, 0.3, 0.0, 0.0]))
+    cost = QuadraticCost(Q, 0.01 * torch.eye(2, dtype=F64), 10 * Q, q=-Q @ goal, q_final=-10 * Q @ goal)
+    mpc = LCSMPCLayer(ContactLCS(system), cost, 10, -0.2, 0.2, relaxation=1e-4)
+    x = tensor([0.0, 0.0, 0.0, -0.9, 0.0])
+    for _ in range(12):
+        x = system.params(x).step(x, mpc(x).action.detach()).x_next
+    assert abs(float(x[0] - goal[0])) < 0.02  # along the push; what lies beside it needs another place to push from
+    assert abs(float(x[1])) < 0.1
+    assert abs(float(x[2])) < 0.1
+    mpc(tensor([0.0, 0.0, 0.0, -0.71, 0.1])).action.sum().backward()
+    assert all(bool(torch.isfinite(p.grad).all()) for p in mpc.lcs.parameters())
+    assert float(mpc.lcs.change["friction"].grad.abs().max()) > 0
