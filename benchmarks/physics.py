@@ -1,9 +1,9 @@
 """Systems made from known physics, against the simulators they stand for: `python benchmarks/physics.py [--smoke]`.
 
 For every system and mode: how long it takes to make the LCS of one state, in a batch, on one core; and how far its
-prediction of one step of 0.1 s is from what the simulator does in many small ones, from the same states and actions. The
-error is that of the coordinates named, root mean square over the states, beside how far they moved: a prediction that
-nothing moves has an error of 100 %. The exact LCP is solved, without relaxation.
+prediction of one step of 0.1 s is from what the simulator does in many small ones, from the same states and actions.
+The error is that of the coordinates named, root mean square over the states, beside how far they moved: a prediction
+that nothing moves has an error of 100 %. The exact LCP is solved, without relaxation.
 """
 
 from __future__ import annotations
@@ -73,24 +73,28 @@ PUSHER = """
 <worldbody>
   <geom type="plane" size="2 2 .1" friction=".4"/>
   <body name="box" pos="0 0 .05">{joints}<geom type="box" size=".05 .05 .05" mass=".5" friction=".4"/></body>
-  <body name="pusher" pos="0 0 .05"><joint name="px" type="slide" axis="1 0 0"/><joint name="py" type="slide" axis="0 1 0"/>
+  <body name="pusher" pos="0 0 .05">
+    <joint name="px" type="slide" axis="1 0 0"/><joint name="py" type="slide" axis="0 1 0"/>
     <geom type="sphere" size=".015" mass=".2" friction=".4"/></body>
 </worldbody>
 <actuator><position joint="px" kp="1000" dampratio="1"/><position joint="py" kp="1000" dampratio="1"/></actuator>
 </mujoco>"""
-PLANAR = """<joint name="x" type="slide" axis="1 0 0" damping="5"/><joint name="y" type="slide" axis="0 1 0" damping="5"/>
+PLANAR = """<joint name="x" type="slide" axis="1 0 0" damping="5"/>
+  <joint name="y" type="slide" axis="0 1 0" damping="5"/>
   <joint name="yaw" type="hinge" axis="0 0 1" damping=".007"/>"""
 CART_POLE = """
 <mujoco><option timestep="0.001" integrator="RK4"/>
-<worldbody><body><joint name="cart" type="slide" axis="1 0 0" damping=".1"/><geom type="box" size=".1 .05 .05" mass="1"/>
-  <body><joint name="pole" type="hinge" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 .6" size=".02" mass=".1"/></body>
+<worldbody><body><joint name="cart" type="slide" axis="1 0 0" damping=".1"/>
+  <geom type="box" size=".1 .05 .05" mass="1"/>
+  <body><joint name="pole" type="hinge" axis="0 1 0"/>
+    <geom type="capsule" fromto="0 0 0 0 0 .6" size=".02" mass=".1"/></body>
 </body></worldbody>
 <actuator><motor joint="cart"/></actuator></mujoco>"""
 BOX = """
 <mujoco><option timestep="0.001" integrator="implicitfast" cone="elliptic"/>
 <worldbody><geom type="plane" size="2 2 .1" friction=".4"/>
-  <body pos="0 0 .05"><freejoint name="box"/><geom type="box" size=".05 .05 .05" mass=".5" friction=".4"/></body></worldbody>
-</mujoco>"""
+  <body pos="0 0 .05"><freejoint name="box"/><geom type="box" size=".05 .05 .05" mass=".5" friction=".4"/></body>
+</worldbody></mujoco>"""
 
 
 def simulated(model: Any, qpos: Any, qvel: Any, ctrl: Any) -> tuple[Any, Any]:

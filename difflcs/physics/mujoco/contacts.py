@@ -26,6 +26,8 @@ Pairs = Sequence[tuple[int | str, int | str]]
 
 MOST_CONTACTS = 12  # by default
 
+_THREE = np.arange(3)
+
 _PLANE, _CAPSULE, _CYLINDER, _BOX, _MESH = (
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "CAPSULE", "CYLINDER", "BOX", "MESH")
 )
@@ -69,6 +71,10 @@ class ContactFinder:
         distance: contacts farther away are left out [m].
         contacts: how many a state has; None: what the shapes of the pairs can have, at most `MOST_CONTACTS`.
         friction: coefficient of all; None: that of the geoms.
+
+    Attributes:
+        axis: normal (3,) of the plane in which everything moves, or None.
+        pairs: numbers of the geoms that may touch, those of the first and those of the second of each pair.
     """
 
     def __init__(
@@ -81,7 +87,7 @@ class ContactFinder:
         self._drop_floors()
         if pairs is not None:
             _allow(model, np.flatnonzero(self.allowed.any(0)))
-        first, second = np.nonzero(np.triu(self.allowed))
+        self.pairs = first, second = np.nonzero(np.triu(self.allowed))
         kinds = np.sort(model.geom_type[np.stack([first, second], -1)], axis=-1)
         if contacts is None:
             contacts = min(MOST_CONTACTS, sum(_POINTS.get((int(a), int(b)), 1) for a, b in kinds))
@@ -116,9 +122,9 @@ class ContactFinder:
     def read(self, i: int, arrays: tuple[Array, Array, Array, Array]) -> None:
         """Put the contacts of the state in `data`, for which `mj_fwdPosition` was called, into row i of the arrays."""
         data, count = self.data, self.n_contacts
-        contact, nv = data.contact, self.model.nv
+        contact, jacobian = data.contact, data.efc_J.reshape(-1, self.model.nv)
         gap, geom, address = contact.dist, contact.geom, contact.efc_address
-        rows = data.efc_J.reshape(-1, nv)[address[:, None] + np.arange(3)]
+        rows = jacobian[address[:, None] + _THREE] if len(jacobian) else np.zeros((len(gap), 3, self.model.nv))
         frame, own = contact.frame.reshape(-1, 3, 3), (address >= 0) & self.allowed[geom[:, 0], geom[:, 1]]
         if self._boxes:
             gap, geom, rows, frame, own = self._mend_boxes(gap, geom, rows, frame, own)
@@ -190,9 +196,9 @@ def plane_of_motion(model: Any, data: Any) -> Array | None:
 
 def _across(normal: Array) -> tuple[Array, Array]:
     """Two unit vectors perpendicular to a unit vector and to each other."""
-    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    first: Array = np.cross(normal, np.eye(3)[np.abs(normal).argmin()]).astype(np.float64)
     first /= np.linalg.norm(first)
-    return first, np.cross(normal, first)
+    return first, np.cross(normal, first).astype(np.float64)
 
 
 def _friction(model: Any, friction: float | None) -> Array:

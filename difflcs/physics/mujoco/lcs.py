@@ -58,8 +58,8 @@ class MujocoLCS:
         pairs: geoms, by name or number, or bodies with all their geoms, that may touch; None: as the model says
             (contype, conaffinity, pairs, excludes).
         friction: coefficient μ of all contacts; None: that of the geoms, as MuJoCo combines them.
-        compliance: how far a contact gives way, in parts of what a body on slides or a free joint moves by the same
-            force, > 0. It makes F + Fᵀ ≻ 0.
+        compliance: how far a contact gives way, in parts of how far the same force moves the two bodies apart (the
+            median over all pairs), > 0. It makes F + Fᵀ ≻ 0.
         cone: model of friction, see `difflcs.physics.contacts`.
         mobility: of a quasi-static motion: "inertia" (the inverse of the mass matrix), "damping" (of the joints'
             damping), or what a unit of force on each degree of freedom does, (nv,) or (nv, nv). Only ratios matter, as
@@ -97,7 +97,8 @@ class MujocoLCS:
         check_choice("cone", cone, ("anitescu", "stewart-trinkle"))
         if isinstance(mobility, str):
             check_choice("mobility", mobility, ("inertia", "damping"))
-        self.motion, self.seconds, self.cone = motion, check_number("seconds", seconds, strict=True), cone
+        self.motion, self.seconds = motion, check_number("seconds", seconds, strict=True)
+        self.cone: Cone = cone
         self.compliance = check_number("compliance", compliance, strict=True)
         if contacts is not None:
             check_positive_int("contacts", contacts)
@@ -110,8 +111,7 @@ class MujocoLCS:
                 getattr(self._data, name)[:] = getattr(data, name)
         mujoco.mj_fwdPosition(model, self._data)
         self.state = MujocoState(model, self._data.qpos, velocities=motion == "dynamic")
-        self._actuators = Actuators(model)
-        self._relative = relative
+        self._actuators, self._relative = Actuators(model), relative
         self._quasi_static = motion == "quasi-static"
         mobility = mobility if isinstance(mobility, str) else np.asarray(mobility)
         if self._quasi_static:
@@ -176,7 +176,10 @@ class MujocoLCS:
         return found if x.dtype == torch.float64 and x.is_cpu else found.to(device=x.device, dtype=x.dtype)
 
     def contacts(self, x: Tensor) -> Contacts:
-        """Gaps and their derivatives at states x (..., n_x); those out of reach have zeros there and a gap of `distance`."""
+        """Gaps and their derivatives at states x (..., n_x).
+
+        Contacts that are missing have a gap of `distance`, and zeros.
+        """
         return self._look(x)[0]
 
     def control(self, x: Tensor, u: Tensor) -> Tensor:
@@ -231,27 +234,24 @@ class MujocoLCS:
         return Contacts(*map(batched, (contacts.gap, normal, slide))), batched(contacts.friction), free, x64
 
     def _typical_response(self) -> float:
-        """What an impulse on a body that moves straight does to its position, the median over such degrees of freedom."""
-        model, data = self._model, self._data
-        moved = self._motion.allocate(1)
+        """How far a unit of force moves two bodies apart that may touch, the median over their pairs."""
+        model, data, nv = self._model, self._data, self.state.nv
+        moved, none = self._motion.allocate(1), self._finder.finish(self._finder.allocate(1))
         self._motion.read(0, data, moved)
-        x = np.concatenate([np.zeros(model.nv), data.qvel])[None, : self.n_x]
-        free = self._motion.finish(moved, x, None, self._finder.finish(self._finder.allocate(1)))
-        diagonal = torch.broadcast_to(free.response, (1, self.n_x, self.n_x))[0].diagonal()[: model.nv].numpy()
-        straight = np.zeros(model.nv, dtype=bool)
-        for j in range(model.njnt):
-            first, kind = model.jnt_dofadr[j], model.jnt_type[j]
-            if kind == mujoco.mjtJoint.mjJNT_SLIDE or kind == mujoco.mjtJoint.mjJNT_FREE:
-                straight[first : first + (3 if kind == mujoco.mjtJoint.mjJNT_FREE else 1)] = True
-        # A force at a typical distance from the axis of a hinge.
-        in_metres = np.where(straight, diagonal, diagonal * self.length**2)
-        giving = in_metres[in_metres > 0]
-        if not len(giving):
+        response = self._motion.finish(moved, np.zeros((1, self.n_x)), None, none).response
+        response = response.reshape(-1, self.n_x, self.n_x)[0, :nv, :nv].numpy()
+        jacobian, gives = np.empty((3, nv)), np.empty(model.ngeom)
+        for geom in range(model.ngeom):
+            mujoco.mj_jacGeom(model, data, jacobian, None, geom)
+            gives[geom] = np.trace(jacobian @ response @ jacobian.T) / (3 if self._finder.axis is None else 2)
+        first, second = self._finder.pairs
+        apart = (gives[first] + gives[second])[gives[first] + gives[second] > 0]
+        if len(first) and not len(apart):
             raise InvalidInputError(
                 "model: expected something that contact forces can move, got nothing; what is pushed needs joints "
                 "without actuators, and a mobility above 0"
             )
-        return float(np.median(giving))
+        return float(np.median(apart)) if len(apart) else 1.0
 
 
 def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: Any) -> LCSParams:
@@ -279,11 +279,11 @@ def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: A
 
 def _check_model(model: Any, data: Any) -> None:
     if not isinstance(model, mujoco.MjModel):
-        raise DTypeError(f"model: expected a mujoco.MjModel, got {describe(model)}; load one, MjModel.from_xml_path")
+        raise DTypeError(f"model: expected a mujoco.MjModel, got {describe(model)}; load one with MjModel")
     if data is not None and not isinstance(data, mujoco.MjData):
         raise DTypeError(f"data: expected a mujoco.MjData, got {describe(data)}; pass mujoco.MjData(model)")
     if data is not None and len(data.qpos) != model.nq:
-        raise InvalidInputError(f"data: expected that of the model, nq={model.nq}, got nq={len(data.qpos)}; pass its own")
+        raise InvalidInputError(f"data: expected nq={model.nq} of the model, got {len(data.qpos)}; pass MjData(model)")
     refused = {
         "joints": not model.nv,
         "no equality constraints": bool(model.neq),
@@ -293,13 +293,12 @@ def _check_model(model: Any, data: Any) -> None:
     }
     for wanted, found in refused.items():
         if found:
-            raise InvalidInputError(f"model: expected {wanted}, got others; change the model")
+            raise InvalidInputError(f"model: expected {wanted}, got something else; change the model")
 
 
 def _typical_radius(model: Any) -> float:
-    moves = model.body_weldid[model.geom_bodyid] != 0
-    touches = (model.geom_contype | model.geom_conaffinity) != 0
-    radii = model.geom_rbound[moves & (model.geom_rbound > 0)]
-    of_contact = model.geom_rbound[moves & touches & (model.geom_rbound > 0)]
-    chosen = of_contact if len(of_contact) else radii
+    size = model.geom_rbound
+    moves = (size > 0) & (model.body_weldid[model.geom_bodyid] != 0)
+    touches = moves & ((model.geom_contype | model.geom_conaffinity) != 0)
+    chosen = size[touches] if touches.any() else size[moves]
     return float(np.median(chosen)) if len(chosen) else 1.0

@@ -4,10 +4,10 @@ With velocities, MuJoCo's acceleration is linearised where the state is, ζ from
 
     ν̇ = a + K ζ + D (ν − ν̄) + B u,    ζ̇ = ν.
 
-K, D and B are finite differences that `mjd_transitionFD` computes natively: gravity, Coriolis forces, springs, damping,
-gears and servos are all in them. A step of h solves these equations exactly. A contact force acts as one impulse f at
-the beginning, through the same equations but implicitly, so that what a stiff servo holds gives way little: it changes ν
-by S f and ζ by h S f with S = (1 − h D − h² K)⁻¹ M⁻¹.
+K, D and B are finite differences that `mjd_transitionFD` computes natively: gravity, Coriolis forces, springs,
+damping, gears and servos are all in them. A step of h solves these equations exactly. A contact force acts as one
+impulse f at the beginning, through the same equations but implicitly, so that what a stiff servo holds gives way
+little: it changes ν by S f and ζ by h S f with S = (1 − h D − h² K)⁻¹ M⁻¹.
 
 A load that acts all the time, such as gravity, moves a body by h²/2 in a step where that impulse moves it by h². So a
 contact that balances the place of a body at rest would leave it with a velocity. Where a load is about to close a
@@ -204,11 +204,15 @@ class Dynamic:
     def _solve(self, K: Array, D: Array, B: Array, load: Array) -> Array:
         """(ζ, ν) after the step as a matrix (n, 2 nv, 2 nv + nu + 1) of ζ, ν, u and 1."""
         n, nv, size = len(K), K.shape[-1], 2 * K.shape[-1] + B.shape[-1] + 1
-        rate = np.zeros((n, size, size))
+        h, rate = self.seconds, np.zeros((n, size, size))
+        # Of (ζ, h ν): the norm of the matrix, which says what its exponential costs, is less in this unit.
         rate[:, :nv, nv : 2 * nv] = np.eye(nv)
-        rate[:, nv : 2 * nv] = np.concatenate([K, D, B, load[:, :, None]], -1)
-        grown: Tensor = torch.linalg.matrix_exp(torch.from_numpy(self.seconds * rate))
-        return grown[:, : 2 * nv].numpy()
+        rate[:, nv : 2 * nv] = np.concatenate([h * h * K, h * D, h * h * B, h * h * load[:, :, None]], -1)
+        grown: Tensor = torch.linalg.matrix_exp(torch.from_numpy(rate))
+        step = grown[:, : 2 * nv].numpy()
+        step[:, :, nv : 2 * nv] *= h
+        step[:, nv:] /= h
+        return step
 
 
 def _balanced(moved: Array, inverse_mass: Array, found: Found, h: float) -> Array:

@@ -51,7 +51,9 @@ class MujocoState:
 
     def __init__(self, model: Any, reference: ArrayLike | None = None, *, velocities: bool = False):
         if not isinstance(model, mujoco.MjModel):
-            raise DTypeError(f"model: expected a mujoco.MjModel, got {describe(model)}; load one, MjModel.from_xml_path")
+            raise DTypeError(
+                f"model: expected a mujoco.MjModel, got {describe(model)}; load one, MjModel.from_xml_path"
+            )
         self.nq, self.nv, self.velocities = int(model.nq), int(model.nv), velocities
         self._reference = self._array("reference", model.qpos0 if reference is None else reference, self.nq).copy()
         names: list[str] = []
@@ -153,9 +155,7 @@ def _conjugate(q: Array) -> Array:
 def _multiply(a: Array, b: Array) -> Array:
     """Product of quaternions (..., 4)."""
     a0, av, b0, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
-    return np.concatenate(
-        [a0 * b0 - (av * bv).sum(-1, keepdims=True), a0 * bv + b0 * av + np.cross(av, bv)], -1
-    )
+    return np.concatenate([a0 * b0 - (av * bv).sum(-1, keepdims=True), a0 * bv + b0 * av + np.cross(av, bv)], -1)
 
 
 def _quaternion(r: Array) -> Array:
