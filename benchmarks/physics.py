@@ -165,7 +165,6 @@ def pushing(count: int, random: np.random.Generator) -> list[Case]:
     for mode, options in {
         "quasi-static": {"mobility": flat, "contacts": 1, "pairs": [("box", "pusher")]},
         "velocities": {"motion": "dynamic", "contacts": 5},
-        "velocities, Stewart-Trinkle": {"motion": "dynamic", "contacts": 5, "cone": "stewart-trinkle"},
     }.items():
         module = MujocoLCS(model, **options)
         cases.append(of_mujoco("pusher and box on a floor", mode, module, model, qpos, rest, u, PLACE_FREE))

@@ -61,6 +61,27 @@ class Found(NamedTuple):
     friction: Array
 
 
+class Read(NamedTuple):
+    """What MuJoCo says of n states, filled one by one.
+
+    Attributes:
+        gap: (n, n_contacts).
+        rows: (n, n_contacts, 3, nv) how the second body moves from the first, along the axes of `frame`.
+        frame: (n, n_contacts, 3, 3) its rows are the normal and two tangents.
+        geom: (n, n_contacts, 2).
+        apart: (n, n_contacts) distance of the points on both bodies whose motion `rows` takes to be that of one point
+            in the middle between them.
+        axes: (n, nv, 3) around which each degree of freedom turns.
+    """
+
+    gap: Array
+    rows: Array
+    frame: Array
+    geom: NDArray[np.intp]
+    apart: Array
+    axes: Array
+
+
 class ContactFinder:
     """Finds contacts at states that somebody sets in `data`, of a model that it changes for its purpose.
 
@@ -96,6 +117,7 @@ class ContactFinder:
         self.n_tangents = (1 if self.axis is not None else 2) if rough else 0
         boxes = (kinds == _BOX).all(-1)
         self._boxes = [(int(a), int(b)) for a, b in zip(first[boxes], second[boxes], strict=True)]
+        self._turns = _moves(model)[model.geom_bodyid].astype(np.float64)
         # Three rows of the Jacobian for each contact, the normal and two tangents, whatever its friction is.
         model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
@@ -113,44 +135,53 @@ class ContactFinder:
         self.allowed[planes & along] = False
         self.allowed[:, planes & along] = False
 
-    def allocate(self, n: int) -> tuple[Array, Array, Array, Array]:
-        """Gap, rows of the Jacobian, frames and friction of n states, all contacts far away."""
-        count, nv = self.n_contacts, self.model.nv
-        gap = np.full((n, count), self.distance)
-        return gap, np.zeros((n, count, 3, nv)), np.zeros((n, count, 3, 3)), np.zeros((n, count))
+    def allocate(self, n: int) -> Read:
+        """For n states, all contacts out of reach."""
+        k, nv = self.n_contacts, self.model.nv
+        gap = np.full((n, k), self.distance)
+        rows, frame, axes = np.zeros((n, k, 3, nv)), np.zeros((n, k, 3, 3)), np.zeros((n, nv, 3))
+        return Read(gap, rows, frame, np.zeros((n, k, 2), dtype=np.intp), np.zeros((n, k)), axes)
 
-    def read(self, i: int, arrays: tuple[Array, Array, Array, Array]) -> None:
-        """Put the contacts of the state in `data`, for which `mj_fwdPosition` was called, into row i of the arrays."""
+    def read(self, i: int, into: Read) -> None:
+        """Put the contacts of the state in `data`, for which `mj_fwdPosition` was called, into row i."""
         data, count = self.data, self.n_contacts
         contact, jacobian = data.contact, data.efc_J.reshape(-1, self.model.nv)
         gap, geom, address = contact.dist, contact.geom, contact.efc_address
         rows = jacobian[address[:, None] + _THREE] if len(jacobian) else np.zeros((len(gap), 3, self.model.nv))
         frame, own = contact.frame.reshape(-1, 3, 3), (address >= 0) & self.allowed[geom[:, 0], geom[:, 1]]
+        apart = gap
         if self._boxes:
-            gap, geom, rows, frame, own = self._mend_boxes(gap, geom, rows, frame, own)
+            gap, geom, rows, frame, own, apart = self._mend_boxes(gap, geom, rows, frame, own)
         # A normal that nothing can move along is that of a body resting on what is outside the plane of motion.
         kept = np.flatnonzero(own & (np.abs(rows[:, 0]).max(-1, initial=0.0) > 1e-9))
         if len(kept) > count:
             kept = np.sort(kept[np.argpartition(gap[kept], count - 1)[:count]])
         k = len(kept)
-        arrays[0][i, :k], arrays[1][i, :k], arrays[2][i, :k] = gap[kept], rows[kept], frame[kept]
-        arrays[3][i, :k] = self.friction[geom[kept, 0], geom[kept, 1]]
+        into.gap[i, :k], into.rows[i, :k], into.frame[i, :k] = gap[kept], rows[kept], frame[kept]
+        into.geom[i, :k], into.apart[i, :k], into.axes[i] = geom[kept], apart[kept], data.cdof[:, :3]
 
-    def finish(self, arrays: tuple[Array, Array, Array, Array]) -> Found:
+    def finish(self, read: Read) -> Found:
         """Contacts with the tangents that count."""
-        gap, rows, frame, friction = arrays
-        tangent = rows[:, :, 1 : 1 + self.n_tangents]
-        if self.axis is not None and self.n_tangents:
-            across = np.cross(self.axis, frame[:, :, 0])
+        normal, sides, slide = read.frame[:, :, 0], read.frame[:, :, 1:], read.rows[:, :, 1:]
+        if self.axis is not None:
+            across = np.cross(self.axis, normal)
             across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
-            parts = np.einsum("nkij,nkj->nki", frame[:, :, 1:], across)
-            tangent = np.einsum("nki,nkiv->nkv", parts, rows[:, :, 1:])[:, :, None]
-        return Found(gap, rows[:, :, 0], tangent, friction)
+            sides, parts = across[:, :, None], np.einsum("nkij,nkj->nki", sides, across)
+            slide = np.einsum("nki,nkiv->nkv", parts, slide)[:, :, None]
+        sides, slide = sides[:, :, : self.n_tangents], slide[:, :, : self.n_tangents]
+        # MuJoCo's contact is in the middle of the gap; friction acts where the two bodies are, half a gap from there:
+        # ω × n gap/2 for each of them, along the tangents.
+        lever = np.einsum("nkti,nvi->nktv", np.cross(normal[:, :, None], sides), read.axes)
+        turned = self._turns[read.geom[:, :, 0]] + self._turns[read.geom[:, :, 1]]
+        tangent = slide + 0.5 * read.apart[:, :, None, None] * lever * turned[:, :, None]
+        friction = np.where(read.frame.any((-1, -2)), self.friction[read.geom[:, :, 0], read.geom[:, :, 1]], 0.0)
+        return Found(read.gap, read.rows[:, :, 0], tangent, friction)
 
     def _mend_boxes(self, gap: Array, geom: Any, rows: Array, frame: Array, own: Any) -> tuple[Any, ...]:
         model, data, ends = self.model, self.data, np.empty(6)
         places, radius = data.geom_xpos, model.geom_rbound
         extra: list[tuple[float, tuple[int, int], Array, Array]] = []
+        middle = gap
         for a, b in self._boxes:
             if np.linalg.norm(places[a] - places[b]) - radius[a] - radius[b] > self.distance:
                 continue
@@ -168,12 +199,23 @@ class ContactFinder:
             gap, geom = np.concatenate([gap, distances]), np.concatenate([geom, pairs])
             rows, frame = np.concatenate([rows, jacobians]), np.concatenate([frame, frames])
             own = np.concatenate([own, np.ones(len(extra), dtype=bool)])
-        return gap, geom, rows, frame, own
+            middle = np.concatenate([middle, np.zeros(len(extra))])
+        return gap, geom, rows, frame, own, middle
 
     def _jacobian(self, geom: int, point: Array) -> Array:
         jacobian = np.empty((3, self.model.nv))
         mujoco.mj_jac(self.model, self.data, jacobian, None, point, int(self.model.geom_bodyid[geom]))
         return jacobian
+
+
+def _moves(model: Any) -> NDArray[np.bool_]:
+    """Which degrees of freedom move which bodies, (nbody, nv)."""
+    moves = np.zeros((model.nbody, model.nv), dtype=bool)
+    for body in range(1, model.nbody):
+        first = model.body_dofadr[body]
+        moves[body] = moves[model.body_parentid[body]]
+        moves[body, first : first + model.body_dofnum[body]] = True
+    return moves
 
 
 def plane_of_motion(model: Any, data: Any) -> Array | None:

@@ -10,8 +10,8 @@ impulse f at the beginning, through the same equations but implicitly, so that w
 little: it changes ν by S f and ζ by h S f with S = (1 − h D − h² K)⁻¹ M⁻¹.
 
 A load that acts all the time, such as gravity, moves a body by h²/2 in a step where that impulse moves it by h². So a
-contact that balances the place of a body at rest would leave it with a velocity. Where a load is about to close a
-contact, it is therefore an impulse at the beginning too, in the direction that the contact can balance.
+contact that balances the place of a body at rest would leave it with a velocity. Where a contact is about to close,
+loads are therefore impulses at the beginning too, in the directions that the contact can balance.
 """
 
 # MuJoCo is a compiled module without type stubs.
@@ -183,7 +183,9 @@ class Dynamic:
         velocity = x[:, nv:]
         load = acceleration - np.einsum("nij,nj->ni", D, velocity)  # the acceleration with ν = 0, ζ = 0 and u = 0
         step = self._solve(K, D, B, load)
-        step[:, :nv, -1] += _balanced(step[:, :, -1], inverse_mass, found, h)
+        place = step[:, :nv, -1] + np.einsum("nij,nj->ni", step[:, :nv, nv : 2 * nv], velocity)
+        closing = found.gap + np.einsum("nkv,nv->nk", found.normal, place) < 0
+        step[:, :nv, -1] += _balanced(step[:, :, -1], inverse_mass, found.normal * closing[:, :, None], h)
         # The control of a servo is held through the step, at a distance from where the joint was at its beginning.
         step[:, :, :nv] += step[:, :, 2 * nv : -1] @ self.moment
         to_x = np.zeros((n, 2 * nv, 2 * nv))
@@ -215,14 +217,12 @@ class Dynamic:
         return step
 
 
-def _balanced(moved: Array, inverse_mass: Array, found: Found, h: float) -> Array:
-    """What is added to ζ (n, nv), moved by loads as (ζ, ν) `moved`, where contacts are about to balance them."""
+def _balanced(moved: Array, inverse_mass: Array, rows: Array, h: float) -> Array:
+    """What is added to ζ (n, nv), moved by loads as (ζ, ν) `moved`, where contacts `rows` are about to balance them."""
     nv = moved.shape[-1] // 2
     place, speed = moved[:, :nv], moved[:, nv:]
-    closing = found.gap + np.einsum("nkv,nv->nk", found.normal, place) < 0
-    if not closing.any():
+    if not rows.any():
         return np.zeros_like(place)
-    rows = found.normal * closing[:, :, None]
     gives = inverse_mass @ rows.swapaxes(-1, -2)
     inner = rows @ gives
     # Contacts of one face are not independent.
