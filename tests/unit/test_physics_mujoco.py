@@ -243,7 +243,8 @@ def test_friction_is_combined_as_mujoco_does(case):
 
 
 def test_pairs_are_those_of_the_model_or_those_named():
-    third = '<body name="other" pos=".3 0 0"><joint name="o" type="slide" axis="0 1 0"/><geom name="ball" size=".02" {}/></body>'
+    third = """<body name="other" pos=".3 0 0"><joint name="o" type="slide" axis="0 1 0"/>
+      <geom name="ball" size=".02" {}/></body>"""
 
     def model(of_ball="", rest=""):
         text = f"""<body name="box">{PLANE.format("")}<geom name="block" type="box" size=".06 .04 .05"/></body>"""
@@ -269,7 +270,8 @@ def test_pairs_are_those_of_the_model_or_those_named():
 
 def test_parents_touch_only_where_named():
     model = load("""<body name="a"><joint type="hinge" axis="0 0 1"/><geom name="a" size=".1"/>
-      <body name="b" pos=".3 0 0"><joint type="hinge" axis="0 0 1"/><geom name="b" size=".1" pos=".1 .1 0"/></body></body>""")
+        <body name="b" pos=".3 0 0"><joint type="hinge" axis="0 0 1"/><geom name="b" size=".1" pos=".1 .1 0"/></body>
+      </body>""")
     assert MujocoLCS(model, motion="dynamic").n_contacts == 0
     module = MujocoLCS(model, motion="dynamic", pairs=[("a", "b")])
     assert float(module.contacts(torch.zeros(4, dtype=torch.float64)).gap[0]) == pytest.approx(np.hypot(0.4, 0.1) - 0.2)
