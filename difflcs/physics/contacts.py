@@ -14,6 +14,10 @@ unique. Two models of dry friction are offered:
 - Stewart-Trinkle: normal force, friction in each direction and sliding distance each have a complementarity condition.
   (D. Stewart, J. Trinkle, "An implicit time-stepping scheme for rigid body dynamics with inelastic collisions and
   Coulomb friction", Int. J. Numer. Methods Eng. 39, 1996.)
+  By itself its F + Fᵀ is indefinite. What makes it definite is a drag: friction is at most μ λ_n + ε σ for a sliding
+  distance σ, in an open contact too, with the smallest ε that suffices. For one contact ε is about μ²/4 over the
+  mobility. Where several contacts share a load it grows as one over their compliance, and little is left of the law:
+  use Anitescu's there.
 """
 
 from __future__ import annotations
@@ -157,7 +161,7 @@ def _each(name: str, value: float | Tensor, gap: Tensor, strict: bool) -> Tensor
             f"{name}: expected one number or (..., n_contacts={gap.shape[-1]}), got {tuple(value.shape)}; give one for "
             f"each contact"
         )
-    return value.expand(torch.broadcast_shapes(value.shape, gap.shape[-1:]))
+    return value if value.ndim and value.shape[-1] == gap.shape[-1] else value.expand(*value.shape[:-1], gap.shape[-1])
 
 
 def _rays(contacts: Contacts, mu: Tensor, soft: Tensor) -> tuple[Tensor, Tensor, Tensor]:
