@@ -8,6 +8,7 @@ that nothing moves has an error of 100 %. The exact LCP is solved, without relax
 
 from __future__ import annotations
 
+import importlib.util
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import physics_pymunk
 import torch
 import tyro
 from torch import Tensor
@@ -238,7 +240,15 @@ def measure(case: Case, o: Options) -> dict[str, Any]:
     return {"ms a state": 1e3 * float(np.median(used[1:])), "n_lam": system.n_lam, "states": len(case.x), **errors}
 
 
-CASES: list[Callable[[int, np.random.Generator], list[Case]]] = [pushing, cart_pole, boxes]
+def in_pymunk(count: int, random: np.random.Generator) -> list[Case]:
+    """Bodies pushed by a disc, where pymunk is installed."""
+    if importlib.util.find_spec("pymunk") is None:
+        print("pymunk is not installed: its rows are left out")
+        return []
+    return [Case(**values) for values in physics_pymunk.cases(count, random)]
+
+
+CASES: list[Callable[[int, np.random.Generator], list[Case]]] = [pushing, cart_pole, boxes, in_pymunk]
 
 
 def main(o: Options) -> None:
