@@ -8,6 +8,7 @@ that nothing moves has an error of 100 %. The exact LCP is solved, without relax
 
 from __future__ import annotations
 
+import importlib.util
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -238,7 +239,17 @@ def measure(case: Case, o: Options) -> dict[str, Any]:
     return {"ms a state": 1e3 * float(np.median(used[1:])), "n_lam": system.n_lam, "states": len(case.x), **errors}
 
 
-CASES: list[Callable[[int, np.random.Generator], list[Case]]] = [pushing, cart_pole, boxes]
+def planar(count: int, random: np.random.Generator) -> list[Case]:
+    """Bodies in the plane, where pymunk is installed, which the scoreboard's Push-T needs."""
+    if importlib.util.find_spec("pymunk") is None:
+        print("T and disc: left out, as pymunk is not installed")
+        return []
+    import physics_pymunk
+
+    return [Case(**fields) for fields in physics_pymunk.cases(count, random)]
+
+
+CASES: list[Callable[[int, np.random.Generator], list[Case]]] = [pushing, cart_pole, boxes, planar]
 
 
 def main(o: Options) -> None:
@@ -255,7 +266,7 @@ def main(o: Options) -> None:
                 for name, v in row.items()
                 if isinstance(v, dict)
             )
-            print(f"{case.system:32s} {case.mode:22s} {row['ms a state']:.3f} ms, n_lam {row['n_lam']:2d}   {told}")
+            print(f"{case.system:32s} {case.mode:31s} {row['ms a state']:.3f} ms, n_lam {row['n_lam']:2d}   {told}")
     options = {"states": o.states, "batch": o.batch, "seed": o.seed, "seconds": SECONDS}
     save(o.out, {"machine": {**machine(), "mujoco": mujoco.__version__}, "options": options, "results": results})
 
