@@ -127,7 +127,7 @@ def error(x, goal):
     return math.hypot(float(x[0]) - goal[0], float(x[1]) - goal[1], 0.5 * turn)
 
 
-# --- one step, on a line ------------------------------------------------------------------------------------------------
+# --- one step, on a line ----------------------------------------------------------------------------------------------
 
 
 def test_it_pushes_where_the_pusher_is_on_the_right_side():
@@ -237,7 +237,7 @@ def test_reset_forgets_the_journey():
     assert policy.decision.mode is Mode.PUSH
 
 
-# --- the loop, in the plane ---------------------------------------------------------------------------------------------
+# --- the loop, in the plane -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("start", [(0.9, 0.0), (0.0, 0.9)])
@@ -292,7 +292,7 @@ def test_bounds_that_depend_on_the_state_hold_the_disc_in_the_workspace():
     assert float(x[3]) > 0.25
 
 
-# --- what is refused ----------------------------------------------------------------------------------------------------
+# --- what is refused --------------------------------------------------------------------------------------------------
 
 
 def test_bad_input_is_refused():
