@@ -33,12 +33,13 @@ class ContactLCS(nn.Module):
     Args:
         physics: what is known or guessed.
         learn: what is learned of it, of `center_of_mass` (2), `gyration` (1), `friction` (one for each disc),
-            `compliance` (one for each disc), `radius` of each disc, `gain` of a `PositionDrive` (each disc and axis) and
-            its `drive_compliance` (each disc), and `outline`: each side of a polygon moves along its normal, each circle has another radius.
+            `compliance` (one for each disc), `radius` of each disc, `gain` of a `PositionDrive` (each disc and axis)
+            and its `drive_compliance` (each disc), and `outline`: each side of a polygon moves along its normal, each
+            circle has another radius.
 
     Raises:
-        DTypeError, InvalidInputError: no `PlanarPushing`, an unknown name, one named twice, the gain of another drive,
-            or friction where there is none.
+        DTypeError, InvalidInputError: no `PlanarPushing`, an unknown name, one named twice, gain or compliance of
+            another drive, or friction or a compliance of the drive where there is none.
     """
 
     def __init__(self, physics: PlanarPushing, learn: Sequence[str] = LEARNABLE[:-2]):
