@@ -1,0 +1,119 @@
+"""Where the cube is now.
+
+The camera's pose is 90 to 190 ms old, a new one comes ten times a second. Since it was taken the tips have been
+measured at every step: the same contact physics that the plan uses is stepped from the old pose along their way.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from trifinger_push.control import STEP
+from trifinger_push.fingers import N_FINGERS, planar_turn
+
+from difflcs.physics import PlanarPushing, box
+
+__all__ = ["HALF", "HEIGHT", "TIP_RADIUS", "UNIT", "CubeEstimator", "box_distance", "planar_pose", "pushing"]
+
+Array = NDArray[np.float64]
+
+HALF = 0.0325
+"""Half the width of the cube [m]."""
+HEIGHT = 2 * HALF
+TIP_RADIUS = 0.010
+"""[m], of tip_sim.stl."""
+UNIT = 0.05
+"""Of length in the systems [m], so that states are about 1."""
+AWAY = 100.0
+"""Where a lifted tip is in the plane, in units: nowhere near."""
+REMEMBERED = 14
+"""Steps, more than the oldest pose."""
+
+
+def pushing(n_discs: int, friction: float, compliance: float) -> PlanarPushing:
+    """The cube from above, pushed by tips; quasi-static, in units of `UNIT`."""
+    half = HALF / UNIT
+    shape = box(-half, half, -half, half)
+    return PlanarPushing(shape, TIP_RADIUS / UNIT, n_discs=n_discs, friction=friction, compliance=compliance)
+
+
+def box_distance(points: Array) -> Array:
+    """Distance (n,) of points (n, 2) in coordinates of the cube from its outline [m], negative inside."""
+    beyond = np.abs(points) - HALF
+    return np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(-1), 0)
+
+
+def planar_pose(position: Array, quaternion: Array) -> Array:
+    """x, y and yaw of a cube that stands on any of its faces; the yaw is one of four.
+
+    Args:
+        position: (3,) [m].
+        quaternion: (4,) x, y, z, w.
+    """
+    x, y, z, w = quaternion
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    side = (int(np.argmax(np.abs(rotation[2]))) + 1) % 3  # an axis that is not the vertical one
+    return np.array([position[0], position[1], np.arctan2(rotation[1, side], rotation[0, side])])
+
+
+class CubeEstimator:
+    """Follows the cube: `pose = estimator.update(camera_observation, tips)` at each step.
+
+    Args:
+        friction: between tip and cube.
+    """
+
+    def __init__(self, friction: float) -> None:
+        self.model = pushing(N_FINGERS, friction, compliance=0.02)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the cube, as at the begin of an episode."""
+        self.pose: Array | None = None
+        self._age = np.inf
+        self._tips: deque[Array] = deque(maxlen=REMEMBERED)
+
+    def update(self, camera: dict[str, Any], tips: Array) -> Array:
+        """Pose (3,) of the cube now: x, y [m], yaw [rad] that goes on where it was.
+
+        Args:
+            camera: the part `camera_observation` of an observation.
+            tips: (3, 3) places of the tips [m].
+        """
+        self._tips.append(tips.copy())
+        age = float(camera["delay"][0])
+        if self.pose is None or age < self._age:  # a new picture
+            pose = planar_pose(camera["object_position"].astype(float), camera["object_orientation"].astype(float))
+            before = pose[2] if self.pose is None else self.pose[2]
+            pose[2] = before + (pose[2] - before + np.pi / 4) % (np.pi / 2) - np.pi / 4
+            since = min(round(age / STEP), len(self._tips) - 1)
+            way = list(self._tips)[len(self._tips) - 1 - since :]
+        else:
+            pose, way = self.pose, list(self._tips)[-2:]
+        for first, second in zip(way[:-1], way[1:], strict=True):
+            pose = self._step(pose, first, second)
+        self.pose, self._age = pose, age
+        return pose
+
+    def _step(self, pose: Array, first: Array, second: Array) -> Array:
+        """The pose after the tips have gone from `first` to `second`."""
+        lifted = np.maximum(first[:, 2], second[:, 2]) > HEIGHT + 0.7 * TIP_RADIUS
+        near = box_distance((first[:, :2] - pose[:2]) @ planar_turn(pose[2])) < 3 * TIP_RADIUS
+        if not (near & ~lifted).any():
+            return pose
+        discs = np.where(lifted[:, None], AWAY, first[:, :2] / UNIT)
+        moved = np.where(lifted[:, None], 0.0, (second - first)[:, :2] / UNIT)
+        x = torch.from_numpy(np.concatenate([pose[:2] / UNIT, pose[2:], discs.ravel()]))
+        with torch.no_grad():
+            after = self.model.params(x).step(x, torch.from_numpy(moved.ravel())).x_next.numpy()
+        return np.array([after[0] * UNIT, after[1] * UNIT, after[2]])
