@@ -16,7 +16,7 @@ from trifinger_push.fingers import N_FINGERS, inverse, planar_turn
 
 from difflcs.records import LCSParams
 
-__all__ = ["FINGER", "PUSH_HEIGHT", "FingerPlaces", "FingerTravel", "OneFinger"]
+__all__ = ["FINGER", "PUSH_HEIGHT", "FingerPlaces", "FingerTravel", "OneFinger", "lift"]
 
 Array = NDArray[np.float64]
 
@@ -26,9 +26,10 @@ PUSH_HEIGHT = 0.022
 """Of a tip that pushes [m]: friction on the table is 1, so that above half the cube's width it would topple."""
 OVER = 0.088
 """Of a tip that is carried over the cube [m]."""
-GAP = 0.006
+GAP = 0.004
 """Between a tip at a place and the cube [m]."""
-PER_FACE = 9
+PER_FACE, PART = 9, 0.6
+"""Places on each face, and the part of its width that they take: at its ends a tip slips off the corner."""
 ARENA = 0.183
 """Largest distance of a tip from the middle [m]; the wall is at 0.195."""
 LINK_RADIUS = 0.012
@@ -46,7 +47,7 @@ class OneFinger:
     n_x, n_u = 7, 3
 
     def __init__(self, friction: float, compliance: float) -> None:
-        self.plane = pushing(1, friction, compliance)
+        self.plane = pushing(friction, compliance, "anitescu")
         self.n_lam = self.plane.n_lam
 
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
@@ -67,7 +68,7 @@ class OneFinger:
 
 def _ring() -> tuple[Array, Array]:
     """Places round the cube in its coordinates and the outward normals there, both (4 · PER_FACE, 2)."""
-    along = np.linspace(-0.8 * HALF, 0.8 * HALF, PER_FACE)
+    along = np.linspace(-PART * HALF, PART * HALF, PER_FACE)
     face = np.stack([np.full(PER_FACE, HALF + TIP_RADIUS + GAP), along], 1)
     turns = [planar_turn(k * np.pi / 2) for k in range(4)]
     return np.concatenate([face @ t.T for t in turns]), np.repeat([t[:, 0] for t in turns], PER_FACE, 0)
@@ -155,6 +156,14 @@ class FingerPlaces:
         return bool(own[5] * UNIT < PUSH_HEIGHT + 0.03 and box_distance(local) - TIP_RADIUS < 0.025)
 
 
+def lift(pose: Array, tip: Array) -> Array:
+    """Waypoint (3,) [m] of a tip beside the cube: up, and away from the face that it may touch."""
+    turn = planar_turn(pose[2])
+    local = (tip[:2] - pose[:2]) @ turn
+    axis = int(np.argmax(np.abs(local)))
+    return np.array([*(tip[:2] + 0.012 * np.sign(local[axis]) * turn[:, axis]), OVER])
+
+
 class FingerTravel:
     """A tip goes straight to its place where the cube is not in the way, else over it. Actions: offset to a waypoint.
 
@@ -162,7 +171,7 @@ class FingerTravel:
         tips: (3, 3) where the tips are now [m], to be set before each decision.
     """
 
-    room = TIP_RADIUS + 0.0025
+    room = TIP_RADIUS + 0.0015
     tolerance = 0.010
 
     def __init__(self) -> None:
@@ -194,11 +203,8 @@ class FingerTravel:
         waypoint = end.copy()
         if self._crosses(pose, tip[:2], end[None, :2])[0]:
             waypoint[2] = OVER
-            if tip[2] <= OVER - 0.012:  # up, and away from the face that it may touch
-                turn = planar_turn(pose[2])
-                local = (tip[:2] - pose[:2]) @ turn
-                axis = int(np.argmax(np.abs(local)))
-                waypoint[:2] = tip[:2] + 0.012 * np.sign(local[axis]) * turn[:, axis]
+            if tip[2] <= OVER - 0.012:
+                waypoint = lift(pose, tip)
         return torch.from_numpy((waypoint - tip) / UNIT)
 
     def arrived(self, x: Tensor, target: Tensor) -> bool:

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from trifinger_push.control import STEP, TipControl, TipReference
-from trifinger_push.cube import UNIT, CubeEstimator
+from trifinger_push.cube import HEIGHT, UNIT, CubeEstimator
 from trifinger_push.fingers import N_FINGERS
-from trifinger_push.places import FINGER, PUSH_HEIGHT, FingerPlaces, FingerTravel, OneFinger
+from trifinger_push.places import FINGER, PUSH_HEIGHT, FingerPlaces, FingerTravel, OneFinger, lift
 from trifinger_rl_datasets import PolicyBase, PolicyConfig
 
 from difflcs import GoalCost, LCSMPCLayer
@@ -20,22 +20,24 @@ __all__ = ["PushPolicy"]
 
 Array = NDArray[np.float64]
 
-FRICTION = 0.4
-"""Between tip and cube that the plan counts on; the simulator's is 0.5."""
+FRICTION = 0.5
+"""Between tip and cube."""
+PLAN_FRICTION = 0.15
+"""That the plan counts on."""
 PLAN_STEP = 0.1
 """Of the system [s]; the plan is made anew at each step of the environment."""
 HORIZON = 8
 REACH = 0.03
 """Largest |u| of each component in a step of the system [m]: 0.3 m/s."""
-INPUT_WEIGHT = 0.04
-SETTINGS = SamplingSettings(keep=0.5, smallest_gain=0.02, switch_price=0.18, travel_price=0.0833, patience=75)
+INPUT_WEIGHT = 0.1
+SETTINGS = SamplingSettings(keep=0.3, smallest_gain=0.02, switch_price=0.18, travel_price=0.0833, patience=75)
 TRAVEL_SPEED, TRAVEL_ACCELERATION = 0.6, 7.0
 """Of a tip [m/s, m/s²]."""
 WAIT_HEIGHT = 0.115
 """Of the tips that do not push [m]."""
 LEAD = 0.03
 """How far the reference of a tip that pushes may be ahead of it [m]."""
-PUSH_FORCE = 0.6
+PUSH_FORCE = 0.4
 """Fed forward while a tip pushes [N]; on the table it takes up to 0.92 N to move the cube."""
 ARRIVED = 0.003
 """Distance of the cube from the goal at which the tips rest [m]."""
@@ -57,7 +59,7 @@ class PushPolicy(PolicyBase):
         torch.set_num_threads(1)
         self.control, self.cube = TipControl(), CubeEstimator(FRICTION)
         self.places, self.travel = FingerPlaces(), FingerTravel()
-        model = OneFinger(FRICTION, compliance=0.05)
+        model = OneFinger(PLAN_FRICTION, compliance=0.05)
         cost = GoalCost.reach(model.n_x, model.n_u, [1.0, 1.0], [3.0, 3.0], INPUT_WEIGHT)
         mpc = LCSMPCLayer(
             model, cost, HORIZON, -REACH / UNIT, REACH / UNIT, relaxation=1e-4, on_failure="mask"
@@ -109,6 +111,9 @@ class PushPolicy(PolicyBase):
         """Where the tips are to go, and the velocity of the one that pushes."""
         assert self.reference is not None
         targets, f = self.waiting.copy(), self.finger
+        for other in range(N_FINGERS):
+            if tips[other, 2] < HEIGHT + 0.01:
+                targets[other] = lift(pose, tips[other])
         if np.linalg.norm(pose[:2] - goal) < ARRIVED:
             targets[f] = self.reference.place[f]
             return targets, None
