@@ -30,7 +30,7 @@ HORIZON = 8
 REACH = 0.03
 """Largest |u| of each component in a step of the system [m]: 0.3 m/s."""
 INPUT_WEIGHT = 0.1
-SETTINGS = SamplingSettings(keep=0.3, smallest_gain=0.02, switch_price=0.18, travel_price=0.0833, patience=75)
+SETTINGS = SamplingSettings(keep=0.3, smallest_gain=0.002, switch_price=0.18, travel_price=0.0833, patience=75)
 TRAVEL_SPEED, TRAVEL_ACCELERATION = 0.6, 7.0
 """Of a tip [m/s, m/s²]."""
 WAIT_HEIGHT = 0.115
@@ -61,9 +61,7 @@ class PushPolicy(PolicyBase):
         self.places, self.travel = FingerPlaces(), FingerTravel()
         model = OneFinger(PLAN_FRICTION, compliance=0.05)
         cost = GoalCost.reach(model.n_x, model.n_u, [1.0, 1.0], [3.0, 3.0], INPUT_WEIGHT)
-        mpc = LCSMPCLayer(
-            model, cost, HORIZON, -REACH / UNIT, REACH / UNIT, relaxation=1e-4, on_failure="mask"
-        )
+        mpc = LCSMPCLayer(model, cost, HORIZON, -REACH / UNIT, REACH / UNIT, relaxation=1e-4, on_failure="mask")
         self.planner = SamplingPolicy(mpc, self.places, self.travel, SETTINGS)
         self.reset()
 
