@@ -17,9 +17,9 @@ in the file already are not played again. `--variant all` plays every one.
 from __future__ import annotations
 
 import json
-import sys
+import os
+import re
 import time
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,12 +29,13 @@ import numpy as np
 import torch
 import tyro
 
-from difflcs.bench import machine, save
-from difflcs.errors import MissingDependencyError
-from difflcs.planning.pusht import GYRATION, PIXELS, PushTPolicy, tee, tee_pushing
+from difflcs import _files
+from difflcs._checks import check_positive_int
+from difflcs.bench import machine
+from difflcs.errors import InvalidInputError
+from difflcs.planning.pusht import GYRATION, PIXELS, STEPS, PushTPolicy, make_env, tee, tee_pushing
 from difflcs.rl import wilson_interval
 
-STEPS = 300
 EVERY = 10
 """Episodes between two writings."""
 
@@ -58,7 +59,7 @@ def learned(seed: int) -> PushTPolicy:
     """With what two minutes of pushing teach."""
     from learn_pusht import learn
 
-    return PushTPolicy(learn(seed).model)
+    return PushTPolicy(learn(make_env(), seed).physics)
 
 
 VARIANTS = {
@@ -111,24 +112,6 @@ class Episode:
     longest: float
 
 
-def make_env() -> Any:
-    """The environment, unmodified.
-
-    Raises:
-        MissingDependencyError: gym-pusht is not installed.
-    """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # pygame's, about pkg_resources
-            import gym_pusht  # noqa: F401
-            import gymnasium
-    except ImportError as error:
-        raise MissingDependencyError(
-            f'expected gym-pusht, not installed ({error}); run: pip install "difflcs[rl,scoreboard]"'
-        ) from error
-    return gymnasium.make("gym_pusht/PushT-v0", obs_type="state", max_episode_steps=STEPS)
-
-
 def play(env: Any, policy: PushTPolicy, seed: int, variant: Variant, limit: int = STEPS) -> Episode:
     """One episode of a seed."""
     noise = np.random.default_rng([seed, 2])
@@ -179,17 +162,51 @@ def measure(name: str, o: Options, env: Any, record: dict[str, Any]) -> dict[str
             row.update(summary(rows))
             keep(o.out, record)
         if not o.json:
-            print(f"{name}: seed {o.seed + i}, {'solved' if found.success else 'not solved'} in {found.steps} steps")
+            print(f"{name}: seed {o.seed + i}, {'solved' if found.success else 'not solved'}, {found.steps} steps")
     return summary(rows[: o.episodes])
 
 
 def keep(path: Path, record: dict[str, Any]) -> None:
-    """Write without a word."""
-    _files.write_atomically(path, (json.dumps(record, ensure_ascii=False) + "\n").encode())
+    """Write the record atomically, an episode a line."""
+    text = json.dumps(record, indent=2, ensure_ascii=False)
+    text = re.sub(r"\[([^\[\]]*)\]", lambda inner: f"[{' '.join(inner[1].split())}]", text)
+    _files.write_atomically(path, (text + "\n").encode())
+
+
+def begin(o: Options) -> dict[str, Any]:
+    """The record to go on with: that of the file where it is of the same seed, or an empty one."""
+    options = {"seed": o.seed, "steps": STEPS, "smoke": o.smoke}
+    empty = {"machine": {**machine(), "cores": os.cpu_count()}, "options": options, "results": {}}
+    if o.out is None or not o.out.exists():
+        return empty
+    found: Any = _files.read_json(o.out)
+    if found["options"] != options:
+        raise InvalidInputError(
+            f"out: expected a record of {options}, got one of {found['options']} in {o.out}; name another file"
+        )
+    return found
 
 
 def main(o: Options) -> None:
     """Play, print, write."""
+    if o.variant not in (*VARIANTS, "all"):
+        raise InvalidInputError(f"variant: expected one of {', '.join(VARIANTS)}, or all, got {o.variant!r}")
+    check_positive_int("episodes", o.episodes)
+    if o.smoke:
+        o.episodes = min(o.episodes, 2)
+    torch.set_num_threads(1)
+    env, record = make_env(), begin(o)
+    for name in VARIANTS if o.variant == "all" else (o.variant,):
+        found = measure(name, o, env, record)
+        if o.json:
+            print(json.dumps({"variant": name, **found}))
+            continue
+        print(
+            f"{name}: {100 * found['success_rate']:.1f} % of {found['episodes']} ({100 * found['ci_low']:.1f} to "
+            f"{100 * found['ci_high']:.1f}), {found['mean_steps']:.1f} steps, coverage {found['coverage']:.3f}, "
+            f"{found['milliseconds_per_step']:.1f} ms a step"
+        )
+    env.close()
 
 
 if __name__ == "__main__":

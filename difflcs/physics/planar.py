@@ -328,31 +328,40 @@ class PlanarPushing:
         plane = torch.diag(x.new_tensor([1.0, 1.0, 0.0]))
         return plane + turn.unsqueeze(-1) * turn.unsqueeze(-2) / gyration.square()
 
-    def _free_motion(self, x: Tensor) -> FreeMotion:
-        m, n_x, batch = self.n_discs, self.n_x, x.shape[:-1]
-        like = {"dtype": x.dtype, "device": x.device}
+    def _without_contact(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """A and B, and the response of the discs alone."""
+        kept = vars(self).get("kept")
+        if kept is not None and kept[0].dtype == like.dtype and kept[0].device == like.device:
+            return kept
+        m, n_x, h = self.n_discs, self.n_x, 0.0 if self.inertia is None else self.inertia.seconds
+        A = torch.eye(n_x, dtype=like.dtype, device=like.device)
+        B, response = A.new_zeros(n_x, 2 * m), A.new_zeros(n_x, n_x)
         step, k = self.drive.step(), self.drive.order
-        A, B = torch.eye(n_x, **like), torch.zeros(n_x, 2 * m, **like)
-        response = torch.zeros(*batch, n_x, n_x, **like)
         places = 3 + torch.arange(2 * m)
         of = [places + 2 * m * i for i in range(k)]  # positions, then velocities
         for i in range(k):
             for j in range(k):
-                A[of[i], of[j]] = step.A[..., i, j].to(x).expand(m, 2).reshape(-1)
-            B[of[i], torch.arange(2 * m)] = step.b[..., i].to(x).expand(m, 2).reshape(-1)
-            response[..., of[i], places] = step.response[..., i].to(x).expand(m, 2).reshape(-1)
-        mobility = self._mobility(x)
+                A[of[i], of[j]] = step.A[..., i, j].to(A).expand(m, 2).reshape(-1)
+            B[of[i], torch.arange(2 * m)] = step.b[..., i].to(A).expand(m, 2).reshape(-1)
+            response[of[i], places] = step.response[..., i].to(A).expand(m, 2).reshape(-1)
+        if self.inertia is not None:
+            decay, speed = torch.exp(-_number("damping", self.inertia.damping).to(A) * h), n_x - 3 + torch.arange(3)
+            A[torch.arange(3), speed] = h * decay.expand(3)
+            A[speed, speed] = decay.expand(3)
+        if not (A.requires_grad or B.requires_grad or response.requires_grad):  # else each call has a graph of its own
+            vars(self)["kept"] = (A, B, response)
+        return A, B, response
+
+    def _free_motion(self, x: Tensor) -> FreeMotion:
+        A, B, response = self._without_contact(x)
+        response, mobility = response.expand(*x.shape[:-1], -1, -1).clone(), self._mobility(x)
         if self.inertia is None:
             response[..., :3, :3] = mobility
         else:
             h, mass = self.inertia.seconds, _number("mass", self.inertia.mass).to(x)
-            decay = torch.exp(-_number("damping", self.inertia.damping).to(x) * h)
-            speed = n_x - 3 + torch.arange(3)
-            A[torch.arange(3), speed] = h * decay.expand(3)
-            A[speed, speed] = decay.expand(3)
             response[..., :3, :3] = h * mobility / mass
-            response[..., n_x - 3 :, :3] = mobility / mass
-        return FreeMotion(A, B, x.new_zeros(n_x), response)
+            response[..., -3:, :3] = mobility / mass
+        return FreeMotion(A, B, x.new_zeros(self.n_x), response)
 
 
 def _number(name: str, value: Any) -> Tensor:

@@ -128,18 +128,14 @@ class Polygon(Shape):
     def distance(self, points: Tensor) -> Distance:
         """See `Shape`. Ties go to the side that comes first."""
         check_tensor("points", points, [("2", 2)])
-        start, end = self.vertices, self.vertices.roll(-1, 0)
+        start, side, square, outward = self._sides()
         with torch.no_grad():
-            nearest, inside = _nearest_side(points, start, end)
-        a, b = start[nearest], end[nearest]
-        side = b - a
-        along = ((points - a) * side).sum(-1) / side.square().sum(-1)
-        t = along.clamp(0.0, 1.0)
-        point = a + t.unsqueeze(-1) * side
-        outward = torch.stack([side[..., 1], -side[..., 0]], -1)
-        outward = outward / outward.norm(dim=-1, keepdim=True)
+            nearest, inside = _nearest_side(points, start, side, square)
+        a, side, outward = start[nearest], side[nearest], outward[nearest]
+        along = ((points - a) * side).sum(-1) / square[nearest]
+        point = a + along.clamp(0.0, 1.0).unsqueeze(-1) * side
         apart = points - point
-        size = apart.norm(dim=-1)
+        size = torch.linalg.vector_norm(apart, dim=-1)
         sign = torch.where(inside, -1.0, 1.0).to(points.dtype)
         # Beside a side its own normal serves, on the outline too, where the direction to it is none; round a corner
         # the direction from the corner.
@@ -148,6 +144,17 @@ class Polygon(Shape):
         normal = torch.where(beside.unsqueeze(-1), outward, (sign / safe).unsqueeze(-1) * apart)
         distance = torch.where(beside, (apart * outward).sum(-1), sign * torch.where(beside, 1.0, size))
         return Distance(distance.unsqueeze(-1), normal.unsqueeze(-2), point.unsqueeze(-2))
+
+    def _sides(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Start (n, 2), vector (n, 2), squared length (n,) and outward normal (n, 2) of every side."""
+        if "sides" in vars(self):
+            return vars(self)["sides"]
+        side = self.vertices.roll(-1, 0) - self.vertices
+        square = side.square().sum(-1)
+        sides = (self.vertices, side, square, torch.stack([side[:, 1], -side[:, 0]], -1) / square.sqrt().unsqueeze(-1))
+        if not side.requires_grad:  # else each call has a graph of its own
+            vars(self)["sides"] = sides
+        return sides
 
     def moments(self) -> Moments:
         """See `Shape`."""
@@ -277,14 +284,14 @@ def _shoelace(vertices: Tensor) -> Tensor:
     return vertices[:, 0] * following[:, 1] - vertices[:, 1] * following[:, 0]
 
 
-def _nearest_side(points: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
+def _nearest_side(points: Tensor, start: Tensor, side: Tensor, square: Tensor) -> tuple[Tensor, Tensor]:
     """Which side is nearest to each point, and which points are inside: a ray from them crosses sides an odd time."""
-    side, to = end - start, points.unsqueeze(-2) - start
-    t = ((to * side).sum(-1) / side.square().sum(-1)).clamp(0.0, 1.0)
-    nearest = (to - t.unsqueeze(-1) * side).square().sum(-1).argmin(-1)
-    y = points[..., 1:]
-    spans = (start[:, 1] > y) != (end[:, 1] > y)
+    to = points.unsqueeze(-2) - start
+    t = ((to * side).sum(-1) / square).clamp_(0.0, 1.0)
+    nearest = (to - t.unsqueeze(-1) * side).square_().sum(-1).argmin(-1)
+    x, y = to.unbind(-1)
+    width, height = side.unbind(-1)
+    spans = (y < 0) != (y < height)
     # x of the point against that of the side at its height, both multiplied by the side's height.
-    height = side[:, 1]
-    left = to[..., 0] * height.abs() < to[..., 1] * side[:, 0] * height.sign()
+    left = x * height.abs() < y * width * height.sign()
     return nearest, ((spans & left).sum(-1) % 2).bool()

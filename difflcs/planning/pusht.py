@@ -9,6 +9,7 @@ zero: what the environment sets is an attribute that pymunk does not read. Lengt
 from __future__ import annotations
 
 import math
+import warnings
 from collections import deque
 from typing import Any
 
@@ -18,41 +19,43 @@ from numpy.typing import ArrayLike, NDArray
 
 from difflcs._checks import check_positive_int
 from difflcs.cost import GoalCost
+from difflcs.errors import MissingDependencyError
 from difflcs.mpc.layer import LCSMPCLayer
 from difflcs.physics.contact import ContactLCS
 from difflcs.physics.planar import PDDrive, PlanarPushing
-from difflcs.physics.shapes import Polygon, Shape, Union
+from difflcs.physics.shapes import Polygon, Shape, Union, box
 from difflcs.planning.places import DiscPlaces, Workspace
 from difflcs.planning.sampling import SamplingPolicy, SamplingSettings
 from difflcs.planning.travel import PlanarTravel
 
-__all__ = ["GOAL", "PIXELS", "PushTPolicy", "tee", "tee_pushing"]
+__all__ = ["GOAL", "PIXELS", "STEPS", "PushTPolicy", "make_env", "tee", "tee_pushing"]
 
 PIXELS = 100.0
 """Pixels in a unit of length."""
 RADIUS = 0.15
 """Of the disc."""
+_BOXES = (box(-0.6, 0.6, 0.0, 0.3), box(-0.15, 0.15, 0.3, 1.2))
+_CENTER = Union(_BOXES).centroid
+CENTER_OF_MASS = (0.0, 0.45 - float(_CENTER[1]))
+"""Of the T, from the centre of its area: the environment takes the mean of the centres of its boxes."""
 GOAL = (256.0, 256.0, math.pi / 4)
 """Pose of the T's origin [px, px, rad]."""
-CENTER_OF_MASS = (0.0, 0.45)
-"""From the T's origin, the middle of its upper edge, to the mean of the centres of its boxes."""
 GYRATION = math.sqrt(3000.0) / PIXELS
-"""As the environment sums it: twice the moment of the bar about the origin, with a mass of 1."""
+"""As the environment sums it: twice the moment of the bar about the T's origin, with a mass of 1."""
 DRIVE = PDDrive(stiffness=100.0, damping=20.0, substep=0.01, substeps=10)
 SIDE = 5.12
 """Of the square that actions are in."""
+STEPS = 300
+"""Of 0.1 s, the limit of an episode."""
 
 
 def tee(scale: float = 1.0) -> Shape:
-    """The T about its centre of mass; `scale` makes it larger or smaller about that."""
-    boxes = ((-0.6, 0.6, 0.0, 0.3), (-0.15, 0.15, 0.3, 1.2))
-    cx, cy = CENTER_OF_MASS
-    corners = [[[a - cx, c - cy], [b - cx, c - cy], [b - cx, d - cy], [a - cx, d - cy]] for a, b, c, d in boxes]
-    return Union(tuple(Polygon(scale * torch.tensor(box, dtype=torch.float64)) for box in corners))
+    """The T in coordinates about the centre of its area; `scale` makes it larger or smaller about that."""
+    return Union(tuple(Polygon(scale * (part.vertices - _CENTER)) for part in _BOXES))
 
 
 def tee_pushing(**changes: Any) -> PlanarPushing:
-    """The T and the disc: state (x, y, yaw of the T about its centre of mass, x, y of the disc, its velocity).
+    """The T and the disc: state (x, y of the centre of the T's area, its yaw, x, y of the disc, its velocity).
 
     Args:
         changes: fields of `PlanarPushing` to have other values.
@@ -61,13 +64,34 @@ def tee_pushing(**changes: Any) -> PlanarPushing:
         "shape": tee(),
         "radius": RADIUS,
         "drive": DRIVE,
-        "center_of_mass": (0.0, 0.0),
+        "center_of_mass": CENTER_OF_MASS,
         "gyration": GYRATION,
         "friction": 0.0,
         "compliance": 0.02,
         "length": 1.0,
     }
     return PlanarPushing(**(own | changes))
+
+
+def make_env(**options: Any) -> Any:
+    """The environment as its authors publish it, with obs_type="state".
+
+    Args:
+        options: for `gymnasium.make`.
+
+    Raises:
+        MissingDependencyError: gym-pusht is not installed.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of pygame, about pkg_resources
+            import gym_pusht  # noqa: F401
+            import gymnasium
+    except ImportError as error:
+        raise MissingDependencyError(
+            f'expected the package gym-pusht, not installed ({error}); run: pip install "difflcs[scoreboard]"'
+        ) from error
+    return gymnasium.make("gym_pusht/PushT-v0", obs_type="state", max_episode_steps=STEPS, **options)
 
 
 class PushTPolicy:
@@ -87,6 +111,7 @@ class PushTPolicy:
         delay: steps by which actions come late. The plan begins at the state that the system predicts for then.
         places: round the T.
         horizon: of the plans [steps].
+        margin: by how much farther than usual from the T places and ways are laid [100 px].
 
     Attributes:
         sampling: the policy inside, with its `decision`.
@@ -100,6 +125,7 @@ class PushTPolicy:
         delay: int = 0,
         places: int = 64,
         horizon: int = 10,
+        margin: float = 0.0,
     ):
         self.system = system = tee_pushing() if system is None else system
         if shape is None:
@@ -109,8 +135,8 @@ class PushTPolicy:
         cost = GoalCost.reach(7, 2, goal_weight=(1.0, 1.0, 0.3), goal_weight_final=(4.0, 4.0, 1.2), input_weight=0.01)
         self.sampling = SamplingPolicy(
             LCSMPCLayer(system, cost, horizon, relaxation=1e-5, on_failure="mask"),
-            DiscPlaces(shape, RADIUS, places, gap=0.02, reach=0.12, workspace=workspace, margin=0.2),
-            PlanarTravel(shape, RADIUS, step=1.2, clearance=0.08, tolerance=0.08),
+            DiscPlaces(shape, RADIUS, places, gap=0.02 + margin, reach=0.12 + margin, workspace=workspace, margin=0.2),
+            PlanarTravel(shape, RADIUS, step=1.2, clearance=0.08 + margin, tolerance=0.08),
             SamplingSettings(keep=0.6, smallest_gain=0.02, switch_price=0.02, travel_price=0.04),
             bounds=workspace.bounds,
             angles=(2,),
@@ -154,8 +180,8 @@ class PushTPolicy:
 
 
 def from_origin(pose: ArrayLike) -> NDArray[np.float64]:
-    """Pose (3,) of the T's centre of mass in units of length, from that of its origin in pixels."""
+    """Pose (3,) of the centre of the T's area in units of length, from that of its origin in pixels."""
     x, y, yaw = np.asarray(pose, np.float64)
     cos, sin = math.cos(yaw), math.sin(yaw)
-    cx, cy = CENTER_OF_MASS
+    cx, cy = _CENTER.tolist()
     return np.array([x / PIXELS + cos * cx - sin * cy, y / PIXELS + sin * cx + cos * cy, yaw])

@@ -229,9 +229,8 @@ class SamplingPolicy:
         scores = torch.cat([gains[:1], gains[1:] - scale * price])
         best, here = float(scores.max()), float(gains[0])
         pushes = self.places.near(state) and here > own.smallest_gain * scale and here >= own.keep * best
-        chosen = 0
-        if not stay and not pushes and bool(torch.isfinite(scores[1:]).any()):
-            chosen = 1 + int(scores[1:].argmax())
+        goes = not stay and not pushes and bool((scores[1:] > 0).any())
+        chosen = 1 + int(scores[1:].argmax()) if goes else 0
         self._place, self._steps = (places[chosen - 1].clone(), 0) if chosen else (None, 0)
         target = states[chosen] if chosen else None
         mode = Mode.TRAVEL if chosen else Mode.PUSH

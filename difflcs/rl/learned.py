@@ -77,9 +77,12 @@ def check_depends(loss: Tensor) -> None:
 
 # --- the Jacobian -----------------------------------------------------------------------------------------------------
 
+FEW_PARAMETERS = 100
+"""Up to so many, a system that depends on the state is differentiated for all samples at once."""
+
 _CHUNK = 16
-"""Samples whose systems are differentiated together: the gradients of each take no part of those of the others, so that
-time and memory grow with the square of this."""
+"""Else: samples whose systems are differentiated together: the gradients of each take no part of those of the others,
+so that time and memory grow with the square of this."""
 
 
 def system_jacobian(
@@ -111,6 +114,10 @@ def system_jacobian(
         found = torch.autograd.grad(component.sum(), list(leaves.values()), retain_graph=True, materialize_grads=True)
         upstream.append(found)
     weights = [torch.stack(parts, 1) for parts in zip(*upstream, strict=True)]  # of each matrix: (N, n_u, ...)
+    if system.batch_shape and sum(p.numel() for p in learned) <= FEW_PARAMETERS:
+        found = _push_forward(lcs, state, context, weights, learned)
+        if found is not None:
+            return found
     size = _CHUNK if system.batch_shape else count
     rows = []
     for first in range(0, count, size):
@@ -119,6 +126,36 @@ def system_jacobian(
             own = lcs.params(state[part], None if context is None else context[part])
         rows.append(_pull_back(own, [w[part] for w in weights], learned))
     return torch.cat(rows)
+
+
+def _push_forward(
+    lcs: Any, state: Tensor, context: Tensor | None, weights: list[Tensor], learned: list[nn.Parameter]
+) -> Tensor | None:
+    """Gradients (N, n_u, ...) with respect to the matrices → (N, n_u, P) to the parameters, of which there are few.
+
+    The pullback vᵀ ∂system/∂θ is linear in v; its derivative by v is the derivative of all systems by each parameter.
+    None where the module has a function that cannot be differentiated twice: the pullback does not depend on v then.
+    """
+    with torch.enable_grad():
+        system = lcs.params(state, context)
+        names = [name for name in SYSTEM if getattr(system, name).requires_grad]
+        fields = [_each(system, name, len(state)) for name in names]
+        if not fields:
+            check_depends(weights[0])
+        v = [torch.zeros_like(field, requires_grad=True) for field in fields]
+        pulled = torch.autograd.grad(fields, learned, v, create_graph=True, materialize_grads=True)
+        flat = torch.cat([g.reshape(-1) for g in pulled])
+        if not flat.requires_grad:
+            return None
+        each = torch.eye(len(flat), dtype=flat.dtype, device=flat.device)
+        changes = torch.autograd.grad(flat, v, each, is_grads_batched=True, allow_unused=True)  # each (P, N, ...)
+    if any(change is None for change in changes):
+        return None
+    found = weights[0].new_zeros(*weights[0].shape[:2], len(flat))
+    of = dict(zip(SYSTEM, weights, strict=True))
+    for name, change in zip(names, changes, strict=True):
+        found += torch.einsum("nak,pnk->nap", of[name].flatten(2), change.flatten(2).to(found.dtype))
+    return found
 
 
 def _each(system: LCSParams | LCSSequence, name: str, count: int) -> Tensor:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch.autograd.functional import jacobian
 
 from difflcs import LCSModule, LCSMPCLayer, QuadraticCost, prediction_loss, violation_loss
-from difflcs.errors import DTypeError, InvalidInputError, ShapeError
+from difflcs.errors import DTypeError, FrictionWarning, InvalidInputError, ShapeError
 from difflcs.physics import (
     Circle,
     ContactLCS,
@@ -151,6 +151,19 @@ def test_units_change_nothing_but_the_forces(cone):
     torch.testing.assert_close(other.step(x, u).x_next, lcs.step(x, u).x_next, rtol=1e-6, atol=1e-9)
 
 
+def test_a_drag_that_spoils_the_friction_is_told():
+    """A block on two feet that share its weight."""
+    lcs, x = sliding_block("anitescu")
+    h, eye, zero = 0.1, torch.eye(2, dtype=F64), torch.zeros(2, 2, dtype=F64)
+    response = torch.cat([torch.cat([h * eye, zero], 1), torch.cat([eye, zero], 1)])
+    free = FreeMotion(lcs.A, lcs.B, lcs.d, response)
+    feet = Contacts(torch.zeros(2, dtype=F64), tensor([[0.0, 1.0, 0.0, 0.0]] * 2), tensor([[[1.0, 0.0, 0.0, 0.0]]] * 2))
+    contact_lcs(feet, free, x, friction=0.5, compliance=1e-3)
+    contact_lcs(feet, free, x, friction=0.5, compliance=0.1, cone="stewart-trinkle")
+    with pytest.warns(FrictionWarning, match="times the distance of a slide"):
+        contact_lcs(feet, free, x, friction=0.5, compliance=1e-3, cone="stewart-trinkle")
+
+
 def test_bad_contacts_are_refused():
     free = FreeMotion(*(torch.eye(2, dtype=F64) for _ in range(2)), torch.zeros(2, dtype=F64), torch.eye(2, dtype=F64))
     contacts = Contacts(tensor([0.0]), tensor([[1.0, 0.0]]), torch.zeros(1, 0, 2, dtype=F64))
@@ -184,6 +197,7 @@ DRIVES = {
 }
 
 
+@pytest.mark.filterwarnings("ignore::difflcs.errors.FrictionWarning")
 @pytest.mark.parametrize("name", DRIVES)
 @pytest.mark.parametrize("cone", ["anitescu", "stewart-trinkle"])
 def test_derivatives_of_gaps_are_those_of_autograd(build, name, cone):

@@ -1,0 +1,15 @@
+"""A linear complementarity system at each state of a MuJoCo model; needs the extra `envs`."""
+
+from difflcs.errors import MissingDependencyError
+
+try:
+    import mujoco as _mujoco  # noqa: F401  the files below import it
+except ImportError as error:
+    raise MissingDependencyError(
+        'expected the package mujoco, not installed; run: pip install "difflcs[envs]"'
+    ) from error
+
+from difflcs.physics.mujoco.lcs import MujocoLCS, lcs_from_mujoco
+from difflcs.physics.mujoco.state import MujocoState
+
+__all__ = ["MujocoLCS", "MujocoState", "lcs_from_mujoco"]

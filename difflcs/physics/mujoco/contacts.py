@@ -1,0 +1,316 @@
+"""What may touch in a MuJoCo model, at many states: gaps and contact Jacobians from MuJoCo's own collision detection.
+
+MuJoCo finds contacts within a margin, here the distance up to which they matter, and builds the Jacobian of their
+constraints natively. So contacts are those that a simulation would have, several where faces meet. One thing is
+mended: between boxes that are apart, MuJoCo's contacts can lie at a wrong distance or be missing, as what separates
+faces is not always the shortest way; where `mj_geomDistance` says otherwise, its two nearest points are the contact.
+"""
+
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from difflcs._checks import describe
+from difflcs.errors import InvalidInputError
+
+Array = NDArray[np.float64]
+Pairs = Sequence[tuple[int | str, int | str]]
+
+MOST_CONTACTS = 12  # by default
+
+_THREE = np.arange(3)
+
+_PLANE, _CAPSULE, _CYLINDER, _BOX, _MESH = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "CAPSULE", "CYLINDER", "BOX", "MESH")
+)
+_POINTS = {  # contacts that a pair of shapes can have, where more than one
+    (_PLANE, _CAPSULE): 2,
+    (_PLANE, _CYLINDER): 4,
+    (_PLANE, _BOX): 4,
+    (_PLANE, _MESH): 4,
+    (_CAPSULE, _CAPSULE): 2,
+    (_CAPSULE, _CYLINDER): 2,
+    (_CAPSULE, _BOX): 2,
+    (_CYLINDER, _CYLINDER): 4,
+    (_CYLINDER, _BOX): 4,
+    (_BOX, _BOX): 4,
+}
+
+
+class Found(NamedTuple):
+    """Contacts of n states.
+
+    Attributes:
+        gap: (n, n_contacts).
+        normal: (n, n_contacts, nv) derivative of the gap by the degrees of freedom.
+        tangent: (n, n_contacts, n_tangents, nv).
+        friction: (n, n_contacts).
+    """
+
+    gap: Array
+    normal: Array
+    tangent: Array
+    friction: Array
+
+
+class Read(NamedTuple):
+    """What MuJoCo says of n states, filled one by one.
+
+    Attributes:
+        gap: (n, n_contacts).
+        rows: (n, n_contacts, 3, nv) how the second body moves from the first, along the axes of `frame`.
+        frame: (n, n_contacts, 3, 3) its rows are the normal and two tangents.
+        geom: (n, n_contacts, 2).
+        apart: (n, n_contacts) distance of the points on both bodies whose motion `rows` takes to be that of one point
+            in the middle between them.
+        axes: (n, nv, 3) around which each degree of freedom turns.
+    """
+
+    gap: Array
+    rows: Array
+    frame: Array
+    geom: NDArray[np.intp]
+    apart: Array
+    axes: Array
+
+
+class ContactFinder:
+    """Finds contacts at states that somebody sets in `data`, of a model that it changes for its purpose.
+
+    Args:
+        model: a copy that is ours.
+        data: its data, at which positions have been computed.
+        pairs: geoms, or bodies with all their geoms, that may touch; None: as the model says.
+        distance: contacts farther away are left out [m].
+        contacts: how many a state has; None: what the shapes of the pairs can have, at most `MOST_CONTACTS`.
+        friction: coefficient of all; None: that of the geoms.
+
+    Attributes:
+        axis: normal (3,) of the plane in which everything moves, or None.
+        pairs: numbers of the geoms that may touch, those of the first and those of the second of each pair.
+    """
+
+    def __init__(
+        self, model: Any, data: Any, pairs: Pairs | None, distance: float, contacts: int | None, friction: float | None
+    ):
+        self.model, self.data, self.distance = model, data, distance
+        self.axis = plane_of_motion(model, data)
+        self.friction = _friction(model, friction)
+        self.allowed = _may_touch(model) if pairs is None else _listed(model, pairs)
+        self._drop_floors()
+        if pairs is not None:
+            _allow(model, np.flatnonzero(self.allowed.any(0)))
+        self.pairs = first, second = np.nonzero(np.triu(self.allowed))
+        kinds = np.sort(model.geom_type[np.stack([first, second], -1)], axis=-1)
+        if contacts is None:
+            contacts = min(MOST_CONTACTS, sum(_POINTS.get((int(a), int(b)), 1) for a, b in kinds))
+        self.n_contacts = contacts
+        rough = bool((self.friction[first, second] > 0).any())
+        self.n_tangents = (1 if self.axis is not None else 2) if rough else 0
+        boxes = (kinds == _BOX).all(-1)
+        self._boxes = [(int(a), int(b)) for a, b in zip(first[boxes], second[boxes], strict=True)]
+        self._turns = _moves(model)[model.geom_bodyid].astype(np.float64)
+        # Three rows of the Jacobian for each contact, the normal and two tangents, whatever its friction is.
+        model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        model.geom_condim[:], model.pair_dim[:] = 3, 3
+        model.geom_gap[:], model.pair_gap[:] = 0.0, 0.0
+        model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_OVERRIDE)
+        model.opt.o_margin = distance
+
+    def _drop_floors(self) -> None:
+        """Planes that nothing in the plane of motion can approach."""
+        if self.axis is None:
+            return
+        planes = self.model.geom_type == _PLANE
+        along = np.abs(self.data.geom_xmat.reshape(-1, 3, 3)[:, :, 2] @ self.axis) > 1 - 1e-9
+        self.allowed[planes & along] = False
+        self.allowed[:, planes & along] = False
+
+    def allocate(self, n: int) -> Read:
+        """For n states, all contacts out of reach."""
+        k, nv = self.n_contacts, self.model.nv
+        gap = np.full((n, k), self.distance)
+        rows, frame, axes = np.zeros((n, k, 3, nv)), np.zeros((n, k, 3, 3)), np.zeros((n, nv, 3))
+        return Read(gap, rows, frame, np.zeros((n, k, 2), dtype=np.intp), np.zeros((n, k)), axes)
+
+    def read(self, i: int, into: Read) -> None:
+        """Put the contacts of the state in `data`, for which `mj_fwdPosition` was called, into row i."""
+        data, count = self.data, self.n_contacts
+        contact, jacobian = data.contact, data.efc_J.reshape(-1, self.model.nv)
+        gap, geom, address = contact.dist, contact.geom, contact.efc_address
+        rows = jacobian[address[:, None] + _THREE] if len(jacobian) else np.zeros((len(gap), 3, self.model.nv))
+        frame, own = contact.frame.reshape(-1, 3, 3), (address >= 0) & self.allowed[geom[:, 0], geom[:, 1]]
+        apart = gap
+        if self._boxes:
+            gap, geom, rows, frame, own, apart = self._mend_boxes(gap, geom, rows, frame, own)
+        # A normal that nothing can move along is that of a body resting on what is outside the plane of motion.
+        kept = np.flatnonzero(own & (np.abs(rows[:, 0]).max(-1, initial=0.0) > 1e-9))
+        if len(kept) > count:
+            kept = np.sort(kept[np.argpartition(gap[kept], count - 1)[:count]])
+        k = len(kept)
+        into.gap[i, :k], into.rows[i, :k], into.frame[i, :k] = gap[kept], rows[kept], frame[kept]
+        into.geom[i, :k], into.apart[i, :k], into.axes[i] = geom[kept], apart[kept], data.cdof[:, :3]
+
+    def finish(self, read: Read) -> Found:
+        """Contacts with the tangents that count."""
+        normal, sides, slide = read.frame[:, :, 0], read.frame[:, :, 1:], read.rows[:, :, 1:]
+        if self.axis is not None:
+            across = np.cross(self.axis, normal)
+            across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
+            sides, parts = across[:, :, None], np.einsum("nkij,nkj->nki", sides, across)
+            slide = np.einsum("nki,nkiv->nkv", parts, slide)[:, :, None]
+        sides, slide = sides[:, :, : self.n_tangents], slide[:, :, : self.n_tangents]
+        # MuJoCo's contact is in the middle of the gap; friction acts where the two bodies are, half a gap from there:
+        # ω × n gap/2 for each of them, along the tangents.
+        lever = np.einsum("nkti,nvi->nktv", np.cross(normal[:, :, None], sides), read.axes)
+        turned = self._turns[read.geom[:, :, 0]] + self._turns[read.geom[:, :, 1]]
+        tangent = slide + 0.5 * read.apart[:, :, None, None] * lever * turned[:, :, None]
+        friction = np.where(read.frame.any((-1, -2)), self.friction[read.geom[:, :, 0], read.geom[:, :, 1]], 0.0)
+        return Found(read.gap, read.rows[:, :, 0], tangent, friction)
+
+    def _mend_boxes(self, gap: Array, geom: Any, rows: Array, frame: Array, own: Any) -> tuple[Any, ...]:
+        model, data, ends = self.model, self.data, np.empty(6)
+        places, radius = data.geom_xpos, model.geom_rbound
+        extra: list[tuple[float, tuple[int, int], Array, Array]] = []
+        middle = gap
+        for a, b in self._boxes:
+            if np.linalg.norm(places[a] - places[b]) - radius[a] - radius[b] > self.distance:
+                continue
+            apart = mujoco.mj_geomDistance(model, data, a, b, self.distance, ends)
+            of_pair = ((geom[:, 0] == a) & (geom[:, 1] == b)) | ((geom[:, 0] == b) & (geom[:, 1] == a))
+            if apart <= 0 or (of_pair.any() and abs(gap[of_pair].min() - apart) < 1e-6):
+                continue
+            own = own & ~of_pair
+            if apart < self.distance:
+                normal = (ends[3:] - ends[:3]) / apart
+                axes = np.stack([normal, *_across(normal)])
+                extra.append((apart, (a, b), axes @ (self._jacobian(b, ends[3:]) - self._jacobian(a, ends[:3])), axes))
+        if extra:
+            distances, pairs, jacobians, frames = zip(*extra, strict=True)
+            gap, geom = np.concatenate([gap, distances]), np.concatenate([geom, pairs])
+            rows, frame = np.concatenate([rows, jacobians]), np.concatenate([frame, frames])
+            own = np.concatenate([own, np.ones(len(extra), dtype=bool)])
+            middle = np.concatenate([middle, np.zeros(len(extra))])
+        return gap, geom, rows, frame, own, middle
+
+    def _jacobian(self, geom: int, point: Array) -> Array:
+        jacobian = np.empty((3, self.model.nv))
+        mujoco.mj_jac(self.model, self.data, jacobian, None, point, int(self.model.geom_bodyid[geom]))
+        return jacobian
+
+
+def _moves(model: Any) -> NDArray[np.bool_]:
+    """Which degrees of freedom move which bodies, (nbody, nv)."""
+    moves = np.zeros((model.nbody, model.nv), dtype=bool)
+    for body in range(1, model.nbody):
+        first = model.body_dofadr[body]
+        moves[body] = moves[model.body_parentid[body]]
+        moves[body, first : first + model.body_dofnum[body]] = True
+    return moves
+
+
+def plane_of_motion(model: Any, data: Any) -> Array | None:
+    """Normal (3,) of the plane in which all joints move their bodies, or None where there is no such plane."""
+    kinds = model.jnt_type
+    slides = data.xaxis[kinds == int(mujoco.mjtJoint.mjJNT_SLIDE)]
+    hinges = data.xaxis[kinds == int(mujoco.mjtJoint.mjJNT_HINGE)]
+    if len(slides) + len(hinges) < len(kinds) or not len(kinds):
+        return None
+    if len(hinges):
+        axis = hinges[0]
+    else:
+        _, size, directions = np.linalg.svd(slides)
+        if (size > 1e-6).sum() != 2:
+            return None
+        axis = directions[2]
+    parallel = np.abs(np.abs(hinges @ axis) - 1) < 1e-9
+    return axis.copy() if parallel.all() and (np.abs(slides @ axis) < 1e-9).all() else None
+
+
+def _across(normal: Array) -> tuple[Array, Array]:
+    """Two unit vectors perpendicular to a unit vector and to each other."""
+    first: Array = np.cross(normal, np.eye(3)[np.abs(normal).argmin()]).astype(np.float64)
+    first /= np.linalg.norm(first)
+    return first, np.cross(normal, first).astype(np.float64)
+
+
+def _friction(model: Any, friction: float | None) -> Array:
+    """Coefficients (ngeom, ngeom): of the geom of higher priority, else the larger, as MuJoCo does."""
+    n = model.ngeom
+    if friction is not None:
+        return np.full((n, n), friction)
+    first, second = model.geom_priority[:, None], model.geom_priority[None]
+
+    def of_pair(values: Any) -> Any:
+        larger = np.maximum(values[:, None], values[None])
+        return np.where(first == second, larger, np.where(first > second, values[:, None], values[None]))
+
+    table = np.where(of_pair(model.geom_condim) > 1, of_pair(model.geom_friction[:, 0]), 0.0)
+    for k in range(model.npair):
+        a, b = model.pair_geom1[k], model.pair_geom2[k]
+        table[a, b] = table[b, a] = model.pair_friction[k, 0] if model.pair_dim[k] > 1 else 0.0
+    return table
+
+
+def _may_touch(model: Any) -> NDArray[np.bool_]:
+    """Pairs (ngeom, ngeom) that MuJoCo would test."""
+    kind, affinity = model.geom_contype, model.geom_conaffinity
+    masks = (kind[:, None] & affinity[None]) | (affinity[:, None] & kind[None])
+    body = model.geom_bodyid
+    weld = model.body_weldid[body]
+    parent = model.body_weldid[model.body_parentid[weld]]
+    allowed = (masks != 0) & (weld[:, None] != weld[None])
+    if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT):
+        moving = (weld[:, None] != 0) & (weld[None] != 0)
+        allowed &= ~(moving & ((parent[:, None] == weld[None]) | (weld[:, None] == parent[None])))
+    for signature in model.exclude_signature:
+        excluded = (body[:, None] == signature >> 16) & (body[None] == signature & 0xFFFF)
+        allowed &= ~(excluded | excluded.T)
+    allowed[model.pair_geom1, model.pair_geom2] = allowed[model.pair_geom2, model.pair_geom1] = True
+    return allowed
+
+
+def _listed(model: Any, pairs: Pairs) -> NDArray[np.bool_]:
+    """Pairs (ngeom, ngeom) that the caller named."""
+    allowed = np.zeros((model.ngeom, model.ngeom), dtype=bool)
+    for pair in pairs:
+        if isinstance(pair, str) or len(pair) != 2:
+            raise InvalidInputError(f'pairs: expected pairs such as ("finger", "box"), got {describe(pair)}; give two')
+        first, second = (_geoms(model, name) for name in pair)
+        allowed[np.ix_(first, second)] = allowed[np.ix_(second, first)] = True
+    weld = model.body_weldid[model.geom_bodyid]
+    return allowed & (weld[:, None] != weld[None])
+
+
+def _geoms(model: Any, name: int | str) -> list[int]:
+    """A geom by its number or name, or all geoms of a body."""
+    if isinstance(name, str):
+        geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name)
+        body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+        found = [geom] if geom >= 0 else [g for g in range(model.ngeom) if model.geom_bodyid[g] == body >= 0]
+    else:
+        found = [name] if 0 <= name < model.ngeom else []
+    if not found:
+        raise InvalidInputError(
+            f"pairs: expected names of geoms or bodies, or numbers of geoms below {model.ngeom}, got {name!r:.100}; "
+            f"see the names in the model's XML"
+        )
+    return found
+
+
+def _allow(model: Any, geoms: Any) -> None:
+    """Let MuJoCo test these geoms against each other, whatever masks, parents and exclusions say."""
+    for masks, of_body in ((model.geom_contype, model.body_contype), (model.geom_conaffinity, model.body_conaffinity)):
+        masks[:], of_body[:] = 0, 0
+        masks[geoms], of_body[model.geom_bodyid[geoms]] = 1, 1
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
+    model.exclude_signature[:] = -1

@@ -1,0 +1,304 @@
+"""MujocoLCS: the linear complementarity system of a MuJoCo model at each state."""
+
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import copy
+from typing import Any, Literal
+
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor, describe
+from difflcs.errors import DTypeError, InvalidInputError
+from difflcs.physics.contacts import Cone, Contacts, contact_lcs, count_forces
+from difflcs.physics.mujoco.contacts import ContactFinder, Pairs
+from difflcs.physics.mujoco.motion import Actuators, Dynamic, QuasiStatic
+from difflcs.physics.mujoco.state import MujocoState
+from difflcs.records import LCSParams
+
+__all__ = ["Motion", "MujocoLCS", "lcs_from_mujoco"]
+
+Motion = Literal["quasi-static", "dynamic"]
+
+
+class MujocoLCS:
+    """The contact physics of a MuJoCo model as an `LCSModule`: a system linearised at each state.
+
+    Contacts, their Jacobians, the mass matrix and all smooth forces are MuJoCo's. Two motions are offered:
+
+    - "quasi-static": the state is the positions. Joints with actuators move as they are told, u is by how much in this
+      step; all else moves only while pushed. For slow pushing; gravity does nothing.
+    - "dynamic": the state is positions and velocities. u is MuJoCo's `ctrl`; that of `position` actuators on joints
+      counts from where the joint is, unless `relative` is false.
+
+    What a joint cannot move falls out of the Jacobians. Where all joints move in one plane, friction has one tangent,
+    in this plane, and contacts across it, such as those of a floor below, are left out.
+
+    Not in the system: limits of joints and actuators (bound the actions and states of the MPC), margins of geoms,
+    torsional and rolling friction. Refused: equality constraints, activation dynamics, and, in dynamic motion, dry
+    friction in joints. The matrices carry no gradient of the state.
+
+    An object keeps one private copy of the model and its data, so use it from one thread at a time.
+
+    Args:
+        model: the MuJoCo model.
+        data: its data: what is not in the state is taken from there (bodies that mocap moves), and `qpos` is the
+            reference of rotations, see `MujocoState`; None: the model's initial state.
+        motion: see above.
+        seconds: of a step [s].
+        contacts: how many a state has, the nearest; missing ones are padded with contacts out of reach. None: as many
+            points as the shapes of all pairs may touch in, at most 12.
+        distance: contacts farther away are left out [m]; None: ten times `length`.
+        pairs: geoms, by name or number, or bodies with all their geoms, that may touch; None: as the model says
+            (contype, conaffinity, pairs, excludes).
+        friction: coefficient μ of all contacts; None: that of the geoms, as MuJoCo combines them.
+        compliance: how far a contact gives way, in parts of how far the same force moves the two bodies apart (the
+            median over all pairs), > 0. It makes F + Fᵀ ≻ 0.
+        cone: model of friction, see `difflcs.physics.contacts`.
+        mobility: of a quasi-static motion: "inertia" (the inverse of the mass matrix), "damping" (of the joints'
+            damping), or what a unit of force on each degree of freedom does, (nv,) or (nv, nv). Only ratios matter, as
+            `compliance` is in parts of it. A body that cannot move along a degree of freedom has 0 there.
+        relative: whether the actions of `position` actuators on joints count from where these are.
+        length: unit of gaps for the relaxation of the MPC, see `contact_lcs` [m]; None: the median radius of the
+            geoms that move and may touch.
+
+    Attributes:
+        state: `MujocoState`, which says what each number of the state is.
+
+    Raises:
+        InvalidInputError and its kinds: an argument does not fit, or the model has what is refused.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        data: Any = None,
+        *,
+        motion: Motion = "quasi-static",
+        seconds: float = 0.1,
+        contacts: int | None = None,
+        distance: float | None = None,
+        pairs: Pairs | None = None,
+        friction: float | None = None,
+        compliance: float = 0.02,
+        cone: Cone = "anitescu",
+        mobility: Literal["inertia", "damping"] | ArrayLike = "inertia",
+        relative: bool = True,
+        length: float | None = None,
+    ):
+        _check_model(model, data)
+        check_choice("motion", motion, ("quasi-static", "dynamic"))
+        check_choice("cone", cone, ("anitescu", "stewart-trinkle"))
+        if isinstance(mobility, str):
+            check_choice("mobility", mobility, ("inertia", "damping"))
+        self.motion, self.seconds = motion, check_number("seconds", seconds, strict=True)
+        self.cone: Cone = cone
+        self.compliance = check_number("compliance", compliance, strict=True)
+        if contacts is not None:
+            check_positive_int("contacts", contacts)
+        if friction is not None:
+            check_number("friction", friction)
+        model = copy.copy(model)
+        self._model, self._data = model, mujoco.MjData(model)
+        if data is not None:
+            for name in ("qpos", "mocap_pos", "mocap_quat"):
+                getattr(self._data, name)[:] = getattr(data, name)
+        mujoco.mj_fwdPosition(model, self._data)
+        self.state = MujocoState(model, self._data.qpos, velocities=motion == "dynamic")
+        self._actuators, self._relative = Actuators(model), relative
+        self._quasi_static = motion == "quasi-static"
+        mobility = mobility if isinstance(mobility, str) else np.asarray(mobility)
+        if self._quasi_static:
+            self._motion: Any = QuasiStatic(model, self._actuators, mobility)
+        else:
+            if (model.dof_frictionloss > 0).any():
+                raise InvalidInputError(
+                    "model: expected no dry friction in joints (frictionloss) in dynamic motion, got some; replace it "
+                    'by damping, or use motion="quasi-static"'
+                )
+            self._motion = Dynamic(model, self._actuators, self.seconds, relative)
+        length = _typical_radius(model) if length is None else check_number("length", length, strict=True)
+        distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
+        self.length = length
+        self._finder = ContactFinder(model, self._data, pairs, distance, contacts, friction)
+        model.opt.disableflags |= sum(
+            int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("EQUALITY", "FRICTIONLOSS", "LIMIT")
+        )
+        self._give = self._typical_response()
+
+    @property
+    def n_x(self) -> int:
+        """Number of states: nv, or 2 nv with velocities."""
+        return self.state.n_x
+
+    @property
+    def n_u(self) -> int:
+        """Number of actions, one for each actuator."""
+        return int(self._model.nu)
+
+    @property
+    def n_contacts(self) -> int:
+        """Number of contacts of every state."""
+        return self._finder.n_contacts
+
+    @property
+    def n_lam(self) -> int:
+        """Number of contact forces."""
+        return count_forces(self.n_contacts, self._finder.n_tangents, self.cone)
+
+    def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
+        """The system at states x (..., n_x); there is no context.
+
+        Raises:
+            InvalidInputError and its kinds: no state, or of another size.
+        """
+        if x is None:
+            raise InvalidInputError(
+                "x: expected states (..., n_x), as contacts depend on where things are, got None; pass x"
+            )
+        contacts, friction, free, x64 = self._look(x)
+        found = contact_lcs(
+            contacts,
+            free,
+            x64,
+            friction=friction,
+            compliance=self.compliance * self._give,
+            cone=self.cone,
+            length=self.length,
+            force=self.length / self._give,
+        )
+        return found if x.dtype == torch.float64 and x.is_cpu else found.to(device=x.device, dtype=x.dtype)
+
+    def contacts(self, x: Tensor) -> Contacts:
+        """Gaps and their derivatives at states x (..., n_x).
+
+        Contacts that are missing have a gap of `distance`, and zeros.
+        """
+        return self._look(x)[0]
+
+    def control(self, x: Tensor, u: Tensor) -> Tensor:
+        """MuJoCo's `ctrl` (..., nu) for actions u (..., n_u) at states x (..., n_x).
+
+        Raises:
+            InvalidInputError: quasi-static motion by actuators that are no `position` actuators.
+        """
+        check_tensor("x", x, [("n_x", self.n_x)])
+        check_tensor("u", u, [("n_u", self.n_u)])
+        servo, dof = torch.from_numpy(self._actuators.servo), torch.from_numpy(self._actuators.dof)
+        if self._quasi_static and not servo.all():
+            raise InvalidInputError(
+                "model: expected position actuators to follow a quasi-static plan, got others; track x + u by your own "
+                "controller"
+            )
+        gear = torch.from_numpy(self._actuators.gear).to(u)
+        # The length of an actuator on a joint is gear · q.
+        here = gear * x[..., dof.clamp_min(0)]
+        if self._quasi_static:
+            return here + gear * u
+        return u + here * servo if self._relative else u
+
+    def _look(self, x: Tensor) -> tuple[Contacts, Tensor, Any, Tensor]:
+        """Contacts, their friction, the motion without contact, and the states in float64."""
+        qpos, qvel = self.state.to_mujoco(x)
+        batch, nv, model, data = x.shape[:-1], self.state.nv, self._model, self._data
+        n = int(np.prod(batch))
+        qpos, qvel = qpos.reshape(n, -1), qvel.reshape(n, -1)
+        found, moved = self._finder.allocate(n), self._motion.allocate(n)
+        for i in range(n):
+            data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
+            mujoco.mj_fwdPosition(model, data)
+            self._finder.read(i, found)
+            self._motion.read(i, data, moved)
+        x64 = x.detach().double().cpu()
+        flat = x64.reshape(n, self.n_x).numpy()
+        tangent = self.state.tangent(flat[:, :nv])
+        contacts = self._finder.finish(found)
+        free = self._motion.finish(moved, flat, tangent, contacts)
+        normal, slide = contacts.normal, contacts.tangent
+        if tangent is not None:
+            normal, slide = normal @ tangent, slide @ tangent[:, None]
+        if not self._quasi_static:
+            normal, slide = (np.concatenate([v, np.zeros_like(v)], -1) for v in (normal, slide))
+
+        def batched(value: Any) -> Tensor:
+            value = torch.as_tensor(value)
+            return value.reshape(*batch, *value.shape[1:])
+
+        free = type(free)(*(batched(v) if v.ndim > rank else v for v, rank in zip(free, (2, 2, 1, 2), strict=True)))
+        return Contacts(*map(batched, (contacts.gap, normal, slide))), batched(contacts.friction), free, x64
+
+    def _typical_response(self) -> float:
+        """How far a unit of force moves two bodies apart that may touch, the median over their pairs."""
+        model, data, nv = self._model, self._data, self.state.nv
+        moved, none = self._motion.allocate(1), self._finder.finish(self._finder.allocate(1))
+        self._motion.read(0, data, moved)
+        response = self._motion.finish(moved, np.zeros((1, self.n_x)), None, none).response
+        response = response.reshape(-1, self.n_x, self.n_x)[0, :nv, :nv].numpy()
+        jacobian, gives = np.empty((3, nv)), np.empty(model.ngeom)
+        for geom in range(model.ngeom):
+            mujoco.mj_jacGeom(model, data, jacobian, None, geom)
+            gives[geom] = np.trace(jacobian @ response @ jacobian.T) / (3 if self._finder.axis is None else 2)
+        first, second = self._finder.pairs
+        apart = (gives[first] + gives[second])[gives[first] + gives[second] > 0]
+        if len(first) and not len(apart):
+            raise InvalidInputError(
+                "model: expected something that contact forces can move, got nothing; what is pushed needs joints "
+                "without actuators, and a mobility above 0"
+            )
+        return float(np.median(apart)) if len(apart) else 1.0
+
+
+def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: Any) -> LCSParams:
+    """The linear complementarity system of a MuJoCo model, linearised at one state or at many.
+
+    Args:
+        model: the MuJoCo model.
+        data: its data; without x, the system is that of `data.qpos` and `data.qvel`.
+        x: (..., n_x) states, in the order of `MujocoState(model, data.qpos)`: positions, and velocities in dynamic
+            motion. Where there are free joints or balls, their rotations count from those in `data`.
+        **options: those of `MujocoLCS`, such as motion="dynamic", seconds=0.05, contacts=2, friction=0.5. Build a
+            `MujocoLCS` where there are many calls.
+
+    Returns:
+        The system, with the batch dimensions of x.
+
+    Raises:
+        InvalidInputError and its kinds: an argument does not fit.
+    """
+    if data is None:
+        raise DTypeError("data: expected a mujoco.MjData, got None; pass mujoco.MjData(model)")
+    module = MujocoLCS(model, data, **options)
+    return module.params(module.state.to_state(data.qpos, data.qvel) if x is None else x)
+
+
+def _check_model(model: Any, data: Any) -> None:
+    if not isinstance(model, mujoco.MjModel):
+        raise DTypeError(f"model: expected a mujoco.MjModel, got {describe(model)}; load one with MjModel")
+    if data is not None and not isinstance(data, mujoco.MjData):
+        raise DTypeError(f"data: expected a mujoco.MjData, got {describe(data)}; pass mujoco.MjData(model)")
+    if data is not None and len(data.qpos) != model.nq:
+        raise InvalidInputError(f"data: expected nq={model.nq} of the model, got {len(data.qpos)}; pass MjData(model)")
+    refused = {
+        "joints": not model.nv,
+        "no equality constraints": bool(model.neq),
+        "actuators without activation": bool(model.na),
+        "one control for each actuator": getattr(model, "nactuator", model.nu) != model.nu,
+        "no flexible bodies": bool(model.nflex),
+    }
+    for wanted, found in refused.items():
+        if found:
+            raise InvalidInputError(f"model: expected {wanted}, got something else; change the model")
+
+
+def _typical_radius(model: Any) -> float:
+    size = model.geom_rbound
+    moves = (size > 0) & (model.body_weldid[model.geom_bodyid] != 0)
+    touches = moves & ((model.geom_contype | model.geom_conaffinity) != 0)
+    chosen = size[touches] if touches.any() else size[moves]
+    return float(np.median(chosen)) if len(chosen) else 1.0

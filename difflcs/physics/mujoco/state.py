@@ -1,0 +1,173 @@
+"""The state of an LCS made from a MuJoCo model: which number means what, and the way there and back.
+
+MuJoCo's `qpos` has unit quaternions, which no linear system can have as a state. Where a joint is free or a ball, the
+state has the rotation vector r ∈ R³ from a reference orientation q̄ instead: q = q̄ exp(r), in coordinates of the body,
+as `mj_integratePos` does. All else is `qpos` itself.
+"""
+
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from difflcs._checks import check_tensor, describe
+from difflcs.errors import DTypeError, NonFiniteError, ShapeError
+
+__all__ = ["MujocoState"]
+
+Array = NDArray[np.float64]
+_SUFFIXES = {
+    int(mujoco.mjtJoint.mjJNT_FREE): ("_x", "_y", "_z", "_rx", "_ry", "_rz"),
+    int(mujoco.mjtJoint.mjJNT_BALL): ("_rx", "_ry", "_rz"),
+    int(mujoco.mjtJoint.mjJNT_SLIDE): ("",),
+    int(mujoco.mjtJoint.mjJNT_HINGE): ("",),
+}
+
+
+class MujocoState:
+    """Order and coordinates of the state: one number for each of MuJoCo's nv degrees of freedom, then perhaps `qvel`.
+
+    The coordinate of a slide or a hinge is its `qpos`. A free joint has its position and the rotation vector from its
+    orientation in `reference`, a ball the rotation vector alone: below half a turn each orientation has one, and at a
+    whole turn the coordinates are singular. So give a reference near which things happen.
+
+    Args:
+        model: the MuJoCo model.
+        reference: (nq,) `qpos` with the orientations from which rotation vectors count; None: `model.qpos0`.
+        velocities: whether `qvel` follows the positions. It is MuJoCo's, angular velocities in coordinates of the body.
+
+    Attributes:
+        names: what each number of the state is: the joint's name (or `joint0`, `joint1` …), for free joints and balls
+            with one of the endings _x _y _z _rx _ry _rz; velocities with the ending _velocity.
+    """
+
+    def __init__(self, model: Any, reference: ArrayLike | None = None, *, velocities: bool = False):
+        if not isinstance(model, mujoco.MjModel):
+            raise DTypeError(
+                f"model: expected a mujoco.MjModel, got {describe(model)}; load one, MjModel.from_xml_path"
+            )
+        self.nq, self.nv, self.velocities = int(model.nq), int(model.nv), velocities
+        self._reference = self._array("reference", model.qpos0 if reference is None else reference, self.nq).copy()
+        names: list[str] = []
+        plain: list[tuple[int, int]] = []
+        self._turning: list[tuple[int, int]] = []  # where quaternions are in qpos, rotation vectors in the state
+        for j in range(model.njnt):
+            kind, q, v = int(model.jnt_type[j]), int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
+            name = model.joint(j).name or f"joint{j}"
+            names += [name + suffix for suffix in _SUFFIXES[kind]]
+            count = len(_SUFFIXES[kind])
+            shifts = count % 3 if count < 6 else 3
+            plain += [(q + i, v + i) for i in range(shifts)]
+            if count >= 3:
+                self._turning.append((q + shifts, v + shifts))
+        self.names = (*names, *(f"{name}_velocity" for name in names)) if velocities else tuple(names)
+        self._of_qpos, self._of_state = np.array(plain, dtype=np.intp).reshape(-1, 2).T
+
+    @property
+    def n_x(self) -> int:
+        """Number of states."""
+        return len(self.names)
+
+    def index(self, name: str) -> int:
+        """Where a name stands in the state.
+
+        Raises:
+            KeyError: there is none of that name.
+        """
+        if name not in self.names:
+            raise KeyError(f"expected one of {', '.join(self.names)}, got {name!r}")
+        return self.names.index(name)
+
+    def to_state(self, qpos: ArrayLike, qvel: ArrayLike | None = None) -> Tensor:
+        """States (..., n_x) from `qpos` (..., nq) and `qvel` (..., nv); without `qvel` at rest.
+
+        Raises:
+            ShapeError, NonFiniteError: numbers that do not fit.
+        """
+        qpos = self._array("qpos", qpos, self.nq)
+        x = np.zeros((*qpos.shape[:-1], self.nv))
+        x[..., self._of_state] = qpos[..., self._of_qpos]
+        for q, v in self._turning:
+            turn = _multiply(_conjugate(self._reference[q : q + 4]), qpos[..., q : q + 4])
+            x[..., v : v + 3] = _rotation_vector(turn)
+        if self.velocities:
+            speed = np.zeros_like(x) if qvel is None else self._array("qvel", qvel, self.nv)
+            x = np.concatenate([x, np.broadcast_to(speed, x.shape)], -1)
+        return torch.from_numpy(x)
+
+    def to_mujoco(self, x: Tensor) -> tuple[Array, Array]:
+        """`qpos` (..., nq) and `qvel` (..., nv) from states (..., n_x); `qvel` is zero where the state has none.
+
+        Raises:
+            DTypeError, ShapeError, NonFiniteError: not such states.
+        """
+        check_tensor("x", x, [("n_x", self.n_x)])
+        numbers = x.detach().double().cpu().numpy()
+        qpos = np.broadcast_to(self._reference, (*numbers.shape[:-1], self.nq)).copy()
+        qpos[..., self._of_qpos] = numbers[..., self._of_state]
+        for q, v in self._turning:
+            qpos[..., q : q + 4] = _multiply(self._reference[q : q + 4], _quaternion(numbers[..., v : v + 3]))
+        velocity = numbers[..., self.nv :] if self.velocities else np.zeros((*numbers.shape[:-1], self.nv))
+        return qpos, velocity
+
+    def tangent(self, x: Array) -> Array | None:
+        """T (..., nv, nv) of qvel = T ẋ, for positions x (..., nv); None where it is the identity, without quaternions.
+
+        The block of a rotation vector is the right Jacobian of SO(3): 1 − (1 − cos r)/r² [r]× + (r − sin r)/r³ [r]×².
+        """
+        if not self._turning:
+            return None
+        T = np.broadcast_to(np.eye(self.nv), (*x.shape[:-1], self.nv, self.nv)).copy()
+        for _, v in self._turning:
+            r = x[..., v : v + 3]
+            angle = np.linalg.norm(r, axis=-1)[..., None, None]
+            small = angle < 1e-4
+            safe = np.where(small, 1.0, angle)
+            first = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
+            second = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
+            cross = np.cross(r[..., None, :], np.eye(3), axisa=-1, axisb=-1)
+            cross = np.swapaxes(cross, -1, -2)  # columns r × e_i
+            T[..., v : v + 3, v : v + 3] = np.eye(3) - first * cross + second * (cross @ cross)
+        return T
+
+    @staticmethod
+    def _array(name: str, value: ArrayLike, size: int) -> Array:
+        array = np.asarray(value, dtype=np.float64)
+        if array.ndim == 0 or array.shape[-1] != size:
+            raise ShapeError(f"{name}: expected shape (..., {size}), got {array.shape}; take it from this model's data")
+        if not np.isfinite(array).all():
+            raise NonFiniteError(f"{name}: expected finite numbers, got NaN or infinity; find where they come from")
+        return array
+
+
+def _conjugate(q: Array) -> Array:
+    return q * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def _multiply(a: Array, b: Array) -> Array:
+    """Product of quaternions (..., 4)."""
+    a0, av, b0, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    return np.concatenate([a0 * b0 - (av * bv).sum(-1, keepdims=True), a0 * bv + b0 * av + np.cross(av, bv)], -1)
+
+
+def _quaternion(r: Array) -> Array:
+    """exp: the unit quaternion (..., 4) of a rotation vector (..., 3)."""
+    half = 0.5 * np.linalg.norm(r, axis=-1, keepdims=True)
+    return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * r], -1)
+
+
+def _rotation_vector(q: Array) -> Array:
+    """log: the rotation vector (..., 3), of at most half a turn, of a quaternion (..., 4)."""
+    q = np.where(q[..., :1] < 0, -q, q)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, q[..., :1])
+    tiny = sine < 1e-12
+    return q[..., 1:] * np.where(tiny, 2.0, angle / np.where(tiny, 1.0, sine))

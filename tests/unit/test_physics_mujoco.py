@@ -1,0 +1,563 @@
+"""`difflcs.physics.mujoco`: states, contacts and systems of MuJoCo models, against MuJoCo and known solutions."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+mujoco = pytest.importorskip("mujoco")
+
+from difflcs import GoalCost, LCSModule, LCSMPCLayer  # noqa: E402
+from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError  # noqa: E402
+from difflcs.physics import PlanarPushing, box  # noqa: E402
+from difflcs.physics.mujoco import MujocoLCS, MujocoState, lcs_from_mujoco  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SHAPES = {
+    "sphere": 'type="sphere" size=".03"',
+    "capsule": 'type="capsule" size=".02 .04"',
+    "box": 'type="box" size=".05 .03 .02"',
+}
+PLANE = '<joint name="{0}x" type="slide" axis="1 0 0"/><joint name="{0}y" type="slide" axis="0 1 0"/>'
+PUSHER = f"""
+<body name="pusher">{PLANE.format("p")}<geom name="tip" type="sphere" size=".015" mass=".2" {{tip}}/></body>"""
+SERVOS = (
+    '<actuator><position joint="px" kp="1000" dampratio="1"/><position joint="py" kp="1000" dampratio="1"/></actuator>'
+)
+
+
+def load(worldbody, rest="", options=""):
+    text = f'<mujoco><option timestep="0.001" {options}/><worldbody>{worldbody}</worldbody>{rest}</mujoco>'
+    return mujoco.MjModel.from_xml_string(text)
+
+
+def pushing(rest=SERVOS, of_box='friction="0.5"', tip='friction="0.3"', options=""):
+    """A box on slides and a hinge, and a sphere on slides, in the plane; a floor below."""
+    body = f"""<geom name="floor" type="plane" size="1 1 .1" pos="0 0 -.05"/>
+      <body name="box">{PLANE.format("")}<joint name="yaw" type="hinge" axis="0 0 1"/>
+        <geom name="block" type="box" size=".06 .04 .05" mass=".5" {of_box}/></body>"""
+    return load(body + PUSHER.format(tip=tip), rest, options)
+
+
+def tensor(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def step(model, qpos, qvel=0.0, ctrl=0.0, seconds=0.1):
+    """What MuJoCo does."""
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, ctrl
+    for _ in range(round(seconds / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+    return data.qpos.copy(), data.qvel.copy()
+
+
+def many_joints():
+    return load("""
+      <body name="a"><joint name="slide" type="slide" axis="1 0 0"/><geom size=".1"/>
+        <body><joint name="ball" type="ball"/><geom size=".1" pos=".3 0 0"/>
+          <body pos=".6 0 0"><joint type="hinge" axis="0 1 0"/><geom size=".1" pos=".3 0 0"/></body></body></body>
+      <body name="b"><freejoint name="free"/><geom type="box" size=".1 .2 .3"/></body>""")
+
+
+def random_state(model, seed):
+    random = np.random.default_rng(seed)
+    qpos = np.zeros(model.nq)
+    mujoco.mj_integratePos(model, model.qpos0.copy(), random.normal(size=model.nv), 1.0)
+    start = model.qpos0.copy()
+    mujoco.mj_integratePos(model, start, random.normal(size=model.nv) * 0.8, 1.0)
+    qpos[:] = start
+    return qpos, random.normal(size=model.nv)
+
+
+# --- the state ------------------------------------------------------------------------------------------------------
+
+
+def test_the_state_says_what_each_number_is():
+    state = MujocoState(many_joints(), velocities=True)
+    places = ["slide", "ball_rx", "ball_ry", "ball_rz", "joint2"]
+    places += [f"free{end}" for end in ("_x", "_y", "_z", "_rx", "_ry", "_rz")]
+    assert list(state.names) == places + [f"{name}_velocity" for name in places]
+    assert state.n_x == 22
+    assert state.names[state.index("free_z")] == "free_z"
+    with pytest.raises(KeyError, match="free_w"):
+        state.index("free_w")
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_states_go_to_mujoco_and_back(seed):
+    model = many_joints()
+    reference, _ = random_state(model, seed + 100)
+    state = MujocoState(model, reference, velocities=True)
+    qpos, qvel = random_state(model, seed)
+    again, velocity = state.to_mujoco(state.to_state(qpos, qvel))
+    for q in (1, 9):  # q and −q are one orientation
+        again[q : q + 4] *= np.sign(again[q : q + 4] @ qpos[q : q + 4])
+    np.testing.assert_allclose(again, qpos, atol=1e-12)
+    np.testing.assert_array_equal(velocity, qvel)
+
+
+def test_states_of_slides_and_hinges_are_qpos_whatever_the_batch():
+    state = MujocoState(pushing())
+    qpos = np.random.default_rng(0).normal(size=(3, 2, 5))
+    x = state.to_state(qpos)
+    assert torch.equal(x, torch.from_numpy(qpos))
+    again, qvel = state.to_mujoco(x)
+    np.testing.assert_array_equal(again, qpos)
+    assert qvel.shape == (3, 2, 5)
+    assert not qvel.any()
+
+
+def test_a_rotation_counts_from_the_reference():
+    model = load('<body><freejoint name="b"/><geom size=".1"/></body>')
+    turned = np.array([0, 0, 0, np.cos(0.4), 0, 0, np.sin(0.4)])
+    assert MujocoState(model).to_state(turned)[5] == pytest.approx(0.8)
+    assert MujocoState(model, turned).to_state(turned).abs().max() == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_tangent_takes_velocities_of_the_state_to_those_of_mujoco(seed):
+    model = many_joints()
+    state = MujocoState(model)
+    qpos, _ = random_state(model, seed)
+    x = state.to_state(qpos)
+    T, numeric, eps = state.tangent(x.numpy()), np.zeros((model.nv, model.nv)), 1e-6
+    for i in range(model.nv):
+        ends = [state.to_mujoco(x + sign * eps * torch.eye(model.nv, dtype=x.dtype)[i])[0] for sign in (-1, 1)]
+        rate = np.empty(model.nv)
+        mujoco.mj_differentiatePos(model, rate, 2 * eps, *ends)
+        numeric[:, i] = rate
+    np.testing.assert_allclose(T, numeric, atol=1e-8)
+
+
+# --- contacts -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("first", "second"), list(itertools.combinations_with_replacement(SHAPES, 2)))
+def test_gaps_are_distances_and_their_derivatives_those_of_distances(first, second):
+    model = load(f"""
+      <body><freejoint name="a"/><geom {SHAPES[first]} mass="1"/></body>
+      <body><freejoint name="b"/><geom {SHAPES[second]} mass="1"/></body>""")
+    module = MujocoLCS(model, motion="dynamic", contacts=1)
+    data, random, eps, ends = mujoco.MjData(model), np.random.default_rng(0), 1e-6, np.zeros(6)
+
+    def distance(x):
+        data.qpos[:] = module.state.to_mujoco(x)[0]
+        mujoco.mj_fwdPosition(model, data)
+        return mujoco.mj_geomDistance(model, data, 0, 1, 1.0, ends)
+
+    compared = 0
+    for _ in range(12):
+        x = torch.from_numpy(
+            np.concatenate([random.normal(size=12) * np.tile([0.08] * 3 + [0.6] * 3, 2), np.zeros(12)])
+        )
+        gap = distance(x)
+        if gap < 0.005:
+            continue
+        found = module.contacts(x)
+        assert float(found.gap[0]) == pytest.approx(gap, abs=1e-7)
+        unit = eps * torch.eye(24, dtype=x.dtype)
+        rates = [(distance(x + unit[i]) - distance(x - unit[i])) / (2 * eps) for i in range(12)]
+        if first == second == "box" and np.abs(np.array(rates) - found.normal[0, :12].numpy()).max() > 1e-2:
+            continue  # faces that are nearly parallel: the nearest points jump
+        np.testing.assert_allclose(found.normal[0, :12], rates, atol=2e-3)
+        assert not found.normal[0, 12:].any()
+        compared += 1
+    assert compared >= 5
+
+
+def test_the_contact_of_a_pusher_beside_a_box():
+    module = MujocoLCS(pushing())
+    found = module.contacts(tensor(0.0, 0.0, 0.0, -0.1, 0.01))
+    assert found.gap.tolist() == pytest.approx([0.1 - 0.06 - 0.015])
+    # d gap = n · (tip − box at the point beside it), with n = −e_x there; along y likewise.
+    torch.testing.assert_close(found.normal[0], tensor(1.0, 0.0, -0.01, -1.0, 0.0))
+    sign = float(found.tangent[0, 0, 4].sign())
+    torch.testing.assert_close(sign * found.tangent[0, 0], tensor(0.0, -1.0, 0.06, 0.0, 1.0))
+
+
+def test_a_floor_that_nothing_in_the_plane_can_approach_is_left_out():
+    assert (MujocoLCS(pushing()).n_contacts, MujocoLCS(pushing()).n_lam) == (1, 2)
+    free = load('<geom type="plane" size="1 1 1"/><body><freejoint/><geom type="box" size=".1 .1 .1"/></body>')
+    assert MujocoLCS(free, motion="dynamic").n_contacts == 4
+    assert MujocoLCS(free, motion="dynamic").n_lam == 16
+    assert MujocoLCS(free, motion="dynamic", cone="stewart-trinkle").n_lam == 24
+
+
+def test_a_box_on_a_floor_has_a_contact_at_each_corner():
+    model = load('<geom type="plane" size="1 1 1"/><body><freejoint/><geom type="box" size=".1 .2 .3"/></body>')
+    found = MujocoLCS(model, motion="dynamic").contacts(tensor(0.0, 0.0, 0.31, *[0.0] * 9))
+    assert found.gap.tolist() == pytest.approx([0.01] * 4)
+    torch.testing.assert_close(found.normal[:, :3], tensor(0.0, 0.0, 1.0).expand(4, 3))
+    corners = sorted((round(float(n[3]), 6), round(float(n[4]), 6)) for n in found.normal)
+    assert corners == [(-0.2, -0.1), (-0.2, 0.1), (0.2, -0.1), (0.2, 0.1)]
+
+
+def test_missing_contacts_are_out_of_reach_and_the_nearest_are_kept():
+    balls = "".join(
+        f'<body pos="{x} 0 0"><joint name="s{x}" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/></body>'
+        for x in (0, 1, 3)
+    )
+    model = load(balls)
+    x = torch.zeros(6, dtype=torch.float64)
+    two = MujocoLCS(model, motion="dynamic", contacts=2, distance=5.0).contacts(x)
+    assert sorted(two.gap.tolist()) == pytest.approx([0.8, 1.8])
+    near = MujocoLCS(model, motion="dynamic", contacts=3, distance=1.0)
+    found = near.contacts(x)
+    assert sorted(found.gap.tolist()) == pytest.approx([0.8, 1.0, 1.0])
+    lam = near.params(x).step(x, torch.zeros(0, dtype=torch.float64)).lam
+    assert not lam.any()
+
+
+FRICTION = {
+    "the larger": ('friction="0.5"', 'friction="0.3"', "", 0.5),
+    "of higher priority": ('friction="0.5"', 'friction="0.3" priority="1"', "", 0.3),
+    "none where both have none": ('friction="0.5" condim="1"', 'friction="0.3" condim="1"', "", 0.0),
+    "some where one has": ('friction="0.5" condim="1"', 'friction="0.3" condim="3"', "", 0.5),
+    "of the pair": ("", "", '<contact><pair geom1="tip" geom2="block" friction=".7 .7 .1 .1 .1"/></contact>', 0.7),
+    "of a pair without": ("", "", '<contact><pair geom1="tip" geom2="block" condim="1"/></contact>', 0.0),
+}
+
+
+@pytest.mark.parametrize("case", FRICTION)
+def test_friction_is_combined_as_mujoco_does(case):
+    of_box, tip, rest, expected = FRICTION[case]
+    model = pushing(SERVOS + rest, of_box, tip)
+    data = mujoco.MjData(model)
+    data.qpos[:] = [0, 0, 0, -0.07, 0]
+    mujoco.mj_forward(model, data)
+    contact = next(c for c in data.contact if {model.geom(g).name for g in c.geom} == {"tip", "block"})
+    assert (contact.friction[0] if contact.dim > 1 else 0.0) == pytest.approx(expected)
+    module = MujocoLCS(model)
+    assert module.n_lam == (2 if expected else 1)
+    if expected:  # rays n ± μ t
+        D = module.params(tensor(0, 0, 0, -0.1, 0)).D
+        assert float((D[0] - D[1])[4].abs() / (D[0] + D[1])[3].abs()) == pytest.approx(expected)
+    assert MujocoLCS(model, friction=0.0).n_lam == 1
+
+
+def test_pairs_are_those_of_the_model_or_those_named():
+    third = """<body name="other" pos=".3 0 0"><joint name="o" type="slide" axis="0 1 0"/>
+      <geom name="ball" size=".02" {}/></body>"""
+
+    def model(of_ball="", rest=""):
+        text = f"""<body name="box">{PLANE.format("")}<geom name="block" type="box" size=".06 .04 .05"/></body>"""
+        return load(text + PUSHER.format(tip="") + third.format(of_ball), SERVOS + rest)
+
+    def count(of_ball="", rest="", **options):
+        return MujocoLCS(model(of_ball, rest), distance=1.0, **options).n_contacts
+
+    assert count() == 3
+    assert count('contype="0" conaffinity="0"') == 1
+    assert count('contype="2" conaffinity="2"') == 1
+    assert count(rest='<contact><exclude body1="other" body2="box"/></contact>') == 2
+    pairs = [("tip", "block")]
+    assert count(pairs=pairs) == 1
+    assert count(pairs=[("pusher", "other"), ("tip", 0)]) == 2
+    x = tensor(0.1, 0.0, -0.1, 0.02, 0.0)
+    named = MujocoLCS(model('contype="0" conaffinity="0"'), pairs=[("ball", "block")], distance=1.0).contacts(x)
+    assert named.gap.tolist() == pytest.approx(
+        [MujocoLCS(model(), pairs=[("ball", "block")]).contacts(x).gap[0].item()]
+    )
+    assert count(pairs=[]) == 0
+
+
+def test_parents_touch_only_where_named():
+    model = load("""<body name="a"><joint type="hinge" axis="0 0 1"/><geom name="a" size=".1"/>
+        <body name="b" pos=".3 0 0"><joint type="hinge" axis="0 0 1"/><geom name="b" size=".1" pos=".1 .1 0"/></body>
+      </body>""")
+    assert MujocoLCS(model, motion="dynamic").n_contacts == 0
+    module = MujocoLCS(model, motion="dynamic", pairs=[("a", "b")])
+    assert float(module.contacts(torch.zeros(4, dtype=torch.float64)).gap[0]) == pytest.approx(np.hypot(0.4, 0.1) - 0.2)
+
+
+# --- quasi-static motion --------------------------------------------------------------------------------------------
+
+
+def test_a_pushed_box_moves_as_far_as_the_pusher_goes_into_it():
+    module = MujocoLCS(pushing(), compliance=1e-6)
+    x, u = tensor(0, 0, 0, -0.08, 0), tensor(0.02, 0.01)
+    after = module.params(x).step(x, u).x_next
+    # 5 mm apart; friction holds the contact point of the tip, inside its cone, and turns the box by the rest.
+    assert float(after[0]) == pytest.approx(0.015, rel=0.2)
+    torch.testing.assert_close(after[3:], x[3:] + u)
+    straight = MujocoLCS(pushing(), compliance=1e-6, friction=0.0)
+    after = straight.params(x).step(x, tensor(0.02, 0.0)).x_next
+    torch.testing.assert_close(after, tensor(0.015, 0, 0, -0.06, 0), atol=1e-6, rtol=0)
+    torch.testing.assert_close(straight.params(x).step(x, tensor(-0.02, 0.0)).x_next[:3], torch.zeros(3).double())
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+def test_it_is_the_planar_pushing_of_the_same_shapes(friction):
+    gyration = float(np.sqrt((0.12**2 + 0.08**2) / 12))  # of the box's mass, which is that of its area
+    planar = PlanarPushing(box(-0.06, 0.06, -0.04, 0.04), 0.015, friction=friction, compliance=1e-6)
+    ours = MujocoLCS(pushing(), friction=friction, compliance=1e-6)
+    assert float(planar.gyration) == pytest.approx(gyration)
+    random = np.random.default_rng(0)
+    x = torch.from_numpy(random.uniform(-1, 1, (200, 5)) * [0.02, 0.02, 3, 0.15, 0.15])
+    u = torch.from_numpy(random.uniform(-0.03, 0.03, (200, 2)))
+    apart = ours.contacts(x).gap[:, 0] > 1e-4
+    assert apart.sum() > 80
+    one, other = (system.params(x[apart]).step(x[apart], u[apart]).x_next for system in (planar, ours))
+    assert (one - x[apart])[:, :3].abs().max() > 0.01
+    torch.testing.assert_close(one, other, atol=3e-5, rtol=0)
+
+
+def test_mobility_by_damping_or_by_numbers():
+    model = pushing()
+    model.dof_damping[:3] = [1.0, 2.0, 0.01]
+    x = tensor(0.0, 0.0, 0.0, -0.075, 0.02)
+    by_damping, by_numbers = (
+        MujocoLCS(model, mobility=value).params(x) for value in ("damping", [1.0, 0.5, 100.0, 0.0, 0.0])
+    )
+    torch.testing.assert_close(by_damping.C, by_numbers.C)
+    torch.testing.assert_close(by_damping.C[2] / by_damping.C[0], 100 * by_damping.D[:, 2] / by_damping.D[:, 0])
+    fixed = MujocoLCS(model, mobility=np.diag([1.0, 0.0, 0.0, 0.0, 0.0]))
+    assert not fixed.params(x).C[1:].any()
+
+
+def test_actions_become_controls_of_the_servos():
+    model = pushing(SERVOS.replace('joint="py"', 'joint="py" gear="2"'))
+    module = MujocoLCS(model)
+    x, u = tensor(0.2, 0.0, 0.0, -0.08, 0.03), tensor(0.01, -0.02)
+    ctrl = module.control(x, u)
+    torch.testing.assert_close(ctrl, tensor(-0.07, 0.02))
+    after, _ = step(model, x.numpy(), ctrl=ctrl.numpy())
+    np.testing.assert_allclose(after[3:], (x[3:] + u).numpy(), atol=2e-4)
+
+
+# --- motion with velocities -----------------------------------------------------------------------------------------
+
+CART_POLE = """
+<body><joint name="cart" type="slide" axis="1 0 0" damping=".1"/><geom type="box" size=".1 .05 .05" mass="1"/>
+  <body><joint name="pole" type="hinge" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 .6" size=".02" mass=".1"/>
+</body></body>"""
+
+
+def test_without_contact_the_error_is_of_second_order_in_the_motion():
+    model = load(CART_POLE, '<actuator><motor joint="cart" gear="3"/></actuator>', 'integrator="RK4"')
+    module = MujocoLCS(model, motion="dynamic", pairs=[])
+    x, u = tensor(0.1, 0.4, 0.5, -1.0), tensor(1.0)
+    errors = []
+    for seconds in (0.1, 0.05):
+        module = MujocoLCS(model, motion="dynamic", pairs=[], seconds=seconds)
+        predicted = module.params(x).step(x, u).x_next
+        after = np.concatenate(step(model, x[:2], x[2:], u.numpy(), seconds))
+        errors.append(np.abs(predicted.numpy() - after).max())
+    assert errors[0] < 2e-2
+    assert errors[1] < errors[0] / 3.5
+    # A small motion about equilibrium, where MuJoCo is linear.
+    x = tensor(0.0, 1e-4, 0.0, 0.0)
+    predicted = module.params(x).step(x, tensor(0.0)).x_next
+    np.testing.assert_allclose(predicted, np.concatenate(step(model, x[:2], x[2:], 0.0, 0.05)), atol=1e-9)
+
+
+@pytest.mark.parametrize("relative", [True, False])
+def test_servos_and_velocity_actuators_are_mujocos(relative):
+    rest = '<actuator><position joint="px" kp="30" kv="2" gear="2"/><velocity joint="py" kv="5"/></actuator>'
+    model = load(PUSHER.format(tip=""), rest, 'integrator="RK4"')
+    module = MujocoLCS(model, motion="dynamic", relative=relative)
+    x, u = tensor(0.3, -0.1, 0.2, 0.1), tensor(0.05, 0.4)
+    ctrl = module.control(x, u)
+    torch.testing.assert_close(ctrl, tensor(0.65, 0.4) if relative else u)
+    after = np.concatenate(step(model, x[:2], x[2:], ctrl.numpy()))
+    np.testing.assert_allclose(module.params(x).step(x, u).x_next, after, atol=2e-3)
+    # Two steps: a relative action counts from where the joint is by then.
+    second = module.params(x).rollout(x, torch.stack([u, u]))[-1]
+    ctrl = module.control(torch.from_numpy(after), u)
+    again = np.concatenate(step(model, after[:2], after[2:], ctrl.numpy()))
+    np.testing.assert_allclose(second, again, atol=4e-3)
+
+
+def test_a_body_in_the_air_falls_and_turns():
+    model = load('<body><freejoint name="b"/><geom type="box" size=".1 .2 .3" mass="1"/></body>')
+    reference = np.array([0, 0, 0, 0.8, 0.6, 0, 0])
+    data = mujoco.MjData(model)
+    data.qpos[:] = reference
+    module = MujocoLCS(model, data, motion="dynamic", seconds=0.02, pairs=[])
+    qpos, qvel = np.array([1, 2, 3, *np.array([0.5, 0.5, 0.5, 0.5])]), np.array([0.3, 0.2, 1.0, 1.0, 2.0, -1.5])
+    x = module.state.to_state(qpos, qvel)
+    after = module.state.to_state(*step(model, qpos, qvel, 0.0, 0.02))
+    predicted = module.params(x).step(x, torch.zeros(0).double()).x_next
+    assert (after - x)[3:6].abs().max() > 0.03
+    torch.testing.assert_close(predicted, after, atol=2e-3, rtol=0)
+    torch.testing.assert_close(predicted[:3], after[:3], atol=2e-4, rtol=0)
+
+
+def test_a_box_at_rest_stays_at_rest():
+    model = load("""<geom type="plane" size="1 1 1" friction=".5"/>
+      <body><freejoint name="b"/><geom type="box" size=".05 .05 .05" mass="2" friction=".5"/></body>""")
+    module = MujocoLCS(model, motion="dynamic", compliance=1e-5)
+    x = tensor(0.0, 0.0, 0.05, *[0.0] * 9)
+    system = module.params(x)
+    found = system.step(x, torch.zeros(0).double())
+    torch.testing.assert_close(found.x_next, x, atol=1e-4, rtol=0)
+    # The impulse of the contacts is that of the weight over the step.
+    impulse = 2.0 * (system.C @ found.lam)[8]
+    assert float(impulse) == pytest.approx(2 * 9.81 * 0.1, rel=1e-3)
+
+
+def test_a_falling_body_stops_at_the_floor():
+    model = load(
+        '<geom type="plane" size="1 1 1"/><body><joint name="z" type="slide" axis="0 0 1"/><geom size=".05"/></body>'
+    )
+    module = MujocoLCS(model, motion="dynamic", compliance=1e-6, friction=0.0)
+    x = tensor(0.1, -1.0)
+    after = module.params(x).step(x, torch.zeros(0).double()).x_next
+    assert float(after[0]) == pytest.approx(0.05, abs=1e-5)
+    assert -0.6 < float(after[1]) < 0.0  # where it stops within the step is not known to the LCS
+
+
+def test_a_servo_gives_way_less_than_what_it_pushes():
+    module = MujocoLCS(pushing(), motion="dynamic")
+    C = module.params(tensor(0, 0, 0, -0.076, 0, *[0.0] * 5)).C
+    assert float(C[3].abs().max()) < 0.05 * float(C[0].abs().max())
+
+
+# --- as a module ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("motion", ["quasi-static", "dynamic"])
+def test_a_batch_is_its_elements(motion):
+    module = MujocoLCS(pushing(), motion=motion)
+    assert isinstance(module, LCSModule)
+    random = np.random.default_rng(0)
+    x = torch.from_numpy(random.uniform(-0.1, 0.1, (2, 3, module.n_x)))
+    system = module.params(x)
+    assert (system.n_x, system.n_u, system.n_lam) == (module.n_x, module.n_u, module.n_lam)
+    for i, j in itertools.product(range(2), range(3)):
+        one = module.params(x[i, j])
+        u = tensor(0.01, 0.02)
+        torch.testing.assert_close(one.step(x[i, j], u).x_next, system.step(x, u).x_next[i, j])
+        assert one.C.ndim == 2
+
+
+def test_single_precision_comes_back_single():
+    module = MujocoLCS(pushing())
+    x = torch.tensor([0.0, 0, 0, -0.1, 0])
+    assert module.params(x).C.dtype == torch.float32
+    torch.testing.assert_close(module.params(x).C.double(), module.params(x.double()).C)
+
+
+def test_the_system_at_the_state_of_the_data():
+    model = pushing()
+    data = mujoco.MjData(model)
+    data.qpos[:] = [0.1, 0.0, 0.3, 0.0, 0.05]
+    x = MujocoState(model, data.qpos).to_state(data.qpos)
+    at_data, at_x = lcs_from_mujoco(model, data), lcs_from_mujoco(model, data, x.expand(2, 5), friction=None)
+    torch.testing.assert_close(at_data.C, at_x.C[1])
+    assert lcs_from_mujoco(model, data, motion="dynamic").n_x == 10
+
+
+def test_the_users_model_and_data_are_left_alone():
+    model = pushing()
+    data = mujoco.MjData(model)
+    before = [model.opt.timestep, model.opt.disableflags, model.opt.o_margin, *model.geom_condim, *model.geom_contype]
+    MujocoLCS(model, data, motion="dynamic", pairs=[("tip", "block")]).params(torch.zeros(10).double())
+    after = [model.opt.timestep, model.opt.disableflags, model.opt.o_margin, *model.geom_condim, *model.geom_contype]
+    assert before == after
+    assert not data.qpos.any()
+
+
+def test_bodies_that_mocap_moves_are_where_the_data_has_them():
+    model = load(f"""<body name="wall" mocap="true"><geom size=".1"/></body>
+      <body name="ball">{PLANE.format("")}<geom size=".1"/></body>""")
+    data = mujoco.MjData(model)
+    data.mocap_pos[0] = [1.0, 0, 0]
+    assert float(
+        MujocoLCS(model, data, motion="dynamic", distance=5.0).contacts(torch.zeros(4).double()).gap
+    ) == pytest.approx(0.8)
+
+
+def test_an_mpc_pushes_the_box_to_its_goal():
+    module = MujocoLCS(pushing())
+    cost = GoalCost.reach(5, 2, goal_weight=(100.0, 100.0, 0.3), input_weight=0.1)
+    mpc = LCSMPCLayer(module, cost, 6, -0.02, 0.02, relaxation=1e-5)
+    x, goal = tensor(0.0, 0.0, 0.0, -0.078, 0.0), tensor(0.05, 0.0, 0.0)
+    for _ in range(8):
+        x = module.params(x).step(x, mpc(x, goal).action).x_next
+    assert (x[:3] - goal).abs().max() < 3e-3
+
+
+# --- what is refused ------------------------------------------------------------------------------------------------
+
+SPHERE = '<body><freejoint/><geom size=".1"/></body>'
+REFUSED = {
+    "no model": (lambda: MujocoLCS("model.xml"), DTypeError, "MjModel"),
+    "no data": (lambda: MujocoLCS(pushing(), 3), DTypeError, "MjData"),
+    "no data to linearise at": (lambda: lcs_from_mujoco(pushing(), None), DTypeError, "MjData"),
+    "other data": (lambda: MujocoLCS(pushing(), mujoco.MjData(many_joints())), InvalidInputError, "nq=5"),
+    "a motion": (lambda: MujocoLCS(pushing(), motion="fast"), InvalidInputError, "quasi-static"),
+    "no actuators": (lambda: MujocoLCS(pushing(rest="")), InvalidInputError, "actuators"),
+    "two on one joint": (
+        lambda: MujocoLCS(pushing(rest=SERVOS.replace("py", "px"))),
+        InvalidInputError,
+        "slide or hinge of its own",
+    ),
+    "a mobility of another size": (lambda: MujocoLCS(pushing(), mobility=[1.0, 2.0]), InvalidInputError, "mobility"),
+    "no damping": (lambda: MujocoLCS(pushing(), mobility="damping"), InvalidInputError, "damping above 0"),
+    "nothing gives way": (lambda: MujocoLCS(pushing(), mobility=np.zeros(5)), InvalidInputError, "move, got nothing"),
+    "an unknown geom": (lambda: MujocoLCS(pushing(), pairs=[("tip", "cup")]), InvalidInputError, "'cup'"),
+    "half a pair": (lambda: MujocoLCS(pushing(), pairs=["tip"]), InvalidInputError, "pairs"),
+    "negative friction": (lambda: MujocoLCS(pushing(), friction=-1.0), InvalidInputError, "friction"),
+    "no compliance": (lambda: MujocoLCS(pushing(), compliance=0.0), InvalidInputError, "compliance"),
+    "no contacts": (lambda: MujocoLCS(pushing(), contacts=0), InvalidInputError, "contacts"),
+    "no joints": (lambda: MujocoLCS(load('<geom size="1"/>')), InvalidInputError, "joints"),
+    "activation": (
+        lambda: MujocoLCS(pushing(rest='<actuator><intvelocity joint="px" kp="1" actrange="-1 1"/></actuator>')),
+        InvalidInputError,
+        "activation",
+    ),
+    "equality": (
+        lambda: MujocoLCS(pushing(rest=SERVOS + '<equality><joint joint1="px" joint2="py"/></equality>')),
+        InvalidInputError,
+        "equality",
+    ),
+    "no state": (lambda: MujocoLCS(pushing()).params(), InvalidInputError, "pass x"),
+    "a state of another size": (lambda: MujocoLCS(pushing()).params(torch.zeros(4).double()), ShapeError, "n_x=5"),
+    "a state that is none": (lambda: MujocoLCS(pushing()).params(tensor(0, 0, 0, 0, np.nan)), NonFiniteError, "NaN"),
+    "qpos of another size": (lambda: MujocoState(pushing()).to_state([1.0]), ShapeError, "qpos"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_bad_input_is_refused(case):
+    call, error, words = REFUSED[case]
+    with pytest.raises(error, match=words):
+        call()
+
+
+def test_dry_friction_of_joints_is_refused_with_velocities_alone():
+    model = pushing()
+    model.dof_frictionloss[:3] = 1.0
+    assert MujocoLCS(model).n_lam == 2
+    with pytest.raises(InvalidInputError, match="frictionloss"):
+        MujocoLCS(model, motion="dynamic")
+
+
+def test_actuators_that_are_no_servos_have_no_control_of_a_plan():
+    module = MujocoLCS(pushing(rest='<actuator><motor joint="px"/><motor joint="py"/></actuator>'))
+    with pytest.raises(InvalidInputError, match="position actuators"):
+        module.control(torch.zeros(5).double(), torch.zeros(2).double())
+
+
+@pytest.mark.slow
+def test_without_mujoco_the_error_says_what_to_install():
+    code = """
+import sys
+sys.modules["mujoco"] = None
+import difflcs.physics
+from difflcs.errors import MissingDependencyError
+try:
+    import difflcs.physics.mujoco
+except MissingDependencyError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+    assert 'pip install "difflcs[envs]"' in done.stdout, done.stderr[-500:]
