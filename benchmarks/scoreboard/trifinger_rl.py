@@ -1,9 +1,9 @@
 """The cube of trifinger-rl-datasets pushed to a place: `python benchmarks/scoreboard/trifinger_rl.py --episodes 64`.
 
-Simulator, task, reward and evaluation are those of the authors (`trifinger_rl_datasets.Evaluation`, PyBullet, torques at
-50 Hz that act 10 ms late, a pose of the cube that is 90 to 190 ms old, 750 steps). Only the random numbers are seeded,
-for which the authors' `python -m trifinger_rl_datasets.evaluate_sim push trifinger_push.PushPolicy` has no option; and
-the environment is taken out of Gymnasium's wrappers, which since 1.0 hide what the evaluation asks for.
+Simulator, task, reward and evaluation are those of the authors (`trifinger_rl_datasets.Evaluation`, PyBullet, torques
+at 50 Hz that act 10 ms late, a pose of the cube that is 90 to 190 ms old, 750 steps). Only the random numbers are
+seeded, for which the authors' `python -m trifinger_rl_datasets.evaluate_sim push trifinger_push.PushPolicy` has no
+option; and the environment is taken out of Gymnasium's wrappers, which since 1.0 hide what the evaluation asks for.
 
 The reward of a step is sech²(15 d), with d [m] the distance of the cube's centre from the goal: at most 750 an episode.
 
@@ -130,7 +130,7 @@ def measure(o: Options) -> dict[str, Any]:
                 keep(o, rows)
             return found
 
-    np.random.seed(o.seed)  # the cube's places
+    np.random.seed(o.seed)  # noqa: NPY002 (from there the package draws the cube's places)
     move_cube.seed(o.seed)  # the goals
     with contextlib.redirect_stdout(io.StringIO()) if o.json else contextlib.nullcontext():
         Recorded(env).evaluate(policy, o.episodes)

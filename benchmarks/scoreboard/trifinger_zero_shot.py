@@ -108,7 +108,9 @@ class OtherSimulator:
         still = np.zeros((3, 3))
         load = LOAD_DECAY * self.load + LOAD_GAIN * STEP * (targets - self.tips())
         self.load = np.clip(load, -LOAD_LIMIT, LOAD_LIMIT)
-        torque = self.control.torque(*self.joints(), (targets, still if velocity is None else velocity, still), self.load)
+        torque = self.control.torque(
+            *self.joints(), (targets, still if velocity is None else velocity, still), self.load
+        )
         self.observation = self.env.step(torque)[0]
         self.estimated = self.estimator.update(self.observation["camera_observation"], self.tips())
 

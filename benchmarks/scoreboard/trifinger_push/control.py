@@ -18,6 +18,7 @@ import numpy as np
 import pinocchio as pin
 import robot_properties_fingers
 from numpy.typing import NDArray
+
 from trifinger_push.fingers import N_FINGERS
 
 __all__ = ["STEP", "TipControl", "TipReference"]

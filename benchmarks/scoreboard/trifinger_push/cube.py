@@ -7,16 +7,17 @@ measured at every step: the same contact physics that the plan uses is stepped f
 from __future__ import annotations
 
 from collections import deque
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from trifinger_push.control import STEP
-from trifinger_push.fingers import planar_turn
 
 from difflcs.physics import PlanarPushing, box
 from difflcs.physics.contacts import Cone
+from trifinger_push.control import STEP
+from trifinger_push.fingers import planar_turn
 
 __all__ = ["HALF", "HEIGHT", "TIP_RADIUS", "UNIT", "CubeEstimator", "box_distance", "planar_pose", "pushing"]
 
@@ -111,7 +112,7 @@ class CubeEstimator:
             way = list(self._tips)[len(self._tips) - 1 - since :]
         else:
             pose, way = self.pose, list(self._tips)[-2:]
-        for first, second in zip(way[:-1], way[1:], strict=True):
+        for first, second in pairwise(way):
             pose = self._step(pose, first, second)
         self.pose, self._age = pose, age
         return pose

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from trifinger_push.cube import HALF, HEIGHT, TIP_RADIUS, UNIT, box_distance, pushing
-from trifinger_push.fingers import N_FINGERS, inverse, planar_turn
 
 from difflcs.records import LCSParams
+from trifinger_push.cube import HALF, HEIGHT, TIP_RADIUS, UNIT, box_distance, pushing
+from trifinger_push.fingers import N_FINGERS, inverse, planar_turn
 
 __all__ = ["FINGER", "PUSH_HEIGHT", "FingerPlaces", "FingerTravel", "OneFinger", "lift"]
 
@@ -75,7 +75,7 @@ def _ring() -> tuple[Array, Array]:
 
 
 def _free(finger: int, pose: Array, points: Array, normals: Array) -> Array:
-    """Which points (n, 2) [m] the finger can push from: within reach, also some way on, and its link not in the cube."""
+    """Which points (n, 2) [m] the finger can push from: in its reach, also some way on, and its link not in the cube."""
     height = np.full(len(points), PUSH_HEIGHT)
     _, knee = inverse(finger, np.column_stack([points, height]))
     _, ahead = inverse(finger, np.column_stack([points - 0.02 * normals, height]))

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from trifinger_rl_datasets import PolicyBase, PolicyConfig
+
+from difflcs import GoalCost, LCSMPCLayer
+from difflcs.planning import Decision, Mode, SamplingPolicy, SamplingSettings
 from trifinger_push.control import STEP, TipControl, TipReference
 from trifinger_push.cube import HEIGHT, UNIT, CubeEstimator
 from trifinger_push.fingers import N_FINGERS
 from trifinger_push.places import FINGER, PUSH_HEIGHT, FingerPlaces, FingerTravel, OneFinger, lift
-from trifinger_rl_datasets import PolicyBase, PolicyConfig
-
-from difflcs import GoalCost, LCSMPCLayer
-from difflcs.planning import Mode, SamplingPolicy, SamplingSettings
 
 __all__ = ["PushPolicy"]
 
@@ -31,6 +32,8 @@ REACH = 0.03
 """Largest |u| of each component in a step of the system [m]: 0.3 m/s."""
 INPUT_WEIGHT = 0.1
 SETTINGS = SamplingSettings(keep=0.3, smallest_gain=0.002, switch_price=0.18, travel_price=0.0833, patience=75)
+WAIVED = replace(SETTINGS, smallest_gain=0.0, switch_price=0.0018, travel_price=0.000833)
+"""Where no journey is worth its price and nothing is gained here, as beside the wall: the best place all the same."""
 TRAVEL_SPEED, TRAVEL_ACCELERATION = 0.6, 7.0
 """Of a tip [m/s, m/s²]."""
 WAIT_HEIGHT = 0.115
@@ -116,9 +119,7 @@ class PushPolicy(PolicyBase):
             targets[f] = self.reference.place[f]
             return targets, None
         self.travel.tips = tips
-        action = self.planner.act(self._state(pose, tips), goal / UNIT)
-        decision = self.planner.decision
-        assert decision is not None
+        action, decision = self._plan(self._state(pose, tips), goal / UNIT)
         if decision.mode is Mode.TRAVEL:
             assert decision.target is not None
             f = self.finger = int(decision.target[FINGER])
@@ -128,6 +129,20 @@ class PushPolicy(PolicyBase):
         velocity = action[:2] * UNIT / PLAN_STEP
         self._asked += float(np.linalg.norm(velocity)) * STEP
         return targets, velocity
+
+    def _plan(self, state: Array, goal: Array) -> tuple[Array, Decision]:
+        """Action and decision of the planner; where it would only wait, prices are waived."""
+        before = self.planner.decision
+        action, decision = self.planner.act(state, goal), self.planner.decision
+        assert decision is not None
+        travelled = before is not None and before.mode is Mode.TRAVEL
+        idle = decision.gain <= SETTINGS.smallest_gain or not self.places.near(torch.from_numpy(state))
+        if decision.mode is Mode.PUSH and idle and not travelled:
+            self.planner.settings = WAIVED
+            action, decision = self.planner.act(state, goal), self.planner.decision
+            assert decision is not None
+            self.planner.settings = SETTINGS
+        return action, decision
 
     def _state(self, pose: Array, tips: Array) -> Array:
         return np.array([pose[0] / UNIT, pose[1] / UNIT, pose[2], *tips[self.finger] / UNIT, self.finger])
