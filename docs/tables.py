@@ -223,6 +223,29 @@ def delay(record: dict) -> str:
     return table(["", "success", "95 % interval", "against late"], rows)
 
 
+def errors(record: dict) -> str:
+    """Predictions of one step by system and mode: error of each coordinate and how far it moved, time of a state."""
+    rows = []
+    for system, modes in record["results"].items():
+        for k, (mode, row) in enumerate(modes.items()):
+            cells = [
+                f"{name} {number(value['error'])} of {number(value['moved'])} {value['unit']}"
+                for name, value in row.items()
+                if isinstance(value, dict)
+            ]
+            rows.append(["" if k else system, mode, "; ".join(cells), duration(1e-3 * row["ms a state"])])
+    return table(["system", "model", "error of motion", "time of a state"], rows)
+
+
+def success(record: dict) -> str:
+    """Success rate of a closed loop, its steps and time."""
+    row = record["results"]
+    interval = f"{100 * row['ci_low']:.1f} to {100 * row['ci_high']:.1f} %"
+    cells = [f"{100 * row['success_rate']:.1f} %", interval, f"{row['goals']}", f"{row['mean_steps']:.0f}"]
+    head = ["success", "95 % interval", "goals", "steps on average", "time of a decision"]
+    return table(head, [[*cells, duration(1e-3 * row["milliseconds_per_step"])]])
+
+
 VARIANTS = {
     "known": "physics as it is",
     "learned": "physics learned from 2 minutes of random pushing",
@@ -295,5 +318,7 @@ TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "scale": {"sizes": sizes},
     "latency": {"ways": latency},
     "delay": {"ways": delay},
+    "physics": {"errors": errors},
+    "box_to_pose": {"success": success},
     "pusht": {"variants": pusht, "published": published},
 }

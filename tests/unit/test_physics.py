@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch.autograd.functional import jacobian
 
 from difflcs import LCSModule, LCSMPCLayer, QuadraticCost, prediction_loss, violation_loss
-from difflcs.errors import DTypeError, InvalidInputError, ShapeError
+from difflcs.errors import DTypeError, FrictionWarning, InvalidInputError, ShapeError
 from difflcs.physics import (
     Circle,
     ContactLCS,
@@ -22,6 +22,7 @@ from difflcs.physics import (
     PDDrive,
     PlanarPushing,
     Polygon,
+    PositionDrive,
     Union,
     box,
     contact_lcs,
@@ -151,6 +152,19 @@ def test_units_change_nothing_but_the_forces(cone):
     torch.testing.assert_close(other.step(x, u).x_next, lcs.step(x, u).x_next, rtol=1e-6, atol=1e-9)
 
 
+def test_a_drag_that_spoils_the_friction_is_told():
+    """A block on two feet that share its weight."""
+    lcs, x = sliding_block("anitescu")
+    h, eye, zero = 0.1, torch.eye(2, dtype=F64), torch.zeros(2, 2, dtype=F64)
+    response = torch.cat([torch.cat([h * eye, zero], 1), torch.cat([eye, zero], 1)])
+    free = FreeMotion(lcs.A, lcs.B, lcs.d, response)
+    feet = Contacts(torch.zeros(2, dtype=F64), tensor([[0.0, 1.0, 0.0, 0.0]] * 2), tensor([[[1.0, 0.0, 0.0, 0.0]]] * 2))
+    contact_lcs(feet, free, x, friction=0.5, compliance=1e-3)
+    contact_lcs(feet, free, x, friction=0.5, compliance=0.1, cone="stewart-trinkle")
+    with pytest.warns(FrictionWarning, match="times the distance of a slide"):
+        contact_lcs(feet, free, x, friction=0.5, compliance=1e-3, cone="stewart-trinkle")
+
+
 def test_bad_contacts_are_refused():
     free = FreeMotion(*(torch.eye(2, dtype=F64) for _ in range(2)), torch.zeros(2, dtype=F64), torch.eye(2, dtype=F64))
     contacts = Contacts(tensor([0.0]), tensor([[1.0, 0.0]]), torch.zeros(1, 0, 2, dtype=F64))
@@ -184,6 +198,7 @@ DRIVES = {
 }
 
 
+@pytest.mark.filterwarnings("ignore::difflcs.errors.FrictionWarning")
 @pytest.mark.parametrize("name", DRIVES)
 @pytest.mark.parametrize("cone", ["anitescu", "stewart-trinkle"])
 def test_derivatives_of_gaps_are_those_of_autograd(build, name, cone):
@@ -257,6 +272,43 @@ def test_the_pd_drive_is_its_own_simulation():
     torch.testing.assert_close(got, tensor([p, v]))
 
 
+def test_what_a_drive_gives_way_and_what_the_body_moves():
+    """Series of springs: a force f moves the body by f, the disc back by a·f, and closes the gap by r·f."""
+    give, soft, gain, command = 0.5, 0.1, 0.8, 0.01
+    system = pushing(compliance=soft, friction=0.0, drive=PositionDrive(gain, give))
+    x = tensor([0.0, 0.0, 0.0, -0.04, 0.0])
+    after = system.params(x).step(x, tensor([command, 0.0])).x_next
+    force = gain * command / (1 + give + soft)
+    torch.testing.assert_close(after, tensor([force, 0.0, 0.0, -0.04 + gain * command - give * force, 0.0]))
+
+
+def test_two_discs_that_squeeze_a_body_hold_each_other():
+    """With a stiff drive they would go on into the body; one that gives way stays almost where it is."""
+    x, u = tensor([0.0, 0.0, 0.0, -0.04, 0.0, 0.04, 0.0]), tensor([0.01, 0.0, -0.01, 0.0])
+    moved = []
+    for give in (0.0, 100.0):
+        system = pushing(n_discs=2, friction=0.0, compliance=1.0, drive=PositionDrive(1.0, give))
+        moved.append(float(system.params(x).step(x, u).x_next[3] - x[3]))
+    torch.testing.assert_close(tensor(moved), tensor([0.01, 0.01 * (1 - 100 / 101)]))
+
+
+def test_only_the_nearest_parts_touch():
+    parts = tuple(box(a, a + 0.02, -0.01, 0.01) for a in (-0.05, -0.01, 0.03))
+    both = [PlanarPushing(Union(parts), 0.005, 2, friction=0.4, nearest=n) for n in (None, 1)]
+    x = tensor([[0.0, 0.0, 0.0, -0.04, 0.02, 0.002, 0.03], [0.01, 0.0, 0.3, 0.06, 0.0, -0.07, 0.0]])
+    full, near = (system.contacts(x) for system in both)
+    assert [system.n_lam for system in both] == [12, 4]
+    assert near.gap.shape == (2, 2)
+    chosen = full.gap.reshape(2, 2, 3).argmin(-1)
+    torch.testing.assert_close(near.gap, full.gap.reshape(2, 2, 3).amin(-1))
+    for name in ("normal", "tangent"):
+        every = getattr(full, name).reshape(2, 2, 3, -1)
+        wanted = every.gather(2, chosen[..., None, None].expand(2, 2, 1, every.shape[-1])).squeeze(2)
+        torch.testing.assert_close(getattr(near, name).reshape(2, 2, -1), wanted)
+    more = PlanarPushing(Union(parts), 0.005, 2, friction=0.4, nearest=9)
+    torch.testing.assert_close(more.contacts(x).gap, full.gap)
+
+
 def test_discs_with_mass_are_pushed_back():
     system = pushing(**DRIVES["force"], n_discs=1)
     x = torch.zeros(system.n_x, dtype=F64)
@@ -277,6 +329,7 @@ def test_discs_with_mass_are_pushed_back():
      ({"drive": "fast"}, DTypeError, "drive: expected a Drive"),
      ({"cone": "flat"}, InvalidInputError, "cone: expected"),
      ({"friction": "much"}, DTypeError, "friction: expected a number"),
+     ({"nearest": 0}, InvalidInputError, "nearest"),
      ({"n_discs": 0}, InvalidInputError, "n_discs")],
 )  # fmt: skip
 def test_a_wrong_description_is_refused(wrong, error, match):
@@ -286,11 +339,13 @@ def test_a_wrong_description_is_refused(wrong, error, match):
         pushing().params()
     with pytest.raises(DTypeError, match="shape: expected a Shape"):
         PlanarPushing("box", 0.01)
+    with pytest.raises(InvalidInputError, match="compliance: expected numbers of at least 0"):
+        pushing(drive=PositionDrive(1.0, -0.1)).params(torch.zeros(5, dtype=F64))
 
 
 def test_gradients_by_the_physics(build):
     """Of a step with contact, by everything that a ContactLCS can learn."""
-    system = ContactLCS(pushing(n_discs=2, compliance=0.1), LEARNABLE)
+    system = ContactLCS(pushing(n_discs=2, compliance=0.1, drive=PositionDrive(0.8, 0.3)), LEARNABLE)
     x = 0.05 * build.normal(0)(3, system.n_x)
     u = 0.02 * build.normal(1)(3, system.n_u)
 
@@ -352,6 +407,8 @@ def test_what_cannot_be_learned_is_refused():
     for physics, learn, match in (
         (pushing(friction=0.0), ("friction",), "friction above 0"),
         (pushing(**DRIVES["pd"]), ("gain",), "PositionDrive"),
+        (pushing(**DRIVES["pd"]), ("drive_compliance",), "PositionDrive"),
+        (pushing(), ("drive_compliance",), "compliance above 0"),
         (pushing(), ("mass",), "learn: expected some of"),
         (pushing(), ("friction", "friction"), "each once"),
     ):

@@ -1,0 +1,14 @@
+"""Pushing the cube of trifinger-rl-datasets by sampling-based contact MPC, without data.
+
+    cd benchmarks/scoreboard && python -m trifinger_rl_datasets.evaluate_sim push trifinger_push.PushPolicy
+
+- fingers.py: geometry of a finger
+- control.py: torques that lead the tips along references
+- cube.py: where the cube is now, from a pose that is late
+- places.py: which finger could push where, and how it gets there
+- policy.py: `PushPolicy`, all of it together
+"""
+
+from trifinger_push.policy import PushPolicy
+
+__all__ = ["PushPolicy"]
