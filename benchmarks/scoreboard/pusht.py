@@ -12,7 +12,7 @@ and limit (300 steps of 0.1 s). The policy is given the state (place of the disc
 - delay: actions come one step late, and the plan begins where the system predicts that it will be.
 
 Times are CPU times of the policy, on one core. With `--out FILE`, episodes are written as they end, and those that are
-in the file already are not played again. `--variant all` plays every one.
+in the file already are not played again: after a change of the policy begin another file. `--variant all` plays all.
 """
 
 from __future__ import annotations
