@@ -19,16 +19,14 @@ import pinocchio as pin
 import robot_properties_fingers
 from numpy.typing import NDArray
 
-from trifinger_push.fingers import N_FINGERS
+from trifinger_push.fingers import N_FINGERS, STEP
 
-__all__ = ["STEP", "TipControl", "TipReference"]
+__all__ = ["TipControl", "TipReference"]
 
 Array = NDArray[np.float64]
 
 URDF = Path(robot_properties_fingers.__file__).parent / "urdf" / "pro" / "trifingerpro.urdf"
 TIPS = ("finger_tip_link_0", "finger_tip_link_120", "finger_tip_link_240")
-STEP = 0.02
-"""Of the environment [s]."""
 DELAY = 0.01
 """Of the action [s]."""
 DAMPING = np.array([0.08, 0.08, 0.04] * N_FINGERS)
