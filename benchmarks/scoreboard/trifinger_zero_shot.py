@@ -178,7 +178,7 @@ def measure(o: Options) -> dict[str, Any]:
     """All ways of observing, and the environment where the model was learned."""
     task = get_task("cube")
     policy = task.make_policy(LCSModel.from_pretrained(MODEL))
-    envs = task.make_envs(1)
+    envs: Any = task.make_envs(1)
     home = evaluate(envs, policy, o.goals, o.seed, task.episode_steps)
     results: dict[str, Any] = {
         "mujoco": {

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["PushPolicy"]
-
 
 def __getattr__(name: str) -> Any:
     """`PushPolicy` when it is asked for: it needs the simulator's packages, the geometry does not."""

@@ -25,7 +25,7 @@ __all__ = ["TipControl", "TipReference"]
 
 Array = NDArray[np.float64]
 
-URDF = Path(robot_properties_fingers.__file__).parent / "urdf" / "pro" / "trifingerpro.urdf"
+URDF = Path(str(robot_properties_fingers.__file__)).parent / "urdf" / "pro" / "trifingerpro.urdf"
 TIPS = ("finger_tip_link_0", "finger_tip_link_120", "finger_tip_link_240")
 DELAY = 0.01
 """Of the action [s]."""
@@ -74,8 +74,9 @@ class TipControl:
         h = DELAY / steps
         for _ in range(steps):
             mass, bias = self._dynamics(q, v)
-            after = np.linalg.solve(mass + h * np.diag(DAMPING), mass @ v + h * (self.sent - bias))
-            q, v = q + h * (v + after) / 2, after
+            after: Array = np.linalg.solve(mass + h * np.diag(DAMPING), mass @ v + h * (self.sent - bias))
+            q = q + h * (v + after) / 2
+            v = after
         return q, v
 
     def torque(self, q: Array, v: Array, reference: tuple[Array, Array, Array], force: Array) -> NDArray[np.float32]:
