@@ -13,6 +13,7 @@ it, τ = M J⁻¹ a + bias + what the damping of the robot's safety layer takes 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -74,7 +75,7 @@ class TipControl:
         h = DELAY / steps
         for _ in range(steps):
             mass, bias = self._dynamics(q, v)
-            after: Array = np.linalg.solve(mass + h * np.diag(DAMPING), mass @ v + h * (self.sent - bias))
+            after: Any = np.linalg.solve(mass + h * np.diag(DAMPING), mass @ v + h * (self.sent - bias))
             q = q + h * (v + after) / 2
             v = after
         return q, v
