@@ -58,17 +58,16 @@ class PhysicsFitSettings(Settings):
     """Episodes per iteration."""
     noise: float = bounded(0.003, minimum=0)
     """Standard deviation [units of the action] of the Gaussian noise on executed actions."""
-    steps: int = bounded(100, minimum=1)
+    steps: int = bounded(60, minimum=1)
     """Steps of Adam per iteration, each on all data of the training."""
     learning_rate: float = bounded(0.02, above=0)
     """Step size of Adam, which begins anew in each iteration."""
-    loss: Literal["prediction", "violation"] = "prediction"
-    """Error of the next state through the relaxed contacts, or the violation loss (Eq. vio_loss)."""
+    loss: Literal["violation", "prediction"] = "violation"
+    """The violation loss (Eq. vio_loss), or the squared error of the next state through the relaxed contacts. With the
+    same data the MPC of the first did better on the sugar box (0.985 against 0.970 of 400 goals) although it explains
+    less of its turning."""
     xi: float = bounded(0.02, above=0)
     """Xi of the violation loss, with states in units of the task's scale."""
-    error_limit: float = bounded(0.2, above=0)
-    """Errors of one transition count at most so much [units of the task's scale]: what no planar contact explains, such
-    as an object that tips, is not to be explained by wrong numbers."""
 
 
 def physics_loss(
@@ -94,17 +93,13 @@ def physics_loss(
         context: (N, n_context) or none.
 
     Returns:
-        Scalar: half of the mean squared error in units of `scale`, or the mean violation loss times 2ξ.
+        Scalar: half of the mean squared error in units of `scale`, or the mean violation loss in these units.
     """
     system: Any = lcs.params(x, context)
-    if settings.loss == "prediction":
-        lam = solve_lcp(system.F, system.gap(x, u), relaxation=relaxation).lam
-        each = 0.5 * ((system.next_state(x, u, lam) - x_next) / scale).square().sum(-1)
-    else:
-        scaled = _in_units(system, scale)
-        found = violation_loss(scaled, x / scale, u, x_next / scale, "auto", settings.xi, reduction="none")
-        each = found
-    return each.clamp_max(0.5 * settings.error_limit**2).mean()
+    if settings.loss == "violation":
+        return violation_loss(_in_units(system, scale), x / scale, u, x_next / scale, "auto", settings.xi)
+    lam = solve_lcp(system.F, system.gap(x, u), relaxation=relaxation).lam
+    return 0.5 * ((system.next_state(x, u, lam) - x_next) / scale).square().sum(-1).mean()
 
 
 def _in_units(system: LCSParams, scale: Tensor) -> LCSParams:

@@ -200,6 +200,11 @@ class TaskSpec:
             value = getattr(self, name)
             if not callable(value) and not (name == "env" and isinstance(value, str)):
                 raise DTypeError(f"{name}: expected a function, got {type(value).__name__}; see difflcs.rl.TaskSpec")
+        if self.physics is not None and not isinstance(self.physics, PhysicsSpec):
+            raise DTypeError(
+                f"physics: expected a PhysicsSpec or None, got {type(self.physics).__name__}; wrap what makes the "
+                f"system in one"
+            )
         low, high = self.bounds
         if not bool((low < high).all()):
             raise InvalidInputError(f"u_min: expected u_min < u_max, got {self.u_min} and {self.u_max}; swap them")

@@ -59,7 +59,7 @@ def pushing_cost() -> GoalCost:
 def contact_cost() -> GoalCost:
     """Cost of an MPC that knows where the object is touched.
 
-    Stage: 35 Σ‖tip − object − 0.8 (object − goal)‖² + 200 ‖object − goal‖² + 2 (yaw − goal yaw)² + 100 ‖u‖²; final: 40,
+    Stage: 35 Σ‖tip − object − 0.8 (object − goal)‖² + 200 ‖object − goal‖² + 2 (yaw − goal yaw)² + 60 ‖u‖²; final: 40,
     200 and 10. Against the cost of the task (`pushing_cost`): tips are drawn behind the object, as seen from the goal;
     they are drawn with more than three times the weight, or they wander past it; and the yaw counts seven times as
     much, or plans of a few steps leave it for later, when there is no time left.
@@ -73,7 +73,7 @@ def contact_cost() -> GoalCost:
         ACTION_SIZE,
         goal_weight=(200.0, 200.0, 2.0),
         goal_weight_final=(200.0, 200.0, 10.0),
-        input_weight=100.0,
+        input_weight=60.0,
     )
     places, goals = torch.zeros(6, STATE_SIZE, dtype=torch.float64), torch.zeros(6, 3, dtype=torch.float64)
     for row in range(6):

@@ -359,6 +359,23 @@ def test_gradients_by_the_physics(build):
     assert torch.autograd.gradcheck(step, [v.requires_grad_() for v in values], atol=1e-5, rtol=1e-3)
 
 
+def test_gradients_by_masses_drives_and_states(build):
+    """Of the step of a body with inertia that discs with mass push, by all numbers that are there."""
+    x = 0.05 * build.normal(0)(3, 14)
+    u = 0.02 * build.normal(1)(3, 4)
+
+    def step(mass, damping, disc_mass, disc_damping, friction, vertices, x):
+        system = PlanarPushing(
+            Polygon(vertices), 0.01, 2, ForceDrive(disc_mass, 0.05, disc_damping), friction=friction, compliance=0.1,
+            inertia=Inertia(mass, 0.05, damping), length=0.03,
+        )  # fmt: skip
+        return 100 * system.params(x).step(x, u).x_next
+
+    vertices = box(-0.03, 0.03, -0.03, 0.03).vertices.clone()
+    values = [tensor(0.1), tensor(2.0), tensor(0.2), tensor(1.0), tensor(0.4), vertices, x]
+    assert torch.autograd.gradcheck(step, [v.requires_grad_() for v in values], atol=1e-4, rtol=1e-3)
+
+
 @pytest.mark.parametrize("loss", [violation_loss, prediction_loss])
 def test_physics_is_learned_from_a_few_pushes(build, loss):
     true = pushing(n_discs=2, compliance=0.05, friction=0.3, gyration=0.03, center_of_mass=(0.004, 0.0))

@@ -9,6 +9,15 @@
 - policy.py: `PushPolicy`, all of it together
 """
 
-from trifinger_push.policy import PushPolicy
+from __future__ import annotations
 
-__all__ = ["PushPolicy"]
+from typing import Any
+
+
+def __getattr__(name: str) -> Any:
+    """`PushPolicy` when it is asked for: it needs the simulator's packages, the geometry does not."""
+    if name == "PushPolicy":
+        from trifinger_push.policy import PushPolicy
+
+        return PushPolicy
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -13,22 +13,21 @@ it, τ = M J⁻¹ a + bias + what the damping of the robot's safety layer takes 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import robot_properties_fingers
 from numpy.typing import NDArray
 
-from trifinger_push.fingers import N_FINGERS
+from trifinger_push.fingers import N_FINGERS, STEP
 
-__all__ = ["STEP", "TipControl", "TipReference"]
+__all__ = ["TipControl", "TipReference"]
 
 Array = NDArray[np.float64]
 
-URDF = Path(robot_properties_fingers.__file__).parent / "urdf" / "pro" / "trifingerpro.urdf"
+URDF = Path(str(robot_properties_fingers.__file__)).parent / "urdf" / "pro" / "trifingerpro.urdf"
 TIPS = ("finger_tip_link_0", "finger_tip_link_120", "finger_tip_link_240")
-STEP = 0.02
-"""Of the environment [s]."""
 DELAY = 0.01
 """Of the action [s]."""
 DAMPING = np.array([0.08, 0.08, 0.04] * N_FINGERS)
@@ -76,8 +75,9 @@ class TipControl:
         h = DELAY / steps
         for _ in range(steps):
             mass, bias = self._dynamics(q, v)
-            after = np.linalg.solve(mass + h * np.diag(DAMPING), mass @ v + h * (self.sent - bias))
-            q, v = q + h * (v + after) / 2, after
+            after: Any = np.linalg.solve(mass + h * np.diag(DAMPING), mass @ v + h * (self.sent - bias))
+            q = q + h * (v + after) / 2
+            v = after
         return q, v
 
     def torque(self, q: Array, v: Array, reference: tuple[Array, Array, Array], force: Array) -> NDArray[np.float32]:

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from difflcs.physics import PlanarPushing, box
 from difflcs.physics.contacts import Cone
-from trifinger_push.control import STEP
-from trifinger_push.fingers import planar_turn
+from trifinger_push.fingers import STEP, planar_turn
 
 __all__ = ["HALF", "HEIGHT", "TIP_RADIUS", "UNIT", "CubeEstimator", "box_distance", "planar_pose", "pushing"]
 

@@ -10,11 +10,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LINKS", "N_FINGERS", "inverse", "planar_turn"]
+__all__ = ["LINKS", "N_FINGERS", "STEP", "inverse", "planar_turn"]
 
 Array = NDArray[np.float64]
 
 N_FINGERS = 3
+STEP = 0.02
+"""Of the environment [s]."""
 TURNS = (0.0, -2 * np.pi / 3, 2 * np.pi / 3)
 """About the vertical, of each finger [rad]."""
 HEIGHT = 0.29

@@ -74,8 +74,8 @@ def _ring() -> tuple[Array, Array]:
     return np.concatenate([face @ t.T for t in turns]), np.repeat([t[:, 0] for t in turns], PER_FACE, 0)
 
 
-def _free(finger: int, pose: Array, points: Array, normals: Array) -> Array:
-    """Which points (n, 2) [m] the finger can push from: in its reach, also some way on, and its link not in the cube."""
+def _free(finger: int, pose: Array, points: Array, normals: Array) -> NDArray[np.bool_]:
+    """Which points (n, 2) [m] a finger can push from: in its reach, also some way on, and its link not in the cube."""
     height = np.full(len(points), PUSH_HEIGHT)
     _, knee = inverse(finger, np.column_stack([points, height]))
     _, ahead = inverse(finger, np.column_stack([points - 0.02 * normals, height]))

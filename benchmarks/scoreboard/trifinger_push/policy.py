@@ -12,9 +12,9 @@ from trifinger_rl_datasets import PolicyBase, PolicyConfig
 
 from difflcs import GoalCost, LCSMPCLayer
 from difflcs.planning import Decision, Mode, SamplingPolicy, SamplingSettings
-from trifinger_push.control import STEP, TipControl, TipReference
+from trifinger_push.control import TipControl, TipReference
 from trifinger_push.cube import HEIGHT, UNIT, CubeEstimator
-from trifinger_push.fingers import N_FINGERS
+from trifinger_push.fingers import N_FINGERS, STEP
 from trifinger_push.places import FINGER, PUSH_HEIGHT, FingerPlaces, FingerTravel, OneFinger, lift
 
 __all__ = ["PushPolicy"]
