@@ -121,3 +121,7 @@ class SolveWarning(DiffLCSWarning):
 
 class DegenerateWarning(DiffLCSWarning):
     """Some solutions are not classically differentiable; a regularised gradient is used."""
+
+
+class FrictionWarning(DiffLCSWarning):
+    """The friction of a system is far from Coulomb's law."""

@@ -17,19 +17,21 @@ unique. Two models of dry friction are offered:
   By itself its F + Fᵀ is indefinite. What makes it definite is a drag: friction is at most μ λ_n + ε σ for a sliding
   distance σ, in an open contact too, with the smallest ε that suffices. For one contact ε is about μ²/4 over the
   mobility. Where several contacts share a load it grows as one over their compliance, and little is left of the law:
-  use Anitescu's there.
+  a `FrictionWarning` says so, and Anitescu's is the one to use there.
 """
 
 from __future__ import annotations
 
+import warnings
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from difflcs._checks import check_choice, check_number, check_tensor
+from difflcs._functorch import is_wrapped
 from difflcs._linalg import matvec
-from difflcs.errors import InvalidInputError, ShapeError
+from difflcs.errors import FrictionWarning, InvalidInputError, ShapeError
 from difflcs.records import LCSParams
 
 __all__ = ["Cone", "Contacts", "FreeMotion", "contact_lcs", "count_forces"]
@@ -109,6 +111,9 @@ def contact_lcs(
         Anitescu, 2 n_tangents + 2 with that of Stewart and Trinkle. In this order, contact by contact: the rays
         n + μ t, n − μ t of each tangent; or the normal force, friction along t and −t of each, the sliding distance.
 
+    Warns:
+        FrictionWarning: the drag of the second of these is much of a slide, see above.
+
     Raises:
         InvalidInputError and its kinds: an argument does not fit.
     """
@@ -172,6 +177,24 @@ def _rays(contacts: Contacts, mu: Tensor, soft: Tensor) -> tuple[Tensor, Tensor,
     return rays.flatten(-4, -2), contacts.gap.repeat_interleave(per, -1), soft.repeat_interleave(per, -1)
 
 
+_MUCH = 0.25
+
+
+def _check_drag(drag: Tensor, W: Tensor, normals: Tensor, mu: Tensor) -> None:
+    """Warn of a drag that by itself holds back more than a quarter of a slide, in the median state."""
+    if is_wrapped(drag) or not W.numel() or not bool((mu > 0).any()):
+        return
+    mobility = W.detach()[..., normals + 1, normals + 1].amax(-1)
+    part = float((drag.detach() * mobility).median())
+    if part > _MUCH:
+        warnings.warn(
+            f"friction by Stewart and Trinkle needs a drag here that gives {part:.2g} times the distance of a slide "
+            f'back, as several contacts share a load: use cone="anitescu", or a larger compliance',
+            FrictionWarning,
+            stacklevel=4,
+        )
+
+
 def _stewart_trinkle(
     contacts: Contacts, free: FreeMotion, x: Tensor, mu: Tensor, soft: Tensor, length: float, force: float
 ) -> LCSParams:
@@ -189,6 +212,7 @@ def _stewart_trinkle(
     normals = torch.arange(n_contacts) * per
     inverse = torch.linalg.inv(W)[..., normals[:, None], normals]
     bound = 0.25 * torch.linalg.matrix_norm(mu.unsqueeze(-1) * inverse * mu.unsqueeze(-2))
+    _check_drag(bound, W, normals, mu)
     batch, like = W.shape[:-2], {"dtype": W.dtype, "device": W.device}
 
     size, sigma = per + 1, torch.arange(n_contacts) * (per + 1) + per

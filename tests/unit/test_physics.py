@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch.autograd.functional import jacobian
 
 from difflcs import LCSModule, LCSMPCLayer, QuadraticCost, prediction_loss, violation_loss
-from difflcs.errors import DTypeError, InvalidInputError, ShapeError
+from difflcs.errors import DTypeError, FrictionWarning, InvalidInputError, ShapeError
 from difflcs.physics import (
     Circle,
     ContactLCS,
@@ -152,6 +152,19 @@ def test_units_change_nothing_but_the_forces(cone):
     torch.testing.assert_close(other.step(x, u).x_next, lcs.step(x, u).x_next, rtol=1e-6, atol=1e-9)
 
 
+def test_a_drag_that_spoils_the_friction_is_told():
+    """A block on two feet that share its weight."""
+    lcs, x = sliding_block("anitescu")
+    h, eye, zero = 0.1, torch.eye(2, dtype=F64), torch.zeros(2, 2, dtype=F64)
+    response = torch.cat([torch.cat([h * eye, zero], 1), torch.cat([eye, zero], 1)])
+    free = FreeMotion(lcs.A, lcs.B, lcs.d, response)
+    feet = Contacts(torch.zeros(2, dtype=F64), tensor([[0.0, 1.0, 0.0, 0.0]] * 2), tensor([[[1.0, 0.0, 0.0, 0.0]]] * 2))
+    contact_lcs(feet, free, x, friction=0.5, compliance=1e-3)
+    contact_lcs(feet, free, x, friction=0.5, compliance=0.1, cone="stewart-trinkle")
+    with pytest.warns(FrictionWarning, match="times the distance of a slide"):
+        contact_lcs(feet, free, x, friction=0.5, compliance=1e-3, cone="stewart-trinkle")
+
+
 def test_bad_contacts_are_refused():
     free = FreeMotion(*(torch.eye(2, dtype=F64) for _ in range(2)), torch.zeros(2, dtype=F64), torch.eye(2, dtype=F64))
     contacts = Contacts(tensor([0.0]), tensor([[1.0, 0.0]]), torch.zeros(1, 0, 2, dtype=F64))
@@ -185,6 +198,7 @@ DRIVES = {
 }
 
 
+@pytest.mark.filterwarnings("ignore::difflcs.errors.FrictionWarning")
 @pytest.mark.parametrize("name", DRIVES)
 @pytest.mark.parametrize("cone", ["anitescu", "stewart-trinkle"])
 def test_derivatives_of_gaps_are_those_of_autograd(build, name, cone):
@@ -343,6 +357,23 @@ def test_gradients_by_the_physics(build):
     system.forward = lambda x, u: system.params(x).step(x, u).x_next
     values = [0.1 * build.normal(2)(max(v.numel(), 1)).reshape(v.shape) for v in system.change.values()]
     assert torch.autograd.gradcheck(step, [v.requires_grad_() for v in values], atol=1e-5, rtol=1e-3)
+
+
+def test_gradients_by_masses_drives_and_states(build):
+    """Of the step of a body with inertia that discs with mass push, by all numbers that are there."""
+    x = 0.05 * build.normal(0)(3, 14)
+    u = 0.02 * build.normal(1)(3, 4)
+
+    def step(mass, damping, disc_mass, disc_damping, friction, vertices, x):
+        system = PlanarPushing(
+            Polygon(vertices), 0.01, 2, ForceDrive(disc_mass, 0.05, disc_damping), friction=friction, compliance=0.1,
+            inertia=Inertia(mass, 0.05, damping), length=0.03,
+        )  # fmt: skip
+        return 100 * system.params(x).step(x, u).x_next
+
+    vertices = box(-0.03, 0.03, -0.03, 0.03).vertices.clone()
+    values = [tensor(0.1), tensor(2.0), tensor(0.2), tensor(1.0), tensor(0.4), vertices, x]
+    assert torch.autograd.gradcheck(step, [v.requires_grad_() for v in values], atol=1e-4, rtol=1e-3)
 
 
 @pytest.mark.parametrize("loss", [violation_loss, prediction_loss])

@@ -127,7 +127,7 @@ def error(x, goal):
     return math.hypot(float(x[0]) - goal[0], float(x[1]) - goal[1], 0.5 * turn)
 
 
-# --- one step, on a line ------------------------------------------------------------------------------------------------
+# --- one step, on a line ----------------------------------------------------------------------------------------------
 
 
 def test_it_pushes_where_the_pusher_is_on_the_right_side():
@@ -190,10 +190,26 @@ def test_a_journey_ends_after_its_patience():
     policy = on_a_line(patience=3)
     policy.travel = Never()
     modes = []
-    for _ in range(6):
+    for _ in range(9):
         policy.act([0.0, 0.51], [1.0])
         modes.append(policy.decision.mode)
-    assert modes == [Mode.TRAVEL] * 4 + [Mode.PUSH, Mode.TRAVEL]
+    # The one place that promises anything is then barred for a step, as nothing has come of it.
+    assert modes == [Mode.TRAVEL] * 4 + [Mode.PUSH] * 2 + [Mode.TRAVEL] * 3
+
+
+def test_a_place_from_which_nothing_moved_is_left_for_the_next_best():
+    class Two(Sides):
+        def sample(self, x):
+            return tensor([[-0.51], [-0.53]])
+
+    policy = on_a_line(Two())
+    targets = []
+    for _ in range(2):  # the block is stuck, whatever is planned
+        policy.act([0.0, 0.51], [1.0])
+        targets.append(round(float(policy.decision.target[1]), 2))
+        policy.act([0.0, targets[-1]], [1.0])
+        assert policy.decision.mode is Mode.PUSH
+    assert targets == [-0.51, -0.53]
 
 
 @pytest.mark.parametrize(("keep", "mode"), [(0.0, Mode.PUSH), (1.0, Mode.TRAVEL)])
@@ -237,7 +253,7 @@ def test_reset_forgets_the_journey():
     assert policy.decision.mode is Mode.PUSH
 
 
-# --- the loop, in the plane ---------------------------------------------------------------------------------------------
+# --- the loop, in the plane -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("start", [(0.9, 0.0), (0.0, 0.9)])
@@ -292,7 +308,7 @@ def test_bounds_that_depend_on_the_state_hold_the_disc_in_the_workspace():
     assert float(x[3]) > 0.25
 
 
-# --- what is refused ----------------------------------------------------------------------------------------------------
+# --- what is refused --------------------------------------------------------------------------------------------------
 
 
 def test_bad_input_is_refused():

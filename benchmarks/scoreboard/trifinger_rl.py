@@ -1,0 +1,184 @@
+"""The cube of trifinger-rl-datasets pushed to a place: `python benchmarks/scoreboard/trifinger_rl.py --episodes 64`.
+
+Simulator, task, reward and evaluation are those of the authors (`trifinger_rl_datasets.Evaluation`, PyBullet, torques
+at 50 Hz that act 10 ms late, a pose of the cube that is 90 to 190 ms old, 750 steps). Only the random numbers are
+seeded, for which the authors' `python -m trifinger_rl_datasets.evaluate_sim push trifinger_push.PushPolicy` has no
+option; and the environment is taken out of Gymnasium's wrappers, which since 1.0 hide what the evaluation asks for.
+
+The reward of a step is sech²(15 d), with d [m] the distance of the cube's centre from the goal: at most 750 an episode.
+
+- contact-mpc: `trifinger_push.PushPolicy`, from geometry and friction, no data;
+- any other name is that of a policy class, as the evaluator takes it. The authors' expert is
+  `trifinger_rl_example.example.TorchPushPolicy` of github.com/rr-learning/trifinger-rl-example, to be installed from
+  there: it was trained by reinforcement learning in simulation.
+
+Times are CPU times of the policy. With `--out FILE` the record of a policy is written after each episode.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+
+from difflcs import _files
+from difflcs.bench import machine
+from difflcs.errors import MissingDependencyError
+from difflcs.rl import wilson_interval
+
+OWN = "contact-mpc"
+KEYS = ("success_rate", "return", "mean_momentary_success", "transient_success_rate")
+"""Of the statistics of an episode, as the evaluation calls them."""
+
+
+@dataclass
+class Options:
+    """Pushing of trifinger-rl-datasets."""
+
+    episodes: int = 64
+    """Episodes; the authors' evaluator has 64."""
+    seed: int = 0
+    """Seed of goals and of the cube's places."""
+    policy: str = OWN
+    """"contact-mpc", or a policy class as the evaluator takes it: package.module.Class."""
+    json: bool = False
+    """Print one line of JSON and nothing else."""
+    out: Path | None = None
+    """Record in which to write this policy's episodes; nowhere if not given."""
+    steps: int | None = None
+    """Steps of an episode, other than the task's, to try things."""
+
+
+class Timed:
+    """A policy, and how long it takes."""
+
+    def __init__(self, policy: Any) -> None:
+        self.policy = policy
+        self.seconds: list[float] = []
+
+    def reset(self) -> None:
+        """See `PolicyBase`."""
+        self.policy.reset()
+
+    def get_action(self, observation: Any) -> Any:
+        """See `PolicyBase`."""
+        start = time.process_time()
+        action = self.policy.get_action(observation)
+        self.seconds.append(time.process_time() - start)
+        return action
+
+
+def policy_class(name: str) -> Any:
+    """A policy class by name.
+
+    Raises:
+        MissingDependencyError: trifinger-rl-datasets is not installed.
+    """
+    try:
+        import trifinger_rl_datasets.evaluate_sim as evaluate
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"expected trifinger-rl-datasets, not installed ({error}); run: pip install trifinger-rl-datasets==1.0.3"
+        ) from error
+    if name == OWN:
+        from trifinger_push import PushPolicy
+
+        return PushPolicy
+    return evaluate.load_policy_class(name)
+
+
+def measure(o: Options) -> dict[str, Any]:
+    """Play the episodes of one policy."""
+    kind = policy_class(o.policy)
+    import gymnasium
+    from trifinger_rl_datasets import Evaluation
+    from trifinger_simulation.tasks import move_cube
+
+    wants = kind.get_policy_config()
+    env: Any = gymnasium.make(
+        "trifinger-cube-push-sim-expert-v0",
+        disable_env_checker=True,
+        visualization=False,
+        flatten_obs=wants.flatten_obs,
+        image_obs=wants.image_obs,
+    ).unwrapped
+    if o.steps is not None:
+        env.sim_env.episode_length = o.steps
+    policy = Timed(kind(env.action_space, env.observation_space, env.sim_env.episode_length))
+    rows: list[list[float]] = []
+
+    class Recorded(Evaluation):
+        """The authors' evaluation, with every episode kept."""
+
+        def run_episode(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+            before = len(policy.seconds)
+            with contextlib.redirect_stdout(io.StringIO()):
+                found = super().run_episode(*args, **kwargs)
+            milliseconds = 1e3 * float(np.mean(policy.seconds[before:]))
+            rows.append([round(float(v), 4) for v in (*(found[key] for key in KEYS), milliseconds)])
+            if not o.json:
+                print(f"episode {len(rows) - 1}: return {rows[-1][1]:.0f}, success {rows[-1][0]:.0f}", flush=True)
+            if o.out is not None:
+                keep(o, rows)
+            return found
+
+    np.random.seed(o.seed)  # noqa: NPY002 (from there the package draws the cube's places)
+    move_cube.seed(o.seed)  # the goals
+    with contextlib.redirect_stdout(io.StringIO()) if o.json else contextlib.nullcontext():
+        Recorded(env).evaluate(policy, o.episodes)
+    return summary(rows)
+
+
+def summary(rows: list[list[float]]) -> dict[str, Any]:
+    """The figures of a policy."""
+    success, returns, momentary, transient, milliseconds = np.array(rows).T
+    low, high = wilson_interval(int(success.sum()), len(rows))
+    return {
+        "success_rate": float(success.mean()),
+        "ci_low": low,
+        "ci_high": high,
+        "episodes": len(rows),
+        "mean_return": float(returns.mean()),
+        "return_error": float(returns.std(ddof=min(1, len(rows) - 1)) / len(rows) ** 0.5),
+        "median_return": float(np.median(returns)),
+        "momentary_success": float(momentary.mean()),
+        "transient_success": float(transient.mean()),
+        "milliseconds_per_step": float(milliseconds.mean()),
+    }
+
+
+def keep(o: Options, rows: list[list[float]]) -> None:
+    """Write what there is of this policy beside the others of the record."""
+    assert o.out is not None
+    record = json.loads(o.out.read_text()) if o.out.exists() else {"machine": machine(), "results": {}}
+    row = {"seed": o.seed, **summary(rows), "rows": rows}
+    if o.steps is not None:
+        row["steps"] = o.steps
+    record["results"][o.policy] = row
+    _files.write_atomically(o.out, (json.dumps(record) + "\n").encode())
+
+
+def main(o: Options) -> None:
+    """Play, print, write."""
+    torch.set_num_threads(1)
+    found = measure(o)
+    if o.json:
+        print(json.dumps({"policy": o.policy, "seed": o.seed, **found}))
+        return
+    print(
+        f"{o.policy}: success {found['success_rate']:.3f} [{found['ci_low']:.3f}, {found['ci_high']:.3f}], "
+        f"mean return {found['mean_return']:.1f} ± {found['return_error']:.1f} (median {found['median_return']:.1f}), "
+        f"{found['milliseconds_per_step']:.1f} ms a step"
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

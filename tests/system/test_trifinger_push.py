@@ -1,0 +1,238 @@
+"""The policy of `benchmarks/scoreboard/trifinger_push`: its geometry here, and the simulator where it is installed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+SCOREBOARD = Path(__file__).resolve().parents[2] / "benchmarks" / "scoreboard"
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(autouse=True)
+def scoreboard(monkeypatch):
+    monkeypatch.syspath_prepend(str(SCOREBOARD))
+
+
+# Places of the tips at joint angles (0, 0.9, -1.7) of every finger, by Pinocchio from trifingerpro.urdf.
+START = np.array([[0.086, 0.06106], [0.00988, -0.10501], [-0.09588, 0.04395]])
+START_HEIGHT = 0.07907
+
+
+def quaternion(axis, angle):
+    axis = np.asarray(axis, float) / np.linalg.norm(axis)
+    return np.array([*(np.sin(angle / 2) * axis), np.cos(angle / 2)])
+
+
+def product(p, q):
+    """Of quaternions x, y, z, w."""
+    return np.array([*(p[3] * q[:3] + q[3] * p[:3] + np.cross(p[:3], q[:3])), p[3] * q[3] - p[:3] @ q[:3]])
+
+
+def camera(pose, age):
+    return {
+        "object_position": np.array([*pose[:2], 0.0325], np.float32),
+        "object_orientation": quaternion([0, 0, 1], pose[2]).astype(np.float32),
+        "delay": np.array([age], np.float32),
+    }
+
+
+def state(pose, tip, finger):
+    from trifinger_push.cube import UNIT
+
+    return torch.tensor([pose[0] / UNIT, pose[1] / UNIT, pose[2], *(np.asarray(tip) / UNIT), finger])
+
+
+@pytest.mark.parametrize("finger", [0, 1, 2])
+def test_inverse_kinematics_knows_the_start_posture(finger):
+    from trifinger_push.fingers import inverse
+
+    angles, knee = inverse(finger, np.array([[*START[finger], START_HEIGHT]]))
+    np.testing.assert_allclose(angles, [[0.0, 0.9, -1.7]], atol=2e-4)
+    # The first link hangs 0.9 rad out of the vertical.
+    np.testing.assert_allclose(knee[0, 2], 0.29 - 0.16 * np.cos(0.9), atol=1e-4)
+
+
+def test_fingers_are_turned_copies_of_each_other():
+    from trifinger_push.fingers import inverse, planar_turn
+
+    tips = np.array([[0.02, 0.08, 0.03], [-0.05, 0.1, 0.05], [0.0, 0.0, 0.1]])
+    first, knee = inverse(0, tips)
+    turned = tips.copy()
+    turned[:, :2] = tips[:, :2] @ planar_turn(2 * np.pi / 3).T
+    second, other = inverse(2, turned)
+    np.testing.assert_allclose(second, first, atol=1e-12)
+    np.testing.assert_allclose(other[:, :2], knee[:, :2] @ planar_turn(2 * np.pi / 3).T, atol=1e-12)
+
+
+def test_out_of_reach_is_not_a_number():
+    from trifinger_push.fingers import inverse
+
+    angles, knee = inverse(0, np.array([[0.0, 0.5, 0.02], [0.0, -0.15, 0.022]]))  # too far; second joint below 0
+    assert np.isnan(angles).any(1).all()
+    assert np.isnan(knee).any(1).all()
+
+
+@pytest.mark.parametrize("face", [([1, 0, 0], 0), ([1, 0, 0], 1), ([1, 0, 0], 2), ([1, 0, 0], 3), ([0, 1, 0], 1)])
+def test_yaw_of_a_cube_on_any_face(face):
+    from trifinger_push.cube import planar_pose
+
+    axis, quarters = face
+    lying = product(quaternion([0, 0, 1], 0.3), quaternion(axis, quarters * np.pi / 2))
+    pose = planar_pose(np.array([0.1, -0.05, 0.0325]), lying)
+    np.testing.assert_allclose(pose[:2], [0.1, -0.05])
+    assert (pose[2] - 0.3 + np.pi / 4) % (np.pi / 2) - np.pi / 4 == pytest.approx(0, abs=1e-9)
+
+
+def test_the_cube_has_moved_since_its_picture():
+    from trifinger_push.cube import HALF, TIP_RADIUS, CubeEstimator
+
+    estimator = CubeEstimator(friction=0.5)
+    tips = np.array([[-HALF - TIP_RADIUS, 0.0, 0.02], [0.1, 0.1, 0.1], [0.1, -0.1, 0.1]])
+    ages = [0.09, 0.11, 0.13, 0.15, 0.17]
+    for age in ages:
+        pose = estimator.update(camera([0.0, 0.0, 0.0], age), tips)
+        tips[0, 0] += 0.004
+    # The tip pushes the middle of a face: since the first picture by four steps, which the cube has made with it.
+    np.testing.assert_allclose(pose, [0.016, 0.0, 0.0], atol=5e-4)
+    # A new picture replaces what was predicted; here the cube is farther off than the tip has come since.
+    pose = estimator.update(camera([0.03, 0.001, 0.0], 0.04), tips)
+    np.testing.assert_allclose(pose, [0.03, 0.001, 0.0], atol=1e-6)
+    # In this one it is where the tip has just come to.
+    estimator.update(camera([0.03, 0.001, 0.0], 0.06), tips)
+    pose = estimator.update(camera([0.02, 0.0, 0.0], 0.02), tips)
+    np.testing.assert_allclose(pose, [0.02, 0.0, 0.0], atol=5e-4)
+
+
+def test_lifted_tips_move_nothing():
+    from trifinger_push.cube import CubeEstimator
+
+    estimator = CubeEstimator(friction=0.5)
+    tips = np.array([[-0.06, 0.0, 0.1], [0.1, 0.1, 0.1], [0.1, -0.1, 0.1]])
+    for age in (0.09, 0.11, 0.13):
+        pose = estimator.update(camera([0.0, 0.0, 0.4], age), tips)
+        tips[0, 0] += 0.02
+    np.testing.assert_allclose(pose, [0.0, 0.0, 0.4], atol=1e-6)
+
+
+def test_the_system_of_a_finger_is_that_of_the_plane_and_stays_what_it_is():
+    from trifinger_push.places import OneFinger
+
+    model = OneFinger(friction=0.3, compliance=0.05)
+    x = state([0.01, 0.02, 0.3], [-0.04, 0.02, 0.022], 2.0)
+    u = torch.tensor([0.2, 0.05, -0.1])
+    after = model.params(x).step(x, u.double()).x_next
+    flat = model.plane.params(x[:5]).step(x[:5], u[:2].double()).x_next
+    torch.testing.assert_close(after[:5], flat)
+    assert float(flat[0]) > float(x[0])
+    torch.testing.assert_close(after[5:], torch.stack([x[5] - 0.1, x[6]]))
+
+
+def test_each_finger_has_places_on_its_own_side_only():
+    from trifinger_push.cube import HALF, TIP_RADIUS, UNIT, box_distance
+    from trifinger_push.fingers import TURNS, planar_turn
+    from trifinger_push.places import FingerPlaces
+
+    places, x = FingerPlaces(), state([0.0, 0.0, 0.0], [0.1, 0.0, 0.1], 0.0)
+    rows = places.sample(x).numpy()
+    assert set(rows[:, 0]) == {0.0, 1.0, 2.0}
+    for finger in range(3):
+        own = rows[rows[:, 0] == finger, 1:] * UNIT
+        assert (box_distance(own) > TIP_RADIUS).all()
+        inward = planar_turn(TURNS[finger]) @ [0.0, -1.0]
+        # Its link leans outward: it cannot stand on the far side of the cube, seen from its mount.
+        assert not (own @ inward > HALF + TIP_RADIUS).any()
+    beside_wall = state([0.14, 0.0, 0.0], [0.1, 0.0, 0.1], 0.0)
+    at = places.states(beside_wall, places.sample(beside_wall)).numpy()[:, 3:5] * UNIT
+    assert (np.linalg.norm(at, axis=1) < 0.183 + 1e-9).all()
+
+
+def test_a_face_that_was_refused_is_not_offered_until_later():
+    from trifinger_push.cube import UNIT
+    from trifinger_push.places import FingerPlaces
+
+    places, x = FingerPlaces(), state([0.0, 0.0, 0.0], [0.1, 0.0, 0.1], 0.0)
+    before = places.sample(x)
+    face = before[before[:, 0] == 0][0]
+    tip = np.array([*(face[1:].numpy() * UNIT), 0.022])
+    places.refuse(np.array([0.0, 0.0, 0.0, *tip, 0.0]), steps=10)
+    assert not places.near(state([0.0, 0.0, 0.0], tip, 0.0))
+    after = places.sample(x)
+    assert len(after) < len(before)
+    assert not (after == face).all(1).any()
+    places.now = 10
+    assert len(places.sample(x)) == len(before)
+
+
+def test_a_tip_goes_straight_where_it_can_and_over_the_cube_where_it_must():
+    from trifinger_push.cube import UNIT
+    from trifinger_push.places import OVER, FingerTravel
+
+    travel, pose = FingerTravel(), [0.0, 0.0, 0.0]
+    target = state(pose, [-0.055, 0.0, 0.022], 0.0)
+    travel.tips = np.array([[-0.09, 0.02, 0.1]] * 3)
+    straight = travel.action(target, target).numpy() * UNIT
+    np.testing.assert_allclose(travel.tips[0] + straight, [-0.055, 0.0, 0.022], atol=1e-9)
+    travel.tips = np.array([[0.09, 0.0, 0.1]] * 3)
+    over = travel.tips[0] + travel.action(target, target).numpy() * UNIT
+    np.testing.assert_allclose(over, [-0.055, 0.0, OVER], atol=1e-9)
+    travel.tips = np.array([[0.05, 0.0, 0.02]] * 3)  # beside the far face: up, and away from it
+    lifted = travel.tips[0] + travel.action(target, target).numpy() * UNIT
+    assert lifted[0] > 0.05
+    assert lifted[2] == pytest.approx(OVER)
+    states = torch.stack([target, target])
+    states[:, 6] = torch.tensor([0.0, 1.0])
+    travel.tips = np.array([[0.09, 0.0, 0.1], [-0.09, 0.02, 0.1], [0.0, 0.1, 0.1]])
+    far, near = travel.distance(target, states).tolist()
+    assert far > near
+    assert not travel.arrived(target, target)
+
+
+def test_a_policy_without_its_packages_says_what_to_install(monkeypatch):
+    pytest.importorskip("tyro")
+    import sys
+
+    import trifinger_rl
+
+    from difflcs.errors import MissingDependencyError
+
+    monkeypatch.setitem(sys.modules, "trifinger_rl_datasets", None)
+    with pytest.raises(MissingDependencyError, match="pip install trifinger-rl-datasets"):
+        trifinger_rl.policy_class("contact-mpc")
+
+
+def test_figures_of_some_episodes():
+    pytest.importorskip("tyro")
+    import trifinger_rl
+
+    found = trifinger_rl.summary([[1.0, 700.0, 0.9, 1.0, 5.0], [0.0, 100.0, 0.1, 1.0, 7.0]])
+    assert found["success_rate"] == 0.5
+    assert found["mean_return"] == 400.0
+    assert found["return_error"] == pytest.approx(300.0)
+    assert found["milliseconds_per_step"] == 6.0
+    assert 0 < found["ci_low"] < 0.5 < found["ci_high"] < 1
+
+
+@pytest.mark.slow  # the simulator steps in real time on one core; nothing quicker shows that a torque moves the cube
+@pytest.mark.filterwarnings("ignore")
+def test_in_the_simulator_the_cube_goes_to_the_goal():
+    pytest.importorskip("trifinger_rl_datasets", reason="the simulator is not among the packages of this repository")
+    import gymnasium
+    from trifinger_push import PushPolicy
+
+    env = gymnasium.make(
+        "trifinger-cube-push-sim-expert-v0", disable_env_checker=True, visualization=False, flatten_obs=False
+    ).unwrapped
+    env.reset()
+    env.sim_env.platform.cube.set_state([0.0, 0.0, 0.0325], [0.0, 0.0, 0.0, 1.0])
+    env.sim_env.active_goal.position = np.array([-0.06, 0.05, 0.0325])
+    observation, _ = env.reset_fingers(500)
+    policy = PushPolicy(env.action_space, env.observation_space, 750)
+    policy.reset()
+    for _ in range(120):
+        observation, _, _, _, info = env.step(policy.get_action(observation))
+    assert info["has_achieved"]
