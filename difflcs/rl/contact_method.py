@@ -7,6 +7,7 @@ episodes are better. A main phase may follow: PPO through the MPC (Algorithm 2),
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -296,7 +297,7 @@ class ContactMethod(Method):
     ) -> LCSModule:
         """See `Method`."""
         lcs = known_physics(task).make_system()
-        if dict(config) != configuration(lcs):
+        if not _alike(dict(config), configuration(lcs)):
             raise CheckpointError(
                 f"{source}: expected what is known of task {task.name} to be as when it was learned, got another "
                 f"physics; is the object's mesh there in one place, and a stand-in in the other?"
@@ -337,6 +338,17 @@ class ContactMethod(Method):
             ppo=short_main(self.ppo),
             models=short_models(self.models),
         )
+
+
+def _alike(one: Any, other: Any) -> bool:
+    """Whether two configurations are equal but for rounding, which another machine may do differently."""
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return one.keys() == other.keys() and all(_alike(value, other[name]) for name, value in one.items())
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(_alike, one, other))
+    if isinstance(one, float) and isinstance(other, float):
+        return math.isclose(one, other, rel_tol=1e-6, abs_tol=1e-9)
+    return type(one) is type(other) and one == other
 
 
 def known_physics(task: TaskSpec) -> PhysicsSpec:
