@@ -18,6 +18,7 @@ from difflcs.rl import (
     Epochs,
     ModelRollouts,
     ModelRolloutSettings,
+    PhysicsSpec,
     Reporter,
     Rollouts,
     TaskSpec,
@@ -62,6 +63,7 @@ TASK = TaskSpec(
         [5 * (state[..., :1] - goal), state[..., 1:], context.log1p(), elapsed.unsqueeze(-1)], -1
     ),
     outcome=outcome,
+    physics=PhysicsSpec(make_system=lambda: Physics(**OFF), scale=(1.0, 1.0)),
 )
 
 
