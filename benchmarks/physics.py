@@ -72,7 +72,7 @@ class Case:
 
 
 PUSHER = """
-<mujoco><option timestep="0.001" integrator="implicitfast" cone="elliptic"/>
+<mujoco><option timestep="0.0005" integrator="implicitfast" cone="elliptic"/>{contact}
 <worldbody>
   <geom type="plane" size="2 2 .1" friction=".4"/>
   <body name="box" pos="0 0 .05">{joints}<geom type="box" size=".05 .05 .05" mass=".5" friction=".4"/></body>
@@ -80,11 +80,11 @@ PUSHER = """
     <joint name="px" type="slide" axis="1 0 0"/><joint name="py" type="slide" axis="0 1 0"/>
     <geom type="sphere" size=".015" mass=".2" friction=".4"/></body>
 </worldbody>
-<actuator><position joint="px" kp="1000" dampratio="1"/><position joint="py" kp="1000" dampratio="1"/></actuator>
+<actuator><position joint="px" kp="{kp}" dampratio="1"/><position joint="py" kp="{kp}" dampratio="1"/></actuator>
 </mujoco>"""
-PLANAR = """<joint name="x" type="slide" axis="1 0 0" damping="5"/>
-  <joint name="y" type="slide" axis="0 1 0" damping="5"/>
-  <joint name="yaw" type="hinge" axis="0 0 1" damping=".007"/>"""
+PLANAR = """<joint name="x" type="slide" axis="1 0 0" damping="{damping}"/>
+  <joint name="y" type="slide" axis="0 1 0" damping="{damping}"/>
+  <joint name="yaw" type="hinge" axis="0 0 1" damping="{of_yaw}"/>"""
 CART_POLE = """
 <mujoco><option timestep="0.001" integrator="RK4"/>
 <worldbody><body><joint name="cart" type="slide" axis="1 0 0" damping=".1"/>
@@ -100,25 +100,36 @@ BOX = """
 </worldbody></mujoco>"""
 
 
-def simulated(model: Any, qpos: Any, qvel: Any, ctrl: Any) -> tuple[Any, Any]:
-    """What `mj_step` does in one step from each state."""
+def simulated(model: Any, qpos: Any, qvel: Any, ctrl: Any, start: Any = None) -> tuple[Any, Any]:
+    """What `mj_step` does in one step from each state; with `start`, controls go from there to `ctrl` in 80 % of it."""
     data, steps = mujoco.MjData(model), round(SECONDS / model.opt.timestep)
     places, speeds = np.empty_like(qpos), np.empty_like(qvel)
     for i in range(len(qpos)):
         mujoco.mj_resetData(model, data)
         data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[i], qvel[i], ctrl[i]
-        for _ in range(steps):
+        for k in range(steps):
+            if start is not None:
+                data.ctrl[:] = start[i] + min(1.0, (k + 1) / (0.8 * steps)) * (ctrl[i] - start[i])
             mujoco.mj_step(model, data)
         places[i], speeds[i] = data.qpos, data.qvel
     return places, speeds
 
 
 def of_mujoco(
-    system: str, mode: str, module: MujocoLCS, model: Any, qpos: Any, qvel: Any, u: Tensor, coordinates: dict
+    system: str,
+    mode: str,
+    module: MujocoLCS,
+    model: Any,
+    qpos: Any,
+    qvel: Any,
+    u: Tensor,
+    coordinates: dict,
+    slowly: bool = False,
 ) -> Case:
     """A case of a MuJoCo model, whose names of coordinates are those of `MujocoState`."""
     x = module.state.to_state(qpos, qvel)
-    after = module.state.to_state(*simulated(model, qpos, qvel, module.control(x, u).numpy()))
+    ctrl, start = (module.control(x, v).numpy() for v in (u, 0 * u))
+    after = module.state.to_state(*simulated(model, qpos, qvel, ctrl, start if slowly else None))
     found = {
         label: ([module.state.index(name) for name in names], unit, size)
         for label, (names, unit, size) in coordinates.items()
@@ -131,45 +142,55 @@ PLACE = {"position": (["x", "y"], "mm", 1e-3), "yaw": (["yaw"], "rad", 1.0)}
 PLACE_FREE = {"position": (["box_x", "box_y"], "mm", 1e-3), "yaw": (["box_rz"], "rad", 1.0)}
 SPEED = {"velocity": (["x_velocity", "y_velocity"], "mm/s", 1e-3)}
 
+HARD = """<option impratio="100"/>
+<default><geom solref=".002 1" solimp=".99 .999 .001 .5 2"/></default>"""
+# Damping [N s/m], stiffness of the servos [N/m], contacts, whether the servos' target moves to its place at constant
+# speed or jumps there, and the largest gap at the start [m].
+PLANAR_BOXES = {
+    "pusher and box, slow, in contact": (200, 100000, HARD, True, 1e-4),
+    "pusher and box, slow": (200, 100000, HARD, True, 0.02),
+    "pusher and box that coasts": (5, 1000, "", False, 0.02),
+}
 
-def around_the_box(count: int, random: np.random.Generator) -> tuple[Any, Any, Any, Tensor]:
-    """The box's pose (n, 3), the pusher's place within 2 cm of it, and pushes (n, 2) of up to 4 cm towards it."""
+
+def around_the_box(count: int, random: np.random.Generator, gap: float = 0.02) -> tuple[Any, Any, Tensor]:
+    """The box's pose (n, 3), the pusher's place beside it, and pushes (n, 2) of 1 to 4 cm towards it."""
     pose = random.uniform(-1, 1, (count, 3)) * [0.1, 0.1, 1.0]
-    side, along = random.integers(0, 4, count) * np.pi / 2, random.uniform(-0.045, 0.045, count)
-    away = 0.05 + 0.015 + random.uniform(0.0, 0.02, count)
+    side, along = random.integers(0, 4, count) * np.pi / 2, random.uniform(-0.025, 0.025, count)
+    away = 0.05 + 0.015 + random.uniform(0.0, gap, count)
     direction = pose[:, 2] + side
     normal = np.stack([np.cos(direction), np.sin(direction)], -1)
     tangent = np.stack([-np.sin(direction), np.cos(direction)], -1)
     pusher = pose[:, :2] + away[:, None] * normal + along[:, None] * tangent
     towards = direction + np.pi + random.uniform(-0.5, 0.5, count)
     u = random.uniform(0.01, 0.04, (count, 1)) * np.stack([np.cos(towards), np.sin(towards)], -1)
-    return pose, pusher, random, torch.from_numpy(u)
+    return pose, pusher, torch.from_numpy(u)
 
 
 def pushing(count: int, random: np.random.Generator) -> list[Case]:
     """A sphere pushes a box: a box on joints in the plane with damping, and a free one on a floor with friction."""
-    pose, pusher, _, u = around_the_box(count, random)
-    rest, cases = np.zeros((count, 5)), []
-    model = mujoco.MjModel.from_xml_string(PUSHER.format(joints=PLANAR))
-    qpos = np.concatenate([pose, pusher], -1)
-    for mode, options in {
-        "quasi-static": {"mobility": "damping"},
-        "velocities": {"motion": "dynamic"},
-    }.items():
-        module = MujocoLCS(model, **options)
-        cases.append(of_mujoco("pusher and box, damped joints", mode, module, model, qpos, rest, u, PLACE | SPEED))
-    model = mujoco.MjModel.from_xml_string(PUSHER.format(joints='<freejoint name="box"/>'))
+    cases = []
+    for system, (damping, stiffness, contact, slowly, gap) in PLANAR_BOXES.items():
+        pose, pusher, u = around_the_box(count, random, gap)
+        qpos, rest = np.concatenate([pose, pusher], -1), np.zeros((count, 5))
+        joints = PLANAR.format(damping=damping, of_yaw=0.0014 * damping)
+        model = mujoco.MjModel.from_xml_string(PUSHER.format(joints=joints, kp=stiffness, contact=contact))
+        modes = {"quasi-static": MujocoLCS(model, mobility="damping")}
+        if not slowly:
+            modes["velocities"] = MujocoLCS(model, motion="dynamic")
+        for mode, module in modes.items():
+            cases.append(of_mujoco(system, mode, module, model, qpos, rest, u, PLACE | SPEED, slowly))
+    pose, pusher, u = around_the_box(count, random)
+    model = mujoco.MjModel.from_xml_string(PUSHER.format(joints='<freejoint name="box"/>', kp=1000, contact=""))
     turn = np.stack([np.cos(pose[:, 2] / 2), *np.zeros((2, count)), np.sin(pose[:, 2] / 2)], -1)
     # As deep in the floor as it is at rest.
-    height = settled(model)
-    qpos = np.concatenate([pose[:, :2], np.full((count, 1), height), turn, pusher], -1)
+    qpos = np.concatenate([pose[:, :2], np.full((count, 1), settled(model)), turn, pusher], -1)
     rest = np.zeros((count, 8))
-    flat = [1.0, 1.0, 0.0, 0.0, 0.0, 1 / 0.038**2, 0.0, 0.0]
-    for mode, options in {
-        "quasi-static": {"mobility": flat, "contacts": 1, "pairs": [("box", "pusher")]},
-        "velocities": {"motion": "dynamic", "contacts": 5},
+    flat = [1.0, 1.0, 0.0, 0.0, 0.0, 1 / 0.038**2, 0.0, 0.0]  # with the radius of gyration of a square
+    for mode, module in {
+        "quasi-static": MujocoLCS(model, mobility=flat, contacts=1, pairs=[("box", "pusher")]),
+        "velocities": MujocoLCS(model, motion="dynamic", contacts=5),
     }.items():
-        module = MujocoLCS(model, **options)
         cases.append(of_mujoco("pusher and box on a floor", mode, module, model, qpos, rest, u, PLACE_FREE))
     return cases
 

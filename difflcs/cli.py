@@ -22,6 +22,7 @@ from difflcs import zoo
 from difflcs._renamed import refuse_flags_of_before
 from difflcs.errors import CheckpointError, DiffLCSError, InvalidInputError
 from difflcs.export import Export
+from difflcs.planning.films import FILMS
 from difflcs.rl._optional import require, versions
 from difflcs.rl.checkpoint import RunDirectory
 from difflcs.rl.evaluate import evaluate
@@ -206,14 +207,14 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Render:
-    """Video of a learned model at work, one episode per goal."""
+    """Video of a learned model at work, one episode per goal; or of Push-T."""
 
     model: Path
-    """Run directory, or zoo:NAME for one of the models that `difflcs zoo` lists."""
+    """Run directory, or zoo:NAME for one of the models that `difflcs zoo` lists; or pusht, which has no goals."""
     goal: tuple[float, ...] | None = None
     """Goals, one after another, each with the numbers that the task wants; by default an example of the task."""
     out: Path = Path("video.mp4")
-    """Video to write, an MP4."""
+    """Video to write, an MP4; with pusht also a GIF."""
     force: bool = False
     """Replace the video if there is one."""
     seed: int = 0
@@ -223,6 +224,8 @@ class Render:
 
     def run(self) -> None:
         """Run the command."""
+        if str(self.model) in FILMS:
+            return FILMS[str(self.model)](self.out, self.seed, 1 if self.smoke else 4, self.force)
         if self.out.suffix.lower() != ".mp4" or self.out.is_dir():
             raise InvalidInputError(f"out: expected the name of an MP4 file, got {self.out}; pass --out video.mp4")
         if self.out.exists() and not self.force:

@@ -5,13 +5,14 @@ and limit (300 steps of 0.1 s). The policy is given the state (place of the disc
 
 - known: geometry, mass and drive as they are;
 - learned: what is learned from two minutes of random pushing, see `learn_pusht.py`;
-- inertia, friction, outline: one of them wrong by 20 % (friction, which is zero, is taken for 0.2);
+- inertia, friction, outline: one of them wrong by 20 %, the outline also by 10 % (friction, which is zero, is taken for
+  0.2); centre of mass: off by 12 px, a fifth of half the T's width;
 - noise: every coordinate observed with a standard deviation of 2 px, the angle with that of 2 px at the T's radius of
   gyration;
 - delay: actions come one step late, and the plan begins where the system predicts that it will be.
 
 Times are CPU times of the policy, on one core. With `--out FILE`, episodes are written as they end, and those that are
-in the file already are not played again. `--variant all` plays every one.
+in the file already are not played again: after a change of the policy begin another file. `--variant all` plays all.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from difflcs import _files
 from difflcs._checks import check_positive_int
 from difflcs.bench import machine
 from difflcs.errors import InvalidInputError
-from difflcs.planning.pusht import GYRATION, PIXELS, STEPS, PushTPolicy, make_env, tee, tee_pushing
+from difflcs.planning.pusht import CENTER_OF_MASS, GYRATION, PIXELS, STEPS, PushTPolicy, make_env, tee, tee_pushing
 from difflcs.rl import wilson_interval
 
 EVERY = 10
@@ -62,14 +63,22 @@ def learned(seed: int) -> PushTPolicy:
     return PushTPolicy(learn(make_env(), seed).physics)
 
 
+def told(**changes: Any) -> Variant:
+    """With another system than that of the environment."""
+    return Variant(lambda seed: PushTPolicy(tee_pushing(**changes)))
+
+
 VARIANTS = {
     "known": Variant(),
     "learned": Variant(learned),
-    "inertia -20 %": Variant(lambda seed: PushTPolicy(tee_pushing(gyration=GYRATION * 0.8**0.5))),
-    "inertia +20 %": Variant(lambda seed: PushTPolicy(tee_pushing(gyration=GYRATION * 1.2**0.5))),
-    "friction 0.2": Variant(lambda seed: PushTPolicy(tee_pushing(friction=torch.tensor(0.2, dtype=torch.float64)))),
-    "outline -20 %": Variant(lambda seed: PushTPolicy(tee_pushing(shape=tee(0.8)))),
-    "outline +20 %": Variant(lambda seed: PushTPolicy(tee_pushing(shape=tee(1.2)))),
+    "inertia -20 %": told(gyration=GYRATION * 0.8**0.5),
+    "inertia +20 %": told(gyration=GYRATION * 1.2**0.5),
+    "centre of mass": told(center_of_mass=(0.0, CENTER_OF_MASS[1] + 0.12)),
+    "friction 0.2": told(friction=torch.tensor(0.2, dtype=torch.float64)),
+    "outline -20 %": told(shape=tee(0.8)),
+    "outline -10 %": told(shape=tee(0.9)),
+    "outline +10 %": told(shape=tee(1.1)),
+    "outline +20 %": told(shape=tee(1.2)),
     "noise 2 px": Variant(noise=2.0),
     "one step late": Variant(lambda seed: PushTPolicy(delay=1), delay=1),
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 import torch
@@ -16,7 +17,7 @@ from difflcs.records import LCSParams
 
 __all__ = ["LEARNABLE", "ContactLCS"]
 
-LEARNABLE = ("center_of_mass", "gyration", "friction", "compliance", "radius", "gain", "outline")
+LEARNABLE = ("center_of_mass", "gyration", "friction", "compliance", "radius", "gain", "drive_compliance", "outline")
 """What a `ContactLCS` can learn."""
 
 
@@ -32,15 +33,16 @@ class ContactLCS(nn.Module):
     Args:
         physics: what is known or guessed.
         learn: what is learned of it, of `center_of_mass` (2), `gyration` (1), `friction` (one for each disc),
-            `compliance` (one for each disc), `radius` of each disc, `gain` of a `PositionDrive` (each disc and axis),
-            and `outline`: each side of a polygon moves along its normal, each circle has another radius.
+            `compliance` (one for each disc), `radius` of each disc, `gain` of a `PositionDrive` (each disc and axis)
+            and its `drive_compliance` (each disc), and `outline`: each side of a polygon moves along its normal, each
+            circle has another radius.
 
     Raises:
-        DTypeError, InvalidInputError: no `PlanarPushing`, an unknown name, one named twice, the gain of another drive,
-            or friction where there is none.
+        DTypeError, InvalidInputError: no `PlanarPushing`, an unknown name, one named twice, gain or compliance of
+            another drive, or friction or a compliance of the drive where there is none.
     """
 
-    def __init__(self, physics: PlanarPushing, learn: Sequence[str] = LEARNABLE[:-1]):
+    def __init__(self, physics: PlanarPushing, learn: Sequence[str] = LEARNABLE[:-2]):
         super().__init__()
         if not isinstance(physics, PlanarPushing):
             raise DTypeError(f"physics: expected a PlanarPushing, got {describe(physics)}; build one from shapes")
@@ -55,10 +57,15 @@ class ContactLCS(nn.Module):
                 "learn: expected friction above 0 where it is learned, got friction 0 in the physics; guess a value, "
                 "or leave it out"
             )
-        if "gain" in self.learn and not isinstance(physics.drive, PositionDrive):
+        if {"gain", "drive_compliance"} & set(self.learn) and not isinstance(physics.drive, PositionDrive):
             raise InvalidInputError(
-                f"learn: expected a PositionDrive where its gain is learned, got {type(physics.drive).__name__}; leave "
-                f"it out"
+                f"learn: expected a PositionDrive where its gain or compliance is learned, got "
+                f"{type(physics.drive).__name__}; leave them out"
+            )
+        if "drive_compliance" in self.learn and not bool((_drive(physics)[1] > 0).all()):
+            raise InvalidInputError(
+                "learn: expected a drive with compliance above 0 where it is learned, got 0; guess a value, or leave "
+                "it out"
             )
         self.guess = physics
         discs = physics.n_discs
@@ -69,6 +76,7 @@ class ContactLCS(nn.Module):
             "compliance": (discs,),
             "radius": (discs,),
             "gain": (discs, 2),
+            "drive_compliance": (discs, 1),
             "outline": (_count_sides(physics.shape),),
         }
         self.change = nn.ParameterDict(
@@ -102,9 +110,9 @@ class ContactLCS(nn.Module):
         }
         if "center_of_mass" in change:
             values["center_of_mass"] = guess.center_of_mass + length * change["center_of_mass"]
-        if "gain" in change:
-            gain = torch.as_tensor(guess.drive.gain, dtype=torch.float64)  # pyright: ignore[reportAttributeAccessIssue]
-            values["drive"] = PositionDrive(gain * change["gain"].exp())
+        if "gain" in change or "drive_compliance" in change:
+            drive = zip(_drive(guess), ("gain", "drive_compliance"), strict=True)
+            values["drive"] = PositionDrive(*(v * change[name].exp() if name in change else v for v, name in drive))
         if "outline" in change:
             values["shape"] = _moved(guess.shape, iter(length * change["outline"]))
         return guess.replace(**values) if values else guess
@@ -119,14 +127,33 @@ class ContactLCS(nn.Module):
         found: dict[str, Any] = {}
         for name in self.learn:
             value: Any
-            if name == "gain":
-                value = now.drive.gain  # pyright: ignore[reportAttributeAccessIssue]
+            if name in ("gain", "drive_compliance"):
+                value = _drive(now)[name != "gain"]
             elif name == "outline":
                 value = (now.length or 1.0) * self.change["outline"]
             else:
                 value = getattr(now, name)
             found[name] = value.detach().tolist()
         return found
+
+    def config(self) -> dict[str, Any]:
+        """What it is built of besides what is learned, in JSON types."""
+        return {"learn": list(self.learn), "guess": _plain(self.guess)}
+
+
+def _plain(value: Any) -> Any:
+    """Numbers, tensors and descriptions in JSON types."""
+    if isinstance(value, Tensor):
+        return value.detach().tolist()
+    if is_dataclass(value) and not isinstance(value, type):
+        return {"kind": type(value).__name__, **{f.name: _plain(getattr(value, f.name)) for f in fields(value)}}
+    return [_plain(v) for v in value] if isinstance(value, tuple | list) else value
+
+
+def _drive(physics: PlanarPushing) -> tuple[Tensor, Tensor]:
+    """Gain and compliance of a `PositionDrive`."""
+    drive: Any = physics.drive
+    return torch.as_tensor(drive.gain, dtype=torch.float64), torch.as_tensor(drive.compliance, dtype=torch.float64)
 
 
 def _count_sides(shape: Shape) -> int:

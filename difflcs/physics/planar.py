@@ -26,7 +26,7 @@ from torch import Tensor
 from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor, describe
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 from difflcs.physics.contacts import Cone, Contacts, FreeMotion, contact_lcs, count_forces
-from difflcs.physics.shapes import Shape
+from difflcs.physics.shapes import Distance, Shape
 from difflcs.records import LCSParams
 
 __all__ = ["Drive", "ForceDrive", "Inertia", "PDDrive", "PlanarPushing", "PositionDrive"]
@@ -62,19 +62,30 @@ class Drive(ABC):
 
 @dataclass(frozen=True, eq=False)
 class PositionDrive(Drive):
-    """A disc goes where it is told, whatever it meets: p₊ = p + gain · u.
+    """A disc goes where it is told, as far as what it meets lets it: p₊ = p + gain · u + compliance · force.
+
+    A controller that holds a place is a spring. With none of its compliance in the model, a plan believes that a disc
+    moves on while it presses on a body that is blocked, and two discs squeeze a body between them.
 
     Attributes:
         gain: part of the commanded increment that it makes in a step; a number, (2,) or (n_discs, 2).
+        compliance: by how far a unit of force pushes it back, ≥ 0, 0 for a disc that nothing stops; a number, (2,),
+            (n_discs, 1) or (n_discs, 2) [length per force, as the mobility of the body is 1 in quasi-static motion].
     """
 
     gain: float | Tensor = 1.0
+    compliance: float | Tensor = 0.0
     order = 1
 
     def step(self) -> DriveStep:
         """See `Drive`."""
-        gain = _number("gain", self.gain)
-        return DriveStep(gain.new_ones(1, 1), gain.unsqueeze(-1), gain.new_zeros(1))
+        gain, compliance = _number("gain", self.gain), _number("compliance", self.compliance)
+        if bool((compliance < 0).any()):
+            raise InvalidInputError(
+                f"compliance: expected numbers of at least 0, got {float(compliance.min()):g}; a force pushes a disc "
+                f"away, never nearer"
+            )
+        return DriveStep(gain.new_ones(1, 1), gain.unsqueeze(-1), compliance.unsqueeze(-1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,6 +187,8 @@ class PlanarPushing:
         inertia: None for quasi-static motion.
         cone: model of friction, see `difflcs.physics.contacts`.
         length: unit of gaps for the relaxation of the MPC, see `contact_lcs`; None: the radius of gyration.
+        nearest: parts of the shape that each disc can touch in one step, those nearest to it; None: all of them. The
+            time of an MPC grows with the contacts, and far parts are out of reach.
 
     Raises:
         InvalidInputError and its kinds: a value does not fit.
@@ -192,6 +205,7 @@ class PlanarPushing:
     inertia: Inertia | None = None
     cone: Cone = "anitescu"
     length: float | None = None
+    nearest: int | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.shape, Shape):
@@ -199,6 +213,8 @@ class PlanarPushing:
         if not isinstance(self.drive, Drive):
             raise DTypeError(f"drive: expected a Drive, got {describe(self.drive)}; give PositionDrive(), for example")
         check_positive_int("n_discs", self.n_discs)
+        if self.nearest is not None:
+            check_positive_int("nearest", self.nearest)
         check_choice("cone", self.cone, ("anitescu", "stewart-trinkle"))
         values: dict[str, Any] = {name: self._of_discs(name, getattr(self, name)) for name in ("radius", "compliance")}
         values["friction"] = 0.0 if self.frictionless else self._of_discs("friction", self.friction)
@@ -246,7 +262,12 @@ class PlanarPushing:
     @property
     def n_lam(self) -> int:
         """Number of contact forces."""
-        return count_forces(self.n_discs * self.shape.n_parts, 0 if self.frictionless else 1, self.cone)
+        return count_forces(self.n_discs * self.parts_touched, 0 if self.frictionless else 1, self.cone)
+
+    @property
+    def parts_touched(self) -> int:
+        """Contacts of each disc."""
+        return self.shape.n_parts if self.nearest is None else min(self.nearest, self.shape.n_parts)
 
     def replace(self, **values: Any) -> PlanarPushing:
         """The same with other values."""
@@ -276,7 +297,7 @@ class PlanarPushing:
         )
 
     def _by_contact(self, value: Any) -> Tensor:
-        return value.repeat_interleave(self.shape.n_parts)
+        return value.repeat_interleave(self.parts_touched)
 
     def _unit_of_force(self) -> float | None:
         if self.inertia is None:
@@ -291,10 +312,13 @@ class PlanarPushing:
         return torch.stack([cos * dx + sin * dy, cos * dy - sin * dx], -1)
 
     def contacts(self, x: Tensor) -> Contacts:
-        """Gaps of all discs, and their derivatives; each disc has as many contacts as the shape has parts."""
-        m, parts, batch = self.n_discs, self.shape.n_parts, x.shape[:-1]
+        """Gaps of all discs, and their derivatives; each disc has a contact with each part, or the nearest."""
+        m, parts, batch = self.n_discs, self.parts_touched, x.shape[:-1]
         discs = x[..., 3 : 3 + 2 * m].reshape(*batch, m, 2)
         found = self.shape.distance(self.to_body(x, discs))
+        if parts < self.shape.n_parts:
+            kept = found.distance.detach().topk(parts, largest=False).indices
+            found = Distance(*(_chosen(value, kept) for value in found))
         gap = found.distance - self._of_discs("radius", self.radius).unsqueeze(-1)
         cos, sin = x[..., 2].cos()[..., None, None], x[..., 2].sin()[..., None, None]
 
@@ -362,6 +386,13 @@ class PlanarPushing:
             response[..., :3, :3] = h * mobility / mass
             response[..., -3:, :3] = mobility / mass
         return FreeMotion(A, B, x.new_zeros(self.n_x), response)
+
+
+def _chosen(values: Tensor, parts: Tensor) -> Tensor:
+    """Values (..., n_parts) or (..., n_parts, 2) of the parts (..., k)."""
+    if values.ndim > parts.ndim:
+        return values.gather(-2, parts.unsqueeze(-1).expand(*parts.shape, values.shape[-1]))
+    return values.gather(-1, parts)
 
 
 def _number(name: str, value: Any) -> Tensor:

@@ -11,17 +11,19 @@ from __future__ import annotations
 import math
 import warnings
 from collections import deque
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
 
 from difflcs._checks import check_positive_int
 from difflcs.cost import GoalCost
 from difflcs.errors import MissingDependencyError
 from difflcs.mpc.layer import LCSMPCLayer
-from difflcs.physics.contact import ContactLCS
+from difflcs.physics.contacts import Contacts
 from difflcs.physics.planar import PDDrive, PlanarPushing
 from difflcs.physics.shapes import Polygon, Shape, Union, box
 from difflcs.planning.places import DiscPlaces, Workspace
@@ -94,6 +96,24 @@ def make_env(**options: Any) -> Any:
     return gymnasium.make("gym_pusht/PushT-v0", obs_type="state", max_episode_steps=STEPS, **options)
 
 
+class Rigid(PlanarPushing):
+    """Planar pushing in which nothing is inside the body: where the outline says so, a disc just touches it.
+
+    With its outline too large a body seems to be penetrated where nothing touches it, and the plan would wait for it to
+    be pushed out. So it goes on until something moves.
+    """
+
+    def contacts(self, x: Tensor) -> Contacts:
+        """See `PlanarPushing`."""
+        found = super().contacts(x)
+        return found._replace(gap=found.gap.clamp_min(0.0))
+
+    @classmethod
+    def of(cls, system: PlanarPushing) -> Rigid:
+        """The same system otherwise."""
+        return cls(**{field.name: getattr(system, field.name) for field in fields(system)})
+
+
 class PushTPolicy:
     """Sampling-based contact MPC for gym-pusht: its observation of obs_type="state" to its action.
 
@@ -119,7 +139,7 @@ class PushTPolicy:
 
     def __init__(
         self,
-        system: PlanarPushing | ContactLCS | None = None,
+        system: PlanarPushing | None = None,
         *,
         shape: Shape | None = None,
         delay: int = 0,
@@ -127,9 +147,8 @@ class PushTPolicy:
         horizon: int = 10,
         margin: float = 0.0,
     ):
-        self.system = system = tee_pushing() if system is None else system
-        if shape is None:
-            shape = system.shape if isinstance(system, PlanarPushing) else system.physics.shape
+        self.system = system = Rigid.of(tee_pushing() if system is None else system)
+        shape = system.shape if shape is None else shape
         self.delay = check_positive_int("delay", delay, minimum=0)
         workspace = Workspace((0.0, 0.0), (SIDE, SIDE), step=0.6)
         cost = GoalCost.reach(7, 2, goal_weight=(1.0, 1.0, 0.3), goal_weight_final=(4.0, 4.0, 1.2), input_weight=0.01)

@@ -4,7 +4,8 @@ An MPC that linearises contact at one state sees the surface next to it as an in
 not find the way round a corner. So the same MPC is solved, as one batch, from where the robot is and from many places
 where its end effectors could be. The gain of a place is what its plan saves against standing still there. The robot
 pushes where it is while the gain there is near the best; else it travels, free of collision, to the place with the best
-gain after the price of the way, and pushes from there.
+gain after the price of the way, and pushes from there. A place from which the cost of standing still has not changed is
+barred until it does: round a corner a plan can promise for ever what no push brings.
 
 Source: S. Venkatesh, B. Bianchini, A. Aydinoglu, W. Yang, M. Posa, "Approximating Global Contact-Implicit MPC via
 Sampling and Local Complementarity" (arXiv:2505.13350), called sampling C3. It compares whole costs, with the cost of
@@ -90,7 +91,7 @@ class Decision:
         target: (n_x,) state to which it travels, with the body where it is now; None where it pushes.
         states: (1 + n_places, n_x) the states that were compared.
         gains: (1 + n_places,) what each plan saves; −∞ where the place is not allowed or its problem was not solved.
-        scores: (1 + n_places,) gains less the price of the way.
+        scores: (1 + n_places,) gains less the price of the way; −∞ also where a place was barred.
         standing: cost of standing still where the robot is.
         solution: the plans of all states.
     """
@@ -163,6 +164,9 @@ class SamplingPolicy:
         self._decision: Decision | None = None
         self._place: Tensor | None = None
         self._steps = 0
+        self._last: Tensor | None = None
+        self._barred: list[Tensor] = []
+        self._reference = 0.0
 
     @property
     def decision(self) -> Decision | None:
@@ -229,15 +233,30 @@ class SamplingPolicy:
         scores = torch.cat([gains[:1], gains[1:] - scale * price])
         best, here = float(scores.max()), float(gains[0])
         pushes = self.places.near(state) and here > own.smallest_gain * scale and here >= own.keep * best
-        goes = not stay and not pushes and bool((scores[1:] > 0).any())
-        chosen = 1 + int(scores[1:].argmax()) if goes else 0
+        chosen = 0 if stay or pushes else self._choose(states, scores, standing)
         self._place, self._steps = (places[chosen - 1].clone(), 0) if chosen else (None, 0)
         target = states[chosen] if chosen else None
+        self._last = self._last if target is None else target
         mode = Mode.TRAVEL if chosen else Mode.PUSH
         self._decision = Decision(mode, bool(chosen), chosen, target, states, gains, scores, standing, solution)
         if target is not None:
             return self.travel.action(state, target).numpy()
         return solution.action[0].numpy()
+
+    def _choose(self, states: Tensor, scores: Tensor, standing: float) -> int:
+        """Row of the place to go to; 0 where none is worth the way. Barred places get a score of −∞."""
+        if abs(standing - self._reference) > self.settings.smallest_gain * self._reference:
+            self._barred, self._reference = [], standing
+        elif self._last is not None:
+            self._barred.append(self._last)
+        while True:
+            best = 1 + int(scores[1:].argmax()) if len(scores) > 1 else 0
+            if not best or not float(scores[best]) > 0:
+                self._barred, self._last = [], None
+                return 0
+            if not any(self.travel.arrived(states[best], place) for place in self._barred):
+                return best
+            scores[best] = -math.inf
 
     def _solve(self, states: Tensor, goal: Tensor | None, context: Tensor | None) -> MPCSolution:
         low, high = (None, None) if self.bounds is None else self.bounds(states)

@@ -10,6 +10,11 @@ require("gymnasium")  # a clear error, before the modules below import it
 
 # ruff: noqa: E402
 from difflcs.rl.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
+from difflcs.rl.contact_method import (
+    ContactMethod,
+    PhysicsFit,
+    PhysicsFitSettings,
+)  # behind methods: it is not the default
 from difflcs.rl.critic import CriticSettings
 from difflcs.rl.dynamics import Ensemble, EnsembleSettings
 from difflcs.rl.evaluate import Evaluation, evaluate, wilson_interval
@@ -35,7 +40,7 @@ from difflcs.rl.ppo import PPO
 from difflcs.rl.ppo_settings import PPOSettings, make_ppo
 from difflcs.rl.rollout import collect
 from difflcs.rl.settings import Adam, Epochs, Rollouts, Settings, ViolationLoss, bounded, group
-from difflcs.rl.tasks import Quantity, TaskSpec, get_task, register_task, task_names
+from difflcs.rl.tasks import PhysicsSpec, Quantity, TaskSpec, get_task, register_task, task_names
 from difflcs.rl.trainer import Trainer
 from difflcs.rl.training import Reporter, TrainConfig, load_model, load_policy, train
 from difflcs.rl.warmup import Warmup, WarmupSettings, action_support, fit
@@ -48,6 +53,7 @@ __all__ = [
     "PDDM",
     "PPO",
     "Adam",
+    "ContactMethod",
     "CriticSettings",
     "Ensemble",
     "EnsembleSettings",
@@ -68,6 +74,9 @@ __all__ = [
     "PPOMLPMethod",
     "PPOMethod",
     "PPOSettings",
+    "PhysicsFit",
+    "PhysicsFitSettings",
+    "PhysicsSpec",
     "Quantity",
     "Reporter",
     "Rollouts",

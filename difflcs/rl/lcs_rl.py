@@ -9,10 +9,11 @@ from difflcs._checks import check_choice, check_positive_int
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.rl.state import State
 from difflcs.rl.trainer import AfterStep, Trainer
-from difflcs.rl.warmup import Warmup, WarmupReport
 
 if TYPE_CHECKING:
+    from difflcs.rl.contact_method import PhysicsFit, PhysicsFitReport
     from difflcs.rl.ppo import PPO, PPOReport
+    from difflcs.rl.warmup import Warmup, WarmupReport
 
 _WARMUP, _MAIN = "warmup", "main"
 
@@ -21,13 +22,13 @@ class LCSRL(Trainer):
     """Both phases as one trainer, see `Trainer`.
 
     Args:
-        warmup: the first phase.
+        warmup: the first phase, or whatever takes its place.
         warmup_steps: environment steps after which the main phase starts.
         make_main: episodes and iterations done before → the second phase, around the same model.
     """
 
-    def __init__(self, warmup: Warmup, warmup_steps: int, make_main: Callable[[int, int], PPO]):
-        self.current: Warmup | PPO = warmup
+    def __init__(self, warmup: Warmup | PhysicsFit, warmup_steps: int, make_main: Callable[[int, int], PPO]):
+        self.current: Any = warmup
         self._warmup, self._warmup_steps, self._make_main = warmup, warmup_steps, make_main
         super().__init__(warmup.learned, warmup.policy, warmup.seed, warmup.episode_steps)
         self._follow()
@@ -43,12 +44,12 @@ class LCSRL(Trainer):
     def _main(self, episodes: int, iterations: int) -> PPO:
         """The main phase that begins there: the current one if it did."""
         current = self.current
-        begun = None if isinstance(current, Warmup) else (current.first_episode, current.first_iteration)
-        if not isinstance(current, Warmup) and begun == (episodes, iterations):
+        begun = None if current is self._warmup else (current.first_episode, current.first_iteration)
+        if begun == (episodes, iterations):
             return current
         return self._make_main(episodes, iterations)
 
-    def step(self, after_step: AfterStep | None = None) -> WarmupReport | PPOReport:
+    def step(self, after_step: AfterStep | None = None) -> WarmupReport | PhysicsFitReport | PPOReport:
         """One iteration of the current phase."""
         report = self.current.step(after_step)
         self._follow()
@@ -65,7 +66,7 @@ class LCSRL(Trainer):
     def load(self, state: State) -> None:
         """See `Trainer`."""
         inner = {name: value for name, value in state.items() if name != "phase"}
-        current: Warmup | PPO = self._warmup
+        current: Any = self._warmup
         try:
             if check_choice("phase", state.get("phase"), (_WARMUP, _MAIN)) == _MAIN:
                 names = ("first_episode", "first_iteration")

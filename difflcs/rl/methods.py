@@ -237,7 +237,7 @@ def _warmup(work: Work, lcs: LCSModule, policy: Policy, settings: WarmupSettings
     return Warmup(lcs, policy, envs, settings, work.seed, work.task.episode_steps, work.init is not None)
 
 
-def _main_phase(
+def main_phase(
     work: Work,
     controller: LCSMPCLayer | MLPController,
     settings: PPOSettings,
@@ -245,6 +245,7 @@ def _main_phase(
     first_episode: int = 0,
     first_iteration: int = 0,
 ) -> PPO:
+    """PPO by its settings, from the episodes and iterations done before."""
     # Here and not above: TorchRL takes seconds to import, which `difflcs --help` should not wait for.
     from difflcs.rl.policy import make_actor
 
@@ -280,11 +281,13 @@ def _short_warmup(settings: WarmupSettings) -> WarmupSettings:
     return replace(settings, rollouts=_few(settings.rollouts), epochs=_short(settings.epochs, 20, 2))
 
 
-def _short_main(settings: PPOSettings, rollouts: int = 3) -> PPOSettings:
+def short_main(settings: PPOSettings, rollouts: int = 3) -> PPOSettings:
+    """The main phase in seconds, see `Method.smoke`."""
     return replace(settings, rollouts=min(settings.rollouts, rollouts), steps=min(settings.steps, 2))
 
 
-def _short_models(settings: ModelRolloutSettings) -> ModelRolloutSettings:
+def short_models(settings: ModelRolloutSettings) -> ModelRolloutSettings:
+    """Model rollouts in seconds, see `Method.smoke`."""
     return replace(
         settings,
         iterations=min(settings.iterations, 1),
@@ -329,7 +332,7 @@ class LCSRLMethod(LCSMethod):
         return LCSRL(
             _warmup(work, lcs, policy, self.warmup),
             round(self.warmup_minutes * work.task.steps_per_minute),
-            lambda episodes, iterations: _main_phase(work, policy, self.ppo, self.models, episodes, iterations),
+            lambda episodes, iterations: main_phase(work, policy, self.ppo, self.models, episodes, iterations),
         )
 
     def smoke(self) -> Self:
@@ -338,8 +341,8 @@ class LCSRLMethod(LCSMethod):
             self,
             warmup_minutes=min(self.warmup_minutes, 0.2),
             warmup=_short_warmup(self.warmup),
-            ppo=_short_main(self.ppo),
-            models=_short_models(self.models),
+            ppo=short_main(self.ppo),
+            models=short_models(self.models),
         )
 
 
@@ -383,11 +386,11 @@ class PPOMethod(LCSMethod):
 
     def trainer(self, work: Work) -> PPO:
         """See `Method`."""
-        return _main_phase(work, self.policy(work.task, self.initial(work)), self.ppo, self.models)
+        return main_phase(work, self.policy(work.task, self.initial(work)), self.ppo, self.models)
 
     def smoke(self) -> Self:
         """See `Method`."""
-        return replace(self, ppo=_short_main(self.ppo), models=_short_models(self.models))
+        return replace(self, ppo=short_main(self.ppo), models=short_models(self.models))
 
 
 @register_method
@@ -422,7 +425,7 @@ class PPOMLPMethod(Method):
         """See `Method`."""
         task, generator = work.task, torch.Generator().manual_seed(work.seed)
         sizes = (task.n_features, *task.bounds, self.width, task.episode_steps)
-        return _main_phase(work, MLPController(task.features, *sizes, generator), self.ppo, None)
+        return main_phase(work, MLPController(task.features, *sizes, generator), self.ppo, None)
 
     def rebuild(
         self, task: TaskSpec, config: Mapping[str, object], tensors: Mapping[str, Tensor], source: str
@@ -440,7 +443,7 @@ class PPOMLPMethod(Method):
 
     def smoke(self) -> Self:
         """See `Method`."""
-        return replace(self, ppo=_short_main(self.ppo, 5))
+        return replace(self, ppo=short_main(self.ppo, 5))
 
 
 @register_method

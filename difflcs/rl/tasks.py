@@ -78,6 +78,45 @@ class Quantity(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
+class PhysicsSpec:
+    """What is known of the physics of a task before anything is learned, for methods that start from it.
+
+    Attributes:
+        make_system: makes the `LCSModule`, a torch.nn.Module with the numbers as they are guessed, such as a
+            `difflcs.physics.ContactLCS`. Called when it is needed: nothing is simulated at import.
+        scale: (n_x,) how much of each state counts alike in a fit [unit of the state].
+        make_cost: makes the cost that an MPC with this system plans with; None: that of the task. What is a good plan
+            in a few steps depends on what the system knows; the rewards stay those of the task.
+        horizon: steps that it plans ahead; None: that of the task.
+        relaxation: product λ·s of its complementarity, in the units of the system; None: that of the task.
+        told: what it is told of the task in words, to stand beside its results.
+
+    Raises:
+        InvalidInputError: a number does not fit.
+        DTypeError: something else where a function is wanted.
+    """
+
+    make_system: Callable[[], Any]
+    scale: tuple[float, ...]
+    make_cost: Callable[[], GoalCost] | None = None
+    horizon: int | None = None
+    relaxation: float | None = None
+    told: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("make_system", "make_cost"):
+            value = getattr(self, name)
+            if not callable(value) and not (name == "make_cost" and value is None):
+                raise DTypeError(f"{name}: expected a function, got {type(value).__name__}; see difflcs.rl.PhysicsSpec")
+        for value in self.scale:
+            check_number("scale", value, strict=True)
+        if self.horizon is not None:
+            check_positive_int("horizon", self.horizon, maximum=10**6)
+        if self.relaxation is not None:
+            check_number("relaxation", self.relaxation, strict=True)
+
+
+@dataclass(frozen=True, kw_only=True)
 class TaskSpec:
     """One task.
 
@@ -113,6 +152,7 @@ class TaskSpec:
         requires: import names of the packages that the environment needs.
         threaded: the vector environment takes the argument `threads`.
         model_name: what its models are called in the zoo; None: as the task.
+        physics: what is known of its physics, for methods that start from it; None: nothing.
 
     Raises:
         InvalidInputError: a value does not fit.
@@ -143,6 +183,7 @@ class TaskSpec:
     requires: tuple[str, ...] = ()
     threaded: bool = False
     model_name: str | None = None
+    physics: PhysicsSpec | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.replace("_", "").replace("-", "").isalnum():
@@ -159,6 +200,11 @@ class TaskSpec:
             value = getattr(self, name)
             if not callable(value) and not (name == "env" and isinstance(value, str)):
                 raise DTypeError(f"{name}: expected a function, got {type(value).__name__}; see difflcs.rl.TaskSpec")
+        if self.physics is not None and not isinstance(self.physics, PhysicsSpec):
+            raise DTypeError(
+                f"physics: expected a PhysicsSpec or None, got {type(self.physics).__name__}; wrap what makes the "
+                f"system in one"
+            )
         low, high = self.bounds
         if not bool((low < high).all()):
             raise InvalidInputError(f"u_min: expected u_min < u_max, got {self.u_min} and {self.u_max}; swap them")

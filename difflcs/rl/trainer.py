@@ -97,10 +97,10 @@ def configuration(learned: Learned) -> dict[str, Any]:
     return {"class": type(learned).__name__, **sizes}
 
 
-def save_learned(learned: Learned, directory: Path) -> None:
-    """Write it into a directory, atomically: by its `save_pretrained`, else as a record named like its class."""
+def save_learned(learned: Learned, directory: Path, kind: str | None = None) -> None:
+    """Write it into a directory, atomically: by its `save_pretrained`, else as a record of a kind, or of its class."""
     save = getattr(learned, "save_pretrained", None)
     if callable(save):
         save(directory)
     else:
-        _files.save_record(directory, type(learned).__name__, configuration(learned), learned.state_dict())
+        _files.save_record(directory, kind or type(learned).__name__, configuration(learned), learned.state_dict())

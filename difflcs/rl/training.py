@@ -343,7 +343,7 @@ class _Training:
                 previous = trainer.env_steps
                 finish(trainer.step(reporter.stepped), previous)
             with writing(run.path):
-                save_learned(trainer.learned, run.model)
+                save_learned(trainer.learned, run.model, self.config.method.kind)
         finally:
             writer.close()
 

@@ -6,6 +6,7 @@ environment is imported here, and no simulation.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,11 +14,20 @@ import torch
 from torch import Tensor
 
 from difflcs.cost import GoalCost
-from difflcs.rl.tasks import Quantity, TaskSpec, register_task
+from difflcs.rl.tasks import PhysicsSpec, Quantity, TaskSpec, register_task
 from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE, EPISODE_STEPS, MOVE, TURN, MoveTask
 from difflcs_envs.ycb import YCB
 
-__all__ = ["caption", "describe", "pushing_cost", "pushing_features", "register_tasks", "trifinger_task"]
+__all__ = [
+    "caption",
+    "contact_cost",
+    "contact_system",
+    "describe",
+    "pushing_cost",
+    "pushing_features",
+    "register_tasks",
+    "trifinger_task",
+]
 
 STATE_SIZE = 9  # object x, y [m], yaw [rad], then x, y [m] of three fingertips
 STEP_SECONDS = 0.1
@@ -44,6 +54,71 @@ def pushing_cost() -> GoalCost:
         pair_weight=10.0,
         pair_weight_final=6.0,
     )
+
+
+def contact_cost() -> GoalCost:
+    """Cost of an MPC that knows where the object is touched.
+
+    Stage: 35 Σ‖tip − object − 0.8 (object − goal)‖² + 200 ‖object − goal‖² + 2 (yaw − goal yaw)² + 60 ‖u‖²; final: 40,
+    200 and 10. Against the cost of the task (`pushing_cost`): tips are drawn behind the object, as seen from the goal;
+    they are drawn with more than three times the weight, or they wander past it; and the yaw counts seven times as
+    much, or plans of a few steps leave it for later, when there is no time left.
+
+    Returns:
+        A `GoalCost` of goals (x [m], y [m], yaw [rad]).
+    """
+    behind, (tips, tips_final) = 0.8, (35.0, 40.0)
+    reach = GoalCost.reach(
+        STATE_SIZE,
+        ACTION_SIZE,
+        goal_weight=(200.0, 200.0, 2.0),
+        goal_weight_final=(200.0, 200.0, 10.0),
+        input_weight=60.0,
+    )
+    places, goals = torch.zeros(6, STATE_SIZE, dtype=torch.float64), torch.zeros(6, 3, dtype=torch.float64)
+    for row in range(6):
+        places[row, 3 + row], places[row, row % 2], goals[row, row % 2] = 1.0, -(1 + behind), behind
+    terms: dict[str, Tensor] = {"R": reach.R}
+    for weight, names in (
+        (tips, ("Q", "goal_to_q", "goal_stage")),
+        (tips_final, ("Q_final", "goal_to_q_final", "goal_final")),
+    ):
+        extra = (places.mT @ places, places.mT @ goals, goals.mT @ goals)
+        terms |= {name: getattr(reach, name) + 2 * weight * term for name, term in zip(names, extra, strict=True)}
+    return GoalCost(**terms)
+
+
+def contact_system(**env_kwargs: Any) -> Any:
+    """What is known of the object and the tips before a training, as a `ContactLCS`.
+
+    Known: the outline at the height of the tips and the centre of mass. Guessed, and the same for every object: tips
+    make 70 % of a commanded step and give way; friction 0.5; the object begins to move when a tip is pressed into it by
+    2 mm; and it turns as if its weight lay 1.4 times as far out as it does.
+
+    Args:
+        **env_kwargs: Arguments of the environment.
+    """
+    from difflcs.physics import ContactLCS, PlanarPushing, Polygon, PositionDrive, Union
+    from difflcs.physics.contact import LEARNABLE
+    from difflcs_envs.trifinger.model import TIP_RADIUS, CubeObject
+    from difflcs_envs.trifinger.objects import make_object
+    from difflcs_envs.trifinger.section import cross_section
+
+    found = make_object(env_kwargs["object"]) if "object" in env_kwargs else CubeObject()
+    outline = Union(tuple(Polygon(torch.from_numpy(corners)) for corners in cross_section(found)))
+    guess = PlanarPushing(
+        outline,
+        radius=TIP_RADIUS - 0.002,
+        n_discs=3,
+        drive=PositionDrive(gain=torch.full((3, 2), 0.7, dtype=torch.float64), compliance=0.1),
+        center_of_mass=(0.0, 0.0),
+        gyration=1.4 * float(outline.gyration),
+        friction=0.5,
+        compliance=0.1,
+        length=0.05,
+        nearest=2,
+    )
+    return ContactLCS(guess, LEARNABLE[:-1])
 
 
 def pushing_features(state: Tensor, goal: Tensor, elapsed: Tensor) -> Tensor:
@@ -86,6 +161,18 @@ def describe(env: Any) -> dict[str, Any]:
     return single.object.describe()
 
 
+def contact_physics(env_kwargs: Mapping[str, Any]) -> PhysicsSpec:
+    """What the methods that start from physics are told of an object that is pushed."""
+    return PhysicsSpec(
+        make_system=functools.partial(contact_system, **env_kwargs),
+        make_cost=contact_cost,
+        horizon=3,
+        relaxation=3e-4,
+        scale=(0.05, 0.05, 1.0, *[0.25] * 6),
+        told="outline of the object at the height of the tips, its centre of mass, radius of the tips",
+    )
+
+
 def trifinger_task(
     name: str, env: str, task: MoveTask, summary: str, goals: tuple[tuple[float, ...], ...], **env_kwargs: Any
 ) -> TaskSpec:
@@ -122,6 +209,7 @@ def trifinger_task(
         requires=("mujoco",),
         threaded=True,
         model_name=f"trifinger-{name.replace('_', '-')}",
+        physics=None if task is not MOVE else contact_physics(env_kwargs),
     )
 
 

@@ -15,13 +15,13 @@ from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
-from difflcs import GoalCost
+from difflcs import GoalCost, LCSParams
 from difflcs.errors import CheckpointError
 from difflcs.rl.methods import Method, Work
 from difflcs.rl.rollout import Plan, collect, mpc_actions
 from difflcs.rl.seeding import Stream, episode_seeds, generator
 from difflcs.rl.settings import bounded
-from difflcs.rl.tasks import Quantity, TaskSpec
+from difflcs.rl.tasks import PhysicsSpec, Quantity, TaskSpec
 from difflcs.rl.trainer import AfterStep, Trainer
 
 STEPS = 5
@@ -73,6 +73,30 @@ def features(state: Tensor, goal: Tensor, elapsed: Tensor) -> Tensor:
     return torch.cat([state, goal - state[..., :1], elapsed.unsqueeze(-1)], -1)
 
 
+class Guess(nn.Module):
+    """What is known of the slide: the first state moves by some part of what is told, the others fade; no contact."""
+
+    def __init__(self, size: int):
+        super().__init__()
+        self.n_x, self.n_u, self.n_lam = size, 1, 1
+        self.gain = nn.Parameter(torch.tensor(0.5, dtype=torch.float64))
+        self.fade = nn.Parameter(torch.full((size - 1,), 0.9, dtype=torch.float64))
+
+    def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
+        one = torch.ones(1, dtype=torch.float64)
+        zero, unit = one.new_zeros(self.n_x, 1), torch.eye(self.n_x, 1, dtype=torch.float64)
+        return LCSParams(
+            A=torch.diag(torch.cat([one, self.fade])),
+            B=self.gain * unit,
+            C=zero,
+            d=zero[:, 0],
+            D=zero.mT,
+            E=0 * one[None],
+            F=one[None],
+            c=one,
+        )
+
+
 def make_task(name: str = "toy", size: int = 2, **changes: Any) -> TaskSpec:
     values: dict[str, Any] = {
         "name": name,
@@ -91,6 +115,7 @@ def make_task(name: str = "toy", size: int = 2, **changes: Any) -> TaskSpec:
         "goal": (Quantity("x", "m"),),
         "errors": (Quantity("position_error", "m"),),
         "example_goals": ((0.5,), (-0.5,)),
+        "physics": PhysicsSpec(make_system=partial(Guess, size), scale=(1.0,) * size, relaxation=1e-3),
     }
     return TaskSpec(**{**values, **changes})
 

@@ -32,10 +32,11 @@ def test_a_box_is_pushed_to_poses_from_the_wrong_side():
 
 # The largest error of a coordinate, as a part of how far it moves, by system and mode.
 ERRORS = {
-    ("pusher and box, damped joints", "quasi-static"): {"position": 0.2, "yaw": 0.5},
-    ("pusher and box, damped joints", "velocities"): {"position": 0.2, "yaw": 0.5, "velocity": 0.3},
+    ("pusher and box, slow, in contact", "quasi-static"): {"position": 0.06, "yaw": 0.15},
+    ("pusher and box, slow", "quasi-static"): {"position": 0.15, "yaw": 0.35},
+    ("pusher and box that coasts", "velocities"): {"position": 0.25, "yaw": 0.5, "velocity": 0.35},
     ("pusher and box on a floor", "quasi-static"): {"position": 0.3, "yaw": 0.6},
-    ("pusher and box on a floor", "velocities"): {"position": 0.35, "yaw": 0.7},
+    ("pusher and box on a floor", "velocities"): {"position": 0.35, "yaw": 0.8},
     ("cart-pole, no contact", "velocities"): {"cart": 0.002, "pole": 0.01, "pole velocity": 0.03},
     ("box in the air", "velocities"): {"position": 0.02, "velocity": 1e-6},
     ("box sliding on a floor", "velocities"): {"position": 0.5, "velocity": 0.5},

@@ -25,6 +25,7 @@ from difflcs_envs.trifinger.env import (  # noqa: E402
     TriFingerTurnCubeEnv,
 )
 from difflcs_envs.trifinger.model import FINGER_YAWS  # noqa: E402
+from difflcs_envs.trifinger.section import cross_section  # noqa: E402
 from difflcs_envs.ycb import YCB  # noqa: E402
 
 OUTWARD = np.stack([-np.sin(FINGER_YAWS), np.cos(FINGER_YAWS)], axis=1)
@@ -464,3 +465,49 @@ def test_gallery(tmp_path, monkeypatch):
     assert gallery.main([str(tmp_path / "pictures")]) == 0
     assert (tmp_path / "pictures" / "objects.png").stat().st_size > 10_000
     assert (tmp_path / "pictures" / "push.mp4").stat().st_size > 5_000
+
+
+# --- cross sections ---------------------------------------------------------------------------------------------------
+
+
+def area(polygon):
+    x, y = polygon.T
+    return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
+
+
+def test_the_cross_section_of_what_is_no_prism_is_that_at_the_height_of_the_tips(stl):
+    """A cone without its top: its section narrows with the height, and 4 mm below the tips counts too."""
+    ring = np.linspace(0, 2 * math.pi, 64, endpoint=False)
+    circle = np.c_[np.cos(ring), np.sin(ring)]
+    frustum = np.concatenate([np.c_[0.03 * circle, np.zeros(64)], np.c_[0.015 * circle, np.full(64, 0.04)]])
+    env = make(stl(trimesh.convex.convex_hull(frustum)))
+    (found,) = cross_section(env.object)
+    assert env.object.tip_height == pytest.approx(0.02, abs=1e-6)
+    assert np.linalg.norm(found, axis=1).max() == pytest.approx(0.03 - 0.015 * 16 / 40, abs=1e-4)
+    assert area(found) > 0  # counterclockwise
+    env.close()
+
+
+def test_the_cross_section_of_a_bracket_is_the_bracket(stl):
+    env = make(stl(bracket()))
+    parts = cross_section(env.object)
+    assert len(parts) >= 2
+    corners = np.concatenate(parts)
+    np.testing.assert_allclose(np.ptp(corners, axis=0), [0.06, 0.06], atol=1e-3)
+    # The notch stays free: no part contains its middle, seen from the corner of the bracket.
+    corner = corners.min(axis=0)
+    for part in parts:
+        side, to = np.roll(part, -1, 0) - part, corner + 0.04 - part
+        assert (side[:, 0] * to[:, 1] - side[:, 1] * to[:, 0]).min() < 0
+    env.close()
+
+
+@pytest.mark.parametrize("name", YCB)
+def test_the_cross_sections_of_stand_ins_are_convex_and_fit(name):
+    env = stand_in(name)
+    parts = cross_section(env.object)
+    for part in parts:
+        side = np.roll(part, -1, 0) - part
+        assert (side[:, 0] * np.roll(side[:, 1], -1) - side[:, 1] * np.roll(side[:, 0], -1)).min() > 0
+    np.testing.assert_allclose(np.ptp(np.concatenate(parts), axis=0), np.ptp(env.object.outline, axis=0), atol=3e-4)
+    env.close()

@@ -14,7 +14,7 @@ pytest.importorskip("mujoco", reason="the environments need the extra [envs]")
 from difflcs import LCSModel  # noqa: E402
 from difflcs.rl.evaluate import evaluate  # noqa: E402
 from difflcs.rl.tasks import get_task, task_names  # noqa: E402
-from difflcs_envs.tasks import caption, pushing_cost  # noqa: E402
+from difflcs_envs.tasks import caption, contact_cost, pushing_cost  # noqa: E402
 from difflcs_envs.ycb import YCB  # noqa: E402
 
 NAMES = ("cube", "turn_cube", *YCB)
@@ -156,3 +156,50 @@ def test_what_is_pushed_can_be_described_through_wrappers_and_vectors(name):
     for one in (env, env.unwrapped, *vectors, wrapped):
         assert task.describe(one) == expected
         one.close()
+
+
+# --- what is known of the physics -------------------------------------------------------------------------------------
+
+
+def test_the_cost_of_contact_plans_is_what_it_says():
+    cost, rng = contact_cost(), torch.Generator().manual_seed(0)
+    x, u, goal = (torch.randn(5, n, dtype=torch.float64, generator=rng) for n in (9, 6, 3))
+
+    def wanted(tips, place, yaw, action):
+        behind = x[:, :2] + 0.8 * (x[:, :2] - goal[:, :2])
+        arms = x[:, 3:].reshape(5, 3, 2) - behind.unsqueeze(1)
+        return (
+            tips * arms.square().sum((1, 2))
+            + place * (x[:, :2] - goal[:, :2]).square().sum(1)
+            + yaw * (x[:, 2] - goal[:, 2]).square()
+            + action * u.square().sum(1)
+        )
+
+    torch.testing.assert_close(cost.stage(x, u, goal), wanted(35, 200, 2, 60))
+    at_the_end = 0.5 * (x @ cost.Q_final * x).sum(1) + (goal @ cost.goal_to_q_final.mT * x).sum(1)
+    at_the_end = at_the_end + 0.5 * (goal @ cost.goal_final * goal).sum(1)
+    torch.testing.assert_close(at_the_end, wanted(40, 200, 10, 0))
+
+
+@pytest.mark.parametrize(("name", "parts"), [("cube", 1), ("mug", None), ("banana", None)])
+def test_what_is_known_of_an_object_is_its_outline(name, parts):
+    task = get_task(name)
+    system = task.physics.make_system()
+    assert (system.n_x, system.n_u) == (task.n_x, task.n_u)
+    assert system.n_lam == 6 * system.guess.parts_touched
+    shape = system.guess.shape
+    assert parts is None or shape.n_parts == parts
+    assert len(task.physics.scale) == task.n_x
+    env = task.make_env()
+    state = env.reset(seed=0)[0]["state"]
+    around = env.unwrapped.object.outline
+    corners = np.concatenate([part.vertices.numpy() for part in shape.parts])
+    np.testing.assert_allclose(np.ptp(corners, axis=0), np.ptp(around, axis=0), atol=3e-4)
+    # No tip touches the object at the start: gaps are above zero, and those of the simulation.
+    gaps = system.guess.replace(radius=0.0095).contacts(torch.from_numpy(state)).gap
+    assert float(gaps.min()) > 0.001
+    env.close()
+
+
+def test_only_what_is_pushed_has_physics_of_pushing():
+    assert get_task("turn_cube").physics is None

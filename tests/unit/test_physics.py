@@ -22,6 +22,7 @@ from difflcs.physics import (
     PDDrive,
     PlanarPushing,
     Polygon,
+    PositionDrive,
     Union,
     box,
     contact_lcs,
@@ -271,6 +272,43 @@ def test_the_pd_drive_is_its_own_simulation():
     torch.testing.assert_close(got, tensor([p, v]))
 
 
+def test_what_a_drive_gives_way_and_what_the_body_moves():
+    """Series of springs: a force f moves the body by f, the disc back by a·f, and closes the gap by r·f."""
+    give, soft, gain, command = 0.5, 0.1, 0.8, 0.01
+    system = pushing(compliance=soft, friction=0.0, drive=PositionDrive(gain, give))
+    x = tensor([0.0, 0.0, 0.0, -0.04, 0.0])
+    after = system.params(x).step(x, tensor([command, 0.0])).x_next
+    force = gain * command / (1 + give + soft)
+    torch.testing.assert_close(after, tensor([force, 0.0, 0.0, -0.04 + gain * command - give * force, 0.0]))
+
+
+def test_two_discs_that_squeeze_a_body_hold_each_other():
+    """With a stiff drive they would go on into the body; one that gives way stays almost where it is."""
+    x, u = tensor([0.0, 0.0, 0.0, -0.04, 0.0, 0.04, 0.0]), tensor([0.01, 0.0, -0.01, 0.0])
+    moved = []
+    for give in (0.0, 100.0):
+        system = pushing(n_discs=2, friction=0.0, compliance=1.0, drive=PositionDrive(1.0, give))
+        moved.append(float(system.params(x).step(x, u).x_next[3] - x[3]))
+    torch.testing.assert_close(tensor(moved), tensor([0.01, 0.01 * (1 - 100 / 101)]))
+
+
+def test_only_the_nearest_parts_touch():
+    parts = tuple(box(a, a + 0.02, -0.01, 0.01) for a in (-0.05, -0.01, 0.03))
+    both = [PlanarPushing(Union(parts), 0.005, 2, friction=0.4, nearest=n) for n in (None, 1)]
+    x = tensor([[0.0, 0.0, 0.0, -0.04, 0.02, 0.002, 0.03], [0.01, 0.0, 0.3, 0.06, 0.0, -0.07, 0.0]])
+    full, near = (system.contacts(x) for system in both)
+    assert [system.n_lam for system in both] == [12, 4]
+    assert near.gap.shape == (2, 2)
+    chosen = full.gap.reshape(2, 2, 3).argmin(-1)
+    torch.testing.assert_close(near.gap, full.gap.reshape(2, 2, 3).amin(-1))
+    for name in ("normal", "tangent"):
+        every = getattr(full, name).reshape(2, 2, 3, -1)
+        wanted = every.gather(2, chosen[..., None, None].expand(2, 2, 1, every.shape[-1])).squeeze(2)
+        torch.testing.assert_close(getattr(near, name).reshape(2, 2, -1), wanted)
+    more = PlanarPushing(Union(parts), 0.005, 2, friction=0.4, nearest=9)
+    torch.testing.assert_close(more.contacts(x).gap, full.gap)
+
+
 def test_discs_with_mass_are_pushed_back():
     system = pushing(**DRIVES["force"], n_discs=1)
     x = torch.zeros(system.n_x, dtype=F64)
@@ -291,6 +329,7 @@ def test_discs_with_mass_are_pushed_back():
      ({"drive": "fast"}, DTypeError, "drive: expected a Drive"),
      ({"cone": "flat"}, InvalidInputError, "cone: expected"),
      ({"friction": "much"}, DTypeError, "friction: expected a number"),
+     ({"nearest": 0}, InvalidInputError, "nearest"),
      ({"n_discs": 0}, InvalidInputError, "n_discs")],
 )  # fmt: skip
 def test_a_wrong_description_is_refused(wrong, error, match):
@@ -300,11 +339,13 @@ def test_a_wrong_description_is_refused(wrong, error, match):
         pushing().params()
     with pytest.raises(DTypeError, match="shape: expected a Shape"):
         PlanarPushing("box", 0.01)
+    with pytest.raises(InvalidInputError, match="compliance: expected numbers of at least 0"):
+        pushing(drive=PositionDrive(1.0, -0.1)).params(torch.zeros(5, dtype=F64))
 
 
 def test_gradients_by_the_physics(build):
     """Of a step with contact, by everything that a ContactLCS can learn."""
-    system = ContactLCS(pushing(n_discs=2, compliance=0.1), LEARNABLE)
+    system = ContactLCS(pushing(n_discs=2, compliance=0.1, drive=PositionDrive(0.8, 0.3)), LEARNABLE)
     x = 0.05 * build.normal(0)(3, system.n_x)
     u = 0.02 * build.normal(1)(3, system.n_u)
 
@@ -316,6 +357,23 @@ def test_gradients_by_the_physics(build):
     system.forward = lambda x, u: system.params(x).step(x, u).x_next
     values = [0.1 * build.normal(2)(max(v.numel(), 1)).reshape(v.shape) for v in system.change.values()]
     assert torch.autograd.gradcheck(step, [v.requires_grad_() for v in values], atol=1e-5, rtol=1e-3)
+
+
+def test_gradients_by_masses_drives_and_states(build):
+    """Of the step of a body with inertia that discs with mass push, by all numbers that are there."""
+    x = 0.05 * build.normal(0)(3, 14)
+    u = 0.02 * build.normal(1)(3, 4)
+
+    def step(mass, damping, disc_mass, disc_damping, friction, vertices, x):
+        system = PlanarPushing(
+            Polygon(vertices), 0.01, 2, ForceDrive(disc_mass, 0.05, disc_damping), friction=friction, compliance=0.1,
+            inertia=Inertia(mass, 0.05, damping), length=0.03,
+        )  # fmt: skip
+        return 100 * system.params(x).step(x, u).x_next
+
+    vertices = box(-0.03, 0.03, -0.03, 0.03).vertices.clone()
+    values = [tensor(0.1), tensor(2.0), tensor(0.2), tensor(1.0), tensor(0.4), vertices, x]
+    assert torch.autograd.gradcheck(step, [v.requires_grad_() for v in values], atol=1e-4, rtol=1e-3)
 
 
 @pytest.mark.parametrize("loss", [violation_loss, prediction_loss])
@@ -366,6 +424,8 @@ def test_what_cannot_be_learned_is_refused():
     for physics, learn, match in (
         (pushing(friction=0.0), ("friction",), "friction above 0"),
         (pushing(**DRIVES["pd"]), ("gain",), "PositionDrive"),
+        (pushing(**DRIVES["pd"]), ("drive_compliance",), "PositionDrive"),
+        (pushing(), ("drive_compliance",), "compliance above 0"),
         (pushing(), ("mass",), "learn: expected some of"),
         (pushing(), ("friction", "friction"), "each once"),
     ):

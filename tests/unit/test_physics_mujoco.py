@@ -403,6 +403,19 @@ def test_a_box_at_rest_stays_at_rest():
     assert float(impulse) == pytest.approx(2 * 9.81 * 0.1, rel=1e-3)
 
 
+@pytest.mark.parametrize("heading", [0.0, 0.7])
+def test_a_box_that_slides_is_slowed_by_coulombs_friction_and_stays_on_the_floor(heading):
+    model = load("""<geom type="plane" size="1 1 1" friction=".3"/>
+      <body><freejoint name="b"/><geom type="box" size=".2 .2 .01" mass="2" friction=".3"/></body>""")
+    module = MujocoLCS(model, motion="dynamic", compliance=1e-5)
+    speed = 0.8 * np.array([np.cos(heading), np.sin(heading)])
+    x = tensor(0.0, 0.0, 0.01, 0.0, 0.0, 0.0, *speed, 0.0, 0.0, 0.0, 0.0)
+    after = module.params(x).step(x, torch.zeros(0).double()).x_next
+    assert float(after[2]) == pytest.approx(0.01, abs=2e-3)  # without the correction: 0.3 · 6 cm
+    slowed = (0.8 - 0.3 * 9.81 * 0.1) / 0.8
+    np.testing.assert_allclose(after[6:8], slowed * speed, atol=0.06)
+
+
 def test_a_falling_body_stops_at_the_floor():
     model = load(
         '<geom type="plane" size="1 1 1"/><body><joint name="z" type="slide" axis="0 0 1"/><geom size=".05"/></body>'

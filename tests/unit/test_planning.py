@@ -190,10 +190,35 @@ def test_a_journey_ends_after_its_patience():
     policy = on_a_line(patience=3)
     policy.travel = Never()
     modes = []
-    for _ in range(6):
+    for _ in range(9):
         policy.act([0.0, 0.51], [1.0])
         modes.append(policy.decision.mode)
-    assert modes == [Mode.TRAVEL] * 4 + [Mode.PUSH, Mode.TRAVEL]
+    # The one place that promises anything is then barred for a step, as nothing has come of it.
+    assert modes == [Mode.TRAVEL] * 4 + [Mode.PUSH] * 2 + [Mode.TRAVEL] * 3
+
+
+def test_a_place_from_which_nothing_moved_is_left_for_the_next_best():
+    class Two(Sides):
+        def sample(self, x):
+            return tensor([[-0.51], [-0.53]])
+
+    policy = on_a_line(Two())
+    targets = []
+    for _ in range(2):  # the block is stuck, whatever is planned
+        policy.act([0.0, 0.51], [1.0])
+        targets.append(round(float(policy.decision.target[1]), 2))
+        policy.act([0.0, targets[-1]], [1.0])
+        assert policy.decision.mode is Mode.PUSH
+    assert targets == [-0.51, -0.53]
+
+
+def test_what_was_barred_is_open_again_when_the_cost_has_changed():
+    policy = on_a_line()
+    policy.act([0.0, 0.51], [1.0])
+    policy.act([0.0, -0.51], [1.0])
+    policy.act([0.0, 0.51], [2.0])
+    assert policy.decision.mode is Mode.TRAVEL
+    assert float(policy.decision.target[1]) == pytest.approx(-0.51)
 
 
 @pytest.mark.parametrize(("keep", "mode"), [(0.0, Mode.PUSH), (1.0, Mode.TRAVEL)])

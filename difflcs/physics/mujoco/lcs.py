@@ -35,7 +35,8 @@ class MujocoLCS:
     - "quasi-static": the state is the positions. Joints with actuators move as they are told, u is by how much in this
       step; all else moves only while pushed. For slow pushing; gravity does nothing.
     - "dynamic": the state is positions and velocities. u is MuJoCo's `ctrl`; that of `position` actuators on joints
-      counts from where the joint is, unless `relative` is false.
+      counts from where the joint is, unless `relative` is false. Anitescu's cone is corrected for contacts that slide
+      with u = 0, which it would open, so that a box that slides stays on the floor.
 
     What a joint cannot move falls out of the Jacobians. Where all joints move in one plane, friction has one tangent,
     in this plane, and contacts across it, such as those of a floor below, are left out.
@@ -163,16 +164,23 @@ class MujocoLCS:
                 "x: expected states (..., n_x), as contacts depend on where things are, got None; pass x"
             )
         contacts, friction, free, x64 = self._look(x)
-        found = contact_lcs(
-            contacts,
-            free,
-            x64,
-            friction=friction,
-            compliance=self.compliance * self._give,
-            cone=self.cone,
-            length=self.length,
-            force=self.length / self._give,
-        )
+
+        def system(contacts: Contacts) -> LCSParams:
+            return contact_lcs(
+                contacts,
+                free,
+                x64,
+                friction=friction,
+                compliance=self.compliance * self._give,
+                cone=self.cone,
+                length=self.length,
+                force=self.length / self._give,
+            )
+
+        found = system(contacts)
+        if self.cone == "anitescu" and not self._quasi_static and self._finder.n_tangents and found.n_lam:
+            idle = x64.new_zeros(*x64.shape[:-1], self.n_u)
+            found = system(_sliding(contacts, friction, found.step(x64, idle).x_next - x64))
         return found if x.dtype == torch.float64 and x.is_cpu else found.to(device=x.device, dtype=x.dtype)
 
     def contacts(self, x: Tensor) -> Contacts:
@@ -252,6 +260,22 @@ class MujocoLCS:
                 "without actuators, and a mobility above 0"
             )
         return float(np.median(apart)) if len(apart) else 1.0
+
+
+def _sliding(contacts: Contacts, friction: Tensor, moved: Tensor) -> Contacts:
+    """Contacts without the gap that Anitescu's cone makes where a contact slides anyway, as far as `moved` (..., n_x).
+
+    A contact that slides by s opens by μ s in that model, as its gap is n·Δx − μ s. With μ s added, and a tangent along
+    the motion, friction is that of Coulomb without the opening.
+    """
+    slide = (contacts.tangent @ moved[..., None, :, None])[..., 0]
+    far, tangent = slide.norm(dim=-1, keepdim=True), contacts.tangent
+    if tangent.shape[-2] == 2:
+        along = torch.where(far > 1e-9, slide / far.clamp_min(1e-9), slide.new_tensor([1.0, 0.0]))
+        cos, sin = along[..., :1], along[..., 1:]
+        first, second = tangent.unbind(-2)
+        tangent = torch.stack([cos * first + sin * second, cos * second - sin * first], -2)
+    return Contacts(contacts.gap + friction * far[..., 0], contacts.normal, tangent)
 
 
 def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: Any) -> LCSParams:

@@ -167,7 +167,12 @@ class StandInObject:
     @property
     def outline(self) -> np.ndarray:
         """Points [m] around the object as seen from above, (K, 2)."""
-        return np.concatenate([primitive.outline() for primitive in self.ycb.stand_in]) - self._middle
+        return np.concatenate(self.outlines)
+
+    @property
+    def outlines(self) -> list[np.ndarray]:
+        """The same of each primitive."""
+        return [primitive.outline() - self._middle for primitive in self.ycb.stand_in]
 
     @property
     def _middle(self) -> np.ndarray:

@@ -1,0 +1,87 @@
+"""What the fingertips touch of an object: the cross section of its convex parts at the height of the tips."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from difflcs_envs.trifinger.objects import MeshObject, StandInObject
+
+if TYPE_CHECKING:
+    from difflcs_envs.trifinger.model import SceneObject
+
+__all__ = ["cross_section"]
+
+BAND = 0.004  # [m] about the height of the tips: a tip is a sphere, and touches what is a little above or below too
+COARSE = 1e-4  # [m] corners that stand out by less are left out
+LEAST_SIDE = 1e-3  # [m] parts smaller than this are left out
+
+
+def cross_section(scene_object: SceneObject) -> list[np.ndarray]:
+    """Convex polygons that together are the cross section of an object in its rest pose.
+
+    Args:
+        scene_object: A cube, an object with a mesh, or a stand-in. Of a stand-in all of every primitive counts, as
+            seen from above.
+
+    Returns:
+        Corners (n, 2) [m], counterclockwise, in coordinates of the object: the origin is its centre of mass.
+    """
+    if isinstance(scene_object, MeshObject):
+        height = scene_object.tip_height - scene_object.rest_height
+        pieces = [
+            np.concatenate([_cut(part, height + shift) for shift in (-BAND, 0.0, BAND)])
+            for part in scene_object.solid.parts
+        ]
+    elif isinstance(scene_object, StandInObject):
+        pieces = scene_object.outlines
+    else:
+        pieces = [scene_object.outline]
+    polygons = [_simplified(_hull(points)) for points in pieces if len(points) >= 3]
+    return [p for p in polygons if len(p) >= 3 and np.ptp(p, axis=0).min() >= LEAST_SIDE]
+
+
+def _cut(points: np.ndarray, height: float) -> np.ndarray:
+    """Points (k, 2) whose hull is the cross section of the hull of points (n, 3)."""
+    above, below = points[points[:, 2] >= height], points[points[:, 2] < height]
+    if not len(above) or not len(below):
+        return np.zeros((0, 2))
+    share = (height - below[:, None, 2]) / (above[None, :, 2] - below[:, None, 2])
+    cut = below[:, None, :2] + share[..., None] * (above[None, :, :2] - below[:, None, :2])
+    return _hull(cut.reshape(-1, 2))
+
+
+def _hull(points: np.ndarray) -> np.ndarray:
+    """Convex hull (n, 2), counterclockwise (Andrew's monotone chain)."""
+    points = np.unique(points, axis=0)
+    if len(points) < 3:
+        return points
+
+    def chain(ordered: np.ndarray) -> list[np.ndarray]:
+        kept: list[np.ndarray] = []
+        for p in ordered:
+            while len(kept) >= 2 and _turn(kept[-2], kept[-1], p) <= 0:
+                kept.pop()
+            kept.append(p)
+        return kept[:-1]
+
+    return np.array(chain(points) + chain(points[::-1]))
+
+
+def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> float:
+    return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
+
+
+def _simplified(polygon: np.ndarray) -> np.ndarray:
+    """A convex polygon without the corners that stand out by less than COARSE, the flattest first."""
+    while len(polygon) > 3:
+        before, after = np.roll(polygon, 1, 0), np.roll(polygon, -1, 0)
+        chord, to = after - before, polygon - before
+        length = np.maximum(np.hypot(*chord.T), 1e-12)
+        stands_out = np.abs(chord[:, 0] * to[:, 1] - chord[:, 1] * to[:, 0]) / length
+        flattest = int(stands_out.argmin())
+        if stands_out[flattest] >= COARSE:
+            break
+        polygon = np.delete(polygon, flattest, 0)
+    return polygon

@@ -1,0 +1,166 @@
+"""LCS-RL with physics inside: what a task tells of its physics, the loss, what is refused, and that it learns."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+pytest.importorskip("gymnasium", reason="needs the extra [rl]")
+pytest.importorskip("tensordict", reason="needs the extra [rl]")
+
+from difflcs import Scales, violation_loss
+from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
+from difflcs.lcp import solve_lcp
+from difflcs.physics import ContactLCS, PlanarPushing, PositionDrive, box
+from difflcs.rl import ContactMethod, PhysicsFit, PhysicsFitSettings, PhysicsSpec, evaluate, get_task
+from difflcs.rl.contact_method import known_physics, physics_loss
+from difflcs.rl.methods import Work
+from difflcs.rl.trainer import configuration
+from tests.conformance.toy import Guess, make_task
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+F64 = torch.float64
+SCALE = torch.tensor([0.05, 0.05, 1.0, 0.2, 0.2], dtype=F64)
+
+
+def pushing(**values):
+    given = {"friction": 0.4, "compliance": 0.05, "drive": PositionDrive(0.8, 0.2), **values}
+    return PlanarPushing(box(-0.03, 0.03, -0.02, 0.02), 0.01, **given)
+
+
+@pytest.fixture
+def pushes(build):
+    """A system, and transitions of another one."""
+    lcs = ContactLCS(pushing(), ("friction", "gain", "drive_compliance"))
+    x, u = 0.05 * build.normal(0)(40, 5), 0.01 * build.normal(1)(40, 2)
+    x[:, 3] = -0.042
+    true = pushing(friction=0.7, drive=PositionDrive(0.6, 0.5))
+    return lcs, x, u, true.params(x).step(x, u).x_next
+
+
+def test_the_violation_loss_is_that_of_the_units_of_the_task(pushes):
+    lcs, x, u, x_next = pushes
+    found = physics_loss(lcs, x, u, x_next, SCALE, PhysicsFitSettings(), 1e-4)
+
+    # `Scales.params` goes the other way: with the inverse units it brings a system in metres to these.
+    inverse = Scales(torch.zeros(5, dtype=F64), 1 / SCALE, torch.ones(2, dtype=F64), 1.0, 1.0)
+    scaled = inverse.params(lcs.params(x))
+    torch.testing.assert_close(found, violation_loss(scaled, x / SCALE, u, x_next / SCALE, "auto", 0.02))
+
+
+def test_the_prediction_loss_is_the_error_of_the_motion_that_the_mpc_plans_with(pushes):
+    lcs, x, u, x_next = pushes
+    found = physics_loss(lcs, x, u, x_next, SCALE, PhysicsFitSettings(loss="prediction"), 1e-4)
+    system = lcs.params(x)
+    lam = solve_lcp(system.F, system.gap(x, u), relaxation=1e-4).lam
+    error = (system.next_state(x, u, lam) - x_next) / SCALE
+    torch.testing.assert_close(found, 0.5 * error.square().sum(1).mean())
+
+
+@pytest.mark.parametrize("loss", ["violation", "prediction"])
+def test_physics_is_found_by_both_losses(pushes, loss):
+    lcs, x, u, x_next = pushes
+    settings = PhysicsFitSettings(loss=loss)
+    adam = torch.optim.Adam(lcs.parameters(), 0.05)
+    for _ in range(150):
+        adam.zero_grad()
+        physics_loss(lcs, x, u, x_next, SCALE, settings, 1e-8).backward()
+        adam.step()
+    found = lcs.summary()
+    assert found["friction"][0] == pytest.approx(0.7, abs=0.07)
+    assert found["gain"][0][0] == pytest.approx(0.6, abs=0.03)
+    assert found["drive_compliance"][0][0] == pytest.approx(0.5, abs=0.1)
+
+
+# --- what a task tells ------------------------------------------------------------------------------------------------
+
+
+def test_a_description_of_physics_is_checked():
+    for wrong, error in (
+        ({"make_system": 3}, DTypeError),
+        ({"make_cost": 3}, DTypeError),
+        ({"scale": (1.0, 0.0)}, InvalidInputError),
+        ({"horizon": 0}, InvalidInputError),
+        ({"relaxation": -1.0}, InvalidInputError),
+    ):
+        with pytest.raises(error, match=next(iter(wrong))):
+            PhysicsSpec(**{"make_system": lambda: None, "scale": (1.0,), **wrong})
+    with pytest.raises(DTypeError, match="physics: expected a PhysicsSpec"):
+        make_task(physics=ContactLCS)
+
+
+def test_the_policy_plans_with_what_the_description_says():
+    task, method = make_task(), ContactMethod()
+    spec = task.physics
+    own = replace(task, physics=replace(spec, horizon=5, relaxation=0.01, make_cost=task.make_cost))
+    for one, wanted in ((task, (task.horizon, 1e-3)), (own, (5, 0.01))):
+        policy = method.policy(one, spec.make_system())
+        assert (policy.horizon, policy.relaxation) == wanted
+
+
+def test_a_task_without_physics_is_refused():
+    task = make_task(physics=None)
+    with pytest.raises(InvalidInputError, match="known physics for contact-lcs, got toy without"):
+        known_physics(task)
+
+
+def test_what_was_learned_of_another_object_is_refused():
+    def task(width):
+        guess = PlanarPushing(box(-width, width, -0.02, 0.02), 0.01, friction=0.4)
+        return make_task(physics=PhysicsSpec(make_system=lambda: ContactLCS(guess), scale=(1.0,) * 5))
+
+    learned = task(0.03).physics.make_system()
+    state = {name: value + 0.1 for name, value in learned.state_dict().items()}
+    method = ContactMethod()
+    found = method.rebuild(task(0.03), configuration(learned), state, "here")
+    torch.testing.assert_close(found.physics.friction.detach(), torch.tensor([0.4], dtype=F64) * torch.e**0.1)
+    method.rebuild(task(0.03 + 1e-12), configuration(learned), state, "here")  # the rounding of another machine
+    for other in (task(0.04), make_task()):
+        with pytest.raises(CheckpointError, match="here: expected what is known of task toy"):
+            method.rebuild(other, configuration(learned), state, "here")
+    with pytest.raises(CheckpointError, match="expected tensors"):
+        method.rebuild(task(0.03), configuration(learned), dict(list(state.items())[1:]), "here")
+    broken = {**state, "change.friction": torch.full((1,), torch.nan, dtype=F64)}
+    with pytest.raises(CheckpointError, match="expected finite"):
+        method.rebuild(task(0.03), configuration(learned), broken, "here")
+
+
+# --- learning ---------------------------------------------------------------------------------------------------------
+
+
+def test_it_learns_how_a_point_slides():
+    task = make_task()
+    envs = task.make_envs(5)
+    trainer = ContactMethod(fit=PhysicsFitSettings(rollouts=5, learning_rate=0.1)).trainer(
+        Work(task, 0, 10, task.make_envs)
+    )
+    assert isinstance(trainer, PhysicsFit)
+    before = evaluate(envs, trainer.policy, 20, 3, 5).median_errors["position_error"]
+    reports = [trainer.step() for _ in range(2)]
+    guess = trainer.learned
+    assert isinstance(guess, Guess)
+    assert float(guess.gain.detach()) == pytest.approx(1.0, abs=0.02)
+    assert float(guess.fade.detach()) == pytest.approx(0.5, abs=0.05)
+    assert reports[-1].loss < 0.01 * reports[0].first_loss
+    assert evaluate(envs, trainer.policy, 20, 3, 5).median_errors["position_error"] < before
+    with pytest.raises(InvalidInputError, match="all of them are done"):
+        trainer.step()
+    trainer.env.close()
+    envs.close()
+
+
+@pytest.mark.slow
+def test_the_cube_is_pushed_before_anything_is_learned_and_after():
+    pytest.importorskip("mujoco", reason="the environments need the extra [envs]")
+    task = get_task("cube")
+    envs = task.make_envs(20)
+    trainer = ContactMethod(fit=PhysicsFitSettings(rollouts=10, steps=30)).trainer(Work(task, 0, 10, task.make_envs))
+    assert evaluate(envs, trainer.policy, 20, 5, task.episode_steps).successes >= 18  # a chance of 1e-3 at 0.97
+    report = trainer.step()
+    assert report.loss < report.first_loss
+    assert evaluate(envs, trainer.policy, 20, 5, task.episode_steps).successes >= 18
+    trainer.env.close()
+    envs.close()

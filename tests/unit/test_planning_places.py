@@ -1,0 +1,233 @@
+"""Where end effectors could be, and how they get there without touching."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from difflcs.errors import InvalidInputError, ShapeError
+from difflcs.physics import Circle, PDDrive, PlanarPushing, Polygon, Union, box
+from difflcs.planning import DiscPlaces, LiftTravel, PlanarTravel, Workspace
+from difflcs.planning.outline import clearance, ring
+from difflcs.planning.pusht import CENTER_OF_MASS, DRIVE, GYRATION, PushTPolicy, from_origin, tee, tee_pushing
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+F64 = torch.float64
+RADIUS = 0.15
+SHAPES = {
+    "circle": Circle(0.5, (0.3, 0.1)),
+    "box": box(-0.5, 0.5, -0.2, 0.2),
+    "not convex": Polygon([[0.0, 0.0], [1.0, 0.0], [0.2, 0.2], [0.0, 1.0]]),
+    "tee": tee(),
+    "apart": Union((box(-0.5, -0.1, -0.2, 0.2), Circle(0.3, (0.4, 0.0)))),
+}
+
+
+def tensor(values):
+    return torch.tensor(values, dtype=F64)
+
+
+# --- curves round a shape ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_a_ring_has_its_distance_and_equal_steps_and_goes_round_once(name):
+    shape = SHAPES[name]
+    points = ring(shape, 0.17, 80)
+    torch.testing.assert_close(clearance(shape, points), torch.full((80,), 0.17, dtype=F64))
+    steps = (points.roll(-1, 0) - points).norm(dim=1)
+    assert float(steps.min()) > 0.6 * float(steps.max())
+    # Counterclockwise, once: seen from a point inside, the angles add up to a turn.
+    inside = {"not convex": [0.1, 0.1], "apart": [-0.3, 0.0]}.get(name, [0.3, 0.0] if name == "circle" else [0.0, 0.0])
+    apart = points - tensor(inside)
+    after = apart.roll(-1, 0)
+    turns = torch.atan2(apart[:, 0] * after[:, 1] - apart[:, 1] * after[:, 0], (apart * after).sum(1))
+    assert float(turns.sum()) == pytest.approx(2 * math.pi)
+
+
+def test_the_length_of_a_ring_is_that_of_geometry():
+    points = ring(box(-0.5, 0.5, -0.2, 0.2), 0.1, 400)
+    length = float((points.roll(-1, 0) - points).norm(dim=1).sum())
+    assert length == pytest.approx(2 * 1.4 + 2 * math.pi * 0.1, rel=2e-3)
+
+
+def test_a_ring_is_refused_where_there_is_none():
+    with pytest.raises(InvalidInputError, match="distance"):
+        ring(SHAPES["box"], 0.0, 10)
+    with pytest.raises(InvalidInputError, match="n_points"):
+        ring(SHAPES["box"], 0.1, 2)
+
+
+# --- places -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), (1.0, -2.0, 2.5)])
+def test_discs_on_places_have_the_gap_and_are_at_rest(pose):
+    system = tee_pushing()
+    places = DiscPlaces(tee(), RADIUS, 40, gap=0.03)
+    x = tensor([*pose, 5.0, 5.0, 1.0, -1.0])
+    states = places.states(x, places.sample(x))
+    assert states.shape == (40, 7)
+    torch.testing.assert_close(system.contacts(states).gap.amin(-1), torch.full((40,), 0.03, dtype=F64))
+    torch.testing.assert_close(states[:, :3], x[:3].expand(40, 3))
+    assert not bool(states[:, 5:].any())
+    assert bool(places.allowed(states).all())
+
+
+def test_near_is_within_reach():
+    places = DiscPlaces(box(-1, 1, -1, 1), 0.1, reach=0.2)
+    assert places.near(tensor([0.0, 0.0, 0.0, 1.29, 0.0]))
+    assert not places.near(tensor([0.0, 0.0, 0.0, 1.31, 0.0]))
+
+
+def test_places_outside_the_workspace_are_not_allowed():
+    workspace = Workspace((-1.0, -1.0), (1.0, 1.0), step=0.1)
+    places = DiscPlaces(box(-0.2, 0.2, -0.2, 0.2), 0.1, 40, workspace=workspace, margin=0.1)
+    x = tensor([0.8, 0.0, 0.0, 0.0, 0.0])
+    states = places.states(x, places.sample(x))
+    torch.testing.assert_close(places.allowed(states), states[:, 3] <= 0.9)
+    assert 5 < int(places.allowed(states).sum()) < 35
+
+
+def test_of_several_discs_each_moves_alone_and_some_together():
+    places = DiscPlaces(box(-0.5, 0.5, -0.5, 0.5), 0.1, 16, n_discs=2, together=10)
+    x = tensor([0.2, 0.1, 0.4, 1.5, 0.0, -1.5, 0.0])
+    sampled = places.sample(x)
+    states = places.states(x, sampled)
+    assert len(states) == 42
+    torch.testing.assert_close(states[:16, 5:7], x[5:7].expand(16, 2))
+    torch.testing.assert_close(states[16:32, 3:5], x[3:5].expand(16, 2))
+    moved = (states[32:, 3:] - x[3:]).abs() > 1e-6
+    assert bool(moved[:, :2].any(1).all())
+    assert bool(moved[:, 2:].any(1).all())
+    apart = (states[:, 3:5] - states[:, 5:7]).norm(dim=1)
+    torch.testing.assert_close(places.allowed(states), apart > 0.2)
+    assert not torch.equal(places.sample(x)[32:], sampled[32:])
+
+
+def test_bounds_of_the_workspace_hold_targets_inside():
+    workspace = Workspace((0.0, 0.0), (1.0, 2.0), step=0.3)
+    low, high = workspace.bounds(tensor([[0, 0, 0, 0.1, 1.0], [0, 0, 0, 0.9, 1.9], [0, 0, 0, 1.2, -0.1]]))
+    torch.testing.assert_close(low, tensor([[-0.1, -0.3], [-0.3, -0.3], [-0.3, 0.0]]))
+    torch.testing.assert_close(high, tensor([[0.3, 0.3], [0.1, 0.1], [0.0, 0.3]]))
+
+
+def test_a_workspace_that_is_none_is_refused():
+    with pytest.raises(InvalidInputError, match="low"):
+        Workspace((0.0, 1.0), (1.0, 1.0), step=0.1)
+    with pytest.raises(ShapeError, match="high"):
+        Workspace((0.0, 0.0), (1.0,), step=0.1)
+    with pytest.raises(InvalidInputError, match="step"):
+        Workspace((0.0, 0.0), (1.0, 1.0), step=0.0)
+
+
+# --- travel -----------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def round_the(name):
+    return PlanarTravel(SHAPES[name], 0.1, 0.2), DiscPlaces(SHAPES[name], 0.1, 40, gap=0.02)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from(sorted(SHAPES)))
+def test_a_disc_gets_round_every_shape_without_touching_it(seed, name):
+    shape, generator = SHAPES[name], torch.Generator().manual_seed(seed)
+    travel, places = round_the(name)
+    x = tensor([0.3, -0.2, 1.0, 0.0, 0.0])
+    states = places.states(x, places.sample(x))
+    first, last = torch.randint(40, (2,), generator=generator).tolist()
+    x, target = states[first], states[last]
+    for _ in range(60):
+        if travel.arrived(x, target):
+            break
+        u = travel.action(x, target)
+        assert float(u.norm()) <= 0.2 + 1e-12
+        on_the_way = torch.cat([x.expand(10, -1)[:, :3], x[3:] + torch.linspace(0.1, 1, 10, dtype=F64)[:, None] * u], 1)
+        assert float(PlanarPushing(shape, 0.1).contacts(on_the_way).gap.min()) > -1e-3
+        x = on_the_way[-1]
+    assert travel.arrived(x, target)
+
+
+def test_a_disc_goes_straight_where_it_can():
+    travel = PlanarTravel(box(-0.5, 0.5, -0.5, 0.5), 0.1, 0.2)
+    x, target = tensor([0, 0, 0, 1.0, 1.0]), tensor([0, 0, 0, -1.0, 1.0])
+    torch.testing.assert_close(travel.action(x, target), tensor([-0.2, 0.0]))
+    torch.testing.assert_close(travel.distance(x, target.unsqueeze(0)), tensor([2.0]))
+
+
+def test_the_way_round_stays_in_the_workspace():
+    shape = box(-0.5, 0.5, -0.5, 0.5)
+    x, target = tensor([0, 0, 0, -0.65, 0.1]), tensor([0, 0, 0, 0.65, 0.1])
+    free = PlanarTravel(shape, 0.1, 0.2)
+    walled = PlanarTravel(shape, 0.1, 0.2, workspace=Workspace((-1.0, -1.0), (1.0, 0.55), step=0.2))
+    assert float(free.action(x, target)[1]) > 0
+    assert float(walled.action(x, target)[1]) < 0
+
+
+def test_what_is_lifted_goes_aside_only_above():
+    travel = LiftTravel(0.3, 0.05, [[0, 1, 2], [3, 4, 5]], tolerance=0.01)
+    x, target = tensor([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]), tensor([0.2, 0.1, 0.02, 1.0, 0.0, 0.0])
+    torch.testing.assert_close(
+        travel.distance(x, torch.stack([target, x])), tensor([0.3 + 0.28 + math.hypot(0.2, 0.1), 0.0])
+    )
+    heights = []
+    for _ in range(60):
+        if travel.arrived(x, target):
+            break
+        u = travel.action(x, target)
+        assert float(u[:3].norm()) <= 0.05 + 1e-12
+        if float(u[:2].norm()) > 0.02:
+            heights.append(float(x[2]))
+        x = x + u
+    assert travel.arrived(x, target)
+    assert min(heights) > 0.28
+    torch.testing.assert_close(x[3:], target[3:])
+
+
+def test_an_end_effector_in_space_has_three_coordinates():
+    with pytest.raises(ShapeError, match="effectors"):
+        LiftTravel(0.3, 0.05, [[0, 1]], tolerance=0.01)
+
+
+# --- Push-T, without the environment ----------------------------------------------------------------------------------
+
+
+def test_the_tee_is_that_of_the_environment():
+    system = tee_pushing()
+    # Moments that pymunk gives: twice that of a bar of 120 × 30 about the middle of its upper edge, for a mass of 1.
+    bar = (120**2 + 30**2) / 12 + 15**2
+    assert pytest.approx(2 * bar / 100**2) == GYRATION**2
+    assert isinstance(system.drive, PDDrive)
+    area, centroid, _ = tee().moments()
+    assert float(area) == pytest.approx(0.63)
+    torch.testing.assert_close(centroid, torch.zeros(2, dtype=F64))
+    # The mean of the centres of both boxes, from the origin of the T, through the middle of the bar.
+    middle = from_origin([0.0, 0.0, 0.0])[1]
+    assert pytest.approx(middle + CENTER_OF_MASS[1]) == 0.5 * (0.15 + 0.75)
+    turned = from_origin([100.0, 200.0, math.pi / 2])
+    assert turned == pytest.approx([1.0 - middle, 2.0, math.pi / 2])
+
+
+def test_a_policy_for_push_t_sends_the_disc_to_places_in_the_plane():
+    policy = PushTPolicy(places=24)
+    target = policy.act([400.0, 400.0, 256.0, 256.0, 0.0])
+    assert target.shape == (2,)
+    assert ((target >= 0) & (target <= 512)).all()
+    assert policy.sampling.decision.mode == "travel"
+
+
+def test_actions_that_come_late_are_planned_from_where_things_will_be():
+    late, seen = PushTPolicy(places=24, delay=1), [400.0, 400.0, 256.0, 256.0, 0.0]
+    sent = late.act(seen)
+    torch.testing.assert_close(late.sampling.decision.states[0, 3:5], tensor([4.0, 4.0]))  # nothing is under way
+    late.sampling.reset()
+    late.act(seen)
+    expected = 4.0 + DRIVE.step().b[0] * (tensor(sent) / 100 - 4.0)
+    torch.testing.assert_close(late.sampling.decision.states[0, 3:5], expected)
