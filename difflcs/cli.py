@@ -207,7 +207,7 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Render:
-    """Video of a learned model at work, one episode per goal; or of a policy that plans with known physics."""
+    """Video of a learned model at work, one episode per goal; or of Push-T."""
 
     model: Path
     """Run directory, or zoo:NAME for one of the models that `difflcs zoo` lists; or pusht, which has no goals."""

@@ -166,7 +166,7 @@ class SamplingPolicy:
         self._steps = 0
         self._last: Tensor | None = None
         self._barred: list[Tensor] = []
-        self._reference = math.inf
+        self._reference = 0.0
 
     @property
     def decision(self) -> Decision | None:

@@ -189,7 +189,9 @@ def test_a_tip_goes_straight_where_it_can_and_over_the_cube_where_it_must():
     travel.tips = np.array([[0.09, 0.0, 0.1], [-0.09, 0.02, 0.1], [0.0, 0.1, 0.1]])
     far, near = travel.distance(target, states).tolist()
     assert far > near
-    assert not travel.arrived(target, target)
+    assert travel.arrived(states[0], target)
+    assert not travel.arrived(states[1], target)  # another finger
+    assert not travel.arrived(state(pose, [-0.055, 0.02, 0.022], 0.0), target)
 
 
 def test_a_policy_without_its_packages_says_what_to_install(monkeypatch):

@@ -212,6 +212,15 @@ def test_a_place_from_which_nothing_moved_is_left_for_the_next_best():
     assert targets == [-0.51, -0.53]
 
 
+def test_what_was_barred_is_open_again_when_the_cost_has_changed():
+    policy = on_a_line()
+    policy.act([0.0, 0.51], [1.0])
+    policy.act([0.0, -0.51], [1.0])
+    policy.act([0.0, 0.51], [2.0])
+    assert policy.decision.mode is Mode.TRAVEL
+    assert float(policy.decision.target[1]) == pytest.approx(-0.51)
+
+
 @pytest.mark.parametrize(("keep", "mode"), [(0.0, Mode.PUSH), (1.0, Mode.TRAVEL)])
 def test_hysteresis_says_when_a_better_place_is_worth_a_journey(keep, mode):
     # From where the pusher is, three tenths away from the block, a plan gains less than from the place beside it.

@@ -209,5 +209,5 @@ class FingerTravel:
 
     def arrived(self, x: Tensor, target: Tensor) -> bool:
         """See `Travel`."""
-        tip, end = self.tips[int(target[FINGER])], target[TIP].numpy() * UNIT
-        return bool(np.linalg.norm(tip - end) < self.tolerance)
+        near = float((x[TIP] - target[TIP]).norm()) * UNIT < self.tolerance
+        return near and float(x[FINGER]) == float(target[FINGER])
