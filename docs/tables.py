@@ -246,6 +246,22 @@ def success(record: dict) -> str:
     return table(head, [[*cells, duration(1e-3 * row["milliseconds_per_step"])]])
 
 
+def objects(record: dict) -> str:
+    """Success on the objects: of one training over minutes of data, and of all seeds at the end."""
+    few = [row for row in record["rows"] if row["seed"] == 0 and row["goals"] == 250]
+    many = [row for row in record["rows"] if row["goals"] == 1000 and row["minutes"] == row["total_minutes"]]
+    minutes = sorted({row["minutes"] for row in few})
+    tasks = list(dict.fromkeys(row["task"] for row in few))
+    rows = []
+    for task in tasks:
+        one = {row["minutes"]: f"{100 * row['success_rate']:.1f} %" for row in few if row["task"] == task}
+        found = [100 * row["success_rate"] for row in many if row["task"] == task]
+        mean = f"{sum(found) / len(found):.1f} % ({min(found):.1f} to {max(found):.1f})" if found else ""
+        rows.append([task.replace("_", " "), *(one.get(m, "") for m in minutes), mean, f"{len(found)}"])
+    head = ["", *(f"{m:g} min" for m in minutes), "3 min, all seeds: mean and range", "seeds"]
+    return table(head, rows)
+
+
 VARIANTS = {
     "known": "physics as it is",
     "learned": "physics learned from 2 minutes of random pushing",
@@ -319,6 +335,7 @@ TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "latency": {"ways": latency},
     "delay": {"ways": delay},
     "physics": {"errors": errors},
+    "objects": {"success": objects},
     "box_to_pose": {"success": success},
     "pusht": {"variants": pusht, "published": published},
 }
