@@ -22,7 +22,7 @@ from difflcs.lcp import solve_lcp
 from difflcs.lcs import LCSModule, LCSParams
 from difflcs.losses import violation_loss
 from difflcs.mpc import LCSMPCLayer
-from difflcs.mpc.backends import BatchedBackend, get_backend
+from difflcs.mpc.backends import get_backend
 from difflcs.rl.lcs_rl import LCSRL
 from difflcs.rl.learned import check_depends, check_module
 from difflcs.rl.methods import Method, Work, main_phase, register_method, short_main, short_models
@@ -44,7 +44,7 @@ from difflcs.rl.rollout import (
 from difflcs.rl.seeding import Stream, episode_seeds
 from difflcs.rl.settings import MOST_ENVS, Settings, bounded, group
 from difflcs.rl.state import State
-from difflcs.rl.tasks import PhysicsSpec, TaskSpec
+from difflcs.rl.tasks import PhysicsSpec, TaskSpec, one_start
 from difflcs.rl.trainer import AfterStep, Trainer, configuration
 
 if TYPE_CHECKING:
@@ -315,21 +315,8 @@ class ContactMethod(Method):
         return lcs
 
     def policy(self, task: TaskSpec, learned: LCSModule) -> LCSMPCLayer:
-        """See `Method`: the MPC as `PhysicsSpec` says, from one start along a short homotopy, as in `LCSMethod`."""
-        spec, backend = known_physics(task), get_backend(self.backend)
-        if isinstance(backend, BatchedBackend):
-            backend = replace(backend, effort="fast", homotopy=backend.homotopy or 100.0)
-        low, high = task.bounds
-        return LCSMPCLayer(
-            learned,
-            (spec.make_cost or task.make_cost)(),
-            horizon=spec.horizon or task.horizon,
-            u_min=low,
-            u_max=high,
-            backend=backend,
-            relaxation=spec.relaxation or task.relaxation,
-            on_failure="mask",
-        )
+        """See `Method`: the MPC as `PhysicsSpec` says."""
+        return task.make_policy(learned, one_start(self.backend), known_physics(task))
 
     def smoke(self) -> Self:
         """See `Method`."""

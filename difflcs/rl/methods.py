@@ -26,7 +26,7 @@ from torch import Tensor
 
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
 from difflcs.lcs import LCSModel, LCSModule
-from difflcs.mpc.backends import BatchedBackend, get_backend
+from difflcs.mpc.backends import get_backend
 from difflcs.rl.dynamics import Ensemble
 from difflcs.rl.lcs_rl import LCSRL
 from difflcs.rl.mlp import MLPController
@@ -36,7 +36,7 @@ from difflcs.rl.ppo import PPO, PPOReport
 from difflcs.rl.ppo_settings import PPOSettings, make_ppo
 from difflcs.rl.rollout import Policy
 from difflcs.rl.settings import MOST_WIDTH, Adam, Epochs, Rollouts, Settings, bounded, group
-from difflcs.rl.tasks import TaskSpec
+from difflcs.rl.tasks import TaskSpec, one_start
 from difflcs.rl.trainer import Trainer
 from difflcs.rl.warmup import Warmup, WarmupReport, WarmupSettings
 
@@ -153,16 +153,8 @@ class LCSMethod(Method):
         return lcs
 
     def policy(self, task: TaskSpec, learned: LCSModule) -> LCSMPCLayer:
-        """See `Method`.
-
-        The solver tries one start, along a short homotopy. With three it finds another plan in one state of seven and
-        takes twice as long; what is learned is how those of one start do on the robot, and plans that jump from optimum
-        to optimum when the system changes a little teach little.
-        """
-        backend = get_backend(self.backend)
-        if isinstance(backend, BatchedBackend):
-            backend = replace(backend, effort="fast", homotopy=backend.homotopy or 100.0)
-        return task.make_policy(learned, backend)
+        """See `Method`."""
+        return task.make_policy(learned, one_start(self.backend))
 
     def initial(self, work: Work) -> LCSModule:
         """The model to start from. Override it, with `kind` and `rebuild`, to learn a module of your own."""

@@ -15,7 +15,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import metadata
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -28,7 +28,7 @@ from difflcs.cost import GoalCost
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.lcs import LCSModule
 from difflcs.mpc import LCSMPCLayer
-from difflcs.mpc.backends import Backend
+from difflcs.mpc.backends import Backend, BatchedBackend, get_backend
 from difflcs.rl._optional import require
 
 if TYPE_CHECKING:
@@ -300,17 +300,22 @@ class TaskSpec:
                 f"task {self.name}: its environment cannot be made: {type(error).__name__}: {error}"
             ) from error
 
-    def make_policy(self, lcs: LCSModule, backend: str | Backend = "batched") -> LCSMPCLayer:
-        """The MPC around a model; unsolved elements are masked, never raised, so that they cannot end a training."""
+    def make_policy(
+        self, lcs: LCSModule, backend: str | Backend = "batched", plan: PhysicsSpec | None = None
+    ) -> LCSMPCLayer:
+        """The MPC around a model; unsolved elements are masked, never raised, so that they cannot end a training.
+
+        It has cost, horizon and relaxation of the task, or those of `plan` where that has any.
+        """
         low, high = self.bounds
         return LCSMPCLayer(
             lcs,
-            self.make_cost(),
-            horizon=self.horizon,
+            ((plan and plan.make_cost) or self.make_cost)(),
+            horizon=(plan and plan.horizon) or self.horizon,
             u_min=low,
             u_max=high,
             backend=backend,
-            relaxation=self.relaxation,
+            relaxation=(plan and plan.relaxation) or self.relaxation,
             on_failure="mask",
         )
 
@@ -320,6 +325,18 @@ class TaskSpec:
             return self.caption(info)
         known = [(q, info[q.name]) for q in self.errors if q.name in info]
         return ", ".join(f"{q.name.replace('_', ' ')} {float(value):.3g} {q.unit}".strip() for q, value in known)
+
+
+def one_start(name: str) -> Backend:
+    """The solver of a name as trainings use it: `batched` tries one start, along a short homotopy.
+
+    With three it finds another plan in one state of seven and takes twice as long; what is learned is how those of one
+    start do on the robot, and plans that jump from optimum to optimum when the system changes a little teach little.
+    """
+    backend = get_backend(name)
+    if isinstance(backend, BatchedBackend):
+        return replace(backend, effort="fast", homotopy=backend.homotopy or 100.0)
+    return backend
 
 
 # --- registry ---------------------------------------------------------------------------------------------------------
