@@ -29,7 +29,7 @@ from difflcs.physics.contacts import Cone, Contacts, FreeMotion, contact_lcs, co
 from difflcs.physics.shapes import Distance, Shape
 from difflcs.records import LCSParams
 
-__all__ = ["Drive", "ForceDrive", "Inertia", "PDDrive", "PlanarPushing", "PositionDrive"]
+__all__ = ["Drive", "ForceDrive", "Inertia", "PDDrive", "PlanarPushing", "PositionDrive", "to_body"]
 
 
 class DriveStep(NamedTuple):
@@ -305,17 +305,11 @@ class PlanarPushing:
         mass = float(_number("mass", self.inertia.mass).detach())
         return (self.length or 1.0) * mass / self.inertia.seconds
 
-    def to_body(self, x: Tensor, points: Tensor) -> Tensor:
-        """Points (..., n, 2) of the plane in coordinates of the body at states x (..., n_x)."""
-        cos, sin = x[..., 2:3].cos(), x[..., 2:3].sin()
-        dx, dy = (points - x[..., None, :2]).unbind(-1)
-        return torch.stack([cos * dx + sin * dy, cos * dy - sin * dx], -1)
-
     def contacts(self, x: Tensor) -> Contacts:
         """Gaps of all discs, and their derivatives; each disc has a contact with each part, or the nearest."""
         m, parts, batch = self.n_discs, self.parts_touched, x.shape[:-1]
         discs = x[..., 3 : 3 + 2 * m].reshape(*batch, m, 2)
-        found = self.shape.distance(self.to_body(x, discs))
+        found = self.shape.distance(to_body(x, discs))
         if parts < self.shape.n_parts:
             kept = found.distance.detach().topk(parts, largest=False).indices
             found = Distance(*(_chosen(value, kept) for value in found))
@@ -393,6 +387,13 @@ def _chosen(values: Tensor, parts: Tensor) -> Tensor:
     if values.ndim > parts.ndim:
         return values.gather(-2, parts.unsqueeze(-1).expand(*parts.shape, values.shape[-1]))
     return values.gather(-1, parts)
+
+
+def to_body(x: Tensor, points: Tensor) -> Tensor:
+    """Points (..., n, 2) of the plane in coordinates of the body whose pose begins the states x (..., n_x)."""
+    cos, sin = x[..., 2:3].cos(), x[..., 2:3].sin()
+    dx, dy = (points - x[..., None, :2]).unbind(-1)
+    return torch.stack([cos * dx + sin * dy, cos * dy - sin * dx], -1)
 
 
 def _number(name: str, value: Any) -> Tensor:

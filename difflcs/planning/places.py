@@ -11,10 +11,11 @@ from torch import Tensor
 
 from difflcs._checks import check_number, check_positive_int, check_tensor
 from difflcs.errors import InvalidInputError, ShapeError
+from difflcs.physics.planar import to_body
 from difflcs.physics.shapes import Shape
 from difflcs.planning.outline import clearance, ring
 
-__all__ = ["DiscPlaces", "Places", "Workspace", "from_body", "to_body"]
+__all__ = ["DiscPlaces", "Places", "Workspace", "from_body"]
 
 
 class Places(Protocol):
@@ -80,11 +81,6 @@ class Workspace:
         """(...) bool: which points (..., 2) are inside, and `margin` away from the border [length]."""
         low, high = points.new_tensor(self.low) + margin, points.new_tensor(self.high) - margin
         return ((points >= low) & (points <= high)).all(-1)
-
-
-def to_body(x: Tensor, points: Tensor) -> Tensor:
-    """Points (..., 2) of the plane in coordinates of the body whose pose begins the state x (n_x,)."""
-    return (points - x[:2]) @ _rotation(x)
 
 
 def from_body(x: Tensor, points: Tensor) -> Tensor:

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from difflcs._checks import check_number, check_positive_int
 from difflcs.errors import ShapeError
+from difflcs.physics.planar import to_body
 from difflcs.physics.shapes import Shape
 from difflcs.planning.outline import clearance, ring
-from difflcs.planning.places import Workspace, from_body, to_body
+from difflcs.planning.places import Workspace, from_body
 
 __all__ = ["LiftTravel", "PlanarTravel", "Travel"]
 
