@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 class PPOSettings(Settings):
     """Settings of the main phase. "paper": given there; the others are ours, tuned on the cube."""
 
-    rollouts: int = bounded(60, minimum=1, maximum=MOST_ENVS)
+    rollouts: int = bounded(30, minimum=1, maximum=MOST_ENVS)
     """Episodes per iteration, run in lockstep; the last ones share what is left of the data evenly."""
     steps: int = bounded(8, minimum=1)
     """Gradient steps per iteration; Adam needs 20 or more."""
