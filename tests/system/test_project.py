@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -83,6 +84,26 @@ def test_the_changelog_begins_with_this_version():
     assert all(date != "unreleased" for version, date in versions if version == difflcs.__version__)
     assert difflcs.__version__ in dict(versions)
     assert [date for _, date in versions[1:] if date == "unreleased"] == []
+
+
+# --- building ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(shutil.which("cmake") is None, reason="needs cmake")
+def test_microsofts_compiler_is_refused_in_a_sentence(tmp_path):
+    # What CMake would have found out about the compiler, said in advance.
+    found = ["-DCMAKE_CXX_COMPILER_ID_RUN=1", "-DCMAKE_CXX_COMPILER_ID=MSVC", "-DCMAKE_CXX_COMPILER_FORCED=1"]
+    done = subprocess.run(
+        ["cmake", "-S", ROOT, "-B", tmp_path, *found], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode != 0
+    said = " ".join(done.stderr.split())
+    assert "expected GCC or Clang, got MSVC" in said
+    assert "Windows Subsystem for Linux" in said
+
+
+def test_the_source_distribution_leaves_nothing_out():
+    assert PROJECT["tool"]["scikit-build"]["sdist"] == {"exclude": ["/runs"]}
 
 
 # --- workflows --------------------------------------------------------------------------------------------------------
