@@ -18,22 +18,20 @@ help:
 	@echo "make docs   build the documentation (build/docs/index.html)"
 	@echo "make clean  remove .venv and build products"
 
-# .ready: everything that developers need, with the kernels for every CPU. .demo: what the demo needs, a quarter of the packages,
-# with the kernels for the CPU that is here, which compile in two thirds of the time.
+# .ready: everything that developers need, with the kernels for every CPU. .demo: what the demo needs, a quarter of the
+# packages, with the kernels for the CPU that is here, which compile in half the time.
 SOURCES := pyproject.toml constraints.txt CMakeLists.txt cmake/kernels.cmake \
   $(wildcard difflcs/_native/*.?pp envs/difflcs_envs/_native/*.?pp)
-HERE = $(or $(shell grep -o -m1 -w avx512dq /proc/cpuinfo 2>/dev/null | cut -c-6),\
-  $(shell grep -o -m1 -w avx2 /proc/cpuinfo 2>/dev/null),none)
 $(VENV)/.ready: EXTRAS := all
 $(VENV)/.ready: ISAS := all
 $(VENV)/.demo: EXTRAS := rl,envs,viz
-$(VENV)/.demo: ISAS = $(HERE)
+$(VENV)/.demo: ISAS := here
 $(VENV)/.ready $(VENV)/.demo: $(SOURCES)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "difflcs needs Python 3.11 or newer, got $$($(PYTHON) --version); try make PYTHON=python3.11"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	SKBUILD_CMAKE_DEFINE=DIFFLCS_ISAS=$(ISAS) \
-	  $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[$(EXTRAS)]"
+	  $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e ".[$(EXTRAS)]"
 	@touch $@
 
 demo: $(or $(wildcard $(VENV)/.ready),$(VENV)/.demo)
