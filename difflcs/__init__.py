@@ -12,7 +12,7 @@ from difflcs.mpc.solution import MPCSolution
 from difflcs.scales import ScaledLCS, Scales, suggest_scales
 from difflcs.status import Status
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "BackendNotFoundError",
