@@ -42,7 +42,7 @@ _DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 class LCSModel(nn.Module):
-    """A learnable linear complementarity system (Eq. lcs), F = G Gᵀ + stiffness·I + H − Hᵀ.
+    """A learnable linear complementarity system (Eq. 1 of the paper), F = G Gᵀ + stiffness·I + H − Hᵀ.
 
     The parametrisation keeps F + Fᵀ ⪰ 2·stiffness·I for any G and H, so that the LCP always has one solution.
 
