@@ -20,7 +20,8 @@ site is built it is made anew. There are these kinds:
 - `zoo`: the models of the zoo, from their cards.
 - `tutorials`: the contents page of the notebooks; in the repository links to them.
 
-Besides, the notebooks of tutorials/ are copied to docs/tutorials, and docstrings are mended for reStructuredText.
+A list between `<!-- cards -->` and `<!-- end -->` becomes cards in the site. Besides, the notebooks of tutorials/ are
+copied to docs/tutorials, and docstrings are mended for reStructuredText.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ from typing import Any
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
 MARKER = re.compile(r"^<!-- generated: (\w+) ?(.*?) -->$.*?^<!-- end -->$", re.MULTILINE | re.DOTALL)
+CARDS = re.compile(r"^<!-- cards -->$(.*?)^<!-- end -->$", re.MULTILINE | re.DOTALL)
 
 
 # --- command line -----------------------------------------------------------------------------------------------------
@@ -367,6 +369,15 @@ def zoo() -> str:
     return "\n\n".join(parts)
 
 
+def cards(items: str) -> str:
+    """Markdown for sphinx-design: the items of a list, `- [title](page): text`, as cards."""
+    parts = ["::::{grid} 1 2 2 2", ":gutter: 3", ""]
+    for title, page, text in re.findall(r"^- \[(.*?)\]\((.*?)\): (.*?)$", items, re.MULTILINE):
+        link = [f":link: {page.removesuffix('.md')}", ":link-type: doc"]
+        parts += [f":::{{grid-item-card}} {title}", *link, "", text[0].upper() + text[1:], ":::", ""]
+    return "\n".join([*parts, "::::"])
+
+
 def titles() -> dict[str, str]:
     """Notebooks of tutorials/ and their titles."""
     found = {}
@@ -425,6 +436,7 @@ IN_REPOSITORY: dict[str, Callable[..., str]] = KINDS | {
 
 def fill(text: str) -> str:
     """A page as the site shows it, where the notebooks are copies in docs/tutorials."""
+    text = CARDS.sub(lambda found: cards(found[1]), text)
     text = MARKER.sub(lambda found: KINDS[found[1]](*found[2].split()), text)
     return text.replace("](../tutorials/", "](tutorials/")
 
