@@ -16,7 +16,7 @@ site is built it is made anew. There are these kinds:
 - `module MODULE NAME ...`: the same of functions, below the docstring of their module.
 - `file PATH`: another Markdown file of the repository, without its title; in the repository a link.
 - `table RECORD PART`: a table of `benchmarks/results/RECORD.json`; tables.py says which there are.
-- `results FILE NUMBER`: that table of `reproduce/results/FILE.md`.
+- `results FILE NUMBER [COLUMN ...]`: that table of `reproduce/results/FILE.md`, without these columns.
 - `zoo`: the models of the zoo, from their cards.
 - `tutorials`: the contents page of the notebooks; in the repository links to them.
 
@@ -341,10 +341,14 @@ def file_link(path: str) -> str:
     return f"In the repository this is the file [{path}](../{path})."
 
 
-def results(name: str, number: str) -> str:
-    """Markdown: a table of what reproduce/ has computed."""
+def results(name: str, number: str, *left_out: str) -> str:
+    """Markdown: a table of what reproduce/ has computed, without the columns of these names."""
     text = (ROOT / "reproduce" / "results" / f"{name}.md").read_text()
-    return re.findall(r"(?:^\|.*\|\n)+", text, re.MULTILINE)[int(number) - 1].rstrip()
+    found = re.findall(r"(?:^\|.*\|\n)+", text, re.MULTILINE)[int(number) - 1]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in found.splitlines()]
+    rows[1] = ["---"] * len(rows[0])
+    kept = [k for k, head in enumerate(rows[0]) if head.replace(" ", "_") not in left_out]
+    return "\n".join("| " + " | ".join(row[k] for k in kept) + " |" for row in rows)
 
 
 def zoo() -> str:
