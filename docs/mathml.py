@@ -27,13 +27,20 @@ def spell_out(code: str) -> str:
     return code.replace("\\dots", "\\ldots").replace("\\Big(", "\\Bigl(").replace("\\Big)", "\\Bigr)")
 
 
+def as_tex_would(code: str) -> str:
+    """What browsers would draw otherwise than TeX: upright capitals, a bar clear of its letter, norms, log x."""
+    code = code.replace('class="capital-greek"', 'mathvariant="normal"').replace("\u02c9", "\u00af")
+    code = re.sub(r"<mo( class=.\w+.)?>(?=\u2016)", r'<mo\1 stretchy="false">', code)
+    return re.sub(r"<mo>&ApplyFunction;</mo>(?!\s*<mo)", '<mspace width="0.1667em"></mspace>', code)
+
+
 def mathml(node: nodes.Element, block: bool) -> str:
     """MathML of a formula."""
     code = spell_out(node.astext().strip())
     if block and pick_math_environment(code) == "align*":  # lines of its own, outside of any environment
         code = wrap_math_code(code, True)
     try:
-        return tex2mathml(code, as_block=block)
+        return as_tex_would(tex2mathml(code, as_block=block))
     except Exception as error:
         LOG.warning("formula %r: %s", code, error, location=node)
         return f"<code>{html.escape(code)}</code>"
