@@ -1,9 +1,9 @@
 """Settings of the documentation: `make docs` builds it into build/docs."""
 
-import importlib.metadata
 import logging
 import os
 import sys
+import tomllib
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -69,7 +69,7 @@ html_css_files = ["difflcs.css"]
 html_copy_source = html_show_sourcelink = False
 
 # Where the project says that its repository is, every page has a link to its source there.
-addresses = dict(line.split(", ", 1) for line in importlib.metadata.metadata("difflcs").get_all("Project-URL") or ())
+addresses = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]["urls"]
 if "Repository" in addresses:
     html_theme_options = {
         "source_repository": addresses["Repository"],

@@ -12,6 +12,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -157,7 +158,9 @@ def test_the_commands_of_a_page_exist(page, parse):
 
 @pytest.mark.parametrize("page", [p for p in PAGES if p.parent.name != "archive"], ids=name)
 def test_the_flags_of_a_page_exist(page, generated):
-    flags = set(re.findall(r"`(--(?:warmup|ppo|models|pddm|imagination|mlp)\.[a-z.-]+)(?!\*|[a-z.-])", page.read_text()))
+    flags = set(
+        re.findall(r"`(--(?:warmup|ppo|models|pddm|imagination|mlp)\.[a-z.-]+)(?!\*|[a-z.-])", page.read_text())
+    )
     assert flags <= set(re.findall(r"`(--[a-z.-]+)`", generated.methods()))
 
 
@@ -292,6 +295,14 @@ def test_cards_are_links_in_the_repository_and_a_grid_in_the_site(generated):
     grid = generated.fill("<!-- cards -->\n\n- [Install](installing.md): how to.\n\n<!-- end -->")
     assert ":::{grid-item-card} Install\n:link: installing\n" in grid
     assert "\nHow to.\n" in grid
+
+
+def test_the_addresses_to_cite_are_those_of_the_project():
+    urls = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]
+    text = (DOCS / "citing.md").read_text()
+    assert f"]({urls['Paper']})" in text
+    assert f"]({urls['Homepage']})" in text
+    assert f"{{{urls['Paper'].rsplit('/', 1)[1]}}}" in text  # eprint
 
 
 def test_fractions_are_read_as_they_are_meant():
