@@ -61,7 +61,7 @@ def _check_support(support: object, n_u: int) -> Tensor:
 
 
 class LCSModel(nn.Module):
-    """A learnable linear complementarity system (Eq. lcs), F = G Gᵀ + stiffness·I + H − Hᵀ.
+    """A learnable linear complementarity system (Eq. 1 of the paper), F = G Gᵀ + stiffness·I + H − Hᵀ.
 
     The parametrisation keeps F + Fᵀ ⪰ 2·stiffness·I for any G and H, so that the LCP always has one solution.
 

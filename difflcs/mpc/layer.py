@@ -35,7 +35,7 @@ from difflcs.status import Status, solved
 
 
 class LCSMPCLayer(nn.Module):
-    """Model predictive control through a linear complementarity system (Eq. mpc_lcs), differentiable in every input.
+    """Model predictive control through an LCS (Eq. 3 of the paper), differentiable in every input.
 
     Solves, for each batch element, the problem of `difflcs.mpc.MPCProblem`, and differentiates its solution with
     respect to the LCS, the cost, the bounds, the constraints, x0 and the goal by perturbation of the optimality

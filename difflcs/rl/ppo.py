@@ -339,7 +339,7 @@ class PPO(Trainer):
     def _improve(
         self, source: Source, episodes: TensorDict, samples: TensorDict, scale: float, key: Sequence[int]
     ) -> _Improvement:
-        """Gradient steps on the combined loss (Eq. total_loss), until the KL divergence is used up."""
+        """Gradient steps on the combined loss (Eq. 7 of the paper), until the KL divergence is used up."""
         outcome = _Improvement()
         policy: Any = episodes["policy"].flatten(0, 1)
         # What is indexed in every step; the rest of what the policy has entered would cost as much as the loss.
