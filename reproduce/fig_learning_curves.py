@@ -10,8 +10,9 @@ from pathlib import Path
 import pandas as pd
 import report
 from matplotlib.figure import Figure
+from recipes import RECIPES
 from records import Cell, select
-from report import NAMES, RECIPES
+from report import NAMES
 from units import METHODS
 
 PAPER = {
@@ -35,7 +36,7 @@ def table(cells: Cells) -> pd.DataFrame:
     lines = []
     for (method, recipe), cell in cells.items():
         if cell is not None:
-            label = NAMES[method] + (f", {RECIPES[recipe]}" if len(METHODS[method]) > 1 else "")
+            label = report.name_of(method, recipe)
             said = ", ".join(f"{value:g} at {minute:g} min" for minute, value in PAPER[method].items())
             early, peak, late, final = (report.say(report.at(cell, when)) for when in (6.0, "peak", 24.0, "final"))
             lines.append([label, early, f"{peak} at {cell.minute('peak'):g} min", late, final, said])
@@ -48,10 +49,12 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
     if not any(cells.values()):
         return False
     figure = Figure((10.0, 4.8), dpi=150, layout="constrained")
-    for axes, (recipe, title) in zip(figure.subplots(1, 2, sharey=True), RECIPES.items(), strict=True):
-        # A method with one recipe is on both sides.
-        shown = {method: cells[method, recipe if len(known) > 1 else known[0]] for method, known in METHODS.items()}
-        report.draw_curves(axes, title, [(cell, NAMES[m], report.COLORS[m]) for m, cell in shown.items()])
+    for axes, recipe in zip(figure.subplots(1, 2, sharey=True), ("ours", "paper"), strict=True):
+        # A method without this recipe is on both sides.
+        shown = {m: cells[m, recipe if recipe in known else known[0]] for m, known in METHODS.items()}
+        report.draw_curves(
+            axes, RECIPES[recipe].label, [(cell, NAMES[m], report.COLORS[m]) for m, cell in shown.items()]
+        )
         if recipe == "paper":
             for method, said in PAPER.items():
                 style = {"marker": "x", "s": 60, "zorder": 5, "clip_on": False, "color": report.COLORS[method]}

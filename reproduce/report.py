@@ -5,12 +5,14 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import records
 import runs
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from recipes import PROTOCOLS, RECIPES
 from records import Cell
 from stats import IQM, Estimate, bootstrap, p_value, wilson
 from units import PRESETS
@@ -22,7 +24,6 @@ README = Path(__file__).parent / "README.md"
 NAMES = {"lcs-rl": "LCS-RL", "violation": "violation only", "ppo": "PPO without warm-up", "pddm": "PDDM"}
 COLORS = {"lcs-rl": "#d55e00", "violation": "#0072b2", "ppo": "#e69f00", "pddm": "#009e73"}
 """Okabe–Ito: red, blue, orange, green as in the paper, told apart by colour-blind readers."""
-RECIPES = {"ours": "our recipe", "paper": "the paper's recipe"}
 MISSING = "—"
 INTERVALS = (
     "In brackets 95 % intervals: over the seeds by the bootstrap, which for three seeds says little more than their "
@@ -65,12 +66,20 @@ def main(name: str, artefact: str, draw: Drawing, words: Sequence[str] | None = 
     return runs.command_line(Draw, action, words)
 
 
+def name_of(method: str, recipe: str, start: str = "scratch", protocol: Any = "full") -> str:
+    """What a method is called in tables: its recipe, where it starts, how it is deployed."""
+    own = "" if (method, recipe) == ("pddm", "ours") else RECIPES[recipe].label
+    begins = "" if start == "scratch" else f"from the {start}'s model"
+    deployed = "" if protocol == "full" else PROTOCOLS[protocol]
+    return ", ".join(filter(None, [NAMES[method], own, begins, deployed]))
+
+
 def at(cell: Cell | None, when: str | float) -> Estimate | None:
     """Success [%] at some minute, see `Cell.minute`; None if there is no such evaluation."""
     values = [] if cell is None else list(cell.at(when))
     if cell is None or not values:
         return None
-    return wilson(values[0], cell.first.goals) if len(values) == 1 else bootstrap([values])
+    return wilson(values[0], cell.goals(when)) if len(values) == 1 else bootstrap([values])
 
 
 def over_objects(cells: Sequence[Cell | None], when: str | float) -> Estimate | None:
@@ -80,8 +89,10 @@ def over_objects(cells: Sequence[Cell | None], when: str | float) -> Estimate | 
 
 def paired(a: Cell | None, b: Cell | None, when: str | float) -> list[float]:
     """Success of a − b [%] for each seed of both; none where they differ in goals or object."""
-    conditions = ["task", "goals", "evaluation_seed", "source", "mass"]
+    conditions = ["task", "evaluation_seed", "source", "mass"]
     if a is None or b is None or any(a.first[name] != b.first[name] for name in conditions):
+        return []
+    if a.at(when).empty or b.at(when).empty or a.goals(when) != b.goals(when):
         return []
     return list((a.at(when) - b.at(when)).dropna())
 
@@ -120,10 +131,9 @@ def provenance(cells: Sequence[Cell | None]) -> list[str]:
     tasks: dict[str, list[str]] = {}
     for cell in found:
         first = cell.first
-        start = None if first.start == "scratch" else f"from the {first.start}'s model"
-        label = ", ".join(filter(None, [NAMES[first.method], RECIPES.get(first.recipe), start]))
+        label = name_of(first.method, first.recipe, first.start, first.protocol)
         left_out = f"; {cell.left_out} trainings of others left out" if cell.left_out else ""
-        line = f"{label}: version {first.version}, {cell.seeds} × {first.goals} goals{left_out}"
+        line = f"{label}: version {first.version}, {cell.amount}{left_out}"
         tasks.setdefault(line, []).append(first.task.replace("_", " "))
     return notes + [f"- {line} ({', '.join(names)})" for line, names in tasks.items()]
 
@@ -168,7 +178,7 @@ def draw_curves(axes: Axes, title: str, curves: Sequence[tuple[Cell | None, str,
     """Success against minutes of data with its interval, of cells with their labels and colours."""
     for cell, label, color in curves:
         if cell is not None:
-            minutes, points = cell.scores.columns, pd.DataFrame([at(cell, minute) for minute in cell.scores])
+            minutes, points = cell.minutes, pd.DataFrame([at(cell, minute) for minute in cell.scores])
             axes.plot(minutes, points.value, label=f"{label} ({cell.seeds})", color=color, lw=2, marker="o", ms=3)
             axes.fill_between(minutes, points.low, points.high, color=color, alpha=0.2, lw=0)
     axes.set(title=title, xlabel="data [min]", ylabel="success [%]", ylim=(0, 102))

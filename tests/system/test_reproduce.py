@@ -24,10 +24,12 @@ FOLDER = Path(__file__).parents[2] / "reproduce"
 sys.path.insert(0, str(FOLDER))
 
 import dask  # noqa: E402
+import deployment  # noqa: E402
 import distributed  # noqa: E402
 import fig_learning_curves  # noqa: E402
 import fig_task  # noqa: E402
 import fig_transfer  # noqa: E402
+import recipes  # noqa: E402
 import records  # noqa: E402
 import report  # noqa: E402
 import runs  # noqa: E402
@@ -40,9 +42,9 @@ from rich.progress import Progress  # noqa: E402
 from units import OBJECTS, Preset, Unit  # noqa: E402
 
 from difflcs.errors import CheckpointError, InvalidInputError  # noqa: E402
-from difflcs.rl import TrainConfig, get_method, wilson_interval  # noqa: E402
+from difflcs.rl import TrainConfig, get_method, get_task, wilson_interval  # noqa: E402
 
-TINY = Preset("smoke", seeds=1, goals=2, evaluate_at=(0.2, 0.5), smoke=True)
+TINY = Preset("smoke", seeds=1, goals=2, final_goals=2, evaluate_at=(0.2, 0.5), smoke=True)
 FIRST = units.FIRST_SEED
 CUBE = Unit("cube", "lcs-rl", "ours", FIRST)
 SCRATCH = Unit("mug", "lcs-rl", "ours", FIRST)
@@ -87,51 +89,105 @@ def run_fig_task(arguments):
 # --- the matrix and its keys ------------------------------------------------------------------------
 
 
-def test_matrix_holds_every_unit_once_and_what_it_starts_from_first():
-    found = units.matrix((), seeds=2)
+def test_matrix_holds_every_unit_once_the_important_ones_first():
+    preset = Preset("paper", seeds=3, goals=1, final_goals=1, slow=Preset("paper", seeds=1, goals=1, final_goals=1))
+    found = units.matrix((), preset)
     assert len(found) == len(set(found))
-    assert {unit.seed for unit in found} == {FIRST, FIRST + 1}
-    # Cube: two methods with two recipes each, two without; objects: two methods, and LCS-RL from the cube.
-    assert len(found) == 2 * (2 * 2 + 2 + 6 * 2 + 6)
+    assert {unit.seed for unit in found} == {FIRST, FIRST + 1, FIRST + 2}
+    # Cube: six of methods and recipes, and seven ablations; objects: five, and two transfers; banana: seven ablations.
+    assert len(found) == 3 * (6 + 7 + 6 * (5 + 2) + 7) + 1 * 2
     for position, unit in enumerate(found):
         assert unit.init is None or unit.init in found[:position]
+    table = units.matrix(["table1"], preset)
+    assert found[: len(table)] == table
+    assert {(unit.method, unit.recipe) for unit in table} == {
+        ("lcs-rl", "ours"), ("lcs-rl", "paper"),
+        ("violation", "ours"), ("violation", "paper"), ("violation", "jin-posa"),
+    }  # fmt: skip
+    assert [unit.method for unit in found[-2:]] == ["pddm", "pddm"]  # what is slow comes last
+    assert [unit.seed for unit in table] == sorted(unit.seed for unit in table)
 
 
 def test_matrix_of_a_part():
-    assert units.matrix(["transfer"], 1, objects=["mug"]) == [SCRATCH, CUBE, TRANSFER]
-    table = units.matrix(["table1"], 1, objects=["banana", "mug"], methods=["violation"], recipes=["paper"])
+    paper, one = units.PRESETS["paper"], units.PRESETS["paper"].with_amounts(1, None)
+    assert units.matrix(["transfer"], one, objects=["mug"], recipes=["ours"]) == [SCRATCH, CUBE, TRANSFER]
+    table = units.matrix(["table1"], one, objects=["banana", "mug"], methods=["violation"], recipes=["paper"])
     assert table == [Unit(task, "violation", "paper", FIRST) for task in ("mug", "banana")]
-    assert {unit.method for unit in units.matrix(["curves"], 1, methods=["pddm"])} == {"pddm"}
-    curves = units.matrix(["curves"], 1, recipes=["ours"])
+    slow = units.matrix(["curves"], paper, methods=["pddm"])
+    assert {(unit.method, unit.seed - FIRST) for unit in slow} == {("pddm", seed) for seed in range(5)}
+    assert len(units.matrix(["curves"], paper.with_amounts(10, None), methods=["pddm"], recipes=["authors"])) == 10
+    curves = units.matrix(["curves"], one, recipes=["ours"])
     assert [(unit.method, unit.recipe) for unit in curves] == [
-        ("pddm", "none"), ("ppo", "paper"), ("violation", "ours"), ("lcs-rl", "ours"),
+        ("lcs-rl", "ours"), ("violation", "ours"), ("pddm", "ours"),
     ]  # fmt: skip
+    assert {unit.recipe for unit in units.matrix(["table1"], units.PRESETS["smoke"])} == {"ours"}
+    ablations = units.matrix(["ablations"], paper)
+    assert {unit.task for unit in ablations} == set(units.ABLATION_TASKS)
+    assert {unit.seed for unit in ablations} == set(range(FIRST, FIRST + units.ABLATION_SEEDS))
+    # In each of them one part is missing: all differ from each other.
+    configs = [units.config_of(unit, paper).method for unit in ablations if unit.task == "cube" and unit.seed == FIRST]
+    tasks = [unit.own.task for unit in ablations if unit.task == "cube" and unit.seed == FIRST]
+    assert len({repr(pair) for pair in zip(configs, tasks, strict=True)}) == len(units.ABLATED) + 1
 
 
 def test_config_is_the_default_recipe_but_for_what_the_unit_says():
     default = {name: get_method(name)() for name in units.METHODS}
-    for method, wanted in (
-        ("violation", replace(default["violation"], warmup=replace(default["violation"].warmup, noise=0.0))),
-        (
-            "lcs-rl",
-            replace(
-                default["lcs-rl"],
-                warmup_minutes=6.0,
-                warmup=replace(default["lcs-rl"].warmup, noise=0.0),
-                ppo=replace(default["lcs-rl"].ppo, update="adam", steps=20, minibatch=None),
-                models=replace(default["lcs-rl"].models, iterations=0),
-            ),
-        ),
-    ):
+    for method in ("violation", "lcs-rl"):
         config = units.config_of(Unit("mug", method, "paper", 3), units.PRESETS["paper"])
-        assert config.method == wanted
+        known = {name: new for name, new in recipes.PAPER.settings.items() if hasattr(default[method], name)}
+        for name, new in known.items():
+            mine, before = getattr(config.method, name), getattr(default[method], name)
+            assert mine == (replace(before, **new) if isinstance(new, dict) else new)
+        assert config.method == replace(default[method], **{name: getattr(config.method, name) for name in known})
         assert (config.task, config.seed, config.minutes) == ("mug", 3, 30.0)
-        assert config.evaluate_goals == config.final_goals == 1000
+        assert (config.evaluate_goals, config.final_goals) == (300, 1000)
         assert config.evaluation_seed == TrainConfig().evaluation_seed  # the same goals for every unit
     assert units.config_of(CUBE, units.PRESETS["paper"]).method == default["lcs-rl"]
-    assert (
-        units.config_of(replace(CUBE, method="pddm", recipe="none"), units.PRESETS["quick"]).method == default["pddm"]
-    )
+    slow = units.config_of(replace(CUBE, method="pddm"), units.PRESETS["paper"])
+    assert slow.method == default["pddm"]
+    assert (slow.final_goals, slow.evaluate_at) == (300, (2.0, 6.0, 10.0, 20.0))
+
+
+def test_a_recipe_changes_its_task_and_no_other():
+    plain = get_task("mug")
+    prior, without = Unit("mug", "violation", "jin-posa", 0).spec, Unit("mug", "lcs-rl", "no-penalty", 0).spec
+    assert (plain.horizon, prior.horizon) == (8, 5)
+    # The cost of a model whose action is the largest: nothing but the weight of the action differs, 200 and 0.001.
+    x, u, goal = (torch.zeros(n, dtype=torch.float64) for n in (9, 6, 3))
+    costs = [float(spec.make_cost().stage(x, u + 0.015, goal)) for spec in (plain, prior)]
+    assert costs == pytest.approx([200 * 6 * 0.015**2, 0.001 * 6 * 0.015**2])
+    assert float(prior.make_cost().stage(x + 0.01, u, goal)) == float(plain.make_cost().stage(x + 0.01, u, goal)) > 0
+    far = torch.tensor([0.05, 0, 0], dtype=torch.float64)
+    rewards = [float(spec.outcome(x, u, x, far, True)[0]) for spec in (plain, without)]
+    assert rewards[1] - rewards[0] == pytest.approx(10)
+    assert (plain.failure_penalty, without.failure_penalty) == (10, 0)
+    env = without.make_env()
+    env.reset(seed=0)
+    infos = [env.step(np.zeros(6))[4] for _ in range(20)]
+    assert not infos[-1]["success"]
+    assert infos[-1]["reward_completion"] == 0
+    env.close()
+
+
+def test_the_same_model_is_deployed_in_several_ways(tmp_path, one_thread, monkeypatch):
+    (job,) = make_jobs([Unit("cube", "violation", "jin-posa", FIRST)], tmp_path).values()
+    calls, measure = [], deployment.Deployments.measure
+
+    def counted(self, run, protocol, minutes, goals):
+        calls.append(protocol)
+        if len(calls) == 2:
+            raise KeyboardInterrupt  # after a checkpoint, before all ways of it are measured
+        return measure(self, run, protocol, minutes, goals)
+
+    monkeypatch.setattr(deployment.Deployments, "measure", counted)
+    with pytest.raises(KeyboardInterrupt):
+        worker.execute(job)
+    rows, _ = worker.execute(job)  # goes on where it stopped, and leaves nothing out
+    assert calls == ["support", "task", "task", "support", "task"]
+    assert list(rows.protocol) == ["support"] * 2 + ["task"] * 2
+    assert list(rows["at"]) == [0.2, 0.5] * 2
+    undisturbed, _ = worker.execute(replace(job, work=tmp_path / "undisturbed"))
+    pd.testing.assert_frame_equal(rows.drop(columns=TIMES), undisturbed.drop(columns=TIMES))
 
 
 def test_key_changes_with_everything_that_decides_a_result_and_with_nothing_else(monkeypatch):
@@ -143,6 +199,7 @@ def test_key_changes_with_everything_that_decides_a_result_and_with_nothing_else
         key(),
         key(replace(CUBE, method="violation")),
         key(replace(CUBE, recipe="paper")),
+        key(replace(CUBE, recipe="no-penalty")),  # the same settings, another task
         key(preset=replace(TINY, goals=3)),
         key(objects=other),
         key(TRANSFER),
@@ -291,7 +348,7 @@ def played(broken=()):
 
 
 def test_failures_stop_what_depends_on_them_and_nothing_else_and_are_tried_again(in_process, tmp_path):
-    jobs, stored = make_jobs(units.matrix(["transfer"], 1, objects=["mug"]), tmp_path), []
+    jobs, stored = make_jobs(units.matrix(["transfer"], TINY, objects=["mug"], recipes=["ours"]), tmp_path), []
     display, text = quietly()
     failed = runs.compute(list(jobs.values()), in_process, stored.append, display, played(broken=["cube"]))
     assert "it [broke]" in (jobs[CUBE].folder / "error.txt").read_text()
@@ -395,11 +452,12 @@ def test_a_script_computes_and_draws(local, tmp_path, monkeypatch, capsys):
     assert code == 0, err
     assert "smoke: 1 units of 0.5 minutes of data, 1 seeds, 4 goals; 0 finished before" in out
     rows = records.read(tmp_path / "smoke-stand-in.csv")
-    assert list(rows["at"]) == [0.0, 0.2, 0.5]
+    assert list(rows["at"]) == [0.0, 0.2, 0.5] * 2
+    assert list(rows.protocol) == ["full"] * 3 + ["support"] * 3
     assert set(rows.version) == {str(get_method("violation").version)}
     # One seed: the interval is Wilson's, of its goals.
     line = next(line for line in (tmp_path / "table1-smoke-stand-in.md").read_text().splitlines() if "| mug" in line)
-    last = rows.iloc[-1]
+    last = rows[rows.protocol == "full"].iloc[-1]
     assert f"{100 * last.success:.1f} [{100 * last.ci_low:.1f}, {100 * last.ci_high:.1f}]" in line
     code, out, _ = run_script(table1.main, capsys, *options, *folders)
     assert "1 finished before" in out
@@ -456,9 +514,9 @@ def test_p_value_against_scipy():
 def unit_rows(unit, values, source="ycb_mesh", goals=1000, **changes):
     """Rows as of a finished unit; `values` are percent at 0, 6, 10 and 30 minutes."""
     base = dict(
-        **asdict(unit), ci_low=0.0, ci_high=1.0, goals=goals, evaluation_seed=0, solver_failures=0, source=source,
-        mass=0.05, version="1", key=f"{unit.method}{unit.recipe}{goals}", versions="difflcs=1", machine="a machine",
-        train_seconds=20.0, evaluation_seconds=10.0, finished="2026-01-01T00:00:00+00:00",
+        **asdict(unit), protocol="full", ci_low=0.0, ci_high=1.0, goals=goals, evaluation_seed=0, solver_failures=0,
+        source=source, mass=0.05, version="1", key=f"{unit.method}{unit.recipe}{goals}", versions="difflcs=1",
+        machine="a machine", train_seconds=20.0, evaluation_seconds=10.0, finished="2026-01-01T00:00:00+00:00",
     )  # fmt: skip
     points = zip((0.0, 6.0, 10.0, 30.0), values, strict=True)
     rows = [{**base, "at": at, "minutes": at, "success": value / 100, **changes} for at, value in points]
@@ -479,7 +537,7 @@ def results(tmp_path):
                 records.add(tmp_path, "paper", unit_rows(unit, values))
         transfer = Unit("mug", "ppo", "ours", seed, "cube")
         records.add(tmp_path, "paper", unit_rows(transfer, (30, 60, 70, 79 + shift)))
-        records.add(tmp_path, "paper", unit_rows(Unit("cube", "pddm", "none", seed), (0, 1, 2, 3), goals=50))
+        records.add(tmp_path, "paper", unit_rows(Unit("cube", "pddm", "ours", seed), (0, 1, 2, 3), goals=50))
     return tmp_path
 
 
