@@ -18,8 +18,8 @@ Chosen = Literal["ours", "paper", "jin-posa", "authors"]
 Protocol = Literal["full", "support", "task"]
 """How a model is deployed in an evaluation, see `PROTOCOLS`."""
 PROTOCOLS: Mapping[Protocol, str] = {
-    "full": "full bounds",
-    "support": "within the action support it collected in",
+    "full": "with full bounds",
+    "support": "in its support",
     "task": "with the paper's MPC and full bounds",
 }
 """full: as it was trained, with the full ±15 mm. support: the same within the bounds of its last episodes, as Jin and

@@ -23,12 +23,14 @@ for package in ("distributed", "matplotlib", "mujoco", "pandas", "rich", "scipy"
 FOLDER = Path(__file__).parents[2] / "reproduce"
 sys.path.insert(0, str(FOLDER))
 
+import ablations  # noqa: E402
 import dask  # noqa: E402
 import deployment  # noqa: E402
 import distributed  # noqa: E402
 import fig_learning_curves  # noqa: E402
 import fig_task  # noqa: E402
 import fig_transfer  # noqa: E402
+import matplotlib.axes  # noqa: E402
 import recipes  # noqa: E402
 import records  # noqa: E402
 import report  # noqa: E402
@@ -499,13 +501,38 @@ def test_bootstrap_against_numbers_by_hand():
 
 
 def test_p_value_against_scipy():
-    from scipy.stats import ttest_rel
+    from scipy.stats import permutation_test
 
-    a, b = np.array([80.1, 85.3, 91.0, 78.2]), np.array([60.3, 70.9, 55.1, 72.4])
-    assert stats.p_value(a - b) == pytest.approx(ttest_rel(a, b).pvalue)
+    for seeds in (4, 7, 10):
+        apart = np.random.default_rng(seeds).normal(0.6, 1.0, seeds)
+        theirs = permutation_test((apart,), np.mean, permutation_type="samples", n_resamples=np.inf)
+        assert stats.p_value(apart) == pytest.approx(theirs.pvalue)
+    assert stats.p_value([1.0, 2.0, 3.0]) == 0.25  # two of eight choices of signs
     assert stats.p_value([0.0, 0.0]) == 1.0
-    assert stats.p_value([100 * 0.7 - 100 * 0.4, 30.0]) == 0.0  # but for rounding the same
+    assert stats.p_value([100 * 0.7 - 100 * 0.4, 30.0]) == 0.5  # but for rounding the same
     assert math.isnan(stats.p_value([1.0]))
+
+
+def test_differences_to_what_others_publish():
+    theirs = stats.published(50.0, 10.0, 10)
+    assert theirs.high - 50 == pytest.approx(2.262 * 10 / math.sqrt(10), rel=1e-3)
+    # Without uncertainty of one, the interval is that of the other; of two equal ones it is √2 times as wide.
+    exact, ours = stats.Estimate(50.0, 50.0, 50.0), stats.Estimate(60.0, 58.0, 61.0)
+    assert stats.apart(ours, exact) == pytest.approx((10.0, 8.0, 11.0))
+    assert stats.apart(exact, ours) == pytest.approx((-10.0, -11.0, -8.0))
+    assert stats.apart(theirs, theirs).high == pytest.approx(math.sqrt(2) * (theirs.high - 50))
+
+
+def test_words_say_what_the_intervals_say():
+    found = {
+        "mug": stats.Estimate(3.0, 1.0, 5.0), "can": stats.Estimate(-2.0, -3.0, -1.0),
+        "box": stats.Estimate(1.0, -1.0, 3.0), "wrench": stats.Estimate(9.0), "clamp": None,
+    }  # fmt: skip
+    assert report.verdict(found) == "better on 1 (mug), worse on 1 (can), not to be told apart on 1 (box)"
+    assert report.verdict({"mug": found["mug"], "cube": found["mug"]}) == "better on all 2"
+    assert report.verdict({"wrench": found["wrench"]}) == "not compared: that takes two seeds"
+    assert report.listed(["a", "b", "c"]) == "a, b and c"
+    assert report.listed([]) == "none"
 
 
 # --- results ----------------------------------------------------------------------------------------
@@ -535,6 +562,8 @@ def results(tmp_path):
                 (Unit(task, "violation", "paper", seed), (0, 20, 20, 20)),
             ):
                 records.add(tmp_path, "paper", unit_rows(unit, values))
+        prior = unit_rows(Unit("mug", "violation", "jin-posa", seed), (0, 0, 0, 12), protocol="support")
+        records.add(tmp_path, "paper", prior)
         transfer = Unit("mug", "ppo", "ours", seed, "cube")
         records.add(tmp_path, "paper", unit_rows(transfer, (30, 60, 70, 79 + shift)))
         records.add(tmp_path, "paper", unit_rows(Unit("cube", "pddm", "ours", seed), (0, 1, 2, 3), goals=50))
@@ -550,10 +579,11 @@ def cells_of(path, task):
 def test_table1_shows_ours_beside_the_paper(results, capsys):
     code, out, _ = run_script(table1.main, capsys, "--results", results)
     assert code == 0
-    success, differences, other, _ = cells_of(results / "table1.md", "mug")
+    success, differences, other, *_, ways = cells_of(results / "table1.md", "mug")
     assert success[1:5] == ["50.0 [40.0, 60.0]", "32.5 ± 8.4", "80.0 [70.0, 90.0]", "44.6 ± 3.9"]  # peak
     assert success[5:] == ["20.0 [10.0, 30.0]", "10.0 ± 6.3", "80.0 [70.0, 90.0]", "44.6 ± 3.9"]  # final
-    assert differences[1:] == ["+30.0 [+30.0, +30.0]", "< 0.001", "+60.0 [+60.0, +60.0]", "< 0.001"]
+    assert differences[1:] == ["+30.0 [+30.0, +30.0]", "0.250", "+60.0 [+60.0, +60.0]", "0.250"]
+    assert ways[1:] == ["20.0 [10.0, 30.0]", "20.0 [20.0, 20.0]", "12.0 [12.0, 12.0]"]
     assert other[1] == "20.0 [20.0, 20.0]"
     assert "50.0 [40.0, 60.0]" in out
     assert "32.5 $\\pm$ 8.4" in (results / "table1.tex").read_text()
@@ -562,7 +592,9 @@ def test_table1_shows_ours_beside_the_paper(results, capsys):
     markdown = (results / "table1.md").read_text()
     assert "Success on six objects, the paper's recipe" in markdown
     assert "LCS-RL, our recipe: version 1, 3 seeds × 1000 goals (mug)" in markdown
-    assert "Computed: 9 trainings" in markdown  # mug only
+    assert "Computed: 12 trainings" in markdown  # mug only
+    assert "LCS-RL, our recipe, at the end against violation only, our recipe: better on all 1." in markdown
+    assert "LCS-RL, our recipe, at the end against the paper's mean: better on all 1." in markdown
 
 
 def test_over_all_objects_the_middle_half_counts(tmp_path, capsys):
@@ -585,12 +617,46 @@ def test_learning_curves_are_drawn(results, capsys):
     assert "PDDM: version 1, 3 seeds × 50 goals" in out  # an unequal number of goals is said
 
 
+def test_curves_stand_where_the_evaluations_were(tmp_path, capsys, monkeypatch):
+    rows = unit_rows(Unit("cube", "lcs-rl", "ours", 0), (0, 40, 50, 70))
+    rows["minutes"] = [0.0, 6.9, 10.5, 30.0]
+    records.add(tmp_path, "paper", rows)
+    drawn, plot = [], matplotlib.axes.Axes.plot
+    monkeypatch.setattr("matplotlib.axes.Axes.plot", lambda s, x, *a, **k: drawn.append(list(x)) or plot(s, x, *a, **k))
+    assert run_script(fig_learning_curves.main, capsys, "--results", tmp_path)[0] == 0
+    assert drawn == [[0.0, 6.9, 10.5, 30.0]]
+    assert "later by up to 0.9 min (LCS-RL)" in (tmp_path / "fig_learning_curves.md").read_text()
+
+
+def test_single_seeds_are_thin_lines(results, capsys, monkeypatch):
+    widths = []
+    plot = matplotlib.axes.Axes.plot
+    monkeypatch.setattr("matplotlib.axes.Axes.plot", lambda *a, **k: widths.append(k["lw"]) or plot(*a, **k))
+    assert run_script(fig_transfer.main, capsys, "--results", results)[0] == 0
+    assert widths == [2, 0.5] * 2
+
+
+def test_ablations_are_compared_with_all_parts(results, capsys):
+    for seed in range(3):
+        records.add(results, "paper", unit_rows(Unit("cube", "lcs-rl", "adam", seed), (0, 40, 40, 60 + 10 * seed)))
+        records.add(results, "paper", unit_rows(Unit("cube", "ppo", "ours", seed), (0, 40, 60 + 10 * seed, 50)))
+    assert run_script(ablations.main, capsys, "--results", results)[0] == 0
+    (adam,) = cells_of(results / "ablations.md", "with Adam")
+    assert adam[3:] == ["70.0 [60.0, 80.0]", "−20.0 [−30.0, −10.0]", "0.250", "−10.0 [−10.0, −10.0]", "0.250"]
+    markdown = (results / "ablations.md").read_text()
+    worse = "it is worse with Adam instead of the natural gradient"
+    assert f"The cube, 10 min: by the intervals {worse}; better without warm-up." in markdown
+    assert f"The cube, final: by the intervals {worse} and without warm-up; better none." in markdown
+    assert (results / "ablations.png").is_file()
+
+
 def test_transfer_is_compared_at_equal_data(results, capsys):
     assert run_script(fig_transfer.main, capsys, "--results", results)[0] == 0
     cells = cells_of(results / "fig_transfer.md", "mug")[0]
     assert cells[1] == "30.0 [30.0, 30.0]"  # the cube's model without any data
-    assert cells[2:6] == ["50.0 [40.0, 60.0]", "60.0 [60.0, 60.0]", "+10.0 [+0.0, +20.0]", "0.225"]  # 6 min
-    assert cells[6:] == ["80.0 [70.0, 90.0]", "89.0 [79.0, 99.0]", "+9.0 [+9.0, +9.0]", "< 0.001"]  # final
+    assert cells[2:] == ["—", "—", "50.0 [40.0, 60.0]", "60.0 [60.0, 60.0]", "80.0 [70.0, 90.0]", "89.0 [79.0, 99.0]"]
+    cells = cells_of(results / "fig_transfer.md", "mug")[1]
+    assert cells[3:] == ["+10.0 [+0.0, +20.0]", "0.500", "+9.0 [+9.0, +9.0]", "0.250"]  # 6 min, final
 
 
 def test_the_same_numbers_give_the_same_files(results, capsys):
@@ -715,7 +781,7 @@ def test_the_tracked_readme_and_tables_are_those_of_the_tracked_results(tmp_path
         (run_runs, ["--methods", "pddm", "--scheduler", "tcp://127.0.0.1:9"], "tcp://127.0.0.1:9"),
         (table1.main, [], "python reproduce/table1.py --rerun --preset quick"),
         (fig_transfer.main, ["--preset", "paper"], "reproduce/fig_transfer.py --rerun --preset paper"),
-        (run_fig_task, [], "reproduce/fig_task.py --rerun"),
+        (run_fig_task, ["--run", "zoo:trifinger-mug"], "expected a model of the cube, got one of mug"),
         (run_fig_task, ["--run", "nowhere"], "nowhere"),
     ],
 )
@@ -766,7 +832,10 @@ def test_the_task_is_drawn(undisturbed, tmp_path, monkeypatch, capsys):
     except RenderingError as error:
         pytest.skip(f"needs OpenGL: {error}")
     job = undisturbed[1][CUBE]
-    code, out, err = run_script(run_fig_task, capsys, "--results", tmp_path, "--work", job.work)
-    assert code == 0, err
-    assert f"model: {job.folder / 'run'}" in out
-    assert (tmp_path / "fig_task.png").stat().st_size > 50_000
+    assert fig_task.newest(job.work) == job.folder / "run"
+    for run in ("zoo:trifinger-cube", job.folder / "run"):
+        code, out, err = run_script(run_fig_task, capsys, "--results", tmp_path, "--run", run)
+        assert code == 0, err
+        assert f"model: {run}" in out
+        assert (tmp_path / "fig_task.png").stat().st_size > 50_000
+    assert fig_task.DrawTask().run == Path("zoo:trifinger-cube")  # without options
