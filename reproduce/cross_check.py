@@ -67,8 +67,8 @@ def prior_environment(checkout: Path) -> Any:
         MissingDependencyError: a package that it needs is not installed.
     """
     import gymnasium
-    import mujoco
 
+    mujoco: Any = importlib.import_module("mujoco")
     file = checkout / f"{MODULE.replace('.', '/')}.py"
     if not file.is_file():
         raise InvalidInputError(f"checkout: expected {file}, found none; clone the prior work and pass its folder")
@@ -83,7 +83,7 @@ def prior_environment(checkout: Path) -> Any:
     finally:
         sys.path.pop(0)
     if not hasattr(mujoco.MjData, "qM"):
-        mujoco.MjData.qM = property(lambda data: data)  # pyright: ignore[reportAttributeAccessIssue]
+        mujoco.MjData.qM = property(lambda data: data)
         full = {"mj_fullM": lambda model, matrix, data: mujoco.mj_fullM(model, data, matrix)}
         module.mujoco = types.SimpleNamespace(**{**vars(mujoco), **full})  # pyright: ignore[reportAttributeAccessIssue]
     env = module.TriFingerQuasiStaticGroundEnv()
@@ -157,7 +157,7 @@ def table(rows: Sequence[dict[str, Any]]) -> pd.DataFrame:
     return pd.DataFrame(lines, columns=columns)
 
 
-def draw(options: Options) -> int:
+def draw_record(options: Options) -> int:
     """Make the record if there is a checkout, then write the table; returns the exit code."""
     path = options.results / "cross_check.json"
     if options.checkout is not None:
@@ -178,4 +178,4 @@ def draw(options: Options) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(command_line(Options, draw))
+    sys.exit(command_line(Options, draw_record))

@@ -190,7 +190,7 @@ def draw(record: dict[str, Any], folder: Path, name: str) -> None:
     report.write_figure(figure, folder, name)
 
 
-def main(options: Options) -> int:
+def draw_record(options: Options) -> int:
     """Compute if that is asked for, then draw; the exit code."""
     name = "robustness-smoke" if options.smoke else "robustness"
     options = replace(options, goals=min(options.goals, 4)) if options.smoke else options
@@ -205,4 +205,4 @@ def main(options: Options) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(command_line(Options, main))
+    sys.exit(command_line(Options, draw_record))

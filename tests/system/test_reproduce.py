@@ -24,6 +24,7 @@ FOLDER = Path(__file__).parents[2] / "reproduce"
 sys.path.insert(0, str(FOLDER))
 
 import ablations  # noqa: E402
+import cross_check  # noqa: E402
 import dask  # noqa: E402
 import deployment  # noqa: E402
 import distributed  # noqa: E402
@@ -34,7 +35,9 @@ import matplotlib.axes  # noqa: E402
 import recipes  # noqa: E402
 import records  # noqa: E402
 import report  # noqa: E402
+import robustness  # noqa: E402
 import runs  # noqa: E402
+import small_models  # noqa: E402
 import stats  # noqa: E402
 import table1  # noqa: E402
 import units  # noqa: E402
@@ -44,7 +47,8 @@ from rich.progress import Progress  # noqa: E402
 from units import OBJECTS, Preset, Unit  # noqa: E402
 
 from difflcs.errors import CheckpointError, InvalidInputError  # noqa: E402
-from difflcs.rl import TrainConfig, get_method, get_task, wilson_interval  # noqa: E402
+from difflcs.rl import TrainConfig, evaluate, get_method, get_task, wilson_interval  # noqa: E402
+from difflcs.zoo import Learned  # noqa: E402
 
 TINY = Preset("smoke", seeds=1, goals=2, final_goals=2, evaluate_at=(0.2, 0.5), smoke=True)
 FIRST = units.FIRST_SEED
@@ -745,20 +749,147 @@ def test_readme_is_filled_between_its_marks_only(tmp_path):
 
 
 def test_the_tracked_readme_and_tables_are_those_of_the_tracked_results(tmp_path, monkeypatch, capsys):
-    names = {"table1": table1, "fig_learning_curves": fig_learning_curves, "fig_transfer": fig_transfer}
+    scripts = {
+        "table1": table1, "fig_learning_curves": fig_learning_curves, "fig_transfer": fig_transfer,
+        "ablations": ablations, "small_models": small_models, "robustness": robustness, "cross_check": cross_check,
+    }  # fmt: skip
     text, tracked = (FOLDER / "README.md").read_text(), records.RESULTS
     readme = tmp_path / "README.md"
     readme.write_text(text)
-    for path in tracked.glob("paper*.csv"):
+    for path in [*tracked.glob("paper*.csv"), *tracked.glob("*.json")]:
         (tmp_path / path.name).write_bytes(path.read_bytes())
     monkeypatch.setattr(report, "README", readme)
     monkeypatch.setattr(records, "RESULTS", tmp_path)
-    for name, script in names.items():
+    shown = [name for name in scripts if (tracked / f"{name}.md").exists()]
+    assert set(shown) >= {"table1", "fig_learning_curves", "fig_transfer", "small_models"}
+    for name, script in scripts.items():
         assert f"<!-- results: {name} -->" in text
-        assert run_script(script.main, capsys, "--results", tmp_path, "--preset", "paper")[0] == 0
+        if hasattr(script, "Options"):
+            code = script.draw_record(script.Options(results=tmp_path)) if name in shown else 0
+        else:
+            code, _, _ = run_script(script.main, capsys, "--results", tmp_path, "--preset", "paper")
+        assert (code == 0) or name not in shown
         for suffix in ("md", "tex"):
-            assert (tmp_path / f"{name}.{suffix}").read_text() == (tracked / f"{name}.{suffix}").read_text()
+            written = tmp_path / f"{name}.{suffix}"
+            assert written.exists() == (name in shown)
+            assert name not in shown or written.read_text() == (tracked / f"{name}.{suffix}").read_text()
     assert readme.read_text() == text, "run the scripts of reproduce/ to bring README.md up to date"
+
+
+# --- other systems, other simulators ----------------------------------------------------------------
+
+
+def test_robustness_is_resumed_and_refuses_another_record(tmp_path, monkeypatch, one_thread, capsys):
+    measured, measure = [], robustness.measure
+
+    def counted(condition, *rest):
+        measured.append(condition.name)
+        if len(measured) == 3:
+            raise KeyboardInterrupt
+        return measure(condition, *rest)
+
+    monkeypatch.setattr(robustness, "measure", counted)
+    options = robustness.Options(goals=2, smoke=True, results=tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        robustness.draw_record(options)
+    assert robustness.draw_record(options) == 0
+    assert measured[2] == measured[3]  # the one that was interrupted, none of those before
+    assert len(measured) == len(set(measured)) + 1
+    record = json.loads((tmp_path / "robustness-smoke.json").read_text())
+    nominal = evaluate(get_task("cube").make_envs(2), Learned.open(options.model).policy, 2, 0)
+    assert record["results"][0]["reached"].count("1") == nominal.successes
+    assert (tmp_path / "robustness-smoke.png").is_file()
+    assert not (tmp_path / "robustness.json").exists()
+    with pytest.raises(CheckpointError, match="pass another --results"):
+        robustness.draw_record(replace(options, goals=1))
+    with pytest.raises(CheckpointError, match=r"robustness\.py --rerun"):
+        robustness.draw_record(replace(options, smoke=False))
+
+
+def test_robustness_changes_what_it_says(monkeypatch):
+    found = list(robustness.conditions(0.01, 0.5, 1000.0))
+    assert [one.name for one in found if one.group == "mass"] == ["2 g", "5 g", "20 g", "30 g", "100 g"]
+    assert {"osc_kp": 2500.0} in [one.env for one in found]
+    seen = []
+    act = lambda state, goal: (seen.append(state), (np.zeros((len(state), 6)), np.zeros(len(state), bool)))[1]  # noqa: E731
+    monkeypatch.setattr(robustness, "mpc_actions", lambda policy: act)
+    state, goal = torch.zeros(2000, 9, dtype=torch.float64), torch.zeros(2000, 3, dtype=torch.float64)
+    noisy = next(one for one in found if one.noise == (0.003, 0.05))
+    robustness.acting(noisy, None, 6, 0)(state, goal)
+    assert seen[0].std(0)[:3].tolist() == pytest.approx([0.003, 0.003, 0.05], rel=0.1)
+    assert not seen[0][:, 3:].any()  # where the tips are, the robot knows
+
+
+PRIOR_WORK = """
+import mujoco
+import numpy as np
+from gym import utils
+from gym.spaces import Box
+from difflcs.rl import get_task
+
+class TriFingerQuasiStaticGroundEnv(utils.EzPickle):
+    box = Box(-1.0, 1.0, (6,), np.float64)
+    def __init__(self):
+        self.inner = get_task("cube").make_env().unwrapped
+        self.goal = np.zeros(3)
+    def reset(self):
+        state = np.random.uniform(-0.004, 0.004, 9)
+        observation, _ = self.inner.reset(seed=int(np.random.randint(100)))
+        self.state = observation["state"]
+        body = "<body><joint/><geom size='1'/></body>"
+        model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        matrix = np.zeros((1, 1))
+        mujoco.mj_fullM(model, matrix, data.qM)
+        assert matrix[0, 0] > 0
+    def set_cube_target(self, position, angle):
+        goal = np.array([*position, angle])
+        self.inner.reset(seed=0, options={"goal": goal, "state": self.state})
+    def get_stateinfo(self):
+        return {"state": self.state}
+    def step(self, action):
+        self.state = self.inner.step(action)[0]["state"]
+"""
+
+
+def test_the_cross_check_plays_the_same_episodes(tmp_path, monkeypatch, capsys, one_thread):
+    file = tmp_path / "checkout" / "env" / "gym_env" / "trifinger_quasistaic_ground_continuous.py"
+    file.parent.mkdir(parents=True)
+    for folder in (file.parent, file.parents[1]):
+        (folder / "__init__.py").touch()
+    file.write_text(PRIOR_WORK)
+    with monkeypatch.context() as patch:
+        for name in ("gym", "gym.utils", "gym.spaces", "gym.error", "env", "env.gym_env", cross_check.MODULE):
+            patch.setitem(sys.modules, name, None)
+            sys.modules.pop(name)
+        options = cross_check.Options(tmp_path / "checkout", (Path("zoo:trifinger-cube"),), 2, results=tmp_path)
+        assert cross_check.draw_record(options) == 0
+    (row,) = json.loads((tmp_path / "cross_check.json").read_text())["results"]
+    assert row["theirs"] == row["ours"]
+    assert len(row["ours"]) == 2
+    assert row["tips_rms"] == row["cube_median"] == 0  # here their simulator is ours
+    markdown = (tmp_path / "cross_check.md").read_text()
+    assert "2 goals (seed 0), each from the same start" in markdown
+    assert cross_check.draw_record(replace(options, checkout=None)) == 0  # from the record
+    assert (tmp_path / "cross_check.md").read_text() == markdown
+    with pytest.raises(InvalidInputError, match="clone the prior work"):
+        cross_check.prior_environment(tmp_path)
+    with pytest.raises(CheckpointError, match="make it with --checkout"):
+        cross_check.draw_record(cross_check.Options(results=tmp_path / "empty"))
+
+
+def test_a_small_model_beside_networks(results, capsys):
+    assert run_script(small_models.main, capsys, "--results", results)[0] == 0
+    markdown = (results / "small_models.md").read_text()
+    # Three seeds of 10 s of evaluation and 4 × 50 goals × 20 steps; the LCS has 4 × 1000 goals.
+    assert [cells[1:] for cells in cells_of(results / "small_models.md", "computing per decision")] == [["0.12", "2.5"]]
+    assert "A decision of PDDM takes 20 times the computing" in markdown
+    assert "cannot be decided here" in markdown  # they have other goals
+    for seed in range(3):
+        records.add(results, "paper", unit_rows(Unit("cube", "pddm", "ours", seed), (0, 1, 2, 3), version="2"))
+    assert run_script(small_models.main, capsys, "--results", results)[0] == 0
+    assert "at little data holds here." in (results / "small_models.md").read_text()
 
 
 # --- bad input --------------------------------------------------------------------------------------
