@@ -89,7 +89,13 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
     tables: Tables = {f"Without one part, {task}: success [%]": table(cells) for task, cells in shown.items()}
     found = [cell for cells in shown.values() for cell in cells.values()]
     said = [line for task, cells in shown.items() for line in words(cells, task)]
-    report.write_tables(folder, name, tables, [NOTE, *said, *report.provenance(found)])
+    report.write_tables(
+        folder,
+        name,
+        tables,
+        [NOTE, *report.bullets(said), *report.provenance(found)],
+        {name: "What each part is worth"},
+    )
     return True
 
 

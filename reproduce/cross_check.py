@@ -134,12 +134,12 @@ def compare(options: Options, checkout: Path) -> dict[str, Any]:
         rows.append(
             {
                 "model": str(model),
-                **{name: [int(pair[k]) for pair in reached] for k, name in enumerate(("theirs", "ours"))},
+                **{name: "".join(str(int(pair[k])) for pair in reached) for k, name in enumerate(("theirs", "ours"))},
                 "tips_rms": float(np.sqrt(np.mean(np.square(tips)))),
                 "cube_median": float(np.median(ends)),
             }
         )
-        print(f"{model}: {sum(rows[-1]['theirs'])} of {options.goals} there, {sum(rows[-1]['ours'])} here")
+        print(f"{model}: {rows[-1]['theirs'].count('1')} of {options.goals} there, {rows[-1]['ours'].count('1')} here")
     ours.close()
     return {"goals": options.goals, "seed": options.seed, "machine": machine(), "results": rows}
 
@@ -148,7 +148,7 @@ def table(rows: Sequence[dict[str, Any]]) -> pd.DataFrame:
     """Success in both, and where they disagree."""
     lines = []
     for row in rows:
-        there, here = (np.array(row[name], bool) for name in ("theirs", "ours"))
+        there, here = (np.array([digit == "1" for digit in row[name]]) for name in ("theirs", "ours"))
         success = [report.say(wilson(100 * reached.mean(), len(reached))) for reached in (there, here)]
         only = f"{int((there & ~here).sum())} and {int((here & ~there).sum())}"
         lines.append([row["model"], *success, only, f"{1e3 * row['tips_rms']:.2f}", f"{1e3 * row['cube_median']:.1f}"])

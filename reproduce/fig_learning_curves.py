@@ -103,7 +103,7 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
     report.write_figure(figure, folder, name)
     title = "Success on the cube, mean over the seeds [%]"
     notes = [NOTE, reached(cells), *report.provenance(list(cells.values()))]
-    report.write_tables(folder, name, {title: table(cells)}, notes)
+    report.write_tables(folder, name, {title: table(cells)}, notes, {name: "Success against minutes of data"})
     return True
 
 

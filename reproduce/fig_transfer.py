@@ -64,7 +64,7 @@ def panel(figure: Figure, cells: Cells, stand_in: bool) -> None:
 
 def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
     """Write a figure for each recipe, and the tables."""
-    tables, said, found = Tables(), [], []
+    tables, said, found, figures = Tables(), [], [], {}
     for recipe in METHODS["lcs-rl"]:
         cells: Cells = {
             task: {start: select(rows, task, method, recipe, start) for start, method in TRANSFER.items()}
@@ -80,9 +80,11 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
         figure = Figure((10.0, 6.4), dpi=150, layout="constrained")
         panel(figure, cells, name.endswith("stand-in"))
         figure.suptitle(label)
-        report.write_figure(figure, folder, name if recipe == "ours" else f"{name}-{recipe}-recipe")
+        stem = name if recipe == "ours" else f"{name}-{recipe}-recipe"
+        report.write_figure(figure, folder, stem)
+        figures[stem] = f"From scratch and from the cube's model, {label}"
     if tables:
-        report.write_tables(folder, name, tables, [NOTE, *said, *report.provenance(found)])
+        report.write_tables(folder, name, tables, [NOTE, *report.bullets(said), *report.provenance(found)], figures)
     return bool(tables)
 
 

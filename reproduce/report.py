@@ -128,6 +128,11 @@ def verdict(differences: Mapping[str, Estimate | None]) -> str:
     return ", ".join(parts) or "not compared: that takes two seeds"
 
 
+def bullets(sentences: Sequence[str]) -> list[str]:
+    """Notes that are a list."""
+    return ["", *(f"- {sentence}" for sentence in sentences), ""] if sentences else []
+
+
 def say(estimate: Estimate | None, signed: bool = False) -> str:
     """A number with its interval."""
     if estimate is None:
@@ -169,8 +174,18 @@ def provenance(cells: Sequence[Cell | None]) -> list[str]:
     return notes + [f"- {line} ({', '.join(names)})" for line, names in tasks.items()]
 
 
-def write_tables(folder: Path, name: str, tables: Tables, notes: Sequence[str]) -> None:
-    """Print tables with their notes; write them as Markdown and LaTeX, and into README.md where they belong there."""
+def write_tables(
+    folder: Path, name: str, tables: Tables, notes: Sequence[str], figures: Mapping[str, str] | None = None
+) -> None:
+    """Print tables with their notes; write them as Markdown and LaTeX, and into README.md where they belong there.
+
+    Args:
+        folder: where to.
+        name: of the files.
+        tables: title → table.
+        notes: below them, each a paragraph or a line of a list.
+        figures: names of figures in the same folder → what they show, for README.md.
+    """
     blocks = [
         f"**{title}**\n\n{table.to_markdown(index=False, tablefmt='github', disable_numparse=True)}\n"
         for title, table in tables.items()
@@ -182,7 +197,8 @@ def write_tables(folder: Path, name: str, tables: Tables, notes: Sequence[str]) 
     write_atomically(folder / f"{name}.tex", (latex + "\n" + "".join(f"% {note}\n" for note in notes)).encode())
     print(f"written: {folder / name}.md, .tex")
     if folder.resolve() == records.RESULTS.resolve():
-        update_readme(name, markdown)
+        pictures = "".join(f"![{shown}](results/{figure}.png)\n\n" for figure, shown in (figures or {}).items())
+        update_readme(name, pictures + markdown)
 
 
 def _latex(table: pd.DataFrame) -> str:

@@ -173,7 +173,8 @@ def draw(record: dict[str, Any], folder: Path, name: str) -> None:
         f"On {', '.join(f'{name} {value}' for name, value in record['machine'].items())}.",
     ]
     title = "Success on a system that is not that of the training"
-    report.write_tables(folder, name, {title: pd.DataFrame(lines, columns=columns)}, notes)
+    table = pd.DataFrame(lines, columns=columns)
+    report.write_tables(folder, name, {title: table}, notes, {name: "Success where the system is another one"})
     figure = Figure((7.0, 5.0), dpi=150, layout="constrained")
     axes = figure.subplots()
     groups = list(dict.fromkeys(row["group"] for row, _, _ in shown))

@@ -120,7 +120,7 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
         columns = {"object": [*LABELS, "all six"], **{label: column(cells, "final") for label, cells in prior.items()}}
         tables["Violation only, final success, by recipe and how it is deployed"] = pd.DataFrame(columns)
         words.append(f"The strongest baseline, by the mean over the objects at the end: {strongest}.")
-    notes = [STAND_INS] * name.endswith("stand-in") + [NOTE, *words, *report.provenance(found)]
+    notes = [STAND_INS] * name.endswith("stand-in") + [NOTE, *report.bullets(words), *report.provenance(found)]
     report.write_tables(folder, name, tables, notes)
     return True
 

@@ -155,7 +155,7 @@ def matrix(
 
     def ablations(seed: int) -> Iterator[Unit]:
         if seed < FIRST_SEED + ABLATION_SEEDS and (not recipes or "ours" in recipes):
-            for task in ABLATION_TASKS if not objects else set(ABLATION_TASKS) & set(objects):
+            for task in (name for name in ABLATION_TASKS if name in ("cube", *tasks)):
                 yield from (Unit(task, "lcs-rl", r, seed) for r in wanted("lcs-rl", (), ["ours"]))
                 yield from (Unit(task, m, r, seed) for m, r in ABLATED.values() if wanted(m, (), [r]))
 
