@@ -22,7 +22,8 @@ PROTOCOLS: Mapping[Protocol, str] = {
     "support": "in its support",
     "task": "with the paper's MPC and full bounds",
 }
-"""full: as it was trained, with the full ±15 mm. support: the same within the bounds of its last episodes, as Jin and
+"""full: as it was trained, with the full ±15 mm; LCS-RL in our recipe stays by itself within the actions that its model
+was fitted to. support: the same within the bounds of its last episodes, as Jin and
 Posa deploy. task: with horizon and cost of the paper and the full bounds, whatever it was trained with."""
 
 
@@ -45,11 +46,12 @@ PAPER = Recipe(
     "the paper's recipe",
     # Learned Σ and a stochastic policy in both phases are the paper's; the size of the noise is that with which the
     # policy of the main phase starts. Contacts and horizon are those of the prior work, whose algorithm the warm-up is.
+    # Episodes of an iteration are twice ours: without model rollouts the gradient of 30 is too noisy.
     settings={
         "n_lam": 5,
         "warmup_minutes": 6.0,
-        "warmup": {"noise": 0.005},
-        "ppo": {**_ADAM, "covariance": "full"},
+        "warmup": {"noise": 0.005, "keep_support": False},
+        "ppo": {**_ADAM, "rollouts": 60, "covariance": "full"},
         "models": {"iterations": 0},
     },
     task={"horizon": 5},
@@ -67,6 +69,7 @@ wanxinjin/Task-Driven-Hybrid-Reduction); it plans in the same support when it is
 ABLATIONS: Mapping[str, Recipe] = {
     "adam": Recipe("Adam instead of the natural gradient", {"ppo": _ADAM}),
     "no-models": Recipe("without model rollouts", {"models": {"iterations": 0}}),
+    "no-support": Recipe("without the kept action support", {"warmup": {"keep_support": False}}),
     "one-action": Recipe("one action per imagined state", {"models": {"actions": 1}}),
     "sigma": Recipe("learned Σ" if _FIXED else "fixed Σ", {"ppo": {"covariance": "diagonal" if _FIXED else "fixed"}}),
     "no-penalty": Recipe("without the penalty of failed episodes", task={"sparse_penalty": 0.0}),
