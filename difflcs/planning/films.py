@@ -144,11 +144,8 @@ def _write(path: Path, frames: list[Image.Image]) -> None:
             video.append_data(np.asarray(frame))
 
 
-def _pusht(path: Path, seed: int, episodes: int, force: bool) -> None:
-    for i, solved in enumerate(record(path, seed, episodes, force=force)):
-        print(f"seed {seed + i}: {'solved' if solved else 'not solved'}")
-    print(f"written: {path}")
-
-
-FILMS: dict[str, Callable[[Path, int, int, bool], None]] = {"pusht": _pusht}
-"""By name: path, seed of the first episode, number of episodes, and whether to replace a file → None."""
+FILMS: dict[str, Callable[[Path, int, int, bool], list[bool]]] = {
+    "pusht": lambda path, seed, episodes, force: record(path, seed, episodes, force=force)
+}
+"""By name: path, seed of the first episode, number of episodes, whether to replace a file → for each episode, whether
+it was solved."""

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 import torch
 from torch import Tensor
 
+from difflcs._checks import did_you_mean
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
 from difflcs.lcs import LCSModel, LCSModule
 from difflcs.mpc.backends import get_backend
@@ -215,8 +216,8 @@ def get_method(name: str) -> type[Method]:
     """
     if name not in _REGISTRY:
         raise InvalidInputError(
-            f"method: expected one of {', '.join(_REGISTRY)}, got {name!r:.200}; add your own with "
-            f"difflcs.rl.register_method"
+            f"method: expected one of {', '.join(_REGISTRY)}, got {name!r:.200}{did_you_mean(name, _REGISTRY)}; add "
+            f"your own with difflcs.rl.register_method"
         )
     return _REGISTRY[name]
 
