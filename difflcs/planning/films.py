@@ -44,12 +44,14 @@ def picture(env: Any, policy: PushTPolicy, text: str = "", size: int = 340) -> I
     draw = ImageDraw.Draw(frame)
     decision = policy.sampling.decision
     if decision is not None:
-        _draw(draw, decision, size / (SIDE * PIXELS))
+        _draw(draw, decision, size)
     draw.text((6, 4), text, fill=(20, 20, 30), font_size=max(10, size // 24))
     return frame
 
 
-def _draw(draw: Any, decision: Decision, scale: float) -> None:
+def _draw(draw: Any, decision: Decision, size: int) -> None:
+    scale, line = size / (SIDE * PIXELS), size / 340
+
     def dot(point: Tensor, radius: float, **colors: Any) -> None:
         x, y = (scale * PIXELS * point).tolist()
         draw.ellipse((x - radius, y - radius, x + radius, y + radius), **colors)
@@ -60,12 +62,12 @@ def _draw(draw: Any, decision: Decision, scale: float) -> None:
     for place, score in zip(decision.states[1:, 3:5], scores.tolist(), strict=True):
         share = min(max(score / best, 0.0), 1.0) ** 2
         color = tuple(round(share * a + (1 - share) * b) for a, b in zip(_GREEN, _GREY, strict=True))
-        dot(place, 1.5 + 2.0 * share, fill=color)
+        dot(place, line * (1.5 + 2.0 * share), fill=color)
     if decision.mode is Mode.TRAVEL and decision.target is not None:
-        dot(decision.target[3:5], 7.0, outline=_BLUE, width=2)
+        dot(decision.target[3:5], 7.0 * line, outline=_BLUE, width=round(2 * line))
     else:
         path = (scale * PIXELS * decision.solution.x[0, :, 3:5]).tolist()
-        draw.line([tuple(point) for point in path], fill=_BLUE, width=2)
+        draw.line([tuple(point) for point in path], fill=_BLUE, width=round(2 * line))
 
 
 def record(
