@@ -16,7 +16,7 @@ from difflcs.rl.checkpoint import RunDirectory
 from difflcs.rl.figures import NoPictureError, plot_learning_curve
 from difflcs.rl.methods import get_method, method_names
 from difflcs.rl.progress import Progress
-from difflcs.rl.tasks import get_task
+from difflcs.rl.tasks import get_task, task_names
 from difflcs.rl.training import TrainConfig, profile, stored_config, train
 from difflcs.zoo import Learned
 
@@ -98,7 +98,11 @@ def train_command(words: Sequence[str]) -> type[Train]:
     ]
     return make_dataclass(
         "Train",
-        [("method", hidden, field(default_factory=kind)), ("method_name", chosen, field(default=kind.name))],
+        [
+            ("task", Annotated[str, tyro.conf.arg(help=f"What to do: {', '.join(task_names())}.")], TrainConfig.task),
+            ("method", hidden, field(default_factory=kind)),
+            ("method_name", chosen, field(default=kind.name)),
+        ],
         bases=(Train,),
         frozen=True,
         namespace={"__doc__": Train.__doc__, "__post_init__": lambda self: None},
@@ -124,7 +128,7 @@ class Demo:
     """Learn to push the cube from 6 minutes of data; learning curve and video."""
 
     task: str = TrainConfig.task
-    """What to do: the name of a task."""
+    """What to do: one of the tasks that `difflcs train --help` lists."""
     out: Path = Path("runs/demo")
     """Run directory. An existing demo is continued, not repeated."""
     seed: int = 0

@@ -43,8 +43,7 @@ class ModelRolloutSettings(Settings):
     """Settings of the model rollouts; all ours, tuned on the cube."""
 
     iterations: int = bounded(5, minimum=0)
-    """Iterations of PPO on model rollouts between two on real episodes, in the first half of the main phase; 0: none,
-    as in the paper."""
+    """Iterations of PPO on model rollouts between two real ones, in the first half of the main phase; 0: none."""
     final_iterations: int = bounded(1, minimum=0)
     """At most as many in its second half."""
     rollouts: int = bounded(120, minimum=1, maximum=MOST_ENVS)
@@ -54,8 +53,7 @@ class ModelRolloutSettings(Settings):
     value_epochs: int = bounded(10, minimum=1)
     """Epochs of the value network at the end of such an iteration."""
     actions: int = bounded(8, minimum=1, maximum=MOST_ENVS)
-    """Actions that the networks judge in each state, an even number (`difflcs.rl.advantages`); 1: only the one that is
-    taken, by GAE as in real episodes."""
+    """Actions that the networks judge in each state, an even number; 1: only the one that is taken, by GAE."""
     zeta: float = bounded(0.5, minimum=0, maximum=1)
     """Zeta of the advantages where several actions are judged, that of PPO otherwise."""
     real_step: float = bounded(0.3, above=0)
