@@ -9,8 +9,9 @@ from collections.abc import Sequence
 
 from difflcs.errors import MissingDependencyError
 
+_INTERRUPTED = 130
 _READER_GONE = 141
-"""What a shell reports of a program whose output nobody reads any more: 128 and the number of SIGPIPE."""
+"""What a shell reports after Ctrl-C, and of a program whose output nobody reads any more: 128 and the signal."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -20,7 +21,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: words after `difflcs`; those of the process if None.
 
     Returns:
-        Exit code; 2 where the extra `rl` is not installed, 141 where the output is piped into something that ended.
+        Exit code; 2 where the extra `rl` is not installed, 130 after Ctrl-C, 141 where the output is piped into
+        something that has ended.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
@@ -28,6 +30,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _run(words)
         finally:
             _flush()  # here and not when Python ends, where nobody could handle an error
+    except KeyboardInterrupt:  # before the command line could say what to do, such as while it is imported
+        print("\ndifflcs: interrupted; nothing was changed", file=sys.stderr)
+        return _INTERRUPTED
     except BrokenPipeError:
         if not _reader_gone():
             raise

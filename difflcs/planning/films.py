@@ -86,7 +86,7 @@ def record(
         For each episode whether it was solved.
 
     Raises:
-        InvalidInputError: an ending of another kind, or the file is there already.
+        InvalidInputError: an ending of another kind, the file is there already, or it cannot be written there.
         MissingDependencyError: gym-pusht, Pillow or imageio is not installed.
     """
     path = Path(path)
@@ -102,6 +102,13 @@ def record(
         raise MissingDependencyError(
             f'expected the package(s) {", ".join(missing)}, not installed; run: pip install "difflcs[scoreboard,viz]"'
         )
+    temporary = path.with_name(f".{path.stem}.tmp{kind}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.touch()  # said before the episodes are played
+        temporary.unlink()
+    except OSError as error:
+        raise InvalidInputError(f"out: expected a place to write {path}, got: {error}; choose another") from error
     env, policy, frames, solved = make_env(render_mode="rgb_array"), PushTPolicy(), [], []
     for i in range(episodes):
         observation, _ = env.reset(seed=seed + i)
@@ -119,8 +126,6 @@ def record(
         frames += [picture(env, policy, verdict, size)] * _PAUSE
         solved.append(bool(success))
     env.close()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.tmp{kind}")
     try:
         _write(temporary, frames)
         os.replace(temporary, path)

@@ -21,7 +21,7 @@ from typing import get_type_hints
 import pytest
 import torch
 
-from difflcs import LCSModel, cli, cli_train
+from difflcs import LCSModel, __main__, cli, cli_train
 from difflcs.rl import progress
 from difflcs.rl.checkpoint import RunDirectory
 from difflcs.rl.methods import LCSRLMethod, get_method, method_names
@@ -320,6 +320,15 @@ def test_who_reads_the_output_may_stop(words):
     assert not done.stderr
 
 
+def test_ctrl_c_while_the_command_is_imported(capsys, monkeypatch):
+    def die(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "main", die)
+    assert __main__.main(["train"]) == 130
+    assert capsys.readouterr().err == "\ndifflcs: interrupted; nothing was changed\n"
+
+
 def test_what_a_training_shows_without_a_terminal(capsys, tmp_path):
     words = "--method violation --smoke --minutes 0.5 --evaluate-at 0 0.3 --evaluate-goals 2 --final-goals 3".split()
     code, out, err = run(capsys, "train", *words, "--out", tmp_path / "run")
@@ -588,6 +597,7 @@ def test_render(capsys, finished, tmp_path):
     file.write_text("no folder")
     code, _, err = run(capsys, "render", finished, "--smoke", "--out", file / "video.mp4")
     assert code == 2
+    assert err.startswith("difflcs: out: expected a place to write ")  # and nothing of ffmpeg before it
     assert "choose another" in err
 
 
