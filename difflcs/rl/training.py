@@ -146,7 +146,7 @@ def train(
     """Train a model and leave a run directory behind.
 
     It can be interrupted at any instant; resumed, it ends with the same parameters as if it had not been. The run
-    directory is locked meanwhile.
+    directory is locked meanwhile. The logger "difflcs" tells of iterations and evaluations, at level INFO.
 
     Args:
         config: what to train; LCS-RL on `task` by default. When resuming, the run's own configuration must equal it.
@@ -163,7 +163,7 @@ def train(
 
     Raises:
         InvalidInputError: no task has this name, its environment cannot be made, the data is used up by the warm-up,
-            `init` does not fit the task, or `force` and `resume`.
+            `init` does not fit the task, an evaluation is to be after the end, or `force` and `resume`.
         CheckpointError: `out` holds files and neither `resume` nor `force` is set, or they cannot be resumed from, or
             they are no run, or they cannot be written; the last checkpoint is intact.
         InUseError: another process trains in `out`.
