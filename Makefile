@@ -2,7 +2,6 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-EXTRAS := all
 
 # One worker per core; a file stays in one worker, which computes its shared fixtures once; long files come first.
 PARALLEL := -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
@@ -19,14 +18,23 @@ help:
 	@echo "make docs   build the documentation (build/docs/index.html)"
 	@echo "make clean  remove .venv and build products"
 
-$(VENV)/.ready: pyproject.toml constraints.txt CMakeLists.txt cmake/kernels.cmake $(wildcard difflcs/_native/*.?pp envs/difflcs_envs/_native/*.?pp)
+# .ready: everything that developers need, with the kernels for every CPU. .demo: what the demo needs, a quarter of the
+# packages, with the kernels for the CPU that is here, which compile in half the time.
+SOURCES := pyproject.toml constraints.txt CMakeLists.txt cmake/kernels.cmake \
+  $(wildcard difflcs/_native/*.?pp envs/difflcs_envs/_native/*.?pp)
+$(VENV)/.ready: EXTRAS := all
+$(VENV)/.ready: ISAS := all
+$(VENV)/.demo: EXTRAS := rl,envs,viz
+$(VENV)/.demo: ISAS := here
+$(VENV)/.ready $(VENV)/.demo: $(SOURCES)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "difflcs needs Python 3.11 or newer, got $$($(PYTHON) --version); try make PYTHON=python3.11"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[$(EXTRAS)]"
+	SKBUILD_CMAKE_DEFINE=DIFFLCS_ISAS=$(ISAS) \
+	  $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e ".[$(EXTRAS)]"
 	@touch $@
 
-demo: $(VENV)/.ready
+demo: $(or $(wildcard $(VENV)/.ready),$(VENV)/.demo)
 	$(BIN)/difflcs demo
 
 check: $(VENV)/.ready

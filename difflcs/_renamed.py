@@ -65,6 +65,7 @@ _GONE: Mapping[str, str] = {
     "--ppo.sample-clip": "single samples have no limit of their own, as in all recipes; see --ppo.outlier-kl",
     "--ppo.final-std": "the policy's deviation no longer falls by a schedule; learn it by --ppo.covariance diagonal",
     "--ppo.failure-penalty": "it is a number of the task, `failure_penalty` of its TaskSpec",
+    "--pddm.noise": "it is always 0.9, as its authors have for every dexterous task",
     "--warmup.held-out": "it is always 0.2, as no recipe had another",
     "--ppo.kl-quantile": "it is always 0.97, as no recipe had another",
     "--ppo.natural-samples": "there are always 300, as no recipe had others",

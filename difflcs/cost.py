@@ -358,7 +358,7 @@ class GoalCost(TensorFields):
     ) -> GoalCost:
         """Bring the first states to a goal: Σ wⱼ (xⱼ − goalⱼ)² + pair_weight·Σ (xᵢ − xⱼ)² + input_weight·‖u‖².
 
-        Weights multiply squares without a factor ½, as in Eq. cost_function of the paper. Pairs pull states together,
+        Weights multiply squares without a factor ½, as in Eq. 13 of the paper. Pairs pull states together,
         for example fingertips to the object.
 
         Args:

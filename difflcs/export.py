@@ -48,7 +48,7 @@ def export_controller(
             f"build a layer with lcs=module.params(x, context)"
         )
     content = controller_bytes(mpc, system, step_seconds)
-    low, high = (mpc.u_min, mpc.u_max) if mpc.bounds is None else mpc.bounds.by_steps()
+    low, high = mpc.limits()
     description = {
         **(about or {}),
         "format": VERSION,

@@ -10,10 +10,18 @@ import torch
 from torch import Tensor, nn
 
 from difflcs import _files, _zoo
-from difflcs._checks import broadcast_batch, check_choice, check_number, check_positive_int, describe
+from difflcs._checks import (
+    broadcast_batch,
+    check_choice,
+    check_number,
+    check_positive_int,
+    check_tensor,
+    describe,
+)
 from difflcs._functorch import runs_eagerly, transforms_active
 from difflcs._recall import Recall, worth_keeping
-from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, ShapeError
+from difflcs.constraints import check_bounds
+from difflcs.errors import BoundsError, CheckpointError, DTypeError, InvalidInputError, ShapeError
 from difflcs.records import (
     SYSTEM,
     LCSModule,
@@ -41,8 +49,19 @@ __all__ = [
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
+def _check_support(support: object, n_u: int) -> Tensor:
+    """Lower and upper bounds (2, n_u) of actions."""
+    support = check_tensor("action_support", support, [("2", 2), ("n_u", n_u)])
+    if support.ndim != 2:
+        raise ShapeError(
+            f"action_support: expected shape (2, {n_u}), got {tuple(support.shape)}; it is that of a model"
+        )
+    check_bounds(support[0], support[1])
+    return support.detach()
+
+
 class LCSModel(nn.Module):
-    """A learnable linear complementarity system (Eq. lcs), F = G Gᵀ + stiffness·I + H − Hᵀ.
+    """A learnable linear complementarity system (Eq. 1 of the paper), F = G Gᵀ + stiffness·I + H − Hᵀ.
 
     The parametrisation keeps F + Fᵀ ⪰ 2·stiffness·I for any G and H, so that the LCP always has one solution.
 
@@ -55,9 +74,12 @@ class LCSModel(nn.Module):
         learn_c: whether c is learned. The paper's experiments keep it at zero (`False`).
         generator: random generator of the initial parameters; torch's default one if None.
         dtype: float64 (default) or float32.
+        action_support: (2, n_u) lower and upper bounds of the actions that the model was fitted to, where that is
+            known: an `LCSMPCLayer` plans within them. A buffer, saved with the model; set it to None to plan without.
 
     Raises:
         InvalidInputError, DTypeError: a size that is too small, a stiffness that is not positive, another dtype.
+        ShapeError, NonFiniteError, BoundsError: an action support that is none.
     """
 
     parameter_names = ("A", "B", "C", "d", "D", "E", "G", "H", "c")
@@ -73,6 +95,7 @@ class LCSModel(nn.Module):
         learn_c: bool = True,
         generator: torch.Generator | None = None,
         dtype: torch.dtype = torch.float64,
+        action_support: Tensor | None = None,
     ):
         super().__init__()
         self.n_x = check_positive_int("n_x", n_x)
@@ -87,6 +110,9 @@ class LCSModel(nn.Module):
             value = torch.zeros(shape) if name == "c" else init_scale * (2 * draw - 1)
             self.register_parameter(name, nn.Parameter(value.to(dtype)))
         self.c.requires_grad_(learn_c)
+        if action_support is not None:
+            action_support = _check_support(action_support, self.n_u).to(dtype, copy=True)
+        self.register_buffer("action_support", action_support)
         self._made: Recall[tuple[float, Tensor]] = Recall()
 
     A: nn.Parameter
@@ -98,6 +124,7 @@ class LCSModel(nn.Module):
     G: nn.Parameter
     H: nn.Parameter
     c: nn.Parameter
+    action_support: Tensor | None
 
     @staticmethod
     def _shapes(x: int, u: int, m: int) -> dict[str, tuple[int, ...]]:
@@ -237,6 +264,8 @@ class LCSModel(nn.Module):
         except InvalidInputError as error:
             raise CheckpointError(f"{source}: its configuration cannot be used: {error}") from error
         wanted_shapes = cls._shapes(n_x, n_u, n_lam)  # compared before anything of these sizes is made
+        if "action_support" in tensors:
+            wanted_shapes["action_support"] = (2, n_u)
         shapes = {k: tuple(v.shape) for k, v in tensors.items()}
         if shapes != wanted_shapes:
             raise CheckpointError(
@@ -245,7 +274,11 @@ class LCSModel(nn.Module):
         for name, tensor in tensors.items():
             if tensor.dtype != dtype or not bool(torch.isfinite(tensor).all()):
                 raise CheckpointError(f"{source}: expected finite {dtype} values in {name}, got {describe(tensor)}")
-        model = cls(n_x, n_u, n_lam, stiffness, learn_c=config["learn_c"], dtype=dtype)
+        support = tensors.get("action_support")
+        try:
+            model = cls(n_x, n_u, n_lam, stiffness, learn_c=config["learn_c"], dtype=dtype, action_support=support)
+        except BoundsError as error:
+            raise CheckpointError(f"{source}: its action support cannot be used: {error}") from error
         model.load_state_dict(dict(tensors))
         return model
 

@@ -29,7 +29,7 @@ def violation_loss(
     reduction: str = "mean",
     check_gamma: bool = True,
 ) -> Tensor:
-    """The violation-based loss of an LCS (Eq. vio_loss of the paper; Jin et al.).
+    """The violation-based loss of an LCS (Eq. 2 of the paper; Jin et al.).
 
     For each transition, with r = A x + B u + C λ + d − x_next and e = D x + E u + F λ + c − φ,
 

@@ -195,7 +195,7 @@ class _Record(SystemMatrices):
 
 @dataclass(frozen=True)
 class LCSParams(_Record):
-    """The matrices of one linear complementarity system, or of one per batch element (Eq. lcs of the paper).
+    """The matrices of one linear complementarity system, or of one per batch element (Eq. 1 of the paper).
 
     x₊ = A x + B u + C λ + d,  0 ≤ λ ⊥ D x + E u + F λ + c ≥ 0,  with F + Fᵀ ≻ 0, so that λ is unique.
 

@@ -1,20 +1,32 @@
-"""What the documentation takes from the code, so that nobody copies it by hand. A Sphinx extension.
+"""What the documentation takes from the code and from records, so that nobody copies it by hand. A Sphinx extension.
 
-A line `<!-- generated: KIND ARGUMENTS -->` of a page is replaced by Markdown that is made when the site is built:
+What stands in a page between `<!-- generated: KIND ARGUMENTS -->` and `<!-- end -->` is written by
+
+    python docs/generated.py
+
+so that pages can be read in the repository, too; `--check` says which are out of date, and changes nothing. When the
+site is built it is made anew. There are these kinds:
 
 - `commands`: the command line's own help, one section per command.
 - `settings CLASS`: a table of a dataclass's own fields with their defaults and docstrings.
 - `methods`: a section for each method that is registered, with tables of its settings and of their groups.
 - `docstring OBJECT`: a docstring that is written in Markdown, as those of the environments.
-- `api MODULE [NAME ...]`: the reference of these public names of a module, or of all that are in its `__all__`.
-- `file PATH`: another Markdown file of the repository, without its title.
+- `api MODULE [NAME ...]`: the reference of these public names of a module, or of all that are in its `__all__`; in the
+  repository what each name is.
+- `module MODULE NAME ...`: the same of functions, below the docstring of their module.
+- `file PATH`: another Markdown file of the repository, without its title; in the repository a link.
 - `table RECORD PART`: a table of `benchmarks/results/RECORD.json`; tables.py says which there are.
+- `results FILE NUMBER [COLUMN ...]`: that table of `reproduce/results/FILE.md`, without these columns.
+- `zoo`: the models of the zoo, from their cards.
+- `tutorials`: the contents page of the notebooks; in the repository links to them.
 
-Besides, the notebooks of tutorials/ are copied to docs/tutorials, and docstrings are mended for reStructuredText.
+A list between `<!-- cards -->` and `<!-- end -->` becomes cards in the site. Besides, the notebooks of tutorials/ are
+copied to docs/tutorials, and docstrings are mended for reStructuredText.
 """
 
 from __future__ import annotations
 
+import argparse
 import ast
 import contextlib
 import importlib
@@ -25,6 +37,7 @@ import json
 import os
 import re
 import shutil
+import sys
 import textwrap
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
@@ -34,7 +47,8 @@ from typing import Any
 
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
-MARKER = re.compile(r"^<!-- generated: (\w+) ?(.*?) -->$", re.MULTILINE)
+MARKER = re.compile(r"^<!-- generated: (\w+) ?(.*?) -->$.*?^<!-- end -->$", re.MULTILINE | re.DOTALL)
+CARDS = re.compile(r"^<!-- cards -->$(.*?)^<!-- end -->$", re.MULTILINE | re.DOTALL)
 
 
 # --- command line -----------------------------------------------------------------------------------------------------
@@ -120,12 +134,12 @@ def setting_rows(group: Any, prefix: str = "--") -> list[tuple[str, str, str]]:
 
 def settings_table(rows: list[tuple[str, str, str]]) -> str:
     """Markdown: a table of such rows."""
-    lines = ["```{container} settings", "| setting | default | meaning |", "|---|---|---|"]
+    lines = ['<div class="settings">', "", "| setting | default | meaning |", "|---|---|---|"]
     for flag, default, meaning in rows:
         text = meaning.replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
         group = flag.endswith(".*")
         lines.append(f"| {f'**`{flag}`**' if group else f'`{flag}`'} | {default} | {f'*{text}*' if group else text} |")
-    return "\n".join([*lines, "```"])
+    return "\n".join([*lines, "", "</div>"])
 
 
 def methods() -> str:
@@ -210,6 +224,24 @@ def api(module: str, *names: str) -> str:
             options = [":no-value:"]
         parts += [f".. {kind}:: {module}.{name}", *(f"   {option}" for option in options), ""]
     return "```{eval-rst}\n" + "\n".join(parts) + "```"
+
+
+def summary(value: Any) -> str:
+    """Markdown: the first sentence of a docstring, on one line."""
+    first = " ".join((inspect.getdoc(value) or "").partition("\n\n")[0].split())
+    return first.replace("|", "\\|").replace("<", "&lt;")
+
+
+def api_summary(module: str, *names: str) -> str:
+    """Markdown: a table of public names, for who reads it in the repository."""
+    owner = importlib.import_module(module)
+    rows = [f"| `{name}` | {summary(getattr(owner, name))} |" for name in names or owner.__all__]
+    return "\n".join(["| name | meaning |", "|---|---|", *rows])
+
+
+def module_functions(name: str, *names: str) -> str:
+    """Markdown: autodoc of a module and some of its names."""
+    return f"```{{eval-rst}}\n.. automodule:: {name}\n   :members: {', '.join(names)}\n```"
 
 
 def mend_docstring(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
@@ -304,27 +336,82 @@ def table(record: str, part: str) -> str:
     return module.TABLES[record][part](found)
 
 
+def file_link(path: str) -> str:
+    """Markdown: where the repository has the file."""
+    return f"In the repository this is the file [{path}](../{path})."
+
+
+def results(name: str, number: str, *left_out: str) -> str:
+    """Markdown: a table of what reproduce/ has computed, without the columns of these names."""
+    text = (ROOT / "reproduce" / "results" / f"{name}.md").read_text()
+    found = re.findall(r"(?:^\|.*\|\n)+", text, re.MULTILINE)[int(number) - 1]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in found.splitlines()]
+    rows[1] = ["---"] * len(rows[0])
+    kept = [k for k, head in enumerate(rows[0]) if head.replace(" ", "_") not in left_out]
+    return "\n".join("| " + " | ".join(row[k] for k in kept) + " |" for row in rows)
+
+
+def zoo() -> str:
+    """Markdown: for each task of the zoo a picture, its models and the commands that made them."""
+    from difflcs import zoo as models
+
+    cards = [models.card(name) for name in models.names()]
+    parts = []
+
+    def source(card: models.ModelCard) -> str:
+        return card.object_source.replace("_", " ")
+
+    for task in sorted({card.task for card in cards}):
+        mine = [card for card in cards if card.task == task]
+        parts.append(f"## {task.replace('_', ' ').replace('-', ' ').capitalize()}")
+        picture = f"figures/zoo/{mine[0].name}.png"
+        if (DOCS / picture).exists():
+            parts.append(f"![Steps of an episode of {mine[0].name}]({picture})")
+        lines = ["| model | method | data | success | object |", "|---|---|---|---|---|"]
+        lines += [f"| `{c.name}` | `{c.method}` | {c.minutes:g} min | {c.success_text} | {source(c)} |" for c in mine]
+        parts += ["\n".join(lines), "\n".join(["```text", *(c.command for c in mine), "```"])]
+    return "\n\n".join(parts)
+
+
+def cards(items: str) -> str:
+    """Markdown for sphinx-design: the items of a list, `- [title](page): text`, as cards."""
+    parts = ["::::{grid} 1 2 2 2", ":gutter: 3", ""]
+    for title, page, text in re.findall(r"^- \[(.*?)\]\((.*?)\): (.*?)$", items, re.MULTILINE):
+        link = [f":link: {page.removesuffix('.md')}", ":link-type: doc"]
+        parts += [f":::{{grid-item-card}} {title}", *link, "", text[0].upper() + text[1:], ":::", ""]
+    return "\n".join([*parts, "::::"])
+
+
+def titles() -> dict[str, str]:
+    """Notebooks of tutorials/ and their titles."""
+    found = {}
+    for notebook in sorted((ROOT / "tutorials").glob("*.ipynb")):
+        first = "".join(json.loads(notebook.read_text())["cells"][0]["source"])
+        found[notebook.stem] = first.partition("\n")[0].lstrip("# ")
+    return found
+
+
+def tutorials() -> str:
+    """Markdown: a contents page of the notebooks."""
+    return "```{toctree}\n:maxdepth: 1\n\n" + "\n".join(f"tutorials/{name}" for name in titles()) + "\n```"
+
+
+def tutorial_links() -> str:
+    """Markdown: links to the notebooks themselves."""
+    return "\n".join(f"- [{title}](../tutorials/{name}.ipynb)" for name, title in titles().items())
+
+
 def copy_tutorials() -> None:
-    """Copy tutorials/*.ipynb to docs/tutorials and write their contents page."""
+    """Copy tutorials/*.ipynb to docs/tutorials, where Sphinx reads them."""
     target = DOCS / "tutorials"
     target.mkdir(exist_ok=True)
-    found = sorted((ROOT / "tutorials").glob("*.ipynb"))
-    for old in target.glob("*.ipynb"):
+    for old in target.iterdir():
         if not (ROOT / "tutorials" / old.name).exists():
             old.unlink()
-    for notebook in found:
+    for notebook in sorted((ROOT / "tutorials").glob("*.ipynb")):
         copy = target / notebook.name
         if not copy.exists() or copy.read_bytes() != notebook.read_bytes():
             shutil.copyfile(notebook, copy)
-    names = "\n".join(notebook.stem for notebook in found)
-    contents = f"```{{toctree}}\n:maxdepth: 1\n\n{names}\n```\n" if found else "This copy has none.\n"
-    text = (
-        "# Tutorials\n\nNotebooks, one idea each, each under three minutes. They are in the folder `tutorials/` of the "
-        "repository; what they show here was computed when they were last run.\n\n" + contents
-    )
-    index = target / "index.md"
-    if not index.exists() or index.read_text() != text:
-        index.write_text(text)
 
 
 # --- Sphinx -----------------------------------------------------------------------------------------------------------
@@ -335,14 +422,56 @@ KINDS: dict[str, Callable[..., str]] = {
     "methods": methods,
     "docstring": docstring,
     "api": api,
+    "module": module_functions,
     "file": repository_file,
     "table": table,
+    "results": results,
+    "zoo": zoo,
+    "tutorials": tutorials,
+}
+# What only Sphinx can read has another form in the repository.
+IN_REPOSITORY: dict[str, Callable[..., str]] = KINDS | {
+    "api": api_summary,
+    "module": api_summary,
+    "file": file_link,
+    "tutorials": tutorial_links,
 }
 
 
 def fill(text: str) -> str:
-    """A page with its markers replaced."""
-    return MARKER.sub(lambda found: KINDS[found[1]](*found[2].split()), text)
+    """A page as the site shows it, where the notebooks are copies in docs/tutorials."""
+    text = CARDS.sub(lambda found: cards(found[1]), text)
+    text = MARKER.sub(lambda found: KINDS[found[1]](*found[2].split()), text)
+    return text.replace("](../tutorials/", "](tutorials/")
+
+
+def refresh(text: str) -> str:
+    """A page as the repository has it."""
+
+    def new(found: re.Match[str]) -> str:
+        start, body = found[0].partition("\n")[0], IN_REPOSITORY[found[1]](*found[2].split())
+        return f"{start}\n\n{body}\n\n<!-- end -->"
+
+    return MARKER.sub(new, text)
+
+
+def main() -> int:
+    """Bring the pages up to date, or say which are not."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--check", action="store_true", help="change nothing; exit code 1 if a page is out of date")
+    check, stale = parser.parse_args().check, []
+    for page in sorted(DOCS.rglob("*.md")):
+        text = page.read_text()
+        new = refresh(text)
+        if new != text:
+            stale.append(str(page.relative_to(ROOT)))
+            if not check:
+                page.write_text(new)
+    if stale:
+        print(("out of date: " if check else "written: ") + ", ".join(stale))
+    if stale and check:
+        print("Run `python docs/generated.py`.")
+    return int(bool(stale) and check)
 
 
 def read_source(app: Any, docname: str, source: list[str]) -> None:
@@ -364,3 +493,7 @@ def setup(app: Any) -> dict[str, bool]:
     app.connect("autodoc-process-docstring", mend_docstring, priority=400)  # before napoleon
     app.connect("autodoc-skip-member", skip_member)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

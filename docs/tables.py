@@ -156,7 +156,7 @@ def efforts(record: dict) -> str:
     rows = [
         [f"{kind} ({row['problems']})"]
         + [
-            f"{100 * row[e]['mean gap']:.2g} % ({100 * row[e]['within 0.1 % of best']:.0f} %), {row[e]['time']:.1f}×"
+            f"{percent(row[e]['mean gap'])} ({100 * row[e]['within 0.1 % of best']:.0f} %), {row[e]['time']:.1f}×"
             for e in names
         ]
         for kind, row in record["results"].items()

@@ -1,7 +1,7 @@
 """The task: the TriFinger with cube and goal, and steps 1, 5, 8, 13, 17, 20 of a trajectory of an LCS-RL model.
 
-`python reproduce/fig_task.py` takes the newest LCS-RL model of the cube that the other scripts have trained, or that of
-`--run RUN`; `--rerun --preset smoke|quick|paper` trains one.
+`python reproduce/fig_task.py` takes the model of the zoo, or that of `--run RUN`; `--rerun --preset smoke|quick|paper`
+trains one as the other scripts do, or takes the one that they have trained.
 """
 
 import sys
@@ -17,10 +17,10 @@ from matplotlib.figure import Figure
 from runs import command_line, run
 
 from difflcs.errors import InvalidInputError
-from difflcs.rl import RunDirectory, get_task, load_policy
+from difflcs.rl import get_task
 from difflcs.rl.rollout import Policy, mpc_actions
 from difflcs.rl.seeding import Stream, episode_seeds
-from difflcs.rl.training import stored_config
+from difflcs.zoo import Learned
 
 STEPS = (1, 5, 8, 13, 17, 20)
 """Those that the paper shows."""
@@ -34,24 +34,24 @@ TRIES, LEAST_WAY, LEAST_TURN = 20, 0.04, 0.2
 class DrawTask(report.Draw):
     """Options of the script."""
 
-    run: Path | None = None
-    """Run directory of `difflcs train --task cube` whose model to take."""
+    run: Path = Path("zoo:trifinger-cube")
+    """Run directory of `difflcs train --task cube` whose model to take, or zoo:NAME."""
 
 
-def find_run(options: DrawTask) -> RunDirectory:
-    """The run asked for; else of the finished LCS-RL units on the cube that with the most data, then the newest."""
-    finished = {path.parent / "run": records.read(path) for path in options.work.glob("cube-lcs-rl-ours-*/result.csv")}
-    newest = max(finished, key=lambda run: (finished[run]["at"].max(), finished[run].finished.max()), default=None)
-    chosen = options.run or newest
-    if chosen is None:
-        raise InvalidInputError(
-            f"{options.work}: expected an LCS-RL model of the cube, found none; pass --run RUN, a directory of "
-            f"`difflcs train --task cube --minutes 30`, or train one with: python reproduce/fig_task.py --rerun"
-        )
-    directory = RunDirectory.open(chosen)
-    if (task := stored_config(directory).task) != "cube":
-        raise InvalidInputError(f"run: expected a run of the cube, got one of {task}; pass another")
-    return directory
+def newest(work: Path) -> Path:
+    """Of the finished LCS-RL units on the cube the run with the most data, then the newest."""
+    finished = {path.parent / "run": records.read(path) for path in work.glob("cube-lcs-rl-ours-*/result.csv")}
+    if not finished:
+        raise InvalidInputError(f"{work}: expected an LCS-RL model of the cube, found none; drop --rerun")
+    return max(finished, key=lambda run: (finished[run]["at"].max(), finished[run].finished.max()))
+
+
+def find_model(path: Path) -> Learned:
+    """A model of the cube."""
+    learned = Learned.open(path)
+    if learned.task != "cube":
+        raise InvalidInputError(f"run: expected a model of the cube, got one of {learned.task}; pass another")
+    return learned
 
 
 def trajectory(policy: Policy) -> tuple[np.ndarray, dict[int, np.ndarray], bool]:
@@ -86,8 +86,8 @@ def trajectory(policy: Policy) -> tuple[np.ndarray, dict[int, np.ndarray], bool]
 def draw(options: DrawTask) -> int:
     """Train if asked for, then write the figure; returns the exit code."""
     code = run(replace(options, seeds=1, methods=("lcs-rl",), recipes=("ours",)), ["curves"]) if options.rerun else 0
-    directory = find_run(options)
-    scene, pictures, reached = trajectory(load_policy(directory))
+    learned = find_model(newest(options.work) if options.rerun else options.run)
+    scene, pictures, reached = trajectory(learned.policy)
     outcome = f"goal {'reached' if reached else 'missed'}"
     figure = Figure((11.0, 4.4), dpi=150, layout="constrained")
     left, right = cast(Any, figure.subfigures(1, 2, width_ratios=(1.15, 1.0)))
@@ -101,8 +101,9 @@ def draw(options: DrawTask) -> int:
         axes.imshow(picture)
         axes.set_title(title, fontsize=10 if picture is scene else 9)
         axes.axis("off")
-    report.write_figure(figure, options.results, "fig_task")
-    print(f"model: {directory.path}; {outcome}")
+    preset = (options.preset or "quick") if options.rerun else "paper"
+    report.write_figure(figure, options.results, "fig_task" + f"-{preset}" * (preset != "paper"))
+    print(f"model: {learned.name}; {outcome}")
     return code
 
 

@@ -10,47 +10,82 @@ from pathlib import Path
 import pandas as pd
 import report
 from matplotlib.figure import Figure
+from recipes import RECIPES
 from records import Cell, select
-from report import say
-from units import OBJECTS, TRANSFER
+from report import Tables, say
+from units import METHODS, OBJECTS, TRANSFER
 
 LABELS = {"scratch": "from scratch", "cube": "from the cube's model"}
 COLORS = {"scratch": "#0072b2", "cube": "#d55e00"}
-WHEN: dict[str, str | float] = {"6 min": 6.0, "final": "final"}
-NOTE = "Differences: from the cube's model − from scratch, paired by seed, with the two-sided p of the t-test."
+WHEN: dict[str, str | float] = {"2 min": 2.0, "6 min": 6.0, "final": "final"}
+NOTE = "Differences: from the cube's model − from scratch, at equal data of the object."
 Cells = dict[str, dict[str, Cell | None]]
 """Object → start → results."""
 
 
-def table(cells: Cells) -> pd.DataFrame:
-    """Success from either start, and the paired difference."""
+def success(cells: Cells) -> pd.DataFrame:
+    """Success from either start."""
     columns = {"object": [task.replace("_", " ") for task in cells]}
     columns["cube's model, no data"] = [say(report.at(starts["cube"], 0.0)) for starts in cells.values()]
+    for (label, when), start in ((pair, start) for pair in WHEN.items() for start in TRANSFER):
+        columns[f"{label}: {LABELS[start]}"] = [say(report.at(starts[start], when)) for starts in cells.values()]
+    return pd.DataFrame(columns)
+
+
+def differences(cells: Cells) -> pd.DataFrame:
+    """The paired differences."""
+    columns = {"object": [task.replace("_", " ") for task in cells]}
     for label, when in WHEN.items():
-        for start in TRANSFER:
-            columns[f"{label}: {LABELS[start]}"] = [say(report.at(starts[start], when)) for starts in cells.values()]
         found = [report.paired(starts["cube"], starts["scratch"], when) for starts in cells.values()]
         means, ps = zip(*map(report.say_difference, found), strict=True)
         columns |= {f"{label}: difference": list(means), f"{label}: p": list(ps)}
     return pd.DataFrame(columns)
 
 
-def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
-    """Write figure and table."""
-    cells = {task: {start: select(rows, task, m, "ours", start) for start, m in TRANSFER.items()} for task in OBJECTS}
-    found = [cell for starts in cells.values() for cell in starts.values() if cell is not None]
-    if not found:
-        return False
-    figure = Figure((10.0, 6.4), dpi=150, layout="constrained")
+def words(cells: Cells, label: str) -> list[str]:
+    """What the intervals say, at each time; and whether the first minutes of PPO cost what transfer has brought."""
+    said = []
+    for time, when in WHEN.items():
+        pairs = {task: (starts["cube"], starts["scratch"]) for task, starts in cells.items()}
+        apart = {task.replace("_", " "): report.paired_estimate(*pair, when) for task, pair in pairs.items()}
+        said.append(f"From the cube's model against from scratch, {label}, {time}: {report.verdict(apart)}.")
+    return said
+
+
+def panel(figure: Figure, cells: Cells, stand_in: bool) -> None:
+    """The curves of all objects."""
     for axes, (task, starts) in zip(figure.subplots(2, 3, sharey=True).flat, cells.items(), strict=True):
-        title = task.replace("_", " ") + (" (stand-in)" if name.endswith("stand-in") else "")
-        report.draw_curves(axes, title, [(cell, LABELS[start], COLORS[start]) for start, cell in starts.items()])
+        title = task.replace("_", " ") + (" (stand-in)" if stand_in else "")
+        lines = [(cell, LABELS[start], COLORS[start], "-") for start, cell in starts.items()]
+        report.draw_curves(axes, title, lines)
         if any(starts.values()):
             axes.legend(fontsize=8, frameon=False, loc="lower right")
-    report.write_figure(figure, folder, name)
-    title = "LCS-RL from scratch and from the cube's model, mean over the seeds [%]"
-    report.write_tables(folder, name, {title: table(cells)}, [NOTE, *report.provenance(found)])
-    return True
+
+
+def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
+    """Write a figure for each recipe, and the tables."""
+    tables, said, found, figures = Tables(), [], [], {}
+    for recipe in METHODS["lcs-rl"]:
+        cells: Cells = {
+            task: {start: select(rows, task, method, recipe, start) for start, method in TRANSFER.items()}
+            for task in OBJECTS
+        }
+        if not any(starts["cube"] for starts in cells.values()):
+            continue
+        found += [cell for starts in cells.values() for cell in starts.values() if cell is not None]
+        label = RECIPES[recipe].label
+        tables[f"LCS-RL from scratch and from the cube's model, {label}: success [%]"] = success(cells)
+        tables[f"The differences, {label}"] = differences(cells)
+        said += words(cells, label)
+        figure = Figure((10.0, 6.4), dpi=150, layout="constrained")
+        panel(figure, cells, name.endswith("stand-in"))
+        figure.suptitle(label)
+        stem = name if recipe == "ours" else f"{name}-{recipe}-recipe"
+        report.write_figure(figure, folder, stem)
+        figures[stem] = f"From scratch and from the cube's model, {label}"
+    if tables:
+        report.write_tables(folder, name, tables, [NOTE, *report.bullets(said), *report.provenance(found)], figures)
+    return bool(tables)
 
 
 main = partial(report.main, "fig_transfer", "transfer", draw)

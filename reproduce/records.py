@@ -21,6 +21,7 @@ from difflcs.errors import CheckpointError
 RESULTS = Path(__file__).parent / "results"
 COLUMNS: dict[Hashable, Any] = {
     **{"task": str, "method": str, "recipe": str, "start": str, "seed": int},  # the unit
+    "protocol": str,  # how it was evaluated, see `recipes.PROTOCOLS`
     **{"at": float, "minutes": float},  # of data: asked for; really: the end of an iteration
     **{"success": float, "ci_low": float, "ci_high": float},  # share of goals reached, and its Wilson 95 % interval
     **{"goals": int, "evaluation_seed": int},  # goals tried, and what they were drawn from
@@ -69,7 +70,7 @@ def add(folder: Path, preset: str, new: pd.DataFrame) -> Path:
     with filelock.FileLock(folder / ".lock"):
         old = read(path)
         kept: Any = old[(old[IDENTITY] != new.loc[0, IDENTITY]).any(axis=1)]
-        write(path, (pd.concat([kept, new]) if len(kept) else new).sort_values(by=[*IDENTITY, "at"]))
+        write(path, (pd.concat([kept, new]) if len(kept) else new).sort_values(by=[*IDENTITY, "protocol", "at"]))
     return path
 
 
@@ -83,7 +84,7 @@ class Cell:
 
     @property
     def first(self) -> Any:
-        """One row, for what all have in common: task, goals, version."""
+        """One row, for what all have in common: task, version, object."""
         return self.rows.iloc[0]
 
     @property
@@ -102,13 +103,30 @@ class Cell:
             return self.scores.columns.max()
         return self.scores.drop(columns=0.0, errors="ignore").mean().idxmax() if when == "peak" else float(when)
 
+    @property
+    def minutes(self) -> Any:
+        """Minutes of data really collected at each evaluation, by the minute asked for: the mean over the seeds."""
+        return self.rows.groupby("at").minutes.mean()
+
+    def goals(self, when: str | float) -> int:
+        """Goals of the evaluations then."""
+        return int(self.rows.goals[self.rows["at"] == self.minute(when)].iloc[0])
+
+    @property
+    def amount(self) -> str:
+        """Seeds and goals that it has, such as "10 seeds × 1000 goals (300 on the way)"."""
+        final, way = self.goals("final"), sorted({*self.rows.goals} - {self.goals("final")})
+        return f"{self.seeds} × {final} goals" + (f" ({', '.join(map(str, way))} on the way)" if way else "")
+
     def at(self, when: str | float) -> pd.Series:
         """Success [%] of each seed then; empty where it was not evaluated."""
         return self.scores.get(self.minute(when), pd.Series(dtype=float))
 
 
-def select(rows: pd.DataFrame, task: str, method: str, recipe: str, start: str = "scratch") -> Cell | None:
-    """The results of one method on one object; None if there are none.
+def select(
+    rows: pd.DataFrame, task: str, method: str, recipe: str, start: str = "scratch", protocol: str = "full"
+) -> Cell | None:
+    """The results of one method on one object, deployed in one way (`recipes.PROTOCOLS`); None if there are none.
 
     Where there are several versions or settings, those with the most evaluated goals, then the newest.
     """
@@ -117,4 +135,5 @@ def select(rows: pd.DataFrame, task: str, method: str, recipe: str, start: str =
         return None
     groups = [group for _, group in found.groupby(["version", "key"])]
     best = max(groups, key=lambda group: (group.goals.sum(), group.finished.max()))
-    return Cell(best, sum(group.seed.nunique() for group in groups if group is not best))
+    shown = best[best.protocol == protocol]
+    return Cell(shown, sum(group.seed.nunique() for group in groups if group is not best)) if len(shown) else None

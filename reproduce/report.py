@@ -2,15 +2,17 @@
 
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import records
 import runs
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from recipes import PROTOCOLS, RECIPES
 from records import Cell
 from stats import IQM, Estimate, bootstrap, p_value, wilson
 from units import PRESETS
@@ -22,12 +24,8 @@ README = Path(__file__).parent / "README.md"
 NAMES = {"lcs-rl": "LCS-RL", "violation": "violation only", "ppo": "PPO without warm-up", "pddm": "PDDM"}
 COLORS = {"lcs-rl": "#d55e00", "violation": "#0072b2", "ppo": "#e69f00", "pddm": "#009e73"}
 """Okabe–Ito: red, blue, orange, green as in the paper, told apart by colour-blind readers."""
-RECIPES = {"ours": "our recipe", "paper": "the paper's recipe"}
 MISSING = "—"
-INTERVALS = (
-    "In brackets 95 % intervals: over the seeds by the bootstrap, which for three seeds says little more than their "
-    "range; of a single seed Wilson's, over its goals."
-)
+STATISTICS = "Brackets and p are explained in reproduce/README.md, section Statistics."
 Tables = dict[str, pd.DataFrame]
 """Title → table of text."""
 Drawing = Callable[[pd.DataFrame, Path, str], bool]
@@ -65,12 +63,20 @@ def main(name: str, artefact: str, draw: Drawing, words: Sequence[str] | None = 
     return runs.command_line(Draw, action, words)
 
 
+def name_of(method: str, recipe: str, start: str = "scratch", protocol: Any = "full") -> str:
+    """What a method is called in tables: its recipe, where it starts, how it is deployed."""
+    own = "" if (method, recipe) == ("pddm", "ours") else RECIPES[recipe].label
+    begins = "" if start == "scratch" else f"from the {start}'s model"
+    deployed = "" if protocol == "full" else PROTOCOLS[protocol]
+    return ", ".join(filter(None, [NAMES[method], own, begins, deployed]))
+
+
 def at(cell: Cell | None, when: str | float) -> Estimate | None:
     """Success [%] at some minute, see `Cell.minute`; None if there is no such evaluation."""
     values = [] if cell is None else list(cell.at(when))
     if cell is None or not values:
         return None
-    return wilson(values[0], cell.first.goals) if len(values) == 1 else bootstrap([values])
+    return wilson(values[0], cell.goals(when)) if len(values) == 1 else bootstrap([values])
 
 
 def over_objects(cells: Sequence[Cell | None], when: str | float) -> Estimate | None:
@@ -78,12 +84,53 @@ def over_objects(cells: Sequence[Cell | None], when: str | float) -> Estimate | 
     return bootstrap([list(cell.at(when)) for cell in cells if cell is not None], IQM) if all(cells) else None
 
 
+def mean_over(cells: Sequence[Cell | None], when: str | float) -> float:
+    """Mean success over the objects that there are results of; -1 without any."""
+    means = [cell.at(when).mean() for cell in cells if cell is not None]
+    return sum(means) / len(means) if means else -1.0
+
+
 def paired(a: Cell | None, b: Cell | None, when: str | float) -> list[float]:
     """Success of a − b [%] for each seed of both; none where they differ in goals or object."""
-    conditions = ["task", "goals", "evaluation_seed", "source", "mass"]
+    conditions = ["task", "evaluation_seed", "source", "mass"]
     if a is None or b is None or any(a.first[name] != b.first[name] for name in conditions):
         return []
+    if a.at(when).empty or b.at(when).empty:
+        return []
+    if when != "peak" and a.goals(when) != b.goals(when):  # peaks may be at the end and on the way
+        return []
     return list((a.at(when) - b.at(when)).dropna())
+
+
+def paired_estimate(a: Cell | None, b: Cell | None, when: str | float) -> Estimate | None:
+    """The mean of `paired` with its interval; None where nothing can be compared."""
+    found = paired(a, b, when)
+    return bootstrap([found]) if found else None
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names in a sentence, such as "mug, wrench and banana"."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1] if names else "none"]))
+
+
+def verdict(differences: Mapping[str, Estimate | None]) -> str:
+    """On which objects a difference is above zero, below it, or cannot be told, by the intervals; without the rest."""
+    known = {name: found for name, found in differences.items() if found is not None and not math.isnan(found.low)}
+    better = [name for name, found in known.items() if found.low > 0]
+    worse = [name for name, found in known.items() if found.high < 0]
+    open_ = [name for name in known if name not in better and name not in worse]
+    found = {"better": better, "worse": worse, "not to be told apart": open_}
+    parts = [
+        f"{how} on all {len(known)}" if len(names) == len(known) else f"{how} on {len(names)} ({listed(names)})"
+        for how, names in found.items()
+        if names
+    ]
+    return ", ".join(parts) or "not compared: that takes two seeds"
+
+
+def bullets(sentences: Sequence[str]) -> list[str]:
+    """Notes that are a list."""
+    return ["", *(f"- {sentence}" for sentence in sentences), ""] if sentences else []
 
 
 def say(estimate: Estimate | None, signed: bool = False) -> str:
@@ -105,31 +152,40 @@ def say_difference(differences: Sequence[float]) -> tuple[str, str]:
 
 def provenance(cells: Sequence[Cell | None]) -> list[str]:
     """Where the numbers come from: how much was computed, on what, and by which version of each method."""
-    found = [cell for cell in cells if cell is not None]
+    found = list(dict.fromkeys(cell for cell in cells if cell is not None))
     rows = pd.concat([cell.rows for cell in found])
     units = rows.drop_duplicates(records.IDENTITY)
     seconds = units.train_seconds + units.evaluation_seconds
     objects = (units.source.str.replace("_", " ") + units.mass.map(" {:g} kg".format)).unique()
     notes = [
-        INTERVALS,
+        STATISTICS,
         f"Computed: {len(units)} trainings in {seconds.sum() / 3600:.1f} core hours, {seconds.mean():.0f} s each on "
         f"average, on {', '.join(units.machine.unique())}, until {units.finished.max()[:10]}; "
         f"{'; '.join(units.versions.unique())}; objects: {', '.join(objects)}; the same goals for all.",
         "Every number is of one version of its method:",
     ]
-    tasks: dict[str, list[str]] = {}
+    tasks: dict[str, dict[str, None]] = {}
     for cell in found:
         first = cell.first
-        start = None if first.start == "scratch" else f"from the {first.start}'s model"
-        label = ", ".join(filter(None, [NAMES[first.method], RECIPES.get(first.recipe), start]))
+        label = name_of(first.method, first.recipe, first.start, first.protocol)
         left_out = f"; {cell.left_out} trainings of others left out" if cell.left_out else ""
-        line = f"{label}: version {first.version}, {cell.seeds} × {first.goals} goals{left_out}"
-        tasks.setdefault(line, []).append(first.task.replace("_", " "))
+        line = f"{label}: version {first.version}, {cell.amount}{left_out}"
+        tasks.setdefault(line, {})[first.task.replace("_", " ")] = None
     return notes + [f"- {line} ({', '.join(names)})" for line, names in tasks.items()]
 
 
-def write_tables(folder: Path, name: str, tables: Tables, notes: Sequence[str]) -> None:
-    """Print tables with their notes; write them as Markdown and LaTeX, and into README.md where they belong there."""
+def write_tables(
+    folder: Path, name: str, tables: Tables, notes: Sequence[str], figures: Mapping[str, str] | None = None
+) -> None:
+    """Print tables with their notes; write them as Markdown and LaTeX, and into README.md where they belong there.
+
+    Args:
+        folder: where to.
+        name: of the files.
+        tables: title → table.
+        notes: below them, each a paragraph or a line of a list.
+        figures: names of figures in the same folder → what they show, for README.md.
+    """
     blocks = [
         f"**{title}**\n\n{table.to_markdown(index=False, tablefmt='github', disable_numparse=True)}\n"
         for title, table in tables.items()
@@ -141,7 +197,8 @@ def write_tables(folder: Path, name: str, tables: Tables, notes: Sequence[str]) 
     write_atomically(folder / f"{name}.tex", (latex + "\n" + "".join(f"% {note}\n" for note in notes)).encode())
     print(f"written: {folder / name}.md, .tex")
     if folder.resolve() == records.RESULTS.resolve():
-        update_readme(name, markdown)
+        pictures = "".join(f"![{shown}](results/{figure}.png)\n\n" for figure, shown in (figures or {}).items())
+        update_readme(name, pictures + markdown)
 
 
 def _latex(table: pd.DataFrame) -> str:
@@ -164,14 +221,21 @@ def update_readme(name: str, markdown: str, readme: Path | None = None) -> None:
         write_atomically(readme, new.encode())
 
 
-def draw_curves(axes: Axes, title: str, curves: Sequence[tuple[Cell | None, str, str]]) -> None:
-    """Success against minutes of data with its interval, of cells with their labels and colours."""
-    for cell, label, color in curves:
+def draw_curves(axes: Axes, title: str, curves: Sequence[tuple[Cell | None, str, str, str]]) -> None:
+    """Success against minutes of data really collected, of cells with their labels, colours and line styles.
+
+    Thick the mean over the seeds, with its interval as a band; thin the single seeds.
+    """
+    for cell, label, color, style in curves:
         if cell is not None:
-            minutes, points = cell.scores.columns, pd.DataFrame([at(cell, minute) for minute in cell.scores])
-            axes.plot(minutes, points.value, label=f"{label} ({cell.seeds})", color=color, lw=2, marker="o", ms=3)
+            minutes, points = cell.minutes, pd.DataFrame([at(cell, minute) for minute in cell.scores])
+            axes.plot(
+                minutes, points.value, style, label=f"{label} ({cell.seeds})", color=color, lw=2, marker="o", ms=3
+            )
             axes.fill_between(minutes, points.low, points.high, color=color, alpha=0.2, lw=0)
-    axes.set(title=title, xlabel="data [min]", ylabel="success [%]", ylim=(0, 102))
+            if len(cell.scores) > 1:
+                axes.plot(minutes, cell.scores.T, style, color=color, lw=0.5, alpha=0.5)
+    axes.set(title=title, xlabel="data [min]", ylabel="success [%]", ylim=(0, 102), xlim=(0, None))
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
 

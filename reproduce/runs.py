@@ -19,13 +19,16 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import deployment
 import pandas as pd
+import recipes
 import records
 import tyro
 import units
 import worker
+from recipes import Chosen
 from rich.progress import Progress, TaskID, TimeElapsedColumn
-from units import Artefact, Method, Object, Preset, PresetName, Recipe, Unit
+from units import Artefact, Method, Object, Preset, PresetName, Unit
 from worker import Files, Job
 
 from difflcs._checks import check_positive_int
@@ -41,18 +44,18 @@ class Compute:
     """What to compute, and where. Without --preset and --rerun the scripts only draw what is there."""
 
     preset: PresetName | None = None
-    """smoke (about a minute), quick (about 15 minutes a script on 2 cores) or paper (10 seeds, 1000 goals). To draw:
+    """smoke (about a minute), quick (about half an hour a script on 2 cores) or paper (10 seeds, 1000 goals). To draw:
     the results to take, by default those of the largest preset there is."""
     seeds: int | None = None
-    """Runs per method and object, with the seeds 10, 11, …; the preset's number by default."""
+    """Runs per method and object, with the seeds 1000, 1001, …; the preset's number by default."""
     goals: int | None = None
-    """Goals of every evaluation; the preset's number by default."""
+    """Goals of every evaluation; by default the preset's numbers, on the way and at the end."""
     objects: tuple[Object, ...] = ()
     """All by default."""
     methods: tuple[Method, ...] = ()
     """All by default."""
-    recipes: tuple[Recipe, ...] = ()
-    """By default both on the cube and ours on the objects."""
+    recipes: tuple[Chosen, ...] = ()
+    """By default all; on the objects with the presets quick and smoke ours alone."""
     workers: int | None = None
     """Processes on this machine, one core each; the number of cores by default."""
     scheduler: str | None = None
@@ -147,7 +150,7 @@ def connect(workers: int | None = None, scheduler: str | None = None) -> Iterato
     import cloudpickle
     from distributed import Client, LocalCluster
 
-    for module in (sys.modules[__name__], records, units, worker):
+    for module in (sys.modules[__name__], recipes, records, units, deployment, worker):
         cloudpickle.register_pickle_by_value(module)
     with contextlib.ExitStack() as held:
         address: Any = scheduler
@@ -161,8 +164,8 @@ def connect(workers: int | None = None, scheduler: str | None = None) -> Iterato
 def run(options: Compute, artefacts: Sequence[str]) -> int:
     """Compute what artefacts (none: all) need; returns the exit code, 1 if units have failed."""
     preset = units.PRESETS[options.preset or "quick"]
-    preset = replace(preset, seeds=options.seeds or preset.seeds, goals=options.goals or preset.goals)
-    wanted = units.matrix(artefacts, preset.seeds, options.objects, options.methods, options.recipes)
+    preset = preset.with_amounts(options.seeds, options.goals)
+    wanted = units.matrix(artefacts, preset, options.objects, options.methods, options.recipes)
     for stand_in in (False, True):
         records.read(records.path_of(options.results, preset.name, stand_in))  # an error now, not after hours
     jobs = make_jobs(wanted, preset, options.work)
@@ -172,7 +175,7 @@ def run(options: Compute, artefacts: Sequence[str]) -> int:
         store(rows)
     print(
         f"{preset.name}: {len(jobs)} units of {preset.evaluate_at[-1]:g} minutes of data, {preset.seeds} seeds, "
-        f"{preset.goals} goals; {len(finished)} finished before"
+        f"{preset.final_goals} goals; {len(finished)} finished before"
     )
     if len(finished) == len(jobs):
         return 0

@@ -1,48 +1,51 @@
-"""The units of work: one training of one method on one object with one seed, and what decides its result.
-
-This is the only file of reproduce/ that trains: it knows the settings of the paper's recipe, and calls `difflcs.rl`.
-"""
+"""The units of work: one training of one method on one object with one seed, and what decides its result."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from difflcs.errors import InvalidInputError
-from difflcs.rl import RunDirectory, TrainConfig, get_method, get_task, train
+from recipes import ABLATIONS, RECIPES, Protocol, Recipe, changed, changed_task
 
-Artefact = Literal["table1", "curves", "transfer"]
+from difflcs.errors import InvalidInputError
+from difflcs.rl import RunDirectory, TaskSpec, TrainConfig, get_method, get_task, train
+from difflcs.rl.training import Reporter
+
+Artefact = Literal["table1", "curves", "transfer", "ablations"]
 Object = Literal["sugar_box", "fish_can", "mug", "wrench", "clamp", "banana"]
 Method = Literal["lcs-rl", "violation", "ppo", "pddm"]
-Recipe = Literal["ours", "paper"]
 PresetName = Literal["paper", "quick", "smoke"]
 
 Names = Sequence[str]
 
 OBJECTS: Names = get_args(Object)
 """The objects of Table I, in its order."""
-_BOTH = get_args(Recipe)
-METHODS: Mapping[str, Names] = {"lcs-rl": _BOTH, "violation": _BOTH, "ppo": ("paper",), "pddm": ("none",)}
-"""Methods of the figures → their recipes. Ours is what the library does by default, the paper's is `PAPER`."""
-PAPER: Mapping[str, Any] = {
-    "warmup_minutes": 6.0,
-    "warmup": {"noise": 0.0},
-    "ppo": {"update": "adam", "steps": 20, "minibatch": None},
-    "models": {"iterations": 0},
+METHODS: Mapping[str, Names] = {
+    "lcs-rl": ("ours", "paper"),
+    "violation": ("ours", "paper", "jin-posa"),
+    "ppo": ("paper",),
+    "pddm": ("ours", "authors"),
 }
-"""Settings of the paper, for every method those that it has."""
+"""Methods of the figures → their recipes, see `recipes.RECIPES`."""
 COMPARED = ("violation", "lcs-rl")
 """The methods of Table I."""
 TRANSFER = {"scratch": "lcs-rl", "cube": "ppo"}
 """Starts → methods of the transfer figure. From scratch is from a random model; from the final LCS-RL model of the cube
 with the same seed it is the main phase alone: a warm-up on little data would first undo what PPO has taught."""
-FIRST_SEED = 10
-"""Seed of the first run of everything. The settings were tuned on the seeds 0 to 4, with other goals."""
+ABLATED: Mapping[str, tuple[str, str]] = {
+    **{name: ("lcs-rl", name) for name in ABLATIONS},
+    "no-warm-up": ("ppo", "ours"),
+}
+"""Ablations → method and recipe."""
+ABLATION_TASKS, ABLATION_SEEDS = ("cube", "banana"), 8
+"""Where the parts of LCS-RL are taken out, and on how many seeds."""
+FIRST_SEED = 1000
+"""Seed of the first run of everything. Nothing was ever chosen by this seed or a later one."""
 
 
 @dataclass(frozen=True)
@@ -54,17 +57,35 @@ class Preset:
     seeds: int
     """Runs per method and object, with the seeds FIRST_SEED, FIRST_SEED + 1, …."""
     goals: int
-    """Of every evaluation."""
-    evaluate_at: tuple[float, ...] = (0.0, 6.0, 12.0, 18.0, 24.0, 30.0)
-    """Minutes of data at which to evaluate, the same for every unit; the last is the end."""
+    """Of every evaluation on the way."""
+    final_goals: int
+    """Of the last evaluation, and of that before any data."""
+    evaluate_at: tuple[float, ...] = (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 15.0, 20.0, 25.0, 30.0)
+    """Minutes of data at which to evaluate; the last is the end."""
     smoke: bool = False
     """Train on so little that nothing is learned."""
+    recipes: Names = ()
+    """Recipes on the objects, if none are asked for; none: all."""
+    slow: Preset | None = None
+    """The same for `SLOW`, whose evaluations take a hundred times as long as those of the others."""
+
+    def of(self, method: str) -> Preset:
+        """How much of a method is computed."""
+        return self.slow if self.slow is not None and method in SLOW else self
+
+    def with_amounts(self, seeds: int | None, goals: int | None) -> Preset:
+        """The same with other numbers of seeds and goals, of everything, where they are given."""
+        slow = self.slow and self.slow.with_amounts(seeds, goals)
+        amounts = {"goals": goals or self.goals, "final_goals": goals or self.final_goals}
+        return replace(self, seeds=seeds or self.seeds, slow=slow, **amounts)
 
 
+SLOW = ("pddm",)
+_FEW = (2.0, 6.0, 10.0, 20.0, 30.0)
 PRESETS: Mapping[str, Preset] = {
-    "paper": Preset("paper", seeds=10, goals=1000),
-    "quick": Preset("quick", seeds=1, goals=100),
-    "smoke": Preset("smoke", seeds=1, goals=4, evaluate_at=(0.0, 0.2, 0.5), smoke=True),
+    "paper": Preset("paper", 10, 300, 1000, slow=Preset("paper", 5, 300, 300, _FEW)),
+    "quick": Preset("quick", 1, 100, 100, recipes=("ours",), slow=Preset("quick", 1, 100, 100, _FEW)),
+    "smoke": Preset("smoke", 1, 4, 4, (0.0, 0.2, 0.5), smoke=True, recipes=("ours",)),
 }
 
 
@@ -81,44 +102,88 @@ class Unit:
     @property
     def init(self) -> Unit | None:
         """The unit whose final model this one starts from."""
-        return None if self.start == "scratch" else Unit("cube", "lcs-rl", "ours", self.seed)
+        return None if self.start == "scratch" else Unit("cube", "lcs-rl", self.recipe, self.seed)
+
+    @property
+    def own(self) -> Recipe:
+        """The recipe itself."""
+        return RECIPES[self.recipe]
+
+    @property
+    def protocols(self) -> Sequence[Protocol]:
+        """In which ways its models are evaluated."""
+        return self.own.protocols.get(self.method, ("full",))
+
+    @property
+    def spec(self) -> TaskSpec:
+        """The task, with what the recipe changes of it."""
+        return changed_task(self.task, self.own.task)
 
     def __str__(self) -> str:
-        recipe = ", the paper's recipe" if self.recipe == "paper" else ""
+        recipe = "" if self.recipe == "ours" else f", {self.own.label}"
         start = "" if self.start == "scratch" else f", from the {self.start}'s model"
         return f"{self.task} {self.method}{recipe}{start}, seed {self.seed}"
 
 
-def matrix(artefacts: Names, seeds: int, objects: Names = (), methods: Names = (), recipes: Names = ()) -> list[Unit]:
-    """The units that artefacts need, each once: the first seeds of everything, and what a unit starts from, come first.
+def matrix(
+    artefacts: Names, preset: Preset, objects: Names = (), methods: Names = (), recipes: Names = ()
+) -> list[Unit]:
+    """The units that artefacts need, each once, what a unit starts from before it: the most important ones first.
 
-    None of `artefacts`, `objects` (the cube is not one), `methods` stands for all; of `recipes` for both on the cube
-    and ours on the objects.
+    These are Table I; then curves, transfer and ablations; then what is slow. Of each the first seeds come first.
+    None of `artefacts`, `objects` (the cube is not one), `methods` stands for all; of `recipes` for all on the cube and
+    those of the preset on the objects.
     """
-    artefacts, objects, methods = artefacts or get_args(Artefact), objects or OBJECTS, methods or list(METHODS)
+    artefacts, tasks = artefacts or get_args(Artefact), [name for name in OBJECTS if name in (objects or OBJECTS)]
+    some = recipes or preset.recipes
+
+    def wanted(method: str, chosen: Names, known: Names = ()) -> list[str]:
+        known = known or METHODS[method]
+        return [name for name in known if (not chosen or name in chosen) and method in (methods or METHODS)]
+
+    def table1(seed: int) -> Iterator[Unit]:
+        for task in tasks:
+            yield from (Unit(task, method, r, seed) for method in COMPARED for r in wanted(method, some))
+
+    def curves(seed: int) -> Iterator[Unit]:
+        yield from (Unit("cube", method, r, seed) for method in METHODS for r in wanted(method, recipes))
+
+    def transfer(seed: int) -> Iterator[Unit]:
+        for task in tasks:
+            for recipe in wanted("lcs-rl", some):
+                yield from (Unit(task, method, recipe, seed, start) for start, method in TRANSFER.items())
+
+    def ablations(seed: int) -> Iterator[Unit]:
+        if seed < FIRST_SEED + ABLATION_SEEDS and (not recipes or "ours" in recipes):
+            for task in (name for name in ABLATION_TASKS if name in ("cube", *tasks)):
+                yield from (Unit(task, "lcs-rl", r, seed) for r in wanted("lcs-rl", (), ["ours"]))
+                yield from (Unit(task, m, r, seed) for m, r in ABLATED.values() if wanted(m, (), [r]))
+
     found: list[Unit] = []
-    for seed in range(FIRST_SEED, FIRST_SEED + seeds):
-        if "curves" in artefacts:
-            for method in reversed([name for name in METHODS if name in methods]):  # PDDM takes longest
-                known = METHODS[method]  # one recipe alone is in the figure whatever is chosen
-                found += [Unit("cube", method, r, seed) for r in known if r in (recipes or known) or len(known) == 1]
-        for task in [name for name in OBJECTS if name in objects]:
-            if "table1" in artefacts:
-                chosen = [method for method in COMPARED if method in methods]
-                found += [Unit(task, method, recipe, seed) for method in chosen for recipe in recipes or ["ours"]]
-            if "transfer" in artefacts and "lcs-rl" in methods:
-                found += [Unit(task, method, "ours", seed, start) for start, method in TRANSFER.items()]
+    for name, units in {"table1": table1, "curves": curves, "transfer": transfer, "ablations": ablations}.items():
+        if name in artefacts:
+            for seed in range(FIRST_SEED, FIRST_SEED + max(preset.seeds, preset.of("pddm").seeds)):
+                found += (unit for unit in units(seed) if seed < FIRST_SEED + preset.of(unit.method).seeds)
     if not found:
         raise InvalidInputError(
-            f"units: expected at least one, got none from {artefacts} with {methods}; choose others"
+            f"units: expected at least one, got none from {artefacts} with {methods} and {recipes}; choose others"
         )
+    found.sort(key=lambda unit: unit.method in SLOW)
     return list(dict.fromkeys(one for unit in found for one in (unit.init, unit) if one is not None))
 
 
 def config_of(unit: Unit, preset: Preset) -> TrainConfig:
-    """All settings of a unit: the library's defaults but for the recipe, and the preset's minutes and goals."""
-    method = get_method(unit.method)()
-    method = _changed(method, PAPER) if unit.recipe == "paper" else method
+    """All settings of a unit: the library's defaults but for the recipe, and the preset's minutes and goals.
+
+    A unit that is not evaluated under the full bounds has no evaluations in its training, see `deployment`.
+    """
+    config = schedule_of(unit, preset)
+    return config if "full" in unit.protocols else replace(config, evaluate_at=(), final_goals=0)
+
+
+def schedule_of(unit: Unit, preset: Preset) -> TrainConfig:
+    """The same with all evaluations."""
+    method, preset = changed(get_method(unit.method)(), unit.own.settings), preset.of(unit.method)
     return TrainConfig(
         task=unit.task,
         method=method.smoke() if preset.smoke else method,
@@ -126,15 +191,8 @@ def config_of(unit: Unit, preset: Preset) -> TrainConfig:
         seed=unit.seed,
         evaluate_at=preset.evaluate_at[:-1],
         evaluate_goals=preset.goals,
-        final_goals=preset.goals,
+        final_goals=preset.final_goals,
     )
-
-
-def _changed(settings: Any, changes: Mapping[str, Any]) -> Any:
-    """The settings with others in place of those that they have; a mapping changes a group of settings."""
-    known = {name: new for name, new in changes.items() if hasattr(settings, name)}
-    groups = {name: _changed(getattr(settings, name), new) for name, new in known.items() if isinstance(new, Mapping)}
-    return replace(settings, **known | groups)
 
 
 def describe_object(task: str) -> Mapping[str, Any]:
@@ -150,18 +208,24 @@ def describe_object(task: str) -> Mapping[str, Any]:
 def key_of(unit: Unit, preset: Preset, objects: Mapping[str, Mapping[str, Any]]) -> str:
     """Identifies the result of a unit, but for the seed; a result with another key is stale.
 
-    It is a hash of settings, version of the method, object (task → `describe_object`), and key of what it starts from.
+    It is a hash of settings, version of the method, object (task → `describe_object`), what the recipe changes of the
+    task, ways of evaluating, and key of what it starts from.
     """
-    config = config_of(unit, preset)
+    config = schedule_of(unit, preset)
     settings = config.to_json()
     del settings["seed"]
     init = key_of(unit.init, preset, objects) if unit.init else None
-    parts = json.dumps([settings, config.method.version, dict(objects[unit.task]), init], sort_keys=True)
+    task = [dict(objects[unit.task]), dict(unit.own.task), list(unit.protocols)]
+    parts = json.dumps([settings, config.method.version, *task, init], sort_keys=True)
     return hashlib.sha256(parts.encode()).hexdigest()[:12]
 
 
-def train_unit(unit: Unit, preset: Preset, out: Path, init: Path | None) -> RunDirectory:
+def train_unit(
+    unit: Unit, preset: Preset, out: Path, init: Path | None = None, reporter: Reporter | None = None
+) -> RunDirectory:
     """Train a unit on one core, from the run directory `init` or from scratch; or go on with what is in `out`."""
-    resume = (out / "config.json").is_file()
-    make_envs = partial(get_task(unit.task).make_envs, threads=1)
-    return train(config_of(unit, preset), out, make_envs=make_envs, init=None if resume else init, resume=resume)
+    resume, spec = (out / "config.json").is_file(), unit.spec
+    make_envs = partial(spec.make_envs, threads=1)
+    start = None if resume else init
+    config = config_of(unit, preset)
+    return train(config, out, task=spec, make_envs=make_envs, init=start, resume=resume, reporter=reporter)

@@ -15,6 +15,7 @@ import filelock
 import pandas as pd
 import records
 import units
+from deployment import Deployments
 from units import Preset, Unit
 
 from difflcs._files import write_atomically
@@ -84,18 +85,24 @@ def _train(job: Job) -> pd.DataFrame:
     if job.init is not None:
         init = job.folder / "init"
         write_files(init, job.init)
-    finished = units.train_unit(unit, job.preset, run, init)
+    schedule = units.schedule_of(unit, job.preset)
+    others = Deployments(unit, schedule, run, job.folder / "deployments.csv")
+    others.catch_up()
+    finished = units.train_unit(unit, job.preset, run, init, others)
     log = pd.read_csv(finished.log)
     evaluated = log.dropna(subset="evaluation_goals").filter(regex="^(minutes$|evaluation_)")
-    evaluated.columns = [name.removeprefix("evaluation_").replace("_rate", "") for name in evaluated.columns]
+    evaluated.columns = [name.removeprefix("evaluation_") for name in evaluated.columns]
+    parts = {"full": evaluated.assign(protocol="full"), **dict(iter(others.rows().groupby("protocol")))}
+    # Before any data a model is evaluated by `train` alone, if at all.
+    at = [minute for minute in (*schedule.evaluate_at, schedule.minutes) if minute > 0 or "full" in unit.protocols]
     # Iterations have lengths of their own: the first evaluation at a minute or, if need be, a little after it.
-    at = list(job.preset.evaluate_at)
-    rows: Any = pd.DataFrame([evaluated[evaluated.minutes > minute - 1e-6].iloc[0] for minute in at])
+    due: Any = [(parts[way][parts[way].minutes > minute - 1e-6], minute) for way in unit.protocols for minute in at]
+    rows: Any = pd.DataFrame([part.iloc[0] for part, _ in due]).rename(columns={"success_rate": "success"})
     seconds: Any = log.filter(regex="_seconds$").sum()
     packages: dict[str, Any] = {**cast(Any, finished.config()["versions"]), "python": platform.python_version()}
     rows = rows.assign(
         **asdict(unit),
-        at=at,
+        at=[minute for _, minute in due],
         evaluation_seed=config.evaluation_seed,
         source=objects[unit.task]["source"],
         mass=objects[unit.task]["mass"],
@@ -104,7 +111,7 @@ def _train(job: Job) -> pd.DataFrame:
         versions=" ".join(f"{name}={version}" for name, version in sorted(packages.items()) if version),
         machine=machine(),
         train_seconds=round(seconds.sum() - seconds["evaluation_seconds"], 1),
-        evaluation_seconds=round(seconds["evaluation_seconds"], 1),
+        evaluation_seconds=round(seconds["evaluation_seconds"] + others.rows().seconds.sum(), 1),
         finished=datetime.now(UTC).isoformat(timespec="seconds"),
     )
     for folder in (finished.checkpoints, finished.tensorboard):

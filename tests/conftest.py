@@ -88,7 +88,7 @@ class Build:
 
     @staticmethod
     def paper_cost(dtype=torch.float64) -> GoalCost:
-        """Eq. cost_function of the paper: nine states (cube x, y, yaw; three fingertips), six actions."""
+        """Eq. 13: nine states (cube x, y, yaw; three fingertips), six actions."""
         pairs = [(3, 0), (4, 1), (5, 0), (6, 1), (7, 0), (8, 1)]
         return GoalCost.reach(9, 6, (200.0, 200.0, 0.3), (200.0, 200.0, 1.5), 200.0, pairs, 10.0, 6.0, dtype=dtype)
 

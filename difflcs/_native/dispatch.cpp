@@ -25,7 +25,9 @@ namespace difflcs {
                                 violation_qp,  violation_value, violation_gradient};                               \
   }
 
+#ifdef DIFFLCS_LANES_baseline
 DIFFLCS_KERNELS(baseline, DIFFLCS_LANES_baseline)
+#endif
 #ifdef DIFFLCS_LANES_avx2
 DIFFLCS_KERNELS(avx2, DIFFLCS_LANES_avx2)
 #endif
@@ -44,7 +46,12 @@ static const Kernels& choose() {
 #ifdef DIFFLCS_LANES_avx2
   if (accept(avx2::table) && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) return avx2::table;
 #endif
+#ifdef DIFFLCS_LANES_baseline
   if (accept(baseline::table)) return baseline::table;
+#endif
+  if (!wanted || !*wanted)
+    throw std::runtime_error(
+        "difflcs was compiled for the CPU of another machine (DIFFLCS_ISAS=here): install it again here");
   throw std::runtime_error(std::string("DIFFLCS_ISA=") + wanted +
                            " is not available: expected baseline, avx2 or avx512 and a CPU that has it; unset the "
                            "variable to let difflcs choose");

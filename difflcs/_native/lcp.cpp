@@ -169,7 +169,7 @@ void Lcp<T, N>::exact(int64_t begin, int64_t end, Watch watch) {
       const Mask fewer = count < fewest, block = fewer | (patience > 0);
       patience = fewer ? Mask{} + 10 : patience - 1;
       fewest = fewer ? count : fewest;
-      for (int64_t i = 0; i < n; i++) active[i] ^= (block ? infeasible(i) : last == i) & ~done;
+      for (int64_t i = 0; i < n; i++) active[i] ^= (block ? infeasible(i) : (Mask)(last == i)) & ~done;
     }
     // What rounding left below zero is put onto zero, and the slack is that of the lam that is returned.
     Mask clipped = Mask{};

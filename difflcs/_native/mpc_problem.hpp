@@ -157,9 +157,7 @@ struct Problem {
     return ((batch.step[which] > 0) || ...);
   }
 
-  const double* input(Input which, int64_t element, int64_t k = 0) const {
-    return batch.at(which, element, k);
-  }
+  const double* input(Input which, int64_t element, int64_t k = 0) const { return batch.at(which, element, k); }
 
   void load_matrices(int64_t e, int lane) {
     const int64_t nl = n.l(), nx = n.x(), nw = n.w(), nc = n.c();

@@ -148,8 +148,7 @@ struct Violation {
       Vec noise = all(0), signal = all(0);
       for (int64_t i = 0; i < n_lam; i++) {
         Vec rounding = all(0);
-        for (int64_t j = 0; j < n_lam; j++)
-          rounding += select(phi[j] > 0, all(0), abs(F[j * n_lam + i] * e_terms[j]));
+        for (int64_t j = 0; j < n_lam; j++) rounding += select(phi[j] > 0, all(0), abs(F[j * n_lam + i] * e_terms[j]));
         noise = max(noise, select(lam[i] > 0, kRounding * weight * rounding, all(0)));
         signal = max(signal, balance[i]);
       }

@@ -1,4 +1,4 @@
-"""Model predictive control through a linear complementarity system (Eq. mpc_lcs)."""
+"""Model predictive control through a linear complementarity system (Eq. 3 of the paper)."""
 
 from difflcs.mpc.controller import ControllerPlan, MPCController
 from difflcs.mpc.layer import LCSMPCLayer

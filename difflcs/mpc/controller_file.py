@@ -109,7 +109,7 @@ def _problem(mpc: LCSMPCLayer, system: LCSParams | LCSSequence) -> tuple[MPCProb
     goal = torch.zeros(mpc.cost.n_goal, dtype=torch.float64) if isinstance(mpc.cost, GoalCost) else None
     inputs.add_cost(mpc.cost, None if goal is None else goal.to(mpc.cost.Q), None)
     if mpc.bounds is None:
-        inputs.tensors |= {"u_min": mpc.u_min, "u_max": mpc.u_max}
+        inputs.tensors |= dict(zip(("u_min", "u_max"), mpc.limits(), strict=True))
     else:
         inputs.add_bounds(mpc.bounds)
     inputs.add_constraints(mpc.constraints)

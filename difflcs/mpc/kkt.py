@@ -24,8 +24,8 @@ from p_H = Q_final x_H + q_final + G_xᵀ m_H,
 So all other multipliers follow from a primal trajectory (x, u, λ) and m alone, whichever backend found them. Every
 matrix and vector but Q_final and q_final may be another one at each stage k; the index is left out.
 
-Perturbation (Büskens; Eq. dloss_dtheta of the paper)
------------------------------------------------------
+Perturbation (Büskens), which Eq. 8 of the paper needs
+------------------------------------------------------
 Write the conditions, with the active bounds and the held constraints as equations, as K(z, θ) = 0 for
 z = (x, u, λ, p, y, ν, m). The implicit function theorem gives z' = −K_z⁻¹ K_θ. K_z is symmetric, so for an upstream
 gradient z̄ on the primal part

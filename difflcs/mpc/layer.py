@@ -9,11 +9,11 @@ import torch
 from torch import Tensor, nn
 
 from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor
-from difflcs._functorch import runs_eagerly, transforms_active
+from difflcs._functorch import is_wrapped, runs_eagerly, transforms_active
 from difflcs._recall import Recall
 from difflcs.constraints import StageBounds, as_bound, check_bounds
 from difflcs.cost import CostSequence
-from difflcs.errors import DegenerateWarning, SolveError, SolveWarning
+from difflcs.errors import BoundsError, DegenerateWarning, SolveError, SolveWarning
 from difflcs.lcs import LCSSequence
 from difflcs.mpc.autograd import Plan, solve
 from difflcs.mpc.backends import Backend, get_backend
@@ -35,7 +35,7 @@ from difflcs.status import Status, solved
 
 
 class LCSMPCLayer(nn.Module):
-    """Model predictive control through a linear complementarity system (Eq. mpc_lcs), differentiable in every input.
+    """Model predictive control through an LCS (Eq. 3 of the paper), differentiable in every input.
 
     Solves, for each batch element, the problem of `difflcs.mpc.MPCProblem`, and differentiates its solution with
     respect to the LCS, the cost, the bounds, the constraints, x0 and the goal by perturbation of the optimality
@@ -122,8 +122,36 @@ class LCSMPCLayer(nn.Module):
         inputs.add_constraints(self.constraints)
         if self.bounds is not None:
             inputs.add_bounds(self.bounds)
-        limits = (self.u_min, self.u_max) if self.bounds is None else self.bounds.by_steps()
-        check_bounds(*limits, strict=self.barrier > 0)
+        check_bounds(*self.limits(), strict=self.barrier > 0)
+
+    def limits(self, system: System | None = None) -> tuple[Tensor, Tensor]:
+        """Bounds of the actions where a call gives none.
+
+        They are the layer's `bounds`; or else u_min and u_max, within the action support of an `LCSModel` that knows
+        one.
+
+        Args:
+            system: the model; the layer's own if None.
+
+        Returns:
+            Lower and upper bounds, (..., n_u), or (..., H, n_u) of bounds that change over the horizon.
+
+        Raises:
+            BoundsError: the model's action support lies outside of u_min and u_max.
+        """
+        if self.bounds is not None:
+            return self.bounds.by_steps()
+        support = getattr(self.lcs if system is None else system, "action_support", None)
+        if support is None:
+            return self.u_min, self.u_max
+        low, high = support.to(self.u_min)
+        limits = torch.where(self.u_min < low, low, self.u_min), torch.where(self.u_max > high, high, self.u_max)
+        if not is_wrapped(limits[0]) and bool((limits[0] > limits[1]).any()):
+            raise BoundsError(
+                f"u_min, u_max: expected bounds that meet the actions {low.tolist()} to {high.tolist()} that the model "
+                f"was fitted to, got {self.u_min.tolist()} to {self.u_max.tolist()}; set its action_support to None"
+            )
+        return limits
 
     def extra_repr(self) -> str:
         """What print(layer) shows."""
@@ -179,7 +207,7 @@ class LCSMPCLayer(nn.Module):
         inputs.add_cost(self.cost if cost is None else check_cost(cost), goal, reference)
         bounds = self.bounds if bounds is None else check_stage_bounds(bounds, u_min=u_min, u_max=u_max)
         if bounds is None:
-            inputs.tensors |= {"u_min": self.u_min, "u_max": self.u_max}
+            inputs.tensors |= dict(zip(("u_min", "u_max"), self.limits(system), strict=True))
         else:
             inputs.add_bounds(bounds)
         inputs.replace_bound("u_min", u_min)

@@ -43,7 +43,7 @@ class StageData(SystemMatrices):
 
 @dataclass(frozen=True)
 class MPCProblem(SystemMatrices):
-    """A batch of LCS-MPC problems (Eq. mpc_lcs) with relaxed complementarity.
+    """A batch of LCS-MPC problems (Eq. 3 of the paper) with relaxed complementarity.
 
         min Σ_{k<H} ½x_kᵀQx_k + qᵀx_k + ½u_kᵀRu_k + rᵀu_k + x_kᵀSu_k + ½x_HᵀQ_final x_H + q_finalᵀx_H
             + Σ_{k≤H} Σ_i price_i·max(0, (G_x x_k + G_u u_k − g)_i)       (rows with a finite price)

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from difflcs.physics.contact import ContactLCS
 from difflcs.physics.contacts import Contacts, FreeMotion, contact_lcs
 from difflcs.physics.planar import ForceDrive, Inertia, PDDrive, PlanarPushing, PositionDrive
 from difflcs.physics.shapes import Circle, Distance, Polygon, Shape, Union, box
+
+if TYPE_CHECKING:  # for type checkers; MuJoCo is an extra, imported by the first use
+    from difflcs.physics.mujoco import MujocoLCS as MujocoLCS
+    from difflcs.physics.mujoco import MujocoState as MujocoState
+    from difflcs.physics.mujoco import lcs_from_mujoco as lcs_from_mujoco
 
 __all__ = [
     "Circle",
@@ -30,7 +35,6 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    # MuJoCo is an extra.
     if name in ("MujocoLCS", "MujocoState", "lcs_from_mujoco"):
         return getattr(importlib.import_module("difflcs.physics.mujoco"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,6 +1,6 @@
 """Advantages: by generalised advantage estimation (GAE), or of many actions for each state.
 
-With q(s, a) = r(s, a) + γ V(s₊) and its mean q̄(s) over the policy's actions, an error of GAE (Eq. adv_func) is
+With q(s, a) = r(s, a) + γ V(s₊) and its mean q̄(s) over the policy's actions, an error of GAE (Eq. 5 of the paper) is
 
     δ_t = [q(s_t, a_t) − q̄(s_t)] + b(s_t),  b = q̄ − V.
 
@@ -120,7 +120,7 @@ class GAE:
 
 
 def gae(values: Tensor, rewards: Tensor, gamma: float, zeta: float) -> GAE:
-    """Generalised advantage estimation (Eq. adv_func).
+    """Generalised advantage estimation (Eq. 5 of the paper).
 
     The rewards of an episode end with it: V(T) = 0, which the value network can know because it sees the time.
 

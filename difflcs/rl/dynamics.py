@@ -31,7 +31,7 @@ class EnsembleSettings(Settings):
     width: int = bounded(128, minimum=1, maximum=MOST_WIDTH)
     """Width of their two hidden layers."""
     epochs: Epochs = group(Epochs, first=60, each=3, minibatch=128)
-    """Passes over all data; the networks are kept from one training to the next."""
+    """Passes over all data in the first training, and in each later one."""
     learning_rate: float = bounded(8e-3, above=0)
     """Adam's step size at the start of each training. Adam is not kept."""
 
@@ -53,10 +53,9 @@ class Ensemble(nn.Module):
         sizes = [n_x + n_u, width, width, n_x]
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for n_in, n_out in pairwise(sizes):
-            bound = n_in**-0.5
-            draw = torch.rand(networks, n_in, n_out, generator=generator)
-            self.weights.append(nn.Parameter(bound * (2 * draw - 1)))
-            self.biases.append(nn.Parameter(torch.zeros(networks, 1, n_out)))
+            self.weights.append(nn.Parameter(torch.empty(networks, n_in, n_out)))
+            self.biases.append(nn.Parameter(torch.empty(networks, 1, n_out)))
+        self.draw(generator)
         for name, size in (("input", n_x + n_u), ("change", n_x)):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
@@ -65,6 +64,14 @@ class Ensemble(nn.Module):
     input_std: Tensor
     change_mean: Tensor
     change_std: Tensor
+
+    def draw(self, generator: torch.Generator | None = None) -> None:
+        """Draw the weights anew, uniform within ± one over the root of the layer's inputs; biases are zero."""
+        with torch.no_grad():
+            for weight, bias in zip(self.weights, self.biases, strict=True):
+                bound = weight.shape[1] ** -0.5
+                weight.copy_(bound * (2 * torch.rand(weight.shape, generator=generator) - 1))
+                bias.zero_()
 
     def standardised(self, inputs: Tensor) -> Tensor:
         """(networks, N, n_x + n_u) → (networks, N, n_x) standardised changes of the state."""

@@ -296,7 +296,7 @@ class LCSRLMethod(LCSMethod):
 
     warmup_minutes: float = bounded(3.0, above=0, maximum=1e6)
     """Data of the warm-up [min], the rest is the main phase's (6 in the paper)."""
-    warmup: WarmupSettings = group(WarmupSettings)
+    warmup: WarmupSettings = group(WarmupSettings, keep_support=True)
     """Settings of the warm-up phase."""
     ppo: PPOSettings = group(PPOSettings)
     """Settings of the main phase."""
@@ -304,7 +304,7 @@ class LCSRLMethod(LCSMethod):
     """Settings of the model rollouts in the main phase."""
 
     name: ClassVar[str] = "lcs-rl"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     summary: ClassVar[str] = "the warm-up (Algorithm 1), and then PPO through the MPC (Algorithm 2)"
     reports: ClassVar[tuple[type, ...]] = (WarmupReport, PPOReport)
 
@@ -372,7 +372,7 @@ class PPOMethod(LCSMethod):
     """Settings of the model rollouts."""
 
     name: ClassVar[str] = "ppo"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     summary: ClassVar[str] = "PPO through the MPC (Algorithm 2) without a warm-up"
     reports: ClassVar[tuple[type, ...]] = (PPOReport,)
 

@@ -43,9 +43,7 @@ class ModelRolloutSettings(Settings):
     """Settings of the model rollouts; all ours, tuned on the cube."""
 
     iterations: int = bounded(5, minimum=0)
-    """Iterations of PPO on model rollouts between two real ones, in the first half of the main phase; 0: none."""
-    final_iterations: int = bounded(1, minimum=0)
-    """At most as many in its second half."""
+    """Iterations of PPO on model rollouts before each one on real episodes; 0: none, as in the paper."""
     rollouts: int = bounded(120, minimum=1, maximum=MOST_ENVS)
     """Model rollouts per iteration."""
     steps: int = bounded(12, minimum=1)
@@ -57,7 +55,7 @@ class ModelRolloutSettings(Settings):
     zeta: float = bounded(0.5, minimum=0, maximum=1)
     """Zeta of the advantages where several actions are judged, that of PPO otherwise."""
     real_step: float = bounded(0.3, above=0)
-    """Factor on the gradient steps on real episodes once there are model rollouts: their gradient is noisier."""
+    """Factor on the gradient steps on real episodes where there are model rollouts: their gradient is noisier."""
     ensemble: EnsembleSettings = group(EnsembleSettings)
     """Settings of the networks; every step is predicted by one of them, drawn at random."""
 

@@ -42,10 +42,14 @@ from difflcs.rl.trainer import AfterStep, Trainer
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
 
+NOISE = 0.9
+"""Standard deviation of ε, the noise of the sampled actions, as a fraction of the action bounds' half range: what the
+authors have for every dexterous task."""
+
 
 @dataclass(frozen=True)
 class PDDMSettings(Settings):
-    """Settings of PDDM: its authors' for dexterous tasks."""
+    """Settings of PDDM: its authors' for dexterous tasks, but that the networks are kept."""
 
     rollouts: Rollouts = group(Rollouts, first=20, each=20)
     """Episodes per iteration."""
@@ -65,8 +69,9 @@ class PDDMSettings(Settings):
     """Sharpness of the weights exp(kappa · (return − best return)) [1 / cost unit]."""
     filter: float = bounded(0.6, above=0, maximum=1)
     """Weight of new noise in the filter over time, n_t = filter·ε_t + (1 − filter)·n_{t−1}."""
-    noise: float = bounded(0.9, above=0)
-    """Standard deviation of ε, as a fraction of the action bounds' half range."""
+    keep_networks: bool = True
+    """Train the networks on from one iteration to the next. Its authors draw them anew for each iteration, which makes
+    them worse where data are few."""
 
 
 class Planner:
@@ -118,7 +123,7 @@ class Planner:
         """The next plan (horizon, n_u) of one episode. One at a time: 700 sequences fill the cache."""
         settings = self.settings
         draw = torch.randn(settings.samples, settings.horizon, len(low), generator=self._generator)
-        draw *= settings.noise * 0.5 * (high - low)
+        draw *= NOISE * 0.5 * (high - low)
         noise, filtered = torch.zeros(settings.samples, len(low)), []
         for step in draw.unbind(1):
             noise = settings.filter * step + (1 - settings.filter) * noise
@@ -223,6 +228,8 @@ class PDDM(Trainer):
         self.episodes += count
         self.buffer = extended(self.buffer, episodes)
         collected = time.perf_counter()
+        if not settings.keep_networks:
+            self.ensemble.draw(generator(self.seed, Stream.FIT, self.iteration, 0))
         loss = self.ensemble.fit(
             *observed_transitions(self.buffer),
             epochs=settings.ensemble.epochs.first if first else settings.ensemble.epochs.each,

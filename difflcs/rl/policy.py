@@ -1,4 +1,4 @@
-"""Stochastic policies as TorchRL actors: Gaussians around the action of the MPC (Eq. stochastic_policy) or a network's.
+"""Stochastic policies as TorchRL actors: Gaussians around the action of the MPC (Eq. 6 of the paper) or a network's.
 
 They write "loc", "scale_tril", "action" and "action_log_prob", and are what `difflcs.rl.PPO` trains.
 """

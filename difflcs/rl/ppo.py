@@ -209,14 +209,14 @@ class PPO(Trainer):
         progress = sum(self.sizes[:done]) / sum(self.sizes)
         scale = 1 - (1 - self.final_step) * progress
         start = time.perf_counter()
-        model_success, model_loss = self._practise(scale, progress)
+        model_success, model_loss = self._practise(scale)
         model_seconds = time.perf_counter() - start
 
         count = self.sizes[done]
         seeds = episode_seeds(self.seed, Stream.TRAINING, self.episodes, count)
         self.episodes += count
         std, step_size = float(self.actor.std.mean()), self.update.size.value
-        if self.models is None or model_success is None:
+        if self.models is None:
             outcome = self._iterate(self.robot, seeds, (), scale, after_step)
         else:
             outcome = self._iterate(self.robot, seeds, (), self.models.settings.real_step * scale, after_step)
@@ -248,22 +248,17 @@ class PPO(Trainer):
             model_seconds=model_seconds,
         )
 
-    def _practise(self, scale: float, progress: float) -> tuple[float | None, float | None]:
+    def _practise(self, scale: float) -> tuple[float | None, float | None]:
         """Iterations on model rollouts: the success of the last ones, and the loss of the ensemble.
 
-        `progress` is that of the main phase, from 0 to 1.
-
-        None before the first real one: what a warm-up has seen within its action support says too little.
+        None where there are no models, or where they know no real episode yet.
         """
         models = self.models
-        if models is None or self.practice is None or self.iteration == self.first_iteration:
+        if models is None or self.practice is None or not (len(models) and models.settings.iterations):
             return None, None
         settings = models.settings
-        count = settings.iterations if progress < 0.5 else min(settings.iterations, settings.final_iterations)
-        if count == 0:
-            return None, None
         loss, success = models.fit(), 0.0
-        for k in range(1, count + 1):
+        for k in range(1, settings.iterations + 1):
             seeds = numbers(settings.rollouts, self.seed, Stream.MODEL_ROLLOUT, self.iteration, k)
             episodes = self._iterate(self.practice, seeds, (k,), scale).episodes
             success = float(episodes["success"].double().mean())
@@ -344,7 +339,7 @@ class PPO(Trainer):
     def _improve(
         self, source: Source, episodes: TensorDict, samples: TensorDict, scale: float, key: Sequence[int]
     ) -> _Improvement:
-        """Gradient steps on the combined loss (Eq. total_loss), until the KL divergence is used up."""
+        """Gradient steps on the combined loss (Eq. 7 of the paper), until the KL divergence is used up."""
         outcome = _Improvement()
         policy: Any = episodes["policy"].flatten(0, 1)
         # What is indexed in every step; the rest of what the policy has entered would cost as much as the loss.

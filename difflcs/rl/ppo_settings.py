@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 class PPOSettings(Settings):
     """Settings of the main phase. "paper": given there; the others are ours, tuned on the cube."""
 
-    rollouts: int = bounded(60, minimum=1, maximum=MOST_ENVS)
+    rollouts: int = bounded(30, minimum=1, maximum=MOST_ENVS)
     """Episodes per iteration, run in lockstep; the last ones share what is left of the data evenly."""
     steps: int = bounded(8, minimum=1)
     """Gradient steps per iteration; Adam needs 20 or more."""
@@ -55,13 +55,13 @@ class PPOSettings(Settings):
     outlier_kl: float = bounded(2.0, above=0)
     """Samples with a KL divergence of their own above this are left out: the MPC has jumped to another optimum."""
     clip: float = bounded(0.3, above=0)
-    """Epsilon of the clipped objective (Eq. explicit_ppo_loss)."""
+    """Epsilon of the clipped objective (Eq. 4 of the paper)."""
     gamma: float = bounded(0.99, minimum=0, maximum=1)
     """Discount per step."""
     zeta: float = bounded(0.8, minimum=0, maximum=1)
-    """Zeta of the advantages (Eq. adv_func), often called lambda."""
+    """Zeta of the advantages (Eq. 5 of the paper), often called lambda."""
     beta: float = bounded(1.0, minimum=0, maximum=1)
-    """Weight of the PPO loss against the violation loss (Eq. total_loss). 1 in the paper."""
+    """Weight of the PPO loss against the violation loss (Eq. 7 of the paper). 1 in the paper."""
     violation: ViolationLoss = group(ViolationLoss)
     """The violation loss, where beta < 1."""
     std: float = bounded(0.005, above=0)

@@ -179,7 +179,7 @@ class Epochs(Settings):
 
 @dataclass(frozen=True)
 class ViolationLoss(Settings):
-    """The violation-based loss (Eq. vio_loss), see `difflcs.violation_loss`."""
+    """The violation-based loss (Eq. 2 of the paper), see `difflcs.violation_loss`."""
 
     gamma: float | Literal["auto"] = bounded(0.05, above=0)
     """Gamma of the loss; auto: as large as F allows, for models whose F has another size."""

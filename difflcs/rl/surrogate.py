@@ -37,7 +37,7 @@ class Surrogate:
         actor: the policy.
         clip: epsilon of the clipped objective.
         outlier_kl: samples with a KL divergence above this have no say.
-        beta: weight of the clipped objective against the violation loss (Eq. total_loss).
+        beta: weight of the clipped objective against the violation loss (Eq. 7 of the paper).
         violation: settings of the violation loss; None where there is no LCS.
     """
 

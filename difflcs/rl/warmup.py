@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from difflcs.errors import InvalidInputError
-from difflcs.lcs import LCSModule
+from difflcs.lcs import LCSModel, LCSModule
 from difflcs.losses import violation_loss
 from difflcs.rl.learned import check_depends, check_module
 from difflcs.rl.rollout import (
@@ -56,6 +56,8 @@ class WarmupSettings(Settings):
     """While collecting, actions stay within mean ± action_support · std of the buffer's actions; 0 turns this off."""
     action_support_growth: float = bounded(1.03, above=0)
     """Factor on action_support per iteration: nearly the full bounds after 6 minutes on the cube."""
+    keep_support: bool = False
+    """Whether the learned `LCSModel` keeps the last of these bounds, within which its MPC plans from then on."""
     adam: Adam = group(Adam, learning_rate=1e-2, betas=(0.9, 0.9))
     """Adam, which is reset in every training call."""
     learning_rate_decay: float = bounded(0.99, above=0)
@@ -229,6 +231,8 @@ class Warmup(Trainer):
         """Newest episodes."""
         self.bounds = (self.low, self.high)
         """Action bounds of the last collected episodes."""
+        if isinstance(lcs, LCSModel):
+            lcs.action_support = torch.stack(self.bounds) if settings.keep_support else None
         self._actions = np.random.default_rng((seed, Stream.ACTION))
         self._minibatches = np.random.default_rng((seed, Stream.MINIBATCH))
 
@@ -238,6 +242,8 @@ class Warmup(Trainer):
         episodes = self._collect(after_step)
         collected = time.perf_counter()
         self.buffer = extended(self.buffer, episodes, self.settings.buffer)
+        if isinstance(self.lcs, LCSModel) and self.lcs.action_support is not None:
+            self.lcs.action_support.copy_(torch.stack(self.bounds))
         first = self.iteration == 0 and not self.pretrained
         epochs = self.settings.epochs.first if first else self.settings.epochs.each
         data, context = transitions(self.buffer), contexts(self.buffer)

@@ -37,7 +37,7 @@ TURN_GOALS = ((0.0, 0.0, 0.8), (0.0, 0.0, -0.8), (0.0, 0.0, 1.4), (0.0, 0.0, -0.
 
 
 def pushing_cost() -> GoalCost:
-    """Cost of the MPC for pushing an object on the table (Eq. cost_function of the paper).
+    """Cost of the MPC for pushing an object on the table (Eq. 13 of the paper).
 
     Stage: 10 Σ‖tip − object‖² + 200 ‖object − goal‖² + 0.3 (yaw − goal yaw)² + 200 ‖u‖²; final: 6, 200 and 1.5.
 

@@ -182,7 +182,7 @@ FLAGS_OF_BEFORE = """
 --ppo.natural --ppo.no-learn-std --mlp.no-natural --mlp.learn-std
 """.split()
 GONE = {
-    "warmup.adam-eps", "ppo.sample-clip", "ppo.final-std", "ppo.failure-penalty", "ppo.violation-batch",
+    "pddm.noise", "warmup.adam-eps", "ppo.sample-clip", "ppo.final-std", "ppo.failure-penalty", "ppo.violation-batch",
     "imagination.steps-minibatch", "mlp.sample-clip", "mlp.final-std", "mlp.failure-penalty", "mlp.violation-batch",
     "mlp.natural", "mlp.no-natural", "mlp.natural-step", "mlp.natural-momentum", "mlp.natural-damping",
     "mlp.natural-samples", "warmup.held-out", "ppo.kl-quantile", "mlp.kl-quantile", "ppo.natural-samples",

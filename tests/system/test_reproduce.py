@@ -23,14 +23,21 @@ for package in ("distributed", "matplotlib", "mujoco", "pandas", "rich", "scipy"
 FOLDER = Path(__file__).parents[2] / "reproduce"
 sys.path.insert(0, str(FOLDER))
 
+import ablations  # noqa: E402
+import cross_check  # noqa: E402
 import dask  # noqa: E402
+import deployment  # noqa: E402
 import distributed  # noqa: E402
 import fig_learning_curves  # noqa: E402
 import fig_task  # noqa: E402
 import fig_transfer  # noqa: E402
+import matplotlib.axes  # noqa: E402
+import recipes  # noqa: E402
 import records  # noqa: E402
 import report  # noqa: E402
+import robustness  # noqa: E402
 import runs  # noqa: E402
+import small_models  # noqa: E402
 import stats  # noqa: E402
 import table1  # noqa: E402
 import units  # noqa: E402
@@ -40,9 +47,10 @@ from rich.progress import Progress  # noqa: E402
 from units import OBJECTS, Preset, Unit  # noqa: E402
 
 from difflcs.errors import CheckpointError, InvalidInputError  # noqa: E402
-from difflcs.rl import TrainConfig, get_method, wilson_interval  # noqa: E402
+from difflcs.rl import TrainConfig, evaluate, get_method, get_task, wilson_interval  # noqa: E402
+from difflcs.zoo import Learned  # noqa: E402
 
-TINY = Preset("smoke", seeds=1, goals=2, evaluate_at=(0.2, 0.5), smoke=True)
+TINY = Preset("smoke", seeds=1, goals=2, final_goals=2, evaluate_at=(0.2, 0.5), smoke=True)
 FIRST = units.FIRST_SEED
 CUBE = Unit("cube", "lcs-rl", "ours", FIRST)
 SCRATCH = Unit("mug", "lcs-rl", "ours", FIRST)
@@ -87,51 +95,105 @@ def run_fig_task(arguments):
 # --- the matrix and its keys ------------------------------------------------------------------------
 
 
-def test_matrix_holds_every_unit_once_and_what_it_starts_from_first():
-    found = units.matrix((), seeds=2)
+def test_matrix_holds_every_unit_once_the_important_ones_first():
+    preset = Preset("paper", seeds=3, goals=1, final_goals=1, slow=Preset("paper", seeds=1, goals=1, final_goals=1))
+    found = units.matrix((), preset)
     assert len(found) == len(set(found))
-    assert {unit.seed for unit in found} == {FIRST, FIRST + 1}
-    # Cube: two methods with two recipes each, two without; objects: two methods, and LCS-RL from the cube.
-    assert len(found) == 2 * (2 * 2 + 2 + 6 * 2 + 6)
+    assert {unit.seed for unit in found} == {FIRST, FIRST + 1, FIRST + 2}
+    # Cube: six of methods and recipes, and seven ablations; objects: five, and two transfers; banana: seven ablations.
+    assert len(found) == 3 * (6 + 7 + 6 * (5 + 2) + 7) + 1 * 2
     for position, unit in enumerate(found):
         assert unit.init is None or unit.init in found[:position]
+    table = units.matrix(["table1"], preset)
+    assert found[: len(table)] == table
+    assert {(unit.method, unit.recipe) for unit in table} == {
+        ("lcs-rl", "ours"), ("lcs-rl", "paper"),
+        ("violation", "ours"), ("violation", "paper"), ("violation", "jin-posa"),
+    }  # fmt: skip
+    assert [unit.method for unit in found[-2:]] == ["pddm", "pddm"]  # what is slow comes last
+    assert [unit.seed for unit in table] == sorted(unit.seed for unit in table)
 
 
 def test_matrix_of_a_part():
-    assert units.matrix(["transfer"], 1, objects=["mug"]) == [SCRATCH, CUBE, TRANSFER]
-    table = units.matrix(["table1"], 1, objects=["banana", "mug"], methods=["violation"], recipes=["paper"])
+    paper, one = units.PRESETS["paper"], units.PRESETS["paper"].with_amounts(1, None)
+    assert units.matrix(["transfer"], one, objects=["mug"], recipes=["ours"]) == [SCRATCH, CUBE, TRANSFER]
+    table = units.matrix(["table1"], one, objects=["banana", "mug"], methods=["violation"], recipes=["paper"])
     assert table == [Unit(task, "violation", "paper", FIRST) for task in ("mug", "banana")]
-    assert {unit.method for unit in units.matrix(["curves"], 1, methods=["pddm"])} == {"pddm"}
-    curves = units.matrix(["curves"], 1, recipes=["ours"])
+    slow = units.matrix(["curves"], paper, methods=["pddm"])
+    assert {(unit.method, unit.seed - FIRST) for unit in slow} == {("pddm", seed) for seed in range(5)}
+    assert len(units.matrix(["curves"], paper.with_amounts(10, None), methods=["pddm"], recipes=["authors"])) == 10
+    curves = units.matrix(["curves"], one, recipes=["ours"])
     assert [(unit.method, unit.recipe) for unit in curves] == [
-        ("pddm", "none"), ("ppo", "paper"), ("violation", "ours"), ("lcs-rl", "ours"),
+        ("lcs-rl", "ours"), ("violation", "ours"), ("pddm", "ours"),
     ]  # fmt: skip
+    assert {unit.recipe for unit in units.matrix(["table1"], units.PRESETS["smoke"])} == {"ours"}
+    ablations = units.matrix(["ablations"], paper)
+    assert {unit.task for unit in ablations} == set(units.ABLATION_TASKS)
+    assert {unit.seed for unit in ablations} == set(range(FIRST, FIRST + units.ABLATION_SEEDS))
+    # In each of them one part is missing: all differ from each other.
+    configs = [units.config_of(unit, paper).method for unit in ablations if unit.task == "cube" and unit.seed == FIRST]
+    tasks = [unit.own.task for unit in ablations if unit.task == "cube" and unit.seed == FIRST]
+    assert len({repr(pair) for pair in zip(configs, tasks, strict=True)}) == len(units.ABLATED) + 1
 
 
 def test_config_is_the_default_recipe_but_for_what_the_unit_says():
     default = {name: get_method(name)() for name in units.METHODS}
-    for method, wanted in (
-        ("violation", replace(default["violation"], warmup=replace(default["violation"].warmup, noise=0.0))),
-        (
-            "lcs-rl",
-            replace(
-                default["lcs-rl"],
-                warmup_minutes=6.0,
-                warmup=replace(default["lcs-rl"].warmup, noise=0.0),
-                ppo=replace(default["lcs-rl"].ppo, update="adam", steps=20, minibatch=None),
-                models=replace(default["lcs-rl"].models, iterations=0),
-            ),
-        ),
-    ):
+    for method in ("violation", "lcs-rl"):
         config = units.config_of(Unit("mug", method, "paper", 3), units.PRESETS["paper"])
-        assert config.method == wanted
+        known = {name: new for name, new in recipes.PAPER.settings.items() if hasattr(default[method], name)}
+        for name, new in known.items():
+            mine, before = getattr(config.method, name), getattr(default[method], name)
+            assert mine == (replace(before, **new) if isinstance(new, dict) else new)
+        assert config.method == replace(default[method], **{name: getattr(config.method, name) for name in known})
         assert (config.task, config.seed, config.minutes) == ("mug", 3, 30.0)
-        assert config.evaluate_goals == config.final_goals == 1000
+        assert (config.evaluate_goals, config.final_goals) == (300, 1000)
         assert config.evaluation_seed == TrainConfig().evaluation_seed  # the same goals for every unit
     assert units.config_of(CUBE, units.PRESETS["paper"]).method == default["lcs-rl"]
-    assert (
-        units.config_of(replace(CUBE, method="pddm", recipe="none"), units.PRESETS["quick"]).method == default["pddm"]
-    )
+    slow = units.config_of(replace(CUBE, method="pddm"), units.PRESETS["paper"])
+    assert slow.method == default["pddm"]
+    assert (slow.final_goals, slow.evaluate_at) == (300, (2.0, 6.0, 10.0, 20.0))
+
+
+def test_a_recipe_changes_its_task_and_no_other():
+    plain = get_task("mug")
+    prior, without = Unit("mug", "violation", "jin-posa", 0).spec, Unit("mug", "lcs-rl", "no-penalty", 0).spec
+    assert (plain.horizon, prior.horizon) == (8, 5)
+    # The cost of a model whose action is the largest: nothing but the weight of the action differs, 200 and 0.001.
+    x, u, goal = (torch.zeros(n, dtype=torch.float64) for n in (9, 6, 3))
+    costs = [float(spec.make_cost().stage(x, u + 0.015, goal)) for spec in (plain, prior)]
+    assert costs == pytest.approx([200 * 6 * 0.015**2, 0.001 * 6 * 0.015**2])
+    assert float(prior.make_cost().stage(x + 0.01, u, goal)) == float(plain.make_cost().stage(x + 0.01, u, goal)) > 0
+    far = torch.tensor([0.05, 0, 0], dtype=torch.float64)
+    rewards = [float(spec.outcome(x, u, x, far, True)[0]) for spec in (plain, without)]
+    assert rewards[1] - rewards[0] == pytest.approx(10)
+    assert (plain.failure_penalty, without.failure_penalty) == (10, 0)
+    env = without.make_env()
+    env.reset(seed=0)
+    infos = [env.step(np.zeros(6))[4] for _ in range(20)]
+    assert not infos[-1]["success"]
+    assert infos[-1]["reward_completion"] == 0
+    env.close()
+
+
+def test_the_same_model_is_deployed_in_several_ways(tmp_path, one_thread, monkeypatch):
+    (job,) = make_jobs([Unit("cube", "violation", "jin-posa", FIRST)], tmp_path).values()
+    calls, measure = [], deployment.Deployments.measure
+
+    def counted(self, run, protocol, minutes, goals):
+        calls.append(protocol)
+        if len(calls) == 2:
+            raise KeyboardInterrupt  # after a checkpoint, before all ways of it are measured
+        return measure(self, run, protocol, minutes, goals)
+
+    monkeypatch.setattr(deployment.Deployments, "measure", counted)
+    with pytest.raises(KeyboardInterrupt):
+        worker.execute(job)
+    rows, _ = worker.execute(job)  # goes on where it stopped, and leaves nothing out
+    assert calls == ["support", "task", "task", "support", "task"]
+    assert list(rows.protocol) == ["support"] * 2 + ["task"] * 2
+    assert list(rows["at"]) == [0.2, 0.5] * 2
+    undisturbed, _ = worker.execute(replace(job, work=tmp_path / "undisturbed"))
+    pd.testing.assert_frame_equal(rows.drop(columns=TIMES), undisturbed.drop(columns=TIMES))
 
 
 def test_key_changes_with_everything_that_decides_a_result_and_with_nothing_else(monkeypatch):
@@ -143,6 +205,7 @@ def test_key_changes_with_everything_that_decides_a_result_and_with_nothing_else
         key(),
         key(replace(CUBE, method="violation")),
         key(replace(CUBE, recipe="paper")),
+        key(replace(CUBE, recipe="no-penalty")),  # the same settings, another task
         key(preset=replace(TINY, goals=3)),
         key(objects=other),
         key(TRANSFER),
@@ -291,7 +354,7 @@ def played(broken=()):
 
 
 def test_failures_stop_what_depends_on_them_and_nothing_else_and_are_tried_again(in_process, tmp_path):
-    jobs, stored = make_jobs(units.matrix(["transfer"], 1, objects=["mug"]), tmp_path), []
+    jobs, stored = make_jobs(units.matrix(["transfer"], TINY, objects=["mug"], recipes=["ours"]), tmp_path), []
     display, text = quietly()
     failed = runs.compute(list(jobs.values()), in_process, stored.append, display, played(broken=["cube"]))
     assert "it [broke]" in (jobs[CUBE].folder / "error.txt").read_text()
@@ -395,11 +458,12 @@ def test_a_script_computes_and_draws(local, tmp_path, monkeypatch, capsys):
     assert code == 0, err
     assert "smoke: 1 units of 0.5 minutes of data, 1 seeds, 4 goals; 0 finished before" in out
     rows = records.read(tmp_path / "smoke-stand-in.csv")
-    assert list(rows["at"]) == [0.0, 0.2, 0.5]
+    assert list(rows["at"]) == [0.0, 0.2, 0.5] * 2
+    assert list(rows.protocol) == ["full"] * 3 + ["support"] * 3
     assert set(rows.version) == {str(get_method("violation").version)}
     # One seed: the interval is Wilson's, of its goals.
     line = next(line for line in (tmp_path / "table1-smoke-stand-in.md").read_text().splitlines() if "| mug" in line)
-    last = rows.iloc[-1]
+    last = rows[rows.protocol == "full"].iloc[-1]
     assert f"{100 * last.success:.1f} [{100 * last.ci_low:.1f}, {100 * last.ci_high:.1f}]" in line
     code, out, _ = run_script(table1.main, capsys, *options, *folders)
     assert "1 finished before" in out
@@ -441,13 +505,38 @@ def test_bootstrap_against_numbers_by_hand():
 
 
 def test_p_value_against_scipy():
-    from scipy.stats import ttest_rel
+    from scipy.stats import permutation_test
 
-    a, b = np.array([80.1, 85.3, 91.0, 78.2]), np.array([60.3, 70.9, 55.1, 72.4])
-    assert stats.p_value(a - b) == pytest.approx(ttest_rel(a, b).pvalue)
+    for seeds in (4, 7, 10):
+        apart = np.random.default_rng(seeds).normal(0.6, 1.0, seeds)
+        theirs = permutation_test((apart,), np.mean, permutation_type="samples", n_resamples=np.inf)
+        assert stats.p_value(apart) == pytest.approx(theirs.pvalue)
+    assert stats.p_value([1.0, 2.0, 3.0]) == 0.25  # two of eight choices of signs
     assert stats.p_value([0.0, 0.0]) == 1.0
-    assert stats.p_value([100 * 0.7 - 100 * 0.4, 30.0]) == 0.0  # but for rounding the same
+    assert stats.p_value([100 * 0.7 - 100 * 0.4, 30.0]) == 0.5  # but for rounding the same
     assert math.isnan(stats.p_value([1.0]))
+
+
+def test_differences_to_what_others_publish():
+    theirs = stats.published(50.0, 10.0, 10)
+    assert theirs.high - 50 == pytest.approx(2.262 * 10 / math.sqrt(10), rel=1e-3)
+    # Without uncertainty of one, the interval is that of the other; of two equal ones it is √2 times as wide.
+    exact, ours = stats.Estimate(50.0, 50.0, 50.0), stats.Estimate(60.0, 58.0, 61.0)
+    assert stats.apart(ours, exact) == pytest.approx((10.0, 8.0, 11.0))
+    assert stats.apart(exact, ours) == pytest.approx((-10.0, -11.0, -8.0))
+    assert stats.apart(theirs, theirs).high == pytest.approx(math.sqrt(2) * (theirs.high - 50))
+
+
+def test_words_say_what_the_intervals_say():
+    found = {
+        "mug": stats.Estimate(3.0, 1.0, 5.0), "can": stats.Estimate(-2.0, -3.0, -1.0),
+        "box": stats.Estimate(1.0, -1.0, 3.0), "wrench": stats.Estimate(9.0), "clamp": None,
+    }  # fmt: skip
+    assert report.verdict(found) == "better on 1 (mug), worse on 1 (can), not to be told apart on 1 (box)"
+    assert report.verdict({"mug": found["mug"], "cube": found["mug"]}) == "better on all 2"
+    assert report.verdict({"wrench": found["wrench"]}) == "not compared: that takes two seeds"
+    assert report.listed(["a", "b", "c"]) == "a, b and c"
+    assert report.listed([]) == "none"
 
 
 # --- results ----------------------------------------------------------------------------------------
@@ -456,9 +545,9 @@ def test_p_value_against_scipy():
 def unit_rows(unit, values, source="ycb_mesh", goals=1000, **changes):
     """Rows as of a finished unit; `values` are percent at 0, 6, 10 and 30 minutes."""
     base = dict(
-        **asdict(unit), ci_low=0.0, ci_high=1.0, goals=goals, evaluation_seed=0, solver_failures=0, source=source,
-        mass=0.05, version="1", key=f"{unit.method}{unit.recipe}{goals}", versions="difflcs=1", machine="a machine",
-        train_seconds=20.0, evaluation_seconds=10.0, finished="2026-01-01T00:00:00+00:00",
+        **asdict(unit), protocol="full", ci_low=0.0, ci_high=1.0, goals=goals, evaluation_seed=0, solver_failures=0,
+        source=source, mass=0.05, version="1", key=f"{unit.method}{unit.recipe}{goals}", versions="difflcs=1",
+        machine="a machine", train_seconds=20.0, evaluation_seconds=10.0, finished="2026-01-01T00:00:00+00:00",
     )  # fmt: skip
     points = zip((0.0, 6.0, 10.0, 30.0), values, strict=True)
     rows = [{**base, "at": at, "minutes": at, "success": value / 100, **changes} for at, value in points]
@@ -477,9 +566,11 @@ def results(tmp_path):
                 (Unit(task, "violation", "paper", seed), (0, 20, 20, 20)),
             ):
                 records.add(tmp_path, "paper", unit_rows(unit, values))
+        prior = unit_rows(Unit("mug", "violation", "jin-posa", seed), (0, 0, 0, 12), protocol="support")
+        records.add(tmp_path, "paper", prior)
         transfer = Unit("mug", "ppo", "ours", seed, "cube")
         records.add(tmp_path, "paper", unit_rows(transfer, (30, 60, 70, 79 + shift)))
-        records.add(tmp_path, "paper", unit_rows(Unit("cube", "pddm", "none", seed), (0, 1, 2, 3), goals=50))
+        records.add(tmp_path, "paper", unit_rows(Unit("cube", "pddm", "ours", seed), (0, 1, 2, 3), goals=50))
     return tmp_path
 
 
@@ -492,10 +583,11 @@ def cells_of(path, task):
 def test_table1_shows_ours_beside_the_paper(results, capsys):
     code, out, _ = run_script(table1.main, capsys, "--results", results)
     assert code == 0
-    success, differences, other, _ = cells_of(results / "table1.md", "mug")
+    success, differences, other, *_, ways = cells_of(results / "table1.md", "mug")
     assert success[1:5] == ["50.0 [40.0, 60.0]", "32.5 ± 8.4", "80.0 [70.0, 90.0]", "44.6 ± 3.9"]  # peak
     assert success[5:] == ["20.0 [10.0, 30.0]", "10.0 ± 6.3", "80.0 [70.0, 90.0]", "44.6 ± 3.9"]  # final
-    assert differences[1:] == ["+30.0 [+30.0, +30.0]", "< 0.001", "+60.0 [+60.0, +60.0]", "< 0.001"]
+    assert differences[1:] == ["+30.0 [+30.0, +30.0]", "0.250", "+60.0 [+60.0, +60.0]", "0.250"]
+    assert ways[1:] == ["20.0 [10.0, 30.0]", "20.0 [20.0, 20.0]", "12.0 [12.0, 12.0]"]
     assert other[1] == "20.0 [20.0, 20.0]"
     assert "50.0 [40.0, 60.0]" in out
     assert "32.5 $\\pm$ 8.4" in (results / "table1.tex").read_text()
@@ -504,7 +596,9 @@ def test_table1_shows_ours_beside_the_paper(results, capsys):
     markdown = (results / "table1.md").read_text()
     assert "Success on six objects, the paper's recipe" in markdown
     assert "LCS-RL, our recipe: version 1, 3 seeds × 1000 goals (mug)" in markdown
-    assert "Computed: 9 trainings" in markdown  # mug only
+    assert "Computed: 12 trainings" in markdown  # mug only
+    assert "LCS-RL, our recipe, at the end against violation only, our recipe: better on all 1." in markdown
+    assert "LCS-RL, our recipe, at the end against the paper's mean: better on all 1." in markdown
 
 
 def test_over_all_objects_the_middle_half_counts(tmp_path, capsys):
@@ -527,12 +621,46 @@ def test_learning_curves_are_drawn(results, capsys):
     assert "PDDM: version 1, 3 seeds × 50 goals" in out  # an unequal number of goals is said
 
 
+def test_curves_stand_where_the_evaluations_were(tmp_path, capsys, monkeypatch):
+    rows = unit_rows(Unit("cube", "lcs-rl", "ours", 0), (0, 40, 50, 70))
+    rows["minutes"] = [0.0, 6.9, 10.5, 30.0]
+    records.add(tmp_path, "paper", rows)
+    drawn, plot = [], matplotlib.axes.Axes.plot
+    monkeypatch.setattr("matplotlib.axes.Axes.plot", lambda s, x, *a, **k: drawn.append(list(x)) or plot(s, x, *a, **k))
+    assert run_script(fig_learning_curves.main, capsys, "--results", tmp_path)[0] == 0
+    assert drawn == [[0.0, 6.9, 10.5, 30.0]]
+    assert "later by up to 0.9 min (LCS-RL)" in (tmp_path / "fig_learning_curves.md").read_text()
+
+
+def test_single_seeds_are_thin_lines(results, capsys, monkeypatch):
+    widths = []
+    plot = matplotlib.axes.Axes.plot
+    monkeypatch.setattr("matplotlib.axes.Axes.plot", lambda *a, **k: widths.append(k["lw"]) or plot(*a, **k))
+    assert run_script(fig_transfer.main, capsys, "--results", results)[0] == 0
+    assert widths == [2, 0.5] * 2
+
+
+def test_ablations_are_compared_with_all_parts(results, capsys):
+    for seed in range(3):
+        records.add(results, "paper", unit_rows(Unit("cube", "lcs-rl", "adam", seed), (0, 40, 40, 60 + 10 * seed)))
+        records.add(results, "paper", unit_rows(Unit("cube", "ppo", "ours", seed), (0, 40, 60 + 10 * seed, 50)))
+    assert run_script(ablations.main, capsys, "--results", results)[0] == 0
+    (adam,) = cells_of(results / "ablations.md", "with Adam")
+    assert adam[3:] == ["70.0 [60.0, 80.0]", "−20.0 [−30.0, −10.0]", "0.250", "−10.0 [−10.0, −10.0]", "0.250"]
+    markdown = (results / "ablations.md").read_text()
+    worse = "it is worse with Adam instead of the natural gradient"
+    assert f"The cube, 10 min: by the intervals {worse}; better without warm-up." in markdown
+    assert f"The cube, final: by the intervals {worse} and without warm-up; better none." in markdown
+    assert (results / "ablations.png").is_file()
+
+
 def test_transfer_is_compared_at_equal_data(results, capsys):
     assert run_script(fig_transfer.main, capsys, "--results", results)[0] == 0
     cells = cells_of(results / "fig_transfer.md", "mug")[0]
     assert cells[1] == "30.0 [30.0, 30.0]"  # the cube's model without any data
-    assert cells[2:6] == ["50.0 [40.0, 60.0]", "60.0 [60.0, 60.0]", "+10.0 [+0.0, +20.0]", "0.225"]  # 6 min
-    assert cells[6:] == ["80.0 [70.0, 90.0]", "89.0 [79.0, 99.0]", "+9.0 [+9.0, +9.0]", "< 0.001"]  # final
+    assert cells[2:] == ["—", "—", "50.0 [40.0, 60.0]", "60.0 [60.0, 60.0]", "80.0 [70.0, 90.0]", "89.0 [79.0, 99.0]"]
+    cells = cells_of(results / "fig_transfer.md", "mug")[1]
+    assert cells[3:] == ["+10.0 [+0.0, +20.0]", "0.500", "+9.0 [+9.0, +9.0]", "0.250"]  # 6 min, final
 
 
 def test_the_same_numbers_give_the_same_files(results, capsys):
@@ -621,20 +749,147 @@ def test_readme_is_filled_between_its_marks_only(tmp_path):
 
 
 def test_the_tracked_readme_and_tables_are_those_of_the_tracked_results(tmp_path, monkeypatch, capsys):
-    names = {"table1": table1, "fig_learning_curves": fig_learning_curves, "fig_transfer": fig_transfer}
+    scripts = {
+        "table1": table1, "fig_learning_curves": fig_learning_curves, "fig_transfer": fig_transfer,
+        "ablations": ablations, "small_models": small_models, "robustness": robustness, "cross_check": cross_check,
+    }  # fmt: skip
     text, tracked = (FOLDER / "README.md").read_text(), records.RESULTS
     readme = tmp_path / "README.md"
     readme.write_text(text)
-    for path in tracked.glob("paper*.csv"):
+    for path in [*tracked.glob("paper*.csv"), *tracked.glob("*.json")]:
         (tmp_path / path.name).write_bytes(path.read_bytes())
     monkeypatch.setattr(report, "README", readme)
     monkeypatch.setattr(records, "RESULTS", tmp_path)
-    for name, script in names.items():
+    shown = [name for name in scripts if (tracked / f"{name}.md").exists()]
+    assert set(shown) >= {"table1", "fig_learning_curves", "fig_transfer", "small_models"}
+    for name, script in scripts.items():
         assert f"<!-- results: {name} -->" in text
-        assert run_script(script.main, capsys, "--results", tmp_path, "--preset", "paper")[0] == 0
+        if hasattr(script, "Options"):
+            code = script.draw_record(script.Options(results=tmp_path)) if name in shown else 0
+        else:
+            code, _, _ = run_script(script.main, capsys, "--results", tmp_path, "--preset", "paper")
+        assert (code == 0) or name not in shown
         for suffix in ("md", "tex"):
-            assert (tmp_path / f"{name}.{suffix}").read_text() == (tracked / f"{name}.{suffix}").read_text()
+            written = tmp_path / f"{name}.{suffix}"
+            assert written.exists() == (name in shown)
+            assert name not in shown or written.read_text() == (tracked / f"{name}.{suffix}").read_text()
     assert readme.read_text() == text, "run the scripts of reproduce/ to bring README.md up to date"
+
+
+# --- other systems, other simulators ----------------------------------------------------------------
+
+
+def test_robustness_is_resumed_and_refuses_another_record(tmp_path, monkeypatch, one_thread, capsys):
+    measured, measure = [], robustness.measure
+
+    def counted(condition, *rest):
+        measured.append(condition.name)
+        if len(measured) == 3:
+            raise KeyboardInterrupt
+        return measure(condition, *rest)
+
+    monkeypatch.setattr(robustness, "measure", counted)
+    options = robustness.Options(goals=2, smoke=True, results=tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        robustness.draw_record(options)
+    assert robustness.draw_record(options) == 0
+    assert measured[2] == measured[3]  # the one that was interrupted, none of those before
+    assert len(measured) == len(set(measured)) + 1
+    record = json.loads((tmp_path / "robustness-smoke.json").read_text())
+    nominal = evaluate(get_task("cube").make_envs(2), Learned.open(options.model).policy, 2, 0)
+    assert record["results"][0]["reached"].count("1") == nominal.successes
+    assert (tmp_path / "robustness-smoke.png").is_file()
+    assert not (tmp_path / "robustness.json").exists()
+    with pytest.raises(CheckpointError, match="pass another --results"):
+        robustness.draw_record(replace(options, goals=1))
+    with pytest.raises(CheckpointError, match=r"robustness\.py --rerun"):
+        robustness.draw_record(replace(options, smoke=False))
+
+
+def test_robustness_changes_what_it_says(monkeypatch):
+    found = list(robustness.conditions(0.01, 0.5, 1000.0))
+    assert [one.name for one in found if one.group == "mass"] == ["2 g", "5 g", "20 g", "30 g", "100 g"]
+    assert {"osc_kp": 2500.0} in [one.env for one in found]
+    seen = []
+    act = lambda state, goal: (seen.append(state), (np.zeros((len(state), 6)), np.zeros(len(state), bool)))[1]  # noqa: E731
+    monkeypatch.setattr(robustness, "mpc_actions", lambda policy: act)
+    state, goal = torch.zeros(2000, 9, dtype=torch.float64), torch.zeros(2000, 3, dtype=torch.float64)
+    noisy = next(one for one in found if one.noise == (0.003, 0.05))
+    robustness.acting(noisy, None, 6, 0)(state, goal)
+    assert seen[0].std(0)[:3].tolist() == pytest.approx([0.003, 0.003, 0.05], rel=0.1)
+    assert not seen[0][:, 3:].any()  # where the tips are, the robot knows
+
+
+PRIOR_WORK = """
+import mujoco
+import numpy as np
+from gym import utils
+from gym.spaces import Box
+from difflcs.rl import get_task
+
+class TriFingerQuasiStaticGroundEnv(utils.EzPickle):
+    box = Box(-1.0, 1.0, (6,), np.float64)
+    def __init__(self):
+        self.inner = get_task("cube").make_env().unwrapped
+        self.goal = np.zeros(3)
+    def reset(self):
+        state = np.random.uniform(-0.004, 0.004, 9)
+        observation, _ = self.inner.reset(seed=int(np.random.randint(100)))
+        self.state = observation["state"]
+        body = "<body><joint/><geom size='1'/></body>"
+        model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        matrix = np.zeros((1, 1))
+        mujoco.mj_fullM(model, matrix, data.qM)
+        assert matrix[0, 0] > 0
+    def set_cube_target(self, position, angle):
+        goal = np.array([*position, angle])
+        self.inner.reset(seed=0, options={"goal": goal, "state": self.state})
+    def get_stateinfo(self):
+        return {"state": self.state}
+    def step(self, action):
+        self.state = self.inner.step(action)[0]["state"]
+"""
+
+
+def test_the_cross_check_plays_the_same_episodes(tmp_path, monkeypatch, capsys, one_thread):
+    file = tmp_path / "checkout" / "env" / "gym_env" / "trifinger_quasistaic_ground_continuous.py"
+    file.parent.mkdir(parents=True)
+    for folder in (file.parent, file.parents[1]):
+        (folder / "__init__.py").touch()
+    file.write_text(PRIOR_WORK)
+    with monkeypatch.context() as patch:
+        for name in ("gym", "gym.utils", "gym.spaces", "gym.error", "env", "env.gym_env", cross_check.MODULE):
+            patch.setitem(sys.modules, name, None)
+            sys.modules.pop(name)
+        options = cross_check.Options(tmp_path / "checkout", (Path("zoo:trifinger-cube"),), 2, results=tmp_path)
+        assert cross_check.draw_record(options) == 0
+    (row,) = json.loads((tmp_path / "cross_check.json").read_text())["results"]
+    assert row["theirs"] == row["ours"]
+    assert len(row["ours"]) == 2
+    assert row["tips_rms"] == row["cube_median"] == 0  # here their simulator is ours
+    markdown = (tmp_path / "cross_check.md").read_text()
+    assert "2 goals (seed 0), each from the same start" in markdown
+    assert cross_check.draw_record(replace(options, checkout=None)) == 0  # from the record
+    assert (tmp_path / "cross_check.md").read_text() == markdown
+    with pytest.raises(InvalidInputError, match="clone the prior work"):
+        cross_check.prior_environment(tmp_path)
+    with pytest.raises(CheckpointError, match="make it with --checkout"):
+        cross_check.draw_record(cross_check.Options(results=tmp_path / "empty"))
+
+
+def test_a_small_model_beside_networks(results, capsys):
+    assert run_script(small_models.main, capsys, "--results", results)[0] == 0
+    markdown = (results / "small_models.md").read_text()
+    # Three seeds of 10 s of evaluation and 4 × 50 goals × 20 steps; the LCS has 4 × 1000 goals.
+    assert [cells[1:] for cells in cells_of(results / "small_models.md", "computing per decision")] == [["0.12", "2.5"]]
+    assert "A decision of PDDM takes 20 times the computing" in markdown
+    assert "cannot be decided here" in markdown  # they have other goals
+    for seed in range(3):
+        records.add(results, "paper", unit_rows(Unit("cube", "pddm", "ours", seed), (0, 1, 2, 3), version="2"))
+    assert run_script(small_models.main, capsys, "--results", results)[0] == 0
+    assert "at little data holds here." in (results / "small_models.md").read_text()
 
 
 # --- bad input --------------------------------------------------------------------------------------
@@ -657,7 +912,7 @@ def test_the_tracked_readme_and_tables_are_those_of_the_tracked_results(tmp_path
         (run_runs, ["--methods", "pddm", "--scheduler", "tcp://127.0.0.1:9"], "tcp://127.0.0.1:9"),
         (table1.main, [], "python reproduce/table1.py --rerun --preset quick"),
         (fig_transfer.main, ["--preset", "paper"], "reproduce/fig_transfer.py --rerun --preset paper"),
-        (run_fig_task, [], "reproduce/fig_task.py --rerun"),
+        (run_fig_task, ["--run", "zoo:trifinger-mug"], "expected a model of the cube, got one of mug"),
         (run_fig_task, ["--run", "nowhere"], "nowhere"),
     ],
 )
@@ -708,7 +963,10 @@ def test_the_task_is_drawn(undisturbed, tmp_path, monkeypatch, capsys):
     except RenderingError as error:
         pytest.skip(f"needs OpenGL: {error}")
     job = undisturbed[1][CUBE]
-    code, out, err = run_script(run_fig_task, capsys, "--results", tmp_path, "--work", job.work)
-    assert code == 0, err
-    assert f"model: {job.folder / 'run'}" in out
-    assert (tmp_path / "fig_task.png").stat().st_size > 50_000
+    assert fig_task.newest(job.work) == job.folder / "run"
+    for run in ("zoo:trifinger-cube", job.folder / "run"):
+        code, out, err = run_script(run_fig_task, capsys, "--results", tmp_path, "--run", run)
+        assert code == 0, err
+        assert f"model: {run}" in out
+        assert (tmp_path / "fig_task.png").stat().st_size > 50_000
+    assert fig_task.DrawTask().run == Path("zoo:trifinger-cube")  # without options

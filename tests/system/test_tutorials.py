@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import asyncio
 import re
+import sys
+import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +20,18 @@ NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 BYTES = 1_000_000
 # What a reader's machine does not have, and what must not be published.
 PRIVATE = re.compile(r"/work\b|/tmp\b|/home/|/root\b|/Users/|site-packages|Traceback|Warning: |[A-Z]:\\\\")
-INSTALL = re.compile(r"try:\n    import difflcs  # noqa: F401\nexcept ImportError:\n    %pip install ")
+# As long as no package index has the library, it comes from the checkout that the notebook lies in.
+INSTALL = re.compile(
+    r"# From a checkout .*\ntry:\n    import difflcs  # noqa: F401\nexcept ImportError:\n"
+    r'    %pip install --quiet "\.\.\[([a-z,]+)\]"$'
+)
+# What brings a package that a notebook imports: an extra, or None where the library itself or Jupyter does.
+BRINGS = {
+    "IPython": None, "PIL": "viz", "difflcs": None, "difflcs.physics": None, "difflcs.planning": None,
+    "difflcs.planning.films": "viz", "difflcs.planning.pusht": "scoreboard", "difflcs.rl": "rl", "difflcs_envs": "envs",
+    "gymnasium": "envs", "matplotlib": "viz", "mujoco": "envs", "numpy": None, "tensordict": "rl", "torch": None,
+    "trimesh": "envs",
+}  # fmt: skip
 SECONDS = 300  # of one cell; a notebook takes about five on a free machine
 
 
@@ -82,6 +96,35 @@ def test_is_committed_with_its_outputs(path: Path):
     assert not [output for output in outputs if output.output_type == "error" or output.get("name") == "stderr"]
     found = PRIVATE.search(said(notebook)) or PRIVATE.search("\n".join(cell.source for cell in notebook.cells))
     assert found is None, found
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_installs_what_it_imports(path: Path):
+    cells = [cell.source for cell in code(read(path))]
+    install = INSTALL.match(cells[0])
+    assert install
+    extras = set(install[1].split(","))
+    assert extras <= set(
+        tomllib.loads((FOLDER.parent / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    )
+    modules = {
+        name
+        for cell in cells[1:]
+        for node in ast.walk(ast.parse(cell))
+        for name in (
+            [alias.name for alias in node.names] if isinstance(node, ast.Import)
+            else [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        )
+    }  # fmt: skip
+    needed = set()
+    for module in modules:
+        if module.split(".")[0] not in sys.stdlib_module_names:
+            needed.add(BRINGS[module] if module in BRINGS else BRINGS[module.split(".")[0]])
+    if re.search(r"task=|get_task|TrainConfig", "".join(cells)):
+        needed.add("envs")  # the tasks of the robot
+    if '"relaxed"' in "".join(cells):
+        needed.add("relaxed")
+    assert needed - {None} <= extras
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

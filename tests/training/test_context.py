@@ -164,7 +164,7 @@ def test_ppo_improves_a_module_of_ones_own():
 
 
 def test_the_violation_loss_beside_ppo_gets_the_context():
-    """Eq. total_loss with β = 0 is the violation loss alone, which finds the true effect."""
+    """Eq. 7 with β = 0 is the violation loss alone, which finds the true effect."""
     adam = Adam(learning_rate=0.02, betas=(0.9, 0.99))
     lcs = Gain()
     trainer = make_trainer(

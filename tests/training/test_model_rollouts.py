@@ -266,7 +266,6 @@ def test_restore_refuses_what_does_not_fit():
         {"iterations": -1},
         {"rollouts": 0},
         {"real_step": 0.0},
-        {"final_iterations": -1},
         {"steps": 0},
         {"value_epochs": 0},
         {"actions": 0},

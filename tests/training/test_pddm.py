@@ -249,7 +249,7 @@ def test_broken_episodes_are_dropped():
         make_pddm(env=make_envs(breaks_at=2)).step()
 
 
-@pytest.mark.parametrize("change", [{"samples": 0}, {"kappa": 0.0}, {"filter": 1.5}, {"noise": math.nan}])
+@pytest.mark.parametrize("change", [{"samples": 0}, {"kappa": 0.0}, {"filter": 1.5}, {"kappa": math.nan}])
 def test_bad_settings_are_refused(change):
     with pytest.raises(InvalidInputError, match=next(iter(change))):
         PDDMSettings(**change)
@@ -258,3 +258,20 @@ def test_bad_settings_are_refused(change):
 def test_too_few_environments():
     with pytest.raises(InvalidInputError, match="at least 10 environments, got 2"):
         make_pddm(env=make_envs(2))
+
+
+def test_networks_drawn_anew_forget_what_they_learned():
+    def weights(keep):
+        trainer = make_pddm(keep_networks=keep)
+        trainer.step()
+        first = [w.detach().clone() for w in trainer.ensemble.weights]
+        trainer.settings = replace(trainer.settings, ensemble=replace(NETWORKS, epochs=Epochs(1, 1, 10**6)))
+        trainer.step()
+        return first, [w.detach() for w in trainer.ensemble.weights]
+
+    (kept_first, kept), (anew_first, anew) = weights(True), weights(False)
+    # The first training is the same: its networks are those that PDDM is made with.
+    assert all(torch.equal(a, b) for a, b in zip(kept_first, anew_first, strict=True))
+    # One step of Adam moves no weight by more than its step size, beside which new weights are far away.
+    assert all(float((a - b).abs().max()) < 2e-3 for a, b in zip(kept_first, kept, strict=True))
+    assert all(float((a - b).abs().max()) > 0.1 for a, b in zip(anew_first, anew, strict=True))

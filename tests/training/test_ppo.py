@@ -267,7 +267,7 @@ def test_steps_left_out_are_counted():
 
 
 def test_combined_loss():
-    """Eq. total_loss: β = 0 is the violation loss alone, which learns the true gain; β = 1 ignores it."""
+    """Eq. 7: β = 0 is the violation loss alone, which learns the true gain; β = 1 ignores it."""
     gains = {}
     for beta in (0.0, 0.5):
         adam = Adam(learning_rate=0.02, betas=(0.9, 0.99))

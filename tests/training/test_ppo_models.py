@@ -2,6 +2,7 @@
 
 import functools
 
+import numpy as np
 import pytest
 import torch
 
@@ -11,6 +12,7 @@ pytest.importorskip("torchrl")
 from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
 from difflcs.rl.evaluate import evaluate
 from difflcs.rl.optim import UpdateRule
+from difflcs.rl.rollout import collect, uniform_actions
 from difflcs.rl.state import flatten
 from tests.training.slide import ROLLOUTS, STEPS, make_envs, make_models, make_ppo, parameters, recorded, same
 
@@ -34,15 +36,19 @@ def test_model_rollouts_follow_the_first_real_episodes_and_count_as_no_data():
 
 
 @pytest.mark.parametrize(
-    ("models", "expected"),
+    ("iterations", "remembered", "expected"),
     [
-        ({"iterations": 2, "final_iterations": 1}, [0, 2, 1, 1]),  # none before the first real episodes
-        ({"iterations": 1, "final_iterations": 3}, [0, 1, 1, 1]),
-        ({"iterations": 1, "final_iterations": 0, "real_step": 0.5}, [0, 1, 0, 0]),
+        (2, False, [0, 2, 2, 2]),  # none before the first real episodes
+        (2, True, [2, 2, 2, 2]),  # but where those of a warm-up are known
+        (0, True, [0, 0, 0, 0]),
     ],
 )
-def test_iterations_on_model_rollouts_become_fewer(models, expected):
-    trainer, counts = make_practising(models=models), []
+def test_iterations_on_model_rollouts_come_before_each_real_one(iterations, remembered, expected):
+    trainer, counts = make_practising(models={"iterations": iterations}), []
+    if remembered:
+        trainer.remember(
+            collect(make_envs(3), uniform_actions(make_envs(3), np.random.default_rng(0)), [1, 2, 3], STEPS)
+        )
     seen = recorded(trainer, "practice")
     while not trainer.done:
         before = len(seen.calls)
@@ -65,14 +71,14 @@ class Noting(UpdateRule):
 
 
 def test_steps_on_real_episodes_are_shorter_beside_model_rollouts():
-    models = {"iterations": 2, "final_iterations": 2, "real_step": 0.25, "steps": 1}
+    models = {"iterations": 2, "real_step": 0.25, "steps": 1}
     trainer = make_practising(models=models, final_step=1.0, steps=1)
     trainer.update = Noting(trainer.update)
     sizes = iter([1.0, 2.0, 3.0, 21.0])  # whatever the real episodes say
     trainer.update.size.adapt = lambda kl: setattr(trainer.update.size, "value", next(sizes))
     for _ in range(2):
         report = trainer.step()
-    assert trainer.update.scales == [1.0, 1.0, 1.0, 0.25]
+    assert trainer.update.scales == [0.25, 1.0, 1.0, 0.25]
     assert trainer.update.size.value == 3.0 == report.learning_rate
 
 
@@ -129,8 +135,8 @@ def test_the_value_network_learns_from_what_the_estimator_says(actions):
     assert torch.equal(trainer.critic.history[2][1], seen[0].calls[1][2])
 
 
-def test_the_first_iteration_does_not_depend_on_models():
-    alone, practising = make_ppo(), make_practising()
+def test_without_real_episodes_models_only_shorten_the_first_step():
+    alone, practising = make_ppo(), make_practising(models={"real_step": 1.0})
     for trainer in (alone, practising):
         trainer.step()
     assert same(parameters(alone), parameters(practising))

@@ -63,6 +63,19 @@ def test_bounds_while_collecting():
     assert off.bounds == (off.low, off.high)
 
 
+def test_the_model_keeps_the_last_bounds_if_it_is_to():
+    trainer = make_trainer(keep_support=True)
+    assert torch.equal(trainer.lcs.action_support, torch.stack([trainer.low, trainer.high]))
+    for _ in range(3):
+        trainer.step()
+        assert torch.equal(trainer.lcs.action_support, torch.stack(trainer.bounds))
+    assert bool((trainer.bounds[1] < trainer.high).all())
+    resumed = make_trainer(seed=0, keep_support=True)
+    resumed.load(trainer.state_dict())
+    assert torch.equal(resumed.lcs.action_support, trainer.lcs.action_support)
+    assert make_trainer().lcs.action_support is None
+
+
 def test_a_pretrained_model_skips_the_random_episodes():
     lcs = LCSModel(2, 1, 1)
     trainer = Warmup(lcs, Reach(lcs), make_envs(3), small_settings(), 0, STEPS, pretrained=True)

@@ -87,7 +87,7 @@ def some(*shape: int, seed: int = 0) -> torch.Tensor:
 
 
 def test_advantages_are_the_papers():
-    """Eq. adv_func written out, with a value of zero at the end of an episode."""
+    """Eq. 5 written out, with a value of zero at the end of an episode."""
     critic, inputs, rewards = make_critic(), some(5, STEPS + 1, 3), some(5, STEPS, seed=1)
     value = critic.network(inputs.float()).detach().double().squeeze(-1)
     value[:, -1] = 0

@@ -23,7 +23,7 @@ def evaluate(cost, x, u):
 
 
 def paper(x, u, goal):
-    """Eq. cost_function of the paper, literally: cube x, y, yaw, then three fingertips."""
+    """Eq. 13, literally: cube x, y, yaw, then three fingertips."""
 
     def near(x, weight):
         return weight * sum(float((x[3 + 2 * i : 5 + 2 * i] - x[:2]).square().sum()) for i in range(3))

@@ -12,7 +12,15 @@ from torch.autograd import gradcheck
 from torch.func import functional_call
 
 from difflcs import LCSModel, LCSParams
-from difflcs.errors import InvalidInputError, NotPositiveDefiniteError, ShapeError
+from difflcs.errors import (
+    BoundsError,
+    CheckpointError,
+    DTypeError,
+    InvalidInputError,
+    NonFiniteError,
+    NotPositiveDefiniteError,
+    ShapeError,
+)
 
 NAMES = ("A", "B", "C", "d", "D", "E", "G", "H", "c")
 
@@ -261,3 +269,42 @@ def test_params_keep_the_gradient_and_detach_drops_it(model):
     params = model.params()
     assert all(v.requires_grad for v in params.tensors().values())
     assert not any(v.requires_grad for v in params.detach().tensors().values())
+
+
+# --- the actions that a model was fitted to -------------------------------------------------------------------------
+
+SUPPORT = torch.tensor([[-0.1, -0.2], [0.05, 0.3]], dtype=torch.float64)
+
+
+def test_an_action_support_is_saved_and_can_be_taken_away(tmp_path):
+    model = LCSModel(4, 2, 3, action_support=SUPPORT)
+    assert "action_support" not in dict(model.named_parameters())
+    model.save_pretrained(tmp_path / "model")
+    assert torch.equal(LCSModel.from_pretrained(tmp_path / "model").action_support, SUPPORT)
+    assert torch.equal(copy.deepcopy(model).action_support, SUPPORT)
+    assert model.float().action_support.dtype == torch.float32
+    model.action_support = None
+    model.double().save_pretrained(tmp_path / "without")
+    assert LCSModel.from_pretrained(tmp_path / "without").action_support is None
+
+
+@pytest.mark.parametrize(
+    ("support", "error"),
+    [
+        (SUPPORT[0], ShapeError),
+        (SUPPORT.expand(3, 2, 2), ShapeError),
+        (SUPPORT[:, :1], ShapeError),
+        (SUPPORT.flip(0), BoundsError),
+        (SUPPORT * torch.nan, NonFiniteError),
+        ([[0.0, 0.0], [1.0, 1.0]], DTypeError),
+    ],
+)
+def test_an_action_support_that_is_none_is_refused(support, error):
+    with pytest.raises(error, match=r"action_support|u_min"):
+        LCSModel(4, 2, 3, action_support=support)
+
+
+def test_a_file_with_a_crossed_action_support_is_refused():
+    model = LCSModel(4, 2, 3, action_support=SUPPORT)
+    with pytest.raises(CheckpointError, match="here: its action support"):
+        LCSModel.from_config(model.config(), {**model.state_dict(), "action_support": SUPPORT.flip(0)}, "here")

@@ -35,7 +35,7 @@ def sigma(model):
 
 
 def objective(p, x, u, x_next, lam, phi, gamma, xi):
-    """Eq. vio_loss for given λ and φ, one transition or a batch."""
+    """Eq. 2 for given λ and φ, one transition or a batch."""
     r = x @ p.A.mT + u @ p.B.mT + lam @ p.C.mT + p.d - x_next
     e = x @ p.D.mT + u @ p.E.mT + lam @ p.F.mT + p.c - phi
     return 0.5 * r.square().sum(-1) + ((lam * phi).sum(-1) + e.square().sum(-1) / (2 * gamma)) / xi

@@ -255,6 +255,42 @@ def test_bounds_of_a_call_replace_those_of_the_layer(layer, x0):
     assert torch.equal(layer.u_max, torch.full((2,), 0.15, dtype=torch.float64))
 
 
+def test_a_plan_stays_within_the_actions_that_the_model_was_fitted_to(build, layer, x0):
+    free = layer(x0).u.detach()
+    support = torch.tensor([[-0.02, -0.3], [0.01, 0.03]], dtype=torch.float64)
+    layer.lcs.action_support = support
+    low, high = layer.limits()
+    assert low.tolist() == [-0.02, -0.15]
+    assert high.tolist() == [0.01, 0.03]
+    held = layer(x0).u.detach()
+    assert bool(((held >= low) & (held <= high)).all())
+    assert not torch.allclose(held, free)
+    other = LCSMPCLayer(layer.lcs.params(), layer.cost, 3, low, high, backend=SOLVER, relaxation=1e-4)
+    torch.testing.assert_close(held, other(x0).u.detach(), rtol=0, atol=1e-12)
+    # What a call asks for comes first, and stages are bounds of one's own.
+    torch.testing.assert_close(layer(x0, u_min=-0.15, u_max=0.15).u.detach(), free, rtol=0, atol=1e-12)
+    stages = StageBounds(torch.full((3, 2), -0.15, dtype=torch.float64), 0.15)
+    torch.testing.assert_close(layer(x0, bounds=stages).u.detach(), free, rtol=0, atol=1e-7)
+    with pytest.raises(BoundsError, match="action_support to None"):
+        LCSMPCLayer(layer.lcs, layer.cost, 3, 0.02, 0.15)
+    layer.lcs.action_support = None
+    torch.testing.assert_close(layer(x0).u.detach(), free, rtol=0, atol=1e-12)
+
+
+def test_learned_bounds_at_the_action_support_have_their_gradient(build, x0):
+    low, high = (nn.Parameter(torch.full((2,), v, dtype=torch.float64)) for v in (-0.01, 0.01))
+    model = build.model(seed=3, scale=0.4)
+    layer = LCSMPCLayer(model, build.cost(0), 3, low, high, backend=SOLVER, relaxation=1e-4)
+    layer(x0).u.sum().backward()
+    wanted = low.grad.clone(), high.grad.clone()
+    assert float(wanted[0].abs().max()) > 0
+    low.grad = high.grad = None
+    model.action_support = torch.stack([low, high]).detach()
+    layer(x0).u.sum().backward()
+    for bound, gradient in zip((low, high), wanted, strict=True):
+        torch.testing.assert_close(bound.grad, gradient, rtol=1e-9, atol=1e-12)
+
+
 def test_bounds_can_be_learned(build, x0):
     low = nn.Parameter(torch.full((2,), -0.01, dtype=torch.float64))
     high = nn.Parameter(torch.full((2,), 0.01, dtype=torch.float64))

@@ -120,7 +120,7 @@ def test_the_gradient_is_that_of_all_actions():
 
 
 def test_the_objective_is_clipped():
-    """Eq. explicit_ppo_loss, written out after the mean has moved."""
+    """Eq. 4, written out after the mean has moved."""
     actor, surrogate, data = made(clip=0.2)
     samples = judged(data)
     with torch.no_grad():
@@ -139,7 +139,7 @@ def test_the_objective_is_clipped():
 
 @pytest.mark.parametrize("beta", [0.0, 0.7])
 def test_the_losses_are_weighted(beta):
-    """Eq. total_loss: β of the clipped objective, 1 − β of the violation loss on some of the newest transitions."""
+    """Eq. 7: β of the clipped objective, 1 − β of the violation loss on some of the newest transitions."""
     actor, surrogate, data = made(beta=beta, violation=VIOLATION)
     _, alone, _ = made()
     seen, (new, other) = episodes(), [solved(actor, data) for _ in range(2)]

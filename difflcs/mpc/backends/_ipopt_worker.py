@@ -74,7 +74,7 @@ def _unpack(packed: casadi.SX, sizes: Sizes) -> dict[str, list[casadi.SX]]:
 
 @functools.lru_cache(maxsize=32)
 def _solver(sizes: Sizes, options: Options) -> casadi.Function:
-    """Direct transcription of Eq. mpc_lcs over (u_k, λ_k, s_k, x_{k+1}), k = 0 … H−1, and v_k, k = 0 … H.
+    """Direct transcription of Eq. 3 of the paper over (u_k, λ_k, s_k, x_{k+1}), k = 0 … H−1, and v_k, k = 0 … H.
 
     Of the functions g the equations come first, stage by stage, then the constraints of the stages 0 … H.
     """

@@ -1,0 +1,80 @@
+"""Further evaluations of the models of one training: the same models, deployed in other ways (`recipes.PROTOCOLS`).
+
+`train` evaluates in one way, "full". Whenever that is due, the checkpoint of the moment is evaluated in the others.
+"""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from units import Unit
+
+from difflcs._files import write_atomically
+from difflcs.rl import Evaluation, RunDirectory, evaluate, get_task, load_policy
+from difflcs.rl.checkpoint import load_checkpoint
+from difflcs.rl.training import EVALUATION_ENVS, Reporter, TrainConfig, goals_due, saved_bounds
+
+NUMBERS = ("success_rate", "ci_low", "ci_high", "goals", "solver_failures")
+
+
+class Deployments(Reporter):
+    """Evaluates what is trained in `run`, and keeps the results in a CSV file beside it, through any interruption.
+
+    Args:
+        unit: what is trained.
+        schedule: its configuration with all evaluations.
+        run: its run directory.
+        file: the CSV file.
+    """
+
+    def __init__(self, unit: Unit, schedule: TrainConfig, run: Path, file: Path):
+        self.unit, self.schedule, self.run, self.file = unit, schedule, run, file
+        self.protocols = [name for name in unit.protocols if name != "full"]
+
+    def evaluated(self, minutes: float, result: Evaluation) -> None:
+        """See `Reporter`: the checkpoint is written, also that before any data."""
+        self.catch_up()
+
+    def iterated(self, report: Any) -> None:
+        """See `Reporter`: the checkpoint is written."""
+        self.catch_up()
+
+    def rows(self) -> pd.DataFrame:
+        """The evaluations so far: protocol, minutes, NUMBERS, seconds."""
+        columns = ["protocol", "minutes", *NUMBERS, "seconds"]
+        return pd.read_csv(self.file) if self.file.is_file() else pd.DataFrame(columns=columns)
+
+    def catch_up(self) -> None:
+        """Evaluate the latest checkpoint in every way, if an evaluation is due there and has not been done."""
+        if not self.protocols or not (self.run / "checkpoints" / "latest.json").is_file():
+            return
+        run = RunDirectory.open(self.run)
+        # After an interruption the log may be ahead of the checkpoint by one row, which will be written anew.
+        latest = load_checkpoint(run.checkpoints)["iteration"]
+        steps = [int(row["env_steps"]) for row in run.rows() if int(row["iteration"]) <= latest][-2:]
+        per_minute = self.unit.spec.steps_per_minute
+        previous, now = steps if len(steps) == 2 else (-1, *steps)
+        goals, minutes = goals_due(self.schedule, previous, now, per_minute), round(now / per_minute, 6)
+        known = self.rows()
+        done = set(known.protocol[known.minutes == minutes])
+        for protocol in self.protocols if goals else ():
+            if protocol not in done:
+                new = self.measure(run, protocol, minutes, goals)
+                known = pd.concat([known, new]) if len(known) else new
+                write_atomically(self.file, known.to_csv(index=False).encode())
+
+    def measure(self, run: RunDirectory, protocol: str, minutes: float, goals: int) -> pd.DataFrame:
+        """One evaluation of the latest checkpoint, as a row."""
+        start = time.perf_counter()
+        spec: Any = get_task(self.unit.task) if protocol == "task" else self.unit.spec
+        bounds = saved_bounds(run) if protocol == "support" else (None, None)
+        envs = spec.make_envs(min(EVALUATION_ENVS, goals), threads=1)
+        try:
+            seed, steps = self.schedule.evaluation_seed, spec.episode_steps
+            found = evaluate(envs, load_policy(run, spec), goals, seed, steps, *bounds)
+        finally:
+            envs.close()
+        numbers = {name: getattr(found, name) for name in NUMBERS}
+        row = {"protocol": protocol, "minutes": minutes, **numbers, "seconds": time.perf_counter() - start}
+        return pd.DataFrame([row])

@@ -1,0 +1,209 @@
+"""Robustness: a model as it was trained, on a system that is not as in the training: `python reproduce/robustness.py`.
+
+Mass, friction, gains of the robot's controller, observations with noise, actions that come late. Without options table
+and figure are drawn from the tracked record; `--rerun` computes what is missing in it, with `--smoke` in seconds.
+"""
+
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import records
+import report
+import torch
+from matplotlib.figure import Figure
+from runs import command_line
+from stats import bootstrap, wilson
+from torch import Tensor
+
+from difflcs._checks import check_positive_int
+from difflcs._files import read_json, write_json
+from difflcs.bench import machine
+from difflcs.errors import CheckpointError
+from difflcs.rl import TaskSpec, collect, get_task
+from difflcs.rl.delay import late_actions, predicted_by
+from difflcs.rl.rollout import Act, mpc_actions
+from difflcs.rl.seeding import Stream, episode_seeds
+from difflcs.zoo import Learned
+
+NOMINAL = "as in the training"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Robustness without retraining. Interrupt it at any time; the same command goes on."""
+
+    model: Path = Path("zoo:trifinger-cube")
+    """Run directory, or zoo:NAME, of a TriFinger task."""
+    goals: int = 1000
+    """Goals, the same for every condition."""
+    seed: int = 0
+    """Of goals, starts and noise."""
+    rerun: bool = False
+    """Compute what is missing in the record; then draw."""
+    smoke: bool = False
+    """A few goals, in a record of its own: shows that everything works."""
+    results: Path = records.RESULTS
+    """Folder of the record, robustness.json, and of table and figure."""
+
+    def __post_init__(self) -> None:
+        check_positive_int("goals", self.goals)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One way in which the system differs from that of the training."""
+
+    group: str
+    name: str
+    env: dict[str, float] | None = None
+    """Arguments of the environment."""
+    noise: tuple[float, float] = (0.0, 0.0)
+    """Standard deviation of the object's observed position [m] and yaw [rad], new in every step."""
+    delay: int = 0
+    """Steps by which actions come late."""
+    predicted: bool = False
+    """Whether the LCS brings the observed state forward to where the action will be executed."""
+
+
+def conditions(mass: float, friction: float, gain: float) -> Iterator[Condition]:
+    """All of them, for an object of a mass [kg] and friction, and the stiffness of the robot's controller [1/s²]."""
+    yield Condition("", NOMINAL)
+    for factor in (0.2, 0.5, 2.0, 3.0, 10.0):
+        yield Condition("mass", f"{1000 * mass * factor:g} g", {"object_mass": mass * factor})
+    for factor in (0.2, 0.5, 1.6):
+        yield Condition("friction", f"{friction * factor:g}", {"object_friction": friction * factor})
+    for factor in (0.4, 2.5):
+        yield Condition("gains", f"× {factor:g}", {"osc_kp": gain * factor})
+    for position, yaw in ((0.001, 0.02), (0.003, 0.05), (0.006, 0.1)):
+        yield Condition("noise", f"{1000 * position:g} mm, {yaw:g} rad", noise=(position, yaw))
+    for delay in (1, 2):
+        late = f"{delay} step{'s' * (delay > 1)} late"
+        yield Condition("delay", late, delay=delay)
+        yield Condition("delay", f"{late}, predicted", delay=delay, predicted=True)
+
+
+def acting(condition: Condition, policy: Any, n_u: int, seed: int) -> Act:
+    """How a model acts in a condition, in one batch of episodes."""
+    act, rng = mpc_actions(policy), np.random.default_rng((seed, Stream.ACTION))
+    position, yaw = condition.noise
+
+    def noisy(state: Tensor, *rest: Tensor) -> tuple[np.ndarray, np.ndarray]:
+        error = torch.from_numpy(rng.standard_normal((len(state), 3)) * (position, position, yaw))
+        return act(torch.cat([state[:, :3] + error, state[:, 3:]], 1), *rest)
+
+    seeing: Act = noisy if any(condition.noise) else act
+    if not condition.delay:
+        return seeing
+    return late_actions(seeing, n_u, condition.delay, predicted_by(policy.lcs) if condition.predicted else None)
+
+
+def measure(condition: Condition, task: TaskSpec, policy: Any, goals: int, seed: int) -> dict[str, Any]:
+    """Whether each goal was reached, and how many solves failed."""
+    envs = replace(task, env_kwargs={**task.env_kwargs, **(condition.env or {})}).make_envs(min(50, goals))
+    parts = []
+    try:
+        for first in range(0, goals, envs.num_envs):
+            seeds = episode_seeds(seed, Stream.EVALUATION, first, min(envs.num_envs, goals - first))
+            parts.append(collect(envs, acting(condition, policy, task.n_u, first), seeds, task.episode_steps))
+    finally:
+        envs.close()
+    reached = torch.cat([part["success"] for part in parts]).int().tolist()
+    failures = sum(int(part["failures"].sum()) for part in parts)
+    return {**asdict(condition), "reached": "".join(map(str, reached)), "solver_failures": failures}
+
+
+def compute(options: Options, path: Path, say: Callable[[str], object] = print) -> None:
+    """Measure what is missing in the record; it is written after every condition."""
+    torch.set_num_threads(1)
+    learned = Learned.open(options.model)
+    task, policy = get_task(learned.task), learned.policy
+    env: Any = task.make_env().unwrapped
+    described = task.describe(env)
+    found = list(conditions(described["mass"], described["friction"], env.osc_kp))
+    env.close()
+    if options.smoke:
+        found = [one for one in found if one.group in ("", "noise") or one.delay == 1]
+    asked = {"model": str(options.model), "goals": options.goals, "seed": options.seed, "object": dict(described)}
+    record: Any = read_json(path) if path.exists() else {"options": asked, "machine": machine(), "results": []}
+    if record["options"] != asked:
+        raise CheckpointError(
+            f"{path}: expected a record of {asked}, got one of {record['options']}; pass another --results, or "
+            f"delete it to compute it anew"
+        )
+    known = {(row["group"], row["name"]) for row in record["results"]}
+    for condition in found:
+        if (condition.group, condition.name) not in known:
+            row = measure(condition, task, policy, options.goals, options.seed)
+            record["results"].append(row)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_json(path, json.loads(json.dumps(record)))
+            say(f"{condition.group} {condition.name}: {100 * np.mean(list(map(int, row['reached']))):.1f} %")
+
+
+def estimates(rows: Sequence[dict[str, Any]]) -> list[tuple[dict[str, Any], Any, Any]]:
+    """Each row with its success [%], and the difference to the nominal one, goal by goal, with their intervals."""
+    reached = {row["name"]: 100.0 * np.array(list(map(int, row["reached"]))) for row in rows}
+    nominal, found = reached[NOMINAL], []
+    for row in rows:
+        own = reached[row["name"]]
+        apart = None if row["name"] == NOMINAL else bootstrap([list(own - nominal)])
+        found.append((row, wilson(own.mean(), len(own)), apart))
+    return found
+
+
+def draw(record: dict[str, Any], folder: Path, name: str) -> None:
+    """Write table and figure."""
+    shown = estimates(record["results"])
+    lines = [
+        [row["group"], row["name"], report.say(success), report.say(apart, signed=True), str(row["solver_failures"])]
+        for row, success, apart in shown
+    ]
+    columns = ["", "condition", "success [%]", "difference", "failed solves"]
+    asked = record["options"]
+    notes = [
+        f"{asked['model']}, {asked['goals']} goals of seed {asked['seed']}, the same in every condition. Brackets: "
+        f"95 % intervals over goals, of success Wilson's, of the difference to the first line by the bootstrap. One "
+        f"step is 0.1 s. Predicted: the LCS first predicts the state in which the action will be executed.",
+        f"On {', '.join(f'{name} {value}' for name, value in record['machine'].items())}.",
+    ]
+    title = "Success on a system that is not that of the training"
+    table = pd.DataFrame(lines, columns=columns)
+    report.write_tables(folder, name, {title: table}, notes, {name: "Success where the system is another one"})
+    figure = Figure((7.0, 5.0), dpi=150, layout="constrained")
+    axes = figure.subplots()
+    groups = list(dict.fromkeys(row["group"] for row, _, _ in shown))
+    palette = ("#000000", "#0072b2", "#009e73", "#d55e00", "#cc79a7", "#e69f00")
+    for y, (row, success, _) in enumerate(shown):
+        color = palette[groups.index(row["group"]) % len(palette)]
+        axes.plot([success.low, success.high], [-y, -y], color=color, lw=2)
+        axes.plot(success.value, -y, "o", color=color)
+    axes.axvline(shown[0][1].value, color="grey", lw=0.8, ls=":")
+    axes.set(xlabel="success [%]", xlim=(0, 101), yticks=[-y for y in range(len(shown))])
+    axes.set_yticklabels([f"{row['group']} {row['name']}".strip() for row, _, _ in shown])
+    axes.grid(alpha=0.25, axis="x")
+    axes.spines[["top", "right"]].set_visible(False)
+    report.write_figure(figure, folder, name)
+
+
+def draw_record(options: Options) -> int:
+    """Compute if that is asked for, then draw; the exit code."""
+    name = "robustness-smoke" if options.smoke else "robustness"
+    options = replace(options, goals=min(options.goals, 4)) if options.smoke else options
+    path = options.results / f"{name}.json"
+    if options.rerun or options.smoke:
+        compute(options, path)
+    if not path.exists():
+        raise CheckpointError(f"{path}: expected a record, found none; make it: python reproduce/robustness.py --rerun")
+    record: Any = read_json(path)
+    draw(record, options.results, name)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command_line(Options, draw_record))

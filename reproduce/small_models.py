@@ -1,0 +1,103 @@
+"""What a small model is good for: an LCS beside the networks of PDDM, on the cube: `python reproduce/small_models.py`.
+
+Without options the table is drawn from the tracked results of the learning curves; `--rerun --preset smoke|quick|paper`
+computes them.
+"""
+
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import report
+from fig_learning_curves import PRIOR
+from records import Cell, select
+from report import say
+from stats import Estimate
+from units import PRESETS, Unit, config_of
+
+from difflcs import LCSModel
+from difflcs.rl import get_task
+from difflcs.rl.dynamics import Ensemble
+
+SHOWN = (("lcs-rl", "ours", "full"), PRIOR, ("pddm", "ours", "full"), ("pddm", "authors", "full"))
+"""Method, recipe, protocol."""
+WHEN: dict[str, str | float] = {"2 min": 2.0, "6 min": 6.0, "10 min": 10.0, "final": "final"}
+EARLY = 6.0
+"""Minutes of data that are called little; PDDM has its second evaluation there."""
+HYBRID = (
+    "LCS-RL in our recipe is itself a hybrid: it also learns from episodes that are played in an ensemble of such "
+    "networks. What acts, what is transferred and what one can read is the LCS; what the networks bring it stands "
+    "among the ablations."
+)
+
+
+def size_of(method: str, recipe: str) -> int:
+    """Numbers that are learned."""
+    task, own = get_task("cube"), config_of(Unit("cube", method, recipe, 0), PRESETS["paper"]).method
+    settings: Any = own
+    if hasattr(settings, "n_lam"):
+        return sum(p.numel() for p in LCSModel(task.n_x, task.n_u, settings.n_lam, learn_c=False).parameters())
+    ensemble = settings.pddm.ensemble
+    return sum(p.numel() for p in Ensemble(task.n_x, task.n_u, ensemble.networks, ensemble.width).parameters())
+
+
+def seconds_per_decision(rows: pd.DataFrame, cell: Cell) -> float:
+    """Of a core, in the evaluations of these trainings, the simulation included."""
+    mine: Any = rows[(rows.key == cell.first.key) & (rows.version == cell.first.version)]
+    mine = mine[(mine.task == cell.first.task) & mine.seed.isin(cell.scores.index)]
+    seconds = mine.drop_duplicates("seed").evaluation_seconds.sum()
+    return seconds / (mine.goals.sum() * get_task("cube").episode_steps)
+
+
+def table(rows: pd.DataFrame, cells: dict[str, Cell]) -> pd.DataFrame:
+    """Success, computing and size of each."""
+    columns: dict[str, list[str]] = {
+        "": [*WHEN, "computing per decision [ms]", "training [core min]", "learned numbers"]
+    }
+    for name, cell in cells.items():
+        success = [say(report.at(cell, when)) for when in WHEN.values()]
+        decision = f"{1e3 * seconds_per_decision(rows, cell):.2g}"
+        training = f"{cell.rows.drop_duplicates('seed').train_seconds.mean() / 60:.1f}"
+        columns[name] = [*success, decision, training, str(size_of(cell.first.method, cell.first.recipe))]
+    return pd.DataFrame(columns)
+
+
+def words(rows: pd.DataFrame, cells: dict[str, Cell]) -> list[str]:
+    """The paper's claim, by the intervals; and what the small model costs."""
+    lcs, networks = (next((c for c in cells.values() if c.first.method == m), None) for m in ("lcs-rl", "pddm"))
+    if lcs is None or networks is None:
+        return []
+    apart: Estimate | None = report.paired_estimate(networks, lcs, EARLY)
+    claim = "cannot be decided here"
+    if apart is not None and apart.low > 0:
+        claim = "does not hold here: the networks are better"
+    elif apart is not None and apart.high < 0:
+        claim = "holds here"
+    ratio = seconds_per_decision(rows, networks) / seconds_per_decision(rows, lcs)
+    sizes = [size_of(cell.first.method, cell.first.recipe) for cell in (networks, lcs)]
+    return [
+        f"After {EARLY:g} minutes of data PDDM reaches {say(report.at(networks, EARLY))} % and LCS-RL "
+        f"{say(report.at(lcs, EARLY))} %. The paper's claim that simple models beat deep networks at little data "
+        f"{claim}.",
+        f"A decision of PDDM takes {ratio:.0f} times the computing of one of the LCS-MPC, and its networks hold "
+        f"{sizes[0] / sizes[1]:.0f} times as many numbers.",
+    ]
+
+
+def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
+    """Write the table."""
+    found = {report.name_of(m, r, protocol=p): select(rows, "cube", m, r, protocol=p) for m, r, p in SHOWN}
+    cells = {label: cell for label, cell in found.items() if cell is not None}
+    if not cells:
+        return False
+    notes = [*words(rows, cells), HYBRID, *report.provenance(list(cells.values()))]
+    report.write_tables(folder, name, {"An LCS and networks on the cube": table(rows, cells)}, notes)
+    return True
+
+
+main = partial(report.main, "small_models", "curves", draw)
+
+if __name__ == "__main__":
+    sys.exit(main())
