@@ -119,7 +119,7 @@ class SceneRenderer:
         self._options.geomgroup[self._goal_group] = 1
         segment = mujoco.mjtRndFlag.mjRND_SEGMENT
         self._scene.flags[segment] = True
-        goal = self._draw(data).any(axis=2)
+        goal = np.asarray(self._draw(data).any(axis=2))
         self._scene.flags[segment] = False
         return self._marked(picture, goal)
 
