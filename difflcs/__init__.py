@@ -1,5 +1,7 @@
 """Differentiable model predictive control through learned linear complementarity systems."""
 
+import logging
+
 from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds
 from difflcs.cost import CostSequence, GoalCost, QuadraticCost
 from difflcs.errors import BackendNotFoundError, DiffLCSError, SolveError
@@ -11,6 +13,8 @@ from difflcs.mpc.layer import LCSMPCLayer
 from difflcs.mpc.solution import MPCSolution
 from difflcs.scales import ScaledLCS, Scales, suggest_scales
 from difflcs.status import Status
+
+logging.getLogger(__name__).addHandler(logging.NullHandler())  # silent unless a program asks for it
 
 __version__ = "0.2.0"
 

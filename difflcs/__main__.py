@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import select
 import sys
 from collections.abc import Sequence
 
 from difflcs.errors import MissingDependencyError
+
+_INTERRUPTED = 130
+_READER_GONE = 141
+"""What a shell reports after Ctrl-C, and of a program whose output nobody reads any more: 128 and the signal."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -15,19 +21,53 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: words after `difflcs`; those of the process if None.
 
     Returns:
-        Exit code; 2 where the extra `rl` is not installed.
+        Exit code; 2 where the extra `rl` is not installed, 130 after Ctrl-C, 141 where the output is piped into
+        something that has ended.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        try:
+            return _run(words)
+        finally:
+            _flush()  # here and not when Python ends, where nobody could handle an error
+    except KeyboardInterrupt:  # before the command line could say what to do, such as while it is imported
+        print("\ndifflcs: interrupted; nothing was changed", file=sys.stderr)
+        return _INTERRUPTED
+    except BrokenPipeError:
+        if not _reader_gone():
+            raise
+        return _READER_GONE
+
+
+def _run(words: Sequence[str]) -> int:
     try:
         from difflcs import cli
     except MissingDependencyError as error:
         if words[:1] == ["doctor"]:  # it is there to say such things
             from difflcs import doctor
 
-            return doctor.main("--json" in words)
-        print(f"error: {error}", file=sys.stderr)
+            return doctor.main("--json" in words, "--dev" in words)
+        print(f"difflcs: {error}", file=sys.stderr)
         return 2
     return cli.main(words)
+
+
+def _flush() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        if stream is not None:  # None without a console
+            stream.flush()
+
+
+def _reader_gone() -> bool:
+    """Whether it was a broken pipe of ours, as in `difflcs train --help | head`. Nothing more is written then."""
+    gone = False
+    for stream in (sys.stdout, sys.stderr):
+        poll = select.poll()
+        poll.register(stream.fileno(), select.POLLOUT)
+        if any(event & select.POLLERR for _, event in poll.poll(0)):
+            gone = True
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    return gone
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Iterable, Sequence
 
@@ -31,6 +32,12 @@ def describe(value: object) -> str:
     except ValueError:  # Python writes no integers of more than 4300 digits
         text = "of many digits"
     return f"{type(value).__name__} {' '.join(text.split())}"[:120]
+
+
+def did_you_mean(got: object, known: Iterable[str]) -> str:
+    """For an error message: which of the known names somebody may have meant, in brackets; empty if none is near."""
+    near = difflib.get_close_matches(str(got)[:100], known, n=2)
+    return f" (did you mean {' or '.join(near)}?)" if near else ""
 
 
 def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (), finite: bool = True) -> Tensor:

@@ -1,304 +1,31 @@
 """The command line: `difflcs train | evaluate | render | export | demo | zoo | assets | bench | doctor`.
 
-Tasks and methods are known by their registries only; the flags of `train` are made of the settings of its method.
+Here are its entry and the small commands. Tasks and methods are known by their registries only.
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
+import io
 import json
+import logging
 import os
 import sys
-import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, make_dataclass
-from itertools import zip_longest
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
 import torch
 
 from difflcs import zoo
+from difflcs._checks import did_you_mean
 from difflcs._renamed import refuse_flags_of_before
-from difflcs.errors import CheckpointError, DiffLCSError, InvalidInputError
-from difflcs.export import Export
-from difflcs.planning.films import FILMS
-from difflcs.rl._optional import require, versions
-from difflcs.rl.checkpoint import RunDirectory
-from difflcs.rl.evaluate import evaluate
-from difflcs.rl.figures import NoPictureError, plot_learning_curve, record_video
-from difflcs.rl.methods import get_method, method_names
-from difflcs.rl.progress import Progress, bar, summary
-from difflcs.rl.tasks import TaskSpec, get_task
-from difflcs.rl.training import EVALUATION_ENVS, TrainConfig, profile, saved_bounds, stored_config, train
-from difflcs.zoo import Learned
-
-_SMOKE_GOALS = 4
-
-
-@dataclass(frozen=True)
-class Train(TrainConfig):
-    """Train a model and leave a run directory: model, log, checkpoints."""
-
-    out: Path = Path("runs/{task}-{method}-{seed}")
-    """Run directory to write; {task}, {method} and {seed} are filled in."""
-    init: Path | None = None
-    """Run or model directory, or zoo:NAME (see `difflcs zoo`), to start from; a random model if None."""
-    resume: bool = False
-    """Continue the run in --out, with its own settings and to the same result as without interruption."""
-    force: bool = False
-    """Replace the run in --out. It is deleted once the new one has begun."""
-    smoke: bool = False
-    """Finish in seconds, on too little data to learn anything."""
-
-    def __post_init__(self) -> None:
-        """Check nothing yet: `run` does, so that its errors are printed like all others."""
-
-    def run(self) -> None:
-        """Run the command."""
-        config = TrainConfig(**{f.name: getattr(self, f.name) for f in fields(TrainConfig)})
-        config = config.smoke() if self.smoke else config
-        out = self.directory(self.out)
-        if self.resume:
-            config = self._resumed(config)
-        with Progress() as progress:
-            run = train(config, out, init=self.init, resume=self.resume, force=self.force, reporter=progress)
-        spent = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in profile(run.rows()).items() if seconds)
-        print(f"time: {spent}")
-        print(f"finished: {run.path}\nevaluate it with: difflcs evaluate {run.path}")
-
-    def _resumed(self, config: TrainConfig) -> TrainConfig:
-        stored = stored_config(RunDirectory.open(self.directory(self.out)))
-        default = TrainConfig(method=type(config.method)())
-        wanted, own, usual, small = (_flat(c.to_json()) for c in (config, stored, default, default.smoke()))
-        for name, value in wanted.items():
-            if value not in (own.get(name), usual[name], small[name]):
-                flag, run = name.removeprefix("settings.").replace("_", "-"), self.directory(self.out)
-                raise CheckpointError(
-                    f"--{flag}: expected {own.get(name)!r}, as {run} was started with, got {value!r}; "
-                    f"drop the flag, or start another run with another --out"
-                )
-        if self.init is not None:
-            raise CheckpointError(
-                "--init: expected it without --resume; a resumed run continues from its own checkpoint"
-            )
-        return stored
-
-    def interrupted(self) -> str:
-        """What to do after Ctrl-C."""
-        return f"continue with: difflcs train --out {self.directory(self.out)} --resume"
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by their dotted names."""
-    found: dict[str, Any] = {}
-    for name, value in values.items():
-        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return found
-
-
-def _train_command(words: Sequence[str]) -> type[Train]:
-    """`Train` with the flags of the method that the words name, or that the run to resume was started with."""
-    import tyro
-
-    name = _value(words, "--method")
-    out = _value(words, "--out")
-    if name is None and "--resume" in words and out is not None and (Path(out) / "config.json").is_file():
-        name = stored_config(RunDirectory.open(Path(out))).method.name
-    kind = get_method(name or method_names()[0])
-    hidden = Annotated[kind, tyro.conf.arg(name="", prefix_name=False)]
-    chosen: Any = Annotated[
-        Literal[method_names()],  # pyright: ignore[reportInvalidTypeForm]
-        tyro.conf.arg(name="method", help=_methods()),
-    ]
-    return make_dataclass(
-        "Train",
-        [("method", hidden, field(default_factory=kind)), ("method_name", chosen, field(default=kind.name))],
-        bases=(Train,),
-        frozen=True,
-        namespace={"__doc__": Train.__doc__, "__post_init__": lambda self: None},
-    )
-
-
-def _methods() -> str:
-    return "How to learn: " + "; ".join(f"{name}: {get_method(name).summary}" for name in method_names()) + "."
-
-
-def _value(words: Sequence[str], flag: str) -> str | None:
-    """What follows a flag, as `--flag value` or `--flag=value`."""
-    for word, following in zip_longest(words, words[1:]):
-        if word == flag:
-            return following
-        if word.startswith(f"{flag}="):
-            return word.partition("=")[2]
-    return None
-
-
-@dataclass(frozen=True)
-class Evaluate:
-    """Success rate of a learned model, without noise, with its 95 % interval."""
-
-    model: Path
-    """Run directory, or zoo:NAME for one of the models that `difflcs zoo` lists."""
-    goals: int = 1000
-    """Random goals, one episode each."""
-    seed: int = 0
-    """Seed of the goals and initial states."""
-    json: bool = False
-    """Print one JSON object instead of text."""
-    action_support: bool = False
-    """Keep the action bounds of the last episodes of a warm-up, instead of the task's full bounds."""
-    smoke: bool = False
-    """Try a few goals only."""
-
-    def run(self) -> None:
-        """Run the command."""
-        goals = min(self.goals, _SMOKE_GOALS) if self.smoke else self.goals
-        learned = Learned.open(self.model)
-        task = get_task(learned.task)
-        bounds = (None, None)
-        if self.action_support:
-            if learned.run is None:
-                raise InvalidInputError(
-                    f"action-support: expected a run, whose episodes give the bounds, got {learned.name}; drop the flag"
-                )
-            bounds = saved_bounds(learned.run)
-        start = time.perf_counter()
-        envs = task.make_envs(max(1, min(EVALUATION_ENVS, goals)))
-        found = _compare(learned, task, envs)
-        try:
-            with bar(goals * task.episode_steps, "evaluating") as shown:
-                result = evaluate(
-                    envs, learned.policy, goals, self.seed, task.episode_steps, *bounds, after_step=shown.update
-                )
-        finally:
-            envs.close()
-        seconds = time.perf_counter() - start
-        if self.json:
-            record = {
-                **asdict(result),
-                "run": learned.name,
-                "task": learned.task,
-                "object": found,
-                "trained_on": learned.object,
-                "method": learned.method,
-                "finished": learned.finished,
-                "backend": learned.backend,
-                "action_support": self.action_support,
-                "card": None if learned.card is None else asdict(learned.card),
-                "seconds": round(seconds, 3),
-                "versions": versions(),
-            }
-            print(json.dumps(record, sort_keys=True))
-            return
-        if not learned.finished:
-            print(f"{learned.name} is not finished: evaluated its latest checkpoint")
-        print(summary(result))
-        for error in task.errors:
-            if error.name in result.median_errors:
-                print(f"median {error.name.replace('_', ' ')}: {result.median_errors[error.name]:.3g} {error.unit}")
-        if learned.card is not None:
-            print(f"its card: {learned.card.success_text}, goal seed {learned.card.evaluation_seed}")
-        if found:
-            print(f"object: {zoo.described(found)}")
-        solver = "" if learned.backend is None else f", backend {learned.backend}"
-        print(f"goal seed {result.seed}, {learned.task}{solver}, {seconds:.1f} s, {_versions()}")
-
-
-@dataclass(frozen=True)
-class Render:
-    """Video of a learned model at work, one episode per goal; or of Push-T."""
-
-    model: Path
-    """Run directory, or zoo:NAME for one of the models that `difflcs zoo` lists; or pusht, which has no goals."""
-    goal: tuple[float, ...] | None = None
-    """Goals, one after another, each with the numbers that the task wants; by default an example of the task."""
-    out: Path = Path("video.mp4")
-    """Video to write, an MP4; with pusht also a GIF."""
-    force: bool = False
-    """Replace the video if there is one."""
-    seed: int = 0
-    """Seed of the initial states."""
-    smoke: bool = False
-    """Play the first goal only."""
-
-    def run(self) -> None:
-        """Run the command."""
-        if str(self.model) in FILMS:
-            return FILMS[str(self.model)](self.out, self.seed, 1 if self.smoke else 4, self.force)
-        if self.out.suffix.lower() != ".mp4" or self.out.is_dir():
-            raise InvalidInputError(f"out: expected the name of an MP4 file, got {self.out}; pass --out video.mp4")
-        if self.out.exists() and not self.force:
-            raise InvalidInputError(
-                f"out: expected a new file, got {self.out}, which exists; pass --force to replace it, or another --out"
-            )
-        learned = Learned.open(self.model)
-        task = get_task(learned.task)
-        goals = self._goals(task)
-        goals = goals[:1] if self.smoke else goals
-        reached = _record(learned, task, goals, self.out, self.seed)
-        for goal, ok in zip(goals, reached, strict=True):
-            print(f"goal {' '.join(f'{v:g}' for v in goal)}: {'reached' if ok else 'missed'}")
-        print(f"written: {self.out}")
-
-    def _goals(self, task: TaskSpec) -> list[tuple[float, ...]]:
-        size = task.n_goal
-        if self.goal and len(self.goal) % size == 0:
-            return [self.goal[i : i + size] for i in range(0, len(self.goal), size)]
-        if self.goal is None and task.example_goals:
-            return [task.example_goals[0]]
-        names = ", ".join(f"{q.name} [{q.unit}]" for q in task.goal) or f"{size} numbers"
-        raise InvalidInputError(f"goal: expected {names} for each goal of {task.name}, got {self.goal}; pass --goal")
-
-
-@dataclass(frozen=True)
-class Demo:
-    """Learn to push the cube from 6 minutes of data; learning curve and video."""
-
-    task: str = TrainConfig.task
-    """What to do: the name of a task."""
-    out: Path = Path("runs/demo")
-    """Run directory. An existing demo is continued, not repeated."""
-    seed: int = 0
-    """Seed of everything random."""
-    smoke: bool = False
-    """Finish in seconds, on too little data to learn anything."""
-
-    def run(self) -> None:
-        """Run the command."""
-        start = time.perf_counter()
-        require("matplotlib", "imageio", "imageio_ffmpeg", "PIL")  # before the training, not after
-        when = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
-        method = get_method("violation")()
-        config = TrainConfig(task=self.task, method=method, seed=self.seed, evaluate_at=when, evaluate_goals=100)
-        config = config.smoke() if self.smoke else config
-        resume = (self.out / "config.json").exists()
-        if resume:
-            print(f"{self.out} exists: continuing it (delete it for a fresh start)")
-        with Progress() as progress:
-            run = train(config, self.out, resume=resume, reporter=progress)
-        rows = run.rows()
-        plot_learning_curve(rows, run.path / "learning_curve.png", f"{config.task}, seed {config.seed}: learning")
-        goals = get_task(config.task).example_goals
-        video = self._video(run, goals[:1] if self.smoke else goals)
-        evaluated = [row for row in rows if row["evaluation_goals"]]
-        print(f"\nsuccess before learning: {_from_row(evaluated[0])}")
-        print(f"success after {float(evaluated[-1]['minutes']):g} minutes of data: {_from_row(evaluated[-1])}")
-        print(f"learning curve: {run.path / 'learning_curve.png'}\nvideo: {video}\nmodel: {run.model}")
-        seconds = time.perf_counter() - start
-        print(f"goal seed {config.evaluation_seed}, training seed {config.seed}, {seconds:.0f} s, {_versions()}")
-
-    def _video(self, run: RunDirectory, goals: Sequence[Sequence[float]]) -> str:
-        learned = Learned.open(run.path)
-        try:
-            reached = _record(learned, get_task(learned.task), goals, run.path / "video.mp4", seed=0)
-        except NoPictureError as error:
-            return f"none, {error}"  # the rest of the demo needs no OpenGL
-        return f"{run.path / 'video.mp4'} ({sum(reached)} of {len(goals)} goals reached in it)"
-
-    def interrupted(self) -> str:
-        """What to do after Ctrl-C."""
-        return "run the same command again to continue"
+from difflcs.cli_models import Evaluate, Export, Render
+from difflcs.cli_train import Demo, Train, train_command
+from difflcs.errors import DiffLCSError, InvalidInputError
+from difflcs.rl._optional import require
 
 
 @dataclass(frozen=True)
@@ -387,12 +114,14 @@ class Doctor:
 
     json: bool = False
     """Print one JSON object instead of text."""
+    dev: bool = False
+    """Also look at what only development of difflcs needs."""
 
     def run(self) -> int:
         """Run the command."""
         from difflcs import doctor
 
-        return doctor.main(self.json)
+        return doctor.main(self.json, self.dev)
 
 
 _COMMANDS: dict[str, Callable[..., Any]] = {
@@ -428,17 +157,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         if words[:1] == ["doctor"] and importlib.util.find_spec("tyro") is None:  # it is there to say such things
-            return int(Doctor("--json" in words).run())
+            return int(Doctor("--json" in words, "--dev" in words).run())
         require("tyro")
-        import tyro
+        command = _parsed(words)
+        torch.set_num_threads(1)  # tensors of 100 × 9 do not gain from threads, and the MPC's workers need the cores
+        with _shown_log():
+            return int(command.run() or 0)
+    except DiffLCSError as error:
+        print(f"difflcs: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        advice = command.interrupted() if hasattr(command, "interrupted") else "nothing was changed"
+        print(f"\ndifflcs: interrupted; {advice}", file=sys.stderr)
+        return 130
 
-        # `train` has settings for which None means something.
-        plain = {k: v if k == "train" else Annotated[v, tyro.conf.DisallowNone] for k, v in _COMMANDS.items()}
-        if words[:1] in (["train"], ["evaluate"]):
-            refuse_flags_of_before(words[1:])
-        if words[:1] == ["train"]:
-            plain["train"] = _train_command(words[1:])
-        command = tyro.extras.subcommand_cli_from_dict(
+
+def _parsed(words: Sequence[str]) -> Any:
+    """The command with its settings."""
+    import tyro
+
+    if words and not words[0].startswith("-") and words[0] not in _COMMANDS:
+        near = did_you_mean(words[0], _COMMANDS)
+        raise InvalidInputError(
+            f"command: expected one of {', '.join(_COMMANDS)}, got {words[0]!r}{near}; see difflcs --help"
+        )
+    # `train` has settings for which None means something.
+    plain = {k: v if k == "train" else Annotated[v, tyro.conf.DisallowNone] for k, v in _COMMANDS.items()}
+    if words[:1] in (["train"], ["evaluate"]):
+        refuse_flags_of_before(words[1:])
+    if words[:1] == ["train"]:
+        plain["train"] = train_command(words[1:])
+    with _own_errors():
+        return tyro.extras.subcommand_cli_from_dict(
             cast(Any, plain),
             prog="difflcs",
             description=_DESCRIPTION,
@@ -449,51 +199,51 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 tyro.conf.FlagCreatePairsOff,
             ),
         )
-        torch.set_num_threads(1)  # tensors of 100 × 9 do not gain from threads, and the MPC's workers need the cores
-        return int(command.run() or 0)
-    except DiffLCSError as error:
-        print(f"difflcs: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        advice = command.interrupted() if hasattr(command, "interrupted") else "nothing was changed"
-        print(f"\ndifflcs: interrupted; {advice}", file=sys.stderr)
-        return 130
 
 
-def _compare(learned: Learned, task: TaskSpec, env: Any) -> dict[str, Any]:
-    """What an environment holds; says so if it is not what the model was trained on."""
-    found = dict(task.describe(env))
-    if learned.object is not None and not learned.fits(found):
-        print(
-            f"difflcs: {learned.name} was trained on {zoo.described(learned.object)}, here it is "
-            f"{zoo.described(found)}: do not compare their success",
-            file=sys.stderr,
-        )
-    return found
+@contextlib.contextmanager
+def _own_errors() -> Iterator[None]:
+    """Errors of settings come out as they are, with their flag; tyro would print its own name of the group.
 
-
-def _record(learned: Learned, task: TaskSpec, goals: Sequence[Sequence[float]], path: Path, seed: int) -> list[bool]:
-    require("imageio", "imageio_ffmpeg", "PIL")
+    Raises:
+        InvalidInputError: a setting of a group has a value that it cannot have.
+    """
+    told = io.StringIO()
     try:
-        env = task.make_env(render_mode="rgb_array", **task.picture)
+        with contextlib.redirect_stderr(told):
+            yield
     except InvalidInputError as error:
-        raise NoPictureError(str(error)) from error
-    try:
-        _compare(learned, task, env)
-        return record_video(env, learned.policy, goals, path, task, seed)
-    except OSError as error:
-        raise InvalidInputError(f"out: expected a place to write {path}, got: {error}; choose another") from error
+        raise _with_flag(error, []) from None
+    except SystemExit as stop:
+        # tyro exits while it handles an error of its own, which it raised while it handled that of the settings.
+        outer = stop.__context__
+        inner = None if outer is None else outer.__context__
+        if not isinstance(inner, InvalidInputError):
+            raise
+        told = io.StringIO()
+        # The root and the command's field are no part of a flag.
+        raise _with_flag(inner, str(getattr(outer, "arg", "")).split(".")[2:]) from None
     finally:
-        env.close()
+        sys.stderr.write(told.getvalue())
 
 
-def _from_row(row: dict[str, str]) -> str:
-    rate, low, high = (100 * float(row[f"evaluation_{name}"]) for name in ("success_rate", "ci_low", "ci_high"))
-    return f"{rate:.1f} % of {row['evaluation_goals']} goals (95 % interval {low:.1f} to {high:.1f} %)"
+def _with_flag(error: InvalidInputError, group: Sequence[str]) -> InvalidInputError:
+    name, colon, rest = str(error).partition(": ")
+    return InvalidInputError(f"--{'.'.join([*group, name]).replace('_', '-')}{colon}{rest}")
 
 
-def _versions() -> str:
-    return ", ".join(f"{name} {version}" for name, version in versions().items() if version is not None)
+@contextlib.contextmanager
+def _shown_log() -> Iterator[None]:
+    """What the library logs appears on stderr, one plain line each."""
+    logger, handler = logging.getLogger("difflcs"), logging.StreamHandler()
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(min(logging.INFO, before or logging.INFO))
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before)
 
 
 if __name__ == "__main__":

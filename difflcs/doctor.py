@@ -1,7 +1,7 @@
 """What this machine has: solvers, instruction set, extras, rendering, meshes.
 
-`difflcs doctor`, or `python -m difflcs.doctor [--json]` where the extra rl is not installed. Whatever breaks is
-reported, never raised. Simulation and OpenGL are tried in processes of their own, which may crash.
+`difflcs doctor [--json] [--dev]`, or `python -m difflcs.doctor`. Whatever breaks is reported, never raised. Simulation
+and OpenGL are tried in processes of their own, which may crash.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from itertools import groupby
@@ -29,13 +29,22 @@ from difflcs import GoalCost, LCSModel, LCSMPCLayer, _zoo, solve_lcp
 from difflcs.errors import BackendNotFoundError, DiffLCSError
 
 GROUPS = ("library", "solvers", "machine", "extras", "environments")
-"""What can be examined, in the order of the report."""
+"""What a user needs to know, in the order of the report."""
+DEVELOPMENT = "development"
+"""One more group: the extras that a checkout needs for its tests, pages, notebooks and tables."""
 TIMEOUT = 120.0
 """Seconds that a process of its own may take; the first picture in software takes some."""
 
 _HARD = ("torch", "numpy", "casadi", "filelock", "safetensors")
 _OPTIONAL_BACKENDS = ("relaxed",)
-_EXTRAS = ("rl", "envs", "viz", "relaxed", "tutorials", "reproduce", "docs", "dev")
+_EXTRAS = {
+    "rl": "training, evaluation and the command line",
+    "envs": "the simulated robot hand",
+    "viz": "videos and figures",
+    "relaxed": "the backend relaxed",
+    "scoreboard": "Push-T",
+}
+"""Extras for users → what they are for."""
 _MARKS = {"ok": "ok", "missing": "--", "failed": "!!"}
 
 # Each prints one JSON object as its last line.
@@ -107,14 +116,15 @@ def examine(groups: Sequence[str] = GROUPS) -> list[Check]:
     """Look at everything; takes some seconds.
 
     Args:
-        groups: what to look at, of `GROUPS`.
+        groups: what to look at, of `GROUPS` and `DEVELOPMENT`.
     """
     look = {
         "library": lambda: [_check("library", name, work, core=True) for name, work in _LIBRARY.items()],
         "solvers": _solvers,
         "machine": lambda: [_check("machine", name, work) for name, work in _MACHINE.items()],
-        "extras": lambda: [_check("extras", name, lambda name=name: _extra(name)) for name in _EXTRAS],
+        "extras": lambda: _extras("extras", _EXTRAS),
         "environments": _environments,
+        DEVELOPMENT: lambda: _extras(DEVELOPMENT, _development()),
     }
     return [check for group in groups for check in look[group]()]
 
@@ -248,6 +258,16 @@ def _devices() -> str:
     return f"cpu and {found}; tensors there are accepted and returned, the solvers run on the CPU"
 
 
+def _extras(group: str, names: Iterable[str]) -> list[Check]:
+    return [_check(group, name, lambda name=name: _extra(name)) for name in names]
+
+
+def _development() -> list[str]:
+    """The extras that are not for users, by the package's own metadata."""
+    known = metadata.metadata("difflcs").get_all("Provides-Extra") or ()
+    return [name for name in known if name not in (*_EXTRAS, "all")]
+
+
 def _extra(name: str) -> str:
     """The packages of an extra, by the package's own metadata."""
     wanted = [line for line in metadata.requires("difflcs") or () if re.search(rf"extra == ['\"]{name}['\"]", line)]
@@ -265,8 +285,9 @@ def _extra(name: str) -> str:
         else:
             found.append(f"{package} {version}")
     if lacking:
-        raise _MissingError(f"without {', '.join(lacking)}", f'pip install "difflcs[{name}]"')
-    return ", ".join(found)
+        purpose = f"for {_EXTRAS[name]}: " if name in _EXTRAS else ""
+        raise _MissingError(f"{purpose}without {', '.join(lacking)}", f'pip install "difflcs[{name}]"')
+    return f"{_EXTRAS[name]}: {', '.join(found)}" if name in _EXTRAS else ", ".join(found)
 
 
 def _version(package: str) -> str | None:
@@ -348,20 +369,21 @@ _LIBRARY: dict[str, Callable[[], str]] = {
 _MACHINE: dict[str, Callable[[], str]] = {"threads": _threads, "devices": _devices}
 
 
-def main(as_object: bool = False) -> int:
+def main(as_object: bool = False, development: bool = False) -> int:
     """Examine and print.
 
     Args:
         as_object: print JSON instead of text.
+        development: look at what only development needs, too.
 
     Returns:
         Exit code: 0 if the library works, 1 if not.
     """
-    checks = examine()
+    checks = examine((*GROUPS, DEVELOPMENT) if development else GROUPS)
     width = min(120, shutil.get_terminal_size().columns)
     print(as_json(checks) if as_object else as_text(checks, width))
     return 0 if healthy(checks) else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main("--json" in sys.argv[1:]))
+    sys.exit(main("--json" in sys.argv[1:], "--dev" in sys.argv[1:]))

@@ -13,14 +13,15 @@ class DiffLCSError(Exception):
     """Base class of every error difflcs raises on purpose.
 
     Attributes:
-        page: the page of the documentation that helps, named at the end of the message.
+        see: where to read more, named at the end of the message: something that every installation has, an expression
+            for Python or a command.
     """
 
-    page: ClassVar[str | None] = None
+    see: ClassVar[str | None] = None
 
     def __str__(self) -> str:
         message = super().__str__()
-        return f"{message} (see {self.page})" if self.page else message
+        return f"{message} (see {self.see})" if self.see else message
 
 
 class InvalidInputError(DiffLCSError, ValueError):
@@ -30,8 +31,6 @@ class InvalidInputError(DiffLCSError, ValueError):
 class ShapeError(InvalidInputError):
     """A tensor has the wrong shape."""
 
-    page = "docs/notation.md"
-
 
 class BatchIndexError(ShapeError, IndexError):
     """A record of matrices was indexed where it has no batch dimension, no such element, or no such stage."""
@@ -39,8 +38,6 @@ class BatchIndexError(ShapeError, IndexError):
 
 class DTypeError(InvalidInputError, TypeError):
     """A value has the wrong type or dtype."""
-
-    page = "docs/notation.md"
 
 
 class DeviceError(InvalidInputError):
@@ -58,31 +55,29 @@ class BoundsError(InvalidInputError):
 class NotPositiveDefiniteError(InvalidInputError):
     """F + Fᵀ is not positive definite, so that the LCP may have no or many solutions."""
 
-    page = "docs/theory.md"
+    see = "help(difflcs.solve_lcp)"
 
 
 class GammaError(InvalidInputError):
     """The violation loss's γ is outside 0 < γ ≤ σ_min(F + Fᵀ)."""
 
-    page = "docs/theory.md"
+    see = "help(difflcs.violation_loss)"
 
 
 class MissingDependencyError(DiffLCSError, ImportError):
     """An optional package is not installed."""
 
-    page = "docs/quickstart.md"
+    see = "difflcs doctor"
 
 
 class BackendNotFoundError(DiffLCSError, LookupError):
     """No such MPC backend, or the package behind it is not installed."""
 
-    page = "docs/backends.md"
+    see = "difflcs doctor"
 
 
 class CheckpointError(DiffLCSError):
     """A checkpoint is missing, corrupt, or was written by something else."""
-
-    page = "docs/training.md"
 
 
 class InUseError(CheckpointError):
@@ -91,8 +86,6 @@ class InUseError(CheckpointError):
 
 class DoubleBackwardError(DiffLCSError, RuntimeError):
     """Second derivatives were asked of a function that has first derivatives only."""
-
-    page = "docs/gradients.md"
 
 
 class SolveError(DiffLCSError, RuntimeError):
@@ -103,7 +96,7 @@ class SolveError(DiffLCSError, RuntimeError):
         status: the `Status` value of each of them.
     """
 
-    page = "docs/gradients.md"
+    see = "help(difflcs.LCSMPCLayer)"
 
     def __init__(self, message: str, elements: Sequence[int], status: Sequence[int]):
         super().__init__(message)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -81,45 +80,3 @@ def _bound(value: torch.Tensor) -> list[Any]:
     flat = value.detach().double().reshape(-1, value.shape[-1]).tolist()
     rows = [[v if abs(v) < float("inf") else None for v in row] for row in flat]
     return rows[0] if len(rows) == 1 else rows
-
-
-@dataclass(frozen=True)
-class Export:
-    """Write the controller of a learned model for the C library."""
-
-    model: Path
-    """Run directory, or zoo:NAME for one of the models that `difflcs zoo` lists."""
-    out: Path = Path("export")
-    """Directory to write controller.difflcs and controller.json into."""
-    force: bool = False
-    """Replace a controller that is there."""
-
-    def run(self) -> None:
-        """Run the command."""
-        from difflcs.rl.tasks import get_task
-        from difflcs.zoo import Learned
-
-        if (self.out / CONTROLLER).exists() and not self.force:
-            raise InvalidInputError(
-                f"out: expected no controller in {self.out}, got one; pass --force to replace it, or another --out"
-            )
-        learned = Learned.open(self.model)
-        task = get_task(learned.task)
-        if not isinstance(learned.policy, LCSMPCLayer):
-            raise InvalidInputError(
-                f"model: expected one that acts by the MPC, got {learned.name} of method {learned.method}; export a "
-                f"run of another method"
-            )
-        quantities = {"goal": task.goal, "errors": task.errors}
-        about = {
-            "model": learned.name,
-            "task": task.name,
-            "method": learned.method,
-            "finished": learned.finished,
-            "object": None if learned.object is None else dict(learned.object),
-            **{name: [{"name": q.name, "unit": q.unit} for q in known] for name, known in quantities.items()},
-        }
-        path = export_controller(learned.policy, self.out, step_seconds=task.step_seconds, about=about)
-        if not learned.finished:
-            print(f"{learned.name} is not finished: exported its latest checkpoint")
-        print(f"written: {path}\nits numbers: {self.out / DESCRIPTION}")

@@ -23,8 +23,8 @@ PROTOCOLS: Mapping[Protocol, str] = {
     "task": "with the paper's MPC and full bounds",
 }
 """full: as it was trained, with the full ±15 mm; LCS-RL in our recipe stays by itself within the actions that its model
-was fitted to. support: the same within the bounds of its last episodes, as Jin and
-Posa deploy. task: with horizon and cost of the paper and the full bounds, whatever it was trained with."""
+was fitted to. support: the same within the bounds of its last episodes, as Jin and Posa deploy. task: with horizon and
+cost of the paper and the full bounds, whatever it was trained with."""
 
 
 @dataclass(frozen=True)

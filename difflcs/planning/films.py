@@ -44,12 +44,14 @@ def picture(env: Any, policy: PushTPolicy, text: str = "", size: int = 340) -> I
     draw = ImageDraw.Draw(frame)
     decision = policy.sampling.decision
     if decision is not None:
-        _draw(draw, decision, size / (SIDE * PIXELS))
+        _draw(draw, decision, size)
     draw.text((6, 4), text, fill=(20, 20, 30), font_size=max(10, size // 24))
     return frame
 
 
-def _draw(draw: Any, decision: Decision, scale: float) -> None:
+def _draw(draw: Any, decision: Decision, size: int) -> None:
+    scale, line = size / (SIDE * PIXELS), size / 340
+
     def dot(point: Tensor, radius: float, **colors: Any) -> None:
         x, y = (scale * PIXELS * point).tolist()
         draw.ellipse((x - radius, y - radius, x + radius, y + radius), **colors)
@@ -60,12 +62,12 @@ def _draw(draw: Any, decision: Decision, scale: float) -> None:
     for place, score in zip(decision.states[1:, 3:5], scores.tolist(), strict=True):
         share = min(max(score / best, 0.0), 1.0) ** 2
         color = tuple(round(share * a + (1 - share) * b) for a, b in zip(_GREEN, _GREY, strict=True))
-        dot(place, 1.5 + 2.0 * share, fill=color)
+        dot(place, line * (1.5 + 2.0 * share), fill=color)
     if decision.mode is Mode.TRAVEL and decision.target is not None:
-        dot(decision.target[3:5], 7.0, outline=_BLUE, width=2)
+        dot(decision.target[3:5], 7.0 * line, outline=_BLUE, width=round(2 * line))
     else:
         path = (scale * PIXELS * decision.solution.x[0, :, 3:5]).tolist()
-        draw.line([tuple(point) for point in path], fill=_BLUE, width=2)
+        draw.line([tuple(point) for point in path], fill=_BLUE, width=round(2 * line))
 
 
 def record(
@@ -84,7 +86,7 @@ def record(
         For each episode whether it was solved.
 
     Raises:
-        InvalidInputError: an ending of another kind, or the file is there already.
+        InvalidInputError: an ending of another kind, the file is there already, or it cannot be written there.
         MissingDependencyError: gym-pusht, Pillow or imageio is not installed.
     """
     path = Path(path)
@@ -100,6 +102,13 @@ def record(
         raise MissingDependencyError(
             f'expected the package(s) {", ".join(missing)}, not installed; run: pip install "difflcs[scoreboard,viz]"'
         )
+    temporary = path.with_name(f".{path.stem}.tmp{kind}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.touch()  # said before the episodes are played
+        temporary.unlink()
+    except OSError as error:
+        raise InvalidInputError(f"out: expected a place to write {path}, got: {error}; choose another") from error
     env, policy, frames, solved = make_env(render_mode="rgb_array"), PushTPolicy(), [], []
     for i in range(episodes):
         observation, _ = env.reset(seed=seed + i)
@@ -117,8 +126,6 @@ def record(
         frames += [picture(env, policy, verdict, size)] * _PAUSE
         solved.append(bool(success))
     env.close()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.tmp{kind}")
     try:
         _write(temporary, frames)
         os.replace(temporary, path)
@@ -144,11 +151,8 @@ def _write(path: Path, frames: list[Image.Image]) -> None:
             video.append_data(np.asarray(frame))
 
 
-def _pusht(path: Path, seed: int, episodes: int, force: bool) -> None:
-    for i, solved in enumerate(record(path, seed, episodes, force=force)):
-        print(f"seed {seed + i}: {'solved' if solved else 'not solved'}")
-    print(f"written: {path}")
-
-
-FILMS: dict[str, Callable[[Path, int, int, bool], None]] = {"pusht": _pusht}
-"""By name: path, seed of the first episode, number of episodes, and whether to replace a file → None."""
+FILMS: dict[str, Callable[[Path, int, int, bool], list[bool]]] = {
+    "pusht": lambda path, seed, episodes, force: record(path, seed, episodes, force=force)
+}
+"""By name: path, seed of the first episode, number of episodes, whether to replace a file → for each episode, whether
+it was solved."""

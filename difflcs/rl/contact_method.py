@@ -68,9 +68,7 @@ class PhysicsFitSettings(Settings):
     learning_rate: float = bounded(0.02, above=0)
     """Step size of Adam, which begins anew in each iteration."""
     loss: Literal["violation", "prediction"] = "violation"
-    """The violation loss (Eq. 2 of the paper), or the squared error of the next state through the relaxed contacts. On
-    the same data the MPC of the first did better at the sugar box (98.5 % against 97.0 % of 400 goals) although it
-    explains less of its turning."""
+    """The violation loss, or the squared error of the next state through the relaxed contacts."""
 
 
 def physics_loss(

@@ -58,6 +58,11 @@ class Evaluation:
             f"(95 % interval {100 * self.ci_low:.1f} to {100 * self.ci_high:.1f} %)"
         )
 
+    def summary(self) -> str:
+        """Success and what went wrong, in one line."""
+        failures = f"success {self}, {self.solver_failures} of {self.solves} solves failed"
+        return failures + (f", {self.unstable} episodes unstable" if self.unstable else "")
+
 
 def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
     """Wilson's score interval of a binomial proportion.

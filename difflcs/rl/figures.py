@@ -132,6 +132,7 @@ def record_video(
     temporary = path.with_name(f".{path.stem}.tmp.mp4")
     act = mpc_actions(policy)
     reached: list[bool] = []
+    temporary.touch()  # says here whether it can be written, where the message is not one of ffmpeg
     try:
         with cast(Any, imageio.get_writer)(temporary, fps=max(1, round(1 / task.step_seconds)), quality=8) as video:
             for number, goal in enumerate(chosen, 1):

@@ -51,8 +51,7 @@ class ModelRolloutSettings(Settings):
     value_epochs: int = bounded(10, minimum=1)
     """Epochs of the value network at the end of such an iteration."""
     actions: int = bounded(8, minimum=1, maximum=MOST_ENVS)
-    """Actions that the networks judge in each state, an even number (`difflcs.rl.advantages`); 1: only the one that is
-    taken, by GAE as in real episodes."""
+    """Actions that the networks judge in each state, an even number; 1: only the one that is taken, by GAE."""
     zeta: float = bounded(0.5, minimum=0, maximum=1)
     """Zeta of the advantages where several actions are judged, that of PPO otherwise."""
     real_step: float = bounded(0.3, above=0)

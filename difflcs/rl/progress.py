@@ -1,42 +1,92 @@
-"""What a terminal shows of a long work."""
+"""What a long work shows of its progress: a bar on a terminal, plain lines elsewhere.
+
+The lines are records of the logger "difflcs": `logging.basicConfig(level=logging.INFO)` shows them in a program of
+one's own, and the command line shows them by itself.
+"""
 
 from __future__ import annotations
 
+import logging
+import sys
+import time
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from difflcs.rl._optional import require
 from difflcs.rl.evaluate import Evaluation
-from difflcs.rl.training import Reporter
+from difflcs.rl.training import ITERATIONS, Reporter, notable
 
 if TYPE_CHECKING:
     from tqdm import tqdm
 
+LIBRARY = logging.getLogger("difflcs")
+_LOG = logging.getLogger(__name__)
+_SECONDS = 5.0
+"""Between two lines about one work."""
 
-def bar(total: int, label: str) -> tqdm:
-    """A progress bar on a terminal, nothing elsewhere."""
+
+def bar(total: int, label: str) -> tqdm | Lines:
+    """A progress bar on a terminal, a line every few seconds elsewhere."""
+    if not sys.stderr.isatty():
+        return Lines(total, label)
     require("tqdm")
     from tqdm import tqdm
 
-    return tqdm(total=total, desc=label, unit="step", disable=None, dynamic_ncols=True, leave=False)
+    return tqdm(total=total, desc=label, unit="step", dynamic_ncols=True, leave=False)
+
+
+class Lines:
+    """Stands for a progress bar where there is no terminal."""
+
+    def __init__(self, total: int, label: str):
+        self.total, self.label, self.done, self.last = total, label, 0, time.monotonic()
+
+    def __enter__(self) -> Lines:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing is open."""
+
+    def update(self, count: int) -> None:
+        """Count what was done, and say it now and then."""
+        self.done += count
+        now = time.monotonic()
+        if now - self.last >= _SECONDS:
+            self.last = now
+            _LOG.info("%s: %d of %d steps", self.label, self.done, self.total)
 
 
 class Progress(Reporter):
-    """A progress bar on a terminal, and a line per evaluation everywhere."""
+    """A progress bar on a terminal. Elsewhere it shows nothing: what `train` logs is enough.
+
+    On a terminal the bar stands for the lines about iterations, and other lines appear above it.
+    """
 
     def __init__(self) -> None:
         self.bar: tqdm | None = None
+        self._held = ExitStack()
 
     def __enter__(self) -> Progress:
+        if sys.stderr.isatty():
+            require("tqdm")
+            from tqdm.contrib.logging import logging_redirect_tqdm
+
+            self._held.enter_context(logging_redirect_tqdm([LIBRARY]))
+            self._held.callback(ITERATIONS.setLevel, ITERATIONS.level)
+            ITERATIONS.setLevel(logging.WARNING)
         return self
 
     def __exit__(self, *_: object) -> None:
         if self.bar is not None:
             self.bar.close()
+        self._held.close()
 
     def started(self, done: int, total: int) -> None:
         """Open the bar."""
-        self.bar = bar(total, "training")
-        self.bar.update(done)
+        if sys.stderr.isatty():
+            from tqdm import tqdm
+
+            self.bar = tqdm(initial=done, total=total, desc="training", unit="step", dynamic_ncols=True, leave=False)
 
     def stepped(self, env_steps: int) -> None:
         """Move it."""
@@ -46,8 +96,7 @@ class Progress(Reporter):
     def iterated(self, report: Any) -> None:
         """Show loss, KL divergence and success beside it."""
         if self.bar is not None:
-            names = [name for name in ("loss", "kl", "success") if hasattr(report, name)]
-            self.bar.set_postfix({name: f"{getattr(report, name):.2g}" for name in names})
+            self.bar.set_postfix(notable(report))
 
     def evaluating(self, minutes: float, goals: int) -> None:
         """Say that an evaluation runs."""
@@ -55,14 +104,6 @@ class Progress(Reporter):
             self.bar.set_description(f"evaluating {goals} goals")
 
     def evaluated(self, minutes: float, result: Evaluation) -> None:
-        """Print the success rate."""
+        """Say that it is over."""
         if self.bar is not None:
             self.bar.set_description("training")
-            self.bar.clear()
-        print(f"{minutes:4.1f} min of data: {summary(result)}", flush=True)
-
-
-def summary(result: Evaluation) -> str:
-    """An evaluation in one line."""
-    failures = f"{result.solver_failures} of {result.solves} solves failed"
-    return f"success {result}, {failures}" + (f", {result.unstable} episodes unstable" if result.unstable else "")

@@ -182,7 +182,6 @@ class ViolationLoss(Settings):
     """The violation-based loss (Eq. 2 of the paper), see `difflcs.violation_loss`."""
 
     gamma: float | Literal["auto"] = bounded(0.05, above=0)
-    """Gamma of the loss; auto: as large as F allows, for models whose F has another size. The prior work's loss without
-    ½, with gamma 0.1 and xi 0.01, is twice this one; Adam does not notice a factor."""
+    """Gamma of the loss; auto: as large as F allows, for models whose F has another size."""
     xi: float = bounded(0.02, above=0)
     """Xi of the loss."""

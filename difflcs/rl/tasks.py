@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_number, check_positive_int
+from difflcs._checks import check_number, check_positive_int, did_you_mean
 from difflcs.cost import GoalCost
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.lcs import LCSModule
@@ -387,7 +387,7 @@ def get_task(task: str | TaskSpec) -> TaskSpec:
     if task not in known:
         failed = "".join(f"; the entry point {name} could not be loaded: {why}" for name, why in _FAILED.items())
         raise InvalidInputError(
-            f"task: expected one of {', '.join(known) or 'no tasks'}, got {task!r:.200}; add your own with "
-            f"difflcs.rl.register_task{failed}"
+            f"task: expected one of {', '.join(known) or 'no tasks'}, got {task!r:.200}"
+            f"{did_you_mean(task, known)}; add your own with difflcs.rl.register_task{failed}"
         )
     return _REGISTRY[task]

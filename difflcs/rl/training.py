@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -32,6 +33,9 @@ EnvFactory = Callable[[int], "VectorEnv"]
 EVALUATION_ENVS = 50
 """Environments of an evaluation: enough to keep the solver's workers busy, few enough to build in a second."""
 _DIRECTORY = "runs/{task}-{method}-{seed}"
+_LOG = logging.getLogger(__name__)
+ITERATIONS = _LOG.getChild("iterations")
+"""Logger of the lines about single iterations, for who wants the others alone."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +146,7 @@ def train(
     """Train a model and leave a run directory behind.
 
     It can be interrupted at any instant; resumed, it ends with the same parameters as if it had not been. The run
-    directory is locked meanwhile.
+    directory is locked meanwhile. The logger "difflcs" tells of iterations and evaluations, at level INFO.
 
     Args:
         config: what to train; LCS-RL on `task` by default. When resuming, the run's own configuration must equal it.
@@ -159,7 +163,7 @@ def train(
 
     Raises:
         InvalidInputError: no task has this name, its environment cannot be made, the data is used up by the warm-up,
-            `init` does not fit the task, or `force` and `resume`.
+            `init` does not fit the task, an evaluation is to be after the end, or `force` and `resume`.
         CheckpointError: `out` holds files and neither `resume` nor `force` is set, or they cannot be resumed from, or
             they are no run, or they cannot be written; the last checkpoint is intact.
         InUseError: another process trains in `out`.
@@ -247,6 +251,8 @@ class _Training:
                 f"init: expected none with method {method.name}, which learns networks instead of an LCSModel"
             )
         reopened = None
+        if not resume:  # what was stored before this was checked can be continued
+            _check_times(self.config)
         if resume:
             reopened, init = self._reopen(held)
             if reopened.finished():
@@ -308,12 +314,17 @@ class _Training:
         config, per_minute, reporter = self.config, self.task.steps_per_minute, self.reporter
         columns = _columns(config.method)
         run.truncate_log(-1 if fresh else trainer.iteration)
+        begun = "training" if fresh else f"continuing after {trainer.env_steps / per_minute:.1f} min of data"
+        _LOG.info(
+            "%s: %s on %s, %g min of data, in %s", begun, config.method.name, config.task, config.minutes, run.path
+        )
         reporter.started(trainer.env_steps, self.total)
         evaluation_envs: list[VectorEnv] = []  # made when first needed: one second
 
         def measure(goals: int) -> Evaluation:
             if not evaluation_envs:
                 evaluation_envs.append(open_envs(min(EVALUATION_ENVS, max(config.evaluate_goals, config.final_goals))))
+            ITERATIONS.info("evaluating %d goals", goals)
             reporter.evaluating(trainer.env_steps / per_minute, goals)
             steps = self.task.episode_steps
             return evaluate(evaluation_envs[0], trainer.policy, goals, config.evaluation_seed, steps)
@@ -330,10 +341,16 @@ class _Training:
                     if isinstance(value, int | float) and name not in ("iteration", "env_steps"):
                         writer.add_scalar(name, value, trainer.env_steps)
                 save_checkpoint(run.checkpoints, trainer.iteration, trainer.state_dict())
+            minutes = trainer.env_steps / per_minute
             if report is not None:
+                told = "".join(f", {name} {value}" for name, value in notable(report).items())
+                ITERATIONS.info(
+                    "iteration %d, %.1f of %g min of data%s", trainer.iteration, minutes, config.minutes, told
+                )
                 reporter.iterated(report)
             if result is not None:
-                reporter.evaluated(trainer.env_steps / per_minute, result)
+                _LOG.info("after %.1f min of data: %s", minutes, result.summary())
+                reporter.evaluated(minutes, result)
 
         writer = SummaryWriter(str(run.tensorboard), purge_step=0 if fresh else trainer.env_steps + 1)
         try:
@@ -346,6 +363,16 @@ class _Training:
                 save_learned(trainer.learned, run.model, self.config.method.kind)
         finally:
             writer.close()
+
+
+def _check_times(config: TrainConfig) -> None:
+    """Refuse evaluations after the end, but not the usual ones, of which a short training has as many as fit."""
+    late = [f"{minute:g}" for minute in config.evaluate_at if minute > config.minutes]
+    if late and config.evaluate_at != TrainConfig.evaluate_at:
+        raise InvalidInputError(
+            f"evaluate_at: expected minutes of data up to the {config.minutes:g} of the training, got "
+            f"{', '.join(late)}; leave them out, or raise minutes"
+        )
 
 
 def _note(run: RunDirectory, found: Mapping[str, Any]) -> None:
@@ -386,6 +413,12 @@ def _row(
         row[f"evaluation_{name}"] = None if result is None else getattr(result, name)
     row["evaluation_seconds"] = None if result is None else seconds
     return row
+
+
+def notable(report: Any) -> dict[str, str]:
+    """What of a trainer's report one looks at while it trains: name → number, in two digits."""
+    names = [name for name in ("loss", "kl", "success") if isinstance(getattr(report, name, None), int | float)]
+    return {name: f"{getattr(report, name):.2g}" for name in names}
 
 
 def profile(rows: Sequence[Mapping[str, str]]) -> dict[str, float]:

@@ -51,8 +51,7 @@ class WarmupSettings(Settings):
     buffer: int = bounded(200, minimum=1)
     """Newest episodes kept for training."""
     noise: float = bounded(0.003, minimum=0)
-    """Standard deviation [units of the action] of the Gaussian noise on executed actions. Without it success on the
-    cube peaks at 48 to 59 %."""
+    """Standard deviation [units of the action] of the Gaussian noise on executed actions."""
     action_support: float = bounded(0.9, minimum=0)
     """While collecting, actions stay within mean ± action_support · std of the buffer's actions; 0 turns this off."""
     action_support_growth: float = bounded(1.03, above=0)

@@ -13,7 +13,7 @@ from difflcs import LCSModel
 from difflcs.rl.tasks import get_task
 
 PATH = Path(__file__).parent / "push.gif"
-WIDTH, HEIGHT = 300, 225
+WIDTH, HEIGHT = 600, 450
 FRAME_MILLISECONDS = 100  # a step of the environment: real time
 
 
@@ -32,10 +32,12 @@ def main() -> None:
             observation, _, _, _, info = env.step(action.numpy())
             views = [env.picture(), env.picture("top")]
             frame = Image.fromarray(np.concatenate(views, axis=1))
-            ImageDraw.Draw(frame).text((6, 4), task.say(info), fill=(20, 20, 30), font_size=14)
+            ImageDraw.Draw(frame).text((12, 8), task.say(info), fill=(20, 20, 30), font_size=28)
             frames.append(frame)
         frames += [frames[-1]] * 5
-    palette = frames[0].quantize(64, dither=Image.Dither.NONE)
+    # Of several frames: the colours of the first alone would lack those of the cube on its goal.
+    sample = Image.fromarray(np.concatenate([np.asarray(frame) for frame in frames[:: len(frames) // 8]]))
+    palette = sample.quantize(256, dither=Image.Dither.NONE)
     small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     small[0].save(PATH, save_all=True, append_images=small[1:], duration=FRAME_MILLISECONDS, loop=0, optimize=True)
     print(f"{PATH.name}: {PATH.stat().st_size / 1000:.0f} kB, {len(frames)} frames")

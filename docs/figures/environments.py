@@ -14,7 +14,7 @@ from difflcs_envs.ycb import YCB
 
 FOLDER = Path(__file__).parent
 GOAL = [0.04, 0.03, 0.4]  # x [m], y [m], yaw [rad]
-WIDTH, HEIGHT = 320, 240
+WIDTH, HEIGHT = 640, 480
 
 
 def make(env_id: str, **arguments):
@@ -43,15 +43,14 @@ def push_in(state: np.ndarray, finger: int) -> np.ndarray:
 def labelled(picture: np.ndarray, text: str) -> np.ndarray:
     """A picture with a word in its corner."""
     image = Image.fromarray(picture)
-    ImageDraw.Draw(image).text((6, 4), text, fill=(20, 20, 30), font_size=16)
+    ImageDraw.Draw(image).text((12, 8), text, fill=(20, 20, 30), font_size=28)
     return np.asarray(image)
 
 
 def save(name: str, rows: list[np.ndarray]) -> None:
-    """Write pictures one below the other, in 128 colours, which keeps the file small."""
-    image = Image.fromarray(np.concatenate(rows)).quantize(128, dither=Image.Dither.NONE)
+    """Write pictures one below the other."""
     path = FOLDER / name
-    image.save(path, optimize=True)
+    Image.fromarray(np.concatenate(rows)).save(path, optimize=True)
     print(f"{name}: {path.stat().st_size / 1000:.0f} kB")
 
 

@@ -4,6 +4,7 @@ import contextlib
 import importlib.util
 import io
 import json
+import logging
 import os
 import re
 import shutil
@@ -20,7 +21,8 @@ from typing import get_type_hints
 import pytest
 import torch
 
-from difflcs import LCSModel, cli
+from difflcs import LCSModel, __main__, cli, cli_train
+from difflcs.rl import progress
 from difflcs.rl.checkpoint import RunDirectory
 from difflcs.rl.methods import LCSRLMethod, get_method, method_names
 from difflcs.rl.training import TrainConfig
@@ -78,9 +80,8 @@ def test_help(capsys, command, monkeypatch):
 
 
 def test_every_command_has_a_test_of_its_help(capsys):
-    with pytest.raises(SystemExit):
-        cli.main(["nonsense"])
-    err = capsys.readouterr().err
+    code, _, err = run(capsys, "nonsense")
+    assert code == 2
     assert all(command in err for command in HELP)
 
 
@@ -120,7 +121,7 @@ def test_each_methods_settings_show_with_that_method_only(flags, method):
 
 def test_the_default_is_lcs_rl_on_the_cube(capsys, flags, monkeypatch, tmp_path):
     seen = []
-    monkeypatch.setattr(cli, "train", lambda config, out, **_: seen.append((config, out)) or run_of(out))
+    monkeypatch.setattr(cli_train, "train", lambda config, out, **_: seen.append((config, out)) or run_of(out))
     assert run(capsys, "train", "--task", "cube")[0] == 0
     assert run(capsys, "train")[0] == 0
     config, out = seen[0]
@@ -136,7 +137,7 @@ def run_of(out: Path) -> SimpleNamespace:
 
 def test_settings_reach_the_method(capsys, monkeypatch):
     seen = []
-    monkeypatch.setattr(cli, "train", lambda config, out, **_: seen.append(config) or run_of(out))
+    monkeypatch.setattr(cli_train, "train", lambda config, out, **_: seen.append(config) or run_of(out))
     words = ["--method", "ppo-mlp", "--width", 32, "--ppo.critic.epochs.first", 7, "--ppo.adam.betas", 0.5, 0.6]
     assert run(capsys, "train", "--seed", 4, *words)[0] == 0
     usual = get_method("ppo-mlp")()
@@ -276,11 +277,99 @@ def test_a_model_of_another_kind_is_refused_before_anything_is_written(capsys, t
     assert not (tmp_path / "run").exists()
 
 
-def test_bad_nested_settings_are_refused(capsys):
-    with pytest.raises(SystemExit) as exit_:
-        cli.main(["train", "--warmup.noise", "-1"])
-    assert exit_.value.code == 2
-    assert "Traceback" not in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--warmup.noise -1", "--warmup.noise: expected a finite 0 <= noise, got -1.0; change it"),
+        ("--ppo.std 0", "--ppo.std: expected a finite 0 < std, got 0.0; change it"),
+        ("--warmup.adam.betas 0.9 2", "--warmup.adam.betas: expected a finite 0 <= betas < 1, got 2.0; change it"),
+        ("--n-lam 0", "--n-lam: expected a finite 1 <= n_lam <= 1000, got 0; change it"),
+    ],
+)
+def test_bad_settings_are_named_as_one_writes_them(capsys, words, message):
+    assert run(capsys, "train", *words.split()) == (2, "", f"difflcs: {message}\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "near"),
+    [
+        ("trian", "train"),
+        ("train --method lcsrl", "lcs-rl"),
+        ("train --task cubes", "cube"),
+        ("train --backend batchd", "batched"),
+        ("evaluate zoo:trifinger-cub", "trifinger-cube"),
+        ("zoo trifingercube", "trifinger-cube"),
+    ],
+)
+def test_a_slip_gets_a_suggestion(capsys, words, near):
+    code, _, err = run(capsys, *words.split())
+    assert code == 2
+    assert f"did you mean {near}" in err
+
+
+@pytest.mark.parametrize("words", ["train --help", "zoo", "zoo --json", "nonsense"])
+def test_who_reads_the_output_may_stop(words):
+    """As in `difflcs train --help | head`: no traceback. The reader ends before anything is written."""
+    end, mine = os.pipe()
+    os.close(end)
+    command = [sys.executable, "-m", "difflcs", *words.split()]
+    broken = {"stdout": mine, "stderr": subprocess.PIPE} if words != "nonsense" else {"stderr": mine}
+    done = subprocess.run(command, **broken, text=True, timeout=120, check=False)
+    os.close(mine)
+    assert done.returncode == 141
+    assert not done.stderr
+
+
+def test_ctrl_c_while_the_command_is_imported(capsys, monkeypatch):
+    def die(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "main", die)
+    assert __main__.main(["train"]) == 130
+    assert capsys.readouterr().err == "\ndifflcs: interrupted; nothing was changed\n"
+
+
+def test_what_a_training_shows_without_a_terminal(capsys, tmp_path):
+    words = "--method violation --smoke --minutes 0.5 --evaluate-at 0 0.3 --evaluate-goals 2 --final-goals 3".split()
+    code, out, err = run(capsys, "train", *words, "--out", tmp_path / "run")
+    assert code == 0
+    lines = err.splitlines()
+    assert lines[0] == f"training: violation on cube, 0.5 min of data, in {tmp_path / 'run'}"
+    shown = [line for line in lines if line.startswith("iteration ")]
+    assert shown[0].startswith("iteration 1, 0.2 of 0.5 min of data, loss ")
+    assert len(shown) == len(RunDirectory.open(tmp_path / "run").rows()) - 1
+    assert [line for line in lines if line.startswith("evaluating")] == [f"evaluating {n} goals" for n in (3, 2, 3)]
+    assert [line.partition(":")[0] for line in lines if line.startswith("after")] == [
+        f"after {minutes} min of data" for minutes in ("0.0", "0.3", "0.5")
+    ]
+    assert f"evaluate it with: difflcs evaluate {tmp_path / 'run'}" in out
+    assert logging.getLogger("difflcs").handlers == [difflcs_handler()]
+
+
+def difflcs_handler() -> logging.Handler:
+    """The one that the library has by itself: it shows nothing."""
+    (handler,) = (h for h in logging.getLogger("difflcs").handlers if isinstance(h, logging.NullHandler))
+    return handler
+
+
+def test_a_long_evaluation_shows_lines_without_a_terminal(capsys, monkeypatch):
+    monkeypatch.setattr(progress, "_SECONDS", 0.0)
+    code, out, err = run(capsys, "evaluate", "zoo:trifinger-cube", "--smoke", "--json")
+    assert code == 0
+    assert json.loads(out)["goals"] == 4
+    assert err.splitlines()[0] == "evaluating: 4 of 80 steps"
+    assert err.splitlines()[-1] == "evaluating: 80 of 80 steps"
+
+
+def test_evaluations_after_the_end_are_refused(capsys, tmp_path):
+    short = ["train", "--method", "violation", "--minutes", 1, "--out", tmp_path / "run"]
+    code, _, err = run(capsys, *short, "--evaluate-at", 0.5, 7, 8)
+    assert (code, err) == (
+        2,
+        "difflcs: evaluate_at: expected minutes of data up to the 1 of the training, got 7, 8; leave them out, or "
+        "raise minutes\n",
+    )
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_missing_package_names_the_line_that_installs_it(capsys, monkeypatch):
@@ -451,7 +540,7 @@ def test_resume_after_any_crash_gives_the_same_run(capsys, finished, tmp_path, m
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(cli.Progress, "iterated", die)
+        patch.setattr(cli_train.Progress, "iterated", die)
         code, _, err = run(capsys, "train", "--method", "violation", "--smoke", "--out", path)
     assert code == 130
     assert f"difflcs train --out {path} --resume" in err
@@ -508,6 +597,7 @@ def test_render(capsys, finished, tmp_path):
     file.write_text("no folder")
     code, _, err = run(capsys, "render", finished, "--smoke", "--out", file / "video.mp4")
     assert code == 2
+    assert err.startswith("difflcs: out: expected a place to write ")  # and nothing of ffmpeg before it
     assert "choose another" in err
 
 
@@ -551,7 +641,7 @@ def test_one_training_at_a_time_in_a_run(capsys, tmp_path, monkeypatch, words):
     arguments = ["train", "--method", "violation", "--smoke", "--minutes", 0.1, "--final-goals", 0, "--out", path]
     seen = []
 
-    class Second(cli.Progress):
+    class Second(cli_train.Progress):
         def started(self, done, total):
             if not seen:
                 seen.append(None)
@@ -560,7 +650,7 @@ def test_one_training_at_a_time_in_a_run(capsys, tmp_path, monkeypatch, words):
                 assert contents(path) == before
             super().started(done, total)
 
-    monkeypatch.setattr(cli, "Progress", Second)
+    monkeypatch.setattr(cli_train, "Progress", Second)
     assert run(capsys, *arguments)[0] == 0
     code, _, err = seen[0]
     assert code == 2
@@ -578,7 +668,7 @@ def test_two_processes_resume_one_run(capsys, tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(cli.Progress, "iterated", die)
+        patch.setattr(cli_train.Progress, "iterated", die)
         assert run(capsys, "train", "--method", "violation", "--smoke", "--final-goals", 0, "--out", path)[0] == 130
     command = [sys.executable, "-m", "difflcs.cli", "train", "--out", str(path), "--resume"]
     with RunDirectory(path).locked():

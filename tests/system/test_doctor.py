@@ -61,7 +61,7 @@ def test_the_environments_are_tried(checks):
 
 
 def test_text_and_json(checks, capsys, monkeypatch):
-    monkeypatch.setattr(doctor, "examine", lambda: checks)
+    monkeypatch.setattr(doctor, "examine", lambda groups: checks)
     monkeypatch.setenv("COLUMNS", "80")
     assert cli.main(["doctor"]) == 0
     text = capsys.readouterr().out
@@ -95,6 +95,18 @@ def test_missing_extras_are_no_failure_and_say_what_to_install(versions):
         assert (found[name].status, found[name].remedy) == ("missing", f'pip install "difflcs[{extra}]"')
     assert "torchrl" in found["rl"].text
     assert doctor.healthy(list(found.values()))
+
+
+def test_what_only_development_needs_is_looked_at_on_request(monkeypatch):
+    seen = []
+    with monkeypatch.context() as patch:
+        patch.setattr(doctor, "examine", lambda groups: seen.append(groups) or [])
+        assert [cli.main(["doctor", *words]) for words in ([], ["--dev"])] == [0, 0]
+    assert seen == [doctor.GROUPS, (*doctor.GROUPS, doctor.DEVELOPMENT)]
+    usual, more = (by_name(doctor.examine([group])) for group in ("extras", doctor.DEVELOPMENT))
+    assert set(usual) == {"rl", "envs", "viz", "relaxed", "scoreboard"}
+    assert {"docs", "dev"} <= set(more)
+    assert not set(usual) & set(more)
 
 
 @pytest.mark.parametrize(("version", "status"), [("0.1.5", "missing"), ("0.13.0+cpu", "ok")])
@@ -166,7 +178,7 @@ sys.exit(__main__.main(["doctor", "--json"]))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
-    assert done.stderr.count("error:") == 1
+    assert done.stderr.count("difflcs: ") == 1
     assert "expected the package(s) gymnasium, not installed; run: pip install" in done.stderr  # of `difflcs train`
     every = json.loads(done.stdout)["checks"]
     found = {check["name"]: check for check in every if check["group"] == "solvers"}

@@ -25,7 +25,7 @@ LAYERS = [
     {"physics"},
     {"planning"},
     {"rl", "zoo", "export"},
-    {"bench", "doctor", "cli", "__main__"},
+    {"bench", "doctor", "cli", "cli_models", "cli_train", "__main__"},
 ]
 
 
@@ -232,3 +232,23 @@ def test_the_readmes_example_runs_and_prints_a_gradient(tmp_path):
     assert any(v != 0 for v in numbers)
     assert "nan" not in done.stdout
     assert "grad" in blocks[0]
+
+
+def test_only_commands_print():
+    """What the library has to say it logs (`difflcs.rl.training`), returns, raises or warns."""
+    commands = {"cli.py", "cli_train.py", "cli_models.py", "__main__.py", "doctor.py", "zoo.py", "bench.py"}
+    for path in sources("difflcs"):
+        if path.relative_to(ROOT / "difflcs").as_posix() not in commands:
+            calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+            assert "print" not in {ast.unparse(call.func) for call in calls}, path
+
+
+def test_errors_refer_to_what_every_installation_has():
+    from difflcs import errors
+
+    kinds = [kind for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, errors.DiffLCSError)]
+    known = {kind.see for kind in kinds} - {None}
+    assert known
+    for text in known:
+        name = text.removeprefix("help(difflcs.").removesuffix(")")
+        assert text == "difflcs doctor" or len(getattr(difflcs, name).__doc__) > 500, text

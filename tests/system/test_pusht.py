@@ -83,3 +83,5 @@ def test_the_film_is_a_gif(capsys, tmp_path):
     assert "--force" in capsys.readouterr().err
     assert main(["render", "pusht", "--out", str(tmp_path / "film.avi")]) == 2
     assert "GIF or MP4" in capsys.readouterr().err
+    assert main(["render", "pusht", "--out", str(film / "in_a_file.gif")]) == 2
+    assert "choose another" in capsys.readouterr().err

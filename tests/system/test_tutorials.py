@@ -140,3 +140,13 @@ def test_has_the_form(path: Path):
     assert re.match(r"import |from ", last_code.source), "the last cell can be copied as it is"
     assert notebook.metadata.kernelspec.name == "python3"
     assert all(re.fullmatch(r"[a-z][a-z0-9-]*", cell.id) for cell in notebook.cells), "stable ids, small diffs"
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_long_drawings_are_folded(path: Path):
+    """A reader sees what is computed and the picture; the code of the picture opens on a click, on the pages too."""
+    for cell in code(read(path)):
+        draws = re.search(r"plt\.(subplots|figure)\(", cell.source) is not None
+        folded = "hide-input" in cell.metadata.get("tags", []) and cell.metadata.get("jupyter", {}).get("source_hidden")
+        assert folded or not draws or len(cell.source.splitlines()) <= 12, cell.id
+        assert draws or not folded or cell.id == "push-film", cell.id

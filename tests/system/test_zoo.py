@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 
-from difflcs import LCSModel, _zoo, cli, zoo
+from difflcs import LCSModel, _zoo, cli, cli_train, zoo
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.rl.checkpoint import RunDirectory
 from difflcs.rl.evaluate import wilson_interval
@@ -230,7 +230,7 @@ def test_the_command_on_a_card_gives_the_settings_back(monkeypatch):
     words = shlex.split(zoo.training_command(config))
     assert words[:6] == ["difflcs", "train", "--task", "mug", "--method", "ppo"]
     seen = []
-    monkeypatch.setattr(cli, "train", lambda config, out, **_: seen.append(config) or RunDirectory(out))
+    monkeypatch.setattr(cli_train, "train", lambda config, out, **_: seen.append(config) or RunDirectory(out))
     assert cli.main(words[1:]) == 0
     assert seen == [config]
 

@@ -559,6 +559,26 @@ def test_picture_shows_cube_and_goal():
     env.close()
 
 
+@pytest.mark.usefixtures("gl")
+@pytest.mark.parametrize("camera", ["front", "top"])
+def test_the_goal_is_an_outline_that_hides_nothing(camera):
+    env = make(render_mode="rgb_array", width=320, height=240, reset_noise=0.0).unwrapped
+
+    def drawn(goal):
+        env.reset(seed=0, options={"goal": goal})
+        return env.picture(camera).astype(int)
+
+    here, there = drawn([0.0, 0.0, 0.0]), drawn([0.06, 0.06, 0.5])
+    cube = (there[..., 0] > 180) & (there[..., 1] > 110) & (there[..., 2] < 100)
+    marked = (here[..., 0] > 180) & (here[..., 1] < 90) & (here[..., 2] < 90)
+    new = marked & (np.abs(here - there).max(2) > 20)
+    assert 30 < new.sum() < 0.5 * cube.sum()  # a line round it
+    inside = cube & ~marked
+    assert inside.sum() > 0.5 * cube.sum()
+    assert np.abs(here - there)[inside].max(1).mean() < 40  # lightly tinted, edges of the cube stay visible
+    env.close()
+
+
 def test_render_without_mode_warns():
     env = make()
     env.reset(seed=0)

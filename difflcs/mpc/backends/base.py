@@ -11,6 +11,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from difflcs._checks import did_you_mean
 from difflcs.errors import BackendNotFoundError, DTypeError, InvalidInputError
 from difflcs.mpc import kkt
 from difflcs.mpc.problem import INPUTS, MPCProblem
@@ -189,8 +190,8 @@ def get_backend(backend: str | Backend) -> Backend:
         raise DTypeError(f"backend: expected a name or a Backend instance, got {backend!r}")
     if isinstance(backend, str) and backend not in REGISTRY:
         raise BackendNotFoundError(
-            f"backend: expected one of {', '.join(map(repr, REGISTRY))}, got {backend!r}; "
-            f"add your own with difflcs.register_backend"
+            f"backend: expected one of {', '.join(map(repr, REGISTRY))}, got {backend!r}"
+            f"{did_you_mean(backend, REGISTRY)}; add your own with difflcs.register_backend"
         )
     found = REGISTRY[backend] if isinstance(backend, str) else type(backend)
     if found.missing():

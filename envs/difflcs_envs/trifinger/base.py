@@ -265,7 +265,7 @@ class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         return self._observation(), float(reward), False, truncated, info
 
     def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Draw the scene, the goal as a transparent cube.
+        """Draw the scene, the goal as an outline.
 
         Returns:
             A picture, uint8 (height, width, 3), with `render_mode="rgb_array"`; otherwise None.

@@ -79,6 +79,7 @@ FINGER_COLORS = ((0.86, 0.33, 0.31, 1.0), (0.30, 0.69, 0.49, 1.0), (0.27, 0.52, 
 LINK_COLOR = (0.25, 0.27, 0.31, 1.0)
 CUBE_COLOR = (0.98, 0.76, 0.25, 1.0)
 GOAL_COLOR = (0.90, 0.16, 0.20, 0.35)
+GOAL_GROUP = 1  # pictures mark the goal by an outline, so that it never hides the object; viewers draw these geoms
 SMALL_PICTURE = 320 * 240  # [pixel] larger pictures get smooth edges
 GOAL_MARGIN = 0.0004  # [m]
 HAND_GROUP = 2  # geoms that hide the table from above; the camera "top" does not show them
@@ -307,7 +308,7 @@ def _look_at(position: tuple[float, float, float], target: tuple[float, float, f
 def _add_object(spec: mujoco.MjSpec, scene_object: SceneObject) -> None:
     position = [0.0, 0.0, scene_object.rest_height]
     goal = spec.worldbody.add_body(name="goal", mocap=True, pos=position)
-    scene_object.add_goal_geoms(spec, goal, {"rgba": GOAL_COLOR, "contype": 0, "conaffinity": 0})
+    scene_object.add_goal_geoms(spec, goal, {"rgba": GOAL_COLOR, "contype": 0, "conaffinity": 0, "group": GOAL_GROUP})
     body = spec.worldbody.add_body(name="object", pos=position)
     if scene_object.pinned:
         body.add_joint(

@@ -81,10 +81,11 @@ class SceneRenderer:
         self._context = _make_gl_context(width, height)
         import mujoco
 
-        from difflcs_envs.trifinger.model import HAND_GROUP
+        from difflcs_envs.trifinger.model import GOAL_COLOR, GOAL_GROUP, HAND_GROUP
 
         self._mujoco = mujoco
-        self._hand_group = HAND_GROUP
+        self._hand_group, self._goal_group = HAND_GROUP, GOAL_GROUP
+        self._goal_color = 255.0 * np.array(GOAL_COLOR[:3])
         self._model = model
         self._scene = mujoco.MjvScene(model, maxgeom=200)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
@@ -98,7 +99,7 @@ class SceneRenderer:
         self._open = True
 
     def render(self, data: Any, camera: str = "front") -> np.ndarray:
-        """Draw the scene.
+        """Draw the scene, and over it the outline of the goal, lightly filled.
 
         Args:
             data: The MuJoCo data.
@@ -111,7 +112,20 @@ class SceneRenderer:
         self._context.make_current()
         mujoco.mj_camlight(self._model, data)
         self._camera.fixedcamid = self._model.camera(camera).id
+        self._options.geomgroup[:] = [1, 0, 1, 0, 0, 0]
         self._options.geomgroup[self._hand_group] = camera != "top"
+        picture = self._draw(data)
+        self._options.geomgroup[:] = 0
+        self._options.geomgroup[self._goal_group] = 1
+        segment = mujoco.mjtRndFlag.mjRND_SEGMENT
+        self._scene.flags[segment] = True
+        goal = self._draw(data).any(axis=2)
+        self._scene.flags[segment] = False
+        return self._marked(picture, goal)
+
+    def _draw(self, data: Any) -> np.ndarray:
+        """What the options show, uint8 (height, width, 3)."""
+        mujoco = self._mujoco
         mujoco.mjv_updateScene(
             self._model, data, self._options, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
         )
@@ -119,6 +133,14 @@ class SceneRenderer:
         pixels = np.empty((self._rectangle.height, self._rectangle.width, 3), dtype=np.uint8)
         mujoco.mjr_readPixels(pixels, None, self._rectangle, self._gpu)
         return np.ascontiguousarray(pixels[::-1])  # OpenGL counts rows from below
+
+    def _marked(self, picture: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """The picture with the goal, a mask (height, width), marked in it."""
+        inner = goal
+        for _ in range(max(1, round(len(picture) / 160))):  # thickness of the line [pixel]
+            inner = inner & np.roll(inner, 1, 0) & np.roll(inner, -1, 0) & np.roll(inner, 1, 1) & np.roll(inner, -1, 1)
+        share = np.where(inner, 0.15, 0.9 * goal)[..., None]
+        return ((1.0 - share) * picture + share * self._goal_color).round().astype(np.uint8)
 
     def close(self) -> None:
         """Free the OpenGL context. May be called again."""

@@ -1,0 +1,117 @@
+"""Draws methods.png from benchmarks/results/objects.json and reproduce/results/paper.csv.
+
+`python docs/figures/methods.py`
+
+On the left success over minutes of data on the cube, on the right at the end on all seven objects. What each method is
+told stands in the legend.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+import matplotlib as mpl
+
+mpl.use("Agg")
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+sys.path.insert(0, str(ROOT / "reproduce"))
+from records import path_of, read, select  # noqa: E402 (from the folder above)
+from stats import Estimate, bootstrap  # noqa: E402
+
+Points = dict[float, list[float]]
+"""Minutes of data → success [%] of each seed."""
+OBJECTS = ("cube", "sugar_box", "fish_can", "mug", "wrench", "clamp", "banana")
+STYLES = {
+    "contact-lcs": ("ContactLCS, told the outline", "#cc79a7"),
+    "lcs-rl": ("LCS-RL, told nothing", "#d55e00"),
+    "pddm": ("PDDM (networks), told nothing", "#009e73"),
+    "violation": ("violation loss only, told nothing", "#0072b2"),
+}
+"""Methods → names with what they are told, colours."""
+GOALS = 1000
+"""Of the evaluations that are taken from objects.json."""
+
+
+def told(task: str) -> Points:
+    """`contact-lcs`: without PPO up to the end of its fit, minute 3, with it after that."""
+    points: dict[float, dict[int, float]] = defaultdict(dict)
+    for row in json.loads((ROOT / "benchmarks" / "results" / "objects.json").read_text())["rows"]:
+        if (row["task"], row["method"], row["goals"]) == (task, "contact-lcs", GOALS):
+            points[float(row["minutes"])][row["seed"]] = 100 * row["success_rate"]
+    return {minute: list(seeds.values()) for minute, seeds in sorted(points.items())}
+
+
+def untold(task: str, method: str) -> Points:
+    """The others, by their default settings."""
+    cell = select(read(path_of(ROOT / "reproduce" / "results", "paper")), task, method, "ours")
+    return {} if cell is None else {at: list(cell.at(at)) for at in cell.scores.columns}
+
+
+def points_of(task: str, method: str) -> Points:
+    """Of one method on one object."""
+    return told(task) if method == "contact-lcs" else untold(task, method)
+
+
+def estimates(points: Points) -> dict[float, Estimate]:
+    """Means over the seeds with intervals of 95 %."""
+    return {minute: bootstrap([values]) for minute, values in points.items()}
+
+
+def draw_minutes(axes: Axes) -> None:
+    """The cube."""
+    for method, (label, color) in STYLES.items():
+        points = points_of("cube", method)
+        if not points:
+            continue
+        found = estimates(points)
+        seeds = {len(values) for values in points.values()}
+        amount = f"{min(seeds)} seeds" if len(seeds) == 1 else f"{min(seeds)} to {max(seeds)} seeds"
+        axes.plot(list(found), [e.value for e in found.values()], "o-", ms=4, color=color, label=f"{label} ({amount})")
+        low, high = [e.low for e in found.values()], [e.high for e in found.values()]
+        axes.fill_between(list(found), low, high, color=color, alpha=0.2, linewidth=0)
+    axes.set_ylim(0, 101)
+    axes.set_xlim(0, 30.5)
+    axes.set_xlabel("minutes of data on the cube")
+    axes.set_ylabel("goals reached [%]")
+    axes.legend(fontsize=8, frameon=False, loc="lower right")
+
+
+def draw_objects(axes: Axes) -> None:
+    """The last evaluation on every object; that of ContactLCS after three minutes."""
+    for k, method in enumerate(m for m in STYLES if m != "pddm"):
+        _, color = STYLES[method]
+        for y, task in enumerate(OBJECTS):
+            points = points_of(task, method)
+            minute = 3.0 if method == "contact-lcs" else max(points, default=0.0)
+            if minute not in points:
+                continue
+            found = bootstrap([points[minute]])
+            place = -y - 0.22 * (k - 1)
+            axes.plot(
+                [found.low, found.high], [place, place], color=color, alpha=0.5, linewidth=3, solid_capstyle="butt"
+            )
+            axes.plot(found.value, place, "o", color=color, ms=5)
+    axes.set_xlim(0, 101)
+    axes.set_yticks([-y for y in range(len(OBJECTS))], [task.replace("_", " ") for task in OBJECTS])
+    axes.set_xlabel("goals reached [%], ContactLCS after 3 min, the others after 30")
+
+
+def main() -> None:
+    """Draw it."""
+    fig, (left, right) = plt.subplots(1, 2, figsize=(10.5, 4.0), layout="constrained", width_ratios=[1.15, 1])
+    draw_minutes(left)
+    draw_objects(right)
+    for axes in (left, right):
+        axes.spines[["top", "right"]].set_visible(False)
+    fig.savefig(HERE / "methods.png", dpi=150)
+
+
+if __name__ == "__main__":
+    main()
