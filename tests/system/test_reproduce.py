@@ -648,9 +648,9 @@ def test_ablations_are_compared_with_all_parts(results, capsys):
     (adam,) = cells_of(results / "ablations.md", "with Adam")
     assert adam[3:] == ["70.0 [60.0, 80.0]", "−20.0 [−30.0, −10.0]", "0.250", "−10.0 [−10.0, −10.0]", "0.250"]
     markdown = (results / "ablations.md").read_text()
-    worse = "it is worse with Adam instead of the natural gradient"
-    assert f"The cube, 10 min: by the intervals {worse}; better without warm-up." in markdown
-    assert f"The cube, final: by the intervals {worse} and without warm-up; better none." in markdown
+    said = "success is lower by its interval: with Adam instead of the natural gradient"
+    assert f"On the cube, 10 min, {said}; higher: without warm-up." in markdown
+    assert f"On the cube, final, {said} and without warm-up; higher: none." in markdown
     assert (results / "ablations.png").is_file()
 
 
