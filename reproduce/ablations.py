@@ -47,7 +47,7 @@ def words(cells: Cells, task: str) -> list[str]:
         known = {name: found for name, found in apart.items() if found is not None}
         worse = report.listed([name for name, found in known.items() if found.high < 0])
         better = report.listed([name for name, found in known.items() if found.low > 0])
-        said.append(f"The {task}, {label}: by the intervals it is worse {worse}; better {better}.")
+        said.append(f"On the {task}, {label}, success is lower by its interval: {worse}; higher: {better}.")
     return said
 
 

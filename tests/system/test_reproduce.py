@@ -100,8 +100,8 @@ def test_matrix_holds_every_unit_once_the_important_ones_first():
     found = units.matrix((), preset)
     assert len(found) == len(set(found))
     assert {unit.seed for unit in found} == {FIRST, FIRST + 1, FIRST + 2}
-    # Cube: six of methods and recipes, and seven ablations; objects: five, and two transfers; banana: seven ablations.
-    assert len(found) == 3 * (6 + 7 + 6 * (5 + 2) + 7) + 1 * 2
+    # Cube: six of methods and recipes; objects: five, and two transfers; both tasks of the ablations: all of these.
+    assert len(found) == 3 * (6 + 6 * (5 + 2) + 2 * len(units.ABLATED)) + 1 * 2
     for position, unit in enumerate(found):
         assert unit.init is None or unit.init in found[:position]
     table = units.matrix(["table1"], preset)
@@ -648,9 +648,9 @@ def test_ablations_are_compared_with_all_parts(results, capsys):
     (adam,) = cells_of(results / "ablations.md", "with Adam")
     assert adam[3:] == ["70.0 [60.0, 80.0]", "−20.0 [−30.0, −10.0]", "0.250", "−10.0 [−10.0, −10.0]", "0.250"]
     markdown = (results / "ablations.md").read_text()
-    worse = "it is worse with Adam instead of the natural gradient"
-    assert f"The cube, 10 min: by the intervals {worse}; better without warm-up." in markdown
-    assert f"The cube, final: by the intervals {worse} and without warm-up; better none." in markdown
+    said = "success is lower by its interval: with Adam instead of the natural gradient"
+    assert f"On the cube, 10 min, {said}; higher: without warm-up." in markdown
+    assert f"On the cube, final, {said} and without warm-up; higher: none." in markdown
     assert (results / "ablations.png").is_file()
 
 
