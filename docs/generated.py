@@ -113,15 +113,15 @@ def field_docstrings(kind: type) -> dict[str, str]:
 
 def settings(name: str) -> str:
     """Markdown: a table of the fields of a dataclass that are no groups."""
-    kind = resolve(name)
-    return settings_table([row for row in setting_rows(kind()) if "." not in row[0]])
+    return settings_table([row for row in setting_rows(resolve(name)()) if "." not in row[0]])
 
 
 def setting_rows(group: Any, prefix: str = "--") -> list[tuple[str, str, str]]:
     """Flag, default and meaning of every field; before those of a group, one row with `.*` that says what it is."""
     documented, rows = field_docstrings(type(group)), []
     for field in fields(group):
-        value, flag = getattr(group, field.name), f"{prefix}{field.name}".replace("_", "-")
+        value = getattr(group, field.name)
+        flag = f"{prefix}{'no_' * (value is True)}{field.name}".replace("_", "-")
         if field.name not in documented:
             where = f"{type(group).__name__}.{field.name}"
             raise ValueError(f"{where}: expected a docstring below the field; write what it means")
@@ -181,7 +181,7 @@ def methods() -> str:
                 parts += [title + about, settings_table([*inside.values()])]
                 continue
             where, before = shown[flag]
-            changed = [row for key, row in inside.items() if row != before[key]]
+            changed = [row for key, row in inside.items() if row != before.get(key)]
             parts.append(
                 f"{title}{meaning} As with [{where}](#{where}){', but for these defaults:' if changed else '.'}"
             )
