@@ -241,13 +241,17 @@ class Learned:
             CheckpointError: there is none, or it cannot be used.
         """
         from difflcs.rl.checkpoint import RunDirectory
+        from difflcs.rl.methods import get_method
         from difflcs.rl.tasks import get_task
-        from difflcs.rl.training import load_model, load_policy, stored_config
+        from difflcs.rl.training import load_policy, stored_config
 
         name = str(source)
         if name.startswith(PREFIX):
-            known = card(name)
-            policy = get_task(known.task).make_policy(load_model(source), known.backend)
+            known, task = card(name), get_task(card(name).task)
+            make: Any = get_method(known.method)
+            method = make(backend=known.backend)
+            learned = method.rebuild(task, *_files.load_record(path(name), method.kind), name)
+            policy = method.policy(task, learned)
             return cls(name, known.task, known.method, known.backend, policy, True, known.object, card=known)
         run = RunDirectory.open(source)
         config, found = stored_config(run), run.config().get("object")
@@ -279,19 +283,24 @@ def add(run: Path, name: str | None = None, *, force: bool = False, root: Path =
         Its card.
 
     Raises:
-        CheckpointError: the run is not finished or was not evaluated at its end, it learned no LCSModel, or there is a
-            model of that name.
+        CheckpointError: the run is not finished or was not evaluated at its end, it learned no system for an MPC, or
+            there is a model of that name.
         InvalidInputError: the name does not say task and method.
     """
     from difflcs.rl.checkpoint import RunDirectory
-    from difflcs.rl.training import load_model, stored_config
+    from difflcs.rl.training import stored_config
 
     directory = RunDirectory.open(run)
     config = stored_config(directory)
     name = _checked_name(name, config)
     if not directory.finished():
         raise CheckpointError(f"{run}: expected a finished run; continue it with: difflcs train --out {run} --resume")
-    model = load_model(run)
+    if config.method.solver is None:
+        raise CheckpointError(
+            f"{run}: expected a run that learned a system for an MPC, got one of {config.method.name}: "
+            f"{config.method.kind}"
+        )
+    record = directory.learned(config.method.kind)
     content = _card(directory, config, name)
     if (root / name).exists() and not force:
         raise CheckpointError(f"{root / name}: expected no model of that name, got one; replace it with --force")
@@ -299,7 +308,7 @@ def add(run: Path, name: str | None = None, *, force: bool = False, root: Path =
     temporary = Path(tempfile.mkdtemp(dir=root, prefix=f".{name}.", suffix=".tmp"))
     try:
         new, old = temporary / "new", temporary / "old"
-        model.save_pretrained(new)
+        _files.save_record(new, config.method.kind, *record)
         _files.write_json(new / "card.json", asdict(content))
         if (root / name).exists():
             (root / name).rename(old)
