@@ -74,6 +74,10 @@ _GONE: Mapping[str, str] = {
     "--imagination.steps-minibatch": "steps on model rollouts have as many samples as those on real ones, "
     "--ppo.minibatch",
     **{
+        f"--{group}.final-iterations": "before every real iteration there are as many, see --models.iterations"
+        for group in ("imagination", "models")
+    },
+    **{
         f"--mlp.{name}": "the natural gradient needs a policy with an MPC, which a network is not"
         for name in ("natural", "no-natural", "natural-step", "natural-momentum", "natural-damping", "natural-samples")
     },

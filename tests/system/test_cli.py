@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import get_type_hints
+from typing import Any
 
 import pytest
 import torch
@@ -101,19 +101,20 @@ def flags():
     return found
 
 
-def settings_of(kind: type, prefix: str = "") -> Iterator[str]:
-    for f in fields(kind):
-        hint = get_type_hints(kind)[f.name]
-        if is_dataclass(hint):
-            yield from settings_of(hint, f"{prefix}{f.name}.")
+def settings_of(settings: Any, prefix: str = "") -> Iterator[str]:
+    """Their flags; of what is on by default the one that turns it off."""
+    for f in fields(settings):
+        value = getattr(settings, f.name)
+        if is_dataclass(value):
+            yield from settings_of(value, f"{prefix}{f.name}.")
         else:
-            yield f"--{prefix}{f.name}".replace("_", "-")
+            yield f"--{prefix}{'no_' * (value is True)}{f.name}".replace("_", "-")
 
 
 @pytest.mark.parametrize("method", method_names())
 def test_each_methods_settings_show_with_that_method_only(flags, method):
-    own = {name: set(settings_of(get_method(name))) for name in method_names()}
-    common = {flag for flag in settings_of(TrainConfig) if not flag.startswith("--method")} | {"--method"}
+    own = {name: set(settings_of(get_method(name)())) for name in method_names()}
+    common = {flag for flag in settings_of(TrainConfig()) if not flag.startswith("--method")} | {"--method"}
     assert flags[method] == own[method] | common | {"--out", "--init", "--resume", "--force", "--smoke"}
     for other in own:
         assert not (own[other] - own[method]) & flags[method]
@@ -128,7 +129,7 @@ def test_the_default_is_lcs_rl_on_the_cube(capsys, flags, monkeypatch, tmp_path)
     assert config == seen[1][0] == TrainConfig() == TrainConfig(task="cube", method=LCSRLMethod())
     assert config.method.name == "lcs-rl"
     assert out == Path("runs/cube-lcs-rl-0")
-    assert set(settings_of(LCSRLMethod)) <= flags["lcs-rl"]
+    assert set(settings_of(LCSRLMethod())) <= flags["lcs-rl"]
 
 
 def run_of(out: Path) -> SimpleNamespace:
@@ -183,7 +184,7 @@ FLAGS_OF_BEFORE = """
 """.split()
 GONE = {
     "pddm.noise", "warmup.adam-eps", "ppo.sample-clip", "ppo.final-std", "ppo.failure-penalty", "ppo.violation-batch",
-    "imagination.steps-minibatch", "mlp.sample-clip", "mlp.final-std", "mlp.failure-penalty", "mlp.violation-batch",
+    "imagination.final-iterations", "imagination.steps-minibatch", "mlp.sample-clip", "mlp.final-std", "mlp.failure-penalty", "mlp.violation-batch",
     "mlp.natural", "mlp.no-natural", "mlp.natural-step", "mlp.natural-momentum", "mlp.natural-damping",
     "mlp.natural-samples", "warmup.held-out", "ppo.kl-quantile", "mlp.kl-quantile", "ppo.natural-samples",
     "ppo.value-weight-decay", "mlp.value-weight-decay",
