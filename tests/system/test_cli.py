@@ -184,7 +184,8 @@ FLAGS_OF_BEFORE = """
 """.split()
 GONE = {
     "pddm.noise", "warmup.adam-eps", "ppo.sample-clip", "ppo.final-std", "ppo.failure-penalty", "ppo.violation-batch",
-    "imagination.final-iterations", "imagination.steps-minibatch", "mlp.sample-clip", "mlp.final-std", "mlp.failure-penalty", "mlp.violation-batch",
+    "imagination.final-iterations",
+    "imagination.steps-minibatch", "mlp.sample-clip", "mlp.final-std", "mlp.failure-penalty", "mlp.violation-batch",
     "mlp.natural", "mlp.no-natural", "mlp.natural-step", "mlp.natural-momentum", "mlp.natural-damping",
     "mlp.natural-samples", "warmup.held-out", "ppo.kl-quantile", "mlp.kl-quantile", "ppo.natural-samples",
     "ppo.value-weight-decay", "mlp.value-weight-decay",
