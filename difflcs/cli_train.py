@@ -141,8 +141,7 @@ class Demo:
         start = time.perf_counter()
         require("matplotlib", "imageio", "imageio_ffmpeg", "PIL")  # before the training, not after
         when = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
-        method = get_method("violation")()
-        config = TrainConfig(task=self.task, method=method, seed=self.seed, evaluate_at=when, evaluate_goals=100)
+        config = TrainConfig(task=self.task, seed=self.seed, evaluate_at=when, evaluate_goals=100)
         config = config.smoke() if self.smoke else config
         resume = (self.out / "config.json").exists()
         if resume:
