@@ -26,6 +26,7 @@ import torch
 
 import difflcs
 from difflcs import GoalCost, LCSModel, LCSMPCLayer, _zoo, solve_lcp
+from difflcs._files import load_record, read_json
 from difflcs.errors import BackendNotFoundError, DiffLCSError
 
 GROUPS = ("library", "solvers", "machine", "extras", "environments")
@@ -207,7 +208,12 @@ def _files() -> str:
 
 def _models() -> str:
     for name in _zoo.names():
-        LCSModel.from_pretrained(f"zoo:{name}")
+        # A system of known physics needs its task to be built again: of that only the files are read.
+        header: Any = read_json(_zoo.find(name) / "config.json")
+        if header["kind"] == "LCSModel":
+            LCSModel.from_pretrained(f"zoo:{name}")
+        else:
+            load_record(_zoo.find(name), header["kind"])
     return f"learned models that ship with the package: {len(_zoo.names())}"
 
 

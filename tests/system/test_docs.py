@@ -198,7 +198,8 @@ def test_every_setting_is_explained(generated):
 
     def flags(group, prefix=""):
         for field in fields(group):
-            value, flag = getattr(group, field.name), f"{prefix}{field.name}".replace("_", "-")
+            value = getattr(group, field.name)
+            flag = f"{prefix}{'no_' * (value is True)}{field.name}".replace("_", "-")
             yield from flags(value, f"{flag}.") if is_dataclass(value) else [(f"--{flag}", value)]
 
     text = generated.fill((DOCS / "settings.md").read_text())
