@@ -100,7 +100,7 @@ def draw_objects(axes: Axes) -> None:
             axes.plot(found.value, place, "o", color=color, ms=5)
     axes.set_xlim(0, 101)
     axes.set_yticks([-y for y in range(len(OBJECTS))], [task.replace("_", " ") for task in OBJECTS])
-    axes.set_xlabel("goals reached [%], ContactLCS after 3 min, the others after 30")
+    axes.set_xlabel("goals reached [%], ContactLCS after 3 min, others after 30")
 
 
 def main() -> None:
