@@ -247,7 +247,8 @@ class Learned:
 
         name = str(source)
         if name.startswith(PREFIX):
-            known, task = card(name), get_task(card(name).task)
+            known = card(name)
+            task = get_task(known.task)
             make: Any = get_method(known.method)
             method = make(backend=known.backend)
             learned = method.rebuild(task, *_files.load_record(path(name), method.kind), name)

@@ -29,13 +29,13 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from successes import success_figures
 
 from difflcs import _files
 from difflcs._checks import check_positive_int
 from difflcs.bench import machine
 from difflcs.errors import InvalidInputError
 from difflcs.planning.pusht import CENTER_OF_MASS, GYRATION, PIXELS, STEPS, PushTPolicy, make_env, tee, tee_pushing
-from difflcs.rl import wilson_interval
 
 EVERY = 10
 """Episodes between two writings."""
@@ -144,12 +144,8 @@ def play(env: Any, policy: PushTPolicy, seed: int, variant: Variant, limit: int 
 def summary(episodes: list[list[float]]) -> dict[str, float]:
     """The figures of a variant."""
     success, steps, coverage, milliseconds, longest = np.array(episodes, float).T
-    low, high = wilson_interval(int(success.sum()), len(success))
     return {
-        "success_rate": float(success.mean()),
-        "ci_low": low,
-        "ci_high": high,
-        "episodes": len(success),
+        **success_figures(success),
         "mean_steps": float(steps.mean()),
         "milliseconds_per_step": float(milliseconds.sum() / steps.sum()),
         "coverage": float(coverage.mean()),

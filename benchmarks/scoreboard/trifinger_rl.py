@@ -28,11 +28,11 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from successes import success_figures
 
 from difflcs import _files
 from difflcs.bench import machine
 from difflcs.errors import MissingDependencyError
-from difflcs.rl import wilson_interval
 
 OWN = "contact-mpc"
 KEYS = ("success_rate", "return", "mean_momentary_success", "transient_success_rate")
@@ -140,12 +140,8 @@ def measure(o: Options) -> dict[str, Any]:
 def summary(rows: list[list[float]]) -> dict[str, Any]:
     """The figures of a policy."""
     success, returns, momentary, transient, milliseconds = np.array(rows).T
-    low, high = wilson_interval(int(success.sum()), len(rows))
     return {
-        "success_rate": float(success.mean()),
-        "ci_low": low,
-        "ci_high": high,
-        "episodes": len(rows),
+        **success_figures(success),
         "mean_return": float(returns.mean()),
         "return_error": float(returns.std(ddof=min(1, len(rows) - 1)) / len(rows) ** 0.5),
         "median_return": float(np.median(returns)),

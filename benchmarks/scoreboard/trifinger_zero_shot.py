@@ -29,11 +29,12 @@ import numpy as np
 import torch
 import tyro
 from numpy.typing import NDArray
+from successes import success_figures
 
 from difflcs import LCSModel, _files
 from difflcs.bench import machine
 from difflcs.errors import MissingDependencyError
-from difflcs.rl import evaluate, get_task, wilson_interval
+from difflcs.rl import evaluate, get_task
 from difflcs.rl.seeding import Stream, episode_seeds
 
 Array = NDArray[np.float64]
@@ -161,12 +162,8 @@ def episode(simulator: OtherSimulator, policy: Any, start: Array, goal: Array, s
 def summary(rows: list[list[float]]) -> dict[str, Any]:
     """The figures of one way of observing."""
     success, distance, angle, way = np.array(rows).T
-    low, high = wilson_interval(int(success.sum()), len(rows))
     return {
-        "success_rate": float(success.mean()),
-        "ci_low": low,
-        "ci_high": high,
-        "episodes": len(rows),
+        **success_figures(success),
         "median_position_error": float(np.median(distance)),
         "median_yaw_error": float(np.median(angle)),
         "within_2_cm": float((distance <= 0.02).mean()),

@@ -1,0 +1,16 @@
+"""What every scoreboard says of its episodes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from difflcs.rl import wilson_interval
+
+
+def success_figures(success: NDArray[np.floating]) -> dict[str, Any]:
+    """Success rate of episodes (N,), 1 or 0 each, with Wilson's 95 % interval, and how many they are."""
+    low, high = wilson_interval(int(success.sum()), len(success))
+    return {"success_rate": float(success.mean()), "ci_low": low, "ci_high": high, "episodes": len(success)}
