@@ -52,8 +52,8 @@ endfunction()
 
 function(difflcs_add_instruction_set target isa lanes)
   set(name ${target}_${isa})
-  add_library(${name} OBJECT ${DIFFLCS_NATIVE}/lcp.cpp ${DIFFLCS_NATIVE}/mpc.cpp
-              ${DIFFLCS_NATIVE}/violation.cpp)
+  add_library(${name} OBJECT ${DIFFLCS_NATIVE}/mpc.cpp ${DIFFLCS_NATIVE}/mpc_adjoint.cpp
+              ${DIFFLCS_NATIVE}/lcp.cpp ${DIFFLCS_NATIVE}/violation.cpp)
   set_target_properties(${name} PROPERTIES POSITION_INDEPENDENT_CODE ON)
   target_compile_definitions(${name} PRIVATE DIFFLCS_ISA=${isa} DIFFLCS_LANES=${lanes})
   target_compile_options(${name} PRIVATE -fno-math-errno -Wno-psabi ${ARGN})
