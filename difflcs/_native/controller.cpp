@@ -71,7 +71,7 @@ void shift(const Numbers& from, int64_t rows, Numbers& to) {
 }  // namespace
 
 Controller::Controller(const void* bytes, size_t size)
-    : kernels_(kernels_for_one()),
+    : kernels_(kernels_for(1)),
       data_(read_controller(bytes, size)),
       driver_(kernels_),
       time_limit_(std::numeric_limits<double>::infinity()) {

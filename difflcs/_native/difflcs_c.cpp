@@ -148,7 +148,7 @@ const char* difflcs_status_name(difflcs_status status) {
 
 const char* difflcs_isa(void) {
   try {
-    return difflcs::kernels_for_one().isa;
+    return difflcs::kernels_for(1).isa;
   } catch (...) {
     return "none";
   }

@@ -62,10 +62,11 @@ const Kernels& kernels() {
   return chosen;
 }
 
-const Kernels& kernels_for_one() {
+const Kernels& kernels_for(int64_t problems) {
 #ifdef DIFFLCS_LANES_avx2
   const char* wanted = std::getenv("DIFFLCS_ISA");
-  if ((!wanted || !*wanted) && kernels().lanes > avx2::table.lanes && __builtin_cpu_supports("avx2"))
+  const bool few = problems <= avx2::table.lanes && avx2::table.lanes < kernels().lanes;
+  if ((!wanted || !*wanted) && few && __builtin_cpu_supports("avx2"))
     return avx2::table;
 #endif
   return kernels();

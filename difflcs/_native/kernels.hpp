@@ -142,8 +142,8 @@ struct Kernels {
 // The best kernels this CPU runs, or those that the environment variable DIFFLCS_ISA names.
 const Kernels& kernels();
 
-// Those for one problem at a time: where lanes would idle, narrow ones take less time (AVX-512 takes 1.4 to 1.8 times
-// as long as AVX2 on the zoo's cube). Both have fused multiply-adds and give the same bits.
-const Kernels& kernels_for_one();
+// Those for so few problems at a time: where lanes would idle, narrow ones take less time (AVX-512 takes 1.4 to 1.8
+// times as long as AVX2 for one problem of the zoo's cube). Both have fused multiply-adds and give the same bits.
+const Kernels& kernels_for(int64_t problems);
 
 }  // namespace difflcs

@@ -231,7 +231,7 @@ void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
   const difflcs::MpcPlans out{x.data(),        u.data(),      lam.data(),     mu.data(),        objective.data(),
                               residual.data(), status.data(), fragile.data(), iterations.data()};
   Threads runner(threads, time_limit);
-  difflcs::MpcDriver(difflcs::kernels()).solve(b, guess, effort, out, runner);
+  difflcs::MpcDriver(difflcs::kernels_for(b.count * starts)).solve(b, guess, effort, out, runner);
 }
 
 void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, Array x, Array u, Array lam, Array mu,

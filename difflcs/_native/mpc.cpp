@@ -1,4 +1,4 @@
-// The batched LCS-MPC solver, compiled once per instruction set (see cmake/kernels.cmake); mpc_adjoint.cpp is its adjoint.
+// The batched LCS-MPC solver, compiled once per instruction set (cmake/kernels.cmake). Its adjoint: mpc_adjoint.cpp.
 //
 // For F + F^T positive definite the relaxed complementarity lam o s = eps has one solution, smooth in (x, u).
 // Eliminating lam leaves a smooth optimal control problem in u alone with box bounds. difflcs/mpc/kkt.py derives its

@@ -1,4 +1,4 @@
-// The variants of the MPC solver and its adjoint: compile-time sizes for the paper's tasks, matrices shared or per element.
+// Variants of the MPC solver and its adjoint: compile-time sizes for the paper's tasks, matrices shared or per element.
 #pragma once
 #include "lanes.hpp"
 #include "sizes.hpp"

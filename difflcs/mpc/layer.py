@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor
 from difflcs._functorch import is_wrapped, runs_eagerly, transforms_active
-from difflcs._recall import Recall
+from difflcs._recall import Recall, worth_keeping
 from difflcs.constraints import StageBounds, as_bound, check_bounds
 from difflcs.cost import CostSequence
 from difflcs.errors import BoundsError, DegenerateWarning, SolveError, SolveWarning
@@ -110,6 +110,7 @@ class LCSMPCLayer(nn.Module):
         self._check_parts()
         self._warned = False
         self._planned: Recall[Planned] = Recall()
+        self._limited: Recall[tuple[Tensor, Tensor]] = Recall()
 
     def _check_parts(self) -> None:
         """What does not depend on a call is refused before the first one."""
@@ -144,13 +145,27 @@ class LCSMPCLayer(nn.Module):
         support = getattr(self.lcs if system is None else system, "action_support", None)
         if support is None:
             return self.u_min, self.u_max
-        low, high = support.to(self.u_min)
-        limits = torch.where(self.u_min < low, low, self.u_min), torch.where(self.u_max > high, high, self.u_max)
+        low, high = support.to(self.u_min).unbind()
+        limits = self.u_min.clamp_min(low), self.u_max.clamp_max(high)
         if not is_wrapped(limits[0]) and bool((limits[0] > limits[1]).any()):
             raise BoundsError(
                 f"u_min, u_max: expected bounds that meet the actions {low.tolist()} to {high.tolist()} that the model "
                 f"was fitted to, got {self.u_min.tolist()} to {self.u_max.tolist()}; set its action_support to None"
             )
+        return limits
+
+    def _limits(self, system: System) -> tuple[Tensor, Tensor]:
+        """The same, made once where nothing is differentiated."""
+        support = getattr(system, "action_support", None)
+        if support is None or torch.is_grad_enabled() or transforms_active():
+            return self.limits(system)
+        made_of = {"u_min": self.u_min, "u_max": self.u_max, "support": support}
+        kept = self._limited.kept
+        if kept is not None and kept.holds(made_of):
+            return kept.value
+        limits = self.limits(system)
+        if all(worth_keeping(tensor) for tensor in made_of.values()):
+            self._limited.keep(limits, made_of)
         return limits
 
     def extra_repr(self) -> str:
@@ -207,7 +222,7 @@ class LCSMPCLayer(nn.Module):
         inputs.add_cost(self.cost if cost is None else check_cost(cost), goal, reference)
         bounds = self.bounds if bounds is None else check_stage_bounds(bounds, u_min=u_min, u_max=u_max)
         if bounds is None:
-            inputs.tensors |= dict(zip(("u_min", "u_max"), self.limits(system), strict=True))
+            inputs.tensors |= dict(zip(("u_min", "u_max"), self._limits(system), strict=True))
         else:
             inputs.add_bounds(bounds)
         inputs.replace_bound("u_min", u_min)

@@ -123,6 +123,19 @@ def test_a_changed_bound_is_noticed(change, name):
     assert not torch.equal(plan(layer, 3 * X, 3 * GOAL).u, before.u)
 
 
+@pytest.mark.parametrize("change", ["in place", "in place of data", "other data", "as an array"])
+@pytest.mark.parametrize("name", ["u_min", "u_max", "action_support"])
+def test_what_limits_the_actions_is_noticed_with_an_action_support(change, name):
+    layer = make_layer()
+    layer.lcs.action_support = torch.tensor([[-0.3, -0.6], [0.3, 0.6]]).double()
+    before = plan(layer, 5 * X, 5 * GOAL)
+    CHANGES[change](layer.lcs.action_support if name == "action_support" else getattr(layer, name))
+    assert_as_fresh(layer, 5 * X, 5 * GOAL)
+    assert not torch.equal(plan(layer, 5 * X, 5 * GOAL).u, before.u)
+    layer.lcs.action_support = None
+    assert_as_fresh(layer, 5 * X, 5 * GOAL)
+
+
 @pytest.mark.parametrize("name", ["G", "g", "E", "weight"])
 def test_changed_constraints_are_noticed(name):
     constraints = LinearConstraints(
