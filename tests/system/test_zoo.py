@@ -78,12 +78,9 @@ def test_every_model_fits_its_card(name):
     assert hash(card) == hash(zoo.card(f"zoo:{name}"))
 
 
-@pytest.mark.parametrize("name", [n for n in _zoo.names() if zoo.card(n).version != "0.1.0"])
+@pytest.mark.parametrize("name", _zoo.names())
 def test_the_command_of_a_card_trains_that_very_model(monkeypatch, name):
-    """What is a default today was one when it was trained, and the command says the rest.
-
-    The models of 0.1.0 have other settings; their cards hold them.
-    """
+    """What is a default today was one when it was trained, and the command says the rest."""
     pytest.importorskip("tyro")
     card, seen = zoo.card(name), []
     monkeypatch.setattr(cli_train, "train", lambda config, out, **_: seen.append(config) or RunDirectory(out))

@@ -76,7 +76,7 @@ class BatchedBackend(Backend):
     effort: Effort = "default"
     restarts: int | None = None
     tol: float = 1e-8
-    max_iter: int = 600
+    max_iter: int = 1000
     time_limit: float | None = None
     seed: int = 0
     homotopy: float | None = None
