@@ -13,7 +13,7 @@ from typing import Any, Literal
 from difflcs.cost import GoalCost
 from difflcs.rl import TaskSpec, get_method, get_task
 
-Chosen = Literal["ours", "paper", "jin-posa", "authors"]
+Chosen = Literal["ours", "paper", "light", "jin-posa", "authors"]
 """Recipes to choose from on the command line."""
 Protocol = Literal["full", "support", "task"]
 """How a model is deployed in an evaluation, see `PROTOCOLS`."""
@@ -35,7 +35,7 @@ class Recipe:
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Of the method, where it has them; a mapping changes a group of settings."""
     task: Mapping[str, float] = field(default_factory=dict)
-    """Of the task: `horizon` and `action_weight` of the MPC, `sparse_penalty` of the reward."""
+    """Of the task: `horizon`, `action_weight` of the MPC, `sparse_penalty` of the reward, `object_mass` [kg]."""
     protocols: Mapping[str, Sequence[Protocol]] = field(default_factory=dict)
     """Method → the ways in which its models are evaluated; "full" alone if it is not here."""
 
@@ -58,6 +58,8 @@ PAPER = Recipe(
     protocols={"violation": ["full", "support"]},
 )
 """The paper's algorithm. What it leaves open is as in the prior work, or as ours."""
+LIGHT = replace(PAPER, label=f"{PAPER.label}, objects of 10 g", task={**PAPER.task, "object_mass": 0.01})
+"""The same where every object is as light as the cube: the paper names no masses."""
 JIN_POSA = Recipe(
     "as Jin & Posa",
     settings={"n_lam": 5, "warmup": {"noise": 0.0, "action_support": 0.9, "action_support_growth": 1.001}},
@@ -79,6 +81,7 @@ ABLATIONS: Mapping[str, Recipe] = {
 RECIPES: Mapping[str, Recipe] = {
     "ours": Recipe("our recipe", protocols={"violation": ["full", "support"]}),
     "paper": PAPER,
+    "light": LIGHT,
     "jin-posa": JIN_POSA,
     "authors": Recipe("networks drawn anew, as its authors do", {"pddm": {"keep_networks": False}}),
     **ABLATIONS,
@@ -98,6 +101,8 @@ def changed_task(name: str, changes: Mapping[str, float]) -> TaskSpec:
     spec = get_task(name)
     if "horizon" in changes:
         spec = replace(spec, horizon=int(changes["horizon"]))
+    if "object_mass" in changes:
+        spec = replace(spec, env_kwargs={**spec.env_kwargs, "object_mass": changes["object_mass"]})
     if "action_weight" in changes:
         spec = replace(spec, make_cost=partial(_weighted, spec.make_cost, changes["action_weight"]))
     if "sparse_penalty" in changes:

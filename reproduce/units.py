@@ -16,7 +16,7 @@ from difflcs.errors import InvalidInputError
 from difflcs.rl import RunDirectory, TaskSpec, TrainConfig, get_method, get_task, train
 from difflcs.rl.training import Reporter
 
-Artefact = Literal["table1", "curves", "transfer", "ablations"]
+Artefact = Literal["table1", "masses", "curves", "transfer", "ablations"]
 Object = Literal["sugar_box", "fish_can", "mug", "wrench", "clamp", "banana"]
 Method = Literal["lcs-rl", "violation", "ppo", "pddm"]
 PresetName = Literal["paper", "quick", "smoke"]
@@ -34,6 +34,8 @@ METHODS: Mapping[str, Names] = {
 """Methods of the figures → their recipes, see `recipes.RECIPES`."""
 COMPARED = ("violation", "lcs-rl")
 """The methods of Table I."""
+MASSES = ("paper", "light")
+"""Recipes that differ in the mass of the objects alone."""
 TRANSFER = {"scratch": "lcs-rl", "cube": "ppo"}
 """Starts → methods of the transfer figure. From scratch is from a random model; from the final LCS-RL model of the cube
 with the same seed it is the main phase alone: a warm-up on little data would first undo what PPO has taught."""
@@ -130,7 +132,7 @@ def matrix(
 ) -> list[Unit]:
     """The units that artefacts need, each once, what a unit starts from before it: the most important ones first.
 
-    These are Table I; then curves, transfer and ablations; then what is slow. Of each the first seeds come first.
+    These are Table I; then masses, curves, transfer, ablations; then what is slow. Of each the first seeds come first.
     None of `artefacts`, `objects` (the cube is not one), `methods` stands for all; of `recipes` for all on the cube and
     those of the preset on the objects.
     """
@@ -144,6 +146,10 @@ def matrix(
     def table1(seed: int) -> Iterator[Unit]:
         for task in tasks:
             yield from (Unit(task, method, r, seed) for method in COMPARED for r in wanted(method, some))
+
+    def masses(seed: int) -> Iterator[Unit]:
+        for task in tasks:
+            yield from (Unit(task, "lcs-rl", r, seed) for r in wanted("lcs-rl", recipes, MASSES))
 
     def curves(seed: int) -> Iterator[Unit]:
         yield from (Unit("cube", method, r, seed) for method in METHODS for r in wanted(method, recipes))
@@ -160,7 +166,8 @@ def matrix(
                 yield from (Unit(task, m, r, seed) for m, r in ABLATED.values() if wanted(m, (), [r]))
 
     found: list[Unit] = []
-    for name, units in {"table1": table1, "curves": curves, "transfer": transfer, "ablations": ablations}.items():
+    every = {"table1": table1, "masses": masses, "curves": curves, "transfer": transfer, "ablations": ablations}
+    for name, units in every.items():
         if name in artefacts:
             for seed in range(FIRST_SEED, FIRST_SEED + max(preset.seeds, preset.of("pddm").seeds)):
                 found += (unit for unit in units(seed) if seed < FIRST_SEED + preset.of(unit.method).seeds)

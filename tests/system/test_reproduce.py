@@ -31,6 +31,7 @@ import distributed  # noqa: E402
 import fig_learning_curves  # noqa: E402
 import fig_task  # noqa: E402
 import fig_transfer  # noqa: E402
+import masses  # noqa: E402
 import matplotlib.axes  # noqa: E402
 import recipes  # noqa: E402
 import records  # noqa: E402
@@ -127,6 +128,9 @@ def test_matrix_of_a_part():
         ("lcs-rl", "ours"), ("violation", "ours"), ("pddm", "ours"),
     ]  # fmt: skip
     assert {unit.recipe for unit in units.matrix(["table1"], units.PRESETS["smoke"])} == {"ours"}
+    masses = units.matrix(["masses"], one, objects=["mug"])
+    assert masses == [Unit("mug", "lcs-rl", "paper", FIRST), Unit("mug", "lcs-rl", "light", FIRST)]
+    assert [unit.spec.env_kwargs.get("object_mass") for unit in masses] == [None, 0.01]
     ablations = units.matrix(["ablations"], paper)
     assert {unit.task for unit in ablations} == set(units.ABLATION_TASKS)
     assert {unit.seed for unit in ablations} == set(range(FIRST, FIRST + units.ABLATION_SEEDS))
@@ -752,6 +756,7 @@ def test_the_tracked_readme_and_tables_are_those_of_the_tracked_results(tmp_path
     scripts = {
         "table1": table1, "fig_learning_curves": fig_learning_curves, "fig_transfer": fig_transfer,
         "ablations": ablations, "small_models": small_models, "robustness": robustness, "cross_check": cross_check,
+        "masses": masses,
     }  # fmt: skip
     text, tracked = (FOLDER / "README.md").read_text(), records.RESULTS
     readme = tmp_path / "README.md"
@@ -890,6 +895,22 @@ def test_a_small_model_beside_networks(results, capsys):
         records.add(results, "paper", unit_rows(Unit("cube", "pddm", "ours", seed), (0, 1, 2, 3), version="2"))
     assert run_script(small_models.main, capsys, "--results", results)[0] == 0
     assert "at little data holds here." in (results / "small_models.md").read_text()
+
+
+def test_objects_of_two_masses_beside_the_paper(results, capsys):
+    args = "--results", results, "--preset", "paper"
+    assert run_script(masses.main, capsys, *args)[0] == 2  # nothing to draw
+    for seed in range(3):
+        for recipe, mass, end in (("paper", 0.05, 20), ("light", 0.01, 60 + seed)):
+            rows = unit_rows(Unit("mug", "lcs-rl", recipe, seed), (0, 10, 20, end), version="2")
+            records.add(results, "paper", rows.assign(mass=mass))
+    assert run_script(masses.main, capsys, *args)[0] == 0
+    markdown = (results / "masses.md").read_text()
+    assert "| final: 50 g" in markdown
+    (line,) = cells_of(results / "masses.md", "mug")
+    assert [cell.split(" ")[0] for cell in line[-3:]] == ["20.0", "61.0", "44.6"]
+    assert "At 50 g, LCS-RL at the end against the paper's mean: worse on all 1." in markdown
+    assert "At 10 g, LCS-RL at the end against the paper's mean: better on all 1." in markdown
 
 
 # --- bad input --------------------------------------------------------------------------------------
