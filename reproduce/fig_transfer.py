@@ -6,6 +6,7 @@
 import sys
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import report
@@ -62,14 +63,21 @@ def panel(figure: Figure, cells: Cells, stand_in: bool) -> None:
             axes.legend(fontsize=8, frameon=False, loc="lower right")
 
 
+def starts_of(rows: pd.DataFrame, task: str, recipe: str) -> dict[str, Cell | None]:
+    """The results from either start, of the same seeds where there are some."""
+    scratch, cube = (select(rows, task, method, recipe, start) for start, method in TRANSFER.items())
+    if scratch is not None and cube is not None:
+        same: Any = rows[rows.seed.isin(cube.scores.index)]
+        paired = select(same, task, TRANSFER["scratch"], recipe)
+        scratch = scratch if paired is None else paired
+    return {"scratch": scratch, "cube": cube}
+
+
 def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
     """Write a figure for each recipe, and the tables."""
     tables, said, found, figures = Tables(), [], [], {}
     for recipe in METHODS["lcs-rl"]:
-        cells: Cells = {
-            task: {start: select(rows, task, method, recipe, start) for start, method in TRANSFER.items()}
-            for task in OBJECTS
-        }
+        cells: Cells = {task: starts_of(rows, task, recipe) for task in OBJECTS}
         if not any(starts["cube"] for starts in cells.values()):
             continue
         found += [cell for starts in cells.values() for cell in starts.values() if cell is not None]

@@ -897,6 +897,15 @@ def test_a_small_model_beside_networks(results, capsys):
     assert "at little data holds here." in (results / "small_models.md").read_text()
 
 
+def test_transfer_compares_the_same_seeds(results, capsys):
+    for seed in range(10, 15):  # more of them, from scratch alone
+        records.add(results, "paper", unit_rows(Unit("mug", "lcs-rl", "ours", seed), (0, 1, 2, 3), version="2"))
+    assert run_script(fig_transfer.main, capsys, "--results", results, "--preset", "paper")[0] == 0
+    success, differences = cells_of(results / "fig_transfer.md", "mug")
+    assert success[-2].startswith("80.0 [")  # not 3
+    assert differences[-2].startswith("+9.0")
+
+
 def test_objects_of_two_masses_beside_the_paper(results, capsys):
     args = "--results", results, "--preset", "paper"
     assert run_script(masses.main, capsys, *args)[0] == 2  # nothing to draw
