@@ -11,10 +11,11 @@ import pandas as pd
 import report
 from records import Cell, select
 from report import Tables, say
-from table1 import LABELS, NOTE, PAPER, STAND_INS, beyond_paper
+from table1 import LABELS, PAPER, STAND_INS, beyond_paper
 from units import MASSES, OBJECTS
 
 WHEN: dict[str, str | float] = {"6 min": 6.0, "final": "final"}
+NOTE = "Success in % of the goals, mean over the seeds; the paper's numbers: mean ± standard deviation."
 Cells = dict[str, list[Cell | None]]
 """Mass → results on each object."""
 

@@ -110,6 +110,8 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
             f"LCS-RL, {label}, at the end against the paper's mean: {report.verdict(beyond_paper(cells['lcs-rl']))}."
         )
         for against, baseline in baselines.items():
+            if not any(report.paired(a, b, "final") for a, b in zip(cells["lcs-rl"], baseline, strict=True)):
+                continue
             tables[f"LCS-RL, {label} − {against}"] = differences(cells["lcs-rl"], baseline)
             pairs = zip(LABELS, cells["lcs-rl"], baseline, strict=True)
             gains = {label: report.paired_estimate(a, b, "final") for label, a, b in pairs}
