@@ -72,7 +72,9 @@ def draw_minutes(axes: Axes) -> None:
             continue
         found = estimates(points)
         seeds = {len(values) for values in points.values()}
-        amount = f"{min(seeds)} seeds" if len(seeds) == 1 else f"{min(seeds)} to {max(seeds)} seeds"
+        amount = (
+            f"{min(seeds)} seed{'s' * (min(seeds) > 1)}" if len(seeds) == 1 else f"{min(seeds)} to {max(seeds)} seeds"
+        )
         axes.plot(list(found), [e.value for e in found.values()], "o-", ms=4, color=color, label=f"{label} ({amount})")
         low, high = [e.low for e in found.values()], [e.high for e in found.values()]
         axes.fill_between(list(found), low, high, color=color, alpha=0.2, linewidth=0)
