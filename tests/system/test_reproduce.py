@@ -101,7 +101,7 @@ def test_matrix_holds_every_unit_once_the_important_ones_first():
     found = units.matrix((), preset)
     assert len(found) == len(set(found))
     assert {unit.seed for unit in found} == {FIRST, FIRST + 1, FIRST + 2}
-    # Cube: six of methods and recipes; objects: five, light ones, two transfers; both tasks of the ablations: all parts.
+    # Cube: six of methods and recipes; objects: five, light ones, two transfers; both tasks of the ablations: all.
     assert len(found) == 3 * (6 + 6 * (5 + 1 + 2) + 2 * len(units.ABLATED)) + 1 * 2
     for position, unit in enumerate(found):
         assert unit.init is None or unit.init in found[:position]
