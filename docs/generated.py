@@ -146,7 +146,8 @@ def methods() -> str:
     """Markdown: how many settings each method has, then a section for each. What was shown before is not repeated."""
     from difflcs.rl import get_method, method_names
 
-    every = {name: setting_rows(get_method(name)()) for name in method_names()}
+    own = [name for name in method_names() if get_method(name).__module__.startswith("difflcs.")]  # and nobody else's
+    every = {name: setting_rows(get_method(name)()) for name in own}
     common = sum(not row[0].startswith("--method") for row in setting_rows(resolve("difflcs.rl.TrainConfig")()))
     counts = {name: sum(bool(row[1]) for row in rows) for name, rows in every.items()}
     distinct = common + len({row[0] for rows in every.values() for row in rows if row[1]})
