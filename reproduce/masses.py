@@ -11,7 +11,7 @@ import pandas as pd
 import report
 from records import Cell, select
 from report import Tables, say
-from table1 import LABELS, PAPER, STAND_INS, beyond_paper
+from table1 import LABELS, PAPER, below, beyond_paper
 from units import MASSES, OBJECTS
 
 WHEN: dict[str, str | float] = {"6 min": 6.0, "final": "final"}
@@ -47,8 +47,7 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
     ]
     tables: Tables = {"LCS-RL by the paper's recipe, by the mass of the objects: success [%]": table(cells)}
     every = [cell for found in cells.values() for cell in found]
-    notes = [STAND_INS] * name.endswith("stand-in") + [NOTE, *report.bullets(words), *report.provenance(every)]
-    report.write_tables(folder, name, tables, notes)
+    report.write_tables(folder, name, tables, below(name, NOTE, words, every))
     return True
 
 

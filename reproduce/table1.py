@@ -5,7 +5,7 @@ Without options the table is drawn from the tracked results. `--rerun --preset s
 
 import itertools
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -81,6 +81,11 @@ def beyond_paper(cells: Cells) -> dict[str, Estimate | None]:
     return {label: found and apart(found, theirs[label]) for label, found in ours.items()}
 
 
+def below(name: str, note: str, words: Sequence[str], cells: Cells) -> list[str]:
+    """What stands below a table: whether the objects are stand-ins, a note, sentences, where the numbers come from."""
+    return [STAND_INS] * name.endswith("stand-in") + [note, *report.bullets(words), *report.provenance(cells)]
+
+
 def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
     """Write the tables of all recipes that there are results of."""
     tables, words, found = Tables(), [], Cells()
@@ -122,8 +127,7 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
         columns = {"object": [*LABELS, "all six"], **{label: column(cells, "final") for label, cells in prior.items()}}
         tables["Violation only, final success, by recipe and how it is deployed"] = pd.DataFrame(columns)
         words.append(f"The strongest baseline, by the mean over the objects at the end: {strongest}.")
-    notes = [STAND_INS] * name.endswith("stand-in") + [NOTE, *report.bullets(words), *report.provenance(found)]
-    report.write_tables(folder, name, tables, notes)
+    report.write_tables(folder, name, tables, below(name, NOTE, words, found))
     return True
 
 
