@@ -132,6 +132,19 @@ def build() -> type[Build]:
     return Build
 
 
+@pytest.fixture(scope="module", autouse=True)
+def registries():
+    """What a file registers is gone after it: no other file finds it, in whatever order a process runs them."""
+    from difflcs.mpc.backends import base
+    from difflcs.rl import methods, tasks
+
+    tasks.task_names()  # installed packages register theirs once
+    with pytest.MonkeyPatch.context() as patch:
+        for module, name in ((base, "REGISTRY"), (methods, "_REGISTRY"), (tasks, "_REGISTRY")):
+            patch.setattr(module, name, dict(getattr(module, name)))
+        yield
+
+
 @pytest.fixture
 def one_thread():
     """Threads cost more than they bring on problems as small as those of the tests."""

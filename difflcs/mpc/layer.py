@@ -155,7 +155,7 @@ class LCSMPCLayer(nn.Module):
         return limits
 
     def _limits(self, system: System) -> tuple[Tensor, Tensor]:
-        """The same, made once where nothing is differentiated."""
+        """What `limits` gives a call, made once where nothing is differentiated."""
         support = getattr(system, "action_support", None)
         if support is None or torch.is_grad_enabled() or transforms_active():
             return self.limits(system)

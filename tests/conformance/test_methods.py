@@ -42,8 +42,8 @@ LARGER = make_task(size=3)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def registered() -> None:
-    """Not while the tests are collected: no other file is to find these among the registered ones."""
+def registered(registries) -> None:
+    """A task and a method for this file alone."""
     register_task(TOY)
     register_method(SearchMethod)
 
