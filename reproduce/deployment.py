@@ -4,10 +4,12 @@
 """
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import torch
 from units import Unit
 
 from difflcs._files import write_atomically
@@ -52,7 +54,8 @@ class Deployments(Reporter):
         run = RunDirectory.open(self.run)
         # After an interruption the log may be ahead of the checkpoint by one row, which will be written anew.
         latest = load_checkpoint(run.checkpoints)["iteration"]
-        steps = [int(row["env_steps"]) for row in run.rows() if int(row["iteration"]) <= latest][-2:]
+        logged = [row for row in run.rows() if int(row["iteration"]) <= latest][-2:]
+        steps = [int(row["env_steps"]) for row in logged]
         per_minute = self.unit.spec.steps_per_minute
         previous, now = steps if len(steps) == 2 else (-1, *steps)
         goals, minutes = goals_due(self.schedule, previous, now, per_minute), round(now / per_minute, 6)
@@ -60,13 +63,26 @@ class Deployments(Reporter):
         done = set(known.protocol[known.minutes == minutes])
         for protocol in self.protocols if goals else ():
             if protocol not in done:
-                new = self.measure(run, protocol, minutes, goals)
+                start = time.perf_counter()
+                numbers = self.of_training(run, protocol, logged[-1], goals) or self.measure(run, protocol, goals)
+                row = {"protocol": protocol, "minutes": minutes, **numbers, "seconds": time.perf_counter() - start}
+                new = pd.DataFrame([row])
                 known = pd.concat([known, new]) if len(known) else new
                 write_atomically(self.file, known.to_csv(index=False).encode())
 
-    def measure(self, run: RunDirectory, protocol: str, minutes: float, goals: int) -> pd.DataFrame:
-        """One evaluation of the latest checkpoint, as a row."""
-        start = time.perf_counter()
+    def of_training(
+        self, run: RunDirectory, protocol: str, logged: Mapping[str, str], goals: int
+    ) -> dict[str, float] | None:
+        """NUMBERS of the training's own evaluation, where it was this very one: in a support as wide as the bounds."""
+        if protocol != "support" or logged["evaluation_goals"] != str(goals):
+            return None
+        pairs = zip(saved_bounds(run), self.unit.spec.bounds, strict=True)
+        if not all(torch.equal(mine, full) for mine, full in pairs):
+            return None
+        return {name: float(logged[f"evaluation_{name}"]) for name in NUMBERS}
+
+    def measure(self, run: RunDirectory, protocol: str, goals: int) -> dict[str, float]:
+        """NUMBERS of one evaluation of the latest checkpoint."""
         spec: Any = get_task(self.unit.task) if protocol == "task" else self.unit.spec
         bounds = saved_bounds(run) if protocol == "support" else (None, None)
         envs = spec.make_envs(min(EVALUATION_ENVS, goals), threads=1)
@@ -75,6 +91,4 @@ class Deployments(Reporter):
             found = evaluate(envs, load_policy(run, spec), goals, seed, steps, *bounds)
         finally:
             envs.close()
-        numbers = {name: getattr(found, name) for name in NUMBERS}
-        row = {"protocol": protocol, "minutes": minutes, **numbers, "seconds": time.perf_counter() - start}
-        return pd.DataFrame([row])
+        return {name: getattr(found, name) for name in NUMBERS}

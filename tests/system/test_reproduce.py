@@ -183,11 +183,11 @@ def test_the_same_model_is_deployed_in_several_ways(tmp_path, one_thread, monkey
     (job,) = make_jobs([Unit("cube", "violation", "jin-posa", FIRST)], tmp_path).values()
     calls, measure = [], deployment.Deployments.measure
 
-    def counted(self, run, protocol, minutes, goals):
+    def counted(self, run, protocol, goals):
         calls.append(protocol)
         if len(calls) == 2:
             raise KeyboardInterrupt  # after a checkpoint, before all ways of it are measured
-        return measure(self, run, protocol, minutes, goals)
+        return measure(self, run, protocol, goals)
 
     monkeypatch.setattr(deployment.Deployments, "measure", counted)
     with pytest.raises(KeyboardInterrupt):
@@ -198,6 +198,24 @@ def test_the_same_model_is_deployed_in_several_ways(tmp_path, one_thread, monkey
     assert list(rows["at"]) == [0.2, 0.5] * 2
     undisturbed, _ = worker.execute(replace(job, work=tmp_path / "undisturbed"))
     pd.testing.assert_frame_equal(rows.drop(columns=TIMES), undisturbed.drop(columns=TIMES))
+
+
+def test_what_the_training_has_evaluated_itself_is_not_evaluated_again(tmp_path, one_thread, monkeypatch):
+    preset = replace(TINY, evaluate_at=(0.0, *TINY.evaluate_at))
+    (job,) = make_jobs([Unit("cube", "violation", "ours", FIRST)], tmp_path, preset).values()
+    calls, measure = [], deployment.Deployments.measure
+
+    def counted(self, run, protocol, goals):
+        calls.append(protocol)
+        return measure(self, run, protocol, goals)
+
+    monkeypatch.setattr(deployment.Deployments, "measure", counted)
+    rows, _ = worker.execute(job)
+    assert calls == ["support"] * 2  # before any data the support is as wide as the bounds, and narrower later
+    monkeypatch.setattr(deployment.Deployments, "of_training", lambda *_: None)
+    all_measured, _ = worker.execute(replace(job, work=tmp_path / "all"))
+    assert calls == ["support"] * 5
+    pd.testing.assert_frame_equal(rows.drop(columns=TIMES), all_measured.drop(columns=TIMES))
 
 
 def test_key_changes_with_everything_that_decides_a_result_and_with_nothing_else(monkeypatch):
