@@ -248,8 +248,9 @@ def success(record: dict) -> str:
 
 def objects(record: dict) -> str:
     """Success on the objects: of one training over minutes of data, and of all seeds at the end."""
-    few = [row for row in record["rows"] if row["seed"] == 0 and row["goals"] == 250]
-    many = [row for row in record["rows"] if row["goals"] == 1000 and row["minutes"] == row["total_minutes"] == 3]
+    told = [row for row in record["rows"] if row["method"] == "contact-lcs"]
+    few = [row for row in told if row["seed"] == 0 and row["goals"] == 250]
+    many = [row for row in told if row["goals"] == 1000 and row["minutes"] == row["total_minutes"] == 3]
     minutes = sorted({row["minutes"] for row in few})
     tasks = list(dict.fromkeys(row["task"] for row in few))
     rows = []
@@ -260,6 +261,27 @@ def objects(record: dict) -> str:
         rows.append([task.replace("_", " "), *(one.get(m, "") for m in minutes), mean, f"{len(found)}"])
     head = ["", *(f"{m:g} min" for m in minutes), "3 min, all seeds: mean and range", "seeds"]
     return table(head, rows)
+
+
+METHODS = {"contact-lcs": "ContactLCS", "lcs-rl": "LCS-RL", "pddm": "PDDM"}
+
+
+def methods(record: dict) -> str:
+    """Success over minutes of data on the cube: mean over the seeds, and the least."""
+    of_cube = [row for row in record["rows"] if row["task"] == "cube"]
+    minutes = sorted({row["minutes"] for row in of_cube})
+    rows = []
+    for method, label in METHODS.items():
+        own = [row for row in of_cube if row["method"] == method]
+        goals = max((row["goals"] for row in own), default=0)
+        own = [row for row in own if row["goals"] == goals]
+        cells = []
+        for minute in minutes:
+            rates = {row["seed"]: 100 * row["success_rate"] for row in own if row["minutes"] == minute}
+            cells.append(f"{sum(rates.values()) / len(rates):.1f} ({min(rates.values()):.1f})" if rates else "")
+        if own:
+            rows.append([label, own[0]["told"], *cells, f"{len({row['seed'] for row in own})} × {goals}"])
+    return table(["", "told", *(f"{m:g} min" for m in minutes), "seeds × goals"], rows)
 
 
 VARIANTS = {
@@ -330,12 +352,13 @@ RACE: dict[str, Callable[[dict], str]] = {
 # Record → part → table.
 TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "race": RACE,
+    "race_avx2": {"best": best("contact"), "machine": machine},
     "optima": {"efforts": efforts},
     "scale": {"sizes": sizes},
     "latency": {"ways": latency},
     "delay": {"ways": delay},
     "physics": {"errors": errors},
-    "objects": {"success": objects},
+    "objects": {"success": objects, "methods": methods},
     "box_to_pose": {"success": success},
     "pusht": {"variants": pusht, "published": published},
 }

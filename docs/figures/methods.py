@@ -35,28 +35,29 @@ STYLES = {
     "violation": ("violation loss only, told nothing", "#0072b2"),
 }
 """Methods → names with what they are told, colours."""
-GOALS = 1000
-"""Of the evaluations that are taken from objects.json."""
 
 
-def told(task: str) -> Points:
-    """`contact-lcs`: without PPO up to the end of its fit, minute 3, with it after that."""
+def recorded(task: str, method: str) -> Points:
+    """From objects.json, of its largest evaluations. ContactLCS is without PPO up to minute 3, with it after that."""
+    rows = json.loads((ROOT / "benchmarks" / "results" / "objects.json").read_text())["rows"]
+    rows = [row for row in rows if (row["task"], row["method"]) == (task, method)]
+    goals = max((row["goals"] for row in rows), default=0)
     points: dict[float, dict[int, float]] = defaultdict(dict)
-    for row in json.loads((ROOT / "benchmarks" / "results" / "objects.json").read_text())["rows"]:
-        if (row["task"], row["method"], row["goals"]) == (task, "contact-lcs", GOALS):
+    for row in rows:
+        if row["goals"] == goals:
             points[float(row["minutes"])][row["seed"]] = 100 * row["success_rate"]
     return {minute: list(seeds.values()) for minute, seeds in sorted(points.items())}
 
 
-def untold(task: str, method: str) -> Points:
-    """The others, by their default settings."""
+def reproduced(task: str, method: str) -> Points:
+    """From the runs of reproduce/, by the default settings."""
     cell = select(read(path_of(ROOT / "reproduce" / "results", "paper")), task, method, "ours")
     return {} if cell is None else {at: list(cell.at(at)) for at in cell.scores.columns}
 
 
 def points_of(task: str, method: str) -> Points:
     """Of one method on one object."""
-    return told(task) if method == "contact-lcs" else untold(task, method)
+    return recorded(task, method) or reproduced(task, method)
 
 
 def estimates(points: Points) -> dict[float, Estimate]:
