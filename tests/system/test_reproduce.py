@@ -623,6 +623,17 @@ def test_table1_shows_ours_beside_the_paper(results, capsys):
     assert "LCS-RL, our recipe, at the end against the paper's mean: better on all 1." in markdown
 
 
+@pytest.mark.parametrize("last", [20, 21])
+def test_table1_says_where_two_deployments_are_one(results, capsys, last):
+    unit = Unit("mug", "violation", "paper", 0)
+    both = [unit_rows(unit, (0, 20, 20, 20)), unit_rows(unit, (0, 30, 30, last), protocol="support")]
+    for seed in range(3):
+        records.add(results, "paper", pd.concat(both).assign(seed=seed))
+    assert run_script(table1.main, capsys, "--results", results)[0] == 0
+    said = "in its support: at the end the same with full bounds" in (results / "table1.md").read_text()
+    assert said == (last == 20)
+
+
 def test_over_all_objects_the_middle_half_counts(tmp_path, capsys):
     for task, value in zip(OBJECTS, (0, 50, 60, 60, 70, 100), strict=True):
         for seed in range(2):
