@@ -628,7 +628,7 @@ def test_table1_says_where_two_deployments_are_one(results, capsys, last):
     unit = Unit("mug", "violation", "paper", 0)
     both = [unit_rows(unit, (0, 20, 20, 20)), unit_rows(unit, (0, 30, 30, last), protocol="support")]
     for seed in range(3):
-        records.add(results, "paper", pd.concat(both).assign(seed=seed))
+        records.add(results, "paper", pd.concat(both, ignore_index=True).assign(seed=seed))
     assert run_script(table1.main, capsys, "--results", results)[0] == 0
     said = "in its support: at the end the same with full bounds" in (results / "table1.md").read_text()
     assert said == (last == 20)
