@@ -280,7 +280,7 @@ def methods(record: dict) -> str:
             rates = {row["seed"]: 100 * row["success_rate"] for row in own if row["minutes"] == minute}
             cells.append(f"{sum(rates.values()) / len(rates):.1f} ({min(rates.values()):.1f})" if rates else "")
         if own:
-            rows.append([label, own[0]["told"], *cells, f"{len({row['seed'] for row in own})} × {goals}"])
+            rows.append([label, own[0]["told"].split(" of ")[0], *cells, f"{len({row['seed'] for row in own})} × {goals}"])
     return table(["", "told", *(f"{m:g} min" for m in minutes), "seeds × goals"], rows)
 
 
