@@ -279,8 +279,9 @@ def methods(record: dict) -> str:
         for minute in minutes:
             rates = {row["seed"]: 100 * row["success_rate"] for row in own if row["minutes"] == minute}
             cells.append(f"{sum(rates.values()) / len(rates):.1f} ({min(rates.values()):.1f})" if rates else "")
+        seeds = len({row["seed"] for row in own})
         if own:
-            rows.append([label, own[0]["told"].split(" of ")[0], *cells, f"{len({row['seed'] for row in own})} × {goals}"])
+            rows.append([label, own[0]["told"].split(" of ")[0], *cells, f"{seeds} × {goals}"])
     return table(["", "told", *(f"{m:g} min" for m in minutes), "seeds × goals"], rows)
 
 
@@ -352,7 +353,7 @@ RACE: dict[str, Callable[[dict], str]] = {
 # Record → part → table.
 TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "race": RACE,
-    "race_avx2": {"best": best("contact"), "machine": machine},
+    "race_avx2": {"best": best("contact")},
     "optima": {"efforts": efforts},
     "scale": {"sizes": sizes},
     "latency": {"ways": latency},
