@@ -266,22 +266,25 @@ def objects(record: dict) -> str:
 METHODS = {"contact-lcs": "ContactLCS", "lcs-rl": "LCS-RL", "pddm": "PDDM"}
 
 
+def largest(record: dict, task: str, method: str) -> list[dict]:
+    """The evaluations of a method on an object that have the most goals."""
+    own = [row for row in record["rows"] if (row["task"], row["method"]) == (task, method)]
+    goals = max((row["goals"] for row in own), default=0)
+    return [row for row in own if row["goals"] == goals]
+
+
 def methods(record: dict) -> str:
     """Success over minutes of data on the cube: mean over the seeds, and the least."""
-    of_cube = [row for row in record["rows"] if row["task"] == "cube"]
-    minutes = sorted({row["minutes"] for row in of_cube})
+    minutes = sorted({row["minutes"] for row in record["rows"] if row["task"] == "cube"})
     rows = []
     for method, label in METHODS.items():
-        own = [row for row in of_cube if row["method"] == method]
-        goals = max((row["goals"] for row in own), default=0)
-        own = [row for row in own if row["goals"] == goals]
-        cells = []
+        own, cells = largest(record, "cube", method), []
         for minute in minutes:
             rates = {row["seed"]: 100 * row["success_rate"] for row in own if row["minutes"] == minute}
             cells.append(f"{sum(rates.values()) / len(rates):.1f} ({min(rates.values()):.1f})" if rates else "")
         seeds = len({row["seed"] for row in own})
         if own:
-            rows.append([label, own[0]["told"].split(" of ")[0], *cells, f"{seeds} × {goals}"])
+            rows.append([label, own[0]["told"].split(" of ")[0], *cells, f"{seeds} × {own[0]['goals']}"])
     return table(["", "told", *(f"{m:g} min" for m in minutes), "seeds × goals"], rows)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 import report
-from recipes import PROTOCOLS, RECIPES
+from recipes import RECIPES
 from records import Cell, select
 from report import Tables, say
 from stats import Estimate, apart, bootstrap, published
@@ -127,12 +127,10 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
         columns = {"object": [*LABELS, "all six"], **{label: column(cells, "final") for label, cells in prior.items()}}
         tables["Violation only, final success, by recipe and how it is deployed"] = pd.DataFrame(columns)
         words.append(f"The strongest baseline, by the mean over the objects at the end: {strongest}.")
-        words += [
-            f"{label}: at the end the same with full bounds, to which the support has grown."
-            for label in columns
-            if (full := label.removesuffix(f", {PROTOCOLS['support']}")) != label
-            and columns.get(full) == columns[label]
-        ]
+        for recipe in ("ours", "paper"):
+            full, support = (report.name_of("violation", recipe, protocol=way) for way in ("full", "support"))
+            if support in columns and columns.get(full) == columns[support]:
+                words.append(f"{support}: at the end the same with full bounds, to which the support has grown.")
     report.write_tables(folder, name, tables, below(name, NOTE, words, found))
     return True
 

@@ -21,9 +21,10 @@ from matplotlib.axes import Axes
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
-sys.path.insert(0, str(ROOT / "reproduce"))
-from records import path_of, read, select  # noqa: E402 (from the folder above)
+sys.path[:0] = [str(ROOT / "reproduce"), str(HERE.parent)]
+from records import path_of, read, select  # noqa: E402 (from the folders above)
 from stats import Estimate, bootstrap  # noqa: E402
+from tables import largest  # noqa: E402
 
 Points = dict[float, list[float]]
 """Minutes of data → success [%] of each seed."""
@@ -39,13 +40,10 @@ STYLES = {
 
 def recorded(task: str, method: str) -> Points:
     """From objects.json, of its largest evaluations. ContactLCS is without PPO up to minute 3, with it after that."""
-    rows = json.loads((ROOT / "benchmarks" / "results" / "objects.json").read_text())["rows"]
-    rows = [row for row in rows if (row["task"], row["method"]) == (task, method)]
-    goals = max((row["goals"] for row in rows), default=0)
+    record = json.loads((ROOT / "benchmarks" / "results" / "objects.json").read_text())
     points: dict[float, dict[int, float]] = defaultdict(dict)
-    for row in rows:
-        if row["goals"] == goals:
-            points[float(row["minutes"])][row["seed"]] = 100 * row["success_rate"]
+    for row in largest(record, task, method):
+        points[float(row["minutes"])][row["seed"]] = 100 * row["success_rate"]
     return {minute: list(seeds.values()) for minute, seeds in sorted(points.items())}
 
 
