@@ -56,6 +56,8 @@ class Compute:
     """All by default."""
     recipes: tuple[Chosen, ...] = ()
     """By default all; on the objects with the presets quick and smoke ours alone."""
+    missing: bool = False
+    """Leave out what is in the results already, wherever it was computed; by default only what is in --work."""
     workers: int | None = None
     """Processes on this machine, one core each; the number of cores by default."""
     scheduler: str | None = None
@@ -81,6 +83,14 @@ def make_jobs(wanted: Sequence[Unit], preset: Preset, work: Path) -> list[Job]:
     if stand_ins:
         print(f"no YCB meshes of {', '.join(stand_ins)} (`difflcs assets download`): stand-ins, with results apart")
     return [Job(unit, preset, units.key_of(unit, preset, objects), work.resolve()) for unit in wanted]
+
+
+def still_missing(jobs: Sequence[Job], results: Sequence[pd.DataFrame]) -> list[Job]:
+    """The jobs without results, and those that they start from, whose runs they need."""
+    known = {tuple(row) for rows in results for row in rows[records.IDENTITY].itertuples(index=False)}
+    missing = [job for job in jobs if job.identity not in known]
+    starts = {job.unit.init for job in missing}
+    return [job for job in jobs if job in missing or job.unit in starts]
 
 
 def compute(
@@ -166,16 +176,17 @@ def run(options: Compute, artefacts: Sequence[str]) -> int:
     preset = units.PRESETS[options.preset or "quick"]
     preset = preset.with_amounts(options.seeds, options.goals)
     wanted = units.matrix(artefacts, preset, options.objects, options.methods, options.recipes)
-    for stand_in in (False, True):
-        records.read(records.path_of(options.results, preset.name, stand_in))  # an error now, not after hours
-    jobs = make_jobs(wanted, preset, options.work)
+    # An error in a file of results comes now, not after hours.
+    known = [records.read(records.path_of(options.results, preset.name, stand_in)) for stand_in in (False, True)]
+    every = make_jobs(wanted, preset, options.work)
+    jobs = still_missing(every, known) if options.missing else every
     finished = [rows for job in jobs if (rows := job.result()) is not None]
     store = partial(records.add, options.results, preset.name)
     for rows in finished:
         store(rows)
     print(
-        f"{preset.name}: {len(jobs)} units of {preset.evaluate_at[-1]:g} minutes of data, {preset.seeds} seeds, "
-        f"{preset.final_goals} goals; {len(finished)} finished before"
+        f"{preset.name}: {len(every)} units of {preset.evaluate_at[-1]:g} minutes of data, {preset.seeds} seeds, "
+        f"{preset.final_goals} goals; {len(every) - len(jobs) + len(finished)} finished before"
     )
     if len(finished) == len(jobs):
         return 0

@@ -43,6 +43,12 @@ class Job:
         """Holds all of the unit: `run`, `result.csv` when that is finished, `error.txt` after a failure."""
         return self.work / "-".join(map(str, (*asdict(self.unit).values(), self.key)))
 
+    @property
+    def identity(self) -> tuple[Any, ...]:
+        """The values of `records.IDENTITY` in its results."""
+        values = {**asdict(self.unit), "key": self.key}
+        return tuple(values[name] for name in records.IDENTITY)
+
     def result(self) -> pd.DataFrame | None:
         """Its evaluations, see `records.COLUMNS`, if its folder holds those of this unit with this key, and the run."""
         mine = {**asdict(self.unit), "key": self.key}

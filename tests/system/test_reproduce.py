@@ -393,6 +393,33 @@ def test_failures_stop_what_depends_on_them_and_nothing_else_and_are_tried_again
     assert received == "['config.json', 'received']"  # the run of what it starts from
 
 
+def test_only_what_is_missing_in_the_results_is_computed(tmp_path, capsys):
+    jobs = make_jobs(units.matrix(["transfer"], TINY, objects=["mug"], recipes=["ours"]), tmp_path)
+
+    def missing(*known):
+        rows = [unit_rows(job.unit, (0, 10, 20, 50), key=job.key) for unit, job in jobs.items() if unit in known]
+        return [job.unit for job in runs.still_missing(list(jobs.values()), rows)]
+
+    assert missing() == list(jobs) == [SCRATCH, CUBE, TRANSFER]
+    assert missing(*jobs) == []
+    assert missing(SCRATCH) == [CUBE, TRANSFER]
+    assert missing(SCRATCH, CUBE) == [CUBE, TRANSFER]  # the run that it starts from is not in the results
+    assert missing(CUBE, TRANSFER) == [SCRATCH]
+    stale = unit_rows(SCRATCH, (0, 10, 20, 50), key="0123456789ab")
+    assert SCRATCH in [job.unit for job in runs.still_missing(list(jobs.values()), [stale])]
+
+    arguments = ("--preset", "smoke", "--artefacts", "table1", "--objects", "mug", "--methods", "violation")
+    preset = units.PRESETS["smoke"]
+    (job,) = make_jobs([replace(SCRATCH, method="violation")], tmp_path / "elsewhere", preset).values()
+    records.add(tmp_path, "smoke", unit_rows(job.unit, (0, 10, 20, 50), "stand_in", key=job.key))
+    folders = ("--work", tmp_path / "work", "--results", tmp_path)
+    code, out, err = run_script(run_runs, capsys, *arguments, "--missing", *folders)
+    assert code == 0, err
+    assert "1 units" in out
+    assert "1 finished before" in out
+    assert not (tmp_path / "work").exists()
+
+
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # sockets of a killed Dask worker
 def test_a_worker_that_always_dies_is_a_failure_of_its_unit_alone(local, tmp_path):
     jobs = make_jobs([CUBE, SCRATCH], tmp_path)
