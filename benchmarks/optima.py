@@ -35,7 +35,7 @@ EQUAL = 1e-3  # relative difference of costs
 class Options:
     """Comparison of the optima that the efforts reach."""
 
-    problems: int = 32
+    problems: int = 128
     """Problems per model."""
     repetitions: int = 5
     """Solves of each, in turn with the other efforts; the fastest counts."""

@@ -175,7 +175,8 @@ class LinearConstraints(_Constraints):
         G: (..., n_c, n_x).
         g: (..., n_c); +∞ where a row does not count.
         E: (..., n_c, n_u), zero if None.
-        weight: (..., n_c) or a number > 0: price per unit of violation [cost per unit of g]; ∞ or None: hard.
+        weight: (..., n_c) or a number > 0: price per unit of violation [cost per unit of g]; ∞, from 1e300 on, or
+            None: hard.
 
     Raises:
         ShapeError, DTypeError, DeviceError, NonFiniteError: a field does not fit the others.

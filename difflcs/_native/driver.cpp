@@ -7,33 +7,32 @@
 namespace difflcs {
 namespace {
 
-// The actions that a start begins with.
-enum class Actions { none, best, mirrored, random };
+// The actions that a start begins with: none; all at one bound for the first half of the horizon and at the other for
+// the second; or each anywhere between its bounds.
+enum class Actions { none, forth, back, random };
 
 struct Start {
   Actions actions;
   bool released, gauss_newton;  // see MpcStart
-  double first;                 // first relaxation, in parts of the square of the problem's scale
+  double first;                 // see MpcStart
 };
 
 // The sequence of starts. A long homotopy leads most actions to one optimum, which is often the best; a short one stays
-// near where it begins. What lies opposite of the best plan so far, in the middle of the bounds mirrored, is another
-// way round the contacts more often than random actions are.
+// near where it begins. Both find no contact that is far from a plan without it: what begins with the largest actions
+// there are does, and so do random ones.
 Start start_of(int64_t i) {
   constexpr Start first[] = {{Actions::none, true, false, 1.0},
                              {Actions::none, true, true, 1e-3},
-                             {Actions::mirrored, false, false, 0.01},
-                             {Actions::best, false, false, 1.0}};
-  constexpr Start then[] = {{Actions::random, false, false, 0.03},
-                            {Actions::random, false, false, 1.0},
-                            {Actions::mirrored, false, false, 0.1},
-                            {Actions::best, false, false, 10.0}};
-  return i < 4 ? first[i] : then[i % 4];
+                             {Actions::forth, false, false, 0.0},
+                             {Actions::back, false, false, 0.0}};
+  return i < 4 ? first[i] : Start{Actions::random, false, false, 0.0};
 }
 
-// Starts of one round know the best of the rounds before. A round is no wider than the lanes of one vector.
-int64_t end_of_round(int64_t begin) { return begin < 4 ? begin + 2 : begin + 4; }
-
+// Starts of one round run side by side in the lanes of a vector, of which no instruction set but the baseline has fewer.
+constexpr int64_t kRound = 4;
+// Starts with large actions go to the bounds; without a bound a few times as far as the best plan of the rounds before.
+// A bound that is this many times farther than that plan stands for none.
+constexpr double kReach = 3.0, kNone = 100.0;
 // Steps at the target of the homotopy after which starts are compared.
 constexpr int64_t kExplore = 2;
 // Actions that differ by less than this part of their range lead to the same optimum.
@@ -136,7 +135,7 @@ void look_at_inputs(MpcBatch& b, int64_t S, int64_t low, int64_t high) {
 void MpcDriver::Store::resize(const MpcBatch& batch, int64_t count) {
   const Sizes n(batch);
   x.resize(count * n.x), u.resize(count * n.u), lam.resize(count * n.lam), mu.resize(count * n.mu);
-  for (auto* v : {&objective, &residual, &scale, &gained}) v->resize(count);
+  for (auto* v : {&objective, &residual, &gained}) v->resize(count);
   status.resize(count), fragile.resize(count), iterations.resize(count), element.resize(count), start.resize(count);
 }
 
@@ -195,19 +194,22 @@ void MpcDriver::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start,
   const Start s = start_of(start);
   tried.start[job] = beginning(s, b, effort);
   double* u = tried.u.data() + job * n.u;
-  const double* from = best >= 0 ? tried.u.data() + best * n.u : nullptr;
-  double reach = 1.0;  // of actions without bounds
-  for (int64_t i = 0; from && i < n.u; i++) reach = std::max(reach, 1.0 + std::abs(from[i]));
+  double largest = 1.0;
+  for (int64_t i = 0; best >= 0 && i < n.u; i++) largest = std::max(largest, 1.0 + std::abs(tried.u[best * n.u + i]));
+  const double far = best >= 0 ? kNone * largest : kHuge;
+  const auto end = [&](double bound) {
+    return std::abs(bound) < far ? bound : std::copysign(kReach * largest, bound);
+  };
   for (int64_t i = 0; i < n.u; i++) {
     const Bound bound(b, tried.element[job], i);
-    const double low = std::max(bound.low, -reach), high = std::min(bound.high, reach);
-    if (s.actions == Actions::random)
+    const double low = end(bound.low), high = end(bound.high);
+    const bool first_half = 2 * (i / b.n_u) < b.horizon;
+    if (s.actions == Actions::none)
+      u[i] = bound.clip(0.0);
+    else if (s.actions == Actions::random)
       u[i] = low + uniform(effort.seed, start, i) * (high - low);
-    else if (s.actions == Actions::none || !from)
-      u[i] = 0.0;
     else
-      u[i] = s.actions == Actions::best ? from[i] : (bound.finite() ? bound.low + bound.high : 0.0) - from[i];
-    u[i] = bound.clip(u[i]);
+      u[i] = (s.actions == Actions::forth) == first_half ? high : low;
   }
 }
 
@@ -220,7 +222,7 @@ void MpcDriver::explore(const MpcBatch& batch, const MpcEffort& effort, Runner& 
   MpcSolve o = with(effort, shifted(batch, tried.plans(), first));
   o.u_start = o.u, o.start = tried.start.data() + first, o.explore = kExplore;
   if (guessed) o.lam_start = o.lam, o.mu_start = o.mu;
-  o.scale = tried.scale.data() + first, o.gained = tried.gained.data() + first;
+  o.gained = tried.gained.data() + first;
   run(jobs, o, runner);
 }
 
@@ -260,7 +262,9 @@ void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
   for (int64_t begun = 0; begun < starts && !runner.stopped();) {
     const bool from_guess = guessed && begun == 0;
     const int64_t shift = guessed ? 1 : 0;
-    const int64_t end = from_guess ? 1 : std::min(starts, end_of_round(begun - shift) + shift);
+    // Who goes far without bounds, waits for those that find out how far that is.
+    const int64_t wide = begun == shift && batch.unbounded ? kRound / 2 : kRound;
+    const int64_t end = from_guess ? 1 : std::min(starts, begun + wide);
     for (int64_t j = begun * count; j < end * count; j++) {
       const int64_t e = j % count;
       if (from_guess) {
@@ -271,14 +275,13 @@ void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
         continue;
       }
       begin(batch, effort, j / count - shift, j, best[e]);
-      // The scale is that of the first start that was released.
-      if (!tried.start[j].released) tried.scale[j] = tried.scale[shift * count + e];
     }
     explore(batch, effort, runner, begun * count, (end - begun) * count, from_guess && whole);
     for (int64_t j = begun * count; j < end * count; j++) {
       int64_t& b = best[j % count];
       if (tried.status[j] == kUnreached) continue;
-      if (b < 0 || !(tried.objective[b] <= tried.objective[j])) b = j;
+      const bool sound = b >= 0 && tried.objective[b] < kHuge;  // where the numbers break down it may be no number
+      if (!sound || tried.objective[j] < tried.objective[b]) b = j;
     }
     begun = end;
   }

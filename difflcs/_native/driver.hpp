@@ -61,7 +61,7 @@ class MpcDriver {
  private:
   // The plans of several problems, and how each began.
   struct Store {
-    std::vector<double> x, u, lam, mu, objective, residual, scale, gained;
+    std::vector<double> x, u, lam, mu, objective, residual, gained;
     std::vector<int8_t> status, fragile;
     std::vector<int32_t> iterations;
     std::vector<int64_t> element;

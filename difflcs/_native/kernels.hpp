@@ -61,8 +61,8 @@ struct MpcStart {
   // Whether the actions are first replaced by the feedback law of the problem without contact, rolled out with it.
   bool released;
   bool gauss_newton;  // without the second derivative of the forces
-  double first;       // first relaxation, in parts of the square of the problem's own scale; never below `at_least`
-  double at_least;
+  double first;       // if released: first relaxation, in parts of the square of the mean gap of the contacts then
+  double at_least;    // first relaxation, whatever the problem's scale
 };
 
 // What the solver needs besides the problem, and where its results go.
@@ -79,7 +79,6 @@ struct MpcSolve {
   double certified;  // largest residual of a solved problem
   double *x, *u, *lam, *mu, *objective,
       *residual;    // out; residual as difflcs.mpc.kkt.residual, from the numbers returned
-  double* scale;    // (count,) mean gap of the contacts in the units of the solver: out where released, else in
   double* gained;   // (count,) out: what the last step at the target has saved
   int8_t* status;   // out; unreached where the watch stopped before
   int8_t* fragile;  // out; whether elimination without row exchanges lost digits

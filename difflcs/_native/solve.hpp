@@ -117,7 +117,7 @@ class Solver {
     return problem.cost(at);
   }
 
-  // After the first step of the lanes that were released: the scale of their problems, and where the homotopy starts.
+  // After the first step of the lanes that were released: the scale of their problems says where the homotopy starts.
   void touch(const MpcSolve& o, Mask which) {
     Vec sum = all(0);
     for (int64_t k = 0; k < n.h; k++) {
@@ -128,15 +128,14 @@ class Solver {
       if (!which[l]) continue;
       const int64_t e = lane[l].element, count = n.h * n.l();
       const double mean = count ? sum[l] / double(count) : 0;
-      if (o.scale) o.scale[e] = mean;
       put(&eps, 0, l, first_relaxation(o.start[e], mean));
       lane[l].iterations++, fresh[l] = -1;
     }
     released &= ~which;
   }
 
-  double first_relaxation(const MpcStart& start, double scale) const {
-    const double own = start.first * scale * scale;
+  double first_relaxation(const MpcStart& start, double mean_gap) const {
+    const double own = start.first * mean_gap * mean_gap;
     const double least = start.at_least > batch.relaxation ? start.at_least : batch.relaxation;
     return own > least && own < kHuge ? own : least;
   }
@@ -183,7 +182,7 @@ class Solver {
     lane[l].element = e;
     released[l] = o.start[e].released ? -1 : 0;
     plain[l] = o.start[e].gauss_newton ? -1 : 0;
-    if (!released[l]) eps[l] = first_relaxation(o.start[e], o.scale ? o.scale[e] : 0);
+    if (!released[l]) eps[l] = first_relaxation(o.start[e], 0);
     problem.load(e, l);
     problem.load_multipliers(o.mu_start ? o.mu_start + e * (n.h + 1) * n.c() : nullptr, l);
     put(&problem.rho, 0, l, kPenalty * lane_of(problem.weight[0], l));

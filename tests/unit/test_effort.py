@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from difflcs import GoalCost, LCSMPCLayer, QuadraticCost
+from difflcs import GoalCost, LCSMPCLayer, LCSParams, QuadraticCost
 from difflcs.errors import InvalidInputError
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.systems import cart_pole_between_walls
@@ -51,6 +51,29 @@ def test_an_unstable_plant_starts_from_its_feedback_law():
     assert float((ours <= 1.001 * best).double().mean()) >= 0.9
 
 
+@pytest.mark.parametrize(("limit", "effort"), [(50.0, "default"), (float("inf"), "best")])
+def test_a_contact_that_is_far_is_found(limit, effort):
+    """Three carts in a row: only who strikes the first one at once moves the last one before the end."""
+    gap, dt, carts, horizon = 0.2, 0.1, 3, 10
+    eye = torch.eye(carts, dtype=torch.float64)
+    gaps = eye[1:] - eye[:-1]
+    A = torch.cat([torch.cat([eye, dt * eye], 1), torch.cat([0 * eye, eye], 1)])
+    B, C = torch.cat([dt * dt * eye[:, :1], dt * eye[:, :1]]), torch.cat([dt * dt * gaps.T, dt * gaps.T])
+    measured = torch.cat([gaps, 0 * gaps], 1)
+    F = measured @ C + 1e-3 * torch.eye(carts - 1, dtype=torch.float64)
+    ends = torch.full((carts - 1,), gap, dtype=torch.float64)
+    lcs = LCSParams(A=A, B=B, C=C, d=torch.zeros(6, dtype=torch.float64), D=measured @ A, E=measured @ B, F=F, c=ends)
+    Q = torch.diag(torch.tensor([0.1, 0.0, 10.0, 0.01, 0.01, 0.01], dtype=torch.float64))
+    q = torch.tensor([0.0, 0.0, -3.0, 0.0, 0.0, 0.0], dtype=torch.float64)  # the last one shall be at 0.3
+    R = torch.tensor([[1e-4]], dtype=torch.float64)
+    layer = {"lcs": lcs, "cost": QuadraticCost(Q, R, 10 * Q, q=q, q_final=10 * q), "horizon": horizon}
+    bounds = {"u_min": -limit, "u_max": limit}
+    x0 = torch.randn(32, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 0.1
+    x0[:, 3:] = 0
+    ours, best = (costs(layer | bounds, (x0,), **options) for options in ({"effort": effort}, {"restarts": 64}))
+    assert float((ours <= best + 1e-3 * best.abs()).double().mean()) >= 0.9
+
+
 def test_the_scale_of_the_problem_starts_the_homotopy(build):
     """The same problem in millimetres has the same plan: the starts do not depend on the units."""
     lcs = build.pushing(1, 5)
@@ -77,7 +100,7 @@ def test_the_scale_of_the_problem_starts_the_homotopy(build):
 
 def test_a_guess_is_the_only_start_unless_the_best_is_wanted(build):
     assert [BatchedBackend(effort=e).starts(guessed=True) for e in ("fast", "default", "best")] == [1, 1, 16]
-    assert [BatchedBackend(effort=e).starts(guessed=False) for e in ("fast", "default", "best")] == [1, 3, 16]
+    assert [BatchedBackend(effort=e).starts(guessed=False) for e in ("fast", "default", "best")] == [1, 4, 16]
     assert BatchedBackend(restarts=5).starts(guessed=True) == BatchedBackend(restarts=5).starts(guessed=False) == 5
     layer = {"lcs": build.pushing(1, 8), "cost": COST, "horizon": 5, "u_min": -0.015, "u_max": 0.015}
     generator = torch.Generator().manual_seed(4)

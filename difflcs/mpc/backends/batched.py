@@ -19,7 +19,7 @@ from difflcs.mpc.solution import Primal
 from difflcs.status import solved
 
 Effort = Literal["fast", "default", "best"]
-_STARTS: dict[str, int] = {"fast": 1, "default": 3, "best": 16}
+_STARTS: dict[str, int] = {"fast": 1, "default": 4, "best": 16}
 # A guess is taken to be near the optimum that is wanted.
 _STARTS_GUESSED: dict[str, int] = {"fast": 1, "default": 1, "best": 16}
 
@@ -45,17 +45,17 @@ class BatchedBackend(Backend):
     set.
 
     The problem has local optima. `effort` says how many starts are tried: the feedback law of the plant without
-    contact, along a long homotopy and a short one; the opposite of the best plan so far; that plan once more from far
-    up the homotopy; random actions. Starts are compared after two steps at the relaxation, and only those that may
-    still win are solved to the end. The starts of an element lie side by side in the lanes of a vector, so that one
-    problem with several starts takes little longer than with one; a batch pays for each.
+    contact, along a long homotopy and a short one; the largest actions forth and then back, and back and then forth,
+    which find contacts that are far; random actions. Starts are compared after two steps at the relaxation, and only
+    those that may still win are solved to the end. The starts of an element lie side by side in the lanes of a vector,
+    so that one problem with several starts takes little longer than with one; a batch pays for each.
 
     Every trajectory is judged after the solve by `difflcs.mpc.kkt.residual`, recomputed from the numbers that are
     returned (`difflcs/_native/certificate.hpp`); one that claims to be solved and is not becomes NUMERICAL. Ctrl-C ends
     a solve within a fraction of a second.
 
     Attributes:
-        effort: "fast", one start; "default", three; "best", sixteen. A guess is the first start, and the only one but
+        effort: "fast", one start; "default", four; "best", sixteen. A guess is the first start, and the only one but
             for "best".
         restarts: number of starts, whatever the effort; None: what the effort says.
         tol: projected gradient dJ/du at which a problem is solved, or 1e-12 of the terms that sum to it where that is

@@ -240,8 +240,11 @@ def _judge(form: Form, status, x, u, lam, mu, cost, violation) -> checks.Ratios:
     def put(name: str, i: int, ratio: float) -> None:
         found.setdefault(name, np.zeros(count))[i] = np.inf if np.isnan(ratio) else ratio
 
+    case = form.case
+    if "price" in case.arrays:  # from 1e300 on a constraint is hard, see `Constraints`
+        price = case.arrays["price"]
+        case = replace(case, arrays=case.arrays | {"price": np.where(price >= 1e300, INF, price)})
     for i in range(count):
-        case = form.case
         low, high = (np.stack([case.at(k, i, n) for n in range(case.horizon)]) for k in ("u_min", "u_max"))
         put("bounds", i, 0.0 if ((u[i] >= low) & (u[i] <= high)).all() else np.inf)
         put("false INFEASIBLE of a convex program", i, 0.0)
