@@ -176,9 +176,11 @@ void MpcDriver::judge_constraints(const MpcBatch& batch, const MpcSolve& results
       &context);
 }
 
-void MpcDriver::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
+void MpcDriver::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& asked, const MpcPlans& out,
                       Runner& runner) {
   if (batch.count == 0) return;
+  MpcEffort effort = asked;
+  if (batch.n_lam == 0) effort.starts = 1;  // without contact there is one optimum
   const auto way = effort.starts == 1 ? &MpcDriver::solve_once : &MpcDriver::search;
   const int64_t chunk = std::max(kChunk, kJobs / effort.starts);
   for (int64_t first = 0; first < batch.count; first += chunk)

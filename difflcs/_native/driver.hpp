@@ -55,8 +55,7 @@ class MpcDriver {
   void reserve(const MpcBatch& batch, int64_t starts);
 
   // Solves a batch.
-  void solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
-             Runner& runner);
+  void solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& asked, const MpcPlans& out, Runner& runner);
 
  private:
   // The plans of several problems, and how each began.

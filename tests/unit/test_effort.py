@@ -114,6 +114,17 @@ def test_a_guess_is_the_only_start_unless_the_best_is_wanted(build):
     assert bool((moves.objective < poor.objective * (1 - 1e-3)).any())
 
 
+def test_one_start_is_enough_without_contact(build):
+    lcs = build.pushing(1, 5)
+    free = LCSParams(lcs.A, lcs.B, lcs.C[:, :0], lcs.d, lcs.D[:0], lcs.E[:0], lcs.F[:0, :0], lcs.c[:0])
+    x0, goal = 0.05 * torch.ones(4, 9, dtype=torch.float64), torch.zeros(4, 3, dtype=torch.float64)
+    plans = [
+        LCSMPCLayer(free, COST, 5, -0.015, 0.015, backend=BatchedBackend(effort=e))(x0, goal) for e in ("fast", "best")
+    ]
+    assert torch.equal(plans[0].u, plans[1].u)
+    assert torch.equal(plans[0].iterations, plans[1].iterations)
+
+
 def test_an_effort_that_is_none_is_refused():
     with pytest.raises(InvalidInputError, match="effort: expected one of 'fast', 'default', 'best', got 'huge'"):
         BatchedBackend(effort="huge")  # pyright: ignore[reportArgumentType]

@@ -56,7 +56,7 @@ class BatchedBackend(Backend):
 
     Attributes:
         effort: "fast", one start; "default", four; "best", sixteen. A guess is the first start, and the only one but
-            for "best".
+            for "best". Without contact (n_lam = 0) one start is enough.
         restarts: number of starts, whatever the effort; None: what the effort says.
         tol: projected gradient dJ/du at which a problem is solved, or 1e-12 of the terms that sum to it where that is
             more. It must also be below 1e-7 of its own scale, see `difflcs.mpc.kkt.residual`.
