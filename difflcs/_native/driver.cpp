@@ -292,24 +292,12 @@ void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
 }
 
 // Solves to the end what may still become the best of its element; a start whose last step saved less than it lies
-// behind, or that is on its way to the same plan, is given up.
+// behind, or that is on its way to the same plan, is given up, unless all others of its element fail.
 void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
                        Runner& runner, int64_t first, int64_t count) {
   const Sizes n(batch);
-  finished.resize(batch, effort.starts * count), origin.resize(effort.starts * count);
-  int64_t kept = 0;
-  for (int64_t j = 0; j < effort.starts * count; j++) {
-    if (tried.status[j] == kUnreached || !promising(batch, j, best[j % count])) continue;
-    copy_plan(n, tried.plans(), j, finished.plans(), kept);
-    origin[kept] = j, finished.element[kept] = tried.element[j], finished.start[kept] = at_target(batch);
-    kept++;
-  }
-  MpcBatch jobs = batch;
-  jobs.count = kept, jobs.element = finished.element.data();
-  MpcSolve o = with(effort, finished.plans());
-  o.u_start = o.u, o.lam_start = o.lam, o.mu_start = o.mu, o.start = finished.start.data();
-  if (kept) run(jobs, o, runner);
-
+  const int64_t all = effort.starts * count;
+  finished.resize(batch, all), origin.resize(all);
   std::fill_n(out.status, count, kUnreached), std::fill_n(out.iterations, count, 0);
   const auto consider = [&](const MpcPlans& from, int64_t i, int64_t e, bool only_solved) {
     out.iterations[e] += from.iterations[i];
@@ -317,9 +305,26 @@ void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
     const bool some = out.status[e] == kUnreached && from.status[i] != kUnreached && !only_solved;
     if (better || some) copy_plan(n, from, i, out, e);
   };
-  for (int64_t i = 0; i < kept; i++) consider(finished.plans(), i, origin[i] % count, false);
+  const auto solve = [&](auto wanted) {
+    int64_t kept = 0;
+    for (int64_t j = 0; j < all; j++) {
+      if (tried.status[j] == kUnreached || !wanted(j)) continue;
+      copy_plan(n, tried.plans(), j, finished.plans(), kept);
+      origin[kept] = j, finished.element[kept] = tried.element[j], finished.start[kept] = at_target(batch);
+      kept++;
+    }
+    MpcBatch jobs = batch;
+    jobs.count = kept, jobs.element = finished.element.data();
+    MpcSolve o = with(effort, finished.plans());
+    o.u_start = o.u, o.lam_start = o.lam, o.mu_start = o.mu, o.start = finished.start.data();
+    if (kept) run(jobs, o, runner);
+    for (int64_t i = 0; i < kept; i++) consider(finished.plans(), i, origin[i] % count, false);
+  };
+  solve([&](int64_t j) { return promising(batch, j, best[j % count]); });
   // Some were solved before they were compared.
-  for (int64_t j = 0; j < effort.starts * count; j++) consider(tried.plans(), j, j % count, true);
+  for (int64_t j = 0; j < all; j++) consider(tried.plans(), j, j % count, true);
+  if (!runner.stopped())
+    solve([&](int64_t j) { return !solved(out.status[j % count]) && !promising(batch, j, best[j % count]); });
   for (int64_t e = 0; e < count; e++) {
     if (out.status[e] != kUnreached) continue;
     if (best[e] >= 0) {  // out of time after its starts were compared
