@@ -356,7 +356,7 @@ RACE: dict[str, Callable[[dict], str]] = {
 # Record → part → table.
 TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "race": RACE,
-    "race_avx2": {"best": best("contact")},
+    "race_avx512": {"best": best("contact")},
     "optima": {"efforts": efforts},
     "scale": {"sizes": sizes},
     "latency": {"ways": latency},
