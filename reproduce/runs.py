@@ -88,9 +88,8 @@ def make_jobs(wanted: Sequence[Unit], preset: Preset, work: Path) -> list[Job]:
 def still_missing(jobs: Sequence[Job], results: Sequence[pd.DataFrame]) -> list[Job]:
     """The jobs without results, and those that they start from, whose runs they need."""
     known = {tuple(row) for rows in results for row in rows[records.IDENTITY].itertuples(index=False)}
-    missing = [job for job in jobs if job.identity not in known]
-    starts = {job.unit.init for job in missing}
-    return [job for job in jobs if job in missing or job.unit in starts]
+    starts = {job.unit.init for job in jobs if job.identity not in known}
+    return [job for job in jobs if job.identity not in known or job.unit in starts]
 
 
 def compute(

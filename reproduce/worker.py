@@ -51,10 +51,9 @@ class Job:
 
     def result(self) -> pd.DataFrame | None:
         """Its evaluations, see `records.COLUMNS`, if its folder holds those of this unit with this key, and the run."""
-        mine = {**asdict(self.unit), "key": self.key}
         with contextlib.suppress(CheckpointError):
             rows = records.read(self.folder / "result.csv")
-            known = len(rows) > 0 and (rows[list(mine)] == list(mine.values())).to_numpy().all()
+            known = len(rows) > 0 and (rows[records.IDENTITY] == list(self.identity)).to_numpy().all()
             return rows if known and (self.folder / "run" / "config.json").is_file() else None
 
     def keep(self, rows: pd.DataFrame) -> None:
