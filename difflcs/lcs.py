@@ -19,7 +19,7 @@ from difflcs._checks import (
     describe,
 )
 from difflcs._functorch import runs_eagerly, transforms_active
-from difflcs._recall import Recall, worth_keeping
+from difflcs._recall import Recall
 from difflcs.constraints import check_bounds
 from difflcs.errors import BoundsError, CheckpointError, DTypeError, InvalidInputError, ShapeError
 from difflcs.records import (
@@ -150,13 +150,14 @@ class LCSModel(nn.Module):
             made_of = {name: getattr(self, name) for name in self.parameter_names}
         # Without gradient a robot asks for one system again and again: it is made and checked once.
         recalls = type(self).F is LCSModel.F and not torch.is_grad_enabled() and not transforms_active()
-        kept = self._made.kept if recalls else None
-        if kept is not None and kept.value[0] == self.stiffness and kept.holds(made_of):
-            F = kept.value[1].clone()
+        tensors = tuple(made_of.values())
+        kept = self._made.value(tensors) if recalls else None
+        if kept is not None and kept[0] == self.stiffness:
+            F = kept[1].clone()
             return LCSParams.of_checked({name: F if name == "F" else made_of[name] for name in SYSTEM})
         params = LCSParams(**{name: self.F if name == "F" else made_of[name] for name in SYSTEM})
-        if recalls and all(worth_keeping(tensor) for tensor in made_of.values()):
-            self._made.keep((self.stiffness, params.F.clone()), made_of)
+        if recalls:
+            self._made.keep((self.stiffness, params.F.clone()), tensors)
         return params
 
     @runs_eagerly

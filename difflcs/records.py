@@ -11,6 +11,7 @@ from torch import Tensor
 
 from difflcs._checks import (
     broadcast_batch,
+    check_finite,
     check_integer,
     check_positive_definite,
     check_same_device,
@@ -89,7 +90,8 @@ class _Record(SystemMatrices):
     def __post_init__(self) -> None:
         tensors = self.tensors()
         for name, value in tensors.items():
-            check_tensor(name, value)
+            check_tensor(name, value, finite=False)
+        check_finite(tensors)
         rank = len(self._STAGES)
         for name, dims in SYSTEM.items():
             if tensors[name].ndim < rank + len(dims):

@@ -9,7 +9,9 @@
 #include <cctype>
 #include <chrono>
 #include <cmath>
+#include <cstdint>
 #include <cstdlib>
+#include <cstring>
 #include <iterator>
 #include <limits>
 #include <memory>
@@ -204,7 +206,8 @@ struct Threads final : difflcs::Runner {
   bool stopped() const override { return stop.ending != kGoOn; }
 };
 
-void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, std::optional<Array> u_start,
+// Returns whether every problem is CONVERGED: the quick question, before anyone asks which are not.
+bool solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, std::optional<Array> u_start,
                std::optional<Array> lam_start, std::optional<Array> mu_start, int64_t starts, uint64_t seed,
                double homotopy, double shrink, double tol, int64_t max_iter, double certified, double time_limit,
                int threads, Output<double> x, Output<double> u, Output<double> lam, Output<double> mu,
@@ -224,7 +227,7 @@ void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
   if (!(starts >= 1 && homotopy >= 0 && shrink > 0 && shrink < 1))
     throw std::invalid_argument("starts must be at least 1, the homotopy must fall");
   if (lam_start && !(u_start && mu_start)) throw std::invalid_argument("lam_start needs u_start and mu_start");
-  if (b.count == 0) return;
+  if (b.count == 0) return true;
   const difflcs::MpcGuess guess{u_start ? u_start->data() : nullptr, lam_start ? lam_start->data() : nullptr,
                                 mu_start ? mu_start->data() : nullptr};
   const difflcs::MpcEffort effort{starts, homotopy, shrink, tol, max_iter, certified, seed};
@@ -232,6 +235,8 @@ void solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
                               residual.data(), status.data(), fragile.data(), iterations.data()};
   Threads runner(threads, time_limit);
   difflcs::MpcDriver(difflcs::kernels_for(b.count * starts)).solve(b, guess, effort, out, runner);
+  return std::all_of(status.data(), status.data() + b.count,
+                     [](int8_t code) { return code == int8_t(difflcs::Status::converged); });
 }
 
 void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, Array x, Array u, Array lam, Array mu,
@@ -398,6 +403,20 @@ nb::dict status_codes() {
   return codes;
 }
 
+// Bits instead of `isfinite` and no early end, so that the loop is one of vectors.
+bool all_finite(const std::vector<Array>& arrays) {
+  constexpr uint64_t exponent = 0x7ff0000000000000u;
+  return std::all_of(arrays.begin(), arrays.end(), [](const Array& a) {
+    uint64_t found = 0;
+    for (const double *v = a.data(), *end = v + a.size(); v != end; v++) {
+      uint64_t bits;
+      std::memcpy(&bits, v, sizeof bits);
+      found |= (bits & exponent) == exponent;
+    }
+    return found == 0;
+  });
+}
+
 }  // namespace
 
 NB_MODULE(_kernels, m) {
@@ -412,13 +431,14 @@ NB_MODULE(_kernels, m) {
       [] { return fields(std::begin(difflcs::kViolationFields), std::end(difflcs::kViolationFields)); },
       "The same of the violation loss.");
   m.def("status_codes", &status_codes, "How a solve can end: name and code.");
+  m.def("all_finite", &all_finite, "arrays"_a, "Whether no number of some arrays is NaN or infinite.");
   m.def("solve_lcp", &solve_lcp, "F"_a, "q"_a, "relaxation"_a, "max_iter"_a, "threads"_a, "lam"_a, "w"_a, "status"_a,
         "iterations"_a, "Solve a batch of LCPs into the given arrays.");
   m.def("solve_mpc", &solve_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "u_start"_a.none(),
         "lam_start"_a.none(), "mu_start"_a.none(), "starts"_a, "seed"_a, "homotopy"_a, "shrink"_a, "tol"_a,
         "max_iter"_a, "certified"_a, "time_limit"_a, "threads"_a, "x"_a, "u"_a, "lam"_a, "mu"_a, "objective"_a,
         "residual"_a, "status"_a, "fragile"_a, "iterations"_a,
-        "Solve a batch of LCS-MPC problems into the given arrays.");
+        "Solve a batch of LCS-MPC problems into the given arrays. Returns whether all are CONVERGED.");
   m.def("vjp_mpc", &vjp_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "x"_a, "u"_a, "lam"_a, "mu"_a,
         "x_bar"_a, "u_bar"_a, "lam_bar"_a, "objective_bar"_a, "solved"_a, "pivot"_a, "threads"_a, "gradients"_a,
         "Gradients of the inputs of solved LCS-MPC problems, into the given arrays.");

@@ -10,19 +10,20 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._checks import all_finite, check_positive_definite, check_tensor
+from difflcs._checks import all_finite, check_finite, check_positive_definite, check_tensor
 from difflcs._fields import check_not_nan
 from difflcs._functorch import transforms_active
 from difflcs.errors import DegenerateWarning, DoubleBackwardError
 from difflcs.mpc.backends.base import Backend, Result
-from difflcs.mpc.gather import RANKS, Planned
+from difflcs.mpc.gather import RANKS
 from difflcs.mpc.problem import INPUTS, MAY_BE_INFINITE, MPCProblem
 from difflcs.mpc.solution import Primal
 from difflcs.status import Status
@@ -55,9 +56,6 @@ class Plan:
         batch: batch dimensions that all inputs broadcast to; vmap adds its own in front.
         own: whether the outputs must have memory of their own, because a backward pass may follow.
         unseen: whether nothing has looked at the numbers yet, because the inputs were made under a transform.
-        before: what was planned before, with the same numbers in the inputs `known` and in those that are left out.
-        known: names of inputs that need not be looked at.
-        private: names of inputs whose numbers the problem copies, so that nobody can change them.
         problem, constant, result: what was solved, and how; once it is.
     """
 
@@ -71,9 +69,6 @@ class Plan:
     batch: tuple[int, ...]
     own: bool
     unseen: bool
-    before: Planned | None = None
-    known: Collection[str] = ()
-    private: Collection[str] = ()
     problem: MPCProblem = field(init=False)
     constant: Tensor = field(init=False)
     result: Result = field(init=False)
@@ -85,19 +80,40 @@ class Plan:
         none of them is wrapped.
         """
         values = self._values(tensors)
-        if self.before is None:
-            constant = values.pop("constant")
-            problem = MPCProblem(**values, horizon=self.horizon, relaxation=self.relaxation, barrier=self.barrier)
-        else:
-            constant = values.pop("constant", self.before.constant)
-            problem = self.before.problem.changed(values)
-        self.problem, self.constant = problem, constant
-        result = self.backend.solve(problem, self._guess(guess))
-        violation = problem.violation(result.primal.x, result.primal.u)
-        if problem.n_c:  # of a failed element the numbers can be so large that products of them are none
+        self.constant = values.pop("constant")
+        self.problem = MPCProblem(**values, horizon=self.horizon, relaxation=self.relaxation, barrier=self.barrier)
+        return self.run(self.flat_guess(guess), tensors["x0"])
+
+    def again(self, changed: Mapping[str, Tensor]) -> Plan:
+        """A plan for the same problem with some other inputs, like them in everything but their numbers."""
+        values = self._values(changed)
+        return self._with(values.pop("constant", self.constant), self.problem.changed(values))
+
+    def at(self, x0: Tensor) -> Plan:
+        """The same from other states (batch, n_x), float64 on the CPU."""
+        return self._with(self.constant, self.problem.at(x0))
+
+    def private(self) -> Plan:
+        """The same in memory of its own, before it is solved."""
+        return self._with(self.constant.clone(), self.problem.private())
+
+    def _with(self, constant: Tensor, problem: MPCProblem) -> Plan:
+        other = object.__new__(Plan)
+        vars(other).update(vars(self), constant=constant, problem=problem)
+        vars(other).pop("result", None)
+        return other
+
+    def run(self, start: Primal | None, x0: Tensor) -> tuple[Tensor, ...]:
+        """What `solve` returns, of the problem as it is, on the device of x0."""
+        problem, constant = self.problem, self.constant
+        violation = torch.from_numpy(np.zeros(problem.batch))  # before the solve, and by NumPy, as it is faster
+        result = self.backend.solve(problem, start)
+        if problem.n_c:
+            violation = problem.violation(result.primal.x, result.primal.u)
+            # Of a failed element the numbers can be so large that products of them are none.
             largest = torch.finfo(self.dtype).max
             violation = violation.nan_to_num(nan=largest, posinf=largest)
-        self.result, objective = _within_range(result, self._objective(result), constant.expand(self._size), self.dtype)
+        self.result, objective = _within_range(result, self._objective(result), constant, self.dtype)
         result = self.result
         primal, status, floats = result.primal, result.status, (objective, violation)
         if self.own:  # copies: what the caller does with the outputs must not change the gradient
@@ -106,9 +122,10 @@ class Plan:
             primal, floats = (tuple(v.to(self.dtype) for v in values) for values in (primal, floats))
             primal = (primal[0], _inside(primal[1], problem), *primal[2:])
         outputs = (*primal, floats[0], status, result.iterations, result.kkt_residual, result.solve_time, floats[1])
-        device = tensors["x0"].device
-        if device.type != "cpu":
-            outputs = tuple(v.to(device) for v in outputs)
+        if not x0.is_cpu:
+            outputs = tuple(v.to(x0.device) for v in outputs)
+        if not self.batch:
+            return tuple([v.squeeze(0) for v in outputs])
         return outputs if len(self.batch) == 1 else tuple(v.reshape((*self.batch, *v.shape[1:])) for v in outputs)
 
     def _objective(self, result: Result) -> Tensor:
@@ -130,12 +147,10 @@ class Plan:
 
     def _values(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Name → numbers as `MPCProblem` wants them; checked, as far as nobody did before."""
-        values, size = {}, self._size
+        values, unchecked, size = {}, {}, self._size
         for name, tensor in tensors.items():
-            if name in self.known:
-                continue
             value = tensor.detach()
-            if value.dtype != torch.float64 or value.device.type != "cpu":
+            if value.dtype != torch.float64 or not value.is_cpu:
                 value = value.to("cpu", torch.float64)
             lead = value.shape[: value.ndim - self.rank(name)]
             if lead or name == "x0":
@@ -154,13 +169,15 @@ class Plan:
                 if self.unseen or tensor.requires_grad:
                     check_not_nan(name, value)
             elif self.unseen or name in _COST:
-                check_tensor(name, value)
-            values[name] = value.clone() if name in self.private else value.contiguous()
+                unchecked[name] = value
+            values[name] = value.contiguous()
+        check_finite(unchecked)
         if self.unseen:
             check_positive_definite(values["F"])
         return values
 
-    def _guess(self, tensors: Sequence[Tensor | None]) -> Primal | None:
+    def flat_guess(self, tensors: Sequence[Tensor | None]) -> Primal | None:
+        """A guess as solvers want it."""
         if tensors[0] is None:
             return None
         flat = []
@@ -173,7 +190,9 @@ class Plan:
                 value = value.to("cpu", torch.float64)
             if self.unseen:
                 check_tensor("guess", value)
-            if len(self.batch) != 1 or value.ndim != 3:
+            if not self.batch and value.ndim == 2:
+                value = value.unsqueeze(0)
+            elif len(self.batch) != 1 or value.ndim != 3:
                 value = value.expand(*self.batch, *value.shape[-2:]).reshape(self._size, *value.shape[-2:])
             flat.append(value)
         return Primal(*flat)
@@ -382,7 +401,11 @@ def _within_range(result: Result, objective: Tensor, constant: Tensor, dtype: to
     """
     largest = torch.finfo(dtype).max
     total = objective + constant
-    if dtype == torch.float64 and result.all_converged and all_finite(total):
+    if (
+        dtype == torch.float64
+        and result.all_converged
+        and (math.isfinite(total) if total.numel() == 1 else all_finite(total))
+    ):
         return result, total
     held = total.abs() <= largest
     if dtype != torch.float64:
@@ -441,5 +464,4 @@ def _finite(vjp: Callable[[Tensor], dict[str, Tensor]], solved: Tensor, limit: f
 def _all_finite(values: Sequence[Tensor], limit: float) -> bool:
     if limit < torch.finfo(torch.float64).max:
         return all(bool((v.abs() <= limit).all()) for v in values)
-    # A finite sum has finite terms; large terms can overflow it.
-    return math.isfinite(sum(float(v.sum()) for v in values)) or all(bool(torch.isfinite(v).all()) for v in values)
+    return all_finite(*values)

@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_same_device, check_tensor, describe
-from difflcs._recall import Kept, Numbers, Recall, worth_keeping
 from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds, as_bound
 from difflcs.cost import CostSequence, GoalCost, QuadraticCost
 from difflcs.errors import DTypeError, ShapeError
 from difflcs.lcs import SYSTEM, LCSModule, LCSParams, LCSSequence
-from difflcs.mpc.problem import INPUTS, MPCProblem
+from difflcs.mpc.problem import INPUTS
 from difflcs.mpc.solution import MPCSolution, Primal
 
 RANKS = {**{name: len(dims) for name, dims in INPUTS.items()}, "constant": 0}
 """Number of dimensions of each input of a call behind those of the batch and of the stages."""
-
-OF_GOAL = ("q", "q_final", "constant")
-"""What a `GoalCost` makes of a goal."""
 
 Bound = float | Tensor
 System = LCSModule | LCSParams | LCSSequence
@@ -71,45 +66,21 @@ def check_stage_bounds(bounds: object, **plain: object) -> StageBounds:
     return bounds
 
 
-@dataclass(frozen=True)
-class Planned:
-    """A problem that a layer has planned, for its next call.
-
-    Attributes:
-        form: settings of the layer, and what it was given, without the numbers.
-        problem: its numbers, in memory of its own.
-        constant: of its objective, (batch,).
-    """
-
-    form: tuple
-    problem: MPCProblem
-    constant: Tensor
-
-
 @dataclass
 class Inputs:
     """What one call plans with: tensors by the names of `MPCProblem`, with the cost's constant.
 
     Attributes:
         horizon: stages of the plan.
-        earlier: what the layer has planned before, whose numbers may be these again.
         tensors: name → tensor as the caller gave it, or as the cost made it of a goal.
         by_stage: names of the inputs with a dimension of stages.
         sizes: n_x, n_u, n_lam, n_c.
-        goal: a goal and what maps it to a cost, where that alone makes the fields `OF_GOAL`.
-        known: name → numbers, of the tensors above whose numbers the earlier problem has. Where the goal is among them,
-            `OF_GOAL` are not among the tensors.
     """
 
     horizon: int
-    earlier: Kept[Planned] | None = None
     tensors: dict[str, Tensor] = field(default_factory=dict)
     by_stage: set[str] = field(default_factory=set)
     sizes: dict[str, int] = field(default_factory=dict)
-    goal: dict[str, Tensor] = field(default_factory=dict)
-    known: dict[str, Numbers] = field(default_factory=dict)
-    _each_time: tuple[str, ...] = ("x0",)
-    _late: Callable[[], dict[str, Tensor]] = dict
 
     def add_system(self, lcs: System, x0: Tensor, context: Tensor | None) -> None:
         """The matrices, asked for at these states if it is a module."""
@@ -146,9 +117,8 @@ class Inputs:
                 )
             if goal is not None and reference is not None:
                 raise ShapeError("goal: expected none with a reference, got both; the reference holds a goal per stage")
-            self._each_time = ("x0", *OF_GOAL)
             if goal is not None:
-                fields = self._cost_of_goal(cost, goal)
+                fields = cost.at(goal, self.horizon)
             else:
                 fields = cost.along(reference, self.horizon)  # pyright: ignore[reportArgumentType]
                 self.by_stage.add("q")
@@ -163,18 +133,6 @@ class Inputs:
                 self.check_horizon("cost", cost.horizon)
                 self.by_stage |= cost.by_stage
         self.tensors.update(fields)
-
-    def _cost_of_goal(self, cost: GoalCost, goal: Tensor) -> dict[str, Tensor]:
-        if type(cost).at is not GoalCost.at:
-            return cost.at(goal, self.horizon)
-        self.goal = {"goal": goal, **cost.maps()}
-        if self.earlier is not None and not torch.is_grad_enabled():
-            self.known = self.earlier.same(self.goal)
-        if len(self.known) < len(self.goal):
-            self.known = {}
-            return cost.at(goal, self.horizon)
-        self._late = functools.partial(cost.at, goal, self.horizon)
-        return cost.weights()
 
     def add_bounds(self, bounds: StageBounds) -> None:
         """Bounds by stage."""
@@ -202,75 +160,17 @@ class Inputs:
         self.sizes["n_c"] = constraints.n_c
         self.tensors.update(constraints.tensors())
 
-    def recall(self, settings: tuple) -> Planned | None:
-        """What was planned earlier with the same settings of the layer; `known` becomes which numbers are the same."""
-        if self.earlier is None or self.earlier.value.form != self._form(settings):
-            self.known = {}
-            self.tensors.update(self._late())
-            return None
-        self.known |= self.earlier.same({k: v for k, v in self.tensors.items() if k not in self._each_time})
-        return self.earlier.value
-
-    def new(self) -> dict[str, Tensor]:
-        """What is not known and might be at the next call: what is small, and shared by the batch."""
-        found = {k: v for k, v in self._fresh().items() if k not in self._each_time and not self._lead(k, v)}
-        if self.goal and "goal" not in self.known:
-            goal = self.goal["goal"]
-            if goal.shape[:-1].numel() == 1 and goal.ndim <= self.tensors["x0"].ndim:
-                found |= self.goal
-        return {name: tensor for name, tensor in found.items() if worth_keeping(tensor)}
-
-    def keep(
-        self, planned: Recall[Planned], settings: tuple, new: dict[str, Tensor], problem: MPCProblem, constant: Tensor
-    ) -> None:
-        """Keep a problem for the next call; `new` has memory of its own in it."""
-        planned.keep(Planned(self._form(settings), problem, constant.clone()), new, self.known)
-
     def batch(self) -> torch.Size:
         """Common batch dimensions; a clear error where devices or batch dimensions do not fit."""
-        fresh = self._fresh()  # what is known is on the CPU and has no batch dimensions that others lack
-        found = {self._lead(name, tensor) for name, tensor in fresh.items()} - {torch.Size()}
-        if len(found) <= 1 and all(tensor.is_cpu for tensor in fresh.values()):
+        found = {self._lead(name, tensor) for name, tensor in self.tensors.items()} - {torch.Size()}
+        if len(found) <= 1 and all(tensor.is_cpu for tensor in self.tensors.values()):
             return found.pop() if found else torch.Size()
-        self.tensors = {**self._late(), **self.tensors}
         check_same_device(reversed(self.tensors.items()))
         return broadcast_batch((name, self._lead(name, tensor)) for name, tensor in reversed(self.tensors.items()))
-
-    def _fresh(self) -> dict[str, Tensor]:
-        return {name: tensor for name, tensor in self.tensors.items() if name not in self.known}
 
     def _lead(self, name: str, tensor: Tensor) -> torch.Size:
         """Batch dimensions of an input."""
         return tensor.shape[: tensor.ndim - RANKS[name] - (name in self.by_stage)]
-
-    def _form(self, settings: tuple) -> tuple:
-        names = frozenset(self.tensors).union(OF_GOAL)
-        return (*settings, names, frozenset(self.by_stage), tuple(self.goal), self.tensors["x0"].ndim)
-
-    def guess(self, guess: MPCSolution | Primal | None, batch: torch.Size) -> tuple[Tensor | None, ...]:
-        """x, u, lam and mu of a guess; mu where it has some."""
-        if guess is None:
-            return (None,) * 4
-        if not isinstance(guess, MPCSolution | Primal):
-            raise DTypeError(
-                f"guess: expected an MPCSolution or a Primal such as solution.shift(), got {describe(guess)}"
-            )
-        H, found = self.horizon, []
-        for name, stages, size in (("x", H + 1, "n_x"), ("u", H, "n_u"), ("lam", H, "n_lam"), ("mu", H + 1, "n_c")):
-            value = getattr(guess, name)
-            if name == "mu" and (value is None or (isinstance(value, Tensor) and not value.numel())):
-                found.append(None)  # a plan without constraints is a guess for one with them
-                continue
-            fits = isinstance(value, Tensor) and value.shape == (*batch, stages, self.sizes[size])
-            dims = [] if fits else [("H+1" if stages > H else "H", stages), (size, self.sizes[size])]
-            check_tensor(f"guess.{name}", value, dims)
-            if not fits:
-                raise ShapeError(
-                    f"guess.{name}: expected batch dimensions {tuple(batch)} like x0, got {tuple(value.shape[:-2])}; "
-                    f"expand or index it"
-                )
-            found.append(value.detach() if value.requires_grad else value)
-        return tuple(found)
 
     def check_sizes(self, name: str, **found: int) -> None:
         """Refuse something that was built for other sizes than the system's."""
@@ -285,3 +185,33 @@ class Inputs:
             raise ShapeError(
                 f"{name}: expected {self.horizon} stages, the layer's horizon, got {horizon}; give one for each stage"
             )
+
+
+def check_guess(
+    guess: MPCSolution | Primal | None,
+    batch: tuple[int, ...],
+    horizon: int,
+    sizes: Mapping[str, int],
+    finite: bool = True,
+) -> tuple[Tensor | None, ...]:
+    """x, u, lam and mu of a guess; mu where it has some. `finite`: whether to look at the numbers."""
+    if guess is None:
+        return (None,) * 4
+    if not isinstance(guess, MPCSolution | Primal):
+        raise DTypeError(f"guess: expected an MPCSolution or a Primal such as solution.shift(), got {describe(guess)}")
+    H, found = horizon, []
+    for name, stages, size in (("x", H + 1, "n_x"), ("u", H, "n_u"), ("lam", H, "n_lam"), ("mu", H + 1, "n_c")):
+        value = getattr(guess, name)
+        if name == "mu" and (value is None or (isinstance(value, Tensor) and not value.numel())):
+            found.append(None)  # a plan without constraints is a guess for one with them
+            continue
+        fits = isinstance(value, Tensor) and value.shape == (*batch, stages, sizes[size])
+        dims = [] if fits else [("H+1" if stages > H else "H", stages), (size, sizes[size])]
+        check_tensor(f"guess.{name}", value, dims, finite)
+        if not fits:
+            raise ShapeError(
+                f"guess.{name}: expected batch dimensions {tuple(batch)} like x0, got {tuple(value.shape[:-2])}; "
+                f"expand or index it"
+            )
+        found.append(value.detach() if value.requires_grad else value)
+    return tuple(found)

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor
 from difflcs._functorch import is_wrapped, runs_eagerly, transforms_active
-from difflcs._recall import Recall, worth_keeping
 from difflcs.constraints import StageBounds, as_bound, check_bounds
 from difflcs.cost import CostSequence
 from difflcs.errors import BoundsError, DegenerateWarning, SolveError, SolveWarning
@@ -23,13 +22,14 @@ from difflcs.mpc.gather import (
     Constraints,
     Cost,
     Inputs,
-    Planned,
     System,
     check_constraints,
     check_cost,
+    check_guess,
     check_stage_bounds,
     check_system,
 )
+from difflcs.mpc.repeat import Repeat
 from difflcs.mpc.solution import MPCSolution, Primal
 from difflcs.status import Status, solved
 
@@ -109,8 +109,7 @@ class LCSMPCLayer(nn.Module):
                 self.register_buffer(name, value, persistent=False)
         self._check_parts()
         self._warned = False
-        self._planned: Recall[Planned] = Recall()
-        self._limited: Recall[tuple[Tensor, Tensor]] = Recall()
+        self._repeat = Repeat()
 
     def _check_parts(self) -> None:
         """What does not depend on a call is refused before the first one."""
@@ -152,20 +151,6 @@ class LCSMPCLayer(nn.Module):
                 f"u_min, u_max: expected bounds that meet the actions {low.tolist()} to {high.tolist()} that the model "
                 f"was fitted to, got {self.u_min.tolist()} to {self.u_max.tolist()}; set its action_support to None"
             )
-        return limits
-
-    def _limits(self, system: System) -> tuple[Tensor, Tensor]:
-        """What `limits` gives a call, made once where nothing is differentiated."""
-        support = getattr(system, "action_support", None)
-        if support is None or torch.is_grad_enabled() or transforms_active():
-            return self.limits(system)
-        made_of = {"u_min": self.u_min, "u_max": self.u_max, "support": support}
-        kept = self._limited.kept
-        if kept is not None and kept.holds(made_of):
-            return kept.value
-        limits = self.limits(system)
-        if all(worth_keeping(tensor) for tensor in made_of.values()):
-            self._limited.keep(limits, made_of)
         return limits
 
     def extra_repr(self) -> str:
@@ -214,51 +199,53 @@ class LCSMPCLayer(nn.Module):
             SolveError: an element was not solved and on_failure="raise".
             InvalidInputError and its kinds: an argument does not fit; nothing was solved.
         """
-        system = self.lcs if lcs is None else check_system(lcs)
-        check_tensor("x0", x0, [("n_x", system.n_x)])
-        unseen = transforms_active()
-        inputs = Inputs(self.horizon, earlier=None if unseen else self._planned.kept)
-        inputs.add_system(system, x0, context)
-        inputs.add_cost(self.cost if cost is None else check_cost(cost), goal, reference)
-        bounds = self.bounds if bounds is None else check_stage_bounds(bounds, u_min=u_min, u_max=u_max)
-        if bounds is None:
-            inputs.tensors |= dict(zip(("u_min", "u_max"), self._limits(system), strict=True))
-        else:
-            inputs.add_bounds(bounds)
-        inputs.replace_bound("u_min", u_min)
-        inputs.replace_bound("u_max", u_max)
-        inputs.add_constraints(self.constraints if constraints is None else check_constraints(constraints))
-        inputs.tensors["x0"] = x0
-        tensors = inputs.tensors
         smooth = self.training_relaxation if self.training else None
         settings = (self.horizon, self.relaxation if smooth is None else smooth, self.barrier)
-        before = inputs.recall(settings)
+        plain = not any(
+            value is not None for value in (reference, u_min, u_max, bounds, lcs, cost, constraints, context)
+        )
+        again = self._repeat.plan(self, settings, x0, goal, guess) if plain else None
+        if again is not None:
+            plan, start = again
+            outputs = plan.run(start, x0)
+        else:
+            system = self.lcs if lcs is None else check_system(lcs)
+            check_tensor("x0", x0, [("n_x", system.n_x)])
+            inputs = Inputs(self.horizon)
+            inputs.add_system(system, x0, context)
+            inputs.add_cost(self.cost if cost is None else check_cost(cost), goal, reference)
+            bounds = self.bounds if bounds is None else check_stage_bounds(bounds, u_min=u_min, u_max=u_max)
+            if bounds is None:
+                inputs.tensors |= dict(zip(("u_min", "u_max"), self.limits(system), strict=True))
+            else:
+                inputs.add_bounds(bounds)
+            inputs.replace_bound("u_min", u_min)
+            inputs.replace_bound("u_max", u_max)
+            inputs.add_constraints(self.constraints if constraints is None else check_constraints(constraints))
+            inputs.tensors["x0"] = x0
+            plan = self._plan(settings, inputs)
+            outputs = solve(plan, inputs.tensors, check_guess(guess, plan.batch, self.horizon, inputs.sizes))
+            if plain:
+                self._repeat.keep(self, settings, plan, x0, goal, inputs.sizes)
+        if plan.unseen or not plan.result.all_converged:
+            self._report(plan.result.status, plan.own)
+        return MPCSolution(*outputs, problem=plan.problem)
+
+    def _plan(self, settings: tuple, inputs: Inputs) -> Plan:
+        """How to solve what a call asks."""
+        tensors, unseen = inputs.tensors, transforms_active()
         needs_grad = torch.is_grad_enabled() and (unseen or any(t.requires_grad for t in tensors.values()))
-        batch = inputs.batch()
-        start = inputs.guess(guess, batch)
-        # With gradients the inputs change from call to call, so that nothing is worth keeping.
-        new = {} if needs_grad or unseen else inputs.new()
-        plan = Plan(
+        single = needs_grad and any(t.dtype == torch.float32 for t in tensors.values())
+        return Plan(
             self.backend,
             *settings,
             by_stage=frozenset(inputs.by_stage),
-            dtype=x0.dtype,
-            smallest=torch.float32
-            if needs_grad and any(t.dtype == torch.float32 for t in tensors.values())
-            else torch.float64,
-            batch=batch,
+            dtype=tensors["x0"].dtype,
+            smallest=torch.float32 if single else torch.float64,
+            batch=inputs.batch(),
             own=needs_grad,
             unseen=unseen,
-            before=before,
-            known=inputs.known,
-            private=new,
         )
-        outputs = solve(plan, tensors, start)
-        if new:
-            inputs.keep(self._planned, settings, new, plan.problem, plan.constant)
-        if unseen or not plan.result.all_converged:
-            self._report(plan.result.status, needs_grad)
-        return MPCSolution(*outputs, problem=plan.problem)
 
     def controller(self, on_failure: OnFailure = "hold", time_limit: float | None = None) -> MPCController:
         """A controller of one robot with this layer's problem as it is now: NumPy in and out, warm, microseconds.

@@ -102,15 +102,16 @@ class MPCProblem(SystemMatrices):
         for name in ("S", "G_x", "G_u", "price"):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, self.x0.new_zeros(self.shape(name)))
-        batch = self.batch
-        for name in INPUTS:
-            shape, stages = self.shape(name), self.stages(name)
+        batch, sizes = self.batch, {dim: getattr(self, dim) for dim in ("n_x", "n_u", "n_lam", "n_c")}
+        for name, dims in INPUTS.items():
+            shape, found = tuple([sizes[dim] for dim in dims]), getattr(self, name).shape
+            if found == (batch, *shape) or (found == shape and name != "x0"):
+                continue
             allowed = [(batch, *shape)] if name == "x0" else [shape, (batch, *shape)]
-            if stages:
+            if stages := self.stages(name):
                 allowed += [(1, stages, *shape), (batch, stages, *shape)]
-            found = tuple(getattr(self, name).shape)
             if found not in allowed:
-                raise ShapeError(f"{name}: expected {' or '.join(map(str, allowed))}, got {found}")
+                raise ShapeError(f"{name}: expected {' or '.join(map(str, allowed))}, got {tuple(found)}")
         self._check_numbers(INPUTS)
 
     def _check_numbers(self, names: Iterable[str]) -> None:
@@ -126,16 +127,29 @@ class MPCProblem(SystemMatrices):
         Raises:
             ShapeError, BoundsError, InvalidInputError: they do not fit the others.
         """
-        if any(value.shape != getattr(self, name).shape for name, value in values.items()):
+        known = vars(self)
+        if any([value.shape != known[name].shape for name, value in values.items()]):
             return replace(self, **values)
         other = object.__new__(MPCProblem)
         own = vars(other)
-        own.update(vars(self), **values)
+        own.update(known, **values)
         own["arrays"] = arrays = self.arrays.copy()
         for name, value in values.items():
             arrays[_ORDER[name]] = array(value)
         other._check_numbers(values)
         return other
+
+    def at(self, x0: Tensor) -> MPCProblem:
+        """The problem from other states, as many as before."""
+        other = object.__new__(MPCProblem)
+        arrays = self.arrays.copy()
+        arrays[_ORDER["x0"]] = array(x0)
+        vars(other).update(vars(self), x0=x0, arrays=arrays)
+        return other
+
+    def private(self) -> MPCProblem:
+        """The same problem in memory of its own."""
+        return replace(self, **{name: getattr(self, name).clone() for name in INPUTS})
 
     @functools.cached_property
     def arrays(self) -> list[np.ndarray]:

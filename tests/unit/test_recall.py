@@ -11,7 +11,9 @@ from torch.func import functional_call
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSParams, LinearConstraints, QuadraticCost, StageBounds
-from difflcs.errors import BoundsError, NonFiniteError, NotPositiveDefiniteError, ShapeError
+from difflcs.errors import BoundsError, DTypeError, NonFiniteError, NotPositiveDefiniteError, ShapeError
+from difflcs.mpc import Primal
+from difflcs.mpc.backends import BatchedBackend
 
 HORIZON = 4
 
@@ -191,6 +193,90 @@ def test_settings_and_arguments_of_a_call_are_noticed():
     assert_as_fresh(layer, X, GOAL)
     layer.lcs.stiffness = 0.7
     assert_as_fresh(layer, X, GOAL)
+
+
+def test_a_loop_asks_neither_model_nor_cost_again(monkeypatch):
+    """Else what this file tests would be slower than it could be, and its tests would test nothing."""
+    asked = []
+    for kind, name in ((LCSModel, "params"), (GoalCost, "at")):
+        original = getattr(kind, name)
+        monkeypatch.setattr(
+            kind, name, lambda *args, original=original, name=name: asked.append(name) or original(*args)
+        )
+    layer, guess = make_layer(), None
+    for state, goal, expected in (
+        (X, GOAL, ["params", "at"]),
+        (2 * X, GOAL, []),
+        (X, GOAL, []),
+        (X, 2 * GOAL, ["at"]),  # a goal that moves
+        (2 * X, GOAL, ["at"]),
+        (X[0], GOAL, ["params", "at"]),  # other shapes
+    ):
+        goal = GOAL if goal is GOAL else goal.clone()
+        found = plan(layer, state, goal, guess=guess if state.ndim == 2 else None)
+        assert asked == expected
+        assert_same(found, plan(copy.deepcopy(layer), state, goal, guess=guess if state.ndim == 2 else None))
+        guess = found.shift()
+        asked.clear()
+
+
+def test_other_parts_are_noticed():
+    layer = make_layer()
+    params = make_model(seed=7).params().detach()
+    for change in (
+        lambda: setattr(layer, "lcs", make_model(seed=5)),
+        lambda: layer.lcs.register_parameter("A", torch.nn.Parameter(0.9 * layer.lcs.A.detach())),
+        lambda: setattr(layer, "cost", GoalCost.reach(4, 2, goal_weight=(1.0, 5.0), input_weight=0.2)),
+        lambda: setattr(layer, "u_max", torch.full((2,), 0.1).double()),
+        lambda: setattr(layer, "backend", BatchedBackend(tol=1e-3)),
+        lambda: setattr(layer, "constraints", LinearConstraints(draw(1, 4), 0.01 * draw(1).abs(), weight=2.0)),
+        lambda: setattr(layer, "constraints", None),
+        lambda: (delattr(layer, "lcs"), setattr(layer, "lcs", params)),
+        lambda: params.A.mul_(0.9),
+        lambda: setattr(layer, "lcs", make_model(seed=8).params().detach()),
+        lambda: (delattr(layer.cost, "Q"), setattr(layer.cost, "Q", 3 * layer.cost.Q_final)),  # no buffer any more
+        lambda: layer.cost.Q.mul_(1.5),
+    ):
+        plan(layer, X, GOAL)
+        change()
+        assert_as_fresh(layer, X, GOAL)
+        assert_as_fresh(layer, X, GOAL)
+
+
+def test_what_becomes_differentiable_is_noticed():
+    cost = make_cost()
+    layer = make_layer(make_model().params().detach(), cost)
+    for _ in range(2):
+        assert not layer(X, GOAL).objective.requires_grad  # with gradients on, but nothing to differentiate
+    for tensor in (cost.Q, layer.u_max, GOAL.clone(), X.clone()):
+        tensor.requires_grad_()
+        x, goal = (tensor if v.shape == tensor.shape else v for v in (X, GOAL))
+        layer(x, goal).objective.sum().backward()
+        assert tensor.grad is not None
+        tensor.requires_grad_(False)
+        assert not layer(X, GOAL).objective.requires_grad
+
+
+def test_a_guess_is_checked_in_a_loop_too():
+    layer = make_layer()
+    guess = plan(layer, X, GOAL).shift()
+    expected = plan(copy.deepcopy(layer), X, GOAL, guess=guess)
+    for given in (guess, Primal(*guess[:3]), Primal(*(v.mT.contiguous().mT for v in guess)), expected):
+        assert_same(plan(layer, X, GOAL, guess=given), plan(copy.deepcopy(layer), X, GOAL, guess=given))
+    single = Primal(*(v.float() for v in guess))
+    assert_same(plan(layer, X, GOAL, guess=single), plan(copy.deepcopy(layer), X, GOAL, guess=single))
+    for kind, wrong, match in (
+        (NonFiniteError, guess._replace(x=guess.x * torch.nan), "guess.x"),
+        (NonFiniteError, guess._replace(u=guess.u / 0), "guess.u"),
+        (ShapeError, guess._replace(lam=guess.lam[:, 1:]), "guess.lam"),
+        (DTypeError, tuple(guess), "guess"),
+    ):
+        with pytest.raises(kind, match=match):
+            plan(layer, X, GOAL, guess=wrong)
+    with pytest.raises(DTypeError, match="goal"):
+        plan(layer, X, [0.1, 0.2])
+    with pytest.raises(DTypeError, match="x0"):
+        plan(layer, X.tolist(), GOAL)
 
 
 def test_parameters_from_a_vector_and_by_functional_call():

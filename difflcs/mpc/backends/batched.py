@@ -124,7 +124,7 @@ class BatchedBackend(Backend):
             objective=found["objective"],
             fragile=found["fragile"].view(torch.bool),  # zeros and ones
         )
-        _kernels.solve_mpc(
+        vars(result)["all_converged"] = _kernels.solve_mpc(  # so that nobody needs to count
             inputs=problem.arrays,
             horizon=horizon,
             relaxation=problem.relaxation,

@@ -1,0 +1,161 @@
+"""The same problem from another state: what the loop of a robot asks of a layer again and again.
+
+A call without gradients, of a layer whose model, cost, bounds and constraints hold the same numbers as in the last one,
+plans with what that one has checked and prepared. Only the state, the goal and the guess are looked at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, TypeGuard
+
+import torch
+from torch import Tensor
+
+from difflcs._checks import all_finite, check_tensor
+from difflcs._functorch import transforms_active
+from difflcs._recall import Snapshot, comparable
+from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds
+from difflcs.cost import CostSequence, GoalCost, QuadraticCost
+from difflcs.lcs import LCSModel, LCSParams, LCSSequence
+from difflcs.mpc.autograd import Plan
+from difflcs.mpc.gather import check_guess
+from difflcs.mpc.solution import MPCSolution, Primal
+
+if TYPE_CHECKING:
+    from difflcs.mpc.layer import LCSMPCLayer
+
+_RECORDS = (LCSParams, LCSSequence)
+# What depends on its tensors alone. A subclass may depend on anything.
+_MODULES = (LCSModel, GoalCost, QuadraticCost, CostSequence, StageBounds, LinearConstraints, ConstraintSequence)
+
+
+class Repeat:
+    """What a layer planned last. Copies, and files, are empty."""
+
+    def __init__(self) -> None:
+        self._last: _Planned | None = None
+
+    def plan(
+        self, layer: LCSMPCLayer, settings: tuple, x0: Tensor, goal: Tensor | None, guess: MPCSolution | Primal | None
+    ) -> tuple[Plan, Primal | None] | None:
+        """A plan that is ready to run, and its guess, where nothing but numbers of what is given here can differ.
+
+        Raises:
+            InvalidInputError and its kinds: of the state, the goal or the guess.
+        """
+        last = self._last  # once: another thread may keep something else
+        if last is None or transforms_active() or not last.fits(layer, settings, x0, goal):
+            return None
+        start = last.start(x0, guess)
+        return last.plan(layer, x0, goal), start
+
+    def keep(
+        self, layer: LCSMPCLayer, settings: tuple, plan: Plan, x0: Tensor, goal: Tensor | None, sizes: Mapping[str, int]
+    ) -> None:
+        """Keep what a call has planned, if the numbers that it was made of can all be found, and compared quickly."""
+        if plan.own or plan.unseen or not _is_double(x0):
+            return
+        held = _held_by(layer)
+        if held is not None and comparable([*_values(layer, held), goal]):
+            self._last = _Planned(layer, held, settings, plan, x0, goal, sizes)
+
+    def __reduce__(self) -> tuple[type, tuple]:
+        return Repeat, ()
+
+
+class _Planned:
+    """A problem that a layer has planned, in memory of its own, and what it was made of."""
+
+    def __init__(
+        self,
+        layer: LCSMPCLayer,
+        held: list[Mapping[str, object]],
+        settings: tuple,
+        plan: Plan,
+        x0: Tensor,
+        goal: Tensor | None,
+        sizes: Mapping[str, int],
+    ):
+        self.held, self.made_of = held, Snapshot(_values(layer, held))
+        self.settings, self.inference = (*settings, _stiffness(layer)), torch.is_inference_mode_enabled()
+        self.x0, self.goal, self.sizes = x0.shape, None if goal is None else (goal.shape, goal.dtype), sizes
+        self.latest = plan.private(), None if goal is None else Snapshot([goal])
+        H, n_x, n_u, n_lam, n_c = plan.horizon, *(sizes[name] for name in ("n_x", "n_u", "n_lam", "n_c"))
+        own = ((H + 1, n_x), (H, n_u), (H, n_lam), (H + 1, n_c))
+        self.flat = [(plan.problem.batch, *shape) for shape in own]
+        self.guess = [torch.Size((*plan.batch, *shape)) for shape in own]
+
+    def fits(self, layer: LCSMPCLayer, settings: tuple, x0: object, goal: object) -> bool:
+        """Whether a call can differ in numbers of its state and goal alone."""
+        if not (_is_double(x0) and x0.shape == self.x0):
+            return False
+        if goal is not None or self.goal is not None:
+            if not isinstance(goal, Tensor) or not goal.is_cpu or (goal.shape, goal.dtype) != self.goal:
+                return False
+        if (*settings, _stiffness(layer)) != self.settings or torch.is_inference_mode_enabled() != self.inference:
+            return False
+        if not self.made_of.same(_values(layer, self.held)):
+            return False
+        if not torch.is_grad_enabled():
+            return True
+        tensors = (*self.made_of.tensors, x0) if goal is None else (*self.made_of.tensors, x0, goal)
+        return not any(tensor.requires_grad for tensor in tensors)
+
+    def plan(self, layer: LCSMPCLayer, x0: Tensor, goal: Tensor | None) -> Plan:
+        """The plan from a state, to a goal."""
+        plan, same = self.latest
+        if goal is not None and same is not None and not same.same([goal]):
+            made = layer.cost.at(goal, plan.horizon)  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]
+            plan = plan.again({name: made[name] for name in ("q", "q_final", "constant")})
+            self.latest = plan, Snapshot([goal])
+        return plan.at(x0.detach().reshape(plan.problem.x0.shape))
+
+    def start(self, x0: Tensor, guess: MPCSolution | Primal | None) -> Primal | None:
+        """A guess as solvers want it, after a look at the numbers that are new."""
+        plan, flat = self.latest[0], self._flat(guess)
+        if flat is None or not all_finite(x0, *flat):
+            check_tensor("x0", x0)
+            return plan.flat_guess(check_guess(guess, plan.batch, plan.horizon, self.sizes))
+        return Primal(*flat) if flat else None
+
+    def _flat(self, guess: object) -> list[Tensor] | None:
+        """The parts of a guess that is just as it must be, none of none; None of any other."""
+        if guess is None:
+            return []
+        if not isinstance(guess, MPCSolution | Primal):
+            return None
+        found = []
+        for value, shape, flat in zip((guess.x, guess.u, guess.lam, guess.mu), self.guess, self.flat, strict=True):
+            if not (_is_double(value) and value.shape == shape):
+                return None
+            found.append((value.detach() if value.requires_grad else value).reshape(flat))
+        return found
+
+
+def _is_double(value: object) -> TypeGuard[Tensor]:
+    return isinstance(value, Tensor) and value.dtype is torch.float64 and value.is_cpu
+
+
+def _held_by(layer: LCSMPCLayer) -> list[Mapping[str, object]] | None:
+    """Where a layer and its parts hold what a plan is made of; None where not all of it can be found."""
+    found: list[Mapping[str, object]] = [layer._parameters, layer._buffers, layer._modules]
+    for part in (layer.lcs, layer.cost, layer.bounds, layer.constraints):
+        if type(part) in _RECORDS:
+            found.append(vars(part))
+        elif type(part) in _MODULES and not any(isinstance(value, Tensor) for value in vars(part).values()):
+            found += [part._parameters, part._buffers]  # pyright: ignore[reportAttributeAccessIssue, reportOptionalMemberAccess]
+        elif part is not None:
+            return None
+    return found
+
+
+def _values(layer: LCSMPCLayer, held: list[Mapping[str, object]]) -> list[object]:
+    """All of it, with the backend, and a model that is no module."""
+    own = vars(layer)
+    return [own["backend"], own.get("lcs")] + [value for mapping in held for value in mapping.values()]
+
+
+def _stiffness(layer: LCSMPCLayer) -> float | None:
+    """What a plan depends on that a model holds besides its tensors."""
+    return getattr(layer._modules.get("lcs"), "stiffness", None)  # pyright: ignore[reportReturnType]
