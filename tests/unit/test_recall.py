@@ -380,6 +380,20 @@ def test_a_module_of_ones_own_is_asked_each_time():
     assert_as_fresh(layer, X, GOAL)
 
 
+def test_bounds_of_ones_own_are_asked_each_time():
+    class Narrowing(LCSMPCLayer):
+        width = 0.5
+
+        def limits(self, system=None):
+            low, high = super().limits(system)
+            return low * self.width, high * self.width
+
+    layer = Narrowing(make_model(), make_cost(), HORIZON, -0.5, 0.5)
+    for width in (0.5, 0.5, 0.1):
+        layer.width = width
+        assert float(plan(layer, 9 * X, 9 * GOAL).u.abs().max()) == pytest.approx(0.5 * width)
+
+
 def test_inference_mode_and_no_grad_take_turns():
     layer = make_layer()
     expected = plan(make_layer(), X, GOAL)
