@@ -24,8 +24,6 @@ def check_bounds(u_min: Tensor, u_max: Tensor, strict: bool = False) -> None:
     check_same_device([("u_min", u_min), ("u_max", u_max)])
     if is_wrapped(u_min) or is_wrapped(u_max):
         return
-    if not strict and bool((u_min < u_max).all()):  # then neither is infinite the wrong way
-        return
     crossed = u_min >= u_max if strict else u_min > u_max
     if bool(crossed.any()):
         index = tuple(torch.nonzero(crossed)[0].tolist())

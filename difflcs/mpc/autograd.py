@@ -163,7 +163,7 @@ class Plan:
                     value = value.expand(*self.batch, *own).reshape(size, *own)
             if name in self.by_stage and value.ndim == self.rank(name):
                 value = value.unsqueeze(0)
-            if name in _SYMMETRIC:
+            if name in _SYMMETRIC and not torch.equal(value, value.mT):
                 value = 0.5 * (value + value.mT)
             if name in MAY_BE_INFINITE:
                 if self.unseen or tensor.requires_grad:

@@ -29,7 +29,7 @@ from difflcs.mpc.gather import (
     check_stage_bounds,
     check_system,
 )
-from difflcs.mpc.repeat import Repeat
+from difflcs.mpc.repeat import Given, Repeat
 from difflcs.mpc.solution import MPCSolution, Primal
 from difflcs.status import Status, solved
 
@@ -201,10 +201,9 @@ class LCSMPCLayer(nn.Module):
         """
         smooth = self.training_relaxation if self.training else None
         settings = (self.horizon, self.relaxation if smooth is None else smooth, self.barrier)
-        plain = not any(
-            value is not None for value in (reference, u_min, u_max, bounds, lcs, cost, constraints, context)
-        )
-        again = self._repeat.plan(self, settings, x0, goal, guess) if plain else None
+        plain = not any(value is not None for value in (reference, u_min, u_max, bounds, cost, constraints, context))
+        given = Given(x0, goal, lcs)
+        again = self._repeat.plan(self, settings, given, guess) if plain else None
         if again is not None:
             plan, start = again
             outputs = plan.run(start, x0)
@@ -226,7 +225,7 @@ class LCSMPCLayer(nn.Module):
             plan = self._plan(settings, inputs)
             outputs = solve(plan, inputs.tensors, check_guess(guess, plan.batch, self.horizon, inputs.sizes))
             if plain and type(self).limits is LCSMPCLayer.limits:  # another's bounds may depend on anything
-                self._repeat.keep(self, settings, plan, x0, goal, inputs.sizes)
+                self._repeat.keep(self, settings, plan, given, inputs.sizes)
         if plan.unseen or not plan.result.all_converged:
             self._report(plan.result.status, plan.own)
         return MPCSolution(*outputs, problem=plan.problem)

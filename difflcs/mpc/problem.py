@@ -99,10 +99,10 @@ class MPCProblem(SystemMatrices):
         check_number("barrier", self.barrier)
         if self.g is None:
             object.__setattr__(self, "g", self.x0.new_zeros(0))
+        batch, sizes = self.batch, {dim: getattr(self, dim) for dim in ("n_x", "n_u", "n_lam", "n_c")}
         for name in ("S", "G_x", "G_u", "price"):
             if getattr(self, name) is None:
-                object.__setattr__(self, name, self.x0.new_zeros(self.shape(name)))
-        batch, sizes = self.batch, {dim: getattr(self, dim) for dim in ("n_x", "n_u", "n_lam", "n_c")}
+                object.__setattr__(self, name, self.x0.new_zeros([sizes[dim] for dim in INPUTS[name]]))
         for name, dims in INPUTS.items():
             shape, found = tuple([sizes[dim] for dim in dims]), getattr(self, name).shape
             if found == (batch, *shape) or (found == shape and name != "x0"):
@@ -116,9 +116,10 @@ class MPCProblem(SystemMatrices):
 
     def _check_numbers(self, names: Iterable[str]) -> None:
         if "u_min" in names or "u_max" in names:
-            limits = self.bounds() if self.by_stage("u_min") or self.by_stage("u_max") else (self.u_min, self.u_max)
-            check_bounds(*limits, strict=self.barrier > 0)
-        if "price" in names:
+            low, high = self.bounds() if self.by_stage("u_min") or self.by_stage("u_max") else (self.u_min, self.u_max)
+            if self.barrier > 0 or not bool((low < high).all()):  # else neither is infinite the wrong way
+                check_bounds(low, high, strict=self.barrier > 0)
+        if "price" in names and self.n_c:
             check_prices("price", self.price)
 
     def changed(self, values: Mapping[str, Tensor]) -> MPCProblem:

@@ -1,13 +1,14 @@
 """The same problem from another state: what the loop of a robot asks of a layer again and again.
 
 A call without gradients, of a layer whose model, cost, bounds and constraints hold the same numbers as in the last one,
-plans with what that one has checked and prepared. Only the state, the goal and the guess are looked at.
+plans with what that one has checked and prepared. Only what the call gives is looked at: a state, a goal, a guess, or a
+system that was linearised anew.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, TypeGuard
+from typing import TYPE_CHECKING, NamedTuple, TypeGuard
 
 import torch
 from torch import Tensor
@@ -19,7 +20,7 @@ from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBoun
 from difflcs.cost import CostSequence, GoalCost, QuadraticCost
 from difflcs.lcs import LCSModel, LCSParams, LCSSequence
 from difflcs.mpc.autograd import Plan
-from difflcs.mpc.gather import check_guess
+from difflcs.mpc.gather import System, check_guess
 from difflcs.mpc.solution import MPCSolution, Primal
 
 if TYPE_CHECKING:
@@ -30,6 +31,29 @@ _RECORDS = (LCSParams, LCSSequence)
 _MODULES = (LCSModel, GoalCost, QuadraticCost, CostSequence, StageBounds, LinearConstraints, ConstraintSequence)
 
 
+class Given(NamedTuple):
+    """What a call may give anew, besides a guess."""
+
+    x0: Tensor
+    goal: Tensor | None
+    lcs: System | None
+
+    def tensors(self) -> list[Tensor]:
+        """All numbers of it, where it has a form."""
+        found = [self.x0] if self.goal is None else [self.x0, self.goal]
+        return found if self.lcs is None else [*found, *self.lcs.tensors().values()]  # pyright: ignore[reportAttributeAccessIssue]
+
+    def form(self) -> tuple | None:
+        """What it is but for its numbers; None of what cannot be used here, or must be refused elsewhere."""
+        x0, goal, lcs = self
+        if not _is_double(x0) or not (goal is None or (isinstance(goal, Tensor) and goal.is_cpu)):
+            return None
+        if not (lcs is None or type(lcs) is LCSParams):
+            return None
+        shapes = None if lcs is None else [value.shape for value in lcs.tensors().values()]
+        return x0.shape, None if goal is None else (goal.shape, goal.dtype), shapes
+
+
 class Repeat:
     """What a layer planned last. Copies, and files, are empty."""
 
@@ -37,28 +61,26 @@ class Repeat:
         self._last: _Planned | None = None
 
     def plan(
-        self, layer: LCSMPCLayer, settings: tuple, x0: Tensor, goal: Tensor | None, guess: MPCSolution | Primal | None
+        self, layer: LCSMPCLayer, settings: tuple, given: Given, guess: MPCSolution | Primal | None
     ) -> tuple[Plan, Primal | None] | None:
-        """A plan that is ready to run, and its guess, where nothing but numbers of what is given here can differ.
+        """A plan that is ready to run, and its guess, where nothing but numbers of what is given can differ.
 
         Raises:
             InvalidInputError and its kinds: of the state, the goal or the guess.
         """
         last = self._last  # once: another thread may keep something else
-        if last is None or transforms_active() or not last.fits(layer, settings, x0, goal):
+        if last is None or transforms_active() or not last.fits(layer, settings, given):
             return None
-        start = last.start(x0, guess)
-        return last.plan(layer, x0, goal), start
+        start = last.start(given.x0, guess)
+        return last.plan(layer, given), start
 
-    def keep(
-        self, layer: LCSMPCLayer, settings: tuple, plan: Plan, x0: Tensor, goal: Tensor | None, sizes: Mapping[str, int]
-    ) -> None:
+    def keep(self, layer: LCSMPCLayer, settings: tuple, plan: Plan, given: Given, sizes: Mapping[str, int]) -> None:
         """Keep what a call has planned, if the numbers that it was made of can all be found, and compared quickly."""
-        if plan.own or plan.unseen or not _is_double(x0):
+        if plan.own or plan.unseen or given.form() is None:
             return
-        held = _held_by(layer)
-        if held is not None and comparable([*_values(layer, held), goal]):
-            self._last = _Planned(layer, held, settings, plan, x0, goal, sizes)
+        held = _held_by(layer, given.lcs is not None)
+        if held is not None and comparable([*_values(layer, held), given.goal]):
+            self._last = _Planned(layer, held, settings, plan, given, sizes)
 
     def __reduce__(self) -> tuple[type, tuple]:
         return Repeat, ()
@@ -73,42 +95,39 @@ class _Planned:
         held: list[Mapping[str, object]],
         settings: tuple,
         plan: Plan,
-        x0: Tensor,
-        goal: Tensor | None,
+        given: Given,
         sizes: Mapping[str, int],
     ):
         self.held, self.made_of = held, Snapshot(_values(layer, held))
         self.settings, self.inference = (*settings, _stiffness(layer)), torch.is_inference_mode_enabled()
-        self.x0, self.goal, self.sizes = x0.shape, None if goal is None else (goal.shape, goal.dtype), sizes
-        self.latest = plan.private(), None if goal is None else Snapshot([goal])
+        self.form, self.sizes = given.form(), sizes
+        self.latest = plan.private(), None if given.goal is None else Snapshot([given.goal])
         H, n_x, n_u, n_lam, n_c = plan.horizon, *(sizes[name] for name in ("n_x", "n_u", "n_lam", "n_c"))
         own = ((H + 1, n_x), (H, n_u), (H, n_lam), (H + 1, n_c))
         self.flat = [(plan.problem.batch, *shape) for shape in own]
         self.guess = [torch.Size((*plan.batch, *shape)) for shape in own]
 
-    def fits(self, layer: LCSMPCLayer, settings: tuple, x0: object, goal: object) -> bool:
-        """Whether a call can differ in numbers of its state and goal alone."""
-        if not (_is_double(x0) and x0.shape == self.x0):
-            return False
-        if goal is not None or self.goal is not None:
-            if not isinstance(goal, Tensor) or not goal.is_cpu or (goal.shape, goal.dtype) != self.goal:
-                return False
-        if (*settings, _stiffness(layer)) != self.settings or torch.is_inference_mode_enabled() != self.inference:
-            return False
-        if not self.made_of.same(_values(layer, self.held)):
-            return False
-        if not torch.is_grad_enabled():
-            return True
-        tensors = (*self.made_of.tensors, x0) if goal is None else (*self.made_of.tensors, x0, goal)
-        return not any(tensor.requires_grad for tensor in tensors)
+    def fits(self, layer: LCSMPCLayer, settings: tuple, given: Given) -> bool:
+        """Whether a call can differ in numbers of what it gives alone."""
+        return (
+            given.form() == self.form
+            and (*settings, _stiffness(layer)) == self.settings
+            and torch.is_inference_mode_enabled() == self.inference
+            and self.made_of.same(_values(layer, self.held))
+            and not (
+                torch.is_grad_enabled() and any(v.requires_grad for v in (*self.made_of.tensors, *given.tensors()))
+            )
+        )
 
-    def plan(self, layer: LCSMPCLayer, x0: Tensor, goal: Tensor | None) -> Plan:
-        """The plan from a state, to a goal."""
-        plan, same = self.latest
+    def plan(self, layer: LCSMPCLayer, given: Given) -> Plan:
+        """The plan from a state, to a goal, with a system if one is given."""
+        (plan, same), (x0, goal, lcs) = self.latest, given
         if goal is not None and same is not None and not same.same([goal]):
             made = layer.cost.at(goal, plan.horizon)  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]
             plan = plan.again({name: made[name] for name in ("q", "q_final", "constant")})
             self.latest = plan, Snapshot([goal])
+        if lcs is not None:
+            return plan.again({**lcs.tensors(), "x0": x0})  # pyright: ignore[reportAttributeAccessIssue]
         return plan.at(x0.detach().reshape(plan.problem.x0.shape))
 
     def start(self, x0: Tensor, guess: MPCSolution | Primal | None) -> Primal | None:
@@ -137,10 +156,10 @@ def _is_double(value: object) -> TypeGuard[Tensor]:
     return isinstance(value, Tensor) and value.dtype is torch.float64 and value.is_cpu
 
 
-def _held_by(layer: LCSMPCLayer) -> list[Mapping[str, object]] | None:
+def _held_by(layer: LCSMPCLayer, system_given: bool) -> list[Mapping[str, object]] | None:
     """Where a layer and its parts hold what a plan is made of; None where not all of it can be found."""
     found: list[Mapping[str, object]] = [layer._parameters, layer._buffers, layer._modules]
-    for part in (layer.lcs, layer.cost, layer.bounds, layer.constraints):
+    for part in (None if system_given else layer.lcs, layer.cost, layer.bounds, layer.constraints):
         if type(part) in _RECORDS:
             found.append(vars(part))
         elif type(part) in _MODULES and not any(isinstance(value, Tensor) for value in vars(part).values()):

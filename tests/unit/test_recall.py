@@ -243,6 +243,26 @@ def test_other_parts_are_noticed():
         assert_as_fresh(layer, X, GOAL)
 
 
+def test_systems_that_are_given_to_each_call():
+    layer = make_layer()
+    layer.lcs.action_support = torch.tensor([[-0.1, -0.2], [0.1, 0.2]]).double()  # holds for its own model alone
+    systems = [make_model(seed).params().detach() for seed in range(3)]
+    several = LCSParams(**{k: torch.stack([s.tensors()[k] for s in systems]) for k in systems[0].tensors()})
+    other = LCSModel(4, 2, 5, init_scale=0.3, generator=torch.Generator().manual_seed(6)).params().detach()
+    for state in (X, X.expand(3, -1)):
+        for lcs in (systems[0], systems[1], systems[1], None, systems[2], other, systems[0], layer.lcs, None):
+            assert_as_fresh(layer, 5 * state, 5 * GOAL, lcs=lcs)
+            assert_as_fresh(layer, 4 * state, 5 * GOAL, lcs=lcs)
+    for lcs in (several, several[[2, 1, 0]], systems[0]):
+        assert_as_fresh(layer, X.expand(3, -1), GOAL, lcs=lcs)
+    systems[0].A.mul_(0.9)
+    assert_as_fresh(layer, X.expand(3, -1), GOAL, lcs=systems[0])
+    learned = make_model().params()
+    layer(X.expand(3, -1), GOAL, lcs=learned).objective.sum().backward()
+    with pytest.raises(ShapeError, match="cost"):
+        plan(layer, X, GOAL, lcs=LCSModel(4, 1, 3).params().detach())
+
+
 def test_what_becomes_differentiable_is_noticed():
     cost = make_cost()
     layer = make_layer(make_model().params().detach(), cost)
