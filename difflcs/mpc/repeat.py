@@ -48,7 +48,7 @@ class Given(NamedTuple):
         x0, goal, lcs = self
         if not _is_double(x0) or not (goal is None or (isinstance(goal, Tensor) and goal.is_cpu)):
             return None
-        if not (lcs is None or type(lcs) is LCSParams):
+        if not (lcs is None or (type(lcs) is LCSParams and lcs.A.is_cpu)):
             return None
         shapes = None if lcs is None else [value.shape for value in lcs.tensors().values()]
         return x0.shape, None if goal is None else (goal.shape, goal.dtype), shapes
