@@ -23,9 +23,12 @@ MOST_NUMBERS = 4096
 
 
 class Snapshot:
-    """Some values: what they are and, of the tensors among them, which are on the CPU, their numbers."""
+    """Some values: what they are and, of the tensors among them, which are on the CPU, their numbers.
 
-    __slots__ = ("_arrays", "_forms", "_numbers", "_values", "tensors")
+    What was made in inference mode is of no use outside of it, so that nothing is the same there.
+    """
+
+    __slots__ = ("_arrays", "_forms", "_inference", "_numbers", "_values", "tensors")
 
     def __init__(self, values: Sequence[object]):
         self._values = tuple(values)
@@ -33,11 +36,13 @@ class Snapshot:
         self._arrays = [tensor.detach().numpy() for tensor in self.tensors]  # so that nobody else gets that memory
         self._forms = self._look()
         self._numbers = _numbers(self._arrays)
+        self._inference = torch.is_inference_mode_enabled()
 
     def same(self, values: Sequence[object]) -> bool:
         """Whether these are the same values, and the tensors hold the same numbers."""
         return (
-            len(values) == len(self._values)
+            self._inference == torch.is_inference_mode_enabled()
+            and len(values) == len(self._values)
             and all(map(operator.is_, values, self._values))
             and self._look() == self._forms
             and _numbers(self._arrays) == self._numbers
@@ -61,22 +66,17 @@ class Recall(Generic[T]):
     """The last value that was kept. Copies of a `Recall`, and files, are empty."""
 
     def __init__(self) -> None:
-        self._kept: tuple[T, Snapshot, bool] | None = None
+        self._kept: tuple[T, Snapshot] | None = None
 
     def value(self, tensors: Sequence[Tensor]) -> T | None:
-        """What was kept, if it was made of these tensors with these numbers.
-
-        What was made in inference mode is of no use outside of it.
-        """
+        """What was kept, if it was made of these tensors with these numbers."""
         kept = self._kept  # once: another thread may keep something else
-        if kept is None or kept[2] != torch.is_inference_mode_enabled() or not kept[1].same(tensors):
-            return None
-        return kept[0]
+        return kept[0] if kept is not None and kept[1].same(tensors) else None
 
     def keep(self, value: T, tensors: Sequence[Tensor]) -> None:
         """Keep a value and what it was made of, if that can be compared, and quickly."""
         if comparable(tensors):
-            self._kept = value, Snapshot(tensors), torch.is_inference_mode_enabled()
+            self._kept = value, Snapshot(tensors)
 
     def __reduce__(self) -> tuple[type, tuple]:
         return Recall, ()

@@ -19,6 +19,9 @@ from difflcs.mpc.solution import MPCSolution, Primal
 RANKS = {**{name: len(dims) for name, dims in INPUTS.items()}, "constant": 0}
 """Number of dimensions of each input of a call behind those of the batch and of the stages."""
 
+GUESS = {"x": (1, "n_x"), "u": (0, "n_u"), "lam": (0, "n_lam"), "mu": (1, "n_c")}
+"""Parts of a guess: how many stages beyond H each has, and its size."""
+
 Bound = float | Tensor
 System = LCSModule | LCSParams | LCSSequence
 Cost = GoalCost | QuadraticCost | CostSequence
@@ -199,14 +202,14 @@ def check_guess(
         return (None,) * 4
     if not isinstance(guess, MPCSolution | Primal):
         raise DTypeError(f"guess: expected an MPCSolution or a Primal such as solution.shift(), got {describe(guess)}")
-    H, found = horizon, []
-    for name, stages, size in (("x", H + 1, "n_x"), ("u", H, "n_u"), ("lam", H, "n_lam"), ("mu", H + 1, "n_c")):
-        value = getattr(guess, name)
+    found = []
+    for name, (extra, size) in GUESS.items():
+        value, stages = getattr(guess, name), horizon + extra
         if name == "mu" and (value is None or (isinstance(value, Tensor) and not value.numel())):
             found.append(None)  # a plan without constraints is a guess for one with them
             continue
         fits = isinstance(value, Tensor) and value.shape == (*batch, stages, sizes[size])
-        dims = [] if fits else [("H+1" if stages > H else "H", stages), (size, sizes[size])]
+        dims = [] if fits else [("H+1" if extra else "H", stages), (size, sizes[size])]
         check_tensor(f"guess.{name}", value, dims, finite)
         if not fits:
             raise ShapeError(

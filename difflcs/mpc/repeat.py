@@ -20,7 +20,7 @@ from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBoun
 from difflcs.cost import CostSequence, GoalCost, QuadraticCost
 from difflcs.lcs import LCSModel, LCSParams, LCSSequence
 from difflcs.mpc.autograd import Plan
-from difflcs.mpc.gather import System, check_guess
+from difflcs.mpc.gather import GUESS, System, check_guess
 from difflcs.mpc.solution import MPCSolution, Primal
 
 if TYPE_CHECKING:
@@ -99,11 +99,9 @@ class _Planned:
         sizes: Mapping[str, int],
     ):
         self.held, self.made_of = held, Snapshot(_values(layer, held))
-        self.settings, self.inference = (*settings, _stiffness(layer)), torch.is_inference_mode_enabled()
-        self.form, self.sizes = given.form(), sizes
+        self.settings, self.form, self.sizes = (*settings, _stiffness(layer)), given.form(), sizes
         self.latest = plan.private(), None if given.goal is None else Snapshot([given.goal])
-        H, n_x, n_u, n_lam, n_c = plan.horizon, *(sizes[name] for name in ("n_x", "n_u", "n_lam", "n_c"))
-        own = ((H + 1, n_x), (H, n_u), (H, n_lam), (H + 1, n_c))
+        own = [(plan.horizon + extra, sizes[size]) for extra, size in GUESS.values()]
         self.flat = [(plan.problem.batch, *shape) for shape in own]
         self.guess = [torch.Size((*plan.batch, *shape)) for shape in own]
 
@@ -112,7 +110,6 @@ class _Planned:
         return (
             given.form() == self.form
             and (*settings, _stiffness(layer)) == self.settings
-            and torch.is_inference_mode_enabled() == self.inference
             and self.made_of.same(_values(layer, self.held))
             and not (
                 torch.is_grad_enabled() and any(v.requires_grad for v in (*self.made_of.tensors, *given.tensors()))
