@@ -91,7 +91,7 @@ class Plan:
 
     def at(self, x0: Tensor) -> Plan:
         """The same from other states (batch, n_x), float64 on the CPU."""
-        return self._with(self.constant, self.problem.changed({"x0": x0}))
+        return self._with(self.constant, self.problem.at(x0))
 
     def private(self) -> Plan:
         """The same in memory of its own, before it is solved."""

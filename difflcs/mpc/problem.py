@@ -140,6 +140,14 @@ class MPCProblem(SystemMatrices):
         other._check_numbers(values)
         return other
 
+    def at(self, x0: Tensor) -> MPCProblem:
+        """The problem from other states, as many as before."""
+        other = object.__new__(MPCProblem)
+        arrays = self.arrays.copy()
+        arrays[_ORDER["x0"]] = array(x0)
+        vars(other).update(vars(self), x0=x0, arrays=arrays)
+        return other
+
     def private(self) -> MPCProblem:
         """The same problem in memory of its own."""
         return replace(self, **{name: getattr(self, name).clone() for name in INPUTS})
