@@ -13,6 +13,9 @@ function(difflcs_add_kernels target)
   # So that they compute the same in Python and in C, whatever else differs between the two builds.
   set_source_files_properties(${sources} PROPERTIES COMPILE_OPTIONS
                               $<$<NOT:$<CXX_COMPILER_ID:MSVC>>:-ffp-contract=off>)
+  # So that a problem has the same plan whichever of them solves it: GCC would sum differently in vectors of its own.
+  set_source_files_properties(${DIFFLCS_NATIVE}/mpc.cpp PROPERTIES COMPILE_OPTIONS
+                              $<$<CXX_COMPILER_ID:GNU>:-fno-tree-vectorize>)
   set(isas ${DIFFLCS_ISAS})
   if(isas STREQUAL "all")
     set(isas avx2 avx512)
@@ -30,6 +33,10 @@ function(difflcs_add_kernels target)
   endif()
   if(avx512 IN_LIST isas)
     difflcs_add_instruction_set(${target} avx512 8 -mavx512f -mavx512dq -mavx512vl -mfma)
+  endif()
+  # One problem alone, for every CPU that has AVX2. Clang would fuse other products and sums than in the others.
+  if(isas AND CMAKE_CXX_COMPILER_ID STREQUAL "GNU")
+    difflcs_add_instruction_set(${target} single 1 -mavx2 -mfma)
   endif()
 endfunction()
 
@@ -52,8 +59,11 @@ endfunction()
 
 function(difflcs_add_instruction_set target isa lanes)
   set(name ${target}_${isa})
-  add_library(${name} OBJECT ${DIFFLCS_NATIVE}/mpc.cpp ${DIFFLCS_NATIVE}/mpc_adjoint.cpp
-              ${DIFFLCS_NATIVE}/lcp.cpp ${DIFFLCS_NATIVE}/violation.cpp)
+  add_library(${name} OBJECT ${DIFFLCS_NATIVE}/mpc.cpp)
+  if(lanes GREATER 1)
+    target_sources(${name} PRIVATE ${DIFFLCS_NATIVE}/mpc_adjoint.cpp ${DIFFLCS_NATIVE}/lcp.cpp
+                   ${DIFFLCS_NATIVE}/violation.cpp)
+  endif()
   set_target_properties(${name} PROPERTIES POSITION_INDEPENDENT_CODE ON)
   target_compile_definitions(${name} PRIVATE DIFFLCS_ISA=${isa} DIFFLCS_LANES=${lanes})
   target_compile_options(${name} PRIVATE -fno-math-errno -Wno-psabi ${ARGN})

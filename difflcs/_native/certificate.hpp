@@ -44,7 +44,7 @@ struct Certificate {
     take(p, nx), take(pn, nx), take(y, nl), take(rho, nl), take(error, nl), take(N, nl * nl), take(rows, nl),
         take(largest_action, nu);
     take(row, (h + 1) * nc), take(row_terms, nc), take(row_missed, nc);
-    if constexpr (sizeof(T) == sizeof(double))
+    if constexpr (kShared<T>)
       if (arena.memory) load_matrices(0, 0);
   }
 
@@ -111,8 +111,9 @@ struct Certificate {
     const int64_t nx = n.x(), nl = n.l();
     auto form = [&] {  // diag(s) + F' diag(lam)
       for (int64_t i = 0; i < nl; i++) {
-        for (int64_t j = 0; j < nl; j++) N[i * nl + j] = F[j * nl + i] * lk[j];
-        N[i * nl + i] += s[i];
+        for (int64_t j = 0; j < i; j++) N[i * nl + j] = F[j * nl + i] * lk[j];
+        N[i * nl + i] = s[i] + F[i * nl + i] * lk[i];
+        for (int64_t j = i + 1; j < nl; j++) N[i * nl + j] = F[j * nl + i] * lk[j];
       }
     };
     for (int64_t i = 0; i < nl; i++) {
@@ -144,7 +145,7 @@ struct Certificate {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nc = n.c(), h = n.h;
     for (int l = 0; l < kLanes; l++) {
       const int64_t e = elements[l < count ? l : 0];
-      if constexpr (sizeof(T) != sizeof(double)) load_matrices(e, l);
+      if constexpr (!kShared<T>) load_matrices(e, l);
       for (int i = 0; i < kInputs; i++)
         if (kMpcFields[i].columns == Size::one) load(vector[i], i, e, l);
       load(x, o.x + e * (h + 1) * nx, (h + 1) * nx, l), load(u, o.u + e * h * nu, h * nu, l);
@@ -199,7 +200,7 @@ struct Certificate {
       }
       for (int64_t i = 0; i < nx; i++) {
         Vec t = q[i];
-        for (int64_t j = 0; j < nx; j++) t += Q[i * nx + j] * xk[j] + A[j * nx + i] * p[j];
+        for (int64_t j = 0; j < nx; j++) t += Q[i * nx + j] * xk[j], t += A[j * nx + i] * p[j];
         for (int64_t j = 0; j < nl; j++) t += D[j * nx + i] * rho[j];
         if (batch.crossed)
           for (int64_t j = 0; j < nu; j++) t += cross[i * nu + j] * uk[j];

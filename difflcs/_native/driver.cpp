@@ -28,7 +28,8 @@ Start start_of(int64_t i) {
   return i < 4 ? first[i] : Start{Actions::random, false, false, 0.0};
 }
 
-// Starts of one round run side by side in the lanes of a vector, of which no instruction set but the baseline has fewer.
+// Starts of one round run side by side in the lanes of a vector, of which no instruction set but the baseline has
+// fewer.
 constexpr int64_t kRound = 4;
 // Starts with large actions go to the bounds; without a bound a few times as far as the best plan of the rounds before.
 // A bound that is this many times farther than that plan stands for none.
@@ -157,7 +158,8 @@ void MpcDriver::run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner
       batch.count, kernels.mpc_workspace(batch), false,
       [](void* context, void* workspace, Watch watch) {
         auto& c = *static_cast<Solving*>(context);
-        c.kernels.mpc_solve(c.batch, c.solve, &c.next, workspace, watch);
+        const auto solve = c.batch.count == 1 ? c.kernels.mpc_solve_alone : c.kernels.mpc_solve;
+        solve(c.batch, c.solve, &c.next, workspace, watch);
       },
       &context);
 }
@@ -199,9 +201,7 @@ void MpcDriver::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start,
   double largest = 1.0;
   for (int64_t i = 0; best >= 0 && i < n.u; i++) largest = std::max(largest, 1.0 + std::abs(tried.u[best * n.u + i]));
   const double far = best >= 0 ? kNone * largest : kHuge;
-  const auto end = [&](double bound) {
-    return std::abs(bound) < far ? bound : std::copysign(kReach * largest, bound);
-  };
+  const auto end = [&](double bound) { return std::abs(bound) < far ? bound : std::copysign(kReach * largest, bound); };
   for (int64_t i = 0; i < n.u; i++) {
     const Bound bound(b, tried.element[job], i);
     const double low = end(bound.low), high = end(bound.high);

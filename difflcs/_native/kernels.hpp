@@ -120,6 +120,8 @@ struct Kernels {
   int64_t (*mpc_workspace)(const MpcBatch& batch);
   // Take problems from the shared counter `next` until none is left, and certify them.
   void (*mpc_solve)(const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void* workspace, Watch watch);
+  // The same for a batch of one, to the same bits.
+  void (*mpc_solve_alone)(const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void* workspace, Watch watch);
   // Which of the solved elements [begin, end) have constraints that make them degenerate.
   void (*mpc_constraints)(const MpcBatch& batch, const MpcSolve& solve, int64_t begin, int64_t end, void* workspace,
                           Watch watch);

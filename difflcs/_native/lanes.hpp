@@ -6,12 +6,16 @@
 #endif
 
 namespace difflcs::DIFFLCS_ISA {
-
 constexpr int kLanes = DIFFLCS_LANES;
+}
+#if DIFFLCS_LANES == 1
+#include "single.hpp"
+#else
+namespace difflcs::DIFFLCS_ISA {
+
 typedef double Vec __attribute__((vector_size(8 * DIFFLCS_LANES)));
 typedef int64_t Mask __attribute__((vector_size(8 * DIFFLCS_LANES)));  // 0 or -1 in each lane
 
-static inline Vec all(double a) { return Vec{} + a; }
 static inline Vec select(Mask m, Vec a, Vec b) { return m ? a : b; }
 static inline Vec max(Vec a, Vec b) { return a > b ? a : b; }
 static inline Vec min(Vec a, Vec b) { return a < b ? a : b; }
@@ -29,6 +33,14 @@ static inline Vec sqrt(Vec a) {
   return r;
 #endif
 }
+}  // namespace difflcs::DIFFLCS_ISA
+#endif
+
+namespace difflcs::DIFFLCS_ISA {
+
+// Zero where a mask is set.
+static inline Vec zero_where(Mask m, Vec a) { return select(m, Vec{}, a); }
+static inline Vec all(double a) { return Vec{} + a; }
 static inline Vec log(Vec a) {
   Vec r;
   for (int l = 0; l < kLanes; l++) r[l] = __builtin_log(a[l]);
@@ -59,19 +71,19 @@ static inline void put(Vec* to, int64_t at, int lane, double value) {
 #define DIFFLCS_INLINE __attribute__((always_inline)) inline
 
 // A small array for unrolled loops: on the stack where the size is known when compiling, else in the scratch given.
-template <int64_t N>
+template <int64_t N, class V = Vec>
 struct Local {
-  Vec v[N];
+  V v[N];
   explicit Local(Vec*) {}
-  Vec& operator[](int64_t i) { return v[i]; }
-  const Vec& operator[](int64_t i) const { return v[i]; }
+  V& operator[](int64_t i) { return v[i]; }
+  const V& operator[](int64_t i) const { return v[i]; }
 };
-template <>
-struct Local<0> {
-  Vec* v;
-  explicit Local(Vec* scratch) : v(scratch) {}
-  Vec& operator[](int64_t i) { return v[i]; }
-  const Vec& operator[](int64_t i) const { return v[i]; }
+template <class V>
+struct Local<0, V> {
+  V* v;
+  explicit Local(Vec* scratch) : v(reinterpret_cast<V*>(scratch)) {}
+  V& operator[](int64_t i) { return v[i]; }
+  const V& operator[](int64_t i) const { return v[i]; }
 };
 
 }  // namespace difflcs::DIFFLCS_ISA

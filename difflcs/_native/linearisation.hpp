@@ -44,7 +44,7 @@ class Linearisation {
     arena.take(K_s, kept ? count : 0, nl, nw), arena.take(size, count, nl), arena.take(y, count, nl);
     arena.take(rows, count * nl), arena.take(right_rows, nl), arena.take(a, nl), arena.take(b, nl),
         arena.take(right_factors, nl * nl), arena.take(bend, nl), arena.take(damped, nl);
-    arena.take(column, nl), arena.take(slopes, nl, nw), arena.take(weighted, nl, nw);
+    arena.take(column, nl * kColumns), arena.take(slopes, nl, nw), arena.take(weighted, nl, nw);
   }
 
   Stage<S> stage(int64_t k) const {
@@ -90,15 +90,20 @@ class Linearisation {
     Lu::solve_transposed(nl, stage.M.entries, stage.rows, stage.y);
     // Since a dlam + b ds = 0, both follow from one T: K_lam = b T, K_s = -a T with (diag(a) + F diag(b)) T = -[D E].
     eliminate(right, right_rows, false);
-    for (int64_t j = 0; j < nw; j++) {
-      Local<kL> t(column);
+    by_columns(0, nw, [&](int64_t j, auto kind) {
+      using V = decltype(kind);
+      Local<kL, V> t(column);
       DIFFLCS_UNROLL
-      for (int64_t i = 0; i < nl; i++) t[i] = all(0) - data.DE(i, j);
+      for (int64_t i = 0; i < nl; i++) t[i] = V{} - read<V>(data.DE[i], j);
       Lu::solve(nl, right, right_rows, t);
       DIFFLCS_UNROLL
-      for (int64_t i = 0; i < nl; i++) slopes(i, j) = t[i], stage.K_lam(i, j) = t[i] = b[i] * t[i];
-      for (int64_t i = 0; i < nx; i++) stage.A_hat(i, j) = all(0) + data.AB(i, j) + C.row(i) * t;
-    }
+      for (int64_t i = 0; i < nl; i++) {
+        write<V>(slopes[i], j, t[i]);
+        t[i] *= b[i];
+        write<V>(stage.K_lam[i], j, t[i]);
+      }
+      for (int64_t i = 0; i < nx; i++) write<V>(stage.A_hat[i], j, V{} + read<V>(data.AB[i], j) + C.row(i) * t);
+    });
     for (int64_t i = 0; i < nl; i++) {
       stage.y[i] *= stage.size[i];
       bend[i] = -2.0 * stage.y[i] * a[i] * b[i], damped[i] = 0.5 * damping * abs(stage.y[i]);
@@ -115,7 +120,11 @@ class Linearisation {
   // sum_m bend_m dz_m dz_m'. It knows of a contact's kink only next to it. Damping adds what bounds a kink that lies
   // lam + s away: |y| / (2 (lam + s)) is the curvature of the parabola that touches y |z| / 2 and lies above it, so
   // that with a damping of one a contact that opens or closes on the way costs no more than the model says.
-  Vec curvature(int64_t i, int64_t j) const { return all(0) + weighted.column(i) * slopes.column(j); }
+  Vec curvature(int64_t i, int64_t j) const { return curvature<Vec>(i, j); }
+  template <class V>
+  V curvature(int64_t i, int64_t j) const {
+    return V{} + weighted.column(i) * slopes.template column<V>(j);
+  }
 
   // Drops Y (Gauss-Newton).
   void drop(Mask which) {
@@ -132,7 +141,10 @@ class Linearisation {
 
  private:
   void weigh(int64_t i, Vec weight) {
-    for (int64_t j = 0; j < n.w(); j++) weighted(i, j) = weight * slopes(i, j);
+    by_columns(0, n.w(), [&](int64_t j, auto kind) {
+      using V = decltype(kind);
+      write<V>(weighted[i], j, weight * read<V>(slopes[i], j));
+    });
   }
 };
 

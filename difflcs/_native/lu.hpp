@@ -94,15 +94,20 @@ inline void lu_factor_pivoted(int64_t n, Vec* M, Mask* rows) {
   }
 }
 
-inline void exchange(Vec* b, int64_t k, const Mask* rows) {
-  for (int l = 0; l < kLanes; l++) {
-    double &first = reinterpret_cast<double*>(b + k)[l], &second = reinterpret_cast<double*>(b + rows[k][l])[l];
+// b has one column in each lane, or as many of one problem as V holds.
+template <class V>
+inline void exchange(V* b, int64_t k, const Mask* rows) {
+  constexpr int width = sizeof(V) / sizeof(double);
+  for (int l = 0; l < width; l++) {
+    double& first = reinterpret_cast<double*>(b + k)[l];
+    double& second = reinterpret_cast<double*>(b + rows[k][l % kLanes])[l];
     const double t = first;
     first = second, second = t;
   }
 }
 
-inline void lu_solve_pivoted(int64_t n, const Vec* M, const Mask* rows, Vec* b) {
+template <class V>
+inline void lu_solve_pivoted(int64_t n, const Vec* M, const Mask* rows, V* b) {
   for (int64_t k = 0; k < n; k++) exchange(b, k, rows);
   lu_solve(n, M, b);
 }

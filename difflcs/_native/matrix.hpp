@@ -6,6 +6,41 @@
 namespace difflcs::DIFFLCS_ISA {
 namespace {
 
+// Calls f(j, V{}) for the columns [first, last) of a matrix. f deals with as many of them, from column j on, as V
+// holds: with one where the lanes hold several problems, mostly with four of one problem alone. It reads them from a
+// row and writes them there.
+template <class Function>
+DIFFLCS_INLINE void by_columns(int64_t first, int64_t last, Function f) {
+  int64_t j = first;
+#if DIFFLCS_LANES == 1
+  for (; j + 4 <= last; j += 4) f(j, Four{});
+  if (j + 2 <= last) f(j, Two{}), j += 2;
+#endif
+  for (; j < last; j++) f(j, Vec{});
+}
+// Numbers of scratch for an array of as many columns.
+constexpr int64_t kColumns = kLanes == 1 ? 4 : 1;
+
+// Typed, as a copy of bytes might change anything, also what a loop has in registers.
+template <class V, class T>
+DIFFLCS_INLINE auto read(const T* row, int64_t j) {
+  if constexpr (sizeof(V) > sizeof(Vec)) {
+    typedef V Unaligned __attribute__((aligned(8)));
+    return V(*reinterpret_cast<const Unaligned*>(row + j));
+  } else {
+    return row[j];
+  }
+}
+template <class V>
+DIFFLCS_INLINE void write(Vec* row, int64_t j, V columns) {
+  if constexpr (sizeof(V) > sizeof(Vec)) {
+    typedef V Unaligned __attribute__((aligned(8)));
+    *reinterpret_cast<Unaligned*>(row + j) = columns;
+  } else {
+    row[j] = columns;
+  }
+}
+
 // A size: N where it is known when compiling, else the one given.
 template <int64_t N>
 struct Dim {
@@ -13,13 +48,13 @@ struct Dim {
   operator int64_t() const { return N ? N : given; }
 };
 
-// A row or a column of a matrix: entries at equal distances.
-template <class T, int64_t N, int64_t Distance>
+// A row or a column of a matrix, or as many neighbouring columns as V holds: entries at equal distances.
+template <class T, int64_t N, int64_t Distance, class V = Vec>
 struct Line {
   T* entries;
   Dim<N> size;
   Dim<Distance> distance;
-  T& operator[](int64_t i) const { return entries[i * distance]; }
+  auto operator[](int64_t i) const { return read<V>(entries + i * distance, 0); }
 };
 
 // The inner product of a line and anything with entries, to be added to a number.
@@ -29,21 +64,22 @@ struct Product {
   V vector;
 };
 
-template <class T, int64_t N, int64_t D>
-DIFFLCS_INLINE Product<Line<T, N, D>, const Vec*> operator*(Line<T, N, D> line, const Vec* vector) {
+template <class T, int64_t N, int64_t D, class V>
+DIFFLCS_INLINE Product<Line<T, N, D, V>, const Vec*> operator*(Line<T, N, D, V> line, const Vec* vector) {
   return {line, vector};
 }
-template <class T, int64_t N, int64_t D, int64_t M>
-DIFFLCS_INLINE Product<Line<T, N, D>, const Local<M>&> operator*(Line<T, N, D> line, const Local<M>& vector) {
+template <class T, int64_t N, int64_t D, class V, int64_t M, class W>
+DIFFLCS_INLINE Product<Line<T, N, D, V>, const Local<M, W>&> operator*(Line<T, N, D, V> line,
+                                                                       const Local<M, W>& vector) {
   return {line, vector};
 }
-template <class T, int64_t N, int64_t D, class U, int64_t M, int64_t E>
-DIFFLCS_INLINE Product<Line<T, N, D>, Line<U, M, E>> operator*(Line<T, N, D> line, Line<U, M, E> other) {
+template <class T, int64_t N, int64_t D, class V, class U, int64_t M, int64_t E, class W>
+DIFFLCS_INLINE Product<Line<T, N, D, V>, Line<U, M, E, W>> operator*(Line<T, N, D, V> line, Line<U, M, E, W> other) {
   return {line, other};
 }
 
-template <class T, int64_t N, int64_t D, class V>
-DIFFLCS_INLINE Vec operator+(Vec sum, const Product<Line<T, N, D>, V>& p) {
+template <class Number, class T, int64_t N, int64_t D, class V, class W>
+DIFFLCS_INLINE Number operator+(Number sum, const Product<Line<T, N, D, V>, W>& p) {
   if constexpr (N > 0) {
     DIFFLCS_UNROLL
     for (int64_t i = 0; i < N; i++) sum += p.line[i] * p.vector[i];
@@ -52,8 +88,8 @@ DIFFLCS_INLINE Vec operator+(Vec sum, const Product<Line<T, N, D>, V>& p) {
   }
   return sum;
 }
-template <class T, int64_t N, int64_t D, class V>
-DIFFLCS_INLINE Vec operator-(Vec sum, const Product<Line<T, N, D>, V>& p) {
+template <class Number, class T, int64_t N, int64_t D, class V, class W>
+DIFFLCS_INLINE Number operator-(Number sum, const Product<Line<T, N, D, V>, W>& p) {
   if constexpr (N > 0) {
     DIFFLCS_UNROLL
     for (int64_t i = 0; i < N; i++) sum -= p.line[i] * p.vector[i];
@@ -73,7 +109,10 @@ struct Matrix {
   T& operator()(int64_t i, int64_t j) const { return entries[i * stride + j]; }
   T* operator[](int64_t i) const { return entries + i * stride; }
   Line<T, Columns, 1> row(int64_t i) const { return {entries + i * stride, columns, {1}}; }
-  Line<T, Rows, Stride> column(int64_t j) const { return {entries + j, rows, stride}; }
+  template <class V = Vec>
+  Line<T, Rows, Stride, V> column(int64_t j) const {
+    return {entries + j, rows, stride};
+  }
   int64_t size() const { return rows * stride; }
   // The columns from `first` on.
   template <int64_t Count>

@@ -136,7 +136,7 @@ struct Problem {
     arena.take(q, by_stage(kq) ? h : 1, nx), arena.take(r, by_stage(kr) ? h : 1, nu);
     arena.take(u_min, bounds, nu), arena.take(u_max, bounds, nu), arena.take(per_width, bounds, nu);
     arena.take(q_final, nx), arena.take(x0, nx), arena.take(multiplier, h + 1, nc);
-    if constexpr (sizeof(T) == sizeof(double))
+    if constexpr (kShared<T>)
       if (arena.memory) load_matrices(0, 0);
   }
 
@@ -231,7 +231,7 @@ struct Problem {
 
   // Puts problem `e` into a lane.
   void load(int64_t e, int lane) {
-    if constexpr (sizeof(T) != sizeof(double)) load_matrices(e, lane);
+    if constexpr (!kShared<T>) load_matrices(e, lane);
     auto vector = [&](const Steps<Vec>& to, Input which, double unit = 1.0) {
       for (int64_t k = 0; k < to.count; k++) {
         const double* from = input(which, e, k);

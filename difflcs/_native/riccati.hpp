@@ -88,7 +88,7 @@ class Riccati {
     arena.take(P, values, nx, nx), arena.take(p, values, nx), arena.take(v, values, nx);
     arena.take(H, nw, nw), arena.take(PA, nx, nw), arena.take(H_uu, nu, nu), arena.take(L, nu, nu),
         arena.take(law, nu, nx + 1);
-    arena.take(linear, nw), arena.take(flat, nu), arena.take(column, nx), arena.take(active, nu),
+    arena.take(linear, nw), arena.take(flat, nu), arena.take(column, nx * kColumns), arena.take(active, nu),
         arena.take(toward, nu), arena.take(share, nu);
     arena.take(gradient, h, nu), arena.take(feedforward, h, nu), arena.take(feedback, h, nu, nx);
     arena.take(lower, h, nu), arena.take(upper, h, nu);
@@ -178,22 +178,28 @@ class Riccati {
   // is given: of stage 0 only the action block is needed.
   void stage_hessian(int64_t k, const StageData<T, S>& data, const Stage<S>& stage, const Matrix<Vec, kX, kX>& P) {
     const int64_t nx = n.x(), nw = n.w(), first = k == 0 ? nx : 0;
-    Local<kX> of_A(column);
-    for (int64_t j = first; j < nw; j++) {
+    by_columns(first, nw, [&](int64_t j, auto kind) {
+      using V = decltype(kind);
+      Local<kX, V> of_A(column);
       DIFFLCS_UNROLL
-      for (int64_t m = 0; m < nx; m++) of_A[m] = stage.A_hat(m, j);
-      for (int64_t i = 0; i < nx; i++) PA(i, j) = all(0) + P.row(i) * of_A;
-    }
+      for (int64_t m = 0; m < nx; m++) of_A[m] = read<V>(stage.A_hat[m], j);
+      for (int64_t i = 0; i < nx; i++) write<V>(PA[i], j, V{} + P.row(i) * of_A);
+    });
     for (int64_t i = first; i < nw; i++) {
+      Local<kX> of_A(column);
       DIFFLCS_UNROLL
       for (int64_t m = 0; m < nx; m++) of_A[m] = stage.A_hat(m, i);
-      for (int64_t j = first; j <= i; j++) {
-        Vec t = all(0);
-        if (i < nx)
-          t += data.Q(i, j);
-        else if (j >= nx)
-          t += data.R(i - nx, j - nx);
-        H(i, j) = t + PA.column(j) * of_A;
+      const auto columns = [&](int64_t from, int64_t to, auto weight) {
+        by_columns(from, to, [&](int64_t j, auto kind) {
+          using V = decltype(kind);
+          write<V>(H[i], j, V{} + weight(j, kind) + PA.template column<V>(j) * of_A);
+        });
+      };
+      if (i < nx)
+        columns(first, i + 1, [&](int64_t j, auto kind) { return read<decltype(kind)>(data.Q[i], j); });
+      else {
+        columns(first, nx, [](int64_t, auto kind) { return decltype(kind){}; });
+        columns(nx, i + 1, [&](int64_t j, auto kind) { return read<decltype(kind)>(data.R[i - nx], j - nx); });
       }
     }
     if (problem.batch.crossed && k > 0)
@@ -313,12 +319,13 @@ class Riccati {
     const int64_t nx = n.x(), nu = n.u();
     if (!kAdjoint && any(newton.gauss_newton)) linearisation.drop(newton.gauss_newton);
     for (int attempt = 0; attempt < 2; attempt++) {
-      for (int64_t i = 0; i < nu; i++)
-        for (int64_t j = 0; j <= i; j++) {
-          Vec t = H(nx + i, nx + j) + linearisation.curvature(nx + i, nx + j);
-          if (i == j && !kAdjoint) t += kActionDamping * newton.regularisation * action_scale(data, j) + flat[j];
-          H_uu(i, j) = t;
-        }
+      for (int64_t i = 0; i < nu; i++) {
+        by_columns(0, i + 1, [&](int64_t j, auto kind) {
+          using V = decltype(kind);
+          write<V>(H_uu[i], j, read<V>(H[nx + i], nx + j) + linearisation.template curvature<V>(nx + i, nx + j));
+        });
+        if (!kAdjoint) H_uu(i, i) += kActionDamping * newton.regularisation * action_scale(data, i) + flat[i];
+      }
       const Mask failed = cholesky(data, attempt == 0);
       if (kAdjoint) found.weak |= failed;
       if (kAdjoint || !any(failed) || attempt == 1) break;
@@ -403,21 +410,33 @@ class Riccati {
   void feedback_law(int64_t k) {
     const int64_t nx = n.x(), nu = n.u(), nw = n.w(), first = k == 0 ? nx : 0, columns = kAdjoint ? nx + 1 : nx;
     for (int64_t i = 0; i < nw; i++)
-      for (int64_t j = first; j <= i; j++)
-        if (i < nx || j < nx) H(i, j) += linearisation.curvature(i, j);
+      by_columns(first, i < nx ? i + 1 : nx, [&](int64_t j, auto kind) {
+        using V = decltype(kind);
+        write<V>(H[i], j, read<V>(H[i], j) + linearisation.template curvature<V>(i, j));
+      });
     for (int64_t i = 0; i < nu; i++) {
-      for (int64_t j = 0; j < nx; j++) law(i, j) = k == 0 ? all(0) : select(active[i], all(0), -H(nx + i, j));
+      by_columns(0, nx, [&](int64_t j, auto kind) {
+        using V = decltype(kind);
+        write<V>(law[i], j, k == 0 ? V{} : zero_where(active[i], -read<V>(H[nx + i], j)));
+      });
       law(i, nx) = select(active[i], all(0), -linear[nx + i]);
     }
-    for (int64_t i = 0; i < nu; i++) {
-      for (int64_t m = 0; m < i; m++)
-        for (int64_t j = first; j < columns; j++) law(i, j) -= L(i, m) * law(m, j);
-      for (int64_t j = first; j < columns; j++) law(i, j) *= L(i, i);
-    }
+    for (int64_t i = 0; i < nu; i++)
+      by_columns(first, columns, [&](int64_t j, auto kind) {
+        using V = decltype(kind);
+        V t = read<V>(law[i], j);
+        for (int64_t m = 0; m < i; m++) t -= L(i, m) * read<V>(law[m], j);
+        t *= L(i, i);
+        write<V>(law[i], j, t);
+      });
     if (k > 0) {
       const Value<S> here = value(k);
       for (int64_t i = 0; i < nx; i++) {
-        for (int64_t j = 0; j <= i; j++) here.P(i, j) = here.P(j, i) = H(i, j) - law.column(i) * law.column(j);
+        by_columns(0, i + 1, [&](int64_t j, auto kind) {
+          using V = decltype(kind);
+          write<V>(here.P[i], j, read<V>(H[i], j) - law.column(i) * law.template column<V>(j));
+        });
+        for (int64_t j = 0; j < i; j++) here.P(j, i) = here.P(i, j);
         Vec v = linear[i];
         if (kAdjoint)
           v = v - law.column(i) * law.column(nx);
@@ -426,11 +445,14 @@ class Riccati {
         here.v[i] = v;
       }
     }
-    for (int64_t i = nu - 1; i >= 0; i--) {
-      for (int64_t m = i + 1; m < nu; m++)
-        for (int64_t j = first; j < columns; j++) law(i, j) -= L(m, i) * law(m, j);
-      for (int64_t j = first; j < columns; j++) law(i, j) *= L(i, i);
-    }
+    for (int64_t i = nu - 1; i >= 0; i--)
+      by_columns(first, columns, [&](int64_t j, auto kind) {
+        using V = decltype(kind);
+        V t = read<V>(law[i], j);
+        for (int64_t m = i + 1; m < nu; m++) t -= L(m, i) * read<V>(law[m], j);
+        t *= L(i, i);
+        write<V>(law[i], j, t);
+      });
     const Matrix<Vec, kU, kX> K = feedback[k];
     for (int64_t i = 0; i < nu; i++) {
       for (int64_t j = 0; j < nx; j++) K(i, j) = law(i, j);

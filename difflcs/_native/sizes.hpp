@@ -1,5 +1,7 @@
 // Sizes of an MPC problem, and what the solver and its certificate both need of the problem's data.
 #pragma once
+#include <type_traits>
+
 #include "kernels.hpp"
 #include "lanes.hpp"
 #include "matrix.hpp"
@@ -8,6 +10,10 @@ namespace difflcs::DIFFLCS_ISA {
 namespace {
 
 constexpr double kTiny = 1e-300;
+
+// Whether all problems share their matrices: the type of an entry says it.
+template <class T>
+constexpr bool kShared = std::is_same_v<T, double>;
 
 // n_x, n_u, n_lam, n_x + n_u, n_c and the horizon; compile-time where the template argument is not zero.
 template <int X, int U, int L>

@@ -74,6 +74,30 @@ def test_the_certificate_is_the_residual_of_the_reference(kind):
             assert float(reference.min()) > 1e-6
 
 
+ALONE = KINDS | {f"9, 6, {n_lam}": Kind(n_x=9, n_u=6, n_lam=n_lam, horizon=5) for n_lam in (5, 8)}
+
+
+@pytest.mark.parametrize("barrier", [0.0, 0.01])
+@pytest.mark.parametrize("kind", ALONE)
+def test_a_problem_alone_has_the_numbers_that_it_has_among_others(kind, barrier):
+    """Alone it is solved by other code, see difflcs/_native/single.hpp."""
+    kind = replace(ALONE[kind], unbounded=ALONE[kind].unbounded and not barrier)  # a barrier needs bounds
+    problem = replace(random_problem(5, kind), barrier=barrier)
+    unfinished = replace(BATCHED, max_iter=2, restarts=1)
+    for backend in (BATCHED, unfinished):
+        cold = backend.solve(problem, None)
+        guess = type(cold.primal)(*(0.9 * value for value in cold.primal))
+        warm = backend.solve(problem, guess)
+        for i in range(0, problem.batch, 4):
+            one = problem.select(torch.tensor([i]))
+            for result, start in ((cold, None), (warm, type(guess)(*(value[[i]] for value in guess)))):
+                alone = backend.solve(one, start)
+                for a, b in zip(alone.primal, result.primal, strict=True):
+                    assert torch.equal(a[0], b[i])
+                for name in ("status", "iterations", "kkt_residual", "objective"):
+                    assert getattr(alone, name)[0] == getattr(result, name)[i]
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_given_by_stage_gives_the_same_plan(kind):
     problem = random_problem(2, KINDS[kind])
