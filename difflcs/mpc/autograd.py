@@ -399,7 +399,6 @@ def _within_range(result: Result, objective: Tensor, constant: Tensor, dtype: to
 
     Those that failed get numbers that it can hold.
     """
-    largest = torch.finfo(dtype).max
     total = objective + constant
     if (
         dtype == torch.float64
@@ -407,6 +406,7 @@ def _within_range(result: Result, objective: Tensor, constant: Tensor, dtype: to
         and (math.isfinite(total) if total.numel() == 1 else all_finite(total))
     ):
         return result, total
+    largest = torch.finfo(dtype).max
     held = total.abs() <= largest
     if dtype != torch.float64:
         for value in result.primal:

@@ -102,7 +102,7 @@ class _Planned:
         self.settings, self.form, self.sizes = (*settings, _stiffness(layer)), given.form(), sizes
         self.latest = plan.private(), None if given.goal is None else Snapshot([given.goal])
         own = [(plan.horizon + extra, sizes[size]) for extra, size in GUESS.values()]
-        self.flat = [(plan.problem.batch, *shape) for shape in own]
+        self.flat = [torch.Size((plan.problem.batch, *shape)) for shape in own]
         self.guess = [torch.Size((*plan.batch, *shape)) for shape in own]
 
     def fits(self, layer: LCSMPCLayer, settings: tuple, given: Given) -> bool:
@@ -125,7 +125,7 @@ class _Planned:
             self.latest = plan, Snapshot([goal])
         if lcs is not None:
             return plan.again({**lcs.tensors(), "x0": x0})  # pyright: ignore[reportAttributeAccessIssue]
-        return plan.at(x0.detach().reshape(plan.problem.x0.shape))
+        return plan.at(_shaped(x0.detach(), plan.problem.x0.shape))
 
     def start(self, x0: Tensor, guess: MPCSolution | Primal | None) -> Primal | None:
         """A guess as solvers want it, after a look at the numbers that are new."""
@@ -145,8 +145,13 @@ class _Planned:
         for value, shape, flat in zip((guess.x, guess.u, guess.lam, guess.mu), self.guess, self.flat, strict=True):
             if not (_is_double(value) and value.shape == shape):
                 return None
-            found.append((value.detach() if value.requires_grad else value).reshape(flat))
+            found.append(_shaped(value.detach() if value.requires_grad else value, flat))
         return found
+
+
+def _shaped(value: Tensor, shape: torch.Size) -> Tensor:
+    """`reshape` takes as long where there is nothing to do."""
+    return value if value.shape == shape else value.reshape(shape)
 
 
 def _is_double(value: object) -> TypeGuard[Tensor]:

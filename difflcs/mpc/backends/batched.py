@@ -110,7 +110,7 @@ class BatchedBackend(Backend):
             "objective": np.empty(batch),
             "residual": np.empty(batch),
             "status": np.empty(batch, np.int8),
-            "fragile": np.empty(batch, np.int8),
+            "fragile": np.empty(batch, np.bool_),
             "iterations": np.empty(batch, np.int32),
         }
         # Whatever can be done before the kernel is: after it, Python's own code and data are no more in the cache.
@@ -122,8 +122,9 @@ class BatchedBackend(Backend):
             found["residual"],
             torch.from_numpy(seconds),
             objective=found["objective"],
-            fragile=found["fragile"].view(torch.bool),  # zeros and ones
+            fragile=found["fragile"],
         )
+        outputs["fragile"] = outputs["fragile"].view(np.int8)  # zeros and ones
         vars(result)["all_converged"] = _kernels.solve_mpc(  # so that nobody needs to count
             inputs=problem.arrays,
             horizon=horizon,
