@@ -10,6 +10,8 @@
 //
 // One problem per SIMD lane: the code reads like the solver of a single problem. A finished lane stores its result and
 // takes the next problem. No lane's arithmetic depends on another lane: whatever iterates, iterates under a mask.
+// A problem alone would leave lanes idle: for it all of this is compiled once more with a single lane, and neighbouring
+// columns of matrices fill the vectors (`by_columns`).
 #include "adjoint.hpp"
 #include "kernels.hpp"
 #include "solve.hpp"
