@@ -157,6 +157,7 @@ def connect(workers: int | None = None, scheduler: str | None = None) -> Iterato
     A unit whose worker dies goes on from its last checkpoint, as often as Dask allows (`allowed-failures`, 3).
     """
     import cloudpickle
+    import dask.config
     from distributed import Client, LocalCluster
 
     for module in (sys.modules[__name__], recipes, records, units, deployment, worker):
@@ -166,6 +167,9 @@ def connect(workers: int | None = None, scheduler: str | None = None) -> Iterato
         if address is None:
             options: Any = {"memory_limit": None, "dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
             count = workers or len(os.sched_getaffinity(0))
+            # Dask gives up a worker that is not there 15 s after a loss, even one that has come back since, is lost
+            # again and is just being started: then nobody would compute the rest. Here each is started again for ever.
+            held.enter_context(dask.config.set({"distributed.deploy.lost-worker-timeout": "52 weeks"}))
             address = held.enter_context(LocalCluster(n_workers=count, threads_per_worker=1, **options))
         yield held.enter_context(Client(address))
 
