@@ -120,8 +120,7 @@ class Linearisation {
   // sum_m bend_m dz_m dz_m'. It knows of a contact's kink only next to it. Damping adds what bounds a kink that lies
   // lam + s away: |y| / (2 (lam + s)) is the curvature of the parabola that touches y |z| / 2 and lies above it, so
   // that with a damping of one a contact that opens or closes on the way costs no more than the model says.
-  Vec curvature(int64_t i, int64_t j) const { return curvature<Vec>(i, j); }
-  template <class V>
+  template <class V = Vec>
   V curvature(int64_t i, int64_t j) const {
     return V{} + weighted.column(i) * slopes.template column<V>(j);
   }
