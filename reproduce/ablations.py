@@ -3,6 +3,7 @@
 Without options table and figure are drawn from the tracked results. `--rerun --preset smoke|quick|paper` computes them.
 """
 
+import math
 import sys
 from functools import partial
 from pathlib import Path
@@ -21,8 +22,6 @@ LABELS = {
     "no-warm-up": "without warm-up",
 }
 NOTE = "LCS-RL in our recipe, without one of its parts each. Differences: without the part − with all, paired by seed."
-FEWEST = 3
-"""Seeds below which an interval, the range of them, says nothing."""
 Cells = dict[str, Cell]
 """Ablation → results; the recipe with all of its parts under its own name, "all"."""
 
@@ -43,17 +42,15 @@ def table(cells: Cells) -> pd.DataFrame:
 
 def words(cells: Cells, task: str) -> list[str]:
     """What the intervals say of every part, at 10 minutes and at the end."""
-    parts = {LABELS[name]: cell for name, cell in cells.items() if name != "all"}
-    few = [name for name, cell in parts.items() if len(report.paired(cell, cells["all"], "final")) < FEWEST]
-    if len(few) == len(parts):
-        return [f"On the {task} nothing has {FEWEST} seeds yet: the intervals are their range and say nothing."]
-    said = [f"On the {task} there are fewer than {FEWEST} seeds to tell by: {report.listed(few)}."] if few else []
+    said = []
     for label, when in list(WHEN.items())[1:]:
-        apart = {name: report.paired_estimate(c, cells["all"], when) for name, c in parts.items() if name not in few}
-        known = {name: found for name, found in apart.items() if found is not None}
+        apart = {LABELS[n]: report.paired_estimate(c, cells["all"], when) for n, c in cells.items() if n != "all"}
+        known = {name: found for name, found in apart.items() if found is not None and not math.isnan(found.low)}
         worse = report.listed([name for name, found in known.items() if found.high < 0])
         better = report.listed([name for name, found in known.items() if found.low > 0])
-        said.append(f"On the {task}, {label}, success is lower by its interval: {worse}; higher: {better}.")
+        few = report.listed([name for name in apart if name not in known])
+        left = "" if few == "none" else f"; fewer than {report.FEWEST} seeds to tell by: {few}"
+        said.append(f"On the {task}, {label}, success is lower by its interval: {worse}; higher: {better}{left}.")
     return said
 
 

@@ -25,6 +25,8 @@ NAMES = {"lcs-rl": "LCS-RL", "violation": "violation only", "ppo": "PPO without 
 COLORS = {"lcs-rl": "#d55e00", "violation": "#0072b2", "ppo": "#e69f00", "pddm": "#009e73"}
 """Okabe–Ito: red, blue, orange, green as in the paper, told apart by colour-blind readers."""
 MISSING = "—"
+FEWEST = 3
+"""Seeds that a sentence about a paired difference takes: the interval of two is their range, and says nothing."""
 STATISTICS = "Brackets and p are explained in reproduce/README.md, section Statistics."
 Tables = dict[str, pd.DataFrame]
 """Title → table of text."""
@@ -103,9 +105,11 @@ def paired(a: Cell | None, b: Cell | None, when: str | float) -> list[float]:
 
 
 def paired_estimate(a: Cell | None, b: Cell | None, when: str | float) -> Estimate | None:
-    """The mean of `paired` with its interval; None where nothing can be compared."""
+    """The mean of `paired`, with its interval from `FEWEST` seeds on; None where nothing can be compared."""
     found = paired(a, b, when)
-    return bootstrap([found]) if found else None
+    if len(found) < FEWEST:
+        return Estimate(sum(found) / len(found)) if found else None
+    return bootstrap([found])
 
 
 def listed(names: Sequence[str]) -> str:
@@ -125,7 +129,7 @@ def verdict(differences: Mapping[str, Estimate | None]) -> str:
         for how, names in found.items()
         if names
     ]
-    return ", ".join(parts) or "not compared: that takes two seeds"
+    return ", ".join(parts) or f"not compared: that takes {FEWEST} seeds"
 
 
 def bullets(sentences: Sequence[str]) -> list[str]:
@@ -137,7 +141,7 @@ def say(estimate: Estimate | None, signed: bool = False) -> str:
     """A number with its interval."""
     if estimate is None:
         return MISSING
-    value, low, high = (f"{x:{'+' if signed else ''}.1f}".replace("-", "−") for x in estimate)
+    value, low, high = (f"{x:{'+' if signed else ''}z.1f}".replace("-", "−") for x in estimate)
     return value if math.isnan(estimate.low) else f"{value} [{low}, {high}]"
 
 
