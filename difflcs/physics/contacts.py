@@ -3,10 +3,11 @@
 A step without contact is linear, x₊ = A x + B u + d. Contact forces λ along the rows of J change it by W Jᵀ λ, where W
 says what a force does to the state. With the gap after the step linearised, the step is an LCS:
 
-    x₊ = A x + B u + d + W Jᵀ λ,    0 ≤ λ ⊥ φ + J (x₊ − x̄) + R λ ≥ 0,
+    x₊ = A x + B u + d + W Jᵀ λ,    0 ≤ λ ⊥ φ + N (x₊ − x̄) + T (x₊ − x) + R λ ≥ 0,    J = N + T,
 
-with gaps φ and their derivatives J at the state x̄, and the compliance R of the contacts, which makes F + Fᵀ ≻ 0 and λ
-unique. Two models of dry friction are offered:
+with gaps φ and their derivatives N at the state x̄, and the compliance R of the contacts, which makes F + Fᵀ ≻ 0 and λ
+unique. A gap has grown since x̄, where it was measured; T, which has the tangents, counts what slides within the step,
+so that friction is right at every step of a plan and not at the first alone. Two models of dry friction are offered:
 
 - Anitescu: the rows of J are the extreme rays n ± μ t of the friction cone. F is symmetric. A contact that slides opens
   by μ times the distance that it slides, an error that vanishes with the step.
@@ -124,18 +125,17 @@ def contact_lcs(
     _check_shapes(contacts, free, n_x, n_contacts, n_tangents)
     mu = _each("friction", friction, contacts.gap, strict=False)
     soft = _each("compliance", compliance, contacts.gap, strict=True) * (force / length)
-    if n_tangents == 0:
-        rows, gap, softness = contacts.normal, contacts.gap, soft
-    elif cone == "anitescu":
-        rows, gap, softness = _rays(contacts, mu, soft)
-    else:
+    if n_tangents and cone == "stewart-trinkle":
         return _stewart_trinkle(contacts, free, x, mu, soft, length, force)
+    rows, gap, softness = _rays(contacts, mu, soft) if n_tangents else (contacts.normal, contacts.gap, soft)
+    normals = contacts.normal.repeat_interleave(2 * n_tangents, -2) if n_tangents else rows
     C = (free.response @ rows.mT) * force
-    rows = rows / length
+    rows, normals = rows / length, normals / length
     F = rows @ C
     F = 0.5 * (F + F.mT) + torch.diag_embed(softness.expand(F.shape[:-1]))
-    c = gap / length + matvec(rows, free.d - x)
-    return LCSParams(A=free.A, B=free.B, C=C, d=free.d, D=rows @ free.A, E=rows @ free.B, F=F, c=c)
+    D = rows @ free.A - (rows - normals)
+    c = gap / length + matvec(rows, free.d) - matvec(normals, x)
+    return LCSParams(A=free.A, B=free.B, C=C, d=free.d, D=D, E=rows @ free.B, F=F, c=c)
 
 
 def _check_shapes(contacts: Contacts, free: FreeMotion, n_x: int, n_contacts: int, n_tangents: int) -> None:
@@ -207,6 +207,9 @@ def _stewart_trinkle(
     rows = torch.cat([contacts.normal.unsqueeze(-2), both], -2).flatten(-3, -2)  # (..., n_contacts · per, n_x)
     C = (free.response @ rows.mT) * force
     rows = rows / length
+    is_normal = torch.zeros(per, dtype=x.dtype, device=x.device)
+    is_normal[0] = 1.0
+    along = (1.0 - is_normal).repeat(n_contacts).unsqueeze(-1) * rows  # the tangents, which count from the step's state
     W = rows @ C
     W = 0.5 * (W + W.mT) + torch.diag_embed(soft.repeat_interleave(per, -1).expand(W.shape[:-1]))
     normals = torch.arange(n_contacts) * per
@@ -231,16 +234,14 @@ def _stewart_trinkle(
         shape[dim] = n_contacts * size
         return values.new_zeros(shape).index_copy(dim, forces.to(values.device), values)
 
-    is_normal = torch.zeros(per, **like)
-    is_normal[0] = 1.0
     gap = (contacts.gap.unsqueeze(-1) * is_normal).flatten(-2) / length
-    c = gap + matvec(rows, free.d - x)
+    c = gap + matvec(rows, free.d) - matvec(rows - along, x)
     return LCSParams(
         A=free.A,
         B=free.B,
         C=spread(C, -1),
         d=free.d,
-        D=spread(rows @ free.A, -2),
+        D=spread(rows @ free.A - along, -2),
         E=spread(rows @ free.B, -2),
         F=F,
         c=spread(c, -1),

@@ -110,15 +110,15 @@ def test_other_bad_shapes_are_refused():
 # --- contacts ---------------------------------------------------------------------------------------------------------
 
 
-def sliding_block(cone, compliance=1e-6):
+def sliding_block(cone, compliance=1e-6, x=None):
     """A point of mass 1 on the floor; state (x, z, speeds), steps of 0.1, gravity and a push along x as action."""
+    x = torch.zeros(4, dtype=F64) if x is None else x
     h, eye, zero = 0.1, torch.eye(2, dtype=F64), torch.zeros(2, 2, dtype=F64)
     A = torch.cat([torch.cat([eye, h * eye], 1), torch.cat([zero, eye], 1)])
     B = tensor([[h * h, 0.0], [0.0, h * h], [h, 0.0], [0.0, h]])
     response = torch.cat([torch.cat([h * eye, zero], 1), torch.cat([eye, zero], 1)])
     free = FreeMotion(A, B, B @ tensor([0.0, -9.81]), response)
-    contacts = Contacts(tensor([0.0]), tensor([[0.0, 1.0, 0.0, 0.0]]), tensor([[[1.0, 0.0, 0.0, 0.0]]]))
-    x = torch.zeros(4, dtype=F64)
+    contacts = Contacts(x[1:2], tensor([[0.0, 1.0, 0.0, 0.0]]), tensor([[[1.0, 0.0, 0.0, 0.0]]]))
     return contact_lcs(contacts, free, x, friction=0.5, compliance=compliance, cone=cone), x
 
 
@@ -138,6 +138,22 @@ def test_sliding_friction():
     lcs, x = sliding_block("anitescu")
     after = lcs.step(x, tensor([6.0, 0.0])).x_next
     torch.testing.assert_close(after[1], 0.5 * after[0], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(("cone", "compliance"), [("anitescu", 1e-6), ("stewart-trinkle", 1e-2)])
+def test_friction_is_right_at_every_step_of_a_plan(cone, compliance):
+    """Gaps and motion are linear here: a plan is what the system of each step's own state says, and the block rests."""
+    x = tensor([0.3, 0.0, 1.5, 0.0])
+    actions = torch.zeros(15, 2, dtype=F64)
+    plan = sliding_block(cone, compliance, x)[0].rollout(x, actions)
+    steps = [x]
+    for u in actions:
+        steps.append(sliding_block(cone, compliance, steps[-1])[0].step(steps[-1], u).x_next)
+    torch.testing.assert_close(plan, torch.stack(steps), rtol=1e-6, atol=1e-8)
+    speed = plan[:, 2]
+    assert (speed[1:] <= speed[:-1] + 1e-6).all()
+    assert float(speed[1]) > 0.5
+    torch.testing.assert_close(speed[-1], tensor(0.0), rtol=0, atol=0.02)
 
 
 @pytest.mark.parametrize("cone", ["anitescu", "stewart-trinkle"])

@@ -237,8 +237,8 @@ def test_friction_is_combined_as_mujoco_does(case):
     module = MujocoLCS(model)
     assert module.n_lam == (2 if expected else 1)
     if expected:  # rays n ± μ t
-        D = module.params(tensor(0, 0, 0, -0.1, 0)).D
-        assert float((D[0] - D[1])[4].abs() / (D[0] + D[1])[3].abs()) == pytest.approx(expected)
+        E = module.params(tensor(0, 0, 0, -0.1, 0)).E
+        assert float((E[0] - E[1])[1].abs() / (E[0] + E[1])[0].abs()) == pytest.approx(expected)
     assert MujocoLCS(model, friction=0.0).n_lam == 1
 
 
@@ -313,11 +313,13 @@ def test_mobility_by_damping_or_by_numbers():
     model = pushing()
     model.dof_damping[:3] = [1.0, 2.0, 0.01]
     x = tensor(0.0, 0.0, 0.0, -0.075, 0.02)
-    by_damping, by_numbers = (
-        MujocoLCS(model, mobility=value).params(x) for value in ("damping", [1.0, 0.5, 100.0, 0.0, 0.0])
-    )
-    torch.testing.assert_close(by_damping.C, by_numbers.C)
-    torch.testing.assert_close(by_damping.C[2] / by_damping.C[0], 100 * by_damping.D[:, 2] / by_damping.D[:, 0])
+    by_damping, by_numbers = (MujocoLCS(model, mobility=value) for value in ("damping", [1.0, 0.5, 100.0, 0.0, 0.0]))
+    C = by_damping.params(x).C
+    torch.testing.assert_close(C, by_numbers.params(x).C)
+    contacts = by_damping.contacts(x)
+    for moved, row in ((C.sum(1), contacts.normal[0]), (C[:, 0] - C[:, 1], contacts.tangent[0, 0])):
+        expected = row[:3] * tensor(1.0, 0.5, 100.0)
+        torch.testing.assert_close(moved[:3] / moved.norm(), expected / expected.norm())
     fixed = MujocoLCS(model, mobility=np.diag([1.0, 0.0, 0.0, 0.0, 0.0]))
     assert not fixed.params(x).C[1:].any()
 
