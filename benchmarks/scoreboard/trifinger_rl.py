@@ -154,8 +154,8 @@ def summary(rows: list[list[float]]) -> dict[str, Any]:
 def keep(o: Options, rows: list[list[float]]) -> None:
     """Write what there is of this policy beside the others of the record."""
     assert o.out is not None
-    record = json.loads(o.out.read_text()) if o.out.exists() else {"machine": machine(), "results": {}}
-    row = {"seed": o.seed, **summary(rows), "rows": rows}
+    record = json.loads(o.out.read_text()) if o.out.exists() else {"results": {}}
+    row = {"machine": machine(), "seed": o.seed, **summary(rows), "rows": rows}
     if o.steps is not None:
         row["steps"] = o.steps
     record["results"][o.policy] = row
