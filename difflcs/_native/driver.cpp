@@ -8,8 +8,8 @@ namespace difflcs {
 namespace {
 
 // The actions that a start begins with: none; all at one bound for the first half of the horizon and at the other for
-// the second; or each anywhere between its bounds.
-enum class Actions { none, forth, back, random };
+// the second; or a random pulse of each, see `pulse`.
+enum class Actions { none, forth, back, pulse };
 
 struct Start {
   Actions actions;
@@ -19,19 +19,18 @@ struct Start {
 
 // The sequence of starts. A long homotopy leads most actions to one optimum, which is often the best; a short one stays
 // near where it begins. Both find no contact that is far from a plan without it: what begins with the largest actions
-// there are does, and so do random ones.
+// there are does, and so do random pulses.
 Start start_of(int64_t i) {
   constexpr Start first[] = {{Actions::none, true, false, 1.0},
                              {Actions::none, true, true, 1e-3},
                              {Actions::forth, false, false, 0.0},
                              {Actions::back, false, false, 0.0}};
-  return i < 4 ? first[i] : Start{Actions::random, false, false, 0.0};
+  return i < 4 ? first[i] : Start{Actions::pulse, false, false, 0.0};
 }
 
-// Starts of one round run side by side in the lanes of a vector, of which no instruction set but the baseline has
-// fewer.
-constexpr int64_t kRound = 4;
-// Starts with large actions go to the bounds; without a bound a few times as far as the best plan of the rounds before.
+// The first starts, which have no large actions.
+constexpr int64_t kNear = 2;
+// Starts with large actions go to the bounds; without a bound a few times as far as the best plan of the starts before.
 // A bound that is this many times farther than that plan stands for none.
 constexpr double kReach = 3.0, kNone = 100.0;
 // Steps at the target of the homotopy after which starts are compared.
@@ -57,6 +56,18 @@ double uniform(uint64_t seed, int64_t start, int64_t position) {
     z ^= z >> 31;
   }
   return double(z >> 11) * 0x1p-53;
+}
+
+// Action `j` of stage `k` in a random pulse, in parts of the way from none to a bound: one way for at most the first
+// kPush of the horizon, the other way for at most kBrake of it, then none. A mass that is far is pushed and then stopped
+// so; actions that are random at every stage would cancel each other out.
+constexpr double kPush = 0.6, kBrake = 0.4, kLeastPulse = 0.5;
+double pulse(uint64_t seed, int64_t start, int64_t j, int64_t k, int64_t horizon) {
+  const auto random = [&](int64_t i) { return uniform(seed, start, 5 * j + i); };
+  const double push = kPush * random(0) * double(horizon), brake = push + kBrake * random(1) * double(horizon);
+  const double way = random(2) < 0.5 ? 1.0 : -1.0;
+  if (double(k) < push) return way * (kLeastPulse + (1.0 - kLeastPulse) * random(3));
+  return double(k) < brake ? -way * (kLeastPulse + (1.0 - kLeastPulse) * random(4)) : 0.0;
 }
 
 struct Sizes {
@@ -205,13 +216,14 @@ void MpcDriver::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start,
   for (int64_t i = 0; i < n.u; i++) {
     const Bound bound(b, tried.element[job], i);
     const double low = end(bound.low), high = end(bound.high);
-    const bool first_half = 2 * (i / b.n_u) < b.horizon;
-    if (s.actions == Actions::none)
-      u[i] = bound.clip(0.0);
-    else if (s.actions == Actions::random)
-      u[i] = low + uniform(effort.seed, start, i) * (high - low);
-    else
-      u[i] = (s.actions == Actions::forth) == first_half ? high : low;
+    const int64_t k = i / b.n_u;
+    if (s.actions == Actions::none || s.actions == Actions::pulse) {
+      const double none = bound.clip(0.0);
+      const double part = s.actions == Actions::none ? 0.0 : pulse(effort.seed, start, i % b.n_u, k, b.horizon);
+      u[i] = none + part * (part > 0 ? high - none : none - low);
+    } else {
+      u[i] = (s.actions == Actions::forth) == (2 * k < b.horizon) ? high : low;
+    }
   }
 }
 
@@ -265,7 +277,7 @@ void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
     const bool from_guess = guessed && begun == 0;
     const int64_t shift = guessed ? 1 : 0;
     // Who goes far without bounds, waits for those that find out how far that is.
-    const int64_t wide = begun == shift && batch.unbounded ? kRound / 2 : kRound;
+    const int64_t wide = begun == shift && batch.unbounded ? kNear : starts;
     const int64_t end = from_guess ? 1 : std::min(starts, begun + wide);
     for (int64_t j = begun * count; j < end * count; j++) {
       const int64_t e = j % count;

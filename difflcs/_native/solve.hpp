@@ -279,22 +279,31 @@ class Solver {
         frozen[l] = -1;
         continue;
       }
-      const bool explored = o.explore > 0 && a.in_stage >= o.explore && !infeasible && !converged && !broken;
-      if (!infeasible && !converged && !broken && !explored && a.iterations < o.max_iter && !stuck) continue;
+      if (!infeasible && !converged && !broken && a.iterations < o.max_iter && !stuck) continue;
       frozen[l] = -1;
       if (converged && regularisation[l] > 0 && !broken) {  // once more without it: it hides a singular Hessian
         regularisation[l] = 0;
         continue;
       }
       store(o, l,
-            converged && !broken                     ? (sweep.weak[l] ? Status::degenerate : Status::converged)
-            : infeasible                             ? Status::infeasible
-            : a.iterations >= o.max_iter || explored ? Status::max_iter
-                                                     : Status::numerical,
-            riccati.force, explored);
+            converged && !broken         ? (sweep.weak[l] ? Status::degenerate : Status::converged)
+            : infeasible                 ? Status::infeasible
+            : a.iterations >= o.max_iter ? Status::max_iter
+                                         : Status::numerical,
+            riccati.force);
       if (!take(o, counter, l)) live--;
     }
     return frozen;
+  }
+
+  // Leaves the lanes that have made their steps at the target to be compared, and gives them other problems.
+  void leave(const MpcSolve& o, int64_t* counter, Mask frozen, int& live) {
+    for (int l = 0; o.explore > 0 && l < kLanes; l++) {
+      const bool at_target = !(frozen[l] || released[l] || fresh[l] || eps[l] > batch.relaxation);
+      if (!at_target || lane[l].in_stage < o.explore) continue;
+      store(o, l, Status::max_iter, problem.multiplier, true);
+      if (!take(o, counter, l)) live--;
+    }
   }
 
   // Armijo search along the feedback law. An accepted lane keeps its trial while the others shorten their step. Returns
@@ -398,7 +407,9 @@ void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
     Vec step, gain;
     const Mask moved = search(frozen, step, gain, watch);
     advance(o, sweep, frozen, moved, step, gain);
-    if (any(released & ~frozen)) touch(o, released & ~frozen);
+    const Mask first = released & ~frozen;
+    if (any(first)) touch(o, first);
+    leave(o, counter, frozen | first, live);
   }
   if (waiting) certificate.judge(o, finished, waiting);
 }

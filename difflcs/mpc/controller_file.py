@@ -82,8 +82,8 @@ def controller_bytes(mpc: LCSMPCLayer, system: LCSParams | LCSSequence, step_sec
         "shrink": backend.shrink,
         "max_iter": backend.max_iter,
         "seed": backend.seed,
-        "starts": backend.starts(guessed=False),
-        "starts_guessed": backend.starts(guessed=True),
+        "starts": backend.starts(problem, guessed=False),
+        "starts_guessed": backend.starts(problem, guessed=True),
         "step_seconds": step_seconds,
     }
     numbers = {**sizes, "horizon": problem.horizon, "n_goal": n_goal, **options}

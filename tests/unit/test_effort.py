@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -99,9 +101,6 @@ def test_the_scale_of_the_problem_starts_the_homotopy(build):
 
 
 def test_a_guess_is_the_only_start_unless_the_best_is_wanted(build):
-    assert [BatchedBackend(effort=e).starts(guessed=True) for e in ("fast", "default", "best")] == [1, 1, 16]
-    assert [BatchedBackend(effort=e).starts(guessed=False) for e in ("fast", "default", "best")] == [1, 4, 16]
-    assert BatchedBackend(restarts=5).starts(guessed=True) == BatchedBackend(restarts=5).starts(guessed=False) == 5
     layer = {"lcs": build.pushing(1, 8), "cost": COST, "horizon": 5, "u_min": -0.015, "u_max": 0.015}
     generator = torch.Generator().manual_seed(4)
     x0 = 0.05 * torch.randn(32, 9, generator=generator, dtype=torch.float64)
@@ -114,6 +113,19 @@ def test_a_guess_is_the_only_start_unless_the_best_is_wanted(build):
     assert bool((moves.objective < poor.objective * (1 - 1e-3)).any())
 
 
+def test_plans_of_many_contacts_get_more_starts():
+    def starts(horizon, n_lam, guessed, **options):
+        problem = SimpleNamespace(horizon=horizon, n_lam=n_lam)
+        efforts = [options] if options else [{"effort": effort} for effort in ("fast", "default", "best")]
+        return [BatchedBackend(**one).starts(problem, guessed) for one in efforts]
+
+    assert starts(5, 8, guessed=False) == [1, 4, 16]
+    assert starts(5, 8, guessed=True) == [1, 1, 16]
+    assert starts(20, 5, guessed=False) == [1, 16, 64]
+    assert starts(20, 5, guessed=True) == [1, 1, 64]
+    assert starts(20, 5, guessed=True, restarts=5) == starts(5, 5, guessed=False, restarts=5) == [5]
+
+
 def test_what_was_given_up_is_solved_where_all_else_fails():
     """With few iterations: 22 of 192 are not solved, and 31 where no start gets a second chance."""
     lcs = LCSModel(9, 6, 8, init_scale=0.3, generator=torch.Generator().manual_seed(2)).params().detach()
@@ -122,7 +134,8 @@ def test_what_was_given_up_is_solved_where_all_else_fails():
     x0 = torch.randn(64, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     failed = 0
     for max_iter in (27, 30, 32):
-        mpc = LCSMPCLayer(lcs, cost, 30, -1.0, 1.0, backend=BatchedBackend(max_iter=max_iter), on_failure="mask")
+        backend = BatchedBackend(restarts=4, max_iter=max_iter)
+        mpc = LCSMPCLayer(lcs, cost, 30, -1.0, 1.0, backend=backend, on_failure="mask")
         with pytest.warns(SolveWarning):
             failed += int((~mpc(x0).converged).sum())
     assert failed <= 26
