@@ -8,7 +8,7 @@ Two families, both solved with the default settings from nothing:
 
 Printed per size: the share of problems solved, iterations, and CPU time per problem and per iteration on one thread;
 then by which power of H, and of n where all sizes grow together, the time of an iteration grows. Iterations are those
-of all starts of a problem. Written as JSON too.
+of one start of a problem, on average. Written as JSON too.
 """
 
 from __future__ import annotations
@@ -64,7 +64,8 @@ class Row:
     horizon: int
     problems: int
     solved: float
-    iterations: float
+    starts: int
+    iterations: float  # of one start; most are given up after a few
     per_problem: float
     per_iteration: float
 
@@ -104,6 +105,7 @@ def measure(family: str, problems: list[MPCProblem]) -> Row:
     solved = torch.cat([result.solved for result in results])
     iterations = torch.cat([result.iterations for result in results]).double()
     p = problems[0]
+    starts = backend.starts(p, guessed=False)
     return Row(
         family=family,
         n_x=p.n_x,
@@ -112,7 +114,8 @@ def measure(family: str, problems: list[MPCProblem]) -> Row:
         horizon=p.horizon,
         problems=len(solved),
         solved=float(solved.double().mean()),
-        iterations=float(iterations.mean()),
+        starts=starts,
+        iterations=float(iterations.mean()) / starts,
         per_problem=spent / len(solved),
         per_iteration=spent / float(iterations.sum()),
     )
@@ -122,7 +125,8 @@ def show(row: Row) -> None:
     """Print one line."""
     print(
         f"{row.family:7s} n_x {row.n_x:2d}  n_u {row.n_u:2d}  n_lam {row.n_lam:2d}  H {row.horizon:2d}: "
-        f"{100 * row.solved:6.2f} % of {row.problems} solved, {row.iterations:6.1f} iterations, "
+        f"{100 * row.solved:6.2f} % of {row.problems} solved, {row.starts:2d} starts of {row.iterations:6.1f} "
+        f"iterations, "
         f"{1e3 * row.per_problem:9.3f} ms per problem, {1e6 * row.per_iteration:7.1f} us per iteration",
         flush=True,
     )

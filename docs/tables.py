@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
+import numpy as np
+
 NOT_RUN = "This part of the race has not been run."
 
 
@@ -165,15 +167,40 @@ def efforts(record: dict) -> str:
 
 
 def sizes(record: dict) -> str:
-    """Share of problems solved, and iterations, by size and horizon."""
+    """Share of problems solved, and iterations of one start times the number of starts, by size and horizon."""
     horizons = sorted({row["horizon"] for row in record["rows"]})
     found: dict[str, dict[int, str]] = {}
     for row in record["rows"]:
         label = f"{row['family']}, n_x {row['n_x']}, n_lam {row['n_lam']}"
-        cell = f"{100 * row['solved']:.0f} %, {row['iterations']:.0f}"
+        cell = f"{100 * row['solved']:.0f} %, {row['iterations']:.0f} × {row['starts']}"
         found.setdefault(label, {})[row["horizon"]] = cell
     rows = [[label, *(cells.get(h, "") for h in horizons)] for label, cells in found.items()]
     return table(["problems", *(f"H {h}" for h in horizons)], rows)
+
+
+def recipes(record: dict) -> str:
+    """Success at each of the minutes, and seconds of one core: mean and range over seeds, and differences by seed."""
+    by_seed: dict[str, dict[int, list[dict]]] = {}
+    for row in record["rows"]:
+        by_seed.setdefault(row["recipe"], {})[row["seed"]] = row["evaluations"]
+    seeds = sorted(set.intersection(*(set(own) for own in by_seed.values())))
+    minutes = [evaluation["minutes"] for evaluation in record["rows"][0]["evaluations"]]
+
+    def column(recipe: str, name: str, k: int) -> np.ndarray:
+        return np.array([by_seed[recipe][seed][k][name] for seed in seeds])
+
+    def cell(values: np.ndarray, unit: str, digits: int = 1, sign: str = "") -> str:
+        mean, low, high = (f"{v:{sign}.{digits}f}" for v in (values.mean(), values.min(), values.max()))
+        return f"{mean} {unit} ({low} to {high})".replace("-", "−")
+
+    found = []
+    for recipe in by_seed:
+        success = [cell(100 * column(recipe, "success_rate", k), "%") for k in range(len(minutes))]
+        found.append([recipe, *success, cell(column(recipe, "seconds", -1), "s", 0)])
+    one, other = by_seed
+    change = [column(one, "success_rate", k) - column(other, "success_rate", k) for k in range(len(minutes))]
+    found.append([f"{one} − {other}", *(cell(100 * c, "points", sign="+") for c in change), ""])
+    return table(["settings", *(f"{m:g} min of data" for m in minutes), "computing"], found)
 
 
 WAYS = {
@@ -359,6 +386,7 @@ TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "race_avx512": {"best": best("contact")},
     "optima": {"efforts": efforts},
     "scale": {"sizes": sizes},
+    "training_time": {"recipes": recipes},
     "latency": {"ways": latency},
     "delay": {"ways": delay},
     "physics": {"errors": errors},

@@ -1,0 +1,116 @@
+"""What a training costs on one core, and what is lost where it shall cost little: `python benchmarks/training_time.py`.
+
+Trains LCS-RL on the cube by its default settings and by quick ones (`QUICK`, fewer and smaller iterations on model
+rollouts), from the same seeds, and evaluates both on the same fresh goals. Seconds are CPU time of one thread without
+the evaluations. Every training is written when it is done; the same call goes on where the last one stopped.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+
+from difflcs.bench import machine, save
+from difflcs.rl import evaluate, get_method, get_task
+from difflcs.rl.methods import Work
+from difflcs.rl.model_rollouts import ModelRolloutSettings
+from difflcs.rl.ppo_settings import PPOSettings
+
+LCS_RL = get_method("lcs-rl")
+QUICK: dict[str, Any] = {
+    "n_lam": 5,
+    "ppo": PPOSettings(rollouts=68, steps=4),
+    "models": ModelRolloutSettings(iterations=3, rollouts=80, steps=10, value_epochs=7),
+}
+"""docs/training.md has them as flags. They were chosen on the seeds 1 to 4."""
+RECIPES = {"quick": LCS_RL(**QUICK), "default": LCS_RL()}
+
+
+@dataclass
+class Options:
+    """What a training costs."""
+
+    recipes: list[str] = field(default_factory=lambda: list(RECIPES))
+    """Which of both."""
+    minutes: list[float] = field(default_factory=lambda: [10, 30])
+    """When to evaluate; the last one is the length of the training."""
+    seeds: list[int] = field(default_factory=lambda: list(range(1000, 1008)))
+    """Seeds of the trainings."""
+    goals: int = 1000
+    """Goals of each evaluation."""
+    evaluation_seed: int = 0
+    """Seed of the goals, the same for all."""
+    envs: int = 100
+    """Environments side by side in evaluations."""
+    out: Path = Path("benchmarks/results/training_time.json")
+    """Where the JSON goes."""
+    smoke: bool = False
+    """Seconds instead of minutes, with the method's smoke settings; learns nothing."""
+
+
+def run(o: Options, recipe: str, seed: int) -> dict[str, Any]:
+    """One training: its seconds and its success, at each of the minutes."""
+    task, method = get_task("cube"), RECIPES[recipe]
+    if o.smoke:
+        method = method.smoke()
+    per_minute = task.steps_per_minute / task.episode_steps
+    opened: list[Any] = []
+
+    def make_envs(count: int) -> Any:
+        opened.append(task.make_envs(count, threads=1))
+        return opened[-1]
+
+    try:
+        trainer = method.trainer(Work(task, seed, round(max(o.minutes) * per_minute), make_envs))
+        envs, spent, rows = make_envs(o.envs), 0.0, []
+        for minutes in sorted(o.minutes):
+            begun = time.process_time()
+            while trainer.episodes < round(minutes * per_minute):
+                trainer.step()
+            spent += time.process_time() - begun
+            found = evaluate(envs, trainer.policy, o.goals, o.evaluation_seed, task.episode_steps)
+            rows.append({"minutes": minutes, "seconds": round(spent, 1), "success_rate": found.success_rate})
+    finally:
+        for envs in opened:
+            envs.close()
+    same = {"recipe": recipe, "seed": seed, "goals": o.goals, "evaluation_seed": o.evaluation_seed}
+    return {**same, "evaluations": rows}
+
+
+def main(o: Options) -> None:
+    """Train, evaluate, write, print."""
+    if o.smoke:
+        o.minutes, o.seeds, o.goals, o.envs = [0.2, 0.4], o.seeds[:1], 4, 4
+    torch.set_num_threads(1)
+    rows = json.loads(o.out.read_text())["rows"] if o.out.exists() else []
+    asked = {"goals": o.goals, "evaluation_seed": o.evaluation_seed}
+    for seed in o.seeds:
+        for recipe in o.recipes:
+            wanted = {"recipe": recipe, "seed": seed, **asked}
+            same = [r for r in rows if wanted.items() <= r.items()]
+            if any([e["minutes"] for e in r["evaluations"]] == sorted(o.minutes) for r in same):
+                continue
+            rows.append(run(o, recipe, seed))
+            save(o.out, {"machine": machine(), "rows": rows})
+            for e in rows[-1]["evaluations"]:
+                line = f"{recipe:8s} seed {seed}  {e['minutes']:4g} min  {100 * e['success_rate']:5.1f} %"
+                print(f"{line}  {e['seconds']:.1f} s", flush=True)
+    for recipe in o.recipes:
+        own = [row["evaluations"] for row in rows if row["recipe"] == recipe]
+        for at in zip(*own, strict=True):
+            success, seconds = [100 * e["success_rate"] for e in at], [e["seconds"] for e in at]
+            print(
+                f"{recipe:8s} {at[0]['minutes']:4g} min: {np.mean(success):.1f} % ({min(success):.1f} to "
+                f"{max(success):.1f}), {np.mean(seconds):.1f} s ({min(seconds):.1f} to {max(seconds):.1f})"
+            )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
