@@ -140,7 +140,8 @@ def test_the_command_line_is_asked(parse):
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_the_commands_of_a_page_exist(page, parse):
     text = page.read_text()
-    shell = [line for kind, code in FENCE.findall(text) if kind in ("bash", "console") for line in code.splitlines()]
+    fenced = [code.replace("\\\n", " ") for kind, code in FENCE.findall(text) if kind in ("bash", "console")]
+    shell = [line for code in fenced for line in code.splitlines()]
     inline = re.findall(r"`(difflcs [a-z][^`\n]*)`", text.replace("\n", " "))
     whole, running = ([re.sub(r"^\$ |\s+#.*$", "", line).strip() for line in lines] for lines in (shell, inline))
     for line in [*whole, *running]:
