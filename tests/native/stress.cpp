@@ -112,10 +112,10 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
   std::vector<int32_t> iterations(count);
   double no_multipliers;
   MpcSolve o{};
-  const std::vector<MpcStart> cold(count, {true, 1.0, 1e-5}), warm(count, {false, 0.0, 1e-5});
-  std::vector<double> scale(count), gained(count);
+  const std::vector<MpcStart> cold(count, {true, false, 1.0, 1e-5}), warm(count, {false, false, 0.0, 1e-5});
+  std::vector<double> gained(count);
   o.start = cold.data(), o.shrink = 0.3, o.steps = 1, o.tol = 1e-8, o.max_iter = 100, o.certified = 1e-6;
-  o.scale = scale.data(), o.gained = gained.data();
+  o.gained = gained.data();
   o.x = x.data(), o.u = u.data(), o.lam = lam.data(), o.mu = &no_multipliers;
   o.objective = objective.data(), o.residual = residual.data(), o.status = status.data();
   o.fragile = fragile.data(), o.iterations = iterations.data();
@@ -144,6 +144,17 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
       u = u_start, lam = lam_start;
     }
     o.u_start = o.lam_start = nullptr, o.start = cold.data();
+  }
+  {  // left to be compared after two steps, over other plans
+    const auto kept_x = x, kept_u = u, kept_lam = lam;
+    const auto kept_status = status;
+    const Workspace workspace(kernels().mpc_workspace(b));
+    int64_t next = 0;
+    o.explore = 2;
+    std::fill(status.begin(), status.end(), kUnreached);
+    kernels().mpc_solve(b, o, &next, workspace.data, kNever);
+    expect(std::count(status.begin(), status.end(), kUnreached) == 0, "what is left has a status");
+    x = kept_x, u = kept_u, lam = kept_lam, status = kept_status;
   }
   MpcGradient g{};
   const auto x_bar = normal(x.size(), 1.0), u_bar = normal(u.size(), 1.0), lam_bar = normal(lam.size(), 1.0);
