@@ -91,11 +91,16 @@ def main(o: Options) -> None:
     torch.set_num_threads(1)
     rows = json.loads(o.out.read_text())["rows"] if o.out.exists() else []
     asked = {"goals": o.goals, "evaluation_seed": o.evaluation_seed}
+
+    def known(recipe: str) -> dict[int, list[dict[str, Any]]]:
+        """Seed → evaluations that are there, at these minutes and on these goals."""
+        own = [row for row in rows if {"recipe": recipe, **asked}.items() <= row.items()]
+        at = sorted(o.minutes)
+        return {row["seed"]: row["evaluations"] for row in own if [e["minutes"] for e in row["evaluations"]] == at}
+
     for seed in o.seeds:
         for recipe in o.recipes:
-            wanted = {"recipe": recipe, "seed": seed, **asked}
-            same = [r for r in rows if wanted.items() <= r.items()]
-            if any([e["minutes"] for e in r["evaluations"]] == sorted(o.minutes) for r in same):
+            if seed in known(recipe):
                 continue
             rows.append(run(o, recipe, seed))
             save(o.out, {"machine": machine(), "rows": rows})
@@ -103,8 +108,7 @@ def main(o: Options) -> None:
                 line = f"{recipe:8s} seed {seed}  {e['minutes']:4g} min  {100 * e['success_rate']:5.1f} %"
                 print(f"{line}  {e['seconds']:.1f} s", flush=True)
     for recipe in o.recipes:
-        own = [row["evaluations"] for row in rows if row["recipe"] == recipe]
-        for at in zip(*own, strict=True):
+        for at in zip(*known(recipe).values(), strict=True):
             success, seconds = [100 * e["success_rate"] for e in at], [e["seconds"] for e in at]
             print(
                 f"{recipe:8s} {at[0]['minutes']:4g} min: {np.mean(success):.1f} % ({min(success):.1f} to "
