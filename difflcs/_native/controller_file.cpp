@@ -137,7 +137,7 @@ ControllerData read_controller(const void* bytes, size_t size) {
   data.relaxation = reader.number("relaxation", kSmallestNumber), data.barrier = reader.number("barrier", 0);
   data.tol = reader.number("tol", kSmallestNumber), data.certified = reader.number("certified", kSmallestNumber);
   data.homotopy = reader.number("homotopy", 0);
-  data.shrink = reader.number("shrink", 0, 1 - 1e-12);
+  data.shrink = reader.number("shrink", kSmallestNumber, 1 - 1e-12);
   data.max_iter = reader.size("max_iter", 1, kLargestCount), data.seed = reader.size("seed", 0, kLargestCount);
   data.starts = reader.size("starts", 1), data.starts_guessed = reader.size("starts_guessed", 1);
   data.step_seconds = reader.number("step_seconds", 0);

@@ -41,9 +41,6 @@ constexpr double kSame = 0.02;
 // relaxations up.
 constexpr int64_t kSteps = 1, kStepsAgain = 2;
 constexpr double kLonger = 1000.0;
-// Factor of the homotopy per stage. Starts that are compared follow a quicker one: what one of them misses for it,
-// another finds.
-constexpr double kShrink = 0.3, kShrinkExploring = 0.2;
 // An iteration with row exchanges takes ten times as long, and what it can mend it mends soon.
 constexpr int64_t kMaxIterPivot = 60;
 // Elements are searched in chunks, so that what is kept of all starts stays small.
@@ -114,8 +111,8 @@ struct Solving {
 
 MpcSolve with(const MpcEffort& effort, const MpcPlans& out) {
   MpcSolve o{};
-  o.shrink = effort.shrink > 0 ? effort.shrink : kShrink, o.steps = kSteps;
-  o.tol = effort.tol, o.max_iter = effort.max_iter, o.certified = effort.certified;
+  o.shrink = effort.shrink, o.steps = kSteps, o.tol = effort.tol, o.max_iter = effort.max_iter;
+  o.certified = effort.certified;
   o.x = out.x, o.u = out.u, o.lam = out.lam, o.mu = out.mu, o.objective = out.objective, o.residual = out.residual;
   o.status = out.status, o.fragile = out.fragile, o.iterations = out.iterations;
   return o;
@@ -238,7 +235,6 @@ void MpcDriver::explore(const MpcBatch& batch, const MpcEffort& effort, Runner& 
   jobs.count = count, jobs.element = tried.element.data() + first;
   MpcSolve o = with(effort, shifted(batch, tried.plans(), first));
   o.u_start = o.u, o.start = tried.start.data() + first, o.explore = kExplore;
-  if (!(effort.shrink > 0)) o.shrink = kShrinkExploring;
   if (guessed) o.lam_start = o.lam, o.mu_start = o.mu;
   o.gained = tried.gained.data() + first;
   run(jobs, o, runner);

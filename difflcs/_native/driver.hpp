@@ -13,7 +13,7 @@ namespace difflcs {
 struct MpcEffort {
   int64_t starts;   // at least one; driver.cpp states their sequence. A guess is the first of them.
   double homotopy;  // first relaxation as a multiple of the problem's; 0: the problem's own scale decides
-  double shrink;    // factor of the homotopy per stage; 0: the driver's own
+  double shrink;    // factor of the homotopy
   double tol;       // on the projected gradient
   int64_t max_iter;
   double certified;  // largest residual of a solved problem

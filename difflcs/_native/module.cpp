@@ -224,7 +224,7 @@ bool solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
   if (u_start) check_size("u_start", u_start->size(), actions);
   if (lam_start) check_size("lam_start", lam_start->size(), forces);
   if (mu_start) check_size("mu_start", mu_start->size(), rows);
-  if (!(starts >= 1 && homotopy >= 0 && shrink >= 0 && shrink < 1))
+  if (!(starts >= 1 && homotopy >= 0 && shrink > 0 && shrink < 1))
     throw std::invalid_argument("starts must be at least 1, the homotopy must fall");
   if (lam_start && !(u_start && mu_start)) throw std::invalid_argument("lam_start needs u_start and mu_start");
   if (b.count == 0) return true;

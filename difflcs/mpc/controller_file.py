@@ -79,7 +79,7 @@ def controller_bytes(mpc: LCSMPCLayer, system: LCSParams | LCSSequence, step_sec
         "tol": backend.tol,
         "certified": kkt.CERTIFIED,
         "homotopy": backend.homotopy or 0.0,
-        "shrink": backend.shrink or 0.0,
+        "shrink": backend.shrink,
         "max_iter": backend.max_iter,
         "seed": backend.seed,
         "starts": backend.starts(problem, guessed=False),

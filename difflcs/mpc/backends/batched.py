@@ -70,7 +70,7 @@ class BatchedBackend(Backend):
         seed: seed of the random starts, which are the same for every element.
         homotopy: λ·s at which a cold start begins, as a multiple of the relaxation; None: the square of the mean gap
             of the contacts, in the units in which F has a unit diagonal. A guess starts at the relaxation.
-        shrink: factor of the homotopy from one relaxation to the next; None: 0.3, and 0.2 where starts are compared.
+        shrink: factor of the homotopy.
         threads: threads to use; torch's number if None.
     """
 
@@ -83,7 +83,7 @@ class BatchedBackend(Backend):
     time_limit: float | None = None
     seed: int = 0
     homotopy: float | None = None
-    shrink: float | None = None
+    shrink: float = 0.3
     threads: int | None = None
 
     def __post_init__(self) -> None:
@@ -98,7 +98,7 @@ class BatchedBackend(Backend):
         check_number("tol", self.tol, strict=True)
         if self.homotopy is not None:
             check_number("homotopy", self.homotopy, minimum=1.0)
-        if self.shrink is not None and check_number("shrink", self.shrink, strict=True) >= 1:
+        if check_number("shrink", self.shrink, strict=True) >= 1:
             check_number("1 - shrink", 1 - self.shrink, strict=True)
 
     def solve(self, problem: MPCProblem, guess: Primal | None) -> BatchedResult:
@@ -139,7 +139,7 @@ class BatchedBackend(Backend):
             starts=self.starts(problem, guess is not None),
             seed=self.seed,
             homotopy=self.homotopy or 0.0,
-            shrink=self.shrink or 0.0,
+            shrink=self.shrink,
             tol=self.tol,
             max_iter=self.max_iter,
             certified=kkt.CERTIFIED,
