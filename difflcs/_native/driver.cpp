@@ -15,17 +15,22 @@ struct Start {
   Actions actions;
   bool released, gauss_newton;  // see MpcStart
   double first;                 // see MpcStart
+  int64_t explore;              // Newton steps at the target of the homotopy after which it is compared
 };
 
 // The sequence of starts. A long homotopy leads most actions to one optimum, which is often the best; a short one stays
 // near where it begins. Both find no contact that is far from a plan without it: what begins with the largest actions
 // there are does, and so do random pulses.
+//
+// What begins at the target, without a homotopy, needs more steps there to show what it is worth. In a batch it then is
+// given up more often; alone, a problem has these steps for nothing while its first start is on its way.
+constexpr int64_t kExplore = 2, kExploreFar = 6;
 Start start_of(int64_t i) {
-  constexpr Start first[] = {{Actions::none, true, false, 1.0},
-                             {Actions::none, true, true, 1e-3},
-                             {Actions::forth, false, false, 0.0},
-                             {Actions::back, false, false, 0.0}};
-  return i < 4 ? first[i] : Start{Actions::pulse, false, false, 0.0};
+  constexpr Start first[] = {{Actions::none, true, false, 1.0, kExplore},
+                             {Actions::none, true, true, 1e-3, kExplore},
+                             {Actions::forth, false, false, 0.0, kExploreFar},
+                             {Actions::back, false, false, 0.0, kExploreFar}};
+  return i < 4 ? first[i] : Start{Actions::pulse, false, false, 0.0, kExploreFar};
 }
 
 // The first starts, which have no large actions.
@@ -33,8 +38,6 @@ constexpr int64_t kNear = 2;
 // Starts with large actions go to the bounds; without a bound a few times as far as the best plan of the starts before.
 // A bound that is this many times farther than that plan stands for none.
 constexpr double kReach = 3.0, kNone = 100.0;
-// Steps at the target of the homotopy after which starts are compared.
-constexpr int64_t kExplore = 2;
 // Actions that differ by less than this part of their range lead to the same optimum.
 constexpr double kSame = 0.02;
 // The homotopy makes one step per stage, and two where a problem is tried again along one that starts this many
@@ -207,7 +210,7 @@ void MpcDriver::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEff
 void MpcDriver::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start, int64_t job, int64_t best) {
   const Sizes n(b);
   const Start s = start_of(start);
-  tried.start[job] = beginning(s, b, effort);
+  tried.start[job] = beginning(s, b, effort), tried.start[job].explore = s.explore;
   double* u = tried.u.data() + job * n.u;
   double largest = 1.0;
   for (int64_t i = 0; best >= 0 && i < n.u; i++) largest = std::max(largest, 1.0 + std::abs(tried.u[best * n.u + i]));
@@ -234,7 +237,7 @@ void MpcDriver::explore(const MpcBatch& batch, const MpcEffort& effort, Runner& 
   MpcBatch jobs = batch;
   jobs.count = count, jobs.element = tried.element.data() + first;
   MpcSolve o = with(effort, shifted(batch, tried.plans(), first));
-  o.u_start = o.u, o.start = tried.start.data() + first, o.explore = kExplore;
+  o.u_start = o.u, o.start = tried.start.data() + first;
   if (guessed) o.lam_start = o.lam, o.mu_start = o.mu;
   o.gained = tried.gained.data() + first;
   run(jobs, o, runner);
@@ -282,7 +285,7 @@ void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
     for (int64_t j = begun * count; j < end * count; j++) {
       const int64_t e = j % count;
       if (from_guess) {
-        tried.start[j] = at_target(batch);
+        tried.start[j] = at_target(batch), tried.start[j].explore = kExplore;
         std::copy_n(guess.u + (first + e) * n.u, n.u, tried.u.data() + j * n.u);
         if (whole) std::copy_n(guess.lam + (first + e) * n.lam, n.lam, tried.lam.data() + j * n.lam);
         if (whole) std::copy_n(guess.mu + (first + e) * n.mu, n.mu, tried.mu.data() + j * n.mu);

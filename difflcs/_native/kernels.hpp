@@ -56,13 +56,14 @@ struct MpcBatch {
   }
 };
 
-// Where the homotopy of a problem starts.
+// Where the homotopy of a problem starts, and how far it is followed.
 struct MpcStart {
   // Whether the actions are first replaced by the feedback law of the problem without contact, rolled out with it.
   bool released;
   bool gauss_newton;  // without the second derivative of the forces
   double first;       // if released: first relaxation, in parts of the square of the mean gap of the contacts then
   double at_least;    // first relaxation, whatever the problem's scale
+  int64_t explore;    // Newton steps at the target after which a problem is left as it is, as MAX_ITER; 0: never
 };
 
 // What the solver needs besides the problem, and where its results go.
@@ -75,7 +76,6 @@ struct MpcSolve {
   int64_t steps;            // most Newton steps of one stage
   double tol;               // on the projected gradient
   int64_t max_iter;
-  int64_t explore;   // Newton steps at the target after which a problem is left as it is, as MAX_ITER; 0: never
   double certified;  // largest residual of a solved problem
   double *x, *u, *lam, *mu, *objective,
       *residual;    // out; residual as difflcs.mpc.kkt.residual, from the numbers returned

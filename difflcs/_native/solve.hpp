@@ -298,9 +298,10 @@ class Solver {
 
   // Leaves the lanes that have made their steps at the target to be compared, and gives them other problems.
   void leave(const MpcSolve& o, int64_t* counter, Mask frozen, int& live) {
-    for (int l = 0; o.explore > 0 && l < kLanes; l++) {
-      const bool at_target = !(frozen[l] || released[l] || fresh[l] || eps[l] > batch.relaxation);
-      if (!at_target || lane[l].in_stage < o.explore) continue;
+    for (int l = 0; l < kLanes; l++) {
+      if (frozen[l] || released[l] || fresh[l] || eps[l] > batch.relaxation) continue;
+      const int64_t steps = o.start[lane[l].element].explore;
+      if (steps == 0 || lane[l].in_stage < steps) continue;
       store(o, l, Status::max_iter, problem.multiplier, true);
       if (!take(o, counter, l)) live--;
     }

@@ -150,7 +150,9 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
     const auto kept_status = status;
     const Workspace workspace(kernels().mpc_workspace(b));
     int64_t next = 0;
-    o.explore = 2;
+    std::vector<MpcStart> compared = cold;
+    for (auto& start : compared) start.explore = 2;
+    o.start = compared.data();
     std::fill(status.begin(), status.end(), kUnreached);
     kernels().mpc_solve(b, o, &next, workspace.data, kNever);
     expect(std::count(status.begin(), status.end(), kUnreached) == 0, "what is left has a status");

@@ -26,13 +26,17 @@ def costs(layer, call, **options):
 
 @pytest.mark.parametrize("n_lam", [5, 8])
 def test_more_effort_finds_better_optima(build, n_lam):
-    layer = {"lcs": build.pushing(2, n_lam), "cost": COST, "horizon": 5, "u_min": -0.015, "u_max": 0.015}
-    generator = torch.Generator().manual_seed(3)
-    x0 = 0.05 * torch.randn(64, 9, generator=generator, dtype=torch.float64)
-    goal = 0.05 * torch.randn(64, 3, generator=generator, dtype=torch.float64)
-    found = {effort: costs(layer, (x0, goal), effort=effort) for effort in ("fast", "default", "best")}
-    best = torch.minimum(torch.stack(list(found.values())).amin(0), costs(layer, (x0, goal), restarts=32))
-    gap = {effort: float(((cost - best) / best.abs()).mean()) for effort, cost in found.items()}
+    gaps = {effort: [] for effort in ("fast", "default", "best")}
+    for seed in range(1, 5):
+        layer = {"lcs": build.pushing(seed, n_lam), "cost": COST, "horizon": 5, "u_min": -0.015, "u_max": 0.015}
+        generator = torch.Generator().manual_seed(3)
+        x0 = 0.05 * torch.randn(64, 9, generator=generator, dtype=torch.float64)
+        goal = 0.05 * torch.randn(64, 3, generator=generator, dtype=torch.float64)
+        found = {effort: costs(layer, (x0, goal), effort=effort) for effort in gaps}
+        best = torch.minimum(torch.stack(list(found.values())).amin(0), costs(layer, (x0, goal), restarts=32))
+        for effort, cost in found.items():
+            gaps[effort].append(((cost - best) / best.abs()).mean())
+    gap = {effort: float(torch.stack(means).mean()) for effort, means in gaps.items()}
     assert gap["best"] <= gap["default"] <= gap["fast"]
     assert gap["default"] < 0.8 * gap["fast"]
     assert gap["best"] < 0.003

@@ -47,10 +47,10 @@ class BatchedBackend(Backend):
 
     The problem has local optima. `effort` says how many starts are tried: the feedback law of the plant without
     contact, along a long homotopy and a short one; the largest actions forth and then back, and back and then forth,
-    which find contacts that are far; random pulses, a push and a brake of each action. Starts are compared after two
+    which find contacts that are far; random pulses, a push and a brake of each action. Starts are compared after a few
     steps at the relaxation, and only those that may still win are solved to the end. The starts of an element lie side
-    by side in the lanes of a vector, so that one problem with several starts takes little longer than with one; a batch
-    pays for each.
+    by side in the lanes of a vector, so that one problem with four starts takes less than twice as long as with one; a
+    batch pays for each.
 
     Every trajectory is judged after the solve by `difflcs.mpc.kkt.residual`, recomputed from the numbers that are
     returned (`difflcs/_native/certificate.hpp`); one that claims to be solved and is not becomes NUMERICAL. Ctrl-C ends
