@@ -254,7 +254,7 @@ struct Certificate {
         for (int64_t j = 0; j < nu && k < h; j++) sum.add(G_u[i * nu + j] * u[k * nu + j]);
         const Vec m = mu[k * nc + i], value = select(given, sum.value, all(-kHuge));
         row[k * nc + i] = value;
-        row_terms[i] = max(row_terms[i], sum.terms);
+        row_terms[i] = max(row_terms[i], select(given, sum.terms, all(0)));
         const Vec held = select(m < kAtPrice * price[i], abs(value), max(-value, all(0)));
         row_missed[i] = max(row_missed[i], select(m > 0, held, max(value, all(0))));
         met(select((m >= 0) & (m * kAtPrice <= price[i]), all(0), all(1)) + 0.0 * m);

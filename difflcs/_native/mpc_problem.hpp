@@ -61,12 +61,12 @@ struct StageData {
     return u ? value + G_u().row(i) * u : value;
   }
 
-  // The sum of the sizes of its terms; a limit that is infinite is none.
+  // The sum of the sizes of its terms; none where the limit is infinite, as there is no constraint then.
   Vec constraint_terms(int64_t i, const Vec* x, const Vec* u) const {
     const int64_t nx = Q.rows, nw = u ? nx + R.rows : nx;
-    Vec terms = select(g[i] < kHuge, abs(g[i]), all(0));
+    Vec terms = abs(g[i]);
     for (int64_t j = 0; j < nw; j++) terms += abs(G(i, j) * (j < nx ? x[j] : u[j - nx]));
-    return terms;
+    return select(g[i] < kHuge, terms, all(0));
   }
 };
 

@@ -151,6 +151,24 @@ def test_an_infeasible_plan_violates_as_little_as_can_be():
     torch.testing.assert_close(problem.violation(result.primal.x, result.primal.u), torch.tensor([7.0]).double())
 
 
+def test_a_violation_is_measured_by_the_stages_where_the_row_counts():
+    """x₊ = 3x + u, |u| ≤ 1, from 100: at most 301 after a step, where 1000 are asked for; later x is far above that."""
+    one = torch.ones(1, 1, dtype=torch.float64)
+    g = torch.full((1, 4, 1), torch.inf, dtype=torch.float64)
+    g[:, 1] = -1000.0
+    empty = torch.zeros(1, 0, dtype=torch.float64)
+    problem = MPCProblem(
+        A=3 * one, B=one, C=empty, d=one[0] * 0, D=empty.mT, E=empty.mT, F=empty[:, :0].reshape(0, 0), c=empty[0],
+        Q=one, R=one, Q_final=one, q=one[0] * 0, r=one[0] * 0, q_final=one[0] * 0, u_min=-one[0], u_max=one[0],
+        G_x=-one, G_u=0 * one, g=g, price=one[0] * torch.inf, x0=100 * one, horizon=3, relaxation=1e-4,
+    )  # fmt: skip
+    result = BATCHED.solve(problem, None)
+    assert result.status.tolist() == [Status.INFEASIBLE]
+    expected = torch.tensor([(1000 - 301) / (1000 + 301)], dtype=torch.float64)
+    torch.testing.assert_close(result.kkt_residual, expected)
+    torch.testing.assert_close(kkt.residual(problem, result.primal, kkt.multipliers(problem, result.primal)), expected)
+
+
 def test_rows_without_a_limit_change_nothing():
     problem = random_problem(4, KINDS["plain"])
     rows = {"G_x": torch.ones(3, 4).double(), "G_u": torch.ones(3, 2).double(), "price": torch.full((3,), torch.inf)}

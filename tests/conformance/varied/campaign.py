@@ -68,6 +68,8 @@ def judge(report: Report, case: Case, seed: int, name: str, result) -> None:
         report.note(f"{name} residual", float(residual[i]))
         if not residual[i] <= LIMIT:
             report.find(f"{name}: residual", seed, i, float(residual[i]))
+        if float(residual[i]) > max(1e-7, 2 * float(result.kkt_residual[i])):
+            report.find(f"{name}: residual is more than it says", seed, i, float(residual[i]))
         for part, value in conditions(case, i, x[i], u[i], lam[i], mu[i]).items():
             report.note(f"{name} {part}", value)
             if not value <= 2 * LIMIT:
