@@ -135,33 +135,30 @@ def test_infeasible_elements_are_said_and_leave_the_others_alone(kind):
     assert gradients["x0"][others].any()
 
 
-def test_an_infeasible_plan_violates_as_little_as_can_be():
-    """x₊ = x + u with |u| ≤ 1 from 0 cannot be above 10 after 3 steps; the least violation in squares has u = 1."""
+def one_state_from(x0, growth, stage, least):
+    """x₊ = growth x + u with |u| ≤ 1 over three steps, and x ≥ least asked for at one stage."""
     one = torch.ones(1, 1, dtype=torch.float64)
     g = torch.full((1, 4, 1), torch.inf, dtype=torch.float64)
-    g[:, 3] = -10.0
+    g[:, stage] = -least
     empty = torch.zeros(1, 0, dtype=torch.float64)
-    problem = MPCProblem(
-        A=one, B=one, C=empty, d=one[0] * 0, D=empty.mT, E=empty.mT, F=empty[:, :0].reshape(0, 0), c=empty[0],
+    return MPCProblem(
+        A=growth * one, B=one, C=empty, d=one[0] * 0, D=empty.mT, E=empty.mT, F=empty[:, :0].reshape(0, 0), c=empty[0],
         Q=one, R=one, Q_final=one, q=one[0] * 0, r=one[0] * 0, q_final=one[0] * 0, u_min=-one[0], u_max=one[0],
-        G_x=-one, G_u=0 * one, g=g, price=one[0] * torch.inf, x0=0 * one, horizon=3, relaxation=1e-4,
+        G_x=-one, G_u=0 * one, g=g, price=one[0] * torch.inf, x0=x0 * one, horizon=3, relaxation=1e-4,
     )  # fmt: skip
+
+
+def test_an_infeasible_plan_violates_as_little_as_can_be():
+    """From 0, x cannot be above 10 after 3 steps; the least violation in squares has u = 1."""
+    problem = one_state_from(0.0, growth=1.0, stage=3, least=10.0)
     result = BATCHED.solve(problem, None)
     assert result.status.tolist() == [Status.INFEASIBLE]
     torch.testing.assert_close(problem.violation(result.primal.x, result.primal.u), torch.tensor([7.0]).double())
 
 
 def test_a_violation_is_measured_by_the_stages_where_the_row_counts():
-    """x₊ = 3x + u, |u| ≤ 1, from 100: at most 301 after a step, where 1000 are asked for; later x is far above that."""
-    one = torch.ones(1, 1, dtype=torch.float64)
-    g = torch.full((1, 4, 1), torch.inf, dtype=torch.float64)
-    g[:, 1] = -1000.0
-    empty = torch.zeros(1, 0, dtype=torch.float64)
-    problem = MPCProblem(
-        A=3 * one, B=one, C=empty, d=one[0] * 0, D=empty.mT, E=empty.mT, F=empty[:, :0].reshape(0, 0), c=empty[0],
-        Q=one, R=one, Q_final=one, q=one[0] * 0, r=one[0] * 0, q_final=one[0] * 0, u_min=-one[0], u_max=one[0],
-        G_x=-one, G_u=0 * one, g=g, price=one[0] * torch.inf, x0=100 * one, horizon=3, relaxation=1e-4,
-    )  # fmt: skip
+    """From 100, x is at most 301 after a step, where 1000 are asked for; later it is far above that."""
+    problem = one_state_from(100.0, growth=3.0, stage=1, least=1000.0)
     result = BATCHED.solve(problem, None)
     assert result.status.tolist() == [Status.INFEASIBLE]
     expected = torch.tensor([(1000 - 301) / (1000 + 301)], dtype=torch.float64)
