@@ -231,7 +231,7 @@ class Learned:
     card: ModelCard | None = None
 
     @classmethod
-    def open(cls, source: Path) -> Learned:
+    def open(cls, source: Path | str) -> Learned:
         """Load it.
 
         Args:
@@ -258,7 +258,7 @@ class Learned:
         config, found = stored_config(run), run.config().get("object")
         found = found if isinstance(found, dict) else None
         if found is not None:
-            check_object(found, source)
+            check_object(found, name)
         method = config.method
         return cls(name, config.task, method.name, method.solver, load_policy(run), run.finished(), found, run=run)
 
@@ -271,7 +271,7 @@ class Learned:
 # --- adding models ----------------------------------------------------------------------------------------------------
 
 
-def add(run: Path, name: str | None = None, *, force: bool = False, root: Path = _zoo.ROOT) -> ModelCard:
+def add(run: Path | str, name: str | None = None, *, force: bool = False, root: Path = _zoo.ROOT) -> ModelCard:
     """Put the model of a finished run into the zoo, all at once or not at all.
 
     Args:

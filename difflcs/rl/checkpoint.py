@@ -127,12 +127,12 @@ class RunDirectory:
         path: the directory; create it with `create`, open an existing one with `open`.
     """
 
-    def __init__(self, path: Path):
-        self.path = path
-        self.checkpoints = path / "checkpoints"
-        self.model = path / "model"
-        self.log = path / "log.csv"
-        self.tensorboard = path / "tensorboard"
+    def __init__(self, path: Path | str):
+        self.path = Path(path)
+        self.checkpoints = self.path / "checkpoints"
+        self.model = self.path / "model"
+        self.log = self.path / "log.csv"
+        self.tensorboard = self.path / "tensorboard"
 
     @classmethod
     def create(cls, path: Path, config: Mapping[str, object]) -> RunDirectory:
@@ -168,15 +168,16 @@ class RunDirectory:
         return _files.locked(self.path)
 
     @classmethod
-    def open(cls, path: Path) -> RunDirectory:
+    def open(cls, path: Path | str) -> RunDirectory:
         """Open an existing run.
 
         Raises:
             CheckpointError: there is no run.
         """
-        if not (path / "config.json").is_file():
+        run = cls(path)
+        if not (run.path / "config.json").is_file():
             raise CheckpointError(f"{path}: expected a directory written by `difflcs train`, found no config.json")
-        return cls(path)
+        return run
 
     def config(self) -> dict[str, object]:
         """What the run was started with.

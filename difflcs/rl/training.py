@@ -134,11 +134,11 @@ class Reporter:
 
 def train(
     config: TrainConfig | None = None,
-    out: Path | None = None,
+    out: Path | str | None = None,
     *,
     task: TaskSpec | str | None = None,
     make_envs: EnvFactory | None = None,
-    init: Path | None = None,
+    init: Path | str | None = None,
     resume: bool = False,
     force: bool = False,
     reporter: Reporter | None = None,
@@ -173,7 +173,7 @@ def train(
     config = TrainConfig(task=spec.name) if config is None else config
     if spec.name != config.task:
         raise InvalidInputError(f"task: expected {config.task!r}, as the configuration says, got {spec.name!r}")
-    out = config.directory() if out is None else out
+    out, init = config.directory() if out is None else Path(out), None if init is None else Path(init)
     run = _Training(config, spec, out, make_envs or spec.make_envs, reporter or Reporter())
     if not force:
         with ExitStack() as held:

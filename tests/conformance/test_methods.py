@@ -108,6 +108,12 @@ def make_trainer():
 # --- training ---------------------------------------------------------------------------------------------------------
 
 
+def test_directories_may_be_strings(tmp_path, finished):
+    run = train(make_config("violation"), str(tmp_path / "run"), init=str(finished("violation").path))
+    assert run.path == tmp_path / "run"
+    assert RunDirectory.open(str(tmp_path / "run")).rows() == run.rows()
+
+
 def test_it_trains_and_says_what_it_did(name, finished):
     run = finished(name)
     rows = run.rows()
