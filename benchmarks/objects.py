@@ -12,7 +12,6 @@ without physics nothing. With `DIFFLCS_YCB_DIR` the objects have their scanned m
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,10 +20,10 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from trainings import Training
 
 from difflcs.bench import machine, save
-from difflcs.rl import evaluate, get_method, get_task
-from difflcs.rl.methods import Work
+from difflcs.rl import get_method, get_task
 
 
 @dataclass
@@ -64,7 +63,6 @@ def run(o: Options, task_name: str, method_name: str, seed: int, done: set[tuple
     task, method = get_task(task_name), get_method(method_name)()
     if o.smoke:
         method = method.smoke()
-    per_minute = task.steps_per_minute / task.episode_steps
     same = {
         "task": task_name,
         "method": method_name,
@@ -75,29 +73,17 @@ def run(o: Options, task_name: str, method_name: str, seed: int, done: set[tuple
     }
     if all(key({**same, "minutes": m}) in done for m in o.minutes):
         return
-    opened = [task.make_envs(o.envs, threads=1)]
     told = task.physics.told if task.physics is not None and method.kind == "physics" else "nothing"
-    described = dict(task.describe(opened[0]))
-
-    def make_envs(count: int) -> Any:
-        opened.append(task.make_envs(count, threads=1))
-        return opened[-1]
-
-    try:
-        trainer = method.trainer(Work(task, seed, round(max(o.minutes) * per_minute), make_envs))
-        spent = 0.0
-        for minutes in sorted(o.minutes):
-            begun = time.process_time()
-            while trainer.episodes < round(minutes * per_minute):
-                trainer.step()
-            spent += time.process_time() - begun
+    with Training(task, method, seed, max(o.minutes), o.envs) as training:
+        described = dict(task.describe(training.envs))
+        for minutes, spent in training.at(o.minutes):
             if key({**same, "minutes": minutes}) in done:
                 continue
-            found = evaluate(opened[0], trainer.policy, o.goals, o.evaluation_seed, task.episode_steps)
+            found = training.evaluate(o.goals, o.evaluation_seed)
             yield {
                 **same,
                 "minutes": minutes,
-                "episodes": trainer.episodes,
+                "episodes": training.trainer.episodes,
                 "success_rate": found.success_rate,
                 "successes": found.successes,
                 "ci_low": found.ci_low,
@@ -108,9 +94,6 @@ def run(o: Options, task_name: str, method_name: str, seed: int, done: set[tuple
                 "told": told,
                 "object": described,
             }
-    finally:
-        for envs in opened:
-            envs.close()
 
 
 def table(rows: list[dict[str, Any]]) -> str:

@@ -8,7 +8,6 @@ the evaluations. Every training is written when it is done; the same call goes o
 from __future__ import annotations
 
 import json
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,10 +15,10 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from trainings import Training
 
 from difflcs.bench import machine, save
-from difflcs.rl import evaluate, get_method, get_task
-from difflcs.rl.methods import Work
+from difflcs.rl import get_method, get_task
 from difflcs.rl.model_rollouts import ModelRolloutSettings
 from difflcs.rl.ppo_settings import PPOSettings
 
@@ -57,29 +56,11 @@ class Options:
 
 def run(o: Options, recipe: str, seed: int) -> dict[str, Any]:
     """One training: its seconds and its success, at each of the minutes."""
-    task, method = get_task("cube"), RECIPES[recipe]
-    if o.smoke:
-        method = method.smoke()
-    per_minute = task.steps_per_minute / task.episode_steps
-    opened: list[Any] = []
-
-    def make_envs(count: int) -> Any:
-        opened.append(task.make_envs(count, threads=1))
-        return opened[-1]
-
-    try:
-        trainer = method.trainer(Work(task, seed, round(max(o.minutes) * per_minute), make_envs))
-        envs, spent, rows = make_envs(o.envs), 0.0, []
-        for minutes in sorted(o.minutes):
-            begun = time.process_time()
-            while trainer.episodes < round(minutes * per_minute):
-                trainer.step()
-            spent += time.process_time() - begun
-            found = evaluate(envs, trainer.policy, o.goals, o.evaluation_seed, task.episode_steps)
+    method, rows = RECIPES[recipe], []
+    with Training(get_task("cube"), method.smoke() if o.smoke else method, seed, max(o.minutes), o.envs) as training:
+        for minutes, spent in training.at(o.minutes):
+            found = training.evaluate(o.goals, o.evaluation_seed)
             rows.append({"minutes": minutes, "seconds": round(spent, 1), "success_rate": found.success_rate})
-    finally:
-        for envs in opened:
-            envs.close()
     same = {"recipe": recipe, "seed": seed, "goals": o.goals, "evaluation_seed": o.evaluation_seed}
     return {**same, "evaluations": rows}
 
