@@ -20,6 +20,13 @@ from difflcs.rl.settings import MOST_NETWORKS, MOST_WIDTH, Epochs, Settings, bou
 
 _KIND = "dynamics"
 _SIZES = ("n_x", "n_u", "networks", "width")
+_VECTOR = 16
+"""Numbers of single precision in the widest vectors of a CPU: products of such sizes are the fastest."""
+
+
+def _whole(size: int) -> int:
+    """The size, rounded up to whole vectors."""
+    return -(-size // _VECTOR) * _VECTOR
 
 
 @dataclass(frozen=True)
@@ -83,6 +90,56 @@ class Ensemble(nn.Module):
     def forward(self, x: Tensor, u: Tensor) -> Tensor:
         """States (networks, N, n_x), actions (networks, N, n_u) → next states, each network from its own states."""
         return x + self.change_mean + self.change_std * self.standardised(torch.cat([x, u], -1))
+
+    @torch.no_grad()
+    def rollout(self, x0: Tensor, u: Tensor) -> Tensor:
+        """Predict where action sequences lead from one state, without gradients.
+
+        These are the numbers of `forward` but for their rounding, in three quarters of its time: one network after the
+        other, so that its activations stay in the cache, by nothing but products and rectifiers, see `_products`.
+
+        Args:
+            x0: (n_x,) state.
+            u: (N, T, n_u) action sequences.
+
+        Returns:
+            (networks, N, T+1, n_x) states, from x0 on.
+        """
+        (count, steps, _), n_x = u.shape, self.n_x
+        first, second, last = self._products()
+        seen = u.new_zeros(steps, count, first.shape[1])
+        seen[..., n_x : n_x + self.n_u] = (u - self.input_mean[n_x:]).transpose(0, 1)
+        seen[..., n_x + self.n_u] = 1
+        states = u.new_empty(self.networks, count, steps + 1, n_x)
+        hidden, hidden_too = u.new_empty(2, count, first.shape[2])
+        for k in range(self.networks):
+            x = (x0 - self.input_mean[:n_x]).expand(count, -1).contiguous()
+            states[k, :, 0] = x
+            for t in range(steps):
+                seen[t, :, :n_x] = x
+                torch.mm(seen[t], first[k], out=hidden).relu_()
+                torch.mm(hidden, second[k], out=hidden_too).relu_()
+                states[k, :, t + 1] = x.addmm_(hidden_too, last[k])
+        return states.add_(self.input_mean[:n_x])
+
+    def _products(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The layers as products alone, (networks, n_in, n_out) each: from inputs less their means to changes.
+
+        A bias is the row of an input that is always one, and scales are parts of the first and the last layer. Zeros
+        fill what lies between the layers up to whole vectors.
+        """
+        inputs, width = self.n_x + self.n_u, self.width
+        wide = _whole(width + 1)
+        first = torch.zeros(self.networks, _whole(inputs + 1), wide)
+        second = torch.zeros(self.networks, wide, wide)
+        last = torch.zeros(self.networks, wide, self.n_x)
+        first[:, :inputs, :width] = self.weights[0] / self.input_std.unsqueeze(-1)
+        second[:, :width, :width] = self.weights[1]
+        last[:, :width] = self.weights[2] * self.change_std
+        first[:, inputs, :width], second[:, width, :width] = self.biases[0].squeeze(1), self.biases[1].squeeze(1)
+        last[:, width] = self.biases[2].squeeze(1) * self.change_std + self.change_mean
+        first[:, inputs, width] = second[:, width, width] = 1  # hands the one on
+        return first, second, last
 
     def fit(
         self,

@@ -447,7 +447,7 @@ class PDDMMethod(Method):
     """Settings of PDDM."""
 
     name: ClassVar[str] = "pddm"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     summary: ClassVar[str] = "PDDM: networks, and a planner that samples actions"
     reports: ClassVar[tuple[type, ...]] = (PDDMReport,)
     kind: ClassVar[str] = "dynamics"

@@ -136,13 +136,9 @@ class Planner:
     def _costs(self, x0: Tensor, goal: Tensor, actions: Tensor) -> Tensor:
         """(samples,) cost of action sequences, averaged over the ensemble; infinite where a prediction overflows."""
         cost = {name: value.float() for name, value in self.cost(goal).fields().items()}
-        u = actions.expand(self.ensemble.networks, *actions.shape)
-        x = x0.float().expand(*u.shape[:2], -1)
-        total, n_x = torch.zeros(u.shape[:2]), self.cost.n_x
-        for k in range(u.shape[2]):
-            total += _quadratic(x[..., :n_x], cost["Q"], cost["q"]) + _quadratic(u[:, :, k], cost["R"], cost["r"])
-            x = self.ensemble(x, u[:, :, k])
-        total += _quadratic(x[..., :n_x], cost["Q_final"], cost["q_final"])
+        x = self.ensemble.rollout(x0.float(), actions)[..., : self.cost.n_x]  # (networks, samples, horizon + 1, n_x)
+        stages = _quadratic(x[..., :-1, :], cost["Q"], cost["q"]) + _quadratic(actions, cost["R"], cost["r"])
+        total = stages.sum(-1) + _quadratic(x[..., -1, :], cost["Q_final"], cost["q_final"])
         return total.mean(0).nan_to_num(nan=3e38, posinf=3e38).clamp_max(1e30)
 
 

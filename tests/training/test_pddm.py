@@ -118,11 +118,32 @@ def test_a_falling_step_size_leaves_less_noise_in_the_networks():
     assert errors[True] < 0.8 * errors[False]
 
 
+@pytest.mark.parametrize(("n_x", "n_u", "networks", "width"), [(2, 1, 1, 15), (3, 2, 2, 16), (9, 6, 3, 31)])
+def test_a_rollout_is_one_step_after_the_other(n_x, n_u, networks, width):
+    draws = torch.Generator().manual_seed(0)
+    ensemble = Ensemble(n_x, n_u, networks, width, draws)
+    # Far from zero and narrow, so that means and scales matter.
+    x = 30 + 0.01 * torch.randn(200, n_x, generator=draws, dtype=torch.float64)
+    u = 5 + 0.1 * torch.randn(200, n_u, generator=draws, dtype=torch.float64)
+    ensemble.fit(x, u, x + 0.02 * (u[:, :1] - 5), epochs=3, minibatch=20, learning_rate=1e-2, generator=draws)
+    actions = u[:60].float().view(20, 3, n_u)
+    found = ensemble.rollout(x[0].float(), actions)
+    state = x[0].float().expand(networks, 20, n_x)
+    torch.testing.assert_close(found[:, :, 0], state)
+    with torch.no_grad():
+        for t in range(3):
+            after = ensemble(found[:, :, t], actions[:, t].expand(networks, -1, -1))
+            torch.testing.assert_close(found[:, :, t + 1], after, rtol=0, atol=1e-5)  # 30 has neighbours 2e-6 away
+            assert float((after - found[:, :, t]).abs().amax()) > 1e-3
+    assert not found.requires_grad
+
+
 class Exact(Ensemble):
     """x₊ = x + u, exactly."""
 
-    def forward(self, x, u):
-        return x + u
+    def rollout(self, x0, u):
+        states = torch.cat([x0.expand(len(u), 1, -1), x0 + u.cumsum(1)], 1)
+        return states.expand(self.networks, *states.shape)
 
 
 def planner(cost: GoalCost | None = None, **changes) -> Planner:
@@ -133,9 +154,9 @@ def planner(cost: GoalCost | None = None, **changes) -> Planner:
 class Asked(Exact):
     """Says which action sequences it was asked about."""
 
-    def forward(self, x, u):
-        self.asked.append(u[0].clone())
-        return super().forward(x, u)
+    def rollout(self, x0, u):
+        self.asked.append(u.clone())
+        return super().rollout(x0, u)
 
 
 def test_costs_are_those_of_the_mpc():
@@ -144,7 +165,7 @@ def test_costs_are_those_of_the_mpc():
     plan.ensemble, model.asked = model, []
     x0, goal = torch.tensor([[0.2]], dtype=torch.float64), torch.tensor([[-0.3]], dtype=torch.float64)
     found = plan(x0, goal).action
-    actions = torch.stack(model.asked, 1).double()  # (samples, horizon, 1)
+    actions = model.asked[0].double()  # (samples, horizon, 1)
     assert actions.shape == (SMALL.samples, SMALL.horizon, 1)
     states = torch.cat([torch.full((SMALL.samples, 1), 0.2), 0.2 + actions.squeeze(-1).cumsum(1)], 1)
     cost = 200 * (states + 0.3).square().sum(1) + 0.01 * actions.square().sum((1, 2))
@@ -185,8 +206,8 @@ def test_overflowing_predictions_do_not_spoil_the_plan():
     plan = planner()
 
     class Wild(Exact):
-        def forward(self, x, u):
-            return torch.where(u > 0, torch.tensor(math.nan), x + u)
+        def rollout(self, x0, u):
+            return torch.where((u > 0).any(1, keepdim=True), torch.tensor(math.nan), super().rollout(x0, u))
 
     plan.ensemble = Wild(1, 1, 2, 4)
     action = plan(torch.zeros(1, 1, dtype=torch.float64), torch.full((1, 1), 0.3, dtype=torch.float64)).action
