@@ -226,6 +226,20 @@ def latency(record: dict) -> str:
     return table(["", *robots], rows)
 
 
+DECIDES = {
+    "PDDM": "PDDM, 700 sequences in three networks",
+    "LCS-MPC": "LCS-MPC, `LCSMPCLayer`",
+    "controller": "LCS-MPC, [`layer.controller()`](robot.md)",
+}
+
+
+def decision(record: dict) -> str:
+    """Milliseconds of one decision, and those of PDDM as a multiple."""
+    spent = record["milliseconds"]
+    rows = [[label, f"{spent[k]:.2g} ms", f"{spent['PDDM'] / spent[k]:.0f}×"] for k, label in DECIDES.items()]
+    return table(["one decision", "computing", "PDDM takes"], rows)
+
+
 LATE = {
     "on time": "on time",
     "idle first": "on time, but idle in the first step",
@@ -389,6 +403,7 @@ TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "scale": {"sizes": sizes},
     "training_time": {"recipes": recipes},
     "latency": {"ways": latency},
+    "decision": {"ways": decision},
     "delay": {"ways": delay},
     "physics": {"errors": errors},
     "objects": {"success": objects, "methods": methods},

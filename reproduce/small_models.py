@@ -43,8 +43,8 @@ def size_of(method: str, recipe: str) -> int:
     return sum(p.numel() for p in Ensemble(task.n_x, task.n_u, ensemble.networks, ensemble.width).parameters())
 
 
-def seconds_per_decision(rows: pd.DataFrame, cell: Cell) -> float:
-    """Of a core, in the evaluations of these trainings, the simulation included."""
+def seconds_per_step(rows: pd.DataFrame, cell: Cell) -> float:
+    """Of a core, in the evaluations of these trainings: the decision and the simulation of its outcome."""
     mine: Any = rows[(rows.key == cell.first.key) & (rows.version == cell.first.version)]
     mine = mine[(mine.task == cell.first.task) & mine.seed.isin(cell.scores.index)]
     seconds = mine.drop_duplicates("seed").evaluation_seconds.sum()
@@ -54,13 +54,13 @@ def seconds_per_decision(rows: pd.DataFrame, cell: Cell) -> float:
 def table(rows: pd.DataFrame, cells: dict[str, Cell]) -> pd.DataFrame:
     """Success, computing and size of each."""
     columns: dict[str, list[str]] = {
-        "": [*WHEN, "computing per decision [ms]", "training [core min]", "learned numbers"]
+        "": [*WHEN, "computing per step, with the simulation [ms]", "training [core min]", "learned numbers"]
     }
     for name, cell in cells.items():
         success = [say(report.at(cell, when)) for when in WHEN.values()]
-        decision = f"{1e3 * seconds_per_decision(rows, cell):.2g}"
+        step = f"{1e3 * seconds_per_step(rows, cell):.2g}"
         training = f"{cell.rows.drop_duplicates('seed').train_seconds.mean() / 60:.1f}"
-        columns[name] = [*success, decision, training, str(size_of(cell.first.method, cell.first.recipe))]
+        columns[name] = [*success, step, training, str(size_of(cell.first.method, cell.first.recipe))]
     return pd.DataFrame(columns)
 
 
@@ -75,14 +75,14 @@ def words(rows: pd.DataFrame, cells: dict[str, Cell]) -> list[str]:
         claim = "does not hold here: the networks are better"
     elif apart is not None and apart.high < 0:
         claim = "holds here"
-    ratio = seconds_per_decision(rows, networks) / seconds_per_decision(rows, lcs)
+    ratio = seconds_per_step(rows, networks) / seconds_per_step(rows, lcs)
     sizes = [size_of(cell.first.method, cell.first.recipe) for cell in (networks, lcs)]
     return [
         f"After {EARLY:g} minutes of data PDDM reaches {say(report.at(networks, EARLY))} % and LCS-RL "
         f"{say(report.at(lcs, EARLY))} %. The paper's claim that simple models beat deep networks at little data "
         f"{claim}.",
-        f"A decision of PDDM takes {ratio:.0f} times the computing of one of the LCS-MPC, and its networks hold "
-        f"{sizes[0] / sizes[1]:.0f} times as many numbers.",
+        f"A step of PDDM takes {ratio:.0f} times the computing of one of the LCS-MPC, the simulation included, and its "
+        f"networks hold {sizes[0] / sizes[1]:.0f} times as many numbers.",
     ]
 
 

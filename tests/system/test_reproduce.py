@@ -948,8 +948,8 @@ def test_a_small_model_beside_networks(results, capsys):
     assert run_script(small_models.main, capsys, "--results", results)[0] == 0
     markdown = (results / "small_models.md").read_text()
     # Three seeds of 10 s of evaluation and 4 × 50 goals × 20 steps; the LCS has 4 × 1000 goals.
-    assert [cells[1:] for cells in cells_of(results / "small_models.md", "computing per decision")] == [["0.12", "2.5"]]
-    assert "A decision of PDDM takes 20 times the computing" in markdown
+    assert [cells[1:] for cells in cells_of(results / "small_models.md", "computing per step")] == [["0.12", "2.5"]]
+    assert "A step of PDDM takes 20 times the computing" in markdown
     assert "cannot be decided here" in markdown  # they have other goals
     for seed in range(3):
         records.add(results, "paper", unit_rows(Unit("cube", "pddm", "ours", seed), (0, 1, 2, 3), version="2"))
