@@ -43,10 +43,13 @@ OTHERS: list[Curve] = [
 """In the table only."""
 DOTTED = "#56b4e9"
 WHEN = (2.0, 6.0, 10.0, "peak", 25.0, "final")
+EARLY = 6.0
+APART: dict[str, str | float] = {f"{EARLY:g} min": EARLY, "10 min": 10.0, "final": "final"}
+"""When LCS-RL is compared with the other curves of its side."""
 NOTE = (
     "Violation only is the prior method. As Jin & Posa and in its support, the bounds of the actions that it collected "
     "last, it is deployed as its authors do. In the paper, and where a line says nothing else, it has the full bounds, "
-    "where it may do what no data have shown."
+    "where it may do what no data have shown. Differences are of the same goals: PDDM's last evaluation has fewer."
 )
 Cells = dict[Curve, Cell | None]
 
@@ -66,6 +69,38 @@ def table(cells: Cells) -> pd.DataFrame:
             lines.append([report.name_of(method, recipe, protocol=protocol), *found, ", ".join(said) or report.MISSING])
     titles = [when if isinstance(when, str) else f"{when:g} min" for when in WHEN]
     return pd.DataFrame(lines, columns=["method", *titles, "paper (from its text)"])
+
+
+def label_of(curve: Curve) -> str:
+    """Its name on one side of the figure."""
+    return f"{NAMES[curve[0]]} as Jin & Posa" if curve == PRIOR else NAMES[curve[0]]
+
+
+def rivals(cells: Cells, recipe: str) -> dict[str, Cell]:
+    """What LCS-RL in a recipe is compared with: the other curves on its side of the figure that there are."""
+    own, *others = SIDES[recipe]
+    found = {label_of(curve): cells[curve] for curve in others}
+    return {label: cell for label, cell in found.items() if cell and report.paired(cells[own], cell, EARLY)}
+
+
+def differences(cells: Cells, recipe: str) -> pd.DataFrame:
+    """LCS-RL in a recipe − each of its rivals, paired by seed."""
+    own, against = cells[SIDES[recipe][0]], rivals(cells, recipe)
+    columns = {"LCS-RL −": list(against)}
+    for label, when in APART.items():
+        said = [report.say_difference(report.paired(own, cell, when)) for cell in against.values()]
+        columns[f"{label}: difference"], columns[f"{label}: p"] = ([one[k] for one in said] for k in (0, 1))
+    return pd.DataFrame(columns)
+
+
+def words(cells: Cells, recipe: str) -> list[str]:
+    """What the intervals of these differences say."""
+    own, against = cells[SIDES[recipe][0]], rivals(cells, recipe)
+    said = []
+    for label, when in APART.items():
+        apart = {name: report.paired_estimate(own, cell, when) for name, cell in against.items()}
+        said.append(f"LCS-RL, {RECIPES[recipe].label}, {label}: {report.verdict(apart, 'than', 'from')}.")
+    return said
 
 
 def reached(cells: Cells) -> str:
@@ -90,8 +125,7 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
     for axes, (recipe, shown) in zip(figure.subplots(1, 2, sharey=True), SIDES.items(), strict=True):
         lines = []
         for curve in shown:
-            label = "violation only, as Jin & Posa" if curve == PRIOR else NAMES[curve[0]]
-            lines.append((cells[curve], label, DOTTED if curve == PRIOR else COLORS[curve[0]], "-"))
+            lines.append((cells[curve], label_of(curve), DOTTED if curve == PRIOR else COLORS[curve[0]], "-"))
         report.draw_curves(axes, RECIPES[recipe].label, lines)
         if recipe == "paper":
             for method, said in PAPER.items():
@@ -101,9 +135,14 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
         if axes.get_legend_handles_labels()[0]:
             axes.legend(fontsize=8, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2)
     report.write_figure(figure, folder, name)
-    title = "Success on the cube, mean over the seeds [%]"
-    notes = [NOTE, reached(cells), *report.provenance(list(cells.values()))]
-    report.write_tables(folder, name, {title: table(cells)}, notes, {name: "Success against minutes of data"})
+    tables, said = {"Success on the cube, mean over the seeds [%]": table(cells)}, []
+    for recipe in SIDES:
+        if rivals(cells, recipe):
+            title = f"LCS-RL on the cube, {RECIPES[recipe].label}, beside the others: differences paired by seed"
+            tables[title] = differences(cells, recipe)
+            said += words(cells, recipe)
+    notes = [NOTE, reached(cells), *report.bullets(said), *report.provenance(list(cells.values()))]
+    report.write_tables(folder, name, tables, notes, {name: "Success against minutes of data"})
     return True
 
 

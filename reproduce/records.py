@@ -27,8 +27,8 @@ COLUMNS: dict[Hashable, Any] = {
     **{"goals": int, "evaluation_seed": int},  # goals tried, and what they were drawn from
     "solver_failures": int,  # MPC solves that did not converge
     **{"source": str, "mass": float},  # of the object: built_in, ycb_mesh or stand_in; [kg]
-    "version": str,  # of the method; before methods had versions "legacy" and a hash of their code
-    "key": str,  # see `units.key_of`; of legacy rows a hash of the settings
+    "version": str,  # of the method
+    "key": str,  # see `units.key_of`
     **{"versions": str, "machine": str},  # of the packages; class of machine
     **{"train_seconds": float, "evaluation_seconds": float},  # on one core, all of the unit
     "finished": str,  # when (UTC)

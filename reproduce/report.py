@@ -117,15 +117,18 @@ def listed(names: Sequence[str]) -> str:
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1] if names else "none"]))
 
 
-def verdict(differences: Mapping[str, Estimate | None]) -> str:
-    """On which objects a difference is above zero, below it, or cannot be told, by the intervals; without the rest."""
+def verdict(differences: Mapping[str, Estimate | None], against: str = "on", unlike: str = "on") -> str:
+    """Where a difference is above zero, below it, or cannot be told, by the intervals; without the rest.
+
+    `against` and `unlike` are the words between a finding and its names, which are objects by default.
+    """
     known = {name: found for name, found in differences.items() if found is not None and not math.isnan(found.low)}
     better = [name for name, found in known.items() if found.low > 0]
     worse = [name for name, found in known.items() if found.high < 0]
     open_ = [name for name in known if name not in better and name not in worse]
-    found = {"better": better, "worse": worse, "not to be told apart": open_}
+    found = {f"better {against}": better, f"worse {against}": worse, f"not to be told apart {unlike}": open_}
     parts = [
-        f"{how} on all {len(known)}" if len(names) == len(known) else f"{how} on {len(names)} ({listed(names)})"
+        f"{how} all {len(known)}" if len(names) == len(known) else f"{how} {len(names)} ({listed(names)})"
         for how, names in found.items()
         if names
     ]

@@ -682,6 +682,26 @@ def test_learning_curves_are_drawn(results, capsys):
     assert "PDDM: version 1, 3 seeds × 50 goals" in out  # an unequal number of goals is said
 
 
+def test_lcs_rl_is_compared_with_the_other_curves(results, capsys):
+    for seed in range(3):  # over 6, 10 and 30 minutes better, not to be told apart, worse; on the same number of goals
+        percent = (0, 30 + seed, 59 - seed * seed, 99)
+        records.add(results, "paper", unit_rows(Unit("cube", "ppo", "paper", seed), percent))
+    assert run_script(fig_learning_curves.main, capsys, "--results", results)[0] == 0
+    rows = cells_of(results / "fig_learning_curves.md", "violation only")
+    (against,) = (row for row in rows if row[1].startswith("+"))
+    assert against[1:] == [
+        *("+0.0 [+0.0, +0.0]", "1.000"),
+        *("+20.0 [+20.0, +20.0]", "0.250"),
+        *("+60.0 [+60.0, +60.0]", "0.250"),
+    ]
+    markdown = (results / "fig_learning_curves.md").read_text()
+    also = "better than 1 (violation only), not to be told apart from 1 (PPO without warm-up)"
+    assert "LCS-RL, our recipe, 6 min: better than 1 (PPO without warm-up), not to be told apart" in markdown
+    assert f"LCS-RL, our recipe, 10 min: {also}." in markdown
+    assert "LCS-RL, our recipe, final: better than 1 (violation only), worse than 1 (PPO without warm-up)" in markdown
+    assert "LCS-RL on the cube, the paper's recipe" not in markdown  # of which there is nothing
+
+
 def test_curves_stand_where_the_evaluations_were(tmp_path, capsys, monkeypatch):
     rows = unit_rows(Unit("cube", "lcs-rl", "ours", 0), (0, 40, 50, 70))
     rows["minutes"] = [0.0, 6.9, 10.5, 30.0]
@@ -955,6 +975,14 @@ def test_a_small_model_beside_networks(results, capsys):
         records.add(results, "paper", unit_rows(Unit("cube", "pddm", "ours", seed), (0, 1, 2, 3), version="2"))
     assert run_script(small_models.main, capsys, "--results", results)[0] == 0
     assert "at little data holds here." in (results / "small_models.md").read_text()
+    for seed in range(3):
+        records.add(results, "paper", unit_rows(Unit("cube", "pddm", "authors", seed), (0, 99, 2, 3)))
+    assert run_script(small_models.main, capsys, "--results", results)[0] == 0
+    markdown = (results / "small_models.md").read_text()
+    assert "- PDDM: after 6 minutes of data LCS-RL − PDDM is +49.0 [+39.0, +59.0] points" in markdown
+    assert "at little data holds here." in markdown  # each way has a sentence of its own
+    assert "drawn anew, as its authors do: after 6 minutes of data LCS-RL − PDDM is −49.0 [−59.0, −39.0]" in markdown
+    assert "does not hold here: the networks are better." in markdown
 
 
 def test_transfer_compares_the_same_seeds(results, capsys):
