@@ -567,6 +567,14 @@ def test_p_value_against_scipy():
     assert math.isnan(stats.p_value([1.0]))
 
 
+@pytest.mark.parametrize(("seeds", "low", "high"), [(3, 0.68, 0.84), (10, 0.84, 0.95)])
+def test_how_often_intervals_contain_the_true_mean(seeds, low, high):
+    """The page says three of four, and nine of ten."""
+    draws = np.random.default_rng(0).normal(50.0, 10.0, (400, seeds))
+    found = [stats.bootstrap([draw]) for draw in draws]
+    assert low < np.mean([estimate.low <= 50.0 <= estimate.high for estimate in found]) < high
+
+
 def test_differences_to_what_others_publish():
     theirs = stats.published(50.0, 10.0, 10)
     assert theirs.high - 50 == pytest.approx(2.262 * 10 / math.sqrt(10), rel=1e-3)
