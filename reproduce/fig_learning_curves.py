@@ -44,6 +44,7 @@ OTHERS: list[Curve] = [
 DOTTED = "#56b4e9"
 WHEN = (2.0, 6.0, 10.0, "peak", 25.0, "final")
 EARLY = 6.0
+"""Minutes of data that are called little."""
 APART: dict[str, str | float] = {f"{EARLY:g} min": EARLY, "10 min": 10.0, "final": "final"}
 """When LCS-RL is compared with the other curves of its side."""
 NOTE = (
@@ -76,29 +77,18 @@ def label_of(curve: Curve) -> str:
     return f"{NAMES[curve[0]]} as Jin & Posa" if curve == PRIOR else NAMES[curve[0]]
 
 
-def rivals(cells: Cells, recipe: str) -> dict[str, Cell]:
-    """What LCS-RL in a recipe is compared with: the other curves on its side of the figure that there are."""
+def pairs_of(cells: Cells, recipe: str) -> report.Pairs:
+    """LCS-RL in a recipe and each of the other curves on its side of the figure that it can be compared with."""
     own, *others = SIDES[recipe]
-    found = {label_of(curve): cells[curve] for curve in others}
-    return {label: cell for label, cell in found.items() if cell and report.paired(cells[own], cell, EARLY)}
+    found = {label_of(curve): (cells[own], cells[curve]) for curve in others}
+    return {label: pair for label, pair in found.items() if report.paired(*pair, EARLY)}
 
 
-def differences(cells: Cells, recipe: str) -> pd.DataFrame:
-    """LCS-RL in a recipe − each of its rivals, paired by seed."""
-    own, against = cells[SIDES[recipe][0]], rivals(cells, recipe)
-    columns = {"LCS-RL −": list(against)}
-    for label, when in APART.items():
-        said = [report.say_difference(report.paired(own, cell, when)) for cell in against.values()]
-        columns[f"{label}: difference"], columns[f"{label}: p"] = ([one[k] for one in said] for k in (0, 1))
-    return pd.DataFrame(columns)
-
-
-def words(cells: Cells, recipe: str) -> list[str]:
-    """What the intervals of these differences say."""
-    own, against = cells[SIDES[recipe][0]], rivals(cells, recipe)
+def words(pairs: report.Pairs, recipe: str) -> list[str]:
+    """What the intervals of the differences say."""
     said = []
     for label, when in APART.items():
-        apart = {name: report.paired_estimate(own, cell, when) for name, cell in against.items()}
+        apart = {name: report.paired_estimate(*pair, when) for name, pair in pairs.items()}
         said.append(f"LCS-RL, {RECIPES[recipe].label}, {label}: {report.verdict(apart, 'than', 'from')}.")
     return said
 
@@ -137,10 +127,10 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
     report.write_figure(figure, folder, name)
     tables, said = {"Success on the cube, mean over the seeds [%]": table(cells)}, []
     for recipe in SIDES:
-        if rivals(cells, recipe):
+        if pairs := pairs_of(cells, recipe):
             title = f"LCS-RL on the cube, {RECIPES[recipe].label}, beside the others: differences paired by seed"
-            tables[title] = differences(cells, recipe)
-            said += words(cells, recipe)
+            tables[title] = report.differences("LCS-RL −", pairs, APART)
+            said += words(pairs, recipe)
     notes = [NOTE, reached(cells), *report.bullets(said), *report.provenance(list(cells.values()))]
     report.write_tables(folder, name, tables, notes, {name: "Success against minutes of data"})
     return True

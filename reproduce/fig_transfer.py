@@ -33,22 +33,16 @@ def success(cells: Cells) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def differences(cells: Cells) -> pd.DataFrame:
-    """The paired differences."""
-    columns = {"object": [task.replace("_", " ") for task in cells]}
-    for label, when in WHEN.items():
-        found = [report.paired(starts["cube"], starts["scratch"], when) for starts in cells.values()]
-        means, ps = zip(*map(report.say_difference, found), strict=True)
-        columns |= {f"{label}: difference": list(means), f"{label}: p": list(ps)}
-    return pd.DataFrame(columns)
+def pairs_of(cells: Cells) -> report.Pairs:
+    """From the cube's model and from scratch, for each object."""
+    return {task.replace("_", " "): (starts["cube"], starts["scratch"]) for task, starts in cells.items()}
 
 
-def words(cells: Cells, label: str) -> list[str]:
+def words(pairs: report.Pairs, label: str) -> list[str]:
     """What the intervals say, at each time; and whether the first minutes of PPO cost what transfer has brought."""
     said = []
     for time, when in WHEN.items():
-        pairs = {task: (starts["cube"], starts["scratch"]) for task, starts in cells.items()}
-        apart = {task.replace("_", " "): report.paired_estimate(*pair, when) for task, pair in pairs.items()}
+        apart = {task: report.paired_estimate(*pair, when) for task, pair in pairs.items()}
         said.append(f"From the cube's model against from scratch, {label}, {time}: {report.verdict(apart)}.")
     return said
 
@@ -83,8 +77,8 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
         found += [cell for starts in cells.values() for cell in starts.values() if cell is not None]
         label = RECIPES[recipe].label
         tables[f"LCS-RL from scratch and from the cube's model, {label}: success [%]"] = success(cells)
-        tables[f"The differences, {label}"] = differences(cells)
-        said += words(cells, label)
+        tables[f"The differences, {label}"] = report.differences("object", pairs_of(cells), WHEN)
+        said += words(pairs_of(cells), label)
         figure = Figure((10.0, 6.4), dpi=150, layout="constrained")
         panel(figure, cells, name.endswith("stand-in"))
         figure.suptitle(label)

@@ -65,6 +65,10 @@ def main(name: str, artefact: str, draw: Drawing, words: Sequence[str] | None = 
     return runs.command_line(Draw, action, words)
 
 
+Pairs = Mapping[str, tuple[Cell | None, Cell | None]]
+"""What is compared: the name of a comparison → its two results."""
+
+
 def name_of(method: str, recipe: str, start: str = "scratch", protocol: Any = "full") -> str:
     """What a method is called in tables: its recipe, where it starts, how it is deployed."""
     own = "" if (method, recipe) == ("pddm", "ours") else RECIPES[recipe].label
@@ -155,6 +159,15 @@ def say_difference(differences: Sequence[float]) -> tuple[str, str]:
     p = p_value(differences)
     text = MISSING if math.isnan(p) else "< 0.001" if p < 0.001 else f"{p:.3f}"
     return say(bootstrap([differences]), signed=True), text
+
+
+def differences(heading: str, pairs: Pairs, when: Mapping[str, str | float]) -> pd.DataFrame:
+    """For each pair a − b, paired by seed, with its p, at each time."""
+    columns = {heading: list(pairs)}
+    for label, at_ in when.items():
+        means, ps = zip(*(say_difference(paired(*pair, at_)) for pair in pairs.values()), strict=True)
+        columns |= {f"{label}: difference": list(means), f"{label}: p": list(ps)}
+    return pd.DataFrame(columns)
 
 
 def provenance(cells: Sequence[Cell | None]) -> list[str]:

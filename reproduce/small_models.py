@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 import report
-from fig_learning_curves import PRIOR
+from fig_learning_curves import EARLY, PRIOR
 from records import Cell, select
 from report import say
 from stats import Estimate
@@ -24,8 +24,6 @@ from difflcs.rl.dynamics import Ensemble
 SHOWN = (("lcs-rl", "ours", "full"), PRIOR, ("pddm", "ours", "full"), ("pddm", "authors", "full"))
 """Method, recipe, protocol."""
 WHEN: dict[str, str | float] = {"2 min": 2.0, "6 min": 6.0, "10 min": 10.0, "final": "final"}
-EARLY = 6.0
-"""Minutes of data that are called little."""
 HYBRID = (
     "LCS-RL in our recipe is itself a hybrid: it also learns from episodes that are played in an ensemble of such "
     "networks. What acts, what is transferred and what one can read is the LCS; what the networks bring it stands "

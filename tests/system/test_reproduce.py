@@ -703,8 +703,8 @@ def test_lcs_rl_is_compared_with_the_other_curves(results, capsys):
         *("+60.0 [+60.0, +60.0]", "0.250"),
     ]
     markdown = (results / "fig_learning_curves.md").read_text()
-    also = "better than 1 (violation only), not to be told apart from 1 (PPO without warm-up)"
     assert "LCS-RL, our recipe, 6 min: better than 1 (PPO without warm-up), not to be told apart" in markdown
+    also = "better than 1 (violation only), not to be told apart from 1 (PPO without warm-up)"
     assert f"LCS-RL, our recipe, 10 min: {also}." in markdown
     assert "LCS-RL, our recipe, final: better than 1 (violation only), worse than 1 (PPO without warm-up)" in markdown
     assert "LCS-RL on the cube, the paper's recipe" not in markdown  # of which there is nothing
