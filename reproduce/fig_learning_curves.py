@@ -93,6 +93,16 @@ def words(pairs: report.Pairs, recipe: str) -> list[str]:
     return said
 
 
+def lowest(cells: Cells, recipe: str) -> list[str]:
+    """How LCS-RL does with its worst seed, which an interval of the mean does not say."""
+    cell = cells[SIDES[recipe][0]]
+    if cell is None:
+        return []
+    found = {label: cell.at(when) for label, when in APART.items()}
+    worst = ", ".join(f"{label} {values.min():.1f} %" for label, values in found.items() if not values.empty)
+    return [f"LCS-RL, {RECIPES[recipe].label}, the lowest of {cell.seeds}: {worst}."] if worst else []
+
+
 def reached(cells: Cells) -> str:
     """How much later than asked for the evaluations were: iterations have lengths of their own."""
     lags: dict[str, float] = {}
@@ -131,6 +141,7 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
             title = f"LCS-RL on the cube, {RECIPES[recipe].label}, beside the others: differences paired by seed"
             tables[title] = report.differences("LCS-RL −", pairs, APART)
             said += words(pairs, recipe)
+        said += lowest(cells, recipe)
     notes = [NOTE, reached(cells), *report.bullets(said), *report.provenance(list(cells.values()))]
     report.write_tables(folder, name, tables, notes, {name: "Success against minutes of data"})
     return True
