@@ -64,14 +64,15 @@ def column(cells: Cells, when: str) -> list[str]:
 
 
 def differences(cells: Cells, baseline: Cells) -> pd.DataFrame:
-    """LCS-RL − a baseline."""
-    columns = {"object": [*LABELS, "all six"]}
+    """LCS-RL − a baseline, on each object and on all."""
+    pairs = dict(zip(LABELS, zip(cells, baseline, strict=True), strict=True))
+    table = report.differences("object", pairs, {when: when for when in WHEN})
+    last = ["all six"]
     for when in WHEN:
-        found = [report.paired(*pair, when) for pair in zip(cells, baseline, strict=True)]
-        means, ps = zip(*map(report.say_difference, found), strict=True)
-        columns[f"{when}: difference"] = [*means, say(bootstrap(found) if all(found) else None, signed=True)]
-        columns[f"{when}: p"] = [*ps, report.MISSING]
-    return pd.DataFrame(columns)
+        found = [report.paired(*pair, when) for pair in pairs.values()]
+        last += [say(bootstrap(found) if all(found) else None, signed=True), report.MISSING]
+    table.loc[len(table)] = last
+    return table
 
 
 def beyond_paper(cells: Cells) -> dict[str, Estimate | None]:
