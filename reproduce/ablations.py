@@ -3,7 +3,6 @@
 Without options table and figure are drawn from the tracked results. `--rerun --preset smoke|quick|paper` computes them.
 """
 
-import math
 import sys
 from functools import partial
 from pathlib import Path
@@ -45,28 +44,27 @@ def words(cells: Cells, task: str) -> list[str]:
     said = []
     for label, when in list(WHEN.items())[1:]:
         apart = {LABELS[n]: report.paired_estimate(c, cells["all"], when) for n, c in cells.items() if n != "all"}
-        known = {name: found for name, found in apart.items() if found is not None and not math.isnan(found.low)}
-        worse = report.listed([name for name, found in known.items() if found.high < 0])
-        better = report.listed([name for name, found in known.items() if found.low > 0])
-        few = report.listed([name for name in apart if name not in known])
-        left = "" if few == "none" else f"; fewer than {report.FEWEST} seeds to tell by: {few}"
-        said.append(f"On the {task}, {label}, success is lower by its interval: {worse}; higher: {better}{left}.")
+        better, worse, _, unknown = report.sides(apart)
+        left = f"; {report.UNTOLD}: {report.listed(unknown)}" if unknown else ""
+        higher, lower = report.listed(better), report.listed(worse)
+        said.append(f"On the {task}, {label}, success is lower by its interval: {lower}; higher: {higher}{left}.")
     return said
 
 
 def panel(figure: Figure, cells: dict[str, Cells]) -> None:
     """The differences with their intervals, at 10 minutes and at the end."""
+    names = [name for name in ABLATED if any(name in found for found in cells.values())]
     for axes, (task, found) in zip(
         figure.subplots(1, len(cells), sharey=True, squeeze=False)[0], cells.items(), strict=True
     ):
-        names = [name for name in found if name != "all"]
         for offset, (label, when, color) in enumerate((("10 min", 10.0, "#56b4e9"), ("final", "final", "#0072b2"))):
+            axes.plot([], [], "o", color=color, label=label)
             for row, name in enumerate(names):
-                apart = report.paired_estimate(found[name], found["all"], when)
+                apart = report.paired_estimate(found.get(name), found["all"], when)
                 if apart is not None:
                     y = -row - 0.2 * offset
                     axes.plot([apart.low, apart.high], [y, y], color=color, lw=2)
-                    axes.plot(apart.value, y, "o", color=color, label=label if row == 0 else None)
+                    axes.plot(apart.value, y, "o", color=color)
         axes.axvline(0.0, color="grey", lw=0.8)
         axes.set(title=task, xlabel="difference in success [points]", yticks=[-r - 0.1 for r in range(len(names))])
         axes.set_yticklabels([LABELS[name] for name in names])

@@ -6,6 +6,7 @@
 import sys
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import report
@@ -108,7 +109,8 @@ def reached(cells: Cells) -> str:
     lags: dict[str, float] = {}
     for (method, _, _), cell in cells.items():
         if cell is not None:
-            lag = max(minute - asked for asked, minute in cell.minutes.items())
+            evaluations: Any = cell.rows
+            lag = float((evaluations["minutes"] - evaluations["at"]).max())
             lags[NAMES[method]] = max(lag, lags.get(NAMES[method], 0.0))
     later = ", ".join(f"{lag:.1f} min ({name})" for name, lag in lags.items())
     head = "An evaluation is at the end of the first iteration that reaches its minute, and the figure shows it there"

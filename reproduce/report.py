@@ -27,6 +27,8 @@ COLORS = {"lcs-rl": "#d55e00", "violation": "#0072b2", "ppo": "#e69f00", "pddm":
 MISSING = "—"
 FEWEST = 3
 """Seeds that a sentence about a paired difference takes: the interval of two is their range, and says nothing."""
+UNTOLD = f"not compared, having fewer than {FEWEST} seeds or other goals"
+"""What is said of those without an interval."""
 STATISTICS = "Brackets and p are explained in reproduce/README.md, section Statistics."
 Tables = dict[str, pd.DataFrame]
 """Title → table of text."""
@@ -86,8 +88,9 @@ def at(cell: Cell | None, when: str | float) -> Estimate | None:
 
 
 def over_objects(cells: Sequence[Cell | None], when: str | float) -> Estimate | None:
-    """Interquartile mean over objects and seeds; None if an object is missing."""
-    return bootstrap([list(cell.at(when)) for cell in cells if cell is not None], IQM) if all(cells) else None
+    """Interquartile mean over objects and seeds; None if an object is missing, or was not evaluated then."""
+    found = [[] if cell is None else list(cell.at(when)) for cell in cells]
+    return bootstrap(found, IQM) if all(found) else None
 
 
 def mean_over(cells: Sequence[Cell | None], when: str | float) -> float:
@@ -97,13 +100,18 @@ def mean_over(cells: Sequence[Cell | None], when: str | float) -> float:
 
 
 def paired(a: Cell | None, b: Cell | None, when: str | float) -> list[float]:
-    """Success of a − b [%] for each seed of both; none where they differ in goals or object."""
+    """Success of a − b [%] for each seed of both; none where they differ in goals, object or version of a method.
+
+    Peaks may be of different goals: at the end there are more of them than on the way.
+    """
     conditions = ["task", "evaluation_seed", "source", "mass"]
     if a is None or b is None or any(a.first[name] != b.first[name] for name in conditions):
         return []
+    if a.first.method == b.first.method and a.first.version != b.first.version:
+        return []
     if a.at(when).empty or b.at(when).empty:
         return []
-    if when != "peak" and a.goals(when) != b.goals(when):  # peaks may be at the end and on the way
+    if when != "peak" and a.goals(when) != b.goals(when):
         return []
     return list((a.at(when) - b.at(when)).dropna())
 
@@ -121,22 +129,28 @@ def listed(names: Sequence[str]) -> str:
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1] if names else "none"]))
 
 
+def sides(differences: Mapping[str, Estimate | None]) -> tuple[list[str], list[str], list[str], list[str]]:
+    """Names whose difference is above zero, below it, or on either side by its interval; and those without one."""
+    known = {name: found for name, found in differences.items() if found is not None and not math.isnan(found.low)}
+    above = [name for name, found in known.items() if found.low > 0]
+    below = [name for name, found in known.items() if found.high < 0]
+    either = [name for name in known if name not in above and name not in below]
+    return above, below, either, [name for name in differences if name not in known]
+
+
 def verdict(differences: Mapping[str, Estimate | None], against: str = "on", unlike: str = "on") -> str:
-    """Where a difference is above zero, below it, or cannot be told, by the intervals; without the rest.
+    """Where a difference is above zero, below it, or cannot be told, by the intervals; and what was not compared.
 
     `against` and `unlike` are the words between a finding and its names, which are objects by default.
     """
-    known = {name: found for name, found in differences.items() if found is not None and not math.isnan(found.low)}
-    better = [name for name, found in known.items() if found.low > 0]
-    worse = [name for name, found in known.items() if found.high < 0]
-    open_ = [name for name in known if name not in better and name not in worse]
-    found = {f"better {against}": better, f"worse {against}": worse, f"not to be told apart {unlike}": open_}
+    *told, unknown = sides(differences)
+    ways = (f"better {against}", f"worse {against}", f"not to be told apart {unlike}")
     parts = [
-        f"{how} all {len(known)}" if len(names) == len(known) else f"{how} {len(names)} ({listed(names)})"
-        for how, names in found.items()
+        f"{how} all {len(names)}" if len(names) == len(differences) else f"{how} {len(names)} ({listed(names)})"
+        for how, names in zip(ways, told, strict=True)
         if names
     ]
-    return ", ".join(parts) or f"not compared: that takes {FEWEST} seeds"
+    return ", ".join([*parts, f"{UNTOLD}: {listed(unknown)}"] if unknown else parts)
 
 
 def bullets(sentences: Sequence[str]) -> list[str]:
@@ -176,12 +190,14 @@ def provenance(cells: Sequence[Cell | None]) -> list[str]:
     rows = pd.concat([cell.rows for cell in found])
     units = rows.drop_duplicates(records.IDENTITY)
     seconds = units.train_seconds + units.evaluation_seconds
+    goals = ", ".join(map(str, rows.evaluation_seed.unique()))
     objects = (units.source.str.replace("_", " ") + units.mass.map(" {:g} kg".format)).unique()
     notes = [
         STATISTICS,
         f"Computed: {len(units)} trainings in {seconds.sum() / 3600:.1f} core hours, {seconds.mean():.0f} s each on "
         f"average, on {', '.join(units.machine.unique())}, until {units.finished.max()[:10]}; "
-        f"{'; '.join(units.versions.unique())}; objects: {', '.join(objects)}; the same goals for all.",
+        f"{'; '.join(units.versions.unique())}; objects: {', '.join(objects)}; "
+        f"goals of seed {goals}, where they are fewer the first of them.",
         "Every number is of one version of its method:",
     ]
     tasks: dict[str, dict[str, None]] = {}

@@ -88,9 +88,9 @@ def conditions(mass: float, friction: float, gain: float) -> Iterator[Condition]
         yield Condition("delay", f"{late}, predicted", delay=delay, predicted=True)
 
 
-def acting(condition: Condition, policy: Any, n_u: int, seed: int) -> Act:
-    """How a model acts in a condition, in one batch of episodes."""
-    act, rng = mpc_actions(policy), np.random.default_rng((seed, Stream.ACTION))
+def acting(condition: Condition, policy: Any, n_u: int, rng: np.random.Generator) -> Act:
+    """How a model acts in a condition, in one batch of episodes, with the noise of a generator."""
+    act = mpc_actions(policy)
     position, yaw = condition.noise
 
     def noisy(state: Tensor, *rest: Tensor) -> tuple[np.ndarray, np.ndarray]:
@@ -110,7 +110,8 @@ def measure(condition: Condition, task: TaskSpec, policy: Any, goals: int, seed:
     try:
         for first in range(0, goals, envs.num_envs):
             seeds = episode_seeds(seed, Stream.EVALUATION, first, min(envs.num_envs, goals - first))
-            parts.append(collect(envs, acting(condition, policy, task.n_u, first), seeds, task.episode_steps))
+            act = acting(condition, policy, task.n_u, np.random.default_rng((seed, Stream.ACTION, first)))
+            parts.append(collect(envs, act, seeds, task.episode_steps))
     finally:
         envs.close()
     reached = torch.cat([part["success"] for part in parts]).int().tolist()
@@ -201,6 +202,11 @@ def draw_record(options: Options) -> int:
     if not path.exists():
         raise CheckpointError(f"{path}: expected a record, found none; make it: python reproduce/robustness.py --rerun")
     record: Any = read_json(path)
+    if record["options"]["model"] != str(options.model):
+        raise CheckpointError(
+            f"{path}: expected a record of {options.model}, got one of {record['options']['model']}; measure it with "
+            f"--rerun, and another --results"
+        )
     draw(record, options.results, name)
     return 0
 

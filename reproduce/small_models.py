@@ -7,7 +7,7 @@ computes them.
 import sys
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 import report
@@ -24,6 +24,7 @@ from difflcs.rl.dynamics import Ensemble
 SHOWN = (("lcs-rl", "ours", "full"), PRIOR, ("pddm", "ours", "full"), ("pddm", "authors", "full"))
 """Method, recipe, protocol."""
 WHEN: dict[str, str | float] = {"2 min": 2.0, "6 min": 6.0, "10 min": 10.0, "final": "final"}
+NO_TIMES = "No times are given: no class of machine has computed all of these methods."
 HYBRID = (
     "LCS-RL in our recipe is itself a hybrid: it also learns from episodes that are played in an ensemble of such "
     "networks. What acts, what is transferred and what one can read is the LCS; what the networks bring it stands "
@@ -41,28 +42,49 @@ def size_of(method: str, recipe: str) -> int:
     return sum(p.numel() for p in Ensemble(task.n_x, task.n_u, ensemble.networks, ensemble.width).parameters())
 
 
-def seconds_per_step(rows: pd.DataFrame, cell: Cell) -> float:
-    """Of a core, in the evaluations of these trainings: the decision and the simulation of its outcome."""
-    mine: Any = rows[(rows.key == cell.first.key) & (rows.version == cell.first.version)]
-    mine = mine[(mine.task == cell.first.task) & mine.seed.isin(cell.scores.index)]
-    seconds = mine.drop_duplicates("seed").evaluation_seconds.sum()
-    return seconds / (mine.goals.sum() * get_task("cube").episode_steps)
+class Times(NamedTuple):
+    """What one method takes of one core: medians over the trainings on one class of machine."""
+
+    step: float
+    """Milliseconds of one step in the evaluations: the decision and the simulation of its outcome."""
+    training: float
+    """Minutes of a whole training."""
+    trainings: int
 
 
-def table(rows: pd.DataFrame, cells: dict[str, Cell]) -> pd.DataFrame:
+def shared_machine(cells: dict[str, Cell]) -> str | None:
+    """The class of machine that has computed the most of all methods, so that times compare; None if no one has."""
+    counts = pd.concat([cell.rows.drop_duplicates("seed").machine.value_counts() for cell in cells.values()], axis=1)
+    fewest = counts.min(axis=1, skipna=False).dropna()
+    return None if fewest.empty else str(fewest.idxmax())
+
+
+def times_of(rows: pd.DataFrame, cell: Cell, machine: str) -> Times:
+    """The times of a method on a class of machine, over all ways in which its models were evaluated there."""
+    own: Any = cell.first
+    same = (rows.key == own.key) & (rows.version == own.version) & (rows.task == own.task) & (rows.machine == machine)
+    trainings = (
+        rows[same]
+        .groupby("seed")
+        .agg(goals=("goals", "sum"), train=("train_seconds", "first"), evaluation=("evaluation_seconds", "first"))
+    )
+    step = (trainings.evaluation / trainings.goals).median() / get_task("cube").episode_steps
+    return Times(1e3 * step, trainings.train.median() / 60, len(trainings))
+
+
+def table(cells: dict[str, Cell], times: dict[str, Times]) -> pd.DataFrame:
     """Success, computing and size of each."""
     columns: dict[str, list[str]] = {
         "": [*WHEN, "computing per step, with the simulation [ms]", "training [core min]", "learned numbers"]
     }
     for name, cell in cells.items():
         success = [say(report.at(cell, when)) for when in WHEN.values()]
-        step = f"{1e3 * seconds_per_step(rows, cell):.2g}"
-        training = f"{cell.rows.drop_duplicates('seed').train_seconds.mean() / 60:.1f}"
-        columns[name] = [*success, step, training, str(size_of(cell.first.method, cell.first.recipe))]
+        took = [f"{times[name].step:.2g}", f"{times[name].training:.1f}"] if times else [report.MISSING] * 2
+        columns[name] = [*success, *took, str(size_of(cell.first.method, cell.first.recipe))]
     return pd.DataFrame(columns)
 
 
-def words(rows: pd.DataFrame, cells: dict[str, Cell]) -> list[str]:
+def words(cells: dict[str, Cell], times: dict[str, Times]) -> list[str]:
     """The paper's claim beside either way of PDDM, by the intervals; and what the small model costs."""
     lcs = next((cell for cell in cells.values() if cell.first.method == "lcs-rl"), None)
     networks = {name: cell for name, cell in cells.items() if cell.first.method == "pddm"}
@@ -81,14 +103,13 @@ def words(rows: pd.DataFrame, cells: dict[str, Cell]) -> list[str]:
             f"{name}: after {EARLY:g} minutes of data LCS-RL − PDDM is {difference} points, paired by seed. The "
             f"paper's claim that simple models beat deep networks at little data {claim}."
         )
-    first = next(iter(networks.values()))
-    ratio = seconds_per_step(rows, first) / seconds_per_step(rows, lcs)
-    sizes = [size_of(cell.first.method, cell.first.recipe) for cell in (first, lcs)]
-    steps = (
-        f"A step of PDDM takes {ratio:.0f} times the computing of one of the LCS-MPC, the simulation included, and its "
-        f"networks hold {sizes[0] / sizes[1]:.0f} times as many numbers."
-    )
-    return [*report.bullets(said), steps]
+    first = next(iter(networks))
+    sizes = [size_of(cell.first.method, cell.first.recipe) for cell in (networks[first], lcs)]
+    costs = f"The networks of PDDM hold {sizes[0] / sizes[1]:.0f} times as many numbers as the LCS"
+    if times:
+        ratio = times[first].step / next(times[name].step for name, cell in cells.items() if cell is lcs)
+        costs += f", and a step of PDDM takes {ratio:.0f} times the computing, the simulation included"
+    return [*report.bullets(said), f"{costs}."]
 
 
 def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
@@ -97,8 +118,12 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
     cells = {label: cell for label, cell in found.items() if cell is not None}
     if not cells:
         return False
-    notes = [*words(rows, cells), HYBRID, *report.provenance(list(cells.values()))]
-    report.write_tables(folder, name, {"An LCS and networks on the cube": table(rows, cells)}, notes)
+    machine = shared_machine(cells)
+    times = {label: times_of(rows, cell, machine) for label, cell in cells.items()} if machine else {}
+    counts = report.listed([str(took.trainings) for took in times.values()])
+    where = f"Times are medians of the trainings on {machine}, which are {counts}." if machine else NO_TIMES
+    notes = [*words(cells, times), where, HYBRID, *report.provenance(list(cells.values()))]
+    report.write_tables(folder, name, {"An LCS and networks on the cube": table(cells, times)}, notes)
     return True
 
 

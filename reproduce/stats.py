@@ -55,12 +55,11 @@ def p_value(differences: Sequence[float]) -> float:
     all choices of signs that give a mean as far from zero. No shape of a distribution is assumed. With n seeds it is
     2^(1−n) at least: .25 for three, .002 for ten.
     """
-    rounded = np.round(differences, 6)  # or equal means would differ by rounding
-    if len(rounded) < 2:
+    if len(differences) < 2:
         return math.nan
-    signs = np.array(list(itertools.product((1.0, -1.0), repeat=len(rounded))))
-    means = np.abs(signs @ rounded)
-    return float((means >= means[0] - 1e-6).mean())
+    signs = np.array(list(itertools.product((1.0, -1.0), repeat=len(differences))))
+    sums = np.abs(signs @ np.asarray(differences))
+    return float((sums >= sums[0] - 1e-6).mean())  # equal sums may differ by rounding
 
 
 def apart(a: Estimate, b: Estimate) -> Estimate:

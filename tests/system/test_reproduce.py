@@ -590,9 +590,12 @@ def test_words_say_what_the_intervals_say():
         "mug": stats.Estimate(3.0, 1.0, 5.0), "can": stats.Estimate(-2.0, -3.0, -1.0),
         "box": stats.Estimate(1.0, -1.0, 3.0), "wrench": stats.Estimate(9.0), "clamp": None,
     }  # fmt: skip
-    assert report.verdict(found) == "better on 1 (mug), worse on 1 (can), not to be told apart on 1 (box)"
+    told = "better on 1 (mug), worse on 1 (can), not to be told apart on 1 (box)"
+    assert report.verdict(found) == f"{told}, {report.UNTOLD}: wrench and clamp"
     assert report.verdict({"mug": found["mug"], "cube": found["mug"]}) == "better on all 2"
-    assert report.verdict({"wrench": found["wrench"]}) == "not compared: that takes 3 seeds"
+    assert report.verdict({"wrench": found["wrench"]}) == f"{report.UNTOLD}: wrench"
+    # What could not be compared is neither forgotten nor counted.
+    assert report.verdict({"mug": found["mug"], "clamp": None}) == f"better on 1 (mug), {report.UNTOLD}: clamp"
     assert report.listed(["a", "b", "c"]) == "a, b and c"
     assert report.listed([]) == "none"
 
@@ -628,7 +631,7 @@ def results(tmp_path):
         records.add(tmp_path, "paper", prior)
         transfer = Unit("mug", "ppo", "ours", seed, "cube")
         records.add(tmp_path, "paper", unit_rows(transfer, (30, 60, 70, 79 + shift)))
-        records.add(tmp_path, "paper", unit_rows(Unit("cube", "pddm", "ours", seed), (0, 1, 2, 3), goals=50))
+        records.add(tmp_path, "paper", unit_rows(Unit("cube", "pddm", "ours", seed), (0, 2, 2, 4), goals=50))
     return tmp_path
 
 
@@ -641,10 +644,11 @@ def cells_of(path, task):
 def test_table1_shows_ours_beside_the_paper(results, capsys):
     code, out, _ = run_script(table1.main, capsys, "--results", results)
     assert code == 0
-    success, differences, other, *_, ways = cells_of(results / "table1.md", "mug")
+    success, differences, deployed, other, *_, ways = cells_of(results / "table1.md", "mug")
     assert success[1:5] == ["50.0 [40.0, 60.0]", "32.5 ± 8.4", "80.0 [70.0, 90.0]", "44.6 ± 3.9"]  # peak
     assert success[5:] == ["20.0 [10.0, 30.0]", "10.0 ± 6.3", "80.0 [70.0, 90.0]", "44.6 ± 3.9"]  # final
     assert differences[1:] == ["+30.0 [+30.0, +30.0]", "0.250", "+60.0 [+60.0, +60.0]", "0.250"]
+    assert deployed[3:] == ["+68.0 [+58.0, +78.0]", "0.250"]
     assert ways[1:] == ["20.0 [10.0, 30.0]", "20.0 [20.0, 20.0]", "12.0 [12.0, 12.0]"]
     assert other[1] == "20.0 [20.0, 20.0]"
     assert "50.0 [40.0, 60.0]" in out
@@ -655,8 +659,41 @@ def test_table1_shows_ours_beside_the_paper(results, capsys):
     assert "Success on six objects, the paper's recipe" in markdown
     assert "LCS-RL, our recipe: version 1, 3 seeds × 1000 goals (mug)" in markdown
     assert "Computed: 12 trainings" in markdown  # mug only
-    assert "LCS-RL, our recipe, at the end against violation only, our recipe: better on all 1." in markdown
-    assert "LCS-RL, our recipe, at the end against the paper's mean: better on all 1." in markdown
+    assert "LCS-RL, our recipe, at the end against violation only, our recipe: better on 1 (mug), not" in markdown
+    assert "LCS-RL, our recipe, at the end against the paper's mean: better on 1 (mug), not compared" in markdown
+    deployed = "violation only, as Jin & Posa, in its support: better on 1 (mug), not compared"
+    assert f"LCS-RL, our recipe, at the end against {deployed}" in markdown
+
+
+def test_few_seeds_are_not_compared_with_the_paper(results, capsys):
+    for seed in range(2):
+        records.add(results, "paper", unit_rows(Unit("clamp", "lcs-rl", "ours", seed), (0, 90, 90, 90)))
+    assert run_script(table1.main, capsys, "--results", results)[0] == 0
+    said = "against the paper's mean: better on 1 (mug), not compared, having fewer than 3 seeds or other goals: "
+    assert f"{said}sugar box, fish can, wrench, clamp and banana." in (results / "table1.md").read_text()
+
+
+def test_differences_are_of_whole_goals(tmp_path):
+    """With shares of six decimals equal differences would not be equal, and p too small: here the mean is zero."""
+    for seed, reached in enumerate((97, 101, 101, 101)):
+        for unit, share in ((Unit("mug", "lcs-rl", "ours", seed), reached), (Unit("mug", "ppo", "ours", seed), 100)):
+            percent = 100 * round(share / 300, 6)
+            records.add(tmp_path, "paper", unit_rows(unit, (0, 0, 0, percent), goals=300))
+    rows = records.read(records.path_of(tmp_path, "paper"))
+    pair = [records.select(rows, "mug", method, "ours") for method in ("lcs-rl", "ppo")]
+    assert stats.p_value(report.paired(*pair, "final")) == 1.0
+
+
+def test_only_what_is_comparable_is_paired(results):
+    for seed in range(3):
+        unit = Unit("mug", "lcs-rl", "adam", seed)
+        records.add(results, "paper", unit_rows(unit, (0, 1, 2, 3), version="2"))
+    rows = records.read(records.path_of(results, "paper"))
+    mug = {recipe: records.select(rows, "mug", "lcs-rl", recipe) for recipe in ("ours", "adam")}
+    assert report.paired(mug["adam"], mug["adam"], "final") == [0.0, 0.0, 0.0]
+    assert report.paired(mug["adam"], mug["ours"], "final") == []  # of another version of the method
+    assert report.over_objects([mug["ours"], mug["adam"]], "final") is not None
+    assert report.over_objects([mug["ours"], mug["adam"]], 2.0) is None  # never evaluated then
 
 
 @pytest.mark.parametrize("last", [20, 21])
@@ -666,7 +703,7 @@ def test_table1_says_where_two_deployments_are_one(results, capsys, last):
     for seed in range(3):
         records.add(results, "paper", pd.concat(both, ignore_index=True).assign(seed=seed))
     assert run_script(table1.main, capsys, "--results", results)[0] == 0
-    said = "in its support: at the end the same with full bounds" in (results / "table1.md").read_text()
+    said = "in its support: at the end every seed has reached as many goals" in (results / "table1.md").read_text()
     assert said == (last == 20)
 
 
@@ -686,7 +723,7 @@ def test_learning_curves_are_drawn(results, capsys):
     code, out, _ = run_script(fig_learning_curves.main, capsys, "--results", results)
     assert code == 0
     assert "55 at 7 min, 30 at 30 min" in out
-    assert "3.0 [3.0, 3.0]" in out  # PDDM
+    assert "4.0 [4.0, 4.0]" in out  # PDDM
     assert "PDDM: version 1, 3 seeds × 50 goals" in out  # an unequal number of goals is said
 
 
@@ -722,10 +759,11 @@ def test_curves_stand_where_the_evaluations_were(tmp_path, capsys, monkeypatch):
     rows = unit_rows(Unit("cube", "lcs-rl", "ours", 0), (0, 40, 50, 70))
     rows["minutes"] = [0.0, 6.9, 10.5, 30.0]
     records.add(tmp_path, "paper", rows)
+    records.add(tmp_path, "paper", unit_rows(Unit("cube", "lcs-rl", "ours", 1), (0, 40, 50, 70)))
     drawn, plot = [], matplotlib.axes.Axes.plot
     monkeypatch.setattr("matplotlib.axes.Axes.plot", lambda s, x, *a, **k: drawn.append(list(x)) or plot(s, x, *a, **k))
     assert run_script(fig_learning_curves.main, capsys, "--results", tmp_path)[0] == 0
-    assert drawn == [[0.0, 6.9, 10.5, 30.0]]
+    assert drawn[0] == [0.0, 6.45, 10.25, 30.0]
     assert "later by up to 0.9 min (LCS-RL)" in (tmp_path / "fig_learning_curves.md").read_text()
 
 
@@ -748,10 +786,30 @@ def test_ablations_are_compared_with_all_parts(results, capsys):
     assert adam[3:] == ["70.0 [60.0, 80.0]", "−20.0 [−30.0, −10.0]", "0.250", "−10.0 [−10.0, −10.0]", "0.250"]
     markdown = (results / "ablations.md").read_text()
     said = "success is lower by its interval: with Adam instead of the natural gradient"
-    few = "fewer than 3 seeds to tell by: with horizon 5"
+    few = f"{report.UNTOLD}: with horizon 5"
     assert f"On the cube, 10 min, {said}; higher: without warm-up; {few}." in markdown
     assert f"On the cube, final, {said} and without warm-up; higher: none; {few}." in markdown
     assert (results / "ablations.png").is_file()
+
+
+def test_every_line_of_the_ablations_has_its_own_name(results, capsys, monkeypatch):
+    """Also where one task has an ablation that the other has not."""
+    for seed in range(3):
+        for task, recipe, end in (("cube", "adam", 10), ("cube", "no-models", 20), ("banana", "no-models", 30)):
+            records.add(results, "paper", unit_rows(Unit(task, "lcs-rl", recipe, seed), (0, 9, 9, end)))
+        records.add(results, "paper", unit_rows(Unit("banana", "lcs-rl", "ours", seed), (0, 40, 40, 40)))
+    drawn = []
+    monkeypatch.setattr(report, "write_figure", lambda figure, *rest: drawn.append(figure))
+    assert run_script(ablations.main, capsys, "--results", results)[0] == 0
+    cube, banana = drawn[0].axes
+    names = [label.get_text() for label in cube.get_yticklabels()]
+    assert names == ["with Adam instead of the natural gradient", "without model rollouts"]
+    points = [
+        [float(y) for line in axes.lines if line.get_marker() == "o" for y in line.get_ydata()]
+        for axes in drawn[0].axes
+    ]
+    assert points == [[0.0, -1.0, -0.2, -1.2], [-1.0, -1.2]]
+    assert all(axes.get_legend() is not None for axes in (cube, banana))
 
 
 def test_transfer_is_compared_at_equal_data(results, capsys):
@@ -903,6 +961,10 @@ def test_robustness_is_resumed_and_refuses_another_record(tmp_path, monkeypatch,
     assert not (tmp_path / "robustness.json").exists()
     with pytest.raises(CheckpointError, match="pass another --results"):
         robustness.draw_record(replace(options, goals=1))
+    (tmp_path / "robustness.json").write_text(json.dumps(record))
+    with pytest.raises(CheckpointError, match="expected a record of runs/mine, got one of zoo:trifinger-cube"):
+        robustness.draw_record(replace(options, smoke=False, model=Path("runs/mine")))
+    (tmp_path / "robustness.json").unlink()
     with pytest.raises(CheckpointError, match=r"robustness\.py --rerun"):
         robustness.draw_record(replace(options, smoke=False))
 
@@ -916,7 +978,7 @@ def test_robustness_changes_what_it_says(monkeypatch):
     monkeypatch.setattr(robustness, "mpc_actions", lambda policy: act)
     state, goal = torch.zeros(2000, 9, dtype=torch.float64), torch.zeros(2000, 3, dtype=torch.float64)
     noisy = next(one for one in found if one.noise == (0.003, 0.05))
-    robustness.acting(noisy, None, 6, 0)(state, goal)
+    robustness.acting(noisy, None, 6, np.random.default_rng(0))(state, goal)
     assert seen[0].std(0)[:3].tolist() == pytest.approx([0.003, 0.003, 0.05], rel=0.1)
     assert not seen[0][:, 3:].any()  # where the tips are, the robot knows
 
@@ -985,7 +1047,8 @@ def test_a_small_model_beside_networks(results, capsys):
     markdown = (results / "small_models.md").read_text()
     # Three seeds of 10 s of evaluation and 4 × 50 goals × 20 steps; the LCS has 4 × 1000 goals.
     assert [cells[1:] for cells in cells_of(results / "small_models.md", "computing per step")] == [["0.12", "2.5"]]
-    assert "A step of PDDM takes 20 times the computing" in markdown
+    assert "a step of PDDM takes 20 times the computing" in markdown
+    assert "Times are medians of the trainings on a machine, which are 3 and 3." in markdown
     assert "cannot be decided here" in markdown  # they have other goals
     for seed in range(3):
         records.add(results, "paper", unit_rows(Unit("cube", "pddm", "ours", seed), (0, 1, 2, 3), version="2"))
@@ -999,6 +1062,23 @@ def test_a_small_model_beside_networks(results, capsys):
     assert "at little data holds here." in markdown  # each way has a sentence of its own
     assert "drawn anew, as its authors do: after 6 minutes of data LCS-RL − PDDM is −49.0 [−59.0, −39.0]" in markdown
     assert "does not hold here: the networks are better." in markdown
+
+
+def test_times_are_of_one_class_of_machine(results, capsys):
+    """Else a slow machine would count as a slow method."""
+    for seed in (3, 4, 5):
+        slow = unit_rows(Unit("cube", "lcs-rl", "ours", seed), (0, 40, 50, 70), evaluation_seconds=1e3, machine="slow")
+        records.add(results, "paper", slow)
+    assert run_script(small_models.main, capsys, "--results", results)[0] == 0
+    markdown = (results / "small_models.md").read_text()
+    assert "Times are medians of the trainings on a machine, which are 3 and 3." in markdown
+    assert cells_of(results / "small_models.md", "computing per step")[0][1:] == ["0.12", "2.5"]
+    for seed in range(3):
+        other = unit_rows(Unit("cube", "pddm", "ours", seed), (0, 1, 2, 3), version="2", machine="another")
+        records.add(results, "paper", other)
+    assert run_script(small_models.main, capsys, "--results", results)[0] == 0
+    assert small_models.NO_TIMES in (results / "small_models.md").read_text()
+    assert cells_of(results / "small_models.md", "computing per step")[0][1:] == ["—", "—"]
 
 
 def test_transfer_compares_the_same_seeds(results, capsys):
@@ -1022,8 +1102,8 @@ def test_objects_of_two_masses_beside_the_paper(results, capsys):
     assert "| final: 50 g" in markdown
     (line,) = cells_of(results / "masses.md", "mug")
     assert [cell.split(" ")[0] for cell in line[-3:]] == ["20.0", "61.0", "44.6"]
-    assert "At 50 g, LCS-RL at the end against the paper's mean: worse on all 1." in markdown
-    assert "At 10 g, LCS-RL at the end against the paper's mean: better on all 1." in markdown
+    assert "At 50 g, LCS-RL at the end against the paper's mean: worse on 1 (mug), not compared" in markdown
+    assert "At 10 g, LCS-RL at the end against the paper's mean: better on 1 (mug), not compared" in markdown
 
 
 # --- bad input --------------------------------------------------------------------------------------
