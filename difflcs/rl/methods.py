@@ -124,13 +124,13 @@ class LCSMethod(Method):
     """A method that learns an `LCSModel` and acts by the MPC around it."""
 
     n_lam: int = bounded(8, minimum=1, maximum=1000)
-    """Contacts, that is complementarity variables, of the model; ignored with --init. 5 do as well on the cube."""
+    """Contacts, that is complementarity variables, of the model; ignored with --init."""
     stiffness: float = bounded(0.1, above=0)
     """Lower bound on the symmetric part of the model's F; ignored with --init."""
     init_scale: float = bounded(1e-3, minimum=0)
     """Initial parameters are uniform within ± this; ignored with --init."""
     backend: str = "batched"
-    """MPC solver: batched, or ipopt, the reference, with which a training takes three times as long."""
+    """MPC solver: batched, or ipopt, the reference, which takes many times as long for a plan."""
 
     kind: ClassVar[str] = "LCSModel"
     takes_init: ClassVar[bool] = True

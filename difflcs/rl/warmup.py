@@ -44,7 +44,7 @@ HELD_OUT = 0.2
 
 @dataclass(frozen=True)
 class WarmupSettings(Settings):
-    """Settings of the warm-up. The defaults reach 69 to 83 % success on the cube after 6 minutes of data (4 seeds)."""
+    """Settings of the warm-up. The defaults reach 63 to 83 % success on the cube after 6 minutes of data (10 seeds)."""
 
     rollouts: Rollouts = group(Rollouts)
     """Episodes per iteration; no random ones when starting from a trained model."""

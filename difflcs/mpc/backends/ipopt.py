@@ -54,13 +54,13 @@ class IpoptBackend(Backend):
         max_iter: iteration limit of one solve.
         workers: processes for a batch; the number of CPUs available if None. 1 solves in this process.
         residual_tol: largest KKT residual that counts as converged.
-        start: value of λ and s at a cold start. 0.05 takes half the iterations of λ = s = 1 and finds better optima.
+        start: value of λ and s at a cold start. 0.05 takes fewer iterations than λ = s = 1 and finds better optima.
             The states start at x0: a rollout is a worse start where the system is unstable.
         mu_init: IPOPT's first barrier parameter at a cold start.
         mu_init_warm: the same when a guess is given.
-        mu_strategy: IPOPT's: "monotone", or "adaptive": better optima on contact-rich pushing, up to three times slower
-            on the cart-pole and chains of carts.
-        contact: "equation", or "inequality": a cold start solves λ·s ≤ ε first, another problem with better optima,
+        mu_strategy: IPOPT's: "monotone", or "adaptive": another way, whose optima are not better or worse in general;
+            up to three times slower on the cart-pole and chains of carts.
+        contact: "equation", or "inequality": a cold start solves λ·s ≤ ε first, which has other optima,
             and the equation from there. That takes up to twice the time; on an unstable system it may end worse.
     """
 
