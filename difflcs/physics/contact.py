@@ -103,7 +103,8 @@ class ContactLCS(nn.Module):
         """The physics as it is now, differentiable in what is learned."""
         guess, change = self.guess, self.change
         length = guess.length or 1.0
-        values: dict[str, Any] = {
+        values: dict[str, Any] = {name: getattr(guess, name) for name in ("center_of_mass", "gyration", "length")}
+        values |= {
             name: getattr(guess, name) * change[name].exp()
             for name in ("gyration", "friction", "compliance", "radius")
             if name in change
@@ -115,7 +116,7 @@ class ContactLCS(nn.Module):
             values["drive"] = PositionDrive(*(v * change[name].exp() if name in change else v for v, name in drive))
         if "outline" in change:
             values["shape"] = _moved(guess.shape, iter(length * change["outline"]))
-        return guess.replace(**values) if values else guess
+        return guess.replace(**values) if change else guess
 
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
         """The system at states x (..., n_x); there is no context."""

@@ -216,6 +216,8 @@ class PlanarPushing:
         if self.nearest is not None:
             check_positive_int("nearest", self.nearest)
         check_choice("cone", self.cone, ("anitescu", "stewart-trinkle"))
+        defaults = [name for name in ("center_of_mass", "gyration", "length") if getattr(self, name) is None]
+        vars(self)["defaults"] = dict.fromkeys(defaults)
         values: dict[str, Any] = {name: self._of_discs(name, getattr(self, name)) for name in ("radius", "compliance")}
         values["friction"] = 0.0 if self.frictionless else self._of_discs("friction", self.friction)
         center = self.shape.centroid if self.center_of_mass is None else self.center_of_mass
@@ -270,8 +272,8 @@ class PlanarPushing:
         return self.shape.n_parts if self.nearest is None else min(self.nearest, self.shape.n_parts)
 
     def replace(self, **values: Any) -> PlanarPushing:
-        """The same with other values."""
-        return replace(self, **values)
+        """The same with other values; what was not given follows from the shape, also from another one."""
+        return replace(self, **{**vars(self)["defaults"], **values})
 
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
         """The system at states x (..., n_x); there is no context.
@@ -335,11 +337,15 @@ class PlanarPushing:
         tangent = normal.new_zeros(*normal.shape[:-1], 0, self.n_x) if self.frictionless else rows(tx, ty).unsqueeze(-2)
         return Contacts(gap.reshape(*batch, m * parts), normal, tangent)
 
+    def _arm(self, yaw: Tensor) -> Tensor:
+        """From the body's origin to its centre of mass (..., 2), in the plane."""
+        center: Any = self.center_of_mass
+        cos, sin = yaw.cos(), yaw.sin()
+        return torch.stack([cos * center[0] - sin * center[1], sin * center[0] + cos * center[1]], -1)
+
     def _mobility(self, x: Tensor) -> Tensor:
         """What a force and a torque, dual to the pose, do to the pose: (..., 3, 3), for mass 1."""
-        center: Any = self.center_of_mass
-        cos, sin = x[..., 2].cos(), x[..., 2].sin()
-        cx, cy = cos * center[0] - sin * center[1], sin * center[0] + cos * center[1]
+        cx, cy = self._arm(x[..., 2]).unbind(-1)
         # The pose is that of the body's origin, which turns about the centre of mass.
         turn = torch.stack([cy, -cx, torch.ones_like(cx)], -1)
         gyration: Any = self.gyration
@@ -348,8 +354,9 @@ class PlanarPushing:
 
     def _without_contact(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """A and B, and the response of the discs alone."""
-        kept = vars(self).get("kept")
-        if kept is not None and kept[0].dtype == like.dtype and kept[0].device == like.device:
+        numbers = _plain_numbers(self.drive, self.inertia)
+        key, (kept_key, kept) = (numbers, like.dtype, like.device), vars(self).get("kept", (None, None))
+        if numbers is not None and key == kept_key:
             return kept
         m, n_x, h = self.n_discs, self.n_x, 0.0 if self.inertia is None else self.inertia.seconds
         A = torch.eye(n_x, dtype=like.dtype, device=like.device)
@@ -366,8 +373,8 @@ class PlanarPushing:
             decay, speed = torch.exp(-_number("damping", self.inertia.damping).to(A) * h), n_x - 3 + torch.arange(3)
             A[torch.arange(3), speed] = h * decay.expand(3)
             A[speed, speed] = decay.expand(3)
-        if not (A.requires_grad or B.requires_grad or response.requires_grad):  # else each call has a graph of its own
-            vars(self)["kept"] = (A, B, response)
+        if numbers is not None and not torch.is_inference_mode_enabled():
+            vars(self)["kept"] = key, (A, B, response)
         return A, B, response
 
     def _free_motion(self, x: Tensor) -> FreeMotion:
@@ -375,11 +382,28 @@ class PlanarPushing:
         response, mobility = response.expand(*x.shape[:-1], -1, -1).clone(), self._mobility(x)
         if self.inertia is None:
             response[..., :3, :3] = mobility
-        else:
-            h, mass = self.inertia.seconds, _number("mass", self.inertia.mass).to(x)
-            response[..., :3, :3] = h * mobility / mass
-            response[..., -3:, :3] = mobility / mass
-        return FreeMotion(A, B, x.new_zeros(self.n_x), response)
+            return FreeMotion(A, B, x.new_zeros(self.n_x), response)
+        h, mass = self.inertia.seconds, _number("mass", self.inertia.mass).to(x)
+        response[..., :3, :3] = h * mobility / mass
+        response[..., -3:, :3] = mobility / mass
+        return FreeMotion(A, B, self._turning(x, A[-1, -1], h), response)
+
+    def _turning(self, x: Tensor, decay: Tensor, h: float) -> Tensor:
+        """What is added (..., n_x) because the centre of mass, not the origin of the body, keeps its velocity."""
+        speed = decay * x[..., -1]
+        before, after = self._arm(x[..., 2]), self._arm(x[..., 2] + h * speed)
+        across = torch.stack([-before[..., 1], before[..., 0]], -1)  # of which the turn makes the origin's velocity
+        across_after = torch.stack([-after[..., 1], after[..., 0]], -1)
+        speed = speed.unsqueeze(-1)
+        rest = x.new_zeros(*x.shape[:-1], self.n_x - 5)
+        place, velocity = before - after + h * speed * across, speed * (across - across_after)
+        return torch.cat([place, rest, velocity, torch.zeros_like(speed)], -1)
+
+
+def _plain_numbers(*parts: Drive | Inertia | None) -> tuple[float, ...] | None:
+    """All values of these; None where one is a tensor, which may be learned or changed in place."""
+    values = [value for part in parts if part is not None for value in vars(part).values()]
+    return tuple(values) if all(isinstance(value, int | float) for value in values) else None
 
 
 def _chosen(values: Tensor, parts: Tensor) -> Tensor:

@@ -147,13 +147,16 @@ class Polygon(Shape):
 
     def _sides(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Start (n, 2), vector (n, 2), squared length (n,) and outward normal (n, 2) of every side."""
-        if "sides" in vars(self):
+        # Kept while the corners are numbers that have not changed; with a gradient each call has a graph of its own.
+        plain = not (self.vertices.requires_grad or self.vertices.is_inference())
+        version = self.vertices._version if plain else None
+        if plain and vars(self).get("version") == version:
             return vars(self)["sides"]
         side = self.vertices.roll(-1, 0) - self.vertices
         square = side.square().sum(-1)
         sides = (self.vertices, side, square, torch.stack([side[:, 1], -side[:, 0]], -1) / square.sqrt().unsqueeze(-1))
-        if not side.requires_grad:  # else each call has a graph of its own
-            vars(self)["sides"] = sides
+        if plain and not torch.is_inference_mode_enabled():
+            vars(self).update(sides=sides, version=version)
         return sides
 
     def moments(self) -> Moments:

@@ -237,6 +237,77 @@ def test_derivatives_of_gaps_are_those_of_autograd(build, name, cone):
         torch.testing.assert_close(system.length * gap, system.contacts(still).gap, rtol=1e-9, atol=1e-12)
 
 
+def test_what_a_call_without_gradients_prepares_is_not_kept_for_those_with():
+    vertices = tensor([[-0.05, -0.05], [0.05, -0.05], [0.05, 0.05], [-0.05, 0.05]]).requires_grad_()
+    gain, place = tensor(0.7).requires_grad_(), tensor([0.08, 0.01])
+    outline, x = Polygon(vertices), torch.zeros(5, dtype=F64)
+    system = PlanarPushing(box(-0.05, 0.05, -0.05, 0.05), 0.01, drive=PositionDrive(gain=gain))
+    with torch.no_grad():
+        outline.distance(place)
+        system.params(x)
+    (slope,) = torch.autograd.grad(outline.distance(place).distance.sum(), vertices)
+    torch.testing.assert_close(slope[:, 0], tensor([0.0, -0.4, -0.6, 0.0]))
+    assert system.params(x).B.requires_grad
+    with torch.no_grad():  # a step of an optimiser
+        vertices.mul_(1.2)
+        gain.mul_(0.5)
+    assert outline.distance(place).distance.item() == pytest.approx(0.02)
+    assert system.params(x).B[3, 0].item() == pytest.approx(0.35)
+
+
+def test_numbers_changed_in_place_are_seen():
+    outline, gain, x = box(-0.05, 0.05, -0.05, 0.05), tensor(0.7), torch.zeros(5, dtype=F64)
+    system = PlanarPushing(outline, 0.01, drive=PositionDrive(gain=gain))
+    place = tensor([0.08, 0.01])
+    assert outline.distance(place).distance.item() == pytest.approx(0.03)
+    assert system.params(x).B[3, 0].item() == pytest.approx(0.7)
+    outline.vertices.mul_(1.2)
+    gain.mul_(0.5)
+    assert outline.distance(place).distance.item() == pytest.approx(0.02)
+    assert system.params(x).B[3, 0].item() == pytest.approx(0.35)
+
+
+def test_what_inference_mode_prepares_is_not_kept():
+    system = pushing()
+    x = torch.zeros(5, dtype=F64)
+    with torch.inference_mode():
+        system.params(x)
+    x = x.clone().requires_grad_()
+    system.params(x).step(x, tensor([0.01, 0.0])).x_next.sum().backward()
+    assert x.grad is not None
+
+
+def test_another_shape_has_its_own_centre_and_gyration():
+    small, large = box(-0.05, 0.05, -0.05, 0.05), box(0.0, 0.2, 0.0, 0.2)
+    system, fresh = PlanarPushing(small, 0.01).replace(shape=large), PlanarPushing(large, 0.01)
+    torch.testing.assert_close(system.gyration, fresh.gyration)
+    torch.testing.assert_close(system.center_of_mass, fresh.center_of_mass)
+    assert system.length == fresh.length
+    moved = PlanarPushing(small, 0.01).replace(center_of_mass=(0.03, 0.0))
+    torch.testing.assert_close(moved.gyration, PlanarPushing(small, 0.01, center_of_mass=(0.03, 0.0)).gyration)
+    given = PlanarPushing(small, 0.01, gyration=0.02, center_of_mass=(0.01, 0.0), length=0.04).replace(shape=large)
+    assert (float(given.gyration), given.center_of_mass.tolist(), given.length) == (0.02, [0.01, 0.0], 0.04)
+    assert ContactLCS(PlanarPushing(small, 0.01), ("outline",)).physics.gyration == PlanarPushing(small, 0.01).gyration
+
+
+@pytest.mark.parametrize("damping", [0.0, 1.0])
+def test_the_centre_of_mass_keeps_its_velocity_wherever_the_origin_is(damping):
+    """A body that spins and glides, described from its centre of mass and from another point."""
+    speed, spin, centre = (0.2, -0.1), 3.0, (0.03, -0.02)
+    found = []
+    for origin in ((0.0, 0.0), centre):
+        system = pushing(inertia=Inertia(1.0, 0.02, damping), center_of_mass=origin, compliance=0.1)
+        x = torch.zeros(system.n_x, dtype=F64)
+        x[3:5] = 5.0  # the disc is far away
+        x[-3:] = tensor([speed[0] + spin * origin[1], speed[1] - spin * origin[0], spin])
+        for _ in range(50):
+            x = system.params(x).step(x, torch.zeros(2, dtype=F64)).x_next
+        turn = tensor([[x[2].cos(), -x[2].sin()], [x[2].sin(), x[2].cos()]])
+        found.append(torch.cat([x[:2] + turn @ tensor(origin), x[2:3], x[-1:]]))
+    start = tensor([*centre, 0.0, 0.0])
+    torch.testing.assert_close(found[1] - start, found[0], rtol=1e-9, atol=1e-12)
+
+
 def test_a_central_push_moves_the_body_as_far_as_the_disc():
     system = pushing()
     x = tensor([0.0, 0.0, 0.0, -0.042, 0.0])
