@@ -58,7 +58,7 @@ class Deployments(Reporter):
         steps = [int(row["env_steps"]) for row in logged]
         per_minute = self.unit.spec.steps_per_minute
         previous, now = steps if len(steps) == 2 else (-1, *steps)
-        goals, minutes = goals_due(self.schedule, previous, now, per_minute), round(now / per_minute, 6)
+        goals, minutes = goals_due(self.schedule, previous, now, self.unit.spec), round(now / per_minute, 6)
         known = self.rows()
         done = set(known.protocol[known.minutes == minutes])
         for protocol in self.protocols if goals else ():

@@ -238,8 +238,8 @@ class _Training:
     def __init__(self, config: TrainConfig, task: TaskSpec, out: Path, make_envs: EnvFactory, reporter: Reporter):
         self.config, self.task, self.out, self.make_envs, self.reporter = config, task, out, make_envs, reporter
         self.opened: list[VectorEnv] = []
-        episodes = max(1, round(config.minutes * task.steps_per_minute / task.episode_steps))
-        self.total_episodes, self.total = episodes, episodes * task.episode_steps  # whole episodes
+        self.total_episodes = episodes_of(config.minutes, task)
+        self.total = self.total_episodes * task.episode_steps
 
     def __call__(self, init: Path | None, resume: bool, begun: Callable[[], object], held: ExitStack) -> RunDirectory:
         """Create or resume the run, and work until it is finished. `begun` is called when nothing can be refused."""
@@ -331,7 +331,7 @@ class _Training:
 
         def finish(report: Any, previous: int) -> None:
             # The row first, then the checkpoint: resuming drops rows after the checkpoint, so none is lost or doubled.
-            goals = goals_due(config, previous, trainer.env_steps, per_minute)
+            goals = goals_due(config, previous, trainer.env_steps, self.task)
             start = time.perf_counter()
             result = measure(goals) if goals else None
             row = _row(columns, trainer.env_steps, per_minute, report, result, time.perf_counter() - start)
@@ -387,13 +387,18 @@ def _note(run: RunDirectory, found: Mapping[str, Any]) -> None:
         )
 
 
-def goals_due(config: TrainConfig, previous: int, now: int, per_minute: float) -> int:
+def episodes_of(minutes: float, task: TaskSpec) -> int:
+    """Whole episodes in so many minutes of data, at least one."""
+    return max(1, round(minutes * task.steps_per_minute / task.episode_steps))
+
+
+def goals_due(config: TrainConfig, previous: int, now: int, task: TaskSpec) -> int:
     """How many goals to evaluate after collecting the environment steps previous + 1 … now; 0 for none."""
     if now == 0:
         return config.final_goals if 0 in config.evaluate_at else 0
-    if previous < round(config.minutes * per_minute) <= now:
+    if previous < episodes_of(config.minutes, task) * task.episode_steps <= now:
         return config.final_goals
-    due = any(previous < minute * per_minute <= now for minute in config.evaluate_at)
+    due = any(previous < minute * task.steps_per_minute <= now for minute in config.evaluate_at)
     return config.evaluate_goals if due else 0
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from difflcs.cost import GoalCost
 from difflcs.rl.tasks import PhysicsSpec, Quantity, TaskSpec, register_task
+from difflcs_envs.trifinger.arguments import checked_task
 from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE, EPISODE_STEPS, MOVE, TURN, MoveTask
 from difflcs_envs.ycb import YCB
 
@@ -104,7 +106,9 @@ def contact_system(**env_kwargs: Any) -> Any:
     from difflcs_envs.trifinger.objects import make_object
     from difflcs_envs.trifinger.section import cross_section
 
-    found = make_object(env_kwargs["object"]) if "object" in env_kwargs else CubeObject()
+    arguments = {"object_source": "source", "rest_pose": "rest_pose", "mesh_parts": "parts", "mesh_scale": "mesh_scale"}
+    given = {argument: env_kwargs[name] for name, argument in arguments.items() if name in env_kwargs}
+    found = make_object(env_kwargs["object"], **given) if "object" in env_kwargs else CubeObject()
     outline = Union(tuple(Polygon(torch.from_numpy(corners)) for corners in cross_section(found)))
     guess = PlanarPushing(
         outline,
@@ -173,6 +177,14 @@ def contact_physics(env_kwargs: Mapping[str, Any]) -> PhysicsSpec:
     )
 
 
+def _judging(task: MoveTask, env_kwargs: Mapping[str, Any]) -> MoveTask:
+    """A task with the numbers of an environment that is made with these arguments."""
+    given = {name: env_kwargs.get(name, getattr(task, name)) for name in ("yaw_tolerance", "sparse_penalty")}
+    near = env_kwargs.get("position_tolerance", task.position_tolerance)
+    task = replace(task, position_tolerance=near)
+    return checked_task(task, reward_weights=env_kwargs.get("reward_weights"), **given)
+
+
 def trifinger_task(
     name: str, env: str, task: MoveTask, summary: str, goals: tuple[tuple[float, ...], ...], **env_kwargs: Any
 ) -> TaskSpec:
@@ -184,8 +196,9 @@ def trifinger_task(
         task: Goals and reward of that environment.
         summary: What is to be done.
         goals: Goals to show what was learned.
-        **env_kwargs: Arguments of the environment.
+        **env_kwargs: Arguments of the environment. What they change of goals and reward is changed here, too.
     """
+    judge = _judging(task, env_kwargs)
     return TaskSpec(
         name=name,
         summary=summary,
@@ -195,11 +208,11 @@ def trifinger_task(
         u_min=-ACTION_LIMIT,
         u_max=ACTION_LIMIT,
         horizon=HORIZON,
-        episode_steps=EPISODE_STEPS,
+        episode_steps=env_kwargs.get("horizon", EPISODE_STEPS),
         step_seconds=STEP_SECONDS,
         features=pushing_features,
-        outcome=task.judge,
-        failure_penalty=task.sparse_penalty,
+        outcome=judge.judge,
+        failure_penalty=judge.sparse_penalty,
         goal=(Quantity("x", "m"), Quantity("y", "m"), Quantity("yaw", "rad")),
         errors=(Quantity("position_error", "m"), Quantity("yaw_error", "rad")),
         caption=caption,

@@ -14,7 +14,7 @@ pytest.importorskip("mujoco", reason="the environments need the extra [envs]")
 from difflcs import LCSModel  # noqa: E402
 from difflcs.rl.evaluate import evaluate  # noqa: E402
 from difflcs.rl.tasks import get_task, task_names  # noqa: E402
-from difflcs_envs.tasks import caption, contact_cost, pushing_cost  # noqa: E402
+from difflcs_envs.tasks import MOVE, caption, contact_cost, pushing_cost, trifinger_task  # noqa: E402
 from difflcs_envs.ycb import YCB  # noqa: E402
 
 NAMES = ("cube", "turn_cube", *YCB)
@@ -199,6 +199,35 @@ def test_what_is_known_of_an_object_is_its_outline(name, parts):
     gaps = system.guess.replace(radius=0.0095).contacts(torch.from_numpy(state)).gap
     assert float(gaps.min()) > 0.001
     env.close()
+
+
+def test_a_task_judges_as_its_environment_does():
+    """Also where the environment has other numbers: model rollouts learn from what the task says."""
+    other = {"position_tolerance": 0.5, "yaw_tolerance": 3.0, "sparse_penalty": 3.0, "horizon": 4}
+    for given in ({}, {"reward_weights": {"tips": 0.0, "action": 100.0}, "sparse_penalty": 3.0, "horizon": 3}, other):
+        task = trifinger_task("own", "TriFingerMoveCube-v0", MOVE, "Own.", (), **given)
+        env = task.make_env()
+        observation, _ = env.reset(seed=0)
+        for step in range(task.episode_steps):
+            after, reward, _, ended, info = env.step(np.full(6, 0.01))
+            assert ended == (step == task.episode_steps - 1)
+            action = info["executed_action"]
+            found = task.outcome(observation["state"], action, after["state"], after["goal"], ended)
+            assert found[0] == pytest.approx(reward)
+            assert found[1] == info["success"]
+            observation = after
+        assert task.failure_penalty == env.unwrapped.task.sparse_penalty
+        env.close()
+
+
+def test_what_is_known_of_an_own_object_is_how_it_lies(tmp_path):
+    trimesh = pytest.importorskip("trimesh", reason="meshes need the extra [envs]")
+    path = tmp_path / "box.stl"
+    trimesh.creation.box((60, 80, 160)).export(path)
+    given = {"object": str(path), "mesh_scale": 0.001, "rest_pose": "upright"}
+    task = trifinger_task("own", "TriFingerMoveObject-v0", MOVE, "Own.", (), **given)
+    corners = np.concatenate([part.vertices.numpy() for part in task.physics.make_system().guess.shape.parts])
+    np.testing.assert_allclose(np.ptp(corners, axis=0), [0.06, 0.08], atol=1e-6)
 
 
 def test_only_what_is_pushed_has_physics_of_pushing():

@@ -17,7 +17,8 @@ from difflcs.errors import BackendNotFoundError, CheckpointError, DTypeError, In
 from difflcs.rl._optional import require
 from difflcs.rl.methods import LCSMethod, get_method, method_names
 from difflcs.rl.settings import Adam, Epochs, Rollouts, Settings, bounded, from_json, group
-from difflcs.rl.training import TrainConfig, goals_due
+from difflcs.rl.tasks import get_task
+from difflcs.rl.training import TrainConfig, episodes_of, goals_due
 from difflcs.rl.warmup import WarmupSettings
 
 
@@ -257,8 +258,17 @@ def test_a_stored_configuration_that_does_not_fit_is_refused(change):
 
 def test_evaluations_fall_due_once():
     config = TrainConfig(minutes=2.0, evaluate_at=(0.0, 0.5, 1.0, 1.1), evaluate_goals=60, final_goals=300)
-    due = {now: goals_due(config, now - 100, now, 600.0) for now in range(0, 1300, 100)}
+    due = {now: goals_due(config, now - 100, now, get_task("cube")) for now in range(0, 1300, 100)}
     assert {k: v for k, v in due.items() if v} == {0: 300, 300: 60, 600: 60, 700: 60, 1200: 300}
+
+
+@pytest.mark.parametrize("minutes", [0.01, 0.75, 1.01, 3.75, 6.7, 12.75, 30.0])
+def test_the_last_evaluation_is_never_left_out(minutes):
+    """Also where the minutes are no whole number of episodes."""
+    task, config = get_task("cube"), TrainConfig(minutes=minutes, evaluate_at=(), final_goals=300)
+    last = episodes_of(minutes, task) * task.episode_steps
+    assert goals_due(config, last - 20, last, task) == 300
+    assert goals_due(config, last - 40, last - 20, task) == 0
 
 
 def test_missing_packages_name_the_line_that_installs_them():
