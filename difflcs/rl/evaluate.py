@@ -109,7 +109,8 @@ def evaluate(
     """Run one noise-free episode per goal; every solve starts cold.
 
     Repeating it gives the same result bit for bit. A smaller evaluation uses the first goals of a larger one with the
-    same seed. Another number of environments changes the solver's rounding (1e-15, which contact may amplify).
+    same seed. Another number of environments changes the solver's rounding (1e-15, which contact may amplify), and the
+    random numbers of a policy that draws them for the whole batch, as PDDM does.
 
     Args:
         env: vector of environments, stepped in lockstep.

@@ -130,12 +130,12 @@ def record_video(
             raise InvalidInputError(f"goal: expected {low} <= goal <= {high}, got {goal.tolist()}")
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.tmp.mp4")
-    act = mpc_actions(policy)
     reached: list[bool] = []
     temporary.touch()  # says here whether it can be written, where the message is not one of ffmpeg
     try:
         with cast(Any, imageio.get_writer)(temporary, fps=max(1, round(1 / task.step_seconds)), quality=8) as video:
             for number, goal in enumerate(chosen, 1):
+                act = mpc_actions(policy)  # which begins anew, as in an evaluation
                 observation, info = env.reset(seed=seed + number, options={"goal": goal})
                 title = f"goal {number} of {len(chosen)}"
                 picture = _captioned(env, f"{title}    0.0 s    {task.say(info)}", "")

@@ -279,16 +279,39 @@ class TaskSpec:
 
         Raises:
             MissingDependencyError: a package that it needs is not installed.
-            InvalidInputError: they cannot be made.
+            InvalidInputError: they cannot be made, or would clip actions within the bounds of the task.
         """
         with self._making() as arguments:
             import gymnasium
 
             if not isinstance(self.env, str):
-                return gymnasium.vector.SyncVectorEnv([functools.partial(self.env, **arguments)] * count)
-            if self.threaded and threads is not None:
-                arguments["threads"] = threads
-            return gymnasium.make_vec(self.env, num_envs=count, **arguments)
+                envs: VectorEnv = gymnasium.vector.SyncVectorEnv([functools.partial(self.env, **arguments)] * count)
+            else:
+                if self.threaded and threads is not None:
+                    arguments["threads"] = threads
+                envs = gymnasium.make_vec(self.env, num_envs=count, **arguments)
+        try:
+            self._check_actions(envs.single_action_space)
+        except InvalidInputError:
+            envs.close()
+            raise
+        return envs
+
+    def _check_actions(self, space: Any) -> None:
+        """Refuse bounds wider than the environment's, which would execute other actions than those planned."""
+        if getattr(space, "shape", None) != (self.n_u,) or not hasattr(space, "low"):
+            raise InvalidInputError(
+                f"task {self.name}: expected an environment whose action space is a Box of shape ({self.n_u},), as the "
+                f"cost has actions of that size, got {space}; change one of them"
+            )
+        (low, high), margin = self.bounds, 1e-6  # a Box often has 32 bits
+        least, most = (torch.as_tensor(value, dtype=torch.float64) for value in (space.low, space.high))
+        if bool((low < least - margin * least.abs()).any() or (high > most + margin * most.abs()).any()):
+            raise InvalidInputError(
+                f"task {self.name}: expected u_min and u_max within the action space of its environment, which clips "
+                f"what is outside, got {low.tolist()} to {high.tolist()} and {least.tolist()} to {most.tolist()}; "
+                f"narrow the bounds, or widen the space"
+            )
 
     @contextmanager
     def _making(self) -> Iterator[dict[str, Any]]:

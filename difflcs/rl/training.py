@@ -153,7 +153,8 @@ def train(
         out: the run directory, new or empty unless resuming; runs/<task>-<method>-<seed> if None.
         task: the task or its name, if the configuration does not say it or it is not registered.
         make_envs: makes the environments; those of the task if None.
-        init: run or model directory, or model of the zoo ("zoo:NAME"), to start from, instead of a random model.
+        init: run or model directory, or model of the zoo ("zoo:NAME"), to start from, instead of a random model. A run
+            that is continued has its own.
         resume: continue the run in `out`.
         force: replace the run in `out`. It is deleted once the new one has begun, and stays if that fails.
         reporter: for progress bars.

@@ -14,6 +14,8 @@ import torch
 
 from difflcs import GoalCost, LCSModel
 from difflcs.errors import DTypeError, InvalidInputError, MissingDependencyError
+from difflcs.rl.figures import record_video
+from difflcs.rl.rollout import Plan
 from difflcs.rl.tasks import ENTRY_POINTS, Quantity, get_task, register_task, task_names
 from tests.conformance.toy import STEPS, U_MAX, Slide, make_task
 
@@ -73,6 +75,44 @@ def test_environments_that_cannot_be_made_say_why():
                 make()
     with pytest.raises(MissingDependencyError, match="no_such_package"):
         make_task(requires=("no_such_package",)).make_env()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"u_max": 2 * U_MAX}, r"within the action space .* \[-0.2\] to \[0.4\] and \[-0.2\] to \[0.2\]"),
+        ({"u_min": -1.0}, "narrow the bounds"),
+        ({"make_cost": lambda: GoalCost.reach(2, 2, goal_weight=(1.0,), input_weight=1.0)}, r"a Box of shape \(2,\)"),
+    ],
+)
+def test_an_environment_that_would_clip_what_is_planned_is_refused(change, message):
+    with pytest.raises(InvalidInputError, match=message):
+        make_task(**change).make_envs(2)
+    make_task(u_max=U_MAX / 2).make_envs(2).close()  # narrower ones are executed as planned
+
+
+def test_every_episode_of_a_film_begins_the_policy_anew(tmp_path):
+    pytest.importorskip("imageio_ffmpeg", reason="films need the extra [viz]")
+    pytest.importorskip("PIL", reason="films need the extra [viz]")
+
+    class Drawn(Slide):
+        def render(self):
+            return np.zeros((64, 64, 3), np.uint8)
+
+    class Counted:
+        def __init__(self):
+            self.steps = []
+
+        def begin(self, seed=0):
+            self.steps.append(0)
+
+        def __call__(self, state, goal, **_):
+            self.steps[-1] += 1
+            return Plan(torch.zeros(1, 1).double(), torch.ones(1, dtype=torch.bool))
+
+    policy = Counted()
+    record_video(Drawn(), policy, [(0.1,), (0.2,), (-0.1,)], tmp_path / "film.mp4", TOY, hold_seconds=0.0)
+    assert policy.steps == [STEPS] * 3
 
 
 def test_the_mpc_is_the_tasks():
