@@ -277,6 +277,103 @@ def test_parents_touch_only_where_named():
     assert float(module.contacts(torch.zeros(4, dtype=torch.float64)).gap[0]) == pytest.approx(np.hypot(0.4, 0.1) - 0.2)
 
 
+CUBE = " ".join(f"{x} {y} {z}" for x, y, z in itertools.product((-0.05, 0.05), repeat=3))
+FACES = SHAPES | {
+    "ellipsoid": 'type="ellipsoid" size=".05 .04 .03"',
+    "cylinder": 'type="cylinder" size=".05 .05"',
+    "box": 'type="box" size=".05 .05 .05"',
+    "mesh": 'type="mesh" mesh="cube"',
+}
+MESH = f'<asset><mesh name="cube" vertex="{CUBE}"/><mesh name="slab" vertex="{CUBE}" scale="6 6 1"/></asset>'
+
+
+@pytest.mark.parametrize("first", ["plane", *FACES])
+@pytest.mark.parametrize("second", FACES)
+def test_there_is_room_for_all_contacts_that_mujoco_finds(first, second):
+    shape = FACES.get(first, 'type="plane" size="1 1 1"')
+    model = load(f'<geom {shape} margin=".5"/><body><freejoint/><geom {FACES[second]}/></body>', MESH)
+    data, random, most = mujoco.MjData(model), np.random.default_rng(0), 0
+    for k in range(60):
+        yaw, tilt = random.uniform(0, np.pi), (0, np.pi / 2, 1.0)[k % 3]
+        turns = np.array([[np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)], [np.cos(tilt / 2), np.sin(tilt / 2), 0, 0]])
+        data.qpos[:3] = [*random.uniform(-0.03, 0.03, 2), random.uniform(0.0, 0.16)]
+        mujoco.mju_mulQuat(data.qpos[3:], *turns)
+        mujoco.mj_forward(model, data)
+        most = max(most, data.ncon)
+    assert 1 <= most <= MujocoLCS(model, motion="dynamic").n_contacts
+
+
+several_contacts_of_faces = pytest.mark.skipif(
+    not hasattr(mujoco.mjtDisableBit, "mjDSBL_MULTICCD"), reason="this MuJoCo makes one contact where faces meet"
+)
+SLABS = {
+    "box": 'type="box" size=".3 .3 .05"',
+    "mesh": 'type="mesh" mesh="slab"',
+    "cylinder": 'type="cylinder" size=".3 .05"',
+    "box of the same size": FACES["box"],
+}
+
+
+@several_contacts_of_faces
+@pytest.mark.parametrize(
+    ("below", "above", "yaw"),
+    [
+        ("box", "mesh", 0.0),
+        ("mesh", "mesh", 0.0),
+        ("mesh", "box", 0.0),
+        ("mesh", "cylinder", 0.0),
+        ("cylinder", "mesh", 0.0),
+        ("mesh", "capsule", 0.0),
+        ("box of the same size", "box", np.pi / 4),  # an octagon: eight contacts
+    ],
+)
+def test_what_rests_on_a_face_does_not_tip(below, above, yaw):
+    shape, height = (FACES[above], 0.05) if above != "capsule" else (SHAPES[above] + ' euler="90 0 0"', 0.02)
+    model = load(
+        f"""<geom {SLABS[below]} pos="0 0 -.05"/>
+        <body pos="0.003 0.002 {height - 1e-4}"><freejoint/><geom {shape} mass="1"/></body>""",
+        MESH,
+    )
+    data = mujoco.MjData(model)
+    data.qpos[3:] = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
+    module = MujocoLCS(model, data, motion="dynamic", seconds=0.05)
+    x = module.state.to_state(data.qpos)
+    for _ in range(6):
+        x = module.params(x).step(x, torch.zeros(0).double()).x_next
+    assert float(x[2]) == pytest.approx(height, abs=3e-4)
+    assert float(x[3:6].norm()) < 1e-3
+    assert float(x[9:].norm()) < 1e-2
+
+
+@several_contacts_of_faces
+def test_a_flat_pusher_does_not_turn_a_mesh_cube():
+    pusher = PUSHER.replace('type="sphere" size=".015"', 'type="box" size=".02 .03 .03" pos="-.0701 0 0"')
+    model = load(
+        f"""<body>{PLANE.format("")}<joint name="yaw" type="hinge" axis="0 0 1"/>
+        <geom type="mesh" mesh="cube" mass=".5"/></body>"""
+        + pusher.format(tip=""),
+        MESH + SERVOS,
+    )
+    x, u = torch.zeros(5).double(), tensor(0.02, 0.0)
+    after = MujocoLCS(model).params(x).step(x, u).x_next
+    torch.testing.assert_close(after, tensor(0.0199, 0.0, 0.0, 0.02, 0.0), atol=2e-4, rtol=0)
+
+
+@pytest.mark.parametrize("flag", ["contact", "constraint"])
+def test_where_contacts_are_disabled_nothing_touches_but_what_is_named(flag):
+    model = load(
+        f"""<geom name="slab" {SLABS["box"]}/>
+        <body pos="0 0 .105"><freejoint/><geom name="cube" {FACES["box"]}/></body>""",
+        f'<option><flag {flag}="disable"/></option>',
+    )
+    x = torch.zeros(12).double()
+    x[2] = 0.105
+    assert MujocoLCS(model, motion="dynamic").n_contacts == 0
+    assert MujocoLCS(model, motion="dynamic").params(x).n_lam == 0
+    named = MujocoLCS(model, motion="dynamic", pairs=[("slab", "cube")]).contacts(x)
+    assert named.gap[:4].tolist() == pytest.approx([0.005] * 4)
+
+
 # --- quasi-static motion --------------------------------------------------------------------------------------------
 
 
@@ -334,6 +431,23 @@ def test_actions_become_controls_of_the_servos():
     np.testing.assert_allclose(after[3:], (x[3:] + u).numpy(), atol=2e-4)
 
 
+@pytest.mark.parametrize("bias", ["40 -400 -40", "0 -400 -40"])
+def test_a_servo_with_a_constant_force_goes_where_it_is_told(bias):
+    model = load(
+        '<body><joint name="a" type="slide" axis="1 0 0"/><geom size=".05" mass="1"/></body>',
+        f'<actuator><general joint="a" gear="2" gainprm="400" biastype="affine" biasprm="{bias}"/></actuator>',
+    )
+    ctrl = MujocoLCS(model).control(tensor(0.01), tensor(0.05))
+    after, _ = step(model, 0.01, ctrl=ctrl.numpy(), seconds=2.0)
+    np.testing.assert_allclose(after, 0.06, atol=1e-5)
+
+
+def test_an_actuator_is_a_servo_only_by_an_affine_bias():
+    rest = '<actuator><general joint="px" gainprm="400" biastype="none" biasprm="0 -400 -40"/></actuator>'
+    module = MujocoLCS(load(PUSHER.format(tip=""), rest), motion="dynamic")
+    torch.testing.assert_close(module.control(tensor(0.3, 0.0, 0.0, 0.0), tensor(0.05)), tensor(0.05))
+
+
 # --- motion with velocities -----------------------------------------------------------------------------------------
 
 CART_POLE = """
@@ -375,6 +489,49 @@ def test_servos_and_velocity_actuators_are_mujocos(relative):
     ctrl = module.control(torch.from_numpy(after), u)
     again = np.concatenate(step(model, after[:2], after[2:], ctrl.numpy()))
     np.testing.assert_allclose(second, again, atol=4e-3)
+
+
+LIMITED = {  # actuators, whether actions are relative, place, action
+    "a motor that cannot rest": ('<motor joint="px" ctrlrange="0.1 1"/>', True, 0.0, 0.5),
+    "a servo out of its range": ('<position joint="px" kp="50" kv="5" ctrlrange="-.1 .1"/>', True, 0.15, -0.08),
+    "a servo by its target": ('<position joint="px" kp="50" kv="5" ctrlrange=".2 .6"/>', False, 0.3, 0.4),
+    "a force on a tendon": (
+        '<position tendon="t" kp="100"/>'
+        '</actuator><tendon><fixed name="t" actuatorfrclimited="true" actuatorfrcrange="-5 5">'
+        '<joint joint="px" coef="1"/></fixed></tendon><actuator>',
+        True,
+        0.1,
+        0.12,
+    ),
+}
+
+
+@pytest.mark.parametrize("case", LIMITED)
+def test_an_actuator_acts_though_it_is_limited(case):
+    actuator, relative, place, action = LIMITED[case]
+    model = load(PUSHER.format(tip=""), f"<actuator>{actuator}</actuator>")
+    module = MujocoLCS(model, motion="dynamic", relative=relative, seconds=0.02)
+    x, u = tensor(place, 0.0, 0.0, 0.0), tensor(action)
+    after = np.concatenate(step(model, x[:2], x[2:], module.control(x, u).numpy(), 0.02))
+    assert abs(after[2]) > 0.02
+    np.testing.assert_allclose(module.params(x).step(x, u).x_next, after, rtol=0.05, atol=1e-3)
+    assert bool(model.actuator_ctrllimited[0]) == ("ctrlrange" in actuator)
+
+
+def test_forces_in_the_data_act_in_dynamic_motion_alone():
+    model = load('<body><freejoint name="b"/><geom size=".05" mass="1"/></body>')
+    data = mujoco.MjData(model)
+    data.xfrc_applied[1, 0], data.qfrc_applied[1] = 10.0, 4.0
+    module = MujocoLCS(model, data, motion="dynamic", seconds=0.05)
+    x = torch.zeros(12).double()
+    after = module.params(x).step(x, torch.zeros(0).double()).x_next
+    torch.testing.assert_close(after[6:8], tensor(0.5, 0.2))
+    torch.testing.assert_close(after[:2], tensor(0.0125, 0.005))
+    pushed = pushing()
+    data, x, u = mujoco.MjData(pushed), tensor(0, 0, 0, -0.08, 0), tensor(0.02, 0.0)
+    without = MujocoLCS(pushed, data).params(x).step(x, u).x_next
+    data.xfrc_applied[:], data.qfrc_applied[:] = 10.0, 10.0
+    torch.testing.assert_close(MujocoLCS(pushed, data).params(x).step(x, u).x_next, without)
 
 
 def test_a_body_in_the_air_falls_and_turns():
@@ -502,7 +659,28 @@ def test_an_mpc_pushes_the_box_to_its_goal():
 
 # --- what is refused ------------------------------------------------------------------------------------------------
 
-SPHERE = '<body><freejoint/><geom size=".1"/></body>'
+SPHERE = '<body><freejoint/><geom name="ball" size=".1"/></body>'
+FIELD = '<asset><hfield name="h" nrow="9" ncol="9" size="1 1 .1 .1"/></asset>'
+TERRAIN = f'<geom name="terrain" type="hfield" hfield="h"/><geom name="wall" size=".1" pos="1 0 0"/>{SPHERE}'
+PAIR = '<contact><pair geom1="tip" geom2="block" friction="1 .1"/></contact>'
+TENDON = '<tendon><fixed name="t" frictionloss="5"><joint joint="px" coef="1"/></fixed></tendon>'
+ADHESION = SERVOS.replace("</actuator>", '<adhesion body="box" gain="50" ctrlrange="0 1"/></actuator>')
+OVERRIDE = '<option o_friction=".9 .9 .1 .1 .1"><flag override="enable"/></option>'
+
+
+TORUS = f"""
+<mujoco><extension><plugin plugin="mujoco.sdf.torus"><instance name="t"/></plugin></extension>
+  <asset><mesh name="torus"><plugin instance="t"/></mesh></asset>
+  <worldbody><geom name="torus" type="sdf" mesh="torus"><plugin instance="t"/></geom>{SPHERE}</worldbody></mujoco>"""
+
+
+def data_of(model, **values):
+    data = mujoco.MjData(model)
+    for name, value in values.items():
+        getattr(data, name)[:] = value
+    return data
+
+
 REFUSED = {
     "no model": (lambda: MujocoLCS("model.xml"), DTypeError, "MjModel"),
     "no data": (lambda: MujocoLCS(pushing(), 3), DTypeError, "MjData"),
@@ -534,6 +712,38 @@ REFUSED = {
         InvalidInputError,
         "equality",
     ),
+    "adhesion": (lambda: MujocoLCS(pushing(ADHESION), motion="dynamic"), InvalidInputError, "adhesion"),
+    "dry friction of a tendon": (
+        lambda: MujocoLCS(pushing(SERVOS + TENDON), motion="dynamic"),
+        InvalidInputError,
+        "tendons .frictionloss",
+    ),
+    "a height field": (
+        lambda: MujocoLCS(load(TERRAIN, FIELD), motion="dynamic"),
+        InvalidInputError,
+        "height field .* geom 'terrain'; use a mesh or boxes",
+    ),
+    "a signed distance field": (
+        lambda: MujocoLCS(mujoco.MjModel.from_xml_string(TORUS), motion="dynamic"),
+        InvalidInputError,
+        "signed distance field .* geom 'torus'",
+    ),
+    "friction of two kinds": (
+        lambda: MujocoLCS(pushing(SERVOS + PAIR)),
+        InvalidInputError,
+        "got 1 and 0.1 between geoms 'block' and 'tip'",
+    ),
+    "friction by override": (lambda: MujocoLCS(pushing(SERVOS + OVERRIDE)), InvalidInputError, "pass friction=0.9"),
+    "a force that is none": (
+        lambda: MujocoLCS(pushing(), data_of(pushing(), xfrc_applied=np.nan), motion="dynamic"),
+        NonFiniteError,
+        "xfrc_applied",
+    ),
+    "data of other bodies": (
+        lambda: MujocoLCS(load(SPHERE), mujoco.MjData(load("<body/>" + SPHERE)), motion="dynamic"),
+        InvalidInputError,
+        r"xfrc_applied \(2, 6\) of the model, got \(3, 6\)",
+    ),
     "no state": (lambda: MujocoLCS(pushing()).params(), InvalidInputError, "pass x"),
     "a state of another size": (lambda: MujocoLCS(pushing()).params(torch.zeros(4).double()), ShapeError, "n_x=5"),
     "a state that is none": (lambda: MujocoLCS(pushing()).params(tensor(0, 0, 0, 0, np.nan)), NonFiniteError, "NaN"),
@@ -554,6 +764,14 @@ def test_dry_friction_of_joints_is_refused_with_velocities_alone():
     assert MujocoLCS(model).n_lam == 2
     with pytest.raises(InvalidInputError, match="frictionloss"):
         MujocoLCS(model, motion="dynamic")
+
+
+def test_what_is_refused_for_its_contacts_is_accepted_without_them():
+    assert MujocoLCS(load(TERRAIN, FIELD), motion="dynamic", pairs=[("ball", "wall")]).n_contacts == 1
+    for rest in (PAIR, OVERRIDE):
+        assert MujocoLCS(pushing(SERVOS + rest), friction=0.4).n_lam == 2
+        assert MujocoLCS(pushing(SERVOS + rest), pairs=[]).n_lam == 0
+    assert MujocoLCS(pushing(SERVOS + TENDON)).n_lam == 2
 
 
 def test_actuators_that_are_no_servos_have_no_control_of_a_plan():

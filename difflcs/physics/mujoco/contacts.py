@@ -31,6 +31,10 @@ _THREE = np.arange(3)
 _PLANE, _CAPSULE, _CYLINDER, _BOX, _MESH = (
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "CAPSULE", "CYLINDER", "BOX", "MESH")
 )
+# Of these MuJoCo misses contacts that are apart, so that things would fall through.
+_FIELDS = (int(mujoco.mjtGeom.mjGEOM_HFIELD), int(mujoco.mjtGeom.mjGEOM_SDF))
+_DISABLED = int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+_OVERRIDE = int(mujoco.mjtEnableBit.mjENBL_OVERRIDE)
 _POINTS = {  # contacts that a pair of shapes can have, where more than one
     (_PLANE, _CAPSULE): 2,
     (_PLANE, _CYLINDER): 4,
@@ -39,9 +43,13 @@ _POINTS = {  # contacts that a pair of shapes can have, where more than one
     (_CAPSULE, _CAPSULE): 2,
     (_CAPSULE, _CYLINDER): 2,
     (_CAPSULE, _BOX): 2,
+    (_CAPSULE, _MESH): 2,
     (_CYLINDER, _CYLINDER): 4,
     (_CYLINDER, _BOX): 4,
-    (_BOX, _BOX): 4,
+    (_CYLINDER, _MESH): 4,
+    (_BOX, _BOX): 8,
+    (_BOX, _MESH): 4,
+    (_MESH, _MESH): 4,
 }
 
 
@@ -106,6 +114,7 @@ class ContactFinder:
         self.friction = _friction(model, friction)
         self.allowed = _may_touch(model) if pairs is None else _listed(model, pairs)
         self._drop_floors()
+        _check_contacts(model, self.allowed, friction)
         if pairs is not None:
             _allow(model, np.flatnonzero(self.allowed.any(0)))
         self.pairs = first, second = np.nonzero(np.triu(self.allowed))
@@ -123,7 +132,7 @@ class ContactFinder:
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
         model.geom_condim[:], model.pair_dim[:] = 3, 3
         model.geom_gap[:], model.pair_gap[:] = 0.0, 0.0
-        model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_OVERRIDE)
+        model.opt.enableflags |= _OVERRIDE
         model.opt.o_margin = distance
 
     def _drop_floors(self) -> None:
@@ -261,8 +270,39 @@ def _friction(model: Any, friction: float | None) -> Array:
     return table
 
 
+def _check_contacts(model: Any, allowed: NDArray[np.bool_], friction: float | None) -> None:
+    """Refuse shapes and friction that would come out wrong, in pairs (ngeom, ngeom) that may touch."""
+    fields = np.flatnonzero(np.isin(model.geom_type, _FIELDS) & allowed.any(0))
+    if len(fields):
+        raise InvalidInputError(
+            f"model: expected no height field or signed distance field that may touch something, got geom "
+            f"{_name(model, fields[0])}; use a mesh or boxes, or name the pairs that may touch, without it, by "
+            f"pairs=[...]"
+        )
+    if friction is not None:
+        return
+    if model.opt.enableflags & _OVERRIDE and allowed.any():
+        raise InvalidInputError(
+            'model: expected the friction of its geoms, got <flag override="enable"/>, which replaces it; pass '
+            f"friction={model.opt.o_friction[0]:g}, or take the flag away"
+        )
+    for k in range(model.npair):
+        a, b, along = model.pair_geom1[k], model.pair_geom2[k], model.pair_friction[k, :2]
+        if allowed[a, b] and model.pair_dim[k] > 1 and along[0] != along[1]:
+            raise InvalidInputError(
+                f"model: expected the same friction along both tangents of a <pair>, got {along[0]:g} and {along[1]:g} "
+                f"between geoms {_name(model, a)} and {_name(model, b)}; make them equal, or pass friction=..."
+            )
+
+
+def _name(model: Any, geom: int) -> str:
+    return repr(model.geom(int(geom)).name) if model.geom(int(geom)).name else str(geom)
+
+
 def _may_touch(model: Any) -> NDArray[np.bool_]:
-    """Pairs (ngeom, ngeom) that MuJoCo would test."""
+    """Pairs (ngeom, ngeom) that MuJoCo would test; none where contacts or constraints are disabled."""
+    if model.opt.disableflags & _DISABLED:
+        return np.zeros((model.ngeom, model.ngeom), dtype=bool)
     kind, affinity = model.geom_contype, model.geom_conaffinity
     masks = (kind[:, None] & affinity[None]) | (affinity[:, None] & kind[None])
     body = model.geom_bodyid
@@ -308,7 +348,8 @@ def _geoms(model: Any, name: int | str) -> list[int]:
 
 
 def _allow(model: Any, geoms: Any) -> None:
-    """Let MuJoCo test these geoms against each other, whatever masks, parents and exclusions say."""
+    """Let MuJoCo test these geoms against each other, whatever flags, masks, parents and exclusions say."""
+    model.opt.disableflags &= ~_DISABLED
     for masks, of_body in ((model.geom_contype, model.body_contype), (model.geom_conaffinity, model.body_conaffinity)):
         masks[:], of_body[:] = 0, 0
         masks[geoms], of_body[model.geom_bodyid[geoms]] = 1, 1

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor, describe
-from difflcs.errors import DTypeError, InvalidInputError
+from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError
 from difflcs.physics.contacts import Cone, Contacts, contact_lcs, count_forces
 from difflcs.physics.mujoco.contacts import ContactFinder, Pairs
 from difflcs.physics.mujoco.motion import Actuators, Dynamic, QuasiStatic
@@ -41,23 +41,25 @@ class MujocoLCS:
     What a joint cannot move falls out of the Jacobians. Where all joints move in one plane, friction has one tangent,
     in this plane, and contacts across it, such as those of a floor below, are left out.
 
-    Not in the system: limits of joints and actuators (bound the actions and states of the MPC), margins of geoms,
-    torsional and rolling friction. Refused: equality constraints, activation dynamics, and, in dynamic motion, dry
-    friction in joints. The matrices carry no gradient of the state.
+    Not in the system: limits of joints, tendons and actuators (bound the actions and states of the MPC), margins of
+    geoms, torsional and rolling friction. Refused: equality constraints, activation dynamics, adhesion, height fields
+    and signed distance fields that may touch something, friction that override sets or that is not the same in all
+    directions, and, in dynamic motion, dry friction in joints and tendons. The matrices carry no gradient of the state.
 
     An object keeps one private copy of the model and its data, so use it from one thread at a time.
 
     Args:
         model: the MuJoCo model.
-        data: its data: what is not in the state is taken from there (bodies that mocap moves), and `qpos` is the
-            reference of rotations, see `MujocoState`; None: the model's initial state.
+        data: its data: what is not in the state is taken from there once (bodies that mocap moves, and the forces
+            `qfrc_applied` and `xfrc_applied`, which do nothing in quasi-static motion, like gravity), and `qpos` is
+            the reference of rotations, see `MujocoState`; None: the model's initial state.
         motion: see above.
         seconds: of a step [s].
         contacts: how many a state has, the nearest; missing ones are padded with contacts out of reach. None: as many
             points as the shapes of all pairs may touch in, at most 12.
         distance: contacts farther away are left out [m]; None: ten times `length`.
         pairs: geoms, by name or number, or bodies with all their geoms, that may touch; None: as the model says
-            (contype, conaffinity, pairs, excludes).
+            (contype, conaffinity, pairs, excludes; none where contacts or constraints are disabled).
         friction: coefficient μ of all contacts; None: that of the geoms, as MuJoCo combines them.
         compliance: how far a contact gives way, in parts of how far the same force moves the two bodies apart (the
             median over all pairs), > 0. It makes F + Fᵀ ≻ 0.
@@ -108,8 +110,7 @@ class MujocoLCS:
         model = copy.copy(model)
         self._model, self._data = model, mujoco.MjData(model)
         if data is not None:
-            for name in ("qpos", "mocap_pos", "mocap_quat"):
-                getattr(self._data, name)[:] = getattr(data, name)
+            _take(self._data, data)
         mujoco.mj_fwdPosition(model, self._data)
         self.state = MujocoState(model, self._data.qpos, velocities=motion == "dynamic")
         self._actuators, self._relative = Actuators(model), relative
@@ -118,11 +119,12 @@ class MujocoLCS:
         if self._quasi_static:
             self._motion: Any = QuasiStatic(model, self._actuators, mobility)
         else:
-            if (model.dof_frictionloss > 0).any():
-                raise InvalidInputError(
-                    "model: expected no dry friction in joints (frictionloss) in dynamic motion, got some; replace it "
-                    'by damping, or use motion="quasi-static"'
-                )
+            for where, friction_loss in (("joints", model.dof_frictionloss), ("tendons", model.tendon_frictionloss)):
+                if (friction_loss > 0).any():
+                    raise InvalidInputError(
+                        f"model: expected no dry friction in {where} (frictionloss) in dynamic motion, got some; "
+                        'replace it by damping, or use motion="quasi-static"'
+                    )
             self._motion = Dynamic(model, self._actuators, self.seconds, relative)
         length = _typical_radius(model) if length is None else check_number("length", length, strict=True)
         distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
@@ -208,7 +210,7 @@ class MujocoLCS:
         # The length of an actuator on a joint is gear · q.
         here = gear * x[..., dof.clamp_min(0)]
         if self._quasi_static:
-            return here + gear * u
+            return here + gear * u - torch.from_numpy(self._actuators.offset).to(u)
         return u + here * servo if self._relative else u
 
     def _look(self, x: Tensor) -> tuple[Contacts, Tensor, Any, Tensor]:
@@ -312,12 +314,26 @@ def _check_model(model: Any, data: Any) -> None:
         "joints": not model.nv,
         "no equality constraints": bool(model.neq),
         "actuators without activation": bool(model.na),
+        "actuators without adhesion": bool((model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)).any()),
         "one control for each actuator": getattr(model, "nactuator", model.nu) != model.nu,
         "no flexible bodies": bool(model.nflex),
     }
     for wanted, found in refused.items():
         if found:
             raise InvalidInputError(f"model: expected {wanted}, got something else; change the model")
+
+
+def _take(into: Any, data: Any) -> None:
+    """What is not in the state, from the caller's data."""
+    for name in ("qpos", "mocap_pos", "mocap_quat", "qfrc_applied", "xfrc_applied"):
+        own, values = getattr(into, name), getattr(data, name)
+        if values.shape != own.shape:
+            raise InvalidInputError(
+                f"data: expected {name} {own.shape} of the model, got {values.shape}; pass MjData(model)"
+            )
+        if not np.isfinite(values).all():
+            raise NonFiniteError(f"data: expected finite numbers in {name}, got NaN or infinity; set it in the data")
+        own[:] = values
 
 
 def _typical_radius(model: Any) -> float:

@@ -35,6 +35,7 @@ Array = NDArray[np.float64]
 
 _JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
+_FIXED, _AFFINE = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_AFFINE)
 _OFF = ("CONSTRAINT", "CLAMPCTRL", "EULERDAMP")
 
 
@@ -45,7 +46,7 @@ class Actuators:
         dof: (nu,) degree of freedom of each actuator on a slide or hinge; −1 for others.
         gear: (nu,).
         servo: (nu,) whether it is a `position` actuator on a slide or hinge.
-        stiffness: (nu,) force per action: `kp` of a servo.
+        offset: (nu,) at which length a servo rests with ctrl = 0, by the constant part of its bias; 0 for others.
     """
 
     def __init__(self, model: Any):
@@ -56,8 +57,10 @@ class Actuators:
             if model.jnt_type[joint[i]] in _SCALAR:
                 self.dof[i] = model.jnt_dofadr[joint[i]]
         self.gear = model.actuator_gear[:, 0].copy()
-        gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1]
-        self.servo = (self.dof >= 0) & (gain != 0) & (np.abs(gain + bias) <= 1e-9 * np.abs(gain))
+        gain, (constant, bias) = model.actuator_gainprm[:, 0], model.actuator_biasprm.T[:2]
+        linear = (model.actuator_gaintype == _FIXED) & (model.actuator_biastype == _AFFINE) & (gain != 0)
+        self.servo = (self.dof >= 0) & linear & (np.abs(gain + bias) <= 1e-9 * np.abs(gain))
+        self.offset = np.where(self.servo, constant / np.where(gain != 0, gain, 1.0), 0.0)
 
 
 class QuasiStatic:
@@ -138,7 +141,7 @@ class Dynamic:
     """All forces that MuJoCo knows but those of its constraints, linearised at each state.
 
     Args:
-        model: ours; constraints and limits of actuators are switched off while it is linearised.
+        model: ours; constraints and limits of controls and actuators are switched off while it is linearised.
         actuators: of the model.
         seconds: of a step [s].
         relative: actions of servos count from where they are.
@@ -152,7 +155,8 @@ class Dynamic:
         # With a time step of one second and no implicit part, the next velocity is ν + acceleration.
         self.flags = sum(int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in _OFF)
         model.opt.timestep, model.opt.integrator = 1.0, mujoco.mjtIntegrator.mjINT_EULER
-        model.actuator_forcelimited[:], model.jnt_actfrclimited[:] = 0, 0
+        for limited in ("actuator_forcelimited", "actuator_ctrllimited", "jnt_actfrclimited", "tendon_actfrclimited"):
+            getattr(model, limited)[:] = 0
 
     def allocate(self, n: int) -> tuple[Array, Array, Array, Array]:
         """Accelerations, transition matrices and inverse mass matrices of n states."""
