@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar, ParamSpec, TypeVar
 
 import torch
@@ -42,6 +42,25 @@ def is_wrapped(tensor: Tensor) -> bool:
 def transforms_active() -> bool:
     """Whether code runs inside a transform of `torch.func`."""
     return torch._C._are_functorch_transforms_active()
+
+
+def forward_mode_active() -> bool:
+    """Whether code runs inside `torch.autograd.forward_ad.dual_level`."""
+    return torch.autograd.forward_ad._current_level >= 0
+
+
+def refuse_tangents(tensors: Iterable[Tensor]) -> None:
+    """Refuse the inputs of forward mode, whose tangents would be lost without a word.
+
+    Raises:
+        NotImplementedError: a tensor has a tangent.
+    """
+    unpack = torch.autograd.forward_ad.unpack_dual
+    if forward_mode_active() and any(unpack(tensor).tangent is not None for tensor in tensors):
+        raise NotImplementedError(
+            "expected reverse mode, got inputs with a tangent, but the layer has no forward-mode derivatives; use "
+            "backward, torch.func.grad or jacrev, or torch.autograd.functional.jacobian without strategy='forward-mode'"
+        )
 
 
 def runs_eagerly(function: Callable[P, R]) -> Callable[P, R]:

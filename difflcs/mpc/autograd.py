@@ -32,6 +32,7 @@ from difflcs.status import Status
 ARGUMENTS = (*INPUTS, "constant", *(f"guess.{name}" for name in Primal._fields))
 _COUNT = len(INPUTS) + 1  # those that are differentiable
 _SYMMETRIC = ("Q", "R", "Q_final")
+_SYSTEM = ("A", "B", "C", "d", "D", "E", "F", "c")
 _COST = ("Q", "R", "S", "Q_final", "q", "r", "q_final", "constant")
 
 
@@ -170,7 +171,12 @@ class Plan:
                     check_not_nan(name, value)
             elif self.unseen or name in _COST:
                 unchecked[name] = value
-            values[name] = value.contiguous()
+            value = value.contiguous()
+            if self.own and name in _SYSTEM and value.data_ptr() == tensor.data_ptr():
+                value = (
+                    value.clone()
+                )  # a solution is measured by what it was planned with, also after an optimiser's step
+            values[name] = value
         check_finite(unchecked)
         if self.unseen:
             check_positive_definite(values["F"])

@@ -188,6 +188,24 @@ def excess(problem: MPCProblem, primal: Primal) -> Tensor:
     return largest(_parts(over.transpose(0, 1), row_units(problem, primal)))
 
 
+def certainly_missed(problem: MPCProblem, primal: Primal) -> Tensor:
+    """Whether a hard constraint (batch,) is violated by more than rounding.
+
+    That is by `CERTIFIED` of its row's unit and of what the actions can move it by in a step. Where all terms of a row
+    vanish, as beside a wall at zero, a rounding error is as large as its unit.
+    """
+    if problem.n_c == 0:
+        return torch.zeros(problem.batch, dtype=torch.bool)
+    P, width = problem.steps(), ranges(problem, primal.u).transpose(0, 1)
+    moved = matvec(P.B.abs(), width)
+    reach = _terms((P.G_x, torch.cat([torch.zeros_like(moved[:1]), moved])))
+    reach[:-1] += _terms((P.G_u, width))
+    reach = torch.where(torch.isinf(P.g), torch.zeros_like(reach), reach)
+    unit = row_units(problem, primal) + reach.amax(0)
+    over = torch.where(torch.isinf(prices(problem)), problem.constraints(primal.x, primal.u), 0.0).clamp_min(0.0)
+    return largest(_parts(over.transpose(0, 1), unit)) > CERTIFIED
+
+
 def prices(problem: MPCProblem) -> Tensor:
     """Price of a violation of each constraint, (batch, H+1, n_c)."""
     return problem.batch_first("price").expand(problem.batch, problem.horizon + 1, problem.n_c)

@@ -68,6 +68,7 @@ from difflcs._linalg import matvec
 from difflcs.mpc.conditions import (
     CERTIFIED,
     Multipliers,
+    certainly_missed,
     complete,
     excess,
     multipliers,
@@ -84,6 +85,7 @@ __all__ = [
     "Linearisation",
     "Multipliers",
     "barrier_curvature",
+    "certainly_missed",
     "complete",
     "excess",
     "linearise",

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor
-from difflcs._functorch import is_wrapped, runs_eagerly, transforms_active
+from difflcs._functorch import forward_mode_active, is_wrapped, refuse_tangents, runs_eagerly, transforms_active
 from difflcs.constraints import StageBounds, as_bound, check_bounds
 from difflcs.cost import CostSequence
 from difflcs.errors import BoundsError, DegenerateWarning, SolveError, SolveWarning
@@ -201,7 +201,8 @@ class LCSMPCLayer(nn.Module):
         """
         smooth = self.training_relaxation if self.training else None
         settings = (self.horizon, self.relaxation if smooth is None else smooth, self.barrier)
-        plain = not any(value is not None for value in (reference, u_min, u_max, bounds, cost, constraints, context))
+        extras = (reference, u_min, u_max, bounds, cost, constraints, context)
+        plain = not any(value is not None for value in extras) and not forward_mode_active()
         given = Given(x0, goal, lcs)
         again = self._repeat.plan(self, settings, given, guess) if plain else None
         if again is not None:
@@ -233,6 +234,8 @@ class LCSMPCLayer(nn.Module):
     def _plan(self, settings: tuple, inputs: Inputs) -> Plan:
         """How to solve what a call asks."""
         tensors, unseen = inputs.tensors, transforms_active()
+        if not unseen:
+            refuse_tangents(tensors.values())
         needs_grad = torch.is_grad_enabled() and (unseen or any(t.requires_grad for t in tensors.values()))
         single = needs_grad and any(t.dtype == torch.float32 for t in tensors.values())
         return Plan(

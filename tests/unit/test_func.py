@@ -269,6 +269,38 @@ def test_a_gradient_inside_a_loss_is_refused_even_where_the_loss_is_linear(layer
 # --- in-place changes -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # torch's own, in forward mode
+@pytest.mark.parametrize("learnable", [True, False])
+def test_forward_mode_is_refused_whatever_requires_a_gradient(layer, x0, learnable):
+    """A tangent that is dropped would be a derivative without the part of the plan."""
+    system = layer.lcs if learnable else layer.lcs.params().detach()
+    mpc = LCSMPCLayer(system, layer.cost, layer.horizon, u_min=-1.0, u_max=1.0)
+    with torch.no_grad():
+        mpc(x0)  # what it remembers is not used either
+    with torch.no_grad(), torch.autograd.forward_ad.dual_level():
+        with pytest.raises(NotImplementedError, match="forward-mode"):
+            mpc(torch.autograd.forward_ad.make_dual(x0, torch.ones_like(x0)))
+        assert mpc(x0).converged.all()  # without a tangent there is nothing to lose
+    with pytest.raises(NotImplementedError, match="forward"):
+        jacobian(lambda x: mpc(x).u, x0, strategy="forward-mode", vectorize=True)
+
+
+def test_a_plan_is_measured_by_the_system_it_was_planned_with(layer, x0):
+    plan = layer(x0)
+    before = plan.complementarity(), plan.dynamics_residual()
+    saved = [p.detach().clone() for p in layer.parameters()]
+    try:
+        with torch.no_grad():  # a step of an optimiser
+            for p in layer.parameters():
+                p.mul_(1.1)
+        assert torch.equal(plan.complementarity(), before[0])
+        assert torch.equal(plan.dynamics_residual(), before[1])
+    finally:
+        with torch.no_grad():
+            for p, value in zip(layer.parameters(), saved, strict=True):
+                p.copy_(value)
+
+
 def test_inputs_changed_in_place_are_noticed(layer, x0):
     leaf = x0.clone()
     solution = layer(leaf)

@@ -166,6 +166,19 @@ def test_a_violation_is_measured_by_the_stages_where_the_row_counts():
     torch.testing.assert_close(kkt.residual(problem, result.primal, kkt.multipliers(problem, result.primal)), expected)
 
 
+@pytest.mark.parametrize("price", [torch.inf, 10.0])
+@pytest.mark.parametrize("x0", [0.0, 1e-12])
+def test_nothing_is_infeasible_where_nothing_hard_is_violated(price, x0):
+    """At rest beside a wall at zero all terms of its row vanish, and a rounding error is as large as they are."""
+    problem = one_state_from(x0, growth=1.0, stage=1, least=0.0)
+    problem = replace(
+        problem, q=problem.q + 1.0, q_final=problem.q_final + 1.0, price=0 * problem.price.nan_to_num() + price
+    )
+    result = BATCHED.solve(replace(problem, g=torch.zeros_like(problem.g)), None)
+    assert problem.violation(result.primal.x, result.primal.u).max() <= 1e-11
+    assert result.status.tolist() != [Status.INFEASIBLE]
+
+
 def test_rows_without_a_limit_change_nothing():
     problem = random_problem(4, KINDS["plain"])
     rows = {"G_x": torch.ones(3, 4).double(), "G_u": torch.ones(3, 2).double(), "price": torch.full((3,), torch.inf)}

@@ -53,6 +53,24 @@ def assert_same(found, expected):
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
 
 
+@pytest.mark.parametrize(
+    ("state", "goal"), [((), (5,)), ((1,), (5,)), ((5,), ()), ((2, 1), (1, 3)), ((3,), (2, 1)), ((), (2, 3))]
+)
+def test_states_and_goals_broadcast_in_every_call(state, goal):
+    layer = make_layer()
+    for seed in range(3):
+        assert_as_fresh(layer, 0.3 * draw(*state, 4, seed=seed), 0.3 * draw(*goal, 2, seed=10 + seed))
+
+
+def test_one_state_serves_several_systems_and_bounds_in_every_call():
+    params = make_model().params().detach()
+    several = LCSParams(**{**params.tensors(), "d": 0.1 * draw(5, 4)})
+    layers = make_layer(several), LCSMPCLayer(params, make_cost(), HORIZON, -0.5 - draw(5, 2).abs(), 0.5)
+    for layer in layers:
+        for seed in range(3):
+            assert_as_fresh(layer, 0.3 * draw(4, seed=seed), GOAL[0])
+
+
 def assert_as_fresh(layer, *inputs, **kwargs):
     """A layer that was used before gives what one without a memory gives, bit for bit."""
     assert_same(plan(layer, *inputs, **kwargs), plan(copy.deepcopy(layer), *inputs, **kwargs))

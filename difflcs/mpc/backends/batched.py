@@ -16,7 +16,7 @@ from difflcs.mpc import kkt
 from difflcs.mpc.backends.base import Backend, Result
 from difflcs.mpc.problem import INPUTS, MPCProblem, array
 from difflcs.mpc.solution import Primal
-from difflcs.status import solved
+from difflcs.status import Status, solved
 
 Effort = Literal["fast", "default", "best"]
 _STARTS: dict[str, int] = {"fast": 1, "default": 4, "best": 16}
@@ -204,10 +204,14 @@ class BatchedBackend(Backend):
 
 
 def _make_presentable(problem: MPCProblem, primal: Primal, status: Tensor) -> None:
-    """Give those that failed finite numbers inside the bounds."""
+    """Give those that failed finite numbers inside the bounds, and call none infeasible that violates nothing hard."""
     failed = torch.nonzero(~solved(status)).squeeze(-1)
     if len(failed):
         part = problem.select(failed)
         primal.u[failed] = part.clip(torch.nan_to_num(primal.u[failed], posinf=0.0, neginf=0.0))
         for value in (primal.x, primal.lam, primal.mu):
             value[failed] = torch.nan_to_num(value[failed])
+        refused = failed[status[failed] == int(Status.INFEASIBLE)]
+        if len(refused):
+            missed = kkt.certainly_missed(problem.select(refused), Primal(*(value[refused] for value in primal)))
+            status[refused[~missed]] = int(Status.NUMERICAL)
