@@ -86,28 +86,28 @@ def table(cells: dict[str, Cell], times: dict[str, Times]) -> pd.DataFrame:
 
 def words(cells: dict[str, Cell], times: dict[str, Times]) -> list[str]:
     """The paper's claim beside either way of PDDM, by the intervals; and what the small model costs."""
-    lcs = next((cell for cell in cells.values() if cell.first.method == "lcs-rl"), None)
+    own = next((name for name, cell in cells.items() if cell.first.method == "lcs-rl"), None)
     networks = {name: cell for name, cell in cells.items() if cell.first.method == "pddm"}
-    if lcs is None or not networks:
+    if own is None or not networks:
         return []
     said = []
     for name, cell in networks.items():
-        apart: Estimate | None = report.paired_estimate(lcs, cell, EARLY)
+        apart: Estimate | None = report.paired_estimate(cells[own], cell, EARLY)
         claim = "cannot be decided here"
         if apart is not None and apart.low > 0:
             claim = "holds here"
         elif apart is not None and apart.high < 0:
             claim = "does not hold here: the networks are better"
-        difference, _ = report.say_difference(report.paired(lcs, cell, EARLY))
+        difference, _ = report.say_difference(report.paired(cells[own], cell, EARLY))
         said.append(
             f"{name}: after {EARLY:g} minutes of data LCS-RL − PDDM is {difference} points, paired by seed. The "
             f"paper's claim that simple models beat deep networks at little data {claim}."
         )
     first = next(iter(networks))
-    sizes = [size_of(cell.first.method, cell.first.recipe) for cell in (networks[first], lcs)]
+    sizes = [size_of(cell.first.method, cell.first.recipe) for cell in (networks[first], cells[own])]
     costs = f"The networks of PDDM hold {sizes[0] / sizes[1]:.0f} times as many numbers as the LCS"
     if times:
-        ratio = times[first].step / next(times[name].step for name, cell in cells.items() if cell is lcs)
+        ratio = times[first].step / times[own].step
         costs += f", and a step of PDDM takes {ratio:.0f} times the computing, the simulation included"
     return [*report.bullets(said), f"{costs}."]
 

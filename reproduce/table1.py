@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 import report
+from fig_learning_curves import PRIOR
 from recipes import RECIPES
 from records import Cell, select
 from report import Tables, say
@@ -38,13 +39,11 @@ PAPER = {
     )
 }
 """The paper's: object → (method, when) → mean, standard deviation [%] of 10 seeds and 1000 goals."""
-PRIOR = (
+WAYS = (
     ("ours", "full"), ("paper", "full"), ("jin-posa", "task"),
     ("ours", "support"), ("paper", "support"), ("jin-posa", "support"),
 )  # fmt: skip
 """Recipes of violation-only and how its models are deployed: first with the full bounds, then within the support."""
-DEPLOYED = report.name_of("violation", "jin-posa", protocol="support")
-"""The prior method as its authors deploy it."""
 Cells = list[Cell | None]
 """Results on each object."""
 
@@ -102,7 +101,7 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
 
     prior = {
         report.name_of("violation", recipe, protocol=protocol): cells_of("violation", recipe, "scratch", protocol)
-        for recipe, protocol in PRIOR
+        for recipe, protocol in WAYS
     }
     prior = {label: cells for label, cells in prior.items() if any(cells)}
     known = {label: sum(cell is not None for cell in cells) for label, cells in prior.items()}
@@ -112,7 +111,7 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
         if not any(map(any, cells.values())):
             continue
         tables[f"Success on six objects, {label}"] = success(cells)
-        baselines = [report.name_of("violation", recipe), strongest, DEPLOYED]
+        baselines = [report.name_of("violation", recipe), strongest, report.name_of(*PRIOR[:2], protocol=PRIOR[2])]
         words.append(
             f"LCS-RL, {label}, at the end against the paper's mean: {report.verdict(beyond_paper(cells['lcs-rl']))}."
         )

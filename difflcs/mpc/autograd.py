@@ -26,13 +26,14 @@ from difflcs.mpc.backends.base import Backend, Result
 from difflcs.mpc.gather import RANKS
 from difflcs.mpc.problem import INPUTS, MAY_BE_INFINITE, MPCProblem
 from difflcs.mpc.solution import Primal
+from difflcs.records import LCSParams, dimensions
 from difflcs.status import Status
 
 # What a call gives to the node, in this order; None for what it leaves out.
 ARGUMENTS = (*INPUTS, "constant", *(f"guess.{name}" for name in Primal._fields))
 _COUNT = len(INPUTS) + 1  # those that are differentiable
 _SYMMETRIC = ("Q", "R", "Q_final")
-_SYSTEM = ("A", "B", "C", "d", "D", "E", "F", "c")
+_SYSTEM = frozenset(dimensions(LCSParams))
 _COST = ("Q", "R", "S", "Q_final", "q", "r", "q_final", "constant")
 
 
@@ -171,12 +172,10 @@ class Plan:
                     check_not_nan(name, value)
             elif self.unseen or name in _COST:
                 unchecked[name] = value
-            value = value.contiguous()
-            if self.own and name in _SYSTEM and value.data_ptr() == tensor.data_ptr():
-                value = (
-                    value.clone()
-                )  # a solution is measured by what it was planned with, also after an optimiser's step
-            values[name] = value
+            values[name] = value.contiguous()
+            # A solution is measured by the system that it was planned with, also after a step of an optimiser.
+            if self.own and name in _SYSTEM and values[name].data_ptr() == tensor.data_ptr():
+                values[name] = value.clone()
         check_finite(unchecked)
         if self.unseen:
             check_positive_definite(values["F"])

@@ -184,8 +184,7 @@ def excess(problem: MPCProblem, primal: Primal) -> Tensor:
     """Largest violation (batch,) of the hard constraints, in parts of their rows' units; 0 where they hold."""
     if problem.n_c == 0:
         return torch.zeros(problem.batch, dtype=torch.float64)
-    over = torch.where(torch.isinf(prices(problem)), problem.constraints(primal.x, primal.u), 0.0).clamp_min(0.0)
-    return largest(_parts(over.transpose(0, 1), row_units(problem, primal)))
+    return largest(_parts(_overshoot(problem, primal), row_units(problem, primal)))
 
 
 def certainly_missed(problem: MPCProblem, primal: Primal) -> Tensor:
@@ -194,16 +193,19 @@ def certainly_missed(problem: MPCProblem, primal: Primal) -> Tensor:
     That is by `CERTIFIED` of its row's unit and of what the actions can move it by in a step. Where all terms of a row
     vanish, as beside a wall at zero, a rounding error is as large as its unit.
     """
-    if problem.n_c == 0:
-        return torch.zeros(problem.batch, dtype=torch.bool)
     P, width = problem.steps(), ranges(problem, primal.u).transpose(0, 1)
     moved = matvec(P.B.abs(), width)
     reach = _terms((P.G_x, torch.cat([torch.zeros_like(moved[:1]), moved])))
     reach[:-1] += _terms((P.G_u, width))
     reach = torch.where(torch.isinf(P.g), torch.zeros_like(reach), reach)
     unit = row_units(problem, primal) + reach.amax(0)
-    over = torch.where(torch.isinf(prices(problem)), problem.constraints(primal.x, primal.u), 0.0).clamp_min(0.0)
-    return largest(_parts(over.transpose(0, 1), unit)) > CERTIFIED
+    return largest(_parts(_overshoot(problem, primal), unit)) > CERTIFIED
+
+
+def _overshoot(problem: MPCProblem, primal: Primal) -> Tensor:
+    """By how much each hard constraint is violated, (H+1, batch, n_c); 0 for the others."""
+    value = problem.constraints(primal.x, primal.u)
+    return torch.where(torch.isinf(prices(problem)), value, 0.0).clamp_min(0.0).transpose(0, 1)
 
 
 def prices(problem: MPCProblem) -> Tensor:

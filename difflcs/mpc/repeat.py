@@ -125,10 +125,9 @@ class _Planned:
             self.latest = plan, Snapshot([goal])
         if lcs is not None:
             return plan.again({**lcs.tensors(), "x0": x0})  # pyright: ignore[reportAttributeAccessIssue]
-        x0 = x0.detach()
         if x0.shape[:-1] != plan.batch:  # one state to several goals
-            x0 = x0.expand(*plan.batch, -1).contiguous()
-        return plan.at(_shaped(x0, plan.problem.x0.shape))
+            return plan.again({"x0": x0})
+        return plan.at(_shaped(x0.detach(), plan.problem.x0.shape))
 
     def start(self, x0: Tensor, guess: MPCSolution | Primal | None) -> Primal | None:
         """A guess as solvers want it, after a look at the numbers that are new."""

@@ -53,6 +53,11 @@ def assert_same(found, expected):
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
 
 
+def assert_as_fresh(layer, *inputs, **kwargs):
+    """A layer that was used before gives what one without a memory gives, bit for bit."""
+    assert_same(plan(layer, *inputs, **kwargs), plan(copy.deepcopy(layer), *inputs, **kwargs))
+
+
 @pytest.mark.parametrize(
     ("state", "goal"), [((), (5,)), ((1,), (5,)), ((5,), ()), ((2, 1), (1, 3)), ((3,), (2, 1)), ((), (2, 3))]
 )
@@ -69,11 +74,6 @@ def test_one_state_serves_several_systems_and_bounds_in_every_call():
     for layer in layers:
         for seed in range(3):
             assert_as_fresh(layer, 0.3 * draw(4, seed=seed), GOAL[0])
-
-
-def assert_as_fresh(layer, *inputs, **kwargs):
-    """A layer that was used before gives what one without a memory gives, bit for bit."""
-    assert_same(plan(layer, *inputs, **kwargs), plan(copy.deepcopy(layer), *inputs, **kwargs))
 
 
 def transpose_data(p):
