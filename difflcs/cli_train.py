@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, make_dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from difflcs.cli_models import film, known_versions
 from difflcs.errors import CheckpointError
@@ -35,6 +36,8 @@ class Train(TrainConfig):
     """Replace the run in --out. It is deleted once the new one has begun."""
     smoke: bool = False
     """Finish in seconds, on too little data to learn anything."""
+    given: ClassVar[frozenset[str]] = frozenset()
+    """Flags of settings that were given, which a resumed run is compared with."""
 
     def __post_init__(self) -> None:
         """Check nothing yet: `run` does, so that its errors are printed like all others."""
@@ -54,14 +57,13 @@ class Train(TrainConfig):
 
     def _resumed(self, config: TrainConfig) -> TrainConfig:
         stored = stored_config(RunDirectory.open(self.directory(self.out)))
-        default = TrainConfig(method=type(config.method)())
-        wanted, own, usual, small = (_flat(c.to_json()) for c in (config, stored, default, default.smoke()))
+        wanted, own = _flat(config.to_json()), _flat(stored.to_json())
         for name, value in wanted.items():
-            if value not in (own.get(name), usual[name], small[name]):
-                flag, run = name.removeprefix("settings.").replace("_", "-"), self.directory(self.out)
+            flag = name.removeprefix("settings.").replace("_", "-")
+            if flag in self.given and value != own.get(name):
                 raise CheckpointError(
-                    f"--{flag}: expected {own.get(name)!r}, as {run} was started with, got {value!r}; "
-                    f"drop the flag, or start another run with another --out"
+                    f"--{flag}: expected {own.get(name)!r}, as {self.directory(self.out)} was started with, got "
+                    f"{value!r}; drop the flag, or start another run with another --out"
                 )
         if self.init is not None:
             raise CheckpointError(
@@ -105,12 +107,18 @@ def train_command(words: Sequence[str]) -> type[Train]:
         ],
         bases=(Train,),
         frozen=True,
-        namespace={"__doc__": Train.__doc__, "__post_init__": lambda self: None},
+        namespace={"__doc__": Train.__doc__, "__post_init__": lambda self: None, "given": _flags(words)},
     )
 
 
 def _methods() -> str:
     return "How to learn: " + "; ".join(f"{name}: {get_method(name).summary}" for name in method_names()) + "."
+
+
+def _flags(words: Sequence[str]) -> frozenset[str]:
+    """Flags among the words, without dashes in front; of `--a.no-b` both that and `a.b`."""
+    given = {word[2:].partition("=")[0].replace("_", "-") for word in words if word.startswith("--")}
+    return frozenset(given | {re.sub(r"(^|\.)no-", r"\1", flag) for flag in given})
 
 
 def _value(words: Sequence[str], flag: str) -> str | None:

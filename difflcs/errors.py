@@ -118,3 +118,7 @@ class DegenerateWarning(DiffLCSWarning):
 
 class FrictionWarning(DiffLCSWarning):
     """The friction of a system is far from Coulomb's law."""
+
+
+class ContactWarning(DiffLCSWarning):
+    """More contacts are near than there is room for."""

@@ -15,11 +15,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from difflcs._checks import check_tensor, describe
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
+
+Array = NDArray[np.float64]
+_ROWS = 256
 
 __all__ = ["Circle", "Distance", "Polygon", "Shape", "Union", "box"]
 
@@ -92,7 +97,8 @@ class Polygon(Shape):
             gradient, or numbers.
 
     Raises:
-        ShapeError, InvalidInputError: not at least three corners, no area, or two corners at one place in succession.
+        ShapeError, InvalidInputError: not at least three corners, no area, two corners at one place in succession, or
+            sides that cross.
     """
 
     vertices: Tensor
@@ -113,6 +119,12 @@ class Polygon(Shape):
         area = float(_shoelace(vertices.detach()).sum()) / 2
         if not abs(area) > 1e-12 * float(sides.max()) ** 2:
             raise InvalidInputError(f"vertices: expected a polygon with an area, got {area:g}; move the corners apart")
+        crossed = _crossing(vertices.detach())
+        if crossed:
+            raise InvalidInputError(
+                f"vertices: expected sides that do not cross, got crossing ones from corners {crossed[0]} and "
+                f"{crossed[1]}; give the corners in the order in which one meets them along the outline"
+            )
         object.__setattr__(self, "vertices", vertices.flip(0) if area < 0 else vertices)
 
     @property
@@ -285,6 +297,26 @@ def _tensor(name: str, value: Any | Sequence) -> Tensor:
 def _shoelace(vertices: Tensor) -> Tensor:
     following = vertices.roll(-1, 0)
     return vertices[:, 0] * following[:, 1] - vertices[:, 1] * following[:, 0]
+
+
+def _crossing(vertices: Tensor) -> tuple[int, int] | None:
+    """Two sides, by their first corners, that cross inside both; None where there are none."""
+    start = vertices.cpu().numpy()
+    end = np.roll(start, -1, axis=0)
+    for first in range(0, len(start), _ROWS):  # a few at a time: some hundred corners need no more
+        a, b = (v[first : first + _ROWS, None] for v in (start, end))
+        # The ends of one side are on both sides of the other, and the other way round.
+        apart = _turn(a, b, start) * _turn(a, b, end) < 0
+        apart &= _turn(start, end, a) * _turn(start, end, b) < 0
+        if apart.any():
+            i, j = np.argwhere(apart)[0]
+            return first + int(i), int(j)
+    return None
+
+
+def _turn(a: Array, b: Array, c: Array) -> Array:
+    """Twice the signed area of triangles: above 0 where c is to the left of the way from a to b."""
+    return (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0])
 
 
 def _nearest_side(points: Tensor, start: Tensor, side: Tensor, square: Tensor) -> tuple[Tensor, Tensor]:

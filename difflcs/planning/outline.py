@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from difflcs._checks import check_number, check_positive_int
+from difflcs.errors import InvalidInputError
 from difflcs.physics.shapes import Shape
 
 __all__ = ["clearance", "ring"]
@@ -34,6 +35,9 @@ def ring(shape: Shape, distance: float, n_points: int) -> Tensor:
 
     Returns:
         (n_points, 2) in coordinates of the body, counterclockwise; the outer curve, if the shape has holes.
+
+    Raises:
+        InvalidInputError: parts are so far apart that one curve at this distance does not go round all of them.
     """
     check_number("distance", distance, strict=True)
     check_positive_int("n_points", n_points, minimum=3)
@@ -42,7 +46,14 @@ def ring(shape: Shape, distance: float, n_points: int) -> Tensor:
         axis = torch.linspace(-half, half, _CELLS + 1, dtype=torch.float64)
         grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1)
         values = clearance(shape, grid) - distance
-        curve = torch.from_numpy(_longest_loop(values.numpy(), axis.numpy()))
+        curves = [torch.from_numpy(curve) for curve in _loops(values.numpy(), axis.numpy())]
+        curve = max(curves, key=_area)
+        apart = sum(not _encloses(curve, other[0]) for other in curves if other is not curve)
+        if apart:
+            raise InvalidInputError(
+                f"shape: expected parts that one curve at distance {distance:g} goes round, got {apart + 1} that are "
+                f"apart; take a larger distance, or fill what is between them"
+            )
         points = _equally(_onto_level(shape, curve, distance), n_points)
         return _onto_level(shape, points, distance)
 
@@ -66,8 +77,20 @@ def _equally(curve: Tensor, n_points: int) -> Tensor:
     return torch.from_numpy(np.stack([np.interp(at, along, closed[:, i]) for i in range(2)], -1))
 
 
-def _longest_loop(values: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The longest closed curve of zeros of values on a grid (n, n), counterclockwise, (m, 2).
+def _area(curve: Tensor) -> float:
+    after = curve.roll(-1, 0)
+    return abs(float((curve[:, 0] * after[:, 1] - curve[:, 1] * after[:, 0]).sum()))
+
+
+def _encloses(curve: Tensor, point: Tensor) -> bool:
+    """Whether a ray from a point (2,) along x crosses a closed curve (m, 2) an odd number of times."""
+    (x, y), (to_x, to_y) = (curve - point).T, (curve.roll(-1, 0) - point).T
+    spans = (y < 0) != (to_y < 0)
+    return bool((x - y * (to_x - x) / (to_y - y) > 0)[spans].sum() % 2)
+
+
+def _loops(values: NDArray[np.float64], axis: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """The closed curves of zeros of values on a grid (n, n), counterclockwise, each (m, 2).
 
     A curve crosses sides of cells; a cell links the crossings of its own sides in pairs, so that each crossing has two
     neighbours and the curve is found by walking.
@@ -92,8 +115,7 @@ def _longest_loop(values: NDArray[np.float64], axis: NDArray[np.float64]) -> NDA
         t = values[i, j] / (values[i, j] - values[k, m])
         return axis[i] + t * (axis[k] - axis[i]), axis[j] + t * (axis[m] - axis[j])
 
-    longest: NDArray[np.float64] = np.empty((0, 2))
-    size = -1.0
+    loops = []
     while neighbours:
         start = at = next(iter(neighbours))
         loop = []
@@ -103,8 +125,6 @@ def _longest_loop(values: NDArray[np.float64], axis: NDArray[np.float64]) -> NDA
             at = next((side for side in following if side in neighbours), start)
         points = np.array([place(side) for side in loop])
         after = np.roll(points, -1, axis=0)
-        length = float(np.linalg.norm(after - points, axis=1).sum())
-        if length > size:
-            turn = (points[:, 0] * after[:, 1] - points[:, 1] * after[:, 0]).sum()
-            longest, size = points if turn > 0 else points[::-1].copy(), length
-    return longest
+        turn = (points[:, 0] * after[:, 1] - points[:, 1] * after[:, 0]).sum()
+        loops.append(points if turn > 0 else points[::-1].copy())
+    return loops

@@ -464,6 +464,10 @@ def test_an_existing_run_is_not_overwritten(capsys, finished):
     code, _, err = run(capsys, "train", "--smoke", "--out", finished, "--resume", "--seed", 3)
     assert code == 2
     assert "--seed: expected 0" in err
+    for words in (["--minutes", 6], ["--minutes=6.0"], ["--final_goals", 300]):  # defaults, and not what the run has
+        code, _, err = run(capsys, "train", "--out", finished, "--resume", *words)
+        assert (code, f"{str(words[0]).partition('=')[0].replace('_', '-')}: expected " in err) == (2, True)
+    assert run(capsys, "train", "--out", finished, "--resume", "--seed", 0)[0] == 0
     assert run(capsys, "train", "--out", finished, "--resume")[0] == 0  # nothing left to do
     assert {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()} == before
 

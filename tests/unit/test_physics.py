@@ -89,11 +89,26 @@ def test_moments_of_what_is_known():
 @pytest.mark.parametrize(
     ("vertices", "error"),
     [([[0.0, 0.0], [1.0, 0.0]], ShapeError), ([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]], InvalidInputError),
-     ([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0], [0.0, 1.0]], InvalidInputError), ("a square", DTypeError)],
+     ([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0], [0.0, 1.0]], InvalidInputError), ("a square", DTypeError),
+     ([[0.0, 0.0], [2.0, 0.0], [0.0, 1.0], [1.0, 1.0]], InvalidInputError)],
 )  # fmt: skip
 def test_what_is_no_polygon_is_refused(vertices, error):
     with pytest.raises(error, match="vertices: expected"):
         Polygon(vertices)
+
+
+def test_sides_that_cross_are_named_and_those_that_touch_are_allowed():
+    star = tensor([[math.cos(4 * math.pi * k / 5), math.sin(4 * math.pi * k / 5)] for k in range(5)])
+    with pytest.raises(InvalidInputError, match="crossing ones from corners 0 and 2; give the corners in the order"):
+        Polygon(star)
+    turn = torch.linspace(0, 2 * math.pi, 601, dtype=F64)[:-1]
+    ring = torch.stack([turn.cos(), turn.sin()], -1)
+    Polygon(ring)
+    ring[[500, 501]] = ring[[501, 500]]
+    with pytest.raises(InvalidInputError, match="crossing"):
+        Polygon(ring)
+    hole = tensor([[0, 0], [3, 0], [3, 3], [0, 3], [0, 0], [1, 1], [1, 2], [2, 2], [2, 1], [1, 1]])
+    assert bool(Polygon(hole).contains(tensor([[0.5, 1.5], [1.5, 1.5]])).tolist() == [True, False])
 
 
 def test_other_bad_shapes_are_refused():

@@ -13,7 +13,7 @@ import torch
 mujoco = pytest.importorskip("mujoco")
 
 from difflcs import GoalCost, LCSModule, LCSMPCLayer  # noqa: E402
-from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError  # noqa: E402
+from difflcs.errors import ContactWarning, DTypeError, InvalidInputError, NonFiniteError, ShapeError  # noqa: E402
 from difflcs.physics import PlanarPushing, box  # noqa: E402
 from difflcs.physics.mujoco import MujocoLCS, MujocoState, lcs_from_mujoco  # noqa: E402
 
@@ -306,6 +306,42 @@ def test_there_is_room_for_all_contacts_that_mujoco_finds(first, second):
 several_contacts_of_faces = pytest.mark.skipif(
     not hasattr(mujoco.mjtDisableBit, "mjDSBL_MULTICCD"), reason="this MuJoCo makes one contact where faces meet"
 )
+
+
+def tower(boxes):
+    floor, size = '<geom type="plane" size="1 1 .1"/>', 0.1
+    stacked = (
+        f'<body pos="0 0 {(k + 0.5) * size - 1e-4}"><freejoint/><geom type="box" size=".05 .05 .05" mass="1"/></body>'
+        for k in range(boxes)
+    )
+    return load(floor + "".join(stacked))
+
+
+def test_contacts_that_have_no_room_are_warned_of_once_and_not_where_they_were_chosen():
+    module = MujocoLCS(model := tower(4), motion="dynamic")
+    state = module.state.to_state(model.qpos0)
+    with pytest.warns(ContactWarning, match=r"at most 12 contacts, got 16 .* contacts=16") as said:
+        assert module.contacts(state).gap.shape == (12,)
+    assert said[0].filename == __file__
+    module.params(state)  # a second warning would be an error
+    low = MujocoLCS(three := tower(3), motion="dynamic")
+    low.contacts(low.state.to_state(three.qpos0))  # 12 touch; the others, within its distance, are not near
+    MujocoLCS(model, motion="dynamic", contacts=12).contacts(state)
+
+
+def test_a_tower_stands_on_four_contacts_a_face():
+    """MuJoCo finds eight between equal boxes, from which four at one corner must not be taken; and what lies on another
+    body is held by it as by a floor."""
+    model = tower(4)
+    module = MujocoLCS(model, motion="dynamic", contacts=16, seconds=0.05)
+    start = x = module.state.to_state(model.qpos0)
+    for _ in range(8):
+        x = module.params(x).step(x, torch.zeros(0).double()).x_next
+        assert float(x[24:].abs().max()) < 0.1  # as long as it settles; half a step of gravity is .25
+    assert float((x - start)[:24].abs().max()) < 3e-3
+    assert float(x[24:].abs().max()) < 1e-3
+
+
 SLABS = {
     "box": 'type="box" size=".3 .3 .05"',
     "mesh": 'type="mesh" mesh="slab"',

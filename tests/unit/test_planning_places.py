@@ -62,6 +62,14 @@ def test_a_ring_is_refused_where_there_is_none():
         ring(SHAPES["box"], 0.0, 10)
     with pytest.raises(InvalidInputError, match="n_points"):
         ring(SHAPES["box"], 0.1, 2)
+    with pytest.raises(InvalidInputError, match=r"shape: expected parts .* got 2 that are apart; take a larger"):
+        ring(SHAPES["apart"], 0.09, 80)  # .2 between them
+
+
+def test_a_ring_round_a_hole_is_the_outer_one():
+    sides = [(-1, 1, -1, -0.9), (-1, 1, 0.9, 1), (-1, -0.9, -1, 1), (0.9, 1, -1, 1)]
+    points = ring(Union(tuple(box(*side) for side in sides)), 0.1, 400)
+    assert float(points.abs().amax(1).min()) > 1.0
 
 
 # --- places -----------------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ faces is not always the shortest way; where `mj_geomDistance` says otherwise, it
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -19,12 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from difflcs._checks import describe
-from difflcs.errors import InvalidInputError
+from difflcs.errors import ContactWarning, InvalidInputError
 
 Array = NDArray[np.float64]
 Pairs = Sequence[tuple[int | str, int | str]]
 
 MOST_CONTACTS = 12  # by default
+_ENOUGH = 4  # contacts that hold a face, where there is no room for all
+_NEAR = 0.1  # of the unit of gaps: a contact as near as this is one that counts
 
 _THREE = np.arange(3)
 
@@ -98,7 +101,9 @@ class ContactFinder:
         data: its data, at which positions have been computed.
         pairs: geoms, or bodies with all their geoms, that may touch; None: as the model says.
         distance: contacts farther away are left out [m].
-        contacts: how many a state has; None: what the shapes of the pairs can have, at most `MOST_CONTACTS`.
+        length: unit of gaps [m].
+        contacts: how many a state has; None: what the shapes of the pairs can have, at most `MOST_CONTACTS`, with a
+            `ContactWarning` where more touch.
         friction: coefficient of all; None: that of the geoms.
 
     Attributes:
@@ -107,9 +112,17 @@ class ContactFinder:
     """
 
     def __init__(
-        self, model: Any, data: Any, pairs: Pairs | None, distance: float, contacts: int | None, friction: float | None
+        self,
+        model: Any,
+        data: Any,
+        pairs: Pairs | None,
+        distance: float,
+        length: float,
+        contacts: int | None,
+        friction: float | None,
     ):
         self.model, self.data, self.distance = model, data, distance
+        self._warn_within = _NEAR * length if contacts is None else -np.inf
         self.axis = plane_of_motion(model, data)
         self.friction = _friction(model, friction)
         self.allowed = _may_touch(model) if pairs is None else _listed(model, pairs)
@@ -164,10 +177,26 @@ class ContactFinder:
         # A normal that nothing can move along is that of a body resting on what is outside the plane of motion.
         kept = np.flatnonzero(own & (np.abs(rows[:, 0]).max(-1, initial=0.0) > 1e-9))
         if len(kept) > count:
+            kept = kept[_spread(contact.pos, geom, gap, kept)]
+        if len(kept) > count:
+            self._warn_of_more(gap[kept])
             kept = np.sort(kept[np.argpartition(gap[kept], count - 1)[:count]])
         k = len(kept)
         into.gap[i, :k], into.rows[i, :k], into.frame[i, :k] = gap[kept], rows[kept], frame[kept]
         into.geom[i, :k], into.apart[i, :k], into.axes[i] = geom[kept], apart[kept], data.cdof[:, :3]
+
+    def _warn_of_more(self, gap: Array) -> None:
+        """Say once where nobody has chosen how many contacts there are, and some that are near have no place."""
+        near = int((gap <= self._warn_within).sum())
+        if near > self.n_contacts:
+            warnings.warn(
+                f"expected at most {self.n_contacts} contacts, got {near} that touch or nearly do; the nearest "
+                f"{self.n_contacts} are kept, so that something may sink or fall: pass contacts={near} or more, or "
+                f"that number if it is enough",
+                ContactWarning,
+                stacklevel=5,
+            )
+            self._warn_within = -np.inf
 
     def finish(self, read: Read) -> Found:
         """Contacts with the tangents that count."""
@@ -250,6 +279,29 @@ def _across(normal: Array) -> tuple[Array, Array]:
     first: Array = np.cross(normal, np.eye(3)[np.abs(normal).argmin()]).astype(np.float64)
     first /= np.linalg.norm(first)
     return first, np.cross(normal, first).astype(np.float64)
+
+
+def _spread(places: Array, geom: Any, gap: Array, kept: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Which of the contacts `kept` are enough: of each pair four, the nearest and those farthest from the ones before.
+
+    Args:
+        places: (n, 3) where MuJoCo's contacts are; numbers from n on are the only contacts of their pairs.
+        geom: (n or more, 2).
+        gap: (n or more,).
+        kept: numbers of contacts.
+    """
+    chosen: list[int] = []
+    for pair in np.unique(geom[kept], axis=0):
+        of_pair = np.flatnonzero((geom[kept] == pair).all(-1))
+        if len(of_pair) > _ENOUGH:
+            at = places[kept[of_pair]]
+            few, far = [int(gap[kept[of_pair]].argmin())], np.full(len(at), np.inf)
+            while len(few) < _ENOUGH:
+                far = np.minimum(far, np.linalg.norm(at - at[few[-1]], axis=-1))
+                few.append(int(far.argmax()))
+            of_pair = of_pair[few]
+        chosen += of_pair.tolist()
+    return np.sort(np.array(chosen, dtype=np.intp))
 
 
 def _friction(model: Any, friction: float | None) -> Array:

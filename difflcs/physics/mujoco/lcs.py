@@ -56,7 +56,7 @@ class MujocoLCS:
         motion: see above.
         seconds: of a step [s].
         contacts: how many a state has, the nearest; missing ones are padded with contacts out of reach. None: as many
-            points as the shapes of all pairs may touch in, at most 12.
+            points as the shapes of all pairs may touch in, at most 12, with a `ContactWarning` where more touch.
         distance: contacts farther away are left out [m]; None: ten times `length`.
         pairs: geoms, by name or number, or bodies with all their geoms, that may touch; None: as the model says
             (contype, conaffinity, pairs, excludes; none where contacts or constraints are disabled).
@@ -129,7 +129,7 @@ class MujocoLCS:
         length = _typical_radius(model) if length is None else check_number("length", length, strict=True)
         distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
         self.length = length
-        self._finder = ContactFinder(model, self._data, pairs, distance, contacts, friction)
+        self._finder = ContactFinder(model, self._data, pairs, distance, length, contacts, friction)
         model.opt.disableflags |= sum(
             int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("EQUALITY", "FRICTIONLOSS", "LIMIT")
         )

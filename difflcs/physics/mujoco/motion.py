@@ -188,7 +188,7 @@ class Dynamic:
         load = acceleration - np.einsum("nij,nj->ni", D, velocity)  # the acceleration with ν = 0, ζ = 0 and u = 0
         step = self._solve(K, D, B, load)
         place = step[:, :nv, -1] + np.einsum("nij,nj->ni", step[:, :nv, nv : 2 * nv], velocity)
-        closing = found.gap + np.einsum("nkv,nv->nk", found.normal, place) < 0
+        closing = _closing(place, inverse_mass, found)
         step[:, :nv, -1] += _balanced(step[:, :, -1], inverse_mass, found.normal * closing[:, :, None], h)
         # The control of a servo is held through the step, at a distance from where the joint was at its beginning.
         step[:, :, :nv] += step[:, :, 2 * nv : -1] @ self.moment
@@ -221,16 +221,36 @@ class Dynamic:
         return step
 
 
+def _closing(place: Array, inverse_mass: Array, found: Found) -> NDArray[np.bool_]:
+    """Which contacts (n, n_contacts) close where bodies go to ζ (n, nv), as those below in a stack are held up."""
+
+    def gap(place: Array) -> Array:
+        return found.gap + np.einsum("nkv,nv->nk", found.normal, place)
+
+    closing = gap(place) < 0
+    for _ in range(closing.shape[1]):
+        held = place + _pushed(inverse_mass, found.normal * closing[:, :, None], np.where(closing, -gap(place), 0.0))
+        more = closing | (gap(held) < 0)
+        if (more == closing).all():
+            break
+        closing = more
+    return closing
+
+
 def _balanced(moved: Array, inverse_mass: Array, rows: Array, h: float) -> Array:
     """What is added to ζ (n, nv), moved by loads as (ζ, ν) `moved`, where contacts `rows` are about to balance them."""
     nv = moved.shape[-1] // 2
-    place, speed = moved[:, :nv], moved[:, nv:]
+    return _pushed(inverse_mass, rows, (rows @ (h * moved[:, nv:] - moved[:, :nv])[:, :, None])[:, :, 0])
+
+
+def _pushed(inverse_mass: Array, rows: Array, by: Array) -> Array:
+    """How far ζ (n, nv) goes when forces along `rows` (n, n_contacts, nv) move these `by` (n, n_contacts)."""
     if not rows.any():
-        return np.zeros_like(place)
+        return np.zeros((len(rows), rows.shape[-1]))
     gives = inverse_mass @ rows.swapaxes(-1, -2)
     inner = rows @ gives
     # Contacts of one face are not independent.
     scale = np.trace(inner, axis1=-2, axis2=-1)[:, None, None]
     inner += np.eye(inner.shape[-1]) * np.where(scale > 0, 1e-9 * scale, 1.0)
-    force = np.linalg.solve(inner, rows @ (h * speed - place)[:, :, None])
+    force = np.linalg.solve(inner, by[:, :, None])
     return (gives @ force)[:, :, 0]
