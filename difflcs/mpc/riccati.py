@@ -144,8 +144,11 @@ def _eliminate(
 class _Bounds:
     """Which actions are held at their bounds; found stage by stage from the last, as their curvature becomes known."""
 
-    def __init__(self, problem: MPCProblem, primal: Primal, gradient: Tensor, width: Tensor, least: Tensor):
-        self.problem, self.u, self.gradient, self.width, self.least = problem, primal.u, gradient, width, least
+    def __init__(
+        self, problem: MPCProblem, primal: Primal, gradient: Tensor, terms: Tensor, width: Tensor, least: Tensor
+    ):
+        self.problem, self.u, self.width, self.least = problem, primal.u, width, least
+        self.gradient, self.terms = gradient, terms
         self.low, self.high = (v.expand_as(primal.u) for v in problem.bounds())
         self.lower: list[Tensor] = []
         self.upper: list[Tensor] = []
@@ -155,12 +158,13 @@ class _Bounds:
     def at(cls, problem: MPCProblem, primal: Primal, dual: Multipliers) -> _Bounds:
         width, rest = ranges(problem, primal.u), at_rest(problem).transpose(0, 1)
         # The least curvature keeps rounding of a gradient apart from a reason to leave the interior.
-        reference = torch.maximum(gradient_terms(problem, primal, dual), width * rest)
+        terms = gradient_terms(problem, primal, dual)
+        reference = torch.maximum(terms, width * rest)
         least = 1e-10 * reference / torch.where(width > 0, width, torch.ones_like(width))
         least = least.clamp_min(torch.finfo(torch.float64).tiny)
         # With constraints the curvature may be negative at a solution: only along them it is not.
         least = torch.maximum(least, rest) if problem.n_c else least
-        return cls(problem, primal, dual.gradient, width, least)
+        return cls(problem, primal, dual.gradient, terms, width, least)
 
     def free(self, k: int, Q_uu: Tensor) -> Tensor:
         """The actions (batch, n_u) that are free at stage k, by their curvature."""
@@ -169,7 +173,9 @@ class _Bounds:
         to_lower, to_upper, step, fixed = u - low, high - u, g / h, high <= low
         lower = (step > to_lower) | (fixed & (g >= 0))
         upper = (-step > to_upper) | (fixed & (g < 0))
-        weak = (torch.minimum(to_lower, to_upper) <= _WEAK * width) & (step.abs() <= _WEAK * width) & ~fixed
+        # With one bound, at zero, and at rest there in all steps, the action has no size: the gradient alone decides.
+        small = torch.where(width > 0, step.abs() <= _WEAK * width, g.abs() <= _WEAK * self.terms[:, k])
+        weak = (torch.minimum(to_lower, to_upper) <= _WEAK * width) & small & ~fixed
         if self.problem.barrier > 0:
             # A barrier that keeps no distance to speak of is the bound itself; its steepness is then only rounding.
             close = torch.maximum(_CLOSE * width, 1e-3 * _CLOSE * torch.maximum(low.abs(), high.abs()))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 import warnings
 from dataclasses import dataclass
 
@@ -443,6 +444,22 @@ def test_a_weakly_active_gradient_is_one_of_the_two_sides(build, backend):
     found, sides = gradient(0.0), (gradient(-1e-3), gradient(1e-3))
     assert min(float((found - side).norm() / side.norm()) for side in sides) < 0.02
     assert float((sides[0] - sides[1]).norm() / sides[0].norm()) > 0.02
+
+
+@every_exact
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_kink_of_an_action_with_one_bound_at_zero_is_degenerate(backend, side):
+    """An action that rests at its only bound in all steps has no size by which to say how near a kink is."""
+    one, none = torch.ones(1, 1, dtype=torch.float64), torch.zeros(1, 0, dtype=torch.float64)
+    lcs = LCSParams(A=one, B=side * one, C=none, d=0 * one[0], D=none.mT, E=none.mT, F=none.mT @ none, c=none[0])
+    mpc = LCSMPCLayer(lcs, QuadraticCost(Q=one, R=0.1 * one, Q_final=one), 4, 0 * one[0], math.inf, backend=backend)
+    x0 = torch.tensor([[0.0], [0.5 * side], [-0.5 * side]], dtype=torch.float64, requires_grad=True)
+    with pytest.warns(DegenerateWarning, match="1 of 3 solutions"):
+        plan = mpc(x0)
+    assert plan.status.tolist() == [Status.DEGENERATE, Status.CONVERGED, Status.CONVERGED]
+    (gradient,) = torch.autograd.grad(plan.u[:, 0].sum(), x0)
+    assert gradient[1] == 0
+    assert float((gradient[0] - gradient[1:, 0]).abs().min()) < 1e-6  # one of the two sides
 
 
 @every_exact
