@@ -15,18 +15,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from difflcs._checks import check_tensor, describe
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 
-Array = NDArray[np.float64]
-_ROWS = 256
-
 __all__ = ["Circle", "Distance", "Polygon", "Shape", "Union", "box"]
+
+_ROWS = 256  # sides that are compared with all others at a time, so that memory grows with their number alone
 
 
 class Distance(NamedTuple):
@@ -301,22 +298,22 @@ def _shoelace(vertices: Tensor) -> Tensor:
 
 def _crossing(vertices: Tensor) -> tuple[int, int] | None:
     """Two sides, by their first corners, that cross inside both; None where there are none."""
-    start = vertices.cpu().numpy()
-    end = np.roll(start, -1, axis=0)
-    for first in range(0, len(start), _ROWS):  # a few at a time: some hundred corners need no more
-        a, b = (v[first : first + _ROWS, None] for v in (start, end))
+    start, end = vertices, vertices.roll(-1, 0)
+    for first in range(0, len(start), _ROWS):
+        a, b = (v[first : first + _ROWS].unsqueeze(1) for v in (start, end))
         # The ends of one side are on both sides of the other, and the other way round.
         apart = _turn(a, b, start) * _turn(a, b, end) < 0
         apart &= _turn(start, end, a) * _turn(start, end, b) < 0
-        if apart.any():
-            i, j = np.argwhere(apart)[0]
-            return first + int(i), int(j)
+        if bool(apart.any()):
+            i, j = apart.nonzero()[0].tolist()
+            return first + i, j
     return None
 
 
-def _turn(a: Array, b: Array, c: Array) -> Array:
+def _turn(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     """Twice the signed area of triangles: above 0 where c is to the left of the way from a to b."""
-    return (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0])
+    along, to = b - a, c - a
+    return along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0]
 
 
 def _nearest_side(points: Tensor, start: Tensor, side: Tensor, square: Tensor) -> tuple[Tensor, Tensor]:

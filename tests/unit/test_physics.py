@@ -111,6 +111,12 @@ def test_sides_that_cross_are_named_and_those_that_touch_are_allowed():
     assert bool(Polygon(hole).contains(tensor([[0.5, 1.5], [1.5, 1.5]])).tolist() == [True, False])
 
 
+def test_a_polygon_can_be_built_of_what_torch_func_differentiates():
+    corners = tensor([[0, 0], [1, 0], [1, 1], [0, 1]])
+    found = torch.func.grad(lambda v: Polygon(v).moments().area)(corners)
+    torch.testing.assert_close(found, corners - 0.5)
+
+
 def test_other_bad_shapes_are_refused():
     with pytest.raises(InvalidInputError, match="r: expected"):
         Circle(0.0)

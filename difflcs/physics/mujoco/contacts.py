@@ -190,9 +190,9 @@ class ContactFinder:
         near = int((gap <= self._warn_within).sum())
         if near > self.n_contacts:
             warnings.warn(
-                f"expected at most {self.n_contacts} contacts, got {near} that touch or nearly do; the nearest "
-                f"{self.n_contacts} are kept, so that something may sink or fall: pass contacts={near} or more, or "
-                f"that number if it is enough",
+                f"expected at most {self.n_contacts} contacts, got {near} that touch or nearly do; only the nearest "
+                f"are kept, so that something may sink or fall: pass contacts={near}, or contacts={self.n_contacts} "
+                f"if these are enough",
                 ContactWarning,
                 stacklevel=5,
             )
@@ -298,6 +298,7 @@ def _spread(places: Array, geom: Any, gap: Array, kept: NDArray[np.intp]) -> NDA
             few, far = [int(gap[kept[of_pair]].argmin())], np.full(len(at), np.inf)
             while len(few) < _ENOUGH:
                 far = np.minimum(far, np.linalg.norm(at - at[few[-1]], axis=-1))
+                far[few] = -1.0
                 few.append(int(far.argmax()))
             of_pair = of_pair[few]
         chosen += of_pair.tolist()

@@ -55,8 +55,9 @@ class MujocoLCS:
             the reference of rotations, see `MujocoState`; None: the model's initial state.
         motion: see above.
         seconds: of a step [s].
-        contacts: how many a state has, the nearest; missing ones are padded with contacts out of reach. None: as many
-            points as the shapes of all pairs may touch in, at most 12, with a `ContactWarning` where more touch.
+        contacts: how many a state has, the nearest, where there are more of four a pair; missing ones are padded with
+            contacts out of reach. None: as many points as the shapes of all pairs may touch in, at most 12, with a
+            `ContactWarning` where more touch.
         distance: contacts farther away are left out [m]; None: ten times `length`.
         pairs: geoms, by name or number, or bodies with all their geoms, that may touch; None: as the model says
             (contype, conaffinity, pairs, excludes; none where contacts or constraints are disabled).
