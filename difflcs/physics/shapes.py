@@ -113,7 +113,7 @@ class Polygon(Shape):
                 f"vertices: expected every corner apart from the next, got corner {int(sides.argmin())} twice; leave "
                 f"one of them out, the last need not repeat the first"
             )
-        area = float(_shoelace(vertices.detach()).sum()) / 2
+        area = float(shoelace(vertices.detach()).sum()) / 2
         if not abs(area) > 1e-12 * float(sides.max()) ** 2:
             raise InvalidInputError(f"vertices: expected a polygon with an area, got {area:g}; move the corners apart")
         crossed = _crossing(vertices.detach())
@@ -171,7 +171,7 @@ class Polygon(Shape):
     def moments(self) -> Moments:
         """See `Shape`."""
         p, n = self.vertices, self.vertices.roll(-1, 0)
-        cross = _shoelace(p)
+        cross = shoelace(p)
         area = cross.sum() / 2
         centroid = ((p + n) * cross.unsqueeze(-1)).sum(0) / (6 * area)
         about_origin = (cross * (p.square() + p * n + n.square()).sum(-1)).sum() / 12
@@ -291,7 +291,8 @@ def _tensor(name: str, value: Any | Sequence) -> Tensor:
     return check_tensor(name, value)
 
 
-def _shoelace(vertices: Tensor) -> Tensor:
+def shoelace(vertices: Tensor) -> Tensor:
+    """Twice the signed area (n,) between each side and the origin; their sum is above 0 counterclockwise."""
     following = vertices.roll(-1, 0)
     return vertices[:, 0] * following[:, 1] - vertices[:, 1] * following[:, 0]
 
@@ -317,13 +318,23 @@ def _turn(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
 
 
 def _nearest_side(points: Tensor, start: Tensor, side: Tensor, square: Tensor) -> tuple[Tensor, Tensor]:
-    """Which side is nearest to each point, and which points are inside: a ray from them crosses sides an odd time."""
+    """Which side is nearest to each point, and which points are inside."""
     to = points.unsqueeze(-2) - start
     t = ((to * side).sum(-1) / square).clamp_(0.0, 1.0)
     nearest = (to - t.unsqueeze(-1) * side).square_().sum(-1).argmin(-1)
+    return nearest, is_inside(to, side)
+
+
+def is_inside(to: Tensor, side: Tensor) -> Tensor:
+    """Which points are inside a closed outline: a ray from them crosses its sides an odd number of times.
+
+    Args:
+        to: (..., n, 2) the way from the first corner of each side to the points.
+        side: (n, 2) the sides, as vectors.
+    """
     x, y = to.unbind(-1)
     width, height = side.unbind(-1)
     spans = (y < 0) != (y < height)
     # x of the point against that of the side at its height, both multiplied by the side's height.
     left = x * height.abs() < y * width * height.sign()
-    return nearest, ((spans & left).sum(-1) % 2).bool()
+    return ((spans & left).sum(-1) % 2).bool()

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from difflcs._checks import check_number, check_positive_int
 from difflcs.errors import InvalidInputError
-from difflcs.physics.shapes import Shape
+from difflcs.physics.shapes import Shape, is_inside, shoelace
 
 __all__ = ["clearance", "ring"]
 
@@ -47,8 +47,9 @@ def ring(shape: Shape, distance: float, n_points: int) -> Tensor:
         grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1)
         values = clearance(shape, grid) - distance
         curves = [torch.from_numpy(curve) for curve in _loops(values.numpy(), axis.numpy())]
-        curve = max(curves, key=_area)
-        apart = sum(not _encloses(curve, other[0]) for other in curves if other is not curve)
+        curve = max(curves, key=lambda curve: float(shoelace(curve).sum()))
+        sides = curve.roll(-1, 0) - curve
+        apart = sum(not bool(is_inside(other[0] - curve, sides)) for other in curves if other is not curve)
         if apart:
             raise InvalidInputError(
                 f"shape: expected parts that one curve at distance {distance:g} goes round, got {apart + 1} that are "
@@ -75,18 +76,6 @@ def _equally(curve: Tensor, n_points: int) -> Tensor:
     along = np.concatenate([[0.0], np.linalg.norm(np.diff(closed, axis=0), axis=1).cumsum()])
     at = np.linspace(0.0, along[-1], n_points, endpoint=False)
     return torch.from_numpy(np.stack([np.interp(at, along, closed[:, i]) for i in range(2)], -1))
-
-
-def _area(curve: Tensor) -> float:
-    after = curve.roll(-1, 0)
-    return abs(float((curve[:, 0] * after[:, 1] - curve[:, 1] * after[:, 0]).sum()))
-
-
-def _encloses(curve: Tensor, point: Tensor) -> bool:
-    """Whether a ray from a point (2,) along x crosses a closed curve (m, 2) an odd number of times."""
-    (x, y), (to_x, to_y) = (curve - point).T, (curve.roll(-1, 0) - point).T
-    spans = (y < 0) != (to_y < 0)
-    return bool((x - y * (to_x - x) / (to_y - y) > 0)[spans].sum() % 2)
 
 
 def _loops(values: NDArray[np.float64], axis: NDArray[np.float64]) -> list[NDArray[np.float64]]:

@@ -177,7 +177,7 @@ class ContactFinder:
         # A normal that nothing can move along is that of a body resting on what is outside the plane of motion.
         kept = np.flatnonzero(own & (np.abs(rows[:, 0]).max(-1, initial=0.0) > 1e-9))
         if len(kept) > count:
-            kept = kept[_spread(contact.pos, geom, gap, kept)]
+            kept = _spread(contact.pos, geom, gap, kept)
         if len(kept) > count:
             self._warn_of_more(gap[kept])
             kept = np.sort(kept[np.argpartition(gap[kept], count - 1)[:count]])
@@ -282,7 +282,7 @@ def _across(normal: Array) -> tuple[Array, Array]:
 
 
 def _spread(places: Array, geom: Any, gap: Array, kept: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Which of the contacts `kept` are enough: of each pair four, the nearest and those farthest from the ones before.
+    """Those of the contacts `kept` that are enough: of each pair four, the nearest and the farthest from those before.
 
     Args:
         places: (n, 3) where MuJoCo's contacts are; numbers from n on are the only contacts of their pairs.
@@ -290,19 +290,19 @@ def _spread(places: Array, geom: Any, gap: Array, kept: NDArray[np.intp]) -> NDA
         gap: (n or more,).
         kept: numbers of contacts.
     """
-    chosen: list[int] = []
-    for pair in np.unique(geom[kept], axis=0):
-        of_pair = np.flatnonzero((geom[kept] == pair).all(-1))
-        if len(of_pair) > _ENOUGH:
-            at = places[kept[of_pair]]
-            few, far = [int(gap[kept[of_pair]].argmin())], np.full(len(at), np.inf)
-            while len(few) < _ENOUGH:
-                far = np.minimum(far, np.linalg.norm(at - at[few[-1]], axis=-1))
-                far[few] = -1.0
-                few.append(int(far.argmax()))
-            of_pair = of_pair[few]
-        chosen += of_pair.tolist()
-    return np.sort(np.array(chosen, dtype=np.intp))
+    pair = geom[kept, 0] * (geom.max() + 1) + geom[kept, 1]
+    pairs, counts = np.unique(pair, return_counts=True)
+    enough = np.ones(len(kept), dtype=bool)
+    for crowded in pairs[counts > _ENOUGH]:
+        of_pair = np.flatnonzero(pair == crowded)
+        at = places[kept[of_pair]]
+        few, far = [int(gap[kept[of_pair]].argmin())], np.full(len(at), np.inf)
+        while len(few) < _ENOUGH:
+            far = np.minimum(far, np.linalg.norm(at - at[few[-1]], axis=-1))
+            far[few] = -1.0
+            few.append(int(far.argmax()))
+        enough[np.delete(of_pair, few)] = False
+    return kept[enough]
 
 
 def _friction(model: Any, friction: float | None) -> Array:
