@@ -273,11 +273,10 @@ class Riccati {
       const Vec curved = max(H(nx + j, nx + j) + linearisation.curvature(nx + j, nx + j), max(least, all(kTiny)));
       const Vec step = g / curved;
       if (barrier == 0) {
-        const Vec distance = min(below, above);
-        found.weak |= (distance <= 1e-5 * width) & (abs(step) <= 1e-5 * width) & (width > 0);
+        Mask small = abs(step) <= 1e-5 * width;
         // With one bound, at zero, and at rest there in all steps, the action has no size: the gradient alone decides.
-        if (problem.batch.unbounded)
-          found.weak |= ~(width > 0) & ~fixed & (distance <= 0) & (abs(g) <= 1e-5 * terms);
+        if (problem.batch.unbounded) small |= ~(width > 0) & (abs(g) <= 1e-5 * terms);
+        found.weak |= (min(below, above) <= 1e-5 * width) & small & ~fixed;
       }
       if (kAdjoint) {
         lower(k, j) = (step > below) | (fixed & (g >= 0));
