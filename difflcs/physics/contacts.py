@@ -35,7 +35,7 @@ from difflcs._linalg import matvec
 from difflcs.errors import FrictionWarning, InvalidInputError, ShapeError
 from difflcs.records import LCSParams
 
-__all__ = ["Cone", "Contacts", "FreeMotion", "contact_lcs", "count_forces"]
+__all__ = ["Cone", "Contacts", "FreeMotion", "contact_lcs", "count_forces", "normal_forces"]
 
 Cone = Literal["anitescu", "stewart-trinkle"]
 
@@ -136,6 +136,12 @@ def contact_lcs(
     D = rows @ free.A - (rows - normals)
     c = gap / length + matvec(rows, free.d) - matvec(normals, x)
     return LCSParams(A=free.A, B=free.B, C=C, d=free.d, D=D, E=rows @ free.B, F=F, c=c)
+
+
+def normal_forces(lam: Tensor, n_contacts: int, n_tangents: int, cone: Cone) -> Tensor:
+    """Normal force (..., n_contacts) of each contact, of the complementarity variable (..., n_lam) of such a system."""
+    each = lam.reshape(*lam.shape[:-1], n_contacts, -1)
+    return each[..., 0] if n_tangents and cone == "stewart-trinkle" else each.sum(-1)
 
 
 def _check_shapes(contacts: Contacts, free: FreeMotion, n_x: int, n_contacts: int, n_tangents: int) -> None:

@@ -1,17 +1,21 @@
 """What a MuJoCo model does in one step without contact: quasi-static, or with velocities.
 
-With velocities, MuJoCo's acceleration is linearised where the state is, ζ from there and ν the velocity:
+With velocities, MuJoCo simulates what a nominal control ū does from the state, and its acceleration is linearised half
+way there, with ζ the change of position and ν the velocity:
 
-    ν̇ = a + K ζ + D (ν − ν̄) + B u,    ζ̇ = ν.
+    ν̇ = a + K ζ + D (ν − ν̄) + B (u − ū),    ζ̇ = ν.
 
-K, D and B are finite differences that `mjd_transitionFD` computes natively: gravity, Coriolis forces, springs,
-damping, gears and servos are all in them. A step of h solves these equations exactly. A contact force acts as one
-impulse f at the beginning, through the same equations but implicitly, so that what a stiff servo holds gives way
-little: it changes ν by S f and ζ by h S f with S = (1 − h D − h² K)⁻¹ M⁻¹.
+K, D and B are finite differences that `mjd_transitionFD` computes natively: gravity, Coriolis forces, springs, damping,
+gears and servos are all in them. What differs from the simulation takes the time steps of the model's own integrator.
+
+A contact force acts as one impulse f at the beginning of the step, implicitly, so that what a stiff servo holds gives
+way little: it changes ν by S f and ζ by h S f with S = (M + [h (−M D) + h² (−M K)]₊)⁻¹, where [·]₊ is the part of the
+symmetric matrix that resists motion (its positive eigenvalues, in the metric of M). So S is positive definite in every
+state and for every step, also where Coriolis forces or an unstable equilibrium would make an implicit step indefinite.
 
 A load that acts all the time, such as gravity, moves a body by h²/2 in a step where that impulse moves it by h². So a
 contact that balances the place of a body at rest would leave it with a velocity. Where a contact is about to close,
-loads are therefore impulses at the beginning too, in the directions that the contact can balance.
+loads are therefore impulses at the beginning too: along its normal, and along its tangents where friction holds.
 """
 
 # MuJoCo is a compiled module without type stubs.
@@ -19,7 +23,7 @@ loads are therefore impulses at the beginning too, in the directions that the co
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -36,7 +40,8 @@ Array = NDArray[np.float64]
 _JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 _FIXED, _AFFINE = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_AFFINE)
-_OFF = ("CONSTRAINT", "CLAMPCTRL", "EULERDAMP")
+_BEYOND = 1e9  # a motion in a step [m, rad] and its velocity that no model has
+_EULER, _RK4 = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("EULER", "RK4"))
 
 
 class Actuators:
@@ -47,6 +52,7 @@ class Actuators:
         gear: (nu,).
         servo: (nu,) whether it is a `position` actuator on a slide or hinge.
         offset: (nu,) at which length a servo rests with ctrl = 0, by the constant part of its bias; 0 for others.
+        holds: (nu,) whether its force falls to zero at some length, as that of servos on joints, tendons or sites does.
     """
 
     def __init__(self, model: Any):
@@ -60,7 +66,13 @@ class Actuators:
         gain, (constant, bias) = model.actuator_gainprm[:, 0], model.actuator_biasprm.T[:2]
         linear = (model.actuator_gaintype == _FIXED) & (model.actuator_biastype == _AFFINE) & (gain != 0)
         self.servo = (self.dof >= 0) & linear & (np.abs(gain + bias) <= 1e-9 * np.abs(gain))
-        self.offset = np.where(self.servo, constant / np.where(gain != 0, gain, 1.0), 0.0)
+        self.holds = linear & (bias != 0)
+        self._gain, self._constant, self._bias = np.where(gain != 0, gain, 1.0), constant.copy(), bias.copy()
+        self.offset = np.where(self.servo, constant / self._gain, 0.0)
+
+    def balance(self, length: Array) -> Array:
+        """Controls (nu,) with which what holds a length has no force at these lengths (nu,); 0 for others."""
+        return np.where(self.holds, -(self._constant + self._bias * length) / self._gain, 0.0)
 
 
 class QuasiStatic:
@@ -114,8 +126,9 @@ class QuasiStatic:
         """Inverse mass matrices of n states."""
         return np.zeros((n, self.model.nv, self.model.nv))
 
-    def read(self, i: int, data: Any, arrays: Array) -> None:
-        """At the state in `data`, for which `mj_fwdPosition` was called."""
+    def read(self, i: int, data: Any, arrays: Array, ctrl: Array | None = None) -> None:
+        """At the state in `data`, for which `mj_fwdPosition` was called; whatever the controls are."""
+        del ctrl
         if self.mobility is None:
             mujoco.mj_solveM(self.model, data, arrays[i], np.eye(self.model.nv))
 
@@ -148,80 +161,211 @@ class Dynamic:
     """
 
     def __init__(self, model: Any, actuators: Actuators, seconds: float, relative: bool):
-        self.model, self.seconds = model, seconds
+        self.model, self.seconds, self.actuators = model, seconds, actuators
         self.relative = np.flatnonzero(actuators.servo) if relative else np.zeros(0, dtype=np.intp)
         self.moment = np.zeros((model.nu, model.nv))
         self.moment[self.relative, actuators.dof[self.relative]] = actuators.gear[self.relative]
-        # With a time step of one second and no implicit part, the next velocity is ν + acceleration.
-        self.flags = sum(int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in _OFF)
-        model.opt.timestep, model.opt.integrator = 1.0, mujoco.mjtIntegrator.mjINT_EULER
+        self.substeps = max(1, round(seconds / model.opt.timestep))
+        self.integrator = int(model.opt.integrator)
+        damped = not model.opt.disableflags & _flags("EULERDAMP") and self.integrator == _EULER
+        self.damping = model.dof_damping.copy() if damped else np.zeros(model.nv)
+        self.tree = np.array(model.dof_treeid)
+        self.flags = _flags("CONSTRAINT", "CLAMPCTRL", "AUTORESET")
         for limited in ("actuator_forcelimited", "actuator_ctrllimited", "jnt_actfrclimited", "tendon_actfrclimited"):
             getattr(model, limited)[:] = 0
 
-    def allocate(self, n: int) -> tuple[Array, Array, Array, Array]:
-        """Accelerations, transition matrices and inverse mass matrices of n states."""
+    def allocate(self, n: int) -> Linearised:
+        """For n states."""
         nv, nu = self.model.nv, self.model.nu
-        return np.zeros((n, nv)), np.zeros((n, 2 * nv, 2 * nv)), np.zeros((n, 2 * nv, nu)), np.zeros((n, nv, nv))
+        sizes = ((nv,), (2 * nv, 2 * nv), (2 * nv, nu), (nv, nv), (nu,), (2 * nv,))
+        return Linearised(*(np.zeros((n, *size)) for size in sizes))
 
-    def read(self, i: int, data: Any, arrays: tuple[Array, Array, Array, Array]) -> None:
-        """At the state in `data`, for which `mj_fwdPosition` was called."""
-        acceleration, A, B, inverse_mass = arrays
-        options, model = self.model.opt, self.model
-        mujoco.mj_solveM(model, data, inverse_mass[i], np.eye(model.nv))
-        before = options.disableflags
-        options.disableflags = before | self.flags
-        data.ctrl[:] = 0.0
-        data.ctrl[self.relative] = data.actuator_length[self.relative]
+    def read(self, i: int, data: Any, into: Linearised, ctrl: Array | None = None) -> None:
+        """At the state in `data`, for which `mj_fwdPosition` was called, and a nominal control (nu,), or balance."""
+        model, options = self.model, self.model.opt
+        before = options.disableflags, options.timestep, options.integrator
+        qpos, qvel = data.qpos.copy(), data.qvel.copy()
+        mujoco.mj_solveM(model, data, into.inverse_mass[i], np.eye(model.nv))
+        data.ctrl[:] = self.actuators.balance(data.actuator_length) if ctrl is None else ctrl
+        into.nominal[i] = data.ctrl
+        into.nominal[i, self.relative] -= data.actuator_length[self.relative]
+        self._simulate(data, self.substeps // 2)
+        # With a time step of one second and no implicit part, the next velocity is ν + acceleration.
+        options.disableflags |= self.flags | _flags("EULERDAMP")
+        options.timestep, options.integrator = 1.0, _EULER
         mujoco.mj_forward(model, data)
-        acceleration[i] = data.qacc
-        mujoco.mjd_transitionFD(model, data, 1e-6, 0, A[i], B[i], None, None)
-        options.disableflags = before
+        into.acceleration[i] = data.qacc
+        mujoco.mjd_transitionFD(model, data, 1e-6, 0, into.A[i], into.B[i], None, None)
+        options.disableflags, options.timestep, options.integrator = before
+        self._simulate(data, self.substeps - self.substeps // 2)
+        nv = model.nv
+        mujoco.mj_differentiatePos(model, into.reached[i, :nv], 1.0, qpos, data.qpos)
+        into.reached[i, nv:] = data.qvel
+        data.qpos[:], data.qvel[:] = qpos, qvel
 
-    def finish(
-        self, arrays: tuple[Array, Array, Array, Array], x: Array, tangent: Array | None, found: Found
-    ) -> FreeMotion:
+    def _simulate(self, data: Any, substeps: int) -> None:
+        options = self.model.opt
+        before = options.disableflags, options.timestep
+        options.disableflags, options.timestep = before[0] | self.flags, self.seconds / self.substeps
+        mujoco.mj_step(self.model, data, substeps)
+        options.disableflags, options.timestep = before
+
+    def finish(self, read: Linearised, x: Array, tangent: Array | None, found: Found) -> DynamicStep:
         """The motion at states x (n, 2 nv), with these contacts."""
-        n, nv, h = len(x), self.model.nv, self.seconds
-        acceleration, A, B, inverse_mass = arrays
-        K, D, B = A[:, nv:, :nv], A[:, nv:, nv:] - np.eye(nv), B[:, nv:]
-        velocity = x[:, nv:]
-        load = acceleration - np.einsum("nij,nj->ni", D, velocity)  # the acceleration with ν = 0, ζ = 0 and u = 0
-        step = self._solve(K, D, B, load)
-        place = step[:, :nv, -1] + np.einsum("nij,nj->ni", step[:, :nv, nv : 2 * nv], velocity)
-        closing = _closing(place, inverse_mass, found)
-        step[:, :nv, -1] += _balanced(step[:, :, -1], inverse_mass, found.normal * closing[:, :, None], h)
+        nv, h = self.model.nv, self.seconds
+        K, D, B = read.A[:, nv:, :nv], read.A[:, nv:, nv:] - np.eye(nv), read.B[:, nv:]
+        load = read.acceleration - np.einsum("nij,nj->ni", D, x[:, nv:])  # with ν = 0, ζ = 0 and u = ū
+        forces, mass = np.concatenate([K, D, B, load[:, :, None]], -1), np.linalg.inv(read.inverse_mass)
+        response = _implicit_response(mass, K, D, h)
+        # Of a step in which a motion grows beyond all bounds, what is linear and explicit says nothing.
+        step, implicit = self._steps(mass, forces), self._implicit(response @ mass, forces)
+        step = np.where((np.abs(step).max((1, 2)) < _BEYOND)[:, None, None], step, implicit)
+        return DynamicStep(self, read, x, tangent, found, step, response, implicit[:, :, -1] - step[:, :, -1])
+
+    def _steps(self, mass: Array, forces: Array) -> Array:
+        """(ζ, ν) after the step as a matrix (n, 2 nv, 2 nv + nu + 1) of ζ, ν, u − ū and 1; `forces` is that of ν̇."""
+        n, nv, of = forces.shape
+        h, one = self.seconds / self.substeps, np.zeros((n, of, of))
+        if self.integrator == _RK4:
+            unit = np.ones(of)
+            unit[nv : 2 * nv] = h  # of (ζ, h ν) the norm, which says what an exponential costs, is less
+            one[:, :nv, nv : 2 * nv], one[:, nv : 2 * nv] = h * np.eye(nv), h * forces
+            grown: Tensor = torch.linalg.matrix_exp(torch.from_numpy(one * unit[:, None] / unit))
+            one = grown.numpy() * unit / unit[:, None]
+        else:
+            resists = h * np.diag(self.damping) if self.integrator == _EULER else -h * mass @ forces[:, :, nv : 2 * nv]
+            one[:] = np.eye(of)
+            one[:, nv : 2 * nv] += h * np.linalg.solve(mass + resists, mass @ forces)
+            one[:, :nv] += h * one[:, nv : 2 * nv]
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.linalg.matrix_power(one, self.substeps)[:, : 2 * nv]
+
+    def _implicit(self, resists: Array, forces: Array) -> Array:
+        """The same by one implicit step, which gives (n, nv, nv) `resists` = S M of the change in velocity."""
+        nv, h = self.model.nv, self.seconds
+        one = h * forces
+        one[:, :, nv : 2 * nv] = np.eye(nv)
+        velocity = resists @ one
+        place = h * velocity
+        place[:, :, :nv] += np.eye(nv)
+        return np.concatenate([place, velocity], 1)
+
+
+class Linearised(NamedTuple):
+    """Of n states.
+
+    Attributes:
+        acceleration: (n, nv) with the nominal control.
+        A: (n, 2 nv, 2 nv) transition by position and velocity in one second of Euler's method.
+        B: (n, 2 nv, nu) by control.
+        inverse_mass: (n, nv, nv).
+        nominal: (n, nu) action at which this is.
+        reached: (n, 2 nv) where the nominal control leads in a step.
+    """
+
+    acceleration: Array
+    A: Array
+    B: Array
+    inverse_mass: Array
+    nominal: Array
+    reached: Array
+
+
+class DynamicStep:
+    """A step from some states, as the contacts there change it.
+
+    Attributes:
+        idle: (n, nu) the nominal action.
+    """
+
+    def __init__(
+        self,
+        motion: Dynamic,
+        read: Linearised,
+        x: Array,
+        tangent: Array | None,
+        found: Found,
+        step: Array,
+        response: Array,
+        loads: Array,
+    ):
+        nv = motion.model.nv
+        self._motion, self._x, self._tangent, self._found = motion, x, tangent, found
+        self._response, self._loads, self.idle = response, loads, read.nominal
+        linear = step[:, :, -1] + np.einsum("nij,nj->ni", step[:, :, nv : 2 * nv], x[:, nv:])
+        reached = np.where((np.abs(read.reached).max(1) < _BEYOND)[:, None], read.reached, linear)
+        step[:, :, -1] += reached - linear
+        self._step = step
+        self._closing = _closing(reached[:, :nv], response, found)
+
+    def free(self, slide: Array | None = None) -> FreeMotion:
+        """The motion without contact if contacts slide by (n, n_contacts, n_tangents) and friction holds the others."""
+        motion, x, tangent, found = self._motion, self._x, self._tangent, self._found
+        n, nv, h = len(x), motion.model.nv, motion.seconds
+        step = self._step.copy()
+        slides = np.zeros_like(self._closing) if slide is None else slide.any(-1)
+        holds = self._closing & ~slides & (found.friction > 0)
+        tangents = np.moveaxis(found.tangent, 2, 0) * holds[:, :, None]
+        normals = found.normal * self._closing[:, :, None]
+        rows = np.concatenate([normals, *tangents], 1)
+        forces = rows if slide is None else np.concatenate([normals - self._drag(slide), *tangents], 1)
+        rows, forces = _by_body(rows, motion.tree), _by_body(forces, motion.tree)
+        for part in (slice(0, nv), slice(nv, 2 * nv)):
+            by = np.einsum("nkv,nv->nk", rows, self._loads[:, part])
+            step[:, part, -1] += _pushed(self._response, rows, by, forces)
         # The control of a servo is held through the step, at a distance from where the joint was at its beginning.
-        step[:, :, :nv] += step[:, :, 2 * nv : -1] @ self.moment
+        control = step[:, :, 2 * nv : -1]
+        step[:, :, :nv] += control @ motion.moment
+        step[:, :, -1] -= np.einsum("nij,nj->ni", control, self.idle)
         to_x = np.zeros((n, 2 * nv, 2 * nv))
         to_x[:] = np.eye(2 * nv)
         of_x = to_x
         if tangent is not None:  # ζ = T (r − r̄)
             of_x = to_x.copy()
             of_x[:, :nv, :nv], to_x[:, :nv, :nv] = tangent, np.linalg.inv(tangent)
-        at = np.concatenate([x[:, :nv], np.zeros_like(velocity)], -1)
+        at = np.concatenate([x[:, :nv], np.zeros((n, nv))], -1)
         A_x = to_x @ step[:, :, : 2 * nv] @ of_x
         d = at - np.einsum("nij,nj->ni", A_x, at) + np.einsum("nij,nj->ni", to_x, step[:, :, -1])
-        impulse = np.linalg.solve(np.eye(nv) - h * D - h * h * K, inverse_mass)
-        response = np.zeros((n, 2 * nv, 2 * nv))
+        impulse, response = self._response, np.zeros((n, 2 * nv, 2 * nv))
         response[:, :, :nv] = to_x @ np.concatenate([h * impulse, impulse], 1) @ to_x[:, :nv, :nv].swapaxes(-1, -2)
-        tensors = (torch.from_numpy(v) for v in (A_x, to_x @ step[:, :, 2 * nv : -1], d, response))
-        return FreeMotion(*tensors)
+        return FreeMotion(*(torch.from_numpy(v) for v in (A_x, to_x @ control, d, response)))
 
-    def _solve(self, K: Array, D: Array, B: Array, load: Array) -> Array:
-        """(ζ, ν) after the step as a matrix (n, 2 nv, 2 nv + nu + 1) of ζ, ν, u and 1."""
-        n, nv, size = len(K), K.shape[-1], 2 * K.shape[-1] + B.shape[-1] + 1
-        h, rate = self.seconds, np.zeros((n, size, size))
-        # Of (ζ, h ν): the norm of the matrix, which says what its exponential costs, is less in this unit.
-        rate[:, :nv, nv : 2 * nv] = np.eye(nv)
-        rate[:, nv : 2 * nv] = np.concatenate([h * h * K, h * D, h * h * B, h * h * load[:, :, None]], -1)
-        grown: Tensor = torch.linalg.matrix_exp(torch.from_numpy(rate))
-        step = grown[:, : 2 * nv].numpy()
-        step[:, :, nv : 2 * nv] *= h
-        step[:, nv:] /= h
-        return step
+    def _drag(self, slide: Array) -> Array:
+        """Friction of contacts that slide, as rows (n, n_contacts, nv) for a unit of normal force."""
+        found, size = self._found, np.linalg.norm(slide, axis=-1, keepdims=True)
+        drag = np.einsum("nkt,nktv->nkv", slide / np.where(size > 0, size, 1.0), found.tangent)
+        drag = drag * (found.friction * self._closing)[:, :, None]
+        gives = found.normal @ self._response
+        # Friction that presses what it holds back into the contact could jam it; so much of it is left out.
+        presses, yields = ((gives * rows).sum(-1) for rows in (drag, found.normal))
+        return drag * np.minimum(1.0, 0.7 * yields / np.maximum(presses, 1e-300))[:, :, None]
 
 
-def _closing(place: Array, inverse_mass: Array, found: Found) -> NDArray[np.bool_]:
+def _flags(*names: str) -> int:
+    return sum(int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in names)
+
+
+def _implicit_response(mass: Array, K: Array, D: Array, h: float) -> Array:
+    """S (n, nv, nv): what an impulse changes the velocity by, with what resists motion treated implicitly."""
+    lower = np.linalg.cholesky(mass)
+    resists = -h * mass @ (D + h * K)
+    resists = 0.5 * (resists + resists.swapaxes(-1, -2))
+    scaled = np.linalg.solve(lower, np.linalg.solve(lower, resists).swapaxes(-1, -2))
+    size, directions = np.linalg.eigh(0.5 * (scaled + scaled.swapaxes(-1, -2)))
+    directions = np.linalg.solve(lower.swapaxes(-1, -2), directions)
+    return directions / (1 + np.maximum(size, 0.0))[:, None] @ directions.swapaxes(-1, -2)
+
+
+def _by_body(rows: Array, tree: Array) -> Array:
+    """Rows (n, k, nv) of pairs of bodies as rows (n, 2 k, nv) of one body each, by the tree (nv,) of each freedom."""
+    trees = np.unique(tree)
+    touched = np.stack([rows[:, :, tree == t].any(-1) for t in trees], -1)
+    first, last = touched.argmax(-1), len(trees) - 1 - touched[:, :, ::-1].argmax(-1)
+    one = rows * (trees[first][:, :, None] == tree)
+    return np.concatenate([one, (rows - one) * (trees[last][:, :, None] == tree)], 1)
+
+
+def _closing(place: Array, response: Array, found: Found) -> NDArray[np.bool_]:
     """Which contacts (n, n_contacts) close where bodies go to ζ (n, nv), as those below in a stack are held up."""
 
     def gap(place: Array) -> Array:
@@ -229,7 +373,7 @@ def _closing(place: Array, inverse_mass: Array, found: Found) -> NDArray[np.bool
 
     closing = gap(place) < 0
     for _ in range(closing.shape[1]):
-        held = place + _pushed(inverse_mass, found.normal * closing[:, :, None], np.where(closing, -gap(place), 0.0))
+        held = place + _pushed(response, found.normal * closing[:, :, None], np.where(closing, -gap(place), 0.0))
         more = closing | (gap(held) < 0)
         if (more == closing).all():
             break
@@ -237,17 +381,11 @@ def _closing(place: Array, inverse_mass: Array, found: Found) -> NDArray[np.bool
     return closing
 
 
-def _balanced(moved: Array, inverse_mass: Array, rows: Array, h: float) -> Array:
-    """What is added to ζ (n, nv), moved by loads as (ζ, ν) `moved`, where contacts `rows` are about to balance them."""
-    nv = moved.shape[-1] // 2
-    return _pushed(inverse_mass, rows, (rows @ (h * moved[:, nv:] - moved[:, :nv])[:, :, None])[:, :, 0])
-
-
-def _pushed(inverse_mass: Array, rows: Array, by: Array) -> Array:
-    """How far ζ (n, nv) goes when forces along `rows` (n, n_contacts, nv) move these `by` (n, n_contacts)."""
+def _pushed(response: Array, rows: Array, by: Array, forces: Array | None = None) -> Array:
+    """How far ζ (n, nv) goes when `forces` (n, k, nv), or those along `rows` (n, k, nv), move these `by` (n, k)."""
     if not rows.any():
         return np.zeros((len(rows), rows.shape[-1]))
-    gives = inverse_mass @ rows.swapaxes(-1, -2)
+    gives = response @ (rows if forces is None else forces).swapaxes(-1, -2)
     inner = rows @ gives
     # Contacts of one face are not independent.
     scale = np.trace(inner, axis1=-2, axis2=-1)[:, None, None]
