@@ -35,7 +35,7 @@ from difflcs._linalg import matvec
 from difflcs.errors import FrictionWarning, InvalidInputError, ShapeError
 from difflcs.records import LCSParams
 
-__all__ = ["Cone", "Contacts", "FreeMotion", "contact_lcs", "count_forces", "normal_forces"]
+__all__ = ["Cone", "Contacts", "FreeMotion", "contact_lcs", "count_forces"]
 
 Cone = Literal["anitescu", "stewart-trinkle"]
 
@@ -92,6 +92,7 @@ def contact_lcs(
     cone: Cone = "anitescu",
     length: float = 1.0,
     force: float | None = None,
+    rest: Tensor | None = None,
 ) -> LCSParams:
     """One step with contact as a linear complementarity system, linearised at some states.
 
@@ -106,6 +107,7 @@ def contact_lcs(
             length · force, so that with a typical length it does not depend on whether x is in metres or in pixels.
         force: unit in which it counts forces; None: the number of `length`, right for a quasi-static body of mobility
             1.
+        rest: (..., n_lam) forces from which the compliance counts, which so close no gap; None: zero.
 
     Returns:
         The system, one per state: n_lam = n_contacts without tangents, 2 n_tangents per contact with the cone of
@@ -126,7 +128,7 @@ def contact_lcs(
     mu = _each("friction", friction, contacts.gap, strict=False)
     soft = _each("compliance", compliance, contacts.gap, strict=True) * (force / length)
     if n_tangents and cone == "stewart-trinkle":
-        return _stewart_trinkle(contacts, free, x, mu, soft, length, force)
+        return _stewart_trinkle(contacts, free, x, mu, soft, length, force, rest)
     rows, gap, softness = _rays(contacts, mu, soft) if n_tangents else (contacts.normal, contacts.gap, soft)
     normals = contacts.normal.repeat_interleave(2 * n_tangents, -2) if n_tangents else rows
     C = (free.response @ rows.mT) * force
@@ -135,13 +137,8 @@ def contact_lcs(
     F = 0.5 * (F + F.mT) + torch.diag_embed(softness.expand(F.shape[:-1]))
     D = rows @ free.A - (rows - normals)
     c = gap / length + matvec(rows, free.d) - matvec(normals, x)
+    c = c if rest is None else c - softness * rest / force
     return LCSParams(A=free.A, B=free.B, C=C, d=free.d, D=D, E=rows @ free.B, F=F, c=c)
-
-
-def normal_forces(lam: Tensor, n_contacts: int, n_tangents: int, cone: Cone) -> Tensor:
-    """Normal force (..., n_contacts) of each contact, of the complementarity variable (..., n_lam) of such a system."""
-    each = lam.reshape(*lam.shape[:-1], n_contacts, -1)
-    return each[..., 0] if n_tangents and cone == "stewart-trinkle" else each.sum(-1)
 
 
 def _check_shapes(contacts: Contacts, free: FreeMotion, n_x: int, n_contacts: int, n_tangents: int) -> None:
@@ -202,7 +199,14 @@ def _check_drag(drag: Tensor, W: Tensor, normals: Tensor, mu: Tensor) -> None:
 
 
 def _stewart_trinkle(
-    contacts: Contacts, free: FreeMotion, x: Tensor, mu: Tensor, soft: Tensor, length: float, force: float
+    contacts: Contacts,
+    free: FreeMotion,
+    x: Tensor,
+    mu: Tensor,
+    soft: Tensor,
+    length: float,
+    force: float,
+    rest: Tensor | None,
 ) -> LCSParams:
     # Forces of a contact: normal, then along ± each tangent; then σ, the distance that it slides:
     #   0 ≤ λ_n ⊥ gap after the step ≥ 0,  0 ≤ β ⊥ σ ± t·slide ≥ 0,  0 ≤ σ ⊥ μ λ_n − Σ β + ε σ ≥ 0.
@@ -242,6 +246,7 @@ def _stewart_trinkle(
 
     gap = (contacts.gap.unsqueeze(-1) * is_normal).flatten(-2) / length
     c = gap + matvec(rows, free.d) - matvec(rows - along, x)
+    c = c if rest is None else c - soft.repeat_interleave(per, -1) * rest[..., forces.to(x.device)] / force
     return LCSParams(
         A=free.A,
         B=free.B,

@@ -16,9 +16,10 @@ from torch import Tensor
 
 from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor, describe
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError
-from difflcs.physics.contacts import Cone, Contacts, FreeMotion, contact_lcs, count_forces, normal_forces
-from difflcs.physics.mujoco.contacts import ContactFinder, Pairs
-from difflcs.physics.mujoco.motion import Actuators, Dynamic, DynamicStep, QuasiStatic
+from difflcs.physics.contacts import Cone, Contacts, FreeMotion, contact_lcs, count_forces
+from difflcs.physics.mujoco.contacts import ContactFinder, Found, Pairs
+from difflcs.physics.mujoco.motion import Actuators, Dynamic, QuasiStatic
+from difflcs.physics.mujoco.nominal import Recovery, at_nominal
 from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams
 
@@ -119,7 +120,7 @@ class MujocoLCS:
         self._quasi_static = motion == "quasi-static"
         mobility = mobility if isinstance(mobility, str) else np.asarray(mobility)
         if self._quasi_static:
-            self._motion: Any = QuasiStatic(model, self._actuators, mobility)
+            self._motion: QuasiStatic | Dynamic = QuasiStatic(model, self._actuators, mobility)
         else:
             for where, friction_loss in (("joints", model.dof_frictionloss), ("tendons", model.tendon_frictionloss)):
                 if (friction_loss > 0).any():
@@ -128,7 +129,7 @@ class MujocoLCS:
                         'replace it by damping, or use motion="quasi-static"'
                     )
             self._motion = Dynamic(model, self._actuators, self.seconds, relative)
-        self._recovery = _recovery(model)
+        self._recovery = Recovery(model)
         self._ctrl = None if ctrl is None else self._controls(torch.as_tensor(ctrl), torch.Size()).reshape(-1)
         length = _typical_radius(model) if length is None else check_number("length", length, strict=True)
         distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
@@ -169,60 +170,43 @@ class MujocoLCS:
             raise InvalidInputError(
                 "x: expected states (..., n_x), as contacts depend on where things are, got None; pass x"
             )
-        look = self._look(x, context)
-        found = self._system(look)
-        return found if x.dtype == torch.float64 and x.is_cpu else found.to(device=x.device, dtype=x.dtype)
+        read = self._read(x, context)
+        found, rest = read.found, None
+        if isinstance(self._motion, QuasiStatic):
+            free = self._motion.finish(read.moved, read.x, read.tangent)
+        else:
+            step, opens = self._motion.finish(read.moved, read.x), self.cone == "anitescu"
+            nominal = at_nominal(step, found, read.geom, self._recovery, self._give, self.compliance, opens)
+            found, rest = nominal.found, read.batched(self._of_cone(nominal.forces))
+            free = step.free(read.tangent, nominal.carried)
+        ranks = zip(free, (2, 2, 1, 2), strict=True)
+        system = contact_lcs(
+            read.contacts(found),
+            FreeMotion(*(read.batched(v) if v.ndim > rank else v for v, rank in ranks)),
+            read.batched(read.x),
+            friction=read.batched(found.friction),
+            compliance=self.compliance * self._give,
+            cone=self.cone,
+            length=self.length,
+            force=self.length / self._give,
+            rest=rest,
+        )
+        return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
 
-    def _system(self, look: _Look) -> LCSParams:
-        """In float64. What contacts do at the nominal action says which slide, and what they carry."""
-
-        def system(contacts: Contacts, free: FreeMotion) -> LCSParams:
-            return contact_lcs(
-                contacts,
-                free,
-                look.x,
-                friction=look.friction,
-                compliance=self.compliance * self._give,
-                cone=self.cone,
-                length=self.length,
-                force=self.length / self._give,
-            )
-
-        if self._quasi_static or not self.n_lam:
-            return system(look.contacts, look.free())
-        # What contacts do at the nominal action, where all that close hold.
-        x, idle, contacts = look.x, look.idle, look.contacts
-        held = system(contacts._replace(gap=contacts.gap.clamp_min(0.0)), look.free())
-        first, apart = held.step(x, idle), held.next_state(x, idle, x.new_zeros(self.n_lam))
-        normal = normal_forces(first.lam, self.n_contacts, self._finder.n_tangents, self.cone)
-        contacts = contacts._replace(gap=self._settled(look, normal * (self.length / self._give / self.seconds)))
-        slide = _along(contacts.tangent, first.x_next - x)
-        hindered = _along(contacts.tangent, apart - x), _along(contacts.normal, apart - x)
-        slides = (normal > 0) & _far(slide, *hindered)
-        if self.cone == "anitescu" and self._finder.n_tangents == 2:
-            contacts = contacts._replace(tangent=_turned(contacts.tangent, slide))
-        found = system(contacts, look.free(slide * slides.unsqueeze(-1)))
-        # Compliance counts from the forces that the nominal action has: what rests does not creep. A contact that
-        # slides by s opens by μ s in Anitescu's model, as its gap is n·Δx − μ s: not where it slides anyway.
-        own = self.n_lam // self.n_contacts
-        give, opens = x.new_full((own,), self.compliance), slides * look.friction / self.length
-        if self.cone == "stewart-trinkle":
-            give[own - 1 :] *= float(own == 1)  # the last is a distance, and no force
-            opens = 0.0 * opens
-        c, lam, far = found.c, 0.0 * first.lam, slide.norm(dim=-1)
-        for _ in range(3):
-            rest = (opens * far).unsqueeze(-1) - give * lam.reshape(*lam.shape[:-1], self.n_contacts, own)
-            found = LCSParams.of_checked(found.tensors() | {"c": c + rest.flatten(-2)})
-            moved, lam = found.step(x, idle)
-            far = _along(contacts.tangent, moved - x).norm(dim=-1)
-        return found
+    def _of_cone(self, forces: Any) -> Any:
+        """Forces (n, n_lam) of the system's cone, of those (n, n_contacts, n_rays) along the rays of Anitescu's."""
+        each = self.n_lam // self.n_contacts
+        if each != forces.shape[-1]:  # Stewart and Trinkle: normal, tangential, and the distance
+            forces = np.concatenate([forces.sum(-1, keepdims=True), np.zeros((*forces.shape[:2], each - 1))], -1)
+        return forces.reshape(len(forces), -1)
 
     def contacts(self, x: Tensor) -> Contacts:
         """Gaps and their derivatives at states x (..., n_x).
 
         Contacts that are missing have a gap of `distance`, and zeros.
         """
-        return self._look(x).contacts
+        read = self._read(x)
+        return read.contacts(read.found)
 
     def control(self, x: Tensor, u: Tensor) -> Tensor:
         """MuJoCo's `ctrl` (..., nu) for actions u (..., n_u) at states x (..., n_x).
@@ -250,51 +234,32 @@ class MujocoLCS:
         check_tensor("ctrl", ctrl, [("n_u", self.n_u)])
         return ctrl.detach().double().cpu().expand(*batch, self.n_u).numpy()
 
-    def _settled(self, look: _Look, force: Tensor) -> Tensor:
-        """Gaps (..., n_contacts) without the depth at which MuJoCo's contacts carry normal forces `force` [N].
-
-        What is deeper comes out as fast as MuJoCo's contacts recover.
-        """
-        gap, out = look.contacts.gap, 1.0 - torch.exp(-self.seconds / look.recovers)
-        return torch.where(gap < 0, -out * (-gap - look.soft * force).clamp_min(0.0), gap)
-
-    def _look(self, x: Tensor, context: Tensor | None = None) -> _Look:
+    def _read(self, x: Tensor, context: Tensor | None = None) -> _States:
         qpos, qvel = self.state.to_mujoco(x)
-        batch, nv, model, data = x.shape[:-1], self.state.nv, self._model, self._data
-        n = int(np.prod(batch))
+        batch, model, data = x.shape[:-1], self._model, self._data
+        n = batch.numel()
         qpos, qvel = qpos.reshape(n, -1), qvel.reshape(n, -1)
         ctrl = [self._ctrl] * n if context is None else self._controls(context, batch).reshape(n, -1)
-        read, moved = self._finder.allocate(n), self._motion.allocate(n)
+        contacts, moved = self._finder.allocate(n), self._motion.allocate(n)
         for i in range(n):
             data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
             mujoco.mj_fwdPosition(model, data)
-            self._finder.read(i, read)
+            self._finder.read(i, contacts)
             self._motion.read(i, data, moved, ctrl[i])
-        x64 = x.detach().double().cpu()
-        flat = x64.reshape(n, self.n_x).numpy()
-        tangent = self.state.tangent(flat[:, :nv])
-        found = self._finder.finish(read)
-        step = self._motion.finish(moved, flat, tangent, found)
-        normal, slide = found.normal, found.tangent
-        if tangent is not None:
-            normal, slide = normal @ tangent, slide @ tangent[:, None]
-        soft = recovers = np.ones_like(found.gap)
-        if not self._quasi_static:
-            normal, slide = (np.concatenate([v, np.zeros_like(v)], -1) for v in (normal, slide))
-            moves = moved.inverse_mass @ found.normal.swapaxes(-1, -2)
-            square, depth = (table[read.geom].max(-1) for table in self._recovery)
-            recovers, soft = np.sqrt(square), depth * np.einsum("nkv,nvk->nk", found.normal, moves)
-        contacts = Contacts(*(_batched(v, batch) for v in (found.gap, normal, slide)))
-        each = (_batched(v, batch) for v in (found.friction, soft, recovers))
-        return _Look(batch, x64, contacts, *each, step)
+        flat = x.detach().double().cpu().reshape(n, self.n_x).numpy()
+        tangent = self.state.tangent(flat[:, : self.state.nv])
+        return _States(batch, flat, tangent, self._finder.finish(contacts), contacts.geom, moved)
 
     def _typical_response(self) -> float:
         """How far a unit of force moves two bodies apart that may touch, the median over their pairs."""
         model, data, nv = self._model, self._data, self.state.nv
-        moved, none = self._motion.allocate(1), self._finder.finish(self._finder.allocate(1))
+        moved = self._motion.allocate(1)
         self._motion.read(0, data, moved)
-        step = self._motion.finish(moved, np.zeros((1, self.n_x)), None, none)
-        response = _free(step).response.reshape(-1, self.n_x, self.n_x)[0, :nv, :nv].numpy()
+        x = np.zeros((1, self.n_x))
+        if isinstance(self._motion, QuasiStatic):
+            response = self._motion.finish(moved, x, None).response.reshape(-1, nv, nv)[0].numpy()
+        else:
+            response = self.seconds * self._motion.finish(moved, x).response[0]
         jacobian, gives = np.empty((3, nv)), np.empty(model.ngeom)
         for geom in range(model.ngeom):
             mujoco.mj_jacGeom(model, data, jacobian, None, geom)
@@ -309,85 +274,37 @@ class MujocoLCS:
         return float(np.median(apart)) if len(apart) else 1.0
 
 
-class _Look(NamedTuple):
-    """States and what was found there.
+class _States(NamedTuple):
+    """What was read at n states.
 
     Attributes:
-        batch: of the states.
-        x: (..., n_x) in float64.
-        contacts: gaps and their derivatives.
-        friction: (..., n_contacts).
-        soft: (..., n_contacts) depth at which MuJoCo's contact carries a unit of force [m/N].
-        recovers: (..., n_contacts) time constant of that contact [s].
-        step: the motion without contact.
+        batch: their batch dimensions.
+        x: (n, n_x).
+        tangent: of their rotations, see `MujocoState.tangent`.
+        found: contacts, of geoms `geom` (n, n_contacts, 2).
+        moved: what the motion has read.
     """
 
     batch: torch.Size
-    x: Tensor
-    contacts: Contacts
-    friction: Tensor
-    soft: Tensor
-    recovers: Tensor
-    step: FreeMotion | DynamicStep
+    x: Any
+    tangent: Any
+    found: Found
+    geom: Any
+    moved: Any
 
-    @property
-    def idle(self) -> Tensor:
-        """(..., n_u) the nominal action."""
-        return _batched(self.step.idle, self.batch)
+    def batched(self, value: Any) -> Tensor:
+        """An array (n, ...) as a tensor."""
+        value = torch.as_tensor(value)
+        return value.reshape(*self.batch, *value.shape[1:])
 
-    def free(self, slide: Tensor | None = None) -> FreeMotion:
-        """The motion without contact, where contacts slide by (..., n_contacts, n_tangents)."""
-        free = _free(self.step, None if slide is None else slide.reshape(self.batch.numel(), *slide.shape[-2:]).numpy())
-        fields = zip(free, (2, 2, 1, 2), strict=True)
-        return FreeMotion(*(_batched(v, self.batch) if v.ndim > rank else v for v, rank in fields))
-
-
-def _free(step: FreeMotion | DynamicStep, slide: Any = None) -> FreeMotion:
-    return step if isinstance(step, FreeMotion) else step.free(slide)
-
-
-def _batched(value: Any, batch: torch.Size) -> Tensor:
-    value = torch.as_tensor(value)
-    return value.reshape(*batch, *value.shape[1:])
-
-
-def _along(rows: Tensor, by: Tensor) -> Tensor:
-    """How far a motion (..., n_x) goes along normals (..., n_contacts, n_x) or tangents (..., n, n_tangents, n_x)."""
-    return (rows @ by.reshape(*by.shape[:-1], *(1,) * (rows.ndim - by.ndim - 1), -1, 1))[..., 0]
-
-
-def _far(slide: Tensor, unhindered: Tensor, closes: Tensor) -> Tensor:
-    """Which contacts (..., n_contacts) slide and do not merely creep, beside what they would do without contact.
-
-    Args:
-        slide: (..., n_contacts, n_tangents).
-        unhindered: the same without contact.
-        closes: (..., n_contacts) along the normals without contact.
-    """
-    sideways, down = unhindered.norm(dim=-1).amax(-1, keepdim=True), closes.abs().amax(-1, keepdim=True)
-    return slide.norm(dim=-1) > torch.maximum(0.2 * sideways, 0.05 * down)
-
-
-def _recovery(model: Any) -> tuple[Any, Any]:
-    """Of each geom's contacts, by `solref` and `solimp`: 1/k [s²], and the depth for an acceleration carried [s²].
-
-    MuJoCo's contact force at rest is d²/(1 − d) k r over what a unit of force accelerates, at depth r and impedance d.
-    """
-    (reference, ratio), impedance = model.geom_solref.T, np.clip(model.geom_solimp[:, :2], 1e-4, 0.9999).T
-    time = np.maximum(reference, 2 * model.opt.timestep)  # as MuJoCo's `refsafe`
-    square = np.where(
-        reference > 0, (impedance[1] * time * ratio) ** 2, impedance[1] ** 2 / np.maximum(-reference, 1e-9)
-    )
-    return square, square * (1 - impedance[0]) / impedance[0] ** 2
-
-
-def _turned(tangent: Tensor, slide: Tensor) -> Tensor:
-    """Tangents (..., n_contacts, 2, n_x), the first along where contacts slide: there the cone of rays is exact."""
-    far = slide.norm(dim=-1, keepdim=True)
-    along = torch.where(far > 1e-9, slide / far.clamp_min(1e-9), slide.new_tensor([1.0, 0.0]))
-    cos, sin = along[..., :1], along[..., 1:]
-    first, second = tangent.unbind(-2)
-    return torch.stack([cos * first + sin * second, cos * second - sin * first], -2)
+    def contacts(self, found: Found) -> Contacts:
+        """Contacts by the state, of those by the degrees of freedom."""
+        rows = (found.normal, found.tangent)
+        if self.tangent is not None:
+            rows = (rows[0] @ self.tangent, rows[1] @ self.tangent[:, None])
+        still = self.x.shape[-1] - found.normal.shape[-1]
+        rows = (np.concatenate([v, np.zeros((*v.shape[:-1], still))], -1) for v in rows)
+        return Contacts(*map(self.batched, (found.gap, *rows)))
 
 
 def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: Any) -> LCSParams:

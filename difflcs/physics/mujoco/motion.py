@@ -12,10 +12,6 @@ A contact force acts as one impulse f at the beginning of the step, implicitly, 
 way little: it changes ν by S f and ζ by h S f with S = (M + [h (−M D) + h² (−M K)]₊)⁻¹, where [·]₊ is the part of the
 symmetric matrix that resists motion (its positive eigenvalues, in the metric of M). So S is positive definite in every
 state and for every step, also where Coriolis forces or an unstable equilibrium would make an implicit step indefinite.
-
-A load that acts all the time, such as gravity, moves a body by h²/2 in a step where that impulse moves it by h². So a
-contact that balances the place of a body at rest would leave it with a velocity. Where a contact is about to close,
-loads are therefore impulses at the beginning too: along its normal, and along its tangents where friction holds.
 """
 
 # MuJoCo is a compiled module without type stubs.
@@ -33,7 +29,6 @@ from torch import Tensor
 
 from difflcs.errors import InvalidInputError
 from difflcs.physics.contacts import FreeMotion
-from difflcs.physics.mujoco.contacts import Found
 
 Array = NDArray[np.float64]
 
@@ -132,9 +127,8 @@ class QuasiStatic:
         if self.mobility is None:
             mujoco.mj_solveM(self.model, data, arrays[i], np.eye(self.model.nv))
 
-    def finish(self, arrays: Array, x: Array, tangent: Array | None, found: Found) -> FreeMotion:
-        """The motion at states x (n, nv), whatever touches."""
-        del found
+    def finish(self, arrays: Array, x: Array, tangent: Array | None) -> FreeMotion:
+        """The motion at states x (n, nv), for the tangent of their rotations."""
         n, nv = x.shape
         if self.mobility is None:
             block = np.ix_(np.arange(n), self.pushed, self.pushed)
@@ -210,8 +204,8 @@ class Dynamic:
         mujoco.mj_step(self.model, data, substeps)
         options.disableflags, options.timestep = before
 
-    def finish(self, read: Linearised, x: Array, tangent: Array | None, found: Found) -> DynamicStep:
-        """The motion at states x (n, 2 nv), with these contacts."""
+    def finish(self, read: Linearised, x: Array) -> DynamicStep:
+        """The motion at states x (n, 2 nv)."""
         nv, h = self.model.nv, self.seconds
         K, D, B = read.A[:, nv:, :nv], read.A[:, nv:, nv:] - np.eye(nv), read.B[:, nv:]
         load = read.acceleration - np.einsum("nij,nj->ni", D, x[:, nv:])  # with ν = 0, ζ = 0 and u = ū
@@ -220,7 +214,11 @@ class Dynamic:
         # Of a step in which a motion grows beyond all bounds, what is linear and explicit says nothing.
         step, implicit = self._steps(mass, forces), self._implicit(response @ mass, forces)
         step = np.where((np.abs(step).max((1, 2)) < _BEYOND)[:, None, None], step, implicit)
-        return DynamicStep(self, read, x, tangent, found, step, response, implicit[:, :, -1] - step[:, :, -1])
+        loads = implicit[:, :, -1] - step[:, :, -1]
+        linear = step[:, :, -1] + np.einsum("nij,nj->ni", step[:, :, nv : 2 * nv], x[:, nv:])
+        reached = np.where((np.abs(read.reached).max(1) < _BEYOND)[:, None], read.reached, linear)
+        step[:, :, -1] += reached - linear
+        return DynamicStep(self, x, step, response, read.inverse_mass, loads, reached[:, :nv], read.nominal)
 
     def _steps(self, mass: Array, forces: Array) -> Array:
         """(ζ, ν) after the step as a matrix (n, 2 nv, 2 nv + nu + 1) of ζ, ν, u − ū and 1; `forces` is that of ν̇."""
@@ -271,48 +269,44 @@ class Linearised(NamedTuple):
     reached: Array
 
 
-class DynamicStep:
-    """A step from some states, as the contacts there change it.
+class DynamicStep(NamedTuple):
+    """A step from n states.
 
     Attributes:
+        motion: whose step it is.
+        x: (n, 2 nv) the states.
+        step: (n, 2 nv, 2 nv + nu + 1) (ζ, ν) afterwards, of ζ, ν, u − ū and 1.
+        response: (n, nv, nv) S.
+        inverse_mass: (n, nv, nv).
+        loads: (n, 2 nv) what an implicit step would add to the part of 1, without velocity.
+        place: (n, nv) ζ afterwards with the nominal action.
         idle: (n, nu) the nominal action.
     """
 
-    def __init__(
-        self,
-        motion: Dynamic,
-        read: Linearised,
-        x: Array,
-        tangent: Array | None,
-        found: Found,
-        step: Array,
-        response: Array,
-        loads: Array,
-    ):
-        nv = motion.model.nv
-        self._motion, self._x, self._tangent, self._found = motion, x, tangent, found
-        self._response, self._loads, self.idle = response, loads, read.nominal
-        linear = step[:, :, -1] + np.einsum("nij,nj->ni", step[:, :, nv : 2 * nv], x[:, nv:])
-        reached = np.where((np.abs(read.reached).max(1) < _BEYOND)[:, None], read.reached, linear)
-        step[:, :, -1] += reached - linear
-        self._step = step
-        self._closing = _closing(reached[:, :nv], response, found)
+    motion: Dynamic
+    x: Array
+    step: Array
+    response: Array
+    inverse_mass: Array
+    loads: Array
+    place: Array
+    idle: Array
 
-    def free(self, slide: Array | None = None) -> FreeMotion:
-        """The motion without contact if contacts slide by (n, n_contacts, n_tangents) and friction holds the others."""
-        motion, x, tangent, found = self._motion, self._x, self._tangent, self._found
+    @property
+    def seconds(self) -> float:
+        """Of the step."""
+        return self.motion.seconds
+
+    @property
+    def tree(self) -> NDArray[np.intp]:
+        """(nv,) which degrees of freedom belong together: those of different trees move each other by contacts alone."""
+        return self.motion.tree
+
+    def free(self, tangent: Array | None, carried: Array | float = 0.0) -> FreeMotion:
+        """The motion without contact, with `carried` (n, 2 nv) added, for the tangent of the state's rotations."""
+        motion, x, step = self.motion, self.x, self.step.copy()
         n, nv, h = len(x), motion.model.nv, motion.seconds
-        step = self._step.copy()
-        slides = np.zeros_like(self._closing) if slide is None else slide.any(-1)
-        holds = self._closing & ~slides & (found.friction > 0)
-        tangents = np.moveaxis(found.tangent, 2, 0) * holds[:, :, None]
-        normals = found.normal * self._closing[:, :, None]
-        rows = np.concatenate([normals, *tangents], 1)
-        forces = rows if slide is None else np.concatenate([normals - self._drag(slide), *tangents], 1)
-        rows, forces = _by_body(rows, motion.tree), _by_body(forces, motion.tree)
-        for part in (slice(0, nv), slice(nv, 2 * nv)):
-            by = np.einsum("nkv,nv->nk", rows, self._loads[:, part])
-            step[:, part, -1] += _pushed(self._response, rows, by, forces)
+        step[:, :, -1] += carried
         # The control of a servo is held through the step, at a distance from where the joint was at its beginning.
         control = step[:, :, 2 * nv : -1]
         step[:, :, :nv] += control @ motion.moment
@@ -326,19 +320,9 @@ class DynamicStep:
         at = np.concatenate([x[:, :nv], np.zeros((n, nv))], -1)
         A_x = to_x @ step[:, :, : 2 * nv] @ of_x
         d = at - np.einsum("nij,nj->ni", A_x, at) + np.einsum("nij,nj->ni", to_x, step[:, :, -1])
-        impulse, response = self._response, np.zeros((n, 2 * nv, 2 * nv))
+        impulse, response = self.response, np.zeros((n, 2 * nv, 2 * nv))
         response[:, :, :nv] = to_x @ np.concatenate([h * impulse, impulse], 1) @ to_x[:, :nv, :nv].swapaxes(-1, -2)
         return FreeMotion(*(torch.from_numpy(v) for v in (A_x, to_x @ control, d, response)))
-
-    def _drag(self, slide: Array) -> Array:
-        """Friction of contacts that slide, as rows (n, n_contacts, nv) for a unit of normal force."""
-        found, size = self._found, np.linalg.norm(slide, axis=-1, keepdims=True)
-        drag = np.einsum("nkt,nktv->nkv", slide / np.where(size > 0, size, 1.0), found.tangent)
-        drag = drag * (found.friction * self._closing)[:, :, None]
-        gives = found.normal @ self._response
-        # Friction that presses what it holds back into the contact could jam it; so much of it is left out.
-        presses, yields = ((gives * rows).sum(-1) for rows in (drag, found.normal))
-        return drag * np.minimum(1.0, 0.7 * yields / np.maximum(presses, 1e-300))[:, :, None]
 
 
 def _flags(*names: str) -> int:
@@ -354,41 +338,3 @@ def _implicit_response(mass: Array, K: Array, D: Array, h: float) -> Array:
     size, directions = np.linalg.eigh(0.5 * (scaled + scaled.swapaxes(-1, -2)))
     directions = np.linalg.solve(lower.swapaxes(-1, -2), directions)
     return directions / (1 + np.maximum(size, 0.0))[:, None] @ directions.swapaxes(-1, -2)
-
-
-def _by_body(rows: Array, tree: Array) -> Array:
-    """Rows (n, k, nv) of pairs of bodies as rows (n, 2 k, nv) of one body each, by the tree (nv,) of each freedom."""
-    trees = np.unique(tree)
-    touched = np.stack([rows[:, :, tree == t].any(-1) for t in trees], -1)
-    first, last = touched.argmax(-1), len(trees) - 1 - touched[:, :, ::-1].argmax(-1)
-    one = rows * (trees[first][:, :, None] == tree)
-    return np.concatenate([one, (rows - one) * (trees[last][:, :, None] == tree)], 1)
-
-
-def _closing(place: Array, response: Array, found: Found) -> NDArray[np.bool_]:
-    """Which contacts (n, n_contacts) close where bodies go to ζ (n, nv), as those below in a stack are held up."""
-
-    def gap(place: Array) -> Array:
-        return found.gap + np.einsum("nkv,nv->nk", found.normal, place)
-
-    closing = gap(place) < 0
-    for _ in range(closing.shape[1]):
-        held = place + _pushed(response, found.normal * closing[:, :, None], np.where(closing, -gap(place), 0.0))
-        more = closing | (gap(held) < 0)
-        if (more == closing).all():
-            break
-        closing = more
-    return closing
-
-
-def _pushed(response: Array, rows: Array, by: Array, forces: Array | None = None) -> Array:
-    """How far ζ (n, nv) goes when `forces` (n, k, nv), or those along `rows` (n, k, nv), move these `by` (n, k)."""
-    if not rows.any():
-        return np.zeros((len(rows), rows.shape[-1]))
-    gives = response @ (rows if forces is None else forces).swapaxes(-1, -2)
-    inner = rows @ gives
-    # Contacts of one face are not independent.
-    scale = np.trace(inner, axis1=-2, axis2=-1)[:, None, None]
-    inner += np.eye(inner.shape[-1]) * np.where(scale > 0, 1e-9 * scale, 1.0)
-    force = np.linalg.solve(inner, by[:, :, None])
-    return (gives @ force)[:, :, 0]
