@@ -21,7 +21,7 @@ from difflcs.physics.mujoco.contacts import Found
 from difflcs.physics.mujoco.motion import DynamicStep
 
 Array = NDArray[np.float64]
-_PASSES = 3  # each reduces what is left of compliance and opening by about their parts of the motion
+_PASSES = 2  # each reduces what is left of compliance and opening by about their parts of the motion
 
 
 class Nominal(NamedTuple):
@@ -134,9 +134,9 @@ def _closing(place: Array, response: Array, found: Found) -> NDArray[np.bool_]:
         return found.gap + np.einsum("nkv,nv->nk", found.normal, place)
 
     closing = gap(place) < 0
-    for _ in range(closing.shape[1]):
+    for _ in range(closing.shape[1] * int(closing.any())):
         rows = found.normal * closing[:, :, None]
-        held = place + _pushed(response, rows, rows, np.where(closing, -gap(place), 0.0))
+        held = place + _pushed(response, rows, rows, np.where(closing, -gap(place), 0.0)[:, :, None])[:, :, 0]
         more = closing | (gap(held) < 0)
         if (more == closing).all():
             break
@@ -161,9 +161,10 @@ def _carried(step: DynamicStep, found: Found, closing: NDArray[np.bool_], slide:
     normals = found.normal * closing[:, :, None]
     forces = normals - _drag(step, found, slide) * closing[:, :, None] if slides.any() else normals
     rows, forces = (_by_body(np.concatenate([v, *tangents], 1), step.tree) for v in (normals, forces))
-    parts = [step.loads[:, :nv], step.loads[:, nv:]]
-    by = [np.einsum("nkv,nv->nk", rows, part) for part in parts]
-    return np.concatenate([_pushed(step.response, rows, forces, part) for part in by], -1)
+    some = rows.any((0, 2))
+    rows, forces = rows[:, some], forces[:, some]
+    loads = np.stack([step.loads[:, :nv], step.loads[:, nv:]], -1)
+    return _pushed(step.response, rows, forces, rows @ loads).swapaxes(-1, -2).reshape(-1, 2 * nv)
 
 
 def _drag(step: DynamicStep, found: Found, slide: Array) -> Array:
@@ -189,16 +190,15 @@ def _by_body(rows: Array, tree: Array) -> Array:
 
 
 def _pushed(response: Array, rows: Array, forces: Array, by: Array) -> Array:
-    """How far ζ (n, nv) goes when forces along `forces` (n, k, nv) move it along `rows` (n, k, nv) by (n, k)."""
-    if not rows.any():
-        return np.zeros((len(rows), rows.shape[-1]))
+    """How far ζ (n, nv, m) goes when forces along `forces` (n, k, nv) move it along `rows` (n, k, nv) by (n, k, m)."""
+    if not rows.size:
+        return np.zeros((len(rows), rows.shape[-1], by.shape[-1]))
     gives = response @ forces.swapaxes(-1, -2)
     inner = rows @ gives
     # Contacts of one face are not independent.
     scale = np.trace(inner, axis1=-2, axis2=-1)[:, None, None]
     inner += np.eye(inner.shape[-1]) * np.where(scale > 0, 1e-9 * scale, 1.0)
-    force = np.linalg.solve(inner, by[:, :, None])
-    return (gives @ force)[:, :, 0]
+    return gives @ np.linalg.solve(inner, by)
 
 
 def _turned(tangent: Array, slide: Array) -> Array:
