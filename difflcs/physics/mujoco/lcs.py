@@ -129,11 +129,11 @@ class MujocoLCS:
                         'replace it by damping, or use motion="quasi-static"'
                     )
             self._motion = Dynamic(model, self._actuators, self.seconds, relative)
-        self._recovery = Recovery(model)
         self._ctrl = None if ctrl is None else self._controls(torch.as_tensor(ctrl), torch.Size()).reshape(-1)
         length = _typical_radius(model) if length is None else check_number("length", length, strict=True)
         distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
         self.length = length
+        self._recovery = Recovery(model, length)
         self._finder = ContactFinder(model, self._data, pairs, distance, length, contacts, friction)
         model.opt.disableflags |= sum(
             int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("EQUALITY", "FRICTIONLOSS", "LIMIT")

@@ -299,7 +299,7 @@ class DynamicStep(NamedTuple):
 
     @property
     def tree(self) -> NDArray[np.intp]:
-        """(nv,) which degrees of freedom belong together: those of different trees move each other by contacts alone."""
+        """(nv,) degrees of freedom that belong together: those of different trees move each other by contacts alone."""
         return self.motion.tree
 
     def free(self, tangent: Array | None, carried: Array | float = 0.0) -> FreeMotion:

@@ -21,6 +21,8 @@ from difflcs.physics.mujoco.contacts import Found
 from difflcs.physics.mujoco.motion import DynamicStep
 
 Array = NDArray[np.float64]
+_USUAL, _LOAD = 0.02, 100.0  # depth of contacts in parts of the length, acceleration [m/s²], both of any load
+_SOFTER = 0.1  # of the compliance: how exactly forces are found
 _PASSES = 2  # each reduces what is left of compliance and opening by about their parts of the motion
 
 
@@ -42,9 +44,14 @@ class Recovery:
     """How deep MuJoCo's contacts lie under a load, and how fast they come out, by `solref` and `solimp` of the geoms.
 
     A contact force at rest is d²/(1 − d) k r over what a unit of force accelerates, at depth r and impedance d.
+
+    Args:
+        model: the MuJoCo model.
+        length: of what touches [m].
     """
 
-    def __init__(self, model: Any):
+    def __init__(self, model: Any, length: float):
+        self._usual = _USUAL * length
         (reference, ratio), impedance = model.geom_solref.T, np.clip(model.geom_solimp[:, :2], 1e-4, 0.9999).T
         time = np.maximum(reference, 2 * model.opt.timestep)  # as MuJoCo's `refsafe`
         given = impedance[1] ** 2 / np.maximum(-reference, 1e-9)
@@ -54,10 +61,12 @@ class Recovery:
     def settled(self, gap: Array, geom: NDArray[np.intp], acceleration: Array, seconds: float) -> Array:
         """Gaps (n, n_contacts) of geoms (n, n_contacts, 2) that carry accelerations (n, n_contacts), after a step.
 
-        What is deeper than the load explains comes out as fast as MuJoCo's contacts recover.
+        What is deeper than the load explains, or a load that only the action makes, comes out as fast as MuJoCo's
+        contacts recover.
         """
         time, depth = self._time[geom].max(-1), self._depth[geom].max(-1)
-        deeper = np.maximum(-gap - depth * acceleration, 0.0)
+        usual = np.minimum(depth * _LOAD, self._usual)
+        deeper = np.maximum(-gap - np.maximum(depth * acceleration, usual), 0.0)
         return np.where(gap < 0, -deeper * (1 - np.exp(-seconds / time)), gap)
 
 
@@ -94,15 +103,18 @@ def at_nominal(
     compliance: float,
     opens: bool,
 ) -> Nominal:
-    """What contacts do.
+    """What contacts do at the nominal action.
 
     Args:
         step: the motion without contact.
-        found: contacts, of geoms (n, n_contacts, 2).
+        found: contacts.
         recovery: of MuJoCo's contacts.
-        give: how far a unit of impulse moves two bodies apart [m/(N s)], of which `compliance` is a part.
+        geom: their geoms (n, n_contacts, 2).
+        give: how far a unit of impulse moves two bodies apart [m/(N s)].
+        compliance: of contacts, in parts of `give`.
         opens: whether the model of friction is Anitescu's, in which sliding contacts open.
     """
+    compliance *= _SOFTER
     closing = _closing(step.place, step.response, found)
     carried = _carried(step, found, closing, np.zeros(found.tangent.shape[:3]))
     nv = step.place.shape[1]
@@ -112,8 +124,8 @@ def at_nominal(
     )
     normal = forces.sum(-1)
     slide = np.einsum("nktv,nv->nkt", found.tangent, place)
-    slides = (normal > 0) & _slides(slide, found, step.place + carried[:, :nv])
     acceleration = np.einsum("nkv,nvw,nkw->nk", found.normal, step.inverse_mass, found.normal) * normal / step.seconds
+    slides = _loaded(acceleration, step, found) & _slides(slide, found, step.place + carried[:, :nv])
     gap = recovery.settled(found.gap, geom, acceleration, step.seconds)
     found = found._replace(tangent=_turned(found.tangent, slide))
     slide = np.einsum("nktv,nv->nkt", found.tangent, place) * slides[:, :, None]
@@ -142,6 +154,13 @@ def _closing(place: Array, response: Array, found: Found) -> NDArray[np.bool_]:
             break
         closing = more
     return closing
+
+
+def _loaded(acceleration: Array, step: DynamicStep, found: Found) -> NDArray[np.bool_]:
+    """Which contacts (n, n_contacts) have a part in what carries the loads, by the accelerations of their forces."""
+    loads = step.loads[:, : step.place.shape[1], None]
+    parts = [np.abs(found.normal @ loads)[..., 0], *np.abs(found.tangent @ loads[:, None])[..., 0].transpose(2, 0, 1)]
+    return acceleration * step.seconds**2 > 0.1 * np.max(parts, (0, 2))[:, None]
 
 
 def _slides(slide: Array, found: Found, place: Array) -> NDArray[np.bool_]:
