@@ -129,7 +129,8 @@ class MujocoLCS:
                         'replace it by damping, or use motion="quasi-static"'
                     )
             self._motion = Dynamic(model, self._actuators, self.seconds, relative)
-        self._ctrl = None if ctrl is None else self._controls(torch.as_tensor(ctrl), torch.Size()).reshape(-1)
+        given = self._data.ctrl if ctrl is None else self._controls(torch.as_tensor(ctrl), torch.Size())
+        self._ctrl = np.where(self._actuators.holds & (ctrl is None), np.nan, given)
         length = _typical_radius(model) if length is None else check_number("length", length, strict=True)
         distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
         self.length = length
@@ -254,7 +255,7 @@ class MujocoLCS:
         """How far a unit of force moves two bodies apart that may touch, the median over their pairs."""
         model, data, nv = self._model, self._data, self.state.nv
         moved = self._motion.allocate(1)
-        self._motion.read(0, data, moved)
+        self._motion.read(0, data, moved, self._ctrl)
         x = np.zeros((1, self.n_x))
         if isinstance(self._motion, QuasiStatic):
             response = self._motion.finish(moved, x, None).response.reshape(-1, nv, nv)[0].numpy()
@@ -352,7 +353,7 @@ def _check_model(model: Any, data: Any) -> None:
 
 def _take(into: Any, data: Any) -> None:
     """What is not in the state, from the caller's data."""
-    for name in ("qpos", "mocap_pos", "mocap_quat", "qfrc_applied", "xfrc_applied"):
+    for name in ("qpos", "ctrl", "mocap_pos", "mocap_quat", "qfrc_applied", "xfrc_applied"):
         own, values = getattr(into, name), getattr(data, name)
         if values.shape != own.shape:
             raise InvalidInputError(

@@ -121,7 +121,7 @@ class QuasiStatic:
         """Inverse mass matrices of n states."""
         return np.zeros((n, self.model.nv, self.model.nv))
 
-    def read(self, i: int, data: Any, arrays: Array, ctrl: Array | None = None) -> None:
+    def read(self, i: int, data: Any, arrays: Array, ctrl: Array) -> None:
         """At the state in `data`, for which `mj_fwdPosition` was called; whatever the controls are."""
         del ctrl
         if self.mobility is None:
@@ -174,13 +174,13 @@ class Dynamic:
         sizes = ((nv,), (2 * nv, 2 * nv), (2 * nv, nu), (nv, nv), (nu,), (2 * nv,))
         return Linearised(*(np.zeros((n, *size)) for size in sizes))
 
-    def read(self, i: int, data: Any, into: Linearised, ctrl: Array | None = None) -> None:
-        """At the state in `data`, for which `mj_fwdPosition` was called, and a nominal control (nu,), or balance."""
+    def read(self, i: int, data: Any, into: Linearised, ctrl: Array) -> None:
+        """At the state in `data`, for which `mj_fwdPosition` was called, and nominal controls (nu,); NaN: balance."""
         model, options = self.model, self.model.opt
         before = options.disableflags, options.timestep, options.integrator
         qpos, qvel = data.qpos.copy(), data.qvel.copy()
         mujoco.mj_solveM(model, data, into.inverse_mass[i], np.eye(model.nv))
-        data.ctrl[:] = self.actuators.balance(data.actuator_length) if ctrl is None else ctrl
+        data.ctrl[:] = np.where(np.isnan(ctrl), self.actuators.balance(data.actuator_length), ctrl)
         into.nominal[i] = data.ctrl
         into.nominal[i, self.relative] -= data.actuator_length[self.relative]
         self._simulate(data, self.substeps // 2)
@@ -214,11 +214,10 @@ class Dynamic:
         # Of a step in which a motion grows beyond all bounds, what is linear and explicit says nothing.
         step, implicit = self._steps(mass, forces), self._implicit(response @ mass, forces)
         step = np.where((np.abs(step).max((1, 2)) < _BEYOND)[:, None, None], step, implicit)
-        loads = implicit[:, :, -1] - step[:, :, -1]
         linear = step[:, :, -1] + np.einsum("nij,nj->ni", step[:, :, nv : 2 * nv], x[:, nv:])
         reached = np.where((np.abs(read.reached).max(1) < _BEYOND)[:, None], read.reached, linear)
         step[:, :, -1] += reached - linear
-        return DynamicStep(self, x, step, response, read.inverse_mass, loads, reached[:, :nv], read.nominal)
+        return DynamicStep(self, x, step, implicit - step, response, read.inverse_mass, reached[:, :nv], read.nominal)
 
     def _steps(self, mass: Array, forces: Array) -> Array:
         """(ζ, ν) after the step as a matrix (n, 2 nv, 2 nv + nu + 1) of ζ, ν, u − ū and 1; `forces` is that of ν̇."""
@@ -276,9 +275,9 @@ class DynamicStep(NamedTuple):
         motion: whose step it is.
         x: (n, 2 nv) the states.
         step: (n, 2 nv, 2 nv + nu + 1) (ζ, ν) afterwards, of ζ, ν, u − ū and 1.
+        delayed: (n, 2 nv, 2 nv + nu + 1) what an implicit step, with all loads at its beginning, has more than that.
         response: (n, nv, nv) S.
         inverse_mass: (n, nv, nv).
-        loads: (n, 2 nv) what an implicit step would add to the part of 1, without velocity.
         place: (n, nv) ζ afterwards with the nominal action.
         idle: (n, nu) the nominal action.
     """
@@ -286,9 +285,9 @@ class DynamicStep(NamedTuple):
     motion: Dynamic
     x: Array
     step: Array
+    delayed: Array
     response: Array
     inverse_mass: Array
-    loads: Array
     place: Array
     idle: Array
 
@@ -303,10 +302,9 @@ class DynamicStep(NamedTuple):
         return self.motion.tree
 
     def free(self, tangent: Array | None, carried: Array | float = 0.0) -> FreeMotion:
-        """The motion without contact, with `carried` (n, 2 nv) added, for the tangent of the state's rotations."""
-        motion, x, step = self.motion, self.x, self.step.copy()
+        """The motion without contact, with `carried` added to `step`, for the tangent of the state's rotations."""
+        motion, x, step = self.motion, self.x, self.step + carried
         n, nv, h = len(x), motion.model.nv, motion.seconds
-        step[:, :, -1] += carried
         # The control of a servo is held through the step, at a distance from where the joint was at its beginning.
         control = step[:, :, 2 * nv : -1]
         step[:, :, :nv] += control @ motion.moment

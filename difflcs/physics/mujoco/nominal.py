@@ -32,7 +32,7 @@ class Nominal(NamedTuple):
     Attributes:
         found: gaps without the depth that the load makes and with what a slide would open; tangents along the slide.
         forces: (n, n_contacts, n_rays) of the extreme rays of Anitescu's cone, in the order of `contact_lcs` [N s].
-        carried: (n, 2 nv) what is added to the motion without contact, as loads are impulses along contacts.
+        carried: what is added to `DynamicStep.step`, as loads are impulses along contacts.
     """
 
     found: Found
@@ -117,26 +117,29 @@ def at_nominal(
     compliance *= _SOFTER
     closing = _closing(step.place, step.response, found)
     carried = _carried(step, found, closing, np.zeros(found.tangent.shape[:3]))
-    nv = step.place.shape[1]
     # First all that close hold.
-    forces, place = _Rays(found, step, give, compliance).forces(
-        step.place + carried[:, :nv], np.maximum(found.gap, 0.0)
-    )
-    normal = forces.sum(-1)
-    slide = np.einsum("nktv,nv->nkt", found.tangent, place)
+    place = _place(step, carried)
+    forces, moved = _Rays(found, step, give, compliance).forces(place, np.maximum(found.gap, 0.0))
+    normal, slide = forces.sum(-1), np.einsum("nktv,nv->nkt", found.tangent, moved)
     acceleration = np.einsum("nkv,nvw,nkw->nk", found.normal, step.inverse_mass, found.normal) * normal / step.seconds
-    slides = _loaded(acceleration, step, found) & _slides(slide, found, step.place + carried[:, :nv])
+    slides = _slides(slide, found, place)
     gap = recovery.settled(found.gap, geom, acceleration, step.seconds)
     found = found._replace(tangent=_turned(found.tangent, slide))
-    slide = np.einsum("nktv,nv->nkt", found.tangent, place) * slides[:, :, None]
+    slide = np.einsum("nktv,nv->nkt", found.tangent, moved) * slides[:, :, None]
     carried = _carried(step, found, closing, slide)
-    rays, place, forces = _Rays(found, step, give, compliance), step.place + carried[:, :nv], 0.0
+    rays, place, forces = _Rays(found, step, give, compliance), _place(step, carried), 0.0
     for _ in range(_PASSES):
         # A contact that slides by s opens by μ s in Anitescu's model, as its gap is n·Δx − μ s.
         opened = gap + opens * found.friction * slides * np.linalg.norm(slide, axis=-1)
         forces, moved = rays.forces(place, opened, forces)
         slide = np.einsum("nktv,nv->nkt", found.tangent, moved)
     return Nominal(found._replace(gap=opened), forces, carried)
+
+
+def _place(step: DynamicStep, carried: Array) -> Array:
+    """ζ (n, nv) afterwards with the nominal action, with `carried` added to the motion without contact."""
+    nv = step.place.shape[1]
+    return step.place + carried[:, :nv, -1] + (carried[:, :nv, nv : 2 * nv] @ step.x[:, nv:, None])[:, :, 0]
 
 
 def _closing(place: Array, response: Array, found: Found) -> NDArray[np.bool_]:
@@ -158,7 +161,7 @@ def _closing(place: Array, response: Array, found: Found) -> NDArray[np.bool_]:
 
 def _loaded(acceleration: Array, step: DynamicStep, found: Found) -> NDArray[np.bool_]:
     """Which contacts (n, n_contacts) have a part in what carries the loads, by the accelerations of their forces."""
-    loads = step.loads[:, : step.place.shape[1], None]
+    loads = step.delayed[:, : step.place.shape[1], -1:]
     parts = [np.abs(found.normal @ loads)[..., 0], *np.abs(found.tangent @ loads[:, None])[..., 0].transpose(2, 0, 1)]
     return acceleration * step.seconds**2 > 0.1 * np.max(parts, (0, 2))[:, None]
 
@@ -174,7 +177,7 @@ def _slides(slide: Array, found: Found, place: Array) -> NDArray[np.bool_]:
 
 
 def _carried(step: DynamicStep, found: Found, closing: NDArray[np.bool_], slide: Array) -> Array:
-    """What is added to (ζ, ν), (n, 2 nv), where contacts slide by (n, n_contacts, n_tangents) or hold, with zeros."""
+    """What is added to `step.step` where contacts slide by (n, n_contacts, n_tangents) or, with zeros, hold."""
     nv, slides = step.place.shape[1], slide.any(-1)
     tangents = np.moveaxis(found.tangent, 2, 0) * (closing & ~slides & (found.friction > 0))[:, :, None]
     normals = found.normal * closing[:, :, None]
@@ -182,8 +185,9 @@ def _carried(step: DynamicStep, found: Found, closing: NDArray[np.bool_], slide:
     rows, forces = (_by_body(np.concatenate([v, *tangents], 1), step.tree) for v in (normals, forces))
     some = rows.any((0, 2))
     rows, forces = rows[:, some], forces[:, some]
-    loads = np.stack([step.loads[:, :nv], step.loads[:, nv:]], -1)
-    return _pushed(step.response, rows, forces, rows @ loads).swapaxes(-1, -2).reshape(-1, 2 * nv)
+    delayed = np.concatenate([step.delayed[:, :nv], step.delayed[:, nv:]], -1)
+    pushed = _pushed(step.response, rows, forces, rows @ delayed)
+    return np.concatenate(np.split(pushed, 2, -1), 1)
 
 
 def _drag(step: DynamicStep, found: Found, slide: Array) -> Array:
