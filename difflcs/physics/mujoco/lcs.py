@@ -196,7 +196,7 @@ class MujocoLCS:
 
     def _of_cone(self, forces: Any) -> Any:
         """Forces (n, n_lam) of the system's cone, of those (n, n_contacts, n_rays) along the rays of Anitescu's."""
-        each = self.n_lam // self.n_contacts
+        each = count_forces(1, self._finder.n_tangents, self.cone)
         if each != forces.shape[-1]:  # Stewart and Trinkle: normal, tangential, and the distance
             forces = np.concatenate([forces.sum(-1, keepdims=True), np.zeros((*forces.shape[:2], each - 1))], -1)
         return forces.reshape(len(forces), -1)

@@ -164,6 +164,9 @@ class Dynamic:
         damped = not model.opt.disableflags & _flags("EULERDAMP") and self.integrator == _EULER
         self.damping = model.dof_damping.copy() if damped else np.zeros(model.nv)
         self.tree = np.array(model.dof_treeid)
+        self.firm = np.isin(
+            self.tree, np.setdiff1d(self.tree, self.tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
+        )
         self.flags = _flags("CONSTRAINT", "CLAMPCTRL", "AUTORESET")
         for limited in ("actuator_forcelimited", "actuator_ctrllimited", "jnt_actfrclimited", "tendon_actfrclimited"):
             getattr(model, limited)[:] = 0
@@ -171,12 +174,12 @@ class Dynamic:
     def allocate(self, n: int) -> Linearised:
         """For n states."""
         nv, nu = self.model.nv, self.model.nu
-        sizes = ((nv,), (2 * nv, 2 * nv), (2 * nv, nu), (nv, nv), (nu,), (2 * nv,))
+        sizes = ((2 * nv,), (nv,), (2 * nv, 2 * nv), (2 * nv, nu), (nv, nv), (nu,), (2 * nv,))
         return Linearised(*(np.zeros((n, *size)) for size in sizes))
 
     def read(self, i: int, data: Any, into: Linearised, ctrl: Array) -> None:
         """At the state in `data`, for which `mj_fwdPosition` was called, and nominal controls (nu,); NaN: balance."""
-        model, options = self.model, self.model.opt
+        model, options, nv = self.model, self.model.opt, self.model.nv
         before = options.disableflags, options.timestep, options.integrator
         qpos, qvel = data.qpos.copy(), data.qvel.copy()
         mujoco.mj_solveM(model, data, into.inverse_mass[i], np.eye(model.nv))
@@ -188,11 +191,11 @@ class Dynamic:
         options.disableflags |= self.flags | _flags("EULERDAMP")
         options.timestep, options.integrator = 1.0, _EULER
         mujoco.mj_forward(model, data)
-        into.acceleration[i] = data.qacc
+        mujoco.mj_differentiatePos(model, into.middle[i, :nv], 1.0, qpos, data.qpos)
+        into.middle[i, nv:], into.acceleration[i] = data.qvel, data.qacc
         mujoco.mjd_transitionFD(model, data, 1e-6, 0, into.A[i], into.B[i], None, None)
         options.disableflags, options.timestep, options.integrator = before
         self._simulate(data, self.substeps - self.substeps // 2)
-        nv = model.nv
         mujoco.mj_differentiatePos(model, into.reached[i, :nv], 1.0, qpos, data.qpos)
         into.reached[i, nv:] = data.qvel
         data.qpos[:], data.qvel[:] = qpos, qvel
@@ -208,7 +211,8 @@ class Dynamic:
         """The motion at states x (n, 2 nv)."""
         nv, h = self.model.nv, self.seconds
         K, D, B = read.A[:, nv:, :nv], read.A[:, nv:, nv:] - np.eye(nv), read.B[:, nv:]
-        load = read.acceleration - np.einsum("nij,nj->ni", D, x[:, nv:])  # with ν = 0, ζ = 0 and u = ū
+        # With ν = 0, ζ = 0 and u = ū.
+        load = read.acceleration - np.einsum("nij,nj->ni", np.concatenate([K, D], -1), read.middle)
         forces, mass = np.concatenate([K, D, B, load[:, :, None]], -1), np.linalg.inv(read.inverse_mass)
         response = _implicit_response(mass, K, D, h)
         # Of a step in which a motion grows beyond all bounds, what is linear and explicit says nothing.
@@ -252,6 +256,7 @@ class Linearised(NamedTuple):
     """Of n states.
 
     Attributes:
+        middle: (n, 2 nv) where the nominal control leads in half a step; all is linearised there.
         acceleration: (n, nv) with the nominal control.
         A: (n, 2 nv, 2 nv) transition by position and velocity in one second of Euler's method.
         B: (n, 2 nv, nu) by control.
@@ -260,6 +265,7 @@ class Linearised(NamedTuple):
         reached: (n, 2 nv) where the nominal control leads in a step.
     """
 
+    middle: Array
     acceleration: Array
     A: Array
     B: Array
@@ -300,6 +306,12 @@ class DynamicStep(NamedTuple):
     def tree(self) -> NDArray[np.intp]:
         """(nv,) degrees of freedom that belong together: those of different trees move each other by contacts alone."""
         return self.motion.tree
+
+    @property
+    def firm(self) -> Array:
+        """(n, nv, nv) S if what has an actuator at every joint gives way to nothing, as it may with another action."""
+        loose = ~self.motion.firm
+        return self.response * (loose & loose[:, None])
 
     def free(self, tangent: Array | None, carried: Array | float = 0.0) -> FreeMotion:
         """The motion without contact, with `carried` added to `step`, for the tangent of the state's rotations."""

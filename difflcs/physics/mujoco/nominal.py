@@ -66,22 +66,21 @@ class Recovery:
         """
         time, depth = self._time[geom].max(-1), self._depth[geom].max(-1)
         usual = np.minimum(depth * _LOAD, self._usual)
-        deeper = np.maximum(-gap - np.maximum(depth * acceleration, usual), 0.0)
+        deeper = np.maximum(-gap - np.clip(depth * acceleration, usual, 5 * self._usual), 0.0)
         return np.where(gap < 0, -deeper * (1 - np.exp(-seconds / time)), gap)
 
 
 class _Rays:
     """The extreme rays of friction cones and the forces along them that keep contacts closed, as in `contact_lcs`."""
 
-    def __init__(self, found: Found, step: DynamicStep, give: float, compliance: float):
+    def __init__(self, found: Found, response: Array, give: float, compliance: float):
         slide = found.friction[:, :, None, None] * found.tangent
         normal = found.normal[:, :, None]
         rows = np.stack([normal + slide, normal - slide], 3) if slide.shape[2] else normal[:, :, None]
         n, k = rows.shape[:2]
-        rows = rows.reshape(n, k, -1, rows.shape[-1])
-        self.shape = rows.shape[:3]
+        self.shape = n, k, max(1, 2 * slide.shape[2])
         self._rows = rows.reshape(n, -1, rows.shape[-1])
-        self._moves = step.seconds * step.response @ self._rows.swapaxes(-1, -2)
+        self._moves = response @ self._rows.swapaxes(-1, -2)
         self._F = self._rows @ self._moves / give
         self._F += compliance * np.eye(self._F.shape[-1])
         self._give, self._compliance = give, compliance
@@ -115,19 +114,25 @@ def at_nominal(
         opens: whether the model of friction is Anitescu's, in which sliding contacts open.
     """
     compliance *= _SOFTER
+    if not found.gap.size:
+        return Nominal(found, np.zeros((*found.gap.shape, 1)), np.zeros_like(step.step))
     closing = _closing(step.place, step.response, found)
     carried = _carried(step, found, closing, np.zeros(found.tangent.shape[:3]))
     # First all that close hold.
-    place = _place(step, carried)
-    forces, moved = _Rays(found, step, give, compliance).forces(place, np.maximum(found.gap, 0.0))
-    normal, slide = forces.sum(-1), np.einsum("nktv,nv->nkt", found.tangent, moved)
-    acceleration = np.einsum("nkv,nvw,nkw->nk", found.normal, step.inverse_mass, found.normal) * normal / step.seconds
+    place, closed = _place(step, carried), np.maximum(found.gap, 0.0)
+    forces, moved = _Rays(found, step.seconds * step.response, give, compliance).forces(place, closed)
+    slide, normal = np.einsum("nktv,nv->nkt", found.tangent, moved), forces.sum(-1)
     slides = _slides(slide, found, place)
+    if slides.any() and step.motion.firm.any():
+        # What robots touch may hold with another action than the nominal one.
+        _, firmly = _Rays(found, step.seconds * step.firm, give, compliance).forces(place, closed)
+        slides &= _slides(np.einsum("nktv,nv->nkt", found.tangent, firmly), found, place)
+    acceleration = np.einsum("nkv,nvw,nkw->nk", found.normal, step.inverse_mass, found.normal) * normal / step.seconds
     gap = recovery.settled(found.gap, geom, acceleration, step.seconds)
     found = found._replace(tangent=_turned(found.tangent, slide))
     slide = np.einsum("nktv,nv->nkt", found.tangent, moved) * slides[:, :, None]
     carried = _carried(step, found, closing, slide)
-    rays, place, forces = _Rays(found, step, give, compliance), _place(step, carried), 0.0
+    rays, place, forces = _Rays(found, step.seconds * step.response, give, compliance), _place(step, carried), 0.0
     for _ in range(_PASSES):
         # A contact that slides by s opens by μ s in Anitescu's model, as its gap is n·Δx − μ s.
         opened = gap + opens * found.friction * slides * np.linalg.norm(slide, axis=-1)
