@@ -36,7 +36,8 @@ _JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 _FIXED, _AFFINE = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_AFFINE)
 _BEYOND = 1e9  # a motion in a step [m, rad] and its velocity that no model has
-_EULER, _RK4 = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("EULER", "RK4"))
+_MOST, _FEW = 10, 4  # steps that are simulated one by one; where there are more, so many as long ones
+_EULER, _RK4, _IMPLICIT = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("EULER", "RK4", "IMPLICIT"))
 
 
 class Actuators:
@@ -159,9 +160,10 @@ class Dynamic:
         self.relative = np.flatnonzero(actuators.servo) if relative else np.zeros(0, dtype=np.intp)
         self.moment = np.zeros((model.nu, model.nv))
         self.moment[self.relative, actuators.dof[self.relative]] = actuators.gear[self.relative]
-        self.substeps = max(1, round(seconds / model.opt.timestep))
-        self.integrator = int(model.opt.integrator)
-        damped = not model.opt.disableflags & _flags("EULERDAMP") and self.integrator == _EULER
+        self.steps = Steps(max(1, round(seconds / model.opt.timestep)), int(model.opt.integrator))
+        coarse = self.steps.integrator if self.steps.integrator == _RK4 else _IMPLICIT
+        self.simulated = self.steps if self.steps.count <= _MOST else Steps(_FEW, coarse)
+        damped = not model.opt.disableflags & _flags("EULERDAMP")
         self.damping = model.dof_damping.copy() if damped else np.zeros(model.nv)
         self.tree = np.array(model.dof_treeid)
         self.firm = np.isin(
@@ -186,7 +188,8 @@ class Dynamic:
         data.ctrl[:] = np.where(np.isnan(ctrl), self.actuators.balance(data.actuator_length), ctrl)
         into.nominal[i] = data.ctrl
         into.nominal[i, self.relative] -= data.actuator_length[self.relative]
-        self._simulate(data, self.substeps // 2)
+        half = self.simulated.count // 2
+        self._simulate(data, half)
         # With a time step of one second and no implicit part, the next velocity is ν + acceleration.
         options.disableflags |= self.flags | _flags("EULERDAMP")
         options.timestep, options.integrator = 1.0, _EULER
@@ -195,17 +198,18 @@ class Dynamic:
         into.middle[i, nv:], into.acceleration[i] = data.qvel, data.qacc
         mujoco.mjd_transitionFD(model, data, 1e-6, 0, into.A[i], into.B[i], None, None)
         options.disableflags, options.timestep, options.integrator = before
-        self._simulate(data, self.substeps - self.substeps // 2)
+        self._simulate(data, self.simulated.count - half)
         mujoco.mj_differentiatePos(model, into.reached[i, :nv], 1.0, qpos, data.qpos)
         into.reached[i, nv:] = data.qvel
         data.qpos[:], data.qvel[:] = qpos, qvel
 
-    def _simulate(self, data: Any, substeps: int) -> None:
+    def _simulate(self, data: Any, steps: int) -> None:
         options = self.model.opt
-        before = options.disableflags, options.timestep
-        options.disableflags, options.timestep = before[0] | self.flags, self.seconds / self.substeps
-        mujoco.mj_step(self.model, data, substeps)
-        options.disableflags, options.timestep = before
+        before = options.disableflags, options.timestep, options.integrator
+        options.disableflags, options.timestep = before[0] | self.flags, self.seconds / self.simulated.count
+        options.integrator = self.simulated.integrator
+        mujoco.mj_step(self.model, data, steps)
+        options.disableflags, options.timestep, options.integrator = before
 
     def finish(self, read: Linearised, x: Array) -> DynamicStep:
         """The motion at states x (n, 2 nv)."""
@@ -216,30 +220,33 @@ class Dynamic:
         forces, mass = np.concatenate([K, D, B, load[:, :, None]], -1), np.linalg.inv(read.inverse_mass)
         response = _implicit_response(mass, K, D, h)
         # Of a step in which a motion grows beyond all bounds, what is linear and explicit says nothing.
-        step, implicit = self._steps(mass, forces), self._implicit(response @ mass, forces)
+        step, implicit = self._steps(mass, forces, self.steps), self._implicit(response @ mass, forces)
         step = np.where((np.abs(step).max((1, 2)) < _BEYOND)[:, None, None], step, implicit)
-        linear = step[:, :, -1] + np.einsum("nij,nj->ni", step[:, :, nv : 2 * nv], x[:, nv:])
-        reached = np.where((np.abs(read.reached).max(1) < _BEYOND)[:, None], read.reached, linear)
-        step[:, :, -1] += reached - linear
-        return DynamicStep(self, x, step, implicit - step, response, read.inverse_mass, reached[:, :nv], read.nominal)
+        # The simulation says what is not linear, by its difference to the same steps of the linear motion.
+        same = self.simulated == self.steps
+        simulated = step if same else self._steps(mass, forces, self.simulated)
+        more = read.reached - _reached(simulated, x)
+        step[:, :, -1] += np.where((np.abs(more).max(1) < _BEYOND)[:, None], more, 0.0)
+        place = _reached(step, x)[:, :nv]
+        return DynamicStep(self, x, step, implicit - step, response, read.inverse_mass, place, read.nominal)
 
-    def _steps(self, mass: Array, forces: Array) -> Array:
+    def _steps(self, mass: Array, forces: Array, steps: Steps) -> Array:
         """(ζ, ν) after the step as a matrix (n, 2 nv, 2 nv + nu + 1) of ζ, ν, u − ū and 1; `forces` is that of ν̇."""
         n, nv, of = forces.shape
-        h, one = self.seconds / self.substeps, np.zeros((n, of, of))
-        if self.integrator == _RK4:
+        h, one = self.seconds / steps.count, np.zeros((n, of, of))
+        if steps.integrator == _RK4:
             unit = np.ones(of)
             unit[nv : 2 * nv] = h  # of (ζ, h ν) the norm, which says what an exponential costs, is less
             one[:, :nv, nv : 2 * nv], one[:, nv : 2 * nv] = h * np.eye(nv), h * forces
             grown: Tensor = torch.linalg.matrix_exp(torch.from_numpy(one * unit[:, None] / unit))
             one = grown.numpy() * unit / unit[:, None]
         else:
-            resists = h * np.diag(self.damping) if self.integrator == _EULER else -h * mass @ forces[:, :, nv : 2 * nv]
+            implicit = np.diag(self.damping) if steps.integrator == _EULER else -mass @ forces[:, :, nv : 2 * nv]
             one[:] = np.eye(of)
-            one[:, nv : 2 * nv] += h * np.linalg.solve(mass + resists, mass @ forces)
+            one[:, nv : 2 * nv] += h * np.linalg.solve(mass + h * implicit, mass @ forces)
             one[:, :nv] += h * one[:, nv : 2 * nv]
         with np.errstate(over="ignore", invalid="ignore"):
-            return np.linalg.matrix_power(one, self.substeps)[:, : 2 * nv]
+            return np.linalg.matrix_power(one, steps.count)[:, : 2 * nv]
 
     def _implicit(self, resists: Array, forces: Array) -> Array:
         """The same by one implicit step, which gives (n, nv, nv) `resists` = S M of the change in velocity."""
@@ -250,6 +257,13 @@ class Dynamic:
         place = h * velocity
         place[:, :, :nv] += np.eye(nv)
         return np.concatenate([place, velocity], 1)
+
+
+class Steps(NamedTuple):
+    """How many of MuJoCo's steps make one of ours, and their integrator."""
+
+    count: int
+    integrator: int
 
 
 class Linearised(NamedTuple):
@@ -333,6 +347,12 @@ class DynamicStep(NamedTuple):
         impulse, response = self.response, np.zeros((n, 2 * nv, 2 * nv))
         response[:, :, :nv] = to_x @ np.concatenate([h * impulse, impulse], 1) @ to_x[:, :nv, :nv].swapaxes(-1, -2)
         return FreeMotion(*(torch.from_numpy(v) for v in (A_x, to_x @ control, d, response)))
+
+
+def _reached(step: Array, x: Array) -> Array:
+    """(ζ, ν) after a step (n, 2 nv, 2 nv + nu + 1) from ζ = 0 with the velocities of x (n, 2 nv) and u = ū."""
+    nv = x.shape[1] // 2
+    return step[:, :, -1] + (step[:, :, nv : 2 * nv] @ x[:, nv:, None])[:, :, 0]
 
 
 def _flags(*names: str) -> int:
