@@ -111,7 +111,7 @@ def at_nominal(
         geom: their geoms (n, n_contacts, 2).
         give: how far a unit of impulse moves two bodies apart [m/(N s)].
         compliance: of contacts, in parts of `give`.
-        opens: whether the model of friction is Anitescu's, in which sliding contacts open.
+        opens: whether the model of friction is Anitescu's, in which a contact that slides opens.
     """
     compliance *= _SOFTER
     if not found.gap.size:
@@ -120,9 +120,11 @@ def at_nominal(
     carried = _carried(step, found, closing, np.zeros(found.tangent.shape[:3]))
     # First all that close hold.
     place, closed = _place(step, carried), np.maximum(found.gap, 0.0)
+    found = found._replace(tangent=_turned(found.tangent, np.einsum("nktv,nv->nkt", found.tangent, place)))
     forces, moved = _Rays(found, step.seconds * step.response, give, compliance).forces(place, closed)
     slide, normal = np.einsum("nktv,nv->nkt", found.tangent, moved), forces.sum(-1)
-    slides = _slides(slide, found, place)
+    # The drag of Stewart and Trinkle's model holds what slides.
+    slides = _slides(slide, found, place) & opens
     if slides.any() and step.motion.firm.any():
         # What robots touch may hold with another action than the nominal one.
         _, firmly = _Rays(found, step.seconds * step.firm, give, compliance).forces(place, closed)
@@ -135,7 +137,7 @@ def at_nominal(
     rays, place, forces = _Rays(found, step.seconds * step.response, give, compliance), _place(step, carried), 0.0
     for _ in range(_PASSES):
         # A contact that slides by s opens by μ s in Anitescu's model, as its gap is n·Δx − μ s.
-        opened = gap + opens * found.friction * slides * np.linalg.norm(slide, axis=-1)
+        opened = gap + found.friction * slides * np.linalg.norm(slide, axis=-1)
         forces, moved = rays.forces(place, opened, forces)
         slide = np.einsum("nktv,nv->nkt", found.tangent, moved)
     return Nominal(found._replace(gap=opened), forces, carried)
