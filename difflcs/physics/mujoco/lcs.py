@@ -120,7 +120,7 @@ class MujocoLCS:
         self._quasi_static = motion == "quasi-static"
         mobility = mobility if isinstance(mobility, str) else np.asarray(mobility)
         if self._quasi_static:
-            self._motion: QuasiStatic | Dynamic = QuasiStatic(model, self._actuators, mobility)
+            self._motion: Any = QuasiStatic(model, self._actuators, mobility)
         else:
             for where, friction_loss in (("joints", model.dof_frictionloss), ("tendons", model.tendon_frictionloss)):
                 if (friction_loss > 0).any():

@@ -217,7 +217,10 @@ class Dynamic:
         K, D, B = read.A[:, nv:, :nv], read.A[:, nv:, nv:] - np.eye(nv), read.B[:, nv:]
         # With ν = 0, ζ = 0 and u = ū.
         load = read.acceleration - np.einsum("nij,nj->ni", np.concatenate([K, D], -1), read.middle)
-        forces, mass = np.concatenate([K, D, B, load[:, :, None]], -1), np.linalg.inv(read.inverse_mass)
+        forces, mass = (
+            np.concatenate([K, D, B, load[:, :, None]], -1),
+            np.linalg.inv(read.inverse_mass).astype(np.float64),
+        )
         response = _implicit_response(mass, K, D, h)
         # Of a step in which a motion grows beyond all bounds, what is linear and explicit says nothing.
         step, implicit = self._steps(mass, forces, self.steps), self._implicit(response @ mass, forces)

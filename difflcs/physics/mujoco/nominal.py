@@ -134,7 +134,11 @@ def at_nominal(
     found = found._replace(tangent=_turned(found.tangent, slide))
     slide = np.einsum("nktv,nv->nkt", found.tangent, moved) * slides[:, :, None]
     carried = _carried(step, found, closing, slide)
-    rays, place, forces = _Rays(found, step.seconds * step.response, give, compliance), _place(step, carried), 0.0
+    rays, place, forces = (
+        _Rays(found, step.seconds * step.response, give, compliance),
+        _place(step, carried),
+        np.zeros_like(forces),
+    )
     for _ in range(_PASSES):
         # A contact that slides by s opens by μ s in Anitescu's model, as its gap is n·Δx − μ s.
         opened = gap + found.friction * slides * np.linalg.norm(slide, axis=-1)
@@ -208,7 +212,7 @@ def _drag(step: DynamicStep, found: Found, slide: Array) -> Array:
     return drag * np.minimum(1.0, 0.7 * yields / np.maximum(presses, 1e-300))[:, :, None]
 
 
-def _by_body(rows: Array, tree: Array) -> Array:
+def _by_body(rows: Array, tree: NDArray[np.intp]) -> Array:
     """Rows (n, k, nv) of pairs of bodies as rows (n, 2 k, nv) of one body each, by the tree (nv,) of each freedom."""
     trees = np.unique(tree)
     if len(trees) == 1:

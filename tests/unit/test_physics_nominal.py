@@ -1,0 +1,175 @@
+"""Dynamic motion of MuJoCo models against MuJoCo: what rests or slides, free motion, nominal controls, fast robots."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+mujoco = pytest.importorskip("mujoco")
+
+from difflcs import GoalCost, LCSMPCLayer, Status  # noqa: E402
+from difflcs.errors import InvalidInputError  # noqa: E402
+from difflcs.physics.mujoco import MujocoLCS  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SECONDS = (0.002, 0.02, 0.1)
+FIRM = '<option timestep=".001" cone="elliptic" impratio="100" iterations="100"/>'  # friction that hardly creeps
+
+
+def load(worldbody, rest="", option=FIRM):
+    return mujoco.MjModel.from_xml_string(f"<mujoco>{option}<worldbody>{worldbody}</worldbody>{rest}</mujoco>")
+
+
+def tilted(degrees, friction, *geoms):
+    """Bodies on a plane that is tilted about y, each a geom and its height above the plane."""
+    a = math.radians(degrees)
+    bodies = "".join(
+        f'<body pos="{z * math.sin(a)} 0 {z * math.cos(a)}" euler="0 {degrees} 0"><freejoint/>'
+        f'<geom {geom} friction="{friction}"/></body>'
+        for z, geom in geoms
+    )
+    return f'<geom type="plane" size="5 5 .1" euler="0 {degrees} 0" friction="{friction}"/>{bodies}'
+
+
+def finger(name, x, sign):
+    return f"""<body pos="{x} 0 .5"><joint name="{name}" type="slide" axis="{sign} 0 0"/>
+      <geom type="box" size=".01 .02 .02" mass=".1" friction=".8"/></body>"""
+
+
+HELD = '<body pos="0 0 .5"><freejoint/><geom type="box" size=".02 .02 .02" mass=".05" friction=".8"/></body>'
+PINCH = HELD + finger("left", -0.03, 1) + finger("right", 0.03, -1)
+WALL = '<geom type="box" size=".1 2 2" pos="-.12 0 .5" friction=".8"/>' + HELD + finger("right", 0.03, -1)
+LINK = """<geom type="plane" size="5 5 .1"/><body pos="0 0 .05"><freejoint/><geom type="box" size=".05 .05 .05"/></body>
+  <body pos="-.15 0 .11"><joint type="hinge" axis="0 1 0"/>
+    <geom type="capsule" size=".01" fromto="0 0 0 .2 0 0" mass=".2"/></body>"""
+SERVOS = '<actuator><position joint="left" kp="300" kv="20"/><position joint="right" kp="300" kv="20"/></actuator>'
+MOTOR = '<actuator><motor joint="right"/></actuator>'
+CUBE = 'type="box" size=".05 .05 .05" mass="1"'
+RESTING = {  # model, control, bodies that are free
+    "flat": (load(tilted(0, 1.0, (0.05, CUBE))), 0.0, 1),
+    "slope": (load(tilted(20, 0.5, (0.05, CUBE))), 0.0, 1),
+    "slope across": (load(tilted(20, 0.5, (0.05, CUBE + ' euler="0 0 30"'))), 0.0, 1),
+    "cylinder on a slope": (load(tilted(25, 0.7, (0.03, 'type="cylinder" size=".05 .03" mass=".1"'))), 0.0, 1),
+    "box on a tilted box": (load(tilted(15, 0.6, (0.05, CUBE), (0.13, 'type="box" size=".04 .04 .03"'))), 0.0, 2),
+    "pinch": (load(PINCH, SERVOS), 0.01, 1),
+    "wall": (load(WALL, MOTOR), 3.0, 1),
+    "link on a box": (load(LINK), 0.0, 1),
+}
+
+
+def at_rest(model, ctrl):
+    data = mujoco.MjData(model)
+    data.ctrl[:] = ctrl
+    mujoco.mj_step(model, data, 1500)
+    assert np.abs(data.qvel).max() < 5e-4
+    return data
+
+
+@pytest.mark.parametrize("seconds", SECONDS)
+@pytest.mark.parametrize("name", RESTING)
+def test_what_friction_holds_stays_at_rest_by_the_right_force(name, seconds):
+    model, ctrl, bodies = RESTING[name]
+    data = at_rest(model, ctrl)
+    given = [None, data.ctrl] if name == "pinch" else [None]  # servos without a nominal control balance
+    for nominal in given:
+        module = MujocoLCS(model, data, motion="dynamic", seconds=seconds, ctrl=nominal)
+        x = module.state.to_state(data.qpos, data.qvel)
+        params = module.params(x)
+        u = torch.from_numpy(data.ctrl - (data.qpos[-2:] if name == "pinch" else 0.0))
+        after, lam = params.step(x, u)
+        free = slice(0, 6 * bodies) if name != "link on a box" else slice(0, model.nv)
+        assert (after - x)[model.nv :][free].abs().max() < 1e-3  # m/s
+        assert (after - x)[: model.nv][free].abs().max() < 1e-4  # m
+        carried = (params.C @ lam)[model.nv :][: 6 * bodies].reshape(-1, 6)[:, 2] / seconds
+        torch.testing.assert_close(carried[-1:], torch.full((1,), 9.81).double(), rtol=1e-2, atol=0)
+
+
+@pytest.mark.parametrize(("degrees", "speed"), [(0, 0.8), (30, 0.3), (40, 0.0)])
+def test_what_slides_goes_as_coulomb_says(degrees, speed):
+    a, h = math.radians(degrees), 0.1
+    model = load(tilted(degrees, 0.5, (0.01, 'type="box" size=".2 .2 .01" mass="1"')))
+    module = MujocoLCS(model, motion="dynamic", seconds=h)
+    along = np.array([math.cos(a), 0, -math.sin(a)])
+    x = module.state.to_state(model.qpos0, np.concatenate([speed * along, np.zeros(3)]))
+    moved = (module.params(x).step(x, torch.zeros(0).double()).x_next - x).numpy()
+    gains = 9.81 * (math.sin(a) - 0.5 * math.cos(a))
+    np.testing.assert_allclose(moved[:3], (speed * h + gains * h * h / 2) * along, atol=3e-3)
+    np.testing.assert_allclose(moved[6:9], gains * h * along, atol=0.04)
+
+
+FREE = """<body><joint name="a" type="hinge" axis="0 1 0" damping=".05"/>
+  <geom type="capsule" size=".02" fromto="0 0 0 .2 0 0" mass=".2"/>
+  <body pos=".2 0 0"><joint name="b" type="hinge" axis="0 1 0" damping=".05"/>
+    <geom type="capsule" size=".02" fromto="0 0 0 .2 0 0" mass=".2"/></body></body>"""
+TENDON = '<tendon><fixed name="t"><joint joint="a" coef="1"/><joint joint="b" coef="1"/></fixed></tendon>'
+ACTUATORS = {
+    "motors": '<actuator><motor joint="a" gear="2"/><motor joint="b"/></actuator>',
+    "absolute servos": '<actuator><position joint="a" kp="20"/><position joint="b" kp="20" gear="2"/></actuator>',
+    "tendon servo": f'{TENDON}<actuator><position tendon="t" kp="20"/></actuator>',
+    "dampers": '<actuator><motor joint="a"/><damper joint="b" kv=".2" ctrlrange="0 1"/></actuator>',
+}
+
+
+@pytest.mark.parametrize(
+    "option", ['timestep=".005"', 'integrator="RK4"', 'integrator="implicitfast"', 'timestep=".02"']
+)
+@pytest.mark.parametrize("name", ACTUATORS)
+def test_free_motion_is_as_right_as_differences_of_the_simulation(name, option):
+    """Beside x₊ = f(x, ū) + ∂f/∂u (u − ū) of MuJoCo's own steps, at the balance of servos and half of the others."""
+    model = load(FREE, ACTUATORS[name], f'<option {option}><flag contact="disable"/></option>')
+    data, random, errors = mujoco.MjData(model), np.random.default_rng(0), []
+    steps = round(0.02 / model.opt.timestep)
+
+    def simulate(qpos, qvel, ctrl):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, ctrl
+        mujoco.mj_step(model, data, steps)
+        return np.concatenate([data.qpos, data.qvel])
+
+    for _ in range(20):
+        qpos, qvel = random.normal(size=2), random.normal(size=2)
+        data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+        nominal = data.actuator_length.copy() if "servo" in name else np.full(model.nu, 0.5)
+        ctrl = nominal + random.uniform(-0.5, 0.5, model.nu)
+        module = MujocoLCS(model, motion="dynamic", seconds=0.02, relative=False)
+        x = module.state.to_state(qpos, qvel)
+        params = module.params(x, None if "servo" in name else torch.from_numpy(nominal))
+        ours = params.step(x, torch.from_numpy(ctrl)).x_next.numpy()
+        start = simulate(qpos, qvel, nominal)
+        columns = [simulate(qpos, qvel, nominal + 1e-5 * e) - start for e in np.eye(model.nu)]
+        differences = start + np.array(columns).T @ (ctrl - nominal) / 1e-5
+        right = simulate(qpos, qvel, ctrl)
+        errors.append([np.abs(v - right).max() / np.abs(right[2:] - qvel).max() for v in (ours, differences)])
+    ours, differences = np.median(errors, 0)
+    assert ours < 1.5 * differences + 1e-4
+
+
+def test_a_nominal_control_is_checked():
+    model = load(FREE, ACTUATORS["motors"])
+    with pytest.raises(InvalidInputError, match="ctrl"):
+        MujocoLCS(model, motion="dynamic", ctrl=[0.0])
+    module = MujocoLCS(model, motion="dynamic", ctrl=[0.1, 0.2])
+    torch.testing.assert_close(
+        module.params(torch.zeros(4).double()).A,
+        MujocoLCS(model, motion="dynamic").params(torch.zeros(4).double(), torch.tensor([0.1, 0.2]).double()).A,
+    )
+
+
+@pytest.mark.parametrize("seconds", [0.02, 0.1])
+def test_fast_and_unstable_robots_have_a_system_at_every_state(seconds):
+    floor = '<geom type="plane" size="2 2 .1" pos="0 0 -.42"/>'
+    module = MujocoLCS(load(floor + FREE, ACTUATORS["motors"]), motion="dynamic", seconds=seconds)
+    random = np.random.default_rng(0)
+    x = torch.from_numpy(random.normal(size=(60, 4)) * [3, 3, 30, 30])
+    F = module.params(x).F
+    assert torch.linalg.eigvalsh(F + F.mT)[:, 0].min() > 0.9 * 2 * module.compliance
+    pole = """<body><joint type="hinge" axis="0 1 0"/><geom size=".01" pos="0 0 .05" mass=".1"/></body>
+      <body pos="-.03 0 .05"><joint name="p" type="slide" axis="1 0 0"/><geom size=".01" mass=".1"/></body>"""
+    upright = MujocoLCS(load(pole, '<actuator><motor joint="p"/></actuator>'), motion="dynamic", seconds=seconds)
+    assert float(upright.params(torch.zeros(4).double()).F.min()) > 0
+    mpc = LCSMPCLayer(module, GoalCost.reach(4, 2, (1.0, 1.0), input_weight=0.1), 5, -1.0, 1.0, on_failure="mask")
+    assert mpc(x[:8], torch.zeros(8, 2).double()).status[0] == Status.CONVERGED
