@@ -36,8 +36,9 @@ class MujocoLCS:
     - "quasi-static": the state is the positions. Joints with actuators move as they are told, u is by how much in this
       step; all else moves only while pushed. For slow pushing; gravity does nothing.
     - "dynamic": the state is positions and velocities. u is MuJoCo's `ctrl`; that of `position` actuators on joints
-      counts from where the joint is, unless `relative` is false. Anitescu's cone is corrected for contacts that slide
-      with u = 0, which it would open, so that a box that slides stays on the floor.
+      counts from where the joint is, unless `relative` is false. It is linearised at a nominal control, which also
+      says what contacts do where friction depends on it: which hold and which slide. What rests in MuJoCo rests here,
+      at the depth that its soft contacts have.
 
     What a joint cannot move falls out of the Jacobians. Where all joints move in one plane, friction has one tangent,
     in this plane, and contacts across it, such as those of a floor below, are left out.
@@ -70,6 +71,8 @@ class MujocoLCS:
             damping), or what a unit of force on each degree of freedom does, (nv,) or (nv, nv). Only ratios matter, as
             `compliance` is in parts of it. A body that cannot move along a degree of freedom has 0 there.
         relative: whether the actions of `position` actuators on joints count from where these are.
+        ctrl: (nu,) nominal control of a dynamic motion, MuJoCo's `ctrl`; `params(x, context)` takes one for each
+            state. None: that at which servos have no force where the state is, and for other actuators that of `data`.
         length: unit of gaps for the relaxation of the MPC, see `contact_lcs` [m]; None: the median radius of the
             geoms that move and may touch.
 
@@ -95,8 +98,8 @@ class MujocoLCS:
         cone: Cone = "anitescu",
         mobility: Literal["inertia", "damping"] | ArrayLike = "inertia",
         relative: bool = True,
-        length: float | None = None,
         ctrl: ArrayLike | None = None,
+        length: float | None = None,
     ):
         _check_model(model, data)
         check_choice("motion", motion, ("quasi-static", "dynamic"))
@@ -162,7 +165,11 @@ class MujocoLCS:
         return count_forces(self.n_contacts, self._finder.n_tangents, self.cone)
 
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
-        """The system at states x (..., n_x); there is no context.
+        """The system at states x (..., n_x).
+
+        Args:
+            x: states.
+            context: (..., nu) nominal controls of a dynamic motion, in place of those of the module.
 
         Raises:
             InvalidInputError and its kinds: no state, or of another size.
