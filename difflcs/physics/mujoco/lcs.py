@@ -14,8 +14,8 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor, describe
-from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError
+from difflcs._checks import broadcast_batch, check_choice, check_number, check_positive_int, check_tensor, describe
+from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
 from difflcs.physics.contacts import Cone, Contacts, FreeMotion, contact_lcs, count_forces
 from difflcs.physics.mujoco.contacts import ContactFinder, Found, Pairs
 from difflcs.physics.mujoco.motion import Actuators, Dynamic, QuasiStatic
@@ -240,6 +240,11 @@ class MujocoLCS:
     def _controls(self, ctrl: Tensor, batch: torch.Size) -> Any:
         """Nominal controls (*batch, nu) as numbers."""
         check_tensor("ctrl", ctrl, [("n_u", self.n_u)])
+        if broadcast_batch([("x", batch), ("ctrl", ctrl.shape[:-1])]) != batch:
+            raise ShapeError(
+                f"ctrl: expected one nominal control for each of the states {tuple(batch)}, or one for all, got "
+                f"{tuple(ctrl.shape)}; leave out its batch dimensions, or give x the same"
+            )
         return ctrl.detach().double().cpu().expand(*batch, self.n_u).numpy()
 
     def _read(self, x: Tensor, context: Tensor | None = None) -> _States:
