@@ -136,8 +136,7 @@ class MujocoLCS:
         self._ctrl = np.where(self._actuators.holds & (ctrl is None), np.nan, given)
         length = _typical_radius(model) if length is None else check_number("length", length, strict=True)
         distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
-        self.length = length
-        self._recovery = Recovery(model, length)
+        self.length, self._recovery = length, Recovery(model, length)
         self._finder = ContactFinder(model, self._data, pairs, distance, length, contacts, friction)
         model.opt.disableflags |= sum(
             int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("EQUALITY", "FRICTIONLOSS", "LIMIT")

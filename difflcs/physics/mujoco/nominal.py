@@ -5,14 +5,19 @@ it by h². So a contact that holds the place of a body would leave it with a vel
 are therefore impulses at the beginning of the step as well: along the normal; along the tangents where friction
 holds; and where a contact slides, along the friction that its normal force brings about.
 
-Compliance, which makes F + Fᵀ ≻ 0, counts from the forces of the nominal action, so that what rests does not creep.
-Nor does a contact open that only lies as deep as MuJoCo's soft contacts do under their load.
+Compliance, which makes F + Fᵀ ≻ 0, counts from the forces of the nominal action, so that what rests does not creep,
+but as slowly as MuJoCo's soft friction lets it. Nor does a contact open that only lies as deep as MuJoCo's soft
+contacts do under their load.
 """
+
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -57,6 +62,9 @@ class Recovery:
         given = impedance[1] ** 2 / np.maximum(-reference, 1e-9)
         stiffness = np.where(reference > 0, (impedance[1] * time * ratio) ** 2, given)
         self._time, self._depth = np.sqrt(stiffness), stiffness * (1 - impedance[0]) / impedance[0] ** 2
+        damping = np.where(reference > 0, 0.5 * impedance[1] * time, impedance[1] / np.maximum(-ratio, 1e-9))
+        pyramid = 1 + (model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL)  # about
+        self._creep = pyramid * damping * (1 / impedance[0] - 1) / model.opt.impratio
 
     def settled(self, gap: Array, geom: NDArray[np.intp], acceleration: Array, seconds: float) -> Array:
         """Gaps (n, n_contacts) of geoms (n, n_contacts, 2) that carry accelerations (n, n_contacts), after a step.
@@ -68,6 +76,11 @@ class Recovery:
         usual = np.minimum(depth * _LOAD, self._usual)
         deeper = np.maximum(-gap - np.clip(depth * acceleration, usual, 5 * self._usual), 0.0)
         return np.where(gap < 0, -deeper * (1 - np.exp(-seconds / time)), gap)
+
+    def crept(self, geom: NDArray[np.intp], acceleration: Array, speed: Array) -> Array:
+        """Speeds (n, n_contacts, n_tangents) that stay of `speed`, where friction carries such accelerations."""
+        creep = -self._creep[geom].max(-1)[:, :, None] * acceleration
+        return np.where(creep * speed > 0, np.sign(speed) * np.minimum(np.abs(speed), np.abs(creep)), 0.0)
 
 
 class _Rays:
@@ -144,7 +157,21 @@ def at_nominal(
         opened = gap + found.friction * slides * np.linalg.norm(slide, axis=-1)
         forces, moved = rays.forces(place, opened, forces)
         slide = np.einsum("nktv,nv->nkt", found.tangent, moved)
-    return Nominal(found._replace(gap=opened), forces, carried)
+    # What creeps moves the point from which friction counts, which is that of so much compliance.
+    creep = _creeping(step, found, geom, recovery, forces) * ~slides[:, :, None] / (compliance / _SOFTER * give)
+    return Nominal(found._replace(gap=opened), forces + creep, carried)
+
+
+def _creeping(step: DynamicStep, found: Found, geom: NDArray[np.intp], recovery: Recovery, forces: Array) -> Array:
+    """How far contacts creep along the rays (n, n_contacts, n_rays) of their `forces`."""
+    if not found.tangent.shape[2]:
+        return np.zeros_like(forces)
+    each = forces.reshape(*found.tangent.shape[:3], 2)
+    friction, velocity = found.friction[:, :, None], step.x[:, None, None, found.normal.shape[-1] :]
+    gives = ((found.tangent @ step.inverse_mass[:, None]) * found.tangent).sum(-1)
+    acceleration = gives * friction * (each[..., 0] - each[..., 1]) / step.seconds
+    far = step.seconds * friction * recovery.crept(geom, acceleration, (found.tangent * velocity).sum(-1))
+    return np.stack([far, -far], -1).reshape(forces.shape)
 
 
 def _place(step: DynamicStep, carried: Array) -> Array:
