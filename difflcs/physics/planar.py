@@ -287,12 +287,15 @@ class PlanarPushing:
             )
         check_tensor("x", x, [("n_x", self.n_x)])
         friction = 0.0 if self.frictionless else self._by_contact(self.friction)
+        contacts, free, compliance = self.contacts(x), self._free_motion(x), self._by_contact(self.compliance)
+        if self.inertia is not None:
+            contacts, compliance = _damped(contacts, free.response, compliance)
         return contact_lcs(
-            self.contacts(x),
-            self._free_motion(x),
+            contacts,
+            free,
             x,
             friction=friction,
-            compliance=self._by_contact(self.compliance),
+            compliance=compliance,
             cone=self.cone,
             length=self.length or 1.0,
             force=self._unit_of_force(),
@@ -398,6 +401,21 @@ class PlanarPushing:
         rest = x.new_zeros(*x.shape[:-1], self.n_x - 5)
         place, velocity = before - after + h * speed * across, speed * (across - across_after)
         return torch.cat([place, rest, velocity, torch.zeros_like(speed)], -1)
+
+
+_MOST = 0.01  # of how far an impulse moves two bodies apart in a step: what a contact gives way at most, and bounces
+
+
+def _damped(contacts: Contacts, response: Tensor, compliance: Tensor) -> tuple[Contacts, Tensor]:
+    """Contacts that do not bounce in short steps, and how far (..., n_contacts) a force closes each within a step.
+
+    Compliance r alone is a spring, which gives back what it takes if a step moves a body by less than r times the
+    impulse. A damper beside it lets it give way by g < r a step. With s = g/r that is φ₊ − (1 − s) φ + s r f = 0 for an
+    impulse f at a gap φ < 0, and φ = −r f at rest, as without it. A gap that is open counts in full, φ₊ + s r f = 0.
+    """
+    most = _MOST * ((contacts.normal @ response) * contacts.normal).sum(-1)
+    gap = torch.where(contacts.gap < 0, (most / compliance).clamp(0.0, 1.0) * contacts.gap, contacts.gap)
+    return contacts._replace(gap=gap), torch.minimum(most, compliance)
 
 
 def _plain_numbers(*parts: Drive | Inertia | None) -> tuple[float, ...] | None:
