@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -360,7 +360,7 @@ class PlanarPushing:
         numbers = _plain_numbers(self.drive, self.inertia)
         key, (kept_key, kept) = (numbers, like.dtype, like.device), vars(self).get("kept", (None, None))
         if numbers is not None and key == kept_key:
-            return kept
+            return kept[0].clone(), kept[1].clone(), kept[2]  # what a caller gets is theirs
         m, n_x, h = self.n_discs, self.n_x, 0.0 if self.inertia is None else self.inertia.seconds
         A = torch.eye(n_x, dtype=like.dtype, device=like.device)
         B, response = A.new_zeros(n_x, 2 * m), A.new_zeros(n_x, n_x)
@@ -377,7 +377,7 @@ class PlanarPushing:
             A[torch.arange(3), speed] = h * decay.expand(3)
             A[speed, speed] = decay.expand(3)
         if numbers is not None and not torch.is_inference_mode_enabled():
-            vars(self)["kept"] = key, (A, B, response)
+            vars(self)["kept"] = key, (A.clone(), B.clone(), response)
         return A, B, response
 
     def _free_motion(self, x: Tensor) -> FreeMotion:
@@ -419,8 +419,10 @@ def _damped(contacts: Contacts, response: Tensor, compliance: Tensor) -> tuple[C
 
 
 def _plain_numbers(*parts: Drive | Inertia | None) -> tuple[float, ...] | None:
-    """All values of these; None where one is a tensor, which may be learned or changed in place."""
-    values = [value for part in parts if part is not None for value in vars(part).values()]
+    """All that these consist of; None where some of it is a tensor, which may be learned or changed in place."""
+    if not all(part is None or is_dataclass(part) for part in parts):
+        return None
+    values = [getattr(part, field.name) for part in parts if part is not None for field in fields(part)]  # pyright: ignore
     return tuple(values) if all(isinstance(value, int | float) for value in values) else None
 
 
