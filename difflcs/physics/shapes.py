@@ -315,7 +315,7 @@ def shoelace(vertices: Tensor) -> Tensor:
 
 
 def _crossing(vertices: Tensor, rounded: float) -> tuple[int, int] | None:
-    """Two sides, by their first corners, that cross inside both, by more than an area that is rounding; None if none."""
+    """Two sides, by their first corners, that cross inside both, by an area above rounding; None if there are none."""
     start, end = vertices, vertices.roll(-1, 0)
     for first in range(0, len(start), _ROWS):
         a, b = (v[first : first + _ROWS].unsqueeze(1) for v in (start, end))

@@ -18,8 +18,8 @@ TAKEN = ("qpos", "mocap_pos", "mocap_quat", "qfrc_applied", "xfrc_applied")
 
 _LARGE = "x: expected {} below 1e10, got larger ones, which MuJoCo takes for errors; look for what diverges"
 _MEMORY = (
-    "model: expected memory for all contacts and constraints, got an arena that is full with {arena} bytes, where MuJoCo "
-    'drops the others; give it more, <size memory="{more}M"/> (spec.memory of a MjSpec), or pass a smaller distance'
+    "model: expected memory for all contacts and constraints, got an arena that is full with {arena} bytes, where "
+    'MuJoCo drops the others; give it more, <size memory="{more}M"/> (spec.memory of a MjSpec), or a smaller distance'
 )
 _WARNINGS = {
     "INERTIA": "model: expected an inertia matrix that can be inverted, got one that is nearly singular (degree of "

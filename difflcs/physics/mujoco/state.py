@@ -135,7 +135,10 @@ class MujocoState:
         for _, v in self._turning:
             r = x[..., v : v + 3]
             angle = np.linalg.norm(r, axis=-1)[..., None, None]
-            singular = np.abs(np.sinc(angle / (2 * np.pi))) < _SINGULAR
+            small = angle < 1e-4
+            safe = np.where(small, 1.0, angle)
+            first = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
+            singular = 2 * first < _SINGULAR**2
             if singular.any():
                 state = ", ".join(map(str, np.argwhere(singular)[0, :-2]))
                 raise InvalidInputError(
@@ -144,9 +147,6 @@ class MujocoState:
                     f"{state or 0}; take the shorter rotation to the same place, to_state(*to_mujoco(x)), or move the "
                     f"reference there: the qpos of the data"
                 )
-            small = angle < 1e-4
-            safe = np.where(small, 1.0, angle)
-            first = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
             second = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
             cross = np.cross(r[..., None, :], np.eye(3), axisa=-1, axisb=-1)
             cross = np.swapaxes(cross, -1, -2)  # columns r × e_i
