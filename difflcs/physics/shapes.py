@@ -129,12 +129,12 @@ class Polygon(Shape):
             )
         learned = vertices.requires_grad
         object.__setattr__(self, "vertices", vertices.flip(0) if area < 0 and not learned else vertices)
-        vars(self).update(turned=area < 0 and learned, made=Recall())
+        vars(self)["turned"] = area < 0 and learned
 
     @property
     def corners(self) -> Tensor:
         """(n, 2) the vertices as they are now, counterclockwise."""
-        return self.vertices.flip(0) if vars(self)["turned"] else self.vertices
+        return self.vertices.flip(0) if vars(self).get("turned") else self.vertices
 
     @property
     def n_parts(self) -> int:
@@ -171,7 +171,7 @@ class Polygon(Shape):
         """Start (n, 2), vector (n, 2), squared length (n,) and outward normal (n, 2) of every side."""
         # Kept while the corners are the same numbers; with a gradient each call has a graph of its own.
         recalls = not (self.vertices.requires_grad or transforms_active() or torch.compiler.is_compiling())
-        made: Recall[tuple[Tensor, Tensor, Tensor, Tensor]] = vars(self)["made"]
+        made: Recall[tuple[Tensor, Tensor, Tensor, Tensor]] = vars(self).setdefault("made", Recall())
         kept = made.value((self.vertices,)) if recalls else None
         if kept is not None:
             return kept

@@ -30,6 +30,7 @@ from difflcs.physics import (
 from difflcs.physics.contact import LEARNABLE
 
 F64 = torch.float64
+pytestmark = pytest.mark.usefixtures("one_thread")
 L_SHAPE = [[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 3.0]]
 
 
@@ -481,13 +482,19 @@ def test_impacts_are_inelastic_whatever_the_step(seconds, compliance, mass):
     """Of a body with a disc that stays where it is told, and with one that has a mass: the closed form."""
     for drive, after in ((PositionDrive(), 0.0), (ForceDrive(0.5, seconds), mass / (mass + 0.5))):
         system = pushing(drive=drive, compliance=compliance, inertia=Inertia(mass, seconds))
-        x = torch.zeros(system.n_x, dtype=F64)
-        x[3], x[-3] = -0.0404 - 3.3 * seconds, -1.0  # it touches within the fourth step
+        speed, steps = torch.rand(2, 50, generator=torch.Generator().manual_seed(0), dtype=F64)
+        x = torch.zeros(50, system.n_x, dtype=F64)
+        x[:, -3], x[:, 3] = (
+            -0.1 - 3 * speed,
+            -0.04 - 4 * steps * seconds * (0.1 + 3 * speed),
+        )  # within four steps it touches
+        start = x[:, -3].clone()
         for _ in range(25):
-            x = system.params(x).step(x, torch.zeros(2, dtype=F64)).x_next
-        torch.testing.assert_close(x[-3:], tensor([-after, 0.0, 0.0]), rtol=0, atol=0.01)
+            x = system.params(x).step(x, torch.zeros(50, 2, dtype=F64)).x_next
+        assert float((x[:, -3] / start - after).abs().max()) < 0.01
+        torch.testing.assert_close(x[:, -2:], torch.zeros(50, 2, dtype=F64), rtol=0, atol=1e-6)
         if drive.order == 2:
-            torch.testing.assert_close(mass * x[-3] + 0.5 * x[5], tensor(-mass))
+            torch.testing.assert_close(mass * x[:, -3] + 0.5 * x[:, 5], mass * start)
 
 
 @pytest.mark.parametrize("seconds", STEPS)
