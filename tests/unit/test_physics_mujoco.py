@@ -929,6 +929,14 @@ def test_what_is_refused_for_its_contacts_is_accepted_without_them():
     assert MujocoLCS(pushing(SERVOS + TENDON)).n_lam == 2
 
 
+def test_equality_constraints_that_the_data_switches_off_do_nothing():
+    model = pushing(SERVOS + '<equality><joint joint1="px" joint2="py"/></equality>')
+    x, off = tensor(*[0.1] * 10), data_of(model, eq_active=0)
+    found, wanted = (MujocoLCS(m, d, motion="dynamic").params(x) for m, d in ((model, off), (pushing(), None)))
+    torch.testing.assert_close(found.A, wanted.A)
+    torch.testing.assert_close(found.F, wanted.F)
+
+
 def test_actuators_that_are_no_servos_have_no_control_of_a_plan():
     module = MujocoLCS(pushing(rest='<actuator><motor joint="px"/><motor joint="py"/></actuator>'))
     with pytest.raises(InvalidInputError, match="position actuators"):

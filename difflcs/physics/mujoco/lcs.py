@@ -44,9 +44,10 @@ class MujocoLCS:
     in this plane, and contacts across it, such as those of a floor below, are left out.
 
     Not in the system: limits of joints, tendons and actuators (bound the actions and states of the MPC), margins of
-    geoms, torsional and rolling friction. Refused: equality constraints, activation dynamics, adhesion, height fields
-    and signed distance fields that may touch something, friction that override sets or that is not the same in all
-    directions, and, in dynamic motion, dry friction in joints and tendons. The matrices carry no gradient of the state.
+    geoms, torsional and rolling friction. Refused: active equality constraints, activation dynamics, adhesion, delay,
+    sleep, height fields and signed distance fields that may touch something, friction that override sets or that is not
+    the same in all directions; in quasi-static motion disabled actuators, and in dynamic motion dry friction in joints
+    and tendons. The matrices carry no gradient of the state.
 
     An object keeps one private copy of the model and its data, so use it from one thread at a time.
 
@@ -322,7 +323,7 @@ def _check_model(model: Any, data: Any, motion: Motion) -> None:
     disabled |= bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_ACTUATION))
     refused = {
         "joints": not model.nv,
-        "no equality constraints": bool(model.neq),
+        "no equality constraints that are active": bool((model.eq_active0 if data is None else data.eq_active).any()),
         "actuators without activation": bool(model.na),
         "actuators without adhesion": bool((model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)).any()),
         "one control for each actuator": getattr(model, "nactuator", model.nu) != model.nu,
