@@ -174,7 +174,7 @@ def _moved(shape: Shape, outward: Any) -> Shape:
             f"learn: expected Circle, Polygon or Union where the outline is learned, got {type(shape).__name__}; leave "
             f"the outline out"
         )
-    vertices = shape.vertices
+    vertices = shape.corners
     side = vertices.roll(-1, 0) - vertices
     normal = torch.stack([side[:, 1], -side[:, 0]], -1) / side.norm(dim=1, keepdim=True)
     by = torch.stack([next(outward) for _ in range(len(vertices))])

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -287,12 +287,15 @@ class PlanarPushing:
             )
         check_tensor("x", x, [("n_x", self.n_x)])
         friction = 0.0 if self.frictionless else self._by_contact(self.friction)
+        contacts, free, compliance = self.contacts(x), self._free_motion(x), self._by_contact(self.compliance)
+        if self.inertia is not None:
+            contacts, compliance = _damped(contacts, free.response, compliance)
         return contact_lcs(
-            self.contacts(x),
-            self._free_motion(x),
+            contacts,
+            free,
             x,
             friction=friction,
-            compliance=self._by_contact(self.compliance),
+            compliance=compliance,
             cone=self.cone,
             length=self.length or 1.0,
             force=self._unit_of_force(),
@@ -357,7 +360,7 @@ class PlanarPushing:
         numbers = _plain_numbers(self.drive, self.inertia)
         key, (kept_key, kept) = (numbers, like.dtype, like.device), vars(self).get("kept", (None, None))
         if numbers is not None and key == kept_key:
-            return kept
+            return kept[0].clone(), kept[1].clone(), kept[2]  # what a caller gets is theirs
         m, n_x, h = self.n_discs, self.n_x, 0.0 if self.inertia is None else self.inertia.seconds
         A = torch.eye(n_x, dtype=like.dtype, device=like.device)
         B, response = A.new_zeros(n_x, 2 * m), A.new_zeros(n_x, n_x)
@@ -374,7 +377,7 @@ class PlanarPushing:
             A[torch.arange(3), speed] = h * decay.expand(3)
             A[speed, speed] = decay.expand(3)
         if numbers is not None and not torch.is_inference_mode_enabled():
-            vars(self)["kept"] = key, (A, B, response)
+            vars(self)["kept"] = key, (A.clone(), B.clone(), response)
         return A, B, response
 
     def _free_motion(self, x: Tensor) -> FreeMotion:
@@ -400,9 +403,26 @@ class PlanarPushing:
         return torch.cat([place, rest, velocity, torch.zeros_like(speed)], -1)
 
 
+_MOST = 0.01  # of how far an impulse moves two bodies apart in a step: what a contact gives way at most, and bounces
+
+
+def _damped(contacts: Contacts, response: Tensor, compliance: Tensor) -> tuple[Contacts, Tensor]:
+    """Contacts that do not bounce in short steps, and how far (..., n_contacts) a force closes each within a step.
+
+    Compliance r alone is a spring, which gives back what it takes if a step moves a body by less than r times the
+    impulse. A damper beside it lets it give way by g < r a step. With s = g/r that is φ₊ − (1 − s) φ + s r f = 0 for an
+    impulse f at a gap φ < 0, and φ = −r f at rest, as without it. A gap that is open counts in full, φ₊ + s r f = 0.
+    """
+    most = _MOST * ((contacts.normal @ response) * contacts.normal).sum(-1)
+    gap = torch.where(contacts.gap < 0, (most / compliance).clamp(0.0, 1.0) * contacts.gap, contacts.gap)
+    return contacts._replace(gap=gap), torch.minimum(most, compliance)
+
+
 def _plain_numbers(*parts: Drive | Inertia | None) -> tuple[float, ...] | None:
-    """All values of these; None where one is a tensor, which may be learned or changed in place."""
-    values = [value for part in parts if part is not None for value in vars(part).values()]
+    """All that these consist of; None where some of it is a tensor, which may be learned or changed in place."""
+    if not all(part is None or is_dataclass(part) for part in parts):
+        return None
+    values = [getattr(part, field.name) for part in parts if part is not None for field in fields(part)]  # pyright: ignore
     return tuple(values) if all(isinstance(value, int | float) for value in values) else None
 
 

@@ -19,6 +19,8 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import check_tensor, describe
+from difflcs._functorch import transforms_active
+from difflcs._recall import Recall
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 
 __all__ = ["Circle", "Distance", "Polygon", "Shape", "Union", "box"]
@@ -90,8 +92,8 @@ class Polygon(Shape):
     """A simple polygon, convex or not.
 
     Attributes:
-        vertices: (n, 2) corners in order, counterclockwise; clockwise ones are reversed. A tensor, which may require a
-            gradient, or numbers.
+        vertices: (n, 2) corners in order, counterclockwise; clockwise ones are reversed. Numbers, or a tensor, of which
+            the polygon has a copy, but for one that requires a gradient: this is the tensor itself, as it is given.
 
     Raises:
         ShapeError, InvalidInputError: not at least three corners, no area, two corners at one place in succession, or
@@ -107,22 +109,32 @@ class Polygon(Shape):
                 f"vertices: expected (n, 2) with at least 3 corners, got {tuple(vertices.shape)}; give one row "
                 f"for each corner"
             )
-        sides = (vertices.detach().roll(-1, 0) - vertices.detach()).norm(dim=1)
+        at = vertices.detach()
+        sides = (at.roll(-1, 0) - at).norm(dim=1)
+        longest = float(sides.max())
         if not float(sides.min()) > 0:
             raise InvalidInputError(
                 f"vertices: expected every corner apart from the next, got corner {int(sides.argmin())} twice; leave "
                 f"one of them out, the last need not repeat the first"
             )
-        area = float(shoelace(vertices.detach()).sum()) / 2
-        if not abs(area) > 1e-12 * float(sides.max()) ** 2:
+        rounded = longest * 4 * torch.finfo(at.dtype).eps * float(at.abs().max())  # of twice an area
+        area = float(shoelace(at - at[0]).sum()) / 2  # far from the origin it would be the difference of large ones
+        if not abs(area) > max(1e-12 * longest**2, rounded):
             raise InvalidInputError(f"vertices: expected a polygon with an area, got {area:g}; move the corners apart")
-        crossed = _crossing(vertices.detach())
+        crossed = _crossing(at, rounded)
         if crossed:
             raise InvalidInputError(
                 f"vertices: expected sides that do not cross, got crossing ones from corners {crossed[0]} and "
                 f"{crossed[1]}; give the corners in the order in which one meets them along the outline"
             )
-        object.__setattr__(self, "vertices", vertices.flip(0) if area < 0 else vertices)
+        learned = vertices.requires_grad
+        object.__setattr__(self, "vertices", vertices.flip(0) if area < 0 and not learned else vertices)
+        vars(self)["turned"] = area < 0 and learned
+
+    @property
+    def corners(self) -> Tensor:
+        """(n, 2) the vertices as they are now, counterclockwise."""
+        return self.vertices.flip(0) if vars(self).get("turned") else self.vertices
 
     @property
     def n_parts(self) -> int:
@@ -141,9 +153,10 @@ class Polygon(Shape):
         with torch.no_grad():
             nearest, inside = _nearest_side(points, start, side, square)
         a, side, outward = start[nearest], side[nearest], outward[nearest]
-        along = ((points - a) * side).sum(-1) / square[nearest]
-        point = a + along.clamp(0.0, 1.0).unsqueeze(-1) * side
-        apart = points - point
+        to = points - a
+        along = (to * side).sum(-1) / square[nearest]
+        beyond = along.clamp(0.0, 1.0).unsqueeze(-1) * side
+        point, apart = a + beyond, to - beyond
         size = torch.linalg.vector_norm(apart, dim=-1)
         sign = torch.where(inside, -1.0, 1.0).to(points.dtype)
         # Beside a side its own normal serves, on the outline too, where the direction to it is none; round a corner
@@ -156,26 +169,30 @@ class Polygon(Shape):
 
     def _sides(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Start (n, 2), vector (n, 2), squared length (n,) and outward normal (n, 2) of every side."""
-        # Kept while the corners are numbers that have not changed; with a gradient each call has a graph of its own.
-        plain = not (self.vertices.requires_grad or self.vertices.is_inference())
-        version = self.vertices._version if plain else None
-        if plain and vars(self).get("version") == version:
-            return vars(self)["sides"]
-        side = self.vertices.roll(-1, 0) - self.vertices
+        # Kept while the corners are the same numbers; with a gradient each call has a graph of its own.
+        recalls = not (self.vertices.requires_grad or transforms_active() or torch.compiler.is_compiling())
+        made: Recall[tuple[Tensor, Tensor, Tensor, Tensor]] = vars(self).setdefault("made", Recall())
+        kept = made.value((self.vertices,)) if recalls else None
+        if kept is not None:
+            return kept
+        corners = self.corners
+        side = corners.roll(-1, 0) - corners
         square = side.square().sum(-1)
-        sides = (self.vertices, side, square, torch.stack([side[:, 1], -side[:, 0]], -1) / square.sqrt().unsqueeze(-1))
-        if plain and not torch.is_inference_mode_enabled():
-            vars(self).update(sides=sides, version=version)
+        sides = (corners, side, square, torch.stack([side[:, 1], -side[:, 0]], -1) / square.sqrt().unsqueeze(-1))
+        if recalls:
+            made.keep(sides, (self.vertices,))
         return sides
 
     def moments(self) -> Moments:
         """See `Shape`."""
-        p, n = self.vertices, self.vertices.roll(-1, 0)
-        cross = shoelace(p)
+        corners = self.corners
+        first = corners[0].detach()  # about the origin, large numbers would cancel far from it
+        p = corners - first
+        n, cross = p.roll(-1, 0), shoelace(p)
         area = cross.sum() / 2
         centroid = ((p + n) * cross.unsqueeze(-1)).sum(0) / (6 * area)
-        about_origin = (cross * (p.square() + p * n + n.square()).sum(-1)).sum() / 12
-        return Moments(area, centroid, about_origin - area * centroid.square().sum())
+        about_first = (cross * (p.square() + p * n + n.square()).sum(-1)).sum() / 12
+        return Moments(area, first + centroid, about_first - area * centroid.square().sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,13 +299,13 @@ def box(x_min: float, x_max: float, y_min: float, y_max: float) -> Polygon:
 
 
 def _tensor(name: str, value: Any | Sequence) -> Tensor:
-    """Numbers as float64; a tensor as it is."""
+    """Numbers as float64; a copy of a tensor, or the tensor itself if it requires a gradient."""
     if not isinstance(value, Tensor):
         try:
             value = torch.tensor(value, dtype=torch.float64)
         except (TypeError, ValueError) as error:
             raise DTypeError(f"{name}: expected numbers or a tensor, got {describe(value)}; {error}") from error
-    return check_tensor(name, value)
+    return check_tensor(name, value if value.requires_grad else value.clone())
 
 
 def shoelace(vertices: Tensor) -> Tensor:
@@ -297,24 +314,24 @@ def shoelace(vertices: Tensor) -> Tensor:
     return vertices[:, 0] * following[:, 1] - vertices[:, 1] * following[:, 0]
 
 
-def _crossing(vertices: Tensor) -> tuple[int, int] | None:
-    """Two sides, by their first corners, that cross inside both; None where there are none."""
+def _crossing(vertices: Tensor, rounded: float) -> tuple[int, int] | None:
+    """Two sides, by their first corners, that cross inside both, by an area above rounding; None if there are none."""
     start, end = vertices, vertices.roll(-1, 0)
     for first in range(0, len(start), _ROWS):
         a, b = (v[first : first + _ROWS].unsqueeze(1) for v in (start, end))
         # The ends of one side are on both sides of the other, and the other way round.
-        apart = _turn(a, b, start) * _turn(a, b, end) < 0
-        apart &= _turn(start, end, a) * _turn(start, end, b) < 0
+        apart = _turn(a, b, start, rounded) * _turn(a, b, end, rounded) < 0
+        apart &= _turn(start, end, a, rounded) * _turn(start, end, b, rounded) < 0
         if bool(apart.any()):
             i, j = apart.nonzero()[0].tolist()
             return first + i, j
     return None
 
 
-def _turn(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """Twice the signed area of triangles: above 0 where c is to the left of the way from a to b."""
+def _turn(a: Tensor, b: Tensor, c: Tensor, rounded: float) -> Tensor:
+    """Twice the signed area of triangles: above 0 where c is to the left of the way from a to b; 0 up to `rounded`."""
     along, to = b - a, c - a
-    return along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0]
+    return torch.nn.functional.hardshrink(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0], rounded)
 
 
 def _nearest_side(points: Tensor, start: Tensor, side: Tensor, square: Tensor) -> tuple[Tensor, Tensor]:

@@ -30,6 +30,7 @@ from difflcs.physics import (
 from difflcs.physics.contact import LEARNABLE
 
 F64 = torch.float64
+pytestmark = pytest.mark.usefixtures("one_thread")
 L_SHAPE = [[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 3.0]]
 
 
@@ -84,6 +85,29 @@ def test_moments_of_what_is_known():
     torch.testing.assert_close(halves.gyration, whole.gyration)
     torch.testing.assert_close(halves.centroid, whole.centroid)
     assert halves.n_parts == 2
+
+
+TOUCHING = [[0.0, 0.0], [3.0, 1.0], [3.0, 3.0], [1.5, 0.5], [0.0, 3.0]]  # a corner on a side
+
+
+@pytest.mark.parametrize("dtype", [F64, torch.float32])
+@pytest.mark.parametrize("offset", [0.0, 1e3, 1e5])
+def test_where_the_origin_is_changes_nothing(offset, dtype):
+    """Shapes and points whose numbers are exact far away too."""
+    away = offset * torch.tensor([1.0, -2.0], dtype=dtype)
+    outline, circle, other = Polygon(torch.tensor(L_SHAPE, dtype=dtype)), Circle(0.5, (1.0, 1.0)), tensor([1.0, 1.0])
+    moved = Union((Polygon(outline.vertices + away), Circle(0.5, other + away)))
+    for found, wanted in zip(moved.moments(), Union((outline, circle)).moments(), strict=True):
+        torch.testing.assert_close(found - (away if found.ndim else 0), wanted, rtol=1e-6, atol=1e-6, check_dtype=False)
+    points = torch.randint(-8, 24, (200, 2), generator=torch.Generator().manual_seed(0)).to(dtype) / 8
+    far, near = moved.parts[0].distance(points + away), outline.distance(points)
+    torch.testing.assert_close(far.distance, near.distance)
+    torch.testing.assert_close(far.normal, near.normal)
+    turn = tensor([[math.cos(0.7), math.sin(0.7)], [-math.sin(0.7), math.cos(0.7)]])
+    Polygon((tensor(TOUCHING) @ turn).to(dtype) + away)
+    for wrong, match in (([[0, 0], [1, 1], [3, 3.0]], "an area"), ([[0, 0], [2, 0], [0, 1], [1, 1.0]], "cross")):
+        with pytest.raises(InvalidInputError, match=match):
+            Polygon((tensor(wrong) @ turn).to(dtype) + away)
 
 
 @pytest.mark.parametrize(
@@ -288,6 +312,37 @@ def test_numbers_changed_in_place_are_seen():
     assert system.params(x).B[3, 0].item() == pytest.approx(0.35)
 
 
+@pytest.mark.parametrize("learned", [False, True])
+@pytest.mark.parametrize("way", [lambda v, new: v.detach().numpy().__setitem__(slice(None), new),
+                                 lambda v, new: v.data.copy_(new), lambda v, new: v.detach().copy_(new)])  # fmt: skip
+def test_a_polygon_has_the_corners_that_it_was_made_with_or_those_of_what_is_learned(way, learned):
+    corners = tensor([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]]).requires_grad_(learned)  # clockwise
+    moved, place = tensor([[0.0, 1.0], [4.0, 1.0], [4.0, -3.0], [0.0, 0.0]]), tensor([1.0, -1.0])
+
+    def seen(shape):
+        return [
+            float(v) for v in (shape.distance(place).distance.detach(), shape.moments().area.detach(), shape.radius)
+        ]
+
+    shape, before, after = Polygon(corners), seen(Polygon(corners.detach())), seen(Polygon(moved))
+    assert seen(shape) == before != after
+    way(corners, moved)
+    assert seen(shape) == (after if learned else before)
+    way(shape.vertices, moved if learned else moved.flip(0))  # its own
+    assert seen(shape) == after
+
+
+@pytest.mark.parametrize("name", ["position", "force"])
+def test_a_system_that_its_owner_changes_is_no_longer_that_of_the_physics(name):
+    system = pushing(**DRIVES[name])
+    x = torch.full((system.n_x,), 0.1, dtype=F64)
+    kept = [value.clone() for value in system.params(x).tensors().values()]
+    for value in system.params(x).tensors().values():
+        value.mul_(2.0).add_(1.0)
+    for value, wanted in zip(system.params(x).tensors().values(), kept, strict=True):
+        assert torch.equal(value, wanted)
+
+
 def test_what_inference_mode_prepares_is_not_kept():
     system = pushing()
     x = torch.zeros(5, dtype=F64)
@@ -415,6 +470,73 @@ def test_only_the_nearest_parts_touch():
         torch.testing.assert_close(getattr(near, name).reshape(2, 2, -1), wanted)
     more = PlanarPushing(Union(parts), 0.005, 2, friction=0.4, nearest=9)
     torch.testing.assert_close(more.contacts(x).gap, full.gap)
+
+
+STEPS = (0.0005, 0.01, 0.1)
+
+
+@pytest.mark.parametrize("seconds", STEPS)
+@pytest.mark.parametrize("compliance", [1e-6, 0.02, 0.3])
+@pytest.mark.parametrize("mass", [0.1, 10.0])
+def test_impacts_are_inelastic_whatever_the_step(seconds, compliance, mass):
+    """Of a body with a disc that stays where it is told, and with one that has a mass: the closed form."""
+    for drive, after in ((PositionDrive(), 0.0), (ForceDrive(0.5, seconds), mass / (mass + 0.5))):
+        system = pushing(drive=drive, compliance=compliance, inertia=Inertia(mass, seconds))
+        speed, steps = torch.rand(2, 50, generator=torch.Generator().manual_seed(0), dtype=F64)
+        x = torch.zeros(50, system.n_x, dtype=F64)
+        x[:, -3], x[:, 3] = (
+            -0.1 - 3 * speed,
+            -0.04 - 4 * steps * seconds * (0.1 + 3 * speed),
+        )  # within four steps it touches
+        start = x[:, -3].clone()
+        for _ in range(25):
+            x = system.params(x).step(x, torch.zeros(50, 2, dtype=F64)).x_next
+        assert float((x[:, -3] / start - after).abs().max()) < 0.01
+        torch.testing.assert_close(x[:, -2:], torch.zeros(50, 2, dtype=F64), rtol=0, atol=1e-6)
+        if drive.order == 2:
+            torch.testing.assert_close(mass * x[:, -3] + 0.5 * x[:, 5], mass * start)
+
+
+@pytest.mark.parametrize("seconds", STEPS)
+def test_a_push_with_a_force_is_newtons_and_closes_the_gap_by_what_the_contact_gives(seconds):
+    mass, disc, push, compliance, n = 1.0, 0.5, 3.0, 0.02, 20
+    system = pushing(
+        drive=ForceDrive(disc, seconds), compliance=compliance, inertia=Inertia(mass, seconds), friction=0.0
+    )  # fmt: skip
+    x = torch.zeros(system.n_x, dtype=F64)
+    x[3] = -0.04 + compliance * push * seconds * mass / (mass + disc)
+    for _ in range(n):
+        params = system.params(x)
+        found = params.step(x, tensor([push, 0.0]))
+        x = found.x_next
+    torch.testing.assert_close(x[[-3, 5]], tensor([n * seconds * push / (mass + disc)] * 2), rtol=1e-6, atol=0)
+    force = float((params.C @ found.lam)[-3]) * mass / seconds
+    assert force == pytest.approx(push * mass / (mass + disc), rel=1e-6)
+    assert float(system.contacts(x).gap) == pytest.approx(-compliance * force * seconds, rel=1e-6)
+
+
+@pytest.mark.parametrize("seconds", [0.005, 0.02])
+@pytest.mark.parametrize(("friction", "compliance"), [(0.0, 0.02), (0.5, 1e-6), (0.5, 0.02)])
+def test_impacts_never_add_energy(seconds, friction, compliance):
+    """Three discs fly at a body that spins; a linear system turns it by its contacts as far as ω h, a small angle."""
+    mass, disc = 0.3, 0.2
+    system = pushing(
+        n_discs=3, drive=ForceDrive(disc, seconds), inertia=Inertia(mass, seconds), friction=friction,
+        compliance=compliance,
+    )  # fmt: skip
+    random = torch.Generator().manual_seed(0)
+    angle = 2 * math.pi * torch.rand(50, 3, generator=random, dtype=F64)
+    way = torch.stack([angle.cos(), angle.sin()], -1).flatten(1)
+    x = torch.zeros(50, system.n_x, dtype=F64)
+    x[:, 3:9], x[:, 9:15], x[:, -1] = 0.07 * way, -0.5 * way, torch.randn(50, generator=random, dtype=F64)
+    weight = tensor([disc] * 6 + [mass, mass, mass * float(system.gyration) ** 2])
+    energy = [x[:, 9:].square() @ weight]
+    for _ in range(round(0.1 / seconds)):
+        x = system.params(x).step(x, torch.zeros(6, dtype=F64)).x_next
+        energy.append(x[:, 9:].square() @ weight)
+    found = torch.stack(energy) / energy[0]
+    assert float(found[-1].mean()) < 0.8
+    assert float((found - found.cummin(0).values).max()) < 1e-3
 
 
 def test_discs_with_mass_are_pushed_back():

@@ -121,6 +121,18 @@ def test_a_rotation_counts_from_the_reference():
     assert MujocoState(model, turned).to_state(turned).abs().max() == pytest.approx(0.0, abs=1e-12)
 
 
+@pytest.mark.parametrize("quaternion", [[0, 0, 0, 0], [2, 0, 0, 0], [0, 0, 0, 0.5]])
+def test_quaternions_are_read_as_mujoco_does(quaternion):
+    """Of any length, and of zeros as no rotation: in the reference, in what becomes a state, and on the way back."""
+    data = mujoco.MjData(model := load('<body><freejoint name="b"/><geom type="box" size=".1 .2 .3"/></body>'))
+    data.qpos[3:] = quaternion
+    mujoco.mj_kinematics(model, data)
+    for reference in (data.qpos, np.array([0, 0, 0, 0.8, 0.6, 0, 0])):
+        state = MujocoState(model, reference)
+        again = state.to_mujoco(state.to_state(data.qpos))[0][3:]
+        np.testing.assert_allclose(again * np.sign(again @ data.xquat[1]), data.xquat[1], atol=1e-12)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_tangent_takes_velocities_of_the_state_to_those_of_mujoco(seed):
     model = many_joints()
@@ -717,7 +729,69 @@ def data_of(model, **values):
     return data
 
 
+def at(model, *x, **options):
+    """The system at a state, after one at zero; zeros follow x."""
+    module = MujocoLCS(model, **options)
+    states = torch.zeros(2, module.n_x).double()
+    states[1, : len(x)] = tensor(*x)
+    return module.params(states)
+
+
+SMALL = '<body><joint name="a" type="slide" axis="1 0 0" {}/><geom size=".1" mass="1e-10"/></body>'
+LATE = SERVOS.replace("/></", ' delay=".05" nsample="20"/></')
+since_mujoco_4 = pytest.mark.skipif(not hasattr(mujoco.MjModel, "nhistory"), reason="this MuJoCo has none")
+
 REFUSED = {
+    "delay of an actuator": pytest.param(
+        lambda: MujocoLCS(pushing(LATE)), InvalidInputError, "no delay of actuators", marks=since_mujoco_4
+    ),
+    "delay of a sensor": pytest.param(
+        lambda: MujocoLCS(pushing(SERVOS + '<sensor><jointpos joint="px" delay=".1" nsample="9"/></sensor>')),
+        InvalidInputError,
+        "no delay of actuators and sensors",
+        marks=since_mujoco_4,
+    ),
+    "sleep": pytest.param(
+        lambda: MujocoLCS(pushing(SERVOS + '<option><flag sleep="enable"/></option>')),
+        InvalidInputError,
+        "sleep",
+        marks=since_mujoco_4,
+    ),
+    "an actuator that its group disables": (
+        lambda: MujocoLCS(pushing(SERVOS + '<option actuatorgroupdisable="0"/>')),
+        InvalidInputError,
+        "not disabled",
+    ),
+    "actuators that a flag disables": (
+        lambda: MujocoLCS(pushing(SERVOS + '<option><flag actuation="disable"/></option>')),
+        InvalidInputError,
+        "not disabled",
+    ),
+    "a whole turn": (
+        lambda: at(load(SPHERE), 0, 0, 0, 0, 2 * np.pi, motion="dynamic"),
+        InvalidInputError,
+        "near a whole turn .* got 6.28319 rad in joint0_rx .* state 1; .* or move the reference",
+    ),
+    "nearly two turns": (
+        lambda: at(load(SPHERE), 0, 0, 0, 4 * np.pi - 0.02, motion="dynamic"),
+        InvalidInputError,
+        "near a whole turn",
+    ),
+    "a place out of all bounds": (
+        lambda: at(load(SPHERE), 1e11, motion="dynamic"),
+        InvalidInputError,
+        "positions below 1e10.*in state 1 of 2",
+    ),
+    "a speed out of all bounds": (
+        lambda: at(load(SPHERE), *[0] * 6, 1e11, motion="dynamic"),
+        InvalidInputError,
+        "velocities below 1e10",
+    ),
+    "an acceleration out of all bounds": (
+        lambda: at(load(SMALL.format('stiffness="1e3"')), 1.0, motion="dynamic"),
+        InvalidInputError,
+        "accelerations",
+    ),
     "no model": (lambda: MujocoLCS("model.xml"), DTypeError, "MjModel"),
     "no data": (lambda: MujocoLCS(pushing(), 3), DTypeError, "MjData"),
     "no data to linearise at": (lambda: lcs_from_mujoco(pushing(), None), DTypeError, "MjData"),
@@ -787,9 +861,11 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("case", REFUSED)
-def test_bad_input_is_refused(case):
-    call, error, words = REFUSED[case]
+CASES = [pytest.param(*getattr(v, "values", v), id=k, marks=getattr(v, "marks", ())) for k, v in REFUSED.items()]
+
+
+@pytest.mark.parametrize(("call", "error", "words"), CASES)
+def test_bad_input_is_refused(call, error, words):
     with pytest.raises(error, match=words):
         call()
 
@@ -802,12 +878,63 @@ def test_dry_friction_of_joints_is_refused_with_velocities_alone():
         MujocoLCS(model, motion="dynamic")
 
 
+def outcome(call):
+    """What comes, or what the error says."""
+    try:
+        return call()
+    except InvalidInputError as error:
+        return str(error)
+
+
+@pytest.mark.parametrize("memory", ["16K", "100K", "2M"])
+def test_where_memory_is_short_no_contact_is_dropped_in_silence(memory):
+    """Nine boxes on a floor; where they are far apart, memory suffices before and after a state that is refused."""
+    boxes = "".join(f'<body pos="{0.12 * i} 0 .05"><freejoint/><geom {FACES["box"]}/></body>' for i in range(9))
+    systems = []
+    for size in ("64M", memory):
+        model = load('<geom type="plane" size="3 3 .1"/>' + boxes, f'<size memory="{size}"/>')
+        near = torch.zeros(9, 12).double()
+        near[:, :3] = torch.from_numpy(model.qpos0.reshape(9, 7)[:, :3])
+        far = near.clone()
+        far[1:, 2] += 10 + torch.arange(8)
+        near, far = (torch.cat([x[:, :6].flatten(), x[:, 6:].flatten()]) for x in (near, far))
+        module = outcome(lambda model=model: MujocoLCS(model, motion="dynamic", contacts=36))
+        if isinstance(module, MujocoLCS):
+            module = [outcome(lambda module=module, x=x: module.params(x).c) for x in (far, near, far)]
+        systems.append(module)
+    whole, short = systems
+    refused = [short] if isinstance(short, str) else [found for found in short if isinstance(found, str)]
+    assert all("memory for all contacts" in error for error in refused)
+    assert memory == "100K" or bool(refused) == (memory == "16K")
+    assert isinstance(short, str) or all(
+        isinstance(s, str) or torch.equal(s, w) for s, w in zip(short, whole, strict=True)
+    )
+
+
+@pytest.mark.parametrize("options", ['actuatorgroupdisable="0"', '><flag actuation="disable"/'])
+def test_disabled_actuators_do_nothing_in_dynamic_motion(options):
+    one, none = pushing(SERVOS + f"<option {options}></option>"), pushing("")
+    x = [0.1, 0.2, 0.3, 0.4, 0.5, 1.0]
+    disabled, without = at(one, *x, motion="dynamic"), at(none, *x, motion="dynamic")
+    assert not disabled.B.any()
+    torch.testing.assert_close(disabled.A, without.A)
+    torch.testing.assert_close(disabled.d, without.d)
+
+
 def test_what_is_refused_for_its_contacts_is_accepted_without_them():
     assert MujocoLCS(load(TERRAIN, FIELD), motion="dynamic", pairs=[("ball", "wall")]).n_contacts == 1
     for rest in (PAIR, OVERRIDE):
         assert MujocoLCS(pushing(SERVOS + rest), friction=0.4).n_lam == 2
         assert MujocoLCS(pushing(SERVOS + rest), pairs=[]).n_lam == 0
     assert MujocoLCS(pushing(SERVOS + TENDON)).n_lam == 2
+
+
+def test_equality_constraints_that_the_data_switches_off_do_nothing():
+    model = pushing(SERVOS + '<equality><joint joint1="px" joint2="py"/></equality>')
+    x, off = tensor(*[0.1] * 10), data_of(model, eq_active=0)
+    found, wanted = (MujocoLCS(m, d, motion="dynamic").params(x) for m, d in ((model, off), (pushing(), None)))
+    torch.testing.assert_close(found.A, wanted.A)
+    torch.testing.assert_close(found.F, wanted.F)
 
 
 def test_actuators_that_are_no_servos_have_no_control_of_a_plan():

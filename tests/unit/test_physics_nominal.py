@@ -90,7 +90,7 @@ def test_what_friction_holds_stays_as_in_mujoco_by_the_right_force(name, option)
             assert wrong[model.nv :][held].max() < 1e-3  # m/s
             assert wrong[: model.nv][held].max() < 1e-4  # m
             carried = (params.C @ lam)[model.nv :][: 6 * free].reshape(-1, 6)[:, 2] / seconds
-            torch.testing.assert_close(carried[-1:], torch.full((1,), 9.81).double(), rtol=1e-2, atol=0)
+            torch.testing.assert_close(carried[-1:], torch.full((1,), 9.81).double(), rtol=2e-2, atol=0)
 
 
 @pytest.mark.parametrize(("degrees", "speed"), [(0, 0.8), (30, 0.3), (40, 0.0)])

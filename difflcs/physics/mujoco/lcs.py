@@ -19,6 +19,7 @@ from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeE
 from difflcs.physics.contacts import Cone, Contacts, FreeMotion, contact_lcs, count_forces
 from difflcs.physics.mujoco.contacts import ContactFinder, Found, Pairs
 from difflcs.physics.mujoco.motion import Actuators, Dynamic, QuasiStatic
+from difflcs.physics.mujoco.native import TAKEN, native
 from difflcs.physics.mujoco.nominal import Recovery, at_nominal
 from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams
@@ -26,6 +27,7 @@ from difflcs.records import LCSParams
 __all__ = ["Motion", "MujocoLCS", "lcs_from_mujoco"]
 
 Motion = Literal["quasi-static", "dynamic"]
+_SLEEP = int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0))  # of MuJoCo 3.4 and later
 
 
 class MujocoLCS:
@@ -44,9 +46,10 @@ class MujocoLCS:
     in this plane, and contacts across it, such as those of a floor below, are left out.
 
     Not in the system: limits of joints, tendons and actuators (bound the actions and states of the MPC), margins of
-    geoms, torsional and rolling friction. Refused: equality constraints, activation dynamics, adhesion, height fields
-    and signed distance fields that may touch something, friction that override sets or that is not the same in all
-    directions, and, in dynamic motion, dry friction in joints and tendons. The matrices carry no gradient of the state.
+    geoms, torsional and rolling friction. Refused: active equality constraints, activation dynamics, adhesion, delay,
+    sleep, height fields and signed distance fields that may touch something, friction that override sets or that is not
+    the same in all directions; in quasi-static motion disabled actuators, and in dynamic motion dry friction in joints
+    and tendons. The matrices carry no gradient of the state.
 
     An object keeps one private copy of the model and its data, so use it from one thread at a time.
 
@@ -101,8 +104,8 @@ class MujocoLCS:
         ctrl: ArrayLike | None = None,
         length: float | None = None,
     ):
-        _check_model(model, data)
         check_choice("motion", motion, ("quasi-static", "dynamic"))
+        _check_model(model, data, motion)
         check_choice("cone", cone, ("anitescu", "stewart-trinkle"))
         if isinstance(mobility, str):
             check_choice("mobility", mobility, ("inertia", "damping"))
@@ -114,14 +117,16 @@ class MujocoLCS:
         if friction is not None:
             check_number("friction", friction)
         model = copy.copy(model)
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it would lose what data says; see native
         self._model, self._data = model, mujoco.MjData(model)
         if data is not None:
             _take(self._data, data)
-        mujoco.mj_fwdPosition(model, self._data)
+        with native(model, self._data, "in the state of data"):
+            mujoco.mj_fwdPosition(model, self._data)
         self.state = MujocoState(model, self._data.qpos, velocities=motion == "dynamic")
         self._actuators, self._relative = Actuators(model), relative
         self._quasi_static = motion == "quasi-static"
-        mobility = mobility if isinstance(mobility, str) else np.asarray(mobility)
+        mobility = mobility if isinstance(mobility, str) else np.array(mobility)
         if self._quasi_static:
             self._motion: Any = QuasiStatic(model, self._actuators, mobility)
         else:
@@ -141,7 +146,8 @@ class MujocoLCS:
         model.opt.disableflags |= sum(
             int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("EQUALITY", "FRICTIONLOSS", "LIMIT")
         )
-        self._give = self._typical_response()
+        with native(model, self._data, "in the state of data"):
+            self._give = self._typical_response()
 
     @property
     def n_x(self) -> int:
@@ -254,10 +260,11 @@ class MujocoLCS:
         ctrl = [self._ctrl] * n if context is None else self._controls(context, batch).reshape(n, -1)
         contacts, moved = self._finder.allocate(n), self._motion.allocate(n)
         for i in range(n):
-            data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
-            mujoco.mj_fwdPosition(model, data)
-            self._finder.read(i, contacts)
-            self._motion.read(i, data, moved, ctrl[i])
+            with native(model, data, f"in state {i} of {n}"):
+                data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
+                mujoco.mj_fwdPosition(model, data)
+                self._finder.read(i, contacts)
+                self._motion.read(i, data, moved, ctrl[i])
         flat = x.detach().double().cpu().reshape(n, self.n_x).numpy()
         tangent = self.state.tangent(flat[:, : self.state.nv])
         return _States(batch, flat, tangent, self._finder.finish(contacts), contacts.geom, moved)
@@ -342,20 +349,27 @@ def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: A
     return module.params(module.state.to_state(data.qpos, data.qvel) if x is None else x)
 
 
-def _check_model(model: Any, data: Any) -> None:
+def _check_model(model: Any, data: Any, motion: Motion) -> None:
     if not isinstance(model, mujoco.MjModel):
         raise DTypeError(f"model: expected a mujoco.MjModel, got {describe(model)}; load one with MjModel")
     if data is not None and not isinstance(data, mujoco.MjData):
         raise DTypeError(f"data: expected a mujoco.MjData, got {describe(data)}; pass mujoco.MjData(model)")
     if data is not None and len(data.qpos) != model.nq:
         raise InvalidInputError(f"data: expected nq={model.nq} of the model, got {len(data.qpos)}; pass MjData(model)")
+    groups = model.actuator_group
+    disabled = (groups >= 0) & (groups < 31) & (model.opt.disableactuator >> groups.clip(0, 30) & 1 > 0)
+    disabled |= bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_ACTUATION))
     refused = {
         "joints": not model.nv,
-        "no equality constraints": bool(model.neq),
+        "no equality constraints that are active": bool((model.eq_active0 if data is None else data.eq_active).any()),
         "actuators without activation": bool(model.na),
         "actuators without adhesion": bool((model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)).any()),
         "one control for each actuator": getattr(model, "nactuator", model.nu) != model.nu,
         "no flexible bodies": bool(model.nflex),
+        "no delay of actuators and sensors (delay, nsample)": bool(getattr(model, "nhistory", 0)),
+        'no <flag sleep="enable"/>': bool(model.opt.enableflags & _SLEEP),
+        "actuators that are not disabled (actuatorgroupdisable, <flag actuation/>) in quasi-static motion, which moves "
+        "what they drive": motion == "quasi-static" and bool(disabled.any()),
     }
     for wanted, found in refused.items():
         if found:
@@ -364,7 +378,7 @@ def _check_model(model: Any, data: Any) -> None:
 
 def _take(into: Any, data: Any) -> None:
     """What is not in the state, from the caller's data."""
-    for name in ("qpos", "ctrl", "mocap_pos", "mocap_quat", "qfrc_applied", "xfrc_applied"):
+    for name in TAKEN:
         own, values = getattr(into, name), getattr(data, name)
         if values.shape != own.shape:
             raise InvalidInputError(

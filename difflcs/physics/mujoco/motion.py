@@ -35,9 +35,17 @@ Array = NDArray[np.float64]
 _JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 _FIXED, _AFFINE = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_AFFINE)
-_BEYOND = 1e9  # a motion in a step [m, rad] and its velocity that no model has
+_BEYOND = 1e6  # a motion in a step [m, rad] and its velocity that no model has
 _MOST, _FEW = 10, 4  # steps that are simulated one by one; where there are more, so many as long ones
-_EULER, _RK4, _IMPLICIT = (int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("EULER", "RK4", "IMPLICIT"))
+_EULER, _RK4, _IMPLICIT, _FAST = (
+    int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("EULER", "RK4", "IMPLICIT", "IMPLICITFAST")
+)
+_ADVANCE = {
+    _EULER: mujoco.mj_Euler,
+    _RK4: lambda model, data: mujoco.mj_RungeKutta(model, data, 4),
+    _IMPLICIT: mujoco.mj_implicit,
+    _FAST: mujoco.mj_implicit,
+}
 
 
 class Actuators:
@@ -141,7 +149,7 @@ class QuasiStatic:
         if tangent is not None:
             inverse = np.linalg.inv(tangent)
             response = inverse @ response @ inverse.swapaxes(-1, -2)
-        tensors = (torch.from_numpy(v) for v in (np.eye(nv), self.B, np.zeros(nv), response))
+        tensors = (torch.from_numpy(v) for v in (np.eye(nv), self.B.copy(), np.zeros(nv), response))
         return FreeMotion(*tensors)
 
 
@@ -169,7 +177,7 @@ class Dynamic:
         self.firm = np.isin(
             self.tree, np.setdiff1d(self.tree, self.tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
         )
-        self.flags = _flags("CONSTRAINT", "CLAMPCTRL", "AUTORESET")
+        self.flags = _flags("CONSTRAINT", "CLAMPCTRL")
         for limited in ("actuator_forcelimited", "actuator_ctrllimited", "jnt_actfrclimited", "tendon_actfrclimited"):
             getattr(model, limited)[:] = 0
 
@@ -194,6 +202,9 @@ class Dynamic:
         options.disableflags |= self.flags | _flags("EULERDAMP")
         options.timestep, options.integrator = 1.0, _EULER
         mujoco.mj_forward(model, data)
+        if not np.abs(data.qacc).max() < _BEYOND**1.5:  # a simulation that diverges says nothing
+            data.qpos[:], data.qvel[:] = qpos, qvel
+            mujoco.mj_forward(model, data)
         mujoco.mj_differentiatePos(model, into.middle[i, :nv], 1.0, qpos, data.qpos)
         into.middle[i, nv:], into.acceleration[i] = data.qvel, data.qacc
         mujoco.mjd_transitionFD(model, data, 1e-6, 0, into.A[i], into.B[i], None, None)
@@ -204,11 +215,14 @@ class Dynamic:
         data.qpos[:], data.qvel[:] = qpos, qvel
 
     def _simulate(self, data: Any, steps: int) -> None:
+        """Without the checks of `mj_step`, which warn of a motion that grows."""
         options = self.model.opt
         before = options.disableflags, options.timestep, options.integrator
         options.disableflags, options.timestep = before[0] | self.flags, self.seconds / self.simulated.count
         options.integrator = self.simulated.integrator
-        mujoco.mj_step(self.model, data, steps)
+        for _ in range(steps):
+            mujoco.mj_forward(self.model, data)
+            _ADVANCE[self.simulated.integrator](self.model, data)
         options.disableflags, options.timestep, options.integrator = before
 
     def finish(self, read: Linearised, x: Array) -> DynamicStep:

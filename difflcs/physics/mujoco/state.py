@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from difflcs._checks import check_tensor, describe
-from difflcs.errors import DTypeError, NonFiniteError, ShapeError
+from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
 
 __all__ = ["MujocoState"]
 
@@ -37,7 +37,8 @@ class MujocoState:
 
     The coordinate of a slide or a hinge is its `qpos`. A free joint has its position and the rotation vector from its
     orientation in `reference`, a ball the rotation vector alone: below half a turn each orientation has one, and at a
-    whole turn the coordinates are singular. So give a reference near which things happen.
+    whole turn the coordinates are singular, so that `tangent` refuses. So give a reference near which things happen.
+    Quaternions are read as MuJoCo does: of any length, and of zeros as no rotation.
 
     Args:
         model: the MuJoCo model.
@@ -68,6 +69,7 @@ class MujocoState:
             plain += [(q + i, v + i) for i in range(shifts)]
             if count >= 3:
                 self._turning.append((q + shifts, v + shifts))
+                self._reference[q + shifts : q + shifts + 4] = _unit(self._reference[q + shifts : q + shifts + 4])
         self.names = (*names, *(f"{name}_velocity" for name in names)) if velocities else tuple(names)
         self._of_qpos, self._of_state = np.array(plain, dtype=np.intp).reshape(-1, 2).T
 
@@ -96,7 +98,7 @@ class MujocoState:
         x = np.zeros((*qpos.shape[:-1], self.nv))
         x[..., self._of_state] = qpos[..., self._of_qpos]
         for q, v in self._turning:
-            turn = _multiply(_conjugate(self._reference[q : q + 4]), qpos[..., q : q + 4])
+            turn = _multiply(_conjugate(self._reference[q : q + 4]), _unit(qpos[..., q : q + 4]))
             x[..., v : v + 3] = _rotation_vector(turn)
         if self.velocities:
             speed = np.zeros_like(x) if qvel is None else self._array("qvel", qvel, self.nv)
@@ -122,6 +124,10 @@ class MujocoState:
         """T (..., nv, nv) of qvel = T ẋ, for positions x (..., nv); None where it is the identity, without quaternions.
 
         The block of a rotation vector is the right Jacobian of SO(3): 1 − (1 − cos r)/r² [r]× + (r − sin r)/r³ [r]×².
+        Its smallest singular value is 2 sin(r/2)/r, as far as which a rotation about another axis moves r.
+
+        Raises:
+            InvalidInputError: a rotation is so near to whole turns that no system in these coordinates is of use.
         """
         if not self._turning:
             return None
@@ -132,6 +138,15 @@ class MujocoState:
             small = angle < 1e-4
             safe = np.where(small, 1.0, angle)
             first = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
+            singular = 2 * first < _SINGULAR**2
+            if singular.any():
+                state = ", ".join(map(str, np.argwhere(singular)[0, :-2]))
+                raise InvalidInputError(
+                    f"x: expected rotations that are not near a whole turn from the reference, where rotation vectors "
+                    f"are singular, got {angle[singular][0]:.6g} rad in {self.names[v]} and the two after it, state "
+                    f"{state or 0}; take the shorter rotation to the same place, to_state(*to_mujoco(x)), or move the "
+                    f"reference there: the qpos of the data"
+                )
             second = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
             cross = np.cross(r[..., None, :], np.eye(3), axisa=-1, axisb=-1)
             cross = np.swapaxes(cross, -1, -2)  # columns r × e_i
@@ -146,6 +161,16 @@ class MujocoState:
         if not np.isfinite(array).all():
             raise NonFiniteError(f"{name}: expected finite numbers, got NaN or infinity; find where they come from")
         return array
+
+
+_SINGULAR = 1e-2  # 3.6 degrees at the first turn
+
+
+def _unit(q: Array) -> Array:
+    """Quaternions (..., 4) of length 1, as `mju_normalize4` makes them: no rotation where there is no length."""
+    size = np.linalg.norm(q, axis=-1, keepdims=True)
+    none = size < 1e-15
+    return np.where(none, np.array([1.0, 0.0, 0.0, 0.0]), q / np.where(none, 1.0, size))
 
 
 def _conjugate(q: Array) -> Array:

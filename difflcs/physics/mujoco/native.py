@@ -1,0 +1,63 @@
+"""What goes wrong inside MuJoCo: the errors of its own and the warnings that it only counts become ours."""
+
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import mujoco
+
+from difflcs.errors import InvalidInputError
+
+TAKEN = ("qpos", "ctrl", "mocap_pos", "mocap_quat", "qfrc_applied", "xfrc_applied")
+"""What a caller's data says besides the state."""
+
+_LARGE = "x: expected {} below 1e10, got larger ones, which MuJoCo takes for errors; look for what diverges"
+_MEMORY = (
+    "model: expected memory for all contacts and constraints, got an arena that is full with {arena} bytes, where "
+    'MuJoCo drops the others; give it more, <size memory="{more}M"/> (spec.memory of a MjSpec), or a smaller distance'
+)
+_WARNINGS = {
+    "INERTIA": "model: expected an inertia matrix that can be inverted, got one that is nearly singular (degree of "
+    "freedom {info}); give its bodies more inertia, or its joint an armature",
+    "CONTACTFULL": _MEMORY,
+    "CNSTRFULL": _MEMORY,
+    "BADQPOS": _LARGE.format("positions"),
+    "BADQVEL": _LARGE.format("velocities"),
+    "BADQACC": "model: expected accelerations below 1e10, got larger ones of degree of freedom {info}; give what moves "
+    "more inertia, or softer springs and servos",
+    "BADCTRL": _LARGE.format("controls, here the places of relative servos,"),
+}
+_KINDS = {int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")): text for name, text in _WARNINGS.items()}
+
+
+@contextmanager
+def native(model: Any, data: Any, where: str) -> Iterator[None]:
+    """Calls of MuJoCo at a state: `model` and `data` are ours, and ready for the next one whatever happens.
+
+    Raises:
+        InvalidInputError: MuJoCo raised an error, or has counted a warning, such as one of contacts that it dropped.
+    """
+    said = None
+    try:
+        yield
+    except mujoco.FatalError as error:
+        said = error
+    numbers = data.warning.number.tolist()
+    if said is None and not any(numbers):
+        return
+    kind = numbers.index(max(numbers))
+    size = {"arena": int(model.narena), "more": max(64, int(model.narena) >> 18), "info": data.warning.lastinfo[kind]}
+    if any(numbers):
+        text = _KINDS.get(kind, f"model: expected no warning of MuJoCo, got its number {kind}; see MUJOCO_LOG.TXT")
+    else:
+        text = _MEMORY if "Alloc" in str(said) else f"model: expected what MuJoCo can compute, got its error {said}"
+    kept = {name: getattr(data, name).copy() for name in TAKEN}
+    mujoco.mj_resetData(model, data)  # what an error leaves behind, such as a stack that was not given back
+    for name, values in kept.items():
+        getattr(data, name)[:] = values
+    raise InvalidInputError(f"{text.format(**size)} ({where})") from said
