@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
 from gymnasium.vector import SyncVectorEnv
@@ -12,7 +11,6 @@ from difflcs.errors import CheckpointError, InvalidInputError
 pytest.importorskip("torchrl")
 from difflcs.rl import Adam, CriticSettings, Epochs, Natural, ppo_settings
 from difflcs.rl.advantages import SAMPLES, Estimate, RewardScale
-from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
 from difflcs.rl.critic import Critic
 from difflcs.rl.evaluate import evaluate
 from difflcs.rl.mlp import MLPController
@@ -21,7 +19,6 @@ from difflcs.rl.optim.update import Deviation, learned_parameters
 from difflcs.rl.policy import make_actor
 from difflcs.rl.ppo import PPO, Source
 from difflcs.rl.rollout import elapsed_fractions
-from difflcs.rl.state import flatten
 from difflcs.rl.surrogate import Surrogate
 from tests.training.slide import (
     ROLLOUTS,
@@ -317,54 +314,6 @@ def test_broken_episodes_are_dropped():
 def test_rewards_that_are_not_finite_are_refused():
     with pytest.raises(InvalidInputError, match="finite rewards"):
         make_ppo(env=make_envs(reward=math.nan)).step()
-
-
-def test_resumed_equals_uninterrupted_bitwise(tmp_path):
-    options = {"covariance": "diagonal", "beta": 0.7}
-    through = make_ppo(**options)
-    while not through.done:
-        through.step()
-    first = make_ppo(**options)
-    for _ in range(2):
-        first.step()
-    save_checkpoint(tmp_path, first.iteration, first.state_dict())
-    first.step()  # lost by the crash
-
-    second = make_ppo(**options)
-    second.load(load_checkpoint(tmp_path))
-    while not second.done:
-        second.step()
-    assert same(parameters(through), parameters(second))
-    (tensors, rest), (others, other_rest) = flatten(through.state_dict()), flatten(second.state_dict())
-    assert rest == other_rest
-    assert tensors.keys() == others.keys()
-    for name, value in tensors.items():
-        assert torch.equal(value, others[name]), name
-
-
-@pytest.mark.parametrize("changes", [{}, {"covariance": "full", "beta": 0.7}, {"update": "adam", "minibatch": 30}])
-def test_global_generators_neither_matter_nor_are_touched(changes):
-    """Neither PyTorch's nor NumPy's, from the first line to the last, in model rollouts too."""
-    runs = []
-    for seed in (7, 8):
-        torch.manual_seed(seed)
-        np.random.seed(seed)  # noqa: NPY002  the global one is what this is about
-        before = torch.random.get_rng_state(), np.random.get_state()[1].tolist()  # noqa: NPY002
-        trainer = make_ppo(models=make_models(iterations=1), **changes)
-        for _ in range(2):
-            trainer.step()
-        assert torch.equal(before[0], torch.random.get_rng_state())
-        assert before[1] == np.random.get_state()[1].tolist()  # noqa: NPY002
-        runs.append(parameters(trainer))
-    assert same(*runs)
-
-
-def test_seeds_differ_and_repeat():
-    runs = [make_ppo(seed) for seed in (0, 0, 1)]
-    for trainer in runs:
-        trainer.step()
-    assert same(parameters(runs[0]), parameters(runs[1]))
-    assert not same(parameters(runs[0]), parameters(runs[2]))
 
 
 @pytest.mark.parametrize("changes", [{}, {"update": "adam", "covariance": "full"}])

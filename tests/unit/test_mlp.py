@@ -3,17 +3,14 @@
 from dataclasses import replace
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 
 from difflcs.errors import CheckpointError, InvalidInputError
 
 pytest.importorskip("torchrl")
-from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
 from difflcs.rl.critic import CriticSettings
 from difflcs.rl.evaluate import evaluate
 from difflcs.rl.methods import get_method
@@ -24,41 +21,12 @@ from difflcs.rl.ppo_settings import PPOSettings, make_ppo
 from difflcs.rl.rollout import collect, elapsed_fractions, mpc_actions
 from difflcs.rl.seeding import Stream, episode_seeds
 from difflcs.rl.settings import Adam, Epochs
-from difflcs.rl.state import flatten
+from tests.training.slide import STEPS, U_MAX, Slide, features
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-STEPS = 6
-U_MAX = 0.1
 ROLLOUTS = 20
 BOUND = torch.full((1,), U_MAX, dtype=torch.float64)
-
-
-class Slide(gymnasium.Env):
-    """x₊ = x + ½u: six steps are just enough for the farthest goals."""
-
-    observation_space = spaces.Dict(
-        {"state": spaces.Box(-10.0, 10.0, (1,), np.float64), "goal": spaces.Box(-1.0, 1.0, (1,), np.float64)}
-    )
-    action_space = spaces.Box(-U_MAX, U_MAX, (1,), np.float64)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.steps, self.state, self.goal = 0, np.zeros(1), self.np_random.uniform(-0.3, 0.3, 1)
-        return {"state": self.state.copy(), "goal": self.goal.copy()}, {}
-
-    def step(self, action):
-        error = float(abs(self.state - self.goal)[0])
-        self.state = self.state + 0.5 * np.asarray(action)
-        self.steps += 1
-        success, last = float(abs(self.state - self.goal)[0]) < 0.05, self.steps >= STEPS
-        info = {"success": success, "reward_completion": -10.0 * (last and not success)}
-        reward = -20 * error + info["reward_completion"]
-        return {"state": self.state.copy(), "goal": self.goal.copy()}, reward, False, last, info
-
-
-def features(state, goal, elapsed):
-    return torch.cat([10 * (state - goal), 10 * (state - goal).abs(), elapsed.unsqueeze(-1)], -1)
 
 
 def make_network(width: int = 16, seed: int = 0) -> MLPController:
@@ -154,27 +122,6 @@ def test_the_initial_weights_are_the_generators():
     assert not torch.equal(one.layers[0].weight, other.layers[0].weight)
 
 
-def test_resumed_equals_uninterrupted_bitwise(tmp_path):
-    through = make_trainer()
-    while not through.done:
-        through.step()
-    first = make_trainer()
-    first.step()
-    save_checkpoint(tmp_path, first.iteration, first.state_dict())
-    second = make_trainer()
-    second.load(load_checkpoint(tmp_path))
-    torch.manual_seed(7)  # the global generator must not matter
-    while not second.done:
-        second.step()
-    (tensors, rest), (own, other) = flatten(through.state_dict()), flatten(second.state_dict())
-    assert rest == other
-    assert tensors.keys() == own.keys()
-    for name, value in tensors.items():
-        assert torch.equal(value, own[name]), name
-    with pytest.raises(CheckpointError, match="other settings"):
-        make_trainer(width=8).load(load_checkpoint(tmp_path))
-
-
 def test_saved_and_loaded(tmp_path):
     network = make_network()
     network.save_pretrained(tmp_path)
@@ -191,10 +138,3 @@ def test_saved_and_loaded(tmp_path):
 def test_what_needs_an_lcs_is_refused(change):
     with pytest.raises(InvalidInputError, match="without an LCS"):
         make_trainer(**change)
-
-
-def test_settings():
-    with pytest.raises(InvalidInputError, match="width"):
-        get_method("ppo-mlp")(width=0)
-    with pytest.raises(InvalidInputError, match="rollouts"):
-        replace(SETTINGS, rollouts=0)

@@ -1,7 +1,6 @@
 """Settings of the main phase, and PPO put together by them."""
 
-import inspect
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import torch
@@ -54,11 +53,3 @@ def test_bad_arguments_are_refused():
         with pytest.raises(InvalidInputError, match="without an LCS"):
             make(network, make_envs(), replace(settings, **changes), 0, **options)
     make(network, make_envs(), replace(settings, update="adam"), 0, **options)
-
-
-def test_every_setting_is_documented():
-    """`difflcs train --help` shows the docstring below each field."""
-    source = inspect.getsource(PPOSettings)
-    for field in fields(PPOSettings):
-        line = source.index(f"    {field.name}: ")
-        assert source[line:].split("\n")[1].strip().startswith('"""'), field.name
