@@ -43,12 +43,6 @@ def finished(tmp_path_factory):
     return path
 
 
-def test_the_library_imports_none_of_this():
-    code = "import sys, difflcs; print(*sys.modules)"
-    loaded = subprocess.check_output([sys.executable, "-c", code], text=True).split()
-    assert not {"tyro", "gymnasium", "mujoco", "difflcs.rl", "difflcs.cli"} & set(loaded)
-
-
 HELP = {
     "": "zoo:trifinger-cube",
     "train": "--warmup.noise",
@@ -505,15 +499,6 @@ def _untimed(row: dict[str, str]) -> dict[str, str]:
     return {name: cell for name, cell in row.items() if not name.endswith("_seconds")}
 
 
-def test_init_starts_from_a_trained_model(capsys, finished, tmp_path):
-    for source in (finished, finished / "model"):
-        out = tmp_path / source.name
-        arguments = ["--method", "violation", "--smoke", "--minutes", 0.1, "--final-goals", 0]
-        arguments += ["--init", source, "--out", out]
-        assert run(capsys, "train", *arguments)[0] == 0
-    assert json.loads((tmp_path / "run/config.json").read_text())["init"] == str(finished)
-
-
 def test_render(capsys, finished, tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     video = tmp_path / "new" / "video.mp4"
@@ -599,21 +584,3 @@ def test_one_training_at_a_time_in_a_run(capsys, tmp_path, monkeypatch, words):
     assert ("in use" in err) == (words != ["--smoke"])
     assert not (path / ".lock").exists()
     assert run(capsys, "train", "--out", path, "--resume")[0] == 0  # finished: nothing to lock
-
-
-def test_two_processes_resume_one_run(capsys, tmp_path, monkeypatch):
-    pytest.importorskip("mujoco")
-    path = tmp_path / "run"
-
-    def die(*_, **__):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(cli_train.Progress, "iterated", die)
-        assert run(capsys, "train", "--method", "violation", "--smoke", "--final-goals", 0, "--out", path)[0] == 130
-    command = [sys.executable, "-m", "difflcs.cli", "train", "--out", str(path), "--resume"]
-    with RunDirectory(path).locked():
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 2
-    assert f"{path}: expected a run that no process works on" in done.stderr
-    assert "Traceback" not in done.stderr

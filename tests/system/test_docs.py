@@ -7,7 +7,6 @@ import contextlib
 import importlib
 import importlib.util
 import io
-import json
 import re
 import shlex
 import subprocess
@@ -240,17 +239,6 @@ def test_the_command_line_page_has_every_command(generated):
     assert all(name in text for name in method_names())
     assert "--warmup.noise" in text
     assert "\x1b" not in text
-
-
-def test_the_optima_of_the_backends_are_those_measured(generated):
-    text = generated.fill((DOCS / "backends.md").read_text())
-    found = json.loads((ROOT / "benchmarks" / "results" / "optima.json").read_text())["results"]
-    for kind, row in found.items():
-        line = re.search(rf"^\| {kind} \((\d+)\) \|(.*)$", text, re.MULTILINE)
-        assert line, kind
-        assert int(line[1]) == row["problems"]
-        shares = [f"{100 * row[effort]['within 0.1 % of best']:.0f}" for effort in ("fast", "default", "best")]
-        assert re.findall(r"\((\d+) %\)", line[2]) == shares, kind
 
 
 def test_links_of_included_files_work_in_the_site(generated, tmp_path, monkeypatch):
