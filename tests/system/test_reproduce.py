@@ -48,7 +48,7 @@ from rich.progress import Progress  # noqa: E402
 from units import OBJECTS, Preset, Unit  # noqa: E402
 
 from difflcs.errors import CheckpointError, InvalidInputError  # noqa: E402
-from difflcs.rl import TrainConfig, evaluate, get_method, get_task, wilson_interval  # noqa: E402
+from difflcs.rl import TrainConfig, evaluate, get_method, get_task  # noqa: E402
 from difflcs.zoo import Learned  # noqa: E402
 
 TINY = Preset("smoke", seeds=1, goals=2, final_goals=2, evaluate_at=(0.2, 0.5), smoke=True)
@@ -520,13 +520,6 @@ def test_a_script_computes_and_draws(local, tmp_path, monkeypatch, capsys):
 
 
 # --- statistics -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("reached", "goals"), [(0, 4), (1, 4), (4, 4), (299, 300)])
-def test_wilson_is_that_of_the_library(reached, goals):
-    found = stats.wilson(100 * reached / goals, goals)
-    assert [found.low / 100, found.high / 100] == pytest.approx(wilson_interval(reached, goals))
-    assert 0 <= found.low <= found.value <= found.high <= 100
 
 
 def test_intervals_stay_within_what_is_possible():

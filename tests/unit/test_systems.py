@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSParams, QuadraticCost, Status, solve_lcp
+from difflcs import GoalCost, LCSMPCLayer, LCSParams, QuadraticCost, Status, solve_lcp
 from difflcs.errors import InvalidInputError
 from difflcs.systems import block_along_wall, cart_pole_between_walls
 
@@ -206,14 +206,6 @@ def test_gradients_of_friction_and_face():
     assert torch.autograd.gradcheck(next_state, values)
     torch.stack([v for v in next_state(*values)]).sum().backward()
     assert all(float(v.grad.abs()) > 0 for v in values)
-
-
-@pytest.mark.parametrize("make", [cart_pole_between_walls, block_along_wall])
-def test_becomes_a_model(make):
-    params = make()
-    model = LCSModel.from_params(params)
-    for name, value in params.tensors().items():
-        torch.testing.assert_close(getattr(model.params(), name).detach(), value)
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,7 @@ def test_every_episode_of_a_film_begins_the_policy_anew(tmp_path):
             return Plan(torch.zeros(1, 1).double(), torch.ones(1, dtype=torch.bool))
 
     policy = Counted()
-    record_video(Drawn(), policy, [(0.1,), (0.2,), (-0.1,)], tmp_path / "film.mp4", TOY, hold_seconds=0.0)
+    record_video(Drawn(), policy, [(0.1,), (0.2,), (-0.1,)], tmp_path / "film.mp4", TOY)
     assert policy.steps == [STEPS] * 3
 
 
