@@ -27,7 +27,6 @@ class Solver(Rival):
         slack: whether s is a variable.
         start: λ and s to start from.
         options: IPOPT's.
-        jit: whether the functions are compiled.
     """
 
     def __init__(
@@ -37,12 +36,11 @@ class Solver(Rival):
         slack: bool = True,
         start: float = 1.0,
         options: dict | None = None,
-        jit: bool = False,
     ):
         super().__init__(problem)
         n = (problem.n_x, problem.n_u, problem.n_lam, problem.horizon)
         self.program = Program.of(problem, contact, slack, start)
-        self.solver = _solver(n, contact, slack, tuple(sorted((options or {}).items())), jit)
+        self.solver = _solver(n, contact, slack, tuple(sorted((options or {}).items())))
 
     def one(self, i: int) -> Answer:
         """One run of IPOPT."""
@@ -57,7 +55,7 @@ class Solver(Rival):
 
 
 @functools.lru_cache(maxsize=32)
-def _solver(sizes: tuple, contact: str, slack: bool, options: tuple, jit: bool) -> casadi.Function:
+def _solver(sizes: tuple, contact: str, slack: bool, options: tuple) -> casadi.Function:
     n_x, n_u, n_lam, horizon = sizes
     shapes = {
         "A": (n_x, n_x), "B": (n_x, n_u), "C": (n_x, n_lam), "d": (n_x,), "D": (n_lam, n_x), "E": (n_lam, n_u),
@@ -71,6 +69,4 @@ def _solver(sizes: tuple, contact: str, slack: bool, options: tuple, jit: bool) 
     settings = {"print_time": False, "error_on_fail": False, "calc_lam_p": False}
     settings |= {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.max_iter": 500}
     settings |= {f"ipopt.{name}": value for name, value in options}
-    if jit:
-        settings |= {"jit": True, "compiler": "shell", "jit_options": {"flags": ["-O2", "-march=native"]}}
     return casadi.nlpsol("mpc", "ipopt", {"x": p.z, "p": p.p, "f": p.f, "g": p.g}, settings)

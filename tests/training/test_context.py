@@ -11,9 +11,9 @@ from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 from torch import nn
 
-from benchmarks.context import FORCE, HeavyBlock, Network, Physics, imitation, learners, make_mpc, prediction
 from difflcs import LCSModel, LCSParams, LCSSequence
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
+from tests.training.heavy_block import FORCE, HeavyBlock, Network, Physics, imitation, learners, make_mpc, prediction
 
 pytest.importorskip("torchrl")
 from tensordict import TensorDict
@@ -141,7 +141,7 @@ def test_the_warmup_finds_the_unknown_numbers():
 
 
 def test_a_context_makes_the_difference():
-    """A fast version of benchmarks/context.py, where a constant system fails by both losses."""
+    """Fitted by the violation loss, or through the MPC to an expert's actions: a constant system fails by both."""
     for learn, sizes, least in ((prediction, (400, 40), (5, 2)), (imitation, (300, 100), (3, 2))):
         errors = {name: learn(lcs, 0, *sizes)[1] for name, lcs in learners(0).items()}
         assert errors["constant"] > least[0] * errors["physics"]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.context import FORCE, HeavyBlock, Physics
 from difflcs import GoalCost
+from tests.training.heavy_block import FORCE, HeavyBlock, Physics
 
 pytest.importorskip("torchrl")
 from difflcs.rl import (

@@ -451,22 +451,6 @@ def test_pulling_at_the_end_of_the_reach_stays_finite():
     assert np.all(np.linalg.norm(observation["state"][3:].reshape(3, 2), axis=1) < 0.2)
 
 
-@pytest.mark.slow
-def test_gallery(tmp_path, monkeypatch):
-    pytest.importorskip("imageio_ffmpeg", reason="needs the extra [viz]")
-    from difflcs_envs import RenderingError, gallery
-    from difflcs_envs.trifinger.rendering import SceneRenderer
-
-    try:
-        SceneRenderer(TriFingerMoveCubeEnv().model, 32, 24).close()
-    except RenderingError as error:
-        pytest.skip(str(error))
-    monkeypatch.setattr(gallery, "YCB", {"mug": YCB["mug"]})
-    assert gallery.main([str(tmp_path / "pictures")]) == 0
-    assert (tmp_path / "pictures" / "objects.png").stat().st_size > 10_000
-    assert (tmp_path / "pictures" / "push.mp4").stat().st_size > 5_000
-
-
 # --- cross sections ---------------------------------------------------------------------------------------------------
 
 

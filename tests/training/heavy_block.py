@@ -1,26 +1,14 @@
-"""What a system that depends on a context gains over a constant one: `python benchmarks/context.py [--smoke]`.
+"""A block of a known mass, another one in every episode, and what can be learned of it: a task with a context.
 
-A block of a mass between 0.3 and 3 kg is pushed along a line, with a soft wall at its end. The mass is the context: it
-is known, and another one in every episode. Three systems are learned: a constant `LCSModel`, which begins as the true
-system of a middle mass; known physics with three unknown numbers; and a network that turns the mass into matrices.
-
-- Prediction: fitted by the violation loss to transitions with many masses, observed with some noise. Error of the
-  predicted velocity.
-- Imitation: fitted through the MPC to the actions of an expert that knows the true system. Error of the first action.
-
-Each error is that of unseen states and masses, and printed as a ratio: that of the constant system over that of each
-other, so that 10 means a tenth of the error.
+A block of a mass between 0.3 and 3 kg is pushed along a line, with a soft wall at its end. Three systems are learned: a
+constant `LCSModel`, which begins as the true system of a middle mass; known physics with three unknown numbers; and a
+network that turns the mass into matrices.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import sys
 import warnings
-from collections.abc import Callable
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -248,59 +236,3 @@ def imitation(lcs: LCSModule, seed: int, samples: int, steps: int) -> tuple[floa
         adam.step()
         schedule.step()
     return before, error()
-
-
-def measure(seeds: int, transitions: int, epochs: int, samples: int, steps: int) -> dict[str, dict[str, list[float]]]:
-    """Errors after learning by task and learner, one of each seed."""
-    sizes: dict[str, tuple[Measure, int, int]] = {
-        "prediction": (prediction, transitions, epochs),
-        "imitation": (imitation, samples, steps),
-    }
-    found: dict[str, dict[str, list[float]]] = {name: {} for name in sizes}
-    for seed in range(seeds):
-        for task, (learn, *size) in sizes.items():
-            for name, lcs in learners(seed).items():
-                before, after = learn(lcs, seed, *size)
-                found[task].setdefault(name, []).append(after)
-                print(f"{task}, seed {seed}, {name}: {before:.4f} before, {after:.4f} after", file=sys.stderr)
-    return found
-
-
-Measure = Callable[[LCSModule, int, int, int], tuple[float, float]]
-
-
-def ratios(found: dict[str, dict[str, list[float]]]) -> dict[str, dict[str, list[float]]]:
-    """The constant system's error over that of each other, one of each seed."""
-    return {
-        task: {
-            name: [ours / theirs for ours, theirs in zip(errors["constant"], own, strict=True)]
-            for name, own in errors.items()
-            if name != "constant"
-        }
-        for task, errors in found.items()
-    }
-
-
-def main() -> None:
-    """Measure, print, write."""
-    parser = argparse.ArgumentParser(description="A system that depends on a context against a constant one.")
-    parser.add_argument("--smoke", action="store_true", help="in seconds: one seed, little data")
-    parser.add_argument("--out", type=Path, help="write the numbers there, as JSON")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    small = {"seeds": 1, "transitions": 500, "epochs": 20, "samples": 200, "steps": 40}
-    full = {"seeds": 5, "transitions": 2000, "epochs": 60, "samples": 1000, "steps": 300}
-    found = measure(**(small if arguments.smoke else full))
-    units = {"prediction": "m/s", "imitation": "N"}
-    for task, by_name in ratios(found).items():
-        print(f"{task}: constant {np.median(found[task]['constant']):.3g} {units[task]}")
-        for name, values in by_name.items():
-            error = np.median(found[task][name])
-            print(f"  {name}: {error:.3g} {units[task]}, ratio {np.median(values):.1f}, at least {min(values):.1f}")
-    if arguments.out:
-        content = {"sizes": small if arguments.smoke else full, "errors": found, "ratios": ratios(found)}
-        arguments.out.write_text(json.dumps(content, indent=2) + "\n")
-
-
-if __name__ == "__main__":
-    main()
