@@ -700,18 +700,6 @@ def test_table1_says_where_two_deployments_are_one(results, capsys, last):
     assert said == (last == 20)
 
 
-def test_over_all_objects_the_middle_half_counts(tmp_path, capsys):
-    for task, value in zip(OBJECTS, (0, 50, 60, 60, 70, 100), strict=True):
-        for seed in range(2):
-            for method, gain in (("violation", 0), ("lcs-rl", -5 if task == "banana" else 10)):
-                percent = value + gain if value else 0
-                records.add(tmp_path, "paper", unit_rows(Unit(task, method, "ours", seed), (0, 0, 0, percent)))
-    assert run_script(table1.main, capsys, "--results", tmp_path)[0] == 0
-    success, differences = cells_of(tmp_path / "table1.md", "all six")
-    assert success[5] == "60.0 [60.0, 60.0]"  # not 56.7, the mean
-    assert differences[1].startswith("+5.8 [")
-
-
 def test_curves_stand_where_the_evaluations_were(tmp_path, capsys, monkeypatch):
     rows = unit_rows(Unit("cube", "lcs-rl", "ours", 0), (0, 40, 50, 70))
     rows["minutes"] = [0.0, 6.9, 10.5, 30.0]

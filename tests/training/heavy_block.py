@@ -1,14 +1,12 @@
 """A block of a known mass, another one in every episode, and what can be learned of it: a task with a context.
 
-A block of a mass between 0.3 and 3 kg is pushed along a line, with a soft wall at its end. Three systems are learned: a
-constant `LCSModel`, which begins as the true system of a middle mass; known physics with three unknown numbers; and a
-network that turns the mass into matrices.
+A block of a mass between 0.3 and 3 kg is pushed along a line, with a soft wall at its end. It is learned as known
+physics with three unknown numbers, or by a network that turns the mass into matrices.
 """
 
 from __future__ import annotations
 
 import math
-import warnings
 
 import gymnasium
 import numpy as np
@@ -17,19 +15,16 @@ from gymnasium import spaces
 from torch import Tensor, nn
 
 from difflcs import GoalCost, LCSModel, LCSModule, LCSMPCLayer, LCSParams
-from difflcs.errors import DegenerateWarning, InvalidInputError
+from difflcs.errors import InvalidInputError
 from difflcs.mpc.backends import BatchedBackend
-from difflcs.rl import Epochs, ViolationLoss, WarmupSettings, fit
 
 MASSES = (0.3, 3.0)  # [kg]
 DAMPING, STIFFNESS, ADDED_MASS = 0.8, 100.0, 0.2  # [N s/m], of the wall [N/m], of the finger that moves along [kg]
 DT = 0.1  # [s]
 FORCE = 5.0  # bound of the action [N]
 HORIZON = 6
-NOISE = 0.001, 0.01  # of the observed next states [m], [m/s]
 LOG_MASSES = math.log(MASSES[0]), math.log(MASSES[1])
 MIDDLE = math.sqrt(MASSES[0] * MASSES[1])
-LOSS = ViolationLoss(gamma="auto", xi=0.1)
 
 
 # --- systems ----------------------------------------------------------------------------------------------------------
@@ -119,27 +114,7 @@ def true_system(mass: Tensor | None = None) -> LCSParams:
     return block(mass, *(torch.tensor(v, dtype=torch.float64) for v in (DAMPING, STIFFNESS, ADDED_MASS)))
 
 
-def learners(seed: int) -> dict[str, LCSModule]:
-    """What is to be learned, the constant system first."""
-    generator = torch.Generator().manual_seed(seed)
-    off = [float(v) for v in torch.exp(2 * torch.rand(3, generator=generator, dtype=torch.float64) - 1)]
-    return {
-        "constant": LCSModel.from_params(true_system(), stiffness=1e-3),
-        "physics": Physics(DAMPING * off[0], STIFFNESS * off[1], ADDED_MASS * off[2]),
-        "network": Network(generator),
-    }
-
-
 # --- data -------------------------------------------------------------------------------------------------------------
-
-
-def draw(count: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
-    """States (count, 2), actions (count, 1), masses (count, 1) [kg], evenly in the mass's logarithm."""
-    rng = np.random.default_rng(seed)
-    x = rng.uniform([0.0, -1.0], [0.4, 1.0], (count, 2))
-    u = rng.uniform(-FORCE, FORCE, (count, 1))
-    mass = np.exp(rng.uniform(*LOG_MASSES, (count, 1)))
-    return torch.from_numpy(x), torch.from_numpy(u), torch.from_numpy(mass)
 
 
 class HeavyBlock(gymnasium.Env):
@@ -182,57 +157,3 @@ def make_mpc(lcs: LCSModule) -> LCSMPCLayer:
     # One start and a short homotopy: a plan that is learned from should change little when the system does.
     backend = BatchedBackend(effort="fast", homotopy=100.0, tol=1e-10)
     return LCSMPCLayer(lcs, cost, HORIZON, -FORCE, FORCE, backend=backend, on_failure="mask")
-
-
-def prediction(lcs: LCSModule, seed: int, transitions: int, epochs: int) -> tuple[float, float]:
-    """Root mean square error of the predicted velocity [m/s], before and after the violation loss."""
-    x, u, mass = draw(transitions, seed)
-    settings = WarmupSettings(epochs=Epochs(minibatch=100), loss=LOSS, learning_rate_decay=1 - 3 / (8 * epochs))
-
-    def error() -> float:
-        unseen = draw(1000, seed + 10_000)
-        with torch.no_grad():
-            system, wanted = lcs.params(unseen[0], unseen[2]), true_system(unseen[2][:, 0])
-            assert isinstance(system, LCSParams)
-            found, seen = (s.step(*unseen[:2]).x_next[:, 1] for s in (system, wanted))
-        return float((found - seen).square().mean().sqrt())
-
-    before = error()
-    noise = torch.from_numpy(np.random.default_rng(seed + 1).normal(size=x.shape)) * torch.tensor(NOISE)
-    x_next = true_system(mass[:, 0]).step(x, u).x_next + noise
-    fit(lcs, x, u, x_next, settings, epochs, np.random.default_rng(seed), context=mass)
-    return before, error()
-
-
-def imitation(lcs: LCSModule, seed: int, samples: int, steps: int) -> tuple[float, float]:
-    """Root mean square error of the first action [N], before and after imitating an expert."""
-    mpc, expert = make_mpc(lcs), make_mpc(Physics())
-
-    def drawn(count: int, seed: int) -> tuple[Tensor, ...]:
-        x, _, mass = draw(count, seed)
-        goal = 0.3 * torch.from_numpy(np.random.default_rng(seed + 1).uniform(size=(count, 1)))
-        with torch.no_grad():
-            return x, goal, mass, expert(x, goal, context=mass).action
-
-    def error() -> float:
-        x, goal, mass, wanted = drawn(1000, seed + 10_000)
-        with torch.no_grad():
-            return float((mpc(x, goal, context=mass).action - wanted).square().mean().sqrt())
-
-    before = error()
-    data = drawn(samples, seed)
-    # Logarithms take larger steps than matrices, whose entries are down to 0.01 here.
-    adam = torch.optim.Adam(mpc.parameters(), 0.02 if isinstance(lcs, Physics) else 0.001)
-    schedule = torch.optim.lr_scheduler.LinearLR(adam, 1.0, 0.05, steps)
-    generator = torch.Generator().manual_seed(seed)
-    for _ in range(steps):
-        chosen = torch.randperm(samples, generator=generator)[:100]
-        x, goal, mass, wanted = (v[chosen] for v in data)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DegenerateWarning)  # of single samples, with the force at its bound
-            loss = (mpc(x, goal, context=mass).action - wanted).square().mean()
-        adam.zero_grad()
-        loss.backward()
-        adam.step()
-        schedule.step()
-    return before, error()

@@ -40,8 +40,8 @@ class Slide(gymnasium.Env):
     )
     action_space = spaces.Box(-U_MAX, U_MAX, (1,), np.float64)
 
-    def __init__(self, breaks_at: int | None = None, reward: float | None = None, penalty: float = PENALTY):
-        self.breaks_at, self.reward, self.penalty = breaks_at, reward, penalty
+    def __init__(self, breaks_at: int | None = None, penalty: float = PENALTY):
+        self.breaks_at, self.penalty = breaks_at, penalty
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -56,7 +56,7 @@ class Slide(gymnasium.Env):
         success = float(abs(self.state - self.goal)[0]) < 0.05
         last = self.steps >= STEPS
         info = {"success": success, "physics_error": broken}
-        reward = -20 * error - self.penalty * (last and not success) if self.reward is None else self.reward
+        reward = -20 * error - self.penalty * (last and not success)
         return {"state": self.state.copy(), "goal": self.goal.copy()}, reward, False, last or broken, info
 
 

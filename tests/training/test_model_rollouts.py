@@ -11,12 +11,11 @@ from gymnasium import spaces
 pytest.importorskip("torchrl")
 from tensordict import TensorDict
 
-from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs.errors import InvalidInputError
 from difflcs.rl import EnsembleSettings, Epochs, ModelRollouts, ModelRolloutSettings
 from difflcs.rl.dynamics import Ensemble
 from difflcs.rl.model_rollouts import ModelEnv
 from difflcs.rl.rollout import collect, uniform_actions
-from difflcs.rl.state import flatten, restore
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -226,36 +225,6 @@ def test_unstable_episodes_are_not_learned_from():
     real["stable"] = torch.tensor([True, False, True, True, False, True])
     rollouts.add(real)
     assert torch.equal(rollouts.episodes["state"], real["state"][real["stable"]])
-
-
-def test_restored_goes_on_the_same():
-    first, second = make_rollouts(), make_rollouts()
-    first.add(episodes())
-    first.fit()
-    restore(second, first.state_dict())
-    assert len(second) == 6
-    for rollouts in (first, second):
-        rollouts.add(episodes(3, seed=9))
-        rollouts.fit()
-    (a, rest), (b, other) = (flatten(rollouts.state_dict()) for rollouts in (first, second))
-    assert rest == other
-    assert a.keys() == b.keys()
-    assert all(torch.equal(a[name], b[name]) for name in a)
-    np.testing.assert_array_equal(first.env.reset(seed=2)[0]["state"], second.env.reset(seed=2)[0]["state"])
-
-
-def test_restore_refuses_what_does_not_fit():
-    rollouts = make_rollouts()
-    rollouts.add(episodes())
-    other, state = make_rollouts(width=8), rollouts.state_dict()
-    with pytest.raises(CheckpointError, match="other settings"):
-        restore(other, state)
-    with pytest.raises(CheckpointError, match="goal"):
-        restore(rollouts, {**state, "episodes": {k: v for k, v in state["episodes"].items() if k != "goal"}})
-    with pytest.raises(CheckpointError, match="as many of each"):
-        restore(rollouts, {**state, "episodes": {**state["episodes"], "goal": state["episodes"]["goal"][:-1]}})
-    assert not len(other)
-    assert len(rollouts) == 6
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ import pytest
 import torch
 from gymnasium.vector import SyncVectorEnv
 
-from difflcs import GoalCost, _files
-from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs import GoalCost
+from difflcs.errors import InvalidInputError
 from difflcs.rl.dynamics import Ensemble, EnsembleSettings
 from difflcs.rl.evaluate import evaluate
 from difflcs.rl.pddm import PDDM, PDDMSettings, Planner
@@ -28,14 +28,6 @@ def make_cost() -> GoalCost:
 def make_pddm(seed: int = 0, total: int = 25, env=None, **changes) -> PDDM:
     env = make_envs(10) if env is None else env
     return PDDM(make_cost(), env, replace(SMALL, **changes), seed, total_episodes=total, episode_steps=STEPS)
-
-
-def parameters(trainer: PDDM) -> list[torch.Tensor]:
-    return [value.clone() for value in trainer.ensemble.state_dict().values()]
-
-
-def same(a: list[torch.Tensor], b: list[torch.Tensor]) -> bool:
-    return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
 
 
 def test_pddm_learns_to_reach():
@@ -178,18 +170,6 @@ def test_overflowing_predictions_do_not_spoil_the_plan():
     plan.ensemble = Wild(1, 1, 2, 4)
     action = plan(torch.zeros(1, 1, dtype=torch.float64), torch.full((1, 1), 0.3, dtype=torch.float64)).action
     assert bool(torch.isfinite(action).all())
-
-
-def test_save_and_load(tmp_path):
-    trainer = make_pddm()
-    trainer.step()
-    trainer.ensemble.save_pretrained(tmp_path)
-    loaded = Ensemble.from_pretrained(tmp_path)
-    assert same(parameters(trainer), list(loaded.state_dict().values()))
-    config = {"n_x": 1, "n_u": 1, "networks": 2, "width": 8}  # of another width than the tensors
-    _files.save_record(tmp_path, "dynamics", config, trainer.ensemble.state_dict())
-    with pytest.raises(CheckpointError, match="expected an ensemble"):
-        Ensemble.from_pretrained(tmp_path)
 
 
 def test_restore_refuses_hostile_checkpoints(refuses_hostile_checkpoints):

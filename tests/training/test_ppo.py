@@ -1,7 +1,5 @@
 """PPO through the MPC, on a small pushing system that needs no simulator: the trainer, and parts handed to it."""
 
-import math
-
 import pytest
 import torch
 from gymnasium.vector import SyncVectorEnv
@@ -9,17 +7,12 @@ from gymnasium.vector import SyncVectorEnv
 from difflcs.errors import CheckpointError, InvalidInputError
 
 pytest.importorskip("torchrl")
-from difflcs.rl import Adam, CriticSettings, Epochs, Natural, ppo_settings
-from difflcs.rl.advantages import SAMPLES, Estimate, RewardScale
-from difflcs.rl.critic import Critic
+from difflcs.rl import CriticSettings, Epochs, Natural, ppo_settings
+from difflcs.rl.advantages import SAMPLES
 from difflcs.rl.evaluate import evaluate
 from difflcs.rl.mlp import MLPController
-from difflcs.rl.optim import StepSize, UpdateRule
-from difflcs.rl.optim.update import Deviation, learned_parameters
-from difflcs.rl.policy import make_actor
-from difflcs.rl.ppo import PPO, Source
+from difflcs.rl.optim import UpdateRule
 from difflcs.rl.rollout import elapsed_fractions
-from difflcs.rl.surrogate import Surrogate
 from tests.training.slide import (
     ROLLOUTS,
     STEPS,
@@ -28,9 +21,7 @@ from tests.training.slide import (
     Slide,
     features,
     make_envs,
-    make_model,
     make_models,
-    make_mpc,
     make_ppo,
     parameters,
     recorded,
@@ -67,60 +58,6 @@ def test_ppo_learns():
     assert reports[0].explained_variance > 0.3
     with pytest.raises(InvalidInputError, match="all of them are done"):
         trainer.step()
-
-
-class AboveAverage:
-    """An estimator of advantages without a value network: the rewards to come, less their mean over the episodes."""
-
-    def __init__(self):
-        self.episodes = 0
-
-    def __call__(self, episodes, inputs, rewards, key):
-        self.episodes += len(episodes)
-        to_come = rewards.flip(1).cumsum(1).flip(1)
-        samples = episodes["policy"].select(*SAMPLES).unsqueeze(-1)
-        samples["advantage"] = (to_come - to_come.mean(0)).unsqueeze(-1).unsqueeze(-1)
-        return Estimate(samples, torch.zeros_like(rewards), rewards)
-
-
-class SteepestDescent(UpdateRule):
-    """An update rule: steps of a given length along the gradient."""
-
-    def step(self, loss, scale):
-        gradients = torch.autograd.grad(loss, self.parameters, materialize_grads=True)
-        length = torch.cat([gradient.flatten() for gradient in gradients]).norm()
-        with torch.no_grad():
-            for p, gradient in zip(self.parameters, gradients, strict=True):
-                p -= scale * self.size.value / length * gradient
-        return True
-
-
-def test_parts_put_together_by_hand_learn():
-    """Nothing of PPO knows which estimator, rule or source it has been given."""
-    actor, env = make_actor(make_mpc(make_model()), 0.06), make_envs(40)
-    learned, estimator = learned_parameters(actor), AboveAverage()
-    rule = SteepestDescent(
-        learned, torch.optim.SGD(learned, 1.0), StepSize(0.05, 0.2, 1.0), Deviation(actor, 1.0, (0.9, 0.99), (1.0, 1.0))
-    )
-    trainer = PPO(
-        actor,
-        Source(env, estimator, steps=8, minibatch=None, value_epochs=1),
-        Critic(CriticSettings(width=4, epochs=Epochs(1, 1, 256)), 3, STEPS, 1.0, 1.0, (0,)),
-        Surrogate(actor, clip=0.3, outlier_kl=2.0, beta=1.0, violation=None),
-        rule,
-        RewardScale(3.0, 10.0, 0.1),
-        0,
-        features=features,
-        rollouts=40,
-        total_episodes=240,
-        episode_steps=STEPS,
-        max_kl=2.0,
-    )
-    before = evaluate(env, trainer.policy, 60, 0, STEPS).success_rate
-    while not trainer.done:
-        trainer.step()
-    assert evaluate(env, trainer.policy, 60, 0, STEPS).success_rate > before + 0.2
-    assert estimator.episodes == 240
 
 
 # --- data ---
@@ -263,28 +200,6 @@ def test_steps_left_out_are_counted():
     assert (report.gradient_steps, report.skipped_steps) == (2, 3)
 
 
-def test_combined_loss():
-    """Eq. 7: β = 0 is the violation loss alone, which learns the true gain; β = 1 ignores it."""
-    gains = {}
-    for beta in (0.0, 0.5):
-        adam = Adam(learning_rate=0.02, betas=(0.9, 0.99))
-        options = {"steps": 50, "minibatch": None, "update": "adam", "adam": adam, "max_kl": 100.0}
-        trainer = make_ppo(iterations=2, beta=beta, std=0.1, **options)
-        while not trainer.done:
-            trainer.step()
-        gains[beta] = abs(float(trainer.learned.B.detach()) - 0.5)
-    assert gains[0.0] < 0.15 < abs(0.1 - 0.5)
-
-
-def test_a_learned_deviation_stays_within_its_range():
-    trainer = make_ppo(covariance="diagonal", std_learning_rate=0.5, std_range=(0.029, 0.031))
-    report = trainer.step()
-    std = float(trainer.actor.std)
-    assert report.std == pytest.approx(0.03)  # of the policy that collected
-    assert std != 0.03
-    assert 0.029 - 1e-12 <= std <= 0.031 + 1e-12
-
-
 def test_the_budget_is_met_exactly():
     settings = small_settings()
     for total in (ROLLOUTS - 5, 2 * ROLLOUTS + 1, 3 * ROLLOUTS):
@@ -309,11 +224,6 @@ def test_broken_episodes_are_dropped():
     assert all(bool(torch.isfinite(p).all()) for p in parameters(trainer))
     with pytest.raises(InvalidInputError, match="stable simulation"):
         make_ppo(env=make_envs(breaks_at=2)).step()
-
-
-def test_rewards_that_are_not_finite_are_refused():
-    with pytest.raises(InvalidInputError, match="finite rewards"):
-        make_ppo(env=make_envs(reward=math.nan)).step()
 
 
 @pytest.mark.parametrize("changes", [{}, {"update": "adam", "covariance": "full"}])

@@ -362,7 +362,7 @@ def test_random_extreme_actions_stay_finite_and_in_the_observation_space():
 # --- controller -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("kp", "part"), [(1000.0, 0.83), (2500.0, 0.96)])
+@pytest.mark.parametrize(("kp", "part"), [(1000.0, 0.83), (2500.0, 0.96), (6000.0, 0.99)])
 def test_part_of_a_command_reached_in_one_step(kp, part):
     env = make(osc_kp=kp)
     start = env.reset(seed=0)[0]["state"][3:]

@@ -49,16 +49,6 @@ def test_tensors_agree_with_arrays(task, shape, ended):
     assert shape == () or task is TURN or 0 < success.sum() < success.size
 
 
-def test_a_batch_gives_the_bits_of_its_elements():
-    arrays = transitions((50,))
-    ends = np.arange(50) % 2 == 0
-    rewards, infos = MOVE.outcome(*arrays, ends)
-    for i in range(50):
-        reward, info = MOVE.outcome(*(array[i] for array in arrays), ends[i])
-        assert reward == rewards[i]
-        assert all(value == infos[name][i] for name, value in info.items())
-
-
 def test_the_reward_has_a_gradient_in_state_and_action():
     state, action, after, goal = tensors(transitions((6,)))
     state.requires_grad_()

@@ -112,36 +112,6 @@ def test_workers_give_the_bits_of_this_process(build):
 # --- without contact --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_without_contact_it_is_the_quadratic_program(build, seed):
-    cp = pytest.importorskip("cvxpy")
-    n = build.normal(seed)
-    rows = {"G_x": n(3, 4), "G_u": n(3, 2), "g": tensor(0.8, 0.3, 0.5), "price": tensor(torch.inf, 0.5, 3.0)}
-    problem = linear_problem(build, seed, batch=1, bound=0.6, S=0.1 * n(4, 2), **rows)
-    t = {name: getattr(problem, name).numpy() for name in INPUTS}
-    x, u = cp.Variable((HORIZON + 1, 4)), cp.Variable((HORIZON, 2))
-    weight = torch.cat([torch.cat([problem.Q, problem.S], 1), torch.cat([problem.S.T, problem.R], 1)])
-    weight = cp.psd_wrap(weight.numpy())
-    cost = 0.5 * cp.quad_form(x[HORIZON], cp.psd_wrap(t["Q_final"])) + t["q_final"] @ x[HORIZON]
-    limits = [x[0] == t["x0"][0], u >= -0.6, u <= 0.6]
-    for k in range(HORIZON + 1):
-        row = t["G_x"] @ x[k] - t["g"] + (t["G_u"] @ u[k] if k < HORIZON else 0)
-        limits.append(row[0] <= 0)
-        cost += 0.5 * cp.pos(row[1]) + 3.0 * cp.pos(row[2])
-        if k < HORIZON:
-            limits.append(x[k + 1] == t["A"] @ x[k] + t["B"] @ u[k] + t["d"])
-            cost += 0.5 * cp.quad_form(cp.hstack([x[k], u[k]]), weight) + t["q"] @ x[k] + t["r"] @ u[k]
-    program = cp.Problem(cp.Minimize(cost), limits)
-    program.solve(solver="CLARABEL")
-    result = SOLVER.solve(problem, None)
-    if program.status == "infeasible":
-        assert result.status.tolist() == [Status.INFEASIBLE]
-        return
-    assert bool(result.solved.all())
-    torch.testing.assert_close(result.primal.u[0], torch.from_numpy(u.value), rtol=0, atol=1e-5)
-    assert float(problem.objective(*result.primal[:2])) == pytest.approx(program.value, abs=1e-7)
-
-
 # --- what cannot be met -----------------------------------------------------------------------------------------------
 
 
@@ -180,28 +150,6 @@ def test_what_cannot_be_met_is_infeasible_and_violates_as_little_as_can_be(build
     assert bool(torch.isfinite(torch.cat([v.flatten() for k, v in gradients.items() if k != "price"])).all())
     assert torch.equal(gradients["x0"][[1, 3]], torch.zeros(2, 2, dtype=torch.float64))
     assert float(gradients["x0"][0].abs().max()) > 0
-
-
-def test_soft_constraints_are_violated_at_their_price(build):
-    problem = reach(build, torch.stack([tensor(-0.2, 1.0), tensor(-1.4, -0.5)]), price=50.0)
-    result = SOLVER.solve(problem, None)
-    assert bool(result.solved.all())
-    torch.testing.assert_close(problem.violation(*result.primal[:2]), tensor(0.0, 1.0), rtol=0, atol=1e-9)
-    assert result.primal.mu[1, HORIZON].tolist() == [50.0, 50.0]
-    assert float(result.primal.mu[:, :HORIZON].abs().max()) == 0
-
-
-def test_an_initial_state_that_breaks_a_hard_constraint_is_infeasible(build):
-    problem = reach(build, torch.stack([tensor(1.0, 1.0), tensor(1.0, 1.0)]))
-    g = problem.g.clone()
-    g[1, 0, 0] = -0.5
-    result = SOLVER.solve(dataclasses.replace(problem, g=g), None)
-    assert result.status.tolist() == [CONVERGED, Status.INFEASIBLE]
-    soft = dataclasses.replace(problem, g=g, price=tensor(3.0, 3.0))
-    result = SOLVER.solve(soft, None)
-    assert result.status.tolist() == [CONVERGED] * 2
-    assert float(result.primal.mu[1, 0, 0]) == 3.0
-    assert float(soft.objective(*result.primal[:2])[1]) == pytest.approx(1.5)
 
 
 def test_contact_that_cannot_hold_a_constraint_keeps_its_plan(build):

@@ -178,20 +178,6 @@ def test_params_may_be_shared_or_one_per_element(build, x0):
     torch.testing.assert_close(solution.u[1, 2], shared.u[0], rtol=1e-6, atol=1e-8)
 
 
-def test_the_solution_certifies_itself(layer, x0):
-    solution = layer(x0)
-    assert bool(solution.converged.all())
-    assert torch.equal(solution.action, solution.u[:, 0])
-    assert torch.equal(solution.x[:, 0], x0)
-    assert float(solution.complementarity().max()) < 1e-10
-    assert float(solution.dynamics_residual().max()) < 1e-10
-    assert float(solution.kkt_residual.max()) < 1e-6
-    for info in (solution.status, solution.iterations, solution.kkt_residual, solution.solve_time):
-        assert not info.requires_grad
-    for value in (solution.x, solution.u, solution.lam, solution.objective):
-        assert value.requires_grad
-
-
 # --- warm start -----------------------------------------------------------------------------------------------------
 
 
@@ -203,14 +189,6 @@ def test_shift_drops_the_first_step_and_repeats_the_last(layer, x0):
         assert torch.equal(new[:, :-1], old[:, 1:])
         assert torch.equal(new[:, -1], old[:, -1])
         assert not new.requires_grad
-
-
-def test_a_receding_horizon_with_warm_starts_needs_fewer_iterations(layer, x0):
-    first = layer(x0)
-    x1 = first.x[:, 1].detach()
-    warm, cold = layer(x1, guess=first.shift()), layer(x1)
-    assert bool(warm.converged.all())
-    assert float(warm.iterations.double().sum()) < float(cold.iterations.double().sum())
 
 
 def test_a_guess_has_no_gradient_and_changes_none(layer, x0):
@@ -758,14 +736,6 @@ def test_copies_and_pickles_plan_the_same(build, layer, x0, copied, kind):
     assert twin.horizon == original.horizon
     assert twin.backend == original.backend
     assert set(twin.state_dict()) == set(original.state_dict())
-
-
-def test_state_dict_holds_the_model_and_the_cost(build, layer, x0):
-    assert {f"lcs.{k}" for k in "ABCdDEGHc"} <= set(layer.state_dict())
-    assert {"cost.Q", "cost.R", "cost.Q_final"} <= set(layer.state_dict())
-    other = LCSMPCLayer(build.model(seed=8), build.cost(5), 3, -0.15, 0.15, backend=SOLVER, relaxation=1e-4)
-    other.load_state_dict(layer.state_dict())
-    assert torch.equal(other(x0).u, layer(x0).u)
 
 
 def test_the_models_parameters_are_the_layers(layer):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 pytest.importorskip("torchrl")
-from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs.errors import CheckpointError
 from difflcs.rl import Adam, Natural
 from difflcs.rl.optim import AdamUpdate, NaturalUpdate, StepSize
 from difflcs.rl.optim.update import Deviation
@@ -227,11 +227,3 @@ def test_a_step_size_that_is_not_positive_is_refused(size):
     with pytest.raises(CheckpointError, match="positive step size"):
         rule.load_state_dict({**state, "step_size": size})
     assert rule.size.value == ADAM.learning_rate
-
-
-@pytest.mark.parametrize("kind", [AdamUpdate, NaturalUpdate])
-def test_a_fixed_model_is_refused(kind):
-    actor = make_actor(make_mpc(make_model().params().detach()), STD)
-    deviation = Deviation(actor, 0.01, (0.9, 0.99), (0.01, 0.05))
-    with pytest.raises(InvalidInputError, match="use an LCSModel"):
-        kind(actor, ADAM if kind is AdamUpdate else Natural(), 0.1, 1.5, deviation)
