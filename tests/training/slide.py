@@ -23,6 +23,7 @@ from difflcs.rl import (
     PPOSettings,
     ppo_settings,
 )
+from difflcs.rl.optim import UpdateRule
 from difflcs.rl.policy import GaussianPolicy, make_actor
 from difflcs.rl.ppo import PPO
 
@@ -144,6 +145,18 @@ def recorded(trainer: PPO, source: str = "robot") -> Recording:
     recording = Recording(part.advantages)
     setattr(trainer, source, replace(part, advantages=recording))
     return recording
+
+
+class Noting(UpdateRule):
+    """A rule that notes what it is asked for, and moves nothing."""
+
+    def __init__(self, rule, answers=lambda: True):
+        super().__init__(rule.parameters, rule.optimiser, rule.size, rule.deviation)
+        self.seen, self.answers = [], answers
+
+    def step(self, loss, scale):
+        self.seen.append((float(loss.detach()), scale))
+        return self.answers()
 
 
 def drawn(actor: GaussianPolicy, count: int = 60, seed: int = 0) -> TensorDict:

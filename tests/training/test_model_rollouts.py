@@ -249,6 +249,3 @@ def test_bad_settings_are_refused(change):
 def test_bad_settings_of_the_ensemble_are_refused(change):
     with pytest.raises(InvalidInputError, match=next(iter(change))):
         EnsembleSettings(**change)
-
-
-# --- the tasks --------------------------------------------------------------------------------------

@@ -11,12 +11,12 @@ from difflcs.rl import CriticSettings, Epochs, Natural, ppo_settings
 from difflcs.rl.advantages import SAMPLES
 from difflcs.rl.evaluate import evaluate
 from difflcs.rl.mlp import MLPController
-from difflcs.rl.optim import UpdateRule
 from difflcs.rl.rollout import elapsed_fractions
 from tests.training.slide import (
     ROLLOUTS,
     STEPS,
     U_MAX,
+    Noting,
     Recording,
     Slide,
     features,
@@ -155,18 +155,6 @@ class Watched(Recording):
 
 
 # --- steps ---
-
-
-class Noting(UpdateRule):
-    """A rule that notes what it is asked for, and moves nothing."""
-
-    def __init__(self, rule, answers=lambda: True):
-        super().__init__(rule.parameters, rule.optimiser, rule.size, rule.deviation)
-        self.seen, self.answers = [], answers
-
-    def step(self, loss, scale):
-        self.seen.append((float(loss.detach()), scale))
-        return self.answers()
 
 
 def test_an_iteration_ends_at_the_kl_limit():

@@ -10,9 +10,8 @@ from difflcs.errors import CheckpointError
 
 pytest.importorskip("torchrl")
 from difflcs.rl.evaluate import evaluate
-from difflcs.rl.optim import UpdateRule
 from difflcs.rl.rollout import collect, uniform_actions
-from tests.training.slide import ROLLOUTS, STEPS, make_envs, make_models, make_ppo, parameters, recorded, same
+from tests.training.slide import ROLLOUTS, STEPS, Noting, make_envs, make_models, make_ppo, parameters, recorded, same
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -56,18 +55,6 @@ def test_iterations_on_model_rollouts_come_before_each_real_one(iterations, reme
     assert counts == expected
 
 
-class Noting(UpdateRule):
-    """A rule that notes the factors on its steps, and moves nothing."""
-
-    def __init__(self, rule):
-        super().__init__(rule.parameters, rule.optimiser, rule.size, rule.deviation)
-        self.scales = []
-
-    def step(self, loss, scale):
-        self.scales.append(scale)
-        return True
-
-
 def test_steps_on_real_episodes_are_shorter_beside_model_rollouts():
     models = {"iterations": 2, "real_step": 0.25, "steps": 1}
     trainer = make_practising(models=models, final_step=1.0, steps=1)
@@ -76,7 +63,7 @@ def test_steps_on_real_episodes_are_shorter_beside_model_rollouts():
     trainer.update.size.adapt = lambda kl: setattr(trainer.update.size, "value", next(sizes))
     for _ in range(2):
         report = trainer.step()
-    assert trainer.update.scales == [0.25, 1.0, 1.0, 0.25]
+    assert [scale for _, scale in trainer.update.seen] == [0.25, 1.0, 1.0, 0.25]
     assert trainer.update.size.value == 3.0 == report.learning_rate
 
 

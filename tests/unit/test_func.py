@@ -264,7 +264,7 @@ def test_a_gradient_inside_a_loss_is_refused_even_where_the_loss_is_linear(layer
         grad(lambda x: grad(lambda y: layer(y).objective)(x).sum())(x0[0])
 
 
-# --- in-place changes -----------------------------------------------------------------------------------------------
+# --- what would be wrong in silence ----------------------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # torch's own, in forward mode

@@ -8,7 +8,7 @@ import torch
 from difflcs.errors import InvalidInputError
 
 pytest.importorskip("torchrl")
-from difflcs.rl import Adam, PPOSettings, ppo_settings
+from difflcs.rl import PPOSettings, ppo_settings
 from difflcs.rl.mlp import MLPController
 from difflcs.rl.policy import make_actor
 from tests.training.slide import STEPS, U_MAX, features, make_envs, make_model, make_mpc, small_settings
@@ -31,8 +31,6 @@ from tests.training.slide import STEPS, U_MAX, features, make_envs, make_model, 
 def test_bad_settings_are_refused(change, message):
     with pytest.raises(InvalidInputError, match=message):
         PPOSettings(**change)
-    with pytest.raises(InvalidInputError, match="learning_rate"):
-        Adam(learning_rate=-1.0)
 
 
 def test_bad_arguments_are_refused():
