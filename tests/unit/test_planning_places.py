@@ -108,6 +108,8 @@ def test_of_several_discs_each_moves_alone():
     x = tensor([0.2, 0.1, 0.4, 1.5, 0.0, -1.5, 0.0])
     states = places.states(x, places.sample(x))
     assert len(states) == 32
+    alone = DiscPlaces(box(-0.5, 0.5, -0.5, 0.5), 0.1, 16)
+    torch.testing.assert_close(states[:16, 3:5], alone.states(x[:5], alone.sample(x[:5]))[:, 3:5])
     torch.testing.assert_close(states[:16, 5:7], x[5:7].expand(16, 2))
     torch.testing.assert_close(states[16:, 3:5], x[3:5].expand(16, 2))
     apart = (states[:, 3:5] - states[:, 5:7]).norm(dim=1)
