@@ -28,6 +28,7 @@ from difflcs.bench import machine, save
 from difflcs.physics import box
 from difflcs.physics.mujoco import MujocoLCS
 from difflcs.planning import DiscPlaces, PlanarTravel, SamplingPolicy, SamplingSettings
+from difflcs.rl import wilson_interval
 
 HALF, RADIUS = (0.07, 0.05), 0.015  # of the box's sides and of the sphere [m]
 STEPS, SUBSTEPS = 150, 50
@@ -125,13 +126,6 @@ def play(seed: int, policy: SamplingPolicy, module: MujocoLCS) -> Episode:
     return Episode(False, STEPS, used / STEPS)
 
 
-def wilson(successes: int, of: int) -> tuple[float, float]:
-    """95 % interval of a rate."""
-    rate, z = successes / of, 1.96
-    middle, half = rate + z * z / (2 * of), z * math.sqrt(rate * (1 - rate) / of + z * z / (4 * of * of))
-    return (middle - half) / (1 + z * z / of), (middle + half) / (1 + z * z / of)
-
-
 def main(o: Options) -> None:
     """Play, print, write."""
     if o.smoke:
@@ -140,7 +134,7 @@ def main(o: Options) -> None:
     policy, module = make_policy()
     episodes = [play(o.seed + k, policy, module) for k in range(o.goals)]
     successes = sum(e.success for e in episodes)
-    low, high = wilson(successes, o.goals)
+    low, high = wilson_interval(successes, o.goals)
     results = {
         "success_rate": successes / o.goals,
         "ci_low": low,

@@ -1,4 +1,4 @@
-"""Problems the benchmarks solve: synthetic pushing models, random and untrained ones, the zoo, a cart-pole, carts."""
+"""Problems the benchmarks solve: synthetic pushing models, random ones, the zoo, a cart-pole, carts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from difflcs_envs.tasks import pushing_cost
 __all__ = [
     "ACTION_LIMIT",
     "FAMILIES",
-    "MODELS",
     "Instance",
     "cart_states",
     "chain_of_carts",
@@ -26,7 +25,6 @@ __all__ = [
     "random_model",
     "states_and_goals",
     "uniform",
-    "untrained_model",
 ]
 
 
@@ -34,15 +32,6 @@ def random_model(n_lam: int, seed: int, n_x: int = 9, n_u: int = 6) -> LCSParams
     """An `LCSModel` with parameters of size 0.3: no structure at all."""
     generator = torch.Generator().manual_seed(seed)
     return LCSModel(n_x, n_u, n_lam, init_scale=0.3, generator=generator).params().detach()
-
-
-def untrained_model(n_lam: int, seed: int) -> LCSParams:
-    """An `LCSModel` as training starts with it: parameters of size 1e-3."""
-    generator = torch.Generator().manual_seed(seed)
-    return LCSModel(9, 6, n_lam, generator=generator).params().detach()
-
-
-MODELS = {"pushing": pushing_model, "random": random_model, "untrained": untrained_model}
 
 
 def chain_of_carts(carts: int, dt: float = 0.05, stiffness: float = 100.0) -> LCSParams:

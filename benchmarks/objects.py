@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import tyro
 from trainings import Training
@@ -96,28 +95,8 @@ def run(o: Options, task_name: str, method_name: str, seed: int, done: set[tuple
             }
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """Mean success over seeds in a row per task and method, in Markdown."""
-    minutes = sorted({row["minutes"] for row in rows})
-    lines = [
-        "| task | method | told | seeds | goals | " + " | ".join(f"{m:g} min" for m in minutes) + " |",
-        "|---|---|---|---|---|" + "---|" * len(minutes),
-    ]
-    for task, method in dict.fromkeys((row["task"], row["method"]) for row in rows):
-        own = [row for row in rows if (row["task"], row["method"]) == (task, method)]
-        cells = []
-        for m in minutes:
-            rates = [row["success_rate"] for row in own if row["minutes"] == m]
-            spread = f" ({min(rates):.3f} to {max(rates):.3f})" if len(rates) > 1 else ""
-            cells.append(f"{np.mean(rates):.3f}{spread}" if rates else "")
-        seeds = len({row["seed"] for row in own})
-        goals = "/".join(str(n) for n in sorted({row["goals"] for row in own}))
-        lines.append(f"| {task} | {method} | {own[0]['told']} | {seeds} | {goals} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
-
-
 def main(o: Options) -> None:
-    """Train, evaluate, write, print."""
+    """Train, evaluate, write."""
     if o.smoke:
         o.tasks, o.seeds, o.minutes, o.goals, o.envs = o.tasks[:1], o.seeds[:1], [0, 0.2], 4, 4
     torch.set_num_threads(1)
@@ -133,7 +112,6 @@ def main(o: Options) -> None:
                         f"({row['ci_low']:.3f} to {row['ci_high']:.3f})  {row['training_cpu_seconds']:.0f} s",
                         flush=True,
                     )
-    print(table(rows))
 
 
 if __name__ == "__main__":

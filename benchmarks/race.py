@@ -70,7 +70,6 @@ CONTACT = (
     Entry("POUNCE, tuned", "pounce", {"start": 0.1, "options": POUNCE}, "rivals", ("pounce-solver", "casadi")),
     Entry("pympcc", "pympcc", {}, "rivals", ("pympcc", "cyipopt-wheels")),
 )
-COMPILED = Entry("IPOPT, tuned, JIT", "ipopt", {"start": 0.1, "options": TUNED, "jit": True})
 LINEAR = (
     Entry("difflcs `batched`", "layer"),
     Entry("DAQP", "daqp_qp", {}, "rivals", ("daqp",)),
@@ -112,8 +111,6 @@ class Options:
     """What to run; the others stay as they are in the file."""
     out: Path = Path("benchmarks/results/race.json")
     """Where the JSON goes."""
-    jit: bool = False
-    """Also IPOPT with compiled functions; each size takes up to a minute to compile."""
     smoke: bool = False
     """Everything tiny."""
 
@@ -395,7 +392,7 @@ def best_rival(families: dict[str, dict]) -> dict[str, dict]:
 
 def race(name: str, o: Options) -> Iterator[tuple[str, object]]:
     """One part of the race, as the entries of the JSON that belong to it."""
-    entries = (*CONTACT, *([COMPILED] if o.jit else [])) if name == "contact" else LINEAR
+    entries = CONTACT if name == "contact" else LINEAR
     batch, make = (o.batch, with_contact) if name == "contact" else (o.linear_batch, without_contact)
     problems = make(max(batch, o.problems), o.seeds)
     with tempfile.TemporaryDirectory() as folder:

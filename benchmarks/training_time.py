@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import tyro
 from trainings import Training
@@ -66,7 +65,7 @@ def run(o: Options, recipe: str, seed: int) -> dict[str, Any]:
 
 
 def main(o: Options) -> None:
-    """Train, evaluate, write, print."""
+    """Train, evaluate, write."""
     if o.smoke:
         o.minutes, o.seeds, o.goals, o.envs = [0.2, 0.4], o.seeds[:1], 4, 4
     torch.set_num_threads(1)
@@ -88,13 +87,6 @@ def main(o: Options) -> None:
             for e in rows[-1]["evaluations"]:
                 line = f"{recipe:8s} seed {seed}  {e['minutes']:4g} min  {100 * e['success_rate']:5.1f} %"
                 print(f"{line}  {e['seconds']:.1f} s", flush=True)
-    for recipe in o.recipes:
-        for at in zip(*known(recipe).values(), strict=True):
-            success, seconds = [100 * e["success_rate"] for e in at], [e["seconds"] for e in at]
-            print(
-                f"{recipe:8s} {at[0]['minutes']:4g} min: {np.mean(success):.1f} % ({min(success):.1f} to "
-                f"{max(success):.1f}), {np.mean(seconds):.1f} s ({min(seconds):.1f} to {max(seconds):.1f})"
-            )
 
 
 if __name__ == "__main__":

@@ -21,7 +21,6 @@ import torch
 
 from difflcs import zoo
 from difflcs._checks import did_you_mean
-from difflcs._renamed import refuse_flags_of_before
 from difflcs.cli_models import Evaluate, Export, Render
 from difflcs.cli_train import Demo, Train, train_command
 from difflcs.errors import DiffLCSError, InvalidInputError
@@ -183,8 +182,6 @@ def _parsed(words: Sequence[str]) -> Any:
         )
     # `train` has settings for which None means something.
     plain = {k: v if k == "train" else Annotated[v, tyro.conf.DisallowNone] for k, v in _COMMANDS.items()}
-    if words[:1] in (["train"], ["evaluate"]):
-        refuse_flags_of_before(words[1:])
     if words[:1] == ["train"]:
         plain["train"] = train_command(words[1:])
     with _own_errors():

@@ -6,36 +6,24 @@
 
 `difflcs zoo` lists them; `difflcs evaluate`, `render` and `train --init` take them as `zoo:trifinger-cube`.
 
-A maintainer adds a finished run, which is evaluated at its end, by
-
-    python -m difflcs.zoo add RUN [NAME] [--force]
-
-in a checkout of the repository with an editable installation. A name is what the task calls its models, with the method
-behind it unless that is the default one; without NAME it is made from the run.
+A maintainer adds a finished run by `python difflcs/_zoo/add.py RUN` in a checkout of the repository.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import shlex
-import shutil
-import sys
-import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from difflcs import _files, _zoo
-from difflcs.errors import CheckpointError, DiffLCSError, InvalidInputError
+from difflcs.errors import CheckpointError
 
 if TYPE_CHECKING:
     from difflcs.rl.checkpoint import RunDirectory
     from difflcs.rl.rollout import Policy
-    from difflcs.rl.training import TrainConfig
 
-__all__ = ["PREFIX", "Learned", "ModelCard", "add", "card", "names", "path"]
+__all__ = ["PREFIX", "Learned", "ModelCard", "card", "names", "path"]
 
 PREFIX = _zoo.PREFIX
 """Before a name it says to the command line and to `LCSModel.from_pretrained`: a model of the zoo, not a path."""
@@ -158,7 +146,7 @@ def table(cards: Sequence[ModelCard]) -> str:
 
 
 def _read(file: Path) -> ModelCard:
-    remedy = "install difflcs again, or add the run again with `python -m difflcs.zoo add RUN --force`"
+    remedy = "install difflcs again"
     try:
         values = _files.read_json(file)
     except (FileNotFoundError, CheckpointError) as error:
@@ -266,177 +254,3 @@ class Learned:
         """Whether an environment holds what it was trained on, as far as both say; True if that is not known."""
         own = self.object or {}
         return all(own[key] == found[key] for key in own.keys() & found.keys())
-
-
-# --- adding models ----------------------------------------------------------------------------------------------------
-
-
-def add(run: Path | str, name: str | None = None, *, force: bool = False, root: Path = _zoo.ROOT) -> ModelCard:
-    """Put the model of a finished run into the zoo, all at once or not at all.
-
-    Args:
-        run: directory of `difflcs train`.
-        name: of the model; made from task and method if None.
-        force: replace a model of that name.
-        root: where the models lie.
-
-    Returns:
-        Its card.
-
-    Raises:
-        CheckpointError: the run is not finished or was not evaluated at its end, it learned no system for an MPC, or
-            there is a model of that name.
-        InvalidInputError: the name does not say task and method.
-    """
-    from difflcs.rl.checkpoint import RunDirectory
-    from difflcs.rl.training import stored_config
-
-    directory = RunDirectory.open(run)
-    config = stored_config(directory)
-    name = _checked_name(name, config)
-    if not directory.finished():
-        raise CheckpointError(f"{run}: expected a finished run; continue it with: difflcs train --out {run} --resume")
-    if config.method.solver is None:
-        raise CheckpointError(
-            f"{run}: expected a run that learned a system for an MPC, got one of {config.method.name}: "
-            f"{config.method.kind}"
-        )
-    record = directory.learned(config.method.kind)
-    content = _card(directory, config, name)
-    if (root / name).exists() and not force:
-        raise CheckpointError(f"{root / name}: expected no model of that name, got one; replace it with --force")
-    root.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(dir=root, prefix=f".{name}.", suffix=".tmp"))
-    try:
-        new, old = temporary / "new", temporary / "old"
-        _files.save_record(new, config.method.kind, *record)
-        _files.write_json(new / "card.json", asdict(content))
-        if (root / name).exists():
-            (root / name).rename(old)
-        try:
-            new.rename(root / name)
-        except OSError:
-            if old.exists():
-                old.rename(root / name)
-            raise
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-    return content
-
-
-def _checked_name(name: str | None, config: TrainConfig) -> str:
-    from difflcs.rl.methods import method_names
-    from difflcs.rl.tasks import get_task
-
-    task, method = get_task(config.task), config.method.name
-    wanted = (task.model_name or task.name) + ("" if method == method_names()[0] else f"-{method}")
-    if name is not None and name.removeprefix(_zoo.PREFIX) != wanted:
-        raise InvalidInputError(
-            f"name: expected {wanted!r} for task {task.name} and method {method}, got {name!r}; leave it out"
-        )
-    return wanted
-
-
-def _card(run: RunDirectory, config: TrainConfig, name: str) -> ModelCard:
-    stored, rows = run.config(), run.rows()
-    last = rows[-1] if rows else {}
-    if not last.get("evaluation_goals"):
-        raise CheckpointError(
-            f"{run.path}: expected an evaluation at the end of {run.log}, got none; train with --final-goals 1000"
-        )
-    found, versions = stored.get("object", {}), stored.get("versions")
-    if not isinstance(found, dict) or not isinstance(versions, dict):
-        raise CheckpointError(
-            f"{run.path}: expected `object` and `versions` in config.json, got {sorted(stored)}; train it again with "
-            f"`difflcs train`, which writes them"
-        )
-    check_object(found, run.path)
-    try:
-        rate, low, high = (float(last[f"evaluation_{k}"]) for k in ("success_rate", "ci_low", "ci_high"))
-        goals, failures = (int(last[f"evaluation_{k}"]) for k in ("goals", "solver_failures"))
-    except (KeyError, ValueError) as error:
-        raise CheckpointError(
-            f"{run.log}: expected an evaluation in its last row, got {error!r}; train again"
-        ) from error
-    return ModelCard(
-        name=name,
-        task=config.task,
-        method=config.method.name,
-        minutes=config.minutes,
-        seed=config.seed,
-        success_rate=rate,
-        ci_low=low,
-        ci_high=high,
-        goals=goals,
-        evaluation_seed=config.evaluation_seed,
-        solver_failures=failures,
-        object=found,
-        backend=config.method.solver or "",
-        version=str(versions.get("difflcs")),
-        command=training_command(config, stored.get("init")),
-        versions=versions,
-        settings=json.loads(json.dumps(config.to_json())),
-    )
-
-
-def training_command(config: TrainConfig, init: object = None) -> str:
-    """The command line of a training: task, method, minutes and seed, and what differs from the defaults of today.
-
-    Args:
-        config: the training.
-        init: what the run started from, as config.json holds it.
-    """
-    from difflcs.rl.training import TrainConfig
-
-    own, usual = (json.loads(json.dumps(c.to_json())) for c in (config, TrainConfig(method=type(config.method)())))
-    words = ["difflcs", "train"]
-    for name in ("task", "method", "minutes", "seed"):
-        words += _flag(name, own.pop(name))
-    words += _differences(own.pop("settings"), usual.pop("settings"))
-    words += _differences(own, usual)
-    if init is not None:
-        source = Path(str(init))  # of a path the last part only: folders of one machine mean nothing elsewhere
-        source = source.parent if source.name == "model" else source
-        words += ["--init", source.name]
-    return shlex.join(words)
-
-
-def _differences(settings: Mapping[str, Any], usual: Mapping[str, Any], prefix: str = "") -> list[str]:
-    words: list[str] = []
-    for name, value in settings.items():
-        if isinstance(value, dict):
-            words += _differences(value, usual.get(name, {}), f"{prefix}{name}.")
-        elif name not in usual or value != usual[name]:
-            words += _flag(prefix + name, value)
-    return words
-
-
-def _flag(name: str, value: object) -> list[str]:
-    name = name.replace("_", "-")
-    if isinstance(value, bool):
-        group, dot, last = name.rpartition(".")
-        return [f"--{name}" if value else f"--{group}{dot}no-{last}"]
-    values = value if isinstance(value, list) else [value]
-    return [f"--{name}", *(f"{v:g}" if isinstance(v, float) and float(f"{v:g}") == v else str(v) for v in values)]
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """`python -m difflcs.zoo add RUN [NAME] [--force]`; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m difflcs.zoo", description="Add learned models to the package.")
-    commands = parser.add_subparsers(required=True, metavar="add")
-    adding = commands.add_parser("add", help="put the model of a finished run into the zoo")
-    adding.add_argument("run", type=Path, metavar="RUN", help="directory of `difflcs train`")
-    adding.add_argument("name", nargs="?", metavar="NAME", help="made from task and method by default")
-    adding.add_argument("--force", action="store_true", help="replace a model of that name")
-    options = parser.parse_args(arguments)
-    try:
-        content = add(options.run, options.name, force=options.force)
-    except (DiffLCSError, OSError) as error:
-        print(f"difflcs.zoo: {error}", file=sys.stderr)
-        return 2
-    print(f"{content}\nwritten: {_zoo.ROOT / content.name}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

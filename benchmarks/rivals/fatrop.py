@@ -21,14 +21,13 @@ class Solver(Rival):
 
     Args:
         problem: what is to be solved.
-        contact: "product" or "inequality".
         start: λ to start from.
         options: FATROP's.
     """
 
-    def __init__(self, problem: Problem, contact: str = "product", start: float = 1.0, options: dict | None = None):
+    def __init__(self, problem: Problem, start: float = 1.0, options: dict | None = None):
         super().__init__(problem)
-        self.program = p = Program.of(problem, contact, False, start, initial_state=True)
+        self.program = p = Program.of(problem, "product", False, start, initial_state=True)
         settings = {"print_time": False, "error_on_fail": False, "structure_detection": "auto", "equality": p.equality}
         settings |= {"calc_lam_p": False, "expand": True, "fatrop.print_level": 0, "fatrop.max_iter": 500}
         settings |= {f"fatrop.{name}": value for name, value in (options or {}).items()}

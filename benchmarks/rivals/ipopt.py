@@ -23,26 +23,15 @@ class Solver(Rival):
 
     Args:
         problem: what is to be solved.
-        contact: "product" or "inequality".
-        slack: whether s is a variable.
         start: λ and s to start from.
         options: IPOPT's.
-        jit: whether the functions are compiled.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        contact: str = "product",
-        slack: bool = True,
-        start: float = 1.0,
-        options: dict | None = None,
-        jit: bool = False,
-    ):
+    def __init__(self, problem: Problem, start: float = 1.0, options: dict | None = None):
         super().__init__(problem)
         n = (problem.n_x, problem.n_u, problem.n_lam, problem.horizon)
-        self.program = Program.of(problem, contact, slack, start)
-        self.solver = _solver(n, contact, slack, tuple(sorted((options or {}).items())), jit)
+        self.program = Program.of(problem, "product", True, start)
+        self.solver = _solver(n, tuple(sorted((options or {}).items())))
 
     def one(self, i: int) -> Answer:
         """One run of IPOPT."""
@@ -57,7 +46,7 @@ class Solver(Rival):
 
 
 @functools.lru_cache(maxsize=32)
-def _solver(sizes: tuple, contact: str, slack: bool, options: tuple, jit: bool) -> casadi.Function:
+def _solver(sizes: tuple, options: tuple) -> casadi.Function:
     n_x, n_u, n_lam, horizon = sizes
     shapes = {
         "A": (n_x, n_x), "B": (n_x, n_u), "C": (n_x, n_lam), "d": (n_x,), "D": (n_lam, n_x), "E": (n_lam, n_u),
@@ -67,10 +56,8 @@ def _solver(sizes: tuple, contact: str, slack: bool, options: tuple, jit: bool) 
     empty = Problem(
         **{k: np.zeros(v) for k, v in shapes.items()}, horizon=horizon, relaxation=1.0, constant=np.zeros(())
     )
-    p = Program.of(empty, contact, slack, 1.0)
+    p = Program.of(empty, "product", True, 1.0)
     settings = {"print_time": False, "error_on_fail": False, "calc_lam_p": False}
     settings |= {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.max_iter": 500}
     settings |= {f"ipopt.{name}": value for name, value in options}
-    if jit:
-        settings |= {"jit": True, "compiler": "shell", "jit_options": {"flags": ["-O2", "-march=native"]}}
     return casadi.nlpsol("mpc", "ipopt", {"x": p.z, "p": p.p, "f": p.f, "g": p.g}, settings)

@@ -46,7 +46,7 @@ class Program:
 
         Args:
             problem: what is to be solved.
-            contact: "product" for λ·s = ε, "inequality" for λ·s ≤ ε, "none" for neither (who solves it adds it).
+            contact: "product" for λ·s = ε, or "none" (who solves it adds it).
             slack: whether s is a variable.
             start: value of λ and s, and u = 0.
             initial_state: whether x_0 is a variable, equal to a parameter.
@@ -92,7 +92,7 @@ class Program:
                 row(x - s_["x0"], 0, 0)
             row(*((gap - s, 0, 0) if slack else (gap, 0, inf)))
             if contact != "none":
-                row(lam * s - eps, 0 if contact == "product" else -inf, 0)
+                row(lam * s - eps, 0, 0)
             actions.append(where_u)
             states.append(where_x)
             x = x_next

@@ -96,8 +96,7 @@ def _rotation(x: Tensor) -> Tensor:
 class DiscPlaces:
     """Discs round a body on a plane, as in `difflcs.physics.PlanarPushing`: on a ring round its shape.
 
-    Each disc in turn goes to each place of the ring while the others stay; with several discs, `together` random
-    choices of places for all of them come on top. Places where discs overlap are not allowed.
+    Each disc in turn goes to each place of the ring while the others stay. Places where discs overlap are not allowed.
 
     Args:
         shape: outline of the body in its own coordinates.
@@ -106,10 +105,8 @@ class DiscPlaces:
         gap: between a disc on the ring and the body [length]; None: a tenth of the radius.
         reach: gap up to which pushing from where a disc is may be thought of [length]; None: the radius.
         n_discs: how many there are.
-        together: choices of places for all discs at once, other ones at each call.
         workspace: that a disc on a place must be inside of; None: everywhere.
         margin: between a place and the border of the workspace [length].
-        seed: of those choices.
 
     Raises:
         InvalidInputError and its kinds: an argument does not fit.
@@ -124,20 +121,16 @@ class DiscPlaces:
         gap: float | None = None,
         reach: float | None = None,
         n_discs: int = 1,
-        together: int = 0,
         workspace: Workspace | None = None,
         margin: float = 0.0,
-        seed: int = 0,
     ):
         self.shape = shape
         self.radius = check_number("radius", radius, strict=True)
         self.n_discs = check_positive_int("n_discs", n_discs)
-        self.together = check_positive_int("together", together, minimum=0)
         self.reach = radius if reach is None else check_number("reach", reach)
         self.workspace, self.margin = workspace, check_number("margin", margin)
         gap = 0.1 * radius if gap is None else check_number("gap", gap, strict=True)
         self.ring = ring(shape, radius + gap, n_places)
-        self._generator = torch.Generator().manual_seed(seed)
 
     def sample(self, x: Tensor) -> Tensor:
         """See `Places`: (n, 2 · n_discs) in coordinates of the body."""
@@ -148,8 +141,7 @@ class DiscPlaces:
         alone = here.expand(n, each, n, 2).clone()
         disc = torch.arange(n)
         alone[disc, :, disc] = self.ring
-        choice = torch.randint(each, (self.together, n), generator=self._generator)
-        return torch.cat([alone.reshape(n * each, 2 * n), self.ring[choice].reshape(self.together, 2 * n)])
+        return alone.reshape(n * each, 2 * n)
 
     def states(self, x: Tensor, places: Tensor) -> Tensor:
         """See `Places`."""

@@ -129,7 +129,6 @@ class PushTPolicy:
         system: of which the MPC plans: state and action as in `tee_pushing`, which it is if None.
         shape: round which places and ways are laid; that of the system if None.
         delay: steps by which actions come late. The plan begins at the state that the system predicts for then.
-        places: round the T.
         horizon: of the plans [steps].
         margin: by how much farther than usual from the T places and ways are laid [100 px].
 
@@ -143,7 +142,6 @@ class PushTPolicy:
         *,
         shape: Shape | None = None,
         delay: int = 0,
-        places: int = 64,
         horizon: int = 10,
         margin: float = 0.0,
     ):
@@ -154,7 +152,7 @@ class PushTPolicy:
         cost = GoalCost.reach(7, 2, goal_weight=(1.0, 1.0, 0.3), goal_weight_final=(4.0, 4.0, 1.2), input_weight=0.01)
         self.sampling = SamplingPolicy(
             LCSMPCLayer(system, cost, horizon, relaxation=1e-5, on_failure="mask"),
-            DiscPlaces(shape, RADIUS, places, gap=0.02 + margin, reach=0.12 + margin, workspace=workspace, margin=0.2),
+            DiscPlaces(shape, RADIUS, gap=0.02 + margin, reach=0.12 + margin, workspace=workspace, margin=0.2),
             PlanarTravel(shape, RADIUS, step=1.2, clearance=0.08 + margin, tolerance=0.08),
             SamplingSettings(keep=0.6, smallest_gain=0.02, switch_price=0.02, travel_price=0.04),
             bounds=workspace.bounds,

@@ -99,7 +99,6 @@ def record_video(
     path: Path,
     task: TaskSpec,
     seed: int = 0,
-    hold_seconds: float = 1.0,
 ) -> list[bool]:
     """Play one noise-free episode per goal into an MP4, in real time, with the task's caption above.
 
@@ -110,7 +109,6 @@ def record_video(
         path: where to write; replaced atomically.
         task: the task.
         seed: of the initial states.
-        hold_seconds: how long the last picture of an episode stays [s].
 
     Returns:
         For each goal, whether it was reached.
@@ -150,7 +148,7 @@ def record_video(
                     text = f"{title}    {step * task.step_seconds:.1f} s    {task.say(info)}"
                     picture = _captioned(env, text, verdict)
                     video.append_data(picture)
-                for _ in range(round(hold_seconds / task.step_seconds)):
+                for _ in range(round(1.0 / task.step_seconds)):
                     video.append_data(picture)
                 reached.append(bool(info["success"]))
         os.replace(temporary, path)

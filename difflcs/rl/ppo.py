@@ -133,7 +133,6 @@ class PPO(Trainer):
         first_episode: episodes collected before, by a warm-up.
         first_iteration: iterations done before.
         max_kl: KL divergence at which an iteration ends early.
-        kl_quantile: fraction of the samples, those of lowest KL, whose mean is the KL divergence of an iteration.
         final_step: factor on all steps, falling linearly from 1 to this.
         models: plays episodes in networks besides those of the robot; None: real ones alone, as in the paper.
         practice: how model rollouts are learned from, where there are models.
@@ -159,7 +158,6 @@ class PPO(Trainer):
         first_episode: int = 0,
         first_iteration: int = 0,
         max_kl: float = 0.3,
-        kl_quantile: float = 0.97,
         final_step: float = 0.3,
         models: ModelRollouts | None = None,
         practice: Source | None = None,
@@ -176,7 +174,7 @@ class PPO(Trainer):
         super().__init__(learned, actor.controller, seed, episode_steps)
         self.actor, self.robot, self.critic, self.surrogate, self.update = actor, robot, critic, surrogate, update
         self.scale, self.features = scale, features
-        self.max_kl, self.kl_quantile, self.final_step = max_kl, kl_quantile, final_step
+        self.max_kl, self.final_step = max_kl, final_step
         self.models, self.practice = models, practice
         self.first_episode, self.first_iteration = first_episode, first_iteration
         self.episodes, self.iteration = first_episode, first_iteration
@@ -365,7 +363,7 @@ class PPO(Trainer):
             outcome.solve_seconds += solved - start
 
             kl = gaussian_kl(old, new)
-            outcome.kl = trimmed_mean(kl, self.kl_quantile)
+            outcome.kl = trimmed_mean(kl, 0.97)
             if not outcome.kl <= self.max_kl and outcome.steps:
                 break
             loss = self.surrogate(new, old, kl, cast("TensorDict", samples[chosen]), episodes, rng)

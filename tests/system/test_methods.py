@@ -9,31 +9,17 @@ import time
 from pathlib import Path
 
 import pytest
-import torch
 
 from difflcs import _files, cli
-from difflcs.rl.checkpoint import RunDirectory
-from difflcs.rl.training import load_model
 
 pytest.importorskip("mujoco")
 pytest.importorskip("torchrl")
-
-METHODS = ("ppo", "ppo-mlp", "pddm")
 
 
 def run(capsys, *arguments) -> tuple[int, str, str]:
     code = cli.main([str(argument) for argument in arguments])
     captured = capsys.readouterr()
     return code, captured.out, captured.err
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory) -> dict[str, Path]:
-    """A finished smoke run of each method."""
-    root = tmp_path_factory.mktemp("methods")
-    for method in METHODS:
-        assert cli.main(["train", "--smoke", "--method", method, "--out", str(root / method)]) == 0
-    return {method: root / method for method in METHODS}
 
 
 def learned(path: Path) -> list[tuple[str, bytes]]:
@@ -64,22 +50,6 @@ def test_resume_after_kill_9(capsys, tmp_path):
     assert learned(through) == learned(killed)
 
 
-def test_init_starts_from_another_run(capsys, finished, tmp_path):
-    out = tmp_path / "transfer"
-    arguments = ["--smoke", "--method", "lcs-rl", "--final-goals", 0, "--out", out, "--init"]
-    assert run(capsys, "train", *arguments, finished["ppo"])[0] == 0
-    assert json.loads((out / "config.json").read_text())["init"] == str(finished["ppo"])
-    first = RunDirectory.open(out).rows()[1]
-    assert first["env_steps"] == "100"
-    assert torch.isfinite(load_model(out).A).all()
-    for method, kind in (("pddm", "dynamics"), ("ppo-mlp", "MLP")):
-        for source in (finished[method], finished[method] / "model"):
-            code, _, err = run(capsys, "train", "--smoke", "--out", tmp_path / "no", "--init", source)
-            assert code == 2
-            assert kind in err
-            assert not (tmp_path / "no").exists()
-
-
 def test_a_folder_that_cannot_be_written_is_reported_first(capsys, tmp_path):
     (tmp_path / "file").touch()
     code, _, err = run(capsys, "train", "--smoke", "--out", tmp_path / "file/run")
@@ -87,8 +57,9 @@ def test_a_folder_that_cannot_be_written_is_reported_first(capsys, tmp_path):
     assert "another --out" in err
 
 
-def test_a_full_disk_leaves_the_last_checkpoint(capsys, finished, tmp_path, monkeypatch):
-    path = tmp_path / "run"
+def test_a_full_disk_leaves_the_last_checkpoint(capsys, tmp_path, monkeypatch):
+    whole, path = tmp_path / "whole", tmp_path / "run"
+    assert run(capsys, "train", "--smoke", "--method", "ppo", "--out", whole)[0] == 0
     write, left = _files.write_atomically, [5]  # config.json, then three files per checkpoint
 
     def full(*arguments):
@@ -105,4 +76,4 @@ def test_a_full_disk_leaves_the_last_checkpoint(capsys, finished, tmp_path, monk
     assert "--resume" in err
     assert json.loads((path / "checkpoints/latest.json").read_text()) == {"checkpoint": "000000"}
     assert run(capsys, "train", "--out", path, "--resume")[0] == 0
-    assert learned(path) == learned(finished["ppo"])
+    assert learned(path) == learned(whole)

@@ -1,31 +1,39 @@
-"""A package of somebody else brings a task: every method trains on it, is evaluated and drawn, by the common commands.
-
-The package is installed for these tests into a folder of its own: its module, and beside it the `.dist-info` with entry
-points that `pip install` would leave there. That is what `importlib.metadata` reads, and needs no network and no build.
-"""
+"""A package of somebody else brings a task: every method learns it, is evaluated and drawn, by the common commands."""
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
-import shutil
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
-import numpy as np
 import pytest
-import torch
 
 pytest.importorskip("torchrl", reason="needs the extra [rl]")
 pytest.importorskip("tyro", reason="needs the extra [rl]")
 
 from difflcs.rl.methods import method_names
-from difflcs.rl.tasks import task_names
 
-PACKAGE = Path(__file__).parent / "fixtures" / "block_task"
+ROOT = Path(__file__).resolve().parents[2]
+MODULE = """
+import numpy as np
+from difflcs.rl.tasks import register_task
+from tests.conformance.toy import Slide, make_task
+
+class Drawn(Slide):
+    metadata = {"render_modes": ["rgb_array"]}
+
+    def __init__(self, render_mode=None, **options):
+        super().__init__(**options)
+        self.render_mode = render_mode
+
+    def render(self):
+        return np.full((64, 96, 3), 90, np.uint8)
+
+def register():
+    register_task(make_task("own", env=Drawn, describe=lambda env: {"length": 0.5}))
+"""
 PROGRAM = """
 import json, sys
 from difflcs.cli import main
@@ -37,124 +45,40 @@ for words in json.loads(sys.argv[1]):
 """
 
 
-def install(folder: Path) -> None:
-    """What `pip install --target folder` does with a pure Python package, as far as Python looks."""
-    project = tomllib.loads((PACKAGE / "pyproject.toml").read_text())["project"]
-    for module in PACKAGE.glob("*.py"):
-        shutil.copy(module, folder)
-    information = folder / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
-    information.mkdir()
-    about = f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
-    (information / "METADATA").write_text(about)
-    groups = [
-        "\n".join([f"[{group}]", *(f"{name} = {value}" for name, value in entries.items())])
-        for group, entries in project["entry-points"].items()
-    ]
-    (information / "entry_points.txt").write_text("\n\n".join(groups) + "\n")
-
-
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory):
+    """A module, and beside it the `.dist-info` with its entry point that `pip install` would leave there."""
     folder = tmp_path_factory.mktemp("site-packages")
-    install(folder)
+    information = folder / "own_task-1.0.dist-info"
+    information.mkdir()
+    (folder / "own_task.py").write_text(MODULE)
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: own-task\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text("[difflcs.tasks]\nown = own_task:register\n")
     return folder
-
-
-@pytest.fixture(scope="module")
-def block():
-    """The package's module, in this process too; its task is not registered here."""
-    spec = importlib.util.spec_from_file_location("block_task", PACKAGE / "block_task.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def python(*arguments, folder, cwd):
-    environment = {**os.environ, "PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment, cwd=cwd)
-
-
-def difflcs(*commands, folder, cwd):
-    """The commands one after another in one process (starting Python takes longer than they do); output of each."""
-    done = python("-c", PROGRAM, json.dumps(commands), folder=folder, cwd=cwd)
-    assert done.returncode == 0, done.stderr[-3000:] + done.stdout[-1000:]
-    return [part.partition("\n")[2] for part in done.stdout.split(">>> ")[1:]]
-
-
-# --- the task ---------------------------------------------------------------------------------------------------------
-
-
-def test_it_is_found_where_it_is_installed_and_only_there(installed, tmp_path):
-    code = "from difflcs.rl.tasks import task_names; print(*task_names())"
-    done = python("-c", code, folder=installed, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "block" in done.stdout.split()
-    assert "block" not in task_names()  # of this process, which does not see that folder
-
-
-def test_its_environment_gives_its_outcome(block):
-    env = block.PushBlock()
-    rng = np.random.default_rng(0)
-    successes = 0
-    for seed in range(30):
-        before, _ = env.reset(seed=seed)
-        for _ in range(block.STEPS):
-            action = rng.uniform(-block.REACH, block.REACH, 2)
-            after, reward, _, ended, info = env.step(action)
-            step = before["state"], action, after["state"], before["goal"]
-            assert block.BLOCK.outcome(*step, ended) == (reward, info["success"])
-            found, success = block.BLOCK.outcome(*map(torch.from_numpy, step), torch.tensor(ended))
-            assert float(found) == pytest.approx(reward, abs=1e-12)
-            assert bool(success) is info["success"]
-            before = after
-        assert ended
-        successes += info["success"]
-    assert successes < 30
-
-
-# --- the commands -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("method", method_names())
 def test_every_method_learns_it(method, installed, tmp_path):
     pytest.importorskip("imageio_ffmpeg", reason="needs the extra [viz]")
     run = tmp_path / "run"
-    _, told, drawn = difflcs(
-        ["train", "--task", "block", "--method", method, "--smoke", "--out", str(run)],
+    commands = [
+        ["train", "--task", "own", "--method", method, "--smoke", "--out", str(run)],
         ["evaluate", str(run), "--goals", "6", "--json"],
         ["render", str(run), "--out", str(tmp_path / "video.mp4"), "--goal", "0.12", "-0.1"],
-        folder=installed,
-        cwd=tmp_path,
-    )
+    ]  # one after another in one process: starting Python takes longer than they do
+    environment = {**os.environ, "PYTHONPATH": f"{installed}{os.pathsep}{ROOT}", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, json.dumps(commands)],
+        capture_output=True, text=True, timeout=300, check=False, env=environment, cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:] + done.stdout[-1000:]
+    _, told, drawn = (part.partition("\n")[2] for part in done.stdout.split(">>> ")[1:])
     record = json.loads(told)
-    assert (record["task"], record["method"], record["goals"], record["finished"]) == ("block", method, 6, True)
+    assert (record["task"], record["method"], record["goals"], record["finished"]) == ("own", method, 6, True)
     assert 0 <= record["success_rate"] <= 1
-    assert record["object"] == record["trained_on"] == {"reach": 0.05, "tolerance": 0.02}
+    assert record["object"] == record["trained_on"] == {"length": 0.5}
     assert 0 <= record["median_errors"]["position_error"] < 1
     assert [line.partition(":")[0] for line in drawn.splitlines()[:2]] == ["goal 0.12", "goal -0.1"]
     assert (tmp_path / "video.mp4").stat().st_size > 1000
-    rows = (run / "log.csv").read_text().splitlines()
-    assert len(rows) > 2
-    assert json.loads((run / "config.json").read_text())["config"]["task"] == "block"
-
-
-def test_it_is_learned_not_only_run(installed, tmp_path):
-    """After a minute of data, forty episodes, the block gets to most goals."""
-    _, told, drawn = difflcs(
-        ["train", "--task", "block", "--method", "violation", "--minutes", "1", "--out", "run", "--final-goals", "0"],
-        ["evaluate", "run", "--goals", "100", "--json"],
-        ["render", "run", "--out", "video.mp4"],
-        folder=installed,
-        cwd=tmp_path,
-    )
-    assert json.loads(told)["success_rate"] > 0.5
-    assert drawn.startswith("goal 0.1: ")
-
-
-def test_what_cannot_be_said_of_it_is_refused_in_its_own_words(installed, tmp_path):
-    done = python("-m", "difflcs", "train", "--task", "blok", "--smoke", folder=installed, cwd=tmp_path)
-    assert done.returncode == 2
-    assert "block" in done.stderr
-    assert "Traceback" not in done.stderr
-    assert not list(tmp_path.iterdir())
+    assert len((run / "log.csv").read_text().splitlines()) > 2
+    assert json.loads((run / "config.json").read_text())["config"]["task"] == "own"

@@ -48,7 +48,7 @@ from rich.progress import Progress  # noqa: E402
 from units import OBJECTS, Preset, Unit  # noqa: E402
 
 from difflcs.errors import CheckpointError, InvalidInputError  # noqa: E402
-from difflcs.rl import TrainConfig, evaluate, get_method, get_task, wilson_interval  # noqa: E402
+from difflcs.rl import TrainConfig, evaluate, get_method, get_task  # noqa: E402
 from difflcs.zoo import Learned  # noqa: E402
 
 TINY = Preset("smoke", seeds=1, goals=2, final_goals=2, evaluate_at=(0.2, 0.5), smoke=True)
@@ -522,13 +522,6 @@ def test_a_script_computes_and_draws(local, tmp_path, monkeypatch, capsys):
 # --- statistics -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("reached", "goals"), [(0, 4), (1, 4), (4, 4), (299, 300)])
-def test_wilson_is_that_of_the_library(reached, goals):
-    found = stats.wilson(100 * reached / goals, goals)
-    assert [found.low / 100, found.high / 100] == pytest.approx(wilson_interval(reached, goals))
-    assert 0 <= found.low <= found.value <= found.high <= 100
-
-
 def test_intervals_stay_within_what_is_possible():
     rng = np.random.default_rng(0)
     for _ in range(50):
@@ -707,54 +700,6 @@ def test_table1_says_where_two_deployments_are_one(results, capsys, last):
     assert said == (last == 20)
 
 
-def test_over_all_objects_the_middle_half_counts(tmp_path, capsys):
-    for task, value in zip(OBJECTS, (0, 50, 60, 60, 70, 100), strict=True):
-        for seed in range(2):
-            for method, gain in (("violation", 0), ("lcs-rl", -5 if task == "banana" else 10)):
-                percent = value + gain if value else 0
-                records.add(tmp_path, "paper", unit_rows(Unit(task, method, "ours", seed), (0, 0, 0, percent)))
-    assert run_script(table1.main, capsys, "--results", tmp_path)[0] == 0
-    success, differences = cells_of(tmp_path / "table1.md", "all six")
-    assert success[5] == "60.0 [60.0, 60.0]"  # not 56.7, the mean
-    assert differences[1].startswith("+5.8 [")
-
-
-def test_learning_curves_are_drawn(results, capsys):
-    code, out, _ = run_script(fig_learning_curves.main, capsys, "--results", results)
-    assert code == 0
-    assert "55 at 7 min, 30 at 30 min" in out
-    assert "4.0 [4.0, 4.0]" in out  # PDDM
-    assert "PDDM: version 1, 3 seeds × 50 goals" in out  # an unequal number of goals is said
-
-
-def test_lcs_rl_is_compared_with_the_other_curves(results, capsys):
-    for seed in range(3):  # over 6, 10 and 30 minutes better, not to be told apart, worse; on the same number of goals
-        percent = (0, 30 + seed, 59 - seed * seed, 99)
-        records.add(results, "paper", unit_rows(Unit("cube", "ppo", "paper", seed), percent))
-    assert run_script(fig_learning_curves.main, capsys, "--results", results)[0] == 0
-    rows = cells_of(results / "fig_learning_curves.md", "violation only")
-    (against,) = (row for row in rows if row[1].startswith("+"))
-    assert against[1:] == [
-        *("+0.0 [+0.0, +0.0]", "1.000"),
-        *("+20.0 [+20.0, +20.0]", "0.250"),
-        *("+60.0 [+60.0, +60.0]", "0.250"),
-    ]
-    markdown = (results / "fig_learning_curves.md").read_text()
-    assert "LCS-RL, our recipe, 6 min: better than 1 (PPO without warm-up), not to be told apart" in markdown
-    also = "better than 1 (violation only), not to be told apart from 1 (PPO without warm-up)"
-    assert f"LCS-RL, our recipe, 10 min: {also}." in markdown
-    assert "LCS-RL, our recipe, final: better than 1 (violation only), worse than 1 (PPO without warm-up)" in markdown
-    assert "LCS-RL on the cube, the paper's recipe" not in markdown  # of which there is nothing
-
-
-def test_the_lowest_seed_of_lcs_rl_is_said(tmp_path, capsys):
-    for seed, percent in enumerate([(0, 40, 92, 99), (0, 39, 97, 99.5), (0, 50, 98, 100)]):
-        records.add(tmp_path, "paper", unit_rows(Unit("cube", "lcs-rl", "ours", seed), percent))
-    assert run_script(fig_learning_curves.main, capsys, "--results", tmp_path)[0] == 0
-    markdown = (tmp_path / "fig_learning_curves.md").read_text()
-    assert "LCS-RL, our recipe, the lowest of 3 seeds: 6 min 39.0 %, 10 min 92.0 %, final 99.0 %." in markdown
-
-
 def test_curves_stand_where_the_evaluations_were(tmp_path, capsys, monkeypatch):
     rows = unit_rows(Unit("cube", "lcs-rl", "ours", 0), (0, 40, 50, 70))
     rows["minutes"] = [0.0, 6.9, 10.5, 30.0]
@@ -775,23 +720,6 @@ def test_single_seeds_are_thin_lines(results, capsys, monkeypatch):
     assert widths == [2, 0.5] * 2
 
 
-def test_ablations_are_compared_with_all_parts(results, capsys):
-    for seed in range(3):
-        records.add(results, "paper", unit_rows(Unit("cube", "lcs-rl", "adam", seed), (0, 40, 40, 60 + 10 * seed)))
-        records.add(results, "paper", unit_rows(Unit("cube", "ppo", "ours", seed), (0, 40, 60 + 10 * seed, 50)))
-        if seed < 2:
-            records.add(results, "paper", unit_rows(Unit("cube", "lcs-rl", "horizon-5", seed), (0, 9, 9, 9)))
-    assert run_script(ablations.main, capsys, "--results", results)[0] == 0
-    (adam,) = cells_of(results / "ablations.md", "with Adam")
-    assert adam[3:] == ["70.0 [60.0, 80.0]", "−20.0 [−30.0, −10.0]", "0.250", "−10.0 [−10.0, −10.0]", "0.250"]
-    markdown = (results / "ablations.md").read_text()
-    said = "success is lower by its interval: with Adam instead of the natural gradient"
-    few = f"{report.UNTOLD}: with horizon 5"
-    assert f"On the cube, 10 min, {said}; higher: without warm-up; {few}." in markdown
-    assert f"On the cube, final, {said} and without warm-up; higher: none; {few}." in markdown
-    assert (results / "ablations.png").is_file()
-
-
 def test_every_line_of_the_ablations_has_its_own_name(results, capsys, monkeypatch):
     """Also where one task has an ablation that the other has not."""
     for seed in range(3):
@@ -810,15 +738,6 @@ def test_every_line_of_the_ablations_has_its_own_name(results, capsys, monkeypat
     ]
     assert points == [[0.0, -1.0, -0.2, -1.2], [-1.0, -1.2]]
     assert all(axes.get_legend() is not None for axes in (cube, banana))
-
-
-def test_transfer_is_compared_at_equal_data(results, capsys):
-    assert run_script(fig_transfer.main, capsys, "--results", results)[0] == 0
-    cells = cells_of(results / "fig_transfer.md", "mug")[0]
-    assert cells[1] == "30.0 [30.0, 30.0]"  # the cube's model without any data
-    assert cells[2:] == ["—", "—", "50.0 [40.0, 60.0]", "60.0 [60.0, 60.0]", "80.0 [70.0, 90.0]", "89.0 [79.0, 99.0]"]
-    cells = cells_of(results / "fig_transfer.md", "mug")[1]
-    assert cells[3:] == ["+10.0 [+0.0, +20.0]", "0.500", "+9.0 [+9.0, +9.0]", "0.250"]  # 6 min, final
 
 
 def test_the_same_numbers_give_the_same_files(results, capsys):
@@ -1090,22 +1009,6 @@ def test_transfer_compares_the_same_seeds(results, capsys):
     assert differences[-2].startswith("+9.0")
 
 
-def test_objects_of_two_masses_beside_the_paper(results, capsys):
-    args = "--results", results, "--preset", "paper"
-    assert run_script(masses.main, capsys, *args)[0] == 2  # nothing to draw
-    for seed in range(3):
-        for recipe, mass, end in (("paper", 0.05, 20), ("light", 0.01, 60 + seed)):
-            rows = unit_rows(Unit("mug", "lcs-rl", recipe, seed), (0, 10, 20, end), version="2")
-            records.add(results, "paper", rows.assign(mass=mass))
-    assert run_script(masses.main, capsys, *args)[0] == 0
-    markdown = (results / "masses.md").read_text()
-    assert "| final: 50 g" in markdown
-    (line,) = cells_of(results / "masses.md", "mug")
-    assert [cell.split(" ")[0] for cell in line[-3:]] == ["20.0", "61.0", "44.6"]
-    assert "At 50 g, LCS-RL at the end against the paper's mean: worse on 1 (mug), not compared" in markdown
-    assert "At 10 g, LCS-RL at the end against the paper's mean: better on 1 (mug), not compared" in markdown
-
-
 # --- bad input --------------------------------------------------------------------------------------
 
 
@@ -1154,12 +1057,6 @@ def test_results_of_another_version_stay_as_they_are(content, results, capsys):
         records.add(results, "paper", unit_rows(unit, (1, 2, 3, 4)))
     assert path.read_text() == content
     assert not (results / "table1.md").exists()
-
-
-def test_the_paper_is_complete():
-    assert set(table1.PAPER) == set(OBJECTS)
-    assert table1.PAPER["wrench"]["lcs-rl", "final"] == (59.5, 6.6)
-    assert all(len(cells) == 4 for cells in table1.PAPER.values())
 
 
 # --- the task's figure ------------------------------------------------------------------------------

@@ -194,31 +194,6 @@ def test_a_tip_goes_straight_where_it_can_and_over_the_cube_where_it_must():
     assert not travel.arrived(state(pose, [-0.055, 0.02, 0.022], 0.0), target)
 
 
-def test_a_policy_without_its_packages_says_what_to_install(monkeypatch):
-    pytest.importorskip("tyro")
-    import sys
-
-    import trifinger_rl
-
-    from difflcs.errors import MissingDependencyError
-
-    monkeypatch.setitem(sys.modules, "trifinger_rl_datasets", None)
-    with pytest.raises(MissingDependencyError, match="pip install trifinger-rl-datasets"):
-        trifinger_rl.policy_class("contact-mpc")
-
-
-def test_figures_of_some_episodes():
-    pytest.importorskip("tyro")
-    import trifinger_rl
-
-    found = trifinger_rl.summary([[1.0, 700.0, 0.9, 1.0, 5.0], [0.0, 100.0, 0.1, 1.0, 7.0]])
-    assert found["success_rate"] == 0.5
-    assert found["mean_return"] == 400.0
-    assert found["return_error"] == pytest.approx(300.0)
-    assert found["milliseconds_per_step"] == 6.0
-    assert 0 < found["ci_low"] < 0.5 < found["ci_high"] < 1
-
-
 @pytest.mark.slow  # the simulator steps in real time on one core; nothing quicker shows that a torque moves the cube
 @pytest.mark.filterwarnings("ignore")
 def test_in_the_simulator_the_cube_goes_to_the_goal():

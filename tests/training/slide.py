@@ -23,6 +23,7 @@ from difflcs.rl import (
     PPOSettings,
     ppo_settings,
 )
+from difflcs.rl.optim import UpdateRule
 from difflcs.rl.policy import GaussianPolicy, make_actor
 from difflcs.rl.ppo import PPO
 
@@ -40,8 +41,8 @@ class Slide(gymnasium.Env):
     )
     action_space = spaces.Box(-U_MAX, U_MAX, (1,), np.float64)
 
-    def __init__(self, breaks_at: int | None = None, reward: float | None = None, penalty: float = PENALTY):
-        self.breaks_at, self.reward, self.penalty = breaks_at, reward, penalty
+    def __init__(self, breaks_at: int | None = None, penalty: float = PENALTY):
+        self.breaks_at, self.penalty = breaks_at, penalty
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -56,7 +57,7 @@ class Slide(gymnasium.Env):
         success = float(abs(self.state - self.goal)[0]) < 0.05
         last = self.steps >= STEPS
         info = {"success": success, "physics_error": broken}
-        reward = -20 * error - self.penalty * (last and not success) if self.reward is None else self.reward
+        reward = -20 * error - self.penalty * (last and not success)
         return {"state": self.state.copy(), "goal": self.goal.copy()}, reward, False, last or broken, info
 
 
@@ -144,6 +145,18 @@ def recorded(trainer: PPO, source: str = "robot") -> Recording:
     recording = Recording(part.advantages)
     setattr(trainer, source, replace(part, advantages=recording))
     return recording
+
+
+class Noting(UpdateRule):
+    """A rule that notes what it is asked for, and moves nothing."""
+
+    def __init__(self, rule, answers=lambda: True):
+        super().__init__(rule.parameters, rule.optimiser, rule.size, rule.deviation)
+        self.seen, self.answers = [], answers
+
+    def step(self, loss, scale):
+        self.seen.append((float(loss.detach()), scale))
+        return self.answers()
 
 
 def drawn(actor: GaussianPolicy, count: int = 60, seed: int = 0) -> TensorDict:

@@ -11,23 +11,21 @@ from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 from torch import nn
 
-from benchmarks.context import FORCE, HeavyBlock, Network, Physics, imitation, learners, make_mpc, prediction
 from difflcs import LCSModel, LCSParams, LCSSequence
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
+from tests.training.heavy_block import FORCE, HeavyBlock, Network, Physics, make_mpc, true_system
 
 pytest.importorskip("torchrl")
 from tensordict import TensorDict
 
 from difflcs.rl import (
     Adam,
-    CriticSettings,
     Epochs,
     Rollouts,
     ViolationLoss,
     Warmup,
     WarmupSettings,
     collect,
-    evaluate,
     fit,
     make_actor,
     make_ppo,
@@ -142,27 +140,6 @@ def test_the_warmup_finds_the_unknown_numbers():
     np.testing.assert_allclose(learned, truth, rtol=0.1)
 
 
-def test_a_context_makes_the_difference():
-    """A fast version of benchmarks/context.py, where a constant system fails by both losses."""
-    for learn, sizes, least in ((prediction, (400, 40), (5, 2)), (imitation, (300, 100), (3, 2))):
-        errors = {name: learn(lcs, 0, *sizes)[1] for name, lcs in learners(0).items()}
-        assert errors["constant"] > least[0] * errors["physics"]
-        assert errors["constant"] > least[1] * errors["network"]
-
-
-def test_ppo_improves_a_module_of_ones_own():
-    lcs = Gain()
-    critic = CriticSettings(epochs=Epochs(first=60, each=3, minibatch=256))
-    trainer = make_trainer(lcs, 0, 8, rollouts=40, steps=10, std=0.04, target_kl=0.2, max_kl=0.6, critic=critic)
-    before = evaluate(trainer.robot.env, trainer.policy, 60, 0, slide.STEPS).success_rate
-    while not trainer.done:
-        assert trainer.step().solver_failures == 0
-    after = evaluate(trainer.robot.env, trainer.policy, 60, 0, slide.STEPS).success_rate
-    assert before < 0.35
-    assert after > before + 0.4
-    assert not lcs.unused.any()
-
-
 def test_the_violation_loss_beside_ppo_gets_the_context():
     """Eq. 7 with β = 0 is the violation loss alone, which finds the true effect."""
     adam = Adam(learning_rate=0.02, betas=(0.9, 0.99))
@@ -218,7 +195,9 @@ def test_a_context_that_changes_is_refused():
 
 
 def test_a_constant_model_takes_no_notice():
-    record = collect(make_envs(2), mpc_actions(make_mpc(learners(0)["constant"])), [1, 2], STEPS)
+    record = collect(
+        make_envs(2), mpc_actions(make_mpc(LCSModel.from_params(true_system(), stiffness=1e-3))), [1, 2], STEPS
+    )
     assert not record["failures"].any()
     assert "context" in record.keys()
 

@@ -2,18 +2,13 @@
 
 from itertools import pairwise
 
-import numpy as np
 import pytest
-import torch
-
-from difflcs.errors import CheckpointError
 
 pytest.importorskip("torchrl")
 from difflcs.rl import LCSRL, Epochs, Rollouts, Warmup, WarmupSettings, ppo_settings
-from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
 from difflcs.rl.policy import make_actor
 from difflcs.rl.ppo import PPO
-from difflcs.rl.state import copy_state, flatten
+from difflcs.rl.state import copy_state
 from tests.training.slide import (
     PENALTY,
     ROLLOUTS,
@@ -90,29 +85,6 @@ def test_episodes_of_both_phases_differ():
     assert len(set(flat)) == len(flat) == 8 + 2 * ROLLOUTS
 
 
-@pytest.mark.parametrize("models", [False, True])
-@pytest.mark.parametrize("after", [1, 3, 4])
-def test_phases_resume_bitwise(tmp_path, after, models):
-    """Interrupted in the warm-up, right between the phases, and in the main phase."""
-    through = make_lcsrl(models=models)
-    for _ in range(5):
-        through.step()
-    first = make_lcsrl(models=models)
-    for _ in range(after):
-        first.step()
-    save_checkpoint(tmp_path, first.iteration, first.state_dict())
-    second = make_lcsrl(models=models)
-    second.load(load_checkpoint(tmp_path))
-    assert second.iteration == after
-    for _ in range(5 - after):
-        second.step()
-    (a, rest), (b, other) = (flatten(trainer.state_dict()) for trainer in (through, second))
-    assert rest == other
-    assert a.keys() == b.keys()
-    for name, value in a.items():
-        assert torch.equal(value, b[name]), name
-
-
 def test_a_trainer_goes_back_to_a_phase():
     """A state of either phase can be loaded in either phase."""
     trainer = make_lcsrl()
@@ -129,16 +101,6 @@ def test_a_trainer_goes_back_to_a_phase():
     assert same(late, parameters(trainer))
 
 
-def test_phases_refuse_a_foreign_state():
-    trainer = make_lcsrl()
-    before = parameters(trainer)
-    for foreign in ({"episodes": 3}, {}, {**trainer.state_dict(), "phase": "other"}):
-        with pytest.raises(CheckpointError, match="another method"):
-            trainer.load(foreign)
-    assert same(before, parameters(trainer))
-    assert isinstance(trainer.current, Warmup)
-
-
 @pytest.mark.parametrize("steps", [0, 3])
 def test_load_refuses_hostile_states(refuses_hostile_checkpoints, steps):
     """In the warm-up, and in the main phase."""
@@ -146,17 +108,6 @@ def test_load_refuses_hostile_states(refuses_hostile_checkpoints, steps):
     for _ in range(steps):
         trainer.step()
     refuses_hostile_checkpoints(trainer)
-
-
-def test_global_generators_are_left_alone():
-    torch.manual_seed(7)
-    np.random.seed(7)  # noqa: NPY002  the global one is what this is about
-    before = torch.random.get_rng_state(), np.random.get_state()[1].tolist()  # noqa: NPY002
-    trainer = make_lcsrl(models=True)
-    for _ in range(5):
-        trainer.step()
-    assert torch.equal(before[0], torch.random.get_rng_state())
-    assert before[1] == np.random.get_state()[1].tolist()  # noqa: NPY002
 
 
 def test_the_main_phase_remembers_the_warm_up():

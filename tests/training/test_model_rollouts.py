@@ -11,14 +11,11 @@ from gymnasium import spaces
 pytest.importorskip("torchrl")
 from tensordict import TensorDict
 
-from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs.errors import InvalidInputError
 from difflcs.rl import EnsembleSettings, Epochs, ModelRollouts, ModelRolloutSettings
 from difflcs.rl.dynamics import Ensemble
 from difflcs.rl.model_rollouts import ModelEnv
 from difflcs.rl.rollout import collect, uniform_actions
-from difflcs.rl.seeding import Stream, episode_seeds
-from difflcs.rl.state import flatten, restore
-from difflcs.rl.tasks import get_task
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -230,36 +227,6 @@ def test_unstable_episodes_are_not_learned_from():
     assert torch.equal(rollouts.episodes["state"], real["state"][real["stable"]])
 
 
-def test_restored_goes_on_the_same():
-    first, second = make_rollouts(), make_rollouts()
-    first.add(episodes())
-    first.fit()
-    restore(second, first.state_dict())
-    assert len(second) == 6
-    for rollouts in (first, second):
-        rollouts.add(episodes(3, seed=9))
-        rollouts.fit()
-    (a, rest), (b, other) = (flatten(rollouts.state_dict()) for rollouts in (first, second))
-    assert rest == other
-    assert a.keys() == b.keys()
-    assert all(torch.equal(a[name], b[name]) for name in a)
-    np.testing.assert_array_equal(first.env.reset(seed=2)[0]["state"], second.env.reset(seed=2)[0]["state"])
-
-
-def test_restore_refuses_what_does_not_fit():
-    rollouts = make_rollouts()
-    rollouts.add(episodes())
-    other, state = make_rollouts(width=8), rollouts.state_dict()
-    with pytest.raises(CheckpointError, match="other settings"):
-        restore(other, state)
-    with pytest.raises(CheckpointError, match="goal"):
-        restore(rollouts, {**state, "episodes": {k: v for k, v in state["episodes"].items() if k != "goal"}})
-    with pytest.raises(CheckpointError, match="as many of each"):
-        restore(rollouts, {**state, "episodes": {**state["episodes"], "goal": state["episodes"]["goal"][:-1]}})
-    assert not len(other)
-    assert len(rollouts) == 6
-
-
 @pytest.mark.parametrize(
     "change",
     [
@@ -282,37 +249,3 @@ def test_bad_settings_are_refused(change):
 def test_bad_settings_of_the_ensemble_are_refused(change):
     with pytest.raises(InvalidInputError, match=next(iter(change))):
         EnsembleSettings(**change)
-
-
-# --- the tasks --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["cube", "turn_cube", "mug"])
-def test_outcomes_are_those_of_the_simulation(name, monkeypatch):
-    """In every step, the last one with its penalty; for tensors, as in model rollouts, and for arrays."""
-    pytest.importorskip("mujoco", reason="the extra [envs] is not installed")
-    monkeypatch.delenv("DIFFLCS_YCB_DIR", raising=False)
-    task = get_task(name)
-    env = task.make_envs(20)
-    seeds = episode_seeds(3, Stream.TRAINING, 0, 20)
-    seen = collect(env, uniform_actions(env, np.random.default_rng(0)), seeds, task.episode_steps)
-    env.close()
-    goals = seen["goal"].unsqueeze(1).expand(-1, task.episode_steps, -1)
-    ended = (torch.arange(1, task.episode_steps + 1) == task.episode_steps).expand(20, -1)
-    arguments = (seen["state"][:, :-1], seen["action"], seen["state"][:, 1:], goals, ended)
-    reward, success = task.outcome(*arguments)
-    torch.testing.assert_close(reward, seen["reward"], rtol=1e-9, atol=1e-12)
-    assert torch.equal(success[:, -1], seen["success"])
-    as_arrays, reached = task.outcome(*(part.numpy() for part in arguments))
-    np.testing.assert_array_equal(as_arrays, seen["reward"].numpy())
-    np.testing.assert_array_equal(reached, success.numpy())
-    one, _ = task.outcome(*(part[:, -1] for part in arguments[:-1]), True)  # one for all
-    torch.testing.assert_close(one, reward[:, -1], rtol=0, atol=0)
-    dense, _ = task.outcome(*arguments[:-1], torch.zeros_like(ended))
-    penalties = dense - reward
-    assert not bool(penalties[:, :-1].any())
-    torch.testing.assert_close(penalties[:, -1], task.failure_penalty * (~seen["success"]).double())
-    assert task.failure_penalty > 0
-    assert bool((~seen["success"]).any())
-    if name == "turn_cube":
-        assert bool(seen["success"].any())  # or the comparison says little

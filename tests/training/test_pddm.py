@@ -3,56 +3,22 @@
 import math
 from dataclasses import replace
 
-import gymnasium
-import numpy as np
 import pytest
 import torch
-from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 
-from difflcs import GoalCost, _files
-from difflcs.errors import CheckpointError, InvalidInputError
-from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
+from difflcs import GoalCost
+from difflcs.errors import InvalidInputError
 from difflcs.rl.dynamics import Ensemble, EnsembleSettings
 from difflcs.rl.evaluate import evaluate
 from difflcs.rl.pddm import PDDM, PDDMSettings, Planner
 from difflcs.rl.settings import Epochs, Rollouts
+from tests.training.slide import STEPS, U_MAX, Slide, make_envs
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-STEPS = 6
-U_MAX = 0.1
 NETWORKS = EnsembleSettings(networks=2, width=16, epochs=Epochs(20, 20, 16), learning_rate=1e-3)
 SMALL = PDDMSettings(rollouts=Rollouts(first=10, each=5), ensemble=NETWORKS, horizon=3, samples=80)
-
-
-class Slide(gymnasium.Env):
-    """x₊ = x + u."""
-
-    observation_space = spaces.Dict(
-        {"state": spaces.Box(-10.0, 10.0, (1,), np.float64), "goal": spaces.Box(-1.0, 1.0, (1,), np.float64)}
-    )
-    action_space = spaces.Box(-U_MAX, U_MAX, (1,), np.float64)
-
-    def __init__(self, breaks_at: int | None = None):
-        self.breaks_at = breaks_at
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.steps, self.state, self.goal = 0, np.zeros(1), self.np_random.uniform(-0.4, 0.4, 1)
-        return {"state": self.state.copy(), "goal": self.goal.copy()}, {}
-
-    def step(self, action):
-        self.state = self.state + np.asarray(action)
-        self.steps += 1
-        broken = self.steps == self.breaks_at
-        info = {"success": float(abs(self.state - self.goal)[0]) < 0.04, "physics_error": broken}
-        observation = {"state": self.state.copy(), "goal": self.goal.copy()}
-        return observation, 0.0, False, self.steps >= STEPS or broken, info
-
-
-def make_envs(count: int = 10, **kwargs) -> SyncVectorEnv:
-    return SyncVectorEnv([lambda: Slide(**kwargs)] * count)
 
 
 def make_cost() -> GoalCost:
@@ -60,16 +26,8 @@ def make_cost() -> GoalCost:
 
 
 def make_pddm(seed: int = 0, total: int = 25, env=None, **changes) -> PDDM:
-    env = make_envs() if env is None else env
+    env = make_envs(10) if env is None else env
     return PDDM(make_cost(), env, replace(SMALL, **changes), seed, total_episodes=total, episode_steps=STEPS)
-
-
-def parameters(trainer: PDDM) -> list[torch.Tensor]:
-    return [value.clone() for value in trainer.ensemble.state_dict().values()]
-
-
-def same(a: list[torch.Tensor], b: list[torch.Tensor]) -> bool:
-    return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
 
 
 def test_pddm_learns_to_reach():
@@ -214,51 +172,8 @@ def test_overflowing_predictions_do_not_spoil_the_plan():
     assert bool(torch.isfinite(action).all())
 
 
-def test_resumed_equals_uninterrupted_bitwise(tmp_path):
-    through = make_pddm()
-    for _ in range(4):
-        through.step()
-    first = make_pddm()
-    for _ in range(2):
-        first.step()
-    save_checkpoint(tmp_path, first.iteration, first.state_dict())
-    first.step()  # lost by the crash
-    second = make_pddm(seed=0)
-    torch.manual_seed(7)  # the global generator must not matter
-    second.load(load_checkpoint(tmp_path))
-    for _ in range(2):
-        second.step()
-    assert same(parameters(through), parameters(second))
-    assert torch.equal(through.buffer["state"], second.buffer["state"])
-
-
-def test_save_and_load(tmp_path):
-    trainer = make_pddm()
-    trainer.step()
-    trainer.ensemble.save_pretrained(tmp_path)
-    loaded = Ensemble.from_pretrained(tmp_path)
-    assert same(parameters(trainer), list(loaded.state_dict().values()))
-    config = {"n_x": 1, "n_u": 1, "networks": 2, "width": 8}  # of another width than the tensors
-    _files.save_record(tmp_path, "dynamics", config, trainer.ensemble.state_dict())
-    with pytest.raises(CheckpointError, match="expected an ensemble"):
-        Ensemble.from_pretrained(tmp_path)
-
-
 def test_restore_refuses_hostile_checkpoints(refuses_hostile_checkpoints):
     refuses_hostile_checkpoints(make_pddm())
-
-
-def test_restore_refuses_what_does_not_fit():
-    trainer = make_pddm()
-    trainer.step()
-    state = trainer.state_dict()
-    other = make_pddm(ensemble=replace(NETWORKS, width=8))
-    before = parameters(other)
-    with pytest.raises(CheckpointError, match="other settings"):
-        other.load(state)
-    with pytest.raises(CheckpointError, match="another method"):
-        trainer.load({"learned": state["learned"]})
-    assert same(before, parameters(other))
 
 
 def test_broken_episodes_are_dropped():
@@ -267,7 +182,7 @@ def test_broken_episodes_are_dropped():
     assert trainer.step().unstable == 1
     assert len(trainer.buffer) == 9
     with pytest.raises(InvalidInputError, match="stable simulation"):
-        make_pddm(env=make_envs(breaks_at=2)).step()
+        make_pddm(env=make_envs(10, breaks_at=2)).step()
 
 
 @pytest.mark.parametrize("change", [{"samples": 0}, {"kappa": 0.0}, {"filter": 1.5}, {"kappa": math.nan}])

@@ -1,8 +1,5 @@
 """PPO through the MPC, on a small pushing system that needs no simulator: the trainer, and parts handed to it."""
 
-import math
-
-import numpy as np
 import pytest
 import torch
 from gymnasium.vector import SyncVectorEnv
@@ -10,30 +7,21 @@ from gymnasium.vector import SyncVectorEnv
 from difflcs.errors import CheckpointError, InvalidInputError
 
 pytest.importorskip("torchrl")
-from difflcs.rl import Adam, CriticSettings, Epochs, Natural, ppo_settings
-from difflcs.rl.advantages import SAMPLES, Estimate, RewardScale
-from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
-from difflcs.rl.critic import Critic
+from difflcs.rl import CriticSettings, Epochs, Natural, ppo_settings
+from difflcs.rl.advantages import SAMPLES
 from difflcs.rl.evaluate import evaluate
 from difflcs.rl.mlp import MLPController
-from difflcs.rl.optim import StepSize, UpdateRule
-from difflcs.rl.optim.update import Deviation, learned_parameters
-from difflcs.rl.policy import make_actor
-from difflcs.rl.ppo import PPO, Source
 from difflcs.rl.rollout import elapsed_fractions
-from difflcs.rl.state import flatten
-from difflcs.rl.surrogate import Surrogate
 from tests.training.slide import (
     ROLLOUTS,
     STEPS,
     U_MAX,
+    Noting,
     Recording,
     Slide,
     features,
     make_envs,
-    make_model,
     make_models,
-    make_mpc,
     make_ppo,
     parameters,
     recorded,
@@ -70,60 +58,6 @@ def test_ppo_learns():
     assert reports[0].explained_variance > 0.3
     with pytest.raises(InvalidInputError, match="all of them are done"):
         trainer.step()
-
-
-class AboveAverage:
-    """An estimator of advantages without a value network: the rewards to come, less their mean over the episodes."""
-
-    def __init__(self):
-        self.episodes = 0
-
-    def __call__(self, episodes, inputs, rewards, key):
-        self.episodes += len(episodes)
-        to_come = rewards.flip(1).cumsum(1).flip(1)
-        samples = episodes["policy"].select(*SAMPLES).unsqueeze(-1)
-        samples["advantage"] = (to_come - to_come.mean(0)).unsqueeze(-1).unsqueeze(-1)
-        return Estimate(samples, torch.zeros_like(rewards), rewards)
-
-
-class SteepestDescent(UpdateRule):
-    """An update rule: steps of a given length along the gradient."""
-
-    def step(self, loss, scale):
-        gradients = torch.autograd.grad(loss, self.parameters, materialize_grads=True)
-        length = torch.cat([gradient.flatten() for gradient in gradients]).norm()
-        with torch.no_grad():
-            for p, gradient in zip(self.parameters, gradients, strict=True):
-                p -= scale * self.size.value / length * gradient
-        return True
-
-
-def test_parts_put_together_by_hand_learn():
-    """Nothing of PPO knows which estimator, rule or source it has been given."""
-    actor, env = make_actor(make_mpc(make_model()), 0.06), make_envs(40)
-    learned, estimator = learned_parameters(actor), AboveAverage()
-    rule = SteepestDescent(
-        learned, torch.optim.SGD(learned, 1.0), StepSize(0.05, 0.2, 1.0), Deviation(actor, 1.0, (0.9, 0.99), (1.0, 1.0))
-    )
-    trainer = PPO(
-        actor,
-        Source(env, estimator, steps=8, minibatch=None, value_epochs=1),
-        Critic(CriticSettings(width=4, epochs=Epochs(1, 1, 256)), 3, STEPS, 1.0, 1.0, (0,)),
-        Surrogate(actor, clip=0.3, outlier_kl=2.0, beta=1.0, violation=None),
-        rule,
-        RewardScale(3.0, 10.0, 0.1),
-        0,
-        features=features,
-        rollouts=40,
-        total_episodes=240,
-        episode_steps=STEPS,
-        max_kl=2.0,
-    )
-    before = evaluate(env, trainer.policy, 60, 0, STEPS).success_rate
-    while not trainer.done:
-        trainer.step()
-    assert evaluate(env, trainer.policy, 60, 0, STEPS).success_rate > before + 0.2
-    assert estimator.episodes == 240
 
 
 # --- data ---
@@ -223,18 +157,6 @@ class Watched(Recording):
 # --- steps ---
 
 
-class Noting(UpdateRule):
-    """A rule that notes what it is asked for, and moves nothing."""
-
-    def __init__(self, rule, answers=lambda: True):
-        super().__init__(rule.parameters, rule.optimiser, rule.size, rule.deviation)
-        self.seen, self.answers = [], answers
-
-    def step(self, loss, scale):
-        self.seen.append((float(loss.detach()), scale))
-        return self.answers()
-
-
 def test_an_iteration_ends_at_the_kl_limit():
     report = make_ppo(max_kl=1e-6).step()
     assert report.gradient_steps == 1
@@ -266,28 +188,6 @@ def test_steps_left_out_are_counted():
     assert (report.gradient_steps, report.skipped_steps) == (2, 3)
 
 
-def test_combined_loss():
-    """Eq. 7: β = 0 is the violation loss alone, which learns the true gain; β = 1 ignores it."""
-    gains = {}
-    for beta in (0.0, 0.5):
-        adam = Adam(learning_rate=0.02, betas=(0.9, 0.99))
-        options = {"steps": 50, "minibatch": None, "update": "adam", "adam": adam, "max_kl": 100.0}
-        trainer = make_ppo(iterations=2, beta=beta, std=0.1, **options)
-        while not trainer.done:
-            trainer.step()
-        gains[beta] = abs(float(trainer.learned.B.detach()) - 0.5)
-    assert gains[0.0] < 0.15 < abs(0.1 - 0.5)
-
-
-def test_a_learned_deviation_stays_within_its_range():
-    trainer = make_ppo(covariance="diagonal", std_learning_rate=0.5, std_range=(0.029, 0.031))
-    report = trainer.step()
-    std = float(trainer.actor.std)
-    assert report.std == pytest.approx(0.03)  # of the policy that collected
-    assert std != 0.03
-    assert 0.029 - 1e-12 <= std <= 0.031 + 1e-12
-
-
 def test_the_budget_is_met_exactly():
     settings = small_settings()
     for total in (ROLLOUTS - 5, 2 * ROLLOUTS + 1, 3 * ROLLOUTS):
@@ -312,59 +212,6 @@ def test_broken_episodes_are_dropped():
     assert all(bool(torch.isfinite(p).all()) for p in parameters(trainer))
     with pytest.raises(InvalidInputError, match="stable simulation"):
         make_ppo(env=make_envs(breaks_at=2)).step()
-
-
-def test_rewards_that_are_not_finite_are_refused():
-    with pytest.raises(InvalidInputError, match="finite rewards"):
-        make_ppo(env=make_envs(reward=math.nan)).step()
-
-
-def test_resumed_equals_uninterrupted_bitwise(tmp_path):
-    options = {"covariance": "diagonal", "beta": 0.7}
-    through = make_ppo(**options)
-    while not through.done:
-        through.step()
-    first = make_ppo(**options)
-    for _ in range(2):
-        first.step()
-    save_checkpoint(tmp_path, first.iteration, first.state_dict())
-    first.step()  # lost by the crash
-
-    second = make_ppo(**options)
-    second.load(load_checkpoint(tmp_path))
-    while not second.done:
-        second.step()
-    assert same(parameters(through), parameters(second))
-    (tensors, rest), (others, other_rest) = flatten(through.state_dict()), flatten(second.state_dict())
-    assert rest == other_rest
-    assert tensors.keys() == others.keys()
-    for name, value in tensors.items():
-        assert torch.equal(value, others[name]), name
-
-
-@pytest.mark.parametrize("changes", [{}, {"covariance": "full", "beta": 0.7}, {"update": "adam", "minibatch": 30}])
-def test_global_generators_neither_matter_nor_are_touched(changes):
-    """Neither PyTorch's nor NumPy's, from the first line to the last, in model rollouts too."""
-    runs = []
-    for seed in (7, 8):
-        torch.manual_seed(seed)
-        np.random.seed(seed)  # noqa: NPY002  the global one is what this is about
-        before = torch.random.get_rng_state(), np.random.get_state()[1].tolist()  # noqa: NPY002
-        trainer = make_ppo(models=make_models(iterations=1), **changes)
-        for _ in range(2):
-            trainer.step()
-        assert torch.equal(before[0], torch.random.get_rng_state())
-        assert before[1] == np.random.get_state()[1].tolist()  # noqa: NPY002
-        runs.append(parameters(trainer))
-    assert same(*runs)
-
-
-def test_seeds_differ_and_repeat():
-    runs = [make_ppo(seed) for seed in (0, 0, 1)]
-    for trainer in runs:
-        trainer.step()
-    assert same(parameters(runs[0]), parameters(runs[1]))
-    assert not same(parameters(runs[0]), parameters(runs[2]))
 
 
 @pytest.mark.parametrize("changes", [{}, {"update": "adam", "covariance": "full"}])

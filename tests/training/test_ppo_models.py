@@ -9,12 +9,9 @@ import torch
 from difflcs.errors import CheckpointError
 
 pytest.importorskip("torchrl")
-from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
 from difflcs.rl.evaluate import evaluate
-from difflcs.rl.optim import UpdateRule
 from difflcs.rl.rollout import collect, uniform_actions
-from difflcs.rl.state import flatten
-from tests.training.slide import ROLLOUTS, STEPS, make_envs, make_models, make_ppo, parameters, recorded, same
+from tests.training.slide import ROLLOUTS, STEPS, Noting, make_envs, make_models, make_ppo, parameters, recorded, same
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -58,18 +55,6 @@ def test_iterations_on_model_rollouts_come_before_each_real_one(iterations, reme
     assert counts == expected
 
 
-class Noting(UpdateRule):
-    """A rule that notes the factors on its steps, and moves nothing."""
-
-    def __init__(self, rule):
-        super().__init__(rule.parameters, rule.optimiser, rule.size, rule.deviation)
-        self.scales = []
-
-    def step(self, loss, scale):
-        self.scales.append(scale)
-        return True
-
-
 def test_steps_on_real_episodes_are_shorter_beside_model_rollouts():
     models = {"iterations": 2, "real_step": 0.25, "steps": 1}
     trainer = make_practising(models=models, final_step=1.0, steps=1)
@@ -78,7 +63,7 @@ def test_steps_on_real_episodes_are_shorter_beside_model_rollouts():
     trainer.update.size.adapt = lambda kl: setattr(trainer.update.size, "value", next(sizes))
     for _ in range(2):
         report = trainer.step()
-    assert trainer.update.scales == [0.25, 1.0, 1.0, 0.25]
+    assert [scale for _, scale in trainer.update.seen] == [0.25, 1.0, 1.0, 0.25]
     assert trainer.update.size.value == 3.0 == report.learning_rate
 
 
@@ -140,25 +125,6 @@ def test_without_real_episodes_models_only_shorten_the_first_step():
     for trainer in (alone, practising):
         trainer.step()
     assert same(parameters(alone), parameters(practising))
-
-
-def test_resumed_equals_uninterrupted_bitwise(tmp_path):
-    through = make_practising()
-    while not through.done:
-        through.step()
-    first = make_practising()
-    for _ in range(2):
-        first.step()
-    save_checkpoint(tmp_path, first.iteration, first.state_dict())
-    second = make_practising()
-    second.load(load_checkpoint(tmp_path))
-    while not second.done:
-        second.step()
-    (a, rest), (b, other) = (flatten(trainer.state_dict()) for trainer in (through, second))
-    assert rest == other
-    assert a.keys() == b.keys()
-    for name, value in a.items():
-        assert torch.equal(value, b[name]), name
 
 
 def test_load_refuses_hostile_states(refuses_hostile_checkpoints):

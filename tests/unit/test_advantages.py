@@ -17,7 +17,6 @@ from difflcs.rl.advantages import (
     GAEAdvantages,
     MultiActionAdvantages,
     RewardScale,
-    action_advantage,
     mirrored_actions,
     multi_action_advantages,
     returns,
@@ -174,67 +173,6 @@ def test_advantages_are_those_of_the_formula():
     torch.testing.assert_close(found, expected)
     immediate = multi_action_advantages(q, values, 0.9, 0.0)
     torch.testing.assert_close(immediate, q - q.mean(-1, keepdim=True))
-
-
-def test_the_gradient_is_that_of_gae_with_less_noise():
-    """x₊ = x + a, a ~ N(θ x, σ²), reward −x₊², and a V that is wrong: gradients of many episodes, by both."""
-    episodes, steps, std, gamma, zeta, count = 40000, 4, 0.4, 0.95, 0.8, 4
-    generator = torch.Generator().manual_seed(0)
-    x = torch.randn(episodes, generator=generator, dtype=torch.float64)
-    states, means, actions = [x], [], []
-    for _ in range(steps):
-        means.append(-0.3 * x)
-        actions.append(means[-1] + std * torch.randn(episodes, generator=generator, dtype=torch.float64))
-        x = x + actions[-1]
-        states.append(x)
-    state, mean, action = torch.stack(states, 1), torch.stack(means, 1), torch.stack(actions, 1)
-
-    def value(x, left):
-        return torch.where(left > 0, -0.7 * left * x.square() + 0.5 * x, 0.0)
-
-    left = torch.arange(steps, -1, -1, dtype=torch.float64)
-    values = value(state, left)
-    errors = -state[:, 1:].square() + gamma * values[:, 1:] - values[:, :-1]
-    advantage = torch.zeros(episodes, steps, dtype=torch.float64)
-    for t in range(steps):
-        advantage[:, t] = sum((gamma * zeta) ** k * errors[:, t + k] for k in range(steps - t))
-    score = state[:, :-1] * (action - mean) / std**2  # of θ
-    gae = (score * advantage).mean(1)
-
-    factor = torch.full((episodes, steps, 1, 1), std, dtype=torch.float64)
-    taken = {"action": action.unsqueeze(-1), "loc": mean.unsqueeze(-1), "scale_tril": factor}
-    with seeded((3,)):
-        judged = mirrored_actions(TensorDict(taken, [episodes, steps]), count)["action"].squeeze(-1)
-    after = state[:, :-1, None] + judged
-    q = -after.square() + gamma * value(after, left[1:, None])
-    scores = state[:, :-1, None] * (judged - mean.unsqueeze(-1)) / std**2
-    ahead = (scores * multi_action_advantages(q, values[:, :-1], gamma, zeta)).mean((1, 2))
-
-    difference = gae - ahead
-    assert float(difference.mean().abs()) < 4 * float(difference.std()) / episodes**0.5
-    assert float(ahead.mean().abs()) > 20 * float(difference.std()) / episodes**0.5
-    assert float(ahead.std()) < 0.6 * float(gae.std())
-
-
-def test_rewards_without_it_have_the_same_returns_with_less_noise():
-    """x₊ = x + a, reward −x₊², a V that is wrong: returns of many episodes from one state, with and without."""
-    episodes, steps, std, gamma, count = 20000, 4, 0.4, 0.95, 8
-    x = torch.full((episodes,), 0.7, dtype=torch.float64)
-    plain, without = torch.zeros(episodes, dtype=torch.float64), torch.zeros(episodes, dtype=torch.float64)
-    for t in range(steps):
-        taken = TensorDict({"loc": -0.3 * x.unsqueeze(-1)}, [episodes])
-        taken["scale_tril"] = torch.full((episodes, 1, 1), std, dtype=torch.float64)
-        with seeded((4, t)):
-            taken["action"] = taken["loc"] + std * torch.randn(episodes, 1, dtype=torch.float64)
-            after = x.unsqueeze(-1) + mirrored_actions(taken, count)["action"].squeeze(-1)
-        left = steps - 1 - t
-        q = -after.square() + gamma * (-0.7 * left * after.square() + 0.5 * after * (left > 0))
-        x = after[:, 0]
-        plain += gamma**t * -x.square()
-        without += gamma**t * (-x.square() - action_advantage(q))
-    difference = plain - without
-    assert float(difference.mean().abs()) < 4 * float(difference.std()) / episodes**0.5
-    assert float(without.std()) < 0.6 * float(plain.std())
 
 
 # --- in episodes whose alternatives are known ---

@@ -145,15 +145,6 @@ def test_one_file_of_the_environments_knows_the_library():
     assert set(packages_of(graph(functions=True), "difflcs_envs", "difflcs")) <= {"difflcs_envs.tasks"}
 
 
-def test_the_core_knows_no_training():
-    edges = graph(functions=False)
-    core = [module for module in edges if module.startswith("difflcs") and ".rl" not in module]
-    commands = ("difflcs.cli", "difflcs.cli_train", "difflcs.cli_models", "difflcs.__main__")
-    for module in core:
-        if module.split(".")[0] == "difflcs" and module not in commands:
-            assert not [target for target in edges[module] if target.startswith("difflcs.rl")], module
-
-
 @pytest.mark.parametrize("module", SOURCES)
 def test_files_and_classes_are_short(module):
     text = SOURCES[module].read_text()

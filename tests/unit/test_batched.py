@@ -101,15 +101,6 @@ def test_nearly_every_problem_is_solved(build, kind):
     assert solved >= 799
 
 
-def test_a_good_guess_saves_iterations(build):
-    x0, goal = data(build, 50)
-    mpc = pushing(build, 5)
-    cold = mpc(x0, goal)
-    warm = mpc(x0, goal, guess=cold)
-    assert float(warm.iterations.double().mean()) < 0.2 * float(cold.iterations.double().mean())
-    torch.testing.assert_close(warm.u, cold.u, rtol=0, atol=1e-8)
-
-
 def plans_and_gradient():
     """Objectives of some plans, and the size of their gradient."""
     g = torch.Generator().manual_seed(0)

@@ -60,12 +60,6 @@ def test_the_objective_of_a_plan_is_the_cost_of_the_paper_on_its_trajectory(buil
         assert float(solution.objective[i]) == pytest.approx(expected, rel=1e-10)
 
 
-def test_the_objective_of_a_quadratic_cost_is_its_value_on_the_trajectory(build):
-    cost = QuadraticCost(**build.cost_tensors(2), constant=torch.tensor(7.5, dtype=torch.float64))
-    solution = LCSMPCLayer(build.params(2), cost, 3, -0.2, 0.2, backend="ipopt")(0.2 * build.normal(2)(4))
-    assert float(solution.objective) == pytest.approx(evaluate(cost, solution.x, solution.u), rel=1e-12)
-
-
 def test_only_the_symmetric_parts_matter(build):
     tensors = build.cost_tensors(0)
     skew = build.normal(0)(4, 4)

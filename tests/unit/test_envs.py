@@ -87,12 +87,6 @@ def test_missing_mujoco_names_the_install_line():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_check_env():
-    env = gymnasium.make(ENV_ID)
-    check_env(env.unwrapped, skip_render_check=True)
-    env.close()
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("gl")
 @pytest.mark.skipif(has_display(), reason="would open a window for the mode 'human'")
@@ -133,12 +127,6 @@ def test_truncates_after_20_steps_and_never_terminates():
     assert [truncated for _, truncated in flags] == [False] * 19 + [True]
     with pytest.raises(gymnasium.error.ResetNeeded, match="reset"):
         env.step(REST)
-
-
-def test_horizon_is_an_argument_of_make():
-    env = gymnasium.make(ENV_ID, horizon=25)
-    env.reset(seed=0)
-    assert [env.step(REST)[3] for _ in range(25)] == [False] * 24 + [True]
 
 
 # --- reward and success ---------------------------------------------------------------------------
@@ -262,14 +250,6 @@ def test_same_seed_same_episode():
         np.testing.assert_array_equal(a, b)
 
 
-def test_same_seed_same_start_in_another_process():
-    code = "import gymnasium; print(gymnasium.make('difflcs_envs:{}').reset(seed=11)[0]['state'].tobytes().hex())"
-    output = subprocess.run(
-        [sys.executable, "-c", code.format(ENV_ID)], check=True, capture_output=True, text=True
-    ).stdout
-    assert output.strip() == TriFingerMoveCubeEnv().reset(seed=11)[0]["state"].tobytes().hex()
-
-
 @pytest.mark.parametrize(
     "clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deepcopy", "pickle"]
 )
@@ -382,7 +362,7 @@ def test_random_extreme_actions_stay_finite_and_in_the_observation_space():
 # --- controller -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("kp", "part"), [(1000.0, 0.83), (2500.0, 0.96)])
+@pytest.mark.parametrize(("kp", "part"), [(1000.0, 0.83), (2500.0, 0.96), (6000.0, 0.99)])
 def test_part_of_a_command_reached_in_one_step(kp, part):
     env = make(osc_kp=kp)
     start = env.reset(seed=0)[0]["state"][3:]
@@ -423,16 +403,6 @@ def test_controller_against_a_slow_reference():
         physics.controller.target = target.ravel().tolist()
         physics.controller.apply()
         np.testing.assert_allclose(physics.data.ctrl, reference_torques(physics, target), rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize("posture", [[0, 0, 0], [0, -0.8, 0], [0, -0.8, -1e-3], [np.pi / 2, 0, 0], [0.3, -1.2, 0]])
-def test_controller_is_finite_in_singular_postures(posture):
-    physics = make().physics
-    physics.data.qpos[7:] = np.tile(posture, 3)
-    mujoco.mj_forward(physics.model, physics.data)
-    physics.controller.target = (physics.data.site_xpos + 0.015).ravel().tolist()
-    physics.controller.apply()
-    assert np.all(np.abs(physics.data.ctrl) < 100)
 
 
 def test_kinematics_agree_with_mujoco():

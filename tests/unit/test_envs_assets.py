@@ -266,23 +266,6 @@ def test_answers_that_are_no_http(tmp_path, answer):
     assert {path.name for path in tmp_path.iterdir()} <= {ARCHIVE + ".part"}
 
 
-def test_random_answers(tmp_path):
-    """Seeded: an answer of a server with random damage is a mesh or a typed error."""
-    rng, content = random.Random(0), archive({MESH: box_stl()})
-    whole = OK + b"Content-Length: %d\r\nContent-Type: a/b\r\n\r\n" % len(content) + content
-    answers = []
-    for _ in range(40):
-        data = bytearray(whole)
-        for _ in range(rng.choice((1, 3, 10))):
-            data[rng.randrange(rng.choice((80, len(data))))] = rng.randrange(256)
-        answers.append([bytes(data[: rng.choice((len(data), rng.randrange(len(data))))])])
-    with raw_server(*answers) as url:
-        for i in range(12):
-            with contextlib.suppress(AssetError):
-                assets.download(["sugar_box"], tmp_path / str(i), url)
-            assert not list((tmp_path / str(i)).glob(".*"))
-
-
 def test_a_server_that_drips_is_given_up(tmp_path, monkeypatch):
     monkeypatch.setattr(assets, "MAX_SECONDS", 0.2)
 

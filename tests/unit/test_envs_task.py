@@ -13,7 +13,6 @@ pytest.importorskip("mujoco", reason="the environments need the extra [envs]")
 from difflcs_envs.trifinger.task import MOVE, TURN, MoveTask  # noqa: E402
 
 TASKS = {"move": MOVE, "turn": TURN, "other": MoveTask(0.5, 0.5, 0.1, tips_weight=1.5, yaw_weight=0.7)}
-ENVIRONMENTS = {"MoveCube": MOVE, "TurnCube": TURN}
 
 
 def transitions(shape, seed=0):
@@ -50,25 +49,6 @@ def test_tensors_agree_with_arrays(task, shape, ended):
     assert shape == () or task is TURN or 0 < success.sum() < success.size
 
 
-def test_a_batch_gives_the_bits_of_its_elements():
-    arrays = transitions((50,))
-    ends = np.arange(50) % 2 == 0
-    rewards, infos = MOVE.outcome(*arrays, ends)
-    for i in range(50):
-        reward, info = MOVE.outcome(*(array[i] for array in arrays), ends[i])
-        assert reward == rewards[i]
-        assert all(value == infos[name][i] for name, value in info.items())
-
-
-def test_the_reward_is_the_sum_of_its_terms_in_their_order():
-    reward, info = MOVE.outcome(*transitions((200,)), np.arange(200) % 3 == 0)
-    total = np.zeros(200)
-    for name in ("tips", "position", "yaw", "action", "completion"):
-        total = total + info[f"reward_{name}"]
-    np.testing.assert_array_equal(reward, total)
-    np.testing.assert_array_equal(info["reward_completion"] == -10.0, (np.arange(200) % 3 == 0) & ~info["success"])
-
-
 def test_the_reward_has_a_gradient_in_state_and_action():
     state, action, after, goal = tensors(transitions((6,)))
     state.requires_grad_()
@@ -88,24 +68,6 @@ def test_vmap():
     expected = MOVE.judge(*arrays, ends)
     torch.testing.assert_close(rewards, expected[0], rtol=1e-12, atol=1e-12)
     assert torch.equal(successes, expected[1])
-
-
-@pytest.mark.parametrize("name", ENVIRONMENTS)
-def test_the_environment_gives_what_its_task_says(name):
-    env = gymnasium.make(f"difflcs_envs:difflcs/TriFinger{name}-v0", reset_noise=0.1).unwrapped
-    assert env.task == ENVIRONMENTS[name]
-    rng = np.random.default_rng(0)
-    for seed in range(3):
-        before, _ = env.reset(seed=seed)
-        for _ in range(20):
-            after, reward, _, truncated, info = env.step(rng.uniform(-0.02, 0.02, 6))
-            step = before["state"], info["executed_action"], after["state"], before["goal"]
-            assert reward == env.task.judge(*step, truncated)[0]
-            for judged in (env.task.judge(*step, truncated), env.task.judge(*tensors(step), truncated)):
-                assert float(judged[0]) == pytest.approx(reward, abs=1e-12)
-                assert bool(judged[1]) is info["success"]
-            before = after
-        assert truncated
 
 
 def test_the_task_needs_no_torch():

@@ -11,8 +11,6 @@ import torch
 gymnasium = pytest.importorskip("gymnasium", reason="the environments need the extra [envs]")
 pytest.importorskip("mujoco", reason="the environments need the extra [envs]")
 
-from difflcs import LCSModel  # noqa: E402
-from difflcs.rl.evaluate import evaluate  # noqa: E402
 from difflcs.rl.tasks import get_task, task_names  # noqa: E402
 from difflcs_envs.tasks import MOVE, caption, contact_cost, pushing_cost, trifinger_task  # noqa: E402
 from difflcs_envs.ycb import YCB  # noqa: E402
@@ -51,43 +49,16 @@ def test_what_a_program_registers_itself_is_not_replaced_by_what_is_installed():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_sizes_bounds_and_times_are_those_of_the_environment(name):
+def test_its_step_and_its_names_are_those_of_the_environment(name):
+    """What else a task says, tests/conformance/test_tasks.py compares."""
     task = get_task(name)
     env = task.make_env()
-    inner = env.unwrapped
-    assert env.observation_space["state"].shape == (task.n_x,)
-    assert env.observation_space["goal"].shape == (task.n_goal,) == (len(task.goal),)
-    assert env.action_space.shape == (task.n_u,)
-    for bound, own in zip(task.bounds, (env.action_space.low, env.action_space.high), strict=True):
-        np.testing.assert_array_equal(bound, own)
-    assert (task.episode_steps, task.step_seconds) == (inner.horizon, inner.dt)
-    assert task.failure_penalty == inner.task.sparse_penalty
+    assert task.step_seconds == env.unwrapped.dt
     assert task.model_name == f"trifinger-{name.replace('_', '-')}"
-    assert task.summary.endswith(".")
     assert [q.name for q in task.goal] == ["x", "y", "yaw"]
-    for goal in task.example_goals:
-        observation, info = env.reset(seed=0, options={"goal": goal})
-        np.testing.assert_array_equal(observation["goal"], goal)
-        assert {q.name for q in task.errors} <= set(info)
-        assert task.say(info) == caption(info)
+    info = env.reset(seed=0)[1]
+    assert task.say(info) == caption(info)
     env.close()
-
-
-@pytest.mark.parametrize("name", FEW)
-def test_the_outcome_is_the_environments(name):
-    task = get_task(name)
-    env = task.make_env(reset_noise=0.1)
-    rng = np.random.default_rng(0)
-    before, _ = env.reset(seed=0)
-    for _ in range(task.episode_steps):
-        after, reward, _, truncated, info = env.step(rng.uniform(-0.02, 0.02, task.n_u))
-        step = before["state"], info["executed_action"], after["state"], before["goal"]
-        assert task.outcome(*step, truncated) == (reward, info["success"])
-        found, success = task.outcome(*map(torch.from_numpy, step), truncated)
-        assert float(found) == pytest.approx(reward, abs=1e-11)
-        assert bool(success) is info["success"]
-        before = after
-    assert truncated
 
 
 def random_tensors(count, task):
@@ -109,39 +80,6 @@ def test_the_reward_is_minus_the_stage_cost_of_the_mpc(name):
     arrays = task.outcome(*(part.numpy() for part in step), ended.numpy())
     np.testing.assert_allclose(reward, arrays[0], rtol=1e-12, atol=1e-12)
     np.testing.assert_array_equal(success, arrays[1])
-
-
-class Recorder(gymnasium.vector.VectorWrapper):
-    """Keeps the last transition of every environment."""
-
-    def reset(self, **kwargs):
-        observation, info = super().reset(**kwargs)
-        self.now = observation
-        return observation, info
-
-    def step(self, actions):
-        before = self.now
-        self.now, *rest = super().step(actions)
-        self.last = before["state"], rest[-1]["executed_action"], self.now["state"], before["goal"], rest[2]
-        return self.now, *rest
-
-
-def test_an_evaluation_counts_the_successes_of_the_outcome(one_thread):
-    task = get_task("cube")
-    envs = Recorder(task.make_envs(30, threads=1))
-    policy = task.make_policy(LCSModel.from_pretrained("trifinger-cube-violation"))  # reaches some goals, not all
-    found = evaluate(envs, policy, goals=30, seed=0, episode_steps=task.episode_steps)
-    assert 0 < found.successes < 30
-    assert envs.last[-1].all()
-    reward, success = task.outcome(*envs.last)
-    assert found.successes == success.sum()
-    assert found.median_errors["position_error"] == np.median(
-        envs.env.envs[0].task.errors(envs.last[2], envs.last[3])[0]
-    )
-    step = [torch.from_numpy(part) for part in envs.last]
-    assert int(task.outcome(*step)[1].sum()) == found.successes
-    assert ((reward < -9) == ~success).all()
-    envs.close()
 
 
 @pytest.mark.parametrize("name", FEW)

@@ -13,15 +13,6 @@ from difflcs.rl.seeding import Stream, episode_seeds
 from tests.training.pusher import STEPS, PusherEnv, Reach, make_envs
 
 
-@pytest.mark.parametrize(
-    ("successes", "trials", "low", "high"),
-    # Newcombe (1998), Table I, method 3.
-    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
-)
-def test_wilson_interval_known_values(successes, trials, low, high):
-    assert wilson_interval(successes, trials) == pytest.approx((low, high), abs=5e-5)
-
-
 def test_wilson_interval_equals_scipy():
     stats = pytest.importorskip("scipy.stats")
     for successes, trials in [(0, 1), (1, 1), (13, 300), (195, 300), (300, 300)]:

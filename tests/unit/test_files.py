@@ -167,40 +167,6 @@ def test_the_configuration_of_one_model_with_the_tensors_of_another_is_noticed(b
 
 
 @pytest.mark.parametrize(
-    "change",
-    [
-        {"n_x": 5},
-        {"n_x": -1},
-        {"n_x": "4"},
-        {"n_x": 4.0},
-        {"n_lam": True},
-        {"stiffness": -0.2},
-        {"stiffness": None},
-        {"dtype": "float16"},
-        {"dtype": ["float64"]},
-        {"learn_c": "no"},
-        {"extra": 1},
-    ],
-    ids=str,
-)
-def test_a_configuration_that_does_not_fit_is_refused(saved, change):
-    path = saved / "config.json"
-    header = json.loads(path.read_text())
-    header["config"].update(change)
-    path.write_text(json.dumps(header))
-    refuse(saved)
-
-
-@pytest.mark.parametrize("field", ["n_x", "stiffness", "dtype", "learn_c"])
-def test_a_configuration_with_a_field_missing_is_refused(saved, field):
-    path = saved / "config.json"
-    header = json.loads(path.read_text())
-    del header["config"][field]
-    path.write_text(json.dumps(header))
-    refuse(saved)
-
-
-@pytest.mark.parametrize(
     ("change", "match"),
     [
         ({"kind": "PDDM"}, "expected a record of kind 'LCSModel', got 'PDDM'"),

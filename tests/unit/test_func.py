@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import warnings
 
 import pytest
@@ -266,7 +264,7 @@ def test_a_gradient_inside_a_loss_is_refused_even_where_the_loss_is_linear(layer
         grad(lambda x: grad(lambda y: layer(y).objective)(x).sum())(x0[0])
 
 
-# --- in-place changes -----------------------------------------------------------------------------------------------
+# --- what would be wrong in silence ----------------------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # torch's own, in forward mode
@@ -301,31 +299,7 @@ def test_a_plan_is_measured_by_the_system_it_was_planned_with(layer, x0):
                 p.copy_(value)
 
 
-def test_inputs_changed_in_place_are_noticed(layer, x0):
-    leaf = x0.clone()
-    solution = layer(leaf)
-    leaf.add_(1.0)
-    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        solution.u.sum().backward()
-
-
-def test_outputs_changed_in_place_change_no_gradient(layer, x0):
-    leaf = x0.clone().requires_grad_()
-    (plain,) = torch.autograd.grad(layer(leaf).action.sum(), leaf)
-    solution = layer(leaf)
-    weight = solution.action.sum()
-    for value in (solution.x, solution.u, solution.lam, solution.status, solution.kkt_residual, solution.mu):
-        value.detach().zero_()
-    (found,) = torch.autograd.grad(weight, leaf)
-    assert torch.equal(found, plain)
-
-
 # --- torch.compile --------------------------------------------------------------------------------------------------
-
-
-def test_importing_the_library_does_not_import_the_compiler():
-    code = "import sys, difflcs; sys.exit('torch._dynamo' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 @pytest.mark.slow

@@ -191,19 +191,6 @@ def test_too_few_iterations_are_an_honest_failure(build, x0):
     assert set(error.value.status) == {Status.MAX_ITER}
 
 
-def test_too_few_iterations_are_masked(build, x0):
-    layer = make_layer(build, backend=IpoptBackend(max_iter=2, workers=1), on_failure="mask")
-    start = x0.clone().requires_grad_()
-    with pytest.warns(SolveWarning, match="9 of 9"):
-        solution = layer(start)
-    (solution.u.sum() + solution.objective.sum()).backward()
-    assert torch.equal(start.grad, torch.zeros(9, 4, dtype=torch.float64))
-    assert float(solution.u.detach().abs().max()) <= 0.15
-    assert bool(torch.isfinite(solution.x).all())
-    assert float(solution.dynamics_residual().max()) < 1e-8  # what is returned is a trajectory, even so
-    assert solution.iterations.tolist() == [2] * 9
-
-
 def test_a_limit_that_some_elements_meet_fails_the_others_only(build, x0):
     full = make_layer(build, backend=IpoptBackend(workers=1))(x0)
     limit = int(full.iterations.median())

@@ -61,19 +61,3 @@ def test_flat_adam_is_adamw():
         mine.step(torch.cat([p.grad.flatten() for p in twin.parameters()]), size)
     for a, b in zip(module.parameters(), twin.parameters(), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
-
-
-def test_flat_adam_goes_on_where_it_stopped():
-    """With what `load_state_dict` gave, of the module and of Adam."""
-    whole = nn.Linear(2, 2)
-    adam = FlatAdam(whole, 1e-4)
-    adam.step(drawn(6), 0.1)
-    other = nn.Linear(2, 2)
-    again = FlatAdam(other, 1e-4)
-    other.load_state_dict(whole.state_dict())
-    again.load_state_dict(adam.state_dict())
-    for one in (adam, again):
-        one.step(drawn(6, seed=1), 0.1)
-    assert torch.equal(whole.weight, other.weight)
-    assert torch.equal(whole.bias, other.bias)
-    assert again.steps == 2

@@ -1,98 +1,54 @@
 """PPO with a network instead of the MPC, on a small system that needs no simulator."""
 
 from dataclasses import replace
-from typing import Any
 
-import gymnasium
-import numpy as np
 import pytest
 import torch
-from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 
-from difflcs.errors import CheckpointError, InvalidInputError
-
 pytest.importorskip("torchrl")
-from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
 from difflcs.rl.critic import CriticSettings
 from difflcs.rl.evaluate import evaluate
 from difflcs.rl.methods import get_method
 from difflcs.rl.mlp import MLPController
 from difflcs.rl.policy import make_actor
-from difflcs.rl.ppo import PPO
-from difflcs.rl.ppo_settings import PPOSettings, make_ppo
-from difflcs.rl.rollout import collect, elapsed_fractions, mpc_actions
-from difflcs.rl.seeding import Stream, episode_seeds
+from difflcs.rl.ppo_settings import make_ppo
 from difflcs.rl.settings import Adam, Epochs
-from difflcs.rl.state import flatten
+from tests.training.slide import STEPS, U_MAX, Slide, features
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-STEPS = 6
-U_MAX = 0.1
 ROLLOUTS = 20
 BOUND = torch.full((1,), U_MAX, dtype=torch.float64)
-
-
-class Slide(gymnasium.Env):
-    """x₊ = x + ½u: six steps are just enough for the farthest goals."""
-
-    observation_space = spaces.Dict(
-        {"state": spaces.Box(-10.0, 10.0, (1,), np.float64), "goal": spaces.Box(-1.0, 1.0, (1,), np.float64)}
-    )
-    action_space = spaces.Box(-U_MAX, U_MAX, (1,), np.float64)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.steps, self.state, self.goal = 0, np.zeros(1), self.np_random.uniform(-0.3, 0.3, 1)
-        return {"state": self.state.copy(), "goal": self.goal.copy()}, {}
-
-    def step(self, action):
-        error = float(abs(self.state - self.goal)[0])
-        self.state = self.state + 0.5 * np.asarray(action)
-        self.steps += 1
-        success, last = float(abs(self.state - self.goal)[0]) < 0.05, self.steps >= STEPS
-        info = {"success": success, "reward_completion": -10.0 * (last and not success)}
-        reward = -20 * error + info["reward_completion"]
-        return {"state": self.state.copy(), "goal": self.goal.copy()}, reward, False, last, info
-
-
-def features(state, goal, elapsed):
-    return torch.cat([10 * (state - goal), 10 * (state - goal).abs(), elapsed.unsqueeze(-1)], -1)
 
 
 def make_network(width: int = 16, seed: int = 0) -> MLPController:
     return MLPController(features, 3, -BOUND, BOUND, width, STEPS, torch.Generator().manual_seed(seed))
 
 
-SETTINGS: PPOSettings = replace(
-    get_method("ppo-mlp")().ppo,
-    rollouts=ROLLOUTS,
-    steps=6,
-    minibatch=50,
-    std=0.03,
-    std_range=(0.01, 0.1),
-    critic=CriticSettings(epochs=Epochs(first=10, each=10, minibatch=256)),
-)
-
-
-def make_trainer(seed: int = 0, iterations: int = 3, width: int = 64, **changes: Any) -> PPO:
-    settings = replace(SETTINGS, **changes)
-    return make_ppo(
-        make_actor(make_network(width), settings.std, settings.covariance),
+@pytest.mark.slow
+def test_it_learns():
+    settings = replace(
+        get_method("ppo-mlp")().ppo,
+        rollouts=ROLLOUTS,
+        steps=30,
+        minibatch=50,
+        std=0.03,
+        std_range=(0.01, 0.1),
+        std_learning_rate=3e-3,
+        adam=Adam(3e-3, (0.9, 0.999)),
+        critic=CriticSettings(epochs=Epochs(first=10, each=10, minibatch=256)),
+    )
+    trainer = make_ppo(
+        make_actor(make_network(64), settings.std, settings.covariance),
         SyncVectorEnv([Slide] * ROLLOUTS),
         settings,
-        seed,
+        0,
         features=features,
-        total_episodes=iterations * ROLLOUTS,
+        total_episodes=12 * ROLLOUTS,
         episode_steps=STEPS,
         failure_penalty=10.0,
     )
-
-
-@pytest.mark.slow
-def test_it_learns():
-    trainer = make_trainer(iterations=12, steps=30, adam=Adam(3e-3, (0.9, 0.999)), std_learning_rate=3e-3)
     envs = trainer.robot.env
     before = evaluate(envs, trainer.policy, 60, 0, STEPS).success_rate
     while not trainer.done:
@@ -128,73 +84,3 @@ def test_it_starts_near_the_middle_of_the_bounds():
     network = MLPController(features, 3, low, low + 0.2)
     state = torch.randn(50, 1).double()
     torch.testing.assert_close(network(state, -state).action, (low + 0.1).expand(50, 2), rtol=0, atol=0.01)
-
-
-def test_training_and_evaluation_see_the_same_time():
-    """The actor gets the elapsed time with the data, the controller counts its steps: without noise they agree."""
-    trainer = make_trainer(std=1e-9)
-    seen = []
-    inner = trainer.robot.env.step
-    trainer.robot.env.step = lambda actions: (seen.append(actions.copy()), inner(actions))[1]
-    seeds = episode_seeds(0, Stream.TRAINING, 0, ROLLOUTS)
-    wanted = collect(SyncVectorEnv([Slide] * ROLLOUTS), mpc_actions(trainer.policy), seeds, STEPS)["action"]
-    trainer.step()
-    torch.testing.assert_close(torch.from_numpy(np.stack(seen, 1)), wanted, rtol=0, atol=1e-7)
-    elapsed = elapsed_fractions(STEPS)
-    torch.testing.assert_close(elapsed, torch.arange(STEPS + 1).double() / STEPS)
-    mean = torch.stack([make_network(64).mean(torch.zeros(1), torch.zeros(1), t) for t in elapsed])
-    assert len(set(mean.flatten().tolist())) == STEPS + 1  # it does depend on the time
-
-
-def test_the_initial_weights_are_the_generators():
-    state = torch.random.get_rng_state()
-    one, two, other = make_network(seed=0), make_network(seed=0), make_network(seed=1)
-    assert torch.equal(state, torch.random.get_rng_state())
-    assert torch.equal(one.layers[0].weight, two.layers[0].weight)
-    assert not torch.equal(one.layers[0].weight, other.layers[0].weight)
-
-
-def test_resumed_equals_uninterrupted_bitwise(tmp_path):
-    through = make_trainer()
-    while not through.done:
-        through.step()
-    first = make_trainer()
-    first.step()
-    save_checkpoint(tmp_path, first.iteration, first.state_dict())
-    second = make_trainer()
-    second.load(load_checkpoint(tmp_path))
-    torch.manual_seed(7)  # the global generator must not matter
-    while not second.done:
-        second.step()
-    (tensors, rest), (own, other) = flatten(through.state_dict()), flatten(second.state_dict())
-    assert rest == other
-    assert tensors.keys() == own.keys()
-    for name, value in tensors.items():
-        assert torch.equal(value, own[name]), name
-    with pytest.raises(CheckpointError, match="other settings"):
-        make_trainer(width=8).load(load_checkpoint(tmp_path))
-
-
-def test_saved_and_loaded(tmp_path):
-    network = make_network()
-    network.save_pretrained(tmp_path)
-    again = MLPController.from_pretrained(tmp_path, features)
-    state = torch.randn(5, 1).double()
-    assert torch.equal(network(state, -state).action, again(state, -state).action)
-    assert again.episode_steps == STEPS
-    (tmp_path / "config.json").unlink()
-    with pytest.raises(CheckpointError, match="missing"):
-        MLPController.from_pretrained(tmp_path, features)
-
-
-@pytest.mark.parametrize("change", [{"beta": 0.5}, {"update": "natural"}])
-def test_what_needs_an_lcs_is_refused(change):
-    with pytest.raises(InvalidInputError, match="without an LCS"):
-        make_trainer(**change)
-
-
-def test_settings():
-    with pytest.raises(InvalidInputError, match="width"):
-        get_method("ppo-mlp")(width=0)
-    with pytest.raises(InvalidInputError, match="rollouts"):
-        replace(SETTINGS, rollouts=0)

@@ -17,7 +17,6 @@ from difflcs import (
     ConstraintSequence,
     CostSequence,
     GoalCost,
-    LCSModel,
     LCSModule,
     LCSMPCLayer,
     LCSParams,
@@ -144,21 +143,6 @@ def test_goals_broadcast_with_states(build):
     assert one_goal.u.shape == (3, 1, 2, 6)
 
 
-def test_the_goals_gradient_matches_central_differences(build):
-    layer = LCSMPCLayer(build.pushing(), build.paper_cost(), 2, -0.015, 0.015, backend=SOLVER, relaxation=1e-3)
-    n, h = build.normal(2), 1e-7
-    x0, goal, direction, weight = 0.05 * n(6, 9), 0.05 * n(6, 3), n(6, 3), n(6, 2, 6)
-    leaf = goal.clone().requires_grad_()
-    solution = layer(x0, leaf)
-    (gradient,) = torch.autograd.grad((solution.u * weight).sum(), leaf)
-    above, below = (layer(x0, goal + s * h * direction, guess=solution).u for s in (1, -1))
-    quotient = (((above - below) / (2 * h)) * weight).sum((1, 2))
-    found = (gradient * direction).sum(1)
-    moved = quotient.abs() > 1e-4
-    assert int(moved.sum()) >= 3
-    assert float(((found - quotient).abs() / quotient.abs())[moved].median()) < 1e-4
-
-
 def test_float32_in_is_float32_out_solved_in_float64(build, x0):
     wide = make_layer(build)
     solution = wide(x0.float().requires_grad_())
@@ -194,20 +178,6 @@ def test_params_may_be_shared_or_one_per_element(build, x0):
     torch.testing.assert_close(solution.u[1, 2], shared.u[0], rtol=1e-6, atol=1e-8)
 
 
-def test_the_solution_certifies_itself(layer, x0):
-    solution = layer(x0)
-    assert bool(solution.converged.all())
-    assert torch.equal(solution.action, solution.u[:, 0])
-    assert torch.equal(solution.x[:, 0], x0)
-    assert float(solution.complementarity().max()) < 1e-10
-    assert float(solution.dynamics_residual().max()) < 1e-10
-    assert float(solution.kkt_residual.max()) < 1e-6
-    for info in (solution.status, solution.iterations, solution.kkt_residual, solution.solve_time):
-        assert not info.requires_grad
-    for value in (solution.x, solution.u, solution.lam, solution.objective):
-        assert value.requires_grad
-
-
 # --- warm start -----------------------------------------------------------------------------------------------------
 
 
@@ -219,14 +189,6 @@ def test_shift_drops_the_first_step_and_repeats_the_last(layer, x0):
         assert torch.equal(new[:, :-1], old[:, 1:])
         assert torch.equal(new[:, -1], old[:, -1])
         assert not new.requires_grad
-
-
-def test_a_receding_horizon_with_warm_starts_needs_fewer_iterations(layer, x0):
-    first = layer(x0)
-    x1 = first.x[:, 1].detach()
-    warm, cold = layer(x1, guess=first.shift()), layer(x1)
-    assert bool(warm.converged.all())
-    assert float(warm.iterations.double().sum()) < float(cold.iterations.double().sum())
 
 
 def test_a_guess_has_no_gradient_and_changes_none(layer, x0):
@@ -373,21 +335,6 @@ def test_backward_twice_through_a_retained_graph_is_the_same(layer, x0):
     first = torch.autograd.grad(solution.u.sum(), layer.lcs.A, retain_graph=True)[0]
     second = torch.autograd.grad(solution.u.sum(), layer.lcs.A)[0]
     assert torch.equal(first, second)
-
-
-@pytest.mark.slow
-def test_gradient_descent_through_the_layer_lowers_a_loss(build, x0):
-    target = make_layer(build)(x0).action
-    model = LCSModel.from_params(build.params(4))
-    layer = LCSMPCLayer(model, build.cost(3), 3, -0.15, 0.15, backend=SOLVER, relaxation=1e-3)
-    optimiser, losses = torch.optim.Adam(layer.parameters(), lr=0.02), []
-    for _ in range(15):
-        loss = (layer(x0).action - target).square().sum()
-        losses.append(float(loss.detach()))
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-    assert min(losses[-3:]) < 0.5 * losses[0]
 
 
 # --- failures -------------------------------------------------------------------------------------------------------
@@ -789,14 +736,6 @@ def test_copies_and_pickles_plan_the_same(build, layer, x0, copied, kind):
     assert twin.horizon == original.horizon
     assert twin.backend == original.backend
     assert set(twin.state_dict()) == set(original.state_dict())
-
-
-def test_state_dict_holds_the_model_and_the_cost(build, layer, x0):
-    assert {f"lcs.{k}" for k in "ABCdDEGHc"} <= set(layer.state_dict())
-    assert {"cost.Q", "cost.R", "cost.Q_final"} <= set(layer.state_dict())
-    other = LCSMPCLayer(build.model(seed=8), build.cost(5), 3, -0.15, 0.15, backend=SOLVER, relaxation=1e-4)
-    other.load_state_dict(layer.state_dict())
-    assert torch.equal(other(x0).u, layer(x0).u)
 
 
 def test_the_models_parameters_are_the_layers(layer):

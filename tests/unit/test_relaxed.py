@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import pickle
 import warnings
 
@@ -11,7 +10,7 @@ import pytest
 import torch
 
 from difflcs import LCSMPCLayer, LCSParams, QuadraticCost, Status, available_backends
-from difflcs.errors import BackendNotFoundError, DTypeError, InvalidInputError, SolveError, SolveWarning
+from difflcs.errors import DTypeError, InvalidInputError, SolveWarning
 from difflcs.mpc import MPCProblem, Primal
 from difflcs.mpc.backends import RelaxedBackend, get_backend
 
@@ -20,7 +19,6 @@ pytestmark = pytest.mark.skipif(
 )
 
 LCS, COST = ("A", "B", "C", "d", "D", "E", "F", "c"), ("Q", "R", "Q_final", "q", "r", "q_final")
-SHARED = (*LCS, *COST, "u_min", "u_max")
 
 
 def tensors(build, seed=0, batch=4, bound=0.15, **sizes):
@@ -131,14 +129,6 @@ def test_the_plan_does_not_depend_on_units(build):
     torch.testing.assert_close(solve(scaled).u / U, solve(t).u, rtol=1e-6, atol=1e-8)
 
 
-def test_shared_and_per_element_inputs_give_the_same(build):
-    t = tensors(build)
-    each = {k: v if k == "x0" else v.expand(4, *v.shape).clone() for k, v in t.items()}
-    shared, own = solve(t), solve(each)
-    torch.testing.assert_close(own.u, shared.u, rtol=1e-7, atol=1e-9)
-    torch.testing.assert_close(own.lam, shared.lam, rtol=1e-7, atol=1e-9)
-
-
 def test_bounds_of_the_actions_hold_with_a_barrier_too(build):
     t = without_contact(build, seed=3)
     mine, exact = solve(t, barrier=1e-3), solve(t, "batched", barrier=1e-3)
@@ -224,26 +214,6 @@ def test_singular_weights_have_finite_right_gradients(build):
     torch.testing.assert_close((leaf.grad * direction).sum(), (ahead - here) / h, rtol=1e-2, atol=1e-3)
 
 
-def test_shared_gradients_are_sums(build):
-    t = tensors(build)
-    shared = {k: v.clone().requires_grad_() for k, v in t.items()}
-    each = {k: (v if k == "x0" else v.expand(4, *v.shape)).clone().requires_grad_() for k, v in t.items()}
-    for leaves in (shared, each):
-        sol = solve(leaves)
-        (sol.u.sum() + sol.lam.sum() + sol.objective.sum()).backward()
-    for k in SHARED:
-        torch.testing.assert_close(shared[k].grad, each[k].grad.sum(0), rtol=1e-5, atol=1e-6, msg=lambda m, k=k: k + m)
-
-
-def test_float32_comes_back(build):
-    t = {k: v.float() for k, v in tensors(build).items()}
-    t["x0"].requires_grad_()
-    sol = solve(t)
-    assert sol.u.dtype == torch.float32
-    sol.u.sum().backward()
-    assert t["x0"].grad.dtype == torch.float32
-
-
 # --- failures -------------------------------------------------------------------------------------------------------
 
 
@@ -297,14 +267,6 @@ def test_a_failed_element_is_masked_and_spoils_nothing(build, fussy):
     assert float(leaves["x0"].grad[0].abs().max()) > 0
 
 
-def test_a_failed_element_is_raised_by_name(build, fussy):
-    t = tensors(build)
-    fussy()
-    t["x0"][1, 0] = 123.0
-    with pytest.raises(SolveError, match=r"1 of 4 MPC problems were not solved.*flat batch elements 1"):
-        solve(t)
-
-
 def test_numbers_beyond_the_solver_spoil_nothing(build):
     t = tensors(build)
     t["x0"][3, 1] = 1e300
@@ -323,13 +285,6 @@ def test_a_residual_beyond_the_tolerance_is_not_converged(build):
     with pytest.warns(SolveWarning, match="NUMERICAL"):
         sol = solve(tensors(build), RelaxedBackend(residual_tol=1e-300), on_failure="mask")
     assert not bool(sol.converged.any())
-
-
-def test_an_empty_batch(build):
-    t = {**tensors(build), "x0": torch.empty(0, 4, dtype=torch.float64, requires_grad=True)}
-    sol = solve(t)
-    assert sol.u.shape == (0, 3, 2)
-    sol.u.sum().backward()
 
 
 def no_contact(t):
@@ -363,18 +318,6 @@ def test_what_the_program_does_not_have_is_refused(build, calls, change, match):
     problem = MPCProblem(**{**t, **change(t)}, horizon=3, relaxation=1e-4)
     with pytest.raises(InvalidInputError, match=match + r".*; use backend='batched' or 'ipopt'"):
         RelaxedBackend().solve(problem, None)
-
-
-@pytest.mark.parametrize("package", ["cvxpy", "cvxpylayers"])
-def test_a_missing_package_is_named_with_its_pip_line(monkeypatch, package):
-    find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == package else find(name, *a))
-    assert "relaxed" not in available_backends()
-    for backend in ("relaxed", RelaxedBackend()):
-        with pytest.raises(
-            BackendNotFoundError, match=rf"'{package}' is not installed; run: pip install \"difflcs\[rel"
-        ):
-            get_backend(backend)
 
 
 def test_options_are_checked():

@@ -8,7 +8,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from difflcs import solve_lcp
 from difflcs.errors import InvalidInputError
 from difflcs.rl.rollout import collect, extended, mpc_actions, no_episodes, noisy_actions, transitions, uniform_actions
-from difflcs.rl.seeding import Stream, episode_seeds
+from difflcs.rl.seeding import episode_seeds
 from tests.training.pusher import STEPS, U_MAX, PusherEnv, Reach, make_envs, pusher
 
 
@@ -97,8 +97,3 @@ def test_an_environment_must_say_whether_it_succeeded():
 
     with pytest.raises(InvalidInputError, match="`success`"):
         collect(SyncVectorEnv([Silent]), mpc_actions(Reach()), [1], STEPS)
-
-
-def test_training_and_evaluation_share_no_episode():
-    assert not set(episode_seeds(0, Stream.TRAINING, 0, 1000)) & set(episode_seeds(0, Stream.EVALUATION, 0, 1000))
-    assert len(set(Stream)) == len(Stream.__members__)

@@ -198,19 +198,6 @@ def test_every_setting_says_what_it_is_and_has_bounds_where_it_is_a_number(kind)
             assert any(bound is not None for bound in f.metadata.values()), f"{kind.__name__}.{f.name} has no bounds"
 
 
-def test_there_are_few_of_them():
-    """Those of a group count once, wherever it is used: that is how many there are to learn."""
-    counted = set()
-    for kind in all_groups():
-        hints = get_type_hints(kind)
-        for f in fields(kind):
-            if not is_dataclass(hints[f.name]):
-                owner = next(base for base in reversed(kind.__mro__) if f.name in inspect.get_annotations(base))
-                counted.add((owner.__name__, f.name))
-    print(f"{len(counted)} settings")
-    assert len(counted) <= 75, sorted(counted)
-
-
 # --- the configuration of a training ----------------------------------------------------------------------------------
 
 

@@ -7,12 +7,11 @@ import pytest
 import torch
 
 pytest.importorskip("torchrl")
-from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs.errors import CheckpointError
 from difflcs.rl import Adam, Natural
 from difflcs.rl.optim import AdamUpdate, NaturalUpdate, StepSize
 from difflcs.rl.optim.update import Deviation
 from difflcs.rl.policy import make_actor
-from difflcs.rl.surrogate import Surrogate, gaussian_kl
 from tests.training.slide import drawn, make_model, make_mpc
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -120,20 +119,6 @@ def test_natural_update_takes_steps_of_its_size():
         assert float((move @ metric @ move).sqrt()) == pytest.approx(0.05 * scale)
 
 
-def test_the_kl_of_a_natural_step_is_its_length():
-    """A step of length l changes the policy by a KL divergence of ½ l²."""
-    actor, rule = make("natural", step=0.01, damping=0.1)
-    data = drawn(actor, 200)
-    rule.measure(data, np.random.default_rng(0))
-    samples = data.select("action", "action_log_prob").unsqueeze(-1)
-    samples["advantage"] = torch.randn(200, 1, 1, generator=torch.Generator().manual_seed(0)).double()
-    new = actor.solve(data.select(*actor.in_keys, "guess"))
-    surrogate = Surrogate(actor, 0.3, 10.0, 1.0, None)
-    rule.step(surrogate(new, data, gaussian_kl(data, new), samples, data, np.random.default_rng(0)), 1.0)
-    kl = gaussian_kl(data, actor.solve(data.select(*actor.in_keys, "guess")))
-    assert float(kl.mean()) == pytest.approx(0.5 * 0.01**2, rel=0.1)
-
-
 def test_the_metric_is_measured_with_some_of_the_samples():
     actor, rule = make("natural", samples=7)
     data, asked, jacobian = drawn(actor), [], actor.jacobian
@@ -227,11 +212,3 @@ def test_a_step_size_that_is_not_positive_is_refused(size):
     with pytest.raises(CheckpointError, match="positive step size"):
         rule.load_state_dict({**state, "step_size": size})
     assert rule.size.value == ADAM.learning_rate
-
-
-@pytest.mark.parametrize("kind", [AdamUpdate, NaturalUpdate])
-def test_a_fixed_model_is_refused(kind):
-    actor = make_actor(make_mpc(make_model().params().detach()), STD)
-    deviation = Deviation(actor, 0.01, (0.9, 0.99), (0.01, 0.05))
-    with pytest.raises(InvalidInputError, match="use an LCSModel"):
-        kind(actor, ADAM if kind is AdamUpdate else Natural(), 0.1, 1.5, deviation)

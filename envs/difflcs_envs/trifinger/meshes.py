@@ -77,12 +77,10 @@ class RestPose:
     Attributes:
         height: Height of the centre of mass [m].
         rotation: From the mesh frame to a frame with z up, (3, 3).
-        toppling_angle: Smallest tilt [rad] after which it falls over.
     """
 
     height: float
     rotation: np.ndarray
-    toppling_angle: float
 
 
 @dataclass(frozen=True)
@@ -237,7 +235,7 @@ def rest_poses(points: np.ndarray, center: np.ndarray) -> list[RestPose]:
         left &= normals @ down <= SAME_POSE
         angle = _toppling_angle(corners, down, height)
         if not poses or angle >= MIN_TOPPLING_ANGLE:  # the lowest pose always counts
-            poses.append(RestPose(height, _upright_rotation(corners, down), angle))
+            poses.append(RestPose(height, _upright_rotation(corners, down)))
     return poses
 
 
