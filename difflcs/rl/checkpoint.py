@@ -214,7 +214,7 @@ class RunDirectory:
         found = load_checkpoint(self.checkpoints).get("learned")
         if not isinstance(found, dict) or not all(isinstance(found.get(k), dict) for k in ("settings", "parameters")):
             raise CheckpointError(f"{self.checkpoints}: expected what was learned, got {_files.short(found)}")
-        return found["settings"], found["parameters"]
+        return found["settings"], found.get("plain", found["parameters"])
 
     def append(self, row: Mapping[str, object]) -> None:
         """Add one row to log.csv; None becomes an empty cell."""
