@@ -55,7 +55,8 @@ def plain_state(module: nn.Module) -> dict[str, Tensor]:
         hooked = [getattr(hook, "name", None) or hook._tensor_name for hook in _hooks(part)]
         parts = {f"{at}{name}_{end}" for name in hooked for end in ("orig", "mask", "g", "v", "u")}
         state = {k: v for k, v in state.items() if k not in parts and not k.startswith(f"{at}parametrizations.")}
-        made = [*hooked, *part._modules.get("parametrizations", ())]  # pyright: ignore[reportGeneralTypeIssues]
+        parametrised: Any = part._modules.get("parametrizations") or ()
+        made = [*hooked, *parametrised]
         state |= {at + name: getattr(part, name).detach() for name in made}
     return state
 

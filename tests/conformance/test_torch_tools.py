@@ -238,6 +238,7 @@ TWO = {"parametrize": enlarge, "prune": lambda part, name: prune.l1_unstructured
 @pytest.mark.parametrize(
     ("name", "tool"), [(name, tool) for name in FIELDS for tool in TWO if (name, tool) != ("weight", "prune")]
 )
+@pytest.mark.filterwarnings("ignore::difflcs.errors.DegenerateWarning")  # of an action that just touches its bound
 def test_costs_bounds_and_constraints_too(name, tool):
     staged, raw = name == "stages", nn.Parameter(FIELDS[name].clone())
     mpc, field = problem(FIELDS | {name: raw}, staged), "u_max" if staged else name
