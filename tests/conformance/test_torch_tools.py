@@ -27,6 +27,7 @@ from difflcs import (
 )
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.mpc import Primal
+from difflcs.physics import Circle, ContactLCS, PlanarPushing
 from difflcs.scales import ScaledLCS
 
 HORIZON, CHANGED = 3, ("A", "C", "G", "H")
@@ -254,6 +255,40 @@ def test_costs_bounds_and_constraints_too(name, tool):
             for _ in range(2):
                 torch.testing.assert_close(mpc(X, GOAL).u, wanted[0])
             raw.mul_(1.2)
+
+
+@pytest.mark.parametrize("tool", TWO)
+def test_parts_of_a_module_that_are_never_called(tool):
+    discs = [ContactLCS(PlanarPushing(Circle(0.1), 0.02, n_discs=2, friction=0.5), ("friction",)) for _ in range(2)]
+    changed, plain = (lcs.change for lcs in discs)
+    TWO[tool](changed, "friction")
+    (raw,) = changed.parameters()
+    x = torch.tensor([0.0, 0.0, 0.3, -0.13, 0.0, 0.01, 0.13]).double()
+    for _ in range(2):
+        with torch.no_grad():
+            raw.add_(torch.tensor([0.2, -0.1]))
+            plain.friction.copy_(matrix(changed, "friction"))
+        values = [violation_loss(lcs, x, draw(4), x + 0.01, "auto") for lcs in discs]
+        torch.testing.assert_close(*values)
+        found, expected = (torch.autograd.grad(v, p)[0] for v, p in zip(values, (raw, plain.friction), strict=True))
+        torch.testing.assert_close(found, expected * (matrix(changed, "friction") / raw).detach())
+
+
+def test_what_a_training_keeps_can_be_read(tmp_path):
+    pytest.importorskip("torchrl")
+    from difflcs.rl import dynamics, mlp, trainer
+
+    state = trainer.learned_state(make("prune"))
+    LCSModel.from_config(state["settings"], state["plain"], "checkpoint")
+    network = mlp.MLPController(lambda *_: X, 4, -torch.ones(2), torch.ones(2), 8, 10)
+    parametrizations.weight_norm(network.layers[0])
+    network.save_pretrained(tmp_path)
+    again = mlp.MLPController.from_pretrained(tmp_path, lambda *_: X)
+    torch.testing.assert_close(again.mean(X, GOAL, X[:, 0]), network.mean(X, GOAL, X[:, 0]))
+    ensemble = dynamics.Ensemble(4, 2, 2, 8)
+    prune.l1_unstructured(ensemble.weights, "0", 3)
+    with pytest.raises(InvalidInputError, match="ensemble: expected weights that are parameters"):
+        ensemble.fit(X, U, NEXT, epochs=1, minibatch=2, learning_rate=0.1, generator=torch.Generator())
 
 
 @pytest.mark.parametrize("name", ["C", "Q"])
