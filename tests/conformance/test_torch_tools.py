@@ -147,8 +147,6 @@ ENTRIES = {
 
 
 class Entry(nn.Module):
-    """Something of a model, for `functional_call`."""
-
     def __init__(self, model, function):
         super().__init__()
         self.model, self.function = model, function
@@ -182,10 +180,11 @@ def test_every_entry_point_has_the_value_and_gradient_of_the_matrices_as_they_ar
 @every_tool
 def test_jacobians_of_a_policy_are_those_of_its_actions(tool):
     model, data = make(tool), observed()
-    of = list(model.parameters())
+    of, policy = list(model.parameters()), policy_of(model)
     for _ in range(2):
-        policy = policy_of(model)
-        data["guess"] = policy.act(data)["plan"]
+        for _ in range(2):  # the second plan is made with what the first has prepared
+            torch.testing.assert_close(policy.act(observed())["loc"], layer(right(model))(X, GOAL).action.detach())
+        data["guess"] = policy.act(observed())["plan"]
         guess = Primal(*(data["guess"][name] for name in ("x", "u", "lam")))
         rows = layer(right(model))(X, GOAL, guess=guess).action.flatten()
         rows = [torch.autograd.grad(v, of, retain_graph=True, materialize_grads=True) for v in rows]
