@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from difflcs._checks import check_tensor, describe
 from difflcs._functorch import is_wrapped
+from difflcs._modules import fresh
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
 
 
@@ -29,6 +30,8 @@ class TensorFields(nn.Module):
 
     def _held(self, names: Iterable[str]) -> dict[str, Tensor]:
         """Some fields by their names; faster than one attribute after the other."""
+        if self._forward_pre_hooks:
+            fresh(self, tuple(names))
         held = {**self._buffers, **self._parameters}
         return {name: held[name] if name in held else getattr(self, name) for name in names}  # pyright: ignore
 

@@ -64,15 +64,19 @@ def refuse_tangents(tensors: Iterable[Tensor]) -> None:
 
 
 def runs_eagerly(function: Callable[P, R]) -> Callable[P, R]:
-    """A function that `torch.compile` leaves to Python: a break of the graph, and the result of eager code.
+    """A function whose numbers are those of eager code in its own precision, whatever runs around it.
 
-    `torch.compiler.disable` at import would import the compiler, which takes seconds.
+    `torch.compile` leaves it to Python: a break of the graph. `torch.compiler.disable` at import would import the
+    compiler, which takes seconds. And `torch.autocast` is off inside.
     """
 
     @functools.wraps(function)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
         if torch.compiler.is_compiling():
-            return torch.compiler.disable(function)(*args, **kwargs)  # pyright: ignore[reportCallIssue]
+            return torch.compiler.disable(wrapper)(*args, **kwargs)  # pyright: ignore[reportCallIssue]
+        if torch._C._is_any_autocast_enabled():
+            with torch._C._DisableAutocast():
+                return function(*args, **kwargs)
         return function(*args, **kwargs)
 
     return wrapper

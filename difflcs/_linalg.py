@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
+
+
+def product(left: Tensor, right: Tensor) -> Tensor:
+    """The product left @ right, float32 in float64: that `torch.autocast` leaves alone, also in a backward pass."""
+    return left @ right if left.dtype is torch.float64 else (left.double() @ right.double()).to(left.dtype)
 
 
 def matvec(matrix: Tensor, vector: Tensor) -> Tensor:
     """Matrix · vector for vectors (..., columns)."""
     # A shared matrix is one GEMM for the whole batch; a matrix per element is a batched product.
-    return vector @ matrix.mT if matrix.ndim == 2 else (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+    return product(vector, matrix.mT) if matrix.ndim == 2 else product(matrix, vector.unsqueeze(-1)).squeeze(-1)
 
 
 def quadratic(matrix: Tensor, vector: Tensor) -> Tensor:

@@ -40,7 +40,6 @@ class Transitions(Solver):
     """
 
     xi: float
-    refuse_large: bool
 
     name = "violation_loss"
     ranks = (2, 2, 2, 1, 2, 2, 2, 1, 1, 1, 1, 0)
@@ -51,7 +50,7 @@ class Transitions(Solver):
             for name, tensor in zip(_NAMES, tensors, strict=True):
                 check_tensor(name, tensor)
         A, B, C, d, D, E, F, c, x, u, x_next, gamma = _arrays(tensors)
-        check_gamma_range(F, gamma, self.refuse_large)
+        check_gamma_range(F, gamma)
         r = _dot(A, x) + _dot(B, u) + d - x_next
         e = _dot(D, x) + _dot(E, u) + c
         rate = gamma[..., None]
@@ -142,7 +141,7 @@ def largest_gamma(F: Tensor) -> Tensor:
     return AUTO * torch.linalg.eigvalsh(F + F.mT)[..., 0].amin()
 
 
-def check_gamma_range(F: np.ndarray, gamma: float | np.ndarray, refuse_large: bool) -> None:
+def check_gamma_range(F: np.ndarray, gamma: float | np.ndarray) -> None:
     """Refuse γ (...) outside its range for F (..., n, n), and F that is not positive definite."""
     n, gamma = F.shape[-1], np.asarray(gamma, np.float64)
     symmetric = F + _t(F)
@@ -171,10 +170,10 @@ def check_gamma_range(F: np.ndarray, gamma: float | np.ndarray, refuse_large: bo
     )
     # The bound itself is allowed; a relative 1e-9 forgives the rounding of the eigenvalue.
     refuse(
-        (gamma <= 0) | (refuse_large & (gamma > smallest * (1 + 1e-9))),
+        (gamma <= 0) | (gamma > smallest * (1 + 1e-9)),
         GammaError,
         "gamma: expected 0 < gamma <= sigma_min(F + F^T) = {:.6g}, got {:.6g}{where}; lower gamma, raise the model's "
-        "stiffness (sigma_min >= 2*stiffness), take gamma='auto', or pass check_gamma=False to keep a fixed gamma",
+        "stiffness (sigma_min >= 2*stiffness), or take gamma='auto'",
         smallest,
         gamma,
     )
@@ -198,7 +197,7 @@ def _definite(matrices: np.ndarray) -> bool:
 
 
 def minimise_over_orthant(Q: np.ndarray, q: np.ndarray, max_iter: int = 500) -> np.ndarray:
-    """Minimise ½ zᵀQz + qᵀz over z ≥ 0 for each row of q (B, m): exact for Q ≻ 0, else a stationary point.
+    """Minimise ½ zᵀQz + qᵀz over z ≥ 0 for each row of q (B, m), with Q ⪰ 0 up to its rounding.
 
     Q is (m, m), shared by all rows, or (B, m, m).
     """
@@ -216,8 +215,8 @@ def minimise_over_orthant(Q: np.ndarray, q: np.ndarray, max_iter: int = 500) -> 
         for part in (convex, ~convex):
             z[part] = minimise_over_orthant(Q[part], q[part], max_iter)
         return z * unit
-    # γ at or above its bound: Q is singular or indefinite. Proximal steps z ← argmin ½zᵀQz + qᵀz + ½ρ‖z − z₋‖²
-    # decrease the objective monotonically, and each is an LCP with a positive definite matrix.
+    # γ at its bound: Q is singular. Proximal steps z ← argmin ½zᵀQz + qᵀz + ½ρ‖z − z₋‖² decrease the objective
+    # monotonically, and each is an LCP with a positive definite matrix.
     rho = np.maximum(1e-6, -1.1 * smallest)
     proximal = Q + rho[..., None, None] * eye
     z = np.zeros_like(q)
@@ -227,7 +226,7 @@ def minimise_over_orthant(Q: np.ndarray, q: np.ndarray, max_iter: int = 500) -> 
         z = step
         if rho.max(initial=0.0) * change <= 1e-10 * np.abs(q).max(initial=0.0):
             return z * unit
-    return z * unit  # a descent from zero that has not settled; only an indefinite Q needs that many steps
+    return z * unit
 
 
 def _solved(Q: np.ndarray, q: np.ndarray) -> np.ndarray:

@@ -91,7 +91,7 @@ class StageBounds(TensorFields):
 
     def tensors(self) -> dict[str, Tensor]:
         """Name → tensor."""
-        return {"u_min": self.u_min, "u_max": self.u_max}
+        return self._held(("u_min", "u_max"))
 
 
 class _Constraints(TensorFields):
@@ -133,11 +133,11 @@ class _Constraints(TensorFields):
 
     def tensors(self) -> dict[str, Tensor]:
         """Name in a problem → tensor: G_x, g, price, and G_u where the actions count."""
-        fields = {inside: getattr(self, name) for name, inside in _NAMES.items()}
+        fields = {_NAMES[name]: value for name, value in self._held(_NAMES).items()}
         if fields["G_u"] is None:
             del fields["G_u"]
         if fields["price"] is None:
-            fields["price"] = self.g.new_full((self.n_c,), torch.inf)
+            fields["price"] = fields["g"].new_full((self.n_c,), torch.inf)
         return fields
 
     @property

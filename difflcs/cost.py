@@ -10,6 +10,7 @@ from torch import Tensor
 from difflcs._checks import check_number, check_positive_int, check_same_device, check_tensor, describe
 from difflcs._fields import TensorFields, check_by_stage, check_stages
 from difflcs._functorch import is_wrapped
+from difflcs._linalg import matvec, quadratic
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 
 # Number of the own dimensions of each field, behind those of the batch and of the stages.
@@ -295,12 +296,12 @@ class GoalCost(TensorFields):
     def at(self, goal: Tensor, horizon: int) -> dict[str, Tensor]:
         """The fields of the cost of one goal."""
         goal = self._goal("goal", goal, [])
-        weight = horizon * self.goal_stage + self.goal_final
+        to_q, to_q_final, stage, final = self.maps().values()
         return {
             **self.weights(),
-            "q": goal @ self.goal_to_q.mT,
-            "q_final": goal @ self.goal_to_q_final.mT,
-            "constant": 0.5 * (goal * (goal @ weight.mT)).sum(-1),
+            "q": matvec(to_q, goal),
+            "q_final": matvec(to_q_final, goal),
+            "constant": 0.5 * quadratic(horizon * stage + final, goal),
         }
 
     def along(self, reference: Tensor, horizon: int | None = None) -> dict[str, Tensor]:
@@ -312,13 +313,13 @@ class GoalCost(TensorFields):
                 f"reference: expected shape (..., H+1, n_goal={self.n_goal}) with H ≥ 1, got {tuple(reference.shape)}; "
                 f"give one goal for each state of the plan"
             )
-        stage, last = reference[..., :-1, :], reference[..., -1, :]
-        tracked = (stage * (stage @ self.goal_stage.mT)).sum((-1, -2))
+        to_q, to_q_final, stage, final = self.maps().values()
+        early, last = reference[..., :-1, :], reference[..., -1, :]
         return {
             **self.weights(),
-            "q": stage @ self.goal_to_q.mT,
-            "q_final": last @ self.goal_to_q_final.mT,
-            "constant": 0.5 * (tracked + (last * (last @ self.goal_final.mT)).sum(-1)),
+            "q": matvec(to_q, early),
+            "q_final": matvec(to_q_final, last),
+            "constant": 0.5 * (quadratic(stage, early).sum(-1) + quadratic(final, last)),
         }
 
     def weights(self) -> dict[str, Tensor]:
@@ -335,8 +336,8 @@ class GoalCost(TensorFields):
     def stage(self, x: Tensor, u: Tensor, goal: Tensor) -> Tensor:
         """The cost of one stage, its constant included: states (..., n_x), actions (..., n_u), goals (...) → (...)."""
         cost = self(goal, horizon=1)
-        quadratic = 0.5 * ((x @ cost.Q) * x).sum(-1) + 0.5 * ((u @ cost.R) * u).sum(-1)
-        return quadratic + (cost.q * x).sum(-1) + 0.5 * (goal * (goal @ self.goal_stage.mT)).sum(-1)
+        squares = quadratic(cost.Q, x) + quadratic(cost.R, u) + quadratic(self.maps()["goal_stage"], goal)
+        return 0.5 * squares + (cost.q * x).sum(-1)
 
     @classmethod
     def reach(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeGuard
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +20,8 @@ from difflcs._checks import (
     describe,
 )
 from difflcs._functorch import runs_eagerly, transforms_active
+from difflcs._linalg import product
+from difflcs._modules import fresh, plain_state, untouched
 from difflcs._recall import Recall
 from difflcs.constraints import check_bounds
 from difflcs.errors import BoundsError, CheckpointError, DTypeError, InvalidInputError, ShapeError
@@ -137,14 +140,20 @@ class LCSModel(nn.Module):
         return f"n_x={self.n_x}, n_u={self.n_u}, n_lam={self.n_lam}, stiffness={self.stiffness:g}"
 
     @property
+    @runs_eagerly
     def F(self) -> Tensor:
         """G Gᵀ + stiffness·I + H − Hᵀ, (n_lam, n_lam), differentiable."""
-        eye = torch.eye(self.n_lam, dtype=self.G.dtype, device=self.G.device)
-        return self.G @ self.G.mT + self.stiffness * eye + self.H - self.H.mT
+        if self._forward_pre_hooks:
+            fresh(self, self.parameter_names)
+        G, H = self.G, self.H  # once: a parametrisation may compute another one each time
+        eye = torch.eye(self.n_lam, dtype=G.dtype, device=G.device)
+        return product(G, G.mT) + self.stiffness * eye + H - H.mT
 
     @runs_eagerly
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
         """The system's matrices, differentiable with respect to the parameters; the same for all x and contexts."""
+        if self._forward_pre_hooks:
+            fresh(self, self.parameter_names)
         made_of: dict[str, Tensor] = self._parameters  # pyright: ignore[reportAssignmentType]
         if tuple(made_of) != self.parameter_names:  # attributes, one by one, would take 5 µs
             made_of = {name: getattr(self, name) for name in self.parameter_names}
@@ -235,12 +244,15 @@ class LCSModel(nn.Module):
 
     def config(self) -> dict[str, object]:
         """What is needed besides the parameters to build the model again (JSON types only)."""
+        with torch.enable_grad():
+            fresh(self, self.parameter_names)
+            learn_c = self.c.requires_grad
         return {
             "n_x": self.n_x,
             "n_u": self.n_u,
             "n_lam": self.n_lam,
             "stiffness": self.stiffness,
-            "learn_c": self.c.requires_grad,
+            "learn_c": learn_c,
             "dtype": str(self.A.dtype).removeprefix("torch."),
         }
 
@@ -278,14 +290,21 @@ class LCSModel(nn.Module):
         support = tensors.get("action_support")
         try:
             model = cls(n_x, n_u, n_lam, stiffness, learn_c=config["learn_c"], dtype=dtype, action_support=support)
+            model.load_state_dict(dict(tensors))
         except BoundsError as error:
             raise CheckpointError(f"{source}: its action support cannot be used: {error}") from error
-        model.load_state_dict(dict(tensors))
+        except RuntimeError as error:
+            raise CheckpointError(
+                f"{source}: expected a class with plain parameters, got {cls.__name__}: {error}; use LCSModel"
+            ) from error
         return model
 
     def save_pretrained(self, directory: str | os.PathLike[str]) -> None:
-        """Write `model.safetensors` and `config.json` into a directory, atomically (created if needed)."""
-        _files.save_record(Path(directory), "LCSModel", self.config(), self.state_dict())
+        """Write `model.safetensors` and `config.json` into a directory, atomically (created if needed).
+
+        Of a model that was parametrised, pruned or normalised by `torch.nn.utils` the matrices are written as they are.
+        """
+        _files.save_record(Path(directory), "LCSModel", self.config(), plain_state(self))
 
     @classmethod
     def from_pretrained(cls, source: str | os.PathLike[str]) -> LCSModel:
@@ -302,3 +321,8 @@ class LCSModel(nn.Module):
         directory = _zoo.resolve(source)
         config, tensors = _files.load_record(directory, "LCSModel")
         return cls.from_config(config, tensors, str(directory))
+
+
+def is_plain(lcs: object) -> TypeGuard[LCSModel]:
+    """Whether the matrices of an LCS are the parameters of an `LCSModel`: what reads them past `params` asks this."""
+    return type(lcs) is LCSModel and untouched(lcs)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, TypeGuard
+from typing import Literal
 
 import numpy as np
 import torch
@@ -13,7 +13,8 @@ from difflcs._functorch import is_wrapped, pull_back, runs_eagerly, solve, trans
 from difflcs._violation import Transitions, check_gamma_range, largest_gamma, minimise_over_orthant
 from difflcs.errors import DTypeError, GammaError, InvalidInputError
 from difflcs.lcp import MAX_ITER
-from difflcs.lcs import SYSTEM, LCSModel, LCSModule, LCSParams
+from difflcs.lcs import SYSTEM, LCSModel, LCSModule, LCSParams, is_plain
+from difflcs.records import system_at
 
 
 @runs_eagerly
@@ -27,7 +28,6 @@ def violation_loss(
     *,
     context: Tensor | None = None,
     reduction: str = "mean",
-    check_gamma: bool = True,
 ) -> Tensor:
     """The violation-based loss of an LCS (Eq. 2 of the paper; Jin et al.).
 
@@ -54,8 +54,6 @@ def violation_loss(
             loss grows with its square whatever ξ. `suggest_scales` finds such units.
         context: (..., n_context) passed on to the `params` of an `LCSModule`.
         reduction: "mean" over the batch, or "none" for one value each.
-        check_gamma: refuse γ > σ_min(F + Fᵀ). False lets a fixed γ through, as the prior work does; the inner QP may
-            then be non-convex, and a stationary point of it is used.
 
     Returns:
         Scalar, or (...,) with reduction="none"; differentiable in the parameters, x, u and x_next.
@@ -70,15 +68,18 @@ def violation_loss(
     check_number("xi", xi, strict=True)
     if not (isinstance(gamma, str) and gamma == "auto"):
         check_number("gamma", gamma)
-    if _has_the_models_params(lcs) and lcs.n_lam and not transforms_active():
-        F, factors = _contact_matrix(lcs)
+    if is_plain(lcs) and lcs.n_lam and not transforms_active():
+        # The loss passes the gradient of F to G and H itself: autograd would take 40 µs for the five small steps, of
+        # 190 µs for the loss of 100 transitions and its gradient.
+        with torch.no_grad():
+            F = lcs.F
         system = (lcs.A, lcs.B, lcs.C, lcs.d, lcs.D, lcs.E, F, lcs.c)
         batch = x.shape[:-1] if _plain(lcs, system, (x, u, x_next)) else None
         if batch is None:
             _check_numbers(lcs, system, (x, u, x_next))
             batch = broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1]), ("x_next", x_next.shape[:-1])])
             x, u, x_next = (v.expand(*batch, v.shape[-1]).reshape(-1, v.shape[-1]) for v in (x, u, x_next))
-        return _shared(lcs, system, (x, u, x_next), gamma, xi, check_gamma, reduction, batch, factors)
+        return _shared(lcs, system, (x, u, x_next), gamma, xi, reduction, batch, (lcs.G, lcs.H))
     params = _params(lcs, x, u, x_next, context)
     if not params.n_lam:
         return _prediction_loss(params, x, u, x_next, reduction)
@@ -87,12 +88,12 @@ def violation_loss(
     x, u, x_next = (v.expand(*batch, v.shape[-1]).reshape(count, v.shape[-1]) for v in (x, u, x_next))
     system = tuple(_for_each(v, batch, len(SYSTEM[name])) for name, v in params.tensors().items())
     if all(v.ndim == len(dims) for v, dims in zip(system, SYSTEM.values(), strict=True)) and not transforms_active():
-        return _shared(params, system, (x, u, x_next), gamma, xi, check_gamma, reduction, batch)
+        return _shared(params, system, (x, u, x_next), gamma, xi, reduction, batch)
     if isinstance(gamma, str):
         rate = largest_gamma(params.F)
     else:
         rate = torch.tensor(float(gamma), dtype=torch.float64, device=x.device)
-    loss = solve(Transitions(xi, check_gamma), *system, x, u, x_next, rate)[0]
+    loss = solve(Transitions(xi), *system, x, u, x_next, rate)[0]
     return _reduce(loss, batch, reduction)
 
 
@@ -149,7 +150,7 @@ def _params(lcs: LCSModule | LCSParams, x: Tensor, u: Tensor, x_next: Tensor, co
         params = lcs
     elif isinstance(lcs, LCSModule):
         check_tensor("x", x, [("n_x", lcs.n_x)])
-        params = lcs.params(x, context)
+        params = system_at(lcs, x, context)
         if not isinstance(params, LCSParams):
             raise DTypeError(
                 f"{type(lcs).__name__}.params: expected LCSParams for transitions, which have no stages, got "
@@ -175,17 +176,12 @@ def _for_each(value: Tensor, batch: torch.Size, rank: int) -> Tensor:
     return value if value.ndim == rank else value.expand(*batch, *own).reshape(batch.numel(), *own)
 
 
-def _has_the_models_params(lcs: object) -> TypeGuard[LCSModel]:
-    return isinstance(lcs, LCSModel) and type(lcs).params is LCSModel.params
-
-
 def _shared(
     lcs: LCSModel | LCSParams,
     system: tuple[Tensor, ...],
     data: tuple[Tensor, ...],
     gamma: float | str,
     xi: float,
-    check_gamma: bool,
     reduction: str,
     batch: torch.Size,
     factors: tuple[Tensor, ...] = (),
@@ -193,19 +189,8 @@ def _shared(
     """The loss with one system for all transitions, data (count, ·): in C++."""
     mean = reduction == "mean"
     rate = float(largest_gamma(system[6])) if isinstance(gamma, str) else gamma
-    loss = _ViolationLoss.apply(lcs, check_gamma, mean, rate, xi, *system, *data, *factors)
+    loss = _ViolationLoss.apply(lcs, mean, rate, xi, *system, *data, *factors)
     return loss if mean else loss.reshape(batch)  # pyright: ignore[reportReturnType, reportAttributeAccessIssue]
-
-
-def _contact_matrix(lcs: LCSModel) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """F, and G and H if it is their function as in `LCSModel`: the loss then passes its gradient to them itself.
-
-    Autograd would take 40 µs for the five small steps, of 190 µs for the loss of 100 transitions and its gradient.
-    """
-    if getattr(type(lcs), "F", None) is not LCSModel.F:
-        return lcs.F, ()
-    with torch.no_grad():
-        return lcs.F, (lcs.G, lcs.H)
 
 
 def _plain(lcs: LCSModel, system: tuple[Tensor, ...], data: tuple[Tensor, ...]) -> bool:
@@ -229,9 +214,7 @@ class _ViolationLoss(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(
-        ctx, lcs: LCSModel | LCSParams, refuse_large: bool, mean: bool, gamma: float, xi: float, *tensors: Tensor
-    ):
+    def forward(ctx, lcs: LCSModel | LCSParams, mean: bool, gamma: float, xi: float, *tensors: Tensor):
         from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 
         A, B, _, _, D, E, F, c, x, u, x_next = tensors[:11]
@@ -244,7 +227,7 @@ class _ViolationLoss(torch.autograd.Function):
         if held is None:
             # A number that is not finite, a γ at or above its bound, or an empty batch.
             _check_numbers(lcs, tensors[:8], (x, u, x_next))
-            check_gamma_range(F.detach().cpu().double().numpy(), gamma, refuse_large)
+            check_gamma_range(F.detach().cpu().double().numpy(), gamma)
             z = minimise_over_orthant(Q, q)
             held = _kernels.violation_value(arrays, gamma, xi, z, r, e, loss)
         if not held:
@@ -254,7 +237,7 @@ class _ViolationLoss(torch.autograd.Function):
             )
         ctx.mean, ctx.solution = mean, (arrays, gamma, xi, z, r, e)
         # The arrays look into these tensors; autograd refuses them where they were changed in place.
-        x_needs, u_needs = ctx.needs_input_grad[13:15]
+        x_needs, u_needs = ctx.needs_input_grad[12:14]
         ctx.save_for_backward(x, u, *tensors[11:12], *((A, B, D, E) if x_needs or u_needs else ()))
         value = torch.from_numpy(loss)
         # The mean of an empty batch is zero, not NaN: no data, no loss, no gradient.
@@ -273,14 +256,14 @@ class _ViolationLoss(torch.autograd.Function):
             upstream = np.full(len(z), upstream / max(len(z), 1))
         # Envelope theorem: derivative of the objective with z fixed. r and e are linear in every input.
         system = [np.empty(v.shape) for v in arrays[:8]]
-        needs = zip(arrays[8:], ctx.needs_input_grad[13:16], strict=True)
+        needs = zip(arrays[8:], ctx.needs_input_grad[12:15], strict=True)
         data = [np.empty(v.shape) if need else None for v, need in needs]
         _kernels.violation_gradient(arrays, gamma, xi, z, r, e, upstream, [*system, *data])
         gradients = [*system, *data]
-        if len(ctx.needs_input_grad) > 16:  # F = G Gᵀ + stiffness·I + H − Hᵀ
+        if len(ctx.needs_input_grad) > 15:  # F = G Gᵀ + stiffness·I + H − Hᵀ
             F_bar, G = system[6], rest[0].numpy(force=True)
             gradients += [(F_bar + F_bar.T) @ G, F_bar - F_bar.T]
-        return (None,) * 5 + tuple(g if g is None else torch.from_numpy(g).to(x) for g in gradients)
+        return (None,) * 4 + tuple(g if g is None else torch.from_numpy(g).to(x) for g in gradients)
 
 
 def _pull_back_transformed(ctx, upstream: Tensor):
@@ -292,9 +275,9 @@ def _pull_back_transformed(ctx, upstream: Tensor):
         upstream = (upstream / max(count, 1)).expand(count)
     tensors = [*(torch.from_numpy(v) for v in arrays), torch.tensor(gamma, dtype=torch.float64)]
     outputs = [torch.empty(count, dtype=torch.float64), *(torch.from_numpy(v) for v in (z, r, e))]
-    gradients = list(pull_back(Transitions(xi, False), tensors, outputs, [upstream], [True] * 12))[:11]
-    if len(ctx.needs_input_grad) > 16:  # F = G Gᵀ + stiffness·I + H − Hᵀ
+    gradients = list(pull_back(Transitions(xi), tensors, outputs, [upstream], [True] * 12))[:11]
+    if len(ctx.needs_input_grad) > 15:  # F = G Gᵀ + stiffness·I + H − Hᵀ
         F_bar = gradients[6]
         assert F_bar is not None
         gradients += [(F_bar + F_bar.mT) @ rest[0].detach().double(), F_bar - F_bar.mT]
-    return (None,) * 5 + tuple(g if g is None else g.to(x) for g in gradients)
+    return (None,) * 4 + tuple(g if g is None else g.to(x) for g in gradients)

@@ -20,6 +20,7 @@ from difflcs._checks import (
 )
 from difflcs._functorch import runs_eagerly
 from difflcs._linalg import matvec
+from difflcs._modules import fresh
 from difflcs.errors import BatchIndexError, DTypeError, InvalidInputError, ShapeError
 from difflcs.lcp import solve_lcp
 
@@ -376,6 +377,12 @@ class LCSModule(Protocol):
             what the module learns.
         """
         ...
+
+
+@runs_eagerly
+def system_at(lcs: LCSModule, x: Tensor | None, context: Tensor | None = None) -> LCSParams | LCSSequence:
+    """`lcs.params(x, context)`, for whoever was handed the module: with what `torch.nn.utils` has made of it."""
+    return fresh(lcs).params(x, context)
 
 
 def advance(system: SystemMatrices, x: Tensor, u: Tensor) -> LCSPrediction:

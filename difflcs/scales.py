@@ -9,8 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from difflcs._checks import broadcast_batch, check_same_device, check_tensor, describe
+from difflcs._linalg import matvec
 from difflcs.errors import InvalidInputError
-from difflcs.records import LCSModule, LCSParams, LCSSequence
+from difflcs.records import LCSModule, LCSParams, LCSSequence, system_at
 
 # In units in which states and actions are about one. From 0.001 to 0.1 made no difference to a block between two
 # fingers (prediction error within 7 %); from 1 on breaking the contact law is so cheap that it was not learned.
@@ -70,10 +71,10 @@ class Scales:
             A=A,
             B=S[:, None] * params.B / U,
             C=S[:, None] * params.C,
-            d=S * params.d + m - A @ m,
+            d=S * params.d + m - matvec(A, m),
             D=D,
             E=params.E / U,
-            c=params.c - D @ m,
+            c=params.c - matvec(D, m),
         )
 
 
@@ -158,5 +159,5 @@ class ScaledLCS(nn.Module):
 
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams | LCSSequence:
         """The system in the units of the data; the module within is asked with states in its own."""
-        inner = self.lcs.params(None if x is None else self.scales.states(x), context)
+        inner = system_at(self.lcs, None if x is None else self.scales.states(x), context)
         return self.scales.params(inner)

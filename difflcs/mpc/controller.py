@@ -21,6 +21,7 @@ from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSourc
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, NonFiniteError, ShapeError, SolveError
 from difflcs.lcs import LCSParams, LCSSequence
 from difflcs.mpc.controller_file import constant_system, controller_bytes
+from difflcs.records import system_at
 from difflcs.status import Status
 
 if TYPE_CHECKING:
@@ -210,7 +211,7 @@ class MPCController:
         if not np.isfinite(x).all() and self._native is not None:
             return  # the step will say so
         with torch.no_grad():
-            system = mpc.lcs.params(torch.from_numpy(x), context)  # pyright: ignore
+            system = system_at(mpc.lcs, torch.from_numpy(x), context)  # pyright: ignore
         if not isinstance(system, LCSParams | LCSSequence):
             raise DTypeError(f"lcs: expected LCSParams or LCSSequence from its params, got {describe(system)}")
         if self._native is None:

@@ -21,6 +21,7 @@ from difflcs.mpc import kkt
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.mpc.gather import Inputs
 from difflcs.mpc.problem import INPUTS, MPCProblem
+from difflcs.records import system_at
 from difflcs.scales import ScaledLCS
 
 if TYPE_CHECKING:
@@ -41,7 +42,8 @@ def constant_system(lcs: object) -> LCSParams | LCSSequence | None:
     while isinstance(inner, ScaledLCS):
         inner = inner.lcs
     with torch.no_grad():
-        return lcs.params().detach() if isinstance(inner, LCSModel) else None  # pyright: ignore
+        constant = isinstance(inner, LCSModel) and getattr(inner.params, "__func__", None) is LCSModel.params
+        return system_at(lcs, None).detach() if constant else None  # pyright: ignore
 
 
 def controller_bytes(mpc: LCSMPCLayer, system: LCSParams | LCSSequence, step_seconds: float = 0.0) -> bytes:

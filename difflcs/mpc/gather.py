@@ -15,6 +15,7 @@ from difflcs.errors import DTypeError, ShapeError
 from difflcs.lcs import SYSTEM, LCSModule, LCSParams, LCSSequence
 from difflcs.mpc.problem import INPUTS
 from difflcs.mpc.solution import MPCSolution, Primal
+from difflcs.records import system_at
 
 RANKS = {**{name: len(dims) for name, dims in INPUTS.items()}, "constant": 0}
 """Number of dimensions of each input of a call behind those of the batch and of the stages."""
@@ -97,7 +98,7 @@ class Inputs:
         else:
             if context is not None:
                 check_tensor("context", context)
-            system = lcs.params(x0, context)
+            system = system_at(lcs, x0, context)
             if not isinstance(system, LCSParams | LCSSequence):
                 raise DTypeError(
                     f"lcs: expected LCSParams or LCSSequence from {type(lcs).__name__}.params, got {describe(system)}; "

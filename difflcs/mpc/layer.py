@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor
 from difflcs._functorch import forward_mode_active, is_wrapped, refuse_tangents, runs_eagerly, transforms_active
+from difflcs._modules import fresh
 from difflcs.constraints import StageBounds, as_bound, check_bounds
 from difflcs.cost import CostSequence
 from difflcs.errors import BoundsError, DegenerateWarning, SolveError, SolveWarning
@@ -139,6 +140,8 @@ class LCSMPCLayer(nn.Module):
         Raises:
             BoundsError: the model's action support lies outside of u_min and u_max.
         """
+        if self._forward_pre_hooks:
+            fresh(self, ("u_min", "u_max"))
         if self.bounds is not None:
             return self.bounds.by_steps()
         support = getattr(self.lcs if system is None else system, "action_support", None)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from difflcs._checks import all_finite, check_tensor
 from difflcs._functorch import transforms_active
+from difflcs._modules import untouched
 from difflcs._recall import Snapshot, comparable
 from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds
 from difflcs.cost import CostSequence, GoalCost, QuadraticCost
@@ -162,11 +163,13 @@ def _is_double(value: object) -> TypeGuard[Tensor]:
 
 def _held_by(layer: LCSMPCLayer, system_given: bool) -> list[Mapping[str, object]] | None:
     """Where a layer and its parts hold what a plan is made of; None where not all of it can be found."""
+    if not untouched(layer):
+        return None
     found: list[Mapping[str, object]] = [layer._parameters, layer._buffers, layer._modules]
     for part in (None if system_given else layer.lcs, layer.cost, layer.bounds, layer.constraints):
         if type(part) in _RECORDS:
             found.append(vars(part))
-        elif type(part) in _MODULES and not any(isinstance(value, Tensor) for value in vars(part).values()):
+        elif type(part) in _MODULES and untouched(part):  # pyright: ignore[reportArgumentType]
             found += [part._parameters, part._buffers]  # pyright: ignore[reportAttributeAccessIssue, reportOptionalMemberAccess]
         elif part is not None:
             return None

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from difflcs._checks import describe
+from difflcs._functorch import runs_eagerly
+from difflcs._modules import fresh
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.physics.planar import PlanarPushing, PositionDrive
 from difflcs.physics.shapes import Circle, Polygon, Shape, Union
@@ -101,7 +103,7 @@ class ContactLCS(nn.Module):
     @property
     def physics(self) -> PlanarPushing:
         """The physics as it is now, differentiable in what is learned."""
-        guess, change = self.guess, self.change
+        guess, change = self.guess, fresh(self.change, self.learn)
         length = guess.length or 1.0
         values: dict[str, Any] = {name: getattr(guess, name) for name in ("center_of_mass", "gyration", "length")}
         values |= {
@@ -118,6 +120,7 @@ class ContactLCS(nn.Module):
             values["shape"] = _moved(guess.shape, iter(length * change["outline"]))
         return guess.replace(**values) if change else guess
 
+    @runs_eagerly
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
         """The system at states x (..., n_x); there is no context."""
         return self.physics.params(x, context)

@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import check_choice, check_number, check_tensor
-from difflcs._functorch import is_wrapped
+from difflcs._functorch import is_wrapped, runs_eagerly
 from difflcs._linalg import matvec
 from difflcs.errors import FrictionWarning, InvalidInputError, ShapeError
 from difflcs.records import LCSParams
@@ -82,6 +82,7 @@ def count_forces(n_contacts: int, n_tangents: int, cone: Cone = "anitescu") -> i
     return n_contacts * (2 * n_tangents if cone == "anitescu" else 2 * n_tangents + 2)
 
 
+@runs_eagerly
 def contact_lcs(
     contacts: Contacts,
     free: FreeMotion,

@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor, describe
+from difflcs._functorch import runs_eagerly
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 from difflcs.physics.contacts import Cone, Contacts, FreeMotion, contact_lcs, count_forces
 from difflcs.physics.shapes import Distance, Shape
@@ -275,6 +276,7 @@ class PlanarPushing:
         """The same with other values; what was not given follows from the shape, also from another one."""
         return replace(self, **{**vars(self)["defaults"], **values})
 
+    @runs_eagerly
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
         """The system at states x (..., n_x); there is no context.
 

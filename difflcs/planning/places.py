@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import check_number, check_positive_int, check_tensor
+from difflcs._linalg import product
 from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics.planar import to_body
 from difflcs.physics.shapes import Shape
@@ -85,7 +86,7 @@ class Workspace:
 
 def from_body(x: Tensor, points: Tensor) -> Tensor:
     """Points (..., 2) in coordinates of the body whose pose begins the state x (n_x,), in the plane."""
-    return points @ _rotation(x).mT + x[:2]
+    return product(points, _rotation(x).mT) + x[:2]
 
 
 def _rotation(x: Tensor) -> Tensor:

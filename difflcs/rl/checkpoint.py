@@ -212,9 +212,10 @@ class RunDirectory:
         if self.finished():
             return _files.load_record(self.model, kind)
         found = load_checkpoint(self.checkpoints).get("learned")
-        if not isinstance(found, dict) or not all(isinstance(found.get(k), dict) for k in ("settings", "parameters")):
+        tensors = "plain" if isinstance(found, dict) and "plain" in found else "parameters"
+        if not isinstance(found, dict) or not all(isinstance(found.get(k), dict) for k in ("settings", tensors)):
             raise CheckpointError(f"{self.checkpoints}: expected what was learned, got {_files.short(found)}")
-        return found["settings"], found["parameters"]
+        return found["settings"], found[tensors]
 
     def append(self, row: Mapping[str, object]) -> None:
         """Add one row to log.csv; None becomes an empty cell."""

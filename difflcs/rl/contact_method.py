@@ -23,6 +23,7 @@ from difflcs.lcs import LCSModule, LCSParams
 from difflcs.losses import violation_loss
 from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.backends import get_backend
+from difflcs.records import system_at
 from difflcs.rl.lcs_rl import LCSRL
 from difflcs.rl.learned import check_depends, check_module
 from difflcs.rl.methods import Method, Work, main_phase, register_method, short_main, short_models
@@ -96,7 +97,7 @@ def physics_loss(
     Returns:
         Scalar: half of the mean squared error in units of `scale`, or the mean violation loss in these units.
     """
-    system: Any = lcs.params(x, context)
+    system: Any = system_at(lcs, x, context)
     if settings.loss == "violation":
         return violation_loss(_in_units(system, scale), x / scale, u, x_next / scale, "auto", _XI)
     lam = solve_lcp(system.F, system.gap(x, u), relaxation=relaxation).lam

@@ -12,6 +12,7 @@ from torch import Tensor
 from difflcs._checks import check_positive_int, describe
 from difflcs.errors import DTypeError
 from difflcs.lcs import LCSModule, LCSParams
+from difflcs.records import system_at
 from difflcs.rl.rollout import Act
 
 Predict = Callable[..., Tensor]
@@ -23,7 +24,7 @@ def predicted_by(model: LCSModule | LCSParams) -> Predict:
 
     def predict(state: Tensor, action: Tensor, context: Tensor | None = None) -> Tensor:
         with torch.no_grad():
-            system = model if isinstance(model, LCSParams) else model.params(state, context)
+            system = model if isinstance(model, LCSParams) else system_at(model, state, context)
             if not isinstance(system, LCSParams):
                 raise DTypeError(f"model: expected a system for one step, LCSParams, got {describe(system)}")
             return system.step(state, action).x_next

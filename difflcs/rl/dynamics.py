@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from difflcs import _files
 from difflcs._checks import check_positive_int
+from difflcs._modules import plain_state, untouched
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.rl.least_squares import gradients
 from difflcs.rl.settings import MOST_NETWORKS, MOST_WIDTH, Epochs, Settings, bounded, group
@@ -168,6 +169,11 @@ class Ensemble(nn.Module):
         Returns:
             The mean loss of the last pass: squared error of the standardised changes.
         """
+        if not all(map(untouched, self.modules())):  # the gradients below are those of the weights themselves
+            raise InvalidInputError(
+                "ensemble: expected weights that are parameters, got some that torch.nn.utils computes; remove its "
+                "parametrisations and hooks before fitting"
+            )
         inputs, changes = torch.cat([x, u], -1).float(), (x_next - x).float()
         for name, data in (("input", inputs), ("change", changes)):
             getattr(self, f"{name}_mean").copy_(data.mean(0))
@@ -198,7 +204,7 @@ class Ensemble(nn.Module):
 
     def save_pretrained(self, directory: Path) -> None:
         """Write the ensemble into a directory, atomically."""
-        _files.save_record(Path(directory), _KIND, self.config(), self.state_dict())
+        _files.save_record(Path(directory), _KIND, self.config(), plain_state(self))
 
     @classmethod
     def from_pretrained(cls, directory: Path) -> Ensemble:

@@ -12,6 +12,7 @@ from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.lcs import SYSTEM, LCSModule, LCSParams, LCSSequence
 from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.solution import Primal
+from difflcs.records import system_at
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
@@ -105,8 +106,8 @@ def system_jacobian(
     """
     lcs: Any = mpc.lcs
     count, learned = len(state), [p for p in lcs.parameters() if p.requires_grad]
-    with torch.no_grad():
-        system = lcs.params(state, context)
+    with torch.enable_grad():
+        system = system_at(lcs, state, context)
     leaves = {name: _each(system, name, count).detach().clone().requires_grad_() for name in SYSTEM}
     action = mpc(state, goal, guess=guess, lcs=type(system)(**leaves)).action
     upstream = []  # of each component of the action: {name: (N, ...)}
@@ -114,32 +115,30 @@ def system_jacobian(
         found = torch.autograd.grad(component.sum(), list(leaves.values()), retain_graph=True, materialize_grads=True)
         upstream.append(found)
     weights = [torch.stack(parts, 1) for parts in zip(*upstream, strict=True)]  # of each matrix: (N, n_u, ...)
-    if system.batch_shape and sum(p.numel() for p in learned) <= FEW_PARAMETERS:
-        found = _push_forward(lcs, state, context, weights, learned)
+    if not system.batch_shape:
+        return _pull_back(system, weights, learned)
+    if sum(p.numel() for p in learned) <= FEW_PARAMETERS:
+        found = _push_forward(system, weights, learned)
         if found is not None:
             return found
-    size = _CHUNK if system.batch_shape else count
     rows = []
-    for first in range(0, count, size):
-        part = slice(first, first + size)
+    for first in range(0, count, _CHUNK):
+        part = slice(first, first + _CHUNK)
         with torch.enable_grad():
-            own = lcs.params(state[part], None if context is None else context[part])
+            own = system_at(lcs, state[part], None if context is None else context[part])
         rows.append(_pull_back(own, [w[part] for w in weights], learned))
     return torch.cat(rows)
 
 
-def _push_forward(
-    lcs: Any, state: Tensor, context: Tensor | None, weights: list[Tensor], learned: list[nn.Parameter]
-) -> Tensor | None:
+def _push_forward(system: LCSParams | LCSSequence, weights: list[Tensor], learned: list[nn.Parameter]) -> Tensor | None:
     """Gradients (N, n_u, ...) with respect to the matrices → (N, n_u, P) to the parameters, of which there are few.
 
     The pullback vᵀ ∂system/∂θ is linear in v; its derivative by v is the derivative of all systems by each parameter.
     None where the module has a function that cannot be differentiated twice: the pullback does not depend on v then.
     """
     with torch.enable_grad():
-        system = lcs.params(state, context)
         names = [name for name in SYSTEM if getattr(system, name).requires_grad]
-        fields = [_each(system, name, len(state)) for name in names]
+        fields = [_each(system, name, len(weights[0])) for name in names]
         if not fields:
             check_depends(weights[0])
         v = [torch.zeros_like(field, requires_grad=True) for field in fields]

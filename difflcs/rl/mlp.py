@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from difflcs import _files
 from difflcs._checks import check_positive_int
+from difflcs._modules import plain_state
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.rl.rollout import Plan, elapsed_fractions
 from difflcs.rl.tasks import Features, see
@@ -108,7 +109,7 @@ class MLPController(nn.Module):
 
     def save_pretrained(self, directory: Path) -> None:
         """Write the network into a directory, atomically. Its features are not: they are code."""
-        _files.save_record(Path(directory), _KIND, self.config(), self.state_dict())
+        _files.save_record(Path(directory), _KIND, self.config(), plain_state(self))
 
     @classmethod
     def from_pretrained(cls, directory: Path, features: Features) -> MLPController:

@@ -13,8 +13,10 @@ from torch.distributions import MultivariateNormal
 from torch.func import functional_call
 
 from difflcs._checks import check_choice, check_number, check_tensor, describe
+from difflcs._functorch import runs_eagerly
+from difflcs._modules import fresh
 from difflcs.errors import DTypeError, InvalidInputError, MissingDependencyError
-from difflcs.lcs import LCSModel, LCSModule, LCSParams, LCSSequence
+from difflcs.lcs import LCSModule, LCSParams, LCSSequence, is_plain
 from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.solution import Primal
 from difflcs.rl._optional import INSTALL
@@ -65,6 +67,8 @@ class GaussianParameters(TensorDictModuleBase):
 
     def scale_tril(self) -> Tensor:
         """L, (n_u, n_u)."""
+        if self._forward_pre_hooks:
+            fresh(self)
         unit = torch.eye(len(self.log_std), dtype=self.log_std.dtype) + self.mixing.tril(-1)
         return self.log_std.exp().unsqueeze(-1) * unit
 
@@ -260,6 +264,7 @@ class LCSMPCPolicy(GaussianPolicy):
         """The MPC."""
         return self.mpc
 
+    @runs_eagerly
     def jacobian(self, data: TensorDictBase) -> Tensor:
         """Jacobians of the mean with respect to what is learned of the LCS, in standard deviations.
 
@@ -273,12 +278,12 @@ class LCSMPCPolicy(GaussianPolicy):
             InvalidInputError, DTypeError: the LCS has none, or is no `torch.nn.Module`.
         """
         lcs = check_module(self.mpc.lcs, name="actor")
-        if not _is_plain(lcs):
+        if not is_plain(lcs):
             state, goal = (data[key] for key in self.in_keys)
             with quiet():
                 found = system_jacobian(self.mpc, state, goal, _guess(data), data.get(CONTEXT, None))
             return torch.linalg.solve_triangular(self.gaussian.scale_tril().detach(), found, upper=False)
-        # A copy of the LCS for each sample: their gradients are the samples' own.
+        # Parameters that are matrices may have batch dimensions. A copy for each sample has the gradient of its own.
         of_lcs = {id(p) for p in lcs.parameters()}
         learned = {name: p for name, p in self.gaussian.named_parameters() if id(p) in of_lcs and p.requires_grad}
         copies = {name: p.detach().expand(len(data), *p.shape).clone().requires_grad_() for name, p in learned.items()}
@@ -339,12 +344,6 @@ def make_actor(
     """The Gaussian around a controller: an `LCSMPCPolicy` or an `MLPPolicy`, see there."""
     kind = MLPPolicy if isinstance(controller, MLPController) else LCSMPCPolicy
     return kind(controller, std, covariance)  # pyright: ignore[reportArgumentType]
-
-
-def _is_plain(lcs: object) -> bool:
-    """Whether its matrices are its parameters as they are, so that those may have batch dimensions."""
-    own = ((getattr(type(lcs), name, None), getattr(LCSModel, name)) for name in ("params", "F"))
-    return isinstance(lcs, LCSModel) and all(mine is plain for mine, plain in own)
 
 
 def _std(value: float | Tensor, n_u: int) -> Tensor:

@@ -11,6 +11,8 @@ from torch import Tensor
 
 from difflcs import _files
 from difflcs._checks import check_positive_int
+from difflcs._modules import plain_state, untouched
+from difflcs.lcs import LCSModel
 from difflcs.rl.rollout import Policy
 from difflcs.rl.state import State, restore
 
@@ -85,7 +87,10 @@ class Trainer(ABC):
 
 def learned_state(learned: Learned) -> dict[str, Any]:
     """What was learned, as a part of a state."""
-    return {"settings": configuration(learned), "parameters": dict(learned.state_dict())}
+    state = {"settings": configuration(learned), "parameters": dict(learned.state_dict())}
+    if isinstance(learned, LCSModel) and not untouched(learned):
+        state["plain"] = plain_state(learned)  # for readers that cannot build it as it is
+    return state
 
 
 def configuration(learned: Learned) -> dict[str, Any]:

@@ -87,7 +87,7 @@ works = {
     "batched": lambda: plan(BatchedBackend(threads=2)),
     "lcp": lambda: solve_lcp(F, q),
     "relaxed lcp": lambda: solve_lcp(F, q, 1e-5),
-    "violation_loss": lambda: [violation_loss(model, x, u, x, check_gamma=False, gamma=1e-3) for _ in range(100)],
+    "violation_loss": lambda: [violation_loss(model, x, u, x, gamma=1e-3) for _ in range(100)],
     "ipopt": lambda: plan(IpoptBackend(workers=1)),
 }
 import casadi  # of ipopt; what is interrupted is to be the work

@@ -257,28 +257,18 @@ def test_gamma_above_the_bound_of_one_transition_names_it(each, data):
         violation_loss(each, *data, gamma)
     for part in (f"{float(bounds[worst]):.6g}", f"{gamma:.6g} at batch index {worst}", "gamma='auto'"):
         assert part in str(error.value)
-    loss = violation_loss(each, *data, gamma, check_gamma=False, reduction="none")
     fine = [i for i in range(COUNT) if i != worst]
-    alone = violation_loss(each[fine], *(v[fine] for v in data), gamma, reduction="none")
-    torch.testing.assert_close(loss[fine], alone, rtol=1e-9, atol=1e-12)
+    assert bool(torch.isfinite(violation_loss(each[fine], *(v[fine] for v in data), gamma)))
 
 
-@pytest.mark.parametrize("factor", [1.0, 1.5, 20.0])
-def test_a_fixed_gamma_is_let_through_for_every_transition_on_request(each, data, factor):
-    gamma = factor * float(sigma(each.F).max())
-    params = learnable(each)
-    loss = violation_loss(params, *data, gamma, check_gamma=False, reduction="none")
-    assert bool(torch.isfinite(loss).all())
-    one_by_one = [violation_loss(each[i], *(v[i] for v in data), gamma, check_gamma=False) for i in range(COUNT)]
-    torch.testing.assert_close(loss.detach(), torch.stack(one_by_one), rtol=1e-5, atol=1e-8)
-    loss.sum().backward()
-    assert all(bool(torch.isfinite(v.grad).all()) for v in params.tensors().values())
-
-
-def test_gamma_zero_is_refused_for_systems_too(each, data):
-    for check in (True, False):
-        with pytest.raises(GammaError, match="0 < gamma"):
-            violation_loss(each, *data, 0.0, check_gamma=check)
+def test_gamma_at_the_bound_of_one_transition_and_zero(each, data):
+    worst = int(sigma(each.F).argmin())
+    gamma = float(sigma(each.F)[worst])
+    found = violation_loss(each, *data, gamma, reduction="none")
+    one = violation_loss(each[worst], *(v[worst] for v in data), gamma)  # by itself
+    torch.testing.assert_close(found[worst], one, rtol=1e-5, atol=1e-8)
+    with pytest.raises(GammaError, match="0 < gamma"):
+        violation_loss(each, *data, 0.0)
 
 
 def test_a_gamma_that_double_precision_cannot_resolve_is_refused(each, data):

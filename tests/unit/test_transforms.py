@@ -214,7 +214,6 @@ class Loss(torch.nn.Module):
 LOSSES = {
     "violation": (violation_loss, {"gamma": 0.1, "xi": 0.3}),
     "auto": (violation_loss, {"gamma": "auto", "xi": 0.3}),
-    "fixed": (violation_loss, {"gamma": 5.0, "xi": 0.3, "check_gamma": False}),
     "prediction": (prediction_loss, {}),
 }
 
