@@ -89,22 +89,19 @@ class RelaxedLcp {
     if constexpr (kPivot) polish(lam_out, w_out, eps, skip);
   }
 
-  // From eps = 1 down to `target`. Returns the lanes that converged and counts their iterations; `bound` is scratch.
-  template <class Halted>
-  DIFFLCS_INLINE Mask follow(Vec* lam_out, Vec* w_out, Vec* bound, Vec target, int64_t max_iter, Mask& iterations,
-                             Halted halted) {
+  // From eps = 1 down to `target`. Returns the lanes that converged; `bound` is scratch.
+  DIFFLCS_INLINE Mask follow(Vec* lam_out, Vec* w_out, Vec* bound, Vec target, int64_t max_iter) {
     const int64_t n = size();
     Vec eps = max(target, all(1)), smallest = all(1e300);  // smallest residual met at the target
     Mask solved = Mask{};
     int stalled[kLanes] = {};
     for (int64_t i = 0; i < n; i++) lam[i] = sqrt(eps);
-    for (int64_t it = 0; it < max_iter && !halted(); it++) {
+    for (int64_t it = 0; it < max_iter; it++) {
       refresh(eps, bound);
       const Vec residual = sqrt(merit);
       const Mask at_target = eps <= target;
       for (int l = 0; l < kLanes; l++) {
         if (solved[l]) continue;
-        iterations[l]++;
         // Converged at 1e-14, or at the level where rounding stops progress, if that is below 1e-10.
         if (at_target[l]) {
           if (residual[l] <= 1e-14 * magnitude[l])
