@@ -44,7 +44,7 @@ def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0, time_limit: float |
 
     Exact problems go through block principal pivoting, where that fails through an interior-point method that finds the
     set of positive λ, with Murty's finite rule as the last resort; relaxed ones, λ ∘ (F λ + q) = relaxation, through
-    damped Newton on the Chen–Harker–Kanzow–Smale function, from n = 33 on and where that fails through the
+    damped Newton on the Chen–Harker–Kanzow–Smale function, from n = 128 on and where that fails through the
     interior-point method. Large problems and fallbacks eliminate with row exchanges, which a dominant skew part needs.
 
     CONVERGED is a certificate, recomputed from the λ and w that are returned: λ, w ≥ 0; λᵢwᵢ is 0, or the relaxation;

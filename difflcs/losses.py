@@ -67,9 +67,9 @@ def violation_loss(
         ShapeError, DTypeError, DeviceError, NonFiniteError, InvalidInputError: the arguments do not fit.
     """
     check_choice("reduction", reduction, ("mean", "none"))
-    check_number("xi", xi, strict=True)
+    xi = check_number("xi", xi, strict=True)
     if not (isinstance(gamma, str) and gamma == "auto"):
-        check_number("gamma", gamma)
+        gamma = check_number("gamma", gamma)
     if _has_the_models_params(lcs) and lcs.n_lam and not transforms_active():
         F, factors = _contact_matrix(lcs)
         system = (lcs.A, lcs.B, lcs.C, lcs.d, lcs.D, lcs.E, F, lcs.c)

@@ -68,6 +68,11 @@ class SystemMatrices:
         return gap if lam is None else gap + matvec(self.F, lam)
 
 
+def _version(tensor: Tensor) -> int:
+    """How often a tensor was changed in place, where torch counts it."""
+    return 0 if tensor.is_inference() else tensor._version
+
+
 # Name → kinds of its dimensions, in the order of every list of these matrices.
 SYSTEM = dimensions(SystemMatrices)
 
@@ -115,12 +120,18 @@ class _Record(SystemMatrices):
                 )
         self.batch_shape  # noqa: B018  raises where the batch dimensions do not fit each other
         check_positive_definite(self.F)
+        vars(self)["_version"] = _version(self.F)
+
+    def check_again(self) -> None:
+        """Refuse F if it was changed in place since it was checked, and is no longer positive definite."""
+        if vars(self).get("_version") != _version(self.F):
+            check_positive_definite(self.F)
 
     @classmethod
     def of_checked(cls, tensors: Mapping[str, Tensor]) -> Self:
         """A record of tensors that have been checked, all of them and together; nothing is checked here."""
         record = object.__new__(cls)
-        vars(record).update(tensors)
+        vars(record).update(tensors, _version=_version(tensors["F"]))
         return record
 
     def _own(self, name: str) -> int:
@@ -313,7 +324,7 @@ class LCSSequence(_Record):
 
     def stage(self, k: int) -> LCSParams:
         """The system of stage k, 0 ≤ k < H; negative ones count from the end."""
-        check_integer("k", k)
+        k = check_integer("k", k)
         if not -self.horizon <= k < self.horizon:
             raise BatchIndexError(f"k: expected a stage of 0 … {self.horizon - 1}, got {k}; choose another")
         return LCSParams(**{n: v.select(v.ndim - self._own(n), k) for n, v in self.tensors().items()})

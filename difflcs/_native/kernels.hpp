@@ -28,7 +28,8 @@ struct LcpBatch {
   int8_t* status;  // (batch,) kUnreached, which it stays where the watch stopped before
 };
 
-constexpr int64_t kLcpAlone = 33;  // LCPs of this size or more are solved one by one
+// From these sizes on LCPs are solved one by one, exact and relaxed ones: lanes are faster below, if they are full.
+constexpr int64_t kAloneExact = 64, kAloneRelaxed = 128;
 
 // What the numbers of a solved LCP have to meet; difflcs.lcp.solve_lcp states it.
 constexpr double kLcpTerms = 1e-10;       // |F lam + q - w| in parts of the terms that sum to it

@@ -81,6 +81,9 @@ struct Lcp {
     }
   }
 
+  // Large problems look at the watch in every iteration.
+  bool halted(Watch watch) const { return size() > 32 && watch.stop(watch.context); }
+
   void slack() { lcp_slack(size(), F, q, lam, w, bound); }
 
   void solve(Vec* b) const {
@@ -127,7 +130,7 @@ void Lcp<T, N>::exact(int64_t begin, int64_t end, Watch watch) {
     Mask fewest = Mask{} + (n + 1), patience = Mask{} + 10;
     Mask done = Mask{}, solved = Mask{};
     for (int64_t i = 0; i < n; i++) active[i] = q[i] < 0;
-    for (int64_t it = 0; it < batch.max_iter; it++) {
+    for (int64_t it = 0; it < batch.max_iter && !halted(watch); it++) {
       // Active rows of F, identity elsewhere: one LU serves every active set. Inactive lam stay exactly zero.
       for (int64_t i = 0; i < n; i++) {
         DIFFLCS_UNROLL
@@ -187,7 +190,7 @@ void Lcp<T, N>::relaxed(int64_t begin, int64_t end, Watch watch) {
     const Vec unit = load(first, end);
     const Vec target = batch.relaxation / (unit * unit);
     RelaxedLcp<T, N, false> path(size(), F, q, newton, rows);
-    Mask solved = path.follow(lam, rhs, bound, target, batch.max_iter);
+    Mask solved = path.follow(lam, rhs, bound, target, batch.max_iter, [&] { return halted(watch); });
     slack();
     solved &= certified(rhs, unit, target);
     for (int64_t i = 0; i < size(); i++) w[i] = rhs[i];
@@ -214,16 +217,16 @@ void dispatch(const LcpBatch& batch, void* memory, Function f) {
 int64_t lcp_workspace(int64_t n) {
   LcpBatch batch{};
   batch.n = n;
-  const int64_t lanes = n < kLcpAlone ? Lcp<Vec, 0>(batch, nullptr).layout(nullptr) : 0, one = LcpOne::scratch(n);
+  const int64_t lanes = n < kAloneRelaxed ? Lcp<Vec, 0>(batch, nullptr).layout(nullptr) : 0, one = LcpOne::scratch(n);
   return lanes > one ? lanes : one;
 }
 
 void lcp_solve(const LcpBatch& batch, int64_t begin, int64_t end, void* memory, Watch watch) {
   // The violation loss of the paper's tasks has twice their number of contacts.
-  if (batch.n < kLcpAlone && batch.relaxation == 0)
+  if (batch.relaxation == 0 && batch.n < kAloneExact)
     dispatch<10, 16>(batch, memory, [&](auto lcp) { lcp.exact(begin, end, watch); });
   // The number of contacts of the paper's tasks: a third faster than with a size that is known at run time only.
-  if (batch.n < kLcpAlone && batch.relaxation > 0)
+  if (batch.relaxation > 0 && batch.n < kAloneRelaxed)
     dispatch<5, 8>(batch, memory, [&](auto lcp) { lcp.relaxed(begin, end, watch); });
   for (int64_t e = begin; e < end; e++) {
     if (solved(batch.status[e])) continue;

@@ -112,7 +112,7 @@ void on_threads(int64_t threads, int64_t workspace_bytes, Stop& stop, Work work)
 void solve(const difflcs::LcpBatch& batch, int64_t count, int threads, Stop& stop) {
   const auto& kernels = difflcs::kernels();
   // Blocks small enough to balance the load; where a block begins does not change any result.
-  const int64_t block = batch.n < difflcs::kLcpAlone ? 16 * kernels.lanes : 1;
+  const int64_t block = batch.n < difflcs::kAloneExact ? 16 * kernels.lanes : kernels.lanes;
   std::atomic<int64_t> next{0};
   const int64_t used = std::max<int64_t>(1, std::min<int64_t>(threads, (count + block - 1) / block));
   std::fill_n(batch.status, count, difflcs::kUnreached);

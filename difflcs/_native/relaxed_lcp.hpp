@@ -90,13 +90,14 @@ class RelaxedLcp {
   }
 
   // From eps = 1 down to `target`. Returns the lanes that converged; `bound` is scratch.
-  DIFFLCS_INLINE Mask follow(Vec* lam_out, Vec* w_out, Vec* bound, Vec target, int64_t max_iter) {
+  template <class Halted>
+  DIFFLCS_INLINE Mask follow(Vec* lam_out, Vec* w_out, Vec* bound, Vec target, int64_t max_iter, Halted halted) {
     const int64_t n = size();
     Vec eps = max(target, all(1)), smallest = all(1e300);  // smallest residual met at the target
     Mask solved = Mask{};
     int stalled[kLanes] = {};
     for (int64_t i = 0; i < n; i++) lam[i] = sqrt(eps);
-    for (int64_t it = 0; it < max_iter; it++) {
+    for (int64_t it = 0; it < max_iter && !halted(); it++) {
       refresh(eps, bound);
       const Vec residual = sqrt(merit);
       const Mask at_target = eps <= target;

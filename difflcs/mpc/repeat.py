@@ -46,7 +46,7 @@ class Given(NamedTuple):
     def form(self) -> tuple | None:
         """What it is but for its numbers; None of what cannot be used here, or must be refused elsewhere."""
         x0, goal, lcs = self
-        if not _is_double(x0) or not (goal is None or (isinstance(goal, Tensor) and goal.is_cpu)):
+        if not _is_double(x0) or not (goal is None or (isinstance(goal, Tensor) and _is_plain(goal))):
             return None
         if not (lcs is None or (type(lcs) is LCSParams and lcs.A.is_cpu)):
             return None
@@ -157,7 +157,11 @@ def _shaped(value: Tensor, shape: torch.Size) -> Tensor:
 
 
 def _is_double(value: object) -> TypeGuard[Tensor]:
-    return isinstance(value, Tensor) and value.dtype is torch.float64 and value.is_cpu
+    return isinstance(value, Tensor) and value.dtype is torch.float64 and _is_plain(value)
+
+
+def _is_plain(value: Tensor) -> bool:
+    return value.is_cpu and value.layout is torch.strided and not value.is_nested and not value.is_neg()
 
 
 def _held_by(layer: LCSMPCLayer, system_given: bool) -> list[Mapping[str, object]] | None:
