@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from typing import TypeGuard
 
 import numpy as np
 import torch
@@ -67,7 +68,7 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
         raise DTypeError(f"{name}: expected a torch.Tensor, got {describe(value)}; wrap it with torch.as_tensor(...)")
     if value.dtype not in FLOATS:
         raise DTypeError(f"{name}: expected float32 or float64, got {describe(value)}; convert it with {name}.double()")
-    if value.layout is not torch.strided or value.is_nested or value.is_neg():
+    if value.layout is not torch.strided or value.is_nested or value.is_neg():  # see `is_array`
         how = "resolve_neg" if value.is_neg() else "to_padded_tensor" if value.is_nested else "to_dense"
         raise DTypeError(f"{name}: expected a dense tensor, got {describe(value)}; convert it with {name}.{how}(...)")
     if not value.is_cpu and value.device.type not in _USABLE_DEVICES:
@@ -84,6 +85,16 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
             f"the first at index {tuple(bad[0].tolist())}; find where they come from before solving"
         )
     return value
+
+
+def is_array(value: object) -> TypeGuard[Tensor]:
+    """Whether NumPy can look at a value as it is: a dense tensor on the CPU."""
+    return (
+        isinstance(value, Tensor)
+        and value.is_cpu
+        and value.layout is torch.strided
+        and not (value.is_nested or value.is_neg())
+    )
 
 
 def _ends_in(shape: torch.Size, dims: Sequence[tuple[str, int]]) -> bool:

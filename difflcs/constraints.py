@@ -43,7 +43,7 @@ def as_bound(name: str, value: object, dims: list[tuple[str, int]], like: Tensor
     """A bound or weight as a tensor: a number holds for all of the last of its trailing dimensions `dims`."""
     number = plain(value)
     if isinstance(number, bool):
-        raise DTypeError(f"{name}: expected a number or a torch.Tensor, got {describe(value)}; write it as a float")
+        raise DTypeError(f"{name}: expected a torch.Tensor, got {describe(value)}; or give a number, as a float")
     if isinstance(number, int | float):
         value, dims = torch.full((dims[-1][1],), float(number), dtype=torch.float64, device=like.device), dims[-1:]
     return check_not_nan(name, value, dims)

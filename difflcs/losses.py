@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_choice, check_number, check_tensor, describe
+from difflcs._checks import broadcast_batch, check_choice, check_number, check_tensor, describe, is_array
 from difflcs._functorch import is_wrapped, pull_back, runs_eagerly, solve, transforms_active
 from difflcs._violation import Transitions, check_gamma_range, largest_gamma, minimise_over_orthant
 from difflcs.errors import DTypeError, GammaError, InvalidInputError
@@ -210,7 +210,7 @@ def _contact_matrix(lcs: LCSModel) -> tuple[Tensor, tuple[Tensor, ...]]:
 
 def _plain(lcs: LCSModel, system: tuple[Tensor, ...], data: tuple[Tensor, ...]) -> bool:
     """Whether these are float64 matrices on the CPU that fit each other: then the kernel can look at the numbers."""
-    if not all(isinstance(v, Tensor) and v.dtype is torch.float64 and v.is_cpu for v in (*system, *data)):
+    if not all(is_array(v) and v.dtype is torch.float64 for v in (*system, *data)):
         return False
     count = data[0].shape[0] if data[0].ndim else 0
     return all(v.shape == (count, n) for v, n in zip(data, (lcs.n_x, lcs.n_u, lcs.n_x), strict=True))

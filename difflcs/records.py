@@ -126,6 +126,7 @@ class _Record(SystemMatrices):
         """Refuse F if it was changed in place since it was checked, and is no longer positive definite."""
         if vars(self).get("_version") != _version(self.F):
             check_positive_definite(self.F)
+            vars(self)["_version"] = _version(self.F)
 
     @classmethod
     def of_checked(cls, tensors: Mapping[str, Tensor]) -> Self:

@@ -211,17 +211,17 @@ struct LcpOne {
   }
 
   // Infeasible interior-point method from `path` and `gap`: Newton on gap = F path + q, path o gap = mu, with mu falling
-  // to `target` and steps that keep both positive. For F + F^T positive definite it converges from any start. Goes on
-  // to the products themselves where they are the relaxation, else only until their mean is below the target.
-  void interior(double target) {
+  // to `target` and steps that keep both positive. For F + F^T positive definite it converges from any start. Returns
+  // whether it stored a solution with a relaxation; without one it ends where the mean product is below the target.
+  bool interior(double target) {
     int at_target = 0;
-    for (int it = 0; it < 300 && at_target < 8 && !watch.stop(watch.context); it++) {
+    for (int it = 0; it < 300 && at_target < 12 && !watch.stop(watch.context); it++) {
       double product = 0, smallest = __builtin_inf();
       for (int64_t i = 0; i < n; i++) {
         const double t = path[i] * gap[i];
         product += t / double(n), smallest = t < smallest ? t : smallest;
       }
-      if (relaxation == 0 && product <= target) return;
+      if (relaxation == 0 && product <= target) return false;
       // A centred point shortens the path, one next to the border is centred first.
       double mu = smallest > 0.1 * product ? 0.1 * product : 0.8 * product;
       if (relaxation > 0 && (!(mu > target) || it > 250)) mu = target;
@@ -234,7 +234,7 @@ struct LcpOne {
         for (int64_t j = 0; j < n; j++) M[i * n + j] = path[i] * F[i * n + j];
         M[i * n + i] += gap[i];
       }
-      if (!factor(n)) return;
+      if (!factor(n)) break;
       back(n, x);
       double length = 1.0;
       for (int64_t i = 0; i < n; i++) {
@@ -245,9 +245,11 @@ struct LcpOne {
         if (change < 0 && -0.9 * gap[i] / change < length) length = -0.9 * gap[i] / change;
       }
       for (int64_t i = 0; i < n; i++) path[i] += length * x[i], gap[i] += length * step[i];
-      if (mu == target && length == 1.0) at_target++;  // Newton converges quadratically from here
       remember(path);
+      // Newton converges quadratically from here; where rounding is large, some iterates are better than others.
+      if (mu == target && length == 1.0 && ++at_target > 5 && on_path()) return true;
     }
+    return relaxation > 0 && on_path();
   }
 
   // Pivoting alone is fast where few exchanges are needed; else it begins next to the solution, where the interior
@@ -265,9 +267,9 @@ struct LcpOne {
     return pivot(int64_t{1} << (n + 2 < 16 ? n + 2 : 16), true);
   }
 
-  bool relaxed() {
-    interior(relaxation);
-    for (int64_t i = 0; i < n; i++) {  // lam o w = relaxation exactly: from the larger of the two
+  // lam o w = relaxation exactly: from the larger of the two.
+  bool on_path() {
+    for (int64_t i = 0; i < n; i++) {
       lam[i] = path[i] > gap[i] ? path[i] : relaxation / gap[i];
       w[i] = path[i] > gap[i] ? relaxation / path[i] : gap[i];
     }
@@ -279,7 +281,7 @@ inline void lcp_one(const LcpBatch& batch, int64_t e, void* scratch, Watch watch
   LcpOne p(batch, e, scratch, watch);
   for (int64_t i = 0; i < p.n; i++) p.path[i] = p.gap[i] = p.relaxation > 1 ? __builtin_sqrt(p.relaxation) : 1.0;
   Status status = Status::converged;
-  if (!(batch.relaxation > 0 ? p.relaxed() : p.exact())) {
+  if (!(batch.relaxation > 0 ? p.interior(p.relaxation) : p.exact())) {
     double terms;
     for (int64_t i = 0; i < p.n; i++) p.lam[i] = p.best[i];
     for (int64_t i = 0; i < p.n; i++) p.w[i] = p.slack(i, p.best, &terms);

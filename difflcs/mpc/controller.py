@@ -221,11 +221,11 @@ class MPCController:
             return
         tensors = {name: value.detach().to("cpu", torch.float64) for name, value in system.tensors().items()}
         check_finite(tensors)
-        form = {name: tuple(value.shape) for name, value in tensors.items()}
-        if form != self._form:
-            raise ShapeError(
-                f"lcs: expected the sizes of the first step, {self._form}, got {form}; make another controller"
-            )
+        for name, shape in self._form.items():
+            if (got := tuple(tensors[name].shape)) != shape:
+                raise ShapeError(
+                    f"lcs: expected {name} {shape} as in the first step, got {got}; make another controller"
+                )
         self._native.set_system([value.contiguous().numpy() for value in tensors.values()])
 
     def reset(self) -> None:
