@@ -169,7 +169,7 @@ def plain(value: object) -> object:
         unread = value.layout is not torch.strided or value.is_nested or value.requires_grad or is_wrapped(value)
         return value if unread or value.ndim or value.device.type not in _USABLE_DEVICES else value.item()
     if isinstance(value, np.generic | np.ndarray) and not value.ndim:
-        value = value[()]
+        value = np.asarray(value)[()]
         return float(value) if isinstance(value, np.floating) else value.item()
     return value
 

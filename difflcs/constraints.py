@@ -74,9 +74,8 @@ class StageBounds(TensorFields):
         by_stage: Collection[str] = ("u_min", "u_max"),
     ):
         super().__init__()
-        given = {
-            name: value for name, value in (("u_min", u_min), ("u_max", u_max)) if isinstance(plain(value), Tensor)
-        }
+        bounds = {"u_min": plain(u_min), "u_max": plain(u_max)}
+        given = {name: value for name, value in bounds.items() if isinstance(value, Tensor)}
         self.by_stage = check_by_stage(by_stage, ("u_min", "u_max"), given)
         for name, value in given.items():
             check_not_nan(name, value)

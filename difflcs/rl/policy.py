@@ -91,7 +91,7 @@ def _guess(tensordict: TensorDictBase) -> Primal | None:
     return None if guess is None else Primal(*_entries(guess, PLAN))
 
 
-def _entries(tensordict: TensorDictBase, keys: Sequence[str]) -> list[Tensor]:
+def _entries(tensordict: TensorDictBase, keys: Sequence) -> list[Tensor]:
     """What a policy reads."""
     missing = [str(key) for key in keys if tensordict.get(key, None) is None]
     if missing:
