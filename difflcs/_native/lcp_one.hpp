@@ -101,15 +101,16 @@ struct LcpOne {
     }
   }
 
-  // F' v + q' in row i, and the sizes of its terms.
+  // F' v + q' in row i, and the sizes of its terms. `Sum`: long double where a last step is corrected by it.
+  template <class Sum = double>
   double slack(int64_t i, const double* v, double* terms) const {
-    double value = q[i];
+    Sum value = q[i];
     *terms = __builtin_fabs(value);
     for (int64_t j = 0; j < n; j++) {
-      const double t = F[i * n + j] * v[j];
-      value += t, *terms += __builtin_fabs(t);
+      const Sum t = Sum(F[i * n + j]) * v[j];
+      value += t, *terms += __builtin_fabs(double(t));
     }
-    return value;
+    return double(value);
   }
 
   // Writes lam and w in the caller's units if they hold by the bounds of kernels.hpp.
@@ -183,7 +184,7 @@ struct LcpOne {
       for (int refinement = 0; refinement < 2; refinement++) {
         double terms;
         for (int64_t i = 0; i < n; i++)
-          if (active[i] != 0) step[i] = -slack(i, lam, &terms);
+          if (active[i] != 0) step[i] = -slack<long double>(i, lam, &terms);
         solve();
       }
       for (int64_t i = 0; i < n; i++) {
@@ -229,7 +230,7 @@ struct LcpOne {
       // (diag(gap) + diag(path) F) dpath = mu - path o (gap + missed).
       for (int64_t i = 0; i < n; i++) {
         double terms;
-        y[i] = slack(i, path, &terms) - gap[i];
+        y[i] = (at_target > 0 ? slack<long double>(i, path, &terms) : slack(i, path, &terms)) - gap[i];
         x[i] = mu - path[i] * (gap[i] + y[i]);
         for (int64_t j = 0; j < n; j++) M[i * n + j] = path[i] * F[i * n + j];
         M[i * n + i] += gap[i];
