@@ -68,6 +68,8 @@ def violation_loss(
     """
     check_choice("reduction", reduction, ("mean", "none"))
     xi = check_number("xi", xi, strict=True)
+    if isinstance(gamma, Tensor):  # nothing is differentiated by γ, nor is it one per transition
+        raise DTypeError(f"gamma: expected a number, got {describe(gamma)}; convert it with float(...)")
     if not (isinstance(gamma, str) and gamma == "auto"):
         gamma = check_number("gamma", gamma)
     if _has_the_models_params(lcs) and lcs.n_lam and not transforms_active():

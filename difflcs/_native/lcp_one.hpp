@@ -211,9 +211,10 @@ struct LcpOne {
     return false;
   }
 
-  // Infeasible interior-point method from `path` and `gap`: Newton on gap = F path + q, path o gap = mu, with mu falling
-  // to `target` and steps that keep both positive. For F + F^T positive definite it converges from any start. Returns
-  // whether it stored a solution with a relaxation; without one it ends where the mean product is below the target.
+  // Infeasible interior-point method from `path` and `gap`: Newton on gap = F path + q, path o gap = mu, with mu
+  // falling to `target` and steps that keep both positive. For F + F^T positive definite it converges from any start.
+  // Returns whether it stored a solution with a relaxation; without one it ends where the mean product is below the
+  // target.
   bool interior(double target) {
     int at_target = 0;
     for (int it = 0; it < 300 && at_target < 12 && !watch.stop(watch.context); it++) {
@@ -282,7 +283,8 @@ inline void lcp_one(const LcpBatch& batch, int64_t e, void* scratch, Watch watch
   LcpOne p(batch, e, scratch, watch);
   for (int64_t i = 0; i < p.n; i++) p.path[i] = p.gap[i] = p.relaxation > 1 ? __builtin_sqrt(p.relaxation) : 1.0;
   Status status = Status::converged;
-  if (!(batch.relaxation > 0 ? p.interior(p.relaxation) : p.exact())) {
+  const bool finite = p.least < __builtin_inf();  // else no step helps
+  if (!finite || !(batch.relaxation > 0 ? p.interior(p.relaxation) : p.exact())) {
     double terms;
     for (int64_t i = 0; i < p.n; i++) p.lam[i] = p.best[i];
     for (int64_t i = 0; i < p.n; i++) p.w[i] = p.slack(i, p.best, &terms);

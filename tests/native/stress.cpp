@@ -297,7 +297,7 @@ void controller(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t h, int64_t n_c,
 
 int main() {
   const double huge = 1e200, nan = std::numeric_limits<double>::quiet_NaN();
-  for (const int64_t n : {1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 16, 40})
+  for (const int64_t n : {1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 16, 70})
     for (const bool shared : {true, false})
       for (const double relaxation : {0.0, 1e-5})
         for (const double broken : {0.0, huge, nan}) lcp(n, 23, shared, relaxation, broken);
