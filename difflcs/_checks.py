@@ -73,11 +73,7 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
         raise DTypeError(f"{name}: expected a dense tensor, got {describe(value)}; convert it with {name}.{how}(...)")
     if not value.is_cpu and value.device.type not in _USABLE_DEVICES:
         raise DeviceError(f"{name}: expected a tensor with data, got {describe(value)}; move it with {name}.to('cpu')")
-    if dims and not _ends_in(value.shape, dims):
-        labels = ", ".join(["..."] + [f"{label}={size}" for label, size in dims])
-        raise ShapeError(
-            f"{name}: expected shape ({labels}), got {tuple(value.shape)}; reshape it or rebuild the model"
-        )
+    check_dims(name, value, dims)
     if finite and not is_wrapped(value) and not all_finite(value):
         bad = torch.nonzero(~torch.isfinite(value.detach()))
         raise NonFiniteError(
@@ -85,6 +81,15 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
             f"the first at index {tuple(bad[0].tolist())}; find where they come from before solving"
         )
     return value
+
+
+def check_dims(name: str, value: Tensor, dims: Sequence[tuple[str, int]]) -> None:
+    """The part of `check_tensor` that is about the trailing dimensions."""
+    if dims and not _ends_in(value.shape, dims):
+        labels = ", ".join(["..."] + [f"{label}={size}" for label, size in dims])
+        raise ShapeError(
+            f"{name}: expected shape ({labels}), got {tuple(value.shape)}; reshape it or rebuild the model"
+        )
 
 
 def is_array(value: object) -> TypeGuard[Tensor]:

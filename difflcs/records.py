@@ -11,6 +11,7 @@ from torch import Tensor
 
 from difflcs._checks import (
     broadcast_batch,
+    check_dims,
     check_finite,
     check_integer,
     check_positive_definite,
@@ -110,7 +111,7 @@ class _Record(SystemMatrices):
         if stages and not stages[0][1]:
             raise ShapeError(f"A: expected at least one stage, got {describe(self.A)}; give H ≥ 1 matrices")
         for name, dims in SYSTEM.items():
-            check_tensor(name, tensors[name], [*stages, *((dim, sizes[dim]) for dim in dims)], finite=False)
+            check_dims(name, tensors[name], [*stages, *((dim, sizes[dim]) for dim in dims)])
         check_same_device(tensors.items())
         for name, value in tensors.items():
             if value.dtype != self.A.dtype:
