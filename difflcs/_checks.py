@@ -5,7 +5,9 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from typing import TypeGuard
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,7 +29,9 @@ _USABLE_DEVICES = ("cpu", "cuda", "mps", "xpu")
 def describe(value: object) -> str:
     """A short description of a value for an error message."""
     if isinstance(value, Tensor):
-        return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')} on {value.device}"
+        shape = "nested" if value.is_nested else str(tuple(value.shape))  # torch knows none of the former
+        layout = "" if value.layout is torch.strided else f" {str(value.layout).removeprefix('torch.')}"
+        return f"{shape}{layout} {str(value.dtype).removeprefix('torch.')} on {value.device}"
     try:
         text = repr(value)
     except ValueError:  # Python writes no integers of more than 4300 digits
@@ -55,7 +59,7 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
         The same tensor, unchanged.
 
     Raises:
-        DTypeError: not a float32 or float64 tensor.
+        DTypeError: not a float32 or float64 tensor, or one that is not dense.
         DeviceError: on a device whose values cannot be read.
         ShapeError: wrong trailing dimensions.
         NonFiniteError: NaN or infinity inside.
@@ -64,13 +68,12 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
         raise DTypeError(f"{name}: expected a torch.Tensor, got {describe(value)}; wrap it with torch.as_tensor(...)")
     if value.dtype not in FLOATS:
         raise DTypeError(f"{name}: expected float32 or float64, got {describe(value)}; convert it with {name}.double()")
+    if value.layout is not torch.strided or value.is_nested or value.is_neg():  # see `is_array`
+        how = "resolve_neg" if value.is_neg() else "to_padded_tensor" if value.is_nested else "to_dense"
+        raise DTypeError(f"{name}: expected a dense tensor, got {describe(value)}; convert it with {name}.{how}(...)")
     if not value.is_cpu and value.device.type not in _USABLE_DEVICES:
         raise DeviceError(f"{name}: expected a tensor with data, got {describe(value)}; move it with {name}.to('cpu')")
-    if dims and not _ends_in(value.shape, dims):
-        labels = ", ".join(["..."] + [f"{label}={size}" for label, size in dims])
-        raise ShapeError(
-            f"{name}: expected shape ({labels}), got {tuple(value.shape)}; reshape it or rebuild the model"
-        )
+    check_dims(name, value, dims)
     if finite and not is_wrapped(value) and not all_finite(value):
         bad = torch.nonzero(~torch.isfinite(value.detach()))
         raise NonFiniteError(
@@ -78,6 +81,25 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
             f"the first at index {tuple(bad[0].tolist())}; find where they come from before solving"
         )
     return value
+
+
+def check_dims(name: str, value: Tensor, dims: Sequence[tuple[str, int]]) -> None:
+    """The part of `check_tensor` that is about the trailing dimensions."""
+    if dims and not _ends_in(value.shape, dims):
+        labels = ", ".join(["..."] + [f"{label}={size}" for label, size in dims])
+        raise ShapeError(
+            f"{name}: expected shape ({labels}), got {tuple(value.shape)}; reshape it or rebuild the model"
+        )
+
+
+def is_array(value: object) -> TypeGuard[Tensor]:
+    """Whether NumPy can look at a value as it is: a dense tensor on the CPU."""
+    return (
+        isinstance(value, Tensor)
+        and value.is_cpu
+        and value.layout is torch.strided
+        and not (value.is_nested or value.is_neg())
+    )
 
 
 def _ends_in(shape: torch.Size, dims: Sequence[tuple[str, int]]) -> bool:
@@ -143,8 +165,30 @@ def check_same_device(tensors: Iterable[tuple[str, Tensor]]) -> None:
             )
 
 
+def plain(value: object) -> object:
+    """The number that a NumPy scalar, or an array or tensor without dimensions, holds; anything else as it is.
+
+    So is a tensor that asks for a gradient, which would be lost, and one whose number cannot be read here.
+    """
+    if isinstance(value, Tensor):
+        unread = value.layout is not torch.strided or value.is_nested or value.requires_grad or is_wrapped(value)
+        return value if unread or value.ndim or value.device.type not in _USABLE_DEVICES else value.item()
+    if isinstance(value, np.generic | np.ndarray) and not value.ndim:
+        value = np.asarray(value)[()]
+        return float(value) if isinstance(value, np.floating) else value.item()
+    return value
+
+
+def make_plain(settings: object) -> None:
+    """Make the numbers among the fields of a frozen dataclass, and in their tuples, Python's; see `plain`."""
+    for name, value in vars(settings).items():
+        own = tuple(map(plain, value)) if type(value) is tuple else plain(value)
+        object.__setattr__(settings, name, own)
+
+
 def check_integer(name: str, value: object) -> int:
-    """Check an integer of either sign."""
+    """Check an integer of either sign, Python's or NumPy's."""
+    value = int(value) if isinstance(value, np.integer) else value
     if isinstance(value, bool) or not isinstance(value, int):
         raise DTypeError(f"{name}: expected an int, got {describe(value)}; convert it with int(...)")
     return value
@@ -165,7 +209,8 @@ def _digits(value: int) -> str:
 
 
 def check_number(name: str, value: object, minimum: float = 0.0, strict: bool = False) -> float:
-    """Check a finite real number, at least (`strict`: above) `minimum`."""
+    """Check a finite real number (see `plain`), at least (`strict`: above) `minimum`."""
+    value = plain(value)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise DTypeError(f"{name}: expected a number, got {describe(value)}; convert it with float(...)")
     too_small = value <= minimum if strict else value < minimum

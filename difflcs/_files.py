@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from difflcs.errors import CheckpointError, InUseError
+from difflcs.errors import CheckpointError, InUseError, InvalidInputError
 
 LOCK = ".lock"
 """Name of the file in a directory that says, while it is locked, that a process works there."""
@@ -28,6 +28,21 @@ MAX_TENSORS = 1 << 32
 _MAX_DEPTH = 32
 """Deepest nesting of JSON; ours has six levels."""
 _FORMAT = 1
+
+
+def check_path(name: str, path: Path) -> None:
+    """Refuse a path that cannot be written as text, which TensorBoard and other libraries want.
+
+    Raises:
+        InvalidInputError: it is not UTF-8, or has a NUL.
+    """
+    try:
+        os.fsencode(path).decode()
+        clean = "\0" not in str(path)
+    except UnicodeError:
+        clean = False
+    if not clean:
+        raise InvalidInputError(f"{name}: expected a path in UTF-8, got {str(path)!r:.200}; choose another name")
 
 
 def write_atomically(path: Path, content: bytes) -> None:

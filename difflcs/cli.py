@@ -152,6 +152,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         Exit code: 0, 1 if `doctor` finds the library broken, 2 after an error of ours, 130 after Ctrl-C.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a path may be no text
     command: Any = None
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:

@@ -7,10 +7,10 @@ from collections.abc import Collection
 import torch
 from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_same_device, check_tensor, describe
+from difflcs._checks import broadcast_batch, check_same_device, check_tensor, describe, plain
 from difflcs._fields import TensorFields, check_by_stage, check_not_nan, check_stages
 from difflcs._functorch import is_wrapped
-from difflcs.errors import BoundsError, InvalidInputError, ShapeError
+from difflcs.errors import BoundsError, DTypeError, InvalidInputError, ShapeError
 
 _OWN = {"G": 2, "g": 1, "E": 2, "weight": 1}
 _EXTRA = {"G": 1, "g": 1, "E": 0, "weight": 1}  # stages beyond H
@@ -40,10 +40,12 @@ def check_bounds(u_min: Tensor, u_max: Tensor, strict: bool = False) -> None:
 
 
 def as_bound(name: str, value: object, dims: list[tuple[str, int]], like: Tensor) -> Tensor:
-    """A bound as a tensor: a number holds for every action; of tensors `dims` are the trailing dimensions."""
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        value = torch.full((dims[-1][1],), float(value), dtype=torch.float64, device=like.device)
-        dims = []
+    """A bound or weight as a tensor: a number holds for all of the last of its trailing dimensions `dims`."""
+    number = plain(value)
+    if isinstance(number, bool):
+        raise DTypeError(f"{name}: expected a torch.Tensor, got {describe(value)}; or give a number, as a float")
+    if isinstance(number, int | float):
+        value, dims = torch.full((dims[-1][1],), float(number), dtype=torch.float64, device=like.device), dims[-1:]
     return check_not_nan(name, value, dims)
 
 
@@ -72,7 +74,8 @@ class StageBounds(TensorFields):
         by_stage: Collection[str] = ("u_min", "u_max"),
     ):
         super().__init__()
-        given = {name: value for name, value in (("u_min", u_min), ("u_max", u_max)) if isinstance(value, Tensor)}
+        bounds = {"u_min": plain(u_min), "u_max": plain(u_max)}
+        given = {name: value for name, value in bounds.items() if isinstance(value, Tensor)}
         self.by_stage = check_by_stage(by_stage, ("u_min", "u_max"), given)
         for name, value in given.items():
             check_not_nan(name, value)
@@ -117,10 +120,8 @@ class _Constraints(TensorFields):
                     f"E: expected a matrix (..., n_c={self.n_c}, n_u), got {describe(E)}; pass one row per constraint"
                 )
             fields["E"], self.n_u = E, E.shape[-1]
-        if isinstance(weight, int | float) and not isinstance(weight, bool):
-            weight = torch.full((self.n_c,), float(weight), dtype=torch.float64, device=G.device)
         if weight is not None:
-            fields["weight"] = check_not_nan("weight", weight, [rows])
+            fields["weight"] = as_bound("weight", weight, [rows], G)
         check_same_device(fields.items())
         if self.by_stage:
             self.horizon = check_stages({k: (fields[k], _OWN[k], _EXTRA[k]) for k in _OWN if k in self.by_stage})
@@ -220,6 +221,6 @@ class ConstraintSequence(_Constraints):
         values = {"G": G, "g": g, "E": E, "weight": weight}
         for name in ("G", "g"):
             check_not_nan(name, values[name])
-        given = [name for name, value in values.items() if isinstance(value, Tensor)]
+        given = [name for name, value in values.items() if isinstance(plain(value), Tensor)]
         self.by_stage = check_by_stage(by_stage, _OWN, given)
         self._fill(G, g, E, weight)

@@ -372,9 +372,8 @@ class GoalCost(TensorFields):
         Returns:
             A `GoalCost` with n_goal = len(goal_weight).
         """
-        check_positive_int("n_x", n_x)
-        check_positive_int("n_u", n_u)
-        check_number("input_weight", input_weight, strict=True)
+        n_x, n_u = check_positive_int("n_x", n_x), check_positive_int("n_u", n_u)
+        input_weight = check_number("input_weight", input_weight, strict=True)
         if dtype not in (torch.float32, torch.float64):
             raise DTypeError(f"dtype: expected torch.float32 or torch.float64, got {dtype}")
         final_pair = pair_weight if pair_weight_final is None else pair_weight_final
@@ -395,12 +394,13 @@ class GoalCost(TensorFields):
 
 
 def _weights(name: str, value: float | Sequence[float], n_x: int) -> list[float]:
-    weights = [float(value)] * n_x if isinstance(value, int | float) else [float(v) for v in value]
+    try:
+        weights = list(value)  # pyright: ignore[reportArgumentType]
+    except TypeError:  # a number, or an array or tensor without dimensions
+        weights = [value] * n_x
     if not 1 <= len(weights) <= n_x:
         raise ShapeError(f"{name}: expected 1 to n_x={n_x} weights, got {len(weights)}")
-    for weight in weights:
-        check_number(name, weight)
-    return weights
+    return [check_number(name, weight) for weight in weights]
 
 
 def _tracking(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -38,12 +39,13 @@ class LCPSolution(NamedTuple):
 
 
 @runs_eagerly
-def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0) -> LCPSolution:
+def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0, time_limit: float | None = None) -> LCPSolution:
     """Solve 0 ≤ λ ⊥ F λ + q ≥ 0 for a batch of P-matrices F (in particular F + Fᵀ ≻ 0).
 
-    Exact problems go through block principal pivoting with Murty's finite rule as the fallback; relaxed ones,
-    λ ∘ (F λ + q) = relaxation, through damped Newton on the Chen–Harker–Kanzow–Smale function with an interior-point
-    method as the fallback. Both fallbacks eliminate with row exchanges, which a dominant skew part of F needs.
+    Exact problems go through block principal pivoting, where that fails through an interior-point method that finds the
+    set of positive λ, with Murty's finite rule as the last resort; relaxed ones, λ ∘ (F λ + q) = relaxation, through
+    damped Newton on the Chen–Harker–Kanzow–Smale function, from n = 128 on and where that fails through the
+    interior-point method. Large problems and fallbacks eliminate with row exchanges, which a dominant skew part needs.
 
     CONVERGED is a certificate, recomputed from the λ and w that are returned: λ, w ≥ 0; λᵢwᵢ is 0, or the relaxation;
     and |F λ + q − w|ᵢ is at most 1e-10 of the terms |qᵢ| + Σⱼ|Fᵢⱼλⱼ| that sum to it and at most 1e-8 of the largest
@@ -59,6 +61,7 @@ def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0) -> LCPSolution:
         F: (..., n, n), or (n, n) shared by the batch.
         q: (..., n), n ≥ 0.
         relaxation: 0 for the exact problem, else the product λᵢ wᵢ, in the units of λ·w.
+        time_limit: seconds for the solve, None for no limit. Elements not solved by then are MAX_ITER.
 
     Returns:
         `LCPSolution` with λ, w of q's dtype. float32 is solved in float64 inside; λ or w above 1e150, or 1e18 in
@@ -67,7 +70,8 @@ def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0) -> LCPSolution:
     Raises:
         ShapeError, DTypeError, DeviceError, NonFiniteError, InvalidInputError: the arguments do not fit.
     """
-    check_number("relaxation", relaxation)
+    relaxation = check_number("relaxation", relaxation)
+    limit = math.inf if time_limit is None else check_number("time_limit", time_limit, strict=True)
     check_tensor("q", q)
     if q.ndim < 1:
         raise ShapeError(f"q: expected shape (..., n), got {tuple(q.shape)}; add the dimension of the variables")
@@ -81,7 +85,7 @@ def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0) -> LCPSolution:
     q_flat = q.expand(*batch, n).reshape(-1, n).double()
     F_flat = F.double() if F.ndim == 2 else F.expand(*batch, n, n).reshape(-1, n, n).double()
     narrow = torch.float32 in (F.dtype, q.dtype)
-    lam, w, status = solve(_Problems(float(relaxation), narrow), F_flat, q_flat)
+    lam, w, status = solve(_Problems(relaxation, limit, narrow), F_flat, q_flat)
     if not is_wrapped(status):
         _warn_of_failures(status, stacklevel=4)
     return LCPSolution(
@@ -90,16 +94,16 @@ def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0) -> LCPSolution:
 
 
 def solve_lcp_arrays(
-    F: np.ndarray, q: np.ndarray, relaxation: float = 0.0
+    F: np.ndarray, q: np.ndarray, relaxation: float = 0.0, time_limit: float = math.inf
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The native solve on float64 arrays F (n, n) or (B, n, n) and q (B, n): λ, w (B, n) and status (B,), no NaN."""
     from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 
     F, q = np.ascontiguousarray(F), np.ascontiguousarray(q)
     lam, w = np.empty_like(q), np.empty_like(q)
-    status, iterations = np.empty(len(q), np.int8), np.empty(len(q), np.int32)
+    status = np.empty(len(q), np.int8)
     limit = MAX_ITER["relaxed" if relaxation > 0 else "exact"]
-    _kernels.solve_lcp(F, q, relaxation, limit, torch.get_num_threads(), lam, w, status, iterations)
+    _kernels.solve_lcp(F, q, relaxation, limit, time_limit, torch.get_num_threads(), lam, w, status)
     failed = status != Status.CONVERGED
     if failed.any():
         np.nan_to_num(lam, copy=False, posinf=0.0, neginf=0.0)
@@ -114,7 +118,7 @@ def _warn_of_failures(status: Tensor, stacklevel: int) -> None:
     if failed:
         warnings.warn(
             f"{failed} of {status.numel()} LCPs were not solved; their gradient is zero. Expected P-matrices: check "
-            f"that F + Fᵀ is positive definite, and read .status",
+            f"that F + Fᵀ is positive definite, and read .status (MAX_ITER: not within time_limit)",
             SolveWarning,
             stacklevel=stacklevel,
         )
@@ -125,6 +129,7 @@ class _Problems(Solver):
     """F, q in float64 → λ, w, status. `narrow`: the caller's dtype is float32, whose range is that of a gradient."""
 
     relaxation: float
+    time_limit: float
     narrow: bool
 
     name = "solve_lcp"
@@ -138,7 +143,9 @@ class _Problems(Solver):
             check_tensor("F", F)
         lam, w, status = (
             torch.from_numpy(a)
-            for a in solve_lcp_arrays(F.detach().cpu().numpy(), q.detach().cpu().numpy(), self.relaxation)
+            for a in solve_lcp_arrays(
+                F.detach().cpu().numpy(), q.detach().cpu().numpy(), self.relaxation, self.time_limit
+            )
         )
         if self.narrow:
             diagonal = F.detach().cpu().diagonal(dim1=-2, dim2=-1)

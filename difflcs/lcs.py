@@ -105,7 +105,7 @@ class LCSModel(nn.Module):
         self.n_u = check_positive_int("n_u", n_u)
         self.n_lam = check_positive_int("n_lam", n_lam, minimum=0)
         self.stiffness = check_number("stiffness", stiffness, strict=True)
-        check_number("init_scale", init_scale)
+        init_scale = check_number("init_scale", init_scale)
         if dtype not in (torch.float32, torch.float64):
             raise DTypeError(f"dtype: expected torch.float32 or torch.float64, got {dtype}")
         for name, shape in self._shapes(self.n_x, self.n_u, self.n_lam).items():
@@ -226,7 +226,7 @@ class LCSModel(nn.Module):
         smallest = float(torch.linalg.eigvalsh(symmetric)[0]) if params.n_lam else float("inf")
         if stiffness is None:
             stiffness = 0.5 * smallest if params.n_lam else 0.1
-        check_number("stiffness", stiffness, strict=True)
+        stiffness = check_number("stiffness", stiffness, strict=True)
         if stiffness >= smallest:
             raise InvalidInputError(
                 f"stiffness: expected less than the smallest eigenvalue {smallest:.3e} of (F + Fᵀ)/2, got {stiffness:g}"

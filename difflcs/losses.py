@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_choice, check_number, check_tensor, describe
+from difflcs._checks import broadcast_batch, check_choice, check_number, check_tensor, describe, is_array
 from difflcs._functorch import is_wrapped, pull_back, runs_eagerly, solve, transforms_active
 from difflcs._violation import Transitions, check_gamma_range, largest_gamma, minimise_over_orthant
 from difflcs.errors import DTypeError, GammaError, InvalidInputError
@@ -65,9 +65,11 @@ def violation_loss(
         ShapeError, DTypeError, DeviceError, NonFiniteError, InvalidInputError: the arguments do not fit.
     """
     check_choice("reduction", reduction, ("mean", "none"))
-    check_number("xi", xi, strict=True)
+    xi = check_number("xi", xi, strict=True)
+    if isinstance(gamma, Tensor):  # nothing is differentiated by γ, nor is it one per transition
+        raise DTypeError(f"gamma: expected a number, got {describe(gamma)}; convert it with float(...)")
     if not (isinstance(gamma, str) and gamma == "auto"):
-        check_number("gamma", gamma)
+        gamma = check_number("gamma", gamma)
     if is_plain(lcs) and lcs.n_lam and not transforms_active():
         # The loss passes the gradient of F to G and H itself: autograd would take 40 µs for the five small steps, of
         # 190 µs for the loss of 100 transitions and its gradient.
@@ -195,7 +197,7 @@ def _shared(
 
 def _plain(lcs: LCSModel, system: tuple[Tensor, ...], data: tuple[Tensor, ...]) -> bool:
     """Whether these are float64 matrices on the CPU that fit each other: then the kernel can look at the numbers."""
-    if not all(isinstance(v, Tensor) and v.dtype is torch.float64 and v.is_cpu for v in (*system, *data)):
+    if not all(is_array(v) and v.dtype is torch.float64 for v in (*system, *data)):
         return False
     count = data[0].shape[0] if data[0].ndim else 0
     return all(v.shape == (count, n) for v, n in zip(data, (lcs.n_x, lcs.n_u, lcs.n_x), strict=True))

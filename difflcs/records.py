@@ -11,6 +11,7 @@ from torch import Tensor
 
 from difflcs._checks import (
     broadcast_batch,
+    check_dims,
     check_finite,
     check_integer,
     check_positive_definite,
@@ -69,6 +70,11 @@ class SystemMatrices:
         return gap if lam is None else gap + matvec(self.F, lam)
 
 
+def _version(tensor: Tensor) -> int:
+    """How often a tensor was changed in place, where torch counts it."""
+    return 0 if tensor.is_inference() else tensor._version
+
+
 # Name → kinds of its dimensions, in the order of every list of these matrices.
 SYSTEM = dimensions(SystemMatrices)
 
@@ -106,7 +112,7 @@ class _Record(SystemMatrices):
         if stages and not stages[0][1]:
             raise ShapeError(f"A: expected at least one stage, got {describe(self.A)}; give H ≥ 1 matrices")
         for name, dims in SYSTEM.items():
-            check_tensor(name, tensors[name], [*stages, *((dim, sizes[dim]) for dim in dims)], finite=False)
+            check_dims(name, tensors[name], [*stages, *((dim, sizes[dim]) for dim in dims)])
         check_same_device(tensors.items())
         for name, value in tensors.items():
             if value.dtype != self.A.dtype:
@@ -116,12 +122,19 @@ class _Record(SystemMatrices):
                 )
         self.batch_shape  # noqa: B018  raises where the batch dimensions do not fit each other
         check_positive_definite(self.F)
+        vars(self)["_version"] = _version(self.F)
+
+    def check_again(self) -> None:
+        """Refuse F if it was changed in place since it was checked, and is no longer positive definite."""
+        if vars(self).get("_version") != _version(self.F):
+            check_positive_definite(self.F)
+            vars(self)["_version"] = _version(self.F)
 
     @classmethod
     def of_checked(cls, tensors: Mapping[str, Tensor]) -> Self:
         """A record of tensors that have been checked, all of them and together; nothing is checked here."""
         record = object.__new__(cls)
-        vars(record).update(tensors)
+        vars(record).update(tensors, _version=_version(tensors["F"]))
         return record
 
     def _own(self, name: str) -> int:
@@ -314,7 +327,7 @@ class LCSSequence(_Record):
 
     def stage(self, k: int) -> LCSParams:
         """The system of stage k, 0 ≤ k < H; negative ones count from the end."""
-        check_integer("k", k)
+        k = check_integer("k", k)
         if not -self.horizon <= k < self.horizon:
             raise BatchIndexError(f"k: expected a stage of 0 … {self.horizon - 1}, got {k}; choose another")
         return LCSParams(**{n: v.select(v.ndim - self._own(n), k) for n, v in self.tensors().items()})

@@ -160,7 +160,7 @@ def block_along_wall(
     )
     mu, alpha = _number("friction", friction), _number("face_angle", face_angle)
     check_number("pi/2 - face_angle", torch.pi / 2 - float(alpha.detach()), strict=True)
-    check_number("stick", stick, strict=True)
+    stick = check_number("stick", stick, strict=True)
     cos, sin = alpha.cos(), alpha.sin()
     directions = _matrix([[cos, -sin], [0, 1], [1, 0], [-1, 0]])  # of λ₁ … λ₄, and of what their gaps measure
     mobility = h / beta
@@ -188,6 +188,8 @@ def block_along_wall(
 
 def _number(name: str, value: Number, strict: bool = False) -> Tensor:
     """A checked scalar as a float64 tensor on the CPU, gradient history kept."""
+    if not isinstance(value, Tensor):
+        value = check_number(name, value, strict=strict)
     tensor = torch.as_tensor(value, dtype=torch.float64).reshape(())
     check_number(name, float(tensor.detach()), strict=strict)
     return tensor

@@ -13,11 +13,11 @@ def solve_lcp(
     q: np.ndarray,
     relaxation: float,
     max_iter: int,
+    time_limit: float,
     threads: int,
     lam: np.ndarray,
     w: np.ndarray,
     status: np.ndarray,
-    iterations: np.ndarray,
 ) -> None: ...
 def solve_mpc(
     inputs: list[np.ndarray],

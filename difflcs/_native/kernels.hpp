@@ -23,11 +23,13 @@ struct LcpBatch {
   const double* q;    // (batch, n)
   double relaxation;  // 0: exact
   int64_t max_iter;
-  double* lam;          // out (batch, n)
-  double* w;            // out (batch, n)
-  int8_t* status;       // out (batch,)
-  int32_t* iterations;  // out (batch,)
+  double* lam;     // out (batch, n)
+  double* w;       // out (batch, n)
+  int8_t* status;  // (batch,) kUnreached, which it stays where the watch stopped before
 };
+
+// From these sizes on LCPs are solved one by one, exact and relaxed ones: lanes are faster below, if they are full.
+constexpr int64_t kAloneExact = 64, kAloneRelaxed = 128;
 
 // What the numbers of a solved LCP have to meet; difflcs.lcp.solve_lcp states it.
 constexpr double kLcpTerms = 1e-10;       // |F lam + q - w| in parts of the terms that sum to it
@@ -114,9 +116,8 @@ struct Kernels {
   const char* isa;
   int lanes;                            // problems solved side by side
   int64_t (*lcp_workspace)(int64_t n);  // bytes, to be aligned to 64
-  // Solve problems [begin, end); both read and write only those.
-  void (*lcp_exact)(const LcpBatch& batch, int64_t begin, int64_t end, void* workspace, Watch watch);
-  void (*lcp_relaxed)(const LcpBatch& batch, int64_t begin, int64_t end, void* workspace, Watch watch);
+  // Solves problems [begin, end); reads and writes only those.
+  void (*lcp_solve)(const LcpBatch& batch, int64_t begin, int64_t end, void* workspace, Watch watch);
   int64_t (*mpc_workspace)(const MpcBatch& batch);
   // Take problems from the shared counter `next` until none is left, and certify them.
   void (*mpc_solve)(const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void* workspace, Watch watch);

@@ -2,6 +2,7 @@
 // reads like the solver of a single problem, and a lane's result never depends on its neighbours.
 #include "kernels.hpp"
 #include "lanes.hpp"
+#include "lcp_one.hpp"
 #include "lu.hpp"
 #include "matrix.hpp"
 #include "relaxed_lcp.hpp"
@@ -67,7 +68,7 @@ struct Lcp {
     return unit;
   }
 
-  void store(int64_t first, int64_t end, Vec unit, const Mask& solved, const Mask& iterations) {
+  void store(int64_t first, int64_t end, Vec unit, const Mask& solved) {
     const int64_t n = size();
     for (int l = 0; l < kLanes && first + l < end; l++) {
       const int64_t e = first + l;
@@ -77,14 +78,13 @@ struct Lcp {
         batch.w[e * n + i] = lane_of(w[i], l) * (unit[l] / entry);
       }
       batch.status[e] = static_cast<int8_t>(solved[l] ? Status::converged : Status::numerical);
-      batch.iterations[e] = static_cast<int32_t>(iterations[l]);
     }
   }
 
-  void slack() { lcp_slack(size(), F, q, lam, w, bound); }
-
   // Large problems look at the watch in every iteration.
   bool halted(Watch watch) const { return size() > 32 && watch.stop(watch.context); }
+
+  void slack() { lcp_slack(size(), F, q, lam, w, bound); }
 
   void solve(Vec* b) const {
     const int64_t n = size();
@@ -127,7 +127,7 @@ void Lcp<T, N>::exact(int64_t begin, int64_t end, Watch watch) {
   const int64_t n = size();
   for (int64_t first = begin; first < end && !watch.stop(watch.context); first += kLanes) {
     const Vec unit = load(first, end);
-    Mask fewest = Mask{} + (n + 1), patience = Mask{} + 10, iterations = Mask{};
+    Mask fewest = Mask{} + (n + 1), patience = Mask{} + 10;
     Mask done = Mask{}, solved = Mask{};
     for (int64_t i = 0; i < n; i++) active[i] = q[i] < 0;
     for (int64_t it = 0; it < batch.max_iter && !halted(watch); it++) {
@@ -162,7 +162,6 @@ void Lcp<T, N>::exact(int64_t begin, int64_t end, Watch watch) {
         count -= m;  // a true lane is -1
         last = m ? Mask{} + i : last;
       }
-      iterations -= ~done;
       solved |= ~done & (count == 0);
       done |= count == 0;
       if (!any(~done)) break;
@@ -181,7 +180,7 @@ void Lcp<T, N>::exact(int64_t begin, int64_t end, Watch watch) {
     for (int64_t i = 0; i < n; i++) rhs[i] = select(active[i], all(0), max(w[i], all(0)));
     solved &= certified(rhs, unit, all(0));
     for (int64_t i = 0; i < n; i++) w[i] = rhs[i];
-    store(first, end, unit, solved, iterations);
+    store(first, end, unit, solved);
   }
 }
 
@@ -191,12 +190,11 @@ void Lcp<T, N>::relaxed(int64_t begin, int64_t end, Watch watch) {
     const Vec unit = load(first, end);
     const Vec target = batch.relaxation / (unit * unit);
     RelaxedLcp<T, N, false> path(size(), F, q, newton, rows);
-    Mask iterations = Mask{};
-    Mask solved = path.follow(lam, rhs, bound, target, batch.max_iter, iterations, [&] { return halted(watch); });
+    Mask solved = path.follow(lam, rhs, bound, target, batch.max_iter, [&] { return halted(watch); });
     slack();
     solved &= certified(rhs, unit, target);
     for (int64_t i = 0; i < size(); i++) w[i] = rhs[i];
-    store(first, end, unit, solved, iterations);
+    store(first, end, unit, solved);
   }
 }
 
@@ -219,17 +217,24 @@ void dispatch(const LcpBatch& batch, void* memory, Function f) {
 int64_t lcp_workspace(int64_t n) {
   LcpBatch batch{};
   batch.n = n;
-  return Lcp<Vec, 0>(batch, nullptr).layout(nullptr);
+  const int64_t lanes = n < kAloneRelaxed ? Lcp<Vec, 0>(batch, nullptr).layout(nullptr) : 0, one = LcpOne::scratch(n);
+  return lanes > one ? lanes : one;
 }
 
-void lcp_exact(const LcpBatch& batch, int64_t begin, int64_t end, void* memory, Watch watch) {
+void lcp_solve(const LcpBatch& batch, int64_t begin, int64_t end, void* memory, Watch watch) {
   // The violation loss of the paper's tasks has twice their number of contacts.
-  dispatch<10, 16>(batch, memory, [&](auto lcp) { lcp.exact(begin, end, watch); });
-}
-
-void lcp_relaxed(const LcpBatch& batch, int64_t begin, int64_t end, void* memory, Watch watch) {
+  if (batch.relaxation == 0 && batch.n < kAloneExact)
+    dispatch<10, 16>(batch, memory, [&](auto lcp) { lcp.exact(begin, end, watch); });
   // The number of contacts of the paper's tasks: a third faster than with a size that is known at run time only.
-  dispatch<5, 8>(batch, memory, [&](auto lcp) { lcp.relaxed(begin, end, watch); });
+  if (batch.relaxation > 0 && batch.n < kAloneRelaxed)
+    dispatch<5, 8>(batch, memory, [&](auto lcp) { lcp.relaxed(begin, end, watch); });
+  for (int64_t e = begin; e < end; e++) {
+    if (solved(batch.status[e])) continue;
+    if (!watch.stop(watch.context))
+      lcp_one(batch, e, memory, watch);
+    else if (batch.status[e] != kUnreached)
+      batch.status[e] = static_cast<int8_t>(Status::max_iter);
+  }
 }
 
 }  // namespace difflcs::DIFFLCS_ISA

@@ -1,26 +1,32 @@
-// One LCP at a time, slowly, with row exchanges: where the batched kernel (lcp.cpp) gave up. Plain doubles, no lanes.
+// One LCP at a time, in plain doubles, with row exchanges: what the batched kernel (lcp.cpp) gave up, and large ones.
 #pragma once
 #include "kernels.hpp"
+#include "lanes.hpp"
 
-namespace difflcs {
+namespace difflcs::DIFFLCS_ISA {
 namespace {
-
-inline int64_t lcp_one_scratch(int64_t n) { return 2 * n * n + 10 * n; }
 
 // One problem in scaled units: F' = S F S with unit diagonal, q' = S q / unit, lam = unit S lam', w = unit S^-1 w'.
 struct LcpOne {
-  const int64_t n;
-  double *F, *M, *scale, *q, *lam, *w, *x, *y, *step, *rows, *active;
+  static constexpr int64_t kPanel = 8;
+  const LcpBatch& batch;
+  const int64_t e, n;
+  const Watch watch;
+  double *F, *M, *scale, *q, *lam, *w, *x, *y, *step, *rows, *active, *path, *gap, *best;
   double unit, relaxation;  // relaxation in scaled units
+  double least;             // how far `best` is from a solution
 
-  LcpOne(const LcpBatch& batch, int64_t e, double* memory) : n(batch.n) {
+  static int64_t scratch(int64_t n) { return (2 * n * n + 12 * n) * int64_t(sizeof(double)); }
+
+  LcpOne(const LcpBatch& batch, int64_t e, void* scratch, Watch watch) : batch(batch), e(e), n(batch.n), watch(watch) {
+    double* memory = static_cast<double*>(scratch);
     auto take = [&](int64_t count) {
       double* at = memory;
       memory += count;
       return at;
     };
     F = take(n * n), M = take(n * n), scale = take(n), q = take(n), lam = take(n), w = take(n), x = take(n);
-    y = take(n), step = take(n), rows = take(n), active = take(n);
+    y = take(n), step = take(n), rows = take(n), active = take(n), path = take(n), gap = take(n), best = take(n);
     const double *from = batch.F + e * batch.F_stride, *right = batch.q + e * n;
     unit = __builtin_sqrt(batch.relaxation);
     for (int64_t i = 0; i < n; i++) {
@@ -35,55 +41,80 @@ struct LcpOne {
       q[i] = right[i] * scale[i] / unit;
     }
     relaxation = batch.relaxation / unit / unit;
+    for (int64_t i = 0; i < n; i++) best[i] = 0.0;
+    least = __builtin_inf();
+    remember(best);
   }
 
-  // LU of M, in place. Not that of lu.hpp: it divides by the pivots, which is one rounding less than to multiply by
-  // their reciprocals, and the violation loss of a model under training is solved here often enough for that to show.
-  bool factor() {
-    for (int64_t k = 0; k < n; k++) {
-      int64_t pivot = k;
-      for (int64_t i = k + 1; i < n; i++)
-        if (__builtin_fabs(M[i * n + k]) > __builtin_fabs(M[pivot * n + k])) pivot = i;
-      rows[k] = double(pivot);
-      if (!(__builtin_fabs(M[pivot * n + k]) > 0)) return false;
-      for (int64_t j = 0; pivot != k && j < n; j++) {
-        const double t = M[k * n + j];
-        M[k * n + j] = M[pivot * n + j], M[pivot * n + j] = t;
+  // LU of the m x m matrix M, in place, with row exchanges; kPanel columns at a time, so that a large matrix is read
+  // once for all of them. Not that of lu.hpp: it divides by the pivots, one rounding less than to multiply by their
+  // reciprocals, and the violation loss of a model under training is solved here often enough for that to show.
+  bool factor(int64_t m) {
+    for (int64_t k = 0; k < m && !watch.stop(watch.context); k += kPanel) {
+      const int64_t end = k + kPanel < m ? k + kPanel : m;
+      for (int64_t c = k; c < end; c++) {
+        int64_t pivot = c;
+        for (int64_t i = c + 1; i < m; i++)
+          if (__builtin_fabs(M[i * m + c]) > __builtin_fabs(M[pivot * m + c])) pivot = i;
+        rows[c] = double(pivot);
+        if (!(__builtin_fabs(M[pivot * m + c]) > 0)) return false;
+        for (int64_t j = 0; pivot != c && j < m; j++) {
+          const double t = M[c * m + j];
+          M[c * m + j] = M[pivot * m + j], M[pivot * m + j] = t;
+        }
+        for (int64_t i = c + 1; i < m; i++) {
+          const double l = M[i * m + c] /= M[c * m + c];
+          for (int64_t j = c + 1; j < end; j++) M[i * m + j] -= l * M[c * m + j];
+        }
       }
-      for (int64_t i = k + 1; i < n; i++) {
-        const double l = M[i * n + k] /= M[k * n + k];
-        for (int64_t j = k + 1; j < n; j++) M[i * n + j] -= l * M[k * n + j];
+      if (end == m) return true;
+      for (int64_t i = k + 1; i < m; i++) {
+        double l[kPanel];
+        for (int64_t c = 0; c < kPanel; c++) l[c] = k + c < i ? M[i * m + k + c] : 0.0;
+        const double* __restrict above = M + k * m;
+        double* __restrict row = M + i * m;
+        if (i < end)
+          for (int64_t c = 0; c < i - k; c++)
+            for (int64_t j = end; j < m; j++) row[j] -= l[c] * above[c * m + j];
+        else
+          for (int64_t j = end; j < m; j++) {
+            double t = row[j];
+            DIFFLCS_UNROLL
+            for (int64_t c = 0; c < kPanel; c++) t -= l[c] * above[c * m + j];
+            row[j] = t;
+          }
       }
     }
-    return true;
+    return false;
   }
-  void back(double* b) const {
-    for (int64_t k = 0; k < n; k++) {
+  void back(int64_t m, double* b) const {
+    for (int64_t k = 0; k < m; k++) {
       const int64_t other = int64_t(rows[k]);
       const double t = b[k];
       b[k] = b[other], b[other] = t;
     }
-    for (int64_t i = 0; i < n; i++)
-      for (int64_t j = 0; j < i; j++) b[i] -= M[i * n + j] * b[j];
-    for (int64_t i = n - 1; i >= 0; i--) {
-      for (int64_t j = i + 1; j < n; j++) b[i] -= M[i * n + j] * b[j];
-      b[i] /= M[i * n + i];
+    for (int64_t i = 0; i < m; i++)
+      for (int64_t j = 0; j < i; j++) b[i] -= M[i * m + j] * b[j];
+    for (int64_t i = m - 1; i >= 0; i--) {
+      for (int64_t j = i + 1; j < m; j++) b[i] -= M[i * m + j] * b[j];
+      b[i] /= M[i * m + i];
     }
   }
 
-  // F' v + q' in row i, and the sizes of its terms.
+  // F' v + q' in row i, and the sizes of its terms. `Sum`: long double where a last step is corrected by it.
+  template <class Sum = double>
   double slack(int64_t i, const double* v, double* terms) const {
-    double value = q[i];
+    Sum value = q[i];
     *terms = __builtin_fabs(value);
     for (int64_t j = 0; j < n; j++) {
-      const double t = F[i * n + j] * v[j];
-      value += t, *terms += __builtin_fabs(t);
+      const Sum t = Sum(F[i * n + j]) * v[j];
+      value += t, *terms += __builtin_fabs(double(t));
     }
-    return value;
+    return double(value);
   }
 
   // Writes lam and w in the caller's units if they hold by the bounds of kernels.hpp.
-  bool store(const LcpBatch& batch, int64_t e) const {
+  bool store() const {
     double largest = 0;
     const double root = __builtin_sqrt(relaxation);
     for (int64_t i = 0; i < n; i++) {
@@ -101,96 +132,167 @@ struct LcpOne {
                         scale[i] * scale[i] * kSmallest <= 1 && scale[i] * scale[i] >= kSmallest;
       if (!held || !sane) return false;
     }
+    write();
+    return true;
+  }
+
+  void write() const {
     for (int64_t i = 0; i < n; i++) {
       batch.lam[e * n + i] = lam[i] * (unit * scale[i]);
       batch.w[e * n + i] = w[i] * (unit / scale[i]);
     }
-    return true;
+  }
+
+  // Keeps the positive part of v if it is nearer to a solution, by the residual of Chen-Harker-Kanzow-Smale.
+  void remember(const double* v) {
+    double terms, distance = 0;
+    for (int64_t i = 0; i < n; i++) x[i] = v[i] > 0 ? v[i] : 0.0;
+    for (int64_t i = 0; i < n; i++) {
+      const double other = slack(i, x, &terms), between = x[i] - other;
+      distance += __builtin_fabs(x[i] + other - __builtin_sqrt(between * between + 4 * relaxation));
+    }
+    if (!(distance < least)) return;
+    least = distance;
+    for (int64_t i = 0; i < n; i++) best[i] = x[i];
+  }
+
+  // Principal pivoting from the set `active` of positive lam: solve for them, exchange every index whose lam or w came
+  // out negative, until five exchanges have not lowered their number (Kostreva; Judice & Pires). Or, `murty`, exchange
+  // the first of them alone, which is finite for every P-matrix and indifferent to degeneracy.
+  bool pivot(int64_t limit, bool murty) {
+    int64_t fewest = n + 1;
+    int patience = 5;
+    for (int64_t it = 0; it < limit && patience > 0 && !watch.stop(watch.context); it++) {
+      int64_t m = 0, wrong = 0;
+      auto solve = [&] {  // step, for the active rows, which it gathers and scatters
+        int64_t k = 0;
+        for (int64_t i = 0; i < n; i++)
+          if (active[i] != 0) y[k++] = step[i];
+        back(m, y);
+        k = 0;
+        for (int64_t i = 0; i < n; i++)
+          if (active[i] != 0) lam[i] += y[k++];
+      };
+      for (int64_t i = 0; i < n; i++) {
+        if (active[i] != 0) x[m++] = double(i);
+        lam[i] = 0.0, step[i] = -q[i];
+      }
+      for (int64_t i = 0; i < m; i++)
+        for (int64_t j = 0; j < m; j++) M[i * m + j] = F[int64_t(x[i]) * n + int64_t(x[j])];
+      if (m > 0 && !factor(m)) return false;
+      solve();
+      for (int refinement = 0; refinement < 2; refinement++) {
+        double terms;
+        for (int64_t i = 0; i < n; i++)
+          if (active[i] != 0) step[i] = -slack<long double>(i, lam, &terms);
+        solve();
+      }
+      for (int64_t i = 0; i < n; i++) {
+        double terms;
+        w[i] = slack(i, lam, &terms);
+        if ((active[i] != 0 ? lam[i] : w[i]) >= -1e-12 * terms) continue;
+        if (!murty || wrong == 0) active[i] = 2.0 + active[i];
+        wrong++;
+      }
+      if (wrong == 0) {
+        for (int64_t i = 0; i < n; i++) {
+          lam[i] = lam[i] > 0 ? lam[i] : 0.0;
+          w[i] = active[i] != 0 || !(w[i] > 0) ? 0.0 : w[i];
+        }
+        return store();
+      }
+      remember(lam);
+      for (int64_t i = 0; i < n; i++) active[i] = active[i] < 2 ? active[i] : 3.0 - active[i];
+      if (wrong < fewest)
+        fewest = wrong, patience = 5;
+      else
+        patience -= !murty;
+    }
+    return false;
+  }
+
+  // Infeasible interior-point method from `path` and `gap`: Newton on gap = F path + q, path o gap = mu, with mu
+  // falling to `target` and steps that keep both positive. For F + F^T positive definite it converges from any start.
+  // Returns whether it stored a solution with a relaxation; without one it ends where the mean product is below the
+  // target.
+  bool interior(double target) {
+    int at_target = 0;
+    for (int it = 0; it < 300 && at_target < 12 && !watch.stop(watch.context); it++) {
+      double product = 0, smallest = __builtin_inf();
+      for (int64_t i = 0; i < n; i++) {
+        const double t = path[i] * gap[i];
+        product += t / double(n), smallest = t < smallest ? t : smallest;
+      }
+      if (relaxation == 0 && product <= target) return false;
+      // A centred point shortens the path, one next to the border is centred first.
+      double mu = smallest > 0.1 * product ? 0.1 * product : 0.8 * product;
+      if (relaxation > 0 && (!(mu > target) || it > 250)) mu = target;
+      // gap dpath + path dgap = mu - path o gap and dgap = F dpath + missed:
+      // (diag(gap) + diag(path) F) dpath = mu - path o (gap + missed).
+      for (int64_t i = 0; i < n; i++) {
+        double terms;
+        y[i] = (at_target > 0 ? slack<long double>(i, path, &terms) : slack(i, path, &terms)) - gap[i];
+        x[i] = mu - path[i] * (gap[i] + y[i]);
+        for (int64_t j = 0; j < n; j++) M[i * n + j] = path[i] * F[i * n + j];
+        M[i * n + i] += gap[i];
+      }
+      if (!factor(n)) break;
+      back(n, x);
+      double length = 1.0;
+      for (int64_t i = 0; i < n; i++) {
+        double change = y[i];
+        for (int64_t j = 0; j < n; j++) change += F[i * n + j] * x[j];
+        step[i] = change;
+        if (x[i] < 0 && -0.9 * path[i] / x[i] < length) length = -0.9 * path[i] / x[i];
+        if (change < 0 && -0.9 * gap[i] / change < length) length = -0.9 * gap[i] / change;
+      }
+      for (int64_t i = 0; i < n; i++) path[i] += length * x[i], gap[i] += length * step[i];
+      remember(path);
+      // Newton converges quadratically from here; where rounding is large, some iterates are better than others.
+      if (mu == target && length == 1.0 && ++at_target > 5 && on_path()) return true;
+    }
+    return relaxation > 0 && on_path();
+  }
+
+  // Pivoting alone is fast where few exchanges are needed; else it begins next to the solution, where the interior
+  // point's lam exceed its w. What is left, Murty's rule solves one day.
+  bool exact() {
+    for (int64_t i = 0; i < n; i++) active[i] = q[i] < 0;
+    if (pivot(40, false)) return true;
+    const double targets[] = {1e-8, 1e-11, 1e-14};
+    for (const double target : targets) {
+      interior(target);
+      for (int64_t i = 0; i < n; i++) active[i] = path[i] > gap[i];
+      if (pivot(40, false)) return true;
+    }
+    for (int64_t i = 0; i < n; i++) active[i] = 0;
+    return pivot(int64_t{1} << (n + 2 < 16 ? n + 2 : 16), true);
+  }
+
+  // lam o w = relaxation exactly: from the larger of the two.
+  bool on_path() {
+    for (int64_t i = 0; i < n; i++) {
+      lam[i] = path[i] > gap[i] ? path[i] : relaxation / gap[i];
+      w[i] = path[i] > gap[i] ? relaxation / path[i] : gap[i];
+    }
+    return store();
   }
 };
 
-// Exact LCP by Murty's least-index method: finite for every P-matrix, indifferent to degeneracy.
-bool lcp_exact_one(const LcpBatch& batch, int64_t e, double* memory, Watch watch) {
-  LcpOne p(batch, e, memory);
-  const int64_t n = p.n, limit = int64_t{1} << (n + 2 < 16 ? n + 2 : 16);
-  for (int64_t i = 0; i < n; i++) p.active[i] = 0;
-  for (int64_t it = 0; it < limit && !watch.stop(watch.context); it++) {
-    for (int64_t i = 0; i < n; i++) {
-      for (int64_t j = 0; j < n; j++)
-        p.M[i * n + j] = p.active[i] != 0 && p.active[j] != 0 ? p.F[i * n + j] : (i == j ? 1.0 : 0.0);
-      p.lam[i] = p.active[i] != 0 ? -p.q[i] : 0.0;
-    }
-    if (!p.factor()) return false;
-    p.back(p.lam);
-    for (int refinement = 0; refinement < 2; refinement++) {
-      double terms;
-      for (int64_t i = 0; i < n; i++) p.step[i] = p.active[i] != 0 ? -p.slack(i, p.lam, &terms) : 0.0;
-      p.back(p.step);
-      for (int64_t i = 0; i < n; i++) p.lam[i] += p.step[i];
-    }
-    int64_t wrong = -1;
-    for (int64_t i = 0; i < n && wrong < 0; i++) {
-      double terms;
-      p.w[i] = p.slack(i, p.lam, &terms);
-      if (!((p.active[i] != 0 ? p.lam[i] : p.w[i]) >= -1e-12 * terms)) wrong = i;
-    }
-    if (wrong < 0) {
-      for (int64_t i = 0; i < n; i++) {
-        p.lam[i] = p.lam[i] > 0 ? p.lam[i] : 0.0;
-        p.w[i] = p.active[i] != 0 || !(p.w[i] > 0) ? 0.0 : p.w[i];
-      }
-      return p.store(batch, e);
-    }
-    p.active[wrong] = 1 - p.active[wrong];
+inline void lcp_one(const LcpBatch& batch, int64_t e, void* scratch, Watch watch) {
+  LcpOne p(batch, e, scratch, watch);
+  for (int64_t i = 0; i < p.n; i++) p.path[i] = p.gap[i] = p.relaxation > 1 ? __builtin_sqrt(p.relaxation) : 1.0;
+  Status status = Status::converged;
+  const bool finite = p.least < __builtin_inf();  // else no step helps
+  if (!finite || !(batch.relaxation > 0 ? p.interior(p.relaxation) : p.exact())) {
+    double terms;
+    for (int64_t i = 0; i < p.n; i++) p.lam[i] = p.best[i];
+    for (int64_t i = 0; i < p.n; i++) p.w[i] = p.slack(i, p.best, &terms);
+    p.write();
+    status = watch.stop(watch.context) ? Status::max_iter : Status::numerical;
   }
-  return false;
-}
-
-// Relaxed LCP by an infeasible interior-point method: Newton on w = F lam + q, lam o w = mu, with mu falling to the
-// relaxation and steps that keep lam and w positive. For F + F^T positive definite it converges from any start.
-bool lcp_relaxed_one(const LcpBatch& batch, int64_t e, double* memory, Watch watch) {
-  LcpOne p(batch, e, memory);
-  const int64_t n = p.n;
-  const double target = p.relaxation;
-  for (int64_t i = 0; i < n; i++) p.lam[i] = p.w[i] = target > 1 ? __builtin_sqrt(target) : 1.0;
-  int at_target = 0;
-  for (int it = 0; it < 300 && at_target < 8 && !watch.stop(watch.context); it++) {
-    double product = 0, smallest = __builtin_inf();
-    for (int64_t i = 0; i < n; i++) {
-      const double t = p.lam[i] * p.w[i];
-      product += t / double(n), smallest = t < smallest ? t : smallest;
-    }
-    // A centred point shortens the path, one next to the border is centred first.
-    double mu = smallest > 0.1 * product ? 0.1 * product : 0.8 * product;
-    if (!(mu > target) || it > 250) mu = target;
-    // w dlam + lam dw = mu - lam o w and dw = F dlam + missed: (diag(w) + diag(lam) F) dlam = mu - lam o (w + missed).
-    for (int64_t i = 0; i < n; i++) {
-      double terms;
-      p.y[i] = p.slack(i, p.lam, &terms) - p.w[i];
-      p.x[i] = mu - p.lam[i] * (p.w[i] + p.y[i]);
-      for (int64_t j = 0; j < n; j++) p.M[i * n + j] = p.lam[i] * p.F[i * n + j];
-      p.M[i * n + i] += p.w[i];
-    }
-    if (!p.factor()) return false;
-    p.back(p.x);
-    double length = 1.0;
-    for (int64_t i = 0; i < n; i++) {
-      double dw = p.y[i];
-      for (int64_t j = 0; j < n; j++) dw += p.F[i * n + j] * p.x[j];
-      p.step[i] = dw;
-      if (p.x[i] < 0 && -0.9 * p.lam[i] / p.x[i] < length) length = -0.9 * p.lam[i] / p.x[i];
-      if (dw < 0 && -0.9 * p.w[i] / dw < length) length = -0.9 * p.w[i] / dw;
-    }
-    for (int64_t i = 0; i < n; i++) p.lam[i] += length * p.x[i], p.w[i] += length * p.step[i];
-    if (mu == target && length == 1.0) at_target++;  // Newton converges quadratically from here
-  }
-  for (int64_t i = 0; i < n; i++)  // lam o w = relaxation exactly: from the larger of the two
-    if (p.lam[i] > p.w[i])
-      p.w[i] = target / p.lam[i];
-    else
-      p.lam[i] = target / p.w[i];
-  return p.store(batch, e);
+  batch.status[e] = static_cast<int8_t>(status);
 }
 
 }  // namespace
-}  // namespace difflcs
+}  // namespace difflcs::DIFFLCS_ISA

@@ -26,7 +26,6 @@
 #include "bind_controller.hpp"
 #include "driver.hpp"
 #include "kernels.hpp"
-#include "lcp_one.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -112,30 +111,24 @@ void on_threads(int64_t threads, int64_t workspace_bytes, Stop& stop, Work work)
 
 void solve(const difflcs::LcpBatch& batch, int64_t count, int threads, Stop& stop) {
   const auto& kernels = difflcs::kernels();
-  const bool relaxed = batch.relaxation > 0;
-  const auto run = relaxed ? kernels.lcp_relaxed : kernels.lcp_exact;
   // Blocks small enough to balance the load; where a block begins does not change any result.
-  const int64_t block = 16 * kernels.lanes;
+  const int64_t block = batch.n < difflcs::kAloneExact ? 16 * kernels.lanes : kernels.lanes;
   std::atomic<int64_t> next{0};
   const int64_t used = std::max<int64_t>(1, std::min<int64_t>(threads, (count + block - 1) / block));
-  const int64_t scratch = difflcs::lcp_one_scratch(batch.n) * int64_t(sizeof(double));
-  on_threads(used, std::max(kernels.lcp_workspace(batch.n), scratch), stop, [&](void* workspace, difflcs::Watch watch) {
-    for (int64_t b; (b = next.fetch_add(block)) < count && !watch.stop(watch.context);) {
-      const int64_t end = std::min(b + block, count);
-      run(batch, b, end, workspace, watch);
-      // What the batched kernel gave up is done again, slowly and with row exchanges.
-      for (int64_t e = b; e < end; e++) {
-        if (difflcs::solved(batch.status[e])) continue;
-        const auto one = relaxed ? difflcs::lcp_relaxed_one : difflcs::lcp_exact_one;
-        if (one(batch, e, static_cast<double*>(workspace), watch))
-          batch.status[e] = static_cast<int8_t>(difflcs::Status::converged);
-      }
-    }
+  std::fill_n(batch.status, count, difflcs::kUnreached);
+  on_threads(used, kernels.lcp_workspace(batch.n), stop, [&](void* workspace, difflcs::Watch watch) {
+    for (int64_t b; (b = next.fetch_add(block)) < count && !watch.stop(watch.context);)
+      kernels.lcp_solve(batch, b, std::min(b + block, count), workspace, watch);
   });
+  for (int64_t e = 0; e < count; e++) {
+    if (batch.status[e] != difflcs::kUnreached) continue;
+    batch.status[e] = static_cast<int8_t>(difflcs::Status::max_iter);
+    for (int64_t i = e * batch.n; i < (e + 1) * batch.n; i++) batch.lam[i] = 0, batch.w[i] = std::max(batch.q[i], 0.0);
+  }
 }
 
-void solve_lcp(Array F, Array q, double relaxation, int64_t max_iter, int threads, Output<double> lam, Output<double> w,
-               Output<int8_t> status, Output<int32_t> iterations) {
+void solve_lcp(Array F, Array q, double relaxation, int64_t max_iter, double time_limit, int threads,
+               Output<double> lam, Output<double> w, Output<int8_t> status) {
   if (q.ndim() != 2) throw std::invalid_argument("q must be (batch, n)");
   const int64_t count = q.shape(0), n = q.shape(1);
   const bool shared = F.ndim() == 2;
@@ -143,13 +136,12 @@ void solve_lcp(Array F, Array q, double relaxation, int64_t max_iter, int thread
       shared ? (int64_t(F.shape(0)) == n && int64_t(F.shape(1)) == n)
              : (F.ndim() == 3 && int64_t(F.shape(0)) == count && int64_t(F.shape(1)) == n && int64_t(F.shape(2)) == n);
   if (!F_ok || n < 1) throw std::invalid_argument("F must be (n, n) or (batch, n, n) with n >= 1");
-  if (int64_t(lam.size()) != count * n || int64_t(w.size()) != count * n || int64_t(status.size()) != count ||
-      int64_t(iterations.size()) != count)
-    throw std::invalid_argument("outputs must be (batch, n), (batch, n), (batch,), (batch,)");
+  if (int64_t(lam.size()) != count * n || int64_t(w.size()) != count * n || int64_t(status.size()) != count)
+    throw std::invalid_argument("outputs must be (batch, n), (batch, n), (batch,)");
   if (!(relaxation >= 0)) throw std::invalid_argument("relaxation must be >= 0");
-  const difflcs::LcpBatch batch{n,        F.data(),   shared ? 0 : n * n, q.data(),      relaxation,
-                                max_iter, lam.data(), w.data(),           status.data(), iterations.data()};
-  Stop stop;
+  const difflcs::LcpBatch batch{n,        F.data(),   shared ? 0 : n * n, q.data(),     relaxation,
+                                max_iter, lam.data(), w.data(),           status.data()};
+  Stop stop(time_limit);
   solve(batch, count, threads, stop);
 }
 
@@ -335,9 +327,7 @@ std::optional<bool> violation_loss(Inputs inputs, double gamma, double xi, int64
   if (!convex || b.count == 0) return std::nullopt;
   std::vector<double> w(b.count * n);
   std::vector<int8_t> status(b.count);
-  std::vector<int32_t> iterations(b.count);
-  const difflcs::LcpBatch lcp{n,        Q.data(), 0,        q.data(),      0.0,
-                              max_iter, z.data(), w.data(), status.data(), iterations.data()};
+  const difflcs::LcpBatch lcp{n, Q.data(), 0, q.data(), 0.0, max_iter, z.data(), w.data(), status.data()};
   Stop stop;
   solve(lcp, b.count, threads, stop);
   for (const int8_t s : status)
@@ -432,8 +422,8 @@ NB_MODULE(_kernels, m) {
       "The same of the violation loss.");
   m.def("status_codes", &status_codes, "How a solve can end: name and code.");
   m.def("all_finite", &all_finite, "arrays"_a, "Whether no number of some arrays is NaN or infinite.");
-  m.def("solve_lcp", &solve_lcp, "F"_a, "q"_a, "relaxation"_a, "max_iter"_a, "threads"_a, "lam"_a, "w"_a, "status"_a,
-        "iterations"_a, "Solve a batch of LCPs into the given arrays.");
+  m.def("solve_lcp", &solve_lcp, "F"_a, "q"_a, "relaxation"_a, "max_iter"_a, "time_limit"_a, "threads"_a, "lam"_a,
+        "w"_a, "status"_a, "Solve a batch of LCPs into the given arrays.");
   m.def("solve_mpc", &solve_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "u_start"_a.none(),
         "lam_start"_a.none(), "mu_start"_a.none(), "starts"_a, "seed"_a, "homotopy"_a, "shrink"_a, "tol"_a,
         "max_iter"_a, "certified"_a, "time_limit"_a, "threads"_a, "x"_a, "u"_a, "lam"_a, "mu"_a, "objective"_a,

@@ -89,10 +89,9 @@ class RelaxedLcp {
     if constexpr (kPivot) polish(lam_out, w_out, eps, skip);
   }
 
-  // From eps = 1 down to `target`. Returns the lanes that converged and counts their iterations; `bound` is scratch.
+  // From eps = 1 down to `target`. Returns the lanes that converged; `bound` is scratch.
   template <class Halted>
-  DIFFLCS_INLINE Mask follow(Vec* lam_out, Vec* w_out, Vec* bound, Vec target, int64_t max_iter, Mask& iterations,
-                             Halted halted) {
+  DIFFLCS_INLINE Mask follow(Vec* lam_out, Vec* w_out, Vec* bound, Vec target, int64_t max_iter, Halted halted) {
     const int64_t n = size();
     Vec eps = max(target, all(1)), smallest = all(1e300);  // smallest residual met at the target
     Mask solved = Mask{};
@@ -104,7 +103,6 @@ class RelaxedLcp {
       const Mask at_target = eps <= target;
       for (int l = 0; l < kLanes; l++) {
         if (solved[l]) continue;
-        iterations[l]++;
         // Converged at 1e-14, or at the level where rounding stops progress, if that is below 1e-10.
         if (at_target[l]) {
           if (residual[l] <= 1e-14 * magnitude[l])

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from difflcs import _files
-from difflcs._checks import check_number, describe
+from difflcs._checks import check_finite, check_number, describe
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, NonFiniteError, ShapeError, SolveError
 from difflcs.lcs import LCSParams, LCSSequence
@@ -214,12 +214,20 @@ class MPCController:
             system = system_at(mpc.lcs, torch.from_numpy(x), context)  # pyright: ignore
         if not isinstance(system, LCSParams | LCSSequence):
             raise DTypeError(f"lcs: expected LCSParams or LCSSequence from its params, got {describe(system)}")
+        system.check_again()
         if self._native is None:
+            self._form = {name: tuple(value.shape) for name, value in system.tensors().items()}
             self._content = controller_bytes(mpc, system)
             self._make()
             return
-        matrices = [value.detach().to("cpu", torch.float64).contiguous() for value in system.tensors().values()]
-        self._native.set_system([value.numpy() for value in matrices])
+        tensors = {name: value.detach().to("cpu", torch.float64) for name, value in system.tensors().items()}
+        check_finite(tensors)
+        for name, shape in self._form.items():
+            if (got := tuple(tensors[name].shape)) != shape:
+                raise ShapeError(
+                    f"lcs: expected {name} {shape} as in the first step, got {got}; make another controller"
+                )
+        self._native.set_system([value.contiguous().numpy() for value in tensors.values()])
 
     def reset(self) -> None:
         """Forget all plans, as at the begin of an episode."""

@@ -57,7 +57,7 @@ def controller_bytes(mpc: LCSMPCLayer, system: LCSParams | LCSSequence, step_sec
     Raises:
         InvalidInputError and its kinds: another backend, a batch, or parts that do not fit each other.
     """
-    check_number("step_seconds", step_seconds)
+    step_seconds = check_number("step_seconds", step_seconds)
     backend = mpc.backend
     if not isinstance(backend, BatchedBackend):
         raise InvalidInputError(

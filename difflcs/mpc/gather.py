@@ -104,6 +104,7 @@ class Inputs:
                     f"lcs: expected LCSParams or LCSSequence from {type(lcs).__name__}.params, got {describe(system)}; "
                     f"return one of them"
                 )
+        system.check_again()
         if isinstance(system, LCSSequence):
             self.check_horizon("lcs", system.horizon)
             self.by_stage.update(SYSTEM)

@@ -94,9 +94,9 @@ class MPCProblem(SystemMatrices):
     barrier: float = 0.0
 
     def __post_init__(self) -> None:
-        check_positive_int("horizon", self.horizon)
-        check_number("relaxation", self.relaxation, strict=True)
-        check_number("barrier", self.barrier)
+        numbers = {"horizon": check_positive_int("horizon", self.horizon)}
+        numbers |= {"relaxation": check_number("relaxation", self.relaxation, strict=True)}
+        vars(self).update(numbers, barrier=check_number("barrier", self.barrier))
         if self.g is None:
             object.__setattr__(self, "g", self.x0.new_zeros(0))
         batch, sizes = self.batch, {dim: getattr(self, dim) for dim in ("n_x", "n_u", "n_lam", "n_c")}

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeGuard
 import torch
 from torch import Tensor
 
-from difflcs._checks import all_finite, check_tensor
+from difflcs._checks import all_finite, check_tensor, is_array
 from difflcs._functorch import transforms_active
 from difflcs._modules import untouched
 from difflcs._recall import Snapshot, comparable
@@ -47,7 +47,7 @@ class Given(NamedTuple):
     def form(self) -> tuple | None:
         """What it is but for its numbers; None of what cannot be used here, or must be refused elsewhere."""
         x0, goal, lcs = self
-        if not _is_double(x0) or not (goal is None or (isinstance(goal, Tensor) and goal.is_cpu)):
+        if not _is_double(x0) or not (goal is None or is_array(goal)):
             return None
         if not (lcs is None or (type(lcs) is LCSParams and lcs.A.is_cpu)):
             return None
@@ -125,6 +125,7 @@ class _Planned:
             plan = plan.again({name: made[name] for name in ("q", "q_final", "constant")})
             self.latest = plan, Snapshot([goal])
         if lcs is not None:
+            lcs.check_again()  # pyright: ignore[reportAttributeAccessIssue]
             return plan.again({**lcs.tensors(), "x0": x0})  # pyright: ignore[reportAttributeAccessIssue]
         if x0.shape[:-1] != plan.batch:  # one state to several goals
             return plan.again({"x0": x0})
@@ -158,7 +159,7 @@ def _shaped(value: Tensor, shape: torch.Size) -> Tensor:
 
 
 def _is_double(value: object) -> TypeGuard[Tensor]:
-    return isinstance(value, Tensor) and value.dtype is torch.float64 and value.is_cpu
+    return is_array(value) and value.dtype is torch.float64
 
 
 def _held_by(layer: LCSMPCLayer, system_given: bool) -> list[Mapping[str, object]] | None:

@@ -95,7 +95,7 @@ def record(
         raise InvalidInputError(f"out: expected the name of a GIF or MP4 file, got {path}; pass --out pusht.gif")
     if path.exists() and not force:
         raise InvalidInputError(f"out: expected a new file, got {path}, which exists; pass --force or another --out")
-    check_positive_int("episodes", episodes)
+    episodes = check_positive_int("episodes", episodes)
     needed = ["PIL"] if kind == ".gif" else ["PIL", "imageio", "imageio_ffmpeg"]
     missing = [name for name in needed if importlib.util.find_spec(name) is None]
     if missing:

@@ -39,8 +39,8 @@ def ring(shape: Shape, distance: float, n_points: int) -> Tensor:
     Raises:
         InvalidInputError: parts are so far apart that one curve at this distance does not go round all of them.
     """
-    check_number("distance", distance, strict=True)
-    check_positive_int("n_points", n_points, minimum=3)
+    distance = check_number("distance", distance, strict=True)
+    n_points = check_positive_int("n_points", n_points, minimum=3)
     with torch.no_grad():
         half = 1.05 * (shape.radius + distance)
         axis = torch.linspace(-half, half, _CELLS + 1, dtype=torch.float64)

@@ -9,7 +9,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_number, check_positive_int, check_tensor
+from difflcs._checks import check_number, check_positive_int, check_tensor, make_plain
 from difflcs._linalg import product
 from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics.planar import to_body
@@ -59,6 +59,7 @@ class Workspace:
     n_discs: int = 1
 
     def __post_init__(self) -> None:
+        make_plain(self)
         check_number("step", self.step, strict=True)
         check_positive_int("n_discs", self.n_discs)
         for name in ("low", "high"):

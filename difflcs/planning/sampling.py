@@ -30,7 +30,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from difflcs._checks import check_number, check_positive_int, check_tensor, describe
+from difflcs._checks import check_number, check_positive_int, check_tensor, describe, make_plain
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError, SolveWarning
 from difflcs.mpc.layer import LCSMPCLayer
 from difflcs.mpc.solution import MPCSolution
@@ -69,6 +69,7 @@ class SamplingSettings:
     patience: int = 40
 
     def __post_init__(self) -> None:
+        make_plain(self)
         for field in fields(self):
             if field.name != "patience":
                 check_number(field.name, getattr(self, field.name))

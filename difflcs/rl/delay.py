@@ -44,7 +44,7 @@ def late_actions(act: Act, n_u: int, steps: int = 1, predict: Predict | None = N
         predict: brings a state forward by the actions that are under way, so that the plan begins where it will be
             executed. None: it begins at the state as observed.
     """
-    check_positive_int("steps", steps, minimum=0)
+    steps = check_positive_int("steps", steps, minimum=0)
     under_way: deque[np.ndarray] = deque()
 
     def late(state: Tensor, goal: Tensor, *context: Tensor) -> tuple[np.ndarray, np.ndarray]:

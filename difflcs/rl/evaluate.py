@@ -128,9 +128,8 @@ def evaluate(
     Returns:
         The success rate with its interval, and what went wrong.
     """
-    check_positive_int("goals", goals)
-    check_positive_int("seed", seed, minimum=0)
-    check_positive_int("delay", delay, minimum=0)
+    goals, seed = check_positive_int("goals", goals), check_positive_int("seed", seed, minimum=0)
+    delay = check_positive_int("delay", delay, minimum=0)
     parts: list[TensorDict] = []
     for first in range(0, goals, env.num_envs):
         count = min(env.num_envs, goals - first)

@@ -191,12 +191,12 @@ class PDDM(Trainer):
         total_episodes: int,
         episode_steps: int = 20,
     ):
-        check_positive_int("total_episodes", total_episodes)
+        total_episodes = check_positive_int("total_episodes", total_episodes)
         needed = min(max(settings.rollouts.first, settings.rollouts.each), total_episodes)
         if env.num_envs < needed:
             raise InvalidInputError(f"env: expected at least {needed} environments, got {env.num_envs}")
         sizes = (settings.ensemble.networks, settings.ensemble.width)
-        check_positive_int("seed", seed, minimum=0)
+        seed = check_positive_int("seed", seed, minimum=0)
         space: Any = env.single_observation_space
         n_seen = cost.n_x + (space[CONTEXT].shape[0] if has_context(env) else 0)
         self.ensemble = Ensemble(n_seen, cost.n_u, *sizes, generator(seed, Stream.FIT, 0, 0))

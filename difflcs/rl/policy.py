@@ -82,7 +82,7 @@ class MPCGaussian(GaussianParameters):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Solve the MPC, from the key "guess" where it is given, else cold."""
-        state, goal = (tensordict[key] for key in self.in_keys)
+        state, goal = _entries(tensordict, self.in_keys)
         solution = self.mpc(state, goal, guess=_guess(tensordict), context=tensordict.get(CONTEXT, None))
         plan = {name: getattr(solution, name).detach() for name in PLAN}
         tensordict["plan"] = TensorDict(plan, tensordict.batch_size)  # pyright: ignore[reportArgumentType]
@@ -92,7 +92,16 @@ class MPCGaussian(GaussianParameters):
 
 def _guess(tensordict: TensorDictBase) -> Primal | None:
     guess = tensordict.get("guess", None)
-    return None if guess is None else Primal(*(guess[name] for name in PLAN))
+    return None if guess is None else Primal(*_entries(guess, PLAN))
+
+
+def _entries(tensordict: TensorDictBase, keys: Sequence) -> list[Tensor]:
+    """What a policy reads."""
+    missing = [str(key) for key in keys if tensordict.get(key, None) is None]
+    if missing:
+        got = sorted(map(str, tensordict.keys()))
+        raise InvalidInputError(f"data: expected the keys {list(keys)}, got {got}; add {', '.join(missing)}")
+    return [tensordict[key] for key in keys]
 
 
 class MLPGaussian(GaussianParameters):
@@ -104,7 +113,7 @@ class MLPGaussian(GaussianParameters):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Evaluate the network."""
-        seen = (tensordict[key] for key in self.in_keys)
+        seen = _entries(tensordict, self.in_keys)
         return self.write(tensordict, self.network.mean(*seen, context=tensordict.get(CONTEXT, None)))
 
 
@@ -279,7 +288,7 @@ class LCSMPCPolicy(GaussianPolicy):
         """
         lcs = check_module(self.mpc.lcs, name="actor")
         if not is_plain(lcs):
-            state, goal = (data[key] for key in self.in_keys)
+            state, goal = _entries(data, self.in_keys)
             with quiet():
                 found = system_jacobian(self.mpc, state, goal, _guess(data), data.get(CONTEXT, None))
             return torch.linalg.solve_triangular(self.gaussian.scale_tril().detach(), found, upper=False)
@@ -287,7 +296,7 @@ class LCSMPCPolicy(GaussianPolicy):
         of_lcs = {id(p) for p in lcs.parameters()}
         learned = {name: p for name, p in self.gaussian.named_parameters() if id(p) in of_lcs and p.requires_grad}
         copies = {name: p.detach().expand(len(data), *p.shape).clone().requires_grad_() for name, p in learned.items()}
-        batch = data.select(*self.in_keys, "guess")
+        batch = data.select(*self.in_keys, "guess", strict=False)
         with quiet():
             functional_call(self.gaussian, copies, (batch,))
         mean = torch.linalg.solve_triangular(batch["scale_tril"].detach(), batch["loc"].unsqueeze(-1), upper=False)

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs.errors import DegenerateWarning, InvalidInputError, SolveWarning
+from difflcs._checks import describe
+from difflcs.errors import DegenerateWarning, InvalidInputError, NonFiniteError, SolveWarning
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
@@ -156,8 +157,8 @@ def collect(
         | ("errors", name) | (N,) | what remains after the last step, of each entry of the info that ends in `_error` |
 
     Raises:
-        InvalidInputError: too many seeds, an episode of another length, observations that autoreset overwrites, or a
-            context that changes during an episode.
+        InvalidInputError: too many seeds, an episode of another length, observations that autoreset overwrites, a
+            context that changes during an episode, a reward that is not finite, or a success that is no bool.
     """
     from tensordict import TensorDict  # takes a second
 
@@ -187,6 +188,8 @@ def collect(
         states.append(state)
         executed.append(action)
         rewards.append(np.array(reward, np.float64)[:n])
+        if len(bad := rewards[-1][stable & ~np.isfinite(rewards[-1])]):
+            raise NonFiniteError(f"env: expected finite rewards, got {bad[0]} in step {t + 1}; bound what it can be")
         ended: np.ndarray = np.asarray(terminated, bool)[:n] | np.asarray(truncated, bool)[:n]
         if bool(((ended != (t + 1 == episode_steps)) & stable).any()):
             length = f"one of {t + 1}" if t + 1 < episode_steps else "a longer one"
@@ -200,7 +203,7 @@ def collect(
             after_step()
     if "success" not in infos and stable.any():
         raise InvalidInputError(f"env: expected `success` in the info of a step, got {sorted(infos)}")
-    success = np.asarray(infos.get("success", stable), bool)[:n] & stable
+    success = np.array([_success(one) for one in infos.get("success", stable)[:n]], bool) & stable
     reported = (k for k in infos if k.endswith("_error") and not k.startswith("_") and k != "physics_error")
     errors = {k: torch.from_numpy(np.asarray(infos[k][:n], np.float64)) for k in reported}
     record: dict[str, Any] = {
@@ -216,6 +219,15 @@ def collect(
     if context is not None:
         record[CONTEXT] = torch.from_numpy(context)
     return TensorDict(record, [n])
+
+
+def _success(value: object) -> bool:
+    """The `success` of an info, None of an environment that has none."""
+    if not (value is None or (isinstance(value, bool | int | float | np.bool_ | np.number) and value in (0, 1))):
+        raise InvalidInputError(
+            f"env: expected True or False as `success` in the info, got {describe(value)}; see `collect`"
+        )
+    return bool(value)
 
 
 def _check_env(env: VectorEnv, episodes: int) -> None:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from types import UnionType
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
-from difflcs._checks import describe
+from difflcs._checks import describe, make_plain
 from difflcs._files import short
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
 
@@ -63,6 +63,7 @@ class Settings:
     """
 
     def __post_init__(self) -> None:
+        make_plain(self)
         hints = get_type_hints(type(self))
         for f in fields(self):
             _check(f.name, getattr(self, f.name), hints[f.name], f.metadata)

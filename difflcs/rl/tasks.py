@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_number, check_positive_int, did_you_mean
+from difflcs._checks import check_number, check_positive_int, did_you_mean, make_plain
 from difflcs.cost import GoalCost
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.lcs import LCSModule
@@ -104,6 +104,7 @@ class PhysicsSpec:
     told: str = ""
 
     def __post_init__(self) -> None:
+        make_plain(self)
         for name in ("make_system", "make_cost"):
             value = getattr(self, name)
             if not callable(value) and not (name == "make_cost" and value is None):
@@ -186,6 +187,7 @@ class TaskSpec:
     physics: PhysicsSpec | None = None
 
     def __post_init__(self) -> None:
+        make_plain(self)
         if not isinstance(self.name, str) or not self.name.replace("_", "").replace("-", "").isalnum():
             raise InvalidInputError(
                 f"name: expected letters, digits, '-' and '_', got {self.name!r:.100}; it becomes a part of file names"

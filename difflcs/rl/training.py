@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from difflcs._files import short, write_json
+from difflcs._files import check_path, short, write_json
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.lcs import LCSModel
 from difflcs.rl._optional import require, versions
@@ -175,6 +175,7 @@ def train(
     if spec.name != config.task:
         raise InvalidInputError(f"task: expected {config.task!r}, as the configuration says, got {spec.name!r}")
     out, init = config.directory() if out is None else Path(out), None if init is None else Path(init)
+    check_path("out", out)
     run = _Training(config, spec, out, make_envs or spec.make_envs, reporter or Reporter())
     if not force:
         with ExitStack() as held:

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import re
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
 
 from difflcs import (
+    ConstraintSequence,
     DiffLCSError,
+    GoalCost,
     LCSModel,
     LCSMPCLayer,
     LCSParams,
+    LinearConstraints,
     QuadraticCost,
+    StageBounds,
     prediction_loss,
     solve_lcp,
     violation_loss,
@@ -21,7 +26,7 @@ from difflcs import (
 from difflcs import errors as e
 from difflcs._checks import check_tensor
 from difflcs.mpc import MPCProblem, Primal
-from difflcs.mpc.backends import IpoptBackend
+from difflcs.mpc.backends import BatchedBackend, IpoptBackend
 
 SOLVER = IpoptBackend(workers=1)
 NAN, INF = float("nan"), float("inf")
@@ -58,6 +63,13 @@ BAD_TENSORS = {
     "meta": (lambda t: t.to("meta"), e.DeviceError, r"got .* on meta; move it with .*\.to\('cpu'\)"),
     "nan": (lambda t: spoil(t, NAN), e.NonFiniteError, "expected finite numbers, got 1 NaN or infinite of"),
     "inf": (lambda t: spoil(t, INF), e.NonFiniteError, "expected finite numbers, got 1 NaN or infinite of"),
+    "sparse": (lambda t: t.to_sparse(), e.DTypeError, "expected a dense tensor, got .*sparse_coo.*to_dense"),
+    "nested": (
+        lambda t: torch.nested.nested_tensor([t], layout=torch.jagged),
+        e.DTypeError,
+        "expected a dense tensor, got nested.*to_padded_tensor",
+    ),
+    "negated": (lambda t: (-1j * t).conj().imag, e.DTypeError, "expected a dense tensor.*resolve_neg"),
     "wide": (lambda t: torch.cat([t, t[..., :1]], -1), e.ShapeError, "expected .*got "),
 }
 every_bad_tensor = pytest.mark.parametrize("bad", BAD_TENSORS)
@@ -102,10 +114,69 @@ def test_solve_lcp_refuses_a_negative_or_infinite_relaxation(relaxation):
     refuse(e.InvalidInputError, match, solve_lcp, F, q, relaxation)
 
 
-@pytest.mark.parametrize("relaxation", ["0.1", None, True, [0.1]])
+@pytest.mark.parametrize("relaxation", ["0.1", None, True, [0.1], np.True_, 1j, torch.ones(()).requires_grad_()])
 def test_solve_lcp_refuses_a_relaxation_that_is_no_number(relaxation):
     F, q = torch.eye(2, dtype=torch.float64), torch.ones(2, dtype=torch.float64)
     refuse(e.DTypeError, "relaxation: expected a number, got", solve_lcp, F, q, relaxation)
+
+
+@pytest.mark.parametrize("limit", [0.0, -1.0, NAN, INF, "1", True])
+def test_solve_lcp_refuses_a_time_limit(limit):
+    F, q = torch.eye(2, dtype=torch.float64), torch.ones(2, dtype=torch.float64)
+    refuse(e.InvalidInputError, "time_limit: expected a", solve_lcp, F, q, time_limit=limit)
+
+
+# --- numbers ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "one", [np.float32(1), np.float16(1), np.int64(1), np.array(1.0), torch.tensor(1), torch.ones(())]
+)
+def test_a_number_of_numpy_or_torch_is_a_number(build, one):
+    F, q, by_stage = torch.eye(2).double(), -torch.ones(2).double(), torch.ones(2, 2).double()
+    backend = BatchedBackend(max_iter=np.int32(9), tol=one, time_limit=one)
+    mpc = layer(build, horizon=np.int64(2), u_max=one, relaxation=one, training_relaxation=one, barrier=one, u_min=-1)
+    for value in (backend.max_iter, mpc.horizon):
+        assert type(value) is int
+    for value in (backend.tol, backend.time_limit, mpc.relaxation, mpc.training_relaxation, mpc.barrier):
+        assert type(value) in (int, float)
+        assert value == 1
+    assert torch.equal(solve_lcp(F, q, one, one).lam, solve_lcp(F, q, 1.0).lam)
+    weights = GoalCost.reach(2, 2, goal_weight=one, input_weight=one, pairs=[(0, 1)], pair_weight=one)
+    assert torch.equal(weights.Q, GoalCost.reach(2, 2, pairs=[(0, 1)], pair_weight=1.0).Q)
+    full = torch.ones(2).double()
+    assert torch.equal(StageBounds(-by_stage, one).u_max, full)
+    assert torch.equal(LinearConstraints(F, q, weight=one).weight, full)
+    assert torch.equal(ConstraintSequence(F, by_stage, weight=one, by_stage=("g",)).weight, full)
+    data = torch.ones(3, 4).double(), torch.ones(3, 2).double(), torch.ones(3, 4).double()
+    model = LCSModel(4, np.int64(2), 3, init_scale=one, stiffness=one)
+    assert type(model.n_u) is int
+    assert torch.isfinite(violation_loss(model, *data, gamma=0.1, xi=one))
+
+
+@pytest.mark.parametrize("truth", [True, np.True_, torch.tensor(True)])
+def test_true_is_no_number(build, truth):
+    matrix = torch.eye(2).double()
+    for name in ("horizon", "u_max", "relaxation", "barrier"):
+        refuse(e.DTypeError, f"{name}: expected a", layer, build, **{name: truth})
+    refuse(e.DTypeError, "goal_weight: expected a number", GoalCost.reach, 2, 2, truth)
+    refuse(e.DTypeError, "weight: expected a torch.Tensor", LinearConstraints, matrix, matrix[0], weight=truth)
+    refuse(e.DTypeError, "tol: expected a number", BatchedBackend, tol=truth)
+
+
+def test_a_layer_refuses_sparse_states_also_after_others(build):
+    mpc, x0 = layer(build, backend="batched"), torch.zeros(4, dtype=torch.float64)
+    with torch.no_grad():
+        mpc(x0)
+        refuse(e.DTypeError, "x0: expected a dense tensor", mpc, x0.to_sparse())
+
+
+def test_a_layer_refuses_F_that_was_spoiled_in_place(build):
+    system, x0 = build.params(), torch.zeros(4, dtype=torch.float64)
+    for mpc, given in ((layer(build, lcs=system), {}), (layer(build, backend="batched"), {"lcs": build.params()})):
+        mpc(x0, **given)
+        given.get("lcs", system).F[0, 0] = -1
+        refuse(e.NotPositiveDefiniteError, "F: expected F", mpc, x0, **given)
 
 
 # --- LCSParams ------------------------------------------------------------------------------------------------------

@@ -165,6 +165,25 @@ def test_a_module_is_asked_at_each_step(build):
     assert not Path("never").exists()
 
 
+@pytest.mark.parametrize("change", ["sequence", "size", "F in place", "NaN"])
+def test_a_module_whose_system_changes_its_form_or_breaks_is_refused(build, change):
+    mpc = LCSMPCLayer(Leaning(build.params(0)), build.cost(0), H, -0.3, 0.3)
+    controller, x = mpc.controller(), states(1)[0]
+    before, plain, other = controller.step(x), mpc.lcs.params, build.params(0)
+    if change == "sequence":
+        other = LCSSequence.stack([other] * H)
+    elif change == "size":
+        other = build.params(0, n_lam=2)
+    else:
+        (other.A if change == "NaN" else other.F)[0, 0] = np.nan if change == "NaN" else -1.0
+    mpc.lcs.params = lambda x, context: other
+    with pytest.raises(InvalidInputError, match=r"expected (. \(.*as in the first|F \+ Fᵀ pos|finite).*; "):
+        controller.step(x)
+    mpc.lcs.params = plain
+    controller.reset()
+    assert np.array_equal(controller.step(x), before)
+
+
 # --- a step that is not solved ----------------------------------------------------------------------------------------
 
 NAN = np.full(4, np.nan)

@@ -566,6 +566,13 @@ def test_human_mode_without_display_is_refused():
 def test_user_choice_of_opengl_is_kept(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
     assert select_gl_backend() == "osmesa"
+    monkeypatch.delenv("MUJOCO_GL")
+    own = select_gl_backend()
+    monkeypatch.setenv("MUJOCO_GL", "")
+    assert select_gl_backend() == own
+    monkeypatch.setenv("MUJOCO_GL", "nonsense")
+    with pytest.raises(difflcs_envs.RenderingError, match=r"MUJOCO_GL: expected egl.*got 'nonsense'; change"):
+        select_gl_backend()
 
 
 def test_broken_opengl_names_the_packages(monkeypatch):

@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from difflcs import LCSModel, _files
-from difflcs.errors import CheckpointError, DiffLCSError
+from difflcs.errors import CheckpointError, DiffLCSError, InvalidInputError
 
 NAMES = ("A", "B", "C", "d", "D", "E", "G", "H", "c")
 
@@ -20,6 +20,15 @@ NAMES = ("A", "B", "C", "d", "D", "E", "G", "H", "c")
 @pytest.fixture
 def model(build):
     return build.model(seed=3)
+
+
+@pytest.mark.parametrize("name", [b"run\xff", b"run\0"])
+def test_a_training_refuses_a_path_that_is_no_text(name, tmp_path):
+    from difflcs.rl import train
+
+    with pytest.raises(InvalidInputError, match=r"out: expected a path in UTF-8, got .*; choose"):
+        train(out=f"{tmp_path}/{os.fsdecode(name)}")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.fixture

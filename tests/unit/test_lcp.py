@@ -438,6 +438,60 @@ def test_inputs_are_left_as_they_were(build):
     assert torch.equal(q, kept[1])
 
 
+# --- large problems -------------------------------------------------------------------------------------------------
+
+
+def make_large(kind, n, seed):
+    """F and q of a kind for which pivoting alone needs many steps, or never ends."""
+    generator = torch.Generator().manual_seed(seed)
+    A, eye = torch.randn(n, n, generator=generator, dtype=torch.float64), torch.eye(n, dtype=torch.float64)
+    ones, q = torch.ones(n, n, dtype=torch.float64), torch.randn(n, generator=generator, dtype=torch.float64)
+    if kind == "skew":
+        return A - A.T + eye, q
+    if kind == "degenerate":
+        role = torch.randint(0, 3, (n,), generator=generator)
+        F = A - A.T + eye
+        return F, torch.where(role == 2, q.abs(), 0.0) - F @ torch.where(role == 1, q.abs(), 0.0)
+    if kind == "obstacle":
+        F = 2 * eye - torch.diag(torch.ones(n - 1).double(), 1) - torch.diag(torch.ones(n - 1).double(), -1)
+        return F, F @ (0.5 - 2 * torch.linspace(-1, 1, n, dtype=torch.float64) ** 2)
+    murty = eye + 2 * torch.triu(ones, 1)
+    return (murty if kind == "murty" else murty.T @ murty), -ones[0]  # else Fathi's
+
+
+@pytest.mark.parametrize("relaxation", [0.0, 1e-4])
+@pytest.mark.parametrize("kind", ["skew", "degenerate", "obstacle", "murty", "fathi"])
+def test_large_problems_are_solved_forwards_and_backwards(kind, relaxation):
+    for n in (63, 64, 130):
+        F, q = (v.requires_grad_() for v in make_large(kind, n, n))
+        lam, w, status = solve_lcp(F, q, relaxation, time_limit=60.0)
+        (lam.sum() + w.sum()).backward()
+        assert bool(torch.isfinite(F.grad).all())
+        F, q, lam, w = (v.detach() for v in (F, q, lam, w))
+        assert int(status) == Status.CONVERGED
+        assert float((lam * w - relaxation).abs().max()) <= 1e-9 * relaxation
+        assert float(torch.minimum(lam, w).min()) >= 0
+        size = F.abs() @ lam + q.abs()
+        assert float(((w - F @ lam - q).abs() / size).max()) <= 1e-12
+        batch = solve_lcp(torch.stack([F, torch.eye(n).double()]), torch.stack([q, q]), relaxation)
+        assert torch.equal(batch.lam[0], lam)
+
+
+@pytest.mark.parametrize("relaxation", [0.0, 1e-4])
+@pytest.mark.parametrize("n", [3, 40, 300])
+def test_what_the_time_does_not_suffice_for_is_max_iter(relaxation, n):
+    F, q = (v.requires_grad_() for v in make_large("skew", n, 0))
+    with pytest.warns(SolveWarning, match="1 of 1 LCPs.*MAX_ITER: not within time_limit"):
+        lam, w, status = solve_lcp(F, q, relaxation, time_limit=1e-9)
+    assert int(status) == Status.MAX_ITER
+    assert bool(torch.isfinite(lam).all() & torch.isfinite(w).all())
+    assert bool((torch.minimum(lam, w) >= 0).all())
+    (lam.sum() + w.sum()).backward()
+    assert not F.grad.any()
+    assert not q.grad.any()
+    assert torch.equal(solve_lcp(F, q, relaxation, 60.0).lam, solve_lcp(F, q, relaxation).lam)
+
+
 # --- failures -------------------------------------------------------------------------------------------------------
 
 

@@ -6,6 +6,7 @@ import torch
 from torch import nn
 
 pytest.importorskip("torchrl")
+from difflcs.errors import InvalidInputError
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.rl.optim import NaturalGradient, StepSize
 from difflcs.rl.policy import make_actor
@@ -137,6 +138,9 @@ def test_jacobian_of_the_mpc():
                     p.view(-1)[i] -= step
             columns.append((ends[0] - ends[1]) / 2e-5 / STD)
     assert bool(found.any())
+    assert torch.equal(actor.jacobian(data.exclude("guess")), found)
+    with pytest.raises(InvalidInputError, match=r"data: expected the keys .*; add goal"):
+        actor.jacobian(data.exclude("goal"))
     torch.testing.assert_close(found, torch.stack(columns, -1), rtol=1e-4, atol=1e-4)
 
 

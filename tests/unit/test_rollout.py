@@ -89,11 +89,21 @@ def test_records_are_extended_by_stable_episodes_and_keep_the_newest():
         extended(no_episodes(env, STEPS), record[:1])
 
 
-def test_an_environment_must_say_whether_it_succeeded():
-    class Silent(PusherEnv):
+@pytest.mark.parametrize(
+    ("reward", "info", "match"),
+    [(1.0, {}, "`success`")]
+    + [(1.0, {"success": value}, "True or False") for value in ("no", 0.3, np.nan, [1])]
+    + [(value, {"success": True}, "finite rewards, got .* in step 1") for value in (-np.inf, np.nan)]
+    + [(1.0, {"success": value}, None) for value in (True, np.True_, 1, np.float32(1))],
+)
+def test_an_environment_must_say_whether_it_succeeded_and_what_it_earned(reward, info, match):
+    class Told(PusherEnv):
         def step(self, action):
-            *rest, _ = super().step(action)
-            return *rest, {}
+            observation, _, *ended, _ = super().step(action)
+            return observation, reward, *ended, info
 
-    with pytest.raises(InvalidInputError, match="`success`"):
-        collect(SyncVectorEnv([Silent]), mpc_actions(Reach()), [1], STEPS)
+    if match is None:
+        assert bool(collect(SyncVectorEnv([Told]), mpc_actions(Reach()), [1], STEPS)["success"])
+        return
+    with pytest.raises(InvalidInputError, match=match):
+        collect(SyncVectorEnv([Told]), mpc_actions(Reach()), [1], STEPS)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_choice, check_number, check_positive_int, check_threads
+from difflcs._checks import check_choice, check_number, check_positive_int, check_threads, make_plain
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.mpc import kkt
 from difflcs.mpc.backends.base import Backend, Result
@@ -87,6 +87,7 @@ class BatchedBackend(Backend):
     threads: int | None = None
 
     def __post_init__(self) -> None:
+        make_plain(self)
         check_choice("effort", self.effort, tuple(_STARTS))
         check_positive_int("max_iter", self.max_iter)
         if self.restarts is not None:

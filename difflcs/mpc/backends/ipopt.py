@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import torch
 
-from difflcs._checks import check_choice, check_number, check_positive_int, check_threads
+from difflcs._checks import check_choice, check_number, check_positive_int, check_threads, make_plain
 from difflcs.mpc import kkt
 from difflcs.mpc.backends.base import Backend, Result, certify
 from difflcs.mpc.problem import INPUTS, MAY_BE_INFINITE, MPCProblem
@@ -79,6 +79,7 @@ class IpoptBackend(Backend):
     contact: str = "equation"
 
     def __post_init__(self) -> None:
+        make_plain(self)
         check_positive_int("max_iter", self.max_iter)
         check_threads(self.workers, "workers")
         for name in ("tol", "residual_tol", "start", "mu_init", "mu_init_warm"):

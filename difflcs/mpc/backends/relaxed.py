@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_number, check_threads, describe
+from difflcs._checks import check_number, check_threads, describe, make_plain
 from difflcs._linalg import matvec
 from difflcs.errors import DTypeError
 from difflcs.lcp import solve_lcp
@@ -116,6 +116,7 @@ class RelaxedBackend(Backend):
     threads: int | None = None
 
     def __post_init__(self) -> None:
+        make_plain(self)
         if not isinstance(self.penalties, tuple) or not self.penalties:
             raise DTypeError(f"penalties: expected a tuple of numbers, one per pass, got {describe(self.penalties)}")
         for value in self.penalties:

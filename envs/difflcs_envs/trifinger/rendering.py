@@ -17,6 +17,7 @@ from difflcs_envs.errors import RenderingError
 __all__ = ["SceneRenderer", "SceneViewer", "has_display", "select_gl_backend"]
 
 _APT_LINE = "apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"
+_BACKENDS = {"", *"enable enabled on true 1 disable disabled off false 0 glfw glx egl osmesa wgl cgl".split()}
 _APT_LINE_OSMESA = "apt-get install libosmesa6"
 
 
@@ -34,13 +35,19 @@ def select_gl_backend() -> str:
 
     Returns:
         The value of `MUJOCO_GL` in lower case; empty for MuJoCo's own choice.
+
+    Raises:
+        RenderingError: MuJoCo would refuse that value when it is imported.
     """
-    if "MUJOCO_GL" not in os.environ and not has_display():
+    if not os.environ.get("MUJOCO_GL", "").strip() and not has_display():
         for backend, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
             if ctypes.util.find_library(library):
                 os.environ["MUJOCO_GL"] = backend
                 break
-    return os.environ.get("MUJOCO_GL", "").lower().strip()
+    chosen = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if chosen not in _BACKENDS:
+        raise RenderingError(f"MUJOCO_GL: expected egl, osmesa, glfw or disabled, got {chosen!r}; change or unset it")
+    return chosen
 
 
 def _make_gl_context(width: int, height: int) -> Any:
@@ -56,12 +63,16 @@ def _make_gl_context(width: int, height: int) -> Any:
         context = GLContext(width, height)
         context.make_current()
     except Exception as error:  # OpenGL raises many types: ImportError, AttributeError, GLError, RuntimeError
-        raise RenderingError(
-            f"No OpenGL context could be made (MUJOCO_GL={backend!r}, display: {has_display()}): {error}. To draw "
-            f"without a screen install EGL with '{_APT_LINE}', or OSMesa with '{_APT_LINE_OSMESA}' and "
-            "MUJOCO_GL=osmesa, and start Python again."
-        ) from error
+        raise _no_context(error) from error
     return context
+
+
+def _no_context(error: Exception) -> RenderingError:
+    return RenderingError(
+        f"No OpenGL context could be made (MUJOCO_GL={select_gl_backend()!r}, display: {has_display()}): {error}. To "
+        f"draw without a screen install EGL with '{_APT_LINE}', or OSMesa with '{_APT_LINE_OSMESA}' and "
+        "MUJOCO_GL=osmesa, and start Python again."
+    )
 
 
 class SceneRenderer:
@@ -94,7 +105,10 @@ class SceneRenderer:
         self._rectangle = mujoco.MjrRect(0, 0, width, height)
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._gpu = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        try:
+            self._gpu = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        except mujoco.FatalError as error:  # GLFW without a display makes contexts that are none
+            raise _no_context(error) from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gpu)
         self._open = True
 

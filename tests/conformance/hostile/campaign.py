@@ -72,7 +72,8 @@ _TARGETS = {
     "form": forms.FORM_TARGETS,
 }
 CELLS = [
-    *(Cell(p, t, 256, 2.0) for p in generators.LCP_CLASSES for t in targets.LCP_TARGETS),
+    *(Cell(p, t, 256, 2.0) for p in generators.LCP_CLASSES if p != "lcp-large" for t in targets.LCP_TARGETS),
+    *(Cell("lcp-large", t, 8, 0.02) for t in targets.LCP_TARGETS),
     *(Cell(p, t, 128, 1.0) for p in generators.MPC_CLASSES for t in targets.MPC_TARGETS),
     *(Cell(p, "ipopt", 8, 0.01) for p in generators.MPC_CLASSES),
     *(Cell(p, "relaxed", 8, 0.005) for p in generators.MPC_CLASSES),

@@ -217,6 +217,19 @@ def lcp_p_matrix(rng: Generator, count: int, small: bool = False) -> LCP:
     return LCP(F, _q(rng, count, n))
 
 
+def lcp_large(rng: Generator, count: int, small: bool = False) -> LCP:
+    """n 33 to 160, where pivoting may take minutes: a large skew part, an obstacle, Murty's and Fathi's, low rank."""
+    n = int(rng.integers(33, 161))
+    eye, (K, q) = np.eye(n), (rng.standard_normal((n, n)), rng.standard_normal((count, n)))
+    murty = eye + 2 * np.triu(np.ones((n, n)), 1)
+    J = K[:, : n // 2]
+    kinds = [K - K.T + eye, 2 * eye - np.eye(n, k=1) - np.eye(n, k=-1), murty, murty.T @ murty, J @ J.T + 1e-3 * eye]
+    F = kinds[rng.integers(len(kinds))]
+    q[::2] = np.where(q[::2] > 1, 0.0, -1.0)
+    q[::4] -= F @ np.where(K[0] > 0, K[0], 0.0)
+    return LCP(F, q)
+
+
 def lcp_not_definite(rng: Generator, count: int, small: bool = False) -> LCP:
     """F that is no P-matrix: random, zero, or negative. There may be no solution; refusing is right, NaN is not."""
     n = int(rng.integers(1, 9))
@@ -500,6 +513,7 @@ LCP_CLASSES: dict[str, Callable[..., LCP]] = {
     "lcp-degenerate": lcp_degenerate,
     "lcp-extreme-q": lcp_extreme_q,
     "lcp-p-matrix": lcp_p_matrix,
+    "lcp-large": lcp_large,
     "lcp-not-definite": lcp_not_definite,
 }
 MPC_CLASSES: dict[str, Callable[..., MPC]] = {

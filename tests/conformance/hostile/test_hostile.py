@@ -30,6 +30,7 @@ FLOORS = {
     "lcp-graded": 0.98,
     "lcp-degenerate": 0.98,
     "lcp-p-matrix": 0.98,
+    "lcp-large": 1.0,
     "mpc-plain": 0.85,
     "mpc-flat": 0.95,
     "mpc-flat-tiny": 0.85,
