@@ -22,7 +22,9 @@ struct Certificate {
   // Of the stage at hand.
   T *A, *B, *C, *D, *E, *F, *Q, *R, *cross, *G_x, *G_u;
   Vec *d, *c, *q, *r, *lo, *hi;
-  Vec *x, *u, *lam, *mu, *s, *size, *p, *pn, *y, *rho, *error, *N, *largest_action;
+  Vec *x, *u, *lam, *mu, *gap, *s, *p, *pn, *y, *rho, *error, *N, *largest_action;
+  // Sizes of states, costates and rho, what a unit of C'p makes of rho, and what the actions' gradients add up.
+  Vec *x_size, *p_size, *rho_size, *answer, *whole, *grown, *A_size, *C_size, *D_size;
   Vec *row, *row_terms, *row_missed;  // values of the constraints; of each the largest over the stages
   Mask* rows;
 
@@ -40,9 +42,11 @@ struct Certificate {
         arena.take(matrix[i], stages, extent(batch, field));
     }
     arena.take(rest, h, nu);
-    take(x, (h + 1) * nx), take(u, h * nu), take(lam, h * nl), take(mu, (h + 1) * nc), take(s, nl), take(size, nl);
+    take(x, (h + 1) * nx), take(u, h * nu), take(lam, h * nl), take(mu, (h + 1) * nc), take(gap, h * nl);
     take(p, nx), take(pn, nx), take(y, nl), take(rho, nl), take(error, nl), take(N, nl * nl), take(rows, nl),
-        take(largest_action, nu);
+        take(largest_action, nu), take(gradient, h * nu);
+    take(x_size, nx), take(p_size, nx), take(rho_size, nl), take(answer, nl), take(whole, nu), take(grown, nx);
+    take(A_size, nx * nx), take(C_size, nx * nl), take(D_size, nl * nx);
     take(row, (h + 1) * nc), take(row_terms, nc), take(row_missed, nc);
     if constexpr (kShared<T>)
       if (arena.memory) load_matrices(0, 0);
@@ -87,6 +91,7 @@ struct Certificate {
     void add(Vec term) { value += term, terms += abs(term); }
     Vec relative() const { return abs(value) / select(terms > 0, terms, all(1)); }
   };
+  Sum* gradient;  // reduced, of each action
 
   // Stationarity in lam, C' p + s o y + F' rho = 0 with rho = y o lam: writes what is missing into `error`, returns it
   // in parts of the terms.
@@ -158,35 +163,22 @@ struct Certificate {
     worst = poison = all(0);
     Mask fragile = Mask{};
     for (int64_t i = 0; i < nx; i++) met(Sum{x[i] - vector[kx0][0][i], abs(vector[kx0][0][i])}.relative());
+    trajectory();
     const Mask weak = constraints();
     enter(h);
     for (int64_t i = 0; i < nx; i++) {
       const T* weights = matrix[kQ_final][0];
       Vec t = vector[kq_final][0][i];
-      for (int64_t j = 0; j < nx; j++) t += weights[i * nx + j] * x[h * nx + j];
-      for (int64_t m = 0; m < nc; m++) t += G_x[m * nx + i] * mu[h * nc + m];
-      p[i] = t;
+      Sum own{t, abs(t)}, fines{};
+      for (int64_t j = 0; j < nx; j++)
+        t += weights[i * nx + j] * x[h * nx + j], own.add(weights[i * nx + j] * x_size[j]);
+      for (int64_t m = 0; m < nc; m++) fines.add(G_x[m * nx + i] * mu[h * nc + m]);
+      p[i] = t + fines.value, p_size[i] = max(max(own.terms, fines.terms), abs(p[i]));
     }
     for (int64_t k = h - 1; k >= 0; k--) {
       enter(k);
-      const Vec *xk = x + k * nx, *uk = u + k * nu, *lk = lam + k * nl, *next = x + (k + 1) * nx, *mk = mu + k * nc;
-      for (int64_t i = 0; i < nx; i++) {
-        Sum sum{d[i], abs(d[i])};
-        for (int64_t j = 0; j < nx; j++) sum.add(A[i * nx + j] * xk[j]);
-        for (int64_t j = 0; j < nu; j++) sum.add(B[i * nu + j] * uk[j]);
-        for (int64_t j = 0; j < nl; j++) sum.add(C[i * nl + j] * lk[j]);
-        sum.value -= next[i];
-        met(sum.relative());
-      }
-      for (int64_t i = 0; i < nl; i++) {
-        Sum sum{c[i], abs(c[i])};
-        for (int64_t j = 0; j < nx; j++) sum.add(D[i * nx + j] * xk[j]);
-        for (int64_t j = 0; j < nu; j++) sum.add(E[i * nu + j] * uk[j]);
-        for (int64_t j = 0; j < nl; j++) sum.add(F[i * nl + j] * lk[j]);
-        s[i] = sum.value;
-        met(abs(lk[i] * s[i] - batch.relaxation) / (batch.relaxation + 1e-7 * abs(lk[i]) * sum.terms));
-        met(select(lk[i] > 0, all(0), all(1)));
-      }
+      const Vec *xk = x + k * nx, *uk = u + k * nu, *lk = lam + k * nl, *mk = mu + k * nc;
+      s = gap + k * nl;
       met(multipliers(lk, fragile));
       for (int64_t j = 0; j < nu; j++) {
         Sum g{r[j], abs(r[j])};
@@ -196,19 +188,24 @@ struct Certificate {
         for (int64_t i = 0; i < nx; i++) g.add(B[i * nu + j] * p[i]);
         for (int64_t i = 0; i < nl; i++) g.add(E[i * nu + j] * rho[i]);
         for (int64_t m = 0; m < nc; m++) g.add(G_u[m * nu + j] * mk[m]);
-        action(k, j, uk[j], g);
+        gradient[k * nu + j] = g;
       }
       for (int64_t i = 0; i < nx; i++) {
         Vec t = q[i];
-        for (int64_t j = 0; j < nx; j++) t += Q[i * nx + j] * xk[j], t += A[j * nx + i] * p[j];
+        Sum own{t, abs(t)}, fines{};
+        for (int64_t j = 0; j < nx; j++) {
+          t += Q[i * nx + j] * xk[j], own.add(Q[i * nx + j] * x_size[j]);
+          t += A[j * nx + i] * p[j];
+        }
         for (int64_t j = 0; j < nl; j++) t += D[j * nx + i] * rho[j];
         if (batch.crossed)
-          for (int64_t j = 0; j < nu; j++) t += cross[i * nu + j] * uk[j];
-        for (int64_t m = 0; m < nc; m++) t += G_x[m * nx + i] * mk[m];
-        pn[i] = t;
+          for (int64_t j = 0; j < nu; j++) t += cross[i * nu + j] * uk[j], own.add(cross[i * nu + j] * uk[j]);
+        for (int64_t m = 0; m < nc; m++) fines.add(G_x[m * nx + i] * mk[m]);
+        pn[i] = t + fines.value, p_size[i] = max(max(p_size[i], abs(pn[i])), max(own.terms, fines.terms));
       }
       for (int64_t i = 0; i < nx; i++) p[i] = pn[i];
     }
+    actions();
     for (int l = 0; l < count; l++) {
       const int64_t e = elements[l];
       const double residual = poison[l] == 0 ? worst[l] : __builtin_inf();
@@ -219,6 +216,98 @@ struct Certificate {
   }
 
  private:
+  // Entries of a matrix, the largest over the stages.
+  void largest(Input which, Vec* to) {
+    const Steps<T>& stages = matrix[which];
+    for (int64_t i = 0; i < stages.size; i++) to[i] = all(0);
+    for (int64_t k = 0; k < stages.count; k++)
+      for (int64_t i = 0; i < stages.size; i++) to[i] = max(to[i], abs(all(0) + stages[k][i]));
+  }
+
+  // Dynamics and complementarity of all stages, and the sizes of the states.
+  void trajectory() {
+    const int64_t nx = n.x(), nu = n.u(), nl = n.l(), h = n.h;
+    largest(kA, A_size), largest(kC, C_size), largest(kD, D_size);
+    for (int64_t i = 0; i < nx; i++) x_size[i] = abs(x[i]);
+    for (int64_t i = 0; i < nl; i++) answer[i] = all(0);
+    for (int64_t k = 0; k < h; k++) {
+      enter(k);
+      const Vec *xk = x + k * nx, *uk = u + k * nu, *lk = lam + k * nl, *next = x + (k + 1) * nx;
+      for (int64_t j = 0; j < nu; j++) whole[j] = effort(k, j) - abs(uk[j]);
+      for (int64_t i = 0; i < nx; i++) {
+        Sum sum{d[i], abs(d[i])};
+        Vec more = all(0);
+        for (int64_t j = 0; j < nx; j++) sum.add(A[i * nx + j] * xk[j]);
+        for (int64_t j = 0; j < nu; j++) sum.add(B[i * nu + j] * uk[j]), more += abs(B[i * nu + j] * whole[j]);
+        for (int64_t j = 0; j < nl; j++) sum.add(C[i * nl + j] * lk[j]);
+        x_size[i] = max(x_size[i], sum.terms + more);
+        sum.value -= next[i];
+        met(sum.relative());
+      }
+      s = gap + k * nl;
+      for (int64_t i = 0; i < nl; i++) {
+        Sum sum{c[i], abs(c[i])};
+        for (int64_t j = 0; j < nx; j++) sum.add(D[i * nx + j] * xk[j]);
+        for (int64_t j = 0; j < nu; j++) sum.add(E[i * nu + j] * uk[j]);
+        for (int64_t j = 0; j < nl; j++) sum.add(F[i * nl + j] * lk[j]);
+        s[i] = sum.value;
+        met(abs(lk[i] * s[i] - batch.relaxation) / (batch.relaxation + 1e-7 * abs(lk[i]) * sum.terms));
+        met(select(lk[i] > 0, all(0), all(1)));
+        answer[i] = max(answer[i], abs(lk[i] / (s[i] + lk[i] * F[i * nl + i])));
+      }
+    }
+    for (int64_t pass = 0; pass < nx; pass++) {
+      for (int64_t i = 0; i < nx; i++) {
+        grown[i] = x_size[i];
+        Vec t = all(0);
+        for (int64_t j = 0; j < nx; j++) t += A_size[i * nx + j] * x_size[j];
+        grown[i] = max(grown[i], t);
+      }
+      for (int64_t i = 0; i < nx; i++) x_size[i] = grown[i];
+    }
+  }
+
+  // Size of an action: at least a part of its range.
+  Vec effort(int64_t k, int64_t j) const {
+    return max(abs(u[k * n.u() + j]), kCancelled * range(largest_action[j], vector[ku_min][k][j], vector[ku_max][k][j]));
+  }
+
+  // The sizes of the costates and of rho, and stationarity of all actions.
+  void actions() {
+    const int64_t nx = n.x(), nu = n.u(), nl = n.l();
+    for (int64_t pass = 0; pass <= nx; pass++) {
+      for (int64_t i = 0; i < nl; i++) {
+        Vec t = all(0);
+        for (int64_t j = 0; j < nx; j++) t += C_size[j * nl + i] * p_size[j];
+        rho_size[i] = answer[i] * t;
+      }
+      for (int64_t i = 0; i < nx && pass < nx; i++) {
+        Vec t = all(0);
+        for (int64_t j = 0; j < nx; j++) t += A_size[j * nx + i] * p_size[j];
+        for (int64_t j = 0; j < nl; j++) t += D_size[j * nx + i] * rho_size[j];
+        grown[i] = max(p_size[i], t);
+      }
+      for (int64_t i = 0; i < nx && pass < nx; i++) p_size[i] = grown[i];
+    }
+    const bool alike = matrix[kB].count == 1 && matrix[kE].count == 1 && matrix[kS].count == 1;
+    for (int64_t k = 0; k < n.h; k++) {
+      enter(k);
+      for (int64_t j = 0; j < nu; j++) {
+        if (k == 0 || !alike) {
+          whole[j] = all(0);
+          for (int64_t i = 0; i < nx; i++) {
+            whole[j] += abs(B[i * nu + j] * p_size[i]);
+            if (batch.crossed) whole[j] += abs(cross[i * nu + j] * x_size[i]);
+          }
+          for (int64_t i = 0; i < nl; i++) whole[j] += abs(E[i * nu + j] * rho_size[i]);
+        }
+        Sum& g = gradient[k * nu + j];
+        g.terms = max(g.terms, kCancelled * whole[j]);
+        action(k, j, u[k * nu + j], g);
+      }
+    }
+  }
+
   // Stationarity of one action with the reduced gradient g, and its bounds.
   void action(int64_t k, int64_t j, Vec at, Sum g) {
     const Vec below = at - lo[j], above = hi[j] - at;
@@ -254,7 +343,10 @@ struct Certificate {
         for (int64_t j = 0; j < nu && k < h; j++) sum.add(G_u[i * nu + j] * u[k * nu + j]);
         const Vec m = mu[k * nc + i], value = select(given, sum.value, all(-kHuge));
         row[k * nc + i] = value;
-        row_terms[i] = max(row_terms[i], select(given, sum.terms, all(0)));
+        Vec size = all(0);
+        for (int64_t j = 0; j < nx; j++) size += abs(G_x[i * nx + j] * x_size[j]);
+        for (int64_t j = 0; j < nu && k < h; j++) size += abs(G_u[i * nu + j] * effort(k, j));
+        row_terms[i] = max(row_terms[i], select(given, max(sum.terms, kCancelled * size), all(0)));
         const Vec held = select(m < kAtPrice * price[i], abs(value), max(-value, all(0)));
         row_missed[i] = max(row_missed[i], select(m > 0, held, max(value, all(0))));
         met(select((m >= 0) & (m * kAtPrice <= price[i]), all(0), all(1)) + 0.0 * m);

@@ -21,8 +21,9 @@ constexpr double kStationary = 1e-7;
 // Violation of a constraint, in parts of the sizes of its terms, at which it is met; and where more is rounding.
 constexpr double kMet = 1e-12, kMetRounded = 1e-7;
 // Weight of the augmented Lagrangian, in parts of the largest weight of the cost: at first, and where a violation that
-// three steps of the multipliers in a row have not halved means that the problem is infeasible.
-constexpr double kPenalty = 10.0, kLargestPenalty = 1e7;
+// three steps of the multipliers in a row have not halved means that the problem is infeasible; if the multipliers are
+// also that many times what the cost asks for, so that it is not the cost that keeps the violation.
+constexpr double kPenalty = 10.0, kLargestPenalty = 1e7, kOutbids = 1e4;
 // A step of the multipliers is due where the projected gradient is below this part of what the step before left, and of
 // the change that it would make. The first counts where constraints are far from the actions that they act through.
 constexpr double kDue = 0.03;
@@ -41,6 +42,9 @@ constexpr int64_t kFailures = 12;
 // many more: where the system is stiff, the gradient at the optimum is rounding too. Part of the cost that counts as
 // rounding.
 constexpr int64_t kStill = 8;
+// As many such steps in, a plan that is stationary but for its scale, which vanishes at a vertex, is put before the
+// certificate, which has the sizes of what cancelled.
+constexpr int64_t kAsk = 2;
 constexpr double kNothing = 1e-12;
 constexpr double kLetGo[] = {1.0, 10.0, 100.0, 1000.0};
 // The least projected gradient that is asked for then.
@@ -203,7 +207,7 @@ class Solver {
   }
 
   // `unfinished`: left as it is, for others to go on from; the objective is then what the solver itself descends on.
-  void store(const MpcSolve& o, int l, Status status, const Matrix<Vec, 0, 0>& multipliers, bool unfinished = false) {
+  void write(const MpcSolve& o, int l, Status status, const Matrix<Vec, 0, 0>& multipliers, bool unfinished = false) {
     const int64_t e = lane[l].element, states = at.x.size(), actions = at.u.size(), forces = at.lam.size();
     problem.store(o.x + e * states, at.x.entries, states, l);
     problem.store(o.u + e * actions, at.u.entries, actions, l);
@@ -214,12 +218,19 @@ class Solver {
     if (o.gained) o.gained[e] = lane[l].gained / unit;
     o.iterations[e] = int32_t(lane[l].iterations);
     o.status[e] = int8_t(status);
-    if (unfinished) {
-      o.residual[e] = kHuge, o.fragile[e] = 0;
-      return;
-    }
-    finished[waiting++] = e;
+    if (unfinished) o.residual[e] = kHuge, o.fragile[e] = 0;
+  }
+  void store(const MpcSolve& o, int l, Status status, const Matrix<Vec, 0, 0>& multipliers) {
+    write(o, l, status, multipliers);
+    finished[waiting++] = lane[l].element;
     if (waiting == kLanes) certificate.judge(o, finished, waiting), waiting = 0;
+  }
+
+  // Stores a plan as solved if the certificate takes it for that.
+  bool accepted(const MpcSolve& o, int l, const Sweep& sweep) {
+    write(o, l, sweep.weak[l] ? Status::degenerate : Status::converged, riccati.force);
+    certificate.judge(o, &lane[l].element, 1);
+    return o.status[lane[l].element] != int8_t(Status::numerical);
   }
 
   // A step of the multipliers, at the target of the homotopy: before, they would follow plans that come to nothing.
@@ -269,23 +280,29 @@ class Solver {
       const bool stuck = a.failures >= kFailures || a.still >= 4 * kStill;
       const double patience = kLetGo[stuck ? 3 : a.still / kStill];
       if (patience > 1 && tol < kInVain) tol = kInVain;
-      const bool stationary = sweep.projected[l] <= patience * tol && sweep.stationary[l] <= patience * kStationary;
+      const bool small = sweep.projected[l] <= patience * tol;
+      const bool stationary = small && sweep.stationary[l] <= patience * kStationary;
       const bool converged = stationary && met(sweep, l);
       const bool broken = !(J[l] < 1e300 && J[l] > -1e300);
+      const bool doubtful = small && !stationary && met(sweep, l) && !broken && (a.still == kAsk || stuck);
       const double largest = kLargestPenalty * lane_of(problem.weight[0], l);
       const bool infeasible = sweep.violated[l] > o.certified && a.stalled >= 3 &&
+                              sweep.fine[l] > kOutbids * sweep.pull[l] &&
                               (problem.rho[l] >= largest || a.iterations >= o.max_iter);
       if (!infeasible && !broken && a.iterations < o.max_iter && n.c() > 0 && owes(sweep, l, stationary)) {
         frozen[l] = -1;
         continue;
       }
-      if (!infeasible && !converged && !broken && a.iterations < o.max_iter && !stuck) continue;
-      frozen[l] = -1;
-      if (converged && regularisation[l] > 0 && !broken) {  // once more without it: it hides a singular Hessian
-        regularisation[l] = 0;
+      if (!infeasible && !converged && !doubtful && !broken && a.iterations < o.max_iter && !stuck) continue;
+      if ((converged || doubtful) && regularisation[l] > 0 && !broken) {  // once more without it: it hides a singular Hessian
+        frozen[l] = -1, regularisation[l] = 0;
         continue;
       }
-      store(o, l,
+      const bool done = doubtful && accepted(o, l, sweep);
+      if (doubtful && !done && !infeasible && a.iterations < o.max_iter && !stuck) continue;
+      frozen[l] = -1;
+      if (!done)
+        store(o, l,
             converged && !broken         ? (sweep.weak[l] ? Status::degenerate : Status::converged)
             : infeasible                 ? Status::infeasible
             : a.iterations >= o.max_iter ? Status::max_iter
@@ -302,7 +319,7 @@ class Solver {
       if (frozen[l] || released[l] || fresh[l] || eps[l] > batch.relaxation) continue;
       const int64_t steps = o.start[lane[l].element].explore;
       if (steps == 0 || lane[l].in_stage < steps) continue;
-      store(o, l, Status::max_iter, problem.multiplier, true);
+      write(o, l, Status::max_iter, problem.multiplier, true);
       if (!take(o, counter, l)) live--;
     }
   }

@@ -5,6 +5,7 @@ The derivation stands in `difflcs.mpc.kkt`, which offers the names of this file.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -18,6 +19,8 @@ from difflcs.mpc.solution import Primal, largest
 CERTIFIED = 1e-6
 # A multiplier above this part of its price is the price, but for rounding.
 _AT_PRICE = 1 - 1e-12
+# A scale is at least this part of what its terms would be, had nothing cancelled before: below 1e-9 of that is rounding.
+_CANCELLED = 1e-3
 
 
 @dataclass(frozen=True)
@@ -127,11 +130,13 @@ def residual(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
     - bounds: the distance of an action to them, in parts of its range u_max − u_min;
     - stationarity in λ: |Cᵀp + s∘y + Fᵀρ| in parts of its Σ|terms|;
     - stationarity in u: |u − clip(u − range·g/G)| / range, the part of its range by which the reduced gradient g would
-      still move an action. G is the scale of g: the larger of its Σ|terms| and of range·(Rⱼⱼ + BⱼᵀQBⱼ), which is what
-      its weights make of a step across the range. G does not vanish with the curvature: flat directions count;
+      still move an action. G is the scale of g: the largest of its Σ|terms|, of range·(Rⱼⱼ + BⱼᵀQBⱼ), which is what
+      its weights make of a step across the range, and of a thousandth of |Bⱼ|ᵀP + |Eⱼ|ᵀρ̂ + |Sⱼ|ᵀX, with the `sizes` of
+      costates, forces' multipliers and states before they cancel. G does not vanish with the curvature, where flat
+      directions count, nor with the costate, which at a vertex is zero but for rounding;
     - constraints: with c = G_x x + G_u u − g and its multiplier m, the size of c where 0 < m < price, that of its
       positive part where m = 0 and of its negative part where m = price, in parts of the row's unit, the largest
-      Σ|terms of c| over the stages; and 1 where m is outside [0, price].
+      Σ|terms of c| over the stages, or a thousandth of |G_x|X + |G_u||u|; and 1 where m is outside [0, price].
 
     An action with an infinite bound has no range; see `ranges` for what stands in its place.
     """
@@ -173,10 +178,16 @@ def _row_violations(problem: MPCProblem, primal: Primal) -> list[Tensor]:
 
 
 def row_units(problem: MPCProblem, primal: Primal) -> Tensor:
-    """What the violation of each constraint is measured by, (batch, n_c): the largest Σ|terms| over the stages."""
+    """What the violation of each constraint is measured by, (batch, n_c): the largest Σ|terms| over the stages.
+
+    At least a thousandth of what these would be, had nothing cancelled in the states before: beside a wall at zero.
+    """
     P, x, u = problem.steps(), primal.x.transpose(0, 1), primal.u.transpose(0, 1)
     terms = _terms((P.G_x, x)) + P.g.abs()
+    whole = _CANCELLED * _terms((P.G_x, state_sizes(problem, primal).expand_as(x)))
     terms[:-1] += _terms((P.G_u, u))
+    whole[:-1] += _CANCELLED * _terms((P.G_u, _efforts(problem, primal)))
+    terms = torch.maximum(terms, whole)
     return torch.where(torch.isinf(P.g), torch.zeros_like(terms), terms).amax(0)
 
 
@@ -233,15 +244,18 @@ def ranges(problem: MPCProblem, u: Tensor) -> Tensor:
 
 
 def gradient_terms(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
-    """Σ|terms| (batch, H, n_u) of the reduced gradient."""
+    """Σ|terms| (batch, H, n_u) of the reduced gradient, at least a thousandth of that before anything cancelled."""
     P = problem.steps()
     u, p, rho = (v.transpose(0, 1) for v in (primal.u, dual.p[:, 1:], dual.rho))
+    X, costates, forces = sizes(problem, primal, dual)
     terms = _terms((P.R, u), (P.B.mT, p), (P.E.mT, rho)) + P.r.abs()
+    whole = _terms((P.B.mT, costates), (P.E.mT, forces))
     if bool(problem.S.any()):
         terms = terms + _terms((P.S.mT, primal.x[:, :-1].transpose(0, 1)))
+        whole = whole + _terms((P.S.mT, X))
     if problem.n_c:
         terms = terms + _terms((P.G_u.mT, primal.mu[:, :-1].transpose(0, 1)))
-    terms = terms.transpose(0, 1)
+    terms = torch.maximum(terms, _CANCELLED * whole).transpose(0, 1)
     if problem.barrier > 0:
         below, above = problem.distances(primal.u)
         terms = terms + problem.barrier * (1 / below + 1 / above)
@@ -249,6 +263,57 @@ def gradient_terms(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Te
         width = ranges(problem, primal.u)
         terms = terms + 1e-8 * problem.barrier * width * (below.square().reciprocal() + above.square().reciprocal())
     return terms
+
+
+def sizes(problem: MPCProblem, primal: Primal, dual: Multipliers) -> tuple[Tensor, Tensor, Tensor]:
+    """Sizes of the states (batch, n_x), the costates (batch, n_x) and the multipliers ρ (batch, n_lam) of a plan.
+
+    A costate that is zero at a vertex of the constraints is made of terms that are not; these are it, or of terms that
+    are not. So a size is that of a number's terms, of their terms and so on, the largest over the stages, n_x times:
+    through every chain of integrators, and never further, lest it grow with the horizon.
+    """
+    P, X = problem.steps(), state_sizes(problem, primal)
+    A, C, D = (_largest(problem, name).mT for name in "ACD")
+    lam, s = primal.lam.transpose(0, 1), dual.s.transpose(0, 1)
+    # What a unit of Cᵀp at most makes of ρ by its own contact.
+    answer = (lam / (s + lam * P.F.diagonal(dim1=-2, dim2=-1))).abs().amax(0)
+    own = _terms((P.Q, X)) + P.q.abs() + _terms((P.S, primal.u.transpose(0, 1)))
+    last = matvec(problem.Q_final.abs(), X) + problem.q_final.abs()
+    first = torch.stack([own.amax(0).expand_as(last), last, dual.p.abs().amax(1)]).amax(0)
+    if problem.n_c:
+        first = torch.maximum(first, _terms((P.G_x.mT, primal.mu.transpose(0, 1))).amax(0))
+
+    def forces(size: Tensor) -> Tensor:
+        return answer * matvec(C, size)
+
+    size = _reach(lambda size: matvec(A, size) + matvec(D, forces(size)), first)
+    return X, size, forces(size)
+
+
+def state_sizes(problem: MPCProblem, primal: Primal) -> Tensor:
+    """Sizes of the states (batch, n_x), see `sizes`."""
+    P, x, lam = problem.steps(), primal.x.transpose(0, 1), primal.lam.transpose(0, 1)
+    terms = _terms((P.A, x[:-1]), (P.B, _efforts(problem, primal)), (P.C, lam)) + P.d.abs()
+    A = _largest(problem, "A")
+    return _reach(lambda size: matvec(A, size), torch.maximum(terms.amax(0), x[0].abs()))
+
+
+def _largest(problem: MPCProblem, name: str) -> Tensor:
+    """Sizes of the entries of a matrix (n, m) or (batch, n, m), the largest over the stages."""
+    value = getattr(problem, name).abs()
+    return value.amax(1) if problem.by_stage(name) else value
+
+
+def _efforts(problem: MPCProblem, primal: Primal) -> Tensor:
+    """Sizes of the actions (H, batch, n_u), which are at least a thousandth of their ranges."""
+    return torch.maximum(primal.u.abs(), _CANCELLED * ranges(problem, primal.u)).transpose(0, 1)
+
+
+def _reach(step: Callable[[Tensor], Tensor], size: Tensor) -> Tensor:
+    """The largest of `size` (batch, n) and of what up to n steps make of it."""
+    for _ in range(size.shape[-1]):
+        size = torch.maximum(size, step(size))
+    return size
 
 
 def at_rest(problem: MPCProblem) -> Tensor:
