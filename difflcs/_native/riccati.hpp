@@ -271,7 +271,8 @@ class Riccati {
       part = min(part, problem.batch.unbounded ? select(reach > kHuge, reach, reach * per_width) : reach * per_width);
       if (barrier > 0) part = select(projected > 0, part, all(0));
       found.stationary = max(found.stationary, part);
-      flat[j] = kFlat * across;
+      // Beside the kinks of constraints that is not enough.
+      flat[j] = n.c() > 0 && !kAdjoint ? (kFlat + newton.regularisation) * across : kFlat * across;
       const Vec least = 1e-10 * reference * per_width;
       const Vec curved = max(H(nx + j, nx + j) + linearisation.curvature(nx + j, nx + j), max(least, all(kTiny)));
       const Vec step = g / curved;

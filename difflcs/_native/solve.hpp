@@ -45,6 +45,9 @@ constexpr int64_t kStill = 8;
 // As many such steps in, a plan that is stationary but for its scale, which vanishes at a vertex, is put before the
 // certificate, which has the sizes of what cancelled.
 constexpr int64_t kAsk = 2;
+// A large weight of the augmented Lagrangian makes much of the rounding of a constraint. Where more than this part is
+// left of the gradient at such a vertex, the multipliers are found once more with the first weight.
+constexpr double kClean = 1e-9;
 constexpr double kNothing = 1e-12;
 constexpr double kLetGo[] = {1.0, 10.0, 100.0, 1000.0};
 // The least projected gradient that is asked for then.
@@ -89,6 +92,7 @@ class Solver {
     double left = 0;          // projected gradient after that; 0 where it is not known yet
     int64_t stalled = 0;      // steps of the multipliers in a row that hardly helped
     double gained = 0;        // by the last step
+    bool cleaned = false;     // see kClean
     int64_t still = 0;        // steps at the target in a row that gained no more than the rounding of the cost
   };
   Lane lane[kLanes];
@@ -247,6 +251,12 @@ class Solver {
     repriced |= which;
   }
 
+  static Mask only(int l) {
+    Mask which = Mask{};
+    which[l] = -1;
+    return which;
+  }
+
   // Whether the constraints of a lane are met, but for what no step of the multipliers diminishes any more.
   bool met(const Sweep& sweep, int l) const { return sweep.violated[l] <= (lane[l].stalled > 0 ? kMetRounded : kMet); }
 
@@ -258,9 +268,7 @@ class Solver {
     const bool impatient = lane[l].in_stage >= kPatience && violated <= kLittle && sweep.owing[l] > 0;
     if (!impatient && (met(sweep, l) || !(stationary || sweep.projected[l] <= due))) return false;
     lane[l].left = 0;
-    Mask which = Mask{};
-    which[l] = -1;
-    pay(which);
+    pay(only(l));
     double& rho = reinterpret_cast<double*>(&problem.rho)[l];
     lane[l].stalled = violated > 0.5 * lane[l].violated ? lane[l].stalled + 1 : 0;
     if (violated > (violated < kSmall ? kSlowEnd : kSlow) * lane[l].violated)
@@ -289,7 +297,8 @@ class Solver {
       const bool infeasible = sweep.violated[l] > o.certified && a.stalled >= 3 &&
                               sweep.fine[l] > kOutbids * sweep.pull[l] &&
                               (problem.rho[l] >= largest || a.iterations >= o.max_iter);
-      if (!infeasible && !broken && a.iterations < o.max_iter && n.c() > 0 && owes(sweep, l, stationary)) {
+      if (!infeasible && !broken && a.iterations < o.max_iter && n.c() > 0 &&
+          owes(sweep, l, stationary || (small && a.still >= kAsk))) {
         frozen[l] = -1;
         continue;
       }
@@ -299,6 +308,15 @@ class Solver {
         continue;
       }
       const bool done = doubtful && accepted(o, l, sweep);
+      const double first = kPenalty * lane_of(problem.weight[0], l);
+      if (doubtful && !a.cleaned && problem.rho[l] > first && o.residual[a.element] > kClean) {
+        frozen[l] = -1;
+        pay(only(l));
+        put(&problem.rho, 0, l, first);
+        lane[l].cleaned = true, lane[l].violated = 1e300;
+        lane[l].stalled = lane[l].failures = lane[l].in_stage = lane[l].still = 0;
+        continue;
+      }
       if (doubtful && !done && !infeasible && a.iterations < o.max_iter && !stuck) continue;
       frozen[l] = -1;
       if (!done)

@@ -6,7 +6,7 @@ The derivation stands in `difflcs.mpc.kkt`, which offers the names of this file.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -19,8 +19,10 @@ from difflcs.mpc.solution import Primal, largest
 CERTIFIED = 1e-6
 # A multiplier above this part of its price is the price, but for rounding.
 _AT_PRICE = 1 - 1e-12
-# A scale is at least this part of what its terms would be, had nothing cancelled before: below 1e-9 of that is rounding.
+# A scale is at least this part of what its terms would be, had nothing cancelled: 1e-9 of that is rounding.
 _CANCELLED = 1e-3
+# The gradient of the violations, in parts of its terms, below which they are the least nearby.
+_LEAST = 1e-4
 
 
 @dataclass(frozen=True)
@@ -211,6 +213,24 @@ def certainly_missed(problem: MPCProblem, primal: Primal) -> Tensor:
     reach = torch.where(torch.isinf(P.g), torch.zeros_like(reach), reach)
     unit = row_units(problem, primal) + reach.amax(0)
     return largest(_parts(_overshoot(problem, primal), unit)) > CERTIFIED
+
+
+def least_violated(problem: MPCProblem, primal: Primal) -> Tensor:
+    """Whether (batch,) no change of the actions nearby lessens Σ(violation / |row|)² of the hard constraints.
+
+    That is stationarity as in `residual`, with the violations as multipliers in place of the cost.
+    """
+    none = {name: torch.zeros_like(getattr(problem, name)) for name in ("Q", "R", "S", "Q_final", "q", "r", "q_final")}
+    P, alone = problem.steps(), replace(problem, **none, barrier=0.0)
+    square = P.G_x.square().sum(-1).expand(problem.horizon + 1, problem.batch, problem.n_c).clone()
+    square[:-1] += P.G_u.square().sum(-1)
+    over = _overshoot(problem, primal) / torch.where(square > 0, square, torch.ones_like(square))
+    over = torch.where(over > _LEAST * over.amax((0, 2), keepdim=True), over, 0.0)  # the rest is met
+    trial = primal._replace(mu=over.transpose(0, 1))
+    dual = multipliers(alone, trial)
+    g, width, (low, high) = dual.gradient, ranges(problem, primal.u), problem.bounds()
+    room = torch.where(g > 0, primal.u - low, high - primal.u) / torch.where(width > 0, width, torch.ones_like(width))
+    return largest(torch.minimum(_parts(g, gradient_terms(alone, trial, dual)), room).transpose(0, 1)) <= _LEAST
 
 
 def _overshoot(problem: MPCProblem, primal: Primal) -> Tensor:
