@@ -19,11 +19,11 @@ namespace {
 // Projected gradient, in parts of its scale (see certificate.hpp), at which a problem is solved.
 constexpr double kStationary = 1e-7;
 // Violation of a constraint, in parts of the sizes of its terms, at which it is met; and where more is rounding.
-constexpr double kMet = 1e-12, kMetRounded = 1e-7;
+constexpr double kMet = 1e-12, kMetHardly = 1e-10, kMetRounded = 1e-7;
 // Weight of the augmented Lagrangian, in parts of the largest weight of the cost: at first, and where a violation that
 // three steps of the multipliers in a row have not halved means that the problem is infeasible; if the multipliers are
 // also that many times what the cost asks for, so that it is not the cost that keeps the violation.
-constexpr double kPenalty = 10.0, kLargestPenalty = 1e7, kOutbids = 1e4;
+constexpr double kPenalty = 10.0, kLargestPenalty = 1e7, kOutbids = 1e6;
 // A step of the multipliers is due where the projected gradient is below this part of what the step before left, and of
 // the change that it would make. The first counts where constraints are far from the actions that they act through.
 constexpr double kDue = 0.03;
@@ -258,7 +258,10 @@ class Solver {
   }
 
   // Whether the constraints of a lane are met, but for what no step of the multipliers diminishes any more.
-  bool met(const Sweep& sweep, int l) const { return sweep.violated[l] <= (lane[l].stalled > 0 ? kMetRounded : kMet); }
+  bool met(const Sweep& sweep, int l) const {
+    const int64_t stalled = lane[l].stalled;
+    return sweep.violated[l] <= (stalled > 1 ? kMetRounded : stalled > 0 ? kMetHardly : kMet);
+  }
 
   // Whether the constraints of a lane at the target ask for other multipliers, which it then gets, or for more weight.
   bool owes(const Sweep& sweep, int l, bool stationary) {

@@ -46,7 +46,9 @@ ROW = LinearConstraints
 PROBLEMS = {
     "linear": (system([[0]], [[1]]), cost(1, 1, q_final=[-1]), 1, ROW(G=tensor([[1]]), g=tensor([1])), [0], -1),
     "row at zero": (system([[1]], [[1]]), cost(1, 1, q_final=[-3]), 2, ROW(G=tensor([[1]]), g=tensor([0])), [-1], 0),
-    "limited speed": (system(*CAR), cost(2, 1, q_final=[-1, 0]), 10, ROW(G=tensor([[0, 1]]), g=tensor([1])), [0, 0], -0.9),
+    "limited speed": (
+        system(*CAR), cost(2, 1, q_final=[-1, 0]), 10, ROW(G=tensor([[0, 1]]), g=tensor([1])), [0, 0], -0.9
+    ),
     "limited position": (
         system(*TRIPLE), cost(3, 1, q_final=[-1, 0, 0]), 8, ROW(G=tensor([[1, 0, 0]]), g=tensor([0.1])), [0, 0, 0], -0.1
     ),

@@ -32,7 +32,12 @@ def conditions(case: Case, i: int, x, u, lam, mu) -> dict[str, float]:
     low, high = (np.stack([case.at(name, i, k) for k in range(H)]) for name in ("u_min", "u_max"))
     c, size = rows(case, i, x, u)
     price = np.stack([case.at("price", i, k) for k in range(H + 1)]) if "price" in case.arrays else np.zeros((H + 1, 0))
-    size = np.maximum(size, 1e-3 * np.stack([abs(case.at("G_x", i, k)) @ X for k in range(H + 1)]) if c.size else 0.0)
+    if (
+        c.size
+    ):  # a row whose terms are rounding is met to a part of what its states are made of, and of its actions' range
+        efforts = np.maximum(abs(u), 1e-3 * np.where(np.isfinite(high - low), high - low, abs(u)))
+        size = np.maximum(size, 1e-3 * np.stack([abs(case.at("G_x", i, k)) @ X for k in range(H + 1)]))
+        size[:-1] = np.maximum(size[:-1], [1e-3 * abs(case.at("G_u", i, k)) @ efforts[k] for k in range(H)])
     unit = np.where(np.isfinite(c), size, 0.0).max(0, initial=0.0)
     unit = np.where(unit > 0, unit, 1.0)
     off = np.where(mu <= 0, np.maximum(c, 0), np.where(mu >= price, np.maximum(-c, 0), abs(c)))
