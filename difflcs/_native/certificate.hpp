@@ -249,45 +249,52 @@ struct Certificate {
         Sum sum{c[i], abs(c[i])};
         for (int64_t j = 0; j < nx; j++) sum.add(D[i * nx + j] * xk[j]);
         for (int64_t j = 0; j < nu; j++) sum.add(E[i * nu + j] * uk[j]);
-        for (int64_t j = 0; j < nl; j++) sum.add(F[i * nl + j] * lk[j]);
+        Vec row = all(0);
+        for (int64_t j = 0; j < nl; j++) sum.add(F[i * nl + j] * lk[j]), row += abs(all(0) + F[i * nl + j]);
         s[i] = sum.value;
         met(abs(lk[i] * s[i] - batch.relaxation) / (batch.relaxation + 1e-7 * abs(lk[i]) * sum.terms));
         met(select(lk[i] > 0, all(0), all(1)));
-        answer[i] = max(answer[i], abs(lk[i] / (s[i] + lk[i] * F[i * nl + i])));
+        answer[i] = max(answer[i], abs(lk[i] / (s[i] + lk[i] * row)));
       }
     }
+    reach(x_size, nx, 1);
+  }
+
+  // Lets the sizes of states reach others along A, those of costates along its transpose.
+  void reach(Vec* size, int64_t by_row, int64_t by_column) {
+    const int64_t nx = n.x();
     for (int64_t pass = 0; pass < nx; pass++) {
       for (int64_t i = 0; i < nx; i++) {
-        grown[i] = x_size[i];
         Vec t = all(0);
-        for (int64_t j = 0; j < nx; j++) t += A_size[i * nx + j] * x_size[j];
-        grown[i] = max(grown[i], t);
+        for (int64_t j = 0; j < nx; j++) t += A_size[i * by_row + j * by_column] * size[j];
+        grown[i] = max(size[i], kFurther * t);
       }
-      for (int64_t i = 0; i < nx; i++) x_size[i] = grown[i];
+      for (int64_t i = 0; i < nx; i++) size[i] = grown[i];
     }
   }
 
   // Size of an action: at least a part of its range.
   Vec effort(int64_t k, int64_t j) const {
-    return max(abs(u[k * n.u() + j]), kCancelled * range(largest_action[j], vector[ku_min][k][j], vector[ku_max][k][j]));
+    const Vec width = range(largest_action[j], vector[ku_min][k][j], vector[ku_max][k][j]);
+    return max(abs(u[k * n.u() + j]), kCancelled * width);
   }
 
   // The sizes of the costates and of rho, and stationarity of all actions.
   void actions() {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l();
-    for (int64_t pass = 0; pass <= nx; pass++) {
+    for (int pass = 0; pass < 2; pass++) {  // through one contact
+      reach(p_size, 1, nx);
       for (int64_t i = 0; i < nl; i++) {
         Vec t = all(0);
         for (int64_t j = 0; j < nx; j++) t += C_size[j * nl + i] * p_size[j];
         rho_size[i] = answer[i] * t;
       }
-      for (int64_t i = 0; i < nx && pass < nx; i++) {
+      for (int64_t i = 0; i < nx && pass == 0; i++) {
         Vec t = all(0);
-        for (int64_t j = 0; j < nx; j++) t += A_size[j * nx + i] * p_size[j];
         for (int64_t j = 0; j < nl; j++) t += D_size[j * nx + i] * rho_size[j];
-        grown[i] = max(p_size[i], t);
+        p_size[i] = max(p_size[i], kFurther * t);
       }
-      for (int64_t i = 0; i < nx && pass < nx; i++) p_size[i] = grown[i];
+      if (nl == 0) break;
     }
     const bool alike = matrix[kB].count == 1 && matrix[kE].count == 1 && matrix[kS].count == 1;
     for (int64_t k = 0; k < n.h; k++) {

@@ -306,7 +306,8 @@ class Solver {
         continue;
       }
       if (!infeasible && !converged && !doubtful && !broken && a.iterations < o.max_iter && !stuck) continue;
-      if ((converged || doubtful) && regularisation[l] > 0 && !broken) {  // once more without it: it hides a singular Hessian
+      // Once more without regularisation: it hides a singular Hessian.
+      if ((converged || doubtful) && regularisation[l] > 0 && !broken) {
         frozen[l] = -1, regularisation[l] = 0;
         continue;
       }
@@ -324,11 +325,11 @@ class Solver {
       frozen[l] = -1;
       if (!done)
         store(o, l,
-            converged && !broken         ? (sweep.weak[l] ? Status::degenerate : Status::converged)
-            : infeasible                 ? Status::infeasible
-            : a.iterations >= o.max_iter ? Status::max_iter
-                                         : Status::numerical,
-            riccati.force);
+              converged && !broken         ? (sweep.weak[l] ? Status::degenerate : Status::converged)
+              : infeasible                 ? Status::infeasible
+              : a.iterations >= o.max_iter ? Status::max_iter
+                                           : Status::numerical,
+              riccati.force);
       if (!take(o, counter, l)) live--;
     }
     return frozen;

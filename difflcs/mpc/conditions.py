@@ -5,7 +5,6 @@ The derivation stands in `difflcs.mpc.kkt`, which offers the names of this file.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -21,6 +20,8 @@ CERTIFIED = 1e-6
 _AT_PRICE = 1 - 1e-12
 # A scale is at least this part of what its terms would be, had nothing cancelled: 1e-9 of that is rounding.
 _CANCELLED = 1e-3
+# What a step further along a chain of states counts: below the growth of most systems, so that no size grows with it.
+_FURTHER = 0.1
 # The gradient of the violations, in parts of its terms, below which they are the least nearby.
 _LEAST = 1e-4
 
@@ -289,33 +290,32 @@ def sizes(problem: MPCProblem, primal: Primal, dual: Multipliers) -> tuple[Tenso
     """Sizes of the states (batch, n_x), the costates (batch, n_x) and the multipliers ρ (batch, n_lam) of a plan.
 
     A costate that is zero at a vertex of the constraints is made of terms that are not; these are it, or of terms that
-    are not. So a size is that of a number's terms, of their terms and so on, the largest over the stages, n_x times:
-    through every chain of integrators, and never further, lest it grow with the horizon.
+    are not. So a size is that of a number's terms, the largest over the stages, or a tenth of what A makes of the size
+    of another, n_x times, and once through a contact: that is along every chain of integrators, and does not grow with
+    the horizon.
     """
     P, X = problem.steps(), state_sizes(problem, primal)
     A, C, D = (_largest(problem, name).mT for name in "ACD")
     lam, s = primal.lam.transpose(0, 1), dual.s.transpose(0, 1)
-    # What a unit of Cᵀp at most makes of ρ by its own contact.
-    answer = (lam / (s + lam * P.F.diagonal(dim1=-2, dim2=-1))).abs().amax(0)
+    # About what a unit of Cᵀp makes of ρ: no more than its contact by itself.
+    answer = (lam / (s + lam * P.F.abs().sum(-1))).abs().amax(0)
     own = _terms((P.Q, X)) + P.q.abs() + _terms((P.S, primal.u.transpose(0, 1)))
     last = matvec(problem.Q_final.abs(), X) + problem.q_final.abs()
     first = torch.stack([own.amax(0).expand_as(last), last, dual.p.abs().amax(1)]).amax(0)
     if problem.n_c:
         first = torch.maximum(first, _terms((P.G_x.mT, primal.mu.transpose(0, 1))).amax(0))
 
-    def forces(size: Tensor) -> Tensor:
-        return answer * matvec(C, size)
-
-    size = _reach(lambda size: matvec(A, size) + matvec(D, forces(size)), first)
-    return X, size, forces(size)
+    size = _reach(A, first)
+    if problem.n_lam:
+        size = _reach(A, torch.maximum(size, _FURTHER * matvec(D, answer * matvec(C, size))))
+    return X, size, answer * matvec(C, size)
 
 
 def state_sizes(problem: MPCProblem, primal: Primal) -> Tensor:
     """Sizes of the states (batch, n_x), see `sizes`."""
     P, x, lam = problem.steps(), primal.x.transpose(0, 1), primal.lam.transpose(0, 1)
     terms = _terms((P.A, x[:-1]), (P.B, _efforts(problem, primal)), (P.C, lam)) + P.d.abs()
-    A = _largest(problem, "A")
-    return _reach(lambda size: matvec(A, size), torch.maximum(terms.amax(0), x[0].abs()))
+    return _reach(_largest(problem, "A"), torch.maximum(terms.amax(0), x[0].abs()))
 
 
 def _largest(problem: MPCProblem, name: str) -> Tensor:
@@ -329,10 +329,10 @@ def _efforts(problem: MPCProblem, primal: Primal) -> Tensor:
     return torch.maximum(primal.u.abs(), _CANCELLED * ranges(problem, primal.u)).transpose(0, 1)
 
 
-def _reach(step: Callable[[Tensor], Tensor], size: Tensor) -> Tensor:
-    """The largest of `size` (batch, n) and of what up to n steps make of it."""
+def _reach(A: Tensor, size: Tensor) -> Tensor:
+    """The largest of `size` (batch, n) and of what up to n steps along A, a tenth each, make of it."""
     for _ in range(size.shape[-1]):
-        size = torch.maximum(size, step(size))
+        size = torch.maximum(size, _FURTHER * matvec(A, size))
     return size
 
 
