@@ -20,7 +20,7 @@ CERTIFIED = 1e-6
 _AT_PRICE = 1 - 1e-12
 # A scale is at least this part of what its terms would be, had nothing cancelled: 1e-9 of that is rounding.
 _CANCELLED = 1e-3
-# What a step further along a chain of states counts: below the growth of most systems, so that no size grows with it.
+# What a step further along a chain of states counts: so little that no size grows with it in most systems.
 _FURTHER = 0.1
 # The gradient of the violations, in parts of its terms, below which they are the least nearby.
 _LEAST = 1e-4
@@ -139,7 +139,7 @@ def residual(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
       directions count, nor with the costate, which at a vertex is zero but for rounding;
     - constraints: with c = G_x x + G_u u − g and its multiplier m, the size of c where 0 < m < price, that of its
       positive part where m = 0 and of its negative part where m = price, in parts of the row's unit, the largest
-      Σ|terms of c| over the stages, or a thousandth of |G_x|X + |G_u||u|; and 1 where m is outside [0, price].
+      Σ|terms of c| over the stages, or a thousandth of |G_x|X (`row_units`); and 1 where m is outside [0, price].
 
     An action with an infinite bound has no range; see `ranges` for what stands in its place.
     """
@@ -183,14 +183,14 @@ def _row_violations(problem: MPCProblem, primal: Primal) -> list[Tensor]:
 def row_units(problem: MPCProblem, primal: Primal) -> Tensor:
     """What the violation of each constraint is measured by, (batch, n_c): the largest Σ|terms| over the stages.
 
-    At least a thousandth of what these would be, had nothing cancelled in the states before: beside a wall at zero.
+    At least a thousandth of what these would be, had nothing cancelled in the states before, and a millionth of what
+    the actions' ranges make of the row in a step: beside a wall at zero.
     """
     P, x, u = problem.steps(), primal.x.transpose(0, 1), primal.u.transpose(0, 1)
     terms = _terms((P.G_x, x)) + P.g.abs()
-    whole = _CANCELLED * _terms((P.G_x, state_sizes(problem, primal).expand_as(x)))
+    whole = _terms((P.G_x, state_sizes(problem, primal))) + _CANCELLED * _reach(problem, primal)
     terms[:-1] += _terms((P.G_u, u))
-    whole[:-1] += _CANCELLED * _terms((P.G_u, _efforts(problem, primal)))
-    terms = torch.maximum(terms, whole)
+    terms = torch.maximum(terms, _CANCELLED * whole)
     return torch.where(torch.isinf(P.g), torch.zeros_like(terms), terms).amax(0)
 
 
@@ -207,13 +207,19 @@ def certainly_missed(problem: MPCProblem, primal: Primal) -> Tensor:
     That is by `CERTIFIED` of its row's unit and of what the actions can move it by in a step. Where all terms of a row
     vanish, as beside a wall at zero, a rounding error is as large as its unit.
     """
+    reach = _reach(problem, primal)
+    reach = torch.where(torch.isinf(problem.steps().g), torch.zeros_like(reach), reach)
+    unit = row_units(problem, primal) + reach.amax(0)
+    return largest(_parts(_overshoot(problem, primal), unit)) > CERTIFIED
+
+
+def _reach(problem: MPCProblem, primal: Primal) -> Tensor:
+    """What the ranges of the actions make of each row in a step, (H+1, batch, n_c)."""
     P, width = problem.steps(), ranges(problem, primal.u).transpose(0, 1)
     moved = matvec(P.B.abs(), width)
     reach = _terms((P.G_x, torch.cat([torch.zeros_like(moved[:1]), moved])))
     reach[:-1] += _terms((P.G_u, width))
-    reach = torch.where(torch.isinf(P.g), torch.zeros_like(reach), reach)
-    unit = row_units(problem, primal) + reach.amax(0)
-    return largest(_parts(_overshoot(problem, primal), unit)) > CERTIFIED
+    return reach
 
 
 def least_violated(problem: MPCProblem, primal: Primal) -> Tensor:
@@ -287,53 +293,42 @@ def gradient_terms(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Te
 
 
 def sizes(problem: MPCProblem, primal: Primal, dual: Multipliers) -> tuple[Tensor, Tensor, Tensor]:
-    """Sizes of the states (batch, n_x), the costates (batch, n_x) and the multipliers ρ (batch, n_lam) of a plan.
+    """Sizes of the states x_k (H, batch, n_x), costates p_{k+1} (H, batch, n_x) and ρ_k (H, batch, n_lam) of a plan.
 
     A costate that is zero at a vertex of the constraints is made of terms that are not; these are it, or of terms that
-    are not. So a size is that of a number's terms, the largest over the stages, or a tenth of what A makes of the size
-    of another, n_x times, and once through a contact: that is along every chain of integrators, and does not grow with
-    the horizon.
+    are not. So a size is Σ|terms| of a number, that of the stage after it (before it, of a state), or a tenth of what A
+    makes of the sizes there, and of what a contact makes of the terms there. Along a chain of integrators it reaches as
+    far as their rounding does; it does not grow along the horizon but where the numbers do, or A by more than ten.
     """
-    P, X = problem.steps(), state_sizes(problem, primal)
-    A, C, D = (_largest(problem, name).mT for name in "ACD")
-    lam, s = primal.lam.transpose(0, 1), dual.s.transpose(0, 1)
+    X, steps, data = state_sizes(problem, primal), problem.steps(), stages_of(problem)
+    u, lam, p, rho, s = (v.transpose(0, 1) for v in (primal.u, primal.lam, dual.p, dual.rho, dual.s))
     # About what a unit of Cᵀp makes of ρ: no more than its contact by itself.
-    answer = (lam / (s + lam * P.F.abs().sum(-1))).abs().amax(0)
-    own = _terms((P.Q, X)) + P.q.abs() + _terms((P.S, primal.u.transpose(0, 1)))
-    last = matvec(problem.Q_final.abs(), X) + problem.q_final.abs()
-    first = torch.stack([own.amax(0).expand_as(last), last, dual.p.abs().amax(1)]).amax(0)
+    answer = (lam / (s + lam * steps.F.abs().sum(-1))).abs()
+    own = _terms((steps.Q, X[:-1]), (steps.A.mT, p[1:]), (steps.D.mT, rho), (steps.S, u)) + steps.q.abs()
+    terms = matvec(problem.Q_final.abs(), X[-1]) + problem.q_final.abs()
     if problem.n_c:
-        first = torch.maximum(first, _terms((P.G_x.mT, primal.mu.transpose(0, 1))).amax(0))
-
-    size = _reach(A, first)
-    if problem.n_lam:
-        size = _reach(A, torch.maximum(size, _FURTHER * matvec(D, answer * matvec(C, size))))
-    return X, size, answer * matvec(C, size)
+        fines = _terms((steps.G_x.mT, primal.mu.transpose(0, 1)))
+        own, terms = own + fines[:-1], terms + fines[-1]
+    size, costates, forces = terms, [], []
+    for k in reversed(range(problem.horizon)):
+        A, C, D = (getattr(data[k], name).abs().mT for name in "ACD")
+        costates.append(size)
+        forces.append(answer[k] * matvec(C, size))
+        further = torch.maximum(matvec(A, size), matvec(D, answer[k] * matvec(C, terms)))
+        terms = own[k]
+        size = torch.maximum(torch.maximum(terms, size), _FURTHER * further)
+    return X[:-1], torch.stack(costates[::-1]), torch.stack(forces[::-1])
 
 
 def state_sizes(problem: MPCProblem, primal: Primal) -> Tensor:
-    """Sizes of the states (batch, n_x), see `sizes`."""
-    P, x, lam = problem.steps(), primal.x.transpose(0, 1), primal.lam.transpose(0, 1)
-    terms = _terms((P.A, x[:-1]), (P.B, _efforts(problem, primal)), (P.C, lam)) + P.d.abs()
-    return _reach(_largest(problem, "A"), torch.maximum(terms.amax(0), x[0].abs()))
-
-
-def _largest(problem: MPCProblem, name: str) -> Tensor:
-    """Sizes of the entries of a matrix (n, m) or (batch, n, m), the largest over the stages."""
-    value = getattr(problem, name).abs()
-    return value.amax(1) if problem.by_stage(name) else value
-
-
-def _efforts(problem: MPCProblem, primal: Primal) -> Tensor:
-    """Sizes of the actions (H, batch, n_u), which are at least a thousandth of their ranges."""
-    return torch.maximum(primal.u.abs(), _CANCELLED * ranges(problem, primal.u)).transpose(0, 1)
-
-
-def _reach(A: Tensor, size: Tensor) -> Tensor:
-    """The largest of `size` (batch, n) and of what up to n steps along A, a tenth each, make of it."""
-    for _ in range(size.shape[-1]):
-        size = torch.maximum(size, _FURTHER * matvec(A, size))
-    return size
+    """Sizes of the states (H+1, batch, n_x), see `sizes`."""
+    P, x, lam, data = problem.steps(), primal.x.transpose(0, 1), primal.lam.transpose(0, 1), stages_of(problem)
+    terms = _terms((P.A, x[:-1]), (P.B, primal.u.transpose(0, 1)), (P.C, lam)) + P.d.abs()
+    found = [x[0].abs()]
+    for k, own in enumerate(terms):
+        further = _FURTHER * matvec(data[k].A.abs(), found[-1])
+        found.append(torch.maximum(torch.maximum(own, found[-1]), further))
+    return torch.stack(found)
 
 
 def at_rest(problem: MPCProblem) -> Tensor:
