@@ -33,8 +33,6 @@ _WEAK = 1e-5
 # A reduced Hessian counts as singular below this pivot, in units of each action's own curvature. Directions below it
 # are held: their sensitivity is zero.
 _SINGULAR = 1e-10
-# With constraints an action this part of its range inside its bounds is not at them for the rounding of a gradient.
-_INSIDE = 1e-3
 # An action with a barrier is differentiated as one at its bound below this part of its range.
 _CLOSE = 1e-8
 # Weight of a held constraint in the augmented Hessian, in units of the row's own curvature; each pass of the refinement
@@ -171,7 +169,7 @@ class _Bounds:
         across = torch.maximum(terms, width * rest) / torch.where(width > 0, width, torch.ones_like(width))
         least = (1e-10 * across).clamp_min(torch.finfo(torch.float64).tiny)
         # With constraints the curvature may be negative at a solution, or zero: only along them it is not.
-        least = torch.maximum(torch.maximum(least, rest), _INSIDE * across) if problem.n_c else least
+        least = torch.maximum(least, rest) if problem.n_c else least
         return cls(problem, primal, dual.gradient, terms, width, least, across)
 
     def free(self, k: int, Q_uu: Tensor) -> Tensor:
@@ -179,8 +177,10 @@ class _Bounds:
         u, g, width, low, high = (v[:, k] for v in (self.u, self.gradient, self.width, self.low, self.high))
         h = torch.maximum(Q_uu.diagonal(dim1=-2, dim2=-1), self.least[:, k])
         to_lower, to_upper, step, fixed = u - low, high - u, g / h, high <= low
-        lower = (step > to_lower) | (fixed & (g >= 0))
-        upper = (-step > to_upper) | (fixed & (g < 0))
+        # With constraints an action is not at a bound for what a solver leaves of a gradient that cancels.
+        held = g / torch.maximum(h, self.across[:, k]) if self.problem.n_c else step
+        lower = (held > to_lower) | (fixed & (g >= 0))
+        upper = (-held > to_upper) | (fixed & (g < 0))
         # With one bound, at zero, and at rest there in all steps, the action has no size: the gradient alone decides.
         small = torch.where(width > 0, step.abs() <= _WEAK * width, g.abs() <= _WEAK * self.terms[:, k])
         weak = (torch.minimum(to_lower, to_upper) <= _WEAK * width) & small & ~fixed
