@@ -72,6 +72,7 @@ class Riccati {
   Vec *row_terms, *row_violation;  // of each constraint, the largest over the stages
   Mask* active;
   Newton newton;
+  Vec kinked;  // beside the kinks of constraints: damping of what is flat
   Sweep found;
 
  public:
@@ -110,7 +111,11 @@ class Riccati {
   Sweep sweep(const Trajectory<S>& at, const Upstream<S>& upstream, const Newton& how = {}) {
     newton = how;
     found = {all(0), all(0), all(0), all(0), all(0), all(0), all(0), Mask{}};
-    for (int64_t i = 0; i < n.c(); i++) row_terms[i] = problem.reach[i], row_violation[i] = all(0);
+    kinked = all(0);
+    for (int64_t i = 0; i < n.c(); i++) {
+      row_terms[i] = problem.reach[i], row_violation[i] = all(0);
+      if (!kAdjoint) kinked = select(problem.reach[i] > 0, newton.regularisation, kinked);
+    }
     for (int64_t j = 0; j < n.u() && problem.batch.unbounded; j++) {
       largest_action[j] = all(0);
       for (int64_t k = 0; k < n.h; k++) largest_action[j] = max(largest_action[j], abs(at.u(k, j)));
@@ -271,8 +276,7 @@ class Riccati {
       part = min(part, problem.batch.unbounded ? select(reach > kHuge, reach, reach * per_width) : reach * per_width);
       if (barrier > 0) part = select(projected > 0, part, all(0));
       found.stationary = max(found.stationary, part);
-      // Beside the kinks of constraints that is not enough.
-      flat[j] = n.c() > 0 && !kAdjoint ? (kFlat + newton.regularisation) * across : kFlat * across;
+      flat[j] = (kFlat + kinked) * across;
       const Vec least = 1e-10 * reference * per_width;
       const Vec curved = max(H(nx + j, nx + j) + linearisation.curvature(nx + j, nx + j), max(least, all(kTiny)));
       const Vec step = g / curved;
