@@ -22,7 +22,10 @@ struct Certificate {
   // Of the stage at hand.
   T *A, *B, *C, *D, *E, *F, *Q, *R, *cross, *G_x, *G_u;
   Vec *d, *c, *q, *r, *lo, *hi;
-  Vec *x, *u, *lam, *mu, *s, *size, *p, *pn, *y, *rho, *error, *N, *largest_action;
+  Vec *x, *u, *lam, *mu, *gap, *s, *p, *pn, *y, *rho, *error, *N, *largest_action;
+  // Sizes of all states, and at a stage of costates and of what they make of rho (kkt.py: `sizes`); terms of both.
+  Vec *x_size, *p_size, *rho_size, *p_terms, *rho_terms, *terms, *grown;
+  Vec* moved;  // what the ranges of the actions before make of each state
   Vec *row, *row_terms, *row_missed;  // values of the constraints; of each the largest over the stages
   Mask* rows;
 
@@ -40,9 +43,11 @@ struct Certificate {
         arena.take(matrix[i], stages, extent(batch, field));
     }
     arena.take(rest, h, nu);
-    take(x, (h + 1) * nx), take(u, h * nu), take(lam, h * nl), take(mu, (h + 1) * nc), take(s, nl), take(size, nl);
+    take(x, (h + 1) * nx), take(u, h * nu), take(lam, h * nl), take(mu, (h + 1) * nc), take(gap, h * nl);
     take(p, nx), take(pn, nx), take(y, nl), take(rho, nl), take(error, nl), take(N, nl * nl), take(rows, nl),
         take(largest_action, nu);
+    take(x_size, (h + 1) * nx), take(p_size, nx), take(rho_size, nl), take(p_terms, nx), take(rho_terms, nl);
+    take(terms, nx), take(grown, nx), take(moved, nc > 0 ? (h + 1) * nx : 0);
     take(row, (h + 1) * nc), take(row_terms, nc), take(row_missed, nc);
     if constexpr (kShared<T>)
       if (arena.memory) load_matrices(0, 0);
@@ -158,56 +163,60 @@ struct Certificate {
     worst = poison = all(0);
     Mask fragile = Mask{};
     for (int64_t i = 0; i < nx; i++) met(Sum{x[i] - vector[kx0][0][i], abs(vector[kx0][0][i])}.relative());
+    trajectory();
     const Mask weak = constraints();
     enter(h);
     for (int64_t i = 0; i < nx; i++) {
       const T* weights = matrix[kQ_final][0];
-      Vec t = vector[kq_final][0][i];
+      Vec t = vector[kq_final][0][i], all_terms = abs(t);
       for (int64_t j = 0; j < nx; j++) t += weights[i * nx + j] * x[h * nx + j];
-      for (int64_t m = 0; m < nc; m++) t += G_x[m * nx + i] * mu[h * nc + m];
-      p[i] = t;
+      for (int64_t j = 0; j < nx; j++) all_terms += abs(weights[i * nx + j] * x_size[h * nx + j]);
+      for (int64_t m = 0; m < nc; m++) {
+        const Vec fine = G_x[m * nx + i] * mu[h * nc + m];
+        t += fine, all_terms += abs(fine);
+      }
+      p[i] = t, p_size[i] = p_terms[i] = all_terms;
     }
     for (int64_t k = h - 1; k >= 0; k--) {
       enter(k);
-      const Vec *xk = x + k * nx, *uk = u + k * nu, *lk = lam + k * nl, *next = x + (k + 1) * nx, *mk = mu + k * nc;
-      for (int64_t i = 0; i < nx; i++) {
-        Sum sum{d[i], abs(d[i])};
-        for (int64_t j = 0; j < nx; j++) sum.add(A[i * nx + j] * xk[j]);
-        for (int64_t j = 0; j < nu; j++) sum.add(B[i * nu + j] * uk[j]);
-        for (int64_t j = 0; j < nl; j++) sum.add(C[i * nl + j] * lk[j]);
-        sum.value -= next[i];
-        met(sum.relative());
-      }
-      for (int64_t i = 0; i < nl; i++) {
-        Sum sum{c[i], abs(c[i])};
-        for (int64_t j = 0; j < nx; j++) sum.add(D[i * nx + j] * xk[j]);
-        for (int64_t j = 0; j < nu; j++) sum.add(E[i * nu + j] * uk[j]);
-        for (int64_t j = 0; j < nl; j++) sum.add(F[i * nl + j] * lk[j]);
-        s[i] = sum.value;
-        met(abs(lk[i] * s[i] - batch.relaxation) / (batch.relaxation + 1e-7 * abs(lk[i]) * sum.terms));
-        met(select(lk[i] > 0, all(0), all(1)));
-      }
+      const Vec *xk = x + k * nx, *uk = u + k * nu, *lk = lam + k * nl, *mk = mu + k * nc, *size = x_size + k * nx;
+      s = gap + k * nl;
       met(multipliers(lk, fragile));
+      for (int64_t i = 0; i < nl; i++) {
+        Vec row = all(0), by_size = all(0), by_terms = all(0);
+        for (int64_t j = 0; j < nl; j++) row += abs(all(0) + F[i * nl + j]);
+        for (int64_t j = 0; j < nx; j++)
+          by_size += abs(C[j * nl + i] * p_size[j]), by_terms += abs(C[j * nl + i] * p_terms[j]);
+        const Vec answer = abs(lk[i] / (s[i] + lk[i] * row));
+        rho_size[i] = answer * by_size, rho_terms[i] = answer * by_terms;
+      }
       for (int64_t j = 0; j < nu; j++) {
         Sum g{r[j], abs(r[j])};
+        Vec whole = all(0);
         for (int64_t m = 0; m < nu; m++) g.add(R[j * nu + m] * uk[m]);
         if (batch.crossed)
-          for (int64_t i = 0; i < nx; i++) g.add(cross[i * nu + j] * xk[i]);
-        for (int64_t i = 0; i < nx; i++) g.add(B[i * nu + j] * p[i]);
-        for (int64_t i = 0; i < nl; i++) g.add(E[i * nu + j] * rho[i]);
+          for (int64_t i = 0; i < nx; i++) g.add(cross[i * nu + j] * xk[i]), whole += abs(cross[i * nu + j] * size[i]);
+        for (int64_t i = 0; i < nx; i++) g.add(B[i * nu + j] * p[i]), whole += abs(B[i * nu + j] * p_size[i]);
+        for (int64_t i = 0; i < nl; i++) g.add(E[i * nu + j] * rho[i]), whole += abs(E[i * nu + j] * rho_size[i]);
         for (int64_t m = 0; m < nc; m++) g.add(G_u[m * nu + j] * mk[m]);
+        g.terms = max(g.terms, kCancelled * whole);
         action(k, j, uk[j], g);
       }
       for (int64_t i = 0; i < nx; i++) {
-        Vec t = q[i];
-        for (int64_t j = 0; j < nx; j++) t += Q[i * nx + j] * xk[j], t += A[j * nx + i] * p[j];
-        for (int64_t j = 0; j < nl; j++) t += D[j * nx + i] * rho[j];
+        Sum sum{q[i], abs(q[i])};
+        Vec along = all(0), through = all(0);
+        for (int64_t j = 0; j < nx; j++) {
+          sum.value += Q[i * nx + j] * xk[j], sum.terms += abs(Q[i * nx + j] * size[j]);
+          sum.add(A[j * nx + i] * p[j]), along += abs(A[j * nx + i] * p_size[j]);
+        }
+        for (int64_t j = 0; j < nl; j++) sum.add(D[j * nx + i] * rho[j]), through += abs(D[j * nx + i] * rho_terms[j]);
         if (batch.crossed)
-          for (int64_t j = 0; j < nu; j++) t += cross[i * nu + j] * uk[j];
-        for (int64_t m = 0; m < nc; m++) t += G_x[m * nx + i] * mk[m];
-        pn[i] = t;
+          for (int64_t j = 0; j < nu; j++) sum.add(cross[i * nu + j] * uk[j]);
+        for (int64_t m = 0; m < nc; m++) sum.add(G_x[m * nx + i] * mk[m]);
+        pn[i] = sum.value, terms[i] = sum.terms;
+        grown[i] = max(max(sum.terms, p_size[i]), kFurther * max(along, through));
       }
-      for (int64_t i = 0; i < nx; i++) p[i] = pn[i];
+      for (int64_t i = 0; i < nx; i++) p[i] = pn[i], p_size[i] = grown[i], p_terms[i] = terms[i];
     }
     for (int l = 0; l < count; l++) {
       const int64_t e = elements[l];
@@ -219,6 +228,44 @@ struct Certificate {
   }
 
  private:
+  // Dynamics and complementarity of all stages, and the sizes of the states.
+  void trajectory() {
+    const int64_t nx = n.x(), nu = n.u(), nl = n.l(), h = n.h;
+    for (int64_t i = 0; i < nx; i++) x_size[i] = abs(x[i]);
+    for (int64_t i = 0; i < nx && n.c() > 0; i++) moved[i] = all(0);
+    for (int64_t k = 0; k < h; k++) {
+      enter(k);
+      const Vec *xk = x + k * nx, *uk = u + k * nu, *lk = lam + k * nl, *next = x + (k + 1) * nx;
+      const Vec* size = x_size + k * nx;
+      for (int64_t i = 0; i < nx; i++) {
+        Sum sum{d[i], abs(d[i])};
+        Vec along = all(0), wide = all(0);
+        for (int64_t j = 0; j < nx; j++) sum.add(A[i * nx + j] * xk[j]), along += abs(A[i * nx + j] * size[j]);
+        for (int64_t j = 0; j < nu; j++) sum.add(B[i * nu + j] * uk[j]);
+        for (int64_t j = 0; j < nu && n.c() > 0; j++) wide += abs(B[i * nu + j] * width(k, j));
+        if (n.c() > 0) moved[(k + 1) * nx + i] = wide;
+        for (int64_t j = 0; j < nl; j++) sum.add(C[i * nl + j] * lk[j]);
+        x_size[(k + 1) * nx + i] = max(max(sum.terms, size[i]), kFurther * along);
+        sum.value -= next[i];
+        met(sum.relative());
+      }
+      s = gap + k * nl;
+      for (int64_t i = 0; i < nl; i++) {
+        Sum sum{c[i], abs(c[i])};
+        for (int64_t j = 0; j < nx; j++) sum.add(D[i * nx + j] * xk[j]);
+        for (int64_t j = 0; j < nu; j++) sum.add(E[i * nu + j] * uk[j]);
+        for (int64_t j = 0; j < nl; j++) sum.add(F[i * nl + j] * lk[j]);
+        s[i] = sum.value;
+        met(abs(lk[i] * s[i] - batch.relaxation) / (batch.relaxation + 1e-7 * abs(lk[i]) * sum.terms));
+        met(select(lk[i] > 0, all(0), all(1)));
+      }
+    }
+  }
+
+  Vec width(int64_t k, int64_t j) const {
+    return range(largest_action[j], vector[ku_min][k][j], vector[ku_max][k][j]);
+  }
+
   // Stationarity of one action with the reduced gradient g, and its bounds.
   void action(int64_t k, int64_t j, Vec at, Sum g) {
     const Vec below = at - lo[j], above = hi[j] - at;
@@ -254,7 +301,11 @@ struct Certificate {
         for (int64_t j = 0; j < nu && k < h; j++) sum.add(G_u[i * nu + j] * u[k * nu + j]);
         const Vec m = mu[k * nc + i], value = select(given, sum.value, all(-kHuge));
         row[k * nc + i] = value;
-        row_terms[i] = max(row_terms[i], select(given, sum.terms, all(0)));
+        Vec size = all(0);
+        for (int64_t j = 0; j < nx; j++)
+          size += abs(G_x[i * nx + j] * (x_size[k * nx + j] + kCancelled * moved[k * nx + j]));
+        for (int64_t j = 0; j < nu && k < h; j++) size += abs(G_u[i * nu + j] * (kCancelled * width(k, j)));
+        row_terms[i] = max(row_terms[i], select(given, max(sum.terms, kCancelled * size), all(0)));
         const Vec held = select(m < kAtPrice * price[i], abs(value), max(-value, all(0)));
         row_missed[i] = max(row_missed[i], select(m > 0, held, max(value, all(0))));
         met(select((m >= 0) & (m * kAtPrice <= price[i]), all(0), all(1)) + 0.0 * m);

@@ -115,6 +115,7 @@ struct Problem {
   Steps<Vec> d, c, q, r, u_min, u_max, g, price;
   Steps<Vec> per_width;  // reciprocal of each action's range, zero where that is zero or infinite
   Vec *q_final, *x0;
+  Vec* reach;  // of each constraint: the least that its violation is measured by, a part of what a step can make of it
   Vec mu;                        // weight of the barrier of the bounds: follows the homotopy down to batch.barrier
   Matrix<Vec, 0, 0> multiplier;  // of the constraints, and the weight of the augmented Lagrangian
   Vec rho;
@@ -135,7 +136,7 @@ struct Problem {
     arena.take(d, by_stage(kd) ? h : 1, nx), arena.take(c, systems > 1 || by_stage(kc) ? h : 1, nl);
     arena.take(q, by_stage(kq) ? h : 1, nx), arena.take(r, by_stage(kr) ? h : 1, nu);
     arena.take(u_min, bounds, nu), arena.take(u_max, bounds, nu), arena.take(per_width, bounds, nu);
-    arena.take(q_final, nx), arena.take(x0, nx), arena.take(multiplier, h + 1, nc);
+    arena.take(q_final, nx), arena.take(x0, nx), arena.take(multiplier, h + 1, nc), arena.take(reach, nc);
     if constexpr (kShared<T>)
       if (arena.memory) load_matrices(0, 0);
   }
@@ -258,6 +259,23 @@ struct Problem {
         put(g[k], i, lane, input(kg, e, k)[i] * unit);
         put(price[k], i, lane, input(kprice, e, k)[i] * (cost / unit));
       }
+    for (int64_t i = 0; i < n.c(); i++) {
+      double most = 0;
+      for (int64_t k = 0; k <= n.h; k++) {
+        const StageData<T, S> to = k < n.h ? stage(k) : last(), before = stage(k > 0 ? k - 1 : 0);
+        const auto range = [&](const StageData<T, S>& at, int64_t j) {
+          return lane_of(at.per_width[j], lane) > 0 ? 1.0 / lane_of(at.per_width[j], lane) : 0.0;
+        };
+        double sum = 0;
+        for (int64_t j = 0; j < n.u(); j++) {
+          if (k < n.h) sum += __builtin_fabs(lane_of(to.G_u()(i, j), lane)) * range(to, j);
+          for (int64_t m = 0; m < n.x() && k > 0; m++)
+            sum += __builtin_fabs(lane_of(to.G_x()(i, m), lane) * lane_of(before.B()(m, j), lane)) * range(before, j);
+        }
+        most = sum > most && lane_of(to.g[i], lane) < kHuge ? sum : most;
+      }
+      put(reach, i, lane, kCancelled * most);
+    }
   }
 
   // One lane of an array from and to the caller's, lam from and to the caller's units.

@@ -36,6 +36,7 @@ struct Sweep {
   Vec stationary;  // projected gradient in parts of its scale, which sees flat directions too (certificate.hpp)
   Vec violated;    // by how much constraints are not met or not complementary, in parts of the sizes of their terms
   Vec owing;       // largest change of their multipliers that the augmented Lagrangian calls for
+  Vec fine, pull;  // the largest multiplier; what the cost asks of states and actions, added up over the stages
   Mask weak;       // a bound is weakly active, or the reduced Hessian is singular
 };
 
@@ -71,6 +72,7 @@ class Riccati {
   Vec *row_terms, *row_violation;  // of each constraint, the largest over the stages
   Mask* active;
   Newton newton;
+  Vec kinked;  // beside the kinks of constraints: damping of what is flat
   Sweep found;
 
  public:
@@ -108,8 +110,12 @@ class Riccati {
   // Around the trajectory `at`.
   Sweep sweep(const Trajectory<S>& at, const Upstream<S>& upstream, const Newton& how = {}) {
     newton = how;
-    found = {all(0), all(0), all(0), all(0), all(0), Mask{}};
-    for (int64_t i = 0; i < n.c(); i++) row_terms[i] = row_violation[i] = all(0);
+    found = {all(0), all(0), all(0), all(0), all(0), all(0), all(0), Mask{}};
+    kinked = all(0);
+    for (int64_t i = 0; i < n.c(); i++) {
+      row_terms[i] = problem.reach[i], row_violation[i] = all(0);
+      if (!kAdjoint) kinked = select(problem.reach[i] > 0, newton.regularisation, kinked);
+    }
     for (int64_t j = 0; j < n.u() && problem.batch.unbounded; j++) {
       largest_action[j] = all(0);
       for (int64_t k = 0; k < n.h; k++) largest_action[j] = max(largest_action[j], abs(at.u(k, j)));
@@ -149,6 +155,7 @@ class Riccati {
     if (n.c() > 0) {
       const StageData<T, S> data = problem.last();
       constraints(n.h, data, x, nullptr);
+      for (int64_t i = 0; i < nx; i++) found.pull += abs(end.p[i]);
       for (int64_t r = 0; r < n.c(); r++) {
         const Vec stiff = stiffness(n.h, r);
         for (int64_t i = 0; i < nx; i++) {
@@ -167,7 +174,7 @@ class Riccati {
       const Vec c = data.constraint(i, x, u), before = problem.multiplier(k, i), price = data.price[i];
       const Force now(c, before, problem.rho, price);
       force(k, i) = now.value, stiffness(k, i) = select(now.held, problem.rho, all(0));
-      found.owing = max(found.owing, abs(now.value - before));
+      found.owing = max(found.owing, abs(now.value - before)), found.fine = max(found.fine, now.value);
       row_terms[i] = max(row_terms[i], data.constraint_terms(i, x, u));
       const Vec missed = select(now.held, abs(c), select(now.value > 0, max(-c, all(0)), max(c, all(0))));
       row_violation[i] = max(row_violation[i], missed);
@@ -238,6 +245,7 @@ class Riccati {
         H(nx + j, nx + j) += mu * (1.0 / (below * below) + 1.0 / (above * above));
       }
       Vec terms = abs(t);
+      if (n.c() > 0) found.pull += terms;
       for (int64_t i = 0; i < n.c(); i++) {
         const Vec part = data.G(i, nx + j) * force(k, i);
         t += part, terms += abs(part);
@@ -268,7 +276,7 @@ class Riccati {
       part = min(part, problem.batch.unbounded ? select(reach > kHuge, reach, reach * per_width) : reach * per_width);
       if (barrier > 0) part = select(projected > 0, part, all(0));
       found.stationary = max(found.stationary, part);
-      flat[j] = kFlat * across;
+      flat[j] = (kFlat + kinked) * across;
       const Vec least = 1e-10 * reference * per_width;
       const Vec curved = max(H(nx + j, nx + j) + linearisation.curvature(nx + j, nx + j), max(least, all(kTiny)));
       const Vec step = g / curved;
@@ -305,6 +313,7 @@ class Riccati {
     for (int64_t i = 0; i < n.x(); i++) {
       Vec t = data.q[i] + data.Q.row(i) * x;
       if (problem.batch.crossed) t = t + data.cross.row(i) * u;
+      if (n.c() > 0) found.pull += abs(t);
       for (int64_t r = 0; r < n.c(); r++) t += data.G(r, i) * force(k, r);
       Vec l = (kAdjoint ? -x_bar[i] : t) + stage.A_hat.column(i) * next.v;
       if (kAdjoint) l = l - stage.K_lam.column(i) * lam_bar;

@@ -19,10 +19,11 @@ namespace {
 // Projected gradient, in parts of its scale (see certificate.hpp), at which a problem is solved.
 constexpr double kStationary = 1e-7;
 // Violation of a constraint, in parts of the sizes of its terms, at which it is met; and where more is rounding.
-constexpr double kMet = 1e-12, kMetRounded = 1e-7;
+constexpr double kMet = 1e-12, kMetHardly = 1e-10, kMetRounded = 1e-7;
 // Weight of the augmented Lagrangian, in parts of the largest weight of the cost: at first, and where a violation that
-// three steps of the multipliers in a row have not halved means that the problem is infeasible.
-constexpr double kPenalty = 10.0, kLargestPenalty = 1e7;
+// three steps of the multipliers in a row have not halved means that the problem is infeasible; if the multipliers are
+// also that many times what the cost asks for, so that it is not the cost that keeps the violation.
+constexpr double kPenalty = 10.0, kLargestPenalty = 1e7, kOutbids = 1e6;
 // A step of the multipliers is due where the projected gradient is below this part of what the step before left, and of
 // the change that it would make. The first counts where constraints are far from the actions that they act through.
 constexpr double kDue = 0.03;
@@ -41,6 +42,12 @@ constexpr int64_t kFailures = 12;
 // many more: where the system is stiff, the gradient at the optimum is rounding too. Part of the cost that counts as
 // rounding.
 constexpr int64_t kStill = 8;
+// As many such steps in, a plan that is stationary but for its scale, which vanishes at a vertex, is put before the
+// certificate, which has the sizes of what cancelled.
+constexpr int64_t kAsk = 2;
+// A large weight of the augmented Lagrangian makes much of the rounding of a constraint. Where more than this part is
+// left of the gradient at such a vertex, the multipliers are found once more with the first weight.
+constexpr double kClean = 1e-9;
 constexpr double kNothing = 1e-12;
 constexpr double kLetGo[] = {1.0, 10.0, 100.0, 1000.0};
 // The least projected gradient that is asked for then.
@@ -85,6 +92,7 @@ class Solver {
     double left = 0;          // projected gradient after that; 0 where it is not known yet
     int64_t stalled = 0;      // steps of the multipliers in a row that hardly helped
     double gained = 0;        // by the last step
+    bool cleaned = false;     // see kClean
     int64_t still = 0;        // steps at the target in a row that gained no more than the rounding of the cost
   };
   Lane lane[kLanes];
@@ -203,7 +211,7 @@ class Solver {
   }
 
   // `unfinished`: left as it is, for others to go on from; the objective is then what the solver itself descends on.
-  void store(const MpcSolve& o, int l, Status status, const Matrix<Vec, 0, 0>& multipliers, bool unfinished = false) {
+  void write(const MpcSolve& o, int l, Status status, const Matrix<Vec, 0, 0>& multipliers, bool unfinished = false) {
     const int64_t e = lane[l].element, states = at.x.size(), actions = at.u.size(), forces = at.lam.size();
     problem.store(o.x + e * states, at.x.entries, states, l);
     problem.store(o.u + e * actions, at.u.entries, actions, l);
@@ -214,12 +222,19 @@ class Solver {
     if (o.gained) o.gained[e] = lane[l].gained / unit;
     o.iterations[e] = int32_t(lane[l].iterations);
     o.status[e] = int8_t(status);
-    if (unfinished) {
-      o.residual[e] = kHuge, o.fragile[e] = 0;
-      return;
-    }
-    finished[waiting++] = e;
+    if (unfinished) o.residual[e] = kHuge, o.fragile[e] = 0;
+  }
+  void store(const MpcSolve& o, int l, Status status, const Matrix<Vec, 0, 0>& multipliers) {
+    write(o, l, status, multipliers);
+    finished[waiting++] = lane[l].element;
     if (waiting == kLanes) certificate.judge(o, finished, waiting), waiting = 0;
+  }
+
+  // Stores a plan as solved if the certificate takes it for that.
+  bool accepted(const MpcSolve& o, int l, const Sweep& sweep) {
+    write(o, l, sweep.weak[l] ? Status::degenerate : Status::converged, riccati.force);
+    certificate.judge(o, &lane[l].element, 1);
+    return o.status[lane[l].element] != int8_t(Status::numerical);
   }
 
   // A step of the multipliers, at the target of the homotopy: before, they would follow plans that come to nothing.
@@ -236,8 +251,17 @@ class Solver {
     repriced |= which;
   }
 
+  static Mask only(int l) {
+    Mask which = Mask{};
+    which[l] = -1;
+    return which;
+  }
+
   // Whether the constraints of a lane are met, but for what no step of the multipliers diminishes any more.
-  bool met(const Sweep& sweep, int l) const { return sweep.violated[l] <= (lane[l].stalled > 0 ? kMetRounded : kMet); }
+  bool met(const Sweep& sweep, int l) const {
+    const int64_t stalled = lane[l].stalled;
+    return sweep.violated[l] <= (stalled > 1 ? kMetRounded : stalled > 0 ? kMetHardly : kMet);
+  }
 
   // Whether the constraints of a lane at the target ask for other multipliers, which it then gets, or for more weight.
   bool owes(const Sweep& sweep, int l, bool stationary) {
@@ -247,9 +271,7 @@ class Solver {
     const bool impatient = lane[l].in_stage >= kPatience && violated <= kLittle && sweep.owing[l] > 0;
     if (!impatient && (met(sweep, l) || !(stationary || sweep.projected[l] <= due))) return false;
     lane[l].left = 0;
-    Mask which = Mask{};
-    which[l] = -1;
-    pay(which);
+    pay(only(l));
     double& rho = reinterpret_cast<double*>(&problem.rho)[l];
     lane[l].stalled = violated > 0.5 * lane[l].violated ? lane[l].stalled + 1 : 0;
     if (violated > (violated < kSmall ? kSlowEnd : kSlow) * lane[l].violated)
@@ -269,28 +291,45 @@ class Solver {
       const bool stuck = a.failures >= kFailures || a.still >= 4 * kStill;
       const double patience = kLetGo[stuck ? 3 : a.still / kStill];
       if (patience > 1 && tol < kInVain) tol = kInVain;
-      const bool stationary = sweep.projected[l] <= patience * tol && sweep.stationary[l] <= patience * kStationary;
+      const bool small = sweep.projected[l] <= patience * tol;
+      const bool stationary = small && sweep.stationary[l] <= patience * kStationary;
       const bool converged = stationary && met(sweep, l);
       const bool broken = !(J[l] < 1e300 && J[l] > -1e300);
+      const bool doubtful = small && !stationary && met(sweep, l) && !broken && (a.still == kAsk || stuck);
       const double largest = kLargestPenalty * lane_of(problem.weight[0], l);
       const bool infeasible = sweep.violated[l] > o.certified && a.stalled >= 3 &&
+                              sweep.fine[l] > kOutbids * sweep.pull[l] &&
                               (problem.rho[l] >= largest || a.iterations >= o.max_iter);
-      if (!infeasible && !broken && a.iterations < o.max_iter && n.c() > 0 && owes(sweep, l, stationary)) {
+      if (!infeasible && !broken && a.iterations < o.max_iter && n.c() > 0 &&
+          owes(sweep, l, stationary || (small && a.still >= kAsk))) {
         frozen[l] = -1;
         continue;
       }
-      if (!infeasible && !converged && !broken && a.iterations < o.max_iter && !stuck) continue;
-      frozen[l] = -1;
-      if (converged && regularisation[l] > 0 && !broken) {  // once more without it: it hides a singular Hessian
-        regularisation[l] = 0;
+      if (!infeasible && !converged && !doubtful && !broken && a.iterations < o.max_iter && !stuck) continue;
+      // Once more without regularisation: it hides a singular Hessian.
+      if ((converged || doubtful) && regularisation[l] > 0 && !broken) {
+        frozen[l] = -1, regularisation[l] = 0;
         continue;
       }
-      store(o, l,
-            converged && !broken         ? (sweep.weak[l] ? Status::degenerate : Status::converged)
-            : infeasible                 ? Status::infeasible
-            : a.iterations >= o.max_iter ? Status::max_iter
-                                         : Status::numerical,
-            riccati.force);
+      const bool done = doubtful && accepted(o, l, sweep);
+      const double first = kPenalty * lane_of(problem.weight[0], l);
+      if (doubtful && !a.cleaned && problem.rho[l] > first && o.residual[a.element] > kClean) {
+        frozen[l] = -1;
+        pay(only(l));
+        put(&problem.rho, 0, l, first);
+        lane[l].cleaned = true, lane[l].violated = 1e300;
+        lane[l].stalled = lane[l].failures = lane[l].in_stage = lane[l].still = 0;
+        continue;
+      }
+      if (doubtful && !done && !infeasible && a.iterations < o.max_iter && !stuck) continue;
+      frozen[l] = -1;
+      if (!done)
+        store(o, l,
+              converged && !broken         ? (sweep.weak[l] ? Status::degenerate : Status::converged)
+              : infeasible                 ? Status::infeasible
+              : a.iterations >= o.max_iter ? Status::max_iter
+                                           : Status::numerical,
+              riccati.force);
       if (!take(o, counter, l)) live--;
     }
     return frozen;
@@ -302,7 +341,7 @@ class Solver {
       if (frozen[l] || released[l] || fresh[l] || eps[l] > batch.relaxation) continue;
       const int64_t steps = o.start[lane[l].element].explore;
       if (steps == 0 || lane[l].in_stage < steps) continue;
-      store(o, l, Status::max_iter, problem.multiplier, true);
+      write(o, l, Status::max_iter, problem.multiplier, true);
       if (!take(o, counter, l)) live--;
     }
   }

@@ -5,7 +5,7 @@ The derivation stands in `difflcs.mpc.kkt`, which offers the names of this file.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -18,6 +18,12 @@ from difflcs.mpc.solution import Primal, largest
 CERTIFIED = 1e-6
 # A multiplier above this part of its price is the price, but for rounding.
 _AT_PRICE = 1 - 1e-12
+# A scale is at least this part of what its terms would be, had nothing cancelled: 1e-9 of that is rounding.
+_CANCELLED = 1e-3
+# What a step further along a chain of states counts: so little that no size grows with it in most systems.
+_FURTHER = 0.1
+# The gradient of the violations, in parts of its terms, below which they are the least nearby.
+_LEAST = 1e-4
 
 
 @dataclass(frozen=True)
@@ -127,11 +133,13 @@ def residual(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
     - bounds: the distance of an action to them, in parts of its range u_max − u_min;
     - stationarity in λ: |Cᵀp + s∘y + Fᵀρ| in parts of its Σ|terms|;
     - stationarity in u: |u − clip(u − range·g/G)| / range, the part of its range by which the reduced gradient g would
-      still move an action. G is the scale of g: the larger of its Σ|terms| and of range·(Rⱼⱼ + BⱼᵀQBⱼ), which is what
-      its weights make of a step across the range. G does not vanish with the curvature: flat directions count;
+      still move an action. G is the scale of g: the largest of its Σ|terms|, of range·(Rⱼⱼ + BⱼᵀQBⱼ), which is what
+      its weights make of a step across the range, and of a thousandth of |Bⱼ|ᵀP + |Eⱼ|ᵀρ̂ + |Sⱼ|ᵀX, with the `sizes` of
+      costates, forces' multipliers and states before they cancel. G does not vanish with the curvature, where flat
+      directions count, nor with the costate, which at a vertex is zero but for rounding;
     - constraints: with c = G_x x + G_u u − g and its multiplier m, the size of c where 0 < m < price, that of its
       positive part where m = 0 and of its negative part where m = price, in parts of the row's unit, the largest
-      Σ|terms of c| over the stages; and 1 where m is outside [0, price].
+      Σ|terms of c| over the stages, or a thousandth of |G_x|X (`row_units`); and 1 where m is outside [0, price].
 
     An action with an infinite bound has no range; see `ranges` for what stands in its place.
     """
@@ -173,10 +181,16 @@ def _row_violations(problem: MPCProblem, primal: Primal) -> list[Tensor]:
 
 
 def row_units(problem: MPCProblem, primal: Primal) -> Tensor:
-    """What the violation of each constraint is measured by, (batch, n_c): the largest Σ|terms| over the stages."""
+    """What the violation of each constraint is measured by, (batch, n_c): the largest Σ|terms| over the stages.
+
+    At least a thousandth of what these would be, had nothing cancelled in the states before, and a millionth of what
+    the actions' ranges make of the row in a step: beside a wall at zero.
+    """
     P, x, u = problem.steps(), primal.x.transpose(0, 1), primal.u.transpose(0, 1)
     terms = _terms((P.G_x, x)) + P.g.abs()
+    whole = _terms((P.G_x, state_sizes(problem, primal))) + _CANCELLED * _reach(problem, primal)
     terms[:-1] += _terms((P.G_u, u))
+    terms = torch.maximum(terms, _CANCELLED * whole)
     return torch.where(torch.isinf(P.g), torch.zeros_like(terms), terms).amax(0)
 
 
@@ -193,13 +207,37 @@ def certainly_missed(problem: MPCProblem, primal: Primal) -> Tensor:
     That is by `CERTIFIED` of its row's unit and of what the actions can move it by in a step. Where all terms of a row
     vanish, as beside a wall at zero, a rounding error is as large as its unit.
     """
+    reach = _reach(problem, primal)
+    reach = torch.where(torch.isinf(problem.steps().g), torch.zeros_like(reach), reach)
+    unit = row_units(problem, primal) + reach.amax(0)
+    return largest(_parts(_overshoot(problem, primal), unit)) > CERTIFIED
+
+
+def _reach(problem: MPCProblem, primal: Primal) -> Tensor:
+    """What the ranges of the actions make of each row in a step, (H+1, batch, n_c)."""
     P, width = problem.steps(), ranges(problem, primal.u).transpose(0, 1)
     moved = matvec(P.B.abs(), width)
     reach = _terms((P.G_x, torch.cat([torch.zeros_like(moved[:1]), moved])))
     reach[:-1] += _terms((P.G_u, width))
-    reach = torch.where(torch.isinf(P.g), torch.zeros_like(reach), reach)
-    unit = row_units(problem, primal) + reach.amax(0)
-    return largest(_parts(_overshoot(problem, primal), unit)) > CERTIFIED
+    return reach
+
+
+def least_violated(problem: MPCProblem, primal: Primal) -> Tensor:
+    """Whether (batch,) no change of the actions nearby lessens Σ(violation / |row|)² of the hard constraints.
+
+    That is stationarity as in `residual`, with the violations as multipliers in place of the cost.
+    """
+    none = {name: torch.zeros_like(getattr(problem, name)) for name in ("Q", "R", "S", "Q_final", "q", "r", "q_final")}
+    P, alone = problem.steps(), replace(problem, **none, barrier=0.0)
+    square = P.G_x.square().sum(-1).expand(problem.horizon + 1, problem.batch, problem.n_c).clone()
+    square[:-1] += P.G_u.square().sum(-1)
+    over = _overshoot(problem, primal) / torch.where(square > 0, square, torch.ones_like(square))
+    over = torch.where(over > _LEAST * over.amax((0, 2), keepdim=True), over, 0.0)  # the rest is met
+    trial = primal._replace(mu=over.transpose(0, 1))
+    dual = multipliers(alone, trial)
+    g, width, (low, high) = dual.gradient, ranges(problem, primal.u), problem.bounds()
+    room = torch.where(g > 0, primal.u - low, high - primal.u) / torch.where(width > 0, width, torch.ones_like(width))
+    return largest(torch.minimum(_parts(g, gradient_terms(alone, trial, dual)), room).transpose(0, 1)) <= _LEAST
 
 
 def _overshoot(problem: MPCProblem, primal: Primal) -> Tensor:
@@ -233,15 +271,18 @@ def ranges(problem: MPCProblem, u: Tensor) -> Tensor:
 
 
 def gradient_terms(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
-    """Σ|terms| (batch, H, n_u) of the reduced gradient."""
+    """Σ|terms| (batch, H, n_u) of the reduced gradient, at least a thousandth of that before anything cancelled."""
     P = problem.steps()
     u, p, rho = (v.transpose(0, 1) for v in (primal.u, dual.p[:, 1:], dual.rho))
+    X, costates, forces = sizes(problem, primal, dual)
     terms = _terms((P.R, u), (P.B.mT, p), (P.E.mT, rho)) + P.r.abs()
+    whole = _terms((P.B.mT, costates), (P.E.mT, forces))
     if bool(problem.S.any()):
         terms = terms + _terms((P.S.mT, primal.x[:, :-1].transpose(0, 1)))
+        whole = whole + _terms((P.S.mT, X))
     if problem.n_c:
         terms = terms + _terms((P.G_u.mT, primal.mu[:, :-1].transpose(0, 1)))
-    terms = terms.transpose(0, 1)
+    terms = torch.maximum(terms, _CANCELLED * whole).transpose(0, 1)
     if problem.barrier > 0:
         below, above = problem.distances(primal.u)
         terms = terms + problem.barrier * (1 / below + 1 / above)
@@ -249,6 +290,45 @@ def gradient_terms(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Te
         width = ranges(problem, primal.u)
         terms = terms + 1e-8 * problem.barrier * width * (below.square().reciprocal() + above.square().reciprocal())
     return terms
+
+
+def sizes(problem: MPCProblem, primal: Primal, dual: Multipliers) -> tuple[Tensor, Tensor, Tensor]:
+    """Sizes of the states x_k (H, batch, n_x), costates p_{k+1} (H, batch, n_x) and ρ_k (H, batch, n_lam) of a plan.
+
+    A costate that is zero at a vertex of the constraints is made of terms that are not; these are it, or of terms that
+    are not. So a size is Σ|terms| of a number, that of the stage after it (before it, of a state), or a tenth of what A
+    makes of the sizes there, and of what a contact makes of the terms there. Along a chain of integrators it reaches as
+    far as their rounding does; it does not grow along the horizon but where the numbers do, or A by more than ten.
+    """
+    X, steps, data = state_sizes(problem, primal), problem.steps(), stages_of(problem)
+    u, lam, p, rho, s = (v.transpose(0, 1) for v in (primal.u, primal.lam, dual.p, dual.rho, dual.s))
+    # About what a unit of Cᵀp makes of ρ: no more than its contact by itself.
+    answer = (lam / (s + lam * steps.F.abs().sum(-1))).abs()
+    own = _terms((steps.Q, X[:-1]), (steps.A.mT, p[1:]), (steps.D.mT, rho), (steps.S, u)) + steps.q.abs()
+    terms = matvec(problem.Q_final.abs(), X[-1]) + problem.q_final.abs()
+    if problem.n_c:
+        fines = _terms((steps.G_x.mT, primal.mu.transpose(0, 1)))
+        own, terms = own + fines[:-1], terms + fines[-1]
+    size, costates, forces = terms, [], []
+    for k in reversed(range(problem.horizon)):
+        A, C, D = (getattr(data[k], name).abs().mT for name in "ACD")
+        costates.append(size)
+        forces.append(answer[k] * matvec(C, size))
+        further = torch.maximum(matvec(A, size), matvec(D, answer[k] * matvec(C, terms)))
+        terms = own[k]
+        size = torch.maximum(torch.maximum(terms, size), _FURTHER * further)
+    return X[:-1], torch.stack(costates[::-1]), torch.stack(forces[::-1])
+
+
+def state_sizes(problem: MPCProblem, primal: Primal) -> Tensor:
+    """Sizes of the states (H+1, batch, n_x), see `sizes`."""
+    P, x, lam, data = problem.steps(), primal.x.transpose(0, 1), primal.lam.transpose(0, 1), stages_of(problem)
+    terms = _terms((P.A, x[:-1]), (P.B, primal.u.transpose(0, 1)), (P.C, lam)) + P.d.abs()
+    found = [x[0].abs()]
+    for k, own in enumerate(terms):
+        further = _FURTHER * matvec(data[k].A.abs(), found[-1])
+        found.append(torch.maximum(torch.maximum(own, found[-1]), further))
+    return torch.stack(found)
 
 
 def at_rest(problem: MPCProblem) -> Tensor:

@@ -113,7 +113,14 @@ def linearise(problem: MPCProblem, primal: Primal) -> Linearisation:
     none = torch.zeros(primal.mu.shape, dtype=torch.bool)
     lower, upper = torch.stack(bounds.lower[::-1], 1), torch.stack(bounds.upper[::-1], 1)
     lin = Linearisation(primal, dual, lower, upper, weak, none, none, stages, torch.zeros_like(primal.mu))
-    return _hold_rows(problem, lin, data, singular) if problem.n_c else replace(lin, degenerate=weak | singular)
+    if not problem.n_c:
+        return replace(lin, degenerate=weak | singular)
+    curved = lin
+    if bool(singular.any()):
+        # At a vertex the rows hold what no curvature does. Which they are shows where actions have that of their range.
+        free, damping = [stage.free > 0 for stage in stages], bounds.across * singular[:, None, None]
+        curved = replace(lin, stages=_sweep(problem, own, data, free, damping=damping)[0])
+    return _hold_rows(problem, lin, data, singular, _spread(curved, data))
 
 
 def _eliminate(
@@ -145,9 +152,9 @@ class _Bounds:
     """Which actions are held at their bounds; found stage by stage from the last, as their curvature becomes known."""
 
     def __init__(
-        self, problem: MPCProblem, primal: Primal, gradient: Tensor, terms: Tensor, width: Tensor, least: Tensor
+        self, problem: MPCProblem, primal: Primal, gradient: Tensor, terms: Tensor, width: Tensor, *least: Tensor
     ):
-        self.problem, self.u, self.width, self.least = problem, primal.u, width, least
+        self.problem, self.u, self.width, (self.least, self.across) = problem, primal.u, width, least
         self.gradient, self.terms = gradient, terms
         self.low, self.high = (v.expand_as(primal.u) for v in problem.bounds())
         self.lower: list[Tensor] = []
@@ -159,20 +166,21 @@ class _Bounds:
         width, rest = ranges(problem, primal.u), at_rest(problem).transpose(0, 1)
         # The least curvature keeps rounding of a gradient apart from a reason to leave the interior.
         terms = gradient_terms(problem, primal, dual)
-        reference = torch.maximum(terms, width * rest)
-        least = 1e-10 * reference / torch.where(width > 0, width, torch.ones_like(width))
-        least = least.clamp_min(torch.finfo(torch.float64).tiny)
-        # With constraints the curvature may be negative at a solution: only along them it is not.
+        across = torch.maximum(terms, width * rest) / torch.where(width > 0, width, torch.ones_like(width))
+        least = (1e-10 * across).clamp_min(torch.finfo(torch.float64).tiny)
+        # With constraints the curvature may be negative at a solution, or zero: only along them it is not.
         least = torch.maximum(least, rest) if problem.n_c else least
-        return cls(problem, primal, dual.gradient, terms, width, least)
+        return cls(problem, primal, dual.gradient, terms, width, least, across)
 
     def free(self, k: int, Q_uu: Tensor) -> Tensor:
         """The actions (batch, n_u) that are free at stage k, by their curvature."""
         u, g, width, low, high = (v[:, k] for v in (self.u, self.gradient, self.width, self.low, self.high))
         h = torch.maximum(Q_uu.diagonal(dim1=-2, dim2=-1), self.least[:, k])
         to_lower, to_upper, step, fixed = u - low, high - u, g / h, high <= low
-        lower = (step > to_lower) | (fixed & (g >= 0))
-        upper = (-step > to_upper) | (fixed & (g < 0))
+        # With constraints an action is not at a bound for what a solver leaves of a gradient that cancels.
+        held = g / torch.maximum(h, self.across[:, k]) if self.problem.n_c else step
+        lower = (held > to_lower) | (fixed & (g >= 0))
+        upper = (-held > to_upper) | (fixed & (g < 0))
         # With one bound, at zero, and at rest there in all steps, the action has no size: the gradient alone decides.
         small = torch.where(width > 0, step.abs() <= _WEAK * width, g.abs() <= _WEAK * self.terms[:, k])
         weak = (torch.minimum(to_lower, to_upper) <= _WEAK * width) & small & ~fixed
@@ -194,6 +202,7 @@ def _sweep(
     data: list[StageData],
     bounds: _Bounds | list[Tensor],
     weight: Tensor | None = None,
+    damping: Tensor | None = None,
 ) -> tuple[list[_Stage], Tensor]:
     """The backward Riccati sweep, and where (batch,) a reduced Hessian is singular or indefinite.
 
@@ -203,6 +212,7 @@ def _sweep(
         data: the stages as given.
         bounds: what decides which actions are free, or these themselves, (batch, n_u) per stage.
         weight: (batch, H+1, n_c) of each constraint in the Hessian; none if None.
+        damping: (batch, H, n_u) curvature to add to the actions; none if None.
     """
     n_x = problem.n_x
     P = problem.Q_final.expand(problem.batch, n_x, n_x)
@@ -217,6 +227,8 @@ def _sweep(
             row = _join(data[k].G_x, data[k].G_u)
             hessian = hessian + row.mT @ (weight[:, k].unsqueeze(-1) * row)
         Q_uu = hessian[:, n_x:, n_x:]
+        if damping is not None:
+            Q_uu = Q_uu + torch.diag_embed(damping[:, k])
         free = bounds.free(k, Q_uu) if isinstance(bounds, _Bounds) else bounds[k]
         L, singular = _cholesky(Q_uu, free)
         degenerate |= singular
@@ -227,14 +239,15 @@ def _sweep(
     return stages[::-1], degenerate
 
 
-def _hold_rows(problem: MPCProblem, lin: Linearisation, data: list[StageData], singular: Tensor) -> Linearisation:
+def _hold_rows(
+    problem: MPCProblem, lin: Linearisation, data: list[StageData], singular: Tensor, spread: Tensor
+) -> Linearisation:
     """The same with the constraints: which of them are held, and the sweep that holds them.
 
     Where none is, `singular` (batch,) says whether the Hessian is; else only along the rows it must not be.
     """
     mu, price = lin.primal.mu, prices(problem)
     c = problem.constraints(lin.primal.x, lin.primal.u)
-    spread = _spread(lin, data)
     above = mu * spread + c
     most = torch.where(torch.isinf(price), torch.inf, price * spread)  # not ∞·0
     fined = above >= most

@@ -205,7 +205,7 @@ class BatchedBackend(Backend):
 
 
 def _make_presentable(problem: MPCProblem, primal: Primal, status: Tensor) -> None:
-    """Give those that failed finite numbers inside the bounds, and call none infeasible that violates nothing hard."""
+    """Give those that failed finite numbers inside the bounds, and call none infeasible that it is not near."""
     failed = torch.nonzero(~solved(status)).squeeze(-1)
     if len(failed):
         part = problem.select(failed)
@@ -214,5 +214,6 @@ def _make_presentable(problem: MPCProblem, primal: Primal, status: Tensor) -> No
             value[failed] = torch.nan_to_num(value[failed])
         refused = failed[status[failed] == int(Status.INFEASIBLE)]
         if len(refused):
-            missed = kkt.certainly_missed(problem.select(refused), Primal(*(value[refused] for value in primal)))
-            status[refused[~missed]] = int(Status.NUMERICAL)
+            part, plans = problem.select(refused), Primal(*(value[refused] for value in primal))
+            sure = kkt.certainly_missed(part, plans) & kkt.least_violated(part, plans)
+            status[refused[~sure]] = int(Status.NUMERICAL)

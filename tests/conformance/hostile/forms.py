@@ -28,6 +28,7 @@ from difflcs.errors import DiffLCSError
 from difflcs.mpc.problem import INPUTS
 from tests.conformance.hostile import checks
 from tests.conformance.hostile.targets import REFUSED, Outcome, quiet, refused_one_by_one
+from tests.conformance.varied import linear
 from tests.conformance.varied.generators import RANKS, Case, random_case
 from tests.conformance.varied.judges import conditions, objective, rows
 
@@ -168,6 +169,32 @@ def no_contact(rng: Generator, count: int, small: bool = False) -> Form:
     return _form(rng, count, n_lam=0)
 
 
+def vertex(rng: Generator, count: int, small: bool = False) -> Form:
+    """Hardly curved: linear programs, R = 0, soft absolute values, R of 1e-10 … 1e-4; limits at zero; n_lam = 0.
+
+    What is summed to the gradient cancels to rounding at a vertex, and states at rest are rounding.
+    """
+    form = _form(rng, count, need_rows=True, n_lam=0)
+    a = {k: v.copy() for k, v in form.case.arrays.items()}
+    for name in ("Q", "R", "S", "Q_final"):
+        a[name] *= 0.0
+    for name in ("q", "r", "q_final"):
+        a[name] = rng.standard_normal(a[name].shape) * (name == "q_final" or rng.random() < 0.5)
+    # Beyond what its plan needs, so that what was possible still is.
+    a["u_min"], a["u_max"] = (np.where(np.isinf(a[k]), 50.0 * sign, a[k]) for k, sign in (("u_min", -1), ("u_max", 1)))
+    kind = rng.integers(4)
+    if kind == 1:
+        a["Q"] += np.diag(rng.integers(0, 2, a["Q"].shape[-1]))
+        a["q"] *= 0.0
+    elif kind == 2:
+        a |= {"G_x": np.concatenate([a["G_x"], -a["G_x"]], -2), "G_u": np.concatenate([a["G_u"], -a["G_u"]], -2)}
+        a["g"] = np.concatenate([a["g"], -np.where(np.isinf(a["g"]), -INF, a["g"])], -1) * rng.integers(0, 2)
+        a["price"] = np.tile(10.0 ** rng.uniform(-2, 1, a["price"].shape), 2)
+    elif kind == 3:
+        a["R"] += 10.0 ** rng.uniform(-10, -4) * np.eye(a["R"].shape[-1])
+    return replace(form, case=replace(form.case, arrays=a))
+
+
 def layer_of(form: Form, leaves: dict[str, torch.Tensor], backend="batched") -> LCSMPCLayer:
     """The layer of a form, through the public records."""
     case = form.case
@@ -267,6 +294,8 @@ def _judge(form: Form, status, x, u, lam, mu, cost, violation) -> checks.Ratios:
         worst = np.maximum(np.where(np.isfinite(c), c, 0.0), 0.0).max(initial=0.0)
         room = 1e-9 * (1e-9 + np.where(np.isfinite(size), size, 0.0).max(initial=0.0))
         put("violation", i, abs(worst - violation[i]) / room)
+        if lam.shape[-1] == 0 and (gap := linear.above_optimum(case, i, u[i])) is not None:
+            put("optimum of a linear program", i, gap / 1e-6)
     return found
 
 
@@ -331,5 +360,6 @@ FORM_CLASSES: dict[str, Callable[..., Form]] = {
     "form-first-stage": first_stage,
     "form-not-numbers": not_numbers,
     "form-extreme": extreme,
+    "form-vertex": vertex,
 }
 FORM_TARGETS = {"batched": form_target(), "warm": form_target(warm=True), "untouched": untouched}

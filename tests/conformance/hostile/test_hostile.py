@@ -47,6 +47,7 @@ FLOORS = {
     "form-plain": 0.7,
     "form-no-contact": 0.9,
     "form-prices": 0.6,
+    "form-vertex": 0.7,
 }
 
 

@@ -15,7 +15,7 @@ SYSTEM = ("A", "B", "C", "d", "D", "E", "F", "c")
 
 def conditions(case: Case, i: int, x, u, lam, mu) -> dict[str, float]:
     """Largest violation of each condition of element i, in parts of the sizes of the terms that make it up."""
-    H = len(u)
+    H, X = len(u), largest_states(case, i, x, u, lam)
     dynamics = complementarity = sign = 0.0
     for k in range(H):
         A, B, C, d, D, E, F, c = (case.at(name, i, k) for name in SYSTEM)
@@ -32,6 +32,12 @@ def conditions(case: Case, i: int, x, u, lam, mu) -> dict[str, float]:
     low, high = (np.stack([case.at(name, i, k) for k in range(H)]) for name in ("u_min", "u_max"))
     c, size = rows(case, i, x, u)
     price = np.stack([case.at("price", i, k) for k in range(H + 1)]) if "price" in case.arrays else np.zeros((H + 1, 0))
+    if (
+        c.size
+    ):  # a row whose terms are rounding is met to a part of what its states are made of, and of its actions' range
+        efforts = np.maximum(abs(u), 1e-3 * np.where(np.isfinite(high - low), high - low, abs(u)))
+        size = np.maximum(size, 1e-3 * np.stack([abs(case.at("G_x", i, k)) @ X for k in range(H + 1)]))
+        size[:-1] = np.maximum(size[:-1], [1e-3 * abs(case.at("G_u", i, k)) @ efforts[k] for k in range(H)])
     unit = np.where(np.isfinite(c), size, 0.0).max(0, initial=0.0)
     unit = np.where(unit > 0, unit, 1.0)
     off = np.where(mu <= 0, np.maximum(c, 0), np.where(mu >= price, np.maximum(-c, 0), abs(c)))
@@ -49,6 +55,15 @@ def conditions(case: Case, i: int, x, u, lam, mu) -> dict[str, float]:
         "price": float(((mu < 0) | (mu > price)).any()),
         "stationarity": float(np.where(free & ~near, abs(gradient) / terms, 0.0).max()),
     }
+
+
+def largest_states(case: Case, i: int, x, u, lam) -> np.ndarray:
+    """Σ|terms| of each state, the largest over the stages: what is left of them where they cancel is rounding."""
+    sizes = [abs(x[0])]
+    for k in range(len(u)):
+        A, B, C, d = (abs(case.at(name, i, k)) for name in "ABCd")
+        sizes.append(A @ abs(x[k]) + B @ abs(u[k]) + C @ abs(lam[k]) + d)
+    return np.max(sizes, 0)
 
 
 def rows(case: Case, i: int, x, u) -> tuple[np.ndarray, np.ndarray]:
@@ -86,19 +101,19 @@ def reduced_gradient(case: Case, i: int, x, u, lam, mu) -> tuple[np.ndarray, np.
     """d(J + Σ mᵀc)/du (H, n_u) along the trajectory that the actions cause, and the sizes of its terms."""
     H, n_u = u.shape
     T = np.zeros((x.shape[1], H * n_u))  # dx_k/du
-    gradient, terms = np.zeros(H * n_u), np.zeros(H * n_u)
+    gradient, terms, X = np.zeros(H * n_u), np.zeros(H * n_u), largest_states(case, i, x, u, lam)
 
-    def add(direction, weight):
+    def add(direction, weight, least=0.0):
         nonlocal gradient, terms
         gradient = gradient + direction.T @ weight
-        terms = terms + abs(direction).T @ abs(weight)
+        terms = terms + abs(direction).T @ np.maximum(abs(weight), least)
 
     for k in range(H):
         A, B, C, _, D, E, F, c = (case.at(name, i, k) for name in SYSTEM)
         Q, R, S, q, r = (case.at(name, i, k) for name in ("Q", "R", "S", "q", "r"))
         U = np.zeros((n_u, H * n_u))
         U[:, k * n_u : (k + 1) * n_u] = np.eye(n_u)
-        add(T, Q @ x[k])
+        add(T, Q @ x[k], 1e-3 * abs(Q) @ X)
         add(T, q)
         add(T, S @ u[k])
         add(U, R @ u[k])
@@ -114,7 +129,7 @@ def reduced_gradient(case: Case, i: int, x, u, lam, mu) -> tuple[np.ndarray, np.
             np.diag(s / size) + (lam[k] / size)[:, None] * F, (lam[k] / size)[:, None] * (D @ T + E @ U)
         )
         T = A @ T + B @ U + C @ L
-    add(T, case.at("Q_final", i, 0) @ x[-1])
+    add(T, case.at("Q_final", i, 0) @ x[-1], 1e-3 * abs(case.at("Q_final", i, 0)) @ X)
     add(T, case.at("q_final", i, 0))
     if mu.shape[1]:
         add(T, case.at("G_x", i, H).T @ mu[H])

@@ -76,6 +76,22 @@ def least_violation(low, high, G, g, price) -> float:
     return float(found.fun) if found.status == 0 else np.nan
 
 
+def above_optimum(case: Case, i: int, u: np.ndarray) -> float | None:
+    """How much more actions cost than those of HiGHS, in parts of the terms; None where it is no linear program."""
+    P, p, low, high, G, g, price = condensed(case, i)
+    soft = np.isfinite(price)
+    if P.any():
+        return None
+    rows, cost = np.concatenate([G, -np.eye(len(g))[:, soft]], 1), np.concatenate([p, price[soft]])
+    limits = [(a if np.isfinite(a) else None, b if np.isfinite(b) else None) for a, b in zip(low, high, strict=True)]
+    best = linprog(cost, rows, g, bounds=limits + [(0, None)] * int(soft.sum()), method="highs")
+    if best.status != 0:
+        return None
+    fines, size = np.maximum(G @ u.ravel() - g, 0), abs(G) @ abs(u.ravel()) + abs(g)
+    value = p @ u.ravel() + (price * fines)[soft].sum()
+    return float((value - best.fun) / (1e-300 + abs(p) @ abs(u.ravel()) + (price * size)[soft].sum()))
+
+
 def optimum(program, solver: str = "daqp") -> np.ndarray | None:
     """The actions of the program by another solver; None where it says that there are none."""
     P, p, low, high, G, g, price = program

@@ -1,0 +1,172 @@
+"""Plans at a vertex: no curvature decides them, and what is summed to their gradient cancels to rounding."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import linprog
+
+from difflcs import ConstraintSequence, LCSMPCLayer, LCSParams, LinearConstraints, QuadraticCost, Status
+from difflcs.mpc import Primal, kkt
+from difflcs.mpc.backends import BatchedBackend
+from difflcs.mpc.problem import MPCProblem
+
+INF = float("inf")
+EXACT = pytest.mark.parametrize("backend", ["batched", "ipopt"])
+
+
+def tensor(value) -> torch.Tensor:
+    return torch.as_tensor(np.array(value), dtype=torch.float64)
+
+
+def system(A, B, **contact) -> LCSParams:
+    A, B = tensor(A), tensor(B)
+    n, m = B.shape
+    none = {
+        "C": np.zeros((n, 0)),
+        "D": np.zeros((0, n)),
+        "E": np.zeros((0, m)),
+        "F": np.zeros((0, 0)),
+        "c": np.zeros(0),
+    }
+    return LCSParams(A=A, B=B, d=torch.zeros(n).double(), **{k: tensor(v) for k, v in {**none, **contact}.items()})
+
+
+def cost(n, m, Q=None, R=None, **linear) -> QuadraticCost:
+    Q, R = tensor(np.zeros((n, n)) if Q is None else Q), tensor(np.zeros((m, m)) if R is None else R)
+    return QuadraticCost(Q=Q, R=R, Q_final=Q, **{k: tensor(v) for k, v in linear.items()})
+
+
+CAR = ([[1, 0.1], [0, 1]], [[0], [0.1]])
+TRIPLE = ([[1, 0.1, 0], [0, 1, 0.1], [0, 0, 1]], [[0], [0], [0.1]])
+SCHOLTES = {"C": [[1], [1], [0]], "D": np.zeros((1, 3)), "E": [[1, 0]], "F": [[1]], "c": [0]}
+ROW = LinearConstraints
+# System, cost, horizon, rows, x0, and the objective that is known.
+PROBLEMS = {
+    "linear": (system([[0]], [[1]]), cost(1, 1, q_final=[-1]), 1, ROW(G=tensor([[1]]), g=tensor([1])), [0], -1),
+    "row at zero": (system([[1]], [[1]]), cost(1, 1, q_final=[-3]), 2, ROW(G=tensor([[1]]), g=tensor([0])), [-1], 0),
+    "limited speed": (
+        system(*CAR), cost(2, 1, q_final=[-1, 0]), 10, ROW(G=tensor([[0, 1]]), g=tensor([1])), [0, 0], -0.9
+    ),
+    "limited position": (
+        system(*TRIPLE), cost(3, 1, q_final=[-1, 0, 0]), 8, ROW(G=tensor([[1, 0, 0]]), g=tensor([0.1])), [0, 0, 0], -0.1
+    ),
+    "dead beat": (system(*CAR), cost(2, 1, Q=np.diag([1, 0])), 5, None, [0.01, 0], 1e-4),
+    "soft absolute value": (
+        system([[1]], [[1]]), cost(1, 1, q_final=[0.1]), 3,
+        ROW(G=tensor([[1], [-1]]), g=tensor([0, 0]), weight=tensor([1, 1])), [0.3], 0.3,
+    ),
+    "scholtes4": (
+        system(np.zeros((3, 3)), [[0, 0], [1, 0], [0, 1]], **SCHOLTES), cost(3, 2, q_final=[1, 1, -1]), 1,
+        ROW(G=tensor([[-4, 0, 1], [0, -4, 1]]), g=tensor([0, 0])), [0, 0, 0], -2e-5**0.5 * 2**0.5,
+    ),
+}  # fmt: skip
+
+
+@EXACT
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_an_exact_plan_at_a_vertex_is_solved(name, backend):
+    lcs, weights, horizon, rows, x0, best = PROBLEMS[name]
+    layer = LCSMPCLayer(lcs, weights, horizon, -50.0, 50.0, backend=backend, on_failure="mask", constraints=rows)
+    plan = layer(tensor(x0))
+    assert Status(int(plan.status)) in (Status.CONVERGED, Status.DEGENERATE)
+    assert float(plan.kkt_residual) < 1e-8
+    assert float(plan.objective) == pytest.approx(best, abs=1e-8)
+
+
+def programs(n: int, count: int):
+    """min cᵀx with x = u, Gx ≤ g and |u| ≤ 10, feasible, some limits tight; and what HiGHS finds."""
+    rng = np.random.default_rng(n)
+    m = 2 * n + 1
+    G, u, c = rng.standard_normal((count, m, n)), rng.uniform(-5, 5, (count, n)), rng.standard_normal((count, n))
+    g = np.einsum("bij,bj->bi", G, u) + rng.uniform(0, 2, (count, m)) * (rng.random((count, m)) < 0.8)
+    found = [linprog(a, b, h, bounds=[(-10, 10)] * n, method="highs") for a, b, h in zip(c, G, g, strict=True)]
+    return c, G, g, np.array([f.fun for f in found])
+
+
+@EXACT
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_random_linear_programs_are_solved(n, backend):
+    count = 128 if backend == "batched" else 8
+    c, G, g, best = programs(n, count)
+    rows = ConstraintSequence(
+        G=torch.stack([torch.zeros(G.shape).double(), tensor(G)], 1), E=torch.zeros(count, 1, *G.shape[1:]).double(),
+        g=torch.stack([torch.full(g.shape, INF).double(), tensor(g)], 1), weight=torch.full(g.shape[1:], INF).double(),
+        by_stage=("G", "E", "g"),
+    )  # fmt: skip
+    weights = cost(n, n)
+    weights = QuadraticCost(Q=weights.Q, R=weights.R, Q_final=weights.Q_final, q_final=tensor(c))
+    lcs = system(np.zeros((n, n)), np.eye(n))
+    layer = LCSMPCLayer(lcs, weights, 1, -10.0, 10.0, backend=backend, on_failure="mask", constraints=rows)
+    plan = layer(torch.zeros(count, n).double())
+    assert plan.converged.double().mean() >= 0.99
+    worse = (plan.objective.numpy() - best)[plan.converged.numpy()]
+    assert np.abs(worse).max() < 1e-6
+    assert not bool((plan.status == Status.INFEASIBLE).any())
+
+
+@EXACT
+def test_a_small_weight_of_the_action_makes_nothing_infeasible(backend):
+    for q, R in ((1.0, 1e-8), (1.0, 1e-10), (1e4, 1e-4), (1e8, 1.0)):
+        weights = cost(1, 1, R=[[R]], q_final=[-q])
+        rows = LinearConstraints(G=tensor([[1]]), g=tensor([1]))
+        layer = LCSMPCLayer(system([[0]], [[1]]), weights, 1, -10.0, 10.0, backend=backend, constraints=rows)
+        assert float(layer(tensor([0])).u) == pytest.approx(1.0, abs=1e-9)
+
+
+@EXACT
+def test_the_gradient_at_a_vertex_is_that_of_the_limit_that_holds_it(backend):
+    g = tensor([1.0]).requires_grad_()
+    rows = LinearConstraints(G=tensor([[1]]), g=g)
+    layer = LCSMPCLayer(
+        system([[0]], [[1]]), cost(1, 1, q_final=[-1]), 1, -10.0, 10.0, backend=backend, constraints=rows
+    )
+    plan = layer(tensor([0]))
+    assert float(torch.autograd.grad(plan.u.sum() + 0.5 * plan.objective, g)[0]) == pytest.approx(0.5, abs=1e-9)
+
+
+@pytest.mark.parametrize("growth", [0.5, 0.99, 1.5])
+def test_the_least_scale_does_not_grow_with_the_horizon(growth):
+    """Terms that cancel at every one of 60 stages: a gradient of a millionth of the costs is still seen."""
+    n, H = 2, 60
+    rotation = growth * np.array([[np.cos(1.0), -np.sin(1.0)], [np.sin(1.0), np.cos(1.0)]])
+    zero = {
+        k: torch.zeros(s).double() for k, s in {"Q": (n, n), "R": (n, n), "Q_final": (n, n), "d": n, "q": n}.items()
+    }
+    contact = {"C": torch.zeros(n, 0), "D": torch.zeros(0, n), "E": torch.zeros(0, n), "F": torch.zeros(0, 0)}
+    problem = MPCProblem(
+        A=tensor(rotation), B=torch.eye(n).double(), **zero, **{k: v.double() for k, v in contact.items()},
+        c=torch.zeros(0).double(), r=torch.zeros(n).double(), q_final=tensor([1e-6, 0]), u_min=-torch.ones(n).double(),
+        u_max=torch.ones(n).double(), G_x=tensor([[1, 0], [-1, 0]]), G_u=torch.zeros(2, n).double(),
+        g=torch.zeros(2).double(), price=tensor([2, 2]), x0=torch.zeros(1, n).double(), horizon=H, relaxation=1e-5,
+    )  # fmt: skip
+    u, mu = torch.zeros(1, H, n).double(), torch.ones(1, H + 1, 2).double()
+    x, lam = problem.rollout(u)
+    primal = Primal(x, u, lam, mu)
+    assert float(kkt.residual(problem, primal, kkt.multipliers(problem, primal))) > kkt.CERTIFIED
+
+
+def test_infeasible_is_not_said_of_what_can_be_solved():
+    """Random rows that a known plan meets, and R/q of 1 … 1e-10."""
+    rng = np.random.default_rng(0)
+    count, n, H = 256, 3, 4
+    new = rng.standard_normal
+    A, B, G = 0.9 * np.eye(n) + 0.1 * new((count, n, n)), new((count, n, 2)), new((count, 2, n))
+    x, u, states = new((count, n)), rng.uniform(-1, 1, (H, count, 2)), []
+    x0 = x
+    for k in range(H):
+        x = np.einsum("bij,bj->bi", A, x) + np.einsum("bij,bj->bi", B, u[k])
+        states.append(np.einsum("bij,bj->bi", G, x))
+    g = np.stack([np.full((count, 2), INF), *states], 1)
+    weight, none = 10.0 ** rng.uniform(-10, 0, (count, 1, 1)), np.zeros
+    arrays = {
+        "A": A, "B": B, "C": none((n, 0)), "d": none(n), "D": none((0, n)), "E": none((0, 2)), "F": none((0, 0)),
+        "c": none(0), "Q": none((n, n)), "R": weight * np.eye(2), "Q_final": none((n, n)), "q": none(n), "r": none(2),
+        "q_final": new((count, n)), "u_min": -np.ones(2), "u_max": np.ones(2), "G_x": G, "G_u": none((2, 2)), "g": g,
+        "price": np.full(2, INF), "x0": x0,
+    }  # fmt: skip
+    problem = MPCProblem(**{k: tensor(v) for k, v in arrays.items()}, horizon=H, relaxation=1e-5)
+    status = BatchedBackend().solve(problem, None).status
+    assert not bool((status == Status.INFEASIBLE).any())
+    assert (status == Status.CONVERGED).logical_or(status == Status.DEGENERATE).double().mean() > 0.9
