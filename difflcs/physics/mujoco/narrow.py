@@ -1,0 +1,279 @@
+"""How far apart two shapes are or how deep they overlap, and where their faces meet.
+
+MuJoCo's own contacts are exact between shapes that have a formula (`NATIVE`). All others it inflates by the distance
+up to which contacts matter, and then misjudges how deep they are. `mj_geomDistance` does not, if its tolerance is small
+beside the shapes. It finds one point on each shape; the faces around the two are cut with each other here.
+"""
+
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH, _SDF = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
+    for name in ("PLANE", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH", "SDF")
+)
+NATIVE = np.zeros((_SDF + 1, _SDF + 1), dtype=bool)  # kinds of shapes between which MuJoCo's contacts are exact
+NATIVE[PLANE] = NATIVE[:, PLANE] = True
+for _kind, _others in ((SPHERE, [SPHERE, CAPSULE, CYLINDER, BOX]), (CAPSULE, [CAPSULE, BOX]), (BOX, [BOX])):
+    NATIVE[_kind, _others] = NATIVE[_others, _kind] = True
+
+# In parts of the smaller shape: tolerance of `mj_geomDistance`; the gap below which its two points give no direction;
+# how far one of the shapes is then put aside; how far a corner may be outside of a face.
+_TOLERANCE, _TOUCHING, _ASIDE, _EDGE = 1e-10, 5e-6, 5e-5, 1e-6
+_ITERATIONS = 100
+_CORNERS, _MOST = 8, 4  # of a face; contacts of a pair
+_STRIP = 3e-3  # half the width of the line along which a round side touches, in parts of its radius
+_SIDES = np.concatenate([np.eye(3), -np.eye(3)])
+
+
+class Witness(NamedTuple):
+    """Nearest or deepest points of pairs (n,).
+
+    Attributes:
+        pair: numbers of the pairs.
+        gap: distance, or minus the least way that parts them [m].
+        normal: (n, 3) unit vector from the first shape to the second.
+        first: (n, 3) point on the first shape.
+        second: (n, 3) point on the second.
+    """
+
+    pair: NDArray[np.intp]
+    gap: Array
+    normal: Array
+    first: Array
+    second: Array
+
+    def take(self, which: Any) -> Witness:
+        """Some of them."""
+        return Witness(*(v[which] for v in self))
+
+
+class _Face(NamedTuple):
+    """Faces of n shapes, seen along a normal: corners (n, _CORNERS, 2), and height = level + slope · place there."""
+
+    corners: Array
+    level: Array
+    slope: Array
+    line: NDArray[np.bool_]
+    faces: NDArray[np.bool_]
+
+    def height(self, at: Array) -> Array:
+        return self.level[:, None] + np.einsum("nj,nkj->nk", self.slope, at)
+
+
+class Narrow:
+    """Measures pairs of geoms as they are in `data`.
+
+    Args:
+        model: a copy that is ours.
+        data: its data.
+        first: (n_pairs,) geoms, none of them a plane.
+        second: (n_pairs,) the others.
+        distance: what is farther apart does not count [m].
+    """
+
+    def __init__(self, model: Any, data: Any, first: NDArray[np.intp], second: NDArray[np.intp], distance: float):
+        self.model, self.data, self.first, self.second, self.distance = model, data, first, second, distance
+        radius, kind = model.geom_rbound, model.geom_type
+        self._reach, self.size = radius[first] + radius[second], np.minimum(radius[first], radius[second])
+        self._pairs = list(zip(first.tolist(), second.tolist(), self.size.tolist(), strict=True))
+        self._ends = np.empty(6)
+        with_faces = np.isin(kind, (CAPSULE, CYLINDER, BOX, MESH))
+        self._meet = with_faces[first] & with_faces[second]
+        geoms = np.unique(np.concatenate([first[self._meet], second[self._meet]]))
+        self._solids = {int(g): _Solid(model, int(g)) for g in geoms}
+        model.opt.ccd_iterations = _ITERATIONS
+        model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
+
+    def at_least(self, pairs: Any) -> Array:
+        """What the gaps of these pairs are at least: those of spheres around the shapes."""
+        place = self.data.geom_xpos
+        apart = place[self.first[pairs]] - place[self.second[pairs]]
+        return np.sqrt(np.einsum("ij,ij->i", apart, apart)) - self._reach[pairs]
+
+    def measure(self, pairs: Any) -> Witness:
+        """Those of these pairs that are within the distance."""
+        found = [(k, *w) for k in pairs.tolist() if (w := self._measure(*self._pairs[k])) is not None]
+        if not found:
+            return Witness(np.zeros(0, dtype=np.intp), np.zeros(0), *np.zeros((3, 0, 3)))
+        pair, gap, normal, ends = zip(*found, strict=True)
+        both = np.array(ends)
+        return Witness(np.array(pair), np.array(gap), np.array(normal), both[:, :3], both[:, 3:])
+
+    def _measure(self, a: int, b: int, size: float) -> tuple[float, Array, Array] | None:
+        model, data, ends = self.model, self.data, self._ends
+        model.opt.ccd_tolerance = _TOLERANCE * size
+        gap = mujoco.mj_geomDistance(model, data, a, b, self.distance, ends)
+        if gap >= self.distance:
+            return None
+        if abs(gap) > _TOUCHING * size:
+            return gap, (ends[3:] - ends[:3]) / gap, ends.copy()
+        # As good as touching: the direction is that to the shape put a little aside, the way that parts them most.
+        place, best, normal, kept = data.geom_xpos, 0.0, _SIDES[0], ends.copy()
+        here = place[b].copy()
+        for side in _SIDES:
+            place[b] = here + _ASIDE * size * side
+            apart = mujoco.mj_geomDistance(model, data, a, b, self.distance, ends)
+            if apart > best:
+                best, normal = apart, (ends[3:] - ends[:3]) / apart
+                kept[:3], kept[3:] = ends[:3], ends[:3] + gap * normal
+            if best > 0.4 * _ASIDE * size:  # one of the six goes along the normal for more than half of its way
+                break
+        place[b] = here
+        return gap, normal, kept
+
+    def contacts(
+        self, of: Witness, where: NDArray[np.intp], places: Array, turns: Array
+    ) -> tuple[NDArray[np.intp], Witness]:
+        """All contacts of these pairs: their witnesses, and where faces meet, corners of what both cover.
+
+        Args:
+            of: (n,).
+            where: (n,) rows of `places` and `turns`.
+            places: (n_states, ngeom, 3) of all geoms.
+            turns: (n_states, ngeom, 3, 3).
+
+        Returns:
+            Numbers in `of`, and what they are.
+        """
+        meet = self._meet[of.pair]
+        numbers, flat = np.flatnonzero(~meet), np.flatnonzero(meet)
+        if not len(flat):
+            return numbers, of
+        pair, gap, normal, origin, _ = of.take(flat)
+        across = np.stack(perpendicular(normal), -1)
+        low, high = (
+            self._face(g := geoms[pair], normal, sign, origin, across, places[where[flat], g], turns[where[flat], g])
+            for geoms, sign in ((self.first, 1.0), (self.second, -1.0))
+        )
+        size = self.size[pair]
+        at, valid = _common(low.corners, high.corners, _EDGE * size)
+        apart = high.height(at) - low.height(at)
+        valid &= (low.faces & high.faces)[:, None] & (apart < self.distance)
+        # The witness stands last, or a corner that is as near stands for it.
+        at = np.concatenate([at, np.zeros((len(flat), 1, 2))], 1)
+        apart = np.concatenate([np.where(valid, apart, np.inf), gap[:, None]], 1)
+        each = np.arange(len(flat))
+        chosen = (apart - 1e-5 * size[:, None] * (np.arange(apart.shape[1]) < apart.shape[1] - 1)).argmin(-1)
+        far = np.where(apart < np.inf, np.inf, -1.0)
+        far[chosen < far.shape[1] - 1, -1] = -1.0
+        picked, most = [(each, chosen)], np.where(low.line | high.line, 2, _MOST)
+        for k in range(1, _MOST):
+            far = np.minimum(far, np.linalg.norm(at - at[each, chosen][:, None], axis=-1))
+            chosen = far.argmax(-1)
+            more = np.flatnonzero((far[each, chosen] > 1e-3 * size) & (k < most))
+            picked.append((more, chosen[more]))
+        row, column = (np.concatenate(v) for v in zip(*picked, strict=True))
+        level = np.concatenate([low.height(at[:, :-1]), np.zeros((len(flat), 1))], 1)[row, column]
+        first = origin[row] + np.einsum("nij,nj->ni", across[row], at[row, column]) + level[:, None] * normal[row]
+        gap, normal = apart[row, column], normal[row]
+        corners = Witness(pair[row], gap, normal, first, first + gap[:, None] * normal)
+        both = Witness(*(np.concatenate(v) for v in zip(of.take(numbers), corners, strict=True)))
+        return np.concatenate([numbers, flat[row]]), both
+
+    def _face(
+        self, geoms: Any, normal: Array, sign: float, origin: Array, across: Array, place: Array, turn: Array
+    ) -> _Face:
+        """Of each geom (n,) the face that looks most along ± normal (n, 3)."""
+        toward = sign * np.einsum("ni,nij->nj", normal, turn)
+        corners, outward = np.empty((len(geoms), _CORNERS, 3)), np.empty_like(toward)
+        line = np.zeros(len(geoms), dtype=bool)
+        for geom in np.unique(geoms):
+            mine = np.flatnonzero(geoms == geom)
+            corners[mine], outward[mine], line[mine] = self._solids[int(geom)].face(toward[mine])
+        corners = np.einsum("nij,nkj->nki", turn, corners) + (place - origin)[:, None]
+        outward = np.einsum("nij,nj->ni", turn, outward)
+        along = np.einsum("ni,ni->n", outward, normal)
+        faces = sign * along > 0.05  # else there is none, as at the end of a capsule
+        along = np.where(faces, along, 1.0)
+        level = np.einsum("ni,ni->n", outward, corners[:, 0]) / along
+        return _Face(corners @ across, level, -np.einsum("ni,nij->nj", outward, across) / along[:, None], line, faces)
+
+
+class _Solid:
+    """Faces of a geom in its own frame: corners (n, _CORNERS, 3) and outward normals (n, 3) of those that are flat."""
+
+    def __init__(self, model: Any, geom: int):
+        kind, self.size = int(model.geom_type[geom]), model.geom_size[geom].copy()
+        self.round, self.cap = kind in (CAPSULE, CYLINDER), 0.5**0.5 if kind == CYLINDER else np.inf
+        if kind == MESH:
+            faces, self.outward = _polygons(model, int(model.geom_dataid[geom]))
+        elif kind == BOX:
+            square, self.outward = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1.0]]), _SIDES
+            faces = [np.insert(square, k % 3, 1 if k < 3 else -1, axis=1) * self.size for k in range(6)]
+        else:
+            angle, self.outward = np.arange(_CORNERS) * (2 * np.pi / _CORNERS), _SIDES[[2, 5]]
+            circle = self.size[0] * np.stack([np.cos(angle), np.sin(angle)], -1)
+            faces = [np.insert(circle, 2, height, axis=1) for height in (self.size[1], -self.size[1])]
+        rows = (np.round(np.linspace(0, max(len(f), _CORNERS) - 1, _CORNERS)).astype(int) for f in faces)
+        self.corners = np.stack([f[np.minimum(r, len(f) - 1)] for f, r in zip(faces, rows, strict=True)])
+
+    def face(self, toward: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Corners, outward normals, and whether it is the line of a round side, of the faces that look most there."""
+        best = (toward @ self.outward.T).argmax(-1)
+        corners, outward = self.corners[best], self.outward[best]
+        line = np.abs(toward[:, 2]) < self.cap if self.round else np.zeros(len(toward), dtype=bool)
+        if line.any():
+            radial = toward[line] * (1.0, 1.0, 0.0)
+            radial /= np.maximum(np.linalg.norm(radial, axis=-1, keepdims=True), 1e-12)
+            aside, (radius, half, _) = np.stack([-radial[:, 1], radial[:, 0], radial[:, 2]], -1), self.size
+            ends = [u * half * _SIDES[2] + v * _STRIP * radius * aside for u, v in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
+            corners[line] = radius * radial[:, None] + np.stack(ends, 1)[:, [0, 1, 2, 3, 3, 3, 3, 3]]
+            outward[line] = radial
+        return corners, outward, line
+
+
+def _polygons(model: Any, mesh: int) -> tuple[list[Array], Array]:
+    """Faces of the hull of a mesh: corners, in order, and outward normals."""
+    start, first = model.mesh_vertadr[mesh], model.mesh_polyadr[mesh]
+    rows = slice(first, first + model.mesh_polynum[mesh])
+    vertices = model.mesh_vert[start : start + model.mesh_vertnum[mesh]].astype(np.float64)
+    ends = zip(model.mesh_polyvertadr[rows], model.mesh_polyvertnum[rows], strict=True)
+    faces = [vertices[model.mesh_polyvert[address : address + count]] for address, count in ends]
+    return faces, model.mesh_polynormal[rows].astype(np.float64)
+
+
+def perpendicular(normal: Array) -> tuple[Array, Array]:
+    """Two unit vectors perpendicular to unit vectors (..., 3) and to each other."""
+    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin(-1)])
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    return first, np.cross(normal, first)
+
+
+def _common(first: Array, second: Array, tolerance: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Corners of what two convex polygons (n, k, 2) have in common, among points (n, k + k + k², 2), and which."""
+    sides = [np.roll(p, -1, 1) - p for p in (first, second)]
+    along, across = sides[0][:, :, None], sides[1][:, None]
+    between, turn = second[:, None] - first[:, :, None], _cross(along, across)
+    size = np.linalg.norm(along, axis=-1) * np.linalg.norm(across, axis=-1)
+    crossing = np.abs(turn) > np.maximum(1e-9 * size, 1e-300)
+    turn = np.where(crossing, turn, 1.0)
+    s, t = _cross(between, across) / turn, _cross(between, along) / turn
+    crossing &= (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
+    crossings = first[:, :, None] + s[..., None] * along
+    n, k, _ = first.shape
+    valid = [_inside(first, second, sides[1], tolerance), _inside(second, first, sides[0], tolerance)]
+    return np.concatenate([first, second, crossings.reshape(n, k * k, 2)], 1), np.concatenate(
+        [*valid, crossing.reshape(n, k * k)], 1
+    )
+
+
+def _inside(points: Array, polygon: Array, sides: Array, tolerance: Array) -> NDArray[np.bool_]:
+    """Which points (n, m, 2) are in convex polygons (n, k, 2), of either orientation."""
+    orientation = np.sign(_cross(polygon, np.roll(polygon, -1, 1)).sum(1))[:, None, None]
+    far = _cross(sides[:, None], points[:, :, None] - polygon[:, None]) * orientation
+    return (far >= -tolerance[:, None, None] * np.linalg.norm(sides, axis=-1)[:, None]).all(-1)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
