@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 Array = NDArray[np.float64]
 
@@ -234,13 +235,23 @@ class _Solid:
 
 
 def _polygons(model: Any, mesh: int) -> tuple[list[Array], Array]:
-    """Faces of the hull of a mesh: corners, in order, and outward normals."""
+    """Faces of the hull of a mesh: corners, in order, and outward normals. MuJoCo joins some that are not quite flat."""
     start, first = model.mesh_vertadr[mesh], model.mesh_polyadr[mesh]
     rows = slice(first, first + model.mesh_polynum[mesh])
     vertices = model.mesh_vert[start : start + model.mesh_vertnum[mesh]].astype(np.float64)
     ends = zip(model.mesh_polyvertadr[rows], model.mesh_polyvertnum[rows], strict=True)
-    faces = [vertices[model.mesh_polyvert[address : address + count]] for address, count in ends]
-    return faces, model.mesh_polynormal[rows].astype(np.float64)
+    size, faces, outward = np.ptp(vertices, axis=0).max(), [], []
+    for (address, count), normal in zip(ends, model.mesh_polynormal[rows].astype(np.float64), strict=True):
+        corners = vertices[model.mesh_polyvert[address : address + count]]
+        if np.ptp(corners @ normal) < 1e-6 * size:
+            faces.append(corners)
+            outward.append(normal)
+        else:  # triangles of the hull with a point below that are not sides to it
+            hull = ConvexHull(np.concatenate([corners, [corners.mean(0) - size * normal]]))
+            outer = (hull.simplices < count).all(-1)
+            faces.extend(corners[hull.simplices[outer]])
+            outward.extend(hull.equations[outer, :3])
+    return faces, np.array(outward)
 
 
 def perpendicular(normal: Array) -> tuple[Array, Array]:
