@@ -242,9 +242,12 @@ def judge(seed: int) -> Judged | None:
     points = tilt = 0.0
     for g, normal, row in zip(gap, n, rows, strict=True):
         at = data.xpos[2] + np.cross(normal, turn @ row[first + 3 : first + 6])
-        low, high = (sign * b.end(at, sign * normal) - a.end(at, normal) for sign in (-1, 1))
-        if a.kind != "plane":  # whose contacts are any points of the other shape
-            high = low
+        low = high = -b.end(at, -normal) - a.end(at, normal)
+        # MuJoCo's own contacts are also of other points, those of a capsule and those on a plane.
+        if a.kind == "plane" or (a.kind, b.kind) == ("box", "capsule"):
+            high = b.end(at, normal) - a.end(at, normal)
+        elif (a.kind, b.kind) == ("capsule", "box"):
+            high = a.end(at, -normal) - b.end(at, -normal)
         points = max(points, (low - g) / width, (g - high) / width)
         tilt = max(tilt, abs(np.linalg.norm(normal) - 1), np.abs(row[:3] + normal).max() if first else 0.0)
     return Judged(pair, true / width, abs(gap[nearest] - true) / width, (true - best) / width, points, tilt, len(gap))

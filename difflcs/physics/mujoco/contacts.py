@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from difflcs._checks import describe
 from difflcs.errors import ContactWarning, InvalidInputError
-from difflcs.physics.mujoco.narrow import NATIVE, Array, Narrow, Witness, perpendicular
+from difflcs.physics.mujoco.narrow import NATIVE, Array, Measured, Narrow, Witness, cross, perpendicular, witnesses
 
 Pairs = Sequence[tuple[int | str, int | str]]
 
@@ -85,8 +85,8 @@ class Read(NamedTuple):
         apart: (n, n_contacts) distance of the points on both bodies whose motion `rows` takes to be that of one point
             in the middle between them.
         axes: (n, nv, 6) around and along which each degree of freedom moves what it moves, at its centre.
-        measured: contacts that MuJoCo did not find, before their faces are cut: states, witnesses, and centres
-            (ngeom, 3), places (ngeom, 3) and turns (ngeom, 3, 3) of all geoms there.
+        measured: what MuJoCo did not find, before faces are cut: states, pairs, and of all geoms there the centres
+            (ngeom, 3), places (ngeom, 3) and turns (ngeom, 3, 3).
     """
 
     gap: Array
@@ -95,7 +95,7 @@ class Read(NamedTuple):
     geom: NDArray[np.intp]
     apart: Array
     axes: Array
-    measured: list[tuple[int, Witness, Array, Array, Array]]
+    measured: list[tuple[int, list[Measured], Array, Array, Array]]
 
 
 class ContactFinder:
@@ -146,7 +146,7 @@ class ContactFinder:
         measured = np.flatnonzero(boxes | ~self._native[first, second])
         self._narrow = Narrow(model, data, first[measured], second[measured], distance)
         self._boxes, self._others = np.flatnonzero(boxes[measured]), np.flatnonzero(~boxes[measured])
-        self._room = np.array([_POINTS.get((int(a), int(b)), 1) for a, b in kinds[measured]], dtype=int)
+        self._room = [_POINTS.get((int(a), int(b)), 1) for a, b in kinds[measured]]
         self._turns = _moves(model)[model.geom_bodyid].astype(np.float64)
         self._root = model.body_rootid[model.geom_bodyid]
         # Three rows of the Jacobian for each contact, the normal and two tangents, whatever its friction is.
@@ -180,19 +180,17 @@ class ContactFinder:
         gap, geom, address = contact.dist, contact.geom, contact.efc_address
         rows = jacobian[address[:, None] + _THREE] if len(jacobian) else np.zeros((len(gap), 3, self.model.nv))
         frame, own = contact.frame.reshape(-1, 3, 3), (address >= 0) & self._native[geom[:, 0], geom[:, 1]]
-        into.axes[i], measured, room = data.cdof, [], 0
+        into.axes[i], measured = data.cdof, []
         if len(self._boxes):
-            own, mended = self._mend_boxes(gap, geom, own)
-            measured.append(mended)
+            own, measured = self._mend_boxes(gap, geom, frame[:, 0], own)
         # A normal that nothing can move along is that of a body resting on what is outside the plane of motion.
         kept = np.flatnonzero(own & (np.abs(rows[:, 0]).max(-1, initial=0.0) > _STILL))
         if len(self._others):
-            measured.append(self._nearest(gap[kept]))
-        if measured := [w for w in measured if len(w.pair)]:
-            room = sum(int(self._room[w.pair].sum()) for w in measured)
+            measured = measured + self._nearest(gap[kept])
+        if measured:
             poses = data.subtree_com[self._root], data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy()
-            into.measured.extend((i, w, *poses) for w in measured)
-        if len(kept) > _ENOUGH and len(kept) + room > count:
+            into.measured.append((i, measured, *poses))
+        if len(kept) > _ENOUGH and len(kept) + sum(self._room[m[0]] for m in measured) > count:
             kept = _spread(contact.pos, geom, gap, kept)
         if len(kept) > count:
             self._warn_of_more(int((gap[kept] <= self._warn_within).sum()))
@@ -201,36 +199,57 @@ class ContactFinder:
         into.gap[i, :k], into.rows[i, :k], into.frame[i, :k] = gap[kept], rows[kept], frame[kept]
         into.geom[i, :k], into.apart[i, :k] = geom[kept], gap[kept]
 
-    def _mend_boxes(self, gap: Array, geom: Any, own: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], Witness]:
-        """Contacts without those of boxes that are nearer or farther than their contacts say, and these boxes."""
+    def _mend_boxes(
+        self, gap: Array, geom: Any, normal: Array, own: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.bool_], list[Measured]]:
+        """Contacts without those of boxes that are nearer, farther or another way than they say, and such boxes."""
         narrow, n = self._narrow, self.model.ngeom
-        found = narrow.measure(self._boxes[narrow.at_least(self._boxes) < self.distance])
-        if not len(found.pair):
-            return own, found
+        near = self._boxes[narrow.at_least(self._boxes) < self.distance]
+        if not (measured := narrow.measure(near.tolist())):
+            return own, measured
+        found = witnesses(measured)
         key, keys = geom.min(-1) * n + geom.max(-1), narrow.first[found.pair] * n + narrow.second[found.pair]
         place = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
         of_boxes, nearest = keys[place] == key, np.full(len(keys), np.inf)
         np.minimum.at(nearest, place[of_boxes], gap[of_boxes])
-        wrong = np.abs(nearest - found.gap) > 1e-6 * narrow.size[found.pair]
-        return own & ~(of_boxes & wrong[place]), found.take(wrong)
+        tolerance = 1e-5 * narrow.size[found.pair]
+        wrong = np.abs(nearest - found.gap) > tolerance
+        same = np.abs(np.einsum("ij,ij->i", normal, found.normal[place])) > 1 - 1e-10
+        for k in np.flatnonzero(of_boxes & ~same & ~wrong[place]):
+            wrong[place[k]] |= narrow.boxes_along(geom[k], normal[k]) < found.gap[place[k]] - tolerance[place[k]]
+        return own & ~(of_boxes & wrong[place]), [measured[k] for k in np.flatnonzero(wrong)]
 
-    def _nearest(self, gap: Array) -> Witness:
+    def _nearest(self, gap: Array) -> list[Measured]:
         """Pairs that MuJoCo does not test: all within the distance, or those that can be among the nearest contacts."""
-        narrow, data, count, found = self._narrow, self.data, self.n_contacts, []
+        narrow, count = self._narrow, self.n_contacts
         lower = narrow.at_least(self._others)
         reach = np.flatnonzero(lower < self.distance)
         if len(reach) <= count:
-            return narrow.measure(self._others[reach])
+            return narrow.measure(self._others[reach].tolist())
         reach = reach[np.argsort(lower[reach])]
-        for start in range(0, len(reach), count):
-            if len(gap) >= count:
-                farthest = max(self._warn_within, np.partition(gap, count - 1)[count - 1])
-                if lower[reach[start]] > farthest:
+        pairs, lower, found = self._others[reach].tolist(), lower[reach], []
+        for start in range(0, len(pairs), count):
+            if lower[start] > self._farthest(gap, found):
+                found = self._moving(found)
+                if lower[start] > self._farthest(gap, found):
                     break
-            found.append(some := narrow.measure(self._others[reach[start : start + count]]))
-            rows = self._motion(some, some.normal[:, None], data.cdof[None], data.subtree_com[self._root][None])
-            gap = np.concatenate([gap, some.gap[np.abs(rows).max((1, 2), initial=0.0) > _STILL]])
-        return Witness(*(np.concatenate(v) for v in zip(*found, strict=True)))
+            found = found + narrow.measure(pairs[start : start + count])
+        farthest = self._farthest(gap, found := self._moving(found))
+        return [m for m in found if m[1] <= farthest]
+
+    def _farthest(self, gap: Array, found: list[Measured]) -> float:
+        """Which of the contacts, those of gaps (n,) and those found, count at most."""
+        gap = np.concatenate([gap, [m[1] for m in found]])
+        enough = len(gap) >= self.n_contacts > 0
+        return max(self._warn_within, np.partition(gap, self.n_contacts - 1)[self.n_contacts - 1]) if enough else np.inf
+
+    def _moving(self, found: list[Measured]) -> list[Measured]:
+        """Those of pairs that can move along the normal."""
+        if not found:
+            return found
+        some, data = witnesses(found), self.data
+        rows = self._motion(some, some.normal[:, None], data.cdof[None], data.subtree_com[self._root][None])
+        return [m for m, row in zip(found, rows, strict=True) if np.abs(row).max(initial=0.0) > _STILL]
 
     def _motion(self, of: Witness, along: Array, axes: Array, centres: Array) -> Array:
         """How the second point moves from the first along directions (n, k, 3), by degrees of freedom: (n, k, nv)."""
@@ -238,17 +257,16 @@ class ContactFinder:
         for sign, geoms, points in ((1, self._narrow.second, of.second), (-1, self._narrow.first, of.first)):
             geom = geoms[of.pair]
             arm = points - centres[np.arange(len(centres)), geom]
-            wrench = np.concatenate([np.cross(arm[:, None], along), along], -1)
+            wrench = np.concatenate([cross(arm[:, None], along), along], -1)
             total = total + sign * (wrench @ axes.swapaxes(-1, -2)) * self._turns[geom][:, None]
         return total
 
     def _with_measured(self, read: Read) -> Read:
         """Contacts with those that were measured: of each state the nearest."""
-        states, witnesses, *poses = zip(*read.measured, strict=True)
+        states, measured, *poses = zip(*read.measured, strict=True)
         centres, places, turns = map(np.stack, poses)
-        where = np.repeat(np.arange(len(states)), [len(w.pair) for w in witnesses])
-        all_of_them = Witness(*(np.concatenate(v) for v in zip(*witnesses, strict=True)))
-        numbers, found = self._narrow.contacts(all_of_them, where, places, turns)
+        where = np.repeat(np.arange(len(states)), [len(m) for m in measured])
+        numbers, found = self._narrow.contacts(witnesses([m for some in measured for m in some]), where, places, turns)
         where = where[numbers]
         state, frame = np.array(states)[where], np.stack([found.normal, *perpendicular(found.normal)], 1)
         rows = self._motion(found, frame, read.axes[state], centres[where])
