@@ -144,7 +144,7 @@ class ContactFinder:
         self.n_tangents = (1 if self.axis is not None else 2) if rough else 0
         boxes = (kinds == _BOX).all(-1)
         measured = np.flatnonzero(boxes | ~self._native[first, second])
-        self._narrow = Narrow(model, data, first[measured], second[measured], distance)
+        self._narrow = Narrow(model, data, first[measured], second[measured], distance, self.axis)
         self._boxes, self._others = np.flatnonzero(boxes[measured]), np.flatnonzero(~boxes[measured])
         self._room = [_POINTS.get((int(a), int(b)), 1) for a, b in kinds[measured]]
         self._turns = _moves(model)[model.geom_bodyid].astype(np.float64)
@@ -266,9 +266,11 @@ class ContactFinder:
         states, measured, *poses = zip(*read.measured, strict=True)
         centres, places, turns = map(np.stack, poses)
         where = np.repeat(np.arange(len(states)), [len(m) for m in measured])
-        numbers, found = self._narrow.contacts(witnesses([m for some in measured for m in some]), where, places, turns)
-        where = where[numbers]
-        state, frame = np.array(states)[where], np.stack([found.normal, *perpendicular(found.normal)], 1)
+        nearest = witnesses([m for some in measured for m in some])
+        frame = np.stack([nearest.normal, *perpendicular(nearest.normal)], 1)
+        numbers, found = self._narrow.contacts(nearest, frame, where, places, turns)
+        where, frame = where[numbers], frame[numbers]
+        state = np.array(states)[where]
         rows = self._motion(found, frame, read.axes[state], centres[where])
         geom = np.stack([self._narrow.first[found.pair], self._narrow.second[found.pair]], -1)
         own, slot = np.nonzero(read.frame.any((-1, -2)))

@@ -32,7 +32,7 @@ for _kind, _others in ((SPHERE, [SPHERE, CAPSULE, CYLINDER, BOX]), (CAPSULE, [CA
 # how far one of the shapes is then put aside; how far a corner may be outside of a face.
 _TOLERANCE, _TOUCHING, _ASIDE, _EDGE = 1e-10, 5e-6, 5e-5, 1e-6
 _ITERATIONS = 100
-_CORNERS, _MOST = 8, 4  # of a face; contacts of a pair
+_FEW, _CORNERS, _MOST = 4, 8, 4  # corners of a face; contacts of a pair
 _STRIP = 3e-3  # half the width of the line along which a round side touches, in parts of its radius
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 _SIDES = np.concatenate([np.eye(3), -np.eye(3)])
@@ -92,15 +92,27 @@ class Narrow:
         first: (n_pairs,) geoms, none of them a plane.
         second: (n_pairs,) the others.
         distance: what is farther apart does not count [m].
+        axis: normal (3,) of the plane in which everything moves, or None.
     """
 
-    def __init__(self, model: Any, data: Any, first: NDArray[np.intp], second: NDArray[np.intp], distance: float):
+    def __init__(
+        self,
+        model: Any,
+        data: Any,
+        first: NDArray[np.intp],
+        second: NDArray[np.intp],
+        distance: float,
+        axis: Array | None,
+    ):
         self.model, self.data, self.first, self.second, self.distance = model, data, first, second, distance
         radius, kind = model.geom_rbound, model.geom_type
         self._reach, self.size = radius[first] + radius[second], np.minimum(radius[first], radius[second])
         self._pairs = list(zip(first.tolist(), second.tolist(), self.size.tolist(), strict=True))
         self._ends = np.empty(6)
         with_faces = np.isin(kind, (CAPSULE, CYLINDER, BOX, MESH))
+        if axis is not None:  # what is round in the plane of motion touches in one point there
+            upright = np.abs(data.geom_xmat.reshape(-1, 3, 3)[:, :, 2] @ axis) > 1 - 1e-9
+            with_faces &= ~(upright & np.isin(kind, (CAPSULE, CYLINDER)))
         self._meet = with_faces[first] & with_faces[second]
         geoms = np.unique(np.concatenate([first[self._meet], second[self._meet]]))
         self._solids = {int(g): _Solid(model, int(g)) for g in geoms}
@@ -148,12 +160,13 @@ class Narrow:
         return float(normal @ (data.geom_xpos[geoms[1]] - data.geom_xpos[geoms[0]])) - wide
 
     def contacts(
-        self, of: Witness, where: NDArray[np.intp], places: Array, turns: Array
+        self, of: Witness, frame: Array, where: NDArray[np.intp], places: Array, turns: Array
     ) -> tuple[NDArray[np.intp], Witness]:
         """All contacts of these pairs: their witnesses, and where faces meet, corners of what both cover.
 
         Args:
             of: (n,).
+            frame: (n, 3, 3) its rows are the normal and two directions across.
             where: (n,) rows of `places` and `turns`.
             places: (n_states, ngeom, 3) of all geoms.
             turns: (n_states, ngeom, 3, 3).
@@ -162,57 +175,66 @@ class Narrow:
             Numbers in `of`, and what they are.
         """
         meet = self._meet[of.pair]
-        numbers, flat = np.flatnonzero(~meet), np.flatnonzero(meet)
-        if not len(flat):
-            return numbers, of
-        pair, gap, normal, origin, _ = of.take(flat)
-        across = np.stack(perpendicular(normal), -1)
-        low, high = (
-            self._face(g := geoms[pair], normal, sign, origin, across, places[where[flat], g], turns[where[flat], g])
-            for geoms, sign in ((self.first, 1.0), (self.second, -1.0))
-        )
-        size = self.size[pair]
+        rows = meet.nonzero()[0]
+        if not len(rows):
+            return np.arange(len(meet)), of
+        n, pair, origin, size = len(rows), of.pair[rows], of.first[rows], self.size[of.pair[rows]]
+        frame, where, gap = frame[rows], where[rows], of.gap[rows]
+        low, high = self._faces(pair, frame, origin, where, places, turns)
         at, valid = _common(low.corners, high.corners, _EDGE * size)
         apart = high.height(at) - low.height(at)
         valid &= (low.faces & high.faces)[:, None] & (apart < self.distance)
-        # The witness stands last, or a corner that is as near stands for it.
-        at = np.concatenate([at, np.zeros((len(flat), 1, 2))], 1)
-        apart = np.concatenate([np.where(valid, apart, np.inf), gap[:, None]], 1)
-        each = np.arange(len(flat))
-        chosen = (apart - 1e-5 * size[:, None] * (np.arange(apart.shape[1]) < apart.shape[1] - 1)).argmin(-1)
+        # The witness comes first, or a corner that is as near stands for it.
+        at = np.concatenate([np.zeros((n, 1, 2)), at], 1)
+        apart = np.concatenate([gap[:, None], np.where(valid, apart, np.inf)], 1)
+        each, near = np.arange(n), apart[:, 1:].argmin(-1) + 1
+        chosen = np.where(apart[each, near] < gap + 1e-5 * size, near, 0)
         far = np.where(apart < np.inf, np.inf, -1.0)
-        far[chosen < far.shape[1] - 1, -1] = -1.0
+        far[chosen > 0, 0] = -1.0
         picked, most = [(each, chosen)], np.where(low.line | high.line, 2, _MOST)
         for k in range(1, _MOST):
-            far = np.minimum(far, np.linalg.norm(at - at[each, chosen][:, None], axis=-1))
+            step = at - at[each, chosen][:, None]
+            far = np.minimum(far, step[..., 0] ** 2 + step[..., 1] ** 2)
             chosen = far.argmax(-1)
-            more = np.flatnonzero((far[each, chosen] > 1e-3 * size) & (k < most))
+            more = ((far[each, chosen] > (1e-3 * size) ** 2) & (k < most)).nonzero()[0]
             picked.append((more, chosen[more]))
         row, column = (np.concatenate(v) for v in zip(*picked, strict=True))
-        level = np.concatenate([low.height(at[:, :-1]), np.zeros((len(flat), 1))], 1)[row, column]
-        first = origin[row] + np.einsum("nij,nj->ni", across[row], at[row, column]) + level[:, None] * normal[row]
-        gap, normal = apart[row, column], normal[row]
+        level = np.where(column > 0, low.level[row] + (low.slope[row] * at[row, column]).sum(-1), 0.0)
+        there, gap, axes = at[row, column], apart[row, column], frame[row]
+        first = origin[row] + np.concatenate([level[:, None], there], -1)[:, None] @ axes
+        normal, first = axes[:, 0], first[:, 0]
         corners = Witness(pair[row], gap, normal, first, first + gap[:, None] * normal)
-        both = Witness(*(np.concatenate(v) for v in zip(of.take(numbers), corners, strict=True)))
-        return np.concatenate([numbers, flat[row]]), both
+        numbers = rows[row]
+        if len(rows) < len(meet):
+            single = (~meet).nonzero()[0]
+            numbers = np.concatenate([single, numbers])
+            corners = Witness(*(np.concatenate([v[single], w]) for v, w in zip(of, corners, strict=True)))
+        return numbers, corners
 
-    def _face(
-        self, geoms: Any, normal: Array, sign: float, origin: Array, across: Array, place: Array, turn: Array
-    ) -> _Face:
-        """Of each geom (n,) the face that looks most along ± normal (n, 3)."""
-        toward = sign * np.einsum("ni,nij->nj", normal, turn)
-        corners, outward = np.empty((len(geoms), _CORNERS, 3)), np.empty_like(toward)
-        line = np.zeros(len(geoms), dtype=bool)
-        for geom in np.unique(geoms):
-            mine = np.flatnonzero(geoms == geom)
-            corners[mine], outward[mine], line[mine] = self._solids[int(geom)].face(toward[mine])
-        corners = np.einsum("nij,nkj->nki", turn, corners) + (place - origin)[:, None]
-        outward = np.einsum("nij,nj->ni", turn, outward)
-        along = np.einsum("ni,ni->n", outward, normal)
-        faces = sign * along > 0.05  # else there is none, as at the end of a capsule
-        along = np.where(faces, along, 1.0)
-        level = np.einsum("ni,ni->n", outward, corners[:, 0]) / along
-        return _Face(corners @ across, level, -np.einsum("ni,nij->nj", outward, across) / along[:, None], line, faces)
+    def _faces(self, pair: Any, frame: Array, origin: Array, where: Any, places: Array, turns: Array) -> list[_Face]:
+        """Of the first and of the second geoms (n,) the faces that look most along the normal, and against it."""
+        n = len(pair)
+        geoms, where = np.concatenate([self.first[pair], self.second[pair]]), np.concatenate([where, where])
+        place, turn = places[where, geoms] - np.concatenate([origin, origin]), turns[where, geoms]
+        axes = np.concatenate([frame, frame])
+        local = axes @ turn  # normal and directions across, along the axes of the geoms
+        toward = local[:, 0].copy()
+        toward[n:] *= -1
+        solids = {g: self._solids[g] for g in set(geoms.tolist())}
+        count = max(s.corners.shape[1] for s in solids.values())
+        corners, outward = np.empty((2 * n, count, 3)), np.empty((2 * n, 3))
+        line = np.zeros(2 * n, dtype=bool)
+        for geom, solid in solids.items():
+            mine = (geoms == geom).nonzero()[0]
+            found, outward[mine], line[mine] = solid.face(toward[mine])
+            corners[mine] = found[:, np.minimum(np.arange(count), found.shape[1] - 1)]
+        corners = (corners + (place[:, None] @ turn)) @ local.swapaxes(1, 2)  # along the normal, and across
+        outward = (outward[:, None] @ local.swapaxes(1, 2))[:, 0]
+        faces = np.abs(outward[:, 0]) > 0.05  # else there is none, as at the end of a capsule
+        outward /= np.where(faces, outward[:, 0], 1.0)[:, None]
+        level = corners[:, 0, 0] + (outward[:, 1:] * corners[:, 0, 1:]).sum(-1)
+        both = _Face(corners[:, :, 1:], level, -outward[:, 1:], line, faces)
+        return [_Face(*(v[:n] for v in both)), _Face(*(v[n:] for v in both))]
 
 
 class _Solid:
@@ -230,7 +252,9 @@ class _Solid:
             angle, self.outward = np.arange(_CORNERS) * (2 * np.pi / _CORNERS), _SIDES[[2, 5]]
             circle = self.size[0] * np.stack([np.cos(angle), np.sin(angle)], -1)
             faces = [np.insert(circle, 2, height, axis=1) for height in (self.size[1], -self.size[1])]
-        rows = (np.round(np.linspace(0, max(len(f), _CORNERS) - 1, _CORNERS)).astype(int) for f in faces)
+        count = _CORNERS if any(len(f) > _FEW for f in faces) else _FEW
+        rows = (np.round(np.linspace(0, max(len(f), count) - 1, count)).astype(int) for f in faces)
+        self.four = np.minimum(np.arange(count), _FEW - 1)
         self.corners = np.stack([f[np.minimum(r, len(f) - 1)] for f, r in zip(faces, rows, strict=True)])
 
     def face(self, toward: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -243,7 +267,7 @@ class _Solid:
             radial /= np.maximum(np.linalg.norm(radial, axis=-1, keepdims=True), 1e-12)
             aside, (radius, half, _) = np.stack([-radial[:, 1], radial[:, 0], radial[:, 2]], -1), self.size
             ends = [u * half * _SIDES[2] + v * _STRIP * radius * aside for u, v in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
-            corners[line] = radius * radial[:, None] + np.stack(ends, 1)[:, [0, 1, 2, 3, 3, 3, 3, 3]]
+            corners[line] = radius * radial[:, None] + np.stack(ends, 1)[:, self.four]
             outward[line] = radial
         return corners, outward, line
 
@@ -282,28 +306,28 @@ def cross(a: Array, b: Array) -> Array:
 
 def _common(first: Array, second: Array, tolerance: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Corners of what two convex polygons (n, k, 2) have in common, among points (n, k + k + k², 2), and which."""
-    sides = [np.roll(p, -1, 1) - p for p in (first, second)]
-    along, across = sides[0][:, :, None], sides[1][:, None]
-    between, turn = second[:, None] - first[:, :, None], _turned(along, across)
-    size = np.linalg.norm(along, axis=-1) * np.linalg.norm(across, axis=-1)
-    crossing = np.abs(turn) > np.maximum(1e-9 * size, 1e-300)
-    turn = np.where(crossing, turn, 1.0)
-    s, t = _turned(between, across) / turn, _turned(between, along) / turn
-    crossing &= (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
-    crossings = first[:, :, None] + s[..., None] * along
     n, k, _ = first.shape
-    valid = [_inside(first, second, sides[1], tolerance), _inside(second, first, sides[0], tolerance)]
-    return np.concatenate([first, second, crossings.reshape(n, k * k, 2)], 1), np.concatenate(
-        [*valid, crossing.reshape(n, k * k)], 1
-    )
+    one, two = (np.concatenate([p[:, 1:], p[:, :1]], 1) - p for p in (first, second))
+    inside = [-tolerance[:, None] * np.sqrt(_product(side, side, 0)) for side in (one, two)]
+    ways = [np.sign(_product(p, side, 1).sum(1))[:, None, None] for p, side in ((first, one), (second, two))]
+    one, two = one[:, :, None], two[:, None]
+    between, turn = second[:, None] - first[:, :, None], _product(one, two, 1)
+    of_one, of_two = _product(between, one, 1), _product(between, two, 1)
+    parallel = np.abs(turn) <= 1e-9 * np.sqrt(_product(one, one, 0) * _product(two, two, 0))
+    turn = np.where(parallel, np.inf, turn)
+    s, t = of_two / turn, of_one / turn
+    crossing = (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1) & ~parallel
+    valid = [
+        (of_two * ways[1] >= inside[1][:, None]).all(2),
+        (-of_one * ways[0] >= inside[0][:, :, None]).all(1),
+        crossing.reshape(n, k * k),
+    ]
+    crossings = (first[:, :, None] + s[..., None] * one).reshape(n, k * k, 2)
+    return np.concatenate([first, second, crossings], 1), np.concatenate(valid, 1)
 
 
-def _inside(points: Array, polygon: Array, sides: Array, tolerance: Array) -> NDArray[np.bool_]:
-    """Which points (n, m, 2) are in convex polygons (n, k, 2), of either orientation."""
-    orientation = np.sign(_turned(polygon, np.roll(polygon, -1, 1)).sum(1))[:, None, None]
-    far = _turned(sides[:, None], points[:, :, None] - polygon[:, None]) * orientation
-    return (far >= -tolerance[:, None, None] * np.linalg.norm(sides, axis=-1)[:, None]).all(-1)
-
-
-def _turned(a: Array, b: Array) -> Array:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+def _product(a: Array, b: Array, turned: int) -> Array:
+    """Products of vectors (..., 2): a × b, or a · b."""
+    if turned:
+        return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
