@@ -13,12 +13,12 @@ from __future__ import annotations
 import argparse
 import itertools
 import multiprocessing
-from collections import defaultdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+import torch
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
@@ -142,7 +142,9 @@ def signed_distance(a: Shape, b: Shape, shrinks: int = 120) -> float:
         n = np.where(better[:, None], tried[each, best], n)
         value = np.where(better, values[each, best], value)
         radius = np.where(better, radius * 1.3, radius * 0.7)
-        if shrink % 10 == 9:  # those that are left behind
+        if radius.max() < 1e-6:
+            break
+        if shrink % 5 == 4:  # those that are left behind
             on = value + 30 * radius * reach >= value.max()
             n, value, radius, before = n[on], value[on], radius[on], before[on]
     return float(value.max())
@@ -209,7 +211,7 @@ def random_scene(seed: int) -> tuple[Any, Any, Shape, Shape]:
 
 
 class Judged(NamedTuple):
-    """What was wrong at most, in parts of the width of the thinner shape; `tilt`: rates that are not those of points."""
+    """Errors of a scene, in parts of the width of the thinner shape; `tilt`: of rates that must be those of a point."""
 
     pair: tuple[str, str]
     distance: float
@@ -218,6 +220,10 @@ class Judged(NamedTuple):
     points: float
     tilt: float
     contacts: int
+
+    def wrong(self) -> bool:
+        """Whether an error is above the limit."""
+        return not max(self.gap, self.normal, self.points, self.tilt) <= LIMIT
 
 
 def judge(seed: int) -> Judged | None:
@@ -251,3 +257,41 @@ def judge(seed: int) -> Judged | None:
         points = max(points, (low - g) / width, (g - high) / width)
         tilt = max(tilt, abs(np.linalg.norm(normal) - 1), np.abs(row[:3] + normal).max() if first else 0.0)
     return Judged(pair, true / width, abs(gap[nearest] - true) / width, (true - best) / width, points, tilt, len(gap))
+
+
+def table(judged: list[Judged]) -> str:
+    """Markdown: what was tried between which shapes, and the largest errors."""
+    lines = ["| of a pair | tried | overlapping | gap | normal | point | silent |", "|---|---|---|---|---|---|---|"]
+    for kind in (*KINDS, "all"):
+        some = [j for j in judged if kind in (*j.pair, "all")]
+        worst = (max(getattr(j, name) for j in some) for name in ("gap", "normal", "points"))
+        overlap, silent = sum(j.distance < 0 for j in some), sum(j.wrong() for j in some)
+        lines.append(f"| {kind} | {len(some)} | {overlap} | {' | '.join(f'{w:.0e}' for w in worst)} | {silent} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Judge scenes, print the table and the seeds that are wrong."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
+    parser.add_argument("--count", type=int, default=1000, help="number of scenes")
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument(
+        "--fill", type=Path, nargs="?", const=Path("docs/promises.md"), help="page to put the table into"
+    )
+    options = parser.parse_args()
+    seeds = range(options.first, options.first + options.count)
+    with multiprocessing.get_context("spawn").Pool(options.processes, torch.set_num_threads, (1,)) as pool:
+        results = dict(zip(seeds, pool.imap(judge, seeds, chunksize=20), strict=True))
+    judged = [j for j in results.values() if j]
+    text = table(judged)
+    print(text, *(f"seed {seed}: {j}" for seed, j in results.items() if j and j.wrong()), sep="\n")
+    if options.fill:
+        head, rest = options.fill.read_text().split("<!-- gaps: begin -->")
+        options.fill.write_text(
+            f"{head}<!-- gaps: begin -->\n{text}\n<!-- gaps: end -->{rest.split('<!-- gaps: end -->')[1]}"
+        )
+
+
+if __name__ == "__main__":
+    main()
