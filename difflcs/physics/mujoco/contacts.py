@@ -253,13 +253,12 @@ class ContactFinder:
 
     def _motion(self, of: Witness, along: Array, axes: Array, centres: Array) -> Array:
         """How the second point moves from the first along directions (n, k, 3), by degrees of freedom: (n, k, nv)."""
-        total: Any = 0.0
-        for sign, geoms, points in ((1, self._narrow.second, of.second), (-1, self._narrow.first, of.first)):
-            geom = geoms[of.pair]
-            arm = points - centres[np.arange(len(centres)), geom]
-            wrench = np.concatenate([cross(arm[:, None], along), along], -1)
-            total = total + sign * (wrench @ axes.swapaxes(-1, -2)) * self._turns[geom][:, None]
-        return total
+        geom = np.stack([self._narrow.first[of.pair], self._narrow.second[of.pair]])
+        arms = np.stack([of.first, of.second]) - centres[np.arange(len(centres)), geom]
+        along = np.broadcast_to(along, (2, *along.shape))
+        motion = np.concatenate([cross(arms[:, :, None], along), along], -1) @ axes.swapaxes(-1, -2)
+        first, second = motion * self._turns[geom][:, :, None]
+        return second - first
 
     def _with_measured(self, read: Read) -> Read:
         """Contacts with those that were measured: of each state the nearest."""
@@ -277,7 +276,7 @@ class ContactFinder:
         moves = np.abs(rows[:, 0]).max(-1, initial=0.0) > _STILL
         state = np.concatenate([own, state[moves]])
 
-        def both(before: Array, measured: Array) -> Array:
+        def both(before: Any, measured: Any) -> Any:
             return np.concatenate([before[own, slot], measured[moves]])
 
         gap = both(read.gap, found.gap)

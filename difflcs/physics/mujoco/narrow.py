@@ -55,10 +55,6 @@ class Witness(NamedTuple):
     first: Array
     second: Array
 
-    def take(self, which: Any) -> Witness:
-        """Some of them."""
-        return Witness(*(v[which] for v in self))
-
 
 Measured = tuple[int, float, Array, Array]  # pair, gap, normal, and both points (6,)
 
@@ -174,7 +170,7 @@ class Narrow:
         Returns:
             Numbers in `of`, and what they are.
         """
-        meet = self._meet[of.pair]
+        meet = self._meet[of.pair] & (of.gap < self.size[of.pair])
         rows = meet.nonzero()[0]
         if not len(rows):
             return np.arange(len(meet)), of
@@ -208,7 +204,8 @@ class Narrow:
         if len(rows) < len(meet):
             single = (~meet).nonzero()[0]
             numbers = np.concatenate([single, numbers])
-            corners = Witness(*(np.concatenate([v[single], w]) for v, w in zip(of, corners, strict=True)))
+            both: Any = (np.concatenate([v[single], w]) for v, w in zip(of, corners, strict=True))
+            corners = Witness(*both)
         return numbers, corners
 
     def _faces(self, pair: Any, frame: Array, origin: Array, where: Any, places: Array, turns: Array) -> list[_Face]:
@@ -234,7 +231,8 @@ class Narrow:
         outward /= np.where(faces, outward[:, 0], 1.0)[:, None]
         level = corners[:, 0, 0] + (outward[:, 1:] * corners[:, 0, 1:]).sum(-1)
         both = _Face(corners[:, :, 1:], level, -outward[:, 1:], line, faces)
-        return [_Face(*(v[:n] for v in both)), _Face(*(v[n:] for v in both))]
+        values: Any = ([v[part] for v in both] for part in (slice(n), slice(n, None)))
+        return [_Face(*v) for v in values]
 
 
 class _Solid:
