@@ -15,7 +15,9 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
+
+from difflcs.errors import InvalidInputError
 
 Array = NDArray[np.float64]
 
@@ -271,22 +273,31 @@ class _Solid:
 
 
 def _polygons(model: Any, mesh: int) -> tuple[list[Array], Array]:
-    """Faces of the hull of a mesh: corners in order, and outward normals. MuJoCo joins some that are not quite flat."""
-    start, first = model.mesh_vertadr[mesh], model.mesh_polyadr[mesh]
-    rows = slice(first, first + model.mesh_polynum[mesh])
+    """Faces of the hull of a mesh: corners in order, outward normals. MuJoCo's own may be missing or not quite flat."""
+    start = model.mesh_vertadr[mesh]
     vertices = model.mesh_vert[start : start + model.mesh_vertnum[mesh]].astype(np.float64)
-    ends = zip(model.mesh_polyvertadr[rows], model.mesh_polyvertnum[rows], strict=True)
-    size, faces, outward = np.ptp(vertices, axis=0).max(), [], []
-    for (address, count), normal in zip(ends, model.mesh_polynormal[rows].astype(np.float64), strict=True):
-        corners = vertices[model.mesh_polyvert[address : address + count]]
-        if np.ptp(corners @ normal) < 1e-6 * size:
-            faces.append(corners)
-            outward.append(normal)
-        else:  # triangles of the hull with a point below that are not sides to it
-            hull = ConvexHull(np.concatenate([corners, [corners.mean(0) - size * normal]]))
-            outer = (hull.simplices < count).all(-1)
-            faces.extend(corners[hull.simplices[outer]])
-            outward.extend(hull.equations[outer, :3])
+    try:
+        hull = ConvexHull(vertices)
+    except QhullError as error:
+        name = model.mesh(mesh).name or mesh
+        raise InvalidInputError(
+            f"model: expected meshes that may touch something with a volume, got mesh {name!r}, whose vertices lie in "
+            f"a plane or on a line; use a box, or name the pairs that may touch, without it, by pairs=[...]"
+        ) from error
+    corners_of = np.searchsorted(np.sort(hull.vertices), hull.simplices)
+    vertices = hull.points[np.sort(hull.vertices)]
+    one, two = (vertices[corners_of[:, k]] - vertices[corners_of[:, 0]] for k in (1, 2))
+    size, left, faces, outward = np.ptp(vertices, axis=0).max(), np.ones(len(one), dtype=bool), [], []
+    for k in np.argsort(-np.linalg.norm(np.cross(one, two), axis=-1)):
+        if not left[k]:
+            continue
+        normal = hull.equations[k, :3]
+        flat = np.abs(vertices @ normal + hull.equations[k, 3]) < 1e-6 * size
+        left &= ~flat[corners_of].all(-1)
+        across = np.stack(perpendicular(normal), -1)
+        at = (vertices[flat] - vertices[flat].mean(0)) @ across
+        faces.append(vertices[flat][np.argsort(np.arctan2(at[:, 1], at[:, 0]))])
+        outward.append(normal)
     return faces, np.array(outward)
 
 
