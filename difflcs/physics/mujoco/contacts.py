@@ -1,9 +1,9 @@
 """What may touch in a MuJoCo model, at many states: gaps and contact Jacobians from MuJoCo's own collision detection.
 
 MuJoCo finds contacts within a margin, here the distance up to which they matter, and builds the Jacobian of their
-constraints natively. So contacts are those that a simulation would have, several where faces meet. One thing is
-mended: between boxes that are apart, MuJoCo's contacts can lie at a wrong distance or be missing, as what separates
-faces is not always the shortest way; where `mj_geomDistance` says otherwise, its two nearest points are the contact.
+constraints natively. That is exact between shapes that have a formula; all others `narrow.py` measures instead. Boxes
+it measures too, as what separates faces is not always the shortest way: where MuJoCo's contacts are not as near as the
+boxes are, or are missing, those of `narrow.py` count.
 """
 
 # MuJoCo is a compiled module without type stubs.
@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 
 from difflcs._checks import describe
 from difflcs.errors import ContactWarning, InvalidInputError
+from difflcs.physics.mujoco.narrow import NATIVE, Array, Measured, Narrow, Witness, cross, perpendicular, witnesses
 
-Array = NDArray[np.float64]
 Pairs = Sequence[tuple[int | str, int | str]]
 
 MOST_CONTACTS = 12  # by default
 _ENOUGH = 4  # contacts that hold a face, where there is no room for all
 _NEAR = 0.1  # of the unit of gaps: a contact as near as this is one that counts
+_STILL = 1e-9  # what the normal of a contact moves at most, if nothing can move along it
 
 _THREE = np.arange(3)
 
@@ -37,6 +38,7 @@ _PLANE, _CAPSULE, _CYLINDER, _BOX, _MESH = (
 # Of these MuJoCo misses contacts that are apart, so that things would fall through.
 _FIELDS = (int(mujoco.mjtGeom.mjGEOM_HFIELD), int(mujoco.mjtGeom.mjGEOM_SDF))
 _DISABLED = int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+_BITS = 31  # of a mask
 _OVERRIDE = int(mujoco.mjtEnableBit.mjENBL_OVERRIDE)
 _POINTS = {  # contacts that a pair of shapes can have, where more than one
     (_PLANE, _CAPSULE): 2,
@@ -82,7 +84,9 @@ class Read(NamedTuple):
         geom: (n, n_contacts, 2).
         apart: (n, n_contacts) distance of the points on both bodies whose motion `rows` takes to be that of one point
             in the middle between them.
-        axes: (n, nv, 3) around which each degree of freedom turns.
+        axes: (n, nv, 6) around and along which each degree of freedom moves what it moves, at its centre.
+        measured: what MuJoCo did not find, before faces are cut: states, pairs, and of all geoms there the centres
+            (ngeom, 3), places (ngeom, 3) and turns (ngeom, 3, 3).
     """
 
     gap: Array
@@ -91,6 +95,7 @@ class Read(NamedTuple):
     geom: NDArray[np.intp]
     apart: Array
     axes: Array
+    measured: list[tuple[int, list[Measured], Array, Array, Array]]
 
 
 class ContactFinder:
@@ -128,8 +133,8 @@ class ContactFinder:
         self.allowed = _may_touch(model) if pairs is None else _listed(model, pairs)
         self._drop_floors()
         _check_contacts(model, self.allowed, friction)
-        if pairs is not None:
-            _allow(model, np.flatnonzero(self.allowed.any(0)))
+        self._native = self.allowed & NATIVE[model.geom_type[:, None], model.geom_type[None]]
+        _test(model, np.flatnonzero(self.allowed.any(0)), named=pairs is not None)
         self.pairs = first, second = np.nonzero(np.triu(self.allowed))
         kinds = np.sort(model.geom_type[np.stack([first, second], -1)], axis=-1)
         if contacts is None:
@@ -138,8 +143,12 @@ class ContactFinder:
         rough = bool((self.friction[first, second] > 0).any())
         self.n_tangents = (1 if self.axis is not None else 2) if rough else 0
         boxes = (kinds == _BOX).all(-1)
-        self._boxes = [(int(a), int(b)) for a, b in zip(first[boxes], second[boxes], strict=True)]
+        measured = np.flatnonzero(boxes | ~self._native[first, second])
+        self._narrow = Narrow(model, data, first[measured], second[measured], distance, self.axis)
+        self._boxes, self._others = np.flatnonzero(boxes[measured]), np.flatnonzero(~boxes[measured])
+        self._room = [_POINTS.get((int(a), int(b)), 1) for a, b in kinds[measured]]
         self._turns = _moves(model)[model.geom_bodyid].astype(np.float64)
+        self._root = model.body_rootid[model.geom_bodyid]
         # Three rows of the Jacobian for each contact, the normal and two tangents, whatever its friction is.
         model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
@@ -161,8 +170,8 @@ class ContactFinder:
         """For n states, all contacts out of reach."""
         k, nv = self.n_contacts, self.model.nv
         gap = np.full((n, k), self.distance)
-        rows, frame, axes = np.zeros((n, k, 3, nv)), np.zeros((n, k, 3, 3)), np.zeros((n, nv, 3))
-        return Read(gap, rows, frame, np.zeros((n, k, 2), dtype=np.intp), np.zeros((n, k)), axes)
+        rows, frame, axes = np.zeros((n, k, 3, nv)), np.zeros((n, k, 3, 3)), np.zeros((n, nv, 6))
+        return Read(gap, rows, frame, np.zeros((n, k, 2), dtype=np.intp), np.zeros((n, k)), axes, [])
 
     def read(self, i: int, into: Read) -> None:
         """Put the contacts of the state in `data`, for which `mj_fwdPosition` was called, into row i."""
@@ -170,24 +179,124 @@ class ContactFinder:
         contact, jacobian = data.contact, data.efc_J.reshape(-1, self.model.nv)
         gap, geom, address = contact.dist, contact.geom, contact.efc_address
         rows = jacobian[address[:, None] + _THREE] if len(jacobian) else np.zeros((len(gap), 3, self.model.nv))
-        frame, own = contact.frame.reshape(-1, 3, 3), (address >= 0) & self.allowed[geom[:, 0], geom[:, 1]]
-        apart = gap
-        if self._boxes:
-            gap, geom, rows, frame, own, apart = self._mend_boxes(gap, geom, rows, frame, own)
+        frame, own = contact.frame.reshape(-1, 3, 3), (address >= 0) & self._native[geom[:, 0], geom[:, 1]]
+        into.axes[i], measured = data.cdof, []
+        if len(self._boxes):
+            own, measured = self._mend_boxes(gap, geom, frame[:, 0], own)
         # A normal that nothing can move along is that of a body resting on what is outside the plane of motion.
-        kept = np.flatnonzero(own & (np.abs(rows[:, 0]).max(-1, initial=0.0) > 1e-9))
-        if len(kept) > count:
+        kept = np.flatnonzero(own & (np.abs(rows[:, 0]).max(-1, initial=0.0) > _STILL))
+        if len(self._others):
+            measured = measured + self._nearest(gap[kept])
+        if measured:
+            poses = data.subtree_com[self._root], data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy()
+            into.measured.append((i, measured, *poses))
+        if len(kept) > _ENOUGH and len(kept) + sum(self._room[m[0]] for m in measured) > count:
             kept = _spread(contact.pos, geom, gap, kept)
         if len(kept) > count:
-            self._warn_of_more(gap[kept])
+            self._warn_of_more(int((gap[kept] <= self._warn_within).sum()))
             kept = np.sort(kept[np.argpartition(gap[kept], count - 1)[:count]])
         k = len(kept)
         into.gap[i, :k], into.rows[i, :k], into.frame[i, :k] = gap[kept], rows[kept], frame[kept]
-        into.geom[i, :k], into.apart[i, :k], into.axes[i] = geom[kept], apart[kept], data.cdof[:, :3]
+        into.geom[i, :k], into.apart[i, :k] = geom[kept], gap[kept]
 
-    def _warn_of_more(self, gap: Array) -> None:
+    def _mend_boxes(
+        self, gap: Array, geom: Any, normal: Array, own: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.bool_], list[Measured]]:
+        """Contacts without those of boxes that are nearer, farther or another way than they say, and such boxes."""
+        narrow, n = self._narrow, self.model.ngeom
+        near = self._boxes[narrow.at_least(self._boxes) < self.distance]
+        if not (measured := narrow.measure(near.tolist())):
+            return own, measured
+        found = witnesses(measured)
+        key, keys = geom.min(-1) * n + geom.max(-1), narrow.first[found.pair] * n + narrow.second[found.pair]
+        place = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
+        of_boxes, nearest = keys[place] == key, np.full(len(keys), np.inf)
+        np.minimum.at(nearest, place[of_boxes], gap[of_boxes])
+        tolerance = 1e-5 * narrow.size[found.pair]
+        wrong = np.abs(nearest - found.gap) > tolerance
+        same = np.abs(np.einsum("ij,ij->i", normal, found.normal[place])) > 1 - 1e-10
+        for k in np.flatnonzero(of_boxes & ~same & ~wrong[place]):
+            wrong[place[k]] |= narrow.boxes_along(geom[k], normal[k]) < found.gap[place[k]] - tolerance[place[k]]
+        return own & ~(of_boxes & wrong[place]), [measured[k] for k in np.flatnonzero(wrong)]
+
+    def _nearest(self, gap: Array) -> list[Measured]:
+        """Pairs that MuJoCo does not test: all within the distance, or those that can be among the nearest contacts."""
+        narrow, count = self._narrow, self.n_contacts
+        lower = narrow.at_least(self._others)
+        reach = np.flatnonzero(lower < self.distance)
+        if len(reach) <= count:
+            return narrow.measure(self._others[reach].tolist())
+        reach = reach[np.argsort(lower[reach])]
+        pairs, lower, found = self._others[reach].tolist(), lower[reach], []
+        for start in range(0, len(pairs), count):
+            if lower[start] > self._farthest(gap, found):
+                found = self._moving(found)
+                if lower[start] > self._farthest(gap, found):
+                    break
+            found = found + narrow.measure(pairs[start : start + count])
+        farthest = self._farthest(gap, found := self._moving(found))
+        return [m for m in found if m[1] <= farthest]
+
+    def _farthest(self, gap: Array, found: list[Measured]) -> float:
+        """Which of the contacts, those of gaps (n,) and those found, count at most."""
+        gap = np.concatenate([gap, [m[1] for m in found]])
+        enough = len(gap) >= self.n_contacts > 0
+        return max(self._warn_within, np.partition(gap, self.n_contacts - 1)[self.n_contacts - 1]) if enough else np.inf
+
+    def _moving(self, found: list[Measured]) -> list[Measured]:
+        """Those of pairs that can move along the normal."""
+        if not found:
+            return found
+        some, data = witnesses(found), self.data
+        rows = self._motion(some, some.normal[:, None], data.cdof[None], data.subtree_com[self._root][None])
+        return [m for m, row in zip(found, rows, strict=True) if np.abs(row).max(initial=0.0) > _STILL]
+
+    def _motion(self, of: Witness, along: Array, axes: Array, centres: Array) -> Array:
+        """How the second point moves from the first along directions (n, k, 3), by degrees of freedom: (n, k, nv)."""
+        geom = np.stack([self._narrow.first[of.pair], self._narrow.second[of.pair]])
+        arms = np.stack([of.first, of.second]) - centres[np.arange(len(centres)), geom]
+        along = np.broadcast_to(along, (2, *along.shape))
+        motion = np.concatenate([cross(arms[:, :, None], along), along], -1) @ axes.swapaxes(-1, -2)
+        first, second = motion * self._turns[geom][:, :, None]
+        return second - first
+
+    def _with_measured(self, read: Read) -> Read:
+        """Contacts with those that were measured: of each state the nearest."""
+        states, measured, *poses = zip(*read.measured, strict=True)
+        centres, places, turns = map(np.stack, poses)
+        where = np.repeat(np.arange(len(states)), [len(m) for m in measured])
+        nearest = witnesses([m for some in measured for m in some])
+        frame = np.stack([nearest.normal, *perpendicular(nearest.normal)], 1)
+        numbers, found = self._narrow.contacts(nearest, frame, where, places, turns)
+        where, frame = where[numbers], frame[numbers]
+        state = np.array(states)[where]
+        rows = self._motion(found, frame, read.axes[state], centres[where])
+        geom = np.stack([self._narrow.first[found.pair], self._narrow.second[found.pair]], -1)
+        own, slot = np.nonzero(read.frame.any((-1, -2)))
+        moves = np.abs(rows[:, 0]).max(-1, initial=0.0) > _STILL
+        state = np.concatenate([own, state[moves]])
+
+        def both(before: Any, measured: Any) -> Any:
+            return np.concatenate([before[own, slot], measured[moves]])
+
+        gap = both(read.gap, found.gap)
+        order = np.lexsort((gap, state))
+        rank = np.arange(len(order)) - np.searchsorted(state[order], state[order])
+        self._warn_of_more(int(np.bincount(state[gap <= self._warn_within], minlength=1).max()))
+        order, rank = order[rank < self.n_contacts], rank[rank < self.n_contacts]
+        full = self.allocate(len(read.gap))
+        for into, before, measured in (
+            (full.gap, read.gap, found.gap),
+            (full.rows, read.rows, rows),
+            (full.frame, read.frame, frame),
+            (full.geom, read.geom, geom),
+            (full.apart, read.apart, np.zeros(len(rows))),
+        ):
+            into[state[order], rank] = both(before, measured)[order]
+        return full._replace(axes=read.axes)
+
+    def _warn_of_more(self, near: int) -> None:
         """Say once where nobody has chosen how many contacts there are, and some that are near have no place."""
-        near = int((gap <= self._warn_within).sum())
         if near > self.n_contacts:
             warnings.warn(
                 f"expected at most {self.n_contacts} contacts, got {near} that touch or nearly do; only the nearest "
@@ -200,6 +309,8 @@ class ContactFinder:
 
     def finish(self, read: Read) -> Found:
         """Contacts with the tangents that count."""
+        if read.measured:
+            read = self._with_measured(read)
         normal, sides, slide = read.frame[:, :, 0], read.frame[:, :, 1:], read.rows[:, :, 1:]
         if self.axis is not None:
             across = np.cross(self.axis, normal)
@@ -209,41 +320,11 @@ class ContactFinder:
         sides, slide = sides[:, :, : self.n_tangents], slide[:, :, : self.n_tangents]
         # MuJoCo's contact is in the middle of the gap; friction acts where the two bodies are, half a gap from there:
         # ω × n gap/2 for each of them, along the tangents.
-        lever = np.einsum("nkti,nvi->nktv", np.cross(normal[:, :, None], sides), read.axes)
+        lever = np.einsum("nkti,nvi->nktv", np.cross(normal[:, :, None], sides), read.axes[:, :, :3])
         turned = self._turns[read.geom[:, :, 0]] + self._turns[read.geom[:, :, 1]]
         tangent = slide + 0.5 * read.apart[:, :, None, None] * lever * turned[:, :, None]
         friction = np.where(read.frame.any((-1, -2)), self.friction[read.geom[:, :, 0], read.geom[:, :, 1]], 0.0)
         return Found(read.gap, read.rows[:, :, 0], tangent, friction)
-
-    def _mend_boxes(self, gap: Array, geom: Any, rows: Array, frame: Array, own: Any) -> tuple[Any, ...]:
-        model, data, ends = self.model, self.data, np.empty(6)
-        places, radius = data.geom_xpos, model.geom_rbound
-        extra: list[tuple[float, tuple[int, int], Array, Array]] = []
-        middle = gap
-        for a, b in self._boxes:
-            if np.linalg.norm(places[a] - places[b]) - radius[a] - radius[b] > self.distance:
-                continue
-            apart = mujoco.mj_geomDistance(model, data, a, b, self.distance, ends)
-            of_pair = ((geom[:, 0] == a) & (geom[:, 1] == b)) | ((geom[:, 0] == b) & (geom[:, 1] == a))
-            if apart <= 0 or (of_pair.any() and abs(gap[of_pair].min() - apart) < 1e-6):
-                continue
-            own = own & ~of_pair
-            if apart < self.distance:
-                normal = (ends[3:] - ends[:3]) / apart
-                axes = np.stack([normal, *_across(normal)])
-                extra.append((apart, (a, b), axes @ (self._jacobian(b, ends[3:]) - self._jacobian(a, ends[:3])), axes))
-        if extra:
-            distances, pairs, jacobians, frames = zip(*extra, strict=True)
-            gap, geom = np.concatenate([gap, distances]), np.concatenate([geom, pairs])
-            rows, frame = np.concatenate([rows, jacobians]), np.concatenate([frame, frames])
-            own = np.concatenate([own, np.ones(len(extra), dtype=bool)])
-            middle = np.concatenate([middle, np.zeros(len(extra))])
-        return gap, geom, rows, frame, own, middle
-
-    def _jacobian(self, geom: int, point: Array) -> Array:
-        jacobian = np.empty((3, self.model.nv))
-        mujoco.mj_jac(self.model, self.data, jacobian, None, point, int(self.model.geom_bodyid[geom]))
-        return jacobian
 
 
 def _moves(model: Any) -> NDArray[np.bool_]:
@@ -272,13 +353,6 @@ def plane_of_motion(model: Any, data: Any) -> Array | None:
         axis = directions[2]
     parallel = np.abs(np.abs(hinges @ axis) - 1) < 1e-9
     return axis.copy() if parallel.all() and (np.abs(slides @ axis) < 1e-9).all() else None
-
-
-def _across(normal: Array) -> tuple[Array, Array]:
-    """Two unit vectors perpendicular to a unit vector and to each other."""
-    first: Array = np.cross(normal, np.eye(3)[np.abs(normal).argmin()]).astype(np.float64)
-    first /= np.linalg.norm(first)
-    return first, np.cross(normal, first).astype(np.float64)
 
 
 def _spread(places: Array, geom: Any, gap: Array, kept: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -400,11 +474,24 @@ def _geoms(model: Any, name: int | str) -> list[int]:
     return found
 
 
-def _allow(model: Any, geoms: Any) -> None:
-    """Let MuJoCo test these geoms against each other, whatever flags, masks, parents and exclusions say."""
-    model.opt.disableflags &= ~_DISABLED
-    for masks, of_body in ((model.geom_contype, model.body_contype), (model.geom_conaffinity, model.body_conaffinity)):
-        masks[:], of_body[:] = 0, 0
-        masks[geoms], of_body[model.geom_bodyid[geoms]] = 1, 1
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
-    model.exclude_signature[:] = -1
+def _test(model: Any, geoms: Any, named: bool) -> None:
+    """Let MuJoCo test these geoms where their shapes have a formula: by the flags and masks of the model, or all."""
+    masks = np.stack([model.geom_type, model.geom_contype, model.geom_conaffinity], -1)[geoms]
+    if named:
+        model.opt.disableflags &= ~_DISABLED
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
+        model.exclude_signature[:] = -1
+        masks[:, 1:] = 1
+    groups, of = np.unique(masks, axis=0, return_inverse=True)
+    if len(groups) > _BITS:  # too many to tell apart: more are tested than count
+        groups, of = np.unique(masks * [1, 0, 0] + [0, 1, 1], axis=0, return_inverse=True)
+    kind, contype, affinity = groups.T
+    tested = NATIVE[kind[:, None], kind[None]] & (((contype[:, None] & affinity) | (affinity[:, None] & contype)) != 0)
+    bits, of = 1 << np.arange(len(groups)), of.reshape(-1)
+    for own, of_body, values in (
+        (model.geom_contype, model.body_contype, bits),
+        (model.geom_conaffinity, model.body_conaffinity, tested @ bits),
+    ):
+        own[:], of_body[:] = 0, 0
+        own[geoms] = values[of]
+        np.bitwise_or.at(of_body, model.geom_bodyid[geoms], own[geoms])
