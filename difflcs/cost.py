@@ -327,6 +327,10 @@ class GoalCost(TensorFields):
         held = self._held(("Q", "R", "Q_final"))
         return {**held, "r": held["R"].new_zeros(self.n_u)}
 
+    def maps(self) -> dict[str, Tensor]:
+        """What makes the other fields of a goal."""
+        return self._held(("goal_to_q", "goal_to_q_final", "goal_stage", "goal_final"))
+
     def _goal(self, name: str, value: Tensor, stages: list[tuple[str, int]]) -> Tensor:
         check_tensor(name, value, [*stages, ("n_goal", self.n_goal)])
         if value.device != self.Q.device:
