@@ -10,6 +10,7 @@ beside the shapes. It finds one point on each shape; the faces around the two ar
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import mujoco
@@ -129,12 +130,17 @@ class Narrow:
 
     def _measure(self, a: int, b: int, size: float) -> tuple[float, Array, Array] | None:
         model, data, ends = self.model, self.data, self._ends
-        model.opt.ccd_tolerance = _TOLERANCE * size
-        gap = mujoco.mj_geomDistance(model, data, a, b, self.distance, ends)
-        if gap >= self.distance:
-            return None
+        # Now and then a tolerance as small as the first leaves the points apart from the depth; a larger one does not.
+        for tolerance in (_TOLERANCE, 1e2 * _TOLERANCE, 1e4 * _TOLERANCE):
+            model.opt.ccd_tolerance = tolerance * size
+            gap = mujoco.mj_geomDistance(model, data, a, b, self.distance, ends)
+            if gap >= self.distance:
+                return None
+            way = ends[3:] - ends[:3]
+            if abs(math.sqrt(way @ way) - abs(gap)) < 1e-7 * size:
+                break
         if abs(gap) > _TOUCHING * size:
-            return gap, (ends[3:] - ends[:3]) / gap, ends.copy()
+            return gap, way / gap, ends.copy()
         # As good as touching, where the two points give no direction; MuJoCo also says 0 where it failed. The answer is
         # that of the shape put a little aside, the way that parts them most.
         place, best = data.geom_xpos, (-np.inf, gap, _SIDES[0], ends.copy())
