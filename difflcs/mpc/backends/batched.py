@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -34,6 +34,9 @@ class BatchedResult(Result):
     """
 
     fragile: Tensor | None = None
+
+
+_FLAT = (1e-2, 1e-6)  # weights of actions beside a price of one: what makes the plan of least violations unique
 
 
 @dataclass(frozen=True)
@@ -150,7 +153,7 @@ class BatchedBackend(Backend):
         )
         seconds.fill((time.perf_counter() - started) / max(batch, 1))
         if not result.all_converged:
-            _make_presentable(problem, result.primal, result.status)
+            self._make_presentable(problem, result.primal, result.status)
             result.kkt_residual.clamp_max_(torch.finfo(torch.float64).max)
         return result
 
@@ -203,17 +206,27 @@ class BatchedBackend(Backend):
     def _threads(self) -> int:
         return self.threads or torch.get_num_threads()
 
+    def _make_presentable(self, problem: MPCProblem, primal: Primal, status: Tensor) -> None:
+        """Give those that failed finite numbers inside the bounds, and call none infeasible that it is not."""
+        failed = torch.nonzero(~solved(status)).squeeze(-1)
+        if len(failed):
+            part = problem.select(failed)
+            primal.u[failed] = part.clip(torch.nan_to_num(primal.u[failed], posinf=0.0, neginf=0.0))
+            for value in (primal.x, primal.lam, primal.mu):
+                value[failed] = torch.nan_to_num(value[failed])
+            refused = failed[status[failed] == int(Status.INFEASIBLE)]
+            if len(refused):
+                part, plans = problem.select(refused), Primal(*(value[refused] for value in primal))
+                sure = kkt.certainly_missed(part, plans) & self._impossible(part, plans)
+                status[refused[~sure]] = int(Status.NUMERICAL)
 
-def _make_presentable(problem: MPCProblem, primal: Primal, status: Tensor) -> None:
-    """Give those that failed finite numbers inside the bounds, and call none infeasible that it is not near."""
-    failed = torch.nonzero(~solved(status)).squeeze(-1)
-    if len(failed):
-        part = problem.select(failed)
-        primal.u[failed] = part.clip(torch.nan_to_num(primal.u[failed], posinf=0.0, neginf=0.0))
-        for value in (primal.x, primal.lam, primal.mu):
-            value[failed] = torch.nan_to_num(value[failed])
-        refused = failed[status[failed] == int(Status.INFEASIBLE)]
-        if len(refused):
-            part, plans = problem.select(refused), Primal(*(value[refused] for value in primal))
-            sure = kkt.certainly_missed(part, plans) & kkt.least_violated(part, plans)
-            status[refused[~sure]] = int(Status.NUMERICAL)
+    def _impossible(self, problem: MPCProblem, plans: Primal) -> Tensor:
+        """Which elements (batch,) miss a hard constraint whatever it costs, by the least violations that are found."""
+        cost = {name: torch.zeros_like(getattr(problem, name)) for name in ("Q", "S", "Q_final", "q", "r", "q_final")}
+        cost["price"] = torch.where(torch.isinf(problem.price), 1.0, 1e-6)
+        missed, known = torch.ones(problem.batch, dtype=torch.bool), kkt.least_violated(problem, plans)
+        for weight in _FLAT:
+            cost["R"] = weight * torch.eye(problem.n_u, dtype=torch.float64).expand(problem.R.shape)
+            nearest = self.solve(replace(problem, **cost, barrier=0.0), None)
+            missed, known = missed & kkt.certainly_missed(problem, nearest.primal), known | solved(nearest.status)
+        return missed & known
