@@ -5,7 +5,7 @@ The derivation stands in `difflcs.mpc.kkt`, which offers the names of this file.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -22,8 +22,6 @@ _AT_PRICE = 1 - 1e-12
 _CANCELLED = 1e-3
 # What a step further along a chain of states counts: so little that no size grows with it in most systems.
 _FURTHER = 0.1
-# The gradient of the violations, in parts of its terms, below which they are the least nearby.
-_LEAST = 1e-4
 
 
 @dataclass(frozen=True)
@@ -220,24 +218,6 @@ def _reach(problem: MPCProblem, primal: Primal) -> Tensor:
     reach = _terms((P.G_x, torch.cat([torch.zeros_like(moved[:1]), moved])))
     reach[:-1] += _terms((P.G_u, width))
     return reach
-
-
-def least_violated(problem: MPCProblem, primal: Primal) -> Tensor:
-    """Whether (batch,) no change of the actions nearby lessens Σ(violation / |row|)² of the hard constraints.
-
-    That is stationarity as in `residual`, with the violations as multipliers in place of the cost.
-    """
-    none = {name: torch.zeros_like(getattr(problem, name)) for name in ("Q", "R", "S", "Q_final", "q", "r", "q_final")}
-    P, alone = problem.steps(), replace(problem, **none, barrier=0.0)
-    square = P.G_x.square().sum(-1).expand(problem.horizon + 1, problem.batch, problem.n_c).clone()
-    square[:-1] += P.G_u.square().sum(-1)
-    over = _overshoot(problem, primal) / torch.where(square > 0, square, torch.ones_like(square))
-    over = torch.where(over > _LEAST * over.amax((0, 2), keepdim=True), over, 0.0)  # the rest is met
-    trial = primal._replace(mu=over.transpose(0, 1))
-    dual = multipliers(alone, trial)
-    g, width, (low, high) = dual.gradient, ranges(problem, primal.u), problem.bounds()
-    room = torch.where(g > 0, primal.u - low, high - primal.u) / torch.where(width > 0, width, torch.ones_like(width))
-    return largest(torch.minimum(_parts(g, gradient_terms(alone, trial, dual)), room).transpose(0, 1)) <= _LEAST
 
 
 def _overshoot(problem: MPCProblem, primal: Primal) -> Tensor:

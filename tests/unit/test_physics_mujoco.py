@@ -151,39 +151,6 @@ def test_the_tangent_takes_velocities_of_the_state_to_those_of_mujoco(seed):
 # --- contacts -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("first", "second"), list(itertools.combinations_with_replacement(SHAPES, 2)))
-def test_gaps_are_distances_and_their_derivatives_those_of_distances(first, second):
-    model = load(f"""
-      <body><freejoint name="a"/><geom {SHAPES[first]} mass="1"/></body>
-      <body><freejoint name="b"/><geom {SHAPES[second]} mass="1"/></body>""")
-    module = MujocoLCS(model, motion="dynamic", contacts=1)
-    data, random, eps, ends = mujoco.MjData(model), np.random.default_rng(0), 1e-6, np.zeros(6)
-
-    def distance(x):
-        data.qpos[:] = module.state.to_mujoco(x)[0]
-        mujoco.mj_fwdPosition(model, data)
-        return mujoco.mj_geomDistance(model, data, 0, 1, 1.0, ends)
-
-    compared = 0
-    for _ in range(12):
-        x = torch.from_numpy(
-            np.concatenate([random.normal(size=12) * np.tile([0.08] * 3 + [0.6] * 3, 2), np.zeros(12)])
-        )
-        gap = distance(x)
-        if gap < 0.005:
-            continue
-        found = module.contacts(x)
-        assert float(found.gap[0]) == pytest.approx(gap, abs=1e-7)
-        unit = eps * torch.eye(24, dtype=x.dtype)
-        rates = [(distance(x + unit[i]) - distance(x - unit[i])) / (2 * eps) for i in range(12)]
-        if first == second == "box" and np.abs(np.array(rates) - found.normal[0, :12].numpy()).max() > 1e-2:
-            continue  # faces that are nearly parallel: the nearest points jump
-        np.testing.assert_allclose(found.normal[0, :12], rates, atol=2e-3)
-        assert not found.normal[0, 12:].any()
-        compared += 1
-    assert compared >= 5
-
-
 def test_the_contact_of_a_pusher_beside_a_box():
     module = MujocoLCS(pushing())
     found = module.contacts(tensor(0.0, 0.0, 0.0, -0.1, 0.01))
@@ -504,24 +471,6 @@ CART_POLE = """
 </body></body>"""
 
 
-def test_without_contact_the_error_is_of_second_order_in_the_motion():
-    model = load(CART_POLE, '<actuator><motor joint="cart" gear="3"/></actuator>', 'integrator="RK4"')
-    module = MujocoLCS(model, motion="dynamic", pairs=[])
-    x, u = tensor(0.1, 0.4, 0.5, -1.0), tensor(1.0)
-    errors = []
-    for seconds in (0.1, 0.05):
-        module = MujocoLCS(model, motion="dynamic", pairs=[], seconds=seconds)
-        predicted = module.params(x).step(x, u).x_next
-        after = np.concatenate(step(model, x[:2], x[2:], u.numpy(), seconds))
-        errors.append(np.abs(predicted.numpy() - after).max())
-    assert errors[0] < 2e-2
-    assert errors[1] < errors[0] / 3.5
-    # A small motion about equilibrium, where MuJoCo is linear.
-    x = tensor(0.0, 1e-4, 0.0, 0.0)
-    predicted = module.params(x).step(x, tensor(0.0)).x_next
-    np.testing.assert_allclose(predicted, np.concatenate(step(model, x[:2], x[2:], 0.0, 0.05)), atol=1e-9)
-
-
 @pytest.mark.parametrize("relative", [True, False])
 def test_servos_and_velocity_actuators_are_mujocos(relative):
     rest = '<actuator><position joint="px" kp="30" kv="2" gear="2"/><velocity joint="py" kv="5"/></actuator>'
@@ -595,32 +544,6 @@ def test_a_body_in_the_air_falls_and_turns():
     assert (after - x)[3:6].abs().max() > 0.03
     torch.testing.assert_close(predicted, after, atol=2e-3, rtol=0)
     torch.testing.assert_close(predicted[:3], after[:3], atol=2e-4, rtol=0)
-
-
-def test_a_box_at_rest_stays_at_rest():
-    model = load("""<geom type="plane" size="1 1 1" friction=".5"/>
-      <body><freejoint name="b"/><geom type="box" size=".05 .05 .05" mass="2" friction=".5"/></body>""")
-    module = MujocoLCS(model, motion="dynamic", compliance=1e-5)
-    x = tensor(0.0, 0.0, 0.05, *[0.0] * 9)
-    system = module.params(x)
-    found = system.step(x, torch.zeros(0).double())
-    torch.testing.assert_close(found.x_next, x, atol=1e-4, rtol=0)
-    # The impulse of the contacts is that of the weight over the step.
-    impulse = 2.0 * (system.C @ found.lam)[8]
-    assert float(impulse) == pytest.approx(2 * 9.81 * 0.1, rel=1e-3)
-
-
-@pytest.mark.parametrize("heading", [0.0, 0.7])
-def test_a_box_that_slides_is_slowed_by_coulombs_friction_and_stays_on_the_floor(heading):
-    model = load("""<geom type="plane" size="1 1 1" friction=".3"/>
-      <body><freejoint name="b"/><geom type="box" size=".2 .2 .01" mass="2" friction=".3"/></body>""")
-    module = MujocoLCS(model, motion="dynamic", compliance=1e-5)
-    speed = 0.8 * np.array([np.cos(heading), np.sin(heading)])
-    x = tensor(0.0, 0.0, 0.01, 0.0, 0.0, 0.0, *speed, 0.0, 0.0, 0.0, 0.0)
-    after = module.params(x).step(x, torch.zeros(0).double()).x_next
-    assert float(after[2]) == pytest.approx(0.01, abs=2e-3)  # without the correction: 0.3 · 6 cm
-    slowed = (0.8 - 0.3 * 9.81 * 0.1) / 0.8
-    np.testing.assert_allclose(after[6:8], slowed * speed, atol=0.06)
 
 
 def test_a_falling_body_stops_at_the_floor():

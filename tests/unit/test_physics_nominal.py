@@ -93,12 +93,14 @@ def test_what_friction_holds_stays_as_in_mujoco_by_the_right_force(name, option)
             torch.testing.assert_close(carried[-1:], torch.full((1,), 9.81).double(), rtol=2e-2, atol=0)
 
 
-@pytest.mark.parametrize(("degrees", "speed"), [(0, 0.8), (30, 0.3), (40, 0.0)])
-def test_what_slides_goes_as_coulomb_says(degrees, speed):
+@pytest.mark.parametrize(
+    ("degrees", "heading", "speed"), [(0, 0.0, 0.8), (0, 0.7, 0.8), (30, 0.0, 0.3), (40, 0.0, 0.0)]
+)
+def test_what_slides_goes_as_coulomb_says(degrees, heading, speed):
     a, h = math.radians(degrees), 0.1
     model = load(tilted(degrees, 0.5, (0.01, 'type="box" size=".2 .2 .01" mass="1"')))
     module = MujocoLCS(model, motion="dynamic", seconds=h)
-    along = np.array([math.cos(a), 0, -math.sin(a)])
+    along = np.array([math.cos(a) * math.cos(heading), math.sin(heading), -math.sin(a)])
     x = module.state.to_state(model.qpos0, np.concatenate([speed * along, np.zeros(3)]))
     moved = (module.params(x).step(x, torch.zeros(0).double()).x_next - x).numpy()
     gains = 9.81 * (math.sin(a) - 0.5 * math.cos(a))

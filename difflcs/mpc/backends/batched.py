@@ -153,7 +153,7 @@ class BatchedBackend(Backend):
         )
         seconds.fill((time.perf_counter() - started) / max(batch, 1))
         if not result.all_converged:
-            self._make_presentable(problem, result.primal, result.status)
+            self._make_presentable(problem, result.primal, result.status, started)
             result.kkt_residual.clamp_max_(torch.finfo(torch.float64).max)
         return result
 
@@ -206,7 +206,7 @@ class BatchedBackend(Backend):
     def _threads(self) -> int:
         return self.threads or torch.get_num_threads()
 
-    def _make_presentable(self, problem: MPCProblem, primal: Primal, status: Tensor) -> None:
+    def _make_presentable(self, problem: MPCProblem, primal: Primal, status: Tensor, started: float) -> None:
         """Give those that failed finite numbers inside the bounds, and call none infeasible that it is not."""
         failed = torch.nonzero(~solved(status)).squeeze(-1)
         if len(failed):
@@ -217,16 +217,18 @@ class BatchedBackend(Backend):
             refused = failed[status[failed] == int(Status.INFEASIBLE)]
             if len(refused):
                 part, plans = problem.select(refused), Primal(*(value[refused] for value in primal))
-                sure = kkt.certainly_missed(part, plans) & self._impossible(part, plans)
+                sure = kkt.certainly_missed(part, plans) & self._impossible(part, started)
                 status[refused[~sure]] = int(Status.NUMERICAL)
 
-    def _impossible(self, problem: MPCProblem, plans: Primal) -> Tensor:
+    def _impossible(self, problem: MPCProblem, started: float) -> Tensor:
         """Which elements (batch,) miss a hard constraint whatever it costs, by the least violations that are found."""
+        left = None if self.time_limit is None else max(1e-4, self.time_limit - (time.perf_counter() - started))
         cost = {name: torch.zeros_like(getattr(problem, name)) for name in ("Q", "S", "Q_final", "q", "r", "q_final")}
         cost["price"] = torch.where(torch.isinf(problem.price), 1.0, 1e-6)
-        missed, known = torch.ones(problem.batch, dtype=torch.bool), kkt.least_violated(problem, plans)
+        missed = torch.ones(problem.batch, dtype=torch.bool)
+        known = ~missed
         for weight in _FLAT:
             cost["R"] = weight * torch.eye(problem.n_u, dtype=torch.float64).expand(problem.R.shape)
-            nearest = self.solve(replace(problem, **cost, barrier=0.0), None)
+            nearest = replace(self, time_limit=left).solve(replace(problem, **cost, barrier=0.0), None)
             missed, known = missed & kkt.certainly_missed(problem, nearest.primal), known | solved(nearest.status)
         return missed & known
