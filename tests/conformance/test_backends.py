@@ -7,6 +7,7 @@ does not promise: that its plan solves the problem as stated.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
 import warnings
@@ -20,8 +21,9 @@ from torch.autograd import gradcheck
 
 from difflcs import LCSMPCLayer, LCSParams, QuadraticCost, Status, available_backends, solve_lcp
 from difflcs.errors import DegenerateWarning, DoubleBackwardError, SolveWarning
-from difflcs.mpc import Primal, kkt
+from difflcs.mpc import Primal
 from difflcs.mpc.backends import get_backend
+from tests.conformance.differences import compare, moves, weigh
 
 BACKENDS = available_backends()
 EXACT = tuple(name for name in BACKENDS if get_backend(name).exact)
@@ -528,100 +530,24 @@ def test_a_wild_guess_does_no_harm(build, solutions, backend):
 # --- backward -------------------------------------------------------------------------------------------------------
 
 
-def weigh(sol, weights):
-    """One number per element from all differentiable outputs."""
-    x, u, lam, objective = weights
-    parts = (x * sol.x).sum((1, 2)) + (u * sol.u).sum((1, 2)) + (lam * sol.lam).sum((1, 2))
-    return parts + objective * sol.objective
-
-
-def direction_of(name, value, n):
-    """A direction in proportion to the value, so that badly scaled inputs are stepped by what is small for them."""
-    direction = n(*value.shape)
-    if name in ("Q", "R", "Q_final", "F"):  # by rows and columns, so that they stay positive definite
-        root = value.diagonal(dim1=-2, dim2=-1).sqrt()
-        direction = direction * root[..., :, None] * root[..., None, :]
-        return direction if name == "F" else 0.5 * (direction + direction.mT)
-    return direction * torch.where(value == 0, 0.1, value.abs())
-
-
-STEP = 1e-6
-
-
-def perturbed(build, problem, base, h):
-    """2·17 copies of a batch: every input moved by ±h along its direction; with the plans of the batch as guess."""
-    n, each = build.normal(41), problem.each().tensors
-    directions = {k: direction_of(k, each[k], n) for k in INPUTS}
-    copies = [{**each, k: each[k] + sign * h * directions[k]} for k, sign in itertools.product(INPUTS, (1, -1))]
-    stacked = {k: torch.cat([c[k] for c in copies]) for k in INPUTS}
-    guess = Primal(*(v.detach().repeat(len(copies), 1, 1) for v in (base.x, base.u, base.lam)))
-    return directions, stacked, guess
-
-
 @pytest.fixture(scope="module")
-def moves(build, solutions):
+def moved(build, solutions):
     """The perturbed copies of each problem solved once per backend, failures masked."""
-    cache = {}
-
-    def get(name, backend):
-        if (name, backend) not in cache:
-            problem, base = solutions(name, backend)
-            directions, stacked, guess = perturbed(build, problem, base, STEP)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", SolveWarning)
-                moved = solve(problem, backend, tensors=stacked, guess=guess, on_failure="mask")
-            cache[name, backend] = directions, stacked, moved
-        return cache[name, backend]
-
-    return get
+    return functools.cache(lambda name, backend: moves(build, solve, *solutions(name, backend), backend))
 
 
 @every_problem
 @every_exact_on_copies
-def test_a_warm_start_next_to_a_solution_is_solved(moves, name, backend):
+def test_a_warm_start_next_to_a_solution_is_solved(moved, name, backend):
     """Where nearly nothing is left to gain, rounding must not be taken for a failure."""
-    _, _, moved = moves(name, backend)
-    assert bool(moved.converged.all()), moved.status.bincount()
+    _, plans = moved(name, backend)
+    assert bool(plans.converged.all()), plans.status.bincount()
 
 
 @every_problem
 @every_exact_on_copies
-def test_gradient_of_every_input_matches_central_differences(build, solutions, moves, name, backend):
-    """All inputs at once: their perturbed copies are one large batch of problems."""
-    problem, base = solutions(name, backend)
-    B, h = problem.batch, STEP
-    directions, stacked, moved = moves(name, backend)
-    each, n = problem.each().tensors, build.normal(42)
-    weights = [n(*v.shape) for v in (base.x, base.u, base.lam)] + [n(B)]
-    leaves = {k: v.clone().requires_grad_() for k, v in each.items()}
-    # All from the same start, so that all end in the same local optimum.
-    sol = solve(problem, backend, tensors=leaves, guess=base)
-    gradients = torch.autograd.grad(weigh(sol, weights).sum(), [leaves[k] for k in INPUTS])
-    gradients = dict(zip(INPUTS, gradients, strict=True))
-
-    # A difference quotient needs more digits than a user: a few Newton steps onto the same optimum.
-    x, u, lam, _ = kkt.polish(moved.problem, Primal(moved.x, moved.u, moved.lam), tol=1e-14)
-    objective = moved.problem.objective(x, u)
-    times = 2 * len(INPUTS)
-    values = ((x, u, lam), [w.repeat(times, *[1] * (w.ndim - 1)) for w in weights])
-    values = sum((w * v).sum((1, 2)) for v, w in zip(*values, strict=False)) + weights[3].repeat(times) * objective
-    values = values.reshape(len(INPUTS), 2, B)
-    low, high = stacked["u_min"][:, None], stacked["u_max"][:, None]
-    active = ((u <= low + 1e-9) | (u >= high - 1e-9)).reshape(len(INPUTS), 2, B, -1)
-    width = (each["u_max"] - each["u_min"]).clamp_max(1.0)
-    apart = (u.reshape(len(INPUTS), 2, *sol.u.shape) - sol.u.detach()).abs() / width[:, None]
-    steady = (active[:, 0] == active[:, 1]).all(-1) & (apart.amax((1, 3, 4)) < 1e-3)
-    steady &= moved.converged.reshape(len(INPUTS), 2, B).all(1)
-    assert float(steady.double().mean()) > 0.9
-
-    for i, k in enumerate(INPUTS):
-        quotient = (values[i, 0] - values[i, 1]) / (2 * h)
-        found = (gradients[k] * directions[k]).flatten(1).sum(1)
-        # Numbers that are zero up to the rounding of the difference quotient carry no relative error.
-        floor = 1e-4 * float((values[i, 0].abs() + 1).max())
-        error = ((found - quotient).abs() / quotient.abs().clamp_min(floor))[steady[i]]
-        assert float(error.median()) <= 1e-4, k
-        assert float(error.quantile(0.75)) <= 1e-3, k
+def test_gradient_of_every_input_matches_central_differences(build, solutions, moved, name, backend):
+    compare(build, solve, *solutions(name, backend), backend, *moved(name, backend))
 
 
 @pytest.mark.parametrize("backend", [name for name in BACKENDS if name not in EXACT])

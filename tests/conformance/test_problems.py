@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import warnings
 from dataclasses import dataclass
 
 import pytest
@@ -28,8 +27,9 @@ from difflcs import (
     available_backends,
 )
 from difflcs.errors import SolveWarning
-from difflcs.mpc import Primal, kkt
+from difflcs.mpc import Primal
 from difflcs.mpc.backends import get_backend
+from tests.conformance.differences import compare, moves, weigh
 
 EXACT = tuple(name for name in available_backends() if get_backend(name).exact)
 LCS, COST = ("A", "B", "C", "d", "D", "E", "F", "c"), ("Q", "R", "S", "Q_final", "q", "r", "q_final")
@@ -510,78 +510,13 @@ def test_batch_equals_loop(solutions, name, backend):
 # --- backward -------------------------------------------------------------------------------------------------------
 
 
-STEP = 1e-6
-
-
-def direction_of(name, value, n):
-    """A direction in proportion to the value; nothing that is infinite moves."""
-    direction = n(*value.shape)
-    if name in ("Q", "R", "Q_final", "F"):  # by rows and columns, so that they stay positive definite
-        root = value.diagonal(dim1=-2, dim2=-1).sqrt()
-        direction = direction * root[..., :, None] * root[..., None, :]
-        return direction if name == "F" else 0.5 * (direction + direction.mT)
-    size = torch.where(value == 0, 0.1, value.abs())
-    return torch.where(value.abs() < INF, direction * size, 0.0)
-
-
-def weigh(sol, weights):
-    x, u, lam, objective = weights
-    parts = (x * sol.x).sum((1, 2)) + (u * sol.u).sum((1, 2)) + (lam * sol.lam).sum((1, 2))
-    return parts + objective * sol.objective
-
-
 @every_problem
 @every_exact_on_copies
 def test_gradient_of_every_input_matches_central_differences(build, solutions, name, backend):
-    """All inputs at once: their perturbed copies are one large batch of problems."""
     problem, base = solutions(name, backend)
-    each, n, B = problem.each(), build.normal(41), problem.batch
-    names = tuple(each.tensors)
-    directions = {k: direction_of(k, each.tensors[k], n) for k in names}
-    copies = [
-        {**each.tensors, k: each.tensors[k] + torch.where(directions[k] == 0, 0.0, sign * STEP * directions[k])}
-        for k, sign in itertools.product(names, (1, -1))
-    ]
-    stacked = {k: torch.cat([c[k] for c in copies]) for k in names}
-    guess = Primal(*(v.detach().repeat(len(copies), 1, 1) for v in (base.x, base.u, base.lam, base.mu)))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", SolveWarning)
-        moved = solve(each, backend, tensors=stacked, guess=guess, on_failure="mask")
-    weights = [n(*v.shape) for v in (base.x, base.u, base.lam)] + [n(B)]
-    leaves = {k: v.clone().requires_grad_() for k, v in each.tensors.items()}
-    sol = solve(each, backend, tensors=leaves, guess=base)
-    gradients = dict(
-        zip(names, torch.autograd.grad(weigh(sol, weights).sum(), [leaves[k] for k in names]), strict=True)
-    )
-
-    # A difference quotient needs more digits than a user: a few Newton steps onto the same optimum.
-    plan = kkt.polish(moved.problem, Primal(moved.x, moved.u, moved.lam, moved.mu), tol=1e-14)
-    times = 2 * len(names)
-    x, u, lam = plan[:3]
-    wide = [w.repeat(times, *[1] * (w.ndim - 1)) for w in weights]
-    values = (wide[0] * x).sum((1, 2)) + (wide[1] * u).sum((1, 2)) + (wide[2] * lam).sum((1, 2))
-    values = (values + wide[3] * moved.problem.objective(x, u)).reshape(len(names), 2, B)
-    low, high = moved.problem.bounds()
-    price = moved.problem.price
-    price = price if price.ndim == 3 or price.ndim == 1 else price.unsqueeze(1)
-    marks = [u <= low + 1e-9, u >= high - 1e-9, plan.mu > 1e-9, plan.mu > price * (1 - 1e-9)]
-    active = torch.cat([mark.flatten(1) for mark in marks], 1).reshape(len(names), 2, B, -1)
-    apart = (u.reshape(len(names), 2, *sol.u.shape) - sol.u.detach()).abs().amax((1, 3, 4))
-    steady = (active[:, 0] == active[:, 1]).all(-1) & (apart < 1e-3)
-    steady &= moved.converged.reshape(len(names), 2, B).all(1)
-    assert float(steady.double().mean()) > 0.9
-
-    some = 0
-    for i, k in enumerate(names):
-        quotient = (values[i, 0] - values[i, 1]) / (2 * STEP)
-        found = (gradients[k] * directions[k]).flatten(1).sum(1)
-        floor = 1e-4 * float((values[i, 0].abs() + 1).max())
-        error = ((found - quotient).abs() / quotient.abs().clamp_min(floor))[steady[i]]
-        assert float(error.median()) <= 1e-4, (k, found, quotient)
-        assert float(error.quantile(0.75)) <= 1e-3, (k, found, quotient)
-        some += int((quotient.abs() > floor).sum() > 0)
-        assert bool(torch.isfinite(gradients[k]).all())
-    assert some >= 0.6 * len(names)  # most inputs matter
+    directions, moved = moves(build, solve, problem, base, backend)
+    some = compare(build, solve, problem, base, backend, directions, moved)
+    assert some >= 0.6 * len(directions)  # most inputs matter
 
 
 @pytest.mark.parametrize("name", ["stages", "preview", "hard", "soft_and_hard", "rows_by_stage", "no_contact"])
