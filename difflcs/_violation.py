@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import check_tensor
-from difflcs._functorch import Solver
+from difflcs._differentiation import Solver
 from difflcs.errors import GammaError, NotPositiveDefiniteError, SolveError
 from difflcs.lcp import solve_lcp_arrays
 from difflcs.records import SYSTEM

@@ -19,7 +19,7 @@ from difflcs._checks import (
     check_tensor,
     describe,
 )
-from difflcs._functorch import runs_eagerly, transforms_active
+from difflcs._differentiation import runs_eagerly, transforms_active
 from difflcs._linalg import product
 from difflcs._modules import fresh, plain_state, untouched
 from difflcs._recall import Recall

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_choice, check_number, check_tensor, describe, is_array
-from difflcs._functorch import is_wrapped, pull_back, runs_eagerly, solve, transforms_active
+from difflcs._differentiation import is_wrapped, pull_back, runs_eagerly, solve, transforms_active
 from difflcs._violation import Transitions, check_gamma_range, largest_gamma, minimise_over_orthant
 from difflcs.errors import DTypeError, GammaError, InvalidInputError
 from difflcs.lcp import MAX_ITER

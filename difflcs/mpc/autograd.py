@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import all_finite, check_finite, check_positive_definite, check_tensor
+from difflcs._differentiation import transforms_active
 from difflcs._fields import check_not_nan
-from difflcs._functorch import transforms_active
 from difflcs.errors import DegenerateWarning, DoubleBackwardError
 from difflcs.mpc.backends.base import Backend, Result
 from difflcs.mpc.gather import RANKS

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor
-from difflcs._functorch import forward_mode_active, is_wrapped, refuse_tangents, runs_eagerly, transforms_active
+from difflcs._differentiation import forward_mode_active, is_wrapped, refuse_tangents, runs_eagerly, transforms_active
 from difflcs._modules import fresh
 from difflcs.constraints import StageBounds, as_bound, check_bounds
 from difflcs.cost import CostSequence

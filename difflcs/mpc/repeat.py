@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import all_finite, check_tensor, is_array
-from difflcs._functorch import transforms_active
+from difflcs._differentiation import transforms_active
 from difflcs._modules import untouched
 from difflcs._recall import Snapshot, comparable
 from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds
