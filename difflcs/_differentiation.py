@@ -200,15 +200,17 @@ def pull_back(
     """A solver's pullback, for the backward pass of an autograd function, whatever transform it runs in."""
     legacy = torch._C._functorch.is_legacy_batchedtensor  # pyright: ignore[reportAttributeAccessIssue]
     batched = any([grad is not None and legacy(grad) for grad in grads])
-    if not transforms_active() or batched:
-        if torch.is_grad_enabled():
-            solver.refuse()
-        if not batched:
-            return _fitted(solver, tensors, solver.pullback(tensors, outputs, grads, needs))
-    # Inside a transform of torch.func every backward pass is recorded; it is refused when it is differentiated.
-    function = _pull_back_legacy if batched else _Pullback.apply
-    found = iter(function(solver, needs, len(tensors), len(outputs), *tensors, *outputs, *grads))  # pyright: ignore
-    return [next(found) if needed else None for needed in needs]
+    if torch.is_grad_enabled() and (batched or not transforms_active()):
+        solver.refuse()
+    if batched or transforms_active():
+        # Inside a transform of torch.func every backward pass is recorded; it is refused when it is differentiated.
+        function = _pull_back_legacy if batched else _Pullback.apply
+        found = iter(function(solver, needs, len(tensors), len(outputs), *tensors, *outputs, *grads))  # pyright: ignore
+        gradients = [next(found) if needed else None for needed in needs]
+    else:
+        gradients = _summed(solver, tensors, solver.pullback(tensors, outputs, grads, needs))
+    pairs = zip(gradients, tensors, strict=True)
+    return [None if gradient is None else gradient.to(like.device, like.dtype) for gradient, like in pairs]
 
 
 class _Pullback(torch.autograd.Function):
@@ -217,7 +219,7 @@ class _Pullback(torch.autograd.Function):
     @staticmethod
     def forward(solver: Solver, needs: Sequence[bool], n: int, m: int, *values: Tensor):
         tensors, outputs, grads = values[:n], values[n : n + m], values[n + m :]
-        gradients = _fitted(solver, tensors, solver.pullback(tensors, outputs, grads, needs))
+        gradients = _summed(solver, tensors, solver.pullback(tensors, outputs, grads, needs))
         needed = [pair for pair, need in zip(zip(gradients, tensors, strict=True), needs, strict=True) if need]
         return tuple(torch.zeros_like(v) if g is None else g for g, v in needed)
 
@@ -295,17 +297,18 @@ def _flatten(
     return flat, batch
 
 
-def _fitted(solver: Solver, tensors: Sequence[Tensor], gradients: Sequence[Tensor | None]) -> list[Tensor | None]:
-    """Gradients in the shapes and dtypes, and on the devices, of their inputs."""
-    found = []
+def _summed(solver: Solver, tensors: Sequence[Tensor], gradients: Sequence[Tensor | None]) -> list[Tensor | None]:
+    """Gradients in the shapes of their inputs, summed over the batch where it shares an input."""
+    found = list(gradients)
     for i, (gradient, like) in enumerate(zip(gradients, tensors, strict=True)):
-        if gradient is not None and gradient.numel() != like.numel():
-            ranks = solver.ranks
-            leads = [tensor.shape[: tensor.ndim - rank] for tensor, rank in zip(tensors, ranks, strict=True)]
+        if gradient is None or gradient.shape == like.shape:
+            continue
+        if gradient.numel() != like.numel():
+            leads = [tensor.shape[: tensor.ndim - rank] for tensor, rank in zip(tensors, solver.ranks, strict=True)]
             batch, lead, own = torch.broadcast_shapes(*leads), leads[i], like.shape[len(leads[i]) :]
             ones = [1] * (len(batch) - len(lead))
             gradient = gradient.reshape((*batch, *own)).sum_to_size((*ones, *lead, *own))
-        found.append(None if gradient is None else gradient.reshape(like.shape).to(like.device, like.dtype))
+        found[i] = gradient.reshape(like.shape)
     return found
 
 
@@ -318,7 +321,7 @@ def _pull_back_legacy(solver: Solver, needs: Sequence[bool], n: int, m: int, *va
         batched = value is not None and functorch.is_legacy_batchedtensor(value)
         dims.append(0 if batched else None)
         if batched:
-            plain[i] = torch._remove_batch_dim(value, level, 1, 0)  # pyright: ignore[reportPrivateImportUsage]
+            plain[i] = torch._remove_batch_dim(value, level, 1, 0)  # pyright: ignore
             count = plain[i].shape[0]  # pyright: ignore[reportOptionalMemberAccess]
     gradients = _pull_back_many(count, dims, solver, needs, n, m, plain)
     return [torch._add_batch_dim(g, 0, level) for g in gradients]  # pyright: ignore[reportPrivateImportUsage]

@@ -47,7 +47,7 @@ def export_controller(
             f"lcs: expected an LCSModel or matrices, got {describe(mpc.lcs)}, whose system may depend on the state; "
             f"build a layer with lcs=module.params(x, context)"
         )
-    content = controller_bytes(mpc, system, step_seconds)
+    content = controller_bytes(mpc.setup(), system, step_seconds)
     low, high = mpc.limits()
     description = {
         **(about or {}),
