@@ -32,18 +32,18 @@ def solve_call(setup: Setup, call: Call) -> tuple[MPCSolver, tuple[Tensor, ...]]
     if not transformed:
         refuse_tangents(tensors.values())
     batch = inputs.batch()
-    parts = check_guess(call.guess, batch, inputs.horizon, inputs.sizes)
-    guess = {f"guess.{name}": part for name, part in zip(GUESS, parts, strict=True) if part is not None}
+    guess = check_guess(call.guess, batch, inputs.horizon, inputs.sizes)
+    own = torch.is_grad_enabled() and (transformed or any([tensor.requires_grad for tensor in tensors.values()]))
     solver = MPCSolver(
         setup.backend,
         setup.relaxation,
         setup.barrier,
         names=(*tensors, *guess),
-        inputs=replace(inputs, tensors={}),  # which would live as long as the graph
+        inputs=Inputs(inputs.horizon, by_stage=inputs.by_stage, sizes=inputs.sizes),
         batch=batch,
         dtype=call.x0.dtype,
-        narrow=any([tensor.dtype == torch.float32 for tensor in tensors.values()]),
-        own=torch.is_grad_enabled() and (transformed or any([tensor.requires_grad for tensor in tensors.values()])),
+        narrow=own and any([tensor.dtype is torch.float32 for tensor in tensors.values()]),
+        own=own,
         transformed=transformed,
     )
     return solver, solve(solver, *tensors.values(), *guess.values())
@@ -94,7 +94,7 @@ class MPCSolver(Solver):
             leads = [tensor.shape[: tensor.ndim - rank] for tensor, rank in zip(tensors, self.ranks, strict=True)]
             self.batch = torch.broadcast_shapes(*leads)
         named = dict(zip(self.names, tensors, strict=True))
-        guess = {name: named.pop(f"guess.{name}") for name in GUESS if f"guess.{name}" in named}
+        guess = {name: named.pop(name) for name in self.names if name not in RANKS}
         values = self.inputs.numbers(named, self.batch, unseen=transformed, own=self.own)
         self.constant = values.pop("constant")
         self.problem = MPCProblem(
@@ -157,18 +157,18 @@ class MPCSolver(Solver):
             return objective
         return torch.where(result.status == int(Status.CONVERGED), result.objective, objective)
 
-    def flat_guess(self, parts: Mapping[str, Tensor | None]) -> Primal | None:
+    def flat_guess(self, parts: Mapping[str, Tensor]) -> Primal | None:
         """A guess as backends want it, with multipliers of zero where it has none."""
         if not parts:
             return None
         flat = []
         for name in GUESS:
-            value = parts.get(name)
+            value = parts.get(f"guess.{name}")
             if value is None:
                 flat.append(self.problem.no_multipliers())
                 continue
             value = value.detach() if value.requires_grad else value
-            if value.dtype != torch.float64 or not value.is_cpu:
+            if value.dtype is not torch.float64 or not value.is_cpu:
                 value = value.to("cpu", torch.float64)
             if self.transformed:
                 check_tensor("guess", value)

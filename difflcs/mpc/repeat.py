@@ -97,8 +97,8 @@ class _Planned:
         solver, flat = self.latest[0], self._flat(call.guess)
         if flat is None or not all_finite(call.x0, *flat):
             check_tensor("x0", call.x0)
-            parts = check_guess(call.guess, solver.batch, solver.inputs.horizon, solver.inputs.sizes)
-            return solver.flat_guess(dict(zip(GUESS, parts, strict=True)) if call.guess is not None else {})
+            inputs = solver.inputs
+            return solver.flat_guess(check_guess(call.guess, solver.batch, inputs.horizon, inputs.sizes))
         return Primal(*flat) if flat else None
 
     def _flat(self, guess: object) -> list[Tensor] | None:

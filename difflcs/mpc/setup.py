@@ -282,12 +282,16 @@ class Inputs:
 
     def batch(self) -> torch.Size:
         """Common batch dimensions; a clear error where devices or batch dimensions do not fit."""
-        leads = {name: tensor.shape[: tensor.ndim - self.rank(name)] for name, tensor in self.tensors.items()}
-        found = set(leads.values()) - {torch.Size()}
-        if len(found) <= 1 and all(tensor.is_cpu for tensor in self.tensors.values()):
+        leads = {}
+        for name, tensor in self.tensors.items():
+            size = tensor.ndim - RANKS[name] - (name in self.by_stage)
+            if size:
+                leads[name] = tensor.shape[:size]
+        found = set(leads.values())
+        if len(found) <= 1 and all([tensor.is_cpu for tensor in self.tensors.values()]):
             return found.pop() if found else torch.Size()
         check_same_device(reversed(self.tensors.items()))
-        return broadcast_batch(reversed(leads.items()))
+        return broadcast_batch([(name, leads.get(name, torch.Size())) for name in reversed(self.tensors)])
 
     def rank(self, name: str) -> int:
         """Number of dimensions of an input behind those of the batch."""
@@ -321,19 +325,19 @@ class Inputs:
         """
         values, unchecked, size = {}, {}, math.prod(batch)
         for name, tensor in tensors.items():
-            rank, value = self.rank(name), tensor.detach()
-            if value.dtype != torch.float64 or not value.is_cpu:
+            value, by_stage = tensor.detach(), name in self.by_stage
+            if value.dtype is not torch.float64 or not value.is_cpu:
                 value = value.to("cpu", torch.float64)
-            lead = value.shape[: value.ndim - rank]
-            if lead or name == "x0":
-                shape = value.shape[len(lead) :]
+            leading = value.ndim - RANKS[name] - by_stage
+            if leading or name == "x0":
+                lead, shape = value.shape[:leading], value.shape[leading:]
                 if math.prod(lead) == 1 and name != "x0":
                     value = value.reshape(shape)  # shared
                 elif lead == batch:
-                    value = value.reshape(size, *shape) if len(lead) != 1 else value
+                    value = value.reshape(size, *shape) if leading != 1 else value
                 else:
                     value = value.expand(*batch, *shape).reshape(size, *shape)
-            if name in self.by_stage and value.ndim == rank:
+            if by_stage and value.ndim == 1 + RANKS[name]:
                 value = value.unsqueeze(0)
             if name in SYMMETRIC and not torch.equal(value, value.mT):
                 value = 0.5 * (value + value.mT)
@@ -356,25 +360,25 @@ def check_guess(
     batch: tuple[int, ...],
     horizon: int,
     sizes: Mapping[str, int],
-) -> tuple[Tensor | None, ...]:
-    """x, u, lam and mu of a guess; mu where it has some."""
+) -> dict[str, Tensor]:
+    """The parts of a guess, "guess.x" and so on; mu where it has some."""
     if guess is None:
-        return (None,) * 4
+        return {}
     if not isinstance(guess, MPCSolution | Primal):
         raise DTypeError(f"guess: expected an MPCSolution or a Primal such as solution.shift(), got {describe(guess)}")
-    found = []
+    found = {}
     for name, (extra, size) in GUESS.items():
         value, stages = getattr(guess, name), horizon + extra
         if name == "mu" and (value is None or (isinstance(value, Tensor) and not value.numel())):
-            found.append(None)  # a plan without constraints is a guess for one with them
-            continue
+            continue  # a plan without constraints is a guess for one with them
         fits = isinstance(value, Tensor) and value.shape == (*batch, stages, sizes[size])
         dims = [] if fits else [("H+1" if extra else "H", stages), (size, sizes[size])]
-        check_tensor(f"guess.{name}", value, dims)
+        check_tensor(f"guess.{name}", value, dims, finite=False)
         if not fits:
             raise ShapeError(
                 f"guess.{name}: expected batch dimensions {tuple(batch)} like x0, got {tuple(value.shape[:-2])}; "
                 f"expand or index it"
             )
-        found.append(value.detach() if value.requires_grad else value)
-    return tuple(found)
+        found[f"guess.{name}"] = value.detach() if value.requires_grad else value
+    check_finite(found)
+    return found
