@@ -81,7 +81,7 @@ def targets(node: ast.Import | ast.ImportFrom, module: str) -> Iterator[str]:
 
 @functools.cache
 def graph(*, functions: bool, types: bool = False) -> dict[str, set[str]]:
-    """Module → the modules of ours that it imports, at module level or in functions; with `types` for annotations too."""
+    """Module → the modules of ours that it imports, at module level or in functions; `types`: for annotations, too."""
     edges: dict[str, set[str]] = {}
     for module, path in SOURCES.items():
         tree = ast.parse(path.read_text())
