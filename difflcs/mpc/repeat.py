@@ -4,7 +4,7 @@ A call without gradients, of a layer whose model, cost, bounds and constraints h
 plans with what that one has checked and prepared. Only what the call gives is looked at: a state, a goal, a guess, or a
 system that was linearised anew.
 
-With 9 states, 6 actions and 5 contacts that takes 130 µs, where `autograd.solve_call` takes 410 µs; 65 µs of both are the
+With 9 states, 6 actions and 5 contacts that takes 130 µs and `autograd.solve_call` 410 µs; 65 µs of both are the
 solve. Without this memory 180 µs would remain if checks and conversions took no time, as the products of matrices that
 make F and the cost of a goal have to be torch's.
 """
