@@ -240,31 +240,6 @@ def decision(record: dict) -> str:
     return table(["one decision", "computing", "PDDM takes"], rows)
 
 
-LATE = {
-    "on time": "on time",
-    "idle first": "on time, but idle in the first step",
-    "late": "one step late",
-    "late, predicted": "one step late, planned from the predicted state",
-}
-
-
-def delay(record: dict) -> str:
-    """Success of actions that come late, and how far it is from that of late ones."""
-    rows = []
-    for way, label in LATE.items():
-        row = record["results"][way]
-        more, half = (100 * v for v in row["to_late"])
-        rows.append(
-            [
-                label,
-                f"{100 * row['success_rate']:.1f} %",
-                f"{100 * row['ci_low']:.1f} to {100 * row['ci_high']:.1f}",
-                "" if way == "late" else f"{more:+.1f} ± {half:.1f} points",
-            ]
-        )
-    return table(["", "success", "95 % interval", "against late"], rows)
-
-
 def errors(record: dict) -> str:
     """Predictions of one step by system and mode: error of each coordinate and how far it moved, time of a state."""
     rows = []
@@ -404,7 +379,6 @@ TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "training_time": {"recipes": recipes},
     "latency": {"ways": latency},
     "decision": {"ways": decision},
-    "delay": {"ways": delay},
     "physics": {"errors": errors},
     "objects": {"success": objects, "methods": methods},
     "box_to_pose": {"success": success},
