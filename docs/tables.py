@@ -181,26 +181,22 @@ def sizes(record: dict) -> str:
 
 def recipes(record: dict) -> str:
     """Success at each of the minutes, and seconds of one core: mean and range over seeds, and differences by seed."""
-    by_seed: dict[str, dict[int, list[dict]]] = {}
-    for row in record["rows"]:
-        by_seed.setdefault(row["recipe"], {})[row["seed"]] = row["evaluations"]
-    seeds = sorted(set.intersection(*(set(own) for own in by_seed.values())))
-    minutes = [evaluation["minutes"] for evaluation in record["rows"][0]["evaluations"]]
+    rows = sorted(record["rows"], key=lambda row: row["seed"])
+    minutes = sorted({row["minutes"] for row in rows})
 
-    def column(recipe: str, name: str, k: int) -> np.ndarray:
-        return np.array([by_seed[recipe][seed][k][name] for seed in seeds])
+    def column(method: str, name: str, at: float) -> np.ndarray:
+        return np.array([row[name] for row in rows if (row["method"], row["minutes"]) == (method, at)])
 
     def cell(values: np.ndarray, unit: str, digits: int = 1, sign: str = "") -> str:
         mean, low, high = (f"{v:{sign}.{digits}f}" for v in (values.mean(), values.min(), values.max()))
         return f"{mean} {unit} ({low} to {high})".replace("-", "−")
 
     found = []
-    for recipe in by_seed:
-        success = [cell(100 * column(recipe, "success_rate", k), "%") for k in range(len(minutes))]
-        found.append([recipe, *success, cell(column(recipe, "seconds", -1), "s", 0)])
-    one, other = by_seed
-    change = [column(one, "success_rate", k) - column(other, "success_rate", k) for k in range(len(minutes))]
-    found.append([f"{one} − {other}", *(cell(100 * c, "points", sign="+") for c in change), ""])
+    for method, label in (("lcs-rl", "default"), ("quick", "quick")):
+        success = [cell(100 * column(method, "success_rate", at), "%") for at in minutes]
+        found.append([label, *success, cell(column(method, "training_cpu_seconds", minutes[-1]), "s", 0)])
+    change = [column("lcs-rl", "success_rate", at) - column("quick", "success_rate", at) for at in minutes]
+    found.append(["default − quick", *(cell(100 * c, "points", sign="+") for c in change), ""])
     return table(["settings", *(f"{m:g} min of data" for m in minutes), "computing"], found)
 
 
