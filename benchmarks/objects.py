@@ -22,11 +22,11 @@ from typing import Any
 import torch
 import tyro
 
-from difflcs.bench import machine, save
+from difflcs.cli.bench import machine, save
 from difflcs.rl import evaluate, get_method, get_task, method_names
-from difflcs.rl.methods import Method, Work
-from difflcs.rl.model_rollouts import ModelRolloutSettings
-from difflcs.rl.ppo_settings import PPOSettings
+from difflcs.rl.learning.model_rollouts import ModelRolloutSettings
+from difflcs.rl.learning.ppo_settings import PPOSettings
+from difflcs.rl.methods.base import Method, Work
 
 QUICK: dict[str, Any] = {
     "n_lam": 5,

@@ -23,7 +23,7 @@ from torch import Tensor
 from difflcs import GoalCost, LCSMPCLayer
 from difflcs.errors import MissingDependencyError
 from difflcs.physics import PDDrive, PlanarPushing, Polygon, Union, box
-from difflcs.physics.contacts import Contacts
+from difflcs.physics.complementarity import Contacts
 from difflcs.planning import Decision, DiscPlaces, Mode, PlanarTravel, SamplingPolicy, SamplingSettings, Workspace
 
 if TYPE_CHECKING:

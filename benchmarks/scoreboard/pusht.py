@@ -32,7 +32,7 @@ from learn_pusht import learn
 from push_t import CENTER_OF_MASS, GYRATION, PIXELS, STEPS, PushTPolicy, make_env, tee, tee_pushing
 from successes import success_figures
 
-from difflcs.bench import machine, save
+from difflcs.cli.bench import machine, save
 from difflcs.errors import InvalidInputError
 
 
