@@ -169,14 +169,26 @@ def efforts(record: dict) -> str:
 
 def sizes(record: dict) -> str:
     """Share of problems solved, and iterations of one start times the number of starts, by size and horizon."""
-    horizons = sorted({row["horizon"] for row in record["rows"]})
+    shown = [row for row in record["rows"] if not row["family"].endswith("weak")]
+    horizons = sorted({row["horizon"] for row in shown})
     found: dict[str, dict[int, str]] = {}
-    for row in record["rows"]:
+    for row in shown:
         label = f"{row['family']}, n_x {row['n_x']}, n_lam {row['n_lam']}"
         cell = f"{100 * row['solved']:.0f} %, {row['iterations']:.0f} × {row['starts']}"
         found.setdefault(label, {})[row["horizon"]] = cell
     rows = [[label, *(cells.get(h, "") for h in horizons)] for label, cells in found.items()]
     return table(["problems", *(f"H {h}" for h in horizons)], rows)
+
+
+def weak(record: dict) -> str:
+    """Share of problems solved where actions are weak, by horizon, of each backend."""
+    shown = [row for row in record["rows"] if row["family"].endswith("weak")]
+    horizons = sorted({row["horizon"] for row in shown})
+    found: dict[str, list[str]] = {}
+    for row in shown:
+        label = f"{row['family'].split(',')[0]} models, `{row['backend']}`"
+        found.setdefault(label, []).append(f"{100 * row['solved']:.1f} %")
+    return table(["problems", *(f"H {h}" for h in horizons)], [[label, *cells] for label, cells in found.items()])
 
 
 def recipes(record: dict) -> str:
@@ -371,7 +383,7 @@ TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "race": RACE,
     "race_avx512": {"best": best("contact")},
     "optima": {"efforts": efforts},
-    "scale": {"sizes": sizes},
+    "scale": {"sizes": sizes, "weak": weak},
     "training_time": {"recipes": recipes},
     "latency": {"ways": latency},
     "decision": {"ways": decision},
