@@ -234,6 +234,28 @@ def latency(record: dict) -> str:
     return table(["", *robots], rows)
 
 
+def steps(record: dict) -> str:
+    """Times of a step of the controller in Python and in C [µs]."""
+    labels = {
+        "Python, `controller.step`": ("python", "step"),
+        "of it outside the solver": ("python", "rest"),
+        "C, `difflcs_step`": ("c", "step"),
+        "of it in the solver": ("c", "solver"),
+    }
+    names = ("p50", "p99", "largest")
+    rows = [[label, *(number(record[who][part][name]) for name in names)] for label, (who, part) in labels.items()]
+    return table(["", *names], rows)
+
+
+def deadlines(record: dict) -> str:
+    """Squared errors of a closed loop with a deadline, and the share of steps that were not solved."""
+    rows = []
+    for limit, label in (("None", "none"), ("0.0002", "200 µs"), ("0.0001", "100 µs")):
+        found = [record["deadline"][f"{on_failure} {limit}"] for on_failure in ("hold", "unfinished")]
+        rows.append([label, *(f"{row['error']:.0f} ({100 * row['unsolved']:.0f} %)" for row in found)])
+    return table(["deadline of a step", '`"hold"`', '`"unfinished"`'], rows)
+
+
 DECIDES = {
     "PDDM": "PDDM, 700 sequences in three networks",
     "LCS-MPC": "LCS-MPC, `LCSMPCLayer`",
@@ -386,6 +408,7 @@ TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "scale": {"sizes": sizes, "weak": weak},
     "training_time": {"recipes": recipes},
     "latency": {"ways": latency},
+    "controller": {"steps": steps, "deadlines": deadlines},
     "decision": {"ways": decision},
     "physics": {"errors": errors},
     "objects": {"success": objects, "methods": methods},
