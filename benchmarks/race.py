@@ -20,14 +20,13 @@ from pathlib import Path
 import numpy as np
 import torch
 import tyro
-from race_global import global_gaps
-from race_problems import small, with_contact, without_contact
+from race_problems import with_contact, without_contact
 from rivals.problem import Problem
 
 from difflcs import LCSMPCLayer, LCSParams, QuadraticCost
 from difflcs.cli.bench import machine, save
 from difflcs.mpc import kkt
-from difflcs.mpc.backends import BatchedBackend, IpoptBackend
+from difflcs.mpc.backends import BatchedBackend
 from difflcs.mpc.problem import MPCProblem
 from difflcs.mpc.solution import Primal
 
@@ -58,7 +57,6 @@ PLAIN = {"bound_relax_factor": 0.0}
 TUNED = {"tol": 1e-6, "mu_init": 1e-4, "bound_relax_factor": 0.0}
 TUNED |= {"fast_step_computation": "yes", "mumps_pivot_order": 0}
 ADAPTIVE = {**TUNED, "mu_strategy": "adaptive"}
-POUNCE = {"tol": 1e-6, "mu_init": 1e-4}
 CONTACT = (
     Entry("difflcs `batched`", "layer"),
     Entry("difflcs `ipopt`", "layer", {"backend": "ipopt"}),
@@ -67,16 +65,12 @@ CONTACT = (
     Entry("IPOPT, tuned, adaptive", "ipopt", {"start": 0.1, "options": ADAPTIVE}),
     Entry("FATROP, λ = 1", "fatrop", {"start": 1.0}),
     Entry("FATROP, tuned", "fatrop", {"start": 0.1, "options": {"tol": 1e-5, "mu_init": 1e-2, "max_iter": 1000}}),
-    Entry("POUNCE, tuned", "pounce", {"start": 0.1, "options": POUNCE}, "rivals", ("pounce-solver", "casadi")),
-    Entry("pympcc", "pympcc", {}, "rivals", ("pympcc", "cyipopt-wheels")),
 )
 LINEAR = (
     Entry("difflcs `batched`", "layer"),
     Entry("DAQP", "daqp_qp", {}, "rivals", ("daqp",)),
     Entry("acados (HPIPM)", "acados_ocp", {}, "acados", ("comma-deps-acados", "numpy")),
     Entry("Clarabel", "clarabel_qp", {}, "rivals", ("clarabel", "scipy")),
-    Entry("Moreau, active set", "moreau_qp", {"solver": "active_set"}, "rivals", ("moreau",)),
-    Entry("Moreau, interior point", "moreau_qp", {"solver": "ipm"}, "rivals"),
     Entry("qpax", "qpax_qp", {}, "rivals", ("qpax",)),
     Entry("mpc.pytorch", "mpc_pytorch", {}, "mpc", ("torch==2.13.0", "mpc")),
     Entry("cvxpylayers", "cvxpylayers_qp"),
@@ -93,21 +87,17 @@ class Options:
     """Problems of an entry with contact that are solved in one call, by who can."""
     linear_batch: int = 32
     """The same without contact."""
-    small_problems: int = 4
-    """Problems of an entry of the comparison with global optima."""
     seeds: int = 3
     """Models, or seeds of initial states, of a family."""
     rounds: int = 2
     """How often everybody solves everything, taking turns; the shortest time of each problem counts."""
     seconds: float = 1.0
     """CPU seconds of a rival for an entry and round; after at least two problems it stops there."""
-    nodes: int = 20_000
-    """Quadratic programs of a branch and bound before it gives up."""
     venvs: Path = Path("/tmp/difflcs-race")
     """Where the environments of the rivals are."""
     install: bool = False
     """Make these environments, from the package index, and end."""
-    parts: tuple[str, ...] = ("contact", "linear", "global")
+    parts: tuple[str, ...] = ("contact", "linear")
     """What to run; the others stay as they are in the file."""
     out: Path = Path("benchmarks/results/race.json")
     """Where the JSON goes."""
@@ -400,7 +390,8 @@ def race(name: str, o: Options) -> Iterator[tuple[str, object]]:
         families = {}
         for family, members in problems.items():
             families[family] = summary([run(problem, processes, o, folder) for problem in members])
-            show(family, families[family])
+            for label, row in families[family].items():
+                print(f"{family:20s} {label:24s} {row.get('error') or row['ratio'][0]}", flush=True)
         differences = {family: finite_differences(members[0]) for family, members in problems.items()}
         for process in processes:
             process.close()
@@ -411,75 +402,19 @@ def race(name: str, o: Options) -> Iterator[tuple[str, object]]:
     yield f"{name}, missing", {p.entry.label: p.missing for p in processes if p.missing}
 
 
-def show(family: str, table: dict[str, dict]) -> None:
-    """A family as text."""
-    print(family)
-    for label, row in table.items():
-        if "error" in row:
-            print(f"  {label:24s} failed: {row['error']}", flush=True)
-            continue
-        mean, low, high = row["ratio"]
-        gap = "" if row["mean gap"] is None else f"gap {100 * row['mean gap']:7.3f} %  near {100 * row['near']:3.0f} %"
-        error = "" if row["gradient error"] is None else f"gradient {row['gradient error']:.0e}"
-        batch = f"  in a batch {1e6 * row['batch']:.0f} µs" if "batch" in row else ""
-        print(
-            f"  {label:24s} {1e6 * row['seconds']:9.0f} µs  {mean:7.2f}× ({low:.2f} … {high:.2f})  "
-            f"solved {row['solved']}/{row['of']}  {gap}  {error}{batch}",
-            flush=True,
-        )
-
-
-def globally(o: Options) -> dict[str, dict]:
-    """Our plans on small problems against global optima with hard contact."""
-    branch = Entry("branch and bound", "global_optimum", {"nodes": o.nodes}, "rivals", ("daqp",))
-    backends = {
-        "`batched`": BatchedBackend(),
-        "`best`": BatchedBackend(effort="best"),
-        "`ipopt`": IpoptBackend(workers=1),
-    }
-    ours = {
-        name: lambda problem, backend=backend: backend.solve(as_mpc(problem), None).primal.u
-        for name, backend in backends.items()
-    }
-    with tempfile.TemporaryDirectory() as folder:
-        (process,) = start((branch,), o.venvs, folder)
-        if process.missing:
-            return {"missing": {"error": process.missing}}
-
-        def optimum(problem: Problem) -> dict:
-            path = f"{folder}/{len(os.listdir(folder))}.npz"
-            problem.save(path)
-            job = {"problem": path, "out": f"{folder}/answer.npz", "few": problem.count}
-            answer = process.ask(**job, seconds=1e9)
-            if "error" not in answer:
-                with np.load(job["out"]) as file:
-                    answer |= dict(file)
-            return answer
-
-        found = global_gaps(small(o.small_problems, o.seeds), optimum, ours, as_mpc)
-        process.close()
-    return found
-
-
 def main(o: Options) -> None:
     """Race, print, write."""
     if o.install:
         install(o.venvs)
         return
     if o.smoke:
-        o.problems, o.batch, o.linear_batch, o.small_problems, o.seeds, o.rounds, o.nodes = 2, 3, 3, 1, 1, 1, 300
+        o.problems, o.batch, o.linear_batch, o.seeds, o.rounds = 2, 3, 3, 1, 1
     torch.set_num_threads(1)
-    options = {
-        n: getattr(o, n) for n in ("problems", "batch", "linear_batch", "small_problems", "seeds", "rounds", "nodes")
-    }
+    options = {n: getattr(o, n) for n in ("problems", "batch", "linear_batch", "seeds", "rounds")}
     results = json.loads(o.out.read_text())["results"] if o.out.exists() else {}
     for name in o.parts:
-        if name == "global":
-            results["global"] = globally(o)
-        else:
-            results |= dict(race(name, o))
-        record = {"machine": machine(), "options": options, "results": results}
-        save(o.out, record)
+        results |= dict(race(name, o))
+        save(o.out, {"machine": machine(), "options": options, "results": results})
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from difflcs import LCSMPCLayer, LCSParams, QuadraticCost
 from difflcs.mpc.backends import BatchedBackend, IpoptBackend
 from rivals.problem import Answer, Problem, Rival
 
-BACKENDS = {"batched": BatchedBackend, "ipopt": IpoptBackend}
+BACKENDS = {"batched": BatchedBackend(threads=1), "ipopt": IpoptBackend(workers=1)}
 
 
 def version() -> str:
@@ -24,15 +24,13 @@ class Solver(Rival):
     Args:
         problem: what is to be solved.
         backend: "batched" or "ipopt".
-        options: of the backend.
     """
 
-    def __init__(self, problem: Problem, backend: str = "batched", options: dict | None = None):
+    def __init__(self, problem: Problem, backend: str = "batched"):
         super().__init__(problem)
         torch.set_num_threads(1)
         self.batches = self.differentiates = backend == "batched"
-        threads = {"threads": 1} if backend == "batched" else {"workers": 1}
-        self.backend = BACKENDS[backend](**threads, **(options or {}))
+        self.backend = BACKENDS[backend]
         self.parts = [self._layer(i) for i in range(problem.count)]
         self.whole = self._layer(None)
 

@@ -17,16 +17,11 @@ def version() -> str:
 
 
 class Solver(Rival):
-    """Its `MPC` with a linear system, in float64.
-
-    Args:
-        problem: what is to be solved.
-        iterations: most iterations of iLQR.
-    """
+    """Its `MPC` with a linear system, in float64."""
 
     batches = differentiates = True
 
-    def __init__(self, problem: Problem, iterations: int = 30):
+    def __init__(self, problem: Problem):
         super().__init__(problem)
         torch.set_num_threads(1)
         torch.set_default_dtype(torch.float64)
@@ -39,14 +34,14 @@ class Solver(Rival):
         F = np.tile(np.concatenate([p.A, p.B], 1), (p.horizon, 1, 1))
         f = np.tile(p.d, (p.horizon, 1))
         self.data = [torch.from_numpy(v) for v in (C, c, F, f)]
-        self.iterations, self.x0 = iterations, torch.from_numpy(p.x0)
+        self.x0 = torch.from_numpy(p.x0)
 
     def _plan(self, x0: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         p, batch = self.problem, len(x0)
         C, c, F, f = (v.unsqueeze(1).expand(-1, batch, *v.shape[1:]).contiguous() for v in self.data)
         low, high = (torch.from_numpy(v).expand(p.horizon + 1, batch, -1).contiguous() for v in (p.u_min, p.u_max))
         solver = mpc.MPC(
-            p.n_x, p.n_u, p.horizon + 1, u_lower=low, u_upper=high, lqr_iter=self.iterations, verbose=-1,
+            p.n_x, p.n_u, p.horizon + 1, u_lower=low, u_upper=high, lqr_iter=30, verbose=-1,
             n_batch=batch, exit_unconverged=False, detach_unconverged=False, eps=1e-8,
         )  # fmt: skip
         _, u, _ = solver(x0, mpc.QuadCost(C, c), mpc.LinDx(F, f))
