@@ -657,6 +657,43 @@ def test_table1_shows_ours_beside_the_paper(results, capsys):
     assert f"LCS-RL, our recipe, at the end against {deployed}" in markdown
 
 
+def test_numbers_by_hand_stand_in_the_other_tables(results, capsys):
+    for seed in range(3):
+        adam, none = (Unit("cube", *units.ABLATED[name], seed) for name in ("adam", "no-warm-up"))
+        records.add(results, "paper", unit_rows(adam, (0, 40, 40, 60 + 10 * seed)))
+        records.add(results, "paper", unit_rows(none, (0, 40, 60 + 10 * seed, 50)))
+        for recipe, mass, end in (("paper", 0.05, 20), ("light", 0.01, 60 + seed)):
+            rows = unit_rows(Unit("mug", "lcs-rl", recipe, seed), (0, 10, 20, end), version="2")
+            records.add(results, "paper", rows.assign(mass=mass))
+    for script in (ablations, fig_learning_curves, fig_transfer, masses):
+        assert run_script(script.main, capsys, "--results", results)[0] == 0
+    (line,) = cells_of(results / "ablations.md", "with Adam")
+    assert line[3:] == ["70.0 [60.0, 80.0]", "−20.0 [−30.0, −10.0]", "0.250", "−10.0 [−10.0, −10.0]", "0.250"]
+    (line,) = (row for row in cells_of(results / "fig_learning_curves.md", "violation only") if row[1].startswith("+"))
+    ends = ["+0.0 [+0.0, +0.0]", "1.000", "+20.0 [+20.0, +20.0]", "0.250", "+60.0 [+60.0, +60.0]", "0.250"]
+    assert line[1:] == ends
+    said = "LCS-RL, our recipe, the lowest of 3 seeds: 6 min 40.0 %, 10 min 50.0 %, final 70.0 %."
+    assert said in (results / "fig_learning_curves.md").read_text()
+    success, apart = cells_of(results / "fig_transfer.md", "mug")[:2]
+    assert success[1] == "30.0 [30.0, 30.0]"  # the cube's model without any data
+    assert success[4:] == ["50.0 [40.0, 60.0]", "60.0 [60.0, 60.0]", "80.0 [70.0, 90.0]", "89.0 [79.0, 99.0]"]
+    assert apart[3:] == ["+10.0 [+0.0, +20.0]", "0.500", "+9.0 [+9.0, +9.0]", "0.250"]  # 6 min, final
+    (line,) = cells_of(results / "masses.md", "mug")
+    assert [cell.split(" ")[0] for cell in line[-3:]] == ["20.0", "61.0", "44.6"]
+    assert (
+        "At 50 g, LCS-RL at the end against the paper's mean: worse on 1 (mug)" in (results / "masses.md").read_text()
+    )
+
+
+def test_over_all_objects_the_middle_half_counts(tmp_path, capsys):
+    for task, value in zip(OBJECTS, (0, 50, 60, 60, 70, 100), strict=True):
+        for seed in range(2):
+            records.add(tmp_path, "paper", unit_rows(Unit(task, "lcs-rl", "ours", seed), (0, 0, 0, value)))
+    assert run_script(table1.main, capsys, "--results", tmp_path)[0] == 0
+    success = cells_of(tmp_path / "table1.md", "all six")[0]
+    assert success[7] == "60.0 [60.0, 60.0]"  # not 56.7, the mean
+
+
 def test_few_seeds_are_not_compared_with_the_paper(results, capsys):
     for seed in range(2):
         records.add(results, "paper", unit_rows(Unit("clamp", "lcs-rl", "ours", seed), (0, 90, 90, 90)))
