@@ -24,7 +24,6 @@ FOLDER = Path(__file__).parents[2] / "reproduce"
 sys.path.insert(0, str(FOLDER))
 
 import ablations  # noqa: E402
-import cross_check  # noqa: E402
 import dask  # noqa: E402
 import deployment  # noqa: E402
 import distributed  # noqa: E402
@@ -864,7 +863,7 @@ def test_readme_is_filled_between_its_marks_only(tmp_path):
 def test_the_tracked_readme_and_tables_are_those_of_the_tracked_results(tmp_path, monkeypatch, capsys):
     scripts = {
         "table1": table1, "fig_learning_curves": fig_learning_curves, "fig_transfer": fig_transfer,
-        "ablations": ablations, "small_models": small_models, "robustness": robustness, "cross_check": cross_check,
+        "ablations": ablations, "small_models": small_models, "robustness": robustness,
         "masses": masses,
     }  # fmt: skip
     text, tracked = (FOLDER / "README.md").read_text(), records.RESULTS
@@ -890,7 +889,7 @@ def test_the_tracked_readme_and_tables_are_those_of_the_tracked_results(tmp_path
     assert readme.read_text() == text, "run the scripts of reproduce/ to bring README.md up to date"
 
 
-# --- other systems, other simulators ----------------------------------------------------------------
+# --- other systems ----------------------------------------------------------------
 
 
 def test_robustness_is_resumed_and_refuses_another_record(tmp_path, monkeypatch, one_thread, capsys):
@@ -936,65 +935,6 @@ def test_robustness_changes_what_it_says(monkeypatch):
     robustness.acting(noisy, None, 6, np.random.default_rng(0))(state, goal)
     assert seen[0].std(0)[:3].tolist() == pytest.approx([0.003, 0.003, 0.05], rel=0.1)
     assert not seen[0][:, 3:].any()  # where the tips are, the robot knows
-
-
-PRIOR_WORK = """
-import mujoco
-import numpy as np
-from gym import utils
-from gym.spaces import Box
-from difflcs.rl import get_task
-
-class TriFingerQuasiStaticGroundEnv(utils.EzPickle):
-    box = Box(-1.0, 1.0, (6,), np.float64)
-    def __init__(self):
-        self.inner = get_task("cube").make_env().unwrapped
-        self.goal = np.zeros(3)
-    def reset(self):
-        state = np.random.uniform(-0.004, 0.004, 9)
-        observation, _ = self.inner.reset(seed=int(np.random.randint(100)))
-        self.state = observation["state"]
-        body = "<body><joint/><geom size='1'/></body>"
-        model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
-        data = mujoco.MjData(model)
-        mujoco.mj_forward(model, data)
-        matrix = np.zeros((1, 1))
-        mujoco.mj_fullM(model, matrix, data.qM)
-        assert matrix[0, 0] > 0
-    def set_cube_target(self, position, angle):
-        goal = np.array([*position, angle])
-        self.inner.reset(seed=0, options={"goal": goal, "state": self.state})
-    def get_stateinfo(self):
-        return {"state": self.state}
-    def step(self, action):
-        self.state = self.inner.step(action)[0]["state"]
-"""
-
-
-def test_the_cross_check_plays_the_same_episodes(tmp_path, monkeypatch, capsys, one_thread):
-    file = tmp_path / "checkout" / "env" / "gym_env" / "trifinger_quasistaic_ground_continuous.py"
-    file.parent.mkdir(parents=True)
-    for folder in (file.parent, file.parents[1]):
-        (folder / "__init__.py").touch()
-    file.write_text(PRIOR_WORK)
-    with monkeypatch.context() as patch:
-        for name in ("gym", "gym.utils", "gym.spaces", "gym.error", "env", "env.gym_env", cross_check.MODULE):
-            patch.setitem(sys.modules, name, None)
-            sys.modules.pop(name)
-        options = cross_check.Options(tmp_path / "checkout", (Path("zoo:trifinger-cube"),), 2, results=tmp_path)
-        assert cross_check.draw_record(options) == 0
-    (row,) = json.loads((tmp_path / "cross_check.json").read_text())["results"]
-    assert row["theirs"] == row["ours"]
-    assert len(row["ours"]) == 2
-    assert row["tips_rms"] == row["cube_median"] == 0  # here their simulator is ours
-    markdown = (tmp_path / "cross_check.md").read_text()
-    assert "2 goals (seed 0), each from the same start" in markdown
-    assert cross_check.draw_record(replace(options, checkout=None)) == 0  # from the record
-    assert (tmp_path / "cross_check.md").read_text() == markdown
-    with pytest.raises(InvalidInputError, match="clone the prior work"):
-        cross_check.prior_environment(tmp_path)
-    with pytest.raises(CheckpointError, match="make it with --checkout"):
-        cross_check.draw_record(cross_check.Options(results=tmp_path / "empty"))
 
 
 def test_a_small_model_beside_networks(results, capsys):
