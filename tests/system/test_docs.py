@@ -162,9 +162,10 @@ def test_the_quick_settings_are_those_that_were_measured(monkeypatch):
     import objects
 
     from difflcs import cli
+    from difflcs.cli.train import Train
 
     asked = []
-    monkeypatch.setattr(cli.Train, "run", lambda command: asked.append(command))
+    monkeypatch.setattr(Train, "run", lambda command: asked.append(command))
     page = [code.replace("\\\n", " ") for code in blocks(DOCS / "training.md", "bash")]
     commands = [code for code in page if "--models.rollouts" in code]
     assert len(commands) == 1
