@@ -20,13 +20,14 @@ from pathlib import Path
 import numpy as np
 import torch
 import tyro
-from race_problems import with_contact, without_contact
+from race_global import global_gaps
+from race_problems import small, with_contact, without_contact
 from rivals.problem import Problem
 
 from difflcs import LCSMPCLayer, LCSParams, QuadraticCost
 from difflcs.cli.bench import machine, save
 from difflcs.mpc import kkt
-from difflcs.mpc.backends import BatchedBackend
+from difflcs.mpc.backends import BatchedBackend, IpoptBackend
 from difflcs.mpc.problem import MPCProblem
 from difflcs.mpc.solution import Primal
 
@@ -87,17 +88,21 @@ class Options:
     """Problems of an entry with contact that are solved in one call, by who can."""
     linear_batch: int = 32
     """The same without contact."""
+    small_problems: int = 4
+    """Problems of an entry of the comparison with global optima."""
     seeds: int = 3
     """Models, or seeds of initial states, of a family."""
     rounds: int = 2
     """How often everybody solves everything, taking turns; the shortest time of each problem counts."""
     seconds: float = 1.0
     """CPU seconds of a rival for an entry and round; after at least two problems it stops there."""
+    nodes: int = 20_000
+    """Quadratic programs of a branch and bound before it gives up."""
     venvs: Path = Path("/tmp/difflcs-race")
     """Where the environments of the rivals are."""
     install: bool = False
     """Make these environments, from the package index, and end."""
-    parts: tuple[str, ...] = ("contact", "linear")
+    parts: tuple[str, ...] = ("contact", "linear", "global")
     """What to run; the others stay as they are in the file."""
     out: Path = Path("benchmarks/results/race.json")
     """Where the JSON goes."""
@@ -402,18 +407,51 @@ def race(name: str, o: Options) -> Iterator[tuple[str, object]]:
     yield f"{name}, missing", {p.entry.label: p.missing for p in processes if p.missing}
 
 
+def globally(o: Options) -> dict[str, dict]:
+    """Our plans on small problems against global optima with hard contact."""
+    branch = Entry("branch and bound", "global_optimum", {"nodes": o.nodes}, "rivals", ("daqp",))
+    backends = {
+        "`batched`": BatchedBackend(),
+        "`best`": BatchedBackend(effort="best"),
+        "`ipopt`": IpoptBackend(workers=1),
+    }
+    ours = {
+        name: lambda problem, backend=backend: backend.solve(as_mpc(problem), None).primal.u
+        for name, backend in backends.items()
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        (process,) = start((branch,), o.venvs, folder)
+        if process.missing:
+            return {"missing": {"error": process.missing}}
+
+        def optimum(problem: Problem) -> dict:
+            path = f"{folder}/{len(os.listdir(folder))}.npz"
+            problem.save(path)
+            job = {"problem": path, "out": f"{folder}/answer.npz", "few": problem.count}
+            answer = process.ask(**job, seconds=1e9)
+            if "error" not in answer:
+                with np.load(job["out"]) as file:
+                    answer |= dict(file)
+            return answer
+
+        found = global_gaps(small(o.small_problems, o.seeds), optimum, ours, as_mpc)
+        process.close()
+    return found
+
+
 def main(o: Options) -> None:
     """Race, print, write."""
     if o.install:
         install(o.venvs)
         return
     if o.smoke:
-        o.problems, o.batch, o.linear_batch, o.seeds, o.rounds = 2, 3, 3, 1, 1
+        o.problems, o.batch, o.linear_batch, o.small_problems, o.seeds, o.rounds, o.nodes = 2, 3, 3, 1, 1, 1, 300
     torch.set_num_threads(1)
-    options = {n: getattr(o, n) for n in ("problems", "batch", "linear_batch", "seeds", "rounds")}
+    names = ("problems", "batch", "linear_batch", "small_problems", "seeds", "rounds", "nodes")
+    options = {name: getattr(o, name) for name in names}
     results = json.loads(o.out.read_text())["results"] if o.out.exists() else {}
     for name in o.parts:
-        results |= dict(race(name, o))
+        results |= {"global": globally(o)} if name == "global" else dict(race(name, o))
         save(o.out, {"machine": machine(), "options": options, "results": results})
 
 

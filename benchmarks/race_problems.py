@@ -1,7 +1,8 @@
-"""The problems of the race: with contact, and without."""
+"""The problems of the race: with contact, without, and small enough for a global optimum."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +20,7 @@ from rivals.problem import Problem
 
 from difflcs import LCSModel, LCSParams, QuadraticCost
 from difflcs.cli.bench import pushing_cost
-from difflcs.systems import cart_pole_between_walls
+from difflcs.systems import block_along_wall, cart_pole_between_walls
 
 RELAXATION = 1e-5
 STATES = 77  # what is added to a seed for the states, so that they are not drawn as the models are
@@ -87,3 +88,30 @@ def without_contact(count: int, seeds: int) -> dict[str, list[Problem]]:
         "cart-pole, H 30": [drop(cart_pole(count, 30, 30 + s)) for s in every],
         "carts, n_x 20, H 20": [drop(chain(count, 10, 20, s)) for s in every],
     }
+
+
+def small(count: int, seeds: int) -> Iterator[tuple[str, Problem]]:
+    """Problems whose modes a branch and bound can go through."""
+    for s in range(seeds):
+        yield "cart-pole, H 10 (2^20 modes)", cart_pole(count, 10, 10 + s)
+    for s in range(seeds):
+        yield "pushing, n_lam 5, H 3 (2^15)", pushing(pushing_model(5, s), count, s, horizon=3)
+    for s in range(seeds):
+        yield "pushing, n_lam 5, H 5 (2^25)", pushing(pushing_model(5, s), count, s)
+    for s in range(seeds):
+        yield "pushing, n_lam 8, H 5 (2^40)", pushing(pushing_model(8, s), count, s)
+    for s in range(seeds):
+        yield "block along a wall, H 4 (2^20)", block(count, 4, s)
+
+
+def block(count: int, horizon: int, seed: int) -> Problem:
+    """Push the block 5 cm along the wall."""
+    weight = torch.diag(torch.tensor([100.0, 10.0, 0.0, 0.0], dtype=torch.float64))
+    q = torch.tensor([-5.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    eye = torch.eye(2, dtype=torch.float64)
+    missed = torch.tensor(0.5 * 100.0 * 0.05**2 * (horizon + 10), dtype=torch.float64)
+    cost = QuadraticCost(Q=weight, R=eye, Q_final=10 * weight, q=q, q_final=10 * q, constant=missed)
+    x0 = uniform([0.02, 0.01, 0.02, 0.02], count, seed + STATES)
+    x0[:, 1] = x0[:, 1].abs()
+    x0[:, 2] -= 0.04
+    return problem(block_along_wall(), cost, x0, horizon, 0.05, seed)

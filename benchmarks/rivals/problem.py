@@ -81,6 +81,10 @@ class Problem:
         matrix = name in ("A", "B", "C", "D", "E", "F", "Q", "R", "Q_final")
         return value if value.ndim == (2 if matrix else 1) else value[i]
 
+    def only(self, i: int) -> dict[str, np.ndarray]:
+        """All fields of one problem by name."""
+        return {f.name: self.at(i, f.name) for f in fields(self) if f.name not in ("horizon", "relaxation", "constant")}
+
 
 @dataclass
 class Answer:
