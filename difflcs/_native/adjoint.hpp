@@ -39,9 +39,9 @@ struct Sink {
 template <class T, class S>
 class Adjoint {
   static constexpr int64_t kX = S::kX, kU = S::kU, kL = S::kL, kW = S::kW;
-  using Lu = Elimination<S::kPivot>;
   const MpcBatch& batch;
   const S n;
+  const Elimination<kL == 0> lu;
   Problem<T, S> problem;
   Riccati<T, S, true> riccati;
   Trajectory<S> at;
@@ -54,7 +54,7 @@ class Adjoint {
   Vec *gap, *dw, *dx_next, *dlam, *ds, *dp, *dy, *rho, *drho;
 
  public:
-  Adjoint(const MpcBatch& b, void* memory) : batch(b), n(b), problem(b, true), riccati(problem) { layout(memory); }
+  Adjoint(const MpcBatch& b, void* memory) : batch(b), n(b), lu{b.pivot}, problem(b, true), riccati(problem) { layout(memory); }
 
   // Lays the arrays out in `memory`, or only counts them where it is null.
   int64_t layout(void* memory) {
@@ -289,7 +289,7 @@ class Adjoint {
       for (int64_t j = 0; j < nl; j++) t -= F(j, i) * (y[j] * dlam[j]);
       dy[i] = t;
     }
-    Lu::solve_transposed(nl, stage.M.entries, stage.rows, dy);
+    lu.solve_transposed(nl, stage.M.entries, stage.rows, dy);
     for (int64_t i = 0; i < nl; i++) {
       dy[i] *= stage.size[i];
       rho[i] = y[i] * lam[i];

@@ -12,10 +12,10 @@ namespace difflcs::DIFFLCS_ISA {
 namespace {
 
 // T is the type of a matrix entry: double where the batch shares all matrices, else Vec.
-template <class T, class S>
+template <class T>
 struct Certificate {
   const MpcBatch& batch;
-  const S n;
+  const AnySizes n;
   Steps<T> matrix[kInputs];    // as the caller gave them: matrices here,
   Steps<Vec> vector[kInputs];  // vectors here
   Steps<T> rest;

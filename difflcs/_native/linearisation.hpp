@@ -22,9 +22,9 @@ struct Stage {
 template <class T, class S>
 class Linearisation {
   static constexpr int64_t kX = S::kX, kL = S::kL, kW = S::kW;
-  using Lu = Elimination<S::kPivot>;
   const Problem<T, S>& problem;
   const S n;
+  const Elimination<kL == 0> lu;
   const bool kept;  // every stage is kept; else each takes the place of the one before it, but for K_lam
   Stages<Matrix<Vec, kL, kL>> M;
   Stages<Matrix<Vec, kL, kW>> K_lam, K_s;
@@ -36,7 +36,7 @@ class Linearisation {
   Matrix<Vec, kL, kW> slopes, weighted;
 
  public:
-  Linearisation(const Problem<T, S>& problem, bool kept) : problem(problem), n(problem.n), kept(kept) {}
+  Linearisation(const Problem<T, S>& problem, bool kept) : problem(problem), n(problem.n), lu{problem.batch.pivot}, kept(kept) {}
 
   void layout(Arena& arena) {
     const int64_t nx = n.x(), nl = n.l(), nw = n.w(), count = kept ? n.h : 1;
@@ -81,13 +81,13 @@ class Linearisation {
         for (int64_t j = 0; j < nl; j++) matrix[i * nl + j] = b[by_row ? i : j] * F(i, j);
         matrix[i * nl + i] += a[i];
       }
-      Lu::factor(nl, matrix, exchanged);
+      lu.factor(nl, matrix, exchanged);
     };
     eliminate(left, stage.rows, true);
     for (int64_t i = 0; i < nl * nl; i++) stage.M.entries[i] = left[i];
     // y = (diag(s) + F^T diag(lam))^-1 (-C^T p), from the same factors.
     for (int64_t i = 0; i < nl; i++) stage.y[i] = all(0) - C.column(i) * p;
-    Lu::solve_transposed(nl, stage.M.entries, stage.rows, stage.y);
+    lu.solve_transposed(nl, stage.M.entries, stage.rows, stage.y);
     // Since a dlam + b ds = 0, both follow from one T: K_lam = b T, K_s = -a T with (diag(a) + F diag(b)) T = -[D E].
     eliminate(right, right_rows, false);
     by_columns(0, nw, [&](int64_t j, auto kind) {
@@ -95,7 +95,7 @@ class Linearisation {
       Local<kL, V> t(column);
       DIFFLCS_UNROLL
       for (int64_t i = 0; i < nl; i++) t[i] = V{} - read<V>(data.DE[i], j);
-      Lu::solve(nl, right, right_rows, t);
+      lu.solve(nl, right, right_rows, t);
       DIFFLCS_UNROLL
       for (int64_t i = 0; i < nl; i++) {
         write<V>(slopes[i], j, t[i]);

@@ -23,7 +23,6 @@ constexpr bool kShared = std::is_same_v<T, double>;
 template <int X, int U, int L>
 struct Sizes {
   static constexpr int64_t kX = X, kU = U, kL = L, kW = X && U ? X + U : 0;
-  static constexpr bool kPivot = false;
   int64_t rx, ru, rl, rc, h;
   explicit Sizes(const MpcBatch& b) : rx(b.n_x), ru(b.n_u), rl(b.n_lam), rc(b.n_c), h(b.horizon) {}
   int64_t x() const { return X ? X : rx; }
@@ -33,11 +32,7 @@ struct Sizes {
   int64_t c() const { return rc; }
 };
 
-// Any sizes, and elimination with row exchanges.
-struct Pivoting : Sizes<0, 0, 0> {
-  static constexpr bool kPivot = true;
-  using Sizes::Sizes;
-};
+using AnySizes = Sizes<0, 0, 0>;
 
 inline bool shared_matrices(const MpcBatch& b) {
   bool shared = true;

@@ -59,7 +59,7 @@ class Solver {
   const S n;
   Problem<T, S> problem;
   Riccati<T, S, false> riccati;
-  Certificate<T, S> certificate;
+  Certificate<T> certificate;
   Trajectory<S> at, next;  // the iterate and the trial
   Vec *gap, *newton, *dx, *du;
   Mask* rows;
@@ -82,7 +82,7 @@ class Solver {
   void solve(const MpcSolve& o, int64_t* counter, Watch watch);
 
  private:
-  using Lcp = RelaxedLcp<T, S::kL, S::kPivot>;
+  using Lcp = RelaxedLcp<T, S::kL, S::kL == 0>;
 
   // The problems in the lanes, and how far each has come.
   struct Lane {
@@ -111,7 +111,7 @@ class Solver {
   // lam and s of one stage, from the guess in `lam`; lanes in `skip` keep both.
   void contacts(const StageData<T, S>& data, const Vec* x, const Vec* u, Vec* lam, Vec* s, Mask skip) {
     data.gap(x, u, gap);
-    Lcp(n.l(), data.F.entries, gap, newton, rows).solve(lam, s, eps, skip);
+    Lcp(n.l(), data.F.entries, gap, newton, rows, batch.pivot).solve(lam, s, eps, skip);
   }
 
   // Roll u out at eps in the lanes of `wanted`; returns the cost of every lane.

@@ -11,14 +11,14 @@ struct Variant {
   using T = Entry;
   using S = Sizes;
 };
-using Widest = Variant<Vec, Sizes<0, 0, 0>>;
+using Widest = Variant<Vec, AnySizes>;
 
 // Calls f with the variant that fits.
 template <class Function>
 void dispatch(const MpcBatch& b, Function f) {
   const bool paper = b.n_x == 9 && b.n_u == 6;
   if (b.pivot)
-    f(Variant<Vec, Pivoting>());
+    f(Widest());
   else if (!shared_matrices(b) && paper && b.n_lam == 5)
     f(Variant<Vec, Sizes<9, 6, 5>>());
   else if (!shared_matrices(b) && paper && b.n_lam == 8)
@@ -30,7 +30,7 @@ void dispatch(const MpcBatch& b, Function f) {
   else if (paper && b.n_lam == 8)
     f(Variant<double, Sizes<9, 6, 8>>());
   else
-    f(Variant<double, Sizes<0, 0, 0>>());
+    f(Variant<double, AnySizes>());
 }
 
 }  // namespace
