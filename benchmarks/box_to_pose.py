@@ -24,7 +24,7 @@ import tyro
 from torch import Tensor
 
 from difflcs import GoalCost, LCSMPCLayer
-from difflcs.bench import machine, save
+from difflcs.cli.bench import machine, save
 from difflcs.physics import box
 from difflcs.physics.mujoco import MujocoLCS
 from difflcs.planning import DiscPlaces, PlanarTravel, SamplingPolicy, SamplingSettings

@@ -21,9 +21,9 @@ import torch
 import tyro
 
 from difflcs import LCSModel
-from difflcs.bench import cpu, save
-from difflcs.export import export_controller
+from difflcs.cli.bench import cpu, save
 from difflcs.mpc import MPCController
+from difflcs.mpc.export import export_controller
 from difflcs.rl.tasks import get_task
 
 LIMIT = [-0.05, -0.05, -0.5], [0.05, 0.05, 0.5]

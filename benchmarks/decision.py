@@ -23,10 +23,9 @@ import torch
 import tyro
 from torch import Tensor
 
-from difflcs.bench import machine, save
-from difflcs.rl import Ensemble, get_method, get_task
-from difflcs.rl.pddm import Planner
-from difflcs.zoo import Learned
+from difflcs.cli.bench import machine, save
+from difflcs.rl import Ensemble, TrainedPolicy, get_method, get_task
+from difflcs.rl.learning.pddm import Planner
 
 
 @dataclass
@@ -61,7 +60,7 @@ def states_and_goals(count: int, seed: int) -> tuple[Tensor, Tensor]:
 def ways(o: Options) -> Mapping[str, Callable[[Tensor, Tensor], Any]]:
     """What decides, from one state (9,) and goal (3,)."""
     task, settings = get_task("cube"), get_method("pddm")().pddm  # pyright: ignore[reportAttributeAccessIssue]
-    mpc: Any = Learned.open(o.model).policy
+    mpc: Any = TrainedPolicy.open(o.model).policy
     controller, sizes = mpc.controller(), (settings.ensemble.networks, settings.ensemble.width)
     ensemble = Ensemble(task.n_x, task.n_u, *sizes, torch.Generator().manual_seed(o.seed))
     planner = Planner(ensemble, task.make_cost(), settings, *task.bounds)

@@ -24,12 +24,11 @@ import torch
 import tyro
 from torch import Tensor
 
-from difflcs.bench import machine, save
-from difflcs.rl import collect, get_task, wilson_interval
-from difflcs.rl.delay import late_actions, predicted_by
+from difflcs.cli.bench import machine, save
+from difflcs.rl import TrainedPolicy, collect, get_task, wilson_interval
 from difflcs.rl.rollout import Act, mpc_actions
+from difflcs.rl.runs.delay import late_actions, predicted_by
 from difflcs.rl.seeding import Stream, episode_seeds
-from difflcs.zoo import Learned
 
 
 @dataclass
@@ -93,7 +92,7 @@ def main(o: Options) -> None:
     if o.smoke:
         o.goals, o.envs = 4, 4
     torch.set_num_threads(1)
-    learned = Learned.open(o.model)
+    learned = TrainedPolicy.open(o.model)
     task, policy = get_task(learned.task), learned.policy
     predict = predicted_by(policy.lcs)  # pyright: ignore[reportAttributeAccessIssue]
     ways: dict[str, Callable[[Act], Act]] = {

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from difflcs import LCSModel, LCSMPCLayer, LCSParams, MPCSolution, QuadraticCost
 from difflcs._native import _kernels
-from difflcs.bench import ACTION_LIMIT, machine, pushing_cost, save, states_and_goals
+from difflcs.cli.bench import ACTION_LIMIT, machine, pushing_cost, save, states_and_goals
 from difflcs.errors import DegenerateWarning
 from difflcs.mpc.backends import batched
 from difflcs.mpc.solution import Primal

@@ -18,7 +18,7 @@ import tyro
 from models import ACTION_LIMIT, pushing_model, random_model, states_and_goals
 
 from difflcs import LCSMPCLayer, LCSParams
-from difflcs.bench import machine, pushing_cost, save
+from difflcs.cli.bench import machine, pushing_cost, save
 from difflcs.mpc.backends import Backend, BatchedBackend, IpoptBackend
 from difflcs.status import solved
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from difflcs import LCSModel, LCSParams, QuadraticCost
-from difflcs.bench import ACTION_LIMIT, pushing_model, states_and_goals
+from difflcs.cli.bench import ACTION_LIMIT, pushing_model, states_and_goals
 from difflcs.systems import cart_pole_between_walls
 from difflcs_envs.tasks import pushing_cost
 

@@ -21,7 +21,7 @@ import torch
 import tyro
 from trainings import Training
 
-from difflcs.bench import machine, save
+from difflcs.cli.bench import machine, save
 from difflcs.rl import get_method, get_task
 
 

@@ -17,7 +17,7 @@ import tyro
 from models import FAMILIES, Instance
 
 from difflcs import LCSMPCLayer
-from difflcs.bench import machine, save
+from difflcs.cli.bench import machine, save
 from difflcs.mpc.backends import Backend, BatchedBackend
 
 EFFORTS: dict[str, Backend] = {

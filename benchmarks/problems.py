@@ -30,7 +30,7 @@ from difflcs import (
     QuadraticCost,
     StageBounds,
 )
-from difflcs.bench import pushing_cost, save
+from difflcs.cli.bench import pushing_cost, save
 from difflcs.mpc.backends import BatchedBackend
 
 

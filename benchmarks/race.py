@@ -25,7 +25,7 @@ from race_problems import small, with_contact, without_contact
 from rivals.problem import Problem
 
 from difflcs import LCSMPCLayer, LCSParams, QuadraticCost
-from difflcs.bench import machine, save
+from difflcs.cli.bench import machine, save
 from difflcs.mpc import kkt
 from difflcs.mpc.backends import BatchedBackend, IpoptBackend
 from difflcs.mpc.problem import MPCProblem

@@ -21,7 +21,7 @@ import tyro
 from models import cart_states, chain_of_carts, push_the_last_cart, random_model
 
 from difflcs import LCSParams, QuadraticCost
-from difflcs.bench import save
+from difflcs.cli.bench import save
 from difflcs.mpc import MPCProblem
 from difflcs.mpc.backends import BatchedBackend
 

@@ -16,10 +16,10 @@ import torch
 import tyro
 from trainings import Training
 
-from difflcs.bench import machine, save
+from difflcs.cli.bench import machine, save
 from difflcs.rl import get_method, get_task
-from difflcs.rl.model_rollouts import ModelRolloutSettings
-from difflcs.rl.ppo_settings import PPOSettings
+from difflcs.rl.learning.model_rollouts import ModelRolloutSettings
+from difflcs.rl.learning.ppo_settings import PPOSettings
 
 LCS_RL = get_method("lcs-rl")
 QUICK: dict[str, Any] = {

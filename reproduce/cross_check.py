@@ -27,11 +27,11 @@ from stats import wilson
 
 from difflcs._checks import check_positive_int
 from difflcs._files import read_json, write_json
-from difflcs.bench import machine
+from difflcs.cli.bench import machine
 from difflcs.errors import CheckpointError, InvalidInputError, MissingDependencyError
+from difflcs.rl import TrainedPolicy
 from difflcs.rl.rollout import Act, mpc_actions
 from difflcs.rl.tasks import get_task
-from difflcs.zoo import Learned
 
 MODULE = "env.gym_env.trifinger_quasistaic_ground_continuous"
 """Their environment, as they spell it."""
@@ -113,7 +113,7 @@ def compare(options: Options, checkout: Path) -> dict[str, Any]:
 
     rows = []
     for model in options.models:
-        learned = Learned.open(model)
+        learned = TrainedPolicy.open(model)
         if learned.task != spec.name:
             raise InvalidInputError(f"models: expected models of the cube, got one of {learned.task}; pass others")
         rng = np.random.default_rng(options.seed)

@@ -23,13 +23,12 @@ from torch import Tensor
 
 from difflcs._checks import check_positive_int
 from difflcs._files import read_json, write_json
-from difflcs.bench import machine
+from difflcs.cli.bench import machine
 from difflcs.errors import CheckpointError
-from difflcs.rl import TaskSpec, collect, get_task
-from difflcs.rl.delay import late_actions, predicted_by
+from difflcs.rl import TaskSpec, TrainedPolicy, collect, get_task
 from difflcs.rl.rollout import Act, mpc_actions
+from difflcs.rl.runs.delay import late_actions, predicted_by
 from difflcs.rl.seeding import Stream, episode_seeds
-from difflcs.zoo import Learned
 
 NOMINAL = "as in the training"
 
@@ -122,7 +121,7 @@ def measure(condition: Condition, task: TaskSpec, policy: Any, goals: int, seed:
 def compute(options: Options, path: Path, say: Callable[[str], object] = print) -> None:
     """Measure what is missing in the record; it is written after every condition."""
     torch.set_num_threads(1)
-    learned = Learned.open(options.model)
+    learned = TrainedPolicy.open(options.model)
     task, policy = get_task(learned.task), learned.policy
     env: Any = task.make_env().unwrapped
     described = task.describe(env)

@@ -136,7 +136,8 @@ def build() -> type[Build]:
 def registries():
     """What a file registers is gone after it: no other file finds it, in whatever order a process runs them."""
     from difflcs.mpc.backends import base
-    from difflcs.rl import methods, tasks
+    from difflcs.rl import tasks
+    from difflcs.rl.methods import base as methods
 
     tasks.task_names()  # installed packages register theirs once
     with pytest.MonkeyPatch.context() as patch:
@@ -194,7 +195,7 @@ def _wrong_tensors(tensor: Tensor) -> Iterator[Tensor]:
 
 def _hostile(state: Any) -> Iterator[tuple[bool, Any]]:
     """States with one thing wrong; whether it is a tensor, which must be noticed."""
-    from difflcs.rl.state import flatten, unflatten
+    from difflcs.rl.learning.state import flatten, unflatten
 
     tensors, rest = flatten(state)
 
@@ -223,7 +224,7 @@ def _hostile(state: Any) -> Iterator[tuple[bool, Any]]:
 
 def _same_state(a: Any, b: Any) -> bool:
     """Whether two states are the same to the bit."""
-    from difflcs.rl.state import flatten
+    from difflcs.rl.learning.state import flatten
 
     (tensors, rest), (others, other_rest) = flatten(a), flatten(b)
     alike = tensors.keys() == others.keys() and rest == other_rest
@@ -239,7 +240,7 @@ def refuses_hostile_checkpoints() -> Callable[[Any], None]:
     accepted.
     """
     from difflcs.errors import CheckpointError
-    from difflcs.rl.state import copy_state
+    from difflcs.rl.learning.state import copy_state
 
     def check(trainer: Any) -> None:
         trainer.step()

@@ -33,7 +33,7 @@ from successes import success_figures
 
 from difflcs import _files
 from difflcs._checks import check_positive_int
-from difflcs.bench import machine
+from difflcs.cli.bench import machine
 from difflcs.errors import InvalidInputError
 from difflcs.planning.pusht import CENTER_OF_MASS, GYRATION, PIXELS, STEPS, PushTPolicy, make_env, tee, tee_pushing
 

@@ -31,7 +31,7 @@ import tyro
 from successes import success_figures
 
 from difflcs import _files
-from difflcs.bench import machine
+from difflcs.cli.bench import machine
 from difflcs.errors import MissingDependencyError
 
 OWN = "contact-mpc"

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from successes import success_figures
 
 from difflcs import LCSModel, _files
-from difflcs.bench import machine
+from difflcs.cli.bench import machine
 from difflcs.errors import MissingDependencyError
 from difflcs.rl import evaluate, get_task
 from difflcs.rl.seeding import Stream, episode_seeds

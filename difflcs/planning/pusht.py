@@ -23,7 +23,7 @@ from difflcs._checks import check_positive_int
 from difflcs.cost import GoalCost
 from difflcs.errors import MissingDependencyError
 from difflcs.mpc.layer import LCSMPCLayer
-from difflcs.physics.contacts import Contacts
+from difflcs.physics.complementarity import Contacts
 from difflcs.physics.planar import PDDrive, PlanarPushing
 from difflcs.physics.shapes import Polygon, Shape, Union, box
 from difflcs.planning.places import DiscPlaces, Workspace

@@ -48,8 +48,7 @@ from rich.progress import Progress  # noqa: E402
 from units import OBJECTS, Preset, Unit  # noqa: E402
 
 from difflcs.errors import CheckpointError, InvalidInputError  # noqa: E402
-from difflcs.rl import TrainConfig, evaluate, get_method, get_task  # noqa: E402
-from difflcs.zoo import Learned  # noqa: E402
+from difflcs.rl import TrainConfig, TrainedPolicy, evaluate, get_method, get_task  # noqa: E402
 
 TINY = Preset("smoke", seeds=1, goals=2, final_goals=2, evaluate_at=(0.2, 0.5), smoke=True)
 FIRST = units.FIRST_SEED
@@ -874,7 +873,7 @@ def test_robustness_is_resumed_and_refuses_another_record(tmp_path, monkeypatch,
     assert measured[2] == measured[3]  # the one that was interrupted, none of those before
     assert len(measured) == len(set(measured)) + 1
     record = json.loads((tmp_path / "robustness-smoke.json").read_text())
-    nominal = evaluate(get_task("cube").make_envs(2), Learned.open(options.model).policy, 2, 0)
+    nominal = evaluate(get_task("cube").make_envs(2), TrainedPolicy.open(options.model).policy, 2, 0)
     assert record["results"][0]["reached"].count("1") == nominal.successes
     assert (tmp_path / "robustness-smoke.png").is_file()
     assert not (tmp_path / "robustness.json").exists()

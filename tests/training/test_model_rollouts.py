@@ -13,8 +13,8 @@ from tensordict import TensorDict
 
 from difflcs.errors import InvalidInputError
 from difflcs.rl import EnsembleSettings, Epochs, ModelRollouts, ModelRolloutSettings
-from difflcs.rl.dynamics import Ensemble
-from difflcs.rl.model_rollouts import ModelEnv
+from difflcs.rl.learning.dynamics import Ensemble
+from difflcs.rl.learning.model_rollouts import ModelEnv
 from difflcs.rl.rollout import collect, uniform_actions
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -9,9 +9,9 @@ from gymnasium.vector import SyncVectorEnv
 
 from difflcs import GoalCost
 from difflcs.errors import InvalidInputError
-from difflcs.rl.dynamics import Ensemble, EnsembleSettings
-from difflcs.rl.evaluate import evaluate
-from difflcs.rl.pddm import PDDM, PDDMSettings, Planner
+from difflcs.rl.learning.dynamics import Ensemble, EnsembleSettings
+from difflcs.rl.learning.pddm import PDDM, PDDMSettings, Planner
+from difflcs.rl.runs.evaluate import evaluate
 from difflcs.rl.settings import Epochs, Rollouts
 from tests.training.slide import STEPS, U_MAX, Slide, make_envs
 

@@ -25,9 +25,9 @@ from difflcs import (
     Status,
 )
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
-from difflcs.export import export_controller
 from difflcs.mpc import MPCController
 from difflcs.mpc.backends import BatchedBackend
+from difflcs.mpc.export import export_controller
 
 H = 5
 

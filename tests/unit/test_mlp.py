@@ -7,12 +7,12 @@ import torch
 from gymnasium.vector import SyncVectorEnv
 
 pytest.importorskip("torchrl")
-from difflcs.rl.critic import CriticSettings
-from difflcs.rl.evaluate import evaluate
+from difflcs.rl.learning.critic import CriticSettings
+from difflcs.rl.learning.mlp import MLPController
+from difflcs.rl.learning.policy import make_actor
+from difflcs.rl.learning.ppo_settings import make_ppo
 from difflcs.rl.methods import get_method
-from difflcs.rl.mlp import MLPController
-from difflcs.rl.policy import make_actor
-from difflcs.rl.ppo_settings import make_ppo
+from difflcs.rl.runs.evaluate import evaluate
 from difflcs.rl.settings import Adam, Epochs
 from tests.training.slide import STEPS, U_MAX, Slide, features
 

@@ -27,7 +27,7 @@ from difflcs.physics import (
     box,
     contact_lcs,
 )
-from difflcs.physics.contact import LEARNABLE
+from difflcs.physics.learnable import LEARNABLE
 
 F64 = torch.float64
 pytestmark = pytest.mark.usefixtures("one_thread")
