@@ -16,21 +16,21 @@ void mpc_solve(const MpcBatch&, const MpcSolve&, int64_t*, void*, Watch);
 #define DIFFLCS_ALONE mpc_solve
 #endif
 
-#define DIFFLCS_KERNELS(ISA, LANES, ALONE)                                                                            \
-  namespace ISA {                                                                                                     \
-  int64_t lcp_workspace(int64_t);                                                                                     \
-  void lcp_solve(const LcpBatch&, int64_t, int64_t, void*, Watch);                                                    \
-  int64_t mpc_workspace(const MpcBatch&);                                                                             \
-  void mpc_solve(const MpcBatch&, const MpcSolve&, int64_t*, void*, Watch);                                           \
-  void mpc_constraints(const MpcBatch&, const MpcSolve&, int64_t, int64_t, void*, Watch);                             \
-  void mpc_vjp(const MpcBatch&, const MpcGradient&, int64_t, int64_t, int64_t, void*, Watch);                         \
-  int64_t violation_workspace(const ViolationBatch&);                                                                 \
-  bool violation_qp(const ViolationBatch&, double*, double*, void*);                                                  \
-  bool violation_value(const ViolationBatch&, const double*, double*, void*);                                         \
-  void violation_gradient(const ViolationBatch&, const double*, const double*, double* const*, void*);                \
-  static const Kernels table = {                                                                                      \
-      #ISA,    LANES, lcp_workspace,   lcp_solve, mpc_workspace,       mpc_solve,                                     \
-      ALONE,   mpc_constraints, mpc_vjp, violation_workspace, violation_qp, violation_value, violation_gradient};     \
+#define DIFFLCS_KERNELS(ISA, LANES, ALONE)                                                                        \
+  namespace ISA {                                                                                                 \
+  int64_t lcp_workspace(int64_t);                                                                                 \
+  void lcp_solve(const LcpBatch&, int64_t, int64_t, void*, Watch);                                                \
+  int64_t mpc_workspace(const MpcBatch&);                                                                         \
+  void mpc_solve(const MpcBatch&, const MpcSolve&, int64_t*, void*, Watch);                                       \
+  void mpc_constraints(const MpcBatch&, const MpcSolve&, int64_t, int64_t, void*, Watch);                         \
+  void mpc_vjp(const MpcBatch&, const MpcGradient&, int64_t, int64_t, int64_t, void*, Watch);                     \
+  int64_t violation_workspace(const ViolationBatch&);                                                             \
+  bool violation_qp(const ViolationBatch&, double*, double*, void*);                                              \
+  bool violation_value(const ViolationBatch&, const double*, double*, void*);                                     \
+  void violation_gradient(const ViolationBatch&, const double*, const double*, double* const*, void*);            \
+  static const Kernels table = {#ISA,         LANES,           lcp_workspace,     lcp_solve, mpc_workspace,       \
+                                mpc_solve,    ALONE,           mpc_constraints,   mpc_vjp,   violation_workspace, \
+                                violation_qp, violation_value, violation_gradient};                               \
   }
 
 #ifdef DIFFLCS_LANES_baseline

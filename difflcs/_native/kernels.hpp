@@ -32,11 +32,9 @@ struct LcpBatch {
 constexpr int64_t kAloneExact = 64, kAloneRelaxed = 128;
 
 // What the numbers of a solved LCP have to meet; difflcs.lcp.solve_lcp states it.
-constexpr double kLcpTerms = 1e-10;       // |F lam + q - w| in parts of the terms that sum to it
-constexpr double kLcpData = 1e-8;         // the same in parts of the largest |q| (and of sqrt(relaxation F_ii))
-constexpr double kRounding = 4e-16;       // of a sum, in parts of its terms
-constexpr double kHuge = 1e300;           // beyond it a bound is infinite
-constexpr double kAtPrice = 1.0 - 1e-12;  // a multiplier above this part of its price is the price, but for rounding
+constexpr double kLcpTerms = 1e-10;  // |F lam + q - w| in parts of the terms that sum to it
+constexpr double kLcpData = 1e-8;    // the same in parts of the largest |q| (and of sqrt(relaxation F_ii))
+constexpr double kHuge = 1e300;      // beyond it a bound is infinite
 constexpr double kSmallest = 1e-100, kLargest = 1e150;  // range of the diagonal of F; of lam and w
 
 // A batch of LCS-MPC problems (see difflcs.mpc.MPCProblem). All arrays are row-major with the batch in front.
@@ -98,9 +96,6 @@ struct MpcGradient {
   int64_t shared_size;
   int64_t offset[kInputs];  // position of each shared input inside a partial sum
 };
-
-// Least gamma sigma_min(F + F^T), in parts of n_lam times the largest diagonal entry of F^T F (difflcs.losses).
-constexpr double kGammaLeast = 4e-13;
 
 // The violation loss of a batch: |r|^2 / 2 + (lam . phi + |e|^2 / (2 gamma)) / xi at the z = (lam, phi) >= 0 that
 // minimises it, with r = A x + B u + C lam + d - x_next and e = D x + E u + F lam + c - phi.

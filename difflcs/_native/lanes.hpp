@@ -69,6 +69,8 @@ static inline void put(Vec* to, int64_t at, int lane, double value) {
 
 // A function that is handed such an array has to become part of its caller.
 #define DIFFLCS_INLINE __attribute__((always_inline)) inline
+// One that is called from several places, where a copy in each would only take longer to compile.
+#define DIFFLCS_NOINLINE __attribute__((noinline))
 
 // A small array for unrolled loops: on the stack where the size is known when compiling, else in the scratch given.
 template <int64_t N, class V = Vec>

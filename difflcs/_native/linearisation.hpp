@@ -36,15 +36,27 @@ class Linearisation {
   Matrix<Vec, kL, kW> slopes, weighted;
 
  public:
-  Linearisation(const Problem<T, S>& problem, bool kept) : problem(problem), n(problem.n), lu{problem.batch.pivot}, kept(kept) {}
+  Linearisation(const Problem<T, S>& problem, bool kept)
+      : problem(problem), n(problem.n), lu{problem.batch.pivot}, kept(kept) {}
 
   void layout(Arena& arena) {
     const int64_t nx = n.x(), nl = n.l(), nw = n.w(), count = kept ? n.h : 1;
-    arena.take(M, count, nl, nl), arena.take(K_lam, n.h, nl, nw), arena.take(A_hat, count, nx, nw);
-    arena.take(K_s, kept ? count : 0, nl, nw), arena.take(size, count, nl), arena.take(y, count, nl);
-    arena.take(rows, count * nl), arena.take(right_rows, nl), arena.take(a, nl), arena.take(b, nl),
-        arena.take(right_factors, nl * nl), arena.take(bend, nl), arena.take(damped, nl);
-    arena.take(column, nl * kColumns), arena.take(slopes, nl, nw), arena.take(weighted, nl, nw);
+    arena.take(M, count, nl, nl);
+    arena.take(K_lam, n.h, nl, nw);
+    arena.take(A_hat, count, nx, nw);
+    arena.take(K_s, kept ? count : 0, nl, nw);
+    arena.take(size, count, nl);
+    arena.take(y, count, nl);
+    arena.take(rows, count * nl);
+    arena.take(right_rows, nl);
+    arena.take(a, nl);
+    arena.take(b, nl);
+    arena.take(right_factors, nl * nl);
+    arena.take(bend, nl);
+    arena.take(damped, nl);
+    arena.take(column, nl * kColumns);
+    arena.take(slopes, nl, nw);
+    arena.take(weighted, nl, nw);
   }
 
   Stage<S> stage(int64_t k) const {
@@ -70,7 +82,8 @@ class Linearisation {
     const auto C = data.C;
     for (int64_t i = 0; i < nl; i++) {
       stage.size[i] = 1.0 / (lam[i] + s[i]);
-      a[i] = s[i] * stage.size[i], b[i] = lam[i] * stage.size[i];
+      a[i] = s[i] * stage.size[i];
+      b[i] = lam[i] * stage.size[i];
     }
     Local<kL * kL> left(stage.M.entries), right(right_factors);
     // diag(a) + diag(b) F, or diag(a) + F diag(b)
@@ -106,7 +119,8 @@ class Linearisation {
     });
     for (int64_t i = 0; i < nl; i++) {
       stage.y[i] *= stage.size[i];
-      bend[i] = -2.0 * stage.y[i] * a[i] * b[i], damped[i] = 0.5 * damping * abs(stage.y[i]);
+      bend[i] = -2.0 * stage.y[i] * a[i] * b[i];
+      damped[i] = 0.5 * damping * abs(stage.y[i]);
       weigh(i, bend[i] + damped[i]);
     }
     if (kept)

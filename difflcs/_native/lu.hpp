@@ -83,7 +83,8 @@ inline void lu_factor_pivoted(int64_t n, Vec* M, Mask* rows) {
       rows[k][l] = pivot;
       for (int64_t j = 0; pivot != k && j < n; j++) {
         const double t = at(k, j);
-        at(k, j) = at(pivot, j), at(pivot, j) = t;
+        at(k, j) = at(pivot, j);
+        at(pivot, j) = t;
       }
       const double inverse = at(k, k) = 1.0 / at(k, k);
       for (int64_t i = k + 1; i < n; i++) {
@@ -102,7 +103,8 @@ inline void exchange(V* b, int64_t k, const Mask* rows) {
     double& first = reinterpret_cast<double*>(b + k)[l];
     double& second = reinterpret_cast<double*>(b + rows[k][l % kLanes])[l];
     const double t = first;
-    first = second, second = t;
+    first = second;
+    second = t;
   }
 }
 

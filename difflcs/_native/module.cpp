@@ -393,6 +393,12 @@ nb::dict status_codes() {
   return codes;
 }
 
+nb::dict tolerances() {
+  nb::dict table;
+  for (const difflcs::Tolerance& tolerance : difflcs::kTolerances) table[tolerance.name] = tolerance.value;
+  return table;
+}
+
 // Bits instead of `isfinite` and no early end, so that the loop is one of vectors.
 bool all_finite(const std::vector<Array>& arrays) {
   constexpr uint64_t exponent = 0x7ff0000000000000u;
@@ -421,6 +427,7 @@ NB_MODULE(_kernels, m) {
       [] { return fields(std::begin(difflcs::kViolationFields), std::end(difflcs::kViolationFields)); },
       "The same of the violation loss.");
   m.def("status_codes", &status_codes, "How a solve can end: name and code.");
+  m.def("tolerances", &tolerances, "Tolerances that the reference in Python has too.");
   m.def("all_finite", &all_finite, "arrays"_a, "Whether no number of some arrays is NaN or infinite.");
   m.def("solve_lcp", &solve_lcp, "F"_a, "q"_a, "relaxation"_a, "max_iter"_a, "time_limit"_a, "threads"_a, "lam"_a,
         "w"_a, "status"_a, "Solve a batch of LCPs into the given arrays.");

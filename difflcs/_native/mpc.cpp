@@ -12,19 +12,11 @@
 // takes the next problem. No lane's arithmetic depends on another lane: whatever iterates, iterates under a mask.
 // A problem alone would leave lanes idle: for it all of this is compiled once more with a single lane, and neighbouring
 // columns of matrices fill the vectors (`by_columns`).
-#include "adjoint.hpp"
 #include "kernels.hpp"
 #include "solve.hpp"
 #include "variants.hpp"
 
 namespace difflcs::DIFFLCS_ISA {
-
-// That of the widest variant serves all.
-int64_t mpc_workspace(const MpcBatch& batch) {
-  const int64_t solve = Solver<Widest::T, Widest::S>(batch, nullptr).layout(nullptr);
-  const int64_t adjoint = Adjoint<Widest::T, Widest::S>(batch, nullptr).layout(nullptr);
-  return solve > adjoint ? solve : adjoint;
-}
 
 void mpc_solve(const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void* workspace, Watch watch) {
   dispatch(batch, [&](auto variant) {

@@ -2,9 +2,17 @@
 // Beside mpc.cpp so that the two compile at once.
 #include "adjoint.hpp"
 #include "kernels.hpp"
+#include "solve.hpp"
 #include "variants.hpp"
 
 namespace difflcs::DIFFLCS_ISA {
+
+// Of the solver and the adjoint; that of the widest variant serves all.
+int64_t mpc_workspace(const MpcBatch& batch) {
+  const int64_t solve = Solver<Widest::T, Widest::S>(batch, nullptr).layout(nullptr);
+  const int64_t adjoint = Adjoint<Widest::T, Widest::S>(batch, nullptr).layout(nullptr);
+  return solve > adjoint ? solve : adjoint;
+}
 
 void mpc_constraints(const MpcBatch& batch, const MpcSolve& solve, int64_t begin, int64_t end, void* workspace,
                      Watch watch) {

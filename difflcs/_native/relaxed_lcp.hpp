@@ -108,9 +108,10 @@ class RelaxedLcp {
         if (at_target[l]) {
           if (residual[l] <= 1e-14 * magnitude[l])
             solved[l] = -1;
-          else if (residual[l] < 0.5 * smallest[l])
-            smallest[l] = residual[l], stalled[l] = 0;
-          else if (residual[l] <= 1e-10 * magnitude[l] && ++stalled[l] >= 2)
+          else if (residual[l] < 0.5 * smallest[l]) {
+            smallest[l] = residual[l];
+            stalled[l] = 0;
+          } else if (residual[l] <= 1e-10 * magnitude[l] && ++stalled[l] >= 2)
             solved[l] = -1;
         }
       }
@@ -134,7 +135,8 @@ class RelaxedLcp {
     for (int64_t i = 0; i < n; i++) {
       const Vec t = q[i] + F.row(i) * next;
       const Vec diff = next[i] - t;
-      w_next[i] = t, root_next[i] = sqrt(diff * diff + eps4);
+      w_next[i] = t;
+      root_next[i] = sqrt(diff * diff + eps4);
       const Vec g = next[i] + t - root_next[i];
       sum += g * g;
     }
@@ -207,7 +209,10 @@ class RelaxedLcp {
     for (int iteration = 0; iteration < 4; iteration++) {
       for (int64_t i = 0; i < n; i++) {
         Vec t = q[i];
-        for (int64_t j = 0; j < n; j++) t += F(i, j) * lam_out[j], jacobian[i * n + j] = lam_out[i] * F(i, j);
+        for (int64_t j = 0; j < n; j++) {
+          t += F(i, j) * lam_out[j];
+          jacobian[i * n + j] = lam_out[i] * F(i, j);
+        }
         jacobian[i * n + i] += w_out[i];
         step[i] = eps - lam_out[i] * t;
       }

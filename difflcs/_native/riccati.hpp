@@ -16,10 +16,6 @@ constexpr double kFlat = 1e-3;
 // Damping of the actions beside that of the contacts, in units of each action's own curvature: what bends the cost is
 // damped where it bends, the actions only lest nothing is.
 constexpr double kActionDamping = 0.01;
-// A reduced Hessian is singular below this part of an action's own curvature (difflcs.mpc.kkt has the same).
-constexpr double kSingular = 1e-10;
-// An action with a barrier is differentiated as one at its bound below this part of its range (kkt has the same).
-constexpr double kClose = 1e-8;
 
 // How the solver's step is taken.
 struct Newton {
@@ -35,17 +31,10 @@ struct Sweep {
   Vec rounding;    // level below which rounding hides it
   Vec stationary;  // projected gradient in parts of its scale, which sees flat directions too (certificate.hpp)
   Vec violated;    // by how much constraints are not met or not complementary, in parts of the sizes of their terms
-  Vec owing;       // largest change of their multipliers that the augmented Lagrangian calls for
-  Vec fine, pull;  // the largest multiplier; what the cost asks of states and actions, added up over the stages
-  Mask weak;       // a bound is weakly active, or the reduced Hessian is singular
-};
-
-// Upstream gradients of x, u and lam.
-template <class S>
-struct Upstream {
-  Matrix<Vec, 0, S::kX> x;
-  Matrix<Vec, 0, S::kU> u;
-  Matrix<Vec, 0, S::kL> lam;
+  Vec multiplier_step;  // largest change of their multipliers that the augmented Lagrangian calls for
+  Vec largest_multiplier;
+  Vec cost_gradient;  // sizes of the gradients of the cost in states and actions, added up over the stages
+  Mask weak;          // a bound is weakly active, or the reduced Hessian is singular
 };
 
 // Value function of the steps from one on: Hessian, costate, and linear term.
@@ -87,16 +76,31 @@ class Riccati {
   void layout(Arena& arena) {
     const int64_t nx = n.x(), nu = n.u(), nw = n.w(), h = n.h, values = kAdjoint ? h + 1 : 2;
     linearisation.layout(arena);
-    arena.take(P, values, nx, nx), arena.take(p, values, nx), arena.take(v, values, nx);
-    arena.take(H, nw, nw), arena.take(PA, nx, nw), arena.take(H_uu, nu, nu), arena.take(L, nu, nu),
-        arena.take(law, nu, nx + 1);
-    arena.take(linear, nw), arena.take(flat, nu), arena.take(column, nx * kColumns), arena.take(active, nu),
-        arena.take(toward, nu), arena.take(share, nu);
-    arena.take(gradient, h, nu), arena.take(feedforward, h, nu), arena.take(feedback, h, nu, nx);
-    arena.take(lower, h, nu), arena.take(upper, h, nu);
+    arena.take(P, values, nx, nx);
+    arena.take(p, values, nx);
+    arena.take(v, values, nx);
+    arena.take(H, nw, nw);
+    arena.take(PA, nx, nw);
+    arena.take(H_uu, nu, nu);
+    arena.take(L, nu, nu);
+    arena.take(law, nu, nx + 1);
+    arena.take(linear, nw);
+    arena.take(flat, nu);
+    arena.take(column, nx * kColumns);
+    arena.take(active, nu);
+    arena.take(toward, nu);
+    arena.take(share, nu);
+    arena.take(gradient, h, nu);
+    arena.take(feedforward, h, nu);
+    arena.take(feedback, h, nu, nx);
+    arena.take(lower, h, nu);
+    arena.take(upper, h, nu);
     const int64_t nc = n.c();
-    arena.take(force, h + 1, nc), arena.take(stiffness, h + 1, nc);
-    arena.take(row_terms, nc), arena.take(row_violation, nc), arena.take(largest_action, nu);
+    arena.take(force, h + 1, nc);
+    arena.take(stiffness, h + 1, nc);
+    arena.take(row_terms, nc);
+    arena.take(row_violation, nc);
+    arena.take(largest_action, nu);
   }
 
   Stage<S> stage(int64_t k) const { return linearisation.stage(k); }
@@ -113,7 +117,8 @@ class Riccati {
     found = {all(0), all(0), all(0), all(0), all(0), all(0), all(0), Mask{}};
     kinked = all(0);
     for (int64_t i = 0; i < n.c(); i++) {
-      row_terms[i] = problem.reach[i], row_violation[i] = all(0);
+      row_terms[i] = problem.reach[i];
+      row_violation[i] = all(0);
       if (!kAdjoint) kinked = select(problem.reach[i] > 0, newton.regularisation, kinked);
     }
     for (int64_t j = 0; j < n.u() && problem.batch.unbounded; j++) {
@@ -148,14 +153,15 @@ class Riccati {
   void terminal(const Vec* x, const Vec* x_bar) {
     const int64_t nx = n.x();
     const Value<S> end = value(n.h);
+    const Matrix<T, kX, kX> Q = problem.Q_final();
     for (int64_t i = 0; i < nx; i++) {
-      for (int64_t j = 0; j < nx; j++) end.P(i, j) = all(0) + problem.Q_final(i, j);
-      end.p[i] = problem.q_final[i] + problem.Q_final.row(i) * x;
+      for (int64_t j = 0; j < nx; j++) end.P(i, j) = all(0) + Q(i, j);
+      end.p[i] = problem.q_final[i] + Q.row(i) * x;
     }
     if (n.c() > 0) {
       const StageData<T, S> data = problem.last();
       constraints(n.h, data, x, nullptr);
-      for (int64_t i = 0; i < nx; i++) found.pull += abs(end.p[i]);
+      for (int64_t i = 0; i < nx; i++) found.cost_gradient += abs(end.p[i]);
       for (int64_t r = 0; r < n.c(); r++) {
         const Vec stiff = stiffness(n.h, r);
         for (int64_t i = 0; i < nx; i++) {
@@ -173,8 +179,10 @@ class Riccati {
     for (int64_t i = 0; i < n.c(); i++) {
       const Vec c = data.constraint(i, x, u), before = problem.multiplier(k, i), price = data.price[i];
       const Force now(c, before, problem.rho, price);
-      force(k, i) = now.value, stiffness(k, i) = select(now.held, problem.rho, all(0));
-      found.owing = max(found.owing, abs(now.value - before)), found.fine = max(found.fine, now.value);
+      force(k, i) = now.value;
+      stiffness(k, i) = select(now.held, problem.rho, all(0));
+      found.multiplier_step = max(found.multiplier_step, abs(now.value - before));
+      found.largest_multiplier = max(found.largest_multiplier, now.value);
       row_terms[i] = max(row_terms[i], data.constraint_terms(i, x, u));
       const Vec missed = select(now.held, abs(c), select(now.value > 0, max(-c, all(0)), max(c, all(0))));
       row_violation[i] = max(row_violation[i], missed);
@@ -245,18 +253,22 @@ class Riccati {
         H(nx + j, nx + j) += mu * (1.0 / (below * below) + 1.0 / (above * above));
       }
       Vec terms = abs(t);
-      if (n.c() > 0) found.pull += terms;
+      if (n.c() > 0) found.cost_gradient += terms;
       for (int64_t i = 0; i < n.c(); i++) {
         const Vec part = data.G(i, nx + j) * force(k, i);
-        t += part, terms += abs(part);
+        t += part;
+        terms += abs(part);
       }
       Vec g = t, l = kAdjoint ? -u_bar[j] : t;
       for (int64_t i = 0; i < nx; i++) {
         const Vec part = stage.A_hat(i, nx + j) * next.p[i];
-        g += part, terms += abs(part), l += stage.A_hat(i, nx + j) * next.v[i];
+        g += part;
+        terms += abs(part);
+        l += stage.A_hat(i, nx + j) * next.v[i];
       }
       if (kAdjoint) l = l - stage.K_lam.column(nx + j) * lam_bar;
-      linear[nx + j] = l, gradient(k, j) = g;
+      linear[nx + j] = l;
+      gradient(k, j) = g;
       // Away from an optimum P, and with it H, can be indefinite: |H| is still a scale for the distance to a bound.
       // Where the cost is flat, the range of the action is the scale: a descent leads across all of it.
       // Without bounds it is what the action is now, or one.
@@ -281,10 +293,10 @@ class Riccati {
       const Vec curved = max(H(nx + j, nx + j) + linearisation.curvature(nx + j, nx + j), max(least, all(kTiny)));
       const Vec step = g / curved;
       if (barrier == 0) {
-        Mask small = abs(step) <= 1e-5 * width;
+        Mask small = abs(step) <= kWeak * width;
         // With one bound, at zero, and at rest there in all steps, the action has no size: the gradient alone decides.
-        if (problem.batch.unbounded) small |= ~(width > 0) & (abs(g) <= 1e-5 * terms);
-        found.weak |= (min(below, above) <= 1e-5 * width) & small & ~fixed;
+        if (problem.batch.unbounded) small |= ~(width > 0) & (abs(g) <= kWeak * terms);
+        found.weak |= (min(below, above) <= kWeak * width) & small & ~fixed;
       }
       if (kAdjoint) {
         lower(k, j) = (step > below) | (fixed & (g >= 0));
@@ -313,11 +325,12 @@ class Riccati {
     for (int64_t i = 0; i < n.x(); i++) {
       Vec t = data.q[i] + data.Q.row(i) * x;
       if (problem.batch.crossed) t = t + data.cross.row(i) * u;
-      if (n.c() > 0) found.pull += abs(t);
+      if (n.c() > 0) found.cost_gradient += abs(t);
       for (int64_t r = 0; r < n.c(); r++) t += data.G(r, i) * force(k, r);
       Vec l = (kAdjoint ? -x_bar[i] : t) + stage.A_hat.column(i) * next.v;
       if (kAdjoint) l = l - stage.K_lam.column(i) * lam_bar;
-      p[i] = t + stage.A_hat.column(i) * next.p, linear[i] = l;
+      p[i] = t + stage.A_hat.column(i) * next.p;
+      linear[i] = l;
     }
   }
 
@@ -411,7 +424,8 @@ class Riccati {
       for (int64_t i = 0; i < nu; i++) {
         const Mask hits = open & (share[i] <= length);
         d[i] = select(open, d[i] + length * toward[i], d[i]);
-        active[i] |= hits, blocked |= hits;
+        active[i] |= hits;
+        blocked |= hits;
       }
       open &= blocked;
       if (!any(open)) break;

@@ -10,10 +10,6 @@ namespace difflcs::DIFFLCS_ISA {
 namespace {
 
 constexpr double kTiny = 1e-300;
-// A scale is at least this part of what its terms would be, had nothing cancelled before.
-constexpr double kCancelled = 1e-3;
-// What a step further along a chain of states counts: so little that no size grows with it in most systems.
-constexpr double kFurther = 0.1;
 
 // Whether all problems share their matrices: the type of an entry says it.
 template <class T>
