@@ -1,5 +1,5 @@
 // The adjoint of the MPC: gradients of all inputs from upstream gradients of the solution, by one Riccati sweep and one
-// sweep forward (difflcs/mpc/kkt.py: the forward half of `_solve`, and `vjp`).
+// sweep forward (difflcs/mpc/riccati.py: the forward half of `_solve`).
 #pragma once
 #include "input_gradients.hpp"
 #include "kernels.hpp"
@@ -102,7 +102,7 @@ class Adjoint {
     const int64_t nx = n.x(), nu = n.u(), nc = n.c();
     T* weight = problem.weight;
     Vec missed = all(0);
-    Mask going = ~Mask{};
+    Mask refining = ~Mask{};
     for (int64_t k = 0; k <= n.h; k++)
       for (int64_t i = 0; i < nc; i++) {
         const Vec m = problem.multiplier(k, i);
@@ -120,12 +120,12 @@ class Adjoint {
         for (int64_t i = 0; i < nx; i++) {
           Vec t = upstream.x(k, i);
           for (int64_t r = 0; r < nc; r++) t -= G(r, i) * pull(k, r);
-          shifted.x(k, i) = select(going, t, shifted.x(k, i));
+          shifted.x(k, i) = select(refining, t, shifted.x(k, i));
         }
         for (int64_t j = 0; j < nu && k < n.h; j++) {
           Vec t = upstream.u(k, j);
           for (int64_t r = 0; r < nc; r++) t -= G(r, nx + j) * pull(k, r);
-          shifted.u(k, j) = select(going, t, shifted.u(k, j));
+          shifted.u(k, j) = select(refining, t, shifted.u(k, j));
         }
       }
       shifted.lam = upstream.lam;
@@ -138,7 +138,7 @@ class Adjoint {
         for (int64_t r = 0; r < nc; r++) {
           const Mask held = riccati.stiffness(k, r) > 0;
           const Vec off = moved ? out.along(k, r) - out.target(k, r) : out.along(k, r);
-          const Vec more = select(going, riccati.stiffness(k, r) * off, all(0));
+          const Vec more = select(refining, riccati.stiffness(k, r) * off, all(0));
           out.dm(k, r) += more;
           change = max(change, abs(more));
           largest = max(largest, abs(out.dm(k, r)));
@@ -146,10 +146,10 @@ class Adjoint {
         }
         for (int64_t i = 0; i < nx && k < n.h; i++) out.dw[i] = out.dx_next[i];
       }
-      missed = select(going, worst, missed);
+      missed = select(refining, worst, missed);
       // What is done stays as it is: an element depends on nothing but itself.
-      going &= change > 1e-12 * largest;
-      if (!any(going)) break;
+      refining &= change > 1e-12 * largest;
+      if (!any(refining)) break;
     }
     return missed;
   }

@@ -1,5 +1,5 @@
 // The certificate of an MPC solution: every optimality condition, recomputed from the numbers returned, in the caller's
-// units. difflcs/mpc/kkt.py derives the conditions and states the measure (`residual`); the names here are the names
+// units. difflcs/mpc/conditions.py states the measure (`residual`), kkt.py derives it; the names here are the names
 // there. It shares nothing with the solver but the elimination of one small matrix, whose result it checks.
 #pragma once
 #include "kernels.hpp"
@@ -23,7 +23,8 @@ struct Certificate {
   T *A, *B, *C, *D, *E, *F, *Q, *R, *cross, *G_x, *G_u;
   Vec *d, *c, *q, *r, *lo, *hi;
   Vec *x, *u, *lam, *mu, *gap, *s, *p, *pn, *y, *rho, *error, *N, *largest_action;
-  // Sizes of all states, and at a stage of costates and of what they make of rho (kkt.py: `sizes`); terms of both.
+  // Sizes of all states, and at a stage of costates and of what they make of rho (conditions.py: `sizes`); terms of
+  // both.
   Vec *x_size, *p_size, *rho_size, *p_terms, *rho_terms, *terms, *grown;
   Vec* moved;                         // what the ranges of the actions before make of each state
   Vec *row, *row_terms, *row_missed;  // values of the constraints; of each the largest over the stages

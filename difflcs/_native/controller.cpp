@@ -98,7 +98,7 @@ Controller::Controller(const void* bytes, size_t size)
     batch_.step[i] = data_.by_stage[i] ? extent(batch_, kMpcFields[i]) : 0;
   }
   batch_.input[kx0] = x0_.get();
-  look_at_inputs(batch_, data_.field[kS].count(), data_.field[ku_min].count(), data_.field[ku_max].count());
+  set_flags(batch_, data_.field[kS].count(), data_.field[ku_min].count(), data_.field[ku_max].count());
   int64_t needed = kernels_.mpc_workspace(batch_);
   if (data_.n_goal > 0) {
     batch_.input[kq] = q_.get();

@@ -117,7 +117,7 @@ struct Solving {
   int64_t next;
 };
 
-MpcSolve with(const MpcEffort& effort, const MpcPlans& out) {
+MpcSolve solver_options(const MpcEffort& effort, const MpcPlans& out) {
   MpcSolve o{};
   o.shrink = effort.shrink;
   o.steps = kSteps;
@@ -160,7 +160,7 @@ MpcPlans shifted(const MpcBatch& b, MpcPlans p, int64_t by) {
 
 }  // namespace
 
-void look_at_inputs(MpcBatch& b, int64_t S, int64_t low, int64_t high) {
+void set_flags(MpcBatch& b, int64_t S, int64_t low, int64_t high) {
   const auto any = [&](Input which, int64_t count, auto test) {
     return std::any_of(b.input[which], b.input[which] + count, test);
   };
@@ -235,8 +235,8 @@ void MpcDriver::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEff
   for (int64_t first = 0; first < batch.count; first += chunk)
     (this->*way)(batch, guess, effort, out, runner, first, std::min(chunk, batch.count - first));
   for (const bool pivot : {false, true})
-    if (!runner.stopped()) again(batch, effort, out, runner, pivot);
-  if (batch.n_c > 0) judge_constraints(batch, with(effort, out), runner);
+    if (!runner.stopped()) retry_failed(batch, effort, out, runner, pivot);
+  if (batch.n_c > 0) judge_constraints(batch, solver_options(effort, out), runner);
 }
 
 // The first actions of a job: the best plan of its element so far is that of job `best`.
@@ -271,7 +271,7 @@ void MpcDriver::explore(const MpcBatch& batch, const MpcEffort& effort, Runner& 
   MpcBatch jobs = batch;
   jobs.count = count;
   jobs.element = tried.element.data() + first;
-  MpcSolve o = with(effort, shifted(batch, tried.plans(), first));
+  MpcSolve o = solver_options(effort, shifted(batch, tried.plans(), first));
   o.u_start = o.u;
   o.start = tried.start.data() + first;
   if (guessed) {
@@ -294,7 +294,7 @@ void MpcDriver::solve_once(const MpcBatch& batch, const MpcGuess& guess, const M
   MpcBatch jobs = batch;
   jobs.count = count;
   jobs.element = tried.element.data();
-  MpcSolve o = with(effort, to);
+  MpcSolve o = solver_options(effort, to);
   o.start = tried.start.data();
   if (guess.u) o.u_start = guess.u + first * n.u;
   if (guess.lam) {
@@ -381,7 +381,7 @@ void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
     MpcBatch jobs = batch;
     jobs.count = kept;
     jobs.element = finished.element.data();
-    MpcSolve o = with(effort, finished.plans());
+    MpcSolve o = solver_options(effort, finished.plans());
     o.u_start = o.u;
     o.lam_start = o.lam;
     o.mu_start = o.mu;
@@ -422,7 +422,8 @@ bool MpcDriver::promising(const MpcBatch& batch, int64_t job, int64_t best) cons
 
 // Solves the elements that failed (one in a thousand) once more, from no action along a longer homotopy; then, where
 // the numbers broke down and not the patience, with row exchanges in the elimination of the forces.
-void MpcDriver::again(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, bool pivot) {
+void MpcDriver::retry_failed(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner,
+                             bool pivot) {
   const Sizes n(batch);
   origin.clear();
   for (int64_t e = 0; e < batch.count; e++) {
@@ -440,7 +441,7 @@ void MpcDriver::again(const MpcBatch& batch, const MpcEffort& effort, const MpcP
   jobs.count = count;
   jobs.element = tried.element.data();
   jobs.pivot = pivot;
-  MpcSolve o = with(effort, tried.plans());
+  MpcSolve o = solver_options(effort, tried.plans());
   o.start = tried.start.data();
   o.steps = kStepsAgain;
   if (pivot) o.max_iter = std::min(o.max_iter, kMaxIterPivot);

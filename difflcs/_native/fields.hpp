@@ -121,7 +121,8 @@ constexpr bool solved(int8_t status) {
 
 }  // namespace
 
-// Tolerances of the kernels that the reference in Python (difflcs/mpc/kkt.py, difflcs/_violation.py) has too.
+// Tolerances of the kernels that the reference in Python (difflcs/mpc/conditions.py, riccati.py, difflcs/_violation.py)
+// has too.
 struct Tolerance {
   const char* name;
   double value;

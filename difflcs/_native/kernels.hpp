@@ -107,33 +107,42 @@ struct ViolationBatch {
   Watch watch;
 };
 
+// The kernels of one instruction set: KERNEL(result, name, parameters). A new kernel is one more line here, and a
+// definition in the namespace DIFFLCS_ISA of a file that cmake/kernels.cmake compiles. A workspace is aligned to 64
+// bytes. Problems [begin, end): no others are read or written.
+#define DIFFLCS_KERNELS(KERNEL)                                                                                        \
+  /* Size of a workspace in bytes. */                                                                                  \
+  KERNEL(int64_t, lcp_workspace, (int64_t n))                                                                          \
+  KERNEL(void, lcp_solve, (const LcpBatch& batch, int64_t begin, int64_t end, void* workspace, Watch watch))           \
+  KERNEL(int64_t, mpc_workspace, (const MpcBatch& batch))                                                              \
+  /* Takes problems from the shared counter `next` until none is left, and certifies them. */                          \
+  KERNEL(void, mpc_solve, (const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void* workspace, Watch watch)) \
+  /* Marks the solved elements whose constraints make them degenerate. */                                              \
+  KERNEL(void, mpc_constraints,                                                                                        \
+         (const MpcBatch& batch, const MpcSolve& solve, int64_t begin, int64_t end, void* workspace, Watch watch))     \
+  /* Gradients of elements that are block number `block`. */                                                           \
+  KERNEL(void, mpc_vjp,                                                                                                \
+         (const MpcBatch& batch, const MpcGradient& gradient, int64_t begin, int64_t end, int64_t block,               \
+          void* workspace, Watch watch))                                                                               \
+  KERNEL(int64_t, violation_workspace, (const ViolationBatch& batch))                                                  \
+  /* r and e at z = 0, and the QP min z'Qz / 2 + q'z over z >= 0: Q (2 n_lam, 2 n_lam) shared by the batch and */      \
+  /* q (count, 2 n_lam). Returns whether they are finite, F + F^T - gamma I is positive definite and Q is so by a */   \
+  /* margin, and gamma is not too small for double precision. */                                                       \
+  KERNEL(bool, violation_qp, (const ViolationBatch& batch, double* Q, double* q, void* workspace))                     \
+  /* r, e and loss (count,) at z (count, 2 n_lam), from r and e at z = 0. Returns whether e has digits that count. */  \
+  KERNEL(bool, violation_value, (const ViolationBatch& batch, const double* z, double* loss, void* workspace))         \
+  /* Gradients of sum(upstream * loss) with z held; those of x, u and x_next only where they are not null. */          \
+  KERNEL(void, violation_gradient,                                                                                     \
+         (const ViolationBatch& batch, const double* z, const double* upstream,                                        \
+          double* const gradient[kViolationInputs], void* workspace))
+
 struct Kernels {
   const char* isa;
-  int lanes;                            // problems solved side by side
-  int64_t (*lcp_workspace)(int64_t n);  // bytes, to be aligned to 64
-  // Solves problems [begin, end); reads and writes only those.
-  void (*lcp_solve)(const LcpBatch& batch, int64_t begin, int64_t end, void* workspace, Watch watch);
-  int64_t (*mpc_workspace)(const MpcBatch& batch);
-  // Take problems from the shared counter `next` until none is left, and certify them.
-  void (*mpc_solve)(const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void* workspace, Watch watch);
-  // The same for a batch of one, to the same bits.
-  void (*mpc_solve_alone)(const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void* workspace, Watch watch);
-  // Which of the solved elements [begin, end) have constraints that make them degenerate.
-  void (*mpc_constraints)(const MpcBatch& batch, const MpcSolve& solve, int64_t begin, int64_t end, void* workspace,
-                          Watch watch);
-  // Gradients of elements [begin, end), which are block number `block`.
-  void (*mpc_vjp)(const MpcBatch& batch, const MpcGradient& gradient, int64_t begin, int64_t end, int64_t block,
-                  void* workspace, Watch watch);
-  int64_t (*violation_workspace)(const ViolationBatch& batch);
-  // r and e at z = 0, and the QP min z'Qz / 2 + q'z over z >= 0: Q (2 n_lam, 2 n_lam) shared by the batch and
-  // q (count, 2 n_lam). Returns whether they are finite, F + F^T - gamma I is positive definite and Q is so by a
-  // margin, and gamma is not too small for double precision.
-  bool (*violation_qp)(const ViolationBatch& batch, double* Q, double* q, void* workspace);
-  // r, e and loss (count,) at z (count, 2 n_lam), from r and e at z = 0. Returns whether e has digits that count.
-  bool (*violation_value)(const ViolationBatch& batch, const double* z, double* loss, void* workspace);
-  // Gradients of sum(upstream * loss) with z held; those of x, u and x_next only where they are not null.
-  void (*violation_gradient)(const ViolationBatch& batch, const double* z, const double* upstream,
-                             double* const gradient[kViolationInputs], void* workspace);
+  int lanes;  // problems solved side by side
+#define DIFFLCS_MEMBER(result, name, parameters) result(*name) parameters;
+  DIFFLCS_KERNELS(DIFFLCS_MEMBER)
+#undef DIFFLCS_MEMBER
+  decltype(mpc_solve) mpc_solve_alone;  // for a batch of one, to the same bits
 };
 
 // The best kernels this CPU runs, or those that the environment variable DIFFLCS_ISA names.

@@ -1,4 +1,4 @@
-// The batched LCP kernels, compiled once per instruction set (see CMakeLists.txt). One problem per SIMD lane: the code
+// The batched LCP kernels, compiled once per instruction set (cmake/kernels.cmake). One problem per SIMD lane: the code
 // reads like the solver of a single problem, and a lane's result never depends on its neighbours.
 #include "kernels.hpp"
 #include "lanes.hpp"

@@ -180,7 +180,7 @@ difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxa
     b.stride[i] = shared ? 0 : own == 2 ? stages * size : size;
   }
   b.pivot = pivot;
-  look_at_inputs(b, inputs[kS].size(), inputs[ku_min].size(), inputs[ku_max].size());
+  set_flags(b, inputs[kS].size(), inputs[ku_min].size(), inputs[ku_max].size());
   return b;
 }
 

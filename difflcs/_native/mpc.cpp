@@ -5,7 +5,8 @@
 // conditions and their sensitivity, and the names are the names there:
 //   relaxed_lcp.hpp     lam of one stage                        mpc_problem.hpp  data, dynamics, cost
 //   linearisation.hpp   a stage with lam eliminated             riccati.hpp      gradient, active bounds, feedback law
-//   solve.hpp           projected Newton along the homotopy     adjoint.hpp      gradients of the inputs
+//   solve.hpp           projected Newton along the homotopy     progress.hpp     how far each problem has come
+//   adjoint.hpp         directions of the solution              input_gradients.hpp  gradients of the inputs
 //   certificate.hpp     judges what is stored, from the stored numbers alone, whatever the solver thinks of them
 //
 // One problem per SIMD lane: the code reads like the solver of a single problem. A finished lane stores its result and

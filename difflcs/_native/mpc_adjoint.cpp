@@ -1,5 +1,5 @@
 // What needs the linearisation at a solution: gradients of the inputs, and constraints that make it degenerate.
-// Beside mpc.cpp so that the two compile at once.
+// A file of its own beside mpc.cpp, so that the two are compiled at the same time.
 #include "adjoint.hpp"
 #include "kernels.hpp"
 #include "solve.hpp"

@@ -18,35 +18,33 @@ constexpr double kMet = 1e-12, kMetHardly = 1e-10, kMetRounded = 1e-7;
 // Weight of the augmented Lagrangian, in parts of the largest weight of the cost: at first, and where a violation that
 // three steps of the multipliers in a row have not halved means that the problem is infeasible; if the multipliers are
 // also that many times what the cost asks for, so that it is not the cost that keeps the violation.
-constexpr double kPenalty = 10.0, kLargestPenalty = 1e7, kOutbids = 1e6;
+constexpr double kPenalty = 10.0, kLargestPenalty = 1e7, kDominates = 1e6;
 // A step of the multipliers is due where the projected gradient is below this part of what the step before left, and of
 // the change that it would make. The first counts where constraints are far from the actions that they act through.
-constexpr double kDue = 0.03;
+constexpr double kUpdateDue = 0.03;
 // A violation that is more than a tenth of the one before (a hundredth, where it is small) asks for ten times the
 // weight, one that stays for more.
 constexpr double kSlow = 0.1, kSlowEnd = 0.01, kSmall = 1e-4, kStays = 0.9, kRaise = 10.0, kRaiseMore = 30.0;
 // Steps after which the multipliers move in any case where little is violated: actions that constraints couple can take
 // turns next to their bounds, and other multipliers end that.
-constexpr int64_t kPatience = 20;
-constexpr double kLittle = 1e-6;
+constexpr int64_t kStepsBeforeUpdate = 20;
+constexpr double kSlightlyViolated = 1e-6;
 // The least damping that is tried, in parts of what bounds the kink of every contact.
 constexpr double kLeastDamping = 0.25;
 // Failed searches in a row, each with 4 times the damping, before a problem is given up.
 constexpr int64_t kFailures = 12;
 // Steps in a row that gain no more than rounding, after which a tenth of the accuracy is let go, and again after as
-// many more: where the system is stiff, the gradient at the optimum is rounding too. Part of the cost that counts as
-// rounding.
-constexpr int64_t kStill = 8;
+// many more: where the system is stiff, the gradient at the optimum is rounding too. A gain below kNoGain of the cost
+// counts as rounding; no smaller projected gradient than kLeastTolerance is asked for then.
+constexpr int64_t kStepsWithoutGain = 8;
+constexpr double kNoGain = 1e-12, kLeastTolerance = 1e-8;
+constexpr double kLooserTolerance[] = {1.0, 10.0, 100.0, 1000.0};
 // As many such steps in, a plan that is stationary but for its scale, which vanishes at a vertex, is put before the
 // certificate, which has the sizes of what cancelled.
-constexpr int64_t kAsk = 2;
+constexpr int64_t kStepsBeforeCertificate = 2;
 // A large weight of the augmented Lagrangian makes much of the rounding of a constraint. Where more than this part is
 // left of the gradient at such a vertex, the multipliers are found once more with the first weight.
-constexpr double kClean = 1e-9;
-constexpr double kNothing = 1e-12;
-constexpr double kLetGo[] = {1.0, 10.0, 100.0, 1000.0};
-// The least projected gradient that is asked for then.
-constexpr double kInVain = 1e-8;
+constexpr double kRoundingLeft = 1e-9;
 
 template <class T>
 struct Progress {
@@ -62,19 +60,19 @@ struct Progress {
   struct Lane {
     int64_t element = -1;  // -1: idle
     int64_t iterations = 0, in_stage = 0, failures = 0;
-    double violated = 1e300;  // at the last step of the multipliers
-    double left = 0;          // projected gradient after that; 0 where it is not known yet
-    int64_t stalled = 0;      // steps of the multipliers in a row that hardly helped
-    double gained = 0;        // by the last step
-    bool cleaned = false;     // see kClean
-    int64_t still = 0;        // steps at the target in a row that gained no more than the rounding of the cost
+    double violated = 1e300;    // at the last step of the multipliers
+    double gradient_left = 0;   // projected gradient after that; 0 where it is not known yet
+    int64_t stalled = 0;        // steps of the multipliers in a row that hardly helped
+    double gained = 0;          // by the last step
+    bool weight_reset = false;  // see kRoundingLeft
+    int64_t without_gain = 0;   // steps at the target in a row that gained no more than the rounding of the cost
   };
   Lane lane[kLanes];
   Vec eps, regularisation, J;
-  Mask fresh;     // without a trajectory at its eps
-  Mask released;  // without contact yet
-  Mask plain;     // by Gauss-Newton
-  Mask repriced;  // with multipliers that J does not know yet
+  Mask needs_rollout;  // without a trajectory at its eps
+  Mask released;       // without contact yet
+  Mask gauss_newton;   // by Gauss-Newton
+  Mask stale_cost;     // with multipliers that J does not know yet
   // Elements that are finished but not certified yet.
   int64_t finished[kLanes];
   int waiting;
@@ -100,7 +98,7 @@ struct Progress {
       const double mean = count ? sum[l] / double(count) : 0;
       put(&eps, 0, l, first_relaxation(o.start[e], mean));
       lane[l].iterations++;
-      fresh[l] = -1;
+      needs_rollout[l] = -1;
     }
     released &= ~which;
   }
@@ -116,14 +114,14 @@ struct Progress {
     const int64_t e = __atomic_fetch_add(counter, int64_t{1}, __ATOMIC_RELAXED);
     const int64_t nu = n.u(), actions = n.h * nu, forces = n.h * n.l();
     lane[l] = {};
-    fresh[l] = -1;
-    released[l] = plain[l] = 0;
+    needs_rollout[l] = -1;
+    released[l] = gauss_newton[l] = 0;
     eps[l] = batch.relaxation;
     regularisation[l] = 0;
     if (e >= batch.count) return false;
     lane[l].element = e;
     released[l] = o.start[e].released ? -1 : 0;
-    plain[l] = o.start[e].gauss_newton ? -1 : 0;
+    gauss_newton[l] = o.start[e].gauss_newton ? -1 : 0;
     if (!released[l]) eps[l] = first_relaxation(o.start[e], 0);
     problem.load(e, l);
     problem.load_multipliers(o.mu_start ? o.mu_start + e * (n.h + 1) * n.c() : nullptr, l);
@@ -188,10 +186,10 @@ struct Progress {
         multiplier = select(which, Force(c, multiplier, problem.rho, data.price[i]).value, multiplier);
       }
     }
-    repriced |= which;
+    stale_cost |= which;
   }
 
-  static Mask only(int l) {
+  static Mask lane_mask(int l) {
     Mask which = Mask{};
     which[l] = -1;
     return which;
@@ -206,19 +204,21 @@ struct Progress {
   // Whether the constraints of a lane at the target ask for other multipliers, which it then gets, or for more weight.
   bool update_due_multipliers(const Sweep& sweep, int l, bool stationary) {
     const double violated = sweep.violated[l];
-    if (lane[l].left == 0) lane[l].left = sweep.projected[l];
-    const double due = kDue * (lane[l].left < sweep.multiplier_step[l] ? lane[l].left : sweep.multiplier_step[l]);
-    const bool impatient = lane[l].in_stage >= kPatience && violated <= kLittle && sweep.multiplier_step[l] > 0;
+    if (lane[l].gradient_left == 0) lane[l].gradient_left = sweep.projected[l];
+    const double due = kUpdateDue * (lane[l].gradient_left < sweep.multiplier_step[l] ? lane[l].gradient_left
+                                                                                      : sweep.multiplier_step[l]);
+    const bool impatient =
+        lane[l].in_stage >= kStepsBeforeUpdate && violated <= kSlightlyViolated && sweep.multiplier_step[l] > 0;
     if (!impatient && (met(sweep, l) || !(stationary || sweep.projected[l] <= due))) return false;
-    lane[l].left = 0;
-    update_multipliers(only(l));
+    lane[l].gradient_left = 0;
+    update_multipliers(lane_mask(l));
     double& rho = reinterpret_cast<double*>(&problem.rho)[l];
     lane[l].stalled = violated > 0.5 * lane[l].violated ? lane[l].stalled + 1 : 0;
     if (violated > (violated < kSmall ? kSlowEnd : kSlow) * lane[l].violated)
       rho *= violated > kStays * lane[l].violated ? kRaiseMore : kRaise;
     lane[l].violated = violated;
     lane[l].iterations++;
-    lane[l].failures = lane[l].in_stage = lane[l].still = 0;
+    lane[l].failures = lane[l].in_stage = lane[l].without_gain = 0;
     return true;
   }
 
@@ -230,20 +230,21 @@ struct Progress {
       const Lane& a = lane[l];
       double tol = o.tol > sweep.rounding[l] ? o.tol : sweep.rounding[l];
       // A search that fails this close to the optimum has met the rounding of the cost.
-      const bool stuck = a.failures >= kFailures || a.still >= 4 * kStill;
-      const double patience = kLetGo[stuck ? 3 : a.still / kStill];
-      if (patience > 1 && tol < kInVain) tol = kInVain;
+      const bool stuck = a.failures >= kFailures || a.without_gain >= 4 * kStepsWithoutGain;
+      const double patience = kLooserTolerance[stuck ? 3 : a.without_gain / kStepsWithoutGain];
+      if (patience > 1 && tol < kLeastTolerance) tol = kLeastTolerance;
       const bool small = sweep.projected[l] <= patience * tol;
       const bool stationary = small && sweep.stationary[l] <= patience * kStationary;
       const bool converged = stationary && met(sweep, l);
       const bool broken = !(J[l] < 1e300 && J[l] > -1e300);
-      const bool doubtful = small && !stationary && met(sweep, l) && !broken && (a.still == kAsk || stuck);
+      const bool doubtful =
+          small && !stationary && met(sweep, l) && !broken && (a.without_gain == kStepsBeforeCertificate || stuck);
       const double largest = kLargestPenalty * lane_of(problem.weight[0], l);
       const bool infeasible = sweep.violated[l] > o.certified && a.stalled >= 3 &&
-                              sweep.largest_multiplier[l] > kOutbids * sweep.cost_gradient[l] &&
+                              sweep.largest_multiplier[l] > kDominates * sweep.cost_gradient[l] &&
                               (problem.rho[l] >= largest || a.iterations >= o.max_iter);
       if (!infeasible && !broken && a.iterations < o.max_iter && n.c() > 0 &&
-          update_due_multipliers(sweep, l, stationary || (small && a.still >= kAsk))) {
+          update_due_multipliers(sweep, l, stationary || (small && a.without_gain >= kStepsBeforeCertificate))) {
         frozen[l] = -1;
         continue;
       }
@@ -256,13 +257,13 @@ struct Progress {
       }
       const bool done = doubtful && accepted(o, l, sweep, force);
       const double first = kPenalty * lane_of(problem.weight[0], l);
-      if (doubtful && !a.cleaned && problem.rho[l] > first && o.residual[a.element] > kClean) {
+      if (doubtful && !a.weight_reset && problem.rho[l] > first && o.residual[a.element] > kRoundingLeft) {
         frozen[l] = -1;
-        update_multipliers(only(l));
+        update_multipliers(lane_mask(l));
         put(&problem.rho, 0, l, first);
-        lane[l].cleaned = true;
+        lane[l].weight_reset = true;
         lane[l].violated = 1e300;
-        lane[l].stalled = lane[l].failures = lane[l].in_stage = lane[l].still = 0;
+        lane[l].stalled = lane[l].failures = lane[l].in_stage = lane[l].without_gain = 0;
         continue;
       }
       if (doubtful && !done && !infeasible && a.iterations < o.max_iter && !stuck) continue;
@@ -282,7 +283,7 @@ struct Progress {
   // Leaves the lanes that have made their steps at the target to be compared, and gives them other problems.
   void leave(const MpcSolve& o, int64_t* counter, Mask frozen, int& live) {
     for (int l = 0; l < kLanes; l++) {
-      if (frozen[l] || released[l] || fresh[l] || eps[l] > batch.relaxation) continue;
+      if (frozen[l] || released[l] || needs_rollout[l] || eps[l] > batch.relaxation) continue;
       const int64_t steps = o.start[lane[l].element].explore;
       if (steps == 0 || lane[l].in_stage < steps) continue;
       write(o, l, Status::max_iter, problem.multiplier, true);
@@ -299,8 +300,8 @@ struct Progress {
       a.iterations++;
       a.in_stage++;
       a.failures = moved[l] ? 0 : a.failures + 1;
-      const bool gains = eps[l] > target || (moved[l] && a.gained > kNothing * (1.0 + __builtin_fabs(J[l])));
-      a.still = gains ? 0 : a.still + 1;
+      const bool gains = eps[l] > target || (moved[l] && a.gained > kNoGain * (1.0 + __builtin_fabs(J[l])));
+      a.without_gain = gains ? 0 : a.without_gain + 1;
       // Levenberg-Marquardt on the kinks of the contacts (linearisation.hpp): a failed step asks for more damping, one
       // that had to be shortened too, and one that gained what its model promised for less.
       double& reg = reinterpret_cast<double*>(&regularisation)[l];
@@ -321,7 +322,7 @@ struct Progress {
         eps[l] = eps[l] * shrink > target ? eps[l] * shrink : target;
         a.in_stage = 0;
         a.failures = 0;
-        fresh[l] = -1;
+        needs_rollout[l] = -1;
       }
     }
   }

@@ -1,6 +1,6 @@
 // The Riccati sweep of the MPC with lam eliminated: reduced gradient, active bounds, and the feedback law that solves
 // the quadratic problem around a trajectory. The adjoint is the same sweep with upstream gradients as linear terms
-// (difflcs/mpc/kkt.py: `linearise` and the backward half of `_solve`).
+// (difflcs/mpc/riccati.py: `linearise`, and the backward half of `_solve`).
 #pragma once
 #include "lanes.hpp"
 #include "linearisation.hpp"
@@ -19,10 +19,10 @@ constexpr double kActionDamping = 0.01;
 
 // How the solver's step is taken.
 struct Newton {
-  Vec regularisation{};  // added to the curvature of contacts and actions
-  Mask stubborn{};       // keeps the second derivative of lam where the Hessian is indefinite
-  Mask gauss_newton{};   // never has it
-  Mask unbounded{};      // knows no bounds
+  Vec regularisation{};   // added to the curvature of contacts and actions
+  Mask keep_curvature{};  // keeps the second derivative of lam where the Hessian is indefinite
+  Mask gauss_newton{};    // never has it
+  Mask unbounded{};       // knows no bounds
 };
 
 // What a sweep finds besides the feedback law.
@@ -61,8 +61,8 @@ class Riccati {
   Vec *row_terms, *row_violation;  // of each constraint, the largest over the stages
   Mask* active;
   Newton newton;
-  Vec kinked;  // beside the kinks of constraints: damping of what is flat
-  Sweep found;
+  Vec flat_damping;  // beside the kinks of constraints: damping of what is flat
+  Sweep result;
 
  public:
   Matrix<Vec, 0, kU> gradient, feedforward;
@@ -114,12 +114,12 @@ class Riccati {
   // Around the trajectory `at`.
   Sweep sweep(const Trajectory<S>& at, const Upstream<S>& upstream, const Newton& how = {}) {
     newton = how;
-    found = {all(0), all(0), all(0), all(0), all(0), all(0), all(0), Mask{}};
-    kinked = all(0);
+    result = {all(0), all(0), all(0), all(0), all(0), all(0), all(0), Mask{}};
+    flat_damping = all(0);
     for (int64_t i = 0; i < n.c(); i++) {
       row_terms[i] = problem.reach[i];
       row_violation[i] = all(0);
-      if (!kAdjoint) kinked = select(problem.reach[i] > 0, newton.regularisation, kinked);
+      if (!kAdjoint) flat_damping = select(problem.reach[i] > 0, newton.regularisation, flat_damping);
     }
     for (int64_t j = 0; j < n.u() && problem.batch.unbounded; j++) {
       largest_action[j] = all(0);
@@ -140,8 +140,8 @@ class Riccati {
       feedback_law(k);
     }
     for (int64_t i = 0; i < n.c(); i++)
-      found.violated = max(found.violated, row_violation[i] / select(row_terms[i] > 0, row_terms[i], all(1)));
-    return found;
+      result.violated = max(result.violated, row_violation[i] / select(row_terms[i] > 0, row_terms[i], all(1)));
+    return result;
   }
 
   // What contact i of stage k answers to a change of state and action, to first order.
@@ -161,7 +161,7 @@ class Riccati {
     if (n.c() > 0) {
       const StageData<T, S> data = problem.last();
       constraints(n.h, data, x, nullptr);
-      for (int64_t i = 0; i < nx; i++) found.cost_gradient += abs(end.p[i]);
+      for (int64_t i = 0; i < nx; i++) result.cost_gradient += abs(end.p[i]);
       for (int64_t r = 0; r < n.c(); r++) {
         const Vec stiff = stiffness(n.h, r);
         for (int64_t i = 0; i < nx; i++) {
@@ -181,8 +181,8 @@ class Riccati {
       const Force now(c, before, problem.rho, price);
       force(k, i) = now.value;
       stiffness(k, i) = select(now.held, problem.rho, all(0));
-      found.multiplier_step = max(found.multiplier_step, abs(now.value - before));
-      found.largest_multiplier = max(found.largest_multiplier, now.value);
+      result.multiplier_step = max(result.multiplier_step, abs(now.value - before));
+      result.largest_multiplier = max(result.largest_multiplier, now.value);
       row_terms[i] = max(row_terms[i], data.constraint_terms(i, x, u));
       const Vec missed = select(now.held, abs(c), select(now.value > 0, max(-c, all(0)), max(c, all(0))));
       row_violation[i] = max(row_violation[i], missed);
@@ -253,7 +253,7 @@ class Riccati {
         H(nx + j, nx + j) += mu * (1.0 / (below * below) + 1.0 / (above * above));
       }
       Vec terms = abs(t);
-      if (n.c() > 0) found.cost_gradient += terms;
+      if (n.c() > 0) result.cost_gradient += terms;
       for (int64_t i = 0; i < n.c(); i++) {
         const Vec part = data.G(i, nx + j) * force(k, i);
         t += part;
@@ -278,8 +278,8 @@ class Riccati {
       Vec projected = abs(scaled - u[j]) * gauss_newton;
       // Next to a bound the barrier is so steep that rounding u alone moves g: a step below rounding counts as none.
       if (barrier > 0) projected = select(abs(g) <= 1e-14 * width * gauss_newton, all(0), projected);
-      found.projected = max(found.projected, projected);
-      found.rounding = max(found.rounding, 1e-12 * terms);
+      result.projected = max(result.projected, projected);
+      result.rounding = max(result.rounding, 1e-12 * terms);
       if (barrier > 0)
         terms += mu * (1.0 / below + 1.0 / above) + 1e-8 * mu * width * (1.0 / (below * below) + 1.0 / (above * above));
       const Vec reference = max(terms, rest[j] * width);
@@ -287,8 +287,8 @@ class Riccati {
       const Vec reach = select(g > 0, below, above);
       part = min(part, problem.batch.unbounded ? select(reach > kHuge, reach, reach * per_width) : reach * per_width);
       if (barrier > 0) part = select(projected > 0, part, all(0));
-      found.stationary = max(found.stationary, part);
-      flat[j] = (kFlat + kinked) * across;
+      result.stationary = max(result.stationary, part);
+      flat[j] = (kFlat + flat_damping) * across;
       const Vec least = 1e-10 * reference * per_width;
       const Vec curved = max(H(nx + j, nx + j) + linearisation.curvature(nx + j, nx + j), max(least, all(kTiny)));
       const Vec step = g / curved;
@@ -296,7 +296,7 @@ class Riccati {
         Mask small = abs(step) <= kWeak * width;
         // With one bound, at zero, and at rest there in all steps, the action has no size: the gradient alone decides.
         if (problem.batch.unbounded) small |= ~(width > 0) & (abs(g) <= kWeak * terms);
-        found.weak |= (min(below, above) <= kWeak * width) & small & ~fixed;
+        result.weak |= (min(below, above) <= kWeak * width) & small & ~fixed;
       }
       if (kAdjoint) {
         lower(k, j) = (step > below) | (fixed & (g >= 0));
@@ -325,7 +325,7 @@ class Riccati {
     for (int64_t i = 0; i < n.x(); i++) {
       Vec t = data.q[i] + data.Q.row(i) * x;
       if (problem.batch.crossed) t = t + data.cross.row(i) * u;
-      if (n.c() > 0) found.cost_gradient += abs(t);
+      if (n.c() > 0) result.cost_gradient += abs(t);
       for (int64_t r = 0; r < n.c(); r++) t += data.G(r, i) * force(k, r);
       Vec l = (kAdjoint ? -x_bar[i] : t) + stage.A_hat.column(i) * next.v;
       if (kAdjoint) l = l - stage.K_lam.column(i) * lam_bar;
@@ -341,7 +341,7 @@ class Riccati {
   }
 
   // Cholesky of H_uu + Y_uu + regularisation with identity rows for active actions. An indefinite block first drops
-  // what is negative in Y at this stage, then has its pivots lifted; lanes that are `stubborn` lift them at once.
+  // what is negative in Y at this stage, then has its pivots lifted; lanes that are `keep_curvature` lift them at once.
   void factor(const StageData<T, S>& data) {
     const int64_t nx = n.x(), nu = n.u();
     if (!kAdjoint && any(newton.gauss_newton)) linearisation.drop(newton.gauss_newton);
@@ -354,9 +354,9 @@ class Riccati {
         if (!kAdjoint) H_uu(i, i) += kActionDamping * newton.regularisation * action_scale(data, i) + flat[i];
       }
       const Mask failed = cholesky(data, attempt == 0);
-      if (kAdjoint) found.weak |= failed;
+      if (kAdjoint) result.weak |= failed;
       if (kAdjoint || !any(failed) || attempt == 1) break;
-      linearisation.make_convex(failed & ~newton.stubborn);
+      linearisation.make_convex(failed & ~newton.keep_curvature);
     }
   }
 
@@ -374,7 +374,7 @@ class Riccati {
       const Mask bad = ~(pivot > lift) & ~active[j];
       failed |= bad;
       // What is added where the cost is flat vanishes with the gradient, and does not hide that it is.
-      if (!kAdjoint && judged) found.weak |= ~(pivot - flat[j] > singular) & ~active[j];
+      if (!kAdjoint && judged) result.weak |= ~(pivot - flat[j] > singular) & ~active[j];
       Vec inverse = 1.0 / sqrt(select(bad, max(abs(pivot), lift), pivot));
       // The adjoint holds an action that nothing moves, and takes a negative curvature by its size.
       if (kAdjoint) inverse = select(bad & (abs(pivot) <= lift), all(0), inverse);

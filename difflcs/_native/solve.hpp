@@ -150,7 +150,7 @@ template <class T, class S>
 void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
   progress.eps = all(batch.relaxation);
   progress.regularisation = progress.J = all(0);
-  progress.fresh = progress.repriced = progress.released = progress.plain = Mask{};
+  progress.needs_rollout = progress.stale_cost = progress.released = progress.gauss_newton = Mask{};
   progress.waiting = 0;
   int live = 0;
   for (int l = 0; l < kLanes; l++) {
@@ -163,24 +163,25 @@ void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
     Mask idle;
     for (int l = 0; l < kLanes; l++) idle[l] = progress.lane[l].element < 0 ? -1 : 0;
     problem.mu = batch.barrier * (progress.eps / batch.relaxation) * problem.cost_unit[0];
-    if (any(progress.fresh & ~idle)) {
-      const Vec rolled = rollout(progress.fresh & ~idle, watch);
-      progress.J = select(progress.fresh, rolled, progress.J);
+    if (any(progress.needs_rollout & ~idle)) {
+      const Vec rolled = rollout(progress.needs_rollout & ~idle, watch);
+      progress.J = select(progress.needs_rollout, rolled, progress.J);
     }
     if (watch.stop(watch.context)) {
       // What has a trajectory is stored; what has none stays unreached.
       for (int l = 0; l < kLanes; l++)
-        if (!idle[l] && !progress.fresh[l] && !progress.released[l])
+        if (!idle[l] && !progress.needs_rollout[l] && !progress.released[l])
           progress.store(o, l, Status::max_iter, problem.multiplier);
       break;
     }
-    if (any(progress.repriced)) progress.J = select(progress.repriced, problem.cost(at), progress.J);
-    progress.fresh = progress.repriced = Mask{};
+    if (any(progress.stale_cost)) progress.J = select(progress.stale_cost, problem.cost(at), progress.J);
+    progress.needs_rollout = progress.stale_cost = Mask{};
     // Gauss-Newton can creep along a curved valley: after 20 steps in one stage every other one keeps the curvature.
-    Mask stubborn;
+    Mask keep_curvature;
     for (int l = 0; l < kLanes; l++)
-      stubborn[l] = progress.lane[l].in_stage > 20 && progress.lane[l].in_stage % 2 ? -1 : 0;
-    const Sweep sweep = riccati.sweep(at, {}, {progress.regularisation, stubborn, progress.plain, progress.released});
+      keep_curvature[l] = progress.lane[l].in_stage > 20 && progress.lane[l].in_stage % 2 ? -1 : 0;
+    const Sweep sweep =
+        riccati.sweep(at, {}, {progress.regularisation, keep_curvature, progress.gauss_newton, progress.released});
     const Mask frozen = progress.finish(o, sweep, riccati.force, counter, idle, live);
     if (live == 0) break;
     Vec step, gain;
