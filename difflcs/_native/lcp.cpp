@@ -219,10 +219,12 @@ void with_size(const LcpBatch& batch, void* memory, Function f) {
 }
 template <int... N, class Function>
 void dispatch(const LcpBatch& batch, void* memory, Function f) {
-  if (batch.F_stride)
+  if (batch.F_stride == 0)
+    with_size<double, N...>(batch, memory, f);
+  else if constexpr (kLanes > 2)
     with_size<Vec, N...>(batch, memory, f);
   else
-    with_size<double, N...>(batch, memory, f);
+    with_size<Vec>(batch, memory, f);
 }
 
 }  // namespace
