@@ -34,7 +34,6 @@ struct Certificate {
 
   void layout(Arena& arena) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nc = n.c(), h = n.h;
-    auto take = [&](auto*& to, int64_t count) { arena.take(to, count); };
     for (int i = 0; i < kInputs; i++) {
       const Field& field = kMpcFields[i];
       const int64_t stages = batch.step[i] == 0 ? 1 : stages_of(batch, field);
@@ -44,30 +43,16 @@ struct Certificate {
         arena.take(matrix[i], stages, extent(batch, field));
     }
     arena.take(rest, h, nu);
-    take(x, (h + 1) * nx);
-    take(u, h * nu);
-    take(lam, h * nl);
-    take(mu, (h + 1) * nc);
-    take(gap, h * nl);
-    take(p, nx);
-    take(pn, nx);
-    take(y, nl);
-    take(rho, nl);
-    take(error, nl);
-    take(N, nl * nl);
-    take(rows, nl);
-    take(largest_action, nu);
-    take(x_size, (h + 1) * nx);
-    take(p_size, nx);
-    take(rho_size, nl);
-    take(p_terms, nx);
-    take(rho_terms, nl);
-    take(terms, nx);
-    take(grown, nx);
-    take(moved, nc > 0 ? (h + 1) * nx : 0);
-    take(row, (h + 1) * nc);
-    take(row_terms, nc);
-    take(row_missed, nc);
+    arena.take_all((h + 1) * nx, x, x_size);
+    arena.take(u, h * nu);
+    arena.take_all(h * nl, lam, gap);
+    arena.take_all((h + 1) * nc, mu, row);
+    arena.take_all(nx, p, pn, p_size, p_terms, terms, grown);
+    arena.take_all(nl, y, rho, error, rows, rho_size, rho_terms);
+    arena.take(N, nl * nl);
+    arena.take(largest_action, nu);
+    arena.take(moved, nc > 0 ? (h + 1) * nx : 0);
+    arena.take_all(nc, row_terms, row_missed);
     if constexpr (kShared<T>)
       if (arena.memory) load_matrices(0, 0);
   }

@@ -58,15 +58,9 @@ struct InputGradients {
     arena.take(upstream.lam, h, nl);
     arena.take(target, h + 1, n.c());
     arena.take(dm, h + 1, n.c());
-    arena.take(gap, nl);
+    arena.take_all(nl, gap, dlam, ds, dy, rho, drho);
     arena.take(dw, n.w());
-    arena.take(dx_next, nx);
-    arena.take(dlam, nl);
-    arena.take(ds, nl);
-    arena.take(dp, nx);
-    arena.take(dy, nl);
-    arena.take(rho, nl);
-    arena.take(drho, nl);
+    arena.take_all(nx, dx_next, dp);
   }
 
   // Solutions of kLanes elements; lanes past `end` repeat the last one.

@@ -24,15 +24,7 @@ struct LcpLanes {
   int64_t layout(void* memory) {
     Arena arena{memory};
     arena.take(F, n * n);
-    arena.take(scale, n);
-    arena.take(inverse, n);
-    arena.take(q, n);
-    arena.take(lam, n);
-    arena.take(w, n);
-    arena.take(rhs, n);
-    arena.take(bound, n);
-    arena.take(active, n);
-    arena.take(rows, n);
+    arena.take_all(n, scale, inverse, q, lam, w, rhs, bound, active, rows);
     arena.take(newton, RelaxedLcp<T, 0, false>::scratch(n));
     M = newton;  // of the exact solver, which is another's turn; n * n of them
     return arena.used;

@@ -48,12 +48,8 @@ class Linearisation {
     arena.take(size, count, nl);
     arena.take(y, count, nl);
     arena.take(rows, count * nl);
-    arena.take(right_rows, nl);
-    arena.take(a, nl);
-    arena.take(b, nl);
+    arena.take_all(nl, right_rows, a, b, bend, damped);
     arena.take(right_factors, nl * nl);
-    arena.take(bend, nl);
-    arena.take(damped, nl);
     arena.take(column, nl * kColumns);
     arena.take(slopes, nl, nw);
     arena.take(weighted, nl, nw);

@@ -164,6 +164,10 @@ struct Arena {
   void take(T*& to, int64_t count) {
     to = take<T>(count);
   }
+  template <class... T>
+  void take_all(int64_t count, T*&... to) {
+    (take(to, count), ...);
+  }
   template <class T, int64_t R, int64_t C>
   void take(Matrix<T, R, C>& to, int64_t rows, int64_t columns) {
     to = {take<T>(rows * columns), {rows}, {columns}, {columns}};

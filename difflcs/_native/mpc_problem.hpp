@@ -150,8 +150,7 @@ struct ProblemData {
     arena.take(R, costs, nu, nu);
     arena.take(cross, costs, nx, nu);
     arena.take(Q_final, nx, nx);
-    arena.take(cost_unit, 1);
-    arena.take(weight, 1);
+    arena.take_all(1, cost_unit, weight);
     arena.take(rest, h, nu);
     arena.take(G, rows, nc, nw);
     arena.take(row_scale, rows, nc);
@@ -164,8 +163,7 @@ struct ProblemData {
     arena.take(u_min, bounds, nu);
     arena.take(u_max, bounds, nu);
     arena.take(per_width, bounds, nu);
-    arena.take(q_final, nx);
-    arena.take(x0, nx);
+    arena.take_all(nx, q_final, x0);
     arena.take(multiplier, h + 1, nc);
     arena.take(reach, nc);
     if constexpr (kShared<T>)

@@ -85,11 +85,8 @@ class Riccati {
     arena.take(L, nu, nu);
     arena.take(law, nu, nx + 1);
     arena.take(linear, nw);
-    arena.take(flat, nu);
+    arena.take_all(nu, flat, active, toward, share);
     arena.take(column, nx * kColumns);
-    arena.take(active, nu);
-    arena.take(toward, nu);
-    arena.take(share, nu);
     arena.take(gradient, h, nu);
     arena.take(feedforward, h, nu);
     arena.take(feedback, h, nu, nx);
@@ -98,8 +95,7 @@ class Riccati {
     const int64_t nc = n.c();
     arena.take(force, h + 1, nc);
     arena.take(stiffness, h + 1, nc);
-    arena.take(row_terms, nc);
-    arena.take(row_violation, nc);
+    arena.take_all(nc, row_terms, row_violation);
     arena.take(largest_action, nu);
   }
 
