@@ -113,7 +113,8 @@ Controller::Controller(const void* bytes, size_t size)
 const Outcome& Controller::step(const double* x, const double* targets, bool follow, double* u) {
   const auto begun = Clock::now();
   const int64_t aims = data_.n_goal * (follow ? data_.horizon + 1 : 1);
-  outcome_ = Outcome{}, unfinished_ = false;
+  outcome_ = Outcome{};
+  unfinished_ = false;
   if (all_finite(x, data_.n_x) && all_finite(targets, aims)) {
     std::copy_n(x, data_.n_x, x0_.get());
     if (data_.n_goal > 0) aim(targets, follow);
@@ -223,7 +224,9 @@ double Controller::clipped(int64_t i, double value) const {
 }
 
 void Controller::reset() {
-  guessed_ = false, planned_ = 0, outcome_ = Outcome{};
+  guessed_ = false;
+  planned_ = 0;
+  outcome_ = Outcome{};
   for (const Numbers* values : {&found_.x, &found_.u, &found_.lam, &found_.mu})
     std::fill_n(values->get(), values->count(), 0.0);
 }
