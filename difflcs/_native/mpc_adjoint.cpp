@@ -1,5 +1,9 @@
 // What needs the linearisation at a solution: gradients of the inputs, and constraints that make it degenerate.
 // A file of its own beside mpc.cpp, so that the two are compiled at the same time.
+#if defined(__GNUC__) && !defined(__clang__)
+// How the length of a constraint's row is rounded depends on whether GCC adds up in vectors of its own. Here it does.
+#define DIFFLCS_ROW_LENGTHS __attribute__((optimize("tree-vectorize")))
+#endif
 #include "adjoint.hpp"
 #include "kernels.hpp"
 #include "solve.hpp"

@@ -6,6 +6,10 @@
 #include "matrix.hpp"
 #include "sizes.hpp"
 
+#ifndef DIFFLCS_ROW_LENGTHS  // see mpc_adjoint.cpp
+#define DIFFLCS_ROW_LENGTHS
+#endif
+
 namespace difflcs::DIFFLCS_ISA {
 namespace {
 
@@ -133,6 +137,8 @@ struct ProblemData {
   Matrix<Vec, 0, 0> multiplier;  // of the constraints, and the weight of the augmented Lagrangian
   Vec rho;
 
+  void (ProblemData::*load_rows)(int64_t element, int lane);  // `load_sized_rows` with the sizes that are known
+
   ProblemData(const MpcBatch& b, bool caller_units)
       : batch(b), n(b), caller_units(caller_units), mu(all(b.barrier)), rho(all(1)) {}
 
@@ -230,7 +236,15 @@ struct ProblemData {
     curvature_at_rest(
         n, [&](int64_t k) { return stage(k).B().entries; }, nw, [&](int64_t k) { return Q[k].entries; },
         Q_final.entries, [&](int64_t k) { return R[k].entries; }, scale.count == 1 && Q.count == 1, rest, lane);
-    for (int64_t k = 0; k < G.count && nc > 0; k++) {
+    if (nc > 0) (this->*load_rows)(e, lane);
+  }
+
+  // The rows of the constraints, made to have length one.
+  template <class S>
+  DIFFLCS_ROW_LENGTHS void load_sized_rows(int64_t e, int lane) {
+    const S n(batch);
+    const int64_t nx = n.x(), nw = n.w(), nc = n.c();
+    for (int64_t k = 0; k < G.count; k++) {
       const StageData<T, AnySizes> to = k < n.h ? stage(k) : last();
       const double *G_x = input(kG_x, e, k), *G_u = input(kG_u, e, k);
       for (int64_t i = 0; i < nc; i++) {
@@ -414,7 +428,9 @@ template <class T, class S>
 struct Problem : ProblemData<T> {
   const S n;
 
-  Problem(const MpcBatch& b, bool caller_units) : ProblemData<T>(b, caller_units), n(b) {}
+  Problem(const MpcBatch& b, bool caller_units) : ProblemData<T>(b, caller_units), n(b) {
+    this->load_rows = &ProblemData<T>::template load_sized_rows<S>;
+  }
 
   StageData<T, S> stage(int64_t k) const { return ProblemData<T>::template stage<S>(k); }
   StageData<T, S> last() const { return ProblemData<T>::template last<S>(); }
