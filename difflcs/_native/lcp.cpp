@@ -10,33 +10,36 @@
 namespace difflcs::DIFFLCS_ISA {
 namespace {
 
-// The problems in the lanes, whatever their size. T is the type of an entry of F: double where the batch shares F, else
-// Vec.
-template <class T>
-struct LcpLanes {
+// T is the type of an entry of F: double where the batch shares F, else Vec. N is the size where it is known when
+// compiling, else zero.
+template <class T, int N>
+struct Lcp {
   const LcpBatch& batch;
-  const int64_t n;
   T *F, *scale, *inverse;  // inverse of scale
   Vec *M, *q, *lam, *w, *rhs, *bound, *newton;
   Mask *active, *rows;
 
+  int64_t size() const { return N ? N : batch.n; }
+
   // Lays the arrays out in `memory`, or only counts them where it is null.
   int64_t layout(void* memory) {
+    const int64_t n = size();
     Arena arena{memory};
     arena.take(F, n * n);
     arena.take_all(n, scale, inverse, q, lam, w, rhs, bound, active, rows);
-    arena.take(newton, RelaxedLcp<T, 0, false>::scratch(n));
+    arena.take(newton, RelaxedLcp<T, N, false>::scratch(n));
     M = newton;  // of the exact solver, which is another's turn; n * n of them
     return arena.used;
   }
 
-  LcpLanes(const LcpBatch& b, void* memory) : batch(b), n(b.n) {
+  Lcp(const LcpBatch& b, void* memory) : batch(b) {
     layout(memory);
     if constexpr (sizeof(T) == sizeof(double))
       if (memory) load_matrix(0, 0);
   }
 
   void load_matrix(int64_t e, int lane) {
+    const int64_t n = size();
     const double* from = batch.F + e * batch.F_stride;
     for (int64_t i = 0; i < n; i++) {
       const double root = from[i * n + i] > 0 ? __builtin_sqrt(from[i * n + i]) : 1.0;
@@ -53,6 +56,7 @@ struct LcpLanes {
   // w = unit * S^-1 w'. Lanes past `end` repeat the last problem.
   // Returns the unit; a non-positive diagonal (not a P-matrix) is left unscaled and fails the residual test later.
   Vec load(int64_t first, int64_t end) {
+    const int64_t n = size();
     for (int l = 0; l < kLanes; l++) {
       const int64_t e = first + l < end ? first + l : end - 1;
       if constexpr (sizeof(T) != sizeof(double)) load_matrix(e, l);
@@ -66,6 +70,7 @@ struct LcpLanes {
   }
 
   void store(int64_t first, int64_t end, Vec unit, const Mask& solved) {
+    const int64_t n = size();
     for (int l = 0; l < kLanes && first + l < end; l++) {
       const int64_t e = first + l;
       for (int64_t i = 0; i < n; i++) {
@@ -78,11 +83,24 @@ struct LcpLanes {
   }
 
   // Large problems look at the watch in every iteration.
-  bool halted(Watch watch) const { return n > 32 && watch.stop(watch.context); }
+  bool halted(Watch watch) const { return size() > 32 && watch.stop(watch.context); }
+
+  void slack() { lcp_slack(size(), F, q, lam, w, bound); }
+
+  void solve(Vec* b) const {
+    const int64_t n = size();
+    Local<N> x(b);
+    DIFFLCS_UNROLL
+    for (int64_t i = 0; i < n; i++) x[i] = b[i];
+    lu_solve(n, M, x);
+    DIFFLCS_UNROLL
+    for (int64_t i = 0; i < n; i++) b[i] = x[i];
+  }
 
   // Which lanes hold a solution: lam, w and q - w + F lam as they are, by the bounds of kernels.hpp. `relaxation` is in
   // scaled units. Call after `slack` has found w and bound for this lam; `returned` is the w that the caller will get.
   Mask certified(const Vec* returned, Vec unit, Vec relaxation) const {
+    const int64_t n = size();
     const Vec root = sqrt(relaxation);
     Vec largest = all(0);  // of q, in the caller's units over `unit`
     for (int64_t i = 0; i < n; i++) largest = max(largest, (abs(q[i]) + root) * inverse[i]);
@@ -96,28 +114,6 @@ struct LcpLanes {
       ok &= (one * __builtin_sqrt(kSmallest) <= 1) & (one >= __builtin_sqrt(kSmallest));
     }
     return ok;
-  }
-};
-
-// Their solvers. N is the size where it is known when compiling, else zero.
-template <class T, int N>
-struct Lcp : LcpLanes<T> {
-  using Lanes = LcpLanes<T>;
-  using Lanes::active, Lanes::batch, Lanes::bound, Lanes::F, Lanes::lam, Lanes::M, Lanes::newton, Lanes::q, Lanes::rhs;
-  using Lanes::certified, Lanes::halted, Lanes::LcpLanes, Lanes::load, Lanes::rows, Lanes::store, Lanes::w;
-
-  int64_t size() const { return N ? N : batch.n; }
-
-  DIFFLCS_NOINLINE void slack() { lcp_slack(size(), F, q, lam, w, bound); }
-
-  DIFFLCS_NOINLINE void solve(Vec* b) const {
-    const int64_t n = size();
-    Local<N> x(b);
-    DIFFLCS_UNROLL
-    for (int64_t i = 0; i < n; i++) x[i] = b[i];
-    lu_solve(n, M, x);
-    DIFFLCS_UNROLL
-    for (int64_t i = 0; i < n; i++) b[i] = x[i];
   }
 
   void exact(int64_t begin, int64_t end, Watch watch);
@@ -224,7 +220,7 @@ void dispatch(const LcpBatch& batch, void* memory, Function f) {
 int64_t lcp_workspace(int64_t n) {
   LcpBatch batch{};
   batch.n = n;
-  const int64_t lanes = n < kAloneRelaxed ? LcpLanes<Vec>(batch, nullptr).layout(nullptr) : 0, one = LcpOne::scratch(n);
+  const int64_t lanes = n < kAloneRelaxed ? Lcp<Vec, 0>(batch, nullptr).layout(nullptr) : 0, one = LcpOne::scratch(n);
   return lanes > one ? lanes : one;
 }
 

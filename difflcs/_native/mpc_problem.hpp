@@ -200,7 +200,7 @@ struct ProblemData {
   const double* input(Input which, int64_t element, int64_t k = 0) const { return batch.at(which, element, k); }
 
   void load_matrices(int64_t e, int lane) {
-    const int64_t nl = n.l(), nx = n.x(), nw = n.w(), nc = n.c();
+    const int64_t nl = n.l(), nw = n.w();
     const auto one = [](int64_t) { return 1.0; };
     auto matrix = [&](auto to, Input which, int64_t k, auto by_row, auto by_column) {
       const double* from = input(which, e, k);
@@ -236,7 +236,7 @@ struct ProblemData {
     curvature_at_rest(
         n, [&](int64_t k) { return stage(k).B().entries; }, nw, [&](int64_t k) { return Q[k].entries; },
         Q_final.entries, [&](int64_t k) { return R[k].entries; }, scale.count == 1 && Q.count == 1, rest, lane);
-    if (nc > 0) (this->*load_rows)(e, lane);
+    if (n.c() > 0) (this->*load_rows)(e, lane);
   }
 
   // The rows of the constraints, made to have length one.
