@@ -1,5 +1,5 @@
-// Gradients of the inputs of an MPC from the directions of its solution, stage by stage (difflcs/mpc/kkt.py: `vjp`),
-// and what the adjoint reads. Nothing here knows the sizes when it is compiled.
+// Gradients of the inputs of an MPC from the directions of its solution, stage by stage (difflcs/mpc/kkt.py: `vjp`).
+// Its sizes are known at run time only, so that it is compiled once for all of them.
 #pragma once
 #include "kernels.hpp"
 #include "lanes.hpp"
@@ -30,8 +30,8 @@ struct Sink {
 
 template <class T>
 struct InputGradients {
-  // Of the Riccati sweep: the costate of the next state, the multipliers of the constraints, which actions are held at
-  // their bounds.
+  // Results of the Riccati sweep: the costate of the next state, the multipliers of the constraints, and the actions
+  // that are held at their bounds.
   struct Held {
     const Vec* p;
     Matrix<Vec, 0, 0> force;

@@ -1,5 +1,6 @@
 // How far the problems in the lanes have come: the homotopy, the damping and the multipliers of each, when it is
-// finished, and which problem takes its place. Nothing here knows the sizes when it is compiled.
+// finished, and which problem takes its place. Its sizes are known at run time only, so that it is compiled once for
+// all of them.
 #pragma once
 #include "certificate.hpp"
 #include "kernels.hpp"
