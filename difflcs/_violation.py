@@ -11,15 +11,13 @@ from torch import Tensor
 
 from difflcs._checks import check_tensor
 from difflcs._functorch import Solver
+from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.errors import GammaError, NotPositiveDefiniteError, SolveError
 from difflcs.lcp import solve_lcp_arrays
 from difflcs.records import SYSTEM
 from difflcs.status import Status
 
-# Least γ σ_min(F + Fᵀ), in parts of n_lam times the largest squared column of F (kernels.hpp has the same).
-_GAMMA_LEAST = 4e-13
-# Rounding of a sum, in parts of its terms (kernels.hpp has the same).
-_ROUNDING = 4e-16
+_GAMMA_LEAST, _ROUNDING = (_kernels.tolerances()[name] for name in ("gamma_least", "rounding"))
 # γ = "auto", in parts of its bound: at the bound itself the inner QP is singular wherever C is. A thousandth below it
 # the smallest eigenvalue of F + Fᵀ − γI is a thousandth of that of F + Fᵀ.
 AUTO = 0.999
