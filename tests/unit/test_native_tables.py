@@ -19,7 +19,7 @@ from difflcs._native import _kernels
 from difflcs.lcs import SYSTEM, LCSParams, dimensions
 from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.status import solved
-from tests.problems import Kind, random_problem
+from tests.conformance.varied.generators import random_case
 
 SOURCE = Path(difflcs.__file__).parent
 
@@ -74,16 +74,17 @@ def test_a_layer_finds_every_field_in_its_system_cost_and_bounds(build):
 
 @pytest.mark.parametrize("name", INPUTS)
 def test_the_kernels_name_the_field_that_does_not_fit(name):
-    problem = random_problem(0, Kind(horizon=2, batch=1, rows=2))
+    problem = random_case(0, batch=1).problem()
     arrays = {k: getattr(problem, k).numpy() for k in INPUTS}
     arrays[name] = np.concatenate([arrays[name], arrays[name]])
-    sizes = {"x": (1, 3, 4), "u": (1, 2, 2), "lam": (1, 2, 3)}
-    solution = {k: np.zeros(size) for k, size in {**sizes, "mu": (1, 3, 2)}.items()}
+    H = problem.horizon
+    sizes = {"x": (1, H + 1, problem.n_x), "u": (1, H, problem.n_u), "lam": (1, H, problem.n_lam)}
+    solution = {k: np.zeros(size) for k, size in {**sizes, "mu": (1, H + 1, problem.n_c)}.items()}
     upstream = {f"{k}_bar": np.zeros(size) for k, size in sizes.items()}
     with pytest.raises(ValueError, match=r"wrong (shape|size)|inconsistent"):
         _kernels.vjp_mpc(
             inputs=list(arrays.values()),
-            horizon=2,
+            horizon=H,
             relaxation=1e-5,
             barrier=0.0,
             **solution,
