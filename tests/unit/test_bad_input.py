@@ -242,7 +242,7 @@ FITS_NOT = {  # what does not fit, the error, and what it says
     "a backend that is none": (
         lambda b: layer(b, backend="gurobi"),
         e.BackendNotFoundError,
-        "expected one of .*'ipopt'.*got 'gurobi'",
+        "expected one of .*'ipopt'.*got 'gurobi'.*register_backend",
     ),
     "infinities that cancel": (
         lambda b: solve_lcp(EYE, torch.tensor([INF, -INF, 0.0]).double()),

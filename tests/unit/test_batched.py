@@ -30,29 +30,9 @@ def data(build, count, seed=1):
     return 0.05 * n(count, 9), 0.05 * n(count, 3)
 
 
-def test_an_element_depends_on_nothing_but_itself(build):
-    x0, goal = data(build, 70)
-    plan = pushing(build, 5)(x0, goal)
-    order = torch.randperm(70, generator=torch.Generator().manual_seed(0))
-    shuffled = pushing(build, 5)(x0[order], goal[order])
-    assert torch.equal(shuffled.u, plan.u[order])
-    assert torch.equal(shuffled.iterations, plan.iterations[order])
-    for i in (0, 13, 69):
-        assert torch.equal(pushing(build, 5)(x0[i], goal[i]).u, plan.u[i])
-    wild = x0.clone()
-    wild[7], wild[33] = 1e6, 1e150
-    beside = pushing(build, 5, on_failure="mask")
-    with pytest.warns(match="were not solved"):
-        disturbed = beside(wild, goal)
-    others = torch.ones(70, dtype=torch.bool)
-    others[[7, 33]] = False
-    assert torch.equal(disturbed.u[others], plan.u[others])
-    assert bool(disturbed.u.isfinite().all())
-
-
 def test_threads_change_nothing_not_even_summed_gradients(build):
     model = LCSModel.from_params(build.pushing(0, 5))
-    x0, goal = data(build, 300)
+    x0, goal = data(build, 100)
     found = []
     for threads in (1, 2, 5):
         model.zero_grad()
@@ -87,7 +67,7 @@ def test_restarts_are_seeded_and_hardly_ever_worse(build):
 
 @pytest.mark.parametrize("kind", ["pushing", "random", "untrained"])
 def test_nearly_every_problem_is_solved(build, kind):
-    x0, goal = data(build, 400)
+    x0, goal = data(build, 200)
     generator = torch.Generator().manual_seed(0)
     solved = 0
     for n_lam in (5, 8):
@@ -98,7 +78,7 @@ def test_nearly_every_problem_is_solved(build, kind):
         with torch.no_grad():
             plan = LCSMPCLayer(lcs, COST, 5, -0.015, 0.015, on_failure="mask")(x0, goal)
         solved += int(plan.converged.sum())
-    assert solved >= 799
+    assert solved >= 399
 
 
 def plans_and_gradient():
@@ -112,7 +92,7 @@ def plans_and_gradient():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("isa", ["baseline", "avx2", "avx512"])
+@pytest.mark.parametrize("isa", [isa for isa in ("baseline", "avx2", "avx512") if isa != _kernels.isa()])
 def test_every_instruction_set_finds_the_same_plans(isa):
     """Other lanes, other rounding: nearly all plans agree closely, a few meet another optimum."""
     script = [
@@ -146,13 +126,18 @@ def test_an_unknown_instruction_set_is_refused_with_the_known_ones():
     assert "DIFFLCS_ISA=mmx is not available: expected baseline, avx2 or avx512" in done.stderr
 
 
-def test_the_chosen_instruction_set_has_a_name():
-    assert _kernels.isa() in ("baseline", "avx2", "avx512")
-
-
 @pytest.mark.parametrize(
-    "options", [{"restarts": 0}, {"tol": 0.0}, {"max_iter": 0}, {"shrink": 1.0}, {"homotopy": 0.5}, {"threads": 0}]
+    "options",
+    [
+        {"restarts": 0},
+        {"tol": 0.0},
+        {"max_iter": 0},
+        {"shrink": 1.0},
+        {"homotopy": 0.5},
+        {"threads": 0},
+        {"effort": "x"},
+    ],
 )
 def test_options_out_of_range_are_refused(options):
-    with pytest.raises(InvalidInputError, match="expected"):
-        BatchedBackend(**options)
+    with pytest.raises(InvalidInputError, match=f"{name}: expected"):
+        BatchedBackend(**{name: WRONG[name]})

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSParams, QuadraticCost
-from difflcs.errors import InvalidInputError, SolveWarning
+from difflcs.errors import SolveWarning
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.systems import cart_pole_between_walls
 
@@ -80,30 +80,6 @@ def test_a_contact_that_is_far_is_found(limit, effort):
     assert float((ours <= best + 1e-3 * best.abs()).double().mean()) >= 0.9
 
 
-def test_the_scale_of_the_problem_starts_the_homotopy(build):
-    """The same problem in millimetres has the same plan: the starts do not depend on the units."""
-    lcs = build.pushing(1, 5)
-    generator = torch.Generator().manual_seed(1)
-    x0 = 0.05 * torch.randn(24, 9, generator=generator, dtype=torch.float64)
-    goal = 0.05 * torch.randn(24, 3, generator=generator, dtype=torch.float64)
-    stated = COST(goal, 5)
-    unit = 1024.0  # a power of two: the numbers are the same to the last bit
-    small = type(lcs)(
-        lcs.A, lcs.B, lcs.C, lcs.d * unit, lcs.D, lcs.E, lcs.F, lcs.c * unit
-    )  # lengths, actions and forces in parts of 1/1024
-    other = QuadraticCost(
-        stated.Q / unit**2,
-        stated.R / unit**2,
-        stated.Q_final / unit**2,
-        stated.q / unit,
-        stated.r / unit,
-        stated.q_final / unit,
-    )
-    one = LCSMPCLayer(lcs, stated, 5, -0.015, 0.015, relaxation=1e-5)(x0)
-    two = LCSMPCLayer(small, other, 5, -0.015 * unit, 0.015 * unit, relaxation=1e-5 * unit**2)(x0 * unit)
-    assert bool(((two.u / unit - one.u).abs().amax((1, 2)) < 1e-6).double().mean() >= 0.95)
-
-
 def test_a_guess_is_the_only_start_unless_the_best_is_wanted(build):
     layer = {"lcs": build.pushing(1, 8), "cost": COST, "horizon": 5, "u_min": -0.015, "u_max": 0.015}
     generator = torch.Generator().manual_seed(4)
@@ -154,8 +130,3 @@ def test_one_start_is_enough_without_contact(build):
     ]
     assert torch.equal(plans[0].u, plans[1].u)
     assert torch.equal(plans[0].iterations, plans[1].iterations)
-
-
-def test_an_effort_that_is_none_is_refused():
-    with pytest.raises(InvalidInputError, match="effort: expected one of 'fast', 'default', 'best', got 'huge'"):
-        BatchedBackend(effort="huge")  # pyright: ignore[reportArgumentType]

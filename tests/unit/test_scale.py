@@ -9,7 +9,6 @@ from difflcs import LCSModel
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.mpc.problem import MPCProblem
 
-BATCHED = BatchedBackend(threads=1)
 ONE_START = BatchedBackend(threads=1, effort="fast")
 
 
@@ -70,12 +69,3 @@ def test_iterations_hardly_grow_with_the_horizon():
     assert bool(short.solved.all())
     assert bool(long.solved.all())
     assert float(long.iterations.double().mean()) < 2.2 * float(short.iterations.double().mean())
-
-
-def test_a_large_problem_does_not_depend_on_its_neighbours():
-    together = random_problem(20, 13, 20, 20, count=3)
-    batch = BATCHED.solve(together, None).primal
-    for element in range(3):
-        alone = BATCHED.solve(together.select(torch.tensor([element])), None).primal
-        assert torch.equal(alone.u[0], batch.u[element])
-        assert torch.equal(alone.lam[0], batch.lam[element])
