@@ -159,6 +159,8 @@ def test_a_model_and_its_params_predict_the_same(build):
     x, u = n(5, 4), 0.3 * n(5, 7, 2)
     assert torch.equal(model(x, u[:, 0]).x_next, model.params().step(x, u[:, 0]).x_next)
     assert torch.equal(model.rollout(x, u), model.params().rollout(x, u))
+    assert model.rollout(x[0], u[:, :0]).shape == (5, 1, 4)
+    assert model.rollout(x[:0], u[:0]).shape == (0, 8, 4)
 
 
 @pytest.mark.parametrize("batch", [(), (3,)])
