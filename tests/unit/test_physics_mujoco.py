@@ -468,12 +468,6 @@ def test_a_falling_body_stops_at_the_floor():
     assert -0.6 < float(after[1]) < 0.0  # where it stops within the step is not known to the LCS
 
 
-def test_a_servo_gives_way_less_than_what_it_pushes():
-    module = MujocoLCS(pushing(), motion="dynamic")
-    C = module.params(tensor(0, 0, 0, -0.076, 0, *[0.0] * 5)).C
-    assert float(C[3].abs().max()) < 0.05 * float(C[0].abs().max())
-
-
 # --- as a module ----------------------------------------------------------------------------------------------------
 
 

@@ -279,15 +279,6 @@ def test_a_block_is_pushed_to_its_goal_from_the_wrong_side(start):
     assert {Mode.PUSH, Mode.TRAVEL} == set(seen)
 
 
-def test_without_other_places_the_same_mpc_does_not_find_the_way():
-    system, policy = pushing()
-    x, goal = tensor([0.0, 0.0, 0.0, 0.9, 0.0]), tensor([0.8, 0.0, 0.0])
-    for _ in range(40):
-        with torch.no_grad():
-            x = move(system, x, policy.mpc(x, goal).action)
-    assert error(x, goal.tolist()) > 0.5
-
-
 def test_two_discs_push_a_block():
     system, policy = pushing(n_discs=2, n_places=16)
     goal = [0.5, 0.0, 0.0]
