@@ -162,23 +162,7 @@ def _values(value: object, path: tuple = ()) -> Iterator[tuple]:
         yield from _values(part, (*path, key))
 
 
-_WRONG = (
-    None,
-    True,
-    -1,
-    1.5,
-    -1.5,
-    10**30,
-    -(10**30),
-    "x",
-    [],
-    [-1],
-    [True],
-    ["x"],
-    [10**30],
-    {},
-    {"state": {}},
-)
+_WRONG = (None, True, -1, 1.5, -1.5, 10**30, -(10**30), "x", [], [-1], [True], ["x"], [10**30], {}, {"state": {}})
 
 
 def _wrong_tensors(tensor: Tensor) -> Iterator[Tensor]:

@@ -45,11 +45,8 @@ def spoil(tensor, value):
 
 
 BAD_TENSORS = {
-    "int": (
-        lambda t: torch.zeros(t.shape, dtype=torch.int64),
-        e.DTypeError,
-        "expected float32 or float64, got .*int64",
-    ),
+    "int": (lambda t: torch.zeros(t.shape, dtype=torch.int64), e.DTypeError,
+     "expected float32 or float64, got .*int64"),
     "half": (lambda t: t.half(), e.DTypeError, "expected float32 or float64, got .*float16"),
     "bool": (lambda t: torch.zeros(t.shape, dtype=torch.bool), e.DTypeError, "got .*bool"),
     "complex": (lambda t: t.to(torch.complex128), e.DTypeError, "got .*complex128"),
@@ -60,14 +57,11 @@ BAD_TENSORS = {
     "nan": (lambda t: spoil(t, NAN), e.NonFiniteError, "expected finite numbers, got 1 NaN or infinite of"),
     "inf": (lambda t: spoil(t, INF), e.NonFiniteError, "expected finite numbers, got 1 NaN or infinite of"),
     "sparse": (lambda t: t.to_sparse(), e.DTypeError, "expected a dense tensor, got .*sparse_coo.*to_dense"),
-    "nested": (
-        lambda t: torch.nested.nested_tensor([t], layout=torch.jagged),
-        e.DTypeError,
-        "expected a dense tensor, got nested.*to_padded_tensor",
-    ),
+    "nested": (lambda t: torch.nested.nested_tensor([t], layout=torch.jagged), e.DTypeError,
+     "expected a dense tensor, got nested.*to_padded_tensor"),
     "negated": (lambda t: (-1j * t).conj().imag, e.DTypeError, "expected a dense tensor.*resolve_neg"),
     "wide": (lambda t: torch.cat([t, t[..., :1]], -1), e.ShapeError, "expected .*got "),
-}
+}  # fmt: skip
 # --- tensors --------------------------------------------------------------------------------------------------------
 
 SYSTEM, COST = ("A", "B", "C", "d", "D", "E", "F", "c"), ("Q", "R", "Q_final", "q", "r", "q_final")
@@ -156,100 +150,47 @@ def layer(build, **changes):
 X, ONE, EYE = torch.zeros(4).double(), torch.ones(2).double(), torch.eye(3).double()
 SKEW = torch.tensor([[1.0, 3, 0], [0, 1, 0], [0, 0, 1]]).double()
 FITS_NOT = {  # what does not fit, the error, and what it says
-    "F of another size": (
-        lambda b: solve_lcp(EYE, torch.ones(4).double()),
-        e.ShapeError,
-        r"F: expected shape \(\.\.\., n=4, n=4\), got \(3, 3\)",
-    ),
+    "F of another size": (lambda b: solve_lcp(EYE, torch.ones(4).double()), e.ShapeError,
+     r"F: expected shape \(\.\.\., n=4, n=4\), got \(3, 3\)"),
     "q without dimension": (lambda b: solve_lcp(EYE, ONE[0]), e.ShapeError, r"q: expected shape \(\.\.\., n\)"),
-    "batches of an LCP": (
-        lambda b: solve_lcp(EYE.expand(2, 3, 3), torch.ones(5, 3).double()),
-        e.ShapeError,
-        r"batch dimensions.*\(2,\).*\(5,\)|batch dimensions.*\(5,\).*\(2,\)",
-    ),
-    "a vector for a matrix": (
-        lambda b: LCSParams(**{**b.lcs_tensors(), "A": X}),
-        e.ShapeError,
-        r"A: expected a matrix .*got \(4,\)",
-    ),
+    "batches of an LCP": (lambda b: solve_lcp(EYE.expand(2, 3, 3), torch.ones(5, 3).double()), e.ShapeError,
+     r"batch dimensions.*\(2,\).*\(5,\)|batch dimensions.*\(5,\).*\(2,\)"),
+    "a vector for a matrix": (lambda b: LCSParams(**{**b.lcs_tensors(), "A": X}), e.ShapeError,
+     r"A: expected a matrix .*got \(4,\)"),
     "batches of a system": (
-        lambda b: LCSParams(**{**b.lcs_tensors(), "d": X.expand(2, 4), "c": torch.ones(5, 3).double()}),
-        e.ShapeError,
-        r"batch dimensions \(5,\) do not fit.*d \(2,\)",
-    ),
-    "mixed dtypes": (
-        lambda b: LCSParams(**{**b.lcs_tensors(), "B": torch.zeros(4, 2)}),
-        e.DTypeError,
-        "float32.*float64|float64.*float32",
-    ),
-    "batches of a loss": (
-        lambda b: violation_loss(b.model(), X.expand(5, 4), ONE.expand(3, 2), X.expand(5, 4)),
-        e.ShapeError,
-        r"batch dimensions \(3,\) do not fit",
-    ),
-    "data of another dtype": (
-        lambda b: b.model()(X.float(), ONE),
-        e.DTypeError,
-        r"x: expected torch.float64 like the model, got .*float32.*model.to\(torch.float32\)",
-    ),
-    "a sequence without steps": (
-        lambda b: b.model().rollout(X, ONE),
-        e.ShapeError,
-        r"u_seq: expected shape \(\.\.\., T, n_u=2\), got \(2,\)",
-    ),
-    "another dtype of a model": (
-        lambda b: LCSModel(2, 2, 2, dtype=torch.float16),
-        e.DTypeError,
-        "dtype: expected torch.float32 or torch.float64, got torch.float16",
-    ),
-    "a guess of another horizon": (
-        lambda b: layer(b)(X, guess=layer(b, horizon=3)(X)),
-        e.ShapeError,
-        r"guess.x: expected shape \(\.\.\., H\+1=3, n_x=4\), got \(4, 4\)",
-    ),
-    "a guess of another batch": (
-        lambda b: layer(b)(X.expand(3, 4), guess=layer(b)(X.expand(2, 4))),
-        e.ShapeError,
-        r"guess.x: expected batch dimensions \(3,\) like x0, got \(2,\)",
-    ),
+     lambda b: LCSParams(**{**b.lcs_tensors(), "d": X.expand(2, 4), "c": torch.ones(5, 3).double()}), e.ShapeError,
+     r"batch dimensions \(5,\) do not fit.*d \(2,\)"),
+    "mixed dtypes": (lambda b: LCSParams(**{**b.lcs_tensors(), "B": torch.zeros(4, 2)}), e.DTypeError,
+     "float32.*float64|float64.*float32"),
+    "batches of a loss": (lambda b: violation_loss(b.model(), X.expand(5, 4), ONE.expand(3, 2), X.expand(5, 4)),
+     e.ShapeError, r"batch dimensions \(3,\) do not fit"),
+    "data of another dtype": (lambda b: b.model()(X.float(), ONE), e.DTypeError,
+     r"x: expected torch.float64 like the model, got .*float32.*model.to\(torch.float32\)"),
+    "a sequence without steps": (lambda b: b.model().rollout(X, ONE), e.ShapeError,
+     r"u_seq: expected shape \(\.\.\., T, n_u=2\), got \(2,\)"),
+    "another dtype of a model": (lambda b: LCSModel(2, 2, 2, dtype=torch.float16), e.DTypeError,
+     "dtype: expected torch.float32 or torch.float64, got torch.float16"),
+    "a guess of another horizon": (lambda b: layer(b)(X, guess=layer(b, horizon=3)(X)), e.ShapeError,
+     r"guess.x: expected shape \(\.\.\., H\+1=3, n_x=4\), got \(4, 4\)"),
+    "a guess of another batch": (lambda b: layer(b)(X.expand(3, 4), guess=layer(b)(X.expand(2, 4))), e.ShapeError,
+     r"guess.x: expected batch dimensions \(3,\) like x0, got \(2,\)"),
     "no guess": (lambda b: layer(b)(X, guess=X), e.DTypeError, "guess: expected an MPCSolution or a Primal"),
-    "no mode": (
-        lambda b: layer(b, on_failure="ignore"),
-        e.InvalidInputError,
-        "on_failure: expected one of 'raise', 'mask', got 'ignore'",
-    ),
-    "no LCS": (
-        lambda b: layer(b, lcs=nn.Linear(2, 2)),
-        e.DTypeError,
-        r"lcs: expected LCSModel, LCSParams, LCSSequence or another LCSModule, got Linear.*; a module needs",
-    ),
-    "no cost": (
-        lambda b: layer(b)(X, cost=len),
-        e.DTypeError,
-        "cost: expected GoalCost, QuadraticCost or CostSequence, got builtin.*; build one",
-    ),
+    "no mode": (lambda b: layer(b, on_failure="ignore"), e.InvalidInputError,
+     "on_failure: expected one of 'raise', 'mask', got 'ignore'"),
+    "no LCS": (lambda b: layer(b, lcs=nn.Linear(2, 2)), e.DTypeError,
+     r"lcs: expected LCSModel, LCSParams, LCSSequence or another LCSModule, got Linear.*; a module needs"),
+    "no cost": (lambda b: layer(b)(X, cost=len), e.DTypeError,
+     "cost: expected GoalCost, QuadraticCost or CostSequence, got builtin.*; build one"),
     "a cost of other states": (lambda b: layer(b, cost=b.cost(n_x=5)), e.ShapeError, "n_x=4, n_u=2 like.*n_x=5, n_u=2"),
-    "a cost of other actions": (
-        lambda b: layer(b, cost=b.cost(n_u=3)),
-        e.ShapeError,
-        "n_x=4, n_u=2 like.*n_x=4, n_u=3",
-    ),
-    "batches of a layer": (
-        lambda b: layer(b, lcs=b.params(batch=(2,)))(X.expand(3, 4)),
-        e.ShapeError,
-        r"batch dimensions .* do not fit.*x0 \(3,\)",
-    ),
-    "a backend that is none": (
-        lambda b: layer(b, backend="gurobi"),
-        e.BackendNotFoundError,
-        "expected one of .*'ipopt'.*got 'gurobi'.*register_backend",
-    ),
-    "infinities that cancel": (
-        lambda b: solve_lcp(EYE, torch.tensor([INF, -INF, 0.0]).double()),
-        e.NonFiniteError,
-        "q: expected finite numbers, got 2",
-    ),
-}
+    "a cost of other actions": (lambda b: layer(b, cost=b.cost(n_u=3)), e.ShapeError,
+     "n_x=4, n_u=2 like.*n_x=4, n_u=3"),
+    "batches of a layer": (lambda b: layer(b, lcs=b.params(batch=(2,)))(X.expand(3, 4)), e.ShapeError,
+     r"batch dimensions .* do not fit.*x0 \(3,\)"),
+    "a backend that is none": (lambda b: layer(b, backend="gurobi"), e.BackendNotFoundError,
+     "expected one of .*'ipopt'.*got 'gurobi'.*register_backend"),
+    "infinities that cancel": (lambda b: solve_lcp(EYE, torch.tensor([INF, -INF, 0.0]).double()), e.NonFiniteError,
+     "q: expected finite numbers, got 2"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", FITS_NOT)

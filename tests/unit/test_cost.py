@@ -229,27 +229,18 @@ def test_a_sequence_knows_its_stages(build):
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        (
-            {"q": torch.zeros(4).double()},
-            ShapeError,
-            r"q: expected a dimension of stages .*got \(4,\).*; say by by_stage",
-        ),
+        ({"q": torch.zeros(4).double()}, ShapeError,
+         r"q: expected a dimension of stages .*got \(4,\).*; say by by_stage"),
         ({"q": torch.zeros(5, 4).double()}, ShapeError, r"q: expected 3 stages, .* like Q, got 5.*; give as many"),
-        (
-            {"by_stage": ("Q_final",)},
-            InvalidInputError,
-            "by_stage: expected names among Q, R, q, r, S, got str 'Q_final'",
-        ),
+        ({"by_stage": ("Q_final",)}, InvalidInputError,
+         "by_stage: expected names among Q, R, q, r, S, got str 'Q_final'"),
         ({"by_stage": "q"}, DTypeError, "by_stage: expected a tuple of names .*got str .q.; add a comma"),
-        (
-            {"by_stage": ()},
-            InvalidInputError,
-            "by_stage: expected at least one field by stage, got none.*; use the class",
-        ),
+        ({"by_stage": ()}, InvalidInputError,
+         "by_stage: expected at least one field by stage, got none.*; use the class"),
         ({"Q": -torch.ones(3, 4, 4).double()}, InvalidInputError, "Q: expected a positive semi-definite"),
         ({"S": torch.zeros(3, 2, 4).double()}, ShapeError, r"S: expected shape \(\.\.\., n_x=4, n_u=2\)"),
     ],
-)
+)  # fmt: skip
 def test_a_sequence_refuses_what_does_not_fit(build, change, error, message):
     with pytest.raises(error, match=message):
         CostSequence(**by_stage(build, **change))

@@ -495,6 +495,18 @@ def test_impacts_never_add_energy(seconds, friction, compliance):
     assert float((found - found.cummin(0).values).max()) < 1e-3
 
 
+def test_discs_with_mass_are_pushed_back():
+    system = pushing(**DRIVES["force"], n_discs=1)
+    x = torch.zeros(system.n_x, dtype=F64)
+    x[3], x[5] = -0.0401, 0.5  # a disc that flies at the body with 0.5 m/s
+    after = system.params(x).step(x, torch.zeros(2, dtype=F64)).x_next
+    body, disc = float(after[-3]), float(after[5])
+    assert body > 0.1
+    assert abs(body - disc) < 0.01  # an inelastic collision
+    # Momentum, but for the damping of a step: the disc loses 0.2 (e^-0.05 · 0.5 − v), the body gains 0.1 v.
+    torch.testing.assert_close(tensor(0.2 * (math.exp(-0.05) * 0.5 - disc)), tensor(0.1 * body), rtol=1e-6, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("wrong", "error", "match"),
     [({"radius": tensor([0.1, 0.1, 0.1])}, ShapeError, "radius: expected a number or"),

@@ -347,16 +347,6 @@ def test_mobility_by_damping_or_by_numbers():
     assert not fixed.params(x).C[1:].any()
 
 
-def test_actions_become_controls_of_the_servos():
-    model = pushing(SERVOS.replace('joint="py"', 'joint="py" gear="2"'))
-    module = MujocoLCS(model)
-    x, u = tensor(0.2, 0.0, 0.0, -0.08, 0.03), tensor(0.01, -0.02)
-    ctrl = module.control(x, u)
-    torch.testing.assert_close(ctrl, tensor(-0.07, 0.02))
-    after, _ = step(model, x.numpy(), ctrl=ctrl.numpy())
-    np.testing.assert_allclose(after[3:], (x[3:] + u).numpy(), atol=2e-4)
-
-
 @pytest.mark.parametrize("bias", ["40 -400 -40", "0 -400 -40"])
 def test_a_servo_with_a_constant_force_goes_where_it_is_told(bias):
     model = load(
