@@ -64,7 +64,7 @@ BAD_TENSORS = {
 }  # fmt: skip
 # --- tensors --------------------------------------------------------------------------------------------------------
 
-SYSTEM, COST = ("A", "B", "C", "d", "D", "E", "F", "c"), ("Q", "R", "Q_final", "q", "r", "q_final")
+SYSTEM, COST = ("A", "B", "C", "d", "D", "E", "F", "c"), ("Q", "R", "S", "Q_final", "q", "r", "q_final")
 ENTRIES = {
     "solve_lcp": ("F", "q"),
     "LCSParams": SYSTEM,
@@ -78,9 +78,9 @@ ENTRIES = {
     "call": ("x0", "u_min", "u_max", "goal"),
     "guess": ("x", "u", "lam"),
 }
-# None is no bound, and so is infinity on the right side; None is zero for linear terms. Sizes are said by the last
-# dimension of q, A, B and F: where these are wider, another argument is blamed.
-NO_MISTAKE = {("none", "q"), ("none", "r"), ("none", "q_final")}
+# None is no bound, and so is infinity on the right side; None is zero for S and linear terms. Sizes are said by the
+# last dimension of q, A, B and F: where these are wider, another argument is blamed.
+NO_MISTAKE = {("none", name) for name in ("S", "q", "r", "q_final")}
 NO_MISTAKE |= {(bad, name) for bad in ("none", "inf", "nan") for name in ("u_min", "u_max")}
 OTHER_BLAMED = {("solve_lcp", "q"), ("LCSParams", "A"), ("LCSParams", "B"), ("LCSParams", "F")}
 
@@ -99,7 +99,7 @@ def entry(build, name, model):
         "prediction_loss": (lambda **t: prediction_loss(model, **t), {"x": x, "u": u, "x_next": x}),
         "forward": (model, {"x": x, "u": u}),
         "rollout": (model.rollout, {"x0": x, "u_seq": n(5, 3, 2)}),
-        "QuadraticCost": (QuadraticCost, build.cost_tensors()),
+        "QuadraticCost": (QuadraticCost, build.cost_tensors() | {"S": torch.zeros(4, 2).double()}),
         "GoalCost": (reach, {"goal": goal}),
         "layer": (lambda **t: layer(build, **t), limits),
         "call": (layer(build, lcs=model, cost=reach), {"x0": x, "goal": goal, **limits}),

@@ -12,7 +12,7 @@ import torch
 
 mujoco = pytest.importorskip("mujoco")
 
-from difflcs import GoalCost, LCSModule, LCSMPCLayer  # noqa: E402
+from difflcs import LCSModule  # noqa: E402
 from difflcs.errors import (  # noqa: E402
     ContactWarning,
     DTypeError,
@@ -511,16 +511,6 @@ def test_bodies_that_mocap_moves_are_where_the_data_has_them():
     assert float(
         MujocoLCS(model, data, motion="dynamic", distance=5.0).contacts(torch.zeros(4).double()).gap
     ) == pytest.approx(0.8)
-
-
-def test_an_mpc_pushes_the_box_to_its_goal():
-    module = MujocoLCS(pushing())
-    cost = GoalCost.reach(5, 2, goal_weight=(100.0, 100.0, 0.3), input_weight=0.1)
-    mpc = LCSMPCLayer(module, cost, 6, -0.02, 0.02, relaxation=1e-5)
-    x, goal = tensor(0.0, 0.0, 0.0, -0.078, 0.0), tensor(0.05, 0.0, 0.0)
-    for _ in range(8):
-        x = module.params(x).step(x, mpc(x, goal).action).x_next
-    assert (x[:3] - goal).abs().max() < 3e-3
 
 
 # --- what is refused ------------------------------------------------------------------------------------------------

@@ -166,16 +166,12 @@ def test_nothing_is_to_be_gained_at_the_goal():
     assert float(policy.decision.gains.max()) < 1e-6
 
 
-def test_a_place_that_is_not_allowed_is_not_chosen():
-    policy = on_a_line(Sides(allowed=(True, False)))
-    policy.act([0.0, 0.51], [1.0])
+@pytest.mark.parametrize("right", [True, False])
+def test_a_place_that_is_not_allowed_is_not_chosen(right):
+    policy = on_a_line(Sides(allowed=(right, False)))
+    u = policy.act([0.0, 0.51], [1.0])
     assert policy.decision.chosen != 2
     assert float(policy.decision.scores[2]) == -math.inf
-
-
-def test_where_no_place_is_allowed_it_stays():
-    policy = on_a_line(Sides(allowed=(False, False)))
-    u = policy.act([0.0, 0.51], [1.0])
     assert policy.decision.mode is Mode.PUSH
     assert np.isfinite(u).all()
 

@@ -9,32 +9,24 @@ import warnings
 import pytest
 import torch
 
-from difflcs import LCSMPCLayer, LCSParams, QuadraticCost, Status, available_backends
+from difflcs import Status, available_backends
 from difflcs.errors import DTypeError, InvalidInputError, SolveWarning
 from difflcs.mpc import MPCProblem, Primal
 from difflcs.mpc.backends import RelaxedBackend, get_backend
+from tests.conformance.test_backends import Problem, badly_scaled, contact, make
+from tests.conformance.test_backends import solve as solve_problem
 
 pytestmark = pytest.mark.skipif(
     bool(RelaxedBackend.missing()), reason="cvxpy and cvxpylayers are not installed: pip install 'difflcs[relaxed]'"
 )
 
-LCS, COST = ("A", "B", "C", "d", "D", "E", "F", "c"), ("Q", "R", "Q_final", "q", "r", "q_final")
+
+def tensors(build, **options):
+    return make(build, **{"batch": 4, **options}).tensors
 
 
-def tensors(build, seed=0, batch=4, bound=0.15, **sizes):
-    n_x, n_u = sizes.get("n_x", 4), sizes.get("n_u", 2)
-    limit = torch.full((n_u,), bound, dtype=torch.float64)
-    cost = build.cost_tensors(seed, n_x=n_x, n_u=n_u)
-    x0 = 0.2 * build.normal(seed + 7)(batch, n_x)
-    return {**build.lcs_tensors(seed, **sizes), **cost, "u_min": -limit, "u_max": limit, "x0": x0}
-
-
-def solve(t, backend="relaxed", horizon=3, guess=None, **options):
-    layer = LCSMPCLayer(
-        LCSParams(**{k: t[k] for k in LCS}), QuadraticCost(**{k: t[k] for k in COST}, check=False),
-        horizon, t["u_min"], t["u_max"], backend=backend, relaxation=1e-4, **options,
-    )  # fmt: skip
-    return layer(t["x0"], guess=guess)
+def solve(t, backend="relaxed", guess=None, **options):
+    return solve_problem(Problem(t), backend, guess=guess, **options)
 
 
 def without_contact(build, **options):
@@ -103,16 +95,9 @@ def test_a_huge_penalty_around_the_exact_plan_keeps_it(build):
 
 
 def test_the_plan_does_not_depend_on_units(build):
-    t = tensors(build)
-    X, U, S = (torch.tensor(v, dtype=torch.float64) for v in ([1e2, 1e-2, 1.0, 3.0], [1e-2, 10.0], [1e2, 1e-2, 3.0]))
-    scaled = {
-        "A": X[:, None] * t["A"] / X, "B": X[:, None] * t["B"] / U, "C": X[:, None] * t["C"] * S, "d": X * t["d"],
-        "D": S[:, None] * t["D"] / X, "E": S[:, None] * t["E"] / U, "F": S[:, None] * t["F"] * S, "c": S * t["c"],
-        "Q": t["Q"] / X / X[:, None], "R": t["R"] / U / U[:, None], "Q_final": t["Q_final"] / X / X[:, None],
-        "q": t["q"] / X, "r": t["r"] / U, "q_final": t["q_final"] / X,
-        "u_min": U * t["u_min"], "u_max": U * t["u_max"], "x0": X * t["x0"],
-    }  # fmt: skip
-    torch.testing.assert_close(solve(scaled).u / U, solve(t).u, rtol=1e-6, atol=1e-8)
+    scaled = badly_scaled(build).tensors
+    U, plain = scaled["u_max"] / 0.15, contact(build).tensors
+    torch.testing.assert_close(solve(scaled).u / U, solve(plain).u, rtol=1e-6, atol=1e-8)
 
 
 def test_bounds_of_the_actions_hold_with_a_barrier_too(build):
