@@ -96,8 +96,8 @@ def x0(build):
 
 
 def make_layer(build, seed=3, **options):
-    options = {"lcs": build.params(seed), "backend": SOLVER, "relaxation": 1e-4, **options}
-    return LCSMPCLayer(cost=build.cost(seed), horizon=3, u_min=-0.15, u_max=0.15, **options)
+    options = {"lcs": build.params(seed), "cost": build.cost(seed), "backend": SOLVER, "relaxation": 1e-4, **options}
+    return LCSMPCLayer(horizon=3, u_min=-0.15, u_max=0.15, **options)
 
 
 # --- shapes ---------------------------------------------------------------------------------------------------------
@@ -257,15 +257,16 @@ def test_raise_names_the_elements_and_their_status(build, x0):
 def test_mask_gives_the_failed_no_gradient_and_leaves_the_others_alone(build, x0, fail, garbage):
     others, results = [i for i in range(6) if i not in fail], []
     for backend, start in ((Flaky(), x0[others]), (Flaky(fail=fail, garbage=garbage), x0)):
-        layer = make_layer(build, seed=3, lcs=build.model(seed=3, scale=0.4), backend=backend, on_failure="mask")
+        cost = QuadraticCost(**build.cost_tensors(3), constant=nn.Parameter(torch.zeros(()).double()))
+        layer = make_layer(build, 3, lcs=build.model(3, scale=0.4), cost=cost, backend=backend, on_failure="mask")
         start = start.clone().requires_grad_()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", SolveWarning)
             solution = layer(start)
-        upstream = torch.where(solution.converged[:, None, None], solution.u.detach(), torch.nan)
-        total = solution.objective.sum() + solution.x.sum() + solution.lam.sum()
-        torch.autograd.backward((solution.u, total), (upstream, torch.ones_like(total)))
-        results.append((solution, start.grad, [p.grad for p in layer.lcs.parameters()]))
+        outputs = (solution.x, solution.u, solution.lam, solution.objective)
+        solved = solution.converged.nonzero()[:, 0]  # what comes from elsewhere for the others is NaN
+        torch.autograd.backward(outputs, [torch.full_like(v, torch.nan).index_fill(0, solved, 1.0) for v in outputs])
+        results.append((solution, start.grad, [p.grad for p in layer.parameters()]))
     (good, good_grad, good_shared), (bad, bad_grad, bad_shared) = results
     for name in ("x", "u", "lam", "objective", "status", "kkt_residual"):
         assert torch.equal(getattr(bad, name)[others], getattr(good, name))
