@@ -93,19 +93,19 @@ def entry(build, name, model):
     reach = GoalCost.reach(4, 2, goal_weight=(1.0, 1.0, 1.0))
     plan = {"x": torch.zeros(5, 3, 4).double(), "u": torch.zeros(5, 2, 2).double(), "lam": torch.ones(5, 2, 3).double()}
     table = {
-        "solve_lcp": (solve_lcp, {"F": torch.eye(3).double(), "q": torch.ones(2, 3).double()}),
-        "LCSParams": (LCSParams, build.lcs_tensors()),
-        "violation_loss": (lambda **t: violation_loss(model, **t), {"x": x, "u": u, "x_next": x}),
-        "prediction_loss": (lambda **t: prediction_loss(model, **t), {"x": x, "u": u, "x_next": x}),
-        "forward": (model, {"x": x, "u": u}),
-        "rollout": (model.rollout, {"x0": x, "u_seq": n(5, 3, 2)}),
-        "QuadraticCost": (QuadraticCost, build.cost_tensors() | {"S": torch.zeros(4, 2).double()}),
-        "GoalCost": (reach, {"goal": goal}),
-        "layer": (lambda **t: layer(build, **t), limits),
-        "call": (layer(build, lcs=model, cost=reach), {"x0": x, "goal": goal, **limits}),
-        "guess": (lambda **t: layer(build, lcs=model)(x, guess=Primal(**t)), plan),
+        "solve_lcp": lambda: (solve_lcp, {"F": torch.eye(3).double(), "q": torch.ones(2, 3).double()}),
+        "LCSParams": lambda: (LCSParams, build.lcs_tensors()),
+        "violation_loss": lambda: (lambda **t: violation_loss(model, **t), {"x": x, "u": u, "x_next": x}),
+        "prediction_loss": lambda: (lambda **t: prediction_loss(model, **t), {"x": x, "u": u, "x_next": x}),
+        "forward": lambda: (model, {"x": x, "u": u}),
+        "rollout": lambda: (model.rollout, {"x0": x, "u_seq": n(5, 3, 2)}),
+        "QuadraticCost": lambda: (QuadraticCost, build.cost_tensors() | {"S": torch.zeros(4, 2).double()}),
+        "GoalCost": lambda: (reach, {"goal": goal}),
+        "layer": lambda: (lambda **t: layer(build, **t), limits),
+        "call": lambda: (layer(build, lcs=model, cost=reach), {"x0": x, "goal": goal, **limits}),
+        "guess": lambda: (lambda **t: layer(build, lcs=model)(x, guess=Primal(**t)), plan),
     }
-    return table[name]
+    return table[name]()
 
 
 BAD_INPUTS = [
