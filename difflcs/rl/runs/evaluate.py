@@ -14,8 +14,8 @@ from torch import Tensor
 from difflcs._checks import check_positive_int
 from difflcs.errors import InvalidInputError
 from difflcs.lcs import LCSModule, LCSParams
-from difflcs.rl.runs.delay import late_actions, predicted_by
 from difflcs.rl.rollout import Policy, action_bounds, collect, mpc_actions
+from difflcs.rl.runs.delay import late_actions, predicted_by
 from difflcs.rl.seeding import Stream, episode_seeds
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from difflcs._files import write_atomically
-from difflcs.errors import DiffLCSError, InvalidInputError
 from difflcs._optional import require
+from difflcs.errors import DiffLCSError, InvalidInputError
 from difflcs.rl.rollout import CONTEXT, Policy, mpc_actions
 
 if TYPE_CHECKING:

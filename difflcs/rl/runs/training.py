@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from difflcs._files import check_path, short, write_json
+from difflcs._optional import require, versions
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.lcs import LCSModel
-from difflcs._optional import require, versions
-from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, replacing, save_checkpoint, writing
-from difflcs.rl.runs.evaluate import Evaluation, evaluate
+from difflcs.rl.learning.trainer import Trainer, save_learned
 from difflcs.rl.methods import LCSMethod, LCSRLMethod, Method, Work, check_fits, get_method
 from difflcs.rl.rollout import Policy
+from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, replacing, save_checkpoint, writing
+from difflcs.rl.runs.evaluate import Evaluation, evaluate
 from difflcs.rl.settings import Settings, bounded, from_json
 from difflcs.rl.tasks import TaskSpec, get_task
-from difflcs.rl.learning.trainer import Trainer, save_learned
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
