@@ -394,8 +394,9 @@ def test_masked_elements_add_nothing_to_the_gradient_of_shared_parameters(build,
 def test_nan_upstream_of_a_failed_element_does_not_spread(build, x0):
     layer = make_layer(build, backend=Flaky(fail=(2,)), on_failure="mask")
     start = x0.clone().requires_grad_()
-    with pytest.warns(SolveWarning):
+    with pytest.warns(SolveWarning) as said:
         u = layer(start).u
+    assert said[0].filename == __file__
     upstream = torch.ones_like(u)
     upstream[2] = torch.nan
     u.backward(upstream)

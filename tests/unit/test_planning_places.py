@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import functools
 import math
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -13,6 +15,7 @@ from hypothesis import strategies as st
 from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics import Circle, PDDrive, PlanarPushing, Polygon, Union, box
 from difflcs.planning import DiscPlaces, LiftTravel, PlanarTravel, Workspace
+from difflcs.planning.films import picture
 from difflcs.planning.outline import clearance, ring
 from difflcs.planning.pusht import CENTER_OF_MASS, DRIVE, GYRATION, PushTPolicy, from_origin, tee, tee_pushing
 
@@ -226,6 +229,14 @@ def test_a_policy_for_push_t_sends_the_disc_to_places_in_the_plane():
     assert target.shape == (2,)
     assert ((target >= 0) & (target <= 512)).all()
     assert policy.sampling.decision.mode == "travel"
+
+
+def test_a_picture_shows_what_was_decided():
+    pytest.importorskip("PIL")
+    env, policy = SimpleNamespace(render=lambda: np.zeros((96, 96, 3), np.uint8)), PushTPolicy()
+    plain = picture(env, policy)
+    policy.act([400.0, 400.0, 256.0, 256.0, 0.0])
+    assert picture(env, policy) != plain
 
 
 def test_actions_that_come_late_are_planned_from_where_things_will_be():
