@@ -82,7 +82,7 @@ sanitize:
 # MUTANTS small faults below FROM, drawn with SEED, put into the working tree one after the other. Minutes for each.
 MUTANTS := 60
 SEED := 43
-FROM :=
+FROM := difflcs envs/difflcs_envs
 TESTS := $(QUICK)
 SESSION := build/mutants.sqlite
 .PHONY: coverage mutants
@@ -93,7 +93,8 @@ coverage: $(VENV)/.ready
 mutants: $(VENV)/.ready
 	$(BIN)/python -m pip install --quiet -c constraints.txt cosmic-ray==8.7.0
 	@mkdir -p build
-	$(BIN)/cosmic-ray init --force tests/mutants.toml $(SESSION)
-	$(BIN)/python tests/draw_mutants.py $(SESSION) "$(FROM)" $(MUTANTS) $(SEED)
-	PATH="$(CURDIR)/$(BIN):$$PATH" TESTS='$(TESTS)' $(BIN)/cosmic-ray exec tests/mutants.toml $(SESSION)
+	sed 's|^module-path.*|module-path = [$(FROM:%="%",)]|' tests/mutants.toml > build/mutants.toml
+	$(BIN)/cosmic-ray init --force build/mutants.toml $(SESSION)
+	$(BIN)/python tests/draw_mutants.py $(SESSION) $(MUTANTS) $(SEED)
+	PATH="$(CURDIR)/$(BIN):$$PATH" TESTS='$(TESTS)' $(BIN)/cosmic-ray exec build/mutants.toml $(SESSION)
 	$(BIN)/cr-report --surviving-only --show-diff $(SESSION)

@@ -1,16 +1,15 @@
-"""Leave a few of the mutants in a cosmic-ray session, drawn with a seed: draw_mutants.py SESSION PATH COUNT SEED."""
+"""Leave a few of the mutants in a cosmic-ray session, drawn with a seed: draw_mutants.py SESSION COUNT SEED."""
 
 import random
 import sqlite3
 import sys
 
-session, path, count, seed = sys.argv[1:]
+session, count, seed = sys.argv[1:]
 with sqlite3.connect(session) as db:
     # Without `|`, which is mostly in annotations, and without `is` for `==`, which small integers do not feel.
     mutants = db.execute(
-        "SELECT module_path, start_pos_row, start_pos_col, operator_name, occurrence, job_id FROM mutation_specs WHERE "
-        "module_path LIKE ? AND operator_name NOT GLOB '*BitOr*' AND operator_name NOT GLOB '*_Is*' ORDER BY 1,2,3,4,5",
-        [path + "%"],
+        "SELECT module_path, start_pos_row, start_pos_col, operator_name, occurrence, job_id FROM mutation_specs "
+        "WHERE operator_name NOT GLOB '*BitOr*' AND operator_name NOT GLOB '*_Is*' ORDER BY 1, 2, 3, 4, 5"
     ).fetchall()
     random.seed(int(seed))
     random.shuffle(mutants)
