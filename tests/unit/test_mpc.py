@@ -282,8 +282,9 @@ def test_mask_gives_the_failed_no_gradient_and_leaves_the_others_alone(build, x0
 
 def test_mask_warns_once_per_layer(build, x0):
     layer = make_layer(build, backend=Flaky(fail=(1,)), on_failure="mask")
-    with pytest.warns(SolveWarning, match=r"1 of 6 .*MAX_ITER.*element.* 1.*gradient is zero.*warns once"):
+    with pytest.warns(SolveWarning, match=r"1 of 6 .*MAX_ITER.*element.* 1.*gradient is zero.*warns once") as said:
         layer(x0)
+    assert said[0].filename == __file__
     layer(x0)  # filterwarnings = error would raise here
 
 

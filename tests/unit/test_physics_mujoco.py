@@ -108,6 +108,8 @@ def test_states_go_to_mujoco_and_back(seed):
         again[q : q + 4] *= np.sign(again[q : q + 4] @ qpos[q : q + 4])
     np.testing.assert_allclose(again, qpos, atol=1e-12)
     np.testing.assert_array_equal(velocity, qvel)
+    both = state.to_state(np.stack([reference, qpos]), np.stack([qvel, qvel]))
+    torch.testing.assert_close(both, torch.stack([state.to_state(place, qvel) for place in (reference, qpos)]))
 
 
 def test_states_of_slides_and_hinges_are_qpos_whatever_the_batch():
