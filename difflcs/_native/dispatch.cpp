@@ -26,7 +26,7 @@ void mpc_solve(const MpcBatch&, const MpcSolve&, int64_t*, void*, Watch);
   void mpc_vjp(const MpcBatch&, const MpcGradient&, int64_t, int64_t, int64_t, void*, Watch);                         \
   int64_t violation_workspace(const ViolationBatch&);                                                                 \
   bool violation_qp(const ViolationBatch&, double*, double*, void*);                                                  \
-  bool violation_value(const ViolationBatch&, const double*, double*, void*);                                         \
+  int64_t violation_value(const ViolationBatch&, const double*, double*, void*);                                      \
   void violation_gradient(const ViolationBatch&, const double*, const double*, double* const*, void*);                \
   static const Kernels table = {                                                                                      \
       #ISA,    LANES, lcp_workspace,   lcp_solve, mpc_workspace,       mpc_solve,                                     \
