@@ -12,6 +12,7 @@ from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_choice, check_number, check_tensor, describe, is_array
 from difflcs._differentiation import Solver, runs_eagerly, solve, transforms_active
+from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.errors import DTypeError, GammaError, InvalidInputError, NotPositiveDefiniteError, SolveError
 from difflcs.lcp import MAX_ITER, solve_lcp_arrays
 from difflcs.lcs import SYSTEM, LCSModel, LCSModule, LCSParams, is_plain
@@ -86,7 +87,9 @@ def violation_loss(
         # 190 µs for the loss of 100 transitions and its gradient.
         with torch.no_grad():
             F = lcs.F
-        system, factors = (lcs.A, lcs.B, lcs.C, lcs.d, lcs.D, lcs.E, F, lcs.c), (lcs.G, lcs.H)
+        made_of = lcs._parameters  # attributes, one by one, would take 5 µs
+        system = tuple([F if name == "F" else made_of[name] for name in SYSTEM])
+        factors = (made_of["G"], made_of["H"])
         if _plain(lcs, system, data):
             return _violation_loss(system, data, x.shape[:-1], gamma, xi, reduction, factors)
         lcs.check_inputs(x=x, u=u, x_next=x_next)
@@ -184,10 +187,13 @@ def _for_each(value: Tensor, batch: torch.Size, rank: int) -> Tensor:
 
 def _plain(lcs: LCSModel, system: tuple[Tensor, ...], data: tuple[Tensor, ...]) -> bool:
     """Whether these are float64 matrices on the CPU that fit each other: then the kernel can look at the numbers."""
-    if not all(is_array(v) and v.dtype is torch.float64 for v in (*system, *data)):
-        return False
-    count = data[0].shape[0] if data[0].ndim else 0
-    return all(v.shape == (count, n) for v, n in zip(data, (lcs.n_x, lcs.n_u, lcs.n_x), strict=True))
+    for value in system:
+        if value.dtype is not torch.float64 or not value.is_cpu or value.layout is not torch.strided:
+            return False
+    for value, size in zip(data, (lcs.n_x, lcs.n_u, lcs.n_x), strict=True):
+        if not is_array(value) or value.dtype is not torch.float64 or value.shape != (len(data[0]), size):
+            return False
+    return True
 
 
 def _violation_loss(
@@ -243,12 +249,12 @@ class _Transitions(Solver):
         return (*_RANKS, *((0,) if self.gamma is None else (2, 2) if self.factored else ()))
 
     def solve(self, tensors: Sequence[Tensor], transformed: bool) -> tuple[Tensor, ...]:
-        from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
-
         arrays = self._arrays(tensors)
         x, c = arrays[8], arrays[7]
         count, n = len(x), c.shape[-1]
-        shared = not arrays[11].ndim and all([a.ndim == rank for a, rank in zip(arrays[:8], _RANKS, strict=False)])
+        shared = self.factored or (
+            not arrays[11].ndim and all([a.ndim == rank for a, rank in zip(arrays[:8], _RANKS, strict=False)])
+        )
         Q = np.empty((2 * n, 2 * n) if shared else (count, 2 * n, 2 * n))
         q, z, r = np.empty((count, 2 * n)), np.empty((count, 2 * n)), np.empty(x.shape)
         e, loss = np.empty((count, n)), np.empty(count)
@@ -279,8 +285,6 @@ class _Transitions(Solver):
         grads: Sequence[Tensor | None],
         needs: Sequence[bool],
     ) -> Sequence[Tensor | None]:
-        from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
-
         # Under a transform, inputs that were shared in the solve may now be of each element.
         arrays = self._arrays(tensors) if self.arrays is None else self.arrays
         (upstream,) = grads
@@ -288,8 +292,7 @@ class _Transitions(Solver):
         bar, count = upstream.numpy(force=True), len(arrays[8])
         if self.mean:
             bar = np.full(count, bar / max(count, 1))
-        gradients = [np.empty(v.shape) for v in arrays[:8]]
-        gradients += [np.empty(v.shape) if need else None for v, need in zip(arrays[8:11], needs[8:11], strict=True)]
+        gradients = [np.empty(v.shape) if i < 8 or needs[i] else None for i, v in enumerate(arrays[:11])]
         _kernels.violation_gradient(arrays, self.xi, *self.minimiser, bar, [*gradients, None])
         if self.factored:  # F = G Gᵀ + stiffness·I + H − Hᵀ
             F_bar, G = gradients[6], tensors[11].numpy(force=True)
