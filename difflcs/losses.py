@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -87,7 +87,7 @@ def violation_loss(
         # 190 µs for the loss of 100 transitions and its gradient.
         with torch.no_grad():
             F = lcs.F
-        made_of = lcs._parameters  # attributes, one by one, would take 5 µs
+        made_of: dict[str, Any] = lcs._parameters  # attributes, one by one, would take 5 µs
         system = tuple([F if name == "F" else made_of[name] for name in SYSTEM])
         factors = (made_of["G"], made_of["H"])
         if _plain(lcs, system, data):
@@ -233,12 +233,15 @@ class _Transitions(Solver):
         mean: whether to return the mean, where no transform adds dimensions to the batch. Otherwise autograd would take
             its two steps.
         factored: whether G and H, of which F is made, are two more inputs, and get the gradient in its place.
+        arrays, minimiser: the inputs of the kernels, and z, r and e at the minimum; once it is solved.
     """
 
     xi: float
     gamma: float | None
     mean: bool = False
     factored: bool = False
+    arrays: list[np.ndarray] | None = field(init=False, default=None)
+    minimiser: tuple[np.ndarray, np.ndarray, np.ndarray] = field(init=False)
 
     name = "violation_loss"
     differentiable = 1
@@ -289,10 +292,10 @@ class _Transitions(Solver):
         arrays = self._arrays(tensors) if self.arrays is None else self.arrays
         (upstream,) = grads
         assert upstream is not None
-        bar, count = upstream.numpy(force=True), len(arrays[8])
-        if self.mean:
-            bar = np.full(count, bar / max(count, 1))
-        gradients = [np.empty(v.shape) if i < 8 or needs[i] else None for i, v in enumerate(arrays[:11])]
+        bar = upstream.numpy(force=True)
+        if self.mean:  # one number for all
+            bar = np.asarray(bar / max(len(arrays[8]), 1))
+        gradients: list[Any] = [np.empty(v.shape) if i < 8 or needs[i] else None for i, v in enumerate(arrays[:11])]
         _kernels.violation_gradient(arrays, self.xi, *self.minimiser, bar, [*gradients, None])
         if self.factored:  # F = G Gᵀ + stiffness·I + H − Hᵀ
             F_bar, G = gradients[6], tensors[11].numpy(force=True)

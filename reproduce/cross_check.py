@@ -10,6 +10,7 @@ calls are answered by the packages of today, see `prior_environment`.
 """
 
 import importlib
+import json
 import sys
 import types
 from collections.abc import Sequence
@@ -26,9 +27,9 @@ from runs import command_line
 from stats import wilson
 
 from difflcs._checks import check_positive_int
-from difflcs._files import read_json, write_json
 from difflcs.bench import machine
 from difflcs.errors import CheckpointError, InvalidInputError, MissingDependencyError
+from difflcs.rl import write_atomically
 from difflcs.rl.rollout import Act, mpc_actions
 from difflcs.rl.tasks import get_task
 from difflcs.zoo import Learned
@@ -163,10 +164,10 @@ def draw_record(options: Options) -> int:
     if options.checkout is not None:
         record = compare(options, options.checkout)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_json(path, record)
+        write_atomically(path, (json.dumps(record, indent=2, sort_keys=True) + "\n").encode())
     if not path.exists():
         raise CheckpointError(f"{path}: expected a record, found none; make it with --checkout, see --help")
-    found: Any = read_json(path)
+    found: Any = json.loads(path.read_text())
     note = (
         f"{found['goals']} goals (seed {found['seed']}), each from the same start in both simulators. Brackets: 95 % "
         f"intervals over the goals, Wilson's. The last two columns: how far apart tips and cube are."

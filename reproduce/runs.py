@@ -32,8 +32,8 @@ from units import Artefact, Method, Object, Preset, PresetName, Unit
 from worker import Files, Job
 
 from difflcs._checks import check_positive_int
-from difflcs._files import write_atomically
 from difflcs.errors import DiffLCSError, InvalidInputError
+from difflcs.rl import write_atomically
 
 if TYPE_CHECKING:
     from distributed import Client

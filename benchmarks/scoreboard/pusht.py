@@ -31,11 +31,11 @@ import torch
 import tyro
 from successes import success_figures
 
-from difflcs import _files
 from difflcs._checks import check_positive_int
 from difflcs.bench import machine
 from difflcs.errors import InvalidInputError
 from difflcs.planning.pusht import CENTER_OF_MASS, GYRATION, PIXELS, STEPS, PushTPolicy, make_env, tee, tee_pushing
+from difflcs.rl import write_atomically
 
 EVERY = 10
 """Episodes between two writings."""
@@ -175,7 +175,7 @@ def keep(path: Path, record: dict[str, Any]) -> None:
     """Write the record atomically, an episode a line."""
     text = json.dumps(record, indent=2, ensure_ascii=False)
     text = re.sub(r"\[([^\[\]]*)\]", lambda inner: f"[{' '.join(inner[1].split())}]", text)
-    _files.write_atomically(path, (text + "\n").encode())
+    write_atomically(path, (text + "\n").encode())
 
 
 def begin(o: Options) -> dict[str, Any]:
@@ -184,7 +184,7 @@ def begin(o: Options) -> dict[str, Any]:
     empty = {"machine": {**machine(), "cores": os.cpu_count()}, "options": options, "results": {}}
     if o.out is None or not o.out.exists():
         return empty
-    found: Any = _files.read_json(o.out)
+    found: Any = json.loads(o.out.read_text())
     if found["options"] != options:
         raise InvalidInputError(
             f"out: expected a record of {options}, got one of {found['options']} in {o.out}; name another file"

@@ -30,9 +30,9 @@ import torch
 import tyro
 from successes import success_figures
 
-from difflcs import _files
 from difflcs.bench import machine
 from difflcs.errors import MissingDependencyError
+from difflcs.rl import write_atomically
 
 OWN = "contact-mpc"
 KEYS = ("success_rate", "return", "mean_momentary_success", "transient_success_rate")
@@ -159,7 +159,7 @@ def keep(o: Options, rows: list[list[float]]) -> None:
     if o.steps is not None:
         row["steps"] = o.steps
     record["results"][o.policy] = row
-    _files.write_atomically(o.out, (json.dumps(record) + "\n").encode())
+    write_atomically(o.out, (json.dumps(record) + "\n").encode())
 
 
 def main(o: Options) -> None:

@@ -31,10 +31,10 @@ import tyro
 from numpy.typing import NDArray
 from successes import success_figures
 
-from difflcs import LCSModel, _files
+from difflcs import LCSModel
 from difflcs.bench import machine
 from difflcs.errors import MissingDependencyError
-from difflcs.rl import evaluate, get_task
+from difflcs.rl import evaluate, get_task, write_atomically
 from difflcs.rl.seeding import Stream, episode_seeds
 
 Array = NDArray[np.float64]
@@ -199,7 +199,7 @@ def measure(o: Options) -> dict[str, Any]:
             results[name] = {**summary(played), "rows": played}
         if o.out is not None:
             record = {"machine": machine(), "model": MODEL, "seed": o.seed, "results": results}
-            _files.write_atomically(o.out, (json.dumps(record) + "\n").encode())
+            write_atomically(o.out, (json.dumps(record) + "\n").encode())
         if not o.json:
             print(f"{len(rows['true'])} goals: " + ", ".join(f"{n} {results[n]['success_rate']:.3f}" for n in rows))
     return results

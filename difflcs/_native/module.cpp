@@ -323,7 +323,8 @@ std::optional<int64_t> violation_loss(Inputs inputs, double xi, int64_t max_iter
                                       Output<double> loss) {
   difflcs::ViolationBatch b = violation_batch(inputs, xi, r, e);
   const int64_t n = 2 * b.n_lam;
-  check_size("Q", Q.size(), b.shared ? n * n : b.count * n * n), check_size("q", q.size(), b.count * n), check_size("z", z.size(), b.count * n);
+  check_size("Q", Q.size(), b.shared ? n * n : b.count * n * n), check_size("q", q.size(), b.count * n),
+      check_size("z", z.size(), b.count * n);
   check_size("loss", loss.size(), b.count);
   bool convex = false;
   pass(b, [&](void* workspace) { convex = difflcs::kernels().violation_qp(b, Q.data(), q.data(), workspace); });
@@ -354,14 +355,20 @@ void violation_gradient(Inputs inputs, double xi, Array z, Output<double> r, Out
                         std::vector<std::optional<Output<double>>> gradients) {
   using namespace difflcs;
   ViolationBatch b = violation_batch(inputs, xi, r, e);
-  check_size("z", z.size(), 2 * b.n_lam * b.count), check_size("upstream", upstream.size(), b.count);
+  check_size("z", z.size(), 2 * b.n_lam * b.count);
+  std::vector<double> same;  // one number is that of all
+  if (upstream.size() == 1)
+    same.assign(b.count, *upstream.data());
+  else
+    check_size("upstream", upstream.size(), b.count);
+  const double* each = upstream.size() == 1 ? same.data() : upstream.data();
   check_size("gradients", gradients.size(), kViolationInputs);
   double* to[kViolationInputs] = {};
   for (int i = 0; i < kViolationInputs; i++) {
     if (!gradients[i] && i < vx) throw std::invalid_argument("the system's gradients are always computed");
     if (gradients[i]) check_size("gradient", gradients[i]->size(), inputs[i].size()), to[i] = gradients[i]->data();
   }
-  pass(b, [&](void* workspace) { kernels().violation_gradient(b, z.data(), upstream.data(), to, workspace); });
+  pass(b, [&](void* workspace) { kernels().violation_gradient(b, z.data(), each, to, workspace); });
 }
 
 // ---- tables ----
@@ -437,11 +444,11 @@ NB_MODULE(_kernels, m) {
   m.def("vjp_mpc", &vjp_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "x"_a, "u"_a, "lam"_a, "mu"_a,
         "x_bar"_a, "u_bar"_a, "lam_bar"_a, "objective_bar"_a, "solved"_a, "pivot"_a, "threads"_a, "gradients"_a,
         "Gradients of the inputs of solved LCS-MPC problems, into the given arrays.");
-  m.def("violation_loss", &violation_loss, "inputs"_a, "xi"_a, "max_iter"_a, "threads"_a, "Q"_a, "q"_a,
-        "z"_a, "r"_a, "e"_a, "loss"_a, "Violation loss of a batch and what its gradient needs, into the given arrays.");
+  m.def("violation_loss", &violation_loss, "inputs"_a, "xi"_a, "max_iter"_a, "threads"_a, "Q"_a, "q"_a, "z"_a, "r"_a,
+        "e"_a, "loss"_a, "Violation loss of a batch and what its gradient needs, into the given arrays.");
   m.def("violation_value", &violation_value, "inputs"_a, "xi"_a, "z"_a, "r"_a, "e"_a, "loss"_a,
         "The same at a given z, from r and e at z = 0.");
-  m.def("violation_gradient", &violation_gradient, "inputs"_a, "xi"_a, "z"_a, "r"_a, "e"_a, "upstream"_a,
-        "gradients"_a, "Gradients of the inputs, into the given arrays; None where one is not wanted.");
+  m.def("violation_gradient", &violation_gradient, "inputs"_a, "xi"_a, "z"_a, "r"_a, "e"_a, "upstream"_a, "gradients"_a,
+        "Gradients of the inputs, into the given arrays; None where one is not wanted.");
   bind_controller(m);
 }

@@ -15,7 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from difflcs import _files, _zoo, zoo
+from difflcs import _storage, _zoo, zoo
 from difflcs.errors import CheckpointError, DiffLCSError
 from difflcs.rl.checkpoint import RunDirectory
 from difflcs.rl.methods import method_names
@@ -49,8 +49,8 @@ def add(run: Path | str, *, force: bool = False, root: Path = _zoo.ROOT) -> zoo.
     card = _card(directory, config, name)
     if (root / name).exists() and not force:
         raise CheckpointError(f"{root / name}: expected no model of that name, got one; replace it with --force")
-    _files.save_record(root / name, config.method.kind, *directory.learned(config.method.kind))
-    _files.write_json(root / name / "card.json", asdict(card))
+    _storage.save_record(root / name, config.method.kind, *directory.learned(config.method.kind))
+    _storage.write_json(root / name / "card.json", asdict(card))
     return card
 
 

@@ -9,6 +9,7 @@ from difflcs.rl._optional import require
 require("gymnasium")  # a clear error, before the modules below import it
 
 # ruff: noqa: E402
+from difflcs._storage import write_atomically
 from difflcs.rl.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
 from difflcs.rl.contact_method import (
     ContactMethod,
@@ -110,6 +111,7 @@ __all__ = [
     "task_names",
     "train",
     "wilson_interval",
+    "write_atomically",
 ]
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from difflcs._files import check_path, short, write_json
+from difflcs._storage import check_path, short, write_json
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.lcs import LCSModel
 from difflcs.rl._optional import require, versions

@@ -19,7 +19,7 @@ HEAVY = (
 )  # fmt: skip
 LAYERS = [
     {"errors"},
-    {"lcs", "lcp", "records", "losses", "_violation", "scales", "cost", "constraints"},
+    {"lcs", "lcp", "records", "losses", "scales", "cost", "constraints"},
     {"systems"},
     {"mpc"},
     {"physics"},
