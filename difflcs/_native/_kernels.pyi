@@ -67,7 +67,6 @@ def vjp_mpc(
 ) -> None: ...
 def violation_loss(
     inputs: list[np.ndarray],
-    gamma: float,
     xi: float,
     max_iter: int,
     threads: int,
@@ -77,19 +76,17 @@ def violation_loss(
     r: np.ndarray,
     e: np.ndarray,
     loss: np.ndarray,
-) -> bool | None: ...
+) -> int | None: ...
 def violation_value(
     inputs: list[np.ndarray],
-    gamma: float,
     xi: float,
     z: np.ndarray,
     r: np.ndarray,
     e: np.ndarray,
     loss: np.ndarray,
-) -> bool: ...
+) -> int: ...
 def violation_gradient(
     inputs: list[np.ndarray],
-    gamma: float,
     xi: float,
     z: np.ndarray,
     r: np.ndarray,

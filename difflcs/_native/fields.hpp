@@ -35,15 +35,16 @@ namespace difflcs {
   FIELD(price, n_c, one, nodes)   \
   FIELD(x0, n_x, one, once)
 
-// Transitions, and the system that they are compared with, which has no stages here.
+// Transitions, the system that they are compared with, which has no stages here, and the weight of its slack.
 #define DIFFLCS_VIOLATION_FIELDS(FIELD) \
   DIFFLCS_SYSTEM_FIELDS(FIELD)          \
-  FIELD(x, count, n_x, once)            \
-  FIELD(u, count, n_u, once)            \
-  FIELD(x_next, count, n_x, once)
+  FIELD(x, n_x, one, once)              \
+  FIELD(u, n_u, one, once)              \
+  FIELD(x_next, n_x, one, once)         \
+  FIELD(gamma, one, one, once)
 
-enum class Size { one, n_x, n_u, n_lam, n_c, count };
-constexpr const char* kSizeNames[] = {"one", "n_x", "n_u", "n_lam", "n_c", "count"};
+enum class Size { one, n_x, n_u, n_lam, n_c };
+constexpr const char* kSizeNames[] = {"one", "n_x", "n_u", "n_lam", "n_c"};
 
 enum class Given { once, steps, nodes };
 constexpr const char* kGivenNames[] = {"", "H", "H+1"};
@@ -81,8 +82,6 @@ inline int64_t extent(const Batch& batch, Size size) {
       return batch.n_lam;
     case Size::n_c:
       return batch.n_c;
-    case Size::count:
-      return batch.count;
     case Size::one:
       break;
   }

@@ -101,8 +101,10 @@ struct MpcGradient {
 // minimises it, with r = A x + B u + C lam + d - x_next and e = D x + E u + F lam + c - phi.
 struct ViolationBatch {
   int64_t count, n_x, n_u, n_lam, n_c;
-  const double* input[kViolationInputs];  // the system is shared by the batch; x, u, x_next are (count, ...)
-  double gamma, xi;
+  const double* input[kViolationInputs];
+  int64_t stride[kViolationInputs];  // distance from one transition to the next; 0 where the batch shares the input
+  bool shared;                       // all of the system and gamma are
+  double xi;
   double *r, *e;  // (count, n_x), (count, n_lam): at z = 0 from violation_qp, at the minimiser from violation_value
   Watch watch;
 };
@@ -125,12 +127,13 @@ struct ViolationBatch {
          (const MpcBatch& batch, const MpcGradient& gradient, int64_t begin, int64_t end, int64_t block,               \
           void* workspace, Watch watch))                                                                               \
   KERNEL(int64_t, violation_workspace, (const ViolationBatch& batch))                                                  \
-  /* r and e at z = 0, and the QP min z'Qz / 2 + q'z over z >= 0: Q (2 n_lam, 2 n_lam) shared by the batch and */      \
-  /* q (count, 2 n_lam). Returns whether they are finite, F + F^T - gamma I is positive definite and Q is so by a */   \
-  /* margin, and gamma is not too small for double precision. */                                                       \
+  /* r and e at z = 0, and the QP min z'Qz / 2 + q'z over z >= 0: Q (2 n_lam, 2 n_lam), of each where the system is */ \
+  /* not shared, and q (count, 2 n_lam). Returns whether they are finite, F + F^T - gamma I is positive definite and */\
+  /* Q is so by a margin, and gamma is not too small for double precision. */                                          \
   KERNEL(bool, violation_qp, (const ViolationBatch& batch, double* Q, double* q, void* workspace))                     \
-  /* r, e and loss (count,) at z (count, 2 n_lam), from r and e at z = 0. Returns whether e has digits that count. */  \
-  KERNEL(bool, violation_value, (const ViolationBatch& batch, const double* z, double* loss, void* workspace))         \
+  /* r, e and loss (count,) at z (count, 2 n_lam), from r and e at z = 0. Returns the first transition whose e has */  \
+  /* no digits that count, or -1. */                                                                                   \
+  KERNEL(int64_t, violation_value, (const ViolationBatch& batch, const double* z, double* loss, void* workspace))      \
   /* Gradients of sum(upstream * loss) with z held; those of x, u and x_next only where they are not null. */          \
   KERNEL(void, violation_gradient,                                                                                     \
          (const ViolationBatch& batch, const double* z, const double* upstream,                                        \

@@ -40,7 +40,7 @@ def test_the_system_is_the_same_everywhere():
     assert list(INPUTS.items())[: len(SYSTEM)] == list(SYSTEM.items())
     violation = list(_kernels.violation_fields().items())
     assert violation[: len(SYSTEM)] == list(SYSTEM.items())
-    assert violation[len(SYSTEM) :] == [("x", ("count", "n_x")), ("u", ("count", "n_u")), ("x_next", ("count", "n_x"))]
+    assert violation[len(SYSTEM) :] == [("x", ("n_x",)), ("u", ("n_u",)), ("x_next", ("n_x",)), ("gamma", ())]
 
 
 @pytest.mark.parametrize("name", INPUTS)
