@@ -210,7 +210,7 @@ def pull_back(
     else:
         gradients = _summed(solver, tensors, solver.pullback(tensors, outputs, grads, needs))
     pairs = zip(gradients, tensors, strict=True)
-    return [None if gradient is None else gradient.to(like.device, like.dtype) for gradient, like in pairs]
+    return [None if gradient is None else gradient.to(like) for gradient, like in pairs]
 
 
 class _Pullback(torch.autograd.Function):

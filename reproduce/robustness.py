@@ -17,15 +17,13 @@ import records
 import report
 import torch
 from matplotlib.figure import Figure
-from runs import command_line
+from runs import check_amounts, command_line
 from stats import bootstrap, wilson
 from torch import Tensor
 
-from difflcs._checks import check_positive_int
-from difflcs._files import read_json, write_json
 from difflcs.cli.bench import machine
 from difflcs.errors import CheckpointError
-from difflcs.rl import TaskSpec, TrainedPolicy, collect, get_task
+from difflcs.rl import TaskSpec, TrainedPolicy, collect, get_task, write_atomically
 from difflcs.rl.rollout import Act, mpc_actions
 from difflcs.rl.runs.delay import late_actions, predicted_by
 from difflcs.rl.seeding import Stream, episode_seeds
@@ -51,7 +49,7 @@ class Options:
     """Folder of the record, robustness.json, and of table and figure."""
 
     def __post_init__(self) -> None:
-        check_positive_int("goals", self.goals)
+        check_amounts(goals=self.goals)
 
 
 @dataclass(frozen=True)
@@ -130,7 +128,8 @@ def compute(options: Options, path: Path, say: Callable[[str], object] = print) 
     if options.smoke:
         found = [one for one in found if one.group in ("", "noise") or one.delay == 1]
     asked = {"model": str(options.model), "goals": options.goals, "seed": options.seed, "object": dict(described)}
-    record: Any = read_json(path) if path.exists() else {"options": asked, "machine": machine(), "results": []}
+    new = {"options": asked, "machine": machine(), "results": []}
+    record: Any = json.loads(path.read_text()) if path.exists() else new
     if record["options"] != asked:
         raise CheckpointError(
             f"{path}: expected a record of {asked}, got one of {record['options']}; pass another --results, or "
@@ -142,7 +141,7 @@ def compute(options: Options, path: Path, say: Callable[[str], object] = print) 
             row = measure(condition, task, policy, options.goals, options.seed)
             record["results"].append(row)
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_json(path, json.loads(json.dumps(record)))
+            write_atomically(path, (json.dumps(record, indent=2, sort_keys=True) + "\n").encode())
             say(f"{condition.group} {condition.name}: {100 * np.mean(list(map(int, row['reached']))):.1f} %")
 
 
@@ -200,7 +199,7 @@ def draw_record(options: Options) -> int:
         compute(options, path)
     if not path.exists():
         raise CheckpointError(f"{path}: expected a record, found none; make it: python reproduce/robustness.py --rerun")
-    record: Any = read_json(path)
+    record: Any = json.loads(path.read_text())
     if record["options"]["model"] != str(options.model):
         raise CheckpointError(
             f"{path}: expected a record of {options.model}, got one of {record['options']['model']}; measure it with "

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from difflcs import _files
+from difflcs import _storage
 from difflcs._checks import check_finite, check_number, describe
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, NonFiniteError, ShapeError, SolveError
@@ -132,7 +132,7 @@ class MPCController:
             InvalidInputError and its kinds: another argument does not fit.
         """
         try:
-            content = _files.read_bytes(Path(path))
+            content = _storage.read_bytes(Path(path))
             sizes = _kernels.Controller(content).sizes()
         except (FileNotFoundError, RuntimeError) as error:
             raise CheckpointError(f"{path}: {error}") from error
@@ -153,7 +153,7 @@ class MPCController:
                 f"lcs: expected an LCSModel or matrices, got {describe(self._setup.lcs)}, whose system may depend on "
                 f"the state; build a layer with lcs=module.params(x, context)"
             )
-        _files.write_atomically(Path(path), self._content)
+        _storage.write_atomically(Path(path), self._content)
 
     def step(
         self,
