@@ -27,7 +27,7 @@ from torch import Tensor
 from difflcs.cli.bench import machine, save
 from difflcs.rl import TrainedPolicy, collect, get_task, wilson_interval
 from difflcs.rl.rollout import Act, mpc_actions
-from difflcs.rl.runs.delay import late_actions, predicted_by
+from difflcs.rl.runs.delay import delay_actions, make_predictor
 from difflcs.rl.seeding import Stream, episode_seeds
 
 
@@ -94,12 +94,12 @@ def main(o: Options) -> None:
     torch.set_num_threads(1)
     learned = TrainedPolicy.open(o.model)
     task, policy = get_task(learned.task), learned.policy
-    predict = predicted_by(policy.lcs)  # pyright: ignore[reportAttributeAccessIssue]
+    predict = make_predictor(policy.lcs)  # pyright: ignore[reportAttributeAccessIssue]
     ways: dict[str, Callable[[Act], Act]] = {
         "on time": lambda act: act,
         "idle first": lambda act: idle_first(act, task.n_u, o.delay),
-        "late": lambda act: late_actions(act, task.n_u, o.delay),
-        "late, predicted": lambda act: late_actions(act, task.n_u, o.delay, predict),
+        "late": lambda act: delay_actions(act, task.n_u, o.delay),
+        "late, predicted": lambda act: delay_actions(act, task.n_u, o.delay, predict),
     }
     envs = task.make_envs(o.envs)
     episodes = {}
