@@ -1,4 +1,4 @@
-"""Policies that plan with known physics as films, with what they decide drawn in: `difflcs render pusht`."""
+"""Films of policies that plan with known physics, with their decisions drawn in: `difflcs render pusht`."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 __all__ = ["FILMS", "picture", "record"]
 
 _PAUSE = 6
-"""Frames for which the end of an episode stands."""
+"""Frames for which the last picture of an episode is shown."""
 _GREEN, _GREY, _BLUE = (0, 158, 115), (150, 150, 150), (0, 114, 178)
 
 
 def picture(env: Any, policy: PushTPolicy, text: str = "", size: int = 340) -> Image.Image:
-    """The environment as it draws itself, and on top what the policy decided last.
+    """Draw the environment, and over it the last decision of the policy.
 
     Places where the disc could be are dots, the greener the more a push from there would gain; that to which it
     travels has a ring. Where it pushes, the planned path of the disc is a line.
@@ -83,7 +83,7 @@ def record(
         force: replace a file that is there.
 
     Returns:
-        For each episode whether it was solved.
+        For each episode, True if it was solved.
 
     Raises:
         InvalidInputError: an ending of another kind, the file is there already, or it cannot be written there.
@@ -105,7 +105,7 @@ def record(
     temporary = path.with_name(f".{path.stem}.tmp{kind}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.touch()  # said before the episodes are played
+        temporary.touch()  # raises here if it cannot be written, before the episodes are played
         temporary.unlink()
     except OSError as error:
         raise InvalidInputError(f"out: expected a place to write {path}, got: {error}; choose another") from error
@@ -135,7 +135,7 @@ def record(
 
 
 def _write(path: Path, frames: list[Image.Image]) -> None:
-    """Ten frames a second: real time."""
+    """Write ten frames a second: real time."""
     if path.suffix == ".gif":
         from PIL import Image
 
@@ -154,5 +154,5 @@ def _write(path: Path, frames: list[Image.Image]) -> None:
 FILMS: dict[str, Callable[[Path, int, int, bool], list[bool]]] = {
     "pusht": lambda path, seed, episodes, force: record(path, seed, episodes, force=force)
 }
-"""By name: path, seed of the first episode, number of episodes, whether to replace a file → for each episode, whether
-it was solved."""
+"""Name → function of the path, the seed of the first episode, the number of episodes, and True to replace a file. It
+returns, for each episode, True if it was solved."""

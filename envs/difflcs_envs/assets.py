@@ -1,9 +1,9 @@
 """The YCB meshes on this machine: find them, or download them from the YCB site.
 
 The archives are kept whole: their SHA-256 is recorded at the first download and every later download must match it.
-Nothing is ever half there. Archives grow in `NAME.part`, from where an interrupted download goes on, and are unpacked
-into a hidden folder that gets its name in one step. One process at a time works in a folder; the others wait. Whatever
-a server sends or an archive holds, its size is limited and the error is an `AssetError`.
+No file is ever incomplete under its name. Archives grow in `NAME.part`, where an interrupted download is resumed, and
+are unpacked into a hidden folder that is renamed in one step. One process at a time works in a folder; the others wait.
+The size of answers and archives is limited; beyond that they raise an `AssetError`.
 """
 
 from __future__ import annotations
@@ -56,14 +56,14 @@ _LAYOUTS = (
 
 
 def ycb_download_directory() -> Path:
-    """Where `download` puts the objects."""
+    """Return the folder into which `download` puts the objects."""
     from difflcs_envs.trifinger.meshes import cache_directory
 
     return cache_directory() / "ycb"
 
 
 def find_ycb_mesh(entry: YcbObject) -> Path | None:
-    """The mesh of an object; None if it is not on this machine.
+    """Find the mesh of an object; None if it is not on this machine.
 
     Raises:
         MeshError: `DIFFLCS_YCB_DIR` is set, but the mesh is not there.
@@ -102,7 +102,7 @@ def download(
         The mesh of each object.
 
     Raises:
-        AssetError: The download failed or is not what it should be. What was there before stays there.
+        AssetError: The download failed or has unexpected content. Earlier files stay.
         ValueError: An object is unknown.
     """
     names = list(YCB if names is None else names)
@@ -177,7 +177,7 @@ def _download_object(entry: YcbObject, folder: Path, address: str, report: Calla
 
 
 def _fetch(address: str, archive: Path) -> None:
-    """Download into `archive`, going on where an earlier attempt was cut off."""
+    """Download into `archive`, resuming where an earlier attempt was cut off."""
     part = archive.with_name(archive.name + ".part")
     for attempt in range(ATTEMPTS):
         try:
@@ -208,7 +208,7 @@ class _BadRange(ValueError):
 
 
 def _fetch_rest(address: str, part: Path) -> bool:
-    """One request for what is missing. Returns whether the file is complete."""
+    """Request the missing bytes. Return True if the file is then complete."""
     have = part.stat().st_size if part.exists() else 0
     request = urllib.request.Request(address, headers={"Range": f"bytes={have}-"} if have else {})
     with urllib.request.urlopen(request, timeout=TIMEOUT) as answer:
@@ -230,9 +230,9 @@ def _fetch_rest(address: str, part: Path) -> bool:
 
 
 def _start(content_range: str | None, have: int) -> int:
-    """Where the bytes of a partial answer begin: where we asked for, or it is of no use."""
-    found = re.fullmatch(r"\s*bytes\s+(\d{1,15})-(\d{1,15})/(\d{1,15}|\*)\s*", content_range or "", re.ASCII)
-    if found is None or int(found[1]) != have or int(found[2]) < have:
+    """Return where the bytes of a partial answer begin, which must be where the request asked."""
+    match = re.fullmatch(r"\s*bytes\s+(\d{1,15})-(\d{1,15})/(\d{1,15}|\*)\s*", content_range or "", re.ASCII)
+    if match is None or int(match[1]) != have or int(match[2]) < have:
         raise _BadRange(f"expected the bytes from {have} on, got Content-Range {content_range!r}")
     return have
 
@@ -308,7 +308,7 @@ def _unpack(archive: Path, folder: Path, entry: YcbObject) -> Path:
 
 @contextlib.contextmanager
 def _decompressed(archive: Path, folder: Path) -> Iterator[BinaryIO]:
-    """The tar inside, as a temporary file: so its size is known before anything in it is believed."""
+    """Decompress the tar inside into a temporary file, so that its size is known before it is read."""
     with tempfile.TemporaryFile(dir=folder) as file:
         with gzip.open(archive) as compressed:
             while chunk := compressed.read(CHUNK):
@@ -341,7 +341,7 @@ def _members(tar: tarfile.TarFile, archive: Path) -> list[tarfile.TarInfo]:
 
 
 def _check(mesh: Path, entry: YcbObject) -> None:
-    """Compare the size of what was downloaded with the table."""
+    """Compare the size of a downloaded mesh with the table."""
     from difflcs_envs.trifinger.meshes import check_extent, load_mesh
 
     try:

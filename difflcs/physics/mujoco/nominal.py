@@ -263,7 +263,7 @@ def _push(response: Array, rows: Array, forces: Array, by: Array) -> Array:
 
 
 def _turn_tangents(tangent: Array, slide: Array) -> Array:
-    """Turn the first of two tangents (n, n_contacts, n_tangents, nv) along the slide, where the cone of rays is exact."""
+    """Turn the first of two tangents (n, n_contacts, n_tangents, nv) along the slide: there the cone is exact."""
     if tangent.shape[2] < 2:
         return tangent
     far = np.linalg.norm(slide, axis=-1, keepdims=True)
