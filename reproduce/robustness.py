@@ -17,11 +17,10 @@ import records
 import report
 import torch
 from matplotlib.figure import Figure
-from runs import command_line
+from runs import check_amounts, command_line
 from stats import bootstrap, wilson
 from torch import Tensor
 
-from difflcs._checks import check_positive_int
 from difflcs._files import read_json, write_json
 from difflcs.cli.bench import machine
 from difflcs.errors import CheckpointError
@@ -51,7 +50,7 @@ class Options:
     """Folder of the record, robustness.json, and of table and figure."""
 
     def __post_init__(self) -> None:
-        check_positive_int("goals", self.goals)
+        check_amounts(goals=self.goals)
 
 
 @dataclass(frozen=True)

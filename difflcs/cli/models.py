@@ -15,7 +15,6 @@ from difflcs._optional import require, versions
 from difflcs.errors import InvalidInputError
 from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.export import CONTROLLER, DESCRIPTION, export_controller
-from difflcs.planning.films import FILMS
 from difflcs.rl import TrainedPolicy
 from difflcs.rl.runs.evaluate import evaluate
 from difflcs.rl.runs.figures import NoPictureError, record_video
@@ -99,14 +98,14 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Render:
-    """Video of a learned model at work, one episode per goal; or of Push-T."""
+    """Video of a learned model at work, one episode per goal."""
 
     model: Path
-    """Run directory, or zoo:NAME for one of the models that `difflcs zoo` lists; or pusht, which has no goals."""
+    """Run directory, or zoo:NAME for one of the models that `difflcs zoo` lists."""
     goal: tuple[float, ...] | None = None
     """Goals, one after another, each with the numbers that the task wants; by default an example of the task."""
     out: Path = Path("video.mp4")
-    """Video to write, an MP4; with pusht also a GIF."""
+    """Video to write, an MP4."""
     force: bool = False
     """Replace the video if there is one."""
     seed: int = 0
@@ -116,8 +115,6 @@ class Render:
 
     def run(self) -> None:
         """Run the command."""
-        if str(self.model) in FILMS:
-            return self._physics()
         if self.out.suffix.lower() != ".mp4" or self.out.is_dir():
             raise InvalidInputError(f"out: expected the name of an MP4 file, got {self.out}; pass --out video.mp4")
         if self.out.exists() and not self.force:
@@ -131,11 +128,6 @@ class Render:
         reached = film(learned, task, goals, self.out, self.seed)
         for goal, ok in zip(goals, reached, strict=True):
             print(f"goal {' '.join(f'{v:g}' for v in goal)}: {'reached' if ok else 'missed'}")
-        print(f"written: {self.out}")
-
-    def _physics(self) -> None:
-        for i, solved in enumerate(FILMS[str(self.model)](self.out, self.seed, 1 if self.smoke else 4, self.force)):
-            print(f"seed {self.seed + i}: {'solved' if solved else 'not solved'}")
         print(f"written: {self.out}")
 
     def _goals(self, task: TaskSpec) -> list[tuple[float, ...]]:

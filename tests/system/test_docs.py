@@ -159,17 +159,18 @@ def test_the_commands_of_a_page_exist(page, parse):
 def test_the_quick_settings_are_those_that_were_measured(monkeypatch):
     pytest.importorskip("torchrl")
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    import training_time
+    import objects
 
     from difflcs import cli
+    from difflcs.cli.train import Train
 
     asked = []
-    monkeypatch.setattr(cli.Train, "run", lambda command: asked.append(command))
+    monkeypatch.setattr(Train, "run", lambda command: asked.append(command))
     page = [code.replace("\\\n", " ") for code in blocks(DOCS / "training.md", "bash")]
     commands = [code for code in page if "--models.rollouts" in code]
     assert len(commands) == 1
     assert cli.main(shlex.split(commands[0])[1:]) == 0
-    assert asked[0].method == training_time.RECIPES["quick"] != training_time.RECIPES["default"]
+    assert asked[0].method == objects.METHODS["quick"] != objects.METHODS["lcs-rl"]
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if p.parent.name != "archive"], ids=name)

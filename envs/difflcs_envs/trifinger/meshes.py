@@ -392,7 +392,7 @@ def _read_parts(path: Path) -> tuple[np.ndarray, ...] | None:
 
 
 def _write_parts(path: Path, parts: tuple[np.ndarray, ...]) -> None:
-    """Write in one step, so that other processes see the old file or the new one. Ignore a cache that is not writable."""
+    """Write in one step: other processes see the old file or the new one. A cache that is not writable is ignored."""
     points, ends = np.concatenate(parts), np.cumsum([len(part) for part in parts])
     digest = np.frombuffer(hashlib.sha256(points.tobytes() + ends.tobytes()).digest(), np.uint8)
     buffer = io.BytesIO()

@@ -1,4 +1,4 @@
-"""Push-T (the environment of gym-pusht): its physics as a `PlanarPushing`, and a policy that solves it.
+"""Push-T (gym-pusht) by sampling-based contact MPC: `python examples/push_t.py --out push_t.gif` makes a film of it.
 
 A disc of radius 15 px pushes a T, made of two boxes of 30 by 120 and 30 by 90 px, to a pose on a plane of 512 px. An
 action is the target of the disc's PD controller, for ten substeps of 0.01 s. The disc is kinematic: nothing pushes it
@@ -11,26 +11,23 @@ from __future__ import annotations
 import math
 import warnings
 from collections import deque
-from dataclasses import fields
-from typing import Any
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from difflcs._checks import check_positive_int
-from difflcs.cost import GoalCost
+from difflcs import GoalCost, LCSMPCLayer
 from difflcs.errors import MissingDependencyError
-from difflcs.mpc.layer import LCSMPCLayer
+from difflcs.physics import PDDrive, PlanarPushing, Polygon, Union, box
 from difflcs.physics.complementarity import Contacts
-from difflcs.physics.planar import PDDrive, PlanarPushing
-from difflcs.physics.shapes import Polygon, Shape, Union, box
-from difflcs.planning.places import DiscPlaces, Workspace
-from difflcs.planning.sampling import SamplingPolicy, SamplingSettings
-from difflcs.planning.travel import PlanarTravel
+from difflcs.planning import Decision, DiscPlaces, Mode, PlanarTravel, SamplingPolicy, SamplingSettings, Workspace
 
-__all__ = ["GOAL", "PIXELS", "STEPS", "PushTPolicy", "make_env", "tee", "tee_pushing"]
+if TYPE_CHECKING:
+    from PIL import Image
 
 PIXELS = 100.0
 """Pixels in a unit of length."""
@@ -49,9 +46,11 @@ SIDE = 5.12
 """Side of the square that actions are in."""
 STEPS = 300
 """Limit of an episode, in steps of 0.1 s."""
+GREEN, GREY, BLUE = (0, 158, 115), (150, 150, 150), (0, 114, 178)
+"""Colours of a film: places from which a push would gain, those from which it would not, and the plan."""
 
 
-def tee(scale: float = 1.0) -> Shape:
+def tee(scale: float = 1.0) -> Union:
     """Make the T in coordinates about the centre of its area, scaled about it by `scale`."""
     return Union(tuple(Polygon(scale * (part.vertices - _CENTER)) for part in _BOXES))
 
@@ -127,33 +126,21 @@ class PushTPolicy:
 
     Args:
         system: the system of the MPC, with state and action as in `tee_pushing`, the default.
-        shape: outline for the places and the ways round it; that of the system if None.
         delay: steps by which actions come late. The plan begins at the state that the system predicts for then.
-        horizon: of the plans [steps].
-        margin: additional distance of places and ways from the T [100 px].
 
     Attributes:
         sampling: the policy inside, with its `decision`.
     """
 
-    def __init__(
-        self,
-        system: PlanarPushing | None = None,
-        *,
-        shape: Shape | None = None,
-        delay: int = 0,
-        horizon: int = 10,
-        margin: float = 0.0,
-    ):
-        self.system = system = Rigid.of(tee_pushing() if system is None else system)
-        shape = system.shape if shape is None else shape
-        self.delay = check_positive_int("delay", delay, minimum=0)
+    def __init__(self, system: PlanarPushing | None = None, delay: int = 0):
+        self.system, self.delay = Rigid.of(tee_pushing() if system is None else system), delay
+        shape = self.system.shape
         workspace = Workspace((0.0, 0.0), (SIDE, SIDE), step=0.6)
         cost = GoalCost.reach(7, 2, goal_weight=(1.0, 1.0, 0.3), goal_weight_final=(4.0, 4.0, 1.2), input_weight=0.01)
         self.sampling = SamplingPolicy(
-            LCSMPCLayer(system, cost, horizon, relaxation=1e-5, on_failure="mask"),
-            DiscPlaces(shape, RADIUS, gap=0.02 + margin, reach=0.12 + margin, workspace=workspace, margin=0.2),
-            PlanarTravel(shape, RADIUS, step=1.2, clearance=0.08 + margin, tolerance=0.08),
+            LCSMPCLayer(self.system, cost, 10, relaxation=1e-5, on_failure="mask"),
+            DiscPlaces(shape, RADIUS, gap=0.02, reach=0.12, workspace=workspace, margin=0.2),
+            PlanarTravel(shape, RADIUS, step=1.2, clearance=0.08, tolerance=0.08),
             SamplingSettings(keep=0.6, smallest_gain=0.02, switch_price=0.02, travel_price=0.04),
             bounds=workspace.bounds,
             angles=(2,),
@@ -202,3 +189,88 @@ def from_origin(pose: ArrayLike) -> NDArray[np.float64]:
     cos, sin = math.cos(yaw), math.sin(yaw)
     cx, cy = _CENTER.tolist()
     return np.array([x / PIXELS + cos * cx - sin * cy, y / PIXELS + sin * cx + cos * cy, yaw])
+
+
+def picture(env: Any, policy: PushTPolicy, text: str = "", size: int = 340) -> Image.Image:
+    """The environment as it draws itself, and on top what the policy decided last.
+
+    Places where the disc could be are dots, the greener the more a push from there would gain; that to which it
+    travels has a ring. Where it pushes, the planned path of the disc is a line.
+
+    Args:
+        env: of `make_env(render_mode="rgb_array")`.
+        policy: after `act`.
+        text: to write into the upper left corner.
+        size: width and height [px].
+    """
+    from PIL import Image, ImageDraw
+
+    frame = Image.fromarray(env.render()).resize((size, size), Image.Resampling.LANCZOS)
+    draw = ImageDraw.Draw(frame)
+    decision = policy.sampling.decision
+    if decision is not None:
+        _draw(draw, decision, size)
+    draw.text((6, 4), text, fill=(20, 20, 30), font_size=max(10, size // 24))
+    return frame
+
+
+def _draw(draw: Any, decision: Decision, size: int) -> None:
+    scale, line = size / (SIDE * PIXELS), size / 340
+
+    def dot(point: Tensor, radius: float, **colors: Any) -> None:
+        x, y = (scale * PIXELS * point).tolist()
+        draw.ellipse((x - radius, y - radius, x + radius, y + radius), **colors)
+
+    scores = decision.scores[1:]
+    best = max(float(scores.max()), 1e-12)
+    # Dots move with the T while the disc travels.
+    for place, score in zip(decision.states[1:, 3:5], scores.tolist(), strict=True):
+        share = min(max(score / best, 0.0), 1.0) ** 2
+        color = tuple(round(share * a + (1 - share) * b) for a, b in zip(GREEN, GREY, strict=True))
+        dot(place, line * (1.5 + 2.0 * share), fill=color)
+    if decision.mode is Mode.TRAVEL and decision.target is not None:
+        dot(decision.target[3:5], 7.0 * line, outline=BLUE, width=round(2 * line))
+    else:
+        path = (scale * PIXELS * decision.solution.x[0, :, 3:5]).tolist()
+        draw.line([tuple(point) for point in path], fill=BLUE, width=round(2 * line))
+
+
+@dataclass
+class Options:
+    """A film of Push-T."""
+
+    out: Path = Path("push_t.gif")
+    """Where the GIF goes."""
+    seed: int = 0
+    """Of the first episode; the next have the next."""
+    episodes: int = 4
+    """How many are played, one after another."""
+
+
+def main(o: Options) -> None:
+    """Play, and write the film at ten frames a second: real time."""
+    env, policy, frames = make_env(render_mode="rgb_array"), PushTPolicy(), []
+    for seed in range(o.seed, o.seed + o.episodes):
+        observation, info = env.reset(seed=seed)
+        policy.reset()
+        success = ended = False
+        while not (success or ended):
+            action = policy.act(observation)
+            decision = policy.sampling.decision
+            assert decision is not None
+            frames.append(picture(env, policy, str(decision.mode)))
+            observation, _, success, ended, info = env.step(action)
+        verdict = f"{'solved' if success else 'not solved'}, {100 * info['coverage']:.0f} % covered"
+        frames += [picture(env, policy, verdict)] * 6
+        print(f"seed {seed}: {verdict}")
+    env.close()
+    palette = frames[0].quantize(64, dither=0)
+    small = [frame.quantize(palette=palette, dither=0) for frame in frames]
+    small[0].save(o.out, save_all=True, append_images=small[1:], duration=100, loop=0, optimize=True)
+    print(f"written: {o.out}")
+
+
+if __name__ == "__main__":
+    import tyro
+
+    main(tyro.cli(Options))
