@@ -12,7 +12,7 @@ from difflcs._differentiation import is_wrapped
 from difflcs._fields import TensorFields, check_by_stage, check_not_nan, check_stages
 from difflcs.errors import BoundsError, DTypeError, InvalidInputError, ShapeError
 
-_OWN = {"G": 2, "g": 1, "E": 2, "weight": 1}
+_DIMENSIONS = {"G": 2, "g": 1, "E": 2, "weight": 1}
 _EXTRA = {"G": 1, "g": 1, "E": 0, "weight": 1}  # stages beyond H
 # What each field is called in a problem (`difflcs.mpc.MPCProblem`).
 _HARD = 1e300  # prices from here on: such a row is a hard constraint
@@ -20,7 +20,7 @@ _NAMES = {"G": "G_x", "E": "G_u", "g": "g", "weight": "price"}
 
 
 def check_bounds(u_min: Tensor, u_max: Tensor, strict: bool = False) -> None:
-    """Refuse bounds that do not broadcast, are on different devices, or cross (`strict`: or touch, or are infinite)."""
+    """Raise if bounds do not broadcast, are on different devices, or cross (`strict`: or touch, or are infinite)."""
     broadcast_batch([("u_min", u_min.shape), ("u_max", u_max.shape)])
     check_same_device([("u_min", u_min), ("u_max", u_max)])
     if is_wrapped(u_min) or is_wrapped(u_max):
@@ -41,7 +41,7 @@ def check_bounds(u_min: Tensor, u_max: Tensor, strict: bool = False) -> None:
 
 
 def as_bound(name: str, value: object, dims: list[tuple[str, int]], like: Tensor) -> Tensor:
-    """A bound or weight as a tensor: a number holds for all of the last of its trailing dimensions `dims`."""
+    """Convert a bound or weight to a tensor: a number fills the last of its trailing dimensions `dims`."""
     number = plain(value)
     if isinstance(number, bool):
         raise DTypeError(f"{name}: expected a torch.Tensor, got {describe(value)}; or give a number, as a float")
@@ -76,12 +76,12 @@ class StageBounds(TensorFields):
     ):
         super().__init__()
         bounds = {"u_min": plain(u_min), "u_max": plain(u_max)}
-        given = {name: value for name, value in bounds.items() if isinstance(value, Tensor)}
-        self.by_stage = check_by_stage(by_stage, ("u_min", "u_max"), given)
-        for name, value in given.items():
+        tensors = {name: value for name, value in bounds.items() if isinstance(value, Tensor)}
+        self.by_stage = check_by_stage(by_stage, ("u_min", "u_max"), tensors)
+        for name, value in tensors.items():
             check_not_nan(name, value)
-        self.horizon = check_stages({name: (given[name], 1, 0) for name in sorted(self.by_stage)})
-        like = given[min(self.by_stage)]
+        self.horizon = check_stages({name: (tensors[name], 1, 0) for name in sorted(self.by_stage)})
+        like = tensors[min(self.by_stage)]
         self.n_u = like.shape[-1]
         for name, value, none in (("u_min", u_min, -torch.inf), ("u_max", u_max, torch.inf)):
             dims = [("H", self.horizon)] * (name in self.by_stage) + [("n_u", self.n_u)]
@@ -89,7 +89,7 @@ class StageBounds(TensorFields):
         check_bounds(*self.by_steps())
 
     def by_steps(self) -> tuple[Tensor, Tensor]:
-        """Lower and upper bounds, broadcasting with (..., H, n_u)."""
+        """Return the lower and upper bounds, which broadcast with (..., H, n_u)."""
         low, high = (v if k in self.by_stage else v.unsqueeze(-2) for k, v in self.tensors().items())
         return low, high
 
@@ -99,7 +99,7 @@ class StageBounds(TensorFields):
 
 
 class _Constraints(TensorFields):
-    """What constraints have in common, whether they change over the horizon or not."""
+    """Base of the constraints, constant or by stage."""
 
     G: Tensor
     g: Tensor
@@ -125,9 +125,11 @@ class _Constraints(TensorFields):
             fields["weight"] = as_bound("weight", weight, [rows], G)
         check_same_device(fields.items())
         if self.by_stage:
-            self.horizon = check_stages({k: (fields[k], _OWN[k], _EXTRA[k]) for k in _OWN if k in self.by_stage})
+            self.horizon = check_stages(
+                {k: (fields[k], _DIMENSIONS[k], _EXTRA[k]) for k in _DIMENSIONS if k in self.by_stage}
+            )
         check_constraints(fields["g"], fields.get("weight"))
-        for name in _OWN:
+        for name in _DIMENSIONS:
             if name in fields:
                 self._register(name, fields[name])
             else:
@@ -151,7 +153,7 @@ class _Constraints(TensorFields):
 
 
 def check_constraints(g: Tensor, weight: Tensor | None) -> None:
-    """Refuse limits that nothing can meet and prices that are not positive."""
+    """Raise if limits cannot be met or prices are not positive."""
     if not is_wrapped(g) and bool((g == -torch.inf).any()):
         raise InvalidInputError("g: expected limits above −∞, got −∞; +∞ says that there is no constraint")
     if weight is not None and not is_wrapped(weight):
@@ -159,7 +161,7 @@ def check_constraints(g: Tensor, weight: Tensor | None) -> None:
 
 
 def check_prices(name: str, prices: Tensor) -> None:
-    """Refuse prices of violations that are not positive."""
+    """Raise if prices of violations are not positive."""
     if not bool((prices > 0).all()):
         raise InvalidInputError(
             f"{name}: expected a positive price of a violation, or infinity for a hard constraint, got "
@@ -195,7 +197,7 @@ class LinearConstraints(_Constraints):
 class ConstraintSequence(_Constraints):
     """Linear constraints that change over the horizon: G_k x_k + E_k u_k ≤ g_k at the stages k = 0 … H.
 
-    As `LinearConstraints`, with the dimension of the stages before each field's own: H+1 of them, and H of E. A
+    As `LinearConstraints`, with the dimension of the stages before the others: H+1 stages, and H for E. A
     constraint of the final state alone has g = +∞ before it.
 
     Args:
@@ -218,12 +220,12 @@ class ConstraintSequence(_Constraints):
         E: Tensor | None = None,
         weight: Tensor | float | None = None,
         *,
-        by_stage: Collection[str] = tuple(_OWN),
+        by_stage: Collection[str] = tuple(_DIMENSIONS),
     ):
         super().__init__()
         values = {"G": G, "g": g, "E": E, "weight": weight}
         for name in ("G", "g"):
             check_not_nan(name, values[name])
-        given = [name for name, value in values.items() if isinstance(plain(value), Tensor)]
-        self.by_stage = check_by_stage(by_stage, _OWN, given)
+        names = [name for name, value in values.items() if isinstance(plain(value), Tensor)]
+        self.by_stage = check_by_stage(by_stage, _DIMENSIONS, names)
         self._fill(G, g, E, weight)

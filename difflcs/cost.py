@@ -13,13 +13,13 @@ from difflcs._fields import TensorFields, check_by_stage, check_stages
 from difflcs._linalg import matvec, quadratic
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 
-# Number of the own dimensions of each field, behind those of the batch and of the stages.
-_OWN = {"Q": 2, "R": 2, "Q_final": 2, "q": 1, "r": 1, "q_final": 1, "constant": 0, "S": 2}
+# Number of dimensions of each field, after those of the batch and of the stages.
+_DIMENSIONS = {"Q": 2, "R": 2, "Q_final": 2, "q": 1, "r": 1, "q_final": 1, "constant": 0, "S": 2}
 _STAGES = ("Q", "R", "q", "r", "S")
 
 
 class _Quadratic(TensorFields):
-    """What costs that are quadratic in states and actions have in common."""
+    """Base of costs that are quadratic in states and actions."""
 
     Q: Tensor
     R: Tensor
@@ -68,7 +68,7 @@ class _Quadratic(TensorFields):
             check_tensor(name, fields[name], dim)
         check_same_device(fields.items())
         if self.by_stage:
-            check_stages({k: (fields[k], _OWN[k], 0) for k in _STAGES if k in self.by_stage})
+            check_stages({k: (fields[k], _DIMENSIONS[k], 0) for k in _STAGES if k in self.by_stage})
         if check:
             for name in ("Q", "R", "Q_final") if S is None else ("Q_final",):
                 _check_convex(name, fields[name])
@@ -92,14 +92,14 @@ class _Quadratic(TensorFields):
         return torch.cat([torch.cat([Q, S], -1), torch.cat([S.mT, R], -1)], -2)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Name → tensor as it was given, with the constant; S where there is one."""
-        fields = self._held(_OWN)
+        """Name → tensor as it was passed, with the constant; S if there is one."""
+        fields = self._held(_DIMENSIONS)
         if fields["S"] is None:
             del fields["S"]
         return fields
 
     def fields(self) -> dict[str, Tensor]:
-        """Name → tensor, with symmetric Q, R and Q_final, without the constant; S where there is one."""
+        """Name → tensor, with symmetric Q, R and Q_final, without the constant; S if there is one."""
         fields = self.tensors()
         del fields["constant"]
         return {k: 0.5 * (v + v.mT) if k in ("Q", "R", "Q_final") else v for k, v in fields.items()}
@@ -146,7 +146,7 @@ class QuadraticCost(_Quadratic):
 class CostSequence(_Quadratic):
     """One convex quadratic cost per stage: the terms of `QuadraticCost`, with weights that change over the horizon.
 
-    Every field that is given has the dimension H of the stages before its own, and before that any batch dimensions, or
+    Every field has the dimension H of the stages before its own, and before that any batch dimensions, or
     none to be shared by the batch. Q_final, q_final and the constant have no stages.
 
     Args:
@@ -181,22 +181,22 @@ class CostSequence(_Quadratic):
         check: bool = True,
     ):
         super().__init__()
-        given = [name for name, value in (("Q", Q), ("R", R), ("q", q), ("r", r), ("S", S)) if value is not None]
-        self.by_stage = check_by_stage(by_stage, _STAGES, given)
+        names = [name for name, value in (("Q", Q), ("R", R), ("q", q), ("r", r), ("S", S)) if value is not None]
+        self.by_stage = check_by_stage(by_stage, _STAGES, names)
         self._fill(Q, R, Q_final, q, r, q_final, constant, S, check)
 
     @property
     def horizon(self) -> int:
         """H, the number of stages."""
         name = min(self.by_stage)
-        return getattr(self, name).shape[-1 - _OWN[name]]
+        return getattr(self, name).shape[-1 - _DIMENSIONS[name]]
 
 
 def _check_convex(name: str, matrix: Tensor) -> None:
     if is_wrapped(matrix) or not matrix.numel():
         return
     symmetric = 0.5 * (matrix + matrix.mT).detach().double().cpu()
-    # Most weights are found in order by a factorisation, a tenth of the cost of their eigenvalues.
+    # Most weights pass a factorisation, a tenth of the cost of their eigenvalues.
     shift = 0.5e-9 * symmetric.diagonal(dim1=-2, dim2=-1).amax(-1, keepdim=True)
     factored = torch.linalg.cholesky_ex(symmetric + torch.diag_embed(shift.expand(symmetric.shape[:-1])))
     if not bool(factored.info.any()):
@@ -270,7 +270,7 @@ class GoalCost(TensorFields):
             self._register(name, value)
 
     def forward(self, goal: Tensor, horizon: int = 1) -> QuadraticCost:
-        """The cost of one goal per batch element.
+        """Compute the cost of one goal per batch element.
 
         Args:
             goal: (..., n_goal).
@@ -282,7 +282,7 @@ class GoalCost(TensorFields):
         return QuadraticCost(**self.at(goal, horizon), check=False)
 
     def follow(self, reference: Tensor) -> CostSequence:
-        """The cost of goals that move: stage k is drawn to its own goal, the final state to the last.
+        """Compute the cost of goals that move: stage k is drawn to its own goal, the final state to the last.
 
         Args:
             reference: (..., H+1, n_goal) one goal for each state of the plan, the first for x0.
@@ -294,7 +294,7 @@ class GoalCost(TensorFields):
         return CostSequence(**self.along(reference), by_stage=("q",), check=False)
 
     def at(self, goal: Tensor, horizon: int) -> dict[str, Tensor]:
-        """The fields of the cost of one goal."""
+        """Compute the fields of the cost of one goal."""
         goal = self._goal("goal", goal, [])
         to_q, to_q_final, stage, final = self.maps().values()
         return {
@@ -305,7 +305,7 @@ class GoalCost(TensorFields):
         }
 
     def along(self, reference: Tensor, horizon: int | None = None) -> dict[str, Tensor]:
-        """The fields of the cost of a reference; q has the stages, H of them if the horizon is given."""
+        """Compute the fields of the cost of a reference; q has the stages, H of them if the horizon is passed."""
         stages = [] if horizon is None else [("H+1", horizon + 1)]
         reference = self._goal("reference", reference, stages)
         if reference.ndim < 2 or reference.shape[-2] < 2:
@@ -323,12 +323,12 @@ class GoalCost(TensorFields):
         }
 
     def weights(self) -> dict[str, Tensor]:
-        """The fields of the cost that no goal changes."""
+        """Return the fields of the cost that no goal changes."""
         held = self._held(("Q", "R", "Q_final"))
         return {**held, "r": held["R"].new_zeros(self.n_u)}
 
     def maps(self) -> dict[str, Tensor]:
-        """What makes the other fields of a goal."""
+        """Return the maps from a goal to the other fields of the cost."""
         return self._held(("goal_to_q", "goal_to_q_final", "goal_stage", "goal_final"))
 
     def _goal(self, name: str, value: Tensor, stages: list[tuple[str, int]]) -> Tensor:
@@ -338,7 +338,7 @@ class GoalCost(TensorFields):
         return value.to(self.Q.dtype)
 
     def stage(self, x: Tensor, u: Tensor, goal: Tensor) -> Tensor:
-        """The cost of one stage, its constant included: states (..., n_x), actions (..., n_u), goals (...) → (...)."""
+        """Cost of one stage, its constant included: states (..., n_x), actions (..., n_u), goals (...) → (...)."""
         cost = self(goal, horizon=1)
         squares = quadratic(cost.Q, x) + quadratic(cost.R, u) + quadratic(self.maps()["goal_stage"], goal)
         return 0.5 * squares + (cost.q * x).sum(-1)

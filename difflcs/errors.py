@@ -1,4 +1,4 @@
-"""Everything difflcs raises or warns with.
+"""All exceptions and warnings of difflcs.
 
 Every message says what was expected, what came, and how to mend it.
 """
@@ -13,8 +13,7 @@ class DiffLCSError(Exception):
     """Base class of every error difflcs raises on purpose.
 
     Attributes:
-        see: where to read more, named at the end of the message: something that every installation has, an expression
-            for Python or a command.
+        see: reference for the end of the message, which every installation has: a Python expression or a command.
     """
 
     see: ClassVar[str | None] = None
@@ -105,7 +104,7 @@ class SolveError(DiffLCSError, RuntimeError):
 
 
 class DiffLCSWarning(UserWarning):
-    """Base class of every warning difflcs gives."""
+    """Base class of every warning of difflcs."""
 
 
 class SolveWarning(DiffLCSWarning):

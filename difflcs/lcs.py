@@ -53,7 +53,7 @@ _DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 def _check_support(support: object, n_u: int) -> Tensor:
-    """Lower and upper bounds (2, n_u) of actions."""
+    """Check lower and upper bounds (2, n_u) of actions."""
     support = check_tensor("action_support", support, [("2", 2), ("n_u", n_u)])
     if support.ndim != 2:
         raise ShapeError(
@@ -74,7 +74,7 @@ class LCSModel(nn.Module):
         n_lam: number of complementarity variables (contacts); 0 for a linear system.
         stiffness: lower bound on the symmetric part of F, > 0.
         init_scale: parameters are drawn uniformly from ±init_scale; c starts at zero.
-        learn_c: whether c is learned. The paper's experiments keep it at zero (`False`).
+        learn_c: True if c is learned. The paper's experiments keep it at zero (`False`).
         generator: random generator of the initial parameters; torch's default one if None.
         dtype: float64 (default) or float32.
         action_support: (2, n_u) lower and upper bounds of the actions that the model was fitted to, where that is
@@ -136,7 +136,7 @@ class LCSModel(nn.Module):
         return {name: tuple(sizes[dim] for dim in dims[name]) for name in LCSModel.parameter_names}
 
     def extra_repr(self) -> str:
-        """What print(model) shows."""
+        """Return the text that print(model) shows."""
         return f"n_x={self.n_x}, n_u={self.n_u}, n_lam={self.n_lam}, stiffness={self.stiffness:g}"
 
     @property
@@ -151,7 +151,7 @@ class LCSModel(nn.Module):
 
     @runs_eagerly
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
-        """The system's matrices, differentiable with respect to the parameters; the same for all x and contexts."""
+        """System's matrices, differentiable with respect to the parameters; the same for all x and contexts."""
         if self._forward_pre_hooks:
             fresh(self, self.parameter_names)
         made_of: dict[str, Tensor] = self._parameters  # pyright: ignore[reportAssignmentType]
@@ -209,7 +209,7 @@ class LCSModel(nn.Module):
 
     @classmethod
     def from_params(cls, params: LCSParams, stiffness: float | None = None) -> LCSModel:
-        """A learnable model that starts at given matrices.
+        """Make a learnable model that starts at the matrices of a system.
 
         Args:
             params: one system, without batch dimensions.
@@ -217,7 +217,7 @@ class LCSModel(nn.Module):
                 contacts. A larger one than that eigenvalue cannot represent F and is refused.
 
         Returns:
-            A model whose `params()` equal the given ones up to rounding.
+            A model whose `params()` equal `params` up to rounding.
         """
         if len(params.batch_shape):
             raise ShapeError(f"params: expected no batch dimensions, got {tuple(params.batch_shape)}; index one system")
@@ -243,7 +243,7 @@ class LCSModel(nn.Module):
         return model
 
     def config(self) -> dict[str, object]:
-        """What is needed besides the parameters to build the model again (JSON types only)."""
+        """Return what the constructor needs to build the model again, besides the parameters (JSON types only)."""
         with torch.enable_grad():
             fresh(self, self.parameter_names)
             learn_c = self.c.requires_grad
@@ -318,7 +318,7 @@ class LCSModel(nn.Module):
             CheckpointError: files are missing, corrupt or of another kind, or no model has this name; nothing is
                 changed.
         """
-        from difflcs import zoo  # files only, but few need them
+        from difflcs import zoo  # handles files only, and few users need it
 
         directory = zoo.resolve(source)
         config, tensors = _storage.load_record(directory, "LCSModel")
@@ -326,5 +326,5 @@ class LCSModel(nn.Module):
 
 
 def is_plain(lcs: object) -> TypeGuard[LCSModel]:
-    """Whether the matrices of an LCS are the parameters of an `LCSModel`: what reads them past `params` asks this."""
+    """Return True if the matrices of an LCS are the parameters of an `LCSModel`, and may be read without `params`."""
     return type(lcs) is LCSModel and untouched(lcs)

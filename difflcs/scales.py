@@ -1,4 +1,4 @@
-"""Units in which an LCS is learned: from data, and back."""
+"""Scaling of data to units of about one, in which an LCS is learned, and back."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ class Scales:
     relaxation: float
 
     def normalise(self, x: Tensor, u: Tensor, x_next: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Transitions x (..., n_x), u (..., n_u), x_next (..., n_x) in these units."""
+        """Convert transitions x (..., n_x), u (..., n_u), x_next (..., n_x) to these units."""
         check_tensor("u", u, [("n_u", len(self.action))])
         return self.states(x), u / self.action.to(u), self.states(x_next, "x_next")
 
     def states(self, x: Tensor, name: str = "x") -> Tensor:
-        """States (..., n_x) in these units; `name` is what to call them in an error."""
+        """Convert states (..., n_x) to these units; `name` is their name in an error."""
         check_tensor(name, x, [("n_x", len(self.state))])
         return (x - self.center.to(x)) / self.state.to(x)
 
     def params(self, params: Record) -> Record:
-        """A system that holds in these units, in those of the data; differentiable.
+        """Convert a system in these units to the units of the data; differentiable.
 
         A = S Ã S⁻¹, B = S B̃ U⁻¹, C = S C̃, d = S d̃ + m − A m, D = D̃ S⁻¹, E = Ẽ U⁻¹, F = F̃, c = c̃ − D m, with m, S and
         U from center, state and action.
@@ -81,7 +81,7 @@ class Scales:
 def suggest_scales(x: Tensor, u: Tensor, x_next: Tensor) -> Scales:
     """Units and settings for learning an LCS from transitions; the same system whatever the units of the data.
 
-    The steps of an optimiser such as Adam have a size of their own: where a state is in the hundreds, an offset that
+    The steps of an optimiser such as Adam have a fixed size: where a state is in the hundreds, an offset that
     has to become 100 takes 10,000 steps of 0.01, and where it is in the thousandths the noise of these steps is all
     there is. The loss adds the squared errors of all states, so that the one with the largest numbers decides. Both go
     away in units in which every state and action is about one. Learn there, and bring the system back:
@@ -158,6 +158,6 @@ class ScaledLCS(nn.Module):
         return self.lcs.n_lam
 
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams | LCSSequence:
-        """The system in the units of the data; the module within is asked with states in its own."""
+        """Return the system in the units of the data; the module within gets states in its units."""
         inner = system_at(self.lcs, None if x is None else self.scales.states(x), context)
         return self.scales.params(inner)

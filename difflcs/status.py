@@ -1,4 +1,4 @@
-"""How a solve ended."""
+"""Status codes of the solvers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _CODES = _kernels.status_codes()
 
 
 class Status(IntEnum):
-    """How the solve of one batch element ended; `advice` says what to do about it."""
+    """Outcome of the solve of one batch element; `advice` says what to do about it."""
 
     CONVERGED = _CODES["CONVERGED"]
     MAX_ITER = _CODES["MAX_ITER"]
@@ -33,12 +33,12 @@ class Status(IntEnum):
 
 
 def solved(status: Tensor) -> Tensor:
-    """`Status.solved` of a tensor of codes, as bool."""
+    """Return `Status.solved` of each of a tensor of codes, as bool."""
     return (status == _CONVERGED) | (status == _DEGENERATE)
 
 
 def all_converged(status: Tensor) -> bool:
-    """Whether every one of some codes on the CPU is CONVERGED: the quick question, before asking which are not."""
+    """Return True if all codes, on the CPU, are CONVERGED: a quick test, before looking for those that are not."""
     if is_wrapped(status):
         return bool((status == _CONVERGED).all())
     codes = status.numpy().tobytes()  # a tenth of the time of a reduction, where there are few

@@ -1,7 +1,7 @@
-"""Two small classic systems with contact, ready made: a cart-pole between soft walls, a block pushed along a wall.
+"""Two small classic systems with contact: a cart-pole between soft walls, a block pushed along a wall.
 
-They are linear complementarity systems from first principles, not learned ones: examples, test cases, and a pattern for
-your own. Each function returns `LCSParams`; `LCSModel.from_params` makes a model of them, to simulate or to learn from.
+They are linear complementarity systems from first principles, not learned: examples, test cases, and a pattern for your
+own. Each function returns `LCSParams`; `LCSModel.from_params` makes a model of them, to simulate or to learn from.
 
 Time steps are semi-implicit: forces change the velocity, the new velocity moves the position, and the gap of a contact
 is that at the *end* of the step (Stewart & Trinkle 1996). So a contact acts in the step in which it closes, and
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import check_number
-from difflcs.lcs import LCSParams
+from difflcs.records import LCSParams
 
 __all__ = ["block_along_wall", "cart_pole_between_walls"]
 
@@ -187,7 +187,7 @@ def block_along_wall(
 
 
 def _number(name: str, value: Number, strict: bool = False) -> Tensor:
-    """A checked scalar as a float64 tensor on the CPU, gradient history kept."""
+    """Check a scalar and return it as a float64 tensor on the CPU, gradient history kept."""
     if not isinstance(value, Tensor):
         value = check_number(name, value, strict=strict)
     tensor = torch.as_tensor(value, dtype=torch.float64).reshape(())
@@ -196,5 +196,5 @@ def _number(name: str, value: Number, strict: bool = False) -> Tensor:
 
 
 def _matrix(rows: list[list[Number]] | list[list[int]]) -> Tensor:
-    """A float64 matrix of numbers and scalar tensors, differentiable in the tensors."""
+    """Make a float64 matrix of numbers and scalar tensors, differentiable in the tensors."""
     return torch.stack([torch.stack([torch.as_tensor(v, dtype=torch.float64) for v in row]) for row in rows])

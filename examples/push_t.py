@@ -32,36 +32,36 @@ if TYPE_CHECKING:
 PIXELS = 100.0
 """Pixels in a unit of length."""
 RADIUS = 0.15
-"""Of the disc."""
+"""Radius of the disc."""
 _BOXES = (box(-0.6, 0.6, 0.0, 0.3), box(-0.15, 0.15, 0.3, 1.2))
 _CENTER = Union(_BOXES).centroid
 CENTER_OF_MASS = (0.0, 0.45 - float(_CENTER[1]))
-"""Of the T, from the centre of its area: the environment takes the mean of the centres of its boxes."""
+"""Centre of mass of the T from the centre of its area: the environment takes the mean of the centres of its boxes."""
 GOAL = (256.0, 256.0, math.pi / 4)
 """Pose of the T's origin [px, px, rad]."""
 GYRATION = math.sqrt(3000.0) / PIXELS
-"""As the environment sums it: twice the moment of the bar about the T's origin, with a mass of 1."""
+"""Radius of gyration as in the environment: twice the moment of the bar about the T's origin, with a mass of 1."""
 DRIVE = PDDrive(stiffness=100.0, damping=20.0, substep=0.01, substeps=10)
 SIDE = 5.12
-"""Of the square that actions are in."""
+"""Side of the square that actions are in."""
 STEPS = 300
-"""Of 0.1 s, the limit of an episode."""
+"""Limit of an episode, in steps of 0.1 s."""
 GREEN, GREY, BLUE = (0, 158, 115), (150, 150, 150), (0, 114, 178)
 """Colours of a film: places from which a push would gain, those from which it would not, and the plan."""
 
 
 def tee(scale: float = 1.0) -> Union:
-    """The T in coordinates about the centre of its area; `scale` makes it larger or smaller about that."""
+    """Make the T in coordinates about the centre of its area, scaled about it by `scale`."""
     return Union(tuple(Polygon(scale * (part.vertices - _CENTER)) for part in _BOXES))
 
 
 def tee_pushing(**changes: Any) -> PlanarPushing:
-    """The T and the disc: state (x, y of the centre of the T's area, its yaw, x, y of the disc, its velocity).
+    """Make the system: state (x, y of the centre of the T's area, its yaw, x, y of the disc, its velocity).
 
     Args:
-        changes: fields of `PlanarPushing` to have other values.
+        changes: other values of fields of `PlanarPushing`.
     """
-    own: dict[str, Any] = {
+    defaults: dict[str, Any] = {
         "shape": tee(),
         "radius": RADIUS,
         "drive": DRIVE,
@@ -71,11 +71,11 @@ def tee_pushing(**changes: Any) -> PlanarPushing:
         "compliance": 0.02,
         "length": 1.0,
     }
-    return PlanarPushing(**(own | changes))
+    return PlanarPushing(**(defaults | changes))
 
 
 def make_env(**options: Any) -> Any:
-    """The environment as its authors publish it, with obs_type="state".
+    """Make the environment as its authors publish it, with obs_type="state".
 
     Args:
         options: for `gymnasium.make`.
@@ -96,20 +96,20 @@ def make_env(**options: Any) -> Any:
 
 
 class Rigid(PlanarPushing):
-    """Planar pushing in which nothing is inside the body: where the outline says so, a disc just touches it.
+    """Planar pushing without overlap: a disc inside the outline counts as touching it.
 
-    With its outline too large a body seems to be penetrated where nothing touches it, and the plan would wait for it to
-    be pushed out. So it goes on until something moves.
+    If the outline is too large, a disc that touches nothing seems to be inside, and a plan would wait until it is
+    pushed out. Without overlap the disc moves on until the body moves.
     """
 
     def contacts(self, x: Tensor) -> Contacts:
         """See `PlanarPushing`."""
-        found = super().contacts(x)
-        return found._replace(gap=found.gap.clamp_min(0.0))
+        contacts = super().contacts(x)
+        return contacts._replace(gap=contacts.gap.clamp_min(0.0))
 
     @classmethod
     def of(cls, system: PlanarPushing) -> Rigid:
-        """The same system otherwise."""
+        """Make a rigid copy of a system."""
         return cls(**{field.name: getattr(system, field.name) for field in fields(system)})
 
 
@@ -122,10 +122,10 @@ class PushTPolicy:
         ...
         observation, *_ = env.step(policy.act(observation))
 
-    The velocity of the disc, which the observation lacks, comes from the drive: what was sent is known.
+    The velocity of the disc, which the observation lacks, comes from the drive, as the past actions are known.
 
     Args:
-        system: of which the MPC plans: state and action as in `tee_pushing`, which it is if None.
+        system: the system of the MPC, with state and action as in `tee_pushing`, the default.
         delay: steps by which actions come late. The plan begins at the state that the system predicts for then.
 
     Attributes:
@@ -150,13 +150,13 @@ class PushTPolicy:
         self.reset()
 
     def reset(self) -> None:
-        """The begin of an episode."""
+        """Start an episode."""
         self.sampling.reset()
         self._velocity = np.zeros(2)
         self._under_way: deque[NDArray[np.float64]] = deque()
 
     def act(self, observation: ArrayLike) -> NDArray[np.float64]:
-        """An action.
+        """Compute an action.
 
         Args:
             observation: (5,) x, y of the disc, x, y [px] and angle [rad] of the T's origin.
@@ -177,14 +177,14 @@ class PushTPolicy:
         return target * PIXELS
 
     def _predict(self, state: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The state one step later."""
+        """Predict the state one step later."""
         with torch.no_grad():
             x, u = torch.from_numpy(state), torch.from_numpy(target - state[3:5])
             return self.system.params(x).step(x, u).x_next.numpy()
 
 
 def from_origin(pose: ArrayLike) -> NDArray[np.float64]:
-    """Pose (3,) of the centre of the T's area in units of length, from that of its origin in pixels."""
+    """Convert the pose (3,) of the T's origin in pixels to that of the centre of its area in units of length."""
     x, y, yaw = np.asarray(pose, np.float64)
     cos, sin = math.cos(yaw), math.sin(yaw)
     cx, cy = _CENTER.tolist()

@@ -25,7 +25,7 @@ from difflcs.cli.bench import machine
 from difflcs.errors import CheckpointError
 from difflcs.rl import TaskSpec, TrainedPolicy, collect, get_task, write_atomically
 from difflcs.rl.rollout import Act, mpc_actions
-from difflcs.rl.runs.delay import late_actions, predicted_by
+from difflcs.rl.runs.delay import delay_actions, make_predictor
 from difflcs.rl.seeding import Stream, episode_seeds
 
 NOMINAL = "as in the training"
@@ -97,7 +97,7 @@ def acting(condition: Condition, policy: Any, n_u: int, rng: np.random.Generator
     seeing: Act = noisy if any(condition.noise) else act
     if not condition.delay:
         return seeing
-    return late_actions(seeing, n_u, condition.delay, predicted_by(policy.lcs) if condition.predicted else None)
+    return delay_actions(seeing, n_u, condition.delay, make_predictor(policy.lcs) if condition.predicted else None)
 
 
 def measure(condition: Condition, task: TaskSpec, policy: Any, goals: int, seed: int) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""How fast the MPC layer is on this machine, against IPOPT in the same run. `difflcs bench`."""
+"""Speed of the MPC layer on this machine, against IPOPT in the same run: `difflcs bench`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Timing:
     """Time of one kind of work, per problem, the best of some repetitions.
 
     Attributes:
-        work: what was done.
+        work: name of the work.
         batched: seconds on one core.
         threads: seconds with all threads.
         ipopt: seconds of backend ipopt on one core.
@@ -40,12 +40,12 @@ class Timing:
 
     @property
     def ratio(self) -> float:
-        """How many times as fast as IPOPT, on one core each."""
+        """Speed as a multiple of IPOPT's, on one core each."""
         return self.ipopt / self.batched
 
 
 def pushing_cost() -> GoalCost:
-    """A cost like that of pushing an object with three fingers: 9 states, of which 3 have a goal, and 6 actions."""
+    """Make a cost as of pushing an object with three fingers: 9 states, 3 of them with a goal, and 6 actions."""
     pairs = [(3 + 2 * finger + axis, axis) for finger in range(3) for axis in range(2)]
     return GoalCost.reach(
         9,
@@ -108,7 +108,7 @@ def _differentiate(mpc: LCSMPCLayer, x0: Tensor, goal: Tensor) -> None:
 
 
 def table(timings: Sequence[Timing], threads: int) -> str:
-    """The timings as text."""
+    """Format the timings as text."""
     columns = ("", "batched", f"{threads} threads" if threads > 1 else "", "ipopt", "ipopt / batched")
     rows = [
         (t.work, _short(t.batched), _short(t.threads) if threads > 1 else "", _short(t.ipopt), f"{t.ratio:.0f}×")
@@ -123,7 +123,7 @@ def _short(seconds: float) -> str:
 
 
 def best(repeats: int, work: Callable[[], object]) -> float:
-    """Shortest time [s] of several runs, after one that does not count."""
+    """Measure the shortest time [s] of several runs, after one that does not count."""
     work()
     times = []
     for _ in range(repeats):
@@ -134,13 +134,13 @@ def best(repeats: int, work: Callable[[], object]) -> float:
 
 
 def save(path: Path, record: dict) -> None:
-    """Write what a benchmark has measured as JSON, atomically; its keys stay in their order."""
+    """Write the record of a benchmark as JSON, atomically; its keys keep their order."""
     _storage.write_atomically(path, (json.dumps(record, indent=2, ensure_ascii=False) + "\n").encode())
     print(f"written to {path}")
 
 
 def machine() -> dict[str, str]:
-    """What was measured on."""
+    """Describe the machine: processor, instruction set and versions."""
     return {
         "cpu": cpu(),
         "instruction set": _kernels.isa(),
@@ -151,7 +151,7 @@ def machine() -> dict[str, str]:
 
 
 def cpu() -> str:
-    """Name of the processor."""
+    """Return the name of the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -160,7 +160,7 @@ def cpu() -> str:
 
 
 def pushing_model(n_lam: int, seed: int) -> LCSParams:
-    """Fingertips that move as told and push an object they touch: n_x 9, n_u 6, random contact directions."""
+    """Make a model of fingertips that move as commanded and push an object: n_x 9, n_u 6, random contact directions."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -176,7 +176,7 @@ def pushing_model(n_lam: int, seed: int) -> LCSParams:
 
 
 def states_and_goals(count: int, seed: int) -> tuple[Tensor, Tensor]:
-    """States (count, 9) of a hand around an object near the origin, and goals (count, 3) of the paper's task space."""
+    """Draw states (count, 9) of a hand around an object near the origin, and goals (count, 3) of the paper's task."""
     generator = torch.Generator().manual_seed(seed)
     angles = torch.deg2rad(torch.tensor([90.0, -30.0, 210.0], dtype=torch.float64))
     home = 0.08 * torch.stack([angles.cos(), angles.sin()], 1).reshape(1, 6)

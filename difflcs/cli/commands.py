@@ -1,4 +1,4 @@
-"""The commands by their names, and the small ones: `difflcs zoo | assets | bench | doctor`."""
+"""The table of all commands, and the small ones themselves: `difflcs zoo | assets | bench | doctor`."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Assets:
             print(f"to use them: export {YCB_DIR_VARIABLE}={self.folder}")
 
     def interrupted(self) -> str:
-        """What to do after Ctrl-C."""
+        """Return the advice after Ctrl-C."""
         return "run the same command again to continue"
 
 
@@ -151,12 +151,12 @@ def run(words: Sequence[str]) -> int:
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # a path may be no text
+            stream.reconfigure(errors="backslashreplace")  # a path may not be valid text
     command: Any = None
     try:
-        command = _parsed(words)
+        command = _parse(words)
         torch.set_num_threads(1)  # tensors of 100 × 9 do not gain from threads, and the MPC's workers need the cores
-        with _shown_log():
+        with _show_log():
             return int(command.run() or 0)
     except DiffLCSError as error:
         print(f"difflcs: {error}", file=sys.stderr)
@@ -167,8 +167,8 @@ def run(words: Sequence[str]) -> int:
         return 130
 
 
-def _parsed(words: Sequence[str]) -> Any:
-    """The command with its settings."""
+def _parse(words: Sequence[str]) -> Any:
+    """Parse the words into a command with its settings."""
     import tyro
 
     if words and not words[0].startswith("-") and words[0] not in _COMMANDS:
@@ -195,8 +195,8 @@ def _parsed(words: Sequence[str]) -> Any:
 
 
 @contextlib.contextmanager
-def _shown_log() -> Iterator[None]:
-    """What the library logs appears on stderr, one plain line each."""
+def _show_log() -> Iterator[None]:
+    """Show the log of the library on stderr, one plain line for each record."""
     logger, handler = logging.getLogger("difflcs"), logging.StreamHandler()
     before = logger.level
     logger.addHandler(handler)

@@ -1,7 +1,7 @@
-"""What this machine has: solvers, instruction set, extras, rendering, meshes.
+"""Report on the installation: solvers, instruction set, extras, rendering, meshes.
 
-`difflcs doctor [--json] [--dev]`, or `python -m difflcs doctor`. Whatever breaks is reported, never raised. Simulation
-and OpenGL are tried in processes of their own, which may crash.
+`difflcs doctor [--json] [--dev]`, or `python -m difflcs doctor`. Failures are reported, never raised. Simulation and
+OpenGL are tried in separate processes, which may crash.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from difflcs._storage import load_record, read_json
 from difflcs.errors import BackendNotFoundError, DiffLCSError
 
 GROUPS = ("library", "solvers", "machine", "extras", "environments")
-"""What a user needs to know, in the order of the report."""
+"""Groups of checks for users, in the order of the report."""
 DEVELOPMENT = "development"
 """One more group: the extras that a checkout needs for its tests, pages, notebooks and tables."""
 TIMEOUT = 120.0
-"""Seconds that a process of its own may take; the first picture in software takes some."""
+"""Seconds that a separate process may take; the first picture in software takes some."""
 
 _HARD = ("torch", "numpy", "casadi", "safetensors")
 _OPTIONAL_BACKENDS = ("relaxed",)
@@ -86,15 +86,15 @@ print(json.dumps({"gl": os.environ.get("MUJOCO_GL", "")}))
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that was looked at.
+    """Result of one check.
 
     Attributes:
         group: heading it belongs to.
-        name: what it is.
+        name: name of the check.
         status: "ok", "missing" (something optional that is not installed), or "failed".
-        text: what was found.
-        remedy: what to do; empty if nothing.
-        core: whether the library does not work without it.
+        text: the result in words.
+        remedy: advice; empty if there is nothing to do.
+        core: True if the library does not work without it.
     """
 
     group: str
@@ -106,7 +106,7 @@ class Check:
 
 
 class _MissingError(Exception):
-    """Something optional is not here."""
+    """Something optional is not installed."""
 
     def __init__(self, text: str, remedy: str):
         super().__init__(text)
@@ -114,10 +114,10 @@ class _MissingError(Exception):
 
 
 def examine(groups: Sequence[str] = GROUPS) -> list[Check]:
-    """Look at everything; takes some seconds.
+    """Run the checks; takes some seconds.
 
     Args:
-        groups: what to look at, of `GROUPS` and `DEVELOPMENT`.
+        groups: groups to check, of `GROUPS` and `DEVELOPMENT`.
     """
     look = {
         "library": lambda: [_check("library", name, work, core=True) for name, work in _LIBRARY.items()],
@@ -131,12 +131,12 @@ def examine(groups: Sequence[str] = GROUPS) -> list[Check]:
 
 
 def healthy(checks: Sequence[Check]) -> bool:
-    """Whether the library itself works, whatever else is missing."""
+    """Return True if the library itself works, whatever else is missing."""
     return all(check.status == "ok" for check in checks if check.core)
 
 
 def as_text(checks: Sequence[Check], width: int = 100) -> str:
-    """One paragraph per check, with its remedy, and a verdict at the end."""
+    """Format one paragraph per check, with its remedy, and a verdict at the end."""
     wrap = TextWrapper(width, subsequent_indent=" " * 19, break_long_words=False, break_on_hyphens=False)
     lines: list[str] = []
     for group, members in groupby(checks, lambda check: check.group):
@@ -150,7 +150,7 @@ def as_text(checks: Sequence[Check], width: int = 100) -> str:
 
 
 def as_json(checks: Sequence[Check]) -> str:
-    """The checks and the verdict as one JSON object."""
+    """Format the checks and the verdict as one JSON object."""
     return json.dumps({"ok": healthy(checks), "checks": [asdict(check) for check in checks]}, sort_keys=True)
 
 
@@ -161,7 +161,7 @@ def _check(group: str, name: str, work: Callable[[], str], core: bool = False) -
         return Check(group, name, "missing", str(error), error.remedy, core)
     except Exception as error:  # a broken package raises anything
         text = " ".join(str(error).split())
-        if isinstance(error, DiffLCSError | RuntimeError) and text:  # says itself how to mend it
+        if isinstance(error, DiffLCSError | RuntimeError) and text:  # its message says how to mend it
             return Check(group, name, "failed", text, core=core)
         remedy = "install difflcs again: pip install --force-reinstall difflcs" if core else ""
         return Check(group, name, "failed", f"{type(error).__name__}: {text}", remedy, core)
@@ -184,7 +184,7 @@ def _hard_dependencies() -> str:
 
 
 def _kernels() -> str:
-    """The compiled kernels solve one LCP whose solution is known."""
+    """Solve an LCP with a known solution by the compiled kernels."""
     from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 
     lam = solve_lcp(torch.eye(2, dtype=torch.float64), torch.tensor([-1.0, 2.0], dtype=torch.float64)).lam
@@ -228,7 +228,7 @@ def _solvers() -> list[Check]:
 
 
 def _solves(name: str) -> str:
-    """Plans a few steps with a tiny model, and differentiates the plan."""
+    """Plan a few steps with a tiny model, and differentiate the plan."""
     model = _tiny_model()
     cost = GoalCost.reach(2, 1, goal_weight=(1.0,), input_weight=0.1)
     try:
@@ -259,8 +259,8 @@ def _threads() -> str:
 def _devices() -> str:
     if not torch.cuda.is_available():
         return "cpu; no GPU that torch can use (none is needed: the solvers run on the CPU)"
-    found = ", ".join(torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count()))
-    return f"cpu and {found}; tensors there are accepted and returned, the solvers run on the CPU"
+    gpus = ", ".join(torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count()))
+    return f"cpu and {gpus}; tensors there are accepted and returned, the solvers run on the CPU"
 
 
 def _extras(group: str, names: Iterable[str]) -> list[Check]:
@@ -268,17 +268,17 @@ def _extras(group: str, names: Iterable[str]) -> list[Check]:
 
 
 def _development() -> list[str]:
-    """The extras that are not for users, by the package's own metadata."""
+    """Return the extras that are not for users, from the metadata of the package."""
     known = metadata.metadata("difflcs").get_all("Provides-Extra") or ()
     return [name for name in known if name not in (*_EXTRAS, "all")]
 
 
 def _extra(name: str) -> str:
-    """The packages of an extra, by the package's own metadata."""
+    """Check the packages of an extra, which the metadata of the package lists."""
     wanted = [line for line in metadata.requires("difflcs") or () if re.search(rf"extra == ['\"]{name}['\"]", line)]
     if not wanted:
         raise RuntimeError("expected packages in the metadata of difflcs, got none; install difflcs again")
-    found, lacking = [], []
+    present, lacking = [], []
     for line in wanted:
         match = re.match(r"[\w.-]+", line)
         package = match[0] if match else line
@@ -288,11 +288,11 @@ def _extra(name: str) -> str:
         elif least and _release(version) < _release(least[1]):
             lacking.append(f"{package} >= {least[1]} (found {version})")
         else:
-            found.append(f"{package} {version}")
+            present.append(f"{package} {version}")
     if lacking:
         purpose = f"for {_EXTRAS[name]}: " if name in _EXTRAS else ""
         raise _MissingError(f"{purpose}without {', '.join(lacking)}", f'pip install "difflcs[{name}]"')
-    return f"{_EXTRAS[name]}: {', '.join(found)}" if name in _EXTRAS else ", ".join(found)
+    return f"{_EXTRAS[name]}: {', '.join(present)}" if name in _EXTRAS else ", ".join(present)
 
 
 def _version(package: str) -> str | None:
@@ -310,18 +310,18 @@ def _release(version: str) -> tuple[int, ...]:
 
 
 def _environments() -> list[Check]:
-    found: dict[str, Any] = {}
+    report: dict[str, Any] = {}
 
     def simulation() -> str:
-        found.update(_in_process(_SIMULATION))
-        return f"the cube's environments step, {'compiled' if found['native'] else 'in Python'}"
+        report.update(_in_process(_SIMULATION))
+        return f"the cube's environments step, {'compiled' if report['native'] else 'in Python'}"
 
     def meshes() -> str:
-        return _meshes(found["meshes"], found["folder"])
+        return _meshes(report["meshes"], report["folder"])
 
     checks = [_check("environments", "simulation", simulation)]
     checks += [_check("environments", "pictures", _pictures), _check("environments", "video", _video)]
-    return checks + [_check("environments", "YCB meshes", meshes)] * bool(found)
+    return checks + [_check("environments", "YCB meshes", meshes)] * bool(report)
 
 
 def _pictures() -> str:
@@ -338,9 +338,9 @@ def _video() -> str:
 
 
 def _meshes(state: dict[str, bool | None], folder: str) -> str:
-    """Which objects have a mesh: yes, no, or None where the folder that the user names lacks it."""
-    there = [name for name, found in state.items() if found]
-    absent = [name for name, found in state.items() if not found]
+    """Report the objects with a mesh; None in `state` means that the folder which the user named lacks it."""
+    there = [name for name, has_mesh in state.items() if has_mesh]
+    absent = [name for name, has_mesh in state.items() if not has_mesh]
     if not absent:
         return f"all {len(there)} in {folder}"
     download = f"difflcs assets download {' '.join(absent) if there else ''}".strip()
@@ -375,11 +375,11 @@ _MACHINE: dict[str, Callable[[], str]] = {"threads": _threads, "devices": _devic
 
 
 def main(as_object: bool = False, development: bool = False) -> int:
-    """Examine and print.
+    """Run the checks and print the report.
 
     Args:
         as_object: print JSON instead of text.
-        development: look at what only development needs, too.
+        development: also check the extras that only development needs.
 
     Returns:
         Exit code: 0 if the library works, 1 if not.

@@ -1,4 +1,4 @@
-"""Flags of the command line: those among its words, and errors that name them."""
+"""Flags among the words of the command line, and errors that name flags."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from itertools import zip_longest
 from difflcs.errors import InvalidInputError
 
 
-def given_flags(words: Sequence[str]) -> frozenset[str]:
-    """Flags among the words, without dashes in front; of `--a.no-b` both that and `a.b`."""
-    given = {word[2:].partition("=")[0].replace("_", "-") for word in words if word.startswith("--")}
-    return frozenset(given | {re.sub(r"(^|\.)no-", r"\1", flag) for flag in given})
+def find_flags(words: Sequence[str]) -> frozenset[str]:
+    """Return the flags among the words, without dashes in front; of `--a.no-b` both that and `a.b`."""
+    flags = {word[2:].partition("=")[0].replace("_", "-") for word in words if word.startswith("--")}
+    return frozenset(flags | {re.sub(r"(^|\.)no-", r"\1", flag) for flag in flags})
 
 
 def flag_value(words: Sequence[str], flag: str) -> str | None:
-    """What follows a flag, as `--flag value` or `--flag=value`."""
+    """Return the value of a flag, written as `--flag value` or `--flag=value`."""
     for word, following in zip_longest(words, words[1:]):
         if word == flag:
             return following
@@ -30,7 +30,7 @@ def flag_value(words: Sequence[str], flag: str) -> str | None:
 
 @contextlib.contextmanager
 def errors_by_flag() -> Iterator[None]:
-    """Errors of settings come out as they are, with their flag; tyro would print its own name of the group.
+    """Raise errors of settings with the name of their flag; tyro would print its own name of the group.
 
     Raises:
         InvalidInputError: a setting of a group has a value that it cannot have.

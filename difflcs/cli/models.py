@@ -1,4 +1,4 @@
-"""The commands for what was learned: `difflcs evaluate | render | export`."""
+"""The commands for learned models: `difflcs evaluate | render | export`."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Evaluate:
             bounds = saved_bounds(learned.run)
         start = time.perf_counter()
         envs = task.make_envs(max(1, min(EVALUATION_ENVS, goals)))
-        found = _compare(learned, task, envs)
+        description = _describe_env(learned, task, envs)
         try:
             with bar(goals * task.episode_steps, "evaluating") as shown:
                 result = evaluate(
@@ -70,7 +70,7 @@ class Evaluate:
                 **asdict(result),
                 "run": learned.name,
                 "task": learned.task,
-                "object": found,
+                "object": description,
                 "trained_on": learned.object,
                 "method": learned.method,
                 "finished": learned.finished,
@@ -90,8 +90,8 @@ class Evaluate:
                 print(f"median {error.name.replace('_', ' ')}: {result.median_errors[error.name]:.3g} {error.unit}")
         if learned.card is not None:
             print(f"its card: {learned.card.success_text}, goal seed {learned.card.evaluation_seed}")
-        if found:
-            print(f"object: {zoo.described(found)}")
+        if description:
+            print(f"object: {zoo.describe(description)}")
         solver = "" if learned.backend is None else f", backend {learned.backend}"
         print(f"goal seed {result.seed}, {learned.task}{solver}, {seconds:.1f} s, {known_versions()}")
 
@@ -179,20 +179,20 @@ class Export:
         print(f"written: {path}\nits numbers: {self.out / DESCRIPTION}")
 
 
-def _compare(learned: TrainedPolicy, task: TaskSpec, env: Any) -> dict[str, Any]:
-    """What an environment holds; says so if it is not what the model was trained on."""
-    found = dict(task.describe(env))
-    if learned.object is not None and not learned.fits(found):
+def _describe_env(learned: TrainedPolicy, task: TaskSpec, env: Any) -> dict[str, Any]:
+    """Return the description of an environment; print a warning if it differs from that of the training."""
+    description = dict(task.describe(env))
+    if learned.object is not None and not learned.fits(description):
         print(
-            f"difflcs: {learned.name} was trained on {zoo.described(learned.object)}, here it is "
-            f"{zoo.described(found)}: do not compare their success",
+            f"difflcs: {learned.name} was trained on {zoo.describe(learned.object)}, here it is "
+            f"{zoo.describe(description)}: do not compare their success",
             file=sys.stderr,
         )
-    return found
+    return description
 
 
 def film(learned: TrainedPolicy, task: TaskSpec, goals: Sequence[Sequence[float]], path: Path, seed: int) -> list[bool]:
-    """Play one episode per goal into a video; for each goal whether it was reached.
+    """Play one episode per goal into a video; for each goal, True if it was reached.
 
     Raises:
         InvalidInputError: a goal is outside the goal space, or the video cannot be written there.
@@ -205,7 +205,7 @@ def film(learned: TrainedPolicy, task: TaskSpec, goals: Sequence[Sequence[float]
     except InvalidInputError as error:
         raise NoPictureError(str(error)) from error
     try:
-        _compare(learned, task, env)
+        _describe_env(learned, task, env)
         return record_video(env, learned.policy, goals, path, task, seed)
     except OSError as error:
         raise InvalidInputError(f"out: expected a place to write {path}, got: {error}; choose another") from error
@@ -214,5 +214,5 @@ def film(learned: TrainedPolicy, task: TaskSpec, goals: Sequence[Sequence[float]
 
 
 def known_versions() -> str:
-    """The packages that decide a result, with their versions, in one line."""
+    """List the packages that decide a result, with their versions, in one line."""
     return ", ".join(f"{name} {version}" for name, version in versions().items() if version is not None)

@@ -1,4 +1,4 @@
-"""The commands that learn: `difflcs train`, whose flags are the settings of its method, and `difflcs demo`."""
+"""The commands for training: `difflcs train`, whose flags are the settings of its method, and `difflcs demo`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from difflcs._optional import require
-from difflcs.cli.flags import flag_value, given_flags
+from difflcs.cli.flags import find_flags, flag_value
 from difflcs.cli.models import film, known_versions
 from difflcs.errors import CheckpointError
 from difflcs.rl import TrainedPolicy
@@ -35,8 +35,8 @@ class Train(TrainConfig):
     """Replace the run in --out. It is deleted once the new one has begun."""
     smoke: bool = False
     """Finish in seconds, on too little data to learn anything."""
-    given: ClassVar[frozenset[str]] = frozenset()
-    """Flags of settings that were given, which a resumed run is compared with."""
+    passed: ClassVar[frozenset[str]] = frozenset()
+    """Flags of settings in the command, with which a resumed run is compared."""
 
     def __post_init__(self) -> None:
         """Check nothing yet: `run` does, so that its errors are printed like all others."""
@@ -56,12 +56,12 @@ class Train(TrainConfig):
 
     def _resumed(self, config: TrainConfig) -> TrainConfig:
         stored = stored_config(RunDirectory.open(self.directory(self.out)))
-        wanted, own = _flat(config.to_json()), _flat(stored.to_json())
+        wanted, before = _flatten(config.to_json()), _flatten(stored.to_json())
         for name, value in wanted.items():
             flag = name.removeprefix("settings.").replace("_", "-")
-            if flag in self.given and value != own.get(name):
+            if flag in self.passed and value != before.get(name):
                 raise CheckpointError(
-                    f"--{flag}: expected {own.get(name)!r}, as {self.directory(self.out)} was started with, got "
+                    f"--{flag}: expected {before.get(name)!r}, as {self.directory(self.out)} was started with, got "
                     f"{value!r}; drop the flag, or start another run with another --out"
                 )
         if self.init is not None:
@@ -71,16 +71,16 @@ class Train(TrainConfig):
         return stored
 
     def interrupted(self) -> str:
-        """What to do after Ctrl-C."""
+        """Return the advice after Ctrl-C."""
         return f"continue with: difflcs train --out {self.directory(self.out)} --resume"
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by their dotted names."""
-    found: dict[str, Any] = {}
+def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Flatten nested settings: dotted name → value."""
+    flat: dict[str, Any] = {}
     for name, value in values.items():
-        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return found
+        flat |= _flatten(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return flat
 
 
 def train_command(words: Sequence[str]) -> type[Train]:
@@ -106,7 +106,7 @@ def train_command(words: Sequence[str]) -> type[Train]:
         ],
         bases=(Train,),
         frozen=True,
-        namespace={"__doc__": Train.__doc__, "__post_init__": lambda self: None, "given": given_flags(words)},
+        namespace={"__doc__": Train.__doc__, "__post_init__": lambda self: None, "passed": find_flags(words)},
     )
 
 
@@ -159,7 +159,7 @@ class Demo:
         return f"{run.path / 'video.mp4'} ({sum(reached)} of {len(goals)} goals reached in it)"
 
     def interrupted(self) -> str:
-        """What to do after Ctrl-C."""
+        """Return the advice after Ctrl-C."""
         return "run the same command again to continue"
 
 

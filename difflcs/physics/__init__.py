@@ -1,4 +1,4 @@
-"""Linear complementarity systems from known physics: shapes in the plane, MuJoCo models, and what of it is learned."""
+"""Linear complementarity systems from known physics: shapes in the plane, MuJoCo models, and learnable physics."""
 
 from __future__ import annotations
 

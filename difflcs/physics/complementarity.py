@@ -1,4 +1,4 @@
-"""From gaps and contact Jacobians to a linear complementarity system: what every kind of contact physics has in common.
+"""Linear complementarity systems from gaps and contact Jacobians, for every kind of contact physics.
 
 A step without contact is linear, x₊ = A x + B u + d. Contact forces λ along the rows of J change it by W Jᵀ λ, where W
 says what a force does to the state. With the gap after the step linearised, the step is an LCS:
@@ -41,7 +41,7 @@ Cone = Literal["anitescu", "stewart-trinkle"]
 
 
 class Contacts(NamedTuple):
-    """What may touch, at some states.
+    """Possible contacts, at some states.
 
     Attributes:
         gap: (..., n_contacts) signed distances, negative in penetration [length].
@@ -76,7 +76,7 @@ class FreeMotion(NamedTuple):
 
 
 def count_forces(n_contacts: int, n_tangents: int, cone: Cone = "anitescu") -> int:
-    """n_lam of the system for so many contacts."""
+    """Return n_lam of a system with so many contacts."""
     if n_tangents == 0:
         return n_contacts
     return n_contacts * (2 * n_tangents if cone == "anitescu" else 2 * n_tangents + 2)
@@ -95,7 +95,7 @@ def contact_lcs(
     force: float | None = None,
     rest: Tensor | None = None,
 ) -> LCSParams:
-    """One step with contact as a linear complementarity system, linearised at some states.
+    """Build the linear complementarity system of one step with contact, linearised at some states.
 
     Args:
         contacts: gaps and their derivatives at x.
@@ -116,7 +116,7 @@ def contact_lcs(
         n + μ t, n − μ t of each tangent; or the normal force, friction along t and −t of each, the sliding distance.
 
     Warns:
-        FrictionWarning: the drag of the second of these is much of a slide, see above.
+        FrictionWarning: the drag of the Stewart-Trinkle cone holds back much of a slide, see above.
 
     Raises:
         InvalidInputError and its kinds: an argument does not fit.
@@ -126,8 +126,8 @@ def contact_lcs(
     force = length if force is None else check_number("force", force, strict=True)
     n_x, n_contacts, n_tangents = x.shape[-1], contacts.gap.shape[-1], contacts.tangent.shape[-2]
     _check_shapes(contacts, free, n_x, n_contacts, n_tangents)
-    mu = _each("friction", friction, contacts.gap, strict=False)
-    soft = _each("compliance", compliance, contacts.gap, strict=True) * (force / length)
+    mu = _per_contact("friction", friction, contacts.gap, strict=False)
+    soft = _per_contact("compliance", compliance, contacts.gap, strict=True) * (force / length)
     if n_tangents and cone == "stewart-trinkle":
         return _stewart_trinkle(contacts, free, x, mu, soft, length, force, rest)
     rows, gap, softness = _rays(contacts, mu, soft) if n_tangents else (contacts.normal, contacts.gap, soft)
@@ -155,8 +155,8 @@ def _check_shapes(contacts: Contacts, free: FreeMotion, n_x: int, n_contacts: in
     check_tensor("free.d", free.d, [of_state])
 
 
-def _each(name: str, value: float | Tensor, gap: Tensor, strict: bool) -> Tensor:
-    """A coefficient of each contact."""
+def _per_contact(name: str, value: float | Tensor, gap: Tensor, strict: bool) -> Tensor:
+    """Expand a coefficient to one for each contact."""
     value = torch.as_tensor(value, dtype=gap.dtype, device=gap.device)
     bad = value <= 0 if strict else value < 0
     if bool(bad.any()) or not bool(torch.isfinite(value).all()):
@@ -174,14 +174,14 @@ def _each(name: str, value: float | Tensor, gap: Tensor, strict: bool) -> Tensor
 
 
 def _rays(contacts: Contacts, mu: Tensor, soft: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Extreme rays n ± μ t of each contact; their gaps and compliances."""
+    """Compute the extreme rays n ± μ t of each contact, their gaps and compliances."""
     per = 2 * contacts.tangent.shape[-2]
     normal, slide = contacts.normal.unsqueeze(-2), mu[..., None, None] * contacts.tangent
     rays = torch.stack([normal + slide, normal - slide], -2)  # (..., n_contacts, n_tangents, 2, n_x)
     return rays.flatten(-4, -2), contacts.gap.repeat_interleave(per, -1), soft.repeat_interleave(per, -1)
 
 
-_MUCH = 0.25
+_LARGE_DRAG = 0.25
 
 
 def _check_drag(drag: Tensor, W: Tensor, normals: Tensor, mu: Tensor) -> None:
@@ -190,7 +190,7 @@ def _check_drag(drag: Tensor, W: Tensor, normals: Tensor, mu: Tensor) -> None:
         return
     mobility = W.detach()[..., normals + 1, normals + 1].amax(-1)
     part = float((drag.detach() * mobility).median())
-    if part > _MUCH:
+    if part > _LARGE_DRAG:
         warnings.warn(
             f"friction by Stewart and Trinkle needs a drag here that gives {part:.2g} times the distance of a slide "
             f'back, as several contacts share a load: use cone="anitescu", or a larger compliance',
@@ -240,7 +240,7 @@ def _stewart_trinkle(
         F[..., sigma, sigma - per + j] = -1.0
 
     def spread(values: Tensor, dim: int) -> Tensor:
-        """Values of the forces, with zeros where a sliding distance has its place."""
+        """Insert zeros into values of the forces, at the places of the sliding distances."""
         shape = list(values.shape)
         shape[dim] = n_contacts * size
         return values.new_zeros(shape).index_copy(dim, forces.to(values.device), values)

@@ -20,7 +20,7 @@ from difflcs.records import LCSParams
 __all__ = ["LEARNABLE", "ContactLCS"]
 
 LEARNABLE = ("center_of_mass", "gyration", "friction", "compliance", "radius", "gain", "drive_compliance", "outline")
-"""What a `ContactLCS` can learn."""
+"""The quantities that a `ContactLCS` can learn."""
 
 
 class ContactLCS(nn.Module):
@@ -29,12 +29,12 @@ class ContactLCS(nn.Module):
     It is an `LCSModule`. Its system follows the state: contacts are where the shapes are. So it is learned from little
     data, by `violation_loss` or `prediction_loss` from transitions, or through an `LCSMPCLayer` by PPO.
 
-    All parameters are without units and of one scale, so that one learning rate serves: logarithms of what is positive,
-    and distances in parts of `length`. They start at zero, where the physics is as it was given.
+    All parameters are without units and of one scale, so that one learning rate serves: logarithms of positive
+    quantities, and distances in parts of `length`. They start at zero, at the physics that was passed.
 
     Args:
-        physics: what is known or guessed.
-        learn: what is learned of it, of `center_of_mass` (2), `gyration` (1), `friction` (one for each disc),
+        physics: the known or guessed physics.
+        learn: the quantities to learn, among `center_of_mass` (2), `gyration` (1), `friction` (one for each disc),
             `compliance` (one for each disc), `radius` of each disc, `gain` of a `PositionDrive` (each disc and axis)
             and its `drive_compliance` (each disc), and `outline`: each side of a polygon moves along its normal, each
             circle has another radius.
@@ -102,7 +102,7 @@ class ContactLCS(nn.Module):
 
     @property
     def physics(self) -> PlanarPushing:
-        """The physics as it is now, differentiable in what is learned."""
+        """The current physics, differentiable in the learned parameters."""
         guess, change = self.guess, fresh(self.change, self.learn)
         length = guess.length or 1.0
         values: dict[str, Any] = {name: getattr(guess, name) for name in ("center_of_mass", "gyration", "length")}
@@ -117,7 +117,7 @@ class ContactLCS(nn.Module):
             drive = zip(_drive(guess), ("gain", "drive_compliance"), strict=True)
             values["drive"] = PositionDrive(*(v * change[name].exp() if name in change else v for v, name in drive))
         if "outline" in change:
-            values["shape"] = _moved(guess.shape, iter(length * change["outline"]))
+            values["shape"] = _move_sides(guess.shape, iter(length * change["outline"]))
         return guess.replace(**values) if change else guess
 
     @runs_eagerly
@@ -126,9 +126,9 @@ class ContactLCS(nn.Module):
         return self.physics.params(x, context)
 
     def summary(self) -> dict[str, Any]:
-        """What is learned, as numbers in the units of the physics."""
+        """Return the learned quantities as numbers in the units of the physics."""
         now = self.physics
-        found: dict[str, Any] = {}
+        learned: dict[str, Any] = {}
         for name in self.learn:
             value: Any
             if name in ("gain", "drive_compliance"):
@@ -137,16 +137,16 @@ class ContactLCS(nn.Module):
                 value = (now.length or 1.0) * self.change["outline"]
             else:
                 value = getattr(now, name)
-            found[name] = value.detach().tolist()
-        return found
+            learned[name] = value.detach().tolist()
+        return learned
 
     def config(self) -> dict[str, Any]:
-        """What it is built of besides what is learned, in JSON types."""
+        """Return what the constructor needs to build it again, in JSON types."""
         return {"learn": list(self.learn), "guess": _plain(self.guess)}
 
 
 def _plain(value: Any) -> Any:
-    """Numbers, tensors and descriptions in JSON types."""
+    """Convert numbers, tensors and dataclasses to JSON types."""
     if isinstance(value, Tensor):
         return value.detach().tolist()
     if is_dataclass(value) and not isinstance(value, type):
@@ -155,7 +155,7 @@ def _plain(value: Any) -> Any:
 
 
 def _drive(physics: PlanarPushing) -> tuple[Tensor, Tensor]:
-    """Gain and compliance of a `PositionDrive`."""
+    """Return gain and compliance of a `PositionDrive`."""
     drive: Any = physics.drive
     return torch.as_tensor(drive.gain, dtype=torch.float64), torch.as_tensor(drive.compliance, dtype=torch.float64)
 
@@ -166,10 +166,10 @@ def _count_sides(shape: Shape) -> int:
     return len(shape.vertices) if isinstance(shape, Polygon) else 1
 
 
-def _moved(shape: Shape, outward: Any) -> Shape:
-    """A shape whose sides have moved by the next numbers, each along its normal."""
+def _move_sides(shape: Shape, outward: Any) -> Shape:
+    """Move the sides of a shape by the next numbers, each along its normal."""
     if isinstance(shape, Union):
-        return Union(tuple(_moved(part, outward) for part in shape.parts))
+        return Union(tuple(_move_sides(part, outward) for part in shape.parts))
     if isinstance(shape, Circle):
         return Circle(shape.r + next(outward), shape.center)
     if not isinstance(shape, Polygon):
@@ -182,12 +182,12 @@ def _moved(shape: Shape, outward: Any) -> Shape:
     normal = torch.stack([side[:, 1], -side[:, 0]], -1) / side.norm(dim=1, keepdim=True)
     by = torch.stack([next(outward) for _ in range(len(vertices))])
     # A corner stays on both of its sides: n₁·δ = h₁, n₀·δ = h₀. Where they are nearly parallel, on their mean.
-    before, own = normal.roll(1, 0), normal
-    cosine = (before * own).sum(-1)
+    before, after = normal.roll(1, 0), normal
+    cosine = (before * after).sum(-1)
     h0, h1 = by.roll(1, 0), by
     across = 1 - cosine.square()
     straight = across < 0.05
     safe = torch.where(straight, torch.ones_like(across), across)
-    sharp = ((h0 - cosine * h1) / safe).unsqueeze(-1) * before + ((h1 - cosine * h0) / safe).unsqueeze(-1) * own
-    flat = (0.5 * (h0 + h1)).unsqueeze(-1) * (before + own) / (1 + cosine).clamp_min(0.5).unsqueeze(-1)
+    sharp = ((h0 - cosine * h1) / safe).unsqueeze(-1) * before + ((h1 - cosine * h0) / safe).unsqueeze(-1) * after
+    flat = (0.5 * (h0 + h1)).unsqueeze(-1) * (before + after) / (1 + cosine).clamp_min(0.5).unsqueeze(-1)
     return Polygon(vertices + torch.where(straight.unsqueeze(-1), flat, sharp))

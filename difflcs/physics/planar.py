@@ -34,7 +34,7 @@ __all__ = ["Drive", "ForceDrive", "Inertia", "PDDrive", "PlanarPushing", "Positi
 
 
 class DriveStep(NamedTuple):
-    """One step of the discs, each coordinate for itself: (position, velocity)₊ = A (position, velocity) + b u.
+    """Motion of the discs in one step, by coordinate: (position, velocity)₊ = A (position, velocity) + b u.
 
     `response` is what an impulse on the coordinate adds. Leading dimensions are (n_discs, 2) or those that broadcast;
     k is 1 without velocities, else 2.
@@ -51,14 +51,14 @@ class DriveStep(NamedTuple):
 
 
 class Drive(ABC):
-    """How discs follow their action."""
+    """Base of the drives, by which discs follow their action."""
 
     order: int
     """1: the state has positions of the discs; 2: velocities too."""
 
     @abstractmethod
     def step(self) -> DriveStep:
-        """One step."""
+        """Return one step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,11 +124,11 @@ class PDDrive(Drive):
         )
         M = torch.linalg.matrix_power(M, self.substeps)
         # target = p + u, and p moves with the target where both are shifted.
-        return DriveStep(M[..., :2, :2] + _outer_first(M[..., :2, 2]), M[..., :2, 2], torch.zeros_like(M[..., :2, 2]))
+        return DriveStep(M[..., :2, :2] + _first_column(M[..., :2, 2]), M[..., :2, 2], torch.zeros_like(M[..., :2, 2]))
 
 
-def _outer_first(b: Tensor) -> Tensor:
-    """A matrix whose first column is b, to add an action's effect of p where u = target − p."""
+def _first_column(b: Tensor) -> Tensor:
+    """Make a matrix whose first column is b, for the effect of p on an action u = target − p."""
     return torch.stack([b, torch.zeros_like(b)], -1)
 
 
@@ -179,7 +179,7 @@ class PlanarPushing:
     Attributes:
         shape: outline of the body in its own coordinates.
         radius: of the discs, a number or (n_discs,) [length].
-        n_discs: how many there are.
+        n_discs: number of discs.
         drive: how they follow their action.
         center_of_mass: (2,) in coordinates of the body; None: the centre of the shape's area.
         gyration: radius of gyration about it [length]; None: that of the shape's area.
@@ -249,7 +249,7 @@ class PlanarPushing:
 
     @property
     def frictionless(self) -> bool:
-        """Whether contacts have one force each, along the normal."""
+        """True if each contact has one force, along the normal."""
         return not isinstance(self.friction, Tensor) and self.friction == 0
 
     @property
@@ -273,7 +273,7 @@ class PlanarPushing:
         return self.shape.n_parts if self.nearest is None else min(self.nearest, self.shape.n_parts)
 
     def replace(self, **values: Any) -> PlanarPushing:
-        """The same with other values; what was not given follows from the shape, also from another one."""
+        """Return a copy with other values; values that were never set follow from the (new) shape."""
         return replace(self, **{**vars(self)["defaults"], **values})
 
     @runs_eagerly
@@ -291,7 +291,7 @@ class PlanarPushing:
         friction = 0.0 if self.frictionless else self._by_contact(self.friction)
         contacts, free, compliance = self.contacts(x), self._free_motion(x), self._by_contact(self.compliance)
         if self.inertia is not None:
-            contacts, compliance = _damped(contacts, free.response, compliance)
+            contacts, compliance = _damp(contacts, free.response, compliance)
         return contact_lcs(
             contacts,
             free,
@@ -316,41 +316,41 @@ class PlanarPushing:
         """Gaps of all discs, and their derivatives; each disc has a contact with each part, or the nearest."""
         m, parts, batch = self.n_discs, self.parts_touched, x.shape[:-1]
         discs = x[..., 3 : 3 + 2 * m].reshape(*batch, m, 2)
-        found = self.shape.distance(to_body(x, discs))
+        nearest = self.shape.distance(to_body(x, discs))
         if parts < self.shape.n_parts:
-            kept = found.distance.detach().topk(parts, largest=False).indices
-            found = Distance(*(_chosen(value, kept) for value in found))
-        gap = found.distance - self._of_discs("radius", self.radius).unsqueeze(-1)
+            kept = nearest.distance.detach().topk(parts, largest=False).indices
+            nearest = Distance(*(_select(value, kept) for value in nearest))
+        gap = nearest.distance - self._of_discs("radius", self.radius).unsqueeze(-1)
         cos, sin = x[..., 2].cos()[..., None, None], x[..., 2].sin()[..., None, None]
 
         def turn(v: Tensor) -> tuple[Tensor, Tensor]:
             return cos * v[..., 0] - sin * v[..., 1], sin * v[..., 0] + cos * v[..., 1]
 
-        (nx, ny), (rx, ry) = turn(found.normal), turn(found.point)
+        (nx, ny), (rx, ry) = turn(nearest.normal), turn(nearest.point)
         tx, ty = -ny, nx
 
         def rows(vx: Tensor, vy: Tensor) -> Tensor:
             """Derivative of (disc − point of the body beside it) along v by the state: (..., m · parts, n_x)."""
             of_body = torch.stack([-vx, -vy, rx * -vy + ry * vx], -1).reshape(*batch, m * parts, 3)
-            own = torch.zeros(*batch, m, parts, m, 2, dtype=x.dtype, device=x.device)
+            of_discs = torch.zeros(*batch, m, parts, m, 2, dtype=x.dtype, device=x.device)
             each = torch.arange(m)
-            own[..., each, :, each, :] = torch.stack([vx, vy], -1).movedim(-3, 0)
+            of_discs[..., each, :, each, :] = torch.stack([vx, vy], -1).movedim(-3, 0)
             rest = x.new_zeros(*batch, m * parts, self.n_x - 3 - 2 * m)
-            return torch.cat([of_body, own.reshape(*batch, m * parts, 2 * m), rest], -1)
+            return torch.cat([of_body, of_discs.reshape(*batch, m * parts, 2 * m), rest], -1)
 
         normal = rows(nx, ny)
         tangent = normal.new_zeros(*normal.shape[:-1], 0, self.n_x) if self.frictionless else rows(tx, ty).unsqueeze(-2)
         return Contacts(gap.reshape(*batch, m * parts), normal, tangent)
 
-    def _arm(self, yaw: Tensor) -> Tensor:
-        """From the body's origin to its centre of mass (..., 2), in the plane."""
+    def _center_offset(self, yaw: Tensor) -> Tensor:
+        """Compute the vector from the body's origin to its centre of mass (..., 2), in the plane."""
         center: Any = self.center_of_mass
         cos, sin = yaw.cos(), yaw.sin()
         return torch.stack([cos * center[0] - sin * center[1], sin * center[0] + cos * center[1]], -1)
 
     def _mobility(self, x: Tensor) -> Tensor:
-        """What a force and a torque, dual to the pose, do to the pose: (..., 3, 3), for mass 1."""
-        cx, cy = self._arm(x[..., 2]).unbind(-1)
+        """Compute the mobility (..., 3, 3): the motion of the pose by a force and a torque dual to it, for mass 1."""
+        cx, cy = self._center_offset(x[..., 2]).unbind(-1)
         # The pose is that of the body's origin, which turns about the centre of mass.
         turn = torch.stack([cy, -cx, torch.ones_like(cx)], -1)
         gyration: Any = self.gyration
@@ -358,7 +358,7 @@ class PlanarPushing:
         return plane + turn.unsqueeze(-1) * turn.unsqueeze(-2) / gyration.square()
 
     def _without_contact(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """A and B, and the response of the discs alone."""
+        """Compute A and B, and the response of the discs alone."""
         numbers = _plain_numbers(self.drive, self.inertia)
         key, (kept_key, kept) = (numbers, like.dtype, like.device), vars(self).get("kept", (None, None))
         if numbers is not None and key == kept_key:
@@ -394,9 +394,9 @@ class PlanarPushing:
         return FreeMotion(A, B, self._turning(x, A[-1, -1], h), response)
 
     def _turning(self, x: Tensor, decay: Tensor, h: float) -> Tensor:
-        """What is added (..., n_x) because the centre of mass, not the origin of the body, keeps its velocity."""
+        """Addition (..., n_x) because the centre of mass, not the origin of the body, keeps its velocity."""
         speed = decay * x[..., -1]
-        before, after = self._arm(x[..., 2]), self._arm(x[..., 2] + h * speed)
+        before, after = self._center_offset(x[..., 2]), self._center_offset(x[..., 2] + h * speed)
         across = torch.stack([-before[..., 1], before[..., 0]], -1)  # of which the turn makes the origin's velocity
         across_after = torch.stack([-after[..., 1], after[..., 0]], -1)
         speed = speed.unsqueeze(-1)
@@ -408,8 +408,8 @@ class PlanarPushing:
 _MOST = 0.01  # of how far an impulse moves two bodies apart in a step: what a contact gives way at most, and bounces
 
 
-def _damped(contacts: Contacts, response: Tensor, compliance: Tensor) -> tuple[Contacts, Tensor]:
-    """Contacts that do not bounce in short steps, and how far (..., n_contacts) a force closes each within a step.
+def _damp(contacts: Contacts, response: Tensor, compliance: Tensor) -> tuple[Contacts, Tensor]:
+    """Damp contacts so that they do not bounce in short steps; return how far (..., n_contacts) a force closes each.
 
     Compliance r alone is a spring, which gives back what it takes if a step moves a body by less than r times the
     impulse. A damper beside it lets it give way by g < r a step. With s = g/r that is φ₊ − (1 − s) φ + s r f = 0 for an
@@ -421,29 +421,29 @@ def _damped(contacts: Contacts, response: Tensor, compliance: Tensor) -> tuple[C
 
 
 def _plain_numbers(*parts: Drive | Inertia | None) -> tuple[float, ...] | None:
-    """All that these consist of; None where some of it is a tensor, which may be learned or changed in place."""
+    """Return the numbers of the parts; None if one is a tensor, which may be learned or changed in place."""
     if not all(part is None or is_dataclass(part) for part in parts):
         return None
     values = [getattr(part, field.name) for part in parts if part is not None for field in fields(part)]  # pyright: ignore
     return tuple(values) if all(isinstance(value, int | float) for value in values) else None
 
 
-def _chosen(values: Tensor, parts: Tensor) -> Tensor:
-    """Values (..., n_parts) or (..., n_parts, 2) of the parts (..., k)."""
+def _select(values: Tensor, parts: Tensor) -> Tensor:
+    """Select values (..., n_parts) or (..., n_parts, 2) of the parts (..., k)."""
     if values.ndim > parts.ndim:
         return values.gather(-2, parts.unsqueeze(-1).expand(*parts.shape, values.shape[-1]))
     return values.gather(-1, parts)
 
 
 def to_body(x: Tensor, points: Tensor) -> Tensor:
-    """Points (..., n, 2) of the plane in coordinates of the body whose pose begins the states x (..., n_x)."""
+    """Convert points (..., n, 2) of the plane to coordinates of the body whose pose begins the states x (..., n_x)."""
     cos, sin = x[..., 2:3].cos(), x[..., 2:3].sin()
     dx, dy = (points - x[..., None, :2]).unbind(-1)
     return torch.stack([cos * dx + sin * dy, cos * dy - sin * dx], -1)
 
 
 def _number(name: str, value: Any) -> Tensor:
-    """A number or tensor as a finite float64 tensor, or as the tensor that it is."""
+    """Convert a number to a finite float64 tensor; a tensor is returned as it is."""
     if not isinstance(value, Tensor):
         try:
             value = torch.tensor(value, dtype=torch.float64)

@@ -29,7 +29,7 @@ _ROWS = 256  # sides that are compared with all others at a time, so that memory
 
 
 class Distance(NamedTuple):
-    """What is nearest to some points on each part of a shape.
+    """The points nearest to some points, one on each part of a shape.
 
     Attributes:
         distance: (..., n_parts) signed, negative inside.
@@ -60,11 +60,11 @@ class Shape(ABC):
 
     @abstractmethod
     def distance(self, points: Tensor) -> Distance:
-        """Nearest to points (..., 2) in coordinates of the body."""
+        """Measure the distance to points (..., 2) in coordinates of the body."""
 
     @abstractmethod
     def moments(self) -> Moments:
-        """Of the area, where parts count twice if they overlap."""
+        """Return the moments of the area; overlapping parts count twice."""
 
     @property
     @abstractmethod
@@ -83,7 +83,7 @@ class Shape(ABC):
         return (polar / area).sqrt()
 
     def contains(self, points: Tensor) -> Tensor:
-        """(...) bool: which of the points (..., 2) are inside."""
+        """Return a mask (...), True for points (..., 2) that are inside."""
         return (self.distance(points).distance < 0).any(-1)
 
 
@@ -168,7 +168,7 @@ class Polygon(Shape):
         return Distance(distance.unsqueeze(-1), normal.unsqueeze(-2), point.unsqueeze(-2))
 
     def _sides(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Start (n, 2), vector (n, 2), squared length (n,) and outward normal (n, 2) of every side."""
+        """Return start (n, 2), vector (n, 2), squared length (n,) and outward normal (n, 2) of every side."""
         # Kept while the corners are the same numbers; with a gradient each call has a graph of its own.
         recalls = not (self.vertices.requires_grad or transforms_active() or torch.compiler.is_compiling())
         made: Recall[tuple[Tensor, Tensor, Tensor, Tensor]] = vars(self).setdefault("made", Recall())
@@ -275,22 +275,22 @@ class Union(Shape):
 
     def distance(self, points: Tensor) -> Distance:
         """See `Shape`."""
-        found = [part.distance(points) for part in self.parts]
-        distance, normal, point = zip(*found, strict=True)
+        distances = [part.distance(points) for part in self.parts]
+        distance, normal, point = zip(*distances, strict=True)
         return Distance(torch.cat(distance, -1), torch.cat(normal, -2), torch.cat(point, -2))
 
     def moments(self) -> Moments:
         """See `Shape`."""
-        found = [part.moments() for part in self.parts]
-        area = torch.stack([m.area for m in found])
-        centers = torch.stack([m.centroid for m in found])
+        moments = [part.moments() for part in self.parts]
+        area = torch.stack([m.area for m in moments])
+        centers = torch.stack([m.centroid for m in moments])
         centroid = (area.unsqueeze(-1) * centers).sum(0) / area.sum()
-        polar = torch.stack([m.polar for m in found]) + area * (centers - centroid).square().sum(-1)
+        polar = torch.stack([m.polar for m in moments]) + area * (centers - centroid).square().sum(-1)
         return Moments(area.sum(), centroid, polar.sum())
 
 
 def box(x_min: float, x_max: float, y_min: float, y_max: float) -> Polygon:
-    """A rectangle along the axes of its body."""
+    """Make a rectangle along the axes of its body."""
     if not (x_min < x_max and y_min < y_max):
         raise InvalidInputError(
             f"box: expected x_min < x_max and y_min < y_max, got {(x_min, x_max, y_min, y_max)}; exchange them"
@@ -299,7 +299,7 @@ def box(x_min: float, x_max: float, y_min: float, y_max: float) -> Polygon:
 
 
 def _tensor(name: str, value: Any | Sequence) -> Tensor:
-    """Numbers as float64; a copy of a tensor, or the tensor itself if it requires a gradient."""
+    """Convert numbers to float64; copy a tensor, or return it if it requires a gradient."""
     if not isinstance(value, Tensor):
         try:
             value = torch.tensor(value, dtype=torch.float64)
@@ -309,13 +309,13 @@ def _tensor(name: str, value: Any | Sequence) -> Tensor:
 
 
 def shoelace(vertices: Tensor) -> Tensor:
-    """Twice the signed area (n,) between each side and the origin; their sum is above 0 counterclockwise."""
+    """Compute twice the signed area (n,) between each side and the origin; their sum is above 0 counterclockwise."""
     following = vertices.roll(-1, 0)
     return vertices[:, 0] * following[:, 1] - vertices[:, 1] * following[:, 0]
 
 
 def _crossing(vertices: Tensor, rounded: float) -> tuple[int, int] | None:
-    """Two sides, by their first corners, that cross inside both, by an area above rounding; None if there are none."""
+    """Find two sides, by their first corners, that cross inside both, by an area above rounding; else None."""
     start, end = vertices, vertices.roll(-1, 0)
     for first in range(0, len(start), _ROWS):
         a, b = (v[first : first + _ROWS].unsqueeze(1) for v in (start, end))
@@ -329,13 +329,13 @@ def _crossing(vertices: Tensor, rounded: float) -> tuple[int, int] | None:
 
 
 def _turn(a: Tensor, b: Tensor, c: Tensor, rounded: float) -> Tensor:
-    """Twice the signed area of triangles: above 0 where c is to the left of the way from a to b; 0 up to `rounded`."""
+    """Compute twice the signed area of triangles, above 0 where c is to the left of a → b; 0 up to `rounded`."""
     along, to = b - a, c - a
     return torch.nn.functional.hardshrink(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0], rounded)
 
 
 def _nearest_side(points: Tensor, start: Tensor, side: Tensor, square: Tensor) -> tuple[Tensor, Tensor]:
-    """Which side is nearest to each point, and which points are inside."""
+    """Return the index of the side nearest to each point, and a mask of the points that are inside."""
     to = points.unsqueeze(-2) - start
     t = ((to * side).sum(-1) / square).clamp_(0.0, 1.0)
     nearest = (to - t.unsqueeze(-1) * side).square_().sum(-1).argmin(-1)
@@ -343,7 +343,7 @@ def _nearest_side(points: Tensor, start: Tensor, side: Tensor, square: Tensor) -
 
 
 def is_inside(to: Tensor, side: Tensor) -> Tensor:
-    """Which points are inside a closed outline: a ray from them crosses its sides an odd number of times.
+    """Return a mask of the points inside a closed outline: a ray from them crosses its sides an odd number of times.
 
     Args:
         to: (..., n, 2) the way from the first corner of each side to the points.

@@ -1,4 +1,4 @@
-"""Where to touch next: contact MPC from many places at once, as a policy."""
+"""Policies that choose the next place to touch, by contact MPC from many places at once."""
 
 from difflcs.planning.places import DiscPlaces, Places, Workspace
 from difflcs.planning.sampling import Decision, Mode, SamplingPolicy, SamplingSettings

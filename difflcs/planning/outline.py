@@ -1,4 +1,4 @@
-"""Closed curves at a given distance round a shape, and the way along them."""
+"""Closed curves at a constant distance round a shape."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ def clearance(shape: Shape, points: Tensor) -> Tensor:
 
 
 def ring(shape: Shape, distance: float, n_points: int) -> Tensor:
-    """Points round a shape at a given distance from it, at equal steps along a closed curve.
+    """Place points round a shape at one distance from it, at equal steps along a closed curve.
 
-    The curve is a level set of the signed distance, found on a grid by marching squares and then moved onto the level
+    The curve is a level set of the signed distance, traced on a grid by marching squares and then moved onto the level
     along the gradient. It is as exact as the distance is: at a corner that points inwards it is cut by at most a cell
     of the grid, a 160th of the whole.
 
     Args:
         shape: in coordinates of its body.
         distance: > 0 [length].
-        n_points: ≥ 3, how many.
+        n_points: number of points, ≥ 3.
 
     Returns:
         (n_points, 2) in coordinates of the body, counterclockwise; the outer curve, if the shape has holes.
@@ -46,7 +46,7 @@ def ring(shape: Shape, distance: float, n_points: int) -> Tensor:
         axis = torch.linspace(-half, half, _CELLS + 1, dtype=torch.float64)
         grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1)
         values = clearance(shape, grid) - distance
-        curves = [torch.from_numpy(curve) for curve in _loops(values.numpy(), axis.numpy())]
+        curves = [torch.from_numpy(curve) for curve in _trace_loops(values.numpy(), axis.numpy())]
         curve = max(curves, key=lambda curve: float(shoelace(curve).sum()))
         sides = curve.roll(-1, 0) - curve
         apart = sum(not bool(is_inside(other[0] - curve, sides)) for other in curves if other is not curve)
@@ -55,34 +55,34 @@ def ring(shape: Shape, distance: float, n_points: int) -> Tensor:
                 f"shape: expected parts that one curve at distance {distance:g} goes round, got {apart + 1} that are "
                 f"apart; take a larger distance, or fill what is between them"
             )
-        points = _equally(_onto_level(shape, curve, distance), n_points)
-        return _onto_level(shape, points, distance)
+        points = _resample(_move_onto_level(shape, curve, distance), n_points)
+        return _move_onto_level(shape, points, distance)
 
 
-def _onto_level(shape: Shape, points: Tensor, distance: float) -> Tensor:
-    """Points moved along the gradient of the distance until they have it."""
+def _move_onto_level(shape: Shape, points: Tensor, distance: float) -> Tensor:
+    """Move points along the gradient of the distance until they have this distance."""
     for _ in range(3):
-        found = shape.distance(points)
-        part = found.distance.argmin(-1, keepdim=True)
-        gap = found.distance.gather(-1, part)
-        normal = found.normal.gather(-2, part.unsqueeze(-1).expand(*part.shape, 2)).squeeze(-2)
+        nearest = shape.distance(points)
+        part = nearest.distance.argmin(-1, keepdim=True)
+        gap = nearest.distance.gather(-1, part)
+        normal = nearest.normal.gather(-2, part.unsqueeze(-1).expand(*part.shape, 2)).squeeze(-2)
         points = points + (distance - gap) * normal
     return points
 
 
-def _equally(curve: Tensor, n_points: int) -> Tensor:
-    """Points at equal steps along a closed curve (m, 2)."""
+def _resample(curve: Tensor, n_points: int) -> Tensor:
+    """Place points at equal steps along a closed curve (m, 2)."""
     closed = torch.cat([curve, curve[:1]]).numpy()
     along = np.concatenate([[0.0], np.linalg.norm(np.diff(closed, axis=0), axis=1).cumsum()])
     at = np.linspace(0.0, along[-1], n_points, endpoint=False)
     return torch.from_numpy(np.stack([np.interp(at, along, closed[:, i]) for i in range(2)], -1))
 
 
-def _loops(values: NDArray[np.float64], axis: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """The closed curves of zeros of values on a grid (n, n), counterclockwise, each (m, 2).
+def _trace_loops(values: NDArray[np.float64], axis: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Trace the closed curves of zeros of values on a grid (n, n), counterclockwise, each (m, 2).
 
-    A curve crosses sides of cells; a cell links the crossings of its own sides in pairs, so that each crossing has two
-    neighbours and the curve is found by walking.
+    A curve crosses sides of cells; a cell links the crossings of its sides in pairs, so that each crossing has two
+    neighbours and the curve can be traced from one to the next.
     """
     inside = values < 0
     neighbours: dict[tuple[int, int, int], list[tuple[int, int, int]]] = {}

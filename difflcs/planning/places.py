@@ -1,4 +1,4 @@
-"""Places where end effectors could be, in coordinates of the body, and the states that they mean."""
+"""Candidate places of the end effectors, in coordinates of the body, and the corresponding states."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["DiscPlaces", "Places", "Workspace", "from_body"]
 
 
 class Places(Protocol):
-    """Where the end effectors could be. A place is a row of numbers that moves with the body, in a form of its own."""
+    """Candidate places of the end effectors. A place is a row of numbers that moves with the body."""
 
     def sample(self, x: Tensor) -> Tensor:
         """Places (n_places, n_place) to compare at a state x (n_x,); the same at each call, or drawn anew."""
@@ -31,11 +31,11 @@ class Places(Protocol):
         ...
 
     def allowed(self, states: Tensor) -> Tensor:
-        """Which of the states (n_places, n_x) the robot may be in, (n_places,) bool."""
+        """Return a mask (n_places,), True for states (n_places, n_x) in which the robot may be."""
         ...
 
     def near(self, x: Tensor) -> bool:
-        """Whether the robot at x is so near the body that the system linearised there means something."""
+        """Return True if the robot at x is so near the body that the system linearised there is meaningful."""
         ...
 
 
@@ -71,7 +71,7 @@ class Workspace:
             )
 
     def bounds(self, states: Tensor) -> tuple[Tensor, Tensor]:
-        """u_min and u_max (..., 2 · n_discs) of relative actions at states (..., n_x).
+        """Return u_min and u_max (..., 2 · n_discs) of relative actions at states (..., n_x).
 
         A disc that is outside is sent no further out.
         """
@@ -80,13 +80,13 @@ class Workspace:
         return low.clamp(-self.step, 0.0), high.clamp(0.0, self.step)
 
     def contains(self, points: Tensor, margin: float = 0.0) -> Tensor:
-        """(...) bool: which points (..., 2) are inside, and `margin` away from the border [length]."""
+        """Return a mask (...), True for points (..., 2) that are inside and `margin` away from the border [length]."""
         low, high = points.new_tensor(self.low) + margin, points.new_tensor(self.high) - margin
         return ((points >= low) & (points <= high)).all(-1)
 
 
 def from_body(x: Tensor, points: Tensor) -> Tensor:
-    """Points (..., 2) in coordinates of the body whose pose begins the state x (n_x,), in the plane."""
+    """Convert points (..., 2) from coordinates of the body whose pose begins the state x (n_x,) to the plane."""
     return product(points, _rotation(x).mT) + x[:2]
 
 
@@ -105,9 +105,9 @@ class DiscPlaces:
         radius: of the discs [length], > 0.
         n_places: on the ring, at equal distances along it.
         gap: between a disc on the ring and the body [length]; None: a tenth of the radius.
-        reach: gap up to which pushing from where a disc is may be thought of [length]; None: the radius.
-        n_discs: how many there are.
-        workspace: that a disc on a place must be inside of; None: everywhere.
+        reach: largest gap between disc and body at which pushing is considered [length]; None: the radius.
+        n_discs: number of discs.
+        workspace: region for discs on places; None: everywhere.
         margin: between a place and the border of the workspace [length].
 
     Raises:
@@ -151,7 +151,7 @@ class DiscPlaces:
         states = x.expand(len(places), -1).clone()
         end = 3 + 2 * self.n_discs
         states[:, 3:end] = from_body(x, places.reshape(-1, 2)).reshape(len(places), end - 3)
-        # Behind the places come velocities, if there are any, of discs and body: by then both are at rest.
+        # The places may be followed by velocities of discs and body: both are at rest by then.
         states[:, end:] = 0.0
         return states
 

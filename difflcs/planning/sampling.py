@@ -44,7 +44,7 @@ Bounds = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 class Mode(enum.StrEnum):
-    """What the robot does."""
+    """Activity of the robot."""
 
     PUSH = "push"
     TRAVEL = "travel"
@@ -52,11 +52,11 @@ class Mode(enum.StrEnum):
 
 @dataclass(frozen=True)
 class SamplingSettings:
-    """When to push and when to travel. Gains and prices are parts of the cost of standing still.
+    """Settings of the choice between pushing and travelling. Gains and prices are parts of the cost of standing still.
 
     Attributes:
         keep: it goes on pushing while the gain here is at least this part of the best score, in [0, 1]: hysteresis.
-        smallest_gain: a gain below this is none: it looks for another place.
+        smallest_gain: with a smaller gain here the robot looks for another place.
         switch_price: price of any journey.
         travel_price: price of a journey by its length [1/length].
         patience: steps after which a journey ends wherever it is.
@@ -80,18 +80,18 @@ class SamplingSettings:
 
 @dataclass(frozen=True)
 class Decision:
-    """What the policy decided in one step, and why.
+    """Decision of the policy in one step, with the numbers behind it.
 
     Row 0 is where the robot is, the others are the places. While it travels nothing is compared: then what follows
     `target` is that of the step in which the journey began.
 
     Attributes:
-        mode: what it does.
-        began: whether it began a journey in this step.
+        mode: push or travel.
+        began: True if it began a journey in this step.
         chosen: row of the target, or 0.
         target: (n_x,) state to which it travels, with the body where it is now; None where it pushes.
         states: (1 + n_places, n_x) the states that were compared.
-        gains: (1 + n_places,) what each plan saves; −∞ where the place is not allowed or its problem was not solved.
+        gains: (1 + n_places,) saving of each plan; −∞ where the place is not allowed or its problem was not solved.
         scores: (1 + n_places,) gains less the price of the way; −∞ also where a place was barred.
         standing: cost of standing still where the robot is.
         solution: the plans of all states.
@@ -171,7 +171,7 @@ class SamplingPolicy:
 
     @property
     def decision(self) -> Decision | None:
-        """What was decided last; None before the first step."""
+        """The last decision; None before the first step."""
         return self._decision
 
     def act(self, x: ArrayLike, goal: ArrayLike | None = None, *, context: Tensor | None = None) -> NDArray[np.float64]:
@@ -180,7 +180,7 @@ class SamplingPolicy:
         Args:
             x: (n_x,) the state.
             goal: (n_goal,), with a `GoalCost`.
-            context: (n_context,) whatever the system depends on besides x; given to the module.
+            context: (n_context,) of the module, if its system depends on more than x.
 
         Returns:
             (n_u,) the action, inside the bounds where it pushes; what `travel` says where it travels.
@@ -195,7 +195,7 @@ class SamplingPolicy:
                 self._steps += 1
                 towards = self.places.states(state, place.unsqueeze(0))[0]
                 if self._steps <= self.settings.patience and not self.travel.arrived(state, towards):
-                    return self._go_on(state, towards)
+                    return self._continue_journey(state, towards)
             return self._decide(state, target, context, stay=place is not None)
 
     def _inputs(self, x: ArrayLike, goal: ArrayLike | None) -> tuple[Tensor, Tensor | None]:
@@ -214,8 +214,8 @@ class SamplingPolicy:
             target[index] += 2 * math.pi * torch.round((state[index] - target[index]) / (2 * math.pi))
         return state, target
 
-    def _go_on(self, state: Tensor, towards: Tensor) -> NDArray[np.float64]:
-        """The next step of a journey."""
+    def _continue_journey(self, state: Tensor, towards: Tensor) -> NDArray[np.float64]:
+        """Take the next step of a journey."""
         assert self._decision is not None
         self._decision = replace(self._decision, mode=Mode.TRAVEL, began=False, target=towards)
         return self.travel.action(state, towards).numpy()
@@ -229,11 +229,11 @@ class SamplingPolicy:
         solution = self._solve(states, goal, context)
         gains, standing = _gains(solution)
         gains = torch.where(allowed & solution.converged, gains, -math.inf)
-        scale, own = max(standing, 0.0), self.settings
-        price = own.switch_price + own.travel_price * self.travel.distance(state, states[1:])
+        scale, settings = max(standing, 0.0), self.settings
+        price = settings.switch_price + settings.travel_price * self.travel.distance(state, states[1:])
         scores = torch.cat([gains[:1], gains[1:] - scale * price])
         best, here = float(scores.max()), float(gains[0])
-        pushes = self.places.near(state) and here > own.smallest_gain * scale and here >= own.keep * best
+        pushes = self.places.near(state) and here > settings.smallest_gain * scale and here >= settings.keep * best
         chosen = 0 if stay or pushes else self._choose(states, scores, standing)
         self._place, self._steps = (places[chosen - 1].clone(), 0) if chosen else (None, 0)
         target = states[chosen] if chosen else None
@@ -245,7 +245,7 @@ class SamplingPolicy:
         return solution.action[0].numpy()
 
     def _choose(self, states: Tensor, scores: Tensor, standing: float) -> int:
-        """Row of the place to go to; 0 where none is worth the way. Barred places get a score of −∞."""
+        """Choose the row of the place to go to; 0 where none is worth the way. Barred places get a score of −∞."""
         if abs(standing - self._reference) > self.settings.smallest_gain * self._reference:
             self._barred, self._reference = [], standing
         elif self._last is not None:
@@ -267,7 +267,7 @@ class SamplingPolicy:
 
 
 def _gains(solution: MPCSolution) -> tuple[Tensor, float]:
-    """What each plan (n,) saves against standing still, and the cost of standing still at the first state."""
+    """Saving of each plan (n,) against standing still, and the cost of standing still at the first state."""
     problem = solution.problem
     planned = problem.objective(solution.x, solution.u)
     standing = problem.objective(solution.x[:, :1].expand_as(solution.x), torch.zeros_like(solution.u))

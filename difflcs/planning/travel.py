@@ -1,4 +1,4 @@
-"""How end effectors get from where they are to another place without touching the body."""
+"""Ways of end effectors to another place without touching the body."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Travel(Protocol):
         ...
 
     def arrived(self, x: Tensor, target: Tensor) -> bool:
-        """Whether x is near enough to the target to push from it."""
+        """Return True if x is near enough to the target to push from it."""
         ...
 
 
@@ -43,7 +43,7 @@ class PlanarTravel:
 
     Where the straight way meets the body, a disc heads for the farthest point in sight on a curve round it, by the
     shorter way round, or the longer one if the shorter leaves the workspace. Actions are relative: u is how far a disc
-    is to be sent, as in `difflcs.physics.PlanarPushing`. Discs do not mind each other.
+    is to be sent, as in `difflcs.physics.PlanarPushing`. Discs ignore each other.
 
     Args:
         shape: outline of the body in its own coordinates.
@@ -51,8 +51,8 @@ class PlanarTravel:
         step: how far a disc is sent in a step [length], > 0.
         clearance: between disc and body on the way round [length]; None: half the radius.
         tolerance: distance to the target at which a disc has arrived [length]; None: half the radius.
-        n_discs: how many there are; x[3 : 3 + 2 · n_discs] are their places.
-        workspace: that the way is to stay in; None: everywhere.
+        n_discs: number of discs; x[3 : 3 + 2 · n_discs] are their places.
+        workspace: region in which the way should stay; None: everywhere.
 
     Raises:
         InvalidInputError and its kinds: an argument does not fit.
@@ -117,7 +117,7 @@ class PlanarTravel:
         return not bool(self.workspace.contains(from_body(x, self.ring[way])).all())
 
     def _in_sight(self, start: Tensor, ends: Tensor) -> Tensor:
-        """Whether a disc can go straight from start (2,) to each of the ends (n, 2), in coordinates of the body.
+        """Return a mask of the ends (n, 2) to which a disc can go straight from start (2,), in coordinates of the body.
 
         It may come as near as an eighth of the clearance, or as near as it is at both ends.
         """

@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from tensordict import TensorDict
 
 TRANSITIONS = ("state", "action", "goal")
-"""What is kept of episodes to learn from, with `CONTEXT` where the environment gives one."""
+"""Keys of the episodes that are kept to learn from, besides `CONTEXT` if the environment has one."""
 CONTEXT = "context"
-"""Key of what the system depends on besides its state, the same for a whole episode: a mass, a gain."""
+"""Key of the quantities that the system depends on besides its state, constant in an episode: a mass, a gain."""
 
 
 class Solution(Protocol):
-    """What is needed of an `MPCSolution`."""
+    """The part of an `MPCSolution` that a rollout uses."""
 
     @property
     def action(self) -> Tensor:
@@ -40,8 +40,8 @@ class Solution(Protocol):
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What policies without a solver return.
+class PolicyOutput:
+    """Output of policies without a solver.
 
     Attributes:
         action: (B, n_u) first actions.
@@ -53,9 +53,9 @@ class Plan:
 
 
 class Policy(Protocol):
-    """What is needed of an `LCSMPCLayer`: (B, n_x) states, (B, n_goal) goals, optional bounds (n_u,) → a solution.
+    """Maps states (B, n_x), goals (B, n_goal) and optional bounds (n_u,) to a solution, as an `LCSMPCLayer` does.
 
-    Where the environment gives a context, (B, n_context), it comes by the keyword `context`.
+    A context (B, n_context), if the environment has one, is passed by the keyword `context`.
     """
 
     def __call__(self, x0: Tensor, goal: Tensor, *, u_min: Tensor | None, u_max: Tensor | None) -> Solution:
@@ -64,14 +64,14 @@ class Policy(Protocol):
 
 
 Act = Callable[..., tuple[np.ndarray, np.ndarray]]
-"""States (B, n_x), goals (B, n_goal) → actions (B, n_u) and whether the solve failed (B,).
+"""States (B, n_x), goals (B, n_goal) → actions (B, n_u) and, for each, True if its solve failed (B,).
 
-Where the environment gives a context, (B, n_context), it is the third argument.
+A context (B, n_context), if the environment has one, is the third argument.
 """
 
 
 def action_bounds(env: VectorEnv) -> tuple[Tensor, Tensor]:
-    """Bounds (n_u,) of the action space, float64."""
+    """Return the bounds (n_u,) of the action space, float64."""
     space: Any = env.single_action_space
     return torch.from_numpy(np.asarray(space.low, np.float64)), torch.from_numpy(np.asarray(space.high, np.float64))
 
@@ -82,8 +82,8 @@ def elapsed_fractions(episode_steps: int) -> Tensor:
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
-    """Without the solver's warnings: failures are counted and reported instead."""
+def ignore_solver_warnings() -> Iterator[None]:
+    """Ignore the solver's warnings: failures are counted and reported instead."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SolveWarning)
         warnings.simplefilter("ignore", DegenerateWarning)
@@ -91,18 +91,18 @@ def quiet() -> Iterator[None]:
 
 
 def mpc_actions(policy: Policy, u_min: Tensor | None = None, u_max: Tensor | None = None, seed: int = 0) -> Act:
-    """Act with the MPC, solved cold; None keeps the policy's own bounds. Failed elements act by its masked output.
+    """Act with the MPC, solved cold, within its own bounds where None. Failed elements act by its masked output.
 
-    For one call of `collect`: a planner with a memory or noise of its own has a method `begin(seed)`, called here.
+    For one call of `collect`: a planner that has memory or draws noise has a method `begin(seed)`, called here.
     """
     begin = getattr(policy, "begin", None)
     if begin is not None:
         begin(seed)
 
     def act(state: Tensor, goal: Tensor, context: Tensor | None = None) -> tuple[np.ndarray, np.ndarray]:
-        given: Any = {} if context is None else {CONTEXT: context}
-        with torch.no_grad(), quiet():
-            solution = policy(state, goal, u_min=u_min, u_max=u_max, **given)
+        keywords: Any = {} if context is None else {CONTEXT: context}
+        with torch.no_grad(), ignore_solver_warnings():
+            solution = policy(state, goal, u_min=u_min, u_max=u_max, **keywords)
         return solution.action.numpy(), (~solution.converged).numpy()
 
     return act
@@ -170,13 +170,13 @@ def collect(
     observation, _ = env.reset(seed=padded)  # pyright: ignore[reportArgumentType]  Gymnasium's vectors take a list
     state, goal = (np.array(observation[key][:n], np.float64) for key in ("state", "goal"))
     context = np.array(observation[CONTEXT][:n], np.float64) if CONTEXT in observation else None
-    given = [torch.from_numpy(value) for value in (goal, context) if value is not None]
+    constant = [torch.from_numpy(value) for value in (goal, context) if value is not None]
     stable = np.asarray(np.isfinite(state).all(-1))
     states, executed, rewards, failures = [state], [], [], np.zeros(n, np.int64)
     infos: dict = {}
     for t in range(episode_steps):
         usable = np.where(stable[:, None], state, 0.0)  # a solver must not see NaN
-        action, failed = act(torch.from_numpy(usable), *given)
+        action, failed = act(torch.from_numpy(usable), *constant)
         action = np.clip(action, low, high)
         batch = np.zeros((env.num_envs, len(low)))
         batch[:n] = action
@@ -222,7 +222,7 @@ def collect(
 
 
 def _success(value: object) -> bool:
-    """The `success` of an info, None of an environment that has none."""
+    """Return the `success` of an info; None if it has none."""
     if not (value is None or (isinstance(value, bool | int | float | np.bool_ | np.number) and value in (0, 1))):
         raise InvalidInputError(
             f"env: expected True or False as `success` in the info, got {describe(value)}; see `collect`"
@@ -240,8 +240,8 @@ def _check_env(env: VectorEnv, episodes: int) -> None:
         )
 
 
-def no_episodes(env: VectorEnv, episode_steps: int) -> TensorDict:
-    """A record of `TRANSITIONS` without episodes, of the sizes of an environment; with its context, if it has one."""
+def make_empty_record(env: VectorEnv, episode_steps: int) -> TensorDict:
+    """Make a record of `TRANSITIONS`, and of the context if there is one, for an environment, without episodes yet."""
     from tensordict import TensorDict
 
     space: Any = env.single_observation_space
@@ -254,8 +254,8 @@ def no_episodes(env: VectorEnv, episode_steps: int) -> TensorDict:
     return TensorDict(empty, [0])  # pyright: ignore[reportArgumentType]
 
 
-def extended(known: TensorDict, episodes: TensorDict, keep: int | None = None) -> TensorDict:
-    """A record of `TRANSITIONS` with those of other episodes behind it, the stable ones where that is known.
+def append_episodes(known: TensorDict, episodes: TensorDict, keep: int | None = None) -> TensorDict:
+    """Append episodes to a record of `TRANSITIONS`, without those marked as not stable.
 
     Args:
         known: a record of `TRANSITIONS`.
@@ -266,54 +266,54 @@ def extended(known: TensorDict, episodes: TensorDict, keep: int | None = None) -
         InvalidInputError: there is no episode in either.
     """
     stable = episodes[episodes["stable"]] if "stable" in episodes.keys() else episodes
-    names = _kept(known)
-    found: Any = torch.cat([known, stable.select(*names)])  # pyright: ignore[reportCallIssue, reportArgumentType]
-    if not len(found):
+    names = _stored_keys(known)
+    record: Any = torch.cat([known, stable.select(*names)])  # pyright: ignore[reportCallIssue, reportArgumentType]
+    if not len(record):
         raise InvalidInputError("env: expected a stable simulation, got NaN or a physics error in every episode")
-    return found if keep is None else found[-keep:]
+    return record if keep is None else record[-keep:]
 
 
-def episodes_state(episodes: TensorDict) -> dict[str, Tensor]:
-    """A record of `TRANSITIONS` as a part of a state, see `difflcs.rl.learning.state`."""
-    return {name: episodes[name] for name in _kept(episodes)}
+def episodes_to_state(episodes: TensorDict) -> dict[str, Tensor]:
+    """Return a record of `TRANSITIONS` as a part of a state, see `difflcs.rl.learning.state`."""
+    return {name: episodes[name] for name in _stored_keys(episodes)}
 
 
-def _kept(episodes: TensorDict) -> list[str]:
+def _stored_keys(episodes: TensorDict) -> list[str]:
     return [name for name in (*TRANSITIONS, CONTEXT) if name in episodes.keys()]
 
 
-def episodes_from(state: Mapping[str, Tensor]) -> TensorDict:
-    """The record that `episodes_state` took apart."""
+def episodes_from_state(state: Mapping[str, Tensor]) -> TensorDict:
+    """Rebuild a record from what `episodes_to_state` returned."""
     from tensordict import TensorDict
 
     return TensorDict(dict(state), [len(state["state"])])  # pyright: ignore[reportArgumentType]
 
 
 def transitions(episodes: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
-    """States (N·T, n_x), actions (N·T, n_u) and next states (N·T, n_x) of a record of episodes."""
+    """Return the states (N·T, n_x), actions (N·T, n_u) and next states (N·T, n_x) of a record of episodes."""
     state = episodes["state"]
     return state[:, :-1].flatten(0, 1), episodes["action"].flatten(0, 1), state[:, 1:].flatten(0, 1)
 
 
 def contexts(episodes: TensorDict) -> Tensor | None:
-    """(N·T, n_context) the contexts of the `transitions` of a record of episodes; None where it has none."""
+    """Return the contexts (N·T, n_context) of the `transitions` of a record of episodes; None if it has none."""
     if CONTEXT not in episodes.keys():
         return None
     return episodes[CONTEXT].unsqueeze(1).expand(-1, episodes["action"].shape[1], -1).flatten(0, 1)
 
 
 def observed_transitions(episodes: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
-    """`transitions` for networks: of the states with the contexts behind them, where there are any."""
+    """Return `transitions` for networks: the contexts, if there are any, are appended to the states."""
     (state, action, after), context = transitions(episodes), contexts(episodes)
-    return beside(state, context), action, beside(after, context)
+    return append_context(state, context), action, append_context(after, context)
 
 
-def beside(state: Tensor, context: Tensor | None) -> Tensor:
-    """States (..., n_x) with their contexts behind them, for networks: (..., n_x + n_context)."""
+def append_context(state: Tensor, context: Tensor | None) -> Tensor:
+    """Append the contexts to states (..., n_x), for networks: (..., n_x + n_context)."""
     return state if context is None else torch.cat([state, context], -1)
 
 
 def has_context(env: VectorEnv) -> bool:
-    """Whether the observations of an environment have a context."""
+    """Return True if the observations of an environment have a context."""
     space: Any = env.single_observation_space
     return CONTEXT in space.keys()

@@ -1,4 +1,4 @@
-"""Random numbers: every purpose has a stream of its own, derived from the seed.
+"""Random numbers: every purpose has its own stream, derived from the seed.
 
 So nothing depends on the order in which numbers are drawn, and the global generators stay as they were.
 """
@@ -14,7 +14,7 @@ import torch
 
 
 class Stream(IntEnum):
-    """What random numbers are for. The values are part of every seed: a new purpose gets a new number."""
+    """Purpose of random numbers. The values are part of every seed: a new purpose gets a new number."""
 
     TRAINING = 0
     """Initial states and goals of training episodes."""
@@ -41,22 +41,22 @@ class Stream(IntEnum):
 
 
 def number(*key: int) -> int:
-    """One random number of 32 bits out of a key of numbers, such as (seed, stream, iteration)."""
+    """Derive a random number of 32 bits from a key of numbers, such as (seed, stream, iteration)."""
     return int(np.random.SeedSequence(key).generate_state(1)[0])
 
 
 def numbers(count: int, *key: int) -> list[int]:
-    """`count` random numbers of 32 bits out of a key of numbers."""
+    """Derive `count` random numbers of 32 bits from a key of numbers."""
     return [int(n) for n in np.random.SeedSequence(key).generate_state(count)]
 
 
 def generator(*key: int) -> torch.Generator:
-    """A generator of torch of its own, seeded by a key of numbers."""
+    """Make a torch generator that is seeded by a key of numbers."""
     return torch.Generator().manual_seed(number(*key))
 
 
 def episode_seeds(seed: int, stream: int, first: int, count: int) -> list[int]:
-    """Reset seeds of the episodes first … first + count − 1 of one stream.
+    """Return the reset seeds of the episodes first … first + count − 1 of one stream.
 
     Every episode has its own seed, so that nothing of an environment has to be stored to resume a run, and the first
     goals of an evaluation are the same whatever its size or number of environments.
@@ -66,7 +66,7 @@ def episode_seeds(seed: int, stream: int, first: int, count: int) -> list[int]:
 
 @contextmanager
 def seeded(key: Sequence[int]) -> Iterator[None]:
-    """TorchRL and torch.nn draw from the global generator: seed it by a key of numbers, and give it back as it was."""
+    """Seed torch's global generator, which TorchRL and torch.nn use, by a key of numbers; restore it afterwards."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(number(*key))
         yield

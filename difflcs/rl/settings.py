@@ -5,8 +5,8 @@
         samples: int = bounded(700, minimum=1, maximum=10**6)
         noise: float = bounded(0.9, above=0)
 
-One validator reads types and bounds; one reader rebuilds a configuration from JSON. Groups that one part alone has
-stand beside that part.
+One validator reads types and bounds; one reader rebuilds a configuration from JSON. A group that only one module uses
+is defined there.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ def bounded(
     """A field of a dataclass with bounds, for each number in it where it is a tuple; None stays allowed if declared.
 
     Args:
-        default: its value if none is given.
+        default: value of the field if none is passed.
         minimum: smallest value.
-        above: what it must exceed, instead of a minimum.
+        above: number that the value must exceed, instead of a minimum.
         maximum: largest value.
-        below: what it must stay below, instead of a maximum.
+        below: number that the value must stay below, instead of a maximum.
     """
     return field(default=default, metadata={"minimum": minimum, "above": above, "maximum": maximum, "below": below})
 
@@ -70,8 +70,8 @@ class Settings:
 
 
 def _check(name: str, value: object, hint: Any, bounds: Mapping[str, float | None]) -> None:
-    if not _fits(value, hint):
-        raise DTypeError(f"{name}: expected {_words(hint)}, got {describe(value)}; convert it")
+    if not _has_type(value, hint):
+        raise DTypeError(f"{name}: expected {_type_name(hint)}, got {describe(value)}; convert it")
     for number in value if isinstance(value, tuple | list) else (value,):
         if isinstance(number, int | float) and not isinstance(number, bool):
             _check_bounds(name, number, bounds)
@@ -91,20 +91,20 @@ def _check_bounds(name: str, value: float, bounds: Mapping[str, float | None]) -
     raise InvalidInputError(f"{name}: expected a finite {least}{name}{most}, got {got}; change it")
 
 
-def _words(hint: Any) -> str:
+def _type_name(hint: Any) -> str:
     return hint.__name__ if isinstance(hint, type) else str(hint).replace("typing.", "")
 
 
-def _fits(value: object, hint: Any) -> bool:
-    """Whether a value has the type that a field declares. Lists stand for tuples, as in JSON; ints for floats."""
+def _has_type(value: object, hint: Any) -> bool:
+    """Return True if a value has the type that a field declares. Lists pass for tuples, as in JSON; ints for floats."""
     parts, origin = get_args(hint), get_origin(hint)
     if origin is Literal:
         return value in parts
     if origin in (Union, UnionType):
-        return any(_fits(value, part) for part in parts)
+        return any(_has_type(value, part) for part in parts)
     if origin is tuple:
         inner = parts[:1] * len(value) if isinstance(value, list | tuple) and parts[-1] is Ellipsis else parts
-        return isinstance(value, list | tuple) and len(value) == len(inner) and all(map(_fits, value, inner))
+        return isinstance(value, list | tuple) and len(value) == len(inner) and all(map(_has_type, value, inner))
     if hint is float:
         return isinstance(value, int | float) and not isinstance(value, bool)
     return isinstance(value, hint) and isinstance(value, bool) == (hint is bool)
@@ -129,10 +129,10 @@ def from_json(values: Mapping[str, object], kind: type[Kind]) -> Kind:
     plain: dict[str, Any] = {}
     for name, hint in wanted.items():
         value = values[name]
-        if not _fits(value, dict if is_dataclass(hint) else hint):
+        if not _has_type(value, dict if is_dataclass(hint) else hint):
             raise CheckpointError(
-                f"{kind.__name__}: expected {name} of the type {_words(hint)}, got {short(value)}; restore config.json "
-                f"from a copy"
+                f"{kind.__name__}: expected {name} of the type {_type_name(hint)}, got {short(value)}; "
+                f"restore config.json from a copy"
             )
         plain[name] = tuple(value) if isinstance(value, list) else value
         if is_dataclass(hint):
@@ -158,7 +158,7 @@ class Adam(Settings):
 
 @dataclass(frozen=True)
 class Rollouts(Settings):
-    """How many episodes are collected at a time, in lockstep."""
+    """Numbers of episodes that are collected at a time, in lockstep."""
 
     first: int = bounded(5, minimum=1, maximum=MOST_ENVS)
     """Episodes of uniformly random actions before the first training."""
@@ -168,7 +168,7 @@ class Rollouts(Settings):
 
 @dataclass(frozen=True)
 class Epochs(Settings):
-    """How long something is fitted to data."""
+    """Passes over the data of a fit."""
 
     first: int = bounded(100, minimum=1)
     """Passes over the data of the first training."""

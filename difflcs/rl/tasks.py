@@ -1,4 +1,4 @@
-"""Tasks: what a training, an evaluation and a picture must know of an environment. Others register theirs here.
+"""Tasks: descriptions of environments for training, evaluation and pictures. Other packages register theirs here.
 
     register_task(TaskSpec(name="block", env=PushBlock, make_cost=..., ...))
     train(TrainConfig(task="block"))
@@ -27,9 +27,9 @@ from difflcs._checks import check_number, check_positive_int, did_you_mean, make
 from difflcs._optional import require
 from difflcs.cost import GoalCost
 from difflcs.errors import DTypeError, InvalidInputError
-from difflcs.lcs import LCSModule
 from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.backends import Backend, BatchedBackend, get_backend
+from difflcs.records import LCSModule
 
 if TYPE_CHECKING:
     import gymnasium
@@ -45,14 +45,16 @@ Contexts (..., n_context) are the fourth argument where the environment gives an
 """
 
 
-def see(features: Features, state: Tensor, goal: Tensor, elapsed: Tensor, context: Tensor | None) -> Tensor:
-    """Features of states, and of their contexts where there are any."""
+def compute_features(
+    features: Features, state: Tensor, goal: Tensor, elapsed: Tensor, context: Tensor | None
+) -> Tensor:
+    """Compute the features of states, and of their contexts if there are any."""
     seen = (state, goal, elapsed)
     return features(*seen) if context is None else features(*seen, context)
 
 
 class Outcome(Protocol):
-    """What a transition is worth, without a simulation; for arrays and tensors of any batch shape."""
+    """Computes reward and success of a transition, without a simulation; for arrays and tensors of any batch shape."""
 
     def __call__(self, state: Any, action: Any, after: Any, goal: Any, ended: Any, /) -> tuple[Any, Any]:
         """Judge transitions.
@@ -79,7 +81,7 @@ class Quantity(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class PhysicsSpec:
-    """What is known of the physics of a task before anything is learned, for methods that start from it.
+    """Known physics of a task, for methods that start from it.
 
     Attributes:
         make_system: makes the `LCSModule`, a torch.nn.Module with the numbers as they are guessed, such as a
@@ -89,7 +91,7 @@ class PhysicsSpec:
             in a few steps depends on what the system knows; the rewards stay those of the task.
         horizon: steps that it plans ahead; None: that of the task.
         relaxation: product λ·s of its complementarity, in the units of the system; None: that of the task.
-        told: what it is told of the task in words, to stand beside its results.
+        told: description of the knowledge it has of the task, to be stated beside its results.
 
     Raises:
         InvalidInputError: a number does not fit.
@@ -260,7 +262,7 @@ class TaskSpec:
     # --- what is built for it ---
 
     def make_env(self, **kwargs: Any) -> gymnasium.Env:
-        """One environment, such as with `render_mode="rgb_array"`.
+        """Make one environment, for example with `render_mode="rgb_array"`.
 
         Raises:
             MissingDependencyError: a package that it needs is not installed.
@@ -273,7 +275,7 @@ class TaskSpec:
             return make(**arguments, **kwargs)
 
     def make_envs(self, count: int, threads: int | None = None) -> VectorEnv:
-        """A vector of environments, stepped in lockstep.
+        """Make a vector of environments, stepped in lockstep.
 
         Args:
             count: how many.
@@ -300,7 +302,7 @@ class TaskSpec:
         return envs
 
     def _check_actions(self, space: Any) -> None:
-        """Refuse bounds wider than the environment's, which would execute other actions than those planned."""
+        """Raise if the bounds are wider than those of the environment, which would clip the planned actions."""
         if getattr(space, "shape", None) != (self.n_u,) or not hasattr(space, "low"):
             raise InvalidInputError(
                 f"task {self.name}: expected an environment whose action space is a Box of shape ({self.n_u},), as the "
@@ -328,7 +330,7 @@ class TaskSpec:
     def make_policy(
         self, lcs: LCSModule, backend: str | Backend = "batched", plan: PhysicsSpec | None = None
     ) -> LCSMPCLayer:
-        """The MPC around a model; unsolved elements are masked, never raised, so that they cannot end a training.
+        """Make the MPC around a model; unsolved elements are masked, never raised, so that they cannot end a training.
 
         It has cost, horizon and relaxation of the task, or those of `plan` where that has any.
         """
@@ -345,18 +347,18 @@ class TaskSpec:
         )
 
     def say(self, info: Mapping[str, Any]) -> str:
-        """What a picture says of a step: the caption of the task, else the errors that the info has."""
+        """Return the caption of a step in a picture: that of the task, else the errors in the info."""
         if self.caption is not None:
             return self.caption(info)
         known = [(q, info[q.name]) for q in self.errors if q.name in info]
         return ", ".join(f"{q.name.replace('_', ' ')} {float(value):.3g} {q.unit}".strip() for q, value in known)
 
 
-def one_start(name: str) -> Backend:
-    """The solver of a name as trainings use it: `batched` tries one start, along a short homotopy.
+def single_start_backend(name: str) -> Backend:
+    """Return a solver by its name as trainings use it: `batched` tries one start, along a short homotopy.
 
-    With three it finds another plan in one state of seven and takes twice as long; what is learned is how those of one
-    start do on the robot, and plans that jump from optimum to optimum when the system changes a little teach little.
+    With three starts it finds another plan in one state of seven and takes twice as long. Learning follows the plans of
+    one start, and plans that jump from optimum to optimum when the system changes a little teach little.
     """
     backend = get_backend(name)
     if isinstance(backend, BatchedBackend):
@@ -385,13 +387,13 @@ def register_task(spec: TaskSpec) -> TaskSpec:
 
 @functools.cache
 def _load_entry_points() -> None:
-    own = dict(_REGISTRY)  # registered in this program: what is installed does not replace it
+    registered = dict(_REGISTRY)  # registered in this program: what is installed does not replace it
     for entry in metadata.entry_points(group=ENTRY_POINTS):
         try:
             entry.load()()
         except Exception as error:  # a broken package of others must not take the rest with it
             _FAILED[f"{entry.name} = {entry.value}"] = f"{type(error).__name__}: {error}"
-    _REGISTRY.update(own)
+    _REGISTRY.update(registered)
 
 
 def task_names() -> tuple[str, ...]:

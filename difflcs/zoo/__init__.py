@@ -1,4 +1,4 @@
-"""Learned models that ship with the package, and what is known about each. It knows files only.
+"""Learned models that ship with the package, and their cards. This module handles files only.
 
     from difflcs import LCSModel, zoo
     lcs = LCSModel.from_pretrained("trifinger-cube")
@@ -24,9 +24,9 @@ from difflcs.errors import CheckpointError
 __all__ = ["MODELS", "PREFIX", "ModelCard", "card", "names", "path"]
 
 PREFIX = "zoo:"
-"""Before a name it says to the command line and to `LCSModel.from_pretrained`: a model of the zoo, not a path."""
+"""Prefix by which the command line and `LCSModel.from_pretrained` know a model of the zoo from a path."""
 MODELS = Path(__file__).parent / "models"
-"""Where the models lie, a folder each: config.json, model.safetensors, card.json."""
+"""Folder of the models, each in a folder with config.json, model.safetensors and card.json."""
 
 _NUMBERS = ("minutes", "success_rate", "ci_low", "ci_high")
 _COUNTS = ("seed", "goals", "evaluation_seed", "solver_failures")
@@ -35,12 +35,12 @@ _WORDS = ("name", "task", "method", "backend", "version", "command")
 
 @dataclass(frozen=True)
 class ModelCard:
-    """Where a model of the zoo comes from and how good it is.
+    """Origin and quality of a model of the zoo.
 
     Attributes:
         name: its name in the zoo.
-        task: what it was trained for, and is evaluated on.
-        method: how it was learned, as `difflcs train --method` takes it.
+        task: name of its task.
+        method: name of its method, as `difflcs train --method` takes it.
         minutes: data [min of simulated time].
         seed: of the training.
         success_rate: successes per goal, without noise.
@@ -49,10 +49,10 @@ class ModelCard:
         goals: goals of that evaluation.
         evaluation_seed: their seed.
         solver_failures: MPC solves of that evaluation that did not converge.
-        object: what decides whether results can be compared, as the task describes its environment.
+        object: description of the environment by its task; results are comparable if it is the same.
         backend: MPC solver of training and evaluation.
         version: of difflcs.
-        command: what trained it.
+        command: the command that trained it.
         versions: of the packages that decide a result.
         settings: every setting of the training; defaults may change, these do not.
     """
@@ -77,7 +77,7 @@ class ModelCard:
 
     @property
     def object_source(self) -> str:
-        """Where the shape of the object is from, such as built_in, ycb_mesh or stand_in; "" if nobody said."""
+        """Source of the object's shape, such as built_in, ycb_mesh or stand_in; "" if unknown."""
         return str(self.object.get("source", ""))
 
     @property
@@ -89,7 +89,7 @@ class ModelCard:
     def __str__(self) -> str:
         lines = {
             "task": self.task,
-            "object": described(self.object),
+            "object": describe(self.object),
             "method": f"{self.method}, {self.minutes:g} min of data, seed {self.seed}, backend {self.backend}",
             "success": f"{self.success_text}, goal seed {self.evaluation_seed}",
             "solver": f"{self.solver_failures} solves failed in that evaluation",
@@ -100,16 +100,16 @@ class ModelCard:
 
 
 def names(root: Path = MODELS) -> tuple[str, ...]:
-    """Names of the models, in alphabetical order."""
+    """Return the names of the models, in alphabetical order."""
     return tuple(sorted(card.parent.name for card in root.glob("[!._]*/card.json")))
 
 
 def path(name: str, root: Path = MODELS) -> Path:
-    """The folder of a model: what `LCSModel.save_pretrained` wrote, and card.json.
+    """Return the folder of a model, with the files of `LCSModel.save_pretrained` and card.json.
 
     Args:
         name: "trifinger-cube" or "zoo:trifinger-cube".
-        root: where the models lie.
+        root: folder of the models.
 
     Raises:
         CheckpointError: no model has this name; the message lists those there are.
@@ -124,7 +124,7 @@ def path(name: str, root: Path = MODELS) -> Path:
 
 
 def resolve(source: str | os.PathLike[str]) -> Path:
-    """The directory that a user means.
+    """Find the directory that a user means.
 
     "zoo:NAME" is always a model of the zoo. Otherwise a path that exists wins, then a model of the zoo of that name.
 
@@ -143,7 +143,7 @@ def resolve(source: str | os.PathLike[str]) -> Path:
 
 
 def card(name: str) -> ModelCard:
-    """The card of a model.
+    """Read the card of a model.
 
     Raises:
         CheckpointError: no model has this name, or its card is damaged.
@@ -152,7 +152,7 @@ def card(name: str) -> ModelCard:
 
 
 def table(cards: Sequence[ModelCard]) -> str:
-    """One line per model."""
+    """Format one line per model."""
     head = ("name", "method", "data", "success", "interval", "goals", "object")
     rows = [
         (
@@ -201,20 +201,23 @@ def _read(file: Path) -> ModelCard:
     return ModelCard(**values)
 
 
-def check_object(found: Mapping[str, Any], source: object) -> None:
-    """Check what a file says of the object that a model was trained on.
+def check_object(description: Mapping[str, Any], source: object) -> None:
+    """Raise unless the description of the object that a model was trained on is usable.
 
     Raises:
         CheckpointError: something else than texts and numbers.
     """
-    if not all(isinstance(value, str | int | float | bool | None) for value in found.values()):
+    if not all(isinstance(value, str | int | float | bool | None) for value in description.values()):
         raise CheckpointError(
-            f"{source}: expected texts and numbers that describe an object, got {_storage.short(dict(found))}; "
+            f"{source}: expected texts and numbers that describe an object, got {_storage.short(dict(description))}; "
             f"restore it from a copy"
         )
 
 
-def described(found: Mapping[str, Any]) -> str:
-    """What decides whether results can be compared, in one line; no hashes."""
-    texts = [f"{key.replace('_', ' ')} {value}" for key, value in found.items() if key not in ("name", "sha256")]
-    return " ".join([str(found.get("name", "")), f"({', '.join(texts)})" if texts else ""]).strip() or "nothing special"
+def describe(description: Mapping[str, Any]) -> str:
+    """Format the description of an object in one line, without hashes."""
+    texts = [f"{key.replace('_', ' ')} {value}" for key, value in description.items() if key not in ("name", "sha256")]
+    return (
+        " ".join([str(description.get("name", "")), f"({', '.join(texts)})" if texts else ""]).strip()
+        or "nothing special"
+    )

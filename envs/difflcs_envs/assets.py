@@ -1,9 +1,9 @@
 """The YCB meshes on this machine: find them, or download them from the YCB site.
 
 The archives are kept whole: their SHA-256 is recorded at the first download and every later download must match it.
-Nothing is ever half there. Archives grow in `NAME.part` and are unpacked into a hidden folder that gets its name in one
-step. One process at a time works in a folder; the others wait. Whatever
-a server sends or an archive holds, its size is limited and the error is an `AssetError`.
+No file is ever incomplete under its name: archives grow in `NAME.part`, and are unpacked into a hidden folder that is
+renamed in one step. One process at a time works in a folder; the others wait. The size of answers and archives is
+limited; beyond that they raise an `AssetError`.
 """
 
 from __future__ import annotations
@@ -56,14 +56,14 @@ _LAYOUTS = (
 
 
 def ycb_download_directory() -> Path:
-    """Where `download` puts the objects."""
+    """Return the folder into which `download` puts the objects."""
     from difflcs_envs.trifinger.meshes import cache_directory
 
     return cache_directory() / "ycb"
 
 
 def find_ycb_mesh(entry: YcbObject) -> Path | None:
-    """The mesh of an object; None if it is not on this machine.
+    """Find the mesh of an object; None if it is not on this machine.
 
     Raises:
         MeshError: `DIFFLCS_YCB_DIR` is set, but the mesh is not there.
@@ -102,7 +102,7 @@ def download(
         The mesh of each object.
 
     Raises:
-        AssetError: The download failed or is not what it should be. What was there before stays there.
+        AssetError: The download failed or has unexpected content. Earlier files stay.
         ValueError: An object is unknown.
     """
     names = list(YCB if names is None else names)
@@ -197,7 +197,7 @@ def _fetch(address: str, archive: Path) -> None:
 
 
 def _fetch_once(address: str, part: Path) -> bool:
-    """One request. Returns whether the file is complete."""
+    """Request the file once. Return True if it is complete."""
     with urllib.request.urlopen(address, timeout=TIMEOUT) as answer, part.open("wb") as file:
         length = answer.headers.get("Content-Length")
         total = None if length is None else int(length)
@@ -283,7 +283,7 @@ def _unpack(archive: Path, folder: Path, entry: YcbObject) -> Path:
 
 @contextlib.contextmanager
 def _decompressed(archive: Path, folder: Path) -> Iterator[BinaryIO]:
-    """The tar inside, as a temporary file: so its size is known before anything in it is believed."""
+    """Decompress the tar inside into a temporary file, so that its size is known before it is read."""
     with tempfile.TemporaryFile(dir=folder) as file:
         with gzip.open(archive) as compressed:
             while chunk := compressed.read(CHUNK):
@@ -316,7 +316,7 @@ def _members(tar: tarfile.TarFile, archive: Path) -> list[tarfile.TarInfo]:
 
 
 def _check(mesh: Path, entry: YcbObject) -> None:
-    """Compare the size of what was downloaded with the table."""
+    """Compare the size of a downloaded mesh with the table."""
     from difflcs_envs.trifinger.meshes import check_extent, load_mesh
 
     try:

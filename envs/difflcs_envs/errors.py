@@ -1,4 +1,4 @@
-"""Errors and warnings of the environments, which stand alone: `tasks.py` apart, nothing here knows `difflcs`."""
+"""Errors and warnings of the environments. Only `tasks.py` in this package imports `difflcs`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ INSTALL_HINT = 'pip install "difflcs[envs]"'
 
 
 class DifflcsEnvsError(Exception):
-    """Base of the errors of this package, but for plain ValueErrors about arguments."""
+    """Base of the errors of this package, except plain ValueErrors about arguments."""
 
 
 class MissingDependencyError(ImportError, DifflcsEnvsError):
@@ -43,7 +43,7 @@ class OptionsError(ValueError, TypeError, DifflcsEnvsError):
 
 
 class AssetError(RuntimeError, DifflcsEnvsError):
-    """A download failed, or what was downloaded is not what it should be."""
+    """A download failed, or has unexpected content."""
 
 
 class PhysicsWarning(RuntimeWarning):

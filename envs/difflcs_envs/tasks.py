@@ -1,4 +1,4 @@
-"""The environments as tasks of `difflcs`: what its trainings, evaluations and pictures must know of them.
+"""The environments as tasks of `difflcs`, for its trainings, evaluations and pictures.
 
 The one file of this package that imports `difflcs`, which finds it by the entry point group `difflcs.tasks`. No
 environment is imported here, and no simulation.
@@ -91,7 +91,7 @@ def contact_cost() -> GoalCost:
 
 
 def contact_system(**env_kwargs: Any) -> Any:
-    """What is known of the object and the tips before a training, as a `ContactLCS`.
+    """Make the known physics of the object and the tips, as a `ContactLCS`.
 
     Known: the outline at the height of the tips and the centre of mass. Guessed, and the same for every object: tips
     make 70 % of a commanded step and give way; friction 0.5; the object begins to move when a tip is pressed into it by
@@ -107,9 +107,9 @@ def contact_system(**env_kwargs: Any) -> Any:
     from difflcs_envs.trifinger.section import cross_section
 
     arguments = {"object_source": "source", "rest_pose": "rest_pose", "mesh_parts": "parts", "mesh_scale": "mesh_scale"}
-    given = {argument: env_kwargs[name] for name, argument in arguments.items() if name in env_kwargs}
-    found = make_object(env_kwargs["object"], **given) if "object" in env_kwargs else CubeObject()
-    outline = Union(tuple(Polygon(torch.from_numpy(corners)) for corners in cross_section(found)))
+    options = {argument: env_kwargs[name] for name, argument in arguments.items() if name in env_kwargs}
+    scene_object = make_object(env_kwargs["object"], **options) if "object" in env_kwargs else CubeObject()
+    outline = Union(tuple(Polygon(torch.from_numpy(corners)) for corners in cross_section(scene_object)))
     guess = PlanarPushing(
         outline,
         radius=TIP_RADIUS - 0.002,
@@ -126,7 +126,7 @@ def contact_system(**env_kwargs: Any) -> Any:
 
 
 def pushing_features(state: Tensor, goal: Tensor, elapsed: Tensor) -> Tensor:
-    """What the value network sees of a pushing task, scaled to about one.
+    """Compute the inputs of the value network of a pushing task, scaled to about one.
 
     Args:
         state: (..., 9).
@@ -154,19 +154,19 @@ def pushing_features(state: Tensor, goal: Tensor, elapsed: Tensor) -> Tensor:
 
 
 def caption(info: Mapping[str, Any]) -> str:
-    """What a picture says of a step: "off by 12 mm, 0.05 rad"."""
+    """Caption a picture of a step: "off by 12 mm, 0.05 rad"."""
     return f"off by {1000 * info['position_error']:.0f} mm, {info['yaw_error']:.2f} rad"
 
 
 def describe(env: Any) -> dict[str, Any]:
-    """What the fingers push: name, source of its shape, mass, ...; of one environment or a vector, wrapped or not."""
+    """Describe the object of an environment or a vector, wrapped or not: name, source of its shape, mass, ..."""
     inner = env.unwrapped
     single = inner.envs[0].unwrapped if hasattr(inner, "envs") else inner
     return single.object.describe()
 
 
 def contact_physics(env_kwargs: Mapping[str, Any]) -> PhysicsSpec:
-    """What the methods that start from physics are told of an object that is pushed."""
+    """Make the known physics of a pushing task, for methods that start from it."""
     return PhysicsSpec(
         make_system=functools.partial(contact_system, **env_kwargs),
         make_cost=contact_cost,
@@ -177,28 +177,28 @@ def contact_physics(env_kwargs: Mapping[str, Any]) -> PhysicsSpec:
     )
 
 
-def _judging(task: MoveTask, env_kwargs: Mapping[str, Any]) -> MoveTask:
-    """A task with the numbers of an environment that is made with these arguments."""
-    given = {name: env_kwargs.get(name, getattr(task, name)) for name in ("yaw_tolerance", "sparse_penalty")}
+def _adapt_task(task: MoveTask, env_kwargs: Mapping[str, Any]) -> MoveTask:
+    """Return a task with the numbers of an environment that is made with these arguments."""
+    numbers = {name: env_kwargs.get(name, getattr(task, name)) for name in ("yaw_tolerance", "sparse_penalty")}
     near = env_kwargs.get("position_tolerance", task.position_tolerance)
     task = replace(task, position_tolerance=near)
-    return checked_task(task, reward_weights=env_kwargs.get("reward_weights"), **given)
+    return checked_task(task, reward_weights=env_kwargs.get("reward_weights"), **numbers)
 
 
 def trifinger_task(
     name: str, env: str, task: MoveTask, summary: str, goals: tuple[tuple[float, ...], ...], **env_kwargs: Any
 ) -> TaskSpec:
-    """One task of the robot hand.
+    """Make one task of the robot hand.
 
     Args:
-        name: What it is called.
+        name: Name of the task.
         env: Name of the Gymnasium environment in the namespace `difflcs`.
         task: Goals and reward of that environment.
-        summary: What is to be done.
-        goals: Goals to show what was learned.
-        **env_kwargs: Arguments of the environment. What they change of goals and reward is changed here, too.
+        summary: The task in one sentence.
+        goals: Goals for pictures of the learned policy.
+        **env_kwargs: Arguments of the environment. Their changes of goals and reward apply here, too.
     """
-    judge = _judging(task, env_kwargs)
+    judge = _adapt_task(task, env_kwargs)
     return TaskSpec(
         name=name,
         summary=summary,

@@ -139,7 +139,7 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
             ValueError: The actions have the wrong shape or are not finite.
             gymnasium.error.ResetNeeded: There was no reset, or (mode DISABLED) an episode has ended.
         """
-        given = self._checked_actions(actions)
+        requested = self._checked_actions(actions)
         if not self._began or (self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any()):
             raise ResetNeeded(
                 "Expected a running episode in every environment, but some have ended or never began. Call reset() "
@@ -149,7 +149,7 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
         for i in np.flatnonzero(fresh).tolist():
             self._reset_one(i, None, {})
         moving = np.flatnonzero(~fresh)
-        executed = given.clip(-ACTION_LIMIT, ACTION_LIMIT)
+        executed = requested.clip(-ACTION_LIMIT, ACTION_LIMIT)
         before = self._states.copy()
         results = step_all([self.envs[i].physics for i in moving], executed[moving], self.threads)
         unstable = np.zeros(self.num_envs, dtype=bool)
@@ -164,7 +164,7 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
         rewards, info = self.envs[0].task.outcome(before, executed, self._states, self._goals, truncated)
         info |= {
             "executed_action": executed,
-            "clipped": (executed != given).any(axis=1),
+            "clipped": (executed != requested).any(axis=1),
             "physics_error": unstable,
         }
         if fresh.any():
@@ -180,7 +180,7 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
         return self._observations(), rewards, np.zeros(self.num_envs, dtype=bool), truncated, infos
 
     def render(self) -> tuple[np.ndarray | None, ...] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """A picture of every environment, or None without render mode."""
+        """Draw a picture of every environment; None without render mode."""
         if self.render_mode is None:
             return None
         return tuple(env.render() for env in self.envs)
@@ -236,15 +236,15 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
     def _checked_actions(self, actions: Any) -> np.ndarray:
         expected = f"Expected actions = {ACTION_MEANING}, shape ({self.num_envs}, {ACTION_SIZE}), all finite"
         try:
-            given = np.array(actions, dtype=np.float64)
+            array = np.array(actions, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise ValueError(f"{expected}, got {actions!r}. Pass one row of numbers per environment.") from error
-        if given.shape != (self.num_envs, ACTION_SIZE):
-            raise ValueError(f"{expected}, got shape {given.shape}. Pass one row per environment.")
-        if not np.isfinite(given).all():
-            bad = np.flatnonzero(~np.isfinite(given).all(axis=1)).tolist()
+        if array.shape != (self.num_envs, ACTION_SIZE):
+            raise ValueError(f"{expected}, got shape {array.shape}. Pass one row per environment.")
+        if not np.isfinite(array).all():
+            bad = np.flatnonzero(~np.isfinite(array).all(axis=1)).tolist()
             raise ValueError(f"{expected}, got NaN or infinity in the rows {bad}. Find out where they come from.")
-        return given
+        return array
 
     def _reset_one(self, i: int, seed: int | None, options: dict[str, Any]) -> None:
         env = self.envs[i]
@@ -254,7 +254,7 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
         self._steps[i], self._ended[i] = 0, False
 
     def _reset_at_once(self, infos: dict[str, Any], ended: np.ndarray) -> dict[str, Any]:
-        """Mode SAME_STEP: keep what the episodes ended with and start the next ones."""
+        """Mode SAME_STEP: keep the last observations and infos, and start the next episodes."""
         last = self._observations()
         final_obs = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended).tolist():
@@ -282,7 +282,7 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
         return self.envs[0].task.pose_info(self._states, self._goals)
 
     def _masked(self, info: dict[str, np.ndarray], mask: np.ndarray, only: np.ndarray | None = None) -> dict[str, Any]:
-        """Gymnasium's form: `name` and `_name`. What is not about the pose exists for the environments `only`."""
+        """Convert to Gymnasium's form: `name`, `_name`. Entries other than the pose's are of the environments `only`."""
         result: dict[str, Any] = {}
         for name, value in info.items():
             has = mask
@@ -297,7 +297,7 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
 
 
 def available_cores() -> int:
-    """CPU cores that this process may use."""
+    """Count the CPU cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

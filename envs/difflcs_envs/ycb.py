@@ -97,7 +97,7 @@ class YcbObject:
     """One YCB object.
 
     Attributes:
-        name: Our name.
+        name: Name in this package.
         code: Its name in the YCB set.
         mass: Published mass [kg].
         size: Extent [m] along x, y, z at rest.
@@ -118,13 +118,13 @@ class YcbObject:
 
 
 def _box(x: tuple[float, float], y: tuple[float, float], height: float, yaw: float = 0.0) -> Primitive:
-    """A box on the table between two x and two y [m]."""
+    """Make a box on the table between two x and two y [m]."""
     center = (sum(x) / 2, sum(y) / 2, height / 2)
     return Primitive("box", center, ((x[1] - x[0]) / 2, (y[1] - y[0]) / 2, height / 2), yaw)
 
 
 def _arc(size: tuple[float, float, float], pieces: int) -> tuple[Primitive, ...]:
-    """Capsules along a circular arc that fills a box of this size, its ends towards +y."""
+    """Make capsules along a circular arc that fills a box of this size, its ends towards +y."""
     length, width, height = size
     radius = height / 2
     chord, rise = length - height, width - height
@@ -143,7 +143,7 @@ def _arc(size: tuple[float, float, float], pieces: int) -> tuple[Primitive, ...]
 
 
 def _clamp(size: tuple[float, float, float]) -> tuple[Primitive, ...]:
-    """A spring clamp from above: two handles that spread to the left, two jaws that close to the right."""
+    """Make a spring clamp as seen from above: two handles that spread to the left, two jaws that close to the right."""
     length, width, height = size
     for _ in range(8):  # the turned handles reach not quite as far as they are long: stretch until the size is right
         pieces = _clamp_pieces(length, width, height)

@@ -19,7 +19,7 @@ from difflcs import GoalCost, LCSParams
 from difflcs.errors import CheckpointError
 from difflcs.rl.learning.trainer import AfterStep, Trainer
 from difflcs.rl.methods import Method, Work
-from difflcs.rl.rollout import Plan, collect, mpc_actions
+from difflcs.rl.rollout import PolicyOutput, collect, mpc_actions
 from difflcs.rl.seeding import Stream, episode_seeds, generator
 from difflcs.rl.settings import bounded
 from difflcs.rl.tasks import PhysicsSpec, Quantity, TaskSpec
@@ -130,9 +130,11 @@ class Gain(nn.Module):
         super().__init__()
         self.gain = nn.Parameter(torch.tensor([gain], dtype=torch.float64), requires_grad=False)
 
-    def forward(self, x0: Tensor, goal: Tensor, *, u_min: Tensor | None = None, u_max: Tensor | None = None) -> Plan:
+    def forward(
+        self, x0: Tensor, goal: Tensor, *, u_min: Tensor | None = None, u_max: Tensor | None = None
+    ) -> PolicyOutput:
         action = (self.gain * (goal - x0[:, :1])).clamp(-U_MAX, U_MAX)
-        return Plan(action, torch.ones(len(x0), dtype=torch.bool))
+        return PolicyOutput(action, torch.ones(len(x0), dtype=torch.bool))
 
     def config(self) -> dict[str, Any]:
         return {"size": 1}

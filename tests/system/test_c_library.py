@@ -194,9 +194,9 @@ def test_what_export_writes(exported, capsys):
 
 
 def test_the_exported_controller_is_that_of_the_model(exported):
-    from difflcs.rl.tasks import get_task, one_start
+    from difflcs.rl.tasks import get_task, single_start_backend
 
-    mpc = get_task("cube").make_policy(LCSModel.from_pretrained(MODEL), one_start("batched"))
+    mpc = get_task("cube").make_policy(LCSModel.from_pretrained(MODEL), single_start_backend("batched"))
     one, two = mpc.controller(), MPCController.load(exported / "controller.difflcs")
     for x in 0.02 * np.random.default_rng(0).normal(size=(5, 9)):
         assert np.array_equal(one.step(x, np.zeros(3)), two.step(x, np.zeros(3)))

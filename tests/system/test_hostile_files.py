@@ -351,7 +351,7 @@ def test_any_value_in_any_field_of_a_card(tmp_path, monkeypatch):
                 known = zoo.card("trifinger-cube")
                 assert str(known)
                 assert zoo.table([known])
-                assert zoo.described(known.object)
+                assert zoo.describe(known.object)
 
 
 @pytest.mark.parametrize("found", [{"name": ["a"]}, {"mass": {"kg": 1}}])

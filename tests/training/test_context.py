@@ -32,7 +32,7 @@ from difflcs.rl import (
 )
 from difflcs.rl.learning.ppo import PPO
 from difflcs.rl.learning.state import flatten
-from difflcs.rl.rollout import contexts, mpc_actions, no_episodes, transitions
+from difflcs.rl.rollout import contexts, make_empty_record, mpc_actions, transitions
 from difflcs.rl.runs.checkpoint import load_checkpoint, save_checkpoint
 from tests.training import slide
 from tests.training.slide import parameters, recorded, same
@@ -165,7 +165,7 @@ def test_episodes_keep_their_context():
     assert torch.equal(flat, record["context"].repeat_interleave(STEPS, 0))
     assert len(flat) == len(transitions(record)[0])
     assert contexts(record.select("state", "action")) is None
-    assert no_episodes(env, STEPS)["context"].shape == (0, 1)
+    assert make_empty_record(env, STEPS)["context"].shape == (0, 1)
 
 
 def test_each_part_of_ppo_sees_the_context_of_its_own_sample():

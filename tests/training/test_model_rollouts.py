@@ -172,7 +172,7 @@ def test_only_the_last_step_holds_the_penalty():
     np.testing.assert_allclose(rewards[-1], -3.0 * ~info["success"], atol=1e-12)
     assert 0 < info["success"].sum() < count
     goals, still = torch.from_numpy(observation["goal"]), torch.zeros(count, STEPS, 1, N_U).double()
-    _, reward, _ = env.foresee(torch.stack(states[:-1], 1), still, goals)
+    _, reward, _ = env.predict_alternatives(torch.stack(states[:-1], 1), still, goals)
     dense = reward.squeeze(2) + torch.stack(states[:-1], 1)[..., 0].abs()
     torch.testing.assert_close(dense, torch.from_numpy(np.stack(rewards, 1)))
 
@@ -190,7 +190,7 @@ def test_foreseen_is_what_was_played():
         successes.append(torch.from_numpy(info["success"]))
     played = torch.stack(states, 1)
     goals = torch.from_numpy(observation["goal"])
-    after, reward, success = env.foresee(played[:, :-1], actions, goals)
+    after, reward, success = env.predict_alternatives(played[:, :-1], actions, goals)
     assert after.shape == (3, STEPS, 2, N_X)
     torch.testing.assert_close(after[:, :, 0], played[:, 1:])
     torch.testing.assert_close(reward[:, :, 0], torch.stack(rewards, 1))

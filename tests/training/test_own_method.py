@@ -33,7 +33,7 @@ from difflcs.rl import (
     register_method,
     train,
 )
-from difflcs.rl.rollout import beside, contexts, transitions, uniform_actions
+from difflcs.rl.rollout import append_context, contexts, transitions, uniform_actions
 from tests.training.slide import same
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -130,7 +130,7 @@ def test_networks_see_the_context():
     np.testing.assert_array_equal(after["context"], start["context"])
     before, taken = torch.from_numpy(start["state"]).unsqueeze(1), torch.from_numpy(actions)[:, None, None]
     seen = [v.expand(-1, STEPS, *v.shape[2:]) for v in (before, taken)]
-    foreseen, _, _ = models.env.foresee(*seen, torch.from_numpy(start["goal"]))
+    foreseen, _, _ = models.env.predict_alternatives(*seen, torch.from_numpy(start["goal"]))
     np.testing.assert_allclose(foreseen[:, 0, 0], after["state"], rtol=0, atol=1e-6)
 
     (x, u, x_next), context = transitions(unseen), contexts(unseen)
@@ -138,6 +138,6 @@ def test_networks_see_the_context():
     errors = []
     for given in (context, context.flip(0)):
         with torch.no_grad():
-            found = models.ensemble(beside(x, given).float().unsqueeze(0), u.float().unsqueeze(0))[0, :, :2]
+            found = models.ensemble(append_context(x, given).float().unsqueeze(0), u.float().unsqueeze(0))[0, :, :2]
         errors.append(float((found - x_next).square().mean().sqrt()))
     assert errors[0] < 0.5 * errors[1]

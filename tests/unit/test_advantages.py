@@ -184,7 +184,7 @@ BOUND = 0.5
 class World:
     """x₊ = x + a, reward −x₊² − 3 in the last step off the goal: knows what other actions would have led to."""
 
-    def foresee(self, states, actions, goals):
+    def predict_alternatives(self, states, actions, goals):
         assert bool((actions.abs() <= BOUND).all())  # what is executed
         after = states.unsqueeze(2) + actions
         success = (after - goals[:, None, None]).abs().squeeze(-1) < 0.4
@@ -219,7 +219,7 @@ def judged(actions: int = 4, zeta: float = 0.0, gamma: float = 0.9):
         episodes["state"], goal.unsqueeze(1).expand(-1, STEPS + 1, -1), elapsed_fractions(STEPS).expand(count, -1)
     )
     executed = episodes["policy", "action"].clamp(-BOUND, BOUND).unsqueeze(2)
-    _, reward, success = World().foresee(episodes["state"][:, :-1], executed, goal)
+    _, reward, success = World().predict_alternatives(episodes["state"][:, :-1], executed, goal)
     rewards = scale(reward.squeeze(2), success[:, -1, 0])
     return episodes, inputs, rewards, estimator, estimator(episodes, inputs, rewards, (0, 6))
 

@@ -7,7 +7,7 @@ import torch
 from difflcs import LCSSequence
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.rl.rollout import collect, mpc_actions
-from difflcs.rl.runs.delay import late_actions, predicted_by
+from difflcs.rl.runs.delay import delay_actions, make_predictor
 from difflcs.rl.runs.evaluate import evaluate
 from tests.training.pusher import STEPS, Reach, make_envs, pusher
 
@@ -15,7 +15,7 @@ SEEDS = [1, 2, 3, 4]
 
 
 def played(steps=0, predict=None):
-    return collect(make_envs(4), late_actions(mpc_actions(Reach()), 1, steps, predict), SEEDS, STEPS)
+    return collect(make_envs(4), delay_actions(mpc_actions(Reach()), 1, steps, predict), SEEDS, STEPS)
 
 
 def test_no_delay_changes_nothing():
@@ -35,7 +35,7 @@ def test_what_is_planned_is_executed_later(steps):
 @pytest.mark.parametrize("steps", [1, 2, 3])
 def test_with_an_exact_model_only_the_first_steps_are_lost(steps):
     """From there on each action is that of the state in which it is executed."""
-    record = played(steps, predicted_by(pusher()))
+    record = played(steps, make_predictor(pusher()))
     act = mpc_actions(Reach())
     for t in range(steps, STEPS):
         planned, _ = act(record["state"][:, t], record["goal"])
@@ -63,4 +63,4 @@ def test_a_system_per_stage_predicts_no_single_step():
             return LCSSequence.stack([pusher()] * 2)
 
     with pytest.raises(DTypeError, match="one step"):
-        played(1, predicted_by(Staged()))
+        played(1, make_predictor(Staged()))

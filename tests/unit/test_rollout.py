@@ -7,7 +7,15 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from difflcs import solve_lcp
 from difflcs.errors import InvalidInputError
-from difflcs.rl.rollout import collect, extended, mpc_actions, no_episodes, noisy_actions, transitions, uniform_actions
+from difflcs.rl.rollout import (
+    append_episodes,
+    collect,
+    make_empty_record,
+    mpc_actions,
+    noisy_actions,
+    transitions,
+    uniform_actions,
+)
 from difflcs.rl.seeding import episode_seeds
 from tests.training.pusher import STEPS, U_MAX, PusherEnv, Reach, make_envs, pusher
 
@@ -77,16 +85,16 @@ def test_a_record_has_one_row_per_episode():
 
 def test_records_are_extended_by_stable_episodes_and_keep_the_newest():
     env = SyncVectorEnv([lambda: PusherEnv(breaks_at=4), PusherEnv])
-    known = no_episodes(env, STEPS)
+    known = make_empty_record(env, STEPS)
     assert len(known) == 0
     record = collect(env, mpc_actions(Reach()), [1, 2], STEPS)
-    known = extended(known, record)
+    known = append_episodes(known, record)
     assert torch.equal(known["state"], record["state"][1:])
     later = collect(make_envs(2), mpc_actions(Reach()), [3, 4], STEPS)
-    assert torch.equal(extended(known, later, keep=2)["goal"], later["goal"])
-    assert len(extended(known, later)) == 3
+    assert torch.equal(append_episodes(known, later, keep=2)["goal"], later["goal"])
+    assert len(append_episodes(known, later)) == 3
     with pytest.raises(InvalidInputError, match="stable simulation"):
-        extended(no_episodes(env, STEPS), record[:1])
+        append_episodes(make_empty_record(env, STEPS), record[:1])
 
 
 @pytest.mark.parametrize(

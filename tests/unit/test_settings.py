@@ -17,7 +17,7 @@ from difflcs._optional import require
 from difflcs.errors import BackendNotFoundError, CheckpointError, DTypeError, InvalidInputError, MissingDependencyError
 from difflcs.rl.learning.warmup import WarmupSettings
 from difflcs.rl.methods import DEFAULT_METHOD, LCSMethod, get_method, method_names
-from difflcs.rl.runs.training import TrainConfig, episodes_of, goals_due
+from difflcs.rl.runs.training import TrainConfig, count_episodes, goals_due
 from difflcs.rl.settings import Adam, Epochs, Rollouts, Settings, bounded, from_json, group
 from difflcs.rl.tasks import get_task
 
@@ -253,7 +253,7 @@ def test_evaluations_fall_due_once():
 def test_the_last_evaluation_is_never_left_out(minutes):
     """Also where the minutes are no whole number of episodes."""
     task, config = get_task("cube"), TrainConfig(minutes=minutes, evaluate_at=(), final_goals=300)
-    last = episodes_of(minutes, task) * task.episode_steps
+    last = count_episodes(minutes, task) * task.episode_steps
     assert goals_due(config, last - 20, last, task) == 300
     assert goals_due(config, last - 40, last - 20, task) == 0
 

@@ -14,7 +14,7 @@ import torch
 
 from difflcs import GoalCost, LCSModel
 from difflcs.errors import DTypeError, InvalidInputError, MissingDependencyError
-from difflcs.rl.rollout import Plan
+from difflcs.rl.rollout import PolicyOutput
 from difflcs.rl.runs.figures import record_video
 from difflcs.rl.tasks import ENTRY_POINTS, Quantity, get_task, register_task, task_names
 from tests.conformance.toy import STEPS, U_MAX, Slide, make_task
@@ -108,7 +108,7 @@ def test_every_episode_of_a_film_begins_the_policy_anew(tmp_path):
 
         def __call__(self, state, goal, **_):
             self.steps[-1] += 1
-            return Plan(torch.zeros(1, 1).double(), torch.ones(1, dtype=torch.bool))
+            return PolicyOutput(torch.zeros(1, 1).double(), torch.ones(1, dtype=torch.bool))
 
     policy = Counted()
     record_video(Drawn(), policy, [(0.1,), (0.2,), (-0.1,)], tmp_path / "film.mp4", TOY)

@@ -1,4 +1,4 @@
-"""What may touch in a MuJoCo model, at many states: gaps and contact Jacobians from MuJoCo's own collision detection.
+"""Contacts of a MuJoCo model at many states: gaps and contact Jacobians from MuJoCo's own collision detection.
 
 MuJoCo finds contacts within a margin, here the distance up to which they matter, and builds the Jacobian of their
 constraints natively. That is exact between shapes that have a formula; all others `narrow.py` measures instead. Boxes
@@ -59,7 +59,7 @@ _POINTS = {  # contacts that a pair of shapes can have, where more than one
 }
 
 
-class Found(NamedTuple):
+class MujocoContacts(NamedTuple):
     """Contacts of n states.
 
     Attributes:
@@ -75,8 +75,8 @@ class Found(NamedTuple):
     friction: Array
 
 
-class Read(NamedTuple):
-    """What MuJoCo says of n states, filled one by one.
+class ContactBuffer(NamedTuple):
+    """Contacts that MuJoCo reports at n states, filled one state at a time.
 
     Attributes:
         gap: (n, n_contacts).
@@ -86,8 +86,8 @@ class Read(NamedTuple):
         apart: (n, n_contacts) distance of the points on both bodies whose motion `rows` takes to be that of one point
             in the middle between them.
         axes: (n, nv, 6) around and along which each degree of freedom moves what it moves, at its centre.
-        measured: what MuJoCo did not find, before faces are cut: states, pairs, and of all geoms there the centres
-            (ngeom, 3), places (ngeom, 3) and turns (ngeom, 3, 3).
+        measured: contacts that `narrow.py` measured, before faces are cut: states, pairs, and of all geoms there the
+            centres (ngeom, 3), places (ngeom, 3) and turns (ngeom, 3, 3).
     """
 
     gap: Array
@@ -100,10 +100,10 @@ class Read(NamedTuple):
 
 
 class ContactFinder:
-    """Finds contacts at states that somebody sets in `data`, of a model that it changes for its purpose.
+    """Finds the contacts at states that the caller sets in `data`. It changes the model for this purpose.
 
     Args:
-        model: a copy that is ours.
+        model: a private copy.
         data: its data, at which positions have been computed.
         pairs: geoms, or bodies with all their geoms, that may touch; None: as the model says.
         distance: contacts farther away are left out [m].
@@ -159,7 +159,7 @@ class ContactFinder:
         model.opt.o_margin = distance
 
     def _drop_floors(self) -> None:
-        """Planes that nothing in the plane of motion can approach."""
+        """Drop planes that nothing in the plane of motion can approach."""
         if self.axis is None:
             return
         planes = self.model.geom_type == _PLANE
@@ -167,25 +167,25 @@ class ContactFinder:
         self.allowed[planes & along] = False
         self.allowed[:, planes & along] = False
 
-    def allocate(self, n: int) -> Read:
-        """For n states, all contacts out of reach."""
+    def allocate(self, n: int) -> ContactBuffer:
+        """Make buffers for n states, with all contacts out of reach."""
         k, nv = self.n_contacts, self.model.nv
         gap = np.full((n, k), self.distance)
         rows, frame, axes = np.zeros((n, k, 3, nv)), np.zeros((n, k, 3, 3)), np.zeros((n, nv, 6))
-        return Read(gap, rows, frame, np.zeros((n, k, 2), dtype=np.intp), np.zeros((n, k)), axes, [])
+        return ContactBuffer(gap, rows, frame, np.zeros((n, k, 2), dtype=np.intp), np.zeros((n, k)), axes, [])
 
-    def read(self, i: int, into: Read) -> None:
-        """Put the contacts of the state in `data`, for which `mj_fwdPosition` was called, into row i."""
+    def read(self, i: int, into: ContactBuffer) -> None:
+        """Write the contacts of the state in `data`, for which `mj_fwdPosition` was called, into row i."""
         data, count = self.data, self.n_contacts
         contact, jacobian = data.contact, data.efc_J.reshape(-1, self.model.nv)
         gap, geom, address = contact.dist, contact.geom, contact.efc_address
         rows = jacobian[address[:, None] + _THREE] if len(jacobian) else np.zeros((len(gap), 3, self.model.nv))
-        frame, own = contact.frame.reshape(-1, 3, 3), (address >= 0) & self._native[geom[:, 0], geom[:, 1]]
+        frame, usable = contact.frame.reshape(-1, 3, 3), (address >= 0) & self._native[geom[:, 0], geom[:, 1]]
         into.axes[i], measured = data.cdof, []
         if len(self._boxes):
-            own, measured = self._mend_boxes(gap, geom, frame[:, 0], own)
+            usable, measured = self._mend_boxes(gap, geom, frame[:, 0], usable)
         # A normal that nothing can move along is that of a body resting on what is outside the plane of motion.
-        kept = np.flatnonzero(own & (np.abs(rows[:, 0]).max(-1, initial=0.0) > _STILL))
+        kept = np.flatnonzero(usable & (np.abs(rows[:, 0]).max(-1, initial=0.0) > _STILL))
         if len(self._others):
             measured = measured + self._nearest(gap[kept])
         if measured:
@@ -201,59 +201,59 @@ class ContactFinder:
         into.geom[i, :k], into.apart[i, :k] = geom[kept], gap[kept]
 
     def _mend_boxes(
-        self, gap: Array, geom: Any, normal: Array, own: NDArray[np.bool_]
+        self, gap: Array, geom: Any, normal: Array, usable: NDArray[np.bool_]
     ) -> tuple[NDArray[np.bool_], list[Measured]]:
-        """Contacts without those of boxes that are nearer, farther or another way than they say, and such boxes."""
+        """Drop contacts of boxes with a wrong gap or direction; return the mask, and measurements of these boxes."""
         narrow, n = self._narrow, self.model.ngeom
         near = self._boxes[narrow.at_least(self._boxes) < self.distance]
         if not (measured := narrow.measure(near.tolist())):
-            return own, measured
-        found = witnesses(measured)
-        key, keys = geom.min(-1) * n + geom.max(-1), narrow.first[found.pair] * n + narrow.second[found.pair]
+            return usable, measured
+        boxes = witnesses(measured)
+        key, keys = geom.min(-1) * n + geom.max(-1), narrow.first[boxes.pair] * n + narrow.second[boxes.pair]
         place = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
         of_boxes, nearest = keys[place] == key, np.full(len(keys), np.inf)
         np.minimum.at(nearest, place[of_boxes], gap[of_boxes])
-        tolerance = 1e-5 * narrow.size[found.pair]
-        wrong = np.abs(nearest - found.gap) > tolerance
-        same = np.abs(np.einsum("ij,ij->i", normal, found.normal[place])) > 1 - 1e-10
+        tolerance = 1e-5 * narrow.size[boxes.pair]
+        wrong = np.abs(nearest - boxes.gap) > tolerance
+        same = np.abs(np.einsum("ij,ij->i", normal, boxes.normal[place])) > 1 - 1e-10
         for k in np.flatnonzero(of_boxes & ~same & ~wrong[place]):
-            wrong[place[k]] |= narrow.boxes_along(geom[k], normal[k]) < found.gap[place[k]] - tolerance[place[k]]
-        return own & ~(of_boxes & wrong[place]), [measured[k] for k in np.flatnonzero(wrong)]
+            wrong[place[k]] |= narrow.boxes_along(geom[k], normal[k]) < boxes.gap[place[k]] - tolerance[place[k]]
+        return usable & ~(of_boxes & wrong[place]), [measured[k] for k in np.flatnonzero(wrong)]
 
     def _nearest(self, gap: Array) -> list[Measured]:
-        """Pairs that MuJoCo does not test: all within the distance, or those that can be among the nearest contacts."""
+        """Measure pairs that MuJoCo does not test: all within the distance, or those that can be among the nearest."""
         narrow, count = self._narrow, self.n_contacts
         lower = narrow.at_least(self._others)
         reach = np.flatnonzero(lower < self.distance)
         if len(reach) <= count:
             return narrow.measure(self._others[reach].tolist())
         reach = reach[np.argsort(lower[reach])]
-        pairs, lower, found = self._others[reach].tolist(), lower[reach], []
+        pairs, lower, measured = self._others[reach].tolist(), lower[reach], []
         for start in range(0, len(pairs), count):
-            if lower[start] > self._farthest(gap, found):
-                found = self._moving(found)
-                if lower[start] > self._farthest(gap, found):
+            if lower[start] > self._farthest(gap, measured):
+                measured = self._moving(measured)
+                if lower[start] > self._farthest(gap, measured):
                     break
-            found = found + narrow.measure(pairs[start : start + count])
-        farthest = self._farthest(gap, found := self._moving(found))
-        return [m for m in found if m[1] <= farthest]
+            measured = measured + narrow.measure(pairs[start : start + count])
+        farthest = self._farthest(gap, measured := self._moving(measured))
+        return [m for m in measured if m[1] <= farthest]
 
-    def _farthest(self, gap: Array, found: list[Measured]) -> float:
-        """Which of the contacts, those of gaps (n,) and those found, count at most."""
-        gap = np.concatenate([gap, [m[1] for m in found]])
+    def _farthest(self, gap: Array, measured: list[Measured]) -> float:
+        """Return the largest gap of a contact to keep, among those of gaps (n,) and the measured ones."""
+        gap = np.concatenate([gap, [m[1] for m in measured]])
         enough = len(gap) >= self.n_contacts > 0
         return max(self._warn_within, np.partition(gap, self.n_contacts - 1)[self.n_contacts - 1]) if enough else np.inf
 
-    def _moving(self, found: list[Measured]) -> list[Measured]:
-        """Those of pairs that can move along the normal."""
-        if not found:
-            return found
-        some, data = witnesses(found), self.data
+    def _moving(self, measured: list[Measured]) -> list[Measured]:
+        """Keep the pairs that can move along the normal."""
+        if not measured:
+            return measured
+        some, data = witnesses(measured), self.data
         rows = self._motion(some, some.normal[:, None], data.cdof[None], data.subtree_com[self._root][None])
-        return [m for m, row in zip(found, rows, strict=True) if np.abs(row).max(initial=0.0) > _STILL]
+        return [m for m, row in zip(measured, rows, strict=True) if np.abs(row).max(initial=0.0) > _STILL]
 
     def _motion(self, of: Witness, along: Array, axes: Array, centres: Array) -> Array:
-        """How the second point moves from the first along directions (n, k, 3), by degrees of freedom: (n, k, nv)."""
+        """Motion of the second point relative to the first along directions (n, k, 3), per degree of freedom."""
         geom = np.stack([self._narrow.first[of.pair], self._narrow.second[of.pair]])
         arms = np.stack([of.first, of.second]) - centres[np.arange(len(centres)), geom]
         along = np.broadcast_to(along, (2, *along.shape))
@@ -261,33 +261,33 @@ class ContactFinder:
         first, second = motion * self._turns[geom][:, :, None]
         return second - first
 
-    def _with_measured(self, read: Read) -> Read:
-        """Contacts with those that were measured: of each state the nearest."""
+    def _with_measured(self, read: ContactBuffer) -> ContactBuffer:
+        """Merge the measured contacts into the others, and keep the nearest of each state."""
         states, measured, *poses = zip(*read.measured, strict=True)
         centres, places, turns = map(np.stack, poses)
         where = np.repeat(np.arange(len(states)), [len(m) for m in measured])
         nearest = witnesses([m for some in measured for m in some])
         frame = np.stack([nearest.normal, *perpendicular(nearest.normal)], 1)
-        numbers, found = self._narrow.contacts(nearest, frame, where, places, turns)
+        numbers, points = self._narrow.contacts(nearest, frame, where, places, turns)
         where, frame = where[numbers], frame[numbers]
         state = np.array(states)[where]
-        rows = self._motion(found, frame, read.axes[state], centres[where])
-        geom = np.stack([self._narrow.first[found.pair], self._narrow.second[found.pair]], -1)
-        own, slot = np.nonzero(read.frame.any((-1, -2)))
+        rows = self._motion(points, frame, read.axes[state], centres[where])
+        geom = np.stack([self._narrow.first[points.pair], self._narrow.second[points.pair]], -1)
+        row, slot = np.nonzero(read.frame.any((-1, -2)))
         moves = np.abs(rows[:, 0]).max(-1, initial=0.0) > _STILL
-        state = np.concatenate([own, state[moves]])
+        state = np.concatenate([row, state[moves]])
 
         def both(before: Any, measured: Any) -> Any:
-            return np.concatenate([before[own, slot], measured[moves]])
+            return np.concatenate([before[row, slot], measured[moves]])
 
-        gap = both(read.gap, found.gap)
+        gap = both(read.gap, points.gap)
         order = np.lexsort((gap, state))
         rank = np.arange(len(order)) - np.searchsorted(state[order], state[order])
         self._warn_of_more(int(np.bincount(state[gap <= self._warn_within], minlength=1).max()))
         order, rank = order[rank < self.n_contacts], rank[rank < self.n_contacts]
         full = self.allocate(len(read.gap))
         for into, before, measured in (
-            (full.gap, read.gap, found.gap),
+            (full.gap, read.gap, points.gap),
             (full.rows, read.rows, rows),
             (full.frame, read.frame, frame),
             (full.geom, read.geom, geom),
@@ -297,7 +297,7 @@ class ContactFinder:
         return full._replace(axes=read.axes)
 
     def _warn_of_more(self, near: int) -> None:
-        """Say once where nobody has chosen how many contacts there are, and some that are near have no place."""
+        """Warn once if near contacts are dropped because their number was left to the default."""
         if near > self.n_contacts:
             warnings.warn(
                 f"expected at most {self.n_contacts} contacts, got {near} that touch or nearly do; only the nearest "
@@ -308,8 +308,8 @@ class ContactFinder:
             )
             self._warn_within = -np.inf
 
-    def finish(self, read: Read) -> Found:
-        """Contacts with the tangents that count."""
+    def finish(self, read: ContactBuffer) -> MujocoContacts:
+        """Return the contacts, with the tangents that count."""
         if read.measured:
             read = self._with_measured(read)
         normal, sides, slide = read.frame[:, :, 0], read.frame[:, :, 1:], read.rows[:, :, 1:]
@@ -325,11 +325,11 @@ class ContactFinder:
         turned = self._turns[read.geom[:, :, 0]] + self._turns[read.geom[:, :, 1]]
         tangent = slide + 0.5 * read.apart[:, :, None, None] * lever * turned[:, :, None]
         friction = np.where(read.frame.any((-1, -2)), self.friction[read.geom[:, :, 0], read.geom[:, :, 1]], 0.0)
-        return Found(read.gap, read.rows[:, :, 0], tangent, friction)
+        return MujocoContacts(read.gap, read.rows[:, :, 0], tangent, friction)
 
 
 def _moves(model: Any) -> NDArray[np.bool_]:
-    """Which degrees of freedom move which bodies, (nbody, nv)."""
+    """Return a mask (nbody, nv), True where a degree of freedom moves a body."""
     moves = np.zeros((model.nbody, model.nv), dtype=bool)
     for body in range(1, model.nbody):
         first = model.body_dofadr[body]
@@ -339,7 +339,7 @@ def _moves(model: Any) -> NDArray[np.bool_]:
 
 
 def plane_of_motion(model: Any, data: Any) -> Array | None:
-    """Normal (3,) of the plane in which all joints move their bodies, or None where there is no such plane."""
+    """Return the normal (3,) of the plane in which all joints move their bodies, or None if there is no such plane."""
     kinds = model.jnt_type
     slides = data.xaxis[kinds == int(mujoco.mjtJoint.mjJNT_SLIDE)]
     hinges = data.xaxis[kinds == int(mujoco.mjtJoint.mjJNT_HINGE)]
@@ -357,7 +357,7 @@ def plane_of_motion(model: Any, data: Any) -> Array | None:
 
 
 def _spread(places: Array, geom: Any, gap: Array, kept: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Those of the contacts `kept` that are enough: of each pair four, the nearest and the farthest from those before.
+    """Select up to four of the contacts `kept` for each pair: the nearest, then each time the farthest from the others.
 
     Args:
         places: (n, 3) where MuJoCo's contacts are; numbers from n on are the only contacts of their pairs.
@@ -381,7 +381,7 @@ def _spread(places: Array, geom: Any, gap: Array, kept: NDArray[np.intp]) -> NDA
 
 
 def _friction(model: Any, friction: float | None) -> Array:
-    """Coefficients (ngeom, ngeom): of the geom of higher priority, else the larger, as MuJoCo does."""
+    """Return the coefficients (ngeom, ngeom): that of the geom of higher priority, else the larger, as MuJoCo does."""
     n = model.ngeom
     if friction is not None:
         return np.full((n, n), friction)
@@ -399,7 +399,7 @@ def _friction(model: Any, friction: float | None) -> Array:
 
 
 def _check_contacts(model: Any, allowed: NDArray[np.bool_], friction: float | None) -> None:
-    """Refuse shapes and friction that would come out wrong, in pairs (ngeom, ngeom) that may touch."""
+    """Raise if pairs (ngeom, ngeom) that may touch have shapes or friction that cannot be represented."""
     fields = np.flatnonzero(np.isin(model.geom_type, _FIELDS) & allowed.any(0))
     if len(fields):
         raise InvalidInputError(
@@ -428,7 +428,7 @@ def _name(model: Any, geom: int) -> str:
 
 
 def _may_touch(model: Any) -> NDArray[np.bool_]:
-    """Pairs (ngeom, ngeom) that MuJoCo would test; none where contacts or constraints are disabled."""
+    """Return the pairs (ngeom, ngeom) that MuJoCo would test; none where contacts or constraints are disabled."""
     if model.opt.disableflags & _DISABLED:
         return np.zeros((model.ngeom, model.ngeom), dtype=bool)
     kind, affinity = model.geom_contype, model.geom_conaffinity
@@ -448,7 +448,7 @@ def _may_touch(model: Any) -> NDArray[np.bool_]:
 
 
 def _listed(model: Any, pairs: Pairs) -> NDArray[np.bool_]:
-    """Pairs (ngeom, ngeom) that the caller named."""
+    """Return the pairs (ngeom, ngeom) that the caller named."""
     allowed = np.zeros((model.ngeom, model.ngeom), dtype=bool)
     for pair in pairs:
         if isinstance(pair, str) or len(pair) != 2:
@@ -460,19 +460,19 @@ def _listed(model: Any, pairs: Pairs) -> NDArray[np.bool_]:
 
 
 def _geoms(model: Any, name: int | str) -> list[int]:
-    """A geom by its number or name, or all geoms of a body."""
+    """Find a geom by its number or name, or all geoms of a body."""
     if isinstance(name, str):
         geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name)
         body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
-        found = [geom] if geom >= 0 else [g for g in range(model.ngeom) if model.geom_bodyid[g] == body >= 0]
+        geoms = [geom] if geom >= 0 else [g for g in range(model.ngeom) if model.geom_bodyid[g] == body >= 0]
     else:
-        found = [name] if 0 <= name < model.ngeom else []
-    if not found:
+        geoms = [name] if 0 <= name < model.ngeom else []
+    if not geoms:
         raise InvalidInputError(
             f"pairs: expected names of geoms or bodies, or numbers of geoms below {model.ngeom}, got {name!r:.100}; "
             f"see the names in the model's XML"
         )
-    return found
+    return geoms
 
 
 def _test(model: Any, geoms: Any, named: bool) -> None:
@@ -489,10 +489,10 @@ def _test(model: Any, geoms: Any, named: bool) -> None:
     kind, contype, affinity = groups.T
     tested = NATIVE[kind[:, None], kind[None]] & (((contype[:, None] & affinity) | (affinity[:, None] & contype)) != 0)
     bits, of = 1 << np.arange(len(groups)), of.reshape(-1)
-    for own, of_body, values in (
+    for of_geom, of_body, values in (
         (model.geom_contype, model.body_contype, bits),
         (model.geom_conaffinity, model.body_conaffinity, tested @ bits),
     ):
-        own[:], of_body[:] = 0, 0
-        own[geoms] = values[of]
-        np.bitwise_or.at(of_body, model.geom_bodyid[geoms], own[geoms])
+        of_geom[:], of_body[:] = 0, 0
+        of_geom[geoms] = values[of]
+        np.bitwise_or.at(of_body, model.geom_bodyid[geoms], of_geom[geoms])

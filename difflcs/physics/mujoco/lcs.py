@@ -17,10 +17,10 @@ from torch import Tensor
 from difflcs._checks import broadcast_batch, check_choice, check_number, check_positive_int, check_tensor, describe
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
 from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, contact_lcs, count_forces
-from difflcs.physics.mujoco.contacts import ContactFinder, Found, Pairs
+from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, Pairs
 from difflcs.physics.mujoco.motion import Actuators, Dynamic, QuasiStatic
 from difflcs.physics.mujoco.native import TAKEN, native
-from difflcs.physics.mujoco.nominal import Recovery, at_nominal
+from difflcs.physics.mujoco.nominal import Recovery, evaluate_nominal
 from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams
 
@@ -73,7 +73,7 @@ class MujocoLCS:
         mobility: of a quasi-static motion: "inertia" (the inverse of the mass matrix), "damping" (of the joints'
             damping), or what a unit of force on each degree of freedom does, (nv,) or (nv, nv). Only ratios matter, as
             `compliance` is in parts of it. A body that cannot move along a degree of freedom has 0 there.
-        relative: whether the actions of `position` actuators on joints count from where these are.
+        relative: True if the actions of `position` actuators on joints count from where these are.
         ctrl: (nu,) nominal control of a dynamic motion, MuJoCo's `ctrl`; `params(x, context)` takes one for each
             state. None: that at which servos have no force where the state is, and for other actuators that of `data`.
         length: unit of gaps for the relaxation of the MPC, see `contact_lcs` [m]; None: the median radius of the
@@ -137,8 +137,8 @@ class MujocoLCS:
                         'replace it by damping, or use motion="quasi-static"'
                     )
             self._motion = Dynamic(model, self._actuators, self.seconds, relative)
-        given = self._data.ctrl if ctrl is None else self._controls(torch.as_tensor(ctrl), torch.Size())
-        self._ctrl = np.where(self._actuators.holds & (ctrl is None), np.nan, given)
+        nominal = self._data.ctrl if ctrl is None else self._controls(torch.as_tensor(ctrl), torch.Size())
+        self._ctrl = np.where(self._actuators.holds & (ctrl is None), np.nan, nominal)
         length = _typical_radius(model) if length is None else check_number("length", length, strict=True)
         distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
         self.length, self._recovery = length, Recovery(model, length)
@@ -184,20 +184,20 @@ class MujocoLCS:
                 "x: expected states (..., n_x), as contacts depend on where things are, got None; pass x"
             )
         read = self._read(x, context)
-        found, rest = read.found, None
+        contacts, rest = read.dof_contacts, None
         if isinstance(self._motion, QuasiStatic):
             free = self._motion.finish(read.moved, read.x, read.tangent)
         else:
             step, opens = self._motion.finish(read.moved, read.x), self.cone == "anitescu"
-            nominal = at_nominal(step, found, read.geom, self._recovery, self._give, self.compliance, opens)
-            found, rest = nominal.found, read.batched(self._of_cone(nominal.forces))
+            nominal = evaluate_nominal(step, contacts, read.geom, self._recovery, self._give, self.compliance, opens)
+            contacts, rest = nominal.contacts, read.batched(self._convert_forces(nominal.forces))
             free = step.free(read.tangent, nominal.carried)
         ranks = zip(free, (2, 2, 1, 2), strict=True)
         system = contact_lcs(
-            read.contacts(found),
+            read.contacts(contacts),
             FreeMotion(*(read.batched(v) if v.ndim > rank else v for v, rank in ranks)),
             read.batched(read.x),
-            friction=read.batched(found.friction),
+            friction=read.batched(contacts.friction),
             compliance=self.compliance * self._give,
             cone=self.cone,
             length=self.length,
@@ -206,23 +206,23 @@ class MujocoLCS:
         )
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
 
-    def _of_cone(self, forces: Any) -> Any:
-        """Forces (n, n_lam) of the system's cone, of those (n, n_contacts, n_rays) along the rays of Anitescu's."""
+    def _convert_forces(self, forces: Any) -> Any:
+        """Convert forces (n, n_contacts, n_rays) along Anitescu's rays to those (n, n_lam) of the system's cone."""
         each = count_forces(1, self._finder.n_tangents, self.cone)
         if each != forces.shape[-1]:  # Stewart and Trinkle: normal, tangential, and the distance
             forces = np.concatenate([forces.sum(-1, keepdims=True), np.zeros((*forces.shape[:2], each - 1))], -1)
         return forces.reshape(len(forces), -1)
 
     def contacts(self, x: Tensor) -> Contacts:
-        """Gaps and their derivatives at states x (..., n_x).
+        """Compute the gaps and their derivatives at states x (..., n_x).
 
         Contacts that are missing have a gap of `distance`, and zeros.
         """
         read = self._read(x)
-        return read.contacts(read.found)
+        return read.contacts(read.dof_contacts)
 
     def control(self, x: Tensor, u: Tensor) -> Tensor:
-        """MuJoCo's `ctrl` (..., nu) for actions u (..., n_u) at states x (..., n_x).
+        """Convert to MuJoCo's `ctrl` (..., nu) actions u (..., n_u) at states x (..., n_x).
 
         Raises:
             InvalidInputError: quasi-static motion by actuators that are no `position` actuators.
@@ -243,7 +243,7 @@ class MujocoLCS:
         return u + here * servo if self._relative else u
 
     def _controls(self, ctrl: Tensor, batch: torch.Size) -> Any:
-        """Nominal controls (*batch, nu) as numbers."""
+        """Return nominal controls (*batch, nu) as an array."""
         check_tensor("ctrl", ctrl, [("n_u", self.n_u)])
         if broadcast_batch([("x", batch), ("ctrl", ctrl.shape[:-1])]) != batch:
             raise ShapeError(
@@ -270,7 +270,7 @@ class MujocoLCS:
         return _States(batch, flat, tangent, self._finder.finish(contacts), contacts.geom, moved)
 
     def _typical_response(self) -> float:
-        """How far a unit of force moves two bodies apart that may touch, the median over their pairs."""
+        """Compute how far a unit of force moves two bodies apart that may touch, the median over their pairs."""
         model, data, nv = self._model, self._data, self.state.nv
         moved = self._motion.allocate(1)
         self._motion.read(0, data, moved, self._ctrl)
@@ -294,40 +294,40 @@ class MujocoLCS:
 
 
 class _States(NamedTuple):
-    """What was read at n states.
+    """Contacts and motion that were read at n states.
 
     Attributes:
         batch: their batch dimensions.
         x: (n, n_x).
         tangent: of their rotations, see `MujocoState.tangent`.
-        found: contacts, of geoms `geom` (n, n_contacts, 2).
-        moved: what the motion has read.
+        dof_contacts: contacts, of geoms `geom` (n, n_contacts, 2).
+        moved: buffers of the motion.
     """
 
     batch: torch.Size
     x: Any
     tangent: Any
-    found: Found
+    dof_contacts: MujocoContacts
     geom: Any
     moved: Any
 
     def batched(self, value: Any) -> Tensor:
-        """An array (n, ...) as a tensor."""
+        """Convert an array (n, ...) to a tensor with the batch dimensions."""
         value = torch.as_tensor(value)
         return value.reshape(*self.batch, *value.shape[1:])
 
-    def contacts(self, found: Found) -> Contacts:
-        """Contacts by the state, of those by the degrees of freedom."""
-        rows = (found.normal, found.tangent)
+    def contacts(self, dof_contacts: MujocoContacts) -> Contacts:
+        """Convert derivatives by the degrees of freedom to derivatives by the state."""
+        rows = (dof_contacts.normal, dof_contacts.tangent)
         if self.tangent is not None:
             rows = (rows[0] @ self.tangent, rows[1] @ self.tangent[:, None])
-        still = self.x.shape[-1] - found.normal.shape[-1]
+        still = self.x.shape[-1] - dof_contacts.normal.shape[-1]
         rows = (np.concatenate([v, np.zeros((*v.shape[:-1], still))], -1) for v in rows)
-        return Contacts(*map(self.batched, (found.gap, *rows)))
+        return Contacts(*map(self.batched, (dof_contacts.gap, *rows)))
 
 
 def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: Any) -> LCSParams:
-    """The linear complementarity system of a MuJoCo model, linearised at one state or at many.
+    """Compute the linear complementarity system of a MuJoCo model, linearised at one state or at many.
 
     Args:
         model: the MuJoCo model.
@@ -371,22 +371,22 @@ def _check_model(model: Any, data: Any, motion: Motion) -> None:
         "actuators that are not disabled (actuatorgroupdisable, <flag actuation/>) in quasi-static motion, which moves "
         "what they drive": motion == "quasi-static" and bool(disabled.any()),
     }
-    for wanted, found in refused.items():
-        if found:
+    for wanted, present in refused.items():
+        if present:
             raise InvalidInputError(f"model: expected {wanted}, got something else; change the model")
 
 
 def _take(into: Any, data: Any) -> None:
-    """What is not in the state, from the caller's data."""
+    """Copy the fields that are not in the state from the caller's data."""
     for name in TAKEN:
-        own, values = getattr(into, name), getattr(data, name)
-        if values.shape != own.shape:
+        field, values = getattr(into, name), getattr(data, name)
+        if values.shape != field.shape:
             raise InvalidInputError(
-                f"data: expected {name} {own.shape} of the model, got {values.shape}; pass MjData(model)"
+                f"data: expected {name} {field.shape} of the model, got {values.shape}; pass MjData(model)"
             )
         if not np.isfinite(values).all():
             raise NonFiniteError(f"data: expected finite numbers in {name}, got NaN or infinity; set it in the data")
-        own[:] = values
+        field[:] = values
 
 
 def _typical_radius(model: Any) -> float:

@@ -1,4 +1,4 @@
-"""What a MuJoCo model does in one step without contact: quasi-static, or with velocities.
+"""Motion of a MuJoCo model in one step without contact: quasi-static, or with velocities.
 
 With velocities, MuJoCo simulates what a nominal control ū does from the state, and its acceleration is linearised half
 way there, with ζ the change of position and ν the velocity:
@@ -49,14 +49,14 @@ _ADVANCE = {
 
 
 class Actuators:
-    """Which actuators are position servos on joints, and what they move.
+    """The actuators of a model: which are position servos on joints, and which joints they move.
 
     Attributes:
         dof: (nu,) degree of freedom of each actuator on a slide or hinge; −1 for others.
         gear: (nu,).
-        servo: (nu,) whether it is a `position` actuator on a slide or hinge.
+        servo: (nu,) True for a `position` actuator on a slide or hinge.
         offset: (nu,) at which length a servo rests with ctrl = 0, by the constant part of its bias; 0 for others.
-        holds: (nu,) whether its force falls to zero at some length, as that of servos on joints, tendons or sites does.
+        holds: (nu,) True if its force falls to zero at some length, as that of servos on joints, tendons or sites does.
     """
 
     def __init__(self, model: Any):
@@ -75,7 +75,7 @@ class Actuators:
         self.offset = np.where(self.servo, constant / self._gain, 0.0)
 
     def balance(self, length: Array) -> Array:
-        """Controls (nu,) with which what holds a length has no force at these lengths (nu,); 0 for others."""
+        """Controls (nu,) at which actuators that hold a length have no force at these lengths (nu,); 0 for others."""
         return np.where(self.holds, -(self._constant + self._bias * length) / self._gain, 0.0)
 
 
@@ -83,7 +83,7 @@ class QuasiStatic:
     """Joints with actuators go where they are told; all else moves only while pushed, by its mobility times the force.
 
     Args:
-        model: ours.
+        model: a private copy.
         actuators: of the model.
         mobility: "inertia": the inverse of the mass matrix; "damping": of the joints' damping; or what a unit of force
             on each degree of freedom does, (nv,) or (nv, nv).
@@ -127,17 +127,17 @@ class QuasiStatic:
         return fixed
 
     def allocate(self, n: int) -> Array:
-        """Inverse mass matrices of n states."""
+        """Make a buffer for the inverse mass matrices of n states."""
         return np.zeros((n, self.model.nv, self.model.nv))
 
     def read(self, i: int, data: Any, arrays: Array, ctrl: Array) -> None:
-        """At the state in `data`, for which `mj_fwdPosition` was called; whatever the controls are."""
+        """Read the state in `data`, for which `mj_fwdPosition` was called; the controls do not matter."""
         del ctrl
         if self.mobility is None:
             mujoco.mj_solveM(self.model, data, arrays[i], np.eye(self.model.nv))
 
     def finish(self, arrays: Array, x: Array, tangent: Array | None) -> FreeMotion:
-        """The motion at states x (n, nv), for the tangent of their rotations."""
+        """Return the motion at states x (n, nv), for the tangent of their rotations."""
         n, nv = x.shape
         if self.mobility is None:
             block = np.ix_(np.arange(n), self.pushed, self.pushed)
@@ -154,10 +154,10 @@ class QuasiStatic:
 
 
 class Dynamic:
-    """All forces that MuJoCo knows but those of its constraints, linearised at each state.
+    """Motion by all forces of MuJoCo except those of its constraints, linearised at each state.
 
     Args:
-        model: ours; constraints and limits of controls and actuators are switched off while it is linearised.
+        model: a private copy; constraints and limits of controls and actuators are switched off while it is linearised.
         actuators: of the model.
         seconds: of a step [s].
         relative: actions of servos count from where they are.
@@ -182,13 +182,13 @@ class Dynamic:
             getattr(model, limited)[:] = 0
 
     def allocate(self, n: int) -> Linearised:
-        """For n states."""
+        """Make buffers for n states."""
         nv, nu = self.model.nv, self.model.nu
         sizes = ((2 * nv,), (nv,), (2 * nv, 2 * nv), (2 * nv, nu), (nv, nv), (nu,), (2 * nv,))
         return Linearised(*(np.zeros((n, *size)) for size in sizes))
 
     def read(self, i: int, data: Any, into: Linearised, ctrl: Array) -> None:
-        """At the state in `data`, for which `mj_fwdPosition` was called, and nominal controls (nu,); NaN: balance."""
+        """Read the state in `data`, for which `mj_fwdPosition` was called, at nominal controls (nu,); NaN: balance."""
         model, options, nv = self.model, self.model.opt, self.model.nv
         before = options.disableflags, options.timestep, options.integrator
         qpos, qvel = data.qpos.copy(), data.qvel.copy()
@@ -215,7 +215,7 @@ class Dynamic:
         data.qpos[:], data.qvel[:] = qpos, qvel
 
     def _simulate(self, data: Any, steps: int) -> None:
-        """Without the checks of `mj_step`, which warn of a motion that grows."""
+        """Simulate without the checks of `mj_step`, which warn of a motion that grows."""
         options = self.model.opt
         before = options.disableflags, options.timestep, options.integrator
         options.disableflags, options.timestep = before[0] | self.flags, self.seconds / self.simulated.count
@@ -226,7 +226,7 @@ class Dynamic:
         options.disableflags, options.timestep, options.integrator = before
 
     def finish(self, read: Linearised, x: Array) -> DynamicStep:
-        """The motion at states x (n, 2 nv)."""
+        """Return the motion at states x (n, 2 nv)."""
         nv, h = self.model.nv, self.seconds
         K, D, B = read.A[:, nv:, :nv], read.A[:, nv:, nv:] - np.eye(nv), read.B[:, nv:]
         # With ν = 0, ζ = 0 and u = ū.
@@ -266,7 +266,7 @@ class Dynamic:
             return np.linalg.matrix_power(one, steps.count)[:, : 2 * nv]
 
     def _implicit(self, resists: Array, forces: Array) -> Array:
-        """The same by one implicit step, which gives (n, nv, nv) `resists` = S M of the change in velocity."""
+        """Compute the same by one implicit step, which keeps (n, nv, nv) `resists` = S M of the change in velocity."""
         nv, h = self.model.nv, self.seconds
         one = h * forces
         one[:, :, nv : 2 * nv] = np.eye(nv)
@@ -277,14 +277,14 @@ class Dynamic:
 
 
 class Steps(NamedTuple):
-    """How many of MuJoCo's steps make one of ours, and their integrator."""
+    """Number of MuJoCo's steps in one of ours, and their integrator."""
 
     count: int
     integrator: int
 
 
 class Linearised(NamedTuple):
-    """Of n states.
+    """Linearised motion of n states.
 
     Attributes:
         middle: (n, 2 nv) where the nominal control leads in half a step; all is linearised there.
@@ -309,10 +309,10 @@ class DynamicStep(NamedTuple):
     """A step from n states.
 
     Attributes:
-        motion: whose step it is.
+        motion: the motion.
         x: (n, 2 nv) the states.
         step: (n, 2 nv, 2 nv + nu + 1) (ζ, ν) afterwards, of ζ, ν, u − ū and 1.
-        delayed: (n, 2 nv, 2 nv + nu + 1) what an implicit step, with all loads at its beginning, has more than that.
+        delayed: (n, 2 nv, 2 nv + nu + 1) difference of an implicit step, with all loads at its beginning, to that.
         response: (n, nv, nv) S.
         inverse_mass: (n, nv, nv).
         place: (n, nv) ζ afterwards with the nominal action.
@@ -330,7 +330,7 @@ class DynamicStep(NamedTuple):
 
     @property
     def seconds(self) -> float:
-        """Of the step."""
+        """Duration of the step [s]."""
         return self.motion.seconds
 
     @property
@@ -340,12 +340,12 @@ class DynamicStep(NamedTuple):
 
     @property
     def firm(self) -> Array:
-        """(n, nv, nv) S if what has an actuator at every joint gives way to nothing, as it may with another action."""
+        """(n, nv, nv) S if bodies with an actuator at every joint do not give way, as may be with another action."""
         loose = ~self.motion.firm
         return self.response * (loose & loose[:, None])
 
     def free(self, tangent: Array | None, carried: Array | float = 0.0) -> FreeMotion:
-        """The motion without contact, with `carried` added to `step`, for the tangent of the state's rotations."""
+        """Motion without contact, with `carried` added to `step`, for the tangent of the state's rotations."""
         motion, x, step = self.motion, self.x, self.step + carried
         n, nv, h = len(x), motion.model.nv, motion.seconds
         # The control of a servo is held through the step, at a distance from where the joint was at its beginning.
@@ -367,7 +367,7 @@ class DynamicStep(NamedTuple):
 
 
 def _reached(step: Array, x: Array) -> Array:
-    """(ζ, ν) after a step (n, 2 nv, 2 nv + nu + 1) from ζ = 0 with the velocities of x (n, 2 nv) and u = ū."""
+    """Compute (ζ, ν) after a step (n, 2 nv, 2 nv + nu + 1) from ζ = 0 with the velocities of x (n, 2 nv) and u = ū."""
     nv = x.shape[1] // 2
     return step[:, :, -1] + (step[:, :, nv : 2 * nv] @ x[:, nv:, None])[:, :, 0]
 
@@ -377,7 +377,7 @@ def _flags(*names: str) -> int:
 
 
 def _implicit_response(mass: Array, K: Array, D: Array, h: float) -> Array:
-    """S (n, nv, nv): what an impulse changes the velocity by, with what resists motion treated implicitly."""
+    """S (n, nv, nv), the change of velocity by an impulse, with forces that resist motion treated implicitly."""
     lower = np.linalg.cholesky(mass)
     resists = -h * mass @ (D + h * K)
     resists = 0.5 * (resists + resists.swapaxes(-1, -2))

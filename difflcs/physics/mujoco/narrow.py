@@ -1,4 +1,4 @@
-"""How far apart two shapes are or how deep they overlap, and where their faces meet.
+"""Distance or overlap of two shapes, and the places where their faces meet.
 
 MuJoCo's own contacts are exact between shapes that have a formula (`NATIVE`). All others it inflates by the distance
 up to which contacts matter, and then misjudges how deep they are. `mj_geomDistance` does not, if its tolerance is small
@@ -62,9 +62,9 @@ class Witness(NamedTuple):
 Measured = tuple[int, float, Array, Array]  # pair, gap, normal, and both points (6,)
 
 
-def witnesses(found: list[Measured]) -> Witness:
-    """As arrays."""
-    pair, gap, normal, points = zip(*found, strict=True)
+def witnesses(measured: list[Measured]) -> Witness:
+    """Stack measurements as arrays."""
+    pair, gap, normal, points = zip(*measured, strict=True)
     both = np.array(points)
     return Witness(np.array(pair), np.array(gap), np.array(normal), both[:, :3], both[:, 3:])
 
@@ -86,11 +86,11 @@ class Narrow:
     """Measures pairs of geoms as they are in `data`.
 
     Args:
-        model: a copy that is ours.
+        model: a private copy.
         data: its data.
         first: (n_pairs,) geoms, none of them a plane.
         second: (n_pairs,) the others.
-        distance: what is farther apart does not count [m].
+        distance: pairs farther apart are left out [m].
         axis: normal (3,) of the plane in which everything moves, or None.
     """
 
@@ -119,14 +119,14 @@ class Narrow:
         model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
 
     def at_least(self, pairs: Any) -> Array:
-        """What the gaps of these pairs are at least: those of spheres around the shapes."""
+        """Return lower bounds of the gaps of these pairs: the gaps of spheres around the shapes."""
         place = self.data.geom_xpos
         apart = place[self.first[pairs]] - place[self.second[pairs]]
         return np.sqrt(np.einsum("ij,ij->i", apart, apart)) - self._reach[pairs]
 
     def measure(self, pairs: list[int]) -> list[Measured]:
-        """Those of these pairs that are within the distance."""
-        return [(k, *found) for k in pairs if (found := self._measure(*self._pairs[k])) is not None]
+        """Measure these pairs, and return those within the distance."""
+        return [(k, *result) for k in pairs if (result := self._measure(*self._pairs[k])) is not None]
 
     def _measure(self, a: int, b: int, size: float) -> tuple[float, Array, Array] | None:
         model, data, ends = self.model, self.data, self._ends
@@ -158,7 +158,7 @@ class Narrow:
         return best[1:]
 
     def boxes_along(self, geoms: Any, normal: Array) -> float:
-        """How far the second of two boxes is beyond the first along a normal (3,)."""
+        """Compute the gap between two boxes along a normal (3,)."""
         data, size = self.data, self.model.geom_size
         wide = sum(float(np.abs(normal @ data.geom_xmat[g].reshape(3, 3)) @ size[g]) for g in geoms)
         return float(normal @ (data.geom_xpos[geoms[1]] - data.geom_xpos[geoms[0]])) - wide
@@ -166,7 +166,7 @@ class Narrow:
     def contacts(
         self, of: Witness, frame: Array, where: NDArray[np.intp], places: Array, turns: Array
     ) -> tuple[NDArray[np.intp], Witness]:
-        """All contacts of these pairs: their witnesses, and where faces meet, corners of what both cover.
+        """Return all contacts of these pairs: their witnesses and, where faces meet, the corners of the common area.
 
         Args:
             of: (n,).
@@ -176,7 +176,7 @@ class Narrow:
             turns: (n_states, ngeom, 3, 3).
 
         Returns:
-            Numbers in `of`, and what they are.
+            Indices into `of`, and the contacts.
         """
         meet = self._meet[of.pair] & (of.gap < self.size[of.pair])
         rows = meet.nonzero()[0]
@@ -185,7 +185,7 @@ class Narrow:
         n, pair, origin, size = len(rows), of.pair[rows], of.first[rows], self.size[of.pair[rows]]
         frame, where, gap = frame[rows], where[rows], of.gap[rows]
         low, high = self._faces(pair, frame, origin, where, places, turns)
-        at, valid = _common(low.corners, high.corners, _EDGE * size)
+        at, valid = _overlap(low.corners, high.corners, _EDGE * size)
         apart = high.height(at) - low.height(at)
         valid &= (low.faces & high.faces)[:, None] & (apart < self.distance)
         # The witness comes first, or a corner that is as near stands for it.
@@ -217,7 +217,7 @@ class Narrow:
         return numbers, corners
 
     def _faces(self, pair: Any, frame: Array, origin: Array, where: Any, places: Array, turns: Array) -> list[_Face]:
-        """Of the first and of the second geoms (n,) the faces that look most along the normal, and against it."""
+        """Return the faces of the first and second geoms (n,) that point most along and against the normal."""
         n = len(pair)
         geoms, where = np.concatenate([self.first[pair], self.second[pair]]), np.concatenate([where, where])
         place, turn = places[where, geoms] - np.concatenate([origin, origin]), turns[where, geoms]
@@ -231,8 +231,8 @@ class Narrow:
         line = np.zeros(2 * n, dtype=bool)
         for geom, solid in solids.items():
             mine = (geoms == geom).nonzero()[0]
-            found, outward[mine], line[mine] = solid.face(toward[mine])
-            corners[mine] = found[:, np.minimum(np.arange(count), found.shape[1] - 1)]
+            face, outward[mine], line[mine] = solid.face(toward[mine])
+            corners[mine] = face[:, np.minimum(np.arange(count), face.shape[1] - 1)]
         corners = (corners + (place[:, None] @ turn)) @ local.swapaxes(1, 2)  # along the normal, and across
         outward = (outward[:, None] @ local.swapaxes(1, 2))[:, 0]
         faces = np.abs(outward[:, 0]) > 0.05  # else there is none, as at the end of a capsule
@@ -264,7 +264,7 @@ class _Solid:
         self.corners = np.stack([f[np.minimum(r, len(f) - 1)] for f, r in zip(faces, rows, strict=True)])
 
     def face(self, toward: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Corners, outward normals, and whether it is the line of a round side, of the faces that look most there."""
+        """Return corners and outward normals of the faces that point most there; True for the line of a round side."""
         best = (toward @ self.outward.T).argmax(-1)
         corners, outward = self.corners[best], self.outward[best]
         line = np.abs(toward[:, 2]) < self.cap if self.round else np.zeros(len(toward), dtype=bool)
@@ -279,7 +279,7 @@ class _Solid:
 
 
 def _polygons(model: Any, mesh: int) -> tuple[list[Array], Array]:
-    """Faces of the hull of a mesh: corners in order, outward normals. MuJoCo's own may be missing or not quite flat."""
+    """Find the faces of a mesh's hull: corners in order, outward normals. MuJoCo's may be missing or not quite flat."""
     start = model.mesh_vertadr[mesh]
     vertices = model.mesh_vert[start : start + model.mesh_vertnum[mesh]].astype(np.float64)
     try:
@@ -308,14 +308,14 @@ def _polygons(model: Any, mesh: int) -> tuple[list[Array], Array]:
 
 
 def perpendicular(normal: Array) -> tuple[Array, Array]:
-    """Two unit vectors perpendicular to unit vectors (..., 3) and to each other."""
+    """Return two unit vectors perpendicular to unit vectors (..., 3) and to each other."""
     first = cross(normal, np.eye(3)[np.abs(normal).argmin(-1)])
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
     return first, cross(normal, first)
 
 
-def _common(first: Array, second: Array, tolerance: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Corners of what two convex polygons (n, k, 2) have in common, among points (n, k + k + k², 2), and which."""
+def _overlap(first: Array, second: Array, tolerance: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Find the corners of the overlap of convex polygons (n, k, 2): points (n, k + k + k², 2) and a mask of them."""
     n, k, _ = first.shape
     one, two = (np.concatenate([p[:, 1:], p[:, :1]], 1) - p for p in (first, second))
     inside = [-tolerance[:, None] * np.sqrt(_product(side, side, 0)) for side in (one, two)]
@@ -337,7 +337,7 @@ def _common(first: Array, second: Array, tolerance: Array) -> tuple[Array, NDArr
 
 
 def _product(a: Array, b: Array, turned: int) -> Array:
-    """Products of vectors (..., 2): a × b, or a · b."""
+    """Compute products of vectors (..., 2): a × b, or a · b."""
     if turned:
         return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]

@@ -1,4 +1,4 @@
-"""What goes wrong inside MuJoCo: the errors of its own and the warnings that it only counts become ours."""
+"""Errors of MuJoCo, and the warnings that it only counts, as exceptions of this library."""
 
 # MuJoCo is a compiled module without type stubs.
 # pyright: reportAttributeAccessIssue=false
@@ -14,7 +14,7 @@ import mujoco
 from difflcs.errors import InvalidInputError
 
 TAKEN = ("qpos", "ctrl", "mocap_pos", "mocap_quat", "qfrc_applied", "xfrc_applied")
-"""What a caller's data says besides the state."""
+"""Fields of a caller's data that are used besides the state."""
 
 _LARGE = "x: expected {} below 1e10, got larger ones, which MuJoCo takes for errors; look for what diverges"
 _MEMORY = (
@@ -37,7 +37,7 @@ _KINDS = {int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")): text for name, text
 
 @contextmanager
 def native(model: Any, data: Any, where: str) -> Iterator[None]:
-    """Calls of MuJoCo at a state: `model` and `data` are ours, and ready for the next one whatever happens.
+    """Raise MuJoCo's errors and warnings at a state as ours; `model` and `data` stay usable whatever happens.
 
     Raises:
         InvalidInputError: MuJoCo raised an error, or has counted a warning, such as one of contacts that it dropped.

@@ -1,4 +1,4 @@
-"""The state of an LCS made from a MuJoCo model: which number means what, and the way there and back.
+"""State of an LCS made from a MuJoCo model: the meaning of its numbers, and conversion from and to MuJoCo.
 
 MuJoCo's `qpos` has unit quaternions, which no linear system can have as a state. Where a joint is free or a ball, the
 state has the rotation vector r ∈ R³ from a reference orientation q̄ instead: q = q̄ exp(r), in coordinates of the body,
@@ -43,11 +43,11 @@ class MujocoState:
     Args:
         model: the MuJoCo model.
         reference: (nq,) `qpos` with the orientations from which rotation vectors count; None: `model.qpos0`.
-        velocities: whether `qvel` follows the positions. It is MuJoCo's, angular velocities in coordinates of the body.
+        velocities: True if `qvel` follows the positions. It is MuJoCo's, angular velocities in coordinates of the body.
 
     Attributes:
-        names: what each number of the state is: the joint's name (or `joint0`, `joint1` …), for free joints and balls
-            with one of the endings _x _y _z _rx _ry _rz; velocities with the ending _velocity.
+        names: name of each number of the state: that of the joint (or `joint0`, `joint1` …), for free joints and
+            balls with one of the endings _x _y _z _rx _ry _rz; velocities with the ending _velocity.
     """
 
     def __init__(self, model: Any, reference: ArrayLike | None = None, *, velocities: bool = False):
@@ -79,7 +79,7 @@ class MujocoState:
         return len(self.names)
 
     def index(self, name: str) -> int:
-        """Where a name stands in the state.
+        """Return the index of a name in the state.
 
         Raises:
             KeyError: there is none of that name.
@@ -89,7 +89,7 @@ class MujocoState:
         return self.names.index(name)
 
     def to_state(self, qpos: ArrayLike, qvel: ArrayLike | None = None) -> Tensor:
-        """States (..., n_x) from `qpos` (..., nq) and `qvel` (..., nv); without `qvel` at rest.
+        """Convert to states (..., n_x) from `qpos` (..., nq) and `qvel` (..., nv); without `qvel` at rest.
 
         Raises:
             ShapeError, NonFiniteError: numbers that do not fit.
@@ -106,7 +106,7 @@ class MujocoState:
         return torch.from_numpy(x)
 
     def to_mujoco(self, x: Tensor) -> tuple[Array, Array]:
-        """`qpos` (..., nq) and `qvel` (..., nv) from states (..., n_x); `qvel` is zero where the state has none.
+        """Convert states (..., n_x) to `qpos` (..., nq) and `qvel` (..., nv), zero where the state has none.
 
         Raises:
             DTypeError, ShapeError, NonFiniteError: not such states.
@@ -121,7 +121,7 @@ class MujocoState:
         return qpos, velocity
 
     def tangent(self, x: Array) -> Array | None:
-        """T (..., nv, nv) of qvel = T ẋ, for positions x (..., nv); None where it is the identity, without quaternions.
+        """T (..., nv, nv) of qvel = T ẋ, for positions x (..., nv); None, without quaternions, for the identity.
 
         The block of a rotation vector is the right Jacobian of SO(3): 1 − (1 − cos r)/r² [r]× + (r − sin r)/r³ [r]×².
         Its smallest singular value is 2 sin(r/2)/r, as far as which a rotation about another axis moves r.
@@ -167,7 +167,7 @@ _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 
 
 def _unit(q: Array) -> Array:
-    """Quaternions (..., 4) of length 1, as `mju_normalize4` makes them: no rotation where there is no length."""
+    """Normalise quaternions (..., 4), as `mju_normalize4` makes them: no rotation where there is no length."""
     size = np.linalg.norm(q, axis=-1, keepdims=True)
     none = size < 1e-15
     return np.where(none, np.array([1.0, 0.0, 0.0, 0.0]), q / np.where(none, 1.0, size))
@@ -178,19 +178,19 @@ def _conjugate(q: Array) -> Array:
 
 
 def _multiply(a: Array, b: Array) -> Array:
-    """Product of quaternions (..., 4)."""
+    """Multiply quaternions (..., 4)."""
     a0, av, b0, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
     return np.concatenate([a0 * b0 - (av * bv).sum(-1, keepdims=True), a0 * bv + b0 * av + cross(av, bv)], -1)
 
 
 def _quaternion(r: Array) -> Array:
-    """exp: the unit quaternion (..., 4) of a rotation vector (..., 3)."""
+    """Compute exp: the unit quaternion (..., 4) of a rotation vector (..., 3)."""
     half = 0.5 * np.linalg.norm(r, axis=-1, keepdims=True)
     return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * r], -1)
 
 
 def _rotation_vector(q: Array) -> Array:
-    """log: the rotation vector (..., 3), of at most half a turn, of a quaternion (..., 4)."""
+    """Compute log: the rotation vector (..., 3), of at most half a turn, of a quaternion (..., 4)."""
     q = np.where(q[..., :1] < 0, -q, q)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     angle = 2 * np.arctan2(sine, q[..., :1])
@@ -199,5 +199,5 @@ def _rotation_vector(q: Array) -> Array:
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Products of vectors (..., 3), several times as fast as `np.cross`."""
+    """Compute cross products of vectors (..., 3), several times as fast as `np.cross`."""
     return a[..., _NEXT] * b[..., _LAST] - a[..., _LAST] * b[..., _NEXT]

@@ -30,7 +30,7 @@ from torch.distributions import MultivariateNormal
 from difflcs.errors import InvalidInputError
 from difflcs.rl.rollout import CONTEXT, elapsed_fractions
 from difflcs.rl.seeding import seeded
-from difflcs.rl.tasks import Features, see
+from difflcs.rl.tasks import Features, compute_features
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
@@ -40,12 +40,12 @@ SAMPLES = ("action", "action_log_prob")
 
 @dataclass(frozen=True)
 class Estimate:
-    """What an estimator says of episodes.
+    """Result of an estimator of advantages.
 
     Attributes:
         samples: (N, T, M) "action", "action_log_prob" and "advantage" (…, 1) of M actions for each state.
         values: (N, T) of the states, by the value network.
-        rewards: (N, T) what the value network is to be fitted to.
+        rewards: (N, T) that the value network is to be fitted to.
     """
 
     samples: TensorDict
@@ -69,7 +69,7 @@ class Advantages(Protocol):
 
 
 class RewardScale:
-    """From rewards of the environment to those that are learned from.
+    """Clips and scales the rewards of the environment for learning.
 
     Args:
         cost_limit: rewards of single steps are at least minus this, besides the penalty of a failed episode.
@@ -95,7 +95,7 @@ class RewardScale:
 
 
 def returns(rewards: Tensor, gamma: float) -> Tensor:
-    """(N, T) discounted sums of the rewards (N, T) to come."""
+    """Sum the discounted rewards (N, T) from each step to the end: (N, T)."""
     total = torch.zeros(len(rewards), dtype=rewards.dtype)
     sums = []
     for reward in reversed(rewards.unbind(1)):
@@ -106,12 +106,12 @@ def returns(rewards: Tensor, gamma: float) -> Tensor:
 
 @dataclass(frozen=True)
 class GAE:
-    """What generalised advantage estimation says of episodes.
+    """Result of generalised advantage estimation.
 
     Attributes:
         values: (N, T) of the states, by the value network.
         advantages: (N, T).
-        targets: (N, T) what the value network is to be fitted to: their sum.
+        targets: (N, T) that the value network is to be fitted to: the sum of both.
     """
 
     values: Tensor
@@ -137,7 +137,7 @@ def gae(values: Tensor, rewards: Tensor, gamma: float, zeta: float) -> GAE:
 
 
 class ValueFunction(Protocol):
-    """What is needed of a `difflcs.rl.learning.critic.Critic`."""
+    """The part of a `difflcs.rl.learning.critic.Critic` that estimators use."""
 
     gamma: float
 
@@ -162,17 +162,17 @@ class GAEAdvantages:
 
     def __call__(self, episodes: TensorDict, inputs: Tensor, rewards: Tensor, key: Sequence[int]) -> Estimate:
         """See `Advantages`."""
-        found = self.critic.gae(inputs, rewards)
+        gae = self.critic.gae(inputs, rewards)
         taken: Any = episodes["policy"]
         samples = taken.select(*SAMPLES).unsqueeze(-1)
-        samples["advantage"] = found.advantages[..., None, None]
-        return Estimate(samples, found.values, rewards)
+        samples["advantage"] = gae.advantages[..., None, None]
+        return Estimate(samples, gae.values, rewards)
 
 
-class Foreseeing(Protocol):
-    """What can tell what other actions would have led to: see `difflcs.rl.learning.model_rollouts.ModelEnv.foresee`."""
+class AlternativePredictor(Protocol):
+    """Predicts the outcome of other actions, as `difflcs.rl.learning.model_rollouts.ModelEnv` does."""
 
-    def foresee(self, states: Tensor, actions: Tensor, goals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def predict_alternatives(self, states: Tensor, actions: Tensor, goals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """States (N, T, n_x), actions (N, T, M, n_u), goals → next states, rewards and successes (N, T, M, ·)."""
         ...
 
@@ -181,7 +181,7 @@ class MultiActionAdvantages:
     """Advantages of many actions for each state of model rollouts, see the module.
 
     Args:
-        env: what the episodes were just played in.
+        env: the environment that has just played the episodes.
         critic: the value network, with its discount.
         features: inputs of the value network.
         scale: rewards to learn from.
@@ -192,7 +192,7 @@ class MultiActionAdvantages:
 
     def __init__(
         self,
-        env: Foreseeing,
+        env: AlternativePredictor,
         critic: ValueFunction,
         features: Features,
         scale: RewardScale,
@@ -210,13 +210,13 @@ class MultiActionAdvantages:
         with seeded(key):
             judged = mirrored_actions(episodes["policy"], self.actions)
         executed = torch.clamp(judged["action"], *self.bounds)
-        after, seen, success = self.env.foresee(episodes["state"][:, :-1], executed, episodes["goal"])
+        after, seen, success = self.env.predict_alternatives(episodes["state"][:, :-1], executed, episodes["goal"])
         goals = episodes["goal"][:, None, None].expand(*after.shape[:-1], -1)
         elapsed = elapsed_fractions(after.shape[1])[1:, None].expand(after.shape[:-1])
         context = episodes.get(CONTEXT, None)
         if context is not None:
             context = context[:, None, None].expand(*after.shape[:-1], -1)
-        values = self.critic.values(see(self.features, after, goals, elapsed, context))
+        values = self.critic.values(compute_features(self.features, after, goals, elapsed, context))
         values[:, -1] = 0  # an episode has ended
         q = self.scale(seen, success[:, -1]) + self.critic.gamma * values
         judged["advantage"] = multi_action_advantages(q, now, self.critic.gamma, self.zeta).unsqueeze(-1)
@@ -268,7 +268,9 @@ def multi_action_advantages(q: Tensor, values: Tensor, gamma: float, zeta: float
 
 
 def action_advantage(q: Tensor) -> Tensor:
-    """How much better the actions taken are than the mean of those judged: (..., M), the one taken first, → (...).
+    """Compute the advantage (...) of the action taken over the mean of all M actions, from their values (..., M).
+
+    The action taken comes first.
 
     Zero in expectation over the actions, so returns without it have the same mean and less noise.
     """

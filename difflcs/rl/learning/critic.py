@@ -17,8 +17,7 @@ from difflcs.rl.learning.state import State
 from difflcs.rl.seeding import seeded
 from difflcs.rl.settings import MOST_WIDTH, Epochs, Settings, bounded, group
 
-_WEIGHT_DECAY = 1e-4
-"""Of AdamW."""
+_WEIGHT_DECAY = 1e-4  # of AdamW
 
 
 @dataclass(frozen=True)
@@ -104,8 +103,8 @@ class Critic:
         with seeded(key):
             for _ in range(epochs):
                 for batch in torch.randperm(len(x)).split(minibatch):
-                    _, found = gradients(layers, tanh, x[batch].unsqueeze(0), y[batch].view(1, -1, 1))
-                    parts = [part for weight, bias in found for part in (weight.mT.flatten(), bias.flatten())]
+                    _, layer_gradients = gradients(layers, tanh, x[batch].unsqueeze(0), y[batch].view(1, -1, 1))
+                    parts = [part for weight, bias in layer_gradients for part in (weight.mT.flatten(), bias.flatten())]
                     self._adam.step(torch.cat(parts), self.settings.learning_rate * (1 - done / steps))
                     done += 1
 

@@ -25,8 +25,8 @@ _VECTOR = 16
 """Numbers of single precision in the widest vectors of a CPU: products of such sizes are the fastest."""
 
 
-def _whole(size: int) -> int:
-    """The size, rounded up to whole vectors."""
+def _round_up(size: int) -> int:
+    """Round a size up to whole vectors."""
     return -(-size // _VECTOR) * _VECTOR
 
 
@@ -130,8 +130,8 @@ class Ensemble(nn.Module):
         fill what lies between the layers up to whole vectors.
         """
         inputs, width = self.n_x + self.n_u, self.width
-        wide = _whole(width + 1)
-        first = torch.zeros(self.networks, _whole(inputs + 1), wide)
+        wide = _round_up(width + 1)
+        first = torch.zeros(self.networks, _round_up(inputs + 1), wide)
         second = torch.zeros(self.networks, wide, wide)
         last = torch.zeros(self.networks, wide, self.n_x)
         first[:, :inputs, :width] = self.weights[0] / self.input_std.unsqueeze(-1)
@@ -188,8 +188,8 @@ class Ensemble(nn.Module):
             orders = torch.stack([torch.randperm(len(inputs), generator=generator) for _ in range(self.networks)])
             losses = []
             for batch in orders.split(minibatch, 1):
-                errors, found = gradients(layers, torch.relu_, inputs[batch], targets[batch])
-                for weight, bias, gradient in zip(self.weights, self.biases, found, strict=True):
+                errors, layer_gradients = gradients(layers, torch.relu_, inputs[batch], targets[batch])
+                for weight, bias, gradient in zip(self.weights, self.biases, layer_gradients, strict=True):
                     weight.grad, bias.grad = gradient
                 if decay:
                     adam.param_groups[0]["lr"] = learning_rate * (1 - done / steps)
@@ -199,7 +199,7 @@ class Ensemble(nn.Module):
         return float(torch.stack(losses).mean())
 
     def config(self) -> dict[str, Any]:
-        """Its sizes."""
+        """Return the sizes of the ensemble."""
         return {name: getattr(self, name) for name in _SIZES}
 
     def save_pretrained(self, directory: Path) -> None:

@@ -28,7 +28,8 @@ BACKWARD: dict[Callable[[Tensor], Tensor], Callable[[Tensor, Tensor], Tensor]] =
     torch.relu_: lambda gradient, value: torch.ops.aten.threshold_backward(gradient, value, 0),
     tanh: torch.ops.aten.tanh_backward,
 }
-"""Of each activation: from the gradient of its value, and its value, to that of its argument."""
+"""Activation → function of the gradient with respect to its value, and of the value, that returns the gradient with
+respect to its argument."""
 
 
 def gradients(
@@ -43,20 +44,20 @@ def gradients(
         targets: (K, B, n_out).
 
     Returns:
-        (K,) mean squared error of each network, and the gradients by the layers' weights and biases.
+        (K,) mean squared error of each network, and the gradients with respect to the layers' weights and biases.
     """
     values = [inputs]
     for weight, bias in layers[:-1]:
         values.append(activation(torch.baddbmm(bias, values[-1], weight)))
     errors = torch.baddbmm(layers[-1][1], values[-1], layers[-1][0]).sub_(targets)
     gradient = errors * (2 / math.prod(errors.shape[1:]))
-    found: list[Layer] = []
+    layer_gradients: list[Layer] = []
     for place in reversed(range(len(layers))):
         value = values[place]
-        found.append((torch.bmm(value.mT, gradient), gradient.sum(1, keepdim=True)))
+        layer_gradients.append((torch.bmm(value.mT, gradient), gradient.sum(1, keepdim=True)))
         if place:
             gradient = BACKWARD[activation](torch.bmm(gradient, layers[place][0].mT), value)
-    return errors.square_().mean((1, 2)), found[::-1]
+    return errors.square_().mean((1, 2)), layer_gradients[::-1]
 
 
 class FlatAdam:
@@ -65,7 +66,7 @@ class FlatAdam:
     Loshchilov and Hutter, "Decoupled weight decay regularization", 2019, with the averaging factors of torch.
 
     Args:
-        module: what is trained.
+        module: the module to train.
         weight_decay: part of the parameters that a step of size one takes away.
     """
 
@@ -80,7 +81,7 @@ class FlatAdam:
         self.average, self.square = torch.zeros_like(self.vector), torch.zeros_like(self.vector)
 
     def step(self, gradient: Tensor, size: float) -> None:
-        """Take a step of a given size against the gradient (P,)."""
+        """Take a step of this size against the gradient (P,)."""
         self.steps += 1
         first, second = self._BETAS
         self.vector.mul_(1 - size * self.weight_decay)
@@ -90,7 +91,7 @@ class FlatAdam:
         self.vector.addcdiv_(self.average, scale, value=-size / (1 - first**self.steps))
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything to go on with, but for the parameters."""
+        """State of the optimiser, without the parameters."""
         return {"steps": self.steps, "average": self.average, "square": self.square}
 
     def load_state_dict(self, state: State) -> None:

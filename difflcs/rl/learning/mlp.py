@@ -15,8 +15,8 @@ from difflcs import _storage
 from difflcs._checks import check_positive_int
 from difflcs._modules import plain_state
 from difflcs.errors import CheckpointError, InvalidInputError
-from difflcs.rl.rollout import Plan, elapsed_fractions
-from difflcs.rl.tasks import Features, see
+from difflcs.rl.rollout import PolicyOutput, elapsed_fractions
+from difflcs.rl.tasks import Features, compute_features
 
 _KIND = "MLP"
 _SIZES = ("n_features", "width", "episode_steps")
@@ -30,7 +30,7 @@ class MLPController(nn.Module):
 
     Args:
         features: its inputs, of states, goals and the elapsed fraction of the episode.
-        n_features: how many they are.
+        n_features: number of inputs.
         u_min: (n_u,) lower bounds of the actions.
         u_max: (n_u,) upper bounds.
         width: width of the hidden layers.
@@ -69,11 +69,11 @@ class MLPController(nn.Module):
         self.begin()
 
     def begin(self, seed: int = 0) -> None:
-        """An episode starts. `seed` is for policies that draw."""
+        """Start an episode. `seed` is for policies that draw random numbers."""
         self._step = 0
 
     def mean(self, state: Tensor, goal: Tensor, elapsed: Tensor, context: Tensor | None = None) -> Tensor:
-        """What it does, without noise.
+        """Compute the actions, without noise.
 
         Args:
             state: (..., n_x).
@@ -85,7 +85,7 @@ class MLPController(nn.Module):
             (..., n_u) actions.
         """
         middle, half = 0.5 * (self.u_max + self.u_min), 0.5 * (self.u_max - self.u_min)
-        return middle + half * self.layers(see(self.features, state, goal, elapsed, context))
+        return middle + half * self.layers(compute_features(self.features, state, goal, elapsed, context))
 
     def forward(
         self,
@@ -95,16 +95,18 @@ class MLPController(nn.Module):
         u_min: Tensor | None = None,
         u_max: Tensor | None = None,
         context: Tensor | None = None,
-    ) -> Plan:
+    ) -> PolicyOutput:
         """Act once in states (B, n_x) towards goals (B, n_goal), one step after the last call."""
         elapsed = elapsed_fractions(self.episode_steps)[self._step % self.episode_steps].expand(x0.shape[:-1])
         self._step += 1
         action = self.mean(x0, goal, elapsed, context)
         low, high = (self.u_min if u_min is None else u_min), (self.u_max if u_max is None else u_max)
-        return Plan(torch.minimum(torch.maximum(action, low), high), torch.ones(x0.shape[:-1], dtype=torch.bool))
+        return PolicyOutput(
+            torch.minimum(torch.maximum(action, low), high), torch.ones(x0.shape[:-1], dtype=torch.bool)
+        )
 
     def config(self) -> dict[str, Any]:
-        """Its sizes."""
+        """Return the sizes of the network."""
         return {name: getattr(self, name) for name in _SIZES}
 
     def save_pretrained(self, directory: Path) -> None:

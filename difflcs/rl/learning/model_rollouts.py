@@ -1,8 +1,8 @@
 """Model rollouts: PPO's data in an ensemble of networks fitted to the real episodes (model-ensemble policy search).
 
-Kurutach et al., "Model-ensemble trust-region policy optimization", 2018. Nothing of it is left in what is learned: the
-LCS and its MPC act alone. What is played in the networks counts as no data of the robot, and costs time of the computer
-instead.
+Kurutach et al., "Model-ensemble trust-region policy optimization", 2018. The networks are used in training only:
+afterwards the LCS and its MPC act alone. Episodes played in the networks do not count as data of the robot; they cost
+computing time instead.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from difflcs.rl.learning.dynamics import Ensemble, EnsembleSettings
 from difflcs.rl.learning.state import State
 from difflcs.rl.rollout import (
     CONTEXT,
-    beside,
-    episodes_from,
-    episodes_state,
-    extended,
-    no_episodes,
+    append_context,
+    append_episodes,
+    episodes_from_state,
+    episodes_to_state,
+    make_empty_record,
     observed_transitions,
 )
 from difflcs.rl.seeding import Stream, generator
@@ -95,7 +95,7 @@ class ModelEnv(VectorEnv):
         self._rng = np.random.default_rng(0)
 
     def remember(self, states: Tensor, goals: Tensor, contexts: Tensor | None = None) -> None:
-        """Replace what starts, goals and the range of states are taken from.
+        """Replace the episodes from which starts, goals and the range of states are taken.
 
         Args:
             states: (N, T+1, n_x) of real episodes.
@@ -111,13 +111,13 @@ class ModelEnv(VectorEnv):
 
         Args:
             seed: one for each episode; a number is that of the first, and the others follow it.
-            options: none are known.
+            options: ignored.
 
         Returns:
             Observations and an empty info.
 
         Raises:
-            InvalidInputError: there is nothing to remember yet.
+            InvalidInputError: `remember` has not been called yet.
         """
         if not len(self._starts):
             raise InvalidInputError("model rollouts: expected real episodes, got none; call remember() first")
@@ -150,8 +150,8 @@ class ModelEnv(VectorEnv):
         self._state, self._step = after, self._step + 1
         return self._observe(), reward.numpy(), nothing, ended, {"success": success.numpy()}
 
-    def foresee(self, states: Tensor, actions: Tensor, goals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What other actions would have led to in the episodes just played, by the networks that played them.
+    def predict_alternatives(self, states: Tensor, actions: Tensor, goals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Predict the outcome of other actions in the episodes just played, by the networks that played them.
 
         Args:
             states: (num_envs, T, n_x) of the episodes, without the last ones.
@@ -174,14 +174,14 @@ class ModelEnv(VectorEnv):
 
     def _predict(self, states: Tensor, actions: Tensor, networks: Tensor, context: Tensor | None) -> Tensor:
         """States (B, n_x), actions (B, n_u), numbers of networks (B,), contexts → next states (B, n_x) in range."""
-        seen = beside(states, context)
+        inputs = append_context(states, context)
         rows = [(networks == k).nonzero().squeeze(1) for k in range(self.ensemble.networks)]
         padded = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)  # every network, as many rows
         with torch.no_grad():
-            found = self.ensemble(seen[padded].float(), actions[padded].float())[..., : states.shape[-1]]
+            outputs = self.ensemble(inputs[padded].float(), actions[padded].float())[..., : states.shape[-1]]
         predicted = torch.empty_like(states)
-        for own, part in zip(rows, found, strict=True):
-            predicted[own] = part[: len(own)].double()
+        for row, part in zip(rows, outputs, strict=True):
+            predicted[row] = part[: len(row)].double()
         predicted = torch.where(predicted.isfinite(), predicted, states)
         return torch.minimum(torch.maximum(predicted, self._low), self._high)
 
@@ -205,7 +205,7 @@ class ModelRollouts:
 
     def __init__(self, env: VectorEnv, outcome: Outcome, settings: ModelRolloutSettings, seed: int, episode_steps: int):
         self.settings, self.seed = settings, check_positive_int("seed", seed, minimum=0)
-        self.episodes = no_episodes(env, episode_steps)
+        self.episodes = make_empty_record(env, episode_steps)
         """Real episodes, a record of `TRANSITIONS`."""
         n_x, n_u = self.episodes["state"].shape[-1], self.episodes["action"].shape[-1]
         sizes = (settings.ensemble.networks, settings.ensemble.width)
@@ -219,8 +219,8 @@ class ModelRollouts:
         return len(self.episodes)
 
     def add(self, episodes: TensorDict) -> None:
-        """Take in the stable ones of real episodes, a record of `difflcs.rl.collect` or of `TRANSITIONS`."""
-        self.episodes = extended(self.episodes, episodes)
+        """Add the stable ones among real episodes, a record of `difflcs.rl.collect` or of `TRANSITIONS`."""
+        self.episodes = append_episodes(self.episodes, episodes)
 
     def fit(self) -> float:
         """Fit the ensemble to all episodes, and let the environment start from them; returns the loss."""
@@ -241,12 +241,12 @@ class ModelRollouts:
         self.env.remember(self.episodes["state"], self.episodes["goal"], self.episodes.get(CONTEXT, None))
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything to go on with, the episodes included."""
-        return {"fits": self.fits, "episodes": episodes_state(self.episodes), "ensemble": self.ensemble.state_dict()}
+        """State to resume from, the episodes included."""
+        return {"fits": self.fits, "episodes": episodes_to_state(self.episodes), "ensemble": self.ensemble.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
         """Go on from what `state_dict` gave."""
-        self.fits, self.episodes = state["fits"], episodes_from(state["episodes"])
+        self.fits, self.episodes = state["fits"], episodes_from_state(state["episodes"])
         self.ensemble.load_state_dict(state["ensemble"])
         if len(self):
             self._remember()

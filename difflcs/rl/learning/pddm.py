@@ -23,16 +23,16 @@ from difflcs.rl.learning.state import State
 from difflcs.rl.learning.trainer import AfterStep, Trainer
 from difflcs.rl.rollout import (
     CONTEXT,
-    Plan,
+    PolicyOutput,
     action_bounds,
-    beside,
+    append_context,
+    append_episodes,
     collect,
-    episodes_from,
-    episodes_state,
-    extended,
+    episodes_from_state,
+    episodes_to_state,
     has_context,
+    make_empty_record,
     mpc_actions,
-    no_episodes,
     observed_transitions,
     uniform_actions,
 )
@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
 
 NOISE = 0.9
-"""Standard deviation of ε, the noise of the sampled actions, as a fraction of the action bounds' half range: what the
-authors have for every dexterous task."""
+"""Standard deviation of ε, the noise of the sampled actions, as a fraction of the action bounds' half range: that of
+the authors for every dexterous task."""
 
 
 @dataclass(frozen=True)
@@ -103,12 +103,12 @@ class Planner:
         u_min: Tensor | None = None,
         u_max: Tensor | None = None,
         context: Tensor | None = None,
-    ) -> Plan:
+    ) -> PolicyOutput:
         """Plan from states (B, n_x) to goals (B, n_goal); the batch must not change between two `begin`."""
         bounds = (self.u_min if u_min is None else u_min), (self.u_max if u_max is None else u_max)
         low, high = (bound.float() for bound in bounds)
         batch, n_u, horizon = len(x0), len(low), self.settings.horizon
-        x0 = beside(x0, context)
+        x0 = append_context(x0, context)
         mean = torch.zeros(batch, horizon, n_u) if self._mean is None else self._mean
         if len(mean) != batch:
             raise InvalidInputError(f"x0: expected {len(mean)} states as before, got {batch}; call begin() at a reset")
@@ -117,7 +117,7 @@ class Planner:
         # The plan one step later, its last step repeated.
         self._mean = torch.cat([planned[:, 1:], planned[:, -1:]], 1)
         # A mean of single precision may leave the bounds by its rounding: 0.1 by up to 1e-8.
-        return Plan(planned[:, 0].double().clamp(*bounds), torch.ones(batch, dtype=torch.bool))
+        return PolicyOutput(planned[:, 0].double().clamp(*bounds), torch.ones(batch, dtype=torch.bool))
 
     def _improve(self, x0: Tensor, goal: Tensor, mean: Tensor, low: Tensor, high: Tensor) -> Tensor:
         """The next plan (horizon, n_u) of one episode. One at a time: 700 sequences fill the cache."""
@@ -170,7 +170,7 @@ class PDDMReport:
 
 
 class PDDM(Trainer):
-    """The baseline, see `Trainer`.
+    """Trainer of the PDDM baseline, see `Trainer`.
 
     Args:
         cost: the planner's objective.
@@ -203,7 +203,7 @@ class PDDM(Trainer):
         planner = Planner(self.ensemble, cost, settings, *action_bounds(env))
         super().__init__(self.ensemble, planner, seed, episode_steps)
         self.env, self.settings, self.total_episodes = env, settings, total_episodes
-        self.buffer = no_episodes(env, episode_steps)
+        self.buffer = make_empty_record(env, episode_steps)
         """All episodes."""
 
     def step(self, after_step: AfterStep | None = None) -> PDDMReport:
@@ -222,7 +222,7 @@ class PDDM(Trainer):
         report = None if after_step is None else lambda: after_step(count)
         episodes = collect(self.env, act, seeds, self.episode_steps, report)
         self.episodes += count
-        self.buffer = extended(self.buffer, episodes)
+        self.buffer = append_episodes(self.buffer, episodes)
         collected = time.perf_counter()
         if not settings.keep_networks:
             self.ensemble.draw(generator(self.seed, Stream.FIT, self.iteration, 0))
@@ -246,9 +246,9 @@ class PDDM(Trainer):
 
     def state_dict(self) -> dict[str, Any]:
         """See `Trainer`."""
-        return {**super().state_dict(), "episodes": episodes_state(self.buffer)}
+        return {**super().state_dict(), "episodes": episodes_to_state(self.buffer)}
 
     def load_state_dict(self, state: State) -> None:
         """See `Trainer`."""
         super().load_state_dict(state)
-        self.buffer = episodes_from(state["episodes"])
+        self.buffer = episodes_from_state(state["episodes"])

@@ -19,10 +19,10 @@ _WARMUP, _MAIN = "warmup", "main"
 
 
 class LCSRL(Trainer):
-    """Both phases as one trainer, see `Trainer`.
+    """Trainer that runs both phases, see `Trainer`.
 
     Args:
-        warmup: the first phase, or whatever takes its place.
+        warmup: the first phase.
         warmup_steps: environment steps after which the main phase starts.
         make_main: episodes and iterations done before → the second phase, around the same model.
     """
@@ -31,18 +31,18 @@ class LCSRL(Trainer):
         self.current: Any = warmup
         self._warmup, self._warmup_steps, self._make_main = warmup, warmup_steps, make_main
         super().__init__(warmup.learned, warmup.policy, warmup.seed, warmup.episode_steps)
-        self._follow()
+        self._advance_phase()
 
-    def _follow(self) -> None:
-        """Begin the main phase when the warm-up is over."""
+    def _advance_phase(self) -> None:
+        """Begin the main phase once the warm-up is over."""
         warmup = self._warmup
         if self.current is warmup and warmup.env_steps >= self._warmup_steps:
             self.current = self._make_main(warmup.episodes, warmup.iteration)
             self.current.remember(warmup.buffer)
         self.iteration, self.episodes = self.current.iteration, self.current.episodes
 
-    def _main(self, episodes: int, iterations: int) -> PPO:
-        """The main phase that begins there: the current one if it did."""
+    def _make_main_phase(self, episodes: int, iterations: int) -> PPO:
+        """Make the main phase that begins there, or return the current one if it has begun."""
         current = self.current
         begun = None if current is self._warmup else (current.first_episode, current.first_iteration)
         if begun == (episodes, iterations):
@@ -52,7 +52,7 @@ class LCSRL(Trainer):
     def step(self, after_step: AfterStep | None = None) -> WarmupReport | PhysicsFitReport | PPOReport:
         """One iteration of the current phase."""
         report = self.current.step(after_step)
-        self._follow()
+        self._advance_phase()
         return report
 
     def state_dict(self) -> dict[str, Any]:
@@ -71,7 +71,7 @@ class LCSRL(Trainer):
             if check_choice("phase", state.get("phase"), (_WARMUP, _MAIN)) == _MAIN:
                 names = ("first_episode", "first_iteration")
                 before = [check_positive_int(name, inner["settings"][name], minimum=0) for name in names]
-                current = self._main(*before)
+                current = self._make_main_phase(*before)
         except (InvalidInputError, KeyError, TypeError) as error:
             raise CheckpointError(
                 f"checkpoint: expected the state of a warm-up or a main phase, got {sorted(state)} ({error}); was it "

@@ -1,6 +1,6 @@
-"""Physics with known contacts, fitted to what its own MPC does.
+"""Fit of a physics with known contacts to the episodes of its own MPC.
 
-A task that says what is known of its physics (`PhysicsSpec`) gives a controller that works before anything is learned.
+A task with known physics (`PhysicsSpec`) has a controller that works before anything is learned.
 Its episodes, with some noise, are the data; the few numbers of the physics are fitted to all of them, and the next
 episodes are better. A main phase may follow: PPO through the MPC (Algorithm 2), as in LCS-RL.
 """
@@ -17,21 +17,20 @@ from torch import Tensor
 
 from difflcs.errors import InvalidInputError
 from difflcs.lcp import solve_lcp
-from difflcs.lcs import LCSModule, LCSParams
 from difflcs.losses import violation_loss
-from difflcs.records import system_at
-from difflcs.rl.learning.learned import check_depends, check_module
+from difflcs.records import LCSModule, LCSParams, system_at
+from difflcs.rl.learning.checks import check_depends, check_module
 from difflcs.rl.learning.state import State
 from difflcs.rl.learning.trainer import AfterStep, Trainer
 from difflcs.rl.rollout import (
     Policy,
+    append_episodes,
     collect,
     contexts,
-    episodes_from,
-    episodes_state,
-    extended,
+    episodes_from_state,
+    episodes_to_state,
+    make_empty_record,
     mpc_actions,
-    no_episodes,
     noisy_actions,
     transitions,
 )
@@ -48,7 +47,7 @@ _XI = 0.02
 
 @dataclass(frozen=True)
 class PhysicsFitSettings(Settings):
-    """How the numbers of a physics are fitted."""
+    """Settings of the fit of a physics."""
 
     rollouts: int = bounded(15, minimum=1, maximum=MOST_ENVS)
     """Episodes per iteration."""
@@ -72,7 +71,7 @@ def physics_loss(
     relaxation: float,
     context: Tensor | None = None,
 ) -> Tensor:
-    """The loss of transitions whose system follows the state.
+    """Compute the loss of transitions of a system that depends on the state.
 
     Args:
         lcs: the module.
@@ -82,7 +81,7 @@ def physics_loss(
         scale: (n_x,) units in which errors of the states count.
         settings: which loss.
         relaxation: λ·s of the prediction; that of the MPC, so that it is the motion the MPC plans with.
-        context: (N, n_context) or none.
+        context: (N, n_context) or None.
 
     Returns:
         Scalar: half of the mean squared error in units of `scale`, or the mean violation loss in these units.
@@ -95,7 +94,7 @@ def physics_loss(
 
 
 def _in_units(system: LCSParams, scale: Tensor) -> LCSParams:
-    """The system of states x/scale."""
+    """Express a system in states x/scale."""
     column = scale.unsqueeze(-1)
     return replace(
         system,
@@ -135,10 +134,10 @@ class PhysicsFitReport:
 
 
 class PhysicsFit(Trainer):
-    """Episodes of the MPC with noise, a fit to all of them, and again; see `Trainer`.
+    """Trainer that alternates noisy episodes of the MPC with a fit to all of them, see `Trainer`.
 
     Args:
-        lcs: what is fitted, in place; `policy` must use the same object.
+        lcs: the system to fit, in place; `policy` must use the same object.
         policy: the MPC around it.
         env: as many environments in lockstep as an iteration has episodes, or more.
         settings: settings.
@@ -150,7 +149,7 @@ class PhysicsFit(Trainer):
 
     Raises:
         InvalidInputError: too few environments, or a module of other sizes than theirs.
-        DTypeError: something else instead of a module.
+        DTypeError: `lcs` is no module.
     """
 
     def __init__(
@@ -170,7 +169,7 @@ class PhysicsFit(Trainer):
             raise InvalidInputError(f"env: expected at least {settings.rollouts} environments, got {env.num_envs}")
         self.lcs, self.env, self.settings = lcs, env, settings
         self.scale, self.relaxation, self.total_episodes = scale, relaxation, total_episodes
-        self.buffer = no_episodes(env, episode_steps)
+        self.buffer = make_empty_record(env, episode_steps)
         """All episodes."""
 
     def step(self, after_step: AfterStep | None = None) -> PhysicsFitReport:
@@ -189,7 +188,7 @@ class PhysicsFit(Trainer):
         report = None if after_step is None else lambda: after_step(count)
         episodes = collect(self.env, act, seeds, self.episode_steps, report)
         self.episodes += count
-        self.buffer = extended(self.buffer, episodes)
+        self.buffer = append_episodes(self.buffer, episodes)
         collected = time.perf_counter()
         losses = self._fit()
         self.iteration += 1
@@ -222,9 +221,9 @@ class PhysicsFit(Trainer):
 
     def state_dict(self) -> dict[str, Any]:
         """See `Trainer`."""
-        return {**super().state_dict(), "episodes": episodes_state(self.buffer)}
+        return {**super().state_dict(), "episodes": episodes_to_state(self.buffer)}
 
     def load_state_dict(self, state: State) -> None:
         """See `Trainer`."""
         super().load_state_dict(state)
-        self.buffer = episodes_from(state["episodes"])
+        self.buffer = episodes_from_state(state["episodes"])

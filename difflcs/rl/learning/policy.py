@@ -17,12 +17,14 @@ from difflcs._differentiation import runs_eagerly
 from difflcs._modules import fresh
 from difflcs._optional import INSTALL
 from difflcs.errors import DTypeError, InvalidInputError, MissingDependencyError
-from difflcs.lcs import LCSModule, LCSParams, LCSSequence, is_plain
+from difflcs.lcs import is_plain
 from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.solution import Primal
-from difflcs.rl.learning.learned import check_module, system_jacobian
+from difflcs.records import LCSModule, LCSParams, LCSSequence
+from difflcs.rl.learning.checks import check_module
+from difflcs.rl.learning.jacobian import system_jacobian
 from difflcs.rl.learning.mlp import MLPController
-from difflcs.rl.rollout import CONTEXT, quiet
+from difflcs.rl.rollout import CONTEXT, ignore_solver_warnings
 
 try:
     from tensordict import TensorDict, TensorDictBase
@@ -44,9 +46,9 @@ class GaussianParameters(TensorDictModuleBase):
 
     Args:
         std: (n_u,) standard deviations.
-        covariance: "fixed"; or what is learned of Σ, "diagonal" or "full".
-        in_keys: what the mean depends on.
-        out_keys: what is written besides "loc" and "scale_tril".
+        covariance: the learned part of Σ, "fixed", "diagonal" or "full".
+        in_keys: keys that the mean depends on.
+        out_keys: keys that are written besides "loc" and "scale_tril".
     """
 
     def __init__(self, std: Tensor, covariance: str, in_keys: Sequence[str], out_keys: Sequence = ()):
@@ -60,7 +62,7 @@ class GaussianParameters(TensorDictModuleBase):
         self.mixing = nn.Parameter(torch.zeros(n_u, n_u, dtype=std.dtype), requires_grad=covariance == "full")
 
     def write(self, tensordict: TensorDictBase, mean: Tensor) -> TensorDictBase:
-        """Enter the Gaussian of mean (..., n_u)."""
+        """Write the Gaussian of mean (..., n_u)."""
         tensordict["loc"] = mean
         tensordict["scale_tril"] = self.scale_tril().expand(*tensordict.batch_size, -1, -1)
         return tensordict
@@ -81,7 +83,7 @@ class MPCGaussian(GaussianParameters):
         self.mpc = mpc
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Solve the MPC, from the key "guess" where it is given, else cold."""
+        """Solve the MPC, starting from the key "guess" if there is one, else cold."""
         state, goal = _entries(tensordict, self.in_keys)
         solution = self.mpc(state, goal, guess=_guess(tensordict), context=tensordict.get(CONTEXT, None))
         plan = {name: getattr(solution, name).detach() for name in PLAN}
@@ -96,7 +98,7 @@ def _guess(tensordict: TensorDictBase) -> Primal | None:
 
 
 def _entries(tensordict: TensorDictBase, keys: Sequence) -> list[Tensor]:
-    """What a policy reads."""
+    """Read the inputs of a policy."""
     missing = [str(key) for key in keys if tensordict.get(key, None) is None]
     if missing:
         got = sorted(map(str, tensordict.keys()))
@@ -118,7 +120,7 @@ class MLPGaussian(GaussianParameters):
 
 
 class GaussianPolicy(ProbabilisticActor):
-    """A TorchRL actor that draws from a Gaussian: what `difflcs.rl.PPO` needs to know of it.
+    """A TorchRL actor that draws from a Gaussian, as `difflcs.rl.PPO` needs it.
 
     Args:
         parameters: writes mean and Cholesky factor.
@@ -153,7 +155,7 @@ class GaussianPolicy(ProbabilisticActor):
 
     @property
     def covariance(self) -> str:
-        """What is learned of Σ: "fixed", "diagonal" or "full"."""
+        """The learned part of Σ: "fixed", "diagonal" or "full"."""
         return self.gaussian.covariance
 
     @property
@@ -162,17 +164,17 @@ class GaussianPolicy(ProbabilisticActor):
         return self.gaussian.scale_tril().detach().square().sum(-1).sqrt()
 
     def solve(self, data: TensorDictBase) -> TensorDictBase:
-        """Enter mean and covariance for states (and guesses), with gradients, but no action.
+        """Write mean and covariance for states (and guesses), with gradients, but no action.
 
-        Failed solves are counted by who asks ("converged"); a regularised gradient of single samples is expected.
+        The caller counts failed solves ("converged"); a regularised gradient of single samples is expected.
         """
-        with quiet():
+        with ignore_solver_warnings():
             self.get_dist_params(data)
         return data
 
     def act(self, data: TensorDictBase) -> TensorDictBase:
-        """Enter mean, covariance and a sample for states, without gradients and warnings."""
-        with torch.no_grad(), quiet():
+        """Write mean, covariance and a sample for states, without gradients and warnings."""
+        with torch.no_grad(), ignore_solver_warnings():
             return self(data)
 
 
@@ -231,7 +233,7 @@ class LCSMPCPolicy(GaussianPolicy):
         ...     adam.step()
 
     Args:
-        mpc: the controller; a learnable LCS in it is what is trained, an `LCSModel` or any other `LCSModule` that is a
+        mpc: the controller; the LCS in it is trained, if it is an `LCSModel` or another `LCSModule` that is a
             `torch.nn.Module`. `on_failure="mask"` keeps a batch going where single solves fail.
         std: standard deviation of each action component, a number or (n_u,) [units of the action].
         covariance: "fixed"; or learned with the policy, "diagonal" or "full", that is with correlations.
@@ -275,7 +277,7 @@ class LCSMPCPolicy(GaussianPolicy):
 
     @runs_eagerly
     def jacobian(self, data: TensorDictBase) -> Tensor:
-        """Jacobians of the mean with respect to what is learned of the LCS, in standard deviations.
+        """Compute the Jacobians of the mean, in standard deviations, with respect to the learned parameters of the LCS.
 
         Args:
             data: (N,) states and goals, contexts where there are any, and plans under "guess" to start from.
@@ -289,25 +291,25 @@ class LCSMPCPolicy(GaussianPolicy):
         lcs = check_module(self.mpc.lcs, name="actor")
         if not is_plain(lcs):
             state, goal = _entries(data, self.in_keys)
-            with quiet():
-                found = system_jacobian(self.mpc, state, goal, _guess(data), data.get(CONTEXT, None))
-            return torch.linalg.solve_triangular(self.gaussian.scale_tril().detach(), found, upper=False)
+            with ignore_solver_warnings():
+                jacobian = system_jacobian(self.mpc, state, goal, _guess(data), data.get(CONTEXT, None))
+            return torch.linalg.solve_triangular(self.gaussian.scale_tril().detach(), jacobian, upper=False)
         # Parameters that are matrices may have batch dimensions. A copy for each sample has the gradient of its own.
         of_lcs = {id(p) for p in lcs.parameters()}
         learned = {name: p for name, p in self.gaussian.named_parameters() if id(p) in of_lcs and p.requires_grad}
         copies = {name: p.detach().expand(len(data), *p.shape).clone().requires_grad_() for name, p in learned.items()}
         batch = data.select(*self.in_keys, "guess", strict=False)
-        with quiet():
+        with ignore_solver_warnings():
             functional_call(self.gaussian, copies, (batch,))
         mean = torch.linalg.solve_triangular(batch["scale_tril"].detach(), batch["loc"].unsqueeze(-1), upper=False)
         leaves, rows = list(copies.values()), []
         for component in mean.squeeze(-1).unbind(-1):
-            found = torch.autograd.grad(component.sum(), leaves, retain_graph=True, materialize_grads=True)
-            rows.append(torch.cat([part.flatten(1) for part in found], 1))
+            gradients = torch.autograd.grad(component.sum(), leaves, retain_graph=True, materialize_grads=True)
+            rows.append(torch.cat([part.flatten(1) for part in gradients], 1))
         return torch.stack(rows, 1)
 
     def clip(self, action: Tensor) -> Tensor:
-        """What of a sample is executed: clipped into the controller's bounds."""
+        """Clip a sample into the controller's bounds, as it is executed."""
         return torch.minimum(torch.maximum(action, self.mpc.u_min), self.mpc.u_max)
 
 
@@ -350,7 +352,7 @@ class MLPPolicy(GaussianPolicy):
 def make_actor(
     controller: LCSMPCLayer | MLPController, std: float | Tensor = 0.005, covariance: str = "fixed"
 ) -> GaussianPolicy:
-    """The Gaussian around a controller: an `LCSMPCPolicy` or an `MLPPolicy`, see there."""
+    """Make the Gaussian policy around a controller: an `LCSMPCPolicy` or an `MLPPolicy`, see there."""
     kind = MLPPolicy if isinstance(controller, MLPController) else LCSMPCPolicy
     return kind(controller, std, covariance)  # pyright: ignore[reportArgumentType]
 

@@ -1,8 +1,8 @@
 """Main phase (Algorithm 2): proximal policy optimisation of the MPC's model, or of a network as a reference point.
 
-What PPO is made of is handed in: where episodes come from (`Source`: the robot, or model rollouts), how their actions
-are judged (`advantages.py`), the loss (`surrogate.py`), and how it moves the policy (`optim/`). `difflcs.rl.make_ppo`
-puts the parts together by the settings. Gradients reach the LCS through the MPC layer.
+The parts of PPO are its arguments: the source of episodes (`Source`: the robot, or model rollouts), the estimator of
+advantages (`advantages.py`), the loss (`surrogate.py`) and the update rule (`optim/`). `difflcs.rl.make_ppo` makes them
+from the settings. Gradients reach the LCS through the MPC layer.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from torch import Tensor
 
 from difflcs.errors import InvalidInputError
 from difflcs.rl.learning.advantages import Advantages, RewardScale, returns
+from difflcs.rl.learning.checks import check_learned
 from difflcs.rl.learning.critic import Critic
-from difflcs.rl.learning.learned import check_learned
 from difflcs.rl.learning.model_rollouts import ModelRollouts
 from difflcs.rl.learning.optim import UpdateRule
 from difflcs.rl.learning.state import State
@@ -28,7 +28,7 @@ from difflcs.rl.learning.surrogate import Surrogate, gaussian_kl, trimmed_mean
 from difflcs.rl.learning.trainer import AfterStep, Trainer
 from difflcs.rl.rollout import CONTEXT, collect, elapsed_fractions
 from difflcs.rl.seeding import Stream, episode_seeds, numbers, seeded
-from difflcs.rl.tasks import Features, see
+from difflcs.rl.tasks import Features, compute_features
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
@@ -93,7 +93,7 @@ class PPOReport:
 
 @dataclass(frozen=True)
 class Source:
-    """Where episodes come from, and how much is learned from an iteration's worth of them.
+    """A source of episodes, and the amount of learning from one iteration of them.
 
     Attributes:
         env: environments in lockstep: the robot's, or those that networks play.
@@ -117,12 +117,12 @@ class PPO(Trainer):
     """The main phase, see `Trainer`; `make_ppo` puts one together.
 
     Args:
-        actor: the policy, from `difflcs.rl.make_actor`; what it has learned is trained in place: an `LCSModel`, any
-            other `LCSModule` that is a `torch.nn.Module`, or a network. An MPC in it needs on_failure="mask".
+        actor: the policy, from `difflcs.rl.make_actor`; its model is trained in place: an `LCSModel`, any other
+            `LCSModule` that is a `torch.nn.Module`, or a network. An MPC in it needs on_failure="mask".
         robot: the real episodes.
         critic: the value network.
         surrogate: the loss.
-        update: what moves the policy.
+        update: the rule that moves the policy.
         scale: rewards to learn from.
         seed: of noise, value network, goals and initial states.
         features: inputs of the value network.
@@ -134,7 +134,7 @@ class PPO(Trainer):
         max_kl: KL divergence at which an iteration ends early.
         final_step: factor on all steps, falling linearly from 1 to this.
         models: plays episodes in networks besides those of the robot; None: real ones alone, as in the paper.
-        practice: how model rollouts are learned from, where there are models.
+        practice: source of model rollouts, if there are models.
 
     Raises:
         InvalidInputError: an argument does not fit.
@@ -184,18 +184,18 @@ class PPO(Trainer):
 
     @property
     def done(self) -> bool:
-        """Whether all episodes are collected."""
+        """True if all episodes are collected."""
         return self.iteration - self.first_iteration >= len(self.sizes)
 
     def remember(self, episodes: TensorDict) -> None:
-        """Let model rollouts know real episodes of before, such as those of a warm-up."""
+        """Add earlier real episodes, such as those of a warm-up, to the data of the model rollouts."""
         if self.models is not None:
             self.models.add(episodes)
 
     def step(self, after_step: AfterStep | None = None) -> PPOReport:
         """One iteration: collect, estimate advantages, improve the policy, fit the value network.
 
-        Before it, iterations on model rollouts, if there are models that know real episodes.
+        Iterations on model rollouts come first, if there are models with real episodes.
 
         Raises:
             InvalidInputError: rewards that are not finite, or no episode with a stable simulation.
@@ -206,7 +206,7 @@ class PPO(Trainer):
         progress = sum(self.sizes[:done]) / sum(self.sizes)
         scale = 1 - (1 - self.final_step) * progress
         start = time.perf_counter()
-        model_success, model_loss = self._practise(scale)
+        model_success, model_loss = self._train_on_models(scale)
         model_seconds = time.perf_counter() - start
 
         count = self.sizes[done]
@@ -245,10 +245,10 @@ class PPO(Trainer):
             model_seconds=model_seconds,
         )
 
-    def _practise(self, scale: float) -> tuple[float | None, float | None]:
-        """Iterations on model rollouts: the success of the last ones, and the loss of the ensemble.
+    def _train_on_models(self, scale: float) -> tuple[float | None, float | None]:
+        """Run the iterations on model rollouts; return the success of the last ones and the loss of the ensemble.
 
-        None where there are no models, or where they know no real episode yet.
+        Both are None if there are no models, or if they have no real episode yet.
         """
         models = self.models
         if models is None or self.practice is None or not (len(models) and models.settings.iterations):
@@ -304,7 +304,7 @@ class PPO(Trainer):
     def _collect(
         self, env: VectorEnv, seeds: list[int], key: Sequence[int], after_step: AfterStep | None
     ) -> tuple[TensorDict, float, float]:
-        """Episodes of the stochastic policy, with what it drew under "policy" (N, T); seconds of physics and solver."""
+        """Collect episodes with the policy's samples under "policy" (N, T), and the seconds of physics and solver."""
         from tensordict import TensorDict
 
         elapsed = elapsed_fractions(self.episode_steps)
@@ -336,10 +336,10 @@ class PPO(Trainer):
     def _improve(
         self, source: Source, episodes: TensorDict, samples: TensorDict, scale: float, key: Sequence[int]
     ) -> _Improvement:
-        """Gradient steps on the combined loss (Eq. 7 of the paper), until the KL divergence is used up."""
+        """Take gradient steps on the combined loss (Eq. 7 of the paper), until the KL divergence is used up."""
         outcome = _Improvement()
         policy: Any = episodes["policy"].flatten(0, 1)
-        # What is indexed in every step; the rest of what the policy has entered would cost as much as the loss.
+        # Only the keys that a step needs: to index all that the policy has written would cost as much as the loss.
         data = policy.select(*self.actor.in_keys, CONTEXT, "action", "loc", "scale_tril", strict=False)
         samples = cast("TensorDict", samples.flatten(0, 1))
         advantage = samples["advantage"]
@@ -393,8 +393,8 @@ class PPO(Trainer):
         super().load_state_dict(state)
         gaussian = self.actor.gaussian
         with torch.no_grad():
-            for own, name in ((gaussian.log_std, "log_std"), (gaussian.mixing, "mixing")):
-                own.copy_(state["covariance"][name])
+            for parameter, name in ((gaussian.log_std, "log_std"), (gaussian.mixing, "mixing")):
+                parameter.copy_(state["covariance"][name])
         self.critic.load_state_dict(state["critic"])
         self.update.load_state_dict(state["update"])
         if self.models is not None:
@@ -403,7 +403,7 @@ class PPO(Trainer):
 
 @dataclass
 class _Improvement:
-    """What the gradient steps of one iteration did."""
+    """Result of the gradient steps of one iteration."""
 
     kl: float = 0.0
     steps: int = 0
@@ -417,7 +417,7 @@ class _Improvement:
 
 @dataclass
 class _Outcome:
-    """What one iteration, on the robot or on model rollouts, has done."""
+    """Result of one iteration, on the robot or on model rollouts."""
 
     episodes: TensorDict
     improvement: _Improvement
@@ -436,7 +436,7 @@ def _inputs(features: Features, episodes: TensorDict) -> Tensor:
     elapsed = elapsed_fractions(steps - 1).expand(states.shape[:-1])
     context = episodes.get(CONTEXT, None)
     context = None if context is None else context.unsqueeze(1).expand(-1, steps, -1)
-    return see(features, states, goals, elapsed, context)
+    return compute_features(features, states, goals, elapsed, context)
 
 
 def _batches(samples: int, steps: int, size: int | None, rng: np.random.Generator) -> Iterator[Tensor]:

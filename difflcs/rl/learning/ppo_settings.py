@@ -1,4 +1,4 @@
-"""Settings of the main phase (Algorithm 2), and PPO put together by them."""
+"""Settings of the main phase (Algorithm 2), and the function that makes PPO from them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from difflcs.errors import InvalidInputError
-from difflcs.lcs import LCSModule, LCSParams, LCSSequence
+from difflcs.records import LCSModule, LCSParams, LCSSequence
 from difflcs.rl.learning.advantages import GAEAdvantages, MultiActionAdvantages, RewardScale
 from difflcs.rl.learning.critic import Critic, CriticSettings
 from difflcs.rl.learning.model_rollouts import ModelRollouts
@@ -100,7 +100,7 @@ def make_ppo(
     failure_penalty: float = 0.0,
     models: ModelRollouts | None = None,
 ) -> PPO:
-    """PPO of the parts that its settings name.
+    """Make PPO from its settings.
 
     Args:
         actor: the policy, made with the deviation that the settings say.
@@ -112,7 +112,7 @@ def make_ppo(
         episode_steps: steps of one episode.
         first_episode: episodes collected before, by a warm-up.
         first_iteration: iterations done before.
-        failure_penalty: what the environment's last reward of a failed episode holds, see `TaskSpec`.
+        failure_penalty: part of the last reward of a failed episode, see `TaskSpec`.
         models: plays episodes in networks besides those of the robot; None: real ones alone, as in the paper. Let PPO
             `remember` the episodes of a warm-up.
 
@@ -142,10 +142,15 @@ def make_ppo(
     judge = GAEAdvantages(critic)
     practice = None
     if models is not None:
-        own = models.settings
-        many = MultiActionAdvantages(models.env, critic, features, scale, action_bounds(env), own.actions, own.zeta)
+        rollouts = models.settings
+        bounds = action_bounds(env)
+        many = MultiActionAdvantages(models.env, critic, features, scale, bounds, rollouts.actions, rollouts.zeta)
         practice = Source(
-            models.env, many if own.actions > 1 else judge, own.steps, settings.minibatch, own.value_epochs
+            models.env,
+            many if rollouts.actions > 1 else judge,
+            rollouts.steps,
+            settings.minibatch,
+            rollouts.value_epochs,
         )
     betas = settings.adam.betas
     deviation = Deviation(actor, settings.std_learning_rate, betas, settings.std_range)
@@ -171,8 +176,10 @@ def make_ppo(
 
 
 _UPDATES: dict[str, Callable[[Any, PPOSettings, Deviation], UpdateRule]] = {
-    "natural": lambda actor, own, deviation: NaturalUpdate(
-        actor, own.natural, own.target_kl, own.step_factor, deviation
+    "natural": lambda actor, settings, deviation: NaturalUpdate(
+        actor, settings.natural, settings.target_kl, settings.step_factor, deviation
     ),
-    "adam": lambda actor, own, deviation: AdamUpdate(actor, own.adam, own.target_kl, own.step_factor, deviation),
+    "adam": lambda actor, settings, deviation: AdamUpdate(
+        actor, settings.adam, settings.target_kl, settings.step_factor, deviation
+    ),
 }

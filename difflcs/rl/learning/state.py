@@ -1,7 +1,7 @@
 """State of a training as a plain tree: dictionaries of tensors, numbers and texts, as `state_dict()` gives them.
 
-One writer flattens a tree into tensors by path and JSON, one reader puts it together again, and one check compares a
-tree with that of the object it is for. What the check cannot know is tried: a part that refuses a state keeps its own.
+`flatten` splits a tree into tensors by path and JSON, `unflatten` joins them, and `check_state` compares a tree with
+that of the object it is for. `restore` loads it, or leaves the object as it was if the object refuses it.
 
 Two names in a tree have a meaning: below "settings" everything must be equal, and below "episodes" the tensors are
 data, any number of rows, as many in each.
@@ -22,17 +22,17 @@ from difflcs.errors import CheckpointError
 State = Mapping[str, Any]
 """Name → a tensor, a number, a text, None, or another such mapping."""
 SETTINGS, EPISODES, RANDOM = "settings", "episodes", "random"
-"""Below these everything must be equal; are rows of data; are states of NumPy's generators, with integers of any size.
-"""
+"""Names with a meaning: everything below must be equal; is rows of data; is a state of a NumPy generator, with integers
+of any size."""
 _SEPARATOR = "/"
 _REMEDY = "was it written with other settings, or by another method?"
 
 
 class Stateful(Protocol):
-    """What can be saved and go on."""
+    """An object whose state can be saved and restored."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that changes."""
+        """Return everything that changes."""
         ...
 
     def load_state_dict(self, state: State, /) -> Any:
@@ -41,7 +41,7 @@ class Stateful(Protocol):
 
 
 def flatten(state: State) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """A tree in two: path → tensor, and the rest, for JSON."""
+    """Split a tree in two: path → tensor, and the rest, for JSON."""
     tensors: dict[str, Tensor] = {}
     rest: dict[str, Any] = {}
     for name, value in state.items():
@@ -56,7 +56,7 @@ def flatten(state: State) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def unflatten(tensors: Mapping[str, Tensor], rest: State) -> dict[str, Any]:
-    """The tree that `flatten` took apart. A tensor whose path leads nowhere stays at the top, for `check_state`."""
+    """Join what `flatten` has split. A tensor whose path leads nowhere stays at the top, for `check_state`."""
     state = {name: unflatten({}, value) if isinstance(value, Mapping) else value for name, value in rest.items()}
     for path, tensor in tensors.items():
         *folders, name = path.split(_SEPARATOR)
@@ -71,7 +71,7 @@ def unflatten(tensors: Mapping[str, Tensor], rest: State) -> dict[str, Any]:
 
 
 def copy_state(state: State) -> dict[str, Any]:
-    """The same tree with tensors of its own."""
+    """Copy a tree and its tensors."""
     return {
         name: copy_state(value)
         if isinstance(value, Mapping)
@@ -82,70 +82,70 @@ def copy_state(state: State) -> dict[str, Any]:
     }
 
 
-def check_state(own: State, found: object, where: str = "checkpoint") -> None:
+def check_state(expected: State, state: object, where: str = "checkpoint") -> None:
     """Compare a tree with that of the object it is for.
 
     Args:
-        own: what the object's `state_dict` gives.
-        found: what was read.
-        where: what to call it in the message.
+        expected: the object's `state_dict`.
+        state: the tree to check.
+        where: its name in the message.
 
     Raises:
         CheckpointError: other names, another type, shape or dtype, a number that is not finite, or other settings.
     """
-    if not isinstance(found, Mapping):
-        raise CheckpointError(f"{where}: expected {sorted(own)}, got {short(found)}; {_REMEDY}")
-    if different := sorted(map(str, own.keys() ^ found.keys())):
-        raise CheckpointError(f"{where}: expected {short(sorted(own))}, got others: {short(different)}; {_REMEDY}")
-    for name, value in own.items():
-        _check(value, found[name], f"{where}.{name}")
+    if not isinstance(state, Mapping):
+        raise CheckpointError(f"{where}: expected {sorted(expected)}, got {short(state)}; {_REMEDY}")
+    if different := sorted(map(str, expected.keys() ^ state.keys())):
+        raise CheckpointError(f"{where}: expected {short(sorted(expected))}, got others: {short(different)}; {_REMEDY}")
+    for name, value in expected.items():
+        _check(value, state[name], f"{where}.{name}")
 
 
-def _check(own: Any, found: Any, where: str) -> None:
+def _check(expected: Any, value: Any, where: str) -> None:
     name = where.rpartition(".")[2]
     if name == SETTINGS:
-        if found != own:
-            raise CheckpointError(f"{where}: expected {short(own)}, got {short(found)}; {_REMEDY}")
-    elif isinstance(own, Mapping):
-        check_state(own, found, where)
-        if name == EPISODES and len({len(value) for value in found.values()}) > 1:
-            lengths = {key: len(value) for key, value in found.items()}
+        if value != expected:
+            raise CheckpointError(f"{where}: expected {short(expected)}, got {short(value)}; {_REMEDY}")
+    elif isinstance(expected, Mapping):
+        check_state(expected, value, where)
+        if name == EPISODES and len({len(rows) for rows in value.values()}) > 1:
+            lengths = {key: len(rows) for key, rows in value.items()}
             raise CheckpointError(f"{where}: expected as many of each, got {lengths}; is it damaged?")
-    elif isinstance(own, Tensor):
+    elif isinstance(expected, Tensor):
         data = f".{EPISODES}." in where
-        shape = tuple(own.shape)[data:]
-        if not isinstance(found, Tensor) or found.dtype != own.dtype or tuple(found.shape)[data:] != shape:
-            got = f"{tuple(found.shape)} {found.dtype}" if isinstance(found, Tensor) else short(found)
-            raise CheckpointError(f"{where}: expected {tuple(own.shape)} {own.dtype}, got {got}; {_REMEDY}")
-        if data and found.ndim != own.ndim:
-            raise CheckpointError(f"{where}: expected {own.ndim} dimensions, got {found.ndim}; {_REMEDY}")
-        if found.is_floating_point() and not bool(torch.isfinite(found).all()):
+        shape = tuple(expected.shape)[data:]
+        if not isinstance(value, Tensor) or value.dtype != expected.dtype or tuple(value.shape)[data:] != shape:
+            got = f"{tuple(value.shape)} {value.dtype}" if isinstance(value, Tensor) else short(value)
+            raise CheckpointError(f"{where}: expected {tuple(expected.shape)} {expected.dtype}, got {got}; {_REMEDY}")
+        if data and value.ndim != expected.ndim:
+            raise CheckpointError(f"{where}: expected {expected.ndim} dimensions, got {value.ndim}; {_REMEDY}")
+        if value.is_floating_point() and not bool(torch.isfinite(value).all()):
             raise CheckpointError(f"{where}: expected finite numbers, got NaN or infinity; is it damaged?")
-    elif not _alike(own, found, where):
+    elif not _is_compatible(expected, value, where):
         raise CheckpointError(
-            f"{where}: expected a {type(own).__name__} such as {short(own)}, got {short(found)}; {_REMEDY}"
+            f"{where}: expected a {type(expected).__name__} such as {short(expected)}, got {short(value)}; {_REMEDY}"
         )
 
 
-def _alike(own: Any, found: Any, where: str) -> bool:
-    if type(found) is not type(own):
+def _is_compatible(expected: Any, value: Any, where: str) -> bool:
+    if type(value) is not type(expected):
         return False
-    if isinstance(own, int) and not isinstance(own, bool):
-        return found >= 0 and (found < 2**63 or f".{RANDOM}." in where)
-    if isinstance(own, float):
-        return math.isfinite(found)
-    return not isinstance(own, str) or found == own
+    if isinstance(expected, int) and not isinstance(expected, bool):
+        return value >= 0 and (value < 2**63 or f".{RANDOM}." in where)
+    if isinstance(expected, float):
+        return math.isfinite(value)
+    return not isinstance(expected, str) or value == expected
 
 
 def restore(part: Stateful, state: State, where: str = "checkpoint") -> None:
-    """Let an object go on from a state, or leave it as it was.
+    """Load a state into an object, or leave it as it was.
 
     Raises:
         CheckpointError: the state is not one of this object.
     """
-    own = part.state_dict()
-    check_state(own, state, where)
-    before = copy_state(own)
+    current = part.state_dict()
+    check_state(current, state, where)
+    before = copy_state(current)
     try:
         part.load_state_dict(state)
     except Exception as error:  # numpy and torch refuse values in many ways
@@ -156,14 +156,14 @@ def restore(part: Stateful, state: State, where: str = "checkpoint") -> None:
 
 
 def moments(optimiser: torch.optim.Optimizer) -> dict[str, Any]:
-    """An optimiser's own tensors by the place of the parameter; its settings come from the configuration."""
-    return {str(place): dict(own) for place, own in optimiser.state_dict()["state"].items()}
+    """Return an optimiser's tensors by the place of the parameter; its settings come from the configuration."""
+    return {str(place): dict(tensors) for place, tensors in optimiser.state_dict()["state"].items()}
 
 
 def load_moments(optimiser: torch.optim.Optimizer, state: State) -> None:
     """Go on from what `moments` gave."""
     whole = optimiser.state_dict()
-    optimiser.load_state_dict({**whole, "state": {int(place): copy_state(own) for place, own in state.items()}})
+    optimiser.load_state_dict({**whole, "state": {int(place): copy_state(tensors) for place, tensors in state.items()}})
 
 
 def initialise_moments(optimiser: torch.optim.Optimizer) -> None:

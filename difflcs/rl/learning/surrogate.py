@@ -1,8 +1,8 @@
 """The loss of PPO: the clipped objective over the samples that are no outliers, and the violation loss beside it.
 
-Two things are our own, because they decide whether it learns:
+It differs from the usual loss in two points, which decide whether it learns:
 
-- Samples whose own KL divergence exceeds a limit are left out as outliers: there the MPC has jumped to another local
+- Samples whose KL divergence exceeds a limit are left out as outliers: there the MPC has jumped to another local
   optimum, and the derivative at the new one says nothing about the old one.
 - The KL divergence that is watched is a mean without its largest values (`trimmed_mean`): single jumps reach 17.
 """
@@ -23,7 +23,7 @@ from difflcs.rl.settings import ViolationLoss
 if TYPE_CHECKING:
     from tensordict import TensorDict, TensorDictBase
 
-    from difflcs.lcs import LCSModule
+    from difflcs.records import LCSModule
     from difflcs.rl.learning.policy import GaussianPolicy
 
 _VIOLATION_BATCH = 300
@@ -36,7 +36,7 @@ class Surrogate:
     Args:
         actor: the policy.
         clip: epsilon of the clipped objective.
-        outlier_kl: samples with a KL divergence above this have no say.
+        outlier_kl: samples with a KL divergence above this are left out.
         beta: weight of the clipped objective against the violation loss (Eq. 7 of the paper).
         violation: settings of the violation loss; None where there is no LCS.
     """
@@ -58,7 +58,7 @@ class Surrogate:
         seen: TensorDict,
         rng: np.random.Generator,
     ) -> Tensor:
-        """The loss of a batch.
+        """Compute the loss of a batch.
 
         Args:
             new: (B,) the policy now.
@@ -83,8 +83,8 @@ class Surrogate:
             chosen = torch.from_numpy(rng.permutation(len(x))[:_VIOLATION_BATCH])
             lcs = cast("LCSModule", self.lcs)
             part = (x[chosen], u[chosen], x_next[chosen], self.violation.gamma, self.violation.xi)
-            given = None if context is None else context[chosen]
-            loss = loss + (1 - self.beta) * violation_loss(lcs, *part, context=given)
+            chosen_context = None if context is None else context[chosen]
+            loss = loss + (1 - self.beta) * violation_loss(lcs, *part, context=chosen_context)
         return loss
 
 

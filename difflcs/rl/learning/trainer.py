@@ -1,4 +1,4 @@
-"""What every trainer is: an object that can be stopped between iterations, saved, and resumed with the same result."""
+"""Base class of the trainers, which can be stopped between iterations, saved, and resumed with the same result."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ AfterStep = Callable[[int], object]
 """Called after every step of the environments with the number of episodes that were stepped, for progress bars."""
 
 
-class Learned(Protocol):
-    """What a training learns and leaves behind: an `LCSModel`, any other module, an ensemble of networks.
+class TrainableModel(Protocol):
+    """An object that a trainer changes and saves: an `LCSModel`, any other module, an ensemble of networks.
 
-    Besides the two methods it may have `config()`, what is needed besides the tensors to build it again (JSON types
+    It may also have `config()`, which returns what its class needs besides the tensors to build it again (JSON types
     only), and `save_pretrained(directory)`, which writes it into a directory, atomically.
     """
 
@@ -43,13 +43,13 @@ class Trainer(ABC):
     were.
 
     Args:
-        learned: what is trained, in place.
-        policy: what acts by it, without noise.
+        learned: the model to train, in place.
+        policy: acts by the model, without noise.
         seed: of everything random.
         episode_steps: steps of one episode.
     """
 
-    def __init__(self, learned: Learned, policy: Policy, seed: int, episode_steps: int):
+    def __init__(self, learned: TrainableModel, policy: Policy, seed: int, episode_steps: int):
         self.learned, self.policy = learned, policy
         self.seed = check_positive_int("seed", seed, minimum=0)
         self.episode_steps = check_positive_int("episode_steps", episode_steps)
@@ -68,11 +68,11 @@ class Trainer(ABC):
         """One iteration; returns its report, a dataclass."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to go on with the same result. Subclasses add to it."""
+        """State from which to resume with the same result. Subclasses add to it."""
         return {"iteration": self.iteration, "collected": self.episodes, "learned": learned_state(self.learned)}
 
     def load_state_dict(self, state: State) -> None:
-        """Go on from a state; checked by whoever calls it, see `load`. Subclasses add to it."""
+        """Resume from a state that the caller has checked, see `load`. Subclasses add to it."""
         self.iteration, self.episodes = state["iteration"], state["collected"]
         self.learned.load_state_dict(state["learned"]["parameters"])
 
@@ -85,16 +85,16 @@ class Trainer(ABC):
         restore(self, state)
 
 
-def learned_state(learned: Learned) -> dict[str, Any]:
-    """What was learned, as a part of a state."""
+def learned_state(learned: TrainableModel) -> dict[str, Any]:
+    """Return the part of a state that holds the model."""
     state = {"settings": configuration(learned), "parameters": dict(learned.state_dict())}
     if isinstance(learned, LCSModel) and not untouched(learned):
         state["plain"] = plain_state(learned)  # for readers that cannot build it as it is
     return state
 
 
-def configuration(learned: Learned) -> dict[str, Any]:
-    """What tells it from others besides its tensors: its `config()`, or the name of its class and its sizes."""
+def configuration(learned: TrainableModel) -> dict[str, Any]:
+    """Return the configuration of a model: its `config()`, or the name of its class and its sizes."""
     config: Any = getattr(learned, "config", None)
     if callable(config):
         return config()  # pyright: ignore[reportReturnType]
@@ -102,8 +102,8 @@ def configuration(learned: Learned) -> dict[str, Any]:
     return {"class": type(learned).__name__, **sizes}
 
 
-def save_learned(learned: Learned, directory: Path, kind: str | None = None) -> None:
-    """Write it into a directory, atomically: by its `save_pretrained`, else as a record of a kind, or of its class."""
+def save_learned(learned: TrainableModel, directory: Path, kind: str | None = None) -> None:
+    """Write a model into a directory, atomically: by its `save_pretrained`, else as a record of `kind` or its class."""
     save = getattr(learned, "save_pretrained", None)
     if callable(save):
         save(directory)

@@ -11,21 +11,22 @@ import torch
 from torch import Tensor
 
 from difflcs.errors import InvalidInputError
-from difflcs.lcs import LCSModel, LCSModule
+from difflcs.lcs import LCSModel
 from difflcs.losses import violation_loss
-from difflcs.rl.learning.learned import check_depends, check_module
+from difflcs.records import LCSModule
+from difflcs.rl.learning.checks import check_depends, check_module
 from difflcs.rl.learning.state import State
 from difflcs.rl.learning.trainer import AfterStep, Trainer
 from difflcs.rl.rollout import (
     Policy,
     action_bounds,
+    append_episodes,
     collect,
     contexts,
-    episodes_from,
-    episodes_state,
-    extended,
+    episodes_from_state,
+    episodes_to_state,
+    make_empty_record,
     mpc_actions,
-    no_episodes,
     noisy_actions,
     transitions,
     uniform_actions,
@@ -69,7 +70,7 @@ class WarmupSettings(Settings):
 
 
 def action_support(actions: Tensor, scale: float, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Bounds within which the model has seen actions: mean ± scale · std, intersected with [low, high].
+    """Compute the bounds of the actions that the model has seen: mean ± scale · std, intersected with [low, high].
 
     Args:
         actions: (..., n_u) executed actions, all within [low, high].
@@ -87,7 +88,7 @@ def action_support(actions: Tensor, scale: float, low: Tensor, high: Tensor) -> 
 
 @dataclass
 class Fit:
-    """What one training call did.
+    """Result of one training call.
 
     Attributes:
         loss: mean of its last ten minibatch losses.
@@ -121,14 +122,14 @@ def fit(
         settings: step size, minibatch, loss.
         epochs: passes over the data.
         rng: draws the split and the minibatches.
-        context: (N, n_context) given to the module, where its system depends on one.
+        context: (N, n_context) of the module, if its system depends on one.
 
     Returns:
         Losses and the number of steps.
 
     Raises:
         GammaError: gamma of the loss is too large for this model.
-        InvalidInputError: there is nothing to learn in the module, or its system does not depend on it.
+        InvalidInputError: the module has no learnable parameter, or its system does not depend on one.
     """
     module = check_module(lcs)
     gamma, xi = settings.loss.gamma, settings.loss.xi
@@ -144,8 +145,8 @@ def fit(
     for _ in range(epochs):
         shuffled = train[torch.from_numpy(rng.permutation(n_train))][: n_train - n_train % size]
         parts = [v[shuffled].split(size) for v in (x, u, x_next)]
-        given = [None] * len(parts[0]) if context is None else context[shuffled].split(size)
-        for x_batch, u_batch, next_batch, context_batch in zip(*parts, given, strict=True):
+        context_batches = [None] * len(parts[0]) if context is None else context[shuffled].split(size)
+        for x_batch, u_batch, next_batch, context_batch in zip(*parts, context_batches, strict=True):
             loss = violation_loss(lcs, x_batch, u_batch, next_batch, gamma, xi, context=context_batch)
             check_depends(loss)
             adam.zero_grad()
@@ -156,8 +157,8 @@ def fit(
             steps += 1
     with torch.no_grad():
         held_out = (x[rest], u[rest], x_next[rest], gamma, xi)
-        given = None if context is None else context[rest]
-        left_out = violation_loss(lcs, *held_out, context=given) if len(rest) else None
+        rest_context = None if context is None else context[rest]
+        left_out = violation_loss(lcs, *held_out, context=rest_context) if len(rest) else None
     return Fit(float(torch.stack(recent).mean()), None if left_out is None else float(left_out), steps)
 
 
@@ -207,8 +208,8 @@ class Warmup(Trainer):
         pretrained: the model is already useful: skip the random episodes and the long first training.
 
     Raises:
-        InvalidInputError: too few environments, or a model that has nothing to learn or other sizes than they.
-        DTypeError: something else instead of a model.
+        InvalidInputError: too few environments, or a model without learnable parameters or with other sizes.
+        DTypeError: `lcs` is no model.
     """
 
     def __init__(
@@ -227,7 +228,7 @@ class Warmup(Trainer):
             raise InvalidInputError(f"env: expected at least {needed} environments, got {env.num_envs}")
         self.lcs, self.env, self.settings, self.pretrained = lcs, env, settings, pretrained
         self.low, self.high = action_bounds(env)
-        self.buffer = no_episodes(env, episode_steps)
+        self.buffer = make_empty_record(env, episode_steps)
         """Newest episodes."""
         self.bounds = (self.low, self.high)
         """Action bounds of the last collected episodes."""
@@ -241,7 +242,7 @@ class Warmup(Trainer):
         start = time.perf_counter()
         episodes = self._collect(after_step)
         collected = time.perf_counter()
-        self.buffer = extended(self.buffer, episodes, self.settings.buffer)
+        self.buffer = append_episodes(self.buffer, episodes, self.settings.buffer)
         if isinstance(self.lcs, LCSModel) and self.lcs.action_support is not None:
             self.lcs.action_support.copy_(torch.stack(self.bounds))
         first = self.iteration == 0 and not self.pretrained
@@ -284,7 +285,7 @@ class Warmup(Trainer):
         generators = {"actions": self._actions, "minibatches": self._minibatches}
         return {
             **super().state_dict(),
-            "episodes": episodes_state(self.buffer),
+            "episodes": episodes_to_state(self.buffer),
             "bounds": {"low": self.bounds[0], "high": self.bounds[1]},
             "random": {name: generator.bit_generator.state for name, generator in generators.items()},
         }
@@ -293,7 +294,7 @@ class Warmup(Trainer):
         """See `Trainer`."""
         super().load_state_dict(state)
         self._actions, self._minibatches = (_generator(state["random"][k]) for k in ("actions", "minibatches"))
-        self.buffer = episodes_from(state["episodes"])
+        self.buffer = episodes_from_state(state["episodes"])
         self.bounds = (state["bounds"]["low"], state["bounds"]["high"])
 
 

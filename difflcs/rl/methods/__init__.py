@@ -1,4 +1,4 @@
-"""Methods: how something is learned, a file each. Others register theirs by `register_method`."""
+"""Methods of learning, one file each. Other packages register theirs by `register_method`."""
 
 from difflcs.rl.methods.base import (
     LCSMethod,

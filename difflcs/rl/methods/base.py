@@ -8,8 +8,8 @@
 
         def trainer(self, work): ...
 
-A method is a frozen dataclass whose fields are its settings; the default instance is the method as it is meant. Where
-this was imported, `train(...)` and the command line know it: `difflcs train --method mine --epochs 20`, `evaluate`,
+A method is a frozen dataclass whose fields are its settings, with the recommended ones as defaults. Once its module is
+imported, `train(...)` and the command line know it: `difflcs train --method mine --epochs 20`, `evaluate`,
 `render`; and the conformance suite of the methods tests it. `LCSMethod` is the base of those that learn an `LCSModel`,
 `Method` of all others.
 """
@@ -26,12 +26,13 @@ from torch import Tensor
 
 from difflcs._checks import did_you_mean
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
-from difflcs.lcs import LCSModel, LCSModule
+from difflcs.lcs import LCSModel
 from difflcs.mpc.backends import get_backend
+from difflcs.records import LCSModule
 from difflcs.rl.learning.trainer import Trainer
 from difflcs.rl.rollout import Policy
 from difflcs.rl.settings import Settings, bounded
-from difflcs.rl.tasks import TaskSpec, one_start
+from difflcs.rl.tasks import TaskSpec, single_start_backend
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Work:
-    """What a method is to learn, and with what.
+    """The task of a training and the means for it.
 
     Attributes:
         task: the task.
@@ -60,14 +61,14 @@ class Work:
 
 @dataclass(frozen=True)
 class Method(Settings, ABC):
-    """How something is learned. Subclass as a frozen dataclass whose fields are its settings.
+    """Base of the methods of learning. Subclass as a frozen dataclass whose fields are its settings.
 
     Attributes:
         name: its name, on the command line too.
         version: raised whenever the same settings give another result.
         summary: what it does, in one line.
         reports: dataclasses that its trainer's `step` returns; their fields are the columns of log.csv.
-        kind: of the record that what it learned is written as.
+        kind: kind of the record that the learned model is written as.
         takes_init: whether it can start from an `LCSModel`.
     """
 
@@ -80,11 +81,11 @@ class Method(Settings, ABC):
 
     @abstractmethod
     def trainer(self, work: Work) -> Trainer:
-        """What learns: one iteration at a time, with reports of the types in `reports`."""
+        """Make the trainer, which learns one iteration at a time and returns reports of the types in `reports`."""
 
     @abstractmethod
     def rebuild(self, task: TaskSpec, config: Mapping[str, object], tensors: Mapping[str, Tensor], source: str) -> Any:
-        """What was learned, out of its configuration and its tensors; `source` names them in the error messages.
+        """Rebuild the learned model from its configuration and its tensors; `source` names them in the error messages.
 
         Raises:
             CheckpointError: they do not fit each other or the task.
@@ -92,7 +93,7 @@ class Method(Settings, ABC):
 
     @abstractmethod
     def policy(self, task: TaskSpec, learned: Any) -> Policy:
-        """What acts by what was learned, without noise."""
+        """Make the policy of the learned model, without noise."""
 
     @property
     def solver(self) -> str | None:
@@ -100,14 +101,14 @@ class Method(Settings, ABC):
         return None
 
     def check(self, minutes: float) -> None:
-        """Refuse what cannot be trained, before anything is written.
+        """Raise if the method cannot be trained, before anything is written.
 
         Raises:
             InvalidInputError: the minutes of data do not fit the settings, or a solver is missing.
         """
 
     def smoke(self) -> Self:
-        """The same in seconds: too little of everything to learn anything."""
+        """Return a copy that runs in seconds: too little of everything to learn anything."""
         return self
 
 
@@ -146,10 +147,10 @@ class LCSMethod(Method):
 
     def policy(self, task: TaskSpec, learned: LCSModule) -> LCSMPCLayer:
         """See `Method`."""
-        return task.make_policy(learned, one_start(self.backend))
+        return task.make_policy(learned, single_start_backend(self.backend))
 
     def initial(self, work: Work) -> LCSModule:
-        """The model to start from. Override it, with `kind` and `rebuild`, to learn a module of your own."""
+        """Make the model to start from. Override it, with `kind` and `rebuild`, to learn a module of your own."""
         if work.init is not None:
             return work.init
         return LCSModel(
@@ -164,7 +165,7 @@ class LCSMethod(Method):
 
 
 def check_fits(lcs: LCSModel, task: TaskSpec, source: object, error: type[Exception] = InvalidInputError) -> None:
-    """Refuse a model of other sizes than a task's, or in single precision, by an error of the given kind."""
+    """Raise `error` unless a model has the sizes of the task and double precision."""
     got = f"n_x={lcs.n_x}, n_u={lcs.n_u}, {str(lcs.A.dtype).removeprefix('torch.')}"
     wanted = f"n_x={task.n_x}, n_u={task.n_u}, float64"
     if got != wanted:

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from difflcs.errors import CheckpointError, InvalidInputError
-from difflcs.lcs import LCSModule
 from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.backends import get_backend
+from difflcs.records import LCSModule
 from difflcs.rl.learning.model_rollouts import ModelRolloutSettings
 from difflcs.rl.learning.phases import LCSRL
 from difflcs.rl.learning.physics_fit import PhysicsFit, PhysicsFitReport, PhysicsFitSettings
@@ -23,7 +23,7 @@ from difflcs.rl.learning.trainer import Trainer, configuration
 from difflcs.rl.methods.base import Method, Work
 from difflcs.rl.methods.phases import main_phase, short_main, short_models
 from difflcs.rl.settings import bounded, group
-from difflcs.rl.tasks import PhysicsSpec, TaskSpec, one_start
+from difflcs.rl.tasks import PhysicsSpec, TaskSpec, single_start_backend
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class ContactMethod(Method):
         """See `Method`.
 
         Raises:
-            InvalidInputError: nothing is known of the task's physics.
+            InvalidInputError: the task has no known physics.
         """
         task, spec = work.task, known_physics(work.task)
         lcs = spec.make_system()
@@ -83,24 +83,24 @@ class ContactMethod(Method):
     ) -> LCSModule:
         """See `Method`."""
         lcs = known_physics(task).make_system()
-        if not _alike(dict(config), configuration(lcs)):
+        if not _nearly_equal(dict(config), configuration(lcs)):
             raise CheckpointError(
                 f"{source}: expected what is known of task {task.name} to be as when it was learned, got another "
                 f"physics; is the object's mesh there in one place, and a stand-in in the other?"
             )
-        own = lcs.state_dict()
-        shapes = {name: tuple(value.shape) for name, value in own.items()}
+        state = lcs.state_dict()
+        shapes = {name: tuple(value.shape) for name, value in state.items()}
         if shapes != {name: tuple(value.shape) for name, value in tensors.items()}:
             raise CheckpointError(f"{source}: expected tensors {shapes}, got others; the file is foreign or corrupt")
         for name, value in tensors.items():
-            if value.dtype != own[name].dtype or not bool(torch.isfinite(value).all()):
-                raise CheckpointError(f"{source}: expected finite {own[name].dtype} values in {name}; is it damaged?")
+            if value.dtype != state[name].dtype or not bool(torch.isfinite(value).all()):
+                raise CheckpointError(f"{source}: expected finite {state[name].dtype} values in {name}; is it damaged?")
         lcs.load_state_dict(dict(tensors))
         return lcs
 
     def policy(self, task: TaskSpec, learned: LCSModule) -> LCSMPCLayer:
         """See `Method`: the MPC as `PhysicsSpec` says."""
-        return task.make_policy(learned, one_start(self.backend), known_physics(task))
+        return task.make_policy(learned, single_start_backend(self.backend), known_physics(task))
 
     def smoke(self) -> Self:
         """See `Method`."""
@@ -113,22 +113,22 @@ class ContactMethod(Method):
         )
 
 
-def _alike(one: Any, other: Any) -> bool:
-    """Whether two configurations are equal but for rounding, which another machine may do differently."""
+def _nearly_equal(one: Any, other: Any) -> bool:
+    """Return True if two configurations are equal up to rounding, in which machines differ."""
     if isinstance(one, Mapping) and isinstance(other, Mapping):
-        return one.keys() == other.keys() and all(_alike(value, other[name]) for name, value in one.items())
+        return one.keys() == other.keys() and all(_nearly_equal(value, other[name]) for name, value in one.items())
     if isinstance(one, list) and isinstance(other, list):
-        return len(one) == len(other) and all(map(_alike, one, other))
+        return len(one) == len(other) and all(map(_nearly_equal, one, other))
     if isinstance(one, float) and isinstance(other, float):
         return math.isclose(one, other, rel_tol=1e-6, abs_tol=1e-9)
     return type(one) is type(other) and one == other
 
 
 def known_physics(task: TaskSpec) -> PhysicsSpec:
-    """What is known of a task's physics.
+    """Return the known physics of a task.
 
     Raises:
-        InvalidInputError: nothing.
+        InvalidInputError: the task has none.
     """
     if task.physics is None:
         raise InvalidInputError(

@@ -57,13 +57,13 @@ class PDDMMethod(Method):
 
     def smoke(self) -> Self:
         """See `Method`."""
-        ensemble, own = self.pddm.ensemble, self.pddm
+        ensemble, settings = self.pddm.ensemble, self.pddm
         return replace(
             self,
             pddm=replace(
-                own,
-                rollouts=few_rollouts(own.rollouts),
-                samples=min(own.samples, 10),
+                settings,
+                rollouts=few_rollouts(settings.rollouts),
+                samples=min(settings.samples, 10),
                 ensemble=replace(ensemble, epochs=short_epochs(ensemble.epochs, 2, 2)),
             ),
         )

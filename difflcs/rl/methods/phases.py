@@ -1,11 +1,11 @@
-"""Phases that methods share, made from their settings, and short forms of these settings for smoke tests."""
+"""The phases that several methods share, and short versions of their settings for smoke tests."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from difflcs.lcs import LCSModule
 from difflcs.mpc import LCSMPCLayer
+from difflcs.records import LCSModule
 from difflcs.rl.learning.mlp import MLPController
 from difflcs.rl.learning.model_rollouts import ModelRollouts, ModelRolloutSettings
 from difflcs.rl.learning.ppo import PPO
@@ -17,7 +17,7 @@ from difflcs.rl.settings import Epochs, Rollouts
 
 
 def warmup_phase(work: Work, lcs: LCSModule, policy: Policy, settings: WarmupSettings) -> Warmup:
-    """The warm-up by its settings."""
+    """Make the warm-up from its settings."""
     envs = work.make_envs(max(settings.rollouts.first, settings.rollouts.each))
     return Warmup(lcs, policy, envs, settings, work.seed, work.task.episode_steps, work.init is not None)
 
@@ -30,7 +30,7 @@ def main_phase(
     first_episode: int = 0,
     first_iteration: int = 0,
 ) -> PPO:
-    """PPO by its settings, from the episodes and iterations done before."""
+    """Make PPO from its settings, to continue after earlier episodes and iterations."""
     # Here and not above: TorchRL takes seconds to import, which `difflcs --help` should not wait for.
     from difflcs.rl.learning.policy import make_actor
 
@@ -55,12 +55,12 @@ def main_phase(
 
 
 def few_rollouts(settings: Rollouts) -> Rollouts:
-    """At most five episodes per iteration, see `Method.smoke`."""
+    """Limit settings to five episodes per iteration, see `Method.smoke`."""
     return replace(settings, first=min(settings.first, 5), each=min(settings.each, 5))
 
 
 def short_epochs(settings: Epochs, first: int, each: int) -> Epochs:
-    """No more epochs than these, see `Method.smoke`."""
+    """Limit settings to so many epochs, see `Method.smoke`."""
     return replace(settings, first=min(settings.first, first), each=min(settings.each, each))
 
 

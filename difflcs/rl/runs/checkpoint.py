@@ -147,7 +147,7 @@ class RunDirectory:
 
     @staticmethod
     def check_free(path: Path) -> None:
-        """Refuse a path where there are files.
+        """Raise if there are files at a path.
 
         Raises:
             CheckpointError: something is there already.
@@ -180,7 +180,7 @@ class RunDirectory:
         return run
 
     def config(self) -> dict[str, object]:
-        """What the run was started with.
+        """Read the configuration that the run was started with.
 
         Raises:
             CheckpointError: config.json is not JSON, or not of a run.
@@ -197,25 +197,25 @@ class RunDirectory:
         return config
 
     def finished(self) -> bool:
-        """Whether the final model is there."""
+        """Return True if the final model is there."""
         return (self.model / "config.json").is_file()
 
     def learned(self, kind: str) -> tuple[dict[str, object], dict[str, Tensor]]:
-        """What was learned: its configuration and its tensors; of an unfinished run those of the latest checkpoint.
+        """Read configuration and tensors of the learned model: the final one, else that of the latest checkpoint.
 
         Args:
-            kind: of a record, as the learned class writes it.
+            kind: kind of the record, as the class of the model writes it.
 
         Raises:
             CheckpointError: there is none, or it is of another kind.
         """
         if self.finished():
             return _storage.load_record(self.model, kind)
-        found = load_checkpoint(self.checkpoints).get("learned")
-        tensors = "plain" if isinstance(found, dict) and "plain" in found else "parameters"
-        if not isinstance(found, dict) or not all(isinstance(found.get(k), dict) for k in ("settings", tensors)):
-            raise CheckpointError(f"{self.checkpoints}: expected what was learned, got {_storage.short(found)}")
-        return found["settings"], found[tensors]
+        state = load_checkpoint(self.checkpoints).get("learned")
+        tensors = "plain" if isinstance(state, dict) and "plain" in state else "parameters"
+        if not isinstance(state, dict) or not all(isinstance(state.get(k), dict) for k in ("settings", tensors)):
+            raise CheckpointError(f"{self.checkpoints}: expected what was learned, got {_storage.short(state)}")
+        return state["settings"], state[tensors]
 
     def append(self, row: Mapping[str, object]) -> None:
         """Add one row to log.csv; None becomes an empty cell."""
@@ -236,8 +236,8 @@ class RunDirectory:
         except FileNotFoundError:
             return []
         try:
-            found = csv.DictReader(line for line in lines if line.endswith("\n"))
-            rows = [row for row in found if None not in row and None not in row.values()]
+            reader = csv.DictReader(line for line in lines if line.endswith("\n"))
+            rows = [row for row in reader if None not in row and None not in row.values()]
             for row in rows:
                 int(row["iteration"])
                 for cell in filter(None, row.values()):
@@ -283,7 +283,7 @@ def writing(path: Path) -> Iterator[None]:
 
 @contextmanager
 def replacing(out: Path) -> Iterator[Callable[[], object]]:
-    """Move the run in `out` aside; calling what is yielded deletes it, otherwise it comes back at the end."""
+    """Move the run in `out` aside. The yielded function deletes it; unless called, the run comes back at the end."""
     out = out.resolve()
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         yield lambda: None

@@ -11,16 +11,15 @@ from torch import Tensor
 
 from difflcs._checks import check_positive_int, describe
 from difflcs.errors import DTypeError
-from difflcs.lcs import LCSModule, LCSParams
-from difflcs.records import system_at
+from difflcs.records import LCSModule, LCSParams, system_at
 from difflcs.rl.rollout import Act
 
 Predict = Callable[..., Tensor]
 """States (B, n_x), actions (B, n_u) → states one step later. A context, where there is one, is the third argument."""
 
 
-def predicted_by(model: LCSModule | LCSParams) -> Predict:
-    """One step of an LCS through its exact LCP, without gradient."""
+def make_predictor(model: LCSModule | LCSParams) -> Predict:
+    """Make a function that predicts one step of an LCS through its exact LCP, without gradient."""
 
     def predict(state: Tensor, action: Tensor, context: Tensor | None = None) -> Tensor:
         with torch.no_grad():
@@ -32,8 +31,8 @@ def predicted_by(model: LCSModule | LCSParams) -> Predict:
     return predict
 
 
-def late_actions(act: Act, n_u: int, steps: int = 1, predict: Predict | None = None) -> Act:
-    """Execute what is planned from a state some steps later. Until the first plan is there, the action is zero.
+def delay_actions(act: Act, n_u: int, steps: int = 1, predict: Predict | None = None) -> Act:
+    """Make a policy whose actions are executed some steps late. Until the first plan is there, the action is zero.
 
     For one call of `difflcs.rl.rollout.collect`.
 

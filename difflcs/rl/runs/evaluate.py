@@ -13,9 +13,9 @@ from torch import Tensor
 
 from difflcs._checks import check_positive_int
 from difflcs.errors import InvalidInputError
-from difflcs.lcs import LCSModule, LCSParams
+from difflcs.records import LCSModule, LCSParams
 from difflcs.rl.rollout import Policy, action_bounds, collect, mpc_actions
-from difflcs.rl.runs.delay import late_actions, predicted_by
+from difflcs.rl.runs.delay import delay_actions, make_predictor
 from difflcs.rl.seeding import Stream, episode_seeds
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ def evaluate(
         act = mpc_actions(policy, u_min, u_max)
         if delay:
             n_u = len(action_bounds(env)[0])
-            act = late_actions(act, n_u, delay, None if model is None else predicted_by(model))
+            act = delay_actions(act, n_u, delay, None if model is None else make_predictor(model))
         parts.append(collect(env, act, episode_seeds(seed, Stream.EVALUATION, first, count), episode_steps, report))
     successes = sum(int(part["success"].sum()) for part in parts)
     low, high = wilson_interval(successes, goals)

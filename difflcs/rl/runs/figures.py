@@ -1,4 +1,4 @@
-"""What a run looks like: its learning curve, and a video of its policy."""
+"""Figures of a run: its learning curve, and a video of its policy."""
 
 from __future__ import annotations
 
@@ -104,14 +104,14 @@ def record_video(
 
     Args:
         env: one environment of the task with render_mode="rgb_array".
-        policy: what acts.
+        policy: the policy to play.
         goals: goals, played one after another.
         path: where to write; replaced atomically.
         task: the task.
         seed: of the initial states.
 
     Returns:
-        For each goal, whether it was reached.
+        For each goal, True if it was reached.
 
     Raises:
         InvalidInputError: a goal is outside the goal space.
@@ -141,8 +141,8 @@ def record_video(
                 for step in range(1, task.episode_steps + 1):
                     state = torch.from_numpy(np.asarray(observation["state"], np.float64)[None])
                     context = [observation[CONTEXT]] if CONTEXT in observation else []
-                    given = [torch.from_numpy(np.asarray(value, np.float64)[None]) for value in (goal, *context)]
-                    action, _ = act(state, *given)
+                    inputs = [torch.from_numpy(np.asarray(value, np.float64)[None]) for value in (goal, *context)]
+                    action, _ = act(state, *inputs)
                     observation, _, _, _, info = env.step(action[0])
                     verdict = "" if step < task.episode_steps else ("reached" if info["success"] else "missed")
                     text = f"{title}    {step * task.step_seconds:.1f} s    {task.say(info)}"

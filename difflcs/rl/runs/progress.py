@@ -1,7 +1,7 @@
-"""What a long work shows of its progress: a bar on a terminal, plain lines elsewhere.
+"""Progress of long work: a bar on a terminal, plain lines elsewhere.
 
-The lines are records of the logger "difflcs": `logging.basicConfig(level=logging.INFO)` shows them in a program of
-one's own, and the command line shows them by itself.
+The lines are records of the logger "difflcs": `logging.basicConfig(level=logging.INFO)` shows them in your
+program, and the command line shows them by itself.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from difflcs._optional import require
 from difflcs.rl.runs.evaluate import Evaluation
-from difflcs.rl.runs.training import ITERATIONS, Reporter, notable
+from difflcs.rl.runs.training import ITERATIONS, Reporter, summarise_report
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 LIBRARY = logging.getLogger("difflcs")
 _LOG = logging.getLogger(__name__)
 _SECONDS = 5.0
-"""Between two lines about one work."""
+"""Seconds between two lines about one work."""
 
 
 def bar(total: int, label: str) -> tqdm | Lines:
-    """A progress bar on a terminal, a line every few seconds elsewhere."""
+    """Make a progress bar on a terminal, or log a line every few seconds elsewhere."""
     if not sys.stderr.isatty():
         return Lines(total, label)
     require("tqdm")
@@ -36,7 +36,7 @@ def bar(total: int, label: str) -> tqdm | Lines:
 
 
 class Lines:
-    """Stands for a progress bar where there is no terminal."""
+    """Replacement of a progress bar where there is no terminal."""
 
     def __init__(self, total: int, label: str):
         self.total, self.label, self.done, self.last = total, label, 0, time.monotonic()
@@ -45,10 +45,10 @@ class Lines:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Nothing is open."""
+        """Do nothing: there is nothing to close."""
 
     def update(self, count: int) -> None:
-        """Count what was done, and say it now and then."""
+        """Count finished work, and log it now and then."""
         self.done += count
         now = time.monotonic()
         if now - self.last >= _SECONDS:
@@ -96,7 +96,7 @@ class Progress(Reporter):
     def iterated(self, report: Any) -> None:
         """Show loss, KL divergence and success beside it."""
         if self.bar is not None:
-            self.bar.set_postfix(notable(report))
+            self.bar.set_postfix(summarise_report(report))
 
     def evaluating(self, minutes: float, goals: int) -> None:
         """Say that an evaluation runs."""

@@ -22,11 +22,11 @@ class TrainedPolicy:
     Attributes:
         name: the run directory, or "zoo:NAME".
         task: what it was trained for.
-        method: how.
+        method: name of the method.
         backend: MPC solver; None without one.
         policy: from states and goals to plans.
-        finished: whether the training is.
-        object: what it was trained on, as the environment described it; None if it did not.
+        finished: True if its training is.
+        object: description of what it was trained on, by the environment; None if there is none.
         run: the run, if it is one.
         card: the card, if it is a model of the zoo.
     """
@@ -43,7 +43,7 @@ class TrainedPolicy:
 
     @classmethod
     def open(cls, source: Path | str) -> TrainedPolicy:
-        """Load it.
+        """Load a trained policy.
 
         Args:
             source: run directory, or "zoo:NAME".
@@ -61,14 +61,16 @@ class TrainedPolicy:
             policy = method.policy(task, learned)
             return cls(name, known.task, known.method, known.backend, policy, True, known.object, card=known)
         run = RunDirectory.open(source)
-        config, found = stored_config(run), run.config().get("object")
-        found = found if isinstance(found, dict) else None
-        if found is not None:
-            zoo.check_object(found, name)
+        config, description = stored_config(run), run.config().get("object")
+        description = description if isinstance(description, dict) else None
+        if description is not None:
+            zoo.check_object(description, name)
         method = config.method
-        return cls(name, config.task, method.name, method.solver, load_policy(run), run.finished(), found, run=run)
+        return cls(
+            name, config.task, method.name, method.solver, load_policy(run), run.finished(), description, run=run
+        )
 
-    def fits(self, found: Mapping[str, Any]) -> bool:
-        """Whether an environment holds what it was trained on, as far as both say; True if that is not known."""
-        own = self.object or {}
-        return all(own[key] == found[key] for key in own.keys() & found.keys())
+    def fits(self, description: Mapping[str, Any]) -> bool:
+        """Return True unless the description of an environment differs from that of the training in a common key."""
+        known = self.object or {}
+        return all(known[key] == description[key] for key in known.keys() & description.keys())

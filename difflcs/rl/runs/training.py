@@ -35,12 +35,12 @@ EVALUATION_ENVS = 50
 _DIRECTORY = "runs/{task}-{method}-{seed}"
 _LOG = logging.getLogger(__name__)
 ITERATIONS = _LOG.getChild("iterations")
-"""Logger of the lines about single iterations, for who wants the others alone."""
+"""Logger of the lines about single iterations, which can be silenced without the others."""
 
 
 @dataclass(frozen=True)
 class TrainConfig(Settings):
-    """What is trained, on how much data, and when it is evaluated."""
+    """Configuration of a training: task, method, amount of data, and evaluations."""
 
     task: str = "cube"
     """What to do: the name of a task."""
@@ -94,7 +94,7 @@ class TrainConfig(Settings):
             raise CheckpointError(f"config: its values cannot be used: {error}") from error
 
     def smoke(self) -> TrainConfig:
-        """The same in seconds: too little data to learn anything."""
+        """Return a copy that runs in seconds: too little data to learn anything."""
         return replace(
             self,
             minutes=min(self.minutes, 0.5),
@@ -114,7 +114,7 @@ class TrainConfig(Settings):
 
 
 class Reporter:
-    """Hears what a training does; override what is wanted."""
+    """Base of the listeners to a training; override the methods that you need."""
 
     def started(self, done: int, total: int) -> None:
         """The training starts with `done` of `total` environment steps collected."""
@@ -149,7 +149,7 @@ def train(
     directory is locked meanwhile. The logger "difflcs" tells of iterations and evaluations, at level INFO.
 
     Args:
-        config: what to train; LCS-RL on `task` by default. When resuming, the run's own configuration must equal it.
+        config: the configuration; LCS-RL on `task` by default. When resuming, it must equal that of the run.
         out: the run directory, new or empty unless resuming; runs/<task>-<method>-<seed> if None.
         task: the task or its name, if the configuration does not say it or it is not registered.
         make_envs: makes the environments; those of the task if None.
@@ -219,7 +219,7 @@ def load_model(path: Path | str) -> LCSModel:
 
 
 def load_policy(run: RunDirectory, task: TaskSpec | None = None) -> Policy:
-    """What a run has learned, as a policy: of a finished run the final one, else that of its latest checkpoint.
+    """Load the policy of a run: the final one if the run is finished, else that of its latest checkpoint.
 
     Args:
         run: the run.
@@ -240,7 +240,7 @@ class _Training:
     def __init__(self, config: TrainConfig, task: TaskSpec, out: Path, make_envs: EnvFactory, reporter: Reporter):
         self.config, self.task, self.out, self.make_envs, self.reporter = config, task, out, make_envs, reporter
         self.opened: list[VectorEnv] = []
-        self.total_episodes = episodes_of(config.minutes, task)
+        self.total_episodes = count_episodes(config.minutes, task)
         self.total = self.total_episodes * task.episode_steps
 
     def __call__(self, init: Path | None, resume: bool, begun: Callable[[], object], held: ExitStack) -> RunDirectory:
@@ -253,7 +253,7 @@ class _Training:
                 f"init: expected none with method {method.name}, which learns networks instead of an LCSModel"
             )
         reopened = None
-        if not resume:  # what was stored before this was checked can be continued
+        if not resume:  # a run that was stored before this check existed can be continued
             _check_times(self.config)
         if resume:
             reopened, init = self._reopen(held)
@@ -268,7 +268,7 @@ class _Training:
 
         def open_envs(count: int) -> VectorEnv:
             self.opened.append(self.make_envs(count))
-            _note(run, self.task.describe(self.opened[-1]))
+            _record_object(run, self.task.describe(self.opened[-1]))
             return self.opened[-1]
 
         try:
@@ -345,7 +345,7 @@ class _Training:
                 save_checkpoint(run.checkpoints, trainer.iteration, trainer.state_dict())
             minutes = trainer.env_steps / per_minute
             if report is not None:
-                told = "".join(f", {name} {value}" for name, value in notable(report).items())
+                told = "".join(f", {name} {value}" for name, value in summarise_report(report).items())
                 ITERATIONS.info(
                     "iteration %d, %.1f of %g min of data%s", trainer.iteration, minutes, config.minutes, told
                 )
@@ -368,7 +368,7 @@ class _Training:
 
 
 def _check_times(config: TrainConfig) -> None:
-    """Refuse evaluations after the end, but not the usual ones, of which a short training has as many as fit."""
+    """Raise if evaluations come after the end, except the default ones, which a short training skips."""
     late = [f"{minute:g}" for minute in config.evaluate_at if minute > config.minutes]
     if late and config.evaluate_at != TrainConfig.evaluate_at:
         raise InvalidInputError(
@@ -377,35 +377,35 @@ def _check_times(config: TrainConfig) -> None:
         )
 
 
-def _note(run: RunDirectory, found: Mapping[str, Any]) -> None:
-    """Record what the environment of a run holds. A resumed run must find the same."""
+def _record_object(run: RunDirectory, current: Mapping[str, Any]) -> None:
+    """Record the description of a run's environment. A resumed run must have the same."""
     config = run.config()
     stored = config.get("object")
-    if stored is None and found:
-        write_json(run.path / "config.json", {**config, "object": dict(found)})
-    elif stored is not None and stored != dict(found):
+    if stored is None and current:
+        write_json(run.path / "config.json", {**config, "object": dict(current)})
+    elif stored is not None and stored != dict(current):
         raise CheckpointError(
-            f"{run.path}: expected the environment it was started with, {stored}, got {dict(found)}; set up the same"
+            f"{run.path}: expected the environment it was started with, {stored}, got {dict(current)}; set up the same"
         )
 
 
-def episodes_of(minutes: float, task: TaskSpec) -> int:
-    """Whole episodes in so many minutes of data, at least one."""
+def count_episodes(minutes: float, task: TaskSpec) -> int:
+    """Count the whole episodes in so many minutes of data, at least one."""
     return max(1, round(minutes * task.steps_per_minute / task.episode_steps))
 
 
 def goals_due(config: TrainConfig, previous: int, now: int, task: TaskSpec) -> int:
-    """How many goals to evaluate after collecting the environment steps previous + 1 … now; 0 for none."""
+    """Return the number of goals to evaluate after the environment steps previous + 1 … now; 0 for no evaluation."""
     if now == 0:
         return config.final_goals if 0 in config.evaluate_at else 0
-    if previous < episodes_of(config.minutes, task) * task.episode_steps <= now:
+    if previous < count_episodes(config.minutes, task) * task.episode_steps <= now:
         return config.final_goals
     due = any(previous < minute * task.steps_per_minute <= now for minute in config.evaluate_at)
     return config.evaluate_goals if due else 0
 
 
 def _columns(method: Method) -> list[str]:
-    """Columns of log.csv: what the method's trainer reports, each once."""
+    """Return the columns of log.csv: the fields of the method's reports, each once."""
     return list(dict.fromkeys(f.name for report in method.reports for f in fields(report)))
 
 
@@ -422,14 +422,14 @@ def _row(
     return row
 
 
-def notable(report: Any) -> dict[str, str]:
-    """What of a trainer's report one looks at while it trains: name → number, in two digits."""
+def summarise_report(report: Any) -> dict[str, str]:
+    """Pick the numbers of a trainer's report to show while it trains: name → number, in two digits."""
     names = [name for name in ("loss", "kl", "success") if isinstance(getattr(report, name, None), int | float)]
     return {name: f"{getattr(report, name):.2g}" for name in names}
 
 
 def profile(rows: Sequence[Mapping[str, str]]) -> dict[str, float]:
-    """Where the time of a run went: name → seconds, summed over the rows of log.csv."""
+    """Sum the seconds that a run spent on each kind of work over the rows of log.csv: name → seconds."""
     names = [name for name in rows[0] if name.endswith("_seconds")] if rows else []
     return {name.removesuffix("_seconds"): sum(float(row[name] or 0) for row in rows) for name in names}
 

@@ -22,7 +22,7 @@ REWARD_TERMS = ("tips", "position", "yaw", "action")
 
 
 def checked_array(name: str, value: Any, size: int, meaning: str) -> np.ndarray:
-    """A finite float64 array of shape (size,), or a ValueError."""
+    """Return a finite float64 array of shape (size,), or raise a ValueError."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -41,7 +41,7 @@ def checked_array(name: str, value: Any, size: int, meaning: str) -> np.ndarray:
 
 
 def checked_number(name: str, value: Any, low: float, high: float = math.inf, low_open: bool = False) -> float:
-    """A finite float within bounds, or a ValueError."""
+    """Return a finite float within bounds, or raise a ValueError."""
     number = float(value) if isinstance(value, numbers.Real) and not isinstance(value, bool) else math.nan
     if not math.isfinite(number) or not low <= number <= high or (low_open and number == low):
         bounds = f"{'>' if low_open else '>='} {low:g}" + (f" and <= {high:g}" if math.isfinite(high) else "")
@@ -52,14 +52,14 @@ def checked_number(name: str, value: Any, low: float, high: float = math.inf, lo
 
 
 def checked_integer(name: str, value: Any) -> int:
-    """A positive int, or a ValueError."""
+    """Return a positive int, or raise a ValueError."""
     if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
         raise ValueError(f"Expected {name} to be a whole number >= 1, got {value!r}. Choose a value in this range.")
     return int(value)
 
 
 def checked_options(options: Any) -> dict[str, Any]:
-    """A copy of the options of `reset`, empty for None.
+    """Return a copy of the options of `reset`, empty for None.
 
     Raises:
         OptionsError: They are no dictionary.
@@ -77,7 +77,7 @@ def checked_options(options: Any) -> dict[str, Any]:
 def checked_task(
     task: MoveTask, yaw_tolerance: float, sparse_penalty: float, reward_weights: Mapping[str, float] | None
 ) -> MoveTask:
-    """A task with other numbers, each of them checked.
+    """Return a task with other numbers, after checking each of them.
 
     Raises:
         ValueError: A number is out of range, or a reward weight has an unknown name.

@@ -1,4 +1,4 @@
-"""What the TriFinger environments have in common: Gymnasium's reset, step and render around the simulation."""
+"""Base class of the TriFinger environments: Gymnasium's reset, step and render around the simulation."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ FullState = tuple[np.random.Generator | None, int | None, np.ndarray]
 
 
 class CommonArguments(TypedDict, total=False):
-    """What every task can be told, besides `render_mode`; the defaults are those of `TriFingerEnv`."""
+    """Arguments of every task, besides `render_mode`; the defaults are those of `TriFingerEnv`."""
 
     osc_kp: float
     yaw_tolerance: float
@@ -80,11 +80,11 @@ class CommonArguments(TypedDict, total=False):
 
 
 class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
-    """What the TriFinger tasks have in common. The tasks below say what they do; make one of those.
+    """Base class of the TriFinger tasks, which are documented below; make one of those.
 
     Attributes:
         task: Goals, errors, success and reward.
-        object: What the fingers push; `object.source` says where its shape comes from.
+        object: The object that the fingers push; `object.source` is the source of its shape.
         physics: The simulation.
     """
 
@@ -146,7 +146,7 @@ class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         return TriFingerPhysics(self.object, self.osc_kp, (self.width, self.height), model)
 
     def sibling(self) -> Self:
-        """Another environment with the same settings, on the same MuJoCo model (building one takes long)."""
+        """Make another environment with the same settings, on the same MuJoCo model (building one takes long)."""
         other = copy.copy(self)
         other.physics = self._make_physics(self.physics.model)
         other._np_random = other._np_random_seed = None
@@ -194,7 +194,7 @@ class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             raise ValueError(
                 f"Expected only the options 'goal' and 'state', got also {sorted(options, key=str)}. Remove them."
             )
-        # Always the same draws, so that an option given now does not change the episodes after it.
+        # Always the same draws, so that an option passed now does not change the episodes after it.
         joint_noise = self.np_random.uniform(-JOINT_NOISE, JOINT_NOISE, (3, 3))
         pose_noise = self.np_random.uniform(-1.0, 1.0, 3) * (POSITION_NOISE, POSITION_NOISE, YAW_NOISE)
         random_goal = self.task.sample_goal(self.np_random)
@@ -243,8 +243,8 @@ class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             raise ResetNeeded(
                 "Expected a running episode, but it has ended or never began. Call reset() before step()."
             )
-        given = checked_array("action", action, ACTION_SIZE, ACTION_MEANING)
-        executed = given.clip(-ACTION_LIMIT, ACTION_LIMIT)
+        requested = checked_array("action", action, ACTION_SIZE, ACTION_MEANING)
+        executed = requested.clip(-ACTION_LIMIT, ACTION_LIMIT)
         before, after = self._state, self.physics.step(executed)
         stable = after is not None
         self._state = continued(before, after) if stable else before.copy()
@@ -254,7 +254,7 @@ class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         reward, outcome = self.task.outcome(before, executed, self._state, self._goal, truncated)
         info: dict[str, Any] = {name: value.item() for name, value in outcome.items()}
         info["executed_action"] = executed
-        info["clipped"] = bool((executed != given).any())
+        info["clipped"] = bool((executed != requested).any())
         info["physics_error"] = not stable
         if truncated:
             self._steps = None
@@ -317,11 +317,11 @@ class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     # --- copies -----------------------------------------------------------------------------------
 
     def get_full_state(self) -> FullState:
-        """Random generator and simulation, with which a sibling goes on as this one does; not the running episode."""
+        """Random generator and simulation, from which a sibling continues as this one; not the running episode."""
         return self._np_random, self._np_random_seed, self.physics.get_full_state()
 
     def set_full_state(self, full_state: FullState) -> None:
-        """Go on from what `get_full_state` gave. There is no episode to step until `reset`."""
+        """Continue from a result of `get_full_state`. There is no episode to step until `reset`."""
         self._np_random, self._np_random_seed, simulation = full_state
         self.physics.set_full_state(simulation)
 

@@ -28,7 +28,7 @@ MOUNTS = MOUNT_RADIUS * FINGER_AXES[:, 1] + [0.0, 0.0, MOUNT_HEIGHT]  # (3, 3) [
 
 
 def tip_positions(joints: np.ndarray) -> np.ndarray:
-    """Fingertip positions from joint angles.
+    """Compute fingertip positions from joint angles.
 
     Args:
         joints: Joint angles [rad], (3 fingers, 3 joints).
@@ -44,7 +44,7 @@ def tip_positions(joints: np.ndarray) -> np.ndarray:
 
 
 def joint_angles(tips: np.ndarray) -> np.ndarray:
-    """Joint angles that bring the fingertips to given positions, knees bent outward (q2 <= 0) as in the start posture.
+    """Compute joint angles for fingertip positions, knees bent outward (q2 <= 0) as in the start posture.
 
     Args:
         tips: World positions [m] below the mounts, (3 fingers, 3).

@@ -1,4 +1,4 @@
-"""From a triangle mesh to a solid that can be simulated: checks, rest pose, convex parts, inertia. No MuJoCo here."""
+"""Triangle meshes as solids for the simulation: checks, rest pose, convex parts, inertia. No MuJoCo here."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class Solid:
 
 
 def cache_directory() -> Path:
-    """Where convex parts and downloads are kept: `DIFFLCS_CACHE_DIR`, or `difflcs` in the user's cache."""
+    """Return the folder of convex parts and downloads: `DIFFLCS_CACHE_DIR`, or `difflcs` in the user's cache."""
     if chosen := os.environ.get(CACHE_VARIABLE):
         return Path(chosen)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "difflcs"
@@ -171,7 +171,7 @@ def load_mesh(path: Path, scale: float = 1.0) -> trimesh.Trimesh:
             f"Expected a mesh in metres, {MIN_SIZE:g} to {MAX_SIZE:g} m long, got {size:g} m: {path}. If the file is "
             "in millimetres pass mesh_scale=0.001; otherwise scale it to what the fingers can push."
         )
-    mesh = mesh if mesh.is_volume else _repaired(mesh)
+    mesh = mesh if mesh.is_volume else _repair(mesh)
     if not mesh.is_volume or mesh.volume < MIN_VOLUME:
         raise MeshError(
             f"Expected a watertight mesh with faces that point outward, got one with holes, loose faces or no volume: "
@@ -188,8 +188,8 @@ def _check_triangles(mesh: trimesh.Trimesh, name: str) -> None:
         )
 
 
-def _repaired(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Without loose fragments, small holes closed, faces outward. Whether that was enough is for the caller to see."""
+def _repair(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Remove loose fragments, close small holes, turn faces outward. The caller checks whether that was enough."""
     trimesh = _require_trimesh()
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     mesh.update_faces(mesh.unique_faces() & mesh.nondegenerate_faces())
@@ -208,7 +208,7 @@ def _repaired(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def rest_poses(points: np.ndarray, center: np.ndarray) -> list[RestPose]:
-    """All poses in which a solid stays put on a table, lowest centre of mass first.
+    """Find all poses in which a solid stays put on a table, lowest centre of mass first.
 
     The solid rests on a face of its convex hull if the centre of mass projects into that face. The height of the
     centre of mass as a function of the direction that is down has a local minimum exactly there.
@@ -240,7 +240,7 @@ def rest_poses(points: np.ndarray, center: np.ndarray) -> list[RestPose]:
 
 
 def _toppling_angle(corners: np.ndarray, down: np.ndarray, height: float) -> float:
-    """Tilt [rad] at which the centre of mass leaves the area that the corners near the table span."""
+    """Compute the tilt [rad] at which the centre of mass leaves the area that the corners near the table span."""
     from scipy.spatial import ConvexHull, QhullError
 
     rotation = _shortest_rotation(down, np.array([0.0, 0.0, -1.0]))
@@ -253,7 +253,7 @@ def _toppling_angle(corners: np.ndarray, down: np.ndarray, height: float) -> flo
 
 
 def _shortest_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """The rotation of smallest angle that takes one unit vector to another, (3, 3)."""
+    """Compute the rotation of smallest angle that takes one unit vector to another, (3, 3)."""
     axis, cosine = np.cross(start, end), float(start @ end)
     if cosine < -1 + 1e-12:  # half a turn about any axis across
         across = np.eye(3)[np.argmin(np.abs(start))]
@@ -304,7 +304,7 @@ def _choose_pose(poses: list[RestPose], choice: str | int, name: str) -> RestPos
 
 
 def check_extent(mesh: trimesh.Trimesh, name: str, expected: tuple[float, float, float], path: Path) -> None:
-    """Compare the size of a mesh, lying on the table, with what is known of the object.
+    """Raise unless a mesh, lying on the table, has the size of the object.
 
     Raises:
         MeshError: They differ by more than scans of one object do (loose fragments, simplification).
@@ -327,7 +327,7 @@ def _millimetres(size: np.ndarray) -> str:
 
 
 def _convex_parts(mesh: trimesh.Trimesh, count: int | None, concavity: float) -> tuple[tuple[np.ndarray, ...], str]:
-    """At most `count` convex parts that cover the mesh, from the cache if they are there, and their cache key."""
+    """Find at most `count` convex parts that cover the mesh, from the cache if possible, and their cache key."""
     if count is None:
         count = 1 if mesh.volume >= SOLID_ENOUGH * mesh.convex_hull.volume else DEFAULT_PARTS
     vertices, faces = np.ascontiguousarray(mesh.vertices, "<f8"), np.ascontiguousarray(mesh.faces, "<i8")
@@ -350,7 +350,7 @@ def _convex_parts(mesh: trimesh.Trimesh, count: int | None, concavity: float) ->
 
 @contextlib.contextmanager
 def _one_at_a_time(name: str) -> Iterator[None]:
-    """Wait for another process that decomposes the same mesh. Where no lock can be written, there is none."""
+    """Wait for another process that decomposes the same mesh. Without a lock if none can be written."""
     try:
         import filelock
     except ImportError as error:
@@ -375,12 +375,12 @@ def _decompose(vertices: np.ndarray, faces: np.ndarray, count: int, concavity: f
     except ImportError as error:
         raise MissingDependencyError("coacd") from error
     coacd.set_log_level("error")
-    found = coacd.run_coacd(coacd.Mesh(vertices, faces), threshold=concavity, max_convex_hull=count, **COACD_SETTINGS)
-    return tuple(np.asarray(points, np.float64) for points, _ in found)
+    hulls = coacd.run_coacd(coacd.Mesh(vertices, faces), threshold=concavity, max_convex_hull=count, **COACD_SETTINGS)
+    return tuple(np.asarray(points, np.float64) for points, _ in hulls)
 
 
 def _read_parts(path: Path) -> tuple[np.ndarray, ...] | None:
-    """Cached parts; None if there are none or the file is damaged."""
+    """Read cached parts; None if there are none or the file is damaged."""
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             points, ends = stored["points"], stored["ends"]
@@ -392,7 +392,7 @@ def _read_parts(path: Path) -> tuple[np.ndarray, ...] | None:
 
 
 def _write_parts(path: Path, parts: tuple[np.ndarray, ...]) -> None:
-    """Write in one piece: another process sees the old file or the new one. A cache that cannot be written is none."""
+    """Write in one step: other processes see the old file or the new one. A cache that is not writable is ignored."""
     points, ends = np.concatenate(parts), np.cumsum([len(part) for part in parts])
     digest = np.frombuffer(hashlib.sha256(points.tobytes() + ends.tobytes()).digest(), np.uint8)
     buffer = io.BytesIO()
@@ -409,7 +409,7 @@ def _write_parts(path: Path, parts: tuple[np.ndarray, ...]) -> None:
             raise
 
 
-# --- the whole way --------------------------------------------------------------------------------
+# --- all steps together --------------------------------------------------------------------------------
 
 
 def make_solid(

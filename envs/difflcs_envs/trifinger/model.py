@@ -87,12 +87,12 @@ COLLISION_GROUP = 3  # geoms that collide but are not drawn
 
 
 def tip_height_for(object_height: float) -> float:
-    """Height [m] at which the fingertips push an object of some height [m]."""
+    """Compute the height [m] at which the fingertips push an object of some height [m]."""
     return min(max(object_height / 2, MIN_TIP_HEIGHT), MAX_TIP_HEIGHT)
 
 
 class SceneObject(Protocol):
-    """What the fingers push. Anything with these members can stand in the scene."""
+    """Interface of the objects in the scene, which the fingers push."""
 
     @property
     def name(self) -> str:
@@ -101,7 +101,7 @@ class SceneObject(Protocol):
 
     @property
     def source(self) -> str:
-        """Where its shape comes from: "built_in", "ycb_mesh", "mesh" or "stand_in"."""
+        """Source of its shape: "built_in", "ycb_mesh", "mesh" or "stand_in"."""
         ...
 
     @property
@@ -116,7 +116,7 @@ class SceneObject(Protocol):
 
     @property
     def pinned(self) -> bool:
-        """Whether the object only turns, about a vertical axis through its origin."""
+        """True if the object only turns, about a vertical axis through its origin."""
         ...
 
     @property
@@ -135,7 +135,7 @@ class SceneObject(Protocol):
         ...
 
     def describe(self) -> dict[str, Any]:
-        """What this object is, in JSON types, for records of results."""
+        """Describe the object in JSON types, for records of results."""
         ...
 
     def add_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody, contact: dict[str, Any]) -> None:
@@ -155,9 +155,9 @@ class CubeObject:
         half_size: Half of the edge [m].
         mass: Mass [kg].
         friction: Sliding friction between cube and table.
-        pinned: Whether it only turns, about a vertical axis through its centre.
+        pinned: True if it only turns, about a vertical axis through its centre.
         name: Name of the object.
-        source: Where its shape comes from.
+        source: Source of its shape.
     """
 
     half_size: float = 0.03
@@ -183,7 +183,7 @@ class CubeObject:
         return self.half_size * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
 
     def describe(self) -> dict[str, Any]:
-        """What this object is, for records of results."""
+        """Describe the object, for records of results."""
         return {
             "name": self.name,
             "source": self.source,
@@ -251,7 +251,7 @@ def _friction(sliding: float) -> list[float]:
 
 
 def _add_scenery(spec: mujoco.MjSpec, table_friction: float) -> None:
-    """Table, sky, lights, cameras and the (purely visual) base of the robot."""
+    """Add table, sky, lights, cameras and the (purely visual) base of the robot."""
     spec.visual.headlight.ambient = [0.45, 0.45, 0.45]
     spec.visual.headlight.diffuse = [0.30, 0.30, 0.30]
     spec.visual.headlight.specular = [0.0, 0.0, 0.0]
@@ -298,7 +298,7 @@ def _add_scenery(spec: mujoco.MjSpec, table_friction: float) -> None:
 
 
 def _look_at(position: tuple[float, float, float], target: tuple[float, float, float]) -> dict[str, list[float]]:
-    """Pose keywords of a camera at `position` that looks at `target` with the horizon level."""
+    """Make the pose keywords of a camera at `position` that looks at `target` with the horizon level."""
     backward = np.subtract(position, target)
     right = np.cross([0.0, 0.0, 1.0], backward)
     up = np.cross(backward, right)

@@ -37,23 +37,23 @@ _FUNCTIONS = ("mj_step1", "mj_step2", "mj_kinematics", "mj_getState")
 
 @functools.cache
 def _library() -> tuple[ctypes.CDLL, dict[str, int]] | None:
-    """The MuJoCo library that this process has loaded, and the addresses of its functions; None if it is not found."""
+    """Find the MuJoCo library that this process has loaded, and the addresses of its functions; else None."""
     folder = Path(mujoco.__file__).parent
     for path in sorted([*folder.glob("libmujoco*"), *folder.glob("mujoco.dll")]):
         try:
             # The library is loaded already; asked by the same path, the system returns that one.
             library = ctypes.CDLL(str(path), mode=getattr(os, "RTLD_NOLOAD", 0) | getattr(os, "RTLD_NOW", 0))
-            found = {name: ctypes.cast(getattr(library, name), ctypes.c_void_p).value for name in _FUNCTIONS}
+            addresses = {name: ctypes.cast(getattr(library, name), ctypes.c_void_p).value for name in _FUNCTIONS}
         except (OSError, AttributeError):
             continue
-        if all(found.values()):
-            return library, {name: address for name, address in found.items() if address}
+        if all(addresses.values()):
+            return library, {name: address for name, address in addresses.items() if address}
     return None
 
 
 @contextmanager
 def _untimed() -> Iterator[None]:
-    """Without MuJoCo's stopwatches (`data.timer`): reading the clock takes 8 % of a step."""
+    """Turn off MuJoCo's stopwatches (`data.timer`): reading the clock takes 8 % of a step."""
     try:
         clock = ctypes.c_void_p.in_dll(_library()[0], "mjcb_time")  # pyright: ignore[reportOptionalSubscript]
     except (TypeError, ValueError):  # no library, or one without this callback
@@ -84,7 +84,7 @@ def native_lane(
         constants: Numbers for the stepper.
 
     Returns:
-        The lane, or None where only Python can step: not compiled, another memory layout, or not wanted
+        The lane, or None where only Python can step: not compiled, another memory layout, or turned off
         (`DIFFLCS_ENVS_NATIVE=0`).
     """
     library = _library() if os.environ.get(NATIVE_VARIABLE, "1") != "0" else None
@@ -110,7 +110,7 @@ def native_lane(
 
 
 def _is_live(data: mujoco.MjData, counters: np.ndarray) -> bool:
-    """Whether the counters are a view of the data and not a copy."""
+    """Return True if the counters are a view of the data and not a copy."""
     kind = int(mujoco.mjtWarning.mjWARN_INERTIA)
     before = int(data.warning[kind].number)
     data.warning[kind].number = before + 1
@@ -122,13 +122,13 @@ def _is_live(data: mujoco.MjData, counters: np.ndarray) -> bool:
 def step_lanes(
     lanes: Sequence[Lane], actions: np.ndarray, states: np.ndarray, stable: np.ndarray, threads: int
 ) -> None:
-    """One control period of every lane, in native threads, without the GIL.
+    """Step every lane by one control period, in native threads, without the GIL.
 
     Args:
         lanes: The simulations, each once.
         actions: Displacements of the tips [m], (n, 6).
         states: Gets the states, (n, 9); rows of unstable lanes are left alone.
-        stable: Gets whether each lane is still sane, (n,) bool. Those that are not must be restored by the caller.
+        stable: Gets True for each lane that is still stable, (n,) bool. The caller must restore the others.
         threads: Most threads to use.
     """
     assert stepper is not None

@@ -1,7 +1,7 @@
 """The objects of the tasks: the YCB objects of the paper, their primitive stand-ins, and any mesh.
 
-The YCB meshes (Calli et al., IEEE RAM 2015) do not ship with this package. They are looked for in the folder that
-`DIFFLCS_YCB_DIR` names, then where `difflcs assets download` puts them. Without them a stand-in of boxes, cylinders and
+The YCB meshes (Calli et al., IEEE RAM 2015) do not ship with this package. They are searched in the folder that
+`DIFFLCS_YCB_DIR` names, then in that of `difflcs assets download`. Without them a stand-in of boxes, cylinders and
 capsules with the size, the mass and the resting height of the object takes its place; `source` says which it is.
 """
 
@@ -47,7 +47,7 @@ class MeshObject:
         solid: Its shape in its rest pose.
         mass: Mass [kg].
         friction: Sliding friction between object and table.
-        pinned: Whether it only turns, about a vertical axis through its origin.
+        pinned: True if it only turns, about a vertical axis through its origin.
     """
 
     name: str
@@ -78,7 +78,7 @@ class MeshObject:
         return np.concatenate(self.solid.parts)[:, :2]
 
     def describe(self) -> dict[str, Any]:
-        """What this object is, for records of results."""
+        """Describe the object, for records of results."""
         return {
             "name": self.name,
             "source": self.source,
@@ -127,7 +127,7 @@ class MeshObject:
 class StandInObject:
     """Boxes, cylinders and capsules in place of a YCB object whose mesh is not on this machine.
 
-    Size, mass and resting height are those of the object, the rest is rough: a result with it is no result with the
+    Size, mass and resting height are those of the object, the rest is rough: results with it are not results with the
     object.
 
     Attributes:
@@ -135,7 +135,7 @@ class StandInObject:
         mass: Mass [kg].
         friction: Sliding friction between object and table.
         source: "stand_in".
-        pinned: Whether it only turns, about a vertical axis through its origin.
+        pinned: True if it only turns, about a vertical axis through its origin.
     """
 
     ycb: YcbObject
@@ -171,7 +171,7 @@ class StandInObject:
 
     @property
     def outlines(self) -> list[np.ndarray]:
-        """The same of each primitive."""
+        """Points [m] around each primitive, as seen from above."""
         return [primitive.outline() - self._middle for primitive in self.ycb.stand_in]
 
     @property
@@ -181,7 +181,7 @@ class StandInObject:
         return volumes @ np.array([p.center[:2] for p in self.ycb.stand_in]) / volumes.sum()
 
     def describe(self) -> dict[str, Any]:
-        """What this object is, for records of results."""
+        """Describe the object, for records of results."""
         return {
             "name": self.name,
             "source": self.source,
@@ -217,7 +217,7 @@ class StandInObject:
 
 
 def _set_inertia(body: mujoco.MjsBody, mass: float, unit_inertia: np.ndarray) -> None:
-    """Mass and inertia by hand: what MuJoCo adds up over overlapping parts is too much (its issue 2152)."""
+    """Set mass and inertia: MuJoCo's sum over overlapping parts is too large (its issue 2152)."""
     i = mass * unit_inertia
     body.explicitinertial = True
     body.mass = mass
@@ -243,7 +243,7 @@ def make_object(
         friction: Sliding friction between object and table.
         source: "auto": the mesh if it is there, else the stand-in; "mesh": the mesh or an error; "stand_in".
         rest_pose: "lying", "upright", or the number of a stable pose, lowest centre of mass first.
-        parts: Most convex parts; None for a choice of ours.
+        parts: Most convex parts; None for the default.
         mesh_scale: Length of one unit of the mesh file [m].
 
     Raises:

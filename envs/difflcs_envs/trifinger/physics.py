@@ -33,8 +33,8 @@ HOME_TIP_RADIUS = 0.0977  # [m] where the tips settle from the start posture
 START_CLEARANCE = 0.021  # [m] at least this far out from the object (tip radius 9.5 mm) do the tips start
 # An object or a tip farther out than this has left the robot's world (tips reach at most 0.36 m).
 WORKSPACE_RADIUS = 0.5  # [m]
-# Deepest overlap of two bodies that a given start state may have. Random extreme actions make up to 2.2 mm, and states
-# met in an episode must be good for another start.
+# Deepest overlap of two bodies in a start state of the user. Random extreme actions make up to 2.2 mm, and states of
+# an episode must be usable as another start.
 MAX_START_PENETRATION = 0.004  # [m]
 
 _STATE_SIGNATURE = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -128,7 +128,7 @@ class TriFingerPhysics:
     # --- reset ------------------------------------------------------------------------------------
 
     def home_tips(self, object_pose: np.ndarray) -> np.ndarray:
-        """Where the tips start in the plane [m], (3, 2): at the home radius, farther out around a long object.
+        """Places in the plane [m], (3, 2), where the tips start: at the home radius, or outside a long object.
 
         Args:
             object_pose: x [m], y [m], yaw [rad] of the object.
@@ -141,7 +141,7 @@ class TriFingerPhysics:
         return np.maximum(HOME_TIP_RADIUS, support + START_CLEARANCE)[:, None] * self._directions
 
     def tips_from_noise(self, joint_noise: np.ndarray, object_pose: np.ndarray) -> np.ndarray:
-        """Where the tips come down when the joints of the start posture are disturbed.
+        """Compute where the tips come down when the joints of the start posture are disturbed.
 
         Lowering keeps a tip's place in the plane, so it moves by what the disturbance moves it in the start posture.
 
@@ -156,7 +156,7 @@ class TriFingerPhysics:
         return self.home_tips(object_pose) + shift[:, :2]
 
     def reset(self, object_pose: np.ndarray, tips: np.ndarray) -> None:
-        """Put object and fingers at rest in a given pose.
+        """Put object and fingers at rest in a pose.
 
         Args:
             object_pose: x [m], y [m], yaw [rad] of the object, which rests on the table.
@@ -218,7 +218,7 @@ class TriFingerPhysics:
         return step_all([self], displacement[None], threads=1)[0]
 
     def step_in_python(self, displacement: np.ndarray) -> bool:
-        """The same without the compiled stepper and without restoring. Returns whether the simulation is sane."""
+        """Step without the compiled stepper and without restoring. Return True if the simulation is stable."""
         model, data, control = self.model, self.data, self.controller.apply
         first_half, second_half = mujoco.mj_step1, mujoco.mj_step2
         self._save()
@@ -236,9 +236,9 @@ class TriFingerPhysics:
             return False
         # Integration leaves the positions of bodies and sites one substep behind the joints.
         mujoco.mj_kinematics(model, data)
-        return self._is_sane(end_time)
+        return self._is_stable(end_time)
 
-    def _is_sane(self, end_time: float) -> bool:
+    def _is_stable(self, end_time: float) -> bool:
         # MuJoCo answers NaN or huge numbers by a warning and by resetting the data, the clock with them.
         if abs(self.data.time - end_time) > 0.5 * TIMESTEP or self.data.warning.number[_INSTABILITY_WARNINGS].any():
             return False
@@ -258,7 +258,7 @@ class TriFingerPhysics:
         return state
 
     def max_penetration(self) -> float:
-        """Deepest overlap of two bodies [m] at the last collision detection; 0 without contact."""
+        """Return the deepest overlap of two bodies [m] at the last collision detection; 0 without contact."""
         contacts = self.data.contact.dist
         return max(0.0, -float(contacts.min())) if len(contacts) else 0.0
 
@@ -274,7 +274,7 @@ class TriFingerPhysics:
         mujoco.mj_kinematics(self.model, self.data)
 
     def get_full_state(self) -> np.ndarray:
-        """Everything that the next steps depend on, as one vector."""
+        """Return everything that the next steps depend on, as one vector."""
         self._save()
         return self._saved.copy()
 
@@ -287,7 +287,7 @@ class TriFingerPhysics:
 def step_all(
     simulations: Sequence[TriFingerPhysics], displacements: np.ndarray, threads: int
 ) -> list[np.ndarray | None]:
-    """`TriFingerPhysics.step` of several simulations, in native threads where the compiled stepper is there.
+    """Do `TriFingerPhysics.step` in several simulations, in native threads where the compiled stepper is there.
 
     Args:
         simulations: The simulations, each once.

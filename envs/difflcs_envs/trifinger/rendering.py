@@ -22,7 +22,7 @@ _APT_LINE_OSMESA = "apt-get install libosmesa6"
 
 
 def has_display() -> bool:
-    """Whether a window can be opened (on Linux: an X or Wayland display is announced)."""
+    """Return True if a window can be opened (on Linux: if the environment names an X or Wayland display)."""
     if not sys.platform.startswith("linux"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -135,10 +135,10 @@ class SceneRenderer:
         self._scene.flags[segment] = True
         goal = np.asarray(self._draw(data).any(axis=2))
         self._scene.flags[segment] = False
-        return self._marked(picture, goal)
+        return self._mark_goal(picture, goal)
 
     def _draw(self, data: Any) -> np.ndarray:
-        """What the options show, uint8 (height, width, 3)."""
+        """Draw the scene with the current options, uint8 (height, width, 3)."""
         mujoco = self._mujoco
         mujoco.mjv_updateScene(
             self._model, data, self._options, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
@@ -148,8 +148,8 @@ class SceneRenderer:
         mujoco.mjr_readPixels(pixels, None, self._rectangle, self._gpu)
         return np.ascontiguousarray(pixels[::-1])  # OpenGL counts rows from below
 
-    def _marked(self, picture: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """The picture with the goal, a mask (height, width), marked in it."""
+    def _mark_goal(self, picture: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """Mark the goal, a mask (height, width), in a picture."""
         inner = goal
         for _ in range(max(1, round(len(picture) / 160))):  # thickness of the line [pixel]
             inner = inner & np.roll(inner, 1, 0) & np.roll(inner, -1, 0) & np.roll(inner, 1, 1) & np.roll(inner, -1, 1)

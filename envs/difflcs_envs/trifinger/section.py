@@ -1,4 +1,4 @@
-"""What the fingertips touch of an object: the cross section of its convex parts at the height of the tips."""
+"""Cross section of an object at the height of the fingertips, from its convex parts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LEAST_SIDE = 1e-3  # [m] parts smaller than this are left out
 
 
 def cross_section(scene_object: SceneObject) -> list[np.ndarray]:
-    """Convex polygons that together are the cross section of an object in its rest pose.
+    """Compute convex polygons that together are the cross section of an object in its rest pose.
 
     Args:
         scene_object: A cube, an object with a mesh, or a stand-in. Of a stand-in all of every primitive counts, as
@@ -38,12 +38,12 @@ def cross_section(scene_object: SceneObject) -> list[np.ndarray]:
         pieces = scene_object.outlines
     else:
         pieces = [scene_object.outline]
-    polygons = [_simplified(_hull(points)) for points in pieces if len(points) >= 3]
+    polygons = [_simplify(_hull(points)) for points in pieces if len(points) >= 3]
     return [p for p in polygons if len(p) >= 3 and np.ptp(p, axis=0).min() >= LEAST_SIDE]
 
 
 def _cut(points: np.ndarray, height: float) -> np.ndarray:
-    """Points (k, 2) whose hull is the cross section of the hull of points (n, 3)."""
+    """Find points (k, 2) whose hull is the cross section of the hull of points (n, 3)."""
     above, below = points[points[:, 2] >= height], points[points[:, 2] < height]
     if not len(above) or not len(below):
         return np.zeros((0, 2))
@@ -53,7 +53,7 @@ def _cut(points: np.ndarray, height: float) -> np.ndarray:
 
 
 def _hull(points: np.ndarray) -> np.ndarray:
-    """Convex hull (n, 2), counterclockwise (Andrew's monotone chain)."""
+    """Compute the convex hull (n, 2), counterclockwise (Andrew's monotone chain)."""
     points = np.unique(points, axis=0)
     if len(points) < 3:
         return points
@@ -73,8 +73,8 @@ def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> float:
     return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
 
 
-def _simplified(polygon: np.ndarray) -> np.ndarray:
-    """A convex polygon without the corners that stand out by less than COARSE, the flattest first."""
+def _simplify(polygon: np.ndarray) -> np.ndarray:
+    """Remove the corners of a convex polygon that stand out by less than COARSE, the flattest first."""
     while len(polygon) > 3:
         before, after = np.roll(polygon, 1, 0), np.roll(polygon, -1, 0)
         chord, to = after - before, polygon - before

@@ -1,4 +1,4 @@
-"""What the TriFinger environments take and give: sizes, units and limits of actions and observations."""
+"""Actions and observations of the TriFinger environments: sizes, units and limits."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ YAW_LIMIT = 8 * math.pi
 
 
 def make_action_space() -> spaces.Box:
-    """The displacement of every fingertip [m]."""
+    """Make the space of the displacements of all fingertips [m]."""
     return spaces.Box(-ACTION_LIMIT, ACTION_LIMIT, (ACTION_SIZE,), dtype=np.float64)
 
 
 def make_observation_space(goal_high: tuple[float, float, float], seconds: float | None) -> spaces.Dict:
-    """State and goal, and the time to go where it is observed.
+    """Make the space of state and goal, and of the time to go if it is observed.
 
     Args:
         goal_high: Bounds of the goal: x [m], y [m], yaw [rad].
@@ -45,7 +45,7 @@ def make_observation_space(goal_high: tuple[float, float, float], seconds: float
 
 
 def continued(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """The state after a step, its yaw on the turn nearest to that of the state before."""
+    """Return the state after a step, with its yaw on the turn nearest to the yaw before."""
     yaw = unwrap(after[2], before[2])
     if abs(yaw) <= YAW_LIMIT:
         after[2] = yaw
@@ -53,5 +53,5 @@ def continued(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 
 def unwrap(angle: float, reference: float) -> float:
-    """The angle plus full turns [rad] that is nearest to a reference."""
+    """Add full turns to an angle [rad] so that it is nearest to a reference."""
     return reference + math.remainder(angle - reference, 2 * math.pi)

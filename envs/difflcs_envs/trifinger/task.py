@@ -71,7 +71,7 @@ class MoveTask:
         return distance, abs((turn + np.pi) % (2 * np.pi) - np.pi)
 
     def is_success(self, position_error: Array, yaw_error: Array) -> Array:
-        """Whether both errors are within the tolerances."""
+        """Return True if both errors are within the tolerances."""
         return (position_error <= self.position_tolerance) & (yaw_error <= self.yaw_tolerance)
 
     def pose_info(self, state: Array, goal: Array) -> dict[str, Array]:
@@ -139,7 +139,7 @@ class MoveTask:
 
 
 def _library(array: Array) -> Any:
-    """PyTorch for its tensors, else NumPy. Nothing is imported: who has a tensor has PyTorch."""
+    """Return PyTorch for its tensors, else NumPy. Nothing is imported: a tensor implies that PyTorch is."""
     torch = sys.modules.get("torch")
     return torch if torch is not None and isinstance(array, torch.Tensor) else np
 
@@ -147,4 +147,4 @@ def _library(array: Array) -> Any:
 MOVE = MoveTask()
 """Push a cube or another object."""
 TURN = MoveTask(position_tolerance=0.001, goal_high=(0.0, 0.0, 1.5))
-"""Turn a cube on its pivot: the position is as good as fixed, and the goal is a matter of the yaw."""
+"""Turn a cube on its pivot: the position is practically fixed, and the goal is a yaw."""

@@ -1,4 +1,4 @@
-"""The natural gradient: steps of a given length in what the policy does, not in its parameters.
+"""The natural gradient: steps of a set length in the behaviour of the policy, not in its parameters.
 
 Amari, "Natural gradient works efficiently in learning", 1998; Kakade, "A natural policy gradient", 2001.
 """
@@ -40,7 +40,7 @@ class NaturalGradient(torch.optim.Optimizer):
     the Jacobian J. A step d changes the policy by a KL divergence of ½ dᵀ F d: its length is √(2 KL).
 
     Args:
-        parameters: what is learned, one dtype.
+        parameters: the learned parameters, of one dtype.
         lr: length of a step.
         momentum: weight of the gradients so far against the newest one.
         damping: isotropic part of the metric, in means of its diagonal: directions that hardly change the policy, along
@@ -98,7 +98,7 @@ class NaturalGradient(torch.optim.Optimizer):
             p -= part.view_as(p)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything to go on with; what is loaded counts after the next `measure`."""
+        """State of the optimiser; a loaded one takes effect at the next `measure`."""
         return {"average": self.average, "metric": self.metric}
 
     def load_state_dict(self, state_dict: State) -> None:

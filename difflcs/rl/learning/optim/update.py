@@ -1,4 +1,4 @@
-"""How PPO moves a policy: along the natural gradient or by Adam, with steps whose size follows the KL divergence.
+"""Update rules of PPO: the natural gradient or Adam, with a step size that follows the KL divergence.
 
 The step size follows the KL divergence that an iteration has reached. Large steps make PPO work here: a KL of 0.005 per
 iteration gains little, 0.03 to 0.1 gains 15 points of success.
@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from difflcs.errors import CheckpointError
-from difflcs.rl.learning.learned import check_depends, check_learned
+from difflcs.rl.learning.checks import check_depends, check_learned
 from difflcs.rl.learning.optim.natural import Natural, NaturalGradient
 from difflcs.rl.learning.state import State, initialise_moments, load_moments, moments
 from difflcs.rl.settings import Adam
@@ -81,7 +81,7 @@ class Deviation:
                 self.log_std.clamp_(*self._limits)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything to go on with, but for the parameters."""
+        """State of the optimiser, without the parameters."""
         return {} if self.adam is None else moments(self.adam)
 
     def load_state_dict(self, state: State) -> None:
@@ -91,7 +91,7 @@ class Deviation:
 
 
 class UpdateRule:
-    """What moves a policy by the gradients of a loss.
+    """Base of the rules that move a policy by the gradients of a loss.
 
     Args:
         learned: parameters behind the mean of the policy.
@@ -107,10 +107,10 @@ class UpdateRule:
         self.parameters = [*learned, *deviation.parameters]
 
     def measure(self, data: TensorDict, rng: np.random.Generator) -> None:
-        """See the data of an iteration before its first step."""
+        """Look at the data of an iteration before its first step."""
 
     def step(self, loss: torch.Tensor, scale: float) -> bool:
-        """Take one step down a loss, or none where a gradient is not finite; says which."""
+        """Take one step down a loss; return False, without a step, if a gradient is not finite."""
         check_depends(loss)
         for p in self.parameters:
             p.grad = None
@@ -123,7 +123,7 @@ class UpdateRule:
         return True
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything to go on with, but for the parameters."""
+        """State of the optimiser, without the parameters."""
         return {"step_size": self.size.value, "optimiser": self._state(), "deviation": self.deviation.state_dict()}
 
     def load_state_dict(self, state: State) -> None:
@@ -148,7 +148,7 @@ class UpdateRule:
 
 
 def learned_parameters(actor: GaussianPolicy) -> list[nn.Parameter]:
-    """What is learned of the model behind the mean of a policy.
+    """Return the learned parameters of the model behind the mean of a policy.
 
     Raises:
         InvalidInputError, DTypeError: the model is fixed, or no `torch.nn.Module`.
