@@ -1,4 +1,4 @@
-"""A sphere pushes a box to poses in the plane, in MuJoCo: `python benchmarks/box_to_pose.py [--goals 200] [--json]`.
+"""A sphere pushes a box to poses in the plane, in MuJoCo: `python benchmarks/box_to_pose.py [--goals 200]`.
 
 A free box of 14 by 10 cm lies on a floor with friction; a sphere of 1.5 cm is held at half its height by two position
 servos. Both are simulated in space, at 500 Hz. Goals are up to 20 cm and half a turn away, and the sphere always starts
@@ -10,12 +10,11 @@ and the true state.
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -24,7 +23,7 @@ import tyro
 from torch import Tensor
 
 from difflcs import GoalCost, LCSMPCLayer
-from difflcs.bench import machine, save
+from difflcs.cli.bench import machine, save
 from difflcs.physics import box
 from difflcs.physics.mujoco import MujocoLCS
 from difflcs.planning import DiscPlaces, PlanarTravel, SamplingPolicy, SamplingSettings
@@ -58,8 +57,6 @@ class Options:
     """Goals, each with its own start."""
     seed: int = 1000
     """Of the first goal; the next have the next."""
-    json: bool = False
-    """Print one line of JSON."""
     out: Path = Path("benchmarks/results/box_to_pose.json")
     """Where the JSON goes."""
     smoke: bool = False
@@ -88,8 +85,7 @@ def make_policy() -> tuple[SamplingPolicy, MujocoLCS]:
     return SamplingPolicy(mpc, Faces(shape, RADIUS, 64), travel, settings, angles=(2,)), module
 
 
-@dataclass
-class Episode:
+class Episode(NamedTuple):
     """One goal: whether it was reached, in how many steps, and seconds of CPU time for each decision."""
 
     success: bool
@@ -133,17 +129,12 @@ def main(o: Options) -> None:
     torch.set_num_threads(1)
     policy, module = make_policy()
     episodes = [play(o.seed + k, policy, module) for k in range(o.goals)]
-    successes = sum(e.success for e in episodes)
-    low, high = wilson_interval(successes, o.goals)
-    results = {
-        "success_rate": successes / o.goals,
-        "ci_low": low,
-        "ci_high": high,
-        "goals": o.goals,
-        "mean_steps": float(np.mean([e.steps for e in episodes])),
-        "milliseconds_per_step": 1e3 * float(np.mean([e.seconds for e in episodes])),
-    }
-    print(json.dumps(results) if o.json else "\n".join(f"{name:24s} {value:.4g}" for name, value in results.items()))
+    successes, steps, seconds = (float(np.mean(values)) for values in zip(*episodes, strict=True))
+    low, high = wilson_interval(round(successes * o.goals), o.goals)
+    results = {"success_rate": successes, "ci_low": low, "ci_high": high, "goals": o.goals, "mean_steps": steps}
+    results["milliseconds_per_step"] = 1e3 * seconds
+    for name, value in results.items():
+        print(f"{name:24s} {value:.4g}")
     if not o.smoke:
         options = {"goals": o.goals, "seed": o.seed}
         save(o.out, {"machine": {**machine(), "mujoco": mujoco.__version__}, "options": options, "results": results})

@@ -8,7 +8,7 @@ compares what on_failure does. At real-time priority (`chrt -f 50 python …`) o
 
 from __future__ import annotations
 
-import csv
+import json
 import re
 import subprocess
 import tempfile
@@ -21,11 +21,12 @@ import torch
 import tyro
 
 from difflcs import LCSModel
-from difflcs.bench import cpu, save
-from difflcs.export import export_controller
+from difflcs.cli.bench import cpu, save
 from difflcs.mpc import MPCController
+from difflcs.mpc.export import export_controller
 from difflcs.rl.tasks import get_task
 
+NAMES = ("p50", "p99", "largest")
 LIMIT = [-0.05, -0.05, -0.5], [0.05, 0.05, 0.5]
 
 
@@ -60,41 +61,37 @@ def recorded(controller: MPCController, count: int) -> np.ndarray:
     return np.array(rows)
 
 
-def spread(microseconds: np.ndarray) -> dict[str, float]:
-    """p50, p99 and largest."""
-    return {"p50": float(np.median(microseconds)), "p99": float(np.percentile(microseconds, 99)),
-            "largest": float(microseconds.max())}  # fmt: skip
+Figures = dict[str, dict[str, float]]
+"""Part of a step → its p50, p99 and largest time [µs]."""
 
 
-def in_python(controller: MPCController, rows: np.ndarray, steps: int) -> dict[str, dict[str, float]]:
-    """Times of one round [µs]."""
-    whole, solver = np.empty(steps), np.empty(steps)
+def in_python(controller: MPCController, rows: np.ndarray, steps: int) -> Figures:
+    """Times of one round."""
+    times = np.empty((steps, 2))
     for i in range(-len(rows), steps):
         x, goal = rows[i % len(rows), :9].copy(), rows[i % len(rows), 9:].copy()
-        begun = time.perf_counter_ns()
+        begun = time.perf_counter()
         controller.step(x, goal)
-        ended = time.perf_counter_ns()
+        ended = time.perf_counter()
         if i >= 0:
             plan = controller.plan
             assert plan is not None
-            whole[i], solver[i] = (ended - begun) / 1e3, 1e6 * plan.solve_time
-    return {"step": spread(whole), "solver": spread(solver), "rest": spread(whole - solver)}
+            times[i] = 1e6 * (ended - begun), 1e6 * plan.solve_time
+    parts = {"step": times[:, 0], "solver": times[:, 1], "rest": times[:, 0] - times[:, 1]}
+    return {part: dict(zip(NAMES, np.percentile(v, (50, 99, 100)).tolist(), strict=True)) for part, v in parts.items()}
 
 
-def in_c(robot: Path, controller: Path, trajectory: Path, steps: int) -> dict[str, dict[str, float]]:
-    """The same of the C program."""
+def in_c(robot: Path, controller: Path, trajectory: Path, steps: int) -> Figures:
+    """The same of the C program, which prints them."""
     text = subprocess.check_output([robot, controller, trajectory, "--bench", str(steps)], text=True)
-    lines = [line for line in text.splitlines() if "p50" in line]
-    found = [[float(v) for v in re.findall(r"(?:p50|p99|largest) ([\d.]+)", line)] for line in lines]
-    return {
-        k: dict(zip(("p50", "p99", "largest"), v, strict=True)) for k, v in zip(("step", "solver"), found, strict=True)
-    }
+    lines = re.findall(r"p50 ([\d.]+).*p99 ([\d.]+).*largest ([\d.]+)", text)
+    found = [dict(zip(NAMES, map(float, line), strict=True)) for line in lines]
+    return dict(zip(("step", "solver"), found, strict=True))
 
 
-def median(rounds: list[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+def median(rounds: list[Figures]) -> Figures:
     """The median of each figure."""
-    first = rounds[0]
-    return {part: {name: float(np.median([r[part][name] for r in rounds])) for name in first[part]} for part in first}
+    return {part: {k: float(np.median([r[part][k] for r in rounds])) for k in NAMES} for part in rounds[0]}
 
 
 def tracking(model: LCSModel, controller: MPCController, episodes: int) -> dict[str, float]:
@@ -117,34 +114,27 @@ def tracking(model: LCSModel, controller: MPCController, episodes: int) -> dict[
 def main(o: Options) -> None:
     """Measure and print."""
     steps, rounds, episodes = (50, 1, 2) if o.smoke else (o.steps, o.rounds, 50)
-    model, task = LCSModel.from_pretrained("trifinger-cube"), get_task("cube")
-    mpc = task.make_policy(model)
+    model = LCSModel.from_pretrained("trifinger-cube")
+    mpc = get_task("cube").make_policy(model)
     controller = mpc.controller()
     rows = recorded(controller, min(1000, steps))
-    found: dict[str, object] = {"machine": cpu(), "isa": controller.isa, "steps": steps, "rounds": rounds}
+    times: dict[str, list[Figures]] = {"python": []} if o.robot is None else {"python": [], "c": []}
     with tempfile.TemporaryDirectory() as folder:
         path, trajectory = export_controller(mpc, folder), Path(folder) / "trajectory.csv"
-        with trajectory.open("w", newline="") as file:
-            csv.writer(file).writerows([[f"n{i}" for i in range(12)], *([repr(float(v)) for v in row] for row in rows)])
-        python, c = [], []
+        names = ",".join(f"n{i}" for i in range(12))
+        np.savetxt(trajectory, rows, fmt="%.17g", delimiter=",", header=names, comments="")
         for _ in range(rounds):
-            python.append(in_python(controller, rows, steps))
+            times["python"].append(in_python(controller, rows, steps))
             if o.robot is not None:
-                c.append(in_c(o.robot, path, trajectory, steps))
-    found["python"] = median(python)
-    if c:
-        found["c"] = median(c)
-    print(f"{found['machine']}, {found['isa']}, {steps} warm steps, median of {rounds} rounds [µs]")
-    for name in ("python", "c"):
-        for part, values in (found[name] if name in found else {}).items():  # pyright: ignore
-            print(f"  {name:6} {part:6} " + "  ".join(f"{k} {v:8.1f}" for k, v in values.items()))
-    found["deadline"] = {}
-    for on_failure in ("hold", "unfinished"):
-        for limit in (None, 200e-6, 100e-6):
-            result = tracking(model, mpc.controller(on_failure, limit), episodes)
-            found["deadline"][f"{on_failure} {limit}"] = result  # pyright: ignore
-            print(f"  {on_failure:10} deadline {limit}: squared error {result['error']:.1f}, "
-                  f"{100 * result['unsolved']:.0f} % of the steps not solved")  # fmt: skip
+                times["c"].append(in_c(o.robot, path, trajectory, steps))
+    found = {"machine": cpu(), "isa": controller.isa, "steps": steps, "rounds": rounds}
+    found |= {name: median(each) for name, each in times.items()}
+    found["deadline"] = {
+        f"{on_failure} {limit}": tracking(model, mpc.controller(on_failure, limit), episodes)
+        for on_failure in ("hold", "unfinished")
+        for limit in (None, 200e-6, 100e-6)
+    }
+    print(json.dumps(found, indent=2))
     if not o.smoke:
         save(o.out, found)
 

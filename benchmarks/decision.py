@@ -23,10 +23,9 @@ import torch
 import tyro
 from torch import Tensor
 
-from difflcs.bench import machine, save
-from difflcs.rl import Ensemble, get_method, get_task
-from difflcs.rl.pddm import Planner
-from difflcs.zoo import Learned
+from difflcs.cli.bench import machine, save
+from difflcs.rl import Ensemble, TrainedPolicy, get_method, get_task
+from difflcs.rl.learning.pddm import Planner
 
 
 @dataclass
@@ -61,7 +60,7 @@ def states_and_goals(count: int, seed: int) -> tuple[Tensor, Tensor]:
 def ways(o: Options) -> Mapping[str, Callable[[Tensor, Tensor], Any]]:
     """What decides, from one state (9,) and goal (3,)."""
     task, settings = get_task("cube"), get_method("pddm")().pddm  # pyright: ignore[reportAttributeAccessIssue]
-    mpc: Any = Learned.open(o.model).policy
+    mpc: Any = TrainedPolicy.open(o.model).policy
     controller, sizes = mpc.controller(), (settings.ensemble.networks, settings.ensemble.width)
     ensemble = Ensemble(task.n_x, task.n_u, *sizes, torch.Generator().manual_seed(o.seed))
     planner = Planner(ensemble, task.make_cost(), settings, *task.bounds)
@@ -86,24 +85,19 @@ def main(o: Options) -> None:
     if o.smoke:
         o.states, o.repeats = 3, 2
     torch.set_num_threads(1)
-    states, goals = states_and_goals(o.states, o.seed)
-    decide = ways(o)
-    spent = {name: np.full(o.states, np.inf) for name in decide}
-    for _ in range(o.repeats):
-        for k, (state, goal) in enumerate(zip(states, goals, strict=True)):
+    decide, cases = ways(o), list(zip(*states_and_goals(o.states, o.seed), strict=True))
+    spent = {name: np.full((o.repeats, o.states), np.inf) for name in decide}
+    for repeat in range(o.repeats):
+        for k, (state, goal) in enumerate(cases):
             for name, way in decide.items():
                 begun = time.process_time()
                 way(state, goal)
-                spent[name][k] = min(spent[name][k], time.process_time() - begun)
-    medians = {name: float(np.median(seconds)) for name, seconds in spent.items()}
-    ratio = medians["PDDM"] / medians["LCS-MPC"]
-    for name, median in medians.items():
-        print(f"{name:10s} {1e3 * median:7.3f} ms")
-    print(f"PDDM / LCS-MPC: {ratio:.0f}")
-    same = {"model": o.model, "states": o.states, "repeats": o.repeats, "seed": o.seed}
-    save(
-        o.out, {"machine": machine(), **same, "milliseconds": {k: 1e3 * v for k, v in medians.items()}, "ratio": ratio}
-    )
+                spent[name][repeat, k] = time.process_time() - begun
+    milliseconds = {name: 1e3 * float(np.median(seconds.min(0))) for name, seconds in spent.items()}
+    ratio = milliseconds["PDDM"] / milliseconds["LCS-MPC"]
+    print(", ".join(f"{name} {median:.3f} ms" for name, median in milliseconds.items()), f"PDDM / LCS-MPC: {ratio:.0f}")
+    asked = {"model": o.model, "states": o.states, "repeats": o.repeats, "seed": o.seed}
+    save(o.out, {"machine": machine(), **asked, "milliseconds": milliseconds, "ratio": ratio})
 
 
 if __name__ == "__main__":

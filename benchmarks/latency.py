@@ -3,26 +3,24 @@
 A loop is closed on the LCS itself, with a disturbance, and a new start and goal for each episode, so that states vary.
 Episode by episode, every way to plan takes its turn at the same problems, with the shifted plans as warm starts:
 
-- kernel: the native solver alone, its arguments ready;
+- kernel: the native solver alone, by the clock of the controller;
 - layer: `LCSMPCLayer` without gradient, tensors in, tensors out;
 - shift: the warm start of the next call, `MPCSolution.shift`;
 - layer and gradient: the plan, and the gradient of its first action in everything that the layer learns and the state;
 - controller: `LCSMPCLayer.controller`, NumPy in and out, which shifts its plan itself.
 
-Prints median and 99th percentile in CPU time, the median as a ratio to that of the kernel, and the median of what a
-call takes beyond the kernel's in the same state. Times of a shared machine mean little, ratios more. The JSON has wall
-time too.
+Prints median and 99th percentile in CPU time, and the median as a ratio to that of the kernel. Times of a shared
+machine mean little, ratios more.
 """
 
 from __future__ import annotations
 
-import os
 import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -30,10 +28,8 @@ import tyro
 from torch import Tensor
 
 from difflcs import LCSModel, LCSMPCLayer, LCSParams, MPCSolution, QuadraticCost
-from difflcs._native import _kernels
-from difflcs.bench import ACTION_LIMIT, machine, pushing_cost, save, states_and_goals
+from difflcs.cli.bench import ACTION_LIMIT, machine, pushing_cost, save, states_and_goals
 from difflcs.errors import DegenerateWarning
-from difflcs.mpc.backends import batched
 from difflcs.mpc.solution import Primal
 from difflcs.systems import cart_pole_between_walls
 
@@ -94,42 +90,14 @@ CASES: dict[str, Callable[[int, int], Case]] = {
 }
 
 
-class Recorder:
-    """Stands before the kernels and remembers the last call, so that it can be made again alone."""
-
-    def __init__(self) -> None:
-        self.again: Callable[[], object] = lambda: None
-
-    def __getattr__(self, name: str) -> Any:
-        kernel = getattr(_kernels, name)
-
-        def call(*args: Any, **kwargs: Any) -> object:
-            self.again = lambda: kernel(*args, **kwargs)
-            return kernel(*args, **kwargs)
-
-        return call
-
-
-def kernel_call(mpc: LCSMPCLayer, inputs: tuple[Tensor, ...], guess: Primal) -> Callable[[], object]:
-    """The call of the native solver that the layer makes for a problem."""
-    recorder = Recorder()
-    batched._kernels = recorder  # pyright: ignore[reportAttributeAccessIssue]
-    try:
-        mpc(*inputs, guess=guess)
-    finally:
-        batched._kernels = _kernels
-    return recorder.again
-
-
-@dataclass
-class Step:
-    """One state of an episode: what the layer is called with, the plan of the state before, and the one found here."""
+class Step(NamedTuple):
+    """One state of an episode, as each way takes it; the guess, and the plan that comes of it."""
 
     inputs: tuple[Tensor, ...]
-    before: MPCSolution
-    guess: Primal
+    leaf: Tensor
+    arrays: list[np.ndarray]
+    guess: Primal | None
     plan: MPCSolution
-    kernel: Callable[[], object]
 
 
 def play(case: Case, episode: int, plan: MPCSolution | None, generator: torch.Generator) -> list[Step]:
@@ -137,87 +105,57 @@ def play(case: Case, episode: int, plan: MPCSolution | None, generator: torch.Ge
     x, steps = case.starts[episode : episode + 1].clone(), []
     goal = () if case.goals is None else (case.goals[episode : episode + 1].clone(),)
     for _ in range(EPISODE):
-        before = case.mpc(x, *goal) if plan is None else plan
-        guess = before.shift()
-        found = plan = case.mpc(x, *goal, guess=guess)
-        steps.append(Step((x, *goal), before, guess, found, kernel_call(case.mpc, (x, *goal), guess)))
+        guess = None if plan is None else plan.shift()
+        plan = case.mpc(x, *goal, guess=guess)
+        arrays = [value[0].numpy() for value in (x, *goal)]
+        steps.append(Step((x, *goal), x.clone().requires_grad_(), arrays, guess, plan))
         noise = torch.randn(x.shape, generator=generator, dtype=torch.float64)
-        x = case.lcs.step(x, found.action).x_next + case.disturbance * noise
+        x = case.lcs.step(x, plan.action).x_next + case.disturbance * noise
     return steps
-
-
-def ways(mpc: LCSMPCLayer, controller: Any) -> dict[str, Callable[[Step], Callable[[], Any]]]:
-    """Name → the call to be timed, at a step."""
-
-    def with_gradient(step: Step) -> Callable[[], Any]:
-        x = step.inputs[0].clone().requires_grad_()
-
-        def work() -> None:
-            with torch.enable_grad():
-                mpc(x, *step.inputs[1:], guess=step.guess).action.square().sum().backward()
-
-        return work
-
-    def with_controller(step: Step) -> Callable[[], Any]:
-        arrays = [value[0].numpy() for value in step.inputs]
-        return lambda: controller.step(*arrays)
-
-    found: dict[str, Callable[[Step], Callable[[], Any]]] = {
-        "kernel": lambda step: step.kernel,
-        "layer": lambda step: lambda: mpc(*step.inputs, guess=step.guess),
-        "shift": lambda step: step.before.shift,
-        "layer and gradient": with_gradient,
-    }
-    if controller is not None:
-        found["controller"] = with_controller
-    return found
-
-
-def timed(work: Callable[[], Any]) -> tuple[int, int, Any]:
-    """CPU and wall time of a call [ns], and its result."""
-    wall, start = time.perf_counter_ns(), time.process_time_ns()
-    result = work()
-    used = time.process_time_ns() - start
-    return used, time.perf_counter_ns() - wall, result
 
 
 @torch.no_grad()
 def measure(case: Case, o: Options) -> dict[str, dict[str, float]]:
     """Every figure of one problem by the name of the way."""
-    mpc = case.mpc
-    make = getattr(mpc, "controller", None)
-    if make is None:
-        print("this version has no LCSMPCLayer.controller: left out")
-    calls = ways(mpc, None if make is None else make())
-    times: dict[str, list[tuple[int, int]]] = {name: [] for name in calls}
+    mpc, controller = case.mpc, case.mpc.controller()
+
+    def differentiate(step: Step) -> None:
+        with torch.enable_grad():
+            mpc(step.leaf, *step.inputs[1:], guess=step.guess).action.square().sum().backward()
+
+    ways: dict[str, Callable[[Step], Any]] = {
+        "layer": lambda step: mpc(*step.inputs, guess=step.guess),
+        "shift": lambda step: step.plan.shift(),
+        "layer and gradient": differentiate,
+        "controller": lambda step: controller.step(*step.arrays),
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in ("kernel", *ways)}
     apart, unsolved, iterations, plan = 0.0, 0, [], None
     generator = torch.Generator().manual_seed(o.seed + 1)
-    for episode in range(o.warm_up + o.episodes):
-        steps = play(case, episode, plan, generator)
+    for episode in range(-o.warm_up, o.episodes):
+        steps = play(case, episode + o.warm_up, plan, generator)
         plan = steps[-1].plan
-        for name, call in calls.items():
+        for name, way in ways.items():
             for step in steps:
-                used, wall, result = timed(call(step))
-                if episode >= o.warm_up:
-                    times[name].append((used, wall))
-                    if name == "controller":
-                        apart = max(apart, float(np.abs(result - step.plan.action[0].numpy()).max()))
+                begun = time.process_time_ns()
+                result = way(step)
+                used = 1e-9 * (time.process_time_ns() - begun)
+                if episode < 0:
+                    continue
+                seconds[name].append(used)
+                if name == "controller":
+                    assert controller.plan is not None
+                    seconds["kernel"].append(controller.plan.solve_time)
+                    apart = max(apart, float(np.abs(result - step.plan.action[0].numpy()).max()))
             mpc.zero_grad()
-        if episode >= o.warm_up:
+        if episode >= 0:
             unsolved += sum(not bool(step.plan.converged) for step in steps)
             iterations += [int(step.plan.iterations) for step in steps]
-    kernel = np.array(times["kernel"]) / 1e3
     figures: dict[str, dict[str, float]] = {}
-    for name, found in times.items():
-        both = np.array(found) / 1e3
-        figures[name] = {
-            "p50 µs": float(np.median(both[:, 0])),
-            "p99 µs": float(np.percentile(both[:, 0], 99)),
-            "wall p50 µs": float(np.median(both[:, 1])),
-            "wall p99 µs": float(np.percentile(both[:, 1], 99)),
-            "p50 to kernel": float(np.median(both[:, 0]) / np.median(kernel[:, 0])),
-            "over kernel µs": float(np.median(both[:, 0] - kernel[:, 0])),
-        }
+    for name, values in seconds.items():
+        p50, p99 = (1e6 * float(np.percentile(values, q)) for q in (50, 99))
+        ratio = float(np.median(values) / np.median(seconds["kernel"]))
+        figures[name] = {"p50 µs": p50, "p99 µs": p99, "p50 to kernel": ratio}
     figures["plans"] = {"unsolved": unsolved, "iterations": float(np.mean(iterations)), "controller apart": apart}
     return figures
 
@@ -228,24 +166,14 @@ def main(o: Options) -> None:
         o.episodes, o.warm_up = 2, 1
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", DegenerateWarning)
-    count, total = o.episodes + o.warm_up, o.episodes * EPISODE
     results = {}
     for name, make in CASES.items():
-        results[name] = figures = measure(make(count, o.seed), o)
-        plans = figures["plans"]
-        print(f"{name}: {plans['iterations']:.1f} iterations, {plans['unsolved']:.0f} of {total} not solved")
-        for way, row in figures.items():
-            if way != "plans":
-                print(
-                    f"  {way:20s} p50 {row['p50 µs']:7.0f} µs   p99 {row['p99 µs']:7.0f} µs   "
-                    f"{row['p50 to kernel']:6.2f} × kernel   {row['over kernel µs']:+7.0f} µs"
-                )
-    record = {
-        "machine": {**machine(), "cores": os.cpu_count()},
-        "options": {"calls": total, "episodes": o.episodes, "warm_up": o.warm_up, "seed": o.seed},
-        "results": results,
-    }
-    save(o.out, record)
+        results[name] = measure(make(o.episodes + o.warm_up, o.seed), o)
+        print(name)
+        for way, row in results[name].items():
+            print(f"  {way:20s}", "  ".join(f"{label} {value:.3g}" for label, value in row.items()))
+    options = {"calls": o.episodes * EPISODE, "episodes": o.episodes, "warm_up": o.warm_up, "seed": o.seed}
+    save(o.out, {"machine": machine(), "options": options, "results": results})
 
 
 if __name__ == "__main__":

@@ -10,22 +10,8 @@ import torch
 from torch import Tensor
 
 from difflcs import LCSModel, LCSParams, QuadraticCost
-from difflcs.bench import ACTION_LIMIT, pushing_model, states_and_goals
+from difflcs.cli.bench import ACTION_LIMIT, pushing_cost, pushing_model, states_and_goals
 from difflcs.systems import cart_pole_between_walls
-from difflcs_envs.tasks import pushing_cost
-
-__all__ = [
-    "ACTION_LIMIT",
-    "FAMILIES",
-    "Instance",
-    "cart_states",
-    "chain_of_carts",
-    "push_the_last_cart",
-    "pushing_model",
-    "random_model",
-    "states_and_goals",
-    "uniform",
-]
 
 
 def random_model(n_lam: int, seed: int, n_x: int = 9, n_u: int = 6) -> LCSParams:
@@ -87,8 +73,9 @@ def _diagonal(*weights: float) -> Tensor:
     return torch.diag(torch.tensor(weights, dtype=torch.float64))
 
 
-def _pushing(lcs: LCSParams, count: int, seed: int) -> Instance:
-    layer = {"lcs": lcs, "cost": pushing_cost(), "horizon": 5, "u_min": -ACTION_LIMIT, "u_max": ACTION_LIMIT}
+def pushing(lcs: LCSParams, count: int, seed: int, horizon: int = 5) -> Instance:
+    """The task of the cube: its cost, and actions of 15 mm."""
+    layer = {"lcs": lcs, "cost": pushing_cost(), "horizon": horizon, "u_min": -ACTION_LIMIT, "u_max": ACTION_LIMIT}
     return Instance(layer, states_and_goals(count, seed))
 
 
@@ -123,9 +110,9 @@ OBJECTS = ("cube", "mug", "wrench", "banana")
 
 # `count` problems of each of a family's models.
 FAMILIES: dict[str, Callable[[int], list[Instance]]] = {
-    "pushing, n_lam 5": lambda count: [_pushing(pushing_model(5, seed), count, seed) for seed in range(4)],
-    "pushing, n_lam 8": lambda count: [_pushing(pushing_model(8, seed), count, seed) for seed in range(4)],
-    "zoo": lambda count: [_pushing(_zoo(name), count, 10 + i) for i, name in enumerate(OBJECTS)],
+    "pushing, n_lam 5": lambda count: [pushing(pushing_model(5, seed), count, seed) for seed in range(4)],
+    "pushing, n_lam 8": lambda count: [pushing(pushing_model(8, seed), count, seed) for seed in range(4)],
+    "zoo": lambda count: [pushing(_zoo(name), count, 10 + i) for i, name in enumerate(OBJECTS)],
     "random, n_lam 5, H 10": lambda count: [_random(random_model(5, seed), 10, count, seed) for seed in range(4)],
     "cart-pole, H 30": lambda count: [_cart_pole(30, 0.04, stiffness, count) for stiffness in (10.0, 100.0)],
     "cart-pole, H 50": lambda count: [_cart_pole(50, 0.02, stiffness, count) for stiffness in (10.0, 100.0)],

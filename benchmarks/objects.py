@@ -1,4 +1,4 @@
-"""Success over minutes of data on the objects, by any method: `python benchmarks/objects.py [--smoke]`.
+"""Success and computing over minutes of data, by any method on any object: `python benchmarks/objects.py [--smoke]`.
 
 Trains each method on each task from each seed, and evaluates what it has learned whenever so many minutes of data are
 collected, on the same fresh goals, without noise. Minute 0 is before any data. Every evaluation is written when it is
@@ -12,17 +12,33 @@ without physics nothing. With `DIFFLCS_YCB_DIR` the objects have their scanned m
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterator
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 import tyro
-from trainings import Training
 
-from difflcs.bench import machine, save
-from difflcs.rl import get_method, get_task
+from difflcs.cli.bench import machine, save
+from difflcs.rl import evaluate, get_method, get_task, method_names
+from difflcs.rl.learning.model_rollouts import ModelRolloutSettings
+from difflcs.rl.learning.ppo_settings import PPOSettings
+from difflcs.rl.methods.base import Method, Work
+
+QUICK: dict[str, Any] = {
+    "n_lam": 5,
+    "ppo": PPOSettings(rollouts=68, steps=4),
+    "models": ModelRolloutSettings(iterations=3, rollouts=80, steps=10, value_epochs=7),
+}
+"""LCS-RL where it shall cost little; docs/training.md has it as flags. Chosen on the seeds 1 to 4."""
+METHODS: dict[str, Method] = {
+    **{name: get_method(name)() for name in method_names()},
+    "quick": get_method("lcs-rl")(**QUICK),
+}
+"""Those that are registered, each with its default settings; and quick settings of LCS-RL."""
 
 
 @dataclass
@@ -34,7 +50,7 @@ class Options:
     )
     """Tasks that are known to `difflcs train`."""
     methods: list[str] = field(default_factory=lambda: ["contact-lcs"])
-    """Methods, each with its default settings."""
+    """Names of `METHODS`."""
     minutes: list[float] = field(default_factory=lambda: [0, 1, 2, 3])
     """When to evaluate; the last one is the length of the training."""
     seeds: list[int] = field(default_factory=lambda: [0, 1, 2, 3, 4, 5, 6, 7])
@@ -43,8 +59,6 @@ class Options:
     """Goals of each evaluation."""
     evaluation_seed: int = 1_000_000
     """Seed of the goals, the same for all."""
-    envs: int = 100
-    """Environments side by side in evaluations."""
     out: Path = Path("benchmarks/results/objects.json")
     """Where the JSON goes."""
     smoke: bool = False
@@ -58,31 +72,34 @@ def key(row: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def run(o: Options, task_name: str, method_name: str, seed: int, done: set[tuple[Any, ...]]) -> Iterator[dict]:
-    """The evaluations of one training that are not done yet."""
-    task, method = get_task(task_name), get_method(method_name)()
-    if o.smoke:
-        method = method.smoke()
-    same = {
-        "task": task_name,
-        "method": method_name,
-        "seed": seed,
-        "total_minutes": max(o.minutes),
-        "goals": o.goals,
-        "evaluation_seed": o.evaluation_seed,
-    }
+    """The evaluations of one training that are not done yet; seconds are CPU time of the training alone."""
+    task, method = get_task(task_name), METHODS[method_name]
+    same = {"task": task_name, "method": method_name, "seed": seed, "total_minutes": max(o.minutes)}
+    same |= {"goals": o.goals, "evaluation_seed": o.evaluation_seed}
     if all(key({**same, "minutes": m}) in done for m in o.minutes):
         return
     told = task.physics.told if task.physics is not None and method.kind == "physics" else "nothing"
-    with Training(task, method, seed, max(o.minutes), o.envs) as training:
-        described = dict(task.describe(training.envs))
-        for minutes, spent in training.at(o.minutes):
+    per_minute, spent = task.steps_per_minute / task.episode_steps, 0.0
+    with ExitStack() as opened:
+
+        def make_envs(count: int) -> Any:
+            return opened.enter_context(closing(task.make_envs(count, threads=1)))
+
+        envs = make_envs(min(100, o.goals))
+        work = Work(task, seed, round(max(o.minutes) * per_minute), make_envs)
+        trainer = (method.smoke() if o.smoke else method).trainer(work)
+        for minutes in sorted(o.minutes):
+            begun = time.process_time()
+            while trainer.episodes < round(minutes * per_minute):
+                trainer.step()
+            spent += time.process_time() - begun
             if key({**same, "minutes": minutes}) in done:
                 continue
-            found = training.evaluate(o.goals, o.evaluation_seed)
+            found = evaluate(envs, trainer.policy, o.goals, o.evaluation_seed, task.episode_steps)
             yield {
                 **same,
                 "minutes": minutes,
-                "episodes": training.trainer.episodes,
+                "episodes": trainer.episodes,
                 "success_rate": found.success_rate,
                 "successes": found.successes,
                 "ci_low": found.ci_low,
@@ -91,14 +108,14 @@ def run(o: Options, task_name: str, method_name: str, seed: int, done: set[tuple
                 "solver_failures": found.solver_failures,
                 "training_cpu_seconds": round(spent, 1),
                 "told": told,
-                "object": described,
+                "object": dict(task.describe(envs)),
             }
 
 
 def main(o: Options) -> None:
     """Train, evaluate, write."""
     if o.smoke:
-        o.tasks, o.seeds, o.minutes, o.goals, o.envs = o.tasks[:1], o.seeds[:1], [0, 0.2], 4, 4
+        o.tasks, o.seeds, o.minutes, o.goals = o.tasks[:1], o.seeds[:1], [0, 0.4], 4
     torch.set_num_threads(1)
     rows = json.loads(o.out.read_text())["rows"] if o.out.exists() else []
     for seed in o.seeds:

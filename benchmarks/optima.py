@@ -17,7 +17,7 @@ import tyro
 from models import FAMILIES, Instance
 
 from difflcs import LCSMPCLayer
-from difflcs.bench import machine, save
+from difflcs.cli.bench import machine, save
 from difflcs.mpc.backends import Backend, BatchedBackend
 
 EFFORTS: dict[str, Backend] = {
@@ -41,8 +41,6 @@ class Options:
     """Problems per model."""
     repetitions: int = 5
     """Solves of each, in turn with the other efforts; the fastest counts."""
-    only: tuple[str, ...] = ()
-    """Families, if not all."""
     out: Path = Path("benchmarks/results/optima.json")
     """Where the JSON goes."""
     smoke: bool = False
@@ -115,19 +113,12 @@ def main(o: Options) -> None:
         o.problems, o.repetitions = 4, 1
     results = {}
     for kind, make in FAMILIES.items():
-        if o.only and kind not in o.only:
-            continue
         instances = make(o.problems)
         count = o.problems * len(instances)
         results[kind] = {"problems": count, **compare(instances, o.repetitions)}
         print(f"{kind}: {count} problems of {len(instances)} models")
         for name in EFFORTS:
-            row = results[kind][name]
-            print(
-                f"  {name:8s} mean gap {100 * row['mean gap']:7.3f} %   within 0.1 % of best "
-                f"{100 * row['within 0.1 % of best']:5.1f} %   failed {row['failed']}   time {row['time']:.2f}×, "
-                f"alone {row['time alone']:.2f}×"
-            )
+            print(f"  {name:8s}", "   ".join(f"{label} {value:.4g}" for label, value in results[kind][name].items()))
     save(o.out, {"machine": machine(), "problems per model": o.problems, "results": results})
 
 

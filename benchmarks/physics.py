@@ -23,7 +23,7 @@ import tyro
 from torch import Tensor
 
 from difflcs import LCSParams
-from difflcs.bench import machine, save
+from difflcs.cli.bench import machine, save
 from difflcs.errors import FrictionWarning
 from difflcs.physics.mujoco import MujocoLCS
 

@@ -8,34 +8,29 @@ of 0.1 m, as in Push-T 100 pixels are.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from difflcs.physics import Inertia, PDDrive, PlanarPushing, Polygon, Union, box
+from difflcs.physics import Inertia, PlanarPushing, Polygon
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "examples"))
+from push_t import DRIVE, RADIUS, tee
 
 Array = NDArray[np.float64]
 
-STIFFNESS, DAMPING, SUBSTEP, SUBSTEPS = 100.0, 20.0, 0.01, 10
-RADIUS, MASS = 0.15, 1.0
-BOXES = ((-0.6, 0.6, 0.0, 0.3), (-0.15, 0.15, 0.3, 1.2))
+MASS = 1.0
 COORDINATES = {"position": ([0, 1], "mm", 0.01), "yaw": ([2], "rad", 1.0)}
-
-
 CORNERS = ((-0.6, 0.0), (0.6, 0.0), (0.6, 0.3), (0.15, 0.3), (0.15, 1.2), (-0.15, 1.2), (-0.15, 0.3), (-0.6, 0.3))
 
 
-def tee() -> Union:
-    """The T as two boxes, with its origin at the centre of its area."""
-    cx, cy = Polygon(CORNERS).centroid.tolist()
-    return Union(tuple(box(a - cx, b - cx, c - cy, d - cy) for a, b, c, d in BOXES))
-
-
 def outline() -> Polygon:
-    """The same as one outline, which has one contact with a disc."""
+    """The T as one outline, which has one contact with a disc."""
     whole = Polygon(CORNERS)
     return Polygon(whole.vertices - whole.centroid)
 
@@ -71,10 +66,11 @@ class Simulation:
         self.body.velocity, self.body.angular_velocity = x[7:9].tolist(), float(x[9])
         self.space.reindex_shapes_for_body(self.body)
         target = x[3:5] + u
-        for _ in range(SUBSTEPS):
+        for _ in range(DRIVE.substeps):
             place, speed = np.array(self.disc.position), np.array(self.disc.velocity)
-            self.disc.velocity = (speed + (STIFFNESS * (target - place) - DAMPING * speed) * SUBSTEP).tolist()
-            self.space.step(SUBSTEP)
+            pull = DRIVE.stiffness * (target - place) - DRIVE.damping * speed
+            self.disc.velocity = (speed + pull * DRIVE.substep).tolist()
+            self.space.step(DRIVE.substep)
         moved = [*self.body.position, self.body.angle, *self.disc.position, *self.disc.velocity]
         return np.array([*moved, *self.body.velocity, self.body.angular_velocity])
 
@@ -100,14 +96,9 @@ def pushes(count: int, random: np.random.Generator) -> tuple[Array, Array]:
 def cases(count: int, random: np.random.Generator) -> Iterator[dict[str, Any]]:
     """Fields of the cases: without friction, with it, and with a velocity that stays."""
     x, u = pushes(count, random)
-    system: dict[str, Any] = {
-        "shape": tee(),
-        "radius": RADIUS,
-        "drive": PDDrive(STIFFNESS, DAMPING, SUBSTEP, SUBSTEPS),
-        "compliance": 1e-3,
-    }
+    system: dict[str, Any] = {"shape": tee(), "radius": RADIUS, "drive": DRIVE, "compliance": 1e-3}
     stewart = {"cone": "stewart-trinkle"}
-    gliding = Inertia(MASS, SUBSTEP * SUBSTEPS, -math.log(0.2))
+    gliding = Inertia(MASS, 0.1, -math.log(0.2))
     for name, mu, decay, mode, options in (
         ("T and disc, no friction", 0.0, 0.0, "quasi-static", {}),
         ("T and disc, friction 0.5", 0.5, 0.0, "quasi-static", {}),

@@ -25,7 +25,7 @@ from race_problems import small, with_contact, without_contact
 from rivals.problem import Problem
 
 from difflcs import LCSMPCLayer, LCSParams, QuadraticCost
-from difflcs.bench import machine, save
+from difflcs.cli.bench import machine, save
 from difflcs.mpc import kkt
 from difflcs.mpc.backends import BatchedBackend, IpoptBackend
 from difflcs.mpc.problem import MPCProblem
@@ -58,7 +58,6 @@ PLAIN = {"bound_relax_factor": 0.0}
 TUNED = {"tol": 1e-6, "mu_init": 1e-4, "bound_relax_factor": 0.0}
 TUNED |= {"fast_step_computation": "yes", "mumps_pivot_order": 0}
 ADAPTIVE = {**TUNED, "mu_strategy": "adaptive"}
-POUNCE = {"tol": 1e-6, "mu_init": 1e-4}
 CONTACT = (
     Entry("difflcs `batched`", "layer"),
     Entry("difflcs `ipopt`", "layer", {"backend": "ipopt"}),
@@ -67,16 +66,12 @@ CONTACT = (
     Entry("IPOPT, tuned, adaptive", "ipopt", {"start": 0.1, "options": ADAPTIVE}),
     Entry("FATROP, λ = 1", "fatrop", {"start": 1.0}),
     Entry("FATROP, tuned", "fatrop", {"start": 0.1, "options": {"tol": 1e-5, "mu_init": 1e-2, "max_iter": 1000}}),
-    Entry("POUNCE, tuned", "pounce", {"start": 0.1, "options": POUNCE}, "rivals", ("pounce-solver", "casadi")),
-    Entry("pympcc", "pympcc", {}, "rivals", ("pympcc", "cyipopt-wheels")),
 )
 LINEAR = (
     Entry("difflcs `batched`", "layer"),
     Entry("DAQP", "daqp_qp", {}, "rivals", ("daqp",)),
     Entry("acados (HPIPM)", "acados_ocp", {}, "acados", ("comma-deps-acados", "numpy")),
     Entry("Clarabel", "clarabel_qp", {}, "rivals", ("clarabel", "scipy")),
-    Entry("Moreau, active set", "moreau_qp", {"solver": "active_set"}, "rivals", ("moreau",)),
-    Entry("Moreau, interior point", "moreau_qp", {"solver": "ipm"}, "rivals"),
     Entry("qpax", "qpax_qp", {}, "rivals", ("qpax",)),
     Entry("mpc.pytorch", "mpc_pytorch", {}, "mpc", ("torch==2.13.0", "mpc")),
     Entry("cvxpylayers", "cvxpylayers_qp"),
@@ -400,7 +395,8 @@ def race(name: str, o: Options) -> Iterator[tuple[str, object]]:
         families = {}
         for family, members in problems.items():
             families[family] = summary([run(problem, processes, o, folder) for problem in members])
-            show(family, families[family])
+            for label, row in families[family].items():
+                print(f"{family:20s} {label:24s} {row.get('error') or row['ratio'][0]}", flush=True)
         differences = {family: finite_differences(members[0]) for family, members in problems.items()}
         for process in processes:
             process.close()
@@ -409,24 +405,6 @@ def race(name: str, o: Options) -> Iterator[tuple[str, object]]:
     yield f"{name}, best rival", best_rival(families)
     yield f"{name}, versions", {p.entry.label: p.version for p in processes if not p.missing}
     yield f"{name}, missing", {p.entry.label: p.missing for p in processes if p.missing}
-
-
-def show(family: str, table: dict[str, dict]) -> None:
-    """A family as text."""
-    print(family)
-    for label, row in table.items():
-        if "error" in row:
-            print(f"  {label:24s} failed: {row['error']}", flush=True)
-            continue
-        mean, low, high = row["ratio"]
-        gap = "" if row["mean gap"] is None else f"gap {100 * row['mean gap']:7.3f} %  near {100 * row['near']:3.0f} %"
-        error = "" if row["gradient error"] is None else f"gradient {row['gradient error']:.0e}"
-        batch = f"  in a batch {1e6 * row['batch']:.0f} µs" if "batch" in row else ""
-        print(
-            f"  {label:24s} {1e6 * row['seconds']:9.0f} µs  {mean:7.2f}× ({low:.2f} … {high:.2f})  "
-            f"solved {row['solved']}/{row['of']}  {gap}  {error}{batch}",
-            flush=True,
-        )
 
 
 def globally(o: Options) -> dict[str, dict]:
@@ -469,17 +447,12 @@ def main(o: Options) -> None:
     if o.smoke:
         o.problems, o.batch, o.linear_batch, o.small_problems, o.seeds, o.rounds, o.nodes = 2, 3, 3, 1, 1, 1, 300
     torch.set_num_threads(1)
-    options = {
-        n: getattr(o, n) for n in ("problems", "batch", "linear_batch", "small_problems", "seeds", "rounds", "nodes")
-    }
+    names = ("problems", "batch", "linear_batch", "small_problems", "seeds", "rounds", "nodes")
+    options = {name: getattr(o, name) for name in names}
     results = json.loads(o.out.read_text())["results"] if o.out.exists() else {}
     for name in o.parts:
-        if name == "global":
-            results["global"] = globally(o)
-        else:
-            results |= dict(race(name, o))
-        record = {"machine": machine(), "options": options, "results": results}
-        save(o.out, record)
+        results |= {"global": globally(o)} if name == "global" else dict(race(name, o))
+        save(o.out, {"machine": machine(), "options": options, "results": results})
 
 
 if __name__ == "__main__":

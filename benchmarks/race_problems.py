@@ -19,7 +19,7 @@ from models import (
 from rivals.problem import Problem
 
 from difflcs import LCSModel, LCSParams, QuadraticCost
-from difflcs.bench import pushing_cost
+from difflcs.cli.bench import pushing_cost
 from difflcs.systems import block_along_wall, cart_pole_between_walls
 
 RELAXATION = 1e-5

@@ -1,45 +1,59 @@
-"""Whether the solver copes with large problems: `python benchmarks/scale.py [--problems 16] [--smoke]`.
+"""How large problems may be, and how long their horizons: `python benchmarks/scale.py [--problems 16] [--smoke]`.
 
-Two families, both solved with the default settings from nothing:
+All are solved with the default settings from nothing, on one thread:
 
 - "random": `random_model` of any size, two actions for three states, |u| ≤ 1, x0 ~ N(0, 1). Nothing in it is like a
   robot: contacts couple everything, and larger ones are unstable.
 - "carts": a chain of carts between two walls whose first cart must push the last one.
+- "random, weak" and "pushing, weak": the cost and the bounds of the cube (15 mm a step) over long horizons, by
+  `batched` and by `ipopt`. Some of these models are unstable in contact, and actions at their bounds cannot hold them.
 
-Printed per size: the share of problems solved, iterations, and CPU time per problem and per iteration on one thread.
-Iterations are those of one start of a problem, on average. Written as JSON too.
+Printed per size: the share of problems solved, iterations of one start on average (most are given up after a few), and
+CPU time per problem. Written as JSON too.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 import tyro
-from models import cart_states, chain_of_carts, push_the_last_cart, random_model
+from models import (
+    Instance,
+    cart_states,
+    chain_of_carts,
+    push_the_last_cart,
+    pushing,
+    pushing_model,
+    random_model,
+)
 
-from difflcs import LCSParams, QuadraticCost
-from difflcs.bench import save
-from difflcs.mpc import MPCProblem
-from difflcs.mpc.backends import BatchedBackend
+from difflcs import LCSMPCLayer, QuadraticCost
+from difflcs.cli.bench import machine, save
+from difflcs.mpc.backends import Backend, BatchedBackend, IpoptBackend
 
-RELAXATION = 1e-5
 # n_x, n_lam, H
 RANDOM = [
     *[(9, n_lam, 10) for n_lam in (2, 5, 8, 12, 20, 30)],
     *[(20, 8, 10), (40, 8, 10), (9, 8, 20), (9, 8, 40), (20, 5, 20), (20, 20, 20), (40, 30, 10), (40, 30, 40)],
 ]
 CARTS = [(carts, horizon) for carts in (2, 4, 10, 20) for horizon in (10, 20, 40)]
+WEAK = {"random, weak": random_model, "pushing, weak": pushing_model}
+HORIZONS, WEAK_MODELS, WEAK_PROBLEMS = (10, 20, 30), 24, 8
+BACKENDS: dict[str, Backend] = {"batched": BatchedBackend(threads=1), "ipopt": IpoptBackend(workers=1)}
 
 
 @dataclass
 class Options:
-    """Convergence, iterations and time per iteration by size."""
+    """Convergence, iterations and time by size."""
 
     problems: int = 16
-    """Problems per model."""
+    """Problems per model of the first two families."""
     seeds: int = 4
     """Models of each size; the carts have one."""
     out: Path = Path("benchmarks/results/scale.json")
@@ -48,101 +62,65 @@ class Options:
     """Everything tiny."""
 
 
-@dataclass
-class Row:
-    """What was measured at one size; times are in seconds of CPU."""
-
-    family: str
-    n_x: int
-    n_u: int
-    n_lam: int
-    horizon: int
-    problems: int
-    solved: float
-    starts: int
-    iterations: float  # of one start; most are given up after a few
-    per_problem: float
-    per_iteration: float
-
-
-def posed(lcs: LCSParams, cost: QuadraticCost, horizon: int, limit: float, x0: torch.Tensor) -> MPCProblem:
-    """The problem that the layer would hand to a backend."""
-    bound = torch.full((lcs.n_u,), limit, dtype=torch.float64)
-    fields = {name: getattr(cost, name) for name in ("Q", "R", "Q_final", "q", "r", "q_final")}
-    return MPCProblem(
-        **lcs.tensors(), **fields, u_min=-bound, u_max=bound, x0=x0, horizon=horizon, relaxation=RELAXATION
-    )
-
-
-def random_problem(n_x: int, n_lam: int, horizon: int, count: int, seed: int) -> MPCProblem:
+def random_problem(n_x: int, n_lam: int, horizon: int, count: int, seed: int) -> Instance:
     """A random model, to be brought to rest."""
     lcs = random_model(n_lam, seed, n_x, n_u=2 * n_x // 3)
     eye = torch.eye(n_x, dtype=torch.float64)
     cost = QuadraticCost(eye, 0.1 * torch.eye(lcs.n_u, dtype=torch.float64), eye)
     x0 = torch.randn(count, n_x, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    return posed(lcs, cost, horizon, 1.0, x0)
+    return Instance({"lcs": lcs, "cost": cost, "horizon": horizon, "u_min": -1.0, "u_max": 1.0}, (x0,))
 
 
-def carts_problem(carts: int, horizon: int, count: int) -> MPCProblem:
+def carts_problem(carts: int, horizon: int, count: int) -> Instance:
     """Push the last cart 0.3 m further, through all others."""
-    lcs = chain_of_carts(carts, dt=0.1)
     cost = push_the_last_cart(carts, horizon, others=0.1)
-    x0 = cart_states(carts, count, carts)
-    return posed(lcs, cost, horizon, 50.0, x0)
+    layer = {"lcs": chain_of_carts(carts, dt=0.1), "cost": cost, "horizon": horizon, "u_min": -50.0, "u_max": 50.0}
+    return Instance(layer, (cart_states(carts, count, carts),))
 
 
-def measure(family: str, problems: list[MPCProblem]) -> Row:
-    """Solve problems of one size."""
-    backend = BatchedBackend(threads=1)
-    started = time.process_time()
-    results = [backend.solve(problem, None) for problem in problems]
-    spent = time.process_time() - started
-    solved = torch.cat([result.solved for result in results])
-    iterations = torch.cat([result.iterations for result in results]).double()
-    p = problems[0]
-    starts = backend.starts(p, guessed=False)
-    return Row(
-        family=family,
-        n_x=p.n_x,
-        n_u=p.n_u,
-        n_lam=p.n_lam,
-        horizon=p.horizon,
-        problems=len(solved),
-        solved=float(solved.double().mean()),
-        starts=starts,
-        iterations=float(iterations.mean()) / starts,
-        per_problem=spent / len(solved),
-        per_iteration=spent / float(iterations.sum()),
-    )
-
-
-def show(row: Row) -> None:
-    """Print one line."""
-    print(
-        f"{row.family:7s} n_x {row.n_x:2d}  n_u {row.n_u:2d}  n_lam {row.n_lam:2d}  H {row.horizon:2d}: "
-        f"{100 * row.solved:6.2f} % of {row.problems} solved, {row.starts:2d} starts of {row.iterations:6.1f} "
-        f"iterations, "
-        f"{1e3 * row.per_problem:9.3f} ms per problem, {1e6 * row.per_iteration:7.1f} us per iteration",
-        flush=True,
-    )
+@torch.no_grad()
+def measure(family: str, name: str, instances: list[Instance]) -> dict[str, Any]:
+    """Solve problems of one size by one backend, print a line, and give the figures; times are seconds of CPU."""
+    backend, plans = BACKENDS[name], []
+    begun = time.process_time()
+    for instance in instances:
+        plans.append(LCSMPCLayer(backend=backend, on_failure="mask", **instance.layer)(*instance.call))
+    spent = time.process_time() - begun
+    solved, iterations = (torch.cat([getattr(p, n) for p in plans]).double() for n in ("converged", "iterations"))
+    problem = plans[0].problem
+    starts = backend.starts(problem, guessed=False) if isinstance(backend, BatchedBackend) else 1
+    row = {
+        "family": family,
+        "backend": name,
+        **{size: getattr(problem, size) for size in ("n_x", "n_u", "n_lam", "horizon")},
+        "problems": len(solved),
+        "solved": float(solved.mean()),
+        "starts": starts,
+        "iterations": float(iterations.mean()) / starts,
+        "per_problem": spent / len(solved),
+    }
+    print("  ".join(f"{label} {v:.4g}" if isinstance(v, float) else f"{label} {v}" for label, v in row.items()))
+    return row
 
 
 def main(o: Options) -> None:
     """Measure, print, write."""
-    random, carts = RANDOM, CARTS
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore")  # what fails is counted
+    random, carts, horizons, models, few = RANDOM, CARTS, HORIZONS, WEAK_MODELS, WEAK_PROBLEMS
     if o.smoke:
-        o.problems, o.seeds = 4, 1
-        random, carts = random[:1], carts[:1]
+        o.problems, o.seeds, random, carts, horizons, models, few = 4, 1, random[:1], carts[:1], horizons[:1], 2, 2
     rows = []
     for size in random:
-        rows.append(measure("random", [random_problem(*size, o.problems, seed) for seed in range(o.seeds)]))
-        show(rows[-1])
-    for size in carts:
-        rows.append(measure("carts", [carts_problem(*size, o.problems * o.seeds)]))
-        show(rows[-1])
-    solved = sum(row.solved * row.problems for row in rows) / sum(row.problems for row in rows)
-    print(f"solved in all: {100 * solved:.2f} %")
-    save(o.out, {"solved": solved, "rows": [asdict(row) for row in rows]})
+        instances = [random_problem(*size, o.problems, seed) for seed in range(o.seeds)]
+        rows.append(measure("random", "batched", instances))
+    rows += [measure("carts", "batched", [carts_problem(*size, o.problems * o.seeds)]) for size in carts]
+    make: Callable[[int, int], Any]
+    for family, make in WEAK.items():
+        for horizon in horizons:
+            instances = [pushing(make(8, seed), few, 1, horizon) for seed in range(models)]
+            rows += [measure(family, name, instances) for name in BACKENDS]
+    save(o.out, {"machine": machine(), "rows": rows})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Entry of the command line, also of `python -m difflcs`: says what is missing before it imports what needs it."""
+"""Entry of the command line as a program, also of `python -m difflcs`: what is written is complete, or it says so."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import select
 import sys
 from collections.abc import Sequence
 
-from difflcs.errors import MissingDependencyError
+from difflcs import cli
 
 _INTERRUPTED = 130
 _READER_GONE = 141
@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         try:
-            return _run(words)
+            return cli.main(words)
         finally:
             _flush()  # here and not when Python ends, where nobody could handle an error
     except KeyboardInterrupt:  # before the command line could say what to do, such as while it is imported
@@ -37,19 +37,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not _reader_gone():
             raise
         return _READER_GONE
-
-
-def _run(words: Sequence[str]) -> int:
-    try:
-        from difflcs import cli
-    except MissingDependencyError as error:
-        if words[:1] == ["doctor"]:  # it is there to say such things
-            from difflcs import doctor
-
-            return doctor.main("--json" in words, "--dev" in words)
-        print(f"difflcs: {error}", file=sys.stderr)
-        return 2
-    return cli.main(words)
 
 
 def _flush() -> None:

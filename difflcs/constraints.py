@@ -15,6 +15,7 @@ from difflcs.errors import BoundsError, DTypeError, InvalidInputError, ShapeErro
 _OWN = {"G": 2, "g": 1, "E": 2, "weight": 1}
 _EXTRA = {"G": 1, "g": 1, "E": 0, "weight": 1}  # stages beyond H
 # What each field is called in a problem (`difflcs.mpc.MPCProblem`).
+_HARD = 1e300  # prices from here on: such a row is a hard constraint
 _NAMES = {"G": "G_x", "E": "G_u", "g": "g", "weight": "price"}
 
 
@@ -137,8 +138,10 @@ class _Constraints(TensorFields):
         fields = {_NAMES[name]: value for name, value in self._held(_NAMES).items()}
         if fields["G_u"] is None:
             del fields["G_u"]
-        if fields["price"] is None:
+        if (price := fields["price"]) is None:
             fields["price"] = fields["g"].new_full((self.n_c,), torch.inf)
+        else:
+            fields["price"] = torch.where(price >= _HARD, torch.inf, price)
         return fields
 
     @property

@@ -10,7 +10,7 @@ from typing import TypeGuard
 import torch
 from torch import Tensor, nn
 
-from difflcs import _storage, _zoo
+from difflcs import _storage
 from difflcs._checks import (
     broadcast_batch,
     check_choice,
@@ -318,7 +318,9 @@ class LCSModel(nn.Module):
             CheckpointError: files are missing, corrupt or of another kind, or no model has this name; nothing is
                 changed.
         """
-        directory = _zoo.resolve(source)
+        from difflcs import zoo  # files only, but few need them
+
+        directory = zoo.resolve(source)
         config, tensors = _storage.load_record(directory, "LCSModel")
         return cls.from_config(config, tensors, str(directory))
 

@@ -19,8 +19,8 @@ from difflcs.lcs import SYSTEM, LCSModel, LCSModule, LCSParams, is_plain
 from difflcs.records import system_at
 from difflcs.status import Status
 
-# Least γ σ_min(F + Fᵀ), in parts of n_lam times the largest squared column of F (kernels.hpp has the same).
-_GAMMA_LEAST = 4e-13
+# Least γ σ_min(F + Fᵀ), in parts of n_lam times the largest squared column of F.
+_GAMMA_LEAST = _kernels.tolerances()["gamma_least"]
 # γ = "auto", in parts of its bound: at the bound itself the inner QP is singular wherever C is. A thousandth below it
 # the smallest eigenvalue of F + Fᵀ − γI is a thousandth of that of F + Fᵀ.
 _AUTO = 0.999

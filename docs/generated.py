@@ -145,6 +145,7 @@ def settings_table(rows: list[tuple[str, str, str]]) -> str:
 def methods() -> str:
     """Markdown: how many settings each method has, then a section for each. What was shown before is not repeated."""
     from difflcs.rl import get_method, method_names
+    from difflcs.rl.methods import DEFAULT_METHOD
 
     own = [name for name in method_names() if get_method(name).__module__.startswith("difflcs.")]  # and nobody else's
     every = {name: setting_rows(get_method(name)()) for name in own}
@@ -159,7 +160,7 @@ def methods() -> str:
     shown: dict[str, tuple[str, dict[str, tuple[str, str, str]]]] = {}  # of a group: where, and its rows by flag
     for name, rows in every.items():
         kind = get_method(name)
-        only = "The method for which no `--method` is needed. " if name == method_names()[0] else ""
+        only = "The method for which no `--method` is needed. " if name == DEFAULT_METHOD else ""
         parts.append(
             f'## {name}\n\n{kind.summary[0].upper()}{kind.summary[1:]}. {only}In Python: `get_method("{name}")`.'
         )

@@ -169,9 +169,10 @@ def efforts(record: dict) -> str:
 
 def sizes(record: dict) -> str:
     """Share of problems solved, and iterations of one start times the number of starts, by size and horizon."""
-    horizons = sorted({row["horizon"] for row in record["rows"]})
+    shown = [row for row in record["rows"] if not row["family"].endswith("weak")]
+    horizons = sorted({row["horizon"] for row in shown})
     found: dict[str, dict[int, str]] = {}
-    for row in record["rows"]:
+    for row in shown:
         label = f"{row['family']}, n_x {row['n_x']}, n_lam {row['n_lam']}"
         cell = f"{100 * row['solved']:.0f} %, {row['iterations']:.0f} × {row['starts']}"
         found.setdefault(label, {})[row["horizon"]] = cell
@@ -179,28 +180,35 @@ def sizes(record: dict) -> str:
     return table(["problems", *(f"H {h}" for h in horizons)], rows)
 
 
+def weak(record: dict) -> str:
+    """Share of problems solved where actions are weak, by horizon, of each backend."""
+    shown = [row for row in record["rows"] if row["family"].endswith("weak")]
+    horizons = sorted({row["horizon"] for row in shown})
+    found: dict[str, list[str]] = {}
+    for row in shown:
+        label = f"{row['family'].split(',')[0]} models, `{row['backend']}`"
+        found.setdefault(label, []).append(f"{100 * row['solved']:.1f} %")
+    return table(["problems", *(f"H {h}" for h in horizons)], [[label, *cells] for label, cells in found.items()])
+
+
 def recipes(record: dict) -> str:
     """Success at each of the minutes, and seconds of one core: mean and range over seeds, and differences by seed."""
-    by_seed: dict[str, dict[int, list[dict]]] = {}
-    for row in record["rows"]:
-        by_seed.setdefault(row["recipe"], {})[row["seed"]] = row["evaluations"]
-    seeds = sorted(set.intersection(*(set(own) for own in by_seed.values())))
-    minutes = [evaluation["minutes"] for evaluation in record["rows"][0]["evaluations"]]
+    rows = sorted(record["rows"], key=lambda row: row["seed"])
+    minutes = sorted({row["minutes"] for row in rows})
 
-    def column(recipe: str, name: str, k: int) -> np.ndarray:
-        return np.array([by_seed[recipe][seed][k][name] for seed in seeds])
+    def column(method: str, name: str, at: float) -> np.ndarray:
+        return np.array([row[name] for row in rows if (row["method"], row["minutes"]) == (method, at)])
 
     def cell(values: np.ndarray, unit: str, digits: int = 1, sign: str = "") -> str:
         mean, low, high = (f"{v:{sign}.{digits}f}" for v in (values.mean(), values.min(), values.max()))
         return f"{mean} {unit} ({low} to {high})".replace("-", "−")
 
     found = []
-    for recipe in by_seed:
-        success = [cell(100 * column(recipe, "success_rate", k), "%") for k in range(len(minutes))]
-        found.append([recipe, *success, cell(column(recipe, "seconds", -1), "s", 0)])
-    one, other = by_seed
-    change = [column(one, "success_rate", k) - column(other, "success_rate", k) for k in range(len(minutes))]
-    found.append([f"{one} − {other}", *(cell(100 * c, "points", sign="+") for c in change), ""])
+    for method, label in (("lcs-rl", "default"), ("quick", "quick")):
+        success = [cell(100 * column(method, "success_rate", at), "%") for at in minutes]
+        found.append([label, *success, cell(column(method, "training_cpu_seconds", minutes[-1]), "s", 0)])
+    change = [column("lcs-rl", "success_rate", at) - column("quick", "success_rate", at) for at in minutes]
+    found.append(["default − quick", *(cell(100 * c, "points", sign="+") for c in change), ""])
     return table(["settings", *(f"{m:g} min of data" for m in minutes), "computing"], found)
 
 
@@ -226,6 +234,28 @@ def latency(record: dict) -> str:
     return table(["", *robots], rows)
 
 
+def steps(record: dict) -> str:
+    """Times of a step of the controller in Python and in C [µs]."""
+    labels = {
+        "Python, `controller.step`": ("python", "step"),
+        "of it outside the solver": ("python", "rest"),
+        "C, `difflcs_step`": ("c", "step"),
+        "of it in the solver": ("c", "solver"),
+    }
+    names = ("p50", "p99", "largest")
+    rows = [[label, *(number(record[who][part][name]) for name in names)] for label, (who, part) in labels.items()]
+    return table(["", *names], rows)
+
+
+def deadlines(record: dict) -> str:
+    """Squared errors of a closed loop with a deadline, and the share of steps that were not solved."""
+    rows = []
+    for limit, label in (("None", "none"), ("0.0002", "200 µs"), ("0.0001", "100 µs")):
+        found = [record["deadline"][f"{on_failure} {limit}"] for on_failure in ("hold", "unfinished")]
+        rows.append([label, *(f"{row['error']:.0f} ({100 * row['unsolved']:.0f} %)" for row in found)])
+    return table(["deadline of a step", '`"hold"`', '`"unfinished"`'], rows)
+
+
 DECIDES = {
     "PDDM": "PDDM, 700 sequences in three networks",
     "LCS-MPC": "LCS-MPC, `LCSMPCLayer`",
@@ -238,31 +268,6 @@ def decision(record: dict) -> str:
     spent = record["milliseconds"]
     rows = [[label, f"{spent[k]:.2g} ms", f"{spent['PDDM'] / spent[k]:.0f}×"] for k, label in DECIDES.items()]
     return table(["one decision", "computing", "PDDM takes"], rows)
-
-
-LATE = {
-    "on time": "on time",
-    "idle first": "on time, but idle in the first step",
-    "late": "one step late",
-    "late, predicted": "one step late, planned from the predicted state",
-}
-
-
-def delay(record: dict) -> str:
-    """Success of actions that come late, and how far it is from that of late ones."""
-    rows = []
-    for way, label in LATE.items():
-        row = record["results"][way]
-        more, half = (100 * v for v in row["to_late"])
-        rows.append(
-            [
-                label,
-                f"{100 * row['success_rate']:.1f} %",
-                f"{100 * row['ci_low']:.1f} to {100 * row['ci_high']:.1f}",
-                "" if way == "late" else f"{more:+.1f} ± {half:.1f} points",
-            ]
-        )
-    return table(["", "success", "95 % interval", "against late"], rows)
 
 
 def errors(record: dict) -> str:
@@ -400,11 +405,11 @@ TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "race": RACE,
     "race_avx512": {"best": best("contact")},
     "optima": {"efforts": efforts},
-    "scale": {"sizes": sizes},
+    "scale": {"sizes": sizes, "weak": weak},
     "training_time": {"recipes": recipes},
     "latency": {"ways": latency},
+    "controller": {"steps": steps, "deadlines": deadlines},
     "decision": {"ways": decision},
-    "delay": {"ways": delay},
     "physics": {"errors": errors},
     "objects": {"success": objects, "methods": methods},
     "box_to_pose": {"success": success},

@@ -13,8 +13,8 @@ import torch
 from units import Unit
 
 from difflcs.rl import Evaluation, RunDirectory, evaluate, get_task, load_policy, write_atomically
-from difflcs.rl.checkpoint import load_checkpoint
-from difflcs.rl.training import EVALUATION_ENVS, Reporter, TrainConfig, goals_due, saved_bounds
+from difflcs.rl.runs.checkpoint import load_checkpoint
+from difflcs.rl.runs.training import EVALUATION_ENVS, Reporter, TrainConfig, goals_due, saved_bounds
 
 NUMBERS = ("success_rate", "ci_low", "ci_high", "goals", "solver_failures")
 

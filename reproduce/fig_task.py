@@ -17,10 +17,9 @@ from matplotlib.figure import Figure
 from runs import command_line, run
 
 from difflcs.errors import InvalidInputError
-from difflcs.rl import get_task
+from difflcs.rl import TrainedPolicy, get_task
 from difflcs.rl.rollout import Policy, mpc_actions
 from difflcs.rl.seeding import Stream, episode_seeds
-from difflcs.zoo import Learned
 
 STEPS = (1, 5, 8, 13, 17, 20)
 """Those that the paper shows."""
@@ -46,9 +45,9 @@ def newest(work: Path) -> Path:
     return max(finished, key=lambda run: (finished[run]["at"].max(), finished[run].finished.max()))
 
 
-def find_model(path: Path) -> Learned:
+def find_model(path: Path) -> TrainedPolicy:
     """A model of the cube."""
-    learned = Learned.open(path)
+    learned = TrainedPolicy.open(path)
     if learned.task != "cube":
         raise InvalidInputError(f"run: expected a model of the cube, got one of {learned.task}; pass another")
     return learned

@@ -17,18 +17,16 @@ import records
 import report
 import torch
 from matplotlib.figure import Figure
-from runs import command_line
+from runs import check_amounts, command_line
 from stats import bootstrap, wilson
 from torch import Tensor
 
-from difflcs._checks import check_positive_int
-from difflcs.bench import machine
+from difflcs.cli.bench import machine
 from difflcs.errors import CheckpointError
-from difflcs.rl import TaskSpec, collect, get_task, write_atomically
-from difflcs.rl.delay import late_actions, predicted_by
+from difflcs.rl import TaskSpec, TrainedPolicy, collect, get_task, write_atomically
 from difflcs.rl.rollout import Act, mpc_actions
+from difflcs.rl.runs.delay import late_actions, predicted_by
 from difflcs.rl.seeding import Stream, episode_seeds
-from difflcs.zoo import Learned
 
 NOMINAL = "as in the training"
 
@@ -51,7 +49,7 @@ class Options:
     """Folder of the record, robustness.json, and of table and figure."""
 
     def __post_init__(self) -> None:
-        check_positive_int("goals", self.goals)
+        check_amounts(goals=self.goals)
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,7 @@ def measure(condition: Condition, task: TaskSpec, policy: Any, goals: int, seed:
 def compute(options: Options, path: Path, say: Callable[[str], object] = print) -> None:
     """Measure what is missing in the record; it is written after every condition."""
     torch.set_num_threads(1)
-    learned = Learned.open(options.model)
+    learned = TrainedPolicy.open(options.model)
     task, policy = get_task(learned.task), learned.policy
     env: Any = task.make_env().unwrapped
     described = task.describe(env)

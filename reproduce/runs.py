@@ -31,12 +31,18 @@ from rich.progress import Progress, TaskID, TimeElapsedColumn
 from units import Artefact, Method, Object, Preset, PresetName, Unit
 from worker import Files, Job
 
-from difflcs._checks import check_positive_int
 from difflcs.errors import DiffLCSError, InvalidInputError
 from difflcs.rl import write_atomically
 
 if TYPE_CHECKING:
     from distributed import Client
+
+
+def check_amounts(**amounts: int | None) -> None:
+    """Raise `InvalidInputError` if an amount that is given is below 1."""
+    for name, amount in amounts.items():
+        if amount is not None and amount < 1:
+            raise InvalidInputError(f"{name}: expected at least 1, got {amount}; pass another --{name}")
 
 
 @dataclass(frozen=True)
@@ -68,9 +74,7 @@ class Compute:
     """Folder of results."""
 
     def __post_init__(self) -> None:
-        for name in ("seeds", "goals", "workers"):
-            if getattr(self, name) is not None:
-                check_positive_int(name, getattr(self, name))
+        check_amounts(seeds=self.seeds, goals=self.goals, workers=self.workers)
         if self.scheduler is not None and (self.workers is not None or "://" not in self.scheduler):
             got = f"{self.scheduler!r} and {self.workers} workers of this machine"
             raise InvalidInputError(f"scheduler: expected an address tcp://host:port alone, got {got}")

@@ -19,7 +19,7 @@ from units import PRESETS, Unit, config_of
 
 from difflcs import LCSModel
 from difflcs.rl import get_task
-from difflcs.rl.dynamics import Ensemble
+from difflcs.rl.learning.dynamics import Ensemble
 
 SHOWN = (("lcs-rl", "ours", "full"), PRIOR, ("pddm", "ours", "full"), ("pddm", "authors", "full"))
 """Method, recipe, protocol."""

@@ -14,7 +14,7 @@ from recipes import ABLATIONS, RECIPES, Protocol, Recipe, changed, changed_task
 
 from difflcs.errors import InvalidInputError
 from difflcs.rl import RunDirectory, TaskSpec, TrainConfig, get_method, get_task, train
-from difflcs.rl.training import Reporter
+from difflcs.rl.runs.training import Reporter
 
 Artefact = Literal["table1", "masses", "curves", "transfer", "ablations"]
 Object = Literal["sugar_box", "fish_can", "mug", "wrench", "clamp", "banana"]

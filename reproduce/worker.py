@@ -3,7 +3,6 @@
 import contextlib
 import os
 import platform
-import re
 import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -137,8 +136,6 @@ def write_files(folder: Path, files: Files) -> None:
 
 def machine() -> str:
     """What kind of machine this is: processor, cores, instruction set of the kernels."""
-    from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
+    from difflcs.cli import bench
 
-    known = Path("/proc/cpuinfo")
-    found = re.search(r"model name\s*: (.*)", known.read_text()) if known.exists() else None
-    return f"{found[1] if found else platform.machine()}, {os.cpu_count()} cores, {_kernels.isa()}"
+    return f"{bench.cpu()}, {os.cpu_count()} cores, {bench.machine()['instruction set']}"

@@ -136,7 +136,8 @@ def build() -> type[Build]:
 def registries():
     """What a file registers is gone after it: no other file finds it, in whatever order a process runs them."""
     from difflcs.mpc.backends import base
-    from difflcs.rl import methods, tasks
+    from difflcs.rl import tasks
+    from difflcs.rl.methods import base as methods
 
     tasks.task_names()  # installed packages register theirs once
     with pytest.MonkeyPatch.context() as patch:
@@ -161,23 +162,7 @@ def _values(value: object, path: tuple = ()) -> Iterator[tuple]:
         yield from _values(part, (*path, key))
 
 
-_WRONG_VALUES = (
-    None,
-    True,
-    -1,
-    1.5,
-    -1.5,
-    10**30,
-    -(10**30),
-    "x",
-    [],
-    [-1],
-    [True],
-    ["x"],
-    [10**30],
-    {},
-    {"state": {}},
-)
+_WRONG = (None, True, -1, 1.5, -1.5, 10**30, -(10**30), "x", [], [-1], [True], ["x"], [10**30], {}, {"state": {}})
 
 
 def _wrong_tensors(tensor: Tensor) -> Iterator[Tensor]:
@@ -194,7 +179,7 @@ def _wrong_tensors(tensor: Tensor) -> Iterator[Tensor]:
 
 def _hostile(state: Any) -> Iterator[tuple[bool, Any]]:
     """States with one thing wrong; whether it is a tensor, which must be noticed."""
-    from difflcs.rl.state import flatten, unflatten
+    from difflcs.rl.learning.state import flatten, unflatten
 
     tensors, rest = flatten(state)
 
@@ -207,7 +192,7 @@ def _hostile(state: Any) -> Iterator[tuple[bool, Any]]:
         return unflatten(tensors, copy)
 
     for path in list(_values(rest))[1:]:
-        for value in _WRONG_VALUES:
+        for value in _WRONG:
             yield False, changed(path, lambda part, key, value=value: part.__setitem__(key, value))
         yield False, changed(path, lambda part, key: part.pop(key))
         yield False, changed((*path[:-1], "another"), lambda part, key: part.__setitem__(key, 1))
@@ -223,7 +208,7 @@ def _hostile(state: Any) -> Iterator[tuple[bool, Any]]:
 
 def _same_state(a: Any, b: Any) -> bool:
     """Whether two states are the same to the bit."""
-    from difflcs.rl.state import flatten
+    from difflcs.rl.learning.state import flatten
 
     (tensors, rest), (others, other_rest) = flatten(a), flatten(b)
     alike = tensors.keys() == others.keys() and rest == other_rest
@@ -239,7 +224,7 @@ def refuses_hostile_checkpoints() -> Callable[[Any], None]:
     accepted.
     """
     from difflcs.errors import CheckpointError
-    from difflcs.rl.state import copy_state
+    from difflcs.rl.learning.state import copy_state
 
     def check(trainer: Any) -> None:
         trainer.step()

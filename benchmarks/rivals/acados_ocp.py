@@ -29,17 +29,12 @@ def version() -> str:
 
 
 class Solver(Rival):
-    """SQP_RTI with full or partial condensing and HPIPM.
+    """SQP_RTI with partial condensing and HPIPM."""
 
-    Args:
-        problem: what is to be solved.
-        qp: acados's name of the QP solver.
-    """
-
-    def __init__(self, problem: Problem, qp: str = "PARTIAL_CONDENSING_HPIPM"):
+    def __init__(self, problem: Problem):
         super().__init__(problem)
         p, ocp, model = problem, AcadosOcp(), AcadosModel()
-        model.name = f"lin{abs(hash((p.A.tobytes(), p.horizon, qp))) % 10**9}"
+        model.name = f"lin{abs(hash((p.A.tobytes(), p.horizon))) % 10**9}"
         model.x, model.u = casadi.SX.sym("x", p.n_x), casadi.SX.sym("u", p.n_u)
         model.disc_dyn_expr = casadi.mtimes(p.A, model.x) + casadi.mtimes(p.B, model.u) + p.d
         ocp.model = model
@@ -52,7 +47,8 @@ class Solver(Rival):
         ocp.constraints.lbu, ocp.constraints.ubu = p.u_min, p.u_max
         ocp.constraints.idxbu, ocp.constraints.x0 = np.arange(p.n_u), p.x0[0]
         options = ocp.solver_options
-        options.integrator_type, options.nlp_solver_type, options.qp_solver = "DISCRETE", "SQP_RTI", qp
+        options.integrator_type, options.nlp_solver_type = "DISCRETE", "SQP_RTI"
+        options.qp_solver = "PARTIAL_CONDENSING_HPIPM"
         options.hessian_approx, options.tf, options.print_level = "EXACT", float(p.horizon), 0
         options.qp_solver_iter_max, options.qp_tol = 200, 1e-8
         self.folder = tempfile.TemporaryDirectory()

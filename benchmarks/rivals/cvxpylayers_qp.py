@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from cvxpylayers.torch import CvxpyLayer
 
-from rivals.problem import Answer, Problem, Rival
+from rivals.differentiable import TorchRival
+from rivals.problem import Problem
 
 PLAIN = {"solve_method": "Clarabel"}
 # The default of its derivative, mode "lsqr", was off by the size of the gradient on these problems.
@@ -21,14 +22,11 @@ def version() -> str:
     return f"cvxpylayers {version_of('cvxpylayers')}, cvxpy {cp.__version__}"
 
 
-class Solver(Rival):
+class Solver(TorchRival):
     """The program over actions and states with x0 as its parameter."""
-
-    batches = differentiates = True
 
     def __init__(self, problem: Problem):
         super().__init__(problem)
-        torch.set_num_threads(1)
         p = problem
         x, u, x0 = cp.Variable((p.horizon + 1, p.n_x)), cp.Variable((p.horizon, p.n_u)), cp.Parameter(p.n_x)
         cost, limits = 0, [x[0] == x0, u <= np.tile(p.u_max, (p.horizon, 1)), u >= np.tile(p.u_min, (p.horizon, 1))]
@@ -39,28 +37,11 @@ class Solver(Rival):
                 cost += cp.sum_squares(_root(p.R) @ u[k]) / 2 + p.r @ u[k]
                 limits.append(x[k + 1] == p.A @ x[k] + p.B @ u[k] + p.d)
         self.layer = CvxpyLayer(cp.Problem(cp.Minimize(cost), limits), parameters=[x0], variables=[u])
-        self.x0 = torch.from_numpy(p.x0)
 
-    def _answer(self, u: torch.Tensor, gradient: np.ndarray | None = None) -> Answer:
-        return Answer(u.detach().numpy(), np.ones(len(u), bool), gradient)
-
-    def one(self, i: int) -> Answer:
-        """One call for one problem."""
-        with torch.no_grad():
-            return self._answer(self.layer(self.x0[i : i + 1], solver_args=PLAIN)[0])
-
-    def all(self) -> Answer:
-        """One call for all."""
-        with torch.no_grad():
-            return self._answer(self.layer(self.x0, solver_args=PLAIN)[0])
-
-    def gradient(self) -> Answer:
-        """One call for all, and back."""
-        x0 = self.x0.clone().requires_grad_()
-        (u,) = self.layer(x0, solver_args=EXACT)
-        (u[:, 0] @ torch.from_numpy(self.problem.weight)).sum().backward()
-        assert x0.grad is not None
-        return self._answer(u, x0.grad.numpy())
+    def plan(self, x0: torch.Tensor, only: int | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """Its layer."""
+        (u,) = self.layer(x0, solver_args=EXACT if x0.requires_grad else PLAIN)
+        return u, torch.ones(len(u), dtype=torch.bool)
 
 
 def _root(weight: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ class Solver(Rival):
 
     def __init__(self, problem: Problem, start: float = 1.0, options: dict | None = None):
         super().__init__(problem)
-        self.program = p = Program.of(problem, "product", False, start, initial_state=True)
+        self.program = p = Program.of(problem, False, start, initial_state=True)
         settings = {"print_time": False, "error_on_fail": False, "structure_detection": "auto", "equality": p.equality}
         settings |= {"calc_lam_p": False, "expand": True, "fatrop.print_level": 0, "fatrop.max_iter": 500}
         settings |= {f"fatrop.{name}": value for name, value in (options or {}).items()}

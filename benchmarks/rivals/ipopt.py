@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-
 import casadi
 import numpy as np
 
@@ -29,9 +27,11 @@ class Solver(Rival):
 
     def __init__(self, problem: Problem, start: float = 1.0, options: dict | None = None):
         super().__init__(problem)
-        n = (problem.n_x, problem.n_u, problem.n_lam, problem.horizon)
-        self.program = Program.of(problem, "product", True, start)
-        self.solver = _solver(n, tuple(sorted((options or {}).items())))
+        self.program = p = Program.of(problem, True, start)
+        settings = {"print_time": False, "error_on_fail": False, "calc_lam_p": False}
+        settings |= {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.max_iter": 500}
+        settings |= {f"ipopt.{name}": value for name, value in (options or {}).items()}
+        self.solver = casadi.nlpsol("mpc", "ipopt", {"x": p.z, "p": p.p, "f": p.f, "g": p.g}, settings)
 
     def one(self, i: int) -> Answer:
         """One run of IPOPT."""
@@ -43,21 +43,3 @@ class Solver(Rival):
         z = np.asarray(found["x"]).ravel()
         solved = self.solver.stats()["return_status"] in SOLVED
         return Answer(z[p.actions][None], np.array([solved]))
-
-
-@functools.lru_cache(maxsize=32)
-def _solver(sizes: tuple, options: tuple) -> casadi.Function:
-    n_x, n_u, n_lam, horizon = sizes
-    shapes = {
-        "A": (n_x, n_x), "B": (n_x, n_u), "C": (n_x, n_lam), "d": (n_x,), "D": (n_lam, n_x), "E": (n_lam, n_u),
-        "F": (n_lam, n_lam), "c": (n_lam,), "Q": (n_x, n_x), "R": (n_u, n_u), "Q_final": (n_x, n_x), "q": (n_x,),
-        "r": (n_u,), "q_final": (n_x,), "u_min": (n_u,), "u_max": (n_u,), "x0": (1, n_x), "weight": (n_u,),
-    }  # fmt: skip
-    empty = Problem(
-        **{k: np.zeros(v) for k, v in shapes.items()}, horizon=horizon, relaxation=1.0, constant=np.zeros(())
-    )
-    p = Program.of(empty, "product", True, 1.0)
-    settings = {"print_time": False, "error_on_fail": False, "calc_lam_p": False}
-    settings |= {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.max_iter": 500}
-    settings |= {f"ipopt.{name}": value for name, value in options}
-    return casadi.nlpsol("mpc", "ipopt", {"x": p.z, "p": p.p, "f": p.f, "g": p.g}, settings)

@@ -23,7 +23,6 @@ class Program:
         start: z to start from but for x; `states` says where these are.
         actions: (horizon, n_u) where u is in z.
         states: (horizon, n_x) where x_1 … x_H are in z.
-        pairs: (2, m) where λ and s are in z, or None where s is an expression.
     """
 
     z: casadi.SX
@@ -38,15 +37,13 @@ class Program:
     start: np.ndarray
     actions: np.ndarray
     states: np.ndarray
-    pairs: np.ndarray | None
 
     @classmethod
-    def of(cls, problem: Problem, contact: str, slack: bool, start: float, initial_state: bool = False) -> Program:
+    def of(cls, problem: Problem, slack: bool, start: float, initial_state: bool = False) -> Program:
         """Direct transcription, stage by stage.
 
         Args:
             problem: what is to be solved.
-            contact: "product" for λ·s = ε, or "none" (who solves it adds it).
             slack: whether s is a variable.
             start: value of λ and s, and u = 0.
             initial_state: whether x_0 is a variable, equal to a parameter.
@@ -55,7 +52,7 @@ class Program:
         eps = casadi.SX.sym("relaxation")
         n_x, n_u, n_lam, inf = problem.n_x, problem.n_u, problem.n_lam, np.inf
         z, low, high, first, rows, least, most, equality = [], [], [], [], [], [], [], []
-        at, actions, states, pairs = 0, [], [], []
+        at, actions, states = 0, [], []
 
         def variable(name: str, size: int, lower, upper, value) -> tuple[casadi.SX, np.ndarray]:
             nonlocal at
@@ -78,12 +75,11 @@ class Program:
             x, _ = variable("x_0", n_x, -inf, inf, 0.0)
         for k in range(problem.horizon):
             u, where_u = variable(f"u_{k}", n_u, problem.u_min, problem.u_max, 0.0)
-            lam, where_lam = variable(f"lam_{k}", n_lam, 0.0, inf, start)
+            lam, _ = variable(f"lam_{k}", n_lam, 0.0, inf, start)
             gap = s_["D"] @ x + s_["E"] @ u + s_["F"] @ lam + s_["c"]
             s = gap
             if slack:
-                s, where_s = variable(f"s_{k}", n_lam, 0.0, inf, start)
-                pairs.append(np.stack([where_lam, where_s]))
+                s, _ = variable(f"s_{k}", n_lam, 0.0, inf, start)
             x_next, where_x = variable(f"x_{k + 1}", n_x, -inf, inf, 0.0)
             cost += casadi.bilin(s_["Q"], x, x) / 2 + casadi.dot(s_["q"], x)
             cost += casadi.bilin(s_["R"], u, u) / 2 + casadi.dot(s_["r"], u)
@@ -91,8 +87,7 @@ class Program:
             if initial_state and k == 0:
                 row(x - s_["x0"], 0, 0)
             row(*((gap - s, 0, 0) if slack else (gap, 0, inf)))
-            if contact != "none":
-                row(lam * s - eps, 0, 0)
+            row(lam * s - eps, 0, 0)
             actions.append(where_u)
             states.append(where_x)
             x = x_next
@@ -101,7 +96,7 @@ class Program:
         joined = (np.concatenate(part) for part in (low, high, least, most))
         return cls(
             casadi.vertcat(*z), packed, cost, casadi.vertcat(*rows), *joined, equality, np.concatenate(first),
-            np.array(actions), np.array(states), np.concatenate(pairs, 1) if pairs else None,
+            np.array(actions), np.array(states),
         )  # fmt: skip
 
     def parameters(self, problem: Problem, i: int) -> np.ndarray:
@@ -113,59 +108,3 @@ class Program:
         z = self.start.copy()
         z[self.states] = problem.x0[i]
         return np.clip(z, self.low, self.high)
-
-
-class Callbacks:
-    """The program's functions for solvers that call back, as cyipopt takes them; evaluated in CasADi's buffers."""
-
-    def __init__(self, program: Program):
-        z, p, f, g = program.z, program.p, program.f, program.g
-        sigma, lam = casadi.SX.sym("sigma"), casadi.SX.sym("lam", g.shape[0])
-        jacobian = casadi.jacobian(g, z)
-        hessian = casadi.tril(casadi.hessian(sigma * f + casadi.dot(lam, g), z)[0])
-        self.rows, self.columns = (np.array(v) for v in jacobian.sparsity().get_triplet())
-        self.hessian_rows, self.hessian_columns = (np.array(v) for v in hessian.sparsity().get_triplet())
-        outputs = {"f": f, "gradient": casadi.gradient(f, z), "g": g, "jacobian": jacobian}
-        self._functions = {name: _Buffered(casadi.Function(name, [z, p], [value])) for name, value in outputs.items()}
-        self._hessian = _Buffered(casadi.Function("hessian", [z, p, lam, sigma], [hessian]))
-        self.p = np.zeros(p.shape[0])
-
-    def objective(self, z):  # noqa: D102  cyipopt's names
-        return float(self._functions["f"](z, self.p)[0])
-
-    def gradient(self, z):  # noqa: D102
-        return self._functions["gradient"](z, self.p)
-
-    def constraints(self, z):  # noqa: D102
-        return self._functions["g"](z, self.p)
-
-    def jacobianstructure(self):  # noqa: D102
-        return self.rows, self.columns
-
-    def jacobian(self, z):  # noqa: D102
-        return self._functions["jacobian"](z, self.p)
-
-    def hessianstructure(self):  # noqa: D102
-        return self.hessian_rows, self.hessian_columns
-
-    def hessian(self, z, lam, sigma):  # noqa: D102
-        return self._hessian(z, self.p, lam, np.array([float(sigma)]))
-
-
-class _Buffered:
-    """A CasADi function of dense inputs and one output, without conversions."""
-
-    def __init__(self, function: casadi.Function):
-        self.function = function
-        self.buffer, self.trigger = function.buffer()
-        self.out = np.zeros(function.nnz_out(0))
-        self.buffer.set_res(0, memoryview(self.out))
-        self.inputs = [np.zeros(function.nnz_in(k)) for k in range(function.n_in())]
-        for k, value in enumerate(self.inputs):
-            self.buffer.set_arg(k, memoryview(value))
-
-    def __call__(self, *values: np.ndarray) -> np.ndarray:
-        for own, value in zip(self.inputs, values, strict=True):
-            own[:] = value
-        self.trigger()
-        return self.out.copy()

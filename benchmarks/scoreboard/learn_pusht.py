@@ -7,8 +7,10 @@ and outline is fitted to the transitions by the violation loss.
 
 from __future__ import annotations
 
+import sys
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +20,9 @@ from torch import Tensor
 
 from difflcs import violation_loss
 from difflcs.physics import ContactLCS, PlanarPushing, Polygon, Union
-from difflcs.planning.pusht import CENTER_OF_MASS, GYRATION, PIXELS, from_origin, make_env, tee, tee_pushing
+
+sys.path.append(str(Path(__file__).resolve().parents[2] / "examples"))
+from push_t import CENTER_OF_MASS, GYRATION, PIXELS, from_origin, make_env, tee, tee_pushing
 
 LEARNED = ("center_of_mass", "gyration", "friction", "compliance", "outline")
 RATE, XI, KEPT = 0.03, 0.1, 0.8
@@ -85,26 +89,20 @@ def frozen(physics: PlanarPushing) -> PlanarPushing:
     return physics.replace(shape=Union(tuple(parts)), **values)
 
 
-@dataclass(frozen=True)
-class Learned:
-    """What was learned.
+class Learned(NamedTuple):
+    """What was learned; pairs are before and after, lengths in units of 100 px.
 
     Attributes:
         physics: the system; without friction if without it the loss is at most 2 % larger.
-        before: what is learned, with its first values, in units of 100 px.
-        after: with its last values.
-        true: as the environment has it; no compliance, as pymunk's is of another kind.
-        outline: distance of each corner of the T from where it is [px], before and after. The two corners of the stem
-            inside the bar are left out: nothing touches them.
-        loss: of the transitions that count, before and after.
+        values: of each parameter.
+        corners: how far each corner is from where it is [px].
+        loss: of the transitions that count.
         seconds: CPU time of learning.
     """
 
     physics: PlanarPushing
-    before: dict[str, Any]
-    after: dict[str, Any]
-    true: dict[str, Any]
-    outline: tuple[list[float], list[float]]
+    values: tuple[dict[str, Any], dict[str, Any]]
+    corners: tuple[list[float], list[float]]
     loss: tuple[float, float]
     seconds: float
 
@@ -140,19 +138,12 @@ def learn(env: Any, seed: int, steps: int = 1200, iterations: int = 300) -> Lear
         loss = (float(trimmed(first, data)), float(trimmed(physics, data)))
         if float(trimmed(smooth, data)) <= 1.02 * loss[1]:
             physics, after = frozen(smooth.physics), {**smooth.summary(), "friction": [0.0]}
-    return Learned(
-        physics,
-        before,
-        after,
-        {"center_of_mass": list(CENTER_OF_MASS), "gyration": GYRATION, "friction": [0.0]},
-        (corners(first), corners(physics)),
-        loss,
-        time.process_time() - start,
-    )
+    spent = time.process_time() - start
+    return Learned(physics, (before, after), (corners(first), corners(physics)), loss, spent)
 
 
 def corners(physics: PlanarPushing) -> list[float]:
-    """Distance of each corner that can be touched from where it is [px]."""
+    """Distance of each corner from where it is [px], without the two inside the bar, which nothing touches."""
     own, true = (
         torch.cat([part.vertices for part in shape.parts if isinstance(part, Polygon)])
         for shape in (physics.shape, tee())
@@ -168,23 +159,20 @@ class Options:
 
     seed: int = 0
     """Of the pushing and of the wrong values."""
-    steps: int = 1200
-    """Transitions of 0.1 s."""
-    iterations: int = 300
-    """Of Adam."""
 
 
 def main(o: Options) -> None:
     """Learn and print."""
     torch.set_num_threads(1)
-    found = learn(make_env(), o.seed, o.steps, o.iterations)
-    print(f"{o.steps / 600:.1f} minutes of random pushing, {found.seconds:.1f} s of CPU time to learn from them")
+    found = learn(make_env(), o.seed)
+    print(f"{found.seconds:.1f} s of CPU time to learn from two minutes of random pushing")
     print(f"violation loss {found.loss[0]:.2e} before, {found.loss[1]:.2e} after")
+    true = {"center_of_mass": list(CENTER_OF_MASS), "gyration": GYRATION, "friction": [0.0]}
     for name in ("center_of_mass", "gyration", "friction", "compliance"):
-        print(f"{name}: {found.before[name]} before, {found.after[name]} after, true {found.true.get(name, '—')}")
-    for when, apart in zip(("before", "after"), found.outline, strict=True):
+        before, after = (values[name] for values in found.values)
+        print(f"{name}: {before} before, {after} after, true {true.get(name, '—')}")
+    for when, apart in zip(("before", "after"), found.corners, strict=True):
         print(f"corners off by {', '.join(f'{v:.1f}' for v in apart)} px {when}")
-    print(f"friction is {'taken for none' if found.physics.frictionless else 'kept'}")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """Push-T of gym-pusht by sampling-based contact MPC: `python benchmarks/scoreboard/pusht.py --episodes 500 --json`.
 
 The environment is as its authors publish it: its own start, success flag (more than 95 % of the goal covered by the T)
-and limit (300 steps of 0.1 s). The policy is given the state (place of the disc, pose of the T) and, by variant:
+and limit (300 steps of 0.1 s). The policy of examples/push_t.py is given the state (place of the disc, pose of the T)
+and, by variant:
 
 - known: geometry, mass and drive as they are;
 - learned: what is learned from two minutes of random pushing, see `learn_pusht.py`;
@@ -11,34 +12,28 @@ and limit (300 steps of 0.1 s). The policy is given the state (place of the disc
   gyration;
 - delay: actions come one step late, and the plan begins where the system predicts that it will be.
 
-Times are CPU times of the policy, on one core. With `--out FILE`, episodes are written as they end, and those that are
-in the file already are not played again: after a change of the policy begin another file. `--variant all` plays all.
+Times are CPU times of the policy, on one core. With `--out FILE`, variants that are in the file already are not played
+again: after a change of the policy begin another file. `--variant all` plays all.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import tyro
+from learn_pusht import learn
+from push_t import CENTER_OF_MASS, GYRATION, PIXELS, STEPS, PushTPolicy, make_env, tee, tee_pushing
 from successes import success_figures
 
-from difflcs._checks import check_positive_int
-from difflcs.bench import machine
+from difflcs.cli.bench import machine, save
 from difflcs.errors import InvalidInputError
-from difflcs.planning.pusht import CENTER_OF_MASS, GYRATION, PIXELS, STEPS, PushTPolicy, make_env, tee, tee_pushing
-from difflcs.rl import write_atomically
-
-EVERY = 10
-"""Episodes between two writings."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +51,6 @@ class Variant:
     delay: int = 0
 
 
-def learned(seed: int) -> PushTPolicy:
-    """With what two minutes of pushing teach."""
-    from learn_pusht import learn
-
-    return PushTPolicy(learn(make_env(), seed).physics)
-
-
 def told(**changes: Any) -> Variant:
     """With another system than that of the environment."""
     return Variant(lambda seed: PushTPolicy(tee_pushing(**changes)))
@@ -70,7 +58,7 @@ def told(**changes: Any) -> Variant:
 
 VARIANTS = {
     "known": Variant(),
-    "learned": Variant(learned),
+    "learned": Variant(lambda seed: PushTPolicy(learn(make_env(), seed).physics)),
     "inertia -20 %": told(gyration=GYRATION * 0.8**0.5),
     "inertia +20 %": told(gyration=GYRATION * 1.2**0.5),
     "centre of mass": told(center_of_mass=(0.0, CENTER_OF_MASS[1] + 0.12)),
@@ -95,15 +83,14 @@ class Options:
     variant: str = "known"
     """One of the variants, or "all"."""
     json: bool = False
-    """Print one line of JSON for each variant, and nothing else."""
+    """Print a line of JSON for each variant."""
     out: Path | None = None
-    """Where the episodes are recorded, to go on from there; nowhere if not given."""
+    """Where the figures of the variants are recorded; nowhere if not given."""
     smoke: bool = False
     """Two episodes of a few steps."""
 
 
-@dataclass(frozen=True)
-class Episode:
+class Episode(NamedTuple):
     """One episode.
 
     Attributes:
@@ -141,8 +128,10 @@ def play(env: Any, policy: PushTPolicy, seed: int, variant: Variant, limit: int 
     return Episode(bool(success), len(times), best, sum(times), max(times))
 
 
-def summary(episodes: list[list[float]]) -> dict[str, float]:
+def measure(variant: Variant, o: Options, env: Any) -> dict[str, float]:
     """The figures of a variant."""
+    policy, limit = variant.policy(o.seed), 5 if o.smoke else STEPS
+    episodes = [play(env, policy, o.seed + i, variant, limit) for i in range(o.episodes)]
     success, steps, coverage, milliseconds, longest = np.array(episodes, float).T
     return {
         **success_figures(success),
@@ -153,56 +142,24 @@ def summary(episodes: list[list[float]]) -> dict[str, float]:
     }
 
 
-def measure(name: str, o: Options, env: Any, record: dict[str, Any]) -> dict[str, float]:
-    """Play the episodes of a variant that are not in the record yet."""
-    variant = VARIANTS[name]
-    row = record["results"].setdefault(name, {"rows": []})
-    rows: list[list[float]] = row["rows"]
-    policy = variant.policy(o.seed) if len(rows) < o.episodes else None
-    for i in range(len(rows), o.episodes):
-        assert policy is not None
-        found = play(env, policy, o.seed + i, variant, 5 if o.smoke else STEPS)
-        rows.append([int(found.success), found.steps, *(round(v, 4) for v in list(vars(found).values())[2:])])
-        if o.out is not None and ((i + 1) % EVERY == 0 or i + 1 == o.episodes):
-            row.update(summary(rows))
-            keep(o.out, record)
-        if not o.json:
-            print(f"{name}: seed {o.seed + i}, {'solved' if found.success else 'not solved'}, {found.steps} steps")
-    return summary(rows[: o.episodes])
-
-
-def keep(path: Path, record: dict[str, Any]) -> None:
-    """Write the record atomically, an episode a line."""
-    text = json.dumps(record, indent=2, ensure_ascii=False)
-    text = re.sub(r"\[([^\[\]]*)\]", lambda inner: f"[{' '.join(inner[1].split())}]", text)
-    write_atomically(path, (text + "\n").encode())
-
-
-def begin(o: Options) -> dict[str, Any]:
-    """The record to go on with: that of the file where it is of the same seed, or an empty one."""
-    options = {"seed": o.seed, "steps": STEPS, "smoke": o.smoke}
-    empty = {"machine": {**machine(), "cores": os.cpu_count()}, "options": options, "results": {}}
-    if o.out is None or not o.out.exists():
-        return empty
-    found: Any = json.loads(o.out.read_text())
-    if found["options"] != options:
-        raise InvalidInputError(
-            f"out: expected a record of {options}, got one of {found['options']} in {o.out}; name another file"
-        )
-    return found
-
-
 def main(o: Options) -> None:
     """Play, print, write."""
     if o.variant not in (*VARIANTS, "all"):
         raise InvalidInputError(f"variant: expected one of {', '.join(VARIANTS)}, or all, got {o.variant!r}")
-    check_positive_int("episodes", o.episodes)
     if o.smoke:
         o.episodes = min(o.episodes, 2)
     torch.set_num_threads(1)
-    env, record = make_env(), begin(o)
+    env, asked = make_env(), {"episodes": o.episodes, "seed": o.seed, "smoke": o.smoke}
+    record = {"machine": machine(), "options": asked, "results": {}}
+    if o.out is not None and o.out.exists():
+        record = json.loads(o.out.read_text())
+        if record["options"] != asked:
+            raise InvalidInputError(f"out: expected a record of {asked}, got {record['options']}; name another file")
     for name in VARIANTS if o.variant == "all" else (o.variant,):
-        found = measure(name, o, env, record)
+        found = record["results"].get(name) or measure(VARIANTS[name], o, env)
+        record["results"][name] = found
+        if o.out is not None:
+            save(o.out, record)
         if o.json:
             print(json.dumps({"variant": name, **found}))
             continue

@@ -12,7 +12,7 @@ The reward of a step is sech²(15 d), with d [m] the distance of the cube's cent
   `trifinger_rl_example.example.TorchPushPolicy` of github.com/rr-learning/trifinger-rl-example, to be installed from
   there: it was trained by reinforcement learning in simulation.
 
-Times are CPU times of the policy. With `--out FILE` the record of a policy is written after each episode.
+Times are CPU times of the policy. The record of a policy is written after each episode.
 """
 
 from __future__ import annotations
@@ -30,9 +30,8 @@ import torch
 import tyro
 from successes import success_figures
 
-from difflcs.bench import machine
+from difflcs.cli.bench import machine, save
 from difflcs.errors import MissingDependencyError
-from difflcs.rl import write_atomically
 
 OWN = "contact-mpc"
 KEYS = ("success_rate", "return", "mean_momentary_success", "transient_success_rate")
@@ -49,24 +48,16 @@ class Options:
     """Seed of goals and of the cube's places."""
     policy: str = OWN
     """"contact-mpc", or a policy class as the evaluator takes it: package.module.Class."""
-    json: bool = False
-    """Print one line of JSON and nothing else."""
-    out: Path | None = None
-    """Record in which to write this policy's episodes; nowhere if not given."""
-    steps: int | None = None
-    """Steps of an episode, other than the task's, to try things."""
+    out: Path = Path("benchmarks/results/trifinger_rl.json")
+    """Record in which to write this policy's episodes, beside those of others."""
 
 
 class Timed:
     """A policy, and how long it takes."""
 
     def __init__(self, policy: Any) -> None:
-        self.policy = policy
+        self.policy, self.reset = policy, policy.reset
         self.seconds: list[float] = []
-
-    def reset(self) -> None:
-        """See `PolicyBase`."""
-        self.policy.reset()
 
     def get_action(self, observation: Any) -> Any:
         """See `PolicyBase`."""
@@ -88,53 +79,7 @@ def policy_class(name: str) -> Any:
         raise MissingDependencyError(
             f"expected trifinger-rl-datasets, not installed ({error}); run: pip install trifinger-rl-datasets==1.0.3"
         ) from error
-    if name == OWN:
-        from trifinger_push import PushPolicy
-
-        return PushPolicy
-    return evaluate.load_policy_class(name)
-
-
-def measure(o: Options) -> dict[str, Any]:
-    """Play the episodes of one policy."""
-    kind = policy_class(o.policy)
-    import gymnasium
-    from trifinger_rl_datasets import Evaluation
-    from trifinger_simulation.tasks import move_cube
-
-    wants = kind.get_policy_config()
-    env: Any = gymnasium.make(
-        "trifinger-cube-push-sim-expert-v0",
-        disable_env_checker=True,
-        visualization=False,
-        flatten_obs=wants.flatten_obs,
-        image_obs=wants.image_obs,
-    ).unwrapped
-    if o.steps is not None:
-        env.sim_env.episode_length = o.steps
-    policy = Timed(kind(env.action_space, env.observation_space, env.sim_env.episode_length))
-    rows: list[list[float]] = []
-
-    class Recorded(Evaluation):
-        """The authors' evaluation, with every episode kept."""
-
-        def run_episode(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-            before = len(policy.seconds)
-            with contextlib.redirect_stdout(io.StringIO()):
-                found = super().run_episode(*args, **kwargs)
-            milliseconds = 1e3 * float(np.mean(policy.seconds[before:]))
-            rows.append([round(float(v), 4) for v in (*(found[key] for key in KEYS), milliseconds)])
-            if not o.json:
-                print(f"episode {len(rows) - 1}: return {rows[-1][1]:.0f}, success {rows[-1][0]:.0f}", flush=True)
-            if o.out is not None:
-                keep(o, rows)
-            return found
-
-    np.random.seed(o.seed)  # noqa: NPY002 (from there the package draws the cube's places)
-    move_cube.seed(o.seed)  # the goals
-    with contextlib.redirect_stdout(io.StringIO()) if o.json else contextlib.nullcontext():
-        Recorded(env).evaluate(policy, o.episodes)
-    return summary(rows)
+    return evaluate.load_policy_class("trifinger_push.PushPolicy" if name == OWN else name)
 
 
 def summary(rows: list[list[float]]) -> dict[str, Any]:
@@ -151,29 +96,44 @@ def summary(rows: list[list[float]]) -> dict[str, Any]:
     }
 
 
-def keep(o: Options, rows: list[list[float]]) -> None:
-    """Write what there is of this policy beside the others of the record."""
-    assert o.out is not None
-    record = json.loads(o.out.read_text()) if o.out.exists() else {"results": {}}
-    row = {"machine": machine(), "seed": o.seed, **summary(rows), "rows": rows}
-    if o.steps is not None:
-        row["steps"] = o.steps
-    record["results"][o.policy] = row
-    write_atomically(o.out, (json.dumps(record) + "\n").encode())
-
-
 def main(o: Options) -> None:
     """Play, print, write."""
+    kind = policy_class(o.policy)
+    import gymnasium
+    from trifinger_rl_datasets import Evaluation
+    from trifinger_simulation.tasks import move_cube
+
     torch.set_num_threads(1)
-    found = measure(o)
-    if o.json:
-        print(json.dumps({"policy": o.policy, "seed": o.seed, **found}))
-        return
-    print(
-        f"{o.policy}: success {found['success_rate']:.3f} [{found['ci_low']:.3f}, {found['ci_high']:.3f}], "
-        f"mean return {found['mean_return']:.1f} ± {found['return_error']:.1f} (median {found['median_return']:.1f}), "
-        f"{found['milliseconds_per_step']:.1f} ms a step"
-    )
+    wants = kind.get_policy_config()
+    env: Any = gymnasium.make(
+        "trifinger-cube-push-sim-expert-v0",
+        disable_env_checker=True,
+        visualization=False,
+        flatten_obs=wants.flatten_obs,
+        image_obs=wants.image_obs,
+    ).unwrapped
+    policy = Timed(kind(env.action_space, env.observation_space, env.sim_env.episode_length))
+    rows: list[list[float]] = []
+
+    class Recorded(Evaluation):
+        """The authors' evaluation, with every episode kept."""
+
+        def run_episode(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+            before = len(policy.seconds)
+            with contextlib.redirect_stdout(io.StringIO()):
+                found = super().run_episode(*args, **kwargs)
+            milliseconds = 1e3 * float(np.mean(policy.seconds[before:]))
+            rows.append([round(float(v), 4) for v in (*(found[key] for key in KEYS), milliseconds)])
+            record = json.loads(o.out.read_text()) if o.out.exists() else {"results": {}}
+            record["results"][o.policy] = {"machine": machine(), "seed": o.seed, **summary(rows), "rows": rows}
+            save(o.out, record)
+            return found
+
+    np.random.seed(o.seed)  # noqa: NPY002 (from there the package draws the cube's places)
+    move_cube.seed(o.seed)  # the goals
+    Recorded(env).evaluate(policy, o.episodes)
+    for name, value in summary(rows).items():
+        print(f"{name:24s} {value:.4g}")
 
 
 if __name__ == "__main__":

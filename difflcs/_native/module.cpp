@@ -123,7 +123,10 @@ void solve(const difflcs::LcpBatch& batch, int64_t count, int threads, Stop& sto
   for (int64_t e = 0; e < count; e++) {
     if (batch.status[e] != difflcs::kUnreached) continue;
     batch.status[e] = static_cast<int8_t>(difflcs::Status::max_iter);
-    for (int64_t i = e * batch.n; i < (e + 1) * batch.n; i++) batch.lam[i] = 0, batch.w[i] = std::max(batch.q[i], 0.0);
+    for (int64_t i = e * batch.n; i < (e + 1) * batch.n; i++) {
+      batch.lam[i] = 0;
+      batch.w[i] = std::max(batch.q[i], 0.0);
+    }
   }
 }
 
@@ -165,8 +168,14 @@ difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxa
   const Array& x0 = inputs[kx0];
   auto last = [&](Input which) { return int64_t(inputs[which].shape(inputs[which].ndim() - 1)); };
   MpcBatch b{};
-  b.count = int64_t(x0.shape(0)), b.n_x = last(kA), b.n_u = last(kB), b.n_lam = last(kF), b.n_c = last(kg);
-  b.horizon = horizon, b.relaxation = relaxation, b.barrier = barrier;
+  b.count = int64_t(x0.shape(0));
+  b.n_x = last(kA);
+  b.n_u = last(kB);
+  b.n_lam = last(kF);
+  b.n_c = last(kg);
+  b.horizon = horizon;
+  b.relaxation = relaxation;
+  b.barrier = barrier;
   if (b.n_x < 1 || b.n_u < 1 || horizon < 1 || !(relaxation > 0) || !(barrier >= 0))
     throw std::invalid_argument("sizes, horizon and relaxation must be positive, the barrier not negative");
   for (int i = 0; i < kInputs; i++) {
@@ -182,7 +191,7 @@ difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxa
     b.stride[i] = shared ? 0 : own == 2 ? stages * size : size;
   }
   b.pivot = pivot;
-  look_at_inputs(b, inputs[kS].size(), inputs[ku_min].size(), inputs[ku_max].size());
+  set_flags(b, inputs[kS].size(), inputs[ku_min].size(), inputs[ku_max].size());
   return b;
 }
 
@@ -210,10 +219,14 @@ bool solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
   const difflcs::MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier, false);
   const int64_t states = b.count * (horizon + 1) * b.n_x, actions = b.count * horizon * b.n_u;
   const int64_t forces = b.count * horizon * b.n_lam, rows = b.count * (horizon + 1) * b.n_c;
-  check_size("x", x.size(), states), check_size("u", u.size(), actions), check_size("lam", lam.size(), forces);
+  check_size("x", x.size(), states);
+  check_size("u", u.size(), actions);
+  check_size("lam", lam.size(), forces);
   check_size("mu", mu.size(), rows);
-  check_size("objective", objective.size(), b.count), check_size("residual", residual.size(), b.count);
-  check_size("status", status.size(), b.count), check_size("iterations", iterations.size(), b.count);
+  check_size("objective", objective.size(), b.count);
+  check_size("residual", residual.size(), b.count);
+  check_size("status", status.size(), b.count);
+  check_size("iterations", iterations.size(), b.count);
   check_size("fragile", fragile.size(), b.count);
   if (u_start) check_size("u_start", u_start->size(), actions);
   if (lam_start) check_size("lam_start", lam_start->size(), forces);
@@ -241,21 +254,35 @@ void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, 
   const MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier, pivot);
   const int64_t states = b.count * (horizon + 1) * b.n_x, actions = b.count * horizon * b.n_u;
   const int64_t forces = b.count * horizon * b.n_lam, rows = b.count * (horizon + 1) * b.n_c;
-  check_size("x", x.size(), states), check_size("u", u.size(), actions), check_size("lam", lam.size(), forces);
+  check_size("x", x.size(), states);
+  check_size("u", u.size(), actions);
+  check_size("lam", lam.size(), forces);
   check_size("mu", mu.size(), rows);
-  check_size("x_bar", x_bar.size(), states), check_size("u_bar", u_bar.size(), actions);
-  check_size("lam_bar", lam_bar.size(), forces), check_size("objective_bar", objective_bar.size(), b.count);
-  check_size("solved", solved.size(), b.count), check_size("gradients", gradients.size(), kInputs);
+  check_size("x_bar", x_bar.size(), states);
+  check_size("u_bar", u_bar.size(), actions);
+  check_size("lam_bar", lam_bar.size(), forces);
+  check_size("objective_bar", objective_bar.size(), b.count);
+  check_size("solved", solved.size(), b.count);
+  check_size("gradients", gradients.size(), kInputs);
   MpcGradient o{};
-  o.x = x.data(), o.u = u.data(), o.lam = lam.data(), o.mu = mu.data(), o.x_bar = x_bar.data(), o.u_bar = u_bar.data();
-  o.lam_bar = lam_bar.data(), o.objective_bar = objective_bar.data(), o.solved = solved.data();
+  o.x = x.data();
+  o.u = u.data();
+  o.lam = lam.data();
+  o.mu = mu.data();
+  o.x_bar = x_bar.data();
+  o.u_bar = u_bar.data();
+  o.lam_bar = lam_bar.data();
+  o.objective_bar = objective_bar.data();
+  o.solved = solved.data();
   for (int i = 0; i < kInputs; i++) {
     check_size("gradient", gradients[i].size(), inputs[i].size());
     std::fill_n(gradients[i].data(), gradients[i].size(), 0.0);
     if (b.stride[i])
       o.per_element[i] = gradients[i].data();
-    else
-      o.offset[i] = o.shared_size, o.shared_size += int64_t(inputs[i].size());
+    else {
+      o.offset[i] = o.shared_size;
+      o.shared_size += int64_t(inputs[i].size());
+    }
   }
   if (b.count == 0) return;
   const auto& kernels = difflcs::kernels();
@@ -405,6 +432,12 @@ nb::dict status_codes() {
   return codes;
 }
 
+nb::dict tolerances() {
+  nb::dict table;
+  for (const difflcs::Tolerance& tolerance : difflcs::kTolerances) table[tolerance.name] = tolerance.value;
+  return table;
+}
+
 // Bits instead of `isfinite` and no early end, so that the loop is one of vectors.
 bool all_finite(const std::vector<Array>& arrays) {
   constexpr uint64_t exponent = 0x7ff0000000000000u;
@@ -433,6 +466,7 @@ NB_MODULE(_kernels, m) {
       [] { return fields(std::begin(difflcs::kViolationFields), std::end(difflcs::kViolationFields)); },
       "The same of the violation loss.");
   m.def("status_codes", &status_codes, "How a solve can end: name and code.");
+  m.def("tolerances", &tolerances, "Tolerances that the reference in Python has too.");
   m.def("all_finite", &all_finite, "arrays"_a, "Whether no number of some arrays is NaN or infinite.");
   m.def("solve_lcp", &solve_lcp, "F"_a, "q"_a, "relaxation"_a, "max_iter"_a, "time_limit"_a, "threads"_a, "lam"_a,
         "w"_a, "status"_a, "Solve a batch of LCPs into the given arrays.");

@@ -5,8 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from difflcs.physics.contact import ContactLCS
-from difflcs.physics.contacts import Contacts, FreeMotion, contact_lcs
+from difflcs.physics.complementarity import Contacts, FreeMotion, contact_lcs
+from difflcs.physics.learnable import ContactLCS
 from difflcs.physics.planar import ForceDrive, Inertia, PDDrive, PlanarPushing, PositionDrive
 from difflcs.physics.shapes import Circle, Distance, Polygon, Shape, Union, box
 

@@ -26,7 +26,7 @@ from torch import Tensor
 from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor, describe
 from difflcs._differentiation import runs_eagerly
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
-from difflcs.physics.contacts import Cone, Contacts, FreeMotion, contact_lcs, count_forces
+from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, contact_lcs, count_forces
 from difflcs.physics.shapes import Distance, Shape
 from difflcs.records import LCSParams
 
@@ -186,7 +186,7 @@ class PlanarPushing:
         friction: between discs and body, a number or (n_discs,); 0 (a number) for none, which halves n_lam.
         compliance: gap that a unit of force closes, > 0, a number or (n_discs,) [length per force].
         inertia: None for quasi-static motion.
-        cone: model of friction, see `difflcs.physics.contacts`.
+        cone: model of friction, see `difflcs.physics.complementarity`.
         length: unit of gaps for the relaxation of the MPC, see `contact_lcs`; None: the radius of gyration.
         nearest: parts of the shape that each disc can touch in one step, those nearest to it; None: all of them. The
             time of an MPC grows with the contacts, and far parts are out of reach.

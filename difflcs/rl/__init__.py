@@ -4,23 +4,26 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from difflcs.rl._optional import require
+from difflcs._optional import require
+from difflcs._storage import write_atomically
 
 require("gymnasium")  # a clear error, before the modules below import it
 
 # ruff: noqa: E402
-from difflcs._storage import write_atomically
-from difflcs.rl.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
-from difflcs.rl.contact_method import (
-    ContactMethod,
-    PhysicsFit,
-    PhysicsFitSettings,
-)  # behind methods: it is not the default
-from difflcs.rl.critic import CriticSettings
-from difflcs.rl.dynamics import Ensemble, EnsembleSettings
-from difflcs.rl.evaluate import Evaluation, evaluate, wilson_interval
-from difflcs.rl.lcs_rl import LCSRL
+from difflcs.rl.learning.critic import CriticSettings
+from difflcs.rl.learning.dynamics import Ensemble, EnsembleSettings
+from difflcs.rl.learning.mlp import MLPController
+from difflcs.rl.learning.model_rollouts import ModelRollouts, ModelRolloutSettings
+from difflcs.rl.learning.optim import Natural, NaturalGradient
+from difflcs.rl.learning.pddm import PDDM, PDDMSettings
+from difflcs.rl.learning.phases import LCSRL
+from difflcs.rl.learning.physics_fit import PhysicsFit, PhysicsFitSettings
+from difflcs.rl.learning.ppo import PPO
+from difflcs.rl.learning.ppo_settings import PPOSettings, make_ppo
+from difflcs.rl.learning.trainer import Trainer
+from difflcs.rl.learning.warmup import Warmup, WarmupSettings, action_support, fit
 from difflcs.rl.methods import (
+    ContactMethod,
     LCSMethod,
     LCSRLMethod,
     Method,
@@ -33,21 +36,16 @@ from difflcs.rl.methods import (
     method_names,
     register_method,
 )
-from difflcs.rl.mlp import MLPController
-from difflcs.rl.model_rollouts import ModelRollouts, ModelRolloutSettings
-from difflcs.rl.optim import Natural, NaturalGradient
-from difflcs.rl.pddm import PDDM, PDDMSettings
-from difflcs.rl.ppo import PPO
-from difflcs.rl.ppo_settings import PPOSettings, make_ppo
 from difflcs.rl.rollout import collect
+from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
+from difflcs.rl.runs.evaluate import Evaluation, evaluate, wilson_interval
+from difflcs.rl.runs.trained import TrainedPolicy
+from difflcs.rl.runs.training import Reporter, TrainConfig, load_model, load_policy, train
 from difflcs.rl.settings import Adam, Epochs, Rollouts, Settings, ViolationLoss, bounded, group
 from difflcs.rl.tasks import PhysicsSpec, Quantity, TaskSpec, get_task, register_task, task_names
-from difflcs.rl.trainer import Trainer
-from difflcs.rl.training import Reporter, TrainConfig, load_model, load_policy, train
-from difflcs.rl.warmup import Warmup, WarmupSettings, action_support, fit
 
 if TYPE_CHECKING:
-    from difflcs.rl.policy import LCSMPCPolicy, MLPPolicy, make_actor
+    from difflcs.rl.learning.policy import LCSMPCPolicy, MLPPolicy, make_actor
 
 __all__ = [
     "LCSRL",
@@ -85,6 +83,7 @@ __all__ = [
     "Settings",
     "TaskSpec",
     "TrainConfig",
+    "TrainedPolicy",
     "Trainer",
     "ViolationLoss",
     "ViolationMethod",
@@ -118,7 +117,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     # TorchRL takes seconds to import; warm-up and evaluation do without it.
     if name in ("LCSMPCPolicy", "MLPPolicy", "make_actor"):
-        from difflcs.rl import policy
+        from difflcs.rl.learning import policy
 
         return getattr(policy, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

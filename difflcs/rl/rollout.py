@@ -274,7 +274,7 @@ def extended(known: TensorDict, episodes: TensorDict, keep: int | None = None) -
 
 
 def episodes_state(episodes: TensorDict) -> dict[str, Tensor]:
-    """A record of `TRANSITIONS` as a part of a state, see `difflcs.rl.state`."""
+    """A record of `TRANSITIONS` as a part of a state, see `difflcs.rl.learning.state`."""
     return {name: episodes[name] for name in _kept(episodes)}
 
 

@@ -24,12 +24,12 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import check_number, check_positive_int, did_you_mean, make_plain
+from difflcs._optional import require
 from difflcs.cost import GoalCost
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.lcs import LCSModule
 from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.backends import Backend, BatchedBackend, get_backend
-from difflcs.rl._optional import require
 
 if TYPE_CHECKING:
     import gymnasium

@@ -1,8 +1,8 @@
 """The YCB meshes on this machine: find them, or download them from the YCB site.
 
 The archives are kept whole: their SHA-256 is recorded at the first download and every later download must match it.
-Nothing is ever half there. Archives grow in `NAME.part`, from where an interrupted download goes on, and are unpacked
-into a hidden folder that gets its name in one step. One process at a time works in a folder; the others wait. Whatever
+Nothing is ever half there. Archives grow in `NAME.part` and are unpacked into a hidden folder that gets its name in one
+step. One process at a time works in a folder; the others wait. Whatever
 a server sends or an archive holds, its size is limited and the error is an `AssetError`.
 """
 
@@ -177,64 +177,39 @@ def _download_object(entry: YcbObject, folder: Path, address: str, report: Calla
 
 
 def _fetch(address: str, archive: Path) -> None:
-    """Download into `archive`, going on where an earlier attempt was cut off."""
+    """Download into `archive`."""
     part = archive.with_name(archive.name + ".part")
-    for attempt in range(ATTEMPTS):
+    for _ in range(ATTEMPTS):
         try:
-            complete = _fetch_rest(address, part)
+            complete, reason = _fetch_once(address, part), "the connection ended early"
         except (OSError, http.client.HTTPException, ValueError, LookupError) as error:  # HTTPError is an OSError
-            if isinstance(error, _BadRange) or (isinstance(error, urllib.error.HTTPError) and error.code == 416):
-                part.unlink(missing_ok=True)  # not a piece of this file: from the start
-            elif isinstance(error, urllib.error.HTTPError) and error.code < 500:
+            if isinstance(error, urllib.error.HTTPError) and error.code < 500:
                 raise AssetError(
                     f"{address}: expected an archive, got the answer {error.code} {error.reason}. Look at the address; "
                     f"with meshes from elsewhere let {YCB_DIR_VARIABLE} name their folder."
                 ) from error
             complete, reason = False, f"{type(error).__name__}: {error}"
-        else:
-            reason = "the connection ended early"
         if complete:
             os.replace(part, archive)
             return
-        if attempt + 1 == ATTEMPTS:
-            raise AssetError(
-                f"{address} could not be downloaded: {reason}. Check the network and run the command again; it goes on "
-                f"where it stopped."
-            )
+    part.unlink(missing_ok=True)
+    raise AssetError(f"{address} could not be downloaded: {reason}. Check the network and run the command again.")
 
 
-class _BadRange(ValueError):
-    """The server answered with another part of the file than the one asked for."""
-
-
-def _fetch_rest(address: str, part: Path) -> bool:
-    """One request for what is missing. Returns whether the file is complete."""
-    have = part.stat().st_size if part.exists() else 0
-    request = urllib.request.Request(address, headers={"Range": f"bytes={have}-"} if have else {})
-    with urllib.request.urlopen(request, timeout=TIMEOUT) as answer:
-        start = _start(answer.headers.get("Content-Range"), have) if answer.status == 206 else 0
+def _fetch_once(address: str, part: Path) -> bool:
+    """One request. Returns whether the file is complete."""
+    with urllib.request.urlopen(address, timeout=TIMEOUT) as answer, part.open("wb") as file:
         length = answer.headers.get("Content-Length")
-        total = None if length is None else start + int(length)
+        total = None if length is None else int(length)
         _check_size(address, part, total or 0)
         deadline = time.monotonic() + MAX_SECONDS
-        with part.open("r+b" if start else "wb") as file:
-            file.seek(start)
-            file.truncate()
-            while chunk := answer.read1(CHUNK):  # what is there, so that a server that drips is noticed
-                file.write(chunk)
-                _check_size(address, part, file.tell())
-                if time.monotonic() > deadline:
-                    raise TimeoutError(f"still going on after {MAX_SECONDS:g} s")
-            size = file.tell()
+        while chunk := answer.read1(CHUNK):  # what is there, so that a server that drips is noticed
+            file.write(chunk)
+            _check_size(address, part, file.tell())
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"still going on after {MAX_SECONDS:g} s")
+        size = file.tell()
     return total is None or size == total
-
-
-def _start(content_range: str | None, have: int) -> int:
-    """Where the bytes of a partial answer begin: where we asked for, or it is of no use."""
-    found = re.fullmatch(r"\s*bytes\s+(\d{1,15})-(\d{1,15})/(\d{1,15}|\*)\s*", content_range or "", re.ASCII)
-    if found is None or int(found[1]) != have or int(found[2]) < have:
-        raise _BadRange(f"expected the bytes from {have} on, got Content-Range {content_range!r}")
-    return have
 
 
 def _check_size(address: str, part: Path, size: int) -> None:
@@ -295,7 +270,7 @@ def _unpack(archive: Path, folder: Path, entry: YcbObject) -> Path:
         if (folder / entry.code).exists():
             os.replace(folder / entry.code, temporary / "old")  # for an instant there is none
         os.replace(unpacked, folder / entry.code)
-    except AssetError:
+    except (AssetError, MissingDependencyError):
         raise
     except Exception as error:  # a damaged archive fails in many ways
         raise AssetError(

@@ -101,7 +101,7 @@ def contact_system(**env_kwargs: Any) -> Any:
         **env_kwargs: Arguments of the environment.
     """
     from difflcs.physics import ContactLCS, PlanarPushing, Polygon, PositionDrive, Union
-    from difflcs.physics.contact import LEARNABLE
+    from difflcs.physics.learnable import LEARNABLE
     from difflcs_envs.trifinger.model import TIP_RADIUS, CubeObject
     from difflcs_envs.trifinger.objects import make_object
     from difflcs_envs.trifinger.section import cross_section

@@ -6,6 +6,7 @@ single environment with the same seed and actions does, bit for bit.
 
 from __future__ import annotations
 
+import functools
 import os
 import warnings
 from collections.abc import Sequence
@@ -302,37 +303,17 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
-def _entry(
-    env: type[TriFingerEnv], num_envs: int, autoreset_mode: AutoresetMode | str, threads: int | None, arguments: Any
+def _multiply(
+    env: type[TriFingerEnv],
+    num_envs: int = 1,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    threads: int | None = None,
+    **arguments: Any,
 ) -> TriFingerVectorEnv:
     return TriFingerVectorEnv(env(**arguments), num_envs, autoreset_mode, threads)
 
 
-def move_cube(
-    num_envs: int = 1,
-    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-    threads: int | None = None,
-    **arguments: Any,
-) -> TriFingerVectorEnv:
-    """`TriFingerMoveCube-v0`, N times; `arguments` are those of the single environment."""
-    return _entry(TriFingerMoveCubeEnv, num_envs, autoreset_mode, threads, arguments)
-
-
-def move_object(
-    num_envs: int = 1,
-    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-    threads: int | None = None,
-    **arguments: Any,
-) -> TriFingerVectorEnv:
-    """`TriFingerMoveObject-v0`, N times; `arguments` are those of the single environment."""
-    return _entry(TriFingerMoveObjectEnv, num_envs, autoreset_mode, threads, arguments)
-
-
-def turn_cube(
-    num_envs: int = 1,
-    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-    threads: int | None = None,
-    **arguments: Any,
-) -> TriFingerVectorEnv:
-    """`TriFingerTurnCube-v0`, N times; `arguments` are those of the single environment."""
-    return _entry(TriFingerTurnCubeEnv, num_envs, autoreset_mode, threads, arguments)
+move_cube = functools.partial(_multiply, TriFingerMoveCubeEnv)
+move_object = functools.partial(_multiply, TriFingerMoveObjectEnv)
+turn_cube = functools.partial(_multiply, TriFingerTurnCubeEnv)
+"""What Gymnasium makes vectors of the three environments by; further arguments are those of the single one."""

@@ -23,15 +23,15 @@ pytest.importorskip("tyro", reason="needs the extra [rl]")
 
 from difflcs import LCSModel, cli
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
-from difflcs.rl import training
-from difflcs.rl.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
-from difflcs.rl.evaluate import evaluate
+from difflcs.rl.learning.ppo import PPOReport
+from difflcs.rl.learning.state import copy_state, flatten
+from difflcs.rl.learning.trainer import Trainer
 from difflcs.rl.methods import Method, Work, get_method, method_names, register_method
-from difflcs.rl.ppo import PPOReport
-from difflcs.rl.state import copy_state, flatten
+from difflcs.rl.runs import training
+from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
+from difflcs.rl.runs.evaluate import evaluate
+from difflcs.rl.runs.training import Reporter, TrainConfig, load_model, load_policy, profile, stored_config, train
 from difflcs.rl.tasks import register_task
-from difflcs.rl.trainer import Trainer
-from difflcs.rl.training import Reporter, TrainConfig, load_model, load_policy, profile, stored_config, train
 from tests.conformance.toy import STEPS, SearchMethod, make_task
 
 pytestmark = pytest.mark.usefixtures("one_thread", "registered")

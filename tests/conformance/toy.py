@@ -17,12 +17,12 @@ from torch import Tensor, nn
 
 from difflcs import GoalCost, LCSParams
 from difflcs.errors import CheckpointError
+from difflcs.rl.learning.trainer import AfterStep, Trainer
 from difflcs.rl.methods import Method, Work
 from difflcs.rl.rollout import Plan, collect, mpc_actions
 from difflcs.rl.seeding import Stream, episode_seeds, generator
 from difflcs.rl.settings import bounded
 from difflcs.rl.tasks import PhysicsSpec, Quantity, TaskSpec
-from difflcs.rl.trainer import AfterStep, Trainer
 
 STEPS = 5
 U_MAX = 0.2

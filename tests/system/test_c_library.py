@@ -16,8 +16,8 @@ import pytest
 
 from difflcs import LCSModel, LCSMPCLayer, cli
 from difflcs.errors import InvalidInputError
-from difflcs.export import export_controller
 from difflcs.mpc import MPCController
+from difflcs.mpc.export import export_controller
 
 ROOT = Path(__file__).resolve().parents[2]
 TOOLS = ("cmake", "cc", "c++")

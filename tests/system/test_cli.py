@@ -21,11 +21,12 @@ from typing import Any
 import pytest
 import torch
 
-from difflcs import LCSModel, __main__, cli, cli_train
-from difflcs.rl import progress
-from difflcs.rl.checkpoint import RunDirectory
+from difflcs import LCSModel, __main__, cli
+from difflcs.cli import train as cli_train
 from difflcs.rl.methods import LCSRLMethod, get_method, method_names
-from difflcs.rl.training import TrainConfig
+from difflcs.rl.runs import progress
+from difflcs.rl.runs.checkpoint import RunDirectory
+from difflcs.rl.runs.training import TrainConfig
 
 
 def run(capsys, *arguments) -> tuple[int, str, str]:
@@ -478,7 +479,7 @@ def test_resume_after_any_crash_gives_the_same_run(capsys, finished, tmp_path, m
     assert code == 0
     assert "not finished" in out
     with monkeypatch.context() as patch:
-        patch.setattr("difflcs.rl.training.save_checkpoint", die)
+        patch.setattr("difflcs.rl.runs.training.save_checkpoint", die)
         assert run(capsys, "train", "--out", path, "--resume")[0] == 130
     with monkeypatch.context() as patch:
         patch.setattr("difflcs.lcs.LCSModel.save_pretrained", die)
@@ -536,7 +537,7 @@ def test_demo(capsys, tmp_path):
 def test_ctrl_c_in_a_real_process(tmp_path):
     pytest.importorskip("mujoco")
     path = tmp_path / "run"
-    command = [sys.executable, "-m", "difflcs.cli", "train", "--method", "violation", "--final-goals", "0"]
+    command = [sys.executable, "-m", "difflcs", "train", "--method", "violation", "--final-goals", "0"]
     command += ["--evaluate-at", "--out", str(path)]
     process = subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, start_new_session=True,

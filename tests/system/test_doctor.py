@@ -10,7 +10,8 @@ from importlib import metadata
 
 import pytest
 
-from difflcs import available_backends, cli, doctor
+from difflcs import available_backends, cli
+from difflcs.cli import doctor
 
 OPTIONAL = (
     "gymnasium", "mujoco", "torchrl", "tensordict", "tensorboard", "tqdm", "tyro", "cvxpy", "cvxpylayers", "trimesh",

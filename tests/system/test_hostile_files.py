@@ -15,12 +15,13 @@ from safetensors.torch import load_file, save, save_file
 
 from difflcs import LCSModel, _storage, zoo
 from difflcs.errors import CheckpointError
-from difflcs.rl.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
-from difflcs.rl.dynamics import Ensemble
+from difflcs.rl.learning.dynamics import Ensemble
+from difflcs.rl.learning.mlp import MLPController
+from difflcs.rl.learning.state import check_state
 from difflcs.rl.methods import method_names
-from difflcs.rl.mlp import MLPController
-from difflcs.rl.state import check_state
-from difflcs.rl.training import TrainConfig, load_policy, stored_config
+from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
+from difflcs.rl.runs.trained import TrainedPolicy
+from difflcs.rl.runs.training import TrainConfig, load_policy, stored_config
 from difflcs_envs.tasks import pushing_features
 
 VALUES = [
@@ -358,4 +359,4 @@ def test_an_object_that_is_none(tmp_path, found):
     run = make_run(tmp_path / "run")
     write(run.path / "config.json", {**run.config(), "object": found})
     with pytest.raises(CheckpointError, match="texts and numbers that describe an object"):
-        zoo.Learned.open(run.path)
+        TrainedPolicy.open(run.path)

@@ -35,7 +35,7 @@ def test_resume_after_kill_9(capsys, tmp_path):
     options += ["--ppo.steps", "2", "--warmup.epochs.first", "20", "--final-goals", "0", "--evaluate-at"]
     through, killed = tmp_path / "through", tmp_path / "killed"
     for resume, until in ((False, 1), (True, 4)):
-        command = [sys.executable, "-m", "difflcs.cli", "train", *options, "--out", str(killed)]
+        command = [sys.executable, "-m", "difflcs", "train", *options, "--out", str(killed)]
         process = subprocess.Popen(
             [*command, *["--resume"] * resume], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )

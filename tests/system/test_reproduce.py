@@ -24,7 +24,6 @@ FOLDER = Path(__file__).parents[2] / "reproduce"
 sys.path.insert(0, str(FOLDER))
 
 import ablations  # noqa: E402
-import cross_check  # noqa: E402
 import dask  # noqa: E402
 import deployment  # noqa: E402
 import distributed  # noqa: E402
@@ -48,8 +47,7 @@ from rich.progress import Progress  # noqa: E402
 from units import OBJECTS, Preset, Unit  # noqa: E402
 
 from difflcs.errors import CheckpointError, InvalidInputError  # noqa: E402
-from difflcs.rl import TrainConfig, evaluate, get_method, get_task  # noqa: E402
-from difflcs.zoo import Learned  # noqa: E402
+from difflcs.rl import TrainConfig, TrainedPolicy, evaluate, get_method, get_task  # noqa: E402
 
 TINY = Preset("smoke", seeds=1, goals=2, final_goals=2, evaluate_at=(0.2, 0.5), smoke=True)
 FIRST = units.FIRST_SEED
@@ -658,6 +656,43 @@ def test_table1_shows_ours_beside_the_paper(results, capsys):
     assert f"LCS-RL, our recipe, at the end against {deployed}" in markdown
 
 
+def test_numbers_by_hand_stand_in_the_other_tables(results, capsys, monkeypatch):
+    monkeypatch.setattr(report, "write_figure", lambda *figure: None)
+    for seed in range(3):
+        adam, none = (Unit("cube", *units.ABLATED[name], seed) for name in ("adam", "no-warm-up"))
+        records.add(results, "paper", unit_rows(adam, (0, 40, 40, 60 + 10 * seed)))
+        records.add(results, "paper", unit_rows(none, (0, 40, 60 + 10 * seed, 50)))
+        for recipe, mass, end in (("paper", 0.05, 20), ("light", 0.01, 60 + seed)):
+            rows = unit_rows(Unit("mug", "lcs-rl", recipe, seed), (0, 10, 20, end), version="2")
+            records.add(results, "paper", rows.assign(mass=mass))
+    for script in (ablations, fig_learning_curves, fig_transfer, masses):
+        assert run_script(script.main, capsys, "--results", results)[0] == 0
+    (line,) = cells_of(results / "ablations.md", "with Adam")
+    assert line[3:] == ["70.0 [60.0, 80.0]", "−20.0 [−30.0, −10.0]", "0.250", "−10.0 [−10.0, −10.0]", "0.250"]
+    (line,) = (row for row in cells_of(results / "fig_learning_curves.md", "violation only") if row[1].startswith("+"))
+    ends = ["+0.0 [+0.0, +0.0]", "1.000", "+20.0 [+20.0, +20.0]", "0.250", "+60.0 [+60.0, +60.0]", "0.250"]
+    assert line[1:] == ends
+    said = "LCS-RL, our recipe, the lowest of 3 seeds: 6 min 40.0 %, 10 min 50.0 %, final 70.0 %."
+    assert said in (results / "fig_learning_curves.md").read_text()
+    success, apart = cells_of(results / "fig_transfer.md", "mug")[:2]
+    assert success[1] == "30.0 [30.0, 30.0]"  # the cube's model without any data
+    assert success[4:] == ["50.0 [40.0, 60.0]", "60.0 [60.0, 60.0]", "80.0 [70.0, 90.0]", "89.0 [79.0, 99.0]"]
+    assert apart[3:] == ["+10.0 [+0.0, +20.0]", "0.500", "+9.0 [+9.0, +9.0]", "0.250"]  # 6 min, final
+    (line,) = cells_of(results / "masses.md", "mug")
+    assert [cell.split(" ")[0] for cell in line[-3:]] == ["20.0", "61.0", "44.6"]
+    said = "At 50 g, LCS-RL at the end against the paper's mean: worse on 1 (mug)"
+    assert said in (results / "masses.md").read_text()
+
+
+def test_over_all_objects_the_middle_half_counts(tmp_path, capsys):
+    for task, value in zip(OBJECTS, (0, 50, 60, 60, 70, 100), strict=True):
+        for seed in range(2):
+            records.add(tmp_path, "paper", unit_rows(Unit(task, "lcs-rl", "ours", seed), (0, 0, 0, value)))
+    assert run_script(table1.main, capsys, "--results", tmp_path)[0] == 0
+    success = cells_of(tmp_path / "table1.md", "all six")[0]
+    assert success[7] == "60.0 [60.0, 60.0]"  # not 56.7, the mean
+
+
 def test_few_seeds_are_not_compared_with_the_paper(results, capsys):
     for seed in range(2):
         records.add(results, "paper", unit_rows(Unit("clamp", "lcs-rl", "ours", seed), (0, 90, 90, 90)))
@@ -828,7 +863,7 @@ def test_readme_is_filled_between_its_marks_only(tmp_path):
 def test_the_tracked_readme_and_tables_are_those_of_the_tracked_results(tmp_path, monkeypatch, capsys):
     scripts = {
         "table1": table1, "fig_learning_curves": fig_learning_curves, "fig_transfer": fig_transfer,
-        "ablations": ablations, "small_models": small_models, "robustness": robustness, "cross_check": cross_check,
+        "ablations": ablations, "small_models": small_models, "robustness": robustness,
         "masses": masses,
     }  # fmt: skip
     text, tracked = (FOLDER / "README.md").read_text(), records.RESULTS
@@ -854,7 +889,7 @@ def test_the_tracked_readme_and_tables_are_those_of_the_tracked_results(tmp_path
     assert readme.read_text() == text, "run the scripts of reproduce/ to bring README.md up to date"
 
 
-# --- other systems, other simulators ----------------------------------------------------------------
+# --- other systems ----------------------------------------------------------------
 
 
 def test_robustness_is_resumed_and_refuses_another_record(tmp_path, monkeypatch, one_thread, capsys):
@@ -874,7 +909,7 @@ def test_robustness_is_resumed_and_refuses_another_record(tmp_path, monkeypatch,
     assert measured[2] == measured[3]  # the one that was interrupted, none of those before
     assert len(measured) == len(set(measured)) + 1
     record = json.loads((tmp_path / "robustness-smoke.json").read_text())
-    nominal = evaluate(get_task("cube").make_envs(2), Learned.open(options.model).policy, 2, 0)
+    nominal = evaluate(get_task("cube").make_envs(2), TrainedPolicy.open(options.model).policy, 2, 0)
     assert record["results"][0]["reached"].count("1") == nominal.successes
     assert (tmp_path / "robustness-smoke.png").is_file()
     assert not (tmp_path / "robustness.json").exists()
@@ -900,65 +935,6 @@ def test_robustness_changes_what_it_says(monkeypatch):
     robustness.acting(noisy, None, 6, np.random.default_rng(0))(state, goal)
     assert seen[0].std(0)[:3].tolist() == pytest.approx([0.003, 0.003, 0.05], rel=0.1)
     assert not seen[0][:, 3:].any()  # where the tips are, the robot knows
-
-
-PRIOR_WORK = """
-import mujoco
-import numpy as np
-from gym import utils
-from gym.spaces import Box
-from difflcs.rl import get_task
-
-class TriFingerQuasiStaticGroundEnv(utils.EzPickle):
-    box = Box(-1.0, 1.0, (6,), np.float64)
-    def __init__(self):
-        self.inner = get_task("cube").make_env().unwrapped
-        self.goal = np.zeros(3)
-    def reset(self):
-        state = np.random.uniform(-0.004, 0.004, 9)
-        observation, _ = self.inner.reset(seed=int(np.random.randint(100)))
-        self.state = observation["state"]
-        body = "<body><joint/><geom size='1'/></body>"
-        model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
-        data = mujoco.MjData(model)
-        mujoco.mj_forward(model, data)
-        matrix = np.zeros((1, 1))
-        mujoco.mj_fullM(model, matrix, data.qM)
-        assert matrix[0, 0] > 0
-    def set_cube_target(self, position, angle):
-        goal = np.array([*position, angle])
-        self.inner.reset(seed=0, options={"goal": goal, "state": self.state})
-    def get_stateinfo(self):
-        return {"state": self.state}
-    def step(self, action):
-        self.state = self.inner.step(action)[0]["state"]
-"""
-
-
-def test_the_cross_check_plays_the_same_episodes(tmp_path, monkeypatch, capsys, one_thread):
-    file = tmp_path / "checkout" / "env" / "gym_env" / "trifinger_quasistaic_ground_continuous.py"
-    file.parent.mkdir(parents=True)
-    for folder in (file.parent, file.parents[1]):
-        (folder / "__init__.py").touch()
-    file.write_text(PRIOR_WORK)
-    with monkeypatch.context() as patch:
-        for name in ("gym", "gym.utils", "gym.spaces", "gym.error", "env", "env.gym_env", cross_check.MODULE):
-            patch.setitem(sys.modules, name, None)
-            sys.modules.pop(name)
-        options = cross_check.Options(tmp_path / "checkout", (Path("zoo:trifinger-cube"),), 2, results=tmp_path)
-        assert cross_check.draw_record(options) == 0
-    (row,) = json.loads((tmp_path / "cross_check.json").read_text())["results"]
-    assert row["theirs"] == row["ours"]
-    assert len(row["ours"]) == 2
-    assert row["tips_rms"] == row["cube_median"] == 0  # here their simulator is ours
-    markdown = (tmp_path / "cross_check.md").read_text()
-    assert "2 goals (seed 0), each from the same start" in markdown
-    assert cross_check.draw_record(replace(options, checkout=None)) == 0  # from the record
-    assert (tmp_path / "cross_check.md").read_text() == markdown
-    with pytest.raises(InvalidInputError, match="clone the prior work"):
-        cross_check.prior_environment(tmp_path)
-    with pytest.raises(CheckpointError, match="make it with --checkout"):
-        cross_check.draw_record(cross_check.Options(results=tmp_path / "empty"))
 
 
 def test_a_small_model_beside_networks(results, capsys):

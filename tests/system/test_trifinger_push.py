@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+
+from difflcs.errors import MissingDependencyError
 
 SCOREBOARD = Path(__file__).resolve().parents[2] / "benchmarks" / "scoreboard"
 
@@ -192,6 +195,15 @@ def test_a_tip_goes_straight_where_it_can_and_over_the_cube_where_it_must():
     assert travel.arrived(states[0], target)
     assert not travel.arrived(states[1], target)  # another finger
     assert not travel.arrived(state(pose, [-0.055, 0.02, 0.022], 0.0), target)
+
+
+def test_the_package_that_is_missing_is_named(monkeypatch):
+    pytest.importorskip("tyro")
+    import trifinger_rl
+
+    monkeypatch.setitem(sys.modules, "trifinger_rl_datasets", None)
+    with pytest.raises(MissingDependencyError, match=r"pip install trifinger-rl-datasets==1\.0\.3"):
+        trifinger_rl.main(trifinger_rl.Options(policy="contact-mpc"))
 
 
 @pytest.mark.slow  # the simulator steps in real time on one core; nothing quicker shows that a torque moves the cube

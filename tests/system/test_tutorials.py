@@ -28,9 +28,9 @@ INSTALL = re.compile(
 # What brings a package that a notebook imports: an extra, or None where the library itself or Jupyter does.
 BRINGS = {
     "IPython": None, "PIL": "viz", "difflcs": None, "difflcs.physics": None, "difflcs.planning": None,
-    "difflcs.planning.films": "viz", "difflcs.planning.pusht": "scoreboard", "difflcs.rl": "rl", "difflcs_envs": "envs",
-    "gymnasium": "envs", "matplotlib": "viz", "mujoco": "envs", "numpy": None, "tensordict": "rl", "torch": None,
-    "trimesh": "envs",
+    "difflcs.rl": "rl", "difflcs_envs": "envs",
+    "gymnasium": "envs", "matplotlib": "viz", "mujoco": "envs", "numpy": None, "push_t": "scoreboard",
+    "tensordict": "rl", "torch": None, "trimesh": "envs",
 }  # fmt: skip
 SECONDS = 300  # of one cell; a notebook takes about five on a free machine
 
@@ -51,9 +51,12 @@ def execute(path: Path, folder: Path) -> nbformat.NotebookNode:
     from nbclient import NotebookClient
 
     notebook = read(path)
+    place = folder / path.parent.name  # beside `examples`, as in a checkout
+    place.mkdir()
+    (folder / "examples").symlink_to(FOLDER.parent / "examples")
     manager = AsyncKernelManager(kernel_name="python3", transport="ipc", ip=str(folder / "kernel"))
     client = NotebookClient(
-        notebook, km=manager, timeout=SECONDS, resources={"metadata": {"path": str(folder)}}, record_timing=False
+        notebook, km=manager, timeout=SECONDS, resources={"metadata": {"path": str(place)}}, record_timing=False
     )
     # A loop of our own, so that none is left open (filterwarnings = error sees it).
     asyncio.run(client.async_execute(cleanup_kc=True))

@@ -13,14 +13,16 @@ from typing import Any
 import pytest
 import torch
 
-from difflcs import LCSModel, _zoo, cli, cli_train, zoo
-from difflcs._zoo import add as adding
+from difflcs import LCSModel, cli, zoo
+from difflcs.cli import train as cli_train
 from difflcs.errors import CheckpointError
-from difflcs.rl.checkpoint import RunDirectory
-from difflcs.rl.evaluate import wilson_interval
 from difflcs.rl.methods import PPOMethod, get_method, method_names
+from difflcs.rl.runs.checkpoint import RunDirectory
+from difflcs.rl.runs.evaluate import wilson_interval
+from difflcs.rl.runs.trained import TrainedPolicy
+from difflcs.rl.runs.training import TrainConfig, load_model
 from difflcs.rl.tasks import get_task, task_names
-from difflcs.rl.training import TrainConfig, load_model
+from reproduce import add_to_zoo as adding
 
 CUBE = "trifinger-cube"
 OBJECT = {"name": "mug", "source": "ycb_mesh", "mass": 0.05, "sha256": "abc"}
@@ -54,7 +56,7 @@ def test_the_cube_is_there_and_everything_is_small():
     assert sum(path.stat().st_size for path in files) < 1_000_000
 
 
-@pytest.mark.parametrize("name", _zoo.names())
+@pytest.mark.parametrize("name", zoo.names())
 def test_every_model_fits_its_card(name):
     card = zoo.card(name)
     assert card.name == name
@@ -76,10 +78,11 @@ def test_every_model_fits_its_card(name):
     else:
         with pytest.raises(CheckpointError, match="LCSModel"):
             LCSModel.from_pretrained(name)
+    assert TrainedPolicy.open(f"zoo:{name}").finished
     assert hash(card) == hash(zoo.card(f"zoo:{name}"))
 
 
-@pytest.mark.parametrize("name", _zoo.names())
+@pytest.mark.parametrize("name", zoo.names())
 def test_the_command_of_a_card_trains_that_very_model(monkeypatch, name):
     """What is a default today was one when it was trained, and the command says the rest."""
     pytest.importorskip("tyro")
@@ -90,7 +93,7 @@ def test_the_command_of_a_card_trains_that_very_model(monkeypatch, name):
     assert (seen[0].task, seen[0].method.name, seen[0].seed) == (card.task, card.method, card.seed)
 
 
-@pytest.mark.parametrize("name", [n for n in _zoo.names() if zoo.card(n).object_source == "built_in"])
+@pytest.mark.parametrize("name", [n for n in zoo.names() if zoo.card(n).object_source == "built_in"])
 def test_evaluation_finds_what_the_card_says(capsys, name):
     pytest.importorskip("mujoco")
     assert cli.main(["evaluate", f"zoo:{name}", "--goals", "40", "--json"]) == 0
@@ -179,7 +182,7 @@ def test_a_finished_run_becomes_a_model_with_its_card(tmp_path):
     run = make_run(tmp_path / "run", init="/home/somebody/runs/cube-7/model")
     root = tmp_path / "zoo"
     card = adding.add(run.path, root=root)
-    assert _zoo.names(root) == ("trifinger-mug",)
+    assert zoo.names(root) == ("trifinger-mug",)
     assert json.loads((root / "trifinger-mug/card.json").read_text()) == json.loads(json.dumps(asdict(card)))
     assert (card.name, card.task, card.method, card.minutes, card.seed) == ("trifinger-mug", "mug", "lcs-rl", 30.0, 3)
     assert (card.success_rate, card.ci_low, card.ci_high, card.goals) == (0.9, 0.88, 0.92, 1000)

@@ -21,11 +21,11 @@ from difflcs.rl import (
     ModelRollouts,
     ModelRolloutSettings,
     PPOSettings,
-    ppo_settings,
 )
-from difflcs.rl.optim import UpdateRule
-from difflcs.rl.policy import GaussianPolicy, make_actor
-from difflcs.rl.ppo import PPO
+from difflcs.rl.learning import ppo_settings
+from difflcs.rl.learning.optim import UpdateRule
+from difflcs.rl.learning.policy import GaussianPolicy, make_actor
+from difflcs.rl.learning.ppo import PPO
 
 STEPS = 6
 U_MAX = 0.1

@@ -30,10 +30,10 @@ from difflcs.rl import (
     make_actor,
     make_ppo,
 )
-from difflcs.rl.checkpoint import load_checkpoint, save_checkpoint
-from difflcs.rl.ppo import PPO
+from difflcs.rl.learning.ppo import PPO
+from difflcs.rl.learning.state import flatten
 from difflcs.rl.rollout import contexts, mpc_actions, no_episodes, transitions
-from difflcs.rl.state import flatten
+from difflcs.rl.runs.checkpoint import load_checkpoint, save_checkpoint
 from tests.training import slide
 from tests.training.slide import parameters, recorded, same
 

@@ -5,10 +5,11 @@ from itertools import pairwise
 import pytest
 
 pytest.importorskip("torchrl")
-from difflcs.rl import LCSRL, Epochs, Rollouts, Warmup, WarmupSettings, ppo_settings
-from difflcs.rl.policy import make_actor
-from difflcs.rl.ppo import PPO
-from difflcs.rl.state import copy_state
+from difflcs.rl import LCSRL, Epochs, Rollouts, Warmup, WarmupSettings
+from difflcs.rl.learning import ppo_settings
+from difflcs.rl.learning.policy import make_actor
+from difflcs.rl.learning.ppo import PPO
+from difflcs.rl.learning.state import copy_state
 from tests.training.slide import (
     PENALTY,
     ROLLOUTS,

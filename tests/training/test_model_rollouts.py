@@ -13,8 +13,8 @@ from tensordict import TensorDict
 
 from difflcs.errors import InvalidInputError
 from difflcs.rl import EnsembleSettings, Epochs, ModelRollouts, ModelRolloutSettings
-from difflcs.rl.dynamics import Ensemble
-from difflcs.rl.model_rollouts import ModelEnv
+from difflcs.rl.learning.dynamics import Ensemble
+from difflcs.rl.learning.model_rollouts import ModelEnv
 from difflcs.rl.rollout import collect, uniform_actions
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -218,6 +218,15 @@ def test_the_ensemble_learns_the_episodes():
     changes = (states[:, 1:] - states[:, :-1]).flatten(0, 1)
     error = predicted - states[:, 1:].flatten(0, 1)
     assert float(error.square().mean()) < 0.05 * float(changes.square().mean())
+
+
+def test_the_first_fit_takes_epochs_of_its_own(monkeypatch):
+    rollouts, taken = make_rollouts(first=3), []
+    monkeypatch.setattr(rollouts.ensemble, "fit", lambda *_, epochs, **__: taken.append(epochs) or 0.0)
+    rollouts.add(episodes())
+    for _ in range(3):
+        rollouts.fit()
+    assert taken == [3, 2, 2]
 
 
 def test_unstable_episodes_are_not_learned_from():

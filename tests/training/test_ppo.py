@@ -7,11 +7,12 @@ from gymnasium.vector import SyncVectorEnv
 from difflcs.errors import CheckpointError, InvalidInputError
 
 pytest.importorskip("torchrl")
-from difflcs.rl import CriticSettings, Epochs, Natural, ppo_settings
-from difflcs.rl.advantages import SAMPLES
-from difflcs.rl.evaluate import evaluate
-from difflcs.rl.mlp import MLPController
+from difflcs.rl import CriticSettings, Epochs, Natural
+from difflcs.rl.learning import ppo_settings
+from difflcs.rl.learning.advantages import SAMPLES
+from difflcs.rl.learning.mlp import MLPController
 from difflcs.rl.rollout import elapsed_fractions
+from difflcs.rl.runs.evaluate import evaluate
 from tests.training.slide import (
     ROLLOUTS,
     STEPS,

@@ -11,12 +11,12 @@ from gymnasium.vector import SyncVectorEnv
 
 from difflcs import GoalCost, LCSModel, LCSMPCLayer, violation_loss
 from difflcs.errors import InvalidInputError
-from difflcs.rl.evaluate import evaluate
+from difflcs.rl.learning.warmup import Warmup, WarmupSettings, action_support, fit
 from difflcs.rl.rollout import collect, uniform_actions
 from difflcs.rl.rollout import transitions as transitions_of
+from difflcs.rl.runs.evaluate import evaluate
 from difflcs.rl.seeding import episode_seeds
 from difflcs.rl.settings import Epochs, Rollouts
-from difflcs.rl.warmup import Warmup, WarmupSettings, action_support, fit
 from tests.training.pusher import STEPS, U_MAX, PusherEnv, Reach, make_envs
 
 

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 
 from difflcs.errors import InvalidInputError
 from difflcs.rl import CriticSettings
-from difflcs.rl.advantages import (
+from difflcs.rl.learning.advantages import (
     SAMPLES,
     GAEAdvantages,
     MultiActionAdvantages,
@@ -21,7 +21,7 @@ from difflcs.rl.advantages import (
     multi_action_advantages,
     returns,
 )
-from difflcs.rl.critic import Critic
+from difflcs.rl.learning.critic import Critic
 from difflcs.rl.rollout import elapsed_fractions
 from difflcs.rl.seeding import seeded
 

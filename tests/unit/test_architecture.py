@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,22 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"difflcs": ROOT / "difflcs", "difflcs_envs": ROOT / "envs" / "difflcs_envs"}
 MOST_LINES, MOST_CLASS_LINES = 500, 300
+# The storeys of the library, from below: core, physics and planning, learning and the tools. A module imports from its
+# own line and those above it here; what begins with "_" helps all, and knows errors alone. The zoo knows files only.
+LAYERS = (
+    ("errors",),
+    ("lcs", "lcp", "records", "losses", "scales", "cost", "constraints", "status", "zoo"),
+    ("systems",),
+    ("mpc",),
+    ("physics",),
+    ("planning",),
+    ("rl.tasks", "rl.settings", "rl.seeding", "rl.rollout"),
+    ("rl.learning",),
+    ("rl.methods",),
+    ("rl.runs",),
+    ("rl",),
+    ("cli", "__main__"),
+)
 
 
 def module_name(package: str, path: Path) -> str:
@@ -62,6 +79,7 @@ def targets(node: ast.Import | ast.ImportFrom, module: str) -> Iterator[str]:
         yield base
 
 
+@functools.cache
 def graph(*, functions: bool) -> dict[str, set[str]]:
     """Module → the modules of ours that it imports, at module level or in functions."""
     edges: dict[str, set[str]] = {}
@@ -111,11 +129,11 @@ def packages_of(edges: dict[str, set[str]], package: str, other: str) -> dict[st
 def test_the_graph_has_what_is_known_to_be_in_it():
     edges = graph(functions=False)
     assert "difflcs.errors" in edges["difflcs.lcs"]
-    assert {"difflcs.rl.tasks", "difflcs.rl.settings"} <= edges["difflcs.rl.methods"]
-    assert "difflcs.zoo" in edges["difflcs.cli"]
-    assert "difflcs.rl.policy" in graph(functions=True)["difflcs.rl.methods"]
-    assert "difflcs.rl.policy" not in edges["difflcs.rl.methods"]  # TorchRL takes seconds
-    assert "difflcs.rl.critic" not in edges["difflcs.rl.advantages"]
+    assert {"difflcs.rl.tasks", "difflcs.rl.settings"} <= edges["difflcs.rl.methods.base"]
+    assert "difflcs.zoo" in edges["difflcs.cli.commands"]
+    assert "difflcs.rl.learning.policy" in graph(functions=True)["difflcs.rl.methods.phases"]
+    assert "difflcs.rl.learning.policy" not in edges["difflcs.rl.methods.phases"]  # TorchRL takes seconds
+    assert "difflcs.rl.learning.critic" not in edges["difflcs.rl.learning.advantages"]
 
 
 def test_a_circle_would_be_found():
@@ -127,6 +145,12 @@ def test_a_circle_would_be_found():
     assert found == {("b", True), ("c", False), ("d", True), ("e", True)}
 
 
+def layer_of(module: str) -> int | None:
+    """Index in `LAYERS`; None for helpers and the root."""
+    below = module.removeprefix("difflcs.") + "."
+    return next((i for i, names in enumerate(LAYERS) if any(below.startswith(f"{name}.") for name in names)), None)
+
+
 # --- what holds -------------------------------------------------------------------------------------------------------
 
 
@@ -134,10 +158,19 @@ def test_no_circle_of_imports():
     assert cycles(graph(functions=False)) == []
 
 
+@pytest.mark.parametrize("module", [module for module in SOURCES if module.startswith("difflcs.")])
+def test_imports_go_one_way(module):
+    own = layer_of(module)
+    for other in graph(functions=False)[module] | graph(functions=True)[module]:
+        layer = layer_of(other)
+        assert own is None or layer is None or layer <= own, f"{module} imports {other}"
+        assert own is not None or layer in (None, 0), f"the helper {module} imports {other}"
+
+
 def test_the_library_knows_no_environment():
     assert packages_of(graph(functions=False), "difflcs", "difflcs_envs") == {}
     known = packages_of(graph(functions=True), "difflcs", "difflcs_envs")
-    assert set(known) <= {"difflcs.cli", "difflcs.doctor"}  # the command `assets`, and what works here
+    assert set(known) <= {"difflcs.cli.commands", "difflcs.cli.doctor"}  # the command `assets`, and what works here
 
 
 def test_one_file_of_the_environments_knows_the_library():

@@ -16,8 +16,8 @@ import torch
 
 from difflcs import LCSModel, _storage
 from difflcs.errors import CheckpointError, InUseError
-from difflcs.rl.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
-from difflcs.rl.state import flatten
+from difflcs.rl.learning.state import flatten
+from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
 
 
 def make_model(seed: int) -> LCSModel:
@@ -161,7 +161,7 @@ def test_log_has_no_doubled_nor_broken_rows(tmp_path):
 
 HOLD = """
 import sys, time, pathlib
-from difflcs.rl.checkpoint import RunDirectory
+from difflcs.rl.runs.checkpoint import RunDirectory
 with RunDirectory(pathlib.Path(sys.argv[1])).locked():
     print("locked", flush=True)
     time.sleep(60)

@@ -62,7 +62,8 @@ def rows(build, **changes):
 def test_constraints_hold_their_fields(build):
     hard = LinearConstraints(*list(rows(build).values())[:2])
     assert (hard.n_c, hard.n_x, hard.n_u) == (3, 4, None)
-    assert torch.equal(hard.tensors()["price"], full(INF, 3))
+    for constraints in (hard, LinearConstraints(**rows(build, weight=1e300))):
+        assert torch.equal(constraints.tensors()["price"], full(INF, 3))
     assert set(hard.tensors()) == {"G_x", "g", "price"}
     assert set(hard.state_dict()) == {"G", "g"}
     soft = LinearConstraints(**rows(build, weight=5.0))

@@ -15,9 +15,10 @@ from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
 from difflcs.lcp import solve_lcp
 from difflcs.physics import ContactLCS, PlanarPushing, PositionDrive, box
 from difflcs.rl import ContactMethod, PhysicsFit, PhysicsFitSettings, PhysicsSpec, evaluate, get_task
-from difflcs.rl.contact_method import known_physics, physics_loss
+from difflcs.rl.learning.physics_fit import physics_loss
+from difflcs.rl.learning.trainer import configuration
 from difflcs.rl.methods import Work
-from difflcs.rl.trainer import configuration
+from difflcs.rl.methods.contact_lcs import known_physics
 from tests.conformance.toy import Guess, make_task
 
 pytestmark = pytest.mark.usefixtures("one_thread")

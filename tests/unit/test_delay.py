@@ -6,9 +6,9 @@ import torch
 
 from difflcs import LCSSequence
 from difflcs.errors import DTypeError, InvalidInputError
-from difflcs.rl.delay import late_actions, predicted_by
-from difflcs.rl.evaluate import evaluate
 from difflcs.rl.rollout import collect, mpc_actions
+from difflcs.rl.runs.delay import late_actions, predicted_by
+from difflcs.rl.runs.evaluate import evaluate
 from tests.training.pusher import STEPS, Reach, make_envs, pusher
 
 SEEDS = [1, 2, 3, 4]

@@ -7,8 +7,8 @@ import torch
 from gymnasium.vector import SyncVectorEnv
 
 from difflcs.errors import InvalidInputError
-from difflcs.rl.evaluate import evaluate, wilson_interval
 from difflcs.rl.rollout import collect, mpc_actions
+from difflcs.rl.runs.evaluate import evaluate, wilson_interval
 from difflcs.rl.seeding import Stream, episode_seeds
 from tests.training.pusher import STEPS, PusherEnv, Reach, make_envs
 

@@ -8,7 +8,7 @@ from torch.autograd.function import once_differentiable
 
 from difflcs import GoalCost, LCSMPCLayer
 from difflcs.physics import ContactLCS, PlanarPushing, box
-from difflcs.rl import learned
+from difflcs.rl.learning import learned
 
 F64 = torch.float64
 LEARN = ("center_of_mass", "gyration", "friction", "radius")

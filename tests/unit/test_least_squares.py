@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from difflcs.rl.least_squares import BACKWARD, FlatAdam, gradients, tanh
+from difflcs.rl.learning.least_squares import BACKWARD, FlatAdam, gradients, tanh
 
 REFERENCE = {torch.relu_: torch.relu, tanh: torch.tanh}
 

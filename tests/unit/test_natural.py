@@ -8,8 +8,8 @@ from torch import nn
 pytest.importorskip("torchrl")
 from difflcs.errors import InvalidInputError
 from difflcs.mpc.backends import BatchedBackend
-from difflcs.rl.optim import NaturalGradient, StepSize
-from difflcs.rl.policy import make_actor
+from difflcs.rl.learning.optim import NaturalGradient, StepSize
+from difflcs.rl.learning.policy import make_actor
 from tests.training.slide import drawn, make_model, make_mpc
 
 pytestmark = pytest.mark.usefixtures("one_thread")

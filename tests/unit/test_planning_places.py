@@ -14,17 +14,17 @@ from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics import Circle, PDDrive, PlanarPushing, Polygon, Union, box
 from difflcs.planning import DiscPlaces, LiftTravel, PlanarTravel, Workspace
 from difflcs.planning.outline import clearance, ring
-from difflcs.planning.pusht import CENTER_OF_MASS, DRIVE, GYRATION, PushTPolicy, from_origin, tee, tee_pushing
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 F64 = torch.float64
 RADIUS = 0.15
+TEE = Union((box(-0.6, 0.6, -0.25, 0.05), box(-0.15, 0.15, 0.05, 0.95)))
 SHAPES = {
     "circle": Circle(0.5, (0.3, 0.1)),
     "box": box(-0.5, 0.5, -0.2, 0.2),
     "not convex": Polygon([[0.0, 0.0], [1.0, 0.0], [0.2, 0.2], [0.0, 1.0]]),
-    "tee": tee(),
+    "tee": TEE,
     "apart": Union((box(-0.5, -0.1, -0.2, 0.2), Circle(0.3, (0.4, 0.0)))),
 }
 
@@ -77,8 +77,8 @@ def test_a_ring_round_a_hole_is_the_outer_one():
 
 @pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), (1.0, -2.0, 2.5)])
 def test_discs_on_places_have_the_gap_and_are_at_rest(pose):
-    system = tee_pushing()
-    places = DiscPlaces(tee(), RADIUS, 40, gap=0.03)
+    system = PlanarPushing(TEE, RADIUS, drive=PDDrive(stiffness=100.0, damping=20.0, substep=0.01, substeps=10))
+    places = DiscPlaces(TEE, RADIUS, 40, gap=0.03)
     x = tensor([*pose, 5.0, 5.0, 1.0, -1.0])
     states = places.states(x, places.sample(x))
     assert states.shape == (40, 7)
@@ -199,40 +199,3 @@ def test_what_is_lifted_goes_aside_only_above():
 def test_an_end_effector_in_space_has_three_coordinates():
     with pytest.raises(ShapeError, match="effectors"):
         LiftTravel(0.3, 0.05, [[0, 1]], tolerance=0.01)
-
-
-# --- Push-T, without the environment ----------------------------------------------------------------------------------
-
-
-def test_the_tee_is_that_of_the_environment():
-    system = tee_pushing()
-    # Moments that pymunk gives: twice that of a bar of 120 × 30 about the middle of its upper edge, for a mass of 1.
-    bar = (120**2 + 30**2) / 12 + 15**2
-    assert pytest.approx(2 * bar / 100**2) == GYRATION**2
-    assert isinstance(system.drive, PDDrive)
-    area, centroid, _ = tee().moments()
-    assert float(area) == pytest.approx(0.63)
-    torch.testing.assert_close(centroid, torch.zeros(2, dtype=F64))
-    # The mean of the centres of both boxes, from the origin of the T, through the middle of the bar.
-    middle = from_origin([0.0, 0.0, 0.0])[1]
-    assert pytest.approx(middle + CENTER_OF_MASS[1]) == 0.5 * (0.15 + 0.75)
-    turned = from_origin([100.0, 200.0, math.pi / 2])
-    assert turned == pytest.approx([1.0 - middle, 2.0, math.pi / 2])
-
-
-def test_a_policy_for_push_t_sends_the_disc_to_places_in_the_plane():
-    policy = PushTPolicy()
-    target = policy.act([400.0, 400.0, 256.0, 256.0, 0.0])
-    assert target.shape == (2,)
-    assert ((target >= 0) & (target <= 512)).all()
-    assert policy.sampling.decision.mode == "travel"
-
-
-def test_actions_that_come_late_are_planned_from_where_things_will_be():
-    late, seen = PushTPolicy(delay=1), [400.0, 400.0, 256.0, 256.0, 0.0]
-    sent = late.act(seen)
-    torch.testing.assert_close(late.sampling.decision.states[0, 3:5], tensor([4.0, 4.0]))  # nothing is under way
-    late.sampling.reset()
-    late.act(seen)
-    expected = 4.0 + DRIVE.step().b[0] * (tensor(sent) / 100 - 4.0)
-    torch.testing.assert_close(late.sampling.decision.states[0, 3:5], expected)

@@ -21,8 +21,8 @@ from torchrl.envs import ClipTransform, GymWrapper, TransformedEnv
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
 
-from difflcs.rl.mlp import MLPController
-from difflcs.rl.policy import LCSMPCPolicy, MLPPolicy
+from difflcs.rl.learning.mlp import MLPController
+from difflcs.rl.learning.policy import LCSMPCPolicy, MLPPolicy
 
 U_MAX = 0.1
 STD = 0.02

@@ -8,9 +8,10 @@ import torch
 from difflcs.errors import InvalidInputError
 
 pytest.importorskip("torchrl")
-from difflcs.rl import PPOSettings, ppo_settings
-from difflcs.rl.mlp import MLPController
-from difflcs.rl.policy import make_actor
+from difflcs.rl import PPOSettings
+from difflcs.rl.learning import ppo_settings
+from difflcs.rl.learning.mlp import MLPController
+from difflcs.rl.learning.policy import make_actor
 from tests.training.slide import STEPS, U_MAX, features, make_envs, make_model, make_mpc, small_settings
 
 

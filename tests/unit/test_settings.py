@@ -13,13 +13,13 @@ from typing import Any, Literal, get_args, get_type_hints
 
 import pytest
 
+from difflcs._optional import require
 from difflcs.errors import BackendNotFoundError, CheckpointError, DTypeError, InvalidInputError, MissingDependencyError
-from difflcs.rl._optional import require
-from difflcs.rl.methods import LCSMethod, get_method, method_names
+from difflcs.rl.learning.warmup import WarmupSettings
+from difflcs.rl.methods import DEFAULT_METHOD, LCSMethod, get_method, method_names
+from difflcs.rl.runs.training import TrainConfig, episodes_of, goals_due
 from difflcs.rl.settings import Adam, Epochs, Rollouts, Settings, bounded, from_json, group
 from difflcs.rl.tasks import get_task
-from difflcs.rl.training import TrainConfig, episodes_of, goals_due
-from difflcs.rl.warmup import WarmupSettings
 
 
 @dataclass(frozen=True)
@@ -231,7 +231,7 @@ def test_bad_settings_of_a_method_are_refused():
 
 def test_a_method_stands_for_its_name():
     assert TrainConfig(method="ppo") == TrainConfig(method=get_method("ppo")())  # pyright: ignore[reportArgumentType]
-    assert TrainConfig().method == get_method(method_names()[0])()
+    assert TrainConfig().method == get_method(DEFAULT_METHOD)()
     assert isinstance(TrainConfig().method, LCSMethod)
 
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from difflcs.errors import CheckpointError
-from difflcs.rl.state import (
+from difflcs.rl.learning.state import (
     check_state,
     copy_state,
     flatten,

@@ -10,10 +10,10 @@ from tensordict import TensorDict
 
 from difflcs import violation_loss
 from difflcs.rl import ViolationLoss
-from difflcs.rl.mlp import MLPController
-from difflcs.rl.policy import make_actor
+from difflcs.rl.learning.mlp import MLPController
+from difflcs.rl.learning.policy import make_actor
+from difflcs.rl.learning.surrogate import Surrogate, gaussian_kl, trimmed_mean
 from difflcs.rl.rollout import transitions
-from difflcs.rl.surrogate import Surrogate, gaussian_kl, trimmed_mean
 from tests.training.slide import U_MAX, drawn, features, make_model, make_mpc
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -157,7 +157,7 @@ def test_the_losses_are_weighted(beta):
 
 @pytest.mark.parametrize(("beta", "violation"), [(1.0, VIOLATION), (1.0, None), (0.5, None)])
 def test_the_violation_loss_is_not_asked_where_it_does_not_count(beta, violation, monkeypatch):
-    monkeypatch.setattr("difflcs.rl.surrogate.violation_loss", None)  # never called
+    monkeypatch.setattr("difflcs.rl.learning.surrogate.violation_loss", None)  # never called
     actor, surrogate, data = made(beta=beta, violation=violation)
     new, numbers = solved(actor, data), rng()
     surrogate(new, data, gaussian_kl(data, new), judged(data), episodes(), numbers)

@@ -14,8 +14,8 @@ import torch
 
 from difflcs import GoalCost, LCSModel
 from difflcs.errors import DTypeError, InvalidInputError, MissingDependencyError
-from difflcs.rl.figures import record_video
 from difflcs.rl.rollout import Plan
+from difflcs.rl.runs.figures import record_video
 from difflcs.rl.tasks import ENTRY_POINTS, Quantity, get_task, register_task, task_names
 from tests.conformance.toy import STEPS, U_MAX, Slide, make_task
 

@@ -9,9 +9,9 @@ import torch
 pytest.importorskip("torchrl")
 from difflcs.errors import CheckpointError
 from difflcs.rl import Adam, Natural
-from difflcs.rl.optim import AdamUpdate, NaturalUpdate, StepSize
-from difflcs.rl.optim.update import Deviation
-from difflcs.rl.policy import make_actor
+from difflcs.rl.learning.optim import AdamUpdate, NaturalUpdate, StepSize
+from difflcs.rl.learning.optim.update import Deviation
+from difflcs.rl.learning.policy import make_actor
 from tests.training.slide import drawn, make_model, make_mpc
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -157,7 +157,7 @@ def test_a_gradient_that_is_not_finite_changes_nothing(kind, bad):
 
 
 def _tensors(state) -> list[torch.Tensor]:
-    from difflcs.rl.state import flatten
+    from difflcs.rl.learning.state import flatten
 
     return list(flatten(state)[0].values())
 

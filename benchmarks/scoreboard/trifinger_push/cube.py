@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from difflcs.physics import PlanarPushing, box
-from difflcs.physics.contacts import Cone
+from difflcs.physics.complementarity import Cone
 from trifinger_push.fingers import STEP, planar_turn
 
 __all__ = ["HALF", "HEIGHT", "TIP_RADIUS", "UNIT", "CubeEstimator", "box_distance", "planar_pose", "pushing"]

@@ -81,10 +81,8 @@ class RelaxedBackend(Backend):
     It takes one system and cost for all stages, finite bounds, n_lam ≥ 1, no S, no constraints. S gets gradient zero.
 
     Its plans are not those of the exact backends (`exact` is False): x and λ solve the program, not the LCS.
-    `python benchmarks/relaxed_quality.py` (seeds 0 to 9, 12 problems each, n_x 9, n_u 6, H 5) executes its actions in
-    synthetic pushing models: 2.9 % above the cost of `batched` at n_lam 5 (median 0.9 %, worst tenth 7.3 %), 3.6 % at
-    n_lam 8 (1.4 %, 8.6 %); one more pass 2.0 and 2.2 %; without any penalty 15 and 20 %. A solve takes 5 to 7 times as
-    long as `ipopt`'s and 200 to 300 times as long as `batched`'s: this backend is for comparison, not for speed.
+    Executed in synthetic pushing models, they cost 3 % more than those of `batched` (docs/archive/older_results.md). A
+    solve takes 200 to 300 times as long: this backend is for comparison, not for speed.
 
     Gradients are cvxpylayers' for the program's parameters, chained by torch through the nominal trajectory and the
     passes; they are those of the whole map, a guess held. Q, R and Q_final must enter cvxpy as square roots, whose

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from difflcs._checks import describe
 from difflcs.errors import ContactWarning, InvalidInputError
-from difflcs.physics.mujoco.narrow import NATIVE, Array, Measured, Narrow, Witness, cross, perpendicular, witnesses
+from difflcs.physics.mujoco.narrow import NATIVE, Array, Measured, Narrow, Witness, perpendicular, witnesses
+from difflcs.physics.mujoco.state import cross
 
 Pairs = Sequence[tuple[int | str, int | str]]
 
@@ -313,14 +314,14 @@ class ContactFinder:
             read = self._with_measured(read)
         normal, sides, slide = read.frame[:, :, 0], read.frame[:, :, 1:], read.rows[:, :, 1:]
         if self.axis is not None:
-            across = np.cross(self.axis, normal)
+            across = cross(self.axis, normal)
             across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
             sides, parts = across[:, :, None], np.einsum("nkij,nkj->nki", sides, across)
             slide = np.einsum("nki,nkiv->nkv", parts, slide)[:, :, None]
         sides, slide = sides[:, :, : self.n_tangents], slide[:, :, : self.n_tangents]
         # MuJoCo's contact is in the middle of the gap; friction acts where the two bodies are, half a gap from there:
         # ω × n gap/2 for each of them, along the tangents.
-        lever = np.einsum("nkti,nvi->nktv", np.cross(normal[:, :, None], sides), read.axes[:, :, :3])
+        lever = np.einsum("nkti,nvi->nktv", cross(normal[:, :, None], sides), read.axes[:, :, :3])
         turned = self._turns[read.geom[:, :, 0]] + self._turns[read.geom[:, :, 1]]
         tangent = slide + 0.5 * read.apart[:, :, None, None] * lever * turned[:, :, None]
         friction = np.where(read.frame.any((-1, -2)), self.friction[read.geom[:, :, 0], read.geom[:, :, 1]], 0.0)

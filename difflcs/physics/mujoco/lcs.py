@@ -16,7 +16,7 @@ from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_choice, check_number, check_positive_int, check_tensor, describe
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
-from difflcs.physics.contacts import Cone, Contacts, FreeMotion, contact_lcs, count_forces
+from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, contact_lcs, count_forces
 from difflcs.physics.mujoco.contacts import ContactFinder, Found, Pairs
 from difflcs.physics.mujoco.motion import Actuators, Dynamic, QuasiStatic
 from difflcs.physics.mujoco.native import TAKEN, native
@@ -69,7 +69,7 @@ class MujocoLCS:
         friction: coefficient μ of all contacts; None: that of the geoms, as MuJoCo combines them.
         compliance: how far a contact gives way, in parts of how far the same force moves the two bodies apart (the
             median over all pairs), > 0. It makes F + Fᵀ ≻ 0.
-        cone: model of friction, see `difflcs.physics.contacts`.
+        cone: model of friction, see `difflcs.physics.complementarity`.
         mobility: of a quasi-static motion: "inertia" (the inverse of the mass matrix), "damping" (of the joints'
             damping), or what a unit of force on each degree of freedom does, (nv,) or (nv, nv). Only ratios matter, as
             `compliance` is in parts of it. A body that cannot move along a degree of freedom has 0 there.

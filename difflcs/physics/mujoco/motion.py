@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from difflcs.errors import InvalidInputError
-from difflcs.physics.contacts import FreeMotion
+from difflcs.physics.complementarity import FreeMotion
 
 Array = NDArray[np.float64]
 

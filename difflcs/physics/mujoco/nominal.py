@@ -27,7 +27,7 @@ from difflcs.physics.mujoco.motion import DynamicStep
 
 Array = NDArray[np.float64]
 _USUAL, _LOAD = 0.02, 100.0  # depth of contacts in parts of the length, acceleration [m/s²], both of any load
-_SOFTER = 0.1  # of the compliance: how exactly forces are found
+_SOFTER = 0.03  # of the compliance: how exactly forces are found
 _PASSES = 2  # each reduces what is left of compliance and opening by about their parts of the motion
 
 
@@ -146,7 +146,8 @@ def at_nominal(
     gap = recovery.settled(found.gap, geom, acceleration, step.seconds)
     found = found._replace(tangent=_turned(found.tangent, slide))
     slide = np.einsum("nktv,nv->nkt", found.tangent, moved) * slides[:, :, None]
-    carried = _carried(step, found, closing, slide)
+    if slides.any():  # else it is as before: what holds does not depend on the directions of the tangents
+        carried = _carried(step, found, closing, slide)
     rays, place, forces = (
         _Rays(found, step.seconds * step.response, give, compliance),
         _place(step, carried),

@@ -148,9 +148,8 @@ class MujocoState:
                     f"reference there: the qpos of the data"
                 )
             second = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
-            cross = np.cross(r[..., None, :], np.eye(3), axisa=-1, axisb=-1)
-            cross = np.swapaxes(cross, -1, -2)  # columns r × e_i
-            T[..., v : v + 3, v : v + 3] = np.eye(3) - first * cross + second * (cross @ cross)
+            turn = np.swapaxes(cross(r[..., None, :], np.eye(3)), -1, -2)  # columns r × e_i
+            T[..., v : v + 3, v : v + 3] = np.eye(3) - first * turn + second * (turn @ turn)
         return T
 
     @staticmethod
@@ -164,6 +163,7 @@ class MujocoState:
 
 
 _SINGULAR = 1e-2  # 3.6 degrees at the first turn
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 
 
 def _unit(q: Array) -> Array:
@@ -180,7 +180,7 @@ def _conjugate(q: Array) -> Array:
 def _multiply(a: Array, b: Array) -> Array:
     """Product of quaternions (..., 4)."""
     a0, av, b0, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
-    return np.concatenate([a0 * b0 - (av * bv).sum(-1, keepdims=True), a0 * bv + b0 * av + np.cross(av, bv)], -1)
+    return np.concatenate([a0 * b0 - (av * bv).sum(-1, keepdims=True), a0 * bv + b0 * av + cross(av, bv)], -1)
 
 
 def _quaternion(r: Array) -> Array:
@@ -196,3 +196,8 @@ def _rotation_vector(q: Array) -> Array:
     angle = 2 * np.arctan2(sine, q[..., :1])
     tiny = sine < 1e-12
     return q[..., 1:] * np.where(tiny, 2.0, angle / np.where(tiny, 1.0, sine))
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Products of vectors (..., 3), several times as fast as `np.cross`."""
+    return a[..., _NEXT] * b[..., _LAST] - a[..., _LAST] * b[..., _NEXT]

@@ -211,7 +211,7 @@ class CubeObject:
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[size] * 3, **appearance)
 
 
-def build_spec(scene_object: SceneObject, max_picture_size: tuple[int, int] = (640, 480)) -> mujoco.MjSpec:
+def build_spec(scene_object: SceneObject, max_picture_size: tuple[int, int]) -> mujoco.MjSpec:
     """Build the scene. Bodies in order: goal (mocap), object (free or pinned), then the three links of each finger.
 
     Args:

@@ -62,8 +62,8 @@ class TriFingerPhysics:
     def __init__(
         self,
         scene_object: SceneObject,
-        kp: float = 1000.0,
-        max_picture_size: tuple[int, int] = (640, 480),
+        kp: float,
+        max_picture_size: tuple[int, int],
         model: mujoco.MjModel | None = None,
     ) -> None:
         """Build the scene.

@@ -1,0 +1,37 @@
+"""The command line: `difflcs train | evaluate | render | export | demo | zoo | assets | bench | doctor`.
+
+Tasks and methods are known by their registries only.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from difflcs._optional import require
+from difflcs.errors import MissingDependencyError
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: words after `difflcs`; those of the process if None.
+
+    Returns:
+        Exit code: 0, 1 if `doctor` finds the library broken, 2 after an error of ours or where the extra `rl` is not
+        installed, 130 after Ctrl-C.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        from difflcs.cli import commands
+
+        require("tyro")
+    except MissingDependencyError as error:
+        if words[:1] == ["doctor"]:  # it is there to say such things
+            from difflcs.cli import doctor
+
+            return doctor.main("--json" in words, "--dev" in words)
+        print(f"difflcs: {error}", file=sys.stderr)
+        return 2
+    return commands.run(words)

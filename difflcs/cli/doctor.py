@@ -1,0 +1,394 @@
+"""What this machine has: solvers, instruction set, extras, rendering, meshes.
+
+`difflcs doctor [--json] [--dev]`, or `python -m difflcs doctor`. Whatever breaks is reported, never raised. Simulation
+and OpenGL are tried in processes of their own, which may crash.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from itertools import groupby
+from textwrap import TextWrapper
+from typing import Any
+
+import torch
+
+import difflcs
+from difflcs import GoalCost, LCSModel, LCSMPCLayer, solve_lcp, zoo
+from difflcs._storage import load_record, read_json
+from difflcs.errors import BackendNotFoundError, DiffLCSError
+
+GROUPS = ("library", "solvers", "machine", "extras", "environments")
+"""What a user needs to know, in the order of the report."""
+DEVELOPMENT = "development"
+"""One more group: the extras that a checkout needs for its tests, pages, notebooks and tables."""
+TIMEOUT = 120.0
+"""Seconds that a process of its own may take; the first picture in software takes some."""
+
+_HARD = ("torch", "numpy", "casadi", "safetensors")
+_OPTIONAL_BACKENDS = ("relaxed",)
+_EXTRAS = {
+    "rl": "training, evaluation and the command line",
+    "envs": "the simulated robot hand",
+    "viz": "videos and figures",
+    "relaxed": "the backend relaxed",
+    "scoreboard": "Push-T",
+}
+"""Extras for users → what they are for."""
+_MARKS = {"ok": "ok", "missing": "--", "failed": "!!"}
+
+# Each prints one JSON object as its last line.
+_SIMULATION = """
+import json, os
+import gymnasium, numpy
+import difflcs_envs
+from difflcs_envs.assets import YCB_DIR_VARIABLE, find_ycb_mesh, ycb_download_directory
+from difflcs_envs.ycb import YCB
+difflcs_envs.register_envs()
+envs = gymnasium.make_vec("difflcs/TriFingerMoveCube-v0", num_envs=2)
+envs.reset(seed=0)
+assert numpy.isfinite(envs.step(numpy.zeros((2, 6)))[0]["state"]).all(), "the state is not finite"
+native = all(env.unwrapped.physics.lane is not None for env in envs.envs)
+envs.close()
+def mesh(entry):
+    try:
+        return find_ycb_mesh(entry) is not None
+    except difflcs_envs.MeshError:  # DIFFLCS_YCB_DIR is set, and lacks it
+        return None
+chosen = os.environ.get(YCB_DIR_VARIABLE)
+folder = f"{YCB_DIR_VARIABLE}={chosen}" if chosen else str(ycb_download_directory())
+print(json.dumps({"meshes": {name: mesh(entry) for name, entry in YCB.items()}, "folder": folder, "native": native}))
+"""
+_PICTURE = """
+import json, os
+import gymnasium
+import difflcs_envs
+difflcs_envs.register_envs()
+env = gymnasium.make("difflcs/TriFingerMoveCube-v0", render_mode="rgb_array", width=32, height=32)
+env.reset(seed=0)
+picture = env.render()
+env.close()
+assert picture.shape == (32, 32, 3) and picture.std() > 0, "the picture is empty"
+print(json.dumps({"gl": os.environ.get("MUJOCO_GL", "")}))
+"""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that was looked at.
+
+    Attributes:
+        group: heading it belongs to.
+        name: what it is.
+        status: "ok", "missing" (something optional that is not installed), or "failed".
+        text: what was found.
+        remedy: what to do; empty if nothing.
+        core: whether the library does not work without it.
+    """
+
+    group: str
+    name: str
+    status: str
+    text: str
+    remedy: str = ""
+    core: bool = False
+
+
+class _MissingError(Exception):
+    """Something optional is not here."""
+
+    def __init__(self, text: str, remedy: str):
+        super().__init__(text)
+        self.remedy = remedy
+
+
+def examine(groups: Sequence[str] = GROUPS) -> list[Check]:
+    """Look at everything; takes some seconds.
+
+    Args:
+        groups: what to look at, of `GROUPS` and `DEVELOPMENT`.
+    """
+    look = {
+        "library": lambda: [_check("library", name, work, core=True) for name, work in _LIBRARY.items()],
+        "solvers": _solvers,
+        "machine": lambda: [_check("machine", name, work) for name, work in _MACHINE.items()],
+        "extras": lambda: _extras("extras", _EXTRAS),
+        "environments": _environments,
+        DEVELOPMENT: lambda: _extras(DEVELOPMENT, _development()),
+    }
+    return [check for group in groups for check in look[group]()]
+
+
+def healthy(checks: Sequence[Check]) -> bool:
+    """Whether the library itself works, whatever else is missing."""
+    return all(check.status == "ok" for check in checks if check.core)
+
+
+def as_text(checks: Sequence[Check], width: int = 100) -> str:
+    """One paragraph per check, with its remedy, and a verdict at the end."""
+    wrap = TextWrapper(width, subsequent_indent=" " * 19, break_long_words=False, break_on_hyphens=False)
+    lines: list[str] = []
+    for group, members in groupby(checks, lambda check: check.group):
+        lines.append(group)
+        for check in members:
+            lines += wrap.wrap(f"  {_MARKS[check.status]}  {check.name:<12} {check.text}")
+            lines += wrap.wrap(f"{'':<19}→ {check.remedy}") * bool(check.remedy)
+    rest = [check.name for check in checks if check.status != "ok" and not check.core]
+    verdict = "The library works" if healthy(checks) else "The library does NOT work, see the lines with !!"
+    return "\n".join([*lines, verdict + (f"; not here: {', '.join(rest)}." if rest else ".")])
+
+
+def as_json(checks: Sequence[Check]) -> str:
+    """The checks and the verdict as one JSON object."""
+    return json.dumps({"ok": healthy(checks), "checks": [asdict(check) for check in checks]}, sort_keys=True)
+
+
+def _check(group: str, name: str, work: Callable[[], str], core: bool = False) -> Check:
+    try:
+        return Check(group, name, "ok", work(), core=core)
+    except _MissingError as error:
+        return Check(group, name, "missing", str(error), error.remedy, core)
+    except Exception as error:  # a broken package raises anything
+        text = " ".join(str(error).split())
+        if isinstance(error, DiffLCSError | RuntimeError) and text:  # says itself how to mend it
+            return Check(group, name, "failed", text, core=core)
+        remedy = "install difflcs again: pip install --force-reinstall difflcs" if core else ""
+        return Check(group, name, "failed", f"{type(error).__name__}: {text}", remedy, core)
+
+
+# --- library and solvers ----------------------------------------------------------------------------------------------
+
+
+def _python() -> str:
+    return f"{platform.python_version()}, {platform.system()} {platform.machine()}"
+
+
+def _hard_dependencies() -> str:
+    import casadi
+    import numpy
+    import safetensors
+
+    modules = {"torch": torch, "numpy": numpy, "casadi": casadi, "safetensors": safetensors}
+    return ", ".join(f"{name} {modules[name].__version__}" for name in _HARD)
+
+
+def _kernels() -> str:
+    """The compiled kernels solve one LCP whose solution is known."""
+    from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
+
+    lam = solve_lcp(torch.eye(2, dtype=torch.float64), torch.tensor([-1.0, 2.0], dtype=torch.float64)).lam
+    if not torch.allclose(lam, torch.tensor([1.0, 0.0], dtype=torch.float64)):
+        raise RuntimeError(f"expected [1, 0] as the solution of an LCP, got {lam.tolist()}")
+    chosen = os.environ.get("DIFFLCS_ISA")
+    why = f"by DIFFLCS_ISA={chosen}" if chosen else "the widest that this CPU has"
+    return f"loaded, instruction set {_kernels.isa()} ({why})"
+
+
+def _files() -> str:
+    model = _tiny_model()
+    with tempfile.TemporaryDirectory() as folder:
+        model.save_pretrained(folder)
+        again = LCSModel.from_pretrained(folder)
+    if not torch.equal(model.A, again.A):
+        raise RuntimeError("expected the model that was saved, got another one back")
+    return "models are saved and read again"
+
+
+def _models() -> str:
+    for name in zoo.names():
+        # A system of known physics needs its task to be built again: of that only the files are read.
+        header: Any = read_json(zoo.path(name) / "config.json")
+        if header["kind"] == "LCSModel":
+            LCSModel.from_pretrained(f"zoo:{name}")
+        else:
+            load_record(zoo.path(name), header["kind"])
+    return f"learned models that ship with the package: {len(zoo.names())}"
+
+
+def _tiny_model() -> LCSModel:
+    return LCSModel(2, 1, 1, init_scale=0.1, generator=torch.Generator().manual_seed(0))
+
+
+def _solvers() -> list[Check]:
+    return [
+        _check("solvers", name, lambda name=name: _solves(name), core=name not in _OPTIONAL_BACKENDS)
+        for name in dict.fromkeys(("batched", "ipopt", *_OPTIONAL_BACKENDS, *difflcs.available_backends()))
+    ]
+
+
+def _solves(name: str) -> str:
+    """Plans a few steps with a tiny model, and differentiates the plan."""
+    model = _tiny_model()
+    cost = GoalCost.reach(2, 1, goal_weight=(1.0,), input_weight=0.1)
+    try:
+        mpc = LCSMPCLayer(model, cost, horizon=3, u_min=-1.0, u_max=1.0, backend=name)
+    except BackendNotFoundError as error:
+        what, _, remedy = str(error).partition("; run: ")
+        raise _MissingError(what.partition(": ")[2], remedy) from error
+    state, goal = torch.tensor([0.1, 0.0], dtype=torch.float64), torch.tensor([0.3], dtype=torch.float64)
+    mpc(state, goal)  # the first call loads the solver
+    start = time.perf_counter()
+    plan = mpc(state, goal)
+    plan.action.sum().backward()
+    seconds = time.perf_counter() - start
+    if model.B.grad is None or not bool(torch.isfinite(model.B.grad).all()):
+        raise RuntimeError("expected a finite gradient, got another one")
+    return f"solves and differentiates a tiny problem, {1e3 * seconds:.1f} ms"
+
+
+# --- machine ----------------------------------------------------------------------------------------------------------
+
+
+def _threads() -> str:
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    variable = os.environ.get("OMP_NUM_THREADS")
+    return f"{usable} of {os.cpu_count()} cores usable" + (f", OMP_NUM_THREADS={variable}" if variable else "")
+
+
+def _devices() -> str:
+    if not torch.cuda.is_available():
+        return "cpu; no GPU that torch can use (none is needed: the solvers run on the CPU)"
+    found = ", ".join(torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count()))
+    return f"cpu and {found}; tensors there are accepted and returned, the solvers run on the CPU"
+
+
+def _extras(group: str, names: Iterable[str]) -> list[Check]:
+    return [_check(group, name, lambda name=name: _extra(name)) for name in names]
+
+
+def _development() -> list[str]:
+    """The extras that are not for users, by the package's own metadata."""
+    known = metadata.metadata("difflcs").get_all("Provides-Extra") or ()
+    return [name for name in known if name not in (*_EXTRAS, "all")]
+
+
+def _extra(name: str) -> str:
+    """The packages of an extra, by the package's own metadata."""
+    wanted = [line for line in metadata.requires("difflcs") or () if re.search(rf"extra == ['\"]{name}['\"]", line)]
+    if not wanted:
+        raise RuntimeError("expected packages in the metadata of difflcs, got none; install difflcs again")
+    found, lacking = [], []
+    for line in wanted:
+        match = re.match(r"[\w.-]+", line)
+        package = match[0] if match else line
+        version, least = _version(package), re.search(r">=\s*([\w.]+)", line)
+        if version is None:
+            lacking.append(package)
+        elif least and _release(version) < _release(least[1]):
+            lacking.append(f"{package} >= {least[1]} (found {version})")
+        else:
+            found.append(f"{package} {version}")
+    if lacking:
+        purpose = f"for {_EXTRAS[name]}: " if name in _EXTRAS else ""
+        raise _MissingError(f"{purpose}without {', '.join(lacking)}", f'pip install "difflcs[{name}]"')
+    return f"{_EXTRAS[name]}: {', '.join(found)}" if name in _EXTRAS else ", ".join(found)
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _release(version: str) -> tuple[int, ...]:
+    return tuple(int(number) for number in re.findall(r"\d+", version.partition("+")[0])[:3])
+
+
+# --- environments -----------------------------------------------------------------------------------------------------
+
+
+def _environments() -> list[Check]:
+    found: dict[str, Any] = {}
+
+    def simulation() -> str:
+        found.update(_in_process(_SIMULATION))
+        return f"the cube's environments step, {'compiled' if found['native'] else 'in Python'}"
+
+    def meshes() -> str:
+        return _meshes(found["meshes"], found["folder"])
+
+    checks = [_check("environments", "simulation", simulation)]
+    checks += [_check("environments", "pictures", _pictures), _check("environments", "video", _video)]
+    return checks + [_check("environments", "YCB meshes", meshes)] * bool(found)
+
+
+def _pictures() -> str:
+    gl = _in_process(_PICTURE)["gl"]
+    return f"a 32 × 32 picture is drawn, {f'MUJOCO_GL={gl}' if gl else 'on the display'}"
+
+
+def _video() -> str:
+    if _version("imageio-ffmpeg") is None:
+        raise _MissingError("without imageio-ffmpeg", 'pip install "difflcs[viz]"')
+    import imageio_ffmpeg
+
+    return f"ffmpeg {imageio_ffmpeg.get_ffmpeg_version()}"
+
+
+def _meshes(state: dict[str, bool | None], folder: str) -> str:
+    """Which objects have a mesh: yes, no, or None where the folder that the user names lacks it."""
+    there = [name for name, found in state.items() if found]
+    absent = [name for name, found in state.items() if not found]
+    if not absent:
+        return f"all {len(there)} in {folder}"
+    download = f"difflcs assets download {' '.join(absent) if there else ''}".strip()
+    if None in state.values():
+        raise _MissingError(f"{folder} lacks {', '.join(absent)}", f"{download}, or unset DIFFLCS_YCB_DIR")
+    raise _MissingError(f"{', '.join(there) or 'none'} in {folder}; stand-ins for {', '.join(absent)}", download)
+
+
+def _in_process(code: str) -> dict[str, Any]:
+    if any(_version(package) is None for package in ("gymnasium", "mujoco")):
+        raise _MissingError("without gymnasium and mujoco", 'pip install "difflcs[envs]"')
+    command = [sys.executable, "-c", code]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, check=False)
+    except subprocess.TimeoutExpired:
+        raise RuntimeError(f"no answer within {TIMEOUT:g} s") from None
+    if done.returncode != 0:
+        lines = [line for line in done.stderr.splitlines() if line.strip()]
+        raise RuntimeError(lines[-1] if lines else f"the process ended with code {done.returncode}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+_LIBRARY: dict[str, Callable[[], str]] = {
+    "python": _python,
+    "difflcs": lambda: difflcs.__version__,
+    "packages": _hard_dependencies,
+    "kernels": _kernels,
+    "files": _files,
+    "zoo": _models,
+}
+_MACHINE: dict[str, Callable[[], str]] = {"threads": _threads, "devices": _devices}
+
+
+def main(as_object: bool = False, development: bool = False) -> int:
+    """Examine and print.
+
+    Args:
+        as_object: print JSON instead of text.
+        development: look at what only development needs, too.
+
+    Returns:
+        Exit code: 0 if the library works, 1 if not.
+    """
+    checks = examine((*GROUPS, DEVELOPMENT) if development else GROUPS)
+    width = min(120, shutil.get_terminal_size().columns)
+    print(as_json(checks) if as_object else as_text(checks, width))
+    return 0 if healthy(checks) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main("--json" in sys.argv[1:], "--dev" in sys.argv[1:]))

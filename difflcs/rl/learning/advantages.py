@@ -1,0 +1,275 @@
+"""Advantages: by generalised advantage estimation (GAE), or of many actions for each state.
+
+With q(s, a) = r(s, a) + γ V(s₊) and its mean q̄(s) over the policy's actions, an error of GAE (Eq. 5 of the paper) is
+
+    δ_t = [q(s_t, a_t) − q̄(s_t)] + b(s_t),  b = q̄ − V.
+
+In an advantage Σ_l (γζ)^l δ_{t+l} the brackets of later steps are noise: they average out over later actions. So is
+b(s_t), the same for all actions. In model rollouts one can look a step ahead, so that without them, and with many
+actions for each state,
+
+    A(s_t, a) = q(s_t, a) − q̄(s_t) + [a = a_t] M Σ_{l≥1} (γζ)^l b(s_{t+l})
+
+has the policy gradient of GAE in expectation, with the same V and ζ. The sum, which corrects what V says wrongly about
+the next states, is known for the action taken only: it counts for all M of them.
+
+The bracket, the advantage of the action taken (`action_advantage`), is also noise in the rewards that V is fitted to,
+and left out of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import torch
+from torch import Tensor
+from torch.distributions import MultivariateNormal
+
+from difflcs.errors import InvalidInputError
+from difflcs.rl.rollout import CONTEXT, elapsed_fractions
+from difflcs.rl.seeding import seeded
+from difflcs.rl.tasks import Features, see
+
+if TYPE_CHECKING:
+    from tensordict import TensorDict
+
+SAMPLES = ("action", "action_log_prob")
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What an estimator says of episodes.
+
+    Attributes:
+        samples: (N, T, M) "action", "action_log_prob" and "advantage" (…, 1) of M actions for each state.
+        values: (N, T) of the states, by the value network.
+        rewards: (N, T) what the value network is to be fitted to.
+    """
+
+    samples: TensorDict
+    values: Tensor
+    rewards: Tensor
+
+
+class Advantages(Protocol):
+    """An estimator of advantages."""
+
+    def __call__(self, episodes: TensorDict, inputs: Tensor, rewards: Tensor, key: Sequence[int]) -> Estimate:
+        """Judge the actions of episodes.
+
+        Args:
+            episodes: a record of `difflcs.rl.collect` with what the policy drew under "policy" (N, T).
+            inputs: (N, T+1, n) of the value network.
+            rewards: (N, T) to learn from.
+            key: of random numbers.
+        """
+        ...
+
+
+class RewardScale:
+    """From rewards of the environment to those that are learned from.
+
+    Args:
+        cost_limit: rewards of single steps are at least minus this, besides the penalty of a failed episode.
+        failure_penalty: what the last reward of a failed episode holds.
+        factor: on all rewards.
+    """
+
+    def __init__(self, cost_limit: float, failure_penalty: float, factor: float):
+        self.cost_limit, self.failure_penalty, self.factor = cost_limit, failure_penalty, factor
+
+    def __call__(self, rewards: Tensor, success: Tensor) -> Tensor:
+        """Rewards (N, T, ...) and successes of the last step (N, ...) bool → (N, T, ...).
+
+        Raises:
+            InvalidInputError: rewards that are not finite.
+        """
+        limit = torch.full_like(rewards, -self.cost_limit)
+        limit[:, -1] -= self.failure_penalty * (~success).to(rewards.dtype)
+        rewards = torch.maximum(rewards, limit)
+        if not bool(torch.isfinite(rewards).all()):
+            raise InvalidInputError("env: expected finite rewards, got NaN or infinity; mend the environment's reward")
+        return self.factor * rewards
+
+
+def returns(rewards: Tensor, gamma: float) -> Tensor:
+    """(N, T) discounted sums of the rewards (N, T) to come."""
+    total = torch.zeros(len(rewards), dtype=rewards.dtype)
+    sums = []
+    for reward in reversed(rewards.unbind(1)):
+        total = reward + gamma * total
+        sums.append(total)
+    return torch.stack(sums[::-1], 1)
+
+
+@dataclass(frozen=True)
+class GAE:
+    """What generalised advantage estimation says of episodes.
+
+    Attributes:
+        values: (N, T) of the states, by the value network.
+        advantages: (N, T).
+        targets: (N, T) what the value network is to be fitted to: their sum.
+    """
+
+    values: Tensor
+    advantages: Tensor
+    targets: Tensor
+
+
+def gae(values: Tensor, rewards: Tensor, gamma: float, zeta: float) -> GAE:
+    """Generalised advantage estimation (Eq. 5 of the paper).
+
+    The rewards of an episode end with it: V(T) = 0, which the value network can know because it sees the time.
+
+    Args:
+        values: (N, T+1) of the states, the last of which does not count.
+        rewards: (N, T).
+        gamma: discount per step.
+        zeta: ζ, often called lambda.
+    """
+    now, following = values[:, :-1], values[:, 1:].clone()
+    following[:, -1] = 0
+    advantages = returns(rewards + gamma * following - now, gamma * zeta)
+    return GAE(now, advantages, advantages + now)
+
+
+class ValueFunction(Protocol):
+    """What is needed of a `difflcs.rl.learning.critic.Critic`."""
+
+    gamma: float
+
+    def values(self, inputs: Tensor) -> Tensor:
+        """(..., n) inputs → (...) values."""
+        ...
+
+    def gae(self, inputs: Tensor, rewards: Tensor) -> GAE:
+        """See `gae`, with its own discount and ζ."""
+        ...
+
+
+class GAEAdvantages:
+    """GAE of the actions taken.
+
+    Args:
+        critic: the value network, with its discount and ζ.
+    """
+
+    def __init__(self, critic: ValueFunction):
+        self.critic = critic
+
+    def __call__(self, episodes: TensorDict, inputs: Tensor, rewards: Tensor, key: Sequence[int]) -> Estimate:
+        """See `Advantages`."""
+        found = self.critic.gae(inputs, rewards)
+        taken: Any = episodes["policy"]
+        samples = taken.select(*SAMPLES).unsqueeze(-1)
+        samples["advantage"] = found.advantages[..., None, None]
+        return Estimate(samples, found.values, rewards)
+
+
+class Foreseeing(Protocol):
+    """What can tell what other actions would have led to: see `difflcs.rl.learning.model_rollouts.ModelEnv.foresee`."""
+
+    def foresee(self, states: Tensor, actions: Tensor, goals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """States (N, T, n_x), actions (N, T, M, n_u), goals → next states, rewards and successes (N, T, M, ·)."""
+        ...
+
+
+class MultiActionAdvantages:
+    """Advantages of many actions for each state of model rollouts, see the module.
+
+    Args:
+        env: what the episodes were just played in.
+        critic: the value network, with its discount.
+        features: inputs of the value network.
+        scale: rewards to learn from.
+        bounds: (n_u,), (n_u,) within which actions are executed.
+        actions: M, an even number.
+        zeta: ζ.
+    """
+
+    def __init__(
+        self,
+        env: Foreseeing,
+        critic: ValueFunction,
+        features: Features,
+        scale: RewardScale,
+        bounds: tuple[Tensor, Tensor],
+        actions: int,
+        zeta: float,
+    ):
+        self.env, self.critic, self.features, self.scale, self.bounds = env, critic, features, scale, bounds
+        self.actions, self.zeta = actions, zeta
+
+    @torch.no_grad()
+    def __call__(self, episodes: TensorDict, inputs: Tensor, rewards: Tensor, key: Sequence[int]) -> Estimate:
+        """See `Advantages`."""
+        now = self.critic.values(inputs[:, :-1])
+        with seeded(key):
+            judged = mirrored_actions(episodes["policy"], self.actions)
+        executed = torch.clamp(judged["action"], *self.bounds)
+        after, seen, success = self.env.foresee(episodes["state"][:, :-1], executed, episodes["goal"])
+        goals = episodes["goal"][:, None, None].expand(*after.shape[:-1], -1)
+        elapsed = elapsed_fractions(after.shape[1])[1:, None].expand(after.shape[:-1])
+        context = episodes.get(CONTEXT, None)
+        if context is not None:
+            context = context[:, None, None].expand(*after.shape[:-1], -1)
+        values = self.critic.values(see(self.features, after, goals, elapsed, context))
+        values[:, -1] = 0  # an episode has ended
+        q = self.scale(seen, success[:, -1]) + self.critic.gamma * values
+        judged["advantage"] = multi_action_advantages(q, now, self.critic.gamma, self.zeta).unsqueeze(-1)
+        return Estimate(judged, now, rewards - action_advantage(q))
+
+
+def mirrored_actions(taken: TensorDict, count: int) -> TensorDict:
+    """Draw actions in pairs that lie symmetrically about the mean: the action taken, its image, and others.
+
+    Args:
+        taken: "action", "loc" (..., n_u) and "scale_tril" (..., n_u, n_u) of a Gaussian policy.
+        count: M, an even number of actions.
+
+    Returns:
+        "action" (..., M, n_u), the one taken first, and "action_log_prob" (..., M); from the global generator.
+    """
+    from tensordict import TensorDict
+
+    mean, factor = taken["loc"].unsqueeze(-2), taken["scale_tril"].unsqueeze(-3)
+    first = taken["action"].unsqueeze(-2) - mean
+    noise = torch.randn(*mean.shape[:-2], count // 2 - 1, mean.shape[-1], dtype=mean.dtype)
+    offsets = torch.cat([first, (factor @ noise.unsqueeze(-1)).squeeze(-1)], -2)
+    action = mean + torch.stack([offsets, -offsets], -2).flatten(-3, -2)
+    log_prob = MultivariateNormal(mean, scale_tril=factor, validate_args=False).log_prob(action)
+    return TensorDict({"action": action, "action_log_prob": log_prob}, action.shape[:-1])
+
+
+def multi_action_advantages(q: Tensor, values: Tensor, gamma: float, zeta: float) -> Tensor:
+    """A(s_t, a) of the module's docstring.
+
+    Args:
+        q: (N, T, M) r + γ V of the next state, the action taken first.
+        values: (N, T) V of the states.
+        gamma: discount per step.
+        zeta: ζ.
+
+    Returns:
+        (N, T, M). The corrections have zero mean over N and T.
+    """
+    mean = q.mean(-1)
+    following, corrections = torch.zeros_like(mean[:, 0]), []
+    for residual in reversed((mean - values).unbind(1)):
+        corrections.append(following)
+        following = gamma * zeta * (residual + following)
+    correction = torch.stack(corrections[::-1], 1)
+    advantages = q - mean.unsqueeze(-1)
+    advantages[..., 0] += q.shape[-1] * (correction - correction.mean())
+    return advantages
+
+
+def action_advantage(q: Tensor) -> Tensor:
+    """How much better the actions taken are than the mean of those judged: (..., M), the one taken first, → (...).
+
+    Zero in expectation over the actions, so returns without it have the same mean and less noise.
+    """
+    return q[..., 0] - q.mean(-1)

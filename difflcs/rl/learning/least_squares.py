@@ -1,0 +1,100 @@
+"""Mean-squares fits of small networks, several side by side, with gradients written by hand.
+
+Of a step on networks this small, autograd and its bookkeeping take longer than the arithmetic: 2.5 times as long for an
+ensemble of four with two hidden layers of 128, 4 times for a value network of 64.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from difflcs.rl.learning.state import State
+
+Layer = tuple[Tensor, Tensor]
+"""Weights (K, n_in, n_out) and biases (K, 1, n_out) of one layer of K networks."""
+
+
+def tanh(x: Tensor) -> Tensor:
+    """Hyperbolic tangent to 1e-7, in half of the time that torch takes for single precision."""
+    return torch.sigmoid(2 * x).mul_(2).sub_(1)
+
+
+BACKWARD: dict[Callable[[Tensor], Tensor], Callable[[Tensor, Tensor], Tensor]] = {
+    torch.relu_: lambda gradient, value: torch.ops.aten.threshold_backward(gradient, value, 0),
+    tanh: torch.ops.aten.tanh_backward,
+}
+"""Of each activation: from the gradient of its value, and its value, to that of its argument."""
+
+
+def gradients(
+    layers: Sequence[Layer], activation: Callable[[Tensor], Tensor], inputs: Tensor, targets: Tensor
+) -> tuple[Tensor, list[Layer]]:
+    """Mean squared errors of networks, and their gradients.
+
+    Args:
+        layers: from the first to the last, which has no activation.
+        activation: a key of `BACKWARD`; it may work in place.
+        inputs: (K, B, n_in).
+        targets: (K, B, n_out).
+
+    Returns:
+        (K,) mean squared error of each network, and the gradients by the layers' weights and biases.
+    """
+    values = [inputs]
+    for weight, bias in layers[:-1]:
+        values.append(activation(torch.baddbmm(bias, values[-1], weight)))
+    errors = torch.baddbmm(layers[-1][1], values[-1], layers[-1][0]).sub_(targets)
+    gradient = errors * (2 / math.prod(errors.shape[1:]))
+    found: list[Layer] = []
+    for place in reversed(range(len(layers))):
+        value = values[place]
+        found.append((torch.bmm(value.mT, gradient), gradient.sum(1, keepdim=True)))
+        if place:
+            gradient = BACKWARD[activation](torch.bmm(gradient, layers[place][0].mT), value)
+    return errors.square_().mean((1, 2)), found[::-1]
+
+
+class FlatAdam:
+    """AdamW on the parameters of a module, which become views of one vector; the gradient comes as a vector too.
+
+    Loshchilov and Hutter, "Decoupled weight decay regularization", 2019, with the averaging factors of torch.
+
+    Args:
+        module: what is trained.
+        weight_decay: part of the parameters that a step of size one takes away.
+    """
+
+    _BETAS, _EPS = (0.9, 0.999), 1e-8
+
+    def __init__(self, module: nn.Module, weight_decay: float):
+        parameters = list(module.parameters())
+        self.vector = nn.utils.parameters_to_vector(parameters).detach()
+        for p, part in zip(parameters, self.vector.split([p.numel() for p in parameters]), strict=True):
+            p.data = part.view_as(p)
+        self.weight_decay, self.steps = weight_decay, 0
+        self.average, self.square = torch.zeros_like(self.vector), torch.zeros_like(self.vector)
+
+    def step(self, gradient: Tensor, size: float) -> None:
+        """Take a step of a given size against the gradient (P,)."""
+        self.steps += 1
+        first, second = self._BETAS
+        self.vector.mul_(1 - size * self.weight_decay)
+        self.average.lerp_(gradient, 1 - first)
+        self.square.mul_(second).addcmul_(gradient, gradient, value=1 - second)
+        scale = (self.square / (1 - second**self.steps)).sqrt_().add_(self._EPS)
+        self.vector.addcdiv_(self.average, scale, value=-size / (1 - first**self.steps))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything to go on with, but for the parameters."""
+        return {"steps": self.steps, "average": self.average, "square": self.square}
+
+    def load_state_dict(self, state: State) -> None:
+        """Go on from what `state_dict` gave."""
+        self.steps = state["steps"]
+        self.average.copy_(state["average"])
+        self.square.copy_(state["square"])

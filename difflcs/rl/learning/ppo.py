@@ -1,0 +1,454 @@
+"""Main phase (Algorithm 2): proximal policy optimisation of the MPC's model, or of a network as a reference point.
+
+What PPO is made of is handed in: where episodes come from (`Source`: the robot, or model rollouts), how their actions
+are judged (`advantages.py`), the loss (`surrogate.py`), and how it moves the policy (`optim/`). `difflcs.rl.make_ppo`
+puts the parts together by the settings. Gradients reach the LCS through the MPC layer.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from difflcs.errors import InvalidInputError
+from difflcs.rl.learning.advantages import Advantages, RewardScale, returns
+from difflcs.rl.learning.critic import Critic
+from difflcs.rl.learning.learned import check_learned
+from difflcs.rl.learning.model_rollouts import ModelRollouts
+from difflcs.rl.learning.optim import UpdateRule
+from difflcs.rl.learning.state import State
+from difflcs.rl.learning.surrogate import Surrogate, gaussian_kl, trimmed_mean
+from difflcs.rl.learning.trainer import AfterStep, Trainer
+from difflcs.rl.rollout import CONTEXT, collect, elapsed_fractions
+from difflcs.rl.seeding import Stream, episode_seeds, numbers, seeded
+from difflcs.rl.tasks import Features, see
+
+if TYPE_CHECKING:
+    from gymnasium.vector import VectorEnv
+    from tensordict import TensorDict, TensorDictBase
+
+    from difflcs.rl.learning.policy import GaussianPolicy
+
+
+@dataclass(frozen=True)
+class PPOReport:
+    """Report of one iteration.
+
+    Attributes:
+        iteration: its number, those of a warm-up included.
+        env_steps: environment steps collected so far.
+        success: share of its episodes that ended at the goal, under the policy's noise.
+        mean_return: mean undiscounted return of its episodes.
+        kl: KL divergence before the last step.
+        learning_rate: step size in it: the length of a natural step, or Adam's.
+        std: mean standard deviation of the policy that collected [units of the action].
+        gradient_steps: gradient steps made.
+        skipped_steps: steps left out because a gradient was not finite.
+        clip_fraction: share of samples outside the clipping range, before the last step.
+        outliers: share of samples left out as outliers, before the last step.
+        explained_variance: of the returns by the value network, before it saw them.
+        solver_failures: MPC solves that did not converge, while collecting and while learning.
+        unstable: episodes dropped because the simulation broke down.
+        model_success: share of the last model rollouts before it that ended at the goal; None without any.
+        model_loss: error of the ensemble that they were played in, in the last pass of its training.
+        physics_seconds: wall time of the environment.
+        solve_seconds: wall time of the MPC.
+        gradient_seconds: wall time of gradients and steps.
+        value_seconds: wall time of advantages and value network.
+        model_seconds: wall time of all model rollouts: the ensemble's training, episodes, solves, gradients.
+    """
+
+    iteration: int
+    env_steps: int
+    success: float
+    mean_return: float
+    kl: float
+    learning_rate: float
+    std: float
+    gradient_steps: int
+    skipped_steps: int
+    clip_fraction: float
+    outliers: float
+    explained_variance: float
+    solver_failures: int
+    unstable: int
+    model_success: float | None
+    model_loss: float | None
+    physics_seconds: float
+    solve_seconds: float
+    gradient_seconds: float
+    value_seconds: float
+    model_seconds: float
+
+
+# --- the parts --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where episodes come from, and how much is learned from an iteration's worth of them.
+
+    Attributes:
+        env: environments in lockstep: the robot's, or those that networks play.
+        advantages: judges the actions of its episodes.
+        steps: gradient steps.
+        minibatch: samples per step; None: all.
+        value_epochs: epochs of the value network.
+    """
+
+    env: VectorEnv
+    advantages: Advantages
+    steps: int
+    minibatch: int | None
+    value_epochs: int
+
+
+# --- the trainer ------------------------------------------------------------------------------------------------------
+
+
+class PPO(Trainer):
+    """The main phase, see `Trainer`; `make_ppo` puts one together.
+
+    Args:
+        actor: the policy, from `difflcs.rl.make_actor`; what it has learned is trained in place: an `LCSModel`, any
+            other `LCSModule` that is a `torch.nn.Module`, or a network. An MPC in it needs on_failure="mask".
+        robot: the real episodes.
+        critic: the value network.
+        surrogate: the loss.
+        update: what moves the policy.
+        scale: rewards to learn from.
+        seed: of noise, value network, goals and initial states.
+        features: inputs of the value network.
+        rollouts: episodes per iteration.
+        total_episodes: episodes of the whole training; the main phase ends there.
+        episode_steps: steps of one episode.
+        first_episode: episodes collected before, by a warm-up.
+        first_iteration: iterations done before.
+        max_kl: KL divergence at which an iteration ends early.
+        final_step: factor on all steps, falling linearly from 1 to this.
+        models: plays episodes in networks besides those of the robot; None: real ones alone, as in the paper.
+        practice: how model rollouts are learned from, where there are models.
+
+    Raises:
+        InvalidInputError: an argument does not fit.
+    """
+
+    def __init__(
+        self,
+        actor: GaussianPolicy,
+        robot: Source,
+        critic: Critic,
+        surrogate: Surrogate,
+        update: UpdateRule,
+        scale: RewardScale,
+        seed: int,
+        *,
+        features: Features,
+        rollouts: int,
+        total_episodes: int,
+        episode_steps: int = 20,
+        first_episode: int = 0,
+        first_iteration: int = 0,
+        max_kl: float = 0.3,
+        final_step: float = 0.3,
+        models: ModelRollouts | None = None,
+        practice: Source | None = None,
+    ):
+        learned = check_learned(actor.learned, robot.env)
+        if total_episodes <= first_episode:
+            raise InvalidInputError(
+                f"total_episodes: expected more than the {first_episode} collected before, got {total_episodes}; "
+                f"train for more minutes or shorten the warm-up"
+            )
+        remaining = total_episodes - first_episode
+        if robot.env.num_envs < min(rollouts, remaining):
+            raise InvalidInputError(f"env: expected at least {rollouts} environments, got {robot.env.num_envs}")
+        super().__init__(learned, actor.controller, seed, episode_steps)
+        self.actor, self.robot, self.critic, self.surrogate, self.update = actor, robot, critic, surrogate, update
+        self.scale, self.features = scale, features
+        self.max_kl, self.final_step = max_kl, final_step
+        self.models, self.practice = models, practice
+        self.first_episode, self.first_iteration = first_episode, first_iteration
+        self.episodes, self.iteration = first_episode, first_iteration
+        # As many iterations as `rollouts` asks for, all of the same size up to one episode.
+        count = math.ceil(remaining / rollouts)
+        self.sizes = [remaining // count + (k < remaining % count) for k in range(count)]
+        """Episodes of each iteration."""
+
+    @property
+    def done(self) -> bool:
+        """Whether all episodes are collected."""
+        return self.iteration - self.first_iteration >= len(self.sizes)
+
+    def remember(self, episodes: TensorDict) -> None:
+        """Let model rollouts know real episodes of before, such as those of a warm-up."""
+        if self.models is not None:
+            self.models.add(episodes)
+
+    def step(self, after_step: AfterStep | None = None) -> PPOReport:
+        """One iteration: collect, estimate advantages, improve the policy, fit the value network.
+
+        Before it, iterations on model rollouts, if there are models that know real episodes.
+
+        Raises:
+            InvalidInputError: rewards that are not finite, or no episode with a stable simulation.
+        """
+        done = self.iteration - self.first_iteration
+        if self.done:
+            raise InvalidInputError(f"step: expected at most {len(self.sizes)} iterations, all of them are done")
+        progress = sum(self.sizes[:done]) / sum(self.sizes)
+        scale = 1 - (1 - self.final_step) * progress
+        start = time.perf_counter()
+        model_success, model_loss = self._practise(scale)
+        model_seconds = time.perf_counter() - start
+
+        count = self.sizes[done]
+        seeds = episode_seeds(self.seed, Stream.TRAINING, self.episodes, count)
+        self.episodes += count
+        std, step_size = float(self.actor.std.mean()), self.update.size.value
+        if self.models is None:
+            outcome = self._iterate(self.robot, seeds, (), scale, after_step)
+        else:
+            outcome = self._iterate(self.robot, seeds, (), self.models.settings.real_step * scale, after_step)
+            self.update.size.value = step_size  # it follows the model rollouts alone
+        episodes, improvement = outcome.episodes, outcome.improvement
+        self.remember(episodes)
+        self.iteration += 1
+        return PPOReport(
+            iteration=self.iteration,
+            env_steps=self.env_steps,
+            success=float(episodes["success"].double().mean()),
+            mean_return=outcome.mean_return,
+            kl=improvement.kl,
+            learning_rate=step_size,
+            std=std,
+            gradient_steps=improvement.steps,
+            skipped_steps=improvement.skipped,
+            clip_fraction=improvement.clip_fraction,
+            outliers=improvement.outliers,
+            explained_variance=outcome.explained_variance,
+            solver_failures=int(episodes["failures"].sum()) + improvement.solver_failures,
+            unstable=int((~episodes["stable"]).sum()),
+            model_success=model_success,
+            model_loss=model_loss,
+            physics_seconds=outcome.physics_seconds,
+            solve_seconds=outcome.solve_seconds + improvement.solve_seconds,
+            gradient_seconds=improvement.gradient_seconds,
+            value_seconds=outcome.value_seconds,
+            model_seconds=model_seconds,
+        )
+
+    def _practise(self, scale: float) -> tuple[float | None, float | None]:
+        """Iterations on model rollouts: the success of the last ones, and the loss of the ensemble.
+
+        None where there are no models, or where they know no real episode yet.
+        """
+        models = self.models
+        if models is None or self.practice is None or not (len(models) and models.settings.iterations):
+            return None, None
+        settings = models.settings
+        loss, success = models.fit(), 0.0
+        for k in range(1, settings.iterations + 1):
+            seeds = numbers(settings.rollouts, self.seed, Stream.MODEL_ROLLOUT, self.iteration, k)
+            episodes = self._iterate(self.practice, seeds, (k,), scale).episodes
+            success = float(episodes["success"].double().mean())
+        return success, loss
+
+    def _iterate(
+        self,
+        source: Source,
+        seeds: list[int],
+        part: tuple[int, ...],
+        scale: float,
+        after_step: AfterStep | None = None,
+    ) -> _Outcome:
+        """Collect an episode for each seed, judge the actions, improve the policy, fit the value network.
+
+        `scale` is the factor on the gradient steps. `part` is () for the robot's episodes and k = 1, 2, … in the
+        iterations on model rollouts before them: it tells their random numbers apart.
+        """
+
+        def key(stream: Stream) -> tuple[int, ...]:
+            return (self.seed, stream, self.iteration, *part)
+
+        episodes, physics_seconds, solve_seconds = self._collect(source.env, seeds, key(Stream.NOISE), after_step)
+        stable = cast("TensorDict", episodes[episodes["stable"]])
+        rewards = self.scale(stable["reward"], stable["success"])
+        start = time.perf_counter()
+        inputs, sums = _inputs(self.features, stable), returns(rewards, self.critic.gamma)
+        self.critic.begin(inputs, rewards, key(Stream.VALUE))
+        estimate = source.advantages(stable, inputs, rewards, key(Stream.LOSS))
+        unexplained = (sums - estimate.values).var() / sums.var().clamp_min(1e-12)
+        value_seconds = time.perf_counter() - start
+        improvement = self._improve(source, stable, estimate.samples, scale, key(Stream.LOSS))
+        start = time.perf_counter()
+        self.critic.learn(inputs, estimate.rewards, key(Stream.VALUE), source.value_epochs)
+        value_seconds += time.perf_counter() - start
+        return _Outcome(
+            episodes=episodes,
+            improvement=improvement,
+            mean_return=float(rewards.sum(1).mean()) / self.scale.factor,
+            explained_variance=1 - float(unexplained),
+            physics_seconds=physics_seconds,
+            solve_seconds=solve_seconds,
+            value_seconds=value_seconds,
+        )
+
+    def _collect(
+        self, env: VectorEnv, seeds: list[int], key: Sequence[int], after_step: AfterStep | None
+    ) -> tuple[TensorDict, float, float]:
+        """Episodes of the stochastic policy, with what it drew under "policy" (N, T); seconds of physics and solver."""
+        from tensordict import TensorDict
+
+        elapsed = elapsed_fractions(self.episode_steps)
+        seen: list[TensorDict] = []
+        solve_seconds = 0.0
+
+        def act(state: Tensor, goal: Tensor, context: Tensor | None = None) -> tuple[np.ndarray, np.ndarray]:
+            nonlocal solve_seconds
+            begun = time.perf_counter()
+            now = elapsed[len(seen)].repeat(len(state))
+            step = TensorDict({"state": state.clone(), "goal": goal.clone(), "elapsed": now}, [len(state)])
+            if context is not None:
+                step[CONTEXT] = context.clone()
+            self.actor.act(step)  # cold: as in evaluation
+            seen.append(step)
+            solve_seconds += time.perf_counter() - begun
+            return np.asarray(step["action"]), _failed(step).numpy()
+
+        start = time.perf_counter()
+        report = None if after_step is None else lambda: after_step(len(seeds))
+        with seeded(key):
+            episodes = collect(env, act, seeds, self.episode_steps, report)
+        seconds = time.perf_counter() - start
+        if not bool(episodes["stable"].any()):
+            raise InvalidInputError("env: expected a stable simulation, got NaN or a physics error in every episode")
+        episodes["policy"] = TensorDict.maybe_dense_stack(seen, 1)
+        return episodes, seconds - solve_seconds, solve_seconds
+
+    def _improve(
+        self, source: Source, episodes: TensorDict, samples: TensorDict, scale: float, key: Sequence[int]
+    ) -> _Improvement:
+        """Gradient steps on the combined loss (Eq. 7 of the paper), until the KL divergence is used up."""
+        outcome = _Improvement()
+        policy: Any = episodes["policy"].flatten(0, 1)
+        # What is indexed in every step; the rest of what the policy has entered would cost as much as the loss.
+        data = policy.select(*self.actor.in_keys, CONTEXT, "action", "loc", "scale_tril", strict=False)
+        samples = cast("TensorDict", samples.flatten(0, 1))
+        advantage = samples["advantage"]
+        samples["advantage"] = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
+        if "plan" in policy.keys():
+            data["guess"] = policy["plan"].clone()  # the rollout's own optimum, then each step's
+        rng = np.random.default_rng(key)
+        start = time.perf_counter()
+        self.update.measure(data, rng)
+        outcome.gradient_seconds += time.perf_counter() - start
+        for chosen in _batches(len(data), source.steps, source.minibatch, rng):
+            start = time.perf_counter()
+            old = cast("TensorDict", data[chosen])
+            asked = old.select(*self.actor.in_keys, "guess", CONTEXT, strict=False)
+            new = cast("TensorDict", self.actor.solve(asked))
+            if "plan" in new.keys():
+                data["guess"][chosen] = new["plan"]
+            outcome.solver_failures += int(_failed(new).sum())
+            solved = time.perf_counter()
+            outcome.solve_seconds += solved - start
+
+            kl = gaussian_kl(old, new)
+            outcome.kl = trimmed_mean(kl, 0.97)
+            if not outcome.kl <= self.max_kl and outcome.steps:
+                break
+            loss = self.surrogate(new, old, kl, cast("TensorDict", samples[chosen]), episodes, rng)
+            outcome.outliers, outcome.clip_fraction = self.surrogate.outliers, self.surrogate.clip_fraction
+            if self.update.step(loss, scale):
+                outcome.steps += 1
+            else:
+                outcome.skipped += 1
+            outcome.gradient_seconds += time.perf_counter() - solved
+        self.update.size.adapt(outcome.kl / scale**2)
+        return outcome
+
+    # --- state ---
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Trainer`."""
+        return {
+            **super().state_dict(),
+            "settings": {"first_episode": self.first_episode, "first_iteration": self.first_iteration},
+            "covariance": {"log_std": self.actor.gaussian.log_std, "mixing": self.actor.gaussian.mixing},
+            "critic": self.critic.state_dict(),
+            "update": self.update.state_dict(),
+            "models": None if self.models is None else self.models.state_dict(),
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        """See `Trainer`."""
+        super().load_state_dict(state)
+        gaussian = self.actor.gaussian
+        with torch.no_grad():
+            for own, name in ((gaussian.log_std, "log_std"), (gaussian.mixing, "mixing")):
+                own.copy_(state["covariance"][name])
+        self.critic.load_state_dict(state["critic"])
+        self.update.load_state_dict(state["update"])
+        if self.models is not None:
+            self.models.load_state_dict(state["models"])
+
+
+@dataclass
+class _Improvement:
+    """What the gradient steps of one iteration did."""
+
+    kl: float = 0.0
+    steps: int = 0
+    skipped: int = 0
+    clip_fraction: float = 0.0
+    outliers: float = 0.0
+    solver_failures: int = 0
+    solve_seconds: float = 0.0
+    gradient_seconds: float = 0.0
+
+
+@dataclass
+class _Outcome:
+    """What one iteration, on the robot or on model rollouts, has done."""
+
+    episodes: TensorDict
+    improvement: _Improvement
+    mean_return: float
+    explained_variance: float
+    physics_seconds: float
+    solve_seconds: float
+    value_seconds: float
+
+
+def _inputs(features: Features, episodes: TensorDict) -> Tensor:
+    """(N, T+1, n) inputs of the value network."""
+    states = episodes["state"]
+    steps = states.shape[1]
+    goals = episodes["goal"].unsqueeze(1).expand(-1, steps, -1)
+    elapsed = elapsed_fractions(steps - 1).expand(states.shape[:-1])
+    context = episodes.get(CONTEXT, None)
+    context = None if context is None else context.unsqueeze(1).expand(-1, steps, -1)
+    return see(features, states, goals, elapsed, context)
+
+
+def _batches(samples: int, steps: int, size: int | None, rng: np.random.Generator) -> Iterator[Tensor]:
+    """The samples of each gradient step."""
+    while steps > 0:
+        order = torch.arange(samples) if size is None else torch.from_numpy(rng.permutation(samples))
+        parts = order.split(size or samples)[:steps]
+        steps -= len(parts)
+        yield from parts
+
+
+def _failed(data: TensorDictBase) -> Tensor:
+    """(N,) bool: the solve did not converge; a network has none."""
+    none = torch.zeros(data.batch_size, dtype=torch.bool)
+    return ~data["converged"].squeeze(-1) if "converged" in data.keys() else none

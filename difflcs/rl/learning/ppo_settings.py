@@ -1,0 +1,178 @@
+"""Settings of the main phase (Algorithm 2), and PPO put together by them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+
+from difflcs.errors import InvalidInputError
+from difflcs.lcs import LCSModule, LCSParams, LCSSequence
+from difflcs.rl.learning.advantages import GAEAdvantages, MultiActionAdvantages, RewardScale
+from difflcs.rl.learning.critic import Critic, CriticSettings
+from difflcs.rl.learning.model_rollouts import ModelRollouts
+from difflcs.rl.learning.optim import AdamUpdate, Natural, NaturalUpdate, UpdateRule
+from difflcs.rl.learning.optim.update import Deviation
+from difflcs.rl.learning.ppo import PPO, Source
+from difflcs.rl.learning.surrogate import Surrogate
+from difflcs.rl.rollout import CONTEXT, action_bounds, has_context
+from difflcs.rl.seeding import Stream
+from difflcs.rl.settings import MOST_ENVS, Adam, Settings, ViolationLoss, bounded, group
+from difflcs.rl.tasks import Features
+
+if TYPE_CHECKING:
+    from gymnasium.vector import VectorEnv
+
+    from difflcs.rl.learning.policy import GaussianPolicy
+
+
+@dataclass(frozen=True)
+class PPOSettings(Settings):
+    """Settings of the main phase. "paper": given there; the others are ours, tuned on the cube."""
+
+    rollouts: int = bounded(30, minimum=1, maximum=MOST_ENVS)
+    """Episodes per iteration, run in lockstep; the last ones share what is left of the data evenly."""
+    steps: int = bounded(8, minimum=1)
+    """Gradient steps per iteration; Adam needs 20 or more."""
+    minibatch: int | None = bounded(600, minimum=1)
+    """Samples per gradient step, every sample once before any is drawn again; None: each step on all of its data."""
+    update: Literal["natural", "adam"] = "natural"
+    """What moves the policy: the natural gradient, for a policy with an MPC, or Adam."""
+    natural: Natural = group(Natural)
+    """Settings of the natural gradient."""
+    adam: Adam = group(Adam, learning_rate=6e-4, betas=(0.9, 0.99))
+    """Settings of Adam; its moments are kept across iterations."""
+    target_kl: float = bounded(0.1, above=0)
+    """KL divergence per iteration: the step size grows below half of it and shrinks above one and a half of it."""
+    step_factor: float = bounded(1.5, minimum=1)
+    """Factor by which the step size grows or shrinks after an iteration; 1: it does not follow the KL divergence."""
+    max_kl: float = bounded(0.3, above=0)
+    """KL divergence at which an iteration ends early."""
+    final_step: float = bounded(0.3, above=0)
+    """Factor on all steps, falling linearly from 1 to this over the main phase; 1 turns this off."""
+    outlier_kl: float = bounded(2.0, above=0)
+    """Samples with a KL divergence of their own above this are left out: the MPC has jumped to another optimum."""
+    clip: float = bounded(0.3, above=0)
+    """Epsilon of the clipped objective (Eq. 4 of the paper)."""
+    gamma: float = bounded(0.99, minimum=0, maximum=1)
+    """Discount per step."""
+    zeta: float = bounded(0.8, minimum=0, maximum=1)
+    """Zeta of the advantages (Eq. 5 of the paper), often called lambda."""
+    beta: float = bounded(1.0, minimum=0, maximum=1)
+    """Weight of the PPO loss against the violation loss (Eq. 7 of the paper). 1 in the paper."""
+    violation: ViolationLoss = group(ViolationLoss)
+    """The violation loss, where beta < 1."""
+    std: float = bounded(0.005, above=0)
+    """Standard deviation of the policy [units of the action]."""
+    covariance: Literal["fixed", "diagonal", "full"] = "fixed"
+    """What is learned of the policy's covariance together with the model."""
+    std_learning_rate: float = bounded(0.01, above=0)
+    """Adam's step size of the logarithms of learned standard deviations."""
+    std_range: tuple[float, float] = bounded((0.001, 0.01), above=0)
+    """Bounds of learned standard deviations [units of the action]."""
+    cost_limit: float = bounded(3.0, above=0)
+    """Rewards of single steps are at least minus this, besides the penalty of a failed episode."""
+    reward_scale: float = bounded(0.1, above=0)
+    """Factor on all rewards: keeps values near one."""
+    critic: CriticSettings = group(CriticSettings)
+    """Settings of the value network."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        low, high = self.std_range
+        if low > high:
+            raise InvalidInputError(f"std_range: expected 0 < low <= high, got {self.std_range}; swap them")
+
+
+def make_ppo(
+    actor: GaussianPolicy,
+    env: VectorEnv,
+    settings: PPOSettings,
+    seed: int,
+    *,
+    features: Features,
+    total_episodes: int,
+    episode_steps: int = 20,
+    first_episode: int = 0,
+    first_iteration: int = 0,
+    failure_penalty: float = 0.0,
+    models: ModelRollouts | None = None,
+) -> PPO:
+    """PPO of the parts that its settings name.
+
+    Args:
+        actor: the policy, made with the deviation that the settings say.
+        env: at least `settings.rollouts` environments in lockstep.
+        settings: settings.
+        seed: of noise, value network, goals and initial states.
+        features: inputs of the value network.
+        total_episodes: episodes of the whole training; the main phase ends there.
+        episode_steps: steps of one episode.
+        first_episode: episodes collected before, by a warm-up.
+        first_iteration: iterations done before.
+        failure_penalty: what the environment's last reward of a failed episode holds, see `TaskSpec`.
+        models: plays episodes in networks besides those of the robot; None: real ones alone, as in the paper. Let PPO
+            `remember` the episodes of a warm-up.
+
+    Raises:
+        InvalidInputError: an argument does not fit.
+        MissingDependencyError: TorchRL is not installed.
+    """
+    lcs = isinstance(actor.learned, LCSModule | LCSParams | LCSSequence)
+    if not lcs and (settings.beta < 1 or settings.update == "natural"):
+        raise InvalidInputError(
+            f'settings: expected beta=1 and update="adam" without an LCS, got beta={settings.beta:g} and '
+            f"update={settings.update!r}; drop them"
+        )
+    if actor.covariance != settings.covariance:
+        raise InvalidInputError(
+            f"actor: expected one made with covariance={settings.covariance!r}, as the settings say, got "
+            f"{actor.covariance!r}; use make_actor(controller, settings.std, settings.covariance)"
+        )
+    space: Any = env.single_observation_space
+    sizes = [space["state"].shape, space["goal"].shape, ()]
+    if has_context(env):
+        sizes.append(space[CONTEXT].shape)
+    example = features(*(torch.zeros(size, dtype=torch.float64) for size in sizes))
+    key = (seed, Stream.VALUE, first_iteration)
+    critic = Critic(settings.critic, len(example), episode_steps, settings.gamma, settings.zeta, key)
+    scale = RewardScale(settings.cost_limit, failure_penalty, settings.reward_scale)
+    judge = GAEAdvantages(critic)
+    practice = None
+    if models is not None:
+        own = models.settings
+        many = MultiActionAdvantages(models.env, critic, features, scale, action_bounds(env), own.actions, own.zeta)
+        practice = Source(
+            models.env, many if own.actions > 1 else judge, own.steps, settings.minibatch, own.value_epochs
+        )
+    betas = settings.adam.betas
+    deviation = Deviation(actor, settings.std_learning_rate, betas, settings.std_range)
+    return PPO(
+        actor,
+        Source(env, judge, settings.steps, settings.minibatch, settings.critic.epochs.each),
+        critic,
+        Surrogate(actor, settings.clip, settings.outlier_kl, settings.beta, settings.violation if lcs else None),
+        _UPDATES[settings.update](actor, settings, deviation),
+        scale,
+        seed,
+        features=features,
+        rollouts=settings.rollouts,
+        total_episodes=total_episodes,
+        episode_steps=episode_steps,
+        first_episode=first_episode,
+        first_iteration=first_iteration,
+        max_kl=settings.max_kl,
+        final_step=settings.final_step,
+        models=models,
+        practice=practice,
+    )
+
+
+_UPDATES: dict[str, Callable[[Any, PPOSettings, Deviation], UpdateRule]] = {
+    "natural": lambda actor, own, deviation: NaturalUpdate(
+        actor, own.natural, own.target_kl, own.step_factor, deviation
+    ),
+    "adam": lambda actor, own, deviation: AdamUpdate(actor, own.adam, own.target_kl, own.step_factor, deviation),
+}

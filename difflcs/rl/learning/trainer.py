@@ -1,0 +1,111 @@
+"""What every trainer is: an object that can be stopped between iterations, saved, and resumed with the same result."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+from torch import Tensor
+
+from difflcs import _storage
+from difflcs._checks import check_positive_int
+from difflcs._modules import plain_state, untouched
+from difflcs.lcs import LCSModel
+from difflcs.rl.learning.state import State, restore
+from difflcs.rl.rollout import Policy
+
+AfterStep = Callable[[int], object]
+"""Called after every step of the environments with the number of episodes that were stepped, for progress bars."""
+
+
+class Learned(Protocol):
+    """What a training learns and leaves behind: an `LCSModel`, any other module, an ensemble of networks.
+
+    Besides the two methods it may have `config()`, what is needed besides the tensors to build it again (JSON types
+    only), and `save_pretrained(directory)`, which writes it into a directory, atomically.
+    """
+
+    def state_dict(self) -> Any:
+        """Its tensors by name."""
+        ...
+
+    def load_state_dict(self, state: Mapping[str, Tensor], /) -> Any:
+        """Replace them."""
+        ...
+
+
+class Trainer(ABC):
+    """Base of the trainers.
+
+    Every random number comes from a stream of its own, derived from the seed; the global generators are left as they
+    were.
+
+    Args:
+        learned: what is trained, in place.
+        policy: what acts by it, without noise.
+        seed: of everything random.
+        episode_steps: steps of one episode.
+    """
+
+    def __init__(self, learned: Learned, policy: Policy, seed: int, episode_steps: int):
+        self.learned, self.policy = learned, policy
+        self.seed = check_positive_int("seed", seed, minimum=0)
+        self.episode_steps = check_positive_int("episode_steps", episode_steps)
+        self.iteration = 0
+        """Iterations done."""
+        self.episodes = 0
+        """Episodes collected."""
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps collected so far."""
+        return self.episodes * self.episode_steps
+
+    @abstractmethod
+    def step(self, after_step: AfterStep | None = None) -> Any:
+        """One iteration; returns its report, a dataclass."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on with the same result. Subclasses add to it."""
+        return {"iteration": self.iteration, "collected": self.episodes, "learned": learned_state(self.learned)}
+
+    def load_state_dict(self, state: State) -> None:
+        """Go on from a state; checked by whoever calls it, see `load`. Subclasses add to it."""
+        self.iteration, self.episodes = state["iteration"], state["collected"]
+        self.learned.load_state_dict(state["learned"]["parameters"])
+
+    def load(self, state: State) -> None:
+        """Go on from what `state_dict` gave.
+
+        Raises:
+            CheckpointError: it does not fit the settings or the model; nothing is changed.
+        """
+        restore(self, state)
+
+
+def learned_state(learned: Learned) -> dict[str, Any]:
+    """What was learned, as a part of a state."""
+    state = {"settings": configuration(learned), "parameters": dict(learned.state_dict())}
+    if isinstance(learned, LCSModel) and not untouched(learned):
+        state["plain"] = plain_state(learned)  # for readers that cannot build it as it is
+    return state
+
+
+def configuration(learned: Learned) -> dict[str, Any]:
+    """What tells it from others besides its tensors: its `config()`, or the name of its class and its sizes."""
+    config: Any = getattr(learned, "config", None)
+    if callable(config):
+        return config()  # pyright: ignore[reportReturnType]
+    sizes = {name: getattr(learned, name) for name in ("n_x", "n_u", "n_lam") if hasattr(learned, name)}
+    return {"class": type(learned).__name__, **sizes}
+
+
+def save_learned(learned: Learned, directory: Path, kind: str | None = None) -> None:
+    """Write it into a directory, atomically: by its `save_pretrained`, else as a record of a kind, or of its class."""
+    save = getattr(learned, "save_pretrained", None)
+    if callable(save):
+        save(directory)
+    else:
+        _storage.save_record(directory, kind or type(learned).__name__, configuration(learned), learned.state_dict())

@@ -1,0 +1,40 @@
+"""Methods: how something is learned, a file each. Others register theirs by `register_method`."""
+
+from difflcs.rl.methods.base import (
+    LCSMethod,
+    Method,
+    Work,
+    check_fits,
+    get_method,
+    method_names,
+    register_method,
+)
+from difflcs.rl.methods.contact_lcs import ContactMethod
+from difflcs.rl.methods.lcs_rl import LCSRLMethod
+from difflcs.rl.methods.pddm import PDDMMethod
+from difflcs.rl.methods.ppo import PPOMethod
+from difflcs.rl.methods.ppo_mlp import PPOMLPMethod
+from difflcs.rl.methods.violation import ViolationMethod
+
+__all__ = [
+    "DEFAULT_METHOD",
+    "ContactMethod",
+    "LCSMethod",
+    "LCSRLMethod",
+    "Method",
+    "PDDMMethod",
+    "PPOMLPMethod",
+    "PPOMethod",
+    "ViolationMethod",
+    "Work",
+    "check_fits",
+    "get_method",
+    "method_names",
+    "register_method",
+]
+
+DEFAULT_METHOD = LCSRLMethod.name
+"""The method of `difflcs train` without `--method`."""
+
+for _method in (LCSRLMethod, ViolationMethod, PPOMethod, PPOMLPMethod, PDDMMethod, ContactMethod):
+    register_method(_method)

@@ -1,0 +1,213 @@
+"""Base classes of the methods, and their registry.
+
+    @register_method
+    @dataclass(frozen=True)
+    class Mine(LCSMethod):
+        name, version, summary, reports = "mine", 1, "…", (MyReport,)
+        epochs: int = bounded(10, minimum=1)
+
+        def trainer(self, work): ...
+
+A method is a frozen dataclass whose fields are its settings; the default instance is the method as it is meant. Where
+this was imported, `train(...)` and the command line know it: `difflcs train --method mine --epochs 20`, `evaluate`,
+`render`; and the conformance suite of the methods tests it. `LCSMethod` is the base of those that learn an `LCSModel`,
+`Method` of all others.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
+
+import torch
+from torch import Tensor
+
+from difflcs._checks import did_you_mean
+from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
+from difflcs.lcs import LCSModel, LCSModule
+from difflcs.mpc.backends import get_backend
+from difflcs.rl.learning.trainer import Trainer
+from difflcs.rl.rollout import Policy
+from difflcs.rl.settings import Settings, bounded
+from difflcs.rl.tasks import TaskSpec, one_start
+
+if TYPE_CHECKING:
+    from gymnasium.vector import VectorEnv
+
+    from difflcs.mpc import LCSMPCLayer
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a method is to learn, and with what.
+
+    Attributes:
+        task: the task.
+        seed: of everything random.
+        total_episodes: episodes of the whole training.
+        make_envs: makes that many environments, which the training closes.
+        init: the model to start from, of the task's sizes; None: a random one.
+    """
+
+    task: TaskSpec
+    seed: int
+    total_episodes: int
+    make_envs: Callable[[int], VectorEnv]
+    init: LCSModel | None = None
+
+
+@dataclass(frozen=True)
+class Method(Settings, ABC):
+    """How something is learned. Subclass as a frozen dataclass whose fields are its settings.
+
+    Attributes:
+        name: its name, on the command line too.
+        version: raised whenever the same settings give another result.
+        summary: what it does, in one line.
+        reports: dataclasses that its trainer's `step` returns; their fields are the columns of log.csv.
+        kind: of the record that what it learned is written as.
+        takes_init: whether it can start from an `LCSModel`.
+    """
+
+    name: ClassVar[str]
+    version: ClassVar[int]
+    summary: ClassVar[str]
+    reports: ClassVar[tuple[type, ...]]
+    kind: ClassVar[str]
+    takes_init: ClassVar[bool] = False
+
+    @abstractmethod
+    def trainer(self, work: Work) -> Trainer:
+        """What learns: one iteration at a time, with reports of the types in `reports`."""
+
+    @abstractmethod
+    def rebuild(self, task: TaskSpec, config: Mapping[str, object], tensors: Mapping[str, Tensor], source: str) -> Any:
+        """What was learned, out of its configuration and its tensors; `source` names them in the error messages.
+
+        Raises:
+            CheckpointError: they do not fit each other or the task.
+        """
+
+    @abstractmethod
+    def policy(self, task: TaskSpec, learned: Any) -> Policy:
+        """What acts by what was learned, without noise."""
+
+    @property
+    def solver(self) -> str | None:
+        """Name of the MPC's backend; None where there is no MPC."""
+        return None
+
+    def check(self, minutes: float) -> None:
+        """Refuse what cannot be trained, before anything is written.
+
+        Raises:
+            InvalidInputError: the minutes of data do not fit the settings, or a solver is missing.
+        """
+
+    def smoke(self) -> Self:
+        """The same in seconds: too little of everything to learn anything."""
+        return self
+
+
+@dataclass(frozen=True)
+class LCSMethod(Method):
+    """A method that learns an `LCSModel` and acts by the MPC around it."""
+
+    n_lam: int = bounded(8, minimum=1, maximum=1000)
+    """Contacts, that is complementarity variables, of the model; ignored with --init."""
+    stiffness: float = bounded(0.1, above=0)
+    """Lower bound on the symmetric part of the model's F; ignored with --init."""
+    init_scale: float = bounded(1e-3, minimum=0)
+    """Initial parameters are uniform within ± this; ignored with --init."""
+    backend: str = "batched"
+    """MPC solver: batched, or ipopt, the reference, which takes many times as long for a plan."""
+
+    kind: ClassVar[str] = "LCSModel"
+    takes_init: ClassVar[bool] = True
+
+    @property
+    def solver(self) -> str:
+        """See `Method`."""
+        return self.backend
+
+    def check(self, minutes: float) -> None:
+        """See `Method`."""
+        get_backend(self.backend)
+
+    def rebuild(
+        self, task: TaskSpec, config: Mapping[str, object], tensors: Mapping[str, Tensor], source: str
+    ) -> LCSModule:
+        """See `Method`."""
+        lcs = LCSModel.from_config(config, tensors, source)
+        check_fits(lcs, task, source, CheckpointError)
+        return lcs
+
+    def policy(self, task: TaskSpec, learned: LCSModule) -> LCSMPCLayer:
+        """See `Method`."""
+        return task.make_policy(learned, one_start(self.backend))
+
+    def initial(self, work: Work) -> LCSModule:
+        """The model to start from. Override it, with `kind` and `rebuild`, to learn a module of your own."""
+        if work.init is not None:
+            return work.init
+        return LCSModel(
+            work.task.n_x,
+            work.task.n_u,
+            self.n_lam,
+            self.stiffness,
+            init_scale=self.init_scale,
+            learn_c=False,
+            generator=torch.Generator().manual_seed(work.seed),
+        )
+
+
+def check_fits(lcs: LCSModel, task: TaskSpec, source: object, error: type[Exception] = InvalidInputError) -> None:
+    """Refuse a model of other sizes than a task's, or in single precision, by an error of the given kind."""
+    got = f"n_x={lcs.n_x}, n_u={lcs.n_u}, {str(lcs.A.dtype).removeprefix('torch.')}"
+    wanted = f"n_x={task.n_x}, n_u={task.n_u}, float64"
+    if got != wanted:
+        raise error(f"init: expected a model with {wanted}, as task {task.name} needs, got {got} in {source}")
+
+
+# --- registry ---------------------------------------------------------------------------------------------------------
+
+_REGISTRY: dict[str, type[Method]] = {}
+
+
+Registered = TypeVar("Registered", bound=type[Method])
+
+
+def register_method(method: Registered) -> Registered:
+    """Make a method available under its `name`; usable as a class decorator.
+
+    Raises:
+        DTypeError: not a `Method` subclass with name, version, summary and reports.
+    """
+    wanted = {"name": str, "version": int, "summary": str, "reports": tuple, "kind": str}
+    if not (isinstance(method, type) and issubclass(method, Method)) or not all(
+        isinstance(getattr(method, name, None), kind) for name, kind in wanted.items()
+    ):
+        raise DTypeError(f"method: expected a subclass of Method with {', '.join(wanted)}, got {method!r}")
+    _REGISTRY[method.name] = method
+    return method
+
+
+def method_names() -> tuple[str, ...]:
+    """Names of the methods, in the order in which they were registered."""
+    return tuple(_REGISTRY)
+
+
+def get_method(name: str) -> type[Method]:
+    """The method of a name; its default instance is `get_method(name)()`.
+
+    Raises:
+        InvalidInputError: no method has this name.
+    """
+    if name not in _REGISTRY:
+        raise InvalidInputError(
+            f"method: expected one of {', '.join(_REGISTRY)}, got {name!r:.200}{did_you_mean(name, _REGISTRY)}; add "
+            f"your own with difflcs.rl.register_method"
+        )
+    return _REGISTRY[name]

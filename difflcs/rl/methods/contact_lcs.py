@@ -1,0 +1,138 @@
+"""The method contact-lcs: LCS-RL with known contacts, whose physics is fitted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs.lcs import LCSModule
+from difflcs.mpc import LCSMPCLayer
+from difflcs.mpc.backends import get_backend
+from difflcs.rl.learning.model_rollouts import ModelRolloutSettings
+from difflcs.rl.learning.phases import LCSRL
+from difflcs.rl.learning.physics_fit import PhysicsFit, PhysicsFitReport, PhysicsFitSettings
+from difflcs.rl.learning.ppo import PPOReport
+from difflcs.rl.learning.ppo_settings import PPOSettings
+from difflcs.rl.learning.trainer import Trainer, configuration
+from difflcs.rl.methods.base import Method, Work
+from difflcs.rl.methods.phases import main_phase, short_main, short_models
+from difflcs.rl.settings import bounded, group
+from difflcs.rl.tasks import PhysicsSpec, TaskSpec, one_start
+
+
+@dataclass(frozen=True)
+class ContactMethod(Method):
+    """LCS-RL with physics inside: known contacts, a dozen numbers fitted to the MPC's own episodes, then PPO."""
+
+    fit_minutes: float = bounded(3.0, above=0, maximum=1e6)
+    """Data of the fit [min]; what is left is that of PPO through the MPC."""
+    fit: PhysicsFitSettings = group(PhysicsFitSettings)
+    """Settings of the fit."""
+    ppo: PPOSettings = group(PPOSettings)
+    """Settings of PPO."""
+    models: ModelRolloutSettings = group(ModelRolloutSettings)
+    """Settings of the model rollouts of PPO."""
+    backend: str = "batched"
+    """MPC solver: batched, or ipopt, the reference."""
+
+    name: ClassVar[str] = "contact-lcs"
+    version: ClassVar[int] = 1
+    summary: ClassVar[str] = "known contacts whose physics is fitted, then PPO through the MPC; told the outline"
+    reports: ClassVar[tuple[type, ...]] = (PhysicsFitReport, PPOReport)
+    kind: ClassVar[str] = "physics"
+
+    @property
+    def solver(self) -> str:
+        """See `Method`."""
+        return self.backend
+
+    def check(self, minutes: float) -> None:
+        """See `Method`."""
+        get_backend(self.backend)
+
+    def trainer(self, work: Work) -> Trainer:
+        """See `Method`.
+
+        Raises:
+            InvalidInputError: nothing is known of the task's physics.
+        """
+        task, spec = work.task, known_physics(work.task)
+        lcs = spec.make_system()
+        policy = self.policy(task, lcs)
+        first = max(1, round(self.fit_minutes * task.steps_per_minute / task.episode_steps))
+        count = min(first, work.total_episodes)
+        scale = torch.tensor(spec.scale, dtype=torch.float64)
+        envs = work.make_envs(min(self.fit.rollouts, count))
+        fit = PhysicsFit(lcs, policy, envs, self.fit, work.seed, scale, policy.relaxation, count, task.episode_steps)
+        if count == work.total_episodes:
+            return fit
+        return LCSRL(
+            fit,
+            count * task.episode_steps,
+            lambda episodes, iterations: main_phase(work, policy, self.ppo, self.models, episodes, iterations),
+        )
+
+    def rebuild(
+        self, task: TaskSpec, config: Mapping[str, object], tensors: Mapping[str, Tensor], source: str
+    ) -> LCSModule:
+        """See `Method`."""
+        lcs = known_physics(task).make_system()
+        if not _alike(dict(config), configuration(lcs)):
+            raise CheckpointError(
+                f"{source}: expected what is known of task {task.name} to be as when it was learned, got another "
+                f"physics; is the object's mesh there in one place, and a stand-in in the other?"
+            )
+        own = lcs.state_dict()
+        shapes = {name: tuple(value.shape) for name, value in own.items()}
+        if shapes != {name: tuple(value.shape) for name, value in tensors.items()}:
+            raise CheckpointError(f"{source}: expected tensors {shapes}, got others; the file is foreign or corrupt")
+        for name, value in tensors.items():
+            if value.dtype != own[name].dtype or not bool(torch.isfinite(value).all()):
+                raise CheckpointError(f"{source}: expected finite {own[name].dtype} values in {name}; is it damaged?")
+        lcs.load_state_dict(dict(tensors))
+        return lcs
+
+    def policy(self, task: TaskSpec, learned: LCSModule) -> LCSMPCLayer:
+        """See `Method`: the MPC as `PhysicsSpec` says."""
+        return task.make_policy(learned, one_start(self.backend), known_physics(task))
+
+    def smoke(self) -> Self:
+        """See `Method`."""
+        return replace(
+            self,
+            fit_minutes=min(self.fit_minutes, 0.2),
+            fit=replace(self.fit, rollouts=min(self.fit.rollouts, 3), steps=min(self.fit.steps, 3)),
+            ppo=short_main(self.ppo),
+            models=short_models(self.models),
+        )
+
+
+def _alike(one: Any, other: Any) -> bool:
+    """Whether two configurations are equal but for rounding, which another machine may do differently."""
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return one.keys() == other.keys() and all(_alike(value, other[name]) for name, value in one.items())
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(_alike, one, other))
+    if isinstance(one, float) and isinstance(other, float):
+        return math.isclose(one, other, rel_tol=1e-6, abs_tol=1e-9)
+    return type(one) is type(other) and one == other
+
+
+def known_physics(task: TaskSpec) -> PhysicsSpec:
+    """What is known of a task's physics.
+
+    Raises:
+        InvalidInputError: nothing.
+    """
+    if task.physics is None:
+        raise InvalidInputError(
+            f"method: expected a task with known physics for {ContactMethod.name}, got {task.name} without; give its "
+            f"TaskSpec a PhysicsSpec, or learn it by lcs-rl"
+        )
+    return task.physics

@@ -1,6 +1,0 @@
-"""Rules by which PPO moves a policy."""
-
-from difflcs.rl.optim.natural import Natural, NaturalGradient
-from difflcs.rl.optim.update import AdamUpdate, NaturalUpdate, StepSize, UpdateRule
-
-__all__ = ["AdamUpdate", "Natural", "NaturalGradient", "NaturalUpdate", "StepSize", "UpdateRule"]

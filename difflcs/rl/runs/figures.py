@@ -1,0 +1,175 @@
+"""What a run looks like: its learning curve, and a video of its policy."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import torch
+
+from difflcs._optional import require
+from difflcs._storage import write_atomically
+from difflcs.errors import DiffLCSError, InvalidInputError
+from difflcs.rl.rollout import CONTEXT, Policy, mpc_actions
+
+if TYPE_CHECKING:
+    import gymnasium
+
+    from difflcs.rl.tasks import TaskSpec
+
+# Okabe–Ito colours, distinguishable by colour-blind readers.
+_BLUE, _ORANGE, _GREY = "#0072b2", "#d55e00", "#999999"
+_ROLLING = 8
+"""Iterations averaged for the success of training episodes: 40 episodes."""
+
+
+def plot_learning_curve(rows: Sequence[Mapping[str, str]], path: Path, title: str) -> None:
+    """Success and loss against minutes of data, as a PNG.
+
+    Args:
+        rows: log.csv of a run, as `RunDirectory.rows()` returns it.
+        path: where to write.
+        title: above the figure.
+    """
+    require("matplotlib")
+    from io import BytesIO
+
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
+
+    figure = Figure(figsize=(7.0, 6.0), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    figure.suptitle(title)
+
+    x, success = _column(rows, "minutes", "success")
+    rolling = [success[max(0, i + 1 - _ROLLING) : i + 1].mean() for i in range(len(success))]
+    above.plot(x, 100 * np.array(rolling), color=_GREY, lw=1.5, label="training episodes (noisy, last 40)")
+    x, rate, low, high, goals = _column(rows, *_evaluation("minutes", "success_rate", "ci_low", "ci_high", "goals"))
+    if len(x):
+        spread = 100 * np.stack([rate - low, high - rate])
+        counts = f"{goals.min():.0f}" + (f" to {goals.max():.0f}" if goals.max() > goals.min() else "")
+        style = {"color": _BLUE, "marker": "o", "lw": 2, "capsize": 4}
+        above.errorbar(x, 100 * rate, spread, **style, label=f"evaluation on {counts} goals, 95 % interval")
+        for at, value, top in zip(x, rate, high, strict=True):
+            place = {"xytext": (0, 4), "textcoords": "offset points", "ha": "center", "va": "bottom"}
+            above.annotate(f"{100 * value:.0f} %", (at, 100 * top), **place, fontsize=9, color=_BLUE)
+    above.set(ylabel="success [%]", ylim=(0, 105))
+    above.legend(loc="lower right", frameon=False, fontsize=9)
+
+    for name, color, label in (("loss", _ORANGE, "training"), ("held_out_loss", _BLUE, "held out")):
+        x, loss = _column(rows, "minutes", name)
+        below.semilogy(x, loss, color=color, lw=1.5, label=label)
+    low, high = np.log10(below.get_ylim())
+    below.set_ylim(10 ** np.floor(low), 10 ** np.ceil(high))  # whole decades, or the axis has one number
+    below.set(xlabel="data [min]", ylabel="violation loss")
+    below.yaxis.set_minor_formatter(NullFormatter())
+    below.legend(loc="lower right", frameon=False, fontsize=9)
+    for axes in (above, below):
+        axes.grid(alpha=0.25)
+        axes.spines[["top", "right"]].set_visible(False)
+
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png")
+    write_atomically(path, buffer.getvalue())
+
+
+def _evaluation(first: str, *names: str) -> list[str]:
+    return [first, *(f"evaluation_{name}" for name in names)]
+
+
+def _column(rows: Sequence[Mapping[str, str]], *names: str) -> tuple[np.ndarray, ...]:
+    """Columns as arrays, of the rows that have a value in each of them."""
+    values = np.array([[float(row[n]) for n in names] for row in rows if all(row[n] != "" for n in names)])
+    return tuple(values.reshape(-1, len(names)).T)
+
+
+class NoPictureError(DiffLCSError):
+    """This machine cannot draw the environment."""
+
+
+def record_video(
+    env: gymnasium.Env[Any, Any],
+    policy: Policy,
+    goals: Sequence[Sequence[float]],
+    path: Path,
+    task: TaskSpec,
+    seed: int = 0,
+) -> list[bool]:
+    """Play one noise-free episode per goal into an MP4, in real time, with the task's caption above.
+
+    Args:
+        env: one environment of the task with render_mode="rgb_array".
+        policy: what acts.
+        goals: goals, played one after another.
+        path: where to write; replaced atomically.
+        task: the task.
+        seed: of the initial states.
+
+    Returns:
+        For each goal, whether it was reached.
+
+    Raises:
+        InvalidInputError: a goal is outside the goal space.
+        NoPictureError: the environment cannot be drawn here.
+    """
+    require("imageio", "imageio_ffmpeg", "PIL")
+    import imageio.v2 as imageio
+
+    space = env.observation_space["goal"]  # pyright: ignore[reportIndexIssue]
+    chosen = [np.asarray(goal, space.dtype) for goal in goals]
+    for goal in chosen:
+        if not space.contains(goal):
+            low, high = space.low.tolist(), space.high.tolist()
+            raise InvalidInputError(f"goal: expected {low} <= goal <= {high}, got {goal.tolist()}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.tmp.mp4")
+    reached: list[bool] = []
+    temporary.touch()  # says here whether it can be written, where the message is not one of ffmpeg
+    try:
+        with cast(Any, imageio.get_writer)(temporary, fps=max(1, round(1 / task.step_seconds)), quality=8) as video:
+            for number, goal in enumerate(chosen, 1):
+                act = mpc_actions(policy)  # which begins anew, as in an evaluation
+                observation, info = env.reset(seed=seed + number, options={"goal": goal})
+                title = f"goal {number} of {len(chosen)}"
+                picture = _captioned(env, f"{title}    0.0 s    {task.say(info)}", "")
+                video.append_data(picture)
+                for step in range(1, task.episode_steps + 1):
+                    state = torch.from_numpy(np.asarray(observation["state"], np.float64)[None])
+                    context = [observation[CONTEXT]] if CONTEXT in observation else []
+                    given = [torch.from_numpy(np.asarray(value, np.float64)[None]) for value in (goal, *context)]
+                    action, _ = act(state, *given)
+                    observation, _, _, _, info = env.step(action[0])
+                    verdict = "" if step < task.episode_steps else ("reached" if info["success"] else "missed")
+                    text = f"{title}    {step * task.step_seconds:.1f} s    {task.say(info)}"
+                    picture = _captioned(env, text, verdict)
+                    video.append_data(picture)
+                for _ in range(round(1.0 / task.step_seconds)):
+                    video.append_data(picture)
+                reached.append(bool(info["success"]))
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return reached
+
+
+def _captioned(env: gymnasium.Env[Any, Any], text: str, verdict: str) -> np.ndarray:
+    from PIL import Image, ImageDraw, ImageFont
+
+    try:
+        picture = Image.fromarray(np.asarray(env.render()))
+    except Exception as error:  # whatever a renderer of others may raise
+        raise NoPictureError(f"{type(error).__name__}: {error}") from error
+    draw = ImageDraw.Draw(picture, "RGBA")
+    size = max(10, picture.height // 30)
+    font = ImageFont.load_default(size)
+    draw.rectangle((0, 0, picture.width, 2 * size), fill=(0, 0, 0, 140))
+    draw.text((size, size // 2), text, font=font, fill="white")
+    if verdict:
+        color = (90, 220, 120) if verdict == "reached" else (255, 120, 90)
+        draw.text((picture.width - size, size // 2), verdict, font=font, fill=color, anchor="ra")
+    return np.asarray(picture)

@@ -1,0 +1,220 @@
+"""Learned models that ship with the package, and what is known about each. It knows files only.
+
+    from difflcs import LCSModel, zoo
+    lcs = LCSModel.from_pretrained("trifinger-cube")
+    print(zoo.card("trifinger-cube").success_rate)
+
+`difflcs zoo` lists them; `difflcs evaluate`, `render` and `train --init` take them as `zoo:trifinger-cube`.
+
+A maintainer adds a finished run by `python reproduce/add_to_zoo.py RUN` in a checkout of the repository.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from difflcs import _storage
+from difflcs.errors import CheckpointError
+
+__all__ = ["MODELS", "PREFIX", "ModelCard", "card", "names", "path"]
+
+PREFIX = "zoo:"
+"""Before a name it says to the command line and to `LCSModel.from_pretrained`: a model of the zoo, not a path."""
+MODELS = Path(__file__).parent / "models"
+"""Where the models lie, a folder each: config.json, model.safetensors, card.json."""
+
+_NUMBERS = ("minutes", "success_rate", "ci_low", "ci_high")
+_COUNTS = ("seed", "goals", "evaluation_seed", "solver_failures")
+_WORDS = ("name", "task", "method", "backend", "version", "command")
+
+
+@dataclass(frozen=True)
+class ModelCard:
+    """Where a model of the zoo comes from and how good it is.
+
+    Attributes:
+        name: its name in the zoo.
+        task: what it was trained for, and is evaluated on.
+        method: how it was learned, as `difflcs train --method` takes it.
+        minutes: data [min of simulated time].
+        seed: of the training.
+        success_rate: successes per goal, without noise.
+        ci_low: lower end of the Wilson 95 % interval.
+        ci_high: its upper end.
+        goals: goals of that evaluation.
+        evaluation_seed: their seed.
+        solver_failures: MPC solves of that evaluation that did not converge.
+        object: what decides whether results can be compared, as the task describes its environment.
+        backend: MPC solver of training and evaluation.
+        version: of difflcs.
+        command: what trained it.
+        versions: of the packages that decide a result.
+        settings: every setting of the training; defaults may change, these do not.
+    """
+
+    name: str
+    task: str
+    method: str
+    minutes: float
+    seed: int
+    success_rate: float
+    ci_low: float
+    ci_high: float
+    goals: int
+    evaluation_seed: int
+    solver_failures: int
+    object: Mapping[str, Any] = field(hash=False)
+    backend: str
+    version: str
+    command: str
+    versions: Mapping[str, str | None] = field(hash=False)
+    settings: Mapping[str, Any] = field(hash=False)
+
+    @property
+    def object_source(self) -> str:
+        """Where the shape of the object is from, such as built_in, ycb_mesh or stand_in; "" if nobody said."""
+        return str(self.object.get("source", ""))
+
+    @property
+    def success_text(self) -> str:
+        """Success rate, goals and interval, as `difflcs evaluate` prints them."""
+        rate, low, high = (100 * value for value in (self.success_rate, self.ci_low, self.ci_high))
+        return f"{rate:.1f} % of {self.goals} goals (95 % interval {low:.1f} to {high:.1f} %)"
+
+    def __str__(self) -> str:
+        lines = {
+            "task": self.task,
+            "object": described(self.object),
+            "method": f"{self.method}, {self.minutes:g} min of data, seed {self.seed}, backend {self.backend}",
+            "success": f"{self.success_text}, goal seed {self.evaluation_seed}",
+            "solver": f"{self.solver_failures} solves failed in that evaluation",
+            "versions": ", ".join(f"{name} {version}" for name, version in self.versions.items() if version),
+            "trained by": self.command,
+        }
+        return "\n".join([self.name, *(f"  {name:<10} {text}" for name, text in lines.items())])
+
+
+def names(root: Path = MODELS) -> tuple[str, ...]:
+    """Names of the models, in alphabetical order."""
+    return tuple(sorted(card.parent.name for card in root.glob("[!._]*/card.json")))
+
+
+def path(name: str, root: Path = MODELS) -> Path:
+    """The folder of a model: what `LCSModel.save_pretrained` wrote, and card.json.
+
+    Args:
+        name: "trifinger-cube" or "zoo:trifinger-cube".
+        root: where the models lie.
+
+    Raises:
+        CheckpointError: no model has this name; the message lists those there are.
+    """
+    name = name.removeprefix(PREFIX)
+    known = names(root)
+    if name in known:
+        return root / name
+    near = difflib.get_close_matches(name, known, n=2)
+    advice = f"did you mean {' or '.join(near)}?" if near else "`difflcs zoo` lists them"
+    raise CheckpointError(f"zoo: expected one of {', '.join(known) or 'no models'}, got {name!r}; {advice}")
+
+
+def resolve(source: str | os.PathLike[str]) -> Path:
+    """The directory that a user means.
+
+    "zoo:NAME" is always a model of the zoo. Otherwise a path that exists wins, then a model of the zoo of that name.
+
+    Raises:
+        CheckpointError: a name, not a path, that is neither.
+    """
+    text = os.fsdecode(source)
+    if text.startswith(PREFIX):
+        return path(text)
+    if os.path.exists(text) or Path(text).name != text:  # only one word may be a name
+        return Path(text)
+    try:
+        return path(text)
+    except CheckpointError as error:
+        raise CheckpointError(f"{text}: no such directory; {error}") from None
+
+
+def card(name: str) -> ModelCard:
+    """The card of a model.
+
+    Raises:
+        CheckpointError: no model has this name, or its card is damaged.
+    """
+    return _read(path(name) / "card.json")
+
+
+def table(cards: Sequence[ModelCard]) -> str:
+    """One line per model."""
+    head = ("name", "method", "data", "success", "interval", "goals", "object")
+    rows = [
+        (
+            c.name,
+            c.method,
+            f"{c.minutes:g} min",
+            f"{100 * c.success_rate:.1f} %",
+            f"{100 * c.ci_low:.1f} to {100 * c.ci_high:.1f}",
+            str(c.goals),
+            c.object_source.replace("_", " "),
+        )
+        for c in cards
+    ]
+    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+    lines = ["  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)) for row in (head, *rows)]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _read(file: Path) -> ModelCard:
+    remedy = "install difflcs again"
+    try:
+        values = _storage.read_json(file)
+    except (FileNotFoundError, CheckpointError) as error:
+        raise CheckpointError(f"{file}: expected a card, got: {error.args[0]}; {remedy}") from error
+    wanted = {f.name for f in fields(ModelCard)}
+    if not isinstance(values, dict) or set(values) != wanted:
+        got = sorted(values) if isinstance(values, dict) else type(values).__name__
+        raise CheckpointError(
+            f"{file}: expected the fields {sorted(wanted)} of a card, got {_storage.short(got)}; {remedy}"
+        )
+    kinds = dict.fromkeys(_NUMBERS, (int, float)) | dict.fromkeys(_COUNTS, (int,)) | dict.fromkeys(_WORDS, (str,))
+    kinds |= {"object": (dict,), "versions": (dict,), "settings": (dict,)}
+    for name, kind in kinds.items():
+        if not isinstance(values[name], kind) or isinstance(values[name], bool):
+            got = _storage.short(values[name])
+            raise CheckpointError(f"{file}: expected {kind[0].__name__} for {name}, got {got}; {remedy}")
+    ranges = dict.fromkeys(("success_rate", "ci_low", "ci_high"), (0, 1)) | dict.fromkeys(_COUNTS, (0, 2**63))
+    for name, (low, high) in {**ranges, "minutes": (0, 1e6)}.items():
+        if not low <= values[name] <= high:
+            raise CheckpointError(f"{file}: expected {low} to {high:g} for {name}, got {values[name]}; {remedy}")
+    check_object(values["object"], file)
+    if not all(isinstance(version, str | None) for version in values["versions"].values()):
+        raise CheckpointError(
+            f"{file}: expected texts for versions, got {_storage.short(values['versions'])}; {remedy}"
+        )
+    return ModelCard(**values)
+
+
+def check_object(found: Mapping[str, Any], source: object) -> None:
+    """Check what a file says of the object that a model was trained on.
+
+    Raises:
+        CheckpointError: something else than texts and numbers.
+    """
+    if not all(isinstance(value, str | int | float | bool | None) for value in found.values()):
+        raise CheckpointError(
+            f"{source}: expected texts and numbers that describe an object, got {_storage.short(dict(found))}; "
+            f"restore it from a copy"
+        )
+
+
+def described(found: Mapping[str, Any]) -> str:
+    """What decides whether results can be compared, in one line; no hashes."""
+    texts = [f"{key.replace('_', ' ')} {value}" for key, value in found.items() if key not in ("name", "sha256")]
+    return " ".join([str(found.get("name", "")), f"({', '.join(texts)})" if texts else ""]).strip() or "nothing special"
