@@ -6,13 +6,14 @@ import json
 import os
 import shutil
 import stat
+import sys
 
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
 from difflcs import LCSModel, _storage
-from difflcs.errors import CheckpointError, DiffLCSError, InvalidInputError
+from difflcs.errors import CheckpointError, DiffLCSError, InvalidInputError, MissingDependencyError
 
 NAMES = ("A", "B", "C", "d", "D", "E", "G", "H", "c")
 
@@ -263,3 +264,12 @@ def test_json_is_written_in_a_stable_order(tmp_path):
     _storage.write_json(tmp_path / "b", {"a": [1.5, None], "b": 1})
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
     assert json.loads((tmp_path / "a").read_text()) == {"a": [1.5, None], "b": 1}
+
+
+def test_a_lock_without_its_package_names_the_line_that_installs_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "filelock", None)
+    with (
+        pytest.raises(MissingDependencyError, match=r"filelock, not installed; run: pip install"),
+        _storage.locked(tmp_path),
+    ):
+        pass
