@@ -6,6 +6,7 @@ BIN := $(VENV)/bin
 # One worker per core; a file stays in one worker, which computes its shared fixtures once; long files come first.
 PARALLEL := -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 TIMED := tests/system/test_time.py
+QUICK := $(PARALLEL) -q -m "not slow" tests/unit tests/conformance
 
 .PHONY: help demo check test lint format docs clean
 
@@ -16,6 +17,7 @@ help:
 	@echo "make lint   ruff and pyright"
 	@echo "make format let ruff put the code in order"
 	@echo "make docs   build the documentation (build/docs/index.html)"
+	@echo "make coverage, make mutants   how much of the library the quick tests run, and notice"
 	@echo "make clean  remove .venv and build products"
 
 # .ready: everything that developers need, with the kernels for every CPU. .demo: what the demo needs, a quarter of the
@@ -40,7 +42,7 @@ demo: $(or $(wildcard $(VENV)/.ready),$(VENV)/.demo)
 check: $(VENV)/.ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/python -m pytest $(PARALLEL) -q -m "not slow" tests/unit tests/conformance
+	$(BIN)/python -m pytest $(QUICK)
 
 # What measures time comes last, when nothing else runs.
 test: $(VENV)/.ready
@@ -75,3 +77,24 @@ sanitize:
 	    echo "$$s:"; DIFFLCS_ISA=$$isa build/sanitize-$$s/stress || exit 1; \
 	  done || exit 1; \
 	done
+
+# The lines that the quick tests do not run (build/coverage/index.html); and whether a test notices when a line is wrong:
+# MUTANTS small faults below FROM, drawn with SEED, put into the working tree one after the other. Minutes for each.
+MUTANTS := 60
+SEED := 43
+FROM := difflcs envs/difflcs_envs
+TESTS := $(QUICK)
+SESSION := build/mutants.sqlite
+.PHONY: coverage mutants
+coverage: $(VENV)/.ready
+	$(BIN)/python -m pip install --quiet -c constraints.txt pytest-cov==7.1.0
+	$(BIN)/python -m pytest $(QUICK) --cov=difflcs --cov=difflcs_envs --cov-report=html:build/coverage
+
+mutants: $(VENV)/.ready
+	$(BIN)/python -m pip install --quiet -c constraints.txt cosmic-ray==8.7.0
+	@mkdir -p build
+	sed 's|^module-path.*|module-path = [$(FROM:%="%",)]|' tests/mutants.toml > build/mutants.toml
+	$(BIN)/cosmic-ray init --force build/mutants.toml $(SESSION)
+	$(BIN)/python tests/draw_mutants.py $(SESSION) $(MUTANTS) $(SEED)
+	PATH="$(CURDIR)/$(BIN):$$PATH" TESTS='$(TESTS)' $(BIN)/cosmic-ray exec build/mutants.toml $(SESSION)
+	$(BIN)/cr-report --surviving-only --show-diff $(SESSION)

@@ -14,7 +14,8 @@ function(difflcs_add_kernels target)
   set_source_files_properties(${sources} PROPERTIES COMPILE_OPTIONS
                               $<$<NOT:$<CXX_COMPILER_ID:MSVC>>:-ffp-contract=off>)
   # So that a problem has the same plan whichever of them solves it: GCC would sum differently in vectors of its own.
-  set_source_files_properties(${DIFFLCS_NATIVE}/mpc.cpp PROPERTIES COMPILE_OPTIONS
+  # Nor is there anything else for such vectors: numbers that are added up are already vectors of all lanes.
+  set_source_files_properties(${DIFFLCS_NATIVE}/mpc.cpp ${DIFFLCS_NATIVE}/mpc_adjoint.cpp PROPERTIES COMPILE_OPTIONS
                               $<$<CXX_COMPILER_ID:GNU>:-fno-tree-vectorize>)
   set(isas ${DIFFLCS_ISAS})
   if(isas STREQUAL "all")

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._functorch import is_wrapped, transforms_active
+from difflcs._differentiation import is_wrapped, transforms_active
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.errors import (
     DeviceError,

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from difflcs._checks import check_tensor, describe
-from difflcs._functorch import is_wrapped
+from difflcs._differentiation import is_wrapped
 from difflcs._modules import fresh
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
 

@@ -1,4 +1,4 @@
-"""What was made of some tensors, for as long as these hold the same numbers.
+"""Cache of a result, valid while the tensors that it was made of hold the same numbers.
 
 A robot plans through one model again and again. What was checked and prepared at one call holds at the next one if the
 numbers are the same. The numbers themselves are compared, as neither the identity of a tensor nor its version says
@@ -34,7 +34,7 @@ class Snapshot:
         self._values = tuple(values)
         self.tensors = tuple([value for value in values if isinstance(value, Tensor)])
         self._arrays = [tensor.detach().numpy() for tensor in self.tensors]  # so that nobody else gets that memory
-        self._forms = self._look()
+        self._forms = _forms(self.tensors)
         self._numbers = _numbers(self._arrays)
         self._inference = torch.is_inference_mode_enabled()
 
@@ -44,13 +44,14 @@ class Snapshot:
             self._inference == torch.is_inference_mode_enabled()
             and len(values) == len(self._values)
             and all(map(operator.is_, values, self._values))
-            and self._look() == self._forms
+            and _forms(self.tensors) == self._forms
             and _numbers(self._arrays) == self._numbers
         )
 
-    def _look(self) -> list[tuple]:
-        """Where the numbers of each tensor are, and in which order: `tensor.data = other` and `t_()` change it."""
-        return [(tensor.data_ptr(), tensor.stride(), tensor.shape) for tensor in self.tensors]
+
+def _forms(tensors: Sequence[Tensor]) -> list[object]:
+    """Where the numbers of each tensor are, and in which order: `tensor.data = other` and `t_()` change it."""
+    return [*map(Tensor.data_ptr, tensors), *map(Tensor.stride, tensors), *map(Tensor.size, tensors)]
 
 
 def _numbers(arrays: Sequence[np.ndarray]) -> list[bytes]:

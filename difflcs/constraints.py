@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_same_device, check_tensor, describe, plain
+from difflcs._differentiation import is_wrapped
 from difflcs._fields import TensorFields, check_by_stage, check_not_nan, check_stages
-from difflcs._functorch import is_wrapped
 from difflcs.errors import BoundsError, DTypeError, InvalidInputError, ShapeError
 
 _DIMENSIONS = {"G": 2, "g": 1, "E": 2, "weight": 1}

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import check_number, check_positive_int, check_same_device, check_tensor, describe
+from difflcs._differentiation import is_wrapped
 from difflcs._fields import TensorFields, check_by_stage, check_stages
-from difflcs._functorch import is_wrapped
 from difflcs._linalg import matvec, quadratic
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 

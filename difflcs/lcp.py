@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_number, check_same_device, check_tensor
-from difflcs._functorch import Solver, is_wrapped, runs_eagerly, solve
+from difflcs._differentiation import Solver, is_wrapped, runs_eagerly, solve
 from difflcs.errors import ShapeError, SolveWarning
 from difflcs.status import Status
 
@@ -157,12 +157,16 @@ class _Problems(Solver):
         return lam.to(q.device), w.to(q.device), status.to(q.device)
 
     def pullback(
-        self, tensors: Sequence[Tensor], outputs: Sequence[Tensor], grads: Sequence[Tensor], needs: Sequence[bool]
+        self,
+        tensors: Sequence[Tensor],
+        outputs: Sequence[Tensor],
+        grads: Sequence[Tensor | None],
+        needs: Sequence[bool],
     ) -> Sequence[Tensor | None]:
         (F, _), (lam, w, status) = tensors, outputs
         solved = (status == Status.CONVERGED).unsqueeze(-1)
         # Whatever comes upstream for a failed element is dropped before it can meet the others.
-        lam_bar, w_bar = (torch.where(solved, g, torch.zeros_like(g)) for g in grads)
+        lam_bar, w_bar = (torch.zeros_like(lam) if g is None else torch.where(solved, g, 0.0) for g in grads)
         total = lam + w
         # Strictly complementary: b = λ/(λ+w). At λ = w = 0 the index counts as inactive: b = 0, a = 1.
         b = torch.where(total > 0, lam / total.clamp_min(torch.finfo(lam.dtype).tiny), torch.zeros_like(lam))

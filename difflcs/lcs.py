@@ -10,7 +10,7 @@ from typing import TypeGuard
 import torch
 from torch import Tensor, nn
 
-from difflcs import _files
+from difflcs import _storage
 from difflcs._checks import (
     broadcast_batch,
     check_choice,
@@ -19,7 +19,7 @@ from difflcs._checks import (
     check_tensor,
     describe,
 )
-from difflcs._functorch import runs_eagerly, transforms_active
+from difflcs._differentiation import runs_eagerly, transforms_active
 from difflcs._linalg import product
 from difflcs._modules import fresh, plain_state, untouched
 from difflcs._recall import Recall
@@ -262,7 +262,7 @@ class LCSModel(nn.Module):
         wanted = {"n_x", "n_u", "n_lam", "stiffness", "learn_c", "dtype"}
         if set(config) != wanted:
             raise CheckpointError(
-                f"{source}: expected the fields {sorted(wanted)} of an LCSModel, got {_files.short(sorted(config))}; "
+                f"{source}: expected the fields {sorted(wanted)} of an LCSModel, got {_storage.short(sorted(config))}; "
                 f"was it written by LCSModel.save_pretrained?"
             )
         try:
@@ -304,7 +304,7 @@ class LCSModel(nn.Module):
 
         Of a model that was parametrised, pruned or normalised by `torch.nn.utils` the matrices are written as they are.
         """
-        _files.save_record(Path(directory), "LCSModel", self.config(), plain_state(self))
+        _storage.save_record(Path(directory), "LCSModel", self.config(), plain_state(self))
 
     @classmethod
     def from_pretrained(cls, source: str | os.PathLike[str]) -> LCSModel:
@@ -321,7 +321,7 @@ class LCSModel(nn.Module):
         from difflcs import zoo  # handles files only, and few users need it
 
         directory = zoo.resolve(source)
-        config, tensors = _files.load_record(directory, "LCSModel")
+        config, tensors = _storage.load_record(directory, "LCSModel")
         return cls.from_config(config, tensors, str(directory))
 
 

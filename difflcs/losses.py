@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_choice, check_number, check_tensor, describe, is_array
-from difflcs._functorch import is_wrapped, pull_back, runs_eagerly, solve, transforms_active
-from difflcs._violation import Transitions, check_gamma_range, largest_gamma, minimise_over_orthant
-from difflcs.errors import DTypeError, GammaError, InvalidInputError
-from difflcs.lcp import MAX_ITER
+from difflcs._differentiation import Solver, runs_eagerly, solve, transforms_active
+from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
+from difflcs.errors import DTypeError, GammaError, InvalidInputError, NotPositiveDefiniteError, SolveError
+from difflcs.lcp import MAX_ITER, solve_lcp_arrays
 from difflcs.lcs import SYSTEM, LCSModel, LCSModule, LCSParams, is_plain
 from difflcs.records import system_at
+from difflcs.status import Status
+
+# Least γ σ_min(F + Fᵀ), in parts of n_lam times the largest squared column of F.
+_GAMMA_LEAST = _kernels.tolerances()["gamma_least"]
+# γ = "auto", in parts of its bound: at the bound itself the inner QP is singular wherever C is. A thousandth below it
+# the smallest eigenvalue of F + Fᵀ − γI is a thousandth of that of F + Fᵀ.
+_AUTO = 0.999
+# Dimensions of A, B, C, d, D, E, F, c, x, u, x_next.
+_RANKS = (*map(len, SYSTEM.values()), 1, 1, 1)
 
 
 @runs_eagerly
@@ -70,33 +81,29 @@ def violation_loss(
         raise DTypeError(f"gamma: expected a number, got {describe(gamma)}; convert it with float(...)")
     if not (isinstance(gamma, str) and gamma == "auto"):
         gamma = check_number("gamma", gamma)
+    data = (x, u, x_next)
     if is_plain(lcs) and lcs.n_lam and not transforms_active():
-        # The loss passes the gradient of F to G and H itself: autograd would take 40 µs for the five small steps, of
+        # The solver passes the gradient of F to G and H itself: autograd would take 40 µs for the five small steps, of
         # 190 µs for the loss of 100 transitions and its gradient.
         with torch.no_grad():
             F = lcs.F
-        system = (lcs.A, lcs.B, lcs.C, lcs.d, lcs.D, lcs.E, F, lcs.c)
-        batch = x.shape[:-1] if _plain(lcs, system, (x, u, x_next)) else None
-        if batch is None:
-            _check_numbers(lcs, system, (x, u, x_next))
-            batch = broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1]), ("x_next", x_next.shape[:-1])])
-            x, u, x_next = (v.expand(*batch, v.shape[-1]).reshape(-1, v.shape[-1]) for v in (x, u, x_next))
-        return _shared(lcs, system, (x, u, x_next), gamma, xi, reduction, batch, (lcs.G, lcs.H))
-    params = _params(lcs, x, u, x_next, context)
-    if not params.n_lam:
-        return _prediction_loss(params, x, u, x_next, reduction)
-    batch = _batch(params, x, u, x_next)
-    count = batch.numel()
-    x, u, x_next = (v.expand(*batch, v.shape[-1]).reshape(count, v.shape[-1]) for v in (x, u, x_next))
-    system = tuple(_for_each(v, batch, len(SYSTEM[name])) for name, v in params.tensors().items())
-    if all(v.ndim == len(dims) for v, dims in zip(system, SYSTEM.values(), strict=True)) and not transforms_active():
-        return _shared(params, system, (x, u, x_next), gamma, xi, reduction, batch)
-    if isinstance(gamma, str):
-        rate = largest_gamma(params.F)
+        made_of: dict[str, Any] = lcs._parameters  # attributes, one by one, would take 5 µs
+        system = tuple([F if name == "F" else made_of[name] for name in SYSTEM])
+        factors = (made_of["G"], made_of["H"])
+        if _plain(lcs, system, data):
+            return _violation_loss(system, data, x.shape[:-1], gamma, xi, reduction, factors)
+        lcs.check_inputs(x=x, u=u, x_next=x_next)
+        for name, value in zip(SYSTEM, system, strict=True):
+            check_tensor(name, value)
+        batch = broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1]), ("x_next", x_next.shape[:-1])])
     else:
-        rate = torch.tensor(float(gamma), dtype=torch.float64, device=x.device)
-    loss = solve(Transitions(xi), *system, x, u, x_next, rate)[0]
-    return _reduce(loss, batch, reduction)
+        params, factors = _params(lcs, x, u, x_next, context), ()
+        if not params.n_lam:
+            return _prediction_loss(params, x, u, x_next, reduction)
+        batch = _batch(params, x, u, x_next)
+        system = tuple(_for_each(v, batch, len(SYSTEM[name])) for name, v in params.tensors().items())
+    data = tuple(v.expand(*batch, v.shape[-1]).reshape(batch.numel(), v.shape[-1]) for v in data)
+    return _violation_loss(system, data, batch, gamma, xi, reduction, factors)
 
 
 @runs_eagerly
@@ -178,108 +185,218 @@ def _for_each(value: Tensor, batch: torch.Size, rank: int) -> Tensor:
     return value if value.ndim == rank else value.expand(*batch, *own).reshape(batch.numel(), *own)
 
 
-def _shared(
-    lcs: LCSModel | LCSParams,
+def _plain(lcs: LCSModel, system: tuple[Tensor, ...], data: tuple[Tensor, ...]) -> bool:
+    """Whether these are float64 matrices on the CPU that fit each other: then the kernel can look at the numbers."""
+    for value in system:
+        if value.dtype is not torch.float64 or not value.is_cpu or value.layout is not torch.strided:
+            return False
+    for value, size in zip(data, (lcs.n_x, lcs.n_u, lcs.n_x), strict=True):
+        if not is_array(value) or value.dtype is not torch.float64 or value.shape != (len(data[0]), size):
+            return False
+    return True
+
+
+def _violation_loss(
     system: tuple[Tensor, ...],
     data: tuple[Tensor, ...],
+    batch: torch.Size,
     gamma: float | str,
     xi: float,
     reduction: str,
-    batch: torch.Size,
-    factors: tuple[Tensor, ...] = (),
+    factors: tuple[Tensor, ...],
 ) -> Tensor:
-    """The loss with one system for all transitions, data (count, ·): in C++."""
-    mean = reduction == "mean"
-    rate = float(largest_gamma(system[6])) if isinstance(gamma, str) else gamma
-    loss = _ViolationLoss.apply(lcs, mean, rate, xi, *system, *data, *factors)
-    return loss if mean else loss.reshape(batch)  # pyright: ignore[reportReturnType, reportAttributeAccessIssue]
+    """The loss of a system, each field shared or (count, …), and data (count, ·); `factors` of an `LCSModel`'s F."""
+    mean = reduction == "mean" and not transforms_active()
+    if isinstance(gamma, str):
+        rate = largest_gamma(system[6])
+        if transforms_active():  # of which each element may have its own
+            return _reduce(solve(_Transitions(xi, None), *system, *data, rate)[0], batch, reduction)
+        gamma = float(rate)
+    loss = solve(_Transitions(xi, gamma, mean, bool(factors)), *system, *data, *factors)[0]
+    return loss if mean else _reduce(loss, batch, reduction)
 
 
-def _plain(lcs: LCSModel, system: tuple[Tensor, ...], data: tuple[Tensor, ...]) -> bool:
-    """Whether these are float64 matrices on the CPU that fit each other: then the kernel can look at the numbers."""
-    if not all(is_array(v) and v.dtype is torch.float64 for v in (*system, *data)):
-        return False
-    count = data[0].shape[0] if data[0].ndim else 0
-    return all(v.shape == (count, n) for v, n in zip(data, (lcs.n_x, lcs.n_u, lcs.n_x), strict=True))
+@dataclass
+class _Transitions(Solver):
+    """A, B, C, d, D, E, F, c, x, u, x_next → the loss of each transition, or its mean; in C++.
 
+    The inner problem over z = (λ, φ) ≥ 0 is to minimise ½ zᵀQz + qᵀz, whose optimality is the LCP (Q, q):
 
-def _check_numbers(lcs: LCSModel | LCSParams, system: tuple[Tensor, ...], data: tuple[Tensor, ...]) -> None:
-    lcs.check_inputs(**dict(zip(("x", "u", "x_next"), data, strict=True)))
-    for name, value in zip(SYSTEM, system, strict=True):
-        check_tensor(name, value)
+        Q = [[CᵀC + FᵀF/(γξ), (I − Fᵀ/γ)/ξ], [·, I/(γξ)]],  q = (Cᵀr + Fᵀe/(γξ), −e/(γξ)) with r and e at z = 0.
 
+    Eliminating φ leaves CᵀC + (F + Fᵀ − γI)/ξ, positive definite for γ < σ_min(F + Fᵀ). The pullback is the envelope
+    theorem: the derivative of the objective with z fixed. r and e are linear in every input.
 
-class _ViolationLoss(torch.autograd.Function):
-    """The loss of A, B, C, d, D, E, F, c and x, u, x_next (B, ·), then G and H if F is their function.
-
-    The mathematics is that of `Transitions`, in C++ for a system that all transitions share.
+    Attributes:
+        xi: ξ.
+        gamma: γ; None: it is one more input, which has no gradient.
+        mean: whether to return the mean, where no transform adds dimensions to the batch. Otherwise autograd would take
+            its two steps.
+        factored: whether G and H, of which F is made, are two more inputs, and get the gradient in its place.
+        arrays, minimiser: the inputs of the kernels, and z, r and e at the minimum; once it is solved.
     """
 
-    @staticmethod
-    def forward(ctx, lcs: LCSModel | LCSParams, mean: bool, gamma: float, xi: float, *tensors: Tensor):
-        from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
+    xi: float
+    gamma: float | None
+    mean: bool = False
+    factored: bool = False
+    arrays: list[np.ndarray] | None = field(init=False, default=None)
+    minimiser: tuple[np.ndarray, np.ndarray, np.ndarray] = field(init=False)
 
-        A, B, _, _, D, E, F, c, x, u, x_next = tensors[:11]
-        arrays = [v.numpy(force=True) for v in tensors[:11]]
-        count, n = len(x), len(c)
-        Q, q, z = np.empty((2 * n, 2 * n)), np.empty((count, 2 * n)), np.empty((count, 2 * n))
-        r, e, loss = np.empty(x.shape), np.empty((count, n)), np.empty(count)
+    name = "violation_loss"
+    differentiable = 1
+    keeps = True
+
+    @property
+    def ranks(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return (*_RANKS, *((0,) if self.gamma is None else (2, 2) if self.factored else ()))
+
+    def solve(self, tensors: Sequence[Tensor], transformed: bool) -> tuple[Tensor, ...]:
+        arrays = self._arrays(tensors)
+        x, c = arrays[8], arrays[7]
+        count, n = len(x), c.shape[-1]
+        shared = self.factored or (
+            not arrays[11].ndim and all([a.ndim == rank for a, rank in zip(arrays[:8], _RANKS, strict=False)])
+        )
+        Q = np.empty((2 * n, 2 * n) if shared else (count, 2 * n, 2 * n))
+        q, z, r = np.empty((count, 2 * n)), np.empty((count, 2 * n)), np.empty(x.shape)
+        e, loss = np.empty((count, n)), np.empty(count)
         limit, threads = MAX_ITER["exact"], torch.get_num_threads()
-        held = _kernels.violation_loss(arrays, gamma, xi, limit, threads, Q, q, z, r, e, loss)
-        if held is None:
+        lost = _kernels.violation_loss(arrays, self.xi, limit, threads, Q, q, z, r, e, loss)
+        if lost is None:
             # A number that is not finite, a γ at or above its bound, or an empty batch.
-            _check_numbers(lcs, tensors[:8], (x, u, x_next))
-            check_gamma_range(F.detach().cpu().double().numpy(), gamma)
+            for name, tensor in zip((*SYSTEM, "x", "u", "x_next"), tensors, strict=False):
+                check_tensor(name, tensor)
+            check_gamma_range(arrays[6].astype(np.float64), arrays[11])
             z = minimise_over_orthant(Q, q)
-            held = _kernels.violation_value(arrays, gamma, xi, z, r, e, loss)
-        if not held:
+            lost = _kernels.violation_value(arrays, self.xi, z, r, e, loss)
+        if lost >= 0:
+            rate = float(np.broadcast_to(arrays[11], count)[lost])
             raise GammaError(
-                f"gamma, xi: expected a product that double precision resolves for these data, got {gamma:.3g} and "
-                f"{xi:.3g}: e/(gamma xi) has lost the digits of the gradient; raise xi or gamma"
+                f"gamma, xi: expected a product that double precision resolves for these data, got {rate:.3g} and "
+                f"{self.xi:.3g}: e/(gamma xi) has lost the digits of the gradient at batch index {lost}; raise xi or "
+                f"gamma"
             )
-        ctx.mean, ctx.solution = mean, (arrays, gamma, xi, z, r, e)
-        # The arrays look into these tensors; autograd refuses them where they were changed in place.
-        x_needs, u_needs = ctx.needs_input_grad[12:14]
-        ctx.save_for_backward(x, u, *tensors[11:12], *((A, B, D, E) if x_needs or u_needs else ()))
+        self.arrays, self.minimiser = None if transformed else arrays, (z, r, e)
         value = torch.from_numpy(loss)
-        # The mean of an empty batch is zero, not NaN: no data, no loss, no gradient.
-        return (value.sum() / max(count, 1) if mean else value).to(x)
+        return ((value.sum() / max(count, 1) if self.mean else value).to(tensors[8]),)
 
-    @staticmethod
-    def backward(ctx, *grads):
-        if is_wrapped(grads[0]) or torch.is_grad_enabled():
-            return _pull_back_transformed(ctx, grads[0])
-        from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
-
-        x, _, *rest = ctx.saved_tensors
-        arrays, gamma, xi, z, r, e = ctx.solution
-        upstream = grads[0].numpy(force=True)
-        if ctx.mean:
-            upstream = np.full(len(z), upstream / max(len(z), 1))
-        # Envelope theorem: derivative of the objective with z fixed. r and e are linear in every input.
-        system = [np.empty(v.shape) for v in arrays[:8]]
-        needs = zip(arrays[8:], ctx.needs_input_grad[12:15], strict=True)
-        data = [np.empty(v.shape) if need else None for v, need in needs]
-        _kernels.violation_gradient(arrays, gamma, xi, z, r, e, upstream, [*system, *data])
-        gradients = [*system, *data]
-        if len(ctx.needs_input_grad) > 15:  # F = G Gᵀ + stiffness·I + H − Hᵀ
-            F_bar, G = system[6], rest[0].numpy(force=True)
+    def pullback(
+        self,
+        tensors: Sequence[Tensor],
+        outputs: Sequence[Tensor],
+        grads: Sequence[Tensor | None],
+        needs: Sequence[bool],
+    ) -> Sequence[Tensor | None]:
+        # Under a transform, inputs that were shared in the solve may now be of each element.
+        arrays = self._arrays(tensors) if self.arrays is None else self.arrays
+        (upstream,) = grads
+        assert upstream is not None
+        bar = upstream.numpy(force=True)
+        if self.mean:  # one number for all
+            bar = np.asarray(bar / max(len(arrays[8]), 1))
+        gradients: list[Any] = [np.empty(v.shape) if i < 8 or needs[i] else None for i, v in enumerate(arrays[:11])]
+        _kernels.violation_gradient(arrays, self.xi, *self.minimiser, bar, [*gradients, None])
+        if self.factored:  # F = G Gᵀ + stiffness·I + H − Hᵀ
+            F_bar, G = gradients[6], tensors[11].numpy(force=True)
             gradients += [(F_bar + F_bar.T) @ G, F_bar - F_bar.T]
-        return (None,) * 4 + tuple(g if g is None else torch.from_numpy(g).to(x) for g in gradients)
+        found = [None if g is None else torch.from_numpy(g) for g in gradients]
+        return found if len(found) == len(tensors) else [*found, None]
+
+    def _arrays(self, tensors: Sequence[Tensor]) -> list[np.ndarray]:
+        """The inputs of the kernels."""
+        arrays = [v.numpy(force=True) for v in tensors[:11]]
+        return [*arrays, tensors[11].numpy(force=True) if self.gamma is None else np.array(self.gamma)]
 
 
-def _pull_back_transformed(ctx, upstream: Tensor):
-    """The gradient for an upstream that a transform wraps: NumPy's, of as many problems as it has. None to record."""
-    x, _, *rest = ctx.saved_tensors
-    arrays, gamma, xi, z, r, e = ctx.solution
-    count = len(z)
-    if ctx.mean:
-        upstream = (upstream / max(count, 1)).expand(count)
-    tensors = [*(torch.from_numpy(v) for v in arrays), torch.tensor(gamma, dtype=torch.float64)]
-    outputs = [torch.empty(count, dtype=torch.float64), *(torch.from_numpy(v) for v in (z, r, e))]
-    gradients = list(pull_back(Transitions(xi), tensors, outputs, [upstream], [True] * 12))[:11]
-    if len(ctx.needs_input_grad) > 15:  # F = G Gᵀ + stiffness·I + H − Hᵀ
-        F_bar = gradients[6]
-        assert F_bar is not None
-        gradients += [(F_bar + F_bar.mT) @ rest[0].detach().double(), F_bar - F_bar.mT]
-    return (None,) * 4 + tuple(g if g is None else g.to(x) for g in gradients)
+# --- the range of γ, and inner problems at its end --------------------------------------------------------------------
+
+
+def largest_gamma(F: Tensor) -> Tensor:
+    """`_AUTO` times the smallest σ_min(F + Fᵀ) of all F (..., n, n), detached; float64, no dimensions."""
+    F = F.detach().double()
+    if not F.numel():
+        return torch.ones((), dtype=torch.float64, device=F.device)  # nothing limits it
+    return _AUTO * torch.linalg.eigvalsh(F + F.mT)[..., 0].amin()
+
+
+def check_gamma_range(F: np.ndarray, gamma: float | np.ndarray) -> None:
+    """Refuse γ (...) outside its range for F (..., n, n), and F that is not positive definite."""
+    n, gamma = F.shape[-1], np.asarray(gamma, np.float64)
+    # FᵀF/γ stands beside F + Fᵀ in the inner QP: their difference has to survive the rounding.
+    least = _GAMMA_LEAST * n * (F * F).sum(-2).max(-1)  # times 1/σ_min
+    smallest = np.linalg.eigvalsh(F + F.swapaxes(-1, -2))[..., 0]
+
+    def refuse(bad: np.ndarray, kind: type[Exception], message: str, *numbers: np.ndarray) -> None:
+        if not bad.any():
+            return
+        i = int(bad.argmax())
+        values = (float(np.broadcast_to(v, bad.shape).reshape(-1)[i]) for v in numbers)
+        raise kind(message.format(*values, where=f" at batch index {i}" if bad.ndim else ""))
+
+    refuse(
+        smallest <= 0,
+        NotPositiveDefiniteError,
+        "F: expected F + Fᵀ positive definite, got smallest eigenvalue {:.3e}{where}; raise the model's stiffness",
+        smallest,
+    )
+    # The bound itself is allowed; a relative 1e-9 forgives the rounding of the eigenvalue.
+    refuse(
+        (gamma <= 0) | (gamma > smallest * (1 + 1e-9)),
+        GammaError,
+        "gamma: expected 0 < gamma <= sigma_min(F + F^T) = {:.6g}, got {:.6g}{where}; lower gamma, raise the model's "
+        "stiffness (sigma_min >= 2*stiffness), or take gamma='auto'",
+        smallest,
+        gamma,
+    )
+    refuse(
+        gamma < least / smallest,
+        GammaError,
+        "gamma: expected at least {:.3g} for this F in double precision, got {:.3g}{where}; raise gamma, or the "
+        "model's stiffness",
+        least / smallest,
+        gamma,
+    )
+
+
+def minimise_over_orthant(Q: np.ndarray, q: np.ndarray, max_iter: int = 500) -> np.ndarray:
+    """Minimise ½ zᵀQz + qᵀz over z ≥ 0 for each row of q (B, m), with Q ⪰ 0 up to its rounding.
+
+    Q is (m, m), shared by all rows, or (B, m, m).
+    """
+    unit = 1 / np.sqrt(np.diagonal(Q, axis1=-2, axis2=-1))  # of each variable, so that Q has a unit diagonal
+    Q, q = unit[..., :, None] * Q * unit[..., None, :], q * unit
+    smallest = np.linalg.eigvalsh(Q)[..., 0]
+    convex = smallest > 1e-13
+    if convex.all():
+        return _solved(Q, q) * unit
+    if convex.any():  # one after the other: each has its own matrix
+        z = np.empty_like(q)
+        for part in (convex, ~convex):
+            z[part] = minimise_over_orthant(Q[part], q[part], max_iter)
+        return z * unit
+    # γ at its bound: Q is singular. Proximal steps z ← argmin ½zᵀQz + qᵀz + ½ρ‖z − z₋‖² decrease the objective
+    # monotonically, and each is an LCP with a positive definite matrix.
+    rho = np.maximum(1e-6, -1.1 * smallest)
+    proximal = Q + rho[..., None, None] * np.eye(Q.shape[-1])
+    z = np.zeros_like(q)
+    for _ in range(max_iter):
+        step = _solved(proximal, q - rho[..., None] * z)
+        change = np.abs(step - z).max(initial=0.0)
+        z = step
+        if rho.max(initial=0.0) * change <= 1e-10 * np.abs(q).max(initial=0.0):
+            return z * unit
+    return z * unit
+
+
+def _solved(Q: np.ndarray, q: np.ndarray) -> np.ndarray:
+    z, _, status = solve_lcp_arrays(Q, q)
+    failed = np.flatnonzero(status != Status.CONVERGED)
+    if len(failed):
+        raise SolveError(
+            f"violation_loss: the inner QP failed on {len(failed)} of {len(status)} transitions (first: {failed[0]}); "
+            f"check the scale of the data and of the parameters",
+            failed.tolist(),
+            status[failed].tolist(),
+        )
+    return z

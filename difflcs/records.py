@@ -19,7 +19,7 @@ from difflcs._checks import (
     check_tensor,
     describe,
 )
-from difflcs._functorch import runs_eagerly
+from difflcs._differentiation import runs_eagerly
 from difflcs._linalg import matvec
 from difflcs._modules import fresh
 from difflcs.errors import BatchIndexError, DTypeError, InvalidInputError, ShapeError

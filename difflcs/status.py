@@ -6,7 +6,7 @@ from enum import IntEnum
 
 from torch import Tensor
 
-from difflcs._functorch import is_wrapped
+from difflcs._differentiation import is_wrapped
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 
 _CODES = _kernels.status_codes()

@@ -15,8 +15,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from difflcs import _files, zoo
+from difflcs import zoo
 from difflcs.errors import CheckpointError, DiffLCSError
+from difflcs.rl import write_atomically
 from difflcs.rl.methods import DEFAULT_METHOD
 from difflcs.rl.runs.checkpoint import RunDirectory
 from difflcs.rl.runs.training import TrainConfig, stored_config
@@ -49,8 +50,11 @@ def add(run: Path | str, *, force: bool = False, root: Path = zoo.MODELS) -> zoo
     card = _card(directory, config, name)
     if (root / name).exists() and not force:
         raise CheckpointError(f"{root / name}: expected no model of that name, got one; replace it with --force")
-    _files.save_record(root / name, config.method.kind, *directory.learned(config.method.kind))
-    _files.write_json(root / name / "card.json", asdict(card))
+    directory.learned(config.method.kind)  # complete and undamaged
+    files = {file: (directory.model / file).read_bytes() for file in ("config.json", "model.safetensors")}
+    files["card.json"] = (json.dumps(asdict(card), indent=2, sort_keys=True) + "\n").encode()
+    for file, content in files.items():
+        write_atomically(root / name / file, content)
     return card
 
 

@@ -12,8 +12,7 @@ import pandas as pd
 import torch
 from units import Unit
 
-from difflcs._files import write_atomically
-from difflcs.rl import Evaluation, RunDirectory, evaluate, get_task, load_policy
+from difflcs.rl import Evaluation, RunDirectory, evaluate, get_task, load_policy, write_atomically
 from difflcs.rl.runs.checkpoint import load_checkpoint
 from difflcs.rl.runs.training import EVALUATION_ENVS, Reporter, TrainConfig, goals_due, saved_bounds
 

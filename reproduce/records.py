@@ -15,8 +15,8 @@ from typing import Any
 import filelock
 import pandas as pd
 
-from difflcs._files import write_atomically
 from difflcs.errors import CheckpointError
+from difflcs.rl import write_atomically
 
 RESULTS = Path(__file__).parent / "results"
 COLUMNS: dict[Hashable, Any] = {

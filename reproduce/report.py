@@ -17,8 +17,8 @@ from records import Cell
 from stats import IQM, Estimate, bootstrap, p_value, wilson
 from units import PRESETS
 
-from difflcs._files import write_atomically
 from difflcs.errors import CheckpointError
+from difflcs.rl import write_atomically
 
 README = Path(__file__).parent / "README.md"
 NAMES = {"lcs-rl": "LCS-RL", "violation": "violation only", "ppo": "PPO without warm-up", "pddm": "PDDM"}

@@ -21,10 +21,9 @@ from runs import check_amounts, command_line
 from stats import bootstrap, wilson
 from torch import Tensor
 
-from difflcs._files import read_json, write_json
 from difflcs.cli.bench import machine
 from difflcs.errors import CheckpointError
-from difflcs.rl import TaskSpec, TrainedPolicy, collect, get_task
+from difflcs.rl import TaskSpec, TrainedPolicy, collect, get_task, write_atomically
 from difflcs.rl.rollout import Act, mpc_actions
 from difflcs.rl.runs.delay import delay_actions, make_predictor
 from difflcs.rl.seeding import Stream, episode_seeds
@@ -129,7 +128,8 @@ def compute(options: Options, path: Path, say: Callable[[str], object] = print) 
     if options.smoke:
         found = [one for one in found if one.group in ("", "noise") or one.delay == 1]
     asked = {"model": str(options.model), "goals": options.goals, "seed": options.seed, "object": dict(described)}
-    record: Any = read_json(path) if path.exists() else {"options": asked, "machine": machine(), "results": []}
+    new = {"options": asked, "machine": machine(), "results": []}
+    record: Any = json.loads(path.read_text()) if path.exists() else new
     if record["options"] != asked:
         raise CheckpointError(
             f"{path}: expected a record of {asked}, got one of {record['options']}; pass another --results, or "
@@ -141,7 +141,7 @@ def compute(options: Options, path: Path, say: Callable[[str], object] = print) 
             row = measure(condition, task, policy, options.goals, options.seed)
             record["results"].append(row)
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_json(path, json.loads(json.dumps(record)))
+            write_atomically(path, (json.dumps(record, indent=2, sort_keys=True) + "\n").encode())
             say(f"{condition.group} {condition.name}: {100 * np.mean(list(map(int, row['reached']))):.1f} %")
 
 
@@ -199,7 +199,7 @@ def draw_record(options: Options) -> int:
         compute(options, path)
     if not path.exists():
         raise CheckpointError(f"{path}: expected a record, found none; make it: python reproduce/robustness.py --rerun")
-    record: Any = read_json(path)
+    record: Any = json.loads(path.read_text())
     if record["options"]["model"] != str(options.model):
         raise CheckpointError(
             f"{path}: expected a record of {options.model}, got one of {record['options']['model']}; measure it with "

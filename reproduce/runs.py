@@ -31,8 +31,8 @@ from rich.progress import Progress, TaskID, TimeElapsedColumn
 from units import Artefact, Method, Object, Preset, PresetName, Unit
 from worker import Files, Job
 
-from difflcs._files import write_atomically
 from difflcs.errors import DiffLCSError, InvalidInputError
+from difflcs.rl import write_atomically
 
 if TYPE_CHECKING:
     from distributed import Client

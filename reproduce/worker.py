@@ -17,8 +17,8 @@ import units
 from deployment import Deployments
 from units import Preset, Unit
 
-from difflcs._files import write_atomically
 from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs.rl import write_atomically
 
 Files = Mapping[str, bytes]
 """Path within a folder → content."""

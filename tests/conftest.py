@@ -162,23 +162,7 @@ def _values(value: object, path: tuple = ()) -> Iterator[tuple]:
         yield from _values(part, (*path, key))
 
 
-_WRONG_VALUES = (
-    None,
-    True,
-    -1,
-    1.5,
-    -1.5,
-    10**30,
-    -(10**30),
-    "x",
-    [],
-    [-1],
-    [True],
-    ["x"],
-    [10**30],
-    {},
-    {"state": {}},
-)
+_WRONG = (None, True, -1, 1.5, -1.5, 10**30, -(10**30), "x", [], [-1], [True], ["x"], [10**30], {}, {"state": {}})
 
 
 def _wrong_tensors(tensor: Tensor) -> Iterator[Tensor]:
@@ -208,7 +192,7 @@ def _hostile(state: Any) -> Iterator[tuple[bool, Any]]:
         return unflatten(tensors, copy)
 
     for path in list(_values(rest))[1:]:
-        for value in _WRONG_VALUES:
+        for value in _WRONG:
             yield False, changed(path, lambda part, key, value=value: part.__setitem__(key, value))
         yield False, changed(path, lambda part, key: part.pop(key))
         yield False, changed((*path[:-1], "another"), lambda part, key: part.__setitem__(key, 1))

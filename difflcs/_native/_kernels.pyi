@@ -7,6 +7,7 @@ def mpc_fields() -> dict[str, tuple[str, ...]]: ...
 def mpc_stages() -> dict[str, str]: ...
 def violation_fields() -> dict[str, tuple[str, ...]]: ...
 def status_codes() -> dict[str, int]: ...
+def tolerances() -> dict[str, float]: ...
 def all_finite(arrays: list[np.ndarray]) -> bool: ...
 def solve_lcp(
     F: np.ndarray,
@@ -66,7 +67,6 @@ def vjp_mpc(
 ) -> None: ...
 def violation_loss(
     inputs: list[np.ndarray],
-    gamma: float,
     xi: float,
     max_iter: int,
     threads: int,
@@ -76,19 +76,17 @@ def violation_loss(
     r: np.ndarray,
     e: np.ndarray,
     loss: np.ndarray,
-) -> bool | None: ...
+) -> int | None: ...
 def violation_value(
     inputs: list[np.ndarray],
-    gamma: float,
     xi: float,
     z: np.ndarray,
     r: np.ndarray,
     e: np.ndarray,
     loss: np.ndarray,
-) -> bool: ...
+) -> int: ...
 def violation_gradient(
     inputs: list[np.ndarray],
-    gamma: float,
     xi: float,
     z: np.ndarray,
     r: np.ndarray,

@@ -63,8 +63,13 @@ int step(Guarded& self, Array x, std::optional<Array> targets, bool follow, Outp
 nb::dict sizes(const Guarded& self) {
   const difflcs::ControllerData& d = self.controller.data();
   nb::dict found;
-  found["n_x"] = d.n_x, found["n_u"] = d.n_u, found["n_lam"] = d.n_lam, found["n_c"] = d.n_c;
-  found["n_goal"] = d.n_goal, found["horizon"] = d.horizon, found["step_seconds"] = d.step_seconds;
+  found["n_x"] = d.n_x;
+  found["n_u"] = d.n_u;
+  found["n_lam"] = d.n_lam;
+  found["n_c"] = d.n_c;
+  found["n_goal"] = d.n_goal;
+  found["horizon"] = d.horizon;
+  found["step_seconds"] = d.step_seconds;
   found["isa"] = self.controller.kernels().isa;
   return found;
 }

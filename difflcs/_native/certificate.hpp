@@ -1,5 +1,5 @@
 // The certificate of an MPC solution: every optimality condition, recomputed from the numbers returned, in the caller's
-// units. difflcs/mpc/kkt.py derives the conditions and states the measure (`residual`); the names here are the names
+// units. difflcs/mpc/conditions.py states the measure (`residual`), kkt.py derives it; the names here are the names
 // there. It shares nothing with the solver but the elimination of one small matrix, whose result it checks.
 #pragma once
 #include "kernels.hpp"
@@ -12,10 +12,10 @@ namespace difflcs::DIFFLCS_ISA {
 namespace {
 
 // T is the type of a matrix entry: double where the batch shares all matrices, else Vec.
-template <class T, class S>
+template <class T>
 struct Certificate {
   const MpcBatch& batch;
-  const S n;
+  const AnySizes n;
   Steps<T> matrix[kInputs];    // as the caller gave them: matrices here,
   Steps<Vec> vector[kInputs];  // vectors here
   Steps<T> rest;
@@ -23,9 +23,10 @@ struct Certificate {
   T *A, *B, *C, *D, *E, *F, *Q, *R, *cross, *G_x, *G_u;
   Vec *d, *c, *q, *r, *lo, *hi;
   Vec *x, *u, *lam, *mu, *gap, *s, *p, *pn, *y, *rho, *error, *N, *largest_action;
-  // Sizes of all states, and at a stage of costates and of what they make of rho (kkt.py: `sizes`); terms of both.
+  // Sizes of all states, and at a stage of costates and of what they make of rho (conditions.py: `sizes`); terms of
+  // both.
   Vec *x_size, *p_size, *rho_size, *p_terms, *rho_terms, *terms, *grown;
-  Vec* moved;  // what the ranges of the actions before make of each state
+  Vec* moved;                         // what the ranges of the actions before make of each state
   Vec *row, *row_terms, *row_missed;  // values of the constraints; of each the largest over the stages
   Mask* rows;
 
@@ -33,7 +34,6 @@ struct Certificate {
 
   void layout(Arena& arena) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nc = n.c(), h = n.h;
-    auto take = [&](auto*& to, int64_t count) { arena.take(to, count); };
     for (int i = 0; i < kInputs; i++) {
       const Field& field = kMpcFields[i];
       const int64_t stages = batch.step[i] == 0 ? 1 : stages_of(batch, field);
@@ -43,12 +43,16 @@ struct Certificate {
         arena.take(matrix[i], stages, extent(batch, field));
     }
     arena.take(rest, h, nu);
-    take(x, (h + 1) * nx), take(u, h * nu), take(lam, h * nl), take(mu, (h + 1) * nc), take(gap, h * nl);
-    take(p, nx), take(pn, nx), take(y, nl), take(rho, nl), take(error, nl), take(N, nl * nl), take(rows, nl),
-        take(largest_action, nu);
-    take(x_size, (h + 1) * nx), take(p_size, nx), take(rho_size, nl), take(p_terms, nx), take(rho_terms, nl);
-    take(terms, nx), take(grown, nx), take(moved, nc > 0 ? (h + 1) * nx : 0);
-    take(row, (h + 1) * nc), take(row_terms, nc), take(row_missed, nc);
+    arena.take_all((h + 1) * nx, x, x_size);
+    arena.take(u, h * nu);
+    arena.take_all(h * nl, lam, gap);
+    arena.take_all((h + 1) * nc, mu, row);
+    arena.take_all(nx, p, pn, p_size, p_terms, terms, grown);
+    arena.take_all(nl, y, rho, error, rows, rho_size, rho_terms);
+    arena.take(N, nl * nl);
+    arena.take(largest_action, nu);
+    arena.take(moved, nc > 0 ? (h + 1) * nx : 0);
+    arena.take_all(nc, row_terms, row_missed);
     if constexpr (kShared<T>)
       if (arena.memory) load_matrices(0, 0);
   }
@@ -74,10 +78,22 @@ struct Certificate {
   void enter(int64_t k) {
     G_x = matrix[kG_x][k];
     if (k == n.h) return;
-    A = matrix[kA][k], B = matrix[kB][k], C = matrix[kC][k], D = matrix[kD][k], E = matrix[kE][k], F = matrix[kF][k];
-    Q = matrix[kQ][k], R = matrix[kR][k], cross = matrix[kS][k], G_u = matrix[kG_u][k];
-    d = vector[kd][k], c = vector[kc][k], q = vector[kq][k], r = vector[kr][k];
-    lo = vector[ku_min][k], hi = vector[ku_max][k];
+    A = matrix[kA][k];
+    B = matrix[kB][k];
+    C = matrix[kC][k];
+    D = matrix[kD][k];
+    E = matrix[kE][k];
+    F = matrix[kF][k];
+    Q = matrix[kQ][k];
+    R = matrix[kR][k];
+    cross = matrix[kS][k];
+    G_u = matrix[kG_u][k];
+    d = vector[kd][k];
+    c = vector[kc][k];
+    q = vector[kq][k];
+    r = vector[kr][k];
+    lo = vector[ku_min][k];
+    hi = vector[ku_max][k];
   }
 
   // Largest residual so far; what is not a number is infinite.
@@ -89,7 +105,10 @@ struct Certificate {
   // A sum, and the sum of the sizes of its terms.
   struct Sum {
     Vec value, terms;
-    void add(Vec term) { value += term, terms += abs(term); }
+    void add(Vec term) {
+      value += term;
+      terms += abs(term);
+    }
     Vec relative() const { return abs(value) / select(terms > 0, terms, all(1)); }
   };
 
@@ -105,7 +124,8 @@ struct Certificate {
       for (int64_t j = 0; j < nl; j++) sum.add(F[j * nl + i] * rho[j]);
       error[i] = -sum.value;
       const Vec part = sum.relative();
-      largest = max(largest, part), not_a_number += 0.0 * part;
+      largest = max(largest, part);
+      not_a_number += 0.0 * part;
     }
     return largest + not_a_number;
   }
@@ -153,8 +173,10 @@ struct Certificate {
       if constexpr (!kShared<T>) load_matrices(e, l);
       for (int i = 0; i < kInputs; i++)
         if (kMpcFields[i].columns == Size::one) load(vector[i], i, e, l);
-      load(x, o.x + e * (h + 1) * nx, (h + 1) * nx, l), load(u, o.u + e * h * nu, h * nu, l);
-      load(lam, o.lam + e * h * nl, h * nl, l), load(mu, o.mu + e * (h + 1) * nc, (h + 1) * nc, l);
+      load(x, o.x + e * (h + 1) * nx, (h + 1) * nx, l);
+      load(u, o.u + e * h * nu, h * nu, l);
+      load(lam, o.lam + e * h * nl, h * nl, l);
+      load(mu, o.mu + e * (h + 1) * nc, (h + 1) * nc, l);
     }
     for (int64_t j = 0; j < nu; j++) {
       largest_action[j] = all(0);
@@ -173,9 +195,11 @@ struct Certificate {
       for (int64_t j = 0; j < nx; j++) all_terms += abs(weights[i * nx + j] * x_size[h * nx + j]);
       for (int64_t m = 0; m < nc; m++) {
         const Vec fine = G_x[m * nx + i] * mu[h * nc + m];
-        t += fine, all_terms += abs(fine);
+        t += fine;
+        all_terms += abs(fine);
       }
-      p[i] = t, p_size[i] = p_terms[i] = all_terms;
+      p[i] = t;
+      p_size[i] = p_terms[i] = all_terms;
     }
     for (int64_t k = h - 1; k >= 0; k--) {
       enter(k);
@@ -185,19 +209,31 @@ struct Certificate {
       for (int64_t i = 0; i < nl; i++) {
         Vec row = all(0), by_size = all(0), by_terms = all(0);
         for (int64_t j = 0; j < nl; j++) row += abs(all(0) + F[i * nl + j]);
-        for (int64_t j = 0; j < nx; j++)
-          by_size += abs(C[j * nl + i] * p_size[j]), by_terms += abs(C[j * nl + i] * p_terms[j]);
+        for (int64_t j = 0; j < nx; j++) {
+          by_size += abs(C[j * nl + i] * p_size[j]);
+          by_terms += abs(C[j * nl + i] * p_terms[j]);
+        }
         const Vec answer = abs(lk[i] / (s[i] + lk[i] * row));
-        rho_size[i] = answer * by_size, rho_terms[i] = answer * by_terms;
+        rho_size[i] = answer * by_size;
+        rho_terms[i] = answer * by_terms;
       }
       for (int64_t j = 0; j < nu; j++) {
         Sum g{r[j], abs(r[j])};
         Vec whole = all(0);
         for (int64_t m = 0; m < nu; m++) g.add(R[j * nu + m] * uk[m]);
         if (batch.crossed)
-          for (int64_t i = 0; i < nx; i++) g.add(cross[i * nu + j] * xk[i]), whole += abs(cross[i * nu + j] * size[i]);
-        for (int64_t i = 0; i < nx; i++) g.add(B[i * nu + j] * p[i]), whole += abs(B[i * nu + j] * p_size[i]);
-        for (int64_t i = 0; i < nl; i++) g.add(E[i * nu + j] * rho[i]), whole += abs(E[i * nu + j] * rho_size[i]);
+          for (int64_t i = 0; i < nx; i++) {
+            g.add(cross[i * nu + j] * xk[i]);
+            whole += abs(cross[i * nu + j] * size[i]);
+          }
+        for (int64_t i = 0; i < nx; i++) {
+          g.add(B[i * nu + j] * p[i]);
+          whole += abs(B[i * nu + j] * p_size[i]);
+        }
+        for (int64_t i = 0; i < nl; i++) {
+          g.add(E[i * nu + j] * rho[i]);
+          whole += abs(E[i * nu + j] * rho_size[i]);
+        }
         for (int64_t m = 0; m < nc; m++) g.add(G_u[m * nu + j] * mk[m]);
         g.terms = max(g.terms, kCancelled * whole);
         action(k, j, uk[j], g);
@@ -206,22 +242,33 @@ struct Certificate {
         Sum sum{q[i], abs(q[i])};
         Vec along = all(0), through = all(0);
         for (int64_t j = 0; j < nx; j++) {
-          sum.value += Q[i * nx + j] * xk[j], sum.terms += abs(Q[i * nx + j] * size[j]);
-          sum.add(A[j * nx + i] * p[j]), along += abs(A[j * nx + i] * p_size[j]);
+          sum.value += Q[i * nx + j] * xk[j];
+          sum.terms += abs(Q[i * nx + j] * size[j]);
+          sum.add(A[j * nx + i] * p[j]);
+          along += abs(A[j * nx + i] * p_size[j]);
         }
-        for (int64_t j = 0; j < nl; j++) sum.add(D[j * nx + i] * rho[j]), through += abs(D[j * nx + i] * rho_terms[j]);
+        for (int64_t j = 0; j < nl; j++) {
+          sum.add(D[j * nx + i] * rho[j]);
+          through += abs(D[j * nx + i] * rho_terms[j]);
+        }
         if (batch.crossed)
           for (int64_t j = 0; j < nu; j++) sum.add(cross[i * nu + j] * uk[j]);
         for (int64_t m = 0; m < nc; m++) sum.add(G_x[m * nx + i] * mk[m]);
-        pn[i] = sum.value, terms[i] = sum.terms;
+        pn[i] = sum.value;
+        terms[i] = sum.terms;
         grown[i] = max(max(sum.terms, p_size[i]), kFurther * max(along, through));
       }
-      for (int64_t i = 0; i < nx; i++) p[i] = pn[i], p_size[i] = grown[i], p_terms[i] = terms[i];
+      for (int64_t i = 0; i < nx; i++) {
+        p[i] = pn[i];
+        p_size[i] = grown[i];
+        p_terms[i] = terms[i];
+      }
     }
     for (int l = 0; l < count; l++) {
       const int64_t e = elements[l];
       const double residual = poison[l] == 0 ? worst[l] : __builtin_inf();
-      o.residual[e] = residual, o.fragile[e] = fragile[l] != 0;
+      o.residual[e] = residual;
+      o.fragile[e] = fragile[l] != 0;
       if (solved(o.status[e]) && !(residual <= o.certified)) o.status[e] = int8_t(Status::numerical);
       if (weak[l] && o.status[e] == int8_t(Status::converged)) o.status[e] = int8_t(Status::degenerate);
     }
@@ -240,7 +287,10 @@ struct Certificate {
       for (int64_t i = 0; i < nx; i++) {
         Sum sum{d[i], abs(d[i])};
         Vec along = all(0), wide = all(0);
-        for (int64_t j = 0; j < nx; j++) sum.add(A[i * nx + j] * xk[j]), along += abs(A[i * nx + j] * size[j]);
+        for (int64_t j = 0; j < nx; j++) {
+          sum.add(A[i * nx + j] * xk[j]);
+          along += abs(A[i * nx + j] * size[j]);
+        }
         for (int64_t j = 0; j < nu; j++) sum.add(B[i * nu + j] * uk[j]);
         for (int64_t j = 0; j < nu && n.c() > 0; j++) wide += abs(B[i * nu + j] * width(k, j));
         if (n.c() > 0) moved[(k + 1) * nx + i] = wide;
@@ -262,16 +312,15 @@ struct Certificate {
     }
   }
 
-  Vec width(int64_t k, int64_t j) const {
-    return range(largest_action[j], vector[ku_min][k][j], vector[ku_max][k][j]);
-  }
+  Vec width(int64_t k, int64_t j) const { return range(largest_action[j], vector[ku_min][k][j], vector[ku_max][k][j]); }
 
   // Stationarity of one action with the reduced gradient g, and its bounds.
   void action(int64_t k, int64_t j, Vec at, Sum g) {
     const Vec below = at - lo[j], above = hi[j] - at;
     Vec width = hi[j] - lo[j];
     if (batch.barrier > 0) {
-      g.add(-batch.barrier / below), g.add(batch.barrier / above);
+      g.add(-batch.barrier / below);
+      g.add(batch.barrier / above);
       g.terms += 1e-8 * batch.barrier * width * (1.0 / (below * below) + 1.0 / (above * above));
     }
     const Mask fixed = width <= 0;
@@ -318,7 +367,7 @@ struct Certificate {
       for (int64_t i = 0; i < nc; i++) {
         Vec acts = all(k > 0);  // what nothing moves is not weakly active
         for (int64_t j = 0; j < nu && k == 0; j++) acts += abs(all(0) + G_u[i * nu + j]);
-        const Vec m = mu[k * nc + i], value = row[k * nc + i], close = 1e-5 * row_terms[i];
+        const Vec m = mu[k * nc + i], value = row[k * nc + i], close = kWeak * row_terms[i];
         const Mask at_zero = ~(m > 0) & (value >= -close),
                    at_price = (m >= kAtPrice * vector[kprice][k][i]) & (value <= close);
         weak |= (at_zero | at_price) & (acts > 0);

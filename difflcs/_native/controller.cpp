@@ -76,21 +76,34 @@ Controller::Controller(const void* bytes, size_t size)
       driver_(kernels_),
       time_limit_(std::numeric_limits<double>::infinity()) {
   const int64_t nx = data_.n_x, nu = data_.n_u, nl = data_.n_lam, nc = data_.n_c, h = data_.horizon;
-  x0_ = Numbers(nx), q_ = Numbers(h * nx), q_final_ = Numbers(nx), given_ = Numbers(nu);
+  x0_ = Numbers(nx);
+  q_ = Numbers(h * nx);
+  q_final_ = Numbers(nx);
+  given_ = Numbers(nu);
   found_ = {Numbers((h + 1) * nx), Numbers(h * nu), Numbers(h * nl), Numbers((h + 1) * nc)};
-  next_u_ = Numbers(h * nu), guess_u_ = Numbers(h * nu), guess_lam_ = Numbers(h * nl);
+  next_u_ = Numbers(h * nu);
+  guess_u_ = Numbers(h * nu);
+  guess_lam_ = Numbers(h * nl);
   guess_mu_ = Numbers((h + 1) * nc);
-  batch_.count = 1, batch_.n_x = nx, batch_.n_u = nu, batch_.n_lam = nl, batch_.n_c = nc, batch_.horizon = h;
-  batch_.relaxation = data_.relaxation, batch_.barrier = data_.barrier;
+  batch_.count = 1;
+  batch_.n_x = nx;
+  batch_.n_u = nu;
+  batch_.n_lam = nl;
+  batch_.n_c = nc;
+  batch_.horizon = h;
+  batch_.relaxation = data_.relaxation;
+  batch_.barrier = data_.barrier;
   for (int i = 0; i < kInputs; i++) {
     batch_.input[i] = data_.field[i].get();
     batch_.step[i] = data_.by_stage[i] ? extent(batch_, kMpcFields[i]) : 0;
   }
   batch_.input[kx0] = x0_.get();
-  look_at_inputs(batch_, data_.field[kS].count(), data_.field[ku_min].count(), data_.field[ku_max].count());
+  set_flags(batch_, data_.field[kS].count(), data_.field[ku_min].count(), data_.field[ku_max].count());
   int64_t needed = kernels_.mpc_workspace(batch_);
   if (data_.n_goal > 0) {
-    batch_.input[kq] = q_.get(), batch_.input[kq_final] = q_final_.get(), batch_.step[kq] = h > 1 ? nx : 0;
+    batch_.input[kq] = q_.get();
+    batch_.input[kq_final] = q_final_.get();
+    batch_.step[kq] = h > 1 ? nx : 0;
     needed = std::max(needed, kernels_.mpc_workspace(batch_));
   }
   driver_.reserve(batch_, std::max(data_.starts, data_.starts_guessed));
@@ -100,7 +113,8 @@ Controller::Controller(const void* bytes, size_t size)
 const Outcome& Controller::step(const double* x, const double* targets, bool follow, double* u) {
   const auto begun = Clock::now();
   const int64_t aims = data_.n_goal * (follow ? data_.horizon + 1 : 1);
-  outcome_ = Outcome{}, unfinished_ = false;
+  outcome_ = Outcome{};
+  unfinished_ = false;
   if (all_finite(x, data_.n_x) && all_finite(targets, aims)) {
     std::copy_n(x, data_.n_x, x0_.get());
     if (data_.n_goal > 0) aim(targets, follow);
@@ -169,13 +183,17 @@ void Controller::solve(Clock::time_point begun) {
   guessed_ = solved(status) || unfinished_;
   if (!guessed_) return;
   const int64_t h = data_.horizon;
-  shift(found_.u, h, guess_u_), shift(found_.lam, h, guess_lam_), shift(found_.mu, h + 1, guess_mu_);
+  shift(found_.u, h, guess_u_);
+  shift(found_.lam, h, guess_lam_);
+  shift(found_.mu, h + 1, guess_mu_);
 }
 
 // A step without a new plan: the guess is one for the next.
 void Controller::wait() {
   const int64_t h = data_.horizon;
-  shift(guess_u_, h, guess_u_), shift(guess_lam_, h, guess_lam_), shift(guess_mu_, h + 1, guess_mu_);
+  shift(guess_u_, h, guess_u_);
+  shift(guess_lam_, h, guess_lam_);
+  shift(guess_mu_, h + 1, guess_mu_);
 }
 
 // Makes what the solver gave up finite; returns whether it was.
@@ -206,7 +224,9 @@ double Controller::clipped(int64_t i, double value) const {
 }
 
 void Controller::reset() {
-  guessed_ = false, planned_ = 0, outcome_ = Outcome{};
+  guessed_ = false;
+  planned_ = 0;
+  outcome_ = Outcome{};
   for (const Numbers* values : {&found_.x, &found_.u, &found_.lam, &found_.mu})
     std::fill_n(values->get(), values->count(), 0.0);
 }

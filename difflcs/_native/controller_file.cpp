@@ -49,7 +49,8 @@ class Reader {
       refuse("expected " + std::to_string(whole) + " bytes, got " + std::to_string(size) + ": the file was cut");
     if (crc32(at_ + 16, size - 16) != little_endian(at_ + 12, 4))
       refuse("the checksum does not match: the file is damaged");
-    at_ += kHeader, left_ -= kHeader;
+    at_ += kHeader;
+    left_ -= kHeader;
   }
 
   // The doubles of the next entry, which has to be this one.
@@ -59,14 +60,16 @@ class Reader {
     if (left_ < kName + 8 || std::memcmp(at_, wanted, kName) != 0)
       refuse(std::string("expected the entry ") + name + ", got " + (left_ < kName + 8 ? "the end" : "another one"));
     const uint64_t count = little_endian(at_ + kName, 8);
-    at_ += kName + 8, left_ -= kName + 8;
+    at_ += kName + 8;
+    left_ -= kName + 8;
     if (count > left_ / 8) refuse(std::string(name) + ": expected its numbers, got the end of the file");
     Numbers numbers{int64_t(count)};
     for (uint64_t i = 0; i < count; i++) {
       const uint64_t bits = little_endian(at_ + 8 * i, 8);
       std::memcpy(numbers.get() + i, &bits, 8);
     }
-    at_ += 8 * count, left_ -= 8 * count;
+    at_ += 8 * count;
+    left_ -= 8 * count;
     return numbers;
   }
 
@@ -131,15 +134,23 @@ void check_limits(const ControllerData& data) {
 ControllerData read_controller(const void* bytes, size_t size) {
   Reader reader(bytes, size);
   ControllerData data{};
-  data.n_x = reader.size("n_x", 1), data.n_u = reader.size("n_u", 1), data.n_lam = reader.size("n_lam", 0);
-  data.n_c = reader.size("n_c", 0), data.horizon = reader.size("horizon", 1), data.n_goal = reader.size("n_goal", 0);
+  data.n_x = reader.size("n_x", 1);
+  data.n_u = reader.size("n_u", 1);
+  data.n_lam = reader.size("n_lam", 0);
+  data.n_c = reader.size("n_c", 0);
+  data.horizon = reader.size("horizon", 1);
+  data.n_goal = reader.size("n_goal", 0);
   constexpr double kSmallestNumber = std::numeric_limits<double>::min();
-  data.relaxation = reader.number("relaxation", kSmallestNumber), data.barrier = reader.number("barrier", 0);
-  data.tol = reader.number("tol", kSmallestNumber), data.certified = reader.number("certified", kSmallestNumber);
+  data.relaxation = reader.number("relaxation", kSmallestNumber);
+  data.barrier = reader.number("barrier", 0);
+  data.tol = reader.number("tol", kSmallestNumber);
+  data.certified = reader.number("certified", kSmallestNumber);
   data.homotopy = reader.number("homotopy", 0);
   data.shrink = reader.number("shrink", kSmallestNumber, 1 - 1e-12);
-  data.max_iter = reader.size("max_iter", 1, kLargestCount), data.seed = reader.size("seed", 0, kLargestCount);
-  data.starts = reader.size("starts", 1), data.starts_guessed = reader.size("starts_guessed", 1);
+  data.max_iter = reader.size("max_iter", 1, kLargestCount);
+  data.seed = reader.size("seed", 0, kLargestCount);
+  data.starts = reader.size("starts", 1);
+  data.starts_guessed = reader.size("starts_guessed", 1);
   data.step_seconds = reader.number("step_seconds", 0);
   for (int i = 0; i < kInputs; i++) {
     if (i == kx0) continue;
@@ -154,8 +165,10 @@ ControllerData read_controller(const void* bytes, size_t size) {
         refuse(std::string(field.name) + ": expected finite numbers, got another");
   }
   const int64_t map = data.n_x * data.n_goal, square = data.n_goal * data.n_goal;
-  data.goal_to_q = reader.take("goal_to_q", map), data.goal_to_q_final = reader.take("goal_to_q_final", map);
-  data.goal_stage = reader.take("goal_stage", square), data.goal_final = reader.take("goal_final", square);
+  data.goal_to_q = reader.take("goal_to_q", map);
+  data.goal_to_q_final = reader.take("goal_to_q_final", map);
+  data.goal_stage = reader.take("goal_stage", square);
+  data.goal_final = reader.take("goal_final", square);
   data.constant = reader.number("constant", -1e300);
   reader.end();
   check_limits(data);

@@ -16,31 +16,22 @@ void mpc_solve(const MpcBatch&, const MpcSolve&, int64_t*, void*, Watch);
 #define DIFFLCS_ALONE mpc_solve
 #endif
 
-#define DIFFLCS_KERNELS(ISA, LANES, ALONE)                                                                            \
-  namespace ISA {                                                                                                     \
-  int64_t lcp_workspace(int64_t);                                                                                     \
-  void lcp_solve(const LcpBatch&, int64_t, int64_t, void*, Watch);                                                    \
-  int64_t mpc_workspace(const MpcBatch&);                                                                             \
-  void mpc_solve(const MpcBatch&, const MpcSolve&, int64_t*, void*, Watch);                                           \
-  void mpc_constraints(const MpcBatch&, const MpcSolve&, int64_t, int64_t, void*, Watch);                             \
-  void mpc_vjp(const MpcBatch&, const MpcGradient&, int64_t, int64_t, int64_t, void*, Watch);                         \
-  int64_t violation_workspace(const ViolationBatch&);                                                                 \
-  bool violation_qp(const ViolationBatch&, double*, double*, void*);                                                  \
-  bool violation_value(const ViolationBatch&, const double*, double*, void*);                                         \
-  void violation_gradient(const ViolationBatch&, const double*, const double*, double* const*, void*);                \
-  static const Kernels table = {                                                                                      \
-      #ISA,    LANES, lcp_workspace,   lcp_solve, mpc_workspace,       mpc_solve,                                     \
-      ALONE,   mpc_constraints, mpc_vjp, violation_workspace, violation_qp, violation_value, violation_gradient};     \
+#define DIFFLCS_DECLARE(result, name, parameters) result name parameters;
+#define DIFFLCS_ENTRY(result, name, parameters) name,
+#define DIFFLCS_TABLE(ISA, LANES, ALONE)                                            \
+  namespace ISA {                                                                   \
+  DIFFLCS_KERNELS(DIFFLCS_DECLARE)                                                  \
+  static const Kernels table = {#ISA, LANES, DIFFLCS_KERNELS(DIFFLCS_ENTRY) ALONE}; \
   }
 
 #ifdef DIFFLCS_LANES_baseline
-DIFFLCS_KERNELS(baseline, DIFFLCS_LANES_baseline, mpc_solve)
+DIFFLCS_TABLE(baseline, DIFFLCS_LANES_baseline, mpc_solve)
 #endif
 #ifdef DIFFLCS_LANES_avx2
-DIFFLCS_KERNELS(avx2, DIFFLCS_LANES_avx2, DIFFLCS_ALONE)
+DIFFLCS_TABLE(avx2, DIFFLCS_LANES_avx2, DIFFLCS_ALONE)
 #endif
 #ifdef DIFFLCS_LANES_avx512
-DIFFLCS_KERNELS(avx512, DIFFLCS_LANES_avx512, DIFFLCS_ALONE)
+DIFFLCS_TABLE(avx512, DIFFLCS_LANES_avx512, DIFFLCS_ALONE)
 #endif
 
 static const Kernels& choose() {

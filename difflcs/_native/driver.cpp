@@ -62,8 +62,8 @@ double uniform(uint64_t seed, int64_t start, int64_t position) {
 }
 
 // Action `j` of stage `k` in a random pulse, in parts of the way from none to a bound: one way for at most the first
-// kPush of the horizon, the other way for at most kBrake of it, then none. A mass that is far is pushed and then stopped
-// so; actions that are random at every stage would cancel each other out.
+// kPush of the horizon, the other way for at most kBrake of it, then none. A mass that is far is pushed and then
+// stopped so; actions that are random at every stage would cancel each other out.
 constexpr double kPush = 0.6, kBrake = 0.4, kLeastPulse = 0.5;
 double pulse(uint64_t seed, int64_t start, int64_t j, int64_t k, int64_t horizon) {
   const auto random = [&](int64_t i) { return uniform(seed, start, 5 * j + i); };
@@ -88,11 +88,14 @@ struct Bound {
 };
 
 void copy_plan(const Sizes& n, const MpcPlans& from, int64_t i, const MpcPlans& to, int64_t j) {
-  std::copy_n(from.x + i * n.x, n.x, to.x + j * n.x), std::copy_n(from.u + i * n.u, n.u, to.u + j * n.u);
+  std::copy_n(from.x + i * n.x, n.x, to.x + j * n.x);
+  std::copy_n(from.u + i * n.u, n.u, to.u + j * n.u);
   std::copy_n(from.lam + i * n.lam, n.lam, to.lam + j * n.lam);
   std::copy_n(from.mu + i * n.mu, n.mu, to.mu + j * n.mu);
-  to.objective[j] = from.objective[i], to.residual[j] = from.residual[i];
-  to.status[j] = from.status[i], to.fragile[j] = from.fragile[i];
+  to.objective[j] = from.objective[i];
+  to.residual[j] = from.residual[i];
+  to.status[j] = from.status[i];
+  to.fragile[j] = from.fragile[i];
 }
 
 // An element that the time did not suffice for: the actions to start from, the state where it is, no forces.
@@ -100,9 +103,11 @@ void stay_at_start(const MpcBatch& b, const MpcGuess& guess, const MpcPlans& out
   const Sizes n(b);
   for (int64_t i = 0; i < n.u; i++) out.u[e * n.u + i] = Bound(b, e, i).clip(guess.u ? guess.u[e * n.u + i] : 0.0);
   for (int64_t i = 0; i < n.x; i++) out.x[e * n.x + i] = b.at(kx0, e)[i % b.n_x];
-  std::fill_n(out.lam + e * n.lam, n.lam, 0.0), std::fill_n(out.mu + e * n.mu, n.mu, 0.0);
+  std::fill_n(out.lam + e * n.lam, n.lam, 0.0);
+  std::fill_n(out.mu + e * n.mu, n.mu, 0.0);
   out.objective[e] = out.residual[e] = std::numeric_limits<double>::max();
-  out.status[e] = int8_t(Status::max_iter), out.fragile[e] = 0;
+  out.status[e] = int8_t(Status::max_iter);
+  out.fragile[e] = 0;
 }
 
 struct Solving {
@@ -112,12 +117,22 @@ struct Solving {
   int64_t next;
 };
 
-MpcSolve with(const MpcEffort& effort, const MpcPlans& out) {
+MpcSolve solver_options(const MpcEffort& effort, const MpcPlans& out) {
   MpcSolve o{};
-  o.shrink = effort.shrink, o.steps = kSteps, o.tol = effort.tol, o.max_iter = effort.max_iter;
+  o.shrink = effort.shrink;
+  o.steps = kSteps;
+  o.tol = effort.tol;
+  o.max_iter = effort.max_iter;
   o.certified = effort.certified;
-  o.x = out.x, o.u = out.u, o.lam = out.lam, o.mu = out.mu, o.objective = out.objective, o.residual = out.residual;
-  o.status = out.status, o.fragile = out.fragile, o.iterations = out.iterations;
+  o.x = out.x;
+  o.u = out.u;
+  o.lam = out.lam;
+  o.mu = out.mu;
+  o.objective = out.objective;
+  o.residual = out.residual;
+  o.status = out.status;
+  o.fragile = out.fragile;
+  o.iterations = out.iterations;
   return o;
 }
 
@@ -131,14 +146,21 @@ MpcStart beginning(const Start& s, const MpcBatch& b, const MpcEffort& effort) {
 
 MpcPlans shifted(const MpcBatch& b, MpcPlans p, int64_t by) {
   const Sizes n(b);
-  p.x += by * n.x, p.u += by * n.u, p.lam += by * n.lam, p.mu += by * n.mu, p.objective += by, p.residual += by;
-  p.status += by, p.fragile += by, p.iterations += by;
+  p.x += by * n.x;
+  p.u += by * n.u;
+  p.lam += by * n.lam;
+  p.mu += by * n.mu;
+  p.objective += by;
+  p.residual += by;
+  p.status += by;
+  p.fragile += by;
+  p.iterations += by;
   return p;
 }
 
 }  // namespace
 
-void look_at_inputs(MpcBatch& b, int64_t S, int64_t low, int64_t high) {
+void set_flags(MpcBatch& b, int64_t S, int64_t low, int64_t high) {
   const auto any = [&](Input which, int64_t count, auto test) {
     return std::any_of(b.input[which], b.input[which] + count, test);
   };
@@ -149,9 +171,16 @@ void look_at_inputs(MpcBatch& b, int64_t S, int64_t low, int64_t high) {
 
 void MpcDriver::Store::resize(const MpcBatch& batch, int64_t count) {
   const Sizes n(batch);
-  x.resize(count * n.x), u.resize(count * n.u), lam.resize(count * n.lam), mu.resize(count * n.mu);
+  x.resize(count * n.x);
+  u.resize(count * n.u);
+  lam.resize(count * n.lam);
+  mu.resize(count * n.mu);
   for (auto* v : {&objective, &residual, &gained}) v->resize(count);
-  status.resize(count), fragile.resize(count), iterations.resize(count), element.resize(count), start.resize(count);
+  status.resize(count);
+  fragile.resize(count);
+  iterations.resize(count);
+  element.resize(count);
+  start.resize(count);
 }
 
 MpcPlans MpcDriver::Store::plans() {
@@ -161,12 +190,16 @@ MpcPlans MpcDriver::Store::plans() {
 
 void MpcDriver::reserve(const MpcBatch& batch, int64_t starts) {
   const int64_t jobs = starts * batch.count;
-  tried.resize(batch, jobs), finished.resize(batch, jobs), best.reserve(batch.count), origin.reserve(jobs);
+  tried.resize(batch, jobs);
+  finished.resize(batch, jobs);
+  best.reserve(batch.count);
+  origin.reserve(jobs);
 }
 
 // One call of the kernel for every problem of a batch.
 void MpcDriver::run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner) const {
-  std::fill_n(solve.status, batch.count, kUnreached), std::fill_n(solve.iterations, batch.count, 0);
+  std::fill_n(solve.status, batch.count, kUnreached);
+  std::fill_n(solve.iterations, batch.count, 0);
   Solving context{kernels, batch, solve, 0};
   runner.run(
       batch.count, kernels.mpc_workspace(batch), false,
@@ -202,15 +235,16 @@ void MpcDriver::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEff
   for (int64_t first = 0; first < batch.count; first += chunk)
     (this->*way)(batch, guess, effort, out, runner, first, std::min(chunk, batch.count - first));
   for (const bool pivot : {false, true})
-    if (!runner.stopped()) again(batch, effort, out, runner, pivot);
-  if (batch.n_c > 0) judge_constraints(batch, with(effort, out), runner);
+    if (!runner.stopped()) retry_failed(batch, effort, out, runner, pivot);
+  if (batch.n_c > 0) judge_constraints(batch, solver_options(effort, out), runner);
 }
 
 // The first actions of a job: the best plan of its element so far is that of job `best`.
 void MpcDriver::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start, int64_t job, int64_t best) {
   const Sizes n(b);
   const Start s = start_of(start);
-  tried.start[job] = beginning(s, b, effort), tried.start[job].explore = s.explore;
+  tried.start[job] = beginning(s, b, effort);
+  tried.start[job].explore = s.explore;
   double* u = tried.u.data() + job * n.u;
   double largest = 1.0;
   for (int64_t i = 0; best >= 0 && i < n.u; i++) largest = std::max(largest, 1.0 + std::abs(tried.u[best * n.u + i]));
@@ -235,10 +269,15 @@ void MpcDriver::explore(const MpcBatch& batch, const MpcEffort& effort, Runner& 
                         bool guessed) {
   const Sizes n(batch);
   MpcBatch jobs = batch;
-  jobs.count = count, jobs.element = tried.element.data() + first;
-  MpcSolve o = with(effort, shifted(batch, tried.plans(), first));
-  o.u_start = o.u, o.start = tried.start.data() + first;
-  if (guessed) o.lam_start = o.lam, o.mu_start = o.mu;
+  jobs.count = count;
+  jobs.element = tried.element.data() + first;
+  MpcSolve o = solver_options(effort, shifted(batch, tried.plans(), first));
+  o.u_start = o.u;
+  o.start = tried.start.data() + first;
+  if (guessed) {
+    o.lam_start = o.lam;
+    o.mu_start = o.mu;
+  }
   o.gained = tried.gained.data() + first;
   run(jobs, o, runner);
 }
@@ -248,15 +287,20 @@ void MpcDriver::solve_once(const MpcBatch& batch, const MpcGuess& guess, const M
                            Runner& runner, int64_t first, int64_t count) {
   const Sizes n(batch);
   const MpcPlans to = shifted(batch, out, first);
-  tried.resize(batch, 0), tried.element.resize(count);
+  tried.resize(batch, 0);
+  tried.element.resize(count);
   tried.start.assign(count, guess.u ? at_target(batch) : beginning(start_of(0), batch, effort));
   for (int64_t e = 0; e < count; e++) tried.element[e] = batch.element ? batch.element[first + e] : first + e;
   MpcBatch jobs = batch;
-  jobs.count = count, jobs.element = tried.element.data();
-  MpcSolve o = with(effort, to);
+  jobs.count = count;
+  jobs.element = tried.element.data();
+  MpcSolve o = solver_options(effort, to);
   o.start = tried.start.data();
   if (guess.u) o.u_start = guess.u + first * n.u;
-  if (guess.lam) o.lam_start = guess.lam + first * n.lam, o.mu_start = guess.mu + first * n.mu;
+  if (guess.lam) {
+    o.lam_start = guess.lam + first * n.lam;
+    o.mu_start = guess.mu + first * n.mu;
+  }
   run(jobs, o, runner);
   for (int64_t e = 0; e < count; e++)
     if (to.status[e] == kUnreached) stay_at_start(jobs, {o.u_start, nullptr, nullptr}, to, e);
@@ -272,7 +316,8 @@ void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
   auto element = [&](int64_t e) { return batch.element ? batch.element[first + e] : first + e; };
 
   // Job s * count + e is start s of element e.
-  tried.resize(batch, starts * count), best.assign(count, -1);
+  tried.resize(batch, starts * count);
+  best.assign(count, -1);
   std::fill(tried.status.begin(), tried.status.end(), kUnreached);
   std::fill(tried.iterations.begin(), tried.iterations.end(), 0);
   for (int64_t j = 0; j < starts * count; j++) tried.element[j] = element(j % count);
@@ -285,7 +330,8 @@ void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
     for (int64_t j = begun * count; j < end * count; j++) {
       const int64_t e = j % count;
       if (from_guess) {
-        tried.start[j] = at_target(batch), tried.start[j].explore = kExplore;
+        tried.start[j] = at_target(batch);
+        tried.start[j].explore = kExplore;
         std::copy_n(guess.u + (first + e) * n.u, n.u, tried.u.data() + j * n.u);
         if (whole) std::copy_n(guess.lam + (first + e) * n.lam, n.lam, tried.lam.data() + j * n.lam);
         if (whole) std::copy_n(guess.mu + (first + e) * n.mu, n.mu, tried.mu.data() + j * n.mu);
@@ -312,8 +358,10 @@ void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
                        Runner& runner, int64_t first, int64_t count) {
   const Sizes n(batch);
   const int64_t all = effort.starts * count;
-  finished.resize(batch, all), origin.resize(all);
-  std::fill_n(out.status, count, kUnreached), std::fill_n(out.iterations, count, 0);
+  finished.resize(batch, all);
+  origin.resize(all);
+  std::fill_n(out.status, count, kUnreached);
+  std::fill_n(out.iterations, count, 0);
   const auto consider = [&](const MpcPlans& from, int64_t i, int64_t e, bool only_solved) {
     out.iterations[e] += from.iterations[i];
     const bool better = solved(from.status[i]) && (!solved(out.status[e]) || from.objective[i] < out.objective[e]);
@@ -325,13 +373,19 @@ void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
     for (int64_t j = 0; j < all; j++) {
       if (tried.status[j] == kUnreached || !wanted(j)) continue;
       copy_plan(n, tried.plans(), j, finished.plans(), kept);
-      origin[kept] = j, finished.element[kept] = tried.element[j], finished.start[kept] = at_target(batch);
+      origin[kept] = j;
+      finished.element[kept] = tried.element[j];
+      finished.start[kept] = at_target(batch);
       kept++;
     }
     MpcBatch jobs = batch;
-    jobs.count = kept, jobs.element = finished.element.data();
-    MpcSolve o = with(effort, finished.plans());
-    o.u_start = o.u, o.lam_start = o.lam, o.mu_start = o.mu, o.start = finished.start.data();
+    jobs.count = kept;
+    jobs.element = finished.element.data();
+    MpcSolve o = solver_options(effort, finished.plans());
+    o.u_start = o.u;
+    o.lam_start = o.lam;
+    o.mu_start = o.mu;
+    o.start = finished.start.data();
     if (kept) run(jobs, o, runner);
     for (int64_t i = 0; i < kept; i++) consider(finished.plans(), i, origin[i] % count, false);
   };
@@ -368,7 +422,8 @@ bool MpcDriver::promising(const MpcBatch& batch, int64_t job, int64_t best) cons
 
 // Solves the elements that failed (one in a thousand) once more, from no action along a longer homotopy; then, where
 // the numbers broke down and not the patience, with row exchanges in the elimination of the forces.
-void MpcDriver::again(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, bool pivot) {
+void MpcDriver::retry_failed(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner,
+                             bool pivot) {
   const Sizes n(batch);
   origin.clear();
   for (int64_t e = 0; e < batch.count; e++) {
@@ -383,9 +438,12 @@ void MpcDriver::again(const MpcBatch& batch, const MpcEffort& effort, const MpcP
     tried.start[i] = {false, false, 0.0, batch.relaxation * kLonger * std::max(effort.homotopy / 100.0, 1.0)};
   }
   MpcBatch jobs = batch;
-  jobs.count = count, jobs.element = tried.element.data(), jobs.pivot = pivot;
-  MpcSolve o = with(effort, tried.plans());
-  o.start = tried.start.data(), o.steps = kStepsAgain;
+  jobs.count = count;
+  jobs.element = tried.element.data();
+  jobs.pivot = pivot;
+  MpcSolve o = solver_options(effort, tried.plans());
+  o.start = tried.start.data();
+  o.steps = kStepsAgain;
   if (pivot) o.max_iter = std::min(o.max_iter, kMaxIterPivot);
   run(jobs, o, runner);
   for (int64_t i = 0; i < count; i++) {

@@ -45,7 +45,7 @@ struct Runner {
 
 // Says of a batch whether S, of `S` numbers, is zero and whether the bounds of the actions, `low` and `high` numbers,
 // are finite.
-void look_at_inputs(MpcBatch& batch, int64_t S, int64_t low, int64_t high);
+void set_flags(MpcBatch& batch, int64_t S, int64_t low, int64_t high);
 
 class MpcDriver {
  public:
@@ -81,7 +81,7 @@ class MpcDriver {
   void finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
               Runner& runner, int64_t first, int64_t count);
   bool promising(const MpcBatch& batch, int64_t job, int64_t best) const;
-  void again(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, bool pivot);
+  void retry_failed(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, bool pivot);
 
   const Kernels& kernels;
   Store tried, finished;

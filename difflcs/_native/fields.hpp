@@ -1,6 +1,6 @@
-// The tables that Python and the kernels share: fields of a problem with their dimensions, and how a solve can end. A
-// new field or code is a new line here. difflcs.mpc.problem checks its own fields against these, and difflcs.status
-// takes its codes from here.
+// The tables that Python and the kernels share: fields of a problem with their dimensions, how a solve can end, and
+// tolerances. A new field or code is a new line here. difflcs.mpc.problem checks its own fields against these;
+// difflcs.status takes its codes from here, and the reference in Python its tolerances.
 #pragma once
 #include <cstdint>
 
@@ -35,15 +35,16 @@ namespace difflcs {
   FIELD(price, n_c, one, nodes)   \
   FIELD(x0, n_x, one, once)
 
-// Transitions, and the system that they are compared with, which has no stages here.
+// Transitions, the system that they are compared with, which has no stages here, and the weight of its slack.
 #define DIFFLCS_VIOLATION_FIELDS(FIELD) \
   DIFFLCS_SYSTEM_FIELDS(FIELD)          \
-  FIELD(x, count, n_x, once)            \
-  FIELD(u, count, n_u, once)            \
-  FIELD(x_next, count, n_x, once)
+  FIELD(x, n_x, one, once)              \
+  FIELD(u, n_u, one, once)              \
+  FIELD(x_next, n_x, one, once)         \
+  FIELD(gamma, one, one, once)
 
-enum class Size { one, n_x, n_u, n_lam, n_c, count };
-constexpr const char* kSizeNames[] = {"one", "n_x", "n_u", "n_lam", "n_c", "count"};
+enum class Size { one, n_x, n_u, n_lam, n_c };
+constexpr const char* kSizeNames[] = {"one", "n_x", "n_u", "n_lam", "n_c"};
 
 enum class Given { once, steps, nodes };
 constexpr const char* kGivenNames[] = {"", "H", "H+1"};
@@ -81,8 +82,6 @@ inline int64_t extent(const Batch& batch, Size size) {
       return batch.n_lam;
     case Size::n_c:
       return batch.n_c;
-    case Size::count:
-      return batch.count;
     case Size::one:
       break;
   }
@@ -120,5 +119,40 @@ constexpr bool solved(int8_t status) {
 }
 
 }  // namespace
+
+// Tolerances of the kernels that the reference in Python (difflcs/mpc/conditions.py, riccati.py, difflcs/_violation.py)
+// has too.
+struct Tolerance {
+  const char* name;
+  double value;
+};
+
+// A bound is weakly active where both the distance to it and the Newton step across it are below this part of the
+// range; a constraint likewise, in parts of its row's unit.
+constexpr double kWeak = 1e-5;
+// A reduced Hessian is singular below this pivot, in units of each action's own curvature. Directions below it are
+// held: their sensitivity is zero.
+constexpr double kSingular = 1e-10;
+// An action with a barrier is differentiated as one at its bound below this part of its range.
+constexpr double kClose = 1e-8;
+// Rows of constraints that miss their limits by more than this part, however often they are refined, depend on each
+// other.
+constexpr double kDependent = 1e-3;
+// A multiplier above this part of its price is the price, but for rounding.
+constexpr double kAtPrice = 1.0 - 1e-12;
+// A scale is at least this part of what its terms would be, had nothing cancelled: 1e-9 of that is rounding.
+constexpr double kCancelled = 1e-3;
+// What a step further along a chain of states counts: so little that no size grows with it in most systems.
+constexpr double kFurther = 0.1;
+// Rounding of a sum, in parts of its terms.
+constexpr double kRounding = 4e-16;
+// Least gamma sigma_min(F + F^T) of the violation loss, in parts of n_lam times the largest squared column of F.
+constexpr double kGammaLeast = 4e-13;
+
+constexpr Tolerance kTolerances[] = {
+    {"weak", kWeak},           {"singular", kSingular}, {"close", kClose},
+    {"dependent", kDependent}, {"at_price", kAtPrice},  {"cancelled", kCancelled},
+    {"further", kFurther},     {"rounding", kRounding}, {"gamma_least", kGammaLeast},
+};
 
 }  // namespace difflcs

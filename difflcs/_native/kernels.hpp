@@ -32,11 +32,9 @@ struct LcpBatch {
 constexpr int64_t kAloneExact = 64, kAloneRelaxed = 128;
 
 // What the numbers of a solved LCP have to meet; difflcs.lcp.solve_lcp states it.
-constexpr double kLcpTerms = 1e-10;       // |F lam + q - w| in parts of the terms that sum to it
-constexpr double kLcpData = 1e-8;         // the same in parts of the largest |q| (and of sqrt(relaxation F_ii))
-constexpr double kRounding = 4e-16;       // of a sum, in parts of its terms
-constexpr double kHuge = 1e300;           // beyond it a bound is infinite
-constexpr double kAtPrice = 1.0 - 1e-12;  // a multiplier above this part of its price is the price, but for rounding
+constexpr double kLcpTerms = 1e-10;  // |F lam + q - w| in parts of the terms that sum to it
+constexpr double kLcpData = 1e-8;    // the same in parts of the largest |q| (and of sqrt(relaxation F_ii))
+constexpr double kHuge = 1e300;      // beyond it a bound is infinite
 constexpr double kSmallest = 1e-100, kLargest = 1e150;  // range of the diagonal of F; of lam and w
 
 // A batch of LCS-MPC problems (see difflcs.mpc.MPCProblem). All arrays are row-major with the batch in front.
@@ -99,46 +97,55 @@ struct MpcGradient {
   int64_t offset[kInputs];  // position of each shared input inside a partial sum
 };
 
-// Least gamma sigma_min(F + F^T), in parts of n_lam times the largest diagonal entry of F^T F (difflcs.losses).
-constexpr double kGammaLeast = 4e-13;
-
 // The violation loss of a batch: |r|^2 / 2 + (lam . phi + |e|^2 / (2 gamma)) / xi at the z = (lam, phi) >= 0 that
 // minimises it, with r = A x + B u + C lam + d - x_next and e = D x + E u + F lam + c - phi.
 struct ViolationBatch {
   int64_t count, n_x, n_u, n_lam, n_c;
-  const double* input[kViolationInputs];  // the system is shared by the batch; x, u, x_next are (count, ...)
-  double gamma, xi;
+  const double* input[kViolationInputs];
+  int64_t stride[kViolationInputs];  // distance from one transition to the next; 0 where the batch shares the input
+  bool shared;                       // all of the system and gamma are
+  double xi;
   double *r, *e;  // (count, n_x), (count, n_lam): at z = 0 from violation_qp, at the minimiser from violation_value
   Watch watch;
 };
 
+// The kernels of one instruction set: KERNEL(result, name, parameters). A new kernel is one more line here, and a
+// definition in the namespace DIFFLCS_ISA of a file that cmake/kernels.cmake compiles. A workspace is aligned to 64
+// bytes. Problems [begin, end): no others are read or written.
+#define DIFFLCS_KERNELS(KERNEL)                                                                                        \
+  /* Size of a workspace in bytes. */                                                                                  \
+  KERNEL(int64_t, lcp_workspace, (int64_t n))                                                                          \
+  KERNEL(void, lcp_solve, (const LcpBatch& batch, int64_t begin, int64_t end, void* workspace, Watch watch))           \
+  KERNEL(int64_t, mpc_workspace, (const MpcBatch& batch))                                                              \
+  /* Takes problems from the shared counter `next` until none is left, and certifies them. */                          \
+  KERNEL(void, mpc_solve, (const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void* workspace, Watch watch)) \
+  /* Marks the solved elements whose constraints make them degenerate. */                                              \
+  KERNEL(void, mpc_constraints,                                                                                        \
+         (const MpcBatch& batch, const MpcSolve& solve, int64_t begin, int64_t end, void* workspace, Watch watch))     \
+  /* Gradients of elements that are block number `block`. */                                                           \
+  KERNEL(void, mpc_vjp,                                                                                                \
+         (const MpcBatch& batch, const MpcGradient& gradient, int64_t begin, int64_t end, int64_t block,               \
+          void* workspace, Watch watch))                                                                               \
+  KERNEL(int64_t, violation_workspace, (const ViolationBatch& batch))                                                  \
+  /* r and e at z = 0, and the QP min z'Qz / 2 + q'z over z >= 0: Q (2 n_lam, 2 n_lam), of each where the system is */ \
+  /* not shared, and q (count, 2 n_lam). Returns whether they are finite, F + F^T - gamma I is positive definite and */\
+  /* Q is so by a margin, and gamma is not too small for double precision. */                                          \
+  KERNEL(bool, violation_qp, (const ViolationBatch& batch, double* Q, double* q, void* workspace))                     \
+  /* r, e and loss (count,) at z (count, 2 n_lam), from r and e at z = 0. Returns the first transition whose e has */  \
+  /* no digits that count, or -1. */                                                                                   \
+  KERNEL(int64_t, violation_value, (const ViolationBatch& batch, const double* z, double* loss, void* workspace))      \
+  /* Gradients of sum(upstream * loss) with z held; those of x, u and x_next only where they are not null. */          \
+  KERNEL(void, violation_gradient,                                                                                     \
+         (const ViolationBatch& batch, const double* z, const double* upstream,                                        \
+          double* const gradient[kViolationInputs], void* workspace))
+
 struct Kernels {
   const char* isa;
-  int lanes;                            // problems solved side by side
-  int64_t (*lcp_workspace)(int64_t n);  // bytes, to be aligned to 64
-  // Solves problems [begin, end); reads and writes only those.
-  void (*lcp_solve)(const LcpBatch& batch, int64_t begin, int64_t end, void* workspace, Watch watch);
-  int64_t (*mpc_workspace)(const MpcBatch& batch);
-  // Take problems from the shared counter `next` until none is left, and certify them.
-  void (*mpc_solve)(const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void* workspace, Watch watch);
-  // The same for a batch of one, to the same bits.
-  void (*mpc_solve_alone)(const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void* workspace, Watch watch);
-  // Which of the solved elements [begin, end) have constraints that make them degenerate.
-  void (*mpc_constraints)(const MpcBatch& batch, const MpcSolve& solve, int64_t begin, int64_t end, void* workspace,
-                          Watch watch);
-  // Gradients of elements [begin, end), which are block number `block`.
-  void (*mpc_vjp)(const MpcBatch& batch, const MpcGradient& gradient, int64_t begin, int64_t end, int64_t block,
-                  void* workspace, Watch watch);
-  int64_t (*violation_workspace)(const ViolationBatch& batch);
-  // r and e at z = 0, and the QP min z'Qz / 2 + q'z over z >= 0: Q (2 n_lam, 2 n_lam) shared by the batch and
-  // q (count, 2 n_lam). Returns whether they are finite, F + F^T - gamma I is positive definite and Q is so by a
-  // margin, and gamma is not too small for double precision.
-  bool (*violation_qp)(const ViolationBatch& batch, double* Q, double* q, void* workspace);
-  // r, e and loss (count,) at z (count, 2 n_lam), from r and e at z = 0. Returns whether e has digits that count.
-  bool (*violation_value)(const ViolationBatch& batch, const double* z, double* loss, void* workspace);
-  // Gradients of sum(upstream * loss) with z held; those of x, u and x_next only where they are not null.
-  void (*violation_gradient)(const ViolationBatch& batch, const double* z, const double* upstream,
-                             double* const gradient[kViolationInputs], void* workspace);
+  int lanes;  // problems solved side by side
+#define DIFFLCS_MEMBER(result, name, parameters) result(*name) parameters;
+  DIFFLCS_KERNELS(DIFFLCS_MEMBER)
+#undef DIFFLCS_MEMBER
+  decltype(mpc_solve) mpc_solve_alone;  // for a batch of one, to the same bits
 };
 
 // The best kernels this CPU runs, or those that the environment variable DIFFLCS_ISA names.

@@ -1,9 +1,6 @@
 // One double per SIMD lane, by the vector extensions of GCC and Clang: plain vector code on every CPU.
 #pragma once
 #include <cstdint>
-#if defined(__AVX__)
-#include <immintrin.h>
-#endif
 
 namespace difflcs::DIFFLCS_ISA {
 constexpr int kLanes = DIFFLCS_LANES;
@@ -21,12 +18,14 @@ static inline Vec max(Vec a, Vec b) { return a > b ? a : b; }
 static inline Vec min(Vec a, Vec b) { return a < b ? a : b; }
 // One instruction where a comparison and a choice are three.
 static inline Vec abs(Vec a) { return (Vec)((Mask)a & (Mask{} + INT64_MAX)); }
-// GCC does not always turn the loop into one instruction.
+// GCC does not always turn the loop into one instruction. The header of the intrinsics would add .3 s to each file's
+// compilation.
 static inline Vec sqrt(Vec a) {
-#if defined(__AVX512F__) && DIFFLCS_LANES == 8
-  return (Vec)_mm512_sqrt_pd((__m512d)a);
-#elif defined(__AVX__) && DIFFLCS_LANES == 4
-  return (Vec)_mm256_sqrt_pd((__m256d)a);
+#if defined(__AVX512F__) && DIFFLCS_LANES == 8 && !defined(__clang__)
+  constexpr int kAsTheCpuRounds = 4;
+  return __builtin_ia32_sqrtpd512_mask(a, Vec{}, -1, kAsTheCpuRounds);
+#elif defined(__AVX__) && DIFFLCS_LANES == 4 && !defined(__clang__)
+  return __builtin_ia32_sqrtpd256(a);
 #else
   Vec r;
   for (int l = 0; l < kLanes; l++) r[l] = __builtin_sqrt(a[l]);
@@ -69,6 +68,8 @@ static inline void put(Vec* to, int64_t at, int lane, double value) {
 
 // A function that is handed such an array has to become part of its caller.
 #define DIFFLCS_INLINE __attribute__((always_inline)) inline
+// One that is called from several places, where a copy in each would only take longer to compile.
+#define DIFFLCS_NOINLINE __attribute__((noinline))
 
 // A small array for unrolled loops: on the stack where the size is known when compiling, else in the scratch given.
 template <int64_t N, class V = Vec>

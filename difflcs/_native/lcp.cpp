@@ -1,4 +1,4 @@
-// The batched LCP kernels, compiled once per instruction set (see CMakeLists.txt). One problem per SIMD lane: the code
+// The batched LCP kernels, compiled once per instruction set (cmake/kernels.cmake). One problem per SIMD lane: the code
 // reads like the solver of a single problem, and a lane's result never depends on its neighbours.
 #include "kernels.hpp"
 #include "lanes.hpp"
@@ -25,9 +25,9 @@ struct Lcp {
   int64_t layout(void* memory) {
     const int64_t n = size();
     Arena arena{memory};
-    arena.take(F, n * n), arena.take(scale, n), arena.take(inverse, n);
-    arena.take(q, n), arena.take(lam, n), arena.take(w, n), arena.take(rhs, n), arena.take(bound, n);
-    arena.take(active, n), arena.take(rows, n), arena.take(newton, RelaxedLcp<T, N, false>::scratch(n));
+    arena.take(F, n * n);
+    arena.take_all(n, scale, inverse, q, lam, w, rhs, bound, active, rows);
+    arena.take(newton, RelaxedLcp<T, N, false>::scratch(n));
     M = newton;  // of the exact solver, which is another's turn; n * n of them
     return arena.used;
   }
@@ -43,7 +43,8 @@ struct Lcp {
     const double* from = batch.F + e * batch.F_stride;
     for (int64_t i = 0; i < n; i++) {
       const double root = from[i * n + i] > 0 ? __builtin_sqrt(from[i * n + i]) : 1.0;
-      put(scale, i, lane, 1.0 / root), put(inverse, i, lane, root);
+      put(scale, i, lane, 1.0 / root);
+      put(inverse, i, lane, root);
     }
     for (int64_t i = 0; i < n; i++)
       for (int64_t j = 0; j < n; j++)
@@ -206,10 +207,12 @@ void with_size(const LcpBatch& batch, void* memory, Function f) {
 }
 template <int... N, class Function>
 void dispatch(const LcpBatch& batch, void* memory, Function f) {
-  if (batch.F_stride)
+  if (batch.F_stride == 0)
+    with_size<double, N...>(batch, memory, f);
+  else if constexpr (kLanes > 2)
     with_size<Vec, N...>(batch, memory, f);
   else
-    with_size<double, N...>(batch, memory, f);
+    with_size<Vec>(batch, memory, f);
 }
 
 }  // namespace

@@ -25,8 +25,20 @@ struct LcpOne {
       memory += count;
       return at;
     };
-    F = take(n * n), M = take(n * n), scale = take(n), q = take(n), lam = take(n), w = take(n), x = take(n);
-    y = take(n), step = take(n), rows = take(n), active = take(n), path = take(n), gap = take(n), best = take(n);
+    F = take(n * n);
+    M = take(n * n);
+    scale = take(n);
+    q = take(n);
+    lam = take(n);
+    w = take(n);
+    x = take(n);
+    y = take(n);
+    step = take(n);
+    rows = take(n);
+    active = take(n);
+    path = take(n);
+    gap = take(n);
+    best = take(n);
     const double *from = batch.F + e * batch.F_stride, *right = batch.q + e * n;
     unit = __builtin_sqrt(batch.relaxation);
     for (int64_t i = 0; i < n; i++) {
@@ -49,7 +61,7 @@ struct LcpOne {
   // LU of the m x m matrix M, in place, with row exchanges; kPanel columns at a time, so that a large matrix is read
   // once for all of them. Not that of lu.hpp: it divides by the pivots, one rounding less than to multiply by their
   // reciprocals, and the violation loss of a model under training is solved here often enough for that to show.
-  bool factor(int64_t m) {
+  DIFFLCS_NOINLINE bool factor(int64_t m) {
     for (int64_t k = 0; k < m && !watch.stop(watch.context); k += kPanel) {
       const int64_t end = k + kPanel < m ? k + kPanel : m;
       for (int64_t c = k; c < end; c++) {
@@ -60,7 +72,8 @@ struct LcpOne {
         if (!(__builtin_fabs(M[pivot * m + c]) > 0)) return false;
         for (int64_t j = 0; pivot != c && j < m; j++) {
           const double t = M[c * m + j];
-          M[c * m + j] = M[pivot * m + j], M[pivot * m + j] = t;
+          M[c * m + j] = M[pivot * m + j];
+          M[pivot * m + j] = t;
         }
         for (int64_t i = c + 1; i < m; i++) {
           const double l = M[i * m + c] /= M[c * m + c];
@@ -87,11 +100,12 @@ struct LcpOne {
     }
     return false;
   }
-  void back(int64_t m, double* b) const {
+  DIFFLCS_NOINLINE void back(int64_t m, double* b) const {
     for (int64_t k = 0; k < m; k++) {
       const int64_t other = int64_t(rows[k]);
       const double t = b[k];
-      b[k] = b[other], b[other] = t;
+      b[k] = b[other];
+      b[other] = t;
     }
     for (int64_t i = 0; i < m; i++)
       for (int64_t j = 0; j < i; j++) b[i] -= M[i * m + j] * b[j];
@@ -108,13 +122,14 @@ struct LcpOne {
     *terms = __builtin_fabs(value);
     for (int64_t j = 0; j < n; j++) {
       const Sum t = Sum(F[i * n + j]) * v[j];
-      value += t, *terms += __builtin_fabs(double(t));
+      value += t;
+      *terms += __builtin_fabs(double(t));
     }
     return double(value);
   }
 
   // Writes lam and w in the caller's units if they hold by the bounds of kernels.hpp.
-  bool store() const {
+  DIFFLCS_NOINLINE bool store() const {
     double largest = 0;
     const double root = __builtin_sqrt(relaxation);
     for (int64_t i = 0; i < n; i++) {
@@ -144,7 +159,7 @@ struct LcpOne {
   }
 
   // Keeps the positive part of v if it is nearer to a solution, by the residual of Chen-Harker-Kanzow-Smale.
-  void remember(const double* v) {
+  DIFFLCS_NOINLINE void remember(const double* v) {
     double terms, distance = 0;
     for (int64_t i = 0; i < n; i++) x[i] = v[i] > 0 ? v[i] : 0.0;
     for (int64_t i = 0; i < n; i++) {
@@ -175,7 +190,8 @@ struct LcpOne {
       };
       for (int64_t i = 0; i < n; i++) {
         if (active[i] != 0) x[m++] = double(i);
-        lam[i] = 0.0, step[i] = -q[i];
+        lam[i] = 0.0;
+        step[i] = -q[i];
       }
       for (int64_t i = 0; i < m; i++)
         for (int64_t j = 0; j < m; j++) M[i * m + j] = F[int64_t(x[i]) * n + int64_t(x[j])];
@@ -203,9 +219,10 @@ struct LcpOne {
       }
       remember(lam);
       for (int64_t i = 0; i < n; i++) active[i] = active[i] < 2 ? active[i] : 3.0 - active[i];
-      if (wrong < fewest)
-        fewest = wrong, patience = 5;
-      else
+      if (wrong < fewest) {
+        fewest = wrong;
+        patience = 5;
+      } else
         patience -= !murty;
     }
     return false;
@@ -221,7 +238,8 @@ struct LcpOne {
       double product = 0, smallest = __builtin_inf();
       for (int64_t i = 0; i < n; i++) {
         const double t = path[i] * gap[i];
-        product += t / double(n), smallest = t < smallest ? t : smallest;
+        product += t / double(n);
+        smallest = t < smallest ? t : smallest;
       }
       if (relaxation == 0 && product <= target) return false;
       // A centred point shortens the path, one next to the border is centred first.
@@ -246,7 +264,10 @@ struct LcpOne {
         if (x[i] < 0 && -0.9 * path[i] / x[i] < length) length = -0.9 * path[i] / x[i];
         if (change < 0 && -0.9 * gap[i] / change < length) length = -0.9 * gap[i] / change;
       }
-      for (int64_t i = 0; i < n; i++) path[i] += length * x[i], gap[i] += length * step[i];
+      for (int64_t i = 0; i < n; i++) {
+        path[i] += length * x[i];
+        gap[i] += length * step[i];
+      }
       remember(path);
       // Newton converges quadratically from here; where rounding is large, some iterates are better than others.
       if (mu == target && length == 1.0 && ++at_target > 5 && on_path()) return true;

@@ -22,9 +22,9 @@ struct Stage {
 template <class T, class S>
 class Linearisation {
   static constexpr int64_t kX = S::kX, kL = S::kL, kW = S::kW;
-  using Lu = Elimination<S::kPivot>;
   const Problem<T, S>& problem;
   const S n;
+  const Elimination<kL == 0> lu;
   const bool kept;  // every stage is kept; else each takes the place of the one before it, but for K_lam
   Stages<Matrix<Vec, kL, kL>> M;
   Stages<Matrix<Vec, kL, kW>> K_lam, K_s;
@@ -36,15 +36,23 @@ class Linearisation {
   Matrix<Vec, kL, kW> slopes, weighted;
 
  public:
-  Linearisation(const Problem<T, S>& problem, bool kept) : problem(problem), n(problem.n), kept(kept) {}
+  Linearisation(const Problem<T, S>& problem, bool kept)
+      : problem(problem), n(problem.n), lu{problem.batch.pivot}, kept(kept) {}
 
   void layout(Arena& arena) {
     const int64_t nx = n.x(), nl = n.l(), nw = n.w(), count = kept ? n.h : 1;
-    arena.take(M, count, nl, nl), arena.take(K_lam, n.h, nl, nw), arena.take(A_hat, count, nx, nw);
-    arena.take(K_s, kept ? count : 0, nl, nw), arena.take(size, count, nl), arena.take(y, count, nl);
-    arena.take(rows, count * nl), arena.take(right_rows, nl), arena.take(a, nl), arena.take(b, nl),
-        arena.take(right_factors, nl * nl), arena.take(bend, nl), arena.take(damped, nl);
-    arena.take(column, nl * kColumns), arena.take(slopes, nl, nw), arena.take(weighted, nl, nw);
+    arena.take(M, count, nl, nl);
+    arena.take(K_lam, n.h, nl, nw);
+    arena.take(A_hat, count, nx, nw);
+    arena.take(K_s, kept ? count : 0, nl, nw);
+    arena.take(size, count, nl);
+    arena.take(y, count, nl);
+    arena.take(rows, count * nl);
+    arena.take_all(nl, right_rows, a, b, bend, damped);
+    arena.take(right_factors, nl * nl);
+    arena.take(column, nl * kColumns);
+    arena.take(slopes, nl, nw);
+    arena.take(weighted, nl, nw);
   }
 
   Stage<S> stage(int64_t k) const {
@@ -70,7 +78,8 @@ class Linearisation {
     const auto C = data.C;
     for (int64_t i = 0; i < nl; i++) {
       stage.size[i] = 1.0 / (lam[i] + s[i]);
-      a[i] = s[i] * stage.size[i], b[i] = lam[i] * stage.size[i];
+      a[i] = s[i] * stage.size[i];
+      b[i] = lam[i] * stage.size[i];
     }
     Local<kL * kL> left(stage.M.entries), right(right_factors);
     // diag(a) + diag(b) F, or diag(a) + F diag(b)
@@ -81,13 +90,13 @@ class Linearisation {
         for (int64_t j = 0; j < nl; j++) matrix[i * nl + j] = b[by_row ? i : j] * F(i, j);
         matrix[i * nl + i] += a[i];
       }
-      Lu::factor(nl, matrix, exchanged);
+      lu.factor(nl, matrix, exchanged);
     };
     eliminate(left, stage.rows, true);
     for (int64_t i = 0; i < nl * nl; i++) stage.M.entries[i] = left[i];
     // y = (diag(s) + F^T diag(lam))^-1 (-C^T p), from the same factors.
     for (int64_t i = 0; i < nl; i++) stage.y[i] = all(0) - C.column(i) * p;
-    Lu::solve_transposed(nl, stage.M.entries, stage.rows, stage.y);
+    lu.solve_transposed(nl, stage.M.entries, stage.rows, stage.y);
     // Since a dlam + b ds = 0, both follow from one T: K_lam = b T, K_s = -a T with (diag(a) + F diag(b)) T = -[D E].
     eliminate(right, right_rows, false);
     by_columns(0, nw, [&](int64_t j, auto kind) {
@@ -95,7 +104,7 @@ class Linearisation {
       Local<kL, V> t(column);
       DIFFLCS_UNROLL
       for (int64_t i = 0; i < nl; i++) t[i] = V{} - read<V>(data.DE[i], j);
-      Lu::solve(nl, right, right_rows, t);
+      lu.solve(nl, right, right_rows, t);
       DIFFLCS_UNROLL
       for (int64_t i = 0; i < nl; i++) {
         write<V>(slopes[i], j, t[i]);
@@ -106,7 +115,8 @@ class Linearisation {
     });
     for (int64_t i = 0; i < nl; i++) {
       stage.y[i] *= stage.size[i];
-      bend[i] = -2.0 * stage.y[i] * a[i] * b[i], damped[i] = 0.5 * damping * abs(stage.y[i]);
+      bend[i] = -2.0 * stage.y[i] * a[i] * b[i];
+      damped[i] = 0.5 * damping * abs(stage.y[i]);
       weigh(i, bend[i] + damped[i]);
     }
     if (kept)

@@ -83,7 +83,8 @@ inline void lu_factor_pivoted(int64_t n, Vec* M, Mask* rows) {
       rows[k][l] = pivot;
       for (int64_t j = 0; pivot != k && j < n; j++) {
         const double t = at(k, j);
-        at(k, j) = at(pivot, j), at(pivot, j) = t;
+        at(k, j) = at(pivot, j);
+        at(pivot, j) = t;
       }
       const double inverse = at(k, k) = 1.0 / at(k, k);
       for (int64_t i = k + 1; i < n; i++) {
@@ -102,7 +103,8 @@ inline void exchange(V* b, int64_t k, const Mask* rows) {
     double& first = reinterpret_cast<double*>(b + k)[l];
     double& second = reinterpret_cast<double*>(b + rows[k][l % kLanes])[l];
     const double t = first;
-    first = second, second = t;
+    first = second;
+    second = t;
   }
 }
 
@@ -112,27 +114,27 @@ inline void lu_solve_pivoted(int64_t n, const Vec* M, const Mask* rows, V* b) {
   lu_solve(n, M, b);
 }
 
-// Elimination of one matrix per lane, with row exchanges or without.
-template <bool kPivot>
+// Elimination of one matrix per lane, with row exchanges if `pivot`, which only a size that is not known when compiling
+// allows.
+template <bool kMayPivot>
 struct Elimination {
+  bool pivot;
   template <class Matrix>
-  static DIFFLCS_INLINE void factor(int64_t n, Matrix& M, [[maybe_unused]] Mask* rows) {
-    if constexpr (kPivot)
-      lu_factor_pivoted(n, M.v, rows);
-    else
-      lu_factor(n, M);
+  DIFFLCS_INLINE void factor(int64_t n, Matrix& M, [[maybe_unused]] Mask* rows) const {
+    if constexpr (kMayPivot)
+      if (pivot) return lu_factor_pivoted(n, M.v, rows);
+    lu_factor(n, M);
   }
   template <class Matrix, class Vector>
-  static DIFFLCS_INLINE void solve(int64_t n, const Matrix& M, [[maybe_unused]] const Mask* rows, Vector& b) {
-    if constexpr (kPivot)
-      lu_solve_pivoted(n, M.v, rows, b.v);
-    else
-      lu_solve(n, M, b);
+  DIFFLCS_INLINE void solve(int64_t n, const Matrix& M, [[maybe_unused]] const Mask* rows, Vector& b) const {
+    if constexpr (kMayPivot)
+      if (pivot) return lu_solve_pivoted(n, M.v, rows, b.v);
+    lu_solve(n, M, b);
   }
-  static DIFFLCS_INLINE void solve_transposed(int64_t n, const Vec* M, [[maybe_unused]] const Mask* rows, Vec* b) {
+  DIFFLCS_INLINE void solve_transposed(int64_t n, const Vec* M, [[maybe_unused]] const Mask* rows, Vec* b) const {
     lu_solve_transposed(n, M, b);
-    if constexpr (kPivot)
-      for (int64_t k = n - 1; k >= 0; k--) exchange(b, k, rows);
+    if constexpr (kMayPivot)
+      for (int64_t k = n - 1; pivot && k >= 0; k--) exchange(b, k, rows);
   }
 };
 

@@ -114,6 +114,11 @@ struct Matrix {
     return {entries + j, rows, stride};
   }
   int64_t size() const { return rows * stride; }
+  // The same with sizes that are known when compiling.
+  template <int64_t R, int64_t C, int64_t D>
+  operator Matrix<T, R, C, D>() const {
+    return {entries, {rows}, {columns}, {stride}};
+  }
   // The columns from `first` on.
   template <int64_t Count>
   Matrix<T, Rows, Count, Stride> block(int64_t first, Dim<Count> count) const {
@@ -146,15 +151,22 @@ struct Arena {
   void* memory;
   int64_t used = 0;
 
+  DIFFLCS_NOINLINE void* take_bytes(int64_t bytes) {
+    void* at = memory ? static_cast<char*>(memory) + used : nullptr;
+    used += (bytes + 63) / 64 * 64;
+    return at;
+  }
   template <class T>
   T* take(int64_t count) {
-    void* at = memory ? static_cast<char*>(memory) + used : nullptr;
-    used += (count * int64_t(sizeof(T)) + 63) / 64 * 64;
-    return static_cast<T*>(at);
+    return static_cast<T*>(take_bytes(count * int64_t(sizeof(T))));
   }
   template <class T>
   void take(T*& to, int64_t count) {
     to = take<T>(count);
+  }
+  template <class... T>
+  void take_all(int64_t count, T*&... to) {
+    (take(to, count), ...);
   }
   template <class T, int64_t R, int64_t C>
   void take(Matrix<T, R, C>& to, int64_t rows, int64_t columns) {
@@ -163,7 +175,8 @@ struct Arena {
   template <class T, int64_t R, int64_t C>
   void take(Stages<Matrix<T, R, C>>& to, int64_t stages, int64_t rows, int64_t columns) {
     to.first = {take<T>(stages * rows * columns), {rows}, {columns}, {columns}};
-    to.count = stages, to.step = stages > 1 ? to.first.size() : 0;
+    to.count = stages;
+    to.step = stages > 1 ? to.first.size() : 0;
   }
   template <class T>
   void take(Steps<T>& to, int64_t stages, int64_t size) {

@@ -123,7 +123,10 @@ void solve(const difflcs::LcpBatch& batch, int64_t count, int threads, Stop& sto
   for (int64_t e = 0; e < count; e++) {
     if (batch.status[e] != difflcs::kUnreached) continue;
     batch.status[e] = static_cast<int8_t>(difflcs::Status::max_iter);
-    for (int64_t i = e * batch.n; i < (e + 1) * batch.n; i++) batch.lam[i] = 0, batch.w[i] = std::max(batch.q[i], 0.0);
+    for (int64_t i = e * batch.n; i < (e + 1) * batch.n; i++) {
+      batch.lam[i] = 0;
+      batch.w[i] = std::max(batch.q[i], 0.0);
+    }
   }
 }
 
@@ -153,7 +156,9 @@ void check_size(const char* name, int64_t got, int64_t expected) {
   if (got != expected) throw std::invalid_argument(std::string(name) + " has the wrong size");
 }
 
-int64_t rank_of(const difflcs::Field& field) { return field.columns == difflcs::Size::one ? 1 : 2; }
+int64_t rank_of(const difflcs::Field& field) {
+  return (field.rows != difflcs::Size::one) + (field.columns != difflcs::Size::one);
+}
 
 difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxation, double barrier, bool pivot) {
   using namespace difflcs;
@@ -163,8 +168,14 @@ difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxa
   const Array& x0 = inputs[kx0];
   auto last = [&](Input which) { return int64_t(inputs[which].shape(inputs[which].ndim() - 1)); };
   MpcBatch b{};
-  b.count = int64_t(x0.shape(0)), b.n_x = last(kA), b.n_u = last(kB), b.n_lam = last(kF), b.n_c = last(kg);
-  b.horizon = horizon, b.relaxation = relaxation, b.barrier = barrier;
+  b.count = int64_t(x0.shape(0));
+  b.n_x = last(kA);
+  b.n_u = last(kB);
+  b.n_lam = last(kF);
+  b.n_c = last(kg);
+  b.horizon = horizon;
+  b.relaxation = relaxation;
+  b.barrier = barrier;
   if (b.n_x < 1 || b.n_u < 1 || horizon < 1 || !(relaxation > 0) || !(barrier >= 0))
     throw std::invalid_argument("sizes, horizon and relaxation must be positive, the barrier not negative");
   for (int i = 0; i < kInputs; i++) {
@@ -180,7 +191,7 @@ difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxa
     b.stride[i] = shared ? 0 : own == 2 ? stages * size : size;
   }
   b.pivot = pivot;
-  look_at_inputs(b, inputs[kS].size(), inputs[ku_min].size(), inputs[ku_max].size());
+  set_flags(b, inputs[kS].size(), inputs[ku_min].size(), inputs[ku_max].size());
   return b;
 }
 
@@ -208,10 +219,14 @@ bool solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
   const difflcs::MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier, false);
   const int64_t states = b.count * (horizon + 1) * b.n_x, actions = b.count * horizon * b.n_u;
   const int64_t forces = b.count * horizon * b.n_lam, rows = b.count * (horizon + 1) * b.n_c;
-  check_size("x", x.size(), states), check_size("u", u.size(), actions), check_size("lam", lam.size(), forces);
+  check_size("x", x.size(), states);
+  check_size("u", u.size(), actions);
+  check_size("lam", lam.size(), forces);
   check_size("mu", mu.size(), rows);
-  check_size("objective", objective.size(), b.count), check_size("residual", residual.size(), b.count);
-  check_size("status", status.size(), b.count), check_size("iterations", iterations.size(), b.count);
+  check_size("objective", objective.size(), b.count);
+  check_size("residual", residual.size(), b.count);
+  check_size("status", status.size(), b.count);
+  check_size("iterations", iterations.size(), b.count);
   check_size("fragile", fragile.size(), b.count);
   if (u_start) check_size("u_start", u_start->size(), actions);
   if (lam_start) check_size("lam_start", lam_start->size(), forces);
@@ -239,21 +254,35 @@ void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, 
   const MpcBatch b = mpc_batch(inputs, horizon, relaxation, barrier, pivot);
   const int64_t states = b.count * (horizon + 1) * b.n_x, actions = b.count * horizon * b.n_u;
   const int64_t forces = b.count * horizon * b.n_lam, rows = b.count * (horizon + 1) * b.n_c;
-  check_size("x", x.size(), states), check_size("u", u.size(), actions), check_size("lam", lam.size(), forces);
+  check_size("x", x.size(), states);
+  check_size("u", u.size(), actions);
+  check_size("lam", lam.size(), forces);
   check_size("mu", mu.size(), rows);
-  check_size("x_bar", x_bar.size(), states), check_size("u_bar", u_bar.size(), actions);
-  check_size("lam_bar", lam_bar.size(), forces), check_size("objective_bar", objective_bar.size(), b.count);
-  check_size("solved", solved.size(), b.count), check_size("gradients", gradients.size(), kInputs);
+  check_size("x_bar", x_bar.size(), states);
+  check_size("u_bar", u_bar.size(), actions);
+  check_size("lam_bar", lam_bar.size(), forces);
+  check_size("objective_bar", objective_bar.size(), b.count);
+  check_size("solved", solved.size(), b.count);
+  check_size("gradients", gradients.size(), kInputs);
   MpcGradient o{};
-  o.x = x.data(), o.u = u.data(), o.lam = lam.data(), o.mu = mu.data(), o.x_bar = x_bar.data(), o.u_bar = u_bar.data();
-  o.lam_bar = lam_bar.data(), o.objective_bar = objective_bar.data(), o.solved = solved.data();
+  o.x = x.data();
+  o.u = u.data();
+  o.lam = lam.data();
+  o.mu = mu.data();
+  o.x_bar = x_bar.data();
+  o.u_bar = u_bar.data();
+  o.lam_bar = lam_bar.data();
+  o.objective_bar = objective_bar.data();
+  o.solved = solved.data();
   for (int i = 0; i < kInputs; i++) {
     check_size("gradient", gradients[i].size(), inputs[i].size());
     std::fill_n(gradients[i].data(), gradients[i].size(), 0.0);
     if (b.stride[i])
       o.per_element[i] = gradients[i].data();
-    else
-      o.offset[i] = o.shared_size, o.shared_size += int64_t(inputs[i].size());
+    else {
+      o.offset[i] = o.shared_size;
+      o.shared_size += int64_t(inputs[i].size());
+    }
   }
   if (b.count == 0) return;
   const auto& kernels = difflcs::kernels();
@@ -278,24 +307,25 @@ void vjp_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, 
 
 // ---- violation loss ----
 
-difflcs::ViolationBatch violation_batch(const Inputs& inputs, double gamma, double xi, Output<double>& r,
-                                        Output<double>& e) {
+difflcs::ViolationBatch violation_batch(const Inputs& inputs, double xi, Output<double>& r, Output<double>& e) {
   using namespace difflcs;
   check_size("inputs", inputs.size(), kViolationInputs);
   for (int i : {vA, vB, vF, vx})
-    if (inputs[i].ndim() != 2) throw std::invalid_argument("A, B, F and x must be matrices");
+    if (inputs[i].ndim() < 2) throw std::invalid_argument("A, B, F and x must be matrices");
+  auto last = [&](ViolationInput which) { return int64_t(inputs[which].shape(inputs[which].ndim() - 1)); };
   ViolationBatch b{};
-  b.count = inputs[vx].shape(0), b.n_x = inputs[vA].shape(0), b.n_u = inputs[vB].shape(1),
-  b.n_lam = inputs[vF].shape(0);
-  b.gamma = gamma, b.xi = xi, b.r = r.data(), b.e = e.data();
+  b.count = int64_t(inputs[vx].shape(0)), b.n_x = last(vA), b.n_u = last(vB), b.n_lam = last(vF);
+  b.xi = xi, b.r = r.data(), b.e = e.data(), b.shared = true;
   for (int i = 0; i < kViolationInputs; i++) {
     const Array& a = inputs[i];
-    const Field& field = kViolationFields[i];
-    const int64_t rank = rank_of(field);
-    if (int64_t(a.ndim()) != rank || int64_t(a.shape(0)) != extent(b, field.rows) ||
-        (rank == 2 && int64_t(a.shape(1)) != extent(b, field.columns)))
-      throw std::invalid_argument(std::string(field.name) + " has the wrong shape");
+    const int64_t size = extent(b, kViolationFields[i]), own = int64_t(a.ndim()) - rank_of(kViolationFields[i]);
+    const bool datum = i == vx || i == vu || i == vx_next;
+    if (own < datum || own > 1 || (own && int64_t(a.shape(0)) != b.count) ||
+        int64_t(a.size()) != (own ? b.count * size : size))
+      throw std::invalid_argument(std::string(kViolationFields[i].name) + " has the wrong shape");
     b.input[i] = a.data();
+    b.stride[i] = own ? size : 0;
+    b.shared = b.shared && (datum || !own);
   }
   if (b.n_x < 1 || b.n_u < 1 || b.n_lam < 1) throw std::invalid_argument("sizes must be positive");
   check_size("r", r.size(), b.count * b.n_x), check_size("e", e.size(), b.count * b.n_lam);
@@ -314,51 +344,58 @@ void pass(difflcs::ViolationBatch& b, Work work) {
 
 // The minimiser z and the values there. No answer where the inputs are not finite, the QP is not convex by a margin,
 // there are no transitions, or the solver failed: then r, e, Q and q are those at z = 0, and z and loss are not set.
-// Else whether double precision suffices.
-std::optional<bool> violation_loss(Inputs inputs, double gamma, double xi, int64_t max_iter, int threads,
-                                   Output<double> Q, Output<double> q, Output<double> z, Output<double> r,
-                                   Output<double> e, Output<double> loss) {
-  difflcs::ViolationBatch b = violation_batch(inputs, gamma, xi, r, e);
+// Else the first transition for which double precision does not suffice, or -1.
+std::optional<int64_t> violation_loss(Inputs inputs, double xi, int64_t max_iter, int threads, Output<double> Q,
+                                      Output<double> q, Output<double> z, Output<double> r, Output<double> e,
+                                      Output<double> loss) {
+  difflcs::ViolationBatch b = violation_batch(inputs, xi, r, e);
   const int64_t n = 2 * b.n_lam;
-  check_size("Q", Q.size(), n * n), check_size("q", q.size(), b.count * n), check_size("z", z.size(), b.count * n);
+  check_size("Q", Q.size(), b.shared ? n * n : b.count * n * n), check_size("q", q.size(), b.count * n),
+      check_size("z", z.size(), b.count * n);
   check_size("loss", loss.size(), b.count);
   bool convex = false;
   pass(b, [&](void* workspace) { convex = difflcs::kernels().violation_qp(b, Q.data(), q.data(), workspace); });
   if (!convex || b.count == 0) return std::nullopt;
   std::vector<double> w(b.count * n);
   std::vector<int8_t> status(b.count);
-  const difflcs::LcpBatch lcp{n, Q.data(), 0, q.data(), 0.0, max_iter, z.data(), w.data(), status.data()};
+  const int64_t stride = b.shared ? 0 : n * n;
+  const difflcs::LcpBatch lcp{n, Q.data(), stride, q.data(), 0.0, max_iter, z.data(), w.data(), status.data()};
   Stop stop;
   solve(lcp, b.count, threads, stop);
   for (const int8_t s : status)
     if (!difflcs::solved(s)) return std::nullopt;
-  bool held = false;
-  pass(b, [&](void* workspace) { held = difflcs::kernels().violation_value(b, z.data(), loss.data(), workspace); });
-  return held;
+  int64_t lost = -1;
+  pass(b, [&](void* workspace) { lost = difflcs::kernels().violation_value(b, z.data(), loss.data(), workspace); });
+  return lost;
 }
 
-bool violation_value(Inputs inputs, double gamma, double xi, Array z, Output<double> r, Output<double> e,
-                     Output<double> loss) {
-  difflcs::ViolationBatch b = violation_batch(inputs, gamma, xi, r, e);
+int64_t violation_value(Inputs inputs, double xi, Array z, Output<double> r, Output<double> e, Output<double> loss) {
+  difflcs::ViolationBatch b = violation_batch(inputs, xi, r, e);
   check_size("z", z.size(), 2 * b.n_lam * b.count), check_size("loss", loss.size(), b.count);
-  bool held = true;
+  int64_t lost = -1;
   if (b.count > 0)
-    pass(b, [&](void* workspace) { held = difflcs::kernels().violation_value(b, z.data(), loss.data(), workspace); });
-  return held;
+    pass(b, [&](void* workspace) { lost = difflcs::kernels().violation_value(b, z.data(), loss.data(), workspace); });
+  return lost;
 }
 
-void violation_gradient(Inputs inputs, double gamma, double xi, Array z, Output<double> r, Output<double> e,
-                        Array upstream, std::vector<std::optional<Output<double>>> gradients) {
+void violation_gradient(Inputs inputs, double xi, Array z, Output<double> r, Output<double> e, Array upstream,
+                        std::vector<std::optional<Output<double>>> gradients) {
   using namespace difflcs;
-  ViolationBatch b = violation_batch(inputs, gamma, xi, r, e);
-  check_size("z", z.size(), 2 * b.n_lam * b.count), check_size("upstream", upstream.size(), b.count);
+  ViolationBatch b = violation_batch(inputs, xi, r, e);
+  check_size("z", z.size(), 2 * b.n_lam * b.count);
+  std::vector<double> same;  // one number is that of all
+  if (upstream.size() == 1)
+    same.assign(b.count, *upstream.data());
+  else
+    check_size("upstream", upstream.size(), b.count);
+  const double* each = upstream.size() == 1 ? same.data() : upstream.data();
   check_size("gradients", gradients.size(), kViolationInputs);
   double* to[kViolationInputs] = {};
   for (int i = 0; i < kViolationInputs; i++) {
     if (!gradients[i] && i < vx) throw std::invalid_argument("the system's gradients are always computed");
     if (gradients[i]) check_size("gradient", gradients[i]->size(), inputs[i].size()), to[i] = gradients[i]->data();
   }
-  pass(b, [&](void* workspace) { kernels().violation_gradient(b, z.data(), upstream.data(), to, workspace); });
+  pass(b, [&](void* workspace) { kernels().violation_gradient(b, z.data(), each, to, workspace); });
 }
 
 // ---- tables ----
@@ -368,7 +405,9 @@ nb::dict fields(const difflcs::Field* begin, const difflcs::Field* end) {
   nb::dict table;
   auto name = [](difflcs::Size size) { return nb::str(difflcs::kSizeNames[int(size)]); };
   for (const difflcs::Field* f = begin; f != end; f++) {
-    if (rank_of(*f) == 1)
+    if (rank_of(*f) == 0)
+      table[f->name] = nb::make_tuple();
+    else if (rank_of(*f) == 1)
       table[f->name] = nb::make_tuple(name(f->rows));
     else
       table[f->name] = nb::make_tuple(name(f->rows), name(f->columns));
@@ -391,6 +430,12 @@ nb::dict status_codes() {
     codes[name.c_str()] = code++;
   }
   return codes;
+}
+
+nb::dict tolerances() {
+  nb::dict table;
+  for (const difflcs::Tolerance& tolerance : difflcs::kTolerances) table[tolerance.name] = tolerance.value;
+  return table;
 }
 
 // Bits instead of `isfinite` and no early end, so that the loop is one of vectors.
@@ -421,6 +466,7 @@ NB_MODULE(_kernels, m) {
       [] { return fields(std::begin(difflcs::kViolationFields), std::end(difflcs::kViolationFields)); },
       "The same of the violation loss.");
   m.def("status_codes", &status_codes, "How a solve can end: name and code.");
+  m.def("tolerances", &tolerances, "Tolerances that the reference in Python has too.");
   m.def("all_finite", &all_finite, "arrays"_a, "Whether no number of some arrays is NaN or infinite.");
   m.def("solve_lcp", &solve_lcp, "F"_a, "q"_a, "relaxation"_a, "max_iter"_a, "time_limit"_a, "threads"_a, "lam"_a,
         "w"_a, "status"_a, "Solve a batch of LCPs into the given arrays.");
@@ -432,11 +478,11 @@ NB_MODULE(_kernels, m) {
   m.def("vjp_mpc", &vjp_mpc, "inputs"_a, "horizon"_a, "relaxation"_a, "barrier"_a, "x"_a, "u"_a, "lam"_a, "mu"_a,
         "x_bar"_a, "u_bar"_a, "lam_bar"_a, "objective_bar"_a, "solved"_a, "pivot"_a, "threads"_a, "gradients"_a,
         "Gradients of the inputs of solved LCS-MPC problems, into the given arrays.");
-  m.def("violation_loss", &violation_loss, "inputs"_a, "gamma"_a, "xi"_a, "max_iter"_a, "threads"_a, "Q"_a, "q"_a,
-        "z"_a, "r"_a, "e"_a, "loss"_a, "Violation loss of a batch and what its gradient needs, into the given arrays.");
-  m.def("violation_value", &violation_value, "inputs"_a, "gamma"_a, "xi"_a, "z"_a, "r"_a, "e"_a, "loss"_a,
+  m.def("violation_loss", &violation_loss, "inputs"_a, "xi"_a, "max_iter"_a, "threads"_a, "Q"_a, "q"_a, "z"_a, "r"_a,
+        "e"_a, "loss"_a, "Violation loss of a batch and what its gradient needs, into the given arrays.");
+  m.def("violation_value", &violation_value, "inputs"_a, "xi"_a, "z"_a, "r"_a, "e"_a, "loss"_a,
         "The same at a given z, from r and e at z = 0.");
-  m.def("violation_gradient", &violation_gradient, "inputs"_a, "gamma"_a, "xi"_a, "z"_a, "r"_a, "e"_a, "upstream"_a,
-        "gradients"_a, "Gradients of the inputs, into the given arrays; None where one is not wanted.");
+  m.def("violation_gradient", &violation_gradient, "inputs"_a, "xi"_a, "z"_a, "r"_a, "e"_a, "upstream"_a, "gradients"_a,
+        "Gradients of the inputs, into the given arrays; None where one is not wanted.");
   bind_controller(m);
 }

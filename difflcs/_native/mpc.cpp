@@ -5,26 +5,19 @@
 // conditions and their sensitivity, and the names are the names there:
 //   relaxed_lcp.hpp     lam of one stage                        mpc_problem.hpp  data, dynamics, cost
 //   linearisation.hpp   a stage with lam eliminated             riccati.hpp      gradient, active bounds, feedback law
-//   solve.hpp           projected Newton along the homotopy     adjoint.hpp      gradients of the inputs
+//   solve.hpp           projected Newton along the homotopy     progress.hpp     how far each problem has come
+//   adjoint.hpp         directions of the solution              input_gradients.hpp  gradients of the inputs
 //   certificate.hpp     judges what is stored, from the stored numbers alone, whatever the solver thinks of them
 //
 // One problem per SIMD lane: the code reads like the solver of a single problem. A finished lane stores its result and
 // takes the next problem. No lane's arithmetic depends on another lane: whatever iterates, iterates under a mask.
 // A problem alone would leave lanes idle: for it all of this is compiled once more with a single lane, and neighbouring
 // columns of matrices fill the vectors (`by_columns`).
-#include "adjoint.hpp"
 #include "kernels.hpp"
 #include "solve.hpp"
 #include "variants.hpp"
 
 namespace difflcs::DIFFLCS_ISA {
-
-// That of the widest variant serves all.
-int64_t mpc_workspace(const MpcBatch& batch) {
-  const int64_t solve = Solver<Widest::T, Widest::S>(batch, nullptr).layout(nullptr);
-  const int64_t adjoint = Adjoint<Widest::T, Widest::S>(batch, nullptr).layout(nullptr);
-  return solve > adjoint ? solve : adjoint;
-}
 
 void mpc_solve(const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void* workspace, Watch watch) {
   dispatch(batch, [&](auto variant) {

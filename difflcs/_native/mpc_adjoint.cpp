@@ -1,10 +1,22 @@
 // What needs the linearisation at a solution: gradients of the inputs, and constraints that make it degenerate.
-// Beside mpc.cpp so that the two compile at once.
+// A file of its own beside mpc.cpp, so that the two are compiled at the same time.
+#if defined(__GNUC__) && !defined(__clang__)
+// How the length of a constraint's row is rounded depends on whether GCC adds up in vectors of its own. Here it does.
+#define DIFFLCS_ROW_LENGTHS __attribute__((optimize("tree-vectorize")))
+#endif
 #include "adjoint.hpp"
 #include "kernels.hpp"
+#include "solve.hpp"
 #include "variants.hpp"
 
 namespace difflcs::DIFFLCS_ISA {
+
+// Of the solver and the adjoint; that of the widest variant serves all.
+int64_t mpc_workspace(const MpcBatch& batch) {
+  const int64_t solve = Solver<Widest::T, Widest::S>(batch, nullptr).layout(nullptr);
+  const int64_t adjoint = Adjoint<Widest::T, Widest::S>(batch, nullptr).layout(nullptr);
+  return solve > adjoint ? solve : adjoint;
+}
 
 void mpc_constraints(const MpcBatch& batch, const MpcSolve& solve, int64_t begin, int64_t end, void* workspace,
                      Watch watch) {

@@ -6,6 +6,10 @@
 #include "matrix.hpp"
 #include "sizes.hpp"
 
+#ifndef DIFFLCS_ROW_LENGTHS  // see mpc_adjoint.cpp
+#define DIFFLCS_ROW_LENGTHS
+#endif
+
 namespace difflcs::DIFFLCS_ISA {
 namespace {
 
@@ -17,7 +21,27 @@ struct Trajectory {
   Matrix<Vec, 0, S::kL> lam, s;
 
   void layout(Arena& arena, const S& n) {
-    arena.take(x, n.h + 1, n.x()), arena.take(u, n.h, n.u()), arena.take(lam, n.h, n.l()), arena.take(s, n.h, n.l());
+    arena.take(x, n.h + 1, n.x());
+    arena.take(u, n.h, n.u());
+    arena.take(lam, n.h, n.l());
+    arena.take(s, n.h, n.l());
+  }
+  // The same with sizes that are known when compiling, or without.
+  template <class Other>
+  operator Trajectory<Other>() const {
+    return {x, u, lam, s};
+  }
+};
+
+// Upstream gradients of x, u and lam.
+template <class S>
+struct Upstream {
+  Matrix<Vec, 0, S::kX> x;
+  Matrix<Vec, 0, S::kU> u;
+  Matrix<Vec, 0, S::kL> lam;
+  template <class Other>
+  operator Upstream<Other>() const {
+    return {x, u, lam};
   }
 };
 
@@ -88,21 +112,14 @@ struct Force {
   }
 };
 
-template <class T, class S>
-struct Problem {
-  static constexpr int64_t kX = S::kX, kU = S::kU, kL = S::kL, kW = S::kW;
+// The data of the problems in the lanes, whatever their sizes.
+template <class T>
+struct ProblemData {
   const MpcBatch& batch;
-  const S n;
-  const bool caller_units;  // of the cost: the adjoint differentiates it as it is
-  Stages<Matrix<T, kX, kW>> AB;
-  Stages<Matrix<T, kX, kL>> C;
-  Stages<Matrix<T, kL, kW>> DE;
-  Stages<Matrix<T, kL, kL>> F;
-  Stages<Matrix<T, kX, kX>> Q;
-  Stages<Matrix<T, kU, kU>> R;
-  Stages<Matrix<T, kX, kU>> cross;
-  Stages<Matrix<T, 0, kW>> G;
-  Matrix<T, kX, kX> Q_final;
+  const AnySizes n;
+  const bool caller_units;                               // of the cost: the adjoint differentiates it as it is
+  Stages<Matrix<T, 0, 0>> AB, C, DE, F, Q, R, cross, G;  // [A B], [D E], S, [G_x G_u]
+  Matrix<T, 0, 0> Q_final;
   // lam = scale * lam', s = s' / scale, chosen so that F' has a unit diagonal: contacts in any units converge alike. C,
   // [D E], F, c, lam and s are kept in these units; the product lam o s does not change.
   Steps<T> scale;
@@ -116,11 +133,13 @@ struct Problem {
   Steps<Vec> per_width;  // reciprocal of each action's range, zero where that is zero or infinite
   Vec *q_final, *x0;
   Vec* reach;  // of each constraint: the least that its violation is measured by, a part of what a step can make of it
-  Vec mu;                        // weight of the barrier of the bounds: follows the homotopy down to batch.barrier
+  Vec mu;      // weight of the barrier of the bounds: follows the homotopy down to batch.barrier
   Matrix<Vec, 0, 0> multiplier;  // of the constraints, and the weight of the augmented Lagrangian
   Vec rho;
 
-  Problem(const MpcBatch& b, bool caller_units)
+  void (ProblemData::*load_rows)(int64_t element, int lane);  // `load_sized_rows` with the sizes that are known
+
+  ProblemData(const MpcBatch& b, bool caller_units)
       : batch(b), n(b), caller_units(caller_units), mu(all(b.barrier)), rho(all(1)) {}
 
   void layout(Arena& arena) {
@@ -128,31 +147,51 @@ struct Problem {
     const int64_t systems = by_stage(kA, kB, kC, kD, kE, kF) ? h : 1, costs = by_stage(kQ, kR, kS) ? h : 1;
     const int64_t bounds = by_stage(ku_min, ku_max) ? h : 1;
     const int64_t rows = nc && by_stage(kG_x, kG_u, kg, kprice) ? h + 1 : 1;
-    arena.take(AB, systems, nx, nw), arena.take(C, systems, nx, nl), arena.take(DE, systems, nl, nw);
-    arena.take(F, systems, nl, nl), arena.take(scale, systems, nl);
-    arena.take(Q, costs, nx, nx), arena.take(R, costs, nu, nu), arena.take(cross, costs, nx, nu);
-    arena.take(Q_final, nx, nx), arena.take(cost_unit, 1), arena.take(weight, 1), arena.take(rest, h, nu);
-    arena.take(G, rows, nc, nw), arena.take(row_scale, rows, nc), arena.take(g, rows, nc), arena.take(price, rows, nc);
-    arena.take(d, by_stage(kd) ? h : 1, nx), arena.take(c, systems > 1 || by_stage(kc) ? h : 1, nl);
-    arena.take(q, by_stage(kq) ? h : 1, nx), arena.take(r, by_stage(kr) ? h : 1, nu);
-    arena.take(u_min, bounds, nu), arena.take(u_max, bounds, nu), arena.take(per_width, bounds, nu);
-    arena.take(q_final, nx), arena.take(x0, nx), arena.take(multiplier, h + 1, nc), arena.take(reach, nc);
+    arena.take(AB, systems, nx, nw);
+    arena.take(C, systems, nx, nl);
+    arena.take(DE, systems, nl, nw);
+    arena.take(F, systems, nl, nl);
+    arena.take(scale, systems, nl);
+    arena.take(Q, costs, nx, nx);
+    arena.take(R, costs, nu, nu);
+    arena.take(cross, costs, nx, nu);
+    arena.take(Q_final, nx, nx);
+    arena.take_all(1, cost_unit, weight);
+    arena.take(rest, h, nu);
+    arena.take(G, rows, nc, nw);
+    arena.take(row_scale, rows, nc);
+    arena.take(g, rows, nc);
+    arena.take(price, rows, nc);
+    arena.take(d, by_stage(kd) ? h : 1, nx);
+    arena.take(c, systems > 1 || by_stage(kc) ? h : 1, nl);
+    arena.take(q, by_stage(kq) ? h : 1, nx);
+    arena.take(r, by_stage(kr) ? h : 1, nu);
+    arena.take(u_min, bounds, nu);
+    arena.take(u_max, bounds, nu);
+    arena.take(per_width, bounds, nu);
+    arena.take_all(nx, q_final, x0);
+    arena.take(multiplier, h + 1, nc);
+    arena.take(reach, nc);
     if constexpr (kShared<T>)
       if (arena.memory) load_matrices(0, 0);
   }
 
+  template <class S = AnySizes>
   StageData<T, S> stage(int64_t k) const {
     return {AB[k],   C[k], DE[k], F[k], Q[k], R[k],     cross[k], G[k],         scale[k], row_scale[k],
             rest[k], d[k], c[k],  q[k], r[k], u_min[k], u_max[k], per_width[k], g[k],     price[k]};
   }
   // Only the constraints mean something there.
+  template <class S = AnySizes>
   StageData<T, S> last() const {
-    StageData<T, S> data = stage(0);
-    data.G = G[n.h], data.row_scale = row_scale[n.h], data.g = g[n.h], data.price = price[n.h];
+    StageData<T, S> data = stage<S>(0);
+    data.G = G[n.h];
+    data.row_scale = row_scale[n.h];
+    data.g = g[n.h];
+    data.price = price[n.h];
     return data;
   }
 
-  // ---- loading ----
   template <class... Inputs>
   bool by_stage(Inputs... which) const {
     return ((batch.step[which] > 0) || ...);
@@ -161,7 +200,7 @@ struct Problem {
   const double* input(Input which, int64_t element, int64_t k = 0) const { return batch.at(which, element, k); }
 
   void load_matrices(int64_t e, int lane) {
-    const int64_t nl = n.l(), nx = n.x(), nw = n.w(), nc = n.c();
+    const int64_t nl = n.l(), nw = n.w();
     const auto one = [](int64_t) { return 1.0; };
     auto matrix = [&](auto to, Input which, int64_t k, auto by_row, auto by_column) {
       const double* from = input(which, e, k);
@@ -180,18 +219,33 @@ struct Problem {
         put(scale[k], i, lane, f > 0 ? 1.0 / __builtin_sqrt(f) : 1.0);
       }
       const auto contact = [&](int64_t i) { return lane_of(scale[k][i], lane); };
-      const StageData<T, S> to = stage(k);
-      matrix(to.A(), kA, k, one, one), matrix(to.B(), kB, k, one, one), matrix(to.C, kC, k, one, contact);
-      matrix(to.D(), kD, k, contact, one), matrix(to.E(), kE, k, contact, one), matrix(to.F, kF, k, contact, contact);
+      const StageData<T, AnySizes> to = stage(k);
+      matrix(to.A(), kA, k, one, one);
+      matrix(to.B(), kB, k, one, one);
+      matrix(to.C, kC, k, one, contact);
+      matrix(to.D(), kD, k, contact, one);
+      matrix(to.E(), kE, k, contact, one);
+      matrix(to.F, kF, k, contact, contact);
     }
-    for (int64_t k = 0; k < Q.count; k++)
-      matrix(Q[k], kQ, k, one, cost), matrix(R[k], kR, k, one, cost), matrix(cross[k], kS, k, one, cost);
+    for (int64_t k = 0; k < Q.count; k++) {
+      matrix(Q[k], kQ, k, one, cost);
+      matrix(R[k], kR, k, one, cost);
+      matrix(cross[k], kS, k, one, cost);
+    }
     matrix(Q_final, kQ_final, 0, one, cost);
     curvature_at_rest(
         n, [&](int64_t k) { return stage(k).B().entries; }, nw, [&](int64_t k) { return Q[k].entries; },
         Q_final.entries, [&](int64_t k) { return R[k].entries; }, scale.count == 1 && Q.count == 1, rest, lane);
-    for (int64_t k = 0; k < G.count && nc > 0; k++) {
-      const StageData<T, S> to = k < n.h ? stage(k) : last();
+    if (n.c() > 0) (this->*load_rows)(e, lane);
+  }
+
+  // The rows of the constraints, made to have length one.
+  template <class S>
+  DIFFLCS_ROW_LENGTHS void load_sized_rows(int64_t e, int lane) {
+    const S n(batch);
+    const int64_t nx = n.x(), nw = n.w(), nc = n.c();
+    for (int64_t k = 0; k < G.count; k++) {
+      const StageData<T, AnySizes> to = k < n.h ? stage(k) : last();
       const double *G_x = input(kG_x, e, k), *G_u = input(kG_u, e, k);
       for (int64_t i = 0; i < nc; i++) {
         // The last stage has no actions.
@@ -240,8 +294,12 @@ struct Problem {
       }
     };
     const double cost = lane_of(cost_unit[0], lane);
-    vector(d, kd), vector(c, kc), vector(q, kq, cost), vector(r, kr, cost), vector(u_min, ku_min),
-        vector(u_max, ku_max);
+    vector(d, kd);
+    vector(c, kc);
+    vector(q, kq, cost);
+    vector(r, kr, cost);
+    vector(u_min, ku_min);
+    vector(u_max, ku_max);
     for (int64_t i = 0; i < n.x(); i++) {
       put(q_final, i, lane, input(kq_final, e)[i] * cost);
       put(x0, i, lane, input(kx0, e)[i]);
@@ -262,8 +320,8 @@ struct Problem {
     for (int64_t i = 0; i < n.c(); i++) {
       double most = 0;
       for (int64_t k = 0; k <= n.h; k++) {
-        const StageData<T, S> to = k < n.h ? stage(k) : last(), before = stage(k > 0 ? k - 1 : 0);
-        const auto range = [&](const StageData<T, S>& at, int64_t j) {
+        const StageData<T, AnySizes> to = k < n.h ? stage(k) : last(), before = stage(k > 0 ? k - 1 : 0);
+        const auto range = [&](const StageData<T, AnySizes>& at, int64_t j) {
           return lane_of(at.per_width[j], lane) > 0 ? 1.0 / lane_of(at.per_width[j], lane) : 0.0;
         };
         double sum = 0;
@@ -318,10 +376,11 @@ struct Problem {
   }
 
   // ---- cost ----
+  template <class S>
   Vec cost(const Trajectory<S>& at) const {
     Vec total = plain_cost(at);
     for (int64_t k = 0; k <= n.h && n.c() > 0; k++) {
-      const StageData<T, S> here = k < n.h ? stage(k) : last();
+      const StageData<T, S> here = k < n.h ? stage<S>(k) : last<S>();
       const Vec* before = multiplier[k];
       for (int64_t i = 0; i < n.c(); i++)
         total += Force::cost(here.constraint(i, at.x[k], k < n.h ? at.u[k] : nullptr), before[i], rho, here.price[i]);
@@ -330,10 +389,10 @@ struct Problem {
   }
 
   // The objective: with what soft constraints cost, in place of the augmented Lagrangian.
-  Vec objective(const Trajectory<S>& at) const {
+  Vec objective(const Trajectory<AnySizes>& at) const {
     Vec total = plain_cost(at);
     for (int64_t k = 0; k <= n.h; k++) {
-      const StageData<T, S> here = k < n.h ? stage(k) : last();
+      const StageData<T, AnySizes> here = k < n.h ? stage(k) : last();
       for (int64_t i = 0; i < n.c(); i++) {
         const Vec violation = max(here.constraint(i, at.x[k], k < n.h ? at.u[k] : nullptr), all(0));
         total += select((violation > 0) & (here.price[i] < kHuge), here.price[i] * violation, all(0));
@@ -343,15 +402,16 @@ struct Problem {
   }
 
  private:
+  template <class S>
   Vec plain_cost(const Trajectory<S>& at) const {
     auto quadratic = [](const auto& W, const Vec* linear, const Vec* z) {
       Vec total = all(0);
       for (int64_t i = 0; i < W.rows; i++) total += z[i] * (0.5 * (all(0) + W.row(i) * z) + linear[i]);
       return total;
     };
-    Vec total = quadratic(Q_final, q_final, at.x[n.h]);
+    Vec total = quadratic(Matrix<T, S::kX, S::kX>(Q_final), q_final, at.x[n.h]);
     for (int64_t k = 0; k < n.h; k++) {
-      const StageData<T, S> here = stage(k);
+      const StageData<T, S> here = stage<S>(k);
       total += quadratic(here.Q, here.q, at.x[k]) + quadratic(here.R, here.r, at.u[k]);
       if (batch.crossed)
         for (int64_t i = 0; i < n.x(); i++) total += at.x(k, i) * (all(0) + here.cross.row(i) * at.u[k]);
@@ -361,6 +421,21 @@ struct Problem {
         for (int64_t j = 0; j < n.u(); j++) total -= mu * log((at.u(k, j) - u_min[k][j]) * (u_max[k][j] - at.u(k, j)));
     return total;
   }
+};
+
+// The same for sizes that are known when compiling.
+template <class T, class S>
+struct Problem : ProblemData<T> {
+  const S n;
+
+  Problem(const MpcBatch& b, bool caller_units) : ProblemData<T>(b, caller_units), n(b) {
+    this->load_rows = &ProblemData<T>::template load_sized_rows<S>;
+  }
+
+  StageData<T, S> stage(int64_t k) const { return ProblemData<T>::template stage<S>(k); }
+  StageData<T, S> last() const { return ProblemData<T>::template last<S>(); }
+  Matrix<T, 0, S::kW> G(int64_t k) const { return ProblemData<T>::G[k]; }
+  Matrix<T, S::kX, S::kX> Q_final() const { return ProblemData<T>::Q_final; }
 };
 
 }  // namespace

@@ -29,10 +29,10 @@ inline void lcp_slack(int64_t n, const T* F, const Vec* q, const Vector& lam, Ve
 }
 
 // T is the type of an entry of F: double where all lanes share it, else Vec. N is the size where it is known when
-// compiling, else zero; `kPivot` eliminates with row exchanges.
-template <class T, int64_t N, bool kPivot>
+// compiling, else zero; `kMayPivot` can eliminate with row exchanges.
+template <class T, int64_t N, bool kMayPivot>
 class RelaxedLcp {
-  using Lu = Elimination<kPivot>;
+  const Elimination<kMayPivot> lu;
   const int64_t given;
   const Matrix<const T, N, N> F;
   const Vec* const q;
@@ -48,8 +48,9 @@ class RelaxedLcp {
   static int64_t scratch(int64_t n) { return n * n + 7 * n; }
 
   // `memory`: scratch(n) numbers; `exchanged`: n row numbers.
-  DIFFLCS_INLINE RelaxedLcp(int64_t n, const T* F, const Vec* q, Vec* memory, Mask* exchanged)
-      : given(n),
+  DIFFLCS_INLINE RelaxedLcp(int64_t n, const T* F, const Vec* q, Vec* memory, Mask* exchanged, bool pivot = false)
+      : lu{pivot},
+        given(n),
         F{F, {n}, {n}, {n}},
         q(q),
         rows(exchanged),
@@ -86,7 +87,7 @@ class RelaxedLcp {
       advance(eps4, done, 8);
     }
     finish(lam_out, w_out, eps, skip);
-    if constexpr (kPivot) polish(lam_out, w_out, eps, skip);
+    if (kMayPivot && lu.pivot) polish(lam_out, w_out, eps, skip);
   }
 
   // From eps = 1 down to `target`. Returns the lanes that converged; `bound` is scratch.
@@ -107,9 +108,10 @@ class RelaxedLcp {
         if (at_target[l]) {
           if (residual[l] <= 1e-14 * magnitude[l])
             solved[l] = -1;
-          else if (residual[l] < 0.5 * smallest[l])
-            smallest[l] = residual[l], stalled[l] = 0;
-          else if (residual[l] <= 1e-10 * magnitude[l] && ++stalled[l] >= 2)
+          else if (residual[l] < 0.5 * smallest[l]) {
+            smallest[l] = residual[l];
+            stalled[l] = 0;
+          } else if (residual[l] <= 1e-10 * magnitude[l] && ++stalled[l] >= 2)
             solved[l] = -1;
         }
       }
@@ -133,7 +135,8 @@ class RelaxedLcp {
     for (int64_t i = 0; i < n; i++) {
       const Vec t = q[i] + F.row(i) * next;
       const Vec diff = next[i] - t;
-      w_next[i] = t, root_next[i] = sqrt(diff * diff + eps4);
+      w_next[i] = t;
+      root_next[i] = sqrt(diff * diff + eps4);
       const Vec g = next[i] + t - root_next[i];
       sum += g * g;
     }
@@ -166,8 +169,8 @@ class RelaxedLcp {
       jacobian[i * n + i] += 1.0 - ratio;
       step[i] = root[i] - lam[i] - w[i];
     }
-    Lu::factor(n, jacobian, rows);
-    Lu::solve(n, jacobian, rows, step);
+    lu.factor(n, jacobian, rows);
+    lu.solve(n, jacobian, rows, step);
     Vec length = all(1), merit_next = merit;
     for (int trial = 0; trial < trials; trial++) {
       DIFFLCS_UNROLL
@@ -206,12 +209,15 @@ class RelaxedLcp {
     for (int iteration = 0; iteration < 4; iteration++) {
       for (int64_t i = 0; i < n; i++) {
         Vec t = q[i];
-        for (int64_t j = 0; j < n; j++) t += F(i, j) * lam_out[j], jacobian[i * n + j] = lam_out[i] * F(i, j);
+        for (int64_t j = 0; j < n; j++) {
+          t += F(i, j) * lam_out[j];
+          jacobian[i * n + j] = lam_out[i] * F(i, j);
+        }
         jacobian[i * n + i] += w_out[i];
         step[i] = eps - lam_out[i] * t;
       }
-      Lu::factor(n, jacobian, rows);
-      Lu::solve(n, jacobian, rows, step);
+      lu.factor(n, jacobian, rows);
+      lu.solve(n, jacobian, rows, step);
       Mask keep = skip;  // a step that would leave the interior, or is not a number
       for (int64_t i = 0; i < n; i++) keep |= ~(abs(step[i]) <= 0.5 * lam_out[i]);
       for (int64_t i = 0; i < n; i++) {

@@ -1,6 +1,6 @@
 // The Riccati sweep of the MPC with lam eliminated: reduced gradient, active bounds, and the feedback law that solves
 // the quadratic problem around a trajectory. The adjoint is the same sweep with upstream gradients as linear terms
-// (difflcs/mpc/kkt.py: `linearise` and the backward half of `_solve`).
+// (difflcs/mpc/riccati.py: `linearise`, and the backward half of `_solve`).
 #pragma once
 #include "lanes.hpp"
 #include "linearisation.hpp"
@@ -16,17 +16,13 @@ constexpr double kFlat = 1e-3;
 // Damping of the actions beside that of the contacts, in units of each action's own curvature: what bends the cost is
 // damped where it bends, the actions only lest nothing is.
 constexpr double kActionDamping = 0.01;
-// A reduced Hessian is singular below this part of an action's own curvature (difflcs.mpc.kkt has the same).
-constexpr double kSingular = 1e-10;
-// An action with a barrier is differentiated as one at its bound below this part of its range (kkt has the same).
-constexpr double kClose = 1e-8;
 
 // How the solver's step is taken.
 struct Newton {
-  Vec regularisation{};  // added to the curvature of contacts and actions
-  Mask stubborn{};       // keeps the second derivative of lam where the Hessian is indefinite
-  Mask gauss_newton{};   // never has it
-  Mask unbounded{};      // knows no bounds
+  Vec regularisation{};   // added to the curvature of contacts and actions
+  Mask keep_curvature{};  // keeps the second derivative of lam where the Hessian is indefinite
+  Mask gauss_newton{};    // never has it
+  Mask unbounded{};       // knows no bounds
 };
 
 // What a sweep finds besides the feedback law.
@@ -35,17 +31,10 @@ struct Sweep {
   Vec rounding;    // level below which rounding hides it
   Vec stationary;  // projected gradient in parts of its scale, which sees flat directions too (certificate.hpp)
   Vec violated;    // by how much constraints are not met or not complementary, in parts of the sizes of their terms
-  Vec owing;       // largest change of their multipliers that the augmented Lagrangian calls for
-  Vec fine, pull;  // the largest multiplier; what the cost asks of states and actions, added up over the stages
-  Mask weak;       // a bound is weakly active, or the reduced Hessian is singular
-};
-
-// Upstream gradients of x, u and lam.
-template <class S>
-struct Upstream {
-  Matrix<Vec, 0, S::kX> x;
-  Matrix<Vec, 0, S::kU> u;
-  Matrix<Vec, 0, S::kL> lam;
+  Vec multiplier_step;  // largest change of their multipliers that the augmented Lagrangian calls for
+  Vec largest_multiplier;
+  Vec cost_gradient;  // sizes of the gradients of the cost in states and actions, added up over the stages
+  Mask weak;          // a bound is weakly active, or the reduced Hessian is singular
 };
 
 // Value function of the steps from one on: Hessian, costate, and linear term.
@@ -72,8 +61,8 @@ class Riccati {
   Vec *row_terms, *row_violation;  // of each constraint, the largest over the stages
   Mask* active;
   Newton newton;
-  Vec kinked;  // beside the kinks of constraints: damping of what is flat
-  Sweep found;
+  Vec flat_damping;  // beside the kinks of constraints: damping of what is flat
+  Sweep result;
 
  public:
   Matrix<Vec, 0, kU> gradient, feedforward;
@@ -87,16 +76,27 @@ class Riccati {
   void layout(Arena& arena) {
     const int64_t nx = n.x(), nu = n.u(), nw = n.w(), h = n.h, values = kAdjoint ? h + 1 : 2;
     linearisation.layout(arena);
-    arena.take(P, values, nx, nx), arena.take(p, values, nx), arena.take(v, values, nx);
-    arena.take(H, nw, nw), arena.take(PA, nx, nw), arena.take(H_uu, nu, nu), arena.take(L, nu, nu),
-        arena.take(law, nu, nx + 1);
-    arena.take(linear, nw), arena.take(flat, nu), arena.take(column, nx * kColumns), arena.take(active, nu),
-        arena.take(toward, nu), arena.take(share, nu);
-    arena.take(gradient, h, nu), arena.take(feedforward, h, nu), arena.take(feedback, h, nu, nx);
-    arena.take(lower, h, nu), arena.take(upper, h, nu);
+    arena.take(P, values, nx, nx);
+    arena.take(p, values, nx);
+    arena.take(v, values, nx);
+    arena.take(H, nw, nw);
+    arena.take(PA, nx, nw);
+    arena.take(H_uu, nu, nu);
+    arena.take(L, nu, nu);
+    arena.take(law, nu, nx + 1);
+    arena.take(linear, nw);
+    arena.take_all(nu, flat, active, toward, share);
+    arena.take(column, nx * kColumns);
+    arena.take(gradient, h, nu);
+    arena.take(feedforward, h, nu);
+    arena.take(feedback, h, nu, nx);
+    arena.take(lower, h, nu);
+    arena.take(upper, h, nu);
     const int64_t nc = n.c();
-    arena.take(force, h + 1, nc), arena.take(stiffness, h + 1, nc);
-    arena.take(row_terms, nc), arena.take(row_violation, nc), arena.take(largest_action, nu);
+    arena.take(force, h + 1, nc);
+    arena.take(stiffness, h + 1, nc);
+    arena.take_all(nc, row_terms, row_violation);
+    arena.take(largest_action, nu);
   }
 
   Stage<S> stage(int64_t k) const { return linearisation.stage(k); }
@@ -110,11 +110,12 @@ class Riccati {
   // Around the trajectory `at`.
   Sweep sweep(const Trajectory<S>& at, const Upstream<S>& upstream, const Newton& how = {}) {
     newton = how;
-    found = {all(0), all(0), all(0), all(0), all(0), all(0), all(0), Mask{}};
-    kinked = all(0);
+    result = {all(0), all(0), all(0), all(0), all(0), all(0), all(0), Mask{}};
+    flat_damping = all(0);
     for (int64_t i = 0; i < n.c(); i++) {
-      row_terms[i] = problem.reach[i], row_violation[i] = all(0);
-      if (!kAdjoint) kinked = select(problem.reach[i] > 0, newton.regularisation, kinked);
+      row_terms[i] = problem.reach[i];
+      row_violation[i] = all(0);
+      if (!kAdjoint) flat_damping = select(problem.reach[i] > 0, newton.regularisation, flat_damping);
     }
     for (int64_t j = 0; j < n.u() && problem.batch.unbounded; j++) {
       largest_action[j] = all(0);
@@ -135,8 +136,8 @@ class Riccati {
       feedback_law(k);
     }
     for (int64_t i = 0; i < n.c(); i++)
-      found.violated = max(found.violated, row_violation[i] / select(row_terms[i] > 0, row_terms[i], all(1)));
-    return found;
+      result.violated = max(result.violated, row_violation[i] / select(row_terms[i] > 0, row_terms[i], all(1)));
+    return result;
   }
 
   // What contact i of stage k answers to a change of state and action, to first order.
@@ -148,14 +149,15 @@ class Riccati {
   void terminal(const Vec* x, const Vec* x_bar) {
     const int64_t nx = n.x();
     const Value<S> end = value(n.h);
+    const Matrix<T, kX, kX> Q = problem.Q_final();
     for (int64_t i = 0; i < nx; i++) {
-      for (int64_t j = 0; j < nx; j++) end.P(i, j) = all(0) + problem.Q_final(i, j);
-      end.p[i] = problem.q_final[i] + problem.Q_final.row(i) * x;
+      for (int64_t j = 0; j < nx; j++) end.P(i, j) = all(0) + Q(i, j);
+      end.p[i] = problem.q_final[i] + Q.row(i) * x;
     }
     if (n.c() > 0) {
       const StageData<T, S> data = problem.last();
       constraints(n.h, data, x, nullptr);
-      for (int64_t i = 0; i < nx; i++) found.pull += abs(end.p[i]);
+      for (int64_t i = 0; i < nx; i++) result.cost_gradient += abs(end.p[i]);
       for (int64_t r = 0; r < n.c(); r++) {
         const Vec stiff = stiffness(n.h, r);
         for (int64_t i = 0; i < nx; i++) {
@@ -173,8 +175,10 @@ class Riccati {
     for (int64_t i = 0; i < n.c(); i++) {
       const Vec c = data.constraint(i, x, u), before = problem.multiplier(k, i), price = data.price[i];
       const Force now(c, before, problem.rho, price);
-      force(k, i) = now.value, stiffness(k, i) = select(now.held, problem.rho, all(0));
-      found.owing = max(found.owing, abs(now.value - before)), found.fine = max(found.fine, now.value);
+      force(k, i) = now.value;
+      stiffness(k, i) = select(now.held, problem.rho, all(0));
+      result.multiplier_step = max(result.multiplier_step, abs(now.value - before));
+      result.largest_multiplier = max(result.largest_multiplier, now.value);
       row_terms[i] = max(row_terms[i], data.constraint_terms(i, x, u));
       const Vec missed = select(now.held, abs(c), select(now.value > 0, max(-c, all(0)), max(c, all(0))));
       row_violation[i] = max(row_violation[i], missed);
@@ -245,18 +249,22 @@ class Riccati {
         H(nx + j, nx + j) += mu * (1.0 / (below * below) + 1.0 / (above * above));
       }
       Vec terms = abs(t);
-      if (n.c() > 0) found.pull += terms;
+      if (n.c() > 0) result.cost_gradient += terms;
       for (int64_t i = 0; i < n.c(); i++) {
         const Vec part = data.G(i, nx + j) * force(k, i);
-        t += part, terms += abs(part);
+        t += part;
+        terms += abs(part);
       }
       Vec g = t, l = kAdjoint ? -u_bar[j] : t;
       for (int64_t i = 0; i < nx; i++) {
         const Vec part = stage.A_hat(i, nx + j) * next.p[i];
-        g += part, terms += abs(part), l += stage.A_hat(i, nx + j) * next.v[i];
+        g += part;
+        terms += abs(part);
+        l += stage.A_hat(i, nx + j) * next.v[i];
       }
       if (kAdjoint) l = l - stage.K_lam.column(nx + j) * lam_bar;
-      linear[nx + j] = l, gradient(k, j) = g;
+      linear[nx + j] = l;
+      gradient(k, j) = g;
       // Away from an optimum P, and with it H, can be indefinite: |H| is still a scale for the distance to a bound.
       // Where the cost is flat, the range of the action is the scale: a descent leads across all of it.
       // Without bounds it is what the action is now, or one.
@@ -266,8 +274,8 @@ class Riccati {
       Vec projected = abs(scaled - u[j]) * gauss_newton;
       // Next to a bound the barrier is so steep that rounding u alone moves g: a step below rounding counts as none.
       if (barrier > 0) projected = select(abs(g) <= 1e-14 * width * gauss_newton, all(0), projected);
-      found.projected = max(found.projected, projected);
-      found.rounding = max(found.rounding, 1e-12 * terms);
+      result.projected = max(result.projected, projected);
+      result.rounding = max(result.rounding, 1e-12 * terms);
       if (barrier > 0)
         terms += mu * (1.0 / below + 1.0 / above) + 1e-8 * mu * width * (1.0 / (below * below) + 1.0 / (above * above));
       const Vec reference = max(terms, rest[j] * width);
@@ -275,16 +283,16 @@ class Riccati {
       const Vec reach = select(g > 0, below, above);
       part = min(part, problem.batch.unbounded ? select(reach > kHuge, reach, reach * per_width) : reach * per_width);
       if (barrier > 0) part = select(projected > 0, part, all(0));
-      found.stationary = max(found.stationary, part);
-      flat[j] = (kFlat + kinked) * across;
+      result.stationary = max(result.stationary, part);
+      flat[j] = (kFlat + flat_damping) * across;
       const Vec least = 1e-10 * reference * per_width;
       const Vec curved = max(H(nx + j, nx + j) + linearisation.curvature(nx + j, nx + j), max(least, all(kTiny)));
       const Vec step = g / curved;
       if (barrier == 0) {
-        Mask small = abs(step) <= 1e-5 * width;
+        Mask small = abs(step) <= kWeak * width;
         // With one bound, at zero, and at rest there in all steps, the action has no size: the gradient alone decides.
-        if (problem.batch.unbounded) small |= ~(width > 0) & (abs(g) <= 1e-5 * terms);
-        found.weak |= (min(below, above) <= 1e-5 * width) & small & ~fixed;
+        if (problem.batch.unbounded) small |= ~(width > 0) & (abs(g) <= kWeak * terms);
+        result.weak |= (min(below, above) <= kWeak * width) & small & ~fixed;
       }
       if (kAdjoint) {
         lower(k, j) = (step > below) | (fixed & (g >= 0));
@@ -313,11 +321,12 @@ class Riccati {
     for (int64_t i = 0; i < n.x(); i++) {
       Vec t = data.q[i] + data.Q.row(i) * x;
       if (problem.batch.crossed) t = t + data.cross.row(i) * u;
-      if (n.c() > 0) found.pull += abs(t);
+      if (n.c() > 0) result.cost_gradient += abs(t);
       for (int64_t r = 0; r < n.c(); r++) t += data.G(r, i) * force(k, r);
       Vec l = (kAdjoint ? -x_bar[i] : t) + stage.A_hat.column(i) * next.v;
       if (kAdjoint) l = l - stage.K_lam.column(i) * lam_bar;
-      p[i] = t + stage.A_hat.column(i) * next.p, linear[i] = l;
+      p[i] = t + stage.A_hat.column(i) * next.p;
+      linear[i] = l;
     }
   }
 
@@ -328,7 +337,7 @@ class Riccati {
   }
 
   // Cholesky of H_uu + Y_uu + regularisation with identity rows for active actions. An indefinite block first drops
-  // what is negative in Y at this stage, then has its pivots lifted; lanes that are `stubborn` lift them at once.
+  // what is negative in Y at this stage, then has its pivots lifted; lanes that are `keep_curvature` lift them at once.
   void factor(const StageData<T, S>& data) {
     const int64_t nx = n.x(), nu = n.u();
     if (!kAdjoint && any(newton.gauss_newton)) linearisation.drop(newton.gauss_newton);
@@ -341,9 +350,9 @@ class Riccati {
         if (!kAdjoint) H_uu(i, i) += kActionDamping * newton.regularisation * action_scale(data, i) + flat[i];
       }
       const Mask failed = cholesky(data, attempt == 0);
-      if (kAdjoint) found.weak |= failed;
+      if (kAdjoint) result.weak |= failed;
       if (kAdjoint || !any(failed) || attempt == 1) break;
-      linearisation.make_convex(failed & ~newton.stubborn);
+      linearisation.make_convex(failed & ~newton.keep_curvature);
     }
   }
 
@@ -361,7 +370,7 @@ class Riccati {
       const Mask bad = ~(pivot > lift) & ~active[j];
       failed |= bad;
       // What is added where the cost is flat vanishes with the gradient, and does not hide that it is.
-      if (!kAdjoint && judged) found.weak |= ~(pivot - flat[j] > singular) & ~active[j];
+      if (!kAdjoint && judged) result.weak |= ~(pivot - flat[j] > singular) & ~active[j];
       Vec inverse = 1.0 / sqrt(select(bad, max(abs(pivot), lift), pivot));
       // The adjoint holds an action that nothing moves, and takes a negative curvature by its size.
       if (kAdjoint) inverse = select(bad & (abs(pivot) <= lift), all(0), inverse);
@@ -411,7 +420,8 @@ class Riccati {
       for (int64_t i = 0; i < nu; i++) {
         const Mask hits = open & (share[i] <= length);
         d[i] = select(open, d[i] + length * toward[i], d[i]);
-        active[i] |= hits, blocked |= hits;
+        active[i] |= hits;
+        blocked |= hits;
       }
       open &= blocked;
       if (!any(open)) break;

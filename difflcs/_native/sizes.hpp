@@ -10,10 +10,6 @@ namespace difflcs::DIFFLCS_ISA {
 namespace {
 
 constexpr double kTiny = 1e-300;
-// A scale is at least this part of what its terms would be, had nothing cancelled before.
-constexpr double kCancelled = 1e-3;
-// What a step further along a chain of states counts: so little that no size grows with it in most systems.
-constexpr double kFurther = 0.1;
 
 // Whether all problems share their matrices: the type of an entry says it.
 template <class T>
@@ -23,7 +19,6 @@ constexpr bool kShared = std::is_same_v<T, double>;
 template <int X, int U, int L>
 struct Sizes {
   static constexpr int64_t kX = X, kU = U, kL = L, kW = X && U ? X + U : 0;
-  static constexpr bool kPivot = false;
   int64_t rx, ru, rl, rc, h;
   explicit Sizes(const MpcBatch& b) : rx(b.n_x), ru(b.n_u), rl(b.n_lam), rc(b.n_c), h(b.horizon) {}
   int64_t x() const { return X ? X : rx; }
@@ -33,11 +28,7 @@ struct Sizes {
   int64_t c() const { return rc; }
 };
 
-// Any sizes, and elimination with row exchanges.
-struct Pivoting : Sizes<0, 0, 0> {
-  static constexpr bool kPivot = true;
-  using Sizes::Sizes;
-};
+using AnySizes = Sizes<0, 0, 0>;
 
 inline bool shared_matrices(const MpcBatch& b) {
   bool shared = true;

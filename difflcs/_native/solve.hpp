@@ -5,53 +5,16 @@
 // free plant, which is rolled out with contact and clipped to the bounds. An unstable plant has fallen over where its
 // actions alone are rolled out. The gaps along it also tell the scale of the problem, from which the homotopy starts.
 #pragma once
-#include "certificate.hpp"
 #include "kernels.hpp"
 #include "lanes.hpp"
 #include "matrix.hpp"
 #include "mpc_problem.hpp"
+#include "progress.hpp"
 #include "relaxed_lcp.hpp"
 #include "riccati.hpp"
 
 namespace difflcs::DIFFLCS_ISA {
 namespace {
-
-// Projected gradient, in parts of its scale (see certificate.hpp), at which a problem is solved.
-constexpr double kStationary = 1e-7;
-// Violation of a constraint, in parts of the sizes of its terms, at which it is met; and where more is rounding.
-constexpr double kMet = 1e-12, kMetHardly = 1e-10, kMetRounded = 1e-7;
-// Weight of the augmented Lagrangian, in parts of the largest weight of the cost: at first, and where a violation that
-// three steps of the multipliers in a row have not halved means that the problem is infeasible; if the multipliers are
-// also that many times what the cost asks for, so that it is not the cost that keeps the violation.
-constexpr double kPenalty = 10.0, kLargestPenalty = 1e7, kOutbids = 1e6;
-// A step of the multipliers is due where the projected gradient is below this part of what the step before left, and of
-// the change that it would make. The first counts where constraints are far from the actions that they act through.
-constexpr double kDue = 0.03;
-// A violation that is more than a tenth of the one before (a hundredth, where it is small) asks for ten times the
-// weight, one that stays for more.
-constexpr double kSlow = 0.1, kSlowEnd = 0.01, kSmall = 1e-4, kStays = 0.9, kRaise = 10.0, kRaiseMore = 30.0;
-// Steps after which the multipliers move in any case where little is violated: actions that constraints couple can take
-// turns next to their bounds, and other multipliers end that.
-constexpr int64_t kPatience = 20;
-constexpr double kLittle = 1e-6;
-// The least damping that is tried, in parts of what bounds the kink of every contact.
-constexpr double kLeastDamping = 0.25;
-// Failed searches in a row, each with 4 times the damping, before a problem is given up.
-constexpr int64_t kFailures = 12;
-// Steps in a row that gain no more than rounding, after which a tenth of the accuracy is let go, and again after as
-// many more: where the system is stiff, the gradient at the optimum is rounding too. Part of the cost that counts as
-// rounding.
-constexpr int64_t kStill = 8;
-// As many such steps in, a plan that is stationary but for its scale, which vanishes at a vertex, is put before the
-// certificate, which has the sizes of what cancelled.
-constexpr int64_t kAsk = 2;
-// A large weight of the augmented Lagrangian makes much of the rounding of a constraint. Where more than this part is
-// left of the gradient at such a vertex, the multipliers are found once more with the first weight.
-constexpr double kClean = 1e-9;
-constexpr double kNothing = 1e-12;
-constexpr double kLetGo[] = {1.0, 10.0, 100.0, 1000.0};
-// The least projected gradient that is asked for then.
-constexpr double kInVain = 1e-8;
 
 template <class T, class S>
 class Solver {
@@ -59,59 +22,43 @@ class Solver {
   const S n;
   Problem<T, S> problem;
   Riccati<T, S, false> riccati;
-  Certificate<T, S> certificate;
-  Trajectory<S> at, next;  // the iterate and the trial
-  Vec *gap, *newton, *dx, *du;
+  Progress<T> progress;
+  Trajectory<S> at, next;  // the iterate, which `progress` has too, and the trial
+  Vec *newton, *dx, *du;
   Mask* rows;
 
  public:
-  Solver(const MpcBatch& b, void* memory) : batch(b), n(b), problem(b, false), riccati(problem), certificate(b) {
+  Solver(const MpcBatch& b, void* memory) : batch(b), n(b), problem(b, false), riccati(problem), progress(b, problem) {
     layout(memory);
   }
 
   // Lays the arrays out in `memory`, or only counts them where it is null.
   int64_t layout(void* memory) {
     Arena arena{memory};
-    problem.layout(arena), at.layout(arena, n), next.layout(arena, n);
-    arena.take(gap, n.l()), arena.take(newton, Lcp::scratch(n.l())), arena.take(rows, n.l());
-    arena.take(dx, n.x()), arena.take(du, n.u());
-    riccati.layout(arena), certificate.layout(arena);
+    problem.layout(arena);
+    progress.layout(arena);
+    at = progress.at;
+    next.layout(arena, n);
+    arena.take(newton, Lcp::scratch(n.l()));
+    arena.take(rows, n.l());
+    arena.take(dx, n.x());
+    arena.take(du, n.u());
+    riccati.layout(arena);
     return arena.used;
   }
 
   void solve(const MpcSolve& o, int64_t* counter, Watch watch);
 
  private:
-  using Lcp = RelaxedLcp<T, S::kL, S::kPivot>;
-
-  // The problems in the lanes, and how far each has come.
-  struct Lane {
-    int64_t element = -1;  // -1: idle
-    int64_t iterations = 0, in_stage = 0, failures = 0;
-    double violated = 1e300;  // at the last step of the multipliers
-    double left = 0;          // projected gradient after that; 0 where it is not known yet
-    int64_t stalled = 0;      // steps of the multipliers in a row that hardly helped
-    double gained = 0;        // by the last step
-    bool cleaned = false;     // see kClean
-    int64_t still = 0;        // steps at the target in a row that gained no more than the rounding of the cost
-  };
-  Lane lane[kLanes];
-  Vec eps, regularisation, J;
-  Mask fresh;     // without a trajectory at its eps
-  Mask released;  // without contact yet
-  Mask plain;     // by Gauss-Newton
-  Mask repriced;  // with multipliers that J does not know yet
-  // Elements that are finished but not certified yet.
-  int64_t finished[kLanes];
-  int waiting;
+  using Lcp = RelaxedLcp<T, S::kL, S::kL == 0>;
 
   // Large problems look at the watch at every stage, small ones once per iteration.
   bool halted(Watch watch) const { return n.l() > 16 && watch.stop(watch.context); }
 
   // lam and s of one stage, from the guess in `lam`; lanes in `skip` keep both.
   void contacts(const StageData<T, S>& data, const Vec* x, const Vec* u, Vec* lam, Vec* s, Mask skip) {
-    data.gap(x, u, gap);
-    Lcp(n.l(), data.F.entries, gap, newton, rows).solve(lam, s, eps, skip);
+    data.gap(x, u, progress.gap);
+    Lcp(n.l(), data.F.entries, progress.gap, newton, rows, batch.pivot).solve(lam, s, progress.eps, skip);
   }
 
   // Roll u out at eps in the lanes of `wanted`; returns the cost of every lane.
@@ -119,33 +66,10 @@ class Solver {
     for (int64_t i = 0; i < n.x(); i++) at.x(0, i) = problem.x0[i];
     for (int64_t k = 0; k < n.h && !halted(watch); k++) {
       const StageData<T, S> data = problem.stage(k);
-      contacts(data, at.x[k], at.u[k], at.lam[k], at.s[k], ~wanted | released);
+      contacts(data, at.x[k], at.u[k], at.lam[k], at.s[k], ~wanted | progress.released);
       data.next_state(at.x[k], at.u[k], at.lam[k], at.x[k + 1]);
     }
     return problem.cost(at);
-  }
-
-  // After the first step of the lanes that were released: the scale of their problems says where the homotopy starts.
-  void touch(const MpcSolve& o, Mask which) {
-    Vec sum = all(0);
-    for (int64_t k = 0; k < n.h; k++) {
-      problem.stage(k).gap(at.x[k], at.u[k], gap);
-      for (int64_t i = 0; i < n.l(); i++) sum += abs(gap[i]);
-    }
-    for (int l = 0; l < kLanes; l++) {
-      if (!which[l]) continue;
-      const int64_t e = lane[l].element, count = n.h * n.l();
-      const double mean = count ? sum[l] / double(count) : 0;
-      put(&eps, 0, l, first_relaxation(o.start[e], mean));
-      lane[l].iterations++, fresh[l] = -1;
-    }
-    released &= ~which;
-  }
-
-  double first_relaxation(const MpcStart& start, double mean_gap) const {
-    const double own = start.first * mean_gap * mean_gap;
-    const double least = start.at_least > batch.relaxation ? start.at_least : batch.relaxation;
-    return own > least && own < kHuge ? own : least;
   }
 
   // The trial trajectory with step length `step` along the feedback law; lanes in `frozen` stay where they are, those
@@ -163,7 +87,10 @@ class Solver {
           for (int64_t i = 0; i < nx; i++) to += K(j, i) * (next.x(k, i) - at.x(k, i));
         Vec low = data.u_min[j], high = data.u_max[j];
         if (batch.barrier > 0)  // at most nine tenths of the way to a bound
-          low = from - 0.9 * (from - low), high = from + 0.9 * (high - from);
+        {
+          low = from - 0.9 * (from - low);
+          high = from + 0.9 * (high - from);
+        }
         next.u(k, j) = select(frozen, from, max(low, min(high, to)));
       }
       // The forces are near what the linearisation says, which must not leave the interior.
@@ -179,180 +106,14 @@ class Solver {
     return problem.cost(next);
   }
 
-  // Take the next problem into a lane; an exhausted queue leaves the lane idle with whatever it held.
-  bool take(const MpcSolve& o, int64_t* counter, int l) {
-    const int64_t e = __atomic_fetch_add(counter, int64_t{1}, __ATOMIC_RELAXED);
-    const int64_t nu = n.u(), actions = n.h * nu, forces = n.h * n.l();
-    lane[l] = {};
-    fresh[l] = -1, released[l] = plain[l] = 0;
-    eps[l] = batch.relaxation, regularisation[l] = 0;
-    if (e >= batch.count) return false;
-    lane[l].element = e;
-    released[l] = o.start[e].released ? -1 : 0;
-    plain[l] = o.start[e].gauss_newton ? -1 : 0;
-    if (!released[l]) eps[l] = first_relaxation(o.start[e], 0);
-    problem.load(e, l);
-    problem.load_multipliers(o.mu_start ? o.mu_start + e * (n.h + 1) * n.c() : nullptr, l);
-    put(&problem.rho, 0, l, kPenalty * lane_of(problem.weight[0], l));
-    for (int64_t i = 0; i < actions; i++) {
-      const double low = problem.u_min[i / nu][i % nu][l], high = problem.u_max[i / nu][i % nu][l];
-      const double margin = batch.barrier > 0 ? 0.01 * (high - low) : 0.0;
-      const double a = low + margin, b = high - margin, value = o.u_start ? o.u_start[e * actions + i] : 0.0;
-      put(at.u.entries, i, l, value < a ? a : value > b ? b : value);
-    }
-    if (o.lam_start && !released[l])
-      problem.load_lam(at.lam.entries, o.lam_start + e * forces, l);
-    else
-      for (int64_t i = 0; i < forces; i++) {
-        put(at.lam.entries, i, l, released[l] ? 0.0 : __builtin_sqrt(eps[l]));
-        put(at.s.entries, i, l, 1.0);
-      }
-    return true;
-  }
-
-  // `unfinished`: left as it is, for others to go on from; the objective is then what the solver itself descends on.
-  void write(const MpcSolve& o, int l, Status status, const Matrix<Vec, 0, 0>& multipliers, bool unfinished = false) {
-    const int64_t e = lane[l].element, states = at.x.size(), actions = at.u.size(), forces = at.lam.size();
-    problem.store(o.x + e * states, at.x.entries, states, l);
-    problem.store(o.u + e * actions, at.u.entries, actions, l);
-    problem.store_lam(o.lam + e * forces, at.lam.entries, l);
-    problem.store_multipliers(o.mu + e * (n.h + 1) * n.c(), multipliers.entries, e, l);
-    const double unit = lane_of(problem.cost_unit[0], l);
-    o.objective[e] = (n.c() > 0 && !unfinished ? problem.objective(at) : J)[l] / unit;
-    if (o.gained) o.gained[e] = lane[l].gained / unit;
-    o.iterations[e] = int32_t(lane[l].iterations);
-    o.status[e] = int8_t(status);
-    if (unfinished) o.residual[e] = kHuge, o.fragile[e] = 0;
-  }
-  void store(const MpcSolve& o, int l, Status status, const Matrix<Vec, 0, 0>& multipliers) {
-    write(o, l, status, multipliers);
-    finished[waiting++] = lane[l].element;
-    if (waiting == kLanes) certificate.judge(o, finished, waiting), waiting = 0;
-  }
-
-  // Stores a plan as solved if the certificate takes it for that.
-  bool accepted(const MpcSolve& o, int l, const Sweep& sweep) {
-    write(o, l, sweep.weak[l] ? Status::degenerate : Status::converged, riccati.force);
-    certificate.judge(o, &lane[l].element, 1);
-    return o.status[lane[l].element] != int8_t(Status::numerical);
-  }
-
-  // A step of the multipliers, at the target of the homotopy: before, they would follow plans that come to nothing.
-  // They become those that the augmented Lagrangian has at the iterate.
-  void pay(Mask which) {
-    for (int64_t k = 0; k <= n.h; k++) {
-      const StageData<T, S> data = k < n.h ? problem.stage(k) : problem.last();
-      for (int64_t i = 0; i < n.c(); i++) {
-        Vec& multiplier = problem.multiplier(k, i);
-        const Vec c = data.constraint(i, at.x[k], k < n.h ? at.u[k] : nullptr);
-        multiplier = select(which, Force(c, multiplier, problem.rho, data.price[i]).value, multiplier);
-      }
-    }
-    repriced |= which;
-  }
-
-  static Mask only(int l) {
-    Mask which = Mask{};
-    which[l] = -1;
-    return which;
-  }
-
-  // Whether the constraints of a lane are met, but for what no step of the multipliers diminishes any more.
-  bool met(const Sweep& sweep, int l) const {
-    const int64_t stalled = lane[l].stalled;
-    return sweep.violated[l] <= (stalled > 1 ? kMetRounded : stalled > 0 ? kMetHardly : kMet);
-  }
-
-  // Whether the constraints of a lane at the target ask for other multipliers, which it then gets, or for more weight.
-  bool owes(const Sweep& sweep, int l, bool stationary) {
-    const double violated = sweep.violated[l];
-    if (lane[l].left == 0) lane[l].left = sweep.projected[l];
-    const double due = kDue * (lane[l].left < sweep.owing[l] ? lane[l].left : sweep.owing[l]);
-    const bool impatient = lane[l].in_stage >= kPatience && violated <= kLittle && sweep.owing[l] > 0;
-    if (!impatient && (met(sweep, l) || !(stationary || sweep.projected[l] <= due))) return false;
-    lane[l].left = 0;
-    pay(only(l));
-    double& rho = reinterpret_cast<double*>(&problem.rho)[l];
-    lane[l].stalled = violated > 0.5 * lane[l].violated ? lane[l].stalled + 1 : 0;
-    if (violated > (violated < kSmall ? kSlowEnd : kSlow) * lane[l].violated)
-      rho *= violated > kStays * lane[l].violated ? kRaiseMore : kRaise;
-    lane[l].violated = violated, lane[l].iterations++, lane[l].failures = lane[l].in_stage = lane[l].still = 0;
-    return true;
-  }
-
-  // Stores the lanes that are done and gives them other problems. Returns the lanes that make no step now.
-  Mask finish(const MpcSolve& o, const Sweep& sweep, int64_t* counter, Mask idle, int& live) {
-    Mask frozen = idle;
-    for (int l = 0; l < kLanes; l++) {
-      if (idle[l] || released[l] || eps[l] > batch.relaxation) continue;
-      const Lane& a = lane[l];
-      double tol = o.tol > sweep.rounding[l] ? o.tol : sweep.rounding[l];
-      // A search that fails this close to the optimum has met the rounding of the cost.
-      const bool stuck = a.failures >= kFailures || a.still >= 4 * kStill;
-      const double patience = kLetGo[stuck ? 3 : a.still / kStill];
-      if (patience > 1 && tol < kInVain) tol = kInVain;
-      const bool small = sweep.projected[l] <= patience * tol;
-      const bool stationary = small && sweep.stationary[l] <= patience * kStationary;
-      const bool converged = stationary && met(sweep, l);
-      const bool broken = !(J[l] < 1e300 && J[l] > -1e300);
-      const bool doubtful = small && !stationary && met(sweep, l) && !broken && (a.still == kAsk || stuck);
-      const double largest = kLargestPenalty * lane_of(problem.weight[0], l);
-      const bool infeasible = sweep.violated[l] > o.certified && a.stalled >= 3 &&
-                              sweep.fine[l] > kOutbids * sweep.pull[l] &&
-                              (problem.rho[l] >= largest || a.iterations >= o.max_iter);
-      if (!infeasible && !broken && a.iterations < o.max_iter && n.c() > 0 &&
-          owes(sweep, l, stationary || (small && a.still >= kAsk))) {
-        frozen[l] = -1;
-        continue;
-      }
-      if (!infeasible && !converged && !doubtful && !broken && a.iterations < o.max_iter && !stuck) continue;
-      // Once more without regularisation: it hides a singular Hessian.
-      if ((converged || doubtful) && regularisation[l] > 0 && !broken) {
-        frozen[l] = -1, regularisation[l] = 0;
-        continue;
-      }
-      const bool done = doubtful && accepted(o, l, sweep);
-      const double first = kPenalty * lane_of(problem.weight[0], l);
-      if (doubtful && !a.cleaned && problem.rho[l] > first && o.residual[a.element] > kClean) {
-        frozen[l] = -1;
-        pay(only(l));
-        put(&problem.rho, 0, l, first);
-        lane[l].cleaned = true, lane[l].violated = 1e300;
-        lane[l].stalled = lane[l].failures = lane[l].in_stage = lane[l].still = 0;
-        continue;
-      }
-      if (doubtful && !done && !infeasible && a.iterations < o.max_iter && !stuck) continue;
-      frozen[l] = -1;
-      if (!done)
-        store(o, l,
-              converged && !broken         ? (sweep.weak[l] ? Status::degenerate : Status::converged)
-              : infeasible                 ? Status::infeasible
-              : a.iterations >= o.max_iter ? Status::max_iter
-                                           : Status::numerical,
-              riccati.force);
-      if (!take(o, counter, l)) live--;
-    }
-    return frozen;
-  }
-
-  // Leaves the lanes that have made their steps at the target to be compared, and gives them other problems.
-  void leave(const MpcSolve& o, int64_t* counter, Mask frozen, int& live) {
-    for (int l = 0; l < kLanes; l++) {
-      if (frozen[l] || released[l] || fresh[l] || eps[l] > batch.relaxation) continue;
-      const int64_t steps = o.start[lane[l].element].explore;
-      if (steps == 0 || lane[l].in_stage < steps) continue;
-      write(o, l, Status::max_iter, problem.multiplier, true);
-      if (!take(o, counter, l)) live--;
-    }
-  }
-
   // Armijo search along the feedback law. An accepted lane keeps its trial while the others shorten their step. Returns
   // the lanes that moved, `step` how far, and `gain`, the change of the cost in parts of what a quadratic model with
   // its minimum at the end of a full step promises.
   Mask search(Mask frozen, Vec& step, Vec& gain, Watch watch) {
-    Vec J_trial = J;
+    Vec J_trial = progress.J;
     Mask accepted = frozen;
-    step = all(1), gain = all(0);
+    step = all(1);
+    gain = all(0);
     for (int search = 0; search < 5; search++) {
       const Vec value = trial(step, frozen, accepted, watch);
       if (halted(watch)) break;
@@ -360,8 +121,11 @@ class Solver {
       Vec slope = all(0);
       for (int64_t i = 0; i < at.u.size(); i++)
         slope += riccati.gradient.entries[i] * (next.u.entries[i] - at.u.entries[i]);
-      const Mask good = (released | (value <= J + 1e-4 * min(slope, all(0)) + 1e-13 * (1.0 + abs(J)))) & ~accepted;
-      J_trial = select(good, value, J_trial), gain = select(good & (slope < 0), 2.0 * (value - J) / slope, gain);
+      const Mask good =
+          (progress.released | (value <= progress.J + 1e-4 * min(slope, all(0)) + 1e-13 * (1.0 + abs(progress.J)))) &
+          ~accepted;
+      J_trial = select(good, value, J_trial);
+      gain = select(good & (slope < 0), 2.0 * (value - progress.J) / slope, gain);
       accepted |= good;
       if (!any(~accepted)) break;
       step = select(accepted, step, step * (search < 2 ? 0.5 : 0.25));
@@ -370,88 +134,64 @@ class Solver {
     auto move = [&](auto& to, const auto& from) {
       for (int64_t i = 0; i < to.size(); i++) to.entries[i] = select(moved, from.entries[i], to.entries[i]);
     };
-    move(at.u, next.u), move(at.x, next.x), move(at.lam, next.lam), move(at.s, next.s);
+    move(at.u, next.u);
+    move(at.x, next.x);
+    move(at.lam, next.lam);
+    move(at.s, next.s);
     for (int l = 0; l < kLanes; l++)
-      if (moved[l]) lane[l].gained = J[l] - J_trial[l];
-    J = select(moved, J_trial, J);
+      if (moved[l]) progress.lane[l].gained = progress.J[l] - J_trial[l];
+    progress.J = select(moved, J_trial, progress.J);
     return moved;
-  }
-
-  // Damping and homotopy after a step.
-  void advance(const MpcSolve& o, const Sweep& sweep, Mask frozen, Mask moved, Vec step, Vec gain) {
-    const double target = batch.relaxation;
-    for (int l = 0; l < kLanes; l++) {
-      if (frozen[l] || released[l]) continue;
-      Lane& a = lane[l];
-      a.iterations++, a.in_stage++;
-      a.failures = moved[l] ? 0 : a.failures + 1;
-      const bool gains = eps[l] > target || (moved[l] && a.gained > kNothing * (1.0 + __builtin_fabs(J[l])));
-      a.still = gains ? 0 : a.still + 1;
-      // Levenberg-Marquardt on the kinks of the contacts (linearisation.hpp): a failed step asks for more damping, one
-      // that had to be shortened too, and one that gained what its model promised for less.
-      double& reg = reinterpret_cast<double*>(&regularisation)[l];
-      const bool shortened = step[l] < 0.3;
-      if (!moved[l] || shortened)
-        reg = reg > 0 ? reg * (moved[l] ? 2 : 4) : kLeastDamping;
-      else if (gain[l] > 0.8 && (reg *= 0.3) < 0.2 * kLeastDamping)
-        reg = 0;
-      // `steps` steps per stage of the homotopy, fewer where the stage is solved.
-      const bool solved = sweep.projected[l] < 1e4 * o.tol;
-      if (eps[l] > target && (a.in_stage >= o.steps || solved || a.failures > 0)) {
-        // A stage that was solved before its first step leads on as far as four.
-        double shrink = o.shrink;
-        if (a.in_stage == 1 && solved) shrink *= shrink, shrink *= shrink;
-        eps[l] = eps[l] * shrink > target ? eps[l] * shrink : target;
-        a.in_stage = 0, a.failures = 0;
-        fresh[l] = -1;
-      }
-    }
   }
 };
 
 // Takes problems from the shared counter until none is left.
 template <class T, class S>
 void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
-  eps = all(batch.relaxation), regularisation = J = all(0);
-  fresh = repriced = released = plain = Mask{};
-  waiting = 0;
+  progress.eps = all(batch.relaxation);
+  progress.regularisation = progress.J = all(0);
+  progress.needs_rollout = progress.stale_cost = progress.released = progress.gauss_newton = Mask{};
+  progress.waiting = 0;
   int live = 0;
   for (int l = 0; l < kLanes; l++) {
-    if (take(o, counter, l))
+    if (progress.take(o, counter, l))
       live++;
     else if (live)
-      problem.load(lane[0].element, l);  // harmless numbers for a lane that never gets a problem
+      problem.load(progress.lane[0].element, l);  // harmless numbers for a lane that never gets a problem
   }
   while (live > 0) {
     Mask idle;
-    for (int l = 0; l < kLanes; l++) idle[l] = lane[l].element < 0 ? -1 : 0;
-    problem.mu = batch.barrier * (eps / batch.relaxation) * problem.cost_unit[0];
-    if (any(fresh & ~idle)) {
-      const Vec rolled = rollout(fresh & ~idle, watch);
-      J = select(fresh, rolled, J);
+    for (int l = 0; l < kLanes; l++) idle[l] = progress.lane[l].element < 0 ? -1 : 0;
+    problem.mu = batch.barrier * (progress.eps / batch.relaxation) * problem.cost_unit[0];
+    if (any(progress.needs_rollout & ~idle)) {
+      const Vec rolled = rollout(progress.needs_rollout & ~idle, watch);
+      progress.J = select(progress.needs_rollout, rolled, progress.J);
     }
     if (watch.stop(watch.context)) {
       // What has a trajectory is stored; what has none stays unreached.
       for (int l = 0; l < kLanes; l++)
-        if (!idle[l] && !fresh[l] && !released[l]) store(o, l, Status::max_iter, problem.multiplier);
+        if (!idle[l] && !progress.needs_rollout[l] && !progress.released[l])
+          progress.store(o, l, Status::max_iter, problem.multiplier);
       break;
     }
-    if (any(repriced)) J = select(repriced, problem.cost(at), J);
-    fresh = repriced = Mask{};
+    if (any(progress.stale_cost)) progress.J = select(progress.stale_cost, problem.cost(at), progress.J);
+    progress.needs_rollout = progress.stale_cost = Mask{};
     // Gauss-Newton can creep along a curved valley: after 20 steps in one stage every other one keeps the curvature.
-    Mask stubborn;
-    for (int l = 0; l < kLanes; l++) stubborn[l] = lane[l].in_stage > 20 && lane[l].in_stage % 2 ? -1 : 0;
-    const Sweep sweep = riccati.sweep(at, {}, {regularisation, stubborn, plain, released});
-    const Mask frozen = finish(o, sweep, counter, idle, live);
+    Mask keep_curvature;
+    for (int l = 0; l < kLanes; l++)
+      keep_curvature[l] = progress.lane[l].in_stage > 20 && progress.lane[l].in_stage % 2 ? -1 : 0;
+    const Sweep sweep =
+        riccati.sweep(at, {}, {progress.regularisation, keep_curvature, progress.gauss_newton, progress.released});
+    const Mask frozen = progress.finish(o, sweep, riccati.force, counter, idle, live);
     if (live == 0) break;
     Vec step, gain;
     const Mask moved = search(frozen, step, gain, watch);
-    advance(o, sweep, frozen, moved, step, gain);
-    const Mask first = released & ~frozen;
-    if (any(first)) touch(o, first);
-    leave(o, counter, frozen | first, live);
+    progress.advance(o, sweep, frozen, moved, step, gain);
+    const Mask first = progress.released & ~frozen;
+    if (any(first)) progress.start_homotopy(o, first);
+    progress.leave(o, counter, frozen | first, live);
   }
-  if (waiting) certificate.judge(o, finished, waiting);
+  if (progress.waiting) progress.certificate.judge(o, progress.finished, progress.waiting);
 }
 
 }  // namespace

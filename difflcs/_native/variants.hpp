@@ -11,26 +11,32 @@ struct Variant {
   using T = Entry;
   using S = Sizes;
 };
-using Widest = Variant<Vec, Sizes<0, 0, 0>>;
+// That which fits every problem. One problem alone shares its matrices with nobody: they are plain numbers.
+using Widest = Variant<std::conditional_t<kLanes == 1, double, Vec>, AnySizes>;
+
+// Calls f with the variant for matrices with entries T that fits.
+template <class T, class Function>
+void dispatch_sizes(const MpcBatch& b, Function f) {
+  const bool paper = b.n_x == 9 && b.n_u == 6;
+  if (paper && b.n_lam == 5)
+    f(Variant<T, Sizes<9, 6, 5>>());
+  else if (paper && b.n_lam == 8)
+    f(Variant<T, Sizes<9, 6, 8>>());
+  else
+    f(Variant<T, AnySizes>());
+}
 
 // Calls f with the variant that fits.
 template <class Function>
 void dispatch(const MpcBatch& b, Function f) {
-  const bool paper = b.n_x == 9 && b.n_u == 6;
   if (b.pivot)
-    f(Variant<Vec, Pivoting>());
-  else if (!shared_matrices(b) && paper && b.n_lam == 5)
-    f(Variant<Vec, Sizes<9, 6, 5>>());
-  else if (!shared_matrices(b) && paper && b.n_lam == 8)
-    f(Variant<Vec, Sizes<9, 6, 8>>());
-  else if (!shared_matrices(b))
     f(Widest());
-  else if (paper && b.n_lam == 5)
-    f(Variant<double, Sizes<9, 6, 5>>());
-  else if (paper && b.n_lam == 8)
-    f(Variant<double, Sizes<9, 6, 8>>());
+  else if (kLanes == 1 || shared_matrices(b))
+    dispatch_sizes<double>(b, f);
+  else if constexpr (kLanes > 2)
+    dispatch_sizes<Vec>(b, f);
   else
-    f(Variant<double, Sizes<0, 0, 0>>());
+    f(Widest());
 }
 
 }  // namespace

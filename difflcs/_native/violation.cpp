@@ -8,21 +8,28 @@
 namespace difflcs::DIFFLCS_ISA {
 namespace {
 
-// Whether a symmetric matrix, which is overwritten, is positive definite: all pivots are positive.
-bool positive_definite(int64_t n, double* M) {
+// Lanes whose symmetric matrix, which is overwritten, is positive definite: all pivots are positive.
+template <class T>
+Mask positive_definite(int64_t n, T* M) {
   lu_factor(n, M);
-  for (int64_t i = 0; i < n; i++)
-    if (!(M[i * n + i] > 0 && M[i * n + i] < 1e300)) return false;
-  return true;
+  Mask positive = ~Mask{};
+  for (int64_t i = 0; i < n; i++) {
+    const Vec pivot = all(0) + M[i * n + i];
+    positive &= (pivot > 0) & (pivot < 1e300);
+  }
+  return positive;
 }
 
+// T is the type of an entry of the system: double where the batch shares it, else Vec.
+template <class T>
 struct Violation {
+  static constexpr bool kShared = sizeof(T) == sizeof(double);
   const ViolationBatch& batch;
   const int64_t n_x, n_u, n_lam;
-  const double *A, *B, *C, *d, *D, *E, *F, *c;
-  const double weight;  // 1 / (gamma xi)
+  const T *A, *B, *C, *d, *D, *E, *F, *c;
+  T gamma, weight;  // 1 / (gamma xi)
+  T *system, *Q_each, *matrix;
   Vec *x, *u, *x_next, *z, *r, *e, *out, *sum;
-  double* matrix;
 
   // Lays the arrays out in `memory`, or only counts them where it is null.
   int64_t layout(void* memory) {
@@ -30,35 +37,47 @@ struct Violation {
     auto take = [&](auto*& to, int64_t count) { arena.take(to, count); };
     take(x, n_x), take(u, n_u), take(x_next, n_x), take(z, 2 * n_lam), take(r, n_x), take(e, n_lam);
     take(out, n_x + n_u + 2 * n_lam), take(sum, (n_x + n_lam) * (n_x + n_u + n_lam + 1));
-    take(matrix, 4 * n_lam * n_lam);
+    take(matrix, 4 * n_lam * n_lam), take(Q_each, kShared ? 0 : 4 * n_lam * n_lam);
+    take(system, kShared ? 0 : (n_x + n_lam) * (n_x + n_u + n_lam + 1));
     return arena.used;
   }
 
-  Violation(const ViolationBatch& b, void* memory)
-      : batch(b),
-        n_x(b.n_x),
-        n_u(b.n_u),
-        n_lam(b.n_lam),
-        A(b.input[vA]),
-        B(b.input[vB]),
-        C(b.input[vC]),
-        d(b.input[vd]),
-        D(b.input[vD]),
-        E(b.input[vE]),
-        F(b.input[vF]),
-        c(b.input[vc]),
-        weight(1.0 / (b.gamma * b.xi)) {
+  Violation(const ViolationBatch& b, void* memory) : batch(b), n_x(b.n_x), n_u(b.n_u), n_lam(b.n_lam) {
     layout(memory);
+    if (!memory) return;
+    const T** const field[] = {&A, &B, &C, &d, &D, &E, &F, &c};
+    T* next = system;
+    for (int i = 0; i < vx; i++) {
+      if constexpr (kShared)
+        *field[i] = batch.input[i];
+      else
+        *field[i] = next, next += extent(batch, kViolationFields[i]);
+    }
+    if constexpr (kShared) gamma = *batch.input[vgamma], weight = 1.0 / (gamma * batch.xi);
   }
 
   // Whether to stop, asked every 1024 transitions.
   bool halted(int64_t first) const { return first % 1024 == 0 && batch.watch.stop(batch.watch.context); }
 
-  // kLanes rows of a (count, size) array; lanes past the end repeat the last row and are never written back.
-  void load(Vec* to, const double* from, int64_t size, int64_t first) const {
+  // kLanes rows of an array with `stride` numbers from one to the next; lanes past the end repeat the last row and are
+  // never written back.
+  void load(Vec* to, const double* from, int64_t size, int64_t stride, int64_t first) const {
     for (int l = 0; l < kLanes; l++) {
       const int64_t row = first + l < batch.count ? first + l : batch.count - 1;
-      for (int64_t i = 0; i < size; i++) put(to, i, l, from[row * size + i]);
+      for (int64_t i = 0; i < size; i++) put(to, i, l, from[row * stride + i]);
+    }
+  }
+  void load(Vec* to, const double* from, int64_t size, int64_t first) const { load(to, from, size, size, first); }
+  // The systems of kLanes transitions, where they are not shared.
+  void load_system([[maybe_unused]] int64_t first) {
+    if constexpr (!kShared) {
+      T* to = system;
+      for (int i = 0; i < vx; i++) {
+        const int64_t size = extent(batch, kViolationFields[i]);
+        load(to, batch.input[i], size, batch.stride[i], first), to += size;
+      }
+      load(&gamma, batch.input[vgamma], 1, batch.stride[vgamma], first);
+      weight = 1.0 / (gamma * batch.xi);
     }
   }
   void store(double* to, const Vec* from, int64_t size, int64_t first) const {
@@ -67,55 +86,66 @@ struct Violation {
   }
 
   // to += M v, or M^T v, with M (rows, columns).
-  static void add_product(Vec* to, const double* M, const Vec* v, int64_t rows, int64_t columns) {
+  static void add_product(Vec* to, const T* M, const Vec* v, int64_t rows, int64_t columns) {
     for (int64_t i = 0; i < rows; i++)
       for (int64_t j = 0; j < columns; j++) to[i] += M[i * columns + j] * v[j];
   }
-  static void add_transposed(Vec* to, const double* M, const Vec* v, int64_t rows, int64_t columns) {
+  static void add_transposed(Vec* to, const T* M, const Vec* v, int64_t rows, int64_t columns) {
     for (int64_t i = 0; i < rows; i++)
       for (int64_t j = 0; j < columns; j++) to[j] += M[i * columns + j] * v[i];
   }
 
   // Q = [[C^T C + F^T F / (gamma xi), (I - F^T / gamma) / xi], [its transpose, I / (gamma xi)]].
-  bool hessian(double* Q) {
+  // Returns the lanes in which it is positive definite by a margin, and gamma is in its range.
+  Mask hessian(T* Q) {
     const int64_t n = n_lam, m = 2 * n_lam;
-    double largest = 0;
+    Vec largest = all(0);
     for (int64_t i = 0; i < n; i++)
       for (int64_t j = 0; j < n; j++) {
-        double cc = 0, ff = 0;
+        T cc = T{}, ff = T{};
         for (int64_t k = 0; k < n_x; k++) cc += C[k * n + i] * C[k * n + j];
         for (int64_t k = 0; k < n; k++) ff += F[k * n + i] * F[k * n + j];
         Q[i * m + j] = cc + weight * ff;
         Q[i * m + n + j] = Q[(n + j) * m + i] = (i == j ? 1.0 / batch.xi : 0.0) - weight * F[j * n + i];
-        Q[(n + i) * m + n + j] = i == j ? weight : 0.0;
+        Q[(n + i) * m + n + j] = i == j ? weight : T{};
       }
-    for (int64_t i = 0; i < m; i++) largest = Q[i * m + i] > largest ? Q[i * m + i] : largest;
+    for (int64_t i = 0; i < m; i++) largest = max(all(0) + Q[i * m + i], largest);
     // By a margin in units of each variable's own curvature.
-    for (int64_t i = 0; i < m * m; i++) matrix[i] = Q[i] - (i % (m + 1) == 0 ? 1e-13 * Q[i] : 0.0);
-    bool convex = largest < 1e300 && positive_definite(m, matrix);
-    auto above = [&](double smallest) {  // whether sigma_min(F + F^T) exceeds it
+    for (int64_t i = 0; i < m * m; i++) matrix[i] = i % (m + 1) == 0 ? Q[i] - 1e-13 * Q[i] : Q[i];
+    const Mask convex = (largest < 1e300) & positive_definite(m, matrix);
+    auto above = [&](T smallest) {  // where sigma_min(F + F^T) exceeds it
       for (int64_t i = 0; i < n; i++)
-        for (int64_t j = 0; j < n; j++) matrix[i * n + j] = F[i * n + j] + F[j * n + i] - (i == j ? smallest : 0.0);
+        for (int64_t j = 0; j < n; j++) {
+          matrix[i * n + j] = F[i * n + j] + F[j * n + i];
+          if (i == j) matrix[i * n + j] -= smallest;
+        }
       return positive_definite(n, matrix);
     };
     // F^T F / gamma stands beside F + F^T: their difference has to survive the rounding.
-    double squares = 0;
+    T squares = T{};
     for (int64_t i = 0; i < n; i++) {
-      double sum = 0;
-      for (int64_t k = 0; k < n; k++) sum += F[k * n + i] * F[k * n + i];
-      squares = sum > squares ? sum : squares;
+      T total = T{};
+      for (int64_t k = 0; k < n; k++) total += F[k * n + i] * F[k * n + i];
+      squares = total > squares ? total : squares;
     }
-    return convex && above(batch.gamma) && above(kGammaLeast * double(n) * squares / batch.gamma);
+    return convex & above(gamma) & above(kGammaLeast * double(n) * squares / gamma);
   }
 
-  // q = (C^T r + F^T e / (gamma xi), -e / (gamma xi)) with r and e at z = 0.
-  bool gradients_at_zero(double* q) {
+  // Q, and q = (C^T r + F^T e / (gamma xi), -e / (gamma xi)) with r and e at z = 0.
+  bool qp(double* Q, double* q) {
     Vec invalid = all(0);
+    Mask convex = ~Mask{};
+    if constexpr (kShared) convex = hessian(Q);
     for (int64_t first = 0; first < batch.count && !halted(first); first += kLanes) {
+      if constexpr (!kShared) {
+        load_system(first);
+        convex &= hessian(Q_each);
+        store(Q, Q_each, 4 * n_lam * n_lam, first);
+      }
       load(x, batch.input[vx], n_x, first), load(u, batch.input[vu], n_u, first);
       load(x_next, batch.input[vx_next], n_x, first);
       for (int64_t i = 0; i < n_x; i++) r[i] = d[i] - x_next[i];
-      for (int64_t i = 0; i < n_lam; i++) e[i] = all(c[i]), out[i] = all(0);
+      for (int64_t i = 0; i < n_lam; i++) e[i] = all(0) + c[i], out[i] = all(0);
       add_product(r, A, x, n_x, n_x), add_product(r, B, u, n_x, n_u);
       add_product(e, D, x, n_lam, n_x), add_product(e, E, u, n_lam, n_u);
       add_transposed(out, F, e, n_lam, n_lam);
@@ -124,15 +154,16 @@ struct Violation {
       for (int64_t i = 0; i < 2 * n_lam; i++) invalid += 0.0 * out[i];  // NaN where anything was not finite
       store(batch.r, r, n_x, first), store(batch.e, e, n_lam, first), store(q, out, 2 * n_lam, first);
     }
-    return !any(invalid != 0);
+    return !any(invalid != 0) && !any(~convex);
   }
 
   // Also whether rounding e, which is divided by gamma xi, leaves its digits: as the dual variable of the contacts,
-  // F^T e / (gamma xi) balances C^T r.
-  bool value(const double* solution, double* loss) {
+  // F^T e / (gamma xi) balances C^T r. Returns the first transition where it does not, or -1.
+  int64_t value(const double* solution, double* loss) {
     const Vec *lam = z, *phi = z + n_lam;
-    Mask lost = Mask{};
+    int64_t lost = -1;
     for (int64_t first = 0; first < batch.count && !halted(first); first += kLanes) {
+      load_system(first);
       load(r, batch.r, n_x, first), load(e, batch.e, n_lam, first), load(z, solution, 2 * n_lam, first);
       Vec *r_terms = x, *e_terms = out, *balance = out + n_lam;
       for (int64_t i = 0; i < n_x; i++) {
@@ -152,27 +183,37 @@ struct Violation {
         noise = max(noise, select(lam[i] > 0, kRounding * weight * rounding, all(0)));
         signal = max(signal, balance[i]);
       }
-      lost |= (noise > 1e-6 * signal) & (signal > 0);
+      const Mask unsure = (noise > 1e-6 * signal) & (signal > 0);
+      for (int l = 0; l < kLanes && lost < 0; l++)
+        if (unsure[l]) lost = first + l;
       add_product(r, C, lam, n_x, n_lam), add_product(e, F, lam, n_lam, n_lam);
       Vec rr = all(0), ee = all(0), product = all(0);
       for (int64_t i = 0; i < n_x; i++) rr += r[i] * r[i];
       for (int64_t i = 0; i < n_lam; i++) {
         // Where phi is free, e = gamma lam by stationarity, without the rounding of a difference.
-        e[i] = select(phi[i] > 0, batch.gamma * lam[i], e[i] - phi[i]);
+        e[i] = select(phi[i] > 0, gamma * lam[i], e[i] - phi[i]);
         ee += e[i] * e[i];
         product += lam[i] * phi[i];
       }
-      const Vec total = 0.5 * rr + (product + ee / (2 * batch.gamma)) / batch.xi;
+      const Vec total = 0.5 * rr + (product + ee / (2 * gamma)) / batch.xi;
       store(batch.r, r, n_x, first), store(batch.e, e, n_lam, first), store(loss, &total, 1, first);
     }
-    return !any(lost);
+    return lost;
   }
 
   // r and e are linear in every input, and by the envelope theorem z does not move.
   void gradient(const double* solution, const double* upstream, double* const to[kViolationInputs]) {
     const int64_t n_w = n_x + n_u + n_lam, rows = n_x + n_lam;
     for (int64_t i = 0; i < rows * (n_w + 1); i++) sum[i] = all(0);
+    // Rows and columns of the sums that belong to each matrix.
+    auto each_matrix = [&](auto visit) {
+      visit(vA, 0, n_x, 0, n_x), visit(vB, 0, n_x, n_x, n_u), visit(vC, 0, n_x, n_x + n_u, n_lam);
+      visit(vd, 0, n_x, n_w, 1);
+      visit(vD, n_x, n_lam, 0, n_x), visit(vE, n_x, n_lam, n_x, n_u), visit(vF, n_x, n_lam, n_x + n_u, n_lam);
+      visit(vc, n_x, n_lam, n_w, 1);
+    };
     for (int64_t first = 0; first < batch.count && !halted(first); first += kLanes) {
+      load_system(first);
       Vec scale;
       load(&scale, upstream, 1, first);
       for (int l = 0; l < kLanes; l++)
@@ -189,7 +230,19 @@ struct Violation {
         for (int64_t j = 0; j < n_lam; j++) row[n_x + n_u + j] += residual * z[j];
         row[n_w] += residual;
       }
-      auto datum = [&](ViolationInput which, const double* of_r, const double* of_e, int64_t size) {
+      // What belongs to these transitions alone is no sum.
+      if constexpr (!kShared)
+        each_matrix([&](ViolationInput which, int64_t first_row, int64_t count, int64_t from, int64_t columns) {
+          if (!batch.stride[which]) return;
+          for (int64_t i = 0; i < count; i++)
+            for (int64_t j = 0; j < columns; j++) {
+              Vec& entry = sum[(first_row + i) * (n_w + 1) + from + j];
+              for (int l = 0; l < kLanes && first + l < batch.count; l++)
+                to[which][(first + l) * count * columns + i * columns + j] = entry[l];
+              entry = all(0);
+            }
+        });
+      auto datum = [&](ViolationInput which, const T* of_r, const T* of_e, int64_t size) {
         if (!to[which]) return;
         for (int64_t i = 0; i < size; i++) out[i] = all(0);
         add_transposed(out, of_r, r, n_x, size), add_transposed(out, of_e, e, n_lam, size);
@@ -201,39 +254,42 @@ struct Violation {
         store(to[vx_next], out, n_x, first);
       }
     }
-    // Columns [from, from + columns) of the sums belong to one matrix.
-    auto reduce = [&](ViolationInput which, int64_t first_row, int64_t count, int64_t from, int64_t columns) {
+    each_matrix([&](ViolationInput which, int64_t first_row, int64_t count, int64_t from, int64_t columns) {
+      if (batch.stride[which]) return;
       for (int64_t i = 0; i < count; i++)
         for (int64_t j = 0; j < columns; j++) {
           double total = 0;
           for (int l = 0; l < kLanes; l++) total += lane_of(sum[(first_row + i) * (n_w + 1) + from + j], l);
           to[which][i * columns + j] = total;
         }
-    };
-    reduce(vA, 0, n_x, 0, n_x), reduce(vB, 0, n_x, n_x, n_u), reduce(vC, 0, n_x, n_x + n_u, n_lam);
-    reduce(vd, 0, n_x, n_w, 1);
-    reduce(vD, n_x, n_lam, 0, n_x), reduce(vE, n_x, n_lam, n_x, n_u), reduce(vF, n_x, n_lam, n_x + n_u, n_lam);
-    reduce(vc, n_x, n_lam, n_w, 1);
+    });
   }
 };
 
-}  // namespace
-
-int64_t violation_workspace(const ViolationBatch& batch) { return Violation(batch, nullptr).layout(nullptr); }
-
-bool violation_qp(const ViolationBatch& batch, double* Q, double* q, void* workspace) {
-  Violation violation(batch, workspace);
-  const bool convex = violation.hessian(Q);
-  return violation.gradients_at_zero(q) && convex;
+// Calls f with the code that fits: the system shared by the batch, or not.
+template <class Function>
+auto dispatch(const ViolationBatch& batch, void* memory, Function f) {
+  if (batch.shared) return f(Violation<double>(batch, memory));
+  return f(Violation<Vec>(batch, memory));
 }
 
-bool violation_value(const ViolationBatch& batch, const double* z, double* loss, void* workspace) {
-  return Violation(batch, workspace).value(z, loss);
+}  // namespace
+
+int64_t violation_workspace(const ViolationBatch& batch) {
+  return dispatch(batch, nullptr, [](auto violation) { return violation.layout(nullptr); });
+}
+
+bool violation_qp(const ViolationBatch& batch, double* Q, double* q, void* workspace) {
+  return dispatch(batch, workspace, [&](auto violation) { return violation.qp(Q, q); });
+}
+
+int64_t violation_value(const ViolationBatch& batch, const double* z, double* loss, void* workspace) {
+  return dispatch(batch, workspace, [&](auto violation) { return violation.value(z, loss); });
 }
 
 void violation_gradient(const ViolationBatch& batch, const double* z, const double* upstream,
                         double* const gradient[kViolationInputs], void* workspace) {
-  Violation(batch, workspace).gradient(z, upstream, gradient);
+  dispatch(batch, workspace, [&](auto violation) { violation.gradient(z, upstream, gradient); });
 }
 
 }  // namespace difflcs::DIFFLCS_ISA

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 import difflcs
-from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSParams, _files
+from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSParams, _storage
 from difflcs._checks import check_positive_int
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.mpc.backends import BatchedBackend, IpoptBackend
@@ -135,7 +135,7 @@ def best(repeats: int, work: Callable[[], object]) -> float:
 
 def save(path: Path, record: dict) -> None:
     """Write the record of a benchmark as JSON, atomically; its keys keep their order."""
-    _files.write_atomically(path, (json.dumps(record, indent=2, ensure_ascii=False) + "\n").encode())
+    _storage.write_atomically(path, (json.dumps(record, indent=2, ensure_ascii=False) + "\n").encode())
     print(f"written to {path}")
 
 

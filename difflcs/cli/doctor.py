@@ -26,7 +26,7 @@ import torch
 
 import difflcs
 from difflcs import GoalCost, LCSModel, LCSMPCLayer, solve_lcp, zoo
-from difflcs._files import load_record, read_json
+from difflcs._storage import load_record, read_json
 from difflcs.errors import BackendNotFoundError, DiffLCSError
 
 GROUPS = ("library", "solvers", "machine", "extras", "environments")
@@ -36,7 +36,7 @@ DEVELOPMENT = "development"
 TIMEOUT = 120.0
 """Seconds that a separate process may take; the first picture in software takes some."""
 
-_HARD = ("torch", "numpy", "casadi", "filelock", "safetensors")
+_HARD = ("torch", "numpy", "casadi", "safetensors")
 _OPTIONAL_BACKENDS = ("relaxed",)
 _EXTRAS = {
     "rl": "training, evaluation and the command line",
@@ -176,11 +176,10 @@ def _python() -> str:
 
 def _hard_dependencies() -> str:
     import casadi
-    import filelock
     import numpy
     import safetensors
 
-    modules = {"torch": torch, "numpy": numpy, "casadi": casadi, "filelock": filelock, "safetensors": safetensors}
+    modules = {"torch": torch, "numpy": numpy, "casadi": casadi, "safetensors": safetensors}
     return ", ".join(f"{name} {modules[name].__version__}" for name in _HARD)
 
 

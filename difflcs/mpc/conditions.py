@@ -11,17 +11,12 @@ import torch
 from torch import Tensor
 
 from difflcs._linalg import matvec
-from difflcs.mpc.problem import STAGES, MPCProblem, StageData
+from difflcs.mpc.problem import STAGES, TOLERANCES, MPCProblem, StageData
 from difflcs.mpc.solution import Primal, largest
 
 # Largest residual of a solution: what CONVERGED means.
 CERTIFIED = 1e-6
-# A multiplier above this part of its price is the price, but for rounding.
-_AT_PRICE = 1 - 1e-12
-# A scale is at least this part of what its terms would be, had nothing cancelled: 1e-9 of that is rounding.
-_CANCELLED = 1e-3
-# What a step further along a chain of states counts: so little that no size grows with it in most systems.
-_FURTHER = 0.1
+_AT_PRICE, _CANCELLED, _FURTHER = (TOLERANCES[name] for name in ("at_price", "cancelled", "further"))
 
 
 @dataclass(frozen=True)

@@ -8,24 +8,22 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from difflcs import _files
+from difflcs import _storage
 from difflcs._checks import check_finite, check_number, describe
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, NonFiniteError, ShapeError, SolveError
 from difflcs.lcs import LCSParams, LCSSequence
 from difflcs.mpc.controller_file import constant_system, controller_bytes
+from difflcs.mpc.setup import Setup
 from difflcs.records import system_at
 from difflcs.status import Status
-
-if TYPE_CHECKING:
-    from difflcs.mpc.layer import LCSMPCLayer
 
 _FALLBACKS = {"hold": 0, "zero": 1, "unfinished": 3, "raise": 0}
 _GIVEN = 2
@@ -77,8 +75,7 @@ class MPCController:
     One controller is for one thread at a time; another call at the same time is refused.
 
     Args:
-        mpc: the layer, with backend `batched`; nothing in it has a batch dimension. Its own `on_failure` and
-            `training_relaxation` do not count.
+        setup: what the layer plans with: its backend is `batched`, and nothing in it has a batch dimension.
         on_failure: the action of a step that is not solved. "hold": what the last solved plan has for this time, for
             at most H−1 steps in a row, then zero; "unfinished": what the solver had reached where the time was over,
             else as "hold"; "zero"; an action (n_u,); or "raise" a `SolveError`. An action is clipped into the bounds.
@@ -89,13 +86,13 @@ class MPCController:
         InvalidInputError and its kinds: an argument does not fit.
     """
 
-    def __init__(self, mpc: LCSMPCLayer, on_failure: OnFailure = "hold", time_limit: float | None = None):
-        system = constant_system(mpc.lcs)
-        limit = getattr(mpc.backend, "time_limit", None) if time_limit is None else time_limit
-        self._layer = mpc if system is None else None
-        self._content = b"" if system is None else controller_bytes(mpc, system)
+    def __init__(self, setup: Setup, on_failure: OnFailure = "hold", time_limit: float | None = None):
+        system = constant_system(setup.lcs)
+        limit = getattr(setup.backend, "time_limit", None) if time_limit is None else time_limit
+        self._setup = setup if system is None else None
+        self._content = b"" if system is None else controller_bytes(setup, system)
         self._native: Any = None
-        self._begin(mpc.horizon, mpc.lcs.n_x, mpc.lcs.n_u, getattr(mpc.cost, "n_goal", 0), on_failure, limit)
+        self._begin(setup.horizon, setup.lcs.n_x, setup.lcs.n_u, getattr(setup.cost, "n_goal", 0), on_failure, limit)
         if system is not None:
             self._make()
 
@@ -135,12 +132,12 @@ class MPCController:
             InvalidInputError and its kinds: another argument does not fit.
         """
         try:
-            content = _files.read_bytes(Path(path))
+            content = _storage.read_bytes(Path(path))
             sizes = _kernels.Controller(content).sizes()
         except (FileNotFoundError, RuntimeError) as error:
             raise CheckpointError(f"{path}: {error}") from error
         self = cls.__new__(cls)
-        self._layer, self._content, self._native = None, content, None
+        self._setup, self._content, self._native = None, content, None
         self._begin(sizes["horizon"], sizes["n_x"], sizes["n_u"], sizes["n_goal"], on_failure, time_limit)
         self._make()
         return self
@@ -151,12 +148,12 @@ class MPCController:
         Raises:
             InvalidInputError: the system depends on the state or a context.
         """
-        if self._layer is not None:
+        if self._setup is not None:
             raise InvalidInputError(
-                f"lcs: expected an LCSModel or matrices, got {describe(self._layer.lcs)}, whose system may depend on "
+                f"lcs: expected an LCSModel or matrices, got {describe(self._setup.lcs)}, whose system may depend on "
                 f"the state; build a layer with lcs=module.params(x, context)"
             )
-        _files.write_atomically(Path(path), self._content)
+        _storage.write_atomically(Path(path), self._content)
 
     def step(
         self,
@@ -195,8 +192,8 @@ class MPCController:
             raise ShapeError(
                 f"{'reference' if follow else 'goal'}: expected none with a cost without goals, got one; use a GoalCost"
             )
-        if self._layer is not None:
-            self._ask(self._layer, x, context)
+        if self._setup is not None:
+            self._ask(self._setup, x, context)
         elif context is not None:
             raise ShapeError("context: expected none with a constant system, got one; leave it out")
         u = np.empty(self.n_u)
@@ -206,18 +203,18 @@ class MPCController:
             raise SolveError(f"the step was not solved: {found.name} ({found.advice})", [0], [status])
         return u
 
-    def _ask(self, mpc: LCSMPCLayer, x: NDArray[np.float64], context: Tensor | None) -> None:
+    def _ask(self, setup: Setup, x: NDArray[np.float64], context: Tensor | None) -> None:
         """Take the system of this state from the module."""
         if not np.isfinite(x).all() and self._native is not None:
             return  # the step will say so
         with torch.no_grad():
-            system = system_at(mpc.lcs, torch.from_numpy(x), context)  # pyright: ignore
+            system = system_at(setup.lcs, torch.from_numpy(x), context)  # pyright: ignore
         if not isinstance(system, LCSParams | LCSSequence):
             raise DTypeError(f"lcs: expected LCSParams or LCSSequence from its params, got {describe(system)}")
         system.check_again()
         if self._native is None:
             self._form = {name: tuple(value.shape) for name, value in system.tensors().items()}
-            self._content = controller_bytes(mpc, system)
+            self._content = controller_bytes(setup, system)
             self._make()
             return
         tensors = {name: value.detach().to("cpu", torch.float64) for name, value in system.tensors().items()}

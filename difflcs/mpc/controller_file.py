@@ -8,7 +8,6 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -19,19 +18,15 @@ from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.lcs import LCSModel, LCSParams, LCSSequence
 from difflcs.mpc import kkt
 from difflcs.mpc.backends import BatchedBackend
-from difflcs.mpc.gather import Inputs
 from difflcs.mpc.problem import INPUTS, MPCProblem
+from difflcs.mpc.setup import Call, Setup, gather
 from difflcs.records import system_at
 from difflcs.scales import ScaledLCS
-
-if TYPE_CHECKING:
-    from difflcs.mpc.layer import LCSMPCLayer
 
 MAGIC = b"\x89LCS\r\n\x1a\n"
 VERSION = 1
 _LARGEST = 2**53  # of whole numbers, so that a double holds it
 _MAPS = ("at", "along")
-_SYMMETRIC = ("Q", "R", "Q_final")
 
 
 def constant_system(lcs: object) -> LCSParams | LCSSequence | None:
@@ -46,11 +41,11 @@ def constant_system(lcs: object) -> LCSParams | LCSSequence | None:
         return system_at(lcs, None).detach() if constant else None  # pyright: ignore
 
 
-def controller_bytes(mpc: LCSMPCLayer, system: LCSParams | LCSSequence, step_seconds: float = 0.0) -> bytes:
+def controller_bytes(setup: Setup, system: LCSParams | LCSSequence, step_seconds: float = 0.0) -> bytes:
     """The file of the controller of a layer, with its cost, bounds and constraints as they are now.
 
     Args:
-        mpc: the layer; its backend is `batched`, and nothing in it has a batch dimension.
+        setup: that of the layer; its backend is `batched`, and nothing in it has a batch dimension.
         system: the system to plan with, without batch dimensions.
         step_seconds: time from one step to the next [s]; 0 if that is not known.
 
@@ -58,22 +53,22 @@ def controller_bytes(mpc: LCSMPCLayer, system: LCSParams | LCSSequence, step_sec
         InvalidInputError and its kinds: another backend, a batch, or parts that do not fit each other.
     """
     step_seconds = check_number("step_seconds", step_seconds)
-    backend = mpc.backend
+    backend, cost = setup.backend, setup.cost
     if not isinstance(backend, BatchedBackend):
         raise InvalidInputError(
             f"backend: expected 'batched', whose solver a controller uses, got {backend.name!r}; build the layer with "
             f"backend='batched'"
         )
-    if isinstance(mpc.cost, GoalCost) and any(getattr(type(mpc.cost), k) is not getattr(GoalCost, k) for k in _MAPS):
+    if isinstance(cost, GoalCost) and any(getattr(type(cost), k) is not getattr(GoalCost, k) for k in _MAPS):
         raise InvalidInputError(
             f"cost: expected a GoalCost, whose terms are linear in the goal, got the subclass "
-            f"{type(mpc.cost).__name__} with a map of its own; give a controller the plain one"
+            f"{type(cost).__name__} with a map of its own; give a controller the plain one"
         )
     for name, value in (("seed", backend.seed), ("max_iter", backend.max_iter)):
         check_positive_int(name, value, minimum=0, maximum=_LARGEST)
-    problem, constant = _problem(mpc, system)
+    problem, constant = _problem(setup, system)
     sizes = {"n_x": problem.n_x, "n_u": problem.n_u, "n_lam": problem.n_lam, "n_c": problem.n_c}
-    cost, n_x = mpc.cost, problem.n_x
+    n_x = problem.n_x
     n_goal = cost.n_goal if isinstance(cost, GoalCost) else 0
     options = {
         "relaxation": problem.relaxation,
@@ -103,32 +98,22 @@ def controller_bytes(mpc: LCSMPCLayer, system: LCSParams | LCSSequence, step_sec
     return _pack(entries)
 
 
-def _problem(mpc: LCSMPCLayer, system: LCSParams | LCSSequence) -> tuple[MPCProblem, float]:
+def _problem(setup: Setup, system: LCSParams | LCSSequence) -> tuple[MPCProblem, float]:
     """The problem of one state, zero, and of one goal, zero; and the constant of its cost."""
-    x0 = torch.zeros(1, system.n_x, dtype=torch.float64)
-    inputs = Inputs(mpc.horizon)
-    inputs.add_system(system, x0, None)
-    goal = torch.zeros(mpc.cost.n_goal, dtype=torch.float64) if isinstance(mpc.cost, GoalCost) else None
-    inputs.add_cost(mpc.cost, None if goal is None else goal.to(mpc.cost.Q), None)
-    if mpc.bounds is None:
-        inputs.tensors |= dict(zip(("u_min", "u_max"), mpc.limits(), strict=True))
-    else:
-        inputs.add_bounds(mpc.bounds)
-    inputs.add_constraints(mpc.constraints)
-    values: dict[str, torch.Tensor] = {}
+    x0, cost = torch.zeros(1, system.n_x, dtype=torch.float64), setup.cost
+    goal = torch.zeros(cost.n_goal, dtype=torch.float64).to(cost.Q) if isinstance(cost, GoalCost) else None
+    low, high = setup.action_bounds(setup.lcs) if setup.bounds is None else (None, None)
+    inputs = gather(setup, Call(x0, goal, lcs=system, u_min=low, u_max=high))
     for name, tensor in inputs.tensors.items():
-        value = tensor.detach().to("cpu", torch.float64)
-        rank = len(INPUTS.get(name, ())) + (name in inputs.by_stage)
-        if value.shape[: value.ndim - rank].numel() != 1:
+        if tensor.shape[: tensor.ndim - inputs.rank(name)].numel() != 1:
+            value = tensor.detach().to("cpu", torch.float64)
             raise ShapeError(
                 f"{name}: expected no batch dimension, as a controller is for one robot, got "
                 f"{describe(value)}; index it"
             )
-        value = value.reshape(value.shape[value.ndim - rank :])
-        value = 0.5 * (value + value.mT) if name in _SYMMETRIC else value
-        values[name] = (value.unsqueeze(0) if name in inputs.by_stage else value).contiguous()
+    values = inputs.numbers(inputs.tensors, (1,))
     constant = float(values.pop("constant"))
-    problem = MPCProblem(**values, x0=x0, horizon=mpc.horizon, relaxation=mpc.relaxation, barrier=mpc.barrier)
+    problem = MPCProblem(**values, horizon=setup.horizon, relaxation=setup.relaxation, barrier=setup.barrier)
     return problem, constant
 
 

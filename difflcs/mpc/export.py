@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from difflcs import __version__, _files
+from difflcs import __version__, _storage
 from difflcs._checks import describe
 from difflcs.errors import InvalidInputError
 from difflcs.mpc import LCSMPCLayer
@@ -47,7 +47,7 @@ def export_controller(
             f"lcs: expected an LCSModel or matrices, got {describe(mpc.lcs)}, whose system may depend on the state; "
             f"build a layer with lcs=module.params(x, context)"
         )
-    content = controller_bytes(mpc, system, step_seconds)
+    content = controller_bytes(mpc.setup(), system, step_seconds)
     low, high = mpc.limits()
     description = {
         **(about or {}),
@@ -68,8 +68,8 @@ def export_controller(
     }
     directory = Path(out)
     try:
-        _files.write_atomically(directory / CONTROLLER, content)
-        _files.write_json(directory / DESCRIPTION, description)
+        _storage.write_atomically(directory / CONTROLLER, content)
+        _storage.write_json(directory / DESCRIPTION, description)
     except OSError as error:
         raise InvalidInputError(f"out: expected a place to write {out}, got: {error}; choose another") from error
     return directory / CONTROLLER

@@ -8,29 +8,27 @@ import warnings
 import torch
 from torch import Tensor, nn
 
-from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor
-from difflcs._functorch import forward_mode_active, is_wrapped, refuse_tangents, runs_eagerly, transforms_active
+from difflcs._checks import check_choice, check_number, check_positive_int
+from difflcs._differentiation import runs_eagerly
 from difflcs._modules import fresh
-from difflcs.constraints import StageBounds, as_bound, check_bounds
-from difflcs.cost import CostSequence
-from difflcs.errors import BoundsError, DegenerateWarning, SolveError, SolveWarning
-from difflcs.lcs import LCSSequence
-from difflcs.mpc.autograd import Plan, solve
+from difflcs.constraints import StageBounds, as_bound
+from difflcs.errors import DegenerateWarning, SolveError, SolveWarning
 from difflcs.mpc.backends import Backend, get_backend
 from difflcs.mpc.controller import MPCController, OnFailure
-from difflcs.mpc.gather import (
+from difflcs.mpc.repeat import Repeat
+from difflcs.mpc.setup import (
     Bound,
+    Call,
     Constraints,
     Cost,
-    Inputs,
+    Setup,
     System,
     check_constraints,
     check_cost,
-    check_guess,
     check_stage_bounds,
     check_system,
+    within_support,
 )
-from difflcs.mpc.repeat import Given, Repeat
 from difflcs.mpc.solution import MPCSolution, Primal
 from difflcs.status import Status, solved
 
@@ -108,22 +106,27 @@ class LCSMPCLayer(nn.Module):
                 self.register_parameter(name, value)
             else:
                 self.register_buffer(name, value, persistent=False)
-        self._check_parts()
+        self.setup().check()
         self._warned = False
         self._repeat = Repeat()
 
-    def _check_parts(self) -> None:
-        """What does not depend on a call is refused before the first one."""
-        inputs = Inputs(self.horizon, sizes={name: getattr(self.lcs, name) for name in ("n_x", "n_u", "n_lam")})
-        if isinstance(self.lcs, LCSSequence):
-            inputs.check_horizon("lcs", self.lcs.horizon)
-        inputs.check_sizes("cost", n_x=self.cost.n_x, n_u=self.cost.n_u)
-        if isinstance(self.cost, CostSequence):
-            inputs.check_horizon("cost", self.cost.horizon)
-        inputs.add_constraints(self.constraints)
-        if self.bounds is not None:
-            inputs.add_bounds(self.bounds)
-        check_bounds(*self.limits(), strict=self.barrier > 0)
+    def setup(self) -> Setup:
+        """What the layer plans with as it is now, but for what counts in training mode alone."""
+        if self._forward_pre_hooks:
+            fresh(self, ("u_min", "u_max"))
+        return Setup(
+            self.lcs,
+            self.cost,
+            self.horizon,
+            self.relaxation,
+            self.barrier,
+            self.backend,
+            self.u_min,
+            self.u_max,
+            self.bounds,
+            self.constraints,
+            None if type(self).limits is LCSMPCLayer.limits else self.limits,
+        )
 
     def limits(self, system: System | None = None) -> tuple[Tensor, Tensor]:
         """Bounds of the actions where a call gives none.
@@ -144,17 +147,7 @@ class LCSMPCLayer(nn.Module):
             fresh(self, ("u_min", "u_max"))
         if self.bounds is not None:
             return self.bounds.by_steps()
-        support = getattr(self.lcs if system is None else system, "action_support", None)
-        if support is None:
-            return self.u_min, self.u_max
-        low, high = support.to(self.u_min).unbind()
-        limits = self.u_min.clamp_min(low), self.u_max.clamp_max(high)
-        if not is_wrapped(limits[0]) and bool((limits[0] > limits[1]).any()):
-            raise BoundsError(
-                f"u_min, u_max: expected bounds that meet the actions {low.tolist()} to {high.tolist()} that the model "
-                f"was fitted to, got {self.u_min.tolist()} to {self.u_max.tolist()}; set its action_support to None"
-            )
-        return limits
+        return within_support(self.u_min, self.u_max, self.lcs if system is None else system)
 
     def extra_repr(self) -> str:
         """What print(layer) shows."""
@@ -202,55 +195,14 @@ class LCSMPCLayer(nn.Module):
             SolveError: an element was not solved and on_failure="raise".
             InvalidInputError and its kinds: an argument does not fit; nothing was solved.
         """
-        smooth = self.training_relaxation if self.training else None
-        settings = (self.horizon, self.relaxation if smooth is None else smooth, self.barrier)
-        extras = (reference, u_min, u_max, bounds, cost, constraints, context)
-        plain = not any(value is not None for value in extras) and not forward_mode_active()
-        given = Given(x0, goal, lcs)
-        again = self._repeat.plan(self, settings, given, guess) if plain else None
-        if again is not None:
-            plan, start = again
-            outputs = plan.run(start, x0)
-        else:
-            system = self.lcs if lcs is None else check_system(lcs)
-            check_tensor("x0", x0, [("n_x", system.n_x)])
-            inputs = Inputs(self.horizon)
-            inputs.add_system(system, x0, context)
-            inputs.add_cost(self.cost if cost is None else check_cost(cost), goal, reference)
-            bounds = self.bounds if bounds is None else check_stage_bounds(bounds, u_min=u_min, u_max=u_max)
-            if bounds is None:
-                inputs.tensors |= dict(zip(("u_min", "u_max"), self.limits(system), strict=True))
-            else:
-                inputs.add_bounds(bounds)
-            inputs.replace_bound("u_min", u_min)
-            inputs.replace_bound("u_max", u_max)
-            inputs.add_constraints(self.constraints if constraints is None else check_constraints(constraints))
-            inputs.tensors["x0"] = x0
-            plan = self._plan(settings, inputs)
-            outputs = solve(plan, inputs.tensors, check_guess(guess, plan.batch, self.horizon, inputs.sizes))
-            if plain and type(self).limits is LCSMPCLayer.limits:  # another's bounds may depend on anything
-                self._repeat.keep(self, settings, plan, given, inputs.sizes)
-        if plan.unseen or not plan.result.all_converged:
-            self._report(plan.result.status, plan.own)
-        return MPCSolution(*outputs, problem=plan.problem)
-
-    def _plan(self, settings: tuple, inputs: Inputs) -> Plan:
-        """How to solve what a call asks."""
-        tensors, unseen = inputs.tensors, transforms_active()
-        if not unseen:
-            refuse_tangents(tensors.values())
-        needs_grad = torch.is_grad_enabled() and (unseen or any(t.requires_grad for t in tensors.values()))
-        single = needs_grad and any(t.dtype == torch.float32 for t in tensors.values())
-        return Plan(
-            self.backend,
-            *settings,
-            by_stage=frozenset(inputs.by_stage),
-            dtype=tensors["x0"].dtype,
-            smallest=torch.float32 if single else torch.float64,
-            batch=inputs.batch(),
-            own=needs_grad,
-            unseen=unseen,
-        )
+        setup = self.setup()
+        if self.training and self.training_relaxation is not None:
+            setup = setup._replace(relaxation=self.training_relaxation)
+        call = Call(x0, goal, reference, guess, u_min, u_max, bounds, lcs, cost, constraints, context)
+        solver, (x, u, lam, objective, mu, *rest) = self._repeat.solve_call(setup, call)
+        if solver.transformed or not solver.result.all_converged:
+            self._report(solver.result.status, solver.own)
+        return MPCSolution(x, u, lam, mu, objective, *rest, problem=solver.problem)
 
     def controller(self, on_failure: OnFailure = "hold", time_limit: float | None = None) -> MPCController:
         """A controller of one robot with this layer's problem as it is now: NumPy in and out, warm, microseconds.
@@ -259,7 +211,7 @@ class LCSMPCLayer(nn.Module):
             on_failure: "hold", "unfinished", "zero", "raise" or an action (n_u,), see `MPCController`.
             time_limit: seconds of one step, that of the backend if None.
         """
-        return MPCController(self, on_failure, time_limit)
+        return MPCController(self.setup(), on_failure, time_limit)
 
     def _report(self, status: Tensor, needs_grad: bool) -> None:
         degenerate = int((status == Status.DEGENERATE).sum())

@@ -24,25 +24,16 @@ from difflcs.mpc.conditions import (
     row_units,
     stages_of,
 )
-from difflcs.mpc.problem import MPCProblem, StageData
+from difflcs.mpc.problem import TOLERANCES, MPCProblem, StageData
 from difflcs.mpc.solution import Primal
 
-# A bound is weakly active where both the distance to it and the Newton step across it are below this part of the range;
-# a constraint likewise, in parts of its row's unit.
-_WEAK = 1e-5
-# A reduced Hessian counts as singular below this pivot, in units of each action's own curvature. Directions below it
-# are held: their sensitivity is zero.
-_SINGULAR = 1e-10
-# An action with a barrier is differentiated as one at its bound below this part of its range.
-_CLOSE = 1e-8
+_WEAK, _SINGULAR, _CLOSE, _DEPENDENT = (TOLERANCES[name] for name in ("weak", "singular", "close", "dependent"))
 # Weight of a held constraint in the augmented Hessian, in units of the row's own curvature; each pass of the refinement
 # divides what is left of the row by it. The digits that it costs the other directions are those of its size.
 _HOLD = 1e5
-# Most passes, and the change of the multipliers, in parts of themselves, at which they end. Rows that depend on each
-# other leave far more than `_DEPENDENT` of some right-hand side.
+# Most passes, and the change of the multipliers, in parts of themselves, at which they end.
 _PASSES = 10
 _LEFT = 1e-13
-_DEPENDENT = 1e-3
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import check_choice, check_number, check_tensor
-from difflcs._functorch import is_wrapped, runs_eagerly
+from difflcs._differentiation import is_wrapped, runs_eagerly
 from difflcs._linalg import matvec
 from difflcs.errors import FrictionWarning, InvalidInputError, ShapeError
 from difflcs.records import LCSParams

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from difflcs._checks import describe
-from difflcs._functorch import runs_eagerly
+from difflcs._differentiation import runs_eagerly
 from difflcs._modules import fresh
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.physics.planar import PlanarPushing, PositionDrive

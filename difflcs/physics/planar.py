@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor, describe
-from difflcs._functorch import runs_eagerly
+from difflcs._differentiation import runs_eagerly
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, contact_lcs, count_forces
 from difflcs.physics.shapes import Distance, Shape

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import check_tensor, describe
-from difflcs._functorch import transforms_active
+from difflcs._differentiation import transforms_active
 from difflcs._recall import Recall
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from difflcs._optional import require
+from difflcs._storage import write_atomically
 
 require("gymnasium")  # a clear error, before the modules below import it
 
@@ -109,6 +110,7 @@ __all__ = [
     "task_names",
     "train",
     "wilson_interval",
+    "write_atomically",
 ]
 
 

@@ -19,7 +19,7 @@ from types import UnionType
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from difflcs._checks import describe, make_plain
-from difflcs._files import short
+from difflcs._storage import short
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
 
 MOST_ENVS, MOST_WIDTH, MOST_NETWORKS = 10_000, 10_000, 1_000

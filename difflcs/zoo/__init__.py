@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from difflcs import _files
+from difflcs import _storage
 from difflcs.errors import CheckpointError
 
 __all__ = ["MODELS", "PREFIX", "ModelCard", "card", "names", "path"]
@@ -174,20 +174,20 @@ def table(cards: Sequence[ModelCard]) -> str:
 def _read(file: Path) -> ModelCard:
     remedy = "install difflcs again"
     try:
-        values = _files.read_json(file)
+        values = _storage.read_json(file)
     except (FileNotFoundError, CheckpointError) as error:
         raise CheckpointError(f"{file}: expected a card, got: {error.args[0]}; {remedy}") from error
     wanted = {f.name for f in fields(ModelCard)}
     if not isinstance(values, dict) or set(values) != wanted:
         got = sorted(values) if isinstance(values, dict) else type(values).__name__
         raise CheckpointError(
-            f"{file}: expected the fields {sorted(wanted)} of a card, got {_files.short(got)}; {remedy}"
+            f"{file}: expected the fields {sorted(wanted)} of a card, got {_storage.short(got)}; {remedy}"
         )
     kinds = dict.fromkeys(_NUMBERS, (int, float)) | dict.fromkeys(_COUNTS, (int,)) | dict.fromkeys(_WORDS, (str,))
     kinds |= {"object": (dict,), "versions": (dict,), "settings": (dict,)}
     for name, kind in kinds.items():
         if not isinstance(values[name], kind) or isinstance(values[name], bool):
-            got = _files.short(values[name])
+            got = _storage.short(values[name])
             raise CheckpointError(f"{file}: expected {kind[0].__name__} for {name}, got {got}; {remedy}")
     ranges = dict.fromkeys(("success_rate", "ci_low", "ci_high"), (0, 1)) | dict.fromkeys(_COUNTS, (0, 2**63))
     for name, (low, high) in {**ranges, "minutes": (0, 1e6)}.items():
@@ -195,7 +195,9 @@ def _read(file: Path) -> ModelCard:
             raise CheckpointError(f"{file}: expected {low} to {high:g} for {name}, got {values[name]}; {remedy}")
     check_object(values["object"], file)
     if not all(isinstance(version, str | None) for version in values["versions"].values()):
-        raise CheckpointError(f"{file}: expected texts for versions, got {_files.short(values['versions'])}; {remedy}")
+        raise CheckpointError(
+            f"{file}: expected texts for versions, got {_storage.short(values['versions'])}; {remedy}"
+        )
     return ModelCard(**values)
 
 
@@ -207,7 +209,7 @@ def check_object(description: Mapping[str, Any], source: object) -> None:
     """
     if not all(isinstance(value, str | int | float | bool | None) for value in description.values()):
         raise CheckpointError(
-            f"{source}: expected texts and numbers that describe an object, got {_files.short(dict(description))}; "
+            f"{source}: expected texts and numbers that describe an object, got {_storage.short(dict(description))}; "
             f"restore it from a copy"
         )
 

@@ -270,7 +270,7 @@ def _unpack(archive: Path, folder: Path, entry: YcbObject) -> Path:
         if (folder / entry.code).exists():
             os.replace(folder / entry.code, temporary / "old")  # for an instant there is none
         os.replace(unpacked, folder / entry.code)
-    except AssetError:
+    except (AssetError, MissingDependencyError):
         raise
     except Exception as error:  # a damaged archive fails in many ways
         raise AssetError(

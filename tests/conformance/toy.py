@@ -140,9 +140,9 @@ class Gain(nn.Module):
         return {"size": 1}
 
     def save_pretrained(self, directory: Path) -> None:
-        from difflcs import _files
+        from difflcs import _storage
 
-        _files.save_record(directory, "gain", self.config(), self.state_dict())
+        _storage.save_record(directory, "gain", self.config(), self.state_dict())
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,10 @@ bool counts_down(void* context) { return --*static_cast<int*>(context) < 0; }
 
 int failures = 0;
 void expect(bool ok, const char* what) {
-  if (!ok) std::printf("FAILED: %s\n", what), failures++;
+  if (!ok) {
+    std::printf("FAILED: %s\n", what);
+    failures++;
+  }
 }
 
 void lcp(int64_t n, int64_t count, bool shared, double relaxation, double broken) {
@@ -76,8 +79,14 @@ void lcp(int64_t n, int64_t count, bool shared, double relaxation, double broken
 void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count, bool shared, double barrier,
          double broken, int threads, bool pivot) {
   MpcBatch b{};
-  b.count = count, b.n_x = n_x, b.n_u = n_u, b.n_lam = n_lam, b.horizon = horizon;
-  b.relaxation = 1e-5, b.barrier = barrier, b.pivot = pivot;
+  b.count = count;
+  b.n_x = n_x;
+  b.n_u = n_u;
+  b.n_lam = n_lam;
+  b.horizon = horizon;
+  b.relaxation = 1e-5;
+  b.barrier = barrier;
+  b.pivot = pivot;
   int64_t sizes[kInputs];
   for (int i = 0; i < kInputs; i++) sizes[i] = extent(b, kMpcFields[i]);
   std::vector<double> data[kInputs];
@@ -105,11 +114,22 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
   MpcSolve o{};
   const std::vector<MpcStart> cold(count, {true, false, 1.0, 1e-5}), warm(count, {false, false, 0.0, 1e-5});
   std::vector<double> gained(count);
-  o.start = cold.data(), o.shrink = 0.3, o.steps = 1, o.tol = 1e-8, o.max_iter = 100, o.certified = 1e-6;
+  o.start = cold.data();
+  o.shrink = 0.3;
+  o.steps = 1;
+  o.tol = 1e-8;
+  o.max_iter = 100;
+  o.certified = 1e-6;
   o.gained = gained.data();
-  o.x = x.data(), o.u = u.data(), o.lam = lam.data(), o.mu = &no_multipliers;
-  o.objective = objective.data(), o.residual = residual.data(), o.status = status.data();
-  o.fragile = fragile.data(), o.iterations = iterations.data();
+  o.x = x.data();
+  o.u = u.data();
+  o.lam = lam.data();
+  o.mu = &no_multipliers;
+  o.objective = objective.data();
+  o.residual = residual.data();
+  o.status = status.data();
+  o.fragile = fragile.data();
+  o.iterations = iterations.data();
   for (int pass = 0; pass < 2; pass++) {  // cold, then from its own solution
     int64_t next = 0;
     std::vector<std::thread> pool;
@@ -121,7 +141,9 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
     for (auto& t : pool) t.join();
     if (broken != 0) break;
     const auto u_start = u, lam_start = lam;
-    o.u_start = u_start.data(), o.lam_start = lam_start.data(), o.start = warm.data();
+    o.u_start = u_start.data();
+    o.lam_start = lam_start.data();
+    o.start = warm.data();
     expect(std::count_if(status.begin(), status.end(), solved) * 10 >= count * 9,
            "nine of ten MPC problems are solved");
     if (pass == 0) {
@@ -132,9 +154,11 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
       kernels().mpc_solve(b, o, &next, workspace.data, {counts_down, &left});
       for (const int8_t s : status)
         expect(s >= kUnreached && s <= int8_t(Status::degenerate), "a status is written or is not");
-      u = u_start, lam = lam_start;
+      u = u_start;
+      lam = lam_start;
     }
-    o.u_start = o.lam_start = nullptr, o.start = cold.data();
+    o.u_start = o.lam_start = nullptr;
+    o.start = cold.data();
   }
   {  // left to be compared after two steps, over other plans
     const auto kept_x = x, kept_u = u, kept_lam = lam;
@@ -147,19 +171,31 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
     std::fill(status.begin(), status.end(), kUnreached);
     kernels().mpc_solve(b, o, &next, workspace.data, kNever);
     expect(std::count(status.begin(), status.end(), kUnreached) == 0, "what is left has a status");
-    x = kept_x, u = kept_u, lam = kept_lam, status = kept_status;
+    x = kept_x;
+    u = kept_u;
+    lam = kept_lam;
+    status = kept_status;
   }
   MpcGradient g{};
   const auto x_bar = normal(x.size(), 1.0), u_bar = normal(u.size(), 1.0), lam_bar = normal(lam.size(), 1.0);
   const auto objective_bar = normal(count, 1.0);
-  g.x = x.data(), g.u = u.data(), g.lam = lam.data(), g.x_bar = x_bar.data(), g.u_bar = u_bar.data();
-  g.lam_bar = lam_bar.data(), g.objective_bar = objective_bar.data(), g.solved = all_solved.data();
+  g.x = x.data();
+  g.u = u.data();
+  g.lam = lam.data();
+  g.x_bar = x_bar.data();
+  g.u_bar = u_bar.data();
+  g.lam_bar = lam_bar.data();
+  g.objective_bar = objective_bar.data();
+  g.solved = all_solved.data();
   std::vector<double> own[kInputs];
   for (int i = 0; i < kInputs; i++) {
-    if (b.stride[i])
-      own[i].resize(count * sizes[i]), g.per_element[i] = own[i].data();
-    else
-      g.offset[i] = g.shared_size, g.shared_size += sizes[i];
+    if (b.stride[i]) {
+      own[i].resize(count * sizes[i]);
+      g.per_element[i] = own[i].data();
+    } else {
+      g.offset[i] = g.shared_size;
+      g.shared_size += sizes[i];
+    }
   }
   const int64_t block = 7, blocks = (count + block - 1) / block;
   std::vector<double> partial(blocks * g.shared_size);
@@ -172,18 +208,25 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
 void violation(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t count, double broken) {
   std::vector<double> data[kViolationInputs], gradient[kViolationInputs];
   ViolationBatch b{};
-  b.count = count, b.n_x = n_x, b.n_u = n_u, b.n_lam = n_lam;
+  b.count = count;
+  b.n_x = n_x;
+  b.n_u = n_u;
+  b.n_lam = n_lam;
   double* to[kViolationInputs];
   for (int i = 0; i < kViolationInputs; i++) {
     const int64_t size = extent(b, kViolationFields[i]);
     data[i] = i == vF ? lcp_matrices(1, n_lam) : normal(size, 0.5);
     gradient[i].resize(size);
-    b.input[i] = data[i].data(), to[i] = gradient[i].data();
+    b.input[i] = data[i].data();
+    to[i] = gradient[i].data();
   }
   if (broken != 0) data[vx][0] = broken;
   const int64_t n = 2 * n_lam;
   std::vector<double> Q(n * n), q(count * n), r(count * n_x), e(count * n_lam), loss(count);
-  b.gamma = 0.1, b.xi = 0.1, b.r = r.data(), b.e = e.data();
+  b.gamma = 0.1;
+  b.xi = 0.1;
+  b.r = r.data();
+  b.e = e.data();
   b.watch = kNever;
   const Workspace workspace(kernels().violation_workspace(b));
   const bool convex = kernels().violation_qp(b, Q.data(), q.data(), workspace.data);
@@ -203,7 +246,9 @@ class File {
     char padded[16] = {};
     std::strncpy(padded, name, sizeof padded);
     const uint64_t count = values.size();
-    append(padded, sizeof padded), append(&count, sizeof count), append(values.data(), count * sizeof(double));
+    append(padded, sizeof padded);
+    append(&count, sizeof count);
+    append(values.data(), count * sizeof(double));
   }
   std::string bytes() const {
     const uint64_t size = 24 + body_.size();
@@ -225,7 +270,12 @@ class File {
 void controller(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t h, int64_t n_c, int64_t n_goal, bool staged,
                 double broken) {
   MpcBatch b{};
-  b.count = 1, b.n_x = n_x, b.n_u = n_u, b.n_lam = n_lam, b.n_c = n_c, b.horizon = h;
+  b.count = 1;
+  b.n_x = n_x;
+  b.n_u = n_u;
+  b.n_lam = n_lam;
+  b.n_c = n_c;
+  b.horizon = h;
   File file;
   const std::pair<const char*, double> numbers[] = {{"n_x", n_x},
                                                     {"n_u", n_u},
@@ -262,8 +312,10 @@ void controller(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t h, int64_t n_c,
     }
     file.put(kMpcFields[i].name, values);
   }
-  file.put("goal_to_q", normal(n_x * n_goal, 1)), file.put("goal_to_q_final", normal(n_x * n_goal, 1));
-  file.put("goal_stage", normal(n_goal * n_goal, 1)), file.put("goal_final", normal(n_goal * n_goal, 1));
+  file.put("goal_to_q", normal(n_x * n_goal, 1));
+  file.put("goal_to_q_final", normal(n_x * n_goal, 1));
+  file.put("goal_stage", normal(n_goal * n_goal, 1));
+  file.put("goal_final", normal(n_goal * n_goal, 1));
   file.put("constant", {1.0});
   const std::string bytes = file.bytes();
   Controller own(bytes.data(), bytes.size());

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import ctypes
 import importlib
 import importlib.util
 import io
 import re
 import shlex
+import shutil
 import subprocess
 import sys
+import textwrap
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -75,6 +79,37 @@ def test_what_is_added_by_a_page_works_by_itself(what, tmp_path):
     (section,) = re.findall(rf"^## Add a {what}\n(.*?)(?=^## )", CONTRIBUTING.read_text(), re.MULTILINE | re.DOTALL)
     (code,) = [code for kind, code in FENCE.findall(section) if kind == "python"]
     run_code([code], tmp_path)
+
+
+CALL_OF_THE_KERNEL = """
+using namespace difflcs;
+#define KERNEL(result, name, parameters) result(*entry) parameters = baseline::name;
+{entry}
+extern "C" void call(int64_t n, int64_t count, const double* F, const double* q, double* lam, double* residual) {{
+  alignas(64) static char workspace[4096];
+  const LcpBatch batch{{n, F, n * n, q, 0.0, 0, lam, nullptr, nullptr}};
+  entry(batch, 0, count, residual, workspace);
+}}
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler")
+def test_the_kernel_that_a_page_adds_is_one_of_the_list(tmp_path):
+    (section,) = re.findall(r"^## Add a kernel\n(.*?)(?=^## )", CONTRIBUTING.read_text(), re.MULTILINE | re.DOTALL)
+    kernel, entry = (textwrap.dedent(code) for code in re.findall(r"^ *```cpp\n(.*?)^ *```$", section, re.M | re.S))
+    (tmp_path / "kernel.cpp").write_text(kernel + CALL_OF_THE_KERNEL.format(entry=entry))
+    options = ["-std=c++17", "-fPIC", "-shared", "-Wno-psabi", "-I", ROOT / "difflcs" / "_native"]
+    rng, count, n = np.random.default_rng(0), 5, 3
+    F, q, lam = rng.standard_normal((count, n, n)), rng.standard_normal((count, n)), rng.random((count, n))
+    w = np.einsum("bij,bj->bi", F, lam) + q
+    for lanes in (1, 2):
+        library, names = tmp_path / f"{lanes}.so", ["-DDIFFLCS_ISA=baseline", f"-DDIFFLCS_LANES={lanes}"]
+        subprocess.run(["c++", *options, *names, tmp_path / "kernel.cpp", "-o", library], check=True)
+        residual = np.empty(count)
+        pointers = [ctypes.c_void_p(array.ctypes.data) for array in (F, q, lam, residual)]
+        ctypes.CDLL(str(library)).call(ctypes.c_int64(n), ctypes.c_int64(count), *pointers)
+        np.testing.assert_allclose(residual, np.abs(np.minimum(lam, w)).max(1), rtol=1e-12)
 
 
 def test_contributing_adds_nothing_else():

@@ -13,7 +13,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save, save_file
 
-from difflcs import LCSModel, _files, zoo
+from difflcs import LCSModel, _storage, zoo
 from difflcs.errors import CheckpointError
 from difflcs.rl.learning.dynamics import Ensemble
 from difflcs.rl.learning.mlp import MLPController
@@ -109,7 +109,7 @@ def signed(path, header):
     """Write a description, and give the tensors a checksum that fits it."""
     tensors = load_file(path / "model.safetensors")
     write(path / "config.json", header)
-    (path / "model.safetensors").write_bytes(save(tensors, metadata={"sha256": _files.digest(header, tensors)}))
+    (path / "model.safetensors").write_bytes(save(tensors, metadata={"sha256": _storage.digest(header, tensors)}))
 
 
 def digest(content):
@@ -243,7 +243,7 @@ def test_tensors_of_another_type(record, name):
     path, load = record
     header = json.loads((path / "config.json").read_text())
     tensors = {k: v.to(getattr(torch, name)) for k, v in load_file(path / "model.safetensors").items()}
-    save_file(tensors, path / "model.safetensors", metadata={"sha256": _files.digest(header, tensors)})
+    save_file(tensors, path / "model.safetensors", metadata={"sha256": _storage.digest(header, tensors)})
     with pytest.raises(CheckpointError):
         load(path)
 
@@ -255,7 +255,7 @@ def test_tensors_that_are_not_finite(record, value):
     tensors = load_file(path / "model.safetensors")
     for tensor in tensors.values():
         tensor.view(-1)[0] = value
-    save_file(tensors, path / "model.safetensors", metadata={"sha256": _files.digest(header, tensors)})
+    save_file(tensors, path / "model.safetensors", metadata={"sha256": _storage.digest(header, tensors)})
     with pytest.raises(CheckpointError, match="finite"):
         load(path)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from difflcs import _files, cli
+from difflcs import _storage, cli
 
 pytest.importorskip("mujoco")
 pytest.importorskip("torchrl")
@@ -60,7 +60,7 @@ def test_a_folder_that_cannot_be_written_is_reported_first(capsys, tmp_path):
 def test_a_full_disk_leaves_the_last_checkpoint(capsys, tmp_path, monkeypatch):
     whole, path = tmp_path / "whole", tmp_path / "run"
     assert run(capsys, "train", "--smoke", "--method", "ppo", "--out", whole)[0] == 0
-    write, left = _files.write_atomically, [5]  # config.json, then three files per checkpoint
+    write, left = _storage.write_atomically, [5]  # config.json, then three files per checkpoint
 
     def full(*arguments):
         left[0] -= 1
@@ -69,7 +69,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(capsys, tmp_path, monkeypatch):
         write(*arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(_files, "write_atomically", full)
+        patch.setattr(_storage, "write_atomically", full)
         code, _, err = run(capsys, "train", "--smoke", "--method", "ppo", "--out", path)
     assert code == 2
     assert "No space left" in err

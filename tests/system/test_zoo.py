@@ -19,6 +19,7 @@ from difflcs.errors import CheckpointError
 from difflcs.rl.methods import PPOMethod, get_method, method_names
 from difflcs.rl.runs.checkpoint import RunDirectory
 from difflcs.rl.runs.evaluate import wilson_interval
+from difflcs.rl.runs.trained import TrainedPolicy
 from difflcs.rl.runs.training import TrainConfig, load_model
 from difflcs.rl.tasks import get_task, task_names
 from reproduce import add_to_zoo as adding
@@ -77,6 +78,7 @@ def test_every_model_fits_its_card(name):
     else:
         with pytest.raises(CheckpointError, match="LCSModel"):
             LCSModel.from_pretrained(name)
+    assert TrainedPolicy.open(f"zoo:{name}").finished
     assert hash(card) == hash(zoo.card(f"zoo:{name}"))
 
 

@@ -220,6 +220,15 @@ def test_the_ensemble_learns_the_episodes():
     assert float(error.square().mean()) < 0.05 * float(changes.square().mean())
 
 
+def test_the_first_fit_takes_epochs_of_its_own(monkeypatch):
+    rollouts, taken = make_rollouts(first=3), []
+    monkeypatch.setattr(rollouts.ensemble, "fit", lambda *_, epochs, **__: taken.append(epochs) or 0.0)
+    rollouts.add(episodes())
+    for _ in range(3):
+        rollouts.fit()
+    assert taken == [3, 2, 2]
+
+
 def test_unstable_episodes_are_not_learned_from():
     rollouts, real = make_rollouts(), episodes()
     real["stable"] = torch.tensor([True, False, True, True, False, True])

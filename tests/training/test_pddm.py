@@ -51,6 +51,9 @@ def test_ensemble_learns_a_linear_system_and_its_members_differ():
     u = 0.01 * torch.randn(400, 2, generator=generator, dtype=torch.float64)
     x_next = x @ A.T + u
     ensemble = Ensemble(2, 2, 3, 32, generator)
+    for weight in ensemble.weights:  # uniform, to both sides
+        torch.testing.assert_close(weight.abs().max(), torch.tensor(weight.shape[1] ** -0.5), rtol=0.1, atol=0)
+        assert weight.min() < -0.9 * weight.max()
     loss = ensemble.fit(x, u, x_next, epochs=60, minibatch=50, learning_rate=1e-3, generator=generator)
     assert loss < 0.02
     with torch.no_grad():

@@ -16,7 +16,7 @@ MOST_LINES, MOST_CLASS_LINES = 500, 300
 # own line and those above it here; what begins with "_" helps all, and knows errors alone. The zoo knows files only.
 LAYERS = (
     ("errors",),
-    ("lcs", "lcp", "records", "losses", "_violation", "scales", "cost", "constraints", "status", "zoo"),
+    ("lcs", "lcp", "records", "losses", "scales", "cost", "constraints", "status", "zoo"),
     ("systems",),
     ("mpc",),
     ("physics",),
@@ -44,8 +44,8 @@ def is_type_checking(node: ast.stmt) -> bool:
     return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
 
 
-def imports(tree: ast.Module) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
-    """Import statements that are run, and whether that is when the module is imported."""
+def imports(tree: ast.Module, types: bool = False) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
+    """Import statements that are run, with `types` those for type checkers too, and whether at the import."""
 
     def walk(nodes: list[ast.stmt], top: bool) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
         for node in nodes:
@@ -54,7 +54,7 @@ def imports(tree: ast.Module) -> Iterator[tuple[ast.Import | ast.ImportFrom, boo
                 continue
             inside = top and not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
             for field in ("body", "orelse", "finalbody"):
-                if not (field == "body" and is_type_checking(node)):
+                if types or not (field == "body" and is_type_checking(node)):
                     yield from walk(getattr(node, field, []), inside)
             for handler in (*getattr(node, "handlers", []), *getattr(node, "cases", [])):
                 yield from walk(handler.body, inside)
@@ -80,14 +80,14 @@ def targets(node: ast.Import | ast.ImportFrom, module: str) -> Iterator[str]:
 
 
 @functools.cache
-def graph(*, functions: bool) -> dict[str, set[str]]:
-    """Module → the modules of ours that it imports, at module level or in functions."""
+def graph(*, functions: bool, types: bool = False) -> dict[str, set[str]]:
+    """Module → the modules of ours that it imports, at module level or in functions; `types`: for annotations, too."""
     edges: dict[str, set[str]] = {}
     for module, path in SOURCES.items():
         tree = ast.parse(path.read_text())
         edges[module] = {
             target
-            for node, top in imports(tree)
+            for node, top in imports(tree, types)
             if top is not functions
             for target in targets(node, module)
             if target in SOURCES and target != module
@@ -143,6 +143,7 @@ def test_a_circle_would_be_found():
     code += "try:\n    import d\nexcept ImportError:\n    import e\n"
     found = {(node.names[0].name, top) for node, top in imports(ast.parse(code))}
     assert found == {("b", True), ("c", False), ("d", True), ("e", True)}
+    assert ("a", True) in {(node.names[0].name, top) for node, top in imports(ast.parse(code), types=True)}
 
 
 def layer_of(module: str) -> int | None:
@@ -155,7 +156,7 @@ def layer_of(module: str) -> int | None:
 
 
 def test_no_circle_of_imports():
-    assert cycles(graph(functions=False)) == []
+    assert cycles(graph(functions=False, types=True)) == []
 
 
 @pytest.mark.parametrize("module", [module for module in SOURCES if module.startswith("difflcs.")])

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from difflcs import LCSModel, _files
+from difflcs import LCSModel, _storage
 from difflcs.errors import CheckpointError, InUseError
 from difflcs.rl.learning.state import flatten
 from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
@@ -63,7 +63,7 @@ def test_a_crash_leaves_the_previous_checkpoint(tmp_path, monkeypatch, step):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(_files, step, die)  # while writing, or between writing and switching
+        patch.setattr(_storage, step, die)  # while writing, or between writing and switching
         with pytest.raises(KeyboardInterrupt):
             save(tmp_path, 2)
     assert_equal(load_checkpoint(tmp_path), 1)

@@ -19,7 +19,7 @@ import pytest
 trimesh = pytest.importorskip("trimesh", reason="the environments need the extra [envs]")
 pytest.importorskip("mujoco", reason="the environments need the extra [envs]")
 
-from difflcs_envs import AssetError, MeshError, assets  # noqa: E402
+from difflcs_envs import AssetError, MeshError, MissingDependencyError, assets  # noqa: E402
 from difflcs_envs.trifinger.objects import make_object  # noqa: E402
 from difflcs_envs.ycb import YCB  # noqa: E402
 
@@ -141,6 +141,13 @@ def test_bad_archives_leave_nothing(server, tmp_path, content, message):
         fetch(server, folder)
     assert list(folder.iterdir()) == []
     assert [path.name for path in tmp_path.iterdir()] == ["deep"]
+
+
+@pytest.mark.parametrize("package", ["filelock", "trimesh", "scipy.spatial"])
+def test_a_missing_package_is_named(server, tmp_path, monkeypatch, package):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(MissingDependencyError, match=f"need the package '{package}'"):
+        fetch(server, tmp_path)
 
 
 def test_missing_archive(server, tmp_path):

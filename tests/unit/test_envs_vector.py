@@ -78,6 +78,8 @@ def test_same_as_single_environments_bit_for_bit(env_id, arguments, mode):
                 assert_same({"x": a[4]["final_obs"]}, {"x": b[4]["final_obs"]})
                 np.testing.assert_array_equal(a[4]["final_info"]["success"], b[4]["final_info"]["success"])
                 np.testing.assert_array_equal(a[4]["position_error"], b[4]["position_error"])
+                for name in (key for key in a[4] if key.startswith("_") and "final" not in key):
+                    np.testing.assert_array_equal(a[4][name], b[4].get(name, np.zeros(3, bool)), err_msg=name)
         else:
             assert_same(a[4], b[4])
     ours.close()

@@ -11,7 +11,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from difflcs import LCSModel, _files
+from difflcs import LCSModel, _storage
 from difflcs.errors import CheckpointError, DiffLCSError, InvalidInputError
 
 NAMES = ("A", "B", "C", "d", "D", "E", "G", "H", "c")
@@ -224,20 +224,20 @@ def test_a_failing_replace_keeps_the_old_file_and_leaves_no_temporary_one(model,
 @pytest.mark.parametrize("interrupt", [KeyboardInterrupt, SystemExit, MemoryError])
 def test_an_interrupt_during_a_write_leaves_the_old_file(tmp_path, monkeypatch, interrupt):
     path = tmp_path / "file"
-    _files.write_atomically(path, b"old")
+    _storage.write_atomically(path, b"old")
 
     def fail(*args):
         raise interrupt
 
     monkeypatch.setattr(os, "fsync", fail)
     with pytest.raises(interrupt):
-        _files.write_atomically(path, b"new")
+        _storage.write_atomically(path, b"new")
     assert contents(tmp_path) == {"file": b"old"}
 
 
 def test_a_file_is_never_seen_half_written(tmp_path, monkeypatch):
     path, seen = tmp_path / "file", []
-    _files.write_atomically(path, b"old")
+    _storage.write_atomically(path, b"old")
     replace = os.replace
 
     def watch(source, target):
@@ -245,7 +245,7 @@ def test_a_file_is_never_seen_half_written(tmp_path, monkeypatch):
         replace(source, target)
 
     monkeypatch.setattr(os, "replace", watch)
-    _files.write_atomically(path, b"newer")
+    _storage.write_atomically(path, b"newer")
     assert seen == [(b"old", 5)]
     assert contents(tmp_path) == {"file": b"newer"}
 
@@ -254,12 +254,12 @@ def test_the_temporary_file_is_in_the_same_directory(tmp_path, monkeypatch):
     """A rename across file systems is not atomic."""
     sources = []
     monkeypatch.setattr(os, "replace", lambda source, target: sources.append(source))
-    _files.write_atomically(tmp_path / "file", b"x")
+    _storage.write_atomically(tmp_path / "file", b"x")
     assert os.path.dirname(sources[0]) == str(tmp_path)
 
 
 def test_json_is_written_in_a_stable_order(tmp_path):
-    _files.write_json(tmp_path / "a", {"b": 1, "a": [1.5, None]})
-    _files.write_json(tmp_path / "b", {"a": [1.5, None], "b": 1})
+    _storage.write_json(tmp_path / "a", {"b": 1, "a": [1.5, None]})
+    _storage.write_json(tmp_path / "b", {"a": [1.5, None], "b": 1})
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
     assert json.loads((tmp_path / "a").read_text()) == {"a": [1.5, None], "b": 1}

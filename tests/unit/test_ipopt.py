@@ -6,13 +6,14 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import textwrap
 from dataclasses import dataclass
 
 import pytest
 import torch
 
-from difflcs import BackendNotFoundError, LCSMPCLayer, SolveError, Status, available_backends, register_backend
+from difflcs import BackendNotFoundError, LCSMPCLayer, available_backends, register_backend
 from difflcs.errors import DTypeError, InvalidInputError, SolveWarning
 from difflcs.mpc.backends import Backend, IpoptBackend, base, get_backend, ipopt
 
@@ -37,27 +38,19 @@ def test_workers_give_the_bits_of_this_process(build, x0):
         assert torch.equal(getattr(alone, name), getattr(three, name))
 
 
-def test_workers_stay_between_calls(build, x0):
+def test_workers_stay_between_calls_and_are_replaced_when_they_are_killed(build, x0):
     layer = make_layer(build)
+    expected, old = layer(x0), ipopt.worker_pids()
     layer(x0)
-    before = ipopt.worker_pids()
-    layer(x0)
-    assert ipopt.worker_pids() == before
-    assert len(before) >= 2
-
-
-@pytest.mark.parametrize("killed", [1, 2])
-def test_killed_workers_are_replaced_and_nothing_is_lost(build, x0, killed):
-    layer = make_layer(build)
-    expected = layer(x0)
-    old = ipopt.worker_pids()[:killed]
-    for pid in old:
+    assert ipopt.worker_pids() == old
+    assert len(old) >= 2
+    for pid in old[:2]:
         os.kill(pid, signal.SIGKILL)
         os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)  # until it is dead; the backend buries it
     again = layer(x0)
     assert torch.equal(again.u, expected.u)
     assert bool(again.converged.all())
-    assert not set(old) & set(ipopt.worker_pids())
+    assert not set(old[:2]) & set(ipopt.worker_pids())
 
 
 def test_a_worker_that_dies_during_a_solve_costs_no_result(build, x0):
@@ -73,7 +66,7 @@ def test_a_worker_that_dies_during_a_solve_costs_no_result(build, x0):
 
 
 def run_script(code, timeout=90):
-    """A fresh process: a crash or a deadlock there is a failed test here, not a lost test run."""
+    """What a script prints. A fresh process: a crash or a deadlock there is a failed test, not a lost test run."""
     head = """
         import warnings; warnings.simplefilter("error")
         import torch
@@ -87,34 +80,36 @@ def run_script(code, timeout=90):
                                backend=IpoptBackend(workers=workers), relaxation=1e-4)
         x0 = torch.randn(6, 3).double()
     """
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(head) + textwrap.dedent(code)],
-        capture_output=True, text=True, timeout=timeout, check=False,
-    )  # fmt: skip
+    with tempfile.NamedTemporaryFile("w", suffix=".py") as script:
+        script.write(textwrap.dedent(head) + textwrap.dedent(code))
+        script.flush()
+        done = subprocess.run(
+            [sys.executable, script.name], capture_output=True, text=True, timeout=timeout, check=False
+        )
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout.split()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [1, 2])
-def test_several_threads_may_solve_at_once(workers):
+def test_several_threads_may_solve_at_once():
     """IPOPT in threads of one process crashes (casadi issue 3456); the backend must keep them apart."""
-    assert run_script(f"""
+    assert run_script("""
         from concurrent.futures import ThreadPoolExecutor
-        mpc = layer({workers})
-        expected = [mpc(x).u.detach() for x in x0]
-        batch = mpc(x0).u.detach()
-        def work(i):
-            x = x0[i % 6].clone().requires_grad_()
-            alone = mpc(x)
-            alone.u.sum().backward()
-            assert torch.equal(alone.u.detach(), expected[i % 6]), i
-            assert bool(torch.isfinite(x.grad).all())
-            assert bool(alone.converged.all())
-            if i % 2 == 0:
-                assert torch.equal(mpc(x0).u.detach(), batch)
-        with ThreadPoolExecutor(6) as pool:
-            list(pool.map(work, range(36)))
+        for workers in (1, 2):
+            mpc = layer(workers)
+            expected = [mpc(x).u.detach() for x in x0]
+            batch = mpc(x0).u.detach()
+            def work(i):
+                x = x0[i % 6].clone().requires_grad_()
+                alone = mpc(x)
+                alone.u.sum().backward()
+                assert torch.equal(alone.u.detach(), expected[i % 6]), i
+                assert bool(torch.isfinite(x.grad).all())
+                assert bool(alone.converged.all())
+                if i % 3 == 0:
+                    assert torch.equal(mpc(x0).u.detach(), batch)
+            with ThreadPoolExecutor(6) as pool:
+                list(pool.map(work, range(18)))
         print("fine")
     """) == ["fine"]
 
@@ -139,36 +134,19 @@ def test_a_forked_child_starts_its_own_workers():
 
 
 @pytest.mark.slow
-def test_workers_end_with_their_process():
-    pids = run_script("""
+def test_workers_do_not_run_the_users_script_again_and_end_with_it():
+    """A script without a main guard: workers do not import it."""
+    started, *pids = run_script("""
+        print("started")
         layer(2)(x0)
         from difflcs.mpc.backends.ipopt import worker_pids
         print(*worker_pids())
     """)
+    assert started == "started"
     assert len(pids) == 2
     for pid in pids:
         with pytest.raises(ProcessLookupError):
             os.kill(int(pid), 0)
-
-
-@pytest.mark.slow
-def test_a_script_without_a_main_guard_is_not_run_again(tmp_path):
-    """Workers do not import the user's main module."""
-    script = tmp_path / "user.py"
-    script.write_text(
-        textwrap.dedent("""
-        print("started")
-        import torch
-        from difflcs import LCSMPCLayer, LCSModel, QuadraticCost
-        from difflcs.mpc.backends import IpoptBackend
-        eye = torch.eye(2).double()
-        mpc = LCSMPCLayer(LCSModel(2, 2, 1), QuadraticCost(eye, eye, eye), 2, -1.0, 1.0,
-                          backend=IpoptBackend(workers=2))
-        print(tuple(mpc(torch.zeros(4, 2).double()).u.shape))
-    """)
-    )
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=90, check=True)
-    assert done.stdout.splitlines() == ["started", "(4, 2, 2)"]
 
 
 # --- options --------------------------------------------------------------------------------------------------------
@@ -182,13 +160,6 @@ def test_by_way_of_the_inequality_it_is_the_same_problem(build, x0):
     assert float(other.complementarity().max()) <= 1e-9
     assert float((other.objective - one.objective).abs().max()) < 1e-3
     assert int(other.iterations.sum()) > int(one.iterations.sum())
-
-
-def test_too_few_iterations_are_an_honest_failure(build, x0):
-    with pytest.raises(SolveError, match=r"9 of 9 .*MAX_ITER.*max_iter") as error:
-        make_layer(build, backend=IpoptBackend(max_iter=2, workers=1))(x0)
-    assert error.value.elements == tuple(range(9))
-    assert set(error.value.status) == {Status.MAX_ITER}
 
 
 def test_a_limit_that_some_elements_meet_fails_the_others_only(build, x0):
@@ -210,11 +181,8 @@ def test_a_limit_that_some_elements_meet_fails_the_others_only(build, x0):
     ("options", "error", "message"),
     [
         ({"tol": 0.0}, InvalidInputError, "tol: .*above 0, got 0"),
-        ({"tol": "small"}, DTypeError, "tol: expected a number, got str 'small'"),
-        ({"max_iter": 0}, InvalidInputError, "max_iter: expected at least 1, got 0"),
         ({"max_iter": 2.5}, DTypeError, "max_iter: expected an int, got float 2.5"),
         ({"workers": 0}, InvalidInputError, "workers: expected at least 1, got 0"),
-        ({"workers": True}, DTypeError, "workers: expected an int, got bool True"),
         ({"start": -1.0}, InvalidInputError, "start: .*got -1"),
         ({"mu_init": float("nan")}, InvalidInputError, "mu_init: .*got nan"),
         ({"mu_strategy": "fast"}, InvalidInputError, "mu_strategy: expected one of 'adaptive', 'monotone', got 'fast'"),
@@ -251,11 +219,8 @@ def test_a_registered_backend_is_available_by_its_name(build, x0):
     assert "mine" in available_backends()
     assert get_backend("mine") == Mine(factor=1)
     assert get_backend(Mine(factor=3)).factor == 3
-    assert bool(make_layer(build, backend="mine")(x0).converged.all())
-
-
-def test_an_unregistered_instance_works_too(build, x0):
-    assert bool(make_layer(build, backend=Mine())(x0).converged.all())
+    for backend in ("mine", Mine()):
+        assert bool(make_layer(build, backend=backend)(x0).converged.all())
 
 
 @pytest.mark.usefixtures("registry")
@@ -271,11 +236,6 @@ def test_a_backend_whose_package_is_missing_gives_the_pip_line(build):
             BackendNotFoundError, match=r"'absent'.*'no_such_package_for_difflcs' is not.*pip install 'mine\[solver\]'"
         ):
             make_layer(build, backend=backend)
-
-
-def test_an_unknown_backend_is_refused_with_the_known_ones(build):
-    with pytest.raises(BackendNotFoundError, match=r"expected one of .*'ipopt'.*got 'iopt'.*register_backend"):
-        make_layer(build, backend="iopt")
 
 
 @pytest.mark.parametrize("backend", [None, 3, IpoptBackend])

@@ -7,6 +7,7 @@ import torch
 from gymnasium.vector import SyncVectorEnv
 
 pytest.importorskip("torchrl")
+from difflcs.errors import CheckpointError
 from difflcs.rl.learning.critic import CriticSettings
 from difflcs.rl.learning.mlp import MLPController
 from difflcs.rl.learning.policy import make_actor
@@ -84,3 +85,9 @@ def test_it_starts_near_the_middle_of_the_bounds():
     network = MLPController(features, 3, low, low + 0.2)
     state = torch.randn(50, 1).double()
     torch.testing.assert_close(network(state, -state).action, (low + 0.1).expand(50, 2), rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize("config", [{}, {"n_features": 3, "width": 0, "episode_steps": STEPS}])
+def test_sizes_that_make_no_network_are_refused(config):
+    with pytest.raises(CheckpointError, match="expected a network written by difflcs"):
+        MLPController.from_config(config, make_network().state_dict(), "here", features)

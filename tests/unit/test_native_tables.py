@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import re
-import subprocess
-import sys
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +12,12 @@ import pytest
 import torch
 
 import difflcs
-from difflcs import LCSMPCLayer, LinearConstraints, QuadraticCost, Status
+from difflcs import LCSMPCLayer, QuadraticCost, Status
 from difflcs._native import _kernels
 from difflcs.lcs import SYSTEM, LCSParams, dimensions
 from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.status import solved
-from tests.problems import Kind, random_problem
+from tests.conformance.varied.generators import random_case
 
 SOURCE = Path(difflcs.__file__).parent
 
@@ -30,23 +28,11 @@ def test_the_fields_of_a_problem_are_those_of_the_kernels_in_their_order():
     assert dimensions(MPCProblem) == INPUTS
 
 
-@pytest.mark.slow
 def test_the_kernels_of_another_version_are_refused(monkeypatch):
-    problem = importlib.import_module("difflcs.mpc.problem")
     fields = {name: dims for name, dims in INPUTS.items() if name != "q_final"}
-    script = (
-        "from difflcs._native import _kernels\n"
-        f"_kernels.mpc_fields = lambda: {fields!r}\n"
-        "import importlib.util, sys\n"
-        f"spec = importlib.util.spec_from_file_location('again', {problem.__file__!r})\n"
-        "module = importlib.util.module_from_spec(spec)\n"
-        "sys.modules['again'] = module\n"
-        "spec.loader.exec_module(module)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert done.returncode != 0
-    assert "other fields of the MPC problem" in done.stderr
-    assert "pip install -e ." in done.stderr
+    monkeypatch.setattr(_kernels, "mpc_fields", lambda: fields)
+    with pytest.raises(ImportError, match=r"(?s)other fields of the MPC problem.*pip install -e \."):
+        runpy.run_path(str(SOURCE / "mpc" / "problem.py"))
 
 
 def test_the_system_is_the_same_everywhere():
@@ -54,36 +40,22 @@ def test_the_system_is_the_same_everywhere():
     assert list(INPUTS.items())[: len(SYSTEM)] == list(SYSTEM.items())
     violation = list(_kernels.violation_fields().items())
     assert violation[: len(SYSTEM)] == list(SYSTEM.items())
-    assert violation[len(SYSTEM) :] == [("x", ("count", "n_x")), ("u", ("count", "n_u")), ("x_next", ("count", "n_x"))]
-
-
-def test_a_layer_finds_every_field_in_its_system_cost_and_bounds(build):
-    lcs = build.pushing(0, 5)
-    eye = torch.eye(9, dtype=torch.float64)
-    cost = QuadraticCost(eye, eye[:6, :6], eye)
-    rows = LinearConstraints(eye[:2], eye[:2, 0], E=eye[:2, :6])
-    problem = LCSMPCLayer(lcs, cost, 2, -1.0, 1.0, constraints=rows)(torch.zeros(9, dtype=torch.float64)).problem
-    found = {**lcs.tensors(), **cost.fields()}
-    limits = {"u_min", "u_max", "G_x", "G_u", "g", "price", "x0"}
-    assert {*found, *limits, "S"} == set(INPUTS)
-    sizes = {"n_x": 9, "n_u": 6, "n_lam": 5, "n_c": 2}
-    for name in INPUTS:
-        value = getattr(problem, name) if name != "x0" else problem.x0[0]
-        assert tuple(value.shape) == tuple(sizes[dim] for dim in INPUTS[name]), name
+    assert violation[len(SYSTEM) :] == [("x", ("n_x",)), ("u", ("n_u",)), ("x_next", ("n_x",)), ("gamma", ())]
 
 
 @pytest.mark.parametrize("name", INPUTS)
 def test_the_kernels_name_the_field_that_does_not_fit(name):
-    problem = random_problem(0, Kind(horizon=2, batch=1, rows=2))
+    problem = random_case(0, batch=1).problem()
     arrays = {k: getattr(problem, k).numpy() for k in INPUTS}
     arrays[name] = np.concatenate([arrays[name], arrays[name]])
-    sizes = {"x": (1, 3, 4), "u": (1, 2, 2), "lam": (1, 2, 3)}
-    solution = {k: np.zeros(size) for k, size in {**sizes, "mu": (1, 3, 2)}.items()}
+    H = problem.horizon
+    sizes = {"x": (1, H + 1, problem.n_x), "u": (1, H, problem.n_u), "lam": (1, H, problem.n_lam)}
+    solution = {k: np.zeros(size) for k, size in {**sizes, "mu": (1, H + 1, problem.n_c)}.items()}
     upstream = {f"{k}_bar": np.zeros(size) for k, size in sizes.items()}
     with pytest.raises(ValueError, match=r"wrong (shape|size)|inconsistent"):
         _kernels.vjp_mpc(
             inputs=list(arrays.values()),
-            horizon=2,
+            horizon=H,
             relaxation=1e-5,
             barrier=0.0,
             **solution,
@@ -115,6 +87,14 @@ def test_the_parameters_of_ipopt_are_the_fields_and_the_two_numbers(build):
 def test_the_codes_are_those_of_the_kernels():
     assert {s.name: int(s) for s in Status} == _kernels.status_codes()
     assert all(s.advice for s in Status)
+
+
+def test_no_file_of_python_states_a_tolerance_of_the_kernels():
+    table = _kernels.tolerances()
+    assert table["at_price"] == 1 - 1e-12
+    names = "|".join(name.upper() for name in table)
+    for path in [*SOURCE.glob("*.py"), *(SOURCE / "mpc").rglob("*.py")]:
+        assert not re.search(rf"^_?({names}) = [\d.]", path.read_text(), re.MULTILINE), path.name
 
 
 def test_what_is_solved_is_said_once():

@@ -28,6 +28,7 @@ from difflcs.physics import (
     contact_lcs,
 )
 from difflcs.physics.learnable import LEARNABLE
+from difflcs.scales import ScaledLCS, Scales
 
 F64 = torch.float64
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -110,15 +111,22 @@ def test_where_the_origin_is_changes_nothing(offset, dtype):
             Polygon((tensor(wrong) @ turn).to(dtype) + away)
 
 
-@pytest.mark.parametrize(
-    ("vertices", "error"),
-    [([[0.0, 0.0], [1.0, 0.0]], ShapeError), ([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]], InvalidInputError),
-     ([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0], [0.0, 1.0]], InvalidInputError), ("a square", DTypeError),
-     ([[0.0, 0.0], [2.0, 0.0], [0.0, 1.0], [1.0, 1.0]], InvalidInputError)],
-)  # fmt: skip
-def test_what_is_no_polygon_is_refused(vertices, error):
-    with pytest.raises(error, match="vertices: expected"):
-        Polygon(vertices)
+BAD_SHAPES = [
+    (lambda: Polygon([[0.0, 0.0], [1.0, 0.0]]), ShapeError, "vertices: expected"),
+    (lambda: Polygon([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]), InvalidInputError, "vertices: expected"),
+    (lambda: Polygon([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), InvalidInputError, "vertices: expected"),
+    (lambda: Polygon("a square"), DTypeError, "vertices: expected"),
+    (lambda: Circle(0.0), InvalidInputError, "r: expected"),
+    (lambda: Union(("circle",)), DTypeError, "parts: expected shapes"),
+    (lambda: Union(()), InvalidInputError, "at least one shape"),
+    (lambda: box(1, 0, 0, 1), InvalidInputError, "x_min < x_max"),
+]
+
+
+@pytest.mark.parametrize(("make", "error", "match"), BAD_SHAPES)
+def test_what_is_no_shape_is_refused(make, error, match):
+    with pytest.raises(error, match=match):
+        make()
 
 
 def test_sides_that_cross_are_named_and_those_that_touch_are_allowed():
@@ -141,21 +149,10 @@ def test_a_polygon_can_be_built_of_what_torch_func_differentiates():
     torch.testing.assert_close(found, corners - 0.5)
 
 
-def test_other_bad_shapes_are_refused():
-    with pytest.raises(InvalidInputError, match="r: expected"):
-        Circle(0.0)
-    with pytest.raises(DTypeError, match="parts: expected shapes"):
-        Union(("circle",))
-    with pytest.raises(InvalidInputError, match="at least one shape"):
-        Union(())
-    with pytest.raises(InvalidInputError, match="x_min < x_max"):
-        box(1, 0, 0, 1)
-
-
 # --- contacts ---------------------------------------------------------------------------------------------------------
 
 
-def sliding_block(cone, compliance=1e-6, x=None):
+def sliding_block(cone="anitescu", compliance=1e-6, x=None, feet=1, **units):
     """A point of mass 1 on the floor; state (x, z, speeds), steps of 0.1, gravity and a push along x as action."""
     x = torch.zeros(4, dtype=F64) if x is None else x
     h, eye, zero = 0.1, torch.eye(2, dtype=F64), torch.zeros(2, 2, dtype=F64)
@@ -163,15 +160,18 @@ def sliding_block(cone, compliance=1e-6, x=None):
     B = tensor([[h * h, 0.0], [0.0, h * h], [h, 0.0], [0.0, h]])
     response = torch.cat([torch.cat([h * eye, zero], 1), torch.cat([eye, zero], 1)])
     free = FreeMotion(A, B, B @ tensor([0.0, -9.81]), response)
-    contacts = Contacts(x[1:2], tensor([[0.0, 1.0, 0.0, 0.0]]), tensor([[[1.0, 0.0, 0.0, 0.0]]]))
-    return contact_lcs(contacts, free, x, friction=0.5, compliance=compliance, cone=cone), x
+    normal, tangent = tensor([[0.0, 1.0, 0.0, 0.0]] * feet), tensor([[[1.0, 0.0, 0.0, 0.0]]] * feet)
+    contacts = Contacts(x[1:2].expand(feet), normal, tangent)
+    return contact_lcs(contacts, free, x, friction=0.5, compliance=compliance, cone=cone, **units), x
 
 
 @pytest.mark.parametrize("cone", ["anitescu", "stewart-trinkle"])
-def test_a_push_within_the_cone_moves_nothing(cone):
+def test_a_push_within_the_cone_moves_nothing_and_units_do_not_matter(cone):
     lcs, x = sliding_block(cone)
     after = lcs.step(x, tensor([4.0, 0.0])).x_next  # friction carries up to 4.9
     torch.testing.assert_close(after, x, rtol=0, atol=2e-5)
+    other, u = sliding_block(cone, length=0.03, force=7.0)[0], tensor([6.0, -1.0])
+    torch.testing.assert_close(other.step(x, u).x_next, lcs.step(x, u).x_next, rtol=1e-6, atol=1e-9)
 
 
 def test_sliding_friction():
@@ -183,6 +183,14 @@ def test_sliding_friction():
     lcs, x = sliding_block("anitescu")
     after = lcs.step(x, tensor([6.0, 0.0])).x_next
     torch.testing.assert_close(after[1], 0.5 * after[0], rtol=0, atol=1e-5)
+
+
+def test_a_drag_that_spoils_the_friction_is_told():
+    """A block on two feet that share its weight."""
+    sliding_block("anitescu", 1e-3, feet=2)
+    sliding_block("stewart-trinkle", 0.1, feet=2)
+    with pytest.warns(FrictionWarning, match="times the distance of a slide"):
+        sliding_block("stewart-trinkle", 1e-3, feet=2)
 
 
 @pytest.mark.parametrize(("cone", "compliance"), [("anitescu", 1e-6), ("stewart-trinkle", 1e-2)])
@@ -199,31 +207,6 @@ def test_friction_is_right_at_every_step_of_a_plan(cone, compliance):
     assert (speed[1:] <= speed[:-1] + 1e-6).all()
     assert float(speed[1]) > 0.5
     torch.testing.assert_close(speed[-1], tensor(0.0), rtol=0, atol=0.02)
-
-
-@pytest.mark.parametrize("cone", ["anitescu", "stewart-trinkle"])
-def test_units_change_nothing_but_the_forces(cone):
-    lcs, x = sliding_block(cone)
-    h, eye, zero = 0.1, torch.eye(2, dtype=F64), torch.zeros(2, 2, dtype=F64)
-    response = torch.cat([torch.cat([h * eye, zero], 1), torch.cat([eye, zero], 1)])
-    free = FreeMotion(lcs.A, lcs.B, lcs.d, response)
-    contacts = Contacts(tensor([0.0]), tensor([[0.0, 1.0, 0.0, 0.0]]), tensor([[[1.0, 0.0, 0.0, 0.0]]]))
-    other = contact_lcs(contacts, free, x, friction=0.5, compliance=1e-6, cone=cone, length=0.03, force=7.0)
-    u = tensor([6.0, -1.0])
-    torch.testing.assert_close(other.step(x, u).x_next, lcs.step(x, u).x_next, rtol=1e-6, atol=1e-9)
-
-
-def test_a_drag_that_spoils_the_friction_is_told():
-    """A block on two feet that share its weight."""
-    lcs, x = sliding_block("anitescu")
-    h, eye, zero = 0.1, torch.eye(2, dtype=F64), torch.zeros(2, 2, dtype=F64)
-    response = torch.cat([torch.cat([h * eye, zero], 1), torch.cat([eye, zero], 1)])
-    free = FreeMotion(lcs.A, lcs.B, lcs.d, response)
-    feet = Contacts(torch.zeros(2, dtype=F64), tensor([[0.0, 1.0, 0.0, 0.0]] * 2), tensor([[[1.0, 0.0, 0.0, 0.0]]] * 2))
-    contact_lcs(feet, free, x, friction=0.5, compliance=1e-3)
-    contact_lcs(feet, free, x, friction=0.5, compliance=0.1, cone="stewart-trinkle")
-    with pytest.warns(FrictionWarning, match="times the distance of a slide"):
-        contact_lcs(feet, free, x, friction=0.5, compliance=1e-3, cone="stewart-trinkle")
 
 
 def test_bad_contacts_are_refused():
@@ -300,18 +283,6 @@ def test_what_a_call_without_gradients_prepares_is_not_kept_for_those_with():
     assert system.params(x).B[3, 0].item() == pytest.approx(0.35)
 
 
-def test_numbers_changed_in_place_are_seen():
-    outline, gain, x = box(-0.05, 0.05, -0.05, 0.05), tensor(0.7), torch.zeros(5, dtype=F64)
-    system = PlanarPushing(outline, 0.01, drive=PositionDrive(gain=gain))
-    place = tensor([0.08, 0.01])
-    assert outline.distance(place).distance.item() == pytest.approx(0.03)
-    assert system.params(x).B[3, 0].item() == pytest.approx(0.7)
-    outline.vertices.mul_(1.2)
-    gain.mul_(0.5)
-    assert outline.distance(place).distance.item() == pytest.approx(0.02)
-    assert system.params(x).B[3, 0].item() == pytest.approx(0.35)
-
-
 @pytest.mark.parametrize("learned", [False, True])
 @pytest.mark.parametrize("way", [lambda v, new: v.detach().numpy().__setitem__(slice(None), new),
                                  lambda v, new: v.data.copy_(new), lambda v, new: v.detach().copy_(new)])  # fmt: skip
@@ -384,13 +355,6 @@ def test_the_centre_of_mass_keeps_its_velocity_wherever_the_origin_is(damping):
     torch.testing.assert_close(found[1] - start, found[0], rtol=1e-9, atol=1e-12)
 
 
-def test_a_central_push_moves_the_body_as_far_as_the_disc():
-    system = pushing()
-    x = tensor([0.0, 0.0, 0.0, -0.042, 0.0])
-    after = system.params(x).step(x, tensor([0.01, 0.0])).x_next
-    torch.testing.assert_close(after, tensor([0.008, 0.0, 0.0, -0.032, 0.0]), rtol=0, atol=1e-6)
-
-
 def test_a_push_beside_the_centre_turns_the_body_as_its_mobility_says():
     system = pushing(friction=0.0)
     lever, rho = 0.02, float(system.gyration)
@@ -417,13 +381,6 @@ def test_a_body_turns_about_its_centre_of_mass():
     torch.testing.assert_close(other[:, 1], after[:, 0], rtol=1e-6, atol=1e-9)
 
 
-def test_friction_carries_a_body_along():
-    x = tensor([0.0, 0.0, 0.0, -0.04, 0.0])
-    sideways = [float(pushing(friction=f).params(x).step(x, tensor([0.005, 0.002])).x_next[1]) for f in (0.0, 0.5)]
-    assert abs(sideways[0]) < 1e-6
-    assert sideways[1] > 5e-4
-
-
 def test_the_pd_drive_is_its_own_simulation():
     drive, target = PDDrive(100.0, 20.0, 0.01, 10), 0.3
     step = drive.step()
@@ -443,16 +400,6 @@ def test_what_a_drive_gives_way_and_what_the_body_moves():
     after = system.params(x).step(x, tensor([command, 0.0])).x_next
     force = gain * command / (1 + give + soft)
     torch.testing.assert_close(after, tensor([force, 0.0, 0.0, -0.04 + gain * command - give * force, 0.0]))
-
-
-def test_two_discs_that_squeeze_a_body_hold_each_other():
-    """With a stiff drive they would go on into the body; one that gives way stays almost where it is."""
-    x, u = tensor([0.0, 0.0, 0.0, -0.04, 0.0, 0.04, 0.0]), tensor([0.01, 0.0, -0.01, 0.0])
-    moved = []
-    for give in (0.0, 100.0):
-        system = pushing(n_discs=2, friction=0.0, compliance=1.0, drive=PositionDrive(1.0, give))
-        moved.append(float(system.params(x).step(x, u).x_next[3] - x[3]))
-    torch.testing.assert_close(tensor(moved), tensor([0.01, 0.01 * (1 - 100 / 101)]))
 
 
 def test_only_the_nearest_parts_touch():
@@ -476,7 +423,7 @@ STEPS = (0.0005, 0.01, 0.1)
 
 
 @pytest.mark.parametrize("seconds", STEPS)
-@pytest.mark.parametrize("compliance", [1e-6, 0.02, 0.3])
+@pytest.mark.parametrize("compliance", [1e-6, 0.3])
 @pytest.mark.parametrize("mass", [0.1, 10.0])
 def test_impacts_are_inelastic_whatever_the_step(seconds, compliance, mass):
     """Of a body with a disc that stays where it is told, and with one that has a mass: the closed form."""
@@ -620,17 +567,11 @@ def test_physics_is_learned_from_a_few_pushes(build, loss):
     optimizer = torch.optim.Adam(model.parameters(), 0.1)
     assert abs(float(model.physics.gyration.detach()) - 0.03) > 0.004
 
-    class Scaled:  # the loss weighs what the units make large: millimetres here
-        n_x, n_u, n_lam = model.n_x, model.n_u, model.n_lam
-
-        def params(self, z, context=None):
-            p = model.params(z / units)
-            return type(p)(A=p.A, B=units[:, None] * p.B, C=units[:, None] * p.C, d=units * p.d, D=p.D / units, E=p.E,
-                           F=p.F, c=p.c)  # fmt: skip
-
+    # The loss weighs what the units make large: millimetres here.
+    scaled = ScaledLCS(model, Scales(torch.zeros(7, dtype=F64), units, torch.ones(4, dtype=F64), 1.0, 1.0))
     for _ in range(50):
         optimizer.zero_grad()
-        value = loss(Scaled(), x * units, u, x_next * units)
+        value = loss(scaled, x * units, u, x_next * units)
         value.backward()
         optimizer.step()
     learned = model.physics

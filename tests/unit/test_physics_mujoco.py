@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
 import itertools
-import subprocess
 import sys
 
 import numpy as np
@@ -12,8 +12,15 @@ import torch
 
 mujoco = pytest.importorskip("mujoco")
 
-from difflcs import GoalCost, LCSModule, LCSMPCLayer  # noqa: E402
-from difflcs.errors import ContactWarning, DTypeError, InvalidInputError, NonFiniteError, ShapeError  # noqa: E402
+from difflcs import LCSModule  # noqa: E402
+from difflcs.errors import (  # noqa: E402
+    ContactWarning,
+    DTypeError,
+    InvalidInputError,
+    MissingDependencyError,
+    NonFiniteError,
+    ShapeError,
+)
 from difflcs.physics import PlanarPushing, box  # noqa: E402
 from difflcs.physics.mujoco import MujocoLCS, MujocoState, lcs_from_mujoco  # noqa: E402
 
@@ -90,7 +97,7 @@ def test_the_state_says_what_each_number_is():
         state.index("free_w")
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_states_go_to_mujoco_and_back(seed):
     model = many_joints()
     reference, _ = random_state(model, seed + 100)
@@ -101,6 +108,8 @@ def test_states_go_to_mujoco_and_back(seed):
         again[q : q + 4] *= np.sign(again[q : q + 4] @ qpos[q : q + 4])
     np.testing.assert_allclose(again, qpos, atol=1e-12)
     np.testing.assert_array_equal(velocity, qvel)
+    both = state.to_state(np.stack([reference, qpos]), np.stack([qvel, qvel]))
+    torch.testing.assert_close(both, torch.stack([state.to_state(place, qvel) for place in (reference, qpos)]))
 
 
 def test_states_of_slides_and_hinges_are_qpos_whatever_the_batch():
@@ -112,13 +121,6 @@ def test_states_of_slides_and_hinges_are_qpos_whatever_the_batch():
     np.testing.assert_array_equal(again, qpos)
     assert qvel.shape == (3, 2, 5)
     assert not qvel.any()
-
-
-def test_a_rotation_counts_from_the_reference():
-    model = load('<body><freejoint name="b"/><geom size=".1"/></body>')
-    turned = np.array([0, 0, 0, np.cos(0.4), 0, 0, np.sin(0.4)])
-    assert MujocoState(model).to_state(turned)[5] == pytest.approx(0.8)
-    assert MujocoState(model, turned).to_state(turned).abs().max() == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("quaternion", [[0, 0, 0, 0], [2, 0, 0, 0], [0, 0, 0, 0.5]])
@@ -133,7 +135,7 @@ def test_quaternions_are_read_as_mujoco_does(quaternion):
         np.testing.assert_allclose(again * np.sign(again @ data.xquat[1]), data.xquat[1], atol=1e-12)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_tangent_takes_velocities_of_the_state_to_those_of_mujoco(seed):
     model = many_joints()
     state = MujocoState(model)
@@ -151,31 +153,12 @@ def test_the_tangent_takes_velocities_of_the_state_to_those_of_mujoco(seed):
 # --- contacts -------------------------------------------------------------------------------------------------------
 
 
-def test_the_contact_of_a_pusher_beside_a_box():
-    module = MujocoLCS(pushing())
-    found = module.contacts(tensor(0.0, 0.0, 0.0, -0.1, 0.01))
-    assert found.gap.tolist() == pytest.approx([0.1 - 0.06 - 0.015])
-    # d gap = n · (tip − box at the point beside it), with n = −e_x there; along y likewise.
-    torch.testing.assert_close(found.normal[0], tensor(1.0, 0.0, -0.01, -1.0, 0.0))
-    sign = float(found.tangent[0, 0, 4].sign())
-    torch.testing.assert_close(sign * found.tangent[0, 0], tensor(0.0, -1.0, 0.06, 0.0, 1.0))
-
-
 def test_a_floor_that_nothing_in_the_plane_can_approach_is_left_out():
     assert (MujocoLCS(pushing()).n_contacts, MujocoLCS(pushing()).n_lam) == (1, 2)
     free = load('<geom type="plane" size="1 1 1"/><body><freejoint/><geom type="box" size=".1 .1 .1"/></body>')
     assert MujocoLCS(free, motion="dynamic").n_contacts == 4
     assert MujocoLCS(free, motion="dynamic").n_lam == 16
     assert MujocoLCS(free, motion="dynamic", cone="stewart-trinkle").n_lam == 24
-
-
-def test_a_box_on_a_floor_has_a_contact_at_each_corner():
-    model = load('<geom type="plane" size="1 1 1"/><body><freejoint/><geom type="box" size=".1 .2 .3"/></body>')
-    found = MujocoLCS(model, motion="dynamic").contacts(tensor(0.0, 0.0, 0.31, *[0.0] * 9))
-    assert found.gap.tolist() == pytest.approx([0.01] * 4)
-    torch.testing.assert_close(found.normal[:, :3], tensor(0.0, 0.0, 1.0).expand(4, 3))
-    corners = sorted((round(float(n[3]), 6), round(float(n[4]), 6)) for n in found.normal)
-    assert corners == [(-0.2, -0.1), (-0.2, 0.1), (0.2, -0.1), (0.2, 0.1)]
 
 
 def test_missing_contacts_are_out_of_reach_and_the_nearest_are_kept():
@@ -282,11 +265,6 @@ def test_there_is_room_for_all_contacts_that_mujoco_finds(first, second):
     assert 1 <= most <= MujocoLCS(model, motion="dynamic").n_contacts
 
 
-several_contacts_of_faces = pytest.mark.skipif(
-    not hasattr(mujoco.mjtDisableBit, "mjDSBL_MULTICCD"), reason="this MuJoCo makes one contact where faces meet"
-)
-
-
 def tower(boxes):
     floor, size = '<geom type="plane" size="1 1 .1"/>', 0.1
     stacked = (
@@ -321,63 +299,11 @@ def test_a_tower_stands_on_four_contacts_a_face():
     assert float(x[24:].abs().max()) < 1e-3
 
 
-SLABS = {
-    "box": 'type="box" size=".3 .3 .05"',
-    "mesh": 'type="mesh" mesh="slab"',
-    "cylinder": 'type="cylinder" size=".3 .05"',
-    "box of the same size": FACES["box"],
-}
-
-
-@several_contacts_of_faces
-@pytest.mark.parametrize(
-    ("below", "above", "yaw"),
-    [
-        ("box", "mesh", 0.0),
-        ("mesh", "mesh", 0.0),
-        ("mesh", "box", 0.0),
-        ("mesh", "cylinder", 0.0),
-        ("cylinder", "mesh", 0.0),
-        ("mesh", "capsule", 0.0),
-        ("box of the same size", "box", np.pi / 4),  # an octagon: eight contacts
-    ],
-)
-def test_what_rests_on_a_face_does_not_tip(below, above, yaw):
-    shape, height = (FACES[above], 0.05) if above != "capsule" else (SHAPES[above] + ' euler="90 0 0"', 0.02)
-    model = load(
-        f"""<geom {SLABS[below]} pos="0 0 -.05"/>
-        <body pos="0.003 0.002 {height - 1e-4}"><freejoint/><geom {shape} mass="1"/></body>""",
-        MESH,
-    )
-    data = mujoco.MjData(model)
-    data.qpos[3:] = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
-    module = MujocoLCS(model, data, motion="dynamic", seconds=0.05)
-    x = module.state.to_state(data.qpos)
-    for _ in range(6):
-        x = module.params(x).step(x, torch.zeros(0).double()).x_next
-    assert float(x[2]) == pytest.approx(height, abs=3e-4)
-    assert float(x[3:6].norm()) < 1e-3
-    assert float(x[9:].norm()) < 1e-2
-
-
-@several_contacts_of_faces
-def test_a_flat_pusher_does_not_turn_a_mesh_cube():
-    pusher = PUSHER.replace('type="sphere" size=".015"', 'type="box" size=".02 .03 .03" pos="-.0701 0 0"')
-    model = load(
-        f"""<body>{PLANE.format("")}<joint name="yaw" type="hinge" axis="0 0 1"/>
-        <geom type="mesh" mesh="cube" mass=".5"/></body>"""
-        + pusher.format(tip=""),
-        MESH + SERVOS,
-    )
-    x, u = torch.zeros(5).double(), tensor(0.02, 0.0)
-    after = MujocoLCS(model).params(x).step(x, u).x_next
-    torch.testing.assert_close(after, tensor(0.0199, 0.0, 0.0, 0.02, 0.0), atol=2e-4, rtol=0)
-
-
 @pytest.mark.parametrize("flag", ["contact", "constraint"])
 def test_where_contacts_are_disabled_nothing_touches_but_what_is_named(flag):
     model = load(
-        f"""<geom name="slab" {SLABS["box"]}/>
+        '<geom name="slab" type="box" size=".3 .3 .05"/>'
+        f"""
         <body pos="0 0 .105"><freejoint/><geom name="cube" {FACES["box"]}/></body>""",
         f'<option><flag {flag}="disable"/></option>',
     )
@@ -390,19 +316,6 @@ def test_where_contacts_are_disabled_nothing_touches_but_what_is_named(flag):
 
 
 # --- quasi-static motion --------------------------------------------------------------------------------------------
-
-
-def test_a_pushed_box_moves_as_far_as_the_pusher_goes_into_it():
-    module = MujocoLCS(pushing(), compliance=1e-6)
-    x, u = tensor(0, 0, 0, -0.08, 0), tensor(0.02, 0.01)
-    after = module.params(x).step(x, u).x_next
-    # 5 mm apart; friction holds the contact point of the tip, inside its cone, and turns the box by the rest.
-    assert float(after[0]) == pytest.approx(0.015, rel=0.2)
-    torch.testing.assert_close(after[3:], x[3:] + u)
-    straight = MujocoLCS(pushing(), compliance=1e-6, friction=0.0)
-    after = straight.params(x).step(x, tensor(0.02, 0.0)).x_next
-    torch.testing.assert_close(after, tensor(0.015, 0, 0, -0.06, 0), atol=1e-6, rtol=0)
-    torch.testing.assert_close(straight.params(x).step(x, tensor(-0.02, 0.0)).x_next[:3], torch.zeros(3).double())
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.4])
@@ -434,16 +347,6 @@ def test_mobility_by_damping_or_by_numbers():
         torch.testing.assert_close(moved[:3] / moved.norm(), expected / expected.norm())
     fixed = MujocoLCS(model, mobility=np.diag([1.0, 0.0, 0.0, 0.0, 0.0]))
     assert not fixed.params(x).C[1:].any()
-
-
-def test_actions_become_controls_of_the_servos():
-    model = pushing(SERVOS.replace('joint="py"', 'joint="py" gear="2"'))
-    module = MujocoLCS(model)
-    x, u = tensor(0.2, 0.0, 0.0, -0.08, 0.03), tensor(0.01, -0.02)
-    ctrl = module.control(x, u)
-    torch.testing.assert_close(ctrl, tensor(-0.07, 0.02))
-    after, _ = step(model, x.numpy(), ctrl=ctrl.numpy())
-    np.testing.assert_allclose(after[3:], (x[3:] + u).numpy(), atol=2e-4)
 
 
 @pytest.mark.parametrize("bias", ["40 -400 -40", "0 -400 -40"])
@@ -557,12 +460,6 @@ def test_a_falling_body_stops_at_the_floor():
     assert -0.6 < float(after[1]) < 0.0  # where it stops within the step is not known to the LCS
 
 
-def test_a_servo_gives_way_less_than_what_it_pushes():
-    module = MujocoLCS(pushing(), motion="dynamic")
-    C = module.params(tensor(0, 0, 0, -0.076, 0, *[0.0] * 5)).C
-    assert float(C[3].abs().max()) < 0.05 * float(C[0].abs().max())
-
-
 # --- as a module ----------------------------------------------------------------------------------------------------
 
 
@@ -618,31 +515,11 @@ def test_bodies_that_mocap_moves_are_where_the_data_has_them():
     ) == pytest.approx(0.8)
 
 
-def test_an_mpc_pushes_the_box_to_its_goal():
-    module = MujocoLCS(pushing())
-    cost = GoalCost.reach(5, 2, goal_weight=(100.0, 100.0, 0.3), input_weight=0.1)
-    mpc = LCSMPCLayer(module, cost, 6, -0.02, 0.02, relaxation=1e-5)
-    x, goal = tensor(0.0, 0.0, 0.0, -0.078, 0.0), tensor(0.05, 0.0, 0.0)
-    for _ in range(8):
-        x = module.params(x).step(x, mpc(x, goal).action).x_next
-    assert (x[:3] - goal).abs().max() < 3e-3
-
-
 # --- what is refused ------------------------------------------------------------------------------------------------
 
 SPHERE = '<body><freejoint/><geom name="ball" size=".1"/></body>'
 FIELD = '<asset><hfield name="h" nrow="9" ncol="9" size="1 1 .1 .1"/></asset>'
 TERRAIN = f'<geom name="terrain" type="hfield" hfield="h"/><geom name="wall" size=".1" pos="1 0 0"/>{SPHERE}'
-PAIR = '<contact><pair geom1="tip" geom2="block" friction="1 .1"/></contact>'
-TENDON = '<tendon><fixed name="t" frictionloss="5"><joint joint="px" coef="1"/></fixed></tendon>'
-ADHESION = SERVOS.replace("</actuator>", '<adhesion body="box" gain="50" ctrlrange="0 1"/></actuator>')
-OVERRIDE = '<option o_friction=".9 .9 .1 .1 .1"><flag override="enable"/></option>'
-
-
-TORUS = f"""
-<mujoco><extension><plugin plugin="mujoco.sdf.torus"><instance name="t"/></plugin></extension>
-  <asset><mesh name="torus"><plugin instance="t"/></mesh></asset>
-  <worldbody><geom name="torus" type="sdf" mesh="torus"><plugin instance="t"/></geom>{SPHERE}</worldbody></mujoco>"""
 
 
 def data_of(model, **values):
@@ -661,133 +538,86 @@ def at(model, *x, **options):
 
 
 SMALL = '<body><joint name="a" type="slide" axis="1 0 0" {}/><geom size=".1" mass="1e-10"/></body>'
-LATE = SERVOS.replace("/></", ' delay=".05" nsample="20"/></')
-since_mujoco_4 = pytest.mark.skipif(not hasattr(mujoco.MjModel, "nhistory"), reason="this MuJoCo has none")
-
-REFUSED = {
-    "delay of an actuator": pytest.param(
-        lambda: MujocoLCS(pushing(LATE)), InvalidInputError, "no delay of actuators", marks=since_mujoco_4
+PAIR = '<contact><pair geom1="tip" geom2="block" friction="1 .1"/></contact>'
+TENDON = '<tendon><fixed name="t" frictionloss="5"><joint joint="px" coef="1"/></fixed></tendon>'
+OVERRIDE = '<option o_friction=".9 .9 .1 .1 .1"><flag override="enable"/></option>'
+TORUS = f"""
+<mujoco><extension><plugin plugin="mujoco.sdf.torus"><instance name="t"/></plugin></extension>
+  <asset><mesh name="torus"><plugin instance="t"/></mesh></asset>
+  <worldbody><geom name="torus" type="sdf" mesh="torus"><plugin instance="t"/></geom>{SPHERE}</worldbody></mujoco>"""
+FLAG = SERVOS + '<option><flag {}="{}"/></option>'
+SINCE_MUJOCO_4 = hasattr(mujoco.MjModel, "nhistory")
+# What stands beside the servos of a box and its pusher, the options, and what the error says.
+RESTS = {
+    "a group of actuators that is disabled": (SERVOS + '<option actuatorgroupdisable="0"/>', {}, "not disabled"),
+    "actuators that a flag disables": (FLAG.format("actuation", "disable"), {}, "not disabled"),
+    "friction of two kinds": (SERVOS + PAIR, {}, "got 1 and 0.1 between geoms 'block' and 'tip'"),
+    "friction by override": (SERVOS + OVERRIDE, {}, "pass friction=0.9"),
+    "dry friction of a tendon": (SERVOS + TENDON, {"motion": "dynamic"}, "tendons .frictionloss"),
+    "adhesion": (
+        SERVOS.replace("</actuator>", '<adhesion body="box" gain="50" ctrlrange="0 1"/></actuator>'),
+        {"motion": "dynamic"},
+        "adhesion",
     ),
-    "delay of a sensor": pytest.param(
-        lambda: MujocoLCS(pushing(SERVOS + '<sensor><jointpos joint="px" delay=".1" nsample="9"/></sensor>')),
-        InvalidInputError,
-        "no delay of actuators and sensors",
-        marks=since_mujoco_4,
-    ),
-    "sleep": pytest.param(
-        lambda: MujocoLCS(pushing(SERVOS + '<option><flag sleep="enable"/></option>')),
-        InvalidInputError,
-        "sleep",
-        marks=since_mujoco_4,
-    ),
-    "an actuator that its group disables": (
-        lambda: MujocoLCS(pushing(SERVOS + '<option actuatorgroupdisable="0"/>')),
-        InvalidInputError,
-        "not disabled",
-    ),
-    "actuators that a flag disables": (
-        lambda: MujocoLCS(pushing(SERVOS + '<option><flag actuation="disable"/></option>')),
-        InvalidInputError,
-        "not disabled",
-    ),
-    "a whole turn": (
-        lambda: at(load(SPHERE), 0, 0, 0, 0, 2 * np.pi, motion="dynamic"),
-        InvalidInputError,
-        "near a whole turn .* got 6.28319 rad in joint0_rx .* state 1; .* or move the reference",
-    ),
-    "nearly two turns": (
-        lambda: at(load(SPHERE), 0, 0, 0, 4 * np.pi - 0.02, motion="dynamic"),
-        InvalidInputError,
-        "near a whole turn",
-    ),
-    "a place out of all bounds": (
-        lambda: at(load(SPHERE), 1e11, motion="dynamic"),
-        InvalidInputError,
-        "positions below 1e10.*in state 1 of 2",
-    ),
-    "a speed out of all bounds": (
-        lambda: at(load(SPHERE), *[0] * 6, 1e11, motion="dynamic"),
-        InvalidInputError,
-        "velocities below 1e10",
-    ),
-    "an acceleration out of all bounds": (
-        lambda: at(load(SMALL.format('stiffness="1e3"')), 1.0, motion="dynamic"),
-        InvalidInputError,
-        "accelerations",
-    ),
-    "no model": (lambda: MujocoLCS("model.xml"), DTypeError, "MjModel"),
-    "no data": (lambda: MujocoLCS(pushing(), 3), DTypeError, "MjData"),
-    "no data to linearise at": (lambda: lcs_from_mujoco(pushing(), None), DTypeError, "MjData"),
-    "other data": (lambda: MujocoLCS(pushing(), mujoco.MjData(many_joints())), InvalidInputError, "nq=5"),
-    "a motion": (lambda: MujocoLCS(pushing(), motion="fast"), InvalidInputError, "quasi-static"),
-    "no actuators": (lambda: MujocoLCS(pushing(rest="")), InvalidInputError, "actuators"),
-    "two on one joint": (
-        lambda: MujocoLCS(pushing(rest=SERVOS.replace("py", "px"))),
-        InvalidInputError,
-        "slide or hinge of its own",
-    ),
-    "a mobility of another size": (lambda: MujocoLCS(pushing(), mobility=[1.0, 2.0]), InvalidInputError, "mobility"),
-    "no damping": (lambda: MujocoLCS(pushing(), mobility="damping"), InvalidInputError, "damping above 0"),
-    "nothing gives way": (lambda: MujocoLCS(pushing(), mobility=np.zeros(5)), InvalidInputError, "move, got nothing"),
-    "an unknown geom": (lambda: MujocoLCS(pushing(), pairs=[("tip", "cup")]), InvalidInputError, "'cup'"),
-    "half a pair": (lambda: MujocoLCS(pushing(), pairs=["tip"]), InvalidInputError, "pairs"),
-    "negative friction": (lambda: MujocoLCS(pushing(), friction=-1.0), InvalidInputError, "friction"),
-    "no compliance": (lambda: MujocoLCS(pushing(), compliance=0.0), InvalidInputError, "compliance"),
-    "no contacts": (lambda: MujocoLCS(pushing(), contacts=0), InvalidInputError, "contacts"),
-    "no joints": (lambda: MujocoLCS(load('<geom size="1"/>')), InvalidInputError, "joints"),
-    "activation": (
-        lambda: MujocoLCS(pushing(rest='<actuator><intvelocity joint="px" kp="1" actrange="-1 1"/></actuator>')),
-        InvalidInputError,
-        "activation",
-    ),
-    "equality": (
-        lambda: MujocoLCS(pushing(rest=SERVOS + '<equality><joint joint1="px" joint2="py"/></equality>')),
-        InvalidInputError,
-        "equality",
-    ),
-    "adhesion": (lambda: MujocoLCS(pushing(ADHESION), motion="dynamic"), InvalidInputError, "adhesion"),
-    "dry friction of a tendon": (
-        lambda: MujocoLCS(pushing(SERVOS + TENDON), motion="dynamic"),
-        InvalidInputError,
-        "tendons .frictionloss",
-    ),
-    "a height field": (
-        lambda: MujocoLCS(load(TERRAIN, FIELD), motion="dynamic"),
-        InvalidInputError,
-        "height field .* geom 'terrain'; use a mesh or boxes",
-    ),
-    "a signed distance field": (
-        lambda: MujocoLCS(mujoco.MjModel.from_xml_string(TORUS), motion="dynamic"),
-        InvalidInputError,
-        "signed distance field .* geom 'torus'",
-    ),
-    "friction of two kinds": (
-        lambda: MujocoLCS(pushing(SERVOS + PAIR)),
-        InvalidInputError,
-        "got 1 and 0.1 between geoms 'block' and 'tip'",
-    ),
-    "friction by override": (lambda: MujocoLCS(pushing(SERVOS + OVERRIDE)), InvalidInputError, "pass friction=0.9"),
-    "a force that is none": (
-        lambda: MujocoLCS(pushing(), data_of(pushing(), xfrc_applied=np.nan), motion="dynamic"),
-        NonFiniteError,
-        "xfrc_applied",
-    ),
-    "data of other bodies": (
-        lambda: MujocoLCS(load(SPHERE), mujoco.MjData(load("<body/>" + SPHERE)), motion="dynamic"),
-        InvalidInputError,
-        r"xfrc_applied \(2, 6\) of the model, got \(3, 6\)",
-    ),
-    "no state": (lambda: MujocoLCS(pushing()).params(), InvalidInputError, "pass x"),
-    "a state of another size": (lambda: MujocoLCS(pushing()).params(torch.zeros(4).double()), ShapeError, "n_x=5"),
-    "a state that is none": (lambda: MujocoLCS(pushing()).params(tensor(0, 0, 0, 0, np.nan)), NonFiniteError, "NaN"),
-    "qpos of another size": (lambda: MujocoState(pushing()).to_state([1.0]), ShapeError, "qpos"),
+    "equality": (SERVOS + '<equality><joint joint1="px" joint2="py"/></equality>', {}, "equality"),
+    "activation": ('<actuator><intvelocity joint="px" kp="1" actrange="-1 1"/></actuator>', {}, "activation"),
+    "two on one joint": (SERVOS.replace("py", "px"), {}, "slide or hinge of its own"),
+    "no actuators": ("", {}, "actuators"),
+    "a motion": (SERVOS, {"motion": "fast"}, "quasi-static"),
+    "a mobility of another size": (SERVOS, {"mobility": [1.0, 2.0]}, "mobility"),
+    "no damping": (SERVOS, {"mobility": "damping"}, "damping above 0"),
+    "nothing gives way": (SERVOS, {"mobility": np.zeros(5)}, "move, got nothing"),
+    "an unknown geom": (SERVOS, {"pairs": [("tip", "cup")]}, "'cup'"),
+    "half a pair": (SERVOS, {"pairs": ["tip"]}, "pairs"),
+    "negative friction": (SERVOS, {"friction": -1.0}, "friction"),
+    "no compliance": (SERVOS, {"compliance": 0.0}, "compliance"),
+    "no contacts": (SERVOS, {"contacts": 0}, "contacts"),
 }
+if SINCE_MUJOCO_4:
+    RESTS["delay of an actuator"] = (SERVOS.replace("/></", ' delay=".05" nsample="20"/></'), {}, "no delay of actu")
+    sensor = '<sensor><jointpos joint="px" delay=".1" nsample="9"/></sensor>'
+    RESTS["delay of a sensor"] = (SERVOS + sensor, {}, "no delay of actuators and sensors")
+    RESTS["sleep"] = (FLAG.format("sleep", "enable"), {}, "sleep")
 
 
-CASES = [pytest.param(*getattr(v, "values", v), id=k, marks=getattr(v, "marks", ())) for k, v in REFUSED.items()]
+@pytest.mark.parametrize("case", RESTS)
+def test_what_a_system_does_not_have_is_refused(case):
+    rest, options, words = RESTS[case]
+    with pytest.raises(InvalidInputError, match=words):
+        MujocoLCS(pushing(rest), **options)
 
 
-@pytest.mark.parametrize(("call", "error", "words"), CASES)
+PUSHING = pushing()
+REFUSED = [  # calls, errors, and what these say
+    (lambda: at(load(SPHERE), 0, 0, 0, 0, 2 * np.pi, motion="dynamic"), InvalidInputError,
+     "near a whole turn .* got 6.28319 rad in joint0_rx .* state 1; .* or move the reference"),
+    (lambda: at(load(SPHERE), 0, 0, 0, 4 * np.pi - 0.02, motion="dynamic"), InvalidInputError, "near a whole turn"),
+    (lambda: at(load(SPHERE), 1e11, motion="dynamic"), InvalidInputError, "positions below 1e10.*in state 1 of 2"),
+    (lambda: at(load(SPHERE), *[0] * 6, 1e11, motion="dynamic"), InvalidInputError, "velocities below 1e10"),
+    (lambda: at(load(SMALL.format('stiffness="1e3"')), 1.0, motion="dynamic"), InvalidInputError, "accelerations"),
+    (lambda: MujocoLCS("model.xml"), DTypeError, "MjModel"),
+    (lambda: MujocoLCS(PUSHING, 3), DTypeError, "MjData"),
+    (lambda: lcs_from_mujoco(PUSHING, None), DTypeError, "MjData"),
+    (lambda: MujocoLCS(PUSHING, mujoco.MjData(many_joints())), InvalidInputError, "nq=5"),
+    (lambda: MujocoLCS(load('<geom size="1"/>')), InvalidInputError, "joints"),
+    (lambda: MujocoLCS(load(TERRAIN, FIELD), motion="dynamic"), InvalidInputError,
+     "height field .* geom 'terrain'; use a mesh or boxes"),
+    (lambda: MujocoLCS(mujoco.MjModel.from_xml_string(TORUS), motion="dynamic"), InvalidInputError,
+     "signed distance field .* geom 'torus'"),
+    (lambda: MujocoLCS(PUSHING, data_of(PUSHING, xfrc_applied=np.nan), motion="dynamic"), NonFiniteError,
+     "xfrc_applied"),
+    (lambda: MujocoLCS(load(SPHERE), mujoco.MjData(load("<body/>" + SPHERE)), motion="dynamic"), InvalidInputError,
+     r"xfrc_applied \(2, 6\) of the model, got \(3, 6\)"),
+    (lambda: MujocoLCS(PUSHING).params(), InvalidInputError, "pass x"),
+    (lambda: MujocoLCS(PUSHING).params(torch.zeros(4).double()), ShapeError, "n_x=5"),
+    (lambda: MujocoLCS(PUSHING).params(tensor(0, 0, 0, 0, np.nan)), NonFiniteError, "NaN"),
+    (lambda: MujocoState(PUSHING).to_state([1.0]), ShapeError, "qpos"),
+    (lambda: MujocoLCS(pushing('<actuator><motor joint="px"/></actuator>')).control(tensor(*[0] * 5), tensor(0)),
+     InvalidInputError, "position actuators"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "error", "words"), REFUSED)
 def test_bad_input_is_refused(call, error, words):
     with pytest.raises(error, match=words):
         call()
@@ -801,37 +631,34 @@ def test_dry_friction_of_joints_is_refused_with_velocities_alone():
         MujocoLCS(model, motion="dynamic")
 
 
-def outcome(call):
-    """What comes, or what the error says."""
-    try:
-        return call()
-    except InvalidInputError as error:
-        return str(error)
-
-
-@pytest.mark.parametrize("memory", ["16K", "100K", "2M"])
-def test_where_memory_is_short_no_contact_is_dropped_in_silence(memory):
+def test_where_memory_is_short_no_contact_is_dropped_in_silence():
     """Nine boxes on a floor; where they are far apart, memory suffices before and after a state that is refused."""
     boxes = "".join(f'<body pos="{0.12 * i} 0 .05"><freejoint/><geom {FACES["box"]}/></body>' for i in range(9))
-    systems = []
-    for size in ("64M", memory):
-        model = load('<geom type="plane" size="3 3 .1"/>' + boxes, f'<size memory="{size}"/>')
+
+    def outcome(call, *arguments, **options):
+        try:
+            return call(*arguments, **options)
+        except InvalidInputError as error:
+            return str(error)
+
+    def systems(memory):
+        model = load('<geom type="plane" size="3 3 .1"/>' + boxes, f'<size memory="{memory}"/>')
         near = torch.zeros(9, 12).double()
         near[:, :3] = torch.from_numpy(model.qpos0.reshape(9, 7)[:, :3])
         far = near.clone()
         far[1:, 2] += 10 + torch.arange(8)
         near, far = (torch.cat([x[:, :6].flatten(), x[:, 6:].flatten()]) for x in (near, far))
-        module = outcome(lambda model=model: MujocoLCS(model, motion="dynamic", contacts=36))
-        if isinstance(module, MujocoLCS):
-            module = [outcome(lambda module=module, x=x: module.params(x).c) for x in (far, near, far)]
-        systems.append(module)
-    whole, short = systems
-    refused = [short] if isinstance(short, str) else [found for found in short if isinstance(found, str)]
-    assert all("memory for all contacts" in error for error in refused)
-    assert memory == "100K" or bool(refused) == (memory == "16K")
-    assert isinstance(short, str) or all(
-        isinstance(s, str) or torch.equal(s, w) for s, w in zip(short, whole, strict=True)
-    )
+        module = outcome(MujocoLCS, model, motion="dynamic", contacts=36)
+        return [module if isinstance(module, str) else outcome(module.params, x) for x in (far, near, far)]
+
+    whole, refused = systems("64M"), {}
+    for memory in ("16K", "100K", "2M"):
+        short = systems(memory)
+        refused[memory] = [error for error in short if isinstance(error, str)]
+        assert all("memory for all contacts" in error for error in refused[memory])
+        assert all(isinstance(s, str) or torch.equal(s.c, w.c) for s, w in zip(short, whole, strict=True))
+    assert refused["16K"]
+    assert not refused["2M"]
 
 
 @pytest.mark.parametrize("options", ['actuatorgroupdisable="0"', '><flag actuation="disable"/'])
@@ -860,23 +687,9 @@ def test_equality_constraints_that_the_data_switches_off_do_nothing():
     torch.testing.assert_close(found.F, wanted.F)
 
 
-def test_actuators_that_are_no_servos_have_no_control_of_a_plan():
-    module = MujocoLCS(pushing(rest='<actuator><motor joint="px"/><motor joint="py"/></actuator>'))
-    with pytest.raises(InvalidInputError, match="position actuators"):
-        module.control(torch.zeros(5).double(), torch.zeros(2).double())
-
-
-@pytest.mark.slow
-def test_without_mujoco_the_error_says_what_to_install():
-    code = """
-import sys
-sys.modules["mujoco"] = None
-import difflcs.physics
-from difflcs.errors import MissingDependencyError
-try:
-    import difflcs.physics.mujoco
-except MissingDependencyError as error:
-    print(error)
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
-    assert 'pip install "difflcs[envs]"' in done.stdout, done.stderr[-500:]
+def test_without_mujoco_the_error_says_what_to_install(monkeypatch):
+    for name in [name for name in sys.modules if name.startswith("difflcs.physics.mujoco")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(MissingDependencyError, match=r'pip install "difflcs\[envs\]"'):
+        importlib.import_module("difflcs.physics.mujoco")

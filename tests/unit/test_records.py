@@ -90,14 +90,6 @@ def test_the_gradient_of_an_indexed_system_arrives_at_its_place(build):
     assert float(tensors["A"].grad[[0, 2]].abs().max()) == 0
 
 
-def test_a_loop_goes_through_the_systems(build):
-    params = build.params(batch=(3,))
-    found = list(params)
-    assert len(found) == 3
-    for i, one in enumerate(found):
-        assert_same(one, params[i])
-
-
 def test_one_system_has_no_index(build, sequence):
     for record in (build.params(), sequence):
         message = r"expected an index of a batch dimension, got int 0 where every field is shared.*; build it from"
@@ -159,6 +151,8 @@ def test_a_model_and_its_params_predict_the_same(build):
     x, u = n(5, 4), 0.3 * n(5, 7, 2)
     assert torch.equal(model(x, u[:, 0]).x_next, model.params().step(x, u[:, 0]).x_next)
     assert torch.equal(model.rollout(x, u), model.params().rollout(x, u))
+    assert model.rollout(x[0], u[:, :0]).shape == (5, 1, 4)
+    assert model.rollout(x[:0], u[:0]).shape == (0, 8, 4)
 
 
 @pytest.mark.parametrize("batch", [(), (3,)])
@@ -174,12 +168,6 @@ def test_a_rollout_through_stages_takes_each_in_its_turn(build, batch):
     # All stages at once are what each is.
     lam = torch.stack([solve_lcp(sequence.stage(k).F, sequence.stage(k).gap(xs[:, k], u[k])).lam for k in range(5)], 1)
     torch.testing.assert_close(sequence.next_state(xs[:, :5], u, lam), xs[:, 1:])
-
-
-def test_a_sequence_of_equal_stages_rolls_out_like_its_system(build):
-    params, n = build.params(batch=(3,)), build.normal(6)
-    x0, u = n(3, 4), 0.3 * n(3, 5, 2)
-    assert torch.equal(LCSSequence.stack([params] * 5).rollout(x0, u), params.rollout(x0, u))
 
 
 # --- stages ---------------------------------------------------------------------------------------------------------
@@ -352,10 +340,3 @@ def test_a_model_takes_states_and_context_and_ignores_both(build):
     expected = model.params()
     for found in (model.params(n(5, 4), n(5, 2)), model.params(x=n(4)), model.params(context=n(1))):
         assert_same(found, expected)
-
-
-def test_a_model_names_batches_that_do_not_fit(build):
-    with pytest.raises(
-        ShapeError, match=r"u: its batch dimensions \(3,\) do not fit the others \(x \(2,\), u \(3,\)\)"
-    ):
-        build.model()(build.normal(0)(2, 4), build.normal(0)(3, 2))

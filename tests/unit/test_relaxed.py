@@ -9,32 +9,24 @@ import warnings
 import pytest
 import torch
 
-from difflcs import LCSMPCLayer, LCSParams, QuadraticCost, Status, available_backends
+from difflcs import Status, available_backends
 from difflcs.errors import DTypeError, InvalidInputError, SolveWarning
 from difflcs.mpc import MPCProblem, Primal
 from difflcs.mpc.backends import RelaxedBackend, get_backend
+from tests.conformance.test_backends import Problem, badly_scaled, contact, make
+from tests.conformance.test_backends import solve as solve_problem
 
 pytestmark = pytest.mark.skipif(
     bool(RelaxedBackend.missing()), reason="cvxpy and cvxpylayers are not installed: pip install 'difflcs[relaxed]'"
 )
 
-LCS, COST = ("A", "B", "C", "d", "D", "E", "F", "c"), ("Q", "R", "Q_final", "q", "r", "q_final")
+
+def tensors(build, **options):
+    return make(build, **{"batch": 4, **options}).tensors
 
 
-def tensors(build, seed=0, batch=4, bound=0.15, **sizes):
-    n_x, n_u = sizes.get("n_x", 4), sizes.get("n_u", 2)
-    limit = torch.full((n_u,), bound, dtype=torch.float64)
-    cost = build.cost_tensors(seed, n_x=n_x, n_u=n_u)
-    x0 = 0.2 * build.normal(seed + 7)(batch, n_x)
-    return {**build.lcs_tensors(seed, **sizes), **cost, "u_min": -limit, "u_max": limit, "x0": x0}
-
-
-def solve(t, backend="relaxed", horizon=3, guess=None, **options):
-    layer = LCSMPCLayer(
-        LCSParams(**{k: t[k] for k in LCS}), QuadraticCost(**{k: t[k] for k in COST}, check=False),
-        horizon, t["u_min"], t["u_max"], backend=backend, relaxation=1e-4, **options,
-    )  # fmt: skip
-    return layer(t["x0"], guess=guess)
+def solve(t, backend="relaxed", guess=None, **options):
+    return solve_problem(Problem(t), backend, guess=guess, **options)
 
 
 def without_contact(build, **options):
@@ -49,20 +41,6 @@ def test_it_is_registered_and_says_that_it_is_not_exact():
     assert "relaxed" in available_backends()
     assert get_backend("relaxed") == RelaxedBackend()
     assert RelaxedBackend.exact is False
-
-
-@pytest.mark.parametrize("batch", [1, 5])
-def test_plans_are_feasible_for_the_convex_program(build, batch):
-    t = tensors(build, batch=batch)
-    sol = solve(t)
-    assert sol.status.tolist() == [Status.CONVERGED] * batch
-    assert float(sol.kkt_residual.max()) < 1e-6
-    assert torch.equal(sol.x[:, 0], t["x0"])
-    predicted = sol.x[:, :-1] @ t["A"].T + sol.u @ t["B"].T + sol.lam @ t["C"].T + t["d"]
-    slack = sol.x[:, :-1] @ t["D"].T + sol.u @ t["E"].T + sol.lam @ t["F"].T + t["c"]
-    torch.testing.assert_close(sol.x[:, 1:], predicted, rtol=1e-12, atol=1e-13)
-    assert float(slack.min()) > -1e-9
-    assert bool(((sol.u >= t["u_min"]) & (sol.u <= t["u_max"])).all())
 
 
 @pytest.fixture
@@ -117,16 +95,9 @@ def test_a_huge_penalty_around_the_exact_plan_keeps_it(build):
 
 
 def test_the_plan_does_not_depend_on_units(build):
-    t = tensors(build)
-    X, U, S = (torch.tensor(v, dtype=torch.float64) for v in ([1e2, 1e-2, 1.0, 3.0], [1e-2, 10.0], [1e2, 1e-2, 3.0]))
-    scaled = {
-        "A": X[:, None] * t["A"] / X, "B": X[:, None] * t["B"] / U, "C": X[:, None] * t["C"] * S, "d": X * t["d"],
-        "D": S[:, None] * t["D"] / X, "E": S[:, None] * t["E"] / U, "F": S[:, None] * t["F"] * S, "c": S * t["c"],
-        "Q": t["Q"] / X / X[:, None], "R": t["R"] / U / U[:, None], "Q_final": t["Q_final"] / X / X[:, None],
-        "q": t["q"] / X, "r": t["r"] / U, "q_final": t["q_final"] / X,
-        "u_min": U * t["u_min"], "u_max": U * t["u_max"], "x0": X * t["x0"],
-    }  # fmt: skip
-    torch.testing.assert_close(solve(scaled).u / U, solve(t).u, rtol=1e-6, atol=1e-8)
+    scaled = badly_scaled(build).tensors
+    U, plain = scaled["u_max"] / 0.15, contact(build).tensors
+    torch.testing.assert_close(solve(scaled).u / U, solve(plain).u, rtol=1e-6, atol=1e-8)
 
 
 def test_bounds_of_the_actions_hold_with_a_barrier_too(build):
@@ -167,8 +138,11 @@ def test_the_layer_of_one_size_is_built_once(build, monkeypatch):
 # --- the gradient ---------------------------------------------------------------------------------------------------
 
 
-def check_against_differences(build, t, tol, **options):
-    n, h = build.normal(41), 1e-6
+@pytest.mark.slow
+@pytest.mark.parametrize("guessed", [False, True])
+def test_every_gradient_is_that_of_all_passes_with_the_guess_held(build, guessed):
+    t, n, h = tensors(build, seed=4, batch=2), build.normal(41), 1e-6
+    options = {"guess": solve(t)} if guessed else {}
     leaves = {k: v.clone().requires_grad_() for k, v in t.items()}
     sol = solve(leaves, **options)
     weights = [n(*v.shape) for v in (sol.x, sol.u, sol.lam)]
@@ -184,24 +158,7 @@ def check_against_differences(build, t, tol, **options):
             direction = 0.5 * (direction + direction.mT)
         moved = [float(value(solve({**t, k: v + sign * h * direction}, **options))) for sign in (1, -1)]
         quotient, found = (moved[0] - moved[1]) / (2 * h), float((leaves[k].grad * direction).sum())
-        assert abs(found - quotient) <= tol * max(abs(quotient), 1e-2), k
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("bound", [0.05, 50.0])
-def test_without_contact_every_gradient_matches_central_differences(build, bound):
-    check_against_differences(build, without_contact(build, seed=3, bound=bound), 1e-3)
-
-
-@pytest.mark.slow
-def test_with_contact_every_gradient_is_that_of_all_passes(build):
-    check_against_differences(build, tensors(build, seed=4, batch=2), 1e-3)
-
-
-@pytest.mark.slow
-def test_gradients_with_a_guess_hold_the_guess(build):
-    t = tensors(build, seed=4, batch=2)
-    check_against_differences(build, t, 1e-3, guess=solve(t))
+        assert abs(found - quotient) <= 1e-3 * max(abs(quotient), 1e-2), k
 
 
 def test_singular_weights_have_finite_right_gradients(build):

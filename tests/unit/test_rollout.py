@@ -56,9 +56,9 @@ def test_a_broken_simulation_is_counted_not_fatal():
     assert not rollouts["success"][0]
 
 
-@pytest.mark.parametrize("length", [STEPS - 1, STEPS + 1])
-def test_episodes_of_another_length_are_refused(length):
-    with pytest.raises(InvalidInputError, match=f"episodes of {STEPS} steps"):
+@pytest.mark.parametrize(("length", "got"), [(STEPS - 1, f"one of {STEPS - 1}"), (STEPS + 1, "a longer one")])
+def test_episodes_of_another_length_are_refused(length, got):
+    with pytest.raises(InvalidInputError, match=f"episodes of {STEPS} steps, got {got}"):
         collect(make_envs(2, length=length), mpc_actions(Reach()), [1, 2], STEPS)
 
 

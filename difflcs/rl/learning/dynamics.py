@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from difflcs import _files
+from difflcs import _storage
 from difflcs._checks import check_positive_int
 from difflcs._modules import plain_state, untouched
 from difflcs.errors import CheckpointError, InvalidInputError
@@ -204,7 +204,7 @@ class Ensemble(nn.Module):
 
     def save_pretrained(self, directory: Path) -> None:
         """Write the ensemble into a directory, atomically."""
-        _files.save_record(Path(directory), _KIND, self.config(), plain_state(self))
+        _storage.save_record(Path(directory), _KIND, self.config(), plain_state(self))
 
     @classmethod
     def from_pretrained(cls, directory: Path) -> Ensemble:
@@ -213,7 +213,7 @@ class Ensemble(nn.Module):
         Raises:
             CheckpointError: files are missing, corrupt or of another kind.
         """
-        config, tensors = _files.load_record(Path(directory), _KIND)
+        config, tensors = _storage.load_record(Path(directory), _KIND)
         return cls.from_config(config, tensors, str(directory))
 
     @classmethod
@@ -234,7 +234,7 @@ class Ensemble(nn.Module):
         for name, size in (("input", n_x + n_u), ("change", n_x)):
             shapes |= {f"{name}_mean": (size,), f"{name}_std": (size,)}
         # Compared before anything of these sizes is made.
-        _files.check_tensors(
+        _storage.check_tensors(
             source, "an ensemble", tensors, {name: (shape, torch.float32) for name, shape in shapes.items()}
         )
         ensemble = cls(n_x, n_u, networks, width)

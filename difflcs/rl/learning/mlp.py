@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from difflcs import _files
+from difflcs import _storage
 from difflcs._checks import check_positive_int
 from difflcs._modules import plain_state
 from difflcs.errors import CheckpointError, InvalidInputError
@@ -111,7 +111,7 @@ class MLPController(nn.Module):
 
     def save_pretrained(self, directory: Path) -> None:
         """Write the network into a directory, atomically. Its features are not: they are code."""
-        _files.save_record(Path(directory), _KIND, self.config(), plain_state(self))
+        _storage.save_record(Path(directory), _KIND, self.config(), plain_state(self))
 
     @classmethod
     def from_pretrained(cls, directory: Path, features: Features) -> MLPController:
@@ -120,7 +120,7 @@ class MLPController(nn.Module):
         Raises:
             CheckpointError: files are missing, corrupt or of another kind.
         """
-        config, tensors = _files.load_record(Path(directory), _KIND)
+        config, tensors = _storage.load_record(Path(directory), _KIND)
         return cls.from_config(config, tensors, str(directory), features)
 
     @classmethod
@@ -141,7 +141,7 @@ class MLPController(nn.Module):
         shapes: dict[str, tuple[int, ...]] = {"u_min": (n_u,), "u_max": (n_u,)}
         for i, (n_in, n_out) in enumerate(pairwise([n_features, width, width, n_u])):
             shapes |= {f"layers.{2 * i}.weight": (n_out, n_in), f"layers.{2 * i}.bias": (n_out,)}
-        _files.check_tensors(
+        _storage.check_tensors(
             source, "a network", tensors, {name: (shape, torch.float64) for name, shape in shapes.items()}
         )
         network = cls(features, n_features, tensors["u_min"], tensors["u_max"], width, episode_steps)

@@ -13,7 +13,7 @@ from torch.distributions import MultivariateNormal
 from torch.func import functional_call
 
 from difflcs._checks import check_choice, check_number, check_tensor, describe
-from difflcs._functorch import runs_eagerly
+from difflcs._differentiation import runs_eagerly
 from difflcs._modules import fresh
 from difflcs._optional import INSTALL
 from difflcs.errors import DTypeError, InvalidInputError, MissingDependencyError

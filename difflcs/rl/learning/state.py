@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from difflcs._files import short
+from difflcs._storage import short
 from difflcs.errors import CheckpointError
 
 State = Mapping[str, Any]

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
-from difflcs import _files
+from difflcs import _storage
 from difflcs._checks import check_positive_int
 from difflcs._modules import plain_state, untouched
 from difflcs.lcs import LCSModel
@@ -108,4 +108,4 @@ def save_learned(learned: TrainableModel, directory: Path, kind: str | None = No
     if callable(save):
         save(directory)
     else:
-        _files.save_record(directory, kind or type(learned).__name__, configuration(learned), learned.state_dict())
+        _storage.save_record(directory, kind or type(learned).__name__, configuration(learned), learned.state_dict())

@@ -28,7 +28,7 @@ from typing import Any
 
 from torch import Tensor
 
-from difflcs import _files
+from difflcs import _storage
 from difflcs.errors import CheckpointError
 from difflcs.rl.learning.state import State, flatten, unflatten
 
@@ -45,7 +45,7 @@ def save_checkpoint(root: Path, iteration: int, state: State, keep: int = 2) -> 
     try:
         tensors, rest = flatten(state)
         content = {"iteration": iteration, "state": rest}
-        _files.save_record(temporary, _KIND, {**content, "sha256": _hash(content)}, tensors)
+        _storage.save_record(temporary, _KIND, {**content, "sha256": _hash(content)}, tensors)
         temporary.chmod(0o755)
         shutil.rmtree(root / name, ignore_errors=True)  # left by a crash before it became the latest
         temporary.rename(root / name)
@@ -53,7 +53,7 @@ def save_checkpoint(root: Path, iteration: int, state: State, keep: int = 2) -> 
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
-    _files.write_json(root / "latest.json", {"checkpoint": name})
+    _storage.write_json(root / "latest.json", {"checkpoint": name})
     for old in sorted(n for n in _numbered(root) if int(n) <= iteration)[:-keep]:
         shutil.rmtree(root / old, ignore_errors=True)
 
@@ -66,7 +66,7 @@ def load_checkpoint(root: Path) -> dict[str, Any]:
     """
     latest = root / "latest.json"
     try:
-        content = _files.read_json(latest)
+        content = _storage.read_json(latest)
     except FileNotFoundError:
         raise CheckpointError(
             f"{root}: expected latest.json, found none; was this written by `difflcs train`?"
@@ -76,7 +76,7 @@ def load_checkpoint(root: Path) -> dict[str, Any]:
     name = content.get("checkpoint") if isinstance(content, dict) else None
     if not isinstance(name, str) or not _is_number(name):
         raise CheckpointError(
-            f'{latest}: expected {{"checkpoint": "<number>"}}, got {_files.short(content)}; '
+            f'{latest}: expected {{"checkpoint": "<number>"}}, got {_storage.short(content)}; '
             f"write one of {sorted(_numbered(root))} into it"
         )
     try:
@@ -88,14 +88,14 @@ def load_checkpoint(root: Path) -> dict[str, Any]:
 
 
 def _load(directory: Path, number: int) -> dict[str, Any]:
-    record, tensors = _files.load_record(directory, _KIND)
+    record, tensors = _storage.load_record(directory, _KIND)
     content = {k: v for k, v in record.items() if k != "sha256"}
     if record.get("sha256") != _hash(content):
         raise CheckpointError(f"{directory}: config.json does not match its checksum")
     iteration, state = content.get("iteration"), content.get("state")
     if iteration != number or not isinstance(state, dict):
         raise CheckpointError(f"{directory}: expected iteration {number} with its state, got {sorted(content)}")
-    _files.check_finite(directory, tensors)
+    _storage.check_finite(directory, tensors)
     return unflatten(tensors, state)
 
 
@@ -142,7 +142,7 @@ class RunDirectory:
             CheckpointError: something is there already.
         """
         cls.check_free(path)
-        _files.write_json(path / "config.json", dict(config))
+        _storage.write_json(path / "config.json", dict(config))
         return cls(path)
 
     @staticmethod
@@ -152,7 +152,7 @@ class RunDirectory:
         Raises:
             CheckpointError: something is there already.
         """
-        if path.exists() and (not path.is_dir() or any(entry.name != _files.LOCK for entry in path.iterdir())):
+        if path.exists() and (not path.is_dir() or any(entry.name != _storage.LOCK for entry in path.iterdir())):
             raise CheckpointError(
                 f"{path}: expected a new or empty directory, found files; "
                 f"pass --resume to continue the run in it, or choose another --out"
@@ -165,7 +165,7 @@ class RunDirectory:
             InUseError: another one does.
             OSError: the directory cannot be written.
         """
-        return _files.locked(self.path)
+        return _storage.locked(self.path)
 
     @classmethod
     def open(cls, path: Path | str) -> RunDirectory:
@@ -187,7 +187,7 @@ class RunDirectory:
         """
         file = self.path / "config.json"
         try:
-            config = _files.read_json(file)
+            config = _storage.read_json(file)
         except FileNotFoundError as error:
             raise CheckpointError(
                 f"{file}: expected the config of a run, found no file; restore it from a copy"
@@ -210,11 +210,11 @@ class RunDirectory:
             CheckpointError: there is none, or it is of another kind.
         """
         if self.finished():
-            return _files.load_record(self.model, kind)
+            return _storage.load_record(self.model, kind)
         state = load_checkpoint(self.checkpoints).get("learned")
         tensors = "plain" if isinstance(state, dict) and "plain" in state else "parameters"
         if not isinstance(state, dict) or not all(isinstance(state.get(k), dict) for k in ("settings", tensors)):
-            raise CheckpointError(f"{self.checkpoints}: expected what was learned, got {_files.short(state)}")
+            raise CheckpointError(f"{self.checkpoints}: expected what was learned, got {_storage.short(state)}")
         return state["settings"], state[tensors]
 
     def append(self, row: Mapping[str, object]) -> None:
@@ -232,7 +232,7 @@ class RunDirectory:
             CheckpointError: log.csv is not a table of numbers, a row for each iteration.
         """
         try:
-            lines = _files.read_text(self.log).splitlines(keepends=True)
+            lines = _storage.read_text(self.log).splitlines(keepends=True)
         except FileNotFoundError:
             return []
         try:
@@ -254,7 +254,7 @@ class RunDirectory:
         rows = [row for row in self.rows() if int(row["iteration"]) <= iteration]
         if rows:
             text = _line(rows[0].keys()) + "".join(_line(row.values()) for row in rows)
-            _files.write_atomically(self.log, text.encode())
+            _storage.write_atomically(self.log, text.encode())
         else:
             self.log.unlink(missing_ok=True)
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import torch
 
-from difflcs._files import write_atomically
 from difflcs._optional import require
+from difflcs._storage import write_atomically
 from difflcs.errors import DiffLCSError, InvalidInputError
 from difflcs.rl.rollout import CONTEXT, Policy, mpc_actions
 

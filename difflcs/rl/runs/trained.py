@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from difflcs import _files, zoo
+from difflcs import _storage, zoo
 from difflcs.rl.methods import get_method
 from difflcs.rl.rollout import Policy
 from difflcs.rl.runs.checkpoint import RunDirectory
@@ -57,7 +57,7 @@ class TrainedPolicy:
             task = get_task(known.task)
             make: Any = get_method(known.method)
             method = make(backend=known.backend)
-            learned = method.rebuild(task, *_files.load_record(zoo.path(name), method.kind), name)
+            learned = method.rebuild(task, *_storage.load_record(zoo.path(name), method.kind), name)
             policy = method.policy(task, learned)
             return cls(name, known.task, known.method, known.backend, policy, True, known.object, card=known)
         run = RunDirectory.open(source)

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from difflcs._files import check_path, short, write_json
 from difflcs._optional import require, versions
+from difflcs._storage import check_path, short, write_json
 from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.lcs import LCSModel
 from difflcs.rl.learning.trainer import Trainer, save_learned

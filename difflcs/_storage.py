@@ -1,4 +1,4 @@
-"""Files: atomic writes, locks, and records of tensors (safetensors) with a JSON description. Never pickle.
+"""Storage in files: atomic writes, locks, JSON, and records of tensors (safetensors). Never pickle.
 
 Whatever lies in a file that is read, the error is a `CheckpointError`. Sizes are checked before anything is read.
 """
@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from difflcs.errors import CheckpointError, InUseError, InvalidInputError
+from difflcs.errors import CheckpointError, InUseError, InvalidInputError, MissingDependencyError
 
 LOCK = ".lock"
 """Name of the file in a directory that says, while it is locked, that a process works there."""
@@ -171,10 +171,15 @@ def locked(directory: Path) -> Iterator[None]:
 
     Raises:
         InUseError: another process, or another part of this one, works in it.
+        MissingDependencyError: filelock, of the extra `rl`, is not installed.
         OSError: the lock cannot be written.
     """
-    import filelock  # torch brings it; `import difflcs` does without
-
+    try:
+        import filelock
+    except ImportError as error:
+        raise MissingDependencyError(
+            'expected the package filelock, not installed; run: pip install "difflcs[rl]"'
+        ) from error
     path = directory / LOCK
     lock = filelock.FileLock(path)
     try:

@@ -1,19 +1,31 @@
-"""What one call of the layer plans with: tensors under the names of `MPCProblem`, from whatever the caller gave."""
+"""What the MPC plans with: what a layer was built with, what a call gives, and the problem that these make."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_same_device, check_tensor, describe
-from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds, as_bound
+from difflcs._checks import (
+    broadcast_batch,
+    check_finite,
+    check_positive_definite,
+    check_same_device,
+    check_tensor,
+    describe,
+)
+from difflcs._differentiation import is_wrapped
+from difflcs._fields import check_not_nan
+from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds, as_bound, check_bounds
 from difflcs.cost import CostSequence, GoalCost, QuadraticCost
-from difflcs.errors import DTypeError, ShapeError
+from difflcs.errors import BoundsError, DTypeError, ShapeError
 from difflcs.lcs import SYSTEM, LCSModule, LCSParams, LCSSequence
-from difflcs.mpc.problem import INPUTS
+from difflcs.mpc.backends.base import Backend
+from difflcs.mpc.problem import INPUTS, MAY_BE_INFINITE
 from difflcs.mpc.solution import MPCSolution, Primal
 from difflcs.records import system_at
 
@@ -23,10 +35,113 @@ RANKS = {**{name: len(dims) for name, dims in INPUTS.items()}, "constant": 0}
 GUESS = {"x": (1, "n_x"), "u": (0, "n_u"), "lam": (0, "n_lam"), "mu": (1, "n_c")}
 """Parts of a guess: how many stages beyond H each has, and its size."""
 
+SYMMETRIC = ("Q", "R", "Q_final")
+_COST = ("Q", "R", "S", "Q_final", "q", "r", "q_final", "constant")
+
 Bound = float | Tensor
 System = LCSModule | LCSParams | LCSSequence
 Cost = GoalCost | QuadraticCost | CostSequence
 Constraints = LinearConstraints | ConstraintSequence
+
+
+class Setup(NamedTuple):
+    """What a layer was built with, as it is now; the names are those of `LCSMPCLayer`.
+
+    Attributes:
+        limits: bounds of the actions for a system, where a layer has a way of its own; None: u_min and u_max within the
+            action support of the system.
+    """
+
+    lcs: System
+    cost: Cost
+    horizon: int
+    relaxation: float
+    barrier: float
+    backend: Backend
+    u_min: Tensor
+    u_max: Tensor
+    bounds: StageBounds | None
+    constraints: Constraints | None
+    limits: Callable[[System], tuple[Tensor, Tensor]] | None
+
+    def check(self) -> None:
+        """Refuse what does not fit each other, as far as that does not depend on a call."""
+        inputs = Inputs(self.horizon, sizes={name: getattr(self.lcs, name) for name in ("n_x", "n_u", "n_lam")})
+        if isinstance(self.lcs, LCSSequence):
+            inputs.check_horizon("lcs", self.lcs.horizon)
+        inputs.check_sizes("cost", n_x=self.cost.n_x, n_u=self.cost.n_u)
+        if isinstance(self.cost, CostSequence):
+            inputs.check_horizon("cost", self.cost.horizon)
+        inputs.add_constraints(self.constraints)
+        if self.bounds is not None:
+            inputs.add_bounds(self.bounds)
+        check_bounds(*self.action_bounds(self.lcs), strict=self.barrier > 0)
+
+    def action_bounds(self, system: System) -> tuple[Tensor, Tensor]:
+        """Bounds of the actions where a call gives none, see `LCSMPCLayer.limits`."""
+        if self.limits is not None:
+            return self.limits(system)
+        return self.bounds.by_steps() if self.bounds is not None else within_support(self.u_min, self.u_max, system)
+
+
+class Call(NamedTuple):
+    """What a call of a layer gives; the names are those of `LCSMPCLayer.forward`."""
+
+    x0: Tensor
+    goal: Tensor | None = None
+    reference: Tensor | None = None
+    guess: MPCSolution | Primal | None = None
+    u_min: Bound | None = None
+    u_max: Bound | None = None
+    bounds: StageBounds | None = None
+    lcs: System | None = None
+    cost: Cost | None = None
+    constraints: Constraints | None = None
+    context: Tensor | None = None
+
+
+def gather(setup: Setup, call: Call) -> Inputs:
+    """The tensors that a call plans with.
+
+    Raises:
+        InvalidInputError and its kinds: an argument does not fit.
+    """
+    system = setup.lcs if call.lcs is None else check_system(call.lcs)
+    check_tensor("x0", call.x0, [("n_x", system.n_x)])
+    inputs = Inputs(setup.horizon)
+    inputs.add_system(system, call.x0, call.context)
+    inputs.add_cost(setup.cost if call.cost is None else check_cost(call.cost), call.goal, call.reference)
+    bounds = setup.bounds
+    if call.bounds is not None:
+        bounds = check_stage_bounds(call.bounds, u_min=call.u_min, u_max=call.u_max)
+    if bounds is None:
+        inputs.tensors |= dict(zip(("u_min", "u_max"), setup.action_bounds(system), strict=True))
+    else:
+        inputs.add_bounds(bounds)
+    inputs.replace_bound("u_min", call.u_min)
+    inputs.replace_bound("u_max", call.u_max)
+    inputs.add_constraints(setup.constraints if call.constraints is None else check_constraints(call.constraints))
+    inputs.tensors["x0"] = call.x0
+    return inputs
+
+
+def within_support(u_min: Tensor, u_max: Tensor, system: System) -> tuple[Tensor, Tensor]:
+    """Bounds of the actions within the action support of an `LCSModel` that knows one.
+
+    Raises:
+        BoundsError: the support lies outside of the bounds.
+    """
+    support = getattr(system, "action_support", None)
+    if support is None:
+        return u_min, u_max
+    low, high = support.to(u_min).unbind()
+    limits = u_min.clamp_min(low), u_max.clamp_max(high)
+    if not is_wrapped(limits[0]) and bool((limits[0] > limits[1]).any()):
+        raise BoundsError(
+            f"u_min, u_max: expected bounds that meet the actions {low.tolist()} to {high.tolist()} that the model "
+            f"was fitted to, got {u_min.tolist()} to {u_max.tolist()}; set its action_support to None"
+        )
+    return limits
 
 
 def check_system(lcs: object) -> System:
@@ -72,7 +187,7 @@ def check_stage_bounds(bounds: object, **plain: object) -> StageBounds:
 
 @dataclass
 class Inputs:
-    """What one call plans with: tensors by the names of `MPCProblem`, with the cost's constant.
+    """Tensors by the names of `MPCProblem`, with the cost's constant.
 
     Attributes:
         horizon: stages of the plan.
@@ -167,15 +282,20 @@ class Inputs:
 
     def batch(self) -> torch.Size:
         """Common batch dimensions; a clear error where devices or batch dimensions do not fit."""
-        found = {self._lead(name, tensor) for name, tensor in self.tensors.items()} - {torch.Size()}
-        if len(found) <= 1 and all(tensor.is_cpu for tensor in self.tensors.values()):
+        leads = {}
+        for name, tensor in self.tensors.items():
+            size = tensor.ndim - RANKS[name] - (name in self.by_stage)
+            if size:
+                leads[name] = tensor.shape[:size]
+        found = set(leads.values())
+        if len(found) <= 1 and all([tensor.is_cpu for tensor in self.tensors.values()]):
             return found.pop() if found else torch.Size()
         check_same_device(reversed(self.tensors.items()))
-        return broadcast_batch((name, self._lead(name, tensor)) for name, tensor in reversed(self.tensors.items()))
+        return broadcast_batch([(name, leads.get(name, torch.Size())) for name in reversed(self.tensors)])
 
-    def _lead(self, name: str, tensor: Tensor) -> torch.Size:
-        """Batch dimensions of an input."""
-        return tensor.shape[: tensor.ndim - RANKS[name] - (name in self.by_stage)]
+    def rank(self, name: str) -> int:
+        """Number of dimensions of an input behind those of the batch."""
+        return RANKS[name] + (name in self.by_stage)
 
     def check_sizes(self, name: str, **found: int) -> None:
         """Refuse something that was built for other sizes than the system's."""
@@ -191,32 +311,74 @@ class Inputs:
                 f"{name}: expected {self.horizon} stages, the layer's horizon, got {horizon}; give one for each stage"
             )
 
+    def numbers(
+        self, tensors: Mapping[str, Tensor], batch: tuple[int, ...], *, unseen: bool = False, own: bool = False
+    ) -> dict[str, Tensor]:
+        """Numbers as `MPCProblem` wants them, and the constant; checked, as far as nobody did before.
+
+        Args:
+            tensors: all of the inputs or some; none of them is wrapped.
+            batch: dimensions of the batch that all of them broadcast to.
+            unseen: whether nothing has looked at the numbers yet.
+            own: whether a system gets memory of its own: a solution is measured by the system that it was planned with,
+                also after a step of an optimiser.
+        """
+        values, unchecked, size = {}, {}, math.prod(batch)
+        for name, tensor in tensors.items():
+            value, by_stage = tensor.detach(), name in self.by_stage
+            if value.dtype is not torch.float64 or not value.is_cpu:
+                value = value.to("cpu", torch.float64)
+            leading = value.ndim - RANKS[name] - by_stage
+            if leading or name == "x0":
+                lead, shape = value.shape[:leading], value.shape[leading:]
+                if math.prod(lead) == 1 and name != "x0":
+                    value = value.reshape(shape)  # shared
+                elif lead == batch:
+                    value = value.reshape(size, *shape) if leading != 1 else value
+                else:
+                    value = value.expand(*batch, *shape).reshape(size, *shape)
+            if by_stage and value.ndim == 1 + RANKS[name]:
+                value = value.unsqueeze(0)
+            if name in SYMMETRIC and not torch.equal(value, value.mT):
+                value = 0.5 * (value + value.mT)
+            if name in MAY_BE_INFINITE:
+                if unseen or tensor.requires_grad:
+                    check_not_nan(name, value)
+            elif unseen or name in _COST:
+                unchecked[name] = value
+            values[name] = value.contiguous()
+            if own and name in SYSTEM and values[name].data_ptr() == tensor.data_ptr():
+                values[name] = value.clone()
+        check_finite(unchecked)
+        if unseen:
+            check_positive_definite(values["F"])
+        return values
+
 
 def check_guess(
     guess: MPCSolution | Primal | None,
     batch: tuple[int, ...],
     horizon: int,
     sizes: Mapping[str, int],
-    finite: bool = True,
-) -> tuple[Tensor | None, ...]:
-    """x, u, lam and mu of a guess; mu where it has some. `finite`: whether to look at the numbers."""
+) -> dict[str, Tensor]:
+    """The parts of a guess, "guess.x" and so on; mu where it has some."""
     if guess is None:
-        return (None,) * 4
+        return {}
     if not isinstance(guess, MPCSolution | Primal):
         raise DTypeError(f"guess: expected an MPCSolution or a Primal such as solution.shift(), got {describe(guess)}")
-    found = []
+    found = {}
     for name, (extra, size) in GUESS.items():
         value, stages = getattr(guess, name), horizon + extra
         if name == "mu" and (value is None or (isinstance(value, Tensor) and not value.numel())):
-            found.append(None)  # a plan without constraints is a guess for one with them
-            continue
+            continue  # a plan without constraints is a guess for one with them
         fits = isinstance(value, Tensor) and value.shape == (*batch, stages, sizes[size])
         dims = [] if fits else [("H+1" if extra else "H", stages), (size, sizes[size])]
-        check_tensor(f"guess.{name}", value, dims, finite)
+        check_tensor(f"guess.{name}", value, dims, finite=False)
         if not fits:
             raise ShapeError(
                 f"guess.{name}: expected batch dimensions {tuple(batch)} like x0, got {tuple(value.shape[:-2])}; "
                 f"expand or index it"
             )
-        found.append(value.detach() if value.requires_grad else value)
-    return tuple(found)
+        found[f"guess.{name}"] = value.detach() if value.requires_grad else value
+    check_finite(found)
+    return found
