@@ -282,7 +282,7 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
         return self.envs[0].task.pose_info(self._states, self._goals)
 
     def _masked(self, info: dict[str, np.ndarray], mask: np.ndarray, only: np.ndarray | None = None) -> dict[str, Any]:
-        """Convert to Gymnasium's form: `name`, `_name`. Entries other than the pose's are of the environments `only`."""
+        """Convert to Gymnasium's form: `name`, `_name`. Entries other than the pose are of the environments `only`."""
         result: dict[str, Any] = {}
         for name, value in info.items():
             has = mask

@@ -8,7 +8,7 @@ from torch.autograd.function import once_differentiable
 
 from difflcs import GoalCost, LCSMPCLayer
 from difflcs.physics import ContactLCS, PlanarPushing, box
-from difflcs.rl.learning import learned
+from difflcs.rl.learning import jacobian
 
 F64 = torch.float64
 LEARN = ("center_of_mass", "gyration", "friction", "radius")
@@ -42,9 +42,9 @@ def test_forwards_and_backwards_agree(build, kind, monkeypatch):
     x = 0.1 * build.normal(0)(40, 5)
     x[:, 3] -= 0.7
     found = []
-    for few in (learned.FEW_PARAMETERS, 0):
-        monkeypatch.setattr(learned, "FEW_PARAMETERS", few)
-        found.append(learned.system_jacobian(mpc, x, goal, None, None))
+    for few in (jacobian.FEW_PARAMETERS, 0):
+        monkeypatch.setattr(jacobian, "FEW_PARAMETERS", few)
+        found.append(jacobian.system_jacobian(mpc, x, goal, None, None))
     torch.testing.assert_close(found[0], found[1])
     assert found[0].shape == (40, 2, 5)
     assert bool((found[0].abs().amax((0, 1)) > 1e-6).all())
