@@ -120,7 +120,7 @@ constexpr bool solved(int8_t status) {
 
 }  // namespace
 
-// Tolerances of the kernels that the reference in Python (difflcs/mpc/conditions.py, riccati.py, difflcs/_violation.py)
+// Tolerances of the kernels that the reference in Python (difflcs/mpc/conditions.py, riccati.py, difflcs/losses.py)
 // has too.
 struct Tolerance {
   const char* name;

@@ -127,9 +127,9 @@ struct ViolationBatch {
          (const MpcBatch& batch, const MpcGradient& gradient, int64_t begin, int64_t end, int64_t block,               \
           void* workspace, Watch watch))                                                                               \
   KERNEL(int64_t, violation_workspace, (const ViolationBatch& batch))                                                  \
-  /* r and e at z = 0, and the QP min z'Qz / 2 + q'z over z >= 0: Q (2 n_lam, 2 n_lam), of each where the system is */ \
-  /* not shared, and q (count, 2 n_lam). Returns whether they are finite, F + F^T - gamma I is positive definite and */\
-  /* Q is so by a margin, and gamma is not too small for double precision. */                                          \
+  /* r and e at z = 0, and the QP min z'Qz / 2 + q'z over z >= 0: Q (2 n_lam, 2 n_lam), of each transition where */    \
+  /* the system is not shared, and q (count, 2 n_lam). Returns whether they are finite, F + F^T - gamma I is */        \
+  /* positive definite and Q is so by a margin, and gamma is not too small for double precision. */                    \
   KERNEL(bool, violation_qp, (const ViolationBatch& batch, double* Q, double* q, void* workspace))                     \
   /* r, e and loss (count,) at z (count, 2 n_lam), from r and e at z = 0. Returns the first transition whose e has */  \
   /* no digits that count, or -1. */                                                                                   \

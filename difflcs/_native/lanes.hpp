@@ -4,7 +4,13 @@
 
 namespace difflcs::DIFFLCS_ISA {
 constexpr int kLanes = DIFFLCS_LANES;
-}
+// Whether problems with matrices of their own have variants for the sizes of the paper's tasks, too.
+#ifdef DIFFLCS_FEWER_VARIANTS
+constexpr bool kSizedPerElement = false;
+#else
+constexpr bool kSizedPerElement = kLanes > 1;
+#endif
+}  // namespace difflcs::DIFFLCS_ISA
 #if DIFFLCS_LANES == 1
 #include "single.hpp"
 #else

@@ -209,7 +209,7 @@ template <int... N, class Function>
 void dispatch(const LcpBatch& batch, void* memory, Function f) {
   if (batch.F_stride == 0)
     with_size<double, N...>(batch, memory, f);
-  else if constexpr (kLanes > 2)
+  else if constexpr (kSizedPerElement)
     with_size<Vec, N...>(batch, memory, f);
   else
     with_size<Vec>(batch, memory, f);

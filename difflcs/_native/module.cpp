@@ -314,8 +314,14 @@ difflcs::ViolationBatch violation_batch(const Inputs& inputs, double xi, Output<
     if (inputs[i].ndim() < 2) throw std::invalid_argument("A, B, F and x must be matrices");
   auto last = [&](ViolationInput which) { return int64_t(inputs[which].shape(inputs[which].ndim() - 1)); };
   ViolationBatch b{};
-  b.count = int64_t(inputs[vx].shape(0)), b.n_x = last(vA), b.n_u = last(vB), b.n_lam = last(vF);
-  b.xi = xi, b.r = r.data(), b.e = e.data(), b.shared = true;
+  b.count = int64_t(inputs[vx].shape(0));
+  b.n_x = last(vA);
+  b.n_u = last(vB);
+  b.n_lam = last(vF);
+  b.xi = xi;
+  b.r = r.data();
+  b.e = e.data();
+  b.shared = true;
   for (int i = 0; i < kViolationInputs; i++) {
     const Array& a = inputs[i];
     const int64_t size = extent(b, kViolationFields[i]), own = int64_t(a.ndim()) - rank_of(kViolationFields[i]);
@@ -328,7 +334,8 @@ difflcs::ViolationBatch violation_batch(const Inputs& inputs, double xi, Output<
     b.shared = b.shared && (datum || !own);
   }
   if (b.n_x < 1 || b.n_u < 1 || b.n_lam < 1) throw std::invalid_argument("sizes must be positive");
-  check_size("r", r.size(), b.count * b.n_x), check_size("e", e.size(), b.count * b.n_lam);
+  check_size("r", r.size(), b.count * b.n_x);
+  check_size("e", e.size(), b.count * b.n_lam);
   return b;
 }
 
@@ -350,8 +357,9 @@ std::optional<int64_t> violation_loss(Inputs inputs, double xi, int64_t max_iter
                                       Output<double> loss) {
   difflcs::ViolationBatch b = violation_batch(inputs, xi, r, e);
   const int64_t n = 2 * b.n_lam;
-  check_size("Q", Q.size(), b.shared ? n * n : b.count * n * n), check_size("q", q.size(), b.count * n),
-      check_size("z", z.size(), b.count * n);
+  check_size("Q", Q.size(), b.shared ? n * n : b.count * n * n);
+  check_size("q", q.size(), b.count * n);
+  check_size("z", z.size(), b.count * n);
   check_size("loss", loss.size(), b.count);
   bool convex = false;
   pass(b, [&](void* workspace) { convex = difflcs::kernels().violation_qp(b, Q.data(), q.data(), workspace); });
@@ -371,7 +379,8 @@ std::optional<int64_t> violation_loss(Inputs inputs, double xi, int64_t max_iter
 
 int64_t violation_value(Inputs inputs, double xi, Array z, Output<double> r, Output<double> e, Output<double> loss) {
   difflcs::ViolationBatch b = violation_batch(inputs, xi, r, e);
-  check_size("z", z.size(), 2 * b.n_lam * b.count), check_size("loss", loss.size(), b.count);
+  check_size("z", z.size(), 2 * b.n_lam * b.count);
+  check_size("loss", loss.size(), b.count);
   int64_t lost = -1;
   if (b.count > 0)
     pass(b, [&](void* workspace) { lost = difflcs::kernels().violation_value(b, z.data(), loss.data(), workspace); });
@@ -393,7 +402,10 @@ void violation_gradient(Inputs inputs, double xi, Array z, Output<double> r, Out
   double* to[kViolationInputs] = {};
   for (int i = 0; i < kViolationInputs; i++) {
     if (!gradients[i] && i < vx) throw std::invalid_argument("the system's gradients are always computed");
-    if (gradients[i]) check_size("gradient", gradients[i]->size(), inputs[i].size()), to[i] = gradients[i]->data();
+    if (gradients[i]) {
+      check_size("gradient", gradients[i]->size(), inputs[i].size());
+      to[i] = gradients[i]->data();
+    }
   }
   pass(b, [&](void* workspace) { kernels().violation_gradient(b, z.data(), each, to, workspace); });
 }

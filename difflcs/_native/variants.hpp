@@ -33,7 +33,7 @@ void dispatch(const MpcBatch& b, Function f) {
     f(Widest());
   else if (kLanes == 1 || shared_matrices(b))
     dispatch_sizes<double>(b, f);
-  else if constexpr (kLanes > 2)
+  else if constexpr (kSizedPerElement)
     dispatch_sizes<Vec>(b, f);
   else
     f(Widest());

@@ -1,5 +1,5 @@
-// The violation loss around its inner QP, compiled once per instruction set (see CMakeLists.txt); difflcs/losses.py has
-// the mathematics, and lcp.cpp solves the QP. One transition per SIMD lane.
+// The violation loss around its inner QP, compiled once per instruction set (cmake/kernels.cmake); difflcs/losses.py
+// has the mathematics, and lcp.cpp solves the QP. One transition per SIMD lane.
 #include "kernels.hpp"
 #include "lanes.hpp"
 #include "lu.hpp"
@@ -34,11 +34,15 @@ struct Violation {
   // Lays the arrays out in `memory`, or only counts them where it is null.
   int64_t layout(void* memory) {
     Arena arena{memory};
-    auto take = [&](auto*& to, int64_t count) { arena.take(to, count); };
-    take(x, n_x), take(u, n_u), take(x_next, n_x), take(z, 2 * n_lam), take(r, n_x), take(e, n_lam);
-    take(out, n_x + n_u + 2 * n_lam), take(sum, (n_x + n_lam) * (n_x + n_u + n_lam + 1));
-    take(matrix, 4 * n_lam * n_lam), take(Q_each, kShared ? 0 : 4 * n_lam * n_lam);
-    take(system, kShared ? 0 : (n_x + n_lam) * (n_x + n_u + n_lam + 1));
+    arena.take_all(n_x, x, x_next, r);
+    arena.take(u, n_u);
+    arena.take(z, 2 * n_lam);
+    arena.take(e, n_lam);
+    arena.take(out, n_x + n_u + 2 * n_lam);
+    arena.take(sum, (n_x + n_lam) * (n_x + n_u + n_lam + 1));
+    arena.take(matrix, 4 * n_lam * n_lam);
+    arena.take(Q_each, kShared ? 0 : 4 * n_lam * n_lam);
+    arena.take(system, kShared ? 0 : (n_x + n_lam) * (n_x + n_u + n_lam + 1));
     return arena.used;
   }
 
@@ -50,10 +54,15 @@ struct Violation {
     for (int i = 0; i < vx; i++) {
       if constexpr (kShared)
         *field[i] = batch.input[i];
-      else
-        *field[i] = next, next += extent(batch, kViolationFields[i]);
+      else {
+        *field[i] = next;
+        next += extent(batch, kViolationFields[i]);
+      }
     }
-    if constexpr (kShared) gamma = *batch.input[vgamma], weight = 1.0 / (gamma * batch.xi);
+    if constexpr (kShared) {
+      gamma = *batch.input[vgamma];
+      weight = 1.0 / (gamma * batch.xi);
+    }
   }
 
   // Whether to stop, asked every 1024 transitions.
@@ -74,7 +83,8 @@ struct Violation {
       T* to = system;
       for (int i = 0; i < vx; i++) {
         const int64_t size = extent(batch, kViolationFields[i]);
-        load(to, batch.input[i], size, batch.stride[i], first), to += size;
+        load(to, batch.input[i], size, batch.stride[i], first);
+        to += size;
       }
       load(&gamma, batch.input[vgamma], 1, batch.stride[vgamma], first);
       weight = 1.0 / (gamma * batch.xi);
@@ -142,17 +152,28 @@ struct Violation {
         convex &= hessian(Q_each);
         store(Q, Q_each, 4 * n_lam * n_lam, first);
       }
-      load(x, batch.input[vx], n_x, first), load(u, batch.input[vu], n_u, first);
+      load(x, batch.input[vx], n_x, first);
+      load(u, batch.input[vu], n_u, first);
       load(x_next, batch.input[vx_next], n_x, first);
       for (int64_t i = 0; i < n_x; i++) r[i] = d[i] - x_next[i];
-      for (int64_t i = 0; i < n_lam; i++) e[i] = all(0) + c[i], out[i] = all(0);
-      add_product(r, A, x, n_x, n_x), add_product(r, B, u, n_x, n_u);
-      add_product(e, D, x, n_lam, n_x), add_product(e, E, u, n_lam, n_u);
+      for (int64_t i = 0; i < n_lam; i++) {
+        e[i] = all(0) + c[i];
+        out[i] = all(0);
+      }
+      add_product(r, A, x, n_x, n_x);
+      add_product(r, B, u, n_x, n_u);
+      add_product(e, D, x, n_lam, n_x);
+      add_product(e, E, u, n_lam, n_u);
       add_transposed(out, F, e, n_lam, n_lam);
-      for (int64_t i = 0; i < n_lam; i++) out[i] *= weight, out[n_lam + i] = -weight * e[i];
+      for (int64_t i = 0; i < n_lam; i++) {
+        out[i] *= weight;
+        out[n_lam + i] = -weight * e[i];
+      }
       add_transposed(out, C, r, n_x, n_lam);
       for (int64_t i = 0; i < 2 * n_lam; i++) invalid += 0.0 * out[i];  // NaN where anything was not finite
-      store(batch.r, r, n_x, first), store(batch.e, e, n_lam, first), store(q, out, 2 * n_lam, first);
+      store(batch.r, r, n_x, first);
+      store(batch.e, e, n_lam, first);
+      store(q, out, 2 * n_lam, first);
     }
     return !any(invalid != 0) && !any(~convex);
   }
@@ -164,14 +185,17 @@ struct Violation {
     int64_t lost = -1;
     for (int64_t first = 0; first < batch.count && !halted(first); first += kLanes) {
       load_system(first);
-      load(r, batch.r, n_x, first), load(e, batch.e, n_lam, first), load(z, solution, 2 * n_lam, first);
+      load(r, batch.r, n_x, first);
+      load(e, batch.e, n_lam, first);
+      load(z, solution, 2 * n_lam, first);
       Vec *r_terms = x, *e_terms = out, *balance = out + n_lam;
       for (int64_t i = 0; i < n_x; i++) {
         r_terms[i] = abs(r[i]);
         for (int64_t j = 0; j < n_lam; j++) r_terms[i] += abs(C[i * n_lam + j] * lam[j]);
       }
       for (int64_t i = 0; i < n_lam; i++) {
-        e_terms[i] = abs(e[i]) + phi[i], balance[i] = all(0);
+        e_terms[i] = abs(e[i]) + phi[i];
+        balance[i] = all(0);
         for (int64_t j = 0; j < n_lam; j++) e_terms[i] += abs(F[i * n_lam + j] * lam[j]);
       }
       for (int64_t j = 0; j < n_x; j++)
@@ -186,7 +210,8 @@ struct Violation {
       const Mask unsure = (noise > 1e-6 * signal) & (signal > 0);
       for (int l = 0; l < kLanes && lost < 0; l++)
         if (unsure[l]) lost = first + l;
-      add_product(r, C, lam, n_x, n_lam), add_product(e, F, lam, n_lam, n_lam);
+      add_product(r, C, lam, n_x, n_lam);
+      add_product(e, F, lam, n_lam, n_lam);
       Vec rr = all(0), ee = all(0), product = all(0);
       for (int64_t i = 0; i < n_x; i++) rr += r[i] * r[i];
       for (int64_t i = 0; i < n_lam; i++) {
@@ -196,7 +221,9 @@ struct Violation {
         product += lam[i] * phi[i];
       }
       const Vec total = 0.5 * rr + (product + ee / (2 * gamma)) / batch.xi;
-      store(batch.r, r, n_x, first), store(batch.e, e, n_lam, first), store(loss, &total, 1, first);
+      store(batch.r, r, n_x, first);
+      store(batch.e, e, n_lam, first);
+      store(loss, &total, 1, first);
     }
     return lost;
   }
@@ -207,9 +234,13 @@ struct Violation {
     for (int64_t i = 0; i < rows * (n_w + 1); i++) sum[i] = all(0);
     // Rows and columns of the sums that belong to each matrix.
     auto each_matrix = [&](auto visit) {
-      visit(vA, 0, n_x, 0, n_x), visit(vB, 0, n_x, n_x, n_u), visit(vC, 0, n_x, n_x + n_u, n_lam);
+      visit(vA, 0, n_x, 0, n_x);
+      visit(vB, 0, n_x, n_x, n_u);
+      visit(vC, 0, n_x, n_x + n_u, n_lam);
       visit(vd, 0, n_x, n_w, 1);
-      visit(vD, n_x, n_lam, 0, n_x), visit(vE, n_x, n_lam, n_x, n_u), visit(vF, n_x, n_lam, n_x + n_u, n_lam);
+      visit(vD, n_x, n_lam, 0, n_x);
+      visit(vE, n_x, n_lam, n_x, n_u);
+      visit(vF, n_x, n_lam, n_x + n_u, n_lam);
       visit(vc, n_x, n_lam, n_w, 1);
     };
     for (int64_t first = 0; first < batch.count && !halted(first); first += kLanes) {
@@ -218,8 +249,11 @@ struct Violation {
       load(&scale, upstream, 1, first);
       for (int l = 0; l < kLanes; l++)
         if (first + l >= batch.count) scale[l] = 0;
-      load(r, batch.r, n_x, first), load(e, batch.e, n_lam, first), load(z, solution, 2 * n_lam, first);
-      load(x, batch.input[vx], n_x, first), load(u, batch.input[vu], n_u, first);
+      load(r, batch.r, n_x, first);
+      load(e, batch.e, n_lam, first);
+      load(z, solution, 2 * n_lam, first);
+      load(x, batch.input[vx], n_x, first);
+      load(u, batch.input[vu], n_u, first);
       for (int64_t i = 0; i < n_x; i++) r[i] *= scale;
       for (int64_t i = 0; i < n_lam; i++) e[i] *= weight * scale;
       // One row per residual, one column for each of x, u, lam and 1.
@@ -245,10 +279,12 @@ struct Violation {
       auto datum = [&](ViolationInput which, const T* of_r, const T* of_e, int64_t size) {
         if (!to[which]) return;
         for (int64_t i = 0; i < size; i++) out[i] = all(0);
-        add_transposed(out, of_r, r, n_x, size), add_transposed(out, of_e, e, n_lam, size);
+        add_transposed(out, of_r, r, n_x, size);
+        add_transposed(out, of_e, e, n_lam, size);
         store(to[which], out, size, first);
       };
-      datum(vx, A, D, n_x), datum(vu, B, E, n_u);
+      datum(vx, A, D, n_x);
+      datum(vu, B, E, n_u);
       if (to[vx_next]) {
         for (int64_t i = 0; i < n_x; i++) out[i] = -r[i];
         store(to[vx_next], out, n_x, first);
