@@ -90,7 +90,8 @@ class MPCSolution:
 
     def _flat(self) -> tuple[Tensor, Tensor, Tensor]:
         return tuple(  # pyright: ignore[reportReturnType]
-            v.detach().to("cpu", torch.float64).reshape(-1, *v.shape[-2:]) for v in (self.x, self.u, self.lam)
+            v.detach().to("cpu", torch.float64).reshape(self.status.numel(), *v.shape[-2:])
+            for v in (self.x, self.u, self.lam)
         )
 
 

@@ -401,6 +401,8 @@ def test_without_contact_and_bounds_the_plan_is_riccatis(build, name, backend):
     problem = dataclasses.replace(problem, tensors={**t, "S": 0.1 * build.normal(3)(4, 2)})
     sol = solve(problem, backend)
     assert sol.lam.shape == (4, HORIZON, 0)
+    assert float(sol.dynamics_residual().max()) < 1e-9
+    assert not sol.complementarity().any()
     for i in range(problem.batch):
         P, p = problem.at("Q_final", i, 0), problem.at("q_final", i, 0)
         gains = []

@@ -279,3 +279,21 @@ def test_judged_actions_depend_on_the_key_alone():
     again = estimator(episodes, inputs, rewards, (0, 6)).samples["action"]
     assert torch.equal(again, found.samples["action"])
     assert not torch.equal(estimator(episodes, inputs, rewards, (0, 7)).samples["action"], again)
+
+
+def test_the_gradient_has_less_noise_than_that_of_gae():
+    """In a known world, one step long: the same mean of the score times the advantage, a fraction of its variance."""
+    count, std = 20000, 0.4
+    mean, target = torch.zeros(count, 1).double(), 0.3
+    taken = TensorDict({"loc": mean, "scale_tril": torch.full((count, 1, 1), std).double()}, [count])
+    taken["action"] = mean + std * some(count, 1)
+    with seeded((4,)):
+        action = mirrored_actions(taken, 4)["action"].squeeze(-1)
+    q = -(action - target).square()
+    values = torch.full((count, 1), -(std**2 + target**2)).double()
+    advantage = multi_action_advantages(q.unsqueeze(1), values, 0.9, 0.0).squeeze(1)
+    many = (advantage * action / std**2).mean(1)  # the scores of a pair cancel, so that no baseline biases it
+    gae = (q[:, 0] - values[:, 0]) * action[:, 0] / std**2
+    for gradient in (gae, many):
+        assert float(gradient.mean()) == pytest.approx(2 * target, abs=4 * float(gradient.std()) / count**0.5)
+    assert float(many.std()) < 0.6 * float(gae.std())
