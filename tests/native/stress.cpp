@@ -205,7 +205,7 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
     kernels().mpc_vjp(b, g, i * block, std::min(count, (i + 1) * block), i, workspace.data, kNever);
 }
 
-void violation(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t count, double broken) {
+void violation(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t count, double broken, bool shared) {
   std::vector<double> data[kViolationInputs], gradient[kViolationInputs];
   ViolationBatch b{};
   b.count = count;
@@ -215,15 +215,19 @@ void violation(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t count, double br
   double* to[kViolationInputs];
   for (int i = 0; i < kViolationInputs; i++) {
     const int64_t size = extent(b, kViolationFields[i]);
-    data[i] = i == vF ? lcp_matrices(1, n_lam) : normal(size, 0.5);
-    gradient[i].resize(size);
+    const bool each = !shared || i == vx || i == vu || i == vx_next;
+    const int64_t systems = each ? count : 1;
+    data[i] = i == vF ? lcp_matrices(systems, n_lam) : normal(systems * size, 0.5);
+    if (i == vgamma) data[i].assign(systems, 0.1);
+    gradient[i].resize(systems * size);
     b.input[i] = data[i].data();
-    to[i] = gradient[i].data();
+    b.stride[i] = each ? size : 0;
+    to[i] = i == vgamma ? nullptr : gradient[i].data();
   }
   if (broken != 0) data[vx][0] = broken;
   const int64_t n = 2 * n_lam;
-  std::vector<double> Q(n * n), q(count * n), r(count * n_x), e(count * n_lam), loss(count);
-  b.gamma = 0.1;
+  std::vector<double> Q((shared ? 1 : count) * n * n), q(count * n), r(count * n_x), e(count * n_lam), loss(count);
+  b.shared = shared;
   b.xi = 0.1;
   b.r = r.data();
   b.e = e.data();
@@ -364,7 +368,10 @@ int main() {
                   broken == 0 && !shared && threads == 1);
   for (const auto& s : shapes)
     for (const double broken : {0.0, huge, nan})
-      for (const int64_t count : {1, 29}) violation(s[0], s[1], s[2], count, broken);
+      for (const int64_t count : {1, 29}) {
+        violation(s[0], s[1], s[2], count, broken, true);
+        violation(s[0], s[1], s[2], count, broken, false);
+      }
   for (const auto& s : shapes)
     for (const int64_t n_c : {0, 2})
       for (const int64_t n_goal : {0, 3})

@@ -145,14 +145,14 @@ def test_no_pickle_and_no_torch_save(path):
             assert node.value.value is False
 
 
-def test_the_autograd_functions_of_the_mpc_are_in_one_file():
+def test_the_autograd_functions_are_in_one_file():
     found = [
         path.name
-        for path in sources("difflcs/mpc")
+        for path in sources("difflcs")
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.ClassDef) and any(ast.unparse(b) == "torch.autograd.Function" for b in node.bases)
     ]
-    assert set(found) == {"autograd.py"}
+    assert set(found) == {"_differentiation.py"}
 
 
 def test_the_layer_never_compares_names_of_backends():
