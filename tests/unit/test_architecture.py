@@ -179,6 +179,14 @@ def test_one_file_of_the_environments_knows_the_library():
     assert set(packages_of(graph(functions=True), "difflcs_envs", "difflcs")) <= {"difflcs_envs.tasks"}
 
 
+@pytest.mark.parametrize("folder", ["benchmarks", "envs", "examples", "reproduce"])
+def test_private_modules_of_the_library_stay_in_it(folder):
+    for path in (ROOT / folder).rglob("*.py"):
+        for node, _ in imports(ast.parse(path.read_text())):
+            names = [f"{getattr(node, 'module', '') or ''}.{alias.name}".strip(".") for alias in node.names]
+            assert not [name for name in names if name.startswith("difflcs.") and "._" in name], path
+
+
 @pytest.mark.parametrize("module", SOURCES)
 def test_files_and_classes_are_short(module):
     text = SOURCES[module].read_text()
