@@ -27,7 +27,6 @@ from difflcs.mpc.setup import (
     check_cost,
     check_stage_bounds,
     check_system,
-    within_support,
 )
 from difflcs.mpc.solution import MPCSolution, Primal
 from difflcs.status import Status, solved
@@ -143,11 +142,7 @@ class LCSMPCLayer(nn.Module):
         Raises:
             BoundsError: the model's action support lies outside of u_min and u_max.
         """
-        if self._forward_pre_hooks:
-            fresh(self, ("u_min", "u_max"))
-        if self.bounds is not None:
-            return self.bounds.by_steps()
-        return within_support(self.u_min, self.u_max, self.lcs if system is None else system)
+        return self.setup()._replace(limits=None).action_bounds(self.lcs if system is None else system)
 
     def extra_repr(self) -> str:
         """What print(layer) shows."""
