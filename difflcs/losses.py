@@ -12,7 +12,7 @@ from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_choice, check_number, check_tensor, describe, is_array
 from difflcs._differentiation import Solver, runs_eagerly, solve, transforms_active
-from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
+from difflcs._native import TOLERANCES, _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.errors import DTypeError, GammaError, InvalidInputError, NotPositiveDefiniteError, SolveError
 from difflcs.lcp import MAX_ITER, solve_lcp_arrays
 from difflcs.lcs import SYSTEM, LCSModel, LCSModule, LCSParams, is_plain
@@ -20,7 +20,7 @@ from difflcs.records import system_at
 from difflcs.status import Status
 
 # Least γ σ_min(F + Fᵀ), in parts of n_lam times the largest squared column of F.
-_GAMMA_LEAST = _kernels.tolerances()["gamma_least"]
+_GAMMA_LEAST = TOLERANCES["gamma_least"]
 # γ = "auto", in parts of its bound: at the bound itself the inner QP is singular wherever C is. A thousandth below it
 # the smallest eigenvalue of F + Fᵀ − γI is a thousandth of that of F + Fᵀ.
 _AUTO = 0.999

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from difflcs._linalg import matvec
-from difflcs.mpc.problem import STAGES, TOLERANCES, MPCProblem, StageData
+from difflcs._native import TOLERANCES
+from difflcs.mpc.problem import STAGES, MPCProblem, StageData
 from difflcs.mpc.solution import Primal, largest
 
 # Largest residual of a solution: what CONVERGED means.

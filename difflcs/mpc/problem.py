@@ -312,5 +312,3 @@ if list(INPUTS.items()) != list(_kernels.mpc_fields().items()) or _kernels.mpc_s
         "difflcs: the compiled kernels were built for other fields of the MPC problem than those of this version; "
         "build them again, in a checkout by `pip install -e .`"
     )
-# What the kernels and the reference in Python compare with; `difflcs/_native/fields.hpp` says what each means.
-TOLERANCES: dict[str, float] = _kernels.tolerances()

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from difflcs._linalg import matvec
+from difflcs._native import TOLERANCES
 from difflcs.mpc.conditions import (
     Contact,
     Multipliers,
@@ -24,7 +25,7 @@ from difflcs.mpc.conditions import (
     row_units,
     stages_of,
 )
-from difflcs.mpc.problem import TOLERANCES, MPCProblem, StageData
+from difflcs.mpc.problem import MPCProblem, StageData
 from difflcs.mpc.solution import Primal
 
 _WEAK, _SINGULAR, _CLOSE, _DEPENDENT = (TOLERANCES[name] for name in ("weak", "singular", "close", "dependent"))
