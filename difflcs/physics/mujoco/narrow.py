@@ -205,8 +205,8 @@ class Narrow:
         row, column = (np.concatenate(v) for v in zip(*picked, strict=True))
         level = np.where(column > 0, low.level[row] + (low.slope[row] * at[row, column]).sum(-1), 0.0)
         there, gap, axes = at[row, column], apart[row, column], frame[row]
-        first = origin[row] + np.concatenate([level[:, None], there], -1)[:, None] @ axes
-        normal, first = axes[:, 0], first[:, 0]
+        first = origin[row] + (np.concatenate([level[:, None], there], -1)[:, None] @ axes)[:, 0]
+        normal = axes[:, 0]
         corners = Witness(pair[row], gap, normal, first, first + gap[:, None] * normal)
         numbers = rows[row]
         if len(rows) < len(meet):
