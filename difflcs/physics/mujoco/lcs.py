@@ -17,8 +17,9 @@ from torch import Tensor
 from difflcs._checks import broadcast_batch, check_choice, check_number, check_positive_int, check_tensor, describe
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
 from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, contact_lcs, count_forces
+from difflcs.physics.mujoco.actuators import DYNAMICS, Actuators
 from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, Pairs
-from difflcs.physics.mujoco.motion import Actuators, Dynamic, QuasiStatic
+from difflcs.physics.mujoco.motion import Dynamic, QuasiStatic
 from difflcs.physics.mujoco.native import TAKEN, native
 from difflcs.physics.mujoco.nominal import Recovery, evaluate_nominal
 from difflcs.physics.mujoco.state import MujocoState
@@ -151,7 +152,7 @@ class MujocoLCS:
 
     @property
     def n_x(self) -> int:
-        """Number of states: nv, or 2 nv with velocities."""
+        """Number of states: nv, or 2 nv + na with velocities."""
         return self.state.n_x
 
     @property
@@ -242,6 +243,29 @@ class MujocoLCS:
             return here + gear * u - torch.from_numpy(self._actuators.offset).to(u)
         return u + here * servo if self._relative else u
 
+    def action_bounds(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute the bounds (..., n_u) of the actions within which actuators do what the system says.
+
+        These are `ctrlrange`, and in dynamic motion `forcerange` and `actuatorfrcrange` of actuators on joints; the
+        layer keeps within them. Infinite where nothing is limited.
+
+        Args:
+            x: (..., n_x) states.
+        """
+        check_tensor("x", x, [("n_x", self.n_x)])
+        actuators, nv = self._actuators, self.state.nv
+        of_joints = x.detach().double().cpu().numpy()[..., actuators.dof.clip(0)]
+        length = actuators.gear * of_joints
+        if self._quasi_static:
+            moves = np.where(actuators.servo & (actuators.gear != 0), actuators.gear, np.nan)
+            low, high = np.sort([(end + actuators.offset - length) / moves for end in actuators.range], axis=0)
+            low, high = np.where(np.isnan(moves), -np.inf, low), np.where(np.isnan(moves), np.inf, high)
+        else:
+            speed = x.detach().double().cpu().numpy()[..., nv + actuators.dof.clip(0)] * actuators.gear
+            low, high = actuators.bounds(length, speed, self._yields)
+            low, high = (v - length * (actuators.servo & self._relative) for v in (low, high))
+        return torch.from_numpy(low).to(x), torch.from_numpy(high).to(x)
+
     def _controls(self, ctrl: Tensor, batch: torch.Size) -> Any:
         """Return nominal controls (*batch, nu) as an array."""
         check_tensor("ctrl", ctrl, [("n_u", self.n_u)])
@@ -257,15 +281,16 @@ class MujocoLCS:
         batch, model, data = x.shape[:-1], self._model, self._data
         n = batch.numel()
         qpos, qvel = qpos.reshape(n, -1), qvel.reshape(n, -1)
+        flat = x.detach().double().cpu().reshape(n, self.n_x).numpy()
+        act = flat[:, self.n_x - self.state.na :] if self.state.na else [data.act.copy()] * n
         ctrl = [self._ctrl] * n if context is None else self._controls(context, batch).reshape(n, -1)
         contacts, moved = self._finder.allocate(n), self._motion.allocate(n)
         for i in range(n):
             with native(model, data, f"in state {i} of {n}"):
-                data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
+                data.qpos[:], data.qvel[:], data.act[:] = qpos[i], qvel[i], act[i]
                 mujoco.mj_fwdPosition(model, data)
                 self._finder.read(i, contacts)
                 self._motion.read(i, data, moved, ctrl[i])
-        flat = x.detach().double().cpu().reshape(n, self.n_x).numpy()
         tangent = self.state.tangent(flat[:, : self.state.nv])
         return _States(batch, flat, tangent, self._finder.finish(contacts), contacts.geom, moved)
 
@@ -278,7 +303,9 @@ class MujocoLCS:
         if isinstance(self._motion, QuasiStatic):
             response = self._motion.finish(moved, x, None).response.reshape(-1, nv, nv)[0].numpy()
         else:
-            response = self.seconds * self._motion.finish(moved, x).response[0]
+            response = self._motion.finish(moved, x).response[0]
+            self._yields = self._actuators.yields(response, self.seconds)
+            response = self.seconds * response
         jacobian, gives = np.empty((3, nv)), np.empty(model.ngeom)
         for geom in range(model.ngeom):
             mujoco.mj_jacGeom(model, data, jacobian, None, geom)
@@ -346,7 +373,7 @@ def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: A
     if data is None:
         raise DTypeError("data: expected a mujoco.MjData, got None; pass mujoco.MjData(model)")
     module = MujocoLCS(model, data, **options)
-    return module.params(module.state.to_state(data.qpos, data.qvel) if x is None else x)
+    return module.params(module.state.to_state(data.qpos, data.qvel, data.act) if x is None else x)
 
 
 def _check_model(model: Any, data: Any, motion: Motion) -> None:
@@ -359,15 +386,23 @@ def _check_model(model: Any, data: Any, motion: Motion) -> None:
     groups = model.actuator_group
     disabled = (groups >= 0) & (groups < 31) & (model.opt.disableactuator >> groups.clip(0, 30) & 1 > 0)
     disabled |= bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_ACTUATION))
+    dynamics, plugins = np.array(model.actuator_dyntype), np.array(model.actuator_plugin)
     refused = {
-        "joints": not model.nv,
+        "joints: nothing in it moves": not model.nv,
         "no equality constraints that are active": bool((model.eq_active0 if data is None else data.eq_active).any()),
-        "actuators without activation": bool(model.na),
-        "actuators without adhesion": bool((model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)).any()),
-        "one control for each actuator": getattr(model, "nactuator", model.nu) != model.nu,
-        "no flexible bodies": bool(model.nflex),
-        "no delay of actuators and sensors (delay, nsample)": bool(getattr(model, "nhistory", 0)),
-        'no <flag sleep="enable"/>': bool(model.opt.enableflags & _SLEEP),
+        "one control for each actuator, not those of <pid> and <orientation>": getattr(model, "nactuator", model.nu)
+        != model.nu,
+        "activation by an integrator, a filter, a muscle or a callback, not by <dcmotor>, <pid> or a plugin": bool(
+            (~np.isin(dynamics, DYNAMICS) & (model.actuator_actnum > 0) | (plugins >= 0)).any()
+        ),
+        "no <adhesion>, whose force depends on what is in contact": bool(
+            (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)).any()
+        ),
+        "rigid bodies, no <flex>": bool(model.nflex),
+        "no delay of actuators and sensors (delay, nsample), which would need their past as states": bool(
+            getattr(model, "nhistory", 0)
+        ),
+        'no <flag sleep="enable"/>, as what sleeps does not follow its forces': bool(model.opt.enableflags & _SLEEP),
         "actuators that are not disabled (actuatorgroupdisable, <flag actuation/>) in quasi-static motion, which moves "
         "what they drive": motion == "quasi-static" and bool(disabled.any()),
     }
