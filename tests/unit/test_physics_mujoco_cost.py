@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 import pytest
 import torch
 
 mujoco = pytest.importorskip("mujoco")
 
-from difflcs import CostModule, LCSMPCLayer, QuadraticCost  # noqa: E402
-from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError  # noqa: E402
 from difflcs.physics.mujoco import (  # noqa: E402
     Distance,
     Effort,
@@ -29,9 +25,9 @@ MODEL = """
 <mujoco><option gravity="0 0 0"/><worldbody>
   <body name="arm"><joint name="shoulder" axis="0 0 1"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/>
     <body name="fore" pos=".3 0 0"><joint name="wrist" type="ball"/>
-      <geom name="pad" type="box" size=".1 .02 .02" pos=".1 0 0" euler="20 30 40"/><site name="tip" pos=".2 0 .1"/></body>
-    </body>
-  <body name="cube" pos="0 .5 0"><freejoint name="free"/><geom name="cube" type="box" size=".05 .05 .05" mass=".3"/></body>
+      <geom name="pad" type="box" size=".1 .02 .02" pos=".1 0 0" euler="20 30 40"/>
+      <site name="tip" pos=".2 0 .1"/></body></body>
+  <body name="cube" pos="0 .5 0"><freejoint name="free"/><geom name="cube" size=".05" mass=".3"/></body>
   <body name="cart" pos="0 0 1"><joint name="rail" type="slide" axis="1 0 0"/><geom size=".05"/></body>
 </worldbody><actuator><motor joint="shoulder"/><motor joint="rail"/></actuator></mujoco>"""
 GOAL = (0.9, 0.1, -0.3, 0.2)
@@ -45,25 +41,30 @@ def make(terms, dynamic=True, seed=0):
     module = MujocoLCS(model, data, motion="dynamic" if dynamic else "quasi-static", contacts=1)
     qpos = data.qpos.copy()
     mujoco.mj_integratePos(model, qpos, random.normal(size=model.nv), 0.7)
-    return MujocoCost(module, terms), module.state.to_state(qpos, random.normal(size=model.nv))
+    return MujocoCost(module, terms), module.state.to_state(qpos, random.normal(size=model.nv)), module
 
 
-def truth(cost, x, goal):
-    """The squares by MuJoCo's kinematics, for the terms below."""
-    state, model = cost._scene._module.state, cost._scene._model
+def look(module, x):
+    """MuJoCo's own data at a state."""
+    model = mujoco.MjModel.from_xml_string(MODEL)
     data = mujoco.MjData(model)
-    data.qpos[:], qvel = (v.copy() for v in state.to_mujoco(x))
+    data.qpos[:], data.qvel[:] = module.state.to_mujoco(x)
     mujoco.mj_kinematics(model, data)
+    return data
+
+
+def truth(module, x, goal):
+    """The squares, for the terms below."""
+    data = look(module, x)
     left = np.zeros(3)
-    mujoco.mju_subQuat(left, np.array(GOAL) / np.linalg.norm(GOAL), data.xquat[model.body("cube").id])
-    squares = {
+    mujoco.mju_subQuat(left, np.array(GOAL) / np.linalg.norm(GOAL), data.body("cube").xquat)
+    return {
         "position": 3.0 * ((data.site("tip").xpos - goal) ** 2).sum(),
         "distance": ([1.0, 2.0, 3.0] * (data.geom("pad").xpos - data.body("cube").xpos) ** 2).sum(),
         "orientation": 5.0 * (left**2).sum(),
         "posture": 2.0 * ((data.qpos[[0, -1]] - [0.4, 0.1]) ** 2).sum(),
-        "velocity": 0.3 * (qvel**2).sum(),
+        "velocity": 0.3 * (data.qvel**2).sum(),
     }
-    return squares
 
 
 TERMS = {
@@ -84,14 +85,14 @@ def stage_cost(found, x):
 
 @pytest.mark.parametrize("name", TERMS)
 def test_value_and_gradient_at_the_state_are_those_of_the_squares(name):
-    cost, x = make([Effort(), TERMS[name]])
+    cost, x, module = make([Effort(), TERMS[name]])
     goal = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
     found = cost.at(x, goal if name == "position" else None)
     away = torch.from_numpy(np.random.default_rng(1).normal(size=cost.n_x))
 
     def error(size):
         there = x + size * away
-        return float(stage_cost(found, there)) - truth(cost, there, goal.numpy())[name]
+        return float(stage_cost(found, there)) - truth(module, there, goal.numpy())[name]
 
     assert error(0.0) == pytest.approx(0.0, abs=1e-9)
     assert (error(1e-4) - error(-1e-4)) / 2e-4 == pytest.approx(0.0, abs=1e-5)  # first derivatives are the same
@@ -101,10 +102,8 @@ def test_value_and_gradient_at_the_state_are_those_of_the_squares(name):
 
 
 def test_at_their_goals_squares_are_right_to_second_order():
-    cost, x = make([Orientation("cube"), Position("cube")])
-    data, scene = mujoco.MjData(cost._scene._model), cost._scene
-    data.qpos[:] = scene._module.state.to_mujoco(x)[0]
-    mujoco.mj_kinematics(scene._model, data)
+    cost, x, module = make([Orientation("cube"), Position("cube")])
+    data = look(module, x)
     goal = torch.from_numpy(np.concatenate([data.body("cube").xquat, data.body("cube").xpos]))
     away = 1e-3 * torch.from_numpy(np.random.default_rng(1).normal(size=cost.n_x))
     again = cost.at(x + away, goal)
