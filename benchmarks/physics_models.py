@@ -41,7 +41,11 @@ MODELS = {  # package → its scenes; what does not load alone, or has no joint,
     ],
     "judo": ["models/xml/*.xml"],
     "metaworld": ["assets/sawyer_xyz/*.xml"],
-    "robosuite": ["models/assets/robots/*/robot.xml", "models/assets/grippers/*.xml", "models/assets/objects/door*.xml"],
+    "robosuite": [
+        "models/assets/robots/*/robot.xml",
+        "models/assets/grippers/*.xml",
+        "models/assets/objects/door*.xml",
+    ],
 }
 LIMITS = (mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT, mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON)
 CONTACTS = tuple(

@@ -97,3 +97,11 @@ def test_a_plan_keeps_a_servo_within_its_range(motion):
     targets = module.control(x, mpc(x).action)
     torch.testing.assert_close(targets, torch.full((2, 1), 0.1, dtype=torch.float64), rtol=0, atol=1e-3)
     assert MujocoLCS(load('<motor joint="a"/>'), motion="dynamic").action_bounds(torch.zeros(2))[0].isinf()
+
+
+def test_what_mocap_moves_is_where_the_data_have_it_when_these_are_observed():
+    body = '<body name="wall" mocap="true" pos="1 0 0"><geom size=".1"/></body><body>'
+    model = mujoco.MjModel.from_xml_string(SLIDE.format("Euler", "", "").replace("<body>", body))
+    module, data = MujocoLCS(model, motion="dynamic"), mujoco.MjData(model)
+    data.mocap_pos[0] = 0.5, 0, 0
+    assert module.contacts(module.observe(data)).gap.item() == pytest.approx(0.3)

@@ -11,7 +11,12 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
+
+from difflcs._checks import broadcast_batch, check_tensor
+from difflcs.errors import InvalidInputError, ShapeError
 
 Array = NDArray[np.float64]
 
@@ -36,6 +41,8 @@ class Actuators:
         servo: (nu,) True for a `position` actuator on a slide or hinge.
         offset: (nu,) at which length a servo rests with ctrl = 0, by the constant part of its bias; 0 for others.
         holds: (nu,) True if its force falls to zero at some length, as that of servos on joints, tendons or sites does.
+        follows: (nu,) True if it has no activation, or one that goes to its control.
+        activated: (na,) actuator of each activation.
         range: (2, nu) controls that it takes; infinite where it takes any.
     """
 
@@ -50,8 +57,8 @@ class Actuators:
         affine = model.actuator_biastype == _AFFINE
         gain, (constant, bias, damping) = model.actuator_gainprm[:, 0], model.actuator_biasprm.T[:3] * affine
         dynamics = np.array(model.actuator_dyntype)
-        follows = np.isin(dynamics, (_NONE, _FILTER, _EXACT))  # its activation goes to the control
-        fixed = (model.actuator_gaintype == _FIXED) & (gain != 0) & follows
+        self.follows = np.isin(dynamics, (_NONE, _FILTER, _EXACT))
+        fixed = (model.actuator_gaintype == _FIXED) & (gain != 0) & self.follows
         linear = fixed & affine
         self.servo = (self.dof >= 0) & linear & (np.abs(gain + bias) <= 1e-9 * np.abs(gain))
         self.holds = linear & (bias != 0)
@@ -63,9 +70,9 @@ class Actuators:
         plain = fixed & (dynamics == _NONE) & (affine & (self.dof >= 0) | (model.actuator_biastype == _UNBIASED))
         self._force = np.where(plain, self._force_limits(model, joint), [[-np.inf], [np.inf]])
         self._exact = np.flatnonzero(dynamics == _EXACT)
-        activation = np.repeat(np.arange(model.nu), model.actuator_actnum)
-        self._decays = dynamics[activation] == _EXACT
-        self._time = np.maximum(model.actuator_dynprm[activation, 0], 1e-15)
+        self.activated = np.repeat(np.arange(model.nu), model.actuator_actnum)
+        self._decays = dynamics[self.activated] == _EXACT
+        self._time = np.maximum(model.actuator_dynprm[self.activated, 0], 1e-15)
 
     def _force_limits(self, model: Any, joint: NDArray[np.intp]) -> Array:
         """Compute the forces (2, nu) that actuators may have, infinite where nothing limits them."""
@@ -86,29 +93,74 @@ class Actuators:
         """Controls (nu,) at which actuators that hold a length have no force at these lengths (nu,); 0 for others."""
         return np.where(self.holds, -(self._constant + self._bias * length) / self._gain, 0.0)
 
-    def yields(self, response: Array, seconds: float) -> Array:
+    def yields(self, moved: Array, velocity: Array | float) -> Array:
         """Part (nu,) of its force that an actuator keeps at the end of a step, as it moves.
 
         Args:
-            response: (nv, nv) change of velocity by an impulse that is implicit in the forces of actuators.
-            seconds: of the step.
+            moved: (nv, nv) how far a unit of force moves in a step in which actuators resist.
+            velocity: (nv, nv) the velocity that it brings about.
         """
-        moves = self.gear**2 * response[self.dof, self.dof]
-        stiffness = seconds * np.maximum(-self._bias, 0.0) + np.maximum(-self._damping, 0.0)
-        return np.where(self.dof >= 0, np.clip(1 - seconds * stiffness * moves, 0.01, 1.0), 1.0)
+        resists = np.maximum(-self._bias, 0.0)[:, None, None] * moved
+        resists += np.maximum(-self._damping, 0.0)[:, None, None] * velocity
+        lost = self.gear**2 * resists[np.arange(len(self.dof)), self.dof, self.dof]
+        return np.where(self.dof >= 0, np.clip(1 - lost, 0.01, 1.0), 1.0)
 
-    def bounds(self, length: Array, velocity: Array, yields: Array) -> tuple[Array, Array]:
-        """Controls (..., nu) within the range, with forces in a step that are within their limits, as far as known.
+    def nominal(self, ctrl: Tensor, batch: torch.Size) -> Array:
+        """Return nominal controls (*batch, nu) as an array.
+
+        Raises:
+            ShapeError and its kinds: controls that do not fit.
+        """
+        check_tensor("ctrl", ctrl, [("n_u", len(self.dof))])
+        if broadcast_batch([("x", batch), ("ctrl", ctrl.shape[:-1])]) != batch:
+            raise ShapeError(
+                f"ctrl: expected one nominal control for each of the states {tuple(batch)}, or one for all, got "
+                f"{tuple(ctrl.shape)}; leave out its batch dimensions, or give x the same"
+            )
+        return ctrl.detach().double().cpu().expand(*batch, len(self.dof)).numpy()
+
+    def _length(self, x: Array) -> Array:
+        """Length (..., nu) of actuators on joints, or its rate, from positions or velocities that x begins with."""
+        return self.gear * x[..., self.dof.clip(0)]
+
+    def bounds(self, x: Array, velocity: Array, yields: Array, relative: bool) -> tuple[Array, Array]:
+        """Actions (..., nu) with controls in their range, and forces in a step within their limits as far as known.
 
         Args:
-            length: (..., nu) of actuators on joints.
-            velocity: (..., nu) of these lengths.
-            yields: (nu,) what their motion leaves of a force.
+            x: (..., n_x) states, which begin with the positions.
+            velocity: (..., n) likewise.
+            yields: (nu,) what motion leaves of a force, see above.
+            relative: True if actions of servos count from where they are.
         """
-        others = self._constant + self._bias * length + self._damping * velocity
-        low, high = np.sort([(force / yields - others) / self._gain for force in self._force], axis=0)
+        length = self._length(x)
+        others = self._constant + self._bias * length + self._damping * self._length(velocity)
+        sides = np.sort([(force / yields - others) / self._gain for force in self._force], axis=0)
         # Where the range leaves no such force, the control is at its end.
-        return np.clip(low, *self.range), np.clip(high, *self.range)
+        low, high = np.clip(sides, *self.range[:, None]) - length * (self.servo & relative)
+        return low, high
+
+    def places(self, x: Array) -> tuple[Array, Array]:
+        """How far joints of servos may go (..., nu) from positions that x begins with, to stay within their range."""
+        moves = np.where(self.servo & (self.gear != 0), self.gear, 1.0)
+        low, high = np.sort([(end + self.offset - self._length(x)) / moves for end in self.range], axis=0)
+        return np.where(self.servo, low, -np.inf), np.where(self.servo, high, np.inf)
+
+    def control(self, x: Tensor, u: Tensor, relative: bool, quasi_static: bool) -> Tensor:
+        """Convert actions u (..., nu) at states x (..., n_x) to controls.
+
+        Raises:
+            InvalidInputError: quasi-static motion by actuators that are no `position` actuators.
+        """
+        if quasi_static and not self.servo.all():
+            raise InvalidInputError(
+                "model: expected position actuators to follow a quasi-static plan, got others; track x + u by your own "
+                "controller"
+            )
+        gear = torch.from_numpy(self.gear).to(u)
+        here = gear * x[..., torch.from_numpy(self.dof).clamp_min(0)]
+        if quasi_static:
+            return here + gear * u - torch.from_numpy(self.offset).to(u)
+        return u + here * torch.from_numpy(self.servo) if relative else u
 
     def durations(self, seconds: float) -> Array:
         """Time (na,) by which an activation's rate at the beginning of a time step moves it in this step."""
@@ -123,3 +175,10 @@ class Actuators:
         yield
         for name, values in zip(fields, kept, strict=True):
             getattr(model, name)[:] = values
+
+
+def disabled_actuators(model: Any) -> NDArray[np.bool_]:
+    """Return a mask (nu,) of actuators that do nothing, by their groups or a flag of the model."""
+    groups = model.actuator_group
+    disabled = (groups >= 0) & (groups < 31) & (model.opt.disableactuator >> groups.clip(0, 30) & 1 > 0)
+    return disabled | bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_ACTUATION))
