@@ -67,12 +67,14 @@ class MujocoContacts(NamedTuple):
         normal: (n, n_contacts, nv) derivative of the gap by the degrees of freedom.
         tangent: (n, n_contacts, n_tangents, nv).
         friction: (n, n_contacts).
+        geom: (n, n_contacts, 2) the geoms.
     """
 
     gap: Array
     normal: Array
     tangent: Array
     friction: Array
+    geom: NDArray[np.intp]
 
 
 class ContactBuffer(NamedTuple):
@@ -325,7 +327,7 @@ class ContactFinder:
         turned = self._turns[read.geom[:, :, 0]] + self._turns[read.geom[:, :, 1]]
         tangent = slide + 0.5 * read.apart[:, :, None, None] * lever * turned[:, :, None]
         friction = np.where(read.frame.any((-1, -2)), self.friction[read.geom[:, :, 0], read.geom[:, :, 1]], 0.0)
-        return MujocoContacts(read.gap, read.rows[:, :, 0], tangent, friction)
+        return MujocoContacts(read.gap, read.rows[:, :, 0], tangent, friction, read.geom)
 
 
 def _moves(model: Any) -> NDArray[np.bool_]:
@@ -453,13 +455,13 @@ def _listed(model: Any, pairs: Pairs) -> NDArray[np.bool_]:
     for pair in pairs:
         if isinstance(pair, str) or len(pair) != 2:
             raise InvalidInputError(f'pairs: expected pairs such as ("finger", "box"), got {describe(pair)}; give two')
-        first, second = (_geoms(model, name) for name in pair)
+        first, second = (find_geoms(model, name) for name in pair)
         allowed[np.ix_(first, second)] = allowed[np.ix_(second, first)] = True
     weld = model.body_weldid[model.geom_bodyid]
     return allowed & (weld[:, None] != weld[None])
 
 
-def _geoms(model: Any, name: int | str) -> list[int]:
+def find_geoms(model: Any, name: int | str) -> list[int]:
     """Find a geom by its number or name, or all geoms of a body."""
     if isinstance(name, str):
         geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name)

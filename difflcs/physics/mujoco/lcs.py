@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import mujoco
@@ -18,15 +19,17 @@ from difflcs._checks import broadcast_batch, check_choice, check_number, check_p
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
 from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, contact_lcs, count_forces
 from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, Pairs
-from difflcs.physics.mujoco.motion import Actuators, Dynamic, QuasiStatic
+from difflcs.physics.mujoco.groups import ContactGroup, ContactSelection
+from difflcs.physics.mujoco.motion import Actuators, Dynamic, QuasiStatic, disabled_actuators
 from difflcs.physics.mujoco.native import TAKEN, native
 from difflcs.physics.mujoco.nominal import Recovery, evaluate_nominal
+from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
 from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams
 
 __all__ = ["Motion", "MujocoLCS", "lcs_from_mujoco"]
 
-Motion = Literal["quasi-static", "dynamic"]
+Motion = Literal["quasi-static", "quasi-dynamic", "dynamic"]
 _SLEEP = int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0))  # of MuJoCo 3.4 and later
 
 
@@ -93,7 +96,7 @@ class MujocoLCS:
         *,
         motion: Motion = "quasi-static",
         seconds: float = 0.1,
-        contacts: int | None = None,
+        contacts: int | Sequence[ContactGroup] | None = None,
         distance: float | None = None,
         pairs: Pairs | None = None,
         friction: float | None = None,
@@ -104,7 +107,7 @@ class MujocoLCS:
         ctrl: ArrayLike | None = None,
         length: float | None = None,
     ):
-        check_choice("motion", motion, ("quasi-static", "dynamic"))
+        check_choice("motion", motion, ("quasi-static", "quasi-dynamic", "dynamic"))
         _check_model(model, data, motion)
         check_choice("cone", cone, ("anitescu", "stewart-trinkle"))
         if isinstance(mobility, str):
@@ -112,8 +115,6 @@ class MujocoLCS:
         self.motion, self.seconds = motion, check_number("seconds", seconds, strict=True)
         self.cone: Cone = cone
         self.compliance = check_number("compliance", compliance, strict=True)
-        if contacts is not None:
-            check_positive_int("contacts", contacts)
         if friction is not None:
             check_number("friction", friction)
         model = copy.copy(model)
@@ -130,18 +131,25 @@ class MujocoLCS:
         if self._quasi_static:
             self._motion: Any = QuasiStatic(model, self._actuators, mobility)
         else:
+            kind = Dynamic if motion == "dynamic" else QuasiDynamic
             for where, friction_loss in (("joints", model.dof_frictionloss), ("tendons", model.tendon_frictionloss)):
                 if (friction_loss > 0).any():
                     raise InvalidInputError(
-                        f"model: expected no dry friction in {where} (frictionloss) in dynamic motion, got some; "
+                        f"model: expected no dry friction in {where} (frictionloss) in {motion} motion, got some; "
                         'replace it by damping, or use motion="quasi-static"'
                     )
-            self._motion = Dynamic(model, self._actuators, self.seconds, relative)
+            self._motion = kind(model, self._actuators, self.seconds, relative)
         nominal = self._data.ctrl if ctrl is None else self._controls(torch.as_tensor(ctrl), torch.Size())
         self._ctrl = np.where(self._actuators.holds & (ctrl is None), np.nan, nominal)
         length = _typical_radius(model) if length is None else check_number("length", length, strict=True)
         distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
         self.length, self._recovery = length, Recovery(model, length)
+        self._selection = None
+        if contacts is not None and not isinstance(contacts, int):
+            self._selection = ContactSelection(model, contacts, distance)
+            contacts = self._selection.n_found
+        elif contacts is not None:
+            check_positive_int("contacts", contacts)
         self._finder = ContactFinder(model, self._data, pairs, distance, length, contacts, friction)
         model.opt.disableflags |= sum(
             int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("EQUALITY", "FRICTIONLOSS", "LIMIT")
@@ -162,12 +170,28 @@ class MujocoLCS:
     @property
     def n_contacts(self) -> int:
         """Number of contacts of every state."""
-        return self._finder.n_contacts
+        return self._finder.n_contacts if self._selection is None else self._selection.n_contacts
 
     @property
     def n_lam(self) -> int:
         """Number of contact forces."""
-        return count_forces(self.n_contacts, self._finder.n_tangents, self.cone)
+        each = count_forces(1, self._finder.n_tangents, self.cone)
+        return self.n_contacts * each if self._selection is None else len(self._selection.rows(each))
+
+    def observe(self, data: Any) -> Tensor:
+        """Return the state (n_x,) of MuJoCo's data, and let rotations count from the orientations there from now on.
+
+        So each plan of a closed loop begins with rotations of zero, however far things have turned, and what uses
+        `state`, such as a `MujocoCost`, counts from there as well. States of before are not those of now. For a batch
+        call `state.follow` and `state.to_state` with `qpos` (..., nq).
+
+        Raises:
+            DTypeError, ShapeError, NonFiniteError: no such data.
+        """
+        if not isinstance(data, mujoco.MjData):
+            raise DTypeError(f"data: expected a mujoco.MjData, got {describe(data)}; for arrays use state.follow")
+        self.state.follow(data.qpos)
+        return self.state.to_state(data.qpos, data.qvel)
 
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
         """The system at states x (..., n_x).
@@ -185,11 +209,13 @@ class MujocoLCS:
             )
         read = self._read(x, context)
         contacts, rest = read.dof_contacts, None
-        if isinstance(self._motion, QuasiStatic):
+        if not isinstance(self._motion, Dynamic):
             free = self._motion.finish(read.moved, read.x, read.tangent)
         else:
             step, opens = self._motion.finish(read.moved, read.x), self.cone == "anitescu"
-            nominal = evaluate_nominal(step, contacts, read.geom, self._recovery, self._give, self.compliance, opens)
+            nominal = evaluate_nominal(
+                step, contacts, contacts.geom, self._recovery, self._give, self.compliance, opens
+            )
             contacts, rest = nominal.contacts, read.batched(self._convert_forces(nominal.forces))
             free = step.free(read.tangent, nominal.carried)
         ranks = zip(free, (2, 2, 1, 2), strict=True)
@@ -204,6 +230,8 @@ class MujocoLCS:
             force=self.length / self._give,
             rest=rest,
         )
+        if self._selection is not None:
+            system = self._selection.reduce(system)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
 
     def _convert_forces(self, forces: Any) -> Any:
@@ -267,7 +295,8 @@ class MujocoLCS:
                 self._motion.read(i, data, moved, ctrl[i])
         flat = x.detach().double().cpu().reshape(n, self.n_x).numpy()
         tangent = self.state.tangent(flat[:, : self.state.nv])
-        return _States(batch, flat, tangent, self._finder.finish(contacts), contacts.geom, moved)
+        found = self._finder.finish(contacts)
+        return _States(batch, flat, tangent, self._selection.select(found) if self._selection else found, moved)
 
     def _typical_response(self) -> float:
         """Compute how far a unit of force moves two bodies apart that may touch, the median over their pairs."""
@@ -275,7 +304,7 @@ class MujocoLCS:
         moved = self._motion.allocate(1)
         self._motion.read(0, data, moved, self._ctrl)
         x = np.zeros((1, self.n_x))
-        if isinstance(self._motion, QuasiStatic):
+        if not isinstance(self._motion, Dynamic):
             response = self._motion.finish(moved, x, None).response.reshape(-1, nv, nv)[0].numpy()
         else:
             response = self.seconds * self._motion.finish(moved, x).response[0]
@@ -283,7 +312,7 @@ class MujocoLCS:
         for geom in range(model.ngeom):
             mujoco.mj_jacGeom(model, data, jacobian, None, geom)
             gives[geom] = np.trace(jacobian @ response @ jacobian.T) / (3 if self._finder.axis is None else 2)
-        first, second = self._finder.pairs
+        first, second = self._finder.pairs if self._selection is None else self._selection.main(self._finder.pairs)
         apart = (gives[first] + gives[second])[gives[first] + gives[second] > 0]
         if len(first) and not len(apart):
             raise InvalidInputError(
@@ -300,7 +329,7 @@ class _States(NamedTuple):
         batch: their batch dimensions.
         x: (n, n_x).
         tangent: of their rotations, see `MujocoState.tangent`.
-        dof_contacts: contacts, of geoms `geom` (n, n_contacts, 2).
+        dof_contacts: contacts.
         moved: buffers of the motion.
     """
 
@@ -308,7 +337,6 @@ class _States(NamedTuple):
     x: Any
     tangent: Any
     dof_contacts: MujocoContacts
-    geom: Any
     moved: Any
 
     def batched(self, value: Any) -> Tensor:
@@ -356,9 +384,6 @@ def _check_model(model: Any, data: Any, motion: Motion) -> None:
         raise DTypeError(f"data: expected a mujoco.MjData, got {describe(data)}; pass mujoco.MjData(model)")
     if data is not None and len(data.qpos) != model.nq:
         raise InvalidInputError(f"data: expected nq={model.nq} of the model, got {len(data.qpos)}; pass MjData(model)")
-    groups = model.actuator_group
-    disabled = (groups >= 0) & (groups < 31) & (model.opt.disableactuator >> groups.clip(0, 30) & 1 > 0)
-    disabled |= bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_ACTUATION))
     refused = {
         "joints": not model.nv,
         "no equality constraints that are active": bool((model.eq_active0 if data is None else data.eq_active).any()),
@@ -369,7 +394,7 @@ def _check_model(model: Any, data: Any, motion: Motion) -> None:
         "no delay of actuators and sensors (delay, nsample)": bool(getattr(model, "nhistory", 0)),
         'no <flag sleep="enable"/>': bool(model.opt.enableflags & _SLEEP),
         "actuators that are not disabled (actuatorgroupdisable, <flag actuation/>) in quasi-static motion, which moves "
-        "what they drive": motion == "quasi-static" and bool(disabled.any()),
+        "what they drive": motion == "quasi-static" and bool(disabled_actuators(model).any()),
     }
     for wanted, present in refused.items():
         if present:

@@ -79,6 +79,13 @@ class Actuators:
         return np.where(self.holds, -(self._constant + self._bias * length) / self._gain, 0.0)
 
 
+def disabled_actuators(model: Any) -> NDArray[np.bool_]:
+    """Return a mask (nu,) of actuators that do nothing, by their groups or a flag of the model."""
+    groups = model.actuator_group
+    disabled = (groups >= 0) & (groups < 31) & (model.opt.disableactuator >> groups.clip(0, 30) & 1 > 0)
+    return disabled | bool(model.opt.disableflags & _flags("ACTUATION"))
+
+
 class QuasiStatic:
     """Joints with actuators go where they are told; all else moves only while pushed, by its mobility times the force.
 

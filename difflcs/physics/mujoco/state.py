@@ -38,6 +38,7 @@ class MujocoState:
     The coordinate of a slide or a hinge is its `qpos`. A free joint has its position and the rotation vector from its
     orientation in `reference`, a ball the rotation vector alone: below half a turn each orientation has one, and at a
     whole turn the coordinates are singular, so that `tangent` refuses. So give a reference near which things happen.
+    `follow` moves the reference along: numbers of before then count from another orientation.
     Quaternions are read as MuJoCo does: of any length, and of zeros as no rotation.
 
     Args:
@@ -56,7 +57,6 @@ class MujocoState:
                 f"model: expected a mujoco.MjModel, got {describe(model)}; load one, MjModel.from_xml_path"
             )
         self.nq, self.nv, self.velocities = int(model.nq), int(model.nv), velocities
-        self._reference = self._array("reference", model.qpos0 if reference is None else reference, self.nq).copy()
         names: list[str] = []
         plain: list[tuple[int, int]] = []
         self._turning: list[tuple[int, int]] = []  # where quaternions are in qpos, rotation vectors in the state
@@ -69,9 +69,32 @@ class MujocoState:
             plain += [(q + i, v + i) for i in range(shifts)]
             if count >= 3:
                 self._turning.append((q + shifts, v + shifts))
-                self._reference[q + shifts : q + shifts + 4] = _unit(self._reference[q + shifts : q + shifts + 4])
         self.names = (*names, *(f"{name}_velocity" for name in names)) if velocities else tuple(names)
         self._of_qpos, self._of_state = np.array(plain, dtype=np.intp).reshape(-1, 2).T
+        self.follow(model.qpos0 if reference is None else reference, "reference")
+
+    def follow(self, qpos: ArrayLike, name: str = "qpos") -> None:
+        """Let rotation vectors count from the orientations in `qpos` (..., nq) from now on.
+
+        With batch dimensions each state has a reference of its own; they are then the first ones of all states.
+
+        Raises:
+            ShapeError, NonFiniteError: numbers that do not fit.
+        """
+        self._reference = self._array(name, qpos, self.nq).copy()
+        for q, _ in self._turning:
+            self._reference[..., q : q + 4] = _unit(self._reference[..., q : q + 4])
+
+    def _references(self, batch: tuple[int, ...]) -> Array:
+        """Return the reference of each state (*batch, nq)."""
+        own = self._reference.shape[:-1]
+        if batch[: len(own)] != own:
+            raise ShapeError(
+                f"x: expected states with the first batch dimensions {own} of the reference of their rotations, got "
+                f"{batch}; follow(qpos) with one reference for all, or with those of these states"
+            )
+        reference = self._reference.reshape(*own, *[1] * (len(batch) - len(own)), self.nq)
+        return np.broadcast_to(reference, (*batch, self.nq))
 
     @property
     def n_x(self) -> int:
@@ -97,8 +120,9 @@ class MujocoState:
         qpos = self._array("qpos", qpos, self.nq)
         x = np.zeros((*qpos.shape[:-1], self.nv))
         x[..., self._of_state] = qpos[..., self._of_qpos]
+        reference = self._references(qpos.shape[:-1]) if self._turning else qpos
         for q, v in self._turning:
-            turn = _multiply(_conjugate(self._reference[q : q + 4]), _unit(qpos[..., q : q + 4]))
+            turn = _multiply(_conjugate(reference[..., q : q + 4]), _unit(qpos[..., q : q + 4]))
             x[..., v : v + 3] = _rotation_vector(turn)
         if self.velocities:
             speed = np.zeros_like(x) if qvel is None else self._array("qvel", qvel, self.nv)
@@ -113,10 +137,10 @@ class MujocoState:
         """
         check_tensor("x", x, [("n_x", self.n_x)])
         numbers = x.detach().double().cpu().numpy()
-        qpos = np.broadcast_to(self._reference, (*numbers.shape[:-1], self.nq)).copy()
+        qpos = self._references(numbers.shape[:-1]).copy()
         qpos[..., self._of_qpos] = numbers[..., self._of_state]
         for q, v in self._turning:
-            qpos[..., q : q + 4] = _multiply(self._reference[q : q + 4], _quaternion(numbers[..., v : v + 3]))
+            qpos[..., q : q + 4] = _multiply(qpos[..., q : q + 4], _quaternion(numbers[..., v : v + 3]))
         velocity = numbers[..., self.nv :] if self.velocities else np.zeros((*numbers.shape[:-1], self.nv))
         return qpos, velocity
 
