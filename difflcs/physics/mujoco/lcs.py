@@ -147,7 +147,7 @@ class MujocoLCS:
         self._selection = None
         if contacts is not None and not isinstance(contacts, int):
             self._selection = ContactSelection(model, contacts, distance)
-            contacts = self._selection.n_found
+            contacts = self._selection.budgets
         elif contacts is not None:
             check_positive_int("contacts", contacts)
         self._finder = ContactFinder(model, self._data, pairs, distance, length, contacts, friction)
@@ -170,7 +170,7 @@ class MujocoLCS:
     @property
     def n_contacts(self) -> int:
         """Number of contacts of every state."""
-        return self._finder.n_contacts if self._selection is None else self._selection.n_contacts
+        return self._finder.n_contacts
 
     @property
     def n_lam(self) -> int:
@@ -286,17 +286,15 @@ class MujocoLCS:
         n = batch.numel()
         qpos, qvel = qpos.reshape(n, -1), qvel.reshape(n, -1)
         ctrl = [self._ctrl] * n if context is None else self._controls(context, batch).reshape(n, -1)
-        contacts, moved = self._finder.allocate(n), self._motion.allocate(n)
+        found, moved = self._finder.find(qpos), self._motion.allocate(n)
         for i in range(n):
             with native(model, data, f"in state {i} of {n}"):
                 data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
                 mujoco.mj_fwdPosition(model, data)
-                self._finder.read(i, contacts)
                 self._motion.read(i, data, moved, ctrl[i])
         flat = x.detach().double().cpu().reshape(n, self.n_x).numpy()
         tangent = self.state.tangent(flat[:, : self.state.nv])
-        found = self._finder.finish(contacts)
-        return _States(batch, flat, tangent, self._selection.select(found) if self._selection else found, moved)
+        return _States(batch, flat, tangent, found, moved)
 
     def _typical_response(self) -> float:
         """Compute how far a unit of force moves two bodies apart that may touch, the median over their pairs."""

@@ -239,14 +239,21 @@ class Finder {
     into->second = load(ends + 3);
     if (std::fabs(gap) > kTouching * size) {
       into->normal = (1 / gap) * way;
-      return true;
+    } else {
+      touch(pair, distance, into);
     }
-    // As good as touching, where the two points give no direction; MuJoCo also says 0 where it failed. The answer is
-    // that of the shape put a little aside, the way that parts them most.
+    Vector other;
+    across(into->normal, &into->tangent, &other);
+    return true;
+  }
+
+  // Measure a pair that as good as touches, where the two points give no direction; MuJoCo also says 0 where it failed.
+  // The answer is that of the shape put a little aside, the way that parts them most.
+  void touch(const Pair& pair, double distance, Contact* into) {
     into->normal = {1, 0, 0};
     double* here = place_.geom_xpos + 3 * pair.second;
-    const double before[3] = {here[0], here[1], here[2]}, aside = kAside * size;
-    double best = -kInfinity;
+    const double before[3] = {here[0], here[1], here[2]}, aside = kAside * pair.size;
+    double best = -kInfinity, ends[6];
     for (int side = 0; side < 6 && !(best > 0.4 * aside); side++) {
       const double sign = side < 3 ? 1 : -1;
       here[side % 3] = before[side % 3] + sign * aside;
@@ -260,7 +267,6 @@ class Finder {
       into->gap = apart - aside * sign * along[side % 3];
       into->second = into->first + into->gap * into->normal;
     }
-    return true;
   }
 
   // Whether MuJoCo's contacts of two boxes are as near as the boxes are, and along directions that can be.
