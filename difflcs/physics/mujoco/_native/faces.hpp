@@ -26,12 +26,12 @@ struct Contact {
 
 // Faces of a geom in its own frame.
 struct Solid {
-  bool round;                    // a capsule or a cylinder, whose side touches along a line
-  double cap;                    // of the normal along the axis, from where on its end touches
-  double radius, half;           // of a round one
-  std::vector<int> counts;       // corners of each face
-  std::vector<double> corners;   // (faces, kCorners, 3)
-  std::vector<double> outward;   // (faces, 3)
+  bool round;                   // a capsule or a cylinder, whose side touches along a line
+  double cap;                   // of the normal along the axis, from where on its end touches
+  double radius, half;          // of a round one
+  std::vector<int> counts;      // corners of each face
+  std::vector<double> corners;  // (faces, kCorners, 3)
+  std::vector<double> outward;  // (faces, 3)
 };
 
 // A face as it is seen along a normal: its corners across, and height = level + slope · place there.

@@ -1,10 +1,10 @@
 // Finds the contacts of a state: pairs by how near they can be, each measured, the nearest kept.
 //
 // Pairs of shapes that have a formula are MuJoCo's contacts. All others MuJoCo inflates by the distance up to which
-// contacts matter, and then misjudges how deep they are. `mj_geomDistance` does not, if its tolerance is small beside the
-// shapes. It finds one point on each shape; the faces around the two are cut with each other. Boxes are measured too, as
-// what separates faces is not always the shortest way: where MuJoCo's contacts are not as near as the boxes are, or are
-// missing, those of the faces count.
+// contacts matter, and then misjudges how deep they are. `mj_geomDistance` does not, if its tolerance is small beside
+// the shapes. It finds one point on each shape; the faces around the two are cut with each other. Boxes are measured
+// too, as what separates faces is not always the shortest way: where MuJoCo's contacts are not as near as the boxes
+// are, or are missing, those of the faces count.
 #pragma once
 
 #include <array>
@@ -22,10 +22,10 @@ constexpr double kStill = 1e-9;  // what the normal of a contact moves at most, 
 constexpr int kEnough = 4;       // contacts that hold a face, where there is no room for all
 
 struct Geom {
-  double radius;           // of the sphere around it; 0 for a plane
-  int kind, root;          // root: body whose centre its degrees of freedom count from
-  Vector centre, half;     // box around it along its axes
-  int solid;               // its faces; −1: none
+  double radius;            // of the sphere around it; 0 for a plane
+  int kind, root;           // root: body whose centre its degrees of freedom count from
+  Vector centre, half;      // box around it along its axes
+  int solid;                // its faces; −1: none
   std::vector<char> moves;  // (nv,) degrees of freedom that move it
 };
 
@@ -124,8 +124,8 @@ class Finder {
     double squared = 0, most = -kInfinity;
     for (int k = 0; k < 3; k++) {
       const Vector middle = one.place + centre[k] * one.axis[k];
-      const double apart = std::max(separation(one.axis[k], middle, b, two),
-                                    separation(-1.0 * one.axis[k], middle, b, two)) - half[k];
+      const double apart =
+          std::max(separation(one.axis[k], middle, b, two), separation(-1.0 * one.axis[k], middle, b, two)) - half[k];
       most = std::max(most, apart);
       if (apart > 0) squared += apart * apart;
     }
@@ -160,10 +160,12 @@ class Finder {
       *near += c.gap <= within;
     }
     if (static_cast<int>(chosen_.size()) > group.count) {
-      std::stable_sort(chosen_.begin(), chosen_.end(), [](const Contact& a, const Contact& b) { return a.gap < b.gap; });
+      std::stable_sort(chosen_.begin(), chosen_.end(),
+                       [](const Contact& a, const Contact& b) { return a.gap < b.gap; });
       chosen_.resize(group.count);
     }
-    std::stable_sort(chosen_.begin(), chosen_.end(), [](const Contact& a, const Contact& b) { return a.pair < b.pair; });
+    std::stable_sort(chosen_.begin(), chosen_.end(),
+                     [](const Contact& a, const Contact& b) { return a.pair < b.pair; });
   }
 
   // Add the contacts of a pair.
@@ -207,13 +209,14 @@ class Finder {
     const int one = scene_.geoms[pair.first].kind, two = scene_.geoms[pair.second].kind;
     std::memset(contacts_.data(), 0, sizeof contacts_);
     const int count = library_.collide[one * library_.kinds + two](place_.model, place_.data, contacts_.data(),
-                                                                    pair.first, pair.second, distance);
+                                                                   pair.first, pair.second, distance);
     for (int k = 0; k < count; k++) {
       const double* c = &contacts_[k * library_.stride];
       const double gap = c[0];
       const Vector middle = load(c + 1), normal = load(c + 4);
       bool again = false;  // boxes may have a contact twice
-      for (int j = 0; j < k && pair.boxes; j++) again |= std::memcmp(c + 1, &contacts_[j * library_.stride + 1], 24) == 0;
+      for (int j = 0; j < k && pair.boxes; j++)
+        again |= std::memcmp(c + 1, &contacts_[j * library_.stride + 1], 24) == 0;
       if (again || !(gap < distance)) continue;
       // The contact is in the middle of the gap; friction acts where the two bodies are.
       const Vector half = 0.5 * gap * normal;
@@ -316,7 +319,8 @@ class Finder {
     double rate = 0;
     for (int side = 0; side < 2; side++) {
       if (!scene_.geoms[geom[side]].moves[v]) continue;
-      const Vector arm = (side == 0 ? c.first : c.second) - load(place_.subtree_com + 3 * scene_.geoms[geom[side]].root);
+      const Vector arm =
+          (side == 0 ? c.first : c.second) - load(place_.subtree_com + 3 * scene_.geoms[geom[side]].root);
       rate += (side == 0 ? -1 : 1) * (dot(cross(arm, along), turn) + dot(along, shift));
     }
     return rate;

@@ -1,7 +1,5 @@
 // Contacts of many states of a MuJoCo model, on threads (nanobind). Python hands over addresses and checked arrays.
 
-#include "finder.hpp"
-
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/string.h>
@@ -12,6 +10,8 @@
 #include <stdexcept>
 #include <system_error>
 #include <thread>
+
+#include "finder.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -60,8 +60,13 @@ Scene make_scene(const nb::dict& f) {
   for (int g = 0; g < s.ngeom; g++) {
     const double* around = box.data() + 6 * g;
     const bool* row = moves.data() + static_cast<int64_t>(s.nv) * g;
-    s.geoms.push_back({radius.data()[g], static_cast<int>(kind.data()[g]), static_cast<int>(root.data()[g]),
-                       load(around), load(around + 3), static_cast<int>(solid.data()[g]), {row, row + s.nv}});
+    s.geoms.push_back({radius.data()[g],
+                       static_cast<int>(kind.data()[g]),
+                       static_cast<int>(root.data()[g]),
+                       load(around),
+                       load(around + 3),
+                       static_cast<int>(solid.data()[g]),
+                       {row, row + s.nv}});
   }
   for (nb::handle each : value<nb::list>(f, "solids")) {
     const auto fields = nb::cast<nb::dict>(each);
@@ -78,17 +83,16 @@ Scene make_scene(const nb::dict& f) {
     s.pairs.push_back({static_cast<int>(of[0]), static_cast<int>(of[1]), flag[0], flag[1], flag[2],
                        numbers.data()[2 * p], numbers.data()[2 * p + 1]});
   }
-  for (const auto& [begin, end, count, distance] :
-       value<std::vector<std::tuple<int, int, int, double>>>(f, "groups"))
+  for (const auto& [begin, end, count, distance] : value<std::vector<std::tuple<int, int, int, double>>>(f, "groups"))
     s.groups.push_back({begin, end, count, distance});
   return s;
 }
 
 Place make_place(const nb::dict& f) {
-  return {at<const void*>(f, "model"),        at<void*>(f, "data"),
-          at<double*>(f, "qpos"),             at<double*>(f, "geom_xpos"),
-          at<double*>(f, "ccd_tolerance"),    at<const double*>(f, "geom_xmat"),
-          at<const double*>(f, "cdof"),       at<const double*>(f, "subtree_com")};
+  return {at<const void*>(f, "model"),     at<void*>(f, "data"),
+          at<double*>(f, "qpos"),          at<double*>(f, "geom_xpos"),
+          at<double*>(f, "ccd_tolerance"), at<const double*>(f, "geom_xmat"),
+          at<const double*>(f, "cdof"),    at<const double*>(f, "subtree_com")};
 }
 
 // Calls work(thread, state) for all states, on as many threads as there are places.
@@ -108,16 +112,18 @@ void on_threads(size_t threads, int64_t states, Work work) {
   for (auto& t : pool) t.join();
 }
 
-// Finds the contacts of states qpos (n, nq). Returns the first state at which MuJoCo said an error, or −1, and the error.
-std::tuple<int64_t, std::string> find(const Library& library, const Scene& scene, const std::vector<const Place*>& places,
-                                      Array<const double> qpos, Array<const double> within, Array<double> gap,
-                                      Array<double> normal, Array<double> tangent, Array<double> friction,
-                                      Array<int64_t> geom, Array<int64_t> near) {
+// Finds the contacts of states qpos (n, nq). Returns the first state at which MuJoCo said an error, or −1, and the
+// error.
+std::tuple<int64_t, std::string> find(const Library& library, const Scene& scene,
+                                      const std::vector<const Place*>& places, Array<const double> qpos,
+                                      Array<const double> within, Array<double> gap, Array<double> normal,
+                                      Array<double> tangent, Array<double> friction, Array<int64_t> geom,
+                                      Array<int64_t> near) {
   const int64_t n = qpos.shape(0), k = scene.contacts(), nv = scene.nv, groups = scene.groups.size();
   if (qpos.size() != static_cast<size_t>(n * scene.nq) || gap.size() != static_cast<size_t>(n * k) ||
       normal.size() != gap.size() * nv || tangent.size() != normal.size() * scene.tangents ||
-      friction.size() != gap.size() || geom.size() != 2 * gap.size() || near.size() != static_cast<size_t>(n * groups) ||
-      within.size() != static_cast<size_t>(groups) || places.empty())
+      friction.size() != gap.size() || geom.size() != 2 * gap.size() ||
+      near.size() != static_cast<size_t>(n * groups) || within.size() != static_cast<size_t>(groups) || places.empty())
     throw std::invalid_argument("expected arrays of the sizes of the scene, a row for each state");
   nb::gil_scoped_release release;
   const Errors errors(library.on_error);
@@ -126,12 +132,8 @@ std::tuple<int64_t, std::string> find(const Library& library, const Scene& scene
   std::vector<std::string> said(n);
   std::atomic<bool> failed{false};
   on_threads(std::min<size_t>(places.size(), n), n, [&](size_t thread, int64_t i) {
-    const Found into{gap.data() + i * k,
-                     normal.data() + i * k * nv,
-                     tangent.data() + i * k * nv * scene.tangents,
-                     friction.data() + i * k,
-                     geom.data() + 2 * i * k,
-                     near.data() + i * groups};
+    const Found into{gap.data() + i * k,      normal.data() + i * k * nv, tangent.data() + i * k * nv * scene.tangents,
+                     friction.data() + i * k, geom.data() + 2 * i * k,    near.data() + i * groups};
     const double* here = qpos.data() + i * scene.nq;
     if (!failed && !Errors::guarded([&] { finders[thread].find(here, within.data(), into); }, &said[i])) failed = true;
   });
@@ -143,13 +145,15 @@ std::tuple<int64_t, std::string> find(const Library& library, const Scene& scene
 }  // namespace
 
 NB_MODULE(_mujoco, m) {
-  nb::class_<Library>(m, "Library", "Functions of MuJoCo.").def("__init__", [](Library* self, const nb::dict& addresses,
-                                                                           int kinds, int stride) {
-    new (self) Library(make_library(addresses, kinds, stride));
-  }, "addresses"_a, "kinds"_a, "stride"_a);
-  nb::class_<Scene>(m, "Scene", "Geoms that may touch.").def("__init__", [](Scene* self, const nb::dict& fields) {
-    new (self) Scene(make_scene(fields));
-  }, "fields"_a);
+  nb::class_<Library>(m, "Library", "Functions of MuJoCo.")
+      .def(
+          "__init__",
+          [](Library* self, const nb::dict& addresses, int kinds, int stride) {
+            new (self) Library(make_library(addresses, kinds, stride));
+          },
+          "addresses"_a, "kinds"_a, "stride"_a);
+  nb::class_<Scene>(m, "Scene", "Geoms that may touch.")
+      .def("__init__", [](Scene* self, const nb::dict& fields) { new (self) Scene(make_scene(fields)); }, "fields"_a);
   nb::class_<Place>(m, "Place", "A model and its data, by addresses. They must outlive it.")
       .def("__init__", [](Place* self, const nb::dict& fields) { new (self) Place(make_place(fields)); }, "fields"_a);
   m.def("find", &find, "library"_a, "scene"_a, "places"_a, "qpos"_a, "within"_a, "gap"_a, "normal"_a, "tangent"_a,
