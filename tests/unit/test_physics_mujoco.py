@@ -560,7 +560,6 @@ RESTS = {
         "adhesion",
     ),
     "equality": (SERVOS + '<equality><joint joint1="px" joint2="py"/></equality>', {}, "equality"),
-    "activation": ('<actuator><intvelocity joint="px" kp="1" actrange="-1 1"/></actuator>', {}, "activation"),
     "two on one joint": (SERVOS.replace("py", "px"), {}, "slide or hinge of its own"),
     "no actuators": ("", {}, "actuators"),
     "a motion": (SERVOS, {"motion": "fast"}, "quasi-static"),
@@ -577,6 +576,8 @@ if SINCE_MUJOCO_4:
     RESTS["delay of an actuator"] = (SERVOS.replace("/></", ' delay=".05" nsample="20"/></'), {}, "no delay of actu")
     sensor = '<sensor><jointpos joint="px" delay=".1" nsample="9"/></sensor>'
     RESTS["delay of a sensor"] = (SERVOS + sensor, {}, "no delay of actuators and sensors")
+    motor = '<actuator><dcmotor joint="px" motorconst=".1" resistance="1" inductance="1e-3"/></actuator>'
+    RESTS["a motor with a state"] = (motor, {}, "activation")
     RESTS["sleep"] = (FLAG.format("sleep", "enable"), {}, "sleep")
 
 
