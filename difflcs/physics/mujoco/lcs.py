@@ -147,13 +147,13 @@ class MujocoLCS:
         length = _typical_radius(model) if length is None else check_number("length", length, strict=True)
         distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
         self.length, self._recovery = length, Recovery(model, length)
-        self._selection = None
-        if contacts is not None and not isinstance(contacts, int):
+        if isinstance(contacts, Sequence):
             self._selection = ContactSelection(model, contacts, distance)
-            contacts = self._selection.budgets
-        elif contacts is not None:
-            check_positive_int("contacts", contacts)
-        self._finder = ContactFinder(model, self._data, pairs, distance, length, contacts, friction)
+            budgets = self._selection.budgets
+        else:
+            self._selection = None
+            budgets = None if contacts is None else check_positive_int("contacts", contacts)
+        self._finder = ContactFinder(model, self._data, pairs, distance, length, budgets, friction)
         model.opt.disableflags |= sum(
             int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("EQUALITY", "FRICTIONLOSS", "LIMIT")
         )
