@@ -147,13 +147,13 @@ class MujocoLCS:
         length = _typical_radius(model) if length is None else check_number("length", length, strict=True)
         distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
         self.length, self._recovery = length, Recovery(model, length)
-        self._selection = None
-        if contacts is not None and not isinstance(contacts, int):
+        if isinstance(contacts, Sequence):
             self._selection = ContactSelection(model, contacts, distance)
-            contacts = self._selection.n_found
-        elif contacts is not None:
-            check_positive_int("contacts", contacts)
-        self._finder = ContactFinder(model, self._data, pairs, distance, length, contacts, friction)
+            budgets = self._selection.budgets
+        else:
+            self._selection = None
+            budgets = None if contacts is None else check_positive_int("contacts", contacts)
+        self._finder = ContactFinder(model, self._data, pairs, distance, length, budgets, friction)
         model.opt.disableflags |= sum(
             int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("EQUALITY", "FRICTIONLOSS", "LIMIT")
         )
@@ -173,7 +173,7 @@ class MujocoLCS:
     @property
     def n_contacts(self) -> int:
         """Number of contacts of every state."""
-        return self._finder.n_contacts if self._selection is None else self._selection.n_contacts
+        return self._finder.n_contacts
 
     @property
     def n_lam(self) -> int:
@@ -291,16 +291,14 @@ class MujocoLCS:
         flat = x.detach().double().cpu().reshape(n, self.n_x).numpy()
         act = flat[:, self.n_x - self.state.na :] if self.state.na else [data.act.copy()] * n
         ctrl = [self._ctrl] * n if context is None else self._actuators.nominal(context, batch).reshape(n, -1)
-        contacts, moved = self._finder.allocate(n), self._motion.allocate(n)
+        found, moved = self._finder.find(qpos), self._motion.allocate(n)
         for i in range(n):
             with native(model, data, f"in state {i} of {n}"):
                 data.qpos[:], data.qvel[:], data.act[:] = qpos[i], qvel[i], act[i]
                 mujoco.mj_fwdPosition(model, data)
-                self._finder.read(i, contacts)
                 self._motion.read(i, data, moved, ctrl[i])
         tangent = self.state.tangent(flat[:, : self.state.nv])
-        found = self._finder.finish(contacts)
-        return _States(batch, flat, tangent, self._selection.select(found) if self._selection else found, moved)
+        return _States(batch, flat, tangent, found, moved)
 
     def _typical_response(self) -> float:
         """Compute how far a unit of force moves two bodies apart that may touch, the median over their pairs."""
