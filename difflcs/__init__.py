@@ -3,7 +3,7 @@
 import logging
 
 from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds
-from difflcs.cost import CostSequence, GoalCost, QuadraticCost
+from difflcs.cost import CostModule, CostSequence, GoalCost, QuadraticCost
 from difflcs.errors import BackendNotFoundError, DiffLCSError, SolveError
 from difflcs.lcp import LCPSolution, solve_lcp
 from difflcs.lcs import LCSModel, LCSModule, LCSParams, LCSSequence
@@ -21,6 +21,7 @@ __version__ = "0.2.0"
 __all__ = [
     "BackendNotFoundError",
     "ConstraintSequence",
+    "CostModule",
     "CostSequence",
     "DiffLCSError",
     "GoalCost",

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from difflcs._checks import check_number, check_positive_int, check_same_device, check_tensor, describe
-from difflcs._differentiation import is_wrapped
+from difflcs._differentiation import is_wrapped, runs_eagerly
 from difflcs._fields import TensorFields, check_by_stage, check_stages
 from difflcs._linalg import matvec, quadratic
+from difflcs._modules import fresh
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 
 # Number of dimensions of each field, after those of the batch and of the stages.
-_DIMENSIONS = {"Q": 2, "R": 2, "Q_final": 2, "q": 1, "r": 1, "q_final": 1, "constant": 0, "S": 2}
+_DIMENSIONS = {"Q": 2, "R": 2, "Q_final": 2, "q": 1, "r": 1, "q_final": 1, "constant": 0, "S": 2, "constant_stage": 0}
 _STAGES = ("Q", "R", "q", "r", "S")
 
 
@@ -29,6 +31,7 @@ class _Quadratic(TensorFields):
     q_final: Tensor
     constant: Tensor
     S: Tensor | None
+    constant_stage: Tensor | None
 
     def _fill(
         self,
@@ -41,6 +44,7 @@ class _Quadratic(TensorFields):
         constant: Tensor | None,
         S: Tensor | None,
         check: bool,
+        constant_stage: Tensor | None = None,
     ) -> None:
         for name, value in (("Q", Q), ("R", R), ("Q_final", Q_final)):
             check_tensor(name, value)
@@ -60,10 +64,11 @@ class _Quadratic(TensorFields):
         }
         x, u = ("n_x", self.n_x), ("n_u", self.n_u)
         dims = {"Q_final": [x, x], "q": [x], "r": [u], "q_final": [x], "constant": []}
-        if S is None:
-            self.register_buffer("S", None)
-        else:
-            fields["S"], dims["S"] = S, [x, u]
+        for name, value, dim in (("S", S, [x, u]), ("constant_stage", constant_stage, [])):
+            if value is None:
+                self.register_buffer(name, None)
+            else:
+                fields[name], dims[name] = value, dim
         for name, dim in dims.items():
             check_tensor(name, fields[name], dim)
         check_same_device(fields.items())
@@ -92,16 +97,14 @@ class _Quadratic(TensorFields):
         return torch.cat([torch.cat([Q, S], -1), torch.cat([S.mT, R], -1)], -2)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Name → tensor as it was passed, with the constant; S if there is one."""
+        """Name → tensor as it was passed, with the constants; S if there is one."""
         fields = self._held(_DIMENSIONS)
-        if fields["S"] is None:
-            del fields["S"]
-        return fields
+        return {name: value for name, value in fields.items() if value is not None}
 
     def fields(self) -> dict[str, Tensor]:
         """Name → tensor, with symmetric Q, R and Q_final, without the constant; S if there is one."""
         fields = self.tensors()
-        del fields["constant"]
+        fields = {name: value for name, value in fields.items() if not name.startswith("constant")}
         return {k: 0.5 * (v + v.mT) if k in ("Q", "R", "Q_final") else v for k, v in fields.items()}
 
 
@@ -120,6 +123,7 @@ class QuadraticCost(_Quadratic):
         q_final: (..., n_x), zero if None.
         constant: (...) added to the objective, zero if None; it changes no action.
         S: (..., n_x, n_u), zero if None; [[Q, S], [Sᵀ, R]] ⪰ 0.
+        constant_stage: (...) added to the objective once for each stage, zero if None.
 
     Raises:
         ShapeError, DTypeError, DeviceError, NonFiniteError: a field does not fit the others.
@@ -137,10 +141,11 @@ class QuadraticCost(_Quadratic):
         constant: Tensor | None = None,
         S: Tensor | None = None,
         *,
+        constant_stage: Tensor | None = None,
         check: bool = True,
     ):
         super().__init__()
-        self._fill(Q, R, Q_final, q, r, q_final, constant, S, check)
+        self._fill(Q, R, Q_final, q, r, q_final, constant, S, check, constant_stage)
 
 
 class CostSequence(_Quadratic):
@@ -190,6 +195,48 @@ class CostSequence(_Quadratic):
         """H, the number of stages."""
         name = min(self.by_stage)
         return getattr(self, name).shape[-1 - _DIMENSIONS[name]]
+
+
+@runtime_checkable
+class CostModule(Protocol):
+    """Whatever says what states and actions cost where things are: the counterpart of `LCSModule`.
+
+    A layer asks it at each call, a controller at each step. It may be a `torch.nn.Module`: then what it learns belongs
+    to the layer. `isinstance(value, CostModule)` asks for the method alone. A module whose cost is the same at all
+    states may say so by an attribute `constant = True`: then it can be exported.
+    """
+
+    def at(self, x: Tensor, goal: Tensor | None = None, context: Tensor | None = None) -> QuadraticCost | CostSequence:
+        """The cost near some states.
+
+        Args:
+            x: (..., n_x) states that the plans begin at.
+            goal: (..., n_goal) that of the call, if it has one.
+            context: (..., n_context) that of the call, which the system sees too.
+
+        Returns:
+            The cost of plans from there, shared, or with leading batch dimensions that broadcast with those of x;
+            differentiable in what the module learns.
+        """
+        ...
+
+
+@runs_eagerly
+def cost_at(
+    cost: CostModule, x: Tensor, goal: Tensor | None = None, context: Tensor | None = None
+) -> QuadraticCost | CostSequence:
+    """`cost.at(x, goal, context)`, for whoever was handed the module.
+
+    Raises:
+        DTypeError: it returns something else than a cost.
+    """
+    found = fresh(cost).at(x, goal, context)
+    if not isinstance(found, QuadraticCost | CostSequence):
+        raise DTypeError(
+            f"cost: expected QuadraticCost or CostSequence from {type(cost).__name__}.at, got {describe(found)}; "
+            f"return one of them"
+        )
+    return found
 
 
 def _check_convex(name: str, matrix: Tensor) -> None:

@@ -17,6 +17,7 @@ from difflcs.mpc.backends import Backend, get_backend
 from difflcs.mpc.controller import MPCController, OnFailure
 from difflcs.mpc.repeat import Repeat
 from difflcs.mpc.setup import (
+    PLAIN_COSTS,
     Bound,
     Call,
     Constraints,
@@ -43,7 +44,8 @@ class LCSMPCLayer(nn.Module):
     Args:
         lcs: an `LCSModel` or any other `LCSModule`, asked for its system at each call (parameters of an nn.Module
             become this layer's); or `LCSParams`, shared or one per batch element; or an `LCSSequence`, one per stage.
-        cost: a `GoalCost`, called with the goal or along a reference; or a `QuadraticCost` or `CostSequence`.
+        cost: a `GoalCost`, called with the goal or along a reference; a `QuadraticCost` or `CostSequence`; or any other
+            `CostModule`, asked for its cost at the states and goals of each call.
         horizon: H ≥ 1 steps.
         u_min: lower bound of the actions: a number, or a tensor (n_u,) or (..., n_u), −∞ where there is none; learned
             if an nn.Parameter. None: no bound.
@@ -99,8 +101,9 @@ class LCSMPCLayer(nn.Module):
         self.backend = get_backend(backend)
         self.constraints = None if constraints is None else check_constraints(constraints)
         self.bounds = None if bounds is None else check_stage_bounds(bounds, u_min=u_min, u_max=u_max)
+        like = cost.Q if isinstance(cost, PLAIN_COSTS) else torch.empty(0)
         for name, value, none in (("u_min", u_min, -torch.inf), ("u_max", u_max, torch.inf)):
-            value = as_bound(name, none if value is None else value, [("n_u", lcs.n_u)], cost.Q)
+            value = as_bound(name, none if value is None else value, [("n_u", lcs.n_u)], like)
             if isinstance(value, nn.Parameter):
                 self.register_parameter(name, value)
             else:
@@ -131,7 +134,7 @@ class LCSMPCLayer(nn.Module):
         """Bounds of the actions where a call gives none.
 
         They are the layer's `bounds`; or else u_min and u_max, within the action support of an `LCSModel` that knows
-        one.
+        one. A call takes them within the `action_bounds(x0)` of a module that has these, as `MujocoLCS` does.
 
         Args:
             system: the model; the layer's own if None.
@@ -171,7 +174,7 @@ class LCSMPCLayer(nn.Module):
 
         Args:
             x0: (..., n_x) initial states, float32 or float64.
-            goal: (..., n_goal), with a `GoalCost` only. Batch dimensions broadcast with those of x0.
+            goal: (..., n_goal), with a `GoalCost` or a `CostModule` only. Batch dimensions broadcast with those of x0.
             reference: (..., H+1, n_goal), with a `GoalCost` only and instead of a goal: one goal for each state of the
                 plan, see `GoalCost.follow`.
             guess: warm start for the same batch, such as `solution.shift()`.
@@ -181,7 +184,7 @@ class LCSMPCLayer(nn.Module):
             lcs: system, or module that is asked for one, for this call.
             cost: cost for this call.
             constraints: constraints for this call.
-            context: (..., n_context) whatever the system depends on besides x0; given to the module.
+            context: (..., n_context) whatever system or cost depend on besides x0; given to the modules.
 
         Returns:
             `MPCSolution` with the broadcast batch dimensions.

@@ -21,7 +21,7 @@ from difflcs._checks import (
 from difflcs._differentiation import is_wrapped
 from difflcs._fields import check_not_nan
 from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds, as_bound, check_bounds
-from difflcs.cost import CostSequence, GoalCost, QuadraticCost
+from difflcs.cost import CostModule, CostSequence, GoalCost, QuadraticCost, cost_at
 from difflcs.errors import BoundsError, DTypeError, ShapeError
 from difflcs.lcs import SYSTEM, LCSModule, LCSParams, LCSSequence
 from difflcs.mpc.backends.base import Backend
@@ -40,8 +40,11 @@ _COST = ("Q", "R", "S", "Q_final", "q", "r", "q_final", "constant")
 
 Bound = float | Tensor
 System = LCSModule | LCSParams | LCSSequence
-Cost = GoalCost | QuadraticCost | CostSequence
+Cost = GoalCost | QuadraticCost | CostSequence | CostModule
 Constraints = LinearConstraints | ConstraintSequence
+
+PLAIN_COSTS = (GoalCost, QuadraticCost, CostSequence)
+"""Costs whose numbers are known before a call; any other is a `CostModule`."""
 
 
 class Setup(NamedTuple):
@@ -69,7 +72,8 @@ class Setup(NamedTuple):
         inputs = Inputs(self.horizon, sizes={name: getattr(self.lcs, name) for name in ("n_x", "n_u", "n_lam")})
         if isinstance(self.lcs, LCSSequence):
             inputs.check_horizon("lcs", self.lcs.horizon)
-        inputs.check_sizes("cost", n_x=self.cost.n_x, n_u=self.cost.n_u)
+        if isinstance(self.cost, PLAIN_COSTS):  # a module is asked at a call
+            inputs.check_sizes("cost", n_x=self.cost.n_x, n_u=self.cost.n_u)
         if isinstance(self.cost, CostSequence):
             inputs.check_horizon("cost", self.cost.horizon)
         inputs.add_constraints(self.constraints)
@@ -77,11 +81,14 @@ class Setup(NamedTuple):
             inputs.add_bounds(self.bounds)
         check_bounds(*self.action_bounds(self.lcs), strict=self.barrier > 0)
 
-    def action_bounds(self, system: System) -> tuple[Tensor, Tensor]:
+    def action_bounds(self, system: System, x0: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Bounds of the actions where a call gives none, see `LCSMPCLayer.limits`."""
         if self.limits is not None:
             return self.limits(system)
-        return self.bounds.by_steps() if self.bounds is not None else within_support(self.u_min, self.u_max, system)
+        if self.bounds is not None:
+            return self.bounds.by_steps()
+        limits = within_support(self.u_min, self.u_max, system)
+        return limits if x0 is None else within_reach(*limits, system, x0)
 
 
 class Call(NamedTuple):
@@ -109,13 +116,15 @@ def gather(setup: Setup, call: Call) -> Inputs:
     system = setup.lcs if call.lcs is None else check_system(call.lcs)
     check_tensor("x0", call.x0, [("n_x", system.n_x)])
     inputs = Inputs(setup.horizon)
+    cost = setup.cost if call.cost is None else check_cost(call.cost)
+    check_context(call.context, system, cost)
     inputs.add_system(system, call.x0, call.context)
-    inputs.add_cost(setup.cost if call.cost is None else check_cost(call.cost), call.goal, call.reference)
+    inputs.add_cost(cost, call.x0, call.goal, call.reference, call.context)
     bounds = setup.bounds
     if call.bounds is not None:
         bounds = check_stage_bounds(call.bounds, u_min=call.u_min, u_max=call.u_max)
     if bounds is None:
-        inputs.tensors |= dict(zip(("u_min", "u_max"), setup.action_bounds(system), strict=True))
+        inputs.tensors |= dict(zip(("u_min", "u_max"), setup.action_bounds(system, call.x0), strict=True))
     else:
         inputs.add_bounds(bounds)
     inputs.replace_bound("u_min", call.u_min)
@@ -144,6 +153,15 @@ def within_support(u_min: Tensor, u_max: Tensor, system: System) -> tuple[Tensor
     return limits
 
 
+def within_reach(u_min: Tensor, u_max: Tensor, system: System, x0: Tensor) -> tuple[Tensor, Tensor]:
+    """Bounds of the actions within those that a module's actuators can do at x0, where it has `action_bounds`."""
+    find = getattr(system, "action_bounds", None)
+    if find is None:
+        return u_min, u_max
+    low, high = (v.to(u_min) for v in find(x0))
+    return u_min.clamp(low, high), u_max.clamp(low, high)
+
+
 def check_system(lcs: object) -> System:
     """Refuse what says no system."""
     if not isinstance(lcs, LCSParams | LCSSequence) and not isinstance(lcs, LCSModule):
@@ -156,11 +174,24 @@ def check_system(lcs: object) -> System:
 
 def check_cost(cost: object) -> Cost:
     """Refuse what is no cost."""
-    if not isinstance(cost, GoalCost | QuadraticCost | CostSequence):
+    if not isinstance(cost, PLAIN_COSTS) and not callable(getattr(cost, "at", None)):
         raise DTypeError(
-            f"cost: expected GoalCost, QuadraticCost or CostSequence, got {describe(cost)}; build one from your weights"
+            f"cost: expected GoalCost, QuadraticCost, CostSequence or another CostModule, got {describe(cost)}; build "
+            f"one from your weights, or a module with at(x, goal, context)"
         )
-    return cost
+    return cost  # pyright: ignore[reportReturnType]
+
+
+def check_context(context: Tensor | None, system: System, cost: Cost) -> None:
+    """Refuse a context that nothing would use."""
+    if context is None:
+        return
+    if isinstance(system, LCSParams | LCSSequence) and isinstance(cost, PLAIN_COSTS):
+        raise ShapeError(
+            f"context: expected none with {type(system).__name__}, got {describe(context)}; pass lcs=a module whose "
+            f"params(x, context) uses it"
+        )
+    check_tensor("context", context)
 
 
 def check_constraints(constraints: object) -> Constraints:
@@ -205,14 +236,7 @@ class Inputs:
         """The matrices, asked for at these states if it is a module."""
         if isinstance(lcs, LCSParams | LCSSequence):
             system = lcs
-            if context is not None:
-                raise ShapeError(
-                    f"context: expected none with {type(lcs).__name__}, got {describe(context)}; pass lcs=a module "
-                    f"whose params(x, context) uses it"
-                )
         else:
-            if context is not None:
-                check_tensor("context", context)
             system = system_at(lcs, x0, context)
             if not isinstance(system, LCSParams | LCSSequence):
                 raise DTypeError(
@@ -226,8 +250,17 @@ class Inputs:
         self.sizes = {"n_x": system.n_x, "n_u": system.n_u, "n_lam": system.n_lam, "n_c": 0}
         self.tensors.update(system.tensors())
 
-    def add_cost(self, cost: Cost, goal: Tensor | None, reference: Tensor | None) -> None:
-        """The weights, at a goal or along a reference if the cost has one."""
+    def add_cost(
+        self, cost: Cost, x0: Tensor, goal: Tensor | None, reference: Tensor | None, context: Tensor | None
+    ) -> None:
+        """The weights, at a goal or along a reference if the cost has one; asked for at these states if a module."""
+        if not isinstance(cost, PLAIN_COSTS):
+            if reference is not None:
+                raise ShapeError(
+                    f"reference: expected a goal with {type(cost).__name__}, got a reference; return a CostSequence "
+                    f"from its method at, or use a GoalCost"
+                )
+            cost, goal = cost_at(cost, x0, goal, context), None
         self.check_sizes("cost", n_x=cost.n_x, n_u=cost.n_u)
         if isinstance(cost, GoalCost):
             if goal is None and reference is None:
@@ -249,6 +282,8 @@ class Inputs:
                         f"{name}: expected none with a {type(cost).__name__}, got one; use a GoalCost to plan to goals"
                     )
             fields = cost.tensors()
+            if "constant_stage" in fields:
+                fields["constant"] = fields["constant"] + self.horizon * fields.pop("constant_stage")
             if isinstance(cost, CostSequence):
                 self.check_horizon("cost", cost.horizon)
                 self.by_stage |= cost.by_stage

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from difflcs.physics.complementarity import Contacts, FreeMotion, contact_lcs
+from difflcs.physics.complementarity import Bounded, Contacts, FreeMotion, Unilateral, contact_lcs
 from difflcs.physics.learnable import ContactLCS
 from difflcs.physics.planar import ForceDrive, Inertia, PDDrive, PlanarPushing, PositionDrive
 from difflcs.physics.shapes import Circle, Distance, Polygon, Shape, Union, box
@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # for type checkers; MuJoCo is an extra, imported by the firs
     from difflcs.physics.mujoco import lcs_from_mujoco as lcs_from_mujoco
 
 __all__ = [
+    "Bounded",
     "Circle",
     "ContactLCS",
     "Contacts",
@@ -28,6 +29,7 @@ __all__ = [
     "Polygon",
     "PositionDrive",
     "Shape",
+    "Unilateral",
     "Union",
     "box",
     "contact_lcs",

@@ -35,7 +35,7 @@ from difflcs._linalg import matvec
 from difflcs.errors import FrictionWarning, InvalidInputError, ShapeError
 from difflcs.records import LCSParams
 
-__all__ = ["Cone", "Contacts", "FreeMotion", "contact_lcs", "count_forces"]
+__all__ = ["Bounded", "Cone", "Contacts", "FreeMotion", "Unilateral", "contact_lcs", "count_forces"]
 
 Cone = Literal["anitescu", "stewart-trinkle"]
 
@@ -75,11 +75,59 @@ class FreeMotion(NamedTuple):
     response: Tensor
 
 
-def count_forces(n_contacts: int, n_tangents: int, cone: Cone = "anitescu") -> int:
-    """Return n_lam of a system with so many contacts."""
-    if n_tangents == 0:
-        return n_contacts
-    return n_contacts * (2 * n_tangents if cone == "anitescu" else 2 * n_tangents + 2)
+class Unilateral(NamedTuple):
+    """One-sided constraints without friction: limits of joints and tendons, contacts of frictionless pairs.
+
+    Each has one multiplier, 0 ≤ λ ⊥ gap after the step ≥ 0, where a contact with friction has one for each ray.
+
+    Attributes:
+        gap: (..., n_unilateral) distance from acting, negative where it is passed.
+        normal: (..., n_unilateral, n_x) derivative of each gap with respect to the state.
+        effect: (..., n_x, n_unilateral) what a unit of each force adds to the next state; None: what it does as an
+            impulse at the beginning of the step, response @ normalᵀ. F stays definite if normal @ effect is symmetric
+            and positive semidefinite, over the rows of all contacts and constraints.
+    """
+
+    gap: Tensor
+    normal: Tensor
+    effect: Tensor | None = None
+
+
+class Bounded(NamedTuple):
+    """Forces that hold something in place as far as they can: dry friction in joints and tendons, drives with limits.
+
+    A force τ in [lower, upper] keeps w = offset + slide · (x₊ − x) at zero; with w > 0 it is `lower`, with w < 0 it is
+    `upper`. Each has two multipliers, λ = τ − lower and the way s = [−w]₊ that is slid against `upper`:
+
+        0 ≤ λ ⊥ w + s ≥ 0,    0 ≤ s ⊥ upper − lower − λ + ε s ≥ 0.
+
+    The coupling of λ and s is skew, so that any ε > 0 makes F + Fᵀ ≻ 0. Because of ε the force passes `upper` by ε s:
+    a drag, chosen so that it gives back at most a thousandth of the way s.
+
+    Attributes:
+        offset: (..., n_bounded) zero for friction; what it lets creep in a step comes off.
+        slide: (..., n_bounded, n_x) derivative of the way with respect to the state.
+        lower: (..., n_bounded) least force along `slide`.
+        upper: (..., n_bounded) largest force, at least `lower`.
+        effect: (..., n_x, n_bounded) see `Unilateral`.
+    """
+
+    offset: Tensor
+    slide: Tensor
+    lower: Tensor
+    upper: Tensor
+    effect: Tensor | None = None
+
+
+_DRAG = 1e-3  # part of a way that the drag of a bounded force gives back
+
+
+def count_forces(
+    n_contacts: int, n_tangents: int, cone: Cone = "anitescu", n_unilateral: int = 0, n_bounded: int = 0
+) -> int:
+    """Return n_lam of a system with so many contacts, one-sided constraints and bounded forces."""
+    rays = 2 * n_tangents if cone == "anitescu" else 2 * n_tangents + 2
+    return n_contacts * (rays if n_tangents else 1) + n_unilateral + 2 * n_bounded
 
 
 @runs_eagerly
@@ -94,6 +142,8 @@ def contact_lcs(
     length: float = 1.0,
     force: float | None = None,
     rest: Tensor | None = None,
+    unilateral: Unilateral | None = None,
+    bounded: Bounded | None = None,
 ) -> LCSParams:
     """Build the linear complementarity system of one step with contact, linearised at some states.
 
@@ -102,18 +152,23 @@ def contact_lcs(
         free: the step without contact.
         x: (..., n_x) states.
         friction: coefficient μ ≥ 0, one or (..., n_contacts); without tangents it does nothing.
-        compliance: gap that a unit of force closes, > 0, one or (..., n_contacts) [length per force].
+        compliance: gap that a unit of force closes, > 0 [length per force], one, or one for each contact, then each
+            one-sided constraint, then each bounded force.
         cone: model of friction, see above.
         length: unit in which the system counts gaps. The relaxation of the MPC, λ·s, is counted in units of
             length · force, so that with a typical length it does not depend on whether x is in metres or in pixels.
         force: unit in which it counts forces; None: the number of `length`, right for a quasi-static body of mobility
             1.
-        rest: (..., n_lam) forces from which the compliance counts, which so close no gap; None: zero.
+        rest: (..., n_lam) forces from which the compliance counts, which so close no gap (of a bounded force τ itself;
+            what stands in the place of its s does nothing); None: zero.
+        unilateral: one-sided constraints without friction, scaled so that a unit of each gap is a `length`.
+        bounded: bounded forces, scaled likewise.
 
     Returns:
-        The system, one per state: n_lam = n_contacts without tangents, 2 n_tangents per contact with the cone of
+        The system, one per state. A contact has one multiplier without tangents, 2 n_tangents with the cone of
         Anitescu, 2 n_tangents + 2 with that of Stewart and Trinkle. In this order, contact by contact: the rays
         n + μ t, n − μ t of each tangent; or the normal force, friction along t and −t of each, the sliding distance.
+        Then one for each one-sided constraint, λ of all bounded forces, s of all. `count_forces` counts them.
 
     Warns:
         FrictionWarning: the drag of the Stewart-Trinkle cone holds back much of a slide, see above.
@@ -126,20 +181,76 @@ def contact_lcs(
     force = length if force is None else check_number("force", force, strict=True)
     n_x, n_contacts, n_tangents = x.shape[-1], contacts.gap.shape[-1], contacts.tangent.shape[-2]
     _check_shapes(contacts, free, n_x, n_contacts, n_tangents)
-    mu = _per_contact("friction", friction, contacts.gap, strict=False)
-    soft = _per_contact("compliance", compliance, contacts.gap, strict=True) * (force / length)
-    if n_tangents and cone == "stewart-trinkle":
-        return _stewart_trinkle(contacts, free, x, mu, soft, length, force, rest)
-    rows, gap, softness = _rays(contacts, mu, soft) if n_tangents else (contacts.normal, contacts.gap, soft)
-    normals = contacts.normal.repeat_interleave(2 * n_tangents, -2) if n_tangents else rows
+    _check_more(unilateral, bounded, n_x)
+    more = [m for m in (unilateral, bounded) if m is not None and m[0].shape[-1]]
+    mu = _per_row("friction", friction, contacts.gap, strict=False)
+    of_all = contacts.gap.new_empty(n_contacts + sum(m[0].shape[-1] for m in more))
+    soft = _per_row("compliance", compliance, of_all, strict=True) * (force / length)
+    stewart_trinkle = cone == "stewart-trinkle" and n_tangents > 0 and n_contacts > 0
+    directions = _normals_and_tangents if stewart_trinkle else _rays
+    rows, normals, gap = directions(contacts, mu) if n_tangents else (contacts.normal, contacts.normal, contacts.gap)
+    each = rows.shape[-2] // max(n_contacts, 1)
+    softness = soft[..., :n_contacts].repeat_interleave(each, -1)
     C = (free.response @ rows.mT) * force
+    if more:
+        effects = [free.response @ m[1].mT if m.effect is None else m.effect for m in more]
+        counted = [m[1] if isinstance(m, Unilateral) else torch.zeros_like(m[1]) for m in more]
+        rows, normals = _join(-2, rows, *(m[1] for m in more)), _join(-2, normals, *counted)
+        gap, softness = _join(-1, gap, *(m[0] for m in more)), torch.cat([softness, soft[..., n_contacts:]], -1)
+        C = torch.cat([C, *(effect.expand(*C.shape[:-1], -1) * force for effect in effects)], -1)
     rows, normals = rows / length, normals / length
     F = rows @ C
     F = 0.5 * (F + F.mT) + torch.diag_embed(softness.expand(F.shape[:-1]))
     D = rows @ free.A - (rows - normals)
     c = gap / length + matvec(rows, free.d) - matvec(normals, x)
-    c = c if rest is None else c - softness * rest / force
-    return LCSParams(A=free.A, B=free.B, C=C, d=free.d, D=D, E=rows @ free.B, F=F, c=c)
+    forces = torch.arange(F.shape[-1], device=F.device)
+    if stewart_trinkle:
+        forces += torch.div(forces, each, rounding_mode="floor").clamp(max=n_contacts)
+    c = c if rest is None else c - softness * rest[..., forces] / force
+    system = _Rows(C, free.d, D, rows @ free.B, F, c)
+    if stewart_trinkle:
+        system = _limit_friction(system, mu, each, forces)
+    if bounded is not None and bounded.offset.shape[-1]:
+        system = _bound(system, bounded.lower / force, bounded.upper / force)
+    return LCSParams(A=free.A, B=free.B, **system._asdict())
+
+
+class _Rows(NamedTuple):
+    """Fields of `LCSParams` that contacts change."""
+
+    C: Tensor
+    d: Tensor
+    D: Tensor
+    E: Tensor
+    F: Tensor
+    c: Tensor
+
+
+def _bound(system: _Rows, lower: Tensor, upper: Tensor) -> _Rows:
+    """Give the last forces, of any sign in `system`, their bounds: they become λ + lower, and s is added."""
+    C, d, D, E, F, c = system
+    n = lower.shape[-1]
+    d, c = d + matvec(C[..., -n:], lower), c + matvec(F[..., -n:], lower)
+    held = F.new_zeros(F.shape[-1], n)
+    held[-n:] = torch.eye(n, dtype=F.dtype, device=F.device)
+    drag = torch.diag_embed(_DRAG / F.diagonal(dim1=-2, dim2=-1)[..., -n:])
+    held = held.expand(*F.shape[:-1], n)
+    F = torch.cat([torch.cat([F, held], -1), torch.cat([-held.mT, drag], -1)], -2)
+    C, D, E = (
+        torch.cat([v, v.new_zeros(shape)], dim)
+        for v, shape, dim in (
+            (C, (*C.shape[:-1], n), -1),
+            (D, (*D.shape[:-2], n, D.shape[-1]), -2),
+            (E, (*E.shape[:-2], n, E.shape[-1]), -2),
+        )
+    )
+    return _Rows(C, d, D, E, F, _join(-1, c, upper - lower))
+
+
+def _join(dim: int, *parts: Tensor) -> Tensor:
+    """Concatenate vectors (dim −1) or rows of matrices (dim −2), whose batch dimensions broadcast."""
+    batch = torch.broadcast_shapes(*(part.shape[:dim] for part in parts))
+    return torch.cat([part.expand(*batch, *part.shape[dim:]) for part in parts], dim)
 
 
 def _check_shapes(contacts: Contacts, free: FreeMotion, n_x: int, n_contacts: int, n_tangents: int) -> None:
@@ -155,8 +266,24 @@ def _check_shapes(contacts: Contacts, free: FreeMotion, n_x: int, n_contacts: in
     check_tensor("free.d", free.d, [of_state])
 
 
-def _per_contact(name: str, value: float | Tensor, gap: Tensor, strict: bool) -> Tensor:
-    """Expand a coefficient to one for each contact."""
+def _check_more(unilateral: Unilateral | None, bounded: Bounded | None, n_x: int) -> None:
+    """Check the rows that are no contacts."""
+    for name, rows in (("unilateral", unilateral), ("bounded", bounded)):
+        if rows is None:
+            continue
+        n, of_state = (f"n_{name}", rows[0].shape[-1]), ("n_x", n_x)
+        for field, value in zip(rows._fields, rows, strict=True):
+            if value is not None:
+                kinds = {"normal": [n, of_state], "slide": [n, of_state], "effect": [of_state, n]}
+                check_tensor(f"{name}.{field}", value, kinds.get(field, [n]))
+    if bounded is not None and bool((bounded.lower > bounded.upper).any()):
+        raise InvalidInputError(
+            "bounded.lower: expected at most the upper bound, got more; exchange them, or give both the same value"
+        )
+
+
+def _per_row(name: str, value: float | Tensor, gap: Tensor, strict: bool) -> Tensor:
+    """Expand a coefficient to one for each contact, or each row."""
     value = torch.as_tensor(value, dtype=gap.dtype, device=gap.device)
     bad = value <= 0 if strict else value < 0
     if bool(bad.any()) or not bool(torch.isfinite(value).all()):
@@ -173,12 +300,22 @@ def _per_contact(name: str, value: float | Tensor, gap: Tensor, strict: bool) ->
     return value if value.ndim and value.shape[-1] == gap.shape[-1] else value.expand(*value.shape[:-1], gap.shape[-1])
 
 
-def _rays(contacts: Contacts, mu: Tensor, soft: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute the extreme rays n ± μ t of each contact, their gaps and compliances."""
+def _rays(contacts: Contacts, mu: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute the extreme rays n ± μ t of each contact, what of them counts from x̄, and their gaps."""
     per = 2 * contacts.tangent.shape[-2]
     normal, slide = contacts.normal.unsqueeze(-2), mu[..., None, None] * contacts.tangent
     rays = torch.stack([normal + slide, normal - slide], -2)  # (..., n_contacts, n_tangents, 2, n_x)
-    return rays.flatten(-4, -2), contacts.gap.repeat_interleave(per, -1), soft.repeat_interleave(per, -1)
+    return rays.flatten(-4, -2), contacts.normal.repeat_interleave(per, -2), contacts.gap.repeat_interleave(per, -1)
+
+
+def _normals_and_tangents(contacts: Contacts, mu: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute the same of the directions n, t and −t of each contact, with a gap along n alone."""
+    del mu
+    both = torch.stack([contacts.tangent, -contacts.tangent], -2).flatten(-3, -2)
+    normal = contacts.normal.unsqueeze(-2)
+    still = torch.zeros_like(both)
+    gap = torch.nn.functional.pad(contacts.gap.unsqueeze(-1), (0, both.shape[-2]))
+    return *(torch.cat([normal, v], -2).flatten(-3, -2) for v in (both, still)), gap.flatten(-2)
 
 
 _LARGE_DRAG = 0.25
@@ -199,39 +336,21 @@ def _check_drag(drag: Tensor, W: Tensor, normals: Tensor, mu: Tensor) -> None:
         )
 
 
-def _stewart_trinkle(
-    contacts: Contacts,
-    free: FreeMotion,
-    x: Tensor,
-    mu: Tensor,
-    soft: Tensor,
-    length: float,
-    force: float,
-    rest: Tensor | None,
-) -> LCSParams:
+def _limit_friction(system: _Rows, mu: Tensor, per: int, forces: Tensor) -> _Rows:
+    """Add the distance σ that each contact slides, after its `per` forces, which go to the places `forces`."""
     # Forces of a contact: normal, then along ± each tangent; then σ, the distance that it slides:
     #   0 ≤ λ_n ⊥ gap after the step ≥ 0,  0 ≤ β ⊥ σ ± t·slide ≥ 0,  0 ≤ σ ⊥ μ λ_n − Σ β + ε σ ≥ 0.
     # μ λ_n without its transpose makes F + Fᵀ indefinite; ε is what it takes, and not more: friction grows by ε σ.
-    n_contacts, n_tangents = contacts.tangent.shape[-3:-1]
-    per = 2 * n_tangents + 1
-    both = torch.stack([contacts.tangent, -contacts.tangent], -2).flatten(-3, -2)
-    rows = torch.cat([contacts.normal.unsqueeze(-2), both], -2).flatten(-3, -2)  # (..., n_contacts · per, n_x)
-    C = (free.response @ rows.mT) * force
-    rows = rows / length
-    is_normal = torch.zeros(per, dtype=x.dtype, device=x.device)
-    is_normal[0] = 1.0
-    along = (1.0 - is_normal).repeat(n_contacts).unsqueeze(-1) * rows  # the tangents, which count from the step's state
-    W = rows @ C
-    W = 0.5 * (W + W.mT) + torch.diag_embed(soft.repeat_interleave(per, -1).expand(W.shape[:-1]))
-    normals = torch.arange(n_contacts) * per
+    C, d, D, E, W, c = system
+    n_contacts = mu.shape[-1]
+    normals = torch.arange(n_contacts, device=W.device) * per
     inverse = torch.linalg.inv(W)[..., normals[:, None], normals]
     bound = 0.25 * torch.linalg.matrix_norm(mu.unsqueeze(-1) * inverse * mu.unsqueeze(-2))
     _check_drag(bound, W, normals, mu)
-    batch, like = W.shape[:-2], {"dtype": W.dtype, "device": W.device}
+    batch, n_lam = W.shape[:-2], W.shape[-1] + n_contacts
 
-    size, sigma = per + 1, torch.arange(n_contacts) * (per + 1) + per
-    forces = torch.tensor([i * size + j for i in range(n_contacts) for j in range(per)], dtype=torch.long)
-    F = torch.zeros(*batch, n_contacts * size, n_contacts * size, **like)
+    sigma = normals + torch.arange(1, n_contacts + 1, device=W.device) + per - 1
+    F = W.new_zeros(*batch, n_lam, n_lam)
     F[..., forces[:, None], forces] = W
     F[..., sigma, sigma] = (1.05 * bound + 1e-9).unsqueeze(-1).expand(*batch, n_contacts)
     F[..., sigma, sigma - per] = mu.expand(*batch, n_contacts)
@@ -242,19 +361,7 @@ def _stewart_trinkle(
     def spread(values: Tensor, dim: int) -> Tensor:
         """Insert zeros into values of the forces, at the places of the sliding distances."""
         shape = list(values.shape)
-        shape[dim] = n_contacts * size
-        return values.new_zeros(shape).index_copy(dim, forces.to(values.device), values)
+        shape[dim] = n_lam
+        return values.new_zeros(shape).index_copy(dim, forces, values)
 
-    gap = (contacts.gap.unsqueeze(-1) * is_normal).flatten(-2) / length
-    c = gap + matvec(rows, free.d) - matvec(rows - along, x)
-    c = c if rest is None else c - soft.repeat_interleave(per, -1) * rest[..., forces.to(x.device)] / force
-    return LCSParams(
-        A=free.A,
-        B=free.B,
-        C=spread(C, -1),
-        d=free.d,
-        D=spread(rows @ free.A - along, -2),
-        E=spread(rows @ free.B, -2),
-        F=F,
-        c=spread(c, -1),
-    )
+    return _Rows(spread(C, -1), d, spread(D, -2), spread(E, -2), F, spread(c, -1))

@@ -180,7 +180,7 @@ FITS_NOT = {  # what does not fit, the error, and what it says
     "no LCS": (lambda b: layer(b, lcs=nn.Linear(2, 2)), e.DTypeError,
      r"lcs: expected LCSModel, LCSParams, LCSSequence or another LCSModule, got Linear.*; a module needs"),
     "no cost": (lambda b: layer(b)(X, cost=len), e.DTypeError,
-     "cost: expected GoalCost, QuadraticCost or CostSequence, got builtin.*; build one"),
+     "cost: expected GoalCost, QuadraticCost, CostSequence or another CostModule, got builtin.*; build one"),
     "a cost of other states": (lambda b: layer(b, cost=b.cost(n_x=5)), e.ShapeError, "n_x=4, n_u=2 like.*n_x=5, n_u=2"),
     "a cost of other actions": (lambda b: layer(b, cost=b.cost(n_u=3)), e.ShapeError,
      "n_x=4, n_u=2 like.*n_x=4, n_u=3"),

@@ -13,6 +13,7 @@ from torch.autograd.functional import jacobian
 from difflcs import LCSModule, LCSMPCLayer, QuadraticCost, prediction_loss, violation_loss
 from difflcs.errors import DTypeError, FrictionWarning, InvalidInputError, ShapeError
 from difflcs.physics import (
+    Bounded,
     Circle,
     ContactLCS,
     Contacts,
@@ -23,10 +24,12 @@ from difflcs.physics import (
     PlanarPushing,
     Polygon,
     PositionDrive,
+    Unilateral,
     Union,
     box,
     contact_lcs,
 )
+from difflcs.physics.complementarity import count_forces
 from difflcs.physics.learnable import LEARNABLE
 from difflcs.scales import ScaledLCS, Scales
 
@@ -209,6 +212,37 @@ def test_friction_is_right_at_every_step_of_a_plan(cone, compliance):
     torch.testing.assert_close(speed[-1], tensor(0.0), rtol=0, atol=0.02)
 
 
+@pytest.mark.parametrize("cone", ["anitescu", "stewart-trinkle"])
+@pytest.mark.parametrize("late", [1.0, 0.5])
+@pytest.mark.parametrize("units", [{}, {"length": 0.03, "force": 7.0}])
+def test_a_stop_and_dry_friction_beside_a_contact(cone, late, units):
+    """A block on the floor, held by 2 N along x before a wall at 5 cm; pushes act at the beginning or all the time."""
+    h, friction, still = 0.1, 0.5 if late == 1 else 0.0, {"rtol": 0, "atol": 1e-3}
+    A, along = torch.eye(4, dtype=F64) + torch.diag(tensor([h, h]), 2), tensor([[1.0, 0.0, 0.0, 0.0]])
+    B = tensor([[h * h * late, 0.0], [0.0, h * h], [h, 0.0], [0.0, h]])
+    response = torch.diag_embed(tensor([h, h, 0.0, 0.0])) + torch.diag(tensor([1.0, 1.0]), -2)
+    free = FreeMotion(A, B, B @ tensor([0.0, -9.81]), response)
+    row, effect = late * along, None if late == 1 else tensor([[h * late], [0.0], [1.0], [0.0]])
+    contact = Contacts(tensor([0.0]), tensor([[0.0, 1.0, 0.0, 0.0]]), along[None])
+
+    def step(x, push):
+        dry = Bounded(tensor([0.0]), row, tensor([-2.0 * h]), tensor([2.0 * h]), effect)
+        stop = Unilateral((0.05 - x[:1]) * late, -row, effect if effect is None else -effect)
+        rows = {"bounded": dry, "unilateral": stop, "cone": cone}
+        system = contact_lcs(contact, free, x, friction=friction, compliance=1e-5, **rows, **units)
+        assert system.n_lam == count_forces(1, 1, cone, 1, 1)
+        assert torch.linalg.eigvalsh(system.F + system.F.mT)[0] > 0
+        return system.step(x, tensor([push, 0.0])).x_next
+
+    holds = 2.0 + friction * 9.81
+    for sign in (-1, 1):
+        x = step(torch.zeros(4, dtype=F64), sign * 0.9 * holds)
+        torch.testing.assert_close(x, torch.zeros(4, dtype=F64), **still)
+        x = step(torch.zeros(4, dtype=F64), sign * (holds + 1.0))  # Anitescu's contact opens, and presses harder
+        torch.testing.assert_close(x[2], tensor(sign * h), rtol=0, atol=0.03)
+    torch.testing.assert_close(step(tensor([0.04, 0.0, 1.0, 0.0]), 0.0)[0], tensor(0.05), **still)
+
+
 def test_bad_contacts_are_refused():
     free = FreeMotion(*(torch.eye(2, dtype=F64) for _ in range(2)), torch.zeros(2, dtype=F64), torch.eye(2, dtype=F64))
     contacts = Contacts(tensor([0.0]), tensor([[1.0, 0.0]]), torch.zeros(1, 0, 2, dtype=F64))
@@ -222,6 +256,12 @@ def test_bad_contacts_are_refused():
     ):
         with pytest.raises(InvalidInputError, match=match):
             contact_lcs(contacts, free, x, **({"friction": 0.5, "compliance": 0.1} | wrong))
+    one, bound = tensor([0.0]), tensor([1.0])
+    crossed = Bounded(one, tensor([[1.0, 0.0]]), bound, -bound)
+    with pytest.raises(InvalidInputError, match="lower: expected at most"):
+        contact_lcs(contacts, free, x, friction=0.0, compliance=0.1, bounded=crossed)
+    with pytest.raises(ShapeError, match=r"unilateral\.normal: expected"):
+        contact_lcs(contacts, free, x, friction=0.0, compliance=0.1, unilateral=Unilateral(one, tensor([[1.0]])))
     with pytest.raises(ShapeError, match=r"contacts\.normal: expected"):
         contact_lcs(contacts._replace(normal=tensor([[1.0]])), free, x, friction=0.0, compliance=0.1)
 

@@ -9,7 +9,21 @@ except ImportError as error:
         'expected the package mujoco, not installed; run: pip install "difflcs[envs]"'
     ) from error
 
+from difflcs.physics.mujoco.cost import Distance, Effort, MujocoCost, Orientation, Position, Posture, Velocity
+from difflcs.physics.mujoco.groups import ContactGroup
 from difflcs.physics.mujoco.lcs import MujocoLCS, lcs_from_mujoco
 from difflcs.physics.mujoco.state import MujocoState
 
-__all__ = ["MujocoLCS", "MujocoState", "lcs_from_mujoco"]
+__all__ = [
+    "ContactGroup",
+    "Distance",
+    "Effort",
+    "MujocoCost",
+    "MujocoLCS",
+    "MujocoState",
+    "Orientation",
+    "Position",
+    "Posture",
+    "Velocity",
+    "lcs_from_mujoco",
+]

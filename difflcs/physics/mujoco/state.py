@@ -33,21 +33,24 @@ _SUFFIXES = {
 
 
 class MujocoState:
-    """Order and coordinates of the state: one number for each of MuJoCo's nv degrees of freedom, then perhaps `qvel`.
+    """Order and coordinates of the state: one number for each of MuJoCo's nv degrees of freedom; `qvel` and `act`.
 
     The coordinate of a slide or a hinge is its `qpos`. A free joint has its position and the rotation vector from its
     orientation in `reference`, a ball the rotation vector alone: below half a turn each orientation has one, and at a
     whole turn the coordinates are singular, so that `tangent` refuses. So give a reference near which things happen.
+    `follow` moves the reference along: numbers of before then count from another orientation.
     Quaternions are read as MuJoCo does: of any length, and of zeros as no rotation.
 
     Args:
         model: the MuJoCo model.
         reference: (nq,) `qpos` with the orientations from which rotation vectors count; None: `model.qpos0`.
-        velocities: True if `qvel` follows the positions. It is MuJoCo's, angular velocities in coordinates of the body.
+        velocities: True if `qvel` follows the positions, and then `act`. They are MuJoCo's, angular velocities in
+            coordinates of the body.
 
     Attributes:
         names: name of each number of the state: that of the joint (or `joint0`, `joint1` …), for free joints and
-            balls with one of the endings _x _y _z _rx _ry _rz; velocities with the ending _velocity.
+            balls with one of the endings _x _y _z _rx _ry _rz; velocities with the ending _velocity; the name of the
+            actuator (or `actuator0` …) with the ending _activation.
     """
 
     def __init__(self, model: Any, reference: ArrayLike | None = None, *, velocities: bool = False):
@@ -56,7 +59,7 @@ class MujocoState:
                 f"model: expected a mujoco.MjModel, got {describe(model)}; load one, MjModel.from_xml_path"
             )
         self.nq, self.nv, self.velocities = int(model.nq), int(model.nv), velocities
-        self._reference = self._array("reference", model.qpos0 if reference is None else reference, self.nq).copy()
+        self.na = int(model.na) if velocities else 0
         names: list[str] = []
         plain: list[tuple[int, int]] = []
         self._turning: list[tuple[int, int]] = []  # where quaternions are in qpos, rotation vectors in the state
@@ -69,9 +72,36 @@ class MujocoState:
             plain += [(q + i, v + i) for i in range(shifts)]
             if count >= 3:
                 self._turning.append((q + shifts, v + shifts))
-                self._reference[q + shifts : q + shifts + 4] = _unit(self._reference[q + shifts : q + shifts + 4])
-        self.names = (*names, *(f"{name}_velocity" for name in names)) if velocities else tuple(names)
+        if velocities:
+            driven = np.repeat(np.arange(model.nu), model.actuator_actnum) if self.na else ()
+            activated = [f"{model.actuator(i).name or f'actuator{i}'}_activation" for i in driven]
+            names += [f"{name}_velocity" for name in names] + activated
+        self.names = tuple(names)
         self._of_qpos, self._of_state = np.array(plain, dtype=np.intp).reshape(-1, 2).T
+        self.follow(model.qpos0 if reference is None else reference, "reference")
+
+    def follow(self, qpos: ArrayLike, name: str = "qpos") -> None:
+        """Let rotation vectors count from the orientations in `qpos` (..., nq) from now on.
+
+        With batch dimensions each state has a reference of its own; they are then the first ones of all states.
+
+        Raises:
+            ShapeError, NonFiniteError: numbers that do not fit.
+        """
+        self._reference = self._array(name, qpos, self.nq).copy()
+        for q, _ in self._turning:
+            self._reference[..., q : q + 4] = _unit(self._reference[..., q : q + 4])
+
+    def _references(self, batch: tuple[int, ...]) -> Array:
+        """Return the reference of each state (*batch, nq)."""
+        own = self._reference.shape[:-1]
+        if batch[: len(own)] != own:
+            raise ShapeError(
+                f"x: expected states with the first batch dimensions {own} of the reference of their rotations, got "
+                f"{batch}; follow(qpos) with one reference for all, or with those of these states"
+            )
+        reference = self._reference.reshape(*own, *[1] * (len(batch) - len(own)), self.nq)
+        return np.broadcast_to(reference, (*batch, self.nq))
 
     @property
     def n_x(self) -> int:
@@ -88,8 +118,8 @@ class MujocoState:
             raise KeyError(f"expected one of {', '.join(self.names)}, got {name!r}")
         return self.names.index(name)
 
-    def to_state(self, qpos: ArrayLike, qvel: ArrayLike | None = None) -> Tensor:
-        """Convert to states (..., n_x) from `qpos` (..., nq) and `qvel` (..., nv); without `qvel` at rest.
+    def to_state(self, qpos: ArrayLike, qvel: ArrayLike | None = None, act: ArrayLike | None = None) -> Tensor:
+        """Convert to states (..., n_x) from `qpos` (..., nq), `qvel` (..., nv) and `act` (..., na), which may be zero.
 
         Raises:
             ShapeError, NonFiniteError: numbers that do not fit.
@@ -97,27 +127,34 @@ class MujocoState:
         qpos = self._array("qpos", qpos, self.nq)
         x = np.zeros((*qpos.shape[:-1], self.nv))
         x[..., self._of_state] = qpos[..., self._of_qpos]
+        reference = self._references(qpos.shape[:-1]) if self._turning else qpos
         for q, v in self._turning:
-            turn = _multiply(_conjugate(self._reference[q : q + 4]), _unit(qpos[..., q : q + 4]))
+            turn = _multiply(_conjugate(reference[..., q : q + 4]), _unit(qpos[..., q : q + 4]))
             x[..., v : v + 3] = _rotation_vector(turn)
         if self.velocities:
-            speed = np.zeros_like(x) if qvel is None else self._array("qvel", qvel, self.nv)
-            x = np.concatenate([x, np.broadcast_to(speed, x.shape)], -1)
+            shape = x.shape[:-1]
+            for name, values, size in (("qvel", qvel, self.nv), ("act", act, self.na)):
+                more = np.zeros(size) if values is None else self._array(name, values, size)
+                x = np.concatenate([x, np.broadcast_to(more, (*shape, size))], -1)
         return torch.from_numpy(x)
 
     def to_mujoco(self, x: Tensor) -> tuple[Array, Array]:
         """Convert states (..., n_x) to `qpos` (..., nq) and `qvel` (..., nv), zero where the state has none.
+
+        The `act` of MuJoCo are the last `na` numbers of the state.
 
         Raises:
             DTypeError, ShapeError, NonFiniteError: not such states.
         """
         check_tensor("x", x, [("n_x", self.n_x)])
         numbers = x.detach().double().cpu().numpy()
-        qpos = np.broadcast_to(self._reference, (*numbers.shape[:-1], self.nq)).copy()
+        qpos = self._references(numbers.shape[:-1]).copy()
         qpos[..., self._of_qpos] = numbers[..., self._of_state]
         for q, v in self._turning:
-            qpos[..., q : q + 4] = _multiply(self._reference[q : q + 4], _quaternion(numbers[..., v : v + 3]))
-        velocity = numbers[..., self.nv :] if self.velocities else np.zeros((*numbers.shape[:-1], self.nv))
+            qpos[..., q : q + 4] = _multiply(qpos[..., q : q + 4], _quaternion(numbers[..., v : v + 3]))
+        velocity = np.zeros((*numbers.shape[:-1], self.nv))
+        if self.velocities:
+            velocity = numbers[..., self.nv : 2 * self.nv]
         return qpos, velocity
 
     def tangent(self, x: Array) -> Array | None:
