@@ -26,7 +26,7 @@ from difflcs.records import system_at
 from difflcs.status import Status
 
 _FALLBACKS = {"hold": 0, "zero": 1, "unfinished": 3, "raise": 0}
-_GIVEN = 2
+_ACTION = 2
 _FLOAT = np.dtype(np.float64)
 
 OnFailure = str | ArrayLike
@@ -34,7 +34,7 @@ OnFailure = str | ArrayLike
 
 @dataclass(frozen=True)
 class ControllerPlan:
-    """What the solver of a controller has found last.
+    """Last result of a controller's solver.
 
     Attributes:
         x: (H+1, n_x) planned states.
@@ -101,11 +101,11 @@ class MPCController:
     ) -> None:
         self.horizon, self.n_x, self.n_u, self.n_goal = horizon, n_x, n_u, n_goal
         self._status: int | None = None
-        self._given: NDArray[np.float64] | None = None
+        self._fallback_action: NDArray[np.float64] | None = None
         self._raises = isinstance(on_failure, str) and on_failure == "raise"
         if not isinstance(on_failure, str):
-            self._given, self._fallback = _numbers("on_failure", on_failure, (n_u,)), _GIVEN
-            if not np.isfinite(self._given).all():
+            self._fallback_action, self._fallback = _numbers("on_failure", on_failure, (n_u,)), _ACTION
+            if not np.isfinite(self._fallback_action).all():
                 raise NonFiniteError(f"on_failure: expected a finite action, got {describe(on_failure)}; change it")
         elif on_failure in _FALLBACKS:
             self._fallback = _FALLBACKS[on_failure]
@@ -118,14 +118,14 @@ class MPCController:
 
     def _make(self) -> None:
         self._native = _kernels.Controller(self._content)
-        self._native.set_fallback(self._fallback, self._given)
+        self._native.set_fallback(self._fallback, self._fallback_action)
         self._native.set_time_limit(self._time_limit or 0.0)
 
     @classmethod
     def load(
         cls, path: str | os.PathLike[str], on_failure: OnFailure = "hold", time_limit: float | None = None
     ) -> Self:
-        """The controller of a file that `save` or `difflcs export` has written.
+        """Load a controller from a file that `save` or `difflcs export` has written.
 
         Raises:
             CheckpointError: there is none, or it is damaged, of another kind or of another version.
@@ -169,7 +169,7 @@ class MPCController:
             x: (n_x,) the state.
             goal: (n_goal,), with a `GoalCost`.
             reference: (H+1, n_goal) instead of a goal: one for each state of the plan, see `GoalCost.follow`.
-            context: (n_context,) whatever the system depends on besides x; given to the module.
+            context: (n_context,) quantities besides x that the system depends on; passed to the module.
 
         Returns:
             (n_u,) the first action of the plan, or that of `on_failure`; always inside the bounds. A new array.
@@ -193,20 +193,20 @@ class MPCController:
                 f"{'reference' if follow else 'goal'}: expected none with a cost without goals, got one; use a GoalCost"
             )
         if self._setup is not None:
-            self._ask(self._setup, x, context)
+            self._update_system(self._setup, x, context)
         elif context is not None:
             raise ShapeError("context: expected none with a constant system, got one; leave it out")
         u = np.empty(self.n_u)
         self._status = status = self._native.step(x, targets, follow, u)
         if self._raises and not Status(status).solved:
-            found = Status(status)
-            raise SolveError(f"the step was not solved: {found.name} ({found.advice})", [0], [status])
+            outcome = Status(status)
+            raise SolveError(f"the step was not solved: {outcome.name} ({outcome.advice})", [0], [status])
         return u
 
-    def _ask(self, setup: Setup, x: NDArray[np.float64], context: Tensor | None) -> None:
-        """Take the system of this state from the module."""
+    def _update_system(self, setup: Setup, x: NDArray[np.float64], context: Tensor | None) -> None:
+        """Update the system from the module, for this state."""
         if not np.isfinite(x).all() and self._native is not None:
-            return  # the step will say so
+            return  # the step fails and reports it
         with torch.no_grad():
             system = system_at(setup.lcs, torch.from_numpy(x), context)  # pyright: ignore
         if not isinstance(system, LCSParams | LCSSequence):
@@ -234,12 +234,12 @@ class MPCController:
 
     @property
     def status(self) -> Status | None:
-        """How the last step ended; None before the first."""
+        """Status of the last step; None before the first."""
         return None if self._status is None else Status(self._status)
 
     @property
     def time_limit(self) -> float | None:
-        """Seconds from the begin of a step until the solver is stopped; None for none."""
+        """Seconds from the start of a step until the solver is stopped; None for no limit."""
         return self._time_limit
 
     @time_limit.setter
@@ -255,7 +255,7 @@ class MPCController:
 
     @property
     def plan(self) -> ControllerPlan | None:
-        """What the solver has found last, also where it was not solved; copies. None before the first step."""
+        """Copy of the solver's last result, even if that step was not solved. None before the first step."""
         if self._status is None:
             return None
         sizes, H = self._native.sizes(), self.horizon
@@ -277,7 +277,7 @@ def _limit(seconds: float | None) -> float | None:
 
 
 def _numbers(name: str, value: object, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """An argument as the native code takes it; NaN and infinity are allowed."""
+    """Convert an argument to a float64 array for the native code; NaN and infinity are allowed."""
     if type(value) is np.ndarray and value.dtype is _FLOAT and value.shape == shape and value.flags.c_contiguous:
         return value
     try:

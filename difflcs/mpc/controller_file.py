@@ -30,7 +30,7 @@ _MAPS = ("at", "along")
 
 
 def constant_system(lcs: object) -> LCSParams | LCSSequence | None:
-    """The system of an LCS whose matrices are the same for all states and contexts; None for any other module."""
+    """Return the system of an LCS whose matrices are the same at all states and contexts; None if it has others."""
     if isinstance(lcs, LCSParams | LCSSequence):
         return lcs.detach()
     inner = lcs
@@ -42,7 +42,7 @@ def constant_system(lcs: object) -> LCSParams | LCSSequence | None:
 
 
 def controller_bytes(setup: Setup, system: LCSParams | LCSSequence, step_seconds: float = 0.0) -> bytes:
-    """The file of the controller of a layer, with its cost, bounds and constraints as they are now.
+    """Make the file of a layer's controller, with its cost, bounds and constraints as they are now.
 
     Args:
         setup: that of the layer; its backend is `batched`, and nothing in it has a batch dimension.
@@ -62,7 +62,7 @@ def controller_bytes(setup: Setup, system: LCSParams | LCSSequence, step_seconds
     if isinstance(cost, GoalCost) and any(getattr(type(cost), k) is not getattr(GoalCost, k) for k in _MAPS):
         raise InvalidInputError(
             f"cost: expected a GoalCost, whose terms are linear in the goal, got the subclass "
-            f"{type(cost).__name__} with a map of its own; give a controller the plain one"
+            f"{type(cost).__name__} that overrides how goals enter; build the layer with a GoalCost"
         )
     for name, value in (("seed", backend.seed), ("max_iter", backend.max_iter)):
         check_positive_int(name, value, minimum=0, maximum=_LARGEST)
@@ -99,7 +99,7 @@ def controller_bytes(setup: Setup, system: LCSParams | LCSSequence, step_seconds
 
 
 def _problem(setup: Setup, system: LCSParams | LCSSequence) -> tuple[MPCProblem, float]:
-    """The problem of one state, zero, and of one goal, zero; and the constant of its cost."""
+    """Make the problem of one state and one goal, both zero, and the constant of its cost."""
     x0, cost = torch.zeros(1, system.n_x, dtype=torch.float64), setup.cost
     goal = torch.zeros(cost.n_goal, dtype=torch.float64).to(cost.Q) if isinstance(cost, GoalCost) else None
     low, high = setup.action_bounds(setup.lcs) if setup.bounds is None else (None, None)
