@@ -275,8 +275,9 @@ class MPCController:
         fields = dict(self._own)
         for part, names in _CHANGES.items():
             if part in self._asks or given[part] is not None:
-                fields |= {name: values.get(name, torch.zeros_like(self._own[name])) for name in names}
-        check_bounds(fields["u_min"], fields["u_max"], strict=self._setup.barrier > 0)
+                fields |= {n: values[n] if n in values else torch.zeros_like(self._own[n]) for n in names}
+        if given["u_min"] is not None or given["u_max"] is not None:
+            check_bounds(fields["u_min"], fields["u_max"], strict=self._setup.barrier > 0)  # pyright: ignore[reportOptionalMemberAccess]
         for name, own in self._own.items():
             if fields[name].numel() != own.numel():
                 raise ShapeError(
