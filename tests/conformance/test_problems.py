@@ -539,6 +539,31 @@ def test_gradients_of_shared_inputs_are_sums_of_those_of_the_elements(build, sol
         )  # fmt: skip
 
 
+class Asked(torch.nn.Module):
+    """A cost that is asked for as a `CostModule`."""
+
+    def __init__(self, cost):
+        super().__init__()
+        self.cost = cost
+
+    def at(self, x, goal=None, context=None):
+        return self.cost
+
+
+@every_problem
+def test_a_cost_that_is_asked_for_counts_as_one_that_is_given(build, solutions, name):
+    problem, found = solutions(name, "batched")[0], []
+    for kind in (lambda cost: cost, Asked):
+        leaves = {k: v.clone().requires_grad_() for k, v in problem.tensors.items()}
+        system, cost, options = parts(problem, leaves)
+        layer = LCSMPCLayer(system, kind(cost), problem.horizon, relaxation=problem.relaxation, **options)
+        plan = layer(leaves["x0"])
+        (plan.u.sum() + plan.objective.sum()).backward()
+        found.append([plan.u, plan.objective, *(leaves[k].grad for k in COST if k in leaves)])
+    for given, asked in zip(*found, strict=True):
+        torch.testing.assert_close(asked, given, rtol=0, atol=0)
+
+
 @every_exact
 def test_what_is_infinite_has_no_gradient(build, backend):
     for make_problem, key in ((half_open, "u_max"), (terminal, "g"), (soft_and_hard, "weight")):

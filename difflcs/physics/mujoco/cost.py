@@ -392,7 +392,7 @@ class _Scene:
         known = [name for name in dict.fromkeys(names) if name]
         raise InvalidInputError(
             f"{about}: expected a {' or '.join(kinds)}, one of {', '.join(known)}, got {describe(name)}"
-            f"{did_you_mean(name, known)}"
+            f"{did_you_mean(name, known)}; name one of them"
         )
 
     def _numbers(self, kind: str) -> range:
@@ -413,7 +413,7 @@ class _Scene:
                 kinds = "joints" if turning else "slides and hinges"
                 raise InvalidInputError(
                     f"{about}: expected {kinds}, among {', '.join(known)}, got {describe(name)}"
-                    f"{did_you_mean(name, known)}"
+                    f"{did_you_mean(name, known)}; name one of them"
                 )
         return [dof for name in names for dof in known[name]]
 
