@@ -229,12 +229,15 @@ class MPCController:
             raise ShapeError(
                 f"{'reference' if follow else 'goal'}: expected none with a cost without goals, got one; use a GoalCost"
             )
-        if self._asks or self._given or not (lcs is cost is u_min is u_max is None):
+        asked = bool(self._asks) or self._given or not (lcs is cost is u_min is u_max is None)
+        if asked:
             x = self._ask(x, goal, context, {"lcs": lcs, "cost": cost, "u_min": u_min, "u_max": u_max})
         elif context is not None:
             raise ShapeError("context: expected none with a constant system, got one; leave it out")
         u = np.empty(self.n_u)
         self._status = status = self._native.step(x, targets, follow, u)
+        if asked:
+            self.time_limit = self._time_limit  # the modules have taken a part of it
         if self._raises and not Status(status).solved:
             found = Status(status)
             raise SolveError(f"the step was not solved: {found.name} ({found.advice})", [0], [status])
@@ -263,27 +266,26 @@ class MPCController:
             if first := self._native is None:
                 self._make(gather(self._setup, call))
             if self._given or not first:
-                self._change(gather(self._setup, call._replace(**given)), given)
+                self._change(self._setup, gather(self._setup, call._replace(**given)), given)
         if self._time_limit is not None:
             self._native.set_time_limit(max(self._time_limit - (time.perf_counter() - begun), 1e-9))
         return x
 
-    def _change(self, inputs: Inputs, given: dict[str, Any]) -> None:
+    def _change(self, setup: Setup, inputs: Inputs, given: dict[str, Any]) -> None:
         """Plan with other numbers of the same form."""
         values, constant = numbers_of_one(inputs)
         check_finite({name: values[name] for name in SYSTEM})
         fields = dict(self._own)
-        for part, names in _CHANGES.items():
-            if part in self._asks or given[part] is not None:
+        for part, names in _CHANGES.items():  # bounds may depend on the state where the layer's system does
+            if part in self._asks or given[part] is not None or part in ("u_min", "u_max"):
                 fields |= {n: values[n] if n in values else torch.zeros_like(self._own[n]) for n in names}
-        if given["u_min"] is not None or given["u_max"] is not None:
-            check_bounds(fields["u_min"], fields["u_max"], strict=self._setup.barrier > 0)  # pyright: ignore[reportOptionalMemberAccess]
-        for name, own in self._own.items():
-            if fields[name].numel() != own.numel():
-                raise ShapeError(
-                    f"lcs: expected {name} {tuple(own.shape)} as in the first step, got {tuple(fields[name].shape)}; "
-                    f"make another controller"
-                )
+            for name in names:
+                if fields[name].numel() != (own := self._own[name]).numel():
+                    raise ShapeError(
+                        f"{part}: expected {name} {tuple(own.shape)} as in the first step, got "
+                        f"{tuple(fields[name].shape)}; make another controller"
+                    )
+        check_bounds(fields["u_min"], fields["u_max"], strict=setup.barrier > 0)
         changed = "cost" in self._asks or given["cost"] is not None
         arrays = [value.numpy() for value in fields.values()]
         self._native.set_inputs(arrays, constant if changed else self._constant)

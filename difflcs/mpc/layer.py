@@ -134,7 +134,7 @@ class LCSMPCLayer(nn.Module):
         """Bounds of the actions where a call gives none.
 
         They are the layer's `bounds`; or else u_min and u_max, within the action support of an `LCSModel` that knows
-        one.
+        one. A call takes them within the `action_bounds(x0)` of a module that has these, as `MujocoLCS` does.
 
         Args:
             system: the model; the layer's own if None.

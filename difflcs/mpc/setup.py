@@ -81,11 +81,14 @@ class Setup(NamedTuple):
             inputs.add_bounds(self.bounds)
         check_bounds(*self.action_bounds(self.lcs), strict=self.barrier > 0)
 
-    def action_bounds(self, system: System) -> tuple[Tensor, Tensor]:
+    def action_bounds(self, system: System, x0: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Bounds of the actions where a call gives none, see `LCSMPCLayer.limits`."""
         if self.limits is not None:
             return self.limits(system)
-        return self.bounds.by_steps() if self.bounds is not None else within_support(self.u_min, self.u_max, system)
+        if self.bounds is not None:
+            return self.bounds.by_steps()
+        limits = within_support(self.u_min, self.u_max, system)
+        return limits if x0 is None else within_reach(*limits, system, x0)
 
 
 class Call(NamedTuple):
@@ -121,7 +124,7 @@ def gather(setup: Setup, call: Call) -> Inputs:
     if call.bounds is not None:
         bounds = check_stage_bounds(call.bounds, u_min=call.u_min, u_max=call.u_max)
     if bounds is None:
-        inputs.tensors |= dict(zip(("u_min", "u_max"), setup.action_bounds(system), strict=True))
+        inputs.tensors |= dict(zip(("u_min", "u_max"), setup.action_bounds(system, call.x0), strict=True))
     else:
         inputs.add_bounds(bounds)
     inputs.replace_bound("u_min", call.u_min)
@@ -148,6 +151,15 @@ def within_support(u_min: Tensor, u_max: Tensor, system: System) -> tuple[Tensor
             f"was fitted to, got {u_min.tolist()} to {u_max.tolist()}; set its action_support to None"
         )
     return limits
+
+
+def within_reach(u_min: Tensor, u_max: Tensor, system: System, x0: Tensor) -> tuple[Tensor, Tensor]:
+    """Bounds of the actions within those that a module's actuators can do at x0, where it has `action_bounds`."""
+    find = getattr(system, "action_bounds", None)
+    if find is None:
+        return u_min, u_max
+    low, high = (v.to(u_min) for v in find(x0))
+    return u_min.clamp(low, high), u_max.clamp(low, high)
 
 
 def check_system(lcs: object) -> System:

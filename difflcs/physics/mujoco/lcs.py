@@ -15,12 +15,13 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_choice, check_number, check_positive_int, check_tensor, describe
-from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
+from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor, describe
+from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError
 from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, contact_lcs, count_forces
+from difflcs.physics.mujoco.actuators import DYNAMICS, Actuators, disabled_actuators
 from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, Pairs
 from difflcs.physics.mujoco.groups import ContactGroup, ContactSelection
-from difflcs.physics.mujoco.motion import Actuators, Dynamic, QuasiStatic, disabled_actuators
+from difflcs.physics.mujoco.motion import Dynamic, QuasiStatic
 from difflcs.physics.mujoco.native import TAKEN, native
 from difflcs.physics.mujoco.nominal import Recovery, evaluate_nominal
 from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
@@ -48,11 +49,13 @@ class MujocoLCS:
     What a joint cannot move falls out of the Jacobians. Where all joints move in one plane, friction has one tangent,
     in this plane, and contacts across it, such as those of a floor below, are left out.
 
-    Not in the system: limits of joints, tendons and actuators (bound the actions and states of the MPC), margins of
-    geoms, torsional and rolling friction. Refused: active equality constraints, activation dynamics, adhesion, delay,
-    sleep, height fields and signed distance fields that may touch something, friction that override sets or that is not
-    the same in all directions; in quasi-static motion disabled actuators, and in dynamic motion dry friction in joints
-    and tendons. The matrices carry no gradient of the state.
+    Limits of actuators are bounds of the actions, see `action_bounds`, and activation is part of the state.
+
+    Not in the system: limits of joints and tendons (bound the states of the MPC), margins of geoms, torsional and
+    rolling friction. Refused: active equality constraints, adhesion, delay, sleep, height fields and signed distance
+    fields that may touch something, friction that override sets or that is not the same in all directions; in
+    quasi-static motion disabled actuators, and in dynamic motion dry friction in joints and tendons. The matrices carry
+    no gradient of the state.
 
     An object keeps one private copy of the model and its data, so use it from one thread at a time.
 
@@ -139,18 +142,18 @@ class MujocoLCS:
                         'replace it by damping, or use motion="quasi-static"'
                     )
             self._motion = kind(model, self._actuators, self.seconds, relative)
-        nominal = self._data.ctrl if ctrl is None else self._controls(torch.as_tensor(ctrl), torch.Size())
+        nominal = self._data.ctrl if ctrl is None else self._actuators.nominal(torch.as_tensor(ctrl), torch.Size())
         self._ctrl = np.where(self._actuators.holds & (ctrl is None), np.nan, nominal)
         length = _typical_radius(model) if length is None else check_number("length", length, strict=True)
         distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
         self.length, self._recovery = length, Recovery(model, length)
-        self._selection = None
-        if contacts is not None and not isinstance(contacts, int):
+        if isinstance(contacts, Sequence):
             self._selection = ContactSelection(model, contacts, distance)
-            contacts = self._selection.n_found
-        elif contacts is not None:
-            check_positive_int("contacts", contacts)
-        self._finder = ContactFinder(model, self._data, pairs, distance, length, contacts, friction)
+            budgets = self._selection.budgets
+        else:
+            self._selection = None
+            budgets = None if contacts is None else check_positive_int("contacts", contacts)
+        self._finder = ContactFinder(model, self._data, pairs, distance, length, budgets, friction)
         model.opt.disableflags |= sum(
             int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("EQUALITY", "FRICTIONLOSS", "LIMIT")
         )
@@ -159,7 +162,7 @@ class MujocoLCS:
 
     @property
     def n_x(self) -> int:
-        """Number of states: nv, or 2 nv with velocities."""
+        """Number of states: nv, or 2 nv + na with velocities."""
         return self.state.n_x
 
     @property
@@ -170,7 +173,7 @@ class MujocoLCS:
     @property
     def n_contacts(self) -> int:
         """Number of contacts of every state."""
-        return self._finder.n_contacts if self._selection is None else self._selection.n_contacts
+        return self._finder.n_contacts
 
     @property
     def n_lam(self) -> int:
@@ -183,15 +186,17 @@ class MujocoLCS:
 
         So each plan of a closed loop begins with rotations of zero, however far things have turned, and what uses
         `state`, such as a `MujocoCost`, counts from there as well. States of before are not those of now. For a batch
-        call `state.follow` and `state.to_state` with `qpos` (..., nq).
+        call `state.follow` and `state.to_state` with `qpos` (..., nq). What is not in the state is taken from the data
+        as well: where mocap has moved bodies, and the forces `qfrc_applied` and `xfrc_applied`.
 
         Raises:
             DTypeError, ShapeError, NonFiniteError: no such data.
         """
         if not isinstance(data, mujoco.MjData):
             raise DTypeError(f"data: expected a mujoco.MjData, got {describe(data)}; for arrays use state.follow")
+        _take(self._data, data)
         self.state.follow(data.qpos)
-        return self.state.to_state(data.qpos, data.qvel)
+        return self.state.to_state(data.qpos, data.qvel, data.act)
 
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
         """The system at states x (..., n_x).
@@ -257,46 +262,43 @@ class MujocoLCS:
         """
         check_tensor("x", x, [("n_x", self.n_x)])
         check_tensor("u", u, [("n_u", self.n_u)])
-        servo, dof = torch.from_numpy(self._actuators.servo), torch.from_numpy(self._actuators.dof)
-        if self._quasi_static and not servo.all():
-            raise InvalidInputError(
-                "model: expected position actuators to follow a quasi-static plan, got others; track x + u by your own "
-                "controller"
-            )
-        gear = torch.from_numpy(self._actuators.gear).to(u)
-        # The length of an actuator on a joint is gear · q.
-        here = gear * x[..., dof.clamp_min(0)]
-        if self._quasi_static:
-            return here + gear * u - torch.from_numpy(self._actuators.offset).to(u)
-        return u + here * servo if self._relative else u
+        return self._actuators.control(x, u, self._relative, self._quasi_static)
 
-    def _controls(self, ctrl: Tensor, batch: torch.Size) -> Any:
-        """Return nominal controls (*batch, nu) as an array."""
-        check_tensor("ctrl", ctrl, [("n_u", self.n_u)])
-        if broadcast_batch([("x", batch), ("ctrl", ctrl.shape[:-1])]) != batch:
-            raise ShapeError(
-                f"ctrl: expected one nominal control for each of the states {tuple(batch)}, or one for all, got "
-                f"{tuple(ctrl.shape)}; leave out its batch dimensions, or give x the same"
-            )
-        return ctrl.detach().double().cpu().expand(*batch, self.n_u).numpy()
+    def action_bounds(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute the bounds (..., n_u) of the actions within which actuators do what the system says.
+
+        These are `ctrlrange`, and unless motion is quasi-static `forcerange`, and `actuatorfrcrange` of joints with one
+        actuator; the layer keeps within them. Infinite where nothing is limited.
+
+        Args:
+            x: (..., n_x) states.
+        """
+        check_tensor("x", x, [("n_x", self.n_x)])
+        numbers = x.detach().double().cpu().numpy()
+        if self._quasi_static:
+            bounds = self._actuators.places(numbers)
+        else:
+            speed = numbers[..., self.state.nv :] if self.state.velocities else np.zeros_like(numbers)
+            bounds = self._actuators.bounds(numbers, speed, self._yields, self._relative)
+        low, high = (torch.from_numpy(v).to(x) for v in bounds)
+        return low, high
 
     def _read(self, x: Tensor, context: Tensor | None = None) -> _States:
         qpos, qvel = self.state.to_mujoco(x)
         batch, model, data = x.shape[:-1], self._model, self._data
         n = batch.numel()
         qpos, qvel = qpos.reshape(n, -1), qvel.reshape(n, -1)
-        ctrl = [self._ctrl] * n if context is None else self._controls(context, batch).reshape(n, -1)
-        contacts, moved = self._finder.allocate(n), self._motion.allocate(n)
+        flat = x.detach().double().cpu().reshape(n, self.n_x).numpy()
+        act = flat[:, self.n_x - self.state.na :] if self.state.na else [data.act.copy()] * n
+        ctrl = [self._ctrl] * n if context is None else self._actuators.nominal(context, batch).reshape(n, -1)
+        found, moved = self._finder.find(qpos), self._motion.allocate(n)
         for i in range(n):
             with native(model, data, f"in state {i} of {n}"):
-                data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
+                data.qpos[:], data.qvel[:], data.act[:] = qpos[i], qvel[i], act[i]
                 mujoco.mj_fwdPosition(model, data)
-                self._finder.read(i, contacts)
                 self._motion.read(i, data, moved, ctrl[i])
-        flat = x.detach().double().cpu().reshape(n, self.n_x).numpy()
         tangent = self.state.tangent(flat[:, : self.state.nv])
-        found = self._finder.finish(contacts)
-        return _States(batch, flat, tangent, self._selection.select(found) if self._selection else found, moved)
+        return _States(batch, flat, tangent, found, moved)
 
     def _typical_response(self) -> float:
         """Compute how far a unit of force moves two bodies apart that may touch, the median over their pairs."""
@@ -306,8 +308,11 @@ class MujocoLCS:
         x = np.zeros((1, self.n_x))
         if not isinstance(self._motion, Dynamic):
             response = self._motion.finish(moved, x, None).response.reshape(-1, nv, nv)[0].numpy()
+            self._yields = self._actuators.yields(response, 0.0)
         else:
-            response = self.seconds * self._motion.finish(moved, x).response[0]
+            impulse = self._motion.finish(moved, x).response[0]
+            response = self.seconds * impulse
+            self._yields = self._actuators.yields(self.seconds * response, response)
         jacobian, gives = np.empty((3, nv)), np.empty(model.ngeom)
         for geom in range(model.ngeom):
             mujoco.mj_jacGeom(model, data, jacobian, None, geom)
@@ -374,7 +379,7 @@ def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: A
     if data is None:
         raise DTypeError("data: expected a mujoco.MjData, got None; pass mujoco.MjData(model)")
     module = MujocoLCS(model, data, **options)
-    return module.params(module.state.to_state(data.qpos, data.qvel) if x is None else x)
+    return module.params(module.state.to_state(data.qpos, data.qvel, data.act) if x is None else x)
 
 
 def _check_model(model: Any, data: Any, motion: Motion) -> None:
@@ -384,15 +389,23 @@ def _check_model(model: Any, data: Any, motion: Motion) -> None:
         raise DTypeError(f"data: expected a mujoco.MjData, got {describe(data)}; pass mujoco.MjData(model)")
     if data is not None and len(data.qpos) != model.nq:
         raise InvalidInputError(f"data: expected nq={model.nq} of the model, got {len(data.qpos)}; pass MjData(model)")
+    dynamics, plugins = np.array(model.actuator_dyntype), np.array(model.actuator_plugin)
     refused = {
-        "joints": not model.nv,
+        "joints: nothing in it moves": not model.nv,
         "no equality constraints that are active": bool((model.eq_active0 if data is None else data.eq_active).any()),
-        "actuators without activation": bool(model.na),
-        "actuators without adhesion": bool((model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)).any()),
-        "one control for each actuator": getattr(model, "nactuator", model.nu) != model.nu,
-        "no flexible bodies": bool(model.nflex),
-        "no delay of actuators and sensors (delay, nsample)": bool(getattr(model, "nhistory", 0)),
-        'no <flag sleep="enable"/>': bool(model.opt.enableflags & _SLEEP),
+        "one control for each actuator, not those of <pid> and <orientation>": getattr(model, "nactuator", model.nu)
+        != model.nu,
+        "activation by an integrator, a filter, a muscle or a callback, not by <dcmotor>, <pid> or a plugin": bool(
+            (~np.isin(dynamics, DYNAMICS) & (model.actuator_actnum > 0) | (plugins >= 0)).any()
+        ),
+        "no <adhesion>, whose force depends on what is in contact": bool(
+            (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)).any()
+        ),
+        "rigid bodies, no <flex>": bool(model.nflex),
+        "no delay of actuators and sensors (delay, nsample), which would need their past as states": bool(
+            getattr(model, "nhistory", 0)
+        ),
+        'no <flag sleep="enable"/>, as what sleeps does not follow its forces': bool(model.opt.enableflags & _SLEEP),
         "actuators that are not disabled (actuatorgroupdisable, <flag actuation/>) in quasi-static motion, which moves "
         "what they drive": motion == "quasi-static" and bool(disabled_actuators(model).any()),
     }

@@ -37,7 +37,7 @@ class Nominal(NamedTuple):
     Attributes:
         contacts: gaps without the depth that the load makes and with what a slide would open; tangents along the slide.
         forces: (n, n_contacts, n_rays) of the extreme rays of Anitescu's cone, in the order of `contact_lcs` [N s].
-        carried: addition to `DynamicStep.step`, as loads are impulses along contacts.
+        carried: addition to (ζ, ν) of `DynamicStep.step`, as loads are impulses along contacts.
     """
 
     contacts: MujocoContacts
@@ -128,7 +128,7 @@ def evaluate_nominal(
     """
     compliance *= _SOFTER
     if not contacts.gap.size:
-        return Nominal(contacts, np.zeros((*contacts.gap.shape, 1)), np.zeros_like(step.step))
+        return Nominal(contacts, np.zeros((*contacts.gap.shape, 1)), np.zeros_like(step.delayed))
     closing = _find_closing(step.place, step.response, contacts)
     carried = _compute_carried(step, contacts, closing, np.zeros(contacts.tangent.shape[:3]))
     # First all that close hold.
@@ -174,7 +174,7 @@ def _compute_creep(
     if not contacts.tangent.shape[2]:
         return np.zeros_like(forces)
     each = forces.reshape(*contacts.tangent.shape[:3], 2)
-    friction, velocity = contacts.friction[:, :, None], step.x[:, None, None, contacts.normal.shape[-1] :]
+    friction, velocity = contacts.friction[:, :, None], step.velocity[:, None, None]
     gives = ((contacts.tangent @ step.inverse_mass[:, None]) * contacts.tangent).sum(-1)
     acceleration = gives * friction * (each[..., 0] - each[..., 1]) / step.seconds
     far = step.seconds * friction * recovery.crept(geom, acceleration, (contacts.tangent * velocity).sum(-1))
@@ -184,7 +184,7 @@ def _compute_creep(
 def _place(step: DynamicStep, carried: Array) -> Array:
     """Compute ζ (n, nv) after the step with the nominal action, with `carried` added to the motion without contact."""
     nv = step.place.shape[1]
-    return step.place + carried[:, :nv, -1] + (carried[:, :nv, nv : 2 * nv] @ step.x[:, nv:, None])[:, :, 0]
+    return step.place + carried[:, :nv, -1] + (carried[:, :nv, nv : 2 * nv] @ step.velocity[:, :, None])[:, :, 0]
 
 
 def _find_closing(place: Array, response: Array, contacts: MujocoContacts) -> NDArray[np.bool_]:
