@@ -107,7 +107,8 @@ class MPCController:
     def __init__(self, setup: Setup, on_failure: OnFailure = "hold", time_limit: float | None = None):
         limit = getattr(setup.backend, "time_limit", None) if time_limit is None else time_limit
         self._setup = setup = constant_setup(setup)
-        self._content, self._native = b"", None
+        self._content = b""
+        self._native: Any = None
         n_goal = setup.cost.n_goal if isinstance(setup.cost, GoalCost) else 0  # that of a module is its own business
         self._begin(setup.horizon, setup.lcs.n_x, setup.lcs.n_u, n_goal, on_failure, limit)
         known = {"lcs": (LCSParams, LCSSequence), "cost": PLAIN_COSTS}
@@ -121,7 +122,6 @@ class MPCController:
         self.horizon, self.n_x, self.n_u, self.n_goal = horizon, n_x, n_u, n_goal
         self._setup: Setup | None
         self._asks: frozenset[str]
-        self._native: Any
         self._own: dict[str, Tensor] = {}
         self._given = False
         self._status: int | None = None

@@ -224,7 +224,7 @@ class TaskSpec:
     @functools.cached_property
     def _cost(self) -> Any:
         cost = self.make_cost()
-        if not isinstance(cost, CostModule) or not all(hasattr(cost, name) for name in ("n_x", "n_u", "n_goal")):
+        if not all(hasattr(cost, name) for name in ("at", "n_x", "n_u", "n_goal")):
             raise DTypeError(
                 f"make_cost: expected it to return a GoalCost, or a CostModule with n_x, n_u and n_goal, got "
                 f"{type(cost).__name__}"

@@ -186,7 +186,7 @@ class PDDM(Trainer):
 
     def __init__(
         self,
-        cost: GoalCost | CostModule,
+        cost: Any,
         env: VectorEnv,
         settings: PDDMSettings,
         seed: int,
