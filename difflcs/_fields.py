@@ -69,8 +69,8 @@ def check_stages(values: dict[str, tuple[Tensor, int, int]]) -> int:
     for name, (value, rank, extra) in values.items():
         if value.ndim <= rank:
             raise ShapeError(
-                f"{name}: expected a dimension of stages before its last {rank}, got {describe(value)}; name in "
-                f"by_stage the fields that have one"
+                f"{name}: expected a dimension of stages before its last {rank}, got {describe(value)}; say by "
+                f"by_stage which fields have one"
             )
         stages = value.shape[-1 - rank] - extra
         if stages < 1:

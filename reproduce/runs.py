@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 def check_amounts(**amounts: int | None) -> None:
-    """Raise `InvalidInputError` if an amount that is given is below 1."""
+    """Raise `InvalidInputError` if an amount is below 1."""
     for name, amount in amounts.items():
         if amount is not None and amount < 1:
             raise InvalidInputError(f"{name}: expected at least 1, got {amount}; pass another --{name}")
@@ -47,7 +47,7 @@ def check_amounts(**amounts: int | None) -> None:
 
 @dataclass(frozen=True)
 class Compute:
-    """What to compute, and where. Without --preset and --rerun the scripts only draw what is there."""
+    """Options of the computation. Without --preset and --rerun the scripts only draw existing results."""
 
     preset: PresetName | None = None
     """smoke (about a minute), quick (about half an hour a script on 2 cores) or paper (10 seeds, 1000 goals). To draw:
@@ -81,7 +81,7 @@ class Compute:
 
 
 def make_jobs(wanted: Sequence[Unit], preset: Preset, work: Path) -> list[Job]:
-    """The jobs of units, in their order."""
+    """Make the jobs of units, in their order."""
     objects = {task: units.describe_object(task) for task in dict.fromkeys(unit.task for unit in wanted)}
     stand_ins = [task for task, described in objects.items() if described["source"] == "stand_in"]
     if stand_ins:
@@ -90,7 +90,7 @@ def make_jobs(wanted: Sequence[Unit], preset: Preset, work: Path) -> list[Job]:
 
 
 def still_missing(jobs: Sequence[Job], results: Sequence[pd.DataFrame]) -> list[Job]:
-    """The jobs without results, and those that they start from, whose runs they need."""
+    """List the jobs without results, and those whose runs they start from."""
     known = {tuple(row) for rows in results for row in rows[records.IDENTITY].itertuples(index=False)}
     starts = {job.unit.init for job in jobs if job.identity not in known}
     return [job for job in jobs if job.identity not in known or job.unit in starts]
@@ -156,7 +156,7 @@ def compute(
 
 @contextlib.contextmanager
 def connect(workers: int | None = None, scheduler: str | None = None) -> Iterator[Client]:
-    """A client of a scheduler, or of worker processes on this machine, which end with this one however that ends.
+    """Connect to a scheduler, or start worker processes on this machine, which always end with this one.
 
     A unit whose worker dies goes on from its last checkpoint, as often as Dask allows (`allowed-failures`, 3).
     """
@@ -179,7 +179,7 @@ def connect(workers: int | None = None, scheduler: str | None = None) -> Iterato
 
 
 def run(options: Compute, artefacts: Sequence[str]) -> int:
-    """Compute what artefacts (none: all) need; returns the exit code, 1 if units have failed."""
+    """Compute the units that artefacts (none: all) need; return the exit code, 1 if units have failed."""
     preset = units.PRESETS[options.preset or "quick"]
     preset = preset.with_amounts(options.seeds, options.goals)
     wanted = units.matrix(artefacts, preset, options.objects, options.methods, options.recipes)
@@ -210,7 +210,7 @@ def run(options: Compute, artefacts: Sequence[str]) -> int:
 
 
 def command_line(kind: type[Any], action: Callable[[Any], int], arguments: Sequence[str] | None = None) -> int:
-    """Run a script with its options, a dataclass: its exit code, 2 after an error of the user, 130 after Ctrl-C."""
+    """Run a script with its options, a dataclass; return the exit code, 2 after a user's error, 130 after Ctrl-C."""
     from difflcs_envs import DifflcsEnvsError
 
     try:

@@ -134,7 +134,7 @@ def test_matrix_of_a_part():
     assert {unit.seed for unit in ablations} == set(range(FIRST, FIRST + units.ABLATION_SEEDS))
     # In each of them one part is missing: all differ from each other.
     configs = [units.config_of(unit, paper).method for unit in ablations if unit.task == "cube" and unit.seed == FIRST]
-    tasks = [unit.own.task for unit in ablations if unit.task == "cube" and unit.seed == FIRST]
+    tasks = [unit.changes.task for unit in ablations if unit.task == "cube" and unit.seed == FIRST]
     assert len({repr(pair) for pair in zip(configs, tasks, strict=True)}) == len(units.ABLATED) + 1
 
 
