@@ -50,6 +50,7 @@ Library make_library(const nb::dict& f, int kinds, int stride) {
   library.kinds = kinds;
   library.stride = stride;
   library.on_error = at<OnError*>(f, "mju_user_error");
+  library.clock = at<void**>(f, "mjcb_time");
   return library;
 }
 
@@ -149,7 +150,7 @@ using Outcome = std::tuple<int64_t, int64_t, std::string>;
 template <class Work>
 Outcome on_threads(const Library& library, const std::vector<const Place*>& places, int64_t states, Work work) {
   nb::gil_scoped_release release;
-  const Errors errors(library.on_error);
+  const Errors errors(library);
   std::vector<std::string> said(states);
   std::vector<int64_t> failed(states, -1);
   std::atomic<int64_t> next{0};
