@@ -26,7 +26,7 @@ from difflcs.physics.mujoco.native import TAKEN, native
 from difflcs.physics.mujoco.nominal import Recovery, evaluate_nominal
 from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
 from difflcs.physics.mujoco.state import MujocoState
-from difflcs.records import LCSParams
+from difflcs.records import LCSParams, LCSSequence, sequence_along
 
 __all__ = ["Motion", "MujocoLCS", "lcs_from_mujoco"]
 
@@ -238,6 +238,14 @@ class MujocoLCS:
         if self._selection is not None:
             system = self._selection.reduce(system)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
+
+    def sequence(self, plan: Any, x: Tensor | None = None) -> LCSSequence:
+        """Linearise along the actions of a plan, from its state or from x (..., n_x), see `difflcs.sequence_along`."""
+        return sequence_along(self, plan, x)
+
+    def context_along(self, x: Tensor, u: Tensor, context: Tensor | None = None) -> Tensor | None:
+        """Return the nominal controls (..., nu) of actions u (..., n_u) at states x (..., n_x) of a plan."""
+        return context if self._quasi_static else self.control(x, u)
 
     def _convert_forces(self, forces: Any) -> Any:
         """Convert forces (n, n_contacts, n_rays) along Anitescu's rays to those (n, n_lam) of the system's cone."""
