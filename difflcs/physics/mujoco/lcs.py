@@ -221,7 +221,8 @@ class MujocoLCS:
             nominal = evaluate_nominal(
                 step, contacts, contacts.geom, self._recovery, self._give, self.compliance, opens
             )
-            contacts, rest = nominal.contacts, read.batched(self._convert_forces(nominal.forces))
+            forces = _convert_forces(nominal.forces, self._finder.n_tangents, self.cone)
+            contacts, rest = nominal.contacts, read.batched(forces)
             free = step.free(read.tangent, nominal.carried)
         ranks = zip(free, (2, 2, 1, 2), strict=True)
         system = contact_lcs(
@@ -246,13 +247,6 @@ class MujocoLCS:
     def context_along(self, x: Tensor, u: Tensor, context: Tensor | None = None) -> Tensor | None:
         """Return the nominal controls (..., nu) of actions u (..., n_u) at states x (..., n_x) of a plan."""
         return context if self._quasi_static else self.control(x, u)
-
-    def _convert_forces(self, forces: Any) -> Any:
-        """Convert forces (n, n_contacts, n_rays) along Anitescu's rays to those (n, n_lam) of the system's cone."""
-        each = count_forces(1, self._finder.n_tangents, self.cone)
-        if each != forces.shape[-1]:  # Stewart and Trinkle: normal, tangential, and the distance
-            forces = np.concatenate([forces.sum(-1, keepdims=True), np.zeros((*forces.shape[:2], each - 1))], -1)
-        return forces.reshape(len(forces), -1)
 
     def contacts(self, x: Tensor) -> Contacts:
         """Compute the gaps and their derivatives at states x (..., n_x).
@@ -390,6 +384,14 @@ def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: A
         raise DTypeError("data: expected a mujoco.MjData, got None; pass mujoco.MjData(model)")
     module = MujocoLCS(model, data, **options)
     return module.params(module.state.to_state(data.qpos, data.qvel, data.act) if x is None else x)
+
+
+def _convert_forces(forces: Any, n_tangents: int, cone: Cone) -> Any:
+    """Convert forces (n, n_contacts, n_rays) along Anitescu's rays to those (n, n_lam) of a cone."""
+    each = count_forces(1, n_tangents, cone)
+    if each != forces.shape[-1]:  # Stewart and Trinkle: normal, tangential, and the distance
+        forces = np.concatenate([forces.sum(-1, keepdims=True), np.zeros((*forces.shape[:2], each - 1))], -1)
+    return forces.reshape(len(forces), -1)
 
 
 def _check_model(model: Any, data: Any, motion: Motion) -> None:
