@@ -1,13 +1,15 @@
 """A module linearised along a plan, and a layer that plans in several passes."""
 
-import mujoco
 import pytest
 import torch
 
 from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSParams, LCSSequence, QuadraticCost, sequence_along
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.physics import ContactLCS, PlanarPushing, PositionDrive, box
-from difflcs.physics.mujoco import MujocoLCS
+
+mujoco = pytest.importorskip("mujoco")
+
+from difflcs.physics.mujoco import MujocoLCS  # noqa: E402
 
 DOOR = """<mujoco><option timestep=".002" integrator="implicitfast"/><worldbody>
   <body><joint name="angle" type="hinge" axis="0 0 1" damping=".5"/>
