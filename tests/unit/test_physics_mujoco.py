@@ -323,9 +323,9 @@ def test_contacts_of_a_pair_do_not_depend_on_the_other_pairs():
         + "".join(body.format(*each) for each in ((-0.1, 3, "a"), (0, 2, "b"), (0.1, 4, "c")))
     )
     pairs = [(name, "base") for name in "abc"]
-    x = MujocoState(model).to_state(model.qpos0)
-    together = MujocoLCS(model, pairs=pairs, contacts=12).contacts(x)
-    alone = [MujocoLCS(model, pairs=[pair], contacts=4).contacts(x) for pair in pairs]
+    x = MujocoState(model, velocities=True).to_state(model.qpos0)
+    together = MujocoLCS(model, motion="dynamic", pairs=pairs, contacts=12).contacts(x)
+    alone = [MujocoLCS(model, motion="dynamic", pairs=[pair], contacts=4).contacts(x) for pair in pairs]
     for name in ("normal", "tangent"):
         mine, theirs = (v.abs().sum(0) for v in (getattr(together, name), torch.cat([getattr(c, name) for c in alone])))
         torch.testing.assert_close(mine, theirs)
