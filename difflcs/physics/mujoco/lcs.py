@@ -325,18 +325,8 @@ class MujocoLCS:
             impulse = self._motion.finish(moved, x).response[0]
             response = self.seconds * impulse
             self._yields = self._actuators.yields(self.seconds * response, response)
-        jacobian, gives = np.empty((3, nv)), np.empty(model.ngeom)
-        for geom in range(model.ngeom):
-            mujoco.mj_jacGeom(model, data, jacobian, None, geom)
-            gives[geom] = np.trace(jacobian @ response @ jacobian.T) / (3 if self._finder.axis is None else 2)
-        first, second = self._finder.pairs if self._selection is None else self._selection.main(self._finder.pairs)
-        apart = (gives[first] + gives[second])[gives[first] + gives[second] > 0]
-        if len(first) and not len(apart):
-            raise InvalidInputError(
-                "model: expected something that contact forces can move, got nothing; what is pushed needs joints "
-                "without actuators, and a mobility above 0"
-            )
-        return float(np.median(apart)) if len(apart) else 1.0
+        pairs = self._finder.pairs if self._selection is None else self._selection.main(self._finder.pairs)
+        return _median_apart(model, data, response, pairs, 3 if self._finder.axis is None else 2)
 
 
 class _States(NamedTuple):
@@ -432,6 +422,22 @@ def _check_model(model: Any, data: Any, motion: Motion) -> None:
     for wanted, present in refused.items():
         if present:
             raise InvalidInputError(f"model: expected {wanted}, got something else; change the model")
+
+
+def _median_apart(model: Any, data: Any, response: Any, pairs: Any, dimensions: int) -> float:
+    """Compute how far a unit of force moves two geoms of a pair apart, the median, for the response of the joints."""
+    jacobian, gives = np.empty((3, model.nv)), np.empty(model.ngeom)
+    for geom in range(model.ngeom):
+        mujoco.mj_jacGeom(model, data, jacobian, None, geom)
+        gives[geom] = np.trace(jacobian @ response @ jacobian.T) / dimensions
+    first, second = pairs
+    apart = (gives[first] + gives[second])[gives[first] + gives[second] > 0]
+    if len(first) and not len(apart):
+        raise InvalidInputError(
+            "model: expected something that contact forces can move, got nothing; what is pushed needs joints "
+            "without actuators, and a mobility above 0"
+        )
+    return float(np.median(apart)) if len(apart) else 1.0
 
 
 def _take(into: Any, data: Any) -> None:
