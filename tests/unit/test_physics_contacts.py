@@ -70,15 +70,17 @@ def test_threads_find_what_one_finds():
     model = pile()
     module = MujocoLCS(model, contacts=12, motion="dynamic")
     x = module.state.to_state(placed(model, 6))
-    alone = [module.contacts(state) for state in x]
+    alone, systems = [module.contacts(state) for state in x], [module.params(state) for state in x]
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(3)
-        together = module.contacts(x)
+        together, system = module.contacts(x), module.params(x)
     finally:
         torch.set_num_threads(threads)
     for found, expected in zip(together, zip(*alone, strict=True), strict=True):
         assert torch.equal(found, torch.stack(expected))
+    for name in ("A", "d", "F"):
+        torch.testing.assert_close(getattr(system, name), torch.stack([getattr(s, name) for s in systems]))
 
 
 def test_more_contacts_than_the_default_warn_once():
