@@ -121,12 +121,12 @@ def solve_soft(
         high: (n, m) largest forces; None: infinite.
     """
     force = np.empty_like(gap)
-    low = np.zeros_like(gap) if low is None else low
-    high = np.full_like(gap, np.inf) if high is None else high
-    arrays = map(np.ascontiguousarray, (rows, np.broadcast_to(response, (len(gap), *response.shape[-2:])), gap))
-    limits = map(np.ascontiguousarray, (low, high))
+    low = np.zeros_like(gap) if low is None else np.ascontiguousarray(low)
+    high = np.full_like(gap, np.inf) if high is None else np.ascontiguousarray(high)
+    rows, gap = np.ascontiguousarray(rows), np.ascontiguousarray(gap)
+    response = np.ascontiguousarray(np.broadcast_to(response, (len(gap), *response.shape[-2:])))
     threads = max(1, min(len(gap), torch.get_num_threads()))
-    _mujoco.solve_soft(*arrays, compliance, *limits, threads, force)
+    _mujoco.solve_soft(rows, response, gap, compliance, low, high, threads, force)
     return force
 
 
