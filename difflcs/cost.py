@@ -149,7 +149,7 @@ class QuadraticCost(_Quadratic):
 
     @classmethod
     def of_checked(cls, fields: Mapping[str, Tensor]) -> Self:
-        """A cost of fields that fit each other, all but S; nothing is checked here."""
+        """Make a cost of fields that fit each other, all but S; nothing is checked here."""
         cost = cls.__new__(cls)
         nn.Module.__init__(cost)
         cost._buffers.update({name: fields.get(name) for name in _DIMENSIONS})

@@ -129,8 +129,8 @@ def _inputs(call: Call) -> list[Tensor]:
 
 def _signature(call: Call) -> tuple | None:
     """Return the shapes and dtypes of a call's arguments; None if it cannot be repeated, or must be refused."""
-    x0, goal, reference, _, u_min, u_max, bounds, lcs, cost, constraints, context = call
-    if not (reference is u_min is u_max is bounds is cost is constraints is context is None):
+    x0, goal, reference, _, u_min, u_max, bounds, lcs, cost, constraints, *rest = call
+    if not (reference is u_min is u_max is bounds is cost is constraints is None) or any(v is not None for v in rest):
         return None
     if not _is_double(x0) or not (goal is None or is_array(goal)) or transforms_active() or forward_mode_active():
         return None
