@@ -15,7 +15,6 @@ from difflcs.errors import InvalidInputError
 from difflcs.rl import EnsembleSettings, Epochs, ModelRollouts, ModelRolloutSettings
 from difflcs.rl.learning.dynamics import Ensemble
 from difflcs.rl.learning.model_rollouts import ModelEnv
-from difflcs.rl.rollout import collect, uniform_actions
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -128,13 +127,6 @@ def test_episodes_end_together_and_begin_anew():
     assert not truncated.any()
     starts = episodes()["state"][:, 0].tolist()
     assert all(row in starts for row in observation["state"].tolist())
-
-
-def test_collect_plays_it():
-    env = make_env()
-    played = collect(env, uniform_actions(env, np.random.default_rng(0)), [1, 2], STEPS)
-    assert played["state"].shape == (2, STEPS + 1, N_X)
-    assert bool(played["stable"].all())
 
 
 def test_predictions_stay_near_the_data_and_finite():

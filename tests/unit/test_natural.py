@@ -8,7 +8,7 @@ from torch import nn
 pytest.importorskip("torchrl")
 from difflcs.errors import InvalidInputError
 from difflcs.mpc.backends import BatchedBackend
-from difflcs.rl.learning.optim import NaturalGradient, StepSize
+from difflcs.rl.learning.optim import NaturalGradient
 from difflcs.rl.learning.policy import make_actor
 from tests.training.slide import drawn, make_model, make_mpc
 
@@ -88,27 +88,6 @@ def test_no_step_without_a_metric(jacobian):
     optimiser.zero_grad()
     optimiser.step()
     assert not flat(parameters).any()
-
-
-def test_nothing_runs_away_where_no_action_can_move():
-    """All actions at their bounds: no Jacobian, no gradient; what is known of the metric remains."""
-    parameters, optimiser = make(momentum=0.8)
-    optimiser.measure(JACOBIAN)
-    metric = optimiser.metric.clone()
-    backward(parameters, [1.0, -2.0, 0.5])
-    optimiser.step()
-    moved = flat(parameters)
-    for _ in range(20):
-        optimiser.measure(torch.zeros_like(JACOBIAN))
-        backward(parameters, [0.0, 0.0, 0.0])
-        optimiser.step()
-    assert torch.equal(optimiser.metric, metric)
-    assert torch.equal(flat(parameters), moved)
-
-    size = StepSize(0.06, target_kl=0.08, factor=1.5, longest=0.4)
-    for _ in range(30):
-        size.adapt(0.0)
-    assert size.value == pytest.approx(0.4)
 
 
 def test_samples_near_a_jump_do_not_make_the_metric():
