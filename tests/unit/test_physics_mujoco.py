@@ -315,6 +315,22 @@ def test_where_contacts_are_disabled_nothing_touches_but_what_is_named(flag):
     assert named.gap[:4].tolist() == pytest.approx([0.005] * 4)
 
 
+def test_contacts_of_a_pair_do_not_depend_on_the_other_pairs():
+    """Faces of several pairs that meet at the same time: cylinders on a tilted box."""
+    body = '<body pos="{0} .01 .0{1}"><freejoint/><geom name="{2}" type="cylinder" size=".0{1} .0{1}"/></body>'
+    model = load(
+        '<geom name="base" type="box" size=".2 .1 .02" pos="0 0 -.02" euler="0 0 9"/>'
+        + "".join(body.format(*each) for each in ((-0.1, 3, "a"), (0, 2, "b"), (0.1, 4, "c")))
+    )
+    pairs = [(name, "base") for name in "abc"]
+    x = MujocoState(model, velocities=True).to_state(model.qpos0)
+    together = MujocoLCS(model, motion="dynamic", pairs=pairs, contacts=12).contacts(x)
+    alone = [MujocoLCS(model, motion="dynamic", pairs=[pair], contacts=4).contacts(x) for pair in pairs]
+    for name in ("normal", "tangent"):
+        mine, theirs = (v.abs().sum(0) for v in (getattr(together, name), torch.cat([getattr(c, name) for c in alone])))
+        torch.testing.assert_close(mine, theirs)
+
+
 # --- quasi-static motion --------------------------------------------------------------------------------------------
 
 

@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import mujoco
@@ -166,15 +164,16 @@ class Actuators:
         """Time (na,) by which an activation's rate at the beginning of a time step moves it in this step."""
         return np.where(self._decays, -self._time * np.expm1(-seconds / self._time), seconds)
 
-    @contextmanager
-    def unlimited_rates(self, model: Any) -> Iterator[None]:
-        """Let activations change by their rates, however long the step, without the limits of what they reach."""
-        fields = ("actuator_dyntype", "actuator_actlimited", "actuator_actearly")
-        kept = [getattr(model, name).copy() for name in fields]
+    def unlimit_rates(self, model: Any) -> None:
+        """Let activations of a model change by their rates, however long the step, to whatever value."""
         model.actuator_dyntype[self._exact], model.actuator_actlimited[:], model.actuator_actearly[:] = _FILTER, 0, 0
-        yield
-        for name, values in zip(fields, kept, strict=True):
-            getattr(model, name)[:] = values
+
+    def describe_balance(self, relative: NDArray[np.intp]) -> dict[str, list[Any]]:
+        """Describe `balance` and `clip` for the compiled part; actions of `relative` count from where they are."""
+        low, high = self.range
+        numbers = {"gain": self._gain, "constant": self._constant, "bias": self._bias, "low": low, "high": high}
+        masks = {"holds": self.holds, "relative": np.isin(np.arange(len(self.dof)), relative)}
+        return {name: values.tolist() for name, values in (numbers | masks).items()}
 
 
 def disabled_actuators(model: Any) -> NDArray[np.bool_]:

@@ -21,6 +21,7 @@ from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, contact_
 from difflcs.physics.mujoco.actuators import DYNAMICS, Actuators, disabled_actuators
 from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, Pairs
 from difflcs.physics.mujoco.groups import ContactGroup, ContactSelection
+from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.motion import Dynamic, QuasiStatic
 from difflcs.physics.mujoco.native import TAKEN, native
 from difflcs.physics.mujoco.nominal import Recovery, evaluate_nominal
@@ -147,13 +148,14 @@ class MujocoLCS:
         length = _typical_radius(model) if length is None else check_number("length", length, strict=True)
         distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
         self.length, self._recovery = length, Recovery(model, length)
-        self._selection = None
-        if contacts is not None and not isinstance(contacts, int):
+        if isinstance(contacts, Sequence):
             self._selection = ContactSelection(model, contacts, distance)
-            contacts = self._selection.n_found
-        elif contacts is not None:
-            check_positive_int("contacts", contacts)
-        self._finder = ContactFinder(model, self._data, pairs, distance, length, contacts, friction)
+            budgets = self._selection.budgets
+        else:
+            self._selection = None
+            budgets = None if contacts is None else check_positive_int("contacts", contacts)
+        self._places = Places(model, self._data)
+        self._finder = ContactFinder(model, self._data, self._places, pairs, distance, length, budgets, friction)
         model.opt.disableflags |= sum(
             int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("EQUALITY", "FRICTIONLOSS", "LIMIT")
         )
@@ -173,7 +175,7 @@ class MujocoLCS:
     @property
     def n_contacts(self) -> int:
         """Number of contacts of every state."""
-        return self._finder.n_contacts if self._selection is None else self._selection.n_contacts
+        return self._finder.n_contacts
 
     @property
     def n_lam(self) -> int:
@@ -285,28 +287,34 @@ class MujocoLCS:
 
     def _read(self, x: Tensor, context: Tensor | None = None) -> _States:
         qpos, qvel = self.state.to_mujoco(x)
-        batch, model, data = x.shape[:-1], self._model, self._data
+        batch, data = x.shape[:-1], self._data
         n = batch.numel()
         qpos, qvel = qpos.reshape(n, -1), qvel.reshape(n, -1)
         flat = x.detach().double().cpu().reshape(n, self.n_x).numpy()
-        act = flat[:, self.n_x - self.state.na :] if self.state.na else [data.act.copy()] * n
-        ctrl = [self._ctrl] * n if context is None else self._actuators.nominal(context, batch).reshape(n, -1)
-        contacts, moved = self._finder.allocate(n), self._motion.allocate(n)
+        act = flat[:, self.n_x - self.state.na :] if self.state.na else np.broadcast_to(data.act, (n, len(data.act)))
+        ctrl = self._ctrl if context is None else self._actuators.nominal(context, batch).reshape(n, -1)
+        ctrl, found = np.broadcast_to(ctrl, (n, self.n_u)), self._finder.find(qpos)
+        moved = self._read_motion(np.concatenate([qpos, qvel, act], -1), ctrl)
+        tangent = self.state.tangent(flat[:, : self.state.nv])
+        return _States(batch, flat, tangent, found, moved)
+
+    def _read_motion(self, states: Any, ctrl: Any) -> Any:
+        """Read the motion at states (n, nq + nv + na) of MuJoCo, with nominal controls (n, nu)."""
+        model, data, n = self._model, self._data, len(states)
+        if isinstance(self._motion, Dynamic):
+            return self._motion.read(self._places, states, ctrl)
+        moved = self._motion.allocate(n)
         for i in range(n):
             with native(model, data, f"in state {i} of {n}"):
-                data.qpos[:], data.qvel[:], data.act[:] = qpos[i], qvel[i], act[i]
+                data.qpos[:], data.qvel[:], data.act[:] = np.split(states[i], [model.nq, model.nq + model.nv])
                 mujoco.mj_fwdPosition(model, data)
-                self._finder.read(i, contacts)
                 self._motion.read(i, data, moved, ctrl[i])
-        tangent = self.state.tangent(flat[:, : self.state.nv])
-        found = self._finder.finish(contacts)
-        return _States(batch, flat, tangent, self._selection.select(found) if self._selection else found, moved)
+        return moved
 
     def _typical_response(self) -> float:
         """Compute how far a unit of force moves two bodies apart that may touch, the median over their pairs."""
         model, data, nv = self._model, self._data, self.state.nv
-        moved = self._motion.allocate(1)
-        self._motion.read(0, data, moved, self._ctrl)
+        moved = self._read_motion(np.concatenate([data.qpos, data.qvel, data.act])[None], self._ctrl[None])
         x = np.zeros((1, self.n_x))
         if not isinstance(self._motion, Dynamic):
             response = self._motion.finish(moved, x, None).response.reshape(-1, nv, nv)[0].numpy()
