@@ -196,24 +196,6 @@ def test_the_same_model_is_deployed_in_several_ways(tmp_path, one_thread, monkey
     pd.testing.assert_frame_equal(rows.drop(columns=TIMES), undisturbed.drop(columns=TIMES))
 
 
-def test_what_the_training_has_evaluated_itself_is_not_evaluated_again(tmp_path, one_thread, monkeypatch):
-    preset = replace(TINY, evaluate_at=(0.0, *TINY.evaluate_at))
-    (job,) = make_jobs([Unit("cube", "violation", "ours", FIRST)], tmp_path, preset).values()
-    calls, measure = [], deployment.Deployments.measure
-
-    def counted(self, run, protocol, goals):
-        calls.append(protocol)
-        return measure(self, run, protocol, goals)
-
-    monkeypatch.setattr(deployment.Deployments, "measure", counted)
-    rows = worker.execute(job)
-    assert calls == ["support"] * 2  # before any data the support is as wide as the bounds, and narrower later
-    monkeypatch.setattr(deployment.Deployments, "of_training", lambda *_: None)
-    all_measured = worker.execute(replace(job, work=tmp_path / "all"))
-    assert calls == ["support"] * 5
-    pd.testing.assert_frame_equal(rows.drop(columns=TIMES), all_measured.drop(columns=TIMES))
-
-
 def test_key_changes_with_everything_that_decides_a_result_and_with_nothing_else(monkeypatch):
     def key(unit=CUBE, preset=TINY, objects=KNOWN):
         return units.key_of(unit, preset, objects)
@@ -571,34 +553,6 @@ def test_table1_shows_ours_beside_the_paper(results, capsys):
     assert f"LCS-RL, our recipe, at the end against {deployed}" in markdown
 
 
-def test_numbers_by_hand_stand_in_the_other_tables(results, capsys, monkeypatch):
-    monkeypatch.setattr(report, "write_figure", lambda *figure: None)
-    for seed in range(3):
-        adam, none = (Unit("cube", *units.ABLATED[name], seed) for name in ("adam", "no-warm-up"))
-        records.add(results, "paper", unit_rows(adam, (0, 40, 40, 60 + 10 * seed)))
-        records.add(results, "paper", unit_rows(none, (0, 40, 60 + 10 * seed, 50)))
-        for recipe, mass, end in (("paper", 0.05, 20), ("light", 0.01, 60 + seed)):
-            rows = unit_rows(Unit("mug", "lcs-rl", recipe, seed), (0, 10, 20, end), version="2")
-            records.add(results, "paper", rows.assign(mass=mass))
-    for script in (ablations, fig_learning_curves, fig_transfer, masses):
-        assert run_script(script.main, capsys, "--results", results)[0] == 0
-    (line,) = cells_of(results / "ablations.md", "with Adam")
-    assert line[3:] == ["70.0 [60.0, 80.0]", "−20.0 [−30.0, −10.0]", "0.250", "−10.0 [−10.0, −10.0]", "0.250"]
-    (line,) = (row for row in cells_of(results / "fig_learning_curves.md", "violation only") if row[1].startswith("+"))
-    ends = ["+0.0 [+0.0, +0.0]", "1.000", "+20.0 [+20.0, +20.0]", "0.250", "+60.0 [+60.0, +60.0]", "0.250"]
-    assert line[1:] == ends
-    said = "LCS-RL, our recipe, the lowest of 3 seeds: 6 min 40.0 %, 10 min 50.0 %, final 70.0 %."
-    assert said in (results / "fig_learning_curves.md").read_text()
-    success, apart = cells_of(results / "fig_transfer.md", "mug")[:2]
-    assert success[1] == "30.0 [30.0, 30.0]"  # the cube's model without any data
-    assert success[4:] == ["50.0 [40.0, 60.0]", "60.0 [60.0, 60.0]", "80.0 [70.0, 90.0]", "89.0 [79.0, 99.0]"]
-    assert apart[3:] == ["+10.0 [+0.0, +20.0]", "0.500", "+9.0 [+9.0, +9.0]", "0.250"]  # 6 min, final
-    (line,) = cells_of(results / "masses.md", "mug")
-    assert [cell.split(" ")[0] for cell in line[-3:]] == ["20.0", "61.0", "44.6"]
-    said = "At 50 g, LCS-RL at the end against the paper's mean: worse on 1 (mug)"
-    assert said in (results / "masses.md").read_text()
-
-
 def test_differences_are_of_whole_goals(tmp_path):
     """With shares of six decimals equal differences would not be equal, and p too small: here the mean is zero."""
     for seed, reached in enumerate((97, 101, 101, 101)):
@@ -745,20 +699,6 @@ def test_robustness_is_resumed_and_refuses_another_record(tmp_path, monkeypatch,
     (tmp_path / "robustness.json").unlink()
     with pytest.raises(CheckpointError, match=r"robustness\.py --rerun"):
         robustness.draw_record(replace(options, smoke=False))
-
-
-def test_robustness_changes_what_it_says(monkeypatch):
-    found = list(robustness.conditions(0.01, 0.5, 1000.0))
-    assert [one.name for one in found if one.group == "mass"] == ["2 g", "5 g", "20 g", "30 g", "100 g"]
-    assert {"osc_kp": 2500.0} in [one.env for one in found]
-    seen = []
-    act = lambda state, goal: (seen.append(state), (np.zeros((len(state), 6)), np.zeros(len(state), bool)))[1]  # noqa: E731
-    monkeypatch.setattr(robustness, "mpc_actions", lambda policy: act)
-    state, goal = torch.zeros(2000, 9, dtype=torch.float64), torch.zeros(2000, 3, dtype=torch.float64)
-    noisy = next(one for one in found if one.noise == (0.003, 0.05))
-    robustness.acting(noisy, None, 6, np.random.default_rng(0))(state, goal)
-    assert seen[0].std(0)[:3].tolist() == pytest.approx([0.003, 0.003, 0.05], rel=0.1)
-    assert not seen[0][:, 3:].any()  # where the tips are, the robot knows
 
 
 # --- bad input --------------------------------------------------------------------------------------

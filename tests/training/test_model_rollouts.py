@@ -199,19 +199,6 @@ def test_foreseen_is_what_was_played():
 # --- data and ensemble ------------------------------------------------------------------------------
 
 
-def test_the_ensemble_learns_the_episodes():
-    rollouts = make_rollouts(width=64, first=150, minibatch=32)
-    rollouts.add(episodes(60))
-    rollouts.fit()
-    other = episodes(20, seed=5)
-    states, inputs = other["state"], (other["state"][:, :-1], other["action"])
-    with torch.no_grad():
-        predicted = rollouts.ensemble(*(v.flatten(0, 1).float().expand(2, -1, -1) for v in inputs)).mean(0)
-    changes = (states[:, 1:] - states[:, :-1]).flatten(0, 1)
-    error = predicted - states[:, 1:].flatten(0, 1)
-    assert float(error.square().mean()) < 0.05 * float(changes.square().mean())
-
-
 def test_the_first_fit_takes_epochs_of_its_own(monkeypatch):
     rollouts, taken = make_rollouts(first=3), []
     monkeypatch.setattr(rollouts.ensemble, "fit", lambda *_, epochs, **__: taken.append(epochs) or 0.0)
