@@ -27,7 +27,7 @@ from difflcs.lcs import SYSTEM, LCSModule, LCSParams, LCSSequence
 from difflcs.mpc.backends.base import Backend
 from difflcs.mpc.problem import INPUTS, MAY_BE_INFINITE
 from difflcs.mpc.solution import MPCSolution, Primal
-from difflcs.records import system_at
+from difflcs.records import sequence_along, system_at
 
 RANKS = {**{name: len(dims) for name, dims in INPUTS.items()}, "constant": 0}
 """Number of dimensions of each input of a call behind those of the batch and of the stages."""
@@ -92,7 +92,11 @@ class Setup(NamedTuple):
 
 
 class Call(NamedTuple):
-    """What a call of a layer gives; the names are those of `LCSMPCLayer.forward`."""
+    """What a call of a layer gives; the names are those of `LCSMPCLayer.forward`.
+
+    Attributes:
+        along: the plan along which a module is asked for its system; None: at x0.
+    """
 
     x0: Tensor
     goal: Tensor | None = None
@@ -105,6 +109,7 @@ class Call(NamedTuple):
     cost: Cost | None = None
     constraints: Constraints | None = None
     context: Tensor | None = None
+    along: Primal | None = None
 
 
 def gather(setup: Setup, call: Call) -> Inputs:
@@ -118,7 +123,7 @@ def gather(setup: Setup, call: Call) -> Inputs:
     inputs = Inputs(setup.horizon)
     cost = setup.cost if call.cost is None else check_cost(call.cost)
     check_context(call.context, system, cost)
-    inputs.add_system(system, call.x0, call.context)
+    inputs.add_system(system, call.x0, call.context, call.along)
     inputs.add_cost(cost, call.x0, call.goal, call.reference, call.context)
     bounds = setup.bounds
     if call.bounds is not None:
@@ -232,12 +237,12 @@ class Inputs:
     by_stage: set[str] = field(default_factory=set)
     sizes: dict[str, int] = field(default_factory=dict)
 
-    def add_system(self, lcs: System, x0: Tensor, context: Tensor | None) -> None:
-        """The matrices, asked for at these states if it is a module."""
+    def add_system(self, lcs: System, x0: Tensor, context: Tensor | None, along: Primal | None = None) -> None:
+        """The matrices, asked for at these states, or along a plan from there, if it is a module."""
         if isinstance(lcs, LCSParams | LCSSequence):
             system = lcs
         else:
-            system = system_at(lcs, x0, context)
+            system = system_at(lcs, x0, context) if along is None else sequence_along(lcs, along, x0, context)
             if not isinstance(system, LCSParams | LCSSequence):
                 raise DTypeError(
                     f"lcs: expected LCSParams or LCSSequence from {type(lcs).__name__}.params, got {describe(system)}; "
