@@ -1,10 +1,9 @@
-"""Worker of Dask that computes one unit. It needs difflcs, but neither this folder nor a common disk."""
+"""Worker process of Dask that computes one unit."""
 
 import contextlib
 import os
 import platform
 import shutil
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,10 +17,6 @@ from deployment import Deployments
 from units import Preset, Unit
 
 from difflcs.errors import CheckpointError, InvalidInputError
-from difflcs.rl import write_atomically
-
-Files = Mapping[str, bytes]
-"""Path within a folder → content."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +29,8 @@ class Job:
     """Key of its result, see `units.key_of`."""
     work: Path
     """Folder of all units."""
-    init: Files | None = None
-    """The run that it starts from."""
+    init: Path | None = None
+    """Folder of the run that it starts from."""
 
     @property
     def folder(self) -> Path:
@@ -60,22 +55,22 @@ class Job:
         records.write(self.folder / "result.csv", rows)
 
 
-def execute(job: Job) -> tuple[pd.DataFrame, Files]:
-    """Compute a unit, continue it, or read it if it is finished; return its evaluations and its run."""
+def execute(job: Job) -> pd.DataFrame:
+    """Compute a unit, continue it, or read it if it is finished; return its evaluations."""
     job.folder.mkdir(parents=True, exist_ok=True)
     with filelock.FileLock(job.folder / ".lock"):  # another process waits; it ends with the one that holds it
         rows = job.result()
         if rows is None:
             rows = _train(job)
             job.keep(rows)
-        return rows, read_files(job.folder / "run")
+        return rows
 
 
 def _train(job: Job) -> pd.DataFrame:
     import torch
 
     torch.set_num_threads(1)  # of this thread only: one unit, one core
-    unit, run, init, config = job.unit, job.folder / "run", None, units.config_of(job.unit, job.preset)
+    unit, run, config = job.unit, job.folder / "run", units.config_of(job.unit, job.preset)
     objects = {one.task: units.describe_object(one.task) for one in (unit, unit.init) if one is not None}
     key = units.key_of(unit, job.preset, objects)
     if key != job.key:
@@ -86,13 +81,10 @@ def _train(job: Job) -> pd.DataFrame:
         )
     if not (run / "config.json").is_file():
         shutil.rmtree(run, ignore_errors=True)  # killed before it began
-    if job.init is not None:
-        init = job.folder / "init"
-        write_files(init, job.init)
     schedule = units.schedule_of(unit, job.preset)
     others = Deployments(unit, schedule, run, job.folder / "deployments.csv")
     others.catch_up()
-    finished = units.train_unit(unit, job.preset, run, init, others)
+    finished = units.train_unit(unit, job.preset, run, job.init, others)
     log = pd.read_csv(finished.log)
     evaluated = log.dropna(subset="evaluation_goals").filter(regex="^(minutes$|evaluation_)")
     evaluated.columns = [name.removeprefix("evaluation_") for name in evaluated.columns]
@@ -121,17 +113,6 @@ def _train(job: Job) -> pd.DataFrame:
     for folder in (finished.checkpoints, finished.tensorboard):
         shutil.rmtree(folder, ignore_errors=True)  # megabytes that nobody needs any more
     return rows[list(records.COLUMNS)].astype(records.COLUMNS).round(6).reset_index(drop=True)
-
-
-def read_files(folder: Path) -> Files:
-    """Read all files into memory: those of a finished run are small."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-def write_files(folder: Path, files: Files) -> None:
-    """Write files back, the reverse of `read_files`."""
-    for name, content in files.items():
-        write_atomically(folder / name, content)
 
 
 def machine() -> str:

@@ -277,12 +277,6 @@ def test_a_run_is_not_continued_with_another_configuration_or_environment(name, 
         train(make_config(name), tmp_path / "run", task=other, resume=True)
 
 
-@pytest.mark.parametrize("minutes", [0.0, -1.0, float("nan"), float("inf"), 1e9])
-def test_minutes_that_make_no_sense_are_refused(name, minutes):
-    with pytest.raises(InvalidInputError, match="minutes"):
-        make_config(name, minutes=minutes)
-
-
 def test_a_model_to_start_from_is_taken_or_refused(name, tmp_path):
     sizes = {"right": (2, 1, 1), "wrong": (3, 1, 1)}
     for which, (n_x, n_u, n_lam) in sizes.items():

@@ -14,11 +14,10 @@ from typing import Any, Literal, get_args, get_type_hints
 import pytest
 
 from difflcs._optional import require
-from difflcs.errors import BackendNotFoundError, CheckpointError, DTypeError, InvalidInputError, MissingDependencyError
-from difflcs.rl.learning.warmup import WarmupSettings
+from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, MissingDependencyError
 from difflcs.rl.methods import DEFAULT_METHOD, LCSMethod, get_method, method_names
 from difflcs.rl.runs.training import TrainConfig, count_episodes, goals_due
-from difflcs.rl.settings import Adam, Epochs, Rollouts, Settings, bounded, from_json, group
+from difflcs.rl.settings import Settings, bounded, from_json, group
 from difflcs.rl.tasks import get_task
 
 
@@ -139,18 +138,6 @@ def test_json_that_does_not_fit_is_refused(change, message):
         from_json(plain, Outer)
 
 
-def test_groups_that_methods_share():
-    for change in ({"learning_rate": 0.0}, {"betas": (0.9, 1.0)}, {"betas": (0.9,)}):
-        with pytest.raises(InvalidInputError, match=next(iter(change))):
-            Adam(**change)
-    for change in ({"noise": -1.0}, {"learning_rate_decay": 0.0}, {"buffer": 0}):
-        with pytest.raises(InvalidInputError, match=next(iter(change))):
-            WarmupSettings(**change)
-    for kind in (Epochs, Rollouts):
-        with pytest.raises(InvalidInputError, match="first"):
-            kind(first=0)
-
-
 # --- everything that a training takes ---------------------------------------------------------------------------------
 
 
@@ -218,15 +205,6 @@ def test_every_setting_says_what_it_is_and_has_bounds_where_it_is_a_number(kind)
 def test_bad_settings_of_a_training_are_refused(change, message):
     with pytest.raises(InvalidInputError, match=message):
         TrainConfig(**change)
-
-
-def test_bad_settings_of_a_method_are_refused():
-    with pytest.raises(InvalidInputError, match="warmup_minutes"):
-        get_method("lcs-rl")(warmup_minutes=0.0)
-    with pytest.raises(InvalidInputError, match="n_lam"):
-        get_method("violation")(n_lam=0)
-    with pytest.raises(BackendNotFoundError, match="magic"):
-        get_method("violation")(backend="magic").check(6.0)
 
 
 def test_a_method_stands_for_its_name():
