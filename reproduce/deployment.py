@@ -14,7 +14,7 @@ from units import Unit
 
 from difflcs.rl import Evaluation, RunDirectory, evaluate, get_task, load_policy, write_atomically
 from difflcs.rl.runs.checkpoint import load_checkpoint
-from difflcs.rl.runs.training import EVALUATION_ENVS, Reporter, TrainConfig, goals_due, saved_bounds
+from difflcs.rl.runs.training import EVALUATION_ENVS, Reporter, TrainConfig, count_goals_due, load_action_support
 
 NUMBERS = ("success_rate", "ci_low", "ci_high", "goals", "solver_failures")
 
@@ -57,7 +57,7 @@ class Deployments(Reporter):
         steps = [int(row["env_steps"]) for row in logged]
         per_minute = self.unit.spec.steps_per_minute
         previous, now = steps if len(steps) == 2 else (-1, *steps)
-        goals, minutes = goals_due(self.schedule, previous, now, self.unit.spec), round(now / per_minute, 6)
+        goals, minutes = count_goals_due(self.schedule, previous, now, self.unit.spec), round(now / per_minute, 6)
         known = self.rows()
         done = set(known.protocol[known.minutes == minutes])
         for protocol in self.protocols if goals else ():
@@ -75,7 +75,7 @@ class Deployments(Reporter):
         """Return the NUMBERS of the training's evaluation if it was the same: in a support as wide as the bounds."""
         if protocol != "support" or logged["evaluation_goals"] != str(goals):
             return None
-        pairs = zip(saved_bounds(run), self.unit.spec.bounds, strict=True)
+        pairs = zip(load_action_support(run), self.unit.spec.bounds, strict=True)
         if not all(torch.equal(mine, full) for mine, full in pairs):
             return None
         return {name: float(logged[f"evaluation_{name}"]) for name in NUMBERS}
@@ -83,7 +83,7 @@ class Deployments(Reporter):
     def measure(self, run: RunDirectory, protocol: str, goals: int) -> dict[str, float]:
         """Compute the NUMBERS of one evaluation of the latest checkpoint."""
         spec: Any = get_task(self.unit.task) if protocol == "task" else self.unit.spec
-        bounds = saved_bounds(run) if protocol == "support" else (None, None)
+        bounds = load_action_support(run) if protocol == "support" else (None, None)
         envs = spec.make_envs(min(EVALUATION_ENVS, goals), threads=1)
         try:
             seed, steps = self.schedule.evaluation_seed, spec.episode_steps

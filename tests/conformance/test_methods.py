@@ -30,7 +30,7 @@ from difflcs.rl.methods import Method, Work, get_method, method_names, register_
 from difflcs.rl.runs import training
 from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
 from difflcs.rl.runs.evaluate import evaluate
-from difflcs.rl.runs.training import Reporter, TrainConfig, load_model, load_policy, profile, stored_config, train
+from difflcs.rl.runs.training import Reporter, TrainConfig, load_model, load_policy, stored_config, sum_seconds, train
 from difflcs.rl.tasks import register_task
 from tests.conformance.toy import STEPS, SearchMethod, make_task
 
@@ -131,7 +131,7 @@ def test_it_trains_and_says_what_it_did(name, finished):
     assert steps == sorted(steps)
     assert all(count % STEPS == 0 for count in steps)
     assert rows[-1]["evaluation_goals"] == "4"
-    spent = profile(rows)
+    spent = sum_seconds(rows)
     assert set(spent) == {c.removesuffix("_seconds") for c in rows[0] if c.endswith("_seconds")}
     files = {path.name for path in run.path.iterdir()}
     assert files == {"config.json", "log.csv", "tensorboard", "checkpoints", "model"}

@@ -53,7 +53,7 @@ def make_env(ensemble: Ensemble | None = None, num_envs: int = 3) -> ModelEnv:
     ensemble = ensemble or Drift(N_X, N_U, 2, 4)
     env = ModelEnv(ensemble, outcome, num_envs, STEPS, SPACES.single_observation_space, SPACES.single_action_space)
     real = episodes()
-    env.remember(real["state"], real["goal"])
+    env.set_episodes(real["state"], real["goal"])
     return env
 
 

@@ -16,7 +16,7 @@ import pytest
 from difflcs._optional import require
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, MissingDependencyError
 from difflcs.rl.methods import DEFAULT_METHOD, LCSMethod, get_method, method_names
-from difflcs.rl.runs.training import TrainConfig, count_episodes, goals_due
+from difflcs.rl.runs.training import TrainConfig, count_episodes, count_goals_due
 from difflcs.rl.settings import Settings, bounded, from_json, group
 from difflcs.rl.tasks import get_task
 
@@ -223,7 +223,7 @@ def test_a_stored_configuration_that_does_not_fit_is_refused(change):
 
 def test_evaluations_fall_due_once():
     config = TrainConfig(minutes=2.0, evaluate_at=(0.0, 0.5, 1.0, 1.1), evaluate_goals=60, final_goals=300)
-    due = {now: goals_due(config, now - 100, now, get_task("cube")) for now in range(0, 1300, 100)}
+    due = {now: count_goals_due(config, now - 100, now, get_task("cube")) for now in range(0, 1300, 100)}
     assert {k: v for k, v in due.items() if v} == {0: 300, 300: 60, 600: 60, 700: 60, 1200: 300}
 
 
@@ -232,8 +232,8 @@ def test_the_last_evaluation_is_never_left_out(minutes):
     """Also where the minutes are no whole number of episodes."""
     task, config = get_task("cube"), TrainConfig(minutes=minutes, evaluate_at=(), final_goals=300)
     last = count_episodes(minutes, task) * task.episode_steps
-    assert goals_due(config, last - 20, last, task) == 300
-    assert goals_due(config, last - 40, last - 20, task) == 0
+    assert count_goals_due(config, last - 20, last, task) == 300
+    assert count_goals_due(config, last - 40, last - 20, task) == 0
 
 
 def test_missing_packages_name_the_line_that_installs_them():
