@@ -119,7 +119,7 @@ class Demo:
     """Learn to push the cube from 6 minutes of data; learning curve and video."""
 
     task: str = TrainConfig.task
-    """What to do: one of the tasks that `difflcs train --help` lists."""
+    """One of the tasks that `difflcs train --help` lists."""
     out: Path = Path("runs/demo")
     """Run directory. An existing demo is continued, not repeated."""
     seed: int = 0

@@ -43,7 +43,7 @@ class TrainConfig(Settings):
     """Configuration of a training: task, method, amount of data, and evaluations."""
 
     task: str = "cube"
-    """What to do: the name of a task."""
+    """Name of a task."""
     minutes: float = bounded(6.0, above=0, maximum=1e6)
     """Data to collect [min of simulated time]; one minute on the cube is 600 steps of 0.1 s."""
     seed: int = bounded(0, minimum=0)
