@@ -10,6 +10,7 @@ mujoco = pytest.importorskip("mujoco")
 
 from difflcs.errors import ContactWarning, InvalidInputError  # noqa: E402
 from difflcs.physics.mujoco import MujocoLCS  # noqa: E402
+from difflcs.physics.mujoco.nominal import solve_soft  # noqa: E402
 
 KINDS = ("box", "box", "capsule", "cylinder", "ellipsoid", "mesh")
 CUBE = " ".join(f"{x} {y} {z}" for x in (-0.04, 0.04) for y in (-0.03, 0.05) for z in (-0.02, 0.03))
@@ -79,7 +80,7 @@ def test_threads_find_what_one_finds():
         torch.set_num_threads(threads)
     for found, expected in zip(together, zip(*alone, strict=True), strict=True):
         assert torch.equal(found, torch.stack(expected))
-    for name in ("A", "d", "F"):
+    for name in ("A", "B", "d"):
         torch.testing.assert_close(getattr(system, name), torch.stack([getattr(s, name) for s in systems]))
 
 
@@ -106,3 +107,19 @@ def test_an_error_of_mujoco_is_ours_and_leaves_the_module_usable(threads, monkey
         with pytest.raises(InvalidInputError, match=r"memory .*in state 1 of 2"):
             module.contacts(near)
         assert all(map(torch.equal, module.contacts(far), before))
+
+
+@pytest.mark.parametrize(("m", "nv"), [(1, 1), (5, 12), (24, 9), (40, 6)])
+def test_soft_forces_are_clipped_by_their_bounds(m, nv):
+    """Of random rows, some twice, and a response of less than full rank."""
+    random = np.random.default_rng(m)
+    rows, gap = random.normal(size=(50, m, nv)), random.normal(size=(50, m))
+    rows[:, m // 2 :], gap[:, m // 2 :] = rows[:, : m - m // 2], gap[:, : m - m // 2]
+    factor = random.normal(size=(50, nv, nv)) / nv
+    factor[:, nv // 2] = 0.0
+    response, high = factor @ factor.swapaxes(-1, -2), random.uniform(0, 3, (50, m))
+    for low, most in ((None, None), (-high, high)):
+        force = solve_soft(rows, response, gap, 1e-3, low, most)
+        slack = gap + np.einsum("nmi,nij,nkj,nk->nm", rows, response, rows, force)
+        least, most = (0.0, np.inf) if low is None else (low, most)
+        np.testing.assert_allclose(force, np.clip(-slack / 1e-3, least, most), rtol=0, atol=1e-7 * np.abs(force).max())

@@ -45,7 +45,7 @@ _FIELDS = (
     "qacc",
     "act_dot",
 )
-_VARIABLES = ("mjCOLLISIONFUNC", "mju_user_error")
+_VARIABLES = ("mjCOLLISIONFUNC", "mju_user_error", "mjcb_time")
 _KINDS, _MOST, _FIRST = int(mujoco.mjtGeom.mjNGEOMTYPES), 128, 10  # doubles of a contact, and those that are read
 _FLAT = """
 <mujoco><worldbody><geom type="plane" size="1 1 1"/><body><geom type="box" size="1 1 1"/></body></worldbody></mujoco>"""

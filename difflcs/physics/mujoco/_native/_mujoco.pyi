@@ -42,3 +42,13 @@ def read_motion(
     nominal: np.ndarray,
     reached: np.ndarray,
 ) -> tuple[int, int, str]: ...
+def solve_soft(
+    J: np.ndarray,
+    R: np.ndarray,
+    q: np.ndarray,
+    compliance: float,
+    low: np.ndarray,
+    high: np.ndarray,
+    threads: int,
+    force: np.ndarray,
+) -> int: ...

@@ -14,6 +14,7 @@
 
 #include "finder.hpp"
 #include "motion.hpp"
+#include "soft.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -50,6 +51,7 @@ Library make_library(const nb::dict& f, int kinds, int stride) {
   library.kinds = kinds;
   library.stride = stride;
   library.on_error = at<OnError*>(f, "mju_user_error");
+  library.clock = at<void**>(f, "mjcb_time");
   return library;
 }
 
@@ -145,29 +147,36 @@ Motion make_motion(const nb::dict& f) {
 // Where MuJoCo said an error or warned: the first state, or −1, the place that it was at, and the error.
 using Outcome = std::tuple<int64_t, int64_t, std::string>;
 
-// Calls work(place, state) for all states, a thread for each place, the GIL released.
+// Calls work(thread, i) for all i below count, the GIL released, until one of them says false.
 template <class Work>
-Outcome on_threads(const Library& library, const std::vector<const Place*>& places, int64_t states, Work work) {
+void on_threads(size_t threads, int64_t count, Work work) {
   nb::gil_scoped_release release;
-  const Errors errors(library.on_error);
-  std::vector<std::string> said(states);
-  std::vector<int64_t> failed(states, -1);
   std::atomic<int64_t> next{0};
   std::atomic<bool> stop{false};
-  auto take = [&](size_t p) {
-    for (int64_t i; !stop && (i = next.fetch_add(1)) < states;) {
-      if (Errors::guarded([&] { work(p, i); }, &said[i]) && !places[p]->has_warned()) continue;
-      failed[i] = static_cast<int64_t>(p);
-      stop = true;
-    }
+  auto take = [&](size_t thread) {
+    for (int64_t i; !stop && (i = next.fetch_add(1)) < count;)
+      if (!work(thread, i)) stop = true;
   };
   std::vector<std::thread> pool;
   try {
-    for (size_t p = 1; p < places.size(); p++) pool.emplace_back(take, p);
+    for (size_t t = 1; t < threads; t++) pool.emplace_back(take, t);
   } catch (const std::system_error&) {  // the work is shared by those that run
   }
   take(0);
   for (auto& t : pool) t.join();
+}
+
+// Calls work(place, state) for all states, a thread for each place.
+template <class Work>
+Outcome at_places(const Library& library, const std::vector<const Place*>& places, int64_t states, Work work) {
+  const Errors errors(library);
+  std::vector<std::string> said(states);
+  std::vector<int64_t> failed(states, -1);
+  on_threads(places.size(), states, [&](size_t p, int64_t i) {
+    if (Errors::guarded([&] { work(p, i); }, &said[i]) && !places[p]->has_warned()) return true;
+    failed[i] = static_cast<int64_t>(p);
+    return false;
+  });
   for (int64_t i = 0; i < states; i++)
     if (failed[i] >= 0) return {i, failed[i], said[i]};
   return {-1, 0, ""};
@@ -187,7 +196,7 @@ Outcome find_contacts(const Library& library, const Scene& scene, const std::vec
         near.size() == n * groups && within.size() == groups && !places.empty());
   std::vector<Finder> finders;
   for (const Place* place : places) finders.emplace_back(library, scene, *place);
-  return on_threads(library, places, n, [&](size_t p, int64_t i) {
+  return at_places(library, places, n, [&](size_t p, int64_t i) {
     const Found into{gap.data() + i * k,      normal.data() + i * k * nv, tangent.data() + i * k * nv * scene.tangents,
                      friction.data() + i * k, geom.data() + 2 * i * k,    near.data() + i * groups};
     finders[p].find(qpos.data() + i * scene.nq, within.data(), into);
@@ -204,12 +213,31 @@ Outcome read_motion(const Library& library, const Motion& motion, const std::vec
         acceleration.size() == n * (nv + na) && A.size() == n * size * size && B.size() == n * size * nu &&
         inverse_mass.size() == n * nv * nv && nominal.size() == n * nu && reached.size() == n * size &&
         !places.empty());
-  return on_threads(library, places, n, [&](size_t p, int64_t i) {
+  return at_places(library, places, n, [&](size_t p, int64_t i) {
     const Linearised into{middle.data() + i * size, acceleration.data() + i * (nv + na), A.data() + i * size * size,
                           B.data() + i * size * nu, inverse_mass.data() + i * nv * nv,   nominal.data() + i * nu,
                           reached.data() + i * size};
     Reader(library, motion, *places[p]).read(state.data() + i * state.shape(1), ctrl.data() + i * nu, into);
   });
+}
+
+// Forces (n, m) between bounds on the rows J (n, m, nv), where R (n, nv, nv) is the motion by forces. Returns how many
+// problems are not solved.
+int64_t solve_soft(Array<const double> J, Array<const double> R, Array<const double> q, double compliance,
+                   Array<const double> low, Array<const double> high, int threads, Array<double> force) {
+  const size_t n = J.shape(0), m = J.shape(1), nv = J.shape(2);
+  check(R.size() == n * nv * nv && q.size() == n * m && low.size() == n * m && high.size() == n * m &&
+        force.size() == n * m && threads > 0);
+  std::vector<SoftForces> solvers;
+  for (int t = 0; t < threads; t++) solvers.emplace_back(static_cast<int>(m), static_cast<int>(nv));
+  std::atomic<int64_t> missed{0};
+  on_threads(threads, n, [&](size_t thread, int64_t i) {
+    const bool found = solvers[thread].solve(J.data() + i * m * nv, R.data() + i * nv * nv, q.data() + i * m,
+                                             compliance, low.data() + i * m, high.data() + i * m, force.data() + i * m);
+    missed += !found;
+    return true;
+  });
+  return missed;
 }
 
 }  // namespace
@@ -235,4 +263,6 @@ NB_MODULE(_mujoco, m) {
   m.def("read_motion", &read_motion, "library"_a, "motion"_a, "places"_a, "state"_a, "ctrl"_a, "middle"_a,
         "acceleration"_a, "A"_a, "B"_a, "inverse_mass"_a, "nominal"_a, "reached"_a,
         "Motion at many states. Returns where MuJoCo said an error or warned.");
+  m.def("solve_soft", &solve_soft, "J"_a, "R"_a, "q"_a, "compliance"_a, "low"_a, "high"_a, "threads"_a, "force"_a,
+        "Forces between bounds on soft rows. Returns how many problems are not solved.");
 }
