@@ -113,8 +113,8 @@ def make_ppo(
         first_episode: episodes collected before, by a warm-up.
         first_iteration: iterations done before.
         failure_penalty: part of the last reward of a failed episode, see `TaskSpec`.
-        models: plays episodes in networks besides those of the robot; None: real ones alone, as in the paper. Let PPO
-            `remember` the episodes of a warm-up.
+        models: plays episodes in networks besides those of the robot; None: real ones alone, as in the paper. Pass
+            the episodes of a warm-up to `PPO.remember`.
 
     Raises:
         InvalidInputError: an argument does not fit.
