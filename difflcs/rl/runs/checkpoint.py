@@ -266,8 +266,8 @@ def _line(cells: Sequence[object] | object) -> str:
 
 
 @contextmanager
-def convert_write_errors(path: Path) -> Iterator[None]:
-    """Turn errors of the file system into ours.
+def wrap_os_errors(path: Path) -> Iterator[None]:
+    """Wrap errors of the operating system in ours.
 
     Raises:
         CheckpointError: something below `path` cannot be written.
@@ -293,7 +293,7 @@ def replace_run(out: Path) -> Iterator[Callable[[], object]]:
     except CheckpointError as error:
         raise CheckpointError(f"{error}. --force replaces runs only; choose another --out") from error
     with ExitStack() as held:
-        with convert_write_errors(out):
+        with wrap_os_errors(out):
             held.enter_context(RunDirectory(out).locked())
             aside = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}.", suffix=".old"))
             os.replace(out, aside / out.name)

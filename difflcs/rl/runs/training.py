@@ -20,13 +20,7 @@ from difflcs.lcs import LCSModel
 from difflcs.rl.learning.trainer import Trainer, save_learned
 from difflcs.rl.methods import LCSMethod, LCSRLMethod, Method, Work, check_fits, get_method
 from difflcs.rl.rollout import Policy
-from difflcs.rl.runs.checkpoint import (
-    RunDirectory,
-    convert_write_errors,
-    load_checkpoint,
-    replace_run,
-    save_checkpoint,
-)
+from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, replace_run, save_checkpoint, wrap_os_errors
 from difflcs.rl.runs.evaluate import Evaluation, evaluate
 from difflcs.rl.settings import Settings, bounded, from_json
 from difflcs.rl.tasks import TaskSpec, get_task
@@ -290,7 +284,7 @@ class _Training:
 
     def _create(self, init: Path | None, held: ExitStack) -> RunDirectory:
         out = self.out
-        with convert_write_errors(out):
+        with wrap_os_errors(out):
             RunDirectory.check_free(out)  # before anything is written there
             out.mkdir(parents=True, exist_ok=True)
             held.enter_context(RunDirectory(out).locked())
@@ -305,7 +299,7 @@ class _Training:
     def _reopen(self, held: ExitStack) -> tuple[RunDirectory, Path | None]:
         run = RunDirectory.open(self.out)
         if not run.finished():
-            with convert_write_errors(self.out):
+            with wrap_os_errors(self.out):
                 held.enter_context(run.locked())
         if stored_config(run) != self.config:
             raise CheckpointError(
@@ -343,7 +337,7 @@ class _Training:
             start = time.perf_counter()
             result = measure(goals) if goals else None
             row = _row(columns, trainer.env_steps, per_minute, report, result, time.perf_counter() - start)
-            with convert_write_errors(run.path):
+            with wrap_os_errors(run.path):
                 run.append(row)
                 for name, value in row.items():
                     if isinstance(value, int | float) and name not in ("iteration", "env_steps"):
@@ -367,7 +361,7 @@ class _Training:
             while trainer.env_steps < self.total:
                 previous = trainer.env_steps
                 finish(trainer.step(reporter.stepped), previous)
-            with convert_write_errors(run.path):
+            with wrap_os_errors(run.path):
                 save_learned(trainer.learned, run.model, self.config.method.kind)
         finally:
             writer.close()
