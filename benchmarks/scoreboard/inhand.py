@@ -176,8 +176,9 @@ class HandPolicy:
         marks.append(time.thread_time())
         cost = self.cost.at(x)
         marks.append(time.thread_time())
+        low, high = (bound.clamp(-self.limit, self.limit) for bound in self.module.action_bounds(x))
         with torch.no_grad():
-            plan = self.mpc(x, lcs=system, cost=cost, guess=self.guess)
+            plan = self.mpc(x, lcs=system, cost=cost, guess=self.guess, u_min=low, u_max=high)
         marks.append(time.thread_time())
         self.times.append(1e3 * np.diff(marks))
         self.guess = plan.shift() if bool(solved(plan.status)) else None
