@@ -36,7 +36,7 @@ from difflcs.physics.mujoco.actuators import Actuators
 Array = NDArray[np.float64]
 
 _BEYOND = 1e6  # a motion in a step [m, rad] and its velocity that no model has
-_MOST, _FEW = 10, 4  # steps that are simulated one by one; where there are more, so many as long ones
+_MOST, _FEW = 50, 25  # steps that are simulated one by one; where there are more, so many as long ones
 _EULER, _RK4, _IMPLICIT, _FAST = (
     int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("EULER", "RK4", "IMPLICIT", "IMPLICITFAST")
 )
