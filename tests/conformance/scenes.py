@@ -23,6 +23,7 @@ from difflcs.errors import DiffLCSError
 from difflcs.physics.mujoco import MujocoLCS
 
 TOLERANCE = 0.5  # of the speed before and of g h, what an impact within the step may cost
+FAR = 0.5  # motion in a step [m, rad], beyond which nothing about it is linear
 JOINTS = ("free", "slide", "hinge", "hinge", "ball")
 SHAPES = ("sphere", "capsule", "box", "cylinder", "ellipsoid")
 
@@ -219,6 +220,8 @@ def judge(seed: int) -> Judged | None:
     mass = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
     ctrl, before = module.control(x, u), data.qvel.copy()
+    if np.abs(before).max() * count * model.opt.timestep > FAR:
+        return None
     found = [simulate(model, data, ctrl, count * times, times) for times in (1, 4)]
     if None in found:
         return None

@@ -74,6 +74,8 @@ class Actuators:
         self.activated = np.repeat(np.arange(model.nu), model.actuator_actnum)
         self._decays = dynamics[self.activated] == _EXACT
         self._time = np.maximum(model.actuator_dynprm[self.activated, 0], 1e-15)
+        self._muscles = np.flatnonzero(dynamics[self.activated] == _MUSCLE)
+        self._rates = model.actuator_dynprm[self.activated, :2].copy()
 
     def _force_limits(self, model: Any, joint: NDArray[np.intp]) -> Array:
         """Compute the forces (2, nu) that actuators may have, infinite where nothing limits them."""
@@ -166,6 +168,19 @@ class Actuators:
     def durations(self, seconds: float) -> Array:
         """Time (na,) by which an activation's rate at the beginning of a time step moves it in this step."""
         return np.where(self._decays, -self._time * np.expm1(-seconds / self._time), seconds)
+
+    def even_out(self, data: Any, A: Array, B: Array) -> None:
+        """Give muscles one rate in both directions, that of the nominal control, in their rows of a transition.
+
+        Differences have the rate of activation by the control and that of deactivation by the activation.
+        """
+        for i in self._muscles:
+            ctrl, at = data.ctrl[self.activated[i]], data.act[i]
+            (rise, fall), middle = self._rates[i], 0.5 + 0.75 * (at + ctrl)
+            rate = 1 / (rise * middle) if ctrl >= at else middle / fall
+            row = len(A) - len(self._time) + i
+            A[row], B[row] = 0.0, 0.0
+            A[row, row], B[row, self.activated[i]] = 1 - rate, rate
 
     @contextmanager
     def unlimited_rates(self, model: Any) -> Iterator[None]:

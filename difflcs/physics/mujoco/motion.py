@@ -178,6 +178,7 @@ class Dynamic:
         into.acceleration[i, :nv], into.acceleration[i, nv:] = data.qacc, data.act_dot
         with self.actuators.unlimited_rates(model):
             mujoco.mjd_transitionFD(model, data, 1e-6, 0, into.A[i], into.B[i], None, None)
+        self.actuators.even_out(data, into.A[i], into.B[i])
         options.disableflags, options.timestep, options.integrator = before
         self._simulate(data, self.simulated.count - half)
         self._changed(data, qpos, act, into.reached[i])
