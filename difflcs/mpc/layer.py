@@ -1,4 +1,4 @@
-"""LCS-MPC as a PyTorch layer: validate, call a backend, wrap."""
+"""PyTorch layer of the LCS-MPC: it checks a call, has a backend solve it, and wraps the solution."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from difflcs._checks import check_choice, check_number, check_positive_int
 from difflcs._differentiation import runs_eagerly
 from difflcs._modules import fresh
 from difflcs.constraints import StageBounds, as_bound
-from difflcs.errors import DegenerateWarning, SolveError, SolveWarning
+from difflcs.errors import DegenerateWarning, InvalidInputError, SolveError, SolveWarning
 from difflcs.mpc.backends import Backend, get_backend
 from difflcs.mpc.controller import MPCController, OnFailure
 from difflcs.mpc.repeat import Repeat
@@ -30,6 +30,7 @@ from difflcs.mpc.setup import (
     check_system,
 )
 from difflcs.mpc.solution import MPCSolution, Primal
+from difflcs.records import LCSParams, LCSSequence
 from difflcs.status import Status, solved
 
 
@@ -61,6 +62,12 @@ class LCSMPCLayer(nn.Module):
         barrier: weight of a logarithmic barrier of the action bounds [cost units]; 0 for none. An action at a bound has
             zero gradient; with a barrier it keeps a small distance and a gradient. The objective includes the barrier.
             Sensible weights are 1e-3 to 1e-1 of the objective; far smaller ones make the problem stiff.
+        passes: how often a call solves, where the system of a module depends on the state: each pass after the first
+            plans with the module linearised along the actions of the pass before (`difflcs.sequence_along`), warm. The
+            plan, its status and its gradient are those of the last pass, whose systems count as those of x0 do in a
+            single one; they are not compared, as objectives of two systems do not say which plan is better. Two see
+            what contacts become on the way; more converge where steps are small beside what they change, else they may
+            come and go. Matrices are solved once.
 
     Raises:
         InvalidInputError and its kinds: an argument does not fit.
@@ -85,11 +92,13 @@ class LCSMPCLayer(nn.Module):
         constraints: Constraints | None = None,
         training_relaxation: float | None = None,
         barrier: float = 0.0,
+        passes: int = 1,
     ):
         super().__init__()
         self.lcs = check_system(lcs)
         self.cost = check_cost(cost)
         self.horizon = check_positive_int("horizon", horizon)
+        self.passes = check_positive_int("passes", passes)
         self.relaxation = check_number("relaxation", relaxation, strict=True)
         self.training_relaxation = (
             None
@@ -113,7 +122,7 @@ class LCSMPCLayer(nn.Module):
         self._repeat = Repeat()
 
     def setup(self) -> Setup:
-        """What the layer plans with as it is now, but for what counts in training mode alone."""
+        """Collect the settings that the layer plans with now, except those of training mode."""
         if self._forward_pre_hooks:
             fresh(self, ("u_min", "u_max"))
         return Setup(
@@ -131,13 +140,13 @@ class LCSMPCLayer(nn.Module):
         )
 
     def limits(self, system: System | None = None) -> tuple[Tensor, Tensor]:
-        """Bounds of the actions where a call gives none.
+        """Return the bounds of the actions for calls that pass none.
 
         They are the layer's `bounds`; or else u_min and u_max, within the action support of an `LCSModel` that knows
         one. A call takes them within the `action_bounds(x0)` of a module that has these, as `MujocoLCS` does.
 
         Args:
-            system: the model; the layer's own if None.
+            system: the model; the layer's if None.
 
         Returns:
             Lower and upper bounds, (..., n_u), or (..., H, n_u) of bounds that change over the horizon.
@@ -148,7 +157,7 @@ class LCSMPCLayer(nn.Module):
         return self.setup()._replace(limits=None).action_bounds(self.lcs if system is None else system)
 
     def extra_repr(self) -> str:
-        """What print(layer) shows."""
+        """Describe the settings for print(layer)."""
         return (
             f"horizon={self.horizon}, relaxation={self.relaxation:g}, backend={self.backend}, "
             f"on_failure={self.on_failure!r}"
@@ -184,7 +193,7 @@ class LCSMPCLayer(nn.Module):
             lcs: system, or module that is asked for one, for this call.
             cost: cost for this call.
             constraints: constraints for this call.
-            context: (..., n_context) whatever system or cost depend on besides x0; given to the modules.
+            context: (..., n_context) quantities besides x0 that system or cost depend on; passed to the modules.
 
         Returns:
             `MPCSolution` with the broadcast batch dimensions.
@@ -197,18 +206,31 @@ class LCSMPCLayer(nn.Module):
         if self.training and self.training_relaxation is not None:
             setup = setup._replace(relaxation=self.training_relaxation)
         call = Call(x0, goal, reference, guess, u_min, u_max, bounds, lcs, cost, constraints, context)
+        if not isinstance(self.lcs if lcs is None else lcs, LCSParams | LCSSequence):
+            for _ in range(self.passes - 1):
+                with torch.no_grad():
+                    x, u, lam, _, mu, *_ = self._repeat.solve_call(setup, call)[1]
+                guess = Primal(x, u, lam, mu)
+                call = call._replace(guess=guess, along=guess)
         solver, (x, u, lam, objective, mu, *rest) = self._repeat.solve_call(setup, call)
         if solver.transformed or not solver.result.all_converged:
-            self._report(solver.result.status, solver.own)
+            self._report(solver.result.status, solver.needs_grad)
         return MPCSolution(x, u, lam, mu, objective, *rest, problem=solver.problem)
 
     def controller(self, on_failure: OnFailure = "hold", time_limit: float | None = None) -> MPCController:
-        """A controller of one robot with this layer's problem as it is now: NumPy in and out, warm, microseconds.
+        """Make a controller of one robot with this layer's problem as it is now: NumPy in and out, warm, microseconds.
 
         Args:
             on_failure: "hold", "unfinished", "zero", "raise" or an action (n_u,), see `MPCController`.
             time_limit: seconds of one step, that of the backend if None.
+
+        Raises:
+            InvalidInputError: several passes, which a controller does not make.
         """
+        if self.passes > 1:
+            raise InvalidInputError(
+                f"passes: expected 1 for a controller, got {self.passes}; build a layer with passes=1, or call this one"
+            )
         return MPCController(self.setup(), on_failure, time_limit)
 
     def _report(self, status: Tensor, needs_grad: bool) -> None:
@@ -240,7 +262,7 @@ class LCSMPCLayer(nn.Module):
 
 
 def _stacklevel() -> int:
-    """Where a warning points to: the line that called the layer, outside this package and torch."""
+    """Find the stack level of the line that called the layer, outside this package and torch, for a warning."""
     level, frame = 1, sys._getframe(1)
     while frame.f_back and frame.f_globals.get("__name__", "").split(".")[0] in ("difflcs", "torch"):
         level, frame = level + 1, frame.f_back

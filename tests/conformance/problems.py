@@ -80,8 +80,19 @@ class Problem:
         return dataclasses.replace(self, tensors={k: v for k, v in self.tensors.items() if k not in names})
 
 
-def solve(problem, backend, guess=None, tensors=None, **options):
-    """The plan of the layer that the inputs describe."""
+class Asked(torch.nn.Module):
+    """A cost that is asked for as a `CostModule`."""
+
+    def __init__(self, cost):
+        super().__init__()
+        self.cost = cost
+
+    def at(self, x, goal=None, context=None):
+        return self.cost
+
+
+def solve(problem, backend, guess=None, tensors=None, asked=False, **options):
+    """The plan of the layer that the inputs describe; `asked`: its cost is a module."""
     t, staged = tensors or problem.tensors, problem.staged
     lcs = (LCSSequence if "A" in staged else LCSParams)(**{k: t[k] for k in LCS})
     weights, by_stage = {k: t[k] for k in COST if k in t}, tuple(staged & set(COST))
@@ -96,6 +107,7 @@ def solve(problem, backend, guess=None, tensors=None, **options):
             ConstraintSequence(**rows, by_stage=by_stage) if by_stage else LinearConstraints(**rows)
         )
     options = {"barrier": problem.barrier, "relaxation": problem.relaxation, **options}
+    cost = Asked(cost) if asked else cost
     return LCSMPCLayer(lcs, cost, problem.horizon, backend=backend, **options)(t["x0"], guess=guess)
 
 

@@ -11,8 +11,11 @@ python -m tests.conformance.scenes --first 17 --count 1
 
 from __future__ import annotations
 
+import argparse
 import copy
+import multiprocessing
 import warnings
+from collections import Counter
 from typing import Any, NamedTuple
 
 import mujoco
@@ -237,3 +240,39 @@ def judge(seed: int) -> Judged | None:
     error, nothing = norm(after - true), norm(before - true)
     names = ",".join(sorted({mujoco.mjtConstraint(k).name.removeprefix("mjCNSTR_").split("_")[0] for k in kinds}))
     return Judged(names or "free", "warned" if said else "made", error, nothing, scale)
+
+
+def table(judged: list[Judged]) -> str:
+    """Markdown: what became of scenes, and errors where doing nothing has 1, by the constraints that act in MuJoCo."""
+    outcomes = Counter(j.outcome for j in judged)
+    lines = [f"{len(judged)} scenes: " + ", ".join(f"{n} {name}" for name, n in outcomes.items()), ""]
+    lines += ["| act | scenes | median error | silent faults |", "|---|---|---|---|"]
+    for kind in sorted({j.kind for j in judged if j.kind}):
+        some = [j for j in judged if j.kind == kind]
+        error = np.median([j.error / max(j.nothing, 1e-9) for j in some])
+        lines.append(f"| {kind} | {len(some)} | {error:.2f} | {sum(j.wrong() for j in some)} |")
+    return "\n".join(lines)
+
+
+def _prepare() -> None:
+    """Prepare a process: one thread; MuJoCo does not print that a scene diverges, which its data counts."""
+    torch.set_num_threads(1)
+    mujoco.set_mju_user_warning(lambda message: None)
+
+
+def main() -> None:
+    """Judge scenes, print the table and the seeds that are wrong."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
+    parser.add_argument("--count", type=int, default=1000, help="number of scenes")
+    parser.add_argument("--processes", type=int, default=2)
+    options = parser.parse_args()
+    seeds = range(options.first, options.first + options.count)
+    with multiprocessing.get_context("spawn").Pool(options.processes, _prepare) as pool:
+        results = dict(zip(seeds, pool.imap(judge, seeds, chunksize=20), strict=True))
+    print(table([j for j in results.values() if j]))
+    print(*(f"seed {seed}: {j}" for seed, j in results.items() if j and j.wrong()), sep="\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -314,6 +314,18 @@ def test_forms_that_say_the_same_have_the_same_plan(build, backend):
     torch.testing.assert_close(solve(sequence, backend).u, solve(problem, backend).u, rtol=1e-6, atol=1e-8)
 
 
+@every_problem
+def test_a_cost_that_is_asked_for_counts_as_one_that_is_given(solutions, name):
+    problem, found = solutions(name, "batched")[0], []
+    for asked in (False, True):
+        leaves = {k: v.clone().requires_grad_() for k, v in problem.tensors.items()}
+        plan = solve(problem, "batched", tensors=leaves, asked=asked)
+        (plan.u.sum() + plan.objective.sum()).backward()
+        found.append([plan.u, plan.objective, *(leaves[k].grad for k in COST if k in leaves)])
+    for given, taken in zip(*found, strict=True):
+        torch.testing.assert_close(taken, given, rtol=0, atol=0)
+
+
 @every_exact
 def test_a_price_above_the_multiplier_makes_a_soft_constraint_hard(build, backend):
     problem = problems.hard(build)

@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import mujoco
@@ -169,28 +167,35 @@ class Actuators:
         """Time (na,) by which an activation's rate at the beginning of a time step moves it in this step."""
         return np.where(self._decays, -self._time * np.expm1(-seconds / self._time), seconds)
 
-    def even_out(self, data: Any, A: Array, B: Array) -> None:
-        """Give muscles one rate in both directions, that of the nominal control, in their rows of a transition.
+    def even_out(self, ctrl: Array, activation: Array, A: Array, B: Array) -> None:
+        """Give muscles one rate in both directions, that of the nominal control, in their rows of n transitions.
 
         Differences have the rate of activation by the control and that of deactivation by the activation.
-        """
-        for i in self._muscles:
-            ctrl, at = data.ctrl[self.activated[i]], data.act[i]
-            (rise, fall), middle = self._rates[i], 0.5 + 0.75 * (at + ctrl)
-            rate = 1 / (rise * middle) if ctrl >= at else middle / fall
-            row = len(A) - len(self._time) + i
-            A[row], B[row] = 0.0, 0.0
-            A[row, row], B[row, self.activated[i]] = 1 - rate, rate
 
-    @contextmanager
-    def unlimited_rates(self, model: Any) -> Iterator[None]:
-        """Let activations change by their rates, however long the step, without the limits of what they reach."""
-        fields = ("actuator_dyntype", "actuator_actlimited", "actuator_actearly")
-        kept = [getattr(model, name).copy() for name in fields]
+        Args:
+            ctrl: (n, nu) nominal controls.
+            activation: (n, na) where it is linearised.
+            A: (n, n_x, n_x) transitions by the state.
+            B: (n, n_x, nu) by control.
+        """
+        i, at = self._muscles, activation[:, self._muscles]
+        acts, row = self.activated[i], A.shape[1] - len(self._time) + i
+        (rise, fall), ctrl = self._rates[i].T, ctrl[:, acts]
+        middle = 0.5 + 0.75 * (at + ctrl)
+        rate = np.where(ctrl >= at, 1 / (rise * middle), middle / fall)
+        A[:, row], B[:, row] = 0.0, 0.0
+        A[:, row, row], B[:, row, acts] = 1 - rate, rate
+
+    def unlimit_rates(self, model: Any) -> None:
+        """Let activations of a model change by their rates, however long the step, to whatever value."""
         model.actuator_dyntype[self._exact], model.actuator_actlimited[:], model.actuator_actearly[:] = _FILTER, 0, 0
-        yield
-        for name, values in zip(fields, kept, strict=True):
-            getattr(model, name)[:] = values
+
+    def describe_balance(self, relative: NDArray[np.intp]) -> dict[str, list[Any]]:
+        """Describe `balance` and `clip` for the compiled part; actions of `relative` count from where they are."""
+        low, high = self.range
+        numbers = {"gain": self._gain, "constant": self._constant, "bias": self._bias, "low": low, "high": high}
+        masks = {"holds": self.holds, "relative": np.isin(np.arange(len(self.dof)), relative)}
+        return {name: values.tolist() for name, values in (numbers | masks).items()}
 
 
 def disabled_actuators(model: Any) -> NDArray[np.bool_]:

@@ -16,15 +16,13 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from difflcs._checks import describe
 from difflcs.errors import ContactWarning, InvalidInputError
 from difflcs.physics.mujoco._native import _mujoco
-from difflcs.physics.mujoco.library import Place, library
+from difflcs.physics.mujoco.library import Places, library
 from difflcs.physics.mujoco.narrow import BOX, CAPSULE, CYLINDER, MESH, NATIVE, PLANE, Array, describe_solid, have_faces
-from difflcs.physics.mujoco.native import native
 
 Pairs = Sequence[tuple[int | str, int | str]]
 
@@ -94,6 +92,7 @@ class ContactFinder:
     Args:
         model: a private copy.
         data: its data, at which positions have been computed.
+        places: of the two.
         pairs: geoms, or bodies with all their geoms, that may touch; None: as the model says.
         distance: contacts farther away are left out [m].
         length: unit of gaps [m].
@@ -112,6 +111,7 @@ class ContactFinder:
         self,
         model: Any,
         data: Any,
+        places: Places,
         pairs: Pairs | None,
         distance: float,
         length: float,
@@ -137,7 +137,7 @@ class ContactFinder:
         model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)  # MuJoCo need not find any
         self._budgets = len(budgets)
-        self._scene, self._places = self._describe_scene(budgets), [Place(model, data)]
+        self._scene, self._places = self._describe_scene(budgets), places
 
     def _drop_floors(self) -> None:
         """Drop planes that nothing in the plane of motion can approach."""
@@ -204,20 +204,11 @@ class ContactFinder:
             np.zeros((n, k)),
             np.zeros((n, k, 2), dtype=np.int64),
         )
-        threads = max(1, min(n, torch.get_num_threads()))
-        while len(self._places) < threads:
-            self._places.append(self._places[0].copy())
-        places = self._places[:threads]
-        for place in places[1:]:
-            place.follow(self.data)
         near, within = np.zeros((n, self._budgets), dtype=np.int64), np.full(self._budgets, self._warn_within)
-        failed, said = _mujoco.find(
-            library(), self._scene, [place.native for place in places], np.ascontiguousarray(qpos), within, *found, near
+        qpos = np.ascontiguousarray(qpos)
+        self._places.check(
+            _mujoco.find_contacts(library(), self._scene, self._places.take(n), qpos, within, *found, near), n
         )
-        if failed >= 0:
-            self._places = self._places[:1]
-            with native(self.model, self.data, f"in state {failed} of {n}"):
-                raise mujoco.FatalError(said)
         self._warn_of_more(int(near.max(initial=0)))
         return found
 

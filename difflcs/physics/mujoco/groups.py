@@ -23,14 +23,15 @@ class ContactGroup(NamedTuple):
     """So many contacts of these geoms, the nearest.
 
     Attributes:
-        of: geoms by name or number, or bodies with all their geoms: contacts in which one of them takes part. None:
-            all contacts that belong to no group before.
+        of: geoms by name or number, or bodies with all their geoms: contacts in which one of them takes part; a pair of
+            them, ("cup", "palm"): their contacts with each other; or a list of such. None: all contacts that belong to
+            no group before.
         contacts: their number.
         friction: False for contacts without friction, which take one row of the system each.
         distance: those farther away are left out [m]; None: that of the module.
     """
 
-    of: str | int | Sequence[str | int] | None
+    of: str | int | Sequence[str | int | tuple[str | int, str | int]] | None
     contacts: int
     friction: bool = True
     distance: float | None = None
@@ -58,11 +59,10 @@ class ContactSelection:
             )
         self.group = np.full((model.ngeom, model.ngeom), -1)
         for i, group in enumerate(groups):
-            names = [group.of] if isinstance(group.of, str | int) else group.of
-            geoms = range(model.ngeom) if names is None else [g for name in names for g in find_geoms(model, name)]
-            mine = np.zeros((model.ngeom, model.ngeom), dtype=bool)
-            mine[list(geoms)] = True
-            self.group[(mine | mine.T) & (self.group < 0)] = i
+            for one in [group.of] if group.of is None or isinstance(group.of, str | int | tuple) else group.of:
+                mine = np.zeros((model.ngeom, model.ngeom), dtype=bool)
+                mine[np.ix_(*(_geoms(model, of) for of in (one if isinstance(one, tuple) else (one, None))))] = True
+                self.group[(mine | mine.T) & (self.group < 0)] = i
         self.budgets = [
             Budget(
                 self.group == i,
@@ -98,3 +98,7 @@ class ContactSelection:
         return LCSParams(
             system.A, system.B, C, system.d, system.D[..., rows, :], system.E[..., rows, :], F, system.c[..., rows]
         )
+
+
+def _geoms(model: Any, of: str | int | None) -> Sequence[int]:
+    return range(model.ngeom) if of is None else find_geoms(model, of)

@@ -21,12 +21,13 @@ from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, contact_
 from difflcs.physics.mujoco.actuators import DYNAMICS, Actuators, disabled_actuators
 from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, Pairs
 from difflcs.physics.mujoco.groups import ContactGroup, ContactSelection
+from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.motion import Dynamic, QuasiStatic
 from difflcs.physics.mujoco.native import TAKEN, native
 from difflcs.physics.mujoco.nominal import Recovery, evaluate_nominal
 from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
 from difflcs.physics.mujoco.state import MujocoState
-from difflcs.records import LCSParams
+from difflcs.records import LCSParams, LCSSequence, sequence_along
 
 __all__ = ["Motion", "MujocoLCS", "lcs_from_mujoco"]
 
@@ -153,7 +154,8 @@ class MujocoLCS:
         else:
             self._selection = None
             budgets = None if contacts is None else check_positive_int("contacts", contacts)
-        self._finder = ContactFinder(model, self._data, pairs, distance, length, budgets, friction)
+        self._places = Places(model, self._data)
+        self._finder = ContactFinder(model, self._data, self._places, pairs, distance, length, budgets, friction)
         model.opt.disableflags |= sum(
             int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("EQUALITY", "FRICTIONLOSS", "LIMIT")
         )
@@ -221,7 +223,8 @@ class MujocoLCS:
             nominal = evaluate_nominal(
                 step, contacts, contacts.geom, self._recovery, self._give, self.compliance, opens
             )
-            contacts, rest = nominal.contacts, read.batched(self._convert_forces(nominal.forces))
+            forces = _convert_forces(nominal.forces, self._finder.n_tangents, self.cone)
+            contacts, rest = nominal.contacts, read.batched(forces)
             free = step.free(read.tangent, nominal.carried)
         ranks = zip(free, (2, 2, 1, 2), strict=True)
         system = contact_lcs(
@@ -239,12 +242,13 @@ class MujocoLCS:
             system = self._selection.reduce(system)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
 
-    def _convert_forces(self, forces: Any) -> Any:
-        """Convert forces (n, n_contacts, n_rays) along Anitescu's rays to those (n, n_lam) of the system's cone."""
-        each = count_forces(1, self._finder.n_tangents, self.cone)
-        if each != forces.shape[-1]:  # Stewart and Trinkle: normal, tangential, and the distance
-            forces = np.concatenate([forces.sum(-1, keepdims=True), np.zeros((*forces.shape[:2], each - 1))], -1)
-        return forces.reshape(len(forces), -1)
+    def sequence(self, plan: Any, x: Tensor | None = None) -> LCSSequence:
+        """Linearise along the actions of a plan, from its state or from x (..., n_x), see `difflcs.sequence_along`."""
+        return sequence_along(self, plan, x)
+
+    def context_along(self, x: Tensor, u: Tensor, context: Tensor | None = None) -> Tensor | None:
+        """Return the nominal controls (..., nu) of actions u (..., n_u) at states x (..., n_x) of a plan."""
+        return context if self._quasi_static else self.control(x, u)
 
     def contacts(self, x: Tensor) -> Contacts:
         """Compute the gaps and their derivatives at states x (..., n_x).
@@ -285,26 +289,34 @@ class MujocoLCS:
 
     def _read(self, x: Tensor, context: Tensor | None = None) -> _States:
         qpos, qvel = self.state.to_mujoco(x)
-        batch, model, data = x.shape[:-1], self._model, self._data
+        batch, data = x.shape[:-1], self._data
         n = batch.numel()
         qpos, qvel = qpos.reshape(n, -1), qvel.reshape(n, -1)
         flat = x.detach().double().cpu().reshape(n, self.n_x).numpy()
-        act = flat[:, self.n_x - self.state.na :] if self.state.na else [data.act.copy()] * n
-        ctrl = [self._ctrl] * n if context is None else self._actuators.nominal(context, batch).reshape(n, -1)
-        found, moved = self._finder.find(qpos), self._motion.allocate(n)
-        for i in range(n):
-            with native(model, data, f"in state {i} of {n}"):
-                data.qpos[:], data.qvel[:], data.act[:] = qpos[i], qvel[i], act[i]
-                mujoco.mj_fwdPosition(model, data)
-                self._motion.read(i, data, moved, ctrl[i])
+        act = flat[:, self.n_x - self.state.na :] if self.state.na else np.broadcast_to(data.act, (n, len(data.act)))
+        ctrl = self._ctrl if context is None else self._actuators.nominal(context, batch).reshape(n, -1)
+        ctrl, found = np.broadcast_to(ctrl, (n, self.n_u)), self._finder.find(qpos)
+        moved = self._read_motion(np.concatenate([qpos, qvel, act], -1), ctrl)
         tangent = self.state.tangent(flat[:, : self.state.nv])
         return _States(batch, flat, tangent, found, moved)
+
+    def _read_motion(self, states: Any, ctrl: Any) -> Any:
+        """Read the motion at states (n, nq + nv + na) of MuJoCo, with nominal controls (n, nu)."""
+        model, data, n = self._model, self._data, len(states)
+        if isinstance(self._motion, Dynamic):
+            return self._motion.read(self._places, states, ctrl)
+        moved = self._motion.allocate(n)
+        for i in range(n):
+            with native(model, data, f"in state {i} of {n}"):
+                data.qpos[:], data.qvel[:], data.act[:] = np.split(states[i], [model.nq, model.nq + model.nv])
+                mujoco.mj_fwdPosition(model, data)
+                self._motion.read(i, data, moved, ctrl[i])
+        return moved
 
     def _typical_response(self) -> float:
         """Compute how far a unit of force moves two bodies apart that may touch, the median over their pairs."""
         model, data, nv = self._model, self._data, self.state.nv
-        moved = self._motion.allocate(1)
-        self._motion.read(0, data, moved, self._ctrl)
+        moved = self._read_motion(np.concatenate([data.qpos, data.qvel, data.act])[None], self._ctrl[None])
         x = np.zeros((1, self.n_x))
         if not isinstance(self._motion, Dynamic):
             response = self._motion.finish(moved, x, None).response.reshape(-1, nv, nv)[0].numpy()
@@ -313,18 +325,8 @@ class MujocoLCS:
             impulse = self._motion.finish(moved, x).response[0]
             response = self.seconds * impulse
             self._yields = self._actuators.yields(self.seconds * response, response)
-        jacobian, gives = np.empty((3, nv)), np.empty(model.ngeom)
-        for geom in range(model.ngeom):
-            mujoco.mj_jacGeom(model, data, jacobian, None, geom)
-            gives[geom] = np.trace(jacobian @ response @ jacobian.T) / (3 if self._finder.axis is None else 2)
-        first, second = self._finder.pairs if self._selection is None else self._selection.main(self._finder.pairs)
-        apart = (gives[first] + gives[second])[gives[first] + gives[second] > 0]
-        if len(first) and not len(apart):
-            raise InvalidInputError(
-                "model: expected something that contact forces can move, got nothing; what is pushed needs joints "
-                "without actuators, and a mobility above 0"
-            )
-        return float(np.median(apart)) if len(apart) else 1.0
+        pairs = self._finder.pairs if self._selection is None else self._selection.main(self._finder.pairs)
+        return _median_apart(model, data, response, pairs, 3 if self._finder.axis is None else 2)
 
 
 class _States(NamedTuple):
@@ -382,6 +384,14 @@ def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: A
     return module.params(module.state.to_state(data.qpos, data.qvel, data.act) if x is None else x)
 
 
+def _convert_forces(forces: Any, n_tangents: int, cone: Cone) -> Any:
+    """Convert forces (n, n_contacts, n_rays) along Anitescu's rays to those (n, n_lam) of a cone."""
+    each = count_forces(1, n_tangents, cone)
+    if each != forces.shape[-1]:  # Stewart and Trinkle: normal, tangential, and the distance
+        forces = np.concatenate([forces.sum(-1, keepdims=True), np.zeros((*forces.shape[:2], each - 1))], -1)
+    return forces.reshape(len(forces), -1)
+
+
 def _check_model(model: Any, data: Any, motion: Motion) -> None:
     if not isinstance(model, mujoco.MjModel):
         raise DTypeError(f"model: expected a mujoco.MjModel, got {describe(model)}; load one with MjModel")
@@ -412,6 +422,22 @@ def _check_model(model: Any, data: Any, motion: Motion) -> None:
     for wanted, present in refused.items():
         if present:
             raise InvalidInputError(f"model: expected {wanted}, got something else; change the model")
+
+
+def _median_apart(model: Any, data: Any, response: Any, pairs: Any, dimensions: int) -> float:
+    """Compute how far a unit of force moves two geoms of a pair apart, the median, for the response of the joints."""
+    jacobian, gives = np.empty((3, model.nv)), np.empty(model.ngeom)
+    for geom in range(model.ngeom):
+        mujoco.mj_jacGeom(model, data, jacobian, None, geom)
+        gives[geom] = np.trace(jacobian @ response @ jacobian.T) / dimensions
+    first, second = pairs
+    apart = (gives[first] + gives[second])[gives[first] + gives[second] > 0]
+    if len(first) and not len(apart):
+        raise InvalidInputError(
+            "model: expected something that contact forces can move, got nothing; what is pushed needs joints "
+            "without actuators, and a mobility above 0"
+        )
+    return float(np.median(apart)) if len(apart) else 1.0
 
 
 def _take(into: Any, data: Any) -> None:

@@ -14,12 +14,38 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import torch
 
 from difflcs.physics.mujoco._native import _mujoco
-from difflcs.physics.mujoco.native import TAKEN
+from difflcs.physics.mujoco.native import TAKEN, native
 
-_FUNCTIONS = ("mj_kinematics", "mj_comPos", "mj_geomDistance")
-_VARIABLES = ("mjCOLLISIONFUNC", "mju_user_error")
+_FUNCTIONS = (
+    "mj_kinematics",
+    "mj_comPos",
+    "mj_fwdPosition",
+    "mj_geomDistance",
+    "mj_solveM",
+    "mj_forwardSkip",
+    "mj_RungeKutta",
+    "mj_differentiatePos",
+    "mjd_transitionFD",
+    "mj_Euler",
+    "mj_implicit",
+)
+_FIELDS = (
+    "qpos",
+    "qvel",
+    "act",
+    "ctrl",
+    "geom_xpos",
+    "geom_xmat",
+    "cdof",
+    "subtree_com",
+    "actuator_length",
+    "qacc",
+    "act_dot",
+)
+_VARIABLES = ("mjCOLLISIONFUNC", "mju_user_error", "mjcb_time")
 _KINDS, _MOST, _FIRST = int(mujoco.mjtGeom.mjNGEOMTYPES), 128, 10  # doubles of a contact, and those that are read
 _FLAT = """
 <mujoco><worldbody><geom type="plane" size="1 1 1"/><body><geom type="box" size="1 1 1"/></body></worldbody></mujoco>"""
@@ -30,22 +56,27 @@ _OTHER = (
 
 
 @functools.cache
-def library() -> _mujoco.Library:
-    """Find the library that Python has loaded.
+def addresses() -> dict[str, int]:
+    """Return the addresses of functions and variables of the library that Python has loaded.
 
     Raises:
         ImportError: it has not what is called.
     """
-    loaded, missing = None, "a library beside the Python package"
+    missing = "a library beside the Python package"
     for path in sorted(Path(mujoco.__file__).parent.glob("libmujoco*")):
         try:  # it is loaded already; asked by the same path, the system returns that one
             loaded = ctypes.CDLL(str(path), mode=getattr(os, "RTLD_NOLOAD", 0) | getattr(os, "RTLD_NOW", 0))
-            addresses = {name: ctypes.cast(getattr(loaded, name), ctypes.c_void_p).value for name in _FUNCTIONS}
-            addresses |= {name: ctypes.addressof(ctypes.c_void_p.in_dll(loaded, name)) for name in _VARIABLES}
-            return _mujoco.Library(addresses, _KINDS, _stride(addresses["mjCOLLISIONFUNC"]))
+            found = {name: ctypes.cast(getattr(loaded, name), ctypes.c_void_p).value or 0 for name in _FUNCTIONS}
+            return found | {name: ctypes.addressof(ctypes.c_void_p.in_dll(loaded, name)) for name in _VARIABLES}
         except (OSError, AttributeError, ValueError) as error:
             missing = str(error)
     raise ImportError(_OTHER.format(mujoco.__version__, missing))
+
+
+@functools.cache
+def library() -> _mujoco.Library:
+    """Return these functions for the compiled part."""
+    return _mujoco.Library(addresses(), _KINDS, _stride(addresses()["mjCOLLISIONFUNC"]))
 
 
 def _stride(table: Any) -> int:
@@ -61,7 +92,7 @@ def _stride(table: Any) -> int:
         for stride in range(_FIRST, _MOST + 1):
             if np.array_equal(found[: 4 * stride].reshape(4, stride)[:, [0, 4, 5, 6]], [[-1, 0, 0, 1]] * 4):
                 return stride
-    raise ValueError("contacts of a box and a plane")
+    raise ImportError(_OTHER.format(mujoco.__version__, "contacts of a box and a plane as they were"))
 
 
 class Place:
@@ -73,20 +104,50 @@ class Place:
 
     def __init__(self, model: Any, data: Any):
         self.model, self.data = model, data
-        fields = {name: getattr(data, name) for name in ("qpos", "geom_xpos", "geom_xmat", "cdof", "subtree_com")}
-        addresses = {name: _address(name, value) for name, value in fields.items()}
-        addresses |= {"model": model._address, "data": data._address, "ccd_tolerance": _option(model)}
-        self.native = _mujoco.Place(addresses)
+        found = {name: _address(name, getattr(data, name)) for name in _FIELDS}
+        warnings = data.warning.number
+        found |= {"model": model._address, "data": data._address, "ccd_tolerance": _option(model)}
+        found |= {"warnings": warnings.ctypes.data, "kinds": len(warnings), "stride": warnings.strides[0] // 4}
+        self.native = _mujoco.Place(found)
 
-    def copy(self) -> Place:
-        """Make another for the same model."""
-        model = copy.copy(self.model)
-        return Place(model, mujoco.MjData(model))
 
-    def follow(self, data: Any) -> None:
-        """Take from other data what is not in the state."""
-        for name in TAKEN:
-            getattr(self.data, name)[:] = getattr(data, name)
+class Places:
+    """Where states are computed: the caller's model and data, and as many copies as there are threads.
+
+    Args:
+        model: a private copy, which does not change any more.
+        data: its data.
+    """
+
+    def __init__(self, model: Any, data: Any):
+        self._all = [Place(model, data)]
+
+    def take(self, n: int) -> list[_mujoco.Place]:
+        """Return places for n states, with all that is not in the state as in the first."""
+        first, threads = self._all[0], max(1, min(n, torch.get_num_threads()))
+        while len(self._all) < threads:
+            model = copy.copy(first.model)
+            self._all.append(Place(model, mujoco.MjData(model)))
+        for place in self._all[1:threads]:
+            for name in TAKEN:
+                getattr(place.data, name)[:] = getattr(first.data, name)
+        return [place.native for place in self._all[:threads]]
+
+    def check(self, outcome: tuple[int, int, str], n: int) -> None:
+        """Raise what MuJoCo said.
+
+        Raises:
+            InvalidInputError: MuJoCo raised an error, or has counted a warning, at one of n states.
+        """
+        state, thread, said = outcome
+        if state >= 0:
+            place, self._all = self._all[thread], self._all[:1]
+            first = self._all[0]
+            with native(first.model, first.data, f"in state {state} of {n}"):
+                for name in ("number", "lastinfo"):
+                    getattr(first.data.warning, name)[:] = getattr(place.data.warning, name)
+                if said:
+                    raise mujoco.FatalError(said)
 
 
 def _address(name: str, field: np.ndarray) -> int:

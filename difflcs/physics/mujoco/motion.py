@@ -21,6 +21,8 @@ state and for every step, also where Coriolis forces or an unstable equilibrium 
 
 from __future__ import annotations
 
+import copy
+import functools
 from typing import Any, NamedTuple
 
 import mujoco
@@ -31,7 +33,9 @@ from torch import Tensor
 
 from difflcs.errors import InvalidInputError
 from difflcs.physics.complementarity import FreeMotion
+from difflcs.physics.mujoco._native import _mujoco
 from difflcs.physics.mujoco.actuators import Actuators
+from difflcs.physics.mujoco.library import Places, addresses, library
 
 Array = NDArray[np.float64]
 
@@ -40,12 +44,7 @@ _MOST, _FEW = 50, 25  # steps that are simulated one by one; where there are mor
 _EULER, _RK4, _IMPLICIT, _FAST = (
     int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("EULER", "RK4", "IMPLICIT", "IMPLICITFAST")
 )
-_ADVANCE = {
-    _EULER: mujoco.mj_Euler,
-    _RK4: lambda model, data: mujoco.mj_RungeKutta(model, data, 4),
-    _IMPLICIT: mujoco.mj_implicit,
-    _FAST: mujoco.mj_implicit,
-}
+_ADVANCE = {_EULER: "mj_Euler", _IMPLICIT: "mj_implicit", _FAST: "mj_implicit"}
 
 
 class QuasiStatic:
@@ -148,58 +147,38 @@ class Dynamic:
         )
         self.flags = _flags("CONSTRAINT")
 
-    def allocate(self, n: int) -> Linearised:
-        """Make buffers for n states."""
-        nv, nu = self.model.nv, self.model.nu
+    def read(self, places: Places, states: Array, ctrl: Array) -> Linearised:
+        """Read the motion at states (n, nq + nv + na) of qpos, qvel and act, at controls (n, nu); NaN: balance.
+
+        Raises:
+            InvalidInputError: MuJoCo raised an error, or has counted a warning.
+        """
+        n, nv, nu = len(states), self.model.nv, self.model.nu
         n_x = 2 * nv + self.model.na
         sizes = ((n_x,), (n_x - nv,), (n_x, n_x), (n_x, nu), (nv, nv), (nu,), (n_x,))
-        return Linearised(*(np.zeros((n, *size)) for size in sizes))
+        read, ctrl = Linearised(*(np.zeros((n, *size)) for size in sizes)), np.ascontiguousarray(ctrl)
+        places.check(_mujoco.read_motion(library(), self._native, places.take(n), states, ctrl, *read), n)
+        activation = states[:, self.model.nq + nv :] + read.middle[:, 2 * nv :]
+        self.actuators.even_out(read.nominal, activation, read.A, read.B)
+        return read
 
-    def read(self, i: int, data: Any, into: Linearised, ctrl: Array) -> None:
-        """Read the state in `data`, for which `mj_fwdPosition` was called, at nominal controls (nu,); NaN: balance."""
-        model, options, nv = self.model, self.model.opt, self.model.nv
-        before = options.disableflags, options.timestep, options.integrator
-        qpos, qvel, act = data.qpos.copy(), data.qvel.copy(), data.act.copy()
-        mujoco.mj_solveM(model, data, into.inverse_mass[i], np.eye(model.nv))
-        balance = self.actuators.balance(data.actuator_length)
-        data.ctrl[:] = self.actuators.clip(np.where(np.isnan(ctrl), balance, ctrl))
-        into.nominal[i] = data.ctrl
-        into.nominal[i, self.relative] -= data.actuator_length[self.relative]
-        half = self.simulated.count // 2
-        self._simulate(data, half)
+    @functools.cached_property
+    def _native(self) -> _mujoco.Motion:
+        """Models as they are simulated and linearised, and what balances actuators, for the compiled part."""
+        model, actuators = self.model, self.actuators
+        self._models = simulated, linearised = copy.copy(model), copy.copy(model)
+        simulated.opt.disableflags |= self.flags
+        simulated.opt.timestep = self.seconds / self.simulated.count
+        simulated.opt.integrator = self.simulated.integrator
         # With a time step of one second and no implicit part, the next velocity is ν + acceleration.
-        options.disableflags |= self.flags | _flags("EULERDAMP")
-        options.timestep, options.integrator = 1.0, _EULER
-        mujoco.mj_forward(model, data)
-        if not np.abs(data.qacc).max() < _BEYOND**1.5:  # a simulation that diverges says nothing
-            data.qpos[:], data.qvel[:], data.act[:] = qpos, qvel, act
-            mujoco.mj_forward(model, data)
-        self._changed(data, qpos, act, into.middle[i])
-        into.acceleration[i, :nv], into.acceleration[i, nv:] = data.qacc, data.act_dot
-        with self.actuators.unlimited_rates(model):
-            mujoco.mjd_transitionFD(model, data, 1e-6, 0, into.A[i], into.B[i], None, None)
-        self.actuators.even_out(data, into.A[i], into.B[i])
-        options.disableflags, options.timestep, options.integrator = before
-        self._simulate(data, self.simulated.count - half)
-        self._changed(data, qpos, act, into.reached[i])
-        data.qpos[:], data.qvel[:], data.act[:] = qpos, qvel, act
-
-    def _changed(self, data: Any, qpos: Array, act: Array, into: Array) -> None:
-        """Write ζ, ν and the change of activation (n_x,) since `qpos` and `act`."""
-        nv = self.model.nv
-        mujoco.mj_differentiatePos(self.model, into[:nv], 1.0, qpos, data.qpos)
-        into[nv : 2 * nv], into[2 * nv :] = data.qvel, data.act - act
-
-    def _simulate(self, data: Any, steps: int) -> None:
-        """Simulate without the checks of `mj_step`, which warn of a motion that grows."""
-        options = self.model.opt
-        before = options.disableflags, options.timestep, options.integrator
-        options.disableflags, options.timestep = before[0] | self.flags, self.seconds / self.simulated.count
-        options.integrator = self.simulated.integrator
-        for _ in range(steps):
-            mujoco.mj_forward(self.model, data)
-            _ADVANCE[self.simulated.integrator](self.model, data)
-        options.disableflags, options.timestep, options.integrator = before
+        linearised.opt.disableflags |= self.flags | _flags("EULERDAMP")
+        linearised.opt.timestep, linearised.opt.integrator = 1.0, _EULER
+        actuators.unlimit_rates(linearised)
+        fields = {name: getattr(model, name) for name in ("nq", "nv", "nu", "na")}
+        fields |= {"simulated": simulated._address, "linearised": linearised._address, "steps": self.simulated.count}
+        advance = _ADVANCE.get(self.simulated.integrator)
+        fields["advance"] = addresses()[advance] if advance else 0
+        return _mujoco.Motion(fields | actuators.describe_balance(self.relative))
 
     def finish(self, read: Linearised, x: Array) -> DynamicStep:
         """Return the motion at states x (n, n_x)."""

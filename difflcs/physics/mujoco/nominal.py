@@ -19,9 +19,10 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from difflcs.lcp import solve_lcp_arrays
+from difflcs.physics.mujoco._native import _mujoco
 from difflcs.physics.mujoco.contacts import MujocoContacts
 from difflcs.physics.mujoco.motion import DynamicStep
 
@@ -70,13 +71,13 @@ class Recovery:
         """Gaps (n, n_contacts) of geoms (n, n_contacts, 2) that carry accelerations (n, n_contacts), after a step.
 
         What is deeper than the load explains, or a load that only the action makes, comes out as MuJoCo's contacts
-        recover, critically damped, from the `speed` (n, n_contacts) at which it opens now.
+        recover, critically damped, from the `speed` (n, n_contacts) at which it opens now, as far as depth explains it.
         """
         time, depth = self._time[geom].max(-1), self._depth[geom].max(-1)
         usual = np.minimum(depth * _LOAD, self._usual)
         deeper = np.maximum(-gap - np.clip(depth * acceleration, usual, 5 * self._usual), 0.0)
-        part = seconds / time
-        moved = deeper * (1 - (1 + part) * np.exp(-part)) + speed * seconds * np.exp(-part)
+        part, most = seconds / time, deeper / time
+        moved = deeper * (1 - (1 + part) * np.exp(-part)) + np.clip(speed, -most, most) * seconds * np.exp(-part)
         return np.where(gap < 0, -moved, gap)
 
     def crept(self, geom: NDArray[np.intp], acceleration: Array, speed: Array) -> Array:
@@ -95,17 +96,40 @@ class _Rays:
         n, k = rows.shape[:2]
         self.shape = n, k, max(1, 2 * slide.shape[2])
         self._rows = rows.reshape(n, -1, rows.shape[-1])
-        self._moves = response @ self._rows.swapaxes(-1, -2)
-        self._F = self._rows @ self._moves / give
-        self._F += compliance * np.eye(self._F.shape[-1])
-        self._give, self._compliance = give, compliance
+        self._response, self._give, self._compliance = response / give, give, compliance
 
     def forces(self, place: Array, gap: Array, rest: Array | float = 0.0) -> tuple[Array, Array]:
         """Forces (n, n_contacts, n_rays) and where they move ζ (n, nv); the compliance counts from forces `rest`."""
         apart = np.repeat(gap, self.shape[2], axis=1) + (self._rows @ place[:, :, None])[:, :, 0]
         rest = np.broadcast_to(rest, self.shape).reshape(apart.shape)
-        lam = solve_lcp_arrays(self._F, apart - self._compliance * self._give * rest)[0] / self._give
-        return lam.reshape(self.shape), place + (self._moves @ lam[:, :, None])[:, :, 0]
+        lam = solve_soft(self._rows, self._response, apart - self._compliance * self._give * rest, self._compliance)
+        moved = self._response @ (self._rows.swapaxes(-1, -2) @ lam[:, :, None])
+        return lam.reshape(self.shape) / self._give, place + moved[:, :, 0]
+
+
+def solve_soft(
+    rows: Array, response: Array, gap: Array, compliance: float, low: Array | None = None, high: Array | None = None
+) -> Array:
+    """Compute forces λ = clip(−(gap + rows · z)/compliance, low, high), with z = response rowsᵀ λ.
+
+    So 0 ≤ λ ⊥ gap + rows · z + compliance · λ ≥ 0 where no bounds are given; between −b and b it is dry friction.
+
+    Args:
+        rows: (n, m, nv).
+        response: (n, nv, nv) motion by forces, symmetric and positive semidefinite.
+        gap: (n, m).
+        compliance: > 0.
+        low: (n, m) least forces; None: 0.
+        high: (n, m) largest forces; None: infinite.
+    """
+    force = np.empty_like(gap)
+    low = np.zeros_like(gap) if low is None else np.ascontiguousarray(low)
+    high = np.full_like(gap, np.inf) if high is None else np.ascontiguousarray(high)
+    rows, gap = np.ascontiguousarray(rows), np.ascontiguousarray(gap)
+    response = np.ascontiguousarray(np.broadcast_to(response, (len(gap), *response.shape[-2:])))
+    threads = max(1, min(len(gap), torch.get_num_threads()))
+    _mujoco.solve_soft(rows, response, gap, compliance, low, high, threads, force)
+    return force
 
 
 def evaluate_nominal(

@@ -158,7 +158,7 @@ class MujocoState:
         return qpos, velocity
 
     def tangent(self, x: Array) -> Array | None:
-        """T (..., nv, nv) of qvel = T ẋ, for positions x (..., nv); None, without quaternions, for the identity.
+        """T (..., nv, nv) of qvel = T ẋ, for positions x (..., nv); None for the identity, where nothing has turned.
 
         The block of a rotation vector is the right Jacobian of SO(3): 1 − (1 − cos r)/r² [r]× + (r − sin r)/r³ [r]×².
         Its smallest singular value is 2 sin(r/2)/r, as far as which a rotation about another axis moves r.
@@ -166,7 +166,7 @@ class MujocoState:
         Raises:
             InvalidInputError: a rotation is so near to whole turns that no system in these coordinates is of use.
         """
-        if not self._turning:
+        if not any(x[..., v : v + 3].any() for _, v in self._turning):
             return None
         T = np.broadcast_to(np.eye(self.nv), (*x.shape[:-1], self.nv, self.nv)).copy()
         for _, v in self._turning:

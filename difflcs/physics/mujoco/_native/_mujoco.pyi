@@ -10,9 +10,12 @@ class Scene:
     def __init__(self, fields: Mapping[str, Any]) -> None: ...
 
 class Place:
-    def __init__(self, fields: Mapping[str, int]) -> None: ...
+    def __init__(self, fields: Mapping[str, Any]) -> None: ...
 
-def find(
+class Motion:
+    def __init__(self, fields: Mapping[str, Any]) -> None: ...
+
+def find_contacts(
     library: Library,
     scene: Scene,
     places: Sequence[Place],
@@ -24,4 +27,28 @@ def find(
     friction: np.ndarray,
     geom: np.ndarray,
     near: np.ndarray,
-) -> tuple[int, str]: ...
+) -> tuple[int, int, str]: ...
+def read_motion(
+    library: Library,
+    motion: Motion,
+    places: Sequence[Place],
+    state: np.ndarray,
+    ctrl: np.ndarray,
+    middle: np.ndarray,
+    acceleration: np.ndarray,
+    A: np.ndarray,
+    B: np.ndarray,
+    inverse_mass: np.ndarray,
+    nominal: np.ndarray,
+    reached: np.ndarray,
+) -> tuple[int, int, str]: ...
+def solve_soft(
+    J: np.ndarray,
+    R: np.ndarray,
+    q: np.ndarray,
+    compliance: float,
+    low: np.ndarray,
+    high: np.ndarray,
+    threads: int,
+    force: np.ndarray,
+) -> int: ...

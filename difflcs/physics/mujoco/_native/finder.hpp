@@ -59,14 +59,6 @@ struct Scene {
   }
 };
 
-// A model and its data, used by one thread at a time.
-struct Place {
-  const void* model;
-  void* data;
-  double *qpos, *geom_xpos, *ccd_tolerance;
-  const double *geom_xmat, *cdof, *subtree_com;
-};
-
 // What is found, one row for each state: gap (k), normal (k, nv), tangent (k, tangents, nv), friction (k), geom (k, 2).
 struct Found {
   double *gap, *normal, *tangent, *friction;

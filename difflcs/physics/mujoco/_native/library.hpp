@@ -16,30 +16,62 @@ constexpr int kMostPoints = 50;       // of a pair (mjMAXCONPAIR)
 using Act = void (*)(const void* model, void* data);
 using Distance = double (*)(const void* model, void* data, int first, int second, double most, double* ends);
 using Collide = int (*)(const void* model, void* data, double* contacts, int first, int second, double margin);
+using Solve = void (*)(const void* model, void* data, double* x, const double* y, int count);
+using Forward = void (*)(const void* model, void* data, int stage, int without_sensors);
+using RungeKutta = void (*)(const void* model, void* data, int order);
+using Difference = void (*)(const void* model, double* velocity, double seconds, const double* from, const double* to);
+using Transition = void (*)(const void* model, void* data, double step, unsigned char centered, double* A, double* B,
+                            double* C, double* D);
 using OnError = void (*)(const char*);
 
 struct Library {
-  Act kinematics, com_pos;
+  Act kinematics, com_pos, fwd_position;
   Distance distance;
+  Solve solve_mass;
+  Forward forward;
+  RungeKutta runge_kutta;
+  Difference difference;
+  Transition transition;
   const Collide* collide;  // table of kinds of geoms
   int kinds;
   int stride;  // doubles of a contact; the first ten: gap, place in the middle, normal, tangent
   OnError* on_error;
+  void** clock;  // which MuJoCo reads in every stage
 };
 
-// MuJoCo ends the process at an error. While one of these lives, its error goes back to `guarded` instead.
+// A model and its data, used by one thread at a time.
+struct Place {
+  const void* model;
+  void* data;
+  double *qpos, *qvel, *act, *ctrl, *geom_xpos, *ccd_tolerance;
+  const double *geom_xmat, *cdof, *subtree_com, *actuator_length, *qacc, *act_dot;
+  const int32_t* warnings;  // how often MuJoCo has warned, by kinds
+  int kinds, stride;        // of warnings, and from one to the next
+
+  bool has_warned() const {
+    for (int k = 0; k < kinds; k++)
+      if (warnings[k * stride] != 0) return true;
+    return false;
+  }
+};
+
+// MuJoCo ends the process at an error. While one of these lives, its error goes back to `guarded` instead, and its
+// stopwatches stand still, as reading the clock takes 8 % of a step.
 class Errors {
  public:
-  explicit Errors(OnError* slot) : slot_(slot) {
+  explicit Errors(const Library& library) : library_(library) {
     std::lock_guard<std::mutex> lock(mutex());
-    if (users()++ == 0) {
-      before() = *slot_;
-      *slot_ = &jump;
-    }
+    if (users()++ > 0) return;
+    before() = *library_.on_error;
+    clock() = *library_.clock;
+    *library_.on_error = &jump;
+    *library_.clock = nullptr;
   }
   ~Errors() {
     std::lock_guard<std::mutex> lock(mutex());
-    if (--users() == 0) *slot_ = before();
+    if (--users() > 0) return;
+    *library_.on_error = before();
+    *library_.clock = clock();
   }
   Errors(const Errors&) = delete;
 
@@ -82,6 +114,10 @@ class Errors {
     static OnError before = nullptr;
     return before;
   }
+  static void*& clock() {
+    static void* clock = nullptr;
+    return clock;
+  }
   static std::jmp_buf*& place() {
     static thread_local std::jmp_buf* place = nullptr;
     return place;
@@ -91,7 +127,7 @@ class Errors {
     return said;
   }
 
-  OnError* slot_;
+  const Library& library_;
 };
 
 }  // namespace difflcs::physics
