@@ -17,9 +17,18 @@ from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_choice, check_number, check_positive_int, check_tensor, describe
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
-from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, contact_lcs, count_forces
+from difflcs.physics.complementarity import (
+    Bounded,
+    Cone,
+    Contacts,
+    FreeMotion,
+    Unilateral,
+    contact_lcs,
+    count_forces,
+)
 from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, Pairs
 from difflcs.physics.mujoco.groups import ContactGroup, ContactSelection
+from difflcs.physics.mujoco.limits import RowBuffer, RowFinder, ScaledRows, scale
 from difflcs.physics.mujoco.motion import Actuators, Dynamic, QuasiStatic, disabled_actuators
 from difflcs.physics.mujoco.native import TAKEN, native
 from difflcs.physics.mujoco.nominal import Recovery, evaluate_nominal
@@ -106,6 +115,7 @@ class MujocoLCS:
         relative: bool = True,
         ctrl: ArrayLike | None = None,
         length: float | None = None,
+        limits: int | None = None,
     ):
         check_choice("motion", motion, ("quasi-static", "quasi-dynamic", "dynamic"))
         _check_model(model, data, motion)
@@ -117,6 +127,8 @@ class MujocoLCS:
         self.compliance = check_number("compliance", compliance, strict=True)
         if friction is not None:
             check_number("friction", friction)
+        if limits is not None:
+            check_positive_int("limits", limits, minimum=0)
         model = copy.copy(model)
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it would lose what data says; see native
         self._model, self._data = model, mujoco.MjData(model)
@@ -124,6 +136,7 @@ class MujocoLCS:
             _take(self._data, data)
         with native(model, self._data, "in the state of data"):
             mujoco.mj_fwdPosition(model, self._data)
+        self._rows = RowFinder(model, limits, motion != "quasi-static")
         self.state = MujocoState(model, self._data.qpos, velocities=motion == "dynamic")
         self._actuators, self._relative = Actuators(model), relative
         self._quasi_static = motion == "quasi-static"
@@ -132,12 +145,6 @@ class MujocoLCS:
             self._motion: Any = QuasiStatic(model, self._actuators, mobility)
         else:
             kind = Dynamic if motion == "dynamic" else QuasiDynamic
-            for where, friction_loss in (("joints", model.dof_frictionloss), ("tendons", model.tendon_frictionloss)):
-                if (friction_loss > 0).any():
-                    raise InvalidInputError(
-                        f"model: expected no dry friction in {where} (frictionloss) in {motion} motion, got some; "
-                        'replace it by damping, or use motion="quasi-static"'
-                    )
             self._motion = kind(model, self._actuators, self.seconds, relative)
         nominal = self._data.ctrl if ctrl is None else self._controls(torch.as_tensor(ctrl), torch.Size())
         self._ctrl = np.where(self._actuators.holds & (ctrl is None), np.nan, nominal)
@@ -176,7 +183,8 @@ class MujocoLCS:
     def n_lam(self) -> int:
         """Number of contact forces."""
         each = count_forces(1, self._finder.n_tangents, self.cone)
-        return self.n_contacts * each if self._selection is None else len(self._selection.rows(each))
+        of_contacts = self.n_contacts * each if self._selection is None else len(self._selection.rows(each))
+        return of_contacts + self._rows.n_limits + 2 * self._rows.n_friction
 
     def observe(self, data: Any) -> Tensor:
         """Return the state (n_x,) of MuJoCo's data, and let rotations count from the orientations there from now on.
@@ -208,16 +216,20 @@ class MujocoLCS:
                 "x: expected states (..., n_x), as contacts depend on where things are, got None; pass x"
             )
         read = self._read(x, context)
-        contacts, rest = read.dof_contacts, None
-        if not isinstance(self._motion, Dynamic):
-            free = self._motion.finish(read.moved, read.x, read.tangent)
-        else:
+        contacts, rest, effect = read.dof_contacts, None, None
+        if isinstance(self._motion, Dynamic):
             step, opens = self._motion.finish(read.moved, read.x), self.cone == "anitescu"
-            nominal = evaluate_nominal(
-                step, contacts, contacts.geom, self._recovery, self._give, self.compliance, opens
-            )
-            contacts, rest = nominal.contacts, read.batched(self._convert_forces(nominal.forces))
+            found = self._rows.finish(read.rows, step.place, step.response)
+            nominal = evaluate_nominal(step, contacts, found, self._recovery, self._give, self.compliance, opens)
+            contacts, rows = nominal.contacts, nominal.rows
+            effect = step.effect(read.tangent, rows.normal, rows.impulse)
+            rest = read.batched(self._convert_forces(nominal.forces, nominal.row_forces))
             free = step.free(read.tangent, nominal.carried)
+        else:
+            free = self._motion.finish(read.moved, read.x, read.tangent)
+            response = np.broadcast_to(read.to_dofs(free.response.numpy()), (len(read.x), *free.response.shape[-2:]))
+            found = self._rows.finish(read.rows, np.zeros_like(read.x), response)
+            rows = scale(found, found.gap, 1.0, response, self._give, 1.0)
         ranks = zip(free, (2, 2, 1, 2), strict=True)
         system = contact_lcs(
             read.contacts(contacts),
@@ -229,17 +241,19 @@ class MujocoLCS:
             length=self.length,
             force=self.length / self._give,
             rest=rest,
+            **read.constraints(rows, effect),
         )
         if self._selection is not None:
             system = self._selection.reduce(system)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
 
-    def _convert_forces(self, forces: Any) -> Any:
-        """Convert forces (n, n_contacts, n_rays) along Anitescu's rays to those (n, n_lam) of the system's cone."""
+    def _convert_forces(self, forces: Any, of_rows: Any) -> Any:
+        """Convert forces (n, n_contacts, n_rays) along Anitescu's rays, and of rows, to (n, n_lam) of the system."""
         each = count_forces(1, self._finder.n_tangents, self.cone)
         if each != forces.shape[-1]:  # Stewart and Trinkle: normal, tangential, and the distance
             forces = np.concatenate([forces.sum(-1, keepdims=True), np.zeros((*forces.shape[:2], each - 1))], -1)
-        return forces.reshape(len(forces), -1)
+        slid = np.zeros((len(forces), self._rows.n_friction))
+        return np.concatenate([forces.reshape(len(forces), -1), of_rows, slid], -1)
 
     def contacts(self, x: Tensor) -> Contacts:
         """Compute the gaps and their derivatives at states x (..., n_x).
@@ -286,17 +300,19 @@ class MujocoLCS:
         n = batch.numel()
         qpos, qvel = qpos.reshape(n, -1), qvel.reshape(n, -1)
         ctrl = [self._ctrl] * n if context is None else self._controls(context, batch).reshape(n, -1)
-        contacts, moved = self._finder.allocate(n), self._motion.allocate(n)
+        contacts, moved, rows = self._finder.allocate(n), self._motion.allocate(n), self._rows.allocate(n)
         for i in range(n):
             with native(model, data, f"in state {i} of {n}"):
                 data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
                 mujoco.mj_fwdPosition(model, data)
                 self._finder.read(i, contacts)
+                self._rows.read(i, data, rows)
                 self._motion.read(i, data, moved, ctrl[i])
         flat = x.detach().double().cpu().reshape(n, self.n_x).numpy()
         tangent = self.state.tangent(flat[:, : self.state.nv])
         found = self._finder.finish(contacts)
-        return _States(batch, flat, tangent, self._selection.select(found) if self._selection else found, moved)
+        found = self._selection.select(found) if self._selection else found
+        return _States(batch, flat, tangent, found, rows, moved)
 
     def _typical_response(self) -> float:
         """Compute how far a unit of force moves two bodies apart that may touch, the median over their pairs."""
@@ -330,6 +346,7 @@ class _States(NamedTuple):
         x: (n, n_x).
         tangent: of their rotations, see `MujocoState.tangent`.
         dof_contacts: contacts.
+        rows: what says where limits are.
         moved: buffers of the motion.
     """
 
@@ -337,6 +354,7 @@ class _States(NamedTuple):
     x: Any
     tangent: Any
     dof_contacts: MujocoContacts
+    rows: RowBuffer
     moved: Any
 
     def batched(self, value: Any) -> Tensor:
@@ -346,12 +364,32 @@ class _States(NamedTuple):
 
     def contacts(self, dof_contacts: MujocoContacts) -> Contacts:
         """Convert derivatives by the degrees of freedom to derivatives by the state."""
-        rows = (dof_contacts.normal, dof_contacts.tangent)
+        return Contacts(
+            self.batched(dof_contacts.gap), self._of_state(dof_contacts.normal), self._of_state(dof_contacts.tangent)
+        )
+
+    def constraints(self, rows: ScaledRows, effect: Any) -> dict[str, Any]:
+        """Return rows that are no contacts as arguments of `contact_lcs`; `effect` (n, n_x, k) as there."""
+        k = rows.gap.shape[1] - rows.bound.shape[1]
+        gap, along = self.batched(rows.gap), self._of_state(rows.normal)
+        effects = [None, None] if effect is None else [self.batched(effect[:, :, :k]), self.batched(effect[:, :, k:])]
+        bound, found = self.batched(rows.bound), {}
+        if k:
+            found["unilateral"] = Unilateral(gap[..., :k], along[..., :k, :], effects[0])
+        if rows.bound.shape[1]:
+            found["bounded"] = Bounded(gap[..., k:], along[..., k:, :], -bound, bound, effects[1])
+        return found
+
+    def to_dofs(self, response: Any) -> Any:
+        """Convert a response (..., nv, nv) of the positions of the state to one of the degrees of freedom."""
+        return response if self.tangent is None else self.tangent @ response @ self.tangent.swapaxes(-1, -2)
+
+    def _of_state(self, rows: Any) -> Tensor:
+        """Convert derivatives (n, ..., nv) by the degrees of freedom to derivatives by the state."""
         if self.tangent is not None:
-            rows = (rows[0] @ self.tangent, rows[1] @ self.tangent[:, None])
-        still = self.x.shape[-1] - dof_contacts.normal.shape[-1]
-        rows = (np.concatenate([v, np.zeros((*v.shape[:-1], still))], -1) for v in rows)
-        return Contacts(*map(self.batched, (dof_contacts.gap, *rows)))
+            rows = rows @ (self.tangent if rows.ndim == 3 else self.tangent[:, None])
+        still = self.x.shape[-1] - rows.shape[-1]
+        return self.batched(np.concatenate([rows, np.zeros((*rows.shape[:-1], still))], -1))
 
 
 def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: Any) -> LCSParams:

@@ -86,6 +86,19 @@ def disabled_actuators(model: Any) -> NDArray[np.bool_]:
     return disabled | bool(model.opt.disableflags & _flags("ACTUATION"))
 
 
+def tendon_jacobian(model: Any, data: Any) -> Array:
+    """Return the derivative (ntendon, nv) of the tendons' lengths, which newer versions of MuJoCo keep sparse."""
+    jacobian = np.zeros((model.ntendon, model.nv))
+    if data.ten_J.size == jacobian.size:
+        return data.ten_J.reshape(jacobian.shape)
+    where = (
+        getattr(data if hasattr(data, name) else model, name)
+        for name in ("ten_J_rownnz", "ten_J_rowadr", "ten_J_colind")
+    )
+    mujoco.mju_sparse2dense(jacobian, data.ten_J.reshape(-1), *(v.reshape(-1) for v in where))
+    return jacobian
+
+
 class QuasiStatic:
     """Joints with actuators go where they are told; all else moves only while pushed, by its mobility times the force.
 
@@ -371,6 +384,12 @@ class DynamicStep(NamedTuple):
         impulse, response = self.response, np.zeros((n, 2 * nv, 2 * nv))
         response[:, :, :nv] = to_x @ np.concatenate([h * impulse, impulse], 1) @ to_x[:, :nv, :nv].swapaxes(-1, -2)
         return FreeMotion(*(torch.from_numpy(v) for v in (A_x, to_x @ control, d, response)))
+
+    def effect(self, tangent: Array | None, normal: Array, impulse: Array) -> Array:
+        """What a unit of force does to the next state (n, 2 nv, k), which moves ζ by h S `normal` and ν by S `impulse`."""
+        h = self.seconds
+        place, velocity = (self.response @ rows.swapaxes(-1, -2) for rows in (h * normal, impulse))
+        return np.concatenate([place if tangent is None else np.linalg.solve(tangent, place), velocity], 1)
 
 
 def _reached(step: Array, x: Array) -> Array:
