@@ -301,6 +301,8 @@ def follow(gap: Array, speed: Array, load: Array, mass: Array, soft: Softness, s
         far += h * h * (count - i) * force
         holds = holds & held
     acts = np.abs(impulse) > 1e-12
+    # Where the load is carried, it acts at the beginning of the step as well.
+    far = far - np.where(holds, load * (seconds**2 - 0.5 * h * h * count * (count + 1)), 0.0)
     part = np.where(acts, far / np.where(acts, impulse, 1.0), seconds) / seconds
     return Followed(r - gap, part, acts, holds, held)
 

@@ -29,7 +29,7 @@ from difflcs.physics.mujoco.motion import DynamicStep
 Array = NDArray[np.float64]
 _USUAL, _LOAD = 0.02, 100.0  # depth of contacts in parts of the length, acceleration [m/s²], both of any load
 _SOFTER = 0.03  # of the compliance: how exactly forces are computed
-_EARLY = 0.7  # least part of a step that a force has for moving: an impact is not to bounce back
+_EARLY = 0.6  # least part of a step that a force has for moving: an impact is not to bounce back
 _PASSES = 2  # each reduces what is left of compliance and opening by about their parts of the motion
 
 
@@ -151,10 +151,11 @@ def _settle(
     after = follow(rows.gap, speed, load, mass, rows.soft, h, step.motion.steps.count)
     inside = np.abs(forces[:, k:]) < 0.999 * scaled.bound
     holds = after.holds & np.concatenate([forces[:, :k] > 0, inside], 1)
-    reached = np.where(after.acts, np.minimum(rows.gap + after.moved, 0.0), np.minimum(rows.gap, 0.0))
+    reached = np.minimum(rows.gap + after.moved, 0.0)
     # A limit holds at the depth that it has after the step. Friction that holds creeps.
     gap = np.where(np.arange(rows.gap.shape[1]) < k, rows.gap - reached, np.where(holds, -after.moved, 0.0))
-    part = np.clip(np.where(holds, 1.0, after.part), _EARLY, 1.0)
+    reach = np.abs(rows.normal @ step.step[:, :nv, 2 * nv : -1]).sum(-1)
+    part = np.clip(np.where(~after.holds & (np.abs(rows.gap) < reach * ~(after.acts & (rows.gap > 0))), _EARLY, after.part), _EARLY, 1.0)
     part[:, k:] = np.where(after.stops[:, k:], 1.0, part[:, k:])
     return scale(rows, gap, part, response, give, h), rows.normal * holds[:, :, None]
 
