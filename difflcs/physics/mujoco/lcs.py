@@ -219,7 +219,8 @@ class MujocoLCS:
         contacts, rest, effect = read.dof_contacts, None, None
         if isinstance(self._motion, Dynamic):
             step, opens = self._motion.finish(read.moved, read.x), self.cone == "anitescu"
-            found = self._rows.finish(read.rows, step.place, step.response)
+            middle = read.moved.middle[:, : self.state.nv], read.moved.length
+            found = self._rows.finish(read.rows, step.place, step.response, middle)
             nominal = evaluate_nominal(step, contacts, found, self._recovery, self._give, self.compliance, opens)
             contacts, rows = nominal.contacts, nominal.rows
             effect = step.effect(read.tangent, rows.normal, rows.impulse)

@@ -6,8 +6,8 @@ brings about the acceleration a goes by
 
     v̇ = a + A/(A + R) (−b v − k d r − a),
 
-its part after a being a force within the bounds. Followed through a step this says how deep a limit is passed or how far
-friction creeps, when in the step the force acts, and whether it does so all the time.
+its part after a being a force within the bounds. Followed through a step this says how deep a limit is passed or how
+far friction creeps, when in the step the force acts, and whether it does so all the time.
 """
 
 # MuJoCo is a compiled module without type stubs.
@@ -50,6 +50,12 @@ class Softness(NamedTuple):
     margin: Array
     bound: Array
 
+    @property
+    def creep(self) -> Array:
+        """Largest speed at which friction that holds creeps; infinite for limits."""
+        d = _impedance(np.zeros_like(self.give), self.impedance)
+        return self.bound * (1 - d) / d * self.give / self.damping
+
     def at(self, index: Any) -> Softness:
         """Return those of some rows."""
         return Softness(*(values[index] for values in self))
@@ -61,12 +67,14 @@ class Rows(NamedTuple):
     Attributes:
         gap: (n, k) distance from where the limit acts; zero for friction.
         normal: (n, k, nv) derivative of the gap, or of the way that rubs, by the degrees of freedom.
+        bend: (n, k) how much more the gap of a tendon grows in the step than its derivative says.
         soft: softness, (n, k).
         n_friction: number of rows of friction.
     """
 
     gap: Array
     normal: Array
+    bend: Array
     soft: Softness
     n_friction: int
 
@@ -165,16 +173,17 @@ class RowFinder:
         if len(self._tendons) or len(self._rubbing_tendons):
             into.length[i], into.tendon[i] = data.ten_length, tendon_jacobian(self.model, data)
 
-    def finish(self, read: RowBuffer, place: Array, response: Array) -> Rows:
+    def finish(self, read: RowBuffer, place: Array, response: Array, middle: tuple[Array, Array] | None = None) -> Rows:
         """Return the rows, of limits those that are nearest to acting.
 
         Args:
             read: the states.
             place: (n, nv) ζ after the step, without the rows.
             response: (n, nv, nv) what a unit of force does to ζ or ν.
+            middle: (n, nv) ζ in the middle of the step, and the lengths (n, ntendon) of the tendons there.
         """
         n, nv = place.shape
-        normal, gap = self._limits(read, place)
+        normal, gap, bend = self._limits(read, place, middle)
         where = np.arange(n)[:, None]
         chosen = np.broadcast_to(np.arange(gap.shape[1]), gap.shape)
         if self.n_limits < gap.shape[1]:
@@ -184,16 +193,17 @@ class RowFinder:
             # What does not give way cannot act.
             after = np.where(gives > 0, after / np.sqrt(np.maximum(gives, 1e-300)), np.inf)
             chosen = np.sort(np.argpartition(after, self.n_limits, -1)[:, : self.n_limits])
-            normal, gap = normal[where, chosen], gap[where, chosen]
+            normal, gap, bend = normal[where, chosen], gap[where, chosen], bend[where, chosen]
         rubbing = np.zeros((n, len(self._rubbing), nv))
         rubbing[:, np.arange(len(self._rubbing)), self._rubbing] = 1.0
         normal = np.concatenate([normal, rubbing, read.tendon[:, self._rubbing_tendons]], 1)
         of_friction = np.arange(len(self._range), len(self._soft.bound))
         chosen = np.concatenate([chosen, np.broadcast_to(of_friction, (n, self.n_friction))], 1)
-        return Rows(np.pad(gap, ((0, 0), (0, self.n_friction))), normal, self._soft.at(chosen), self.n_friction)
+        gap, bend = (np.pad(values, ((0, 0), (0, self.n_friction))) for values in (gap, bend))
+        return Rows(gap, normal, bend, self._soft.at(chosen), self.n_friction)
 
-    def _limits(self, read: RowBuffer, place: Array) -> tuple[Array, Array]:
-        """Return derivatives (n, k, nv) and gaps (n, k) of all limits, each that of its nearer side after the step."""
+    def _limits(self, read: RowBuffer, place: Array, middle: tuple[Array, Array] | None) -> tuple[Array, Array, Array]:
+        """Return derivatives (n, k, nv), gaps and bends of all limits, each of its nearer side after the step."""
         model, (n, nv) = self.model, place.shape
         k, balls = len(self._joints), len(self._balls)
         value, along = np.zeros((n, len(self._range))), np.zeros((n, len(self._range), nv))
@@ -210,8 +220,11 @@ class RowFinder:
         lower, upper = value - self._range[:, 0], self._range[:, 1] - value
         moved = (along @ place[:, :, None])[:, :, 0]
         side = np.where(lower + moved < upper - moved, 1.0, -1.0)
-        gap = np.where(side > 0, lower, upper) - self._soft.margin[: len(self._range)]
-        return side[:, :, None] * along, gap
+        gap, bend = np.where(side > 0, lower, upper) - self._soft.margin[: len(self._range)], np.zeros_like(side)
+        if middle is not None and len(self._tendons):
+            straight = read.length + (read.tendon @ middle[0][:, :, None])[:, :, 0]
+            bend[:, k + balls :] = 4 * side[:, k + balls :] * (middle[1] - straight)[:, self._tendons]
+        return side[:, :, None] * along, gap, bend
 
     def _warn_of_more(self, after: Array) -> None:
         """Warn once if limits that act at the nominal action are dropped because of the default number."""
@@ -219,7 +232,8 @@ class RowFinder:
         if self._warn and acting > self.n_limits:
             warnings.warn(
                 f"expected at most {self.n_limits} limits of joints and tendons that act in a step, got {acting}; only "
-                f"those nearest to acting are kept: pass limits={acting}, or limits={self.n_limits} if these are enough",
+                f"the nearest are kept, so that others are passed: pass limits={acting}, or limits={self.n_limits} if "
+                f"these are enough",
                 ContactWarning,
                 stacklevel=5,
             )
@@ -299,7 +313,7 @@ def follow(gap: Array, speed: Array, load: Array, mass: Array, soft: Softness, s
         r += h * v
         impulse += h * force
         far += h * h * (count - i) * force
-        holds = holds & held
+        holds = holds & (held | (i == 0 < count - 1))  # what begins to touch holds as well
     acts = np.abs(impulse) > 1e-12
     # Where the load is carried, it acts at the beginning of the step as well.
     far = far - np.where(holds, load * (seconds**2 - 0.5 * h * h * count * (count + 1)), 0.0)

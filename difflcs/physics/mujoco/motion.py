@@ -204,7 +204,7 @@ class Dynamic:
     def allocate(self, n: int) -> Linearised:
         """Make buffers for n states."""
         nv, nu = self.model.nv, self.model.nu
-        sizes = ((2 * nv,), (nv,), (2 * nv, 2 * nv), (2 * nv, nu), (nv, nv), (nu,), (2 * nv,))
+        sizes = ((2 * nv,), (self.model.ntendon,), (nv,), (2 * nv, 2 * nv), (2 * nv, nu), (nv, nv), (nu,), (2 * nv,))
         return Linearised(*(np.zeros((n, *size)) for size in sizes))
 
     def read(self, i: int, data: Any, into: Linearised, ctrl: Array) -> None:
@@ -226,7 +226,7 @@ class Dynamic:
             data.qpos[:], data.qvel[:] = qpos, qvel
             mujoco.mj_forward(model, data)
         mujoco.mj_differentiatePos(model, into.middle[i, :nv], 1.0, qpos, data.qpos)
-        into.middle[i, nv:], into.acceleration[i] = data.qvel, data.qacc
+        into.middle[i, nv:], into.acceleration[i], into.length[i] = data.qvel, data.qacc, data.ten_length
         mujoco.mjd_transitionFD(model, data, 1e-6, 0, into.A[i], into.B[i], None, None)
         options.disableflags, options.timestep, options.integrator = before
         self._simulate(data, self.simulated.count - half)
@@ -308,6 +308,7 @@ class Linearised(NamedTuple):
 
     Attributes:
         middle: (n, 2 nv) where the nominal control leads in half a step; all is linearised there.
+        length: (n, ntendon) of tendons there.
         acceleration: (n, nv) with the nominal control.
         A: (n, 2 nv, 2 nv) transition by position and velocity in one second of Euler's method.
         B: (n, 2 nv, nu) by control.
@@ -317,6 +318,7 @@ class Linearised(NamedTuple):
     """
 
     middle: Array
+    length: Array
     acceleration: Array
     A: Array
     B: Array
@@ -386,7 +388,7 @@ class DynamicStep(NamedTuple):
         return FreeMotion(*(torch.from_numpy(v) for v in (A_x, to_x @ control, d, response)))
 
     def effect(self, tangent: Array | None, normal: Array, impulse: Array) -> Array:
-        """What a unit of force does to the next state (n, 2 nv, k), which moves ζ by h S `normal` and ν by S `impulse`."""
+        """What forces do to the next state (n, 2 nv, k): ζ moves by h S `normal` (n, k, nv), ν by S `impulse`."""
         h = self.seconds
         place, velocity = (self.response @ rows.swapaxes(-1, -2) for rows in (h * normal, impulse))
         return np.concatenate([place if tangent is None else np.linalg.solve(tangent, place), velocity], 1)

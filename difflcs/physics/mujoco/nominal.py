@@ -29,7 +29,7 @@ from difflcs.physics.mujoco.motion import DynamicStep
 Array = NDArray[np.float64]
 _USUAL, _LOAD = 0.02, 100.0  # depth of contacts in parts of the length, acceleration [m/s²], both of any load
 _SOFTER = 0.03  # of the compliance: how exactly forces are computed
-_EARLY = 0.6  # least part of a step that a force has for moving: an impact is not to bounce back
+_EARLY = 0.6  # least part of a step in which a force moves things; from 0.5 on an impact would bounce with its speed
 _PASSES = 2  # each reduces what is left of compliance and opening by about their parts of the motion
 
 
@@ -134,29 +134,33 @@ def solve_bounded(F: Array, q: Array, bound: Array) -> Array:
 def _settle(
     step: DynamicStep, contacts: MujocoContacts, rows: Rows, give: float, compliance: float
 ) -> tuple[ScaledRows, Array]:
-    """Find where limits hold and how friction acts; return them, and the rows (n, n_rows, nv) that hold all the time."""
+    """Find where limits and friction hold; return them, and (n, n_rows, nv) those that hold all the time."""
     h, nv, k = step.seconds, step.place.shape[1], rows.gap.shape[1] - rows.n_friction
-    response = h * step.response
+    response, is_limit = h * step.response, np.arange(rows.gap.shape[1]) < k
     if not rows.gap.size:
         return scale(rows, rows.gap, 1.0, response, give, h), rows.normal
-    # With all loads at the beginning of the step, as forces are.
-    rays = _Rays(contacts, scale(rows, np.maximum(rows.gap, 0.0), 1.0, response, give, h), response, give, compliance)
+    # First a step with all loads at its beginning, as forces are: limits hold at zero, what creeps goes on creeping.
+    speed = (rows.normal @ step.x[:, nv:, None])[:, :, 0]
+    creeps = np.abs(speed) < rows.soft.creep
+    gap = np.where(is_limit, np.maximum(rows.gap, 0.0) + 2 * rows.bend, -h * speed * creeps)
+    scaled = scale(rows, gap, 1.0, response, give, h)
+    rays = _Rays(contacts, scaled, response, give, compliance)
     forces, moved = rays.forces(_place(step, step.delayed), np.maximum(contacts.gap, 0.0))
     forces = rays.split(forces)[1]
-    speed = (rows.normal @ step.x[:, nv:, None])[:, :, 0]
     mass = np.einsum("nki,nij,nkj->nk", rows.normal, step.inverse_mass, rows.normal)
-    scaled = scale(rows, rows.gap, 1.0, response, give, h)
-    own = np.einsum("nki,nij,nkj->nk", rows.normal, step.response, rows.normal) * forces * scaled.unit
-    load = ((rows.normal @ moved[:, :, None])[:, :, 0] / h - own - speed) / h
+    after_bend = (rows.normal @ moved[:, :, None])[:, :, 0] + 2 * rows.bend
+    load = (after_bend / h - speed - mass * forces * scaled.unit) / h
     after = follow(rows.gap, speed, load, mass, rows.soft, h, step.motion.steps.count)
     inside = np.abs(forces[:, k:]) < 0.999 * scaled.bound
     holds = after.holds & np.concatenate([forces[:, :k] > 0, inside], 1)
-    reached = np.minimum(rows.gap + after.moved, 0.0)
-    # A limit holds at the depth that it has after the step. Friction that holds creeps.
-    gap = np.where(np.arange(rows.gap.shape[1]) < k, rows.gap - reached, np.where(holds, -after.moved, 0.0))
+    # A limit holds at the depth that it has after the step, friction after its creep.
+    depth = np.minimum(rows.gap + after.moved, 0.0)
+    gap = np.where(is_limit, rows.gap + 2 * rows.bend - depth, -after.moved * holds)
+    # What only another action brings to its limit is pressed there all the time: half an impulse does as much.
     reach = np.abs(rows.normal @ step.step[:, :nv, 2 * nv : -1]).sum(-1)
-    part = np.clip(np.where(~after.holds & (np.abs(rows.gap) < reach * ~(after.acts & (rows.gap > 0))), _EARLY, after.part), _EARLY, 1.0)
-    part[:, k:] = np.where(after.stops[:, k:], 1.0, part[:, k:])
+    pressed = ~holds & (np.abs(rows.gap) < reach) & ~(after.acts & (rows.gap > 0))
+    part = np.clip(np.where(is_limit & pressed, _EARLY, after.part), _EARLY, 1.0)
+    part = np.where(~is_limit & after.stops, 1.0, part)
     return scale(rows, gap, part, response, give, h), rows.normal * holds[:, :, None]
 
 
