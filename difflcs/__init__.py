@@ -11,6 +11,7 @@ from difflcs.losses import prediction_loss, violation_loss
 from difflcs.mpc.backends import available_backends, register_backend
 from difflcs.mpc.layer import LCSMPCLayer
 from difflcs.mpc.solution import MPCSolution
+from difflcs.records import sequence_along
 from difflcs.scales import ScaledLCS, Scales, suggest_scales
 from difflcs.status import Status
 
@@ -42,6 +43,7 @@ __all__ = [
     "available_backends",
     "prediction_loss",
     "register_backend",
+    "sequence_along",
     "solve_lcp",
     "suggest_scales",
     "violation_loss",

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
-from typing import Protocol, runtime_checkable
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Protocol, Self, runtime_checkable
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from difflcs._checks import check_number, check_positive_int, check_same_device, check_tensor, describe
 from difflcs._differentiation import is_wrapped, runs_eagerly
@@ -146,6 +146,15 @@ class QuadraticCost(_Quadratic):
     ):
         super().__init__()
         self._fill(Q, R, Q_final, q, r, q_final, constant, S, check, constant_stage)
+
+    @classmethod
+    def of_checked(cls, fields: Mapping[str, Tensor]) -> Self:
+        """A cost of fields that fit each other, all but S; nothing is checked here."""
+        cost = cls.__new__(cls)
+        nn.Module.__init__(cost)
+        cost._buffers.update({name: fields.get(name) for name in _DIMENSIONS})
+        cost.n_x, cost.n_u = fields["Q"].shape[-1], fields["R"].shape[-1]
+        return cost
 
 
 class CostSequence(_Quadratic):

@@ -398,6 +398,42 @@ def system_at(lcs: LCSModule, x: Tensor | None, context: Tensor | None = None) -
     return fresh(lcs).params(x, context)
 
 
+@runs_eagerly
+def sequence_along(lcs: LCSModule, plan: Any, x0: Tensor | None = None, context: Tensor | None = None) -> LCSSequence:
+    """Linearise a module along the motion that it predicts for the actions of a plan.
+
+    It is asked anew in each state that these actions lead to, where one system holds the contacts of one state through
+    the whole horizon. So what comes into reach on the way is in it, and a side that is left, is not. States that a plan
+    itself predicts serve less well: where its system was wrong, it may see one body inside another.
+
+    Args:
+        lcs: the module. Where it has a method `context_along(x, u, context)`, that says the context of each stage, such
+            as a nominal control.
+        plan: an `MPCSolution`, or a `Primal` such as `solution.shift()`.
+        x0: (..., n_x) states to begin at; None: those of the plan.
+        context: (..., n_context) see `LCSModule.params`.
+
+    Returns:
+        One system per stage, differentiable in what the module learns and, at stage 0, as `params` is in x0. The states
+        where the module is asked are no functions of anything.
+
+    Raises:
+        DTypeError: the module does not return `LCSParams`.
+    """
+    u = plan.u.detach()
+    x = (plan.x[..., 0, :] if x0 is None else x0).expand(*u.shape[:-2], lcs.n_x)
+    context_along, systems = getattr(lcs, "context_along", None), []
+    for k in range(u.shape[-2]):
+        given = context if context_along is None else context_along(x, u[..., k, :], context)
+        system = system_at(lcs, x, given)
+        if not isinstance(system, LCSParams):
+            raise DTypeError(f"lcs: expected LCSParams from {type(lcs).__name__}.params, got {describe(system)}")
+        systems.append(system)
+        with torch.no_grad():
+            x = advance(system, x, u[..., k, :]).x_next
+    return LCSSequence.stack(systems)
+
+
 def advance(system: SystemMatrices, x: Tensor, u: Tensor) -> LCSPrediction:
     """One step of a system for states and actions that were checked."""
     lam = solve_lcp(system.F, system.gap(x, u)).lam

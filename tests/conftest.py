@@ -92,6 +92,17 @@ class Build:
         pairs = [(3, 0), (4, 1), (5, 0), (6, 1), (7, 0), (8, 1)]
         return GoalCost.reach(9, 6, (200.0, 200.0, 0.3), (200.0, 200.0, 1.5), 200.0, pairs, 10.0, 6.0, dtype=dtype)
 
+    class AskedCost:
+        """A `GoalCost` that is asked as a `CostModule`."""
+
+        def __init__(self, cost: GoalCost):
+            self.cost, self.n_x, self.n_u, self.n_goal = cost, cost.n_x, cost.n_u, cost.n_goal
+
+        def at(self, x: Tensor, goal: Tensor | None = None, context: Tensor | None = None) -> QuadraticCost:
+            assert goal is not None
+            end, one = self.cost(goal, horizon=0), self.cost(goal, horizon=1)
+            return QuadraticCost(**end.tensors(), constant_stage=one.constant - end.constant)
+
     @staticmethod
     def pushing(seed: int = 0, n_lam: int = 5) -> LCSParams:
         """A synthetic pushing model of the paper's size."""

@@ -99,16 +99,17 @@ void set_fallback(Guarded& self, int kind, std::optional<Array> given) {
   controller->set_fallback(difflcs::Fallback(kind), given ? given->data() : nullptr);
 }
 
-void set_system(Guarded& self, std::vector<Array> matrices) {
+void set_inputs(Guarded& self, std::vector<Array> values, double constant) {
   const Use controller(self);
-  expect(matrices.size() == 8, "a system has eight fields");
-  const double* from[8];
-  for (int i = 0; i < 8; i++) {
-    expect(int64_t(matrices[i].size()) == controller->data().field[i].count(),
-           "the system must have the sizes of the first");
-    from[i] = matrices[i].data();
+  const difflcs::ControllerData& d = controller->data();
+  expect(values.size() == difflcs::kG_x, "there must be one array for each field of system, cost and bounds");
+  std::vector<const double*> from;
+  for (const Array& value : values) {
+    expect(int64_t(value.size()) == d.field[from.size()].count(), "the fields must have the sizes of the first");
+    from.push_back(value.data());
   }
-  controller->set_system(from);
+  controller->set_inputs(difflcs::kA, int(from.size()), from.data());
+  controller->set_constant(constant);
 }
 
 }  // namespace
@@ -129,5 +130,5 @@ void bind_controller(nb::module_& m) {
           },
           "seconds"_a)
       .def("set_fallback", &set_fallback, "kind"_a, "given"_a.none())
-      .def("set_system", &set_system, "matrices"_a);
+      .def("set_inputs", &set_inputs, "values"_a, "constant"_a, "Other numbers of system, cost and bounds.");
 }

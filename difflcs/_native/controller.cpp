@@ -236,9 +236,9 @@ void Controller::set_fallback(Fallback kind, const double* given) {
   if (kind == Fallback::given) std::copy_n(given, data_.n_u, given_.get());
 }
 
-void Controller::set_system(const double* const matrices[8]) {
-  static_assert(kA == 0 && kc == 7, "the system's fields come first");
-  for (int i = kA; i <= kc; i++) std::copy_n(matrices[i], data_.field[i].count(), data_.field[i].get());
+void Controller::set_inputs(Input first, int count, const double* const* values) {
+  for (int i = 0; i < count; i++) std::copy_n(values[i], data_.field[first + i].count(), data_.field[first + i].get());
+  set_flags(batch_, data_.field[kS].count(), data_.field[ku_min].count(), data_.field[ku_max].count());
 }
 
 }  // namespace difflcs

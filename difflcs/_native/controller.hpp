@@ -63,8 +63,10 @@ class Controller {
   // The action `given` (n_u) is clipped into the bounds; it must be finite.
   void set_fallback(Fallback kind, const double* given);
 
-  // Other matrices of the system, in the order of the fields; by stage where those of the file are.
-  void set_system(const double* const matrices[8]);
+  // Other numbers of `count` fields from `first` on, in the order of fields.hpp; by stage where those of the file are.
+  void set_inputs(Input first, int count, const double* const* values);
+  // What is added to the objective, besides that of a goal.
+  void set_constant(double constant) { data_.constant = constant; }
 
  private:
   void aim(const double* targets, bool follow);

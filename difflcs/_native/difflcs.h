@@ -110,6 +110,13 @@ DIFFLCS_API void difflcs_set_time_limit(difflcs_controller* controller, double s
 DIFFLCS_API difflcs_status difflcs_set_fallback(difflcs_controller* controller, difflcs_fallback kind,
                                                 const double* action);
 
+/* Other numbers of the system, in the order A B C d D E F c, or of the cost, in the order Q R S Q_final q r q_final (Q, R
+ * and Q_final symmetric): for a robot that linearises them anew before a step. Row-major, with the sizes of those in the
+ * file, stages included, and copied; F + F^T must stay positive definite, and the cost convex. Returns DIFFLCS_INVALID,
+ * and changes nothing, where one is NULL or not finite, or the cost has goals. */
+DIFFLCS_API difflcs_status difflcs_set_system(difflcs_controller* controller, const double* const matrices[8]);
+DIFFLCS_API difflcs_status difflcs_set_cost(difflcs_controller* controller, const double* const terms[7]);
+
 /* "CONVERGED" and so on. */
 DIFFLCS_API const char* difflcs_status_name(difflcs_status status);
 /* The instruction set in use: "baseline" or "avx2"; or that of the environment variable DIFFLCS_ISA, also "avx512".

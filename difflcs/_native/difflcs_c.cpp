@@ -40,6 +40,17 @@ difflcs_status step(difflcs_controller* c, const double* x, const double* target
   return difflcs_status(int(c->controller.step(x, targets, follow, u).status));
 }
 
+difflcs_status set_inputs(difflcs_controller* c, difflcs::Input first, int count, const double* const* values) {
+  if (!c || !values) return DIFFLCS_INVALID;
+  for (int i = 0; i < count; i++) {
+    if (!values[i]) return DIFFLCS_INVALID;
+    for (int64_t j = 0; j < c->controller.data().field[first + i].count(); j++)
+      if (!std::isfinite(values[i][j])) return DIFFLCS_INVALID;
+  }
+  c->controller.set_inputs(first, count, values);
+  return DIFFLCS_CONVERGED;
+}
+
 }  // namespace
 
 extern "C" {
@@ -126,6 +137,15 @@ difflcs_status difflcs_set_fallback(difflcs_controller* c, difflcs_fallback kind
     if (!std::isfinite(action[j])) return DIFFLCS_INVALID;
   c->controller.set_fallback(difflcs::Fallback(int(kind)), action);
   return DIFFLCS_CONVERGED;
+}
+
+difflcs_status difflcs_set_system(difflcs_controller* c, const double* const matrices[8]) {
+  return set_inputs(c, difflcs::kA, 8, matrices);
+}
+
+difflcs_status difflcs_set_cost(difflcs_controller* c, const double* const terms[7]) {
+  if (c && c->controller.data().n_goal > 0) return DIFFLCS_INVALID;
+  return set_inputs(c, difflcs::kQ, 7, terms);
 }
 
 const char* difflcs_status_name(difflcs_status status) {

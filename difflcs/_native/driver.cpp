@@ -46,6 +46,9 @@ constexpr int64_t kSteps = 1, kStepsAgain = 2;
 constexpr double kLonger = 1000.0;
 // An iteration with row exchanges takes ten times as long, and what it can mend it mends soon.
 constexpr int64_t kMaxIterPivot = 60;
+// From this number of forces, or of states and actions, on problems are solved one by one: the matrices of several side
+// by side would not fit into the cache.
+constexpr int64_t kAlone = 48;
 // Elements are searched in chunks, so that what is kept of all starts stays small.
 constexpr int64_t kJobs = 8192, kChunk = 64;
 
@@ -205,7 +208,8 @@ void MpcDriver::run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner
       batch.count, kernels.mpc_workspace(batch), false,
       [](void* context, void* workspace, Watch watch) {
         auto& c = *static_cast<Solving*>(context);
-        const auto solve = c.batch.count == 1 ? c.kernels.mpc_solve_alone : c.kernels.mpc_solve;
+        const bool large = std::max(c.batch.n_x + c.batch.n_u, c.batch.n_lam) >= kAlone;
+        const auto solve = c.batch.count == 1 || large ? c.kernels.mpc_solve_alone : c.kernels.mpc_solve;
         solve(c.batch, c.solve, &c.next, workspace, watch);
       },
       &context);

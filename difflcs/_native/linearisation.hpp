@@ -111,7 +111,9 @@ class Linearisation {
         t[i] *= b[i];
         write<V>(stage.K_lam[i], j, t[i]);
       }
-      for (int64_t i = 0; i < nx; i++) write<V>(stage.A_hat[i], j, V{} + read<V>(data.AB[i], j) + C.row(i) * t);
+      multiply(
+          C, t, [&](int64_t i) { return V{} + read<V>(data.AB[i], j); },
+          [&](int64_t i, V sum) { write<V>(stage.A_hat[i], j, sum); });
     });
     for (int64_t i = 0; i < nl; i++) {
       stage.y[i] *= stage.size[i];

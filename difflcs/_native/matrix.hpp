@@ -126,6 +126,30 @@ struct Matrix {
   }
 };
 
+// Calls store(i, first(i) + matrix.row(i) * vector) for all rows; several at a time, so that none waits for the sum of
+// another, where they are not unrolled.
+template <class T, int64_t R, int64_t C, int64_t D, class W, class First, class Store>
+DIFFLCS_INLINE void multiply(Matrix<T, R, C, D> matrix, const W& vector, First first, Store store) {
+  constexpr int kRows = 4;
+  int64_t i = 0;
+  if constexpr (C == 0) {
+    for (; i + kRows <= matrix.rows; i += kRows) {
+      auto a = first(i), b = first(i + 1), c = first(i + 2), d = first(i + 3);
+      for (int64_t j = 0; j < matrix.columns; j++) {
+        a += matrix(i, j) * vector[j];
+        b += matrix(i + 1, j) * vector[j];
+        c += matrix(i + 2, j) * vector[j];
+        d += matrix(i + 3, j) * vector[j];
+      }
+      store(i, a), store(i + 1, b), store(i + 2, c), store(i + 3, d);
+    }
+    for (; i < matrix.rows; i++) store(i, first(i) + matrix.row(i) * vector);
+  } else {
+    DIFFLCS_UNROLL
+    for (; i < matrix.rows; i++) store(i, first(i) + matrix.row(i) * vector);
+  }
+}
+
 // Matrices of one size, one per stage, or one for all stages.
 template <class M>
 struct Stages {

@@ -131,11 +131,10 @@ class RelaxedLcp {
   DIFFLCS_INLINE Vec evaluate(Vec eps4) {
     const int64_t n = size();
     Vec sum = all(0);
+    multiply(F, next, [&](int64_t i) { return q[i]; }, [&](int64_t i, Vec t) { w_next[i] = t; });
     DIFFLCS_UNROLL
     for (int64_t i = 0; i < n; i++) {
-      const Vec t = q[i] + F.row(i) * next;
-      const Vec diff = next[i] - t;
-      w_next[i] = t;
+      const Vec t = w_next[i], diff = next[i] - t;
       root_next[i] = sqrt(diff * diff + eps4);
       const Vec g = next[i] + t - root_next[i];
       sum += g * g;

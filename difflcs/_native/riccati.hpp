@@ -194,7 +194,7 @@ class Riccati {
       Local<kX, V> of_A(column);
       DIFFLCS_UNROLL
       for (int64_t m = 0; m < nx; m++) of_A[m] = read<V>(stage.A_hat[m], j);
-      for (int64_t i = 0; i < nx; i++) write<V>(PA[i], j, V{} + P.row(i) * of_A);
+      multiply(P, of_A, [](int64_t) { return V{}; }, [&](int64_t i, V sum) { write<V>(PA[i], j, sum); });
     });
     for (int64_t i = first; i < nw; i++) {
       Local<kX> of_A(column);

@@ -11,9 +11,9 @@ namespace {
 
 constexpr double kTiny = 1e-300;
 
-// Whether all problems share their matrices: the type of an entry says it.
+// Whether all problems share their matrices: the type of an entry says it, where there are several lanes.
 template <class T>
-constexpr bool kShared = std::is_same_v<T, double>;
+constexpr bool kShared = std::is_same_v<T, double> && kLanes > 1;
 
 // n_x, n_u, n_lam, n_x + n_u, n_c and the horizon; compile-time where the template argument is not zero.
 template <int X, int U, int L>

@@ -11,7 +11,7 @@ struct Variant {
   using T = Entry;
   using S = Sizes;
 };
-// That which fits every problem. One problem alone shares its matrices with nobody: they are plain numbers.
+// That which fits every problem. With one problem at a time all numbers are plain.
 using Widest = Variant<std::conditional_t<kLanes == 1, double, Vec>, AnySizes>;
 
 // Calls f with the variant for matrices with entries T that fits.

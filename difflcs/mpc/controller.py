@@ -6,6 +6,7 @@ The work is done by the C++ class of `difflcs/_native/controller.hpp`, the same 
 from __future__ import annotations
 
 import os
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -18,16 +19,32 @@ from torch import Tensor
 from difflcs import _storage
 from difflcs._checks import check_finite, check_number, describe
 from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
+from difflcs.constraints import check_bounds
+from difflcs.cost import GoalCost
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, NonFiniteError, ShapeError, SolveError
-from difflcs.lcs import LCSParams, LCSSequence
-from difflcs.mpc.controller_file import constant_system, controller_bytes
-from difflcs.mpc.setup import Setup
-from difflcs.records import system_at
+from difflcs.lcs import SYSTEM, LCSParams, LCSSequence
+from difflcs.mpc.controller_file import (
+    check_constant,
+    constant_setup,
+    controller_bytes,
+    gather_at_zero,
+    make_problem,
+    numbers_of_one,
+)
+from difflcs.mpc.setup import PLAIN_COSTS, Bound, Call, Cost, Inputs, Setup, System, gather
 from difflcs.status import Status
 
 _FALLBACKS = {"hold": 0, "zero": 1, "unfinished": 3, "raise": 0}
 _GIVEN = 2
 _FLOAT = np.dtype(np.float64)
+
+# What a step may have of its own, and its fields, in the order of difflcs/_native/fields.hpp.
+_CHANGES = {
+    "lcs": tuple(SYSTEM),
+    "cost": ("Q", "R", "S", "Q_final", "q", "r", "q_final"),
+    "u_min": ("u_min",),
+    "u_max": ("u_max",),
+}
 
 OnFailure = str | ArrayLike
 
@@ -68,9 +85,10 @@ class MPCController:
 
     It holds a copy of the layer's system, cost, bounds and constraints as they were; make another one after learning.
     Each step begins at the plan of the one before, one step later, as `MPCSolution.shift` has it. A state that is not
-    finite is no error but a step that is not solved: on a robot something must happen. A module whose system depends
-    on the state or a context (any but `LCSModel`, `ScaledLCS` and plain matrices) is asked for it at each step, which
-    takes as long as the module does, and another 100 µs for the checks of its matrices.
+    finite is no error but a step that is not solved: on a robot something must happen. A module whose system or cost
+    depends on the state, a goal or a context (any but `LCSModel`, `ScaledLCS`, plain matrices, and costs that are no
+    `CostModule`) is asked for it at each step, which takes as long as the module does, and some 100 µs for checks. The
+    time limit counts from before that.
 
     One controller is for one thread at a time; another call at the same time is refused.
 
@@ -87,25 +105,31 @@ class MPCController:
     """
 
     def __init__(self, setup: Setup, on_failure: OnFailure = "hold", time_limit: float | None = None):
-        system = constant_system(setup.lcs)
         limit = getattr(setup.backend, "time_limit", None) if time_limit is None else time_limit
-        self._setup = setup if system is None else None
-        self._content = b"" if system is None else controller_bytes(setup, system)
+        self._setup = setup = constant_setup(setup)
+        self._content = b""
         self._native: Any = None
-        self._begin(setup.horizon, setup.lcs.n_x, setup.lcs.n_u, getattr(setup.cost, "n_goal", 0), on_failure, limit)
-        if system is not None:
-            self._make()
+        n_goal = setup.cost.n_goal if isinstance(setup.cost, GoalCost) else 0  # that of a module is its own business
+        self._begin(setup.horizon, setup.lcs.n_x, setup.lcs.n_u, n_goal, on_failure, limit)
+        known = {"lcs": (LCSParams, LCSSequence), "cost": PLAIN_COSTS}
+        self._asks = frozenset(name for name, kinds in known.items() if not isinstance(getattr(setup, name), kinds))
+        if not self._asks:
+            self._make(gather_at_zero(setup))
 
     def _begin(
         self, horizon: int, n_x: int, n_u: int, n_goal: int, on_failure: OnFailure, time_limit: float | None
     ) -> None:
         self.horizon, self.n_x, self.n_u, self.n_goal = horizon, n_x, n_u, n_goal
+        self._setup: Setup | None
+        self._asks: frozenset[str]
+        self._own: dict[str, Tensor] = {}
+        self._given = False
         self._status: int | None = None
-        self._given: NDArray[np.float64] | None = None
+        self._action: NDArray[np.float64] | None = None
         self._raises = isinstance(on_failure, str) and on_failure == "raise"
         if not isinstance(on_failure, str):
-            self._given, self._fallback = _numbers("on_failure", on_failure, (n_u,)), _GIVEN
-            if not np.isfinite(self._given).all():
+            self._action, self._fallback = _numbers("on_failure", on_failure, (n_u,)), _GIVEN
+            if not np.isfinite(self._action).all():
                 raise NonFiniteError(f"on_failure: expected a finite action, got {describe(on_failure)}; change it")
         elif on_failure in _FALLBACKS:
             self._fallback = _FALLBACKS[on_failure]
@@ -116,9 +140,17 @@ class MPCController:
             )
         self._time_limit = _limit(time_limit)
 
-    def _make(self) -> None:
+    def _make(self, inputs: Inputs) -> None:
+        """Make the native controller of what is planned with first."""
+        assert self._setup is not None
+        problem, self._constant = make_problem(self._setup, inputs)
+        self._content = controller_bytes(self._setup, problem, self._constant)
+        self._own = {name: getattr(problem, name).clone() for names in _CHANGES.values() for name in names}
+        self._load()
+
+    def _load(self) -> None:
         self._native = _kernels.Controller(self._content)
-        self._native.set_fallback(self._fallback, self._given)
+        self._native.set_fallback(self._fallback, self._action)
         self._native.set_time_limit(self._time_limit or 0.0)
 
     @classmethod
@@ -137,22 +169,19 @@ class MPCController:
         except (FileNotFoundError, RuntimeError) as error:
             raise CheckpointError(f"{path}: {error}") from error
         self = cls.__new__(cls)
-        self._setup, self._content, self._native = None, content, None
+        self._setup, self._content, self._asks = None, content, frozenset()
         self._begin(sizes["horizon"], sizes["n_x"], sizes["n_u"], sizes["n_goal"], on_failure, time_limit)
-        self._make()
+        self._load()
         return self
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the file that `load` and the C library read, atomically.
 
         Raises:
-            InvalidInputError: the system depends on the state or a context.
+            InvalidInputError: system or cost may depend on the state.
         """
         if self._setup is not None:
-            raise InvalidInputError(
-                f"lcs: expected an LCSModel or matrices, got {describe(self._setup.lcs)}, whose system may depend on "
-                f"the state; build a layer with lcs=module.params(x, context)"
-            )
+            check_constant(self._setup)
         _storage.write_atomically(Path(path), self._content)
 
     def step(
@@ -162,14 +191,22 @@ class MPCController:
         reference: ArrayLike | None = None,
         *,
         context: Tensor | None = None,
+        lcs: System | None = None,
+        cost: Cost | None = None,
+        u_min: Bound | None = None,
+        u_max: Bound | None = None,
     ) -> NDArray[np.float64]:
         """Plan from a state.
 
         Args:
             x: (n_x,) the state.
-            goal: (n_goal,), with a `GoalCost`.
+            goal: (n_goal,), with a `GoalCost`, or what a `CostModule` takes.
             reference: (H+1, n_goal) instead of a goal: one for each state of the plan, see `GoalCost.follow`.
-            context: (n_context,) whatever the system depends on besides x; given to the module.
+            context: (n_context,) whatever system or cost depend on besides x; given to the modules.
+            lcs: system for this step, or module that is asked for one, of the layer's form.
+            cost: cost for this step, likewise; no `GoalCost`, and none where the layer has one.
+            u_min: bound for this step, (n_u,), or by stage where the layer's are.
+            u_max: likewise.
 
         Returns:
             (n_u,) the first action of the plan, or that of `on_failure`; always inside the bounds. A new array.
@@ -188,43 +225,70 @@ class MPCController:
                 )
             shape = (self.horizon + 1, self.n_goal) if follow else (self.n_goal,)
             targets = _numbers("reference" if follow else "goal", reference if follow else goal, shape)
-        elif follow or goal is not None:
+        elif follow or (goal is not None and cost is None and "cost" not in self._asks):
             raise ShapeError(
                 f"{'reference' if follow else 'goal'}: expected none with a cost without goals, got one; use a GoalCost"
             )
-        if self._setup is not None:
-            self._ask(self._setup, x, context)
+        asked = bool(self._asks) or self._given or not (lcs is cost is u_min is u_max is None)
+        if asked:
+            x = self._ask(x, goal, context, {"lcs": lcs, "cost": cost, "u_min": u_min, "u_max": u_max})
         elif context is not None:
             raise ShapeError("context: expected none with a constant system, got one; leave it out")
         u = np.empty(self.n_u)
         self._status = status = self._native.step(x, targets, follow, u)
+        if asked:
+            self.time_limit = self._time_limit  # the modules have taken a part of it
         if self._raises and not Status(status).solved:
             found = Status(status)
             raise SolveError(f"the step was not solved: {found.name} ({found.advice})", [0], [status])
         return u
 
-    def _ask(self, setup: Setup, x: NDArray[np.float64], context: Tensor | None) -> None:
-        """Take the system of this state from the module."""
-        if not np.isfinite(x).all() and self._native is not None:
-            return  # the step will say so
+    def _ask(
+        self, x: NDArray[np.float64], goal: ArrayLike | None, context: Tensor | None, given: dict[str, Any]
+    ) -> NDArray[np.float64]:
+        """Take what this step plans with, from the modules and from what is given; return its state."""
+        if self._setup is None:
+            raise InvalidInputError(
+                f"{', '.join(given)}: expected none in a controller of a file, got one; make a controller of a layer"
+            )
+        if self.n_goal and given["cost"] is not None:
+            raise ShapeError("cost: expected none where the layer has a GoalCost, got one; give the layer another")
+        begun = time.perf_counter()
+        goal = (
+            np.zeros(self.n_goal) if self.n_goal else None if goal is None else _numbers("goal", goal, np.shape(goal))
+        )
+        finite = np.isfinite(x).all() and (goal is None or np.isfinite(goal).all())
+        if not finite and self._native is not None:
+            return np.full(self.n_x, np.nan)  # the step will say so
+        call = Call(torch.from_numpy(x), None if goal is None else torch.from_numpy(goal), context=context)
+        self._given = any(value is not None for value in given.values())
         with torch.no_grad():
-            system = system_at(setup.lcs, torch.from_numpy(x), context)  # pyright: ignore
-        if not isinstance(system, LCSParams | LCSSequence):
-            raise DTypeError(f"lcs: expected LCSParams or LCSSequence from its params, got {describe(system)}")
-        system.check_again()
-        if self._native is None:
-            self._form = {name: tuple(value.shape) for name, value in system.tensors().items()}
-            self._content = controller_bytes(setup, system)
-            self._make()
-            return
-        tensors = {name: value.detach().to("cpu", torch.float64) for name, value in system.tensors().items()}
-        check_finite(tensors)
-        for name, shape in self._form.items():
-            if (got := tuple(tensors[name].shape)) != shape:
-                raise ShapeError(
-                    f"lcs: expected {name} {shape} as in the first step, got {got}; make another controller"
-                )
-        self._native.set_system([value.contiguous().numpy() for value in tensors.values()])
+            if first := self._native is None:
+                self._make(gather(self._setup, call))
+            if self._given or not first:
+                self._change(self._setup, gather(self._setup, call._replace(**given)), given)
+        if self._time_limit is not None:
+            self._native.set_time_limit(max(self._time_limit - (time.perf_counter() - begun), 1e-9))
+        return x
+
+    def _change(self, setup: Setup, inputs: Inputs, given: dict[str, Any]) -> None:
+        """Plan with other numbers of the same form."""
+        values, constant = numbers_of_one(inputs)
+        check_finite({name: values[name] for name in SYSTEM})
+        fields = dict(self._own)
+        for part, names in _CHANGES.items():  # bounds may depend on the state where the layer's system does
+            if part in self._asks or given[part] is not None or part in ("u_min", "u_max"):
+                fields |= {n: values[n] if n in values else torch.zeros_like(self._own[n]) for n in names}
+            for name in names:
+                if fields[name].numel() != (own := self._own[name]).numel():
+                    raise ShapeError(
+                        f"{part}: expected {name} {tuple(own.shape)} as in the first step, got "
+                        f"{tuple(fields[name].shape)}; make another controller"
+                    )
+        check_bounds(fields["u_min"], fields["u_max"], strict=setup.barrier > 0)
+        changed = "cost" in self._asks or given["cost"] is not None
+        arrays = [value.numpy() for value in fields.values()]
+        self._native.set_inputs(arrays, constant if changed else self._constant)
 
     def reset(self) -> None:
         """Forget all plans, as at the begin of an episode."""

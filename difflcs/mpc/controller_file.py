@@ -13,13 +13,13 @@ import numpy as np
 import torch
 
 from difflcs._checks import check_number, check_positive_int, describe
-from difflcs.cost import GoalCost
+from difflcs.cost import CostSequence, GoalCost, QuadraticCost, cost_at
 from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.lcs import LCSModel, LCSParams, LCSSequence
 from difflcs.mpc import kkt
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.mpc.problem import INPUTS, MPCProblem
-from difflcs.mpc.setup import Call, Setup, gather
+from difflcs.mpc.setup import PLAIN_COSTS, Call, Inputs, Setup, gather
 from difflcs.records import system_at
 from difflcs.scales import ScaledLCS
 
@@ -41,12 +41,80 @@ def constant_system(lcs: object) -> LCSParams | LCSSequence | None:
         return system_at(lcs, None).detach() if constant else None  # pyright: ignore
 
 
-def controller_bytes(setup: Setup, system: LCSParams | LCSSequence, step_seconds: float = 0.0) -> bytes:
-    """The file of the controller of a layer, with its cost, bounds and constraints as they are now.
+def constant_cost(cost: object, n_x: int) -> GoalCost | QuadraticCost | CostSequence | None:
+    """The cost of a layer where it is the same for all states and contexts; None for any other module."""
+    if isinstance(cost, PLAIN_COSTS):
+        return cost
+    with torch.no_grad():
+        constant = getattr(cost, "constant", False) is True
+        return cost_at(cost, torch.zeros(n_x, dtype=torch.float64)) if constant else None  # pyright: ignore
+
+
+def constant_setup(setup: Setup) -> Setup:
+    """The same with system, cost and bounds as they are now, as far as no state changes them."""
+    system, cost = constant_system(setup.lcs), constant_cost(setup.cost, setup.lcs.n_x)
+    bounds = (setup.u_min, setup.u_max) if setup.bounds is not None else setup.action_bounds(setup.lcs)
+    low, high = (bound.detach().clone() for bound in bounds)
+    return setup._replace(
+        lcs=setup.lcs if system is None else system,
+        cost=setup.cost if cost is None else cost,
+        u_min=low,
+        u_max=high,
+        limits=None,
+    )
+
+
+def check_constant(setup: Setup) -> None:
+    """Refuse a system or a cost that may depend on the state."""
+    if not isinstance(setup.lcs, LCSParams | LCSSequence):
+        raise InvalidInputError(
+            f"lcs: expected an LCSModel or matrices, got {describe(setup.lcs)}, whose system may depend on the state; "
+            f"build a layer with lcs=module.params(x, context)"
+        )
+    if not isinstance(setup.cost, PLAIN_COSTS):
+        raise InvalidInputError(
+            f"cost: expected a GoalCost or weights, got {describe(setup.cost)}, whose cost may depend on the state; "
+            f"build a layer with cost=module.at(x, goal, context)"
+        )
+
+
+def gather_at_zero(setup: Setup) -> Inputs:
+    """The inputs of one state, zero, and of one goal, zero, of a setup whose system and cost no state changes."""
+    cost, x0 = setup.cost, torch.zeros(1, setup.lcs.n_x, dtype=torch.float64)
+    return gather(setup, Call(x0, torch.zeros(cost.n_goal).to(cost.Q) if isinstance(cost, GoalCost) else None))
+
+
+def numbers_of_one(inputs: Inputs) -> tuple[dict[str, torch.Tensor], float]:
+    """The numbers of one robot's problem, and the constant of its cost.
+
+    Raises:
+        ShapeError: there is a batch of them.
+    """
+    for name, tensor in inputs.tensors.items():
+        if tensor.shape[: tensor.ndim - inputs.rank(name)].numel() != 1:
+            value = tensor.detach().to("cpu", torch.float64)
+            raise ShapeError(
+                f"{name}: expected no batch dimension, as a controller is for one robot, got "
+                f"{describe(value)}; index it"
+            )
+    values = inputs.numbers(inputs.tensors, (1,))
+    return values, float(values.pop("constant"))
+
+
+def make_problem(setup: Setup, inputs: Inputs) -> tuple[MPCProblem, float]:
+    """The problem of one robot, and the constant of its cost."""
+    values, constant = numbers_of_one(inputs)
+    problem = MPCProblem(**values, horizon=setup.horizon, relaxation=setup.relaxation, barrier=setup.barrier)
+    return problem, constant
+
+
+def controller_bytes(setup: Setup, problem: MPCProblem, constant: float, step_seconds: float = 0.0) -> bytes:
+    """The file of the controller of a layer.
 
     Args:
-        setup: that of the layer; its backend is `batched`, and nothing in it has a batch dimension.
-        system: the system to plan with, without batch dimensions.
+        setup: that of the layer; its backend is `batched`.
+        problem: what it plans with, and the constant of its cost: see `make_problem`.
+        constant: likewise.
         step_seconds: time from one step to the next [s]; 0 if that is not known.
 
     Raises:
@@ -66,7 +134,6 @@ def controller_bytes(setup: Setup, system: LCSParams | LCSSequence, step_seconds
         )
     for name, value in (("seed", backend.seed), ("max_iter", backend.max_iter)):
         check_positive_int(name, value, minimum=0, maximum=_LARGEST)
-    problem, constant = _problem(setup, system)
     sizes = {"n_x": problem.n_x, "n_u": problem.n_u, "n_lam": problem.n_lam, "n_c": problem.n_c}
     n_x = problem.n_x
     n_goal = cost.n_goal if isinstance(cost, GoalCost) else 0
@@ -96,25 +163,6 @@ def controller_bytes(setup: Setup, system: LCSParams | LCSSequence, step_seconds
         entries.append((name, value))
     entries.append(("constant", np.array([constant], np.float64)))
     return _pack(entries)
-
-
-def _problem(setup: Setup, system: LCSParams | LCSSequence) -> tuple[MPCProblem, float]:
-    """The problem of one state, zero, and of one goal, zero; and the constant of its cost."""
-    x0, cost = torch.zeros(1, system.n_x, dtype=torch.float64), setup.cost
-    goal = torch.zeros(cost.n_goal, dtype=torch.float64).to(cost.Q) if isinstance(cost, GoalCost) else None
-    low, high = setup.action_bounds(setup.lcs) if setup.bounds is None else (None, None)
-    inputs = gather(setup, Call(x0, goal, lcs=system, u_min=low, u_max=high))
-    for name, tensor in inputs.tensors.items():
-        if tensor.shape[: tensor.ndim - inputs.rank(name)].numel() != 1:
-            value = tensor.detach().to("cpu", torch.float64)
-            raise ShapeError(
-                f"{name}: expected no batch dimension, as a controller is for one robot, got "
-                f"{describe(value)}; index it"
-            )
-    values = inputs.numbers(inputs.tensors, (1,))
-    constant = float(values.pop("constant"))
-    problem = MPCProblem(**values, horizon=setup.horizon, relaxation=setup.relaxation, barrier=setup.barrier)
-    return problem, constant
 
 
 def _pack(entries: Iterable[tuple[str, np.ndarray]]) -> bytes:

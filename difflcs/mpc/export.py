@@ -13,7 +13,14 @@ from difflcs import __version__, _storage
 from difflcs._checks import describe
 from difflcs.errors import InvalidInputError
 from difflcs.mpc import LCSMPCLayer
-from difflcs.mpc.controller_file import VERSION, constant_system, controller_bytes
+from difflcs.mpc.controller_file import (
+    VERSION,
+    check_constant,
+    constant_setup,
+    controller_bytes,
+    gather_at_zero,
+    make_problem,
+)
 
 CONTROLLER, DESCRIPTION = "controller.difflcs", "controller.json"
 
@@ -41,13 +48,10 @@ def export_controller(
     """
     if not isinstance(mpc, LCSMPCLayer):
         raise InvalidInputError(f"mpc: expected an LCSMPCLayer, got {describe(mpc)}; pass the layer of the controller")
-    system = constant_system(mpc.lcs)
-    if system is None:
-        raise InvalidInputError(
-            f"lcs: expected an LCSModel or matrices, got {describe(mpc.lcs)}, whose system may depend on the state; "
-            f"build a layer with lcs=module.params(x, context)"
-        )
-    content = controller_bytes(mpc.setup(), system, step_seconds)
+    setup = constant_setup(mpc.setup())
+    check_constant(setup)
+    problem, constant = make_problem(setup, gather_at_zero(setup))
+    content = controller_bytes(setup, problem, constant, step_seconds)
     low, high = mpc.limits()
     description = {
         **(about or {}),
@@ -55,10 +59,10 @@ def export_controller(
         "difflcs": __version__,
         "file": CONTROLLER,
         "bytes": len(content),
-        "n_x": system.n_x,
-        "n_u": system.n_u,
-        "n_lam": system.n_lam,
-        "n_c": 0 if mpc.constraints is None else mpc.constraints.n_c,
+        "n_x": problem.n_x,
+        "n_u": problem.n_u,
+        "n_lam": problem.n_lam,
+        "n_c": problem.n_c,
         "n_goal": getattr(mpc.cost, "n_goal", 0),
         "horizon": mpc.horizon,
         "relaxation": mpc.relaxation,

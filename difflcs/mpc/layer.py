@@ -12,7 +12,7 @@ from difflcs._checks import check_choice, check_number, check_positive_int
 from difflcs._differentiation import runs_eagerly
 from difflcs._modules import fresh
 from difflcs.constraints import StageBounds, as_bound
-from difflcs.errors import DegenerateWarning, SolveError, SolveWarning
+from difflcs.errors import DegenerateWarning, InvalidInputError, SolveError, SolveWarning
 from difflcs.mpc.backends import Backend, get_backend
 from difflcs.mpc.controller import MPCController, OnFailure
 from difflcs.mpc.repeat import Repeat
@@ -30,6 +30,7 @@ from difflcs.mpc.setup import (
     check_system,
 )
 from difflcs.mpc.solution import MPCSolution, Primal
+from difflcs.records import LCSParams, LCSSequence
 from difflcs.status import Status, solved
 
 
@@ -61,6 +62,12 @@ class LCSMPCLayer(nn.Module):
         barrier: weight of a logarithmic barrier of the action bounds [cost units]; 0 for none. An action at a bound has
             zero gradient; with a barrier it keeps a small distance and a gradient. The objective includes the barrier.
             Sensible weights are 1e-3 to 1e-1 of the objective; far smaller ones make the problem stiff.
+        passes: how often a call solves, where the system of a module depends on the state: each pass after the first
+            plans with the module linearised along the actions of the pass before (`difflcs.sequence_along`), warm. The
+            plan, its status and its gradient are those of the last pass, whose systems count as those of x0 do in a
+            single one; they are not compared, as objectives of two systems do not say which plan is better. Two see
+            what contacts become on the way; more converge where steps are small beside what they change, else they may
+            come and go. Matrices are solved once.
 
     Raises:
         InvalidInputError and its kinds: an argument does not fit.
@@ -85,11 +92,13 @@ class LCSMPCLayer(nn.Module):
         constraints: Constraints | None = None,
         training_relaxation: float | None = None,
         barrier: float = 0.0,
+        passes: int = 1,
     ):
         super().__init__()
         self.lcs = check_system(lcs)
         self.cost = check_cost(cost)
         self.horizon = check_positive_int("horizon", horizon)
+        self.passes = check_positive_int("passes", passes)
         self.relaxation = check_number("relaxation", relaxation, strict=True)
         self.training_relaxation = (
             None
@@ -134,7 +143,7 @@ class LCSMPCLayer(nn.Module):
         """Bounds of the actions where a call gives none.
 
         They are the layer's `bounds`; or else u_min and u_max, within the action support of an `LCSModel` that knows
-        one.
+        one. A call takes them within the `action_bounds(x0)` of a module that has these, as `MujocoLCS` does.
 
         Args:
             system: the model; the layer's own if None.
@@ -197,6 +206,12 @@ class LCSMPCLayer(nn.Module):
         if self.training and self.training_relaxation is not None:
             setup = setup._replace(relaxation=self.training_relaxation)
         call = Call(x0, goal, reference, guess, u_min, u_max, bounds, lcs, cost, constraints, context)
+        if not isinstance(self.lcs if lcs is None else lcs, LCSParams | LCSSequence):
+            for _ in range(self.passes - 1):
+                with torch.no_grad():
+                    x, u, lam, _, mu, *_ = self._repeat.solve_call(setup, call)[1]
+                guess = Primal(x, u, lam, mu)
+                call = call._replace(guess=guess, along=guess)
         solver, (x, u, lam, objective, mu, *rest) = self._repeat.solve_call(setup, call)
         if solver.transformed or not solver.result.all_converged:
             self._report(solver.result.status, solver.own)
@@ -208,7 +223,14 @@ class LCSMPCLayer(nn.Module):
         Args:
             on_failure: "hold", "unfinished", "zero", "raise" or an action (n_u,), see `MPCController`.
             time_limit: seconds of one step, that of the backend if None.
+
+        Raises:
+            InvalidInputError: several passes, which a controller does not make.
         """
+        if self.passes > 1:
+            raise InvalidInputError(
+                f"passes: expected 1 for a controller, got {self.passes}; build a layer with passes=1, or call this one"
+            )
         return MPCController(self.setup(), on_failure, time_limit)
 
     def _report(self, status: Tensor, needs_grad: bool) -> None:

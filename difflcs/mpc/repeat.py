@@ -127,8 +127,8 @@ def _given(call: Call) -> list[Tensor]:
 
 def _form(call: Call) -> tuple | None:
     """What a call gives but for its numbers; None of one that cannot be used here, or must be refused elsewhere."""
-    x0, goal, reference, _, u_min, u_max, bounds, lcs, cost, constraints, context = call
-    if not (reference is u_min is u_max is bounds is cost is constraints is context is None):
+    x0, goal, reference, _, u_min, u_max, bounds, lcs, cost, constraints, *rest = call
+    if not (reference is u_min is u_max is bounds is cost is constraints is None) or any(v is not None for v in rest):
         return None
     if not _is_double(x0) or not (goal is None or is_array(goal)) or transforms_active() or forward_mode_active():
         return None

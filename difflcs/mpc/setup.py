@@ -27,7 +27,7 @@ from difflcs.lcs import SYSTEM, LCSModule, LCSParams, LCSSequence
 from difflcs.mpc.backends.base import Backend
 from difflcs.mpc.problem import INPUTS, MAY_BE_INFINITE
 from difflcs.mpc.solution import MPCSolution, Primal
-from difflcs.records import system_at
+from difflcs.records import sequence_along, system_at
 
 RANKS = {**{name: len(dims) for name, dims in INPUTS.items()}, "constant": 0}
 """Number of dimensions of each input of a call behind those of the batch and of the stages."""
@@ -81,15 +81,22 @@ class Setup(NamedTuple):
             inputs.add_bounds(self.bounds)
         check_bounds(*self.action_bounds(self.lcs), strict=self.barrier > 0)
 
-    def action_bounds(self, system: System) -> tuple[Tensor, Tensor]:
+    def action_bounds(self, system: System, x0: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Bounds of the actions where a call gives none, see `LCSMPCLayer.limits`."""
         if self.limits is not None:
             return self.limits(system)
-        return self.bounds.by_steps() if self.bounds is not None else within_support(self.u_min, self.u_max, system)
+        if self.bounds is not None:
+            return self.bounds.by_steps()
+        limits = within_support(self.u_min, self.u_max, system)
+        return limits if x0 is None else within_reach(*limits, system, x0)
 
 
 class Call(NamedTuple):
-    """What a call of a layer gives; the names are those of `LCSMPCLayer.forward`."""
+    """What a call of a layer gives; the names are those of `LCSMPCLayer.forward`.
+
+    Attributes:
+        along: the plan along which a module is asked for its system; None: at x0.
+    """
 
     x0: Tensor
     goal: Tensor | None = None
@@ -102,6 +109,7 @@ class Call(NamedTuple):
     cost: Cost | None = None
     constraints: Constraints | None = None
     context: Tensor | None = None
+    along: Primal | None = None
 
 
 def gather(setup: Setup, call: Call) -> Inputs:
@@ -115,13 +123,13 @@ def gather(setup: Setup, call: Call) -> Inputs:
     inputs = Inputs(setup.horizon)
     cost = setup.cost if call.cost is None else check_cost(call.cost)
     check_context(call.context, system, cost)
-    inputs.add_system(system, call.x0, call.context)
+    inputs.add_system(system, call.x0, call.context, call.along)
     inputs.add_cost(cost, call.x0, call.goal, call.reference, call.context)
     bounds = setup.bounds
     if call.bounds is not None:
         bounds = check_stage_bounds(call.bounds, u_min=call.u_min, u_max=call.u_max)
     if bounds is None:
-        inputs.tensors |= dict(zip(("u_min", "u_max"), setup.action_bounds(system), strict=True))
+        inputs.tensors |= dict(zip(("u_min", "u_max"), setup.action_bounds(system, call.x0), strict=True))
     else:
         inputs.add_bounds(bounds)
     inputs.replace_bound("u_min", call.u_min)
@@ -148,6 +156,15 @@ def within_support(u_min: Tensor, u_max: Tensor, system: System) -> tuple[Tensor
             f"was fitted to, got {u_min.tolist()} to {u_max.tolist()}; set its action_support to None"
         )
     return limits
+
+
+def within_reach(u_min: Tensor, u_max: Tensor, system: System, x0: Tensor) -> tuple[Tensor, Tensor]:
+    """Bounds of the actions within those that a module's actuators can do at x0, where it has `action_bounds`."""
+    find = getattr(system, "action_bounds", None)
+    if find is None:
+        return u_min, u_max
+    low, high = (v.to(u_min) for v in find(x0))
+    return u_min.clamp(low, high), u_max.clamp(low, high)
 
 
 def check_system(lcs: object) -> System:
@@ -220,12 +237,12 @@ class Inputs:
     by_stage: set[str] = field(default_factory=set)
     sizes: dict[str, int] = field(default_factory=dict)
 
-    def add_system(self, lcs: System, x0: Tensor, context: Tensor | None) -> None:
-        """The matrices, asked for at these states if it is a module."""
+    def add_system(self, lcs: System, x0: Tensor, context: Tensor | None, along: Primal | None = None) -> None:
+        """The matrices, asked for at these states, or along a plan from there, if it is a module."""
         if isinstance(lcs, LCSParams | LCSSequence):
             system = lcs
         else:
-            system = system_at(lcs, x0, context)
+            system = system_at(lcs, x0, context) if along is None else sequence_along(lcs, along, x0, context)
             if not isinstance(system, LCSParams | LCSSequence):
                 raise DTypeError(
                     f"lcs: expected LCSParams or LCSSequence from {type(lcs).__name__}.params, got {describe(system)}; "

@@ -179,7 +179,7 @@ class SamplingPolicy:
 
         Args:
             x: (n_x,) the state.
-            goal: (n_goal,), with a `GoalCost`.
+            goal: (n_goal,), with a `GoalCost` or a `CostModule`.
             context: (n_context,) of the module, if its system depends on more than x.
 
         Returns:

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from difflcs._checks import check_number, check_positive_int, did_you_mean, make_plain
 from difflcs._optional import require
-from difflcs.cost import GoalCost
+from difflcs.cost import CostModule, GoalCost
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.backends import Backend, BatchedBackend, get_backend
@@ -100,7 +100,7 @@ class PhysicsSpec:
 
     make_system: Callable[[], Any]
     scale: tuple[float, ...]
-    make_cost: Callable[[], GoalCost] | None = None
+    make_cost: Callable[[], GoalCost | CostModule] | None = None
     horizon: int | None = None
     relaxation: float | None = None
     told: str = ""
@@ -131,7 +131,8 @@ class TaskSpec:
             episodes of fixed length that end by truncation; `success` in every step's info; a goal can be chosen by
             `reset(options={"goal": …})`; everything random comes from the seed of `reset`.
         env_kwargs: keyword arguments of the environment.
-        make_cost: makes the cost of the MPC, whose sizes are those of the task.
+        make_cost: makes the cost of the MPC, whose sizes are those of the task: a `GoalCost`, or a `CostModule` with
+            n_x, n_u and n_goal, such as a `MujocoCost`.
         u_min: lower bounds of the action, one number or n_u of them [units of the action].
         u_max: upper bounds of the action.
         horizon: steps that the MPC plans ahead.
@@ -164,7 +165,7 @@ class TaskSpec:
 
     name: str
     env: str | Callable[..., gymnasium.Env]
-    make_cost: Callable[[], GoalCost]
+    make_cost: Callable[[], GoalCost | CostModule]
     u_min: float | Sequence[float]
     u_max: float | Sequence[float]
     horizon: int
@@ -221,10 +222,13 @@ class TaskSpec:
     # --- sizes ---
 
     @functools.cached_property
-    def _cost(self) -> GoalCost:
+    def _cost(self) -> Any:
         cost = self.make_cost()
-        if not isinstance(cost, GoalCost):
-            raise DTypeError(f"make_cost: expected it to return a GoalCost, got {type(cost).__name__}")
+        if not all(hasattr(cost, name) for name in ("at", "n_x", "n_u", "n_goal")):
+            raise DTypeError(
+                f"make_cost: expected it to return a GoalCost, or a CostModule with n_x, n_u and n_goal, got "
+                f"{type(cost).__name__}"
+            )
         return cost
 
     @property

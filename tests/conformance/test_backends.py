@@ -1,226 +1,75 @@
 """The conformance suite: every backend in the registry solves the same problems, forward and backward.
 
-A new backend is tested here by being registered. One that declares `exact = False` is spared only the checks of what it
-does not promise: that its plan solves the problem as stated.
+A new backend is tested here by being registered. One that declares `exact = False` is spared the checks of what it does
+not promise: that its plan solves the problem as stated, in every form.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import math
 import warnings
-from dataclasses import dataclass
 
-import numpy as np
 import pytest
 import torch
-from torch import Tensor
-from torch.autograd import gradcheck
 
-from difflcs import LCSMPCLayer, LCSParams, QuadraticCost, Status, available_backends, solve_lcp
+from difflcs import LCSMPCLayer, LCSParams, QuadraticCost, Status, available_backends
 from difflcs.errors import DegenerateWarning, DoubleBackwardError, SolveWarning
 from difflcs.mpc import Primal
 from difflcs.mpc.backends import get_backend
+from tests.conformance import problems
 from tests.conformance.differences import compare, moves, weigh
+from tests.conformance.problems import BOUNDS, COST, HORIZON, INF, LCS, PROBLEMS, STAGED, make, solve
 
 BACKENDS = available_backends()
 EXACT = tuple(name for name in BACKENDS if get_backend(name).exact)
-LCS, COST = ("A", "B", "C", "d", "D", "E", "F", "c"), ("Q", "R", "Q_final", "q", "r", "q_final")
-INPUTS = (*LCS, *COST, "u_min", "u_max", "x0")
-NDIM = {k: 2 if k in ("A", "B", "C", "D", "E", "F", "Q", "R", "Q_final") else 1 for k in INPUTS}
-
-
-@dataclass(frozen=True)
-class Problem:
-    """A batch of problems in the terms of the public interface."""
-
-    tensors: dict[str, Tensor]
-    horizon: int = 3
-    relaxation: float = 1e-4
-
-    @property
-    def batch(self):
-        return len(self.tensors["x0"])
-
-    def shared(self, name):
-        return self.tensors[name].ndim == NDIM[name]
-
-    def each(self):
-        """The same problem with every input given per element, copied."""
-        full = {k: v.expand(self.batch, *v.shape[-NDIM[k] :]).clone() for k, v in self.tensors.items()}
-        return dataclasses.replace(self, tensors=full)
-
-    def element(self, i):
-        return {k: v if self.shared(k) else v[i] for k, v in self.tensors.items()}
-
-
-def solve(problem, backend, guess=None, tensors=None, **options):
-    t = tensors or problem.tensors
-    layer = LCSMPCLayer(
-        LCSParams(**{k: t[k] for k in LCS}), QuadraticCost(**{k: t[k] for k in COST}, check=False),
-        problem.horizon, t["u_min"], t["u_max"], backend=backend, relaxation=problem.relaxation, **options,
-    )  # fmt: skip
-    return layer(t["x0"], guess=guess)
-
-
-# --- the problems ---------------------------------------------------------------------------------------------------
-
-
-def make(build, seed=0, batch=8, bound=0.15, n_x=4, n_u=2, n_lam=3, per_element=(), size=0.2, **options):
-    def lead(group):
-        return (batch,) if group in per_element else ()
-
-    sizes = {"n_x": n_x, "n_u": n_u}
-    limit = torch.full((n_u,), bound, dtype=torch.float64)
-    u_min, u_max = -limit, limit
-    if "bounds" in per_element:
-        spread = 0.5 + torch.rand(2, batch, n_u, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-        u_min, u_max = u_min * spread[0], u_max * spread[1]
-    tensors = {
-        **build.lcs_tensors(seed, **sizes, n_lam=n_lam, batch=lead("lcs")),
-        **build.cost_tensors(seed, **sizes, batch=lead("cost")),
-        "u_min": u_min,
-        "u_max": u_max,
-        "x0": size * build.normal(seed + 7)(batch, n_x),
-    }
-    return Problem(tensors, **options)
-
-
-def contact(build):
-    return make(build)
-
-
-def hard_contact(build):
-    return make(build, seed=2, relaxation=1e-6)
-
-
-def without_contact(build):
-    problem = make(build, seed=3, bound=50.0)
-    return dataclasses.replace(
-        problem, tensors={**problem.tensors, "C": torch.zeros_like(problem.tensors["C"])}, relaxation=1e-3
-    )
-
-
-def saturated(build):
-    return make(build, seed=1, bound=0.01)
-
-
-def paper_sized(build):
-    cost = build.paper_cost()(0.05 * build.normal(4)(6, 3), horizon=5)
-    limit = torch.full((6,), 0.015, dtype=torch.float64)
-    tensors = {
-        **build.pushing().tensors(),
-        **{k: v.detach() for k, v in cost.fields().items()},
-        "u_min": -limit,
-        "u_max": limit,
-        "x0": 0.05 * build.normal(3)(6, 9),
-    }
-    return Problem(tensors, horizon=5, relaxation=1e-5)
-
-
-def far_start(build):
-    return make(build, seed=5, size=20.0)
-
-
-def badly_scaled(build):
-    """`contact` in other units of state, action, row of the LCP and force; see the test that compares the two."""
-    t = contact(build).tensors
-    X, U, S = (torch.tensor(v, dtype=torch.float64) for v in ([1e3, 1e-2, 1.0, 1e-3], [1e-2, 10.0], [1e2, 1e-2, 3.0]))
-    changed = {
-        "A": X[:, None] * t["A"] / X, "B": X[:, None] * t["B"] / U, "C": X[:, None] * t["C"] * S, "d": X * t["d"],
-        "D": S[:, None] * t["D"] / X, "E": S[:, None] * t["E"] / U, "F": S[:, None] * t["F"] * S, "c": S * t["c"],
-        "Q": t["Q"] / X / X[:, None], "R": t["R"] / U / U[:, None], "Q_final": t["Q_final"] / X / X[:, None],
-        "q": t["q"] / X, "r": t["r"] / U, "q_final": t["q_final"] / X,
-        "u_min": U * t["u_min"], "u_max": U * t["u_max"], "x0": X * t["x0"],
-    }  # fmt: skip
-    return Problem(changed)
-
-
-def horizon_one(build):
-    return make(build, seed=6, horizon=1)
-
-
-def one_contact(build):
-    return make(build, seed=7, n_lam=1)
-
-
-def other_sizes(build):
-    return make(build, seed=8, n_x=6, n_u=3, n_lam=4, horizon=4)
-
-
-def smallest(build):
-    return make(build, seed=9, n_x=1, n_u=1, n_lam=1, horizon=2)
-
-
-def lcs_per_element(build):
-    return make(build, seed=10, per_element=("lcs",))
-
-
-def cost_and_bounds_per_element(build):
-    return make(build, seed=11, per_element=("cost", "bounds"))
-
-
-def batch_of_one(build):
-    return make(build, seed=12, batch=1)
-
-
-def one_sided_bounds(build):
-    """Bounds that do not contain zero."""
-    problem = make(build, seed=13)
-    return dataclasses.replace(problem, tensors={**problem.tensors, "u_min": torch.tensor([0.05, -0.3]).double()})
-
-
-PROBLEMS = {
-    f.__name__: f
-    for f in (
-        contact, hard_contact, without_contact, saturated, paper_sized, far_start, badly_scaled, horizon_one,
-        one_contact, other_sizes, smallest, lcs_per_element, cost_and_bounds_per_element, batch_of_one,
-        one_sided_bounds,
-    )
-}  # fmt: skip
 
 every_problem = pytest.mark.parametrize("name", PROBLEMS)
+every_plain_problem = pytest.mark.parametrize("name", [f.__name__ for f in problems.PLAIN])
 every_backend = pytest.mark.parametrize("backend", BACKENDS)
 every_exact = pytest.mark.parametrize("backend", EXACT)
-# 34 copies of every problem, or as many differences: seconds for a solver that takes milliseconds for one.
+# 34 copies of every problem: seconds for a solver that takes milliseconds for one.
 every_exact_on_copies = pytest.mark.parametrize(
     "backend", [pytest.param(name, marks=[pytest.mark.slow] * (name == "ipopt")) for name in EXACT]
 )
 
 
+def every_backend_on(*names, exact=()):
+    """Parametrise by problems and backends; on those in `exact` by exact backends alone."""
+    pairs = [(name, backend) for backend in BACKENDS for name in (*names, *(exact if backend in EXACT else ()))]
+    return pytest.mark.parametrize(("name", "backend"), pairs)
+
+
 @pytest.fixture(scope="module")
 def solutions(build):
     """Each problem solved once per backend."""
-    cache = {}
 
+    @functools.cache
     def get(name, backend):
-        if (name, backend) not in cache:
-            problem = PROBLEMS[name](build)
-            with warnings.catch_warnings():
-                if backend not in EXACT:  # an approximation may give up where the problem is hard
-                    warnings.simplefilter("ignore", SolveWarning)
-                mode = "raise" if backend in EXACT else "mask"
-                cache[name, backend] = problem, solve(problem, backend, on_failure=mode)
-        return cache[name, backend]
+        problem = PROBLEMS[name](build)
+        with warnings.catch_warnings():
+            if backend not in EXACT:  # an approximation may give up where the problem is hard
+                warnings.simplefilter("ignore", SolveWarning)
+            return problem, solve(problem, backend, on_failure="raise" if backend in EXACT else "mask")
 
     return get
 
 
 def test_the_default_backend_is_registered():
     assert "ipopt" in BACKENDS
+    assert len(EXACT) >= 2
 
 
 # --- forward --------------------------------------------------------------------------------------------------------
 
 
-@every_problem
+@every_plain_problem
 @every_backend
-def test_shapes_and_dtypes(solutions, name, backend):
+def test_shapes_dtypes_start_and_bounds(solutions, name, backend):
     problem, sol = solutions(name, backend)
-    B, H, t = problem.batch, problem.horizon, problem.tensors
-    n_x, n_u, n_lam = t["A"].shape[-1], t["B"].shape[-1], t["F"].shape[-1]
+    B, H, t = problem.batch, problem.horizon, problem.full()
+    n_x, n_u, n_lam = (problem.tensors[k].shape[-1] for k in "ABF")
     assert sol.x.shape == (B, H + 1, n_x)
     assert sol.u.shape == (B, H, n_u)
     assert sol.lam.shape == (B, H, n_lam)
@@ -231,158 +80,122 @@ def test_shapes_and_dtypes(solutions, name, backend):
     assert sol.status.dtype == torch.int8
     assert bool((sol.solve_time > 0).all())
     assert bool((sol.iterations > 0).all())
-
-
-@every_problem
-@every_backend
-def test_plans_start_at_x0_and_keep_the_bounds_exactly(solutions, name, backend):
-    problem, sol = solutions(name, backend)
-    low, high = (problem.each().tensors[k][:, None] for k in ("u_min", "u_max"))
     assert torch.equal(sol.x[:, 0], problem.tensors["x0"])
-    assert bool(((sol.u >= low) & (sol.u <= high)).all())
+    assert bool(((sol.u >= t["u_min"]) & (sol.u <= t["u_max"])).all())
 
 
 @every_problem
 @every_exact
-def test_every_element_is_solved_to_the_tolerance(solutions, name, backend):
-    _, sol = solutions(name, backend)
-    assert bool(sol.converged.all())
+def test_plans_are_solved_and_keep_dynamics_complementarity_and_bounds(solutions, name, backend):
+    problem, sol = solutions(name, backend)
+    t = problem.full()
+    assert bool(sol.converged.all()), sol.status
     assert float(sol.kkt_residual.max()) <= 1e-6
-
-
-@every_problem
-@every_exact
-def test_dynamics_and_complementarity_hold_by_hand(solutions, name, backend):
-    problem, sol = solutions(name, backend)
-    for i in range(problem.batch):
-        t, x, u, lam = problem.element(i), sol.x[i], sol.u[i], sol.lam[i]
-        predicted = x[:-1] @ t["A"].T + u @ t["B"].T + lam @ t["C"].T + t["d"]
-        slack = x[:-1] @ t["D"].T + u @ t["E"].T + lam @ t["F"].T + t["c"]
-        size = x.abs().amax(0)
-        assert float(((x[1:] - predicted).abs() / (1 + size)).max()) < 1e-7
-        assert float(torch.minimum(lam, slack).min()) > 0
-        assert float((lam * slack - problem.relaxation).abs().max()) < 1e-7
+    n_c = problem.tensors["g"].shape[-1] if "g" in t else 0
+    assert sol.mu.shape == (problem.batch, problem.horizon + 1, n_c)
+    assert sol.violation.shape == (problem.batch,)
+    assert not sol.mu.requires_grad
+    following, slack = problems.predicted(t, sol.x, sol.u, sol.lam)
+    assert float(((sol.x[:, 1:] - following).abs() / (1 + sol.x.abs().amax(1, keepdim=True))).max()) < 1e-8
+    assert bool((sol.lam > 0).all() and (slack > 0).all())
+    torch.testing.assert_close(sol.lam * slack, torch.full_like(slack, problem.relaxation), rtol=0, atol=1e-8)
+    assert torch.equal(sol.x[:, 0], problem.tensors["x0"])
+    assert bool(((sol.u >= t["u_min"]) & (sol.u <= t["u_max"])).all())
     assert float(sol.dynamics_residual().max()) < 1e-6
-    assert float(sol.complementarity().max()) < 1e-7
-
-
-def rollout_objective(problem, t, u):
-    """J of actions (batch, H, n_u) through the relaxed LCP, for inputs t with a batch dimension."""
-
-    def mul(M, v):
-        return (M @ v[..., None])[..., 0]
-
-    x, total = t["x0"], 0.0
-    for k in range(problem.horizon):
-        total = total + (x * (0.5 * mul(t["Q"], x) + t["q"])).sum(-1)
-        total = total + (u[:, k] * (0.5 * mul(t["R"], u[:, k]) + t["r"])).sum(-1)
-        lam = solve_lcp(t["F"], mul(t["D"], x) + mul(t["E"], u[:, k]) + t["c"], relaxation=problem.relaxation).lam
-        x = mul(t["A"], x) + mul(t["B"], u[:, k]) + mul(t["C"], lam) + t["d"]
-    return total + (x * (0.5 * mul(t["Q_final"], x) + t["q_final"])).sum(-1)
+    assert float(sol.complementarity().max() if slack.numel() else 0.0) < 1e-7
 
 
 @every_problem
 @every_exact
-def test_the_objective_is_stationary_and_no_action_nearby_is_better(build, solutions, name, backend):
-    """Independent of kkt.py: autograd of a rollout, and random feasible neighbours."""
+def test_the_objective_is_the_sum_of_its_terms_and_no_plan_nearby_is_better(build, solutions, name, backend):
+    """Independent of kkt.py: autograd of a rollout, and random neighbours, violations at more than their multiplier."""
     problem, sol = solutions(name, backend)
-    t = problem.each().tensors
+    t = problem.full()
+    expected = problems.cost(problem, t, sol.x, sol.u) + problems.fines(problem, t, sol.x, sol.u)
+    torch.testing.assert_close(sol.objective, expected, rtol=1e-9, atol=1e-10)
+
     u = sol.u.clone().requires_grad_()
-    value = rollout_objective(problem, t, u)
-    torch.testing.assert_close(value.detach(), sol.objective, rtol=1e-7, atol=1e-8)
-    (gradient,) = torch.autograd.grad(value.sum(), u)
-    low, high = t["u_min"][:, None], t["u_max"][:, None]
-    projected = sol.u - (sol.u - gradient).clamp(low, high)
-    assert float(projected.abs().max()) < 1e-5
-    n, width = build.normal(31), (high - low).clamp_max(0.3 * 10)
+    x = problems.rollout(problem, t, u)
+    value = problems.cost(problem, t, x, u).sum()
+    if "G" in t:
+        value = value + torch.where(sol.mu > 0, sol.mu * problems.rows(t, x, u), 0.0).sum()
+    (gradient,) = torch.autograd.grad(value, u)
+    assert float((sol.u - (sol.u - gradient).clamp(t["u_min"], t["u_max"])).abs().max()) < 1e-5
+
+    n, dear = build.normal(31), 2 * float(sol.mu.max()) + 1 if "G" in t else INF
+    low, high = (torch.as_tensor(t[k]).expand_as(sol.u) for k in BOUNDS)
+    inside = 1e-9 * (high - low) if problem.barrier else 0.0
     for step in (1e-3, 1e-2):
         for _ in range(10):
-            near = (sol.u + step * width * n(*sol.u.shape)).clamp(low, high)
-            assert bool(
-                (rollout_objective(problem, t, near) >= sol.objective - 1e-7 * (1 + value.detach().abs())).all()
-            )
+            near = sol.u + step * (high - low).clamp_max(3.0) * n(*sol.u.shape)
+            near = near.clamp(low + inside, high - inside)
+            x = problems.rollout(problem, t, near)
+            other = problems.cost(problem, t, x, near) + problems.fines(problem, t, x, near, dear)
+            assert bool((other >= sol.objective - 1e-7 * (1 + sol.objective.abs())).all())
+
+
+@pytest.mark.parametrize("name", [f.__name__ for f in problems.CONSTRAINED])
+@every_exact
+def test_constraints_hold_or_are_paid_for(solutions, name, backend):
+    problem, sol = solutions(name, backend)
+    t, mu = problem.full(), sol.mu
+    value, price = problems.rows(t, sol.x, sol.u), t["weight"].expand(mu.shape)
+    torch.testing.assert_close(sol.violation, value.amax((1, 2)).clamp_min(0.0), rtol=0, atol=1e-9)
+    assert float(value[price == INF].max() if (price == INF).any() else 0.0) <= 1e-7
+    assert bool((mu >= 0).all() and (mu <= price * (1 + 1e-12)).all())
+    free, paid = mu <= 1e-9, mu >= price * (1 - 1e-9)
+    assert float(value[~paid].max()) <= 1e-6
+    assert float(value[~free].min()) >= -1e-6
+    assert bool((~free & ~paid).any()) or name == "soft"
+    assert name != "soft" or float(sol.violation.max()) > 1e-3
+
+
+@every_problem
+def test_exact_backends_agree_where_they_find_the_same_optimum(solutions, name):
+    """Local optima may differ; where the objectives agree the plans agree."""
+    _, first = solutions(name, EXACT[0])
+    for other in EXACT[1:]:
+        problem, second = solutions(name, other)
+        same = (first.objective - second.objective).abs() <= 1e-6 * (1 + first.objective.abs())
+        assert float(same.double().mean()) >= 0.25
+        t = problem.full()
+        width = float(torch.as_tensor(t["u_max"] - t["u_min"]).clamp_max(1.0).max())
+        assert float((first.u - second.u).abs()[same].max()) <= 1e-2 * width
+        assert float((first.mu - second.mu).abs()[same].sum()) <= 1e-3 * (1 + float(first.mu.sum()))
+
+
+@pytest.mark.parametrize("name", ["no_contact", "no_contact_stages"])
+@every_exact
+def test_without_contact_and_bounds_the_plan_is_riccatis(build, name, backend):
+    problem = PROBLEMS[name](build).without(BOUNDS).changed(S=0.1 * build.normal(3)(4, 2))
+    sol, t = solve(problem, backend), problem.full()
+    assert sol.lam.shape == (4, HORIZON, 0)
+    at = {k: (lambda j, k=k: t[k][:, j if k in problem.staged else 0]) for k in "ABdQRSqr"}
+    P, p, gains = t["Q_final"], t["q_final"], []
+    for k in reversed(range(HORIZON)):
+        A, B, d, Q, R, S, q, r = (at[key](k) for key in "ABdQRSqr")
+        H, M, h = R + B.mT @ P @ B, S + A.mT @ P @ B, r + problems.mul(B.mT, p + problems.mul(P, d))
+        K, f = -torch.linalg.solve(H, M.mT), -torch.linalg.solve(H, h)
+        p = q + problems.mul(A.mT, p + problems.mul(P, d)) + problems.mul(M, f)
+        P = Q + A.mT @ P @ A + M @ K
+        gains.insert(0, (K, f))
+    x = t["x0"]
+    for k, (K, f) in enumerate(gains):
+        u = problems.mul(K, x) + f
+        torch.testing.assert_close(sol.u[:, k], u, rtol=1e-7, atol=1e-9)
+        x = problems.mul(at["A"](k), x) + problems.mul(at["B"](k), u) + at["d"](k)
+    torch.testing.assert_close(sol.x[:, -1], x, rtol=1e-7, atol=1e-9)
 
 
 @every_exact
-def test_without_contact_the_plan_is_that_of_the_dense_kkt_system(solutions, backend):
-    """Bounds far away, C = 0: a linear-quadratic problem, its optimality conditions solved as one linear system."""
-    problem, sol = solutions("without_contact", backend)
-    H, n_x, n_u = problem.horizon, 4, 2
-    for i in range(problem.batch):
-        t = {k: v.numpy() for k, v in problem.element(i).items()}
-        count = H * (n_x + n_u)  # variables x_1 … x_H, u_0 … u_{H−1}; then one costate per step
-        K, right = np.zeros((count + H * n_x,) * 2), np.zeros(count + H * n_x)
-        for k in range(H):
-            xs, us, ps = slice(k * n_x, (k + 1) * n_x), H * n_x + k * n_u, count + k * n_x
-            us, ps = slice(us, us + n_u), slice(ps, ps + n_x)
-            last = k == H - 1
-            K[xs, xs], right[xs] = (t["Q_final"], -t["q_final"]) if last else (t["Q"], -t["q"])
-            K[us, us], right[us] = t["R"], -t["r"]
-            K[ps, xs], K[ps, us] = -np.eye(n_x), t["B"]
-            right[ps] = -t["d"]
-            if k == 0:
-                right[ps] -= t["A"] @ t["x0"]
-            else:
-                K[ps, (k - 1) * n_x : k * n_x] = t["A"]
-        K[:count, count:] = K[count:, :count].T
-        z = np.linalg.solve(K, right)
-        np.testing.assert_allclose(sol.x[i, 1:].numpy().ravel(), z[: H * n_x], rtol=1e-7, atol=1e-8)
-        np.testing.assert_allclose(sol.u[i].numpy().ravel(), z[H * n_x : count], rtol=1e-7, atol=1e-8)
-
-
-@every_exact
-def test_without_contact_bounded_plans_are_those_of_an_enumerated_box_qp(build, backend):
-    problem = make(build, seed=3, bound=0.06, horizon=2, batch=6)
-    t = {**problem.tensors, "C": torch.zeros(4, 3, dtype=torch.float64)}
-    problem = dataclasses.replace(problem, tensors=t)
-    sol, at_bound = solve(problem, backend), 0
-    for i in range(6):
-        e = {k: v.expand(1, *v.shape) for k, v in problem.element(i).items()}
-
-        def value(flat, e=e):
-            return rollout_objective(problem, e, flat.reshape(1, 2, 2)).sum()
-
-        zero = torch.zeros(4, dtype=torch.float64)
-        P = torch.autograd.functional.hessian(value_without_lcp(e), zero)
-        p = torch.autograd.functional.jacobian(value_without_lcp(e), zero)
-        best, least = None, np.inf
-        for side in itertools.product([-0.06, 0.06, None], repeat=4):
-            u = torch.tensor([s or 0.0 for s in side], dtype=torch.float64)
-            free = [j for j, s in enumerate(side) if s is None]
-            if free:
-                u[free] = torch.linalg.solve(P[free][:, free], -(p + P @ u)[free])
-            J = float(0.5 * u @ P @ u + p @ u)
-            if float(u.abs().max()) <= 0.06 + 1e-12 and J < least:
-                best, least = u, J
-        torch.testing.assert_close(sol.u[i].reshape(-1), best, rtol=1e-6, atol=1e-8)
-        at_bound += int((best.abs() >= 0.06).sum())
-    assert 0 < at_bound < 24
-
-
-def value_without_lcp(e):
-    def value(flat):
-        u, x, total = flat.reshape(2, 2), e["x0"][0], 0.0
-        for k in range(2):
-            total = total + x @ (0.5 * e["Q"][0] @ x + e["q"][0]) + u[k] @ (0.5 * e["R"][0] @ u[k] + e["r"][0])
-            x = e["A"][0] @ x + e["B"][0] @ u[k] + e["d"][0]
-        return total + x @ (0.5 * e["Q_final"][0] @ x + e["q_final"][0])
-
-    return value
-
-
-@every_exact
-def test_saturated_problems_are_saturated(solutions, backend):
-    _, sol = solutions("saturated", backend)
-    assert float((sol.u.abs() == 0.01).double().mean()) > 0.5
-
-
-@every_exact
-def test_contact_problems_touch_and_slide_free(solutions, backend):
+def test_problems_are_of_the_kind_that_they_are_said_to_be(solutions, backend):
     """The suite would prove little if no force were on, or all."""
     for name in ("contact", "hard_contact", "paper_sized"):
         problem, sol = solutions(name, backend)
-        on = float((sol.lam > problem.relaxation**0.5).double().mean())
-        assert 0.1 < on < 0.9
+        assert 0.1 < float((sol.lam > problem.relaxation**0.5).double().mean()) < 0.9
+    assert float((solutions("saturated", backend)[1].u.abs() == 0.01).double().mean()) > 0.5
+    assert float(solutions("barrier", backend)[1].u.abs().max()) < 0.05
+    assert float(solve(solutions("barrier", backend)[0], backend, barrier=0.0).u.abs().max()) == 0.05
 
 
 @every_exact
@@ -395,55 +208,26 @@ def test_units_do_not_change_the_plan(solutions, backend):
     torch.testing.assert_close((scaled.u / U)[same], plain.u[same], rtol=1e-4, atol=1e-5)
 
 
-@every_problem
-def test_exact_backends_agree_where_they_find_the_same_optimum(solutions, name):
-    """Local optima may differ; where the objectives agree the plans agree."""
-    assert len(EXACT) >= 2
-    problem, first = solutions(name, EXACT[0])
-    for other in EXACT[1:]:
-        _, second = solutions(name, other)
-        size = 1 + first.objective.abs()
-        same = (first.objective - second.objective).abs() <= 1e-6 * size
-        assert float(same.double().mean()) >= 0.25
-        width = (problem.tensors["u_max"] - problem.tensors["u_min"]).max()
-        assert float((first.u - second.u).abs()[same].max()) <= 1e-2 * float(width.clamp_max(1))
-
-
 @every_exact
-def test_a_weakly_active_bound_is_degenerate_and_has_a_finite_gradient(build, backend):
+def test_a_weakly_active_bound_is_degenerate_and_has_the_gradient_of_one_side(build, backend):
     """The bound of one action is moved to where the free optimum lies: active with multiplier zero."""
-    problem = without_contact(build)
+    problem = problems.without_contact(build)
     free = solve(problem, backend)
-    t = problem.each().tensors
-    t["u_max"][2, 1] = free.u[2, :, 1].max()
-    t["x0"].requires_grad_()
-    with pytest.warns(DegenerateWarning, match=r"1 of 8 solutions are not classically differentiable"):
-        sol = solve(problem, backend, tensors=t)
-    ok = Status.CONVERGED
-    assert sol.status.tolist() == [ok, ok, Status.DEGENERATE, ok, ok, ok, ok, ok]
-    assert bool(sol.converged.all())
-    torch.testing.assert_close(sol.u[2].detach(), free.u[2], rtol=0, atol=1e-6)
-    (gradient,) = torch.autograd.grad(sol.u.sum(), t["x0"])
-    assert bool(torch.isfinite(gradient).all())
-    assert float(gradient[2].abs().max()) > 0
+    k, ok = int(free.u[2, :, 1].argmax()), Status.CONVERGED
 
-
-@every_exact
-def test_a_weakly_active_gradient_is_one_of_the_two_sides(build, backend):
-    problem = without_contact(build)
-    free = solve(problem, backend)
-    k = int(free.u[2, :, 1].argmax())
-
-    def gradient(shift):
+    def plan(shift):
         t = problem.each().tensors
         t["u_max"][2, 1] = free.u[2, k, 1] + shift
         t["x0"].requires_grad_()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DegenerateWarning)
-            sol = solve(problem, backend, tensors=t)
-        return torch.autograd.grad(sol.u[2].square().sum(), t["x0"])[0][2]
+        sol = solve(problem, backend, tensors=t)
+        return sol, torch.autograd.grad(sol.u[2].square().sum(), t["x0"])[0][2]
 
-    found, sides = gradient(0.0), (gradient(-1e-3), gradient(1e-3))
+    with pytest.warns(DegenerateWarning, match=r"1 of 8 solutions are not classically differentiable"):
+        sol, found = plan(0.0)
+    assert sol.status.tolist() == [ok, ok, Status.DEGENERATE, ok, ok, ok, ok, ok]
+    assert bool(sol.converged.all())
+    torch.testing.assert_close(sol.u[2].detach(), free.u[2], rtol=0, atol=1e-6)
+    sides = (plan(-1e-3)[1], plan(1e-3)[1])
     assert min(float((found - side).norm() / side.norm()) for side in sides) < 0.02
     assert float((sides[0] - sides[1]).norm() / sides[0].norm()) > 0.02
 
@@ -465,38 +249,27 @@ def test_a_kink_of_an_action_with_one_bound_at_zero_is_degenerate(backend, side)
 
 
 @every_exact
-def test_solving_twice_gives_the_same_bits(build, backend):
-    problem = contact(build)
-    first, second = solve(problem, backend), solve(problem, backend)
+def test_solving_twice_gives_the_same_bits(solutions, backend):
+    problem, first = solutions("contact", backend)
+    second = solve(problem, backend)
     assert torch.equal(first.u, second.u)
     assert torch.equal(first.lam, second.lam)
 
 
-@pytest.mark.parametrize("name", ["contact", "lcs_per_element", "cost_and_bounds_per_element"])
-@every_backend
-def test_batch_equals_loop(build, solutions, name, backend):
+@every_backend_on("contact", "cost_and_bounds_per_element", exact=("stages_per_element", "everything", "hard"))
+def test_batch_equals_loop(solutions, name, backend):
     problem, sol = solutions(name, backend)
     for i in range(problem.batch):
-        one = dataclasses.replace(
-            problem, tensors={k: v[None] if k == "x0" else v for k, v in problem.element(i).items()}
-        )
-        alone = solve(one, backend)
+        alone = solve(problem, backend, tensors=problem.element(i))
         torch.testing.assert_close(alone.u[0], sol.u[i], rtol=1e-6, atol=1e-8)
         torch.testing.assert_close(alone.lam[0], sol.lam[i], rtol=1e-5, atol=1e-8)
+        torch.testing.assert_close(alone.mu[0], sol.mu[i], rtol=1e-4, atol=1e-6)
         assert int(alone.status[0]) == int(sol.status[i])
 
 
 @every_backend
-def test_an_element_does_not_depend_on_its_neighbours(build, solutions, backend):
-    problem, sol = solutions("contact", backend)
-    order = torch.tensor([5, 2, 7, 0])
-    part = dataclasses.replace(problem, tensors={**problem.tensors, "x0": problem.tensors["x0"][order]})
-    torch.testing.assert_close(solve(part, backend).u, sol.u[order], rtol=1e-6, atol=1e-8)
-
-
-@every_backend
 def test_an_empty_batch_is_solved(build, backend):
-    problem = contact(build)
+    problem = problems.contact(build)
     t = {**problem.tensors, "x0": torch.empty(0, 4, dtype=torch.float64), "A": problem.tensors["A"].clone()}
     t["A"].requires_grad_()
     sol = solve(problem, backend, tensors=t)
@@ -506,15 +279,17 @@ def test_an_empty_batch_is_solved(build, backend):
     assert torch.equal(gradient, torch.zeros(4, 4, dtype=torch.float64))
 
 
-@pytest.mark.parametrize("name", ["contact", "paper_sized"])
+@pytest.mark.parametrize("name", ["contact", "paper_sized", "stages", "hard", "rows_by_stage", "no_contact_stages"])
 @every_exact
 def test_a_warm_start_ends_in_the_same_plan_with_less_work(solutions, name, backend):
     problem, sol = solutions(name, backend)
-    warm = solve(problem, backend, guess=sol)
-    assert bool(warm.converged.all())
-    same = (warm.u - sol.u).abs().amax((1, 2)) < 1e-5
-    assert float(same.double().mean()) > 0.5  # another local optimum is allowed, rarely
-    assert float(warm.iterations.double().mean()) < float(sol.iterations.double().mean())
+    for guess in (sol, Primal(sol.x, sol.u, sol.lam)):  # with the multipliers, and without
+        warm = solve(problem, backend, guess=guess)
+        assert bool(warm.converged.all())
+        same = (warm.u - sol.u).abs().amax((1, 2)) < 1e-5
+        assert float(same.double().mean()) > 0.5  # another local optimum is allowed, rarely
+        if guess is sol or not sol.mu.numel():
+            assert float(warm.iterations.double().mean()) < float(sol.iterations.double().mean())
 
 
 @every_exact
@@ -527,27 +302,86 @@ def test_a_wild_guess_does_no_harm(build, solutions, backend):
     assert float(wild.kkt_residual.max()) <= 1e-6
 
 
+@every_exact
+def test_forms_that_say_the_same_have_the_same_plan(build, backend):
+    """A far bound and none; stages that are alike and one matrix for all."""
+    problem, far = problems.unbounded(build), torch.full((2,), 1e3, dtype=torch.float64)
+    wide = problem.changed(u_min=-far, u_max=far)
+    torch.testing.assert_close(solve(problem, backend).u, solve(wide, backend).u, rtol=1e-5, atol=1e-6)
+    problem = problems.hard(build)
+    t = {k: v.expand(problem.stages(k), *v.shape) if k in STAGED else v for k, v in problem.tensors.items()}
+    sequence = dataclasses.replace(problem, tensors=t, staged=frozenset(set(t) & set(STAGED)))
+    torch.testing.assert_close(solve(sequence, backend).u, solve(problem, backend).u, rtol=1e-6, atol=1e-8)
+
+
+@every_problem
+def test_a_cost_that_is_asked_for_counts_as_one_that_is_given(solutions, name):
+    problem, found = solutions(name, "batched")[0], []
+    for asked in (False, True):
+        leaves = {k: v.clone().requires_grad_() for k, v in problem.tensors.items()}
+        plan = solve(problem, "batched", tensors=leaves, asked=asked)
+        (plan.u.sum() + plan.objective.sum()).backward()
+        found.append([plan.u, plan.objective, *(leaves[k].grad for k in COST if k in leaves)])
+    for given, taken in zip(*found, strict=True):
+        torch.testing.assert_close(taken, given, rtol=0, atol=0)
+
+
+@every_exact
+def test_a_price_above_the_multiplier_makes_a_soft_constraint_hard(build, backend):
+    problem = problems.hard(build)
+    plan = solve(problem, backend)
+    dear = {**problem.tensors, "weight": torch.full((2,), 3 * float(plan.mu.max()), dtype=torch.float64)}
+    # From the same local optimum: another program may lead a cold start to another one.
+    soft_plan = solve(problem, backend, guess=plan, tensors=dear)
+    torch.testing.assert_close(soft_plan.u, plan.u, rtol=1e-5, atol=1e-6)
+    cheap = {**problem.tensors, "weight": torch.full((2,), 0.2 * float(plan.mu.max()), dtype=torch.float64)}
+    cheap_plan = solve(problem, backend, tensors=cheap)
+    assert float(cheap_plan.violation.max()) > 1e-4
+    assert float(cheap_plan.mu.max()) == pytest.approx(float(cheap["weight"][0]), rel=1e-9)
+
+
+@every_exact
+def test_multipliers_are_what_a_wider_limit_would_save(build, backend):
+    problem = problems.hard(build)
+    t = problem.each().tensors
+    g = t["g"].clone().requires_grad_()
+    sol = solve(problem, backend, tensors={**t, "g": g})
+    (gradient,) = torch.autograd.grad(sol.objective.sum(), g)
+    torch.testing.assert_close(gradient, -sol.mu.sum(1), rtol=1e-6, atol=1e-8)
+
+
+@every_exact
+def test_an_infeasible_element_is_a_status_and_spoils_no_other(build, backend):
+    problem = problems.hard(build).each()
+    t = dict(problem.tensors)
+    bad = t["g"].clone()
+    bad[2, 0] = (t["G"][2, 0] * t["x0"][2]).sum() - 0.3  # the first state violates it by 0.3, whatever follows
+    x0 = t["x0"].clone().requires_grad_()
+    with pytest.warns(SolveWarning, match="1 of 4 .*1 INFEASIBLE"):
+        sol = solve(problem, backend, tensors={**t, "g": bad, "x0": x0}, on_failure="mask")
+    good = solve(problem, backend)
+    ok = Status.CONVERGED
+    assert sol.status.tolist() == [ok, ok, Status.INFEASIBLE, ok]
+    others = [0, 1, 3]
+    torch.testing.assert_close(sol.u[others].detach(), good.u[others], rtol=1e-6, atol=1e-8)
+    assert float(sol.violation[2]) == pytest.approx(0.3, abs=0.02)
+    (gradient,) = torch.autograd.grad(sol.u.sum() + sol.objective.sum(), x0)
+    assert torch.equal(gradient[2], torch.zeros(4).double())
+    assert float(gradient[others].abs().amax(1).min()) > 0
+
+
 # --- backward -------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def moved(build, solutions):
-    """The perturbed copies of each problem solved once per backend, failures masked."""
-    return functools.cache(lambda name, backend: moves(build, solve, *solutions(name, backend), backend))
-
-
 @every_problem
 @every_exact_on_copies
-def test_a_warm_start_next_to_a_solution_is_solved(moved, name, backend):
-    """Where nearly nothing is left to gain, rounding must not be taken for a failure."""
-    _, plans = moved(name, backend)
-    assert bool(plans.converged.all()), plans.status.bincount()
-
-
-@every_problem
-@every_exact_on_copies
-def test_gradient_of_every_input_matches_central_differences(build, solutions, moved, name, backend):
-    compare(build, solve, *solutions(name, backend), backend, *moved(name, backend))
+def test_gradient_of_every_input_matches_central_differences(build, solutions, name, backend):
+    problem, base = solutions(name, backend)
+    directions, moved = moves(build, solve, problem, base, backend)
+    # Next to a solution nearly nothing is left to gain; rounding must not be taken for a failure.
+    assert bool(moved.converged.all()), moved.status.bincount()
+    some = compare(build, solve, problem, base, backend, directions, moved)
+    assert some >= 0.6 * len(directions)  # most inputs matter
 
 
 @pytest.mark.parametrize("backend", [name for name in BACKENDS if name not in EXACT])
@@ -565,93 +399,39 @@ def test_gradient_of_an_approximation_is_roughly_that_of_its_own_solve(build, so
     assert float(error.median()) < 0.05
 
 
-@pytest.mark.parametrize("k", INPUTS)
-@every_exact_on_copies
-def test_gradcheck_in_each_input(build, k, backend):
-    problem = make(build, seed=20, batch=1, n_x=2, n_u=1, n_lam=2, horizon=2, bound=0.12, relaxation=1e-3)
-    t = problem.tensors
-    base = solve(problem, backend)
-    at_bound = base.u.abs() >= 0.12
-    assert 0 < int(at_bound.sum()) < base.u.numel()
-
-    precise = get_backend(backend)
-    if "tol" in {field.name for field in dataclasses.fields(precise)}:
-        precise = dataclasses.replace(precise, tol=1e-11)  # difference quotients need the digits
-
-    def function(value):
-        sol = solve(problem, precise, tensors={**t, k: value}, guess=base)
-        return sol.x, sol.u, sol.lam, sol.objective
-
-    assert gradcheck(function, (t[k].clone().requires_grad_(),), eps=1e-6, atol=1e-5, rtol=1e-4)
-
-
-@pytest.mark.parametrize("name", ["contact", "saturated"])
-@every_backend
-def test_gradients_of_shared_inputs_are_sums_of_those_of_the_elements(build, name, backend):
-    problem, n = PROBLEMS[name](build), build.normal(5)
+@every_backend_on("contact", "saturated", exact=("stages", "soft_and_hard", "rows_by_stage", "no_contact"))
+def test_gradients_of_shared_inputs_are_sums_of_those_of_the_elements(build, solutions, name, backend):
+    problem, base = solutions(name, backend)
+    n, (rtol, atol) = build.normal(5), (1e-5, 1e-7) if backend in EXACT else (1e-2, 1e-3)
+    weights = [n(*v.shape) for v in (base.x, base.u, base.lam)] + [n(problem.batch)]
     shared = {k: v.clone().requires_grad_() for k, v in problem.tensors.items()}
     each = {k: v.requires_grad_() for k, v in problem.each().tensors.items()}
     for tensors in (shared, each):
-        sol = solve(problem, backend, tensors=tensors)
-        if tensors is shared:
-            weights = [n(*v.shape) for v in (sol.x, sol.u, sol.lam)] + [n(problem.batch)]
-        weigh(sol, weights).sum().backward()
-    for k in INPUTS:
+        weigh(solve(problem, backend, tensors=tensors), weights).sum().backward()
+    for k in problem.tensors:
         expected = each[k].grad.sum(0) if problem.shared(k) else each[k].grad
+        size = float(1 + each[k].grad.norm())
         torch.testing.assert_close(
-            shared[k].grad,
-            expected,
-            rtol=1e-5 if backend in EXACT else 1e-2,
-            atol=(1e-7 if backend in EXACT else 1e-3) * float(1 + each[k].grad.abs().max()),
-            msg=lambda m, k=k: f"{k}: {m}",
+            shared[k].grad, expected, rtol=rtol, atol=atol * size, msg=lambda m, k=k: f"{k}: {m}"
         )
 
 
 @every_exact
-@pytest.mark.parametrize("name", ["contact", "saturated", "lcs_per_element"])
-def test_the_objectives_gradient_is_that_of_the_envelope_theorem(build, solutions, name, backend):
-    """dJ*/dθ is the derivative of the rollout's objective with the actions held, but for the bounds."""
-    problem, _ = solutions(name, backend)
-    leaves = {k: v.requires_grad_() for k, v in problem.each().tensors.items()}
-    sol = solve(problem, backend, tensors=leaves)
-    inner = [k for k in INPUTS if not k.startswith("u_")]
-    found = torch.autograd.grad(sol.objective.sum(), [leaves[k] for k in inner])
-    held = torch.autograd.grad(rollout_objective(problem, leaves, sol.u.detach()).sum(), [leaves[k] for k in inner])
-    for k, left, right in zip(inner, found, held, strict=True):
-        if k in ("Q", "R", "Q_final"):
-            right = 0.5 * (right + right.mT)
-        torch.testing.assert_close(left, right, rtol=1e-5, atol=1e-7, msg=lambda m, k=k: f"{k}: {m}")
-
-
-@every_exact
-def test_an_action_at_its_bound_moves_with_the_bound_and_with_nothing_else(solutions, backend):
-    problem, base = solutions("saturated", backend)
-    leaves = {k: v.requires_grad_() for k, v in problem.each().tensors.items()}
-    sol = solve(problem, backend, tensors=leaves)
-    held = (base.action == 0.01).nonzero()
-    assert len(held)
-    i, j = held[0].tolist()
-    grads = torch.autograd.grad(sol.action[i, j], list(leaves.values()))
-    for k, g in zip(leaves, grads, strict=True):
-        expected = torch.zeros_like(g)
-        if k == "u_max":
-            expected[i, j] = 1
-        torch.testing.assert_close(g, expected, rtol=0, atol=1e-9)
-
-
-@every_backend
-def test_gradients_of_each_output_alone_are_finite(build, backend):
-    problem = contact(build)
-    leaves = {k: v.requires_grad_() for k, v in problem.each().tensors.items()}
-    sol = solve(problem, backend, tensors=leaves)
-    for output in (sol.x, sol.u, sol.lam, sol.objective, sol.action):
-        for g in torch.autograd.grad(output.sum(), list(leaves.values()), retain_graph=True):
-            assert bool(torch.isfinite(g).all())
+def test_what_is_infinite_has_no_gradient(build, backend):
+    for name, key in (("half_open", "u_max"), ("terminal", "g"), ("soft_and_hard", "weight")):
+        problem = PROBLEMS[name](build)
+        leaf = problem.tensors[key].clone().requires_grad_()
+        sol = solve(problem, backend, tensors={**problem.tensors, key: leaf})
+        (gradient,) = torch.autograd.grad(sol.u.sum() + sol.objective.sum(), leaf)
+        infinite = torch.isinf(leaf)
+        assert bool(infinite.any())
+        assert torch.equal(gradient[infinite], torch.zeros_like(gradient[infinite]))
+        assert bool(torch.isfinite(gradient).all())
 
 
 @every_backend
 def test_double_backward_is_refused(build, backend):
-    problem = contact(build)
+    problem = problems.contact(build)
     x0 = problem.tensors["x0"].clone().requires_grad_()
     sol = solve(problem, backend, tensors={**problem.tensors, "x0": x0})
     with pytest.raises(DoubleBackwardError, match=r"first derivatives only.*create_graph=False"):
@@ -672,50 +452,14 @@ def test_a_backend_is_a_frozen_dataclass_whose_string_is_its_default_instance(ba
         instance.name = "other"
 
 
-# --- barrier and training relaxation ----------------------------------------------------------------------------------
-
-
-@every_exact
-def test_a_barrier_keeps_actions_off_their_bounds_and_gives_them_a_gradient(build, backend):
-    problem = make(build, seed=1, bound=0.05, batch=4)
-    plain, soft = solve(problem, backend), solve(problem, backend, barrier=1e-3)
-    assert float(plain.u.abs().max()) == 0.05
-    assert float(soft.u.abs().max()) < 0.05
-    t = problem.tensors
-    u = soft.u
-    logs = ((u - t["u_min"]).log() + (t["u_max"] - u).log()).sum((1, 2))
-    bare = rollout_objective(problem, problem.each().tensors, u)
-    torch.testing.assert_close(soft.objective, bare - 1e-3 * logs, rtol=1e-8, atol=1e-8)
-    leaf = t["x0"].clone().requires_grad_()
-    action = solve(problem, backend, tensors={**t, "x0": leaf}, barrier=1e-3).action
-    assert float(torch.autograd.grad(action.sum(), leaf)[0].abs().amax(1).min()) > 1e-6
-
-
-@pytest.mark.parametrize("k", ["A", "F", "c", "Q", "r", "u_min", "u_max", "x0"])
-@every_exact_on_copies
-def test_gradcheck_with_a_barrier(build, k, backend):
-    problem = make(build, seed=20, batch=1, n_x=2, n_u=1, n_lam=2, horizon=2, bound=0.12, relaxation=1e-3)
-    precise = get_backend(backend)
-    if "tol" in {field.name for field in dataclasses.fields(precise)}:
-        precise = dataclasses.replace(precise, tol=1e-11)
-    base = solve(problem, backend, barrier=1e-2)
-
-    def function(value):
-        sol = solve(problem, precise, tensors={**problem.tensors, k: value}, guess=base, barrier=1e-2)
-        return sol.x, sol.u, sol.lam, sol.objective
-
-    assert gradcheck(function, (problem.tensors[k].clone().requires_grad_(),), eps=1e-6, atol=1e-5, rtol=1e-4)
-
-
 @every_exact
 def test_training_mode_plans_at_its_own_relaxation(build, backend):
-    problem = make(build, seed=0, batch=4)
+    problem = make(build)
     t = problem.tensors
-    layer = LCSMPCLayer(
-        LCSParams(**{k: t[k] for k in LCS}), QuadraticCost(**{k: t[k] for k in COST}), 3, t["u_min"], t["u_max"],
-        backend=backend, relaxation=1e-4, training_relaxation=1e-2,
-    )  # fmt: skip
-    soft = solve(dataclasses.replace(problem, relaxation=1e-2), backend)
+    lcs, cost = LCSParams(**{k: t[k] for k in LCS}), QuadraticCost(**{k: t[k] for k in COST if k in t})
+    options = {"backend": backend, "relaxation": 1e-4, "training_relaxation": 1e-2}
+    layer = LCSMPCLayer(lcs, cost, 3, t["u_min"], t["u_max"], **options)
+    soft = solve(problem, backend, relaxation=1e-2)
     assert torch.equal(layer.train()(t["x0"]).u, soft.u)
     assert float(layer(t["x0"]).complementarity().max()) < 1e-8
     assert torch.equal(layer.eval()(t["x0"]).u, solve(problem, backend).u)

@@ -61,7 +61,7 @@ def test_the_native_certificate_is_the_one_of_kkt(build, barrier, per_element):
 
 
 def test_a_residual_has_no_units(build):
-    from tests.conformance.test_backends import badly_scaled, contact
+    from tests.conformance.problems import badly_scaled, contact
 
     rough = {"max_iter": 1, "effort": "fast", "homotopy": 1.0, "shrink": 1e-3}
     found = []

@@ -120,9 +120,11 @@ class Asked(Exact):
         return super().rollout(x0, u)
 
 
-def test_costs_are_those_of_the_mpc():
+@pytest.mark.parametrize("asked", [False, True])
+def test_costs_are_those_of_the_mpc(build, asked):
     """The plan is the mean of the sequences it tried, weighted by the objective written out."""
-    plan, model = planner(kappa=0.02), Asked(1, 1, 2, 4)  # so that more than the best sequence counts
+    cost = build.AskedCost(make_cost()) if asked else make_cost()
+    plan, model = planner(cost, kappa=0.02), Asked(1, 1, 2, 4)  # so that more than the best sequence counts
     plan.ensemble, model.asked = model, []
     x0, goal = torch.tensor([[0.2]], dtype=torch.float64), torch.tensor([[-0.3]], dtype=torch.float64)
     found = plan(x0, goal).action

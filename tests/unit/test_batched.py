@@ -261,6 +261,19 @@ def test_large_random_problems_converge(n_x, n_u, n_lam, horizon):
     assert float(plan.iterations.double().mean()) < 90
 
 
+@pytest.mark.parametrize(("n_x", "n_u", "n_lam"), [(4, 2, 49), (40, 9, 6)])
+def test_large_problems_have_the_same_plans_alone_and_in_a_batch_with_systems_of_their_own(n_x, n_u, n_lam):
+    generator = torch.Generator().manual_seed(1)
+    models = [LCSModel(n_x, n_u, n_lam, init_scale=0.2, generator=generator).params().detach() for _ in range(3)]
+    lcs = LCSParams(**{name: torch.stack([m.tensors()[name] for m in models]) for name in models[0].tensors()})
+    cost = GoalCost.reach(n_x, n_u, goal_weight=0.5, input_weight=0.05)
+    x0, goal = torch.randn(3, n_x, generator=generator, dtype=torch.float64), torch.zeros(n_x).double()
+    mpc = LCSMPCLayer(lcs, cost, 3, -1.0, 1.0, backend=BatchedBackend(threads=1, effort="fast"))
+    together = mpc(x0, goal).u
+    for model, x, u in zip(models, x0, together, strict=True):
+        torch.testing.assert_close(mpc(x, goal, lcs=model).u, u, rtol=1e-9, atol=1e-9)
+
+
 def test_iterations_hardly_grow_with_the_horizon():
     cost = GoalCost.reach(8, 1, goal_weight=[5.0] * 4 + [0.5] * 4, input_weight=0.005)
     low = torch.tensor([0.1] * 4 + [0.3] * 4, dtype=torch.float64)

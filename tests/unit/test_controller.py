@@ -162,6 +162,78 @@ def test_a_module_is_asked_at_each_step(build):
     assert not Path("never").exists()
 
 
+class Tilted:
+    """A `CostModule` whose linear terms are the state and the goal."""
+
+    def __init__(self, cost, constant=False):
+        self.base, self.constant = cost, constant
+
+    def at(self, x, goal=None, context=None):
+        terms = {**self.base.tensors(), "constant_stage": 0.5 * (x**2).sum(-1)}
+        terms["q"] = terms["q"] + (0 if self.constant else 0.1 * x)
+        return QuadraticCost(**terms) if goal is None else QuadraticCost(**{**terms, "q_final": -goal})
+
+
+@pytest.mark.parametrize("asked", ["both", "cost", "given"])
+def test_each_step_may_have_a_system_a_cost_and_bounds_of_its_own(build, asked):
+    lcs = Leaning(build.params(0)) if asked == "both" else build.params(0)
+    mpc = LCSMPCLayer(lcs, build.cost(0) if asked == "given" else Tilted(build.cost(0)), H, -0.3, 0.3)
+    controller, solution = mpc.controller(time_limit=100.0), None
+    for i, x in enumerate(states(8)):
+        context, own = torch.ones(1).double() if asked == "both" else None, {}
+        goal = None if asked == "given" or i == 3 else 0.1 * torch.from_numpy(x)
+        if i % 3 == 1:  # what is given counts for this step alone
+            low = torch.tensor([-0.02, -0.3 - 0.1 * i], dtype=torch.float64)
+            own = {"lcs": build.params(i), "cost": Tilted(build.cost(i)), "u_min": low, "u_max": 0.01}
+        guess = None if solution is None else solution.shift()
+        solution = mpc(torch.from_numpy(x), goal, guess=guess, context=context, **own)
+        assert np.array_equal(controller.step(x, goal, context=context, **own), solution.action.numpy())
+        assert controller.plan.objective == pytest.approx(float(solution.objective), rel=1e-12)
+    held = controller.plan.u[1]
+    controller.time_limit = 1e-9
+    assert np.array_equal(controller.step(x, goal, context=context), held)
+    assert controller.plan.late
+    assert controller.plan.fallback
+
+
+def test_a_cost_module_is_written_where_it_is_constant(build, tmp_path):
+    mpc = LCSMPCLayer(build.params(0), Tilted(build.cost(0), constant=True), H, -0.3, 0.3)
+    x = states(1)[0]
+    path = export_controller(mpc, tmp_path)
+    assert np.array_equal(MPCController.load(path).step(x), mpc(torch.from_numpy(x)).action.numpy())
+    mpc = LCSMPCLayer(build.params(0), Tilted(build.cost(0)), H, -0.3, 0.3)
+    for write in (mpc.controller().save, lambda path: export_controller(mpc, path)):
+        with pytest.raises(InvalidInputError, match=r"cost: .*may depend on the state; build a layer with cost=module"):
+            write(tmp_path / "never")
+
+
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [
+        ({"lcs": LCSParams}, "lcs: expected LCSModel"),
+        ({"lcs": "n_lam"}, r"expected C \(4, 3\) as in the first"),
+        ({"cost": "goal"}, "goal: expected .*GoalCost"),
+        ({"cost": "n_x"}, "n_x=4, n_u=2 like the LCS"),
+        ({"u_min": 1.0}, "u_min: expected u_min <= u_max"),
+        ({"u_max": torch.zeros(3, 2).double()}, "no batch dimension"),
+    ],
+)
+def test_a_step_refuses_what_does_not_fit(build, plain, reaching, tmp_path, own, message):
+    named = {"n_lam": build.params(0, n_lam=2), "goal": reaching.cost, "n_x": build.cost(0, n_x=5)}
+    own = {name: named.get(value, value) if isinstance(value, str) else value for name, value in own.items()}
+    controller, x = plain.controller(), states(1)[0]
+    before = controller.step(x)
+    with pytest.raises(InvalidInputError, match=message):
+        controller.step(x, **own)
+    controller.reset()
+    assert np.array_equal(controller.step(x), before)
+    controller.save(tmp_path / "c")
+    with pytest.raises(InvalidInputError, match="expected none in a controller of a file"):
+        MPCController.load(tmp_path / "c").step(x, **own)
+    with pytest.raises(ShapeError, match="cost: expected none where the layer has a GoalCost"):
+        reaching.controller().step(x, [0.0, 0.0], cost=plain.cost)
+
+
 @pytest.mark.parametrize("change", ["sequence", "size", "F in place", "NaN"])
 def test_a_module_whose_system_changes_its_form_or_breaks_is_refused(build, change):
     mpc = LCSMPCLayer(Leaning(build.params(0)), build.cost(0), H, -0.3, 0.3)

@@ -315,6 +315,22 @@ def test_where_contacts_are_disabled_nothing_touches_but_what_is_named(flag):
     assert named.gap[:4].tolist() == pytest.approx([0.005] * 4)
 
 
+def test_contacts_of_a_pair_do_not_depend_on_the_other_pairs():
+    """Faces of several pairs that meet at the same time: cylinders on a tilted box."""
+    body = '<body pos="{0} .01 .0{1}"><freejoint/><geom name="{2}" type="cylinder" size=".0{1} .0{1}"/></body>'
+    model = load(
+        '<geom name="base" type="box" size=".2 .1 .02" pos="0 0 -.02" euler="0 0 9"/>'
+        + "".join(body.format(*each) for each in ((-0.1, 3, "a"), (0, 2, "b"), (0.1, 4, "c")))
+    )
+    pairs = [(name, "base") for name in "abc"]
+    x = MujocoState(model, velocities=True).to_state(model.qpos0)
+    together = MujocoLCS(model, motion="dynamic", pairs=pairs, contacts=12).contacts(x)
+    alone = [MujocoLCS(model, motion="dynamic", pairs=[pair], contacts=4).contacts(x) for pair in pairs]
+    for name in ("normal", "tangent"):
+        mine, theirs = (v.abs().sum(0) for v in (getattr(together, name), torch.cat([getattr(c, name) for c in alone])))
+        torch.testing.assert_close(mine, theirs)
+
+
 # --- quasi-static motion --------------------------------------------------------------------------------------------
 
 
@@ -558,7 +574,6 @@ RESTS = {
         "adhesion",
     ),
     "equality": (SERVOS + '<equality><joint joint1="px" joint2="py"/></equality>', {}, "equality"),
-    "activation": ('<actuator><intvelocity joint="px" kp="1" actrange="-1 1"/></actuator>', {}, "activation"),
     "two on one joint": (SERVOS.replace("py", "px"), {}, "slide or hinge of its own"),
     "no actuators": ("", {}, "actuators"),
     "a motion": (SERVOS, {"motion": "fast"}, "quasi-static"),
@@ -575,6 +590,8 @@ if SINCE_MUJOCO_4:
     RESTS["delay of an actuator"] = (SERVOS.replace("/></", ' delay=".05" nsample="20"/></'), {}, "no delay of actu")
     sensor = '<sensor><jointpos joint="px" delay=".1" nsample="9"/></sensor>'
     RESTS["delay of a sensor"] = (SERVOS + sensor, {}, "no delay of actuators and sensors")
+    motor = '<actuator><dcmotor joint="px" motorconst=".1" resistance="1" inductance="1e-3"/></actuator>'
+    RESTS["a motor with a state"] = (motor, {}, "activation")
     RESTS["sleep"] = (FLAG.format("sleep", "enable"), {}, "sleep")
 
 

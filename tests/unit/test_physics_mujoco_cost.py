@@ -8,6 +8,8 @@ import torch
 
 mujoco = pytest.importorskip("mujoco")
 
+from difflcs import CostModule, LCSMPCLayer  # noqa: E402
+from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError  # noqa: E402
 from difflcs.physics.mujoco import (  # noqa: E402
     Distance,
     Effort,
@@ -109,3 +111,122 @@ def test_at_their_goals_squares_are_right_to_second_order():
     again = cost.at(x + away, goal)
     assert float(stage_cost(cost.at(x, goal), x)) == pytest.approx(0.0, abs=1e-11)
     assert float(stage_cost(cost.at(x, goal), x + away)) == pytest.approx(float(stage_cost(again, x + away)), rel=1e-2)
+
+
+def test_orientations_do_not_depend_on_the_reference():
+    """The same squares, and the same change of them with MuJoCo's velocities, wherever rotation vectors count from."""
+    (cost, x, module), found = make([TERMS["orientation"], TERMS["distance"]], seed=3), []
+    data = look(module, x)
+    for follow in (False, True):
+        x = module.observe(data) if follow else x
+        fields, T = cost.at(x), module.state.tangent(x.numpy()[: module.state.nv])
+        per_velocity = np.eye(module.state.nv) if T is None else np.linalg.inv(T)
+        H, g = (v.numpy()[..., : module.state.nv] for v in (fields.Q[: module.state.nv], fields.Q @ x + fields.q))
+        found.append((stage_cost(fields, x).item(), per_velocity.T @ g, per_velocity.T @ H @ per_velocity))
+    assert T is None  # the reference has moved
+    for before, after in zip(*found, strict=True):
+        np.testing.assert_allclose(after, before, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", [0.5, 3.0])
+def test_a_goal_beyond_the_reach_pulls_no_harder(angle):
+    cost, x, module = make([Orientation("cube", weight=2.0, reach=1.0)])
+    turn, goal = np.zeros(4), np.zeros(4)
+    mujoco.mju_axisAngle2Quat(turn, np.array([0.0, 0.6, 0.8]), angle)
+    mujoco.mju_mulQuat(goal, look(module, x).body("cube").xquat, -3.0 * turn)  # of any length, and sign
+    found = cost.at(x, torch.from_numpy(goal))
+    assert float(stage_cost(found, x)) == pytest.approx(2.0 * min(angle, 1.0) ** 2)
+
+
+def test_batches_of_states_and_goals_are_those_of_each():
+    cost, x, module = make([Position("tip", goal=(0.1, 0.2, 0.3)), Orientation("cube"), Posture(["rail"]), Effort()])
+    away = torch.from_numpy(np.random.default_rng(0).normal(size=(2, 3, cost.n_x)))
+    goals = torch.from_numpy(np.random.default_rng(1).normal(size=(2, 3, 5)))
+    assert (cost.n_goal, cost.constant, MujocoCost(module, [Velocity(), Effort()]).constant) == (5, False, True)
+    found = cost.at(x + 0.1 * away, goals).tensors()
+    for i in np.ndindex(2, 3):
+        own = cost.at((x + 0.1 * away)[i], goals[i]).tensors()
+        for name in ("Q", "q", "Q_final", "q_final", "constant", "constant_stage"):
+            torch.testing.assert_close(found[name][i], own[name], rtol=1e-9, atol=1e-9)
+    assert cost.at(x, goals).q.shape == (2, 3, cost.n_x)
+    assert cost.at(x, goals).Q.shape == (cost.n_x, cost.n_x)
+
+
+def test_weights_and_goals_get_gradients():
+    weight = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64, requires_grad=True)
+    final = torch.nn.Parameter(torch.tensor(0.5, dtype=torch.float64))
+    goal = torch.tensor([0.3, 0.1, 0.2, 1.0, -0.2, 0.3, 0.4], dtype=torch.float64, requires_grad=True)
+    turn = Orientation("cube", weight=weight, weight_final=final, reach=2.0)
+    cost, x, module = make([Position("tip"), turn, Effort(0.1)])
+    assert isinstance(cost, CostModule)
+    assert [name for name, _ in cost.named_parameters()] == ["weight_final_1"]
+
+    def fields(*_):
+        found = cost.at(x, goal)
+        return found.Q, found.q, found.Q_final, found.q_final, found.constant, found.constant_stage
+
+    assert torch.autograd.gradcheck(fields, (weight, final, goal), atol=1e-6)
+    wanted = tuple(value.detach() for value in fields())
+    with torch.no_grad():  # without gradients NumPy does it
+        torch.testing.assert_close(fields(), wanted)
+    plan = LCSMPCLayer(module, cost, 2, -1.0, 1.0)(x, goal)
+    plan.action.square().sum().backward()
+    assert float(weight.grad.abs().sum()) > 0
+
+
+def test_an_arm_brings_its_hand_to_a_place():
+    cost, x, module = make([Position("tip", weight=50.0), Effort(0.01)], dynamic=False)
+    data = look(module, x)
+    mpc = LCSMPCLayer(module, cost, 3, -0.1, 0.1)
+    turn, goal, controller = np.zeros(4), np.zeros(3), mpc.controller()
+    mujoco.mju_axisAngle2Quat(turn, np.array([0.0, 0.0, 1.0]), 0.8)
+    mujoco.mju_rotVecQuat(goal, data.site("tip").xpos, turn)
+    for _ in range(12):
+        x[0] += controller.step(x, goal)[0]
+    assert np.linalg.norm(look(module, x).site("tip").xpos - goal) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("terms", "error", "message"),
+    [
+        ([Position("tipp")], InvalidInputError, r"\[0\] Position: expected a body or site or geom, one of .*cube, .*tip"
+         r".*, got str 'tipp' \(did you mean tip\?\); n"),
+        ([Position("site:cube")], InvalidInputError, "expected a site, one of tip, got"),
+        ([Effort(), Distance("cube", 3)], InvalidInputError, r"terms\[1\] Distance: .*got int 3"),
+        ([Posture(["free"], (0.0,))], InvalidInputError, "expected slides and hinges, among shoulder, rail, got"),
+        ([Velocity("spin")], InvalidInputError, "expected joints, among shoulder, wrist, free, rail, got str 'spin'"),
+        ([Position("tip", goal=(1.0, 2.0))], ShapeError, r"expected a goal of shape \(3,\), got \(2,\)"),
+        ([Orientation("tip", goal=(np.nan, 0, 0, 1))], NonFiniteError, "expected a finite goal"),
+        ([Orientation("tip", reach=0.0)], InvalidInputError, "reach: expected .*above 0"),
+        ([Effort((1.0, 2.0, 3.0))], ShapeError, "weight: expected one number or 2 of them"),
+        ([Position("tip", weight_final=-1.0)], InvalidInputError, "weight_final: expected at least 0, got -1"),
+        (["tip"], DTypeError, "expected Position, Orientation, … or Effort, got"),
+    ],
+)  # fmt: skip
+def test_terms_that_do_not_fit_say_why(terms, error, message):
+    with pytest.raises(error, match=message):
+        make(terms)
+
+
+def test_calls_that_do_not_fit_say_why():
+    cost, x, module = make([Position("tip")])
+    fixed = MujocoCost(module, [TERMS["posture"]])
+    goal = torch.zeros(3, dtype=torch.float64)
+    for call, message in (
+        (lambda: cost.at(x), r"goal: expected \(..., n_goal=3\)"),
+        (lambda: cost.at(x, goal[:2]), "n_goal=3"),
+        (lambda: cost.at(x[:3], goal), "n_x=22"),
+        (lambda: fixed.at(x, goal), "goal: expected none, as all terms have goals"),
+        (
+            lambda: LCSMPCLayer(module, cost, 2)(x, reference=goal.expand(3, 3)),
+            "reference: expected a goal with Mujoco",
+        ),
+    ):
+        with pytest.raises(ShapeError, match=message):
+            call()
+    with pytest.raises(
+        InvalidInputError, match=r'Velocity: expected a module whose state has velocities \(motion="dyn'
+    ):
+        make([Velocity()], dynamic=False)
+    with pytest.raises(DTypeError, match="module: expected a MujocoLCS"):
+        MujocoCost(mujoco.MjModel.from_xml_string(MODEL), [])

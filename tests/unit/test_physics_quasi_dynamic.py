@@ -104,8 +104,8 @@ def stack():
 def test_groups_have_budgets_of_contacts_and_of_friction():
     model = stack()
     groups = [
-        ContactGroup("block", 5),
-        ContactGroup(["round"], 1, distance=0.01),
+        ContactGroup([("floor", "box"), ("block", "other"), ("block", "round")], 5),  # geoms and bodies
+        ContactGroup("round", 1, distance=0.01),
         ContactGroup(None, 3, friction=False),
     ]
     module = MujocoLCS(model, motion="quasi-dynamic", contacts=groups, distance=0.05)

@@ -80,9 +80,9 @@ class Jump:
         return bool((target[1] - x[1]).abs() < 1e-3)
 
 
-def on_a_line(places=None, **settings):
+def on_a_line(places=None, kind=None, **settings):
     cost = GoalCost.reach(2, 1, goal_weight=(1.0,), input_weight=1e-3)
-    mpc = LCSMPCLayer(Line(), cost, 4, -0.2, 0.2, relaxation=1e-6, on_failure="mask")
+    mpc = LCSMPCLayer(Line(), cost if kind is None else kind(cost), 4, -0.2, 0.2, relaxation=1e-6, on_failure="mask")
     return SamplingPolicy(mpc, places or Sides(), Jump(), SamplingSettings(**settings))
 
 
@@ -149,8 +149,9 @@ def test_it_travels_where_the_pusher_is_on_the_wrong_side_and_pushes_from_there(
     assert u[0] > 0.15
 
 
-def test_the_cost_of_standing_still_and_what_a_plan_saves_are_those_of_the_mpc():
-    policy = on_a_line()
+@pytest.mark.parametrize("asked", [False, True])
+def test_the_cost_of_standing_still_and_what_a_plan_saves_are_those_of_the_mpc(build, asked):
+    policy = on_a_line(kind=build.AskedCost if asked else None)
     policy.act([0.2, -0.31], [1.0])
     decision = policy.decision
     assert decision.standing == pytest.approx(5 * 0.8**2)  # four stages and the last

@@ -13,8 +13,8 @@ from difflcs import Status, available_backends
 from difflcs.errors import DTypeError, InvalidInputError, SolveWarning
 from difflcs.mpc import MPCProblem, Primal
 from difflcs.mpc.backends import RelaxedBackend, get_backend
-from tests.conformance.test_backends import Problem, badly_scaled, contact, make
-from tests.conformance.test_backends import solve as solve_problem
+from tests.conformance.problems import Problem, badly_scaled, contact, make
+from tests.conformance.problems import solve as solve_problem
 
 pytestmark = pytest.mark.skipif(
     bool(RelaxedBackend.missing()), reason="cvxpy and cvxpylayers are not installed: pip install 'difflcs[relaxed]'"

@@ -122,6 +122,15 @@ def test_the_mpc_is_the_tasks():
     assert policy(torch.zeros(4, 2).double(), torch.ones(4, 1).double()).action.shape == (4, 1)
 
 
+def test_the_cost_of_the_mpc_may_be_asked_for(build):
+    task = make_task(make_cost=lambda: build.AskedCost(TOY.make_cost()))
+    assert (task.n_x, task.n_u, task.n_goal) == (2, 1, 1)
+    x, goal, lcs = torch.rand(4, 2).double(), torch.ones(4, 1).double(), LCSModel(2, 1, 1, init_scale=0.1)
+    own, asked = (each.make_policy(lcs)(x, goal) for each in (TOY, task))
+    torch.testing.assert_close(own.u, asked.u)
+    torch.testing.assert_close(own.objective, asked.objective)
+
+
 def test_what_a_picture_says():
     assert TOY.say({"position_error": 0.12345, "other": 1}) == "position error 0.123 m"
     assert TOY.say({}) == ""

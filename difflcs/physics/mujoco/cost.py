@@ -20,6 +20,7 @@ from difflcs._fields import TensorFields
 from difflcs.cost import QuadraticCost
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
 from difflcs.physics.mujoco.lcs import MujocoLCS
+from difflcs.physics.mujoco.state import cross
 
 __all__ = ["Distance", "Effort", "MujocoCost", "Orientation", "Position", "Posture", "Velocity"]
 
@@ -125,6 +126,7 @@ class Effort:
 
 
 Term = Position | Orientation | Distance | Posture | Velocity | Effort
+_NO_ROTATION = np.array([1.0, 0.0, 0.0, 0.0])
 _ROUNDING = 1e-13  # of the largest curvature, added to all, as AᵀWA is positive semi-definite up to rounding
 
 
@@ -165,25 +167,48 @@ class MujocoCost(TensorFields):
         if not isinstance(module, MujocoLCS):
             raise DTypeError(f"module: expected a MujocoLCS, got {describe(module)}; pass the one of the system")
         self.n_x, self.n_u = module.n_x, module.n_u
-        self._scene = scene = _Scene(module)
-        rows = [scene.bind(f"terms[{k}] {type(term).__name__}", term) for k, term in enumerate(terms)]
+        self._scene = _Scene(module)
+        rows = [self._scene.bind(f"terms[{k}] {type(term).__name__}", term) for k, term in enumerate(terms)]
         order = sorted(range(len(rows)), key=lambda k: rows[k].kind)
-        goals, asked, start = [], {}, 0
-        for k in order:
-            row, term = rows[k], terms[k]
-            for name in ("weight", "weight_final"):
-                if (weight := getattr(term, name, None)) is not None:
-                    self._register(f"{name}_{k}", _weight(f"{row.about}: {name}", weight, row.size))
-            if row.goal is None:
-                asked[k] = range(start, start + row.n_goal)
-            goals.append(np.zeros(row.n_goal) if row.goal is None else _goal(row))
-            start += row.n_goal
-        self._parts = [(k, rows[k].size) for k in order if rows[k].kind != _EFFORT]
-        self._efforts = [k for k in order if rows[k].kind == _EFFORT]
-        self._reach = torch.tensor([row.reach for row in rows if row.kind == _TURN], dtype=torch.float64)
-        self._goals = torch.from_numpy(np.concatenate([np.zeros(0), *goals]))
-        self._asked = torch.tensor([i for k in sorted(asked) for i in asked[k]], dtype=torch.long)
-        self.n_goal = len(self._asked)
+        self._keep_weights(rows, terms, order)
+        self._keep_goals(rows, order)
+
+    def _keep_weights(self, rows: Sequence[_Row], terms: Sequence[Term], order: Sequence[int]) -> None:
+        """Register weights: numbers together, and tensors by themselves, as they may be learned."""
+        given = {
+            (name, k): _weight(f"{row.about}: {name}", getattr(term, name), row.size)
+            for k, (row, term) in enumerate(zip(rows, terms, strict=True))
+            for name in ("weight", "weight_final")
+            if getattr(term, name, None) is not None
+        }
+        tensors = {key: weight for key, weight in given.items() if isinstance(weight, Tensor)}
+        plain = {key: weight for key, weight in given.items() if key not in tensors}
+        self._register("weights", torch.from_numpy(np.concatenate([[], *(v.reshape(-1) for v in plain.values())])))
+        for (name, k), weight in tensors.items():
+            self._register(f"{name}_{k}", weight)
+        self._weights = ["weights", *(f"{name}_{k}" for name, k in tensors)]
+        found, start = {}, 0  # where each is among the numbers of all
+        for key, weight in (plain | tensors).items():
+            end = start + int(np.prod(weight.shape))
+            found[key], start = np.broadcast_to(np.arange(start, end), (rows[key[1]].size,)), end
+        squares = [k for k in order if rows[k].kind != _EFFORT]
+        stages = [found["weight", k] for k in squares]
+        final = [found.get(("weight_final", k), stage) for k, stage in zip(squares, stages, strict=True)]
+        self._of_rows = np.stack([np.concatenate([[], *part]) for part in (stages, final)]).astype(np.intp)
+        efforts = [found["weight", k] for k in order if k not in squares]
+        self._of_actions = np.reshape(efforts, (-1, self.n_u)).astype(np.intp)
+
+    def _keep_goals(self, rows: Sequence[_Row], order: Sequence[int]) -> None:
+        """Keep goals in the order of the rows, and which of them are those of a call, in the order of the terms."""
+        self._reach = np.array([[row.reach] for row in rows if row.kind == _TURN])
+        self._goals = np.concatenate([[], *(_goal(rows[k]) for k in order)])
+        starts = np.cumsum([0, *(rows[k].n_goal for k in order)])
+        asked = [starts[order.index(k)] + np.arange(row.n_goal) for k, row in enumerate(rows) if row.goal is None]
+        asked = np.concatenate([[], *asked]).astype(np.intp)
+        self.n_goal = len(asked)
+        self._asked = np.isin(np.arange(len(self._goals)), asked)
+        self._of_call = np.zeros(len(self._goals), np.intp)
+        self._of_call[asked] = np.arange(self.n_goal)
 
     @property
     def constant(self) -> bool:
@@ -196,85 +221,86 @@ class MujocoCost(TensorFields):
         Raises:
             InvalidInputError and its kinds: states or goals of another size.
         """
-        value, jacobian, turns = self._scene.read(x)
-        batch, here = x.shape[:-1], x.detach().to("cpu", torch.float64)
-        A = torch.from_numpy(jacobian).reshape(*batch, *jacobian.shape[1:])
-        target = self._target(goal, torch.from_numpy(turns).reshape(*batch, *turns.shape[1:]))
-        left = torch.from_numpy(value).reshape(*batch, -1) - (A @ here.unsqueeze(-1)).squeeze(-1) - target
-        weight, effort = self._weights()
-        weighted = 2 * weight.unsqueeze(-1) * A.unsqueeze(-3)  # (..., 2, rows, n_x) of stages and the final state
-        Q = A.unsqueeze(-3).mT @ weighted
-        largest = Q.detach().diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None]
-        Q = Q + _ROUNDING * largest * torch.eye(self.n_x, dtype=torch.float64)
-        q = (left[..., None, None, :] @ weighted).squeeze(-2)
-        constant = (weight * left.unsqueeze(-2) ** 2).sum(-1)
-        fields = {"Q": Q[..., 0, :, :], "R": 2 * torch.diag(effort), "Q_final": Q[..., 1, :, :]}
-        fields |= {"q": q[..., 0, :], "q_final": q[..., 1, :]}
+        given = [*self._held(self._weights).values(), *self._check_goal(goal)]
+        given = [value.to("cpu", torch.float64) for value in given]
+        learns = torch.is_grad_enabled() and any(value.requires_grad for value in given)
+        of: Any = torch if learns else np  # the formulas below are those of both; NumPy takes a third of the time
+        numbers = given if learns else [value.detach().numpy() for value in given]
+        flat = of.concatenate([weight.reshape(-1) for weight in numbers[: len(self._weights)]])
+        A, offset, turns = map(of.asarray, self._scene.read(x))
+        left = offset - self._wanted(of, numbers[len(self._weights) :], turns)
+        weight = flat[self._of_rows]
+        weighted = 2 * weight[..., None] * A[..., None, :, :]  # (..., 2, rows, n_x), of stages and the final state
+        Q = A[..., None, :, :].swapaxes(-1, -2) @ weighted
+        q = (left[..., None, None, :] @ weighted)[..., 0, :]
+        constant = (weight * left[..., None, :] ** 2).sum(-1)
+        Q = Q + (_ROUNDING * abs(Q).max()) * of.eye(self.n_x)
+        fields = {"Q": Q[..., 0, :, :], "R": 2 * of.diag(flat[self._of_actions].sum(0)), "Q_final": Q[..., 1, :, :]}
+        fields |= {"q": q[..., 0, :], "r": of.zeros(self.n_u), "q_final": q[..., 1, :]}
         fields |= {"constant": constant[..., 1], "constant_stage": constant[..., 0]}
-        if x.dtype != torch.float64 or not x.is_cpu:
-            fields = {name: tensor.to(x.device, x.dtype) for name, tensor in fields.items()}
-        return QuadraticCost(**fields, check=False)
+        same = x.dtype is torch.float64 and x.is_cpu
+        tensors = {name: torch.as_tensor(value) for name, value in fields.items()}
+        return QuadraticCost.of_checked(tensors if same else {k: v.to(x.device, x.dtype) for k, v in tensors.items()})
 
-    def _target(self, goal: Tensor | None, turns: Tensor) -> Tensor:
-        """What is wanted of all rows (..., rows), with orientations `turns` (..., n, 4)."""
-        goals, asked = self._goals, self.n_goal
-        if (goal is not None) != bool(asked):
+    def _check_goal(self, goal: Tensor | None) -> list[Tensor]:
+        """The goal of a call, if there is to be one."""
+        if not self.n_goal and goal is not None:
             raise ShapeError(
-                f"goal: expected (..., n_goal={asked}) for the terms without a goal of their own, got none; call "
-                f"mpc(x0, goal)"
-                if asked
-                else f"goal: expected none, as all terms have one of their own, got {describe(goal)}; leave out the "
-                f"goal of a term to give it with each call"
+                f"goal: expected none, as all terms have goals of their own, got {describe(goal)}; leave out the goal "
+                f"of a term to give it with each call"
             )
-        if goal is not None:
-            goal = check_tensor("goal", goal, [("n_goal", asked)]).to("cpu", torch.float64)
-            goals = goals.expand(*goal.shape[:-1], -1).index_copy(-1, self._asked, goal)
-        if not len(self._reach):
+        if self.n_goal and goal is None:
+            raise ShapeError(
+                f"goal: expected (..., n_goal={self.n_goal}) for terms without a goal of their own, got none; call "
+                f"mpc(x0, goal)"
+            )
+        return [] if goal is None else [check_tensor("goal", goal, [("n_goal", self.n_goal)])]
+
+    def _wanted(self, of: Any, goal: list[Any], turns: Any) -> Any:
+        """What all rows (..., rows) are to be, where things have the orientations `turns` (..., n, 4)."""
+        goals = of.asarray(self._goals)
+        if goal:
+            goals = of.where(of.asarray(self._asked), goal[0][..., self._of_call], goals)
+        n = len(self._reach)
+        if not n:
             return goals
-        points, n = 3 * self._scene.n_points, len(self._reach)
-        wanted = goals[..., points : points + 4 * n].reshape(*goals.shape[:-1], n, 4)
-        left = _rotation_between(turns, wanted, self._reach).flatten(-2)
-        others = (goals[..., :points], goals[..., points + 4 * n :])
-        others = [part.expand(*left.shape[:-1], -1) for part in others]
-        return torch.cat([others[0], left, others[1]], -1)
-
-    def _weights(self) -> tuple[Tensor, Tensor]:
-        """Weights (2, rows) of the squares, at stages and at the final state, and those of the actions (n_u,)."""
-        held = self._held([*self._buffers, *self._parameters])
-        held = {name: weight.to("cpu", torch.float64) for name, weight in held.items()}
-        effort = sum((held[f"weight_{k}"] for k in self._efforts), torch.zeros(self.n_u, dtype=torch.float64))
-        stages = [held[f"weight_{k}"].expand(size) for k, size in self._parts]
-        final = [held.get(f"weight_final_{k}", held[f"weight_{k}"]).expand(size) for k, size in self._parts]
-        none = effort.new_zeros(0)
-        return torch.stack([torch.cat([none, *stages]), torch.cat([none, *final])]), effort
+        first, last = 3 * self._scene.n_points, 3 * self._scene.n_points + 4 * n
+        wanted = goals[..., first:last].reshape(*goals.shape[:-1], n, 4)
+        left = _rotation_between(of, turns, wanted, of.asarray(self._reach))
+        parts = [goals[..., :first], left.reshape(*left.shape[:-2], 3 * n), goals[..., last:]]
+        return of.concatenate([of.broadcast_to(part, (*left.shape[:-2], part.shape[-1])) for part in parts], -1)
 
 
-def _rotation_between(here: Tensor, goal: Tensor, reach: Tensor) -> Tensor:
-    """Compute log(here⁻¹ goal) (..., n, 3) of quaternions (..., n, 4), with angles cut at `reach` (n,)."""
-    size = torch.linalg.vector_norm(goal, dim=-1, keepdim=True)
-    none = size < 1e-15  # no rotation, as MuJoCo reads it
-    goal = torch.where(none, goal.new_tensor([1.0, 0, 0, 0]), goal / torch.where(none, 1.0, size))
+def _rotation_between(of: Any, here: Any, goal: Any, reach: Any) -> Any:
+    """Compute log(here⁻¹ goal) (..., n, 3) of quaternions (..., n, 4), with angles cut at `reach` (n, 1)."""
+    square = (goal * goal).sum(-1)[..., None]
+    none = square < 1e-30  # no rotation, as MuJoCo reads it
+    goal = of.where(none, of.asarray(_NO_ROTATION), goal / of.sqrt(of.where(none, 1.0, square)))
     w, v, goal_w, goal_v = here[..., :1], here[..., 1:], goal[..., :1], goal[..., 1:]
-    cosine = w * goal_w + (v * goal_v).sum(-1, keepdim=True)
-    turn = w * goal_v - goal_w * v - torch.linalg.cross(*torch.broadcast_tensors(v, goal_v))
-    sign = torch.where(cosine < 0, -1.0, 1.0)
-    sine = torch.linalg.vector_norm(turn, dim=-1, keepdim=True)
-    angle, tiny = 2 * torch.atan2(sine, sign * cosine), sine < 1e-12
-    cut = torch.minimum(angle, reach.unsqueeze(-1))
-    return sign * turn * torch.where(tiny, 2.0, cut / torch.where(tiny, 1.0, sine))
+    cosine = w * goal_w + (v * goal_v).sum(-1)[..., None]
+    sign = of.where(cosine < 0, -1.0, 1.0)
+    turn = sign * (w * goal_v - goal_w * v - cross(v, goal_v))
+    square = (turn * turn).sum(-1)[..., None]
+    tiny = square < 1e-24
+    sine = of.sqrt(of.where(tiny, 1.0, square))
+    return turn * of.where(tiny, 2.0, of.minimum(2 * of.arctan2(sine, sign * cosine), reach) / sine)
 
 
-def _weight(name: str, value: Weight, size: int) -> Tensor:
-    weight = value if isinstance(value, Tensor) else torch.from_numpy(np.array(value, dtype=np.float64))
-    check_tensor(name, weight)
+def _weight(name: str, value: Weight, size: int) -> Any:
+    """A weight: a tensor as it is, anything else as an array."""
+    weight: Any = value if isinstance(value, Tensor) else np.array(value, dtype=np.float64)
+    check_tensor(name, torch.as_tensor(weight))
     if weight.shape not in ((), (size,)):
         raise ShapeError(f"{name}: expected one number or {size} of them, got {describe(weight)}; see the term")
-    if bool((weight.detach() < 0).any()):
-        raise InvalidInputError(f"{name}: expected at least 0, got {float(weight.detach().min()):g}; change its sign")
+    if bool((weight < 0).any()):
+        raise InvalidInputError(f"{name}: expected at least 0, got {float(weight.min()):g}; change its sign")
     return weight
 
 
 def _goal(row: _Row) -> Any:
+    """The goal of a term's own, zeros where it has none."""
+    if row.goal is None:
+        return np.zeros(row.n_goal)
     goal = np.array(row.goal, dtype=np.float64)
     if goal.shape != (row.n_goal,):
         raise ShapeError(f"{row.about}: expected a goal of shape ({row.n_goal},), got {goal.shape}; see the term")
@@ -366,7 +392,7 @@ class _Scene:
         known = [name for name in dict.fromkeys(names) if name]
         raise InvalidInputError(
             f"{about}: expected a {' or '.join(kinds)}, one of {', '.join(known)}, got {describe(name)}"
-            f"{did_you_mean(name, known)}"
+            f"{did_you_mean(name, known)}; name one of them"
         )
 
     def _numbers(self, kind: str) -> range:
@@ -387,21 +413,23 @@ class _Scene:
                 kinds = "joints" if turning else "slides and hinges"
                 raise InvalidInputError(
                     f"{about}: expected {kinds}, among {', '.join(known)}, got {describe(name)}"
-                    f"{did_you_mean(name, known)}"
+                    f"{did_you_mean(name, known)}; name one of them"
                 )
         return [dof for name in names for dof in known[name]]
 
     def read(self, x: Tensor) -> tuple[Any, Any, Any]:
-        """Read all rows at states x (..., n_x), of which there are n.
+        """Read all rows at states x (..., n_x).
 
         Returns:
-            Values (n, rows), zero for orientations; their derivatives (n, rows, n_x); orientations (n, turns, 4).
+            A (..., rows, n_x) and b (..., rows), so that A x + b is what the terms measure, of rotations the change;
+            and orientations (..., turns, 4).
         """
         state, model, data, source = self._module.state, self._model, self._data, self._module._data
         qpos = state.to_mujoco(x)[0].reshape(-1, state.nq)
-        flat, nv, n = x.detach().double().cpu().reshape(len(qpos), -1).numpy(), state.nv, len(qpos)
-        count = len(self.frames)
+        flat, nv, n, count = x.detach().double().cpu().numpy(), state.nv, len(qpos), len(self.frames)
+        batch, flat = flat.shape[:-1], flat.reshape(n, -1)
         place, turn, moves = np.empty((n, count, 3)), np.empty((n, count, 9)), np.empty((n, count, 2, 3, nv))
+        turned = np.empty((n, len(self._turns), 4))
         data.mocap_pos[:], data.mocap_quat[:] = source.mocap_pos, source.mocap_quat
         for i in range(n if count else 0):
             data.qpos[:] = qpos[i]
@@ -411,23 +439,21 @@ class _Scene:
                 _, places, turns, differentiate = _FRAMES[kind]
                 place[i, k], turn[i, k] = getattr(data, places)[index], getattr(data, turns)[index]
                 differentiate(model, data, moves[i, k, 0], moves[i, k, 1], index)
+            for j, k in enumerate(self._turns):
+                mujoco.mju_mat2Quat(turned[i, j], turn[i, k])
         points, rotations = 3 * self.n_points, 3 * len(self._turns)
         value = np.zeros((n, points + rotations + len(self._columns)))
-        jacobian = np.zeros((*value.shape, flat.shape[-1]))
+        A = np.zeros((*value.shape, flat.shape[-1]))
         for j, (first, second) in enumerate(self._points):
             rows = slice(3 * j, 3 * j + 3)
-            value[:, rows], jacobian[:, rows, :nv] = place[:, first], moves[:, first, 0]
+            value[:, rows], A[:, rows, :nv] = place[:, first], moves[:, first, 0]
             if second is not None:
                 value[:, rows] -= place[:, second]
-                jacobian[:, rows, :nv] -= moves[:, second, 0]
-        turned = turn.reshape(n, count, 3, 3)[:, self._turns]
-        own = turned.swapaxes(-1, -2) @ moves[:, self._turns, 1]
-        jacobian[:, points : points + rotations, :nv] = own.reshape(n, rotations, nv)
+                A[:, rows, :nv] -= moves[:, second, 0]
+        own = turn.reshape(n, count, 3, 3)[:, self._turns].swapaxes(-1, -2) @ moves[:, self._turns, 1]
+        A[:, points : points + rotations, :nv] = own.reshape(n, rotations, nv)
         if count and (tangent := state.tangent(flat[:, :nv])) is not None:
-            jacobian[:, :, :nv] = jacobian[:, :, :nv] @ tangent
-        value[:, points + rotations :] = flat[:, self._columns]
-        jacobian[:, range(points + rotations, value.shape[1]), self._columns] = 1.0
-        quaternions = np.empty((n, len(self._turns), 4))
-        for i, j in np.ndindex(quaternions.shape[:2]):
-            mujoco.mju_mat2Quat(quaternions[i, j], turned[i, j].ravel())
-        return value, jacobian, quaternions
+            A[:, :, :nv] = A[:, :, :nv] @ tangent
+        offset = value - (A @ flat[..., None])[..., 0]
+        A[:, range(points + rotations, value.shape[1]), self._columns] = 1.0
+        return A.reshape(*batch, *A.shape[1:]), offset.reshape(*batch, -1), turned.reshape(*batch, *turned.shape[1:])

@@ -11,27 +11,27 @@ from numpy.typing import NDArray
 
 from difflcs._checks import check_number, check_positive_int, describe
 from difflcs.errors import InvalidInputError
-from difflcs.physics.mujoco.contacts import MujocoContacts, find_geoms
+from difflcs.physics.mujoco.contacts import Budget, find_geoms
 from difflcs.records import LCSParams
 
 __all__ = ["ContactGroup", "ContactSelection"]
 
 Array = NDArray[np.float64]
-_FOUND = 48
 
 
 class ContactGroup(NamedTuple):
     """So many contacts of these geoms, the nearest.
 
     Attributes:
-        of: geoms by name or number, or bodies with all their geoms: contacts in which one of them takes part. None:
-            all contacts that belong to no group before.
+        of: geoms by name or number, or bodies with all their geoms: contacts in which one of them takes part; a pair of
+            them, ("cup", "palm"): their contacts with each other; or a list of such. None: all contacts that belong to
+            no group before.
         contacts: their number.
         friction: False for contacts without friction, which take one row of the system each.
         distance: those farther away are left out [m]; None: that of the module.
     """
 
-    of: str | int | Sequence[str | int] | None
+    of: str | int | Sequence[str | int | tuple[str | int, str | int]] | None
     contacts: int
     friction: bool = True
     distance: float | None = None
@@ -47,7 +47,7 @@ class ContactSelection:
 
     Attributes:
         n_contacts: number of contacts of all groups.
-        n_found: number of contacts to select from, the nearest of all.
+        budgets: the same for a `ContactFinder`.
         rough: (n_contacts,) True for those with friction.
         group: (ngeom, ngeom) number of the group of each pair; −1 for none.
     """
@@ -59,20 +59,24 @@ class ContactSelection:
             )
         self.group = np.full((model.ngeom, model.ngeom), -1)
         for i, group in enumerate(groups):
-            names = [group.of] if isinstance(group.of, str | int) else group.of
-            geoms = range(model.ngeom) if names is None else [g for name in names for g in find_geoms(model, name)]
-            mine = np.zeros((model.ngeom, model.ngeom), dtype=bool)
-            mine[list(geoms)] = True
-            self.group[(mine | mine.T) & (self.group < 0)] = i
-        self._counts = [check_positive_int("contacts of a group", group.contacts) for group in groups]
-        self._distances = [
-            distance if g.distance is None else check_number("distance of a group", g.distance, strict=True)
-            for g in groups
+            for one in [group.of] if group.of is None or isinstance(group.of, str | int | tuple) else group.of:
+                mine = np.zeros((model.ngeom, model.ngeom), dtype=bool)
+                mine[np.ix_(*(_geoms(model, of) for of in (one if isinstance(one, tuple) else (one, None))))] = True
+                self.group[(mine | mine.T) & (self.group < 0)] = i
+        self.budgets = [
+            Budget(
+                self.group == i,
+                check_positive_int("contacts of a group", group.contacts),
+                distance
+                if group.distance is None
+                else check_number("distance of a group", group.distance, strict=True),
+                bool(group.friction),
+            )
+            for i, group in enumerate(groups)
         ]
-        self._far = distance
-        self.n_contacts = sum(self._counts)
-        self.n_found = max(_FOUND, 2 * self.n_contacts)
-        self.rough = np.repeat([bool(group.friction) for group in groups], self._counts)
+        counts = [budget.contacts for budget in self.budgets]
+        self.n_contacts = sum(counts)
+        self.rough = np.repeat([budget.friction for budget in self.budgets], counts)
 
     def main(self, pairs: Sequence[NDArray[np.intp]]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the pairs, of two arrays of geoms, that belong to the first group."""
@@ -95,23 +99,6 @@ class ContactSelection:
             system.A, system.B, C, system.d, system.D[..., rows, :], system.E[..., rows, :], F, system.c[..., rows]
         )
 
-    def select(self, contacts: MujocoContacts) -> MujocoContacts:
-        """Select the contacts of each group, group after group."""
-        group = np.where(contacts.normal.any(-1), self.group[contacts.geom[..., 0], contacts.geom[..., 1]], -1)
-        gaps = (
-            np.where((group == i) & (contacts.gap <= d), contacts.gap, np.inf) for i, d in enumerate(self._distances)
-        )
-        chosen, found = [], []
-        for gap, count in zip(gaps, self._counts, strict=True):
-            nearest = np.argsort(gap, axis=-1, kind="stable")[:, :count]
-            nearest = np.pad(nearest, ((0, 0), (0, count - nearest.shape[1])))
-            kept = np.isfinite(np.take_along_axis(gap, nearest, -1))
-            kept[:, gap.shape[1] :] = False
-            chosen.append(nearest)
-            found.append(kept)
-        index, mask = np.concatenate(chosen, -1), np.concatenate(found, -1)
-        state = np.arange(len(index))[:, None]
-        gap, *rest = (value[state, index] for value in contacts)
-        rest = (np.where(mask.reshape(*mask.shape, *[1] * (value.ndim - 2)), value, 0) for value in rest)
-        selected = MujocoContacts(np.where(mask, gap, self._far), *rest)
-        return selected._replace(friction=selected.friction * self.rough)
+
+def _geoms(model: Any, of: str | int | None) -> Sequence[int]:
+    return range(model.ngeom) if of is None else find_geoms(model, of)

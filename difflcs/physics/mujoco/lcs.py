@@ -15,8 +15,8 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_choice, check_number, check_positive_int, check_tensor, describe
-from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
+from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor, describe
+from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError
 from difflcs.physics.complementarity import (
     Bounded,
     Cone,
@@ -26,15 +26,17 @@ from difflcs.physics.complementarity import (
     contact_lcs,
     count_forces,
 )
+from difflcs.physics.mujoco.actuators import DYNAMICS, Actuators, disabled_actuators
 from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, Pairs
 from difflcs.physics.mujoco.groups import ContactGroup, ContactSelection
-from difflcs.physics.mujoco.limits import RowBuffer, RowFinder, ScaledRows, scale
-from difflcs.physics.mujoco.motion import Actuators, Dynamic, QuasiStatic, disabled_actuators
+from difflcs.physics.mujoco.library import Places
+from difflcs.physics.mujoco.limits import RowFinder, ScaledRows, scale
+from difflcs.physics.mujoco.motion import Dynamic, QuasiStatic
 from difflcs.physics.mujoco.native import TAKEN, native
 from difflcs.physics.mujoco.nominal import Recovery, evaluate_nominal
 from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
 from difflcs.physics.mujoco.state import MujocoState
-from difflcs.records import LCSParams
+from difflcs.records import LCSParams, LCSSequence, sequence_along
 
 __all__ = ["Motion", "MujocoLCS", "lcs_from_mujoco"]
 
@@ -57,11 +59,13 @@ class MujocoLCS:
     What a joint cannot move falls out of the Jacobians. Where all joints move in one plane, friction has one tangent,
     in this plane, and contacts across it, such as those of a floor below, are left out.
 
-    Not in the system: limits of joints, tendons and actuators (bound the actions and states of the MPC), margins of
-    geoms, torsional and rolling friction. Refused: active equality constraints, activation dynamics, adhesion, delay,
-    sleep, height fields and signed distance fields that may touch something, friction that override sets or that is not
-    the same in all directions; in quasi-static motion disabled actuators, and in dynamic motion dry friction in joints
-    and tendons. The matrices carry no gradient of the state.
+    Limits of actuators are bounds of the actions, see `action_bounds`, and activation is part of the state.
+
+    Not in the system: limits of joints and tendons (bound the states of the MPC), margins of geoms, torsional and
+    rolling friction. Refused: active equality constraints, adhesion, delay, sleep, height fields and signed distance
+    fields that may touch something, friction that override sets or that is not the same in all directions; in
+    quasi-static motion disabled actuators, and in dynamic motion dry friction in joints and tendons. The matrices carry
+    no gradient of the state.
 
     An object keeps one private copy of the model and its data, so use it from one thread at a time.
 
@@ -136,7 +140,7 @@ class MujocoLCS:
             _take(self._data, data)
         with native(model, self._data, "in the state of data"):
             mujoco.mj_fwdPosition(model, self._data)
-        self._rows = RowFinder(model, limits, motion != "quasi-static")
+        self._rows = RowFinder(model, self._data, limits, motion != "quasi-static")
         self.state = MujocoState(model, self._data.qpos, velocities=motion == "dynamic")
         self._actuators, self._relative = Actuators(model), relative
         self._quasi_static = motion == "quasi-static"
@@ -146,18 +150,19 @@ class MujocoLCS:
         else:
             kind = Dynamic if motion == "dynamic" else QuasiDynamic
             self._motion = kind(model, self._actuators, self.seconds, relative)
-        nominal = self._data.ctrl if ctrl is None else self._controls(torch.as_tensor(ctrl), torch.Size())
+        nominal = self._data.ctrl if ctrl is None else self._actuators.nominal(torch.as_tensor(ctrl), torch.Size())
         self._ctrl = np.where(self._actuators.holds & (ctrl is None), np.nan, nominal)
         length = _typical_radius(model) if length is None else check_number("length", length, strict=True)
         distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
         self.length, self._recovery = length, Recovery(model, length)
-        self._selection = None
-        if contacts is not None and not isinstance(contacts, int):
+        if isinstance(contacts, Sequence):
             self._selection = ContactSelection(model, contacts, distance)
-            contacts = self._selection.n_found
-        elif contacts is not None:
-            check_positive_int("contacts", contacts)
-        self._finder = ContactFinder(model, self._data, pairs, distance, length, contacts, friction)
+            budgets = self._selection.budgets
+        else:
+            self._selection = None
+            budgets = None if contacts is None else check_positive_int("contacts", contacts)
+        self._places = Places(model, self._data)
+        self._finder = ContactFinder(model, self._data, self._places, pairs, distance, length, budgets, friction)
         model.opt.disableflags |= sum(
             int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("EQUALITY", "FRICTIONLOSS", "LIMIT")
         )
@@ -166,7 +171,7 @@ class MujocoLCS:
 
     @property
     def n_x(self) -> int:
-        """Number of states: nv, or 2 nv with velocities."""
+        """Number of states: nv, or 2 nv + na with velocities."""
         return self.state.n_x
 
     @property
@@ -177,7 +182,7 @@ class MujocoLCS:
     @property
     def n_contacts(self) -> int:
         """Number of contacts of every state."""
-        return self._finder.n_contacts if self._selection is None else self._selection.n_contacts
+        return self._finder.n_contacts
 
     @property
     def n_lam(self) -> int:
@@ -191,15 +196,17 @@ class MujocoLCS:
 
         So each plan of a closed loop begins with rotations of zero, however far things have turned, and what uses
         `state`, such as a `MujocoCost`, counts from there as well. States of before are not those of now. For a batch
-        call `state.follow` and `state.to_state` with `qpos` (..., nq).
+        call `state.follow` and `state.to_state` with `qpos` (..., nq). What is not in the state is taken from the data
+        as well: where mocap has moved bodies, and the forces `qfrc_applied` and `xfrc_applied`.
 
         Raises:
             DTypeError, ShapeError, NonFiniteError: no such data.
         """
         if not isinstance(data, mujoco.MjData):
             raise DTypeError(f"data: expected a mujoco.MjData, got {describe(data)}; for arrays use state.follow")
+        _take(self._data, data)
         self.state.follow(data.qpos)
-        return self.state.to_state(data.qpos, data.qvel)
+        return self.state.to_state(data.qpos, data.qvel, data.act)
 
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
         """The system at states x (..., n_x).
@@ -219,17 +226,17 @@ class MujocoLCS:
         contacts, rest, effect = read.dof_contacts, None, None
         if isinstance(self._motion, Dynamic):
             step, opens = self._motion.finish(read.moved, read.x), self.cone == "anitescu"
-            middle = read.moved.middle[:, : self.state.nv], read.moved.length
-            found = self._rows.finish(read.rows, step.place, step.response, middle)
+            found = self._rows.find(read.qpos, step.place, step.response, read.moved.middle[:, : self.state.nv])
             nominal = evaluate_nominal(step, contacts, found, self._recovery, self._give, self.compliance, opens)
             contacts, rows = nominal.contacts, nominal.rows
             effect = step.effect(read.tangent, rows.normal, rows.impulse)
-            rest = read.batched(self._convert_forces(nominal.forces, nominal.row_forces))
+            forces = _convert_forces(nominal.forces, self._finder.n_tangents, self.cone)
+            rest = read.batched(np.concatenate([forces, nominal.row_forces, np.zeros_like(rows.bound)], -1))
             free = step.free(read.tangent, nominal.carried)
         else:
             free = self._motion.finish(read.moved, read.x, read.tangent)
             response = np.broadcast_to(read.to_dofs(free.response.numpy()), (len(read.x), *free.response.shape[-2:]))
-            found = self._rows.finish(read.rows, np.zeros_like(read.x), response)
+            found = self._rows.find(read.qpos, np.zeros_like(read.x), response)
             rows = scale(found, found.gap, 1.0, response, self._give, 1.0)
         ranks = zip(free, (2, 2, 1, 2), strict=True)
         system = contact_lcs(
@@ -248,13 +255,13 @@ class MujocoLCS:
             system = self._selection.reduce(system)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
 
-    def _convert_forces(self, forces: Any, of_rows: Any) -> Any:
-        """Convert forces (n, n_contacts, n_rays) along Anitescu's rays, and of rows, to (n, n_lam) of the system."""
-        each = count_forces(1, self._finder.n_tangents, self.cone)
-        if each != forces.shape[-1]:  # Stewart and Trinkle: normal, tangential, and the distance
-            forces = np.concatenate([forces.sum(-1, keepdims=True), np.zeros((*forces.shape[:2], each - 1))], -1)
-        slid = np.zeros((len(forces), self._rows.n_friction))
-        return np.concatenate([forces.reshape(len(forces), -1), of_rows, slid], -1)
+    def sequence(self, plan: Any, x: Tensor | None = None) -> LCSSequence:
+        """Linearise along the actions of a plan, from its state or from x (..., n_x), see `difflcs.sequence_along`."""
+        return sequence_along(self, plan, x)
+
+    def context_along(self, x: Tensor, u: Tensor, context: Tensor | None = None) -> Tensor | None:
+        """Return the nominal controls (..., nu) of actions u (..., n_u) at states x (..., n_x) of a plan."""
+        return context if self._quasi_static else self.control(x, u)
 
     def contacts(self, x: Tensor) -> Contacts:
         """Compute the gaps and their derivatives at states x (..., n_x).
@@ -272,71 +279,67 @@ class MujocoLCS:
         """
         check_tensor("x", x, [("n_x", self.n_x)])
         check_tensor("u", u, [("n_u", self.n_u)])
-        servo, dof = torch.from_numpy(self._actuators.servo), torch.from_numpy(self._actuators.dof)
-        if self._quasi_static and not servo.all():
-            raise InvalidInputError(
-                "model: expected position actuators to follow a quasi-static plan, got others; track x + u by your own "
-                "controller"
-            )
-        gear = torch.from_numpy(self._actuators.gear).to(u)
-        # The length of an actuator on a joint is gear · q.
-        here = gear * x[..., dof.clamp_min(0)]
-        if self._quasi_static:
-            return here + gear * u - torch.from_numpy(self._actuators.offset).to(u)
-        return u + here * servo if self._relative else u
+        return self._actuators.control(x, u, self._relative, self._quasi_static)
 
-    def _controls(self, ctrl: Tensor, batch: torch.Size) -> Any:
-        """Return nominal controls (*batch, nu) as an array."""
-        check_tensor("ctrl", ctrl, [("n_u", self.n_u)])
-        if broadcast_batch([("x", batch), ("ctrl", ctrl.shape[:-1])]) != batch:
-            raise ShapeError(
-                f"ctrl: expected one nominal control for each of the states {tuple(batch)}, or one for all, got "
-                f"{tuple(ctrl.shape)}; leave out its batch dimensions, or give x the same"
-            )
-        return ctrl.detach().double().cpu().expand(*batch, self.n_u).numpy()
+    def action_bounds(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute the bounds (..., n_u) of the actions within which actuators do what the system says.
+
+        These are `ctrlrange`, and unless motion is quasi-static `forcerange`, and `actuatorfrcrange` of joints with one
+        actuator; the layer keeps within them. Infinite where nothing is limited.
+
+        Args:
+            x: (..., n_x) states.
+        """
+        check_tensor("x", x, [("n_x", self.n_x)])
+        numbers = x.detach().double().cpu().numpy()
+        if self._quasi_static:
+            bounds = self._actuators.places(numbers)
+        else:
+            speed = numbers[..., self.state.nv :] if self.state.velocities else np.zeros_like(numbers)
+            bounds = self._actuators.bounds(numbers, speed, self._yields, self._relative)
+        low, high = (torch.from_numpy(v).to(x) for v in bounds)
+        return low, high
 
     def _read(self, x: Tensor, context: Tensor | None = None) -> _States:
         qpos, qvel = self.state.to_mujoco(x)
-        batch, model, data = x.shape[:-1], self._model, self._data
+        batch, data = x.shape[:-1], self._data
         n = batch.numel()
         qpos, qvel = qpos.reshape(n, -1), qvel.reshape(n, -1)
-        ctrl = [self._ctrl] * n if context is None else self._controls(context, batch).reshape(n, -1)
-        contacts, moved, rows = self._finder.allocate(n), self._motion.allocate(n), self._rows.allocate(n)
+        flat = x.detach().double().cpu().reshape(n, self.n_x).numpy()
+        act = flat[:, self.n_x - self.state.na :] if self.state.na else np.broadcast_to(data.act, (n, len(data.act)))
+        ctrl = self._ctrl if context is None else self._actuators.nominal(context, batch).reshape(n, -1)
+        ctrl, found = np.broadcast_to(ctrl, (n, self.n_u)), self._finder.find(qpos)
+        moved = self._read_motion(np.concatenate([qpos, qvel, act], -1), ctrl)
+        tangent = self.state.tangent(flat[:, : self.state.nv])
+        return _States(batch, flat, qpos, tangent, found, moved)
+
+    def _read_motion(self, states: Any, ctrl: Any) -> Any:
+        """Read the motion at states (n, nq + nv + na) of MuJoCo, with nominal controls (n, nu)."""
+        model, data, n = self._model, self._data, len(states)
+        if isinstance(self._motion, Dynamic):
+            return self._motion.read(self._places, states, ctrl)
+        moved = self._motion.allocate(n)
         for i in range(n):
             with native(model, data, f"in state {i} of {n}"):
-                data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
+                data.qpos[:], data.qvel[:], data.act[:] = np.split(states[i], [model.nq, model.nq + model.nv])
                 mujoco.mj_fwdPosition(model, data)
-                self._finder.read(i, contacts)
-                self._rows.read(i, data, rows)
                 self._motion.read(i, data, moved, ctrl[i])
-        flat = x.detach().double().cpu().reshape(n, self.n_x).numpy()
-        tangent = self.state.tangent(flat[:, : self.state.nv])
-        found = self._finder.finish(contacts)
-        found = self._selection.select(found) if self._selection else found
-        return _States(batch, flat, tangent, found, rows, moved)
+        return moved
 
     def _typical_response(self) -> float:
         """Compute how far a unit of force moves two bodies apart that may touch, the median over their pairs."""
         model, data, nv = self._model, self._data, self.state.nv
-        moved = self._motion.allocate(1)
-        self._motion.read(0, data, moved, self._ctrl)
+        moved = self._read_motion(np.concatenate([data.qpos, data.qvel, data.act])[None], self._ctrl[None])
         x = np.zeros((1, self.n_x))
         if not isinstance(self._motion, Dynamic):
             response = self._motion.finish(moved, x, None).response.reshape(-1, nv, nv)[0].numpy()
+            self._yields = self._actuators.yields(response, 0.0)
         else:
-            response = self.seconds * self._motion.finish(moved, x).response[0]
-        jacobian, gives = np.empty((3, nv)), np.empty(model.ngeom)
-        for geom in range(model.ngeom):
-            mujoco.mj_jacGeom(model, data, jacobian, None, geom)
-            gives[geom] = np.trace(jacobian @ response @ jacobian.T) / (3 if self._finder.axis is None else 2)
-        first, second = self._finder.pairs if self._selection is None else self._selection.main(self._finder.pairs)
-        apart = (gives[first] + gives[second])[gives[first] + gives[second] > 0]
-        if len(first) and not len(apart):
-            raise InvalidInputError(
-                "model: expected something that contact forces can move, got nothing; what is pushed needs joints "
-                "without actuators, and a mobility above 0"
-            )
-        return float(np.median(apart)) if len(apart) else 1.0
+            impulse = self._motion.finish(moved, x).response[0]
+            response = self.seconds * impulse
+            self._yields = self._actuators.yields(self.seconds * response, response)
+        pairs = self._finder.pairs if self._selection is None else self._selection.main(self._finder.pairs)
+        return _median_apart(model, data, response, pairs, 3 if self._finder.axis is None else 2)
 
 
 class _States(NamedTuple):
@@ -345,17 +348,17 @@ class _States(NamedTuple):
     Attributes:
         batch: their batch dimensions.
         x: (n, n_x).
+        qpos: (n, nq).
         tangent: of their rotations, see `MujocoState.tangent`.
         dof_contacts: contacts.
-        rows: what says where limits are.
         moved: buffers of the motion.
     """
 
     batch: torch.Size
     x: Any
+    qpos: Any
     tangent: Any
     dof_contacts: MujocoContacts
-    rows: RowBuffer
     moved: Any
 
     def batched(self, value: Any) -> Tensor:
@@ -413,7 +416,15 @@ def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: A
     if data is None:
         raise DTypeError("data: expected a mujoco.MjData, got None; pass mujoco.MjData(model)")
     module = MujocoLCS(model, data, **options)
-    return module.params(module.state.to_state(data.qpos, data.qvel) if x is None else x)
+    return module.params(module.state.to_state(data.qpos, data.qvel, data.act) if x is None else x)
+
+
+def _convert_forces(forces: Any, n_tangents: int, cone: Cone) -> Any:
+    """Convert forces (n, n_contacts, n_rays) along Anitescu's rays to those (n, n_lam) of a cone."""
+    each = count_forces(1, n_tangents, cone)
+    if each != forces.shape[-1]:  # Stewart and Trinkle: normal, tangential, and the distance
+        forces = np.concatenate([forces.sum(-1, keepdims=True), np.zeros((*forces.shape[:2], each - 1))], -1)
+    return forces.reshape(len(forces), -1)
 
 
 def _check_model(model: Any, data: Any, motion: Motion) -> None:
@@ -423,21 +434,45 @@ def _check_model(model: Any, data: Any, motion: Motion) -> None:
         raise DTypeError(f"data: expected a mujoco.MjData, got {describe(data)}; pass mujoco.MjData(model)")
     if data is not None and len(data.qpos) != model.nq:
         raise InvalidInputError(f"data: expected nq={model.nq} of the model, got {len(data.qpos)}; pass MjData(model)")
+    dynamics, plugins = np.array(model.actuator_dyntype), np.array(model.actuator_plugin)
     refused = {
-        "joints": not model.nv,
+        "joints: nothing in it moves": not model.nv,
         "no equality constraints that are active": bool((model.eq_active0 if data is None else data.eq_active).any()),
-        "actuators without activation": bool(model.na),
-        "actuators without adhesion": bool((model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)).any()),
-        "one control for each actuator": getattr(model, "nactuator", model.nu) != model.nu,
-        "no flexible bodies": bool(model.nflex),
-        "no delay of actuators and sensors (delay, nsample)": bool(getattr(model, "nhistory", 0)),
-        'no <flag sleep="enable"/>': bool(model.opt.enableflags & _SLEEP),
+        "one control for each actuator, not those of <pid> and <orientation>": getattr(model, "nactuator", model.nu)
+        != model.nu,
+        "activation by an integrator, a filter, a muscle or a callback, not by <dcmotor>, <pid> or a plugin": bool(
+            (~np.isin(dynamics, DYNAMICS) & (model.actuator_actnum > 0) | (plugins >= 0)).any()
+        ),
+        "no <adhesion>, whose force depends on what is in contact": bool(
+            (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)).any()
+        ),
+        "rigid bodies, no <flex>": bool(model.nflex),
+        "no delay of actuators and sensors (delay, nsample), which would need their past as states": bool(
+            getattr(model, "nhistory", 0)
+        ),
+        'no <flag sleep="enable"/>, as what sleeps does not follow its forces': bool(model.opt.enableflags & _SLEEP),
         "actuators that are not disabled (actuatorgroupdisable, <flag actuation/>) in quasi-static motion, which moves "
         "what they drive": motion == "quasi-static" and bool(disabled_actuators(model).any()),
     }
     for wanted, present in refused.items():
         if present:
             raise InvalidInputError(f"model: expected {wanted}, got something else; change the model")
+
+
+def _median_apart(model: Any, data: Any, response: Any, pairs: Any, dimensions: int) -> float:
+    """Compute how far a unit of force moves two geoms of a pair apart, the median, for the response of the joints."""
+    jacobian, gives = np.empty((3, model.nv)), np.empty(model.ngeom)
+    for geom in range(model.ngeom):
+        mujoco.mj_jacGeom(model, data, jacobian, None, geom)
+        gives[geom] = np.trace(jacobian @ response @ jacobian.T) / dimensions
+    first, second = pairs
+    apart = (gives[first] + gives[second])[gives[first] + gives[second] > 0]
+    if len(first) and not len(apart):
+        raise InvalidInputError(
+            "model: expected something that contact forces can move, got nothing; what is pushed needs joints "
+            "without actuators, and a mobility above 0"
+        )
+    return float(np.median(apart)) if len(apart) else 1.0
 
 
 def _take(into: Any, data: Any) -> None:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from difflcs.errors import ContactWarning
-from difflcs.physics.mujoco.motion import tendon_jacobian
+from difflcs.physics.mujoco.native import native
 
 Array = NDArray[np.float64]
 MOST_LIMITS = 8  # by default
@@ -97,32 +97,19 @@ class ScaledRows(NamedTuple):
     unit: Array
 
 
-class RowBuffer(NamedTuple):
-    """Numbers of n states.
-
-    Attributes:
-        qpos: (n, nq).
-        length: (n, ntendon).
-        tendon: (n, ntendon, nv) derivative of the length.
-    """
-
-    qpos: Array
-    length: Array
-    tendon: Array
-
-
 class RowFinder:
     """Finds the rows at states.
 
     Args:
-        model: the model, before flags are changed.
+        model: a private copy, before its flags are changed.
+        data: its data.
         limits: how many limits a state has, those nearest to acting; None: of all joints and tendons that have some, at
             most `MOST_LIMITS`, with a `ContactWarning` where more act.
         friction: False if dry friction is left out.
     """
 
-    def __init__(self, model: Any, limits: int | None, friction: bool):
-        self.model = model
+    def __init__(self, model: Any, data: Any, limits: int | None, friction: bool):
+        self.model, self.data = model, data
         off = _disabled(model, "CONSTRAINT")
         limited = model.jnt_limited.astype(bool) & (model.jnt_type != int(mujoco.mjtJoint.mjJNT_FREE))
         limited, tendons = limited & ~(off | _disabled(model, "LIMIT")), model.tendon_limited.astype(bool)
@@ -162,28 +149,20 @@ class RowFinder:
         """Number of rows of every state."""
         return self.n_limits + self.n_friction
 
-    def allocate(self, n: int) -> RowBuffer:
-        """Make buffers for n states."""
-        model = self.model
-        return RowBuffer(np.zeros((n, model.nq)), np.zeros((n, model.ntendon)), np.zeros((n, model.ntendon, model.nv)))
-
-    def read(self, i: int, data: Any, into: RowBuffer) -> None:
-        """Read the state in `data`, for which `mj_fwdPosition` was called."""
-        into.qpos[i] = data.qpos
-        if len(self._tendons) or len(self._rubbing_tendons):
-            into.length[i], into.tendon[i] = data.ten_length, tendon_jacobian(self.model, data)
-
-    def finish(self, read: RowBuffer, place: Array, response: Array, middle: tuple[Array, Array] | None = None) -> Rows:
-        """Return the rows, of limits those that are nearest to acting.
+    def find(self, qpos: Array, place: Array, response: Array, middle: Array | None = None) -> Rows:
+        """Find the rows, of limits those that are nearest to acting.
 
         Args:
-            read: the states.
+            qpos: (n, nq) positions.
             place: (n, nv) ζ after the step, without the rows.
             response: (n, nv, nv) what a unit of force does to ζ or ν.
-            middle: (n, nv) ζ in the middle of the step, and the lengths (n, ntendon) of the tendons there.
+            middle: (n, nv) ζ in the middle of the step, if it has velocities.
+
+        Raises:
+            InvalidInputError: MuJoCo raised an error.
         """
         n, nv = place.shape
-        normal, gap, bend = self._limits(read, place, middle)
+        normal, gap, bend, tendons = self._limits(qpos, place, middle)
         where = np.arange(n)[:, None]
         chosen = np.broadcast_to(np.arange(gap.shape[1]), gap.shape)
         if self.n_limits < gap.shape[1]:
@@ -196,35 +175,53 @@ class RowFinder:
             normal, gap, bend = normal[where, chosen], gap[where, chosen], bend[where, chosen]
         rubbing = np.zeros((n, len(self._rubbing), nv))
         rubbing[:, np.arange(len(self._rubbing)), self._rubbing] = 1.0
-        normal = np.concatenate([normal, rubbing, read.tendon[:, self._rubbing_tendons]], 1)
+        normal = np.concatenate([normal, rubbing, tendons[:, self._rubbing_tendons]], 1)
         of_friction = np.arange(len(self._range), len(self._soft.bound))
         chosen = np.concatenate([chosen, np.broadcast_to(of_friction, (n, self.n_friction))], 1)
         gap, bend = (np.pad(values, ((0, 0), (0, self.n_friction))) for values in (gap, bend))
         return Rows(gap, normal, bend, self._soft.at(chosen), self.n_friction)
 
-    def _limits(self, read: RowBuffer, place: Array, middle: tuple[Array, Array] | None) -> tuple[Array, Array, Array]:
-        """Return derivatives (n, k, nv), gaps and bends of all limits, each of its nearer side after the step."""
+    def _limits(self, qpos: Array, place: Array, middle: Array | None) -> tuple[Array, Array, Array, Array]:
+        """Return of all limits, of the nearer side after the step, derivatives (n, k, nv), gaps (n, k) and bends.
+
+        And the derivatives (n, ntendon, nv) of all tendons' lengths.
+        """
         model, (n, nv) = self.model, place.shape
         k, balls = len(self._joints), len(self._balls)
         value, along = np.zeros((n, len(self._range))), np.zeros((n, len(self._range), nv))
-        value[:, :k] = read.qpos[:, model.jnt_qposadr[self._joints]]
+        value[:, :k] = qpos[:, model.jnt_qposadr[self._joints]]
         along[:, np.arange(k), model.jnt_dofadr[self._joints]] = 1.0
         for row, joint in enumerate(self._balls, k):
             address, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
-            quaternion = read.qpos[:, address : address + 4]
+            quaternion = qpos[:, address : address + 4]
             quaternion = quaternion * np.where(quaternion[:, :1] < 0, -1.0, 1.0)
             sine = np.linalg.norm(quaternion[:, 1:], axis=-1)
             value[:, row] = 2 * np.arctan2(sine, quaternion[:, 0])
             along[:, row, dof : dof + 3] = quaternion[:, 1:] / np.maximum(sine, 1e-12)[:, None]
-        value[:, k + balls :], along[:, k + balls :] = read.length[:, self._tendons], read.tendon[:, self._tendons]
+        length, tendons = self._read_tendons(qpos)
+        value[:, k + balls :], along[:, k + balls :] = length[:, self._tendons], tendons[:, self._tendons]
         lower, upper = value - self._range[:, 0], self._range[:, 1] - value
         moved = (along @ place[:, :, None])[:, :, 0]
         side = np.where(lower + moved < upper - moved, 1.0, -1.0)
         gap, bend = np.where(side > 0, lower, upper) - self._soft.margin[: len(self._range)], np.zeros_like(side)
         if middle is not None and len(self._tendons):
-            straight = read.length + (read.tendon @ middle[0][:, :, None])[:, :, 0]
-            bend[:, k + balls :] = 4 * side[:, k + balls :] * (middle[1] - straight)[:, self._tendons]
-        return side[:, :, None] * along, gap, bend
+            halfway = qpos.copy()
+            for q, change in zip(halfway, middle, strict=True):
+                mujoco.mj_integratePos(model, q, change, 1.0)
+            longer = self._read_tendons(halfway)[0] - length - (tendons @ middle[:, :, None])[:, :, 0]
+            bend[:, k + balls :] = 4 * side[:, k + balls :] * longer[:, self._tendons]
+        return side[:, :, None] * along, gap, bend, tendons
+
+    def _read_tendons(self, qpos: Array) -> tuple[Array, Array]:
+        """Return lengths (n, ntendon) of tendons at positions (n, nq), and their derivatives (n, ntendon, nv)."""
+        model, data, n = self.model, self.data, len(qpos)
+        length, tendons = np.zeros((n, model.ntendon)), np.zeros((n, model.ntendon, model.nv))
+        for i in range(n * bool(len(self._tendons) + len(self._rubbing_tendons))):
+            with native(model, data, f"in state {i} of {n}"):
+                data.qpos[:] = qpos[i]
+                mujoco.mj_fwdPosition(model, data)
+                length[i], tendons[i] = data.ten_length, tendon_jacobian(model, data)
+        return length, tendons
 
     def _warn_of_more(self, after: Array) -> None:
         """Warn once if limits that act at the nominal action are dropped because of the default number."""
@@ -345,3 +342,16 @@ def _reference(model: Any, reference: Array, impedance: Array, of_limits: int) -
 
 def _disabled(model: Any, name: str) -> bool:
     return bool(model.opt.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")))
+
+
+def tendon_jacobian(model: Any, data: Any) -> Array:
+    """Return the derivative (ntendon, nv) of the tendons' lengths, which newer versions of MuJoCo keep sparse."""
+    jacobian = np.zeros((model.ntendon, model.nv))
+    if data.ten_J.size == jacobian.size:
+        return data.ten_J.reshape(jacobian.shape)
+    where = (
+        getattr(data if hasattr(data, name) else model, name)
+        for name in ("ten_J_rownnz", "ten_J_rowadr", "ten_J_colind")
+    )
+    mujoco.mju_sparse2dense(jacobian, data.ten_J.reshape(-1), *(v.reshape(-1) for v in where))
+    return jacobian

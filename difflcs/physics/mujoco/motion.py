@@ -7,6 +7,8 @@ way there, with ζ the change of position and ν the velocity:
 
 K, D and B are finite differences that `mjd_transitionFD` computes natively: gravity, Coriolis forces, springs, damping,
 gears and servos are all in them. What differs from the simulation takes the time steps of the model's own integrator.
+Where actuators have activation, ζ stands for its change as well where it acts, and ν̇ for its rate where it changes.
+An actuator at a limit of its control or force has a constant force.
 
 A contact force acts as one impulse f at the beginning of the step, implicitly, so that what a stiff servo holds gives
 way little: it changes ν by S f and ζ by h S f with S = (M + [h (−M D) + h² (−M K)]₊)⁻¹, where [·]₊ is the part of the
@@ -19,6 +21,8 @@ state and for every step, also where Coriolis forces or an unstable equilibrium 
 
 from __future__ import annotations
 
+import copy
+import functools
 from typing import Any, NamedTuple
 
 import mujoco
@@ -29,74 +33,18 @@ from torch import Tensor
 
 from difflcs.errors import InvalidInputError
 from difflcs.physics.complementarity import FreeMotion
+from difflcs.physics.mujoco._native import _mujoco
+from difflcs.physics.mujoco.actuators import Actuators
+from difflcs.physics.mujoco.library import Places, addresses, library
 
 Array = NDArray[np.float64]
 
-_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
-_SCALAR = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
-_FIXED, _AFFINE = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_AFFINE)
 _BEYOND = 1e6  # a motion in a step [m, rad] and its velocity that no model has
 _MOST, _FEW = 10, 4  # steps that are simulated one by one; where there are more, so many as long ones
 _EULER, _RK4, _IMPLICIT, _FAST = (
     int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("EULER", "RK4", "IMPLICIT", "IMPLICITFAST")
 )
-_ADVANCE = {
-    _EULER: mujoco.mj_Euler,
-    _RK4: lambda model, data: mujoco.mj_RungeKutta(model, data, 4),
-    _IMPLICIT: mujoco.mj_implicit,
-    _FAST: mujoco.mj_implicit,
-}
-
-
-class Actuators:
-    """The actuators of a model: which are position servos on joints, and which joints they move.
-
-    Attributes:
-        dof: (nu,) degree of freedom of each actuator on a slide or hinge; −1 for others.
-        gear: (nu,).
-        servo: (nu,) True for a `position` actuator on a slide or hinge.
-        offset: (nu,) at which length a servo rests with ctrl = 0, by the constant part of its bias; 0 for others.
-        holds: (nu,) True if its force falls to zero at some length, as that of servos on joints, tendons or sites does.
-    """
-
-    def __init__(self, model: Any):
-        joint = model.actuator_trnid[:, 0]
-        on_joint = model.actuator_trntype == _JOINT
-        self.dof = np.full(model.nu, -1)
-        for i in np.flatnonzero(on_joint):
-            if model.jnt_type[joint[i]] in _SCALAR:
-                self.dof[i] = model.jnt_dofadr[joint[i]]
-        self.gear = model.actuator_gear[:, 0].copy()
-        gain, (constant, bias) = model.actuator_gainprm[:, 0], model.actuator_biasprm.T[:2]
-        linear = (model.actuator_gaintype == _FIXED) & (model.actuator_biastype == _AFFINE) & (gain != 0)
-        self.servo = (self.dof >= 0) & linear & (np.abs(gain + bias) <= 1e-9 * np.abs(gain))
-        self.holds = linear & (bias != 0)
-        self._gain, self._constant, self._bias = np.where(gain != 0, gain, 1.0), constant.copy(), bias.copy()
-        self.offset = np.where(self.servo, constant / self._gain, 0.0)
-
-    def balance(self, length: Array) -> Array:
-        """Controls (nu,) at which actuators that hold a length have no force at these lengths (nu,); 0 for others."""
-        return np.where(self.holds, -(self._constant + self._bias * length) / self._gain, 0.0)
-
-
-def disabled_actuators(model: Any) -> NDArray[np.bool_]:
-    """Return a mask (nu,) of actuators that do nothing, by their groups or a flag of the model."""
-    groups = model.actuator_group
-    disabled = (groups >= 0) & (groups < 31) & (model.opt.disableactuator >> groups.clip(0, 30) & 1 > 0)
-    return disabled | bool(model.opt.disableflags & _flags("ACTUATION"))
-
-
-def tendon_jacobian(model: Any, data: Any) -> Array:
-    """Return the derivative (ntendon, nv) of the tendons' lengths, which newer versions of MuJoCo keep sparse."""
-    jacobian = np.zeros((model.ntendon, model.nv))
-    if data.ten_J.size == jacobian.size:
-        return data.ten_J.reshape(jacobian.shape)
-    where = (
-        getattr(data if hasattr(data, name) else model, name)
-        for name in ("ten_J_rownnz", "ten_J_rowadr", "ten_J_colind")
-    )
-    mujoco.mju_sparse2dense(jacobian, data.ten_J.reshape(-1), *(v.reshape(-1) for v in where))
-    return jacobian
+_ADVANCE = {_EULER: "mj_Euler", _IMPLICIT: "mj_implicit", _FAST: "mj_implicit"}
 
 
 class QuasiStatic:
@@ -177,7 +125,7 @@ class Dynamic:
     """Motion by all forces of MuJoCo except those of its constraints, linearised at each state.
 
     Args:
-        model: a private copy; constraints and limits of controls and actuators are switched off while it is linearised.
+        model: a private copy; constraints are switched off while it is linearised.
         actuators: of the model.
         seconds: of a step [s].
         relative: actions of servos count from where they are.
@@ -197,103 +145,95 @@ class Dynamic:
         self.firm = np.isin(
             self.tree, np.setdiff1d(self.tree, self.tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
         )
-        self.flags = _flags("CONSTRAINT", "CLAMPCTRL")
-        for limited in ("actuator_forcelimited", "actuator_ctrllimited", "jnt_actfrclimited", "tendon_actfrclimited"):
-            getattr(model, limited)[:] = 0
+        self.flags = _flags("CONSTRAINT")
 
-    def allocate(self, n: int) -> Linearised:
-        """Make buffers for n states."""
-        nv, nu = self.model.nv, self.model.nu
-        sizes = ((2 * nv,), (self.model.ntendon,), (nv,), (2 * nv, 2 * nv), (2 * nv, nu), (nv, nv), (nu,), (2 * nv,))
-        return Linearised(*(np.zeros((n, *size)) for size in sizes))
+    def read(self, places: Places, states: Array, ctrl: Array) -> Linearised:
+        """Read the motion at states (n, nq + nv + na) of qpos, qvel and act, at controls (n, nu); NaN: balance.
 
-    def read(self, i: int, data: Any, into: Linearised, ctrl: Array) -> None:
-        """Read the state in `data`, for which `mj_fwdPosition` was called, at nominal controls (nu,); NaN: balance."""
-        model, options, nv = self.model, self.model.opt, self.model.nv
-        before = options.disableflags, options.timestep, options.integrator
-        qpos, qvel = data.qpos.copy(), data.qvel.copy()
-        mujoco.mj_solveM(model, data, into.inverse_mass[i], np.eye(model.nv))
-        data.ctrl[:] = np.where(np.isnan(ctrl), self.actuators.balance(data.actuator_length), ctrl)
-        into.nominal[i] = data.ctrl
-        into.nominal[i, self.relative] -= data.actuator_length[self.relative]
-        half = self.simulated.count // 2
-        self._simulate(data, half)
+        Raises:
+            InvalidInputError: MuJoCo raised an error, or has counted a warning.
+        """
+        n, nv, nu = len(states), self.model.nv, self.model.nu
+        n_x = 2 * nv + self.model.na
+        sizes = ((n_x,), (n_x - nv,), (n_x, n_x), (n_x, nu), (nv, nv), (nu,), (n_x,))
+        read, ctrl = Linearised(*(np.zeros((n, *size)) for size in sizes)), np.ascontiguousarray(ctrl)
+        places.check(_mujoco.read_motion(library(), self._native, places.take(n), states, ctrl, *read), n)
+        return read
+
+    @functools.cached_property
+    def _native(self) -> _mujoco.Motion:
+        """Models as they are simulated and linearised, and what balances actuators, for the compiled part."""
+        model, actuators = self.model, self.actuators
+        self._models = simulated, linearised = copy.copy(model), copy.copy(model)
+        simulated.opt.disableflags |= self.flags
+        simulated.opt.timestep = self.seconds / self.simulated.count
+        simulated.opt.integrator = self.simulated.integrator
         # With a time step of one second and no implicit part, the next velocity is ν + acceleration.
-        options.disableflags |= self.flags | _flags("EULERDAMP")
-        options.timestep, options.integrator = 1.0, _EULER
-        mujoco.mj_forward(model, data)
-        if not np.abs(data.qacc).max() < _BEYOND**1.5:  # a simulation that diverges says nothing
-            data.qpos[:], data.qvel[:] = qpos, qvel
-            mujoco.mj_forward(model, data)
-        mujoco.mj_differentiatePos(model, into.middle[i, :nv], 1.0, qpos, data.qpos)
-        into.middle[i, nv:], into.acceleration[i], into.length[i] = data.qvel, data.qacc, data.ten_length
-        mujoco.mjd_transitionFD(model, data, 1e-6, 0, into.A[i], into.B[i], None, None)
-        options.disableflags, options.timestep, options.integrator = before
-        self._simulate(data, self.simulated.count - half)
-        mujoco.mj_differentiatePos(model, into.reached[i, :nv], 1.0, qpos, data.qpos)
-        into.reached[i, nv:] = data.qvel
-        data.qpos[:], data.qvel[:] = qpos, qvel
-
-    def _simulate(self, data: Any, steps: int) -> None:
-        """Simulate without the checks of `mj_step`, which warn of a motion that grows."""
-        options = self.model.opt
-        before = options.disableflags, options.timestep, options.integrator
-        options.disableflags, options.timestep = before[0] | self.flags, self.seconds / self.simulated.count
-        options.integrator = self.simulated.integrator
-        for _ in range(steps):
-            mujoco.mj_forward(self.model, data)
-            _ADVANCE[self.simulated.integrator](self.model, data)
-        options.disableflags, options.timestep, options.integrator = before
+        linearised.opt.disableflags |= self.flags | _flags("EULERDAMP")
+        linearised.opt.timestep, linearised.opt.integrator = 1.0, _EULER
+        actuators.unlimit_rates(linearised)
+        fields = {name: getattr(model, name) for name in ("nq", "nv", "nu", "na")}
+        fields |= {"simulated": simulated._address, "linearised": linearised._address, "steps": self.simulated.count}
+        advance = _ADVANCE.get(self.simulated.integrator)
+        fields["advance"] = addresses()[advance] if advance else 0
+        return _mujoco.Motion(fields | actuators.describe_balance(self.relative))
 
     def finish(self, read: Linearised, x: Array) -> DynamicStep:
-        """Return the motion at states x (n, 2 nv)."""
-        nv, h = self.model.nv, self.seconds
-        K, D, B = read.A[:, nv:, :nv], read.A[:, nv:, nv:] - np.eye(nv), read.B[:, nv:]
+        """Return the motion at states x (n, n_x)."""
+        nv, h, n_x = self.model.nv, self.seconds, x.shape[1]
+        velocity = x[:, nv : 2 * nv]
+        rates, B = read.A[:, nv:] - np.eye(n_x)[nv:], read.B[:, nv:]
         # With ν = 0, ζ = 0 and u = ū.
-        load = read.acceleration - np.einsum("nij,nj->ni", np.concatenate([K, D], -1), read.middle)
+        load = read.acceleration - np.einsum("nij,nj->ni", rates, read.middle)
         forces, mass = (
-            np.concatenate([K, D, B, load[:, :, None]], -1),
+            np.concatenate([rates, B, load[:, :, None]], -1),
             np.linalg.inv(read.inverse_mass).astype(np.float64),
         )
-        response = _implicit_response(mass, K, D, h)
+        response = _implicit_response(mass, rates[:, :nv, :nv], rates[:, :nv, nv : 2 * nv], h)
         # Of a step in which a motion grows beyond all bounds, what is linear and explicit says nothing.
         step, implicit = self._steps(mass, forces, self.steps), self._implicit(response @ mass, forces)
         step = np.where((np.abs(step).max((1, 2)) < _BEYOND)[:, None, None], step, implicit)
         # The simulation says what is not linear, by its difference to the same steps of the linear motion.
         same = self.simulated == self.steps
         simulated = step if same else self._steps(mass, forces, self.simulated)
-        more = read.reached - _reached(simulated, x)
+        more = read.reached - _reached(simulated, velocity)
         step[:, :, -1] += np.where((np.abs(more).max(1) < _BEYOND)[:, None], more, 0.0)
-        place = _reached(step, x)[:, :nv]
-        return DynamicStep(self, x, step, implicit - step, response, read.inverse_mass, place, read.nominal)
+        place, delayed = _reached(step, velocity)[:, :nv], (implicit - step)[:, : 2 * nv]
+        return DynamicStep(self, x, step, delayed, response, read.inverse_mass, place, read.nominal)
 
     def _steps(self, mass: Array, forces: Array, steps: Steps) -> Array:
-        """(ζ, ν) after the step as a matrix (n, 2 nv, 2 nv + nu + 1) of ζ, ν, u − ū and 1; `forces` is that of ν̇."""
-        n, nv, of = forces.shape
+        """The state after the step as a matrix (n, n_x, n_x + nu + 1) of it, u − ū and 1; `forces` is that of rates."""
+        n, of, nv = len(forces), forces.shape[2], self.model.nv
+        n_x = nv + forces.shape[1]
         h, one = self.seconds / steps.count, np.zeros((n, of, of))
+        activation = self.actuators.durations(h)[:, None] * forces[:, nv:]
         if steps.integrator == _RK4:
             unit = np.ones(of)
             unit[nv : 2 * nv] = h  # of (ζ, h ν) the norm, which says what an exponential costs, is less
-            one[:, :nv, nv : 2 * nv], one[:, nv : 2 * nv] = h * np.eye(nv), h * forces
+            one[:, :nv, nv : 2 * nv], one[:, nv : 2 * nv] = h * np.eye(nv), h * forces[:, :nv]
+            one[:, 2 * nv : n_x] = activation
             grown: Tensor = torch.linalg.matrix_exp(torch.from_numpy(one * unit[:, None] / unit))
             one = grown.numpy() * unit / unit[:, None]
         else:
-            implicit = np.diag(self.damping) if steps.integrator == _EULER else -mass @ forces[:, :, nv : 2 * nv]
+            damped = forces[:, :nv, nv : 2 * nv]
+            implicit = np.diag(self.damping) if steps.integrator == _EULER else -mass @ damped
             one[:] = np.eye(of)
-            one[:, nv : 2 * nv] += h * np.linalg.solve(mass + h * implicit, mass @ forces)
+            one[:, nv : 2 * nv] += h * np.linalg.solve(mass + h * implicit, mass @ forces[:, :nv])
             one[:, :nv] += h * one[:, nv : 2 * nv]
+            one[:, 2 * nv : n_x] += activation
         with np.errstate(over="ignore", invalid="ignore"):
-            return np.linalg.matrix_power(one, steps.count)[:, : 2 * nv]
+            return np.linalg.matrix_power(one, steps.count)[:, :n_x]
 
     def _implicit(self, resists: Array, forces: Array) -> Array:
         """Compute the same by one implicit step, which keeps (n, nv, nv) `resists` = S M of the change in velocity."""
         nv, h = self.model.nv, self.seconds
-        one = h * forces
+        one, activation = h * forces[:, :nv], h * forces[:, nv:]
         one[:, :, nv : 2 * nv] = np.eye(nv)
         velocity = resists @ one
         place = h * velocity
         place[:, :, :nv] += np.eye(nv)
-        return np.concatenate([place, velocity], 1)
+        activation[:, :, 2 * nv : 2 * nv + self.model.na] += np.eye(self.model.na)
+        return np.concatenate([place, velocity, activation], 1)
 
 
 class Steps(NamedTuple):
@@ -307,18 +247,17 @@ class Linearised(NamedTuple):
     """Linearised motion of n states.
 
     Attributes:
-        middle: (n, 2 nv) where the nominal control leads in half a step; all is linearised there.
-        length: (n, ntendon) of tendons there.
-        acceleration: (n, nv) with the nominal control.
-        A: (n, 2 nv, 2 nv) transition by position and velocity in one second of Euler's method.
-        B: (n, 2 nv, nu) by control.
+        middle: (n, n_x) where the nominal control leads in half a step, as ζ, ν and the change of the activation na;
+            all is linearised there.
+        acceleration: (n, nv + na) rates of velocities and activation with the nominal control.
+        A: (n, n_x, n_x) transition by position, velocity and activation in one second of Euler's method.
+        B: (n, n_x, nu) by control.
         inverse_mass: (n, nv, nv).
         nominal: (n, nu) action at which this is.
-        reached: (n, 2 nv) where the nominal control leads in a step.
+        reached: (n, n_x) where the nominal control leads in a step.
     """
 
     middle: Array
-    length: Array
     acceleration: Array
     A: Array
     B: Array
@@ -332,9 +271,9 @@ class DynamicStep(NamedTuple):
 
     Attributes:
         motion: the motion.
-        x: (n, 2 nv) the states.
-        step: (n, 2 nv, 2 nv + nu + 1) (ζ, ν) afterwards, of ζ, ν, u − ū and 1.
-        delayed: (n, 2 nv, 2 nv + nu + 1) difference of an implicit step, with all loads at its beginning, to that.
+        x: (n, n_x) the states: positions, velocities, activation.
+        step: (n, n_x, n_x + nu + 1) ζ, ν and the change of activation afterwards, of these, u − ū and 1.
+        delayed: (n, 2 nv, n_x + nu + 1) difference of an implicit step, with all loads at its beginning, to (ζ, ν).
         response: (n, nv, nv) S.
         inverse_mass: (n, nv, nv).
         place: (n, nv) ζ afterwards with the nominal action.
@@ -366,38 +305,49 @@ class DynamicStep(NamedTuple):
         loose = ~self.motion.firm
         return self.response * (loose & loose[:, None])
 
-    def free(self, tangent: Array | None, carried: Array | float = 0.0) -> FreeMotion:
-        """Motion without contact, with `carried` added to `step`, for the tangent of the state's rotations."""
-        motion, x, step = self.motion, self.x, self.step + carried
-        n, nv, h = len(x), motion.model.nv, motion.seconds
+    @property
+    def velocity(self) -> Array:
+        """(n, nv) velocities."""
+        nv = self.place.shape[1]
+        return self.x[:, nv : 2 * nv]
+
+    def free(self, tangent: Array | None, carried: Array | None = None) -> FreeMotion:
+        """Motion without contact, with `carried` added to (ζ, ν), for the tangent of the state's rotations."""
+        motion, x, step = self.motion, self.x, self.step.copy()
+        (n, n_x), nv, h = x.shape, motion.model.nv, motion.seconds
+        if carried is not None:
+            step[:, : 2 * nv] += carried
         # The control of a servo is held through the step, at a distance from where the joint was at its beginning.
-        control = step[:, :, 2 * nv : -1]
+        control = step[:, :, n_x:-1]
         step[:, :, :nv] += control @ motion.moment
         step[:, :, -1] -= np.einsum("nij,nj->ni", control, self.idle)
-        to_x = np.zeros((n, 2 * nv, 2 * nv))
-        to_x[:] = np.eye(2 * nv)
+        to_x = np.zeros((n, n_x, n_x))
+        to_x[:] = np.eye(n_x)
         of_x = to_x
         if tangent is not None:  # ζ = T (r − r̄)
             of_x = to_x.copy()
             of_x[:, :nv, :nv], to_x[:, :nv, :nv] = tangent, np.linalg.inv(tangent)
-        at = np.concatenate([x[:, :nv], np.zeros((n, nv))], -1)
-        A_x = to_x @ step[:, :, : 2 * nv] @ of_x
+        at = x.copy()
+        at[:, nv : 2 * nv] = 0.0
+        A_x = to_x @ step[:, :, :n_x] @ of_x
         d = at - np.einsum("nij,nj->ni", A_x, at) + np.einsum("nij,nj->ni", to_x, step[:, :, -1])
-        impulse, response = self.response, np.zeros((n, 2 * nv, 2 * nv))
-        response[:, :, :nv] = to_x @ np.concatenate([h * impulse, impulse], 1) @ to_x[:, :nv, :nv].swapaxes(-1, -2)
+        impulse, response = self.response, np.zeros((n, n_x, n_x))
+        both = np.concatenate([h * impulse, impulse], 1)
+        response[:, : 2 * nv, :nv] = to_x[:, : 2 * nv, : 2 * nv] @ both @ to_x[:, :nv, :nv].swapaxes(-1, -2)
         return FreeMotion(*(torch.from_numpy(v) for v in (A_x, to_x @ control, d, response)))
 
     def effect(self, tangent: Array | None, normal: Array, impulse: Array) -> Array:
-        """What forces do to the next state (n, 2 nv, k): ζ moves by h S `normal` (n, k, nv), ν by S `impulse`."""
-        h = self.seconds
+        """What forces do to the next state (n, n_x, k): ζ moves by h S `normal` (n, k, nv), ν by S `impulse`."""
+        h, (n, n_x), nv = self.seconds, self.x.shape, self.place.shape[1]
         place, velocity = (self.response @ rows.swapaxes(-1, -2) for rows in (h * normal, impulse))
-        return np.concatenate([place if tangent is None else np.linalg.solve(tangent, place), velocity], 1)
+        still = np.zeros((n, n_x - 2 * nv, normal.shape[1]))
+        return np.concatenate([place if tangent is None else np.linalg.solve(tangent, place), velocity, still], 1)
 
 
-def _reached(step: Array, x: Array) -> Array:
-    """Compute (ζ, ν) after a step (n, 2 nv, 2 nv + nu + 1) from ζ = 0 with the velocities of x (n, 2 nv) and u = ū."""
-    nv = x.shape[1] // 2
-    return step[:, :, -1] + (step[:, :, nv : 2 * nv] @ x[:, nv:, None])[:, :, 0]
+def _reached(step: Array, velocity: Array) -> Array:
+    """Compute the change (n, n_x) in a step (n, n_x, n_x + nu + 1) from velocities (n, nv) with u = ū."""
+    nv = velocity.shape[1]
+    return step[:, :, -1] + (step[:, :, nv : 2 * nv] @ velocity[:, :, None])[:, :, 0]
 
 
 def _flags(*names: str) -> int:

@@ -19,9 +19,10 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from difflcs.lcp import solve_lcp_arrays
+from difflcs.physics.mujoco._native import _mujoco
 from difflcs.physics.mujoco.contacts import MujocoContacts
 from difflcs.physics.mujoco.limits import Rows, ScaledRows, follow, scale
 from difflcs.physics.mujoco.motion import DynamicStep
@@ -41,7 +42,7 @@ class Nominal(NamedTuple):
         forces: (n, n_contacts, n_rays) of the extreme rays of Anitescu's cone, in the order of `contact_lcs` [N s].
         rows: limits and dry friction.
         row_forces: (n, n_rows) of these.
-        carried: addition to `DynamicStep.step`, as loads are impulses along contacts.
+        carried: addition to (ζ, ν) of `DynamicStep.step`, as loads are impulses along contacts.
     """
 
     contacts: MujocoContacts
@@ -99,17 +100,18 @@ class _Rays:
         n, k = rays.shape[:2]
         self.shape = n, k, max(1, 2 * slide.shape[2])
         self._rows = np.concatenate([rays.reshape(n, -1, rays.shape[-1]), rows.normal], 1)
-        self._moves = response @ self._rows.swapaxes(-1, -2)
-        self._F = self._rows @ self._moves / give
-        self._F += compliance * np.eye(self._F.shape[-1])
-        self._give, self._compliance, self._of_rows, self._bound = give, compliance, rows.gap, give * rows.bound
+        self._response, self._give, self._compliance, self._of_rows = response / give, give, compliance, rows.gap
+        unbounded = np.full((n, self._rows.shape[1] - rows.bound.shape[1]), np.inf)
+        self._low = np.concatenate([np.zeros_like(unbounded), -give * rows.bound], 1)
+        self._high = np.concatenate([unbounded, give * rows.bound], 1)
 
     def forces(self, place: Array, gap: Array, rest: Array | float = 0.0) -> tuple[Array, Array]:
-        """Forces (n, n) of rays and rows, and where they move ζ (n, nv); the compliance counts from forces `rest`."""
+        """Forces (n, m) of rays and rows, and where they move ζ (n, nv); the compliance counts from forces `rest`."""
         apart = np.concatenate([np.repeat(gap, self.shape[2], axis=1), self._of_rows], 1)
         apart = apart + (self._rows @ place[:, :, None])[:, :, 0] - self._compliance * self._give * rest
-        lam = solve_bounded(self._F, apart, self._bound) / self._give
-        return lam, place + (self._moves @ lam[:, :, None])[:, :, 0]
+        lam = solve_soft(self._rows, self._response, apart, self._compliance, self._low, self._high)
+        moved = self._response @ (self._rows.swapaxes(-1, -2) @ lam[:, :, None])
+        return lam / self._give, place + moved[:, :, 0]
 
     def split(self, forces: Array) -> tuple[Array, Array]:
         """Forces of contacts (n, n_contacts, n_rays) and of rows (n, n_rows)."""
@@ -117,18 +119,29 @@ class _Rays:
         return forces[:, :count].reshape(self.shape), forces[:, count:]
 
 
-def solve_bounded(F: Array, q: Array, bound: Array) -> Array:
-    """Solve 0 ≤ λ ⊥ F λ + q ≥ 0, where the last forces are in [−bound, bound] instead, see `Bounded`."""
-    k, n = bound.shape[-1], q.shape[-1]
-    if not k:
-        return solve_lcp_arrays(F, q)[0]
-    full = np.zeros((*F.shape[:-2], n + k, n + k))
-    full[:, :n, :n], own = F, np.arange(n - k, n)
-    full[:, own, own + k], full[:, own + k, own], full[:, own + k, own + k] = 1.0, -1.0, 1e-3 / F[:, own, own]
-    q = np.concatenate([q - (F[:, :, n - k :] @ bound[:, :, None])[:, :, 0], 2 * bound], -1)
-    lam = solve_lcp_arrays(full, q)[0][:, :n]
-    lam[:, n - k :] -= bound
-    return lam
+def solve_soft(
+    rows: Array, response: Array, gap: Array, compliance: float, low: Array | None = None, high: Array | None = None
+) -> Array:
+    """Compute forces λ = clip(−(gap + rows · z)/compliance, low, high), with z = response rowsᵀ λ.
+
+    So 0 ≤ λ ⊥ gap + rows · z + compliance · λ ≥ 0 where no bounds are given; between −b and b it is dry friction.
+
+    Args:
+        rows: (n, m, nv).
+        response: (n, nv, nv) motion by forces, symmetric and positive semidefinite.
+        gap: (n, m).
+        compliance: > 0.
+        low: (n, m) least forces; None: 0.
+        high: (n, m) largest forces; None: infinite.
+    """
+    force = np.empty_like(gap)
+    low = np.zeros_like(gap) if low is None else np.ascontiguousarray(low)
+    high = np.full_like(gap, np.inf) if high is None else np.ascontiguousarray(high)
+    rows, gap = np.ascontiguousarray(rows), np.ascontiguousarray(gap)
+    response = np.ascontiguousarray(np.broadcast_to(response, (len(gap), *response.shape[-2:])))
+    threads = max(1, min(len(gap), torch.get_num_threads()))
+    _mujoco.solve_soft(rows, response, gap, compliance, low, high, threads, force)
+    return force
 
 
 def _settle(
@@ -140,7 +153,7 @@ def _settle(
     if not rows.gap.size:
         return scale(rows, rows.gap, 1.0, response, give, h), rows.normal
     # First a step with all loads at its beginning, as forces are: limits hold at zero, what creeps goes on creeping.
-    speed = (rows.normal @ step.x[:, nv:, None])[:, :, 0]
+    speed = (rows.normal @ step.velocity[:, :, None])[:, :, 0]
     creeps = np.abs(speed) < rows.soft.creep
     gap = np.where(is_limit, np.maximum(rows.gap, 0.0) + 2 * rows.bend, -h * speed * creeps)
     scaled = scale(rows, gap, 1.0, response, give, h)
@@ -157,7 +170,7 @@ def _settle(
     depth = np.minimum(rows.gap + after.moved, 0.0)
     gap = np.where(is_limit, rows.gap + 2 * rows.bend - depth, -after.moved * holds)
     # What only another action brings to its limit is pressed there all the time: half an impulse does as much.
-    reach = np.abs(rows.normal @ step.step[:, :nv, 2 * nv : -1]).sum(-1)
+    reach = np.abs(rows.normal @ step.step[:, :nv, step.x.shape[1] : -1]).sum(-1)
     pressed = ~holds & (np.abs(rows.gap) < reach) & ~(after.acts & (rows.gap > 0))
     part = np.clip(np.where(is_limit & pressed, _EARLY, after.part), _EARLY, 1.0)
     part = np.where(~is_limit & after.stops, 1.0, part)
@@ -187,7 +200,7 @@ def evaluate_nominal(
     compliance *= _SOFTER
     if not contacts.gap.size and not rows.gap.size:
         settled = scale(rows, rows.gap, 1.0, step.seconds * step.response, give, step.seconds)
-        return Nominal(contacts, np.zeros((*contacts.gap.shape, 1)), settled, rows.gap, np.zeros_like(step.step))
+        return Nominal(contacts, np.zeros((*contacts.gap.shape, 1)), settled, rows.gap, np.zeros_like(step.delayed))
     response = step.seconds * step.response
     settled, held = _settle(step, contacts, rows, give, compliance)
     closing = _find_closing(step.place, step.response, contacts, held)
@@ -232,7 +245,7 @@ def _compute_creep(step: DynamicStep, contacts: MujocoContacts, recovery: Recove
     if not contacts.tangent.shape[2]:
         return np.zeros_like(forces)
     each = forces.reshape(*contacts.tangent.shape[:3], 2)
-    friction, velocity = contacts.friction[:, :, None], step.x[:, None, None, contacts.normal.shape[-1] :]
+    friction, velocity = contacts.friction[:, :, None], step.velocity[:, None, None]
     gives = ((contacts.tangent @ step.inverse_mass[:, None]) * contacts.tangent).sum(-1)
     acceleration = gives * friction * (each[..., 0] - each[..., 1]) / step.seconds
     far = step.seconds * friction * recovery.crept(contacts.geom, acceleration, (contacts.tangent * velocity).sum(-1))
@@ -242,7 +255,7 @@ def _compute_creep(step: DynamicStep, contacts: MujocoContacts, recovery: Recove
 def _place(step: DynamicStep, carried: Array) -> Array:
     """Compute ζ (n, nv) after the step with the nominal action, with `carried` added to the motion without contact."""
     nv = step.place.shape[1]
-    return step.place + carried[:, :nv, -1] + (carried[:, :nv, nv : 2 * nv] @ step.x[:, nv:, None])[:, :, 0]
+    return step.place + carried[:, :nv, -1] + (carried[:, :nv, nv : 2 * nv] @ step.velocity[:, :, None])[:, :, 0]
 
 
 def _find_closing(place: Array, response: Array, contacts: MujocoContacts, held: Array) -> NDArray[np.bool_]:

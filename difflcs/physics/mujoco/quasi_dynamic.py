@@ -34,7 +34,8 @@ from numpy.typing import NDArray
 
 from difflcs.errors import InvalidInputError
 from difflcs.physics.complementarity import FreeMotion
-from difflcs.physics.mujoco.motion import Actuators, disabled_actuators, tendon_jacobian
+from difflcs.physics.mujoco.actuators import Actuators, disabled_actuators
+from difflcs.physics.mujoco.limits import tendon_jacobian
 
 Array = NDArray[np.float64]
 _GAINS = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
@@ -77,10 +78,11 @@ class QuasiDynamic:
     """
 
     def __init__(self, model: Any, actuators: Actuators, seconds: float, relative: bool):
-        if not np.isin(model.actuator_gaintype, _GAINS).all() or not np.isin(model.actuator_biastype, _BIASES).all():
+        plain = np.isin(model.actuator_gaintype, _GAINS) & np.isin(model.actuator_biastype, _BIASES)
+        if not (plain & actuators.follows).all():
             raise InvalidInputError(
-                "model: expected actuators of fixed or affine gain and bias in quasi-dynamic motion, got others, such "
-                'as muscles; replace them, or use motion="dynamic"'
+                "model: expected actuators of fixed or affine gain and bias in quasi-dynamic motion, of no activation "
+                'but filters, got others, such as muscles; replace them, or use motion="dynamic"'
             )
         self.model, self.seconds, self.actuators = model, seconds, actuators
         self.relative = actuators.servo & relative
@@ -110,7 +112,8 @@ class QuasiDynamic:
     def read(self, i: int, data: Any, into: Rest, ctrl: Array) -> None:
         """Read the state in `data`, for which `mj_fwdPosition` was called, at nominal controls (nu,); NaN: balance."""
         model, length = self.model, data.actuator_length
-        data.ctrl[:] = np.where(np.isnan(ctrl), self.actuators.balance(length), ctrl)
+        data.ctrl[:] = self.actuators.clip(np.where(np.isnan(ctrl), self.actuators.balance(length), ctrl))
+        data.act[:] = data.ctrl[self.actuators.activated]  # filters have settled
         mujoco.mj_solveM(model, data, into.inverse_mass[i], np.eye(model.nv))
         mujoco.mj_fwdVelocity(model, data)
         mujoco.mj_fwdActuation(model, data)

@@ -33,7 +33,7 @@ _SUFFIXES = {
 
 
 class MujocoState:
-    """Order and coordinates of the state: one number for each of MuJoCo's nv degrees of freedom, then perhaps `qvel`.
+    """Order and coordinates of the state: one number for each of MuJoCo's nv degrees of freedom; `qvel` and `act`.
 
     The coordinate of a slide or a hinge is its `qpos`. A free joint has its position and the rotation vector from its
     orientation in `reference`, a ball the rotation vector alone: below half a turn each orientation has one, and at a
@@ -44,11 +44,13 @@ class MujocoState:
     Args:
         model: the MuJoCo model.
         reference: (nq,) `qpos` with the orientations from which rotation vectors count; None: `model.qpos0`.
-        velocities: True if `qvel` follows the positions. It is MuJoCo's, angular velocities in coordinates of the body.
+        velocities: True if `qvel` follows the positions, and then `act`. They are MuJoCo's, angular velocities in
+            coordinates of the body.
 
     Attributes:
         names: name of each number of the state: that of the joint (or `joint0`, `joint1` …), for free joints and
-            balls with one of the endings _x _y _z _rx _ry _rz; velocities with the ending _velocity.
+            balls with one of the endings _x _y _z _rx _ry _rz; velocities with the ending _velocity; the name of the
+            actuator (or `actuator0` …) with the ending _activation.
     """
 
     def __init__(self, model: Any, reference: ArrayLike | None = None, *, velocities: bool = False):
@@ -57,6 +59,7 @@ class MujocoState:
                 f"model: expected a mujoco.MjModel, got {describe(model)}; load one, MjModel.from_xml_path"
             )
         self.nq, self.nv, self.velocities = int(model.nq), int(model.nv), velocities
+        self.na = int(model.na) if velocities else 0
         names: list[str] = []
         plain: list[tuple[int, int]] = []
         self._turning: list[tuple[int, int]] = []  # where quaternions are in qpos, rotation vectors in the state
@@ -69,7 +72,11 @@ class MujocoState:
             plain += [(q + i, v + i) for i in range(shifts)]
             if count >= 3:
                 self._turning.append((q + shifts, v + shifts))
-        self.names = (*names, *(f"{name}_velocity" for name in names)) if velocities else tuple(names)
+        if velocities:
+            driven = np.repeat(np.arange(model.nu), model.actuator_actnum) if self.na else ()
+            activated = [f"{model.actuator(i).name or f'actuator{i}'}_activation" for i in driven]
+            names += [f"{name}_velocity" for name in names] + activated
+        self.names = tuple(names)
         self._of_qpos, self._of_state = np.array(plain, dtype=np.intp).reshape(-1, 2).T
         self.follow(model.qpos0 if reference is None else reference, "reference")
 
@@ -111,8 +118,8 @@ class MujocoState:
             raise KeyError(f"expected one of {', '.join(self.names)}, got {name!r}")
         return self.names.index(name)
 
-    def to_state(self, qpos: ArrayLike, qvel: ArrayLike | None = None) -> Tensor:
-        """Convert to states (..., n_x) from `qpos` (..., nq) and `qvel` (..., nv); without `qvel` at rest.
+    def to_state(self, qpos: ArrayLike, qvel: ArrayLike | None = None, act: ArrayLike | None = None) -> Tensor:
+        """Convert to states (..., n_x) from `qpos` (..., nq), `qvel` (..., nv) and `act` (..., na), which may be zero.
 
         Raises:
             ShapeError, NonFiniteError: numbers that do not fit.
@@ -125,12 +132,16 @@ class MujocoState:
             turn = _multiply(_conjugate(reference[..., q : q + 4]), _unit(qpos[..., q : q + 4]))
             x[..., v : v + 3] = _rotation_vector(turn)
         if self.velocities:
-            speed = np.zeros_like(x) if qvel is None else self._array("qvel", qvel, self.nv)
-            x = np.concatenate([x, np.broadcast_to(speed, x.shape)], -1)
+            shape = x.shape[:-1]
+            for name, values, size in (("qvel", qvel, self.nv), ("act", act, self.na)):
+                more = np.zeros(size) if values is None else self._array(name, values, size)
+                x = np.concatenate([x, np.broadcast_to(more, (*shape, size))], -1)
         return torch.from_numpy(x)
 
     def to_mujoco(self, x: Tensor) -> tuple[Array, Array]:
         """Convert states (..., n_x) to `qpos` (..., nq) and `qvel` (..., nv), zero where the state has none.
+
+        The `act` of MuJoCo are the last `na` numbers of the state.
 
         Raises:
             DTypeError, ShapeError, NonFiniteError: not such states.
@@ -141,11 +152,13 @@ class MujocoState:
         qpos[..., self._of_qpos] = numbers[..., self._of_state]
         for q, v in self._turning:
             qpos[..., q : q + 4] = _multiply(qpos[..., q : q + 4], _quaternion(numbers[..., v : v + 3]))
-        velocity = numbers[..., self.nv :] if self.velocities else np.zeros((*numbers.shape[:-1], self.nv))
+        velocity = np.zeros((*numbers.shape[:-1], self.nv))
+        if self.velocities:
+            velocity = numbers[..., self.nv : 2 * self.nv]
         return qpos, velocity
 
     def tangent(self, x: Array) -> Array | None:
-        """T (..., nv, nv) of qvel = T ẋ, for positions x (..., nv); None, without quaternions, for the identity.
+        """T (..., nv, nv) of qvel = T ẋ, for positions x (..., nv); None for the identity, where nothing has turned.
 
         The block of a rotation vector is the right Jacobian of SO(3): 1 − (1 − cos r)/r² [r]× + (r − sin r)/r³ [r]×².
         Its smallest singular value is 2 sin(r/2)/r, as far as which a rotation about another axis moves r.
@@ -153,7 +166,7 @@ class MujocoState:
         Raises:
             InvalidInputError: a rotation is so near to whole turns that no system in these coordinates is of use.
         """
-        if not self._turning:
+        if not any(x[..., v : v + 3].any() for _, v in self._turning):
             return None
         T = np.broadcast_to(np.eye(self.nv), (*x.shape[:-1], self.nv, self.nv)).copy()
         for _, v in self._turning:

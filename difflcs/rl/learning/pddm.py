@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import check_positive_int
-from difflcs.cost import GoalCost
+from difflcs.cost import CostModule, GoalCost, cost_at
 from difflcs.errors import InvalidInputError
 from difflcs.rl.learning.dynamics import Ensemble, EnsembleSettings
 from difflcs.rl.learning.state import State
@@ -85,7 +85,9 @@ class Planner:
         u_max: (n_u,) upper bounds.
     """
 
-    def __init__(self, ensemble: Ensemble, cost: GoalCost, settings: PDDMSettings, u_min: Tensor, u_max: Tensor):
+    def __init__(
+        self, ensemble: Ensemble, cost: GoalCost | CostModule, settings: PDDMSettings, u_min: Tensor, u_max: Tensor
+    ):
         self.ensemble, self.cost, self.settings = ensemble, cost, settings
         self.u_min, self.u_max = u_min, u_max
         self.begin()
@@ -135,8 +137,9 @@ class Planner:
 
     def _costs(self, x0: Tensor, goal: Tensor, actions: Tensor) -> Tensor:
         """(samples,) cost of action sequences, averaged over the ensemble; infinite where a prediction overflows."""
-        cost = {name: value.float() for name, value in self.cost(goal).fields().items()}
-        x = self.ensemble.rollout(x0.float(), actions)[..., : self.cost.n_x]  # (networks, samples, horizon + 1, n_x)
+        found = self.cost(goal) if isinstance(self.cost, GoalCost) else cost_at(self.cost, x0, goal)
+        cost = {name: value.float() for name, value in found.fields().items()}
+        x = self.ensemble.rollout(x0.float(), actions)[..., : found.n_x]  # (networks, samples, horizon + 1, n_x)
         stages = _quadratic(x[..., :-1, :], cost["Q"], cost["q"]) + _quadratic(actions, cost["R"], cost["r"])
         total = stages.sum(-1) + _quadratic(x[..., -1, :], cost["Q_final"], cost["q_final"])
         return total.mean(0).nan_to_num(nan=3e38, posinf=3e38).clamp_max(1e30)
@@ -183,7 +186,7 @@ class PDDM(Trainer):
 
     def __init__(
         self,
-        cost: GoalCost,
+        cost: Any,
         env: VectorEnv,
         settings: PDDMSettings,
         seed: int,

@@ -28,7 +28,7 @@ from difflcs.errors import DiffLCSError
 from difflcs.mpc.problem import INPUTS
 from tests.conformance.hostile import checks
 from tests.conformance.hostile.targets import REFUSED, Outcome, quiet, refused_one_by_one
-from tests.conformance.varied import linear
+from tests.conformance.varied import programs
 from tests.conformance.varied.generators import RANKS, Case, random_case
 from tests.conformance.varied.judges import conditions, objective, rows
 
@@ -294,7 +294,7 @@ def _judge(form: Form, status, x, u, lam, mu, cost, violation) -> checks.Ratios:
         worst = np.maximum(np.where(np.isfinite(c), c, 0.0), 0.0).max(initial=0.0)
         room = 1e-9 * (1e-9 + np.where(np.isfinite(size), size, 0.0).max(initial=0.0))
         put("violation", i, abs(worst - violation[i]) / room)
-        if lam.shape[-1] == 0 and (gap := linear.above_optimum(case, i, u[i])) is not None:
+        if lam.shape[-1] == 0 and (gap := programs.above_optimum(case, i, u[i])) is not None:
             put("optimum of a linear program", i, gap / 1e-6)
     return found
 

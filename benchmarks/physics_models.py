@@ -1,0 +1,218 @@
+"""Models by others, one step of `MujocoLCS` against MuJoCo: `python benchmarks/physics_models.py [--packages DIR ...]`.
+
+The models are the scenes of dm_control, gymnasium, gymnasium-robotics, robosuite, metaworld and judo-rai: packages that
+are installed, or that lie in a folder (`pip install --target DIR --no-deps gymnasium-robotics metaworld ...`). For each
+model: is it accepted, and if not, why; how far the velocity after one step of 20 ms is from MuJoCo's, in parts of the
+change of velocity, so that doing nothing has an error of 1. States are along a random motion, actions are random within
+the ranges of the actuators and within `action_bounds`. Medians are told for states that move freely, that have a
+contact, or where a joint or tendon is at its limit in this step. Beside them are those of differences: MuJoCo's own
+steps with the nominal control, linearised at each by `mjd_transitionFD`, contacts included.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import time
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+import tyro
+
+from difflcs.cli.bench import machine, save
+from difflcs.errors import DiffLCSError
+from difflcs.physics.mujoco import MujocoLCS
+
+SECONDS = 0.02  # of a step
+MODELS = {  # package → its scenes; what does not load alone, or has no joint, is a part of others
+    "dm_control": ["suite/*.xml"],
+    "gymnasium": ["envs/mujoco/assets/*.xml"],
+    "gymnasium_robotics": [
+        "envs/assets/adroit_hand/adroit_*.xml",
+        "envs/assets/fetch/*.xml",
+        "envs/assets/hand/manipulate_*[!s].xml",
+        "envs/assets/hand/reach.xml",
+        "envs/assets/kitchen_franka/kitchen_assets/kitchen_env_model.xml",
+        "envs/assets/point/point.xml",
+    ],
+    "judo": ["models/xml/*.xml"],
+    "metaworld": ["assets/sawyer_xyz/*.xml"],
+    "robosuite": [
+        "models/assets/robots/*/robot.xml",
+        "models/assets/grippers/*.xml",
+        "models/assets/objects/door*.xml",
+    ],
+}
+LIMITS = (mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT, mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON)
+CONTACTS = tuple(
+    getattr(mujoco.mjtConstraint, f"mjCNSTR_CONTACT_{name}") for name in ("FRICTIONLESS", "PYRAMIDAL", "ELLIPTIC")
+)
+
+
+@dataclass
+class Options:
+    """Refusals, errors of one step and times on models by others."""
+
+    packages: tuple[Path, ...] = ()
+    """Folders with packages, besides those that are installed."""
+    only: str = ""
+    """Part of the name of the models that count."""
+    states: int = 60
+    """States of a model."""
+    seed: int = 0
+    """Seed of motions and controls."""
+    out: Path = Path("benchmarks/results/physics_models.json")
+    """Where the JSON goes."""
+
+
+def find(packages: tuple[Path, ...]) -> dict[str, tuple[Path, ...]]:
+    """Files by package."""
+    found = {}
+    for package, patterns in MODELS.items():
+        roots = [folder / package for folder in packages if (folder / package).is_dir()]
+        spec = None if roots else importlib.util.find_spec(package)
+        roots = roots or [Path(place) for place in (spec.submodule_search_locations if spec else None) or ()]
+        found[package] = tuple(sorted(path for root in roots for p in patterns for path in root.glob(p)))
+    return found
+
+
+def draw(model: Any, data: Any, random: np.random.Generator) -> np.ndarray:
+    """Random controls: in their ranges, or of servos near to where these are."""
+    low, high = model.actuator_ctrlrange.T
+    near = np.where(model.actuator_biasprm[:, 1] < 0, data.actuator_length, 0.0) + random.normal(size=model.nu) * 0.3
+    return np.where(model.actuator_ctrllimited, random.uniform(low, np.maximum(high, low)), near)
+
+
+def roam(model: Any, count: int, random: np.random.Generator) -> list[tuple[np.ndarray, ...]]:
+    """States (qpos, qvel, act) along random motions of two seconds, one each tenth of a second."""
+    data, states = mujoco.MjData(model), []
+    steps = max(1, round(0.1 / model.opt.timestep))
+    for _ in range(4 * count):
+        if not 0 < data.time < 2.5:
+            mujoco.mj_resetData(model, data)
+            qpos = data.qpos.copy()
+            mujoco.mj_integratePos(model, qpos, random.normal(size=model.nv) * 0.05, 1.0)
+            data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+        data.ctrl[:] = draw(model, data, random)
+        mujoco.mj_step(model, data, steps)
+        if data.warning.number.any():
+            data.warning.number[:] = 0
+            mujoco.mj_resetData(model, data)
+        elif data.time > 0.25:
+            states.append((data.qpos.copy(), data.qvel.copy(), data.act.copy()))
+        if len(states) == count:
+            break
+    return states
+
+
+class Simulated:
+    """One step in MuJoCo from a state.
+
+    Attributes:
+        after: (nv,) velocities.
+        kind: "free", "contact" or "limit".
+    """
+
+    def __init__(self, model: Any, state: tuple[np.ndarray, ...], ctrl: np.ndarray, linearise: bool = False):
+        data, nv = mujoco.MjData(model), model.nv
+        data.qpos[:], data.qvel[:], data.act[:] = state
+        data.ctrl[:] = ctrl
+        self.kind, self.by_ctrl = "free", np.zeros((2 * nv + model.na, model.nu))
+        A, B = np.zeros((len(self.by_ctrl), len(self.by_ctrl))), np.zeros_like(self.by_ctrl)
+        for _ in range(max(1, round(SECONDS / model.opt.timestep))):
+            if linearise:
+                mujoco.mjd_transitionFD(model, data, 1e-6, 1, A, B, None, None)
+                self.by_ctrl = A @ self.by_ctrl + B
+            mujoco.mj_step(model, data)
+            active = data.efc_type[data.efc_force != 0]
+            if np.isin(active, LIMITS).any():
+                self.kind = "limit"
+            elif self.kind == "free" and np.isin(active, CONTACTS).any():
+                self.kind = "contact"
+        self.after = data.qvel.copy()
+
+
+def median(values: list[float]) -> float | None:
+    """None where there are none."""
+    return float(np.median(values)) if values else None
+
+
+@torch.no_grad()
+def measure(model: Any, o: Options) -> dict[str, Any]:
+    """Errors by kind, and the time of a state."""
+    module = MujocoLCS(model, motion="dynamic", seconds=SECONDS)
+    random, nv = np.random.default_rng(o.seed), model.nv
+    states = roam(model, o.states, random)
+    x = torch.stack([module.state.to_state(*state) for state in states])
+    data, ctrl, nominal = mujoco.MjData(model), [], []
+    for state, low, high in zip(states, *(v.numpy() for v in module.action_bounds(x)), strict=True):
+        data.qpos[:], data.qvel[:] = state[:2]
+        mujoco.mj_fwdPosition(model, data)
+        here = module.state.to_state(*state)
+        zero = module.control(here, torch.zeros(model.nu, dtype=torch.float64)).numpy()
+        ctrl.append(np.clip(draw(model, data, random), zero + low, zero + high))
+        nominal.append(zero)
+    zeros, actions = torch.tensor(np.array(nominal)), torch.tensor(np.array(ctrl))
+    start = time.process_time()
+    system = module.params(x)
+    seconds = (time.process_time() - start) / len(x)
+    predicted = system.step(x, actions - zeros).x_next[:, nv : 2 * nv].numpy()
+    errors: dict[str, dict[str, list[float]]] = {kind: {"lcs": [], "fd": []} for kind in ("free", "contact", "limit")}
+    for i, state in enumerate(states):
+        true = Simulated(model, state, ctrl[i])
+        change = np.linalg.norm(true.after - state[1])
+        if change < 1e-6 or not np.isfinite(change):
+            continue
+        base = Simulated(model, state, nominal[i], linearise=True)
+        differences = base.after + (base.by_ctrl @ (ctrl[i] - nominal[i]))[nv : 2 * nv]
+        for name, velocity in (("lcs", predicted[i]), ("fd", differences)):
+            errors[true.kind][name].append(float(np.linalg.norm(velocity - true.after) / change))
+    told = {kind: {"states": len(v["lcs"]), **{n: median(e) for n, e in v.items()}} for kind, v in errors.items()}
+    return {"ms": 1e3 * seconds, "n_x": module.n_x, "n_u": module.n_u, "n_lam": module.n_lam, **told}
+
+
+def main(o: Options) -> None:
+    """Measure, print, write."""
+    torch.set_num_threads(1)
+    results: dict[str, dict[str, Any]] = {}
+    for package, paths in find(o.packages).items():
+        for path in paths:
+            name = f"{package}/{path.parent.name if path.stem == 'robot' else path.stem}"
+            if o.only not in name:
+                continue
+            try:
+                model = mujoco.MjModel.from_xml_path(str(path))
+            except ValueError:
+                continue
+            if not model.nv:
+                continue
+            with warnings.catch_warnings(record=True) as said:
+                warnings.simplefilter("always")
+                try:
+                    row = measure(model, o)
+                except DiffLCSError as error:
+                    row = {"refused": str(error)}
+            row |= {"warnings": sorted({str(w.message) for w in said})}
+            results[name] = row
+            print(name, row.get("refused") or describe(row), flush=True)
+    options = {"states": o.states, "seed": o.seed, "seconds": SECONDS}
+    save(o.out, {"machine": {**machine(), "mujoco": mujoco.__version__}, "options": options, "results": results})
+
+
+def describe(row: dict[str, Any]) -> str:
+    """One line of a model."""
+    kinds = (
+        f"{kind} {v['lcs']:.2f} ({v['fd']:.2f}; {v['states']})"
+        for kind in ("free", "contact", "limit")
+        if (v := row[kind])["states"]
+    )
+    return f"{row['ms']:.2f} ms  n_lam {row['n_lam']}  " + "  ".join(kinds)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

@@ -1,0 +1,266 @@
+"""In-hand turning by an Allegro hand: `python benchmarks/scoreboard/inhand.py --assets DIR --episodes 20 --json`.
+
+Task and models are those of Jin (github.com/asu-iris/Complementarity-Free-Dexterous-Manipulation, 17 objects, 96.5 %
+over all its tasks) and of IMPACT (github.com/JonasPflaume/IMPACT, MIT, 155 of 170), whose folders `xmls` and `assets`
+DIR has to contain; or set DIFFLCS_INHAND_DIR. An object lies on the palm, its place normally distributed by 5 mm, its
+yaw uniform in ±90°; the goal is 90° of yaw away, to either side. A decision moves the targets of 16 joint servos by
+at most 0.1 rad, 0.2 rad for objects of 100 g, from where the joints are, and holds them for 50 steps of 2 ms.
+
+- Success, in both papers: 1 − (q·goal)² < 0.04, which is 23°, after each of 20 decisions in a row. With `--position`
+  the object has to be within 2 cm of its target place as well.
+- Failure: 500 decisions, or the object's centre below 5 mm.
+
+The controller knows model and state. It has one set of settings for all objects, chosen with seeds below 1000; final
+figures are of seeds 5000 and up. Times are CPU times of one core. With `--out FILE` episodes that are in the file are
+not played again: after a change of the controller begin another file.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import time
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+import tyro
+from successes import success_figures
+
+from difflcs import LCSMPCLayer
+from difflcs.errors import ContactWarning, InvalidInputError
+from difflcs.mpc.backends import BatchedBackend
+from difflcs.physics.mujoco import ContactGroup, Distance, Effort, MujocoCost, MujocoLCS, Orientation, Position
+from difflcs.status import solved
+
+OBJECTS = {  # place of the start [m], its height, and the target place, as published
+    "airplane": ((-0.03, -0.01), 0.03, (-0.02, -0.01, 0.03)),
+    "binoculars": ((-0.03, 0.0), 0.04, (-0.01, 0.0, 0.04)),
+    "bowl": ((-0.03, 0.0), 0.04, (-0.03, -0.01, 0.04)),
+    "bunny": ((-0.03, 0.0), 0.04, (0.0, 0.0, 0.04)),
+    "camera": ((-0.03, 0.0), 0.04, (-0.01, 0.0, 0.04)),
+    "can": ((-0.02, 0.0), 0.04, (-0.01, 0.0, 0.06)),
+    "cube": ((-0.03, -0.01), 0.04, (-0.01, 0.0, 0.05)),
+    "cup": ((-0.03, 0.0), 0.03, (0.0, 0.0, 0.03)),
+    "elephant": ((-0.02, 0.0), 0.04, (-0.01, 0.0, 0.04)),
+    "foambrick": ((-0.01, 0.0), 0.04, (-0.01, 0.0, 0.04)),
+    "mug": ((0.0, 0.0), 0.04, (0.0, 0.0, 0.04)),
+    "piggy_bank": ((0.0, 0.0), 0.04, (0.0, 0.0, 0.04)),
+    "rubber_duck": ((-0.02, 0.0), 0.05, (0.0, 0.0, 0.05)),
+    "stick": ((-0.01, 0.0), 0.03, (-0.01, 0.0, 0.03)),
+    "teapot": ((-0.02, 0.0), 0.05, (0.0, 0.0, 0.05)),
+    "torus": ((-0.02, 0.0), 0.04, (0.0, 0.0, 0.04)),
+    "water_bottle": ((-0.02, 0.0), 0.06, (0.0, 0.0, 0.06)),
+}
+JOINTS = (0.125, 1.13, 1.45, 1.24, -0.02, 0.445, 1.17, 1.5, -0.459, 1.54, 1.11, 1.23, 0.638, 1.85, 1.5, 1.26)
+FINGERS, LINKS = ("ff", "mf", "rf", "th"), ("base", "proximal", "medial", "distal", "tip")
+LIMIT, HELD, SUBSTEPS, LOST = 500, 20, 50, 0.005
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Of the controller, the same for all objects."""
+
+    horizon: int = 4
+    palm: int = 3
+    """Contacts of the object with the palm."""
+    finger: int = 2
+    """Contacts of the object with each finger."""
+    fingers: int = 4
+    """Contacts of fingers with each other."""
+    friction: float = 0.5
+    inertia: float = 5.0
+    """Factor of the inertia of rotation."""
+    compliance: float = 0.1
+    relaxation: float = 1e-3
+    place: float = 1000.0
+    height: float = 1.0
+    """Factor of `place` for the vertical."""
+    turn: float = 18.75
+    reach: float = 1.6
+    near: float = 1.0
+    """Weight of the distances of object and fingertips."""
+    effort: float = 0.2
+    solver: str = "fast"
+
+
+@dataclass
+class Options:
+    """In-hand turning with an Allegro hand."""
+
+    assets: Path = Path(os.environ.get("DIFFLCS_INHAND_DIR", "."))
+    """Folder with the published `xmls` and `assets`."""
+    objects: str = "all"
+    """Names with commas; all: those that are there."""
+    episodes: int = 20
+    """Episodes of each object, of seeds `seed`, `seed` + 1, …"""
+    seed: int = 0
+    """Seed of the first episode."""
+    position: bool = False
+    """Success needs the position as well, within 2 cm."""
+    json: bool = False
+    """Print a line of JSON for each object and for all."""
+    out: Path | None = None
+    """Where episodes are recorded, a line of JSON each; nowhere if not given."""
+    settings: Settings = field(default_factory=Settings)
+
+
+def yaw_quaternion(angle: float) -> np.ndarray:
+    """Quaternion of a turn about the vertical."""
+    return np.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
+
+
+def make_task(folder: Path, name: str, seed: int) -> tuple[Any, Any, np.ndarray, np.ndarray]:
+    """Model, data at the start, target place and target quaternion, drawn as the papers draw them."""
+    random = np.random.RandomState(100 + seed)
+    start, height, place = OBJECTS[name]
+    xy = np.array(start) + 0.005 * random.randn(2)
+    yaw = np.pi * random.rand() - np.pi / 2
+    goal = yaw_quaternion(yaw + random.choice([-np.pi / 2, np.pi / 2]))
+    model = mujoco.MjModel.from_xml_path(str(folder / "xmls" / f"env_allegro_{name}.xml"))
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.concatenate([JOINTS, xy, [height], yaw_quaternion(yaw)])
+    mujoco.mj_forward(model, data)
+    return model, data, np.array(place), goal
+
+
+class HandPolicy:
+    """Contact MPC: a quasi-dynamic system and a cost in task space, both linearised where hand and object are."""
+
+    def __init__(self, model: Any, data: Any, place: np.ndarray, goal: np.ndarray, settings: Settings):
+        s = settings
+        model = copy.copy(model)
+        model.body_inertia[model.body("obj").id] *= s.inertia
+        self.limit = 0.1 if model.body("obj").mass[0] < 0.05 else 0.2
+        self.module = MujocoLCS(
+            model,
+            data,
+            motion="quasi-dynamic",
+            contacts=[
+                ContactGroup(("obj", "palm"), s.palm),
+                *(ContactGroup([("obj", f"{f}_{link}") for link in LINKS], s.finger) for f in FINGERS),
+                ContactGroup(None, s.fingers, friction=False, distance=0.006),
+            ],
+            distance=0.03,
+            friction=s.friction,
+            compliance=s.compliance,
+            length=0.02,
+        )
+        tips = [Distance("obj", f"ftp_{i}", weight=s.near, weight_final=0.0) for i in range(4)]
+        place_weight = [s.place, s.place, s.place * s.height]
+        self.cost = MujocoCost(
+            self.module,
+            [
+                Position("body:obj", place, weight=0.0, weight_final=place_weight),
+                Orientation("body:obj", goal, weight=0.0, weight_final=s.turn, reach=s.reach),
+                *tips,
+                Effort(s.effort),
+            ],
+        )
+        backend = BatchedBackend(effort=s.solver, threads=1)
+        self.mpc = LCSMPCLayer(
+            self.module, self.cost, s.horizon, -self.limit, self.limit, backend, s.relaxation, "mask"
+        )
+        self.guess, self.times = None, []
+
+    def act(self, data: Any) -> np.ndarray:
+        """MuJoCo's ctrl for the next 0.1 s."""
+        marks = [time.thread_time()]
+        x = self.module.observe(data)
+        system = self.module.params(x)
+        marks.append(time.thread_time())
+        cost = self.cost.at(x)
+        marks.append(time.thread_time())
+        with torch.no_grad():
+            plan = self.mpc(x, lcs=system, cost=cost, guess=self.guess)
+        marks.append(time.thread_time())
+        self.times.append(1e3 * np.diff(marks))
+        self.guess = plan.shift() if bool(solved(plan.status)) else None
+        return self.module.control(x, plan.action).numpy()
+
+
+def play(o: Options, name: str, seed: int) -> dict[str, Any]:
+    """One episode."""
+    model, data, place, goal = make_task(o.assets, name, seed)
+    policy, held, lost, steps = HandPolicy(model, data, place, goal, o.settings), 0, False, 0
+    while held < HELD and not lost and steps < LIMIT:
+        data.ctrl[:] = policy.act(data)
+        mujoco.mj_step(model, data, SUBSTEPS)
+        wrong = 1 - float(data.qpos[-4:] @ goal) ** 2
+        apart = float(np.linalg.norm(data.qpos[-7:-4] - place))
+        held = held + 1 if wrong < 0.04 and (apart < 0.02 or not o.position) else 0
+        lost, steps = bool(data.qpos[-5] < LOST), steps + 1
+    return {
+        "object": name,
+        "seed": seed,
+        "success": held == HELD,
+        "dropped": lost,
+        "steps": steps,
+        "position_mm": 1e3 * apart,
+        "angle_deg": 2 * np.degrees(np.arcsin(np.sqrt(np.clip(wrong, 0, 1)))),
+        "milliseconds": np.mean(policy.times, 0).tolist(),
+        "all_milliseconds": np.round(np.sum(policy.times, 1), 2).tolist(),
+    }
+
+
+def figures(episodes: list[dict[str, Any]]) -> dict[str, Any]:
+    """Figures of episodes; place, angle and steps are medians and means of successful ones."""
+    good = [e for e in episodes if e["success"]] or episodes
+    parts = np.average([e["milliseconds"] for e in episodes], 0, [e["steps"] for e in episodes])
+    return {
+        **success_figures(np.array([e["success"] for e in episodes], float)),
+        "dropped": sum(e["dropped"] for e in episodes),
+        "mean_steps": float(np.mean([e["steps"] for e in good])),
+        "position_mm": float(np.median([e["position_mm"] for e in good])),
+        "angle_deg": float(np.median([e["angle_deg"] for e in good])),
+        "milliseconds_per_step": dict(zip(("system", "cost", "solve"), parts.round(2).tolist(), strict=True)),
+        "milliseconds_p99": float(np.percentile(np.concatenate([e["all_milliseconds"] for e in episodes]), 99)),
+    }
+
+
+def main(o: Options) -> None:
+    """Play, print, record."""
+    there = [name for name in OBJECTS if (o.assets / "xmls" / f"env_allegro_{name}.xml").exists()]
+    names = there if o.objects == "all" else o.objects.split(",")
+    if not names or set(names) - set(there):
+        raise InvalidInputError(
+            f"objects: expected some of {', '.join(there) or 'nothing'}, whose files are in {o.assets}, got "
+            f"{o.objects!r}; pass --assets DIR with the published xmls/env_allegro_*.xml"
+        )
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore", ContactWarning)
+    lines = o.out.read_text().splitlines() if o.out is not None and o.out.exists() else []
+    known = {(e["object"], e["seed"]): e for e in map(json.loads, lines)}
+    for name in names:
+        for seed in range(o.seed, o.seed + o.episodes):
+            if (name, seed) not in known:
+                known[name, seed] = play(o, name, seed)
+                if o.out is not None:
+                    with o.out.open("a") as file:
+                        file.write(json.dumps(known[name, seed]) + "\n")
+        report(o, name, [known[name, seed] for seed in range(o.seed, o.seed + o.episodes)])
+    report(o, "all", [known[name, o.seed + i] for name in names for i in range(o.episodes)])
+
+
+def report(o: Options, name: str, episodes: list[dict[str, Any]]) -> None:
+    """Print the figures of some episodes."""
+    found = figures(episodes)
+    if o.json:
+        print(json.dumps({"object": name, **found}), flush=True)
+        return
+    print(
+        f"{name}: {100 * found['success_rate']:.1f} % of {found['episodes']} ({100 * found['ci_low']:.1f} to "
+        f"{100 * found['ci_high']:.1f}), {found['dropped']} dropped, {found['mean_steps']:.0f} steps, "
+        f"{found['position_mm']:.0f} mm, {found['angle_deg']:.0f}°, ms {found['milliseconds_per_step']}, p99 "
+        f"{found['milliseconds_p99']:.0f}",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

@@ -1,0 +1,54 @@
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+class Library:
+    def __init__(self, addresses: Mapping[str, Any], kinds: int, stride: int) -> None: ...
+
+class Scene:
+    def __init__(self, fields: Mapping[str, Any]) -> None: ...
+
+class Place:
+    def __init__(self, fields: Mapping[str, Any]) -> None: ...
+
+class Motion:
+    def __init__(self, fields: Mapping[str, Any]) -> None: ...
+
+def find_contacts(
+    library: Library,
+    scene: Scene,
+    places: Sequence[Place],
+    qpos: np.ndarray,
+    within: np.ndarray,
+    gap: np.ndarray,
+    normal: np.ndarray,
+    tangent: np.ndarray,
+    friction: np.ndarray,
+    geom: np.ndarray,
+    near: np.ndarray,
+) -> tuple[int, int, str]: ...
+def read_motion(
+    library: Library,
+    motion: Motion,
+    places: Sequence[Place],
+    state: np.ndarray,
+    ctrl: np.ndarray,
+    middle: np.ndarray,
+    acceleration: np.ndarray,
+    A: np.ndarray,
+    B: np.ndarray,
+    inverse_mass: np.ndarray,
+    nominal: np.ndarray,
+    reached: np.ndarray,
+) -> tuple[int, int, str]: ...
+def solve_soft(
+    J: np.ndarray,
+    R: np.ndarray,
+    q: np.ndarray,
+    compliance: float,
+    low: np.ndarray,
+    high: np.ndarray,
+    threads: int,
+    force: np.ndarray,
+) -> int: ...

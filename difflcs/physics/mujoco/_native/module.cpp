@@ -1,0 +1,268 @@
+// Contacts and motion of many states of a MuJoCo model, on threads (nanobind). Python hands over addresses and checked
+// arrays.
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include <atomic>
+#include <stdexcept>
+#include <system_error>
+#include <thread>
+
+#include "finder.hpp"
+#include "motion.hpp"
+#include "soft.hpp"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace {
+
+using namespace difflcs::physics;
+
+template <class T>
+using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
+
+template <class T>
+T at(const nb::dict& fields, const char* name) {
+  return reinterpret_cast<T>(nb::cast<std::uintptr_t>(fields[name]));
+}
+
+template <class T>
+T value(const nb::dict& fields, const char* name) {
+  return nb::cast<T>(fields[name]);
+}
+
+Library make_library(const nb::dict& f, int kinds, int stride) {
+  Library library{};
+  library.kinematics = at<Act>(f, "mj_kinematics");
+  library.com_pos = at<Act>(f, "mj_comPos");
+  library.fwd_position = at<Act>(f, "mj_fwdPosition");
+  library.distance = at<Distance>(f, "mj_geomDistance");
+  library.solve_mass = at<Solve>(f, "mj_solveM");
+  library.forward = at<Forward>(f, "mj_forwardSkip");
+  library.runge_kutta = at<RungeKutta>(f, "mj_RungeKutta");
+  library.difference = at<Difference>(f, "mj_differentiatePos");
+  library.transition = at<Transition>(f, "mjd_transitionFD");
+  library.collide = at<const Collide*>(f, "mjCOLLISIONFUNC");
+  library.kinds = kinds;
+  library.stride = stride;
+  library.on_error = at<OnError*>(f, "mju_user_error");
+  library.clock = at<void**>(f, "mjcb_time");
+  return library;
+}
+
+Scene make_scene(const nb::dict& f) {
+  Scene s{};
+  s.nq = value<int>(f, "nq");
+  s.nv = value<int>(f, "nv");
+  s.plane = value<int>(f, "plane");
+  s.tangents = value<int>(f, "tangents");
+  const auto axis = value<std::vector<double>>(f, "axis");
+  s.planar = !axis.empty();
+  if (s.planar) s.axis = load(axis.data());
+  const auto radius = value<Array<const double>>(f, "radius"), box = value<Array<const double>>(f, "box");
+  const auto kind = value<Array<const int64_t>>(f, "kind"), root = value<Array<const int64_t>>(f, "root");
+  const auto solid = value<Array<const int64_t>>(f, "solid");
+  const auto moves = value<Array<const bool>>(f, "moves");
+  s.ngeom = static_cast<int>(radius.shape(0));
+  for (int g = 0; g < s.ngeom; g++) {
+    const double* around = box.data() + 6 * g;
+    const bool* row = moves.data() + static_cast<int64_t>(s.nv) * g;
+    s.geoms.push_back({radius.data()[g],
+                       static_cast<int>(kind.data()[g]),
+                       static_cast<int>(root.data()[g]),
+                       load(around),
+                       load(around + 3),
+                       static_cast<int>(solid.data()[g]),
+                       {row, row + s.nv}});
+  }
+  for (nb::handle each : value<nb::list>(f, "solids")) {
+    const auto fields = nb::cast<nb::dict>(each);
+    s.solids.push_back({value<bool>(fields, "round"), value<double>(fields, "cap"), value<double>(fields, "radius"),
+                        value<double>(fields, "half"), value<std::vector<int>>(fields, "counts"),
+                        value<std::vector<double>>(fields, "corners"), value<std::vector<double>>(fields, "outward")});
+  }
+  const auto geoms = value<Array<const int64_t>>(f, "geoms");
+  const auto flags = value<Array<const bool>>(f, "flags");
+  const auto numbers = value<Array<const double>>(f, "numbers");
+  for (size_t p = 0; p < geoms.shape(0); p++) {
+    const int64_t* of = geoms.data() + 2 * p;
+    const bool* flag = flags.data() + 3 * p;
+    s.pairs.push_back({static_cast<int>(of[0]), static_cast<int>(of[1]), flag[0], flag[1], flag[2],
+                       numbers.data()[2 * p], numbers.data()[2 * p + 1]});
+  }
+  for (const auto& [begin, end, count, distance] : value<std::vector<std::tuple<int, int, int, double>>>(f, "groups"))
+    s.groups.push_back({begin, end, count, distance});
+  return s;
+}
+
+Place make_place(const nb::dict& f) {
+  Place p{};
+  p.model = at<const void*>(f, "model");
+  p.data = at<void*>(f, "data");
+  p.qpos = at<double*>(f, "qpos");
+  p.qvel = at<double*>(f, "qvel");
+  p.act = at<double*>(f, "act");
+  p.ctrl = at<double*>(f, "ctrl");
+  p.geom_xpos = at<double*>(f, "geom_xpos");
+  p.ccd_tolerance = at<double*>(f, "ccd_tolerance");
+  p.geom_xmat = at<const double*>(f, "geom_xmat");
+  p.cdof = at<const double*>(f, "cdof");
+  p.subtree_com = at<const double*>(f, "subtree_com");
+  p.actuator_length = at<const double*>(f, "actuator_length");
+  p.qacc = at<const double*>(f, "qacc");
+  p.act_dot = at<const double*>(f, "act_dot");
+  p.warnings = at<const int32_t*>(f, "warnings");
+  p.kinds = value<int>(f, "kinds");
+  p.stride = value<int>(f, "stride");
+  return p;
+}
+
+Motion make_motion(const nb::dict& f) {
+  Motion m{};
+  m.simulated = at<const void*>(f, "simulated");
+  m.linearised = at<const void*>(f, "linearised");
+  m.advance = at<Act>(f, "advance");
+  m.nq = value<int>(f, "nq");
+  m.nv = value<int>(f, "nv");
+  m.nu = value<int>(f, "nu");
+  m.na = value<int>(f, "na");
+  m.steps = value<int>(f, "steps");
+  for (auto [name, into] :
+       {std::pair{"gain", &m.gain}, {"constant", &m.constant}, {"bias", &m.bias}, {"low", &m.low}, {"high", &m.high}})
+    *into = value<std::vector<double>>(f, name);
+  for (auto [name, into] : {std::pair{"holds", &m.holds}, {"relative", &m.relative}}) {
+    const auto mask = value<std::vector<bool>>(f, name);
+    into->assign(mask.begin(), mask.end());
+  }
+  m.identity.assign(static_cast<size_t>(m.nv) * m.nv, 0.0);
+  for (int v = 0; v < m.nv; v++) m.identity[v * m.nv + v] = 1.0;
+  return m;
+}
+
+// Where MuJoCo said an error or warned: the first state, or −1, the place that it was at, and the error.
+using Outcome = std::tuple<int64_t, int64_t, std::string>;
+
+// Calls work(thread, i) for all i below count, the GIL released, until one of them says false.
+template <class Work>
+void on_threads(size_t threads, int64_t count, Work work) {
+  nb::gil_scoped_release release;
+  std::atomic<int64_t> next{0};
+  std::atomic<bool> stop{false};
+  auto take = [&](size_t thread) {
+    for (int64_t i; !stop && (i = next.fetch_add(1)) < count;)
+      if (!work(thread, i)) stop = true;
+  };
+  std::vector<std::thread> pool;
+  try {
+    for (size_t t = 1; t < threads; t++) pool.emplace_back(take, t);
+  } catch (const std::system_error&) {  // the work is shared by those that run
+  }
+  take(0);
+  for (auto& t : pool) t.join();
+}
+
+// Calls work(place, state) for all states, a thread for each place.
+template <class Work>
+Outcome at_places(const Library& library, const std::vector<const Place*>& places, int64_t states, Work work) {
+  const Errors errors(library);
+  std::vector<std::string> said(states);
+  std::vector<int64_t> failed(states, -1);
+  on_threads(places.size(), states, [&](size_t p, int64_t i) {
+    if (Errors::guarded([&] { work(p, i); }, &said[i]) && !places[p]->has_warned()) return true;
+    failed[i] = static_cast<int64_t>(p);
+    return false;
+  });
+  for (int64_t i = 0; i < states; i++)
+    if (failed[i] >= 0) return {i, failed[i], said[i]};
+  return {-1, 0, ""};
+}
+
+void check(bool fits) {
+  if (!fits) throw std::invalid_argument("expected arrays of the sizes of the model, a row for each state");
+}
+
+// Finds the contacts of states qpos (n, nq).
+Outcome find_contacts(const Library& library, const Scene& scene, const std::vector<const Place*>& places,
+                      Array<const double> qpos, Array<const double> within, Array<double> gap, Array<double> normal,
+                      Array<double> tangent, Array<double> friction, Array<int64_t> geom, Array<int64_t> near) {
+  const size_t n = qpos.shape(0), k = scene.contacts(), nv = scene.nv, groups = scene.groups.size();
+  check(qpos.size() == n * scene.nq && gap.size() == n * k && normal.size() == n * k * nv &&
+        tangent.size() == n * k * nv * scene.tangents && friction.size() == n * k && geom.size() == 2 * n * k &&
+        near.size() == n * groups && within.size() == groups && !places.empty());
+  std::vector<Finder> finders;
+  for (const Place* place : places) finders.emplace_back(library, scene, *place);
+  return at_places(library, places, n, [&](size_t p, int64_t i) {
+    const Found into{gap.data() + i * k,      normal.data() + i * k * nv, tangent.data() + i * k * nv * scene.tangents,
+                     friction.data() + i * k, geom.data() + 2 * i * k,    near.data() + i * groups};
+    finders[p].find(qpos.data() + i * scene.nq, within.data(), into);
+  });
+}
+
+// Reads the motion at states (n, nq + nv + na) with nominal controls ctrl (n, nu).
+Outcome read_motion(const Library& library, const Motion& motion, const std::vector<const Place*>& places,
+                    Array<const double> state, Array<const double> ctrl, Array<double> middle,
+                    Array<double> acceleration, Array<double> A, Array<double> B, Array<double> inverse_mass,
+                    Array<double> nominal, Array<double> reached) {
+  const size_t n = state.shape(0), nv = motion.nv, na = motion.na, nu = motion.nu, size = motion.size();
+  check(state.size() == n * (motion.nq + nv + na) && ctrl.size() == n * nu && middle.size() == n * size &&
+        acceleration.size() == n * (nv + na) && A.size() == n * size * size && B.size() == n * size * nu &&
+        inverse_mass.size() == n * nv * nv && nominal.size() == n * nu && reached.size() == n * size &&
+        !places.empty());
+  return at_places(library, places, n, [&](size_t p, int64_t i) {
+    const Linearised into{middle.data() + i * size, acceleration.data() + i * (nv + na), A.data() + i * size * size,
+                          B.data() + i * size * nu, inverse_mass.data() + i * nv * nv,   nominal.data() + i * nu,
+                          reached.data() + i * size};
+    Reader(library, motion, *places[p]).read(state.data() + i * state.shape(1), ctrl.data() + i * nu, into);
+  });
+}
+
+// Forces (n, m) between bounds on the rows J (n, m, nv), where R (n, nv, nv) is the motion by forces. Returns how many
+// problems are not solved.
+int64_t solve_soft(Array<const double> J, Array<const double> R, Array<const double> q, double compliance,
+                   Array<const double> low, Array<const double> high, int threads, Array<double> force) {
+  const size_t n = J.shape(0), m = J.shape(1), nv = J.shape(2);
+  check(R.size() == n * nv * nv && q.size() == n * m && low.size() == n * m && high.size() == n * m &&
+        force.size() == n * m && threads > 0);
+  std::vector<SoftForces> solvers;
+  for (int t = 0; t < threads; t++) solvers.emplace_back(static_cast<int>(m), static_cast<int>(nv));
+  std::atomic<int64_t> missed{0};
+  on_threads(threads, n, [&](size_t thread, int64_t i) {
+    const bool found = solvers[thread].solve(J.data() + i * m * nv, R.data() + i * nv * nv, q.data() + i * m,
+                                             compliance, low.data() + i * m, high.data() + i * m, force.data() + i * m);
+    missed += !found;
+    return true;
+  });
+  return missed;
+}
+
+}  // namespace
+
+NB_MODULE(_mujoco, m) {
+  nb::class_<Library>(m, "Library", "Functions of MuJoCo.")
+      .def(
+          "__init__",
+          [](Library* self, const nb::dict& addresses, int kinds, int stride) {
+            new (self) Library(make_library(addresses, kinds, stride));
+          },
+          "addresses"_a, "kinds"_a, "stride"_a);
+  nb::class_<Scene>(m, "Scene", "Geoms that may touch.")
+      .def("__init__", [](Scene* self, const nb::dict& fields) { new (self) Scene(make_scene(fields)); }, "fields"_a);
+  nb::class_<Place>(m, "Place", "A model and its data, by addresses. They must outlive it.")
+      .def("__init__", [](Place* self, const nb::dict& fields) { new (self) Place(make_place(fields)); }, "fields"_a);
+  nb::class_<Motion>(m, "Motion", "Models that are simulated and linearised, by addresses. They must outlive it.")
+      .def(
+          "__init__", [](Motion* self, const nb::dict& fields) { new (self) Motion(make_motion(fields)); }, "fields"_a);
+  m.def("find_contacts", &find_contacts, "library"_a, "scene"_a, "places"_a, "qpos"_a, "within"_a, "gap"_a, "normal"_a,
+        "tangent"_a, "friction"_a, "geom"_a, "near"_a,
+        "Contacts of many states. Returns where MuJoCo said an error or warned.");
+  m.def("read_motion", &read_motion, "library"_a, "motion"_a, "places"_a, "state"_a, "ctrl"_a, "middle"_a,
+        "acceleration"_a, "A"_a, "B"_a, "inverse_mass"_a, "nominal"_a, "reached"_a,
+        "Motion at many states. Returns where MuJoCo said an error or warned.");
+  m.def("solve_soft", &solve_soft, "J"_a, "R"_a, "q"_a, "compliance"_a, "low"_a, "high"_a, "threads"_a, "force"_a,
+        "Forces between bounds on soft rows. Returns how many problems are not solved.");
+}

@@ -1,0 +1,100 @@
+// Motion of a state without contact: simulated with a nominal control, and linearised half way there.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <vector>
+
+#include "library.hpp"
+
+namespace difflcs::physics {
+
+constexpr double kBeyond = 1e9;  // acceleration of a simulation that diverges and says nothing
+constexpr double kDifference = 1e-6;
+
+// What all states have in common.
+struct Motion {
+  const void* simulated;   // the model, without constraints, with the time step and integrator of the simulation
+  const void* linearised;  // the same with one step of a second of Euler's method: ν + acceleration
+  Act advance;             // one step of the integrator; none: Runge and Kutta's
+  int nq, nv, nu, na, steps;
+  std::vector<double> gain, constant, bias;  // (nu) of actuators that hold a length
+  std::vector<double> low, high;             // (nu) range of controls
+  std::vector<char> holds, relative;         // (nu)
+  std::vector<double> identity;              // (nv, nv)
+
+  int size() const { return 2 * nv + na; }
+};
+
+// One row of each array of `Linearised` in motion.py.
+struct Linearised {
+  double *middle, *acceleration, *A, *B, *inverse_mass, *nominal, *reached;
+};
+
+// Reads the motion at a state of qpos, qvel and act, with nominal controls, NaN where actuators have no force.
+class Reader {
+ public:
+  Reader(const Library& library, const Motion& motion, const Place& place)
+      : library_(library), motion_(motion), place_(place) {}
+
+  void read(const double* state, const double* ctrl, const Linearised& into) const {
+    const Motion& m = motion_;
+    set(state);
+    library_.fwd_position(m.simulated, place_.data);
+    library_.solve_mass(m.simulated, place_.data, into.inverse_mass, m.identity.data(), m.nv);
+    for (int j = 0; j < m.nu; j++) {
+      const double length = place_.actuator_length[j];
+      const double balance = m.holds[j] ? -(m.constant[j] + m.bias[j] * length) / m.gain[j] : 0.0;
+      place_.ctrl[j] = std::clamp(std::isnan(ctrl[j]) ? balance : ctrl[j], m.low[j], m.high[j]);
+      into.nominal[j] = place_.ctrl[j] - (m.relative[j] ? length : 0.0);
+    }
+    simulate(m.steps / 2);
+    forward(m.linearised);
+    if (!std::all_of(place_.qacc, place_.qacc + m.nv, [](double a) { return std::fabs(a) < kBeyond; })) {
+      set(state);
+      forward(m.linearised);
+    }
+    change(state, into.middle);
+    std::copy_n(place_.qacc, m.nv, into.acceleration);
+    std::copy_n(place_.act_dot, m.na, into.acceleration + m.nv);
+    library_.transition(m.linearised, place_.data, kDifference, 0, into.A, into.B, nullptr, nullptr);
+    simulate(m.steps - m.steps / 2);
+    change(state, into.reached);
+  }
+
+ private:
+  void set(const double* state) const {
+    std::copy_n(state, motion_.nq, place_.qpos);
+    std::copy_n(state + motion_.nq, motion_.nv, place_.qvel);
+    std::copy_n(state + motion_.nq + motion_.nv, motion_.na, place_.act);
+  }
+
+  void forward(const void* model) const { library_.forward(model, place_.data, 0, 1); }
+
+  // Without the checks of `mj_step`, which warn of a motion that grows.
+  void simulate(int steps) const {
+    for (int k = 0; k < steps; k++) {
+      forward(motion_.simulated);
+      if (motion_.advance != nullptr) {
+        motion_.advance(motion_.simulated, place_.data);
+      } else {
+        library_.runge_kutta(motion_.simulated, place_.data, 4);
+      }
+    }
+  }
+
+  // Write ζ, ν and the change of activation since `state`.
+  void change(const double* state, double* into) const {
+    const Motion& m = motion_;
+    library_.difference(m.simulated, into, 1.0, state, place_.qpos);
+    std::copy_n(place_.qvel, m.nv, into + m.nv);
+    for (int j = 0; j < m.na; j++) into[2 * m.nv + j] = place_.act[j] - state[m.nq + m.nv + j];
+  }
+
+  const Library& library_;
+  const Motion& motion_;
+  const Place& place_;
+};
+
+}  // namespace difflcs::physics

@@ -1,0 +1,183 @@
+"""Actuators of a MuJoCo model: servos, activation, and limits of control and force."""
+
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from difflcs._checks import broadcast_batch, check_tensor
+from difflcs.errors import InvalidInputError, ShapeError
+
+Array = NDArray[np.float64]
+
+_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
+_SCALAR = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
+_FIXED, _UNBIASED, _AFFINE = (
+    int(v) for v in (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
+)
+_NONE, _INTEGRATOR, _FILTER, _EXACT, _MUSCLE, _USER = DYNAMICS = tuple(
+    int(getattr(mujoco.mjtDyn, f"mjDYN_{name}"))
+    for name in ("NONE", "INTEGRATOR", "FILTER", "FILTEREXACT", "MUSCLE", "USER")
+)
+"""Activation dynamics whose rate does not depend on the time step."""
+
+
+class Actuators:
+    """The actuators of a model: which are position servos on joints, which joints they move, and what limits them.
+
+    Attributes:
+        dof: (nu,) degree of freedom of each actuator on a slide or hinge; −1 for others.
+        gear: (nu,).
+        servo: (nu,) True for a `position` actuator on a slide or hinge.
+        offset: (nu,) at which length a servo rests with ctrl = 0, by the constant part of its bias; 0 for others.
+        holds: (nu,) True if its force falls to zero at some length, as that of servos on joints, tendons or sites does.
+        follows: (nu,) True if it has no activation, or one that goes to its control.
+        activated: (na,) actuator of each activation.
+        range: (2, nu) controls that it takes; infinite where it takes any.
+    """
+
+    def __init__(self, model: Any):
+        joint = model.actuator_trnid[:, 0]
+        on_joint = model.actuator_trntype == _JOINT
+        self.dof = np.full(model.nu, -1)
+        for i in np.flatnonzero(on_joint):
+            if model.jnt_type[joint[i]] in _SCALAR:
+                self.dof[i] = model.jnt_dofadr[joint[i]]
+        self.gear = model.actuator_gear[:, 0].copy()
+        affine = model.actuator_biastype == _AFFINE
+        gain, (constant, bias, damping) = model.actuator_gainprm[:, 0], model.actuator_biasprm.T[:3] * affine
+        dynamics = np.array(model.actuator_dyntype)
+        self.follows = np.isin(dynamics, (_NONE, _FILTER, _EXACT))
+        fixed = (model.actuator_gaintype == _FIXED) & (gain != 0) & self.follows
+        linear = fixed & affine
+        self.servo = (self.dof >= 0) & linear & (np.abs(gain + bias) <= 1e-9 * np.abs(gain))
+        self.holds = linear & (bias != 0)
+        self._gain, self._constant, self._bias, self._damping = np.where(gain != 0, gain, 1.0), constant, bias, damping
+        self.offset = np.where(self.servo, constant / self._gain, 0.0)
+        limited = np.array(model.actuator_ctrllimited, dtype=bool)
+        limited &= not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
+        self.range = np.where(limited, model.actuator_ctrlrange.T, [[-np.inf], [np.inf]])
+        plain = fixed & (dynamics == _NONE) & (affine & (self.dof >= 0) | (model.actuator_biastype == _UNBIASED))
+        self._force = np.where(plain, self._force_limits(model, joint), [[-np.inf], [np.inf]])
+        self._exact = np.flatnonzero(dynamics == _EXACT)
+        self.activated = np.repeat(np.arange(model.nu), model.actuator_actnum)
+        self._decays = dynamics[self.activated] == _EXACT
+        self._time = np.maximum(model.actuator_dynprm[self.activated, 0], 1e-15)
+
+    def _force_limits(self, model: Any, joint: NDArray[np.intp]) -> Array:
+        """Compute the forces (2, nu) that actuators may have, infinite where nothing limits them."""
+        none = np.array([[-np.inf], [np.inf]])
+        force = np.where(np.array(model.actuator_forcelimited, dtype=bool), model.actuator_forcerange.T, none)
+        alone = (self.dof >= 0) & (np.bincount(self.dof + 1, minlength=1)[self.dof + 1] == 1) & (self.gear != 0)
+        for i in np.flatnonzero(alone):
+            if model.jnt_actfrclimited[joint[i]]:
+                low, high = np.sort(model.jnt_actfrcrange[joint[i]] / self.gear[i])
+                force[:, i] = np.maximum(force[0, i], low), np.minimum(force[1, i], high)
+        return force
+
+    def clip(self, ctrl: Array) -> Array:
+        """Controls (nu,) within their range."""
+        return np.clip(ctrl, *self.range)
+
+    def balance(self, length: Array) -> Array:
+        """Controls (nu,) at which actuators that hold a length have no force at these lengths (nu,); 0 for others."""
+        return np.where(self.holds, -(self._constant + self._bias * length) / self._gain, 0.0)
+
+    def yields(self, moved: Array, velocity: Array | float) -> Array:
+        """Part (nu,) of its force that an actuator keeps at the end of a step, as it moves.
+
+        Args:
+            moved: (nv, nv) how far a unit of force moves in a step in which actuators resist.
+            velocity: (nv, nv) the velocity that it brings about.
+        """
+        resists = np.maximum(-self._bias, 0.0)[:, None, None] * moved
+        resists += np.maximum(-self._damping, 0.0)[:, None, None] * velocity
+        lost = self.gear**2 * resists[np.arange(len(self.dof)), self.dof, self.dof]
+        return np.where(self.dof >= 0, np.clip(1 - lost, 0.01, 1.0), 1.0)
+
+    def nominal(self, ctrl: Tensor, batch: torch.Size) -> Array:
+        """Return nominal controls (*batch, nu) as an array.
+
+        Raises:
+            ShapeError and its kinds: controls that do not fit.
+        """
+        check_tensor("ctrl", ctrl, [("n_u", len(self.dof))])
+        if broadcast_batch([("x", batch), ("ctrl", ctrl.shape[:-1])]) != batch:
+            raise ShapeError(
+                f"ctrl: expected one nominal control for each of the states {tuple(batch)}, or one for all, got "
+                f"{tuple(ctrl.shape)}; leave out its batch dimensions, or give x the same"
+            )
+        return ctrl.detach().double().cpu().expand(*batch, len(self.dof)).numpy()
+
+    def _length(self, x: Array) -> Array:
+        """Length (..., nu) of actuators on joints, or its rate, from positions or velocities that x begins with."""
+        return self.gear * x[..., self.dof.clip(0)]
+
+    def bounds(self, x: Array, velocity: Array, yields: Array, relative: bool) -> tuple[Array, Array]:
+        """Actions (..., nu) with controls in their range, and forces in a step within their limits as far as known.
+
+        Args:
+            x: (..., n_x) states, which begin with the positions.
+            velocity: (..., n) likewise.
+            yields: (nu,) what motion leaves of a force, see above.
+            relative: True if actions of servos count from where they are.
+        """
+        length = self._length(x)
+        others = self._constant + self._bias * length + self._damping * self._length(velocity)
+        sides = np.sort([(force / yields - others) / self._gain for force in self._force], axis=0)
+        # Where the range leaves no such force, the control is at its end.
+        low, high = np.clip(sides, *self.range[:, None]) - length * (self.servo & relative)
+        return low, high
+
+    def places(self, x: Array) -> tuple[Array, Array]:
+        """How far joints of servos may go (..., nu) from positions that x begins with, to stay within their range."""
+        moves = np.where(self.servo & (self.gear != 0), self.gear, 1.0)
+        low, high = np.sort([(end + self.offset - self._length(x)) / moves for end in self.range], axis=0)
+        return np.where(self.servo, low, -np.inf), np.where(self.servo, high, np.inf)
+
+    def control(self, x: Tensor, u: Tensor, relative: bool, quasi_static: bool) -> Tensor:
+        """Convert actions u (..., nu) at states x (..., n_x) to controls.
+
+        Raises:
+            InvalidInputError: quasi-static motion by actuators that are no `position` actuators.
+        """
+        if quasi_static and not self.servo.all():
+            raise InvalidInputError(
+                "model: expected position actuators to follow a quasi-static plan, got others; track x + u by your own "
+                "controller"
+            )
+        gear = torch.from_numpy(self.gear).to(u)
+        here = gear * x[..., torch.from_numpy(self.dof).clamp_min(0)]
+        if quasi_static:
+            return here + gear * u - torch.from_numpy(self.offset).to(u)
+        return u + here * torch.from_numpy(self.servo) if relative else u
+
+    def durations(self, seconds: float) -> Array:
+        """Time (na,) by which an activation's rate at the beginning of a time step moves it in this step."""
+        return np.where(self._decays, -self._time * np.expm1(-seconds / self._time), seconds)
+
+    def unlimit_rates(self, model: Any) -> None:
+        """Let activations of a model change by their rates, however long the step, to whatever value."""
+        model.actuator_dyntype[self._exact], model.actuator_actlimited[:], model.actuator_actearly[:] = _FILTER, 0, 0
+
+    def describe_balance(self, relative: NDArray[np.intp]) -> dict[str, list[Any]]:
+        """Describe `balance` and `clip` for the compiled part; actions of `relative` count from where they are."""
+        low, high = self.range
+        numbers = {"gain": self._gain, "constant": self._constant, "bias": self._bias, "low": low, "high": high}
+        masks = {"holds": self.holds, "relative": np.isin(np.arange(len(self.dof)), relative)}
+        return {name: values.tolist() for name, values in (numbers | masks).items()}
+
+
+def disabled_actuators(model: Any) -> NDArray[np.bool_]:
+    """Return a mask (nu,) of actuators that do nothing, by their groups or a flag of the model."""
+    groups = model.actuator_group
+    disabled = (groups >= 0) & (groups < 31) & (model.opt.disableactuator >> groups.clip(0, 30) & 1 > 0)
+    return disabled | bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_ACTUATION))

@@ -1,0 +1,365 @@
+"""Problems that every backend solves, in the terms of the public interface, and what their plans are judged by.
+
+The judges are sums and products that are written out here. A new form of problem is one more function in `PROBLEMS`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from difflcs import (
+    ConstraintSequence,
+    CostSequence,
+    LCSMPCLayer,
+    LCSParams,
+    LCSSequence,
+    LinearConstraints,
+    QuadraticCost,
+    StageBounds,
+    solve_lcp,
+)
+
+LCS, COST = ("A", "B", "C", "d", "D", "E", "F", "c"), ("Q", "R", "S", "Q_final", "q", "r", "q_final")
+BOUNDS, ROWS = ("u_min", "u_max"), ("G", "g", "E_rows", "weight")
+MATRICES = ("A", "B", "C", "D", "E", "F", "Q", "R", "S", "Q_final", "G", "E_rows")
+STAGED = (*LCS, "Q", "R", "S", "q", "r", *BOUNDS, *ROWS)  # all but Q_final, q_final, x0
+HORIZON, INF = 3, float("inf")
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A batch of problems; `staged` names what is given by stage."""
+
+    tensors: dict[str, Tensor]
+    staged: frozenset[str] = frozenset()
+    horizon: int = HORIZON
+    relaxation: float = 1e-4
+    barrier: float = 0.0
+
+    @property
+    def batch(self):
+        return len(self.tensors["x0"])
+
+    def own(self, name):
+        return (2 if name in MATRICES else 1) + (name in self.staged)
+
+    def stages(self, name):
+        return self.horizon + (name in ("G", "g", "weight"))
+
+    def shared(self, name):
+        return self.tensors[name].ndim == self.own(name)
+
+    def each(self):
+        """The same with every input given per element, copied."""
+        full = {k: v.expand(self.batch, *v.shape[v.ndim - self.own(k) :]).clone() for k, v in self.tensors.items()}
+        return dataclasses.replace(self, tensors=full)
+
+    def element(self, i):
+        """Inputs of one element, as a batch of one."""
+        return {k: v if self.shared(k) else v[i : i + 1] for k, v in self.tensors.items()}
+
+    def full(self):
+        """Every input of every element at every stage (batch, stages, …); x0 and what is final without stages."""
+        each, found = self.each().tensors, {"S": torch.zeros(()).double(), "u_min": -INF, "u_max": INF}
+        for k, v in each.items():
+            found[k] = v.unsqueeze(1) if k in STAGED and k not in self.staged else v
+        if "G" in each:
+            found.setdefault("weight", torch.full_like(found["g"], INF))
+        return found
+
+    def changed(self, **tensors):
+        """The same with other inputs."""
+        return dataclasses.replace(self, tensors={**self.tensors, **tensors})
+
+    def without(self, names):
+        """The same without some inputs."""
+        return dataclasses.replace(self, tensors={k: v for k, v in self.tensors.items() if k not in names})
+
+
+class Asked(torch.nn.Module):
+    """A cost that is asked for as a `CostModule`."""
+
+    def __init__(self, cost):
+        super().__init__()
+        self.cost = cost
+
+    def at(self, x, goal=None, context=None):
+        return self.cost
+
+
+def solve(problem, backend, guess=None, tensors=None, asked=False, **options):
+    """The plan of the layer that the inputs describe; `asked`: its cost is a module."""
+    t, staged = tensors or problem.tensors, problem.staged
+    lcs = (LCSSequence if "A" in staged else LCSParams)(**{k: t[k] for k in LCS})
+    weights, by_stage = {k: t[k] for k in COST if k in t}, tuple(staged & set(COST))
+    kind = CostSequence if by_stage else QuadraticCost
+    cost = kind(**weights, check=False, **({"by_stage": by_stage} if by_stage else {}))
+    limits, by_stage = {k: t[k] for k in BOUNDS if k in t}, tuple(staged & set(BOUNDS))
+    options |= {"bounds": StageBounds(**limits, by_stage=by_stage)} if by_stage else limits
+    if "G" in t:
+        rows = {"G": t["G"], "g": t["g"], "E": t.get("E_rows"), "weight": t.get("weight")}
+        by_stage = tuple(name.removesuffix("_rows") for name in staged & set(ROWS))
+        options["constraints"] = (
+            ConstraintSequence(**rows, by_stage=by_stage) if by_stage else LinearConstraints(**rows)
+        )
+    options = {"barrier": problem.barrier, "relaxation": problem.relaxation, **options}
+    cost = Asked(cost) if asked else cost
+    return LCSMPCLayer(lcs, cost, problem.horizon, backend=backend, **options)(t["x0"], guess=guess)
+
+
+# --- judges -----------------------------------------------------------------------------------------------------------
+
+
+def mul(M, v):
+    return (M @ v.unsqueeze(-1)).squeeze(-1)
+
+
+def predicted(t, x, u, lam):
+    """Next states of full inputs, and the slack of every contact."""
+    x = x[:, :-1]
+    slack = mul(t["D"], x) + mul(t["E"], u) + mul(t["F"], lam) + t["c"]
+    return mul(t["A"], x) + mul(t["B"], u) + mul(t["C"], lam) + t["d"], slack
+
+
+def rollout(problem, t, u):
+    """States of actions by the public record, relaxed as the plan is."""
+    states = [t["x0"]]
+    for k in range(problem.horizon):
+        A, B, C, d, D, E, F, c = (t[name][:, k if name in problem.staged else 0] for name in LCS)
+        x = states[-1]
+        lam = solve_lcp(F, mul(D, x) + mul(E, u[:, k]) + c, relaxation=problem.relaxation).lam
+        states.append(mul(A, x) + mul(B, u[:, k]) + mul(C, lam) + d)
+    return torch.stack(states, 1)
+
+
+def rows(t, x, u):
+    """G x + E u − g of every stage (batch, H+1, n_c)."""
+    value = mul(t["G"], x) - t["g"]
+    if "E_rows" in t:
+        value = value + torch.nn.functional.pad(mul(t["E_rows"], u), (0, 0, 0, 1))
+    return value
+
+
+def cost(problem, t, x, u):
+    """The objective of each trajectory without the price of violations."""
+    now, last = x[:, :-1], x[:, -1]
+    stages = (now * (0.5 * mul(t["Q"], now) + t["q"])).sum((1, 2)) + (u * (0.5 * mul(t["R"], u) + t["r"])).sum((1, 2))
+    if "S" in problem.tensors:
+        stages = stages + (now * mul(t["S"], u)).sum((1, 2))
+    if problem.barrier:
+        stages = stages - problem.barrier * ((u - t["u_min"]).log() + (t["u_max"] - u).log()).sum((1, 2))
+    return stages + (last * (0.5 * mul(t["Q_final"], last) + t["q_final"])).sum(1)
+
+
+def fines(problem, t, x, u, most=INF):
+    """The price of violations; hard rows, and what is dearer, cost `most`, or nothing where that is infinite."""
+    if "G" not in problem.tensors:
+        return torch.zeros(problem.batch).double()
+    price = t["weight"].clamp_max(most)
+    return (torch.where(price < INF, price, 0.0) * rows(t, x, u).clamp_min(0.0)).sum((1, 2))
+
+
+# --- the problems -----------------------------------------------------------------------------------------------------
+
+
+def make(build, seed=0, batch=4, bound=0.15, n_x=4, n_u=2, n_lam=3, each=(), size=0.2, staged=(), **options):
+    """Random problems; of what is in `each` every element has its own, of what is in `staged` every stage."""
+
+    def lead(group):
+        return (batch,) if group in each else ()
+
+    sizes, limit = {"n_x": n_x, "n_u": n_u}, torch.full((n_u,), bound, dtype=torch.float64)
+    tensors = {
+        **build.lcs_tensors(seed, **sizes, n_lam=n_lam, batch=lead("lcs")),
+        **build.cost_tensors(seed, **sizes, batch=lead("cost")),
+        "u_min": -limit,
+        "u_max": limit,
+        "x0": size * build.normal(seed + 7)(batch, n_x),
+    }
+    if "bounds" in each:
+        spread = 0.5 + torch.rand(2, batch, n_u, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        tensors |= {"u_min": -limit * spread[0], "u_max": limit * spread[1]}
+    return vary(build, Problem(tensors, **options), staged)
+
+
+def vary(build, problem, names, seed=1):
+    """Each stage its own version of some inputs."""
+    tensors, n = dict(problem.tensors), build.normal(seed)
+    for name in names:
+        value, rank = tensors[name], problem.own(name)
+        stages = problem.stages(name)
+        lead, own = value.shape[: value.ndim - rank], value.shape[value.ndim - rank :]
+        # Definite matrices are scaled as a whole, so that they stay definite.
+        shape = [1] * rank if name in ("Q", "R", "F", *BOUNDS) else own
+        factor = 1 + 0.2 * n(*lead, stages, *shape).clamp(-2, 2)
+        tensors[name] = value.unsqueeze(len(lead)) * factor
+    return dataclasses.replace(problem, tensors=tensors, staged=problem.staged | frozenset(names))
+
+
+def contact(build):
+    return make(build, batch=8)
+
+
+def hard_contact(build):
+    return make(build, seed=2, batch=8, relaxation=1e-6)
+
+
+def without_contact(build):
+    problem = make(build, seed=3, batch=8, bound=50.0, relaxation=1e-3)
+    return problem.changed(C=torch.zeros_like(problem.tensors["C"]))
+
+
+def saturated(build):
+    return make(build, seed=1, batch=8, bound=0.01)
+
+
+def barrier(build):
+    """The best actions without the barrier are at their bounds."""
+    return make(build, seed=1, bound=0.05, barrier=1e-3)
+
+
+def paper_sized(build):
+    cost = build.paper_cost()(0.05 * build.normal(4)(6, 3), horizon=5)
+    limit = torch.full((6,), 0.015, dtype=torch.float64)
+    weights = {k: v.detach() for k, v in cost.fields().items()}
+    bounds = {"u_min": -limit, "u_max": limit}
+    tensors = {**build.pushing().tensors(), **weights, **bounds, "x0": 0.05 * build.normal(3)(6, 9)}
+    return Problem(tensors, horizon=5, relaxation=1e-5)
+
+
+def far_start(build):
+    return make(build, seed=5, size=20.0)
+
+
+def badly_scaled(build):
+    """`contact` in other units of state, action, row of the LCP and force; see the test that compares the two."""
+    t = contact(build).tensors
+    X, U, S = (torch.tensor(v, dtype=torch.float64) for v in ([1e3, 1e-2, 1.0, 1e-3], [1e-2, 10.0], [1e2, 1e-2, 3.0]))
+    changed = {
+        "A": X[:, None] * t["A"] / X, "B": X[:, None] * t["B"] / U, "C": X[:, None] * t["C"] * S, "d": X * t["d"],
+        "D": S[:, None] * t["D"] / X, "E": S[:, None] * t["E"] / U, "F": S[:, None] * t["F"] * S, "c": S * t["c"],
+        "Q": t["Q"] / X / X[:, None], "R": t["R"] / U / U[:, None], "Q_final": t["Q_final"] / X / X[:, None],
+        "q": t["q"] / X, "r": t["r"] / U, "q_final": t["q_final"] / X,
+        "u_min": U * t["u_min"], "u_max": U * t["u_max"], "x0": X * t["x0"],
+    }  # fmt: skip
+    return Problem(changed)
+
+
+def horizon_one(build):
+    return make(build, seed=6, horizon=1)
+
+
+def other_sizes(build):
+    return make(build, seed=8, n_x=6, n_u=3, n_lam=4, horizon=4)
+
+
+def smallest(build):
+    return make(build, seed=9, n_x=1, n_u=1, n_lam=1, horizon=2)
+
+
+def lcs_per_element(build):
+    return make(build, seed=10, each=("lcs",))
+
+
+def cost_and_bounds_per_element(build):
+    return make(build, seed=11, each=("cost", "bounds"))
+
+
+def one_sided_bounds(build):
+    """Bounds that do not contain zero."""
+    return make(build, seed=13).changed(u_min=torch.tensor([0.05, -0.3]).double())
+
+
+def cross(build):
+    return make(build, seed=1).changed(S=0.2 * build.normal(9)(4, 2))
+
+
+def stages(build):
+    return vary(build, cross(build), (*LCS, "Q", "R", "S", "q", "r", *BOUNDS))
+
+
+def stages_per_element(build):
+    problem = make(build, seed=3, each=("lcs", "cost")).changed(S=0.1 * build.normal(9)(4, 4, 2))
+    return vary(build, problem, (*LCS, "Q", "R", "S", "q", "r"))
+
+
+def preview(build):
+    return make(build, seed=4, staged=("q",))
+
+
+def half_open(build):
+    return make(build, seed=5, bound=0.05).changed(u_max=torch.tensor([INF, 0.05]).double())
+
+
+def unbounded(build):
+    return make(build, seed=6).without(BOUNDS)
+
+
+def no_contact(build):
+    return make(build, seed=7, n_lam=0, bound=0.1)
+
+
+def no_contact_stages(build):
+    return make(build, seed=8, n_lam=0, bound=0.1, staged=(*LCS, "Q", "R", "q", "r"))
+
+
+def with_rows(build, problem, weight=None, margin=0.01):
+    """Two constraints that some plans without them violate; the actions count in the second."""
+    n = build.normal(21)
+    G, E = n(2, 4), n(2, 2) * torch.tensor([[0.0], [1.0]]).double()
+    free = solve(problem, "ipopt")
+    value = free.x @ G.mT
+    value[:, :-1] += free.u @ E.mT
+    g = value.amax(1).quantile(0.5, 0) - margin
+    g[0] = torch.maximum(g[0], value[:, 0, 0].max() + 0.01)  # the first row is about x0 alone at the first stage
+    return problem.changed(G=G, g=g, E_rows=E, **({} if weight is None else {"weight": torch.tensor(weight).double()}))
+
+
+def hard(build):
+    return with_rows(build, make(build, seed=10, bound=0.4))
+
+
+def soft(build):
+    return with_rows(build, make(build, seed=10, bound=0.4), [0.02, 0.01], margin=0.05)
+
+
+def soft_and_hard(build):
+    return with_rows(build, make(build, seed=10, bound=0.4), [0.05, INF])
+
+
+def rows_by_stage(build):
+    return vary(build, with_rows(build, make(build, seed=12, bound=0.4), [0.3, 0.3]), ROWS)
+
+
+def terminal(build):
+    """A constraint of the last state alone, by g = ∞ before it."""
+    problem = with_rows(build, make(build, seed=13, bound=0.4))
+    g = torch.full((HORIZON + 1, 2), INF, dtype=torch.float64)
+    free = solve(problem.without(ROWS), "ipopt")
+    g[-1, 0] = (free.x[:, -1] @ problem.tensors["G"][0]).median() - 0.01
+    return dataclasses.replace(problem.changed(g=g), staged=problem.staged | {"g"})
+
+
+def everything(build):
+    problem = make(build, seed=14, bound=0.4, each=("lcs", "cost")).changed(
+        S=0.1 * build.normal(9)(4, 4, 2), u_max=torch.tensor([INF, 0.3]).double()
+    )
+    problem = vary(build, problem, (*LCS, "Q", "R", "S", "q", "r", "u_min"))
+    return vary(build, with_rows(build, problem, [0.5, 0.5]), ("G", "E_rows", "g"))
+
+
+# Of the public system, cost and bounds alone; the others are for exact backends.
+PLAIN = (
+    contact, hard_contact, without_contact, saturated, paper_sized, far_start, badly_scaled, horizon_one, other_sizes,
+    smallest, lcs_per_element, cost_and_bounds_per_element, one_sided_bounds,
+)  # fmt: skip
+CONSTRAINED = (hard, soft, soft_and_hard, rows_by_stage, terminal, everything)
+FORMS = (
+    barrier, cross, stages, stages_per_element, preview, half_open, unbounded, no_contact, no_contact_stages,
+    *CONSTRAINED,
+)  # fmt: skip
+PROBLEMS = {f.__name__: f for f in (*PLAIN, *FORMS)}

@@ -1,0 +1,107 @@
+"""Actuators with activation and with limits of control and force, beside MuJoCo's own steps."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from difflcs import LCSMPCLayer, QuadraticCost
+
+mujoco = pytest.importorskip("mujoco")
+from difflcs.physics.mujoco import MujocoLCS  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SLIDE = """<mujoco><option timestep=".002" integrator="{0}" gravity="0 0 0"/><worldbody><body>
+    <joint name="a" type="slide" axis="1 0 0" damping="2" {2}/><geom size=".1" mass="1"/></body></worldbody>
+    <actuator>{1}</actuator></mujoco>"""
+
+
+def load(actuator, joint="", integrator="Euler"):
+    return mujoco.MjModel.from_xml_string(SLIDE.format(integrator, actuator, joint))
+
+
+def both(model, q, v, act, u, ctrl=None, **options):
+    """The state after 20 ms: by the system, with actions u, and in MuJoCo."""
+    module = MujocoLCS(model, motion="dynamic", seconds=0.02, **options)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.act[:] = q, v, act
+    x, u = module.state.to_state(data.qpos, data.qvel, data.act), torch.tensor([u], dtype=torch.float64)
+    data.ctrl[:] = module.control(x, u)
+    context = None if ctrl is None else torch.tensor([ctrl], dtype=torch.float64)
+    after = module.params(x, context).step(x, u).x_next
+    mujoco.mj_step(model, data, 10)
+    return after, module.state.to_state(data.qpos, data.qvel, data.act)
+
+
+LINEAR = {
+    "integrator": '<general joint="a" dyntype="integrator" gainprm="3"/>',
+    "velocity": '<intvelocity joint="a" kp="50" kv="2" actrange="-5 5"/>',
+    "filter": '<cylinder joint="a" timeconst=".03" area="20"/>',
+    "exact filter": '<position joint="a" kp="80" kv="3" timeconst=".03"/>',
+}
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
+@pytest.mark.parametrize("kind", LINEAR)
+def test_activation_is_a_state_that_follows_its_control(kind, integrator):
+    model = load(LINEAR[kind], integrator=integrator)
+    after, true = both(model, 0.1, -0.3, 0.2, 0.5)
+    assert MujocoLCS(model, motion="dynamic").state.names == ("a", "a_velocity", "actuator0_activation")
+    torch.testing.assert_close(after, true, rtol=0, atol=3e-3 if integrator == "RK4" else 1e-8)
+    assert MujocoLCS(model).n_x == 1  # quasi-static
+
+
+def test_a_muscle_and_what_it_activates_are_right_at_its_nominal_control():
+    model = load('<muscle joint="a" lengthrange="-1 1" force="30"/>')
+    after, true = both(model, 0.1, 0.0, 0.2, 0.8, ctrl=0.8)
+    torch.testing.assert_close(after, true, rtol=0, atol=2e-4)
+    assert abs(true[2] - 0.2) > 0.1
+
+
+LIMITED = {
+    "forcerange": ('<position joint="a" kp="5000" kv="100" forcerange="-4 4"/>', ""),
+    "actuatorfrcrange": ('<position joint="a" kp="5000" kv="100"/>', 'actuatorfrcrange="-4 4"'),
+    "ctrlrange": ('<motor joint="a" ctrlrange="-4 4"/>', ""),
+}
+
+
+@pytest.mark.parametrize("kind", LIMITED)
+def test_what_is_far_beyond_a_limit_has_the_force_at_the_limit(kind):
+    model = load(*LIMITED[kind])
+    after, true = both(model, 0.0, 0.0, [], 4.0 if kind == "ctrlrange" else 50.0, ctrl=50.0, relative=False)
+    torch.testing.assert_close(after, true, rtol=1e-6, atol=1e-9)
+    assert true[1] == pytest.approx(4 * 0.02, rel=0.05)
+
+
+@pytest.mark.parametrize(("kind", "low", "high"), [
+    ("forcerange", -4, 4), ("actuatorfrcrange", -4, 4), ("ctrlrange", -4, 4),
+])  # fmt: skip
+def test_bounds_of_actions_are_those_that_limits_leave(kind, low, high):
+    module = MujocoLCS(load(*LIMITED[kind]), motion="dynamic", seconds=1e-4)
+    bounds = torch.stack(module.action_bounds(torch.tensor([0.3, 0.02], dtype=torch.float64))).flatten()
+    of_force = 1 if kind == "ctrlrange" else 5000  # a servo, whose action counts from where it is, has a drag
+    wanted = torch.tensor([low, high], dtype=torch.float64) / of_force + 0.02 * 100 / 5000 * (of_force > 1)
+    torch.testing.assert_close(bounds, wanted, rtol=0.02, atol=1e-6)
+
+
+@pytest.mark.parametrize("motion", ["quasi-static", "dynamic"])
+def test_a_plan_keeps_a_servo_within_its_range(motion):
+    model = load('<position joint="a" kp="100" kv="20" ctrlrange="-.05 .1"/>')
+    module = MujocoLCS(model, motion=motion)
+    n_x = module.n_x
+    cost = QuadraticCost(torch.zeros(n_x, n_x), torch.eye(1) * 1e-6, torch.eye(n_x), q_final=torch.full((n_x,), -9.0))
+    mpc = LCSMPCLayer(module, cost.double(), 1, -1.0, 1.0)
+    x = torch.zeros(2, n_x, dtype=torch.float64)
+    x[:, 0] = torch.tensor([0.0, 0.08])
+    targets = module.control(x, mpc(x).action)
+    torch.testing.assert_close(targets, torch.full((2, 1), 0.1, dtype=torch.float64), rtol=0, atol=1e-3)
+    assert MujocoLCS(load('<motor joint="a"/>'), motion="dynamic").action_bounds(torch.zeros(2))[0].isinf()
+
+
+def test_what_mocap_moves_is_where_the_data_have_it_when_these_are_observed():
+    body = '<body name="wall" mocap="true" pos="1 0 0"><geom size=".1"/></body><body>'
+    model = mujoco.MjModel.from_xml_string(SLIDE.format("Euler", "", "").replace("<body>", body))
+    module, data = MujocoLCS(model, motion="dynamic"), mujoco.MjData(model)
+    data.mocap_pos[0] = 0.5, 0, 0
+    assert module.contacts(module.observe(data)).gap.item() == pytest.approx(0.3)

@@ -1,0 +1,125 @@
+"""Contacts of many geoms and many states at once: those of each pair, and of each state, alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+mujoco = pytest.importorskip("mujoco")
+
+from difflcs.errors import ContactWarning, InvalidInputError  # noqa: E402
+from difflcs.physics.mujoco import MujocoLCS  # noqa: E402
+from difflcs.physics.mujoco.nominal import solve_soft  # noqa: E402
+
+KINDS = ("box", "box", "capsule", "cylinder", "ellipsoid", "mesh")
+CUBE = " ".join(f"{x} {y} {z}" for x in (-0.04, 0.04) for y in (-0.03, 0.05) for z in (-0.02, 0.03))
+
+
+def pile(kinds=KINDS, memory="16M"):
+    """Bodies of all kinds above a floor."""
+    shape = {"mesh": 'type="mesh" mesh="m"'}
+    geoms = (shape.get(kind, f'type="{kind}" size=".05 .06 .04"') for kind in kinds)
+    bodies = "".join(
+        f'<body pos="{9 * i} 0 1"><freejoint/><geom {geom} mass="1"/></body>' for i, geom in enumerate(geoms)
+    )
+    return mujoco.MjModel.from_xml_string(f"""<mujoco><size memory="{memory}"/>
+        <asset><mesh name="m" vertex="{CUBE}"/></asset>
+        <worldbody><geom type="plane" size="1 1 1"/>{bodies}</worldbody></mujoco>""")
+
+
+def placed(model, n, seed=0):
+    """Positions (n, nq) of bodies that lie on the floor, lean on each other or fall."""
+    random, data, qpos = np.random.default_rng(seed), mujoco.MjData(model), []
+    for steps in random.integers(0, 300, n):
+        mujoco.mj_resetData(model, data)
+        bodies = data.qpos.reshape(-1, 7)
+        bodies[:, :3] = random.uniform([-0.2, -0.2, 0.06], [0.2, 0.2, 0.3], (len(bodies), 3))
+        bodies[:, 3:] = random.normal(size=(len(bodies), 4))
+        mujoco.mj_step(model, data, int(steps))
+        qpos.append(data.qpos.copy())
+    return np.array(qpos)
+
+
+def rows(found, keep):
+    """Contacts as rows of numbers, in the order of their gaps."""
+    each = torch.cat([found.gap[..., None], found.normal, found.tangent.flatten(-2)], -1)[keep]
+    return each[each[:, 0].argsort()].round(decimals=9)
+
+
+def test_contacts_of_a_scene_are_those_of_its_pairs():
+    model = pile()
+    qpos = placed(model, 3)
+    whole = MujocoLCS(model, contacts=400, distance=0.1, motion="dynamic")
+    x = whole.state.to_state(qpos)
+    pairs = [(a, b) for a in range(model.ngeom) for b in range(a + 1, model.ngeom)]
+    alone = [MujocoLCS(model, contacts=8, distance=0.1, motion="dynamic", pairs=[pair]).contacts(x) for pair in pairs]
+    alone = type(alone[0])(*(torch.cat(values, 1) for values in zip(*alone, strict=True)))
+    scene = whole.contacts(x)
+    nearest = MujocoLCS(model, contacts=9, distance=0.1, motion="dynamic").contacts(x)
+    for i in range(len(x)):
+        one, all_pairs = (rows(type(f)(*(v[i] for v in f)), f.normal[i].any(-1)) for f in (scene, alone))
+        torch.testing.assert_close(one, all_pairs, rtol=0, atol=1e-8)
+        assert len(one) > 10
+        # Four contacts of a pair are enough where there is no room for all, so that some may be farther.
+        near = nearest.gap[i].sort().values
+        assert (near >= one[:9, 0] - 1e-9).all()
+        assert all((one[:, 0] - gap).abs().min() < 1e-9 for gap in near)
+
+
+def test_threads_find_what_one_finds():
+    model = pile()
+    module = MujocoLCS(model, contacts=12, motion="dynamic")
+    x = module.state.to_state(placed(model, 6))
+    alone, systems = [module.contacts(state) for state in x], [module.params(state) for state in x]
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        together, system = module.contacts(x), module.params(x)
+    finally:
+        torch.set_num_threads(threads)
+    for found, expected in zip(together, zip(*alone, strict=True), strict=True):
+        assert torch.equal(found, torch.stack(expected))
+    for name in ("A", "B", "d"):
+        torch.testing.assert_close(getattr(system, name), torch.stack([getattr(s, name) for s in systems]))
+
+
+def test_more_contacts_than_the_default_warn_once():
+    model = pile(("box",) * 5)
+    qpos = model.qpos0.reshape(-1, 7) + np.stack([np.arange(5) * 0.2, *np.zeros((6, 5))], -1)
+    qpos[:, 2] = 0.04
+    module = MujocoLCS(model, motion="dynamic")
+    with pytest.warns(ContactWarning, match="contacts=20"):
+        module.contacts(module.state.to_state(qpos.ravel()))
+    module.contacts(module.state.to_state(qpos.ravel()))
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_an_error_of_mujoco_is_ours_and_leaves_the_module_usable(threads, monkeypatch):
+    """There is no memory to measure two meshes, and none is needed where they are far apart."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    module = MujocoLCS(pile(("mesh", "mesh"), memory="24K"), motion="dynamic")
+    far = torch.tensor([[0, 0, 1, 0, 0, 0, 9, 0, 1, 0, 0, 0, *[0] * 12]] * 2).double()
+    near = far.clone()
+    near[1, 6] = 0.1
+    before = module.contacts(far)
+    for _ in range(2):
+        with pytest.raises(InvalidInputError, match=r"memory .*in state 1 of 2"):
+            module.contacts(near)
+        assert all(map(torch.equal, module.contacts(far), before))
+
+
+@pytest.mark.parametrize(("m", "nv"), [(1, 1), (5, 12), (24, 9), (40, 6)])
+def test_soft_forces_are_clipped_by_their_bounds(m, nv):
+    """Of random rows, some twice, and a response of less than full rank."""
+    random = np.random.default_rng(m)
+    rows, gap = random.normal(size=(50, m, nv)), random.normal(size=(50, m))
+    rows[:, m // 2 :], gap[:, m // 2 :] = rows[:, : m - m // 2], gap[:, : m - m // 2]
+    factor = random.normal(size=(50, nv, nv)) / nv
+    factor[:, nv // 2] = 0.0
+    response, high = factor @ factor.swapaxes(-1, -2), random.uniform(0, 3, (50, m))
+    for low, most in ((None, None), (-high, high)):
+        force = solve_soft(rows, response, gap, 1e-3, low, most)
+        slack = gap + np.einsum("nmi,nij,nkj,nk->nm", rows, response, rows, force)
+        least, most = (0.0, np.inf) if low is None else (low, most)
+        np.testing.assert_allclose(force, np.clip(-slack / 1e-3, least, most), rtol=0, atol=1e-7 * np.abs(force).max())
