@@ -54,11 +54,11 @@ class Options:
     """A sphere pushes a box to poses."""
 
     goals: int = 200
-    """Goals, each with its own start."""
+    """Goals, each with a start."""
     seed: int = 1000
     """Of the first goal; the next have the next."""
     out: Path = Path("benchmarks/results/box_to_pose.json")
-    """Where the JSON goes."""
+    """Path of the JSON output."""
     smoke: bool = False
     """Two goals only."""
 
@@ -67,13 +67,13 @@ class Faces(DiscPlaces):
     """Places beside the faces of the box: at a corner, one half plane says little of what a push does."""
 
     def sample(self, x: Tensor) -> Tensor:
-        """See `Places`."""
+        """Sample places; see `Places`."""
         ring = super().sample(x)
         return ring[(ring.abs() < 0.85 * ring.new_tensor(HALF)).any(-1)]
 
 
 def make_policy() -> tuple[SamplingPolicy, MujocoLCS]:
-    """The policy, and the system that it plans with: state (x, y, yaw of the box; x, y of the sphere)."""
+    """Make the policy and the system that it plans with: state (x, y, yaw of the box; x, y of the sphere)."""
     module = MujocoLCS(mujoco.MjModel.from_xml_string(WORLD.format(joints=PLANE)))
     weight = (100.0, 100.0, 0.36)  # 0.1 rad as much as 6 mm
     final = tuple(4 * w for w in weight)
@@ -94,7 +94,7 @@ class Episode(NamedTuple):
 
 
 def wrapped(angle: float) -> float:
-    """In [−π, π)."""
+    """Wrap an angle into [−π, π)."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
@@ -123,7 +123,7 @@ def play(seed: int, policy: SamplingPolicy, module: MujocoLCS) -> Episode:
 
 
 def main(o: Options) -> None:
-    """Play, print, write."""
+    """Run the episodes, print and write the figures."""
     if o.smoke:
         o.goals = 2
     torch.set_num_threads(1)

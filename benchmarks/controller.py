@@ -1,4 +1,4 @@
-"""How long a step of the controller takes, and what a deadline costs: `python benchmarks/controller.py [--smoke]`.
+"""Time of a step of the controller, and the price of a deadline: `python benchmarks/controller.py [--smoke]`.
 
 The controller of the zoo's cube goes over one recorded trajectory, in rounds that alternate: in Python, and with
 --robot in the C program of examples/c. Of each step it takes the whole, the part that the solver takes (measured in the
@@ -41,13 +41,13 @@ class Options:
     robot: Path | None = None
     """The program of examples/c, to be timed as well."""
     out: Path = Path("benchmarks/results/controller.json")
-    """Where the JSON goes."""
+    """Path of the JSON output."""
     smoke: bool = False
     """A few steps only."""
 
 
 def recorded(controller: MPCController, count: int) -> np.ndarray:
-    """A trajectory of the model with noise, a new goal every 20 steps: rows of state and goal."""
+    """Record a trajectory of the model with noise, a new goal every 20 steps: rows of state and goal."""
     rng, x, goal, rows = np.random.default_rng(0), np.zeros(9), np.zeros(3), []
     for k in range(count):
         if k % 20 == 0:
@@ -66,7 +66,7 @@ Figures = dict[str, dict[str, float]]
 
 
 def in_python(controller: MPCController, rows: np.ndarray, steps: int) -> Figures:
-    """Times of one round."""
+    """Time one round in Python."""
     times = np.empty((steps, 2))
     for i in range(-len(rows), steps):
         x, goal = rows[i % len(rows), :9].copy(), rows[i % len(rows), 9:].copy()
@@ -82,15 +82,15 @@ def in_python(controller: MPCController, rows: np.ndarray, steps: int) -> Figure
 
 
 def in_c(robot: Path, controller: Path, trajectory: Path, steps: int) -> Figures:
-    """The same of the C program, which prints them."""
+    """Time one round of the C program, which prints its times."""
     text = subprocess.check_output([robot, controller, trajectory, "--bench", str(steps)], text=True)
     lines = re.findall(r"p50 ([\d.]+).*p99 ([\d.]+).*largest ([\d.]+)", text)
-    found = [dict(zip(NAMES, map(float, line), strict=True)) for line in lines]
-    return dict(zip(("step", "solver"), found, strict=True))
+    rows = [dict(zip(NAMES, map(float, line), strict=True)) for line in lines]
+    return dict(zip(("step", "solver"), rows, strict=True))
 
 
 def median(rounds: list[Figures]) -> Figures:
-    """The median of each figure."""
+    """Compute the median of each figure."""
     return {part: {k: float(np.median([r[part][k] for r in rounds])) for k in NAMES} for part in rounds[0]}
 
 
@@ -127,16 +127,16 @@ def main(o: Options) -> None:
             times["python"].append(in_python(controller, rows, steps))
             if o.robot is not None:
                 times["c"].append(in_c(o.robot, path, trajectory, steps))
-    found = {"machine": cpu(), "isa": controller.isa, "steps": steps, "rounds": rounds}
-    found |= {name: median(each) for name, each in times.items()}
-    found["deadline"] = {
+    record = {"machine": cpu(), "isa": controller.isa, "steps": steps, "rounds": rounds}
+    record |= {name: median(each) for name, each in times.items()}
+    record["deadline"] = {
         f"{on_failure} {limit}": tracking(model, mpc.controller(on_failure, limit), episodes)
         for on_failure in ("hold", "unfinished")
         for limit in (None, 200e-6, 100e-6)
     }
-    print(json.dumps(found, indent=2))
+    print(json.dumps(record, indent=2))
     if not o.smoke:
-        save(o.out, found)
+        save(o.out, record)
 
 
 if __name__ == "__main__":

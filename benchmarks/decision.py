@@ -1,4 +1,4 @@
-"""What one decision costs: the LCS-MPC beside PDDM's planner, on the cube: `python benchmarks/decision.py [--smoke]`.
+"""Time of one decision: the LCS-MPC against PDDM's planner, on the cube: `python benchmarks/decision.py [--smoke]`.
 
 The same states of the task, one state a call, in turn by each way, one thread, CPU time without the simulation:
 
@@ -30,7 +30,7 @@ from difflcs.rl.learning.pddm import Planner
 
 @dataclass
 class Options:
-    """What one decision costs."""
+    """Time of one decision."""
 
     model: str = "zoo:trifinger-cube"
     """Run directory, or zoo:NAME, of LCS-RL on the cube."""
@@ -41,13 +41,13 @@ class Options:
     seed: int = 0
     """Seed of the first start and goal."""
     out: Path = Path("benchmarks/results/decision.json")
-    """Where the JSON goes."""
+    """Path of the JSON output."""
     smoke: bool = False
     """A few decisions only."""
 
 
 def states_and_goals(count: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Of resets of the task: (count, 9), (count, 3)."""
+    """Draw states (count, 9) and goals (count, 3) from resets of the task."""
     envs = get_task("cube").make_envs(1, threads=1)
     try:
         seen = [envs.reset(seed=seed + k)[0] for k in range(count)]
@@ -58,7 +58,7 @@ def states_and_goals(count: int, seed: int) -> tuple[Tensor, Tensor]:
 
 
 def ways(o: Options) -> Mapping[str, Callable[[Tensor, Tensor], Any]]:
-    """What decides, from one state (9,) and goal (3,)."""
+    """Make the planners, each a function of one state (9,) and goal (3,)."""
     task, settings = get_task("cube"), get_method("pddm")().pddm  # pyright: ignore[reportAttributeAccessIssue]
     mpc: Any = TrainedPolicy.open(o.model).policy
     controller, sizes = mpc.controller(), (settings.ensemble.networks, settings.ensemble.width)

@@ -1,4 +1,4 @@
-"""How long one robot waits for its action: `python benchmarks/latency.py [--smoke]`.
+"""Latency of an action for one robot: `python benchmarks/latency.py [--smoke]`.
 
 A loop is closed on the LCS itself, with a disturbance, and a new start and goal for each episode, so that states vary.
 Episode by episode, every way to plan takes its turn at the same problems, with the shifted plans as warm starts:
@@ -47,7 +47,7 @@ class Options:
     seed: int = 0
     """Seed of starts, goals and disturbances."""
     out: Path = Path("benchmarks/results/latency.json")
-    """Where the JSON goes."""
+    """Path of the JSON output."""
     smoke: bool = False
     """A few calls only."""
 
@@ -64,7 +64,7 @@ class Case:
 
 
 def cart_pole(horizon: int, count: int, seed: int) -> Case:
-    """Balance upright between two walls, from starts at which the tip touches one or not."""
+    """Make a cart-pole to balance upright between two walls, from starts at which the tip touches one or not."""
     generator = torch.Generator().manual_seed(seed)
     weight = torch.diag(torch.tensor([10.0, 50.0, 1.0, 1.0], dtype=torch.float64))
     cost = QuadraticCost(weight, torch.eye(1, dtype=torch.float64), 5 * weight)
@@ -101,7 +101,7 @@ class Step(NamedTuple):
 
 
 def play(case: Case, episode: int, plan: MPCSolution | None, generator: torch.Generator) -> list[Step]:
-    """An episode in closed loop, after one that ended with a plan."""
+    """Play an episode in closed loop, after one that ended with a plan."""
     x, steps = case.starts[episode : episode + 1].clone(), []
     goal = () if case.goals is None else (case.goals[episode : episode + 1].clone(),)
     for _ in range(EPISODE):
@@ -116,7 +116,7 @@ def play(case: Case, episode: int, plan: MPCSolution | None, generator: torch.Ge
 
 @torch.no_grad()
 def measure(case: Case, o: Options) -> dict[str, dict[str, float]]:
-    """Every figure of one problem by the name of the way."""
+    """Measure every figure of one problem by the name of the way."""
     mpc, controller = case.mpc, case.mpc.controller()
 
     def differentiate(step: Step) -> None:

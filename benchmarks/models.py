@@ -15,13 +15,13 @@ from difflcs.systems import cart_pole_between_walls
 
 
 def random_model(n_lam: int, seed: int, n_x: int = 9, n_u: int = 6) -> LCSParams:
-    """An `LCSModel` with parameters of size 0.3: no structure at all."""
+    """Make an `LCSModel` with random parameters of size 0.3, without structure."""
     generator = torch.Generator().manual_seed(seed)
     return LCSModel(n_x, n_u, n_lam, init_scale=0.3, generator=generator).params().detach()
 
 
 def chain_of_carts(carts: int, dt: float = 0.05, stiffness: float = 100.0) -> LCSParams:
-    """Carts of 1 kg, 0.2 m apart, between walls 1 m away; the first is pushed, the others are hit by their neighbours.
+    """Make carts of 1 kg, 0.2 m apart, between walls 1 m away; the first is pushed, the others hit by their neighbours.
 
     States are displacements [m] and velocities [m/s]; n_lam = carts + 1 gaps, semi-implicit as in `difflcs.systems`.
     """
@@ -38,7 +38,7 @@ def chain_of_carts(carts: int, dt: float = 0.05, stiffness: float = 100.0) -> LC
 
 
 def push_the_last_cart(carts: int, horizon: int, others: float = 0.0) -> QuadraticCost:
-    """Cost of the last cart's distance to 0.3 m further, with little on the first and `others` on those between."""
+    """Make the cost of the last cart's distance to 0.3 m further, little on the first and `others` on the others."""
     weight = torch.full((2 * carts,), 0.01, dtype=torch.float64)
     weight[1:carts] = others
     weight[0], weight[carts - 1] = 0.1, 10.0
@@ -50,20 +50,20 @@ def push_the_last_cart(carts: int, horizon: int, others: float = 0.0) -> Quadrat
 
 
 def cart_states(carts: int, count: int, seed: int) -> Tensor:
-    """States of a chain of carts, some of which touch or overlap."""
+    """Draw states of a chain of carts, some of which touch or overlap."""
     return uniform([0.3] * carts + [0.5] * carts, count, seed)
 
 
 @dataclass(frozen=True)
 class Instance:
-    """A batch of problems: what `LCSMPCLayer` is built with, and what it is called with."""
+    """A batch of problems: arguments of `LCSMPCLayer` and of its call."""
 
     layer: dict[str, Any]
     call: tuple[Tensor, ...]
 
 
 def uniform(size: list[float], count: int, seed: int) -> Tensor:
-    """States (count, n_x) between −size and size."""
+    """Draw states (count, n_x) between −size and size."""
     generator = torch.Generator().manual_seed(seed)
     half = torch.tensor(size, dtype=torch.float64)
     return half * (2 * torch.rand(count, len(size), generator=generator, dtype=torch.float64) - 1)
@@ -74,7 +74,7 @@ def _diagonal(*weights: float) -> Tensor:
 
 
 def pushing(lcs: LCSParams, count: int, seed: int, horizon: int = 5) -> Instance:
-    """The task of the cube: its cost, and actions of 15 mm."""
+    """Make the task of the cube: its cost, and actions of 15 mm."""
     layer = {"lcs": lcs, "cost": pushing_cost(), "horizon": horizon, "u_min": -ACTION_LIMIT, "u_max": ACTION_LIMIT}
     return Instance(layer, states_and_goals(count, seed))
 
@@ -91,7 +91,7 @@ def _random(lcs: LCSParams, horizon: int, count: int, seed: int) -> Instance:
 
 
 def _cart_pole(horizon: int, dt: float, stiffness: float, count: int) -> Instance:
-    """Stay upright, or lean on a wall."""
+    """Make a cart-pole that stays upright, or leans on a wall."""
     lcs = cart_pole_between_walls(dt=dt, wall_stiffness=stiffness)
     cost = QuadraticCost(_diagonal(1, 1, 0.1, 0.1), _diagonal(0.01), _diagonal(100, 100, 1, 1))
     x0 = uniform([0.02, 0.05, 0.1, 0.3], count, horizon)

@@ -38,7 +38,7 @@ METHODS: dict[str, Method] = {
     **{name: get_method(name)() for name in method_names()},
     "quick": get_method("lcs-rl")(**QUICK),
 }
-"""Those that are registered, each with its default settings; and quick settings of LCS-RL."""
+"""Registered methods with their default settings, and quick settings of LCS-RL."""
 
 
 @dataclass
@@ -60,19 +60,19 @@ class Options:
     evaluation_seed: int = 1_000_000
     """Seed of the goals, the same for all."""
     out: Path = Path("benchmarks/results/objects.json")
-    """Where the JSON goes."""
+    """Path of the JSON output."""
     smoke: bool = False
     """Seconds instead of hours, with the methods' smoke settings; learns nothing."""
 
 
 def key(row: dict[str, Any]) -> tuple[Any, ...]:
-    """What makes an evaluation the same as another."""
+    """Compute the key that identifies an evaluation."""
     names = ("task", "method", "seed", "total_minutes", "minutes", "goals", "evaluation_seed")
     return tuple(row[name] for name in names)
 
 
 def run(o: Options, task_name: str, method_name: str, seed: int, done: set[tuple[Any, ...]]) -> Iterator[dict]:
-    """The evaluations of one training that are not done yet; seconds are CPU time of the training alone."""
+    """Run the evaluations of one training that are missing; seconds are CPU time of the training alone."""
     task, method = get_task(task_name), METHODS[method_name]
     same = {"task": task_name, "method": method_name, "seed": seed, "total_minutes": max(o.minutes)}
     same |= {"goals": o.goals, "evaluation_seed": o.evaluation_seed}
@@ -95,17 +95,17 @@ def run(o: Options, task_name: str, method_name: str, seed: int, done: set[tuple
             spent += time.process_time() - begun
             if key({**same, "minutes": minutes}) in done:
                 continue
-            found = evaluate(envs, trainer.policy, o.goals, o.evaluation_seed, task.episode_steps)
+            evaluation = evaluate(envs, trainer.policy, o.goals, o.evaluation_seed, task.episode_steps)
             yield {
                 **same,
                 "minutes": minutes,
                 "episodes": trainer.episodes,
-                "success_rate": found.success_rate,
-                "successes": found.successes,
-                "ci_low": found.ci_low,
-                "ci_high": found.ci_high,
-                "median_errors": dict(found.median_errors),
-                "solver_failures": found.solver_failures,
+                "success_rate": evaluation.success_rate,
+                "successes": evaluation.successes,
+                "ci_low": evaluation.ci_low,
+                "ci_high": evaluation.ci_high,
+                "median_errors": dict(evaluation.median_errors),
+                "solver_failures": evaluation.solver_failures,
                 "training_cpu_seconds": round(spent, 1),
                 "told": told,
                 "object": dict(task.describe(envs)),

@@ -1,4 +1,4 @@
-"""Which optima the solver reaches, and what that costs: `python benchmarks/optima.py [--smoke]`.
+"""Optima that the solver reaches, and their price: `python benchmarks/optima.py [--smoke]`.
 
 The LCS-MPC has local optima. Every effort of the batched backend solves the same problems, cold; the reference is the
 best cost seen by anyone, 32 starts among them. Printed per family and effort: the mean gap to it, the share of problems
@@ -42,13 +42,13 @@ class Options:
     repetitions: int = 5
     """Solves of each, in turn with the other efforts; the fastest counts."""
     out: Path = Path("benchmarks/results/optima.json")
-    """Where the JSON goes."""
+    """Path of the JSON output."""
     smoke: bool = False
     """Everything tiny."""
 
 
 def solve(instance: Instance, backend: Backend) -> tuple[torch.Tensor, float]:
-    """Objective of each problem, infinite where it failed, and CPU seconds."""
+    """Solve; return the objective of each problem, infinite where it failed, and CPU seconds."""
     mpc = LCSMPCLayer(backend=backend, on_failure="mask", **instance.layer)
     with torch.no_grad():
         started = time.process_time()
@@ -58,7 +58,7 @@ def solve(instance: Instance, backend: Backend) -> tuple[torch.Tensor, float]:
 
 
 def time_alone(instance: Instance, repetitions: int) -> dict[str, float]:
-    """Seconds that each effort needs for the first problems one by one; the fastest of the repetitions counts."""
+    """Time each effort on the first problems one by one; the fastest repetition counts."""
     layers = {
         name: LCSMPCLayer(backend=backend, on_failure="mask", **instance.layer) for name, backend in EFFORTS.items()
     }
@@ -76,7 +76,7 @@ def time_alone(instance: Instance, repetitions: int) -> dict[str, float]:
 
 
 def compare(instances: list[Instance], repetitions: int) -> dict[str, dict[str, float]]:
-    """The figures described above for each effort."""
+    """Compute the figures described above for each effort."""
     gaps: dict[str, list[torch.Tensor]] = {name: [] for name in EFFORTS}
     seconds, alone = dict.fromkeys(EFFORTS, 0.0), dict.fromkeys(EFFORTS, 0.0)
     for instance in instances:
@@ -87,8 +87,8 @@ def compare(instances: list[Instance], repetitions: int) -> dict[str, dict[str, 
             for name, backend in EFFORTS.items():
                 costs[name], spent = solve(instance, backend)
                 least[name] = min(least[name], spent)
-        found = [*costs.values(), *(solve(instance, backend)[0] for backend in REFERENCE.values())]
-        best = torch.stack(found).amin(0)
+        objectives = [*costs.values(), *(solve(instance, backend)[0] for backend in REFERENCE.values())]
+        best = torch.stack(objectives).amin(0)
         for name in EFFORTS:
             gaps[name].append((costs[name] - best) / best.abs())
             seconds[name] += least[name]

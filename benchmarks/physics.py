@@ -46,7 +46,7 @@ class Options:
     seed: int = 0
     """Seed of states and actions."""
     out: Path = Path("benchmarks/results/physics.json")
-    """Where the JSON goes."""
+    """Path of the JSON output."""
     smoke: bool = False
     """A few states only."""
 
@@ -104,7 +104,7 @@ BOX = """
 
 
 def simulated(model: Any, qpos: Any, qvel: Any, ctrl: Any, start: Any = None) -> tuple[Any, Any]:
-    """What `mj_step` does in one step from each state; with `start`, controls go from there to `ctrl` in 80 % of it."""
+    """Step each state in MuJoCo; with `start`, controls go from there to `ctrl` in 80 % of the step."""
     data, steps = mujoco.MjData(model), round(SECONDS / model.opt.timestep)
     places, speeds = np.empty_like(qpos), np.empty_like(qvel)
     for i in range(len(qpos)):
@@ -129,7 +129,7 @@ def of_mujoco(
     coordinates: dict,
     slowly: bool = False,
 ) -> Case:
-    """A case of a MuJoCo model, whose names of coordinates are those of `MujocoState`."""
+    """Make a case of a MuJoCo model, whose names of coordinates are those of `MujocoState`."""
     x = module.state.to_state(qpos, qvel)
     ctrl, start = (module.control(x, v).numpy() for v in (u, 0 * u))
     after = module.state.to_state(*simulated(model, qpos, qvel, ctrl, start if slowly else None))
@@ -157,7 +157,7 @@ PLANAR_BOXES = {
 
 
 def around_the_box(count: int, random: np.random.Generator, gap: float = 0.02) -> tuple[Any, Any, Tensor]:
-    """The box's pose (n, 3), the pusher's place beside it, and pushes (n, 2) of 1 to 4 cm towards it."""
+    """Draw the box's pose (n, 3), the pusher's place beside it, and pushes (n, 2) of 1 to 4 cm towards it."""
     pose = random.uniform(-1, 1, (count, 3)) * [0.1, 0.1, 1.0]
     side, along = random.integers(0, 4, count) * np.pi / 2, random.uniform(-0.025, 0.025, count)
     away = 0.05 + 0.015 + random.uniform(0.0, gap, count)
@@ -171,7 +171,7 @@ def around_the_box(count: int, random: np.random.Generator, gap: float = 0.02) -
 
 
 def pushing(count: int, random: np.random.Generator) -> list[Case]:
-    """A sphere pushes a box: a box on joints in the plane with damping, and a free one on a floor with friction."""
+    """Make a sphere that pushes a box: on joints in the plane with damping, or free on a floor with friction."""
     cases = []
     for system, (damping, stiffness, contact, slowly, gap) in PLANAR_BOXES.items():
         pose, pusher, u = around_the_box(count, random, gap)
@@ -199,7 +199,7 @@ def pushing(count: int, random: np.random.Generator) -> list[Case]:
 
 
 def settled(model: Any) -> float:
-    """Height of the box at rest."""
+    """Compute the height of the box at rest."""
     data = mujoco.MjData(model)
     data.qpos[7:], data.ctrl[:] = 0.5, 0.5  # the pusher, out of the way
     for _ in range(1000):
@@ -208,7 +208,7 @@ def settled(model: Any) -> float:
 
 
 def cart_pole(count: int, random: np.random.Generator) -> list[Case]:
-    """No contact: what linearising and the step cost alone."""
+    """Make a cart-pole without contact: the cost of linearisation and step alone."""
     model = mujoco.MjModel.from_xml_string(CART_POLE)
     qpos, qvel = random.uniform(-1, 1, (count, 2)) * [1.0, 0.5], random.uniform(-1, 1, (count, 2)) * [1.0, 1.0]
     u = torch.from_numpy(random.uniform(-5, 5, (count, 1)))
@@ -222,7 +222,7 @@ def cart_pole(count: int, random: np.random.Generator) -> list[Case]:
 
 
 def boxes(count: int, random: np.random.Generator) -> list[Case]:
-    """A box that falls and turns in the air, and one that slides on the floor."""
+    """Make a box that falls and turns in the air, and one that slides on the floor."""
     model = mujoco.MjModel.from_xml_string(BOX)
     names = {
         "position": (["box_x", "box_y", "box_z"], "mm", 1e-3),
@@ -339,7 +339,7 @@ def measure(case: Case, o: Options) -> dict[str, Any]:
 
 
 def planar(count: int, random: np.random.Generator) -> list[Case]:
-    """Bodies in the plane, where pymunk is installed, which the scoreboard's Push-T needs."""
+    """Make bodies in the plane, if pymunk is installed, which the scoreboard's Push-T needs."""
     if importlib.util.find_spec("pymunk") is None:
         print("T and disc: left out, as pymunk is not installed")
         return []

@@ -30,7 +30,7 @@ CORNERS = ((-0.6, 0.0), (0.6, 0.0), (0.6, 0.3), (0.15, 0.3), (0.15, 1.2), (-0.15
 
 
 def outline() -> Polygon:
-    """The T as one outline, which has one contact with a disc."""
+    """Make the T as one outline, which has one contact with a disc."""
     whole = Polygon(CORNERS)
     return Polygon(whole.vertices - whole.centroid)
 
@@ -60,7 +60,7 @@ class Simulation:
         self.space.collision_slop = 0.0
 
     def step(self, x: Array, u: Array) -> Array:
-        """One step of 0.1 s from a state of `PlanarPushing` with velocities of disc and body."""
+        """Advance 0.1 s from a state of `PlanarPushing` with velocities of disc and body."""
         self.body.position, self.body.angle = x[:2].tolist(), float(x[2])
         self.disc.position, self.disc.velocity = x[3:5].tolist(), x[5:7].tolist()
         self.body.velocity, self.body.angular_velocity = x[7:9].tolist(), float(x[9])
@@ -76,9 +76,9 @@ class Simulation:
 
 
 def pushes(count: int, random: np.random.Generator) -> tuple[Array, Array]:
-    """States with the disc beside the T, at rest, and pushes towards it."""
-    shape, found = tee(), []
-    while len(found) < count:
+    """Draw states with the disc beside the T, at rest, and pushes towards it."""
+    shape, pairs = tee(), []
+    while len(pairs) < count:
         pose = random.uniform(-1, 1, 3) * [0.5, 0.5, math.pi]
         place = random.uniform(-1.2, 1.2, 2)
         gap, normal, _ = (v.numpy() for v in shape.distance(torch.from_numpy(place)))
@@ -88,13 +88,13 @@ def pushes(count: int, random: np.random.Generator) -> tuple[Array, Array]:
         turn = np.array([[math.cos(pose[2]), -math.sin(pose[2])], [math.sin(pose[2]), math.cos(pose[2])]])
         towards = math.atan2(*(turn @ -normal[near])[::-1]) + random.uniform(-0.5, 0.5)
         u = random.uniform(0.2, 0.5) * np.array([math.cos(towards), math.sin(towards)])
-        found.append((np.concatenate([pose, turn @ place + pose[:2], np.zeros(5)]), u))
-    x, u = zip(*found, strict=True)
+        pairs.append((np.concatenate([pose, turn @ place + pose[:2], np.zeros(5)]), u))
+    x, u = zip(*pairs, strict=True)
     return np.array(x), np.array(u)
 
 
 def cases(count: int, random: np.random.Generator) -> Iterator[dict[str, Any]]:
-    """Fields of the cases: without friction, with it, and with a velocity that stays."""
+    """Make the fields of the cases: without friction, with it, and with a velocity that stays."""
     x, u = pushes(count, random)
     system: dict[str, Any] = {"shape": tee(), "radius": RADIUS, "drive": DRIVE, "compliance": 1e-3}
     stewart = {"cone": "stewart-trinkle"}

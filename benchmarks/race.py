@@ -1,8 +1,8 @@
 """A race against the strongest solvers at hand: `python benchmarks/race.py [--smoke]`. The page is docs/race.md.
 
 The same problems, cold, for everybody, one core, CPU time, set-up excluded. Every rival is a process in an environment
-of its own (`--venvs`, folders made by `--install`); rivals that are not there are reported as missing. Objectives are
-those of executing a rival's own actions in the LCS; the reference is the best that anyone found, and our solver from 32
+apart (`--venvs`, folders made by `--install`); rivals that are not there are reported as missing. Objectives are
+those of executing a rival's own actions in the LCS; the reference is the best of all, and our solver from 32
 random starts. Written as JSON, from which the page's tables are rendered when the site is built.
 """
 
@@ -99,13 +99,13 @@ class Options:
     nodes: int = 20_000
     """Quadratic programs of a branch and bound before it gives up."""
     venvs: Path = Path("/tmp/difflcs-race")
-    """Where the environments of the rivals are."""
+    """Folder of the rivals' environments."""
     install: bool = False
     """Make these environments, from the package index, and end."""
     parts: tuple[str, ...] = ("contact", "linear", "global")
-    """What to run; the others stay as they are in the file."""
+    """Parts to run; the others stay as they are in the file."""
     out: Path = Path("benchmarks/results/race.json")
-    """Where the JSON goes."""
+    """Path of the JSON output."""
     smoke: bool = False
     """Everything tiny."""
 
@@ -114,7 +114,7 @@ class Options:
 
 
 def install(venvs: Path) -> None:
-    """One environment for each group of rivals whose packages agree; what fails is said and left out."""
+    """Make an environment for each group of rivals whose packages agree; report and leave out failures."""
     wanted: dict[str, list[str]] = {}
     for entry in (*CONTACT, *LINEAR):
         wanted.setdefault(entry.venv, []).extend(entry.packages)
@@ -154,7 +154,7 @@ class Process:
         return json.loads(line) if line else {"error": f"the process ended with code {self.process.wait()}"}
 
     def ask(self, **job: object) -> dict:
-        """One job, and its answer."""
+        """Send a job and return its answer."""
         assert self.process.stdin
         if self.process.poll() is not None:
             return {"error": f"the process ended with code {self.process.returncode}"}
@@ -163,44 +163,44 @@ class Process:
         return self._answer()
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         if hasattr(self, "process"):
             self.process.communicate()
 
 
 def start(entries: tuple[Entry, ...], venvs: Path, folder: str) -> list[Process]:
-    """All that are there, and a word about those that are not."""
-    found = [Process(entry, venvs, folder) for entry in entries]
-    for process in found:
+    """Start all rivals that are installed, and report the others."""
+    processes = [Process(entry, venvs, folder) for entry in entries]
+    for process in processes:
         print(f"  {process.entry.label:24s} {'MISSING: ' + process.missing if process.missing else process.version}")
-    return found
+    return processes
 
 
 # --- judging ----------------------------------------------------------------------------------------------------------
 
 
 def as_mpc(problem: Problem, few: slice | None = None) -> MPCProblem:
-    """The problem as difflcs's own, or some of it."""
+    """Convert the problem, or some of its elements, to an `MPCProblem`."""
     data = {}
     for name in ("A", "B", "C", "d", "D", "E", "F", "c", "Q", "R", "Q_final", "q", "r", "q_final", "u_min", "u_max"):
         value = torch.from_numpy(np.ascontiguousarray(getattr(problem, name)))
-        own = 2 if name in ("A", "B", "C", "D", "E", "F", "Q", "R", "Q_final") else 1
-        data[name] = value[few] if few is not None and value.ndim > own else value
+        rank = 2 if name in ("A", "B", "C", "D", "E", "F", "Q", "R", "Q_final") else 1
+        data[name] = value[few] if few is not None and value.ndim > rank else value
     x0 = torch.from_numpy(problem.x0 if few is None else problem.x0[few])
     return MPCProblem(**data, x0=x0, horizon=problem.horizon, relaxation=problem.relaxation)
 
 
 def best_known(problem: Problem, few: slice) -> torch.Tensor:
-    """Objective of our solver from 32 starts, along a long homotopy."""
+    """Compute the objective of our solver from 32 starts, along a long homotopy."""
     mpc = as_mpc(problem, few)
-    found = BatchedBackend(effort="best", restarts=32, max_iter=600).solve(mpc, None)
-    objective = mpc.objective(found.primal.x, found.primal.u)
-    return torch.where(found.solved, objective, torch.inf)
+    result = BatchedBackend(effort="best", restarts=32, max_iter=600).solve(mpc, None)
+    objective = mpc.objective(result.primal.x, result.primal.u)
+    return torch.where(result.solved, objective, torch.inf)
 
 
 @dataclass
 class Judged:
-    """What a rival's actions are worth: objective of executing them, whether they are a certified optimum to 0.1 %."""
+    """Value of a rival's actions: objective of executing them, and whether they are a certified optimum to 0.1 %."""
 
     objective: np.ndarray
     solved: np.ndarray
@@ -210,7 +210,7 @@ class Judged:
 def judge(problem: Problem, u: np.ndarray, said: np.ndarray, gradient: np.ndarray | None) -> Judged:
     """Execute the actions, polish them by Newton steps, certify, and compare gradients at this very optimum.
 
-    A rival without gradients of its own is given those of the optimality conditions at its unpolished plan.
+    A rival without gradients gets those of the optimality conditions at its unpolished plan.
     """
     mpc = as_mpc(problem, slice(len(u)))
     plan = mpc.clip(torch.from_numpy(np.nan_to_num(u)))
@@ -223,11 +223,11 @@ def judge(problem: Problem, u: np.ndarray, said: np.ndarray, gradient: np.ndarra
     near = (objective - polished).abs() <= EQUAL * polished.abs()
     solved = torch.from_numpy(said) & (residual <= 1e-6) & near
     true = _sensitivity(mpc, linear, problem.weight)
-    found = _sensitivity(mpc, kkt.linearise(mpc, raw), problem.weight)
+    sensitivity = _sensitivity(mpc, kkt.linearise(mpc, raw), problem.weight)
     if gradient is not None:
-        found = torch.from_numpy(gradient[: len(u)].copy())
+        sensitivity = torch.from_numpy(gradient[: len(u)].copy())
     size = true.norm(dim=1)
-    error = torch.where(solved & (size > 1e-9), (found - true).norm(dim=1) / size, torch.nan)
+    error = torch.where(solved & (size > 1e-9), (sensitivity - true).norm(dim=1) / size, torch.nan)
     return Judged(objective.numpy(), solved.numpy(), error.numpy())
 
 
@@ -240,7 +240,7 @@ def _sensitivity(mpc: MPCProblem, linear: kkt.Linearisation, weight: np.ndarray)
 
 
 def finite_differences(problem: Problem, step: float = 1e-6) -> float:
-    """Median relative difference of the layer's gradient to central differences of its own plan, warm-started."""
+    """Compare the layer's gradient with central differences of its plan, warm-started: median relative difference."""
     mpc = as_mpc(problem, slice(32))
     lcs = LCSParams(**{name: getattr(mpc, name) for name in ("A", "B", "C", "d", "D", "E", "F", "c")})
     cost = QuadraticCost(**{name: getattr(mpc, name) for name in ("Q", "R", "Q_final", "q", "r", "q_final")})
@@ -268,7 +268,7 @@ def finite_differences(problem: Problem, step: float = 1e-6) -> float:
 
 
 def run(problem: Problem, processes: list[Process], o: Options, folder: str) -> dict[str, dict]:
-    """One entry: everybody solves it in turns, `rounds` times."""
+    """Run one entry: everybody solves it in turns, `rounds` times."""
     path, out = f"{folder}/{len(os.listdir(folder))}.npz", f"{folder}/answer.npz"  # rivals know a problem by its path
     problem.save(path)
     best: dict[str, dict] = {}
@@ -296,32 +296,32 @@ def run(problem: Problem, processes: list[Process], o: Options, folder: str) -> 
     if problem.n_lam:
         reference = best_known(problem, slice(o.problems)).numpy() + constant
     judged = {}
-    for label, found in best.items():
-        if "error" not in found:
-            n = len(found["times"])
-            judged[label] = judge(problem, found["u"][:n], np.array(found["solved"][:n]), found.get("gradient"))
+    for label, outcome in best.items():
+        if "error" not in outcome:
+            n = len(outcome["times"])
+            judged[label] = judge(problem, outcome["u"][:n], np.array(outcome["solved"][:n]), outcome.get("gradient"))
             judged[label].objective += constant[:n]
             solved = np.where(judged[label].solved, judged[label].objective, np.inf)
             reference[:n] = np.minimum(reference[:n], solved)
     rows = {}
-    for label, found in best.items():
-        if "error" in found:
-            rows[label] = {"error": found["error"]}
+    for label, outcome in best.items():
+        if "error" in outcome:
+            rows[label] = {"error": outcome["error"]}
             continue
-        j, n = judged[label], len(found["times"])
+        j, n = judged[label], len(outcome["times"])
         gap = (j.objective - reference[:n]) / reference[:n]
         rows[label] = {
-            "setup": found["setup"],
-            "seconds": float(np.mean(found["times"])),
-            "times": [float(t) for t in found["times"]],
+            "setup": outcome["setup"],
+            "seconds": float(np.mean(outcome["times"])),
+            "times": [float(t) for t in outcome["times"]],
             "solved": int(j.solved.sum()),
             "of": n,
             "gap": [float(v) for v in gap[j.solved]],
             "gradient error": [float(v) for v in j.gradient_error[np.isfinite(j.gradient_error)]],
         }
         for name in ("batch", "with_gradient"):
-            if name in found:
-                rows[label][name] = found[name] / problem.count
+            if name in outcome:
+                rows[label][name] = outcome[name] / problem.count
     return rows
 
 
@@ -331,7 +331,7 @@ def ratio(row: dict, ours: dict) -> float:
 
 
 def summary(entries: list[dict[str, dict]]) -> dict[str, dict]:
-    """A family's rows: geometric mean and range over its entries of times and ratios, gap and share solved."""
+    """Summarise a family: geometric mean and range over its entries of times and ratios, gap and share solved."""
     ours = [entry["difflcs `batched`"] for entry in entries]
     table = {}
     for label in entries[0]:
@@ -362,13 +362,13 @@ def summary(entries: list[dict[str, dict]]) -> dict[str, dict]:
 
 
 def geometric(values: list[float] | np.ndarray) -> float:
-    """Geometric mean."""
+    """Compute the geometric mean."""
     return float(np.exp(np.mean(np.log(np.maximum(values, 1e-9)))))
 
 
 def best_rival(families: dict[str, dict]) -> dict[str, dict]:
-    """For each family the fastest rival that solved everything, and its ratio to ours; their geometric mean."""
-    found = {}
+    """Find for each family the fastest rival that solved everything, and its ratio to ours; their geometric mean."""
+    fastest = {}
     for family, table in families.items():
         whole = {
             label: row
@@ -377,16 +377,16 @@ def best_rival(families: dict[str, dict]) -> dict[str, dict]:
         }
         if whole:
             label = min(whole, key=lambda name: whole[name]["ratio"][0])
-            found[family] = {"rival": label, "one": whole[label]["ratio"], "batch": whole[label]["ratio to batch"]}
+            fastest[family] = {"rival": label, "one": whole[label]["ratio"], "batch": whole[label]["ratio to batch"]}
     for kind in ("one", "batch"):
-        values = [row[kind][0] for row in found.values() if isinstance(row, dict) and "rival" in row]
+        values = [row[kind][0] for row in fastest.values() if isinstance(row, dict) and "rival" in row]
         if values:
-            found[f"geometric mean, {kind}"] = {"ratio": geometric(values), "range": [min(values), max(values)]}
-    return found
+            fastest[f"geometric mean, {kind}"] = {"ratio": geometric(values), "range": [min(values), max(values)]}
+    return fastest
 
 
 def race(name: str, o: Options) -> Iterator[tuple[str, object]]:
-    """One part of the race, as the entries of the JSON that belong to it."""
+    """Run one part of the race; return its entries of the JSON."""
     entries = CONTACT if name == "contact" else LINEAR
     batch, make = (o.batch, with_contact) if name == "contact" else (o.linear_batch, without_contact)
     problems = make(max(batch, o.problems), o.seeds)
@@ -408,7 +408,7 @@ def race(name: str, o: Options) -> Iterator[tuple[str, object]]:
 
 
 def globally(o: Options) -> dict[str, dict]:
-    """Our plans on small problems against global optima with hard contact."""
+    """Compare our plans on small problems with global optima with hard contact."""
     branch = Entry("branch and bound", "global_optimum", {"nodes": o.nodes}, "rivals", ("daqp",))
     backends = {
         "`batched`": BatchedBackend(),
@@ -434,13 +434,13 @@ def globally(o: Options) -> dict[str, dict]:
                     answer |= dict(file)
             return answer
 
-        found = global_gaps(small(o.small_problems, o.seeds), optimum, ours, as_mpc)
+        outcome = global_gaps(small(o.small_problems, o.seeds), optimum, ours, as_mpc)
         process.close()
-    return found
+    return outcome
 
 
 def main(o: Options) -> None:
-    """Race, print, write."""
+    """Run the race, print and write the figures."""
     if o.install:
         install(o.venvs)
         return

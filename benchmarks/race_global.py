@@ -13,7 +13,7 @@ from difflcs.mpc.problem import MPCProblem
 
 
 def hard_cost(mpc: MPCProblem, u: torch.Tensor) -> torch.Tensor:
-    """Cost (count,) of executing actions with λ·s = 0."""
+    """Compute the cost (count,) of executing actions with λ·s = 0."""
     states = [mpc.x0]
     for k in range(mpc.horizon):
         stage = mpc.stage(k)
@@ -28,26 +28,26 @@ def global_gaps(
     ours: dict[str, Callable[[Problem], torch.Tensor]],
     as_mpc: Callable[[Problem], MPCProblem],
 ) -> dict[str, dict]:
-    """For each family what `ours` cost above the proved optimum, [mean, worst], relative.
+    """Compute for each family the relative cost of `ours` above the proved optimum, [mean, worst].
 
     Args:
         problems: family and problems.
         optimum: plans `u`, whether each is proved (`solved`) and `times`, by branch and bound.
         ours: name → actions.
-        as_mpc: the problem as difflcs's own.
+        as_mpc: function from a problem to an `MPCProblem`.
     """
     families: dict[str, dict] = {}
     for family, problem in problems:
-        found, mpc = optimum(problem), as_mpc(problem)
+        answer, mpc = optimum(problem), as_mpc(problem)
         table = families.setdefault(family, {"problems": 0, "proved": 0, "seconds": [], "gaps": {}})
-        if "error" in found:
-            families[family] = found
+        if "error" in answer:
+            families[family] = answer
             continue
-        proved = np.array(found["solved"])
-        best = hard_cost(mpc, torch.from_numpy(found["u"]))[proved].numpy()
+        proved = np.array(answer["solved"])
+        best = hard_cost(mpc, torch.from_numpy(answer["u"]))[proved].numpy()
         table["problems"] += problem.count
         table["proved"] += int(proved.sum())
-        table["seconds"] += found["times"]
+        table["seconds"] += answer["times"]
         for name, plan in ours.items():
             cost = hard_cost(mpc, mpc.clip(plan(problem)))[proved].numpy()
             gap = (cost - best) / (best + np.broadcast_to(problem.constant, problem.count)[proved])

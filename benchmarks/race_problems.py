@@ -27,7 +27,7 @@ STATES = 77  # what is added to a seed for the states, so that they are not draw
 
 
 def problem(lcs: LCSParams, cost: QuadraticCost, x0: torch.Tensor, horizon: int, limit: float, seed: int) -> Problem:
-    """Arrays of it, as the rivals take them."""
+    """Make the arrays of a problem, as the rivals take them."""
     arrays = {name: value.detach().double().numpy() for name, value in lcs.tensors().items()}
     arrays |= {n: getattr(cost, n).detach().double().numpy() for n in ("Q", "R", "Q_final", "q", "r", "q_final")}
     bound = np.full(lcs.n_u, limit)
@@ -40,13 +40,13 @@ def problem(lcs: LCSParams, cost: QuadraticCost, x0: torch.Tensor, horizon: int,
 
 
 def pushing(lcs: LCSParams, count: int, seed: int, horizon: int = 5) -> Problem:
-    """A hand around an object, a goal for each problem."""
+    """Make a hand around an object, with a goal for each problem."""
     x0, goal = states_and_goals(count, seed)
     return problem(lcs, pushing_cost()(goal, horizon), x0, horizon, ACTION_LIMIT, seed)
 
 
 def cart_pole(count: int, horizon: int, seed: int) -> Problem:
-    """The cart-pole between soft walls, pushed with up to 20 N."""
+    """Make the cart-pole between soft walls, pushed with up to 20 N."""
     weight = torch.diag(torch.tensor([1.0, 10.0, 0.1, 0.1], dtype=torch.float64))
     cost = QuadraticCost(Q=weight, R=0.01 * torch.eye(1, dtype=torch.float64), Q_final=10 * weight)
     x0 = uniform([0.3, 0.4, 1.0, 2.0], count, seed + STATES)
@@ -61,18 +61,18 @@ def chain(count: int, carts: int, horizon: int, seed: int) -> Problem:
 
 
 def with_contact(count: int, seeds: int) -> dict[str, list[Problem]]:
-    """Families of the race, one entry for each model or seed of initial states."""
+    """Make the families of the race, one entry for each model or seed of initial states."""
     every = range(seeds)
     cube = LCSModel.from_pretrained("zoo:trifinger-cube").params().detach()
-    found = {f"pushing, n_lam {n}": [pushing(pushing_model(n, s), count, s) for s in every] for n in (5, 8)}
-    found["learned cube"] = [pushing(cube, count, 10 + s) for s in every]
-    found |= {f"cart-pole, H {h}": [cart_pole(count, h, h + s) for s in every] for h in (10, 20, 30)}
-    found |= {f"chain of {n}, H {h}": [chain(count, n, h, n + s) for s in every] for n, h in ((4, 10), (10, 10))}
-    return found
+    families = {f"pushing, n_lam {n}": [pushing(pushing_model(n, s), count, s) for s in every] for n in (5, 8)}
+    families["learned cube"] = [pushing(cube, count, 10 + s) for s in every]
+    families |= {f"cart-pole, H {h}": [cart_pole(count, h, h + s) for s in every] for h in (10, 20, 30)}
+    families |= {f"chain of {n}, H {h}": [chain(count, n, h, n + s) for s in every] for n, h in ((4, 10), (10, 10))}
+    return families
 
 
 def without_contact(count: int, seeds: int) -> dict[str, list[Problem]]:
-    """Linear MPC with bounds on the actions: n_lam = 0. All problems of an entry differ in x0 alone."""
+    """Make linear MPC with bounds on the actions: n_lam = 0. All problems of an entry differ in x0 alone."""
 
     def drop(p: Problem) -> Problem:
         none = {"C": p.C[..., :0], "D": p.D[:0], "E": p.E[:0], "F": p.F[:0, :0], "c": p.c[:0]}
@@ -91,7 +91,7 @@ def without_contact(count: int, seeds: int) -> dict[str, list[Problem]]:
 
 
 def small(count: int, seeds: int) -> Iterator[tuple[str, Problem]]:
-    """Problems whose modes a branch and bound can go through."""
+    """Make problems whose modes a branch and bound can enumerate."""
     for s in range(seeds):
         yield "cart-pole, H 10 (2^20 modes)", cart_pole(count, 10, 10 + s)
     for s in range(seeds):

@@ -57,13 +57,13 @@ class Options:
     seeds: int = 4
     """Models of each size; the carts have one."""
     out: Path = Path("benchmarks/results/scale.json")
-    """Where the JSON goes."""
+    """Path of the JSON output."""
     smoke: bool = False
     """Everything tiny."""
 
 
 def random_problem(n_x: int, n_lam: int, horizon: int, count: int, seed: int) -> Instance:
-    """A random model, to be brought to rest."""
+    """Make a random model, to be brought to rest."""
     lcs = random_model(n_lam, seed, n_x, n_u=2 * n_x // 3)
     eye = torch.eye(n_x, dtype=torch.float64)
     cost = QuadraticCost(eye, 0.1 * torch.eye(lcs.n_u, dtype=torch.float64), eye)

@@ -1,4 +1,4 @@
-"""Entry of the command line as a program, also of `python -m difflcs`: what is written is complete, or it says so."""
+"""Entry of the command line as a program, also of `python -m difflcs`, with complete output and exit codes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from difflcs import cli
 
 _INTERRUPTED = 130
 _READER_GONE = 141
-"""What a shell reports after Ctrl-C, and of a program whose output nobody reads any more: 128 and the signal."""
+"""Exit codes of a shell after Ctrl-C, and of a program whose output nobody reads any more: 128 plus the signal."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -46,7 +46,7 @@ def _flush() -> None:
 
 
 def _reader_gone() -> bool:
-    """Whether it was a broken pipe of ours, as in `difflcs train --help | head`. Nothing more is written then."""
+    """Return whether the reader of our output has gone, as in `difflcs train --help | head`; then write no more."""
     gone = False
     for stream in (sys.stdout, sys.stderr):
         poll = select.poll()

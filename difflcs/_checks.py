@@ -27,7 +27,7 @@ _USABLE_DEVICES = ("cpu", "cuda", "mps", "xpu")
 
 
 def describe(value: object) -> str:
-    """A short description of a value for an error message."""
+    """Describe a value briefly for an error message."""
     if isinstance(value, Tensor):
         shape = "nested" if value.is_nested else str(tuple(value.shape))  # torch knows none of the former
         layout = "" if value.layout is torch.strided else f" {str(value.layout).removeprefix('torch.')}"
@@ -40,7 +40,7 @@ def describe(value: object) -> str:
 
 
 def did_you_mean(got: object, known: Iterable[str]) -> str:
-    """For an error message: which of the known names somebody may have meant, in brackets; empty if none is near."""
+    """Suggest the known names that somebody may have meant, in brackets for an error message; empty if none is near."""
     near = difflib.get_close_matches(str(got)[:100], known, n=2)
     return f" (did you mean {' or '.join(near)}?)" if near else ""
 
@@ -84,7 +84,7 @@ def check_tensor(name: str, value: object, dims: Sequence[tuple[str, int]] = (),
 
 
 def check_dims(name: str, value: Tensor, dims: Sequence[tuple[str, int]]) -> None:
-    """The part of `check_tensor` that is about the trailing dimensions."""
+    """Check the trailing dimensions of a tensor, as a part of `check_tensor`."""
     if dims and not _ends_in(value.shape, dims):
         labels = ", ".join(["..."] + [f"{label}={size}" for label, size in dims])
         raise ShapeError(
@@ -93,7 +93,7 @@ def check_dims(name: str, value: Tensor, dims: Sequence[tuple[str, int]]) -> Non
 
 
 def is_array(value: object) -> TypeGuard[Tensor]:
-    """Whether NumPy can look at a value as it is: a dense tensor on the CPU."""
+    """Return whether NumPy can read a value as it is: a dense tensor on the CPU."""
     return (
         isinstance(value, Tensor)
         and value.is_cpu
@@ -114,7 +114,7 @@ def _ends_in(shape: torch.Size, dims: Sequence[tuple[str, int]]) -> bool:
 
 
 def all_finite(*values: Tensor) -> bool:
-    """Whether no number of some tensors is NaN or infinite. One look at all, as it is the look that takes the time."""
+    """Return whether no number of some tensors is NaN or infinite, in one call, as each call takes time."""
     if transforms_active() or not all([v.is_cpu for v in values]):
         return all(bool(torch.isfinite(v.detach()).all()) for v in values)
     return _kernels.all_finite([(v.detach() if v.requires_grad else v).numpy() for v in values])
@@ -144,7 +144,7 @@ def check_positive_definite(F: Tensor) -> None:
 
 
 def batch_index(shape: Sequence[int], flat: int) -> str:
-    """The element of a batch that a flat index means, as one writes it: 3, or (1, 0)."""
+    """Write a flat index as the index of a batch element: 3, or (1, 0)."""
     index = []
     for size in reversed(shape):
         flat, i = divmod(flat, size)
@@ -166,9 +166,9 @@ def check_same_device(tensors: Iterable[tuple[str, Tensor]]) -> None:
 
 
 def plain(value: object) -> object:
-    """The number that a NumPy scalar, or an array or tensor without dimensions, holds; anything else as it is.
+    """Return the number in a NumPy scalar, or in an array or tensor without dimensions; anything else as it is.
 
-    So is a tensor that asks for a gradient, which would be lost, and one whose number cannot be read here.
+    A tensor also stays as it is if it requires a gradient, which would be lost, or if its number cannot be read here.
     """
     if isinstance(value, Tensor):
         unread = value.layout is not torch.strided or value.is_nested or value.requires_grad or is_wrapped(value)
@@ -182,8 +182,8 @@ def plain(value: object) -> object:
 def make_plain(settings: object) -> None:
     """Make the numbers among the fields of a frozen dataclass, and in their tuples, Python's; see `plain`."""
     for name, value in vars(settings).items():
-        own = tuple(map(plain, value)) if type(value) is tuple else plain(value)
-        object.__setattr__(settings, name, own)
+        plain_value = tuple(map(plain, value)) if type(value) is tuple else plain(value)
+        object.__setattr__(settings, name, plain_value)
 
 
 def check_integer(name: str, value: object) -> int:
@@ -242,7 +242,7 @@ def check_choice(name: str, value: object, choices: Sequence[str]) -> str:
 
 
 def broadcast_batch(shapes: Iterable[tuple[str, torch.Size]]) -> torch.Size:
-    """Common leading batch shape of several named ones; a clear error where they do not broadcast."""
+    """Broadcast the leading batch shapes of several named ones; an error names one that does not fit."""
     result: tuple[int, ...] = ()
     named = list(shapes)
     for name, shape in named:
@@ -258,7 +258,7 @@ def broadcast_batch(shapes: Iterable[tuple[str, torch.Size]]) -> torch.Size:
 
 
 def _broadcast(left: tuple[int, ...], right: tuple[int, ...]) -> tuple[int, ...] | None:
-    """What both shapes broadcast to, or None; `torch.broadcast_shapes` costs 100 µs."""
+    """Broadcast two shapes, or return None; `torch.broadcast_shapes` costs 100 µs."""
     if left == right or not right:
         return left
     if len(left) < len(right):

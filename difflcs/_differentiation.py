@@ -1,13 +1,13 @@
-"""The bridge to autograd of whatever is computed outside it, also for `torch.func` and `torch.compile`.
+"""Bridge to autograd for computations outside it, also under `torch.func` and `torch.compile`.
 
-A `Solver` says how to solve, and how to pull a gradient back. `solve` makes of it a node of the graph. Whatever
-transform is active, both are only ever called with plain tensors:
+A `Solver` defines how to solve and how to pull a gradient back; `solve` makes it a node of the graph. Both are called
+with plain tensors only, whatever transform is active:
 
 - `torch.func.vmap` folds the dimension that it adds into the batch, in the solve and in its pullback;
-- the pullback is a function of its own, so that `torch.func.grad`, which records every backward pass, can record it.
-  Its own backward refuses: there are no second derivatives;
+- the pullback is a separate function, so that `torch.func.grad`, which records every backward pass, can record it.
+  Its backward pass refuses: there are no second derivatives;
 - `is_grads_batched`, and with it `torch.autograd.functional.jacobian(vectorize=True)`, maps the backward pass by an
-  older vmap, which no rule of ours can reach; there the batched gradients are unwrapped by hand.
+  older vmap that accepts no rules; there the batched gradients are unwrapped by hand.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ R = TypeVar("R")
 
 
 def is_wrapped(tensor: Tensor) -> bool:
-    """Whether a transform of `torch.func`, or a vectorised backward pass, stands between us and the numbers.
+    """Return whether a transform of `torch.func`, or a vectorised backward pass, hides the numbers of a tensor.
 
-    There is no public question for it. A batched tensor refuses `.numpy()` and `bool()`; one that tracks gradients for
+    There is no public function for it. A batched tensor refuses `.numpy()` and `bool()`; one that tracks gradients for
     `torch.func.grad` does not, but what is read from it is lost to the transform.
     """
     functorch = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
@@ -41,12 +41,12 @@ def is_wrapped(tensor: Tensor) -> bool:
 
 
 def transforms_active() -> bool:
-    """Whether code runs inside a transform of `torch.func`."""
+    """Return whether code runs inside a transform of `torch.func`."""
     return torch._C._are_functorch_transforms_active()
 
 
 def forward_mode_active() -> bool:
-    """Whether code runs inside `torch.autograd.forward_ad.dual_level`."""
+    """Return whether code runs inside `torch.autograd.forward_ad.dual_level`."""
     return torch.autograd.forward_ad._current_level >= 0
 
 
@@ -65,10 +65,10 @@ def refuse_tangents(tensors: Iterable[Tensor]) -> None:
 
 
 def runs_eagerly(function: Callable[P, R]) -> Callable[P, R]:
-    """A function whose numbers are those of eager code in its own precision, whatever runs around it.
+    """Make a function compute as eager code in its own precision, whatever surrounds the call.
 
-    `torch.compile` leaves it to Python: a break of the graph. `torch.compiler.disable` at import would import the
-    compiler, which takes seconds. And `torch.autocast` is off inside.
+    `torch.compile` breaks the graph there. `torch.compiler.disable` at import would import the compiler, which takes
+    seconds. `torch.autocast` is off inside.
     """
 
     @functools.wraps(function)
@@ -87,18 +87,18 @@ def runs_eagerly(function: Callable[P, R]) -> Callable[P, R]:
 
 
 class Solver(ABC):
-    """A function of tensors that is computed outside autograd, and its pullback.
+    """A function of tensors that is computed outside autograd, with its pullback.
 
-    Each input has its own dimensions, and before them those of the batch, or none of these if the batch shares it; they
-    broadcast. Every output has all dimensions of the batch first. `torch.func.vmap` makes one dimension of them.
+    Each input has batch dimensions before its trailing ones, or none if the batch shares it; they broadcast. Every
+    output has all batch dimensions first. `torch.func.vmap` flattens them into one.
 
     Attributes:
-        name: what has first derivatives only, for the error message.
-        ranks: number of its own dimensions of each input.
+        name: name of the function in the error for second derivatives.
+        ranks: number of trailing dimensions of each input.
         differentiable: number of outputs that have a gradient. They come first.
-        keeps: whether `solve` leaves in the solver, which then serves one call, what its pullback needs. The pullback
-            is always of all that was solved, in the same order, and gets no outputs: of several gradients for one
-            solve, one after the other. So callers may change outputs in place.
+        keeps: whether `solve` stores in the solver, which then serves one call, the data of its pullback. The pullback
+            then covers the whole solve, in the same order, and gets no outputs; several gradients of one solve are
+            computed one after the other. So callers may change outputs in place.
     """
 
     name: ClassVar[str]
@@ -108,7 +108,7 @@ class Solver(ABC):
 
     @abstractmethod
     def solve(self, tensors: Sequence[Tensor], transformed: bool) -> tuple[Tensor, ...]:
-        """The outputs. `transformed`: nothing has looked at the numbers yet, and nobody can warn later."""
+        """Compute the outputs. `transformed`: the numbers are unchecked, and nobody can warn later."""
 
     @abstractmethod
     def pullback(
@@ -118,14 +118,14 @@ class Solver(ABC):
         grads: Sequence[Tensor | None],
         needs: Sequence[bool],
     ) -> Sequence[Tensor | None]:
-        """A gradient for each of `tensors` that needs one, None for zero.
+        """Compute a gradient for each of `tensors` that needs one, None for zero.
 
         It is of the shape of the input; or has the batch in one dimension, and is summed to that shape by the caller.
-        Under `torch.func.vmap` each element may have inputs of its own that were shared in the solve.
+        Under `torch.func.vmap` inputs that were shared in the solve may differ between elements.
 
         Args:
             tensors: the inputs.
-            outputs: what `solve` returned.
+            outputs: those of `solve`.
             grads: of the differentiable outputs; None for zero.
             needs: which of the inputs need a gradient.
         """
@@ -136,7 +136,7 @@ class Solver(ABC):
 
 
 def solve(solver: Solver, *tensors: Tensor) -> tuple[Tensor, ...]:
-    """The outputs of a solver, as nodes of the graph if there is one."""
+    """Compute the outputs of a solver, as nodes of the graph if there is one."""
     if transforms_active():
         return _Transformed.apply(solver, *tensors)[:-1]  # pyright: ignore[reportReturnType, reportOptionalSubscript]
     if forward_mode_active() or (torch.is_grad_enabled() and any([tensor.requires_grad for tensor in tensors])):
@@ -169,7 +169,7 @@ class _Eager(torch.autograd.Function):
 
 
 class _Transformed(torch.autograd.Function):
-    """The outputs, and an empty tensor that knows which transforms they have met."""
+    """Outputs, and an empty tensor that records which transforms they have passed through."""
 
     @staticmethod
     def forward(solver: Solver, *tensors: Tensor):
@@ -197,7 +197,7 @@ def pull_back(
     grads: Sequence[Tensor | None],
     needs: Sequence[bool],
 ) -> Sequence[Tensor | None]:
-    """A solver's pullback, for the backward pass of an autograd function, whatever transform it runs in."""
+    """Run a solver's pullback in the backward pass of an autograd function, under any transform."""
     legacy = torch._C._functorch.is_legacy_batchedtensor  # pyright: ignore[reportAttributeAccessIssue]
     batched = any([grad is not None and legacy(grad) for grad in grads])
     if torch.is_grad_enabled() and (batched or not transforms_active()):
@@ -205,8 +205,8 @@ def pull_back(
     if batched or transforms_active():
         # Inside a transform of torch.func every backward pass is recorded; it is refused when it is differentiated.
         function = _pull_back_legacy if batched else _Pullback.apply
-        found = iter(function(solver, needs, len(tensors), len(outputs), *tensors, *outputs, *grads))  # pyright: ignore
-        gradients = [next(found) if needed else None for needed in needs]
+        results = iter(function(solver, needs, len(tensors), len(outputs), *tensors, *outputs, *grads))  # pyright: ignore
+        gradients = [next(results) if needed else None for needed in needs]
     else:
         gradients = _summed(solver, tensors, solver.pullback(tensors, outputs, grads, needs))
     pairs = zip(gradients, tensors, strict=True)
@@ -214,7 +214,7 @@ def pull_back(
 
 
 class _Pullback(torch.autograd.Function):
-    """Gradients of the first n values, which are inputs, where they need one; then come m outputs and the gradients."""
+    """Gradients of those of the first n values, the inputs, that need one; then follow m outputs and the gradients."""
 
     @staticmethod
     def forward(solver: Solver, needs: Sequence[bool], n: int, m: int, *values: Tensor):
@@ -246,8 +246,8 @@ def _pull_back_many(
     m: int,
     values: Sequence[Tensor | None],
 ) -> tuple[Tensor, ...]:
-    """What `_Pullback` returns of `count` problems, or of as many gradients of one, (count, …) each."""
-    if solver.keeps and all(dim is None for dim in dims[n : n + m]):  # the solve has not met this dimension
+    """Pull back `count` problems, or as many gradients of one; (count, …) each."""
+    if solver.keeps and all(dim is None for dim in dims[n : n + m]):  # the solve has no such dimension
         each = []
         for i in range(count):
             one = [v if v is None or dim is None else v.select(dim, i) for v, dim in zip(values, dims, strict=True)]
@@ -256,9 +256,9 @@ def _pull_back_many(
     sizes = [0 if v is None else v.ndim - (dim is not None) for v, dim in zip(values, dims, strict=True)]
     leading = max(size - rank for size, rank in zip(sizes, solver.ranks, strict=False))
     ranks = (*solver.ranks, *(size - leading for size in sizes[n:]))
-    # Shared inputs are repeated: each of the `count` problems wants the gradient of its own.
+    # Shared inputs are repeated, as each of the `count` problems needs a gradient.
     flat, batch = _flatten(count, dims, values, ranks, share=False)
-    found, gradients = [], iter(_Pullback.apply(solver, needs, n, m, *flat))  # pyright: ignore
+    results, gradients = [], iter(_Pullback.apply(solver, needs, n, m, *flat))  # pyright: ignore
     for value, dim, rank, needed in zip(values, dims, ranks, needs, strict=False):
         if not needed or value is None:
             continue
@@ -268,16 +268,16 @@ def _pull_back_many(
             del shape[dim]
         lead = [1] * (len(batch) - len(shape) + rank) + shape[: len(shape) - rank]
         gradient = gradient.reshape(count, *batch, *gradient.shape[1:])
-        shared = [1 + i for i, (size, own) in enumerate(zip(batch, lead, strict=True)) if size != own]
+        shared = [1 + i for i, (size, lead_size) in enumerate(zip(batch, lead, strict=True)) if size != lead_size]
         gradient = gradient.sum(shared, keepdim=True) if shared else gradient
-        found.append(gradient.reshape(count, *shape))
-    return tuple(found)
+        results.append(gradient.reshape(count, *shape))
+    return tuple(results)
 
 
 def _flatten(
     count: int, dims: Sequence[int | None], values: Sequence[Tensor | None], ranks: Sequence[int], share: bool
 ) -> tuple[list[Tensor | None], torch.Size]:
-    """Fold a dimension of size `count` and those of the batch into one, and the dimensions that the batch had.
+    """Fold a dimension of size `count` and the batch dimensions into one; also return the batch dimensions.
 
     `dims`: where each value has that dimension. `share`: a value that has neither stays as it is.
     """
@@ -291,25 +291,25 @@ def _flatten(
         if whole is None or (share and dim is None and not lead):
             flat.append(value)
             continue
-        own = whole.shape[1 + len(lead) :]
-        whole = whole.reshape(len(whole), *[1] * (len(batch) - len(lead)), *lead, *own)
-        flat.append(whole.expand(count, *batch, *own).reshape(count * math.prod(batch), *own))
+        shape = whole.shape[1 + len(lead) :]
+        whole = whole.reshape(len(whole), *[1] * (len(batch) - len(lead)), *lead, *shape)
+        flat.append(whole.expand(count, *batch, *shape).reshape(count * math.prod(batch), *shape))
     return flat, batch
 
 
 def _summed(solver: Solver, tensors: Sequence[Tensor], gradients: Sequence[Tensor | None]) -> list[Tensor | None]:
-    """Gradients in the shapes of their inputs, summed over the batch where it shares an input."""
-    found = list(gradients)
+    """Sum gradients to the shapes of their inputs, over the batch where it shares an input."""
+    summed = list(gradients)
     for i, (gradient, like) in enumerate(zip(gradients, tensors, strict=True)):
         if gradient is None or gradient.shape == like.shape:
             continue
         if gradient.numel() != like.numel():
             leads = [tensor.shape[: tensor.ndim - rank] for tensor, rank in zip(tensors, solver.ranks, strict=True)]
-            batch, lead, own = torch.broadcast_shapes(*leads), leads[i], like.shape[len(leads[i]) :]
+            batch, lead, shape = torch.broadcast_shapes(*leads), leads[i], like.shape[len(leads[i]) :]
             ones = [1] * (len(batch) - len(lead))
-            gradient = gradient.reshape((*batch, *own)).sum_to_size((*ones, *lead, *own))
-        found[i] = gradient.reshape(like.shape)
-    return found
+            gradient = gradient.reshape((*batch, *shape)).sum_to_size((*ones, *lead, *shape))
+        summed[i] = gradient.reshape(like.shape)
+    return summed
 
 
 def _pull_back_legacy(solver: Solver, needs: Sequence[bool], n: int, m: int, *values: Tensor | None) -> list[Tensor]:

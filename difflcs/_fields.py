@@ -1,4 +1,4 @@
-"""Modules that hold the tensors of a problem, each constant over the horizon or given by stage."""
+"""Base of modules that hold the tensors of a problem, each constant over the horizon or one per stage."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class TensorFields(nn.Module):
     """A module whose tensors are registered by kind: nn.Parameter as parameter, any other tensor as buffer.
 
     Attributes:
-        by_stage: names of the fields that have a dimension of stages in front of their own; the others hold at all.
+        by_stage: names of the fields that have a dimension of stages in front; the others hold at all stages.
     """
 
     by_stage: frozenset[str] = frozenset()
@@ -29,7 +29,7 @@ class TensorFields(nn.Module):
             self.register_buffer(name, value, persistent=persistent)
 
     def _held(self, names: Iterable[str]) -> dict[str, Tensor]:
-        """Some fields by their names; faster than one attribute after the other."""
+        """Return some fields by their names; faster than one attribute after the other."""
         if self._forward_pre_hooks:
             fresh(self, tuple(names))
         held = {**self._buffers, **self._parameters}
@@ -40,8 +40,8 @@ class TensorFields(nn.Module):
         return ", ".join(f"{name}{tuple(getattr(self, name).shape)}" for name in names)
 
 
-def check_by_stage(by_stage: Collection[str], names: Iterable[str], given: Iterable[str]) -> frozenset[str]:
-    """Which of the given fields have a dimension of stages."""
+def check_by_stage(by_stage: Collection[str], names: Iterable[str], present: Iterable[str]) -> frozenset[str]:
+    """Return which of the present fields have a dimension of stages."""
     names = tuple(names)
     if isinstance(by_stage, str) or not isinstance(by_stage, Collection):
         raise DTypeError(f"by_stage: expected a tuple of names like {names[:2]}, got {describe(by_stage)}; add a comma")
@@ -50,45 +50,45 @@ def check_by_stage(by_stage: Collection[str], names: Iterable[str], given: Itera
             raise InvalidInputError(
                 f"by_stage: expected names among {', '.join(names)}, got {describe(name)}; leave it out"
             )
-    found = frozenset(by_stage) & frozenset(given)
-    if not found:
+    staged = frozenset(by_stage) & frozenset(present)
+    if not staged:
         raise InvalidInputError(
             f"by_stage: expected at least one field by stage, got none of {', '.join(names)}; use the class without "
             f"stages for what is constant"
         )
-    return found
+    return staged
 
 
 def check_stages(values: dict[str, tuple[Tensor, int, int]]) -> int:
-    """The horizon that fields by stage agree on.
+    """Return the horizon that fields by stage agree on.
 
     Args:
-        values: name → tensor, number of its own dimensions behind the stages, and how many stages it has beyond H.
+        values: name → tensor, number of its dimensions after the stages, and of its stages beyond H.
     """
     horizon, first = 0, ""
-    for name, (value, own, extra) in values.items():
-        if value.ndim <= own:
+    for name, (value, rank, extra) in values.items():
+        if value.ndim <= rank:
             raise ShapeError(
-                f"{name}: expected a dimension of stages before its own {own}, got {describe(value)}; say by by_stage "
-                f"which fields have one"
+                f"{name}: expected a dimension of stages before its last {rank}, got {describe(value)}; say by "
+                f"by_stage which fields have one"
             )
-        found = value.shape[-1 - own] - extra
-        if found < 1:
+        stages = value.shape[-1 - rank] - extra
+        if stages < 1:
             raise ShapeError(
-                f"{name}: expected at least {1 + extra} stages, got {found + extra} in {describe(value)}; give one per "
-                f"stage"
+                f"{name}: expected at least {1 + extra} stages, got {stages + extra} in {describe(value)}; give one "
+                f"per stage"
             )
-        if first and found != horizon:
+        if first and stages != horizon:
             raise ShapeError(
                 f"{name}: expected {horizon + extra} stages, for a horizon of {horizon} like {first}, got "
-                f"{found + extra} in {describe(value)}; give as many for each field"
+                f"{stages + extra} in {describe(value)}; give as many for each field"
             )
-        horizon, first = found, first or name
+        horizon, first = stages, first or name
     return horizon
 
 
 def check_not_nan(name: str, value: object, dims: Iterable[tuple[str, int]] = ()) -> Tensor:
-    """As `check_tensor`, for numbers that may be infinite."""
+    """Check a tensor as `check_tensor` does, but allow infinity."""
     tensor = check_tensor(name, value, list(dims), finite=False)
     if not is_wrapped(tensor) and bool(torch.isnan(tensor.detach()).any()):
         raise NonFiniteError(

@@ -7,16 +7,16 @@ from torch import Tensor
 
 
 def product(left: Tensor, right: Tensor) -> Tensor:
-    """The product left @ right, float32 in float64: that `torch.autocast` leaves alone, also in a backward pass."""
+    """Multiply left @ right, float32 in float64; `torch.autocast` leaves it alone, also in a backward pass."""
     return left @ right if left.dtype is torch.float64 else (left.double() @ right.double()).to(left.dtype)
 
 
 def matvec(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Matrix · vector for vectors (..., columns)."""
+    """Multiply a matrix with vectors (..., columns)."""
     # A shared matrix is one GEMM for the whole batch; a matrix per element is a batched product.
     return product(vector, matrix.mT) if matrix.ndim == 2 else product(matrix, vector.unsqueeze(-1)).squeeze(-1)
 
 
 def quadratic(matrix: Tensor, vector: Tensor) -> Tensor:
-    """vectorᵀ · matrix · vector, (...)."""
+    """Compute vectorᵀ · matrix · vector, (...)."""
     return (vector * matvec(matrix, vector)).sum(-1)

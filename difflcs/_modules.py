@@ -1,8 +1,8 @@
-"""What the tools of `torch.nn.utils` have made of the parameters of a module.
+"""Tensors of modules whose parameters the tools of `torch.nn.utils` have replaced.
 
 `parametrize` makes a property of a parameter: it is enough to read tensors by their names. `prune`, and `weight_norm`
 and `spectral_norm` of old, keep an attribute in the place of a parameter. A hook computes it whenever the module is
-called, so whoever asks a module by another method has to run the hooks first.
+called, so code that uses another method of a module has to run the hooks first.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ M = TypeVar("M")
 
 
 def untouched(module: nn.Module) -> bool:
-    """Whether the tensors of a module are its parameters and buffers as they are."""
+    """Return whether the tensors of a module are its parameters and buffers as they are."""
     return "parametrizations" not in module._modules and Tensor not in map(type, vars(module).values())
 
 
 def fresh(module: M, names: Collection[str] = ()) -> M:
-    """A module, or something else, after what the hooks of `torch.nn.utils` compute in it and its parts.
+    """Run the hooks of `torch.nn.utils` in a module and its parts, and return it; anything else is returned as it is.
 
     Args:
-        module: what is returned.
-        names: of its tensors. No other hook may compute one: nobody knows what it expects.
+        module: the module, or any other object.
+        names: names of its tensors. No other hook may compute one, as it may expect arguments.
 
     Raises:
         InvalidInputError: another hook stands before `forward`, and an attribute in the place of one of these tensors.
@@ -48,7 +48,7 @@ def fresh(module: M, names: Collection[str] = ()) -> M:
 
 
 def plain_state(module: nn.Module) -> dict[str, Tensor]:
-    """The state dict that a module would have if its tensors were parameters: what a new one of its class can load."""
+    """Make the state dict that a module would have if its tensors were parameters, for a new one of its class."""
     state = fresh(module).state_dict()
     for path, part in module.named_modules():
         at = f"{path}." if path else ""
@@ -62,7 +62,7 @@ def plain_state(module: nn.Module) -> dict[str, Tensor]:
 
 
 def _hooks(module: nn.Module) -> list[Any]:
-    """Hooks by which torch computes a tensor before each call."""
+    """List the hooks by which torch computes a tensor before each call."""
     if not module._forward_pre_hooks:
         return []
     from torch.nn.utils.prune import BasePruningMethod

@@ -23,11 +23,11 @@ def require(*packages: str) -> None:
 
 
 def versions() -> dict[str, str | None]:
-    """Versions of the packages that decide a result; None for one that is not installed."""
-    found: dict[str, str | None] = {}
+    """List the versions of the packages that decide a result; None for one that is not installed."""
+    installed: dict[str, str | None] = {}
     for name in _REPORTED:
         try:
-            found[name] = metadata.version(name)
+            installed[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = None
-    return found
+            installed[name] = None
+    return installed

@@ -1,6 +1,6 @@
 """Cache of a result, valid while the tensors that it was made of hold the same numbers.
 
-A robot plans through one model again and again. What was checked and prepared at one call holds at the next one if the
+A robot plans with one model again and again. Results of checks and preparations at one call hold at the next if the
 numbers are the same. The numbers themselves are compared, as neither the identity of a tensor nor its version says
 enough: `tensor.data.mul_(2)`, a NumPy array that shares the memory and `vector_to_parameters` leave no trace there. It
 costs less than 1 µs for a matrix of a robot's size.
@@ -19,13 +19,13 @@ from torch import Tensor
 T = TypeVar("T")
 
 MOST_NUMBERS = 4096
-"""Of a tensor that is compared: it would take as long to compare larger ones as to check and prepare them again."""
+"""Largest size of a tensor that is compared: for larger ones this takes as long as to check and prepare them again."""
 
 
 class Snapshot:
-    """Some values: what they are and, of the tensors among them, which are on the CPU, their numbers.
+    """Some values and the numbers of the tensors among them, which are on the CPU.
 
-    What was made in inference mode is of no use outside of it, so that nothing is the same there.
+    Tensors made in inference mode cannot be used outside of it, so a snapshot from there matches nothing outside.
     """
 
     __slots__ = ("_arrays", "_forms", "_inference", "_numbers", "_values", "tensors")
@@ -39,7 +39,7 @@ class Snapshot:
         self._inference = torch.is_inference_mode_enabled()
 
     def same(self, values: Sequence[object]) -> bool:
-        """Whether these are the same values, and the tensors hold the same numbers."""
+        """Return whether these are the same values, and the tensors hold the same numbers."""
         return (
             self._inference == torch.is_inference_mode_enabled()
             and len(values) == len(self._values)
@@ -50,7 +50,7 @@ class Snapshot:
 
 
 def _forms(tensors: Sequence[Tensor]) -> list[object]:
-    """Where the numbers of each tensor are, and in which order: `tensor.data = other` and `t_()` change it."""
+    """List each tensor's memory and layout, which `tensor.data = other` and `t_()` change."""
     return [*map(Tensor.data_ptr, tensors), *map(Tensor.stride, tensors), *map(Tensor.size, tensors)]
 
 
@@ -59,23 +59,23 @@ def _numbers(arrays: Sequence[np.ndarray]) -> list[bytes]:
 
 
 def comparable(values: Sequence[object]) -> bool:
-    """Whether the numbers of all tensors among them can be compared, and quickly."""
+    """Return whether the numbers of all tensors among them can be compared, and quickly."""
     return all(value.is_cpu and value.numel() <= MOST_NUMBERS for value in values if isinstance(value, Tensor))
 
 
 class Recall(Generic[T]):
-    """The last value that was kept. Copies of a `Recall`, and files, are empty."""
+    """Memory of the last value that was kept. Copies of a `Recall`, also in files, are empty."""
 
     def __init__(self) -> None:
         self._kept: tuple[T, Snapshot] | None = None
 
     def value(self, tensors: Sequence[Tensor]) -> T | None:
-        """What was kept, if it was made of these tensors with these numbers."""
+        """Return the kept value if it was made of these tensors with these numbers; else None."""
         kept = self._kept  # once: another thread may keep something else
         return kept[0] if kept is not None and kept[1].same(tensors) else None
 
     def keep(self, value: T, tensors: Sequence[Tensor]) -> None:
-        """Keep a value and what it was made of, if that can be compared, and quickly."""
+        """Keep a value and a snapshot of its tensors, if they can be compared, and quickly."""
         if comparable(tensors):
             self._kept = value, Snapshot(tensors)
 

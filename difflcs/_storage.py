@@ -1,6 +1,6 @@
 """Storage in files: atomic writes, locks, JSON, and records of tensors (safetensors). Never pickle.
 
-Whatever lies in a file that is read, the error is a `CheckpointError`. Sizes are checked before anything is read.
+Any file that cannot be used raises a `CheckpointError`. Sizes are checked before anything is read.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from torch import Tensor
 from difflcs.errors import CheckpointError, InUseError, InvalidInputError, MissingDependencyError
 
 LOCK = ".lock"
-"""Name of the file in a directory that says, while it is locked, that a process works there."""
+"""Name of the file whose lock shows that a process works in the directory."""
 MAX_TEXT = 1 << 26
 """Largest JSON or CSV file that is read [byte]; a training of days writes less than a megabyte."""
 MAX_TENSORS = 1 << 32
 """Largest file of tensors that is read [byte]."""
 _MAX_DEPTH = 32
-"""Deepest nesting of JSON; ours has six levels."""
+"""Deepest nesting of JSON that is read; ours has six levels."""
 _FORMAT = 1
 
 
@@ -141,25 +141,25 @@ def _children(part: dict | list) -> Iterable[object]:
 
 
 def _check_size(path: Path, limit: int) -> None:
-    """Refuse what is no plain file (a pipe would never end) or too large.
+    """Refuse anything but a plain file (a pipe would never end), and one that is too large.
 
     Raises:
         FileNotFoundError: there is no such file.
         CheckpointError: see above.
     """
     try:
-        found = path.stat()
+        status = path.stat()
     except FileNotFoundError:
         raise
     except (OSError, ValueError) as error:
         raise CheckpointError(
             f"{path}: expected a file that can be read, got {error}; restore it from a copy"
         ) from error
-    if not stat.S_ISREG(found.st_mode):
+    if not stat.S_ISREG(status.st_mode):
         raise CheckpointError(f"{path}: expected a plain file, got another kind; restore it from a copy")
-    if found.st_size > limit:
+    if status.st_size > limit:
         raise CheckpointError(
-            f"{path}: expected at most {limit >> 20} MB, got {found.st_size >> 20} MB; difflcs did not write it"
+            f"{path}: expected at most {limit >> 20} MB, got {status.st_size >> 20} MB; difflcs did not write it"
         )
 
 
@@ -219,7 +219,7 @@ def save_record(directory: Path, kind: str, config: Mapping[str, object], tensor
 
 
 def digest(header: Mapping[str, object], tensors: Mapping[str, Tensor]) -> str:
-    """SHA-256 of a record: its description and the names, shapes, types and values of its tensors."""
+    """Compute the SHA-256 of a record: its description and the names, shapes, types and values of its tensors."""
     total = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(tensors):
         total.update(f"{name} {tuple(tensors[name].shape)} {tensors[name].dtype}".encode())
@@ -229,7 +229,7 @@ def digest(header: Mapping[str, object], tensors: Mapping[str, Tensor]) -> str:
 
 
 def load_record(directory: Path, kind: str) -> tuple[dict[str, object], dict[str, Tensor]]:
-    """Read and check what `save_record` wrote.
+    """Read and check a record that `save_record` wrote.
 
     Raises:
         CheckpointError: missing, corrupt, too large, of another kind, or of a newer format.
@@ -271,23 +271,23 @@ def _read_tensors(path: Path) -> tuple[Mapping[str, str], dict[str, Tensor]]:
 def check_tensors(
     source: object, what: str, got: Mapping[str, Tensor], wanted: Mapping[str, tuple[tuple[int, ...], torch.dtype]]
 ) -> None:
-    """Compare tensors of a file with what is to hold them, before that is built.
+    """Check tensors of a file against the expected shapes and dtypes, before a model is built.
 
     Args:
-        source: where they are from, for the message.
-        what: what they are to be, for the message.
+        source: their file or directory, for the message.
+        what: name of the object that they belong to, for the message.
         got: name → tensor.
         wanted: name → shape and dtype.
 
     Raises:
         CheckpointError: another name, shape or dtype, or NaN or infinity.
     """
-    found = {name: (tuple(value.shape), value.dtype) for name, value in got.items()}
-    if different := sorted(k for k in {*found, *wanted} if found.get(k) != wanted.get(k)):
+    actual = {name: (tuple(value.shape), value.dtype) for name, value in got.items()}
+    if different := sorted(k for k in {*actual, *wanted} if actual.get(k) != wanted.get(k)):
         name = different[0]
         raise CheckpointError(
             f"{source}: expected {what} that fits its configuration, got others in {short(different)}: {name} is "
-            f"{found.get(name)} instead of {wanted.get(name)}; the file is foreign or corrupt"
+            f"{actual.get(name)} instead of {wanted.get(name)}; the file is foreign or corrupt"
         )
     check_finite(source, got)
 
@@ -304,6 +304,6 @@ def check_finite(source: object, tensors: Mapping[str, Tensor]) -> None:
 
 
 def short(value: object) -> str:
-    """A value as it would be written, cut where it gets long."""
+    """Write a value as text, cut if it gets long."""
     text = repr(value)
     return text if len(text) <= 200 else f"{text[:200]}…"

@@ -14,8 +14,8 @@ from difflcs.errors import BoundsError, DTypeError, InvalidInputError, ShapeErro
 
 _DIMENSIONS = {"G": 2, "g": 1, "E": 2, "weight": 1}
 _EXTRA = {"G": 1, "g": 1, "E": 0, "weight": 1}  # stages beyond H
-# What each field is called in a problem (`difflcs.mpc.MPCProblem`).
-_HARD = 1e300  # prices from here on: such a row is a hard constraint
+_HARD = 1e300  # price from which on a row is a hard constraint
+# Field → its name in a problem (`difflcs.mpc.MPCProblem`).
 _NAMES = {"G": "G_x", "E": "G_u", "g": "g", "weight": "price"}
 
 
@@ -94,7 +94,7 @@ class StageBounds(TensorFields):
         return low, high
 
     def tensors(self) -> dict[str, Tensor]:
-        """Name → tensor."""
+        """Return name → tensor."""
         return self._held(("u_min", "u_max"))
 
 
@@ -136,7 +136,7 @@ class _Constraints(TensorFields):
                 self.register_buffer(name, None)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Name in a problem → tensor: G_x, g, price, and G_u where the actions count."""
+        """Return name in a problem → tensor: G_x, g, price, and G_u if the actions count."""
         fields = {_NAMES[name]: value for name, value in self._held(_NAMES).items()}
         if fields["G_u"] is None:
             del fields["G_u"]
@@ -170,12 +170,12 @@ def check_prices(name: str, prices: Tensor) -> None:
 
 
 class LinearConstraints(_Constraints):
-    """G x_k + E u_k ≤ g at every stage k = 0 … H; at stage H, where there is no action, G x_H ≤ g.
+    """Linear constraints G x_k + E u_k ≤ g at every stage k = 0 … H; at stage H, without an action, G x_H ≤ g.
 
     Hard, or soft with a price: violations then cost `weight` per unit, and a price above the constraint's multiplier
     keeps it as if it were hard. Every field is shared by the batch or has leading batch dimensions; it is learned if it
-    requires grad (an nn.Parameter is registered as one). What the first state alone violates cannot be met: such a
-    problem is INFEASIBLE.
+    requires grad (an nn.Parameter is registered as one). If the first state alone violates a hard
+    constraint, the problem is INFEASIBLE.
 
     Args:
         G: (..., n_c, n_x).

@@ -97,12 +97,12 @@ class _Quadratic(TensorFields):
         return torch.cat([torch.cat([Q, S], -1), torch.cat([S.mT, R], -1)], -2)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Name → tensor as it was passed, with the constants; S if there is one."""
+        """Return name → tensor as it was passed, with the constants; S if there is one."""
         fields = self._held(_DIMENSIONS)
         return {name: value for name, value in fields.items() if value is not None}
 
     def fields(self) -> dict[str, Tensor]:
-        """Name → tensor, with symmetric Q, R and Q_final, without the constant; S if there is one."""
+        """Return name → tensor, with symmetric Q, R and Q_final, without the constant; S if there is one."""
         fields = self.tensors()
         fields = {name: value for name, value in fields.items() if not name.startswith("constant")}
         return {k: 0.5 * (v + v.mT) if k in ("Q", "R", "Q_final") else v for k, v in fields.items()}
@@ -149,7 +149,7 @@ class QuadraticCost(_Quadratic):
 
     @classmethod
     def of_checked(cls, fields: Mapping[str, Tensor]) -> Self:
-        """A cost of fields that fit each other, all but S; nothing is checked here."""
+        """Make a cost of fields that fit each other, all but S; nothing is checked here."""
         cost = cls.__new__(cls)
         nn.Module.__init__(cost)
         cost._buffers.update({name: fields.get(name) for name in _DIMENSIONS})
@@ -160,7 +160,7 @@ class QuadraticCost(_Quadratic):
 class CostSequence(_Quadratic):
     """One convex quadratic cost per stage: the terms of `QuadraticCost`, with weights that change over the horizon.
 
-    Every field has the dimension H of the stages before its own, and before that any batch dimensions, or
+    Every field has a dimension H of stages before its rows and columns, and before that any batch dimensions, or
     none to be shared by the batch. Q_final, q_final and the constant have no stages.
 
     Args:
@@ -208,24 +208,24 @@ class CostSequence(_Quadratic):
 
 @runtime_checkable
 class CostModule(Protocol):
-    """Whatever says what states and actions cost where things are: the counterpart of `LCSModule`.
+    """Interface of modules that return the cost near some states: the counterpart of `LCSModule`.
 
-    A layer asks it at each call, a controller at each step. It may be a `torch.nn.Module`: then what it learns belongs
-    to the layer. `isinstance(value, CostModule)` asks for the method alone. A module whose cost is the same at all
+    A layer calls it at each call, a controller at each step. If it is a `torch.nn.Module`, its parameters belong to the
+    layer. `isinstance(value, CostModule)` checks for the method alone. A module whose cost is the same at all
     states may say so by an attribute `constant = True`: then it can be exported.
     """
 
     def at(self, x: Tensor, goal: Tensor | None = None, context: Tensor | None = None) -> QuadraticCost | CostSequence:
-        """The cost near some states.
+        """Return the cost near some states.
 
         Args:
-            x: (..., n_x) states that the plans begin at.
-            goal: (..., n_goal) that of the call, if it has one.
-            context: (..., n_context) that of the call, which the system sees too.
+            x: (..., n_x) initial states of the plans.
+            goal: (..., n_goal) of the call, if it has one.
+            context: (..., n_context) of the call, which the system also gets.
 
         Returns:
             The cost of plans from there, shared, or with leading batch dimensions that broadcast with those of x;
-            differentiable in what the module learns.
+            differentiable in the module's parameters.
         """
         ...
 
@@ -234,18 +234,18 @@ class CostModule(Protocol):
 def cost_at(
     cost: CostModule, x: Tensor, goal: Tensor | None = None, context: Tensor | None = None
 ) -> QuadraticCost | CostSequence:
-    """`cost.at(x, goal, context)`, for whoever was handed the module.
+    """Call `cost.at(x, goal, context)` after the hooks of `torch.nn.utils` in the module.
 
     Raises:
-        DTypeError: it returns something else than a cost.
+        DTypeError: it returns anything but a cost.
     """
-    found = fresh(cost).at(x, goal, context)
-    if not isinstance(found, QuadraticCost | CostSequence):
+    value = fresh(cost).at(x, goal, context)
+    if not isinstance(value, QuadraticCost | CostSequence):
         raise DTypeError(
-            f"cost: expected QuadraticCost or CostSequence from {type(cost).__name__}.at, got {describe(found)}; "
+            f"cost: expected QuadraticCost or CostSequence from {type(cost).__name__}.at, got {describe(value)}; "
             f"return one of them"
         )
-    return found
+    return value
 
 
 def _check_convex(name: str, matrix: Tensor) -> None:
@@ -338,7 +338,7 @@ class GoalCost(TensorFields):
         return QuadraticCost(**self.at(goal, horizon), check=False)
 
     def follow(self, reference: Tensor) -> CostSequence:
-        """Compute the cost of goals that move: stage k is drawn to its own goal, the final state to the last.
+        """Compute the cost of goals that move: stage k tracks goal k, the final state the last one.
 
         Args:
             reference: (..., H+1, n_goal) one goal for each state of the plan, the first for x0.
@@ -394,7 +394,7 @@ class GoalCost(TensorFields):
         return value.to(self.Q.dtype)
 
     def stage(self, x: Tensor, u: Tensor, goal: Tensor) -> Tensor:
-        """Cost of one stage, its constant included: states (..., n_x), actions (..., n_u), goals (...) → (...)."""
+        """Compute the cost of one stage, with its constant: x (..., n_x), u (..., n_u), goal (..., n_goal) → (...)."""
         cost = self(goal, horizon=1)
         squares = quadratic(cost.Q, x) + quadratic(cost.R, u) + quadratic(self.maps()["goal_stage"], goal)
         return 0.5 * squares + (cost.q * x).sum(-1)
@@ -466,7 +466,7 @@ def _weights(name: str, value: float | Sequence[float], n_x: int) -> list[float]
 def _tracking(
     n_x: int, weights: list[float], pairs: list[tuple[int, int]], pair_weight: float, dtype: torch.dtype
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """½xᵀQx + (G goal)ᵀx + ½goalᵀK goal of the tracking terms: Q, G, K."""
+    """Compute Q, G and K of the tracking terms ½xᵀQx + (G goal)ᵀx + ½goalᵀK goal."""
     n_goal = len(weights)
     diagonal = 2 * torch.diag(torch.tensor(weights, dtype=dtype))
     Q = torch.zeros(n_x, n_x, dtype=dtype)

@@ -42,9 +42,9 @@ class LCPSolution(NamedTuple):
 def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0, time_limit: float | None = None) -> LCPSolution:
     """Solve 0 ≤ λ ⊥ F λ + q ≥ 0 for a batch of P-matrices F (in particular F + Fᵀ ≻ 0).
 
-    Exact problems go through block principal pivoting, where that fails through an interior-point method that finds the
-    set of positive λ, with Murty's finite rule as the last resort; relaxed ones, λ ∘ (F λ + q) = relaxation, through
-    damped Newton on the Chen–Harker–Kanzow–Smale function, from n = 128 on and where that fails through the
+    Exact problems go through block principal pivoting, if that fails through an interior-point method that identifies
+    the positive λ, with Murty's finite rule as the last resort; relaxed ones, λ ∘ (F λ + q) = relaxation, through
+    damped Newton on the Chen–Harker–Kanzow–Smale function, from n = 128 on and if that fails through the
     interior-point method. Large problems and fallbacks eliminate with row exchanges, which a dominant skew part needs.
 
     CONVERGED is a certificate, recomputed from the λ and w that are returned: λ, w ≥ 0; λᵢwᵢ is 0, or the relaxation;
@@ -84,8 +84,8 @@ def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0, time_limit: float |
         return LCPSolution(lam, lam + q, torch.full(batch, int(Status.CONVERGED), dtype=torch.int8, device=q.device))
     q_flat = q.expand(*batch, n).reshape(-1, n).double()
     F_flat = F.double() if F.ndim == 2 else F.expand(*batch, n, n).reshape(-1, n, n).double()
-    narrow = torch.float32 in (F.dtype, q.dtype)
-    lam, w, status = solve(_Problems(relaxation, limit, narrow), F_flat, q_flat)
+    single = torch.float32 in (F.dtype, q.dtype)
+    lam, w, status = solve(_Problems(relaxation, limit, single), F_flat, q_flat)
     if not is_wrapped(status):
         _warn_of_failures(status, stacklevel=4)
     return LCPSolution(
@@ -96,7 +96,7 @@ def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0, time_limit: float |
 def solve_lcp_arrays(
     F: np.ndarray, q: np.ndarray, relaxation: float = 0.0, time_limit: float = math.inf
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The native solve on float64 arrays F (n, n) or (B, n, n) and q (B, n): λ, w (B, n) and status (B,), no NaN."""
+    """Solve with the native code: F (n, n) or (B, n, n), q (B, n), float64 → λ, w (B, n) and status (B,), no NaN."""
     from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSource]
 
     F, q = np.ascontiguousarray(F), np.ascontiguousarray(q)
@@ -126,11 +126,11 @@ def _warn_of_failures(status: Tensor, stacklevel: int) -> None:
 
 @dataclass(frozen=True)
 class _Problems(Solver):
-    """F, q in float64 → λ, w, status. `narrow`: the caller's dtype is float32, whose range is that of a gradient."""
+    """Solver of LCPs: F, q in float64 → λ, w, status. `single`: the caller has float32, which limits gradients."""
 
     relaxation: float
     time_limit: float
-    narrow: bool
+    single: bool
 
     name = "solve_lcp"
     ranks = (2, 1)
@@ -147,7 +147,7 @@ class _Problems(Solver):
                 F.detach().cpu().numpy(), q.detach().cpu().numpy(), self.relaxation, self.time_limit
             )
         )
-        if self.narrow:
+        if self.single:
             diagonal = F.detach().cpu().diagonal(dim1=-2, dim2=-1)
             too_large = (torch.maximum(lam, w).amax(-1) > _FLOAT32) | (diagonal < 1 / _FLOAT32).any(-1)
             status = torch.where(too_large, int(Status.NUMERICAL), status).to(torch.int8)
@@ -165,7 +165,7 @@ class _Problems(Solver):
     ) -> Sequence[Tensor | None]:
         (F, _), (lam, w, status) = tensors, outputs
         solved = (status == Status.CONVERGED).unsqueeze(-1)
-        # Whatever comes upstream for a failed element is dropped before it can meet the others.
+        # The upstream gradient of a failed element is dropped, so that it cannot spread to the others.
         lam_bar, w_bar = (torch.zeros_like(lam) if g is None else torch.where(solved, g, 0.0) for g in grads)
         total = lam + w
         # Strictly complementary: b = λ/(λ+w). At λ = w = 0 the index counts as inactive: b = 0, a = 1.

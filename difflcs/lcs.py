@@ -1,4 +1,4 @@
-"""The learnable linear complementarity system. The records of its matrices are in `difflcs.records`."""
+"""Learnable linear complementarity system. The records of its matrices are in `difflcs.records`."""
 
 from __future__ import annotations
 
@@ -77,12 +77,12 @@ class LCSModel(nn.Module):
         learn_c: True if c is learned. The paper's experiments keep it at zero (`False`).
         generator: random generator of the initial parameters; torch's default one if None.
         dtype: float64 (default) or float32.
-        action_support: (2, n_u) lower and upper bounds of the actions that the model was fitted to, where that is
+        action_support: (2, n_u) lower and upper bounds of the actions that the model was fitted to, if
             known: an `LCSMPCLayer` plans within them. A buffer, saved with the model; set it to None to plan without.
 
     Raises:
         InvalidInputError, DTypeError: a size that is too small, a stiffness that is not positive, another dtype.
-        ShapeError, NonFiniteError, BoundsError: an action support that is none.
+        ShapeError, NonFiniteError, BoundsError: an invalid action support.
     """
 
     parameter_names = ("A", "B", "C", "d", "D", "E", "G", "H", "c")
@@ -151,20 +151,20 @@ class LCSModel(nn.Module):
 
     @runs_eagerly
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
-        """System's matrices, differentiable with respect to the parameters; the same for all x and contexts."""
+        """Return the system's matrices, differentiable in the parameters; the same for all x and contexts."""
         if self._forward_pre_hooks:
             fresh(self, self.parameter_names)
-        made_of: dict[str, Tensor] = self._parameters  # pyright: ignore[reportAssignmentType]
-        if tuple(made_of) != self.parameter_names:  # attributes, one by one, would take 5 µs
-            made_of = {name: getattr(self, name) for name in self.parameter_names}
-        # Without gradient a robot asks for one system again and again: it is made and checked once.
+        parameters: dict[str, Tensor] = self._parameters  # pyright: ignore[reportAssignmentType]
+        if tuple(parameters) != self.parameter_names:  # attributes, one by one, would take 5 µs
+            parameters = {name: getattr(self, name) for name in self.parameter_names}
+        # Without gradient a robot needs one system again and again: it is made and checked once.
         recalls = type(self).F is LCSModel.F and not torch.is_grad_enabled() and not transforms_active()
-        tensors = tuple(made_of.values())
+        tensors = tuple(parameters.values())
         kept = self._made.value(tensors) if recalls else None
         if kept is not None and kept[0] == self.stiffness:
             F = kept[1].clone()
-            return LCSParams.of_checked({name: F if name == "F" else made_of[name] for name in SYSTEM})
-        params = LCSParams(**{name: self.F if name == "F" else made_of[name] for name in SYSTEM})
+            return LCSParams.of_checked({name: F if name == "F" else parameters[name] for name in SYSTEM})
+        params = LCSParams(**{name: self.F if name == "F" else parameters[name] for name in SYSTEM})
         if recalls:
             self._made.keep((self.stiffness, params.F.clone()), tensors)
         return params
@@ -243,7 +243,7 @@ class LCSModel(nn.Module):
         return model
 
     def config(self) -> dict[str, object]:
-        """Return what the constructor needs to build the model again, besides the parameters (JSON types only)."""
+        """Return the constructor's arguments to build the model again, without the parameters (JSON types only)."""
         with torch.enable_grad():
             fresh(self, self.parameter_names)
             learn_c = self.c.requires_grad
@@ -302,13 +302,13 @@ class LCSModel(nn.Module):
     def save_pretrained(self, directory: str | os.PathLike[str]) -> None:
         """Write `model.safetensors` and `config.json` into a directory, atomically (created if needed).
 
-        Of a model that was parametrised, pruned or normalised by `torch.nn.utils` the matrices are written as they are.
+        For a model that `torch.nn.utils` has parametrised, pruned or normalised, the resulting matrices are written.
         """
         _storage.save_record(Path(directory), "LCSModel", self.config(), plain_state(self))
 
     @classmethod
     def from_pretrained(cls, source: str | os.PathLike[str]) -> LCSModel:
-        """Read a model that ships with the package, or what `save_pretrained` wrote.
+        """Read a model that ships with the package, or one that `save_pretrained` wrote.
 
         Args:
             source: a directory, or a name that `difflcs zoo` lists, such as "trifinger-cube". A path that exists wins

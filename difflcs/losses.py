@@ -40,7 +40,7 @@ def violation_loss(
     context: Tensor | None = None,
     reduction: str = "mean",
 ) -> Tensor:
-    """The violation-based loss of an LCS (Eq. 2 of the paper; Jin et al.).
+    """Compute the violation-based loss of an LCS (Eq. 2 of the paper; Jin et al.).
 
     For each transition, with r = A x + B u + C λ + d − x_next and e = D x + E u + F λ + c − φ,
 
@@ -58,7 +58,7 @@ def violation_loss(
         x_next: (..., n_x) observed next states.
         gamma: γ, weight of the slack; 0 < γ ≤ σ_min(F + Fᵀ) of every transition. "auto" takes 0.999 times the smallest
             of these bounds at each call, as a constant that is not differentiated: at the bound itself the inner QP
-            can be singular, a thousandth below it is well solved. It grows with F where a fixed γ stays behind.
+            can be singular, a thousandth below it is well solved. It grows with F, unlike a fixed γ.
         xi: ξ > 0, weight of the dynamics against complementarity. With a small ξ the loss is the prediction loss, with
             a large one the contact law is broken for free. It compares squared states with forces times gaps: the
             default suits states, forces and gaps of like units. A common unit of all of them changes nothing, as the
@@ -77,7 +77,7 @@ def violation_loss(
     """
     check_choice("reduction", reduction, ("mean", "none"))
     xi = check_number("xi", xi, strict=True)
-    if isinstance(gamma, Tensor):  # nothing is differentiated by γ, nor is it one per transition
+    if isinstance(gamma, Tensor):  # γ has no gradient, nor is it one per transition
         raise DTypeError(f"gamma: expected a number, got {describe(gamma)}; convert it with float(...)")
     if not (isinstance(gamma, str) and gamma == "auto"):
         gamma = check_number("gamma", gamma)
@@ -87,9 +87,9 @@ def violation_loss(
         # 190 µs for the loss of 100 transitions and its gradient.
         with torch.no_grad():
             F = lcs.F
-        made_of: dict[str, Any] = lcs._parameters  # attributes, one by one, would take 5 µs
-        system = tuple([F if name == "F" else made_of[name] for name in SYSTEM])
-        factors = (made_of["G"], made_of["H"])
+        parameters: dict[str, Any] = lcs._parameters  # attributes, one by one, would take 5 µs
+        system = tuple([F if name == "F" else parameters[name] for name in SYSTEM])
+        factors = (parameters["G"], parameters["H"])
         if _plain(lcs, system, data):
             return _violation_loss(system, data, x.shape[:-1], gamma, xi, reduction, factors)
         lcs.check_inputs(x=x, u=u, x_next=x_next)
@@ -116,9 +116,9 @@ def prediction_loss(
     context: Tensor | None = None,
     reduction: str = "mean",
 ) -> Tensor:
-    """½‖x̂ − x_next‖² with x̂ predicted through the exact LCP, for comparison with `violation_loss`.
+    """Compute ½‖x̂ − x_next‖² with x̂ predicted through the exact LCP, for comparison with `violation_loss`.
 
-    Its gradient vanishes where contacts are wrongly inactive, which is what the violation loss mends.
+    Its gradient vanishes where contacts are wrongly inactive; that of the violation loss does not.
 
     Args:
         lcs: the model, any `LCSModule`, or `LCSParams`, shared or one per transition, as for `violation_loss`.
@@ -147,7 +147,7 @@ def _reduce(loss: Tensor, batch: torch.Size, reduction: str) -> Tensor:
 
 
 def _params(lcs: LCSModule | LCSParams, x: Tensor, u: Tensor, x_next: Tensor, context: Tensor | None) -> LCSParams:
-    """The system of some transitions, which are checked against it."""
+    """Return the system of some transitions, after a check that they fit it."""
     if context is not None:
         check_tensor("context", context)
     if isinstance(lcs, LCSParams):
@@ -180,13 +180,13 @@ def _batch(params: LCSParams, x: Tensor, u: Tensor, x_next: Tensor) -> torch.Siz
 
 
 def _for_each(value: Tensor, batch: torch.Size, rank: int) -> Tensor:
-    """A field that is shared, or (count, …) of each transition."""
-    own = value.shape[value.ndim - rank :]
-    return value if value.ndim == rank else value.expand(*batch, *own).reshape(batch.numel(), *own)
+    """Expand a field to (count, …), one per transition, unless it is shared."""
+    shape = value.shape[value.ndim - rank :]
+    return value if value.ndim == rank else value.expand(*batch, *shape).reshape(batch.numel(), *shape)
 
 
 def _plain(lcs: LCSModel, system: tuple[Tensor, ...], data: tuple[Tensor, ...]) -> bool:
-    """Whether these are float64 matrices on the CPU that fit each other: then the kernel can look at the numbers."""
+    """Return whether these are float64 matrices on the CPU that fit each other, so that the kernel can read them."""
     for value in system:
         if value.dtype is not torch.float64 or not value.is_cpu or value.layout is not torch.strided:
             return False
@@ -205,11 +205,11 @@ def _violation_loss(
     reduction: str,
     factors: tuple[Tensor, ...],
 ) -> Tensor:
-    """The loss of a system, each field shared or (count, …), and data (count, ·); `factors` of an `LCSModel`'s F."""
+    """Compute the loss of a system, each field shared or (count, …), on data (count, ·); `factors` of its F."""
     mean = reduction == "mean" and not transforms_active()
     if isinstance(gamma, str):
         rate = largest_gamma(system[6])
-        if transforms_active():  # of which each element may have its own
+        if transforms_active():  # under which γ may differ between elements
             return _reduce(solve(_Transitions(xi, None), *system, *data, rate)[0], batch, reduction)
         gamma = float(rate)
     loss = solve(_Transitions(xi, gamma, mean, bool(factors)), *system, *data, *factors)[0]
@@ -218,7 +218,7 @@ def _violation_loss(
 
 @dataclass
 class _Transitions(Solver):
-    """A, B, C, d, D, E, F, c, x, u, x_next → the loss of each transition, or its mean; in C++.
+    """Solver of the loss: A, B, C, d, D, E, F, c, x, u, x_next → the loss of each transition, or its mean; in C++.
 
     The inner problem over z = (λ, φ) ≥ 0 is to minimise ½ zᵀQz + qᵀz, whose optimality is the LCP (Q, q):
 
@@ -232,8 +232,8 @@ class _Transitions(Solver):
         gamma: γ; None: it is one more input, which has no gradient.
         mean: whether to return the mean, where no transform adds dimensions to the batch. Otherwise autograd would take
             its two steps.
-        factored: whether G and H, of which F is made, are two more inputs, and get the gradient in its place.
-        arrays, minimiser: the inputs of the kernels, and z, r and e at the minimum; once it is solved.
+        factored: whether the factors G and H of F are two more inputs, and get the gradient in its place.
+        arrays, minimiser: the inputs of the kernels, and z, r and e at the minimum, once it is solved.
     """
 
     xi: float
@@ -288,7 +288,7 @@ class _Transitions(Solver):
         grads: Sequence[Tensor | None],
         needs: Sequence[bool],
     ) -> Sequence[Tensor | None]:
-        # Under a transform, inputs that were shared in the solve may now be of each element.
+        # Under a transform, inputs that were shared in the solve may now differ between elements.
         arrays = self._arrays(tensors) if self.arrays is None else self.arrays
         (upstream,) = grads
         assert upstream is not None
@@ -300,11 +300,11 @@ class _Transitions(Solver):
         if self.factored:  # F = G Gᵀ + stiffness·I + H − Hᵀ
             F_bar, G = gradients[6], tensors[11].numpy(force=True)
             gradients += [(F_bar + F_bar.T) @ G, F_bar - F_bar.T]
-        found = [None if g is None else torch.from_numpy(g) for g in gradients]
-        return found if len(found) == len(tensors) else [*found, None]
+        converted = [None if g is None else torch.from_numpy(g) for g in gradients]
+        return converted if len(converted) == len(tensors) else [*converted, None]
 
     def _arrays(self, tensors: Sequence[Tensor]) -> list[np.ndarray]:
-        """The inputs of the kernels."""
+        """Collect the inputs of the kernels."""
         arrays = [v.numpy(force=True) for v in tensors[:11]]
         return [*arrays, tensors[11].numpy(force=True) if self.gamma is None else np.array(self.gamma)]
 
@@ -313,7 +313,7 @@ class _Transitions(Solver):
 
 
 def largest_gamma(F: Tensor) -> Tensor:
-    """`_AUTO` times the smallest σ_min(F + Fᵀ) of all F (..., n, n), detached; float64, no dimensions."""
+    """Compute `_AUTO` times the smallest σ_min(F + Fᵀ) of all F (..., n, n), detached; float64, no dimensions."""
     F = F.detach().double()
     if not F.numel():
         return torch.ones((), dtype=torch.float64, device=F.device)  # nothing limits it
@@ -370,7 +370,7 @@ def minimise_over_orthant(Q: np.ndarray, q: np.ndarray, max_iter: int = 500) -> 
     convex = smallest > 1e-13
     if convex.all():
         return _solved(Q, q) * unit
-    if convex.any():  # one after the other: each has its own matrix
+    if convex.any():  # one after the other, as their matrices differ
         z = np.empty_like(q)
         for part in (convex, ~convex):
             z[part] = minimise_over_orthant(Q[part], q[part], max_iter)

@@ -27,14 +27,14 @@ from difflcs.lcp import solve_lcp
 
 
 def dimensions(record: type) -> dict[str, tuple[str, ...]]:
-    """The fields of a record that are tensors, each with the kinds of its trailing dimensions, as annotated there."""
+    """Return the tensor fields of a record, each with the kinds of its trailing dimensions, as annotated there."""
     hints = get_type_hints(record, include_extras=True)
     return {f.name: hints[f.name].__metadata__ for f in fields(record) if hasattr(hints[f.name], "__metadata__")}
 
 
 @dataclass(frozen=True)
 class SystemMatrices:
-    """Sizes and equations of whatever holds the matrices of an LCS, shared or one per batch element."""
+    """Sizes and equations of a record that holds the matrices of an LCS, shared or one per batch element."""
 
     A: Annotated[Tensor, "n_x", "n_x"]
     B: Annotated[Tensor, "n_x", "n_u"]
@@ -61,17 +61,17 @@ class SystemMatrices:
         return self.F.shape[-1]
 
     def next_state(self, x: Tensor, u: Tensor, lam: Tensor) -> Tensor:
-        """A x + B u + C λ + d, (..., n_x)."""
+        """Compute A x + B u + C λ + d, (..., n_x)."""
         return matvec(self.A, x) + matvec(self.B, u) + matvec(self.C, lam) + self.d
 
     def gap(self, x: Tensor, u: Tensor, lam: Tensor | None = None) -> Tensor:
-        """D x + E u + c, plus F λ if given, (..., n_lam)."""
+        """Compute D x + E u + c, plus F λ unless lam is None, (..., n_lam)."""
         gap = matvec(self.D, x) + matvec(self.E, u) + self.c
         return gap if lam is None else gap + matvec(self.F, lam)
 
 
 def _version(tensor: Tensor) -> int:
-    """How often a tensor was changed in place, where torch counts it."""
+    """Return how often a tensor was changed in place, if torch counts it."""
     return 0 if tensor.is_inference() else tensor._version
 
 
@@ -88,9 +88,9 @@ class LCSPrediction(NamedTuple):
 
 @dataclass(frozen=True)
 class _Record(SystemMatrices):
-    """What records of matrices have in common: they are checked when made, and behave like one tensor."""
+    """Base of records of matrices: they are checked when made, and behave like one tensor."""
 
-    # Dimensions of every field between those of the batch and its own.
+    # Dimensions of every field between those of the batch and its rows and columns.
     _STAGES: ClassVar[tuple[str, ...]] = ()
 
     @runs_eagerly
@@ -132,37 +132,37 @@ class _Record(SystemMatrices):
 
     @classmethod
     def of_checked(cls, tensors: Mapping[str, Tensor]) -> Self:
-        """A record of tensors that have been checked, all of them and together; nothing is checked here."""
+        """Make a record of tensors that have been checked, all of them and together; nothing is checked here."""
         record = object.__new__(cls)
         vars(record).update(tensors, _version=_version(tensors["F"]))
         return record
 
-    def _own(self, name: str) -> int:
-        """Number of a field's own dimensions: those of stages, rows and columns."""
+    def _rank(self, name: str) -> int:
+        """Count a field's dimensions after those of the batch: stages, rows and columns."""
         return len(self._STAGES) + len(SYSTEM[name])
 
     @property
     def batch_shape(self) -> torch.Size:
         """Leading batch dimensions; empty when every field is shared."""
-        return broadcast_batch((k, v.shape[: v.ndim - self._own(k)]) for k, v in self.tensors().items())
+        return broadcast_batch((k, v.shape[: v.ndim - self._rank(k)]) for k, v in self.tensors().items())
 
     def tensors(self) -> dict[str, Tensor]:
-        """Name → tensor, in the order of the fields."""
+        """Return name → tensor, in the order of the fields."""
         return {name: getattr(self, name) for name in SYSTEM}
 
     def detach(self) -> Self:
-        """The same numbers without gradient history."""
+        """Return the same numbers without gradient history."""
         return self._map(lambda v: v.detach())
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
-        """The same system in another dtype or on another device; the arguments are those of `torch.Tensor.to`."""
+        """Convert the system to another dtype or device; the arguments are those of `torch.Tensor.to`."""
         return self._map(lambda v: v.to(*args, **kwargs))
 
     def _map(self, function: Callable[[Tensor], Tensor]) -> Self:
         return replace(self, **{k: function(v) for k, v in self.tensors().items()})
 
     def __getitem__(self, index: Any) -> Self:
-        """Some systems of a batch: an integer, slice, tensor, or a tuple of these, of the batch dimensions alone.
+        """Select systems of a batch: an integer, slice, tensor, or a tuple of these, of the batch dimensions alone.
 
         A field that is shared by the batch stays shared. Broadcast dimensions are indexed as if they were expanded.
 
@@ -177,11 +177,11 @@ class _Record(SystemMatrices):
             )
         key = index if isinstance(index, tuple) else (index,)
         for name, value in self.tensors().items():
-            own = self._own(name)
-            if value.ndim > own:
-                value = value.expand(*batch, *value.shape[value.ndim - own :])
+            rank = self._rank(name)
+            if value.ndim > rank:
+                value = value.expand(*batch, *value.shape[value.ndim - rank :])
                 try:
-                    value = value[(*key, *[slice(None)] * own)]
+                    value = value[(*key, *[slice(None)] * rank)]
                 except (IndexError, TypeError) as error:
                     raise BatchIndexError(
                         f"{type(self).__name__}: expected an index of the batch dimensions {tuple(batch)}, got "
@@ -191,7 +191,7 @@ class _Record(SystemMatrices):
         return type(self)(**values)
 
     def __iter__(self) -> Iterator[Self]:
-        """The systems along the first batch dimension."""
+        """Iterate over the systems along the first batch dimension."""
         if not self.batch_shape:
             self[0]  # raises: without this, a loop over one system would do nothing
         return (self[i] for i in range(self.batch_shape[0]))
@@ -273,8 +273,8 @@ class LCSSequence(_Record):
 
     x_{k+1} = A_k x_k + B_k u_k + C_k λ_k + d_k,  0 ≤ λ_k ⊥ D_k x_k + E_k u_k + F_k λ_k + c_k ≥ 0,  k = 0 … H − 1.
 
-    Every field has the dimension H of the stages before its own, and before that any batch dimensions, or none to be
-    shared by the batch. `next_state` and `gap` take all stages at once: x (..., H, n_x).
+    Every field has a dimension H of stages before its rows and columns, and before that any batch dimensions, or none
+    to be shared by the batch. `next_state` and `gap` take all stages at once: x (..., H, n_x).
 
     Attributes:
         A: (..., H, n_x, n_x) autonomous dynamics.
@@ -299,7 +299,7 @@ class LCSSequence(_Record):
 
     @classmethod
     def stack(cls, systems: Sequence[LCSParams]) -> LCSSequence:
-        """A sequence from one system per stage, in their order; batch dimensions of each field broadcast.
+        """Make a sequence from one system per stage, in their order; batch dimensions of each field broadcast.
 
         Raises:
             InvalidInputError, DTypeError, ShapeError: no systems, something else, or of different sizes.
@@ -310,27 +310,27 @@ class LCSSequence(_Record):
         for k, system in enumerate(systems):
             if not isinstance(system, LCSParams):
                 raise DTypeError(f"systems[{k}]: expected LCSParams, got {describe(system)}; build one for each stage")
-            sizes, wanted = ((s.n_x, s.n_u, s.n_lam) for s in (system, systems[0]))
-            if sizes != wanted:
+            sizes, expected = ((s.n_x, s.n_u, s.n_lam) for s in (system, systems[0]))
+            if sizes != expected:
                 raise ShapeError(
-                    f"systems[{k}]: expected n_x, n_u, n_lam = {wanted} like systems[0], got {sizes}; a contact that a "
-                    f"stage lacks gets zeros in C, D and E, and ones in c and the diagonal of F"
+                    f"systems[{k}]: expected n_x, n_u, n_lam = {expected} like systems[0], got {sizes}; a contact that "
+                    f"a stage lacks gets zeros in C, D and E, and ones in c and the diagonal of F"
                 )
         values = {}
         for name, dims in SYSTEM.items():
             each = [getattr(system, name) for system in systems]
             batch = broadcast_batch((f"systems[{k}].{name}", v.shape[: v.ndim - len(dims)]) for k, v in enumerate(each))
-            own = each[0].shape[each[0].ndim - len(dims) :]
+            shape = each[0].shape[each[0].ndim - len(dims) :]
             check_same_device((f"systems[{k}].{name}", v) for k, v in enumerate(each))
-            values[name] = torch.stack([v.expand(*batch, *own) for v in each], dim=-1 - len(dims))
+            values[name] = torch.stack([v.expand(*batch, *shape) for v in each], dim=-1 - len(dims))
         return cls(**values)
 
     def stage(self, k: int) -> LCSParams:
-        """The system of stage k, 0 ≤ k < H; negative ones count from the end."""
+        """Return the system of stage k, 0 ≤ k < H; negative ones count from the end."""
         k = check_integer("k", k)
         if not -self.horizon <= k < self.horizon:
             raise BatchIndexError(f"k: expected a stage of 0 … {self.horizon - 1}, got {k}; choose another")
-        return LCSParams(**{n: v.select(v.ndim - self._own(n), k) for n, v in self.tensors().items()})
+        return LCSParams(**{n: v.select(v.ndim - self._rank(n), k) for n, v in self.tensors().items()})
 
     @runs_eagerly
     def rollout(self, x0: Tensor, u_seq: Tensor) -> Tensor:
@@ -357,10 +357,10 @@ class LCSSequence(_Record):
 
 @runtime_checkable
 class LCSModule(Protocol):
-    """Whatever says which system holds where: a learned model, or one made from physics, states and a context.
+    """Interface of modules that return the system at some states: a learned model, or one from physics and a context.
 
-    Layers, losses and training take any; most are `torch.nn.Module`s. `isinstance(value, LCSModule)` asks for the four
-    names.
+    Layers, losses and training take any; most are `torch.nn.Module`s. `isinstance(value, LCSModule)` checks for the
+    four names.
     """
 
     @property
@@ -379,22 +379,22 @@ class LCSModule(Protocol):
         ...
 
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams | LCSSequence:
-        """The system at some states.
+        """Return the system at some states.
 
         Args:
-            x: (..., n_x) states, where the caller has them. A module whose system depends on them says so if they lack.
-            context: (..., n_context) whatever else it depends on.
+            x: (..., n_x) states, if the caller has them. A module that needs them raises an error if they are missing.
+            context: (..., n_context) further quantities that it depends on.
 
         Returns:
             The matrices, shared, or with leading batch dimensions that broadcast with those of x; differentiable in
-            what the module learns.
+            the module's parameters.
         """
         ...
 
 
 @runs_eagerly
 def system_at(lcs: LCSModule, x: Tensor | None, context: Tensor | None = None) -> LCSParams | LCSSequence:
-    """`lcs.params(x, context)`, for whoever was handed the module: with what `torch.nn.utils` has made of it."""
+    """Call `lcs.params(x, context)` after the hooks of `torch.nn.utils` in the module."""
     return fresh(lcs).params(x, context)
 
 
@@ -424,8 +424,8 @@ def sequence_along(lcs: LCSModule, plan: Any, x0: Tensor | None = None, context:
     x = (plan.x[..., 0, :] if x0 is None else x0).expand(*u.shape[:-2], lcs.n_x)
     context_along, systems = getattr(lcs, "context_along", None), []
     for k in range(u.shape[-2]):
-        given = context if context_along is None else context_along(x, u[..., k, :], context)
-        system = system_at(lcs, x, given)
+        stage_context = context if context_along is None else context_along(x, u[..., k, :], context)
+        system = system_at(lcs, x, stage_context)
         if not isinstance(system, LCSParams):
             raise DTypeError(f"lcs: expected LCSParams from {type(lcs).__name__}.params, got {describe(system)}")
         systems.append(system)
@@ -435,7 +435,7 @@ def sequence_along(lcs: LCSModule, plan: Any, x0: Tensor | None = None, context:
 
 
 def advance(system: SystemMatrices, x: Tensor, u: Tensor) -> LCSPrediction:
-    """One step of a system for states and actions that were checked."""
+    """Advance a system by one step, for states and actions that were checked."""
     lam = solve_lcp(system.F, system.gap(x, u)).lam
     return LCSPrediction(system.next_state(x, u, lam), lam)
 

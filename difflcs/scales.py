@@ -30,11 +30,11 @@ class Scales:
     Attributes:
         center: (n_x,) mean of the states [unit of each state].
         state: (n_x,) standard deviation of each state [its unit]; 1 for a state that does not vary.
-        action: (n_u,) root mean square of each action [its unit], which keeps zero where it is; 1 for one never used.
+        action: (n_u,) root mean square of each action [its unit], so that zero stays zero; 1 for one never used.
         xi: ξ of `violation_loss` for transitions in these units.
         relaxation: of `LCSMPCLayer` and `solve_lcp`, for a system that was learned in these units: 0.05 times the
             square of a step, the root mean square of (x_next − x)/state of the state that moves most. λ and w have no
-            unit, so that it stays the same when `params` has brought the system back to the units of the data.
+            unit, so that it stays the same after `params` has converted the system to the units of the data.
     """
 
     center: Tensor
@@ -79,20 +79,20 @@ class Scales:
 
 
 def suggest_scales(x: Tensor, u: Tensor, x_next: Tensor) -> Scales:
-    """Units and settings for learning an LCS from transitions; the same system whatever the units of the data.
+    """Suggest units and settings for learning an LCS; the learned system does not depend on the units of the data.
 
-    The steps of an optimiser such as Adam have a fixed size: where a state is in the hundreds, an offset that
-    has to become 100 takes 10,000 steps of 0.01, and where it is in the thousandths the noise of these steps is all
-    there is. The loss adds the squared errors of all states, so that the one with the largest numbers decides. Both go
-    away in units in which every state and action is about one. Learn there, and bring the system back:
+    The steps of an optimiser such as Adam have a fixed size. If a state is in the hundreds, an offset of 100 takes
+    10,000 steps of 0.01; if it is in the thousandths, the noise of these steps hides it. The loss adds the squared
+    errors of all states, so that the largest numbers dominate. Neither happens in units in which every state and action
+    is about one. Learn there, and convert the system back:
 
         scales = suggest_scales(x, u, x_next)
         loss = violation_loss(model, *scales.normalise(x, u, x_next), gamma="auto", xi=scales.xi)
         mpc = LCSMPCLayer(scales.params(model.params()), ..., relaxation=scales.relaxation)
 
-    γ is in the units of F, which no data tell; `violation_loss` takes the largest allowed as "auto". ξ does not depend
-    on a common unit of all states, actions and gaps: violation_loss grows with its square, whatever ξ. It only has
-    a meaning where states, forces and gaps are about one, as here.
+    γ is in the units of F, which do not follow from data; `violation_loss` takes the largest allowed as "auto". ξ does
+    not depend on a common unit of all states, actions and gaps: violation_loss grows with its square, whatever ξ. It is
+    meaningful only if states, forces and gaps are about one, as here.
 
     Args:
         x: (..., n_x) states.

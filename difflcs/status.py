@@ -28,7 +28,7 @@ class Status(IntEnum):
 
     @property
     def advice(self) -> str:
-        """One sentence for the user."""
+        """Advice to the user, one sentence."""
         return _ADVICE[self]
 
 

@@ -32,7 +32,7 @@ def cart_pole_between_walls(
     gravity: Number = 9.81,
     dt: Number = 0.02,
 ) -> LCSParams:
-    """An upside-down pendulum on a cart, linearised upright, whose tip may lean on two soft walls.
+    """Make an upside-down pendulum on a cart, linearised upright, whose tip may lean on two soft walls.
 
     | index | state x | unit |
     |-------|---------|------|
@@ -111,7 +111,7 @@ def block_along_wall(
     dt: Number = 0.05,
     stick: float = 0.01,
 ) -> LCSParams:
-    """A fingertip pushes a block over an oiled table, on its slanted rear face, along a wall with friction.
+    """Make a fingertip that pushes a block over an oiled table, on its slanted rear face, along a wall with friction.
 
     | index | state x | unit |
     |-------|---------|------|

@@ -26,21 +26,21 @@ Cells = dict[str, Cell]
 
 
 def table(cells: Cells) -> pd.DataFrame:
-    """Success with and without each part, and the paired differences."""
+    """Make the table of success with and without each part, and of the paired differences."""
     lines = []
     for name, cell in cells.items():
         line = ["all parts" if name == "all" else LABELS[name]]
         line += [say(report.at(cell, when)) for when in WHEN.values()]
         for when in list(WHEN.values())[1:]:
-            found = [] if name == "all" else report.paired(cell, cells["all"], when)
-            line += report.say_difference(found)
+            paired = [] if name == "all" else report.paired(cell, cells["all"], when)
+            line += report.say_difference(paired)
         lines.append(line)
     columns = ["", *WHEN, *(f"{label}: {what}" for label in list(WHEN)[1:] for what in ("difference", "p"))]
     return pd.DataFrame(lines, columns=columns)
 
 
 def words(cells: Cells, task: str) -> list[str]:
-    """What the intervals say of every part, at 10 minutes and at the end."""
+    """Describe the differences of every part by their intervals, at 10 minutes and at the end."""
     said = []
     for label, when in list(WHEN.items())[1:]:
         apart = {LABELS[n]: report.paired_estimate(c, cells["all"], when) for n, c in cells.items() if n != "all"}
@@ -52,15 +52,15 @@ def words(cells: Cells, task: str) -> list[str]:
 
 
 def panel(figure: Figure, cells: dict[str, Cells]) -> None:
-    """The differences with their intervals, at 10 minutes and at the end."""
-    names = [name for name in ABLATED if any(name in found for found in cells.values())]
-    for axes, (task, found) in zip(
+    """Draw the differences with their intervals, at 10 minutes and at the end."""
+    names = [name for name in ABLATED if any(name in results for results in cells.values())]
+    for axes, (task, results) in zip(
         figure.subplots(1, len(cells), sharey=True, squeeze=False)[0], cells.items(), strict=True
     ):
         for offset, (label, when, color) in enumerate((("10 min", 10.0, "#56b4e9"), ("final", "final", "#0072b2"))):
             axes.plot([], [], "o", color=color, label=label)
             for row, name in enumerate(names):
-                apart = report.paired_estimate(found.get(name), found["all"], when)
+                apart = report.paired_estimate(results.get(name), results["all"], when)
                 if apart is not None:
                     y = -row - 0.2 * offset
                     axes.plot([apart.low, apart.high], [y, y], color=color, lw=2)
@@ -88,13 +88,13 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
     panel(figure, shown)
     report.write_figure(figure, folder, name)
     tables: Tables = {f"Without one part, {task}: success [%]": table(cells) for task, cells in shown.items()}
-    found = [cell for cells in shown.values() for cell in cells.values()]
+    used = [cell for cells in shown.values() for cell in cells.values()]
     said = [line for task, cells in shown.items() for line in words(cells, task)]
     report.write_tables(
         folder,
         name,
         tables,
-        [NOTE, *report.bullets(said), *report.provenance(found)],
+        [NOTE, *report.bullets(said), *report.provenance(used)],
         {name: "What each part is worth"},
     )
     return True

@@ -66,8 +66,8 @@ def _card(run: RunDirectory, config: TrainConfig, name: str) -> zoo.ModelCard:
         raise CheckpointError(
             f"{run.path}: expected an evaluation at the end of {run.log}, got none; train with --final-goals 1000"
         )
-    found, versions = stored.get("object", {}), stored["versions"]
-    zoo.check_object(found, run.path)
+    described, versions = stored.get("object", {}), stored["versions"]
+    zoo.check_object(described, run.path)
     rate, low, high = (float(last[f"evaluation_{k}"]) for k in ("success_rate", "ci_low", "ci_high"))
     goals, failures = (int(last[f"evaluation_{k}"]) for k in ("goals", "solver_failures"))
     return zoo.ModelCard(
@@ -82,7 +82,7 @@ def _card(run: RunDirectory, config: TrainConfig, name: str) -> zoo.ModelCard:
         goals=goals,
         evaluation_seed=config.evaluation_seed,
         solver_failures=failures,
-        object=found,
+        object=described,
         backend=config.method.solver or "",
         version=str(versions["difflcs"]),
         command=training_command(config, stored.get("init")),
@@ -92,18 +92,18 @@ def _card(run: RunDirectory, config: TrainConfig, name: str) -> zoo.ModelCard:
 
 
 def training_command(config: TrainConfig, init: object = None) -> str:
-    """The command line of a training: task, method, minutes and seed, and what differs from the defaults of today.
+    """Make the command line of a training: task, method, minutes, seed, and settings that differ from today's defaults.
 
     Args:
         config: the training.
         init: what the run started from, as config.json holds it.
     """
-    own, usual = (json.loads(json.dumps(c.to_json())) for c in (config, TrainConfig(method=type(config.method)())))
+    settings, usual = (json.loads(json.dumps(c.to_json())) for c in (config, TrainConfig(method=type(config.method)())))
     words = ["difflcs", "train"]
     for name in ("task", "method", "minutes", "seed"):
-        words += _flag(name, own.pop(name))
-    words += _differences(own.pop("settings"), usual.pop("settings"))
-    words += _differences(own, usual)
+        words += _flag(name, settings.pop(name))
+    words += _differences(settings.pop("settings"), usual.pop("settings"))
+    words += _differences(settings, usual)
     if init is not None:
         source = Path(str(init))  # of a path the last part only: folders of one machine mean nothing elsewhere
         source = source.parent if source.name == "model" else source
@@ -131,7 +131,7 @@ def _flag(name: str, value: object) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the script; returns the exit code."""
+    """Run the script; return the exit code."""
     parser = argparse.ArgumentParser(description="Add the model of a finished run to the zoo.")
     parser.add_argument("run", type=Path, metavar="RUN", help="directory of `difflcs train`")
     parser.add_argument("--force", action="store_true", help="replace a model of that name")

@@ -14,13 +14,13 @@ from units import Unit
 
 from difflcs.rl import Evaluation, RunDirectory, evaluate, get_task, load_policy, write_atomically
 from difflcs.rl.runs.checkpoint import load_checkpoint
-from difflcs.rl.runs.training import EVALUATION_ENVS, Reporter, TrainConfig, goals_due, saved_bounds
+from difflcs.rl.runs.training import EVALUATION_ENVS, Reporter, TrainConfig, count_goals_due, load_action_support
 
 NUMBERS = ("success_rate", "ci_low", "ci_high", "goals", "solver_failures")
 
 
 class Deployments(Reporter):
-    """Evaluates what is trained in `run`, and keeps the results in a CSV file beside it, through any interruption.
+    """Evaluations of the models of a training, kept in a CSV file beside its run; they survive any interruption.
 
     Args:
         unit: what is trained.
@@ -34,15 +34,15 @@ class Deployments(Reporter):
         self.protocols = [name for name in unit.protocols if name != "full"]
 
     def evaluated(self, minutes: float, result: Evaluation) -> None:
-        """See `Reporter`: the checkpoint is written, also that before any data."""
+        """Evaluate the checkpoint just written, also the one before any data; see `Reporter`."""
         self.catch_up()
 
     def iterated(self, report: Any) -> None:
-        """See `Reporter`: the checkpoint is written."""
+        """Evaluate the checkpoint just written; see `Reporter`."""
         self.catch_up()
 
     def rows(self) -> pd.DataFrame:
-        """The evaluations so far: protocol, minutes, NUMBERS, seconds."""
+        """Read the evaluations so far: protocol, minutes, NUMBERS, seconds."""
         columns = ["protocol", "minutes", *NUMBERS, "seconds"]
         return pd.read_csv(self.file) if self.file.is_file() else pd.DataFrame(columns=columns)
 
@@ -57,7 +57,7 @@ class Deployments(Reporter):
         steps = [int(row["env_steps"]) for row in logged]
         per_minute = self.unit.spec.steps_per_minute
         previous, now = steps if len(steps) == 2 else (-1, *steps)
-        goals, minutes = goals_due(self.schedule, previous, now, self.unit.spec), round(now / per_minute, 6)
+        goals, minutes = count_goals_due(self.schedule, previous, now, self.unit.spec), round(now / per_minute, 6)
         known = self.rows()
         done = set(known.protocol[known.minutes == minutes])
         for protocol in self.protocols if goals else ():
@@ -72,22 +72,22 @@ class Deployments(Reporter):
     def of_training(
         self, run: RunDirectory, protocol: str, logged: Mapping[str, str], goals: int
     ) -> dict[str, float] | None:
-        """NUMBERS of the training's own evaluation, where it was this very one: in a support as wide as the bounds."""
+        """Return the NUMBERS of the training's evaluation if it was the same: in a support as wide as the bounds."""
         if protocol != "support" or logged["evaluation_goals"] != str(goals):
             return None
-        pairs = zip(saved_bounds(run), self.unit.spec.bounds, strict=True)
+        pairs = zip(load_action_support(run), self.unit.spec.bounds, strict=True)
         if not all(torch.equal(mine, full) for mine, full in pairs):
             return None
         return {name: float(logged[f"evaluation_{name}"]) for name in NUMBERS}
 
     def measure(self, run: RunDirectory, protocol: str, goals: int) -> dict[str, float]:
-        """NUMBERS of one evaluation of the latest checkpoint."""
+        """Compute the NUMBERS of one evaluation of the latest checkpoint."""
         spec: Any = get_task(self.unit.task) if protocol == "task" else self.unit.spec
-        bounds = saved_bounds(run) if protocol == "support" else (None, None)
+        bounds = load_action_support(run) if protocol == "support" else (None, None)
         envs = spec.make_envs(min(EVALUATION_ENVS, goals), threads=1)
         try:
             seed, steps = self.schedule.evaluation_seed, spec.episode_steps
-            found = evaluate(envs, load_policy(run, spec), goals, seed, steps, *bounds)
+            evaluation = evaluate(envs, load_policy(run, spec), goals, seed, steps, *bounds)
         finally:
             envs.close()
-        return {name: getattr(found, name) for name in NUMBERS}
+        return {name: getattr(evaluation, name) for name in NUMBERS}

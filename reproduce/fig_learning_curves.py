@@ -57,36 +57,36 @@ Cells = dict[Curve, Cell | None]
 
 
 def table(cells: Cells) -> pd.DataFrame:
-    """What the text of the paper says about the figure, and ours."""
+    """Make the table of the figures in the paper's text, and ours."""
     lines = []
     for (method, recipe, protocol), cell in cells.items():
         if cell is not None:
-            found = [report.say(report.at(cell, when)) for when in WHEN]
-            found[WHEN.index("peak")] += f" at {cell.minute('peak'):g} min"
+            line = [report.say(report.at(cell, when)) for when in WHEN]
+            line[WHEN.index("peak")] += f" at {cell.minute('peak'):g} min"
             said = (
                 [f"{value:g} at {minute:g} min" for minute, value in PAPER[method].items()]
                 if protocol == "full"
                 else []
             )
-            lines.append([report.name_of(method, recipe, protocol=protocol), *found, ", ".join(said) or report.MISSING])
+            lines.append([report.name_of(method, recipe, protocol=protocol), *line, ", ".join(said) or report.MISSING])
     titles = [when if isinstance(when, str) else f"{when:g} min" for when in WHEN]
     return pd.DataFrame(lines, columns=["method", *titles, "paper (from its text)"])
 
 
 def label_of(curve: Curve) -> str:
-    """Its name on one side of the figure."""
+    """Return the label of a curve on one side of the figure."""
     return f"{NAMES[curve[0]]} as Jin & Posa" if curve == PRIOR else NAMES[curve[0]]
 
 
 def pairs_of(cells: Cells, recipe: str) -> report.Pairs:
-    """LCS-RL in a recipe and each of the other curves on its side of the figure that it can be compared with."""
-    own, *others = SIDES[recipe]
-    found = {label_of(curve): (cells[own], cells[curve]) for curve in others}
-    return {label: pair for label, pair in found.items() if report.paired(*pair, EARLY)}
+    """Pair LCS-RL in a recipe with each curve on its side of the figure that it can be compared with."""
+    first, *others = SIDES[recipe]
+    pairs = {label_of(curve): (cells[first], cells[curve]) for curve in others}
+    return {label: pair for label, pair in pairs.items() if report.paired(*pair, EARLY)}
 
 
 def words(pairs: report.Pairs, recipe: str) -> list[str]:
-    """What the intervals of the differences say."""
+    """Describe the differences by their intervals."""
     said = []
     for label, when in APART.items():
         apart = {name: report.paired_estimate(*pair, when) for name, pair in pairs.items()}
@@ -95,17 +95,17 @@ def words(pairs: report.Pairs, recipe: str) -> list[str]:
 
 
 def lowest(cells: Cells, recipe: str) -> list[str]:
-    """How LCS-RL does with its worst seed, which an interval of the mean does not say."""
+    """Describe LCS-RL's worst seed, which an interval of the mean does not show."""
     cell = cells[SIDES[recipe][0]]
     if cell is None:
         return []
-    found = {label: cell.at(when) for label, when in APART.items()}
-    worst = ", ".join(f"{label} {values.min():.1f} %" for label, values in found.items() if not values.empty)
+    successes = {label: cell.at(when) for label, when in APART.items()}
+    worst = ", ".join(f"{label} {values.min():.1f} %" for label, values in successes.items() if not values.empty)
     return [f"LCS-RL, {RECIPES[recipe].label}, the lowest of {cell.seeds}: {worst}."] if worst else []
 
 
 def reached(cells: Cells) -> str:
-    """How much later than asked for the evaluations were: iterations have lengths of their own."""
+    """Report how much later than asked for the evaluations were: iterations vary in length."""
     lags: dict[str, float] = {}
     for (method, _, _), cell in cells.items():
         if cell is not None:

@@ -22,7 +22,7 @@ from difflcs.rl.rollout import Policy, mpc_actions
 from difflcs.rl.seeding import Stream, episode_seeds
 
 STEPS = (1, 5, 8, 13, 17, 20)
-"""Those that the paper shows."""
+"""Steps that the paper shows."""
 SIZE = (1280, 960)
 """Width and height of the pictures [pixel]."""
 TRIES, LEAST_WAY, LEAST_TURN = 20, 0.04, 0.2
@@ -38,7 +38,7 @@ class DrawTask(report.Draw):
 
 
 def newest(work: Path) -> Path:
-    """Of the finished LCS-RL units on the cube the run with the most data, then the newest."""
+    """Find the finished LCS-RL unit on the cube with the most data, then the newest."""
     finished = {path.parent / "run": records.read(path) for path in work.glob("cube-lcs-rl-ours-*/result.csv")}
     if not finished:
         raise InvalidInputError(f"{work}: expected an LCS-RL model of the cube, found none; drop --rerun")
@@ -46,7 +46,7 @@ def newest(work: Path) -> Path:
 
 
 def find_model(path: Path) -> TrainedPolicy:
-    """A model of the cube."""
+    """Find a model of the cube."""
     learned = TrainedPolicy.open(path)
     if learned.task != "cube":
         raise InvalidInputError(f"run: expected a model of the cube, got one of {learned.task}; pass another")
@@ -54,7 +54,7 @@ def find_model(path: Path) -> TrainedPolicy:
 
 
 def trajectory(policy: Policy) -> tuple[np.ndarray, dict[int, np.ndarray], bool]:
-    """One noise-free episode: the scene at its start from the front, `STEPS` from above, whether the goal was reached.
+    """Run a noise-free episode; return the scene at its start, `STEPS` from above, and whether the goal was reached.
 
     It is to the first evaluation goal that is far enough away and reached, or the last one tried.
     """
@@ -83,7 +83,7 @@ def trajectory(policy: Policy) -> tuple[np.ndarray, dict[int, np.ndarray], bool]
 
 
 def draw(options: DrawTask) -> int:
-    """Train if asked for, then write the figure; returns the exit code."""
+    """Train if asked for, then write the figure; return the exit code."""
     code = run(replace(options, seeds=1, methods=("lcs-rl",), recipes=("ours",)), ["curves"]) if options.rerun else 0
     learned = find_model(newest(options.work) if options.rerun else options.run)
     scene, pictures, reached = trajectory(learned.policy)

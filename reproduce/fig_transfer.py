@@ -25,7 +25,7 @@ Cells = dict[str, dict[str, Cell | None]]
 
 
 def success(cells: Cells) -> pd.DataFrame:
-    """Success from either start."""
+    """Make the table of success from either start."""
     columns = {"object": [task.replace("_", " ") for task in cells]}
     columns["cube's model, no data"] = [say(report.at(starts["cube"], 0.0)) for starts in cells.values()]
     for (label, when), start in ((pair, start) for pair in WHEN.items() for start in TRANSFER):
@@ -34,12 +34,12 @@ def success(cells: Cells) -> pd.DataFrame:
 
 
 def pairs_of(cells: Cells) -> report.Pairs:
-    """From the cube's model and from scratch, for each object."""
+    """Pair training from the cube's model with training from scratch, for each object."""
     return {task.replace("_", " "): (starts["cube"], starts["scratch"]) for task, starts in cells.items()}
 
 
 def words(pairs: report.Pairs, label: str) -> list[str]:
-    """What the intervals say, at each time; and whether the first minutes of PPO cost what transfer has brought."""
+    """Describe the differences at each time, and whether PPO's first minutes undo what transfer has gained."""
     said = []
     for time, when in WHEN.items():
         apart = {task: report.paired_estimate(*pair, when) for task, pair in pairs.items()}
@@ -48,7 +48,7 @@ def words(pairs: report.Pairs, label: str) -> list[str]:
 
 
 def panel(figure: Figure, cells: Cells, stand_in: bool) -> None:
-    """The curves of all objects."""
+    """Draw the curves of all objects."""
     for axes, (task, starts) in zip(figure.subplots(2, 3, sharey=True).flat, cells.items(), strict=True):
         title = task.replace("_", " ") + (" (stand-in)" if stand_in else "")
         lines = [(cell, LABELS[start], COLORS[start], "-") for start, cell in starts.items()]
@@ -58,7 +58,7 @@ def panel(figure: Figure, cells: Cells, stand_in: bool) -> None:
 
 
 def starts_of(rows: pd.DataFrame, task: str, recipe: str) -> dict[str, Cell | None]:
-    """The results from either start, of the same seeds where there are some."""
+    """Select the results from either start, of the same seeds where there are some."""
     scratch, cube = (select(rows, task, method, recipe, start) for start, method in TRANSFER.items())
     if scratch is not None and cube is not None:
         same: Any = rows[rows.seed.isin(cube.scores.index)]
@@ -69,12 +69,12 @@ def starts_of(rows: pd.DataFrame, task: str, recipe: str) -> dict[str, Cell | No
 
 def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
     """Write a figure for each recipe, and the tables."""
-    tables, said, found, figures = Tables(), [], [], {}
+    tables, said, used, figures = Tables(), [], [], {}
     for recipe in METHODS["lcs-rl"]:
         cells: Cells = {task: starts_of(rows, task, recipe) for task in OBJECTS}
         if not any(starts["cube"] for starts in cells.values()):
             continue
-        found += [cell for starts in cells.values() for cell in starts.values() if cell is not None]
+        used += [cell for starts in cells.values() for cell in starts.values() if cell is not None]
         label = RECIPES[recipe].label
         tables[f"LCS-RL from scratch and from the cube's model, {label}: success [%]"] = success(cells)
         tables[f"The differences, {label}"] = report.differences("object", pairs_of(cells), WHEN)
@@ -86,7 +86,7 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
         report.write_figure(figure, folder, stem)
         figures[stem] = f"From scratch and from the cube's model, {label}"
     if tables:
-        report.write_tables(folder, name, tables, [NOTE, *report.bullets(said), *report.provenance(found)], figures)
+        report.write_tables(folder, name, tables, [NOTE, *report.bullets(said), *report.provenance(used)], figures)
     return bool(tables)
 
 

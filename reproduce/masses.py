@@ -1,4 +1,4 @@
-"""What the masses decide, which the paper does not name: six objects of 50 g and of 10 g: `python reproduce/masses.py`.
+"""Success by mass, which the paper does not state: six objects of 50 g and of 10 g: `python reproduce/masses.py`.
 
 Without options the table is drawn from the tracked results. `--rerun --preset smoke|quick|paper` computes it.
 """
@@ -21,11 +21,11 @@ Cells = dict[str, list[Cell | None]]
 
 
 def table(cells: Cells) -> pd.DataFrame:
-    """Success on objects of each mass, the paper's beside it."""
+    """Make the table of success on objects of each mass, with the paper's."""
     columns = {"object": [*LABELS, "all six"]}
     for label, when in WHEN.items():
-        for mass, found in cells.items():
-            shown = [*(report.at(cell, when) for cell in found), report.over_objects(found, when)]
+        for mass, results in cells.items():
+            shown = [*(report.at(cell, when) for cell in results), report.over_objects(results, when)]
             columns[f"{label}: {mass}"] = [say(one) for one in shown]
     theirs = (PAPER[task]["lcs-rl", "final"] for task in OBJECTS)
     columns["final: paper"] = [*(f"{mean:.1f} ± {sd:.1f}" for mean, sd in theirs), report.MISSING]
@@ -36,17 +36,17 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
     """Write the table."""
     cells: Cells = {}
     for recipe in MASSES:
-        found = [select(rows, task, "lcs-rl", recipe) for task in OBJECTS]
-        if any(found):
-            cells[f"{1000 * next(cell for cell in found if cell).first.mass:g} g"] = found
+        results = [select(rows, task, "lcs-rl", recipe) for task in OBJECTS]
+        if any(results):
+            cells[f"{1000 * next(cell for cell in results if cell).first.mass:g} g"] = results
     if len(cells) < len(MASSES):
         return False
     words = [
-        f"At {mass}, LCS-RL at the end against the paper's mean: {report.verdict(beyond_paper(found))}."
-        for mass, found in cells.items()
+        f"At {mass}, LCS-RL at the end against the paper's mean: {report.verdict(beyond_paper(results))}."
+        for mass, results in cells.items()
     ]
     tables: Tables = {"LCS-RL by the paper's recipe, by the mass of the objects: success [%]": table(cells)}
-    every = [cell for found in cells.values() for cell in found]
+    every = [cell for results in cells.values() for cell in results]
     report.write_tables(folder, name, tables, below(name, NOTE, words, every))
     return True
 

@@ -29,7 +29,7 @@ cost of the paper and the full bounds, whatever it was trained with."""
 
 @dataclass(frozen=True)
 class Recipe:
-    """What differs from the defaults of the library."""
+    """Differences from the defaults of the library."""
 
     label: str
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -90,14 +90,14 @@ RECIPES: Mapping[str, Recipe] = {
 
 
 def changed(settings: Any, changes: Mapping[str, Any]) -> Any:
-    """The settings with others in place of those that they have; a mapping changes a group of settings."""
+    """Replace settings by others; a mapping changes a group of settings."""
     known = {name: new for name, new in changes.items() if hasattr(settings, name)}
     groups = {name: changed(getattr(settings, name), new) for name, new in known.items() if isinstance(new, Mapping)}
     return replace(settings, **known | groups)
 
 
 def changed_task(name: str, changes: Mapping[str, float]) -> TaskSpec:
-    """A task with what a recipe changes of it."""
+    """Apply a recipe's changes to a task."""
     spec = get_task(name)
     if "horizon" in changes:
         spec = replace(spec, horizon=int(changes["horizon"]))

@@ -1,4 +1,4 @@
-"""What was measured: tidy CSV files, one row per evaluation, in the tracked folder of results.
+"""Records of measurements: tidy CSV files, one row per evaluation, in the tracked folder of results.
 
     results/<preset>.csv            with the YCB meshes (and the cube)
     results/<preset>-stand-in.csv   with stand-ins, which are other objects
@@ -38,12 +38,12 @@ IDENTITY = ["task", "method", "recipe", "start", "seed", "key"]
 
 
 def path_of(folder: Path, preset: str, stand_in: bool = False) -> Path:
-    """The file of a preset's results."""
+    """Return the file of a preset's results."""
     return folder / f"{preset}{'-stand-in' if stand_in else ''}.csv"
 
 
 def read(path: Path) -> pd.DataFrame:
-    """The rows of a file, none if there is no file; `CheckpointError` if another version or something else wrote it."""
+    """Read the rows of a file, none if there is no file; `CheckpointError` if another version or program wrote it."""
     if not path.exists():
         return pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in COLUMNS.items()})
     try:
@@ -84,7 +84,7 @@ class Cell:
 
     @property
     def first(self) -> Any:
-        """One row, for what all have in common: task, version, object."""
+        """One row, for the columns that all have in common: task, version, object."""
         return self.rows.iloc[0]
 
     @property
@@ -100,11 +100,11 @@ class Cell:
 
     @property
     def seeds(self) -> str:
-        """How many it has."""
+        """Number of seeds."""
         return f"{len(self.scores)} seed{'s' * (len(self.scores) > 1)}"
 
     def minute(self, when: str | float) -> float:
-        """The minute given; "final", the last; or "peak", where the mean over the seeds is highest after the start."""
+        """Resolve a minute: a number; "final", the last; "peak", of the highest mean over seeds after the start."""
         if when == "final":
             return self.scores.columns.max()
         return self.scores.drop(columns=0.0, errors="ignore").mean().idxmax() if when == "peak" else float(when)
@@ -115,31 +115,31 @@ class Cell:
         return self.rows.groupby("at").minutes.mean()
 
     def goals(self, when: str | float) -> int:
-        """Goals of the evaluations then."""
+        """Count the goals of the evaluations at a time."""
         return int(self.rows.goals[self.rows["at"] == self.minute(when)].iloc[0])
 
     @property
     def amount(self) -> str:
-        """Seeds and goals that it has, such as "10 seeds × 1000 goals (300 on the way)"."""
+        """Describe the number of seeds and goals, such as "10 seeds × 1000 goals (300 on the way)"."""
         final, way = self.goals("final"), sorted({*self.rows.goals} - {self.goals("final")})
         return f"{self.seeds} × {final} goals" + (f" ({', '.join(map(str, way))} on the way)" if way else "")
 
     def at(self, when: str | float) -> pd.Series:
-        """Success [%] of each seed then; empty where it was not evaluated."""
+        """Return the success [%] of each seed at a time; empty if it was not evaluated."""
         return self.scores.get(self.minute(when), pd.Series(dtype=float))
 
 
 def select(
     rows: pd.DataFrame, task: str, method: str, recipe: str, start: str = "scratch", protocol: str = "full"
 ) -> Cell | None:
-    """The results of one method on one object, deployed in one way (`recipes.PROTOCOLS`); None if there are none.
+    """Select the results of a method on an object, deployed in one way (`recipes.PROTOCOLS`); None without any.
 
     Where there are several versions or settings, those with the most evaluated goals, then the newest.
     """
-    found: Any = rows[(rows[IDENTITY[:4]] == [task, method, recipe, start]).all(axis=1)]
-    if found.empty:
+    selected: Any = rows[(rows[IDENTITY[:4]] == [task, method, recipe, start]).all(axis=1)]
+    if selected.empty:
         return None
-    groups = [group for _, group in found.groupby(["version", "key"])]
+    groups = [group for _, group in selected.groupby(["version", "key"])]
     best = max(groups, key=lambda group: (group.goals.sum(), group.finished.max()))
     shown = best[best.protocol == protocol]
     return Cell(shown, sum(group.seed.nunique() for group in groups if group is not best)) if len(shown) else None

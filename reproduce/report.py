@@ -1,4 +1,4 @@
-"""What the tables and figures share: which results, how numbers are said, and how they are written."""
+"""Common parts of the tables and figures: selection of results, format of numbers, and output."""
 
 import io
 import math
@@ -28,7 +28,7 @@ MISSING = "—"
 FEWEST = 3
 """Seeds that a sentence about a paired difference takes: the interval of two is their range, and says nothing."""
 UNTOLD = f"not compared, having fewer than {FEWEST} seeds or other goals"
-"""What is said of those without an interval."""
+"""Note for numbers without an interval."""
 STATISTICS = "Brackets and p are explained in reproduce/README.md, section Statistics."
 Tables = dict[str, pd.DataFrame]
 """Title → table of text."""
@@ -45,7 +45,7 @@ class Draw(runs.Compute):
 
 
 def main(name: str, artefact: str, draw: Drawing, words: Sequence[str] | None = None) -> int:
-    """What every drawing script does: compute if that is asked for, then draw, stand-ins apart; the exit code."""
+    """Run a drawing script: compute if asked for, then draw, stand-ins apart; return the exit code."""
 
     def action(options: Draw) -> int:
         code = runs.run(options, [artefact]) if options.rerun else 0
@@ -68,19 +68,19 @@ def main(name: str, artefact: str, draw: Drawing, words: Sequence[str] | None = 
 
 
 Pairs = Mapping[str, tuple[Cell | None, Cell | None]]
-"""What is compared: the name of a comparison → its two results."""
+"""Comparisons: name → its two results."""
 
 
 def name_of(method: str, recipe: str, start: str = "scratch", protocol: Any = "full") -> str:
-    """What a method is called in tables: its recipe, where it starts, how it is deployed."""
-    own = "" if (method, recipe) == ("pddm", "ours") else RECIPES[recipe].label
+    """Name a method in tables: its recipe, start and deployment."""
+    label = "" if (method, recipe) == ("pddm", "ours") else RECIPES[recipe].label
     begins = "" if start == "scratch" else f"from the {start}'s model"
     deployed = "" if protocol == "full" else PROTOCOLS[protocol]
-    return ", ".join(filter(None, [NAMES[method], own, begins, deployed]))
+    return ", ".join(filter(None, [NAMES[method], label, begins, deployed]))
 
 
 def at(cell: Cell | None, when: str | float) -> Estimate | None:
-    """Success [%] at some minute, see `Cell.minute`; None if there is no such evaluation."""
+    """Return the success [%] at some minute, see `Cell.minute`; None if there is no such evaluation."""
     values = [] if cell is None else list(cell.at(when))
     if cell is None or not values:
         return None
@@ -88,19 +88,19 @@ def at(cell: Cell | None, when: str | float) -> Estimate | None:
 
 
 def over_objects(cells: Sequence[Cell | None], when: str | float) -> Estimate | None:
-    """Interquartile mean over objects and seeds; None if an object is missing, or was not evaluated then."""
-    found = [[] if cell is None else list(cell.at(when)) for cell in cells]
-    return bootstrap(found, IQM) if all(found) else None
+    """Compute the interquartile mean over objects and seeds; None if an object is missing or was not evaluated."""
+    values = [[] if cell is None else list(cell.at(when)) for cell in cells]
+    return bootstrap(values, IQM) if all(values) else None
 
 
 def mean_over(cells: Sequence[Cell | None], when: str | float) -> float:
-    """Mean success over the objects that there are results of; -1 without any."""
+    """Compute the mean success over the objects that have results; -1 without any."""
     means = [cell.at(when).mean() for cell in cells if cell is not None]
     return sum(means) / len(means) if means else -1.0
 
 
 def paired(a: Cell | None, b: Cell | None, when: str | float) -> list[float]:
-    """Success of a − b [%] for each seed of both; none where they differ in goals, object or version of a method.
+    """Compute the success of a − b [%] for each seed of both; none if they differ in goals, object or version.
 
     Peaks may be of different goals: at the end there are more of them than on the way.
     """
@@ -117,29 +117,29 @@ def paired(a: Cell | None, b: Cell | None, when: str | float) -> list[float]:
 
 
 def paired_estimate(a: Cell | None, b: Cell | None, when: str | float) -> Estimate | None:
-    """The mean of `paired`, with its interval from `FEWEST` seeds on; None where nothing can be compared."""
-    found = paired(a, b, when)
-    if len(found) < FEWEST:
-        return Estimate(sum(found) / len(found)) if found else None
-    return bootstrap([found])
+    """Compute the mean of `paired`, with its interval from `FEWEST` seeds on; None if nothing can be compared."""
+    values = paired(a, b, when)
+    if len(values) < FEWEST:
+        return Estimate(sum(values) / len(values)) if values else None
+    return bootstrap([values])
 
 
 def listed(names: Sequence[str]) -> str:
-    """Names in a sentence, such as "mug, wrench and banana"."""
+    """Join names in a sentence, such as "mug, wrench and banana"."""
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1] if names else "none"]))
 
 
 def sides(differences: Mapping[str, Estimate | None]) -> tuple[list[str], list[str], list[str], list[str]]:
-    """Names whose difference is above zero, below it, or on either side by its interval; and those without one."""
-    known = {name: found for name, found in differences.items() if found is not None and not math.isnan(found.low)}
-    above = [name for name, found in known.items() if found.low > 0]
-    below = [name for name, found in known.items() if found.high < 0]
+    """Sort names by their difference: above zero, below it, on either side by its interval, or without one."""
+    known = {name: value for name, value in differences.items() if value is not None and not math.isnan(value.low)}
+    above = [name for name, value in known.items() if value.low > 0]
+    below = [name for name, value in known.items() if value.high < 0]
     either = [name for name in known if name not in above and name not in below]
     return above, below, either, [name for name in differences if name not in known]
 
 
 def verdict(differences: Mapping[str, Estimate | None], against: str = "on", unlike: str = "on") -> str:
-    """Where a difference is above zero, below it, or cannot be told, by the intervals; and what was not compared.
+    """Describe where a difference is above or below zero or undecided, by the intervals; and what was not compared.
 
     `against` and `unlike` are the words between a finding and its names, which are objects by default.
     """
@@ -154,12 +154,12 @@ def verdict(differences: Mapping[str, Estimate | None], against: str = "on", unl
 
 
 def bullets(sentences: Sequence[str]) -> list[str]:
-    """Notes that are a list."""
+    """Format notes as a list."""
     return ["", *(f"- {sentence}" for sentence in sentences), ""] if sentences else []
 
 
 def say(estimate: Estimate | None, signed: bool = False) -> str:
-    """A number with its interval."""
+    """Format a number with its interval."""
     if estimate is None:
         return MISSING
     value, low, high = (f"{x:{'+' if signed else ''}z.1f}".replace("-", "−") for x in estimate)
@@ -167,7 +167,7 @@ def say(estimate: Estimate | None, signed: bool = False) -> str:
 
 
 def say_difference(differences: Sequence[float]) -> tuple[str, str]:
-    """The mean difference with its interval, and the p-value."""
+    """Format the mean difference with its interval, and the p-value."""
     if not differences:
         return MISSING, MISSING
     p = p_value(differences)
@@ -176,7 +176,7 @@ def say_difference(differences: Sequence[float]) -> tuple[str, str]:
 
 
 def differences(heading: str, pairs: Pairs, when: Mapping[str, str | float]) -> pd.DataFrame:
-    """For each pair a − b, paired by seed, with its p, at each time."""
+    """Make a row for each pair a − b, paired by seed, with its p, at each time."""
     columns = {heading: list(pairs)}
     for label, at_ in when.items():
         means, ps = zip(*(say_difference(paired(*pair, at_)) for pair in pairs.values()), strict=True)
@@ -185,9 +185,9 @@ def differences(heading: str, pairs: Pairs, when: Mapping[str, str | float]) -> 
 
 
 def provenance(cells: Sequence[Cell | None]) -> list[str]:
-    """Where the numbers come from: how much was computed, on what, and by which version of each method."""
-    found = list(dict.fromkeys(cell for cell in cells if cell is not None))
-    rows = pd.concat([cell.rows for cell in found])
+    """Describe the origin of the numbers: amounts computed, machines, and versions of each method."""
+    used = list(dict.fromkeys(cell for cell in cells if cell is not None))
+    rows = pd.concat([cell.rows for cell in used])
     units = rows.drop_duplicates(records.IDENTITY)
     seconds = units.train_seconds + units.evaluation_seconds
     goals = ", ".join(map(str, rows.evaluation_seed.unique()))
@@ -201,7 +201,7 @@ def provenance(cells: Sequence[Cell | None]) -> list[str]:
         "Every number is of one version of its method:",
     ]
     tasks: dict[str, dict[str, None]] = {}
-    for cell in found:
+    for cell in used:
         first = cell.first
         label = name_of(first.method, first.recipe, first.start, first.protocol)
         left_out = f"; {cell.left_out} trainings of others left out" if cell.left_out else ""
@@ -213,7 +213,7 @@ def provenance(cells: Sequence[Cell | None]) -> list[str]:
 def write_tables(
     folder: Path, name: str, tables: Tables, notes: Sequence[str], figures: Mapping[str, str] | None = None
 ) -> None:
-    """Print tables with their notes; write them as Markdown and LaTeX, and into README.md where they belong there.
+    """Print tables with their notes; write them as Markdown and LaTeX, and into README.md if it has their mark.
 
     Args:
         folder: where to.
@@ -245,7 +245,7 @@ def _latex(table: pd.DataFrame) -> str:
 
 
 def update_readme(name: str, markdown: str, readme: Path | None = None) -> None:
-    """Replace what stands between `<!-- results: NAME -->` and `<!-- end -->`; nothing where there is no such mark."""
+    """Replace the text between `<!-- results: NAME -->` and `<!-- end -->`; do nothing without such a mark."""
     readme = readme or README
     text = readme.read_text()
     before, mark, rest = text.partition(f"<!-- results: {name} -->\n")
@@ -258,7 +258,7 @@ def update_readme(name: str, markdown: str, readme: Path | None = None) -> None:
 
 
 def draw_curves(axes: Axes, title: str, curves: Sequence[tuple[Cell | None, str, str, str]]) -> None:
-    """Success against minutes of data really collected, of cells with their labels, colours and line styles.
+    """Draw success against minutes of data really collected, for cells with their labels, colours and line styles.
 
     Thick the mean over the seeds, with its interval as a band; thin the single seeds.
     """

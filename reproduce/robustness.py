@@ -44,7 +44,7 @@ class Options:
     rerun: bool = False
     """Compute what is missing in the record; then draw."""
     smoke: bool = False
-    """A few goals, in a record of its own: shows that everything works."""
+    """A few goals, in a separate record: shows that everything works."""
     results: Path = records.RESULTS
     """Folder of the record, robustness.json, and of table and figure."""
 
@@ -65,11 +65,11 @@ class Condition:
     delay: int = 0
     """Steps by which actions come late."""
     predicted: bool = False
-    """Whether the LCS brings the observed state forward to where the action will be executed."""
+    """Whether the LCS advances the observed state to the time at which the action will be executed."""
 
 
 def conditions(mass: float, friction: float, gain: float) -> Iterator[Condition]:
-    """All of them, for an object of a mass [kg] and friction, and the stiffness of the robot's controller [1/s²]."""
+    """List all conditions, for an object's mass [kg] and friction and the robot controller's stiffness [1/s²]."""
     yield Condition("", NOMINAL)
     for factor in (0.2, 0.5, 2.0, 3.0, 10.0):
         yield Condition("mass", f"{1000 * mass * factor:g} g", {"object_mass": mass * factor})
@@ -86,7 +86,7 @@ def conditions(mass: float, friction: float, gain: float) -> Iterator[Condition]
 
 
 def acting(condition: Condition, policy: Any, n_u: int, rng: np.random.Generator) -> Act:
-    """How a model acts in a condition, in one batch of episodes, with the noise of a generator."""
+    """Run a model in a condition, in one batch of episodes, with the noise of a generator."""
     act = mpc_actions(policy)
     position, yaw = condition.noise
 
@@ -101,7 +101,7 @@ def acting(condition: Condition, policy: Any, n_u: int, rng: np.random.Generator
 
 
 def measure(condition: Condition, task: TaskSpec, policy: Any, goals: int, seed: int) -> dict[str, Any]:
-    """Whether each goal was reached, and how many solves failed."""
+    """Count the goals reached and the solves that failed."""
     envs = replace(task, env_kwargs={**task.env_kwargs, **(condition.env or {})}).make_envs(min(50, goals))
     parts = []
     try:
@@ -123,10 +123,10 @@ def compute(options: Options, path: Path, say: Callable[[str], object] = print) 
     task, policy = get_task(learned.task), learned.policy
     env: Any = task.make_env().unwrapped
     described = task.describe(env)
-    found = list(conditions(described["mass"], described["friction"], env.osc_kp))
+    selected = list(conditions(described["mass"], described["friction"], env.osc_kp))
     env.close()
     if options.smoke:
-        found = [one for one in found if one.group in ("", "noise") or one.delay == 1]
+        selected = [one for one in selected if one.group in ("", "noise") or one.delay == 1]
     asked = {"model": str(options.model), "goals": options.goals, "seed": options.seed, "object": dict(described)}
     new = {"options": asked, "machine": machine(), "results": []}
     record: Any = json.loads(path.read_text()) if path.exists() else new
@@ -136,7 +136,7 @@ def compute(options: Options, path: Path, say: Callable[[str], object] = print) 
             f"delete it to compute it anew"
         )
     known = {(row["group"], row["name"]) for row in record["results"]}
-    for condition in found:
+    for condition in selected:
         if (condition.group, condition.name) not in known:
             row = measure(condition, task, policy, options.goals, options.seed)
             record["results"].append(row)
@@ -146,14 +146,14 @@ def compute(options: Options, path: Path, say: Callable[[str], object] = print) 
 
 
 def estimates(rows: Sequence[dict[str, Any]]) -> list[tuple[dict[str, Any], Any, Any]]:
-    """Each row with its success [%], and the difference to the nominal one, goal by goal, with their intervals."""
+    """Compute each row's success [%], and the difference to the nominal one, goal by goal, with their intervals."""
     reached = {row["name"]: 100.0 * np.array(list(map(int, row["reached"]))) for row in rows}
-    nominal, found = reached[NOMINAL], []
+    nominal, results = reached[NOMINAL], []
     for row in rows:
-        own = reached[row["name"]]
-        apart = None if row["name"] == NOMINAL else bootstrap([list(own - nominal)])
-        found.append((row, wilson(own.mean(), len(own)), apart))
-    return found
+        goals = reached[row["name"]]
+        apart = None if row["name"] == NOMINAL else bootstrap([list(goals - nominal)])
+        results.append((row, wilson(goals.mean(), len(goals)), apart))
+    return results
 
 
 def draw(record: dict[str, Any], folder: Path, name: str) -> None:
@@ -191,7 +191,7 @@ def draw(record: dict[str, Any], folder: Path, name: str) -> None:
 
 
 def draw_record(options: Options) -> int:
-    """Compute if that is asked for, then draw; the exit code."""
+    """Compute if asked for, then draw; return the exit code."""
     name = "robustness-smoke" if options.smoke else "robustness"
     options = replace(options, goals=min(options.goals, 4)) if options.smoke else options
     path = options.results / f"{name}.json"

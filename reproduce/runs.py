@@ -1,6 +1,6 @@
 """Compute the runs behind the tables and figures: `python reproduce/runs.py --preset paper`.
 
-Workers of Dask compute the units of work (`units.py`), on this machine or on a cluster. What is finished is never
+Worker processes of Dask compute the units of work (`units.py`) on this machine. What is finished is never
 computed again; what was interrupted goes on; a failure is shown, does not stop the rest, and is tried again next time.
 Results go to `reproduce/results/`, everything else (models, logs) to `runs/reproduce/`.
 """
@@ -29,7 +29,7 @@ import worker
 from recipes import Chosen
 from rich.progress import Progress, TaskID, TimeElapsedColumn
 from units import Artefact, Method, Object, Preset, PresetName, Unit
-from worker import Files, Job
+from worker import Job
 
 from difflcs.errors import DiffLCSError, InvalidInputError
 from difflcs.rl import write_atomically
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 def check_amounts(**amounts: int | None) -> None:
-    """Raise `InvalidInputError` if an amount that is given is below 1."""
+    """Raise `InvalidInputError` if an amount is below 1."""
     for name, amount in amounts.items():
         if amount is not None and amount < 1:
             raise InvalidInputError(f"{name}: expected at least 1, got {amount}; pass another --{name}")
@@ -47,7 +47,7 @@ def check_amounts(**amounts: int | None) -> None:
 
 @dataclass(frozen=True)
 class Compute:
-    """What to compute, and where. Without --preset and --rerun the scripts only draw what is there."""
+    """Options of the computation. Without --preset and --rerun the scripts only draw existing results."""
 
     preset: PresetName | None = None
     """smoke (about a minute), quick (about half an hour a script on 2 cores) or paper (10 seeds, 1000 goals). To draw:
@@ -66,8 +66,6 @@ class Compute:
     """Leave out what is in the results already, wherever it was computed; by default only what is in --work."""
     workers: int | None = None
     """Processes on this machine, one core each; the number of cores by default."""
-    scheduler: str | None = None
-    """Address of a Dask scheduler, tcp://host:port, whose workers compute instead."""
     work: Path = Path("runs") / "reproduce"
     """Folder for models, logs and checkpoints."""
     results: Path = records.RESULTS
@@ -75,13 +73,10 @@ class Compute:
 
     def __post_init__(self) -> None:
         check_amounts(seeds=self.seeds, goals=self.goals, workers=self.workers)
-        if self.scheduler is not None and (self.workers is not None or "://" not in self.scheduler):
-            got = f"{self.scheduler!r} and {self.workers} workers of this machine"
-            raise InvalidInputError(f"scheduler: expected an address tcp://host:port alone, got {got}")
 
 
 def make_jobs(wanted: Sequence[Unit], preset: Preset, work: Path) -> list[Job]:
-    """The jobs of units, in their order."""
+    """Make the jobs of units, in their order."""
     objects = {task: units.describe_object(task) for task in dict.fromkeys(unit.task for unit in wanted)}
     stand_ins = [task for task, described in objects.items() if described["source"] == "stand_in"]
     if stand_ins:
@@ -90,7 +85,7 @@ def make_jobs(wanted: Sequence[Unit], preset: Preset, work: Path) -> list[Job]:
 
 
 def still_missing(jobs: Sequence[Job], results: Sequence[pd.DataFrame]) -> list[Job]:
-    """The jobs without results, and those that they start from, whose runs they need."""
+    """List the jobs without results, and those whose runs they start from."""
     known = {tuple(row) for rows in results for row in rows[records.IDENTITY].itertuples(index=False)}
     starts = {job.unit.init for job in jobs if job.identity not in known}
     return [job for job in jobs if job.identity not in known or job.unit in starts]
@@ -101,7 +96,7 @@ def compute(
     client: Any,
     store: Callable[[pd.DataFrame], object],
     show: Progress,
-    execute: Callable[[Job], tuple[pd.DataFrame, Files]] = worker.execute,
+    execute: Callable[[Job], pd.DataFrame] = worker.execute,
 ) -> dict[Unit, str]:
     """Compute the units that are not finished, a unit after the one that it starts from, which is among `jobs`.
 
@@ -132,7 +127,7 @@ def compute(
                 fail(job, f"it starts from {first.unit}, which failed")
             elif len(running) < slots and (first is None or first.result() is not None):
                 waiting.remove(job)
-                ready = job if first is None else replace(job, init=worker.read_files(first.folder / "run"))
+                ready = job if first is None else replace(job, init=first.folder / "run")
                 # A closure is pickled by value, with all it refers to: workers need not have this folder.
                 future = client.submit(lambda ready=ready: execute(ready), pure=False)
                 running[future] = job, show.add_task(str(job.unit), total=None)
@@ -141,22 +136,19 @@ def compute(
             job, bar = running.pop(future)
             show.remove_task(bar)
             try:
-                rows, files = future.result()
+                rows = future.result()
             except Exception as error:  # whatever a unit, its worker or Dask may raise
                 write_atomically(job.folder / "error.txt", traceback.format_exc().encode())
                 fail(job, f"{type(error).__name__}: {error}")
                 continue
-            if job.result() is None:  # the worker has another disk
-                worker.write_files(job.folder / "run", files)
-                job.keep(rows)
             store(rows)
             end(job, f"{100 * rows.success.iloc[-1]:.1f} % of {rows.goals.iloc[-1]} goals")
     return failed
 
 
 @contextlib.contextmanager
-def connect(workers: int | None = None, scheduler: str | None = None) -> Iterator[Client]:
-    """A client of a scheduler, or of worker processes on this machine, which end with this one however that ends.
+def connect(workers: int | None = None) -> Iterator[Client]:
+    """Start worker processes on this machine, which end with this one however that ends.
 
     A unit whose worker dies goes on from its last checkpoint, as often as Dask allows (`allowed-failures`, 3).
     """
@@ -166,20 +158,20 @@ def connect(workers: int | None = None, scheduler: str | None = None) -> Iterato
 
     for module in (sys.modules[__name__], recipes, records, units, deployment, worker):
         cloudpickle.register_pickle_by_value(module)
-    with contextlib.ExitStack() as held:
-        address: Any = scheduler
-        if address is None:
-            options: Any = {"memory_limit": None, "dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
-            count = workers or len(os.sched_getaffinity(0))
-            # Dask gives up a worker that is not there 15 s after a loss, even one that has come back since, is lost
-            # again and is just being started: then nobody would compute the rest. Here each is started again for ever.
-            held.enter_context(dask.config.set({"distributed.deploy.lost-worker-timeout": "52 weeks"}))
-            address = held.enter_context(LocalCluster(n_workers=count, threads_per_worker=1, **options))
-        yield held.enter_context(Client(address))
+    options: Any = {"memory_limit": None, "dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
+    count = workers or len(os.sched_getaffinity(0))
+    # Dask gives up a worker that is not there 15 s after a loss, even one that has come back since, is lost again and
+    # is just being started: then nobody would compute the rest. Here each is started again for ever.
+    with (
+        dask.config.set({"distributed.deploy.lost-worker-timeout": "52 weeks"}),
+        LocalCluster(n_workers=count, threads_per_worker=1, **options) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
 
 
 def run(options: Compute, artefacts: Sequence[str]) -> int:
-    """Compute what artefacts (none: all) need; returns the exit code, 1 if units have failed."""
+    """Compute the units that artefacts (none: all) need; return the exit code, 1 if units have failed."""
     preset = units.PRESETS[options.preset or "quick"]
     preset = preset.with_amounts(options.seeds, options.goals)
     wanted = units.matrix(artefacts, preset, options.objects, options.methods, options.recipes)
@@ -199,7 +191,7 @@ def run(options: Compute, artefacts: Sequence[str]) -> int:
         return 0
     columns = (*Progress.get_default_columns(), TimeElapsedColumn())
     bars = Progress(*columns, disable=not sys.stdout.isatty())  # the lines of units that have ended are printed anyway
-    with connect(options.workers, options.scheduler) as client, bars:
+    with connect(options.workers) as client, bars:
         failed = compute(jobs, client, store, bars)
     for job in jobs:
         if job.unit in failed:
@@ -210,7 +202,7 @@ def run(options: Compute, artefacts: Sequence[str]) -> int:
 
 
 def command_line(kind: type[Any], action: Callable[[Any], int], arguments: Sequence[str] | None = None) -> int:
-    """Run a script with its options, a dataclass: its exit code, 2 after an error of the user, 130 after Ctrl-C."""
+    """Run a script with its options, a dataclass; return the exit code, 2 after a user's error, 130 after Ctrl-C."""
     from difflcs_envs import DifflcsEnvsError
 
     try:

@@ -1,4 +1,4 @@
-"""What a small model is good for: an LCS beside the networks of PDDM, on the cube: `python reproduce/small_models.py`.
+"""Success and cost of a small model: an LCS against PDDM's networks, on the cube: `python reproduce/small_models.py`.
 
 Without options the table is drawn from the tracked results of the learning curves; `--rerun --preset smoke|quick|paper`
 computes them.
@@ -33,9 +33,9 @@ HYBRID = (
 
 
 def size_of(method: str, recipe: str) -> int:
-    """Numbers that are learned."""
-    task, own = get_task("cube"), config_of(Unit("cube", method, recipe, 0), PRESETS["paper"]).method
-    settings: Any = own
+    """Count the learned numbers."""
+    task, method_settings = get_task("cube"), config_of(Unit("cube", method, recipe, 0), PRESETS["paper"]).method
+    settings: Any = method_settings
     if hasattr(settings, "n_lam"):
         return sum(p.numel() for p in LCSModel(task.n_x, task.n_u, settings.n_lam, learn_c=False).parameters())
     ensemble = settings.pddm.ensemble
@@ -43,7 +43,7 @@ def size_of(method: str, recipe: str) -> int:
 
 
 class Times(NamedTuple):
-    """What one method takes of one core: medians over the trainings on one class of machine."""
+    """Computing time of one method on one core: medians over the trainings on one class of machine."""
 
     step: float
     """Milliseconds of one step in the evaluations: the decision and the simulation of its outcome."""
@@ -53,16 +53,16 @@ class Times(NamedTuple):
 
 
 def shared_machine(cells: dict[str, Cell]) -> str | None:
-    """The class of machine that has computed the most of all methods, so that times compare; None if no one has."""
+    """Find the class of machine that has computed most of all methods, so that times compare; None without one."""
     counts = pd.concat([cell.rows.drop_duplicates("seed").machine.value_counts() for cell in cells.values()], axis=1)
     fewest = counts.min(axis=1, skipna=False).dropna()
     return None if fewest.empty else str(fewest.idxmax())
 
 
 def times_of(rows: pd.DataFrame, cell: Cell, machine: str) -> Times:
-    """The times of a method on a class of machine, over all ways in which its models were evaluated there."""
-    own: Any = cell.first
-    same = (rows.key == own.key) & (rows.version == own.version) & (rows.task == own.task) & (rows.machine == machine)
+    """Compute the times of a method on a class of machine, over all deployments of its models there."""
+    row: Any = cell.first
+    same = (rows.key == row.key) & (rows.version == row.version) & (rows.task == row.task) & (rows.machine == machine)
     trainings = (
         rows[same]
         .groupby("seed")
@@ -73,7 +73,7 @@ def times_of(rows: pd.DataFrame, cell: Cell, machine: str) -> Times:
 
 
 def table(cells: dict[str, Cell], times: dict[str, Times]) -> pd.DataFrame:
-    """Success, computing and size of each."""
+    """Make the table of success, computing time and size of each."""
     columns: dict[str, list[str]] = {
         "": [*WHEN, "computing per step, with the simulation [ms]", "training [core min]", "learned numbers"]
     }
@@ -85,37 +85,37 @@ def table(cells: dict[str, Cell], times: dict[str, Times]) -> pd.DataFrame:
 
 
 def words(cells: dict[str, Cell], times: dict[str, Times]) -> list[str]:
-    """The paper's claim beside either way of PDDM, by the intervals; and what the small model costs."""
-    own = next((name for name, cell in cells.items() if cell.first.method == "lcs-rl"), None)
+    """Describe the paper's claim against both forms of PDDM by the intervals, and the cost of the small model."""
+    lcs = next((name for name, cell in cells.items() if cell.first.method == "lcs-rl"), None)
     networks = {name: cell for name, cell in cells.items() if cell.first.method == "pddm"}
-    if own is None or not networks:
+    if lcs is None or not networks:
         return []
     said = []
     for name, cell in networks.items():
-        apart: Estimate | None = report.paired_estimate(cells[own], cell, EARLY)
+        apart: Estimate | None = report.paired_estimate(cells[lcs], cell, EARLY)
         claim = "cannot be decided here"
         if apart is not None and apart.low > 0:
             claim = "holds here"
         elif apart is not None and apart.high < 0:
             claim = "does not hold here: the networks are better"
-        difference, _ = report.say_difference(report.paired(cells[own], cell, EARLY))
+        difference, _ = report.say_difference(report.paired(cells[lcs], cell, EARLY))
         said.append(
             f"{name}: after {EARLY:g} minutes of data LCS-RL − PDDM is {difference} points, paired by seed. The "
             f"paper's claim that simple models beat deep networks at little data {claim}."
         )
     first = next(iter(networks))
-    sizes = [size_of(cell.first.method, cell.first.recipe) for cell in (networks[first], cells[own])]
+    sizes = [size_of(cell.first.method, cell.first.recipe) for cell in (networks[first], cells[lcs])]
     costs = f"The networks of PDDM hold {sizes[0] / sizes[1]:.0f} times as many numbers as the LCS"
     if times:
-        ratio = times[first].step / times[own].step
+        ratio = times[first].step / times[lcs].step
         costs += f", and a step of PDDM takes {ratio:.0f} times the computing, the simulation included"
     return [*report.bullets(said), f"{costs}."]
 
 
 def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
     """Write the table."""
-    found = {report.name_of(m, r, protocol=p): select(rows, "cube", m, r, protocol=p) for m, r, p in SHOWN}
-    cells = {label: cell for label, cell in found.items() if cell is not None}
+    results = {report.name_of(m, r, protocol=p): select(rows, "cube", m, r, protocol=p) for m, r, p in SHOWN}
+    cells = {label: cell for label, cell in results.items() if cell is not None}
     if not cells:
         return False
     machine = shared_machine(cells)

@@ -2,7 +2,7 @@
 
 Over seeds and objects it is the stratified bootstrap of Agarwal et al. (Deep reinforcement learning at the edge of the
 statistical precipice, 2021): seeds are drawn anew within each object. Their package rliable draws from NumPy's global
-generator whatever generator it is given, and fails to import with pandas 3; SciPy's bootstrap does the same.
+generator whatever generator is passed, and fails to import with pandas 3; SciPy's bootstrap does the same.
 """
 
 import itertools
@@ -24,7 +24,7 @@ class Estimate(NamedTuple):
 
 
 def wilson(success: float, goals: int) -> Estimate:
-    """Success [%] of one run, with Wilson's interval: what other goals would have given."""
+    """Compute the success [%] of one run with Wilson's interval, for other goals."""
     interval = stats.binomtest(round(success / 100 * goals), goals).proportion_ci(method="wilson")
     return Estimate(success, 100 * interval.low, 100 * interval.high)
 
@@ -34,7 +34,7 @@ IQM = partial(stats.trim_mean, proportiontocut=0.25)
 
 
 def bootstrap(strata: Sequence[Sequence[float]], statistic: Callable[..., np.ndarray] = np.mean) -> Estimate:
-    """A statistic over all values, one per seed of each object, and what other seeds would have given."""
+    """Compute a statistic over all values, one per seed of each object, with the interval for other seeds."""
     value = float(statistic(np.concatenate(strata), axis=-1))
     if min(map(len, strata)) < 2:
         return Estimate(value)
@@ -49,7 +49,7 @@ def bootstrap(strata: Sequence[Sequence[float]], statistic: Callable[..., np.nda
 
 
 def p_value(differences: Sequence[float]) -> float:
-    """Two-sided p of the permutation test of paired differences, exact; NaN for one seed.
+    """Compute the two-sided p of the permutation test of paired differences, exact; NaN for one seed.
 
     If a seed made no difference between the two, each difference were as likely with the other sign: p is the share of
     all choices of signs that give a mean as far from zero. No shape of a distribution is assumed. With n seeds it is
@@ -63,13 +63,13 @@ def p_value(differences: Sequence[float]) -> float:
 
 
 def apart(a: Estimate, b: Estimate) -> Estimate:
-    """The difference a − b of two independent numbers, its interval from theirs (MOVER; Zou & Donner 2008)."""
+    """Compute the difference a − b of two independent numbers, its interval from theirs (MOVER; Zou & Donner 2008)."""
     low = math.hypot(a.value - a.low, b.high - b.value)
     high = math.hypot(a.high - a.value, b.value - b.low)
     return Estimate(a.value - b.value, a.value - b.value - low, a.value - b.value + high)
 
 
 def published(mean: float, deviation: float, seeds: int = 10) -> Estimate:
-    """A mean that others give with its standard deviation over seeds, with the t-interval that follows."""
+    """Convert a published mean and standard deviation over seeds to an estimate with its t-interval."""
     half = float(stats.t.ppf(0.975, seeds - 1)) * deviation / math.sqrt(seeds)
     return Estimate(mean, mean - half, mean + half)

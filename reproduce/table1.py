@@ -49,7 +49,7 @@ Cells = list[Cell | None]
 
 
 def success(cells: Mapping[str, Cells]) -> pd.DataFrame:
-    """Success of each method on every object, ours beside the paper's."""
+    """Make the table of success of each method on every object, ours and the paper's."""
     columns = {"object": [*LABELS, "all six"]}
     for when, method in itertools.product(WHEN, COMPARED):
         name = f"{when}: {report.NAMES[method]}"
@@ -60,24 +60,24 @@ def success(cells: Mapping[str, Cells]) -> pd.DataFrame:
 
 
 def column(cells: Cells, when: str) -> list[str]:
-    """Success on each object and on all."""
-    return [say(found) for found in (*(report.at(cell, when) for cell in cells), report.over_objects(cells, when))]
+    """Make the column of success on each object and on all."""
+    return [say(value) for value in (*(report.at(cell, when) for cell in cells), report.over_objects(cells, when))]
 
 
 def differences(cells: Cells, baseline: Cells) -> pd.DataFrame:
-    """LCS-RL − a baseline, on each object and on all."""
+    """Compute LCS-RL − a baseline, on each object and on all."""
     pairs = dict(zip(LABELS, zip(cells, baseline, strict=True), strict=True))
     table = report.differences("object", pairs, {when: when for when in WHEN})
     last = ["all six"]
     for when in WHEN:
-        found = [report.paired(*pair, when) for pair in pairs.values()]
-        last += [say(bootstrap(found) if all(found) else None, signed=True), report.MISSING]
+        paired = [report.paired(*pair, when) for pair in pairs.values()]
+        last += [say(bootstrap(paired) if all(paired) else None, signed=True), report.MISSING]
     table.loc[len(table)] = last
     return table
 
 
 def beyond_paper(cells: Cells) -> dict[str, Estimate | None]:
-    """Final success of LCS-RL − the paper's, with the intervals of both; None for fewer than `report.FEWEST` seeds."""
+    """Compute the final success of LCS-RL − the paper's, with both intervals; None below `report.FEWEST` seeds."""
     differences = {}
     for task, label, cell in zip(OBJECTS, LABELS, cells, strict=True):
         ours = report.at(cell, "final") if cell and len(cell.scores) >= report.FEWEST else None
@@ -86,17 +86,17 @@ def beyond_paper(cells: Cells) -> dict[str, Estimate | None]:
 
 
 def below(name: str, note: str, words: Sequence[str], cells: Cells) -> list[str]:
-    """What stands below a table: whether the objects are stand-ins, a note, sentences, where the numbers come from."""
+    """List the notes below a table: whether the objects are stand-ins, a note, sentences, the origin of the numbers."""
     return [STAND_INS] * name.endswith("stand-in") + [note, *report.bullets(words), *report.provenance(cells)]
 
 
 def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
-    """Write the tables of all recipes that there are results of."""
-    tables, words, found = Tables(), [], Cells()
+    """Write the tables of all recipes that have results."""
+    tables, words, used = Tables(), [], Cells()
 
     def cells_of(*what: str) -> Cells:
         cells = [select(rows, task, *what) for task in OBJECTS]
-        found.extend(cells)
+        used.extend(cells)
         return cells
 
     prior = {
@@ -135,7 +135,7 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
             ends = [difference for pair in pairs for difference in report.paired(*pair, "final")]
             if ends and not any(ends):
                 words.append(f"{support}: at the end every seed has reached as many goals with full bounds.")
-    report.write_tables(folder, name, tables, below(name, NOTE, words, found))
+    report.write_tables(folder, name, tables, below(name, NOTE, words, used))
     return True
 
 

@@ -1,4 +1,4 @@
-"""The units of work: one training of one method on one object with one seed, and what decides its result."""
+"""Units of work: one training of one method on one object with one seed, and all that decides its result."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ ABLATED: Mapping[str, tuple[str, str]] = {
 }
 """Ablations → method and recipe."""
 ABLATION_TASKS, ABLATION_SEEDS = ("cube", "banana"), 8
-"""Where the parts of LCS-RL are taken out, and on how many seeds."""
+"""Tasks for the ablations of LCS-RL, and their number of seeds."""
 FIRST_SEED = 1000
 """Seed of the first run of everything. Nothing was ever chosen by this seed or a later one."""
 
 
 @dataclass(frozen=True)
 class Preset:
-    """How much is computed."""
+    """Amounts to compute."""
 
     name: str
     """Also that of its file of results."""
@@ -72,11 +72,11 @@ class Preset:
     """The same for `SLOW`, whose evaluations take a hundred times as long as those of the others."""
 
     def of(self, method: str) -> Preset:
-        """How much of a method is computed."""
+        """Return the amounts for a method."""
         return self.slow if self.slow is not None and method in SLOW else self
 
     def with_amounts(self, seeds: int | None, goals: int | None) -> Preset:
-        """The same with other numbers of seeds and goals, of everything, where they are given."""
+        """Replace the numbers of seeds and goals of everything by others, unless they are None."""
         slow = self.slow and self.slow.with_amounts(seeds, goals)
         amounts = {"goals": goals or self.goals, "final_goals": goals or self.final_goals}
         return replace(self, seeds=seeds or self.seeds, slow=slow, **amounts)
@@ -107,22 +107,22 @@ class Unit:
         return None if self.start == "scratch" else Unit("cube", "lcs-rl", self.recipe, self.seed)
 
     @property
-    def own(self) -> Recipe:
-        """The recipe itself."""
+    def changes(self) -> Recipe:
+        """Recipe of this unit."""
         return RECIPES[self.recipe]
 
     @property
     def protocols(self) -> Sequence[Protocol]:
-        """In which ways its models are evaluated."""
-        return self.own.protocols.get(self.method, ("full",))
+        """Names of the deployments in which its models are evaluated."""
+        return self.changes.protocols.get(self.method, ("full",))
 
     @property
     def spec(self) -> TaskSpec:
         """The task, with what the recipe changes of it."""
-        return changed_task(self.task, self.own.task)
+        return changed_task(self.task, self.changes.task)
 
     def __str__(self) -> str:
-        recipe = "" if self.recipe == "ours" else f", {self.own.label}"
+        recipe = "" if self.recipe == "ours" else f", {self.changes.label}"
         start = "" if self.start == "scratch" else f", from the {self.start}'s model"
         return f"{self.task} {self.method}{recipe}{start}, seed {self.seed}"
 
@@ -130,7 +130,7 @@ class Unit:
 def matrix(
     artefacts: Names, preset: Preset, objects: Names = (), methods: Names = (), recipes: Names = ()
 ) -> list[Unit]:
-    """The units that artefacts need, each once, what a unit starts from before it: the most important ones first.
+    """List the units that artefacts need, each once and after the one it starts from: the most important first.
 
     These are Table I; then masses, curves, transfer, ablations; then what is slow. Of each the first seeds come first.
     None of `artefacts`, `objects` (the cube is not one), `methods` stands for all; of `recipes` for all on the cube and
@@ -165,22 +165,22 @@ def matrix(
                 yield from (Unit(task, "lcs-rl", r, seed) for r in wanted("lcs-rl", (), ["ours"]))
                 yield from (Unit(task, m, r, seed) for m, r in ABLATED.values() if wanted(m, (), [r]))
 
-    found: list[Unit] = []
+    needed: list[Unit] = []
     every = {"table1": table1, "masses": masses, "curves": curves, "transfer": transfer, "ablations": ablations}
     for name, units in every.items():
         if name in artefacts:
             for seed in range(FIRST_SEED, FIRST_SEED + max(preset.seeds, preset.of("pddm").seeds)):
-                found += (unit for unit in units(seed) if seed < FIRST_SEED + preset.of(unit.method).seeds)
-    if not found:
+                needed += (unit for unit in units(seed) if seed < FIRST_SEED + preset.of(unit.method).seeds)
+    if not needed:
         raise InvalidInputError(
             f"units: expected at least one, got none from {artefacts} with {methods} and {recipes}; choose others"
         )
-    found.sort(key=lambda unit: unit.method in SLOW)
-    return list(dict.fromkeys(one for unit in found for one in (unit.init, unit) if one is not None))
+    needed.sort(key=lambda unit: unit.method in SLOW)
+    return list(dict.fromkeys(one for unit in needed for one in (unit.init, unit) if one is not None))
 
 
 def config_of(unit: Unit, preset: Preset) -> TrainConfig:
-    """All settings of a unit: the library's defaults but for the recipe, and the preset's minutes and goals.
+    """Build all settings of a unit: the library's defaults, the recipe's changes, the preset's minutes and goals.
 
     A unit that is not evaluated under the full bounds has no evaluations in its training, see `deployment`.
     """
@@ -189,8 +189,8 @@ def config_of(unit: Unit, preset: Preset) -> TrainConfig:
 
 
 def schedule_of(unit: Unit, preset: Preset) -> TrainConfig:
-    """The same with all evaluations."""
-    method, preset = changed(get_method(unit.method)(), unit.own.settings), preset.of(unit.method)
+    """Build the settings of a unit with all evaluations."""
+    method, preset = changed(get_method(unit.method)(), unit.changes.settings), preset.of(unit.method)
     return TrainConfig(
         task=unit.task,
         method=method.smoke() if preset.smoke else method,
@@ -203,7 +203,7 @@ def schedule_of(unit: Unit, preset: Preset) -> TrainConfig:
 
 
 def describe_object(task: str) -> Mapping[str, Any]:
-    """What is pushed on this machine, in JSON types: where its shape comes from, the hash of its mesh, its mass."""
+    """Describe the object on this machine, in JSON types: the origin of its shape, the hash of its mesh, its mass."""
     spec = get_task(task)
     env = spec.make_env()
     try:
@@ -213,7 +213,7 @@ def describe_object(task: str) -> Mapping[str, Any]:
 
 
 def key_of(unit: Unit, preset: Preset, objects: Mapping[str, Mapping[str, Any]]) -> str:
-    """Identifies the result of a unit, but for the seed; a result with another key is stale.
+    """Compute the key of a unit's result, without the seed; a result with another key is stale.
 
     It is a hash of settings, version of the method, object (task → `describe_object`), what the recipe changes of the
     task, ways of evaluating, and key of what it starts from.
@@ -222,7 +222,7 @@ def key_of(unit: Unit, preset: Preset, objects: Mapping[str, Mapping[str, Any]])
     settings = config.to_json()
     del settings["seed"]
     init = key_of(unit.init, preset, objects) if unit.init else None
-    task = [dict(objects[unit.task]), dict(unit.own.task), list(unit.protocols)]
+    task = [dict(objects[unit.task]), dict(unit.changes.task), list(unit.protocols)]
     parts = json.dumps([settings, config.method.version, *task, init], sort_keys=True)
     return hashlib.sha256(parts.encode()).hexdigest()[:12]
 

@@ -1,10 +1,9 @@
-"""Computes one unit, on whatever worker of Dask. Workers need difflcs, but neither this folder nor a common disk."""
+"""Worker process of Dask that computes one unit."""
 
 import contextlib
 import os
 import platform
 import shutil
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,38 +17,34 @@ from deployment import Deployments
 from units import Preset, Unit
 
 from difflcs.errors import CheckpointError, InvalidInputError
-from difflcs.rl import write_atomically
-
-Files = Mapping[str, bytes]
-"""Path within a folder → content."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """A unit, and what a worker needs to compute it."""
+    """A unit, and the data that a worker needs to compute it."""
 
     unit: Unit
     preset: Preset
     key: str
-    """What identifies its result, see `units.key_of`."""
+    """Key of its result, see `units.key_of`."""
     work: Path
     """Folder of all units."""
-    init: Files | None = None
-    """The run that it starts from."""
+    init: Path | None = None
+    """Folder of the run that it starts from."""
 
     @property
     def folder(self) -> Path:
-        """Holds all of the unit: `run`, `result.csv` when that is finished, `error.txt` after a failure."""
+        """Folder of the unit: `run`, `result.csv` when that is finished, `error.txt` after a failure."""
         return self.work / "-".join(map(str, (*asdict(self.unit).values(), self.key)))
 
     @property
     def identity(self) -> tuple[Any, ...]:
-        """The values of `records.IDENTITY` in its results."""
+        """Values of `records.IDENTITY` in its results."""
         values = {**asdict(self.unit), "key": self.key}
         return tuple(values[name] for name in records.IDENTITY)
 
     def result(self) -> pd.DataFrame | None:
-        """Its evaluations, see `records.COLUMNS`, if its folder holds those of this unit with this key, and the run."""
+        """Read its evaluations, see `records.COLUMNS`, and the run, if its folder holds those of this unit and key."""
         with contextlib.suppress(CheckpointError):
             rows = records.read(self.folder / "result.csv")
             known = len(rows) > 0 and (rows[records.IDENTITY] == list(self.identity)).to_numpy().all()
@@ -60,22 +55,22 @@ class Job:
         records.write(self.folder / "result.csv", rows)
 
 
-def execute(job: Job) -> tuple[pd.DataFrame, Files]:
-    """Compute a unit, or go on with it, or take what is there if it is finished: its evaluations, and its run."""
+def execute(job: Job) -> pd.DataFrame:
+    """Compute a unit, continue it, or read it if it is finished; return its evaluations."""
     job.folder.mkdir(parents=True, exist_ok=True)
     with filelock.FileLock(job.folder / ".lock"):  # another process waits; it ends with the one that holds it
         rows = job.result()
         if rows is None:
             rows = _train(job)
             job.keep(rows)
-        return rows, read_files(job.folder / "run")
+        return rows
 
 
 def _train(job: Job) -> pd.DataFrame:
     import torch
 
     torch.set_num_threads(1)  # of this thread only: one unit, one core
-    unit, run, init, config = job.unit, job.folder / "run", None, units.config_of(job.unit, job.preset)
+    unit, run, config = job.unit, job.folder / "run", units.config_of(job.unit, job.preset)
     objects = {one.task: units.describe_object(one.task) for one in (unit, unit.init) if one is not None}
     key = units.key_of(unit, job.preset, objects)
     if key != job.key:
@@ -86,20 +81,17 @@ def _train(job: Job) -> pd.DataFrame:
         )
     if not (run / "config.json").is_file():
         shutil.rmtree(run, ignore_errors=True)  # killed before it began
-    if job.init is not None:
-        init = job.folder / "init"
-        write_files(init, job.init)
     schedule = units.schedule_of(unit, job.preset)
     others = Deployments(unit, schedule, run, job.folder / "deployments.csv")
     others.catch_up()
-    finished = units.train_unit(unit, job.preset, run, init, others)
+    finished = units.train_unit(unit, job.preset, run, job.init, others)
     log = pd.read_csv(finished.log)
     evaluated = log.dropna(subset="evaluation_goals").filter(regex="^(minutes$|evaluation_)")
     evaluated.columns = [name.removeprefix("evaluation_") for name in evaluated.columns]
     parts = {"full": evaluated.assign(protocol="full"), **dict(iter(others.rows().groupby("protocol")))}
     # Before any data a model is evaluated by `train` alone, if at all.
     at = [minute for minute in (*schedule.evaluate_at, schedule.minutes) if minute > 0 or "full" in unit.protocols]
-    # Iterations have lengths of their own: the first evaluation at a minute or, if need be, a little after it.
+    # Iterations vary in length: the first evaluation at a minute or, if need be, a little after it.
     due: Any = [(parts[way][parts[way].minutes > minute - 1e-6], minute) for way in unit.protocols for minute in at]
     rows: Any = pd.DataFrame([part.iloc[0] for part, _ in due]).rename(columns={"success_rate": "success"})
     seconds: Any = log.filter(regex="_seconds$").sum()
@@ -109,7 +101,7 @@ def _train(job: Job) -> pd.DataFrame:
         at=[minute for _, minute in due],
         evaluation_seed=config.evaluation_seed,
         source=objects[unit.task]["source"],
-        mass=unit.own.task.get("object_mass", objects[unit.task]["mass"]),
+        mass=unit.changes.task.get("object_mass", objects[unit.task]["mass"]),
         version=str(config.method.version),
         key=key,
         versions=" ".join(f"{name}={version}" for name, version in sorted(packages.items()) if version),
@@ -123,19 +115,8 @@ def _train(job: Job) -> pd.DataFrame:
     return rows[list(records.COLUMNS)].astype(records.COLUMNS).round(6).reset_index(drop=True)
 
 
-def read_files(folder: Path) -> Files:
-    """All files: those of a finished run are small."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-def write_files(folder: Path, files: Files) -> None:
-    """The reverse of `read_files`."""
-    for name, content in files.items():
-        write_atomically(folder / name, content)
-
-
 def machine() -> str:
-    """What kind of machine this is: processor, cores, instruction set of the kernels."""
+    """Describe this class of machine: processor, cores, instruction set of the kernels."""
     from difflcs.cli import bench
 
     return f"{bench.cpu()}, {os.cpu_count()} cores, {bench.machine()['instruction set']}"

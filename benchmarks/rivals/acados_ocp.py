@@ -24,7 +24,7 @@ from rivals.problem import Answer, Problem, Rival  # noqa: E402
 
 
 def version() -> str:
-    """Of the wheel that ships acados."""
+    """Return the version of the wheel that ships acados."""
     return f"comma-deps-acados {version_of('comma-deps-acados')}"
 
 
@@ -57,7 +57,7 @@ class Solver(Rival):
         self.solver = AcadosOcpSolver(ocp, json_file=json_file, verbose=False)
 
     def one(self, i: int) -> Answer:
-        """One QP."""
+        """Solve one QP."""
         solver, p = self.solver, self.problem
         for k in range(p.horizon):
             solver.set(k, "u", np.zeros(p.n_u))

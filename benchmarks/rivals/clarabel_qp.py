@@ -12,12 +12,12 @@ from rivals.problem import Answer, Problem, Rival, sparse_program
 
 
 def version() -> str:
-    """Of Clarabel."""
+    """Return the version of Clarabel."""
     return f"clarabel {version_of('clarabel')}"
 
 
 class Solver(Rival):
-    """Its solver with data that is updated: the structure is set-up."""
+    """Clarabel's solver with data that is updated; the structure is set-up."""
 
     def __init__(self, problem: Problem):
         super().__init__(problem)
@@ -34,10 +34,10 @@ class Solver(Rival):
         self.solver = clarabel.DefaultSolver(upper, q, rows, self.b, cones, settings)
 
     def one(self, i: int) -> Answer:
-        """One program."""
+        """Solve one program."""
         b = self.b.copy()
         b[: self.problem.n_x] += self.problem.A @ self.problem.x0[i]
         self.solver.update(b=b)
-        found = self.solver.solve()
-        u = np.array(found.x)[self.where].reshape(1, self.problem.horizon, -1)
-        return Answer(u, np.array([str(found.status) == "Solved"]))
+        solution = self.solver.solve()
+        u = np.array(solution.x)[self.where].reshape(1, self.problem.horizon, -1)
+        return Answer(u, np.array([str(solution.status) == "Solved"]))

@@ -18,7 +18,7 @@ EXACT = {**PLAIN, "mode": "dense"}
 
 
 def version() -> str:
-    """Of cvxpylayers and cvxpy."""
+    """Return the versions of cvxpylayers and cvxpy."""
     return f"cvxpylayers {version_of('cvxpylayers')}, cvxpy {cp.__version__}"
 
 
@@ -39,7 +39,7 @@ class Solver(TorchRival):
         self.layer = CvxpyLayer(cp.Problem(cp.Minimize(cost), limits), parameters=[x0], variables=[u])
 
     def plan(self, x0: torch.Tensor, only: int | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-        """Its layer."""
+        """Call the layer."""
         (u,) = self.layer(x0, solver_args=EXACT if x0.requires_grad else PLAIN)
         return u, torch.ones(len(u), dtype=torch.bool)
 

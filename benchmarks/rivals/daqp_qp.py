@@ -11,7 +11,7 @@ from rivals.problem import Answer, Condensed, Problem, Rival
 
 
 def version() -> str:
-    """Of DAQP."""
+    """Return the version of DAQP."""
     return f"daqp {version_of('daqp')}"
 
 
@@ -26,7 +26,7 @@ class Solver(Rival):
         self.model.setup(c.H, c.h.copy(), empty, c.high, c.low, np.zeros(len(c.low), np.int32))
 
     def one(self, i: int) -> Answer:
-        """One program."""
+        """Solve one program."""
         c = self.condensed
         self.model.update(f=c.G @ self.problem.x0[i] + c.h)
         z, _, flag, _ = self.model.solve()

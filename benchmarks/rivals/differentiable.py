@@ -1,4 +1,4 @@
-"""What the rivals in PyTorch share: one call for a batch, with or without gradients."""
+"""Base of the rivals in PyTorch: one call for a batch, with or without gradients."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ class TorchRival(Rival):
         self.x0 = torch.from_numpy(problem.x0)
 
     def plan(self, x0: torch.Tensor, only: int | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-        """Actions and which of them are said to be solved; `only` says of which problem x0 is, None: of all."""
+        """Plan; return actions and which of them are solved. `only`: index of the problem of x0; None: all of them."""
         raise NotImplementedError
 
     @torch.no_grad()
     def one(self, i: int) -> Answer:
-        """One call for one problem."""
+        """Solve one problem in one call."""
         return Answer(*(value.numpy() for value in self.plan(self.x0[i : i + 1], i)))
 
     @torch.no_grad()
     def all(self) -> Answer:
-        """One call for all."""
+        """Solve all problems in one call."""
         return Answer(*(value.numpy() for value in self.plan(self.x0)))
 
     def gradient(self) -> Answer:
-        """One call for all, and back."""
+        """Solve all problems in one call, and differentiate."""
         x0 = self.x0.clone().requires_grad_()
         u, solved = self.plan(x0)
         (u[:, 0] @ torch.from_numpy(self.problem.weight)).sum().backward()

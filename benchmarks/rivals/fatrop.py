@@ -10,7 +10,7 @@ from rivals.problem import Answer, Problem, Rival
 
 
 def version() -> str:
-    """Of CasADi, which ships FATROP."""
+    """Return the version of CasADi, which ships FATROP."""
     if not casadi.has_nlpsol("fatrop"):
         raise ImportError("this CasADi has no FATROP")
     return f"casadi {casadi.__version__}"
@@ -34,12 +34,12 @@ class Solver(Rival):
         self.solver = casadi.nlpsol("mpc", "fatrop", {"x": p.z, "p": p.p, "f": p.f, "g": p.g}, settings)
 
     def one(self, i: int) -> Answer:
-        """One run of FATROP."""
+        """Run FATROP once."""
         p = self.program
         start = p.begin(self.problem, i)
         start[: self.problem.n_x] = self.problem.x0[i]
-        found = self.solver(
+        solution = self.solver(
             x0=start, p=p.parameters(self.problem, i), lbx=p.low, ubx=p.high, lbg=p.least, ubg=p.most
         )  # fmt: skip
-        z = np.asarray(found["x"]).ravel()
+        z = np.asarray(solution["x"]).ravel()
         return Answer(z[p.actions][None], np.array([bool(self.solver.stats()["success"])]))

@@ -15,12 +15,12 @@ EQUALITY = 5  # DAQP's word for a constraint that holds with equality
 
 
 def version() -> str:
-    """Of DAQP."""
+    """Return the version of DAQP."""
     return f"daqp {version_of('daqp')}"
 
 
 def lcp(F: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """λ of 0 ≤ λ ⊥ F λ + q ≥ 0 by Murty's least-index pivoting, which ends where F + Fᵀ ≻ 0."""
+    """Solve 0 ≤ λ ⊥ F λ + q ≥ 0 by Murty's least-index pivoting, which ends if F + Fᵀ ≻ 0."""
     basic = np.zeros(len(q), bool)
     for _ in range(4 ** len(q)):
         lam = np.zeros(len(q))
@@ -50,7 +50,7 @@ class Solver(Rival):
         self.nodes, self.gap = nodes, gap
 
     def execute(self, data: dict[str, np.ndarray], u: np.ndarray) -> float:
-        """Cost of actions under hard contact."""
+        """Compute the cost of actions under hard contact."""
         x, total = data["x0"], 0.0
         for action in u:
             lam = lcp(data["F"], data["D"] @ x + data["E"] @ action + data["c"])
@@ -59,7 +59,7 @@ class Solver(Rival):
         return float(total + 0.5 * x @ data["Q_final"] @ x + data["q_final"] @ x)
 
     def program(self, data: dict[str, np.ndarray]) -> tuple[np.ndarray, ...]:
-        """H, f, constant of the cost, S and s0 with s = S z + s0, for z = (u_0, λ_0, u_1, …)."""
+        """Compute H, f, constant of the cost, S and s0 with s = S z + s0, for z = (u_0, λ_0, u_1, …)."""
         horizon, n_u, n_lam = self.problem.horizon, self.problem.n_u, self.problem.n_lam
         step, size = n_u + n_lam, horizon * (n_u + n_lam)
         N, n = np.zeros((len(data["x0"]), size)), data["x0"]
@@ -69,27 +69,27 @@ class Solver(Rival):
             H, f, constant = H + N.T @ Q @ N, f + N.T @ (Q @ n + q), constant + 0.5 * n @ Q @ n + q @ n
             if k == horizon:
                 break
-            own, force = slice(k * step, k * step + n_u), slice(k * step + n_u, (k + 1) * step)
-            H[own, own] += data["R"]
-            f[own] += data["r"]
+            in_u, force = slice(k * step, k * step + n_u), slice(k * step + n_u, (k + 1) * step)
+            H[in_u, in_u] += data["R"]
+            f[in_u] += data["r"]
             row = data["D"] @ N
-            row[:, own] += data["E"]
+            row[:, in_u] += data["E"]
             row[:, force] += data["F"]
             S.append(row)
             s0.append(data["D"] @ n + data["c"])
             N, n = data["A"] @ N, data["A"] @ n + data["d"]
-            N[:, own] += data["B"]
+            N[:, in_u] += data["B"]
             N[:, force] += data["C"]
         return 0.5 * (H + H.T), f, constant, np.concatenate(S), np.concatenate(s0)
 
     def one(self, i: int) -> Answer:
-        """The best plan, and whether it is proved to be the best of all."""
+        """Find the best plan; return it, and whether it is proved to be the best of all."""
         data, p = self.problem.only(i), self.problem
         H, f, constant, S, s0 = self.program(data)
         size, contacts = len(f), len(s0)
         forces = (np.arange(p.horizon)[:, None] * (p.n_u + p.n_lam) + p.n_u + np.arange(p.n_lam)).ravel()
         actions = np.setdiff1d(np.arange(size), forces)
-        # The forces have no cost of their own: 1e-9 of the mean curvature makes their part positive definite.
+        # The forces have no cost: 1e-9 of the mean curvature makes their part positive definite.
         H[forces, forces] += 1e-9 * np.trace(H) / size
         low, high = np.full(size + contacts, -np.inf), np.full(size + contacts, np.inf)
         low[actions], high[actions] = np.tile(p.u_min, p.horizon), np.tile(p.u_max, p.horizon)

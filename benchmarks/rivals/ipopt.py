@@ -12,7 +12,7 @@ SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
 def version() -> str:
-    """Of CasADi, which ships IPOPT."""
+    """Return the version of CasADi, which ships IPOPT."""
     return f"casadi {casadi.__version__}"
 
 
@@ -34,12 +34,12 @@ class Solver(Rival):
         self.solver = casadi.nlpsol("mpc", "ipopt", {"x": p.z, "p": p.p, "f": p.f, "g": p.g}, settings)
 
     def one(self, i: int) -> Answer:
-        """One run of IPOPT."""
+        """Run IPOPT once."""
         p = self.program
-        found = self.solver(
+        solution = self.solver(
             x0=p.begin(self.problem, i), p=p.parameters(self.problem, i),
             lbx=p.low, ubx=p.high, lbg=p.least, ubg=p.most,
         )  # fmt: skip
-        z = np.asarray(found["x"]).ravel()
+        z = np.asarray(solution["x"]).ravel()
         solved = self.solver.stats()["return_status"] in SOLVED
         return Answer(z[p.actions][None], np.array([solved]))

@@ -15,7 +15,7 @@ BACKENDS = {"batched": BatchedBackend(threads=1), "ipopt": IpoptBackend(workers=
 
 
 def version() -> str:
-    """Of difflcs."""
+    """Return the version of difflcs."""
     return f"difflcs {difflcs.__version__}"
 
 
@@ -47,6 +47,6 @@ class Solver(TorchRival):
         )  # fmt: skip
 
     def plan(self, x0: torch.Tensor, only: int | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-        """By the layer of this problem, or by that of all."""
-        found = (self.whole if only is None else self.parts[only])(x0)
-        return found.u, found.converged
+        """Plan by the layer of this problem, or by that of all."""
+        solution = (self.whole if only is None else self.parts[only])(x0)
+        return solution.u, solution.converged

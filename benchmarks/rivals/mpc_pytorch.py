@@ -13,7 +13,7 @@ from rivals.problem import Problem
 
 
 def version() -> str:
-    """Of the package mpc."""
+    """Return the version of the package mpc."""
     return f"mpc {version_of('mpc')}"
 
 
@@ -34,7 +34,7 @@ class Solver(TorchRival):
         self.data = [torch.from_numpy(v) for v in (C, c, F, f)]
 
     def plan(self, x0: torch.Tensor, only: int | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-        """Its iLQR."""
+        """Run its iLQR."""
         p, batch = self.problem, len(x0)
         C, c, F, f = (v.unsqueeze(1).expand(-1, batch, *v.shape[1:]).contiguous() for v in self.data)
         low, high = (torch.from_numpy(v).expand(p.horizon + 1, batch, -1).contiguous() for v in (p.u_min, p.u_max))

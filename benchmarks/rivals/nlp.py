@@ -40,7 +40,7 @@ class Program:
 
     @classmethod
     def of(cls, problem: Problem, slack: bool, start: float, initial_state: bool = False) -> Program:
-        """Direct transcription, stage by stage.
+        """Make the program by direct transcription, stage by stage.
 
         Args:
             problem: what is to be solved.
@@ -100,11 +100,11 @@ class Program:
         )  # fmt: skip
 
     def parameters(self, problem: Problem, i: int) -> np.ndarray:
-        """The parameters of one problem."""
+        """Collect the parameters of one problem."""
         return np.concatenate([problem.at(i, name).ravel("F") for name in NAMES] + [[problem.relaxation]])
 
     def begin(self, problem: Problem, i: int) -> np.ndarray:
-        """Where to start: the states stay at x0, zero action inside the bounds."""
+        """Make the start: the states stay at x0, zero action inside the bounds."""
         z = self.start.copy()
         z[self.states] = problem.x0[i]
         return np.clip(z, self.low, self.high)

@@ -1,4 +1,4 @@
-"""What a rival is given and what it must offer. Needs numpy alone: rivals run in environments without difflcs."""
+"""Problems for a rival, and the interface that it implements. Needs numpy alone: rivals run without difflcs."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ class Problem:
 
     @classmethod
     def load(cls, path: str) -> Problem:
-        """What `save` wrote."""
+        """Read a file that `save` wrote."""
         with np.load(path) as file:
-            found = {field.name: file[field.name] for field in fields(cls)}
-        return cls(**{**found, "horizon": int(found["horizon"]), "relaxation": float(found["relaxation"])})
+            arrays = {field.name: file[field.name] for field in fields(cls)}
+        return cls(**{**arrays, "horizon": int(arrays["horizon"]), "relaxation": float(arrays["relaxation"])})
 
     def save(self, path: str) -> None:
         """Write a .npz file."""
@@ -62,27 +62,27 @@ class Problem:
 
     @property
     def n_x(self) -> int:
-        """States."""
+        """Number of states."""
         return self.x0.shape[1]
 
     @property
     def n_u(self) -> int:
-        """Actions."""
+        """Number of actions."""
         return self.B.shape[-1]
 
     @property
     def n_lam(self) -> int:
-        """Contacts."""
+        """Number of contacts."""
         return self.C.shape[-1]
 
     def at(self, i: int, name: str) -> np.ndarray:
-        """One field of one problem."""
+        """Return one field of one problem."""
         value = getattr(self, name)
         matrix = name in ("A", "B", "C", "D", "E", "F", "Q", "R", "Q_final")
         return value if value.ndim == (2 if matrix else 1) else value[i]
 
     def only(self, i: int) -> dict[str, np.ndarray]:
-        """All fields of one problem by name."""
+        """Return all fields of one problem by name."""
         return {f.name: self.at(i, f.name) for f in fields(self) if f.name not in ("horizon", "relaxation", "constant")}
 
 
@@ -102,11 +102,11 @@ class Answer:
 
 
 class Rival:
-    """A solver with its settings. What `__init__` and the first call do is set-up, which no time of the race includes.
+    """A solver with its settings. The work of `__init__` and of the first call is set-up, which no time includes.
 
     Attributes:
         batches: whether one call for many problems is more than a loop.
-        differentiates: whether it has gradients of its own.
+        differentiates: whether it computes gradients.
     """
 
     batches = False
@@ -120,11 +120,11 @@ class Rival:
         raise NotImplementedError
 
     def all(self) -> Answer:
-        """Plans for all problems in one call, cold."""
+        """Solve all problems in one call, cold."""
         raise NotImplementedError
 
     def gradient(self) -> Answer:
-        """Plans for all problems with their gradients."""
+        """Solve all problems with their gradients."""
         raise NotImplementedError
 
 
@@ -140,7 +140,7 @@ class Condensed:
 
     @classmethod
     def of(cls, problem: Problem) -> Condensed:
-        """Of problems that differ in x0 alone."""
+        """Condense problems that differ in x0 alone."""
         p, horizon, n_x, n_u = problem, problem.horizon, problem.n_x, problem.n_u
         # x_k = M x0 + N z + n, stage by stage
         M, N, n = np.eye(n_x), np.zeros((n_x, horizon * n_u)), np.zeros(n_x)
@@ -151,16 +151,16 @@ class Condensed:
             G += N.T @ Q @ M
             h += N.T @ (Q @ n + q)
             if k < horizon:
-                own = slice(k * n_u, (k + 1) * n_u)
-                H[own, own] += p.R
-                h[own] += p.r
+                in_u = slice(k * n_u, (k + 1) * n_u)
+                H[in_u, in_u] += p.R
+                h[in_u] += p.r
                 M, N, n = p.A @ M, p.A @ N, p.A @ n + p.d
-                N[:, own] += p.B
+                N[:, in_u] += p.B
         return cls(0.5 * (H + H.T), G, h, np.tile(p.u_min, horizon), np.tile(p.u_max, horizon))
 
 
 def sparse_program(problem: Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """A linear MPC over z = (u_0, x_1, u_1, …, x_H): min ½ zᵀPz + qᵀz with A z = b.
+    """Write a linear MPC over z = (u_0, x_1, u_1, …, x_H): min ½ zᵀPz + qᵀz with A z = b.
 
     Returns:
         P, q, A, b, and where the actions are in z. The first n_x entries of b are those for x0 = 0: add A x0.

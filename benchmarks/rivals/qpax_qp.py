@@ -16,7 +16,7 @@ from rivals.problem import Answer, Condensed, Problem, Rival  # noqa: E402
 
 
 def version() -> str:
-    """Of qpax and JAX."""
+    """Return the versions of qpax and JAX."""
     return f"qpax {version_of('qpax')}, jax {jax.__version__}"
 
 
@@ -35,8 +35,8 @@ class Solver(Rival):
         weight = jnp.array(problem.weight)
 
         def plan(x0):
-            found = qpax.solve_qp(H, G @ x0 + h, none, nothing, *box)
-            return found[0], found[4]
+            solution = qpax.solve_qp(H, G @ x0 + h, none, nothing, *box)
+            return solution[0], solution[4]
 
         def action(x0):
             # kappa smooths the gradient; its default 1e-3 is much in units of these problems
@@ -52,14 +52,14 @@ class Solver(Rival):
         return Answer(u, np.atleast_1d(np.asarray(solved) == 1), gradient)
 
     def one(self, i: int) -> Answer:
-        """One call for one problem."""
+        """Solve one problem in one call."""
         return self._answer(*self.plan(self.x0[i]))
 
     def all(self) -> Answer:
-        """One call for all."""
+        """Solve all problems in one call."""
         return self._answer(*self.many(self.x0))
 
     def gradient(self) -> Answer:
-        """One call for all plans and gradients."""
+        """Compute all plans and gradients in one call."""
         gradient, z = self.action(self.x0)
         return self._answer(z, np.ones(len(z), int), np.asarray(gradient))

@@ -29,14 +29,14 @@ def package() -> None:
 
 
 def cpu(work: Callable[[], object]) -> tuple[float, object]:
-    """CPU seconds of all threads, and what came back."""
+    """Do some work; return CPU seconds of all threads, and its result."""
     start = time.process_time()
-    found = work()
-    return time.process_time() - start, found
+    result = work()
+    return time.process_time() - start, result
 
 
 def race(name: str, settings: dict, job: dict) -> dict:
-    """The first `few` problems of a file one by one, until `seconds` are spent; then all in one call, where it can."""
+    """Solve the first `few` problems of a file one by one for `seconds`; then all in one call, if possible."""
     import numpy as np
 
     from rivals.problem import Problem
@@ -81,7 +81,7 @@ KEPT: dict = {}
 
 
 def main() -> None:
-    """Serve jobs; whatever libraries print goes nowhere."""
+    """Serve jobs; the output of libraries is discarded."""
     reply = os.fdopen(os.dup(1), "w")
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)

@@ -39,7 +39,7 @@ class Transitions(NamedTuple):
 
 
 def random_pushing(env: Any, steps: int, seed: int) -> Transitions:
-    """The disc heads for random places within 90 px of the T's middle, at most 30 px ahead, each for some steps."""
+    """Collect pushes: the disc goes to random places within 90 px of the T's middle, at most 30 px ahead."""
     rng = np.random.default_rng([seed, 1])
     x, u, x_next = [], [], []
     for step in range(steps):
@@ -57,12 +57,12 @@ def random_pushing(env: Any, steps: int, seed: int) -> Transitions:
 
 
 def state(info: dict[str, np.ndarray]) -> np.ndarray:
-    """The state (7,) from what the environment tells beside its observation."""
+    """Compute the state (7,) from the environment's information."""
     return np.concatenate([from_origin(info["block_pose"]), info["pos_agent"] / PIXELS, info["vel_agent"] / PIXELS])
 
 
 def guess(seed: int) -> ContactLCS:
-    """Where learning begins: everything that is learned is wrong.
+    """Make the start of learning: everything that is learned is wrong.
 
     The centre of mass is 20 px off in a random direction, the radius of gyration a third too large, friction 0.3 where
     there is none, the compliance five times what we use, and every side of the outline is moved by up to 6 px.
@@ -81,7 +81,7 @@ def guess(seed: int) -> ContactLCS:
 
 
 def frozen(physics: PlanarPushing) -> PlanarPushing:
-    """The same physics, of which nothing is learned any more."""
+    """Copy the physics without learnable parameters."""
     assert isinstance(physics.shape, Union)
     parts = [Polygon(part.vertices.detach()) for part in physics.shape.parts if isinstance(part, Polygon)]
     names = ["center_of_mass", "gyration", "compliance"] + ([] if physics.frictionless else ["friction"])
@@ -90,7 +90,7 @@ def frozen(physics: PlanarPushing) -> PlanarPushing:
 
 
 class Learned(NamedTuple):
-    """What was learned; pairs are before and after, lengths in units of 100 px.
+    """Result of learning; pairs are before and after, lengths in units of 100 px.
 
     Attributes:
         physics: the system; without friction if without it the loss is at most 2 % larger.
@@ -108,13 +108,13 @@ class Learned(NamedTuple):
 
 
 def trimmed(model: ContactLCS | PlanarPushing, data: Transitions) -> Tensor:
-    """Mean violation loss without the largest fifth: T at a wall, disc inside the T at the begin of an episode."""
+    """Compute the mean violation loss without the largest fifth: T at a wall, disc inside the T at the start."""
     each = violation_loss(model, *data, gamma="auto", xi=XI, reduction="none")
     return each.sort().values[: int(KEPT * len(each))].mean()
 
 
 def fit(model: ContactLCS, data: Transitions, iterations: int) -> None:
-    """Adam on all data at each step; its rate falls to zero along a cosine."""
+    """Fit by Adam on all data at each step; its rate falls to zero along a cosine."""
     optimizer = torch.optim.Adam(model.parameters(), RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, iterations)
     for _ in range(iterations):
@@ -125,7 +125,7 @@ def fit(model: ContactLCS, data: Transitions, iterations: int) -> None:
 
 
 def learn(env: Any, seed: int, steps: int = 1200, iterations: int = 300) -> Learned:
-    """From wrong values to a system, with random pushing between."""
+    """Learn a system from wrong values by random pushing."""
     data = random_pushing(env, steps, seed)
     start = time.process_time()
     model = guess(seed)
@@ -143,14 +143,14 @@ def learn(env: Any, seed: int, steps: int = 1200, iterations: int = 300) -> Lear
 
 
 def corners(physics: PlanarPushing) -> list[float]:
-    """Distance of each corner from where it is [px], without the two inside the bar, which nothing touches."""
-    own, true = (
+    """Compute each corner's distance to its true place [px], without the two inside the bar, which nothing touches."""
+    learned, true = (
         torch.cat([part.vertices for part in shape.parts if isinstance(part, Polygon)])
         for shape in (physics.shape, tee())
         if isinstance(shape, Union)
     )
     outside = [0, 1, 2, 3, 6, 7]
-    return (PIXELS * (own - true)[outside]).norm(dim=1).tolist()
+    return (PIXELS * (learned - true)[outside]).norm(dim=1).tolist()
 
 
 @dataclass
@@ -164,14 +164,14 @@ class Options:
 def main(o: Options) -> None:
     """Learn and print."""
     torch.set_num_threads(1)
-    found = learn(make_env(), o.seed)
-    print(f"{found.seconds:.1f} s of CPU time to learn from two minutes of random pushing")
-    print(f"violation loss {found.loss[0]:.2e} before, {found.loss[1]:.2e} after")
+    result = learn(make_env(), o.seed)
+    print(f"{result.seconds:.1f} s of CPU time to learn from two minutes of random pushing")
+    print(f"violation loss {result.loss[0]:.2e} before, {result.loss[1]:.2e} after")
     true = {"center_of_mass": list(CENTER_OF_MASS), "gyration": GYRATION, "friction": [0.0]}
     for name in ("center_of_mass", "gyration", "friction", "compliance"):
-        before, after = (values[name] for values in found.values)
+        before, after = (values[name] for values in result.values)
         print(f"{name}: {before} before, {after} after, true {true.get(name, '—')}")
-    for when, apart in zip(("before", "after"), found.corners, strict=True):
+    for when, apart in zip(("before", "after"), result.corners, strict=True):
         print(f"corners off by {', '.join(f'{v:.1f}' for v in apart)} px {when}")
 
 

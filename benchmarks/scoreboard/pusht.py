@@ -1,6 +1,6 @@
 """Push-T of gym-pusht by sampling-based contact MPC: `python benchmarks/scoreboard/pusht.py --episodes 500 --json`.
 
-The environment is as its authors publish it: its own start, success flag (more than 95 % of the goal covered by the T)
+The environment is as its authors publish it: its start, success flag (more than 95 % of the goal covered by the T)
 and limit (300 steps of 0.1 s). The policy of examples/push_t.py is given the state (place of the disc, pose of the T)
 and, by variant:
 
@@ -38,7 +38,7 @@ from difflcs.errors import InvalidInputError
 
 @dataclass(frozen=True)
 class Variant:
-    """What the policy is told and how it observes and acts.
+    """Knowledge, observations and actions of the policy.
 
     Attributes:
         policy: makes it; its argument is the seed.
@@ -52,7 +52,7 @@ class Variant:
 
 
 def told(**changes: Any) -> Variant:
-    """With another system than that of the environment."""
+    """Replace the system of the policy by another than the environment's."""
     return Variant(lambda seed: PushTPolicy(tee_pushing(**changes)))
 
 
@@ -85,7 +85,7 @@ class Options:
     json: bool = False
     """Print a line of JSON for each variant."""
     out: Path | None = None
-    """Where the figures of the variants are recorded; nowhere if not given."""
+    """Path of the record of the variants' figures; none by default."""
     smoke: bool = False
     """Two episodes of a few steps."""
 
@@ -94,7 +94,7 @@ class Episode(NamedTuple):
     """One episode.
 
     Attributes:
-        success: the environment's own flag.
+        success: the environment's flag.
         steps: until success or the limit.
         coverage: largest part of the goal that the T has covered.
         milliseconds: CPU time of the policy, of all steps.
@@ -109,7 +109,7 @@ class Episode(NamedTuple):
 
 
 def play(env: Any, policy: PushTPolicy, seed: int, variant: Variant, limit: int = STEPS) -> Episode:
-    """One episode of a seed."""
+    """Play one episode of a seed."""
     noise = np.random.default_rng([seed, 2])
     spread = variant.noise * np.array([1.0, 1.0, 1.0, 1.0, 1.0 / (GYRATION * PIXELS)])
     observation, _ = env.reset(seed=seed)
@@ -129,7 +129,7 @@ def play(env: Any, policy: PushTPolicy, seed: int, variant: Variant, limit: int 
 
 
 def measure(variant: Variant, o: Options, env: Any) -> dict[str, float]:
-    """The figures of a variant."""
+    """Compute the figures of a variant."""
     policy, limit = variant.policy(o.seed), 5 if o.smoke else STEPS
     episodes = [play(env, policy, o.seed + i, variant, limit) for i in range(o.episodes)]
     success, steps, coverage, milliseconds, longest = np.array(episodes, float).T
@@ -143,7 +143,7 @@ def measure(variant: Variant, o: Options, env: Any) -> dict[str, float]:
 
 
 def main(o: Options) -> None:
-    """Play, print, write."""
+    """Run the episodes, print and write the figures."""
     if o.variant not in (*VARIANTS, "all"):
         raise InvalidInputError(f"variant: expected one of {', '.join(VARIANTS)}, or all, got {o.variant!r}")
     if o.smoke:
@@ -156,17 +156,17 @@ def main(o: Options) -> None:
         if record["options"] != asked:
             raise InvalidInputError(f"out: expected a record of {asked}, got {record['options']}; name another file")
     for name in VARIANTS if o.variant == "all" else (o.variant,):
-        found = record["results"].get(name) or measure(VARIANTS[name], o, env)
-        record["results"][name] = found
+        figures = record["results"].get(name) or measure(VARIANTS[name], o, env)
+        record["results"][name] = figures
         if o.out is not None:
             save(o.out, record)
         if o.json:
-            print(json.dumps({"variant": name, **found}))
+            print(json.dumps({"variant": name, **figures}))
             continue
         print(
-            f"{name}: {100 * found['success_rate']:.1f} % of {found['episodes']} ({100 * found['ci_low']:.1f} to "
-            f"{100 * found['ci_high']:.1f}), {found['mean_steps']:.1f} steps, coverage {found['coverage']:.3f}, "
-            f"{found['milliseconds_per_step']:.1f} ms a step"
+            f"{name}: {100 * figures['success_rate']:.1f} % of {figures['episodes']} ({100 * figures['ci_low']:.1f} to "
+            f"{100 * figures['ci_high']:.1f}), {figures['mean_steps']:.1f} steps, coverage {figures['coverage']:.3f}, "
+            f"{figures['milliseconds_per_step']:.1f} ms a step"
         )
     env.close()
 

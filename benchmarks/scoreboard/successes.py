@@ -1,4 +1,4 @@
-"""What every scoreboard says of its episodes."""
+"""Success figures that every scoreboard reports."""
 
 from __future__ import annotations
 
@@ -11,6 +11,6 @@ from difflcs.rl import wilson_interval
 
 
 def success_figures(success: NDArray[np.floating]) -> dict[str, Any]:
-    """Success rate of episodes (N,), 1 or 0 each, with Wilson's 95 % interval, and how many they are."""
+    """Compute the success rate of episodes (N,), 1 or 0 each, with Wilson's 95 % interval, and their number."""
     low, high = wilson_interval(int(success.sum()), len(success))
     return {"success_rate": float(success.mean()), "ci_low": low, "ci_high": high, "episodes": len(success)}

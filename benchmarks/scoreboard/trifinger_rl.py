@@ -53,14 +53,14 @@ class Options:
 
 
 class Timed:
-    """A policy, and how long it takes."""
+    """A policy with a clock."""
 
     def __init__(self, policy: Any) -> None:
         self.policy, self.reset = policy, policy.reset
         self.seconds: list[float] = []
 
     def get_action(self, observation: Any) -> Any:
-        """See `PolicyBase`."""
+        """Compute the action and time it; see `PolicyBase`."""
         start = time.process_time()
         action = self.policy.get_action(observation)
         self.seconds.append(time.process_time() - start)
@@ -68,7 +68,7 @@ class Timed:
 
 
 def policy_class(name: str) -> Any:
-    """A policy class by name.
+    """Load a policy class by name.
 
     Raises:
         MissingDependencyError: trifinger-rl-datasets is not installed.
@@ -83,7 +83,7 @@ def policy_class(name: str) -> Any:
 
 
 def summary(rows: list[list[float]]) -> dict[str, Any]:
-    """The figures of a policy."""
+    """Compute the figures of a policy."""
     success, returns, momentary, transient, milliseconds = np.array(rows).T
     return {
         **success_figures(success),
@@ -97,7 +97,7 @@ def summary(rows: list[list[float]]) -> dict[str, Any]:
 
 
 def main(o: Options) -> None:
-    """Play, print, write."""
+    """Run the episodes, print and write the figures."""
     kind = policy_class(o.policy)
     import gymnasium
     from trifinger_rl_datasets import Evaluation
@@ -121,13 +121,13 @@ def main(o: Options) -> None:
         def run_episode(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
             before = len(policy.seconds)
             with contextlib.redirect_stdout(io.StringIO()):
-                found = super().run_episode(*args, **kwargs)
+                result = super().run_episode(*args, **kwargs)
             milliseconds = 1e3 * float(np.mean(policy.seconds[before:]))
-            rows.append([round(float(v), 4) for v in (*(found[key] for key in KEYS), milliseconds)])
+            rows.append([round(float(v), 4) for v in (*(result[key] for key in KEYS), milliseconds)])
             record = json.loads(o.out.read_text()) if o.out.exists() else {"results": {}}
             record["results"][o.policy] = {"machine": machine(), "seed": o.seed, **summary(rows), "rows": rows}
             save(o.out, record)
-            return found
+            return result
 
     np.random.seed(o.seed)  # noqa: NPY002 (from there the package draws the cube's places)
     move_cube.seed(o.seed)  # the goals

@@ -74,7 +74,7 @@ class Adjoint {
   void judge_constraints(const MpcSolve& o, int64_t begin, int64_t end, Watch watch) {
     const int64_t rows = (n.h + 1) * n.c();
     for (int64_t group = begin; group < end && !watch.stop(watch.context); group += kLanes) {
-      bool acting = false;  // without a multiplier there is nothing to judge
+      bool acting = false;  // without a multiplier there is nothing to test
       for (int64_t i = group * rows; i < (group + kLanes < end ? group + kLanes : end) * rows; i++)
         acting = acting || o.mu[i] > 0;
       if (!acting) continue;
@@ -147,7 +147,7 @@ class Adjoint {
         for (int64_t i = 0; i < nx && k < n.h; i++) out.dw[i] = out.dx_next[i];
       }
       missed = select(refining, worst, missed);
-      // What is done stays as it is: an element depends on nothing but itself.
+      // Finished lanes keep their result: an element depends on nothing but itself.
       refining &= change > 1e-12 * largest;
       if (!any(refining)) break;
     }

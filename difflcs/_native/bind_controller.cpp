@@ -62,16 +62,16 @@ int step(Guarded& self, Array x, std::optional<Array> targets, bool follow, Outp
 
 nb::dict sizes(const Guarded& self) {
   const difflcs::ControllerData& d = self.controller.data();
-  nb::dict found;
-  found["n_x"] = d.n_x;
-  found["n_u"] = d.n_u;
-  found["n_lam"] = d.n_lam;
-  found["n_c"] = d.n_c;
-  found["n_goal"] = d.n_goal;
-  found["horizon"] = d.horizon;
-  found["step_seconds"] = d.step_seconds;
-  found["isa"] = self.controller.kernels().isa;
-  return found;
+  nb::dict data;
+  data["n_x"] = d.n_x;
+  data["n_u"] = d.n_u;
+  data["n_lam"] = d.n_lam;
+  data["n_c"] = d.n_c;
+  data["n_goal"] = d.n_goal;
+  data["horizon"] = d.horizon;
+  data["step_seconds"] = d.step_seconds;
+  data["isa"] = self.controller.kernels().isa;
+  return data;
 }
 
 nb::tuple outcome(Guarded& self) {
@@ -82,8 +82,8 @@ nb::tuple outcome(Guarded& self) {
 
 void plan(Guarded& self, Output x, Output u, Output lam, Output mu) {
   const Use controller(self);
-  const difflcs::Trace& found = controller->plan();
-  const difflcs::Numbers* from[] = {&found.x, &found.u, &found.lam, &found.mu};
+  const difflcs::Trace& plan = controller->plan();
+  const difflcs::Numbers* from[] = {&plan.x, &plan.u, &plan.lam, &plan.mu};
   int i = 0;
   for (const Output* to : {&x, &u, &lam, &mu}) {
     expect(int64_t(to->size()) == from[i]->count(), "x, u, lam and mu must be those of a plan");
@@ -92,11 +92,11 @@ void plan(Guarded& self, Output x, Output u, Output lam, Output mu) {
   }
 }
 
-void set_fallback(Guarded& self, int kind, std::optional<Array> given) {
+void set_fallback(Guarded& self, int kind, std::optional<Array> action) {
   const Use controller(self);
   expect(kind >= 0 && kind <= 3, "the kind must be from 0 to 3");
-  expect(kind != 2 || (given && int64_t(given->size()) == controller->data().n_u), "the action must be (n_u,)");
-  controller->set_fallback(difflcs::Fallback(kind), given ? given->data() : nullptr);
+  expect(kind != 2 || (action && int64_t(action->size()) == controller->data().n_u), "the action must be (n_u,)");
+  controller->set_fallback(difflcs::Fallback(kind), action ? action->data() : nullptr);
 }
 
 void set_inputs(Guarded& self, std::vector<Array> values, double constant) {
@@ -129,6 +129,6 @@ void bind_controller(nb::module_& m) {
             Use(self)->set_time_limit(seconds > 0 ? seconds : std::numeric_limits<double>::infinity());
           },
           "seconds"_a)
-      .def("set_fallback", &set_fallback, "kind"_a, "given"_a.none())
+      .def("set_fallback", &set_fallback, "kind"_a, "action"_a.none())
       .def("set_inputs", &set_inputs, "values"_a, "constant"_a, "Other numbers of system, cost and bounds.");
 }

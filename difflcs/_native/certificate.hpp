@@ -16,17 +16,17 @@ template <class T>
 struct Certificate {
   const MpcBatch& batch;
   const AnySizes n;
-  Steps<T> matrix[kInputs];    // as the caller gave them: matrices here,
+  Steps<T> matrix[kInputs];    // in the caller's units: matrices here,
   Steps<Vec> vector[kInputs];  // vectors here
   Steps<T> rest;
-  // Of the stage at hand.
+  // Of the current stage.
   T *A, *B, *C, *D, *E, *F, *Q, *R, *cross, *G_x, *G_u;
   Vec *d, *c, *q, *r, *lo, *hi;
   Vec *x, *u, *lam, *mu, *gap, *s, *p, *pn, *y, *rho, *error, *N, *largest_action;
-  // Sizes of all states, and at a stage of costates and of what they make of rho (conditions.py: `sizes`); terms of
-  // both.
+  // Sizes of all states, and at one stage of the costates and of rho's response to them (conditions.py: `sizes`); terms
+  // of both.
   Vec *x_size, *p_size, *rho_size, *p_terms, *rho_terms, *terms, *grown;
-  Vec* moved;                         // what the ranges of the actions before make of each state
+  Vec* moved;                         // change of each state by the ranges of the earlier actions
   Vec *row, *row_terms, *row_missed;  // values of the constraints; of each the largest over the stages
   Mask* rows;
 
@@ -96,7 +96,7 @@ struct Certificate {
     hi = vector[ku_max][k];
   }
 
-  // Largest residual so far; what is not a number is infinite.
+  // Largest residual so far; NaN counts as infinite.
   Vec worst, poison;
   void met(Vec violation) {
     worst = max(worst, violation);
@@ -164,7 +164,7 @@ struct Certificate {
     return select(poor, missing(lk), missed);
   }
 
-  // Judges at most kLanes elements by what is stored of them; a solved one whose residual is too large becomes
+  // Checks at most kLanes elements by their stored numbers; a solved one whose residual is too large becomes
   // numerical, and one with a weakly active constraint degenerate.
   void judge(const MpcSolve& o, const int64_t* elements, int count) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nc = n.c(), h = n.h;
@@ -365,7 +365,7 @@ struct Certificate {
     for (int64_t k = 0; k <= h && nc > 0; k++) {
       enter(k);
       for (int64_t i = 0; i < nc; i++) {
-        Vec acts = all(k > 0);  // what nothing moves is not weakly active
+        Vec acts = all(k > 0);  // a row that nothing moves is not weakly active
         for (int64_t j = 0; j < nu && k == 0; j++) acts += abs(all(0) + G_u[i * nu + j]);
         const Vec m = mu[k * nc + i], value = row[k * nc + i], close = kWeak * row_terms[i];
         const Mask at_zero = ~(m > 0) & (value >= -close),

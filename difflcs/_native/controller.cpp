@@ -10,7 +10,7 @@ namespace {
 
 using Clock = std::chrono::steady_clock;
 
-// Runs the work on this thread, in the memory of the controller, until the time is over.
+// Runs the work on this thread, in the controller's memory, until the time is over.
 class Alone final : public Runner {
  public:
   Alone(void* workspace, Clock::time_point ends) : workspace_(workspace), ends_(ends) {}
@@ -79,7 +79,7 @@ Controller::Controller(const void* bytes, size_t size)
   x0_ = Numbers(nx);
   q_ = Numbers(h * nx);
   q_final_ = Numbers(nx);
-  given_ = Numbers(nu);
+  fallback_action_ = Numbers(nu);
   found_ = {Numbers((h + 1) * nx), Numbers(h * nu), Numbers(h * nl), Numbers((h + 1) * nc)};
   next_u_ = Numbers(h * nu);
   guess_u_ = Numbers(h * nu);
@@ -149,7 +149,7 @@ void Controller::aim(const double* targets, bool follow) {
   goal_constant_ = 0.5 * (tracked + quadratic(data_.goal_final, last, ng));
 }
 
-// The one place that knows the solver; what it finds is the guess of the next step.
+// Calls the solver; its result is the guess of the next step.
 void Controller::solve(Clock::time_point begun) {
   int8_t status = kUnreached, fragile = 0;
   const MpcGuess guess = guessed_ ? MpcGuess{guess_u_.get(), guess_lam_.get(), guess_mu_.get()} : MpcGuess{};
@@ -170,15 +170,14 @@ void Controller::solve(Clock::time_point begun) {
   outcome_.solve_seconds = seconds_since(started);
   outcome_.late = runner.stopped();
   outcome_.status = Status(status);
-  // The driver's sign of a problem for which the time did not suffice even to begin.
+  // The driver marks a problem that was not begun in time.
   const bool begun_at_all = outcome_.objective != std::numeric_limits<double>::max();
   if (begun_at_all) outcome_.objective += data_.constant + goal_constant_;
   for (double* value : {&outcome_.objective, &outcome_.residual})
     if (!std::isfinite(*value)) *value = std::numeric_limits<double>::max();
   if (!begun_at_all) return wait();
   const bool usable = make_finite();
-  // What the time or the iterations did not suffice for goes on in the next step. What failed otherwise begins anew
-  // there.
+  // The next step continues a solve that ran out of time or iterations. After any other failure it starts afresh.
   unfinished_ = usable && outcome_.status == Status::max_iter;
   guessed_ = solved(status) || unfinished_;
   if (!guessed_) return;
@@ -196,7 +195,7 @@ void Controller::wait() {
   shift(guess_mu_, h + 1, guess_mu_);
 }
 
-// Makes what the solver gave up finite; returns whether it was.
+// Makes an unfinished plan finite; returns whether it was.
 bool Controller::make_finite() {
   bool finite = true;
   for (const Numbers* values : {&found_.x, &found_.u, &found_.lam, &found_.mu})
@@ -212,12 +211,12 @@ bool Controller::make_finite() {
 void Controller::fall_back(double* u) {
   const bool holding = (fallback_ == Fallback::hold || fallback_ == Fallback::unfinished) && planned_ > 0;
   for (int64_t j = 0; j < data_.n_u; j++)
-    u[j] = clipped(j, fallback_ == Fallback::given ? given_.get()[j] : holding ? next_u_.get()[j] : 0.0);
+    u[j] = clipped(j, fallback_ == Fallback::action ? fallback_action_.get()[j] : holding ? next_u_.get()[j] : 0.0);
   shift(next_u_, data_.horizon, next_u_);
   planned_ = std::max<int64_t>(planned_ - 1, 0);
 }
 
-// A value for action number i of a plan (H, n_u).
+// Clips a value for action number i of a plan (H, n_u).
 double Controller::clipped(int64_t i, double value) const {
   const auto bound = [&](Input which) { return data_.field[which].get()[data_.by_stage[which] ? i : i % data_.n_u]; };
   return std::min(std::max(value, bound(ku_min)), bound(ku_max));
@@ -231,9 +230,9 @@ void Controller::reset() {
     std::fill_n(values->get(), values->count(), 0.0);
 }
 
-void Controller::set_fallback(Fallback kind, const double* given) {
+void Controller::set_fallback(Fallback kind, const double* action) {
   fallback_ = kind;
-  if (kind == Fallback::given) std::copy_n(given, data_.n_u, given_.get());
+  if (kind == Fallback::action) std::copy_n(action, data_.n_u, fallback_action_.get());
 }
 
 void Controller::set_inputs(Input first, int count, const double* const* values) {

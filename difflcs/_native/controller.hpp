@@ -1,6 +1,6 @@
-// The controller of one robot: one problem with all its memory, the plan that it follows, and what it does when a step
-// is not solved in time. It knows neither torch nor Python and is compiled once, for every instruction set. Exceptions
-// are for making one; a step throws nothing and allocates nothing.
+// Controller of one robot: one problem with all its memory, the plan that it follows, and its fallback for a step that
+// is not solved in time. It needs neither torch nor Python and is compiled once, for all instruction sets. Only its
+// construction may throw; a step throws nothing and allocates nothing.
 #pragma once
 #include <chrono>
 #include <cstdint>
@@ -15,11 +15,11 @@ namespace difflcs {
 enum class Fallback {
   hold,        // that of the last plan for this time, while it lasts; then zero
   zero,        // zero
-  given,       // one that the caller has set
+  action,      // one that the caller has set
   unfinished,  // that of the plan which the solver had reached when the time or the iterations were over; else `hold`
 };
 
-// How a step went.
+// Outcome of a step.
 struct Outcome {
   Status status = Status::max_iter;
   bool fallback = false;  // the action is not that of a plan for this state
@@ -46,12 +46,12 @@ class Controller {
   const Kernels& kernels() const { return kernels_; }
 
   // Plans from the state x (n_x) and writes the action u (n_u), which is always finite and inside the bounds of the
-  // first stage. With a goal, `targets` is (n_goal), or (H + 1, n_goal) where `follow`; else it is not looked at. A
+  // first stage. With a goal, `targets` is (n_goal), or (H + 1, n_goal) where `follow`; else it is ignored. A
   // state or a target that is not finite makes the step `numerical`.
   const Outcome& step(const double* x, const double* targets, bool follow, double* u);
   const Outcome& outcome() const { return outcome_; }
 
-  // What the solver has found last, also where it was not solved; zeros before.
+  // The solver's last result, even if it was not solved; zeros before.
   const Trace& plan() const { return found_; }
 
   // Forgets all plans: the next step begins as the first one did.
@@ -60,12 +60,12 @@ class Controller {
   // Seconds from the beginning of a step until the solver is stopped; infinity for none.
   void set_time_limit(double seconds) { time_limit_ = seconds; }
 
-  // The action `given` (n_u) is clipped into the bounds; it must be finite.
-  void set_fallback(Fallback kind, const double* given);
+  // `action` (n_u), for Fallback::action, is clipped into the bounds; it must be finite.
+  void set_fallback(Fallback kind, const double* action);
 
   // Other numbers of `count` fields from `first` on, in the order of fields.hpp; by stage where those of the file are.
   void set_inputs(Input first, int count, const double* const* values);
-  // What is added to the objective, besides that of a goal.
+  // Constant of the objective, besides that of a goal.
   void set_constant(double constant) { data_.constant = constant; }
 
  private:
@@ -80,12 +80,12 @@ class Controller {
   ControllerData data_;
   MpcDriver driver_;
   MpcBatch batch_{};
-  Numbers x0_, q_, q_final_, workspace_, given_;
+  Numbers x0_, q_, q_final_, workspace_, fallback_action_;
   Trace found_;
   Numbers next_u_, guess_u_, guess_lam_, guess_mu_;
   int64_t planned_ = 0;      // steps that next_u_, the rest of the last plan that was solved, still lasts
   bool guessed_ = false;     // the guess is one
-  bool unfinished_ = false;  // what was found is a trajectory, but not solved
+  bool unfinished_ = false;  // the result is a trajectory, but not solved
   double goal_constant_ = 0;
   double time_limit_;
   Fallback fallback_ = Fallback::hold;

@@ -13,7 +13,7 @@ namespace {
 
 constexpr unsigned char kMagic[] = {0x89, 'L', 'C', 'S', '\r', '\n', 0x1a, '\n'};
 constexpr size_t kHeader = 24, kName = 16;
-// Sizes above it are made up: their products would not fit into 64 bits.
+// Larger sizes are refused: their products would not fit into 64 bits.
 constexpr int64_t kLargestSize = 100000;
 // A double holds every whole number up to it.
 constexpr int64_t kLargestCount = int64_t{1} << 53;
@@ -53,7 +53,7 @@ class Reader {
     left_ -= kHeader;
   }
 
-  // The doubles of the next entry, which has to be this one.
+  // Reads the doubles of the next entry, which must have this name.
   Numbers take(const char* name) {
     char wanted[kName + 1] = {};
     std::strncpy(wanted, name, kName);

@@ -5,7 +5,7 @@
 //   uint32   CRC-32 (ISO-HDLC, as in zlib and PNG) of everything behind it
 //   uint64   size of the whole file [byte]
 //   entries  16 bytes name, zero-padded; uint64 count; `count` doubles
-// The entries are those of controller_file.cpp, in its order. It says what each number may be.
+// The entries are those of controller_file.cpp, in its order. It checks the range of each number.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -38,14 +38,14 @@ class Numbers {
   std::unique_ptr<double, Free> data_;
 };
 
-// One problem, and how to solve it. The names are those of MpcBatch, MpcEffort and GoalCost (difflcs/cost.py).
+// One problem with its solver's options. The names are those of MpcBatch, MpcEffort and GoalCost (difflcs/cost.py).
 struct ControllerData {
   int64_t n_x, n_u, n_lam, n_c, horizon;
   int64_t n_goal;  // 0: the cost knows no goal
   double relaxation, barrier, tol, certified;
   double homotopy, shrink;
   int64_t max_iter, seed, starts, starts_guessed;  // without a guess, and with one
-  double step_seconds;                             // time from one step to the next [s]; 0 where it is not known
+  double step_seconds;                             // time from one step to the next [s]; 0 if not known
   Numbers field[kInputs];                          // all but x0
   bool by_stage[kInputs];
   Numbers goal_to_q, goal_to_q_final;  // (n_x, n_goal)

@@ -1,4 +1,4 @@
-// The C interface: difflcs.h says what it does. No exception leaves it.
+// The C interface, documented in difflcs.h. No exception leaves it.
 #include <cmath>
 #include <cstdio>
 #include <cstring>
@@ -27,7 +27,7 @@ static_assert(int(difflcs::Status::converged) == DIFFLCS_CONVERGED &&
                   int(difflcs::Status::degenerate) == DIFFLCS_DEGENERATE,
               "the codes of difflcs.h are those of fields.hpp");
 
-// A file of more is none of ours [byte].
+// Largest controller file [byte].
 constexpr long kLargestFile = 1L << 30;
 
 void write_error(char* error, size_t size, const char* what) {

@@ -7,7 +7,7 @@
 namespace difflcs {
 namespace {
 
-// The actions that a start begins with: none; all at one bound for the first half of the horizon and at the other for
+// Actions of a start: none; all at one bound for the first half of the horizon and at the other for
 // the second; or a random pulse of each, see `pulse`.
 enum class Actions { none, forth, back, pulse };
 
@@ -19,11 +19,11 @@ struct Start {
 };
 
 // The sequence of starts. A long homotopy leads most actions to one optimum, which is often the best; a short one stays
-// near where it begins. Both find no contact that is far from a plan without it: what begins with the largest actions
-// there are does, and so do random pulses.
+// near where it begins. Neither finds a contact that is far from a plan without it; starts with the largest actions
+// and random pulses do.
 //
-// What begins at the target, without a homotopy, needs more steps there to show what it is worth. In a batch it then is
-// given up more often; alone, a problem has these steps for nothing while its first start is on its way.
+// A start at the target, without a homotopy, needs more steps there before its objective can be compared. In a batch it
+// is then given up more often; for a single problem these steps are free while its first start is under way.
 constexpr int64_t kExplore = 2, kExploreFar = 6;
 Start start_of(int64_t i) {
   constexpr Start first[] = {{Actions::none, true, false, 1.0, kExplore},
@@ -35,21 +35,21 @@ Start start_of(int64_t i) {
 
 // The first starts, which have no large actions.
 constexpr int64_t kNear = 2;
-// Starts with large actions go to the bounds; without a bound a few times as far as the best plan of the starts before.
-// A bound that is this many times farther than that plan stands for none.
+// Starts with large actions go to the bounds; without a bound, a few times as far as the best plan of earlier starts.
+// A bound that is this many times farther than that plan counts as none.
 constexpr double kReach = 3.0, kNone = 100.0;
 // Actions that differ by less than this part of their range lead to the same optimum.
 constexpr double kSame = 0.02;
-// The homotopy makes one step per stage, and two where a problem is tried again along one that starts this many
-// relaxations up.
+// The homotopy makes one step per stage, and two if a problem is solved again along one that starts at this
+// multiple of the relaxation.
 constexpr int64_t kSteps = 1, kStepsAgain = 2;
 constexpr double kLonger = 1000.0;
-// An iteration with row exchanges takes ten times as long, and what it can mend it mends soon.
+// An iteration with row exchanges takes ten times as long, and helps early if at all.
 constexpr int64_t kMaxIterPivot = 60;
 // From this number of forces, or of states and actions, on problems are solved one by one: the matrices of several side
 // by side would not fit into the cache.
 constexpr int64_t kAlone = 48;
-// Elements are searched in chunks, so that what is kept of all starts stays small.
+// Elements are searched in chunks, so that the memory for all starts stays small.
 constexpr int64_t kJobs = 8192, kChunk = 64;
 
 // A number in [0, 1) for every triple: splitmix64.
@@ -101,7 +101,7 @@ void copy_plan(const Sizes& n, const MpcPlans& from, int64_t i, const MpcPlans& 
   to.fragile[j] = from.fragile[i];
 }
 
-// An element that the time did not suffice for: the actions to start from, the state where it is, no forces.
+// Result of an element that was not begun in time: its first actions, the initial state, no forces.
 void stay_at_start(const MpcBatch& b, const MpcGuess& guess, const MpcPlans& out, int64_t e) {
   const Sizes n(b);
   for (int64_t i = 0; i < n.u; i++) out.u[e * n.u + i] = Bound(b, e, i).clip(guess.u ? guess.u[e * n.u + i] : 0.0);
@@ -199,7 +199,7 @@ void MpcDriver::reserve(const MpcBatch& batch, int64_t starts) {
   origin.reserve(jobs);
 }
 
-// One call of the kernel for every problem of a batch.
+// Calls the kernel for every problem of a batch.
 void MpcDriver::run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner) const {
   std::fill_n(solve.status, batch.count, kUnreached);
   std::fill_n(solve.iterations, batch.count, 0);
@@ -215,7 +215,7 @@ void MpcDriver::run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner
       &context);
 }
 
-// Which of the solved problems have constraints that make them degenerate.
+// Marks solved problems whose constraints make them degenerate.
 void MpcDriver::judge_constraints(const MpcBatch& batch, const MpcSolve& results, Runner& runner) const {
   Solving context{kernels, batch, results, 0};
   runner.run(
@@ -243,7 +243,7 @@ void MpcDriver::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEff
   if (batch.n_c > 0) judge_constraints(batch, solver_options(effort, out), runner);
 }
 
-// The first actions of a job: the best plan of its element so far is that of job `best`.
+// Sets the first actions of a job: the best plan of its element so far is that of job `best`.
 void MpcDriver::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start, int64_t job, int64_t best) {
   const Sizes n(b);
   const Start s = start_of(start);
@@ -268,7 +268,7 @@ void MpcDriver::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start,
   }
 }
 
-// Runs jobs [first, first + count) to where starts are compared.
+// Runs jobs [first, first + count) to the point where starts are compared.
 void MpcDriver::explore(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, int64_t first, int64_t count,
                         bool guessed) {
   const Sizes n(batch);
@@ -286,7 +286,7 @@ void MpcDriver::explore(const MpcBatch& batch, const MpcEffort& effort, Runner& 
   run(jobs, o, runner);
 }
 
-// Elements [first, first + count) from one start.
+// Solves elements [first, first + count) from one start.
 void MpcDriver::solve_once(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
                            Runner& runner, int64_t first, int64_t count) {
   const Sizes n(batch);
@@ -310,7 +310,7 @@ void MpcDriver::solve_once(const MpcBatch& batch, const MpcGuess& guess, const M
     if (to.status[e] == kUnreached) stay_at_start(jobs, {o.u_start, nullptr, nullptr}, to, e);
 }
 
-// The same from several, of which the best counts.
+// Solves them from several starts and keeps the best plan.
 void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
                        Runner& runner, int64_t first, int64_t count) {
   const Sizes n(batch);
@@ -328,7 +328,7 @@ void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
   for (int64_t begun = 0; begun < starts && !runner.stopped();) {
     const bool from_guess = guessed && begun == 0;
     const int64_t shift = guessed ? 1 : 0;
-    // Who goes far without bounds, waits for those that find out how far that is.
+    // Starts with large actions and no bounds wait for those that show how far to go.
     const int64_t wide = begun == shift && batch.unbounded ? kNear : starts;
     const int64_t end = from_guess ? 1 : std::min(starts, begun + wide);
     for (int64_t j = begun * count; j < end * count; j++) {
@@ -347,7 +347,7 @@ void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
     for (int64_t j = begun * count; j < end * count; j++) {
       int64_t& b = best[j % count];
       if (tried.status[j] == kUnreached) continue;
-      const bool sound = b >= 0 && tried.objective[b] < kHuge;  // where the numbers break down it may be no number
+      const bool sound = b >= 0 && tried.objective[b] < kHuge;  // it may be NaN after a breakdown
       if (!sound || tried.objective[j] < tried.objective[b]) b = j;
     }
     begun = end;
@@ -356,8 +356,8 @@ void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
   finish(batch, guess, effort, to, runner, first, count);
 }
 
-// Solves to the end what may still become the best of its element; a start whose last step saved less than it lies
-// behind, or that is on its way to the same plan, is given up, unless all others of its element fail.
+// Solves the jobs to the end that may still become the best of their element. A start whose last step gained less than
+// it lies behind, or that approaches the same plan, is given up, unless all others of its element fail.
 void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
                        Runner& runner, int64_t first, int64_t count) {
   const Sizes n(batch);
@@ -404,9 +404,9 @@ void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
       copy_plan(n, tried.plans(), best[e], out, e);
       out.status[e] = int8_t(Status::max_iter);
     } else {
-      MpcBatch own = batch;
-      own.element = tried.element.data();
-      stay_at_start(own, {guess.u ? guess.u + first * n.u : nullptr, nullptr, nullptr}, out, e);
+      MpcBatch elements = batch;
+      elements.element = tried.element.data();
+      stay_at_start(elements, {guess.u ? guess.u + first * n.u : nullptr, nullptr, nullptr}, out, e);
     }
   }
 }
@@ -424,8 +424,8 @@ bool MpcDriver::promising(const MpcBatch& batch, int64_t job, int64_t best) cons
   return false;
 }
 
-// Solves the elements that failed (one in a thousand) once more, from no action along a longer homotopy; then, where
-// the numbers broke down and not the patience, with row exchanges in the elimination of the forces.
+// Solves the elements that failed (one in a thousand) once more, from no action along a longer homotopy; then, if
+// the numbers broke down rather than the iterations ran out, with row exchanges in the elimination of the forces.
 void MpcDriver::retry_failed(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner,
                              bool pivot) {
   const Sizes n(batch);

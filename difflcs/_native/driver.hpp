@@ -1,6 +1,5 @@
-// How the optimum of an LCS-MPC problem is searched: from which starts, what is kept of them, and what is tried where
-// all fail. Shared by the Python module and the C library, so that both give the same bits; independent of the
-// instruction set.
+// Search for the optimum of an LCS-MPC problem: its starts, their comparison, and the attempts if all fail. Shared by
+// the Python module and the C library, so that both give the same bits; independent of the instruction set.
 #pragma once
 #include <cstdint>
 #include <vector>
@@ -9,10 +8,10 @@
 
 namespace difflcs {
 
-// How hard to try.
+// Effort of the search.
 struct MpcEffort {
   int64_t starts;   // at least one; driver.cpp states their sequence. A guess is the first of them.
-  double homotopy;  // first relaxation as a multiple of the problem's; 0: the problem's own scale decides
+  double homotopy;  // first relaxation as a multiple of the problem's; 0: from the problem's scale
   double shrink;    // factor of the homotopy
   double tol;       // on the projected gradient
   int64_t max_iter;
@@ -20,19 +19,19 @@ struct MpcEffort {
   uint64_t seed;     // of the random starts
 };
 
-// What to begin with, (count, ...) each: actions alone, or with forces and multipliers. Null: nothing.
+// The guess, (count, ...) each: actions alone, or with forces and multipliers. Null: nothing.
 struct MpcGuess {
   const double *u, *lam, *mu;
 };
 
-// Where the results of a batch go.
+// Outputs of a batch.
 struct MpcPlans {
   double *x, *u, *lam, *mu, *objective, *residual;
   int8_t *status, *fragile;
   int32_t* iterations;
 };
 
-// Runs work on one thread or on several, each with a workspace of its own, until it is done or the time is over.
+// Runs work on one thread or on several, each with a separate workspace, until it is done or the time is over.
 // `to_the_end`: whatever the time.
 struct Runner {
   using Work = void (*)(void* context, void* workspace, Watch watch);
@@ -43,15 +42,15 @@ struct Runner {
   ~Runner() = default;
 };
 
-// Says of a batch whether S, of `S` numbers, is zero and whether the bounds of the actions, `low` and `high` numbers,
-// are finite.
+// Sets the flags of a batch: whether S, of `S` numbers, is zero, and whether the bounds of the actions, `low` and
+// `high` numbers, are finite.
 void set_flags(MpcBatch& batch, int64_t S, int64_t low, int64_t high);
 
 class MpcDriver {
  public:
   explicit MpcDriver(const Kernels& kernels) : kernels(kernels) {}
 
-  // Takes the memory that a batch of this size needs, whatever happens: after it `solve` allocates nothing.
+  // Allocates all memory that a batch of this size can need: afterwards `solve` allocates nothing.
   void reserve(const MpcBatch& batch, int64_t starts);
 
   // Solves a batch.

@@ -1,4 +1,4 @@
-// The tables that Python and the kernels share: fields of a problem with their dimensions, how a solve can end, and
+// Tables that Python and the kernels share: fields of a problem with their dimensions, outcomes of a solve, and
 // tolerances. A new field or code is a new line here. difflcs.mpc.problem checks its own fields against these;
 // difflcs.status takes its codes from here, and the reference in Python its tolerances.
 #pragma once
@@ -92,7 +92,7 @@ inline int64_t extent(const Batch& batch, const Field& field) {
   return extent(batch, field.rows) * extent(batch, field.columns);
 }
 
-// How many stages a field has where it is given by stage; 0 where it cannot be.
+// Number of stages of a field that may vary by stage; 0 of one that cannot.
 template <class Batch>
 inline int64_t stages_of(const Batch& batch, const Field& field) {
   return field.stages == Given::once ? 0 : field.stages == Given::steps ? batch.horizon : batch.horizon + 1;
@@ -100,7 +100,7 @@ inline int64_t stages_of(const Batch& batch, const Field& field) {
 
 }  // namespace
 
-// How a solve can end.
+// Outcomes of a solve.
 #define DIFFLCS_STATUS_CODES(CODE) CODE(converged) CODE(max_iter) CODE(infeasible) CODE(numerical) CODE(degenerate)
 
 #define DIFFLCS_CODE(name) name,
@@ -113,7 +113,7 @@ constexpr int8_t kUnreached = -1;  // inside the native code only
 
 namespace {
 
-// Whether an element that ended so can be used.
+// Returns whether an element with this outcome can be used.
 constexpr bool solved(int8_t status) {
   return status == int8_t(Status::converged) || status == int8_t(Status::degenerate);
 }
@@ -130,7 +130,7 @@ struct Tolerance {
 // A bound is weakly active where both the distance to it and the Newton step across it are below this part of the
 // range; a constraint likewise, in parts of its row's unit.
 constexpr double kWeak = 1e-5;
-// A reduced Hessian is singular below this pivot, in units of each action's own curvature. Directions below it are
+// A reduced Hessian is singular below this pivot, in units of each action's curvature. Directions below it are
 // held: their sensitivity is zero.
 constexpr double kSingular = 1e-10;
 // An action with a barrier is differentiated as one at its bound below this part of its range.
@@ -138,11 +138,11 @@ constexpr double kClose = 1e-8;
 // Rows of constraints that miss their limits by more than this part, however often they are refined, depend on each
 // other.
 constexpr double kDependent = 1e-3;
-// A multiplier above this part of its price is the price, but for rounding.
+// A multiplier above this part of its price counts as the price.
 constexpr double kAtPrice = 1.0 - 1e-12;
-// A scale is at least this part of what its terms would be, had nothing cancelled: 1e-9 of that is rounding.
+// A scale is at least this part of its terms without cancellation: 1e-9 of that is rounding.
 constexpr double kCancelled = 1e-3;
-// What a step further along a chain of states counts: so little that no size grows with it in most systems.
+// Factor of a step along a chain of states: so small that in most systems no size grows with it.
 constexpr double kFurther = 0.1;
 // Rounding of a sum, in parts of its terms.
 constexpr double kRounding = 4e-16;

@@ -9,7 +9,7 @@
 namespace difflcs::DIFFLCS_ISA {
 namespace {
 
-// Adds products to gradients: into the lanes' sums where the input is shared, else into each element's own.
+// Adds products to gradients: into the lanes' sums where the input is shared, else into those of each element.
 struct Sink {
   const MpcBatch& batch;
   const MpcGradient& o;
@@ -82,7 +82,7 @@ struct InputGradients {
     }
   }
 
-  // The same with upstream gradients. Returns which lanes count.
+  // Loads them with upstream gradients. Returns which lanes count.
   Mask load(const MpcGradient& o, int64_t group, int64_t end) {
     const int64_t states = at.x.size(), actions = at.u.size(), forces = at.lam.size();
     load_solutions(o, group, end);

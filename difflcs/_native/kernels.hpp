@@ -8,7 +8,7 @@
 
 namespace difflcs {
 
-// Asked between two steps of long work; true: stop here. A plain function, because the kernels know neither clocks nor
+// Called between two steps of long work; true: stop here. A plain function, because the kernels know neither clocks nor
 // Python.
 struct Watch {
   bool (*stop)(void* context);
@@ -31,7 +31,7 @@ struct LcpBatch {
 // From these sizes on LCPs are solved one by one, exact and relaxed ones: lanes are faster below, if they are full.
 constexpr int64_t kAloneExact = 64, kAloneRelaxed = 128;
 
-// What the numbers of a solved LCP have to meet; difflcs.lcp.solve_lcp states it.
+// Tolerances of a solved LCP, as in difflcs.lcp.solve_lcp.
 constexpr double kLcpTerms = 1e-10;  // |F lam + q - w| in parts of the terms that sum to it
 constexpr double kLcpData = 1e-8;    // the same in parts of the largest |q| (and of sqrt(relaxation F_ii))
 constexpr double kHuge = 1e300;      // beyond it a bound is infinite
@@ -56,7 +56,7 @@ struct MpcBatch {
   }
 };
 
-// Where the homotopy of a problem starts, and how far it is followed.
+// Start of a problem's homotopy, and the length of its path.
 struct MpcStart {
   // Whether the actions are first replaced by the feedback law of the problem without contact, rolled out with it.
   bool released;
@@ -66,7 +66,7 @@ struct MpcStart {
   int64_t explore;    // Newton steps at the target after which a problem is left as it is, as MAX_ITER; 0: never
 };
 
-// What the solver needs besides the problem, and where its results go.
+// Options and outputs of the solver.
 struct MpcSolve {
   const double* u_start;    // (count, H, n_u), or null for zero
   const double* lam_start;  // (count, H, n_lam), or null for the root of the first relaxation
@@ -85,7 +85,7 @@ struct MpcSolve {
   int32_t* iterations;
 };
 
-// Upstream gradients of the outputs, and where the gradients of the inputs go.
+// Upstream gradients of the outputs, and the gradients of the inputs.
 struct MpcGradient {
   const double *x, *u, *lam, *mu;         // the solution
   const double *x_bar, *u_bar, *lam_bar;  // upstream

@@ -4,7 +4,7 @@
 
 namespace difflcs::DIFFLCS_ISA {
 constexpr int kLanes = DIFFLCS_LANES;
-// Whether problems with matrices of their own have variants for the sizes of the paper's tasks, too.
+// Whether problems with separate matrices also have variants for the sizes of the paper's tasks.
 #ifdef DIFFLCS_FEWER_VARIANTS
 constexpr bool kSizedPerElement = false;
 #else
@@ -72,9 +72,9 @@ static inline void put(Vec* to, int64_t at, int lane, double value) {
 #define DIFFLCS_UNROLL _Pragma("GCC unroll 16")
 #endif
 
-// A function that is handed such an array has to become part of its caller.
+// A function with such an array as argument must be inlined.
 #define DIFFLCS_INLINE __attribute__((always_inline)) inline
-// One that is called from several places, where a copy in each would only take longer to compile.
+// A function with several callers, where a copy in each would only take longer to compile.
 #define DIFFLCS_NOINLINE __attribute__((noinline))
 
 // A small array for unrolled loops: on the stack where the size is known when compiling, else in the scratch given.

@@ -82,7 +82,7 @@ struct Lcp {
     }
   }
 
-  // Large problems look at the watch in every iteration.
+  // Large problems check the watch in every iteration.
   bool halted(Watch watch) const { return size() > 32 && watch.stop(watch.context); }
 
   void slack() { lcp_slack(size(), F, q, lam, w, bound); }
@@ -97,7 +97,7 @@ struct Lcp {
     for (int64_t i = 0; i < n; i++) b[i] = x[i];
   }
 
-  // Which lanes hold a solution: lam, w and q - w + F lam as they are, by the bounds of kernels.hpp. `relaxation` is in
+  // Returns which lanes hold a solution, from lam, w and q - w + F lam by the bounds of kernels.hpp. `relaxation` is in
   // scaled units. Call after `slack` has found w and bound for this lam; `returned` is the w that the caller will get.
   Mask certified(const Vec* returned, Vec unit, Vec relaxation) const {
     const int64_t n = size();
@@ -107,7 +107,7 @@ struct Lcp {
     Mask ok = ~Mask{};
     for (int64_t i = 0; i < n; i++) {
       const Vec missed = abs(w[i] - returned[i]), one = all(0) + scale[i];
-      const Vec total = missed + kRounding * bound[i];  // what a caller may find, who adds in another order
+      const Vec total = missed + kRounding * bound[i];  // what a caller may get in another order of the sum
       ok &= (missed <= kLcpTerms * bound[i]) & (total <= kLcpData * (1.0 + root));
       ok &= (total * inverse[i] <= kLcpData * largest) & (lam[i] >= 0) & (returned[i] >= 0);
       ok &= (max(lam[i] * one, returned[i] * inverse[i]) * unit <= kLargest);
@@ -171,7 +171,7 @@ void Lcp<T, N>::exact(int64_t begin, int64_t end, Watch watch) {
       fewest = fewer ? count : fewest;
       for (int64_t i = 0; i < n; i++) active[i] ^= (block ? infeasible(i) : (Mask)(last == i)) & ~done;
     }
-    // What rounding left below zero is put onto zero, and the slack is that of the lam that is returned.
+    // Values that rounding left below zero become zero, and the slack is recomputed for that lam.
     Mask clipped = Mask{};
     for (int64_t i = 0; i < n; i++) {
       clipped |= lam[i] < 0;
@@ -199,11 +199,11 @@ void Lcp<T, N>::relaxed(int64_t begin, int64_t end, Watch watch) {
   }
 }
 
-// Calls f with the code that fits: F shared by the batch or per element, and compile-time sizes where they are given.
+// Calls f with the code that fits: F shared by the batch or per element, and compile-time sizes if there are any.
 template <class T, int... N, class Function>
 void with_size(const LcpBatch& batch, void* memory, Function f) {
-  const bool found = ((batch.n == N && (f(Lcp<T, N>(batch, memory)), true)) || ...);
-  if (!found) f(Lcp<T, 0>(batch, memory));
+  const bool sized = ((batch.n == N && (f(Lcp<T, N>(batch, memory)), true)) || ...);
+  if (!sized) f(Lcp<T, 0>(batch, memory));
 }
 template <int... N, class Function>
 void dispatch(const LcpBatch& batch, void* memory, Function f) {

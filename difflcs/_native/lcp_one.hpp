@@ -1,4 +1,4 @@
-// One LCP at a time, in plain doubles, with row exchanges: what the batched kernel (lcp.cpp) gave up, and large ones.
+// One LCP at a time, in plain doubles, with row exchanges: large problems, and those that lcp.cpp gave up.
 #pragma once
 #include "kernels.hpp"
 #include "lanes.hpp"
@@ -276,7 +276,7 @@ struct LcpOne {
   }
 
   // Pivoting alone is fast where few exchanges are needed; else it begins next to the solution, where the interior
-  // point's lam exceed its w. What is left, Murty's rule solves one day.
+  // point's lam exceed its w. Murty's rule solves the rest in finite time.
   bool exact() {
     for (int64_t i = 0; i < n; i++) active[i] = q[i] < 0;
     if (pivot(40, false)) return true;

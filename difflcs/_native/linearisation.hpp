@@ -9,7 +9,7 @@
 namespace difflcs::DIFFLCS_ISA {
 namespace {
 
-// What the adjoint needs again of each stage.
+// Factors of each stage that the adjoint reuses.
 template <class S>
 struct Stage {
   Matrix<Vec, S::kL, S::kL> M;  // LU factors of diag(a) + diag(b) F, and the row exchanges
@@ -60,7 +60,7 @@ class Linearisation {
     return {M[own], rows + own * n.l(), size[own], y[own], K_lam[k], K_s[own], A_hat[own]};
   }
 
-  // What lam of stage k becomes for a change of state and action, to first order.
+  // Predicts lam of stage k for a change of state and action, to first order.
   Vec change(int64_t k, int64_t i, const Vec* dx, const Vec* du) const {
     const Matrix<Vec, kL, kW> K = K_lam[k];
     Vec sum = all(0);

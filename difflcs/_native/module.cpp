@@ -45,7 +45,7 @@ struct AlignedBuffer {
   explicit AlignedBuffer(int64_t bytes) : data(::operator new(bytes, std::align_val_t{64})) {}
 };
 
-// What ends the work of all threads of one call before its end.
+// Flag by which one thread ends the work of all threads of a call.
 enum Ending { kGoOn, kOutOfTime, kInterrupted };
 
 using Clock = std::chrono::steady_clock;
@@ -81,13 +81,13 @@ struct Lookout {
   }
 };
 
-// Runs work(workspace, watch) on at most `threads` threads, GIL released. A thread that cannot be started, or has no
-// memory, is done without. Raises what a signal handler raised.
+// Runs work(workspace, watch) on at most `threads` threads, GIL released. If a thread cannot be started, or has no
+// memory, the others do its work. Raises the exception of a signal handler.
 template <class Work>
 void on_threads(int64_t threads, int64_t workspace_bytes, Stop& stop, Work work) {
   {
     nb::gil_scoped_release release;
-    const AlignedBuffer own(workspace_bytes);
+    const AlignedBuffer workspace(workspace_bytes);
     std::vector<std::thread> pool;
     auto start = [&] {
       auto workspace = std::make_shared<AlignedBuffer>(workspace_bytes);
@@ -103,7 +103,7 @@ void on_threads(int64_t threads, int64_t workspace_bytes, Stop& stop, Work work)
     } catch (const std::bad_alloc&) {
     }
     Lookout lookout{stop, true};
-    work(own.data.get(), difflcs::Watch{&Lookout::ask, &lookout});
+    work(workspace.data.get(), difflcs::Watch{&Lookout::ask, &lookout});
     for (auto& t : pool) t.join();
   }
   if (stop.ending == kInterrupted) throw nb::python_error();
@@ -180,15 +180,15 @@ difflcs::MpcBatch mpc_batch(const Inputs& inputs, int64_t horizon, double relaxa
     throw std::invalid_argument("sizes, horizon and relaxation must be positive, the barrier not negative");
   for (int i = 0; i < kInputs; i++) {
     const Array& a = inputs[i];
-    const int64_t rank = rank_of(kMpcFields[i]), size = extent(b, kMpcFields[i]), own = int64_t(a.ndim()) - rank;
+    const int64_t rank = rank_of(kMpcFields[i]), size = extent(b, kMpcFields[i]), leading = int64_t(a.ndim()) - rank;
     const int64_t stages = stages_of(b, kMpcFields[i]);
-    const bool shared = own == 0 || (own == 2 && a.shape(0) == 1);
-    const int64_t whole = (own == 2 ? stages * size : size) * (shared ? 1 : b.count);
-    if (own < 0 || own > (stages ? 2 : 1) || int64_t(a.size()) != whole || (i == kx0 && own != 1))
+    const bool shared = leading == 0 || (leading == 2 && a.shape(0) == 1);
+    const int64_t whole = (leading == 2 ? stages * size : size) * (shared ? 1 : b.count);
+    if (leading < 0 || leading > (stages ? 2 : 1) || int64_t(a.size()) != whole || (i == kx0 && leading != 1))
       throw std::invalid_argument(std::string(kMpcFields[i].name) + " has the wrong shape");
     b.input[i] = a.data();
-    b.step[i] = own == 2 ? size : 0;
-    b.stride[i] = shared ? 0 : own == 2 ? stages * size : size;
+    b.step[i] = leading == 2 ? size : 0;
+    b.stride[i] = shared ? 0 : leading == 2 ? stages * size : size;
   }
   b.pivot = pivot;
   set_flags(b, inputs[kS].size(), inputs[ku_min].size(), inputs[ku_max].size());
@@ -209,7 +209,7 @@ struct Threads final : difflcs::Runner {
   bool stopped() const override { return stop.ending != kGoOn; }
 };
 
-// Returns whether every problem is CONVERGED: the quick question, before anyone asks which are not.
+// Returns whether every problem is CONVERGED, so that callers can skip further checks.
 bool solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier, std::optional<Array> u_start,
                std::optional<Array> lam_start, std::optional<Array> mu_start, int64_t starts, uint64_t seed,
                double homotopy, double shrink, double tol, int64_t max_iter, double certified, double time_limit,
@@ -324,14 +324,14 @@ difflcs::ViolationBatch violation_batch(const Inputs& inputs, double xi, Output<
   b.shared = true;
   for (int i = 0; i < kViolationInputs; i++) {
     const Array& a = inputs[i];
-    const int64_t size = extent(b, kViolationFields[i]), own = int64_t(a.ndim()) - rank_of(kViolationFields[i]);
+    const int64_t size = extent(b, kViolationFields[i]), leading = int64_t(a.ndim()) - rank_of(kViolationFields[i]);
     const bool datum = i == vx || i == vu || i == vx_next;
-    if (own < datum || own > 1 || (own && int64_t(a.shape(0)) != b.count) ||
-        int64_t(a.size()) != (own ? b.count * size : size))
+    if (leading < datum || leading > 1 || (leading && int64_t(a.shape(0)) != b.count) ||
+        int64_t(a.size()) != (leading ? b.count * size : size))
       throw std::invalid_argument(std::string(kViolationFields[i].name) + " has the wrong shape");
     b.input[i] = a.data();
-    b.stride[i] = own ? size : 0;
-    b.shared = b.shared && (datum || !own);
+    b.stride[i] = leading ? size : 0;
+    b.shared = b.shared && (datum || !leading);
   }
   if (b.n_x < 1 || b.n_u < 1 || b.n_lam < 1) throw std::invalid_argument("sizes must be positive");
   check_size("r", r.size(), b.count * b.n_x);
@@ -349,9 +349,9 @@ void pass(difflcs::ViolationBatch& b, Work work) {
   });
 }
 
-// The minimiser z and the values there. No answer where the inputs are not finite, the QP is not convex by a margin,
-// there are no transitions, or the solver failed: then r, e, Q and q are those at z = 0, and z and loss are not set.
-// Else the first transition for which double precision does not suffice, or -1.
+// Computes the minimiser z and the values there. Returns none if the inputs are not finite, the QP is not convex by a
+// margin, there are no transitions, or the solver failed: then r, e, Q and q are those at z = 0, and z and loss are not
+// set. Else returns the first transition for which double precision does not suffice, or -1.
 std::optional<int64_t> violation_loss(Inputs inputs, double xi, int64_t max_iter, int threads, Output<double> Q,
                                       Output<double> q, Output<double> z, Output<double> r, Output<double> e,
                                       Output<double> loss) {
@@ -450,17 +450,17 @@ nb::dict tolerances() {
   return table;
 }
 
-// Bits instead of `isfinite` and no early end, so that the loop is one of vectors.
+// Tests bits instead of `isfinite`, without an early end, so that the loop is vectorised.
 bool all_finite(const std::vector<Array>& arrays) {
   constexpr uint64_t exponent = 0x7ff0000000000000u;
   return std::all_of(arrays.begin(), arrays.end(), [](const Array& a) {
-    uint64_t found = 0;
+    uint64_t invalid = 0;
     for (const double *v = a.data(), *end = v + a.size(); v != end; v++) {
       uint64_t bits;
       std::memcpy(&bits, v, sizeof bits);
-      found |= (bits & exponent) == exponent;
+      invalid |= (bits & exponent) == exponent;
     }
-    return found == 0;
+    return invalid == 0;
   });
 }
 

@@ -1,7 +1,7 @@
-// What needs the linearisation at a solution: gradients of the inputs, and constraints that make it degenerate.
-// A file of its own beside mpc.cpp, so that the two are compiled at the same time.
+// Gradients of the inputs, and the test for degenerate constraints: both need the linearisation at a solution.
+// Apart from mpc.cpp, so that the two are compiled at the same time.
 #if defined(__GNUC__) && !defined(__clang__)
-// How the length of a constraint's row is rounded depends on whether GCC adds up in vectors of its own. Here it does.
+// The rounding of a constraint row's length depends on whether GCC vectorises the sum. Here it does.
 #define DIFFLCS_ROW_LENGTHS __attribute__((optimize("tree-vectorize")))
 #endif
 #include "adjoint.hpp"

@@ -132,7 +132,7 @@ struct ProblemData {
   Steps<Vec> d, c, q, r, u_min, u_max, g, price;
   Steps<Vec> per_width;  // reciprocal of each action's range, zero where that is zero or infinite
   Vec *q_final, *x0;
-  Vec* reach;  // of each constraint: the least that its violation is measured by, a part of what a step can make of it
+  Vec* reach;  // of each constraint: the least unit of its violation, a part of its largest change in a step
   Vec mu;      // weight of the barrier of the bounds: follows the homotopy down to batch.barrier
   Matrix<Vec, 0, 0> multiplier;  // of the constraints, and the weight of the augmented Lagrangian
   Vec rho;
@@ -388,7 +388,7 @@ struct ProblemData {
     return total;
   }
 
-  // The objective: with what soft constraints cost, in place of the augmented Lagrangian.
+  // The objective, with the price of soft constraints in place of the augmented Lagrangian.
   Vec objective(const Trajectory<AnySizes>& at) const {
     Vec total = plain_cost(at);
     for (int64_t k = 0; k <= n.h; k++) {

@@ -1,6 +1,5 @@
-// How far the problems in the lanes have come: the homotopy, the damping and the multipliers of each, when it is
-// finished, and which problem takes its place. Its sizes are known at run time only, so that it is compiled once for
-// all of them.
+// Progress of the problems in the lanes: the homotopy, damping and multipliers of each, when it is finished, and which
+// problem takes its place. Its sizes are known at run time only, so that it is compiled once for all of them.
 #pragma once
 #include "certificate.hpp"
 #include "kernels.hpp"
@@ -14,37 +13,37 @@ namespace {
 
 // Projected gradient, in parts of its scale (see certificate.hpp), at which a problem is solved.
 constexpr double kStationary = 1e-7;
-// Violation of a constraint, in parts of the sizes of its terms, at which it is met; and where more is rounding.
+// Violation of a constraint, in parts of the sizes of its terms, at which it is met; looser if the rest is rounding.
 constexpr double kMet = 1e-12, kMetHardly = 1e-10, kMetRounded = 1e-7;
-// Weight of the augmented Lagrangian, in parts of the largest weight of the cost: at first, and where a violation that
-// three steps of the multipliers in a row have not halved means that the problem is infeasible; if the multipliers are
-// also that many times what the cost asks for, so that it is not the cost that keeps the violation.
+// Weight of the augmented Lagrangian, in parts of the largest weight of the cost: at first, and from which on a
+// violation that three steps of the multipliers in a row have not halved means that the problem is infeasible. The
+// multipliers must also exceed those that the cost balances by the last factor, so that the cost is not the reason.
 constexpr double kPenalty = 10.0, kLargestPenalty = 1e7, kDominates = 1e6;
 // A step of the multipliers is due where the projected gradient is below this part of what the step before left, and of
 // the change that it would make. The first counts where constraints are far from the actions that they act through.
 constexpr double kUpdateDue = 0.03;
-// A violation that is more than a tenth of the one before (a hundredth, where it is small) asks for ten times the
-// weight, one that stays for more.
+// A violation above a tenth of the previous one (a hundredth if it is small) raises the weight ten times, one that does
+// not fall more.
 constexpr double kSlow = 0.1, kSlowEnd = 0.01, kSmall = 1e-4, kStays = 0.9, kRaise = 10.0, kRaiseMore = 30.0;
 // Steps after which the multipliers move in any case where little is violated: actions that constraints couple can take
 // turns next to their bounds, and other multipliers end that.
 constexpr int64_t kStepsBeforeUpdate = 20;
 constexpr double kSlightlyViolated = 1e-6;
-// The least damping that is tried, in parts of what bounds the kink of every contact.
+// Least damping, in parts of the one that bounds the kink of every contact.
 constexpr double kLeastDamping = 0.25;
 // Failed searches in a row, each with 4 times the damping, before a problem is given up.
 constexpr int64_t kFailures = 12;
-// Steps in a row that gain no more than rounding, after which a tenth of the accuracy is let go, and again after as
-// many more: where the system is stiff, the gradient at the optimum is rounding too. A gain below kNoGain of the cost
-// counts as rounding; no smaller projected gradient than kLeastTolerance is asked for then.
+// Steps in a row that gain no more than rounding, after which the tolerance is raised ten times, and again after as
+// many more: if the system is stiff, the gradient at the optimum is rounding too. A gain below kNoGain of the cost
+// counts as rounding; the tolerance is then at least kLeastTolerance.
 constexpr int64_t kStepsWithoutGain = 8;
 constexpr double kNoGain = 1e-12, kLeastTolerance = 1e-8;
 constexpr double kLooserTolerance[] = {1.0, 10.0, 100.0, 1000.0};
-// As many such steps in, a plan that is stationary but for its scale, which vanishes at a vertex, is put before the
-// certificate, which has the sizes of what cancelled.
+// After this many such steps the certificate decides about a plan that is stationary except for its scale, which
+// vanishes at a vertex: the certificate knows the sizes of the terms that cancelled.
 constexpr int64_t kStepsBeforeCertificate = 2;
-// A large weight of the augmented Lagrangian makes much of the rounding of a constraint. Where more than this part is
-// left of the gradient at such a vertex, the multipliers are found once more with the first weight.
+// A large weight of the augmented Lagrangian amplifies the rounding of a constraint. If more than this part of the
+// gradient is left at such a vertex, the multipliers are computed once more with the first weight.
 constexpr double kRoundingLeft = 1e-9;
 
 template <class T>
@@ -57,13 +56,13 @@ struct Progress {
   Trajectory<AnySizes> at;  // the iterate
   Vec* gap;
 
-  // The problems in the lanes, and how far each has come.
+  // The problems in the lanes with their progress.
   struct Lane {
     int64_t element = -1;  // -1: idle
     int64_t iterations = 0, in_stage = 0, failures = 0;
     double violated = 1e300;    // at the last step of the multipliers
     double gradient_left = 0;   // projected gradient after that; 0 where it is not known yet
-    int64_t stalled = 0;        // steps of the multipliers in a row that hardly helped
+    int64_t stalled = 0;        // consecutive steps of the multipliers that hardly helped
     double gained = 0;          // by the last step
     bool weight_reset = false;  // see kRoundingLeft
     int64_t without_gain = 0;   // steps at the target in a row that gained no more than the rounding of the cost
@@ -73,7 +72,7 @@ struct Progress {
   Mask needs_rollout;  // without a trajectory at its eps
   Mask released;       // without contact yet
   Mask gauss_newton;   // by Gauss-Newton
-  Mask stale_cost;     // with multipliers that J does not know yet
+  Mask stale_cost;     // J is that of earlier multipliers
   // Elements that are finished but not certified yet.
   int64_t finished[kLanes];
   int waiting;
@@ -105,12 +104,12 @@ struct Progress {
   }
 
   double first_relaxation(const MpcStart& start, double mean_gap) const {
-    const double own = start.first * mean_gap * mean_gap;
+    const double scaled = start.first * mean_gap * mean_gap;
     const double least = start.at_least > batch.relaxation ? start.at_least : batch.relaxation;
-    return own > least && own < kHuge ? own : least;
+    return scaled > least && scaled < kHuge ? scaled : least;
   }
 
-  // Take the next problem into a lane; an exhausted queue leaves the lane idle with whatever it held.
+  // Take the next problem into a lane; an exhausted queue leaves the lane idle with its old data.
   bool take(const MpcSolve& o, int64_t* counter, int l) {
     const int64_t e = __atomic_fetch_add(counter, int64_t{1}, __ATOMIC_RELAXED);
     const int64_t nu = n.u(), actions = n.h * nu, forces = n.h * n.l();
@@ -169,14 +168,14 @@ struct Progress {
     }
   }
 
-  // Stores a plan as solved if the certificate takes it for that.
+  // Stores a plan as solved if the certificate confirms it.
   bool accepted(const MpcSolve& o, int l, const Sweep& sweep, const Multipliers& force) {
     write(o, l, sweep.weak[l] ? Status::degenerate : Status::converged, force);
     certificate.judge(o, &lane[l].element, 1);
     return o.status[lane[l].element] != int8_t(Status::numerical);
   }
 
-  // A step of the multipliers, at the target of the homotopy: before, they would follow plans that come to nothing.
+  // A step of the multipliers, at the target of the homotopy: earlier they would follow plans that change.
   // They become those that the augmented Lagrangian has at the iterate.
   void update_multipliers(Mask which) {
     for (int64_t k = 0; k <= n.h; k++) {
@@ -196,13 +195,13 @@ struct Progress {
     return which;
   }
 
-  // Whether the constraints of a lane are met, but for what no step of the multipliers diminishes any more.
+  // Whether the constraints of a lane are met, except for a rest that no step of the multipliers reduces.
   bool met(const Sweep& sweep, int l) const {
     const int64_t stalled = lane[l].stalled;
     return sweep.violated[l] <= (stalled > 1 ? kMetRounded : stalled > 0 ? kMetHardly : kMet);
   }
 
-  // Whether the constraints of a lane at the target ask for other multipliers, which it then gets, or for more weight.
+  // Updates the multipliers or the weight of a lane at the target, if its constraints need it; returns whether.
   bool update_due_multipliers(const Sweep& sweep, int l, bool stationary) {
     const double violated = sweep.violated[l];
     if (lane[l].gradient_left == 0) lane[l].gradient_left = sweep.projected[l];
@@ -250,7 +249,7 @@ struct Progress {
         continue;
       }
       if (!infeasible && !converged && !doubtful && !broken && a.iterations < o.max_iter && !stuck) continue;
-      // Once more without regularisation: it hides a singular Hessian.
+      // Once more without regularisation, which hides a singular Hessian.
       if ((converged || doubtful) && regularisation[l] > 0 && !broken) {
         frozen[l] = -1;
         regularisation[l] = 0;

@@ -2,7 +2,7 @@
 // Chen-Harker-Kanzow-Smale,
 //   g_i = lam_i + w_i - sqrt((lam_i - w_i)^2 + 4 eps) = 0  <=>  lam_i > 0, w_i > 0, lam_i w_i = eps.
 // One problem per SIMD lane. `solve` starts next to the solution and stays at one eps, as the MPC needs it; `follow`
-// comes from eps = 1 without a guess, as a problem on its own needs it.
+// comes from eps = 1 without a guess, as a single problem needs it.
 #pragma once
 #include "kernels.hpp"
 #include "lanes.hpp"

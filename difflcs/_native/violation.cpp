@@ -8,7 +8,7 @@
 namespace difflcs::DIFFLCS_ISA {
 namespace {
 
-// Lanes whose symmetric matrix, which is overwritten, is positive definite: all pivots are positive.
+// Returns the lanes whose symmetric matrix, which is overwritten, is positive definite: all pivots are positive.
 template <class T>
 Mask positive_definite(int64_t n, T* M) {
   lu_factor(n, M);
@@ -120,7 +120,7 @@ struct Violation {
         Q[(n + i) * m + n + j] = i == j ? weight : T{};
       }
     for (int64_t i = 0; i < m; i++) largest = max(all(0) + Q[i * m + i], largest);
-    // By a margin in units of each variable's own curvature.
+    // The margin is in units of each variable's curvature.
     for (int64_t i = 0; i < m * m; i++) matrix[i] = i % (m + 1) == 0 ? Q[i] - 1e-13 * Q[i] : Q[i];
     const Mask convex = (largest < 1e300) & positive_definite(m, matrix);
     auto above = [&](T smallest) {  // where sigma_min(F + F^T) exceeds it

@@ -47,11 +47,11 @@ class Assets:
     """Fetch the meshes of the YCB objects; without them stand-ins are used."""
 
     action: Literal["download"]
-    """What to do."""
+    """Action on the assets."""
     objects: tuple[str, ...]
     """sugar_box, fish_can, banana, mug, wrench, clamp, large_clamp, extra_large_clamp; by default all."""
     folder: Path | None = None
-    """Where to put them. By default where the environments look for them."""
+    """Folder of the assets. By default where the environments look for them."""
 
     def run(self) -> None:
         """Run the command."""

@@ -19,7 +19,7 @@ from difflcs.rl import TrainedPolicy
 from difflcs.rl.runs.evaluate import evaluate
 from difflcs.rl.runs.figures import NoPictureError, record_video
 from difflcs.rl.runs.progress import bar
-from difflcs.rl.runs.training import EVALUATION_ENVS, saved_bounds
+from difflcs.rl.runs.training import EVALUATION_ENVS, load_action_support
 from difflcs.rl.tasks import TaskSpec, get_task
 
 _SMOKE_GOALS = 4
@@ -53,7 +53,7 @@ class Evaluate:
                 raise InvalidInputError(
                     f"action-support: expected a run, whose episodes give the bounds, got {learned.name}; drop the flag"
                 )
-            bounds = saved_bounds(learned.run)
+            bounds = load_action_support(learned.run)
         start = time.perf_counter()
         envs = task.make_envs(max(1, min(EVALUATION_ENVS, goals)))
         description = _describe_env(learned, task, envs)

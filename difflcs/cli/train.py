@@ -17,7 +17,7 @@ from difflcs.rl.methods import DEFAULT_METHOD, get_method, method_names
 from difflcs.rl.runs.checkpoint import RunDirectory
 from difflcs.rl.runs.figures import NoPictureError, plot_learning_curve
 from difflcs.rl.runs.progress import Progress
-from difflcs.rl.runs.training import TrainConfig, profile, stored_config, train
+from difflcs.rl.runs.training import TrainConfig, stored_config, sum_seconds, train
 from difflcs.rl.tasks import get_task, task_names
 
 
@@ -50,7 +50,7 @@ class Train(TrainConfig):
             config = self._resumed(config)
         with Progress() as progress:
             run = train(config, out, init=self.init, resume=self.resume, force=self.force, reporter=progress)
-        spent = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in profile(run.rows()).items() if seconds)
+        spent = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in sum_seconds(run.rows()).items() if seconds)
         print(f"time: {spent}")
         print(f"finished: {run.path}\nevaluate it with: difflcs evaluate {run.path}")
 
@@ -119,7 +119,7 @@ class Demo:
     """Learn to push the cube from 6 minutes of data; learning curve and video."""
 
     task: str = TrainConfig.task
-    """What to do: one of the tasks that `difflcs train --help` lists."""
+    """One of the tasks that `difflcs train --help` lists."""
     out: Path = Path("runs/demo")
     """Run directory. An existing demo is continued, not repeated."""
     seed: int = 0

@@ -1,4 +1,4 @@
-"""The MPC as a solver that autograd differentiates: how to solve one call, and how to pull its gradients back."""
+"""The MPC as a solver for autograd: how one call is solved, and how its gradients are computed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from difflcs.status import Status
 
 
 def solve_call(setup: Setup, call: Call) -> tuple[MPCSolver, tuple[Tensor, ...]]:
-    """The solver of a call, which has solved it, and what `MPCSolver.solve` returns, as nodes of the graph.
+    """Solve a call; return its solver, and the outputs of `MPCSolver.solve` as nodes of the graph.
 
     Raises:
         InvalidInputError and its kinds: an argument does not fit; nothing was solved.
@@ -33,7 +33,7 @@ def solve_call(setup: Setup, call: Call) -> tuple[MPCSolver, tuple[Tensor, ...]]
         refuse_tangents(tensors.values())
     batch = inputs.batch()
     guess = check_guess(call.guess, batch, inputs.horizon, inputs.sizes)
-    own = torch.is_grad_enabled() and (transformed or any([tensor.requires_grad for tensor in tensors.values()]))
+    needs_grad = torch.is_grad_enabled() and (transformed or any([tensor.requires_grad for tensor in tensors.values()]))
     solver = MPCSolver(
         setup.backend,
         setup.relaxation,
@@ -42,8 +42,8 @@ def solve_call(setup: Setup, call: Call) -> tuple[MPCSolver, tuple[Tensor, ...]]
         inputs=Inputs(inputs.horizon, by_stage=inputs.by_stage, sizes=inputs.sizes),
         batch=batch,
         dtype=call.x0.dtype,
-        narrow=own and any([tensor.dtype is torch.float32 for tensor in tensors.values()]),
-        own=own,
+        has_float32=needs_grad and any([tensor.dtype is torch.float32 for tensor in tensors.values()]),
+        needs_grad=needs_grad,
         transformed=transformed,
     )
     return solver, solve(solver, *tensors.values(), *guess.values())
@@ -51,18 +51,18 @@ def solve_call(setup: Setup, call: Call) -> tuple[MPCSolver, tuple[Tensor, ...]]
 
 @dataclass
 class MPCSolver(Solver):
-    """Inputs of `MPCProblem` and parts of a guess, with any dimensions of the batch → a plan.
+    """Solver of an `MPCProblem`: its inputs and parts of a guess, with any batch dimensions → a plan.
 
     Attributes:
         backend, relaxation, barrier: see `MPCProblem` and `Backend`.
-        names: of the tensors that are given.
+        names: of the tensors that are passed.
         inputs: horizon, sizes and which inputs are by stage, without the tensors.
-        batch: dimensions of the batch that all inputs broadcast to.
+        batch: batch dimensions that all inputs broadcast to.
         dtype: of x, u, lam and the objective.
-        narrow: whether an input is float32, whose range is that of a gradient.
-        own: whether the outputs must have memory of their own, because a backward pass may follow.
-        transformed: whether nothing has looked at the numbers yet, because the inputs were made under a transform.
-        problem, constant, result: what was solved, and how; once it is.
+        has_float32: whether an input is float32, whose range then limits the gradients.
+        needs_grad: whether a backward pass may follow, so that the outputs must be copies.
+        transformed: whether the numbers are unchecked, because the inputs came from a transform.
+        problem, constant, result: the problem, the constant of its cost and the result, once it is solved.
     """
 
     backend: Backend
@@ -72,8 +72,8 @@ class MPCSolver(Solver):
     inputs: Inputs
     batch: tuple[int, ...]
     dtype: torch.dtype
-    narrow: bool
-    own: bool
+    has_float32: bool
+    needs_grad: bool
     transformed: bool
     problem: MPCProblem = field(init=False)
     constant: Tensor = field(init=False)
@@ -89,31 +89,31 @@ class MPCSolver(Solver):
         return tuple([self.inputs.rank(name) if name in RANKS else 2 for name in self.names])
 
     def solve(self, tensors: Sequence[Tensor], transformed: bool) -> tuple[Tensor, ...]:
-        """x, u, lam, objective, mu, status, iterations, kkt_residual, solve_time, violation; batch dimensions first."""
+        """Solve; return x, u, lam, objective, mu, status, iterations, kkt_residual, solve_time and violation."""
         if transformed:
             leads = [tensor.shape[: tensor.ndim - rank] for tensor, rank in zip(tensors, self.ranks, strict=True)]
             self.batch = torch.broadcast_shapes(*leads)
         named = dict(zip(self.names, tensors, strict=True))
         guess = {name: named.pop(name) for name in self.names if name not in RANKS}
-        values = self.inputs.numbers(named, self.batch, unseen=transformed, own=self.own)
+        values = self.inputs.numbers(named, self.batch, unseen=transformed, copy=self.needs_grad)
         self.constant = values.pop("constant")
         self.problem = MPCProblem(
             **values, horizon=self.inputs.horizon, relaxation=self.relaxation, barrier=self.barrier
         )
         return self.run(self.flat_guess(guess), named["x0"].device)
 
-    def again(self, changed: Mapping[str, Tensor]) -> MPCSolver:
-        """A solver of the same problem with some other inputs, like them in everything but their numbers."""
-        values = self.inputs.numbers(changed, self.batch)
-        return self._with(values.pop("constant", self.constant), self.problem.changed(values))
+    def with_inputs(self, inputs: Mapping[str, Tensor]) -> MPCSolver:
+        """Make a solver of the same problem with some other inputs of the same shapes, dtypes and devices."""
+        values = self.inputs.numbers(inputs, self.batch)
+        return self._with(values.pop("constant", self.constant), self.problem.with_inputs(values))
 
-    def at(self, x0: Tensor) -> MPCSolver:
-        """The same from other states (batch, n_x), float64 on the CPU."""
-        return self._with(self.constant, self.problem.at(x0))
+    def with_x0(self, x0: Tensor) -> MPCSolver:
+        """Make a solver of the same problem from other states (batch, n_x), float64 on the CPU."""
+        return self._with(self.constant, self.problem.with_x0(x0))
 
-    def private(self) -> MPCSolver:
-        """The same in memory of its own, before it is solved."""
-        return self._with(self.constant.clone(), self.problem.private())
+    def copy(self) -> MPCSolver:
+        """Make a copy, not yet solved, that shares no memory with this one."""
+        return self._with(self.constant.clone(), self.problem.copy())
 
     def _with(self, constant: Tensor, problem: MPCProblem) -> MPCSolver:
         other = object.__new__(MPCSolver)
@@ -122,19 +122,19 @@ class MPCSolver(Solver):
         return other
 
     def run(self, start: Primal | None, device: torch.device) -> tuple[Tensor, ...]:
-        """What `solve` returns, of the problem as it is, on a device."""
+        """Solve the problem as it is and return the outputs of `solve` on a device."""
         problem, constant = self.problem, self.constant
         violation = torch.from_numpy(np.zeros(problem.batch))  # before the solve, and by NumPy, as it is faster
         result = self.backend.solve(problem, start)
         if problem.n_c:
             violation = problem.violation(result.primal.x, result.primal.u)
-            # Of a failed element the numbers can be so large that products of them are none.
+            # The numbers of a failed element can be so large that their products overflow.
             largest = torch.finfo(self.dtype).max
             violation = violation.nan_to_num(nan=largest, posinf=largest)
         self.result, objective = _within_range(result, self._objective(result), constant, self.dtype)
         result = self.result
         primal, status, floats = result.primal, result.status, (objective, violation)
-        if self.own:  # copies: what the caller does with the outputs must not change the gradient
+        if self.needs_grad:  # copies: what the caller does with the outputs must not change the gradient
             primal, status = tuple(v.clone() for v in primal), status.clone()
         if self.dtype != torch.float64:
             primal, floats = (tuple(v.to(self.dtype) for v in values) for values in (primal, floats))
@@ -149,7 +149,7 @@ class MPCSolver(Solver):
         return outputs if len(self.batch) == 1 else tuple(v.reshape((*self.batch, *v.shape[1:])) for v in outputs)
 
     def _objective(self, result: Result) -> Tensor:
-        """The cost of the plans (batch,), by the solver where it says it."""
+        """Compute the cost of the plans (batch,), unless the solver has returned it."""
         if result.objective is not None and result.all_converged:
             return result.objective
         objective = self.problem.objective(result.primal.x, result.primal.u)
@@ -158,7 +158,7 @@ class MPCSolver(Solver):
         return torch.where(result.status == int(Status.CONVERGED), result.objective, objective)
 
     def flat_guess(self, parts: Mapping[str, Tensor]) -> Primal | None:
-        """A guess as backends want it, with multipliers of zero where it has none."""
+        """Make a guess in the form that backends take; multipliers that it lacks are zero."""
         if not parts:
             return None
         flat = []
@@ -186,21 +186,21 @@ class MPCSolver(Solver):
         grads: Sequence[Tensor | None],
         needs: Sequence[bool],
     ) -> Sequence[Tensor | None]:
-        """Gradients of the inputs from those of x, u, lam and the objective."""
+        """Compute the gradients of the inputs from those of x, u, lam and the objective."""
         named = zip(self.names, tensors, needs, strict=True)
         wanted = {name: tensor for name, tensor, needed in named if needed and name in RANKS}
         result, solved = self.result, self.result.solved
         upstream = tuple(self._upstream(i, g) for i, g in enumerate(grads))
-        problem = self._apart(wanted)
+        problem = self._unshare(wanted)
 
         def vjp(keep: Tensor) -> dict[str, Tensor]:
             return self.backend.vjp(problem, result, upstream, keep)  # pyright: ignore[reportArgumentType]
 
         gradients = {}
         if wanted.keys() - {"constant"}:
-            # NaN that comes from the caller goes back to the caller, as everywhere in torch; our own would be an error.
+            # NaN from the caller is passed on, as everywhere in torch; one that arises here would be an error.
             theirs = not _all_finite(upstream, torch.finfo(torch.float64).max)
-            limit = torch.finfo(torch.float32 if self.narrow else torch.float64).max
+            limit = torch.finfo(torch.float32 if self.has_float32 else torch.float64).max
             gradients = vjp(solved) if theirs else _finite(vjp, solved, limit)
         gradients["constant"] = upstream[3]
         for name in wanted.keys() & SYMMETRIC:
@@ -208,28 +208,28 @@ class MPCSolver(Solver):
         return [gradients[name] if name in wanted else None for name in self.names]
 
     def _upstream(self, index: int, grad: Tensor | None) -> Tensor:
-        """Gradient of one output, flat; what comes for a failed element is dropped before it can meet the others."""
+        """Flatten the gradient of one output; that of a failed element becomes zero, so that it cannot spread."""
         like = self.result.primal[index] if index < 3 else self.result.kkt_residual
         if grad is None:
             return torch.zeros_like(like)
         flat = grad.to("cpu", torch.float64).reshape(like.shape)
         return torch.where(self.result.solved.reshape(-1, *[1] * (like.ndim - 1)), flat, 0.0)
 
-    def _apart(self, wanted: Mapping[str, Tensor]) -> MPCProblem:
-        """The problem with an input for each element where that was shared, but is to get a gradient for each."""
+    def _unshare(self, wanted: Mapping[str, Tensor]) -> MPCProblem:
+        """Expand inputs that were shared, but are to get a gradient for each element."""
         problem, changed = self.problem, {}
         for name in wanted.keys() - {"constant"}:
-            lead, own = wanted[name].shape[: -self.inputs.rank(name)], wanted[name].shape[-self.inputs.rank(name) :]
+            lead, shape = wanted[name].shape[: -self.inputs.rank(name)], wanted[name].shape[-self.inputs.rank(name) :]
             if lead == (problem.batch,) and problem.shared(name):
-                value = getattr(problem, name).reshape(1, *own)
-                changed[name] = value.expand(problem.batch, *own).contiguous()
+                value = getattr(problem, name).reshape(1, *shape)
+                changed[name] = value.expand(problem.batch, *shape).contiguous()
         return replace(problem, **changed) if changed else problem
 
 
 def _within_range(result: Result, objective: Tensor, constant: Tensor, dtype: torch.dtype) -> tuple[Result, Tensor]:
-    """The objective with its constant; elements whose numbers `dtype` cannot hold become NUMERICAL.
+    """Add the constant to the objective; elements whose numbers `dtype` cannot hold become NUMERICAL.
 
-    Those that failed get numbers that it can hold.
+    The numbers of failed elements are clipped to its range.
     """
     total = objective + constant
     if (
@@ -257,7 +257,7 @@ def _within_range(result: Result, objective: Tensor, constant: Tensor, dtype: to
 
 
 def _inside(u: Tensor, problem: MPCProblem) -> Tensor:
-    """Rounded actions (batch, H, n_u), inside the bounds in float64 too where a number of their dtype lies there."""
+    """Move rounded actions (batch, H, n_u) inside the float64 bounds, if a number of their dtype lies there."""
     u_min, u_max = problem.bounds()
     low, high = u_min.to(u.dtype), u_max.to(u.dtype)
     up, down = torch.full_like(low, torch.inf), torch.full_like(high, -torch.inf)
@@ -267,7 +267,7 @@ def _inside(u: Tensor, problem: MPCProblem) -> Tensor:
 
 
 def _finite(vjp: Callable[[Tensor], dict[str, Tensor]], solved: Tensor, limit: float) -> dict[str, Tensor]:
-    """Gradients without the elements whose own are not finite; they are found by halving the batch."""
+    """Compute gradients without the elements for which they are not finite; these are found by halving the batch."""
     gradients = vjp(solved)
     if _all_finite(list(gradients.values()), limit):
         return gradients

@@ -15,7 +15,7 @@ from difflcs._native import TOLERANCES
 from difflcs.mpc.problem import STAGES, MPCProblem, StageData
 from difflcs.mpc.solution import Primal, largest
 
-# Largest residual of a solution: what CONVERGED means.
+# Largest residual of a CONVERGED solution.
 CERTIFIED = 1e-6
 _AT_PRICE, _CANCELLED, _FURTHER = (TOLERANCES[name] for name in ("at_price", "cancelled", "further"))
 
@@ -48,7 +48,7 @@ class Contact:
     size: Tensor
 
     def solve(self, right: Tensor) -> Tensor:
-        """M⁻¹ right for matrices."""
+        """Compute M⁻¹ right for matrices."""
         return torch.linalg.lu_solve(self.factors, self.pivots, right)
 
     def solve_transposed(self, right: Tensor) -> Tensor:
@@ -59,24 +59,24 @@ class Contact:
 
 
 def complete(problem: MPCProblem, primal: Primal) -> Primal:
-    """A trajectory with multipliers of the constraints, zero where it has none."""
+    """Fill in multipliers of the constraints, zero, if a trajectory has none."""
     return primal if primal.mu is not None else primal._replace(mu=problem.no_multipliers())
 
 
 def stages_of(problem: MPCProblem) -> list[StageData]:
-    """The data of the stages 0 … H; one record for all where nothing varies."""
+    """List the data of the stages 0 … H; one record for all if nothing varies."""
     if any(problem.by_stage(name) for name, stages in STAGES.items() if stages):
         return [problem.stage(k) for k in range(problem.horizon + 1)]
     return [problem.stage(0)] * (problem.horizon + 1)
 
 
 def multipliers(problem: MPCProblem, primal: Primal) -> Multipliers:
-    """Multipliers of a trajectory by the backward recursion of the derivation."""
+    """Compute the multipliers of a trajectory by the backward recursion of the derivation."""
     return backward(problem, complete(problem, primal))[0]
 
 
 def backward(problem: MPCProblem, primal: Primal) -> tuple[Multipliers, list[Contact]]:
-    """Multipliers, and what eliminates λ at each stage."""
+    """Compute the multipliers, and the factors that eliminate λ at each stage."""
     x, u, lam, mu = primal
     steps, data = problem.steps(), stages_of(problem)
     s = steps.gap(*(v.transpose(0, 1) for v in (x[:, :-1], u, lam)))
@@ -116,9 +116,9 @@ def backward(problem: MPCProblem, primal: Primal) -> tuple[Multipliers, list[Con
 
 
 def residual(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
-    """Largest violation of the optimality conditions, (batch,); without units, and infinite for what is not a number.
+    """Compute the largest violation of the optimality conditions, (batch,); without units, infinite for NaN.
 
-    A solution is CONVERGED where this is at most `CERTIFIED`. The maximum, over all steps and components, of
+    A solution is CONVERGED where this is at most `CERTIFIED`. The maximum, over all steps and components, of:
 
     - dynamics: |x_{k+1} − (A x_k + B u_k + C λ_k + d)| in parts of Σ|terms|, the sum of the sizes of the terms of the
       right-hand side; likewise x_0 against x0;
@@ -149,7 +149,7 @@ def residual(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
     lam_terms = _terms((P.C.mT, p[1:]), (P.F.mT, rho)) + (s * y).abs()
     u_terms = gradient_terms(problem, primal, dual).transpose(0, 1)
     width, fixed = ranges(problem, primal.u).transpose(0, 1), high <= low
-    scale = torch.maximum(u_terms, width * at_rest(problem))
+    scale = torch.maximum(u_terms, width * curvature_at_rest(problem))
     unit = torch.where(width > 0, width, torch.ones_like(width))
     moved = torch.minimum(_parts(g, scale), torch.where(g > 0, u - low, high - u) / unit).clamp_min(0.0)
     violations = [
@@ -175,10 +175,10 @@ def _row_violations(problem: MPCProblem, primal: Primal) -> list[Tensor]:
 
 
 def row_units(problem: MPCProblem, primal: Primal) -> Tensor:
-    """What the violation of each constraint is measured by, (batch, n_c): the largest Σ|terms| over the stages.
+    """Compute the unit (batch, n_c) in which the violation of each constraint is measured.
 
-    At least a thousandth of what these would be, had nothing cancelled in the states before, and a millionth of what
-    the actions' ranges make of the row in a step: beside a wall at zero.
+    It is the largest Σ|terms| over the stages; at least a thousandth of that without cancellation in the states, plus a
+    millionth of the row's change by the actions' ranges in a step, which counts beside a wall at zero.
     """
     P, x, u = problem.steps(), primal.x.transpose(0, 1), primal.u.transpose(0, 1)
     terms = _terms((P.G_x, x)) + P.g.abs()
@@ -189,17 +189,17 @@ def row_units(problem: MPCProblem, primal: Primal) -> Tensor:
 
 
 def excess(problem: MPCProblem, primal: Primal) -> Tensor:
-    """Largest violation (batch,) of the hard constraints, in parts of their rows' units; 0 where they hold."""
+    """Compute the largest violation (batch,) of the hard constraints, in their rows' units; 0 if they hold."""
     if problem.n_c == 0:
         return torch.zeros(problem.batch, dtype=torch.float64)
     return largest(_parts(_overshoot(problem, primal), row_units(problem, primal)))
 
 
 def certainly_missed(problem: MPCProblem, primal: Primal) -> Tensor:
-    """Whether a hard constraint (batch,) is violated by more than rounding.
+    """Return whether a hard constraint is violated by more than rounding, (batch,).
 
-    That is by `CERTIFIED` of its row's unit and of what the actions can move it by in a step. Where all terms of a row
-    vanish, as beside a wall at zero, a rounding error is as large as its unit.
+    The threshold is `CERTIFIED` of the row's unit plus its largest change by the actions in a step: if all terms of a
+    row vanish, as beside a wall at zero, a rounding error is as large as its unit.
     """
     reach = _reach(problem, primal)
     reach = torch.where(torch.isinf(problem.steps().g), torch.zeros_like(reach), reach)
@@ -208,7 +208,7 @@ def certainly_missed(problem: MPCProblem, primal: Primal) -> Tensor:
 
 
 def _reach(problem: MPCProblem, primal: Primal) -> Tensor:
-    """What the ranges of the actions make of each row in a step, (H+1, batch, n_c)."""
+    """Compute the largest change of each row by the actions' ranges in a step, (H+1, batch, n_c)."""
     P, width = problem.steps(), ranges(problem, primal.u).transpose(0, 1)
     moved = matvec(P.B.abs(), width)
     reach = _terms((P.G_x, torch.cat([torch.zeros_like(moved[:1]), moved])))
@@ -217,25 +217,25 @@ def _reach(problem: MPCProblem, primal: Primal) -> Tensor:
 
 
 def _overshoot(problem: MPCProblem, primal: Primal) -> Tensor:
-    """By how much each hard constraint is violated, (H+1, batch, n_c); 0 for the others."""
+    """Compute the violation of each hard constraint, (H+1, batch, n_c); 0 for the others."""
     value = problem.constraints(primal.x, primal.u)
     return torch.where(torch.isinf(prices(problem)), value, 0.0).clamp_min(0.0).transpose(0, 1)
 
 
 def prices(problem: MPCProblem) -> Tensor:
-    """Price of a violation of each constraint, (batch, H+1, n_c)."""
+    """Return the price of a violation of each constraint, (batch, H+1, n_c)."""
     return problem.batch_first("price").expand(problem.batch, problem.horizon + 1, problem.n_c)
 
 
 def within_prices(problem: MPCProblem, mu: Tensor) -> Tensor:
-    """Multipliers of the constraints (batch, H+1, n_c) clipped into [0, price]."""
+    """Clip multipliers of the constraints (batch, H+1, n_c) into [0, price]."""
     return torch.minimum(mu.clamp_min(0.0), prices(problem))
 
 
 def ranges(problem: MPCProblem, u: Tensor) -> Tensor:
-    """Range of each action, (batch, H, n_u): u_max − u_min.
+    """Compute the range u_max − u_min of each action, (batch, H, n_u).
 
-    Where that is infinite it is the largest size of the action over the stages, or that of its finite bound.
+    If it is infinite: the largest size of the action over the stages, or that of its finite bound if larger.
     """
     low, high = problem.bounds()
     width = high - low
@@ -247,7 +247,7 @@ def ranges(problem: MPCProblem, u: Tensor) -> Tensor:
 
 
 def gradient_terms(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Tensor:
-    """Σ|terms| (batch, H, n_u) of the reduced gradient, at least a thousandth of that before anything cancelled."""
+    """Compute Σ|terms| (batch, H, n_u) of the reduced gradient, at least a thousandth of that without cancellation."""
     P = problem.steps()
     u, p, rho = (v.transpose(0, 1) for v in (primal.u, dual.p[:, 1:], dual.rho))
     X, costates, forces = sizes(problem, primal, dual)
@@ -269,46 +269,46 @@ def gradient_terms(problem: MPCProblem, primal: Primal, dual: Multipliers) -> Te
 
 
 def sizes(problem: MPCProblem, primal: Primal, dual: Multipliers) -> tuple[Tensor, Tensor, Tensor]:
-    """Sizes of the states x_k (H, batch, n_x), costates p_{k+1} (H, batch, n_x) and ρ_k (H, batch, n_lam) of a plan.
+    """Compute sizes of the states x_k (H, batch, n_x), costates p_{k+1} (H, batch, n_x) and ρ_k (H, batch, n_lam).
 
-    A costate that is zero at a vertex of the constraints is made of terms that are not; these are it, or of terms that
-    are not. So a size is Σ|terms| of a number, that of the stage after it (before it, of a state), or a tenth of what A
-    makes of the sizes there, and of what a contact makes of the terms there. Along a chain of integrators it reaches as
-    far as their rounding does; it does not grow along the horizon but where the numbers do, or A by more than ten.
+    At a vertex of the constraints a costate may be zero although the terms that it sums are not, or although theirs are
+    not. So a size is the largest of: Σ|terms| of the number; the size at the next stage (of a state: the previous one);
+    a tenth of |A| times the sizes there, or of the contact's response to the terms there. Along a chain of integrators
+    it reaches as far as their rounding does. It grows along the horizon only with the numbers, or if A exceeds ten.
     """
     X, steps, data = state_sizes(problem, primal), problem.steps(), stages_of(problem)
     u, lam, p, rho, s = (v.transpose(0, 1) for v in (primal.u, primal.lam, dual.p, dual.rho, dual.s))
-    # About what a unit of Cᵀp makes of ρ: no more than its contact by itself.
-    answer = (lam / (s + lam * steps.F.abs().sum(-1))).abs()
-    own = _terms((steps.Q, X[:-1]), (steps.A.mT, p[1:]), (steps.D.mT, rho), (steps.S, u)) + steps.q.abs()
+    # Response of ρ to a unit of Cᵀp, at most that of its contact by itself.
+    response = (lam / (s + lam * steps.F.abs().sum(-1))).abs()
+    stage_terms = _terms((steps.Q, X[:-1]), (steps.A.mT, p[1:]), (steps.D.mT, rho), (steps.S, u)) + steps.q.abs()
     terms = matvec(problem.Q_final.abs(), X[-1]) + problem.q_final.abs()
     if problem.n_c:
-        fines = _terms((steps.G_x.mT, primal.mu.transpose(0, 1)))
-        own, terms = own + fines[:-1], terms + fines[-1]
+        row_terms = _terms((steps.G_x.mT, primal.mu.transpose(0, 1)))
+        stage_terms, terms = stage_terms + row_terms[:-1], terms + row_terms[-1]
     size, costates, forces = terms, [], []
     for k in reversed(range(problem.horizon)):
         A, C, D = (getattr(data[k], name).abs().mT for name in "ACD")
         costates.append(size)
-        forces.append(answer[k] * matvec(C, size))
-        further = torch.maximum(matvec(A, size), matvec(D, answer[k] * matvec(C, terms)))
-        terms = own[k]
+        forces.append(response[k] * matvec(C, size))
+        further = torch.maximum(matvec(A, size), matvec(D, response[k] * matvec(C, terms)))
+        terms = stage_terms[k]
         size = torch.maximum(torch.maximum(terms, size), _FURTHER * further)
     return X[:-1], torch.stack(costates[::-1]), torch.stack(forces[::-1])
 
 
 def state_sizes(problem: MPCProblem, primal: Primal) -> Tensor:
-    """Sizes of the states (H+1, batch, n_x), see `sizes`."""
+    """Compute the sizes of the states (H+1, batch, n_x), see `sizes`."""
     P, x, lam, data = problem.steps(), primal.x.transpose(0, 1), primal.lam.transpose(0, 1), stages_of(problem)
     terms = _terms((P.A, x[:-1]), (P.B, primal.u.transpose(0, 1)), (P.C, lam)) + P.d.abs()
-    found = [x[0].abs()]
-    for k, own in enumerate(terms):
-        further = _FURTHER * matvec(data[k].A.abs(), found[-1])
-        found.append(torch.maximum(torch.maximum(own, found[-1]), further))
-    return torch.stack(found)
+    result = [x[0].abs()]
+    for k, term in enumerate(terms):
+        further = _FURTHER * matvec(data[k].A.abs(), result[-1])
+        result.append(torch.maximum(torch.maximum(term, result[-1]), further))
+    return torch.stack(result)
 
 
-def at_rest(problem: MPCProblem) -> Tensor:
-    """Curvature of each action by its own weight and the next state's, broadcasting with (H, batch, n_u)."""
+def curvature_at_rest(problem: MPCProblem) -> Tensor:
+    """Compute each action's curvature from its weight and the next state's, broadcasting with (H, batch, n_u)."""
     data = stages_of(problem)
 
     def curvature(k: int) -> Tensor:
@@ -321,13 +321,13 @@ def at_rest(problem: MPCProblem) -> Tensor:
 
 
 def _stack(values: list[Tensor]) -> Tensor:
-    """Stages (n,) or (batch, n) → (H, 1 or batch, n)."""
+    """Stack stages (n,) or (batch, n) into (H, 1 or batch, n)."""
     values = [v if v.ndim == 2 else v.unsqueeze(0) for v in values]
     return torch.stack(torch.broadcast_tensors(*values))
 
 
 def _terms(*products: tuple[Tensor, Tensor]) -> Tensor:
-    """Σ|terms| of a sum of products of a matrix and a vector."""
+    """Compute Σ|terms| of a sum of products of a matrix and a vector."""
     first, *rest = (matvec(matrix.abs(), vector.abs()) for matrix, vector in products)
     return sum(rest, first)
 

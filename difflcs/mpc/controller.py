@@ -35,10 +35,10 @@ from difflcs.mpc.setup import PLAIN_COSTS, Bound, Call, Cost, Inputs, Setup, Sys
 from difflcs.status import Status
 
 _FALLBACKS = {"hold": 0, "zero": 1, "unfinished": 3, "raise": 0}
-_GIVEN = 2
+_ACTION = 2
 _FLOAT = np.dtype(np.float64)
 
-# What a step may have of its own, and its fields, in the order of difflcs/_native/fields.hpp.
+# Arguments of a step that replace those of the layer, and their fields, in the order of difflcs/_native/fields.hpp.
 _CHANGES = {
     "lcs": tuple(SYSTEM),
     "cost": ("Q", "R", "S", "Q_final", "q", "r", "q_final"),
@@ -51,7 +51,7 @@ OnFailure = str | ArrayLike
 
 @dataclass(frozen=True)
 class ControllerPlan:
-    """What the solver of a controller has found last.
+    """Last result of a controller's solver.
 
     Attributes:
         x: (H+1, n_x) planned states.
@@ -87,17 +87,17 @@ class MPCController:
     Each step begins at the plan of the one before, one step later, as `MPCSolution.shift` has it. A state that is not
     finite is no error but a step that is not solved: on a robot something must happen. A module whose system or cost
     depends on the state, a goal or a context (any but `LCSModel`, `ScaledLCS`, plain matrices, and costs that are no
-    `CostModule`) is asked for it at each step, which takes as long as the module does, and some 100 µs for checks. The
-    time limit counts from before that.
+    `CostModule`) is called at each step, which takes as long as the module does, and some 100 µs for checks. The time
+    limit includes this.
 
     One controller is for one thread at a time; another call at the same time is refused.
 
     Args:
-        setup: what the layer plans with: its backend is `batched`, and nothing in it has a batch dimension.
-        on_failure: the action of a step that is not solved. "hold": what the last solved plan has for this time, for
-            at most H−1 steps in a row, then zero; "unfinished": what the solver had reached where the time was over,
+        setup: settings of the layer; its backend is `batched`, and nothing in it has a batch dimension.
+        on_failure: the action of a step that is not solved. "hold": that of the last solved plan for this time, for
+            at most H−1 steps in a row, then zero; "unfinished": that of the iterate when the time was over,
             else as "hold"; "zero"; an action (n_u,); or "raise" a `SolveError`. An action is clipped into the bounds.
-        time_limit: seconds from the begin of a step until the solver is stopped, which it notices at its next
+        time_limit: seconds from the start of a step until the solver is stopped, which it notices at its next
             iteration; that of the backend if None.
 
     Raises:
@@ -109,11 +109,11 @@ class MPCController:
         self._setup = setup = constant_setup(setup)
         self._content = b""
         self._native: Any = None
-        n_goal = setup.cost.n_goal if isinstance(setup.cost, GoalCost) else 0  # that of a module is its own business
+        n_goal = setup.cost.n_goal if isinstance(setup.cost, GoalCost) else 0  # a module may take any goal
         self._begin(setup.horizon, setup.lcs.n_x, setup.lcs.n_u, n_goal, on_failure, limit)
         known = {"lcs": (LCSParams, LCSSequence), "cost": PLAIN_COSTS}
-        self._asks = frozenset(name for name, kinds in known.items() if not isinstance(getattr(setup, name), kinds))
-        if not self._asks:
+        self._modules = frozenset(name for name, kinds in known.items() if not isinstance(getattr(setup, name), kinds))
+        if not self._modules:
             self._make(gather_at_zero(setup))
 
     def _begin(
@@ -121,14 +121,14 @@ class MPCController:
     ) -> None:
         self.horizon, self.n_x, self.n_u, self.n_goal = horizon, n_x, n_u, n_goal
         self._setup: Setup | None
-        self._asks: frozenset[str]
-        self._own: dict[str, Tensor] = {}
-        self._given = False
+        self._modules: frozenset[str]
+        self._first_inputs: dict[str, Tensor] = {}
+        self._overridden = False
         self._status: int | None = None
         self._action: NDArray[np.float64] | None = None
         self._raises = isinstance(on_failure, str) and on_failure == "raise"
         if not isinstance(on_failure, str):
-            self._action, self._fallback = _numbers("on_failure", on_failure, (n_u,)), _GIVEN
+            self._action, self._fallback = _numbers("on_failure", on_failure, (n_u,)), _ACTION
             if not np.isfinite(self._action).all():
                 raise NonFiniteError(f"on_failure: expected a finite action, got {describe(on_failure)}; change it")
         elif on_failure in _FALLBACKS:
@@ -141,11 +141,11 @@ class MPCController:
         self._time_limit = _limit(time_limit)
 
     def _make(self, inputs: Inputs) -> None:
-        """Make the native controller of what is planned with first."""
+        """Make the native controller of the first problem."""
         assert self._setup is not None
         problem, self._constant = make_problem(self._setup, inputs)
         self._content = controller_bytes(self._setup, problem, self._constant)
-        self._own = {name: getattr(problem, name).clone() for names in _CHANGES.values() for name in names}
+        self._first_inputs = {name: getattr(problem, name).clone() for names in _CHANGES.values() for name in names}
         self._load()
 
     def _load(self) -> None:
@@ -157,7 +157,7 @@ class MPCController:
     def load(
         cls, path: str | os.PathLike[str], on_failure: OnFailure = "hold", time_limit: float | None = None
     ) -> Self:
-        """The controller of a file that `save` or `difflcs export` has written.
+        """Load a controller from a file that `save` or `difflcs export` has written.
 
         Raises:
             CheckpointError: there is none, or it is damaged, of another kind or of another version.
@@ -169,7 +169,7 @@ class MPCController:
         except (FileNotFoundError, RuntimeError) as error:
             raise CheckpointError(f"{path}: {error}") from error
         self = cls.__new__(cls)
-        self._setup, self._content, self._asks = None, content, frozenset()
+        self._setup, self._content, self._modules = None, content, frozenset()
         self._begin(sizes["horizon"], sizes["n_x"], sizes["n_u"], sizes["n_goal"], on_failure, time_limit)
         self._load()
         return self
@@ -200,12 +200,12 @@ class MPCController:
 
         Args:
             x: (n_x,) the state.
-            goal: (n_goal,), with a `GoalCost`, or what a `CostModule` takes.
+            goal: (n_goal,), with a `GoalCost`, or any that a `CostModule` takes.
             reference: (H+1, n_goal) instead of a goal: one for each state of the plan, see `GoalCost.follow`.
-            context: (n_context,) whatever system or cost depend on besides x; given to the modules.
-            lcs: system for this step, or module that is asked for one, of the layer's form.
-            cost: cost for this step, likewise; no `GoalCost`, and none where the layer has one.
-            u_min: bound for this step, (n_u,), or by stage where the layer's are.
+            context: (n_context,) quantities besides x that system or cost depend on; passed to the modules.
+            lcs: system for this step, or a module that returns one, of the same sizes as the layer's.
+            cost: cost for this step, likewise; no `GoalCost`, and none if the layer has one.
+            u_min: bound for this step, (n_u,), or by stage if the layer's are.
             u_max: likewise.
 
         Returns:
@@ -225,33 +225,33 @@ class MPCController:
                 )
             shape = (self.horizon + 1, self.n_goal) if follow else (self.n_goal,)
             targets = _numbers("reference" if follow else "goal", reference if follow else goal, shape)
-        elif follow or (goal is not None and cost is None and "cost" not in self._asks):
+        elif follow or (goal is not None and cost is None and "cost" not in self._modules):
             raise ShapeError(
                 f"{'reference' if follow else 'goal'}: expected none with a cost without goals, got one; use a GoalCost"
             )
-        asked = bool(self._asks) or self._given or not (lcs is cost is u_min is u_max is None)
-        if asked:
-            x = self._ask(x, goal, context, {"lcs": lcs, "cost": cost, "u_min": u_min, "u_max": u_max})
+        update = bool(self._modules) or self._overridden or not (lcs is cost is u_min is u_max is None)
+        if update:
+            x = self._update(x, goal, context, {"lcs": lcs, "cost": cost, "u_min": u_min, "u_max": u_max})
         elif context is not None:
             raise ShapeError("context: expected none with a constant system, got one; leave it out")
         u = np.empty(self.n_u)
         self._status = status = self._native.step(x, targets, follow, u)
-        if asked:
+        if update:
             self.time_limit = self._time_limit  # the modules have taken a part of it
         if self._raises and not Status(status).solved:
-            found = Status(status)
-            raise SolveError(f"the step was not solved: {found.name} ({found.advice})", [0], [status])
+            outcome = Status(status)
+            raise SolveError(f"the step was not solved: {outcome.name} ({outcome.advice})", [0], [status])
         return u
 
-    def _ask(
-        self, x: NDArray[np.float64], goal: ArrayLike | None, context: Tensor | None, given: dict[str, Any]
+    def _update(
+        self, x: NDArray[np.float64], goal: ArrayLike | None, context: Tensor | None, overrides: dict[str, Any]
     ) -> NDArray[np.float64]:
-        """Take what this step plans with, from the modules and from what is given; return its state."""
+        """Update the native controller from the modules and a step's arguments; return the state to plan from."""
         if self._setup is None:
             raise InvalidInputError(
-                f"{', '.join(given)}: expected none in a controller of a file, got one; make a controller of a layer"
+                f"{', '.join(overrides)}: expected none in a controller of a file, got one; make one from a layer"
             )
-        if self.n_goal and given["cost"] is not None:
+        if self.n_goal and overrides["cost"] is not None:
             raise ShapeError("cost: expected none where the layer has a GoalCost, got one; give the layer another")
         begun = time.perf_counter()
         goal = (
@@ -259,51 +259,51 @@ class MPCController:
         )
         finite = np.isfinite(x).all() and (goal is None or np.isfinite(goal).all())
         if not finite and self._native is not None:
-            return np.full(self.n_x, np.nan)  # the step will say so
+            return np.full(self.n_x, np.nan)  # the step fails and reports it
         call = Call(torch.from_numpy(x), None if goal is None else torch.from_numpy(goal), context=context)
-        self._given = any(value is not None for value in given.values())
+        self._overridden = any(value is not None for value in overrides.values())
         with torch.no_grad():
             if first := self._native is None:
                 self._make(gather(self._setup, call))
-            if self._given or not first:
-                self._change(self._setup, gather(self._setup, call._replace(**given)), given)
+            if self._overridden or not first:
+                self._set_inputs(self._setup, gather(self._setup, call._replace(**overrides)), overrides)
         if self._time_limit is not None:
             self._native.set_time_limit(max(self._time_limit - (time.perf_counter() - begun), 1e-9))
         return x
 
-    def _change(self, setup: Setup, inputs: Inputs, given: dict[str, Any]) -> None:
-        """Plan with other numbers of the same form."""
+    def _set_inputs(self, setup: Setup, inputs: Inputs, overrides: dict[str, Any]) -> None:
+        """Replace the numbers of the problem by others of the same shapes."""
         values, constant = numbers_of_one(inputs)
         check_finite({name: values[name] for name in SYSTEM})
-        fields = dict(self._own)
-        for part, names in _CHANGES.items():  # bounds may depend on the state where the layer's system does
-            if part in self._asks or given[part] is not None or part in ("u_min", "u_max"):
-                fields |= {n: values[n] if n in values else torch.zeros_like(self._own[n]) for n in names}
+        fields = dict(self._first_inputs)
+        for part, names in _CHANGES.items():  # bounds may depend on the state if the layer's system does
+            if part in self._modules or overrides[part] is not None or part in ("u_min", "u_max"):
+                fields |= {n: values[n] if n in values else torch.zeros_like(self._first_inputs[n]) for n in names}
             for name in names:
-                if fields[name].numel() != (own := self._own[name]).numel():
+                if fields[name].numel() != (first := self._first_inputs[name]).numel():
                     raise ShapeError(
-                        f"{part}: expected {name} {tuple(own.shape)} as in the first step, got "
+                        f"{part}: expected {name} {tuple(first.shape)} as in the first step, got "
                         f"{tuple(fields[name].shape)}; make another controller"
                     )
         check_bounds(fields["u_min"], fields["u_max"], strict=setup.barrier > 0)
-        changed = "cost" in self._asks or given["cost"] is not None
+        new_cost = "cost" in self._modules or overrides["cost"] is not None
         arrays = [value.numpy() for value in fields.values()]
-        self._native.set_inputs(arrays, constant if changed else self._constant)
+        self._native.set_inputs(arrays, constant if new_cost else self._constant)
 
     def reset(self) -> None:
-        """Forget all plans, as at the begin of an episode."""
+        """Forget all plans, as at the start of an episode."""
         self._status = None
         if self._native is not None:
             self._native.reset()
 
     @property
     def status(self) -> Status | None:
-        """How the last step ended; None before the first."""
+        """Status of the last step; None before the first."""
         return None if self._status is None else Status(self._status)
 
     @property
     def time_limit(self) -> float | None:
-        """Seconds from the begin of a step until the solver is stopped; None for none."""
+        """Seconds from the start of a step until the solver is stopped; None for no limit."""
         return self._time_limit
 
     @time_limit.setter
@@ -314,12 +314,12 @@ class MPCController:
 
     @property
     def isa(self) -> str | None:
-        """The instruction set in use, for one problem at a time; None before a module was asked for its system."""
+        """The instruction set in use, for one problem at a time; None before the first call of a module."""
         return None if self._native is None else self._native.sizes()["isa"]
 
     @property
     def plan(self) -> ControllerPlan | None:
-        """What the solver has found last, also where it was not solved; copies. None before the first step."""
+        """Copy of the solver's last result, even if that step was not solved. None before the first step."""
         if self._status is None:
             return None
         sizes, H = self._native.sizes(), self.horizon
@@ -341,7 +341,7 @@ def _limit(seconds: float | None) -> float | None:
 
 
 def _numbers(name: str, value: object, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """An argument as the native code takes it; NaN and infinity are allowed."""
+    """Convert an argument to a float64 array for the native code; NaN and infinity are allowed."""
     if type(value) is np.ndarray and value.dtype is _FLOAT and value.shape == shape and value.flags.c_contiguous:
         return value
     try:

@@ -1,6 +1,6 @@
 """The file of a controller: one problem with the options of its solver, which Python and C read by the same code.
 
-`difflcs/_native/controller_file.hpp` says how its bytes lie.
+`difflcs/_native/controller_file.hpp` documents its bytes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _MAPS = ("at", "along")
 
 
 def constant_system(lcs: object) -> LCSParams | LCSSequence | None:
-    """The system of an LCS whose matrices are the same for all states and contexts; None for any other module."""
+    """Return the system of an LCS whose matrices are the same at all states and contexts; None if it has others."""
     if isinstance(lcs, LCSParams | LCSSequence):
         return lcs.detach()
     inner = lcs
@@ -42,7 +42,7 @@ def constant_system(lcs: object) -> LCSParams | LCSSequence | None:
 
 
 def constant_cost(cost: object, n_x: int) -> GoalCost | QuadraticCost | CostSequence | None:
-    """The cost of a layer where it is the same for all states and contexts; None for any other module."""
+    """Return a cost that is the same for all states and contexts; None for any other module."""
     if isinstance(cost, PLAIN_COSTS):
         return cost
     with torch.no_grad():
@@ -51,7 +51,7 @@ def constant_cost(cost: object, n_x: int) -> GoalCost | QuadraticCost | CostSequ
 
 
 def constant_setup(setup: Setup) -> Setup:
-    """The same with system, cost and bounds as they are now, as far as no state changes them."""
+    """Replace system, cost and bounds of a setup by constant ones, as far as they do not depend on the state."""
     system, cost = constant_system(setup.lcs), constant_cost(setup.cost, setup.lcs.n_x)
     bounds = (setup.u_min, setup.u_max) if setup.bounds is not None else setup.action_bounds(setup.lcs)
     low, high = (bound.detach().clone() for bound in bounds)
@@ -79,13 +79,13 @@ def check_constant(setup: Setup) -> None:
 
 
 def gather_at_zero(setup: Setup) -> Inputs:
-    """The inputs of one state, zero, and of one goal, zero, of a setup whose system and cost no state changes."""
+    """Gather the inputs at state zero and goal zero, for a setup whose system and cost depend on no state."""
     cost, x0 = setup.cost, torch.zeros(1, setup.lcs.n_x, dtype=torch.float64)
     return gather(setup, Call(x0, torch.zeros(cost.n_goal).to(cost.Q) if isinstance(cost, GoalCost) else None))
 
 
 def numbers_of_one(inputs: Inputs) -> tuple[dict[str, torch.Tensor], float]:
-    """The numbers of one robot's problem, and the constant of its cost.
+    """Convert inputs to the numbers of one robot's problem, and the constant of its cost.
 
     Raises:
         ShapeError: there is a batch of them.
@@ -102,18 +102,18 @@ def numbers_of_one(inputs: Inputs) -> tuple[dict[str, torch.Tensor], float]:
 
 
 def make_problem(setup: Setup, inputs: Inputs) -> tuple[MPCProblem, float]:
-    """The problem of one robot, and the constant of its cost."""
+    """Make the problem of one robot, and the constant of its cost."""
     values, constant = numbers_of_one(inputs)
     problem = MPCProblem(**values, horizon=setup.horizon, relaxation=setup.relaxation, barrier=setup.barrier)
     return problem, constant
 
 
 def controller_bytes(setup: Setup, problem: MPCProblem, constant: float, step_seconds: float = 0.0) -> bytes:
-    """The file of the controller of a layer.
+    """Make the file of a layer's controller.
 
     Args:
-        setup: that of the layer; its backend is `batched`.
-        problem: what it plans with, and the constant of its cost: see `make_problem`.
+        setup: settings of the layer; its backend is `batched`.
+        problem: its problem and the constant of its cost, see `make_problem`.
         constant: likewise.
         step_seconds: time from one step to the next [s]; 0 if that is not known.
 
@@ -130,7 +130,7 @@ def controller_bytes(setup: Setup, problem: MPCProblem, constant: float, step_se
     if isinstance(cost, GoalCost) and any(getattr(type(cost), k) is not getattr(GoalCost, k) for k in _MAPS):
         raise InvalidInputError(
             f"cost: expected a GoalCost, whose terms are linear in the goal, got the subclass "
-            f"{type(cost).__name__} with a map of its own; give a controller the plain one"
+            f"{type(cost).__name__} that overrides how goals enter; build the layer with a GoalCost"
         )
     for name, value in (("seed", backend.seed), ("max_iter", backend.max_iter)):
         check_positive_int(name, value, minimum=0, maximum=_LARGEST)

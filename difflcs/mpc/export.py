@@ -1,4 +1,4 @@
-"""What a robot without Python needs of a learned model: the file of its controller, and what the numbers in it mean."""
+"""Export of a controller for a robot without Python: its file, and a description of the numbers in it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def export_controller(
         mpc: the layer, with backend `batched`; nothing in it has a batch dimension.
         out: directory to write `controller.difflcs` and `controller.json` into, each atomically; made if needed.
         step_seconds: time from one step to the next [s]; 0 if that is not known.
-        about: what else `controller.json` is to say, in JSON types.
+        about: further entries of `controller.json`, in JSON types.
 
     Returns:
         The path of `controller.difflcs`.
@@ -80,7 +80,7 @@ def export_controller(
 
 
 def _bound(value: torch.Tensor) -> list[Any]:
-    """A bound as JSON has it: null where there is none."""
+    """Convert a bound to JSON: null for an infinite one."""
     flat = value.detach().double().reshape(-1, value.shape[-1]).tolist()
     rows = [[v if abs(v) < float("inf") else None for v in row] for row in flat]
     return rows[0] if len(rows) == 1 else rows

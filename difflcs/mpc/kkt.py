@@ -14,15 +14,15 @@ violation costs `price`, so 0 ≤ m ≤ price, where a hard constraint has an in
 
     m = 0 and c ≤ 0 (inactive),   0 < m < price and c = 0 (held),   m = price and c ≥ 0 (fined).
 
-The last has price·c in the objective, which is the term mᵀc of L. With ρ_k = y_k ∘ λ_k, stationarity gives, backwards
-from p_H = Q_final x_H + q_final + G_xᵀ m_H,
+A fined constraint has price·c in the objective, which is the term mᵀc of L. With ρ_k = y_k ∘ λ_k, stationarity gives,
+backwards from p_H = Q_final x_H + q_final + G_xᵀ m_H,
 
     λ_k:  (diag s_k + Fᵀ diag λ_k) y_k = −Cᵀ p_{k+1}                                     (solve for y_k)
     u_k:  g_k + ν_k = 0   with   g_k = R u_k + r + Sᵀ x_k + Bᵀ p_{k+1} + Eᵀ ρ_k + G_uᵀ m_k    (g: reduced gradient)
     x_k:  p_k = Q x_k + q + S u_k + Aᵀ p_{k+1} + Dᵀ ρ_k + G_xᵀ m_k.
 
-So all other multipliers follow from a primal trajectory (x, u, λ) and m alone, whichever backend found them. Every
-matrix and vector but Q_final and q_final may be another one at each stage k; the index is left out.
+So all other multipliers follow from a primal trajectory (x, u, λ) and m alone, whatever backend solved for it. Every
+matrix and vector but Q_final and q_final may change with the stage k; the index is left out.
 
 Perturbation (Büskens), which Eq. 8 of the paper needs
 ------------------------------------------------------
@@ -101,7 +101,7 @@ __all__ = [
 def vjp(
     problem: MPCProblem, lin: Linearisation, grads: tuple[Tensor, Tensor, Tensor, Tensor], solved: Tensor
 ) -> dict[str, Tensor]:
-    """Gradients of every input for upstream gradients on x, u, λ and the objective.
+    """Compute the gradients of every input for upstream gradients on x, u, λ and the objective.
 
     Args:
         problem: the problems.
@@ -111,7 +111,7 @@ def vjp(
 
     Returns:
         One tensor per name in `INPUTS`, shaped like the input: summed over the batch where it is shared, and over the
-        stages where it is not given by stage.
+        stages if they share it.
     """
     x_bar, u_bar, lam_bar, objective_bar = grads
     w = solve(problem, lin, x_bar, u_bar, lam_bar)
@@ -164,7 +164,7 @@ def vjp(
     rows = {name: torch.zeros_like(getattr(problem, name)) for name in ("G_x", "G_u", "g", "price")}
     if problem.n_c:
         x0_bar = x0_bar + matvec(first.G_x.mT, dm[:, 0])
-        # Of a fined constraint price·c is in the objective, of any other nothing.
+        # A fined constraint has price·c in the objective; any other has no term there.
         fine = keep(J * problem.constraints(lin.primal.x, lin.primal.u) - problem.rows(w.x, w.u))
         rows = {
             "G_x": -outer("G_x", (dm, x), (m, dx)),
@@ -196,23 +196,23 @@ def vjp(
     }
 
 
-# Residual below which a Newton step either halves it or has met rounding.
+# Residual below which a Newton step either halves it or has reached rounding.
 _NEARLY_ROUNDED = 1e-8
 
 
 def polish(problem: MPCProblem, primal: Primal, max_iter: int | None = None, tol: float = 1e-10) -> Primal:
-    """Newton steps on the conditions, active bounds and constraints held: the same local optimum to machine precision.
+    """Improve solutions to machine precision by Newton steps on the conditions, active bounds and constraints held.
 
     An interior-point solution is off by its barrier parameter, and finite differences of it and the envelope theorem
     are only as good as that. Actions held at a bound are put onto it, and constraints that are not held get their
     multiplier, zero or the price; then each step is the sensitivity solve with minus the reduced gradient upstream and
-    minus the constraint where it is held. Every element keeps the best trajectory met, which may be the given one, and
+    minus the constraint where it is held. Every element keeps its best trajectory, which may be the first, and
     is left alone once its residual is below 1e-8 and a step no longer halves it: that is rounding.
 
     Args:
         problem: the problems.
         primal: nearly optimal trajectories.
-        max_iter: most Newton steps, 6 if None, and 12 with constraints; two or three are the rule, more where a
+        max_iter: limit of Newton steps, 6 if None, and 12 with constraints; two or three are usual, more if a
             constraint is hardly active.
         tol: residual at which an element is left alone.
     """
@@ -232,7 +232,7 @@ def polish(problem: MPCProblem, primal: Primal, max_iter: int | None = None, tol
             off = -problem.constraints(lin.primal.x, lin.primal.u)
             w = solve(problem, lin, zeros[0], -lin.multipliers.gradient, zeros[1], off)
             u = lin.primal.u + w.u
-            mu = within_prices(problem, torch.where(lin.held, lin.primal.mu + w.mu, lin.settled(problem)))
+            mu = within_prices(problem, torch.where(lin.held, lin.primal.mu + w.mu, lin.row_multipliers(problem)))
         if problem.barrier == 0:
             u = torch.where(lin.lower, low, u)
             u = torch.where(lin.upper, high, u)
@@ -241,9 +241,9 @@ def polish(problem: MPCProblem, primal: Primal, max_iter: int | None = None, tol
         x, lam = problem.rollout(u)
         trial = Primal(x, u, lam, mu)
         lin = linearise(problem, trial)
-        settled = lin.settled(problem)
-        if not torch.equal(settled, mu):  # a constraint has left or joined the active ones
-            trial = trial._replace(mu=settled)
+        updated = lin.row_multipliers(problem)
+        if not torch.equal(updated, mu):  # a constraint has left or joined the active ones
+            trial = trial._replace(mu=updated)
             lin = linearise(problem, trial)
         trial_residual = residual(problem, trial, lin.multipliers)
         better = open_ & (trial_residual < best_residual)

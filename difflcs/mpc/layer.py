@@ -1,4 +1,4 @@
-"""LCS-MPC as a PyTorch layer: validate, call a backend, wrap."""
+"""PyTorch layer of the LCS-MPC: it checks a call, has a backend solve it, and wraps the solution."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ class LCSMPCLayer(nn.Module):
         self._repeat = Repeat()
 
     def setup(self) -> Setup:
-        """What the layer plans with as it is now, but for what counts in training mode alone."""
+        """Collect the settings that the layer plans with now, except those of training mode."""
         if self._forward_pre_hooks:
             fresh(self, ("u_min", "u_max"))
         return Setup(
@@ -140,13 +140,13 @@ class LCSMPCLayer(nn.Module):
         )
 
     def limits(self, system: System | None = None) -> tuple[Tensor, Tensor]:
-        """Bounds of the actions where a call gives none.
+        """Return the bounds of the actions for calls that pass none.
 
         They are the layer's `bounds`; or else u_min and u_max, within the action support of an `LCSModel` that knows
         one. A call takes them within the `action_bounds(x0)` of a module that has these, as `MujocoLCS` does.
 
         Args:
-            system: the model; the layer's own if None.
+            system: the model; the layer's if None.
 
         Returns:
             Lower and upper bounds, (..., n_u), or (..., H, n_u) of bounds that change over the horizon.
@@ -157,7 +157,7 @@ class LCSMPCLayer(nn.Module):
         return self.setup()._replace(limits=None).action_bounds(self.lcs if system is None else system)
 
     def extra_repr(self) -> str:
-        """What print(layer) shows."""
+        """Describe the settings for print(layer)."""
         return (
             f"horizon={self.horizon}, relaxation={self.relaxation:g}, backend={self.backend}, "
             f"on_failure={self.on_failure!r}"
@@ -193,7 +193,7 @@ class LCSMPCLayer(nn.Module):
             lcs: system, or module that is asked for one, for this call.
             cost: cost for this call.
             constraints: constraints for this call.
-            context: (..., n_context) whatever system or cost depend on besides x0; given to the modules.
+            context: (..., n_context) quantities besides x0 that system or cost depend on; passed to the modules.
 
         Returns:
             `MPCSolution` with the broadcast batch dimensions.
@@ -214,11 +214,11 @@ class LCSMPCLayer(nn.Module):
                 call = call._replace(guess=guess, along=guess)
         solver, (x, u, lam, objective, mu, *rest) = self._repeat.solve_call(setup, call)
         if solver.transformed or not solver.result.all_converged:
-            self._report(solver.result.status, solver.own)
+            self._report(solver.result.status, solver.needs_grad)
         return MPCSolution(x, u, lam, mu, objective, *rest, problem=solver.problem)
 
     def controller(self, on_failure: OnFailure = "hold", time_limit: float | None = None) -> MPCController:
-        """A controller of one robot with this layer's problem as it is now: NumPy in and out, warm, microseconds.
+        """Make a controller of one robot with this layer's problem as it is now: NumPy in and out, warm, microseconds.
 
         Args:
             on_failure: "hold", "unfinished", "zero", "raise" or an action (n_u,), see `MPCController`.
@@ -262,7 +262,7 @@ class LCSMPCLayer(nn.Module):
 
 
 def _stacklevel() -> int:
-    """Where a warning points to: the line that called the layer, outside this package and torch."""
+    """Find the stack level of the line that called the layer, outside this package and torch, for a warning."""
     level, frame = 1, sys._getframe(1)
     while frame.f_back and frame.f_globals.get("__name__", "").split(".")[0] in ("difflcs", "torch"):
         level, frame = level + 1, frame.f_back

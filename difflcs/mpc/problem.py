@@ -1,4 +1,4 @@
-"""The MPC problem a backend solves: numbers only, checked once."""
+"""The MPC problem that a backend solves: numbers only, checked once."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from difflcs.lcs import SystemMatrices, dimensions
 
 @dataclass(frozen=True)
 class StageData(SystemMatrices):
-    """What varies by stage, at one stage or at all of them: system, cost, bounds and constraints.
+    """The data of one stage, or of all stages: system, cost, bounds and constraints.
 
     Of one stage every field broadcasts with (batch, ...); of all of them with (H, batch, ...), or (H+1, batch, ...)
     for G_x, g and price. The names are those of `MPCProblem`.
@@ -104,14 +104,14 @@ class MPCProblem(SystemMatrices):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, self.x0.new_zeros([sizes[dim] for dim in INPUTS[name]]))
         for name, dims in INPUTS.items():
-            shape, found = tuple([sizes[dim] for dim in dims]), getattr(self, name).shape
-            if found == (batch, *shape) or (found == shape and name != "x0"):
+            expected, actual = tuple([sizes[dim] for dim in dims]), getattr(self, name).shape
+            if actual == (batch, *expected) or (actual == expected and name != "x0"):
                 continue
-            allowed = [(batch, *shape)] if name == "x0" else [shape, (batch, *shape)]
+            allowed = [(batch, *expected)] if name == "x0" else [expected, (batch, *expected)]
             if stages := self.stages(name):
-                allowed += [(1, stages, *shape), (batch, stages, *shape)]
-            if found not in allowed:
-                raise ShapeError(f"{name}: expected {' or '.join(map(str, allowed))}, got {tuple(found)}")
+                allowed += [(1, stages, *expected), (batch, stages, *expected)]
+            if actual not in allowed:
+                raise ShapeError(f"{name}: expected {' or '.join(map(str, allowed))}, got {tuple(actual)}")
         self._check_numbers(INPUTS)
 
     def _check_numbers(self, names: Iterable[str]) -> None:
@@ -122,8 +122,8 @@ class MPCProblem(SystemMatrices):
         if "price" in names and self.n_c:
             check_prices("price", self.price)
 
-    def changed(self, values: Mapping[str, Tensor]) -> MPCProblem:
-        """The problem with other inputs, of which alone the shapes and numbers are checked.
+    def with_inputs(self, values: Mapping[str, Tensor]) -> MPCProblem:
+        """Make the problem with other inputs; only their shapes and numbers are checked.
 
         Raises:
             ShapeError, BoundsError, InvalidInputError: they do not fit the others.
@@ -132,29 +132,29 @@ class MPCProblem(SystemMatrices):
         if any([value.shape != known[name].shape for name, value in values.items()]):
             return replace(self, **values)
         other = object.__new__(MPCProblem)
-        own = vars(other)
-        own.update(known, **values)
-        own["arrays"] = arrays = self.arrays.copy()
+        fields = vars(other)
+        fields.update(known, **values)
+        fields["arrays"] = arrays = self.arrays.copy()
         for name, value in values.items():
             arrays[_ORDER[name]] = array(value)
         other._check_numbers(values)
         return other
 
-    def at(self, x0: Tensor) -> MPCProblem:
-        """The problem from other states, as many as before."""
+    def with_x0(self, x0: Tensor) -> MPCProblem:
+        """Make the problem from other states, as many as before."""
         other = object.__new__(MPCProblem)
         arrays = self.arrays.copy()
         arrays[_ORDER["x0"]] = array(x0)
         vars(other).update(vars(self), x0=x0, arrays=arrays)
         return other
 
-    def private(self) -> MPCProblem:
-        """The same problem in memory of its own."""
+    def copy(self) -> MPCProblem:
+        """Make a copy that shares no memory with this one."""
         return replace(self, **{name: getattr(self, name).clone() for name in INPUTS})
 
     @functools.cached_property
     def arrays(self) -> list[np.ndarray]:
-        """The inputs in their order, for the kernels."""
+        """The inputs as arrays, in their order, for the kernels."""
         return [array(getattr(self, name)) for name in INPUTS]
 
     @property
@@ -168,31 +168,31 @@ class MPCProblem(SystemMatrices):
         return self.g.shape[-1]
 
     def shape(self, name: str) -> tuple[int, ...]:
-        """Dimensions of one input without the batch and the stages."""
+        """Return the dimensions of one input without the batch and the stages."""
         return tuple(getattr(self, dim) for dim in INPUTS[name])
 
     def stages(self, name: str) -> int:
-        """How many stages one input has where it is given by stage; 0 where it has none."""
+        """Return the number of stages of an input that may vary by stage; 0 of one that cannot."""
         return {"": 0, "H": self.horizon, "H+1": self.horizon + 1}[STAGES[name]]
 
     def by_stage(self, name: str) -> bool:
-        """Whether this input is given by stage."""
+        """Return whether this input varies by stage."""
         return getattr(self, name).ndim == len(INPUTS[name]) + 2
 
     def shared(self, name: str) -> bool:
-        """Whether the whole batch shares this input."""
+        """Return whether the whole batch shares this input."""
         value = getattr(self, name)
         return value.ndim == len(INPUTS[name]) or (self.by_stage(name) and value.shape[0] == 1)
 
     def stage(self, k: int) -> StageData:
-        """The data of stage k, broadcasting with (batch, ...). At k = H only G_x, g and price mean something."""
+        """Return the data of stage k, broadcasting with (batch, ...). At k = H only G_x, g and price have a meaning."""
         at = {"H": min(k, self.horizon - 1), "H+1": k}
         return StageData(
             **{name: v[:, at[STAGES[name]]] if self.by_stage(name) else v for name, v in self._stagewise().items()}
         )
 
     def steps(self) -> StageData:
-        """The data of all stages, stages first: broadcasting with (H, batch, ...), see `StageData`."""
+        """Return the data of all stages, stages first: broadcasting with (H, batch, ...), see `StageData`."""
         return StageData(
             **{name: v.transpose(0, 1) if self.by_stage(name) else v for name, v in self._stagewise().items()}
         )
@@ -201,16 +201,16 @@ class MPCProblem(SystemMatrices):
         return {name: getattr(self, name) for name, stages in STAGES.items() if stages}
 
     def batch_first(self, name: str) -> Tensor:
-        """One input, broadcasting with (batch, H, ...)."""
+        """Return one input, broadcasting with (batch, H, ...)."""
         value = getattr(self, name)
         return value.unsqueeze(1) if value.ndim == len(INPUTS[name]) + 1 else value
 
     def no_multipliers(self) -> Tensor:
-        """Multipliers of the constraints that are all zero, (batch, H+1, n_c)."""
+        """Return multipliers of the constraints that are all zero, (batch, H+1, n_c)."""
         return torch.zeros(self.batch, self.horizon + 1, self.n_c, dtype=torch.float64)
 
     def objective(self, x: Tensor, u: Tensor) -> Tensor:
-        """Cost (batch,) of trajectories x (batch, H+1, n_x), u (batch, H, n_u)."""
+        """Compute the cost (batch,) of trajectories x (batch, H+1, n_x), u (batch, H, n_u)."""
         Q, R, q, r = (self.batch_first(name) for name in ("Q", "R", "q", "r"))
         stages = 0.5 * quadratic(Q, x[:, :-1]) + (q * x[:, :-1]).sum(-1) + 0.5 * quadratic(R, u) + (r * u).sum(-1)
         if bool(self.S.any()):
@@ -221,44 +221,44 @@ class MPCProblem(SystemMatrices):
         if self.barrier > 0:
             below, above = self.distances(u)
             total = total - self.barrier * (below.log() + above.log()).sum((1, 2))
-        return total + self._fines(x, u) if self.n_c else total
+        return total + self._penalties(x, u) if self.n_c else total
 
     def constraints(self, x: Tensor, u: Tensor) -> Tensor:
-        """G_x x + G_u u − g of trajectories, (batch, H+1, n_c); −∞ where there is no constraint."""
+        """Compute G_x x + G_u u − g of trajectories, (batch, H+1, n_c); −∞ where there is no constraint."""
         return self.rows(x, u) - self.batch_first("g")
 
     def rows(self, x: Tensor, u: Tensor) -> Tensor:
-        """G_x x + G_u u of trajectories or of directions of them, (batch, H+1, n_c)."""
+        """Compute G_x x + G_u u of trajectories, or of directions, (batch, H+1, n_c)."""
         value = matvec(self.batch_first("G_x"), x)
         value[:, :-1] += matvec(self.batch_first("G_u"), u)
         return value
 
     def violation(self, x: Tensor, u: Tensor) -> Tensor:
-        """Largest violation (batch,) of the constraints, soft ones too; 0 where they hold."""
+        """Compute the largest violation (batch,) of the constraints, soft ones too; 0 if they hold."""
         if self.n_c == 0:
             return x.new_zeros(len(x))
         return self.constraints(x, u).clamp_min(0.0).amax((1, 2))
 
-    def _fines(self, x: Tensor, u: Tensor) -> Tensor:
+    def _penalties(self, x: Tensor, u: Tensor) -> Tensor:
         price = self.batch_first("price")
-        fines = torch.where(torch.isinf(price), 0.0, price) * self.constraints(x, u).clamp_min(0.0)
-        total = fines[:, self.horizon].sum(-1)
+        penalties = torch.where(torch.isinf(price), 0.0, price) * self.constraints(x, u).clamp_min(0.0)
+        total = penalties[:, self.horizon].sum(-1)
         for k in range(self.horizon):
-            total = total + fines[:, k].sum(-1)
+            total = total + penalties[:, k].sum(-1)
         return total
 
     def bounds(self) -> tuple[Tensor, Tensor]:
-        """u_min and u_max, broadcasting with (batch, H, n_u)."""
+        """Return u_min and u_max, broadcasting with (batch, H, n_u)."""
         low, high = (self.batch_first(name) for name in ("u_min", "u_max"))
         return low, high
 
     def distances(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Distances u − u_min and u_max − u of actions (batch, H, n_u) to their bounds."""
+        """Compute the distances u − u_min and u_max − u of actions (batch, H, n_u) to their bounds."""
         low, high = self.bounds()
         return u - low, high - u
 
     def rollout(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """The trajectory that actions u (batch, H, n_u) cause: x (batch, H+1, n_x) and λ (batch, H, n_lam)."""
+        """Compute the trajectory of actions u (batch, H, n_u): x (batch, H+1, n_x) and λ (batch, H, n_lam)."""
         states, forces = [self.x0], []
         for k in range(self.horizon):
             stage = self.stage(k)
@@ -270,41 +270,41 @@ class MPCProblem(SystemMatrices):
         return torch.stack(states, 1), torch.stack(forces, 1)
 
     def clip(self, u: Tensor) -> Tensor:
-        """Actions (batch, H, n_u) clipped into the bounds."""
+        """Clip actions (batch, H, n_u) into the bounds."""
         low, high = self.bounds()
         return torch.minimum(torch.maximum(u, low), high)
 
     def start(self, u: Tensor) -> Tensor:
-        """Actions (batch, H, n_u) to start from: clipped, and with a barrier 1 % of the range off the bounds."""
+        """Move actions (batch, H, n_u) to a start: clipped, and with a barrier 1 % of the range off the bounds."""
         low, high = self.bounds()
         margin = 0.01 * (high - low) if self.barrier > 0 else 0.0
         return torch.minimum(torch.maximum(u, low + margin), high - margin)
 
     def clip_inside(self, u: Tensor, inside: Tensor) -> Tensor:
-        """Actions (batch, H, n_u) moved from `inside` towards `u`, at most nine tenths of the way to a bound."""
+        """Move actions (batch, H, n_u) from `inside` towards `u`, at most nine tenths of the way to a bound."""
         below, above = self.distances(inside)
         return torch.minimum(torch.maximum(u, inside - 0.9 * below), inside + 0.9 * above)
 
     def select(self, index: Tensor) -> MPCProblem:
-        """The problems at some batch indices."""
+        """Select the problems at some batch indices."""
         chosen = {k: getattr(self, k) if self.shared(k) else getattr(self, k)[index] for k in INPUTS}
         return replace(self, **chosen)
 
 
 def array(value: Tensor) -> np.ndarray:
-    """The memory of a tensor on the CPU, or of a contiguous copy of it."""
+    """Return the memory of a tensor on the CPU, or of a contiguous copy of it."""
     return value.contiguous().numpy()
 
 
 # Differentiable inputs with the kind of each trailing dimension, in the order in which autograd and the kernels take
-# them; and how many stages each has where it is given by stage.
+# them; and the number of stages of those that may vary by stage.
 INPUTS: dict[str, tuple[str, ...]] = dimensions(MPCProblem)
 _ORDER = {name: i for i, name in enumerate(INPUTS)}
 STAGES: dict[str, str] = {
     name: "H+1" if name in ("G_x", "g", "price") else "" if name in ("Q_final", "q_final", "x0") else "H"
     for name in INPUTS
 }
-# Those that may be infinite: no bound, no constraint, a hard one.
+# Inputs that may be infinite: no bound, no constraint, a hard one.
 MAY_BE_INFINITE = ("u_min", "u_max", "g", "price")
 
 if list(INPUTS.items()) != list(_kernels.mpc_fields().items()) or _kernels.mpc_stages() != STAGES:

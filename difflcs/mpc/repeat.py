@@ -1,7 +1,7 @@
 """Fast repeated calls of a layer, as in the loop of a robot: the same problem from another state.
 
 A call without gradients, of a layer whose model, cost, bounds and constraints hold the same numbers as in the last one,
-plans with what that one has checked and prepared. Only what the call gives is looked at: a state, a goal, a guess, or a
+reuses what was checked and prepared there. Only the arguments of the call are checked: a state, a goal, a guess, or a
 system that was linearised anew.
 
 With 9 states, 6 actions and 5 contacts that takes 130 µs and `autograd.solve_call` 410 µs; 65 µs of both are the
@@ -29,75 +29,77 @@ from difflcs.mpc.setup import GUESS, Call, Setup, check_guess
 from difflcs.mpc.solution import MPCSolution, Primal
 
 _RECORDS = (LCSParams, LCSSequence)
-# What depends on its tensors alone. A subclass may depend on anything.
+# Modules that depend on their tensors alone. A subclass may depend on anything.
 _MODULES = (LCSModel, GoalCost, QuadraticCost, CostSequence, StageBounds, LinearConstraints, ConstraintSequence)
 
 
 class Repeat:
-    """The last plan of a layer. Copies, and files, are empty."""
+    """Memory of a layer's last plan. Copies of it, also in files, are empty."""
 
     def __init__(self) -> None:
-        self._last: _Planned | None = None
+        self._last: _Prepared | None = None
 
     def solve_call(self, setup: Setup, call: Call) -> tuple[MPCSolver, tuple[Tensor, ...]]:
-        """What `autograd.solve_call` returns, sooner where nothing but numbers of a state, goal or system can differ.
+        """Return the same as `autograd.solve_call`, sooner if only numbers of a state, goal or system can differ.
 
         Raises:
             InvalidInputError and its kinds: an argument does not fit; nothing was solved.
         """
-        last, form = self._last, _form(call)  # once: another thread may keep something else
-        if last is not None and form is not None and last.fits(setup, call, form):
+        last, signature = self._last, _signature(call)  # once: another thread may keep something else
+        if last is not None and signature is not None and last.fits(setup, call, signature):
             start = last.start(call)
             solver = last.solver(setup, call)
             return solver, solver.run(start, call.x0.device)
         solver, outputs = solve_call(setup, call)
-        if form is not None and not solver.own and setup.limits is None:
-            held = _held_by(setup, call)
-            if held is not None and comparable([*_values(setup, call, held), call.goal]):
-                self._last = _Planned(setup, call, form, held, solver)
+        if signature is not None and not solver.needs_grad and setup.limits is None:
+            mappings = _tensor_mappings(setup, call)
+            if mappings is not None and comparable([*_values(setup, call, mappings), call.goal]):
+                self._last = _Prepared(setup, call, signature, mappings, solver)
         return solver, outputs
 
     def __reduce__(self) -> tuple[type, tuple]:
         return Repeat, ()
 
 
-class _Planned:
-    """A problem that a layer has planned, in memory of its own, and what it was made of."""
+class _Prepared:
+    """Copy of a problem that a layer has solved, with a snapshot of the values that it was made of."""
 
-    def __init__(self, setup: Setup, call: Call, form: tuple, held: list[Mapping[str, object]], solver: MPCSolver):
-        self.held, self.made_of = held, Snapshot(_values(setup, call, held))
-        self.form, self.settings = form, _settings(setup)
-        self.latest = solver.private(), None if call.goal is None else Snapshot([call.goal])
+    def __init__(
+        self, setup: Setup, call: Call, signature: tuple, mappings: list[Mapping[str, object]], solver: MPCSolver
+    ):
+        self.mappings, self.snapshot = mappings, Snapshot(_values(setup, call, mappings))
+        self.signature, self.settings = signature, _settings(setup)
+        self.latest = solver.copy(), None if call.goal is None else Snapshot([call.goal])
         inputs, problem = solver.inputs, solver.problem
-        own = [(inputs.horizon + extra, inputs.sizes[size]) for extra, size in GUESS.values()]
-        self.flat = [torch.Size((problem.batch, *shape)) for shape in own]
-        self.guess = [torch.Size((*solver.batch, *shape)) for shape in own]
+        shapes = [(inputs.horizon + extra, inputs.sizes[size]) for extra, size in GUESS.values()]
+        self.flat = [torch.Size((problem.batch, *shape)) for shape in shapes]
+        self.guess = [torch.Size((*solver.batch, *shape)) for shape in shapes]
 
-    def fits(self, setup: Setup, call: Call, form: tuple) -> bool:
-        """Whether a call can differ in numbers of what it gives alone."""
+    def fits(self, setup: Setup, call: Call, signature: tuple) -> bool:
+        """Return whether a call can differ from the last only in the numbers of its arguments."""
         return (
-            form == self.form
+            signature == self.signature
             and _settings(setup) == self.settings
-            and self.made_of.same(_values(setup, call, self.held))
-            and not (torch.is_grad_enabled() and any(v.requires_grad for v in (*self.made_of.tensors, *_given(call))))
+            and self.snapshot.same(_values(setup, call, self.mappings))
+            and not (torch.is_grad_enabled() and any(v.requires_grad for v in (*self.snapshot.tensors, *_inputs(call))))
         )
 
     def solver(self, setup: Setup, call: Call) -> MPCSolver:
-        """The solver of a call: from its state, to its goal, with its system if it gives one."""
+        """Make the solver of a call: from its state, to its goal, with its system if it has one."""
         (solver, same), (x0, goal, lcs) = self.latest, (call.x0, call.goal, call.lcs)
         if goal is not None and same is not None and not same.same([goal]):
             made = setup.cost.at(goal, setup.horizon)  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]
-            solver = solver.again({name: made[name] for name in ("q", "q_final", "constant")})
+            solver = solver.with_inputs({name: made[name] for name in ("q", "q_final", "constant")})
             self.latest = solver, Snapshot([goal])
         if lcs is not None:
             lcs.check_again()  # pyright: ignore[reportAttributeAccessIssue]
-            return solver.again({**lcs.tensors(), "x0": x0})  # pyright: ignore[reportAttributeAccessIssue]
+            return solver.with_inputs({**lcs.tensors(), "x0": x0})  # pyright: ignore[reportAttributeAccessIssue]
         if x0.shape[:-1] != solver.batch:  # one state to several goals
-            return solver.again({"x0": x0})
-        return solver.at(_shaped(x0.detach(), solver.problem.x0.shape))
+            return solver.with_inputs({"x0": x0})
+        return solver.with_x0(_reshape(x0.detach(), solver.problem.x0.shape))
 
     def start(self, call: Call) -> Primal | None:
-        """A guess as backends want it, after a look at the numbers that are new."""
+        """Make the guess in the form that backends take, after a check of the new numbers."""
         solver, flat = self.latest[0], self._flat(call.guess)
         if flat is None or not all_finite(call.x0, *flat):
             check_tensor("x0", call.x0)
@@ -106,27 +108,27 @@ class _Planned:
         return Primal(*flat) if flat else None
 
     def _flat(self, guess: object) -> list[Tensor] | None:
-        """The parts of a guess that is just as it must be, none of none; None of any other."""
+        """Return the parts of a guess of the expected shapes and dtype, [] without a guess; None of any other guess."""
         if guess is None:
             return []
         if not isinstance(guess, MPCSolution | Primal):
             return None
-        found = []
+        parts = []
         for value, shape, flat in zip((guess.x, guess.u, guess.lam, guess.mu), self.guess, self.flat, strict=True):
             if not (_is_double(value) and value.shape == shape):
                 return None
-            found.append(_shaped(value.detach() if value.requires_grad else value, flat))
-        return found
+            parts.append(_reshape(value.detach() if value.requires_grad else value, flat))
+        return parts
 
 
-def _given(call: Call) -> list[Tensor]:
-    """The numbers that a call with a form gives."""
-    found = [call.x0] if call.goal is None else [call.x0, call.goal]
-    return found if call.lcs is None else [*found, *call.lcs.tensors().values()]  # pyright: ignore[reportAttributeAccessIssue]
+def _inputs(call: Call) -> list[Tensor]:
+    """Collect the tensors that a call with a signature passes."""
+    tensors = [call.x0] if call.goal is None else [call.x0, call.goal]
+    return tensors if call.lcs is None else [*tensors, *call.lcs.tensors().values()]  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _form(call: Call) -> tuple | None:
-    """What a call gives but for its numbers; None of one that cannot be used here, or must be refused elsewhere."""
+def _signature(call: Call) -> tuple | None:
+    """Return the shapes and dtypes of a call's arguments; None if it cannot be repeated, or must be refused."""
     x0, goal, reference, _, u_min, u_max, bounds, lcs, cost, constraints, *rest = call
     if not (reference is u_min is u_max is bounds is cost is constraints is None) or any(v is not None for v in rest):
         return None
@@ -138,8 +140,8 @@ def _form(call: Call) -> tuple | None:
     return x0.shape, None if goal is None else (goal.shape, goal.dtype), shapes
 
 
-def _shaped(value: Tensor, shape: torch.Size) -> Tensor:
-    """`reshape` takes as long where there is nothing to do."""
+def _reshape(value: Tensor, shape: torch.Size) -> Tensor:
+    """Reshape, if needed: `Tensor.reshape` takes as long when there is nothing to do."""
     return value if value.shape == shape else value.reshape(shape)
 
 
@@ -147,29 +149,29 @@ def _is_double(value: object) -> TypeGuard[Tensor]:
     return is_array(value) and value.dtype is torch.float64
 
 
-def _held_by(setup: Setup, call: Call) -> list[Mapping[str, object]] | None:
-    """Where the parts of a layer hold what a plan is made of; None where not all of it can be found."""
-    found: list[Mapping[str, object]] = []
+def _tensor_mappings(setup: Setup, call: Call) -> list[Mapping[str, object]] | None:
+    """Collect the mappings in which a layer's parts hold their tensors; None if a part may hold others."""
+    mappings: list[Mapping[str, object]] = []
     for part in _parts(setup, call):
         if type(part) in _RECORDS:
-            found.append(vars(part))
+            mappings.append(vars(part))
         elif type(part) in _MODULES and untouched(part):  # pyright: ignore[reportArgumentType]
-            found += [part._parameters, part._buffers]  # pyright: ignore[reportAttributeAccessIssue]
+            mappings += [part._parameters, part._buffers]  # pyright: ignore[reportAttributeAccessIssue]
         elif part is not None:
             return None
-    return found
+    return mappings
 
 
 def _parts(setup: Setup, call: Call) -> tuple[object, ...]:
     return None if call.lcs is not None else setup.lcs, setup.cost, setup.bounds, setup.constraints
 
 
-def _values(setup: Setup, call: Call, held: list[Mapping[str, object]]) -> list[object]:
-    """All that a plan is made of but for what a call gives."""
-    own = [*_parts(setup, call), setup.backend, setup.u_min, setup.u_max]
-    return own + [value for mapping in held for value in mapping.values()]
+def _values(setup: Setup, call: Call, mappings: list[Mapping[str, object]]) -> list[object]:
+    """Collect all values that a plan depends on, except the arguments of the call."""
+    values = [*_parts(setup, call), setup.backend, setup.u_min, setup.u_max]
+    return values + [value for mapping in mappings for value in mapping.values()]
 
 
 def _settings(setup: Setup) -> tuple:
-    """The numbers that a plan depends on: also what a model holds besides its tensors."""
+    """Collect the numbers that a plan depends on, including those that a model holds besides its tensors."""
     return setup.horizon, setup.relaxation, setup.barrier, getattr(setup.lcs, "stiffness", None)

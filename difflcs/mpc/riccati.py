@@ -16,9 +16,9 @@ from difflcs._native import TOLERANCES
 from difflcs.mpc.conditions import (
     Contact,
     Multipliers,
-    at_rest,
     backward,
     complete,
+    curvature_at_rest,
     gradient_terms,
     prices,
     ranges,
@@ -29,12 +29,12 @@ from difflcs.mpc.problem import MPCProblem, StageData
 from difflcs.mpc.solution import Primal
 
 _WEAK, _SINGULAR, _CLOSE, _DEPENDENT = (TOLERANCES[name] for name in ("weak", "singular", "close", "dependent"))
-# Weight of a held constraint in the augmented Hessian, in units of the row's own curvature; each pass of the refinement
-# divides what is left of the row by it. The digits that it costs the other directions are those of its size.
+# Weight of a held constraint in the augmented Hessian, in units of the row's curvature; each pass of the refinement
+# divides the row's remainder by it. It costs the other directions as many digits as it has.
 _HOLD = 1e5
-# Most passes, and the change of the multipliers, in parts of themselves, at which they end.
+# Largest number of passes, and the relative change of the multipliers at which they end.
 _PASSES = 10
-_LEFT = 1e-13
+_UNCHANGED = 1e-13
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Linearisation:
         degenerate: (batch,) bool: a bound or a constraint is weakly active, the constraints held depend on each other,
             or the reduced Hessian is singular or indefinite.
         held: (batch, H+1, n_c) bool: constraints held with equality.
-        fined: (batch, H+1, n_c) bool: soft constraints that are violated, at their price.
+        fined: (batch, H+1, n_c) bool: soft constraints that are violated and pay their price.
         stages: one `_Stage` per step.
     """
 
@@ -62,25 +62,25 @@ class Linearisation:
     stages: list[_Stage]
     weight: Tensor  # (batch, H+1, n_c), of held constraints in the augmented Hessian
 
-    def settled(self, problem: MPCProblem) -> Tensor:
-        """The multipliers of the constraints, (batch, H+1, n_c): zero where inactive, the price where fined."""
+    def row_multipliers(self, problem: MPCProblem) -> Tensor:
+        """Return the multipliers of the constraints, (batch, H+1, n_c): zero if inactive, the price if fined."""
         price = prices(problem)
         return torch.where(self.held, self.primal.mu, torch.where(self.fined, price, torch.zeros_like(price)))
 
 
 class _Eliminated(NamedTuple):
-    """One stage with λ eliminated: what does not depend on the stages after it."""
+    """One stage with λ eliminated: the part that does not depend on later stages."""
 
     contact: Contact
     K_lam: Tensor  # (batch, n_lam, n_x + n_u)
     K_s: Tensor
     A_hat: Tensor  # (batch, n_x, n_x + n_u), [A B] + C K_lam
-    hessian: Tensor  # (batch, n_x + n_u, n_x + n_u), of the stage's own terms
+    hessian: Tensor  # (batch, n_x + n_u, n_x + n_u), of the stage's terms
 
 
 @dataclass(frozen=True)
 class _Stage:
-    own: _Eliminated
+    eliminated: _Eliminated
     P: Tensor  # (batch, n_x, n_x), Hessian of the value function after this step
     Q_xu: Tensor  # (batch, n_x, n_u), active columns zero
     L: Tensor  # (batch, n_u, n_u), Cholesky factor of Q_uu with identity rows for active actions
@@ -88,19 +88,19 @@ class _Stage:
 
 
 def linearise(problem: MPCProblem, primal: Primal) -> Linearisation:
-    """Factor K_z at a trajectory: the backward Riccati sweep, with the active set found on the way.
+    """Factor K_z at a trajectory: the backward Riccati sweep, which determines the active set on the way.
 
-    An action is held at a bound where a Newton step along its own curvature would cross it, g > h·(u − u_min) (above:
+    An action is held at a bound where a Newton step along its curvature would cross it, g > h·(u − u_min) (above:
     −g > h·(u_max − u)); this orders the bound's multiplier against its distance, whatever the scales. In the same way a
-    constraint is held where 0 < m + c/V < price, with V = a K⁻¹ aᵀ the curvature that the problem without constraints
-    gives the row a = [G_x G_u]: how far a unit more of its multiplier m moves it. Above the price it is fined.
+    constraint is held where 0 < m + c/V < price. V = a K⁻¹ aᵀ, of the row a = [G_x G_u] in the problem without
+    constraints, is how far a unit more of its multiplier m moves it. Above the price it is fined.
     """
     primal = complete(problem, primal)
     dual, contacts = backward(problem, primal)
     data = stages_of(problem)
-    own = _eliminate(problem, primal, dual, contacts, data)
+    eliminated = _eliminate(problem, primal, dual, contacts, data)
     bounds = _Bounds.at(problem, primal, dual)
-    stages, singular = _sweep(problem, own, data, bounds)
+    stages, singular = _sweep(problem, eliminated, data, bounds)
     weak = torch.stack(bounds.weak).any(0)
     none = torch.zeros(primal.mu.shape, dtype=torch.bool)
     lower, upper = torch.stack(bounds.lower[::-1], 1), torch.stack(bounds.upper[::-1], 1)
@@ -109,9 +109,9 @@ def linearise(problem: MPCProblem, primal: Primal) -> Linearisation:
         return replace(lin, degenerate=weak | singular)
     curved = lin
     if bool(singular.any()):
-        # At a vertex the rows hold what no curvature does. Which they are shows where actions have that of their range.
+        # At a vertex the rows hold directions without curvature. To tell which, actions get that of their range.
         free, damping = [stage.free > 0 for stage in stages], bounds.across * singular[:, None, None]
-        curved = replace(lin, stages=_sweep(problem, own, data, free, damping=damping)[0])
+        curved = replace(lin, stages=_sweep(problem, eliminated, data, free, damping=damping)[0])
     return _hold_rows(problem, lin, data, singular, _spread(curved, data))
 
 
@@ -141,7 +141,7 @@ def _eliminate(
 
 
 class _Bounds:
-    """Which actions are held at their bounds; found stage by stage from the last, as their curvature becomes known."""
+    """Active set of the action bounds, determined from the last stage to the first as the curvature becomes known."""
 
     def __init__(
         self, problem: MPCProblem, primal: Primal, gradient: Tensor, terms: Tensor, width: Tensor, *least: Tensor
@@ -155,7 +155,7 @@ class _Bounds:
 
     @classmethod
     def at(cls, problem: MPCProblem, primal: Primal, dual: Multipliers) -> _Bounds:
-        width, rest = ranges(problem, primal.u), at_rest(problem).transpose(0, 1)
+        width, rest = ranges(problem, primal.u), curvature_at_rest(problem).transpose(0, 1)
         # The least curvature keeps rounding of a gradient apart from a reason to leave the interior.
         terms = gradient_terms(problem, primal, dual)
         across = torch.maximum(terms, width * rest) / torch.where(width > 0, width, torch.ones_like(width))
@@ -165,11 +165,11 @@ class _Bounds:
         return cls(problem, primal, dual.gradient, terms, width, least, across)
 
     def free(self, k: int, Q_uu: Tensor) -> Tensor:
-        """The actions (batch, n_u) that are free at stage k, by their curvature."""
+        """Return which actions (batch, n_u) are free at stage k, by their curvature."""
         u, g, width, low, high = (v[:, k] for v in (self.u, self.gradient, self.width, self.low, self.high))
         h = torch.maximum(Q_uu.diagonal(dim1=-2, dim2=-1), self.least[:, k])
         to_lower, to_upper, step, fixed = u - low, high - u, g / h, high <= low
-        # With constraints an action is not at a bound for what a solver leaves of a gradient that cancels.
+        # With constraints, the remainder of a gradient that cancels does not hold an action at its bound.
         held = g / torch.maximum(h, self.across[:, k]) if self.problem.n_c else step
         lower = (held > to_lower) | (fixed & (g >= 0))
         upper = (-held > to_upper) | (fixed & (g < 0))
@@ -190,19 +190,19 @@ class _Bounds:
 
 def _sweep(
     problem: MPCProblem,
-    own: list[_Eliminated],
+    eliminated: list[_Eliminated],
     data: list[StageData],
     bounds: _Bounds | list[Tensor],
     weight: Tensor | None = None,
     damping: Tensor | None = None,
 ) -> tuple[list[_Stage], Tensor]:
-    """The backward Riccati sweep, and where (batch,) a reduced Hessian is singular or indefinite.
+    """Run the backward Riccati sweep; also return whether a reduced Hessian is singular or indefinite, (batch,).
 
     Args:
         problem: the problems.
-        own: the stages with λ eliminated.
-        data: the stages as given.
-        bounds: what decides which actions are free, or these themselves, (batch, n_u) per stage.
+        eliminated: the stages with λ eliminated.
+        data: the original stages.
+        bounds: the bounds that decide which actions are free, or the free actions, (batch, n_u) per stage.
         weight: (batch, H+1, n_c) of each constraint in the Hessian; none if None.
         damping: (batch, H, n_u) curvature to add to the actions; none if None.
     """
@@ -213,8 +213,8 @@ def _sweep(
     stages: list[_Stage] = []
     degenerate = torch.zeros(problem.batch, dtype=torch.bool)
     for k in reversed(range(problem.horizon)):
-        A_hat = own[k].A_hat
-        hessian = A_hat.mT @ (P @ A_hat) + own[k].hessian
+        A_hat = eliminated[k].A_hat
+        hessian = A_hat.mT @ (P @ A_hat) + eliminated[k].hessian
         if weight is not None:
             row = _join(data[k].G_x, data[k].G_u)
             hessian = hessian + row.mT @ (weight[:, k].unsqueeze(-1) * row)
@@ -225,7 +225,7 @@ def _sweep(
         L, singular = _cholesky(Q_uu, free)
         degenerate |= singular
         Q_xu = hessian[:, :n_x, n_x:] * free.unsqueeze(-2)
-        stages.append(_Stage(own[k], P, Q_xu, L, free.to(L.dtype)))
+        stages.append(_Stage(eliminated[k], P, Q_xu, L, free.to(L.dtype)))
         Z = torch.linalg.solve_triangular(L, Q_xu.mT, upper=False)
         P = hessian[:, :n_x, :n_x] - Z.mT @ Z
     return stages[::-1], degenerate
@@ -234,9 +234,10 @@ def _sweep(
 def _hold_rows(
     problem: MPCProblem, lin: Linearisation, data: list[StageData], singular: Tensor, spread: Tensor
 ) -> Linearisation:
-    """The same with the constraints: which of them are held, and the sweep that holds them.
+    """Determine which constraints are held, and repeat the sweep with those held.
 
-    Where none is, `singular` (batch,) says whether the Hessian is; else only along the rows it must not be.
+    `singular` (batch,) says whether the Hessian is singular; it counts for elements without a held constraint, as the
+    others need a regular Hessian only along the held rows.
     """
     mu, price = lin.primal.mu, prices(problem)
     c = problem.constraints(lin.primal.x, lin.primal.u)
@@ -244,7 +245,7 @@ def _hold_rows(
     most = torch.where(torch.isinf(price), torch.inf, price * spread)  # not ∞·0
     fined = above >= most
     held = (above > 0) & ~fined & (spread > 0)
-    # Weakly active: c, and what the multiplier is off its end in the same unit, are both near zero.
+    # Weakly active: c, and the multiplier's distance to the end of its range in the same unit, are both near zero.
     close = _WEAK * row_units(problem, lin.primal).unsqueeze(1)
     off_end = torch.minimum(mu * spread, torch.where(torch.isinf(price), torch.inf, (price - mu) * spread)).abs()
     weak = ((c.abs() <= close) & (off_end <= close) & (close > 0)).flatten(1).any(1)
@@ -254,48 +255,48 @@ def _hold_rows(
         return lin
     weight = torch.where(held, _HOLD / torch.where(held, spread, torch.ones_like(spread)), torch.zeros_like(spread))
     free = [stage.free > 0 for stage in lin.stages]
-    stages, along = _sweep(problem, [stage.own for stage in lin.stages], data, free, weight)
+    stages, along = _sweep(problem, [stage.eliminated for stage in lin.stages], data, free, weight)
     singular = torch.where(held.flatten(1).any(1), along, singular)
     lin = replace(lin, stages=stages, weight=weight)
     return replace(lin, degenerate=weak | singular | _dependent(problem, lin, spread))
 
 
 def _spread(lin: Linearisation, data: list[StageData]) -> Tensor:
-    """V = diag(a K⁻¹ aᵀ) of every constraint, (batch, H+1, n_c), of the problem without constraints.
+    """Compute V = diag(a K⁻¹ aᵀ) of every constraint, (batch, H+1, n_c), in the problem without constraints.
 
-    K⁻¹ is the covariance of (dx, du) where each Q_uu is the inverse covariance of the actions around their feedback.
+    K⁻¹ is the covariance of (dx, du) if each Q_uu is the inverse covariance of the actions around their feedback.
     """
     batch, _, n_x = lin.primal.x.shape
     moved = torch.zeros(batch, n_x, n_x, dtype=torch.float64)
-    found = []
+    variances = []
     for at, stage in zip(data, lin.stages, strict=False):
         feedback = -torch.cholesky_solve(stage.Q_xu.mT, stage.L)
-        A, B = stage.own.A_hat.split([n_x, feedback.shape[-2]], -1)
+        A, B = stage.eliminated.A_hat.split([n_x, feedback.shape[-2]], -1)
         by_state, by_action = at.G_x + at.G_u @ feedback, _scaled(at.G_u, stage)
-        found.append((by_state * (by_state @ moved)).sum(-1) + by_action.square().sum(-2))
+        variances.append((by_state * (by_state @ moved)).sum(-1) + by_action.square().sum(-2))
         closed, root = A + B @ feedback, _scaled(B, stage)
         moved = closed @ moved @ closed.mT + root.mT @ root
-    found.append((data[-1].G_x * (data[-1].G_x @ moved)).sum(-1))
-    return torch.stack(found, 1)
+    variances.append((data[-1].G_x * (data[-1].G_x @ moved)).sum(-1))
+    return torch.stack(variances, 1)
 
 
 def _scaled(matrix: Tensor, stage: _Stage) -> Tensor:
-    """L⁻¹ matrixᵀ for a matrix that acts on the free actions."""
+    """Compute L⁻¹ matrixᵀ for a matrix that acts on the free actions."""
     return torch.linalg.solve_triangular(stage.L, (matrix * stage.free.unsqueeze(-2)).mT, upper=False)
 
 
 def _dependent(problem: MPCProblem, lin: Linearisation, spread: Tensor) -> Tensor:
-    """Where (batch,) the held rows depend on each other: some right-hand side of theirs cannot be met."""
+    """Return whether the held rows depend on each other, (batch,): a right-hand side of theirs cannot be met."""
     spots = torch.arange(lin.held[0].numel(), dtype=torch.float64).reshape(lin.held.shape[1:])
     target = torch.where(lin.held, (1.5 + spots.cos()) * spread.clamp_min(0.0).sqrt(), 0.0)
     x_bar, u_bar, lam_bar, _ = (torch.zeros_like(v) for v in lin.primal)
-    found = solve(problem, lin, x_bar, u_bar, lam_bar, target)
-    left = _along(problem, lin, found) - target
-    return (left.abs() > _DEPENDENT * target).flatten(1).any(1)
+    direction = solve(problem, lin, x_bar, u_bar, lam_bar, target)
+    remainder = _along(problem, lin, direction) - target
+    return (remainder.abs() > _DEPENDENT * target).flatten(1).any(1)
 
 
 def barrier_curvature(problem: MPCProblem, u: Tensor) -> Tensor:
-    """Second derivative (batch, H, n_u) of the barrier of the action bounds; zero without a barrier."""
+    """Compute the second derivative (batch, H, n_u) of the barrier of the action bounds; zero without a barrier."""
     if problem.barrier == 0:
         return torch.zeros_like(u)
     below, above = problem.distances(u)
@@ -310,8 +311,8 @@ def _join(left: Tensor, right: Tensor) -> Tensor:
 def _cholesky(Q_uu: Tensor, free: Tensor) -> tuple[Tensor, Tensor]:
     """Factor Q_uu with identity rows where not free; where it is singular or indefinite, a positive definite stand-in.
 
-    Its eigenvalues are taken in units of each action's own curvature. One near zero becomes so large that its direction
-    hardly moves; a negative one is taken by its size.
+    Its eigenvalues are in units of each action's curvature. One near zero becomes so large that its direction
+    hardly moves; a negative one is replaced by its absolute value.
     """
     diagonal = Q_uu.diagonal(dim1=-2, dim2=-1)
     unit = torch.where(free & (diagonal > 0), diagonal, torch.ones_like(diagonal)).sqrt()
@@ -360,7 +361,7 @@ def solve(
         x_bar: (batch, H+1, n_x); the first is ignored.
         u_bar: (batch, H, n_u).
         lam_bar: (batch, H, n_lam).
-        target: (batch, H+1, n_c) what G_x dx + G_u du of the held constraints shall be; zero if None.
+        target: (batch, H+1, n_c) required G_x dx + G_u du of the held constraints; zero if None.
     """
     if not bool(lin.held.any()):
         return _solve(problem, lin, x_bar, u_bar, lam_bar)
@@ -372,22 +373,22 @@ def solve(
     least = torch.full((problem.batch,), torch.inf, dtype=torch.float64)
     for _ in range(_PASSES):
         force, before = mu - lin.weight * target, mu
-        found = _solve(
+        direction = _solve(
             problem,
             lin,
             x_bar - matvec(G_x.mT, force),
             u_bar - matvec(G_u.mT, force[:, :-1]),
             lam_bar,
         )
-        along = lin.weight * _along(problem, lin, found)
-        # The multiplier that belongs to this direction; ν does not know of the part in the augmented Hessian.
+        along = lin.weight * _along(problem, lin, direction)
+        # The multiplier of this direction; ν lacks the part in the augmented Hessian.
         mu = force + along
-        found = found._replace(mu=mu, nu=found.nu - matvec(G_u.mT, along[:, :-1]))
+        direction = direction._replace(mu=mu, nu=direction.nu - matvec(G_u.mT, along[:, :-1]))
         change, size = (((v.abs() * unit).flatten(1).amax(1)) for v in (mu - before, mu))
         better = change < least
-        best = found if best is None else _choose(better, found, best)
+        best = direction if best is None else _choose(better, direction, best)
         least = torch.where(better, change, least)
-        if not bool((better & (change > _LEFT * size)).any()):
+        if not bool((better & (change > _UNCHANGED * size)).any()):
             break
     assert best is not None
     return best
@@ -398,13 +399,13 @@ def _choose(mask: Tensor, left: Direction, right: Direction) -> Direction:
 
 
 def _along(problem: MPCProblem, lin: Linearisation, w: Direction) -> Tensor:
-    """G_x dx + G_u du of the held constraints, (batch, H+1, n_c), zero elsewhere."""
+    """Compute G_x dx + G_u du of the held constraints, (batch, H+1, n_c); zero elsewhere."""
     moved = problem.rows(w.x, w.u)
     return torch.where(lin.held, moved, torch.zeros_like(moved))
 
 
 def _solve(problem: MPCProblem, lin: Linearisation, x_bar: Tensor, u_bar: Tensor, lam_bar: Tensor) -> Direction:
-    """One backward and one forward sweep; constraints count by their weight in the Hessian alone."""
+    """Run one backward and one forward sweep; constraints enter only through their weight in the Hessian."""
     n_x, horizon = problem.n_x, problem.horizon
     dual, data = lin.multipliers, stages_of(problem)
     crossed = bool(problem.S.any())
@@ -413,8 +414,8 @@ def _solve(problem: MPCProblem, lin: Linearisation, x_bar: Tensor, u_bar: Tensor
     values, feedforward = [v], []
     for k in reversed(range(horizon)):
         stage = lin.stages[k]
-        upstream = torch.cat([x_bar[:, k], u_bar[:, k]], -1) + matvec(stage.own.K_lam.mT, lam_bar[:, k])
-        linear = matvec(stage.own.A_hat.mT, v) - upstream
+        upstream = torch.cat([x_bar[:, k], u_bar[:, k]], -1) + matvec(stage.eliminated.K_lam.mT, lam_bar[:, k])
+        linear = matvec(stage.eliminated.A_hat.mT, v) - upstream
         right = (linear[:, n_x:] * stage.free).unsqueeze(-1)
         step = -torch.cholesky_solve(right, stage.L).squeeze(-1)
         feedforward.append(step)
@@ -425,17 +426,17 @@ def _solve(problem: MPCProblem, lin: Linearisation, x_bar: Tensor, u_bar: Tensor
     dx = torch.zeros_like(x_bar[:, 0])
     dxs, dus, dlams, dps, drhos, dnus = [dx], [], [], [], [], []
     for k in range(horizon):
-        stage, own, at = lin.stages[k], lin.stages[k].own, data[k]
+        stage, eliminated, at = lin.stages[k], lin.stages[k].eliminated, data[k]
         feedback = torch.cholesky_solve(matvec(stage.Q_xu.mT, dx).unsqueeze(-1), stage.L).squeeze(-1)
         du = feedforward[k] - feedback
         dw = torch.cat([dx, du], -1)
-        dlam, ds = matvec(own.K_lam, dw), matvec(own.K_s, dw)
+        dlam, ds = matvec(eliminated.K_lam, dw), matvec(eliminated.K_s, dw)
         across = matvec(at.S.mT, dx) if crossed else 0.0
-        dx = matvec(own.A_hat, dw)
+        dx = matvec(eliminated.A_hat, dw)
         dp = matvec(stage.P, dx) + values[k + 1]
         y, lam = dual.y[:, k], lin.primal.lam[:, k]
         right = lam_bar[:, k] - matvec(at.C.mT, dp) - y * ds - matvec(at.F.mT, y * dlam)
-        drho = own.contact.solve_transposed(right) * lam + y * dlam
+        drho = eliminated.contact.solve_transposed(right) * lam + y * dlam
         dnu = u_bar[:, k] - matvec(at.R, du) - matvec(at.B.mT, dp) - matvec(at.E.mT, drho) - across
         for store, value in zip((dxs, dus, dlams, dps, drhos, dnus), (dx, du, dlam, dp, drho, dnu), strict=True):
             store.append(value)

@@ -1,4 +1,4 @@
-"""What the MPC plans with: what a layer was built with, what a call gives, and the problem that these make."""
+"""Inputs of the MPC: the settings of a layer, the arguments of a call, and the problem that they make."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ PLAIN_COSTS = (GoalCost, QuadraticCost, CostSequence)
 
 
 class Setup(NamedTuple):
-    """What a layer was built with, as it is now; the names are those of `LCSMPCLayer`.
+    """Settings of a layer as they are now; the names are those of `LCSMPCLayer`.
 
     Attributes:
-        limits: bounds of the actions for a system, where a layer has a way of its own; None: u_min and u_max within the
+        limits: a subclass's function from a system to the bounds of the actions; None: u_min and u_max within the
             action support of the system.
     """
 
@@ -68,7 +68,7 @@ class Setup(NamedTuple):
     limits: Callable[[System], tuple[Tensor, Tensor]] | None
 
     def check(self) -> None:
-        """Refuse what does not fit each other, as far as that does not depend on a call."""
+        """Refuse parts that do not fit each other, as far as that does not depend on a call."""
         inputs = Inputs(self.horizon, sizes={name: getattr(self.lcs, name) for name in ("n_x", "n_u", "n_lam")})
         if isinstance(self.lcs, LCSSequence):
             inputs.check_horizon("lcs", self.lcs.horizon)
@@ -82,7 +82,7 @@ class Setup(NamedTuple):
         check_bounds(*self.action_bounds(self.lcs), strict=self.barrier > 0)
 
     def action_bounds(self, system: System, x0: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Bounds of the actions where a call gives none, see `LCSMPCLayer.limits`."""
+        """Return the bounds of the actions for calls that pass none, see `LCSMPCLayer.limits`."""
         if self.limits is not None:
             return self.limits(system)
         if self.bounds is not None:
@@ -92,10 +92,10 @@ class Setup(NamedTuple):
 
 
 class Call(NamedTuple):
-    """What a call of a layer gives; the names are those of `LCSMPCLayer.forward`.
+    """Arguments of a call of a layer; the names are those of `LCSMPCLayer.forward`.
 
     Attributes:
-        along: the plan along which a module is asked for its system; None: at x0.
+        along: the plan along which a module returns its system; None: at x0.
     """
 
     x0: Tensor
@@ -113,7 +113,7 @@ class Call(NamedTuple):
 
 
 def gather(setup: Setup, call: Call) -> Inputs:
-    """The tensors that a call plans with.
+    """Gather the tensors that a call plans with.
 
     Raises:
         InvalidInputError and its kinds: an argument does not fit.
@@ -140,7 +140,7 @@ def gather(setup: Setup, call: Call) -> Inputs:
 
 
 def within_support(u_min: Tensor, u_max: Tensor, system: System) -> tuple[Tensor, Tensor]:
-    """Bounds of the actions within the action support of an `LCSModel` that knows one.
+    """Clip the bounds of the actions to the action support of an `LCSModel` that has one.
 
     Raises:
         BoundsError: the support lies outside of the bounds.
@@ -159,16 +159,16 @@ def within_support(u_min: Tensor, u_max: Tensor, system: System) -> tuple[Tensor
 
 
 def within_reach(u_min: Tensor, u_max: Tensor, system: System, x0: Tensor) -> tuple[Tensor, Tensor]:
-    """Bounds of the actions within those that a module's actuators can do at x0, where it has `action_bounds`."""
-    find = getattr(system, "action_bounds", None)
-    if find is None:
+    """Clip the bounds of the actions to what a module's actuators can do at x0, if it has `action_bounds`."""
+    action_bounds = getattr(system, "action_bounds", None)
+    if action_bounds is None:
         return u_min, u_max
-    low, high = (v.to(u_min) for v in find(x0))
+    low, high = (v.to(u_min) for v in action_bounds(x0))
     return u_min.clamp(low, high), u_max.clamp(low, high)
 
 
 def check_system(lcs: object) -> System:
-    """Refuse what says no system."""
+    """Refuse anything but a system or a module that has one."""
     if not isinstance(lcs, LCSParams | LCSSequence) and not isinstance(lcs, LCSModule):
         raise DTypeError(
             f"lcs: expected LCSModel, LCSParams, LCSSequence or another LCSModule, got {describe(lcs)}; a module "
@@ -178,7 +178,7 @@ def check_system(lcs: object) -> System:
 
 
 def check_cost(cost: object) -> Cost:
-    """Refuse what is no cost."""
+    """Refuse anything but a cost."""
     if not isinstance(cost, PLAIN_COSTS) and not callable(getattr(cost, "at", None)):
         raise DTypeError(
             f"cost: expected GoalCost, QuadraticCost, CostSequence or another CostModule, got {describe(cost)}; build "
@@ -200,7 +200,7 @@ def check_context(context: Tensor | None, system: System, cost: Cost) -> None:
 
 
 def check_constraints(constraints: object) -> Constraints:
-    """Refuse what is no constraint."""
+    """Refuse anything but constraints."""
     if not isinstance(constraints, LinearConstraints | ConstraintSequence):
         raise DTypeError(
             f"constraints: expected LinearConstraints or ConstraintSequence, got {describe(constraints)}; build one "
@@ -210,7 +210,7 @@ def check_constraints(constraints: object) -> Constraints:
 
 
 def check_stage_bounds(bounds: object, **plain: object) -> StageBounds:
-    """Refuse what is no `StageBounds`, and bounds that are given twice."""
+    """Refuse anything but `StageBounds`, and bounds that are passed twice."""
     if not isinstance(bounds, StageBounds):
         raise DTypeError(
             f"bounds: expected StageBounds, got {describe(bounds)}; pass constant bounds as u_min and u_max"
@@ -227,7 +227,7 @@ class Inputs:
 
     Attributes:
         horizon: stages of the plan.
-        tensors: name → tensor as the caller gave it, or as the cost made it of a goal.
+        tensors: name → tensor from the caller, or made from a goal by the cost.
         by_stage: names of the inputs with a dimension of stages.
         sizes: n_x, n_u, n_lam, n_c.
     """
@@ -238,7 +238,7 @@ class Inputs:
     sizes: dict[str, int] = field(default_factory=dict)
 
     def add_system(self, lcs: System, x0: Tensor, context: Tensor | None, along: Primal | None = None) -> None:
-        """The matrices, asked for at these states, or along a plan from there, if it is a module."""
+        """Add the matrices; a module is asked for them at these states, or along a plan from there."""
         if isinstance(lcs, LCSParams | LCSSequence):
             system = lcs
         else:
@@ -258,7 +258,7 @@ class Inputs:
     def add_cost(
         self, cost: Cost, x0: Tensor, goal: Tensor | None, reference: Tensor | None, context: Tensor | None
     ) -> None:
-        """The weights, at a goal or along a reference if the cost has one; asked for at these states if a module."""
+        """Add the weights, at a goal or along a reference if the cost has one; a module is asked for them."""
         if not isinstance(cost, PLAIN_COSTS):
             if reference is not None:
                 raise ShapeError(
@@ -295,20 +295,20 @@ class Inputs:
         self.tensors.update(fields)
 
     def add_bounds(self, bounds: StageBounds) -> None:
-        """Bounds by stage."""
+        """Add bounds by stage."""
         self.check_sizes("bounds", n_u=bounds.n_u)
         self.check_horizon("bounds", bounds.horizon)
         self.tensors.update(bounds.tensors())
         self.by_stage |= bounds.by_stage
 
     def replace_bound(self, name: str, value: Bound | None) -> None:
-        """A bound of this call in place of another, if there is one."""
+        """Replace a bound by that of this call, if there is one."""
         if value is not None:
             self.tensors[name] = as_bound(name, value, [("n_u", self.sizes["n_u"])], self.tensors["Q"])
             self.by_stage.discard(name)
 
     def add_constraints(self, constraints: Constraints | None) -> None:
-        """Linear constraints, if there are any."""
+        """Add linear constraints, if there are any."""
         if constraints is None:
             return
         self.check_sizes("constraints", n_x=constraints.n_x)
@@ -321,15 +321,15 @@ class Inputs:
         self.tensors.update(constraints.tensors())
 
     def batch(self) -> torch.Size:
-        """Common batch dimensions; a clear error where devices or batch dimensions do not fit."""
+        """Compute the common batch dimensions; an error says where devices or batch dimensions do not fit."""
         leads = {}
         for name, tensor in self.tensors.items():
             size = tensor.ndim - RANKS[name] - (name in self.by_stage)
             if size:
                 leads[name] = tensor.shape[:size]
-        found = set(leads.values())
-        if len(found) <= 1 and all([tensor.is_cpu for tensor in self.tensors.values()]):
-            return found.pop() if found else torch.Size()
+        distinct = set(leads.values())
+        if len(distinct) <= 1 and all([tensor.is_cpu for tensor in self.tensors.values()]):
+            return distinct.pop() if distinct else torch.Size()
         check_same_device(reversed(self.tensors.items()))
         return broadcast_batch([(name, leads.get(name, torch.Size())) for name in reversed(self.tensors)])
 
@@ -337,12 +337,12 @@ class Inputs:
         """Number of dimensions of an input behind those of the batch."""
         return RANKS[name] + (name in self.by_stage)
 
-    def check_sizes(self, name: str, **found: int) -> None:
+    def check_sizes(self, name: str, **actual: int) -> None:
         """Refuse something that was built for other sizes than the system's."""
-        wanted = {size: self.sizes[size] for size in found}
-        if found != wanted:
-            expected, got = (", ".join(f"{k}={v}" for k, v in sizes.items()) for sizes in (wanted, found))
-            raise ShapeError(f"{name}: expected {expected} like the LCS, got {got}; build them for the same system")
+        expected = {size: self.sizes[size] for size in actual}
+        if actual != expected:
+            want, got = (", ".join(f"{k}={v}" for k, v in sizes.items()) for sizes in (expected, actual))
+            raise ShapeError(f"{name}: expected {want} like the LCS, got {got}; build them for the same system")
 
     def check_horizon(self, name: str, horizon: int) -> None:
         """Refuse something that was built for another number of stages than the layer's."""
@@ -352,16 +352,16 @@ class Inputs:
             )
 
     def numbers(
-        self, tensors: Mapping[str, Tensor], batch: tuple[int, ...], *, unseen: bool = False, own: bool = False
+        self, tensors: Mapping[str, Tensor], batch: tuple[int, ...], *, unseen: bool = False, copy: bool = False
     ) -> dict[str, Tensor]:
-        """Numbers as `MPCProblem` wants them, and the constant; checked, as far as nobody did before.
+        """Convert tensors to the numbers of an `MPCProblem`, and the constant; check those that are still unchecked.
 
         Args:
             tensors: all of the inputs or some; none of them is wrapped.
             batch: dimensions of the batch that all of them broadcast to.
-            unseen: whether nothing has looked at the numbers yet.
-            own: whether a system gets memory of its own: a solution is measured by the system that it was planned with,
-                also after a step of an optimiser.
+            unseen: whether the numbers are unchecked.
+            copy: whether to copy the system, so that a solution is measured by the one that it was planned with even
+                after a step of an optimiser.
         """
         values, unchecked, size = {}, {}, math.prod(batch)
         for name, tensor in tensors.items():
@@ -387,7 +387,7 @@ class Inputs:
             elif unseen or name in _COST:
                 unchecked[name] = value
             values[name] = value.contiguous()
-            if own and name in SYSTEM and values[name].data_ptr() == tensor.data_ptr():
+            if copy and name in SYSTEM and values[name].data_ptr() == tensor.data_ptr():
                 values[name] = value.clone()
         check_finite(unchecked)
         if unseen:
@@ -401,12 +401,12 @@ def check_guess(
     horizon: int,
     sizes: Mapping[str, int],
 ) -> dict[str, Tensor]:
-    """The parts of a guess, "guess.x" and so on; mu where it has some."""
+    """Check a guess and return its parts, "guess.x" and so on; mu only if it has some."""
     if guess is None:
         return {}
     if not isinstance(guess, MPCSolution | Primal):
         raise DTypeError(f"guess: expected an MPCSolution or a Primal such as solution.shift(), got {describe(guess)}")
-    found = {}
+    parts = {}
     for name, (extra, size) in GUESS.items():
         value, stages = getattr(guess, name), horizon + extra
         if name == "mu" and (value is None or (isinstance(value, Tensor) and not value.numel())):
@@ -419,6 +419,6 @@ def check_guess(
                 f"guess.{name}: expected batch dimensions {tuple(batch)} like x0, got {tuple(value.shape[:-2])}; "
                 f"expand or index it"
             )
-        found[f"guess.{name}"] = value.detach() if value.requires_grad else value
-    check_finite(found)
-    return found
+        parts[f"guess.{name}"] = value.detach() if value.requires_grad else value
+    check_finite(parts)
+    return parts

@@ -1,4 +1,4 @@
-"""What an MPC solve returns."""
+"""Solutions of the MPC."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class MPCSolution:
         return worst.reshape(self.status.shape).to(self.status.device)
 
     def shift(self) -> Primal:
-        """The plan one step later, its last step repeated: a guess for the next solve of a receding horizon."""
+        """Shift the plan by one step and repeat its last: a guess for the next solve of a receding horizon."""
         parts = (self.x, self.u, self.lam, self.mu)
         return Primal(*(torch.cat([v[..., 1:, :], v[..., -1:, :]], -2).detach() for v in parts))
 
@@ -96,7 +96,7 @@ class MPCSolution:
 
 
 def largest(values: Tensor) -> Tensor:
-    """Largest of (steps, batch, n) per element of the batch, (batch,); 0 where there is none, NaN where one is."""
+    """Compute the largest of (steps, batch, n) per batch element, (batch,); 0 if there is none, NaN if one is."""
     values = values.transpose(0, 1).flatten(1)
     return values.amax(1) if values.shape[1] else values.new_zeros(len(values))
 
@@ -107,7 +107,7 @@ def _by_step(*trajectories: Tensor) -> tuple[Tensor, ...]:
 
 
 class _Kept:
-    """A problem that a tree of tensors carries along; equal to itself alone, where comparing tensors would fail."""
+    """Problem that a tree of tensors carries along; equal only to itself, as tensors cannot be compared as a whole."""
 
     def __init__(self, problem: MPCProblem):
         self.problem = problem

@@ -6,8 +6,8 @@ says what a force does to the state. With the gap after the step linearised, the
     x₊ = A x + B u + d + W Jᵀ λ,    0 ≤ λ ⊥ φ + N (x₊ − x̄) + T (x₊ − x) + R λ ≥ 0,    J = N + T,
 
 with gaps φ and their derivatives N at the state x̄, and the compliance R of the contacts, which makes F + Fᵀ ≻ 0 and λ
-unique. A gap has grown since x̄, where it was measured; T, which has the tangents, counts what slides within the step,
-so that friction is right at every step of a plan and not at the first alone. Two models of dry friction are offered:
+unique. N multiplies the motion since x̄, where the gap was measured. T holds the tangents and multiplies the motion
+within the step, so that friction is right at every step of a plan. Two models of dry friction are offered:
 
 - Anitescu: the rows of J are the extreme rays n ± μ t of the friction cone. F is symmetric. A contact that slides opens
   by μ times the distance that it slides, an error that vanishes with the step.
@@ -15,10 +15,10 @@ so that friction is right at every step of a plan and not at the first alone. Tw
 - Stewart-Trinkle: normal force, friction in each direction and sliding distance each have a complementarity condition.
   (D. Stewart, J. Trinkle, "An implicit time-stepping scheme for rigid body dynamics with inelastic collisions and
   Coulomb friction", Int. J. Numer. Methods Eng. 39, 1996.)
-  By itself its F + Fᵀ is indefinite. What makes it definite is a drag: friction is at most μ λ_n + ε σ for a sliding
-  distance σ, in an open contact too, with the smallest ε that suffices. For one contact ε is about μ²/4 over the
-  mobility. Where several contacts share a load it grows as one over their compliance, and little is left of the law:
-  a `FrictionWarning` says so, and Anitescu's is the one to use there.
+  By itself its F + Fᵀ is indefinite. A drag makes it definite: friction is at most μ λ_n + ε σ for a sliding distance
+  σ, in an open contact too, with the smallest sufficient ε. For one contact ε is about μ²/4 over the mobility. If
+  several contacts share a load, ε grows as one over their compliance and the law is far from Coulomb's: a
+  `FrictionWarning` says so; use Anitescu's model there.
 """
 
 from __future__ import annotations

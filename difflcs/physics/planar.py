@@ -411,9 +411,9 @@ _MOST = 0.01  # of how far an impulse moves two bodies apart in a step: what a c
 def _damp(contacts: Contacts, response: Tensor, compliance: Tensor) -> tuple[Contacts, Tensor]:
     """Damp contacts so that they do not bounce in short steps; return how far (..., n_contacts) a force closes each.
 
-    Compliance r alone is a spring, which gives back what it takes if a step moves a body by less than r times the
-    impulse. A damper beside it lets it give way by g < r a step. With s = g/r that is φ₊ − (1 − s) φ + s r f = 0 for an
-    impulse f at a gap φ < 0, and φ = −r f at rest, as without it. A gap that is open counts in full, φ₊ + s r f = 0.
+    Compliance r alone is a spring: it returns its energy if a step moves a body by less than r times the impulse. A
+    damper beside it limits its motion in a step to g < r per impulse. With s = g/r, an impulse f at a gap φ < 0 meets
+    φ₊ − (1 − s) φ + s r f = 0, and at rest φ = −r f, as without damper. An open gap counts in full, φ₊ + s r f = 0.
     """
     most = _MOST * ((contacts.normal @ response) * contacts.normal).sum(-1)
     gap = torch.where(contacts.gap < 0, (most / compliance).clamp(0.0, 1.0) * contacts.gap, contacts.gap)

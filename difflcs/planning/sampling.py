@@ -1,20 +1,20 @@
 """Sampling-based contact MPC: push from here, or go to where pushing is worth more.
 
-An MPC that linearises contact at one state sees the surface next to it as an infinite plane: it pushes well, and does
-not find the way round a corner. So the same MPC is solved, as one batch, from where the robot is and from many places
-where its end effectors could be. The gain of a place is what its plan saves against standing still there. The robot
-pushes where it is while the gain there is near the best; else it travels, free of collision, to the place with the best
-gain after the price of the way, and pushes from there. A place from which the cost of standing still has not changed is
-barred until it does: round a corner a plan can promise for ever what no push brings.
+An MPC that linearises contact at one state sees the surface next to it as an infinite plane: it pushes well, but finds
+no way round a corner. So the same MPC is solved, as one batch, from the robot's place and from many other places of its
+end effectors. The gain of a place is the cost that its plan saves compared with standing still there. While the gain at
+the robot's place is near the best, the robot pushes from there. Else it travels, free of collision, to the place with
+the best gain after the price of the way. A place from which pushes have not changed the cost of standing still is
+barred until that cost changes: round a corner a plan can predict a gain for ever that no push achieves.
 
 Source: S. Venkatesh, B. Bianchini, A. Aydinoglu, W. Yang, M. Posa, "Approximating Global Contact-Implicit MPC via
 Sampling and Local Complementarity" (arXiv:2505.13350), called sampling C3. It compares whole costs, with the cost of
 travelling added, by C3 as the local controller and re-decides at each step; here the local controller is an
-`LCSMPCLayer`, gains are compared as parts of the cost of standing still, and a journey that has begun is finished.
+`LCSMPCLayer`, gains are relative to the cost of standing still, and a journey that has begun is finished.
 
-What it cannot do: it sees one push ahead, not two (a detour whose first push costs more than standing still is found
-only within the horizon); a place is judged as if the robot were there already; the body is taken to rest while the
-robot travels, and several end effectors not to collide with each other on the way.
+Limits: it looks one push ahead, not two: a detour whose first push costs more than standing still is found only within
+the horizon. A place is judged as if the robot were there already. The body is assumed to rest while the robot travels,
+and several end effectors are assumed not to collide with each other on the way.
 """
 
 from __future__ import annotations

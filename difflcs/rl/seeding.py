@@ -19,7 +19,7 @@ class Stream(IntEnum):
     TRAINING = 0
     """Initial states and goals of training episodes."""
     EVALUATION = 1
-    """Those of evaluations: never those of a training with the same seed."""
+    """Seeds of evaluations: never those of a training with the same seed."""
     MINIBATCH = 2
     """Split and minibatches of the warm-up."""
     ACTION = 3

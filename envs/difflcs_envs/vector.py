@@ -316,4 +316,4 @@ def _multiply(
 move_cube = functools.partial(_multiply, TriFingerMoveCubeEnv)
 move_object = functools.partial(_multiply, TriFingerMoveObjectEnv)
 turn_cube = functools.partial(_multiply, TriFingerTurnCubeEnv)
-"""What Gymnasium makes vectors of the three environments by; further arguments are those of the single one."""
+"""Vector entry points for Gymnasium, of the three environments; further arguments are those of the single one."""

@@ -463,36 +463,24 @@ def test_bench(capsys):
     assert [timing["work"] for timing in record["timings"]] == ["forward", "forward + backward"]
 
 
-def test_resume_after_any_crash_gives_the_same_run(capsys, finished, tmp_path, monkeypatch):
-    """Die after the checkpoint of iteration 1, then between log and checkpoint of 2, then before the final model."""
+def test_an_interrupted_training_says_how_to_go_on(capsys, finished, tmp_path, monkeypatch):
+    """Interrupted before the final model; after any iteration: tests/conformance/test_methods.py."""
     path = tmp_path / "run"
 
     def die(*_, **__):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(cli_train.Progress, "iterated", die)
+        patch.setattr("difflcs.lcs.LCSModel.save_pretrained", die)
         code, _, err = run(capsys, "train", "--method", "violation", "--smoke", "--out", path)
     assert code == 130
     assert f"difflcs train --out {path} --resume" in err
     code, out, _ = run(capsys, "evaluate", path, "--smoke")
     assert code == 0
     assert "not finished" in out
-    with monkeypatch.context() as patch:
-        patch.setattr("difflcs.rl.runs.training.save_checkpoint", die)
-        assert run(capsys, "train", "--out", path, "--resume")[0] == 130
-    with monkeypatch.context() as patch:
-        patch.setattr("difflcs.lcs.LCSModel.save_pretrained", die)
-        assert run(capsys, "train", "--out", path, "--resume")[0] == 130
     assert run(capsys, "train", "--out", path, "--resume")[0] == 0
-    for name in ("model/model.safetensors", "checkpoints/000003/model.safetensors", "checkpoints/000003/config.json"):
-        assert (path / name).read_bytes() == (finished / name).read_bytes()
-    logs = [[_untimed(row) for row in RunDirectory.open(run).rows()] for run in (path, finished)]
-    assert logs[0] == logs[1]
-
-
-def _untimed(row: dict[str, str]) -> dict[str, str]:
-    return {name: cell for name, cell in row.items() if not name.endswith("_seconds")}
+    model = "model/model.safetensors"
+    assert (path / model).read_bytes() == (finished / model).read_bytes()
 
 
 def test_render(capsys, finished, tmp_path):

@@ -8,13 +8,14 @@ import ctypes
 import importlib
 import importlib.util
 import io
+import multiprocessing
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
 import sys
 import textwrap
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -47,23 +48,24 @@ def generated():
     return module
 
 
-def test_there_are_pages_with_code():
-    assert {"quickstart.md", "own_system.md", "gradients.md", "backends.md"} <= {
-        name(p) for p in PAGES if blocks(p, "python")
-    }
+FORKS = multiprocessing.get_context(
+    "forkserver"
+)  # of a process that has imported what takes seconds, and nothing of us
+FORKS.set_forkserver_preload(["torch", "torchrl.data", "gymnasium", "mujoco", "casadi"])
 
 
 def run_code(code: list[str], folder: Path) -> None:
     """Run blocks in a process and a folder of their own: they may register what they want, and read nothing of ours."""
     pytest.importorskip("gymnasium")
     pytest.importorskip("torchrl")
-    script = folder / "page.py"
-    script.write_text("import torch\n\ntorch.set_num_threads(1)\n" + "\n".join(code))
-    done = subprocess.run(
-        [sys.executable, script], capture_output=True, text=True, timeout=600, check=False, cwd=folder
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    for line in done.stderr.splitlines():
+    script, said = folder / "page.py", folder / "said"
+    head = f"import os\nos.chdir({str(folder)!r})\nos.dup2(os.open({str(said)!r}, os.O_CREAT | os.O_WRONLY), 2)\n"
+    script.write_text(head + "import torch\n\ntorch.set_num_threads(1)\n" + "\n".join(code))
+    process = FORKS.Process(target=runpy.run_path, args=(str(script),), kwargs={"run_name": "__main__"})
+    process.start()
+    process.join(600)
+    assert process.exitcode == 0, said.read_text()[-3000:]
+    for line in said.read_text().splitlines():
         assert "difflcs" not in line, f"a warning that the page does not mention: {line}"
 
 
@@ -135,11 +137,6 @@ def test_code_fits_the_page(page):
     for language in ("python", "bash", "console"):
         for code in blocks(page, language):
             assert [line for line in code.splitlines() if len(line) > 90] == []
-
-
-def test_blocks_are_rarely_skipped():
-    skipped = [code for page in PAGES for code in blocks(page, "python") if SKIP.match(code)]
-    assert len(skipped) <= 2
 
 
 @pytest.fixture
@@ -258,31 +255,6 @@ def test_a_page_that_is_out_of_date_is_found(generated):
     page = (DOCS / "settings.md").read_text()
     stale = page.replace("| `--seed` |", "| `--sead` |")
     assert page == generated.refresh(stale) != stale
-
-
-def test_cards_are_links_in_the_repository_and_a_grid_in_the_site(generated):
-    grid = generated.fill("<!-- cards -->\n\n- [Install](installing.md): how to.\n\n<!-- end -->")
-    assert ":::{grid-item-card} Install\n:link: installing\n" in grid
-    assert "\nHow to.\n" in grid
-
-
-def test_the_addresses_to_cite_are_those_of_the_project():
-    urls = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]
-    text = (DOCS / "citing.md").read_text()
-    assert f"]({urls['Paper']})" in text
-    assert f"]({urls['Homepage']})" in text
-    assert f"{{{urls['Paper'].rsplit('/', 1)[1]}}}" in text  # eprint
-
-
-def test_fractions_are_read_as_they_are_meant():
-    mathml = importlib.util.spec_from_file_location("mathml", DOCS / "mathml.py")
-    assert mathml
-    assert mathml.loader
-    pytest.importorskip("docutils")
-    pytest.importorskip("sphinx")
-    module = importlib.util.module_from_spec(mathml)
-    mathml.loader.exec_module(module)
-    assert module.spell_out(r"\tfrac12 x + \frac1\xi + \frac{a}{b}") == r"\tfrac{1}{2} x + \frac{1}{\xi} + \frac{a}{b}"
 
 
 def test_the_site_builds(tmp_path):

@@ -60,26 +60,6 @@ def test_inverse_kinematics_knows_the_start_posture(finger):
     np.testing.assert_allclose(knee[0, 2], 0.29 - 0.16 * np.cos(0.9), atol=1e-4)
 
 
-def test_fingers_are_turned_copies_of_each_other():
-    from trifinger_push.fingers import inverse, planar_turn
-
-    tips = np.array([[0.02, 0.08, 0.03], [-0.05, 0.1, 0.05], [0.0, 0.0, 0.1]])
-    first, knee = inverse(0, tips)
-    turned = tips.copy()
-    turned[:, :2] = tips[:, :2] @ planar_turn(2 * np.pi / 3).T
-    second, other = inverse(2, turned)
-    np.testing.assert_allclose(second, first, atol=1e-12)
-    np.testing.assert_allclose(other[:, :2], knee[:, :2] @ planar_turn(2 * np.pi / 3).T, atol=1e-12)
-
-
-def test_out_of_reach_is_not_a_number():
-    from trifinger_push.fingers import inverse
-
-    angles, knee = inverse(0, np.array([[0.0, 0.5, 0.02], [0.0, -0.15, 0.022]]))  # too far; second joint below 0
-    assert np.isnan(angles).any(1).all()
-    assert np.isnan(knee).any(1).all()
-
-
 @pytest.mark.parametrize("face", [([1, 0, 0], 0), ([1, 0, 0], 1), ([1, 0, 0], 2), ([1, 0, 0], 3), ([0, 1, 0], 1)])
 def test_yaw_of_a_cube_on_any_face(face):
     from trifinger_push.cube import planar_pose
@@ -111,17 +91,6 @@ def test_the_cube_has_moved_since_its_picture():
     np.testing.assert_allclose(pose, [0.02, 0.0, 0.0], atol=5e-4)
 
 
-def test_lifted_tips_move_nothing():
-    from trifinger_push.cube import CubeEstimator
-
-    estimator = CubeEstimator(friction=0.5)
-    tips = np.array([[-0.06, 0.0, 0.1], [0.1, 0.1, 0.1], [0.1, -0.1, 0.1]])
-    for age in (0.09, 0.11, 0.13):
-        pose = estimator.update(camera([0.0, 0.0, 0.4], age), tips)
-        tips[0, 0] += 0.02
-    np.testing.assert_allclose(pose, [0.0, 0.0, 0.4], atol=1e-6)
-
-
 def test_the_system_of_a_finger_is_that_of_the_plane_and_stays_what_it_is():
     from trifinger_push.places import OneFinger
 
@@ -133,25 +102,6 @@ def test_the_system_of_a_finger_is_that_of_the_plane_and_stays_what_it_is():
     torch.testing.assert_close(after[:5], flat)
     assert float(flat[0]) > float(x[0])
     torch.testing.assert_close(after[5:], torch.stack([x[5] - 0.1, x[6]]))
-
-
-def test_each_finger_has_places_on_its_own_side_only():
-    from trifinger_push.cube import HALF, TIP_RADIUS, UNIT, box_distance
-    from trifinger_push.fingers import TURNS, planar_turn
-    from trifinger_push.places import FingerPlaces
-
-    places, x = FingerPlaces(), state([0.0, 0.0, 0.0], [0.1, 0.0, 0.1], 0.0)
-    rows = places.sample(x).numpy()
-    assert set(rows[:, 0]) == {0.0, 1.0, 2.0}
-    for finger in range(3):
-        own = rows[rows[:, 0] == finger, 1:] * UNIT
-        assert (box_distance(own) > TIP_RADIUS).all()
-        inward = planar_turn(TURNS[finger]) @ [0.0, -1.0]
-        # Its link leans outward: it cannot stand on the far side of the cube, seen from its mount.
-        assert not (own @ inward > HALF + TIP_RADIUS).any()
-    beside_wall = state([0.14, 0.0, 0.0], [0.1, 0.0, 0.1], 0.0)
-    at = places.states(beside_wall, places.sample(beside_wall)).numpy()[:, 3:5] * UNIT
-    assert (np.linalg.norm(at, axis=1) < 0.183 + 1e-9).all()
 
 
 def test_a_face_that_was_refused_is_not_offered_until_later():

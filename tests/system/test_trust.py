@@ -8,7 +8,6 @@ from __future__ import annotations
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 import torch
 
@@ -83,60 +82,7 @@ def test_a_broken_element_has_a_large_residual():
         assert bool(torch.isfinite(value).all())
 
 
-# --- LCP ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("relaxation", [0.0, 1e-5, 1e-3])
-@pytest.mark.parametrize("epsilon", [1e-4, 1e-6, 1e-8, 1e-10])
-@pytest.mark.filterwarnings("ignore::difflcs.errors.SolveWarning")
-def test_a_dominant_skew_part_is_solved_or_refused(relaxation, epsilon):
-    rng = np.random.default_rng(380)
-    K = rng.standard_normal((400, 5, 5))
-    F, q = torch.from_numpy(K - K.swapaxes(1, 2) + epsilon * np.eye(5)), torch.from_numpy(rng.standard_normal((400, 5)))
-    lam, w, status = solve_lcp(F, q, relaxation)
-    solved = status == Status.CONVERGED
-    missed = (w - (F @ lam.unsqueeze(-1)).squeeze(-1) - q).abs().amax(-1) / q.abs().amax(-1)
-    assert float(missed[solved].max()) <= 1e-7
-    assert bool((torch.minimum(lam, w) >= 0).all())
-    assert bool(torch.isfinite(lam).all() and torch.isfinite(w).all())
-    share = float(solved.double().mean())
-    assert share >= {1e-4: 1.0, 1e-6: 0.99, 1e-8: 0.4, 1e-10: 0.0}[epsilon]
-
-
-def test_an_lcp_beyond_the_range_of_numbers_is_refused_and_its_gradient_is_finite():
-    F = torch.stack([torch.eye(3, dtype=F64), 1e-300 * torch.eye(3, dtype=F64)]).requires_grad_()
-    with pytest.warns(SolveWarning):
-        solution = solve_lcp(F, -torch.ones(2, 3, dtype=F64))
-    assert solution.status.tolist() == [Status.CONVERGED, Status.NUMERICAL]
-    solution.lam.sum().backward()
-    assert bool(torch.isfinite(F.grad).all())
-    assert torch.equal(F.grad[1], torch.zeros(3, 3, dtype=F64))
-
-
-def test_float32_overflow_of_an_lcp_is_a_status():
-    F = torch.tensor([[1e-20]])
-    with pytest.warns(SolveWarning):
-        solution = solve_lcp(F, torch.tensor([[-1e30], [-1.0]]))
-    assert solution.status.tolist() == [Status.NUMERICAL, Status.NUMERICAL]
-    assert bool(torch.isfinite(solution.lam).all())
-
-
 # --- flat costs -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("R", [0.0, 1e-12, 1e-7, 1e-3])
-@pytest.mark.parametrize("scale", [1.0, 1e-9, 1e6])
-@pytest.mark.parametrize("backend", ["batched", "ipopt", "relaxed"])
-def test_a_linear_cost_ends_at_its_vertex_from_any_guess(R, scale, backend):
-    def solve(r, guess=None):
-        system, cost = one_action(R=R * scale, r=r * scale)
-        layer = LCSMPCLayer(system, cost, 3, -0.05, 0.05, backend=backend)
-        return layer(torch.zeros(1, dtype=F64), guess=guess)
-
-    low = solve(1.0)
-    torch.testing.assert_close(low.u, torch.full_like(low.u, -0.05), rtol=0, atol=1e-7)
-    high = solve(-1.0, guess=low.shift())
-    torch.testing.assert_close(high.u, torch.full_like(high.u, 0.05), rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("backend", ["batched", "ipopt"])
@@ -159,35 +105,6 @@ def test_an_action_without_cost_or_effect_is_degenerate_and_has_a_finite_gradien
     single = QuadraticCost(cost.Q, matrix([1.0]), cost.Q_final)
     LCSMPCLayer(system, single, 3, -1.0, 1.0)(torch.tensor([[0.5], [-0.3]], dtype=F64)).u.square().sum().backward()
     torch.testing.assert_close(A.grad, alone.grad, rtol=1e-6, atol=1e-9)
-
-
-# --- float32 --------------------------------------------------------------------------------------------------------
-
-
-def test_float32_actions_keep_float64_bounds():
-    system, cost = one_action(r=-10.0)
-    plan = LCSMPCLayer(system, cost, 3, -0.3, 0.3)(torch.zeros(1))
-    assert plan.u.dtype == torch.float32
-    assert bool((plan.u.double() <= 0.3).all())
-    assert float(plan.u.min()) > 0.2999999
-    system, cost = one_action(r=10.0)
-    plan = LCSMPCLayer(system, cost, 3, -0.1, 0.3)(torch.zeros(1))
-    assert bool((plan.u.double() >= -0.1).all())
-
-
-def test_float32_overflow_of_a_plan_is_a_status_and_spoils_no_neighbour():
-    system, cost = one_action(Q=1e-30)
-    A = (1e3 * system.A).requires_grad_()
-    layer = LCSMPCLayer(
-        LCSParams(**{**system.tensors(), "A": A}), cost, 14, -1.0, 1.0, on_failure="mask"
-    )  # x_H = 1e42 x_0
-    with pytest.warns(SolveWarning):
-        plan = layer(torch.tensor([[1.0], [0.0]]))
-    assert plan.status[0] == Status.NUMERICAL
-    for value in (plan.x, plan.u, plan.lam, plan.objective):
-        assert bool(torch.isfinite(value).all())
-    plan.x.sum().backward()
-    assert bool(torch.isfinite(A.grad).all())
 
 
 # --- autograd's own rules -------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from torch import nn
 
 from difflcs import LCSModel, LCSParams, LCSSequence
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
-from tests.training.heavy_block import FORCE, HeavyBlock, Network, Physics, make_mpc, true_system
+from tests.training.heavy_block import FORCE, HeavyBlock, Network, Physics, make_mpc
 
 pytest.importorskip("torchrl")
 from tensordict import TensorDict
@@ -31,7 +31,6 @@ from difflcs.rl import (
     make_ppo,
 )
 from difflcs.rl.learning.ppo import PPO
-from difflcs.rl.learning.state import flatten
 from difflcs.rl.rollout import contexts, make_empty_record, mpc_actions, transitions
 from difflcs.rl.runs.checkpoint import load_checkpoint, save_checkpoint
 from tests.training import slide
@@ -194,14 +193,6 @@ def test_a_context_that_changes_is_refused():
         collect(env, mpc_actions(slide.make_mpc(Gain())), [1, 2], slide.STEPS)
 
 
-def test_a_constant_model_takes_no_notice():
-    record = collect(
-        make_envs(2), mpc_actions(make_mpc(LCSModel.from_params(true_system(), stiffness=1e-3))), [1, 2], STEPS
-    )
-    assert not record["failures"].any()
-    assert "context" in record.keys()
-
-
 # --- the Jacobian -----------------------------------------------------------------------------------------------------
 
 
@@ -262,37 +253,6 @@ def test_jacobian_of_a_system_for_each_sample(lcs):
 # --- resuming ---------------------------------------------------------------------------------------------------------
 
 
-def same_state(a: Any, b: Any) -> bool:
-    (tensors, rest), (others, other_rest) = flatten(a.state_dict()), flatten(b.state_dict())
-    alike = rest == other_rest and tensors.keys() == others.keys()
-    return alike and all(torch.equal(value, others[name]) for name, value in tensors.items())
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        make_warmup,
-        lambda: make_warmup(Network(torch.Generator().manual_seed(0))),
-        lambda: make_trainer(Gain(), beta=0.7, covariance="diagonal"),
-        lambda: make_trainer(Gain(), update="adam", minibatch=30),
-    ],
-    ids=["warm-up", "network", "natural", "adam"],
-)
-def test_resumed_equals_uninterrupted_bitwise(make, tmp_path):
-    through, first, second = make(), make(), make()
-    for _ in range(3):
-        through.step()
-    first.step()
-    save_checkpoint(tmp_path, first.iteration, first.state_dict())
-    first.step()  # lost by the crash
-    second.load(load_checkpoint(tmp_path))
-    for _ in range(2):
-        second.step()
-    assert not same(parameters(first), parameters(through))
-    assert same(parameters(second), parameters(through))
-    assert same_state(second, through)
-
-
 class Tied(Physics):
     """One parameter under two names."""
 
@@ -306,12 +266,13 @@ def test_tied_parameters_are_saved(tmp_path):
     first.step()
     save_checkpoint(tmp_path, first.iteration, first.state_dict())
     second.load(load_checkpoint(tmp_path))
-    assert same_state(first, second)
+    assert same(parameters(first), parameters(second))
     assert len(list(second.learned.parameters())) == 3  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_load_refuses_hostile_states(refuses_hostile_checkpoints):
-    refuses_hostile_checkpoints(make_warmup())
+@pytest.mark.parametrize("make", [make_warmup, lambda: make_trainer(Gain(), beta=0.7, covariance="diagonal")])
+def test_load_refuses_hostile_states_and_goes_on_from_its_own(refuses_hostile_checkpoints, make):
+    refuses_hostile_checkpoints(make())
 
 
 def test_load_refuses_another_module():

@@ -15,7 +15,6 @@ from difflcs.errors import InvalidInputError
 from difflcs.rl import EnsembleSettings, Epochs, ModelRollouts, ModelRolloutSettings
 from difflcs.rl.learning.dynamics import Ensemble
 from difflcs.rl.learning.model_rollouts import ModelEnv
-from difflcs.rl.rollout import collect, uniform_actions
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -54,7 +53,7 @@ def make_env(ensemble: Ensemble | None = None, num_envs: int = 3) -> ModelEnv:
     ensemble = ensemble or Drift(N_X, N_U, 2, 4)
     env = ModelEnv(ensemble, outcome, num_envs, STEPS, SPACES.single_observation_space, SPACES.single_action_space)
     real = episodes()
-    env.remember(real["state"], real["goal"])
+    env.set_episodes(real["state"], real["goal"])
     return env
 
 
@@ -130,13 +129,6 @@ def test_episodes_end_together_and_begin_anew():
     assert all(row in starts for row in observation["state"].tolist())
 
 
-def test_collect_plays_it():
-    env = make_env()
-    played = collect(env, uniform_actions(env, np.random.default_rng(0)), [1, 2], STEPS)
-    assert played["state"].shape == (2, STEPS + 1, N_X)
-    assert bool(played["stable"].all())
-
-
 def test_predictions_stay_near_the_data_and_finite():
     class Broken(Ensemble):
         def forward(self, x, u):
@@ -205,19 +197,6 @@ def test_foreseen_is_what_was_played():
 
 
 # --- data and ensemble ------------------------------------------------------------------------------
-
-
-def test_the_ensemble_learns_the_episodes():
-    rollouts = make_rollouts(width=64, first=150, minibatch=32)
-    rollouts.add(episodes(60))
-    rollouts.fit()
-    other = episodes(20, seed=5)
-    states, inputs = other["state"], (other["state"][:, :-1], other["action"])
-    with torch.no_grad():
-        predicted = rollouts.ensemble(*(v.flatten(0, 1).float().expand(2, -1, -1) for v in inputs)).mean(0)
-    changes = (states[:, 1:] - states[:, :-1]).flatten(0, 1)
-    error = predicted - states[:, 1:].flatten(0, 1)
-    assert float(error.square().mean()) < 0.05 * float(changes.square().mean())
 
 
 def test_the_first_fit_takes_epochs_of_its_own(monkeypatch):

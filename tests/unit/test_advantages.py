@@ -152,12 +152,6 @@ def test_the_others_are_drawn_from_the_policy():
     assert float(offsets.mean(0).abs().max()) < 0.05
 
 
-def test_two_actions_are_the_one_taken_and_its_image():
-    taken = gaussian(3)
-    action = mirrored_actions(taken, 2)["action"]
-    torch.testing.assert_close(action[:, 1], 2 * taken["loc"] - taken["action"])
-
-
 def test_advantages_are_those_of_the_formula():
     generator = torch.Generator().manual_seed(0)
     q = torch.randn(7, 5, 4, generator=generator, dtype=torch.float64)

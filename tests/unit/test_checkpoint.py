@@ -98,11 +98,7 @@ CORRUPTIONS = {
     "latest is foreign": lambda root: (root / "latest.json").write_text("[]"),
     "latest leads outside": lambda root: (root / "latest.json").write_text('{"checkpoint": "../1"}'),
     "no directory": lambda root: shutil.rmtree(root / "000002"),
-    "no tensors": lambda root: (root / "000002/model.safetensors").unlink(),
-    "no description": lambda root: (root / "000002/config.json").unlink(),
     "a flipped bit": lambda root: _flip(root / "000002/model.safetensors"),
-    "truncated tensors": lambda root: (root / "000002/model.safetensors").write_bytes(b"\x08\x00\x00"),
-    "truncated description": lambda root: (root / "000002/config.json").write_text('{"format": 1,'),
     "an edited counter": lambda root: _edit(
         root / "000002/config.json", lambda r: r["config"]["state"].update(collected=99)
     ),

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import nn
 
-from difflcs import CostSequence, GoalCost, LCSMPCLayer, QuadraticCost
+from difflcs import CostSequence, GoalCost, QuadraticCost
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 
 
@@ -49,15 +49,6 @@ def test_reach_is_the_cost_of_the_paper_with_its_constant(build, seed):
     n = build.normal(seed)
     x, u, goal = n(6, 9), n(5, 6), n(3)
     assert evaluate(build.paper_cost()(goal, horizon=5), x, u) == pytest.approx(paper(x, u, goal), rel=1e-12)
-
-
-def test_the_objective_of_a_plan_is_the_cost_of_the_paper_on_its_trajectory(build):
-    n = build.normal(1)
-    x0, goal = 0.05 * n(4, 9), 0.05 * n(4, 3)
-    solution = LCSMPCLayer(build.pushing(), build.paper_cost(), 5, -0.015, 0.015, backend="ipopt")(x0, goal)
-    for i in range(4):
-        expected = paper(solution.x[i], solution.u[i], goal[i])
-        assert float(solution.objective[i]) == pytest.approx(expected, rel=1e-10)
 
 
 def test_only_the_symmetric_parts_matter(build):

@@ -173,18 +173,6 @@ def test_gradients_of_each_sample_by_the_shared_parameters(layer, x0):
         torch.testing.assert_close(gradient, each[name].reshape(3, 2, *gradient.shape[1:]).sum(1), rtol=1e-7, atol=1e-9)
 
 
-def test_gradients_of_systems_beside_a_batch(build, layer, x0, systems):
-    def loss(system, x):
-        return layer(x, lcs=LCSParams(**system)).u.square().sum()
-
-    found = vmap(grad(loss), in_dims=(0, None))(systems, x0)
-    for i in (1, 5):
-        leaves = {k: v[i].clone().requires_grad_() for k, v in systems.items()}
-        loss(leaves, x0).backward()
-        for name, leaf in leaves.items():
-            torch.testing.assert_close(found[name][i], leaf.grad, rtol=1e-7, atol=1e-10)
-
-
 @pytest.mark.parametrize("vectorize", [False, True])
 def test_jacobians(layer, x0, vectorize):
     plain = jacobian_by_rows(layer, x0)
@@ -213,29 +201,6 @@ def test_a_batch_of_gradients_at_once(layer, x0):
     (found,) = torch.autograd.grad(both, leaf, right, is_grads_batched=True)
     envelope = torch.autograd.grad(layer(leaf).objective.sum(), leaf)[0]
     close(found.transpose(0, 1), jacobian_by_rows(layer, x0) + envelope[:, None])
-
-
-def test_jacobians_by_parameters(layer, x0):
-    weight = layer.lcs.B.detach().clone()
-
-    def action(B):
-        return functional_call(layer, {"lcs.B": B}, (x0[:2],)).action
-
-    rows = jacrev(action)(weight)
-    assert rows.shape == (2, 2, 4, 2)
-    leaf = weight.clone().requires_grad_()
-    for i in range(2):
-        (plain,) = torch.autograd.grad(action(leaf)[i, 1], leaf)
-        torch.testing.assert_close(rows[i, 1], plain, rtol=1e-7, atol=1e-10)
-
-
-def test_float32_stays_float32(build, x0):
-    narrow = LCSMPCLayer(build.model(3, scale=0.4, dtype=torch.float32), build.cost(0), 3, -0.15, 0.15, relaxation=1e-4)
-    found = vmap(grad(lambda x: narrow(x).u.sum()))(x0.float())
-    assert found.dtype == torch.float32
-    leaf = x0.float().requires_grad_()
-    narrow(leaf).u.sum().backward()
-    torch.testing.assert_close(found, leaf.grad)
 
 
 # --- second derivatives ---------------------------------------------------------------------------------------------

@@ -1,65 +1,20 @@
 """PPO with a network instead of the MPC, on a small system that needs no simulator."""
 
-from dataclasses import replace
-
 import pytest
 import torch
-from gymnasium.vector import SyncVectorEnv
 
 pytest.importorskip("torchrl")
 from difflcs.errors import CheckpointError
-from difflcs.rl.learning.critic import CriticSettings
 from difflcs.rl.learning.mlp import MLPController
-from difflcs.rl.learning.policy import make_actor
-from difflcs.rl.learning.ppo_settings import make_ppo
-from difflcs.rl.methods import get_method
-from difflcs.rl.runs.evaluate import evaluate
-from difflcs.rl.settings import Adam, Epochs
-from tests.training.slide import STEPS, U_MAX, Slide, features
+from tests.training.slide import STEPS, U_MAX, features
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-ROLLOUTS = 20
 BOUND = torch.full((1,), U_MAX, dtype=torch.float64)
 
 
 def make_network(width: int = 16, seed: int = 0) -> MLPController:
     return MLPController(features, 3, -BOUND, BOUND, width, STEPS, torch.Generator().manual_seed(seed))
-
-
-@pytest.mark.slow
-def test_it_learns():
-    settings = replace(
-        get_method("ppo-mlp")().ppo,
-        rollouts=ROLLOUTS,
-        steps=30,
-        minibatch=50,
-        std=0.03,
-        std_range=(0.01, 0.1),
-        std_learning_rate=3e-3,
-        adam=Adam(3e-3, (0.9, 0.999)),
-        critic=CriticSettings(epochs=Epochs(first=10, each=10, minibatch=256)),
-    )
-    trainer = make_ppo(
-        make_actor(make_network(64), settings.std, settings.covariance),
-        SyncVectorEnv([Slide] * ROLLOUTS),
-        settings,
-        0,
-        features=features,
-        total_episodes=12 * ROLLOUTS,
-        episode_steps=STEPS,
-        failure_penalty=10.0,
-    )
-    envs = trainer.robot.env
-    before = evaluate(envs, trainer.policy, 60, 0, STEPS).success_rate
-    while not trainer.done:
-        report = trainer.step()
-    assert before < 0.35
-    assert evaluate(envs, trainer.policy, 60, 0, STEPS).success_rate > before + 0.4
-    assert report.solver_failures == 0
-    assert report.gradient_steps == 30
-    assert report.std != pytest.approx(0.03)
-    assert trainer.learned is trainer.policy
 
 
 def test_actions_stay_within_the_bounds_and_depend_on_the_time():

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.autograd.functional import jacobian
 
-from difflcs import LCSModule, LCSMPCLayer, QuadraticCost, prediction_loss, violation_loss
+from difflcs import LCSModule, LCSMPCLayer, QuadraticCost
 from difflcs.errors import DTypeError, FrictionWarning, InvalidInputError, ShapeError
 from difflcs.physics import (
     Bounded,
@@ -31,7 +31,6 @@ from difflcs.physics import (
 )
 from difflcs.physics.complementarity import count_forces
 from difflcs.physics.learnable import LEARNABLE
-from difflcs.scales import ScaledLCS, Scales
 
 F64 = torch.float64
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -526,18 +525,6 @@ def test_impacts_never_add_energy(seconds, friction, compliance):
     assert float((found - found.cummin(0).values).max()) < 1e-3
 
 
-def test_discs_with_mass_are_pushed_back():
-    system = pushing(**DRIVES["force"], n_discs=1)
-    x = torch.zeros(system.n_x, dtype=F64)
-    x[3], x[5] = -0.0401, 0.5  # a disc that flies at the body with 0.5 m/s
-    after = system.params(x).step(x, torch.zeros(2, dtype=F64)).x_next
-    body, disc = float(after[-3]), float(after[5])
-    assert body > 0.1
-    assert abs(body - disc) < 0.01  # an inelastic collision
-    # Momentum, but for the damping of a step: the disc loses 0.2 (e^-0.05 · 0.5 − v), the body gains 0.1 v.
-    torch.testing.assert_close(tensor(0.2 * (math.exp(-0.05) * 0.5 - disc)), tensor(0.1 * body), rtol=1e-6, atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("wrong", "error", "match"),
     [({"radius": tensor([0.1, 0.1, 0.1])}, ShapeError, "radius: expected a number or"),
@@ -591,34 +578,6 @@ def test_gradients_by_masses_drives_and_states(build):
     vertices = box(-0.03, 0.03, -0.03, 0.03).vertices.clone()
     values = [tensor(0.1), tensor(2.0), tensor(0.2), tensor(1.0), tensor(0.4), vertices, x]
     assert torch.autograd.gradcheck(step, [v.requires_grad_() for v in values], atol=1e-4, rtol=1e-3)
-
-
-@pytest.mark.parametrize("loss", [violation_loss, prediction_loss])
-def test_physics_is_learned_from_a_few_pushes(build, loss):
-    true = pushing(n_discs=2, compliance=0.05, friction=0.3, gyration=0.03, center_of_mass=(0.004, 0.0))
-    model = ContactLCS(pushing(n_discs=2, compliance=0.05), ("center_of_mass", "gyration", "friction"))
-    rng = build.normal(0)
-    x, u = torch.zeros(100, true.n_x, dtype=F64), 0.01 * rng(100, true.n_u)
-    angle = 2 * math.pi * torch.rand(100, 2, dtype=F64, generator=torch.Generator().manual_seed(1))
-    x[:, 3:] = (0.045 * torch.stack([angle.cos(), angle.sin()], -1)).flatten(1)
-    with torch.no_grad():
-        x_next = true.params(x).step(x, u).x_next
-    units = tensor([100.0, 100.0, 3.0, *[1.0] * 4])
-    optimizer = torch.optim.Adam(model.parameters(), 0.1)
-    assert abs(float(model.physics.gyration.detach()) - 0.03) > 0.004
-
-    # The loss weighs what the units make large: millimetres here.
-    scaled = ScaledLCS(model, Scales(torch.zeros(7, dtype=F64), units, torch.ones(4, dtype=F64), 1.0, 1.0))
-    for _ in range(50):
-        optimizer.zero_grad()
-        value = loss(scaled, x * units, u, x_next * units)
-        value.backward()
-        optimizer.step()
-    learned = model.physics
-    torch.testing.assert_close(learned.gyration.detach(), tensor(0.03), rtol=0.03, atol=0)
-    torch.testing.assert_close(learned.friction.detach(), tensor([0.3, 0.3]), rtol=0.1, atol=0)
-    torch.testing.assert_close(learned.center_of_mass.detach(), tensor([0.004, 0.0]), rtol=0, atol=5e-4)
-    assert set(model.summary()) == {"center_of_mass", "gyration", "friction"}
 
 
 def test_a_moved_outline_keeps_its_directions():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 import pytest
 import torch
@@ -81,7 +83,8 @@ def test_threads_find_what_one_finds():
     for found, expected in zip(together, zip(*alone, strict=True), strict=True):
         assert torch.equal(found, torch.stack(expected))
     for name in ("A", "B", "d"):
-        torch.testing.assert_close(getattr(system, name), torch.stack([getattr(s, name) for s in systems]))
+        each = torch.stack([getattr(s, name) for s in systems])
+        torch.testing.assert_close(getattr(system, name), each, rtol=1e-5, atol=1e-5)
 
 
 def test_more_contacts_than_the_default_warn_once():
@@ -98,7 +101,11 @@ def test_more_contacts_than_the_default_warn_once():
 def test_an_error_of_mujoco_is_ours_and_leaves_the_module_usable(threads, monkeypatch):
     """There is no memory to measure two meshes, and none is needed where they are far apart."""
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
-    module = MujocoLCS(pile(("mesh", "mesh"), memory="24K"), motion="dynamic")
+    module, size = None, 4
+    while module is None:  # as little memory as it can be made with, in each version of MuJoCo another
+        with suppress(InvalidInputError, ValueError):
+            module = MujocoLCS(pile(("mesh", "mesh"), memory=f"{size}K"), motion="dynamic")
+        size += 1
     far = torch.tensor([[0, 0, 1, 0, 0, 0, 9, 0, 1, 0, 0, 0, *[0] * 12]] * 2).double()
     near = far.clone()
     near[1, 6] = 0.1

@@ -5,11 +5,8 @@ import math
 import subprocess
 import sys
 
-import gymnasium
-import numpy as np
 import pytest
 import torch
-from gymnasium import spaces
 
 from difflcs import GoalCost, LCSModel, LCSMPCLayer
 from difflcs.errors import DTypeError, InvalidInputError
@@ -17,9 +14,7 @@ from difflcs.errors import DTypeError, InvalidInputError
 pytest.importorskip("torchrl")
 from tensordict import TensorDict
 from torchrl.data import Unbounded
-from torchrl.envs import ClipTransform, GymWrapper, TransformedEnv
-from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
-from torchrl.objectives import ClipPPOLoss
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from difflcs.rl.learning.mlp import MLPController
 from difflcs.rl.learning.policy import LCSMPCPolicy, MLPPolicy
@@ -188,44 +183,6 @@ def test_bad_arguments(mpc, arguments, error, message):
         LCSMPCPolicy(**{"mpc": mpc, **arguments})
 
 
-class Drift(gymnasium.Env):
-    """x₊ = x + u, with a strict action space."""
-
-    observation_space = spaces.Dict(
-        {"state": spaces.Box(-10.0, 10.0, (2,), np.float64), "goal": spaces.Box(-1.0, 1.0, (1,), np.float64)}
-    )
-    action_space = spaces.Box(-U_MAX, U_MAX, (2,), np.float64)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.state, self.goal = np.zeros(2), self.np_random.uniform(-0.5, 0.5, 1)
-        return {"state": self.state, "goal": self.goal}, {}
-
-    def step(self, action):
-        assert np.abs(action).max() <= U_MAX + 1e-8  # TorchRL's ClipTransform has float32 bounds
-        self.state = self.state + action
-        return {"state": self.state, "goal": self.goal}, -abs(float(self.state[0] - self.goal[0])), False, False, {}
-
-
-def test_in_torchrls_own_loop(mpc):
-    """A TorchRL rollout through `ClipTransform`: the sample is kept, the clipped action is executed."""
-    env = TransformedEnv(GymWrapper(Drift()), ClipTransform(in_keys_inv=["action"], low=-U_MAX, high=U_MAX))
-    check_env_specs(env)
-    policy = LCSMPCPolicy(mpc, U_MAX, in_keys=("observation", "goal"))  # the names that GymWrapper gives
-    with torch.no_grad():
-        data = env.rollout(8, policy)
-    assert data.batch_size == (8,)
-    moved = data["next", "observation"] - data["observation"]
-    torch.testing.assert_close(moved, policy.clip(data["action"]), rtol=0, atol=1e-7)
-    assert not torch.equal(moved, data["action"])
-    data["advantage"] = torch.ones(8, 1, dtype=torch.float64)
-    warm = data.select("observation", "goal", "action", "action_log_prob", "advantage")
-    loss = ClipPPOLoss(policy, None, entropy_bonus=False, critic_coeff=None)
-    value = loss(warm)["loss_objective"]
-    assert float(value.detach()) == pytest.approx(-1.0)  # ratio 1, advantage 1
-    value.backward()
-
-
 @pytest.mark.filterwarnings(
     "ignore:Creating .* which inherits from WeightUpdaterBase"
 )  # importing TorchRL's collectors
@@ -275,10 +232,3 @@ def test_a_network_instead_of_the_mpc():
     policy.get_dist(data.select(*policy.in_keys)).log_prob(data["action"].detach()).sum().backward()
     assert all(bool(p.grad.any()) for p in network.parameters())
     assert bool(policy.gaussian.log_std.grad.any())  # learned by default, as is usual for networks
-
-
-def test_a_model_of_ones_own_stays_the_same_object():
-    lcs = LCSModel(2, 2, 1)
-    cost = GoalCost.reach(2, 2, goal_weight=(1.0,), input_weight=1.0)
-    policy = LCSMPCPolicy(LCSMPCLayer(lcs, cost, horizon=1, u_min=-1.0, u_max=1.0))
-    assert policy.mpc.lcs is lcs

@@ -64,21 +64,6 @@ def rng(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def test_the_first_gradient_is_the_policy_gradient():
-    """At the parameters that drew the actions all ratios are 1: the gradient is that of −mean(A log π)."""
-    actor, surrogate, data = made()
-    samples = judged(data)
-    expected = score(actor, data, samples["advantage"].flatten())
-    new = solved(actor, data)
-    kl = gaussian_kl(data, new)
-    torch.testing.assert_close(kl, torch.zeros(len(data)).double(), rtol=0, atol=1e-12)
-    found = gradients(surrogate(new, data, kl, samples, episodes(), rng()), actor)
-    assert surrogate.clip_fraction == surrogate.outliers == 0
-    for a, b in zip(found, expected, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-8)
-    assert any(bool(gradient.any()) for gradient in found)
-
-
 def test_outliers_are_left_out():
     """Samples whose mean has moved too far have no say, however large their advantage; nor do their gradients."""
     actor, surrogate, data = made()

@@ -106,19 +106,6 @@ def test_adam_update_is_adam(covariance):
     assert same(values(actor), values(other))
 
 
-def test_natural_update_takes_steps_of_its_size():
-    """Of the length size · scale in the metric that it measured."""
-    for scale in (1.0, 0.25):
-        actor, rule = make("natural", momentum=0.0, step=0.05)
-        data = drawn(actor)
-        rule.measure(data, np.random.default_rng(0))
-        before = torch.cat([p.detach().flatten().clone() for p in rule.parameters])
-        assert rule.step(loss_of(actor, data), scale)
-        move = torch.cat([p.detach().flatten() for p in rule.parameters]) - before
-        metric = rule.optimiser.metric
-        assert float((move @ metric @ move).sqrt()) == pytest.approx(0.05 * scale)
-
-
 def test_the_metric_is_measured_with_some_of_the_samples():
     actor, rule = make("natural", samples=7)
     data, asked, jacobian = drawn(actor), [], actor.jacobian

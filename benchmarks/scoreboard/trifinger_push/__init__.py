@@ -15,7 +15,7 @@ from typing import Any
 
 
 def __getattr__(name: str) -> Any:
-    """`PushPolicy` when it is asked for: it needs the simulator's packages, the geometry does not."""
+    """Import `PushPolicy` on demand: it needs the simulator's packages, the geometry does not."""
     if name == "PushPolicy":
         from trifinger_push.policy import PushPolicy
 

@@ -45,7 +45,7 @@ SINGULAR = 5e-4
 
 
 class TipControl:
-    """Joint torques from references of the tips; it remembers the torque that it sent last."""
+    """Joint torques from references of the tips; it stores the last torque sent."""
 
     def __init__(self) -> None:
         self.model = pin.buildModelFromUrdf(str(URDF))
@@ -58,7 +58,7 @@ class TipControl:
         self.sent = np.zeros(3 * N_FINGERS)
 
     def tips(self, q: Array) -> tuple[Array, Array]:
-        """Places (3, 3) of the tips [m] at joint angles (9,), and their Jacobians (3, 3, 9)."""
+        """Compute the places (3, 3) of the tips [m] at joint angles (9,), and their Jacobians (3, 3, 9)."""
         pin.computeJointJacobians(self.model, self.data, q)
         pin.updateFramePlacements(self.model, self.data)
         places = np.array([self.data.oMf[i].translation for i in self.frames])
@@ -66,12 +66,12 @@ class TipControl:
         return places, np.stack([pin.getFrameJacobian(self.model, self.data, i, around)[:3] for i in self.frames])
 
     def _dynamics(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Mass matrix and bias."""
+        """Compute the mass matrix and the bias."""
         upper = np.triu(pin.crba(self.model, self.data, q))
         return upper + np.triu(upper, 1).T, pin.nonLinearEffects(self.model, self.data, q, v)
 
     def predict(self, q: Array, v: Array, steps: int = 2) -> tuple[Array, Array]:
-        """Joint angles and velocities when the next torque begins to act."""
+        """Predict joint angles and velocities at the time when the next torque begins to act."""
         h = DELAY / steps
         for _ in range(steps):
             mass, bias = self._dynamics(q, v)
@@ -81,7 +81,7 @@ class TipControl:
         return q, v
 
     def torque(self, q: Array, v: Array, reference: tuple[Array, Array, Array], force: Array) -> NDArray[np.float32]:
-        """Torques (9,) [N m].
+        """Compute torques (9,) [N m].
 
         Args:
             q: (9,) measured joint angles [rad].
@@ -97,11 +97,11 @@ class TipControl:
         a *= np.minimum(1, LARGEST_ACCELERATION / np.maximum(np.linalg.norm(a, axis=1, keepdims=True), 1e-9))
         wanted, push = np.zeros(9), np.zeros(9)
         for f in range(N_FINGERS):
-            own = slice(3 * f, 3 * f + 3)
-            j = jacobians[f][:, own]
+            joints = slice(3 * f, 3 * f + 3)
+            j = jacobians[f][:, joints]
             damping = 1e-4 if abs(np.linalg.det(j)) < SINGULAR else 1e-8
-            wanted[own] = j.T @ np.linalg.solve(j @ j.T + damping * np.eye(3), a[f])
-            push[own] = j.T @ force[f]
+            wanted[joints] = j.T @ np.linalg.solve(j @ j.T + damping * np.eye(3), a[f])
+            push[joints] = j.T @ force[f]
         torque = mass @ wanted + bias + DAMPING * (v + wanted * STEP / 2) + push
         self.sent = np.clip(torque, -LARGEST_TORQUE, LARGEST_TORQUE)
         return self.sent.astype(np.float32)
@@ -121,7 +121,7 @@ class TipReference:
         self.speed, self.acceleration = speed, acceleration
 
     def towards(self, targets: Array) -> tuple[Array, Array, Array]:
-        """One step to targets (3, 3), to arrive at rest; place and velocity before it, and the acceleration."""
+        """Step towards targets (3, 3), to arrive at rest; return place and velocity before it, and the acceleration."""
         gap = targets - self.place
         distance = np.linalg.norm(gap, axis=1, keepdims=True)
         # The fastest from which it can still stop, in steps.
@@ -140,7 +140,7 @@ class TipReference:
         return *before, a
 
     def lead(self, finger: int, tip: Array, velocity: Array, height: float, most: float) -> tuple[Array, Array, Array]:
-        """One step of a tip that pushes: a velocity in the plane, and a height to keep.
+        """Step a tip that pushes, with a velocity in the plane and a height to keep.
 
         Args:
             finger: which one.

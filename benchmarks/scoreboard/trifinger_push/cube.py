@@ -1,4 +1,4 @@
-"""Where the cube is now.
+"""Estimate of the cube's current pose.
 
 The camera's pose is 90 to 190 ms old, a new one comes ten times a second. Since it was taken the tips have been
 measured at every step: the same contact physics that the plan uses is stepped from the old pose along their way.
@@ -39,7 +39,7 @@ REMEMBERED = 14
 
 
 def pushing(friction: float, compliance: float, cone: Cone) -> PlanarPushing:
-    """The cube from above, pushed by one tip; quasi-static, in units of `UNIT`."""
+    """Make the cube from above, pushed by one tip; quasi-static, in units of `UNIT`."""
     half = HALF / UNIT
     return PlanarPushing(
         box(-half, half, -half, half),
@@ -52,13 +52,13 @@ def pushing(friction: float, compliance: float, cone: Cone) -> PlanarPushing:
 
 
 def box_distance(points: Array) -> Array:
-    """Distance (n,) of points (n, 2) in coordinates of the cube from its outline [m], negative inside."""
+    """Compute the distance (n,) of points (n, 2) in the cube's frame from its outline [m], negative inside."""
     beyond = np.abs(points) - HALF
     return np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(-1), 0)
 
 
 def planar_pose(position: Array, quaternion: Array) -> Array:
-    """x, y and yaw of a cube that stands on any of its faces; the yaw is one of four.
+    """Compute x, y and yaw of a cube that stands on any of its faces; the yaw is one of four.
 
     Args:
         position: (3,) [m].
@@ -95,7 +95,7 @@ class CubeEstimator:
         self._tips: deque[Array] = deque(maxlen=REMEMBERED)
 
     def update(self, camera: dict[str, Any], tips: Array) -> Array:
-        """Pose (3,) of the cube now: x, y [m], yaw [rad] that goes on where it was.
+        """Estimate the pose (3,) of the cube now: x, y [m], yaw [rad], continuous.
 
         Args:
             camera: the part `camera_observation` of an observation.
@@ -117,7 +117,7 @@ class CubeEstimator:
         return pose
 
     def _step(self, pose: Array, first: Array, second: Array) -> Array:
-        """The pose after the tips have gone from `first` to `second`."""
+        """Predict the pose after the tips have gone from `first` to `second`."""
         gaps = box_distance((first[:, :2] - pose[:2]) @ planar_turn(pose[2])) - TIP_RADIUS
         gaps[np.maximum(first[:, 2], second[:, 2]) > HEIGHT + 0.01] = np.inf
         tip = int(gaps.argmin())

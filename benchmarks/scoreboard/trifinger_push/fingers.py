@@ -32,13 +32,13 @@ LOW, HIGH = np.array([-0.33, 0.0, -2.7]), np.array([1.0, 1.57, 0.0])
 
 
 def planar_turn(angle: float) -> Array:
-    """(2, 2) rotation matrix."""
+    """Make a (2, 2) rotation matrix."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s], [s, c]])
 
 
 def inverse(finger: int, tips: Array) -> tuple[Array, Array]:
-    """Inverse kinematics of one finger.
+    """Compute the inverse kinematics of one finger.
 
     Args:
         finger: 0, 1 or 2.

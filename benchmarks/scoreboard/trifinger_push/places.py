@@ -1,4 +1,4 @@
-"""Which finger could push where, and how its tip gets there: `Places` and `Travel` of `difflcs.planning`.
+"""Places from which each finger can push, and ways for its tip: `Places` and `Travel` of `difflcs.planning`.
 
 State of the plan: x, y, yaw of the cube; x, y, z of the tip that pushes; which finger it is. Lengths in `UNIT`.
 """
@@ -21,7 +21,7 @@ __all__ = ["FINGER", "PUSH_HEIGHT", "FingerPlaces", "FingerTravel", "OneFinger",
 Array = NDArray[np.float64]
 
 POSE, TIP, FINGER = slice(0, 3), slice(3, 6), 6
-"""Where they are in the state."""
+"""Slices of the state."""
 PUSH_HEIGHT = 0.022
 """Of a tip that pushes [m]: friction on the table is 1, so that above half the cube's width it would topple."""
 OVER = 0.088
@@ -51,7 +51,7 @@ class OneFinger:
         self.n_lam = self.plane.n_lam
 
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
-        """The system at states x (..., 7)."""
+        """Return the system at states x (..., 7)."""
         assert x is not None
         flat = self.plane.params(x[..., :5])
         n_x, n_u = self.n_x - 5, self.n_u - 2
@@ -67,7 +67,7 @@ class OneFinger:
 
 
 def _ring() -> tuple[Array, Array]:
-    """Places round the cube in its coordinates and the outward normals there, both (4 · PER_FACE, 2)."""
+    """Compute places round the cube in its frame and the outward normals there, both (4 · PER_FACE, 2)."""
     along = np.linspace(-PART * HALF, PART * HALF, PER_FACE)
     face = np.stack([np.full(PER_FACE, HALF + TIP_RADIUS + GAP), along], 1)
     turns = [planar_turn(k * np.pi / 2) for k in range(4)]
@@ -75,7 +75,7 @@ def _ring() -> tuple[Array, Array]:
 
 
 def _free(finger: int, pose: Array, points: Array, normals: Array) -> NDArray[np.bool_]:
-    """Which points (n, 2) [m] a finger can push from: in its reach, also some way on, and its link not in the cube."""
+    """Return which points (n, 2) [m] a finger can push from: in reach, also further on, its link not in the cube."""
     height = np.full(len(points), PUSH_HEIGHT)
     _, knee = inverse(finger, np.column_stack([points, height]))
     _, ahead = inverse(finger, np.column_stack([points - 0.02 * normals, height]))
@@ -111,7 +111,7 @@ class FingerPlaces:
         self.held = False
 
     def refuse(self, x: Array, steps: int) -> None:
-        """The finger at x does not move the cube: nothing from its face for so many steps."""
+        """Refuse the face of the finger at x, which does not move the cube, for some steps."""
         local = (x[TIP][:2] - x[:2]) @ planar_turn(x[2])
         axis = int(np.argmax(np.abs(local)))
         normal = np.eye(2)[axis] * np.sign(local[axis])
@@ -119,7 +119,7 @@ class FingerPlaces:
         self.held = True
 
     def sample(self, x: Tensor) -> Tensor:
-        """See `Places`."""
+        """Sample places; see `Places`."""
         pose = x[POSE].numpy() * [UNIT, UNIT, 1]
         turn = planar_turn(pose[2])
         points, normals = self.ring @ turn.T + pose[:2], self.normals @ turn.T
@@ -134,7 +134,7 @@ class FingerPlaces:
         return torch.from_numpy(np.concatenate(rows))
 
     def states(self, x: Tensor, places: Tensor) -> Tensor:
-        """See `Places`."""
+        """Make the states at places; see `Places`."""
         cos, sin = float(x[2].cos()), float(x[2].sin())
         states = x.expand(len(places), -1).clone()
         states[:, 3] = x[0] + cos * places[:, 1] - sin * places[:, 2]
@@ -144,20 +144,20 @@ class FingerPlaces:
         return states
 
     def allowed(self, states: Tensor) -> Tensor:
-        """See `Places`; what is not allowed was not sampled."""
+        """Return whether places are allowed; see `Places`. Those that are not were not sampled."""
         return torch.ones(len(states), dtype=torch.bool)
 
     def near(self, x: Tensor) -> bool:
-        """See `Places`."""
+        """Return whether the finger is near the cube; see `Places`."""
         if self.held:
             return False
-        own = x.numpy()
-        local = (own[3:5] - own[:2]) @ planar_turn(own[2]) * UNIT
-        return bool(own[5] * UNIT < PUSH_HEIGHT + 0.03 and box_distance(local) - TIP_RADIUS < 0.025)
+        state = x.numpy()
+        local = (state[3:5] - state[:2]) @ planar_turn(state[2]) * UNIT
+        return bool(state[5] * UNIT < PUSH_HEIGHT + 0.03 and box_distance(local) - TIP_RADIUS < 0.025)
 
 
 def lift(pose: Array, tip: Array) -> Array:
-    """Waypoint (3,) [m] of a tip beside the cube: up, and away from the face that it may touch."""
+    """Compute a waypoint (3,) [m] of a tip beside the cube: up, and away from the face that it may touch."""
     turn = planar_turn(pose[2])
     local = (tip[:2] - pose[:2]) @ turn
     axis = int(np.argmax(np.abs(local)))
@@ -178,26 +178,26 @@ class FingerTravel:
         self.tips = np.zeros((N_FINGERS, 3))
 
     def _crosses(self, pose: Array, start: Array, ends: Array) -> Array:
-        """Which straight ways in the plane from start (2,) to ends (n, 2) touch the cube."""
+        """Return which straight ways in the plane from start (2,) to ends (n, 2) touch the cube."""
         s = np.linspace(0, 1, 25)[:, None, None]
         way = (start * (1 - s) + ends * s - pose[:2]) @ planar_turn(pose[2])
         return box_distance(way).min(0) < self.room
 
     def distance(self, x: Tensor, states: Tensor) -> Tensor:
-        """See `Travel`: of the tip of each state's finger, in units."""
-        pose, found = x[POSE].numpy() * [UNIT, UNIT, 1], np.zeros(len(states))
+        """Compute the distance of each state's finger, in units; see `Travel`."""
+        pose, distances = x[POSE].numpy() * [UNIT, UNIT, 1], np.zeros(len(states))
         fingers, ends = states[:, FINGER].numpy(), states[:, TIP].numpy() * UNIT
         for finger, tip in enumerate(self.tips):
-            own = fingers == finger
-            across = np.linalg.norm(ends[own, :2] - tip[:2], axis=1)
-            climb = np.maximum(OVER - tip[2], 0) + OVER - ends[own, 2]
+            mine = fingers == finger
+            across = np.linalg.norm(ends[mine, :2] - tip[:2], axis=1)
+            climb = np.maximum(OVER - tip[2], 0) + OVER - ends[mine, 2]
             over = np.maximum(across, 0.5 * across + climb)
-            straight = np.hypot(across, ends[own, 2] - tip[2])
-            found[own] = np.where(self._crosses(pose, tip[:2], ends[own, :2]), over, straight)
-        return torch.from_numpy(found / UNIT)
+            straight = np.hypot(across, ends[mine, 2] - tip[2])
+            distances[mine] = np.where(self._crosses(pose, tip[:2], ends[mine, :2]), over, straight)
+        return torch.from_numpy(distances / UNIT)
 
     def action(self, x: Tensor, target: Tensor) -> Tensor:
-        """See `Travel`."""
+        """Compute the action; see `Travel`."""
         pose = x[POSE].numpy() * [UNIT, UNIT, 1]
         tip, end = self.tips[int(target[FINGER])], target[TIP].numpy() * UNIT
         waypoint = end.copy()
@@ -208,6 +208,6 @@ class FingerTravel:
         return torch.from_numpy((waypoint - tip) / UNIT)
 
     def arrived(self, x: Tensor, target: Tensor) -> bool:
-        """See `Travel`."""
+        """Return whether the tip has arrived; see `Travel`."""
         near = float((x[TIP] - target[TIP]).norm()) * UNIT < self.tolerance
         return near and float(x[FINGER]) == float(target[FINGER])

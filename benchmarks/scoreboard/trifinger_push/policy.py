@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 FRICTION = 0.5
 """Between tip and cube."""
 PLAN_FRICTION = 0.15
-"""That the plan counts on."""
+"""Friction that the plan assumes."""
 PLAN_STEP = 0.1
 """Of the system [s]; the plan is made anew at each step of the environment."""
 HORIZON = 8
@@ -33,7 +33,7 @@ REACH = 0.03
 INPUT_WEIGHT = 0.1
 SETTINGS = SamplingSettings(keep=0.3, smallest_gain=0.002, switch_price=0.18, travel_price=0.0833, patience=75)
 WAIVED = replace(SETTINGS, smallest_gain=0.0, switch_price=0.0018, travel_price=0.000833)
-"""Where no journey is worth its price and nothing is gained here, as beside the wall: the best place all the same."""
+"""Settings for states in which no journey is worth its price and nothing is gained, as beside the wall."""
 TRAVEL_SPEED, TRAVEL_ACCELERATION = 0.6, 7.0
 """Of a tip [m/s, m/s²]."""
 WAIT_HEIGHT = 0.115
@@ -70,7 +70,7 @@ class PushPolicy(PolicyBase):
 
     @staticmethod
     def get_policy_config() -> PolicyConfig:
-        """Observations as dictionaries."""
+        """Return the configuration: observations as dictionaries."""
         return PolicyConfig(flatten_obs=False, image_obs=False)
 
     def reset(self) -> None:
@@ -85,7 +85,7 @@ class PushPolicy(PolicyBase):
         self._pushed = 0
 
     def get_action(self, observation: Any) -> NDArray[np.float32]:
-        """Joint torques (9,) [N m]."""
+        """Compute joint torques (9,) [N m]."""
         robot = observation["robot_observation"]
         q, v = robot["position"].astype(float), robot["velocity"].astype(float)
         tips, _ = self.control.tips(q)
@@ -109,7 +109,7 @@ class PushPolicy(PolicyBase):
         return self.control.torque(q, v, (place, speed, acceleration), force)
 
     def _decide(self, pose: Array, tips: Array, goal: Array) -> tuple[Array, Array | None]:
-        """Where the tips are to go, and the velocity of the one that pushes."""
+        """Decide the targets of the tips, and the velocity of the one that pushes."""
         assert self.reference is not None
         targets, f = self.waiting.copy(), self.finger
         for other in range(N_FINGERS):
@@ -131,7 +131,7 @@ class PushPolicy(PolicyBase):
         return targets, velocity
 
     def _plan(self, state: Array, goal: Array) -> tuple[Array, Decision]:
-        """Action and decision of the planner; where it would only wait, prices are waived."""
+        """Plan; return the planner's action and decision. If it would only wait, prices are waived."""
         before = self.planner.decision
         action, decision = self.planner.act(state, goal), self.planner.decision
         assert decision is not None
@@ -148,7 +148,7 @@ class PushPolicy(PolicyBase):
         return np.array([pose[0] / UNIT, pose[1] / UNIT, pose[2], *tips[self.finger] / UNIT, self.finger])
 
     def _watch(self, pose: Array, tips: Array) -> None:
-        """See whether a tip that pushes gets on."""
+        """Check whether a tip that pushes makes progress."""
         self.places.now += 1
         decision = self.planner.decision
         if decision is None or decision.mode is not Mode.PUSH:

@@ -23,7 +23,7 @@ import numpy as np
 
 
 class Sizes(NamedTuple):
-    """What decides the symbolic program.
+    """Key of the symbolic program.
 
     Attributes:
         n_x, n_u, n_lam, n_c, horizon: sizes of the problem.
@@ -40,10 +40,10 @@ class Sizes(NamedTuple):
 
 
 class Options(NamedTuple):
-    """What decides the solver besides `Sizes`.
+    """Key of the solver besides `Sizes`.
 
     Attributes:
-        tol, max_iter, mu_init: IPOPT's own.
+        tol, max_iter, mu_init: options of IPOPT.
         adaptive: whether IPOPT chooses its barrier parameter anew in each iteration.
         inequality: whether the contact is λ·s ≤ ε, not =.
         barrier: whether the cost has a barrier of the action bounds.
@@ -62,21 +62,21 @@ class Options(NamedTuple):
 
 
 def _unpack(packed: casadi.SX, sizes: Sizes) -> dict[str, list[casadi.SX]]:
-    """Each parameter by its name, as a list of its copies."""
-    found, at = {}, 0
+    """Split packed parameters by name, each as a list of its copies."""
+    named, offset = {}, 0
     for name, rows, columns, copies in sizes.parameters:
-        found[name] = []
+        named[name] = []
         for _ in range(copies):
-            found[name].append(casadi.reshape(packed[at : at + rows * columns], columns, rows).T)
-            at += rows * columns
-    return found
+            named[name].append(casadi.reshape(packed[offset : offset + rows * columns], columns, rows).T)
+            offset += rows * columns
+    return named
 
 
 @functools.lru_cache(maxsize=32)
 def _solver(sizes: Sizes, options: Options) -> casadi.Function:
-    """Direct transcription of Eq. 3 of the paper over (u_k, λ_k, s_k, x_{k+1}), k = 0 … H−1, and v_k, k = 0 … H.
+    """Transcribe Eq. 3 of the paper over (u_k, λ_k, s_k, x_{k+1}), k = 0 … H−1, and v_k, k = 0 … H.
 
-    Of the functions g the equations come first, stage by stage, then the constraints of the stages 0 … H.
+    In g the equations come first, stage by stage, then the constraints of the stages 0 … H.
     """
     packed = casadi.SX.sym("p", sum(rows * columns * copies for _, rows, columns, copies in sizes.parameters))
     copies = _unpack(packed, sizes)
@@ -169,8 +169,7 @@ class Chunk(NamedTuple):
 class Solved(NamedTuple):
     """Result of a chunk.
 
-    Of each problem x_1 … x_H, u, λ, the multipliers of the constraints, IPOPT's word for how it ended, iterations and
-    seconds.
+    For each problem: x_1 … x_H, u, λ, the multipliers of the constraints, IPOPT's return status, iterations, seconds.
     """
 
     x: np.ndarray
@@ -183,7 +182,7 @@ class Solved(NamedTuple):
 
     @classmethod
     def start(cls, chunk: Chunk) -> Solved:
-        """The start of a chunk, about which IPOPT has said nothing."""
+        """Make the result of a chunk before IPOPT has run: its start."""
         count = len(chunk.u)
         return cls(
             chunk.x.copy(), chunk.u.copy(), chunk.lam.copy(), np.zeros(chunk.v.shape),
@@ -193,26 +192,26 @@ class Solved(NamedTuple):
 
 def solve_chunk(sizes: Sizes, options: Options, chunk: Chunk) -> Solved:
     """Solve one problem after the other; an exception fails its element only, Ctrl-C ends them all."""
-    with _heard_interrupts() as interrupts:
+    with _caught_interrupts() as interrupts:
         return _solve_chunk(sizes, options, chunk, interrupts)
 
 
 @contextlib.contextmanager
-def _heard_interrupts() -> Iterator[list[int]]:
-    """The signals of Ctrl-C that came: CasADi swallows the KeyboardInterrupt, and merely fails the problem at hand."""
-    heard: list[int] = []
+def _caught_interrupts() -> Iterator[list[int]]:
+    """Collect signals of Ctrl-C: CasADi swallows the KeyboardInterrupt, and merely fails the current problem."""
+    caught: list[int] = []
     before = signal.getsignal(signal.SIGINT)
     if not callable(before) or threading.current_thread() is not threading.main_thread():
-        yield heard
+        yield caught
         return
 
-    def hear(number: int, frame: FrameType | None) -> None:
-        heard.append(number)
+    def catch(number: int, frame: FrameType | None) -> None:
+        caught.append(number)
         before(number, frame)
 
-    signal.signal(signal.SIGINT, hear)
+    signal.signal(signal.SIGINT, catch)
     try:
-        yield heard
+        yield caught
     finally:
         signal.signal(signal.SIGINT, before)
 

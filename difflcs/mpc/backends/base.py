@@ -1,4 +1,4 @@
-"""What a solver must offer to become a backend, and the registry of the backends."""
+"""Interface that every solver backend implements, and the registry of backends."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Result:
         kkt_residual: (batch,) see `difflcs.mpc.kkt.residual`; the largest float where it is infinite.
         solve_time: (batch,) seconds.
         linearisation: the factored optimality conditions for the gradient.
-        objective: (batch,) the cost of the plans that are CONVERGED, if the solver says it; up to rounding it is
+        objective: (batch,) the cost of the CONVERGED plans, if the solver returns it; up to rounding it is
             `MPCProblem.objective`.
     """
 
@@ -44,7 +44,7 @@ class Result:
 
     @functools.cached_property
     def all_converged(self) -> bool:
-        """Whether every plan is CONVERGED: the quick question before all others."""
+        """Whether every plan is CONVERGED, so that callers can skip further checks."""
         return all_converged(self.status)
 
     @property
@@ -82,13 +82,13 @@ class Backend(ABC):
     def vjp(
         self, problem: MPCProblem, result: Result, grads: tuple[Tensor, Tensor, Tensor, Tensor], solved: Tensor
     ) -> dict[str, Tensor]:
-        """Gradients of the inputs; by default the sensitivity of the optimality conditions (`difflcs.mpc.kkt`)."""
+        """Compute the gradients of the inputs; by default from the optimality conditions (`difflcs.mpc.kkt`)."""
         linearisation = result.linearisation or kkt.linearise(problem, result.primal)
         return kkt.vjp(problem, linearisation, grads, solved)
 
     @classmethod
     def missing(cls) -> tuple[str, ...]:
-        """Required packages that are not installed."""
+        """List required packages that are not installed."""
         return tuple(package for package in cls.requires if importlib.util.find_spec(package) is None)
 
 
@@ -100,7 +100,7 @@ def certify(
     Actions are clipped into the bounds first, multipliers of the constraints into [0, price]; a solver without them may
     leave these out. A CONVERGED element whose `difflcs.mpc.kkt.residual` exceeds `tol`
     becomes NUMERICAL; one that is not classically differentiable becomes DEGENERATE. Elements that did not converge get
-    finite numbers: their actions clipped into the bounds (zero where not finite) and the trajectory that these cause.
+    finite numbers: actions clipped into the bounds (zero if not finite) and the trajectory that these cause.
     So an INFEASIBLE element keeps the plan that its solver ended with.
     """
     status = status.clone()
@@ -118,7 +118,7 @@ def certify(
 
 
 def replace_failed(problem: MPCProblem, primal: Primal, failed: Tensor) -> Primal:
-    """Finite numbers for failed (batch,) elements: actions clipped into the bounds, and the trajectory they cause."""
+    """Give failed (batch,) elements finite numbers: actions clipped into the bounds, and the trajectory they cause."""
     primal, index = kkt.complete(problem, primal), torch.nonzero(failed).squeeze(-1)
     if not len(index):
         return primal
@@ -176,12 +176,12 @@ def register_backend(backend: type[Backend]) -> type[Backend]:
 
 
 def available_backends() -> tuple[str, ...]:
-    """Names of the backends whose packages are installed."""
+    """List the names of the backends whose packages are installed."""
     return tuple(name for name, backend in REGISTRY.items() if not backend.missing())
 
 
 def get_backend(backend: str | Backend) -> Backend:
-    """The backend itself, or the default instance of a named one.
+    """Return the backend itself, or the default instance of a named one.
 
     Raises:
         BackendNotFoundError: no such name, or its package is missing; the message gives the pip line.
@@ -193,9 +193,9 @@ def get_backend(backend: str | Backend) -> Backend:
             f"backend: expected one of {', '.join(map(repr, REGISTRY))}, got {backend!r}"
             f"{did_you_mean(backend, REGISTRY)}; add your own with difflcs.register_backend"
         )
-    found = REGISTRY[backend] if isinstance(backend, str) else type(backend)
-    if found.missing():
+    kind = REGISTRY[backend] if isinstance(backend, str) else type(backend)
+    if kind.missing():
         raise BackendNotFoundError(
-            f"backend {found.name!r}: the package {found.missing()[0]!r} is not installed; run: {found.install}"
+            f"backend {kind.name!r}: the package {kind.missing()[0]!r} is not installed; run: {kind.install}"
         )
-    return found() if isinstance(backend, str) else backend
+    return kind() if isinstance(backend, str) else backend

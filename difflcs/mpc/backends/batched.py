@@ -27,7 +27,7 @@ _MANY_CONTACTS, _MORE_STARTS = 100, 4
 
 @dataclass(frozen=True)
 class BatchedResult(Result):
-    """A `Result` that remembers how to differentiate it.
+    """A `Result` with what its gradient needs.
 
     Attributes:
         fragile: (batch,) bool: the elimination of λ needs row exchanges, because the skew part of F dominates.
@@ -36,7 +36,7 @@ class BatchedResult(Result):
     fragile: Tensor | None = None
 
 
-_FLAT = (1e-2, 1e-6)  # weights of actions beside a price of one: what makes the plan of least violations unique
+_FLAT = (1e-2, 1e-6)  # weights of actions beside a price of one: they make the plan of least violations unique
 
 
 @dataclass(frozen=True)
@@ -63,11 +63,11 @@ class BatchedBackend(Backend):
         effort: "fast", one start; "default", four; "best", sixteen; the last two four times as many where horizon ×
             n_lam is 100 or more, as such plans have many optima. A guess is the first start, and the only one but for
             "best". Without contact (n_lam = 0) one start is enough.
-        restarts: number of starts, whatever the effort; None: what the effort says.
-        tol: projected gradient dJ/du at which a problem is solved, or 1e-12 of the terms that sum to it where that is
-            more. It must also be below 1e-7 of its own scale, see `difflcs.mpc.kkt.residual`.
-        max_iter: iteration limit of one solve. What fails is solved once more, cold and along a longer homotopy; and
-            with row exchanges in the elimination of λ, where it failed for want of them.
+        restarts: number of starts, whatever the effort; None: that of the effort.
+        tol: projected gradient dJ/du at which a problem is solved, or 1e-12 of the terms that sum to it if that is
+            more. It must also be below 1e-7 of its scale, see `difflcs.mpc.kkt.residual`.
+        max_iter: iteration limit of one solve. An element that fails is solved once more, cold and along a longer
+            homotopy; and with row exchanges in the elimination of λ if it failed for lack of them.
         time_limit: seconds for one call, None for no limit. Elements not solved by then are MAX_ITER: those under way
             keep their iterate, those not begun stay at the actions of the guess or zero, with x = x0 and λ = 0.
         seed: seed of the random starts, which are the same for every element.
@@ -120,16 +120,16 @@ class BatchedBackend(Backend):
             "fragile": np.empty(batch, np.bool_),
             "iterations": np.empty(batch, np.int32),
         }
-        # Whatever can be done before the kernel is: after it, Python's own code and data are no more in the cache.
-        found, seconds = {name: torch.from_numpy(value) for name, value in outputs.items()}, np.empty(batch)
+        # Done before the kernel, which evicts Python's code and data from the cache.
+        tensors, seconds = {name: torch.from_numpy(value) for name, value in outputs.items()}, np.empty(batch)
         result = BatchedResult(
-            Primal(found["x"], found["u"], found["lam"], found["mu"]),
-            found["status"],
-            found["iterations"],
-            found["residual"],
+            Primal(tensors["x"], tensors["u"], tensors["lam"], tensors["mu"]),
+            tensors["status"],
+            tensors["iterations"],
+            tensors["residual"],
             torch.from_numpy(seconds),
-            objective=found["objective"],
-            fragile=found["fragile"],
+            objective=tensors["objective"],
+            fragile=tensors["fragile"],
         )
         outputs["fragile"] = outputs["fragile"].view(np.int8)  # zeros and ones
         vars(result)["all_converged"] = _kernels.solve_mpc(  # so that nobody needs to count
@@ -158,7 +158,7 @@ class BatchedBackend(Backend):
         return result
 
     def starts(self, problem: MPCProblem, guessed: bool) -> int:
-        """How many starts each element gets; a guess is the first of them."""
+        """Return the number of starts of each element; a guess is the first of them."""
         if self.restarts is not None:
             return self.restarts
         if self.effort == "fast" or (guessed and self.effort != "best"):
@@ -169,7 +169,7 @@ class BatchedBackend(Backend):
     def vjp(
         self, problem: MPCProblem, result: Result, grads: tuple[Tensor, Tensor, Tensor, Tensor], solved: Tensor
     ) -> dict[str, Tensor]:
-        """The adjoint sweep in native code; the same numbers as `difflcs.mpc.kkt.vjp`."""
+        """Compute the gradients by the adjoint sweep in native code; the same numbers as `difflcs.mpc.kkt.vjp`."""
         assert isinstance(result, BatchedResult)
         fragile = torch.zeros_like(solved) if result.fragile is None else result.fragile & solved
         gradients = self._vjp(problem, result, grads, solved & ~fragile, pivot=False)
@@ -207,7 +207,7 @@ class BatchedBackend(Backend):
         return self.threads or torch.get_num_threads()
 
     def _make_presentable(self, problem: MPCProblem, primal: Primal, status: Tensor, started: float) -> None:
-        """Give those that failed finite numbers inside the bounds, and call none infeasible that it is not."""
+        """Give failed elements finite numbers inside the bounds, and confirm those that are infeasible."""
         failed = torch.nonzero(~solved(status)).squeeze(-1)
         if len(failed):
             part = problem.select(failed)
@@ -221,7 +221,7 @@ class BatchedBackend(Backend):
                 status[refused[~sure]] = int(Status.NUMERICAL)
 
     def _impossible(self, problem: MPCProblem, started: float) -> Tensor:
-        """Which elements (batch,) miss a hard constraint whatever it costs, by the least violations that are found."""
+        """Return which elements (batch,) miss a hard constraint at any cost, by a solve for the least violations."""
         left = None if self.time_limit is None else max(1e-4, self.time_limit - (time.perf_counter() - started))
         cost = {name: torch.zeros_like(getattr(problem, name)) for name in ("Q", "S", "Q_final", "q", "r", "q_final")}
         cost["price"] = torch.where(torch.isinf(problem.price), 1.0, 1e-6)

@@ -27,7 +27,7 @@ from difflcs.status import Status
 if TYPE_CHECKING:
     from difflcs.mpc.backends._ipopt_worker import Chunk, Options, Sizes, Solved
 
-# What IPOPT says; anything else is NUMERICAL.
+# Return status of IPOPT → ours; anything else is NUMERICAL.
 _STATUS = {
     "Solve_Succeeded": Status.CONVERGED,
     "Solved_To_Acceptable_Level": Status.CONVERGED,  # these are judged by the residual
@@ -50,14 +50,14 @@ class IpoptBackend(Backend):
     still violates them is INFEASIBLE, and this plan is what it returns.
 
     Attributes:
-        tol: IPOPT's own tolerance.
+        tol: IPOPT's tolerance.
         max_iter: iteration limit of one solve.
         workers: processes for a batch; the number of CPUs available if None. 1 solves in this process.
         residual_tol: largest KKT residual that counts as converged.
         start: value of λ and s at a cold start. 0.05 takes fewer iterations than λ = s = 1 and finds better optima.
             The states start at x0: a rollout is a worse start where the system is unstable.
         mu_init: IPOPT's first barrier parameter at a cold start.
-        mu_init_warm: the same when a guess is given.
+        mu_init_warm: the same with a guess.
         mu_strategy: IPOPT's: "monotone", or "adaptive": another way, whose optima are not better or worse in general;
             up to three times slower on the cart-pole and chains of carts.
         contact: "equation", or "inequality": a cold start solves λ·s ≤ ε first, which has other optima,
@@ -90,42 +90,42 @@ class IpoptBackend(Backend):
     def solve(self, problem: MPCProblem, guess: Primal | None) -> Result:
         """Solve every element; a failure, even a crash of a worker, stays with its element."""
         if guess is None and self.contact == "inequality" and problem.n_lam:
-            found = self._by_inequality(problem)
+            run = self._by_inequality(problem)
         else:
-            found = self._run(problem, guess, warm=guess is not None)
+            run = self._run(problem, guess, warm=guess is not None)
         if problem.n_c and bool(torch.isinf(problem.price).any()):
-            failed = torch.nonzero(found.status != Status.CONVERGED).squeeze(-1)
+            failed = torch.nonzero(run.status != Status.CONVERGED).squeeze(-1)
             if len(failed):
                 part = problem.select(failed)
-                found.replace(failed, self._least_violation(part, found.select(failed)))
-        primal = Primal(found.x, found.u, found.lam, found.mu)
-        usable = (found.status == Status.CONVERGED) & torch.isfinite(found.u).all(-1).all(-1)
+                run.replace(failed, self._least_violation(part, run.select(failed)))
+        primal = Primal(run.x, run.u, run.lam, run.mu)
+        usable = (run.status == Status.CONVERGED) & torch.isfinite(run.u).all(-1).all(-1)
         index = torch.nonzero(usable).squeeze(-1)
         if len(index):
             polished = kkt.polish(problem.select(index), Primal(*(v[index] for v in primal)))
             for whole, part in zip(primal, polished, strict=True):
                 whole[index] = part
-        return certify(problem, primal, found.status, found.iterations, found.seconds, self.residual_tol)
+        return certify(problem, primal, run.status, run.iterations, run.seconds, self.residual_tol)
 
-    def _by_inequality(self, problem: MPCProblem) -> _Found:
-        """A run with λ·s ≤ ε, one with the equation from its actions, and a cold one where that fails."""
+    def _by_inequality(self, problem: MPCProblem) -> _Run:
+        """Solve with λ·s ≤ ε, then with the equation from those actions; cold if that fails."""
         ahead = self._run(problem, None, warm=False, inequality=True)
         u = torch.nan_to_num(ahead.u, posinf=0.0, neginf=0.0)
-        found = self._run(problem, Primal(ahead.x, u, ahead.lam, ahead.mu), warm=True)
-        found.iterations += ahead.iterations
-        found.seconds += ahead.seconds
-        failed = torch.nonzero(found.status != Status.CONVERGED).squeeze(-1)
+        run = self._run(problem, Primal(ahead.x, u, ahead.lam, ahead.mu), warm=True)
+        run.iterations += ahead.iterations
+        run.seconds += ahead.seconds
+        failed = torch.nonzero(run.status != Status.CONVERGED).squeeze(-1)
         if len(failed):
             again = self._run(problem.select(failed), None, warm=False)
-            again.iterations += found.iterations[failed]
-            again.seconds += found.seconds[failed]
-            found.replace(failed, again)
-        return found
+            again.iterations += run.iterations[failed]
+            again.seconds += run.seconds[failed]
+            run.replace(failed, again)
+        return run
 
     def _run(
         self, problem: MPCProblem, guess: Primal | None, warm: bool, elastic: bool = False, inequality: bool = False
-    ) -> _Found:
-        """One IPOPT run per element."""
+    ) -> _Run:
+        """Run IPOPT once per element."""
         from difflcs.mpc.backends._ipopt_worker import Options, Sizes, solve_chunk
 
         P = problem
@@ -143,7 +143,7 @@ class IpoptBackend(Backend):
             solved = _locals.pool.solve(sizes, options, chunk, workers)
         words = [_STATUS.get(str(word), Status.NUMERICAL) for word in solved.status]
         x, u, lam, mu = (torch.from_numpy(v) for v in (solved.x, solved.u, solved.lam, solved.mu))
-        return _Found(
+        return _Run(
             torch.cat([problem.x0.unsqueeze(1), x], 1),
             u,
             lam,
@@ -153,27 +153,27 @@ class IpoptBackend(Backend):
             torch.from_numpy(solved.seconds),
         )
 
-    def _least_violation(self, problem: MPCProblem, failed: _Found) -> _Found:
+    def _least_violation(self, problem: MPCProblem, failed: _Run) -> _Run:
         """Say whether problems that failed can be solved at all: minimise the squared violations alone.
 
-        What remains violated is INFEASIBLE and keeps the plan with the least violation; where next to nothing does, the
-        problem is tried once more from there.
+        A problem that stays violated is INFEASIBLE and keeps the plan with the least violation; one that is nearly met
+        is solved once more from there.
         """
         start = Primal(failed.x, torch.nan_to_num(failed.u, posinf=0.0, neginf=0.0), failed.lam, failed.mu)
-        found = self._run(problem, start, warm=False, elastic=True)
-        u = problem.clip(torch.nan_to_num(found.u, posinf=0.0, neginf=0.0))
+        run = self._run(problem, start, warm=False, elastic=True)
+        u = problem.clip(torch.nan_to_num(run.u, posinf=0.0, neginf=0.0))
         x, lam = problem.rollout(u)
         plan = Primal(x, u, lam, problem.no_multipliers())
         excess = kkt.excess(problem, plan)
-        sure = found.status == Status.CONVERGED
-        spent = failed.iterations + found.iterations, failed.seconds + found.seconds
+        sure = run.status == Status.CONVERGED
+        spent = failed.iterations + run.iterations, failed.seconds + run.seconds
         status = torch.where(sure & (excess > self.residual_tol), int(Status.INFEASIBLE), failed.status)
-        # IPOPT took it for infeasible, and it is not.
+        # IPOPT reported it infeasible, but it is not.
         mistaken = sure & (excess <= self.residual_tol) & (failed.status == Status.INFEASIBLE)
         status = torch.where(mistaken, int(Status.NUMERICAL), status).to(torch.int8)
         taken = (sure & (status == Status.INFEASIBLE))[:, None, None]
         kept = Primal(*(torch.where(taken, a, b) for a, b in zip(plan, start, strict=True)))
-        result = _Found(kept.x, kept.u, kept.lam, kept.mu, status, *spent)
+        result = _Run(kept.x, kept.u, kept.lam, kept.mu, status, *spent)
         again = torch.nonzero(sure & (excess <= _NEARLY)).squeeze(-1)
         if len(again):
             part = problem.select(again)
@@ -192,7 +192,7 @@ class IpoptBackend(Backend):
         flat = []
         for name, rows, columns, copies in parameters(problem):
             value = torch.as_tensor(getattr(problem, name), dtype=torch.float64)
-            # What is infinite is told by the bounds of variables and rows.
+            # Infinite numbers enter as bounds of variables and rows.
             value = (
                 torch.where(torch.isinf(value), torch.zeros_like(value), value) if name in MAY_BE_INFINITE else value
             )
@@ -218,13 +218,13 @@ class IpoptBackend(Backend):
 
 
 # Violation, in parts of a row's unit, up to which a problem is tried again from the plan with the least violation: at
-# the boundary of what can be met IPOPT knows it to the root of its tolerance.
+# the boundary of feasibility IPOPT's violation is accurate to the square root of its tolerance.
 _NEARLY = 1e-3
 
 
 @dataclass
-class _Found:
-    """What one run returns for each element."""
+class _Run:
+    """Result of one IPOPT run of each element."""
 
     x: torch.Tensor
     u: torch.Tensor
@@ -234,18 +234,18 @@ class _Found:
     iterations: torch.Tensor
     seconds: torch.Tensor
 
-    def select(self, index: torch.Tensor) -> _Found:
-        return _Found(*(v[index] for v in vars(self).values()))
+    def select(self, index: torch.Tensor) -> _Run:
+        return _Run(*(v[index] for v in vars(self).values()))
 
-    def replace(self, index: torch.Tensor, part: _Found) -> None:
+    def replace(self, index: torch.Tensor, part: _Run) -> None:
         for whole, new in zip(vars(self).values(), vars(part).values(), strict=True):
             whole[index] = new
 
 
 def parameters(problem: MPCProblem) -> tuple[tuple[str, int, int, int], ...]:
-    """Name, rows, columns and copies of what the program takes: every input of the problem, and its two numbers.
+    """List name, rows, columns and copies of the program's parameters: the problem's inputs and two numbers.
 
-    An input that is given by stage has a copy for each.
+    An input that varies by stage has a copy for each.
     """
     table = [(name, problem.shape(name), problem.stages(name) if problem.by_stage(name) else 1) for name in INPUTS]
     table += [("relaxation", (1,), 1), ("barrier", (1,), 1)]
@@ -346,17 +346,17 @@ class _Pool:
 
 
 def _cpus() -> int:
-    """CPUs this process may use."""
+    """Count the CPUs that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def worker_pids() -> tuple[int, ...]:
-    """Process ids of the workers of this process, in the order in which they are used."""
+    """List the process ids of this process's workers, in their order of use."""
     return tuple(worker.process.pid for worker in _locals.pool.workers)
 
 
 class _Locals:
-    """What belongs to this process: a forked child must neither talk to its parent's workers nor hold its locks."""
+    """State of one process: a forked child must neither talk to its parent's workers nor hold its locks."""
 
     def __init__(self):
         self.here = threading.Lock()  # IPOPT in several threads of one process crashes

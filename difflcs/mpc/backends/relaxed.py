@@ -48,7 +48,7 @@ class _Pass:
 
 @dataclass(frozen=True)
 class RelaxedResult(Result):
-    """A `Result` that remembers how it came about.
+    """A `Result` with the convex programs that led to it.
 
     Attributes:
         passes: the convex programs, in their order.
@@ -74,7 +74,7 @@ class RelaxedBackend(Backend):
     an error of one λ̃_i would cost if it stayed in the state to the end, so that the penalty depends on no unit; 0.01
     makes a λ unique that moves no state. The program is always feasible, since F + Fᵀ ≻ 0.
 
-    The first pass has ū = 0 and a small penalty, which lets it find contacts; each further pass has its own penalty and
+    The first pass has ū = 0 and a small penalty, which lets it make contacts; each further pass has another penalty and
     as ū the plan before it. With a guess there is one pass, the last, with the guess's actions as ū: `mpc(x0,
     guess=solution)` is one more pass.
 
@@ -128,7 +128,7 @@ class RelaxedBackend(Backend):
         check_plain(problem, self.name)
 
     def solve(self, problem: MPCProblem, guess: Primal | None) -> RelaxedResult:
-        """One pass per penalty, or the last one alone with a guess.
+        """Solve one pass per penalty, or only the last with a guess.
 
         Raises:
             InvalidInputError: the problem has what this backend cannot do, see `check`.
@@ -158,7 +158,7 @@ class RelaxedBackend(Backend):
     def vjp(
         self, problem: MPCProblem, result: Result, grads: tuple[Tensor, Tensor, Tensor, Tensor], solved: Tensor
     ) -> dict[str, Tensor]:
-        """Cvxpylayers' gradient of each pass's parameters, then torch's of the inputs; last pass first."""
+        """Compute the gradients: cvxpylayers' for each pass's parameters, then torch's for the inputs, backwards."""
         assert isinstance(result, RelaxedResult)
         index = torch.nonzero(solved).squeeze(-1)
         inputs = {name: getattr(problem, name).clone().requires_grad_() for name in INPUTS}
@@ -179,8 +179,8 @@ class RelaxedBackend(Backend):
             for graph in step.graphs:
                 seeds = [v[graph.index] for v in upstream]
                 with _quiet(), _interruptible():
-                    found = torch.autograd.grad(graph.outputs[:3], graph.parameters, seeds, retain_graph=True)
-                for bar, value in zip(bars, found, strict=True):
+                    parts = torch.autograd.grad(graph.outputs[:3], graph.parameters, seeds, retain_graph=True)
+                for bar, value in zip(bars, parts, strict=True):
                     bar[graph.index] = value
             *more, nominal_bar = _pull(parameters, [*inputs.values(), nominal], [bar[index] for bar in bars])
             total = [a + b for a, b in zip(total, more, strict=True)]
@@ -211,7 +211,7 @@ class RelaxedBackend(Backend):
         return _Pass(nominal, penalty, graphs, plan, residual)
 
     def _call(self, layer: CvxpyLayer, parameters: list[Tensor], index: Tensor) -> tuple[_Graph, ...]:
-        """One call of the layer; nothing where the solver raises."""
+        """Call the layer once; return nothing if the solver raises."""
         leaves = [v[index].requires_grad_() for v in parameters]
         threads = self.threads or torch.get_num_threads()
         options = {
@@ -233,7 +233,7 @@ class RelaxedBackend(Backend):
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Torch on one thread: with two, the tiny batched products took 20 times as long on a busy machine."""
+    """Run torch on one thread: with two, the tiny batched products took 20 times as long on a busy machine."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -244,7 +244,7 @@ def _one_thread() -> Iterator[None]:
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """After Ctrl-C diffcp's threads finish the element they are at; an interpreter that ends before them aborts."""
+    """Join diffcp's threads at exit after Ctrl-C: they finish their element and would abort an ended interpreter."""
     before = set(threading.enumerate())
     try:
         yield
@@ -256,7 +256,7 @@ def _interruptible() -> Iterator[None]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without the one warning that cvxpylayers 1.2 causes with NumPy 2 at every call."""
+    """Hide the one warning that cvxpylayers 1.2 causes with NumPy 2 at every call."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "__array__ implementation doesn't accept a copy", DeprecationWarning)
         yield
@@ -268,13 +268,13 @@ _PLAIN = ("A", "B", "C", "d", "D", "E", "F", "c", "u_min", "u_max", "x0")
 
 
 def _weights(horizon: int) -> tuple[str, ...]:
-    """Weights that act on an action or on a state after x0."""
+    """List the weights that act on an action or on a state after x0."""
     return ("Q", "R", "Q_final") if horizon > 1 else ("R", "Q_final")
 
 
 @lru_cache(maxsize=32)
 def _layer(n_x: int, n_u: int, n_lam: int, horizon: int, barrier: float) -> CvxpyLayer:
-    """The program with the parameters of `_parameters`; built once for each size."""
+    """Build the program with the parameters of `_parameters`; once for each size."""
     import cvxpy as cp
     from cvxpylayers.torch import CvxpyLayer  # pyright: ignore[reportPrivateImportUsage]
 
@@ -317,7 +317,7 @@ def _layer(n_x: int, n_u: int, n_lam: int, horizon: int, barrier: float) -> Cvxp
 def _parameters(
     inputs: Mapping[str, Tensor], nominal: Tensor, relaxation: float, penalty: float, centre: Primal
 ) -> list[Tensor]:
-    """Inputs → the layer's parameters, each (batch, ...); differentiable, Q, R and Q_final around `centre` only.
+    """Compute the layer's parameters (batch, ...) from the inputs; differentiable, Q, R, Q_final around `centre` only.
 
     The quadratic cost enters as ½‖L(z − centre)‖² + (Q·centre + q)ᵀz, which differs from ½zᵀQz + qᵀz by a constant.
     """
@@ -339,7 +339,7 @@ def _parameters(
 def _linearise(
     t: Mapping[str, Tensor], nominal: Tensor, relaxation: float, penalty: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows α∘λ + β∘s − γ of the penalty, weighted, each (batch, H, n_lam)."""
+    """Compute the weighted rows α∘λ + β∘s − γ of the penalty, each (batch, H, n_lam)."""
     u = torch.minimum(torch.maximum(nominal, t["u_min"].unsqueeze(1)), t["u_max"].unsqueeze(1))
     horizon = nominal.shape[1]
     unit = t["F"].diagonal(dim1=-2, dim2=-1).sqrt()
@@ -359,7 +359,7 @@ def _linearise(
 
 @_one_thread()
 def _pull(outputs: list[Tensor], inputs: list[Tensor], bars: list[Tensor]) -> list[Tensor]:
-    """Gradients of the inputs, zero where nothing depends on one."""
+    """Compute the gradients of the inputs, zero where nothing depends on one."""
     pairs = [(v, bar) for v, bar in zip(outputs, bars, strict=True) if v.requires_grad]
     values, upstream = zip(*pairs, strict=True)
     return list(
@@ -368,7 +368,7 @@ def _pull(outputs: list[Tensor], inputs: list[Tensor], bars: list[Tensor]) -> li
 
 
 def _root(matrix: Tensor) -> Tensor:
-    """L with L Lᵀ = matrix, for a positive semi-definite one that may be singular."""
+    """Compute L with L Lᵀ = matrix, for a positive semi-definite one that may be singular."""
     values, vectors = torch.linalg.eigh(matrix)
     return vectors * values.clamp_min(0.0).sqrt().unsqueeze(-2)
 
@@ -377,9 +377,9 @@ def _root(matrix: Tensor) -> Tensor:
 def _polish(
     problem: MPCProblem, u: Tensor, lam: Tensor, mu: Tensor, *row: Tensor, steps: int = 3
 ) -> tuple[Primal, Tensor]:
-    """Newton steps on the program with its active bounds held; each element keeps its best point.
+    """Improve a plan by Newton steps on the program with its active bounds held; each element keeps its best point.
 
-    A conic solver is right to its tolerance only, which shows in difference quotients.
+    A conic solver is accurate only to its tolerance, which shows in difference quotients.
 
     Args:
         problem: the problems.
@@ -387,7 +387,7 @@ def _polish(
         lam: (batch, H, n_lam) solver's λ.
         mu: (batch, H, n_lam) solver's multiplier of s ≥ 0.
         row: α, β, γ of the penalty.
-        steps: most Newton steps.
+        steps: number of Newton steps.
 
     Returns:
         The trajectory with exact dynamics, bounds and λ ≥ 0, and its residual (batch,), NaN where the solver gave none.
@@ -473,7 +473,7 @@ class _Point:
         )
 
     def newton(self, problem: MPCProblem) -> tuple[Tensor, Tensor, Tensor]:
-        """U, λ and multiplier of s ≥ 0 that solve the program if its active constraints are those of this point."""
+        """Compute u, λ and multiplier of s ≥ 0 that solve the program if its active constraints are those here."""
         z = torch.cat([self.primal.u.flatten(1), self.primal.lam.flatten(1)], 1)
         in_u = self.primal.u.shape[1] * self.primal.u.shape[2]
         # By Newton's step of one coordinate, so that units do not decide what is active.
@@ -487,9 +487,9 @@ class _Point:
         K[:, :n, :n], K[:, :n, n:], K[:, n:, :n] = self.hessian, -self.S.mT, self.S
         right = torch.cat([-self.gradient, -self.s], 1)
         # Rows of held z give the step to its bound, those of open s a zero multiplier.
-        given = torch.cat([held, ~touching], 1)
-        K = torch.where(given.unsqueeze(-1), torch.eye(n + m, dtype=torch.float64), K)
-        right = torch.where(given, torch.cat([bound - z, torch.zeros_like(self.s)], 1), right)
+        fixed = torch.cat([held, ~touching], 1)
+        K = torch.where(fixed.unsqueeze(-1), torch.eye(n + m, dtype=torch.float64), K)
+        right = torch.where(fixed, torch.cat([bound - z, torch.zeros_like(self.s)], 1), right)
         step = torch.nan_to_num(torch.linalg.solve_ex(K, right)[0], nan=0.0, posinf=0.0, neginf=0.0)
         u, lam = (z + step[:, :n]).split([in_u, m], 1)
         u = u.reshape(self.primal.u.shape)

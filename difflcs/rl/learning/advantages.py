@@ -4,17 +4,17 @@ With q(s, a) = r(s, a) + γ V(s₊) and its mean q̄(s) over the policy's action
 
     δ_t = [q(s_t, a_t) − q̄(s_t)] + b(s_t),  b = q̄ − V.
 
-In an advantage Σ_l (γζ)^l δ_{t+l} the brackets of later steps are noise: they average out over later actions. So is
-b(s_t), the same for all actions. In model rollouts one can look a step ahead, so that without them, and with many
+In an advantage Σ_l (γζ)^l δ_{t+l} the brackets of later steps are noise: they average out over later actions. b(s_t) is
+noise too, as it is the same for all actions. Model rollouts can look a step ahead, so both can be left out. With many
 actions for each state,
 
     A(s_t, a) = q(s_t, a) − q̄(s_t) + [a = a_t] M Σ_{l≥1} (γζ)^l b(s_{t+l})
 
-has the policy gradient of GAE in expectation, with the same V and ζ. The sum, which corrects what V says wrongly about
-the next states, is known for the action taken only: it counts for all M of them.
+has the policy gradient of GAE in expectation, with the same V and ζ. The sum corrects the errors of V
+at the next states. It is known for the action taken only, so it has the weight of all M.
 
 The bracket, the advantage of the action taken (`action_advantage`), is also noise in the rewards that V is fitted to,
-and left out of them.
+and is subtracted from them.
 """
 
 from __future__ import annotations

@@ -94,7 +94,7 @@ class ModelEnv(VectorEnv):
         self._context: Tensor | None = None
         self._rng = np.random.default_rng(0)
 
-    def remember(self, states: Tensor, goals: Tensor, contexts: Tensor | None = None) -> None:
+    def set_episodes(self, states: Tensor, goals: Tensor, contexts: Tensor | None = None) -> None:
         """Replace the episodes from which starts, goals and the range of states are taken.
 
         Args:
@@ -117,10 +117,10 @@ class ModelEnv(VectorEnv):
             Observations and an empty info.
 
         Raises:
-            InvalidInputError: `remember` has not been called yet.
+            InvalidInputError: `set_episodes` has not been called yet.
         """
         if not len(self._starts):
-            raise InvalidInputError("model rollouts: expected real episodes, got none; call remember() first")
+            raise InvalidInputError("model rollouts: expected real episodes, got none; call set_episodes() first")
         if seed is None or isinstance(seed, int):
             first = int(self._rng.integers(2**31)) if seed is None else seed
             seed = range(first, first + self.num_envs)
@@ -238,7 +238,7 @@ class ModelRollouts:
         return loss
 
     def _remember(self) -> None:
-        self.env.remember(self.episodes["state"], self.episodes["goal"], self.episodes.get(CONTEXT, None))
+        self.env.set_episodes(self.episodes["state"], self.episodes["goal"], self.episodes.get(CONTEXT, None))
 
     def state_dict(self) -> dict[str, Any]:
         """State to resume from, the episodes included."""

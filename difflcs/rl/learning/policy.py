@@ -294,7 +294,7 @@ class LCSMPCPolicy(GaussianPolicy):
             with ignore_solver_warnings():
                 jacobian = system_jacobian(self.mpc, state, goal, _guess(data), data.get(CONTEXT, None))
             return torch.linalg.solve_triangular(self.gaussian.scale_tril().detach(), jacobian, upper=False)
-        # Parameters that are matrices may have batch dimensions. A copy for each sample has the gradient of its own.
+        # Parameters that are matrices may have batch dimensions: a copy for each sample gets that sample's gradient.
         of_lcs = {id(p) for p in lcs.parameters()}
         learned = {name: p for name, p in self.gaussian.named_parameters() if id(p) in of_lcs and p.requires_grad}
         copies = {name: p.detach().expand(len(data), *p.shape).clone().requires_grad_() for name, p in learned.items()}

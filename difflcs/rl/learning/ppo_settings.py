@@ -39,7 +39,7 @@ class PPOSettings(Settings):
     minibatch: int | None = bounded(600, minimum=1)
     """Samples per gradient step, every sample once before any is drawn again; None: each step on all of its data."""
     update: Literal["natural", "adam"] = "natural"
-    """What moves the policy: the natural gradient, for a policy with an MPC, or Adam."""
+    """Update rule of the policy: the natural gradient, for a policy with an MPC, or Adam."""
     natural: Natural = group(Natural)
     """Settings of the natural gradient."""
     adam: Adam = group(Adam, learning_rate=6e-4, betas=(0.9, 0.99))
@@ -67,7 +67,7 @@ class PPOSettings(Settings):
     std: float = bounded(0.005, above=0)
     """Standard deviation of the policy [units of the action]."""
     covariance: Literal["fixed", "diagonal", "full"] = "fixed"
-    """What is learned of the policy's covariance together with the model."""
+    """Part of the policy's covariance that is learned together with the model."""
     std_learning_rate: float = bounded(0.01, above=0)
     """Adam's step size of the logarithms of learned standard deviations."""
     std_range: tuple[float, float] = bounded((0.001, 0.01), above=0)
@@ -113,8 +113,8 @@ def make_ppo(
         first_episode: episodes collected before, by a warm-up.
         first_iteration: iterations done before.
         failure_penalty: part of the last reward of a failed episode, see `TaskSpec`.
-        models: plays episodes in networks besides those of the robot; None: real ones alone, as in the paper. Let PPO
-            `remember` the episodes of a warm-up.
+        models: plays episodes in networks besides those of the robot; None: real ones alone, as in the paper. Pass
+            the episodes of a warm-up to `PPO.remember`.
 
     Raises:
         InvalidInputError: an argument does not fit.

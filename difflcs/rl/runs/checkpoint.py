@@ -266,8 +266,8 @@ def _line(cells: Sequence[object] | object) -> str:
 
 
 @contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Turn errors of the file system into ours.
+def wrap_os_errors(path: Path) -> Iterator[None]:
+    """Wrap errors of the operating system in ours.
 
     Raises:
         CheckpointError: something below `path` cannot be written.
@@ -282,7 +282,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def replacing(out: Path) -> Iterator[Callable[[], object]]:
+def replace_run(out: Path) -> Iterator[Callable[[], object]]:
     """Move the run in `out` aside. The yielded function deletes it; unless called, the run comes back at the end."""
     out = out.resolve()
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
@@ -293,7 +293,7 @@ def replacing(out: Path) -> Iterator[Callable[[], object]]:
     except CheckpointError as error:
         raise CheckpointError(f"{error}. --force replaces runs only; choose another --out") from error
     with ExitStack() as held:
-        with writing(out):
+        with wrap_os_errors(out):
             held.enter_context(RunDirectory(out).locked())
             aside = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}.", suffix=".old"))
             os.replace(out, aside / out.name)

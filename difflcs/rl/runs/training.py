@@ -20,7 +20,7 @@ from difflcs.lcs import LCSModel
 from difflcs.rl.learning.trainer import Trainer, save_learned
 from difflcs.rl.methods import LCSMethod, LCSRLMethod, Method, Work, check_fits, get_method
 from difflcs.rl.rollout import Policy
-from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, replacing, save_checkpoint, writing
+from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, replace_run, save_checkpoint, wrap_os_errors
 from difflcs.rl.runs.evaluate import Evaluation, evaluate
 from difflcs.rl.settings import Settings, bounded, from_json
 from difflcs.rl.tasks import TaskSpec, get_task
@@ -43,7 +43,7 @@ class TrainConfig(Settings):
     """Configuration of a training: task, method, amount of data, and evaluations."""
 
     task: str = "cube"
-    """What to do: the name of a task."""
+    """Name of a task."""
     minutes: float = bounded(6.0, above=0, maximum=1e6)
     """Data to collect [min of simulated time]; one minute on the cube is 600 steps of 0.1 s."""
     seed: int = bounded(0, minimum=0)
@@ -184,7 +184,7 @@ def train(
         raise InvalidInputError("force: expected without resume, got both; one replaces a run, the other continues it")
     if init is not None and init.resolve().is_relative_to(out.resolve()):
         raise InvalidInputError(f"init: expected a model outside the run that is replaced, {out}, got {init}; copy it")
-    with replacing(out) as begun, ExitStack() as held:
+    with replace_run(out) as begun, ExitStack() as held:
         return run(init, resume, begun, held)
 
 
@@ -284,7 +284,7 @@ class _Training:
 
     def _create(self, init: Path | None, held: ExitStack) -> RunDirectory:
         out = self.out
-        with writing(out):
+        with wrap_os_errors(out):
             RunDirectory.check_free(out)  # before anything is written there
             out.mkdir(parents=True, exist_ok=True)
             held.enter_context(RunDirectory(out).locked())
@@ -299,7 +299,7 @@ class _Training:
     def _reopen(self, held: ExitStack) -> tuple[RunDirectory, Path | None]:
         run = RunDirectory.open(self.out)
         if not run.finished():
-            with writing(self.out):
+            with wrap_os_errors(self.out):
                 held.enter_context(run.locked())
         if stored_config(run) != self.config:
             raise CheckpointError(
@@ -333,11 +333,11 @@ class _Training:
 
         def finish(report: Any, previous: int) -> None:
             # The row first, then the checkpoint: resuming drops rows after the checkpoint, so none is lost or doubled.
-            goals = goals_due(config, previous, trainer.env_steps, self.task)
+            goals = count_goals_due(config, previous, trainer.env_steps, self.task)
             start = time.perf_counter()
             result = measure(goals) if goals else None
             row = _row(columns, trainer.env_steps, per_minute, report, result, time.perf_counter() - start)
-            with writing(run.path):
+            with wrap_os_errors(run.path):
                 run.append(row)
                 for name, value in row.items():
                     if isinstance(value, int | float) and name not in ("iteration", "env_steps"):
@@ -361,7 +361,7 @@ class _Training:
             while trainer.env_steps < self.total:
                 previous = trainer.env_steps
                 finish(trainer.step(reporter.stepped), previous)
-            with writing(run.path):
+            with wrap_os_errors(run.path):
                 save_learned(trainer.learned, run.model, self.config.method.kind)
         finally:
             writer.close()
@@ -394,7 +394,7 @@ def count_episodes(minutes: float, task: TaskSpec) -> int:
     return max(1, round(minutes * task.steps_per_minute / task.episode_steps))
 
 
-def goals_due(config: TrainConfig, previous: int, now: int, task: TaskSpec) -> int:
+def count_goals_due(config: TrainConfig, previous: int, now: int, task: TaskSpec) -> int:
     """Return the number of goals to evaluate after the environment steps previous + 1 … now; 0 for no evaluation."""
     if now == 0:
         return config.final_goals if 0 in config.evaluate_at else 0
@@ -428,13 +428,13 @@ def summarise_report(report: Any) -> dict[str, str]:
     return {name: f"{getattr(report, name):.2g}" for name in names}
 
 
-def profile(rows: Sequence[Mapping[str, str]]) -> dict[str, float]:
+def sum_seconds(rows: Sequence[Mapping[str, str]]) -> dict[str, float]:
     """Sum the seconds that a run spent on each kind of work over the rows of log.csv: name → seconds."""
     names = [name for name in rows[0] if name.endswith("_seconds")] if rows else []
     return {name.removesuffix("_seconds"): sum(float(row[name] or 0) for row in rows) for name in names}
 
 
-def saved_bounds(run: RunDirectory) -> tuple[torch.Tensor, torch.Tensor]:
+def load_action_support(run: RunDirectory) -> tuple[torch.Tensor, torch.Tensor]:
     """The action support (n_u,), (n_u,) of the last episodes before the latest checkpoint of a warm-up.
 
     Raises:

@@ -68,7 +68,7 @@ _GENERATORS = {**generators.LCP_CLASSES, **generators.MPC_CLASSES, **generators.
 _TARGETS = {
     "lcp": {**targets.LCP_TARGETS, **rules.RULE_TARGETS},
     "mpc": {**targets.MPC_TARGETS, **targets.SLOW_TARGETS, **rules.RULE_TARGETS},
-    "loss": {**targets.LOSS_TARGETS, **rules.RULE_TARGETS},
+    "loss": targets.LOSS_TARGETS,
     "form": forms.FORM_TARGETS,
 }
 CELLS = [
@@ -80,7 +80,6 @@ CELLS = [
     *(Cell(p, t, 64, 0.25) for p in generators.LOSS_CLASSES for t in targets.LOSS_TARGETS),
     *(Cell(p, t, 24, 0.05) for p in forms.FORM_CLASSES for t in forms.FORM_TARGETS),
     *(Cell(p, "neighbours", 32, 0.2) for p in ("lcp-plain", "mpc-plain")),
-    *(Cell(p, t, 16, 0.02) for p in ("lcp-plain", "mpc-plain", "loss-plain") for t in ("in-place", "double backward")),
 ]
 
 

@@ -26,6 +26,9 @@ PARAMETERS = [
 FLOORS = {
     "lcp-plain": 1.0,
     "lcp-skew-1e-2": 0.99,
+    "lcp-skew-1e-4": 0.99,
+    "lcp-skew-1e-6": 0.97,
+    "lcp-skew-1e-8": 0.5,
     "lcp-nearly-singular": 0.98,
     "lcp-graded": 0.98,
     "lcp-degenerate": 0.98,

@@ -51,6 +51,25 @@ static void null_pointers(const char* path) {
   difflcs_free(c);
 }
 
+/* A system that stays where it is, whatever is done: the best action is none. Matrices that do not fit change nothing. */
+static void other_system(difflcs_controller* c, difflcs_sizes n) {
+  static double zeros[64 * 64], eye_x[64 * 64], eye_lam[64 * 64], ones[64];
+  const double* matrices[8] = {eye_x, zeros, zeros, zeros, zeros, zeros, eye_lam, ones};
+  for (size_t i = 0; i < n.n_x; i++) eye_x[i * n.n_x + i] = 1;
+  for (size_t i = 0; i < n.n_lam; i++) eye_lam[i * n.n_lam + i] = ones[i] = 1;
+  EXPECT(difflcs_set_system(c, matrices) == DIFFLCS_CONVERGED);
+  const long before = allocations;
+  EXPECT(difflcs_set_system(c, matrices) == DIFFLCS_CONVERGED);
+  EXPECT(difflcs_step(c, state, goal, action) == DIFFLCS_CONVERGED && allocations == before);
+  for (size_t j = 0; j < n.n_u; j++) EXPECT(fabs(action[j]) < 1e-6);
+  ones[0] = NAN;
+  EXPECT(difflcs_set_system(c, matrices) == DIFFLCS_INVALID);
+  matrices[3] = NULL;
+  EXPECT(difflcs_set_system(c, matrices) == DIFFLCS_INVALID && difflcs_set_system(NULL, matrices) == DIFFLCS_INVALID);
+  EXPECT(n.n_goal == 0 || difflcs_set_cost(c, matrices) == DIFFLCS_INVALID);
+  EXPECT(difflcs_step(c, state, goal, action) == DIFFLCS_CONVERGED);
+}
+
 /* A circle of all that one can ask of a loaded controller. */
 static void circle(difflcs_controller* c, difflcs_sizes n, int times) {
   for (int i = 0; i < times; i++) {
@@ -109,6 +128,7 @@ static void independent(const char* path, difflcs_controller* first, difflcs_siz
   ten_steps(first, second, n, action);
   ten_steps(second, NULL, n, other);
   EXPECT(memcmp(action, other, n.n_u * sizeof(double)) == 0);
+  other_system(second, n);
   difflcs_free(second);
 }
 

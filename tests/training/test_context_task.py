@@ -1,9 +1,8 @@
-"""A task with a context, and a method that learns a module of one's own, by the common code of all trainings."""
+"""A task with a context, by the common code of all trainings."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,27 +18,20 @@ from difflcs.rl import (
     ModelRollouts,
     ModelRolloutSettings,
     PhysicsSpec,
-    Rollouts,
     TaskSpec,
     TrainConfig,
-    ViolationLoss,
-    ViolationMethod,
-    WarmupSettings,
     collect,
     evaluate,
     get_method,
     load_policy,
     method_names,
-    register_method,
     train,
 )
 from difflcs.rl.rollout import append_context, contexts, transitions, uniform_actions
-from tests.training.slide import same
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 STEPS = HeavyBlock.STEPS
-LOSS = ViolationLoss(gamma="auto", xi=0.1)
 OFF = {"damping": 2.0, "stiffness": 50.0, "added_mass": 0.6}
 
 
@@ -64,42 +56,6 @@ TASK = TaskSpec(
     outcome=outcome,
     physics=PhysicsSpec(make_system=lambda: Physics(**OFF), scale=(1.0, 1.0)),
 )
-
-
-@dataclass(frozen=True)
-class PhysicsMethod(ViolationMethod):
-    """The warm-up of known physics with unknown numbers."""
-
-    name: ClassVar[str] = "physics"
-    version: ClassVar[int] = 1
-    summary: ClassVar[str] = "the warm-up of known physics with unknown numbers"
-    kind: ClassVar[str] = "Physics"
-    takes_init: ClassVar[bool] = False
-
-    def initial(self, work):
-        return Physics(**OFF)
-
-    def rebuild(self, task, config, tensors, source):
-        found = Physics()
-        found.load_state_dict(dict(tensors))
-        return found
-
-
-@pytest.fixture
-def registered():
-    register_method(PhysicsMethod)
-    return PhysicsMethod(warmup=WarmupSettings(rollouts=Rollouts(4, 4), epochs=Epochs(8, 4, 20), noise=0.1, loss=LOSS))
-
-
-def test_a_method_that_learns_a_module_of_ones_own(registered, tmp_path):
-    """What its run directory holds acts as what was trained."""
-    config = TrainConfig(task="heavy-block", method=registered, minutes=0.3, evaluate_at=(), final_goals=4)
-    run = train(config, tmp_path / "run", task=TASK)
-    settings, tensors = run.learned("Physics")
-    assert settings == {"class": "Physics", "n_x": 2, "n_u": 1, "n_lam": 1}
-    policy: Any = load_policy(run, TASK)
-    assert same([*policy.lcs.state_dict().values()], [tensors[name] for name in policy.lcs.state_dict()])
-    assert float(run.rows()[-1]["evaluation_success_rate"]) >= 0
 
 
 @pytest.mark.parametrize("method", method_names())
