@@ -278,13 +278,16 @@ class Followed(NamedTuple):
     stops: NDArray[np.bool_]
 
 
-def follow(gap: Array, speed: Array, load: Array, mass: Array, soft: Softness, seconds: float, count: int) -> Followed:
+def follow(
+    gap: Array, speed: Array, load: Array, turn: Array, mass: Array, soft: Softness, seconds: float, count: int
+) -> Followed:
     """Follow soft rows (n, k) through a step.
 
     Args:
         gap: at its beginning.
         speed: v at its beginning.
         load: acceleration a without the row's own force.
+        turn: part of it that is due to its Jacobian's change, J̇ ν, which MuJoCo's force does not resist.
         mass: A, the inverse of the mass.
         soft: MuJoCo's parameters.
         seconds: duration of the step [s].
@@ -301,7 +304,7 @@ def follow(gap: Array, speed: Array, load: Array, mass: Array, soft: Softness, s
         firm = mass / (mass + (1 - d) / d * soft.give)
         spring, damping = firm * soft.stiffness * d, firm * soft.damping
         # Steps that are longer than MuJoCo's are implicit.
-        force = -damping * v - spring * r - firm * load
+        force = -damping * v - spring * r - firm * (load - turn)
         if coarse:
             force = (force - h * (damping * load + spring * (v + h * load))) / (1 + h * damping + h * h * spring)
         held = np.where(limit, (r < 0) & (force > 0), (lower < force) & (force < upper))

@@ -163,7 +163,7 @@ def _settle(
     mass = np.einsum("nki,nij,nkj->nk", rows.normal, step.inverse_mass, rows.normal)
     after_bend = (rows.normal @ moved[:, :, None])[:, :, 0] + 2 * rows.bend
     load = (after_bend / h - speed - mass * forces * scaled.unit) / h
-    after = follow(rows.gap, speed, load, mass, rows.soft, h, step.motion.steps.count)
+    after = follow(rows.gap, speed, load, 2 * rows.bend / h**2, mass, rows.soft, h, step.motion.steps.count)
     inside = np.abs(forces[:, k:]) < 0.999 * scaled.bound
     holds = after.holds & np.concatenate([forces[:, :k] > 0, inside], 1)
     # A limit holds at the depth that it has after the step, friction after its creep.
@@ -172,7 +172,7 @@ def _settle(
     # What only another action brings to its limit is pressed there all the time: half an impulse does as much.
     reach = np.abs(rows.normal @ step.step[:, :nv, step.x.shape[1] : -1]).sum(-1)
     pressed = ~holds & (np.abs(rows.gap) < reach) & ~(after.acts & (rows.gap > 0))
-    part = np.clip(np.where(is_limit & pressed, _EARLY, after.part), _EARLY, 1.0)
+    part = np.clip(np.where(is_limit & pressed, _EARLY, after.part), _EARLY, 1.25)
     part = np.where(~is_limit & after.stops, 1.0, part)
     return scale(rows, gap, part, response, give, h), rows.normal * holds[:, :, None]
 
