@@ -40,7 +40,7 @@ from difflcs.physics.mujoco.library import Places, addresses, library
 Array = NDArray[np.float64]
 
 _BEYOND = 1e6  # a motion in a step [m, rad] and its velocity that no model has
-_MOST, _FEW = 10, 4  # steps that are simulated one by one; where there are more, so many as long ones
+_MOST, _FEW = 50, 25  # steps that are simulated one by one; where there are more, so many as long ones
 _EULER, _RK4, _IMPLICIT, _FAST = (
     int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("EULER", "RK4", "IMPLICIT", "IMPLICITFAST")
 )
@@ -158,6 +158,8 @@ class Dynamic:
         sizes = ((n_x,), (n_x - nv,), (n_x, n_x), (n_x, nu), (nv, nv), (nu,), (n_x,))
         read, ctrl = Linearised(*(np.zeros((n, *size)) for size in sizes)), np.ascontiguousarray(ctrl)
         places.check(_mujoco.read_motion(library(), self._native, places.take(n), states, ctrl, *read), n)
+        activation = states[:, self.model.nq + nv :] + read.middle[:, 2 * nv :]
+        self.actuators.even_out(read.nominal, activation, read.A, read.B)
         return read
 
     @functools.cached_property

@@ -73,16 +73,18 @@ class Recovery:
         pyramid = 1 + (model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL)  # about
         self._creep = pyramid * damping * (1 / impedance[0] - 1) / model.opt.impratio
 
-    def settled(self, gap: Array, geom: NDArray[np.intp], acceleration: Array, seconds: float) -> Array:
+    def settled(self, gap: Array, geom: NDArray[np.intp], acceleration: Array, speed: Array, seconds: float) -> Array:
         """Gaps (n, n_contacts) of geoms (n, n_contacts, 2) that carry accelerations (n, n_contacts), after a step.
 
-        What is deeper than the load explains, or a load that only the action makes, comes out as fast as MuJoCo's
-        contacts recover.
+        What is deeper than the load explains, or a load that only the action makes, comes out as MuJoCo's contacts
+        recover, critically damped, from the `speed` (n, n_contacts) at which it opens now, as far as depth explains it.
         """
         time, depth = self._time[geom].max(-1), self._depth[geom].max(-1)
         usual = np.minimum(depth * _LOAD, self._usual)
         deeper = np.maximum(-gap - np.clip(depth * acceleration, usual, 5 * self._usual), 0.0)
-        return np.where(gap < 0, -deeper * (1 - np.exp(-seconds / time)), gap)
+        part, most = seconds / time, deeper / time
+        moved = deeper * (1 - (1 + part) * np.exp(-part)) + np.clip(speed, -most, most) * seconds * np.exp(-part)
+        return np.where(gap < 0, -moved, gap)
 
     def crept(self, geom: NDArray[np.intp], acceleration: Array, speed: Array) -> Array:
         """Part (n, n_contacts, n_tangents) of `speed` that remains as friction carries such accelerations."""
@@ -222,7 +224,8 @@ def evaluate_nominal(
     acceleration = (
         np.einsum("nkv,nvw,nkw->nk", contacts.normal, step.inverse_mass, contacts.normal) * normal / step.seconds
     )
-    gap = recovery.settled(contacts.gap, contacts.geom, acceleration, step.seconds)
+    speed = (contacts.normal @ step.velocity[:, :, None])[:, :, 0]
+    gap = recovery.settled(contacts.gap, contacts.geom, acceleration, speed, step.seconds)
     contacts = contacts._replace(tangent=_turn_tangents(contacts.tangent, slide))
     slide = np.einsum("nktv,nv->nkt", contacts.tangent, moved) * slides[:, :, None]
     if slides.any():  # else it is as before: what holds does not depend on the directions of the tangents
