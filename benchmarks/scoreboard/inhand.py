@@ -6,7 +6,7 @@ DIR has to contain; or set DIFFLCS_INHAND_DIR. An object lies on the palm, its p
 yaw uniform in ±90°; the goal is 90° of yaw away, to either side. A decision moves the targets of 16 joint servos by
 at most 0.1 rad, 0.2 rad for objects of 100 g, from where the joints are, and holds them for 50 steps of 2 ms.
 
-- Success, in both papers: 1 − (q·goal)² < 0.04, which is 23°, after each of 20 decisions in a row. With `--position`
+- Success, in both papers: 1 − (q·goal)² < 0.04, which is 23°, after each of 21 decisions in a row. With `--position`
   the object has to be within 2 cm of its target place as well.
 - Failure: 500 decisions, or the object's centre below 5 mm.
 
@@ -59,7 +59,7 @@ OBJECTS = {  # place of the start [m], its height, and the target place, as publ
 }
 JOINTS = (0.125, 1.13, 1.45, 1.24, -0.02, 0.445, 1.17, 1.5, -0.459, 1.54, 1.11, 1.23, 0.638, 1.85, 1.5, 1.26)
 FINGERS, LINKS = ("ff", "mf", "rf", "th"), ("base", "proximal", "medial", "distal", "tip")
-LIMIT, HELD, SUBSTEPS, LOST = 500, 20, 50, 0.005
+LIMIT, HELD, SUBSTEPS, LOST = 500, 21, 50, 0.005
 
 
 @dataclass(frozen=True)
