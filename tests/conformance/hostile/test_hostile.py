@@ -198,13 +198,3 @@ def test_records_survive_a_cut_line(tmp_path):
     assert page.read_text().startswith(f"before\n{campaign.BEGIN}| problems")
     assert page.read_text().endswith(f"{campaign.END}after\n")
     assert "old" not in page.read_text()
-
-
-def test_a_batch_of_no_problems_of_any_form_is_solved(one_thread):
-    rng = np.random.default_rng(0)
-    form = forms.plain(rng, 4).select(slice(0, 0))
-    leaves = forms.leaves_of(form)
-    plan = forms.layer_of(form, leaves)(leaves["x0"])
-    assert plan.u.shape[0] == plan.mu.shape[0] == plan.violation.shape[0] == 0
-    plan.objective.sum().backward()
-    assert leaves["x0"].grad is not None
