@@ -1,7 +1,6 @@
 """The vector environment, TorchRL, and libraries that expect Gymnasium."""
 
 import multiprocessing
-import pickle
 import warnings
 
 import numpy as np
@@ -164,16 +163,6 @@ def test_instability_stays_in_its_lane(tmp_path, monkeypatch):
     assert not envs.step(np.zeros((3, 6)))[4]["physics_error"].any()
 
 
-def test_copies_continue_alike():
-    envs = move_cube(3)
-    envs.reset(seed=0)
-    envs.step(np.full((3, 6), 0.01))
-    copied = pickle.loads(pickle.dumps(envs))
-    for _ in range(21):
-        one, other = envs.step(np.full((3, 6), -0.01)), copied.step(np.full((3, 6), -0.01))
-        assert_same(one[0], other[0])
-
-
 @pytest.mark.parametrize("arguments", [{"num_envs": 0}, {"num_envs": 2.5}, {"num_envs": 2, "threads": 0}])
 def test_bad_arguments(arguments):
     with pytest.raises(ValueError, match=r"Expected .*got"):
@@ -188,17 +177,6 @@ def test_bad_actions(actions):
         envs.step(actions)
     with pytest.raises(ValueError, match="2 seeds"):
         envs.reset(seed=[1, 2, 3])
-
-
-def test_wrappers_of_gymnasium():
-    envs = gymnasium.make_vec(CUBE, num_envs=2)
-    envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(gymnasium.wrappers.vector.FlattenObservation(envs))
-    observation, _ = envs.reset(seed=0)
-    assert observation.shape == (2, 12)
-    for _ in range(20):
-        observation, _, _, truncated, infos = envs.step(envs.action_space.sample())
-    assert truncated.all()
-    assert infos["episode"]["l"].tolist() == [20, 20]
 
 
 def test_another_library_learns_a_little():

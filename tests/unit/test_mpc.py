@@ -204,27 +204,6 @@ def test_equal_bounds_fix_the_action(layer, x0):
     torch.testing.assert_close(gradient, torch.tensor([6.0, 0.0], dtype=torch.float64))
 
 
-# --- gradients ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("chosen", ["F", "Q", "u_max", "x0"])
-def test_any_subset_may_require_the_gradient(build, x0, chosen):
-    tensors = {**build.lcs_tensors(3), **build.cost_tensors(3), "u_max": torch.full((2,), 0.15).double(), "x0": x0}
-    results = []
-    for only in (False, True):
-        leaves = {k: v.clone().requires_grad_(not only or k == chosen) for k, v in tensors.items()}
-        layer = LCSMPCLayer(
-            LCSParams(**{k: leaves[k] for k in build.lcs_tensors()}),
-            QuadraticCost(**{k: leaves[k] for k in build.cost_tensors()}),
-            3, -0.15, leaves["u_max"], backend=SOLVER, relaxation=1e-4,
-        )  # fmt: skip
-        layer(leaves["x0"]).u.sum().backward()
-        results.append(leaves[chosen].grad)
-        if only:
-            assert all(v.grad is None for k, v in leaves.items() if k != chosen)
-    torch.testing.assert_close(results[0], results[1])
-
-
 # --- failures -------------------------------------------------------------------------------------------------------
 
 

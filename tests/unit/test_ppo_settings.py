@@ -26,6 +26,8 @@ def test_bad_arguments_are_refused():
         make(actor, make_envs(), replace(settings, covariance="diagonal"), 0, **options)
     with pytest.raises(InvalidInputError, match="shorten the warm-up"):
         make(actor, make_envs(), settings, 0, **options, first_episode=20)
+    with pytest.raises(InvalidInputError, match="std_range"):
+        replace(settings, std_range=(0.2, 0.1))
     bound = torch.full((1,), U_MAX)
     network = make_actor(MLPController(features, 3, -bound, bound, 4, STEPS), settings.std)
     for changes in ({}, {"update": "adam", "beta": 0.5}):
