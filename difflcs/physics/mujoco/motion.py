@@ -40,7 +40,7 @@ from difflcs.physics.mujoco.library import Places, addresses, library
 Array = NDArray[np.float64]
 
 _BEYOND = 1e6  # a motion in a step [m, rad] and its velocity that no model has
-_MOST, _FEW = 10, 4  # steps that are simulated one by one; where there are more, so many as long ones
+_MOST, _FEW = 50, 25  # steps that are simulated one by one; where there are more, so many as long ones
 _EULER, _RK4, _IMPLICIT, _FAST = (
     int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("EULER", "RK4", "IMPLICIT", "IMPLICITFAST")
 )
@@ -158,6 +158,8 @@ class Dynamic:
         sizes = ((n_x,), (n_x - nv,), (n_x, n_x), (n_x, nu), (nv, nv), (nu,), (n_x,))
         read, ctrl = Linearised(*(np.zeros((n, *size)) for size in sizes)), np.ascontiguousarray(ctrl)
         places.check(_mujoco.read_motion(library(), self._native, places.take(n), states, ctrl, *read), n)
+        activation = states[:, self.model.nq + nv :] + read.middle[:, 2 * nv :]
+        self.actuators.even_out(read.nominal, activation, read.A, read.B)
         return read
 
     @functools.cached_property
@@ -335,6 +337,13 @@ class DynamicStep(NamedTuple):
         both = np.concatenate([h * impulse, impulse], 1)
         response[:, : 2 * nv, :nv] = to_x[:, : 2 * nv, : 2 * nv] @ both @ to_x[:, :nv, :nv].swapaxes(-1, -2)
         return FreeMotion(*(torch.from_numpy(v) for v in (A_x, to_x @ control, d, response)))
+
+    def effect(self, tangent: Array | None, normal: Array, impulse: Array) -> Array:
+        """What forces do to the next state (n, n_x, k): ζ moves by h S `normal` (n, k, nv), ν by S `impulse`."""
+        h, (n, n_x), nv = self.seconds, self.x.shape, self.place.shape[1]
+        place, velocity = (self.response @ rows.swapaxes(-1, -2) for rows in (h * normal, impulse))
+        still = np.zeros((n, n_x - 2 * nv, normal.shape[1]))
+        return np.concatenate([place if tangent is None else np.linalg.solve(tangent, place), velocity, still], 1)
 
 
 def _reached(step: Array, velocity: Array) -> Array:
