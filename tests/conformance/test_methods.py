@@ -250,6 +250,10 @@ def test_foreign_checkpoints_are_refused_and_change_nothing(name, make_trainer, 
         assert same(trainer.state_dict(), before), source
 
 
+def test_hostile_states_are_refused(name, make_trainer, refuses_hostile_checkpoints):
+    refuses_hostile_checkpoints(make_trainer(name))
+
+
 def test_a_run_is_not_continued_with_the_checkpoints_of_another_method(name, finished, tmp_path):
     other = NAMES[NAMES.index(name) - 1]
     run = RunDirectory.create(tmp_path / "run", finished(name).config())

@@ -326,14 +326,6 @@ def test_layer_refuses_crossed_bounds_with_both_numbers(build, bounds):
     refuse(e.BoundsError, r"at index \(1, 1\)", layer(build), torch.zeros(2, 4).double(), u_min=one[0], u_max=one[1])
 
 
-def test_a_learned_bound_that_crossed_is_refused_by_the_layer(build):
-    high = nn.Parameter(torch.full((2,), 0.1, dtype=torch.float64))
-    mpc = layer(build, u_max=high)
-    with torch.no_grad():
-        high[1] = -0.2
-    refuse(e.BoundsError, r"-0\.1.*-0\.2", mpc, torch.zeros(4).double())
-
-
 # --- MPCProblem -----------------------------------------------------------------------------------------------------
 
 

@@ -423,15 +423,6 @@ def test_force_of_a_blocked_fingertip(kp, force):
     assert total == pytest.approx(force, rel=0.11)
 
 
-def test_tips_keep_their_height_and_rest_where_they_are():
-    env = stand_in("mug")
-    state = env.reset(seed=0)[0]["state"]
-    for _ in range(10):
-        last = env.step(REST)[0]["state"]
-    np.testing.assert_allclose(last[3:], state[3:], atol=1e-4)
-    np.testing.assert_allclose(env.data.site_xpos[:, 2], 0.04, atol=1e-4)
-
-
 def test_pulling_at_the_end_of_the_reach_stays_finite():
     env = TriFingerMoveCubeEnv(reset_noise=0.0, horizon=200)
     env.reset(seed=0)
