@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 _USUAL, _LOAD = 0.02, 100.0  # depth of contacts in parts of the length, acceleration [m/s²], both of any load
 _SOFTER = 0.03  # of the compliance: how exactly forces are computed
 _EARLY = 0.6  # least part of a step in which a force moves things; from 0.5 on an impact would bounce with its speed
+_STUCK = 10.0  # times the force that a limit has by itself
 _PASSES = 2  # each reduces what is left of compliance and opening by about their parts of the motion
 
 
@@ -161,7 +162,8 @@ def _settle(
     gap = np.where(is_limit, np.maximum(rows.gap, 0.0) + 2 * rows.bend, -h * speed * creeps)
     scaled = scale(rows, gap, 1.0, response, give, h)
     rays = _Rays(contacts, scaled, response, give, compliance)
-    forces, moved = rays.forces(_place(step, step.delayed), np.maximum(contacts.gap, 0.0))
+    place, closed = _place(step, step.delayed), np.maximum(contacts.gap, 0.0)
+    forces, moved = rays.forces(place, closed)
     forces = rays.split(forces)[1]
     after_bend = (rows.normal @ moved[:, :, None])[:, :, 0] + 2 * rows.bend
     load = find_load(step, rows.normal, rows.bend, after_bend / h, forces * scaled.unit)
@@ -176,7 +178,14 @@ def _settle(
     pressed = ~holds & (np.abs(rows.gap) < reach) & ~(after.acts & (rows.gap > 0))
     part = np.clip(np.where(is_limit & pressed, _EARLY, after.part), _EARLY, 1.25)
     part = np.where(~is_limit & after.stops, 1.0, part)
-    return scale(rows, gap, part, response, give, h), rows.normal * holds[:, :, None]
+    settled = scale(rows, gap, part, response, give, h)
+    # Where what is passed comes back against other rows, it takes more force than it has: all stays where it is.
+    forces = _Rays(contacts, settled, response, give, compliance).forces(place, closed)[0]
+    stuck = (rays.split(forces)[1] * settled.unit > _STUCK * after.impulse) & is_limit & (rows.gap < 0)
+    stuck = stuck.any(-1, keepdims=True) & is_limit & (gap < 0)
+    if stuck.any():
+        settled = scale(rows, np.where(stuck, 2 * rows.bend, gap), np.where(stuck, 1.0, part), response, give, h)
+    return settled, rows.normal * holds[:, :, None]
 
 
 def evaluate_nominal(
