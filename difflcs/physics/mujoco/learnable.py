@@ -21,7 +21,8 @@ from difflcs._modules import fresh
 from difflcs.errors import InvalidInputError
 from difflcs.physics.mujoco.lcs import MujocoLCS
 from difflcs.physics.mujoco.narrow import BOX, CAPSULE, CYLINDER, ELLIPSOID, SPHERE
-from difflcs.records import SYSTEM, LCSParams, LCSSequence, sequence_along
+from difflcs.physics.mujoco.quasi_dynamic import BIASES, GAINS
+from difflcs.records import SYSTEM, LCSParams
 
 __all__ = ["LearnableMujocoLCS"]
 
@@ -33,43 +34,38 @@ class _Kind(NamedTuple):
 
     Attributes:
         of: what has it: body, geom, pair, actuator or joint; none for the compliance, which is ours.
-        fields: of `MjModel`, with the columns that belong to it; None for a vector.
+        fields: of `MjModel`, with the columns that belong to it.
         offset: whether it changes by a vector, in parts of the length, where else it has a factor.
     """
 
     of: str
-    fields: tuple[tuple[str, slice | int | None], ...]
+    fields: tuple[tuple[str, slice], ...]
     offset: bool = False
 
 
+_ALL = slice(0, 3)
 _KINDS = {
-    "mass": _Kind("body", (("body_mass", None), ("body_inertia", slice(3)))),
-    "inertia": _Kind("body", (("body_inertia", slice(3)),)),
-    "center_of_mass": _Kind("body", (("body_ipos", slice(3)),), offset=True),
-    "friction": _Kind("geom", (("geom_friction", 0),)),
-    "pair_friction": _Kind("pair", (("pair_friction", slice(2)),)),
-    "size": _Kind("geom", (("geom_size", slice(3)),)),
-    "offset": _Kind("geom", (("geom_pos", slice(3)),), offset=True),
-    "gain": _Kind("actuator", (("actuator_gainprm", slice(3)), ("actuator_biasprm", slice(3)))),
-    "servo_damping": _Kind("actuator", (("actuator_biasprm", 2),)),
-    "damping": _Kind("joint", (("dof_damping", None),)),
-    "armature": _Kind("joint", (("dof_armature", None),)),
-    "stiffness": _Kind("joint", (("jnt_stiffness", None),)),
+    "mass": _Kind("body", (("body_mass", _ALL), ("body_inertia", _ALL))),
+    "inertia": _Kind("body", (("body_inertia", _ALL),)),
+    "center_of_mass": _Kind("body", (("body_ipos", _ALL),), offset=True),
+    "friction": _Kind("geom", (("geom_friction", slice(0, 1)),)),
+    "pair_friction": _Kind("pair", (("pair_friction", slice(0, 2)),)),
+    "size": _Kind("geom", (("geom_size", _ALL),)),
+    "offset": _Kind("geom", (("geom_pos", _ALL),), offset=True),
+    "gain": _Kind("actuator", (("actuator_gainprm", _ALL), ("actuator_biasprm", _ALL))),
+    "servo_damping": _Kind("actuator", (("actuator_biasprm", slice(2, 3)),)),
+    "damping": _Kind("joint", (("dof_damping", slice(0, 1)),)),
+    "armature": _Kind("joint", (("dof_armature", slice(0, 1)),)),
+    "stiffness": _Kind("joint", (("jnt_stiffness", slice(0, 1)),)),
     "compliance": _Kind("", ()),
 }
+_COUNTS = {"body": "nbody", "geom": "ngeom", "pair": "npair", "actuator": "nu", "joint": "njnt"}
 _STEP, _STATE_STEP = 3e-3, 1e-4  # of the differences: of parameters, which are of size 1, and of states and controls
 _SIZED = (SPHERE, CAPSULE, CYLINDER, ELLIPSOID, BOX)
-_PLAIN = (  # of actuators whose force is linear in their numbers
-    (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)),
-    (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)),
-)
 
 
 class _Entry(NamedTuple):
-    """What some of the parameters say: their quantity, the name and numbers of what has it, their place, their count.
-
-    Each parameter of a factor belongs to a column of `fields` if there are several, else to all columns.
-    """
+    """Parameters of one quantity: its kind, a name and the numbers of what has it, their place and count."""
 
     kind: str
     name: str
@@ -93,14 +89,15 @@ class LearnableMujocoLCS(nn.Module):
         data: see `MujocoLCS`.
         learn: what to learn, each a kind or a pair (kind, name). Of bodies: `mass` (and inertia with it), `inertia`,
             `center_of_mass` (3). Of geoms, by their name or that of their body: `friction`, `size` (each size of one
-            geom, one factor of several), `offset` (3). Of actuators: `gain`, of a servo its damping as well. Of joints:
-            `damping`, `armature`, `stiffness`, `frictionloss`. Besides, `compliance`. Without a name, or with "*", one
-            factor is for all that have some.
+            geom, one factor of several; without its mass), `offset` (3). Of a `<pair>`: `pair_friction`. Of actuators:
+            `gain`, of a servo its damping with it, and `servo_damping`. Of joints: `damping`, `armature`, `stiffness`.
+            Besides, `compliance`. Without a name, or with "*", one factor is for all that have some.
         **options: those of `MujocoLCS`.
 
     Attributes:
         change: the parameters (n,).
         state: `MujocoState`.
+        n_x, n_u, n_lam: sizes of the system.
 
     Raises:
         InvalidInputError and its kinds: an unknown kind or name, one twice, one without such a quantity, or an argument
@@ -111,18 +108,19 @@ class LearnableMujocoLCS(nn.Module):
         super().__init__()
         first = MujocoLCS(model, data, **options)
         self._model, self.state = copy.copy(model), first.state
+        self.n_x, self.n_u, self.n_lam = first.n_x, first.n_u, first.n_lam
         self._data = mujoco.MjData(model) if data is None else copy.copy(data)
         self._options = {"compliance": first.compliance, **options, "length": first.length}
         if self._options.get("contacts") is None:  # the first has warned if these are too few
             self._options["contacts"] = first.n_contacts or None
         self._entries: list[_Entry] = []
         pairs = [(one, "*") if isinstance(one, str) else tuple(one) for one in learn]
-        for kind, name in pairs if not isinstance(learn, str) else []:
-            self._entries.append(self._entry(kind, name))
         if not pairs or len(set(pairs)) < len(pairs) or isinstance(learn, str):
             raise InvalidInputError(
                 f"learn: expected kinds or pairs (kind, name), each once, got {learn!r:.200}; name what is uncertain"
             )
+        for kind, name in pairs:
+            self._entries.append(self._entry(kind, name))
         self.change = nn.Parameter(torch.zeros(sum(e.count for e in self._entries), dtype=torch.float64))
         self._built: tuple[bytes, MujocoLCS] = self.change.detach().numpy().tobytes(), first
 
@@ -133,27 +131,22 @@ class LearnableMujocoLCS(nn.Module):
             )
         start, of = sum(e.count for e in self._entries), _KINDS[kind]
         if kind == "friction" and self._options.get("friction") is not None:
-            raise InvalidInputError(
-                "learn: expected no friction=... where it is learned, got one; set that of the geoms"
-            )
+            raise InvalidInputError("learn: expected no friction=... where it is learned, got one; set that of geoms")
         if kind == "compliance":
             return _Entry(kind, name, [], start, 1)
-        model, count = self._model, {"body": "nbody", "geom": "ngeom", "pair": "npair", "joint": "njnt"}
-        ids = list(range(getattr(model, count.get(of.of, "nu"))))
+        model, ids = self._model, list(range(getattr(self._model, _COUNTS[of.of])))
         if name != "*":
-            body, one = (
-                mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{what.upper()}"), name)
-                for what in ("body", of.of)
-            )
+            kinds = (getattr(mujoco.mjtObj, f"mjOBJ_{what.upper()}") for what in (of.of, "body"))
+            one, body = (mujoco.mj_name2id(model, what, name) for what in kinds)
             ids = [one] if one >= 0 else [g for g in ids if of.of == "geom" and model.geom_bodyid[g] == body]
         if of.fields[0][0].startswith("dof"):
             ids = [i for i in range(model.nv) if model.dof_jntid[i] in ids]
-        if of.of == "actuator":
-            plain = np.isin(model.actuator_gaintype, _PLAIN[0]) & np.isin(model.actuator_biastype, _PLAIN[1])
+        if of.of == "actuator":  # whose force is linear in their numbers
+            plain = np.isin(model.actuator_gaintype, GAINS) & np.isin(model.actuator_biastype, BIASES)
             ids = [i for i in ids if plain[i]]
         if kind == "size":
             ids = [i for i in ids if int(model.geom_type[i]) in _SIZED]
-        ids = ids if of.offset else [i for i in ids if np.any(_read(model, of.fields[0])[i] != 0)]
+        ids = ids if of.offset else [i for i in ids if _columns(model, *of.fields[0])[i].any()]
         if not ids:
             raise InvalidInputError(
                 f"learn: expected the name of a {of.of} with a {kind} to learn, got {name!r:.100}; see the names in "
@@ -166,21 +159,6 @@ class LearnableMujocoLCS(nn.Module):
             )
         sizes = np.count_nonzero(model.geom_size[ids[0]]) if kind == "size" and len(ids) == 1 else 1
         return _Entry(kind, name, ids, start, 3 if of.offset else int(sizes))
-
-    @property
-    def n_x(self) -> int:
-        """Number of states."""
-        return self.state.n_x
-
-    @property
-    def n_u(self) -> int:
-        """Number of actions."""
-        return self._built[1].n_u
-
-    @property
-    def n_lam(self) -> int:
-        """Number of contact forces."""
-        return self._built[1].n_lam
 
     @property
     def physics(self) -> MujocoLCS:
@@ -197,10 +175,6 @@ class LearnableMujocoLCS(nn.Module):
         self._data = copy.copy(data)
         self._data.qpos[:] = reference  # where the median of the responses is taken
         return x
-
-    def sequence(self, plan: Any, x: Tensor | None = None) -> LCSSequence:
-        """See `MujocoLCS.sequence`."""
-        return sequence_along(self, plan, x)
 
     def control(self, x: Tensor, u: Tensor) -> Tensor:
         """See `MujocoLCS.control`."""
@@ -237,7 +211,7 @@ class LearnableMujocoLCS(nn.Module):
 
     def config(self) -> dict[str, Any]:
         """Return what is learned and from where, in JSON types."""
-        guess = [[_read(self._model, f)[e.ids].tolist() for f in _KINDS[e.kind].fields] for e in self._entries]
+        guess = [[_columns(self._model, *f)[e.ids].tolist() for f in _KINDS[e.kind].fields] for e in self._entries]
         return {"learn": [[e.kind, e.name] for e in self._entries], "guess": guess, "nq": self.state.nq}
 
     def _changed(self, change: Array) -> Any:
@@ -246,18 +220,14 @@ class LearnableMujocoLCS(nn.Module):
         for kind, _, ids, start, count in self._entries:
             part, of = change[start : start + count], _KINDS[kind]
             for name, columns in of.fields:
-                field = getattr(model, name)
-                index = np.ix_(ids, np.arange(field.shape[1])[columns]) if isinstance(columns, slice) else ids
-                if isinstance(columns, int):
-                    field[ids, columns] *= np.exp(part)
-                elif of.offset:
-                    field[index] += self._options["length"] * part
+                values = _columns(model, name, columns)
+                if of.offset:
+                    values[ids] += self._options["length"] * part
                 else:
-                    factor = np.exp(part) if count == 1 else np.append(np.exp(part), np.ones(3 - count))
-                    field[index] *= factor
-            if kind == "size":
-                for i in ids:
-                    model.geom_rbound[i], model.geom_aabb[i, 3:] = _extent(int(model.geom_type[i]), model.geom_size[i])
+                    values[ids, : None if count == 1 else count] *= np.exp(part)
+            if kind == "size":  # what is around them is at most that much larger
+                model.geom_rbound[ids] *= np.exp(part).max()
+                model.geom_aabb[ids, 3:] *= np.exp(part).max()
             if of.offset:  # MuJoCo need not compute frames that are the same
                 model.geom_sameframe[:], model.site_sameframe[:] = 0, 0
                 model.body_sameframe[ids if of.of == "body" else []] = 0
@@ -342,18 +312,7 @@ def _slope(ahead: Tensor, behind: Tensor) -> Tensor:
     return torch.where(jump, smaller, 0.5 * (ahead + behind))
 
 
-def _read(model: Any, field: tuple[str, slice | int | None]) -> Any:
-    """Read a field of the model, or its columns."""
-    value, columns = getattr(model, field[0]), field[1]
-    return value if columns is None else value[:, columns]
-
-
-def _extent(kind: int, size: Array) -> tuple[Any, Array]:
-    """Compute the radius of the sphere and half the box (3,) around a geom."""
-    if kind == SPHERE:
-        return size[0], np.full(3, size[0])
-    if kind == CAPSULE:
-        return size[0] + size[1], np.array([size[0], size[0], size[0] + size[1]])
-    if kind == CYLINDER:
-        return np.hypot(size[0], size[1]), np.array([size[0], size[0], size[1]])
-    return size.max() if kind == ELLIPSOID else np.linalg.norm(size), size
+def _columns(model: Any, name: str, columns: slice) -> Array:
+    """Return columns of a field of the model, to be changed in place."""
+    values = getattr(model, name)
+    return values.reshape(len(values), -1)[:, columns]
