@@ -9,9 +9,13 @@ contact, or where a joint or tendon is at its limit in this step. Beside them ar
 steps with the nominal control, linearised at each by `mjd_transitionFD`, contacts included.
 """
 
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 import importlib.util
+import re
 import time
 import warnings
 from dataclasses import dataclass
@@ -47,6 +51,7 @@ MODELS = {  # package → its scenes; what does not load alone, or has no joint,
         "models/assets/objects/door*.xml",
     ],
 }
+EULER, RK4 = int(mujoco.mjtIntegrator.mjINT_EULER), int(mujoco.mjtIntegrator.mjINT_RK4)
 LIMITS = (mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT, mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON)
 CONTACTS = tuple(
     getattr(mujoco.mjtConstraint, f"mjCNSTR_CONTACT_{name}") for name in ("FRICTIONLESS", "PYRAMIDAL", "ELLIPTIC")
@@ -87,16 +92,25 @@ def draw(model: Any, data: Any, random: np.random.Generator) -> np.ndarray:
     return np.where(model.actuator_ctrllimited, random.uniform(low, np.maximum(high, low)), near)
 
 
+def place(model: Any, data: Any, random: np.random.Generator) -> None:
+    """Begin near the model's own place, or as far from it as bodies need that are deep in each other there."""
+    for spread in (0.05, 0.05, 0.2, 0.5, 1.0):
+        mujoco.mj_resetData(model, data)
+        qpos = data.qpos.copy()
+        mujoco.mj_integratePos(model, qpos, random.normal(size=model.nv) * spread, 1.0)
+        data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+        if min(data.contact.dist, default=0.0) > -0.02:
+            break
+
+
 def roam(model: Any, count: int, random: np.random.Generator) -> list[tuple[np.ndarray, ...]]:
     """States (qpos, qvel, act) along random motions of two seconds, one each tenth of a second."""
     data, states = mujoco.MjData(model), []
     steps = max(1, round(0.1 / model.opt.timestep))
     for _ in range(4 * count):
         if not 0 < data.time < 2.5:
-            mujoco.mj_resetData(model, data)
-            qpos = data.qpos.copy()
-            mujoco.mj_integratePos(model, qpos, random.normal(size=model.nv) * 0.05, 1.0)
-            data.qpos[:] = qpos
+            place(model, data, random)
         mujoco.mj_forward(model, data)
         data.ctrl[:] = draw(model, data, random)
         mujoco.mj_step(model, data, steps)
@@ -108,6 +122,11 @@ def roam(model: Any, count: int, random: np.random.Generator) -> list[tuple[np.n
         if len(states) == count:
             break
     return states
+
+
+def count_steps(model: Any) -> int:
+    """MuJoCo's steps in one of ours, of 20 ms, or of MuJoCo's where these are longer."""
+    return max(1, round(SECONDS / model.opt.timestep))
 
 
 class Simulated:
@@ -124,9 +143,12 @@ class Simulated:
         data.ctrl[:] = ctrl
         self.kind, self.by_ctrl = "free", np.zeros((2 * nv + model.na, model.nu))
         A, B = np.zeros((len(self.by_ctrl), len(self.by_ctrl))), np.zeros_like(self.by_ctrl)
-        for _ in range(max(1, round(SECONDS / model.opt.timestep))):
+        for _ in range(count_steps(model)):
             if linearise:
+                integrator = model.opt.integrator
+                model.opt.integrator = EULER if integrator == RK4 else integrator  # RK4 has no differences
                 mujoco.mjd_transitionFD(model, data, 1e-6, 1, A, B, None, None)
+                model.opt.integrator = integrator
                 self.by_ctrl = A @ self.by_ctrl + B
             mujoco.mj_step(model, data)
             active = data.efc_type[data.efc_force != 0]
@@ -143,9 +165,9 @@ def median(values: list[float]) -> float | None:
 
 
 @torch.no_grad()
-def measure(model: Any, o: Options) -> dict[str, Any]:
-    """Errors by kind, and the time of a state."""
-    module = MujocoLCS(model, motion="dynamic", seconds=SECONDS)
+def measure(model: Any, o: Options, contacts: int | None = None) -> dict[str, Any]:
+    """Errors by kind, and the time of a state, with as many contacts as a `ContactWarning` asks for."""
+    module = MujocoLCS(model, motion="dynamic", seconds=count_steps(model) * model.opt.timestep, contacts=contacts)
     random, nv = np.random.default_rng(o.seed), model.nv
     states = roam(model, o.states, random)
     x = torch.stack([module.state.to_state(*state) for state in states])
@@ -158,9 +180,14 @@ def measure(model: Any, o: Options) -> dict[str, Any]:
         ctrl.append(np.clip(draw(model, data, random), zero + low, zero + high))
         nominal.append(zero)
     zeros, actions = torch.tensor(np.array(nominal)), torch.tensor(np.array(ctrl))
-    start = time.process_time()
-    system = module.params(x)
-    seconds = (time.process_time() - start) / len(x)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        start = time.process_time()
+        system = module.params(x)
+        seconds = (time.process_time() - start) / len(x)
+    more = [int(found[1]) for w in said if (found := re.search(r"pass contacts=(\d+)", str(w.message)))]
+    if more and contacts is None:
+        return measure(model, o, max(more))
     predicted = system.step(x, actions - zeros).x_next[:, nv : 2 * nv].numpy()
     errors: dict[str, dict[str, list[float]]] = {kind: {"lcs": [], "fd": []} for kind in ("free", "contact", "limit")}
     for i, state in enumerate(states):

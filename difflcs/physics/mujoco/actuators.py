@@ -65,12 +65,15 @@ class Actuators:
         limited = np.array(model.actuator_ctrllimited, dtype=bool)
         limited &= not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
         self.range = np.where(limited, model.actuator_ctrlrange.T, [[-np.inf], [np.inf]])
+        self.range[:, dynamics == _MUSCLE] = np.clip(self.range[:, dynamics == _MUSCLE], 0.0, 1.0)
         plain = fixed & (dynamics == _NONE) & (affine & (self.dof >= 0) | (model.actuator_biastype == _UNBIASED))
         self._force = np.where(plain, self._force_limits(model, joint), [[-np.inf], [np.inf]])
         self._exact = np.flatnonzero(dynamics == _EXACT)
         self.activated = np.repeat(np.arange(model.nu), model.actuator_actnum)
         self._decays = dynamics[self.activated] == _EXACT
         self._time = np.maximum(model.actuator_dynprm[self.activated, 0], 1e-15)
+        self._muscles = np.flatnonzero(dynamics[self.activated] == _MUSCLE)
+        self._rates = model.actuator_dynprm[self.activated, :2].copy()
 
     def _force_limits(self, model: Any, joint: NDArray[np.intp]) -> Array:
         """Compute the forces (2, nu) that actuators may have, infinite where nothing limits them."""
@@ -163,6 +166,25 @@ class Actuators:
     def durations(self, seconds: float) -> Array:
         """Time (na,) by which an activation's rate at the beginning of a time step moves it in this step."""
         return np.where(self._decays, -self._time * np.expm1(-seconds / self._time), seconds)
+
+    def even_out(self, ctrl: Array, activation: Array, A: Array, B: Array) -> None:
+        """Give muscles one rate in both directions, that of the nominal control, in their rows of n transitions.
+
+        Differences have the rate of activation by the control and that of deactivation by the activation.
+
+        Args:
+            ctrl: (n, nu) nominal controls.
+            activation: (n, na) where it is linearised.
+            A: (n, n_x, n_x) transitions by the state.
+            B: (n, n_x, nu) by control.
+        """
+        i, at = self._muscles, activation[:, self._muscles]
+        acts, row = self.activated[i], A.shape[1] - len(self._time) + i
+        (rise, fall), ctrl = self._rates[i].T, ctrl[:, acts]
+        middle = 0.5 + 0.75 * (at + ctrl)
+        rate = np.where(ctrl >= at, 1 / (rise * middle), middle / fall)
+        A[:, row], B[:, row] = 0.0, 0.0
+        A[:, row, row], B[:, row, acts] = 1 - rate, rate
 
     def unlimit_rates(self, model: Any) -> None:
         """Let activations of a model change by their rates, however long the step, to whatever value."""

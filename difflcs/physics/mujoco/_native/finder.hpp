@@ -333,8 +333,9 @@ class Finder {
       tangent[0] = cross(scene_.axis, c.normal);
       tangent[0] = (1 / std::max(norm(tangent[0]), 1e-12)) * tangent[0];
     } else {  // as MuJoCo makes a frame
-      Vector one = norm(c.tangent) > 0.5 ? c.tangent : std::fabs(c.normal.y) < 0.5 ? Vector{0, 1, 0} : Vector{0, 0, 1};
-      one = one - dot(one, c.normal) * c.normal;
+      const auto across = [&](Vector v) { return v - dot(v, c.normal) * c.normal; };
+      Vector one = across(c.tangent);  // that of a capsule on a plane is along it, and may be upright
+      if (norm(one) < 1e-6) one = across(std::fabs(c.normal.y) < 0.5 ? Vector{0, 1, 0} : Vector{0, 0, 1});
       tangent[0] = (1 / norm(one)) * one;
       tangent[1] = cross(c.normal, tangent[0]);
     }

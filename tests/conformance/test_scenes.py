@@ -1,0 +1,21 @@
+"""A few hundred scenes of the campaign of random models."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mujoco")
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from tests.conformance import scenes
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.mark.parametrize("first", range(0, 240, 40))
+def test_a_step_of_a_random_scene_is_like_mujocos_or_says_why_not(first):
+    judged = {seed: scenes.judge(seed) for seed in range(first, first + 40)}
+    assert not {seed: j for seed, j in judged.items() if j and j.wrong() and "LIMIT" not in j.kind}
+    assert sum(j is not None and j.outcome == "made" for j in judged.values()) >= 5
