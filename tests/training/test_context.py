@@ -270,11 +270,6 @@ def test_tied_parameters_are_saved(tmp_path):
     assert len(list(second.learned.parameters())) == 3  # pyright: ignore[reportAttributeAccessIssue]
 
 
-@pytest.mark.parametrize("make", [make_warmup, lambda: make_trainer(Gain(), beta=0.7, covariance="diagonal")])
-def test_load_refuses_hostile_states_and_goes_on_from_its_own(refuses_hostile_checkpoints, make):
-    refuses_hostile_checkpoints(make())
-
-
 def test_load_refuses_another_module():
     class Other(Physics):
         pass

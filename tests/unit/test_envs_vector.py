@@ -1,6 +1,7 @@
 """The vector environment, TorchRL, and libraries that expect Gymnasium."""
 
 import multiprocessing
+import pickle
 import warnings
 
 import numpy as np
@@ -161,6 +162,16 @@ def test_instability_stays_in_its_lane(tmp_path, monkeypatch):
     assert np.isfinite(rewards).all()
     assert infos["physics_error"].tolist() == truncated.tolist() == [False, True, False]
     assert not envs.step(np.zeros((3, 6)))[4]["physics_error"].any()
+
+
+def test_copies_continue_alike():
+    envs = move_cube(3)
+    envs.reset(seed=0)
+    envs.step(np.full((3, 6), 0.01))
+    copied = pickle.loads(pickle.dumps(envs))
+    for _ in range(21):
+        one, other = envs.step(np.full((3, 6), -0.01)), copied.step(np.full((3, 6), -0.01))
+        assert_same(one[0], other[0])
 
 
 @pytest.mark.parametrize("arguments", [{"num_envs": 0}, {"num_envs": 2.5}, {"num_envs": 2, "threads": 0}])

@@ -205,15 +205,6 @@ def fill(page: Path, records: list[Record]) -> None:
     page.write_text(f"{before}{BEGIN}{markdown(records)}\n{END}{after}")
 
 
-def _print(records: list[Record]) -> None:
-    names = ("tried", "converged", "degenerate", "flagged", "silent", "compared", "worst", "1/CPU s")
-    print(f"{'class/target':36}" + "".join(f"{name:>11}" for name in names))
-    for name, r in table(records).items():
-        counts = (r.tried, r.converged, r.degenerate, r.flagged, r.silent, r.compared)
-        rate = r.tried / max(r.seconds, 1e-9)
-        print(f"{name:36}" + "".join(f"{c:11}" for c in counts) + f"{r.worst:11.2g}{rate:11.0f}  {r.by_check or ''}")
-
-
 @cache
 def _one_thread() -> None:
     torch.set_num_threads(1)
@@ -274,7 +265,7 @@ def main() -> None:
             if time.perf_counter() - last > 30:
                 last = time.perf_counter()
                 print(f"{k + 1} of {len(todo)} chunks, {last - started:.0f} s", flush=True)
-    _print(records)
+    print(markdown(records))
 
 
 def show(cell: Cell, seed: int, index: int) -> None:
