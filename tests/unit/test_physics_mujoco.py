@@ -555,7 +555,6 @@ def at(model, *x, **options):
 
 SMALL = '<body><joint name="a" type="slide" axis="1 0 0" {}/><geom size=".1" mass="1e-10"/></body>'
 PAIR = '<contact><pair geom1="tip" geom2="block" friction="1 .1"/></contact>'
-TENDON = '<tendon><fixed name="t" frictionloss="5"><joint joint="px" coef="1"/></fixed></tendon>'
 OVERRIDE = '<option o_friction=".9 .9 .1 .1 .1"><flag override="enable"/></option>'
 TORUS = f"""
 <mujoco><extension><plugin plugin="mujoco.sdf.torus"><instance name="t"/></plugin></extension>
@@ -569,7 +568,6 @@ RESTS = {
     "actuators that a flag disables": (FLAG.format("actuation", "disable"), {}, "not disabled"),
     "friction of two kinds": (SERVOS + PAIR, {}, "got 1 and 0.1 between geoms 'block' and 'tip'"),
     "friction by override": (SERVOS + OVERRIDE, {}, "pass friction=0.9"),
-    "dry friction of a tendon": (SERVOS + TENDON, {"motion": "dynamic"}, "tendons .frictionloss"),
     "adhesion": (
         SERVOS.replace("</actuator>", '<adhesion body="box" gain="50" ctrlrange="0 1"/></actuator>'),
         {"motion": "dynamic"},
@@ -640,14 +638,6 @@ def test_bad_input_is_refused(call, error, words):
         call()
 
 
-def test_dry_friction_of_joints_is_refused_with_velocities_alone():
-    model = pushing()
-    model.dof_frictionloss[:3] = 1.0
-    assert MujocoLCS(model).n_lam == 2
-    with pytest.raises(InvalidInputError, match="frictionloss"):
-        MujocoLCS(model, motion="dynamic")
-
-
 def test_where_memory_is_short_no_contact_is_dropped_in_silence():
     """Nine boxes on a floor; where they are far apart, memory suffices before and after a state that is refused."""
     boxes = "".join(f'<body pos="{0.12 * i} 0 .05"><freejoint/><geom {FACES["box"]}/></body>' for i in range(9))
@@ -693,7 +683,6 @@ def test_what_is_refused_for_its_contacts_is_accepted_without_them():
     for rest in (PAIR, OVERRIDE):
         assert MujocoLCS(pushing(SERVOS + rest), friction=0.4).n_lam == 2
         assert MujocoLCS(pushing(SERVOS + rest), pairs=[]).n_lam == 0
-    assert MujocoLCS(pushing(SERVOS + TENDON)).n_lam == 2
 
 
 def test_equality_constraints_that_the_data_switches_off_do_nothing():

@@ -338,6 +338,13 @@ class DynamicStep(NamedTuple):
         response[:, : 2 * nv, :nv] = to_x[:, : 2 * nv, : 2 * nv] @ both @ to_x[:, :nv, :nv].swapaxes(-1, -2)
         return FreeMotion(*(torch.from_numpy(v) for v in (A_x, to_x @ control, d, response)))
 
+    def effect(self, tangent: Array | None, normal: Array, impulse: Array) -> Array:
+        """What forces do to the next state (n, n_x, k): ζ moves by h S `normal` (n, k, nv), ν by S `impulse`."""
+        h, (n, n_x), nv = self.seconds, self.x.shape, self.place.shape[1]
+        place, velocity = (self.response @ rows.swapaxes(-1, -2) for rows in (h * normal, impulse))
+        still = np.zeros((n, n_x - 2 * nv, normal.shape[1]))
+        return np.concatenate([place if tangent is None else np.linalg.solve(tangent, place), velocity, still], 1)
+
 
 def _reached(step: Array, velocity: Array) -> Array:
     """Compute the change (n, n_x) in a step (n, n_x, n_x + nu + 1) from velocities (n, nv) with u = ū."""

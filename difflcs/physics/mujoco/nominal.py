@@ -24,11 +24,13 @@ from numpy.typing import NDArray
 
 from difflcs.physics.mujoco._native import _mujoco
 from difflcs.physics.mujoco.contacts import MujocoContacts
+from difflcs.physics.mujoco.limits import Rows, ScaledRows, follow, scale
 from difflcs.physics.mujoco.motion import DynamicStep
 
 Array = NDArray[np.float64]
 _USUAL, _LOAD = 0.02, 100.0  # depth of contacts in parts of the length, acceleration [m/s²], both of any load
 _SOFTER = 0.03  # of the compliance: how exactly forces are computed
+_EARLY = 0.6  # least part of a step in which a force moves things; from 0.5 on an impact would bounce with its speed
 _PASSES = 2  # each reduces what is left of compliance and opening by about their parts of the motion
 
 
@@ -38,11 +40,15 @@ class Nominal(NamedTuple):
     Attributes:
         contacts: gaps without the depth that the load makes and with what a slide would open; tangents along the slide.
         forces: (n, n_contacts, n_rays) of the extreme rays of Anitescu's cone, in the order of `contact_lcs` [N s].
+        rows: limits and dry friction.
+        row_forces: (n, n_rows) of these.
         carried: addition to (ζ, ν) of `DynamicStep.step`, as loads are impulses along contacts.
     """
 
     contacts: MujocoContacts
     forces: Array
+    rows: ScaledRows
+    row_forces: Array
     carried: Array
 
 
@@ -87,24 +93,32 @@ class Recovery:
 
 
 class _Rays:
-    """The extreme rays of friction cones and the forces along them that keep contacts closed, as in `contact_lcs`."""
+    """The extreme rays of friction cones and rows, and the forces that keep them closed, as in `contact_lcs`."""
 
-    def __init__(self, contacts: MujocoContacts, response: Array, give: float, compliance: float):
+    def __init__(self, contacts: MujocoContacts, rows: ScaledRows, response: Array, give: float, compliance: float):
         slide = contacts.friction[:, :, None, None] * contacts.tangent
         normal = contacts.normal[:, :, None]
-        rows = np.stack([normal + slide, normal - slide], 3) if slide.shape[2] else normal[:, :, None]
-        n, k = rows.shape[:2]
+        rays = np.stack([normal + slide, normal - slide], 3) if slide.shape[2] else normal[:, :, None]
+        n, k = rays.shape[:2]
         self.shape = n, k, max(1, 2 * slide.shape[2])
-        self._rows = rows.reshape(n, -1, rows.shape[-1])
-        self._response, self._give, self._compliance = response / give, give, compliance
+        self._rows = np.concatenate([rays.reshape(n, -1, rays.shape[-1]), rows.normal], 1)
+        self._response, self._give, self._compliance, self._of_rows = response / give, give, compliance, rows.gap
+        unbounded = np.full((n, self._rows.shape[1] - rows.bound.shape[1]), np.inf)
+        self._low = np.concatenate([np.zeros_like(unbounded), -give * rows.bound], 1)
+        self._high = np.concatenate([unbounded, give * rows.bound], 1)
 
     def forces(self, place: Array, gap: Array, rest: Array | float = 0.0) -> tuple[Array, Array]:
-        """Forces (n, n_contacts, n_rays) and where they move ζ (n, nv); the compliance counts from forces `rest`."""
-        apart = np.repeat(gap, self.shape[2], axis=1) + (self._rows @ place[:, :, None])[:, :, 0]
-        rest = np.broadcast_to(rest, self.shape).reshape(apart.shape)
-        lam = solve_soft(self._rows, self._response, apart - self._compliance * self._give * rest, self._compliance)
+        """Forces (n, m) of rays and rows, and where they move ζ (n, nv); the compliance counts from forces `rest`."""
+        apart = np.concatenate([np.repeat(gap, self.shape[2], axis=1), self._of_rows], 1)
+        apart = apart + (self._rows @ place[:, :, None])[:, :, 0] - self._compliance * self._give * rest
+        lam = solve_soft(self._rows, self._response, apart, self._compliance, self._low, self._high)
         moved = self._response @ (self._rows.swapaxes(-1, -2) @ lam[:, :, None])
-        return lam.reshape(self.shape) / self._give, place + moved[:, :, 0]
+        return lam / self._give, place + moved[:, :, 0]
+
+    def split(self, forces: Array) -> tuple[Array, Array]:
+        """Forces of contacts (n, n_contacts, n_rays) and of rows (n, n_rows)."""
+        count = self.shape[1] * self.shape[2]
+        return forces[:, :count].reshape(self.shape), forces[:, count:]
 
 
 def solve_soft(
@@ -132,72 +146,104 @@ def solve_soft(
     return force
 
 
+def _settle(
+    step: DynamicStep, contacts: MujocoContacts, rows: Rows, give: float, compliance: float
+) -> tuple[ScaledRows, Array]:
+    """Find where limits and friction hold; return them, and (n, n_rows, nv) those that hold all the time."""
+    h, nv, k = step.seconds, step.place.shape[1], rows.gap.shape[1] - rows.n_friction
+    response, is_limit = h * step.response, np.arange(rows.gap.shape[1]) < k
+    if not rows.gap.size:
+        return scale(rows, rows.gap, 1.0, response, give, h), rows.normal
+    # First a step with all loads at its beginning, as forces are: limits hold at zero, what creeps goes on creeping.
+    speed = (rows.normal @ step.velocity[:, :, None])[:, :, 0]
+    creeps = np.abs(speed) < rows.soft.creep
+    gap = np.where(is_limit, np.maximum(rows.gap, 0.0) + 2 * rows.bend, -h * speed * creeps)
+    scaled = scale(rows, gap, 1.0, response, give, h)
+    rays = _Rays(contacts, scaled, response, give, compliance)
+    forces, moved = rays.forces(_place(step, step.delayed), np.maximum(contacts.gap, 0.0))
+    forces = rays.split(forces)[1]
+    mass = np.einsum("nki,nij,nkj->nk", rows.normal, step.inverse_mass, rows.normal)
+    after_bend = (rows.normal @ moved[:, :, None])[:, :, 0] + 2 * rows.bend
+    load = (after_bend / h - speed - mass * forces * scaled.unit) / h
+    after = follow(rows.gap, speed, load, 2 * rows.bend / h**2, mass, rows.soft, h, step.motion.steps.count)
+    inside = np.abs(forces[:, k:]) < 0.999 * scaled.bound
+    holds = after.holds & np.concatenate([forces[:, :k] > 0, inside], 1)
+    # A limit holds at the depth that it has after the step, friction after its creep.
+    depth = np.minimum(rows.gap + after.moved, 0.0)
+    gap = np.where(is_limit, rows.gap + 2 * rows.bend - depth, -after.moved * holds)
+    # What only another action brings to its limit is pressed there all the time: half an impulse does as much.
+    reach = np.abs(rows.normal @ step.step[:, :nv, step.x.shape[1] : -1]).sum(-1)
+    pressed = ~holds & (np.abs(rows.gap) < reach) & ~(after.acts & (rows.gap > 0))
+    part = np.clip(np.where(is_limit & pressed, _EARLY, after.part), _EARLY, 1.25)
+    part = np.where(~is_limit & after.stops, 1.0, part)
+    return scale(rows, gap, part, response, give, h), rows.normal * holds[:, :, None]
+
+
 def evaluate_nominal(
     step: DynamicStep,
     contacts: MujocoContacts,
-    geom: NDArray[np.intp],
+    rows: Rows,
     recovery: Recovery,
     give: float,
     compliance: float,
     opens: bool,
 ) -> Nominal:
-    """Decide which contacts close, hold or slide at the nominal action.
+    """Decide which contacts close, hold or slide at the nominal action, and which rows act.
 
     Args:
         step: the motion without contact.
         contacts: contacts.
+        rows: limits and dry friction.
         recovery: of MuJoCo's contacts.
-        geom: their geoms (n, n_contacts, 2).
         give: how far a unit of impulse moves two bodies apart [m/(N s)].
         compliance: of contacts, in parts of `give`.
         opens: True for the friction of Anitescu, in which a contact that slides opens.
     """
     compliance *= _SOFTER
-    if not contacts.gap.size:
-        return Nominal(contacts, np.zeros((*contacts.gap.shape, 1)), np.zeros_like(step.delayed))
-    closing = _find_closing(step.place, step.response, contacts)
-    carried = _compute_carried(step, contacts, closing, np.zeros(contacts.tangent.shape[:3]))
+    if not contacts.gap.size and not rows.gap.size:
+        settled = scale(rows, rows.gap, 1.0, step.seconds * step.response, give, step.seconds)
+        return Nominal(contacts, np.zeros((*contacts.gap.shape, 1)), settled, rows.gap, np.zeros_like(step.delayed))
+    response = step.seconds * step.response
+    settled, held = _settle(step, contacts, rows, give, compliance)
+    closing = _find_closing(step.place, step.response, contacts, held)
+    carried = _compute_carried(step, contacts, closing, np.zeros(contacts.tangent.shape[:3]), held)
     # First all that close hold.
     place, closed = _place(step, carried), np.maximum(contacts.gap, 0.0)
     contacts = contacts._replace(
         tangent=_turn_tangents(contacts.tangent, np.einsum("nktv,nv->nkt", contacts.tangent, place))
     )
-    forces, moved = _Rays(contacts, step.seconds * step.response, give, compliance).forces(place, closed)
-    slide, normal = np.einsum("nktv,nv->nkt", contacts.tangent, moved), forces.sum(-1)
+    rays = _Rays(contacts, settled, response, give, compliance)
+    forces, moved = rays.forces(place, closed)
+    slide, normal = np.einsum("nktv,nv->nkt", contacts.tangent, moved), rays.split(forces)[0].sum(-1)
     # The drag of Stewart and Trinkle's model holds what slides.
     slides = _find_sliding(slide, contacts, place) & opens
     if slides.any() and step.motion.firm.any():
         # What robots touch may hold with another action than the nominal one.
-        _, firmly = _Rays(contacts, step.seconds * step.firm, give, compliance).forces(place, closed)
+        _, firmly = _Rays(contacts, settled, step.seconds * step.firm, give, compliance).forces(place, closed)
         slides &= _find_sliding(np.einsum("nktv,nv->nkt", contacts.tangent, firmly), contacts, place)
     acceleration = (
         np.einsum("nkv,nvw,nkw->nk", contacts.normal, step.inverse_mass, contacts.normal) * normal / step.seconds
     )
-    gap = recovery.settled(
-        contacts.gap, geom, acceleration, (contacts.normal @ step.velocity[:, :, None])[:, :, 0], step.seconds
-    )
+    speed = (contacts.normal @ step.velocity[:, :, None])[:, :, 0]
+    gap = recovery.settled(contacts.gap, contacts.geom, acceleration, speed, step.seconds)
     contacts = contacts._replace(tangent=_turn_tangents(contacts.tangent, slide))
     slide = np.einsum("nktv,nv->nkt", contacts.tangent, moved) * slides[:, :, None]
     if slides.any():  # else it is as before: what holds does not depend on the directions of the tangents
-        carried = _compute_carried(step, contacts, closing, slide)
-    rays, place, forces = (
-        _Rays(contacts, step.seconds * step.response, give, compliance),
-        _place(step, carried),
-        np.zeros_like(forces),
-    )
+        carried = _compute_carried(step, contacts, closing, slide, held)
+    rays = _Rays(contacts, settled, response, give, compliance)
+    place, forces = _place(step, carried), np.zeros_like(forces)
     for _ in range(_PASSES):
         # A contact that slides by s opens by μ s in Anitescu's model, as its gap is n·Δx − μ s.
         opened = gap + contacts.friction * slides * np.linalg.norm(slide, axis=-1)
         forces, moved = rays.forces(place, opened, forces)
         slide = np.einsum("nktv,nv->nkt", contacts.tangent, moved)
+    of_contacts, of_rows = rays.split(forces)
     # What creeps moves the point from which friction counts, which is that of so much compliance.
-    creep = _compute_creep(step, contacts, geom, recovery, forces) * ~slides[:, :, None] / (compliance / _SOFTER * give)
-    return Nominal(contacts._replace(gap=opened), forces + creep, carried)
+    creep = _compute_creep(step, contacts, recovery, of_contacts) * ~slides[:, :, None] / (compliance / _SOFTER * give)
+    return Nominal(contacts._replace(gap=opened), of_contacts + creep, settled, of_rows, carried)
 
 
-def _compute_creep(
-    step: DynamicStep, contacts: MujocoContacts, geom: NDArray[np.intp], recovery: Recovery, forces: Array
-) -> Array:
+def _compute_creep(step: DynamicStep, contacts: MujocoContacts, recovery: Recovery, forces: Array) -> Array:
     """Compute the creep of contacts along the rays (n, n_contacts, n_rays) of their `forces`."""
     if not contacts.tangent.shape[2]:
         return np.zeros_like(forces)
@@ -205,7 +251,7 @@ def _compute_creep(
     friction, velocity = contacts.friction[:, :, None], step.velocity[:, None, None]
     gives = ((contacts.tangent @ step.inverse_mass[:, None]) * contacts.tangent).sum(-1)
     acceleration = gives * friction * (each[..., 0] - each[..., 1]) / step.seconds
-    far = step.seconds * friction * recovery.crept(geom, acceleration, (contacts.tangent * velocity).sum(-1))
+    far = step.seconds * friction * recovery.crept(contacts.geom, acceleration, (contacts.tangent * velocity).sum(-1))
     return np.stack([far, -far], -1).reshape(forces.shape)
 
 
@@ -215,17 +261,22 @@ def _place(step: DynamicStep, carried: Array) -> Array:
     return step.place + carried[:, :nv, -1] + (carried[:, :nv, nv : 2 * nv] @ step.velocity[:, :, None])[:, :, 0]
 
 
-def _find_closing(place: Array, response: Array, contacts: MujocoContacts) -> NDArray[np.bool_]:
-    """Find the contacts (n, n_contacts) that close as bodies move by ζ (n, nv), stacked bodies held up in turn."""
+def _find_closing(place: Array, response: Array, contacts: MujocoContacts, held: Array) -> NDArray[np.bool_]:
+    """Find the contacts (n, n_contacts) that close as bodies move by ζ (n, nv), stacked bodies held up in turn.
+
+    The rows `held` (n, k, nv) do not move.
+    """
+    if held.any():
+        place = place + _push(response, held, held, -held @ place[:, :, None])[:, :, 0]
 
     def gap(place: Array) -> Array:
         return contacts.gap + np.einsum("nkv,nv->nk", contacts.normal, place)
 
     closing = gap(place) < 0
     for _ in range(closing.shape[1] * int(closing.any())):
-        rows = contacts.normal * closing[:, :, None]
-        held = place + _push(response, rows, rows, np.where(closing, -gap(place), 0.0)[:, :, None])[:, :, 0]
-        more = closing | (gap(held) < 0)
+        rows = np.concatenate([contacts.normal * closing[:, :, None], held], 1)
+        by = np.concatenate([np.where(closing, -gap(place), 0.0), np.zeros(held.shape[:2])], 1)
+        more = closing | (gap(place + _push(response, rows, rows, by[:, :, None])[:, :, 0]) < 0)
         if (more == closing).all():
             break
         closing = more
@@ -237,18 +288,25 @@ def _find_sliding(slide: Array, contacts: MujocoContacts, place: Array) -> NDArr
 
     The measure is what they would do without contact, where bodies go to ζ (n, nv).
     """
-    sideways = np.linalg.norm(np.einsum("nktv,nv->nkt", contacts.tangent, place), axis=-1).max(-1, keepdims=True)
-    down = np.abs(np.einsum("nkv,nv->nk", contacts.normal, place)).max(-1, keepdims=True)
+    sideways = np.linalg.norm(np.einsum("nktv,nv->nkt", contacts.tangent, place), axis=-1).max(
+        -1, keepdims=True, initial=0.0
+    )
+    down = np.abs(np.einsum("nkv,nv->nk", contacts.normal, place)).max(-1, keepdims=True, initial=0.0)
     return np.linalg.norm(slide, axis=-1) > np.maximum(0.2 * sideways, 0.05 * down)
 
 
-def _compute_carried(step: DynamicStep, contacts: MujocoContacts, closing: NDArray[np.bool_], slide: Array) -> Array:
-    """Compute the addition to `step.step` where contacts slide by (n, n_contacts, n_tangents) or, with zeros, hold."""
+def _compute_carried(
+    step: DynamicStep, contacts: MujocoContacts, closing: NDArray[np.bool_], slide: Array, held: Array
+) -> Array:
+    """Compute the addition to `step.step` where contacts slide by (n, n_contacts, n_tangents) or, with zeros, hold.
+
+    The rows `held` (n, k, nv) hold.
+    """
     nv, slides = step.place.shape[1], slide.any(-1)
     tangents = np.moveaxis(contacts.tangent, 2, 0) * (closing & ~slides & (contacts.friction > 0))[:, :, None]
     normals = contacts.normal * closing[:, :, None]
     forces = normals - _compute_drag(step, contacts, slide) * closing[:, :, None] if slides.any() else normals
-    rows, forces = (_split_by_body(np.concatenate([v, *tangents], 1), step.tree) for v in (normals, forces))
+    rows, forces = (_split_by_body(np.concatenate([v, *tangents, held], 1), step.tree) for v in (normals, forces))
     some = rows.any((0, 2))
     rows, forces = rows[:, some], forces[:, some]
     delayed = np.concatenate([step.delayed[:, :nv], step.delayed[:, nv:]], -1)

@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 from difflcs.errors import InvalidInputError
 from difflcs.physics.complementarity import FreeMotion
 from difflcs.physics.mujoco.actuators import Actuators, disabled_actuators
+from difflcs.physics.mujoco.limits import tendon_jacobian
 
 Array = NDArray[np.float64]
 _GAINS = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
@@ -126,7 +127,7 @@ class QuasiDynamic:
                 into.moment[i], data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
             )
         if model.ntendon:
-            into.tendon[i] = _tendon_jacobian(model, data)
+            into.tendon[i] = tendon_jacobian(model, data)
 
     def finish(self, read: Rest, x: Array, tangent: Array | None) -> FreeMotion:
         """Return the motion at states x (n, nv), for the tangent of their rotations."""
@@ -159,16 +160,3 @@ def respond(mass: NDArray[Any], damping: Array, stiffness: Array, seconds: float
 def _along(rows: Array, each: Array) -> Array:
     """Sum rowᵀ each row (n, nv, nv) over rows (n, k, nv) with (n, k) or (k,) factors."""
     return rows.swapaxes(-1, -2) @ (each[..., None] * rows)
-
-
-def _tendon_jacobian(model: Any, data: Any) -> Array:
-    """Return the derivative (ntendon, nv) of the tendons' lengths, which newer versions of MuJoCo keep sparse."""
-    jacobian = np.zeros((model.ntendon, model.nv))
-    if data.ten_J.size == jacobian.size:
-        return data.ten_J.reshape(jacobian.shape)
-    where = (
-        getattr(data if hasattr(data, name) else model, name)
-        for name in ("ten_J_rownnz", "ten_J_rowadr", "ten_J_colind")
-    )
-    mujoco.mju_sparse2dense(jacobian, data.ten_J.reshape(-1), *(v.reshape(-1) for v in where))
-    return jacobian

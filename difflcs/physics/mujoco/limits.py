@@ -1,0 +1,360 @@
+"""Limits and dry friction of joints and tendons: rows of the system that are no contacts.
+
+A row has a velocity v = J ν and a force along Jᵀ, one-sided at a limit, between bounds in dry friction. MuJoCo's are
+soft: with A = J M⁻¹ Jᵀ, impedance d and the regularisation R = (1 − d)/d · A₀ of the model, a row on which all else
+brings about the acceleration a goes by
+
+    v̇ = a + A/(A + R) (−b v − k d r − a),
+
+its part after a being a force within the bounds. Followed through a step this says how deep a limit is passed or how
+far friction creeps, when in the step the force acts, and whether it does so all the time.
+"""
+
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from difflcs.errors import ContactWarning
+from difflcs.physics.mujoco.native import native
+
+Array = NDArray[np.float64]
+MOST_LIMITS = 8  # by default
+_MOST_STEPS = 10  # in which a row is followed through a step
+_BALL, _SLIDE = int(mujoco.mjtJoint.mjJNT_BALL), int(mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+class Softness(NamedTuple):
+    """MuJoCo's parameters of rows, (k,) of a model's or (n, k) of chosen ones.
+
+    Attributes:
+        stiffness: k, zero of friction [1/s²].
+        damping: b [1/s].
+        impedance: (..., 5) solimp.
+        give: A₀, the inverse mass that MuJoCo estimates.
+        margin: distance at which a limit begins to act.
+        bound: largest force of friction; infinite for limits.
+    """
+
+    stiffness: Array
+    damping: Array
+    impedance: Array
+    give: Array
+    margin: Array
+    bound: Array
+
+    @property
+    def creep(self) -> Array:
+        """Largest speed at which friction that holds creeps; infinite for limits."""
+        d = _impedance(np.zeros_like(self.give), self.impedance)
+        return self.bound * (1 - d) / d * self.give / self.damping
+
+    def at(self, index: Any) -> Softness:
+        """Return those of some rows."""
+        return Softness(*(values[index] for values in self))
+
+
+class Rows(NamedTuple):
+    """Rows of n states, k − n_friction of limits and then those of dry friction.
+
+    Attributes:
+        gap: (n, k) distance from where the limit acts; zero for friction.
+        normal: (n, k, nv) derivative of the gap, or of the way that rubs, by the degrees of freedom.
+        bend: (n, k) how much more the gap of a tendon grows in the step than its derivative says.
+        soft: softness, (n, k).
+        n_friction: number of rows of friction.
+    """
+
+    gap: Array
+    normal: Array
+    bend: Array
+    soft: Softness
+    n_friction: int
+
+
+class ScaledRows(NamedTuple):
+    """Rows as the system has them, in units of a force that moves them as far as it moves contacts.
+
+    Attributes:
+        gap: (n, k) distance to where the row holds.
+        normal: (n, k, nv) derivative; what the force does to ζ is h S of it.
+        impulse: (n, k, nv) what the force does to ν is S of it.
+        bound: (n, n_friction) largest force of friction.
+        unit: (n, k) impulse along `Rows.normal` of a unit of force.
+    """
+
+    gap: Array
+    normal: Array
+    impulse: Array
+    bound: Array
+    unit: Array
+
+
+class RowFinder:
+    """Finds the rows at states.
+
+    Args:
+        model: a private copy, before its flags are changed.
+        data: its data.
+        limits: how many limits a state has, those nearest to acting; None: of all joints and tendons that have some, at
+            most `MOST_LIMITS`, with a `ContactWarning` where more act.
+        friction: False if dry friction is left out.
+    """
+
+    def __init__(self, model: Any, data: Any, limits: int | None, friction: bool):
+        self.model, self.data = model, data
+        off = _disabled(model, "CONSTRAINT")
+        limited = model.jnt_limited.astype(bool) & (model.jnt_type != int(mujoco.mjtJoint.mjJNT_FREE))
+        limited, tendons = limited & ~(off | _disabled(model, "LIMIT")), model.tendon_limited.astype(bool)
+        self._joints = np.flatnonzero(limited & (model.jnt_type >= _SLIDE))
+        self._balls = np.flatnonzero(limited & (model.jnt_type == _BALL))
+        self._tendons = np.flatnonzero(tendons & ~(off | _disabled(model, "LIMIT")))
+        rubs = friction and not (off or _disabled(model, "FRICTIONLOSS"))
+        self._rubbing = np.flatnonzero(model.dof_frictionloss * rubs > 0)
+        self._rubbing_tendons = np.flatnonzero(model.tendon_frictionloss * rubs > 0)
+        self.n_friction = len(self._rubbing) + len(self._rubbing_tendons)
+        joints, tendons = np.concatenate([self._joints, self._balls]), self._tendons
+        of_limits = len(joints) + len(tendons)
+        self._warn = limits is None
+        self.n_limits = min(of_limits, MOST_LIMITS if limits is None else limits)
+        self._range = np.concatenate([model.jnt_range[joints], model.tendon_range[tendons]])
+        self._range[len(self._joints) : len(joints), 0] = -np.inf  # balls have the largest angle alone
+        dofs, rubbing, rubbing_tendons = model.jnt_dofadr[joints], self._rubbing, self._rubbing_tendons
+        self._soft = Softness(
+            *_reference(
+                model,
+                np.concatenate([model.jnt_solref[joints], model.tendon_solref_lim[tendons],
+                                model.dof_solref[rubbing], model.tendon_solref_fri[rubbing_tendons]]),
+                impedance := np.concatenate([model.jnt_solimp[joints], model.tendon_solimp_lim[tendons],
+                                             model.dof_solimp[rubbing], model.tendon_solimp_fri[rubbing_tendons]]),
+                of_limits,
+            ),
+            impedance,
+            np.concatenate([model.dof_invweight0[dofs], model.tendon_invweight0[tendons],
+                            model.dof_invweight0[rubbing], model.tendon_invweight0[rubbing_tendons]]),
+            np.concatenate([model.jnt_margin[joints], model.tendon_margin[tendons], np.zeros(self.n_friction)]),
+            np.concatenate([np.full(of_limits, np.inf), model.dof_frictionloss[rubbing],
+                            model.tendon_frictionloss[rubbing_tendons]]),
+        )  # fmt: skip
+
+    @property
+    def n_rows(self) -> int:
+        """Number of rows of every state."""
+        return self.n_limits + self.n_friction
+
+    def find(self, qpos: Array, place: Array, response: Array, middle: Array | None = None) -> Rows:
+        """Find the rows, of limits those that are nearest to acting.
+
+        Args:
+            qpos: (n, nq) positions.
+            place: (n, nv) ζ after the step, without the rows.
+            response: (n, nv, nv) what a unit of force does to ζ or ν.
+            middle: (n, nv) ζ in the middle of the step, if it has velocities.
+
+        Raises:
+            InvalidInputError: MuJoCo raised an error.
+        """
+        n, nv = place.shape
+        normal, gap, bend, tendons = self._limits(qpos, place, middle)
+        where = np.arange(n)[:, None]
+        chosen = np.broadcast_to(np.arange(gap.shape[1]), gap.shape)
+        if self.n_limits < gap.shape[1]:
+            gives = np.einsum("nki,nij,nkj->nk", normal, response, normal)
+            after = np.minimum(gap, gap + (normal @ place[:, :, None])[:, :, 0])
+            self._warn_of_more(after)
+            # What does not give way cannot act.
+            after = np.where(gives > 0, after / np.sqrt(np.maximum(gives, 1e-300)), np.inf)
+            chosen = np.sort(np.argpartition(after, self.n_limits, -1)[:, : self.n_limits])
+            normal, gap, bend = normal[where, chosen], gap[where, chosen], bend[where, chosen]
+        rubbing = np.zeros((n, len(self._rubbing), nv))
+        rubbing[:, np.arange(len(self._rubbing)), self._rubbing] = 1.0
+        normal = np.concatenate([normal, rubbing, tendons[:, self._rubbing_tendons]], 1)
+        of_friction = np.arange(len(self._range), len(self._soft.bound))
+        chosen = np.concatenate([chosen, np.broadcast_to(of_friction, (n, self.n_friction))], 1)
+        gap, bend = (np.pad(values, ((0, 0), (0, self.n_friction))) for values in (gap, bend))
+        return Rows(gap, normal, bend, self._soft.at(chosen), self.n_friction)
+
+    def _limits(self, qpos: Array, place: Array, middle: Array | None) -> tuple[Array, Array, Array, Array]:
+        """Return of all limits, of the nearer side after the step, derivatives (n, k, nv), gaps (n, k) and bends.
+
+        And the derivatives (n, ntendon, nv) of all tendons' lengths.
+        """
+        model, (n, nv) = self.model, place.shape
+        k, balls = len(self._joints), len(self._balls)
+        value, along = np.zeros((n, len(self._range))), np.zeros((n, len(self._range), nv))
+        value[:, :k] = qpos[:, model.jnt_qposadr[self._joints]]
+        along[:, np.arange(k), model.jnt_dofadr[self._joints]] = 1.0
+        for row, joint in enumerate(self._balls, k):
+            address, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
+            quaternion = qpos[:, address : address + 4]
+            quaternion = quaternion * np.where(quaternion[:, :1] < 0, -1.0, 1.0)
+            sine = np.linalg.norm(quaternion[:, 1:], axis=-1)
+            value[:, row] = 2 * np.arctan2(sine, quaternion[:, 0])
+            along[:, row, dof : dof + 3] = quaternion[:, 1:] / np.maximum(sine, 1e-12)[:, None]
+        length, tendons = self._read_tendons(qpos)
+        value[:, k + balls :], along[:, k + balls :] = length[:, self._tendons], tendons[:, self._tendons]
+        lower, upper = value - self._range[:, 0], self._range[:, 1] - value
+        moved = (along @ place[:, :, None])[:, :, 0]
+        side = np.where(lower + moved < upper - moved, 1.0, -1.0)
+        gap, bend = np.where(side > 0, lower, upper) - self._soft.margin[: len(self._range)], np.zeros_like(side)
+        if middle is not None and len(self._tendons):
+            halfway = qpos.copy()
+            for q, change in zip(halfway, middle, strict=True):
+                mujoco.mj_integratePos(model, q, change, 1.0)
+            longer = self._read_tendons(halfway)[0] - length - (tendons @ middle[:, :, None])[:, :, 0]
+            bend[:, k + balls :] = 4 * side[:, k + balls :] * longer[:, self._tendons]
+        return side[:, :, None] * along, gap, bend, tendons
+
+    def _read_tendons(self, qpos: Array) -> tuple[Array, Array]:
+        """Return lengths (n, ntendon) of tendons at positions (n, nq), and their derivatives (n, ntendon, nv)."""
+        model, data, n = self.model, self.data, len(qpos)
+        length, tendons = np.zeros((n, model.ntendon)), np.zeros((n, model.ntendon, model.nv))
+        for i in range(n * bool(len(self._tendons) + len(self._rubbing_tendons))):
+            with native(model, data, f"in state {i} of {n}"):
+                data.qpos[:] = qpos[i]
+                mujoco.mj_fwdPosition(model, data)
+                length[i], tendons[i] = data.ten_length, tendon_jacobian(model, data)
+        return length, tendons
+
+    def _warn_of_more(self, after: Array) -> None:
+        """Warn once if limits that act at the nominal action are dropped because of the default number."""
+        acting = int((after < 0).sum(-1).max(initial=0))
+        if self._warn and acting > self.n_limits:
+            warnings.warn(
+                f"expected at most {self.n_limits} limits of joints and tendons that act in a step, got {acting}; only "
+                f"the nearest are kept, so that others are passed: pass limits={acting}, or limits={self.n_limits} if "
+                f"these are enough",
+                ContactWarning,
+                stacklevel=5,
+            )
+            self._warn = False
+
+
+def scale(rows: Rows, gap: Array, part: Array | float, response: Array, give: float, seconds: float) -> ScaledRows:
+    """Scale rows so that a unit of force moves each as far as it moves contacts; those that cannot move get zeros.
+
+    Args:
+        rows: the rows.
+        gap: (n, k) distance to where each holds.
+        part: (n, k) see `Followed`.
+        response: (n, nv, nv) what an impulse at the beginning of the step does to ζ.
+        give: how far contacts move by it.
+        seconds: duration of the step [s], for bounds of impulses; 1 for those of forces.
+    """
+    gives = np.einsum("nki,nij,nkj->nk", rows.normal, response, rows.normal)
+    least = 1e-9 * np.einsum("nki,nki->nk", rows.normal, rows.normal) * np.trace(response, axis1=-2, axis2=-1)[:, None]
+    unit = np.where(gives > least, np.sqrt(give / np.where(gives > least, gives, 1.0)), 0.0) / part
+    impulse = unit[:, :, None] * rows.normal
+    of_friction = unit[:, unit.shape[1] - rows.n_friction :]
+    bound = (
+        seconds * rows.soft.bound[:, unit.shape[1] - rows.n_friction :] / np.where(of_friction > 0, of_friction, 1.0)
+    )
+    return ScaledRows(unit * part * gap, impulse * np.reshape(part, (*np.shape(part), 1)), impulse, bound, unit)
+
+
+class Followed(NamedTuple):
+    """Soft rows (n, k) after a step.
+
+    Attributes:
+        moved: change of the gap, or of the way that rubs.
+        part: how far an impulse moves at the time in the step at which the row's force acts, of how far one at the
+            beginning would.
+        acts: True where there is a force.
+        holds: True where it acts all the time, within its bounds.
+        stops: True where it is within its bounds at the end of the step.
+    """
+
+    moved: Array
+    part: Array
+    acts: NDArray[np.bool_]
+    holds: NDArray[np.bool_]
+    stops: NDArray[np.bool_]
+
+
+def follow(
+    gap: Array, speed: Array, load: Array, turn: Array, mass: Array, soft: Softness, seconds: float, count: int
+) -> Followed:
+    """Follow soft rows (n, k) through a step.
+
+    Args:
+        gap: at its beginning.
+        speed: v at its beginning.
+        load: acceleration a without the row's own force.
+        turn: part of it that is due to its Jacobian's change, J̇ ν, which MuJoCo's force does not resist.
+        mass: A, the inverse of the mass.
+        soft: MuJoCo's parameters.
+        seconds: duration of the step [s].
+        count: of MuJoCo's steps in it.
+    """
+    coarse = count > _MOST_STEPS
+    count = min(count, _MOST_STEPS)
+    h, limit = seconds / count, np.isinf(soft.bound)
+    lower, upper = np.where(limit, 0.0, -mass * soft.bound), mass * soft.bound
+    r, v, impulse, far = gap.copy(), speed.copy(), np.zeros_like(gap), np.zeros_like(gap)
+    held = holds = np.ones_like(limit)
+    for i in range(count):
+        d = _impedance(np.where(limit, np.abs(r), 0.0), soft.impedance)
+        firm = mass / (mass + (1 - d) / d * soft.give)
+        spring, damping = firm * soft.stiffness * d, firm * soft.damping
+        # Steps that are longer than MuJoCo's are implicit.
+        force = -damping * v - spring * r - firm * (load - turn)
+        if coarse:
+            force = (force - h * (damping * load + spring * (v + h * load))) / (1 + h * damping + h * h * spring)
+        held = np.where(limit, (r < 0) & (force > 0), (lower < force) & (force < upper))
+        force = np.where(limit & (r >= 0), 0.0, np.clip(force, lower, upper))
+        v += h * (load + force)
+        r += h * v
+        impulse += h * force
+        far += h * h * (count - i) * force
+        holds = holds & (held | (i == 0 < count - 1))  # what begins to touch holds as well
+    acts = np.abs(impulse) > 1e-12
+    # Where the load is carried, it acts at the beginning of the step as well.
+    far = far - np.where(holds, load * (seconds**2 - 0.5 * h * h * count * (count + 1)), 0.0)
+    part = np.where(acts, far / np.where(acts, impulse, 1.0), seconds) / seconds
+    return Followed(r - gap, part, acts, holds, held)
+
+
+def _impedance(depth: Array, parameters: Array) -> Array:
+    """Compute MuJoCo's impedance d of (...) depths with solimp (..., 5)."""
+    least, most, width, middle, power = np.moveaxis(parameters, -1, 0)
+    x = np.minimum(depth / np.maximum(width, 1e-15), 1.0)
+    middle, power = np.clip(middle, 1e-4, 0.9999), np.maximum(power, 1.0)
+    y = np.where(x <= middle, x**power / middle ** (power - 1), 1 - (1 - x) ** power / (1 - middle) ** (power - 1))
+    return np.clip(least + y * (most - least), 1e-4, 0.9999)
+
+
+def _reference(model: Any, reference: Array, impedance: Array, of_limits: int) -> tuple[Array, Array]:
+    """Compute k and b (k,) of solref (k, 2) and solimp (k, 5); the first `of_limits` have a stiffness."""
+    most = np.clip(impedance[:, 1], 1e-4, 0.9999)
+    time, ratio = reference.T
+    safe = not _disabled(model, "REFSAFE")
+    time = np.where(time > 0, np.maximum(time, 2 * model.opt.timestep * safe), time)
+    standard = time > 0
+    inverse = 1 / np.where(standard, most * time, 1.0)
+    stiffness = np.where(standard, (inverse / np.where(standard, ratio, 1.0)) ** 2, -time / most**2)
+    stiffness[of_limits:] = 0.0
+    return stiffness, np.where(standard, 2 * inverse, -ratio / most)
+
+
+def _disabled(model: Any, name: str) -> bool:
+    return bool(model.opt.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")))
+
+
+def tendon_jacobian(model: Any, data: Any) -> Array:
+    """Return the derivative (ntendon, nv) of the tendons' lengths, which newer versions of MuJoCo keep sparse."""
+    jacobian = np.zeros((model.ntendon, model.nv))
+    if data.ten_J.size == jacobian.size:
+        return data.ten_J.reshape(jacobian.shape)
+    where = (
+        getattr(data if hasattr(data, name) else model, name)
+        for name in ("ten_J_rownnz", "ten_J_rowadr", "ten_J_colind")
+    )
+    mujoco.mju_sparse2dense(jacobian, data.ten_J.reshape(-1), *(v.reshape(-1) for v in where))
+    return jacobian

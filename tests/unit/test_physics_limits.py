@@ -1,0 +1,128 @@
+"""Limits and dry friction of joints and tendons against MuJoCo: what rests, slides, stops, and what a system has."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+mujoco = pytest.importorskip("mujoco")
+
+from difflcs.errors import ContactWarning  # noqa: E402
+from difflcs.physics.mujoco import MujocoLCS  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def load(worldbody, rest=""):
+    return mujoco.MjModel.from_xml_string(
+        f'<mujoco><option timestep=".001"/><worldbody>{worldbody}</worldbody>{rest}</mujoco>'
+    )
+
+
+def hinge(words=""):
+    return f'<body pos="0 0 1"><joint name="j" axis="0 1 0" {words}/><geom size=".05" mass="1" pos=".2 0 0"/></body>'
+
+
+DRAWER = """<body><joint name="j" type="slide" axis="0 0 1" range="0 .2" {}/>
+  <geom type="box" size=".1 .1 .01" mass="1"/></body>"""
+BOX = '<body pos="0 0 .06"><freejoint/><geom type="box" size=".05 .05 .05" mass="2"/></body>'
+STRING = """<site name="hook" pos="0 0 1"/><body pos=".1 0 .8"><freejoint/><site name="eye"/>
+  <geom size=".02" mass=".3"/></body>"""
+CORD = '<tendon><spatial limited="true" range="0 .3" {}><site site="hook"/><site site="eye"/></spatial></tendon>'
+FIXED = '<tendon><fixed limited="true" range="-1 {}" {}><joint joint="j" coef="1"/></fixed></tendon>'
+MOTOR = '<actuator><motor joint="j"/></actuator>'
+RESTING = {
+    "drawer": (DRAWER.format(""), ""),
+    "drawer of soft stops": (DRAWER.format('solreflimit=".05 1" solimplimit=".1 .9 .02"'), ""),
+    "drawer that acts before": (DRAWER.format('margin=".01"'), ""),
+    "drawer and box": (DRAWER.format("") + BOX, ""),
+    "hinge": (hinge('range="-10 10"'), ""),
+    "ball": (hinge('type="ball" range="0 30"'), ""),
+    "string": (STRING, CORD.format("")),
+    "tendon": (hinge(), FIXED.format(".5", "")),
+    "friction": (hinge('frictionloss="3"'), ""),
+    "friction of a tendon": (hinge(), FIXED.format("9", 'frictionloss="3"')),
+    "friction of a slide under a box": (DRAWER.format('frictionloss="60"') + BOX, ""),
+}
+
+
+@pytest.mark.parametrize("name", RESTING)
+def test_what_rests_on_limits_or_dry_friction_stays_as_in_mujoco(name):
+    model = load(*RESTING[name])
+    start = mujoco.MjData(model)
+    if name == "friction of a slide under a box":
+        start.qpos[0], start.qpos[3] = 0.1, 0.16
+    for _ in range(2000):  # what swings comes to rest
+        mujoco.mj_step(model, start)
+        start.qvel[:] *= 0.99
+    for seconds in (0.002, 0.02, 0.1):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = start.qpos, start.qvel
+        mujoco.mj_step(model, data, round(seconds / model.opt.timestep))
+        module = MujocoLCS(model, start, motion="dynamic", seconds=seconds)
+        x = module.state.to_state(start.qpos, start.qvel)
+        after = module.params(x).step(x, torch.zeros(0).double()).x_next
+        wrong = (after - module.state.to_state(data.qpos, data.qvel)).abs()
+        assert wrong[: model.nv].max() < 2e-4, seconds
+        assert wrong[model.nv :].max() < 3e-3, seconds
+
+
+MOVING = {  # bodies, the rest, start, control
+    "slides": (hinge('frictionloss=".5" damping=".1"'), "", (0.0, -3.0), 0.0),
+    "hits a stop": (hinge('range="-60 10"'), "", (-0.5, 1.0), 0.0),
+    "is pushed against a stop": (hinge('range="-20 10"'), MOTOR, (-0.3, 0.0), -4.0),
+    "breaks away": (hinge('frictionloss="3"'), MOTOR, (0.0, 0.0), 3.0),
+    "holds against a motor": (hinge('frictionloss="3"'), MOTOR, (0.0, 0.0), -3.0),
+    "a string goes tight": (STRING, CORD.format(""), (), 0.0),
+}
+
+
+@pytest.mark.parametrize("name", MOVING)
+def test_what_moves_against_limits_and_dry_friction_goes_as_in_mujoco(name):
+    """Twenty steps of 20 ms, each from MuJoCo's state: in the median a fifth of the change in velocity is wrong."""
+    bodies, rest, state, ctrl = MOVING[name]
+    model = load(bodies, rest)
+    data = mujoco.MjData(model)
+    if state:
+        data.qpos[0], data.qvel[0] = state
+    data.ctrl[:] = ctrl
+    module = MujocoLCS(model, data, motion="dynamic", seconds=0.02)
+    parts = []
+    for _ in range(20):
+        x = module.state.to_state(data.qpos, data.qvel)
+        after = module.params(x).step(x, torch.from_numpy(data.ctrl)).x_next
+        mujoco.mj_step(model, data, 20)
+        right = module.state.to_state(data.qpos, data.qvel)
+        wrong, change = (after - right)[model.nv :].norm(), (right - x)[model.nv :].norm()
+        parts.append(float(wrong / change.clamp_min(0.02)))
+    assert np.median(parts) < 0.2
+
+
+@pytest.mark.parametrize("motion", ["quasi-static", "quasi-dynamic"])
+def test_a_rope_tows_what_has_no_velocity(motion):
+    slides = "".join(f'<body pos="0 {i} 0"><joint name="{name}" type="slide" axis="1 0 0" frictionloss=".01"/>'
+                     '<geom size=".05" mass="1"/></body>' for i, name in enumerate("ab"))  # fmt: skip
+    rope = '<tendon><fixed range="-1 .05"><joint joint="a" coef="1"/><joint joint="b" coef="-1"/></fixed></tendon>'
+    model = load(slides, rope + '<actuator><position joint="a" kp="3000" kv="20"/></actuator>')
+    module, x = MujocoLCS(model, motion=motion), torch.zeros(2, dtype=torch.float64)
+    for far, towed in ((0.04, 0.0), (0.1, 0.05), (-0.1, 0.0)):
+        after = module.params(x).step(x, torch.tensor([far]).double()).x_next
+        torch.testing.assert_close(after, torch.tensor([far, towed]).double(), rtol=0, atol=5e-3)
+
+
+def test_the_nearest_of_many_limits_are_kept_and_more_are_told():
+    chain = "".join(f'<body><joint type="slide" axis="0 0 1" range="0 .1"/><geom size=".01" pos="{i} 0 0"/></body>'
+                    for i in range(10))  # fmt: skip
+    model = load(chain, '<option><flag contact="disable"/></option>')
+    with pytest.warns(ContactWarning, match="pass limits=10"):
+        MujocoLCS(model, motion="dynamic").params(torch.zeros(20, dtype=torch.float64))
+    module = MujocoLCS(model, motion="dynamic", limits=3)
+    x = torch.cat([torch.full((10,), 0.05), torch.zeros(10)]).double()
+    x[[2, 5, 7]] = 0.0
+    after = module.params(x).step(x, torch.zeros(0).double()).x_next
+    assert module.n_lam == 3
+    torch.testing.assert_close(after[10:][[2, 5, 7]], torch.zeros(3).double(), rtol=0, atol=1e-2)
+    assert MujocoLCS(model, motion="dynamic", limits=0).n_lam == 0
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
+    assert MujocoLCS(model, motion="dynamic").n_lam == 0
