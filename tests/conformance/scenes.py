@@ -160,7 +160,7 @@ class Judged(NamedTuple):
         """Whether a fault is silent."""
         if self.outcome in ("refused", "warned"):
             return False
-        return self.outcome != "made" or not self.error <= self.nothing + TOLERANCE * self.scale
+        return self.outcome != "made" or not self.error <= self.nothing + TOLERANCE * self.scale + 1e-6
 
 
 def random_scene(seed: int) -> tuple[Any, Any, np.random.Generator] | None:
