@@ -33,7 +33,7 @@ from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import RowFinder, ScaledRows, scale
 from difflcs.physics.mujoco.motion import Dynamic, QuasiStatic
 from difflcs.physics.mujoco.native import TAKEN, native
-from difflcs.physics.mujoco.nominal import Recovery, evaluate_nominal
+from difflcs.physics.mujoco.nominal import Recovery, convert_forces, evaluate_nominal
 from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
 from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams, LCSSequence, sequence_along
@@ -61,11 +61,13 @@ class MujocoLCS:
 
     Limits of actuators are bounds of the actions, see `action_bounds`, and activation is part of the state.
 
-    Not in the system: limits of joints and tendons (bound the states of the MPC), margins of geoms, torsional and
-    rolling friction. Refused: active equality constraints, adhesion, delay, sleep, height fields and signed distance
-    fields that may touch something, friction that override sets or that is not the same in all directions; in
-    quasi-static motion disabled actuators, and in dynamic motion dry friction in joints and tendons. The matrices carry
-    no gradient of the state.
+    Limits of joints and tendons are one-sided constraints, as soft as MuJoCo's and without friction. Dry friction of
+    joints and tendons (`frictionloss`) is a bounded force; in quasi-static motion it does nothing.
+
+    Not in the system: margins of geoms, torsional and rolling friction. Refused: active equality constraints, adhesion,
+    delay, sleep, height fields and signed distance fields that may touch something, friction that override sets or that
+    is not the same in all directions; in quasi-static motion disabled actuators. The matrices carry no gradient of the
+    state.
 
     An object keeps one private copy of the model and its data, so use it from one thread at a time.
 
@@ -94,6 +96,8 @@ class MujocoLCS:
             state. None: that at which servos have no force where the state is, and for other actuators that of `data`.
         length: unit of gaps for the relaxation of the MPC, see `contact_lcs` [m]; None: the median radius of the
             geoms that move and may touch.
+        limits: how many limits of joints and tendons a state has, those that the nominal action comes nearest to; None:
+            all, at most 8, with a `ContactWarning` where more act. 0 leaves them out.
 
     Attributes:
         state: `MujocoState`, which says what each number of the state is.
@@ -186,7 +190,7 @@ class MujocoLCS:
 
     @property
     def n_lam(self) -> int:
-        """Number of contact forces."""
+        """Number of forces: of contacts, then of limits, then two for each joint or tendon with dry friction."""
         each = count_forces(1, self._finder.n_tangents, self.cone)
         of_contacts = self.n_contacts * each if self._selection is None else len(self._selection.rows(each))
         return of_contacts + self._rows.n_limits + 2 * self._rows.n_friction
@@ -230,7 +234,7 @@ class MujocoLCS:
             nominal = evaluate_nominal(step, contacts, found, self._recovery, self._give, self.compliance, opens)
             contacts, rows = nominal.contacts, nominal.rows
             effect = step.effect(read.tangent, rows.normal, rows.impulse)
-            forces = _convert_forces(nominal.forces, self._finder.n_tangents, self.cone)
+            forces = convert_forces(nominal.forces, self._finder.n_tangents, self.cone)
             rest = read.batched(np.concatenate([forces, nominal.row_forces, np.zeros_like(rows.bound)], -1))
             free = step.free(read.tangent, nominal.carried)
         else:
@@ -417,14 +421,6 @@ def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: A
         raise DTypeError("data: expected a mujoco.MjData, got None; pass mujoco.MjData(model)")
     module = MujocoLCS(model, data, **options)
     return module.params(module.state.to_state(data.qpos, data.qvel, data.act) if x is None else x)
-
-
-def _convert_forces(forces: Any, n_tangents: int, cone: Cone) -> Any:
-    """Convert forces (n, n_contacts, n_rays) along Anitescu's rays to those (n, n_lam) of a cone."""
-    each = count_forces(1, n_tangents, cone)
-    if each != forces.shape[-1]:  # Stewart and Trinkle: normal, tangential, and the distance
-        forces = np.concatenate([forces.sum(-1, keepdims=True), np.zeros((*forces.shape[:2], each - 1))], -1)
-    return forces.reshape(len(forces), -1)
 
 
 def _check_model(model: Any, data: Any, motion: Motion) -> None:

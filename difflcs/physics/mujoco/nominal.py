@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from difflcs.physics.complementarity import Cone, count_forces
 from difflcs.physics.mujoco._native import _mujoco
 from difflcs.physics.mujoco.contacts import MujocoContacts
 from difflcs.physics.mujoco.limits import Rows, ScaledRows, follow, scale
@@ -241,6 +242,14 @@ def evaluate_nominal(
     # What creeps moves the point from which friction counts, which is that of so much compliance.
     creep = _compute_creep(step, contacts, recovery, of_contacts) * ~slides[:, :, None] / (compliance / _SOFTER * give)
     return Nominal(contacts._replace(gap=opened), of_contacts + creep, settled, of_rows, carried)
+
+
+def convert_forces(forces: Array, n_tangents: int, cone: Cone) -> Array:
+    """Convert forces (n, n_contacts, n_rays) along Anitescu's rays to those (n, n_lam) of a cone."""
+    each = count_forces(1, n_tangents, cone)
+    if each != forces.shape[-1]:  # Stewart and Trinkle: normal, tangential, and the distance
+        forces = np.concatenate([forces.sum(-1, keepdims=True), np.zeros((*forces.shape[:2], each - 1))], -1)
+    return forces.reshape(len(forces), -1)
 
 
 def _compute_creep(step: DynamicStep, contacts: MujocoContacts, recovery: Recovery, forces: Array) -> Array:
