@@ -44,12 +44,7 @@ _MOST, _FEW = 50, 25  # steps that are simulated one by one; where there are mor
 _EULER, _RK4, _IMPLICIT, _FAST = (
     int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("EULER", "RK4", "IMPLICIT", "IMPLICITFAST")
 )
-_UNSTABLE = {
-    _EULER: 2.0,
-    _RK4: 2.78,
-    _IMPLICIT: 2.0,
-    _FAST: 2.0,
-}  # of h times the rate of damping, or h²/2 of stiffness
+_GROWS = 30.0  # by how much a motion that is stable in truth may grow in a step
 _ADVANCE = {_EULER: "mj_Euler", _IMPLICIT: "mj_implicit", _FAST: "mj_implicit"}
 
 
@@ -181,13 +176,16 @@ class Dynamic:
         if steps not in self._native:
             self._native[steps] = self._describe(steps)
         places.check(_mujoco.read_motion(library(), self._native[steps], places.take(n), states, ctrl, *arrays), n)
-        return Linearised(*arrays, np.zeros(n, dtype=bool))
+        return Linearised(*arrays, unstable=np.zeros(n, dtype=bool))
 
     def _find_unstable(self, read: Linearised) -> NDArray[np.bool_]:
         """Find the states (n,) at which steps without constraints overshoot, each farther than the last."""
         nv, h = self.model.nv, self.seconds / self.simulated.count
         stiff, damped = read.A[:, nv : 2 * nv, :nv], read.A[:, nv : 2 * nv, nv : 2 * nv] - np.eye(nv)
-        rates, most = h * damped + 0.5 * h * h * stiff, _UNSTABLE[self.simulated.integrator]
+        # Euler's steps grow by g each where h times the rate of damping, or h²/2 of stiffness, is this much.
+        g = _GROWS ** (1 / self.simulated.count)
+        most = (1 + g) ** 2 / (2 * g) * (1.39 if self.simulated.integrator == _RK4 else 1)
+        rates = h * damped + 0.5 * h * h * stiff
         if self.simulated.integrator != _RK4:
             implicit = -damped if self.simulated.integrator != _EULER else read.inverse_mass * self.damping
             rates = np.linalg.solve(np.eye(nv) + h * implicit, rates)
