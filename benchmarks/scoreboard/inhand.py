@@ -87,6 +87,10 @@ class Settings:
     """Weight of the distances of object and fingertips."""
     effort: float = 0.2
     solver: str = "fast"
+    patience: int = 25
+    """Decisions without progress after which the hand opens, and takes the object anew."""
+    opening: int = 8
+    """Decisions for which it opens."""
 
 
 @dataclass
@@ -166,18 +170,33 @@ class HandPolicy:
         self.mpc = LCSMPCLayer(
             self.module, self.cost, s.horizon, -self.limit, self.limit, backend, s.relaxation, "mask"
         )
-        self.guess, self.times = None, []
+        self.goal, self.settings, self.guess, self.times = goal, settings, None, []
+        self.best, self.waited = np.inf, 0
+
+    def stalls(self, data: Any) -> bool:
+        """Tell whether the object has not turned on for too long: then the hand opens for some decisions."""
+        left = 2 * np.arccos(min(1.0, abs(float(data.qpos[-4:] @ self.goal))))
+        self.waited += 1
+        if self.waited > 0 and left < max(self.best - 0.05, 0.35):  # turned on by 3°, or almost there
+            self.best, self.waited = min(left, self.best), 0
+        if self.waited > self.settings.patience:
+            self.best, self.waited = np.inf, -self.settings.opening
+        return self.waited < 0
 
     def act(self, data: Any) -> np.ndarray:
         """MuJoCo's ctrl for the next 0.1 s."""
+        if self.stalls(data):
+            self.guess = None
+            return data.qpos[:16] + np.clip(np.array(JOINTS) - data.qpos[:16], -self.limit, self.limit)
         marks = [time.thread_time()]
         x = self.module.observe(data)
         system = self.module.params(x)
         marks.append(time.thread_time())
         cost = self.cost.at(x)
         marks.append(time.thread_time())
+        low, high = (bound.clamp(-self.limit, self.limit) for bound in self.module.action_bounds(x))
         with torch.no_grad():
-            plan = self.mpc(x, lcs=system, cost=cost, guess=self.guess)
+            plan = self.mpc(x, lcs=system, cost=cost, guess=self.guess, u_min=low, u_max=high)
         marks.append(time.thread_time())
         self.times.append(1e3 * np.diff(marks))
         self.guess = plan.shift() if bool(solved(plan.status)) else None

@@ -268,7 +268,8 @@ class MPCController:
             if self._overridden or not first:
                 self._set_inputs(self._setup, gather(self._setup, call._replace(**overrides)), overrides)
         if self._time_limit is not None:
-            self._native.set_time_limit(max(self._time_limit - (time.perf_counter() - begun), 1e-9))
+            native: Any = self._native
+            native.set_time_limit(max(self._time_limit - (time.perf_counter() - begun), 1e-9))
         return x
 
     def _set_inputs(self, setup: Setup, inputs: Inputs, overrides: dict[str, Any]) -> None:

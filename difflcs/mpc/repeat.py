@@ -12,7 +12,7 @@ make F and the cost of a goal have to be torch's.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TypeGuard
+from typing import Any, TypeGuard
 
 import torch
 from torch import Tensor
@@ -88,7 +88,8 @@ class _Prepared:
         """Make the solver of a call: from its state, to its goal, with its system if it has one."""
         (solver, same), (x0, goal, lcs) = self.latest, (call.x0, call.goal, call.lcs)
         if goal is not None and same is not None and not same.same([goal]):
-            made = setup.cost.at(goal, setup.horizon)  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]
+            cost: Any = setup.cost  # a GoalCost, as there is a goal
+            made = cost.at(goal, setup.horizon)
             solver = solver.with_inputs({name: made[name] for name in ("q", "q_final", "constant")})
             self.latest = solver, Snapshot([goal])
         if lcs is not None:

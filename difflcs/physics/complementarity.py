@@ -315,7 +315,8 @@ def _normals_and_tangents(contacts: Contacts, mu: Tensor) -> tuple[Tensor, Tenso
     normal = contacts.normal.unsqueeze(-2)
     still = torch.zeros_like(both)
     gap = torch.nn.functional.pad(contacts.gap.unsqueeze(-1), (0, both.shape[-2]))
-    return *(torch.cat([normal, v], -2).flatten(-3, -2) for v in (both, still)), gap.flatten(-2)
+    rows, normals = (torch.cat([normal, v], -2).flatten(-3, -2) for v in (both, still))
+    return rows, normals, gap.flatten(-2)
 
 
 _LARGE_DRAG = 0.25

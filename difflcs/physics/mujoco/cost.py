@@ -185,7 +185,8 @@ class MujocoCost(TensorFields):
         given = [value.to("cpu", torch.float64) for value in given]
         learns = torch.is_grad_enabled() and any(value.requires_grad for value in given)
         of: Any = torch if learns else np  # the formulas below are those of both; NumPy takes a third of the time
-        weights, *others = given if learns else [value.detach().numpy() for value in given]
+        arrays: list[Any] = given if learns else [value.detach().numpy() for value in given]
+        weights, *others = arrays
         weights = weights + 0  # a copy
         for (_, at), value in zip(self._learned, others, strict=False):
             weights[at] = value

@@ -61,7 +61,8 @@ class ContactSelection:
         for i, group in enumerate(groups):
             for one in [group.of] if group.of is None or isinstance(group.of, str | int | tuple) else group.of:
                 mine = np.zeros((model.ngeom, model.ngeom), dtype=bool)
-                mine[np.ix_(*(_geoms(model, of) for of in (one if isinstance(one, tuple) else (one, None))))] = True
+                sides = one if isinstance(one, tuple) else (one, None)
+                mine[np.ix_(*(_geoms(model, side) for side in sides))] = True
                 self.group[(mine | mine.T) & (self.group < 0)] = i
         self.budgets = [
             Budget(
@@ -100,5 +101,5 @@ class ContactSelection:
         )
 
 
-def _geoms(model: Any, of: str | int | None) -> Sequence[int]:
+def _geoms(model: Any, of: Any) -> Sequence[int]:
     return range(model.ngeom) if of is None else find_geoms(model, of)

@@ -211,8 +211,8 @@ class Dynamic:
         fields["advance"] = addresses()[advance] if advance else 0
         return _mujoco.Motion(fields | actuators.describe_balance(self.relative))
 
-    def finish(self, read: Linearised, x: Array) -> DynamicStep:
-        """Return the motion at states x (n, n_x)."""
+    def finish(self, read: Linearised, x: Array, equality: Any = None) -> DynamicStep:
+        """Return the motion at states x (n, n_x), with soft equality constraints, `EqualityRows`."""
         nv, h, n_x = self.model.nv, self.seconds, x.shape[1]
         velocity = x[:, nv : 2 * nv]
         rates, B = read.A[:, nv:] - np.eye(n_x)[nv:], read.B[:, nv:]
@@ -222,22 +222,35 @@ class Dynamic:
             np.concatenate([rates, B, load[:, :, None]], -1),
             np.linalg.inv(read.inverse_mass).astype(np.float64),
         )
-        response = _implicit_response(mass, rates[:, :nv, :nv], rates[:, :nv, nv : 2 * nv], h)
+        damping = np.diag(self.damping) if self.steps.integrator == _EULER else -mass @ rates[:, :nv, nv : 2 * nv]
+        free, inverse_mass, heavier = forces, read.inverse_mass, mass
+        if equality is not None:
+            heavier, forces = _add_equality(mass, forces, equality)
+            inverse_mass = np.linalg.inv(heavier)
+        response = _implicit_response(heavier, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
         # Of a step in which a motion grows beyond all bounds, what is linear and explicit says nothing.
-        step, implicit = self._steps(mass, forces, self.steps), self._implicit(response @ mass, forces)
+        step, implicit = self._steps(mass, forces, damping, self.steps), self._implicit(response @ heavier, forces)
         step = np.where((np.abs(step).max((1, 2)) < _BEYOND)[:, None, None], step, implicit)
         # The simulation says what is not linear, by its difference to the same steps of the linear motion.
-        same = self.simulated == self.steps
-        simulated = step if same else self._steps(mass, forces, self.simulated)
+        same = self.simulated == self.steps and equality is None
+        simulated = step if same else self._steps(mass, free, damping, self.simulated)
         if (some := read.unstable).any():
-            step[some] = simulated[some] = self._steps(mass[some], forces[some], self.finer)
+            slow = -mass[some] @ rates[some, :nv, nv : 2 * nv]
+            simulated[some], step[some] = (self._steps(mass[some], of[some], slow, self.finer) for of in (free, forces))
         more = read.reached - _reached(simulated, velocity)
-        step[:, :, -1] += np.where((np.abs(more).max(1) < _BEYOND)[:, None], more, 0.0)
+        more = np.where((np.abs(more).max(1) < _BEYOND)[:, None], more, 0.0)
+        if equality is not None:
+            for part in (slice(nv), slice(nv, 2 * nv)):
+                more[:, part] = (inverse_mass @ mass @ more[:, part, None])[:, :, 0]
+        step[:, :, -1] += more
         place, delayed = _reached(step, velocity)[:, :nv], (implicit - step)[:, : 2 * nv]
-        return DynamicStep(self, x, step, delayed, response, read.inverse_mass, place, read.nominal)
+        return DynamicStep(self, x, step, delayed, response, inverse_mass, place, read.nominal)
 
-    def _steps(self, mass: Array, forces: Array, steps: Steps) -> Array:
-        """The state after the step as a matrix (n, n_x, n_x + nu + 1) of it, u − ū and 1; `forces` is that of rates."""
+    def _steps(self, mass: Array, forces: Array, damping: Array, steps: Steps) -> Array:
+        """The state after the step as a matrix (n, n_x, n_x + nu + 1) of it, u − ū and 1; `forces` is that of rates.
+
+        The `damping` (nv, nv) or (n, nv, nv) is implicit.
+        """
         n, of, nv = len(forces), forces.shape[2], self.model.nv
         n_x = nv + forces.shape[1]
         h, one = self.seconds / steps.count, np.zeros((n, of, of))
@@ -250,10 +263,8 @@ class Dynamic:
             grown: Tensor = torch.linalg.matrix_exp(torch.from_numpy(one * unit[:, None] / unit))
             one = grown.numpy() * unit / unit[:, None]
         else:
-            damped = forces[:, :nv, nv : 2 * nv]
-            implicit = np.diag(self.damping) if steps.integrator == _EULER else -mass @ damped
             one[:] = np.eye(of)
-            one[:, nv : 2 * nv] += h * np.linalg.solve(mass + h * implicit, mass @ forces[:, :nv])
+            one[:, nv : 2 * nv] += h * np.linalg.solve(mass + h * damping, mass @ forces[:, :nv])
             one[:, :nv] += h * one[:, nv : 2 * nv]
             one[:, 2 * nv : n_x] += activation
         with np.errstate(over="ignore", invalid="ignore"):
@@ -348,6 +359,11 @@ class DynamicStep(NamedTuple):
         nv = self.place.shape[1]
         return self.x[:, nv : 2 * nv]
 
+    @property
+    def reached(self) -> Array:
+        """(n, n_x) ζ, ν and the change of activation afterwards with the nominal action."""
+        return _reached(self.step, self.velocity)
+
     def free(self, tangent: Array | None, carried: Array | None = None) -> FreeMotion:
         """Motion without contact, with `carried` added to (ζ, ν), for the tangent of the state's rotations."""
         motion, x, step = self.motion, self.x, self.step.copy()
@@ -385,6 +401,17 @@ def _reached(step: Array, velocity: Array) -> Array:
     """Compute the change (n, n_x) in a step (n, n_x, n_x + nu + 1) from velocities (n, nv) with u = ū."""
     nv = velocity.shape[1]
     return step[:, :, -1] + (step[:, :, nv : 2 * nv] @ velocity[:, :, None])[:, :, 0]
+
+
+def _add_equality(mass: Array, forces: Array, rows: Any) -> tuple[Array, Array]:
+    """Return mass and rates with soft equality constraints, which add mass, damping and stiffness."""
+    nv, heavier = mass.shape[-1], mass + rows.force @ rows.normal
+    pull = np.zeros((*rows.gap.shape, forces.shape[-1]))
+    pull[:, :, :nv] = -rows.stiffness[:, :, None] * rows.normal
+    pull[:, :, nv : 2 * nv] = -rows.damping[:, :, None] * rows.normal
+    pull[:, :, -1] = -rows.stiffness * rows.gap
+    held = np.linalg.solve(heavier, mass @ forces[:, :nv] + rows.force @ pull)
+    return heavier, np.concatenate([held, forces[:, nv:]], 1)
 
 
 def _flags(*names: str) -> int:

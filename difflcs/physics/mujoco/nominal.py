@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from difflcs.physics.complementarity import Cone, count_forces
 from difflcs.physics.mujoco._native import _mujoco
 from difflcs.physics.mujoco.contacts import MujocoContacts
-from difflcs.physics.mujoco.limits import Rows, ScaledRows, follow, scale
+from difflcs.physics.mujoco.limits import Rows, ScaledRows, find_load, follow, scale
 from difflcs.physics.mujoco.motion import DynamicStep
 
 Array = NDArray[np.float64]
@@ -172,10 +172,9 @@ def _settle(
     rays = _Rays(contacts, scaled, response, give, compliance)
     forces, moved = rays.forces(_place(step, step.delayed), np.maximum(contacts.gap, 0.0))
     forces = rays.split(forces)[1]
-    mass = np.einsum("nki,nij,nkj->nk", rows.normal, step.inverse_mass, rows.normal)
     after_bend = (rows.normal @ moved[:, :, None])[:, :, 0] + 2 * rows.bend
-    load = (after_bend / h - speed - mass * forces * scaled.unit) / h
-    after = follow(rows.gap, speed, load, 2 * rows.bend / h**2, mass, rows.soft, h, step.motion.steps.count)
+    load = find_load(step, rows.normal, rows.bend, after_bend / h, forces * scaled.unit)
+    after = follow(rows.gap, speed, load, rows.soft, h, step.motion.steps.count)
     inside = np.abs(forces[:, k:]) < 0.999 * scaled.bound
     holds = after.holds & np.concatenate([forces[:, :k] > 0, inside], 1)
     # A limit holds at the depth that it has after the step, friction after its creep.
