@@ -273,7 +273,6 @@ class Followed(NamedTuple):
         acts: True where there is a force.
         holds: True where it acts all the time, within its bounds.
         stops: True where it is within its bounds at the end of the step.
-        impulse: sum of the sizes of its force.
     """
 
     moved: Array
@@ -282,7 +281,6 @@ class Followed(NamedTuple):
     acts: NDArray[np.bool_]
     holds: NDArray[np.bool_]
     stops: NDArray[np.bool_]
-    impulse: Array
 
 
 class Load(NamedTuple):
@@ -348,7 +346,7 @@ def follow(gap: Array, speed: Array, load: Load, soft: Softness, seconds: float,
     # Where the load is carried, it acts at the beginning of the step as well.
     far = way[0] - np.where(holds, seconds * rate[1] - way[1], 0.0)
     part = np.where(acts, far / np.where(np.abs(rate[0]) > 1e-12, rate[0], 1.0), seconds) / seconds
-    return Followed(r - gap, v, part, acts, holds, held, total / np.maximum(mass, 1e-300))
+    return Followed(r - gap, v, part, acts, holds, held)
 
 
 def _impedance(depth: Array, parameters: Array) -> Array:
