@@ -58,14 +58,19 @@ PLAIN = {"bound_relax_factor": 0.0}
 TUNED = {"tol": 1e-6, "mu_init": 1e-4, "bound_relax_factor": 0.0}
 TUNED |= {"fast_step_computation": "yes", "mumps_pivot_order": 0}
 ADAPTIVE = {**TUNED, "mu_strategy": "adaptive"}
+LONG = {"tol": 1e-5, "mu_init": 1e-2, "max_iter": 1000}
 CONTACT = (
     Entry("difflcs `batched`", "layer"),
     Entry("difflcs `ipopt`", "layer", {"backend": "ipopt"}),
-    Entry("IPOPT, λ = s = 1", "ipopt", {"start": 1.0, "options": PLAIN}),
-    Entry("IPOPT, tuned", "ipopt", {"start": 0.1, "options": TUNED}),
-    Entry("IPOPT, tuned, adaptive", "ipopt", {"start": 0.1, "options": ADAPTIVE}),
-    Entry("FATROP, λ = 1", "fatrop", {"start": 1.0}),
-    Entry("FATROP, tuned", "fatrop", {"start": 0.1, "options": {"tol": 1e-5, "mu_init": 1e-2, "max_iter": 1000}}),
+    Entry("IPOPT, λ = s = 1", "casadi_nlp", {"start": 1.0, "options": PLAIN}),
+    Entry("IPOPT, tuned", "casadi_nlp", {"start": 0.1, "options": TUNED}),
+    Entry("IPOPT, tuned, adaptive", "casadi_nlp", {"start": 0.1, "options": ADAPTIVE}),
+    Entry("FATROP, λ = 1", "casadi_nlp", {"name": "fatrop", "start": 1.0}),
+    Entry(
+        "FATROP, tuned",
+        "casadi_nlp",
+        {"name": "fatrop", "start": 0.1, "options": {"tol": 1e-5, "mu_init": 1e-2, "max_iter": 1000}},
+    ),
 )
 LINEAR = (
     Entry("difflcs `batched`", "layer"),

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable
 
 # With several workers of pytest-xdist at once, each takes its share of the cores: torch's number of threads is also
 # that of the kernels, of diffcp and of the processes that a test starts. Tests about threads say themselves how many
@@ -164,98 +162,3 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
-
-
-def _values(value: object, path: tuple = ()) -> Iterator[tuple]:
-    yield path
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for key, part in items:
-        yield from _values(part, (*path, key))
-
-
-_WRONG = (None, True, -1, 1.5, -1.5, 10**30, -(10**30), "x", [], [-1], [True], ["x"], [10**30], {}, {"state": {}})
-
-
-def _wrong_tensors(tensor: Tensor) -> Iterator[Tensor]:
-    """Tensors of another type, shape or length, or with NaN."""
-    yield from (tensor.to(dtype) for dtype in (torch.complex64, torch.int64, torch.float16) if dtype != tensor.dtype)
-    yield from (tensor.unsqueeze(0), tensor.unsqueeze(-1))
-    if tensor.ndim and len(tensor):
-        yield from (torch.cat([tensor, tensor[:1]]), tensor[:0])
-    if tensor.is_floating_point() and tensor.numel():
-        broken = tensor.clone()
-        broken.view(-1)[-1] = torch.nan
-        yield broken
-
-
-def _hostile(state: Any) -> Iterator[tuple[bool, Any]]:
-    """States with one thing wrong; whether it is a tensor, which must be noticed."""
-    from difflcs.rl.learning.state import flatten, unflatten
-
-    tensors, rest = flatten(state)
-
-    def changed(path: tuple, change: Callable[[Any, Any], None]) -> Any:
-        copy = json.loads(json.dumps(rest))
-        part = copy
-        for key in path[:-1]:
-            part = part[key]
-        change(part, path[-1])
-        return unflatten(tensors, copy)
-
-    for path in list(_values(rest))[1:]:
-        for value in _WRONG:
-            yield False, changed(path, lambda part, key, value=value: part.__setitem__(key, value))
-        yield False, changed(path, lambda part, key: part.pop(key))
-        yield False, changed((*path[:-1], "another"), lambda part, key: part.__setitem__(key, 1))
-    for name, tensor in tensors.items():
-        others = {path: value for path, value in tensors.items() if path != name}
-        for wrong in _wrong_tensors(tensor):
-            yield True, unflatten({**others, name: wrong}, rest)
-        yield True, unflatten(others, rest)
-        yield True, unflatten({**tensors, f"{name}x": torch.zeros(1)}, rest)
-    yield True, unflatten({**tensors, "another": torch.zeros(1)}, rest)
-    yield True, unflatten({**tensors, "nowhere/another": torch.zeros(1)}, rest)
-
-
-def _same_state(a: Any, b: Any) -> bool:
-    """Whether two states are the same to the bit."""
-    from difflcs.rl.learning.state import flatten
-
-    (tensors, rest), (others, other_rest) = flatten(a), flatten(b)
-    alike = tensors.keys() == others.keys() and rest == other_rest
-    return alike and all(v.dtype == others[name].dtype and torch.equal(v, others[name]) for name, v in tensors.items())
-
-
-@pytest.fixture(scope="session")
-def refuses_hostile_checkpoints() -> Callable[[Any], None]:
-    """A check: a trainer goes back to a state of its own, and refuses such states with anything wrong.
-
-    A refusal changes nothing: it stays where it was, one step further. What is accepted is taken as it is: a number
-    that could have been written, such as another step size, or one that is equal to its own. A wrong tensor is never
-    accepted.
-    """
-    from difflcs.errors import CheckpointError
-    from difflcs.rl.learning.state import copy_state
-
-    def check(trainer: Any) -> None:
-        trainer.step()
-        whole = copy_state(trainer.state_dict())
-        trainer.step()
-        following = copy_state(trainer.state_dict())
-        assert not _same_state(whole, following)
-        for is_tensor, state in _hostile(whole):
-            try:
-                trainer.load(state)
-            except CheckpointError:
-                pass
-            else:
-                assert not is_tensor
-                assert _same_state(trainer.state_dict(), state)
-                trainer.load(following)
-            assert _same_state(trainer.state_dict(), following)
-        trainer.load(whole)
-        assert _same_state(trainer.state_dict(), whole)
-        trainer.step()  # by what a state does not hold, too, nothing has changed
-        assert _same_state(trainer.state_dict(), following)
-
-    return check

@@ -59,7 +59,6 @@ difflcs_envs.register_envs()
 envs = gymnasium.make_vec("difflcs/TriFingerMoveCube-v0", num_envs=2)
 envs.reset(seed=0)
 assert numpy.isfinite(envs.step(numpy.zeros((2, 6)))[0]["state"]).all(), "the state is not finite"
-native = all(env.unwrapped.physics.lane is not None for env in envs.envs)
 envs.close()
 def mesh(entry):
     try:
@@ -68,7 +67,7 @@ def mesh(entry):
         return None
 chosen = os.environ.get(YCB_DIR_VARIABLE)
 folder = f"{YCB_DIR_VARIABLE}={chosen}" if chosen else str(ycb_download_directory())
-print(json.dumps({"meshes": {name: mesh(entry) for name, entry in YCB.items()}, "folder": folder, "native": native}))
+print(json.dumps({"meshes": {name: mesh(entry) for name, entry in YCB.items()}, "folder": folder}))
 """
 _PICTURE = """
 import json, os
@@ -314,7 +313,7 @@ def _environments() -> list[Check]:
 
     def simulation() -> str:
         report.update(_in_process(_SIMULATION))
-        return f"the cube's environments step, {'compiled' if report['native'] else 'in Python'}"
+        return "the cube's environments step"
 
     def meshes() -> str:
         return _meshes(report["meshes"], report["folder"])

@@ -91,9 +91,8 @@ class Asked(torch.nn.Module):
         return self.cost
 
 
-def solve(problem, backend, guess=None, tensors=None, asked=False, **options):
-    """The plan of the layer that the inputs describe; `asked`: its cost is a module."""
-    t, staged = tensors or problem.tensors, problem.staged
+def layer_of(t, staged, horizon, asked=False, **options):
+    """The layer that inputs by name describe, those of `staged` by stage; `asked`: its cost is a module."""
     lcs = (LCSSequence if "A" in staged else LCSParams)(**{k: t[k] for k in LCS})
     weights, by_stage = {k: t[k] for k in COST if k in t}, tuple(staged & set(COST))
     kind = CostSequence if by_stage else QuadraticCost
@@ -106,9 +105,13 @@ def solve(problem, backend, guess=None, tensors=None, asked=False, **options):
         options["constraints"] = (
             ConstraintSequence(**rows, by_stage=by_stage) if by_stage else LinearConstraints(**rows)
         )
-    options = {"barrier": problem.barrier, "relaxation": problem.relaxation, **options}
-    cost = Asked(cost) if asked else cost
-    return LCSMPCLayer(lcs, cost, problem.horizon, backend=backend, **options)(t["x0"], guess=guess)
+    return LCSMPCLayer(lcs, Asked(cost) if asked else cost, horizon, **options)
+
+
+def solve(problem, backend, guess=None, tensors=None, **options):
+    """The plan of the layer of a problem, or of other inputs of its form."""
+    t, given = tensors or problem.tensors, {"barrier": problem.barrier, "relaxation": problem.relaxation, **options}
+    return layer_of(t, problem.staged, problem.horizon, backend=backend, **given)(t["x0"], guess=guess)
 
 
 # --- judges -----------------------------------------------------------------------------------------------------------

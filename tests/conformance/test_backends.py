@@ -248,14 +248,6 @@ def test_a_kink_of_an_action_with_one_bound_at_zero_is_degenerate(backend, side)
     assert float((gradient[0] - gradient[1:, 0]).abs().min()) < 1e-6  # one of the two sides
 
 
-@every_exact
-def test_solving_twice_gives_the_same_bits(solutions, backend):
-    problem, first = solutions("contact", backend)
-    second = solve(problem, backend)
-    assert torch.equal(first.u, second.u)
-    assert torch.equal(first.lam, second.lam)
-
-
 @every_backend_on("contact", "cost_and_bounds_per_element", exact=("stages_per_element", "everything", "hard"))
 def test_batch_equals_loop(solutions, name, backend):
     problem, sol = solutions(name, backend)
@@ -290,16 +282,6 @@ def test_a_warm_start_ends_in_the_same_plan_with_less_work(solutions, name, back
         assert float(same.double().mean()) > 0.5  # another local optimum is allowed, rarely
         if guess is sol or not sol.mu.numel():
             assert float(warm.iterations.double().mean()) < float(sol.iterations.double().mean())
-
-
-@every_exact
-def test_a_wild_guess_does_no_harm(build, solutions, backend):
-    problem, sol = solutions("contact", backend)
-    n = build.normal(3)
-    guess = Primal(1e3 * n(*sol.x.shape), 1e3 * n(*sol.u.shape), 1e3 * n(*sol.lam.shape))
-    wild = solve(problem, backend, guess=guess)
-    assert bool(wild.converged.all())
-    assert float(wild.kkt_residual.max()) <= 1e-6
 
 
 @every_exact

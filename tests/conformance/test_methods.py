@@ -24,7 +24,7 @@ pytest.importorskip("tyro", reason="needs the extra [rl]")
 from difflcs import LCSModel, cli
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
 from difflcs.rl.learning.ppo import PPOReport
-from difflcs.rl.learning.state import copy_state, flatten
+from difflcs.rl.learning.state import copy_state, flatten, unflatten
 from difflcs.rl.learning.trainer import Trainer
 from difflcs.rl.methods import Method, Work, get_method, method_names, register_method
 from difflcs.rl.runs import training
@@ -248,6 +248,26 @@ def test_foreign_checkpoints_are_refused_and_change_nothing(name, make_trainer, 
         with pytest.raises(CheckpointError, match="expected"):
             trainer.load(state)
         assert same(trainer.state_dict(), before), source
+
+
+def test_states_with_anything_wrong_are_refused_and_change_nothing(name, make_trainer):
+    """What `check_state` refuses: tests/unit/test_state.py."""
+    trainer = make_trainer(name)
+    trainer.step()
+    before = copy_state(trainer.state_dict())
+    tensors, rest = flatten(before)
+    wrong = [(tensors, {key: value for key, value in rest.items() if key != gone}) for gone in rest]
+    wrong += [({**tensors, "another": torch.zeros(1)}, rest), (tensors, {**rest, "another": 1})]
+    for key, value in tensors.items():
+        others = [value.unsqueeze(0), value.unsqueeze(-1), value.to(torch.complex64)]
+        if value.is_floating_point() and value.numel():
+            others.append(torch.full_like(value, torch.nan))
+        wrong += [({**tensors, key: other}, rest) for other in others]
+        wrong.append(({path: kept for path, kept in tensors.items() if path != key}, rest))
+    for parts in wrong:
+        with pytest.raises(CheckpointError):
+            trainer.load(unflatten(*parts))
+    assert same(trainer.state_dict(), before)
 
 
 def test_a_run_is_not_continued_with_the_checkpoints_of_another_method(name, finished, tmp_path):

@@ -8,12 +8,10 @@ import logging
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -129,24 +127,6 @@ def test_the_default_is_lcs_rl_on_the_cube(capsys, flags, monkeypatch, tmp_path)
 
 def run_of(out: Path) -> SimpleNamespace:
     return SimpleNamespace(path=out, rows=lambda: [])
-
-
-def test_settings_reach_the_method(capsys, monkeypatch):
-    seen = []
-    monkeypatch.setattr(cli_train, "train", lambda config, out, **_: seen.append(config) or run_of(out))
-    words = ["--method", "ppo-mlp", "--width", 32, "--ppo.critic.epochs.first", 7, "--ppo.adam.betas", 0.5, 0.6]
-    assert run(capsys, "train", "--seed", 4, *words)[0] == 0
-    usual = get_method("ppo-mlp")()
-    assert seen[0].method == replace(
-        usual,
-        width=32,
-        ppo=replace(
-            usual.ppo,
-            adam=replace(usual.ppo.adam, betas=(0.5, 0.6)),
-            critic=replace(usual.ppo.critic, epochs=replace(usual.ppo.critic.epochs, first=7)),
-        ),
-    )
-    assert seen[0].seed == 4
 
 
 def test_flags_of_another_method_are_refused(capsys):
@@ -520,28 +500,6 @@ def test_demo(capsys, tmp_path):
         assert "success before learning: " in out
         assert "success after 0.5 minutes of data: " in out
         assert (tmp_path / "demo/learning_curve.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_ctrl_c_in_a_real_process(tmp_path):
-    pytest.importorskip("mujoco")
-    path = tmp_path / "run"
-    command = [sys.executable, "-m", "difflcs", "train", "--method", "violation", "--final-goals", "0"]
-    command += ["--evaluate-at", "--out", str(path)]
-    process = subprocess.Popen(
-        command, stderr=subprocess.PIPE, text=True, start_new_session=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # ignored where the tests run under nohup
-    )  # fmt: skip
-    try:
-        deadline = time.monotonic() + 60
-        while not (path / "checkpoints/000002").exists() and time.monotonic() < deadline:
-            time.sleep(0.05)
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the solver's workers, too
-        _, err = process.communicate(timeout=60)  # 3 s on a busy machine
-    finally:
-        process.kill()
-    assert process.returncode == 130, err
-    assert "--resume" in err
-    assert "Traceback" not in err
 
 
 @pytest.mark.parametrize("words", [["--resume"], ["--force", "--smoke"], ["--smoke"]])

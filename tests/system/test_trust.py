@@ -184,16 +184,6 @@ def test_nan_from_the_caller_goes_back_to_the_caller(build):
 # --- time and threads -----------------------------------------------------------------------------------------------
 
 
-def test_a_time_limit_that_suffices_changes_nothing(build):
-    tensors = build.lcs_tensors(1)
-    x0 = 0.3 * build.normal(2)(5, 4)
-    plans = [
-        LCSMPCLayer(LCSParams(**tensors), build.cost(1), 3, -0.1, 0.1, backend=BatchedBackend(time_limit=limit))(x0)
-        for limit in (None, 1e3)
-    ]
-    assert torch.equal(plans[0].u, plans[1].u)
-
-
 def test_a_thread_that_cannot_start_costs_speed_only():
     code = (
         "import resource, torch\n"

@@ -1,7 +1,7 @@
 """A block of a known mass, another one in every episode, and what can be learned of it: a task with a context.
 
 A block of a mass between 0.3 and 3 kg is pushed along a line, with a soft wall at its end. It is learned as known
-physics with three unknown numbers, or by a network that turns the mass into matrices.
+physics with three unknown numbers.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import torch
 from gymnasium import spaces
 from torch import Tensor, nn
 
-from difflcs import GoalCost, LCSModel, LCSModule, LCSMPCLayer, LCSParams
+from difflcs import GoalCost, LCSModule, LCSMPCLayer, LCSParams
 from difflcs.errors import InvalidInputError
 from difflcs.mpc.backends import BatchedBackend
 
@@ -77,35 +77,6 @@ class Physics(nn.Module):
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
         """The systems of masses (..., 1) [kg]."""
         return block(_mass(context), **{name: value.exp() for name, value in self.logarithms.items()})
-
-
-class Network(nn.Module):
-    """A network turns the mass into matrices: those of a middle mass, and what it adds to each number."""
-
-    n_x, n_u, n_lam = 2, 1, 1
-    stiffness = 1e-3  # least F
-
-    def __init__(self, generator: torch.Generator, width: int = 16):
-        super().__init__()
-        middle = LCSModel.from_params(true_system(), stiffness=self.stiffness)
-        self.names = [name for name in middle.parameter_names if name != "H"]
-        self.middle = nn.ParameterDict({name: getattr(middle, name).detach().clone() for name in self.names})
-        self.slopes = nn.Parameter(2 * torch.randn(width, generator=generator, dtype=torch.float64))
-        self.offsets = nn.Parameter(torch.randn(width, generator=generator, dtype=torch.float64))
-        size = sum(value.numel() for value in self.middle.values())
-        self.weights = nn.Parameter(torch.zeros(width, size, dtype=torch.float64))
-
-    def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
-        """The systems of masses (..., 1) [kg]."""
-        where = (_mass(context) / MIDDLE).log().unsqueeze(-1)
-        added = torch.tanh(self.slopes * where + self.offsets) @ self.weights
-        parts = added.split([self.middle[name].numel() for name in self.names], -1)
-        found = {
-            name: self.middle[name] + part.unflatten(-1, self.middle[name].shape)
-            for name, part in zip(self.names, parts, strict=True)
-        }
-        G = found.pop("G")
-        return LCSParams(**found, F=G @ G.mT + self.stiffness * torch.eye(1, dtype=torch.float64))
 
 
 def true_system(mass: Tensor | None = None) -> LCSParams:

@@ -13,7 +13,7 @@ from torch import nn
 
 from difflcs import LCSModel, LCSParams, LCSSequence
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
-from tests.training.heavy_block import FORCE, HeavyBlock, Network, Physics, make_mpc
+from tests.training.heavy_block import FORCE, HeavyBlock, Physics, make_mpc
 
 pytest.importorskip("torchrl")
 from tensordict import TensorDict
@@ -222,9 +222,9 @@ def test_any_module_has_the_jacobian_of_a_model(kind):
     torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("lcs", [Physics(**OFF), Network(torch.Generator().manual_seed(1), width=2)], ids=["3", "n"])
-def test_jacobian_of_a_system_for_each_sample(lcs):
+def test_jacobian_of_a_system_for_each_sample():
     """Against central differences of the planned action, over more samples than are differentiated together."""
+    lcs = Physics(**OFF)
     actor = make_actor(make_mpc(lcs), 0.5, "full")
     with torch.no_grad():
         actor.gaussian.log_std.fill_(np.log(0.25))
@@ -268,11 +268,6 @@ def test_tied_parameters_are_saved(tmp_path):
     second.load(load_checkpoint(tmp_path))
     assert same(parameters(first), parameters(second))
     assert len(list(second.learned.parameters())) == 3  # pyright: ignore[reportAttributeAccessIssue]
-
-
-@pytest.mark.parametrize("make", [make_warmup, lambda: make_trainer(Gain(), beta=0.7, covariance="diagonal")])
-def test_load_refuses_hostile_states_and_goes_on_from_its_own(refuses_hostile_checkpoints, make):
-    refuses_hostile_checkpoints(make())
 
 
 def test_load_refuses_another_module():

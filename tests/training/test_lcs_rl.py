@@ -102,15 +102,6 @@ def test_a_trainer_goes_back_to_a_phase():
     assert same(late, parameters(trainer))
 
 
-@pytest.mark.parametrize("steps", [0, 3])
-def test_load_refuses_hostile_states(refuses_hostile_checkpoints, steps):
-    """In the warm-up, and in the main phase."""
-    trainer = make_lcsrl()
-    for _ in range(steps):
-        trainer.step()
-    refuses_hostile_checkpoints(trainer)
-
-
 def test_the_main_phase_remembers_the_warm_up():
     trainer = make_lcsrl(models=True)
     for _ in range(3):

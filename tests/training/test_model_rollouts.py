@@ -1,6 +1,5 @@
 """Model rollouts: the environment that an ensemble plays, its data, and the outcomes of tasks against MuJoCo."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -213,27 +212,3 @@ def test_unstable_episodes_are_not_learned_from():
     real["stable"] = torch.tensor([True, False, True, True, False, True])
     rollouts.add(real)
     assert torch.equal(rollouts.episodes["state"], real["state"][real["stable"]])
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"iterations": -1},
-        {"rollouts": 0},
-        {"real_step": 0.0},
-        {"steps": 0},
-        {"value_epochs": 0},
-        {"actions": 0},
-        {"actions": 3},
-        {"zeta": 1.1},
-    ],
-)
-def test_bad_settings_are_refused(change):
-    with pytest.raises(InvalidInputError, match=next(iter(change))):
-        replace(small(), **change)
-
-
-@pytest.mark.parametrize("change", [{"networks": 0}, {"width": 0}, {"learning_rate": 0.0}])
-def test_bad_settings_of_the_ensemble_are_refused(change):
-    with pytest.raises(InvalidInputError, match=next(iter(change))):
-        EnsembleSettings(**change)

@@ -176,16 +176,6 @@ def test_overflowing_predictions_do_not_spoil_the_plan():
     assert bool(torch.isfinite(action).all())
 
 
-def test_restore_refuses_hostile_checkpoints(refuses_hostile_checkpoints):
-    refuses_hostile_checkpoints(make_pddm())
-
-
-@pytest.mark.parametrize("change", [{"samples": 0}, {"kappa": 0.0}, {"filter": 1.5}, {"kappa": math.nan}])
-def test_bad_settings_are_refused(change):
-    with pytest.raises(InvalidInputError, match=next(iter(change))):
-        PDDMSettings(**change)
-
-
 def test_networks_drawn_anew_forget_what_they_learned():
     def weights(keep):
         trainer = make_pddm(keep_networks=keep)

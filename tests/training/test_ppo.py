@@ -215,10 +215,6 @@ def test_broken_episodes_are_dropped():
         make_ppo(env=make_envs(breaks_at=2)).step()
 
 
-def test_load_refuses_hostile_states(refuses_hostile_checkpoints):
-    refuses_hostile_checkpoints(make_ppo(update="adam", covariance="full"))  # natural: test_ppo_models.py
-
-
 def test_load_refuses_what_does_not_fit():
     trainer = make_ppo()
     trainer.step()

@@ -119,10 +119,6 @@ def test_without_real_episodes_models_only_shorten_the_first_step():
     assert same(parameters(alone), parameters(practising))
 
 
-def test_load_refuses_hostile_states(refuses_hostile_checkpoints):
-    refuses_hostile_checkpoints(make_practising())
-
-
 def test_a_state_without_models_is_refused():
     trainer = make_ppo()
     trainer.step()

@@ -89,10 +89,6 @@ def test_buffer_keeps_the_newest():
     assert trainer.env_steps == (2 + 3 + 3) * STEPS
 
 
-def test_restore_refuses_hostile_checkpoints(refuses_hostile_checkpoints):
-    refuses_hostile_checkpoints(make_trainer())
-
-
 def transitions(episodes: int, seed: int) -> list[torch.Tensor]:
     """States, actions and next states of uniformly random episodes."""
     envs = make_envs(episodes)

@@ -6,7 +6,6 @@ import inspect
 import os
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import pytest
@@ -51,14 +50,6 @@ def test_threads_change_nothing_not_even_summed_gradients(build):
         found.append([plan.u.detach(), *(p.grad.clone() for p in model.parameters())])
     for other in found[1:]:
         assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
-
-
-def test_it_may_be_used_from_several_threads(build):
-    mpc = pushing(build, 5)
-    x0, goal = data(build, 16)
-    wanted = mpc(x0, goal).u
-    with ThreadPoolExecutor(4) as pool:
-        assert all(torch.equal(u, wanted) for u in pool.map(lambda _: mpc(x0, goal).u, range(20)))
 
 
 # --- processors ------------------------------------------------------------------------------------------------------

@@ -2,8 +2,6 @@
 
 import multiprocessing
 import pickle
-import subprocess
-import sys
 import warnings
 
 import numpy as np
@@ -103,19 +101,6 @@ def test_threads_and_place_in_the_vector_change_nothing():
         np.testing.assert_array_equal(states(num_envs, threads, place), expected)
 
 
-@pytest.mark.slow
-def test_deterministic_across_processes():
-    code = (
-        "import gymnasium as g, numpy as np\n"
-        f"e = g.make_vec('difflcs_envs:{OBJECT}', num_envs=2, object='clamp', object_source='stand_in')\n"
-        "e.reset(seed=3)\n"
-        "for t in range(22): s = e.step(np.full((2, 6), 0.001 * (t - 10)))[0]['state']\n"
-        "print(s.tobytes().hex())"
-    )
-    first, second = (subprocess.check_output([sys.executable, "-c", code]) for _ in range(2))
-    assert first == second
-
-
 def _step_after_fork(envs, queue):
     queue.put(envs.step(np.full((4, 6), 0.003))[0]["state"])
 
@@ -133,20 +118,6 @@ def test_threads_survive_a_fork():
     states = queue.get(timeout=20)
     process.join(timeout=20)
     np.testing.assert_array_equal(states, envs.step(np.full((4, 6), 0.003))[0]["state"])
-
-
-def test_autoreset_on_the_next_step():
-    envs = move_cube(2, horizon=3)
-    envs.reset(seed=0)
-    zero = np.zeros((2, 6))
-    truncated = [envs.step(zero)[3].tolist() for _ in range(3)]
-    assert truncated == [[False, False], [False, False], [True, True]]
-    observation, rewards, _, ended, infos = envs.step(zero)
-    np.testing.assert_array_equal(rewards, 0.0)
-    assert not ended.any()
-    assert "executed_action" not in infos
-    assert infos["_success"].all()
-    np.testing.assert_allclose(observation["state"][:, 3:5], [[0, 0.0977]] * 2, atol=0.005)
 
 
 def test_disabled_autoreset_needs_a_mask():
@@ -217,17 +188,6 @@ def test_bad_actions(actions):
         envs.step(actions)
     with pytest.raises(ValueError, match="2 seeds"):
         envs.reset(seed=[1, 2, 3])
-
-
-def test_wrappers_of_gymnasium():
-    envs = gymnasium.make_vec(CUBE, num_envs=2)
-    envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(gymnasium.wrappers.vector.FlattenObservation(envs))
-    observation, _ = envs.reset(seed=0)
-    assert observation.shape == (2, 12)
-    for _ in range(20):
-        observation, _, _, truncated, infos = envs.step(envs.action_space.sample())
-    assert truncated.all()
-    assert infos["episode"]["l"].tolist() == [20, 20]
 
 
 def test_another_library_learns_a_little():

@@ -27,20 +27,6 @@ def test_wilson_interval_equals_scipy():
         wilson_interval(4, 3)
 
 
-@pytest.mark.parametrize(
-    ("successes", "trials", "low", "high"),
-    [
-        (81, 263, 0.2553, 0.3662),
-        (15, 148, 0.0624, 0.1605),
-        (0, 20, 0.0, 0.1611),
-        (1, 29, 0.0061, 0.1718),
-    ],
-)
-def test_wilson_interval_is_that_of_the_literature(successes, trials, low, high):
-    """Newcombe, Two-sided confidence intervals for the single proportion, 1998, table I, method 3."""
-    assert wilson_interval(successes, trials) == pytest.approx((low, high), abs=5e-5)
-
-
 def test_evaluation_does_not_depend_on_the_number_of_environments():
     progress = []
     results = [evaluate(make_envs(n), Reach(), 7, 3, STEPS, after_step=progress.append) for n in (2, 7)]

@@ -166,22 +166,6 @@ def test_tensors_of_another_program_are_refused(saved):
 # --- atomic writes --------------------------------------------------------------------------------------------------
 
 
-def test_a_failing_replace_keeps_the_old_file_and_leaves_no_temporary_one(model, saved, monkeypatch):
-    before = contents(saved)
-    with torch.no_grad():
-        model.A.add_(1.0)
-
-    def fail(*args):
-        raise OSError("disk on fire")
-
-    monkeypatch.setattr(os, "replace", fail)
-    with pytest.raises(OSError, match="disk on fire"):
-        model.save_pretrained(saved)
-    monkeypatch.undo()
-    assert contents(saved) == before
-    LCSModel.from_pretrained(saved)
-
-
 @pytest.mark.parametrize("interrupt", [KeyboardInterrupt, SystemExit, MemoryError])
 def test_an_interrupt_during_a_write_leaves_the_old_file(tmp_path, monkeypatch, interrupt):
     path = tmp_path / "file"

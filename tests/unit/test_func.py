@@ -1,4 +1,4 @@
-"""The layer under torch.func, vectorised jacobians and torch.compile: the numbers of plain calls, or a clear error."""
+"""The layer under torch.func and torch.compile: the numbers of plain calls, or an error. Jacobians: test_transforms."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import warnings
 import pytest
 import torch
 from torch import Tensor
-from torch.autograd.functional import hessian, jacobian
-from torch.func import functional_call, grad, jacrev, vmap
+from torch.autograd.functional import jacobian
+from torch.func import functional_call, grad, vmap
 
 from difflcs import LCSMPCLayer, LCSParams, MPCSolution, Status
 from difflcs import errors as e
@@ -38,14 +38,6 @@ def systems(build):
 
 def close(found, expected):
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-11, check_stride=False)
-
-
-def jacobian_by_rows(layer, x):
-    """d action / d x of each element, (B, n_u, n_x), by one backward pass per action."""
-    leaf = x.clone().requires_grad_()
-    action = layer(leaf).action
-    found = [torch.autograd.grad(action[:, j].sum(), leaf, retain_graph=True)[0] for j in range(action.shape[1])]
-    return torch.stack(found, 1)
 
 
 # --- vmap -----------------------------------------------------------------------------------------------------------
@@ -173,54 +165,7 @@ def test_gradients_of_each_sample_by_the_shared_parameters(layer, x0):
         torch.testing.assert_close(gradient, each[name].reshape(3, 2, *gradient.shape[1:]).sum(1), rtol=1e-7, atol=1e-9)
 
 
-@pytest.mark.parametrize("vectorize", [False, True])
-def test_jacobians(layer, x0, vectorize):
-    plain = jacobian_by_rows(layer, x0)
-    close(jacrev(lambda x: layer(x).action)(x0[0]), plain[0])
-    close(vmap(jacrev(lambda x: layer(x).action))(x0), plain)
-    whole = jacrev(lambda x: layer(x).action)(x0)
-    old = jacobian(lambda x: layer(x).action, x0, vectorize=vectorize)
-    for jac in (whole, old):
-        for i in range(6):
-            close(jac[i, :, i], plain[i])
-            assert float(jac[i, :, (i + 1) % 6].detach().abs().max()) == 0
-    state, objective = jacobian(lambda x: (layer(x).x, layer(x).objective), x0[1], vectorize=vectorize)
-    assert state.shape == (4, 4, 4)
-    close(state[0], torch.eye(4, dtype=torch.float64))
-    assert objective.shape == (4,)
-
-
-def test_a_batch_of_gradients_at_once(layer, x0):
-    leaf = x0.clone().requires_grad_()
-    solution = layer(leaf)
-    vectors = torch.eye(2, dtype=torch.float64)[:, None].expand(2, 6, 2)
-    (found,) = torch.autograd.grad(solution.action, leaf, vectors, is_grads_batched=True, retain_graph=True)
-    close(found.transpose(0, 1), jacobian_by_rows(layer, x0))
-    both = (solution.action, solution.objective)
-    right = (vectors, torch.ones(2, 6, dtype=torch.float64))
-    (found,) = torch.autograd.grad(both, leaf, right, is_grads_batched=True)
-    envelope = torch.autograd.grad(layer(leaf).objective.sum(), leaf)[0]
-    close(found.transpose(0, 1), jacobian_by_rows(layer, x0) + envelope[:, None])
-
-
 # --- second derivatives ---------------------------------------------------------------------------------------------
-
-
-def test_second_derivatives_are_refused(layer, x0):
-    def loss(x):
-        return layer(x).u.square().sum()
-
-    refusal = pytest.raises(e.DoubleBackwardError, match=r"LCSMPCLayer has first derivatives only.*create_graph=False")
-    for function in (
-        lambda: jacrev(jacrev(loss))(x0[0]),
-        lambda: grad(lambda x: grad(loss)(x).sum())(x0),
-        lambda: vmap(grad(lambda x: grad(loss)(x).sum()))(x0),
-        lambda: hessian(loss, x0[0]),
-        lambda: hessian(loss, x0[0], vectorize=True),
-        lambda: torch.autograd.grad(loss(x0.clone().requires_grad_()), layer.lcs.A, create_graph=True),
-    ):
-        with refusal:
-            function()
 
 
 def test_a_gradient_inside_a_loss_is_refused_even_where_the_loss_is_linear(layer, x0):

@@ -15,7 +15,9 @@ import torch
 
 from difflcs import BackendNotFoundError, LCSMPCLayer, available_backends, register_backend
 from difflcs.errors import DTypeError, InvalidInputError, SolveWarning
+from difflcs.mpc import kkt
 from difflcs.mpc.backends import Backend, IpoptBackend, base, get_backend, ipopt
+from tests.conformance.varied.generators import random_case
 
 
 @pytest.fixture
@@ -26,6 +28,14 @@ def x0(build):
 def make_layer(build, **options):
     options = {"backend": IpoptBackend(workers=2), "relaxation": 1e-4, **options}
     return LCSMPCLayer(build.params(3), build.cost(3), 3, -0.15, 0.15, **options)
+
+
+def test_prices_and_limits_need_not_have_the_same_stages():
+    problem = random_case(2, 2).problem()
+    assert problem.price.ndim != problem.g.ndim
+    result = IpoptBackend(workers=1).solve(problem, None)
+    residual = kkt.residual(problem, result.primal, kkt.multipliers(problem, result.primal))
+    assert bool(torch.isfinite(residual[result.solved]).all())
 
 
 # --- worker processes -----------------------------------------------------------------------------------------------

@@ -56,20 +56,6 @@ def test_the_generator_alone_decides_the_start():
     assert not torch.equal(first.A, other.A)
 
 
-# --- prediction -----------------------------------------------------------------------------------------------------
-
-
-def test_float32_model_answers_in_float32(build, data):
-    model = build.model(seed=3, dtype=torch.float32)
-    x, u = (v.float() for v in data)
-    x_next, lam = model(x, u)
-    assert x_next.dtype == lam.dtype == torch.float32
-    expected = build.model(seed=3)(*data)
-    torch.testing.assert_close(x_next.double(), expected.x_next, rtol=1e-4, atol=1e-4)
-    x_next.sum().backward()
-    assert all(p.grad is not None and p.grad.dtype == torch.float32 for p in model.parameters())
-
-
 # --- modules --------------------------------------------------------------------------------------------------------
 
 

@@ -204,44 +204,6 @@ def test_equal_bounds_fix_the_action(layer, x0):
     torch.testing.assert_close(gradient, torch.tensor([6.0, 0.0], dtype=torch.float64))
 
 
-# --- gradients ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("chosen", ["F", "Q", "u_max", "x0"])
-def test_any_subset_may_require_the_gradient(build, x0, chosen):
-    tensors = {**build.lcs_tensors(3), **build.cost_tensors(3), "u_max": torch.full((2,), 0.15).double(), "x0": x0}
-    results = []
-    for only in (False, True):
-        leaves = {k: v.clone().requires_grad_(not only or k == chosen) for k, v in tensors.items()}
-        layer = LCSMPCLayer(
-            LCSParams(**{k: leaves[k] for k in build.lcs_tensors()}),
-            QuadraticCost(**{k: leaves[k] for k in build.cost_tensors()}),
-            3, -0.15, leaves["u_max"], backend=SOLVER, relaxation=1e-4,
-        )  # fmt: skip
-        layer(leaves["x0"]).u.sum().backward()
-        results.append(leaves[chosen].grad)
-        if only:
-            assert all(v.grad is None for k, v in leaves.items() if k != chosen)
-    torch.testing.assert_close(results[0], results[1])
-
-
-def test_no_grad_and_frozen_inputs_build_no_graph(layer, x0):
-    with torch.no_grad():
-        solution = layer(x0)
-    assert not solution.u.requires_grad
-    layer.requires_grad_(False)
-    assert not layer(x0).objective.requires_grad
-    with torch.inference_mode():
-        assert layer(x0).u.shape == (6, 3, 2)
-
-
-def test_backward_twice_through_a_retained_graph_is_the_same(layer, x0):
-    solution = layer(x0)
-    first = torch.autograd.grad(solution.u.sum(), layer.lcs.A, retain_graph=True)[0]
-    second = torch.autograd.grad(solution.u.sum(), layer.lcs.A)[0]
-    assert torch.equal(first, second)
-
-
 # --- failures -------------------------------------------------------------------------------------------------------
 
 
@@ -506,11 +468,6 @@ def test_calls_that_do_not_fit_are_refused(build, x0, options, error, message):
     if any(message is words for _, _, words in FITS_NOT_A_LAYER):
         with pytest.raises(error):
             recording(build, **options(build))
-
-
-def test_a_barrier_needs_finite_bounds(build):
-    with pytest.raises(BoundsError, match="finite bounds with a barrier"):
-        recording(build, bounds=StageBounds(-ones(3, 2)), barrier=0.1)
 
 
 def test_a_guess_may_leave_out_the_multipliers(build, x0):

@@ -1,4 +1,4 @@
-"""Limits and dry friction of joints and tendons against MuJoCo: what rests, slides, stops, and what a system has."""
+"""Limits, dry friction and equality constraints against MuJoCo: what rests, slides, stops, and what a system has."""
 
 from __future__ import annotations
 
@@ -68,18 +68,30 @@ def test_what_rests_on_limits_or_dry_friction_stays_as_in_mujoco(name):
         assert wrong[model.nv :].max() < 3e-3, seconds
 
 
+BAR = (
+    '<body name="{0}" pos="{1} 0 1"><joint name="{0}" axis="0 1 0"/><geom size=".03" pos="0 0 .4" mass="1"/>{2}</body>'
+)
+LINK = '<body name="b" pos="0 0 .4"><joint name="b" axis="0 1 0"/><geom size=".03" pos=".3 0 0" mass="1"/></body>'
+PLATE = '<body name="f" pos="0 .5 1"><freejoint/><geom type="box" size=".1 .1 .02" mass="1"/></body>'
+EQUAL = {
+    "connect": (PLATE, '<connect body1="f" anchor=".3 0 0"/>'),
+    "loop": (BAR.format("a", 0, LINK) + BAR.format("c", 0.6, ""), '<connect body1="b" body2="c" anchor=".6 0 0"/>'),
+    "weld": (PLATE + BAR.format("a", 0, ""), '<weld body1="a" body2="f"/>'),
+    "joints": (BAR.format("a", 0, "") + BAR.format("c", 2, ""), '<joint joint1="a" joint2="c" polycoef="0 -2 0 0 0"/>'),
+}
 MOVING = {  # bodies, the rest, start, control
     "slides": (hinge('frictionloss=".5" damping=".1"'), "", (0.0, -3.0), 0.0),
     "hits a stop": (hinge('range="-60 10"'), "", (-0.5, 1.0), 0.0),
     "is pushed against a stop": (hinge('range="-20 10"'), MOTOR, (-0.3, 0.0), -4.0),
     "breaks away": (hinge('frictionloss="3"'), MOTOR, (0.0, 0.0), 3.0),
     "holds against a motor": (hinge('frictionloss="3"'), MOTOR, (0.0, 0.0), -3.0),
+    **{name: (bodies, f"<equality>{rows}</equality>", (), 0.0) for name, (bodies, rows) in EQUAL.items()},
     "a string goes tight": (STRING, CORD.format(""), (), 0.0),
 }
 
 
 @pytest.mark.parametrize("name", MOVING)
-def test_what_moves_against_limits_and_dry_friction_goes_as_in_mujoco(name):
+def test_what_moves_against_constraints_goes_as_in_mujoco(name):
     """Twenty steps of 20 ms, each from MuJoCo's state: in the median a fifth of the change in velocity is wrong."""
     bodies, rest, state, ctrl = MOVING[name]
     model = load(bodies, rest)
@@ -97,6 +109,19 @@ def test_what_moves_against_limits_and_dry_friction_goes_as_in_mujoco(name):
         wrong, change = (after - right)[model.nv :].norm(), (right - x)[model.nv :].norm()
         parts.append(float(wrong / change.clamp_min(0.02)))
     assert np.median(parts) < 0.2
+
+
+@pytest.mark.parametrize("motion", ["quasi-static", "quasi-dynamic"])
+def test_what_has_no_velocity_keeps_to_an_equality_constraint(motion):
+    model = load(
+        BAR.format("a", 0, "") + BAR.format("c", 2, ""),
+        '<equality><joint joint1="c" joint2="a" polycoef=".1 -2 0 0 0"/></equality>'
+        '<actuator><position joint="a" kp="3000" kv="20"/></actuator>',
+    )
+    module, x = MujocoLCS(model, motion=motion), torch.tensor([0.1, 0.05]).double()
+    after = module.params(x).step(x, torch.tensor([0.2]).double()).x_next
+    assert abs(after[0] - 0.3) < 1e-2
+    assert abs(after[1] - 0.1 + 2 * after[0]) < 1e-9
 
 
 @pytest.mark.parametrize("motion", ["quasi-static", "quasi-dynamic"])

@@ -573,7 +573,6 @@ RESTS = {
         {"motion": "dynamic"},
         "adhesion",
     ),
-    "equality": (SERVOS + '<equality><joint joint1="px" joint2="py"/></equality>', {}, "equality"),
     "two on one joint": (SERVOS.replace("py", "px"), {}, "slide or hinge of its own"),
     "no actuators": ("", {}, "actuators"),
     "a motion": (SERVOS, {"motion": "fast"}, "quasi-static"),

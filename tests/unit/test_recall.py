@@ -7,8 +7,6 @@ from operator import attrgetter
 import numpy as np
 import pytest
 import torch
-from torch.func import functional_call
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from difflcs import GoalCost, LCSModel, LCSMPCLayer, LCSParams, LinearConstraints, QuadraticCost, StageBounds
 from difflcs.errors import BoundsError, DTypeError, NonFiniteError, NotPositiveDefiniteError, ShapeError
@@ -276,20 +274,6 @@ def test_a_guess_is_checked_in_a_loop_too():
         plan(layer, X.tolist(), GOAL)
 
 
-def test_parameters_from_a_vector_and_by_functional_call():
-    layer, other = make_layer(), make_model(seed=3)
-    for scale in (1.0, 1.1, 1.0, 1.2):
-        vector_to_parameters(scale * parameters_to_vector(layer.lcs.parameters()).detach(), layer.lcs.parameters())
-        assert_as_fresh(layer, X, GOAL)
-    values = {f"lcs.{name}": p for name, p in other.named_parameters()}
-    with torch.no_grad():
-        expected = make_layer(other)(X, GOAL)
-        assert_same(functional_call(layer, values, (X, GOAL)), expected)
-        for p in other.parameters():
-            p.mul_(0.5)
-        assert_as_fresh(layer, X, GOAL)  # its own parameters, although the others were changed since
-
-
 def test_tensors_that_equalled_others_may_change_afterwards():
     """What is kept has memory of its own."""
     layer = make_layer()
@@ -337,19 +321,6 @@ def test_errors_are_those_of_a_first_call():
     refused(BoundsError, "u_min", lambda layer: layer.u_max.fill_(-1.0), X, GOAL)
     refused(ShapeError, "batch dimensions", lambda layer: None, X.expand(2, -1), GOAL.expand(3, -1))
     refused(NotPositiveDefiniteError, "^F", lambda layer: setattr(layer.lcs, "stiffness", -9.0), X, GOAL)
-
-
-def test_gradients_after_calls_without():
-    layer, fresh = make_layer(), make_layer()
-    plan(layer, X, GOAL)
-    for used in (layer, fresh):
-        solution = used(X, GOAL)
-        (solution.action.sum() + solution.objective.sum()).backward()
-    for one, two in zip(layer.parameters(), fresh.parameters(), strict=True):
-        assert torch.equal(one.grad, two.grad)
-    goal = GOAL.clone().requires_grad_()
-    layer(X, goal).action.sum().backward()
-    assert goal.grad is not None
 
 
 def test_a_module_of_ones_own_is_asked_each_time():

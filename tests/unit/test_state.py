@@ -17,9 +17,6 @@ from difflcs.rl.learning.state import (
     check_state,
     copy_state,
     flatten,
-    initialise_moments,
-    load_moments,
-    moments,
     restore,
     unflatten,
 )
@@ -189,33 +186,3 @@ def test_a_part_that_refuses_a_state_stays_as_it_was(error):
     restore(part, {"weights": torch.ones(3), "size": 2.0})
     assert torch.equal(part.weights, torch.ones(3))
     assert part.size == 2.0
-
-
-def test_moments_of_adam_are_there_from_the_start_and_go_on():
-    def make() -> tuple[torch.nn.Parameter, torch.optim.Adam]:
-        p = torch.nn.Parameter(torch.ones(3))
-        adam = torch.optim.Adam([p], 0.1)
-        initialise_moments(adam)
-        return p, adam
-
-    def step(p: torch.nn.Parameter, adam: torch.optim.Adam) -> None:
-        adam.zero_grad()
-        (p**2).sum().backward()
-        adam.step()
-
-    p, adam = make()
-    names = {place: set(own) for place, own in moments(adam).items()}
-    step(p, adam)
-    assert {place: set(own) for place, own in moments(adam).items()} == names
-    state, value = copy_state(moments(adam)), p.detach().clone()
-    step(p, adam)
-    other, second = make()
-    load_moments(second, state)
-    with torch.no_grad():
-        other.copy_(value)
-    step(other, second)
-    assert torch.equal(p, other)
-    plain = torch.nn.Parameter(torch.ones(3))
-    usual = torch.optim.Adam([plain], 0.1)
-    step(plain, usual)
-    assert torch.equal(plain.detach(), value)  # moments of zero are those that Adam starts with

@@ -1,4 +1,4 @@
-"""solve_lcp, the losses and the records under torch.func, vectorised jacobians and torch.compile."""
+"""solve_lcp, the losses, the layer and the records under torch.func, vectorised jacobians and torch.compile."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch.autograd.functional import jacobian
 from torch.func import functional_call, grad, jacrev, vmap
 
-from difflcs import LCSParams, LCSSequence, Status, prediction_loss, solve_lcp, violation_loss
+from difflcs import LCSMPCLayer, LCSParams, LCSSequence, Status, prediction_loss, solve_lcp, violation_loss
 from difflcs.errors import DoubleBackwardError, GammaError, NonFiniteError, NotPositiveDefiniteError, SolveWarning
 
 COUNT = 6
@@ -31,10 +31,6 @@ def lcps(build):
 def data(build):
     n = build.normal(5)
     return n(COUNT, 4), n(COUNT, 2), n(COUNT, 4)
-
-
-def lam_of(relaxation):
-    return lambda F, q: solve_lcp(F, q, relaxation).lam
 
 
 # --- solve_lcp ------------------------------------------------------------------------------------------------------
@@ -66,22 +62,6 @@ def test_vmap_over_batches_that_broadcast_inside(lcps, relaxation):
 
 
 @exact_and_relaxed
-@pytest.mark.parametrize("argument", [0, 1])
-def test_every_way_to_a_jacobian_gives_the_same(lcps, relaxation, argument):
-    F, q = lcps
-    f = lam_of(relaxation)
-
-    def of(value):
-        return f(*((value, q) if argument == 0 else (F[0], value)))
-
-    at = F[0] if argument == 0 else q
-    expected = jacobian(of, at)
-    assert float(expected.abs().max()) > 0.1
-    for found in (jacobian(of, at, vectorize=True), jacrev(of)(at)):
-        torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-14)
-
-
-@exact_and_relaxed
 def test_grad_is_the_gradient_of_backward(lcps, relaxation):
     F, q = lcps
 
@@ -102,17 +82,6 @@ def test_grad_is_the_gradient_of_backward(lcps, relaxation):
     alone = vmap(grad(total, (0, 1)))(F, q)
     for i in range(COUNT):
         torch.testing.assert_close(tuple(v[i] for v in alone), grad(total, (0, 1))(F[i], q[i]), rtol=1e-12, atol=1e-14)
-
-
-def test_batched_gradients_of_a_graph_that_was_made_before(lcps):
-    F, q = lcps[0].requires_grad_(), lcps[1].requires_grad_()
-    lam, w, _ = solve_lcp(F, q)
-    upstream = torch.eye(COUNT * 4, dtype=torch.float64).reshape(-1, COUNT, 4)
-    many = torch.autograd.grad((lam, w), (F, q), (upstream, 2 * upstream), is_grads_batched=True, retain_graph=True)
-    for k in (0, 7, 23):
-        one = torch.autograd.grad((lam, w), (F, q), (upstream[k], 2 * upstream[k]), retain_graph=True)
-        for left, right in zip(many, one, strict=True):
-            torch.testing.assert_close(left[k], right, rtol=1e-12, atol=1e-14)
 
 
 def test_a_gradient_inside_an_outer_graph_is_a_gradient_of_it(lcps):
@@ -136,23 +105,52 @@ REFUSED = {
 }
 
 
+FUNCTIONS = ["LCP by q", "LCP by F", "relaxed LCP", "model", "shared", "each", "layer"]
+every_function = pytest.mark.parametrize("what", FUNCTIONS)
+
+
+@pytest.fixture
+def function(build, lcps, data, what):
+    """A function of one tensor, and where to evaluate it."""
+    (F, q), (x, u, x_next), model = lcps, data, build.model(seed=3)
+    if "LCP" in what:
+        relaxation = 1e-3 if "relaxed" in what else 0.0
+        return (lambda F: solve_lcp(F, q).lam, F[0]) if "F" in what else (lambda q: solve_lcp(F, q, relaxation).lam, q)
+    if what == "layer":
+        layer = LCSMPCLayer(build.model(seed=3, scale=0.4), build.cost(0), 3, -0.15, 0.15, relaxation=1e-4)
+        return lambda x: layer(x).action, 0.2 * x
+    lcs = {"model": model, "shared": model.params().detach(), "each": build.params(seed=3, batch=(COUNT,))}[what]
+    return lambda x: violation_loss(lcs, x, u, x_next, 0.02, 0.3, reduction="none"), x
+
+
+@every_function
+def test_every_way_to_a_jacobian_gives_the_same(function):
+    of, at = function
+    expected = jacobian(of, at)
+    assert float(expected.abs().max()) > 0.1
+    for found in (jacobian(of, at, vectorize=True), jacrev(of)(at)):
+        torch.testing.assert_close(found.detach(), expected, rtol=1e-9, atol=1e-11)
+
+
+@every_function
+def test_batched_gradients_of_a_graph_that_was_made_before(build, function):
+    of, at = function
+    at = at.clone().requires_grad_()
+    value = of(at)
+    upstream = build.normal(1)(5, *value.shape)
+    (many,) = torch.autograd.grad(value, at, upstream, is_grads_batched=True, retain_graph=True)
+    for k in range(5):
+        (one,) = torch.autograd.grad(value, at, upstream[k], retain_graph=True)
+        torch.testing.assert_close(many[k], one, rtol=1e-9, atol=1e-11)
+
+
 @pytest.mark.parametrize("how", REFUSED)
-@pytest.mark.parametrize("what", ["solve_lcp", "violation_loss", "each"])
-def test_second_derivatives_are_refused_everywhere(build, lcps, data, what, how):
-    F, q = lcps
-    x, u, x_next = data
-    systems = {"violation_loss": build.model(seed=3), "each": build.params(seed=3, batch=(COUNT,))}
-    if what == "solve_lcp":
-        function, at = (lambda q: solve_lcp(F, q).lam), q.clone()
-    else:
-        at = x.clone()
-
-        def function(x):
-            return violation_loss(systems[what], x, u, x_next, 0.02, reduction="none")
-
-    name = "solve_lcp" if what == "solve_lcp" else "violation_loss"
+@pytest.mark.parametrize("what", ["LCP by q", "model", "each", "layer"])
+def test_second_derivatives_are_refused_everywhere(function, what, how):
+    of, at = function
+    name = {"LCP by q": "solve_lcp", "layer": "LCSMPCLayer"}.get(what, "violation_loss")
     with pytest.raises(DoubleBackwardError, match=rf"{name} has first derivatives only; expected create_graph=False"):
-        REFUSED[how](function, at)
+        REFUSED[how](of, at.clone())
 
 
 def test_numbers_that_are_hidden_from_the_checks_are_checked_by_the_solver(lcps):
@@ -232,21 +230,6 @@ def test_an_ensemble_of_models_is_mapped(build, data, gamma):
     found = vmap(lambda values: functional_call(loss, values, data))(stacked)
     expected = torch.stack([violation_loss(m, *data, gamma).detach() for m in models])
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-14)
-
-
-@pytest.mark.parametrize("which", ["model", "shared", "each"])
-def test_every_way_to_a_jacobian_of_the_loss_gives_the_same(build, data, which):
-    x, u, x_next = data
-    model = build.model(seed=3)
-    lcs = {"model": model, "shared": model.params().detach(), "each": build.params(seed=3, batch=(COUNT,))}[which]
-
-    def of(x):
-        return violation_loss(lcs, x, u, x_next, 0.02, 0.3, reduction="none")
-
-    expected = jacobian(of, x)
-    assert float(expected.abs().max()) > 0.1
-    for found in (jacobian(of, x, vectorize=True), jacrev(of)(x)):
-        torch.testing.assert_close(found.detach(), expected, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("reduction", ["mean", "none"])

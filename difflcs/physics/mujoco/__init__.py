@@ -12,12 +12,14 @@ except ImportError as error:
 from difflcs.physics.mujoco.cost import Distance, Effort, MujocoCost, Orientation, Position, Posture, Velocity
 from difflcs.physics.mujoco.groups import ContactGroup
 from difflcs.physics.mujoco.lcs import MujocoLCS, lcs_from_mujoco
+from difflcs.physics.mujoco.learnable import LearnableMujocoLCS
 from difflcs.physics.mujoco.state import MujocoState
 
 __all__ = [
     "ContactGroup",
     "Distance",
     "Effort",
+    "LearnableMujocoLCS",
     "MujocoCost",
     "MujocoLCS",
     "MujocoState",

@@ -28,6 +28,7 @@ from difflcs.physics.complementarity import (
 )
 from difflcs.physics.mujoco.actuators import DYNAMICS, Actuators, disabled_actuators
 from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, Pairs
+from difflcs.physics.mujoco.equality import Equality
 from difflcs.physics.mujoco.groups import ContactGroup, ContactSelection
 from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import RowFinder, ScaledRows, scale
@@ -59,15 +60,13 @@ class MujocoLCS:
     What a joint cannot move falls out of the Jacobians. Where all joints move in one plane, friction has one tangent,
     in this plane, and contacts across it, such as those of a floor below, are left out.
 
-    Limits of actuators are bounds of the actions, see `action_bounds`, and activation is part of the state.
+    Limits of actuators are bounds of the actions, see `action_bounds`, and activation is part of the state. Limits of
+    joints and tendons are one-sided constraints; their dry friction (`frictionloss`), which quasi-static motion does
+    without, is a bounded force; active equality constraints are part of the motion. All are as soft as MuJoCo's.
 
-    Limits of joints and tendons are one-sided constraints, as soft as MuJoCo's and without friction. Dry friction of
-    joints and tendons (`frictionloss`) is a bounded force; in quasi-static motion it does nothing.
-
-    Not in the system: margins of geoms, torsional and rolling friction. Refused: active equality constraints, adhesion,
-    delay, sleep, height fields and signed distance fields that may touch something, friction that override sets or that
-    is not the same in all directions; in quasi-static motion disabled actuators. The matrices carry no gradient of the
-    state.
+    Not in the system: margins of geoms, torsional and rolling friction. Refused: adhesion, delay, sleep, height fields
+    and signed distance fields that may touch something, friction that override sets or that is not the same in all
+    directions; in quasi-static motion disabled actuators. The matrices carry no gradient of the state.
 
     An object keeps one private copy of the model and its data, so use it from one thread at a time.
 
@@ -135,8 +134,6 @@ class MujocoLCS:
         self.compliance = check_number("compliance", compliance, strict=True)
         if friction is not None:
             check_number("friction", friction)
-        if limits is not None:
-            check_positive_int("limits", limits, minimum=0)
         model = copy.copy(model)
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it would lose what data says; see native
         self._model, self._data = model, mujoco.MjData(model)
@@ -144,6 +141,7 @@ class MujocoLCS:
             _take(self._data, data)
         with native(model, self._data, "in the state of data"):
             mujoco.mj_fwdPosition(model, self._data)
+        self._equality = Equality(model, self._data)
         self._rows = RowFinder(model, self._data, limits, motion != "quasi-static")
         self.state = MujocoState(model, self._data.qpos, velocities=motion == "dynamic")
         self._actuators, self._relative = Actuators(model), relative
@@ -229,9 +227,11 @@ class MujocoLCS:
         read = self._read(x, context)
         contacts, rest, effect = read.dof_contacts, None, None
         if isinstance(self._motion, Dynamic):
-            step, opens = self._motion.finish(read.moved, read.x), self.cone == "anitescu"
+            step = self._equality.hold(self._motion, read.moved, read.x, read.qpos)
             found = self._rows.find(read.qpos, step.place, step.response, read.moved.middle[:, : self.state.nv])
-            nominal = evaluate_nominal(step, contacts, found, self._recovery, self._give, self.compliance, opens)
+            nominal = evaluate_nominal(
+                step, contacts, found, self._recovery, self._give, self.compliance, self.cone == "anitescu"
+            )
             contacts, rows = nominal.contacts, nominal.rows
             effect = step.effect(read.tangent, rows.normal, rows.impulse)
             forces = convert_forces(nominal.forces, self._finder.n_tangents, self.cone)
@@ -239,6 +239,7 @@ class MujocoLCS:
             free = step.free(read.tangent, nominal.carried)
         else:
             free = self._motion.finish(read.moved, read.x, read.tangent)
+            free = self._equality.hold_positions(free, read.x, read.qpos, read.tangent)
             response = np.broadcast_to(read.to_dofs(free.response.numpy()), (len(read.x), *free.response.shape[-2:]))
             found = self._rows.find(read.qpos, np.zeros_like(read.x), response)
             rows = scale(found, found.gap, 1.0, response, self._give, 1.0)
@@ -433,7 +434,6 @@ def _check_model(model: Any, data: Any, motion: Motion) -> None:
     dynamics, plugins = np.array(model.actuator_dyntype), np.array(model.actuator_plugin)
     refused = {
         "joints: nothing in it moves": not model.nv,
-        "no equality constraints that are active": bool((model.eq_active0 if data is None else data.eq_active).any()),
         "one control for each actuator, not those of <pid> and <orientation>": getattr(model, "nactuator", model.nu)
         != model.nu,
         "activation by an integrator, a filter, a muscle or a callback, not by <dcmotor>, <pid> or a plugin": bool(

@@ -22,7 +22,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from difflcs._checks import check_positive_int
 from difflcs.errors import ContactWarning
+from difflcs.physics.mujoco.motion import DynamicStep
 from difflcs.physics.mujoco.native import native
 
 Array = NDArray[np.float64]
@@ -123,7 +125,8 @@ class RowFinder:
         joints, tendons = np.concatenate([self._joints, self._balls]), self._tendons
         of_limits = len(joints) + len(tendons)
         self._warn = limits is None
-        self.n_limits = min(of_limits, MOST_LIMITS if limits is None else limits)
+        most = MOST_LIMITS if limits is None else check_positive_int("limits", limits, minimum=0)
+        self.n_limits = min(of_limits, most)
         self._range = np.concatenate([model.jnt_range[joints], model.tendon_range[tendons]])
         self._range[len(self._joints) : len(joints), 0] = -np.inf  # balls have the largest angle alone
         dofs, rubbing, rubbing_tendons = model.jnt_dofadr[joints], self._rubbing, self._rubbing_tendons
@@ -264,6 +267,7 @@ class Followed(NamedTuple):
 
     Attributes:
         moved: change of the gap, or of the way that rubs.
+        speed: v afterwards.
         part: how far an impulse moves at the time in the step at which the row's force acts, of how far one at the
             beginning would.
         acts: True where there is a force.
@@ -272,23 +276,44 @@ class Followed(NamedTuple):
     """
 
     moved: Array
+    speed: Array
     part: Array
     acts: NDArray[np.bool_]
     holds: NDArray[np.bool_]
     stops: NDArray[np.bool_]
 
 
-def follow(
-    gap: Array, speed: Array, load: Array, turn: Array, mass: Array, soft: Softness, seconds: float, count: int
-) -> Followed:
+class Load(NamedTuple):
+    """Motion of rows (n, k) without their own force: v̇ = a = acceleration − drag v.
+
+    Attributes:
+        acceleration: with v = 0.
+        drag: of what resists the motion of the row.
+        turn: part of the acceleration that is due to its Jacobian's change, J̇ ν, which MuJoCo's force does not resist.
+        mass: A, the inverse of the mass.
+    """
+
+    acceleration: Array
+    drag: Array
+    turn: Array
+    mass: Array
+
+
+def find_load(step: DynamicStep, rows: Array, bend: Array, after: Array, impulse: Array) -> Load:
+    """Find the load of rows (n, k, nv) that impulses (n, k) along them bring to velocities `after` (n, k) in a step."""
+    h, speed = step.seconds, (rows @ step.velocity[:, :, None])[:, :, 0]
+    mass, gives = (np.einsum("nki,nij,nkj->nk", rows, S, rows) for S in (step.inverse_mass, step.response))
+    drag = np.maximum(mass / np.maximum(gives, 1e-12 * mass + 1e-300) - 1, 0.0) / h
+    return Load(((after - gives * impulse) * (1 + h * drag) - speed) / h, drag, 2 * bend / h**2, mass)
+
+
+def follow(gap: Array, speed: Array, load: Load, soft: Softness, seconds: float, count: int) -> Followed:
     """Follow soft rows (n, k) through a step.
 
     Args:
         gap: at its beginning.
         speed: v at its beginning.
-        load: acceleration a without the row's own force.
-        turn: part of it that is due to its Jacobian's change, J̇ ν, which MuJoCo's force does not resist.
-        mass: A, the inverse of the mass.
+        load: what moves and resists.
         soft: MuJoCo's parameters.
         seconds: duration of the step [s].
         count: of MuJoCo's steps in it.
@@ -296,29 +321,32 @@ def follow(
     coarse = count > _MOST_STEPS
     count = min(count, _MOST_STEPS)
     h, limit = seconds / count, np.isinf(soft.bound)
-    lower, upper = np.where(limit, 0.0, -mass * soft.bound), mass * soft.bound
-    r, v, impulse, far = gap.copy(), speed.copy(), np.zeros_like(gap), np.zeros_like(gap)
-    held = holds = np.ones_like(limit)
+    free, drag, turn, mass = load
+    lower, upper, slower = np.where(limit, 0.0, -mass * soft.bound), mass * soft.bound, 1 + h * drag
+    r, v, held, holds = gap.copy(), speed.copy(), np.ones_like(limit), np.ones_like(limit)
+    way = np.zeros((2, *gap.shape))  # by the force, and by the load
+    rate, total = np.zeros_like(way), np.zeros_like(gap)
     for i in range(count):
         d = _impedance(np.where(limit, np.abs(r), 0.0), soft.impedance)
         firm = mass / (mass + (1 - d) / d * soft.give)
-        spring, damping = firm * soft.stiffness * d, firm * soft.damping
-        # Steps that are longer than MuJoCo's are implicit.
-        force = -damping * v - spring * r - firm * (load - turn)
-        if coarse:
-            force = (force - h * (damping * load + spring * (v + h * load))) / (1 + h * damping + h * h * spring)
+        spring, damping = firm * soft.stiffness * d, firm * (soft.damping - drag)
+        if coarse:  # steps that are longer than MuJoCo's are implicit
+            damping = damping + h * spring
+            then = damping * (v + h * free) / slower
+            force = -(firm * (free - turn) + spring * r + then) / (1 + h * damping / slower)
+        else:
+            force = -damping * v - spring * r - firm * (free - turn)
         held = np.where(limit, (r < 0) & (force > 0), (lower < force) & (force < upper))
         force = np.where(limit & (r >= 0), 0.0, np.clip(force, lower, upper))
-        v += h * (load + force)
-        r += h * v
-        impulse += h * force
-        far += h * h * (count - i) * force
+        v = (v + h * (free + force)) / slower
+        rate = (rate + h * np.stack([force, free])) / slower
+        r, way, total = r + h * v, way + h * rate, total + h * np.abs(force)
         holds = holds & (held | (i == 0 < count - 1))  # what begins to touch holds as well
-    acts = np.abs(impulse) > 1e-12
+    acts = total > 1e-12
     # Where the load is carried, it acts at the beginning of the step as well.
-    far = far - np.where(holds, load * (seconds**2 - 0.5 * h * h * count * (count + 1)), 0.0)
-    part = np.where(acts, far / np.where(acts, impulse, 1.0), seconds) / seconds
-    return Followed(r - gap, part, acts, holds, held)
+    far = way[0] - np.where(holds, seconds * rate[1] - way[1], 0.0)
+    part = np.where(acts, far / np.where(np.abs(rate[0]) > 1e-12, rate[0], 1.0), seconds) / seconds
+    return Followed(r - gap, v, part, acts, holds, held)
 
 
 def _impedance(depth: Array, parameters: Array) -> Array:

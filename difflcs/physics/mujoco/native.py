@@ -13,7 +13,7 @@ import mujoco
 
 from difflcs.errors import InvalidInputError
 
-TAKEN = ("qpos", "ctrl", "act", "mocap_pos", "mocap_quat", "qfrc_applied", "xfrc_applied")
+TAKEN = ("qpos", "ctrl", "act", "mocap_pos", "mocap_quat", "eq_active", "qfrc_applied", "xfrc_applied")
 """Fields of a caller's data that are used besides the state."""
 
 _LARGE = "x: expected {} below 1e10, got larger ones, which MuJoCo takes for errors; look for what diverges"

@@ -38,8 +38,8 @@ from difflcs.physics.mujoco.actuators import Actuators, disabled_actuators
 from difflcs.physics.mujoco.limits import tendon_jacobian
 
 Array = NDArray[np.float64]
-_GAINS = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
-_BIASES = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
+GAINS = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
+BIASES = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
 _UNSTABLE = 30.0  # exponent up to which a motion that stiffness drives apart is followed
 
 
@@ -78,7 +78,7 @@ class QuasiDynamic:
     """
 
     def __init__(self, model: Any, actuators: Actuators, seconds: float, relative: bool):
-        plain = np.isin(model.actuator_gaintype, _GAINS) & np.isin(model.actuator_biastype, _BIASES)
+        plain = np.isin(model.actuator_gaintype, GAINS) & np.isin(model.actuator_biastype, BIASES)
         if not (plain & actuators.follows).all():
             raise InvalidInputError(
                 "model: expected actuators of fixed or affine gain and bias in quasi-dynamic motion, of no activation "
@@ -88,9 +88,9 @@ class QuasiDynamic:
         self.relative = actuators.servo & relative
         # force = (g₀ + g₁ length + g₂ velocity) control + b₀ + b₁ length + b₂ velocity
         self._gain = (
-            model.actuator_gainprm[:, :3] * np.where(model.actuator_gaintype == _GAINS[1], 1.0, [[1], [0], [0]]).T
+            model.actuator_gainprm[:, :3] * np.where(model.actuator_gaintype == GAINS[1], 1.0, [[1], [0], [0]]).T
         )
-        self._bias = model.actuator_biasprm[:, :3] * (model.actuator_biastype == _BIASES[1])[:, None]
+        self._bias = model.actuator_biasprm[:, :3] * (model.actuator_biastype == BIASES[1])[:, None]
         for force in (self._gain, self._bias):
             force[disabled_actuators(model)] = 0.0
         flags = model.opt.disableflags

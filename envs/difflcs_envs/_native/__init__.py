@@ -1,1 +1,1 @@
-"""The compiled stepper of the environments. Optional: without it they step in Python, with the same numbers."""
+"""The compiled stepper of the environments."""

@@ -1,8 +1,7 @@
 // Steps the TriFinger without Python: controller and physics of one control period, several simulations side by side.
 //
 // Knows no MuJoCo header, hence no MuJoCo version: it gets the addresses of five functions of the library that Python
-// has loaded, and of the fields of each simulation, from their NumPy views. The order of every floating-point operation
-// is that of trifinger/osc.py, so that both give the same numbers.
+// has loaded, and of the fields of each simulation, from their NumPy views. trifinger/osc.py has the control law.
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
@@ -130,7 +129,7 @@ struct Lane {
   // Model and data, and fields of the data.
   const void* model;
   void* data;
-  const double *axes, *anchors, *tips, *velocities, *bias, *mass;  // of the fingers, see OperationalSpaceController
+  const double *axes, *anchors, *tips, *velocities, *bias, *mass;  // of the fingers, see osc.py
   double* control;
   const double *object_position, *object_quaternion;
   std::vector<const std::int32_t*> warnings;  // counters of the warnings that mean instability
@@ -146,7 +145,7 @@ struct Lane {
     return now;
   }
 
-  // Joint acceleration J^T (J J^T + damping I)^-1 a near a singular posture, see _damped_solve in osc.py.
+  // Joint acceleration J^T (J J^T + damping I)^-1 a near a singular posture, see osc.py.
   void damped_solve(const double (&J)[3][3], const double (&e)[3], double det, double (&q)[3]) const {
     const double ratio = det / singular_determinant;
     const double damping = singular_damping * singular_damping * (1.0 - ratio * ratio) + 1e-12;

@@ -1,7 +1,7 @@
 """The bridge to the compiled stepper: finds the loaded MuJoCo library and hands over addresses.
 
 Nothing depends on MuJoCo's headers: functions are looked up by name in the library that the Python package has loaded,
-fields by the addresses of their NumPy views. If anything is not as expected, the environments step in Python.
+fields by the addresses of their NumPy views.
 """
 
 # MuJoCo is a compiled module without type stubs.
@@ -15,22 +15,14 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
 
-try:
-    from difflcs_envs._native import _stepper as stepper  # pyright: ignore[reportMissingModuleSource]
-except ImportError:  # not compiled for this Python
-    stepper = None
+from difflcs_envs._native import _stepper as stepper  # pyright: ignore[reportMissingModuleSource]
 
-if TYPE_CHECKING:
-    from difflcs_envs._native._stepper import Lane  # pyright: ignore[reportMissingModuleSource]
-
-__all__ = ["NATIVE_VARIABLE", "native_lane", "step_lanes"]
-
-NATIVE_VARIABLE = "DIFFLCS_ENVS_NATIVE"  # "0" asks for Python
+__all__ = ["make_lane", "step_lanes"]
 
 _FUNCTIONS = ("mj_step1", "mj_step2", "mj_kinematics", "mj_getState")
 
@@ -66,13 +58,13 @@ def _untimed() -> Iterator[None]:
         clock.value = before
 
 
-def native_lane(
+def make_lane(
     model: mujoco.MjModel,
     data: mujoco.MjData,
     fields: dict[str, np.ndarray],
     warnings: Sequence[int],
     constants: dict[str, float],
-) -> Lane | None:
+) -> stepper.Lane:
     """Bind the compiled stepper to one simulation.
 
     Args:
@@ -83,17 +75,20 @@ def native_lane(
         warnings: Kinds of MuJoCo warnings that mean instability.
         constants: Numbers for the stepper.
 
-    Returns:
-        The lane, or None where only Python can step: not compiled, another memory layout, or turned off
-        (`DIFFLCS_ENVS_NATIVE=0`).
+    Raises:
+        RuntimeError: This version of MuJoCo cannot be bound to: it lacks a function, or lays out its memory otherwise.
     """
-    library = _library() if os.environ.get(NATIVE_VARIABLE, "1") != "0" else None
-    if stepper is None or library is None or not hasattr(data, "_address"):
-        return None
+    unknown = RuntimeError(
+        "Expected a MuJoCo whose library and memory the compiled stepper can use, as those of 3.3.7 to 4.0, got MuJoCo "
+        f'{mujoco.__version__}. Install one of these: pip install "mujoco<=4.0"'
+    )
+    library = _library()
+    if library is None or not hasattr(data, "_address"):
+        raise unknown
     counters = data.warning.number  # a strided view into the data
     views = [*fields.values(), data.qpos]
     if any(view.dtype != np.float64 or not view.flags.c_contiguous for view in views) or counters.dtype != np.int32:
-        return None
+        raise unknown
     first, stride = counters.ctypes.data, counters.strides[0]
     addresses: dict[str, Any] = {name: view.ctypes.data for name, view in fields.items()}
     addresses |= {
@@ -106,7 +101,9 @@ def native_lane(
     data.time = probe = 0.123456789
     same = lane.time == probe and _is_live(data, counters)
     data.time = before
-    return lane if same else None
+    if not same:
+        raise unknown
+    return lane
 
 
 def _is_live(data: mujoco.MjData, counters: np.ndarray) -> bool:
@@ -120,7 +117,7 @@ def _is_live(data: mujoco.MjData, counters: np.ndarray) -> bool:
 
 
 def step_lanes(
-    lanes: Sequence[Lane], actions: np.ndarray, states: np.ndarray, stable: np.ndarray, threads: int
+    lanes: Sequence[stepper.Lane], actions: np.ndarray, states: np.ndarray, stable: np.ndarray, threads: int
 ) -> None:
     """Step every lane by one control period, in native threads, without the GIL.
 
@@ -131,6 +128,5 @@ def step_lanes(
         stable: Gets True for each lane that is still stable, (n,) bool. The caller must restore the others.
         threads: Most threads to use.
     """
-    assert stepper is not None
     with _untimed():
         stepper.step_lanes(lanes, actions, states, stable, threads)

@@ -20,8 +20,8 @@ from difflcs_envs.trifinger.model import (
     SceneObject,
     build_spec,
 )
-from difflcs_envs.trifinger.native import native_lane, step_lanes
-from difflcs_envs.trifinger.osc import SINGULAR_DAMPING, SINGULAR_DETERMINANT, OperationalSpaceController
+from difflcs_envs.trifinger.native import make_lane, step_lanes
+from difflcs_envs.trifinger.osc import SINGULAR_DAMPING, SINGULAR_DETERMINANT, controller_fields
 
 __all__ = ["TriFingerPhysics", "step_all"]
 
@@ -50,13 +50,12 @@ _INSTABILITY_WARNINGS = [
 
 
 class TriFingerPhysics:
-    """One robot, one object, one controller.
+    """One robot, one object, one controller, which steps compiled.
 
     Attributes:
         model: The MuJoCo model.
         data: The MuJoCo data. After `reset` and `step` all positions (`xpos`, `site_xpos`, ...) are up to date.
-        controller: The operational-space controller of the tips.
-        lane: The compiled stepper of this simulation; None where Python steps.
+        lane: The compiled stepper of this simulation.
     """
 
     def __init__(
@@ -78,7 +77,6 @@ class TriFingerPhysics:
         self.tip_height = scene_object.tip_height
         self.model: mujoco.MjModel = model or build_spec(scene_object, max_picture_size).compile()
         self.data = mujoco.MjData(self.model)
-        self.controller = OperationalSpaceController(self.model, self.data, kp)
         first_site = self.model.site("tip_0").id
         self._tips = self.data.site_xpos[first_site : first_site + NUM_FINGERS]  # views
         self._object_position = self.data.xpos[self.model.body("object").id]
@@ -89,10 +87,10 @@ class TriFingerPhysics:
         self._saved = np.empty(mujoco.mj_stateSize(self.model, _STATE_SIGNATURE))
         self._directions = kinematics.FINGER_AXES[:, 1, :2]  # outward, (3, 2)
         self._outline = scene_object.outline
-        self.lane = native_lane(
+        self.lane = make_lane(
             self.model,
             self.data,
-            self.controller.fields()
+            controller_fields(self.model, self.data)
             | {
                 "object_position": self._object_position,
                 "object_quaternion": self._object_quaternion,
@@ -100,8 +98,8 @@ class TriFingerPhysics:
             },
             _INSTABILITY_WARNINGS,
             {
-                "kp": self.controller.kp,
-                "kd": self.controller.kd,
+                "kp": float(kp),
+                "kd": 2.0 * math.sqrt(kp),
                 "singular_determinant": SINGULAR_DETERMINANT,
                 "singular_damping": SINGULAR_DAMPING,
                 "tip_height": self.tip_height,
@@ -217,35 +215,6 @@ class TriFingerPhysics:
         """
         return step_all([self], displacement[None], threads=1)[0]
 
-    def step_in_python(self, displacement: np.ndarray) -> bool:
-        """Step without the compiled stepper and without restoring. Return True if the simulation is stable."""
-        model, data, control = self.model, self.data, self.controller.apply
-        first_half, second_half = mujoco.mj_step1, mujoco.mj_step2
-        self._save()
-        end_time = data.time + CONTROL_PERIOD
-        target = self._tips.copy()
-        target[:, :2] += displacement.reshape(NUM_FINGERS, 2)
-        target[:, 2] = self.tip_height
-        self.controller.target = target.ravel().tolist()
-        try:
-            for _ in range(SUBSTEPS):
-                first_half(model, data)
-                control()
-                second_half(model, data)
-        except (OverflowError, np.linalg.LinAlgError):  # the controller met non-finite numbers
-            return False
-        # Integration leaves the positions of bodies and sites one substep behind the joints.
-        mujoco.mj_kinematics(model, data)
-        return self._is_stable(end_time)
-
-    def _is_stable(self, end_time: float) -> bool:
-        # MuJoCo answers NaN or huge numbers by a warning and by resetting the data, the clock with them.
-        if abs(self.data.time - end_time) > 0.5 * TIMESTEP or self.data.warning.number[_INSTABILITY_WARNINGS].any():
-            return False
-        positions = [*self._object_position[:2].tolist(), *self._tips.ravel().tolist()]
-        # Written so that NaN fails.
-        return all(abs(p) <= WORKSPACE_RADIUS for p in positions)
-
     # --- read-out ---------------------------------------------------------------------------------
 
     def state(self) -> np.ndarray:
@@ -287,7 +256,7 @@ class TriFingerPhysics:
 def step_all(
     simulations: Sequence[TriFingerPhysics], displacements: np.ndarray, threads: int
 ) -> list[np.ndarray | None]:
-    """Do `TriFingerPhysics.step` in several simulations, in native threads where the compiled stepper is there.
+    """Do `TriFingerPhysics.step` in several simulations, in native threads.
 
     Args:
         simulations: The simulations, each once.
@@ -297,15 +266,9 @@ def step_all(
     Returns:
         The state after it of every simulation, None where it became unstable and was restored.
     """
-    lanes = [simulation.lane for simulation in simulations if simulation.lane is not None]
-    stable = np.empty(len(simulations), dtype=bool)
-    if len(lanes) == len(simulations):
-        states = np.empty((len(simulations), STATE_SIZE))
-        step_lanes(lanes, np.ascontiguousarray(displacements, dtype=np.float64), states, stable, threads)
-    else:
-        for i, simulation in enumerate(simulations):
-            stable[i] = simulation.step_in_python(displacements[i])
-        states = [simulation.state() for simulation in simulations]
+    lanes = [simulation.lane for simulation in simulations]
+    states, stable = np.empty((len(simulations), STATE_SIZE)), np.empty(len(simulations), dtype=bool)
+    step_lanes(lanes, np.ascontiguousarray(displacements, dtype=np.float64), states, stable, threads)
     result: list[np.ndarray | None] = list(states)
     for i in np.flatnonzero(~stable).tolist():
         simulations[i].restore()

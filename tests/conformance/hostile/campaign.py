@@ -67,7 +67,7 @@ class Cell:
 _GENERATORS = {**generators.LCP_CLASSES, **generators.MPC_CLASSES, **generators.LOSS_CLASSES, **forms.FORM_CLASSES}
 _TARGETS = {
     "lcp": {**targets.LCP_TARGETS, **rules.RULE_TARGETS},
-    "mpc": {**targets.MPC_TARGETS, **targets.SLOW_TARGETS, **rules.RULE_TARGETS},
+    "mpc": {**targets.MPC_TARGETS, **targets.SLOW_TARGETS},
     "loss": targets.LOSS_TARGETS,
     "form": forms.FORM_TARGETS,
 }
@@ -79,7 +79,7 @@ CELLS = [
     *(Cell(p, "relaxed", 8, 0.005) for p in generators.MPC_CLASSES),
     *(Cell(p, t, 64, 0.25) for p in generators.LOSS_CLASSES for t in targets.LOSS_TARGETS),
     *(Cell(p, t, 24, 0.05) for p in forms.FORM_CLASSES for t in forms.FORM_TARGETS),
-    *(Cell(p, "neighbours", 32, 0.2) for p in ("lcp-plain", "mpc-plain")),
+    Cell("lcp-plain", "neighbours", 32, 0.2),
 ]
 
 
@@ -205,15 +205,6 @@ def fill(page: Path, records: list[Record]) -> None:
     page.write_text(f"{before}{BEGIN}{markdown(records)}\n{END}{after}")
 
 
-def _print(records: list[Record]) -> None:
-    names = ("tried", "converged", "degenerate", "flagged", "silent", "compared", "worst", "1/CPU s")
-    print(f"{'class/target':36}" + "".join(f"{name:>11}" for name in names))
-    for name, r in table(records).items():
-        counts = (r.tried, r.converged, r.degenerate, r.flagged, r.silent, r.compared)
-        rate = r.tried / max(r.seconds, 1e-9)
-        print(f"{name:36}" + "".join(f"{c:11}" for c in counts) + f"{r.worst:11.2g}{rate:11.0f}  {r.by_check or ''}")
-
-
 @cache
 def _one_thread() -> None:
     torch.set_num_threads(1)
@@ -274,7 +265,7 @@ def main() -> None:
             if time.perf_counter() - last > 30:
                 last = time.perf_counter()
                 print(f"{k + 1} of {len(todo)} chunks, {last - started:.0f} s", flush=True)
-    _print(records)
+    print(markdown(records))
 
 
 def show(cell: Cell, seed: int, index: int) -> None:

@@ -7,33 +7,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.random import Generator
 
-from difflcs import (
-    ConstraintSequence,
-    CostSequence,
-    LCSMPCLayer,
-    LCSParams,
-    LCSSequence,
-    LinearConstraints,
-    QuadraticCost,
-    StageBounds,
-    Status,
-)
+from difflcs import LCSMPCLayer, Status
 from difflcs.errors import DiffLCSError
 from difflcs.mpc.problem import INPUTS
+from tests.conformance import problems
 from tests.conformance.hostile import checks
 from tests.conformance.hostile.targets import REFUSED, Outcome, quiet, refused_one_by_one
 from tests.conformance.varied import programs
 from tests.conformance.varied.generators import RANKS, Case, random_case
 from tests.conformance.varied.judges import conditions, objective, rows
 
-SYSTEM, COST = ("A", "B", "C", "d", "D", "E", "F", "c"), ("Q", "R", "S", "Q_final", "q", "r", "q_final")
-ROWS = {"G_x": "G", "G_u": "E", "g": "g", "price": "weight"}
+SYSTEM, ROWS = ("A", "B", "C", "d", "D", "E", "F", "c"), ("G_x", "G_u", "g", "price")
+NAMES = {"G_x": "G", "G_u": "E_rows", "price": "weight"}  # in `problems`
 INF = np.inf
 
 
@@ -197,35 +187,15 @@ def vertex(rng: Generator, count: int, small: bool = False) -> Form:
 
 def layer_of(form: Form, leaves: dict[str, torch.Tensor], backend="batched") -> LCSMPCLayer:
     """The layer of a form, through the public records."""
-    case = form.case
-
-    def staged(names) -> tuple[str, ...]:
-        return tuple(name for name in names if name in leaves and leaves[name].ndim == RANKS[name] + 2)
-
-    system = {k: leaves[k] for k in SYSTEM}
-    if staged(SYSTEM):
-        stages = {k: v if k in staged(SYSTEM) else v.unsqueeze(1).expand(-1, case.horizon, *v.shape[1:])
-                  for k, v in system.items()}  # fmt: skip
-        lcs = LCSSequence(**stages)
-    else:
-        lcs = LCSParams(**system)
-    weights = {k: leaves[k] for k in COST}
-    by_stage = staged(COST)
-    cost = (
-        CostSequence(**weights, by_stage=by_stage, check=False) if by_stage else QuadraticCost(**weights, check=False)
-    )
-    limits = {k: leaves[k] for k in ("u_min", "u_max")}
-    by_stage = staged(limits)
-    options: dict[str, Any] = {"bounds": StageBounds(**limits, by_stage=by_stage)} if by_stage else limits
-    if "g" in leaves:
-        table = {ROWS[k]: leaves[k] for k in ROWS}
-        by_stage = tuple(ROWS[k] for k in staged(ROWS))
-        options["constraints"] = (
-            ConstraintSequence(**table, by_stage=by_stage) if by_stage else LinearConstraints(**table)
-        )
-    return LCSMPCLayer(
-        lcs, cost, case.horizon, backend=backend, relaxation=case.relaxation, on_failure="mask", **options
-    )
+    horizon = form.case.horizon
+    staged = frozenset(NAMES.get(k, k) for k, v in leaves.items() if v.ndim == RANKS[k] + 2)
+    tensors = {NAMES.get(k, k): v for k, v in leaves.items()}
+    if staged & set(SYSTEM):  # then all of the system is given by stage
+        for k in set(SYSTEM) - staged:
+            tensors[k] = leaves[k].unsqueeze(1).expand(-1, horizon, *leaves[k].shape[1:])
+        staged |= set(SYSTEM)
+    options = {"backend": backend, "relaxation": form.case.relaxation, "on_failure": "mask"}
+    return problems.layer_of(tensors, staged, horizon, **options)
 
 
 def leaves_of(form: Form) -> dict[str, torch.Tensor]:

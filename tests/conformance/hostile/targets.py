@@ -11,10 +11,11 @@ import numpy as np
 import torch
 from numpy.random import Generator
 
-from difflcs import LCSModel, LCSMPCLayer, LCSParams, QuadraticCost, Status, solve_lcp, violation_loss
+from difflcs import LCSModel, LCSMPCLayer, Status, solve_lcp, violation_loss
 from difflcs.errors import DiffLCSError, DiffLCSWarning
 from difflcs.mpc import Primal
 from difflcs.mpc.backends import IpoptBackend
+from tests.conformance import problems
 from tests.conformance.hostile import checks
 from tests.conformance.hostile.generators import LCP, MPC, Loss
 
@@ -206,17 +207,9 @@ def _compare(terms: np.ndarray, difference, step: float, of_terms: float = 1e-7)
 
 def layer_of(problem: MPC, leaves: dict[str, torch.Tensor], backend="batched") -> LCSMPCLayer:
     low, high = problem.numbers or (leaves["u_min"], leaves["u_max"])
-    return LCSMPCLayer(
-        LCSParams(**{k: leaves[k] for k in SYSTEM}),
-        QuadraticCost(**{k: leaves[k] for k in COST}, check=False),
-        problem.horizon,
-        low,
-        high,
-        backend=backend,
-        relaxation=problem.relaxation,
-        barrier=problem.barrier,
-        on_failure="mask",
-    )
+    options = {"relaxation": problem.relaxation, "barrier": problem.barrier, "on_failure": "mask"}
+    tensors = {**leaves, "u_min": low, "u_max": high}
+    return problems.layer_of(tensors, frozenset(), problem.horizon, backend=backend, **options)
 
 
 def leaves_of(problem: MPC) -> dict[str, torch.Tensor]:

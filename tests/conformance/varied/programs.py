@@ -1,4 +1,4 @@
-"""Problems without contacts are linear or quadratic programs of their actions; by HiGHS and Clarabel.
+"""Problems without contacts are quadratic programs of their actions; the linear ones are solved by HiGHS.
 
 None of this calls the library's mathematics.
 """
@@ -6,13 +6,9 @@ None of this calls the library's mathematics.
 from __future__ import annotations
 
 import numpy as np
-from scipy import sparse
-from scipy.linalg import block_diag
 from scipy.optimize import linprog
 
 from tests.conformance.varied.generators import Case
-
-INF = np.inf
 
 
 def condensed(case: Case, i: int):
@@ -51,20 +47,6 @@ def condensed(case: Case, i: int):
     return P, p, low, high, G[there], g[there], price[there]
 
 
-def least_violation(low, high, G, g, price) -> float:
-    """The least largest violation of the hard rows, in parts of each row's size; by linear programming."""
-    hard = np.isinf(price)
-    if not hard.any():
-        return 0.0
-    size = np.maximum(np.abs(G[hard]).sum(1) + np.abs(g[hard]), 1.0)
-    rows = np.concatenate([G[hard] / size[:, None], -np.ones((int(hard.sum()), 1))], 1)
-    bounds = [(a if np.isfinite(a) else None, b if np.isfinite(b) else None) for a, b in zip(low, high, strict=True)]
-    cost = np.zeros(rows.shape[1])
-    cost[-1] = 1.0
-    found = linprog(cost, rows, g[hard] / size, bounds=[*bounds, (0, None)], method="highs")
-    return float(found.fun) if found.status == 0 else np.nan
-
-
 def above_optimum(case: Case, i: int, u: np.ndarray) -> float | None:
     """How much more actions cost than those of HiGHS, in parts of the terms; None where it is no linear program."""
     P, p, low, high, G, g, price = condensed(case, i)
@@ -79,34 +61,3 @@ def above_optimum(case: Case, i: int, u: np.ndarray) -> float | None:
     fines, size = np.maximum(G @ u.ravel() - g, 0), abs(G) @ abs(u.ravel()) + abs(g)
     value = p @ u.ravel() + (price * fines)[soft].sum()
     return float((value - best.fun) / (1e-300 + abs(p) @ abs(u.ravel()) + (price * size)[soft].sum()))
-
-
-def optimum(program) -> np.ndarray | None:
-    """The actions of the program by Clarabel, with a slack for every soft row; None without an answer."""
-    import clarabel
-
-    P, p, low, high, G, g, price = program
-    soft = np.flatnonzero(np.isfinite(price))
-    n, m = len(p), len(soft)
-    E = np.zeros((len(g), m))
-    E[soft, np.arange(m)] = -1.0
-    low, high = np.concatenate([low, np.zeros(m)]), np.concatenate([high, np.full(m, INF)])
-    A, b = [np.concatenate([G, E], 1)], [g]
-    for sign, bound in ((1, high), (-1, -low)):
-        there = np.isfinite(bound)
-        A.append(sign * np.eye(n + m)[there])
-        b.append(bound[there])
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-11
-    size, upper = np.concatenate(b), sparse.csc_matrix(np.triu(block_diag(P, np.zeros((m, m)))))
-    rows, cones = sparse.csc_matrix(np.concatenate(A)), [clarabel.NonnegativeConeT(len(size))]
-    found = clarabel.DefaultSolver(upper, np.concatenate([p, price[soft]]), rows, size, cones, settings).solve()
-    return np.asarray(found.x)[:n] if "Solved" in str(found.status) else None
-
-
-def value(program, U) -> float:
-    """The cost of actions, prices included."""
-    P, p, _, _, G, g, price = program
-    soft = np.isfinite(price)
-    return float(0.5 * U @ P @ U + p @ U + (price[soft] * np.maximum(G[soft] @ U - g[soft], 0)).sum())

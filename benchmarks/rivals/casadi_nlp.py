@@ -1,0 +1,46 @@
+"""CasADi with IPOPT or FATROP, as one would write it by hand. The backend `ipopt` of difflcs is in `layer.py`."""
+
+from __future__ import annotations
+
+import casadi
+import numpy as np
+
+from rivals.nlp import Program
+from rivals.problem import Answer, Problem, Rival
+
+
+def version() -> str:
+    """Return the version of CasADi, which ships both."""
+    return f"casadi {casadi.__version__}"
+
+
+class Solver(Rival):
+    """The program over x, u, λ and s; for FATROP, which knows states and controls only, s is an expression with bounds.
+
+    Args:
+        problem: what is to be solved.
+        name: "ipopt" or "fatrop".
+        start: λ and s to start from.
+        options: the solver's.
+    """
+
+    def __init__(self, problem: Problem, name: str = "ipopt", start: float = 1.0, options: dict | None = None):
+        super().__init__(problem)
+        self.staged = name == "fatrop"
+        self.program = p = Program.of(problem, not self.staged, start, initial_state=self.staged)
+        settings = {"print_time": False, "error_on_fail": False, "calc_lam_p": False}
+        if self.staged:
+            settings |= {"structure_detection": "auto", "equality": p.equality, "expand": True}
+        own = {"print_level": 0, "max_iter": 500} | ({} if self.staged else {"sb": "yes"}) | (options or {})
+        settings |= {f"{name}.{option}": value for option, value in own.items()}
+        self.solver = casadi.nlpsol("mpc", name, {"x": p.z, "p": p.p, "f": p.f, "g": p.g}, settings)
+
+    def one(self, i: int) -> Answer:
+        """Run the solver once."""
+        p = self.program
+        start, parameters = p.begin(self.problem, i), p.parameters(self.problem, i)
+        if self.staged:
+            start[: self.problem.n_x] = self.problem.x0[i]
+        solution = self.solver(x0=start, p=parameters, lbx=p.low, ubx=p.high, lbg=p.least, ubg=p.most)
+        z = np.asarray(solution["x"]).ravel()
+        return Answer(z[p.actions][None], np.array([bool(self.solver.stats()["success"])]))

@@ -1,0 +1,125 @@
+"""Equality constraints of a MuJoCo model, which have no forces of their own in the system.
+
+MuJoCo's are soft: with the derivative E of the violation r their force is f = (−b E ν − k d r − E ν̇)/R. So they add to
+motion by M ν̇ = τ the mass Eᵀ E/R, the damping Eᵀ b E/R and the stiffness Eᵀ k d E/R. Without velocities, with the
+response S, 1 − S Eᵀ (E S Eᵀ)⁺ E projects the motion, and what forces do to it, to where they hold.
+"""
+
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import copy
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from difflcs.physics.complementarity import FreeMotion
+from difflcs.physics.mujoco.motion import Dynamic, DynamicStep, Linearised
+from difflcs.physics.mujoco.native import TAKEN, native
+
+Array = NDArray[np.float64]
+_DEPENDENT = 1e-9  # part of the largest singular value below which rows say the same
+
+
+class EqualityRows(NamedTuple):
+    """Equality constraints of n states.
+
+    Attributes:
+        gap: (n, k) r at ζ = 0, of the linear function of ζ that is r where it was read.
+        normal: (n, k, nv) its derivative E by the degrees of freedom.
+        stiffness: (n, k) k d [1/s²].
+        damping: (n, k) b [1/s].
+        force: (n, nv, k) Eᵀ/R.
+    """
+
+    gap: Array
+    normal: Array
+    stiffness: Array
+    damping: Array
+    force: Array
+
+
+class Equality:
+    """The equality constraints of a model that are active.
+
+    Args:
+        model: the model.
+        data: its data, from which what is active, and where mocap bodies are, is taken at each state.
+    """
+
+    def __init__(self, model: Any, data: Any):
+        self._taken, self.model = data, copy.copy(model)
+        self.model.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)
+        for name in ("CONTACT", "LIMIT", "FRICTIONLOSS"):
+            self.model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"))
+        self.data = mujoco.MjData(self.model)
+
+    def read(self, qpos: Array, moved: Array | None = None) -> EqualityRows | None:
+        """Read the constraints at positions (n, nq) that have moved by ζ (n, nv); None: there are none.
+
+        Raises:
+            InvalidInputError: MuJoCo raised an error.
+        """
+        model, data, rows = self.model, self.data, []
+        if not self._taken.eq_active.any():
+            return None
+        for name in TAKEN:
+            getattr(data, name)[:] = getattr(self._taken, name)
+        for i, q in enumerate(qpos):
+            with native(model, data, f"in state {i} of {len(qpos)}"):
+                data.qpos[:] = q
+                if moved is not None:
+                    mujoco.mj_integratePos(model, data.qpos, moved[i], 1.0)
+                mujoco.mj_fwdPosition(model, data)
+                if not data.nefc:
+                    return None
+                jacobian = data.efc_J.reshape(-1, model.nv)
+                rows.append([v.copy() for v in (data.efc_pos, jacobian, data.efc_KBIP[:, :3], data.efc_R)])
+        gap, normal, reference, regularisation = map(np.stack, zip(*rows, strict=True))
+        if moved is not None:
+            gap = gap - (normal @ moved[:, :, None])[:, :, 0]
+        stiffness = reference[..., 0] * reference[..., 2]
+        return EqualityRows(
+            gap, normal, stiffness, reference[..., 1], normal.swapaxes(-1, -2) / regularisation[:, None]
+        )
+
+    def hold(self, motion: Dynamic, read: Linearised, x: Array, qpos: Array) -> DynamicStep:
+        """Return the step with the constraints from states x (n, n_x), which have positions qpos (n, nq)."""
+        rows = self.read(qpos)
+        step = motion.finish(read, x, rows)
+        if rows is None:
+            return step
+        # As they turn, they are linearised half way.
+        rows = self.read(qpos, 0.5 * step.place)
+        step = motion.finish(read, x, rows)
+        after = self.read(qpos, step.place)
+        assert rows is not None
+        assert after is not None
+        nv = step.place.shape[1]
+        turned = (after.normal - rows.normal) @ step.reached[:, nv : 2 * nv, None]
+        step.step[:, nv : 2 * nv, -1] -= (step.inverse_mass @ rows.force @ turned)[:, :, 0]
+        return step
+
+    def hold_positions(self, free: FreeMotion, x: Array, qpos: Array, tangent: Array | None) -> FreeMotion:
+        """Return a motion of positions x (n, nv), which are qpos (n, nq), that keeps to the constraints."""
+        rows = self.read(qpos)
+        if rows is None:
+            return free
+        A, B, d, response = (v.numpy() for v in free)
+        E = rows.normal if tangent is None else rows.normal @ tangent
+        by = _push(response, E)
+        along = np.eye(x.shape[1]) - by @ E
+        back = by @ ((E @ x[:, :, None])[:, :, 0] - rows.gap)[:, :, None]
+        d = (along @ d[..., None] + back)[:, :, 0]
+        return FreeMotion(*(torch.from_numpy(v) for v in (along @ A, along @ B, d, along @ response)))
+
+
+def _push(response: Array, rows: Array) -> Array:
+    """Compute S Eᵀ (E S Eᵀ)⁺ (n, nv, k), the motion that moves along rows (n, k, nv) by given ways."""
+    pushed = response @ rows.swapaxes(-1, -2)
+    return pushed @ np.linalg.pinv(rows @ pushed, _DEPENDENT, hermitian=True)

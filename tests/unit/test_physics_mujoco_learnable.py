@@ -1,0 +1,152 @@
+"""LearnableMujocoLCS: it is the system of the changed model, and its gradients are slopes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+mujoco = pytest.importorskip("mujoco", reason="needs the extra [envs]")
+
+from difflcs import GoalCost, LCSMPCLayer  # noqa: E402
+from difflcs.errors import InvalidInputError  # noqa: E402
+from difflcs.physics.mujoco import LearnableMujocoLCS, MujocoLCS  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+F64 = torch.float64
+VALUES = {"mass": 0.4, "inertia": 4e-4, "com": 0.004, "friction": 0.5, "size": 0.05, "offset": 0.0, "tip": 0.02}
+VALUES |= {"kp": 50.0, "kv": 2.0, "damping": 0.3, "armature": 0.01, "stiffness": 3.0}
+OPTIONS = {"seconds": 0.02, "length": 0.05, "contacts": 6}
+
+
+def scene(**changed):
+    """A finger that pushes a cube on a floor."""
+    v = VALUES | changed
+    return mujoco.MjModel.from_xml_string(f"""
+    <mujoco><worldbody>
+      <geom name="floor" type="plane" size="1 1 .1" friction=".1"/>
+      <body name="cube" pos="0 0 .05"><freejoint/>
+        <inertial pos="{v["com"]} .002 0" mass="{v["mass"]}" diaginertia="{" ".join(3 * [str(v["inertia"])])}"/>
+        <geom name="block" type="box" size="{v["size"]} .05 .05" pos="{v["offset"]} 0 0" friction="{v["friction"]}"/>
+      </body>
+      <body name="finger" pos="-.075 0 .06">
+        <joint name="push" type="slide" axis="1 0 0" damping="{v["damping"]}" armature="{v["armature"]}"
+          stiffness="{v["stiffness"]}"/>
+        <geom name="tip" type="capsule" size="{v["tip"]} {v["tip"]}" mass=".1" friction=".1"/>
+      </body>
+    </worldbody><actuator><position name="servo" joint="push" kp="{v["kp"]}" kv="{v["kv"]}"/></actuator></mujoco>""")
+
+
+def states(n_x, seed=0):
+    """Near the state of the model, apart, touching and overlapping a little."""
+    x = 0.004 * np.random.default_rng(seed).normal(size=(6, n_x))
+    x[:, :3] += [0.0, 0.0, 0.05]
+    return torch.from_numpy(x)
+
+
+@pytest.mark.parametrize("motion", ["dynamic", "quasi-dynamic"])
+@pytest.mark.parametrize(
+    ("learn", "change", "changed"),
+    [
+        (("mass", "cube"), [0.5], {"mass": 0.4 * math.exp(0.5), "inertia": 4e-4 * math.exp(0.5)}),
+        (("inertia", "cube"), [-0.5], {"inertia": 4e-4 * math.exp(-0.5)}),
+        (("center_of_mass", "cube"), [0.2, 0.0, 0.0], {"com": 0.014}),
+        (("friction", "block"), [0.3], {"friction": 0.5 * math.exp(0.3)}),
+        (("size", "cube"), [0.1, 0.0, 0.0], {"size": 0.05 * math.exp(0.1)}),
+        (("size", "tip"), [0.2, 0.2], {"tip": 0.02 * math.exp(0.2)}),
+        (("offset", "block"), [-0.1, 0.0, 0.0], {"offset": -0.005}),
+        (("gain", "servo"), [0.4], {"kp": 50 * math.exp(0.4), "kv": 2 * math.exp(0.4)}),
+        (("servo_damping", "servo"), [0.4], {"kv": 2 * math.exp(0.4)}),
+        (("damping", "push"), [-1.0], {"damping": 0.3 * math.exp(-1)}),
+        (("armature", "push"), [0.7], {"armature": 0.01 * math.exp(0.7)}),
+        ("stiffness", [0.7], {"stiffness": 3 * math.exp(0.7)}),
+        ("compliance", [0.7], {}),
+    ],
+    ids=str,
+)
+def test_it_is_the_system_of_the_changed_model(motion, learn, change, changed):
+    learned = LearnableMujocoLCS(scene(), learn=[learn], motion=motion, **OPTIONS)
+    x = states(learned.n_x)
+    before, give = learned.params(x), 0.02 if changed else 0.02 * math.exp(0.7)
+    with torch.no_grad():
+        learned.change.copy_(torch.tensor(change))
+    found, wanted = learned.params(x), MujocoLCS(scene(**changed), motion=motion, compliance=give, **OPTIONS).params(x)
+    moved = 0.0
+    for name, value in wanted.tensors().items():
+        # What slides a little has a direction that rounding turns.
+        torch.testing.assert_close(found.tensors()[name].detach(), value, rtol=1e-3, atol=1e-3)
+        moved += float((value - before.tensors()[name]).abs().sum().detach())
+    assert moved > 1e-4
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(("motion", "tolerance"), [("dynamic", 0.02), ("quasi-dynamic", 1e-4)])
+def test_gradients_are_slopes_of_the_matrices(motion, tolerance, seed):
+    learn = [("mass", "cube"), ("friction", "block"), ("size", "tip"), ("center_of_mass", "cube"), "gain", "compliance"]
+    learned = LearnableMujocoLCS(scene(), learn=learn, motion=motion, **OPTIONS)
+    x, ctrl = states(learned.n_x, seed)[:1].requires_grad_(), torch.full((1,), 0.01, dtype=F64, requires_grad=True)
+    generator = torch.Generator().manual_seed(seed)
+    weights = {k: torch.randn(v.shape, generator=generator, dtype=F64) for k, v in learned.params(x).tensors().items()}
+
+    def total(change, x, ctrl):
+        with torch.no_grad():
+            learned.change.copy_(change)
+        return sum((weights[name] * v).sum() for name, v in learned.params(x, ctrl).tensors().items())
+
+    inputs = (torch.full_like(learned.change, 0.1).detach(), x.detach(), ctrl.detach())
+    total(inputs[0], x, ctrl).backward()
+    for k, gradient in enumerate((learned.change.grad, x.grad, ctrl.grad)):
+        ways = torch.eye(inputs[k].numel(), dtype=F64).reshape(-1, *inputs[k].shape) * 1e-4
+        moved = ([v + way * sign if i == k else v for i, v in enumerate(inputs)] for way in ways for sign in (1, -1))
+        with torch.no_grad():
+            ends = torch.tensor([float(total(*at)) for at in moved], dtype=F64)
+        slopes = ((ends[::2] - ends[1::2]) / 2e-4).reshape(gradient.shape)
+        torch.testing.assert_close(gradient, slopes, rtol=tolerance, atol=1e-9 + tolerance * float(slopes.abs().max()))
+
+
+def test_a_plan_has_a_gradient():
+    learned = LearnableMujocoLCS(scene(), learn=["gain", ("mass", "cube")], motion="quasi-dynamic", **OPTIONS)
+    cost = GoalCost.reach(7, 1, goal_weight=(100.0,), input_weight=0.1)
+    mpc = LCSMPCLayer(learned, cost, 3, -0.1, 0.1)
+    x, goal = states(7)[:2], torch.tensor([0.05], dtype=F64)
+    mpc(x, goal).u.sum().backward()
+    ends = []
+    for sign in (1, -1):
+        with torch.no_grad():
+            learned.change.copy_(torch.tensor([2e-4 * sign, 0.0]))
+            ends.append(float(mpc(x, goal).u.sum()))
+    assert learned.change.grad[0] == pytest.approx((ends[0] - ends[1]) / 4e-4, rel=1e-2)
+
+
+def test_it_counts_rotations_from_where_things_are():
+    learned = LearnableMujocoLCS(scene(), learn=["gain"], motion="quasi-dynamic", **OPTIONS)
+    data = mujoco.MjData(scene())
+    data.qpos[3:7], data.xfrc_applied[1, 2] = [0.6, 0.8, 0.0, 0.0], 1.0
+    x = learned.observe(data)
+    assert x[3:6].abs().max() == 0
+    before = learned.params(x).d
+    with torch.no_grad():
+        learned.change.fill_(1e-12)  # another model, with what was observed
+    torch.testing.assert_close(learned.params(x).d.detach(), before.detach())
+
+
+@pytest.mark.parametrize(
+    ("learn", "message"),
+    [
+        ("mass", "expected kinds or pairs"),
+        ([], "expected kinds or pairs"),
+        (["mass", ("mass", "*")], "each once"),
+        (["masses"], "did you mean"),
+        ([("mass", "sphere")], "name of a body with a mass"),
+        ([("size", "floor")], "name of a geom with a size"),
+        ([("center_of_mass", "*")], "simple"),
+    ],
+)
+def test_what_cannot_be_learned_is_refused(learn, message):
+    with pytest.raises(InvalidInputError, match=message):
+        LearnableMujocoLCS(scene(), learn=learn, motion="dynamic")
+    with pytest.raises(InvalidInputError, match="no friction="):
+        LearnableMujocoLCS(scene(), learn=["friction"], friction=0.3)
