@@ -165,11 +165,16 @@ def median(values: list[float]) -> float | None:
 
 
 @torch.no_grad()
-def measure(model: Any, o: Options, contacts: int | None = None) -> dict[str, Any]:
-    """Errors by kind, and the time of a state, with as many contacts as a `ContactWarning` asks for."""
+def measure(model: Any, o: Options, contacts: int | None = None) -> dict[str, Any] | None:
+    """Errors by kind, and the time of a state, with as many contacts as a `ContactWarning` asks for.
+
+    None where every simulation of the model diverges.
+    """
     module = MujocoLCS(model, motion="dynamic", seconds=count_steps(model) * model.opt.timestep, contacts=contacts)
     random, nv = np.random.default_rng(o.seed), model.nv
     states = roam(model, o.states, random)
+    if not states:
+        return None
     x = torch.stack([module.state.to_state(*state) for state in states])
     data, ctrl, nominal = mujoco.MjData(model), [], []
     for state, low, high in zip(states, *(v.numpy() for v in module.action_bounds(x)), strict=True):
@@ -182,6 +187,7 @@ def measure(model: Any, o: Options, contacts: int | None = None) -> dict[str, An
     zeros, actions = torch.tensor(np.array(nominal)), torch.tensor(np.array(ctrl))
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
+        module.params(x[:1])  # what is done once
         start = time.process_time()
         system = module.params(x)
         seconds = (time.process_time() - start) / len(x)
@@ -224,6 +230,8 @@ def main(o: Options) -> None:
                     row = measure(model, o)
                 except DiffLCSError as error:
                     row = {"refused": str(error)}
+            if row is None:
+                continue
             row |= {"warnings": sorted({str(w.message) for w in said})}
             results[name] = row
             print(name, row.get("refused") or describe(row), flush=True)

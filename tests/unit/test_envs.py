@@ -138,6 +138,21 @@ def test_reward_is_the_sum_of_its_terms_and_minus_the_path_cost():
         assert (info["reward_completion"] == -10.0) == (truncated and not info["success"])
 
 
+@pytest.mark.parametrize(
+    ("goal", "success"),
+    [([0.019, 0, 0.19], True), ([0.021, 0, 0], False), ([0, 0, 0.21], False), ([0.015, 0.015, 0], False)],
+)
+def test_success_tolerances_and_sparse_penalty(goal, success):
+    env = make(sparse_penalty=7.0)
+    _, info = env.reset(seed=0, options={"goal": goal})
+    assert info["success"] is success
+    for _ in range(20):
+        info = env.step(REST)[4]
+    assert info["success"] is success
+    assert info["reward_completion"] == (0.0 if success else -7.0)
+    assert make(position_tolerance=0.03, yaw_tolerance=0.3).reset(options={"goal": goal})[1]["success"]
+
+
 # --- start ----------------------------------------------------------------------------------------
 
 

@@ -22,7 +22,6 @@ state and for every step, also where Coriolis forces or an unstable equilibrium 
 from __future__ import annotations
 
 import copy
-import functools
 from typing import Any, NamedTuple
 
 import mujoco
@@ -40,10 +39,12 @@ from difflcs.physics.mujoco.library import Places, addresses, library
 Array = NDArray[np.float64]
 
 _BEYOND = 1e6  # a motion in a step [m, rad] and its velocity that no model has
+_FINER = 4  # how many steps for one of MuJoCo's where these are unstable
 _MOST, _FEW = 50, 25  # steps that are simulated one by one; where there are more, so many as long ones
 _EULER, _RK4, _IMPLICIT, _FAST = (
     int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("EULER", "RK4", "IMPLICIT", "IMPLICITFAST")
 )
+_GROWS = 30.0  # by how much a motion that is stable in truth may grow in a step
 _ADVANCE = {_EULER: "mj_Euler", _IMPLICIT: "mj_implicit", _FAST: "mj_implicit"}
 
 
@@ -140,6 +141,9 @@ class Dynamic:
         coarse = self.steps.integrator if self.steps.integrator == _RK4 else _IMPLICIT
         self.simulated = self.steps if self.steps.count <= _MOST else Steps(_FEW, coarse)
         damped = not model.opt.disableflags & _flags("EULERDAMP")
+        self.finer = Steps(_FINER * self.simulated.count, _IMPLICIT)
+        self._models: list[Any] = []
+        self._native: dict[Steps, _mujoco.Motion] = {}
         self.damping = model.dof_damping.copy() if damped else np.zeros(model.nv)
         self.tree = np.array(model.dof_treeid)
         self.firm = np.isin(
@@ -153,30 +157,57 @@ class Dynamic:
         Raises:
             InvalidInputError: MuJoCo raised an error, or has counted a warning.
         """
-        n, nv, nu = len(states), self.model.nv, self.model.nu
-        n_x = 2 * nv + self.model.na
-        sizes = ((n_x,), (n_x - nv,), (n_x, n_x), (n_x, nu), (nv, nv), (nu,), (n_x,))
-        read, ctrl = Linearised(*(np.zeros((n, *size)) for size in sizes)), np.ascontiguousarray(ctrl)
-        places.check(_mujoco.read_motion(library(), self._native, places.take(n), states, ctrl, *read), n)
-        activation = states[:, self.model.nq + nv :] + read.middle[:, 2 * nv :]
+        read = self._read(self.simulated, places, states, ctrl)
+        unstable = self._find_unstable(read)
+        if unstable.any():
+            again = self._read(self.finer, places, states[unstable], ctrl[unstable])
+            for values, better in zip(read, again, strict=True):
+                values[unstable] = better
+            read.unstable[:] = unstable
+        activation = states[:, self.model.nq + self.model.nv :] + read.middle[:, 2 * self.model.nv :]
         self.actuators.even_out(read.nominal, activation, read.A, read.B)
         return read
 
-    @functools.cached_property
-    def _native(self) -> _mujoco.Motion:
-        """Models as they are simulated and linearised, and what balances actuators, for the compiled part."""
+    def _read(self, steps: Steps, places: Places, states: Array, ctrl: Array) -> Linearised:
+        n, nv, nu = len(states), self.model.nv, self.model.nu
+        n_x = 2 * nv + self.model.na
+        sizes = ((n_x,), (n_x - nv,), (n_x, n_x), (n_x, nu), (nv, nv), (nu,), (n_x,))
+        arrays, ctrl = [np.zeros((n, *size)) for size in sizes], np.ascontiguousarray(ctrl)
+        if steps not in self._native:
+            self._native[steps] = self._describe(steps)
+        places.check(_mujoco.read_motion(library(), self._native[steps], places.take(n), states, ctrl, *arrays), n)
+        return Linearised(*arrays, unstable=np.zeros(n, dtype=bool))
+
+    def _find_unstable(self, read: Linearised) -> NDArray[np.bool_]:
+        """Find the states (n,) at which steps without constraints overshoot, each farther than the last."""
+        nv, h = self.model.nv, self.seconds / self.simulated.count
+        stiff, damped = read.A[:, nv : 2 * nv, :nv], read.A[:, nv : 2 * nv, nv : 2 * nv] - np.eye(nv)
+        # Euler's steps grow by g each where h times the rate of damping, or h²/2 of stiffness, is this much.
+        g = _GROWS ** (1 / self.simulated.count)
+        most = (1 + g) ** 2 / (2 * g) * (1.39 if self.simulated.integrator == _RK4 else 1)
+        rates = h * damped + 0.5 * h * h * stiff
+        if self.simulated.integrator != _RK4:
+            implicit = -damped if self.simulated.integrator != _EULER else read.inverse_mass * self.damping
+            rates = np.linalg.solve(np.eye(nv) + h * implicit, rates)
+        found = np.einsum("nij,nji->n", rates, rates) > most**2  # the sum of squares of the eigenvalues
+        found[found] = np.linalg.eigvals(rates[found]).real.min(-1, initial=0.0) < -most
+        return found
+
+    def _describe(self, steps: Steps) -> _mujoco.Motion:
+        """Describe for the compiled part how the motion is simulated and linearised, and what balances actuators."""
         model, actuators = self.model, self.actuators
-        self._models = simulated, linearised = copy.copy(model), copy.copy(model)
+        simulated, linearised = copy.copy(model), copy.copy(model)
+        self._models += simulated, linearised
         simulated.opt.disableflags |= self.flags
-        simulated.opt.timestep = self.seconds / self.simulated.count
-        simulated.opt.integrator = self.simulated.integrator
+        simulated.opt.timestep = self.seconds / steps.count
+        simulated.opt.integrator = steps.integrator
         # With a time step of one second and no implicit part, the next velocity is ν + acceleration.
         linearised.opt.disableflags |= self.flags | _flags("EULERDAMP")
         linearised.opt.timestep, linearised.opt.integrator = 1.0, _EULER
         actuators.unlimit_rates(linearised)
         fields = {name: getattr(model, name) for name in ("nq", "nv", "nu", "na")}
-        fields |= {"simulated": simulated._address, "linearised": linearised._address, "steps": self.simulated.count}
-        advance = _ADVANCE.get(self.simulated.integrator)
+        fields |= {"simulated": simulated._address, "linearised": linearised._address, "steps": steps.count}
+        advance = _ADVANCE.get(steps.integrator)
         fields["advance"] = addresses()[advance] if advance else 0
         return _mujoco.Motion(fields | actuators.describe_balance(self.relative))
 
@@ -195,7 +226,7 @@ class Dynamic:
         free, inverse_mass, heavier = forces, read.inverse_mass, mass
         if equality is not None:
             heavier, forces = _add_equality(mass, forces, equality)
-            inverse_mass = np.linalg.inv(heavier)
+            inverse_mass = np.linalg.inv(heavier).astype(np.float64)
         response = _implicit_response(heavier, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
         # Of a step in which a motion grows beyond all bounds, what is linear and explicit says nothing.
         step, implicit = self._steps(mass, forces, damping, self.steps), self._implicit(response @ heavier, forces)
@@ -203,6 +234,9 @@ class Dynamic:
         # The simulation says what is not linear, by its difference to the same steps of the linear motion.
         same = self.simulated == self.steps and equality is None
         simulated = step if same else self._steps(mass, free, damping, self.simulated)
+        if (some := read.unstable).any():
+            slow = -mass[some] @ rates[some, :nv, nv : 2 * nv]
+            simulated[some], step[some] = (self._steps(mass[some], of[some], slow, self.finer) for of in (free, forces))
         more = read.reached - _reached(simulated, velocity)
         more = np.where((np.abs(more).max(1) < _BEYOND)[:, None], more, 0.0)
         if equality is not None:
@@ -267,6 +301,7 @@ class Linearised(NamedTuple):
         inverse_mass: (n, nv, nv).
         nominal: (n, nu) action at which this is.
         reached: (n, n_x) where the nominal control leads in a step.
+        unstable: (n,) True where this is in finer steps, as the model's are unstable.
     """
 
     middle: Array
@@ -276,6 +311,7 @@ class Linearised(NamedTuple):
     inverse_mass: Array
     nominal: Array
     reached: Array
+    unstable: NDArray[np.bool_]
 
 
 class DynamicStep(NamedTuple):
@@ -358,7 +394,9 @@ class DynamicStep(NamedTuple):
         h, (n, n_x), nv = self.seconds, self.x.shape, self.place.shape[1]
         place, velocity = (self.response @ rows.swapaxes(-1, -2) for rows in (h * normal, impulse))
         still = np.zeros((n, n_x - 2 * nv, normal.shape[1]))
-        return np.concatenate([place if tangent is None else np.linalg.solve(tangent, place), velocity, still], 1)
+        if tangent is not None:
+            place = np.linalg.solve(tangent, place).astype(np.float64)
+        return np.concatenate([place, velocity, still], 1)
 
 
 def _reached(step: Array, velocity: Array) -> Array:
@@ -374,7 +412,7 @@ def _add_equality(mass: Array, forces: Array, rows: Any) -> tuple[Array, Array]:
     pull[:, :, :nv] = -rows.stiffness[:, :, None] * rows.normal
     pull[:, :, nv : 2 * nv] = -rows.damping[:, :, None] * rows.normal
     pull[:, :, -1] = -rows.stiffness * rows.gap
-    held = np.linalg.solve(heavier, mass @ forces[:, :nv] + rows.force @ pull)
+    held: Array = np.linalg.solve(heavier, mass @ forces[:, :nv] + rows.force @ pull)
     return heavier, np.concatenate([held, forces[:, nv:]], 1)
 
 

@@ -31,6 +31,7 @@ from difflcs.physics.mujoco.motion import DynamicStep
 Array = NDArray[np.float64]
 _USUAL, _LOAD = 0.02, 100.0  # depth of contacts in parts of the length, acceleration [m/s²], both of any load
 _SOFTER = 0.03  # of the compliance: how exactly forces are computed
+_GAINS = 1.0  # of the speeds before the step and without contact, which contacts and limits do not make faster
 _EARLY = 0.6  # least part of a step in which a force moves things; from 0.5 on an impact would bounce with its speed
 _PASSES = 2  # each reduces what is left of compliance and opening by about their parts of the motion
 
@@ -116,6 +117,11 @@ class _Rays:
         moved = self._response @ (self._rows.swapaxes(-1, -2) @ lam[:, :, None])
         return lam / self._give, place + moved[:, :, 0]
 
+    def impulse(self, forces: Array, rows: ScaledRows) -> Array:
+        """Impulse (n, nv, 1) on the degrees of freedom by forces (n, m)."""
+        along = np.concatenate([self._rows[:, : self._rows.shape[1] - rows.impulse.shape[1]], rows.impulse], 1)
+        return along.swapaxes(-1, -2) @ forces[:, :, None]
+
     def split(self, forces: Array) -> tuple[Array, Array]:
         """Forces of contacts (n, n_contacts, n_rays) and of rows (n, n_rows)."""
         count = self.shape[1] * self.shape[2]
@@ -148,9 +154,12 @@ def solve_soft(
 
 
 def _settle(
-    step: DynamicStep, contacts: MujocoContacts, rows: Rows, give: float, compliance: float
+    step: DynamicStep, contacts: MujocoContacts, rows: Rows, give: float, compliance: float, at_once: Array
 ) -> tuple[ScaledRows, Array]:
-    """Find where limits and friction hold; return them, and (n, n_rows, nv) those that hold all the time."""
+    """Find where limits and friction hold; return them, and (n, n_rows, nv) those that hold all the time.
+
+    In the states `at_once` (n,) they act at the beginning of the step, as contacts do.
+    """
     h, nv, k = step.seconds, step.place.shape[1], rows.gap.shape[1] - rows.n_friction
     response, is_limit = h * step.response, np.arange(rows.gap.shape[1]) < k
     if not rows.gap.size:
@@ -175,7 +184,7 @@ def _settle(
     reach = np.abs(rows.normal @ step.step[:, :nv, step.x.shape[1] : -1]).sum(-1)
     pressed = ~holds & (np.abs(rows.gap) < reach) & ~(after.acts & (rows.gap > 0))
     part = np.clip(np.where(is_limit & pressed, _EARLY, after.part), _EARLY, 1.25)
-    part = np.where(~is_limit & after.stops, 1.0, part)
+    part = np.where(~is_limit & after.stops | at_once[:, None], 1.0, part)
     return scale(rows, gap, part, response, give, h), rows.normal * holds[:, :, None]
 
 
@@ -190,6 +199,8 @@ def evaluate_nominal(
 ) -> Nominal:
     """Decide which contacts close, hold or slide at the nominal action, and which rows act.
 
+    Where contacts and limits jam each other, they act at the same time, as they would else make things fast.
+
     Args:
         step: the motion without contact.
         contacts: contacts.
@@ -203,8 +214,31 @@ def evaluate_nominal(
     if not contacts.gap.size and not rows.gap.size:
         settled = scale(rows, rows.gap, 1.0, step.seconds * step.response, give, step.seconds)
         return Nominal(contacts, np.zeros((*contacts.gap.shape, 1)), settled, rows.gap, np.zeros_like(step.delayed))
+    arguments = step, contacts, rows, recovery, give, compliance, opens
+    nominal, velocity = _evaluate(*arguments, np.zeros(len(step.x), dtype=bool))
+    if rows.gap.size and contacts.gap.size:
+        mass = 1 / np.diagonal(step.inverse_mass, axis1=1, axis2=2)
+        speeds = step.velocity, _velocity(step, np.zeros_like(step.delayed)), velocity
+        before, alone, after = (np.sqrt((mass * v * v).sum(-1)) for v in speeds)
+        jams = after > _GAINS * (before + alone)
+        if jams.any():
+            nominal, _ = _evaluate(*arguments, jams)
+    return nominal
+
+
+def _evaluate(
+    step: DynamicStep,
+    contacts: MujocoContacts,
+    rows: Rows,
+    recovery: Recovery,
+    give: float,
+    compliance: float,
+    opens: bool,
+    at_once: Array,
+) -> tuple[Nominal, Array]:
+    """Do so, and return the velocities (n, nv) after the step; for states `at_once` (n,) see `_settle`."""
     response = step.seconds * step.response
-    settled, held = _settle(step, contacts, rows, give, compliance)
+    settled, held = _settle(step, contacts, rows, give, compliance, at_once)
     closing = _find_closing(step.place, step.response, contacts, held)
     carried = _compute_carried(step, contacts, closing, np.zeros(contacts.tangent.shape[:3]), held)
     # First all that close hold.
@@ -240,7 +274,8 @@ def evaluate_nominal(
     of_contacts, of_rows = rays.split(forces)
     # What creeps moves the point from which friction counts, which is that of so much compliance.
     creep = _compute_creep(step, contacts, recovery, of_contacts) * ~slides[:, :, None] / (compliance / _SOFTER * give)
-    return Nominal(contacts._replace(gap=opened), of_contacts + creep, settled, of_rows, carried)
+    velocity = _velocity(step, carried) + (step.response @ rays.impulse(forces, settled))[:, :, 0]
+    return Nominal(contacts._replace(gap=opened), of_contacts + creep, settled, of_rows, carried), velocity
 
 
 def convert_forces(forces: Array, n_tangents: int, cone: Cone) -> Array:
@@ -267,6 +302,13 @@ def _place(step: DynamicStep, carried: Array) -> Array:
     """Compute ζ (n, nv) after the step with the nominal action, with `carried` added to the motion without contact."""
     nv = step.place.shape[1]
     return step.place + carried[:, :nv, -1] + (carried[:, :nv, nv : 2 * nv] @ step.velocity[:, :, None])[:, :, 0]
+
+
+def _velocity(step: DynamicStep, carried: Array) -> Array:
+    """Compute ν (n, nv) likewise."""
+    nv = step.place.shape[1]
+    after = step.step[:, nv : 2 * nv] + carried[:, nv:]
+    return after[:, :, -1] + (after[:, :, nv : 2 * nv] @ step.velocity[:, :, None])[:, :, 0]
 
 
 def _find_closing(place: Array, response: Array, contacts: MujocoContacts, held: Array) -> NDArray[np.bool_]:
