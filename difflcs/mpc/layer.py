@@ -143,7 +143,8 @@ class LCSMPCLayer(nn.Module):
         """Return the bounds of the actions for calls that pass none.
 
         They are the layer's `bounds`; or else u_min and u_max, within the action support of an `LCSModel` that knows
-        one. A call takes them within the `action_bounds(x0)` of a module that has these, as `MujocoLCS` does.
+        one. A call takes them within the `action_bounds(x0)` of a module that has these, as `MujocoLCS` does, of the
+        layer's where the call passes matrices.
 
         Args:
             system: the model; the layer's if None.

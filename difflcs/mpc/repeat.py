@@ -164,7 +164,8 @@ def _tensor_mappings(setup: Setup, call: Call) -> list[Mapping[str, object]] | N
 
 
 def _parts(setup: Setup, call: Call) -> tuple[object, ...]:
-    return None if call.lcs is not None else setup.lcs, setup.cost, setup.bounds, setup.constraints
+    matters = call.lcs is None or hasattr(setup.lcs, "action_bounds")
+    return setup.lcs if matters else None, setup.cost, setup.bounds, setup.constraints
 
 
 def _values(setup: Setup, call: Call, mappings: list[Mapping[str, object]]) -> list[object]:

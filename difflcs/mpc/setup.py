@@ -88,7 +88,10 @@ class Setup(NamedTuple):
         if self.bounds is not None:
             return self.bounds.by_steps()
         limits = within_support(self.u_min, self.u_max, system)
-        return limits if x0 is None else within_reach(*limits, system, x0)
+        if x0 is None:
+            return limits
+        # Matrices of a call are mostly those of the layer's module, whose actuators they do not know.
+        return within_reach(*limits, system if hasattr(system, "action_bounds") else self.lcs, x0)
 
 
 class Call(NamedTuple):

@@ -94,8 +94,9 @@ def test_a_plan_keeps_a_servo_within_its_range(motion):
     mpc = LCSMPCLayer(module, cost.double(), 1, -1.0, 1.0)
     x = torch.zeros(2, n_x, dtype=torch.float64)
     x[:, 0] = torch.tensor([0.0, 0.08])
-    targets = module.control(x, mpc(x).action)
-    torch.testing.assert_close(targets, torch.full((2, 1), 0.1, dtype=torch.float64), rtol=0, atol=1e-3)
+    for plan in (mpc(x), mpc(x, lcs=module.params(x)), mpc(x.flip(0), lcs=module.params(x.flip(0)))):
+        targets = module.control(plan.x[:, 0], plan.action)
+        torch.testing.assert_close(targets, torch.full((2, 1), 0.1, dtype=torch.float64), rtol=0, atol=1e-3)
     assert MujocoLCS(load('<motor joint="a"/>'), motion="dynamic").action_bounds(torch.zeros(2))[0].isinf()
 
 
