@@ -66,7 +66,7 @@ class Options:
     """Folders with packages, besides those that are installed."""
     only: str = ""
     """Part of the name of the models that count."""
-    states: int = 60
+    states: int = 30
     """States of a model."""
     seed: int = 0
     """Seed of motions and controls."""
