@@ -226,7 +226,7 @@ class Dynamic:
         free, inverse_mass, heavier = forces, read.inverse_mass, mass
         if equality is not None:
             heavier, forces = _add_equality(mass, forces, equality)
-            inverse_mass = np.linalg.inv(heavier)
+            inverse_mass = np.linalg.inv(heavier).astype(np.float64)
         response = _implicit_response(heavier, forces[:, :nv, :nv], forces[:, :nv, nv : 2 * nv], h)
         # Of a step in which a motion grows beyond all bounds, what is linear and explicit says nothing.
         step, implicit = self._steps(mass, forces, damping, self.steps), self._implicit(response @ heavier, forces)
@@ -410,7 +410,7 @@ def _add_equality(mass: Array, forces: Array, rows: Any) -> tuple[Array, Array]:
     pull[:, :, :nv] = -rows.stiffness[:, :, None] * rows.normal
     pull[:, :, nv : 2 * nv] = -rows.damping[:, :, None] * rows.normal
     pull[:, :, -1] = -rows.stiffness * rows.gap
-    held = np.linalg.solve(heavier, mass @ forces[:, :nv] + rows.force @ pull)
+    held: Array = np.linalg.solve(heavier, mass @ forces[:, :nv] + rows.force @ pull)
     return heavier, np.concatenate([held, forces[:, nv:]], 1)
 
 

@@ -89,6 +89,35 @@ def test_a_chunk_depends_on_class_seed_and_number_alone():
     assert a.arrays["x0"].shape != c.arrays["x0"].shape or (a.arrays["x0"] != c.arrays["x0"]).any()
 
 
+def test_elements_whose_sweep_must_exchange_rows_change_no_gradient_of_others(one_thread, monkeypatch):
+    """At a nearly skew F the sweep of the gradients is done a second time, of these elements alone."""
+    problem, rng = next(c for c in campaign.CELLS if c.name == "mpc-plain/batched").chunk(0, 0)
+    F, bad = problem.arrays["F"].copy(), np.arange(problem.count) % 2 == 0
+    K = rng.standard_normal(F.shape)
+    F[bad] = (K - K.swapaxes(-1, -2) + 1e-10 * np.eye(F.shape[-1]))[bad]
+    problem, fragile, vjp = replace(problem, arrays=problem.arrays | {"F": F}), [], BatchedBackend.vjp
+
+    def spied(self, problem, result, grads, solved):
+        fragile.append(result.fragile & solved)
+        return vjp(self, problem, result, grads, solved)
+
+    def gradients(problem):
+        leaves = targets.leaves_of(problem)
+        with targets.quiet():
+            plan = targets.layer_of(problem, leaves)(leaves["x0"])
+            (plan.x.sum() + plan.u.sum()).backward()
+        return {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+
+    monkeypatch.setattr(BatchedBackend, "vjp", spied)
+    together = gradients(problem)
+    assert fragile[0].sum() > 4
+    assert together["x0"][fragile[0]].any(-1).all()
+    for part in (bad, ~bad):
+        for name, gradient in gradients(problem.select(part)).items():
+            assert torch.equal(gradient, together[name][torch.from_numpy(part)]), name
+            assert gradient.isfinite().all()
+
+
 def test_every_generator_says_what_is_hostile():
     classes = (generators.LCP_CLASSES, generators.MPC_CLASSES, forms.FORM_CLASSES)
     for generator in (f for table in classes for f in table.values()):
