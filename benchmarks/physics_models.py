@@ -218,6 +218,7 @@ def main(o: Options) -> None:
             name = f"{package}/{path.parent.name if path.stem == 'robot' else path.stem}"
             if o.only not in name:
                 continue
+            name = f"{package}/{path.parent.name}/{path.stem}" if name in results else name
             try:
                 model = mujoco.MjModel.from_xml_path(str(path))
             except ValueError:
