@@ -6,7 +6,7 @@ DIR has to contain; or set DIFFLCS_INHAND_DIR. An object lies on the palm, its p
 yaw uniform in ±90°; the goal is 90° of yaw away, to either side. A decision moves the targets of 16 joint servos by
 at most 0.1 rad, 0.2 rad for objects of 100 g, from where the joints are, and holds them for 50 steps of 2 ms.
 
-- Success, in both papers: 1 − (q·goal)² < 0.04, which is 23°, after each of 20 decisions in a row. With `--position`
+- Success: 1 − (q·goal)² < 0.04, which is 23°, after each of 21 decisions in a row. With `--position`
   the object has to be within 2 cm of its target place as well.
 - Failure: 500 decisions, or the object's centre below 5 mm.
 
@@ -22,7 +22,7 @@ import json
 import os
 import time
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ import tyro
 from successes import success_figures
 
 from difflcs import LCSMPCLayer
+from difflcs.cli.bench import machine, save
 from difflcs.errors import ContactWarning, InvalidInputError
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.physics.mujoco import ContactGroup, Distance, Effort, MujocoCost, MujocoLCS, Orientation, Position
@@ -59,7 +60,8 @@ OBJECTS = {  # place of the start [m], its height, and the target place, as publ
 }
 JOINTS = (0.125, 1.13, 1.45, 1.24, -0.02, 0.445, 1.17, 1.5, -0.459, 1.54, 1.11, 1.23, 0.638, 1.85, 1.5, 1.26)
 FINGERS, LINKS = ("ff", "mf", "rf", "th"), ("base", "proximal", "medial", "distal", "tip")
-LIMIT, HELD, SUBSTEPS, LOST = 500, 20, 50, 0.005
+COLUMNS = "object", "seed", "success", "dropped", "steps", "position_mm", "angle_deg"
+LIMIT, HELD, SUBSTEPS, LOST = 500, 21, 50, 0.005
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,8 @@ class Options:
     """Print a line of JSON for each object and for all."""
     out: Path | None = None
     """Where episodes are recorded, a line of JSON each; nowhere if not given."""
+    results: Path | None = None
+    """File for the figures of each object and of all, with their episodes."""
     settings: Settings = field(default_factory=Settings)
 
 
@@ -263,7 +267,15 @@ def main(o: Options) -> None:
                     with o.out.open("a") as file:
                         file.write(json.dumps(known[name, seed]) + "\n")
         report(o, name, [known[name, seed] for seed in range(o.seed, o.seed + o.episodes)])
-    report(o, "all", [known[name, o.seed + i] for name in names for i in range(o.episodes)])
+    rows = [known[name, o.seed + i] for name in names for i in range(o.episodes)]
+    report(o, "all", rows)
+    if o.results is not None:
+        groups = {"all": rows, **{name: [e for e in rows if e["object"] == name] for name in names}}
+        record = {"machine": machine(), "seed": o.seed, "position": o.position, "settings": asdict(o.settings)}
+        record["results"] = {name: figures(group) for name, group in groups.items()}
+        record["columns"] = list(COLUMNS)
+        record["rows"] = [[e[key] for key in COLUMNS] for e in rows]
+        save(o.results, record)
 
 
 def report(o: Options, name: str, episodes: list[dict[str, Any]]) -> None:

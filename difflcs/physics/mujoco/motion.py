@@ -394,7 +394,9 @@ class DynamicStep(NamedTuple):
         h, (n, n_x), nv = self.seconds, self.x.shape, self.place.shape[1]
         place, velocity = (self.response @ rows.swapaxes(-1, -2) for rows in (h * normal, impulse))
         still = np.zeros((n, n_x - 2 * nv, normal.shape[1]))
-        return np.concatenate([place if tangent is None else np.linalg.solve(tangent, place), velocity, still], 1)
+        if tangent is not None:
+            place = np.linalg.solve(tangent, place).astype(np.float64)
+        return np.concatenate([place, velocity, still], 1)
 
 
 def _reached(step: Array, velocity: Array) -> Array:

@@ -243,6 +243,8 @@ int64_t solve_soft(Array<const double> J, Array<const double> R, Array<const dou
 }  // namespace
 
 NB_MODULE(_mujoco, m) {
+  // What a cache holds when Python ends is no leak.
+  nb::set_leak_warnings(false);
   nb::class_<Library>(m, "Library", "Functions of MuJoCo.")
       .def(
           "__init__",
