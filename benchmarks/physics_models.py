@@ -66,7 +66,7 @@ class Options:
     """Folders with packages, besides those that are installed."""
     only: str = ""
     """Part of the name of the models that count."""
-    states: int = 60
+    states: int = 30
     """States of a model."""
     seed: int = 0
     """Seed of motions and controls."""
@@ -218,6 +218,7 @@ def main(o: Options) -> None:
             name = f"{package}/{path.parent.name if path.stem == 'robot' else path.stem}"
             if o.only not in name:
                 continue
+            name = f"{package}/{path.parent.name}/{path.stem}" if name in results else name
             try:
                 model = mujoco.MjModel.from_xml_path(str(path))
             except ValueError:

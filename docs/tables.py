@@ -284,6 +284,34 @@ def errors(record: dict) -> str:
     return table(["system", "model", "error of motion", "time of a state"], rows)
 
 
+def foreign(record: dict) -> str:
+    """Models by others: errors of a step and those of differences in brackets, by kind; a refusal in words."""
+    rows = []
+    for name, row in record["results"].items():
+        cells = ["", "", ""]
+        if "refused" not in row:
+            few = [row[kind] for kind in ("free", "contact", "limit")]
+            cells = [f"{v['lcs']:.2f} ({v['fd']:.2f})" if v["states"] else "" for v in few]
+        time = duration(1e-3 * row["ms"]) if "ms" in row else row["refused"].replace("|", "\\|")
+        rows.append([name.replace("_", "\\_"), *cells, time])
+    return table(["model", "free", "contact", "limit", "time of a state, or why it is refused"], rows)
+
+
+def summary(record: dict) -> str:
+    """Models by others: how many of a package are accepted, and medians over these of the medians of a model."""
+    rows, results = [], record["results"]
+    for package in (*dict.fromkeys(name.split("/")[0] for name in results), ""):
+        some = [row for name, row in results.items() if package in ("", name.split("/")[0])]
+        accepted = [row for row in some if "refused" not in row]
+        cells = [package.replace("_", "\\_") or "all", f"{len(accepted)} of {len(some)}"]
+        for kind in ("free", "contact", "limit"):
+            few = [row[kind] for row in accepted if row[kind]["states"] >= 5]
+            medians = [f"{np.median([v[of] for v in few]):.2f}" for of in ("lcs", "fd") if few]
+            cells.append(f"{medians[0]} ({medians[1]})" if few else "")
+        rows.append([*cells, duration(1e-3 * float(np.median([row["ms"] for row in accepted])))])
+    return table(["package", "accepted", "free", "contact", "limit", "time of a state"], rows)
+
+
 def success(record: dict) -> str:
     """Success rate of a closed loop, its steps and time."""
     row = record["results"]
@@ -412,6 +440,7 @@ TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "decision": {"ways": decision},
     "physics": {"errors": errors},
     "objects": {"success": objects, "methods": methods},
+    "physics_models": {"summary": summary, "models": foreign},
     "box_to_pose": {"success": success},
     "pusht": {"variants": pusht, "published": published},
 }
