@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from difflcs._checks import describe
 from difflcs.errors import ContactWarning, InvalidInputError
-from difflcs.physics.mujoco._native import _mujoco
+from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.library import Places, library
 from difflcs.physics.mujoco.narrow import BOX, CAPSULE, CYLINDER, MESH, NATIVE, PLANE, Array, describe_solid, have_faces
 

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 import torch
 
-from difflcs.physics.mujoco._native import _mujoco
+from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.native import TAKEN, native
 
 _FUNCTIONS = (

@@ -32,7 +32,7 @@ from torch import Tensor
 
 from difflcs.errors import InvalidInputError
 from difflcs.physics.complementarity import FreeMotion
-from difflcs.physics.mujoco._native import _mujoco
+from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.actuators import Actuators
 from difflcs.physics.mujoco.library import Places, addresses, library
 

@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 from difflcs.physics.complementarity import Cone, count_forces
-from difflcs.physics.mujoco._native import _mujoco
+from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.contacts import MujocoContacts
 from difflcs.physics.mujoco.limits import Rows, ScaledRows, find_load, follow, scale
 from difflcs.physics.mujoco.motion import DynamicStep
