@@ -50,10 +50,8 @@ class MujocoLCS:
 
     Contacts, their Jacobians, the mass matrix and all smooth forces are MuJoCo's. Three motions are offered:
 
-    - "quasi-static": the state is the positions. Joints with actuators move as they are told, u is by how much in this
-      step; all else moves only while pushed. For slow pushing; gravity does nothing.
-    - "quasi-dynamic": the state is the positions. Servos give way as they do in MuJoCo, gravity and given forces act,
-      and everything is at rest after each step, see `quasi_dynamic.py`. For grasping and turning in a hand.
+    - "quasi-static": the state is the positions. Joints with actuators move by u, all else only while pushed.
+    - "quasi-dynamic": the same state, with gravity and servos that give way, at rest after each step. For grasping.
     - "dynamic": the state is positions and velocities. u is MuJoCo's `ctrl`; that of `position` actuators on joints
       counts from where the joint is, unless `relative` is false. It is linearised at a nominal control, which also
       says what contacts do where friction depends on it: which hold and which slide. What rests in MuJoCo rests here,
