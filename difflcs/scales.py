@@ -8,7 +8,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor, nn
 
-from difflcs._checks import broadcast_batch, check_same_device, check_tensor, describe
+from difflcs._checks import broadcast_batch, check_same_device, check_tensor, describe, takes_arrays
 from difflcs._linalg import matvec
 from difflcs.errors import InvalidInputError
 from difflcs.records import LCSModule, LCSParams, LCSSequence, system_at
@@ -43,11 +43,13 @@ class Scales:
     xi: float
     relaxation: float
 
+    @takes_arrays
     def normalise(self, x: Tensor, u: Tensor, x_next: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Convert transitions x (..., n_x), u (..., n_u), x_next (..., n_x) to these units."""
         check_tensor("u", u, [("n_u", len(self.action))])
         return self.states(x), u / self.action.to(u), self.states(x_next, "x_next")
 
+    @takes_arrays
     def states(self, x: Tensor, name: str = "x") -> Tensor:
         """Convert states (..., n_x) to these units; `name` is their name in an error."""
         check_tensor(name, x, [("n_x", len(self.state))])
@@ -78,6 +80,7 @@ class Scales:
         )
 
 
+@takes_arrays
 def suggest_scales(x: Tensor, u: Tensor, x_next: Tensor) -> Scales:
     """Suggest units and settings for learning an LCS; the learned system does not depend on the units of the data.
 
