@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from difflcs._checks import check_number, check_positive_int, check_tensor
+from difflcs._checks import check_number, check_positive_int, check_tensor, takes_arrays
 from difflcs._optional import require
 from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.records import SYSTEM, LCSModule, LCSParams, advance, check_inputs, system_at
@@ -162,6 +162,7 @@ class FitReport:
         return figure
 
 
+@takes_arrays
 def fit_report(
     system: LCSModule | LCSParams,
     x: Tensor,

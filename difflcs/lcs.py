@@ -18,6 +18,7 @@ from difflcs._checks import (
     check_positive_int,
     check_tensor,
     describe,
+    takes_arrays,
 )
 from difflcs._differentiation import runs_eagerly, transforms_active
 from difflcs._linalg import product
@@ -72,6 +73,7 @@ class PredictiveModule(nn.Module):
     params: Callable[..., Any]
 
     @runs_eagerly
+    @takes_arrays
     def forward(self, x: Tensor, u: Tensor) -> LCSPrediction:
         """Predict one step through the exact LCP.
 
@@ -87,6 +89,7 @@ class PredictiveModule(nn.Module):
         return advance(self.params(x), x, u)
 
     @runs_eagerly
+    @takes_arrays
     def rollout(self, x0: Tensor, u_seq: Tensor) -> Tensor:
         """Predict a trajectory.
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from difflcs import _storage
-from difflcs._checks import broadcast_batch, check_number, check_same_device, check_tensor, describe
+from difflcs._checks import broadcast_batch, check_number, check_same_device, check_tensor, describe, takes_arrays
 from difflcs._linalg import matvec
 from difflcs._modules import plain_state
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
@@ -49,11 +49,13 @@ class Scales:
     xi: float
     relaxation: float
 
+    @takes_arrays
     def normalise(self, x: Tensor, u: Tensor, x_next: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Convert transitions x (..., n_x), u (..., n_u), x_next (..., n_x) to these units."""
         check_tensor("u", u, [("n_u", len(self.action))])
         return self.states(x), u / self.action.to(u), self.states(x_next, "x_next")
 
+    @takes_arrays
     def states(self, x: Tensor, name: str = "x") -> Tensor:
         """Convert states (..., n_x) to these units; `name` is their name in an error."""
         check_tensor(name, x, [("n_x", len(self.state))])
@@ -84,6 +86,7 @@ class Scales:
         )
 
 
+@takes_arrays
 def suggest_scales(x: Tensor, u: Tensor, x_next: Tensor) -> Scales:
     """Suggest units and settings for learning an LCS; the learned system does not depend on the units of the data.
 

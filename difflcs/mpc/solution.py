@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.utils._pytree import register_pytree_node
 
+from difflcs._checks import describe_shapes
+from difflcs._differentiation import is_wrapped
 from difflcs.mpc.problem import MPCProblem
 from difflcs.status import Status, solved
 
@@ -28,7 +30,7 @@ class Primal(NamedTuple):
     mu: Tensor = None  # pyright: ignore[reportAssignmentType]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class MPCSolution:
     """Solutions of a batch of MPC problems; they certify themselves.
 
@@ -57,7 +59,17 @@ class MPCSolution:
     kkt_residual: Tensor
     solve_time: Tensor
     violation: Tensor
-    problem: MPCProblem = field(repr=False)
+    problem: MPCProblem
+
+    def __repr__(self) -> str:
+        tensors = {name: getattr(self, name) for name in ("x", "u", "lam", "mu")}
+        text = f"MPCSolution({describe_shapes(tensors)}"
+        if self.status.numel() and not is_wrapped(self.status):
+            codes = self.status.flatten().tolist()
+            text += "; status " + ", ".join(f"{codes.count(c)} {Status(c).name}" for c in sorted(set(codes)))
+            for name in ("objective", "kkt_residual", "violation"):
+                text += f"; {name} ≤ {float(getattr(self, name).detach().max()):.3g}"
+        return text + ")"
 
     @property
     def action(self) -> Tensor:
