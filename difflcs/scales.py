@@ -19,8 +19,8 @@ from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
 from difflcs.lcs import LCSModel, PredictiveModule
 from difflcs.records import LCSModule, LCSParams, LCSSequence, system_at
 
-# In units in which states and actions are about one. From 0.001 to 0.1 made no difference to a block between two
-# fingers (prediction error within 7 %); from 1 on breaking the contact law is so cheap that it was not learned.
+# In units in which states and actions are about one: from 1 on, breaking the contact law is so cheap that it is not
+# learned (docs/figures/xi.py).
 _XI = 0.01
 # Relaxation in parts of the squared step: where a contact switches λ = w = √relaxation, here 0.22 of a step. It gives
 # the layer's default of 1e-5 for the paper's fingers, which move by 1.5 cm a step.
@@ -196,4 +196,4 @@ class ScaledLCS(PredictiveModule):
         shapes = {"center": lcs.n_x, "state": lcs.n_x, "action": lcs.n_u}
         wanted = {name: ((size,), torch.float64) for name, size in shapes.items()}
         _storage.check_tensors(directory, "scales", parts["scales"], wanted)
-        return cls(lcs, Scales(**parts["scales"], **numbers))
+        return cls(lcs, Scales(*(parts["scales"][name] for name in shapes), **numbers))
