@@ -8,7 +8,7 @@ import warnings
 import torch
 from torch import Tensor, nn
 
-from difflcs._checks import check_choice, check_number, check_positive_int
+from difflcs._checks import check_choice, check_number, check_positive_int, takes_arrays
 from difflcs._differentiation import runs_eagerly
 from difflcs._modules import fresh
 from difflcs.constraints import StageBounds, as_bound
@@ -77,6 +77,7 @@ class LCSMPCLayer(nn.Module):
     u_min: Tensor
     u_max: Tensor
 
+    @takes_arrays
     def __init__(
         self,
         lcs: System,
@@ -165,6 +166,7 @@ class LCSMPCLayer(nn.Module):
         )
 
     @runs_eagerly
+    @takes_arrays
     def forward(
         self,
         x0: Tensor,

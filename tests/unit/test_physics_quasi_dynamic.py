@@ -121,6 +121,16 @@ def test_groups_have_budgets_of_contacts_and_of_friction():
     assert not module.contacts(far).normal[5].any()
 
 
+@pytest.mark.parametrize("cone", ["anitescu", "stewart-trinkle"])
+def test_what_rests_on_contacts_of_a_group_without_friction_does_not_creep(cone):
+    model = load('<geom name="floor" type="plane" size="1 1 .1"/>' + BOX.format("0 0 .02", 0.5))
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 2000)
+    module = MujocoLCS(model, motion="dynamic", contacts=[ContactGroup(None, 4, friction=False)], cone=cone)
+    x = module.observe(data)
+    torch.testing.assert_close(module.params(x).step(x, torch.zeros(0).double()).x_next, x, atol=1e-7, rtol=0)
+
+
 @pytest.mark.parametrize(
     ("contacts", "words"), [([], "one at least"), (["block"], "ContactGroup"), ([ContactGroup("x", 1)], "'x'")]
 )

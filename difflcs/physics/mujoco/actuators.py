@@ -15,6 +15,7 @@ from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_tensor
 from difflcs.errors import InvalidInputError, ShapeError
+from difflcs.physics.mujoco.native import flags
 
 Array = NDArray[np.float64]
 
@@ -63,7 +64,7 @@ class Actuators:
         self._gain, self._constant, self._bias, self._damping = np.where(gain != 0, gain, 1.0), constant, bias, damping
         self.offset = np.where(self.servo, constant / self._gain, 0.0)
         limited = np.array(model.actuator_ctrllimited, dtype=bool)
-        limited &= not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
+        limited &= not model.opt.disableflags & flags("CLAMPCTRL")
         self.range = np.where(limited, model.actuator_ctrlrange.T, [[-np.inf], [np.inf]])
         self.range[:, dynamics == _MUSCLE] = np.clip(self.range[:, dynamics == _MUSCLE], 0.0, 1.0)
         plain = fixed & (dynamics == _NONE) & (affine & (self.dof >= 0) | (model.actuator_biastype == _UNBIASED))
@@ -202,4 +203,4 @@ def disabled_actuators(model: Any) -> NDArray[np.bool_]:
     """Return a mask (nu,) of actuators that do nothing, by their groups or a flag of the model."""
     groups = model.actuator_group
     disabled = (groups >= 0) & (groups < 31) & (model.opt.disableactuator >> groups.clip(0, 30) & 1 > 0)
-    return disabled | bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_ACTUATION))
+    return disabled | bool(model.opt.disableflags & flags("ACTUATION"))

@@ -23,6 +23,7 @@ from difflcs.errors import ContactWarning, InvalidInputError
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.library import Places, library
 from difflcs.physics.mujoco.narrow import BOX, CAPSULE, CYLINDER, MESH, NATIVE, PLANE, Array, describe_solid, have_faces
+from difflcs.physics.mujoco.native import flags
 
 Pairs = Sequence[tuple[int | str, int | str]]
 
@@ -32,7 +33,6 @@ _ITERATIONS = 100  # of MuJoCo's distance
 
 # Of these MuJoCo misses contacts that are apart, so that things would fall through.
 _FIELDS = (int(mujoco.mjtGeom.mjGEOM_HFIELD), int(mujoco.mjtGeom.mjGEOM_SDF))
-_DISABLED = int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
 _OVERRIDE = int(mujoco.mjtEnableBit.mjENBL_OVERRIDE)
 _POINTS = {  # contacts that a pair of shapes can have, where more than one
     (PLANE, CAPSULE): 2,
@@ -105,6 +105,7 @@ class ContactFinder:
         pairs: numbers of the geoms that may touch, those of the first and those of the second of each pair.
         n_contacts: number of contacts of every state.
         n_tangents: of each contact.
+        rough: (n_contacts,) False for those of budgets without friction, where there is some.
     """
 
     def __init__(
@@ -131,11 +132,12 @@ class ContactFinder:
             contacts = min(MOST_CONTACTS, sum(_POINTS.get((int(a), int(b)), 1) for a, b in kinds))
         budgets = [Budget(self.allowed, contacts, distance)] if isinstance(contacts, int) else list(contacts)
         self.n_contacts = sum(budget.contacts for budget in budgets)
-        rough = bool((self.friction[first, second] > 0).any())
-        self.n_tangents = (1 if self.axis is not None else 2) if rough else 0
+        self.n_tangents = (1 if self.axis is not None else 2) if (self.friction[first, second] > 0).any() else 0
+        rough = [budget.friction or not self.n_tangents for budget in budgets]
+        self.rough = np.repeat(rough, [budget.contacts for budget in budgets])
         model.opt.ccd_iterations = _ITERATIONS
-        model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
-        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)  # MuJoCo need not find any
+        model.opt.disableflags &= ~flags("NATIVECCD")
+        model.opt.disableflags |= flags("CONTACT")  # MuJoCo need not find any
         self._budgets = len(budgets)
         self._scene, self._places = self._describe_scene(budgets), places
 
@@ -302,7 +304,7 @@ def _name(model: Any, geom: int) -> str:
 
 def _may_touch(model: Any) -> NDArray[np.bool_]:
     """Return the pairs (ngeom, ngeom) that MuJoCo would test; none where contacts or constraints are disabled."""
-    if model.opt.disableflags & _DISABLED:
+    if model.opt.disableflags & flags("CONTACT", "CONSTRAINT"):
         return np.zeros((model.ngeom, model.ngeom), dtype=bool)
     kind, affinity = model.geom_contype, model.geom_conaffinity
     masks = (kind[:, None] & affinity[None]) | (affinity[:, None] & kind[None])
@@ -310,7 +312,7 @@ def _may_touch(model: Any) -> NDArray[np.bool_]:
     weld = model.body_weldid[body]
     parent = model.body_weldid[model.body_parentid[weld]]
     allowed = (masks != 0) & (weld[:, None] != weld[None])
-    if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT):
+    if not model.opt.disableflags & flags("FILTERPARENT"):
         moving = (weld[:, None] != 0) & (weld[None] != 0)
         allowed &= ~(moving & ((parent[:, None] == weld[None]) | (weld[:, None] == parent[None])))
     for signature in model.exclude_signature:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from difflcs.physics.complementarity import FreeMotion
 from difflcs.physics.mujoco.motion import Dynamic, DynamicStep, Linearised
-from difflcs.physics.mujoco.native import TAKEN, native
+from difflcs.physics.mujoco.native import TAKEN, flags, native
 
 Array = NDArray[np.float64]
 _DEPENDENT = 1e-9  # part of the largest singular value below which rows say the same
@@ -55,8 +55,7 @@ class Equality:
     def __init__(self, model: Any, data: Any):
         self._taken, self.model = data, copy.copy(model)
         self.model.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)
-        for name in ("CONTACT", "LIMIT", "FRICTIONLOSS"):
-            self.model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"))
+        self.model.opt.disableflags |= flags("CONTACT", "LIMIT", "FRICTIONLOSS")
         self.data = mujoco.MjData(self.model)
 
     def read(self, qpos: Array, moved: Array | None = None) -> EqualityRows | None:

@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from difflcs._checks import check_number, check_positive_int, describe
 from difflcs.errors import InvalidInputError
 from difflcs.physics.mujoco.contacts import Budget, find_geoms
-from difflcs.records import LCSParams
 
 __all__ = ["ContactGroup", "ContactSelection"]
 
@@ -38,7 +36,7 @@ class ContactGroup(NamedTuple):
 
 
 class ContactSelection:
-    """Selects the contacts of each group from all that a state has.
+    """Selects the pairs of geoms of each group.
 
     Args:
         model: the MuJoCo model.
@@ -46,9 +44,7 @@ class ContactSelection:
         distance: of the module [m].
 
     Attributes:
-        n_contacts: number of contacts of all groups.
         budgets: the same for a `ContactFinder`.
-        rough: (n_contacts,) True for those with friction.
         group: (ngeom, ngeom) number of the group of each pair; −1 for none.
     """
 
@@ -75,30 +71,12 @@ class ContactSelection:
             )
             for i, group in enumerate(groups)
         ]
-        counts = [budget.contacts for budget in self.budgets]
-        self.n_contacts = sum(counts)
-        self.rough = np.repeat([budget.friction for budget in self.budgets], counts)
 
     def main(self, pairs: Sequence[NDArray[np.intp]]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the pairs, of two arrays of geoms, that belong to the first group."""
         first, second = pairs
         mine = self.group[first, second] == 0
         return first[mine], second[mine]
-
-    def rows(self, each: int) -> NDArray[np.intp]:
-        """Return the numbers of the rows to keep where each contact has so many: all, or the first without friction."""
-        rows = np.arange(self.n_contacts * each).reshape(-1, each)
-        return np.concatenate([row if rough else row[:1] for row, rough in zip(rows, self.rough, strict=True)])
-
-    def reduce(self, system: LCSParams) -> LCSParams:
-        """Keep one row for each contact without friction, whose rays are all the same."""
-        if self.rough.all():
-            return system
-        rows = torch.from_numpy(self.rows(system.n_lam // self.n_contacts))
-        C, F = system.C[..., rows], system.F[..., rows[:, None], rows]
-        return LCSParams(
-            system.A, system.B, C, system.d, system.D[..., rows, :], system.E[..., rows, :], F, system.c[..., rows]
-        )
 
 
 def _geoms(model: Any, of: Any) -> Sequence[int]:

@@ -33,8 +33,8 @@ from difflcs.physics.mujoco.groups import ContactGroup, ContactSelection
 from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import RowFinder, ScaledRows, scale
 from difflcs.physics.mujoco.motion import Dynamic, QuasiStatic
-from difflcs.physics.mujoco.native import TAKEN, native
-from difflcs.physics.mujoco.nominal import Recovery, convert_forces, evaluate_nominal
+from difflcs.physics.mujoco.native import TAKEN, flags, native
+from difflcs.physics.mujoco.nominal import Recovery, Situation, evaluate_nominal
 from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
 from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams, LCSSequence, sequence_along
@@ -135,7 +135,7 @@ class MujocoLCS:
         if friction is not None:
             check_number("friction", friction)
         model = copy.copy(model)
-        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it would lose what data says; see native
+        model.opt.disableflags |= flags("AUTORESET")  # it would lose what data says; see native
         self._model, self._data = model, mujoco.MjData(model)
         if data is not None:
             _take(self._data, data)
@@ -165,9 +165,7 @@ class MujocoLCS:
             budgets = None if contacts is None else check_positive_int("contacts", contacts)
         self._places = Places(model, self._data)
         self._finder = ContactFinder(model, self._data, self._places, pairs, distance, length, budgets, friction)
-        model.opt.disableflags |= sum(
-            int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("EQUALITY", "FRICTIONLOSS", "LIMIT")
-        )
+        model.opt.disableflags |= flags("EQUALITY", "FRICTIONLOSS", "LIMIT")
         with native(model, self._data, "in the state of data"):
             self._give = self._typical_response()
 
@@ -188,10 +186,10 @@ class MujocoLCS:
 
     @property
     def n_lam(self) -> int:
-        """Number of forces: of contacts, then of limits, then two for each joint or tendon with dry friction."""
-        each = count_forces(1, self._finder.n_tangents, self.cone)
-        of_contacts = self.n_contacts * each if self._selection is None else len(self._selection.rows(each))
-        return of_contacts + self._rows.n_limits + 2 * self._rows.n_friction
+        """Number of forces: of contacts, of those without friction last, of limits, two of each dry friction."""
+        rough, rows = int(self._finder.rough.sum()), self._rows
+        smooth = self.n_contacts - rough
+        return count_forces(rough, self._finder.n_tangents, self.cone, smooth + rows.n_limits, rows.n_friction)
 
     def observe(self, data: Any) -> Tensor:
         """Return the state (n_x,) of MuJoCo's data, and let rotations count from the orientations there from now on.
@@ -225,17 +223,15 @@ class MujocoLCS:
                 "x: expected states (..., n_x), as contacts depend on where things are, got None; pass x"
             )
         read = self._read(x, context)
-        contacts, rest, effect = read.dof_contacts, None, None
+        contacts, rest, step, rough = read.dof_contacts, None, None, self._finder.rough
         if isinstance(self._motion, Dynamic):
             step = self._equality.hold(self._motion, read.moved, read.x, read.qpos)
             found = self._rows.find(read.qpos, step.place, step.response, read.moved.middle[:, : self.state.nv])
-            nominal = evaluate_nominal(
-                step, contacts, found, self._recovery, self._give, self.compliance, self.cone == "anitescu"
-            )
+            acting = step, contacts, rough, found
+            soft = self._recovery, self._give, self.compliance, self.cone == "anitescu"
+            nominal = evaluate_nominal(Situation(*acting, *soft))
             contacts, rows = nominal.contacts, nominal.rows
-            effect = step.effect(read.tangent, rows.normal, rows.impulse)
-            forces = convert_forces(nominal.forces, self._finder.n_tangents, self.cone)
-            rest = read.batched(np.concatenate([forces, nominal.row_forces, np.zeros_like(rows.bound)], -1))
+            rest = read.batched(nominal.rest(rough, self._finder.n_tangents, self.cone))
             free = step.free(read.tangent, nominal.carried)
         else:
             free = self._motion.finish(read.moved, read.x, read.tangent)
@@ -243,6 +239,10 @@ class MujocoLCS:
             response = np.broadcast_to(read.to_dofs(free.response.numpy()), (len(read.x), *free.response.shape[-2:]))
             found = self._rows.find(read.qpos, np.zeros_like(read.x), response)
             rows = scale(found, found.gap, 1.0, response, self._give, 1.0)
+        if not rough.all():
+            rows = rows.after(contacts.gap[:, ~rough], contacts.normal[:, ~rough])
+            contacts = MujocoContacts(*(values[:, rough] for values in contacts))
+        effect = None if step is None else step.effect(read.tangent, rows.normal, rows.impulse)
         ranks = zip(free, (2, 2, 1, 2), strict=True)
         system = contact_lcs(
             read.contacts(contacts),
@@ -256,8 +256,6 @@ class MujocoLCS:
             rest=rest,
             **read.constraints(rows, effect),
         )
-        if self._selection is not None:
-            system = self._selection.reduce(system)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
 
     def sequence(self, plan: Any, x: Tensor | None = None) -> LCSSequence:

@@ -21,6 +21,7 @@ from difflcs._modules import fresh
 from difflcs.errors import InvalidInputError
 from difflcs.physics.mujoco.lcs import MujocoLCS
 from difflcs.physics.mujoco.narrow import BOX, CAPSULE, CYLINDER, ELLIPSOID, SPHERE
+from difflcs.physics.mujoco.native import flags
 from difflcs.physics.mujoco.quasi_dynamic import BIASES, GAINS
 from difflcs.records import SYSTEM, LCSParams
 
@@ -232,7 +233,7 @@ class LearnableMujocoLCS(nn.Module):
                 model.geom_sameframe[:], model.site_sameframe[:] = 0, 0
                 model.body_sameframe[ids if of.of == "body" else []] = 0
         if any(_KINDS[e.kind].of == "geom" for e in self._entries):  # the boxes of its tree are those of before
-            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
+            model.opt.disableflags |= flags("MIDPHASE")
         mujoco.mj_setConst(model, mujoco.MjData(model))
         return model
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from difflcs._checks import check_positive_int
 from difflcs.errors import ContactWarning
 from difflcs.physics.mujoco.motion import DynamicStep
-from difflcs.physics.mujoco.native import native
+from difflcs.physics.mujoco.native import flags, native
 
 Array = NDArray[np.float64]
 MOST_LIMITS = 8  # by default
@@ -98,6 +98,11 @@ class ScaledRows(NamedTuple):
     bound: Array
     unit: Array
 
+    def after(self, gap: Array, normal: Array) -> ScaledRows:
+        """Return these rows after contacts without friction, of gaps (n, k) and their derivatives (n, k, nv)."""
+        found = (np.concatenate(v, 1) for v in ((gap, self.gap), (normal, self.normal), (normal, self.impulse)))
+        return ScaledRows(*found, self.bound, np.concatenate([np.ones_like(gap), self.unit], 1))
+
 
 class RowFinder:
     """Finds the rows at states.
@@ -112,13 +117,13 @@ class RowFinder:
 
     def __init__(self, model: Any, data: Any, limits: int | None, friction: bool):
         self.model, self.data = model, data
-        off = _disabled(model, "CONSTRAINT")
-        limited = model.jnt_limited.astype(bool) & (model.jnt_type != int(mujoco.mjtJoint.mjJNT_FREE))
-        limited, tendons = limited & ~(off | _disabled(model, "LIMIT")), model.tendon_limited.astype(bool)
+        disabled = model.opt.disableflags
+        limits_act, rubs = (not disabled & flags("CONSTRAINT", name) for name in ("LIMIT", "FRICTIONLOSS"))
+        limited = model.jnt_limited.astype(bool) & (model.jnt_type != int(mujoco.mjtJoint.mjJNT_FREE)) & limits_act
         self._joints = np.flatnonzero(limited & (model.jnt_type >= _SLIDE))
         self._balls = np.flatnonzero(limited & (model.jnt_type == _BALL))
-        self._tendons = np.flatnonzero(tendons & ~(off | _disabled(model, "LIMIT")))
-        rubs = friction and not (off or _disabled(model, "FRICTIONLOSS"))
+        self._tendons = np.flatnonzero(model.tendon_limited.astype(bool) & limits_act)
+        rubs = rubs and friction
         self._rubbing = np.flatnonzero(model.dof_frictionloss * rubs > 0)
         self._rubbing_tendons = np.flatnonzero(model.tendon_frictionloss * rubs > 0)
         self.n_friction = len(self._rubbing) + len(self._rubbing_tendons)
@@ -146,11 +151,6 @@ class RowFinder:
             np.concatenate([np.full(of_limits, np.inf), model.dof_frictionloss[rubbing],
                             model.tendon_frictionloss[rubbing_tendons]]),
         )  # fmt: skip
-
-    @property
-    def n_rows(self) -> int:
-        """Number of rows of every state."""
-        return self.n_limits + self.n_friction
 
     def find(self, qpos: Array, place: Array, response: Array, middle: Array | None = None) -> Rows:
         """Find the rows, of limits those that are nearest to acting.
@@ -362,17 +362,13 @@ def _reference(model: Any, reference: Array, impedance: Array, of_limits: int) -
     """Compute k and b (k,) of solref (k, 2) and solimp (k, 5); the first `of_limits` have a stiffness."""
     most = np.clip(impedance[:, 1], 1e-4, 0.9999)
     time, ratio = reference.T
-    safe = not _disabled(model, "REFSAFE")
+    safe = not model.opt.disableflags & flags("REFSAFE")
     time = np.where(time > 0, np.maximum(time, 2 * model.opt.timestep * safe), time)
     standard = time > 0
     inverse = 1 / np.where(standard, most * time, 1.0)
     stiffness = np.where(standard, (inverse / np.where(standard, ratio, 1.0)) ** 2, -time / most**2)
     stiffness[of_limits:] = 0.0
     return stiffness, np.where(standard, 2 * inverse, -ratio / most)
-
-
-def _disabled(model: Any, name: str) -> bool:
-    return bool(model.opt.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")))
 
 
 def tendon_jacobian(model: Any, data: Any) -> Array:

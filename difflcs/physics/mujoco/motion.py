@@ -35,6 +35,7 @@ from difflcs.physics.complementarity import FreeMotion
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.actuators import Actuators
 from difflcs.physics.mujoco.library import Places, addresses, library
+from difflcs.physics.mujoco.native import flags
 
 Array = NDArray[np.float64]
 
@@ -140,7 +141,7 @@ class Dynamic:
         self.steps = Steps(max(1, round(seconds / model.opt.timestep)), int(model.opt.integrator))
         coarse = self.steps.integrator if self.steps.integrator == _RK4 else _IMPLICIT
         self.simulated = self.steps if self.steps.count <= _MOST else Steps(_FEW, coarse)
-        damped = not model.opt.disableflags & _flags("EULERDAMP")
+        damped = not model.opt.disableflags & flags("EULERDAMP")
         self.finer = Steps(_FINER * self.simulated.count, _IMPLICIT)
         self._models: list[Any] = []
         self._native: dict[Steps, _mujoco.Motion] = {}
@@ -149,7 +150,7 @@ class Dynamic:
         self.firm = np.isin(
             self.tree, np.setdiff1d(self.tree, self.tree[np.setdiff1d(np.arange(model.nv), actuators.dof)])
         )
-        self.flags = _flags("CONSTRAINT")
+        self.flags = flags("CONSTRAINT")
 
     def read(self, places: Places, states: Array, ctrl: Array) -> Linearised:
         """Read the motion at states (n, nq + nv + na) of qpos, qvel and act, at controls (n, nu); NaN: balance.
@@ -202,7 +203,7 @@ class Dynamic:
         simulated.opt.timestep = self.seconds / steps.count
         simulated.opt.integrator = steps.integrator
         # With a time step of one second and no implicit part, the next velocity is ν + acceleration.
-        linearised.opt.disableflags |= self.flags | _flags("EULERDAMP")
+        linearised.opt.disableflags |= self.flags | flags("EULERDAMP")
         linearised.opt.timestep, linearised.opt.integrator = 1.0, _EULER
         actuators.unlimit_rates(linearised)
         fields = {name: getattr(model, name) for name in ("nq", "nv", "nu", "na")}
@@ -414,10 +415,6 @@ def _add_equality(mass: Array, forces: Array, rows: Any) -> tuple[Array, Array]:
     pull[:, :, -1] = -rows.stiffness * rows.gap
     held: Array = np.linalg.solve(heavier, mass @ forces[:, :nv] + rows.force @ pull)
     return heavier, np.concatenate([held, forces[:, nv:]], 1)
-
-
-def _flags(*names: str) -> int:
-    return sum(int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in names)
 
 
 def _implicit_response(mass: Array, K: Array, D: Array, h: float) -> Array:

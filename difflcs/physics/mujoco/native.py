@@ -1,4 +1,4 @@
-"""Errors of MuJoCo, and the warnings that it only counts, as exceptions of this library."""
+"""MuJoCo's errors, and the warnings that it only counts, as exceptions of this library; bits of its flags."""
 
 # MuJoCo is a compiled module without type stubs.
 # pyright: reportAttributeAccessIssue=false
@@ -32,6 +32,13 @@ _WARNINGS = {
     "more inertia, or softer springs and servos",
     "BADCTRL": _LARGE.format("controls, here the places of relative servos,"),
 }
+
+
+def flags(*names: str) -> int:
+    """Return the bits of `disableflags` with these names, such as CONTACT."""
+    return sum(int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in names)
+
+
 _KINDS = {int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")): text for name, text in _WARNINGS.items()}
 
 

@@ -15,6 +15,7 @@ contacts do under their load.
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, NamedTuple
 
 import mujoco
@@ -22,6 +23,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from difflcs.errors import ContactWarning
 from difflcs.physics.complementarity import Cone, count_forces
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.contacts import MujocoContacts
@@ -52,6 +54,15 @@ class Nominal(NamedTuple):
     rows: ScaledRows
     row_forces: Array
     carried: Array
+
+    def rest(self, rough: NDArray[np.bool_], n_tangents: int, cone: Cone) -> Array:
+        """Forces (n, n_lam) from which the compliance counts, as `contact_lcs` has them for a cone."""
+        forces, smooth = self.forces[:, rough], self.forces[:, ~rough].sum(-1)
+        each = count_forces(1, n_tangents, cone)
+        if each != forces.shape[-1]:  # Stewart and Trinkle: normal, tangential, and the distance
+            forces = np.concatenate([forces.sum(-1, keepdims=True), np.zeros((*forces.shape[:2], each - 1))], -1)
+        slid = np.zeros_like(self.rows.bound)
+        return np.concatenate([forces.reshape(len(forces), -1), smooth, self.row_forces, slid], -1)
 
 
 class Recovery:
@@ -94,16 +105,53 @@ class Recovery:
         return np.where(creep * speed > 0, np.sign(speed) * np.minimum(np.abs(speed), np.abs(creep)), 0.0)
 
 
+class Situation(NamedTuple):
+    """What acts in a step from n states.
+
+    Attributes:
+        step: the motion without contact.
+        contacts: contacts.
+        rough: (n_contacts,) False for contacts without friction.
+        rows: limits and dry friction.
+        recovery: of MuJoCo's contacts.
+        give: how far a unit of impulse moves two bodies apart [m/(N s)].
+        compliance: of contacts, in parts of `give`.
+        opens: True for the friction of Anitescu, in which a contact that slides opens.
+    """
+
+    step: DynamicStep
+    contacts: MujocoContacts
+    rough: NDArray[np.bool_]
+    rows: Rows
+    recovery: Recovery
+    give: float
+    compliance: float
+    opens: bool
+
+    def rays(self, contacts: MujocoContacts, rows: ScaledRows, response: Array) -> _Rays:
+        """Return the rays of contacts and rows as they are found to act, for forces that are nearly exact."""
+        return _Rays(contacts, self.rough, rows, self.step.seconds * response, self.give, _SOFTER * self.compliance)
+
+
 class _Rays:
     """The extreme rays of friction cones and rows, and the forces that keep them closed, as in `contact_lcs`."""
 
-    def __init__(self, contacts: MujocoContacts, rows: ScaledRows, response: Array, give: float, compliance: float):
+    def __init__(
+        self,
+        contacts: MujocoContacts,
+        rough: NDArray[np.bool_],
+        rows: ScaledRows,
+        response: Array,
+        give: float,
+        compliance: float,
+    ):
         slide = contacts.friction[:, :, None, None] * contacts.tangent
         normal = contacts.normal[:, :, None]
         rays = np.stack([normal + slide, normal - slide], 3) if slide.shape[2] else normal[:, :, None]
         n, k = rays.shape[:2]
         self.shape = n, k, max(1, 2 * slide.shape[2])
-        self._rows = np.concatenate([rays.reshape(n, -1, rays.shape[-1]), rows.normal], 1)
+        self._kept = np.flatnonzero(rough[:, None] | (np.arange(self.shape[2]) == 0))  # one where all are the same
+        self._rows = np.concatenate([rays.reshape(n, -1, rays.shape[-1])[:, self._kept], rows.normal], 1)
         self._response, self._give, self._compliance, self._of_rows = response / give, give, compliance, rows.gap
         unbounded = np.full((n, self._rows.shape[1] - rows.bound.shape[1]), np.inf)
         self._low = np.concatenate([np.zeros_like(unbounded), -give * rows.bound], 1)
@@ -111,7 +159,7 @@ class _Rays:
 
     def forces(self, place: Array, gap: Array, rest: Array | float = 0.0) -> tuple[Array, Array]:
         """Forces (n, m) of rays and rows, and where they move ζ (n, nv); the compliance counts from forces `rest`."""
-        apart = np.concatenate([np.repeat(gap, self.shape[2], axis=1), self._of_rows], 1)
+        apart = np.concatenate([gap[:, self._kept // self.shape[2]], self._of_rows], 1)
         apart = apart + (self._rows @ place[:, :, None])[:, :, 0] - self._compliance * self._give * rest
         lam = solve_soft(self._rows, self._response, apart, self._compliance, self._low, self._high)
         moved = self._response @ (self._rows.swapaxes(-1, -2) @ lam[:, :, None])
@@ -119,13 +167,14 @@ class _Rays:
 
     def impulse(self, forces: Array, rows: ScaledRows) -> Array:
         """Impulse (n, nv, 1) on the degrees of freedom by forces (n, m)."""
-        along = np.concatenate([self._rows[:, : self._rows.shape[1] - rows.impulse.shape[1]], rows.impulse], 1)
+        along = np.concatenate([self._rows[:, : len(self._kept)], rows.impulse], 1)
         return along.swapaxes(-1, -2) @ forces[:, :, None]
 
     def split(self, forces: Array) -> tuple[Array, Array]:
         """Forces of contacts (n, n_contacts, n_rays) and of rows (n, n_rows)."""
-        count = self.shape[1] * self.shape[2]
-        return forces[:, :count].reshape(self.shape), forces[:, count:]
+        of_contacts = np.zeros((len(forces), self.shape[1] * self.shape[2]))
+        of_contacts[:, self._kept] = forces[:, : len(self._kept)]
+        return of_contacts.reshape(self.shape), forces[:, len(self._kept) :]
 
 
 def solve_soft(
@@ -142,6 +191,9 @@ def solve_soft(
         compliance: > 0.
         low: (n, m) least forces; None: 0.
         high: (n, m) largest forces; None: infinite.
+
+    Warns:
+        ContactWarning: for some states rounding keeps it from finding them exactly.
     """
     force = np.empty_like(gap)
     low = np.zeros_like(gap) if low is None else np.ascontiguousarray(low)
@@ -149,17 +201,24 @@ def solve_soft(
     rows, gap = np.ascontiguousarray(rows), np.ascontiguousarray(gap)
     response = np.ascontiguousarray(np.broadcast_to(response, (len(gap), *response.shape[-2:])))
     threads = max(1, min(len(gap), torch.get_num_threads()))
-    _mujoco.solve_soft(rows, response, gap, compliance, low, high, threads, force)
+    missed = _mujoco.solve_soft(rows, response, gap, compliance, low, high, threads, force)
+    if missed:
+        warnings.warn(
+            f"expected the forces of contacts and limits at the nominal action, found none that fit for {missed} of "
+            f"{len(gap)} states, so that what touches there may creep: look for bodies of very different mass, or pass "
+            f"a larger compliance",
+            ContactWarning,
+            stacklevel=2,
+        )
     return force
 
 
-def _settle(
-    step: DynamicStep, contacts: MujocoContacts, rows: Rows, give: float, compliance: float, at_once: Array
-) -> tuple[ScaledRows, Array]:
+def _settle(at: Situation, at_once: Array) -> tuple[ScaledRows, Array]:
     """Find where limits and friction hold; return them, and (n, n_rows, nv) those that hold all the time.
 
     In the states `at_once` (n,) they act at the beginning of the step, as contacts do.
     """
+    step, contacts, rows, give = at.step, at.contacts, at.rows, at.give
     h, nv, k = step.seconds, step.place.shape[1], rows.gap.shape[1] - rows.n_friction
     response, is_limit = h * step.response, np.arange(rows.gap.shape[1]) < k
     if not rows.gap.size:
@@ -169,7 +228,7 @@ def _settle(
     creeps = np.abs(speed) < rows.soft.creep
     gap = np.where(is_limit, np.maximum(rows.gap, 0.0) + 2 * rows.bend, -h * speed * creeps)
     scaled = scale(rows, gap, 1.0, response, give, h)
-    rays = _Rays(contacts, scaled, response, give, compliance)
+    rays = at.rays(contacts, scaled, step.response)
     forces, moved = rays.forces(_place(step, step.delayed), np.maximum(contacts.gap, 0.0))
     forces = rays.split(forces)[1]
     after_bend = (rows.normal @ moved[:, :, None])[:, :, 0] + 2 * rows.bend
@@ -188,57 +247,30 @@ def _settle(
     return scale(rows, gap, part, response, give, h), rows.normal * holds[:, :, None]
 
 
-def evaluate_nominal(
-    step: DynamicStep,
-    contacts: MujocoContacts,
-    rows: Rows,
-    recovery: Recovery,
-    give: float,
-    compliance: float,
-    opens: bool,
-) -> Nominal:
+def evaluate_nominal(at: Situation) -> Nominal:
     """Decide which contacts close, hold or slide at the nominal action, and which rows act.
 
     Where contacts and limits jam each other, they act at the same time, as they would else make things fast.
-
-    Args:
-        step: the motion without contact.
-        contacts: contacts.
-        rows: limits and dry friction.
-        recovery: of MuJoCo's contacts.
-        give: how far a unit of impulse moves two bodies apart [m/(N s)].
-        compliance: of contacts, in parts of `give`.
-        opens: True for the friction of Anitescu, in which a contact that slides opens.
     """
-    compliance *= _SOFTER
+    step, contacts, rows = at.step, at.contacts, at.rows
     if not contacts.gap.size and not rows.gap.size:
-        settled = scale(rows, rows.gap, 1.0, step.seconds * step.response, give, step.seconds)
+        settled = scale(rows, rows.gap, 1.0, step.seconds * step.response, at.give, step.seconds)
         return Nominal(contacts, np.zeros((*contacts.gap.shape, 1)), settled, rows.gap, np.zeros_like(step.delayed))
-    arguments = step, contacts, rows, recovery, give, compliance, opens
-    nominal, velocity = _evaluate(*arguments, np.zeros(len(step.x), dtype=bool))
+    nominal, velocity = _evaluate(at, np.zeros(len(step.x), dtype=bool))
     if rows.gap.size and contacts.gap.size:
         mass = 1 / np.diagonal(step.inverse_mass, axis1=1, axis2=2)
         speeds = step.velocity, _velocity(step, np.zeros_like(step.delayed)), velocity
         before, alone, after = (np.sqrt((mass * v * v).sum(-1)) for v in speeds)
         jams = after > _GAINS * (before + alone)
         if jams.any():
-            nominal, _ = _evaluate(*arguments, jams)
+            nominal, _ = _evaluate(at, jams)
     return nominal
 
 
-def _evaluate(
-    step: DynamicStep,
-    contacts: MujocoContacts,
-    rows: Rows,
-    recovery: Recovery,
-    give: float,
-    compliance: float,
-    opens: bool,
-    at_once: Array,
-) -> tuple[Nominal, Array]:
+def _evaluate(at: Situation, at_once: Array) -> tuple[Nominal, Array]:
     """Do so, and return the velocities (n, nv) after the step; for states `at_once` (n,) see `_settle`."""
-    response = step.seconds * step.response
-    settled, held = _settle(step, contacts, rows, give, compliance, at_once)
+    step, contacts, recovery = at.step, at.contacts, at.recovery
+    settled, held = _settle(at, at_once)
     closing = _find_closing(step.place, step.response, contacts, held)
     carried = _compute_carried(step, contacts, closing, np.zeros(contacts.tangent.shape[:3]), held)
     # First all that close hold.
@@ -246,14 +278,14 @@ def _evaluate(
     contacts = contacts._replace(
         tangent=_turn_tangents(contacts.tangent, np.einsum("nktv,nv->nkt", contacts.tangent, place))
     )
-    rays = _Rays(contacts, settled, response, give, compliance)
+    rays = at.rays(contacts, settled, step.response)
     forces, moved = rays.forces(place, closed)
     slide, normal = np.einsum("nktv,nv->nkt", contacts.tangent, moved), rays.split(forces)[0].sum(-1)
     # The drag of Stewart and Trinkle's model holds what slides.
-    slides = _find_sliding(slide, contacts, place) & opens
+    slides = _find_sliding(slide, contacts, place) & at.opens
     if slides.any() and step.motion.firm.any():
         # What robots touch may hold with another action than the nominal one.
-        _, firmly = _Rays(contacts, settled, step.seconds * step.firm, give, compliance).forces(place, closed)
+        _, firmly = at.rays(contacts, settled, step.firm).forces(place, closed)
         slides &= _find_sliding(np.einsum("nktv,nv->nkt", contacts.tangent, firmly), contacts, place)
     acceleration = (
         np.einsum("nkv,nvw,nkw->nk", contacts.normal, step.inverse_mass, contacts.normal) * normal / step.seconds
@@ -264,7 +296,7 @@ def _evaluate(
     slide = np.einsum("nktv,nv->nkt", contacts.tangent, moved) * slides[:, :, None]
     if slides.any():  # else it is as before: what holds does not depend on the directions of the tangents
         carried = _compute_carried(step, contacts, closing, slide, held)
-    rays = _Rays(contacts, settled, response, give, compliance)
+    rays = at.rays(contacts, settled, step.response)
     place, forces = _place(step, carried), np.zeros_like(forces)
     for _ in range(_PASSES):
         # A contact that slides by s opens by μ s in Anitescu's model, as its gap is n·Δx − μ s.
@@ -273,17 +305,9 @@ def _evaluate(
         slide = np.einsum("nktv,nv->nkt", contacts.tangent, moved)
     of_contacts, of_rows = rays.split(forces)
     # What creeps moves the point from which friction counts, which is that of so much compliance.
-    creep = _compute_creep(step, contacts, recovery, of_contacts) * ~slides[:, :, None] / (compliance / _SOFTER * give)
+    creep = _compute_creep(step, contacts, recovery, of_contacts) * ~slides[:, :, None] / (at.compliance * at.give)
     velocity = _velocity(step, carried) + (step.response @ rays.impulse(forces, settled))[:, :, 0]
     return Nominal(contacts._replace(gap=opened), of_contacts + creep, settled, of_rows, carried), velocity
-
-
-def convert_forces(forces: Array, n_tangents: int, cone: Cone) -> Array:
-    """Convert forces (n, n_contacts, n_rays) along Anitescu's rays to those (n, n_lam) of a cone."""
-    each = count_forces(1, n_tangents, cone)
-    if each != forces.shape[-1]:  # Stewart and Trinkle: normal, tangential, and the distance
-        forces = np.concatenate([forces.sum(-1, keepdims=True), np.zeros((*forces.shape[:2], each - 1))], -1)
-    return forces.reshape(len(forces), -1)
 
 
 def _compute_creep(step: DynamicStep, contacts: MujocoContacts, recovery: Recovery, forces: Array) -> Array:

@@ -36,6 +36,7 @@ from difflcs.errors import InvalidInputError
 from difflcs.physics.complementarity import FreeMotion
 from difflcs.physics.mujoco.actuators import Actuators, disabled_actuators
 from difflcs.physics.mujoco.limits import tendon_jacobian
+from difflcs.physics.mujoco.native import flags
 
 Array = NDArray[np.float64]
 GAINS = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
@@ -93,8 +94,7 @@ class QuasiDynamic:
         self._bias = model.actuator_biasprm[:, :3] * (model.actuator_biastype == BIASES[1])[:, None]
         for force in (self._gain, self._bias):
             force[disabled_actuators(model)] = 0.0
-        flags = model.opt.disableflags
-        springs, dampers = (not flags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{n}")) for n in ("SPRING", "DAMPER"))
+        springs, dampers = (not model.opt.disableflags & flags(name) for name in ("SPRING", "DAMPER"))
         self._tendons = model.tendon_stiffness * springs, model.tendon_damping * dampers
         self._servo_damping = getattr(model, "actuator_damping", np.zeros(model.nu)) * dampers
         self._damping = np.diag(model.dof_damping * dampers)
