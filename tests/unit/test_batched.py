@@ -176,6 +176,25 @@ def test_a_contact_that_is_far_is_found(limit, effort):
     assert float((ours <= best + 1e-3 * best.abs()).double().mean()) >= 0.9
 
 
+@pytest.mark.parametrize("effort", ["fast", "default"])
+def test_plans_for_almost_hard_contact_cost_less_where_contact_is_hard(build, effort):
+    lcs, call = build.pushing(0, 5), data(build, 32)
+    mpc = pushing(build, 5, lcs=lcs, effort=effort)
+
+    def executed(relaxation):
+        mpc.relaxation = relaxation
+        plan = mpc(*call)
+        assert (plan.status == 0).all()
+        assert plan.complementarity().max() < 1e-3 * relaxation
+        return mpc(*call, guess=plan).u, plan.problem.objective(lcs.rollout(call[0], plan.u), plan.u)
+
+    (_, soft), (again, hard) = executed(1e-5), executed(1e-7)
+    gain = (soft - hard) / (1 + soft.abs())
+    assert gain.mean() > 0.002
+    assert gain.min() > -0.05
+    assert torch.isfinite(again).all()
+
+
 def test_a_guess_is_the_only_start_unless_the_best_is_wanted(build):
     x0, goal = data(build, 32, 4)
     poor, stays, moves = (pushing(build, 8, 1, effort=effort) for effort in ("fast", "default", "best"))
