@@ -51,8 +51,8 @@ constexpr double kSoft = 1e-5, kSofter = 1000.0;
 // An iteration with row exchanges takes ten times as long, and helps early if at all.
 constexpr int64_t kMaxIterPivot = 60;
 // From this number of forces, or of states and actions, on problems are solved one by one: the matrices of several side
-// by side would not fit into the cache.
-constexpr int64_t kAlone = 48;
+// by side would not fit into the cache. Forces that share few bodies are solved for faster alone, too (low_rank.hpp).
+constexpr int64_t kAloneForces = 40, kAlone = 48;
 // Elements are searched in chunks, so that the memory for all starts stays small.
 constexpr int64_t kJobs = 8192, kChunk = 64;
 
@@ -215,7 +215,7 @@ void MpcDriver::run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner
       batch.count, kernels.mpc_workspace(batch), false,
       [](void* context, void* workspace, Watch watch) {
         auto& c = *static_cast<Solving*>(context);
-        const bool large = std::max(c.batch.n_x + c.batch.n_u, c.batch.n_lam) >= kAlone;
+        const bool large = c.batch.n_x + c.batch.n_u >= kAlone || c.batch.n_lam >= kAloneForces;
         const auto solve = c.batch.count == 1 || large ? c.kernels.mpc_solve_alone : c.kernels.mpc_solve;
         solve(c.batch, c.solve, &c.next, workspace, watch);
       },

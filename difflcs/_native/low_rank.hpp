@@ -14,8 +14,8 @@ namespace {
 
 // The least number of forces for which this is faster.
 constexpr int64_t kLowRankFrom = 24;
-// F has a unit diagonal: entries of F - diag(rest) - W W^T up to the first number are rounding, and entries of rest from
-// the second on are large enough to divide by.
+// F has a unit diagonal: entries of F - diag(rest) - W W^T up to the first number are rounding, and entries of rest
+// from the second on are large enough to divide by.
 constexpr double kLowRankRounding = 2e-14, kLeastRest = 1e-6;
 // Part of a force's direction that has to lie across the rows of C if its rest is read from that.
 constexpr double kAcross = 0.01;

@@ -284,6 +284,29 @@ def test_large_problems_have_the_same_plans_alone_and_in_a_batch_with_systems_of
         torch.testing.assert_close(mpc(x, goal, lcs=model).u, u, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("compliance", [0.3, 1e-4])
+@pytest.mark.parametrize("shared", [False, True])
+def test_forces_on_few_bodies_have_the_plans_of_elimination(build, shared, compliance):
+    """Alone they are found in the size of what they move, side by side by elimination."""
+    n = build.normal(2)
+    rows = n(3, 32, 8)
+    rows[:, 2:, 6:] = 0.0  # of two states only the first two forces know
+    if not shared:
+        rows[:, 0, 7] = rows[:, 1, 6] = 0.0
+    F = rows @ rows.mT + torch.diag_embed(compliance * n(3, 32).exp())
+    A, B = 0.9 * torch.eye(8).double(), n(3, 8, 3)
+    lcs = LCSParams(A=A.expand(3, 8, 8), B=B, C=rows.mT, d=0 * n(3, 8), D=rows @ A, E=rows @ B, F=F, c=n(3, 32))
+    mpc = LCSMPCLayer(
+        lcs, GoalCost.reach(8, 3, goal_weight=0.5, input_weight=0.05), 3, -1.0, 1.0, backend=BatchedBackend(threads=1)
+    )
+    x0, goal = n(3, 8), torch.zeros(8).double()
+    together = mpc(x0, goal)
+    for i in range(3):
+        alone = mpc(x0[i], goal, lcs=LCSParams(**{name: value[i] for name, value in lcs.tensors().items()}))
+        torch.testing.assert_close(alone.u, together.u[i], rtol=1e-7, atol=1e-7)
+        torch.testing.assert_close(alone.lam, together.lam[i], rtol=1e-6, atol=1e-6)
+
+
 def test_iterations_hardly_grow_with_the_horizon():
     cost = GoalCost.reach(8, 1, goal_weight=[5.0] * 4 + [0.5] * 4, input_weight=0.005)
     low = torch.tensor([0.1] * 4 + [0.3] * 4, dtype=torch.float64)
