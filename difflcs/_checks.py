@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TypeGuard
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import ParamSpec, TypeGuard, TypeVar
 
 import numpy as np
 import torch
@@ -22,6 +23,9 @@ from difflcs.errors import (
     ShapeError,
 )
 
+P = ParamSpec("P")
+R = TypeVar("R")
+
 FLOATS = (torch.float32, torch.float64)
 _USABLE_DEVICES = ("cpu", "cuda", "mps", "xpu")
 
@@ -32,11 +36,36 @@ def describe(value: object) -> str:
         shape = "nested" if value.is_nested else str(tuple(value.shape))  # torch knows none of the former
         layout = "" if value.layout is torch.strided else f" {str(value.layout).removeprefix('torch.')}"
         return f"{shape}{layout} {str(value.dtype).removeprefix('torch.')} on {value.device}"
+    if isinstance(value, np.ndarray) and value.ndim:
+        return f"ndarray {value.shape} {value.dtype}"
     try:
         text = repr(value)
     except ValueError:  # Python writes no integers of more than 4300 digits
         text = "of many digits"
     return f"{type(value).__name__} {' '.join(text.split())}"[:120]
+
+
+def describe_shapes(tensors: Mapping[str, Tensor]) -> str:
+    """Describe tensors by name and shape for a repr, and the dtypes that are not float64: A(2, 2), d(2,)."""
+    kinds = {str(value.dtype).removeprefix("torch.") for value in tensors.values()} - {"float64"}
+    return ", ".join([*(f"{name}{tuple(value.shape)}" for name, value in tensors.items()), *sorted(kinds)])
+
+
+def to_tensor(value: object) -> object:
+    """Convert a NumPy array of real numbers to a float64 tensor, a copy; anything else stays as it is."""
+    if not isinstance(value, np.ndarray) or not value.ndim or value.dtype.kind not in "fiu":
+        return value
+    return torch.from_numpy(np.array(value, np.float64))
+
+
+def takes_arrays(function: Callable[P, R]) -> Callable[P, R]:
+    """Make a function of tensors take NumPy arrays, too: see `to_tensor`."""
+
+    @functools.wraps(function)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+        return function(*map(to_tensor, args), **{k: to_tensor(v) for k, v in kwargs.items()})  # pyright: ignore
+
+    return wrapper
 
 
 def did_you_mean(got: object, known: Iterable[str]) -> str:
@@ -248,7 +277,7 @@ def broadcast_batch(shapes: Iterable[tuple[str, torch.Size]]) -> torch.Size:
     for name, shape in named:
         wide = _broadcast(result, shape)
         if wide is None:
-            listing = ", ".join(f"{n} {tuple(s)}" for n, s in named)
+            listing = ", ".join(dict.fromkeys(f"{n} {tuple(s)}" for n, s in named if s))
             raise ShapeError(
                 f"{name}: its batch dimensions {tuple(shape)} do not fit the others ({listing}); "
                 f"expected equal batch dimensions, or none for a shared value"

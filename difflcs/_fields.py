@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable
 import torch
 from torch import Tensor, nn
 
-from difflcs._checks import check_tensor, describe
+from difflcs._checks import check_tensor, describe, describe_shapes
 from difflcs._differentiation import is_wrapped
 from difflcs._modules import fresh
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
@@ -37,7 +37,7 @@ class TensorFields(nn.Module):
 
     def extra_repr(self) -> str:
         names = [*dict(self.named_parameters(recurse=False)), *dict(self.named_buffers(recurse=False))]
-        return ", ".join(f"{name}{tuple(getattr(self, name).shape)}" for name in names)
+        return describe_shapes({name: getattr(self, name) for name in names})
 
 
 def check_by_stage(by_stage: Collection[str], names: Iterable[str], present: Iterable[str]) -> frozenset[str]:

@@ -7,7 +7,7 @@ from collections.abc import Collection
 import torch
 from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_same_device, check_tensor, describe, plain
+from difflcs._checks import broadcast_batch, check_same_device, check_tensor, describe, plain, takes_arrays
 from difflcs._differentiation import is_wrapped
 from difflcs._fields import TensorFields, check_by_stage, check_not_nan, check_stages
 from difflcs.errors import BoundsError, DTypeError, InvalidInputError, ShapeError
@@ -67,6 +67,7 @@ class StageBounds(TensorFields):
     u_min: Tensor
     u_max: Tensor
 
+    @takes_arrays
     def __init__(
         self,
         u_min: Tensor | float | None = None,
@@ -189,6 +190,7 @@ class LinearConstraints(_Constraints):
         InvalidInputError: g is −∞, or a weight is not positive.
     """
 
+    @takes_arrays
     def __init__(self, G: Tensor, g: Tensor, E: Tensor | None = None, weight: Tensor | float | None = None):
         super().__init__()
         self._fill(G, g, E, weight)
@@ -213,6 +215,7 @@ class ConstraintSequence(_Constraints):
         InvalidInputError: g is −∞, or a weight is not positive; no field is by stage.
     """
 
+    @takes_arrays
     def __init__(
         self,
         G: Tensor,

@@ -8,7 +8,7 @@ from typing import Protocol, Self, runtime_checkable
 import torch
 from torch import Tensor, nn
 
-from difflcs._checks import check_number, check_positive_int, check_same_device, check_tensor, describe
+from difflcs._checks import check_number, check_positive_int, check_same_device, check_tensor, describe, takes_arrays
 from difflcs._differentiation import is_wrapped, runs_eagerly
 from difflcs._fields import TensorFields, check_by_stage, check_stages
 from difflcs._linalg import matvec, quadratic
@@ -130,6 +130,7 @@ class QuadraticCost(_Quadratic):
         InvalidInputError: Q_final, or Q and R with S, has a negative eigenvalue.
     """
 
+    @takes_arrays
     def __init__(
         self,
         Q: Tensor,
@@ -180,6 +181,7 @@ class CostSequence(_Quadratic):
         InvalidInputError: Q_final, or Q and R with S, has a negative eigenvalue; no field is by stage.
     """
 
+    @takes_arrays
     def __init__(
         self,
         Q: Tensor,
@@ -289,6 +291,7 @@ class GoalCost(TensorFields):
     goal_stage: Tensor
     goal_final: Tensor
 
+    @takes_arrays
     def __init__(
         self,
         Q: Tensor,
@@ -325,6 +328,7 @@ class GoalCost(TensorFields):
         for name, value in fields.items():
             self._register(name, value)
 
+    @takes_arrays
     def forward(self, goal: Tensor, horizon: int = 1) -> QuadraticCost:
         """Compute the cost of one goal per batch element.
 
@@ -337,6 +341,7 @@ class GoalCost(TensorFields):
         """
         return QuadraticCost(**self.at(goal, horizon), check=False)
 
+    @takes_arrays
     def follow(self, reference: Tensor) -> CostSequence:
         """Compute the cost of goals that move: stage k tracks goal k, the final state the last one.
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_number, check_same_device, check_tensor
+from difflcs._checks import broadcast_batch, check_number, check_same_device, check_tensor, takes_arrays
 from difflcs._differentiation import Solver, is_wrapped, runs_eagerly, solve
 from difflcs.errors import ShapeError, SolveWarning
 from difflcs.status import Status
@@ -39,6 +39,7 @@ class LCPSolution(NamedTuple):
 
 
 @runs_eagerly
+@takes_arrays
 def solve_lcp(F: Tensor, q: Tensor, relaxation: float = 0.0, time_limit: float | None = None) -> LCPSolution:
     """Solve 0 ≤ λ ⊥ F λ + q ≥ 0 for a batch of P-matrices F (in particular F + Fᵀ ≻ 0).
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_choice, check_number, check_tensor, describe, is_array
+from difflcs._checks import broadcast_batch, check_choice, check_number, check_tensor, describe, is_array, takes_arrays
 from difflcs._differentiation import Solver, runs_eagerly, solve, transforms_active
 from difflcs._native import TOLERANCES, _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.errors import DTypeError, GammaError, InvalidInputError, NotPositiveDefiniteError, SolveError
@@ -29,6 +29,7 @@ _RANKS = (*map(len, SYSTEM.values()), 1, 1, 1)
 
 
 @runs_eagerly
+@takes_arrays
 def violation_loss(
     lcs: LCSModule | LCSParams,
     x: Tensor,
@@ -107,6 +108,7 @@ def violation_loss(
 
 
 @runs_eagerly
+@takes_arrays
 def prediction_loss(
     lcs: LCSModule | LCSParams,
     x: Tensor,

@@ -18,6 +18,9 @@ from difflcs._checks import (
     check_same_device,
     check_tensor,
     describe,
+    describe_shapes,
+    takes_arrays,
+    to_tensor,
 )
 from difflcs._differentiation import runs_eagerly
 from difflcs._linalg import matvec
@@ -95,6 +98,7 @@ class _Record(SystemMatrices):
 
     @runs_eagerly
     def __post_init__(self) -> None:
+        vars(self).update({name: to_tensor(value) for name, value in self.tensors().items()})
         tensors = self.tensors()
         for name, value in tensors.items():
             check_tensor(name, value, finite=False)
@@ -123,6 +127,9 @@ class _Record(SystemMatrices):
         self.batch_shape  # noqa: B018  raises where the batch dimensions do not fit each other
         check_positive_definite(self.F)
         vars(self)["_version"] = _version(self.F)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({describe_shapes(self.tensors())})"
 
     def check_again(self) -> None:
         """Refuse F if it was changed in place since it was checked, and is no longer positive definite."""
@@ -209,7 +216,7 @@ class _Record(SystemMatrices):
         return self._fits(x0=x0.shape[:-1], u_seq=u_seq.shape[:-2])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class LCSParams(_Record):
     """The matrices of one linear complementarity system, or of one per batch element (Eq. 1 of the paper).
 
@@ -235,6 +242,7 @@ class LCSParams(_Record):
     """
 
     @runs_eagerly
+    @takes_arrays
     def step(self, x: Tensor, u: Tensor) -> LCSPrediction:
         """Predict one step through the exact LCP.
 
@@ -250,6 +258,7 @@ class LCSParams(_Record):
         return advance(self, x, u)
 
     @runs_eagerly
+    @takes_arrays
     def rollout(self, x0: Tensor, u_seq: Tensor) -> Tensor:
         """Predict a trajectory.
 
@@ -267,7 +276,7 @@ class LCSParams(_Record):
         return torch.stack(states, dim=-2)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class LCSSequence(_Record):
     """One linear complementarity system per stage of a horizon H, e.g. linearised along a trajectory.
 
@@ -333,6 +342,7 @@ class LCSSequence(_Record):
         return LCSParams(**{n: v.select(v.ndim - self._rank(n), k) for n, v in self.tensors().items()})
 
     @runs_eagerly
+    @takes_arrays
     def rollout(self, x0: Tensor, u_seq: Tensor) -> Tensor:
         """Predict a trajectory through the stages.
 

@@ -233,12 +233,14 @@ class Inputs:
         tensors: name → tensor from the caller, or made from a goal by the cost.
         by_stage: names of the inputs with a dimension of stages.
         sizes: n_x, n_u, n_lam, n_c.
+        source: "goal" or "reference", of which the linear terms of the cost were made.
     """
 
     horizon: int
     tensors: dict[str, Tensor] = field(default_factory=dict)
     by_stage: set[str] = field(default_factory=set)
     sizes: dict[str, int] = field(default_factory=dict)
+    source: str = ""
 
     def add_system(self, lcs: System, x0: Tensor, context: Tensor | None, along: Primal | None = None) -> None:
         """Add the matrices; a module is asked for them at these states, or along a plan from there."""
@@ -278,6 +280,7 @@ class Inputs:
                 )
             if goal is not None and reference is not None:
                 raise ShapeError("goal: expected none with a reference, got both; the reference holds a goal per stage")
+            self.source = "reference" if goal is None else "goal"
             if goal is not None:
                 fields = cost.at(goal, self.horizon)
             else:
@@ -334,7 +337,9 @@ class Inputs:
         if len(distinct) <= 1 and all([tensor.is_cpu for tensor in self.tensors.values()]):
             return distinct.pop() if distinct else torch.Size()
         check_same_device(reversed(self.tensors.items()))
-        return broadcast_batch([(name, leads.get(name, torch.Size())) for name in reversed(self.tensors)])
+        made = ("q", "q_final", "constant") if self.source else ()
+        named = [(self.source if k in made else k, leads.get(k, torch.Size())) for k in reversed(self.tensors)]
+        return broadcast_batch(named)
 
     def rank(self, name: str) -> int:
         """Number of dimensions of an input behind those of the batch."""

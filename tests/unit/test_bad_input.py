@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from torch import nn
+from torch.utils._pytree import tree_leaves
 
 from difflcs import (
     ConstraintSequence,
@@ -51,7 +52,7 @@ BAD_TENSORS = {
     "bool": (lambda t: torch.zeros(t.shape, dtype=torch.bool), e.DTypeError, "got .*bool"),
     "complex": (lambda t: t.to(torch.complex128), e.DTypeError, "got .*complex128"),
     "list": (lambda t: t.tolist(), e.DTypeError, "(?s)expected a torch.Tensor, got list.*torch.as_tensor"),
-    "numpy": (lambda t: t.numpy(), e.DTypeError, "(?s)expected a torch.Tensor, got ndarray.*torch.as_tensor"),
+    "words": (lambda t: t.numpy().astype(str), e.DTypeError, r"expected a torch.Tensor, got ndarray \(.*\) <U.*wrap"),
     "none": (lambda t: None, (e.DTypeError, e.ShapeError), "expected .*(got|none)"),
     "meta": (lambda t: t.to("meta"), e.DeviceError, r"got .* on meta; move it with .*\.to\('cpu'\)"),
     "nan": (lambda t: spoil(t, NAN), e.NonFiniteError, "expected finite numbers, got 1 NaN or infinite of"),
@@ -131,6 +132,20 @@ def test_a_bad_tensor_is_refused_by_its_name(build, function, name, bad):
     assert all(p.grad is None for p in model.parameters())
 
 
+@pytest.mark.parametrize("function", sorted(ENTRIES.keys() - {"guess"}))
+def test_an_array_is_taken_like_a_tensor(build, function):
+    call, tensors = entry(build, function, build.model())
+
+    def numbers(**tensors):
+        made = call(**tensors)
+        made = made.state_dict() if isinstance(made, nn.Module) else getattr(made, "__dict__", made)
+        made = made["u"] if function == "call" else made  # a plan knows how long it took
+        return [v for v in tree_leaves(made) if isinstance(v, torch.Tensor)]
+
+    arrays = {name: value.numpy()[..., ::-1][..., ::-1] for name, value in tensors.items()}  # torch has no such strides
+    assert all(map(torch.equal, numbers(**arrays), numbers(**tensors)))
+
+
 @pytest.mark.parametrize("name", ["A", "D", "G", "c"])
 @pytest.mark.parametrize("function", ["violation_loss", "prediction_loss", "call"])
 def test_parameters_that_are_not_finite_are_refused(build, name, function):
@@ -186,6 +201,9 @@ FITS_NOT = {  # what does not fit, the error, and what it says
      "n_x=4, n_u=2 like.*n_x=4, n_u=3"),
     "batches of a layer": (lambda b: layer(b, lcs=b.params(batch=(2,)))(X.expand(3, 4)), e.ShapeError,
      r"batch dimensions .* do not fit.*x0 \(3,\)"),
+    "a goal of another batch": (
+     lambda b: layer(b, cost=GoalCost.reach(4, 2))(X.expand(3, 4), reference=X.expand(2, 3, 4)), e.ShapeError,
+     r"^reference: its batch dimensions \(2,\) do not fit the others \(x0 \(3,\), reference \(2,\)\)"),
     "a backend that is none": (lambda b: layer(b, backend="gurobi"), e.BackendNotFoundError,
      "expected one of .*'ipopt'.*got 'gurobi'.*register_backend"),
     "infinities that cancel": (lambda b: solve_lcp(EYE, torch.tensor([INF, -INF, 0.0]).double()), e.NonFiniteError,
