@@ -69,6 +69,11 @@ class MujocoContacts(NamedTuple):
     friction: Array
     geom: NDArray[np.intp]
 
+    def take(self, which: NDArray[np.bool_]) -> MujocoContacts:
+        """Return those of a mask (n_contacts,)."""
+        gap, normal, tangent, friction = (values[:, which] for values in self[:4])
+        return MujocoContacts(gap, normal, tangent, friction, self.geom[:, which])
+
 
 class Budget(NamedTuple):
     """So many contacts of these pairs.

@@ -102,7 +102,7 @@ def correct(
     trees, tree = np.unique(step.tree, return_inverse=True)
     mass = (tree[:, None] == np.arange(len(trees))) / np.diagonal(step.inverse_mass, axis1=1, axis2=2)[:, :, None]
 
-    def size(moved: Array) -> Array:
+    def size(moved: NDArray[Any]) -> Array:
         """Size (n, n_trees) of a change of velocity (n, 2 nv), by its energy."""
         return np.sqrt(np.einsum("nv,nvt->nt", moved[:, nv : 2 * nv] ** 2, mass))
 

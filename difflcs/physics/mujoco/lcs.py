@@ -159,8 +159,8 @@ class MujocoLCS:
         distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
         self.length, self._recovery = length, Recovery(model, length)
         self._selection = ContactSelection(model, contacts, distance) if isinstance(contacts, Sequence) else None
-        count = contacts if contacts is None or self._selection else check_positive_int("contacts", contacts)
-        budgets = self._selection.budgets if self._selection else count
+        budgets: Any = self._selection.budgets if self._selection else contacts
+        budgets = budgets if contacts is None or self._selection else check_positive_int("contacts", contacts)
         plain = motion == "dynamic" and pairs is None and friction is None
         self._whole = WholeStep(model, self._motion.steps, limits != 0) if plain else None
         self._places = Places(model, self._data)
@@ -240,7 +240,7 @@ class MujocoLCS:
             rows = scale(found, found.gap, 1.0, response, self._give, 1.0)
         if not rough.all():
             rows = rows.after(contacts.gap[:, ~rough], contacts.normal[:, ~rough])
-            contacts = MujocoContacts(*(values[:, rough] for values in contacts))
+            contacts = contacts.take(rough)
         effect = None if step is None else step.effect(read.tangent, rows.normal, rows.impulse)
         ranks = zip(free, (2, 2, 1, 2), strict=True)
         system = contact_lcs(
