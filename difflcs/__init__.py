@@ -5,6 +5,7 @@ import logging
 from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds
 from difflcs.cost import CostModule, CostSequence, GoalCost, QuadraticCost
 from difflcs.errors import BackendNotFoundError, DiffLCSError, SolveError
+from difflcs.fit import FitReport, Transitions, fit_report
 from difflcs.lcp import LCPSolution, solve_lcp
 from difflcs.lcs import LCSModel, LCSModule, LCSParams, LCSSequence
 from difflcs.losses import prediction_loss, violation_loss
@@ -25,6 +26,7 @@ __all__ = [
     "CostModule",
     "CostSequence",
     "DiffLCSError",
+    "FitReport",
     "GoalCost",
     "LCPSolution",
     "LCSMPCLayer",
@@ -40,7 +42,9 @@ __all__ = [
     "SolveError",
     "StageBounds",
     "Status",
+    "Transitions",
     "available_backends",
+    "fit_report",
     "prediction_loss",
     "register_backend",
     "sequence_along",

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TypeGuard
+from typing import Any, TypeGuard
 
 import torch
 from torch import Tensor, nn
@@ -64,7 +64,56 @@ def _check_support(support: object, n_u: int) -> Tensor:
     return support.detach()
 
 
-class LCSModel(nn.Module):
+class PredictiveModule(nn.Module):
+    """A module of an LCS that predicts steps and trajectories of it; subclasses have sizes and `params`."""
+
+    n_x: int
+    n_u: int
+    n_lam: int
+    params: Callable[..., Any]
+
+    @runs_eagerly
+    @takes_arrays
+    def forward(self, x: Tensor, u: Tensor) -> LCSPrediction:
+        """Predict one step through the exact LCP.
+
+        Args:
+            x: (..., n_x) states.
+            u: (..., n_u) actions; batch dimensions broadcast with those of x.
+
+        Returns:
+            x_next (..., n_x) and lam (..., n_lam), differentiable in x, u and every parameter.
+        """
+        self.check_inputs(x=x, u=u)
+        broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1])])
+        return advance(self.params(x), x, u)
+
+    @runs_eagerly
+    @takes_arrays
+    def rollout(self, x0: Tensor, u_seq: Tensor) -> Tensor:
+        """Predict a trajectory.
+
+        Args:
+            x0: (..., n_x) initial states.
+            u_seq: (..., T, n_u) actions, T ≥ 0.
+
+        Returns:
+            (..., T+1, n_x) states, x0 first.
+        """
+        check_sequence(self.n_u, u_seq)
+        self.check_inputs(x0=x0, u_seq=u_seq)
+        batch = broadcast_batch([("x0", x0.shape[:-1]), ("u_seq", u_seq.shape[:-2])])
+        states = [x0.expand(*batch, self.n_x)]
+        for t in range(u_seq.shape[-2]):
+            states.append(self(states[-1], u_seq[..., t, :]).x_next)
+        return torch.stack(states, dim=-2)
+
+    def check_inputs(self, **tensors: Tensor) -> None:
+        """Check states `x…` and actions `u…` against the model's sizes, dtype-class and device."""
+        check_inputs(self.n_x, self.n_u, next(self.parameters()), tensors, owner="model")
+
+
+class LCSModel(PredictiveModule):
     """A learnable linear complementarity system (Eq. 1 of the paper), F = G Gᵀ + stiffness·I + H − Hᵀ.
 
     The parametrisation keeps F + Fᵀ ⪰ 2·stiffness·I for any G and H, so that the LCP always has one solution.
@@ -169,46 +218,6 @@ class LCSModel(nn.Module):
         if recalls:
             self._made.keep((self.stiffness, params.F.clone()), tensors)
         return params
-
-    @runs_eagerly
-    @takes_arrays
-    def forward(self, x: Tensor, u: Tensor) -> LCSPrediction:
-        """Predict one step through the exact LCP.
-
-        Args:
-            x: (..., n_x) states.
-            u: (..., n_u) actions; batch dimensions broadcast with those of x.
-
-        Returns:
-            x_next (..., n_x) and lam (..., n_lam), differentiable in x, u and every parameter.
-        """
-        self.check_inputs(x=x, u=u)
-        broadcast_batch([("x", x.shape[:-1]), ("u", u.shape[:-1])])
-        return advance(self.params(x), x, u)
-
-    @runs_eagerly
-    @takes_arrays
-    def rollout(self, x0: Tensor, u_seq: Tensor) -> Tensor:
-        """Predict a trajectory.
-
-        Args:
-            x0: (..., n_x) initial states.
-            u_seq: (..., T, n_u) actions, T ≥ 0.
-
-        Returns:
-            (..., T+1, n_x) states, x0 first.
-        """
-        check_sequence(self.n_u, u_seq)
-        self.check_inputs(x0=x0, u_seq=u_seq)
-        batch = broadcast_batch([("x0", x0.shape[:-1]), ("u_seq", u_seq.shape[:-2])])
-        states = [x0.expand(*batch, self.n_x)]
-        for t in range(u_seq.shape[-2]):
-            states.append(self(states[-1], u_seq[..., t, :]).x_next)
-        return torch.stack(states, dim=-2)
-
-    def check_inputs(self, **tensors: Tensor) -> None:
-        """Check states `x…` and actions `u…` against the model's sizes, dtype-class and device."""
-        check_inputs(self.n_x, self.n_u, self.A, tensors, owner="model")
 
     @classmethod
     def from_params(cls, params: LCSParams, stiffness: float | None = None) -> LCSModel:

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TypeVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_same_device, check_tensor, describe, takes_arrays
+from difflcs import _storage
+from difflcs._checks import broadcast_batch, check_number, check_same_device, check_tensor, describe, takes_arrays
 from difflcs._linalg import matvec
-from difflcs.errors import InvalidInputError
+from difflcs._modules import plain_state
+from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
+from difflcs.lcs import LCSModel, PredictiveModule
 from difflcs.records import LCSModule, LCSParams, LCSSequence, system_at
 
-# In units in which states and actions are about one. From 0.001 to 0.1 made no difference to a block between two
-# fingers (prediction error within 7 %); from 1 on breaking the contact law is so cheap that it was not learned.
+# In units in which states and actions are about one: from 1 on, breaking the contact law is so cheap that it is not
+# learned (docs/figures/xi.py).
 _XI = 0.01
 # Relaxation in parts of the squared step: where a contact switches λ = w = √relaxation, here 0.22 of a step. It gives
 # the layer's default of 1e-5 for the paper's fingers, which move by 1.5 cm a step.
@@ -135,32 +141,59 @@ def suggest_scales(x: Tensor, u: Tensor, x_next: Tensor) -> Scales:
     return Scales(center, state, action, _XI, _RELAXATION * step * step)
 
 
-class ScaledLCS(nn.Module):
+class ScaledLCS(PredictiveModule):
     """An `LCSModule` that was learned in units of `Scales`, for states and actions in the units of the data.
 
-    Its parameters are those of the module within, so that a layer that takes it goes on learning in these units.
+    Its parameters are those of the module within, so that a layer that takes it goes on learning in these units. It
+    predicts in the units of the data: `forward` and `rollout` are those of `LCSModel`.
     """
 
     def __init__(self, lcs: LCSModule, scales: Scales):
         super().__init__()
         self.lcs, self.scales = lcs, scales
-
-    @property
-    def n_x(self) -> int:
-        """Number of states."""
-        return self.lcs.n_x
-
-    @property
-    def n_u(self) -> int:
-        """Number of actions."""
-        return self.lcs.n_u
-
-    @property
-    def n_lam(self) -> int:
-        """Number of complementarity variables."""
-        return self.lcs.n_lam
+        self.n_x, self.n_u, self.n_lam = lcs.n_x, lcs.n_u, lcs.n_lam
 
     def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams | LCSSequence:
         """Return the system in the units of the data; the module within gets states in its units."""
         inner = system_at(self.lcs, None if x is None else self.scales.states(x), context)
         return self.scales.params(inner)
+
+    def save_pretrained(self, directory: str | os.PathLike[str]) -> None:
+        """Write the `LCSModel` within and its scales into a directory, atomically (created if needed).
+
+        Raises:
+            DTypeError: the module within is no `LCSModel`; save its `state_dict` and the scales yourself.
+        """
+        if not isinstance(self.lcs, LCSModel):
+            raise DTypeError(
+                f"lcs: expected an LCSModel within, got {describe(self.lcs)}; save its state_dict() and the scales"
+            )
+        tensors = {f"scales.{name}": getattr(self.scales, name) for name in ("center", "state", "action")}
+        tensors |= {f"lcs.{name}": value for name, value in plain_state(self.lcs).items()}
+        numbers = {"xi": self.scales.xi, "relaxation": self.scales.relaxation}
+        _storage.save_record(Path(directory), "ScaledLCS", {"lcs": self.lcs.config(), **numbers}, tensors)
+
+    @classmethod
+    def from_pretrained(cls, directory: str | os.PathLike[str]) -> ScaledLCS:
+        """Read what `save_pretrained` wrote.
+
+        Raises:
+            CheckpointError: files are missing, corrupt or of another kind; nothing is changed.
+        """
+        config, tensors = _storage.load_record(Path(directory), "ScaledLCS")
+        parts = {"lcs": {}, "scales": {}}
+        for name, value in tensors.items():
+            part, _, rest = name.partition(".")
+            parts.setdefault(part, {})[rest] = value
+        settings, inner = {name: config.get(name) for name in ("xi", "relaxation")}, config.get("lcs")
+        try:
+            numbers = {name: check_number(name, value, strict=True) for name, value in settings.items()}
+        except InvalidInputError as error:
+            raise CheckpointError(f"{directory}: its scales cannot be used: {error}") from error
+        if not isinstance(inner, Mapping):
+            raise CheckpointError(f"{directory}: expected the fields of an LCSModel, got {_storage.short(inner)}")
+        lcs = LCSModel.from_config(inner, parts["lcs"], str(directory))
+        shapes = {"center": lcs.n_x, "state": lcs.n_x, "action": lcs.n_u}
+        wanted = {name: ((size,), torch.float64) for name, size in shapes.items()}
+        _storage.check_tensors(directory, "scales", parts["scales"], wanted)
+        return cls(lcs, Scales(*(parts["scales"][name] for name in shapes), **numbers))

@@ -44,11 +44,15 @@ constexpr double kSame = 0.02;
 // multiple of the relaxation.
 constexpr int64_t kSteps = 1, kStepsAgain = 2;
 constexpr double kLonger = 1000.0;
+// Starts are compared at a relaxation of kSoft, but at most kSofter times the problem's, if that is harder; the plans
+// that may win are then solved at the problem's own. Almost hard contact has more optima, and its kinks keep a plan
+// where it begins.
+constexpr double kSoft = 1e-5, kSofter = 1000.0;
 // An iteration with row exchanges takes ten times as long, and helps early if at all.
 constexpr int64_t kMaxIterPivot = 60;
 // From this number of forces, or of states and actions, on problems are solved one by one: the matrices of several side
-// by side would not fit into the cache.
-constexpr int64_t kAlone = 48;
+// by side would not fit into the cache. Forces that share few bodies are solved for faster alone, too (low_rank.hpp).
+constexpr int64_t kAloneForces = 40, kAlone = 48;
 // Elements are searched in chunks, so that the memory for all starts stays small.
 constexpr int64_t kJobs = 8192, kChunk = 64;
 
@@ -142,9 +146,12 @@ MpcSolve solver_options(const MpcEffort& effort, const MpcPlans& out) {
 // A problem that begins where its homotopy ends, as a guess does.
 MpcStart at_target(const MpcBatch& b) { return {false, false, 0.0, b.relaxation}; }
 
+// The relaxation at which starts are compared.
+double comparison(const MpcBatch& b) { return std::max(b.relaxation, std::min(kSoft, kSofter * b.relaxation)); }
+
 MpcStart beginning(const Start& s, const MpcBatch& b, const MpcEffort& effort) {
   return {s.released, s.gauss_newton, effort.homotopy > 0 ? 0.0 : s.first,
-          b.relaxation * std::max(effort.homotopy, 1.0)};
+          comparison(b) * std::max(effort.homotopy, 1.0)};
 }
 
 MpcPlans shifted(const MpcBatch& b, MpcPlans p, int64_t by) {
@@ -208,7 +215,7 @@ void MpcDriver::run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner
       batch.count, kernels.mpc_workspace(batch), false,
       [](void* context, void* workspace, Watch watch) {
         auto& c = *static_cast<Solving*>(context);
-        const bool large = std::max(c.batch.n_x + c.batch.n_u, c.batch.n_lam) >= kAlone;
+        const bool large = c.batch.n_x + c.batch.n_u >= kAlone || c.batch.n_lam >= kAloneForces;
         const auto solve = c.batch.count == 1 || large ? c.kernels.mpc_solve_alone : c.kernels.mpc_solve;
         solve(c.batch, c.solve, &c.next, workspace, watch);
       },
@@ -234,7 +241,8 @@ void MpcDriver::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEff
   if (batch.count == 0) return;
   MpcEffort effort = asked;
   if (batch.n_lam == 0) effort.starts = 1;  // without contact there is one optimum
-  const auto way = effort.starts == 1 ? &MpcDriver::solve_once : &MpcDriver::search;
+  const bool once = effort.starts == 1 && (batch.n_lam == 0 || comparison(batch) == batch.relaxation);
+  const auto way = once ? &MpcDriver::solve_once : &MpcDriver::search;
   const int64_t chunk = std::max(kChunk, kJobs / effort.starts);
   for (int64_t first = 0; first < batch.count; first += chunk)
     (this->*way)(batch, guess, effort, out, runner, first, std::min(chunk, batch.count - first));
@@ -275,6 +283,7 @@ void MpcDriver::explore(const MpcBatch& batch, const MpcEffort& effort, Runner& 
   MpcBatch jobs = batch;
   jobs.count = count;
   jobs.element = tried.element.data() + first;
+  jobs.relaxation = comparison(batch);
   MpcSolve o = solver_options(effort, shifted(batch, tried.plans(), first));
   o.u_start = o.u;
   o.start = tried.start.data() + first;
@@ -284,6 +293,8 @@ void MpcDriver::explore(const MpcBatch& batch, const MpcEffort& effort, Runner& 
   }
   o.gained = tried.gained.data() + first;
   run(jobs, o, runner);
+  for (int64_t j = first; j < first + count && jobs.relaxation > batch.relaxation; j++)  // solved there alone
+    if (solved(tried.status[j])) tried.status[j] = int8_t(Status::max_iter);
 }
 
 // Solves elements [first, first + count) from one start.
@@ -439,7 +450,7 @@ void MpcDriver::retry_failed(const MpcBatch& batch, const MpcEffort& effort, con
   tried.resize(batch, count);
   for (int64_t i = 0; i < count; i++) {
     tried.element[i] = batch.element ? batch.element[origin[i]] : origin[i];
-    tried.start[i] = {false, false, 0.0, batch.relaxation * kLonger * std::max(effort.homotopy / 100.0, 1.0)};
+    tried.start[i] = {false, false, 0.0, comparison(batch) * kLonger * std::max(effort.homotopy / 100.0, 1.0)};
   }
   MpcBatch jobs = batch;
   jobs.count = count;

@@ -2,6 +2,7 @@
 // dx+ = A_hat (dx, du), and the second derivative of lam. difflcs/mpc/kkt.py derives it.
 #pragma once
 #include "lanes.hpp"
+#include "low_rank.hpp"
 #include "lu.hpp"
 #include "matrix.hpp"
 #include "mpc_problem.hpp"
@@ -76,10 +77,13 @@ class Linearisation {
     const StageData<T, S> data = problem.stage(k);
     const auto F = data.F;
     const auto C = data.C;
+    const LowRank low_rank = problem.low_rank[k];
+    const bool short_cut = kLanes == 1 && kL == 0 && !kept && low_rank;
     for (int64_t i = 0; i < nl; i++) {
       stage.size[i] = 1.0 / (lam[i] + s[i]);
       a[i] = s[i] * stage.size[i];
       b[i] = lam[i] * stage.size[i];
+      if (short_cut) low_rank.weigh(i, a[i], b[i]);
     }
     Local<kL * kL> left(stage.M.entries), right(right_factors);
     // diag(a) + diag(b) F, or diag(a) + F diag(b)
@@ -92,19 +96,29 @@ class Linearisation {
       }
       lu.factor(nl, matrix, exchanged);
     };
-    eliminate(left, stage.rows, true);
-    for (int64_t i = 0; i < nl * nl; i++) stage.M.entries[i] = left[i];
+    if (short_cut) {
+      low_rank.factor();
+    } else {
+      eliminate(left, stage.rows, true);
+      for (int64_t i = 0; i < nl * nl; i++) stage.M.entries[i] = left[i];
+    }
     // y = (diag(s) + F^T diag(lam))^-1 (-C^T p), from the same factors.
     for (int64_t i = 0; i < nl; i++) stage.y[i] = all(0) - C.column(i) * p;
-    lu.solve_transposed(nl, stage.M.entries, stage.rows, stage.y);
+    if (short_cut)
+      low_rank.solve_right(stage.y);
+    else
+      lu.solve_transposed(nl, stage.M.entries, stage.rows, stage.y);
     // Since a dlam + b ds = 0, both follow from one T: K_lam = b T, K_s = -a T with (diag(a) + F diag(b)) T = -[D E].
-    eliminate(right, right_rows, false);
+    if (!short_cut) eliminate(right, right_rows, false);
     by_columns(0, nw, [&](int64_t j, auto kind) {
       using V = decltype(kind);
       Local<kL, V> t(column);
       DIFFLCS_UNROLL
       for (int64_t i = 0; i < nl; i++) t[i] = V{} - read<V>(data.DE[i], j);
-      lu.solve(nl, right, right_rows, t);
+      if constexpr (kLanes == 1 && kL == 0)
+        short_cut ? low_rank.solve_right(t.v) : lu.solve(nl, right, right_rows, t);
+      else
+        lu.solve(nl, right, right_rows, t);
       DIFFLCS_UNROLL
       for (int64_t i = 0; i < nl; i++) {
         write<V>(slopes[i], j, t[i]);

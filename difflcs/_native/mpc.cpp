@@ -3,7 +3,7 @@
 // For F + F^T positive definite the relaxed complementarity lam o s = eps has one solution, smooth in (x, u).
 // Eliminating lam leaves a smooth optimal control problem in u alone with box bounds. difflcs/mpc/kkt.py derives its
 // conditions and their sensitivity, and the names are the names there:
-//   relaxed_lcp.hpp     lam of one stage                        mpc_problem.hpp  data, dynamics, cost
+//   relaxed_lcp.hpp     lam of one stage (low_rank.hpp: large)  mpc_problem.hpp  data, dynamics, cost
 //   linearisation.hpp   a stage with lam eliminated             riccati.hpp      gradient, active bounds, feedback law
 //   solve.hpp           projected Newton along the homotopy     progress.hpp     how far each problem has come
 //   adjoint.hpp         directions of the solution              input_gradients.hpp  gradients of the inputs

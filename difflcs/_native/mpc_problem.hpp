@@ -3,6 +3,7 @@
 #pragma once
 #include "kernels.hpp"
 #include "lanes.hpp"
+#include "low_rank.hpp"
 #include "matrix.hpp"
 #include "sizes.hpp"
 
@@ -129,6 +130,7 @@ struct ProblemData {
   T* cost_unit;
   T* weight;      // largest weight of the cost
   Steps<T> rest;  // curvature of each action by the next stage's weights alone: the least scale of its gradient
+  LowRank low_rank;  // of F
   Steps<Vec> d, c, q, r, u_min, u_max, g, price;
   Steps<Vec> per_width;  // reciprocal of each action's range, zero where that is zero or infinite
   Vec *q_final, *x0;
@@ -152,6 +154,7 @@ struct ProblemData {
     arena.take(DE, systems, nl, nw);
     arena.take(F, systems, nl, nl);
     arena.take(scale, systems, nl);
+    low_rank.layout(arena, systems, nl, !batch.pivot);
     arena.take(Q, costs, nx, nx);
     arena.take(R, costs, nu, nu);
     arena.take(cross, costs, nx, nu);
@@ -226,6 +229,7 @@ struct ProblemData {
       matrix(to.D(), kD, k, contact, one);
       matrix(to.E(), kE, k, contact, one);
       matrix(to.F, kF, k, contact, contact);
+      low_rank.find(k, to.F, to.C);
     }
     for (int64_t k = 0; k < Q.count; k++) {
       matrix(Q[k], kQ, k, one, cost);

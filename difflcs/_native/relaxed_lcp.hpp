@@ -6,6 +6,7 @@
 #pragma once
 #include "kernels.hpp"
 #include "lanes.hpp"
+#include "low_rank.hpp"
 #include "lu.hpp"
 #include "matrix.hpp"
 
@@ -33,6 +34,7 @@ inline void lcp_slack(int64_t n, const T* F, const Vec* q, const Vector& lam, Ve
 template <class T, int64_t N, bool kMayPivot>
 class RelaxedLcp {
   const Elimination<kMayPivot> lu;
+  const LowRank low_rank;
   const int64_t given;
   const Matrix<const T, N, N> F;
   const Vec* const q;
@@ -47,9 +49,11 @@ class RelaxedLcp {
  public:
   static int64_t scratch(int64_t n) { return n * n + 7 * n; }
 
-  // `memory`: scratch(n) numbers; `exchanged`: n row numbers.
-  DIFFLCS_INLINE RelaxedLcp(int64_t n, const T* F, const Vec* q, Vec* memory, Mask* exchanged, bool pivot = false)
+  // `memory`: scratch(n) numbers; `exchanged`: n row numbers; `low_rank`: of F.
+  DIFFLCS_INLINE RelaxedLcp(int64_t n, const T* F, const Vec* q, Vec* memory, Mask* exchanged, bool pivot = false,
+                            const LowRank& low_rank = {})
       : lu{pivot},
+        low_rank(low_rank),
         given(n),
         F{F, {n}, {n}, {n}},
         q(q),
@@ -131,7 +135,14 @@ class RelaxedLcp {
   DIFFLCS_INLINE Vec evaluate(Vec eps4) {
     const int64_t n = size();
     Vec sum = all(0);
-    multiply(F, next, [&](int64_t i) { return q[i]; }, [&](int64_t i, Vec t) { w_next[i] = t; });
+    if (kMayPivot && kLanes == 1 && low_rank)  // F is symmetric: by columns, for several rows at a time
+      by_columns(0, n, [&](int64_t i, auto kind) {
+        auto t = read<decltype(kind)>(q, i);
+        for (int64_t j = 0; j < n; j++) t += next[j] * read<decltype(kind)>(F[j], i);
+        write<decltype(kind)>(&w_next[0], i, t);
+      });
+    else
+      multiply(F, next, [&](int64_t i) { return q[i]; }, [&](int64_t i, Vec t) { w_next[i] = t; });
     DIFFLCS_UNROLL
     for (int64_t i = 0; i < n; i++) {
       const Vec t = w_next[i], diff = next[i] - t;
@@ -160,16 +171,26 @@ class RelaxedLcp {
   // lanes that are not `done`. The generalised Jacobian of g is diag(a) + diag(b) F, a = 1 - ratio and b = 1 + ratio.
   DIFFLCS_INLINE void advance(Vec eps4, Mask done, int trials) {
     const int64_t n = size();
+    const bool short_cut = kMayPivot && kLanes == 1 && low_rank;
     DIFFLCS_UNROLL
     for (int64_t i = 0; i < n; i++) {
       const Vec ratio = (lam[i] - w[i]) / root[i], b = 1.0 + ratio;
+      step[i] = root[i] - lam[i] - w[i];
+      if (short_cut) {
+        low_rank.weigh(i, 1.0 - ratio, b);
+        continue;
+      }
       DIFFLCS_UNROLL
       for (int64_t j = 0; j < n; j++) jacobian[i * n + j] = b * F(i, j);
       jacobian[i * n + i] += 1.0 - ratio;
-      step[i] = root[i] - lam[i] - w[i];
     }
-    lu.factor(n, jacobian, rows);
-    lu.solve(n, jacobian, rows, step);
+    if (short_cut) {
+      low_rank.factor();
+      low_rank.solve(&step[0]);
+    } else {
+      lu.factor(n, jacobian, rows);
+      lu.solve(n, jacobian, rows, step);
+    }
     Vec length = all(1), merit_next = merit;
     for (int trial = 0; trial < trials; trial++) {
       DIFFLCS_UNROLL

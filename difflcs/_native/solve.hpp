@@ -56,9 +56,10 @@ class Solver {
   bool halted(Watch watch) const { return n.l() > 16 && watch.stop(watch.context); }
 
   // lam and s of one stage, from the guess in `lam`; lanes in `skip` keep both.
-  void contacts(const StageData<T, S>& data, const Vec* x, const Vec* u, Vec* lam, Vec* s, Mask skip) {
+  void contacts(int64_t k, const StageData<T, S>& data, const Vec* x, const Vec* u, Vec* lam, Vec* s, Mask skip) {
     data.gap(x, u, progress.gap);
-    Lcp(n.l(), data.F.entries, progress.gap, newton, rows, batch.pivot).solve(lam, s, progress.eps, skip);
+    Lcp(n.l(), data.F.entries, progress.gap, newton, rows, batch.pivot, problem.low_rank[k])
+        .solve(lam, s, progress.eps, skip);
   }
 
   // Roll u out at eps in the lanes of `wanted`; returns the cost of every lane.
@@ -66,7 +67,7 @@ class Solver {
     for (int64_t i = 0; i < n.x(); i++) at.x(0, i) = problem.x0[i];
     for (int64_t k = 0; k < n.h && !halted(watch); k++) {
       const StageData<T, S> data = problem.stage(k);
-      contacts(data, at.x[k], at.u[k], at.lam[k], at.s[k], ~wanted | progress.released);
+      contacts(k, data, at.x[k], at.u[k], at.lam[k], at.s[k], ~wanted | progress.released);
       data.next_state(at.x[k], at.u[k], at.lam[k], at.x[k + 1]);
     }
     return problem.cost(at);
@@ -100,7 +101,7 @@ class Solver {
         const Vec near = max(at.lam(k, j) + riccati.force_change(k, j, dx, du), 0.1 * at.lam(k, j));
         next.lam(k, j) = select(skip, next.lam(k, j), near);
       }
-      contacts(data, next.x[k], next.u[k], next.lam[k], next.s[k], skip);
+      contacts(k, data, next.x[k], next.u[k], next.lam[k], next.s[k], skip);
       data.next_state(next.x[k], next.u[k], next.lam[k], next.x[k + 1]);
     }
     return problem.cost(next);

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils._pytree import register_pytree_node
 
 from difflcs._checks import describe_shapes
 from difflcs._differentiation import is_wrapped
+from difflcs._optional import require
+from difflcs.errors import BatchIndexError
 from difflcs.mpc.problem import MPCProblem
 from difflcs.status import Status, solved
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["MPCSolution", "Primal", "Status"]
 
@@ -99,6 +105,46 @@ class MPCSolution:
         """Shift the plan by one step and repeat its last: a guess for the next solve of a receding horizon."""
         parts = (self.x, self.u, self.lam, self.mu)
         return Primal(*(torch.cat([v[..., 1:, :], v[..., -1:, :]], -2).detach() for v in parts))
+
+    def plot(self, element: int = 0) -> Figure:
+        """Draw a plan: states, actions between their bounds, forces and gaps; needs matplotlib.
+
+        Args:
+            element: of a batch, counted through all its dimensions.
+
+        Raises:
+            BatchIndexError: there is no such element.
+            MissingDependencyError: matplotlib is not installed.
+        """
+        require("matplotlib")
+        from matplotlib.figure import Figure
+
+        count = self.status.numel()
+        if not -count <= element < count:
+            raise BatchIndexError(f"element: expected one of a batch of {count}, got {element}; choose another")
+        x, u, lam = self._flat()
+        gap = self.problem.steps().gap(*_by_step(x[:, :-1], u, lam)).transpose(0, 1)
+        figure = Figure(figsize=(9, 5.5), layout="constrained")
+        panels = figure.subplots(2, 2, sharex=True).flat
+        parts = {"states x": x, "actions u": u, "forces λ": lam, "gaps": gap}
+        for axes, (name, values) in zip(panels, parts.items(), strict=True):
+            rows = values[element].numpy()
+            for i, row in enumerate(rows.T):
+                # A state is at a stage; the rest holds from one stage to the next.
+                axes.plot(row, ".-", label=i) if values is x else axes.stairs(row, baseline=None, lw=1.5, label=i)
+            if values is u:
+                for bound in self.problem.bounds():
+                    edges = bound.expand(u.shape)[element].T.numpy()
+                    for i, row in enumerate(edges):
+                        if np.isfinite(row).all():
+                            axes.stairs(row, baseline=None, ls=":", color=f"C{i}")
+            axes.xaxis.get_major_locator().set_params(integer=True)
+            axes.set(title=name, xlabel="" if values is x or values is u else "stage")
+            if 0 < rows.shape[1] <= 10:
+                axes.legend(ncols=2, fontsize=8)
+        status = Status(int(self.status.flatten()[element])).name
+        figure.suptitle(f"{status}, cost {float(self.objective.detach().flatten()[element]):.4g}")
+        return figure
 
     def _flat(self) -> tuple[Tensor, Tensor, Tensor]:
         return tuple(  # pyright: ignore[reportReturnType]

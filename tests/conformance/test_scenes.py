@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from tests.conformance import scenes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-KNOWN = {217}  # a robot jammed between floor and limits, with more creep than in MuJoCo
+KNOWN = {126}  # a light link between limits, which another control than the nominal one throws about
 
 
 @pytest.mark.parametrize("first", range(0, 240, 40))

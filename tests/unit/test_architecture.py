@@ -16,7 +16,7 @@ MOST_LINES, MOST_CLASS_LINES = 500, 300
 # own line and those above it here; what begins with "_" helps all, and knows errors alone. The zoo knows files only.
 LAYERS = (
     ("errors",),
-    ("lcs", "lcp", "records", "losses", "scales", "cost", "constraints", "status", "zoo"),
+    ("lcs", "lcp", "records", "losses", "scales", "fit", "cost", "constraints", "status", "zoo"),
     ("systems",),
     ("mpc",),
     ("physics",),

@@ -176,6 +176,25 @@ def test_a_contact_that_is_far_is_found(limit, effort):
     assert float((ours <= best + 1e-3 * best.abs()).double().mean()) >= 0.9
 
 
+@pytest.mark.parametrize("effort", ["fast", "default"])
+def test_plans_for_almost_hard_contact_cost_less_where_contact_is_hard(build, effort):
+    lcs, call = build.pushing(0, 5), data(build, 32)
+    mpc = pushing(build, 5, lcs=lcs, effort=effort)
+
+    def executed(relaxation):
+        mpc.relaxation = relaxation
+        plan = mpc(*call)
+        assert (plan.status == 0).all()
+        assert plan.complementarity().max() < 1e-3 * relaxation
+        return mpc(*call, guess=plan).u, plan.problem.objective(lcs.rollout(call[0], plan.u), plan.u)
+
+    (_, soft), (again, hard) = executed(1e-5), executed(1e-7)
+    gain = (soft - hard) / (1 + soft.abs())
+    assert gain.mean() > 0.002
+    assert gain.min() > -0.05
+    assert torch.isfinite(again).all()
+
+
 def test_a_guess_is_the_only_start_unless_the_best_is_wanted(build):
     x0, goal = data(build, 32, 4)
     poor, stays, moves = (pushing(build, 8, 1, effort=effort) for effort in ("fast", "default", "best"))
@@ -263,6 +282,29 @@ def test_large_problems_have_the_same_plans_alone_and_in_a_batch_with_systems_of
     together = mpc(x0, goal).u
     for model, x, u in zip(models, x0, together, strict=True):
         torch.testing.assert_close(mpc(x, goal, lcs=model).u, u, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("compliance", [0.3, 1e-4])
+@pytest.mark.parametrize("shared", [False, True])
+def test_forces_on_few_bodies_have_the_plans_of_elimination(build, shared, compliance):
+    """Alone they are found in the size of what they move, side by side by elimination."""
+    n = build.normal(2)
+    rows = n(3, 32, 8)
+    rows[:, 2:, 6:] = 0.0  # of two states only the first two forces know
+    if not shared:
+        rows[:, 0, 7] = rows[:, 1, 6] = 0.0
+    F = rows @ rows.mT + torch.diag_embed(compliance * n(3, 32).exp())
+    A, B = 0.9 * torch.eye(8).double(), n(3, 8, 3)
+    lcs = LCSParams(A=A.expand(3, 8, 8), B=B, C=rows.mT, d=0 * n(3, 8), D=rows @ A, E=rows @ B, F=F, c=n(3, 32))
+    mpc = LCSMPCLayer(
+        lcs, GoalCost.reach(8, 3, goal_weight=0.5, input_weight=0.05), 3, -1.0, 1.0, backend=BatchedBackend(threads=1)
+    )
+    x0, goal = n(3, 8), torch.zeros(8).double()
+    together = mpc(x0, goal)
+    for i in range(3):
+        alone = mpc(x0[i], goal, lcs=LCSParams(**{name: value[i] for name, value in lcs.tensors().items()}))
+        torch.testing.assert_close(alone.u, together.u[i], rtol=1e-7, atol=1e-7)
+        torch.testing.assert_close(alone.lam, together.lam[i], rtol=1e-6, atol=1e-6)
 
 
 def test_iterations_hardly_grow_with_the_horizon():

@@ -29,7 +29,7 @@ from difflcs import (
     StageBounds,
     Status,
 )
-from difflcs.errors import BoundsError, DTypeError, ShapeError, SolveWarning
+from difflcs.errors import BatchIndexError, BoundsError, DTypeError, ShapeError, SolveWarning
 from difflcs.mpc import MPCProblem, Primal
 from difflcs.mpc.backends import Backend, BatchedBackend, certify
 from difflcs.mpc.backends.base import Result
@@ -539,6 +539,17 @@ def test_a_plan_and_a_system_print_their_shapes_and_how_the_plan_ended(build, la
     )
     assert [part for part in shown if part not in text] == []
     assert len(text) < 1000
+
+
+def test_a_plan_is_drawn(layer, x0):
+    pytest.importorskip("matplotlib")
+    plan = layer(x0)
+    states, actions, forces, gaps = plan.plot(1).axes
+    assert torch.equal(torch.as_tensor(states.lines[2].get_ydata()), plan.x[1, :, 2].detach())
+    assert len(actions.patches) == 3 * plan.u.shape[-1]  # each with two bounds
+    assert len(forces.patches) == len(gaps.patches) == plan.lam.shape[-1]
+    with pytest.raises(BatchIndexError, match=f"a batch of {len(x0)}"):
+        plan.plot(len(x0))
 
 
 @pytest.mark.slow

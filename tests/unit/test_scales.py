@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from difflcs import LCSModel, LCSModule, LCSSequence, ScaledLCS, suggest_scales
-from difflcs.errors import DeviceError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
+from difflcs.errors import CheckpointError, DeviceError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
 
 
 @pytest.fixture
@@ -125,6 +125,21 @@ def test_a_scaled_module_is_a_module_in_the_units_of_the_data(build, data):
     found.sum().backward()
     assert all(float(p.grad.abs().max()) > 0 for p in model.parameters())
     assert list(scaled.parameters()) == list(model.parameters())
+
+
+def test_a_scaled_module_predicts_and_is_saved_with_its_scales(build, data, tmp_path):
+    x, u, _ = data
+    scaled = ScaledLCS(build.model(seed=3), suggest_scales(*data))
+    found = scaled.rollout(x[:5], u[:15].reshape(5, 3, 2))
+    torch.testing.assert_close(found[:, 1], scaled.params().step(x[:5], u[:15].reshape(5, 3, 2)[:, 0]).x_next)
+    scaled.save_pretrained(tmp_path / "it")
+    read = ScaledLCS.from_pretrained(tmp_path / "it")
+    assert torch.equal(read(x, u).x_next, scaled(x, u).x_next)
+    assert (read.scales.xi, read.scales.relaxation) == (scaled.scales.xi, scaled.scales.relaxation)
+    with pytest.raises(CheckpointError, match="ScaledLCS"):
+        LCSModel.from_pretrained(tmp_path / "it")
+    with pytest.raises(DTypeError, match="LCSModel within"):
+        ScaledLCS(scaled, scaled.scales).save_pretrained(tmp_path / "other")
 
 
 def test_a_scaled_module_asks_with_states_in_its_own_units(build, data):

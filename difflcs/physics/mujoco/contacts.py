@@ -69,6 +69,11 @@ class MujocoContacts(NamedTuple):
     friction: Array
     geom: NDArray[np.intp]
 
+    def take(self, which: NDArray[np.bool_]) -> MujocoContacts:
+        """Return those of a mask (n_contacts,)."""
+        gap, normal, tangent, friction = (values[:, which] for values in self[:4])
+        return MujocoContacts(gap, normal, tangent, friction, self.geom[:, which])
+
 
 class Budget(NamedTuple):
     """So many contacts of these pairs.
@@ -348,3 +353,12 @@ def find_geoms(model: Any, name: int | str) -> list[int]:
             f"see the names in the model's XML"
         )
     return geoms
+
+
+def typical_radius(model: Any) -> float:
+    """Return the median radius of the geoms that move and may touch."""
+    size = model.geom_rbound
+    moves = (size > 0) & (model.body_weldid[model.geom_bodyid] != 0)
+    touches = moves & ((model.geom_contype | model.geom_conaffinity) != 0)
+    chosen = size[touches] if touches.any() else size[moves]
+    return float(np.median(chosen)) if len(chosen) else 1.0

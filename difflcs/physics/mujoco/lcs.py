@@ -27,7 +27,8 @@ from difflcs.physics.complementarity import (
     count_forces,
 )
 from difflcs.physics.mujoco.actuators import DYNAMICS, Actuators, disabled_actuators
-from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, Pairs
+from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, Pairs, typical_radius
+from difflcs.physics.mujoco.correction import WholeStep, correct
 from difflcs.physics.mujoco.equality import Equality
 from difflcs.physics.mujoco.groups import ContactGroup, ContactSelection
 from difflcs.physics.mujoco.library import Places
@@ -154,15 +155,14 @@ class MujocoLCS:
             self._motion = kind(model, self._actuators, self.seconds, relative)
         nominal = self._data.ctrl if ctrl is None else self._actuators.nominal(torch.as_tensor(ctrl), torch.Size())
         self._ctrl = np.where(self._actuators.holds & (ctrl is None), np.nan, nominal)
-        length = _typical_radius(model) if length is None else check_number("length", length, strict=True)
+        length = typical_radius(model) if length is None else check_number("length", length, strict=True)
         distance = 10 * length if distance is None else check_number("distance", distance, strict=True)
         self.length, self._recovery = length, Recovery(model, length)
-        if isinstance(contacts, Sequence):
-            self._selection = ContactSelection(model, contacts, distance)
-            budgets = self._selection.budgets
-        else:
-            self._selection = None
-            budgets = None if contacts is None else check_positive_int("contacts", contacts)
+        self._selection = ContactSelection(model, contacts, distance) if isinstance(contacts, Sequence) else None
+        budgets: Any = self._selection.budgets if self._selection else contacts
+        budgets = budgets if contacts is None or self._selection else check_positive_int("contacts", contacts)
+        plain = motion == "dynamic" and pairs is None and friction is None
+        self._whole = WholeStep(model, self._motion.steps, limits != 0) if plain else None
         self._places = Places(model, self._data)
         self._finder = ContactFinder(model, self._data, self._places, pairs, distance, length, budgets, friction)
         model.opt.disableflags |= flags("EQUALITY", "FRICTIONLOSS", "LIMIT")
@@ -227,9 +227,8 @@ class MujocoLCS:
         if isinstance(self._motion, Dynamic):
             step = self._equality.hold(self._motion, read.moved, read.x, read.qpos)
             found = self._rows.find(read.qpos, step.place, step.response, read.moved.middle[:, : self.state.nv])
-            acting = step, contacts, rough, found
             soft = self._recovery, self._give, self.compliance, self.cone == "anitescu"
-            nominal = evaluate_nominal(Situation(*acting, *soft))
+            nominal = evaluate_nominal(Situation(step, contacts, rough, found, *soft))
             contacts, rows = nominal.contacts, nominal.rows
             rest = read.batched(nominal.rest(rough, self._finder.n_tangents, self.cone))
             free = step.free(read.tangent, nominal.carried)
@@ -241,7 +240,7 @@ class MujocoLCS:
             rows = scale(found, found.gap, 1.0, response, self._give, 1.0)
         if not rough.all():
             rows = rows.after(contacts.gap[:, ~rough], contacts.normal[:, ~rough])
-            contacts = MujocoContacts(*(values[:, rough] for values in contacts))
+            contacts = contacts.take(rough)
         effect = None if step is None else step.effect(read.tangent, rows.normal, rows.impulse)
         ranks = zip(free, (2, 2, 1, 2), strict=True)
         system = contact_lcs(
@@ -256,6 +255,10 @@ class MujocoLCS:
             rest=rest,
             **read.constraints(rows, effect),
         )
+        if step is not None and self._whole is not None and self.n_lam:
+            idle = self.control(torch.from_numpy(read.x), torch.from_numpy(step.idle)).numpy()
+            after = self._whole.simulate(self._data, read.states, idle)
+            system = correct(system, step, after, read.tangent, rows.bound * self._give / self.length, found)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
 
     def sequence(self, plan: Any, x: Tensor | None = None) -> LCSSequence:
@@ -312,9 +315,9 @@ class MujocoLCS:
         act = flat[:, self.n_x - self.state.na :] if self.state.na else np.broadcast_to(data.act, (n, len(data.act)))
         ctrl = self._ctrl if context is None else self._actuators.nominal(context, batch).reshape(n, -1)
         ctrl, found = np.broadcast_to(ctrl, (n, self.n_u)), self._finder.find(qpos)
-        moved = self._read_motion(np.concatenate([qpos, qvel, act], -1), ctrl)
+        moved = self._read_motion(states := np.concatenate([qpos, qvel, act], -1), ctrl)
         tangent = self.state.tangent(flat[:, : self.state.nv])
-        return _States(batch, flat, qpos, tangent, found, moved)
+        return _States(batch, flat, states, qpos, tangent, found, moved)
 
     def _read_motion(self, states: Any, ctrl: Any) -> Any:
         """Read the motion at states (n, nq + nv + na) of MuJoCo, with nominal controls (n, nu)."""
@@ -351,6 +354,7 @@ class _States(NamedTuple):
     Attributes:
         batch: their batch dimensions.
         x: (n, n_x).
+        states: (n, nq + nv + na) MuJoCo's.
         qpos: (n, nq).
         tangent: of their rotations, see `MujocoState.tangent`.
         dof_contacts: contacts.
@@ -359,6 +363,7 @@ class _States(NamedTuple):
 
     batch: torch.Size
     x: Any
+    states: Any
     qpos: Any
     tangent: Any
     dof_contacts: MujocoContacts
@@ -480,11 +485,3 @@ def _take(into: Any, data: Any) -> None:
         if not np.isfinite(values).all():
             raise NonFiniteError(f"data: expected finite numbers in {name}, got NaN or infinity; set it in the data")
         field[:] = values
-
-
-def _typical_radius(model: Any) -> float:
-    size = model.geom_rbound
-    moves = (size > 0) & (model.body_weldid[model.geom_bodyid] != 0)
-    touches = moves & ((model.geom_contype | model.geom_conaffinity) != 0)
-    chosen = size[touches] if touches.any() else size[moves]
-    return float(np.median(chosen)) if len(chosen) else 1.0

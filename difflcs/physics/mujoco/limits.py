@@ -100,8 +100,9 @@ class ScaledRows(NamedTuple):
 
     def after(self, gap: Array, normal: Array) -> ScaledRows:
         """Return these rows after contacts without friction, of gaps (n, k) and their derivatives (n, k, nv)."""
-        found = (np.concatenate(v, 1) for v in ((gap, self.gap), (normal, self.normal), (normal, self.impulse)))
-        return ScaledRows(*found, self.bound, np.concatenate([np.ones_like(gap), self.unit], 1))
+        unit = np.concatenate([np.ones_like(gap), self.unit], 1)
+        along, impulse = (np.concatenate([normal, rows], 1) for rows in (self.normal, self.impulse))
+        return ScaledRows(np.concatenate([gap, self.gap], 1), along, impulse, self.bound, unit)
 
 
 class RowFinder:

@@ -290,6 +290,14 @@ class Steps(NamedTuple):
     integrator: int
 
 
+def advance_step(model: Any, data: Any, integrator: int) -> None:
+    """Integrate by a time step from `mj_forward`, without the checks of `mj_step`."""
+    if integrator == _RK4:
+        mujoco.mj_RungeKutta(model, data, 4)
+    else:
+        getattr(mujoco, _ADVANCE[integrator])(model, data)
+
+
 class Linearised(NamedTuple):
     """Linearised motion of n states.
 

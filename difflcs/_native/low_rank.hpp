@@ -1,0 +1,251 @@
+// F = diag(rest) + W W^T with few columns in W, as contacts have it that act on few bodies: systems with
+// diag(a) + diag(b) F are then solved in the size of W's columns, by the formula of Sherman, Morrison and Woodbury. For
+// a large problem alone; others eliminate (lu.hpp).
+//
+// Forces move the state along C, and F - diag(rest) is what contacts feel of that: its rows are sums of rows of C. So
+// what F does across the rows of C is rest alone.
+#pragma once
+#include "lanes.hpp"
+#include "lu.hpp"
+#include "matrix.hpp"
+
+namespace difflcs::DIFFLCS_ISA {
+namespace {
+
+// The least number of forces for which this is faster.
+constexpr int64_t kLowRankFrom = 24;
+// F has a unit diagonal: entries of F - diag(rest) - W W^T up to the first number are rounding, and entries of rest
+// from the second on are large enough to divide by.
+constexpr double kLowRankRounding = 2e-14, kLeastRest = 1e-6;
+// Part of a force's direction that has to lie across the rows of C if its rest is read from that.
+constexpr double kAcross = 0.01;
+// Part of a row of C by which it has to differ from those before it to count.
+constexpr double kAnotherRow = 1e-10;
+
+class LowRank {
+  static constexpr int64_t kRows = 4;
+  int64_t n, most;  // W has room for so many columns; none where this is not looked for
+  Stages<Matrix<Vec, 0, 0>> columns, rows;
+  Steps<Vec> rests;
+  Steps<int64_t> ranks;
+  // Of the system in use: its numbers, 1 / (a + b rest), b, W scaled by b / (a + b rest), I + W^T that as factors.
+  Matrix<Vec, 0, 0> W, W_t, scaled;
+  Vec *rest, *inverse, *b, *capacitance, *left, *right;
+  int64_t rank = 0;
+
+ public:
+  void layout(Arena& arena, int64_t systems, int64_t forces, bool wanted) {
+    n = forces;
+    most = kLanes == 1 && wanted && n >= kLowRankFrom ? n / 2 / kRows * kRows : 0;
+    if (most == 0) return;
+    arena.take(columns, systems, n, most);
+    arena.take(rows, systems, most, n);
+    arena.take(rests, systems, n);
+    arena.take(ranks, systems, 1);
+    arena.take(scaled, n, most);
+    arena.take(capacitance, most * most);
+    arena.take_all(n, inverse, b);
+    arena.take_all(n * kColumns, left, right);
+  }
+
+  // That of stage k.
+  LowRank operator[](int64_t k) const {
+    LowRank one = *this;
+    if (most > 0) one.take(k, ranks[k][0]);
+    return one;
+  }
+
+  // Whether F is of this kind.
+  explicit operator bool() const { return rank > 0; }
+
+  // Looks whether system k is of this kind.
+  template <class Square, class Wide>
+  void find(int64_t k, const Square& F, const Wide& C) const {
+    if (most == 0) return;
+    LowRank one = *this;
+    one.take(k, most);
+    ranks[k][0] = one.describe(F, C) ? one.rank : 0;
+  }
+
+  // Row i of the matrix has a_i and b_i.
+  void weigh(int64_t i, Vec a_i, Vec b_i) const {
+    b[i] = b_i;
+    inverse[i] = 1.0 / (a_i + b_i * rest[i]);
+  }
+
+  // After all rows are weighed.
+  DIFFLCS_NOINLINE void factor() const {
+    for (int64_t k = 0; k < n; k++) {
+      const Vec weight = b[k] * inverse[k];
+      by_columns(0, rank, [&](int64_t j, auto kind) {
+        using V = decltype(kind);
+        write<V>(scaled[k], j, weight * read<V>(W[k], j));
+      });
+    }
+    for (int64_t i = 0; i < rank; i += kRows)
+      by_columns(0, i + kRows, [&](int64_t j, auto kind) {
+        using V = decltype(kind);
+        V sum[kRows] = {};
+        for (int64_t k = 0; k < n; k++)
+          for (int64_t r = 0; r < kRows; r++) sum[r] += scaled(k, i + r) * read<V>(W[k], j);
+        for (int64_t r = 0; r < kRows; r++) write<V>(capacitance + (i + r) * rank, j, sum[r]);
+      });
+    for (int64_t i = 0; i < rank; i++) {
+      for (int64_t j = 0; j < i; j++) capacitance[j * rank + i] = capacitance[i * rank + j];
+      capacitance[i * rank + i] += 1.0;
+    }
+    lu_factor_by_panels(rank, capacitance);
+  }
+
+  // g becomes (diag(a) + diag(b) F)^-1 g.
+  void solve(Vec* g) const {
+    for (int64_t i = 0; i < n; i++) g[i] *= inverse[i];
+    const Local<0> moved = feel(Local<0>(g));
+    multiply(W, moved, [](int64_t) { return all(0); }, [&](int64_t i, Vec sum) { g[i] -= b[i] * inverse[i] * sum; });
+  }
+
+  // g becomes (diag(a) + F diag(b))^-1 g, where it has as many columns as V holds.
+  template <class V = Vec>
+  void solve_right(V* g) const {
+    Local<0, V> forces(right);
+    for (int64_t i = 0; i < n; i++) {
+      g[i] *= inverse[i];
+      forces[i] = b[i] * g[i];
+    }
+    const Local<0, V> moved = feel(forces);
+    multiply(W, moved, [](int64_t) { return V{}; }, [&](int64_t i, V sum) { g[i] = g[i] - inverse[i] * sum; });
+  }
+
+ private:
+  template <class V>
+  Local<0, V> feel(const Local<0, V>& forces) const {
+    Local<0, V> to(left);
+    multiply(W_t, forces, [](int64_t) { return V{}; }, [&](int64_t i, V sum) { to[i] = sum; });
+    lu_solve_by_rows(rank, capacitance, to.v);
+    return to;
+  }
+
+  void take(int64_t k, int64_t columns_of_W) {
+    rank = columns_of_W;
+    W = columns[k];
+    W_t = rows[k];
+    W_t.rows = {rank};
+    W.columns = {rank};
+    rest = rests[k];
+  }
+
+  // Finds rest, rank and W; returns whether they are F to rounding.
+  template <class Square, class Wide>
+  DIFFLCS_NOINLINE bool describe(const Square& F, const Wide& C) {
+    rank = 0;
+    if (!read_rest(F, C) || !decompose(F)) return false;
+    for (; rank % kRows; rank++)
+      for (int64_t i = 0; i < n; i++) W(i, rank) = all(0);
+    for (int64_t i = 0; i < n; i++)
+      for (int64_t m = 0; m < rank; m++) W_t(m, i) = W(i, m);
+    Vec worst = all(0);
+    for (int64_t i = 0; i < n; i++) {
+      by_columns(0, n, [&](int64_t j, auto kind) {
+        using V = decltype(kind);
+        V sum = V{} - read<V>(F[i], j);
+        for (int64_t m = 0; m < rank; m++) sum += W(i, m) * read<V>(W_t[m], j);
+        write<V>(left, j, sum);
+      });
+      left[i] += rest[i];
+      for (int64_t j = 0; j < n; j++) worst = max(worst, abs(left[j]));
+    }
+    return !any(worst > kLowRankRounding);
+  }
+
+  // The rest of each row, from what F does across the rows of C; where nothing of a force is across, `b` is zero.
+  template <class Square, class Wide>
+  bool read_rest(const Square& F, const Wide& C) {
+    auto basis = scaled;  // orthonormal columns, for the rows of C
+    int64_t count = 0;
+    for (int64_t r = 0; r < C.rows; r++) {
+      Vec before = all(0), after = all(0);
+      for (int64_t i = 0; i < n; i++) {
+        left[i] = all(0) + C(r, i);
+        before += left[i] * left[i];
+      }
+      basis.columns = {count};
+      for (int pass = 0; pass < 2; pass++) {
+        by_columns(0, count, [&](int64_t j, auto kind) {
+          using V = decltype(kind);
+          V sum{};
+          for (int64_t i = 0; i < n; i++) sum += left[i] * read<V>(basis[i], j);
+          write<V>(right, j, -sum);
+        });
+        multiply(basis, right, [&](int64_t i) { return left[i]; }, [&](int64_t i, Vec sum) { left[i] = sum; });
+      }
+      for (int64_t i = 0; i < n; i++) after += left[i] * left[i];
+      if (any(after <= kAnotherRow * kAnotherRow * before)) continue;
+      if (count == most) return false;
+      for (int64_t i = 0; i < n; i++) basis(i, count) = left[i] / sqrt(after);
+      count++;
+    }
+    for (int64_t i = 0; i < n; i++) {
+      by_columns(0, count, [&](int64_t m, auto kind) {
+        using V = decltype(kind);
+        V sum{};
+        for (int64_t j = 0; j < n; j++) sum += (all(0) + F(i, j)) * read<V>(basis[j], m);
+        write<V>(right, m, sum);
+      });
+      Vec across = all(1), own = all(0) + F(i, i);
+      for (int64_t m = 0; m < count; m++) {
+        across -= basis(i, m) * basis(i, m);
+        own -= basis(i, m) * right[m];
+      }
+      b[i] = select(across > kAcross, across, all(0));
+      rest[i] = select(b[i] > 0, own / across, all(0));
+      if (any((b[i] > 0) & (rest[i] < kLeastRest))) return false;
+    }
+    return true;
+  }
+
+  // W by Cholesky's method with pivots, first those of the rows whose rest is known. The others have as much rest as
+  // leaves what they share diagonally dominant.
+  template <class Square>
+  bool decompose(const Square& F) {
+    Vec* remains = inverse;
+    for (int64_t i = 0; i < n; i++) remains[i] = F(i, i) - rest[i];
+    const auto eliminate = [&](bool whole) {
+      for (;;) {
+        int64_t p = -1;
+        Vec largest = all(kLowRankRounding);
+        for (int64_t i = 0; i < n; i++)
+          if ((whole || any(b[i] > 0)) && any(remains[i] > largest)) largest = remains[p = i];
+        if (p < 0) return true;
+        if (rank == most) return false;
+        const Vec unit = 1.0 / sqrt(largest);
+        W.columns = {rank};
+        for (int64_t m = 0; m < rank; m++) right[m] = -W(p, m);
+        multiply(
+            W, right, [&](int64_t i) { return all(0) + F(i, p); },
+            [&](int64_t i, Vec sum) {
+              const Vec entry = i == p ? sqrt(largest) : unit * sum;
+              W(i, rank) = entry;
+              remains[i] -= entry * entry;
+            });
+        remains[p] = all(0);
+        rank++;
+      }
+    };
+    if (!eliminate(false)) return false;
+    W.columns = {rank};
+    for (int64_t i = 0; i < n; i++) {
+      if (any(b[i] > 0)) continue;
+      rest[i] = remains[i];
+      for (int64_t j = 0; j < n; j++)
+        if (j != i && !any(b[j] > 0)) rest[i] -= abs(F(i, j) - (all(0) + W.row(i) * W[j]));
+      if (any(rest[i] < kLeastRest)) return false;
+    }
+    for (int64_t i = 0; i < n; i++) remains[i] = select(b[i] > 0, remains[i], remains[i] - rest[i]);
+    if (!eliminate(true)) return false;
+    for (int64_t i = 0; i < n; i++) rest[i] += remains[i];
+    return true;
+  }
+};
+
+}  // namespace
+}  // namespace difflcs::DIFFLCS_ISA

@@ -1,0 +1,292 @@
+"""Transitions from episodes, and a report on how well a system predicts them."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from difflcs._checks import check_number, check_positive_int, check_tensor, takes_arrays
+from difflcs._optional import require
+from difflcs.errors import InvalidInputError, ShapeError
+from difflcs.records import SYSTEM, LCSModule, LCSParams, advance, check_inputs, system_at
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["FitReport", "Transitions", "fit_report"]
+
+
+class Transitions(NamedTuple):
+    """Transitions of a system, those of one episode one after the other; made to be unpacked into a loss.
+
+    Attributes:
+        x: (N, n_x) states.
+        u: (N, n_u) actions.
+        x_next: (N, n_x) next states. Where x_next[k] is x[k + 1], the two belong to one episode.
+    """
+
+    x: Tensor
+    u: Tensor
+    x_next: Tensor
+
+    @classmethod
+    def from_episodes(
+        cls, states: Iterable[ArrayLike], actions: Iterable[ArrayLike], episode: ArrayLike | None = None
+    ) -> Transitions:
+        """Pair states with actions and next states, never across the end of an episode.
+
+        Args:
+            states: for each episode (T+1, n_x), as an environment returns them; NumPy or torch.
+            actions: for each episode (T, n_u).
+            episode: None; or (N,) the number of the episode of each row of a log, such as a column of a CSV file.
+                States are then (N, n_x) and actions (N, n_u), the action of a row being taken in its state. The last
+                row of an episode has no next state, and its action is not used.
+
+        Returns:
+            Transitions in float64.
+
+        Raises:
+            ShapeError: an episode has not one state more than actions, or rows do not fit each other.
+            NonFiniteError: a number is NaN or infinite; leave out the episode.
+            InvalidInputError: there are no transitions.
+        """
+        if episode is None:
+            pairs = [(_rows("states", s), _rows("actions", u)) for s, u in zip(states, actions, strict=True)]
+        else:
+            s, u, number = _rows("states", states), _rows("actions", actions), np.asarray(episode)
+            if not len(s) == len(u) == number.size:
+                raise ShapeError(
+                    f"episode: expected one number for each row, got {number.size} for {len(s)} states and {len(u)} "
+                    f"actions; pass columns of one log"
+                )
+            ends = np.flatnonzero(number[1:] != number[:-1]) + 1
+            cuts = [0, *ends.tolist(), len(s)]
+            pairs = [(s[a:b], u[a : b - 1]) for a, b in itertools.pairwise(cuts)]
+        for k, (s, u) in enumerate(pairs):
+            if len(s) != len(u) + 1:
+                raise ShapeError(
+                    f"states[{k}]: expected one state more than the {len(u)} actions, got {len(s)}; keep the first and "
+                    f"the last state of each episode"
+                )
+        if not sum(len(u) for _, u in pairs):
+            raise InvalidInputError("actions: expected at least one transition, got none; give episodes of some steps")
+        return cls(*(torch.cat(v) for v in zip(*((s[:-1], u, s[1:]) for s, u in pairs), strict=True)))
+
+    def split(self, share: float = 0.2, seed: int = 0) -> tuple[Transitions, Transitions]:
+        """Split into transitions to fit to and to test on, by whole episodes drawn at random.
+
+        Args:
+            share: of the episodes that are to test on, at least one, above 0 and below 1.
+            seed: of the drawing.
+        """
+        share = check_number("share", share, strict=True)
+        number = (~_continues(self.x, self.x_next)).roll(1).cumsum(0) - 1
+        number = number - number[0]
+        count = int(number[-1]) + 1
+        if share >= 1 or count < 2:
+            raise InvalidInputError(
+                f"share: expected less than 1 of at least two episodes, got {share:g} of {count}; "
+                f"split one long episode by hand"
+            )
+        drawn = np.random.default_rng(seed).permutation(count)[: min(max(1, round(share * count)), count - 1)]
+        test = torch.isin(number, torch.as_tensor(drawn))
+        return Transitions(*(v[~test] for v in self)), Transitions(*(v[test] for v in self))
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """Errors of a system's predictions on transitions, by state, by contact and by number of steps.
+
+    Errors are root mean squares. Those of single states are in parts of `step`: what standing still has is 1.
+
+    Attributes:
+        step: (n_x,) how far each state moves in a step [its unit].
+        error: (n_x,) of one step of the system.
+        linear: (n_x,) of an affine system by least squares, which has no contacts.
+        acts: (n_lam,) share of the transitions in which a force is larger than its gap.
+        without: (n_lam,) factor by which the error grows, all states together, if this force is taken away.
+        gain: (N, n_lam) how much more squared error each transition has without a force: the data that it explains.
+        rollout: (H, 3) error after 1 to H steps of the system, of the affine system and of standing still, in parts of
+            the spread of the states; NaN where no episode is that long.
+    """
+
+    step: Tensor
+    error: Tensor
+    linear: Tensor
+    acts: Tensor
+    without: Tensor
+    gain: Tensor
+    rollout: Tensor
+
+    def __str__(self) -> str:
+        """Show three tables."""
+        lines = ["state        step     error    affine   (standing still: 1)"]
+        for i, row in enumerate(zip(self.step, self.error, self.linear, strict=True)):
+            lines.append(f"{i:5d} {row[0]:11.3g} {row[1]:9.3f} {row[2]:9.3f}")
+        lines.append("force     acts in   error without it")
+        for i, (acts, factor) in enumerate(zip(self.acts, self.without, strict=True)):
+            lines.append(f"{i:5d} {100 * acts:9.1f} %   × {factor:.2f}" if acts else f"{i:5d}     never")
+        lines.append("steps     error    affine   still   (in parts of the spread of the states)")
+        for h, row in enumerate(self.rollout, 1):
+            if bool(row.isfinite().all()) and (h in (1, 2, 3, 5) or h % 10 == 0 or h == len(self.rollout)):
+                lines.append(f"{h:5d} {row[0]:9.3f} {row[1]:9.3f} {row[2]:7.3f}")
+        return "\n".join(lines)
+
+    def plot(self) -> Figure:
+        """Draw the three tables side by side; needs matplotlib."""
+        require("matplotlib")
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(11, 3.2), layout="constrained")
+        states, forces, steps = figure.subplots(1, 3)
+        place = np.arange(len(self.error))
+        states.bar(place - 0.2, self.error.numpy(), 0.4, label="system")
+        states.bar(place + 0.2, self.linear.numpy(), 0.4, label="affine")
+        states.axhline(1, color="gray", lw=1, label="standing still")
+        states.set(xlabel="state", ylabel="error of a step, in parts of the step", xticks=place)
+        forces.bar(np.arange(len(self.acts)), 100 * self.acts.numpy())
+        forces.set(xlabel="force", ylabel="acts in [%] of the transitions", xticks=np.arange(len(self.acts)))
+        for column, name in enumerate(("system", "affine", "standing still")):
+            colour = {"color": "gray"} if column == 2 else {}
+            steps.plot(1 + np.arange(len(self.rollout)), self.rollout[:, column].numpy(), label=name, **colour)
+        steps.set(xlabel="steps", ylabel="error, in parts of the spread", ylim=(0, None))
+        states.legend()
+        steps.legend()
+        return figure
+
+
+@takes_arrays
+def fit_report(
+    system: LCSModule | LCSParams,
+    x: Tensor,
+    u: Tensor,
+    x_next: Tensor,
+    *,
+    train: Sequence[Tensor] | None = None,
+    horizon: int = 10,
+    context: Tensor | None = None,
+) -> FitReport:
+    """Measure how well a system predicts transitions that it was not fitted to.
+
+    It predicts through the exact LCP, as it does in a plan, so reports of fits with different ξ or γ can be compared,
+    which their losses cannot. Two others predict the same: an affine system by least squares, and standing still. A
+    system whose contacts are of use beats both.
+
+    Args:
+        system: a learned model or any other `LCSModule`, or one system without batch dimensions.
+        x: (N, n_x) states.
+        u: (N, n_u) actions.
+        x_next: (N, n_x) next states. Rollouts go from row to row as long as x_next[k] is x[k + 1], and so never across
+            the end of an episode.
+        train: x, u and x_next that the system was fitted to, and that the affine system is fitted to as well. Without
+            them it is fitted to the transitions of the report, which flatters it.
+        horizon: the largest number of steps of a rollout, ≥ 1.
+        context: (N, n_context) passed on to the `params` of an `LCSModule`.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, NonFiniteError, InvalidInputError: the arguments do not fit.
+    """
+    horizon = check_positive_int("horizon", horizon)
+    with torch.no_grad():
+        check_tensor("x", x, [("n_x", system.n_x)])
+        check_inputs(system.n_x, system.n_u, x, {"x": x, "u": u, "x_next": x_next}, owner="state x")
+        if not x.ndim == u.ndim == x_next.ndim == 2 or not len(x) == len(u) == len(x_next) > 1:
+            shapes = ", ".join(str(tuple(v.shape)) for v in (x, u, x_next))
+            raise ShapeError(f"x, u, x_next: expected (N, n) of the same N > 1 transitions, got {shapes}")
+
+        def at(rows: Tensor | slice, x: Tensor) -> LCSParams:
+            if isinstance(system, LCSParams):
+                return system
+            params = system_at(system, x, None if context is None else context[rows])
+            if not isinstance(params, LCSParams):
+                raise InvalidInputError("system: expected one system for each state, got a sequence; report on a stage")
+            return params
+
+        everything = slice(None)
+        params, move = at(everything, x), x_next - x
+        step, spread = (_positive(v) for v in (_rms(move), x.std(0, correction=0)))
+        prediction = advance(params, x, u)
+        solution = _least_squares(*(train or (x, u, x_next)))
+
+        squared = ((prediction.x_next - x_next) / step).square().sum(1)
+        lam, without = prediction.lam, []
+        for i in range(system.n_lam):
+            others = [j for j in range(system.n_lam) if j != i]
+            guess = advance(_keep_forces(params, others), x, u).x_next if others else params.next_state(x, u, 0 * lam)
+            without.append(((guess - x_next) / step).square().sum(1) - squared)
+        gain = torch.stack(without, 1) if without else x.new_zeros(len(x), 0)
+        base = squared.mean().clamp_min(1e-300)
+        rows, ends, walkers, rollout = torch.arange(len(x)), _continues(x, x_next), [x, x, x], []
+        for h in range(horizon):
+            now, action = rows + h, u[rows + h]
+            walkers = [
+                advance(at(now, walkers[0]), walkers[0], action).x_next,
+                _affine(solution, walkers[1], action),
+                walkers[2],
+            ]
+            rollout.append(torch.stack([_rms((w - x_next[now]) / spread).square().mean().sqrt() for w in walkers]))
+            on = ends[now]
+            rows, walkers = rows[on], [w[on] for w in walkers]
+        return FitReport(
+            step=step,
+            error=_rms(prediction.x_next - x_next) / step,
+            linear=_rms(_affine(solution, x, u) - x_next) / step,
+            acts=(lam > params.gap(x, u) + (params.F @ lam.unsqueeze(-1)).squeeze(-1)).double().mean(0),
+            without=((base + gain.mean(0)) / base).sqrt(),
+            gain=gain,
+            rollout=torch.stack(rollout),
+        )
+
+
+def _rows(name: str, value: Any) -> Tensor:
+    """Convert rows of numbers to a finite matrix in float64."""
+    rows = value.detach().double() if isinstance(value, Tensor) else torch.as_tensor(np.asarray(value, np.float64))
+    if rows.ndim != 2:
+        raise ShapeError(f"{name}: expected rows (T, n), got shape {tuple(rows.shape)}; give one row for each step")
+    return check_tensor(name, rows)
+
+
+def _continues(x: Tensor, x_next: Tensor) -> Tensor:
+    """(N,) whether the next transition begins where this one ends; the last has none."""
+    return torch.cat([(x[1:] == x_next[:-1]).all(1), x.new_zeros(1, dtype=torch.bool)])
+
+
+def _keep_forces(params: LCSParams, kept: Sequence[int]) -> LCSParams:
+    """Leave out all forces but some."""
+    values = {}
+    for name, dims in SYSTEM.items():
+        value = getattr(params, name)
+        for place, dim in enumerate(dims):
+            if dim == "n_lam":
+                value = value.index_select(value.ndim - len(dims) + place, torch.as_tensor(kept, device=value.device))
+        values[name] = value
+    return LCSParams(**values)
+
+
+def _regressors(x: Tensor, u: Tensor) -> Tensor:
+    return torch.cat([x, u, torch.ones_like(x[:, :1])], 1)
+
+
+def _least_squares(x: Tensor, u: Tensor, x_next: Tensor) -> Tensor:
+    """Fit moves by an affine function of state and action; (n_x + n_u + 1, n_x)."""
+    return torch.linalg.lstsq(_regressors(x, u), x_next - x).solution
+
+
+def _affine(solution: Tensor, x: Tensor, u: Tensor) -> Tensor:
+    return x + _regressors(x, u) @ solution
+
+
+def _rms(rows: Tensor) -> Tensor:
+    return rows.square().mean(0).sqrt()
+
+
+def _positive(scale: Tensor) -> Tensor:
+    """Replace zeros by one: what never moves counts in its own unit."""
+    return torch.where(scale > 0, scale, torch.ones_like(scale))

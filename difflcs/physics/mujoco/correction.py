@@ -1,0 +1,122 @@
+"""Correction of what forces do, by MuJoCo's own step with all constraints at the nominal action.
+
+A force is one impulse in the system; in MuJoCo it acts all through the step, on constraints that are soft, and turn. At
+the nominal action the two differ by Δ. As forces λ̄ bring Δ about, C becomes C + Δ wᵀ with wᵀ λ̄ = 1, so that Δ goes when
+they go. On each tree of bodies they count by the energy that they bring about, and Δ as far as it is no more than this;
+the rest is added to d. F and the gaps stay.
+
+What contacts do depends on friction, which holds with one action and slides with another. So Δ of contacts counts only
+where they do worse than nothing.
+"""
+
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from difflcs.physics.mujoco.limits import Rows
+from difflcs.physics.mujoco.motion import DynamicStep, Steps, advance_step
+from difflcs.physics.mujoco.native import TAKEN, flags
+from difflcs.records import LCSParams
+
+Array = NDArray[np.float64]
+_WORSE = 0.25  # of all motion, by which contacts are worse than nothing where Δ counts wholly
+
+
+class WholeStep:
+    """MuJoCo's own steps, with all constraints.
+
+    Args:
+        model: the model.
+        steps: its steps in one of ours.
+        limits: False if joints and tendons have none.
+    """
+
+    def __init__(self, model: Any, steps: Steps, limits: bool):
+        self.model, self.steps = copy.copy(model), steps
+        self.model.opt.disableflags |= 0 if limits else flags("LIMIT")
+        self.data = mujoco.MjData(self.model)
+
+    def simulate(self, taken: Any, states: Array, ctrl: Array) -> Array:
+        """Return (ζ, ν) (n, 2 nv) after a step from states (n, nq + nv + na); NaN where MuJoCo warns or raises.
+
+        Args:
+            taken: data with what is not in the states.
+            states: qpos, qvel and act.
+            ctrl: (n, nu) controls.
+        """
+        model, data, nv = self.model, self.data, self.model.nv
+        after = np.full((len(states), 2 * nv), np.nan)
+        for name in TAKEN:
+            getattr(data, name)[:] = getattr(taken, name)
+        for i, state in enumerate(states):
+            data.qpos[:], data.qvel[:], data.act[:] = np.split(state, [model.nq, model.nq + nv])
+            data.ctrl[:], data.qacc_warmstart[:] = ctrl[i], 0.0
+            try:
+                for _ in range(self.steps.count):
+                    mujoco.mj_forwardSkip(model, data, 0, 1)
+                    advance_step(model, data, self.steps.integrator)
+            except mujoco.FatalError:  # the system stands without a correction
+                self.data = mujoco.MjData(model)
+                return after
+            if not data.warning.number.any():
+                mujoco.mj_differentiatePos(model, after[i, :nv], 1.0, state[: model.nq], data.qpos)
+                after[i, nv:] = data.qvel
+            data.warning.number[:] = 0
+        return after
+
+
+def correct(
+    system: LCSParams, step: DynamicStep, after: Array, tangent: Array | None, bound: Array, rows: Rows
+) -> LCSParams:
+    """Correct C and d of systems at n states.
+
+    Args:
+        system: the systems, in any batch dimensions.
+        step: the motion without constraints.
+        after: (n, 2 nv) (ζ, ν) after MuJoCo's step; states with NaN stay as they are.
+        tangent: of the states' rotations, see `MujocoState.tangent`.
+        bound: (n, n_bounded) of dry friction, the last forces of the systems.
+        rows: limits and dry friction.
+    """
+    x, nv, batch = step.x, step.place.shape[1], system.C.shape[:-2]
+    found = system.step(*(torch.from_numpy(v).reshape(*batch, v.shape[1]) for v in (x, step.idle)))
+    C, d, predicted, lam = (v.reshape(len(x), *v.shape[len(batch) :]).numpy() for v in (system.C, system.d, *found))
+    n_bounded, lower = bound.shape[1], np.zeros_like(lam)
+    n_contacts = lam.shape[1] - 2 * n_bounded - (n_limits := rows.gap.shape[1] - n_bounded)
+    lower[:, n_contacts + n_limits :][:, :n_bounded] = -bound
+    C, d, forces = C.copy(), d.copy(), lam + lower
+    place = after[:, :nv] if tangent is None else np.linalg.solve(tangent, after[:, :nv, None])[:, :, 0]
+    change = np.concatenate([place, after[:, nv:] - x[:, nv : 2 * nv]], 1)
+    known = np.isfinite(change).all(1, keepdims=True)
+    change = np.where(known, change, 0.0)
+    wrong = np.where(known, x[:, : 2 * nv] + change - predicted[:, : 2 * nv], 0.0)
+    trees, tree = np.unique(step.tree, return_inverse=True)
+    mass = (tree[:, None] == np.arange(len(trees))) / np.diagonal(step.inverse_mass, axis1=1, axis2=2)[:, :, None]
+
+    def size(moved: NDArray[Any]) -> Array:
+        """Size (n, n_trees) of a change of velocity (n, 2 nv), by its energy."""
+        return np.sqrt(np.einsum("nv,nvt->nt", moved[:, nv : 2 * nv] ** 2, mass))
+
+    energy = np.einsum("nvj,nvt->ntj", (C[:, nv : 2 * nv] * forces[:, None]) ** 2, mass)
+    total = np.maximum(energy.sum(-1), 1e-20)
+    free = predicted - (C @ forces[:, :, None])[:, :, 0] - x
+    speed = np.concatenate([np.zeros_like(place), x[:, nv : 2 * nv]], 1)
+    worse = (size(wrong) - size(change)) / (_WORSE * (size(speed) + size(free)) + 1e-9)
+    counts = 1 - energy[:, :, :n_contacts].sum(-1) / total * (1 - np.clip(worse, 0.0, 1.0))
+    due = counts * np.minimum(1.0, np.sqrt(total) / np.maximum(size(wrong), 1e-15))
+    part = energy / np.where(forces != 0, forces, 1.0)[:, None] / total[:, :, None]
+    both = np.concatenate([tree, tree])
+    by_forces = (wrong * due[:, both])[:, :, None] * part[:, both]
+    C[:, : 2 * nv] += by_forces
+    d[:, : 2 * nv] += (by_forces @ lower[:, :, None])[:, :, 0] + wrong * (counts - due)[:, both]
+    C, d = (torch.from_numpy(v).reshape(*batch, *v.shape[1:]) for v in (C, d))
+    return LCSParams(system.A, system.B, C, d, system.D, system.E, system.F, system.c)
