@@ -9,7 +9,7 @@ import pytest
 def test_the_arm_does_better_than_nothing(monkeypatch, capsys):
     pytest.importorskip("mujoco")
     monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "examples"))
-    import pusher  # pyright: ignore[reportMissingImports]
+    import pusher
 
     monkeypatch.setattr(pusher, "STEPS", 40)
     means = []
