@@ -11,13 +11,13 @@ import math
 import warnings
 from dataclasses import dataclass
 
-import difflcs_envs
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import Tensor, nn
 
+import difflcs_envs
 from difflcs import LCSModel, LCSMPCLayer
 from difflcs.errors import DegenerateWarning, SolveWarning
 from difflcs.rl import evaluate, get_task
