@@ -4,9 +4,7 @@ For every system and mode: how long it takes to make the LCS of one state, in a 
 prediction of one step of 0.1 s is from what the simulator does in many small ones, from the same states and actions.
 The error is that of the coordinates named, root mean square over the states, beside how far they moved: a prediction
 that nothing moves has an error of 100 %. The exact LCP is solved, without relaxation.
-
-Then the time of a state of larger models, one alone and one of 64, in times of `mj_forward`, which is MuJoCo's own work
-at a state: a planar walker, places round a body in space, a hand of 115 geoms.
+The times of larger models are those of physics_models.py.
 """
 
 from __future__ import annotations
@@ -247,69 +245,6 @@ def boxes(count: int, random: np.random.Generator) -> list[Case]:
     return cases
 
 
-BALL = """<body name="ball" pos="-.2 0 .05"><joint name="bx" type="slide" axis="1 0 0"/>
-  <joint name="by" type="slide" axis="0 1 0"/><joint name="bz" type="slide" axis="0 0 1"/>
-  <geom type="sphere" size=".015" mass=".2"/></body>"""
-BALL_SERVOS = "".join(f'<position joint="b{axis}" kp="1000" dampratio="1"/>' for axis in "xyz")
-
-
-def of_limb(name: str, sizes: list[str], place: str, axis: str) -> str:
-    """A chain of bodies, each with a hinge and the geoms of `sizes`, XML that says {k} where it is the k-th."""
-    if not sizes:
-        return ""
-    k = len(sizes)
-    joint = f'<joint name="{name}{k}" axis="{axis}" range="-90 90" damping=".05" armature=".001"/>'
-    return f'<body pos="{place}">{joint}{sizes[0]}{of_limb(name, sizes[1:], "0 0 -.04", axis)}</body>'
-
-
-def motors(names: list[str], kind: str) -> str:
-    """Actuators on joints."""
-    return "<actuator>" + "".join(f'<{kind} joint="{name}"/>' for name in names) + "</actuator>"
-
-
-def timed_models() -> dict[str, Any]:
-    """Models of several sizes."""
-    plate = "".join(f'<geom type="box" size=".004 .006 .003" pos="0 {0.004 * k} {-0.006 * k}"/>' for k in range(6))
-    fingers = "".join(of_limb(f"f{i}", [plate] * 4, f"{0.03 * i} 0 0", "1 0 0") for i in range(4))
-    palm = "".join(f'<geom type="box" size=".007 .01 .004" pos="{0.015 * k} -.04 0"/>' for k in range(18))
-    leg = '<geom type="capsule" fromto="0 0 0 0 0 -.04" size=".01"/>'
-    torso = """<joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
-      <joint name="turn" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 .1" size=".02"/>"""
-    legs = "".join(of_limb(name, [leg] * 3, "0 0 0", "0 1 0") for name in "lr")
-    return {
-        "walker": f"""<mujoco><worldbody><geom type="plane" size="9 9 .1"/><body pos="0 0 .13">{torso}{legs}</body>
-          </worldbody>{motors([f"{side}{k}" for side in "lr" for k in (1, 2, 3)], "motor")}</mujoco>""",
-        "ball round a box": BOX.replace("</worldbody>", f"{BALL}</worldbody><actuator>{BALL_SERVOS}</actuator>"),
-        "hand of 115 geoms": f"""<mujoco><worldbody>{palm}{fingers}<body pos=".04 0 -.03"><freejoint/>
-          <geom type="box" size=".02 .02 .02" mass=".05"/></body></worldbody>
-          {motors([f"f{i}{k}" for i in range(4) for k in (1, 2, 3, 4)], 'position kp="1"')}</mujoco>""",
-    }
-
-
-def time_states(o: Options) -> dict[str, dict[str, float]]:
-    """Times of a state of these models in parts of that of `mj_forward`."""
-    rows, count = {}, 8 if o.smoke else 64
-    for name, text in timed_models().items():
-        model = mujoco.MjModel.from_xml_string(text)
-        random, data = np.random.default_rng(o.seed), mujoco.MjData(model)
-        states = []
-        for _ in range(count):
-            data.ctrl[:] = random.uniform(-0.3, 0.3, model.nu)
-            mujoco.mj_step(model, data, 5)
-            states.append((data.qpos.copy(), data.qvel.copy()))
-        for motion in ("quasi-static", "dynamic"):
-            if motion == "quasi-static" and name == "walker":
-                continue
-            module = MujocoLCS(model, motion=motion, seconds=0.05, contacts=12)
-            x = torch.stack([module.state.to_state(*state) for state in states])
-            forward = median_time(o.repeats, mujoco.mj_forward, model, data)
-            row = {"us of mj_forward": 1e6 * forward, "of 1": median_time(o.repeats, module.params, x[:1]) / forward}
-            row[f"of {count}"] = median_time(o.repeats, module.params, x) / count / forward
-            rows[f"{name}, {motion}"] = row
-            print(f"{name + ', ' + motion:32s}", "   ".join(f"{label} {v:.1f}" for label, v in row.items()))
-    return rows
-
-
 def median_time(repeats: int, call: Callable[..., Any], *arguments: Any) -> float:
     """Processor time of a call [s], the median; three at once, as a clock has its time too."""
     used = []
@@ -366,17 +301,8 @@ def main(o: Options) -> None:
                 if isinstance(v, dict)
             )
             print(f"{case.system:32s} {case.mode:31s} {row['ms a state']:.3f} ms, n_lam {row['n_lam']:2d}   {told}")
-    times = time_states(o)
     options = {"states": o.states, "batch": o.batch, "seed": o.seed, "seconds": SECONDS}
-    save(
-        o.out,
-        {
-            "machine": {**machine(), "mujoco": mujoco.__version__},
-            "options": options,
-            "results": results,
-            "times": times,
-        },
-    )
+    save(o.out, {"machine": {**machine(), "mujoco": mujoco.__version__}, "options": options, "results": results})
 
 
 if __name__ == "__main__":

@@ -223,21 +223,21 @@ def fit_report(
             without.append(((guess - x_next) / step).square().sum(1) - squared)
         gain = torch.stack(without, 1) if without else x.new_zeros(len(x), 0)
         base = squared.mean().clamp_min(1e-300)
-        rows, ends, walkers, rollout = torch.arange(len(x)), _continues(x, x_next), [x, x, x], []
+        linear, ends, rows, rollout = _affine(solution, x, u), _continues(x, x_next), torch.arange(len(x)), []
+        predictions = [prediction.x_next, linear, x]
         for h in range(horizon):
-            now, action = rows + h, u[rows + h]
-            walkers = [
-                advance(at(now, walkers[0]), walkers[0], action).x_next,
-                _affine(solution, walkers[1], action),
-                walkers[2],
-            ]
-            rollout.append(torch.stack([_rms((w - x_next[now]) / spread).square().mean().sqrt() for w in walkers]))
-            on = ends[now]
-            rows, walkers = rows[on], [w[on] for w in walkers]
+            if h:
+                on = ends[rows + h - 1]
+                rows, (reached, by_affine, still) = rows[on], (v[on] for v in predictions)
+                now, action = rows + h, u[rows + h]
+                moved = advance(at(now, reached), reached, action).x_next
+                predictions = [moved, _affine(solution, by_affine, action), still]
+            errors = [(v - x_next[rows + h]) / spread for v in predictions]
+            rollout.append(torch.stack([_rms(error).square().mean().sqrt() for error in errors]))
         return FitReport(
             step=step,
             error=_rms(prediction.x_next - x_next) / step,
-            linear=_rms(_affine(solution, x, u) - x_next) / step,
+            linear=_rms(linear - x_next) / step,
             acts=(lam > params.gap(x, u) + (params.F @ lam.unsqueeze(-1)).squeeze(-1)).double().mean(0),
             without=((base + gain.mean(0)) / base).sqrt(),
             gain=gain,

@@ -98,8 +98,8 @@ class _Record(SystemMatrices):
 
     @runs_eagerly
     def __post_init__(self) -> None:
-        vars(self).update({name: to_tensor(value) for name, value in self.tensors().items()})
-        tensors = self.tensors()
+        tensors: dict[str, Any] = {name: to_tensor(value) for name, value in self.tensors().items()}
+        vars(self).update(tensors)
         for name, value in tensors.items():
             check_tensor(name, value, finite=False)
         check_finite(tensors)

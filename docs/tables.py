@@ -234,19 +234,6 @@ def latency(record: dict) -> str:
     return table(["", *robots], rows)
 
 
-def steps(record: dict) -> str:
-    """Times of a step of the controller in Python and in C [µs]."""
-    labels = {
-        "Python, `controller.step`": ("python", "step"),
-        "of it outside the solver": ("python", "rest"),
-        "C, `difflcs_step`": ("c", "step"),
-        "of it in the solver": ("c", "solver"),
-    }
-    names = ("p50", "p99", "largest")
-    rows = [[label, *(number(record[who][part][name]) for name in names)] for label, (who, part) in labels.items()]
-    return table(["", *names], rows)
-
-
 def deadlines(record: dict) -> str:
     """Squared errors of a closed loop with a deadline, and the share of steps that were not solved."""
     rows = []
@@ -258,15 +245,15 @@ def deadlines(record: dict) -> str:
 
 DECIDES = {
     "PDDM": "PDDM, 700 sequences in three networks",
-    "LCS-MPC": "LCS-MPC, `LCSMPCLayer`",
-    "controller": "LCS-MPC, [`layer.controller()`](robot.md)",
+    "layer, cold": "LCS-MPC, `LCSMPCLayer`, cold",
+    "controller": "LCS-MPC, [`layer.controller()`](robot.md), warm",
 }
 
 
 def decision(record: dict) -> str:
-    """Milliseconds of one decision, and those of PDDM as a multiple."""
-    spent = record["milliseconds"]
-    rows = [[label, f"{spent[k]:.2g} ms", f"{spent['PDDM'] / spent[k]:.0f}×"] for k, label in DECIDES.items()]
+    """Milliseconds of one decision on the cube, and those of PDDM as a multiple."""
+    spent = {way: row["p50 µs"] for way, row in record["results"]["zoo cube, H 8"].items() if way in DECIDES}
+    rows = [[label, f"{1e-3 * spent[k]:.2g} ms", f"{spent['PDDM'] / spent[k]:.0f}×"] for k, label in DECIDES.items()]
     return table(["one decision", "computing", "PDDM takes"], rows)
 
 
@@ -435,9 +422,7 @@ TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "optima": {"efforts": efforts},
     "scale": {"sizes": sizes, "weak": weak},
     "training_time": {"recipes": recipes},
-    "latency": {"ways": latency},
-    "controller": {"steps": steps, "deadlines": deadlines},
-    "decision": {"ways": decision},
+    "latency": {"ways": latency, "deadlines": deadlines, "decision": decision},
     "physics": {"errors": errors},
     "objects": {"success": objects, "methods": methods},
     "physics_models": {"summary": summary, "models": foreign},

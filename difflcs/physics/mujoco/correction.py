@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from difflcs.physics.mujoco.limits import Rows
 from difflcs.physics.mujoco.motion import DynamicStep, Steps, advance_step
-from difflcs.physics.mujoco.native import TAKEN, flags
+from difflcs.physics.mujoco.native import copy_taken, flags
 from difflcs.records import LCSParams
 
 Array = NDArray[np.float64]
@@ -55,8 +55,7 @@ class WholeStep:
         """
         model, data, nv = self.model, self.data, self.model.nv
         after = np.full((len(states), 2 * nv), np.nan)
-        for name in TAKEN:
-            getattr(data, name)[:] = getattr(taken, name)
+        copy_taken(data, taken)
         for i, state in enumerate(states):
             data.qpos[:], data.qvel[:], data.act[:] = np.split(state, [model.nq, model.nq + nv])
             data.ctrl[:], data.qacc_warmstart[:] = ctrl[i], 0.0

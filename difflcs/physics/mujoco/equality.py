@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from difflcs.physics.complementarity import FreeMotion
 from difflcs.physics.mujoco.motion import Dynamic, DynamicStep, Linearised
-from difflcs.physics.mujoco.native import TAKEN, flags, native
+from difflcs.physics.mujoco.native import copy_taken, flags, native
 
 Array = NDArray[np.float64]
 _DEPENDENT = 1e-9  # part of the largest singular value below which rows say the same
@@ -67,8 +67,7 @@ class Equality:
         model, data, rows = self.model, self.data, []
         if not self._taken.eq_active.any():
             return None
-        for name in TAKEN:
-            getattr(data, name)[:] = getattr(self._taken, name)
+        copy_taken(data, self._taken)
         for i, q in enumerate(qpos):
             with native(model, data, f"in state {i} of {len(qpos)}"):
                 data.qpos[:] = q

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
-from difflcs.physics.mujoco.native import TAKEN, native
+from difflcs.physics.mujoco.native import copy_taken, native
 
 _FUNCTIONS = (
     "mj_kinematics",
@@ -129,8 +129,7 @@ class Places:
             model = copy.copy(first.model)
             self._all.append(Place(model, mujoco.MjData(model)))
         for place in self._all[1:threads]:
-            for name in TAKEN:
-                getattr(place.data, name)[:] = getattr(first.data, name)
+            copy_taken(place.data, first.data)
         return [place.native for place in self._all[:threads]]
 
     def check(self, outcome: tuple[int, int, str], n: int) -> None:

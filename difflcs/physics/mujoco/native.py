@@ -39,6 +39,12 @@ def flags(*names: str) -> int:
     return sum(int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in names)
 
 
+def copy_taken(into: Any, data: Any) -> None:
+    """Copy the fields that are `TAKEN` from one data of a model into another."""
+    for name in TAKEN:
+        getattr(into, name)[:] = getattr(data, name)
+
+
 _KINDS = {int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")): text for name, text in _WARNINGS.items()}
 
 
