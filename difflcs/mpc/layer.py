@@ -52,8 +52,8 @@ class LCSMPCLayer(nn.Module):
             if an nn.Parameter. None: no bound.
         u_max: upper bound, likewise.
         backend: name of a registered backend, or an instance with options.
-        relaxation: λ·s of the relaxed complementarity, > 0, at which plan and gradient are. 1e-7 is hard contact but
-            for tenths of a percent of the cost; with training_relaxation=1e-5 gradients stay smooth in training.
+        relaxation: λ·s of the relaxed complementarity, > 0, at which plan and gradient are. 1e-7 is nearly hard
+            contact; with training_relaxation=1e-5 gradients stay smooth in training.
         on_failure: "raise" a `SolveError` when an element is not solved, or "mask" it: finite numbers inside the
             bounds, zero gradient, one `SolveWarning` per layer.
         bounds: `StageBounds`, instead of u_min and u_max.
