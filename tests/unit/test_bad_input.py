@@ -1,7 +1,5 @@
 """Every bad input meets a typed error that says what was expected, what came, and how to mend it."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Checkpoints: round trips, every kind of damage, and writes that leave the old file or the new."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

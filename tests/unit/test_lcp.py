@@ -4,8 +4,6 @@ Signs, equations, complementarity and gradients of easy, degenerate, badly scale
 by the campaign in tests/conformance/hostile.
 """
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

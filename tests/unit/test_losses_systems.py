@@ -1,7 +1,5 @@
 """The losses with systems other than one LCSModel: LCSParams, one per transition, modules; and gamma="auto"."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
