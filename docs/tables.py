@@ -257,20 +257,6 @@ def decision(record: dict) -> str:
     return table(["one decision", "computing", "PDDM takes"], rows)
 
 
-def errors(record: dict) -> str:
-    """Predictions of one step by system and mode: error of each coordinate and how far it moved, time of a state."""
-    rows = []
-    for system, modes in record["results"].items():
-        for k, (mode, row) in enumerate(modes.items()):
-            cells = [
-                f"{name} {number(value['error'])} of {number(value['moved'])} {value['unit']}"
-                for name, value in row.items()
-                if isinstance(value, dict)
-            ]
-            rows.append(["" if k else system, mode, "; ".join(cells), duration(1e-3 * row["ms a state"])])
-    return table(["system", "model", "error of motion", "time of a state"], rows)
-
-
 def foreign(record: dict) -> str:
     """Models by others: errors of a step and those of differences in brackets, by kind; a refusal in words."""
     rows = []
@@ -423,7 +409,6 @@ TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "scale": {"sizes": sizes, "weak": weak},
     "training_time": {"recipes": recipes},
     "latency": {"ways": latency, "deadlines": deadlines, "decision": decision},
-    "physics": {"errors": errors},
     "objects": {"success": objects, "methods": methods},
     "physics_models": {"summary": summary, "models": foreign},
     "box_to_pose": {"success": success},
