@@ -1,7 +1,5 @@
 """The C library from outside: built and installed without Python, found by CMake, and bit-equal to Python."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

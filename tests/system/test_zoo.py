@@ -1,7 +1,5 @@
 """Models that ship with the package: names, cards, how they are added, and that they are as good as their cards say."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

@@ -1,7 +1,5 @@
 """Any `LCSModule` in warm-up and PPO, and a context on its way from the environment to model, loss and critic."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -35,8 +33,6 @@ from difflcs.rl.rollout import contexts, make_empty_record, mpc_actions, transit
 from difflcs.rl.runs.checkpoint import load_checkpoint, save_checkpoint
 from tests.training import slide
 from tests.training.slide import parameters, recorded, same
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 STEPS = HeavyBlock.STEPS
 LOSS = ViolationLoss(gamma="auto", xi=0.1)

@@ -15,8 +15,6 @@ from difflcs.rl import EnsembleSettings, Epochs, ModelRollouts, ModelRolloutSett
 from difflcs.rl.learning.dynamics import Ensemble
 from difflcs.rl.learning.model_rollouts import ModelEnv
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 STEPS, N_X, N_U = 5, 2, 2
 SPACES = SimpleNamespace(
     single_observation_space=spaces.Dict(

@@ -11,8 +11,6 @@ from difflcs.rl.rollout import collect, uniform_actions
 from difflcs.rl.runs.evaluate import evaluate
 from tests.training.slide import ROLLOUTS, STEPS, Noting, make_envs, make_models, make_ppo, parameters, recorded, same
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def make_practising(seed: int = 0, first_epochs: int = 20, models: dict | None = None, **changes):
     return make_ppo(seed, models=make_models(seed, first_epochs, **(models or {})), **changes)

@@ -1,7 +1,5 @@
 """Backend `batched`: threads, instruction sets, efforts, and large problems; more in tests/conformance."""
 
-from __future__ import annotations
-
 import inspect
 import os
 import subprocess

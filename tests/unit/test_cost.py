@@ -1,7 +1,5 @@
 """QuadraticCost and GoalCost: their value, convexity and gradients."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 import re

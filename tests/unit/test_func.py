@@ -1,7 +1,5 @@
 """The layer under torch.func and torch.compile: the numbers of plain calls, or an error. Jacobians: test_transforms."""
 
-from __future__ import annotations
-
 import warnings
 
 import pytest
@@ -13,8 +11,6 @@ from torch.func import functional_call, grad, vmap
 from difflcs import LCSMPCLayer, LCSParams, MPCSolution, Status
 from difflcs import errors as e
 from difflcs.mpc import Primal
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """violation_loss of one LCSModel, and prediction_loss; values and gradients are judged in test_losses_systems.py."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """LCSMPCLayer: what a user of PyTorch expects of a layer, and what happens when a solve fails."""
 
-from __future__ import annotations
-
 import copy
 import gc
 import pickle

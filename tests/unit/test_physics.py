@@ -1,7 +1,5 @@
 """Shapes, contacts, a body pushed by discs, and what is learned of it."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -33,7 +31,6 @@ from difflcs.physics.complementarity import count_forces
 from difflcs.physics.learnable import LEARNABLE
 
 F64 = torch.float64
-pytestmark = pytest.mark.usefixtures("one_thread")
 L_SHAPE = [[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 3.0]]
 
 

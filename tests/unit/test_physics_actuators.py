@@ -1,7 +1,5 @@
 """Actuators with activation and with limits of control and force, beside MuJoCo's own steps."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -9,8 +7,6 @@ from difflcs import LCSMPCLayer, QuadraticCost
 
 mujoco = pytest.importorskip("mujoco")
 from difflcs.physics.mujoco import MujocoLCS  # noqa: E402
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 SLIDE = """<mujoco><option timestep=".002" integrator="{0}" gravity="0 0 0"/><worldbody><body>
     <joint name="a" type="slide" axis="1 0 0" damping="2" {2}/><geom size=".1" mass="1"/></body></worldbody>

@@ -1,7 +1,5 @@
 """Contacts of many geoms and many states at once: those of each pair, and of each state, alone."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 
 import numpy as np

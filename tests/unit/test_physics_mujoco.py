@@ -1,7 +1,5 @@
 """`difflcs.physics.mujoco`: states, contacts and systems of MuJoCo models, against MuJoCo and known solutions."""
 
-from __future__ import annotations
-
 import importlib
 import itertools
 import sys
@@ -23,8 +21,6 @@ from difflcs.errors import (  # noqa: E402
 )
 from difflcs.physics import PlanarPushing, box  # noqa: E402
 from difflcs.physics.mujoco import MujocoLCS, MujocoState, lcs_from_mujoco  # noqa: E402
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 SHAPES = {
     "sphere": 'type="sphere" size=".03"',
@@ -383,11 +379,6 @@ def test_an_actuator_is_a_servo_only_by_an_affine_bias():
 
 
 # --- motion with velocities -----------------------------------------------------------------------------------------
-
-CART_POLE = """
-<body><joint name="cart" type="slide" axis="1 0 0" damping=".1"/><geom type="box" size=".1 .05 .05" mass="1"/>
-  <body><joint name="pole" type="hinge" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 .6" size=".02" mass=".1"/>
-</body></body>"""
 
 
 @pytest.mark.parametrize("relative", [True, False])

@@ -1,7 +1,5 @@
 """LearnableMujocoLCS: it is the system of the changed model, and its gradients are slopes."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -13,8 +11,6 @@ mujoco = pytest.importorskip("mujoco", reason="needs the extra [envs]")
 from difflcs import GoalCost, LCSMPCLayer  # noqa: E402
 from difflcs.errors import InvalidInputError  # noqa: E402
 from difflcs.physics.mujoco import LearnableMujocoLCS, MujocoLCS  # noqa: E402
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 F64 = torch.float64
 VALUES = {"mass": 0.4, "inertia": 4e-4, "com": 0.004, "friction": 0.5, "size": 0.05, "offset": 0.0, "tip": 0.02}

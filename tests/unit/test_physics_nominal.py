@@ -1,7 +1,5 @@
 """Dynamic motion of MuJoCo models against MuJoCo: what rests or slides, free motion, nominal controls, fast robots."""
 
-from __future__ import annotations
-
 import copy
 import math
 
@@ -14,8 +12,6 @@ mujoco = pytest.importorskip("mujoco")
 from difflcs import GoalCost, LCSMPCLayer, Status  # noqa: E402
 from difflcs.errors import InvalidInputError  # noqa: E402
 from difflcs.physics.mujoco import MujocoLCS  # noqa: E402
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 SECONDS = (0.002, 0.02, 0.1)
 FIRM = '<option timestep=".001" cone="elliptic" impratio="100"/>'  # friction that hardly creeps; by default it does

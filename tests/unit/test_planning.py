@@ -1,7 +1,5 @@
 """Sampling-based contact MPC: where to push, when to travel, and how the loop closes on a small planar system."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -12,8 +10,6 @@ from difflcs import GoalCost, LCSMPCLayer, LCSParams
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
 from difflcs.physics import PlanarPushing, box
 from difflcs.planning import DiscPlaces, Mode, PlanarTravel, SamplingPolicy, SamplingSettings, Workspace
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 F64 = torch.float64
 RADIUS = 0.1

@@ -1,7 +1,5 @@
 """LCSParams and LCSSequence as records that behave like tensors, and what counts as an LCSModule."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Units suggested from data: the same whatever the units of the data, and a model learns as well in any."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """States as trees: flattened and put together again, compared, and taken back where they do not fit."""
 
-from __future__ import annotations
-
 import json
 import math
 from typing import Any

@@ -1,7 +1,5 @@
 """solve_lcp, the losses, the layer and the records under torch.func, vectorised jacobians and torch.compile."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
