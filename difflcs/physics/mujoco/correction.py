@@ -6,8 +6,8 @@ they go. On each tree of bodies they count by the energy that they bring about, 
 the rest is added to d. F and the gaps stay.
 
 What contacts do depends on friction, which holds with one action and slides with another. So Δ of contacts counts only
-where they do worse than nothing, and goes to d: a grip that is many times as firm as at the nominal action must not make
-it as many times as large.
+where they do worse than nothing, and goes to d: a grip many times as firm as at the nominal action must not make it as
+many times as large.
 """
 
 # MuJoCo is a compiled module without type stubs.
