@@ -127,14 +127,6 @@ def test_a_changed_number_in_the_configuration_is_noticed(saved):
     refuse(saved)
 
 
-def test_the_configuration_of_one_model_with_the_tensors_of_another_is_noticed(build, saved, tmp_path):
-    """What a crash between the two writes, or a half-finished copy, leaves behind."""
-    other = LCSModel(4, 2, 3, stiffness=0.7)
-    other.save_pretrained(tmp_path / "other")
-    shutil.copy(tmp_path / "other" / "model.safetensors", saved / "model.safetensors")
-    refuse(saved)
-
-
 @pytest.mark.parametrize(
     ("change", "match"),
     [

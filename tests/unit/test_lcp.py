@@ -1,7 +1,7 @@
 """solve_lcp: right on every P-matrix, differentiable, one element at a time.
 
-Signs, equations, complementarity and gradients of easy, degenerate, badly scaled, large and impossible LCPs, and that
-neighbours do not matter, are judged by the campaign in tests/conformance/hostile.
+Signs, equations, complementarity and gradients of easy, degenerate, badly scaled, large and impossible LCPs are judged
+by the campaign in tests/conformance/hostile.
 """
 
 import itertools
@@ -165,11 +165,13 @@ def test_an_element_that_is_not_solvable_is_reported_and_spoils_no_other(build, 
     clean = solve_lcp(clean_F, clean_q, relaxation)
     clean.lam.sum().backward()
     F[2], q[2] = -torch.eye(3), -1.0  # −λ − 1 ≥ 0 has no solution
+    F[4], q[4] = 1e300 * F[4], 1e305 * q[4]
+    F[5] = F[5] - F[5].T + 1e-12 * torch.eye(3)
     F.requires_grad_()
     q.requires_grad_()
-    with pytest.warns(SolveWarning, match=r"1 of 6 LCPs were not solved.*positive definite.*status"):
+    with pytest.warns(SolveWarning, match=r"2 of 6 LCPs were not solved.*positive definite.*status"):
         solution = solve_lcp(F, q, relaxation)
-    assert (solution.status != Status.CONVERGED).tolist() == [False, False, True, False, False, False]
+    assert (solution.status != Status.CONVERGED).tolist() == [False, False, True, False, True, False]
     assert bool(torch.isfinite(solution.lam).all())
     assert float(solution.lam.detach().min()) >= 0
     upstream = torch.ones_like(solution.lam)
@@ -177,7 +179,7 @@ def test_an_element_that_is_not_solvable_is_reported_and_spoils_no_other(build, 
     torch.autograd.backward((solution.lam, solution.w), (upstream, torch.where(upstream.isnan(), torch.nan, 0.0)))
     assert torch.equal(F.grad[2], torch.zeros(3, 3, dtype=torch.float64))
     assert torch.equal(q.grad[2], torch.zeros(3, dtype=torch.float64))
-    others = [0, 1, 3, 4, 5]
+    others = [0, 1, 3]
     assert torch.equal(solution.lam[others], clean.lam[others])
     assert torch.equal(F.grad[others], clean_F.grad[others])
     assert torch.equal(q.grad[others], clean_q.grad[others])

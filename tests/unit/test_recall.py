@@ -305,6 +305,7 @@ def test_errors_are_those_of_a_first_call():
                     used(*inputs)
 
     refused(NonFiniteError, "^x0", lambda layer: None, X * torch.nan, GOAL)
+    refused(DTypeError, "^x0: expected a dense", lambda layer: None, X.to_sparse(), GOAL)
     refused(NonFiniteError, "^goal", lambda layer: None, X, GOAL * torch.inf)
     refused(NonFiniteError, "^A", lambda layer: layer.lcs.A.data.fill_(torch.nan), X, GOAL)
     refused(NonFiniteError, "^Q", lambda layer: layer.cost.Q.fill_(torch.nan), X, GOAL)
