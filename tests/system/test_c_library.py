@@ -140,29 +140,6 @@ def test_the_example_measures_itself(exported, robot):
 
 @pytest.mark.slow
 @needs_tools
-def test_a_damaged_file_is_an_error_in_words(exported, robot, tmp_path):
-    content = (exported / "controller.difflcs").read_bytes()
-    for damaged, message in ((content[:-9], "the file was cut"), (content[:-1] + b"!", "the file is damaged")):
-        (tmp_path / "c").write_bytes(damaged)
-        done = subprocess.run(
-            [robot, tmp_path / "c", exported / "trajectory.csv"],
-            capture_output=True,
-            text=True,
-            timeout=60,
-            env=BASELINE,
-        )
-        assert done.returncode == 1
-        assert message in done.stderr
-    unknown = {**BASELINE, "DIFFLCS_ISA": "of-tomorrow"}
-    done = subprocess.run(
-        [robot, exported / "controller.difflcs", "x"], capture_output=True, text=True, timeout=60, env=unknown
-    )
-    assert done.returncode == 1
-    assert "DIFFLCS_ISA=of-tomorrow is not available" in done.stderr
-
-
-@pytest.mark.slow
-@needs_tools
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="symbols are listed on Linux")
 def test_nothing_but_the_header_is_to_be_seen(installed):
     if shutil.which("nm") is None:

@@ -63,26 +63,6 @@ def by_enumeration(params, x, u, x_next, gamma, xi):
 # --- one system per transition --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("part", [0.05, 0.5, 0.99])
-@pytest.mark.parametrize("xi", [1e-3, 0.3])
-def test_each_transition_has_the_loss_of_its_own_system(each, data, part, xi):
-    gamma = part * float(sigma(each.F).min())
-    found = violation_loss(each, *data, gamma, xi, reduction="none")
-    expected = [by_enumeration(each[i], *(v[i] for v in data), gamma, xi) for i in range(COUNT)]
-    torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), rtol=1e-8, atol=1e-8)
-    assert float(found.min()) > 0.01
-
-
-def test_params_of_a_model_have_its_loss_bit_for_bit(build, data):
-    model = build.model(seed=3)
-    assert torch.equal(violation_loss(model.params(), *data), violation_loss(model, *data))
-    left = torch.autograd.grad(violation_loss(model.params(), *data), list(model.parameters()))
-    right = torch.autograd.grad(violation_loss(model, *data), list(model.parameters()))
-    for a, b in zip(left, right, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-13)
-    assert torch.equal(prediction_loss(model.params(), *data), prediction_loss(model, *data))
-
-
 @pytest.mark.parametrize("function", [violation_loss, prediction_loss])
 @pytest.mark.parametrize("own", [NAMES, ("A", "F"), ("C",), ("c", "d")], ids="-".join)
 def test_the_gradient_is_that_of_finite_differences_in_every_input(build, function, own):
@@ -261,11 +241,6 @@ def test_a_module_is_asked_for_the_system_of_the_states(build, data, function):
     loss.sum().backward()
     assert float(module.mass.grad.abs()) > 0
     assert all(float(p.grad.abs().max()) > 0 for p in module.inner.parameters())
-
-
-def test_a_module_with_one_system_for_all_is_like_its_model(build, data):
-    module = Moving(build, per_transition=False)
-    assert torch.equal(violation_loss(module, *data), violation_loss(module.inner, *data))
 
 
 def test_a_model_with_params_of_its_own_is_asked_for_them(build, data):

@@ -89,6 +89,18 @@ def test_what_friction_holds_stays_as_in_mujoco_by_the_right_force(name, option)
             torch.testing.assert_close(carried[-1:], torch.full((1,), 9.81).double(), rtol=2e-2, atol=0)
 
 
+def test_a_grip_that_the_nominal_control_does_not_close_holds_from_step_to_step():
+    model = load(PINCH, SERVOS, "")
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 0.01
+    mujoco.mj_step(model, data, 300)
+    module = MujocoLCS(model, data, motion="dynamic", seconds=0.1)
+    x = module.state.to_state(data.qpos, data.qvel)
+    for _ in range(8):
+        x = module.params(x).step(x, torch.from_numpy(data.ctrl) - x[6:8]).x_next
+        assert abs(float(x[10])) < 0.01  # m/s; in half a step it falls at .5
+
+
 @pytest.mark.parametrize(
     ("degrees", "heading", "speed"), [(0, 0.0, 0.8), (0, 0.7, 0.8), (30, 0.0, 0.3), (40, 0.0, 0.0)]
 )

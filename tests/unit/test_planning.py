@@ -124,14 +124,6 @@ def error(x, goal):
 # --- one step, on a line ----------------------------------------------------------------------------------------------
 
 
-def test_it_pushes_where_the_pusher_is_on_the_right_side():
-    policy = on_a_line()
-    u = policy.act([0.0, -0.51], [1.0])
-    assert policy.decision.mode is Mode.PUSH
-    assert not policy.decision.began
-    np.testing.assert_allclose(u, [0.2], atol=1e-4)
-
-
 def test_it_travels_where_the_pusher_is_on_the_wrong_side_and_pushes_from_there():
     policy, x = on_a_line(), tensor([0.0, 0.51])
     u = policy.act(x, [1.0])

@@ -39,7 +39,7 @@ def same(one: Any, other: Any) -> bool:
     return type(one) is type(other) and one == other
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(TREES)
 def test_a_tree_comes_back(tree):
     tensors, rest = flatten(tree)
