@@ -11,9 +11,9 @@ from functools import partial
 from typing import Any, Literal
 
 from difflcs.cost import GoalCost
-from difflcs.rl import TaskSpec, get_task
+from difflcs.rl import TaskSpec, get_method, get_task
 
-Chosen = Literal["ours", "paper", "jin-posa", "authors"]
+Chosen = Literal["ours", "paper", "light", "jin-posa", "authors"]
 """Recipes to choose from on the command line."""
 Protocol = Literal["full", "support", "task"]
 """How a model is deployed in an evaluation, see `PROTOCOLS`."""
@@ -35,12 +35,13 @@ class Recipe:
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Of the method, where it has them; a mapping changes a group of settings."""
     task: Mapping[str, float] = field(default_factory=dict)
-    """Of the task: `horizon` and `action_weight` of the MPC."""
+    """Of the task: `horizon`, `action_weight` of the MPC, `sparse_penalty` of the reward, `object_mass` [kg]."""
     protocols: Mapping[str, Sequence[Protocol]] = field(default_factory=dict)
     """Method → the ways in which its models are evaluated; "full" alone if it is not here."""
 
 
 _ADAM = {"update": "adam", "steps": 20, "minibatch": None}
+_FIXED = get_method("lcs-rl")().ppo.covariance == "fixed"  # pyright: ignore[reportAttributeAccessIssue]
 PAPER = Recipe(
     "the paper's recipe",
     # Learned Σ and a stochastic policy in both phases are the paper's; the size of the noise is that with which the
@@ -57,6 +58,8 @@ PAPER = Recipe(
     protocols={"violation": ["full", "support"]},
 )
 """The paper's algorithm. What it leaves open is as in the prior work, or as ours."""
+LIGHT = replace(PAPER, label=f"{PAPER.label}, objects of 10 g", task={**PAPER.task, "object_mass": 0.01})
+"""The same where every object is as light as the cube: the paper names no masses."""
 JIN_POSA = Recipe(
     "as Jin & Posa",
     settings={"n_lam": 5, "warmup": {"noise": 0.0, "action_support": 0.9, "action_support_growth": 1.001}},
@@ -65,11 +68,23 @@ JIN_POSA = Recipe(
 )
 """The prior work: its horizon, contacts, weight of the action, and action support (examples/trifinger_task2 of
 wanxinjin/Task-Driven-Hybrid-Reduction); it plans in the same support when it is evaluated."""
+ABLATIONS: Mapping[str, Recipe] = {
+    "adam": Recipe("Adam instead of the natural gradient", {"ppo": _ADAM}),
+    "no-models": Recipe("without model rollouts", {"models": {"iterations": 0}}),
+    "no-support": Recipe("without the kept action support", {"warmup": {"keep_support": False}}),
+    "one-action": Recipe("one action per imagined state", {"models": {"actions": 1}}),
+    "sigma": Recipe("learned Σ" if _FIXED else "fixed Σ", {"ppo": {"covariance": "diagonal" if _FIXED else "fixed"}}),
+    "no-penalty": Recipe("without the penalty of failed episodes", task={"sparse_penalty": 0.0}),
+    "horizon-5": Recipe("horizon 5", task={"horizon": 5}),
+}
+"""LCS-RL in our recipe but for one part. Without warm-up it is the method "ppo" in our recipe."""
 RECIPES: Mapping[str, Recipe] = {
     "ours": Recipe("our recipe", protocols={"violation": ["full", "support"]}),
     "paper": PAPER,
+    "light": LIGHT,
     "jin-posa": JIN_POSA,
     "authors": Recipe("networks drawn anew, as its authors do", {"pddm": {"keep_networks": False}}),
+    **ABLATIONS,
 }
 """All recipes by their names."""
 
@@ -86,8 +101,17 @@ def changed_task(name: str, changes: Mapping[str, float]) -> TaskSpec:
     spec = get_task(name)
     if "horizon" in changes:
         spec = replace(spec, horizon=int(changes["horizon"]))
+    if "object_mass" in changes:
+        spec = replace(spec, env_kwargs={**spec.env_kwargs, "object_mass": changes["object_mass"]})
     if "action_weight" in changes:
         spec = replace(spec, make_cost=partial(_weighted, spec.make_cost, changes["action_weight"]))
+    if "sparse_penalty" in changes:
+        from difflcs_envs.trifinger.task import MOVE
+
+        penalty = changes["sparse_penalty"]
+        judge = replace(MOVE, sparse_penalty=penalty).judge
+        kwargs = {**spec.env_kwargs, "sparse_penalty": penalty}
+        spec = replace(spec, outcome=judge, failure_penalty=penalty, env_kwargs=kwargs)
     return spec
 
 

@@ -129,16 +129,21 @@ def listed(names: Sequence[str]) -> str:
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1] if names else "none"]))
 
 
+def sides(differences: Mapping[str, Estimate | None]) -> tuple[list[str], list[str], list[str], list[str]]:
+    """Sort names by their difference: above zero, below it, on either side by its interval, or without one."""
+    known = {name: value for name, value in differences.items() if value is not None and not math.isnan(value.low)}
+    above = [name for name, value in known.items() if value.low > 0]
+    below = [name for name, value in known.items() if value.high < 0]
+    either = [name for name in known if name not in above and name not in below]
+    return above, below, either, [name for name in differences if name not in known]
+
+
 def verdict(differences: Mapping[str, Estimate | None], against: str = "on", unlike: str = "on") -> str:
     """Describe where a difference is above or below zero or undecided, by the intervals; and what was not compared.
 
     `against` and `unlike` are the words between a finding and its names, which are objects by default.
     """
-    known = {name: value for name, value in differences.items() if value is not None and not math.isnan(value.low)}
-    above = [name for name, value in known.items() if value.low > 0]
-    below = [name for name, value in known.items() if value.high < 0]
-    told = above, below, [name for name in known if name not in above and name not in below]
-    unknown = [name for name in differences if name not in known]
+    *told, unknown = sides(differences)
     ways = (f"better {against}", f"worse {against}", f"not to be told apart {unlike}")
     parts = [
         f"{how} all {len(names)}" if len(names) == len(differences) else f"{how} {len(names)} ({listed(names)})"

@@ -5,7 +5,7 @@ Without options the table is drawn from the tracked results. `--rerun --preset s
 
 import itertools
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -85,6 +85,11 @@ def beyond_paper(cells: Cells) -> dict[str, Estimate | None]:
     return differences
 
 
+def below(name: str, note: str, words: Sequence[str], cells: Cells) -> list[str]:
+    """List the notes below a table: whether the objects are stand-ins, a note, sentences, the origin of the numbers."""
+    return [STAND_INS] * name.endswith("stand-in") + [note, *report.bullets(words), *report.provenance(cells)]
+
+
 def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
     """Write the tables of all recipes that have results."""
     tables, words, used = Tables(), [], Cells()
@@ -130,9 +135,7 @@ def draw(rows: pd.DataFrame, folder: Path, name: str) -> bool:
             ends = [difference for pair in pairs for difference in report.paired(*pair, "final")]
             if ends and not any(ends):
                 words.append(f"{support}: at the end every seed has reached as many goals with full bounds.")
-    stand_ins = [STAND_INS] * name.endswith("stand-in")
-    notes = [*stand_ins, NOTE, *report.bullets(words), *report.provenance(used)]
-    report.write_tables(folder, name, tables, notes)
+    report.write_tables(folder, name, tables, below(name, NOTE, words, used))
     return True
 
 

@@ -10,13 +10,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from recipes import RECIPES, Protocol, Recipe, changed, changed_task
+from recipes import ABLATIONS, RECIPES, Protocol, Recipe, changed, changed_task
 
 from difflcs.errors import InvalidInputError
 from difflcs.rl import RunDirectory, TaskSpec, TrainConfig, get_method, get_task, train
 from difflcs.rl.runs.training import Reporter
 
-Artefact = Literal["table1", "curves", "transfer"]
+Artefact = Literal["table1", "masses", "curves", "transfer", "ablations"]
 Object = Literal["sugar_box", "fish_can", "mug", "wrench", "clamp", "banana"]
 Method = Literal["lcs-rl", "violation", "ppo", "pddm"]
 PresetName = Literal["paper", "quick", "smoke"]
@@ -34,9 +34,18 @@ METHODS: Mapping[str, Names] = {
 """Methods of the figures → their recipes, see `recipes.RECIPES`."""
 COMPARED = ("violation", "lcs-rl")
 """The methods of Table I."""
+MASSES = ("paper", "light")
+"""Recipes that differ in the mass of the objects alone."""
 TRANSFER = {"scratch": "lcs-rl", "cube": "ppo"}
 """Starts → methods of the transfer figure. From scratch is from a random model; from the final LCS-RL model of the cube
 with the same seed it is the main phase alone: a warm-up on little data would first undo what PPO has taught."""
+ABLATED: Mapping[str, tuple[str, str]] = {
+    **{name: ("lcs-rl", name) for name in ABLATIONS},
+    "no-warm-up": ("ppo", "ours"),
+}
+"""Ablations → method and recipe."""
+ABLATION_TASKS, ABLATION_SEEDS = ("cube", "banana"), 8
+"""Tasks for the ablations of LCS-RL, and their number of seeds."""
 FIRST_SEED = 1000
 """Seed of the first run of everything. Nothing was ever chosen by this seed or a later one."""
 
@@ -123,19 +132,24 @@ def matrix(
 ) -> list[Unit]:
     """List the units that artefacts need, each once and after the one it starts from: the most important first.
 
-    These are Table I; then curves and transfer; then what is slow. Of each the first seeds come first.
+    These are Table I; then masses, curves, transfer, ablations; then what is slow. Of each the first seeds come first.
     None of `artefacts`, `objects` (the cube is not one), `methods` stands for all; of `recipes` for all on the cube and
     those of the preset on the objects.
     """
     artefacts, tasks = artefacts or get_args(Artefact), [name for name in OBJECTS if name in (objects or OBJECTS)]
     some = recipes or preset.recipes
 
-    def wanted(method: str, chosen: Names) -> list[str]:
-        return [name for name in METHODS[method] if (not chosen or name in chosen) and method in (methods or METHODS)]
+    def wanted(method: str, chosen: Names, known: Names = ()) -> list[str]:
+        known = known or METHODS[method]
+        return [name for name in known if (not chosen or name in chosen) and method in (methods or METHODS)]
 
     def table1(seed: int) -> Iterator[Unit]:
         for task in tasks:
             yield from (Unit(task, method, r, seed) for method in COMPARED for r in wanted(method, some))
+
+    def masses(seed: int) -> Iterator[Unit]:
+        for task in tasks:
+            yield from (Unit(task, "lcs-rl", r, seed) for r in wanted("lcs-rl", recipes, MASSES))
 
     def curves(seed: int) -> Iterator[Unit]:
         yield from (Unit("cube", method, r, seed) for method in METHODS for r in wanted(method, recipes))
@@ -145,8 +159,14 @@ def matrix(
             for recipe in wanted("lcs-rl", some):
                 yield from (Unit(task, method, recipe, seed, start) for start, method in TRANSFER.items())
 
+    def ablations(seed: int) -> Iterator[Unit]:
+        if seed < FIRST_SEED + ABLATION_SEEDS and (not recipes or "ours" in recipes):
+            for task in (name for name in ABLATION_TASKS if name in ("cube", *tasks)):
+                yield from (Unit(task, "lcs-rl", r, seed) for r in wanted("lcs-rl", (), ["ours"]))
+                yield from (Unit(task, m, r, seed) for m, r in ABLATED.values() if wanted(m, (), [r]))
+
     needed: list[Unit] = []
-    every = {"table1": table1, "curves": curves, "transfer": transfer}
+    every = {"table1": table1, "masses": masses, "curves": curves, "transfer": transfer, "ablations": ablations}
     for name, units in every.items():
         if name in artefacts:
             for seed in range(FIRST_SEED, FIRST_SEED + max(preset.seeds, preset.of("pddm").seeds)):

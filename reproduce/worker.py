@@ -101,7 +101,7 @@ def _train(job: Job) -> pd.DataFrame:
         at=[minute for _, minute in due],
         evaluation_seed=config.evaluation_seed,
         source=objects[unit.task]["source"],
-        mass=objects[unit.task]["mass"],
+        mass=unit.changes.task.get("object_mass", objects[unit.task]["mass"]),
         version=str(config.method.version),
         key=key,
         versions=" ".join(f"{name}={version}" for name, version in sorted(packages.items()) if version),

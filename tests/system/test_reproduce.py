@@ -22,17 +22,20 @@ for package in ("distributed", "matplotlib", "mujoco", "pandas", "rich", "scipy"
 FOLDER = Path(__file__).parents[2] / "reproduce"
 sys.path.insert(0, str(FOLDER))
 
+import ablations  # noqa: E402
 import dask  # noqa: E402
 import deployment  # noqa: E402
 import distributed  # noqa: E402
 import fig_learning_curves  # noqa: E402
 import fig_task  # noqa: E402
 import fig_transfer  # noqa: E402
+import masses  # noqa: E402
 import recipes  # noqa: E402
 import records  # noqa: E402
 import report  # noqa: E402
 import robustness  # noqa: E402
 import runs  # noqa: E402
+import small_models  # noqa: E402
 import stats  # noqa: E402
 import table1  # noqa: E402
 import units  # noqa: E402
@@ -94,8 +97,8 @@ def test_matrix_holds_every_unit_once_the_important_ones_first():
     found = units.matrix((), preset)
     assert len(found) == len(set(found))
     assert {unit.seed for unit in found} == {FIRST, FIRST + 1, FIRST + 2}
-    # Cube: six of methods and recipes; objects: five, and a transfer by each of two recipes.
-    assert len(found) == 3 * (6 + 6 * (5 + 2)) + 1 * 2
+    # Cube: six of methods and recipes; objects: five, light ones, two transfers; both tasks of the ablations: all.
+    assert len(found) == 3 * (6 + 6 * (5 + 1 + 2) + 2 * len(units.ABLATED)) + 1 * 2
     for position, unit in enumerate(found):
         assert unit.init is None or unit.init in found[:position]
     table = units.matrix(["table1"], preset)
@@ -121,6 +124,16 @@ def test_matrix_of_a_part():
         ("lcs-rl", "ours"), ("violation", "ours"), ("pddm", "ours"),
     ]  # fmt: skip
     assert {unit.recipe for unit in units.matrix(["table1"], units.PRESETS["smoke"])} == {"ours"}
+    masses = units.matrix(["masses"], one, objects=["mug"])
+    assert masses == [Unit("mug", "lcs-rl", "paper", FIRST), Unit("mug", "lcs-rl", "light", FIRST)]
+    assert [unit.spec.env_kwargs.get("object_mass") for unit in masses] == [None, 0.01]
+    ablations = units.matrix(["ablations"], paper)
+    assert {unit.task for unit in ablations} == set(units.ABLATION_TASKS)
+    assert {unit.seed for unit in ablations} == set(range(FIRST, FIRST + units.ABLATION_SEEDS))
+    # In each of them one part is missing: all differ from each other.
+    configs = [units.config_of(unit, paper).method for unit in ablations if unit.task == "cube" and unit.seed == FIRST]
+    tasks = [unit.changes.task for unit in ablations if unit.task == "cube" and unit.seed == FIRST]
+    assert len({repr(pair) for pair in zip(configs, tasks, strict=True)}) == len(units.ABLATED) + 1
 
 
 def test_config_is_the_default_recipe_but_for_what_the_unit_says():
@@ -143,13 +156,23 @@ def test_config_is_the_default_recipe_but_for_what_the_unit_says():
 
 def test_a_recipe_changes_its_task_and_no_other():
     plain = get_task("mug")
-    prior = Unit("mug", "violation", "jin-posa", 0).spec
+    prior, without = Unit("mug", "violation", "jin-posa", 0).spec, Unit("mug", "lcs-rl", "no-penalty", 0).spec
     assert (plain.horizon, prior.horizon) == (8, 5)
     # The cost of a model whose action is the largest: nothing but the weight of the action differs, 200 and 0.001.
     x, u, goal = (torch.zeros(n, dtype=torch.float64) for n in (9, 6, 3))
     costs = [float(spec.make_cost().stage(x, u + 0.015, goal)) for spec in (plain, prior)]
     assert costs == pytest.approx([200 * 6 * 0.015**2, 0.001 * 6 * 0.015**2])
     assert float(prior.make_cost().stage(x + 0.01, u, goal)) == float(plain.make_cost().stage(x + 0.01, u, goal)) > 0
+    far = torch.tensor([0.05, 0, 0], dtype=torch.float64)
+    rewards = [float(spec.outcome(x, u, x, far, True)[0]) for spec in (plain, without)]
+    assert rewards[1] - rewards[0] == pytest.approx(10)
+    assert (plain.failure_penalty, without.failure_penalty) == (10, 0)
+    env = without.make_env()
+    env.reset(seed=0)
+    infos = [env.step(np.zeros(6))[4] for _ in range(20)]
+    assert not infos[-1]["success"]
+    assert infos[-1]["reward_completion"] == 0
+    env.close()
 
 
 def test_the_same_model_is_deployed_in_several_ways(tmp_path, monkeypatch):
@@ -177,13 +200,12 @@ def test_key_changes_with_everything_that_decides_a_result_and_with_nothing_else
     def key(unit=CUBE, preset=TINY, objects=KNOWN):
         return units.key_of(unit, preset, objects)
 
-    monkeypatch.setitem(recipes.RECIPES, "near", recipes.Recipe("near", task={"horizon": 5}))
     other = {**KNOWN, "cube": {**KNOWN["cube"], "mass": 0.06}}
     different = [
         key(),
         key(replace(CUBE, method="violation")),
         key(replace(CUBE, recipe="paper")),
-        key(replace(CUBE, recipe="near")),  # the same settings, another task
+        key(replace(CUBE, recipe="no-penalty")),  # the same settings, another task
         key(preset=replace(TINY, goals=3)),
         key(objects=other),
         key(TRANSFER),
@@ -619,7 +641,8 @@ def test_readme_is_filled_between_its_marks_only(tmp_path):
 def test_the_tracked_readme_and_tables_are_those_of_the_tracked_results(tmp_path, monkeypatch, capsys):
     scripts = {
         "table1": table1, "fig_learning_curves": fig_learning_curves, "fig_transfer": fig_transfer,
-        "robustness": robustness,
+        "ablations": ablations, "small_models": small_models, "robustness": robustness,
+        "masses": masses,
     }  # fmt: skip
     text, tracked = (FOLDER / "README.md").read_text(), records.RESULTS
     readme = tmp_path / "README.md"
@@ -629,7 +652,7 @@ def test_the_tracked_readme_and_tables_are_those_of_the_tracked_results(tmp_path
     monkeypatch.setattr(report, "README", readme)
     monkeypatch.setattr(records, "RESULTS", tmp_path)
     shown = [name for name in scripts if (tracked / f"{name}.md").exists()]
-    assert set(shown) >= {"table1", "fig_learning_curves", "fig_transfer"}
+    assert set(shown) >= {"table1", "fig_learning_curves", "fig_transfer", "small_models"}
     for name, script in scripts.items():
         assert f"<!-- results: {name} -->" in text
         if hasattr(script, "Options"):
