@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from difflcs.errors import CheckpointError
+
 pytest.importorskip("torchrl")
 from difflcs.rl.rollout import collect, uniform_actions
 from difflcs.rl.runs.evaluate import evaluate
@@ -101,3 +103,12 @@ def test_without_real_episodes_models_only_shorten_the_first_step():
     for trainer in (alone, practising):
         trainer.step()
     assert same(parameters(alone), parameters(practising))
+
+
+def test_a_state_without_models_is_refused():
+    trainer = make_ppo()
+    trainer.step()
+    with pytest.raises(CheckpointError, match=r"models.*other settings"):
+        make_practising().load(trainer.state_dict())
+    with pytest.raises(CheckpointError, match=r"models.*other settings"):
+        trainer.load(make_practising().state_dict())

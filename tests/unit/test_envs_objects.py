@@ -166,11 +166,6 @@ def test_processes_decompose_a_mesh_once(stl, tmp_path):
     assert [entry.name for entry in (tmp_path / "cache").iterdir()] == ["parts"]
 
 
-def test_millimetres(stl):
-    box = trimesh.creation.box((60, 40, 30))
-    np.testing.assert_allclose(np.sort(make(stl(box), mesh_scale=0.001).object.solid.size), [0.03, 0.04, 0.06])
-
-
 @pytest.mark.parametrize(("pose", "height"), [("lying", 15), (0, 15), (2, 20), (4, 30), ("upright", 30)])
 def test_rest_poses_of_a_box(stl, pose, height):
     env = make(stl(trimesh.creation.box((0.04, 0.03, 0.06))), rest_pose=pose)

@@ -16,7 +16,6 @@ from difflcs import (
     ConstraintSequence,
     CostSequence,
     GoalCost,
-    LCSModule,
     LCSMPCLayer,
     LCSParams,
     LCSSequence,
@@ -114,19 +113,6 @@ def test_leading_dimensions_of_states_and_systems_broadcast_and_are_kept(build, 
     assert torch.equal(folded.u.reshape(6, 3, 2), flat.u)
     grid = LCSParams(**{k: v.expand(2, 3, *v.shape) for k, v in layer.lcs.params().tensors().items()})
     assert torch.equal(layer(x0[0], lcs=grid).u, one.u.expand(2, 3, 3, 2))
-
-
-def test_float32_in_is_float32_out_solved_in_float64(build, x0):
-    layer = LCSMPCLayer(build.model(seed=3, dtype=torch.float32), build.cost(0), 3, -0.15, 0.15, backend=SOLVER)
-    x0 = x0.float().requires_grad_()
-    solution = layer(x0)
-    for value in (solution.x, solution.u, solution.lam, solution.objective):
-        assert value.dtype == torch.float32
-    wide = layer(x0.double(), lcs=layer.lcs.params().to(torch.float64))
-    torch.testing.assert_close(solution.u, wide.u.float(), rtol=1e-5, atol=1e-6)
-    solution.action.sum().backward()
-    assert x0.grad.dtype == layer.lcs.A.grad.dtype == torch.float32
-    assert bool(torch.isfinite(layer.lcs.A.grad).all())
 
 
 # --- warm start -----------------------------------------------------------------------------------------------------
@@ -352,46 +338,6 @@ def test_one_plain_bound_of_a_call_replaces_that_of_the_stages(build, x0):
 
 
 # --- modules that say the system ------------------------------------------------------------------------------------
-
-
-class Mass(nn.Module):
-    """A block whose mass is the context, and whose friction depends on where it is."""
-
-    n_x, n_u, n_lam = 4, 2, 3
-
-    def __init__(self, build, stages=0):
-        super().__init__()
-        self.base, self.stages = build.lcs_tensors(3), stages
-        self.gain = nn.Parameter(torch.tensor(1.0, dtype=torch.float64))
-        self.seen = []
-
-    def params(self, x=None, context=None):
-        self.seen.append((x, context))
-        B = self.base["B"] * self.gain / (1.0 if context is None else context[..., None])
-        c = self.base["c"] if x is None else self.base["c"] + 0.01 * x[..., :1]
-        system = LCSParams(**{**self.base, "B": B, "c": c})
-        return LCSSequence.stack([system] * self.stages) if self.stages else system
-
-
-@pytest.mark.parametrize("stages", [0, 3])
-def test_a_module_is_asked_at_each_call(build, x0, stages):
-    module = Mass(build, stages)
-    assert isinstance(module, LCSModule)
-    layer = LCSMPCLayer(module, build.cost(3), 3, -0.15, 0.15, relaxation=1e-4)
-    assert {name for name, _ in layer.named_parameters()} == {"lcs.gain"}
-    context = torch.linspace(0.5, 2.0, 6, dtype=torch.float64)[:, None].requires_grad_()
-    solution = layer(x0, context=context)
-    assert module.seen[-1][0] is x0
-    assert module.seen[-1][1] is context
-    plain = LCSMPCLayer(module.params(x0, context), build.cost(3), 3, -0.15, 0.15, relaxation=1e-4)
-    assert torch.equal(plain(x0).u, solution.u)
-    solution.u.square().sum().backward()
-    assert float(module.gain.grad.abs()) > 0
-    assert float(context.grad.abs().min()) > 0
-    assert not torch.equal(layer(x0).u, solution.u)  # without a context
-    again = LCSMPCLayer(build.params(3), build.cost(3), 3, -0.15, 0.15, relaxation=1e-4)
-    any_object = SimpleNamespace(n_x=4, n_u=2, n_lam=3, params=module.params)
-    assert torch.equal(again(x0, lcs=any_object, context=context).u, solution.u)
 
 
 def ones(*shape):

@@ -10,7 +10,6 @@ import torch
 
 mujoco = pytest.importorskip("mujoco")
 
-from difflcs import LCSModule  # noqa: E402
 from difflcs.errors import (  # noqa: E402
     ContactWarning,
     DTypeError,
@@ -414,37 +413,7 @@ def test_forces_in_the_data_act_in_dynamic_motion_alone():
     torch.testing.assert_close(MujocoLCS(pushed, data).params(x).step(x, u).x_next, without)
 
 
-def test_a_body_in_the_air_falls_and_turns():
-    model = load('<body><freejoint name="b"/><geom type="box" size=".1 .2 .3" mass="1"/></body>')
-    reference = np.array([0, 0, 0, 0.8, 0.6, 0, 0])
-    data = mujoco.MjData(model)
-    data.qpos[:] = reference
-    module = MujocoLCS(model, data, motion="dynamic", seconds=0.02, pairs=[])
-    qpos, qvel = np.array([1, 2, 3, *np.array([0.5, 0.5, 0.5, 0.5])]), np.array([0.3, 0.2, 1.0, 1.0, 2.0, -1.5])
-    x = module.state.to_state(qpos, qvel)
-    after = module.state.to_state(*step(model, qpos, qvel, 0.0, 0.02))
-    predicted = module.params(x).step(x, torch.zeros(0).double()).x_next
-    assert (after - x)[3:6].abs().max() > 0.03
-    torch.testing.assert_close(predicted, after, atol=2e-3, rtol=0)
-    torch.testing.assert_close(predicted[:3], after[:3], atol=2e-4, rtol=0)
-
-
 # --- as a module ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("motion", ["quasi-static", "dynamic"])
-def test_a_batch_is_its_elements(motion):
-    module = MujocoLCS(pushing(), motion=motion)
-    assert isinstance(module, LCSModule)
-    random = np.random.default_rng(0)
-    x = torch.from_numpy(random.uniform(-0.1, 0.1, (2, 3, module.n_x)))
-    system = module.params(x)
-    assert (system.n_x, system.n_u, system.n_lam) == (module.n_x, module.n_u, module.n_lam)
-    for i, j in itertools.product(range(2), range(3)):
-        one = module.params(x[i, j])
-        u = tensor(0.01, 0.02)
-        torch.testing.assert_close(one.step(x[i, j], u).x_next, system.step(x, u).x_next[i, j])
-        assert one.C.ndim == 2
 
 
 def test_single_precision_comes_back_single():

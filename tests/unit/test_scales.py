@@ -58,17 +58,6 @@ def test_a_state_that_never_changes_and_an_action_that_is_never_used_keep_their_
     assert all(bool(torch.isfinite(v).all()) for v in scales.normalise(x, u, x_next))
 
 
-def test_leading_dimensions_dtypes_and_gradients_of_the_data_do_not_matter(data):
-    expected = suggest_scales(*data)
-    shaped = suggest_scales(*(v.reshape(4, 50, -1).requires_grad_() for v in data))
-    narrow = suggest_scales(*(v.float() for v in data))
-    for name in ("center", "state", "action"):
-        assert torch.equal(getattr(shaped, name), getattr(expected, name))
-        assert not getattr(shaped, name).requires_grad
-        torch.testing.assert_close(getattr(narrow, name), getattr(expected, name), rtol=1e-4, atol=1e-5)
-    assert expected.normalise(*(v.float() for v in data))[0].dtype == torch.float32
-
-
 # --- there and back -------------------------------------------------------------------------------------------------
 
 
