@@ -463,6 +463,14 @@ def test_render(capsys, finished, tmp_path):
     assert "choose another" in err
 
 
+def test_pictures_of_a_model(capsys, tmp_path, finished):
+    assert run(capsys, "plot", finished, "--smoke", "--out", tmp_path / "run")[0] == 0
+    assert run(capsys, "evaluate", "zoo:trifinger-cube", "--smoke", "--plot", tmp_path / "zoo")[0] == 0
+    pictures = {str(p.relative_to(tmp_path)): p.read_bytes()[:4] for p in tmp_path.glob("*/*")}
+    names = ("run/learning_curve", "run/fit", "run/episode", "zoo/fit", "zoo/episode")
+    assert pictures == {f"{name}.png": b"\x89PNG" for name in names}
+
+
 def test_demo(capsys, tmp_path):
     pytest.importorskip("mujoco")
     for attempt in range(2):  # the second continues, that is, only draws again
