@@ -28,9 +28,6 @@ from difflcs.rl.seeding import seeded
 STEPS = 6
 
 
-# --- rewards ---
-
-
 @st.composite
 def rewarded(draw):
     """Dense rewards (N, T, ...), successes (N, ...), and the numbers of a `RewardScale`."""
@@ -72,9 +69,6 @@ def test_rewards_that_are_not_finite_are_refused(bad):
         RewardScale(3.0, 10.0, 0.1)(rewards, torch.ones(2, dtype=torch.bool))
 
 
-# --- GAE ---
-
-
 def make_critic(gamma: float = 0.9, zeta: float = 0.8) -> Critic:
     return Critic(CriticSettings(), 3, STEPS, gamma, zeta, (0, 5))
 
@@ -113,9 +107,6 @@ def test_gae_judges_the_actions_taken():
     assert torch.equal(found.samples["advantage"].flatten(2), plain.advantages.unsqueeze(-1))
     assert torch.equal(found.values, plain.values)
     assert torch.equal(found.rewards, rewards)  # as they are
-
-
-# --- many actions ---
 
 
 def gaussian(*shape: int, n_u: int = 3, seed: int = 0) -> TensorDict:
@@ -165,9 +156,6 @@ def test_advantages_are_those_of_the_formula():
     torch.testing.assert_close(found, expected)
     immediate = multi_action_advantages(q, values, 0.9, 0.0)
     torch.testing.assert_close(immediate, q - q.mean(-1, keepdim=True))
-
-
-# --- in episodes whose alternatives are known ---
 
 
 BOUND = 0.5
@@ -240,11 +228,3 @@ def test_all_actions_are_judged_and_corrected_by_later_values():
     expected = multi_action_advantages(q, values, 0.9, 0.7)
     torch.testing.assert_close(found.samples["advantage"].squeeze(-1), expected, rtol=1e-5, atol=1e-5)
     assert bool((found.samples["action"].abs() > BOUND).any())  # judged as executed, but not clipped
-
-
-def test_judged_actions_depend_on_the_key_alone():
-    episodes, inputs, rewards, estimator, found = judged()
-    torch.manual_seed(5)
-    again = estimator(episodes, inputs, rewards, (0, 6)).samples["action"]
-    assert torch.equal(again, found.samples["action"])
-    assert not torch.equal(estimator(episodes, inputs, rewards, (0, 7)).samples["action"], again)

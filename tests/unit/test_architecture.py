@@ -121,9 +121,6 @@ def packages_of(edges: dict[str, set[str]], package: str, other: str) -> dict[st
     }
 
 
-# --- the reader -------------------------------------------------------------------------------------------------------
-
-
 def test_the_graph_has_what_is_known_to_be_in_it():
     edges = graph(functions=False)
     assert "difflcs.errors" in edges["difflcs.lcs"]
@@ -138,9 +135,6 @@ def layer_of(module: str) -> int | None:
     """Index in `LAYERS`; None for helpers and the root."""
     below = module.removeprefix("difflcs.") + "."
     return next((i for i, names in enumerate(LAYERS) if any(below.startswith(f"{name}.") for name in names)), None)
-
-
-# --- what holds -------------------------------------------------------------------------------------------------------
 
 
 def test_no_circle_of_imports():

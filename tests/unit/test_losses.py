@@ -18,9 +18,6 @@ def data(build):
     return n(8, 4), n(8, 2), n(8, 4)
 
 
-# --- value ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("n_lam", [3, 5, 8])
 def test_neighbours_and_threads_change_no_bit_of_a_loss(build, n_lam):
     model, n = build.model(seed=1, n_x=9, n_u=6, n_lam=n_lam, scale=0.3), build.normal(2)
@@ -51,9 +48,6 @@ def test_layout_and_shape_of_the_data_do_not_matter(build, model):
     assert torch.equal(violation_loss(model, x, u, x_next), expected)
 
 
-# --- shapes ---------------------------------------------------------------------------------------------------------
-
-
 def test_reduction(model, data):
     each = violation_loss(model, *data, reduction="none")
     assert each.shape == (8,)
@@ -71,9 +65,6 @@ def test_float32_in_is_float32_out(build, data, function):
     torch.testing.assert_close(loss.detach().double(), expected, rtol=1e-3, atol=1e-5)
     loss.backward()
     assert all(p.grad.dtype == torch.float32 and bool(torch.isfinite(p.grad).all()) for p in model.parameters())
-
-
-# --- prediction loss ------------------------------------------------------------------------------------------------
 
 
 def test_prediction_loss_is_half_the_squared_error(model, data):

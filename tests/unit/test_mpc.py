@@ -70,13 +70,6 @@ class Recorder(Backend):
         zeros = torch.zeros(B, dtype=torch.float64)
         return Result(primal, zeros.to(torch.int8), zeros.to(torch.int32), zeros, zeros)
 
-    def vjp(self, problem, result, grads, solved):
-        """One per element and entry, so that a gradient says how many elements share an input."""
-        count = float(solved.sum())
-        values = {k: getattr(problem, k) for k in INPUTS}
-        gradients = {k: torch.full_like(v, count if problem.shared(k) else 1.0) for k, v in values.items()}
-        return gradients | {"Q": gradients["Q"].triu()}
-
     @property
     def problem(self) -> MPCProblem:
         return self.seen[-1][0]
@@ -271,44 +264,6 @@ def test_without_bounds_there_are_none(build, x0):
     assert backend.problem.n_c == 0
     layer(x0, u_max=1.0)
     assert torch.equal(backend.problem.u_max, torch.ones(2).double())
-
-
-def test_what_is_constant_reaches_the_problem_as_constant(build, x0):
-    layer, backend = recording(build, cost=GoalCost.reach(4, 2, 1.0))
-    reference = build.normal(1)(6, 4, 4)
-    layer(x0, reference=reference)
-    problem = backend.problem
-    assert {k for k in INPUTS if problem.by_stage(k)} == {"q"}
-    assert {k for k in INPUTS if not problem.shared(k)} == {"q", "q_final", "x0"}
-    assert problem.q.shape == (6, 3, 4)
-    torch.testing.assert_close(problem.q, -2 * reference[:, :-1])
-    layer(x0, reference=reference[0])
-    assert backend.problem.q.shape == (1, 3, 4)
-
-
-def test_gradients_come_back_in_the_shape_of_each_input(build):
-    """The recorder's gradient counts the elements: shapes, sums over shared dimensions, dtypes."""
-    n = build.normal(4)
-    t = build.lcs_tensors(3)
-    A = t["A"].expand(5, 1, 4, 4).clone().requires_grad_()  # one for each of 5, shared by the 2
-    B = t["B"].clone().requires_grad_()
-    c = t["c"].expand(2, 3).clone().requires_grad_()  # aligned with the last batch dimension
-    d = t["d"].expand(1, 1, 4).clone().requires_grad_()
-    Q = build.cost_tensors(3)["Q"].float().requires_grad_()
-    weights = {**build.cost_tensors(3), "Q": Q, "constant": torch.zeros(5, 1).double().requires_grad_()}
-    x0 = n(5, 2, 4).requires_grad_()
-    g = n(5, 1, 4, 2).requires_grad_()
-    system = LCSParams(**{**t, "A": A, "B": B, "c": c, "d": d})
-    rows = ConstraintSequence(n(2, 4), g, by_stage=("g",))
-    layer, _ = recording(build, lcs=system, cost=QuadraticCost(**weights), constraints=rows)
-    solution = layer(x0)
-    assert solution.u.shape == (5, 2, 3, 2)
-    (solution.u.sum() + solution.objective.sum()).backward()
-    for leaf, count in ((A, 2), (B, 10), (c, 5), (d, 10), (x0, 1), (g, 2), (weights["constant"], 2)):
-        assert leaf.grad.dtype == leaf.dtype
-        assert torch.equal(leaf.grad, torch.full_like(leaf, float(count)))
-    # Only the symmetric part of Q matters, whatever a backend says.
-    assert torch.equal(Q.grad, 5 * torch.ones(4, 4) + 5 * torch.eye(4))
 
 
 @pytest.mark.parametrize("name", ["lcs", "cost", "constraints", "bounds"])

@@ -71,9 +71,6 @@ def test_a_problem_alone_has_the_numbers_that_it_has_among_others(build, name):
                     assert getattr(alone, key)[0] == getattr(result, key)[i]
 
 
-# --- limits -----------------------------------------------------------------------------------------------------------
-
-
 def one_state_from(x0, growth, stage, least):
     """x₊ = growth x + u with |u| ≤ 1 over three steps, and x ≥ least asked for at one stage."""
     one = torch.ones(1, 1, dtype=torch.float64)

@@ -353,50 +353,6 @@ def test_an_actuator_is_a_servo_only_by_an_affine_bias():
 # --- motion with velocities -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("relative", [True, False])
-def test_servos_and_velocity_actuators_are_mujocos(relative):
-    rest = '<actuator><position joint="px" kp="30" kv="2" gear="2"/><velocity joint="py" kv="5"/></actuator>'
-    model = load(PUSHER.format(tip=""), rest, 'integrator="RK4"')
-    module = MujocoLCS(model, motion="dynamic", relative=relative)
-    x, u = tensor(0.3, -0.1, 0.2, 0.1), tensor(0.05, 0.4)
-    ctrl = module.control(x, u)
-    torch.testing.assert_close(ctrl, tensor(0.65, 0.4) if relative else u)
-    after = np.concatenate(step(model, x[:2], x[2:], ctrl.numpy()))
-    np.testing.assert_allclose(module.params(x).step(x, u).x_next, after, atol=2e-3)
-    # Two steps: a relative action counts from where the joint is by then.
-    second = module.params(x).rollout(x, torch.stack([u, u]))[-1]
-    ctrl = module.control(torch.from_numpy(after), u)
-    again = np.concatenate(step(model, after[:2], after[2:], ctrl.numpy()))
-    np.testing.assert_allclose(second, again, atol=4e-3)
-
-
-LIMITED = {  # actuators, whether actions are relative, place, action
-    "a motor that cannot rest": ('<motor joint="px" ctrlrange="0.1 1"/>', True, 0.0, 0.5),
-    "a servo out of its range": ('<position joint="px" kp="50" kv="5" ctrlrange="-.1 .1"/>', True, 0.15, -0.08),
-    "a servo by its target": ('<position joint="px" kp="50" kv="5" ctrlrange=".2 .6"/>', False, 0.3, 0.4),
-    "a force on a tendon": (
-        '<position tendon="t" kp="100"/>'
-        '</actuator><tendon><fixed name="t" actuatorfrclimited="true" actuatorfrcrange="-5 5">'
-        '<joint joint="px" coef="1"/></fixed></tendon><actuator>',
-        True,
-        0.1,
-        0.12,
-    ),
-}
-
-
-@pytest.mark.parametrize("case", LIMITED)
-def test_an_actuator_acts_though_it_is_limited(case):
-    actuator, relative, place, action = LIMITED[case]
-    model = load(PUSHER.format(tip=""), f"<actuator>{actuator}</actuator>")
-    module = MujocoLCS(model, motion="dynamic", relative=relative, seconds=0.02)
-    x, u = tensor(place, 0.0, 0.0, 0.0), tensor(action)
-    after = np.concatenate(step(model, x[:2], x[2:], module.control(x, u).numpy(), 0.02))
-    assert abs(after[2]) > 0.02
-    np.testing.assert_allclose(module.params(x).step(x, u).x_next, after, rtol=0.05, atol=1e-3)
-    assert bool(model.actuator_ctrllimited[0]) == ("ctrlrange" in actuator)
-
-
 def test_forces_in_the_data_act_in_dynamic_motion_alone():
     model = load('<body><freejoint name="b"/><geom size=".05" mass="1"/></body>')
     data = mujoco.MjData(model)

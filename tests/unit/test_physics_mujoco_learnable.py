@@ -78,13 +78,12 @@ def test_it_is_the_system_of_the_changed_model(motion, learn, change, changed):
     assert moved > 1e-4
 
 
-@pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize(("motion", "tolerance"), [("dynamic", 0.02), ("quasi-dynamic", 1e-4)])
-def test_gradients_are_slopes_of_the_matrices(motion, tolerance, seed):
+def test_gradients_are_slopes_of_the_matrices(motion, tolerance):
     learn = [("mass", "cube"), ("friction", "block"), ("size", "tip"), ("center_of_mass", "cube"), "gain", "compliance"]
     learned = LearnableMujocoLCS(scene(), learn=learn, motion=motion, **OPTIONS)
-    x, ctrl = states(learned.n_x, seed)[:1].requires_grad_(), torch.full((1,), 0.01, dtype=F64, requires_grad=True)
-    generator = torch.Generator().manual_seed(seed)
+    x, ctrl = states(learned.n_x, seed=1)[:1].requires_grad_(), torch.full((1,), 0.01, dtype=F64, requires_grad=True)
+    generator = torch.Generator().manual_seed(1)
     weights = {k: torch.randn(v.shape, generator=generator, dtype=F64) for k, v in learned.params(x).tensors().items()}
 
     def total(change, x, ctrl):
