@@ -228,3 +228,10 @@ def test_all_actions_are_judged_and_corrected_by_later_values():
     expected = multi_action_advantages(q, values, 0.9, 0.7)
     torch.testing.assert_close(found.samples["advantage"].squeeze(-1), expected, rtol=1e-5, atol=1e-5)
     assert bool((found.samples["action"].abs() > BOUND).any())  # judged as executed, but not clipped
+
+
+def test_rewards_to_fit_values_to_are_without_the_action_advantage():
+    *_, rewards, _, found = judged()
+    advantage = found.samples["advantage"][:, :, 0, 0]
+    assert float(advantage.abs().max()) > 1e-3
+    torch.testing.assert_close(found.rewards, rewards - advantage)

@@ -48,6 +48,14 @@ def test_reach_is_the_cost_of_the_paper_with_its_constant(build, seed):
     assert evaluate(build.paper_cost()(goal, horizon=5), x, u) == pytest.approx(paper(x, u, goal), rel=1e-12)
 
 
+def test_goals_of_any_batch_shape(build):
+    cost, goal = build.paper_cost(), build.normal(0)(2, 5, 3)
+    mapped = cost(goal, horizon=4)
+    assert mapped.q.shape == mapped.q_final.shape == (2, 5, 9)
+    assert mapped.constant.shape == (2, 5)
+    torch.testing.assert_close(mapped.q[1, 3], cost(goal[1, 3]).q)
+
+
 def test_only_the_symmetric_parts_matter(build):
     tensors = build.cost_tensors(0)
     skew = build.normal(0)(4, 4)
