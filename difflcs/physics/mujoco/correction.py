@@ -9,22 +9,20 @@ What contacts do depends on friction, which holds with one action and slides wit
 where they do worse than nothing.
 """
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
-import copy
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from difflcs.errors import InvalidInputError
+from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
+from difflcs.physics.mujoco.library import Places, library
 from difflcs.physics.mujoco.limits import Rows
-from difflcs.physics.mujoco.motion import DynamicStep, Steps, advance_step
-from difflcs.physics.mujoco.native import copy_taken, flags
+from difflcs.physics.mujoco.motion import Dynamic, DynamicStep
+from difflcs.physics.mujoco.native import flags
 from difflcs.records import LCSParams
 
 Array = NDArray[np.float64]
@@ -35,41 +33,28 @@ class WholeStep:
     """MuJoCo's own steps, with all constraints.
 
     Args:
-        model: the model.
-        steps: its steps in one of ours.
+        motion: the motion, of a model whose flags are its own.
         limits: False if joints and tendons have none.
     """
 
-    def __init__(self, model: Any, steps: Steps, limits: bool):
-        self.model, self.steps = copy.copy(model), steps
-        self.model.opt.disableflags |= 0 if limits else flags("LIMIT")
-        self.data = mujoco.MjData(self.model)
+    def __init__(self, motion: Dynamic, limits: bool):
+        self.nv = motion.model.nv
+        self._native = motion.describe(motion.steps, 0 if limits else flags("LIMIT"))
 
-    def simulate(self, taken: Any, states: Array, ctrl: Array) -> Array:
+    def simulate(self, places: Places, states: Array, ctrl: Array) -> Array:
         """Return (ζ, ν) (n, 2 nv) after a step from states (n, nq + nv + na); NaN where MuJoCo warns or raises.
 
         Args:
-            taken: data with what is not in the states.
+            places: with what is not in the states.
             states: qpos, qvel and act.
             ctrl: (n, nu) controls.
         """
-        model, data, nv = self.model, self.data, self.model.nv
-        after = np.full((len(states), 2 * nv), np.nan)
-        copy_taken(data, taken)
-        for i, state in enumerate(states):
-            data.qpos[:], data.qvel[:], data.act[:] = np.split(state, [model.nq, model.nq + nv])
-            data.ctrl[:], data.qacc_warmstart[:] = ctrl[i], 0.0
-            try:
-                for _ in range(self.steps.count):
-                    mujoco.mj_forwardSkip(model, data, 0, 1)
-                    advance_step(model, data, self.steps.integrator)
-            except mujoco.FatalError:  # the system stands without a correction
-                self.data = mujoco.MjData(model)
-                return after
-            if not data.warning.number.any():
-                mujoco.mj_differentiatePos(model, after[i, :nv], 1.0, state[: model.nq], data.qpos)
-                after[i, nv:] = data.qvel
-            data.warning.number[:] = 0
+        after = np.full((len(states), 2 * self.nv), np.nan)
+        native = places.take(len(states))
+        try:
+            places.check(_mujoco.simulate(library(), self._native, native, states, ctrl, after), len(states))
+        except InvalidInputError:  # the systems stand without a correction
+            after[:] = np.nan
         return after
 
 

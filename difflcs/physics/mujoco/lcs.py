@@ -162,7 +162,7 @@ class MujocoLCS:
         budgets: Any = self._selection.budgets if self._selection else contacts
         budgets = budgets if contacts is None or self._selection else check_positive_int("contacts", contacts)
         plain = motion == "dynamic" and pairs is None and friction is None
-        self._whole = WholeStep(model, self._motion.steps, limits != 0) if plain else None
+        self._whole = WholeStep(self._motion, limits != 0) if plain else None
         self._places = Places(model, self._data)
         self._finder = ContactFinder(model, self._data, self._places, pairs, distance, length, budgets, friction)
         model.opt.disableflags |= flags("EQUALITY", "FRICTIONLOSS", "LIMIT")
@@ -257,7 +257,7 @@ class MujocoLCS:
         )
         if step is not None and self._whole is not None and self.n_lam:
             idle = self.control(torch.from_numpy(read.x), torch.from_numpy(step.idle)).numpy()
-            after = self._whole.simulate(self._data, read.states, idle)
+            after = self._whole.simulate(self._places, read.states, idle)
             system = correct(system, step, after, read.tangent, rows.bound * self._give / self.length, found)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
 

@@ -63,6 +63,16 @@ class Reader {
     change(state, into.reached);
   }
 
+  // Write ζ and ν after the steps from a state at a control.
+  void advance(const double* state, const double* ctrl, double* after) const {
+    set(state);
+    std::copy_n(ctrl, motion_.nu, place_.ctrl);
+    std::fill_n(place_.qacc_warmstart, motion_.nv, 0.0);
+    simulate(motion_.steps);
+    library_.difference(motion_.simulated, after, 1.0, state, place_.qpos);
+    std::copy_n(place_.qvel, motion_.nv, after + motion_.nv);
+  }
+
  private:
   void set(const double* state) const {
     std::copy_n(state, motion_.nq, place_.qpos);
