@@ -23,7 +23,7 @@ from difflcs.physics.mujoco.library import Places, library
 from difflcs.physics.mujoco.limits import Rows
 from difflcs.physics.mujoco.motion import Dynamic, DynamicStep
 from difflcs.physics.mujoco.native import flags
-from difflcs.records import LCSParams
+from difflcs.records import LCSParams, advance
 
 Array = NDArray[np.float64]
 _WORSE = 0.25  # of all motion, by which contacts are worse than nothing where Δ counts wholly
@@ -72,7 +72,7 @@ def correct(
         rows: limits and dry friction.
     """
     x, nv, batch = step.x, step.place.shape[1], system.C.shape[:-2]
-    found = system.step(*(torch.from_numpy(v).reshape(*batch, v.shape[1]) for v in (x, step.idle)))
+    found = advance(system, *(torch.from_numpy(v).reshape(*batch, v.shape[1]) for v in (x, step.idle)))
     C, d, predicted, lam = (v.reshape(len(x), *v.shape[len(batch) :]).numpy() for v in (system.C, system.d, *found))
     n_bounded, lower = bound.shape[1], np.zeros_like(lam)
     n_contacts = lam.shape[1] - 2 * n_bounded - (n_limits := rows.gap.shape[1] - n_bounded)
@@ -88,9 +88,9 @@ def correct(
 
     def size(moved: NDArray[Any]) -> Array:
         """Size (n, n_trees) of a change of velocity (n, 2 nv), by its energy."""
-        return np.sqrt(np.einsum("nv,nvt->nt", moved[:, nv : 2 * nv] ** 2, mass))
+        return np.sqrt((moved[:, None, nv : 2 * nv] ** 2 @ mass)[:, 0])
 
-    energy = np.einsum("nvj,nvt->ntj", (C[:, nv : 2 * nv] * forces[:, None]) ** 2, mass)
+    energy = mass.swapaxes(-1, -2) @ (C[:, nv : 2 * nv] * forces[:, None]) ** 2
     total = np.maximum(energy.sum(-1), 1e-20)
     free = predicted - (C @ forces[:, :, None])[:, :, 0] - x
     speed = np.concatenate([np.zeros_like(place), x[:, nv : 2 * nv]], 1)
@@ -103,4 +103,4 @@ def correct(
     C[:, : 2 * nv] += by_forces
     d[:, : 2 * nv] += (by_forces @ lower[:, :, None])[:, :, 0] + wrong * (counts - due)[:, both]
     C, d = (torch.from_numpy(v).reshape(*batch, *v.shape[1:]) for v in (C, d))
-    return LCSParams(system.A, system.B, C, d, system.D, system.E, system.F, system.c)
+    return LCSParams.of_checked({**system.tensors(), "C": C, "d": d})
