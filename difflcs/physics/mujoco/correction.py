@@ -9,13 +9,18 @@ What contacts do depends on friction, which holds with one action and slides wit
 where they do worse than nothing.
 """
 
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 from typing import Any
 
+import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from difflcs.errors import InvalidInputError
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
@@ -23,6 +28,7 @@ from difflcs.physics.mujoco.library import Places, library
 from difflcs.physics.mujoco.limits import Rows
 from difflcs.physics.mujoco.motion import Dynamic, DynamicStep
 from difflcs.physics.mujoco.native import flags
+from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams, advance
 
 Array = NDArray[np.float64]
@@ -38,24 +44,43 @@ class WholeStep:
     """
 
     def __init__(self, motion: Dynamic, limits: bool):
-        self.nv = motion.model.nv
+        self.model = motion.model
         self._native = motion.describe(motion.steps, 0 if limits else flags("LIMIT"))
 
     def simulate(self, places: Places, states: Array, ctrl: Array) -> Array:
-        """Return (ζ, ν) (n, 2 nv) after a step from states (n, nq + nv + na); NaN where MuJoCo warns or raises.
+        """Return ζ, ν and the change of activation (n, 2 nv + na) after a step; NaN where MuJoCo warns or raises.
 
         Args:
             places: with what is not in the states.
-            states: qpos, qvel and act.
+            states: (n, nq + nv + na) qpos, qvel and act.
             ctrl: (n, nu) controls.
         """
-        after = np.full((len(states), 2 * self.nv), np.nan)
+        after = np.full((len(states), 2 * self.model.nv + self.model.na), np.nan)
         native = places.take(len(states))
         try:
             places.check(_mujoco.simulate(library(), self._native, native, states, ctrl, after), len(states))
         except InvalidInputError:  # the systems stand without a correction
             after[:] = np.nan
         return after
+
+    def follow(self, places: Places, state: MujocoState, control: Any, x: Tensor, u: Tensor) -> Tensor | None:
+        """Follow states (..., H, n_x) from x (..., n_x), one before each of actions u (..., H, n_u).
+
+        None where MuJoCo warns or raises. `control` converts actions at states.
+        """
+        found, states = [x.detach()], state.flatten(x, np.zeros(0))
+        to = state.nq, state.nq + state.nv
+        for action in u.detach().unbind(-2)[:-1]:
+            ctrl = control(found[-1], action).double().cpu().reshape(len(states), -1).contiguous().numpy()
+            after = self.simulate(places, states, ctrl)
+            if not np.isfinite(after).all():
+                return None
+            for one, change in zip(states, after, strict=True):
+                mujoco.mj_integratePos(self.model, one[: to[0]], change[: state.nv], 1.0)
+            states[:, to[0] : to[1]] = after[:, state.nv : 2 * state.nv]
+            states[:, to[1] :] += after[:, 2 * state.nv :]
+            found.append(state.to_state(*np.split(states.reshape(*x.shape[:-1], -1), to, -1)).to(x))
+        return torch.stack(found, -2)
 
 
 def correct(
@@ -66,7 +91,7 @@ def correct(
     Args:
         system: the systems, in any batch dimensions.
         step: the motion without constraints.
-        after: (n, 2 nv) (ζ, ν) after MuJoCo's step; states with NaN stay as they are.
+        after: (n, 2 nv + na) after MuJoCo's step, see `WholeStep`; states with NaN stay as they are.
         tangent: of the states' rotations, see `MujocoState.tangent`.
         bound: (n, n_bounded) of dry friction, the last forces of the systems.
         rows: limits and dry friction.
@@ -79,7 +104,7 @@ def correct(
     lower[:, n_contacts + n_limits :][:, :n_bounded] = -bound
     C, d, forces = C.copy(), d.copy(), lam + lower
     place = after[:, :nv] if tangent is None else np.linalg.solve(tangent, after[:, :nv, None])[:, :, 0]
-    change = np.concatenate([place, after[:, nv:] - x[:, nv : 2 * nv]], 1)
+    change = np.concatenate([place, after[:, nv : 2 * nv] - x[:, nv : 2 * nv]], 1)
     known = np.isfinite(change).all(1, keepdims=True)
     change = np.where(known, change, 0.0)
     wrong = np.where(known, x[:, : 2 * nv] + change - predicted[:, : 2 * nv], 0.0)

@@ -35,7 +35,7 @@ from difflcs.physics.complementarity import FreeMotion
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.actuators import Actuators
 from difflcs.physics.mujoco.library import Places, addresses, library
-from difflcs.physics.mujoco.native import flags
+from difflcs.physics.mujoco.native import flags, native
 
 Array = NDArray[np.float64]
 
@@ -121,6 +121,21 @@ class QuasiStatic:
             response = inverse @ response @ inverse.swapaxes(-1, -2)
         tensors = (torch.from_numpy(v) for v in (np.eye(nv), self.B.copy(), np.zeros(nv), response))
         return FreeMotion(*tensors)
+
+
+def read_each(motion: Any, model: Any, data: Any, states: Array, ctrl: Array) -> Any:
+    """Read a motion of positions at states (n, nq + nv + na), one after the other, with nominal controls (n, nu).
+
+    Raises:
+        InvalidInputError: MuJoCo raised an error, or has counted a warning.
+    """
+    moved = motion.allocate(len(states))
+    for i, state in enumerate(states):
+        with native(model, data, f"in state {i} of {len(states)}"):
+            data.qpos[:], data.qvel[:], data.act[:] = np.split(state, [model.nq, model.nq + model.nv])
+            mujoco.mj_fwdPosition(model, data)
+            motion.read(i, data, moved, ctrl[i])
+    return moved
 
 
 class Dynamic:

@@ -222,16 +222,17 @@ Outcome read_motion(const Library& library, const Motion& motion, const std::vec
   });
 }
 
-// Simulates steps from states (n, nq + nv + na) at controls (n, nu): (ζ, ν) (n, 2 nv) after them, NaN where MuJoCo warns.
+// Simulates steps from states (n, nq + nv + na) at controls (n, nu): ζ, ν and the change of activation (n, 2 nv + na)
+// after them, NaN where MuJoCo warns.
 Outcome simulate(const Library& library, const Motion& motion, const std::vector<const Place*>& places,
                  Array<const double> state, Array<const double> ctrl, Array<double> after) {
-  const size_t n = state.shape(0), nv = motion.nv, nu = motion.nu;
-  check(state.size() == n * (motion.nq + nv + motion.na) && ctrl.size() == n * nu && after.size() == n * 2 * nv &&
+  const size_t n = state.shape(0), nu = motion.nu, size = motion.size();
+  check(state.size() == n * (motion.nq + motion.nv + motion.na) && ctrl.size() == n * nu && after.size() == n * size &&
         !places.empty());
   return at_places(library, places, n, [&](size_t p, int64_t i) {
-    double* into = after.data() + i * 2 * nv;
+    double* into = after.data() + i * size;
     Reader(library, motion, *places[p]).advance(state.data() + i * state.shape(1), ctrl.data() + i * nu, into);
-    if (places[p]->has_warned()) std::fill_n(into, 2 * nv, std::nan(""));
+    if (places[p]->has_warned()) std::fill_n(into, size, std::nan(""));
     places[p]->forget_warnings();
   });
 }

@@ -63,14 +63,13 @@ class Reader {
     change(state, into.reached);
   }
 
-  // Write ζ and ν after the steps from a state at a control.
+  // Write ζ, ν and the change of activation after the steps from a state at a control.
   void advance(const double* state, const double* ctrl, double* after) const {
     set(state);
     std::copy_n(ctrl, motion_.nu, place_.ctrl);
     std::fill_n(place_.qacc_warmstart, motion_.nv, 0.0);
     simulate(motion_.steps);
-    library_.difference(motion_.simulated, after, 1.0, state, place_.qpos);
-    std::copy_n(place_.qvel, motion_.nv, after + motion_.nv);
+    change(state, after);
   }
 
  private:
