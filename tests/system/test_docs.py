@@ -1,7 +1,5 @@
 """The documentation: its code runs, its commands exist, its numbers are those measured, no public name is missing."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import ctypes

@@ -1,7 +1,5 @@
 """`difflcs doctor` tells the truth, and never fails itself."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

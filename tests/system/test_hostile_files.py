@@ -1,7 +1,5 @@
 """Files that are damaged, foreign, or made up with a right checksum: a typed error, and nothing of their size."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

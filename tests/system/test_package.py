@@ -1,7 +1,5 @@
 """The package from outside: what an import costs, what imports what, and that the README runs."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess

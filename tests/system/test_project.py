@@ -1,7 +1,5 @@
 """What surrounds the code: types as a strict user sees them, addresses, citation, versions, workflows, extras."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

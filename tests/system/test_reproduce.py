@@ -175,7 +175,7 @@ def test_a_recipe_changes_its_task_and_no_other():
     env.close()
 
 
-def test_the_same_model_is_deployed_in_several_ways(tmp_path, one_thread, monkeypatch):
+def test_the_same_model_is_deployed_in_several_ways(tmp_path, monkeypatch):
     (job,) = make_jobs([Unit("cube", "violation", "jin-posa", FIRST)], tmp_path).values()
     calls, measure = [], deployment.Deployments.measure
 
@@ -362,7 +362,7 @@ def test_only_what_is_missing_in_the_results_is_computed(tmp_path, capsys):
     assert not (tmp_path / "work").exists()
 
 
-def test_a_worker_that_would_compute_something_else_refuses(tmp_path, one_thread):
+def test_a_worker_that_would_compute_something_else_refuses(tmp_path):
     job = make_jobs([SCRATCH], tmp_path)[SCRATCH]
     other = replace(job, key="0123456789ab")  # as where other versions, settings or meshes are
     with pytest.raises(InvalidInputError, match="install the same version of difflcs there") as caught:
@@ -670,7 +670,7 @@ def test_the_tracked_readme_and_tables_are_those_of_the_tracked_results(tmp_path
 # --- other systems ----------------------------------------------------------------
 
 
-def test_robustness_is_resumed_and_refuses_another_record(tmp_path, monkeypatch, one_thread, capsys):
+def test_robustness_is_resumed_and_refuses_another_record(tmp_path, monkeypatch, capsys):
     measured, measure = [], robustness.measure
 
     def counted(condition, *rest):

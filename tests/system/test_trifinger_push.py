@@ -1,7 +1,5 @@
 """The policy of `benchmarks/scoreboard/trifinger_push`: its geometry here, and the simulator where it is installed."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -12,8 +10,6 @@ import torch
 from difflcs.errors import MissingDependencyError
 
 SCOREBOARD = Path(__file__).resolve().parents[2] / "benchmarks" / "scoreboard"
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(autouse=True)

@@ -3,8 +3,6 @@
 Each test is a failure that was once met, at its smallest; `tests/conformance/hostile` searches for more of their kind.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """Models that ship with the package: names, cards, how they are added, and that they are as good as their cards say."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex
@@ -234,19 +232,8 @@ def test_the_list(capsys):
 def test_a_training_starts_from_a_model_of_the_zoo(capsys, tmp_path):
     pytest.importorskip("mujoco")
     out = tmp_path / "run"
-    arguments = [
-        "train",
-        "--smoke",
-        "--minutes",
-        "0.1",
-        "--final-goals",
-        "0",
-        "--out",
-        str(out),
-        "--method",
-        "violation",
-    ]
-    assert cli.main([*arguments, "--init", f"zoo:{CUBE}"]) == 0
+    arguments = "train --smoke --minutes 0.1 --final-goals 0 --method violation".split()
+    assert cli.main([*arguments, "--out", str(out), "--init", f"zoo:{CUBE}"]) == 0
     assert json.loads((out / "config.json").read_text())["init"] == f"zoo:{CUBE}"
     assert cli.main(["train", "--out", str(out), "--resume"]) == 0
     assert cli.main(["evaluate", f"zoo:{CUBE}", "--smoke", "--action-support"]) == 2

@@ -4,8 +4,6 @@ A block of a mass between 0.3 and 3 kg is pushed along a line, with a soft wall 
 physics with three unknown numbers.
 """
 
-from __future__ import annotations
-
 import math
 
 import gymnasium

@@ -1,7 +1,5 @@
 """Any `LCSModule` in warm-up and PPO, and a context on its way from the environment to model, loss and critic."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -35,8 +33,6 @@ from difflcs.rl.rollout import contexts, make_empty_record, mpc_actions, transit
 from difflcs.rl.runs.checkpoint import load_checkpoint, save_checkpoint
 from tests.training import slide
 from tests.training.slide import parameters, recorded, same
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 STEPS = HeavyBlock.STEPS
 LOSS = ViolationLoss(gamma="auto", xi=0.1)
@@ -196,32 +192,6 @@ def test_a_context_that_changes_is_refused():
 # --- the Jacobian -----------------------------------------------------------------------------------------------------
 
 
-class Plain(LCSModel):
-    """An `LCSModel` that nobody knows to be one."""
-
-    def params(self, x=None, context=None):
-        return super().params(x, context)
-
-
-class Stages(Plain):
-    """The same system at each stage, by stage."""
-
-    def params(self, x=None, context=None):
-        return LCSSequence.stack([super().params(x, context)] * 3)
-
-
-@pytest.mark.parametrize("kind", [Plain, Stages])
-def test_any_module_has_the_jacobian_of_a_model(kind):
-    lcs = slide.make_model()
-    other = kind(1, 1, 1, learn_c=False)
-    other.load_state_dict(lcs.state_dict())
-    actors = [make_actor(slide.make_mpc(module), slide.small_settings().std) for module in (lcs, other)]
-    data = slide.drawn(actors[0], 20)
-    wanted, found = (actor.jacobian(data) for actor in actors)
-    assert bool(wanted.any())
-    torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-9)
-
-
 def test_jacobian_of_a_system_for_each_sample():
     """Against central differences of the planned action, over more samples than are differentiated together."""
     lcs = Physics(**OFF)
@@ -353,6 +323,13 @@ def test_a_system_without_gradient_is_refused(update):
         slide_warmup(Detached()).step()
     with pytest.raises(InvalidInputError, match="depends on the module's parameters"):
         make_trainer(Detached(), update=update).step()
+
+
+class Stages(LCSModel):
+    """The same system at each stage, by stage."""
+
+    def params(self, x=None, context=None):
+        return LCSSequence.stack([super().params(x, context)] * 3)
 
 
 def test_a_sequence_is_no_system_of_transitions():

@@ -1,7 +1,5 @@
 """A task with a context, by the common code of all trainings."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -28,8 +26,6 @@ from difflcs.rl import (
     train,
 )
 from difflcs.rl.rollout import append_context, contexts, transitions, uniform_actions
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 STEPS = HeavyBlock.STEPS
 OFF = {"damping": 2.0, "stiffness": 50.0, "added_mass": 0.6}

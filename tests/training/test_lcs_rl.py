@@ -24,8 +24,6 @@ from tests.training.slide import (
     small_settings,
 )
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def make_lcsrl(seed: int = 0, models: bool = False) -> LCSRL:
     lcs = make_model()

@@ -14,8 +14,6 @@ from difflcs.rl.runs.evaluate import evaluate
 from difflcs.rl.settings import Epochs, Rollouts
 from tests.training.slide import STEPS, U_MAX, make_envs
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 NETWORKS = EnsembleSettings(networks=2, width=16, epochs=Epochs(20, 20, 16), learning_rate=1e-3)
 SMALL = PDDMSettings(rollouts=Rollouts(first=10, each=5), ensemble=NETWORKS, horizon=3, samples=80)
 

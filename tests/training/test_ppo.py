@@ -31,9 +31,6 @@ from tests.training.slide import (
     small_settings,
 )
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
-
 # --- learning ---
 
 

@@ -4,30 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from difflcs.errors import CheckpointError
-
 pytest.importorskip("torchrl")
 from difflcs.rl.rollout import collect, uniform_actions
 from difflcs.rl.runs.evaluate import evaluate
 from tests.training.slide import ROLLOUTS, STEPS, Noting, make_envs, make_models, make_ppo, parameters, recorded, same
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def make_practising(seed: int = 0, first_epochs: int = 20, models: dict | None = None, **changes):
     return make_ppo(seed, models=make_models(seed, first_epochs, **(models or {})), **changes)
-
-
-def test_model_rollouts_follow_the_first_real_episodes_and_count_as_no_data():
-    trainer = make_practising()
-    reports = [trainer.step() for _ in range(2)]
-    assert reports[0].model_success is None
-    assert reports[0].model_loss is None
-    assert reports[1].model_success is not None
-    assert 0 < reports[1].model_loss < 2
-    assert reports[1].model_seconds > 0
-    assert [report.env_steps for report in reports] == [STEPS * ROLLOUTS, 2 * STEPS * ROLLOUTS]
-    assert len(trainer.models) == 2 * ROLLOUTS
 
 
 @pytest.mark.parametrize(
@@ -117,12 +101,3 @@ def test_without_real_episodes_models_only_shorten_the_first_step():
     for trainer in (alone, practising):
         trainer.step()
     assert same(parameters(alone), parameters(practising))
-
-
-def test_a_state_without_models_is_refused():
-    trainer = make_ppo()
-    trainer.step()
-    with pytest.raises(CheckpointError, match=r"models.*other settings"):
-        make_practising().load(trainer.state_dict())
-    with pytest.raises(CheckpointError, match=r"models.*other settings"):
-        trainer.load(make_practising().state_dict())

@@ -25,8 +25,6 @@ from difflcs.rl.learning.critic import Critic
 from difflcs.rl.rollout import elapsed_fractions
 from difflcs.rl.seeding import seeded
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 STEPS = 6
 
 

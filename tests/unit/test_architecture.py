@@ -1,7 +1,5 @@
 """What imports what, and how long files and classes are, read from the sources."""
 
-from __future__ import annotations
-
 import ast
 import functools
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """StageBounds, LinearConstraints and ConstraintSequence: what they hold, and what they refuse."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 

@@ -1,7 +1,5 @@
 """LCS-RL with physics inside: what a task tells of its physics, the loss, what is refused, and that it learns."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -20,8 +18,6 @@ from difflcs.rl.learning.trainer import configuration
 from difflcs.rl.methods import Work
 from difflcs.rl.methods.contact_lcs import known_physics
 from tests.conformance.toy import Guess, make_task
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 F64 = torch.float64
 SCALE = torch.tensor([0.05, 0.05, 1.0, 0.2, 0.2], dtype=F64)

@@ -1,7 +1,5 @@
 """The controller of one robot: the same plans as the layer's, an action for every step, files that are checked."""
 
-from __future__ import annotations
-
 import contextlib
 import struct
 import threading

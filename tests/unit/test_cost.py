@@ -1,7 +1,5 @@
 """QuadraticCost and GoalCost: their value, convexity and gradients."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 import re
@@ -56,28 +54,6 @@ def test_only_the_symmetric_parts_matter(build):
     skew = build.normal(0)(4, 4)
     bent = QuadraticCost(**{**tensors, "Q": tensors["Q"] + skew - skew.T})
     torch.testing.assert_close(bent.fields()["Q"], tensors["Q"])
-
-
-def test_missing_linear_terms_are_zero(build):
-    tensors = build.cost_tensors(0)
-    cost = QuadraticCost(tensors["Q"], tensors["R"], tensors["Q_final"])
-    assert all(float(getattr(cost, k).abs().max()) == 0 for k in ("q", "r", "q_final", "constant"))
-
-
-def test_one_weight_for_all_states():
-    cost = GoalCost.reach(3, 2, goal_weight=2.0, input_weight=0.5)
-    assert cost.n_goal == 3
-    assert GoalCost.reach(3, 2, dtype=torch.float32).Q.dtype == torch.float32
-    x, u, goal = torch.ones(2, 3).double(), torch.ones(1, 2).double(), torch.zeros(3).double()
-    assert evaluate(cost(goal), x, u) == pytest.approx(2 * 3 + 0.5 * 2 + 2 * 3)
-
-
-def test_goals_of_any_batch_shape(build):
-    cost, goal = build.paper_cost(), build.normal(0)(2, 5, 3)
-    mapped = cost(goal, horizon=4)
-    assert mapped.q.shape == mapped.q_final.shape == (2, 5, 9)
-    assert mapped.constant.shape == (2, 5)
-    torch.testing.assert_close(mapped.q[1, 3], cost(goal[1, 3]).q)
 
 
 def test_parameters_are_learned_and_plain_tensors_are_buffers(build):

@@ -1,20 +1,15 @@
 """The layer under torch.func and torch.compile: the numbers of plain calls, or an error. Jacobians: test_transforms."""
 
-from __future__ import annotations
-
 import warnings
 
 import pytest
 import torch
-from torch import Tensor
 from torch.autograd.functional import jacobian
-from torch.func import functional_call, grad, vmap
+from torch.func import grad, vmap
 
 from difflcs import LCSMPCLayer, LCSParams, MPCSolution, Status
 from difflcs import errors as e
 from difflcs.mpc import Primal
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture
@@ -147,22 +142,6 @@ def test_grad_is_backward(layer, x0):
     close(torch.autograd.grad(mapped, leaf)[0], plain)
     close(vmap(vmap(grad(loss)))(x0.reshape(3, 2, 4)), plain.reshape(3, 2, 4))
     close(vmap(grad(loss), in_dims=1, out_dims=1)(x0.T), plain.T)
-
-
-def test_gradients_of_each_sample_by_the_shared_parameters(layer, x0):
-    parameters = dict(layer.named_parameters())
-
-    def loss(values: dict[str, Tensor], x: Tensor):
-        return functional_call(layer, values, (x,)).action.square().sum()
-
-    each = vmap(grad(loss), in_dims=(None, 0))(parameters, x0)
-    for i in (0, 3):
-        plain = torch.autograd.grad(loss(parameters, x0[i]), list(parameters.values()))
-        for name, gradient in zip(parameters, plain, strict=True):
-            torch.testing.assert_close(each[name][i], gradient, rtol=1e-7, atol=1e-10)
-    pairs = vmap(grad(loss), in_dims=(None, 0))(parameters, x0.reshape(3, 2, 4))
-    for name, gradient in pairs.items():
-        torch.testing.assert_close(gradient, each[name].reshape(3, 2, *gradient.shape[1:]).sum(1), rtol=1e-7, atol=1e-9)
 
 
 # --- second derivatives ---------------------------------------------------------------------------------------------

@@ -1,7 +1,5 @@
 """Backend `ipopt`: worker processes, threads, forks, crashes and options; and the registry of the backends."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

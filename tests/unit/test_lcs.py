@@ -1,7 +1,5 @@
 """LCSParams and LCSModel: the equations, their gradients, and what a module must survive."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import pickle

@@ -1,7 +1,5 @@
 """LCSMPCLayer: what a user of PyTorch expects of a layer, and what happens when a solve fails."""
 
-from __future__ import annotations
-
 import copy
 import gc
 import pickle
@@ -300,26 +298,6 @@ def test_what_is_constant_reaches_the_problem_as_constant(build, x0):
     torch.testing.assert_close(problem.q, -2 * reference[:, :-1])
     layer(x0, reference=reference[0])
     assert backend.problem.q.shape == (1, 3, 4)
-
-
-def test_every_input_by_stage_reaches_the_problem(build, x0):
-    n = build.normal(4)
-    sequence = LCSSequence.stack([build.params(s) for s in (3, 4, 5)])
-    each = [build.cost_tensors(s) for s in (3, 4, 5)]
-    weights = {k: torch.stack([t[k] for t in each]) for k in ("Q", "R", "q", "r")}
-    cost = CostSequence(**weights, Q_final=each[0]["Q_final"], S=0.01 * n(6, 3, 4, 2))
-    bounds = StageBounds(-torch.rand(6, 3, 2).double(), 1.0)
-    rows = ConstraintSequence(n(4, 2, 4), n(6, 4, 2), n(3, 2, 2), torch.ones(4, 2).double())
-    layer, backend = recording(build, lcs=sequence, cost=cost, bounds=bounds, constraints=rows)
-    layer(x0)
-    problem = backend.problem
-    constant = {"u_max", "Q_final", "q_final", "x0"}
-    assert {k for k in INPUTS if not problem.by_stage(k)} == constant
-    assert {k for k in INPUTS if not problem.shared(k)} == {"S", "u_min", "g", "x0"}
-    for name, value in (("A", sequence.A), ("Q", weights["Q"]), ("G_u", rows.E), ("price", rows.weight)):
-        assert torch.equal(getattr(problem, name)[0], value)
-    assert torch.equal(problem.g, rows.g)
-    assert torch.equal(problem.u_min, bounds.u_min)
 
 
 def test_gradients_come_back_in_the_shape_of_each_input(build):

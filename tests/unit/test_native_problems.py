@@ -3,8 +3,6 @@
 Plans and gradients of every form of problem, and that elements leave each other alone: tests/conformance.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

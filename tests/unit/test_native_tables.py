@@ -1,7 +1,5 @@
 """The tables that Python and the kernels share: fields of a problem, and how a solve can end."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import runpy

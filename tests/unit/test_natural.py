@@ -11,8 +11,6 @@ from difflcs.rl.learning.optim import NaturalGradient
 from difflcs.rl.learning.policy import make_actor
 from tests.training.slide import drawn, make_model, make_mpc
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 STD = 0.03
 
 

@@ -1,7 +1,5 @@
 """`difflcs.physics.mujoco`: states, contacts and systems of MuJoCo models, against MuJoCo and known solutions."""
 
-from __future__ import annotations
-
 import importlib
 import itertools
 import sys
@@ -23,8 +21,6 @@ from difflcs.errors import (  # noqa: E402
 )
 from difflcs.physics import PlanarPushing, box  # noqa: E402
 from difflcs.physics.mujoco import MujocoLCS, MujocoState, lcs_from_mujoco  # noqa: E402
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 SHAPES = {
     "sphere": 'type="sphere" size=".03"',
@@ -110,17 +106,6 @@ def test_states_go_to_mujoco_and_back(seed):
     np.testing.assert_array_equal(velocity, qvel)
     both = state.to_state(np.stack([reference, qpos]), np.stack([qvel, qvel]))
     torch.testing.assert_close(both, torch.stack([state.to_state(place, qvel) for place in (reference, qpos)]))
-
-
-def test_states_of_slides_and_hinges_are_qpos_whatever_the_batch():
-    state = MujocoState(pushing())
-    qpos = np.random.default_rng(0).normal(size=(3, 2, 5))
-    x = state.to_state(qpos)
-    assert torch.equal(x, torch.from_numpy(qpos))
-    again, qvel = state.to_mujoco(x)
-    np.testing.assert_array_equal(again, qpos)
-    assert qvel.shape == (3, 2, 5)
-    assert not qvel.any()
 
 
 @pytest.mark.parametrize("quaternion", [[0, 0, 0, 0], [2, 0, 0, 0], [0, 0, 0, 0.5]])
@@ -315,22 +300,6 @@ def test_where_contacts_are_disabled_nothing_touches_but_what_is_named(flag):
     assert named.gap[:4].tolist() == pytest.approx([0.005] * 4)
 
 
-def test_contacts_of_a_pair_do_not_depend_on_the_other_pairs():
-    """Faces of several pairs that meet at the same time: cylinders on a tilted box."""
-    body = '<body pos="{0} .01 .0{1}"><freejoint/><geom name="{2}" type="cylinder" size=".0{1} .0{1}"/></body>'
-    model = load(
-        '<geom name="base" type="box" size=".2 .1 .02" pos="0 0 -.02" euler="0 0 9"/>'
-        + "".join(body.format(*each) for each in ((-0.1, 3, "a"), (0, 2, "b"), (0.1, 4, "c")))
-    )
-    pairs = [(name, "base") for name in "abc"]
-    x = MujocoState(model, velocities=True).to_state(model.qpos0)
-    together = MujocoLCS(model, motion="dynamic", pairs=pairs, contacts=12).contacts(x)
-    alone = [MujocoLCS(model, motion="dynamic", pairs=[pair], contacts=4).contacts(x) for pair in pairs]
-    for name in ("normal", "tangent"):
-        mine, theirs = (v.abs().sum(0) for v in (getattr(together, name), torch.cat([getattr(c, name) for c in alone])))
-        torch.testing.assert_close(mine, theirs)
-
-
 # --- quasi-static motion --------------------------------------------------------------------------------------------
 
 
@@ -383,11 +352,6 @@ def test_an_actuator_is_a_servo_only_by_an_affine_bias():
 
 
 # --- motion with velocities -----------------------------------------------------------------------------------------
-
-CART_POLE = """
-<body><joint name="cart" type="slide" axis="1 0 0" damping=".1"/><geom type="box" size=".1 .05 .05" mass="1"/>
-  <body><joint name="pole" type="hinge" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 .6" size=".02" mass=".1"/>
-</body></body>"""
 
 
 @pytest.mark.parametrize("relative", [True, False])
@@ -465,17 +429,6 @@ def test_a_body_in_the_air_falls_and_turns():
     torch.testing.assert_close(predicted[:3], after[:3], atol=2e-4, rtol=0)
 
 
-def test_a_falling_body_stops_at_the_floor():
-    model = load(
-        '<geom type="plane" size="1 1 1"/><body><joint name="z" type="slide" axis="0 0 1"/><geom size=".05"/></body>'
-    )
-    module = MujocoLCS(model, motion="dynamic", compliance=1e-6, friction=0.0)
-    x = tensor(0.1, -1.0)
-    after = module.params(x).step(x, torch.zeros(0).double()).x_next
-    assert float(after[0]) == pytest.approx(0.05, abs=1e-5)
-    assert -0.6 < float(after[1]) < 0.0  # where it stops within the step is not known to the LCS
-
-
 # --- as a module ----------------------------------------------------------------------------------------------------
 
 
@@ -519,16 +472,6 @@ def test_the_users_model_and_data_are_left_alone():
     after = [model.opt.timestep, model.opt.disableflags, model.opt.o_margin, *model.geom_condim, *model.geom_contype]
     assert before == after
     assert not data.qpos.any()
-
-
-def test_bodies_that_mocap_moves_are_where_the_data_has_them():
-    model = load(f"""<body name="wall" mocap="true"><geom size=".1"/></body>
-      <body name="ball">{PLANE.format("")}<geom size=".1"/></body>""")
-    data = mujoco.MjData(model)
-    data.mocap_pos[0] = [1.0, 0, 0]
-    assert float(
-        MujocoLCS(model, data, motion="dynamic", distance=5.0).contacts(torch.zeros(4).double()).gap
-    ) == pytest.approx(0.8)
 
 
 # --- what is refused ------------------------------------------------------------------------------------------------

@@ -1,7 +1,5 @@
 """`difflcs.physics.mujoco.cost`: squares of places and rotations, against MuJoCo's own kinematics."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -20,8 +18,6 @@ from difflcs.physics.mujoco import (  # noqa: E402
     Posture,
     Velocity,
 )
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 MODEL = """
 <mujoco><option gravity="0 0 0"/><worldbody>

@@ -1,7 +1,5 @@
 """Sampling-based contact MPC: where to push, when to travel, and how the loop closes on a small planar system."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -12,8 +10,6 @@ from difflcs import GoalCost, LCSMPCLayer, LCSParams
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
 from difflcs.physics import PlanarPushing, box
 from difflcs.planning import DiscPlaces, Mode, PlanarTravel, SamplingPolicy, SamplingSettings, Workspace
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 F64 = torch.float64
 RADIUS = 0.1
@@ -126,14 +122,6 @@ def error(x, goal):
 
 
 # --- one step, on a line ----------------------------------------------------------------------------------------------
-
-
-def test_it_pushes_where_the_pusher_is_on_the_right_side():
-    policy = on_a_line()
-    u = policy.act([0.0, -0.51], [1.0])
-    assert policy.decision.mode is Mode.PUSH
-    assert not policy.decision.began
-    np.testing.assert_allclose(u, [0.2], atol=1e-4)
 
 
 def test_it_travels_where_the_pusher_is_on_the_wrong_side_and_pushes_from_there():

@@ -1,7 +1,5 @@
 """Backend `relaxed`: its convex program, gradient and failures; more of all three in test_backends.py."""
 
-from __future__ import annotations
-
 import dataclasses
 import pickle
 

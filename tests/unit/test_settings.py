@@ -1,7 +1,5 @@
 """Settings: types, bounds and groups; what `difflcs train` takes, all of it documented and bounded."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 import json

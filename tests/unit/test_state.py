@@ -1,7 +1,5 @@
 """States as trees: flattened and put together again, compared, and taken back where they do not fit."""
 
-from __future__ import annotations
-
 import json
 import math
 from typing import Any
@@ -41,7 +39,7 @@ def same(one: Any, other: Any) -> bool:
     return type(one) is type(other) and one == other
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(TREES)
 def test_a_tree_comes_back(tree):
     tensors, rest = flatten(tree)

@@ -16,8 +16,6 @@ from difflcs.rl.learning.surrogate import Surrogate, gaussian_kl, trimmed_mean
 from difflcs.rl.rollout import transitions
 from tests.training.slide import U_MAX, drawn, features, make_model, make_mpc
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 STD = 0.03
 VIOLATION = ViolationLoss(gamma=0.07, xi=0.03)
 

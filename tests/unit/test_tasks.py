@@ -1,7 +1,5 @@
 """Tasks: what they are made of, what is refused, and how they are found."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

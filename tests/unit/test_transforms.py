@@ -1,7 +1,5 @@
 """solve_lcp, the losses, the layer and the records under torch.func, vectorised jacobians and torch.compile."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
@@ -230,19 +228,6 @@ def test_an_ensemble_of_models_is_mapped(build, data, gamma):
     found = vmap(lambda values: functional_call(loss, values, data))(stacked)
     expected = torch.stack([violation_loss(m, *data, gamma).detach() for m in models])
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-14)
-
-
-@pytest.mark.parametrize("reduction", ["mean", "none"])
-def test_batched_gradients_of_every_parameter_of_a_loss(build, data, reduction):
-    model = build.model(seed=3)
-    inputs = [*model.parameters(), *(v.requires_grad_() for v in data)]
-    loss = violation_loss(model, *data, reduction=reduction)
-    upstream = build.normal(1)(5, *loss.shape)
-    many = torch.autograd.grad(loss, inputs, upstream, is_grads_batched=True, retain_graph=True)
-    for k in range(5):
-        one = torch.autograd.grad(loss, inputs, upstream[k], retain_graph=True)
-        for left, right in zip(many, one, strict=True):
-            torch.testing.assert_close(left[k], right, rtol=1e-9, atol=1e-12)
 
 
 def test_what_vmap_hides_from_the_records_is_checked_by_the_loss(build, data):

@@ -14,8 +14,6 @@ from difflcs.rl.learning.optim.update import Deviation
 from difflcs.rl.learning.policy import make_actor
 from tests.training.slide import drawn, make_model, make_mpc
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 STD = 0.03
 ADAM = Adam(learning_rate=0.02, betas=(0.9, 0.99))
 

@@ -6,7 +6,8 @@ they go. On each tree of bodies they count by the energy that they bring about, 
 the rest is added to d. F and the gaps stay.
 
 What contacts do depends on friction, which holds with one action and slides with another. So Δ of contacts counts only
-where they do worse than nothing.
+where they do worse than nothing, and goes to d: a grip many times as firm as at the nominal action must not make it as
+many times as large.
 """
 
 # MuJoCo is a compiled module without type stubs.
@@ -120,8 +121,9 @@ def correct(
     free = predicted - (C @ forces[:, :, None])[:, :, 0] - x
     speed = np.concatenate([np.zeros_like(place), x[:, nv : 2 * nv]], 1)
     worse = (size(wrong) - size(change)) / (_WORSE * (size(speed) + size(free)) + 1e-9)
-    counts = 1 - energy[:, :, :n_contacts].sum(-1) / total * (1 - np.clip(worse, 0.0, 1.0))
-    due = counts * np.minimum(1.0, np.sqrt(total) / np.maximum(size(wrong), 1e-15))
+    share = energy[:, :, :n_contacts].sum(-1) / total
+    counts = 1 - share * (1 - np.clip(worse, 0.0, 1.0))
+    due = (1 - share) * np.minimum(1.0, np.sqrt(total) / np.maximum(size(wrong), 1e-15))
     part = energy / np.where(forces != 0, forces, 1.0)[:, None] / total[:, :, None]
     both = np.concatenate([tree, tree])
     by_forces = (wrong * due[:, both])[:, :, None] * part[:, both]
