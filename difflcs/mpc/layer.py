@@ -219,7 +219,7 @@ class LCSMPCLayer(nn.Module):
         solver, (x, u, lam, objective, mu, *rest) = self._repeat.solve_call(setup, call)
         if solver.transformed or not solver.result.all_converged:
             self._report(solver.result.status, solver.needs_grad)
-        return MPCSolution(x, u, lam, mu, objective, *rest, problem=solver.problem)
+        return MPCSolution(x, u, lam, mu, objective, *rest, of=solver.problem)
 
     def controller(self, on_failure: OnFailure = "hold", time_limit: float | None = None) -> MPCController:
         """Make a controller of one robot with this layer's problem as it is now: NumPy in and out, warm, microseconds.

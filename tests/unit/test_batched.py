@@ -238,17 +238,6 @@ def test_what_was_given_up_is_solved_where_all_else_fails():
 # --- large problems ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("n_x", "n_u", "n_lam", "horizon"), [(20, 13, 20, 20), (9, 6, 30, 10), (9, 6, 8, 40)])
-def test_large_random_problems_converge(n_x, n_u, n_lam, horizon):
-    """Models without any structure, in which contacts couple everything."""
-    generator = torch.Generator().manual_seed(0)
-    lcs = LCSModel(n_x, n_u, n_lam, init_scale=0.3, generator=generator).params().detach()
-    cost = GoalCost.reach(n_x, n_u, goal_weight=0.5, input_weight=0.05)
-    mpc = LCSMPCLayer(lcs, cost, horizon, -1.0, 1.0, backend=BatchedBackend(threads=1, effort="fast"))
-    plan = mpc(torch.randn(8, n_x, generator=generator, dtype=torch.float64), torch.zeros(n_x).double())
-    assert float(plan.iterations.double().mean()) < 90
-
-
 @pytest.mark.parametrize(("n_x", "n_u", "n_lam"), [(4, 2, 49), (40, 9, 6)])
 def test_large_problems_have_the_same_plans_alone_and_in_a_batch_with_systems_of_their_own(n_x, n_u, n_lam):
     generator = torch.Generator().manual_seed(1)

@@ -1,8 +1,5 @@
 """StageBounds, LinearConstraints and ConstraintSequence: what they hold, and what they refuse."""
 
-import copy
-import pickle
-
 import pytest
 import torch
 from torch import nn
@@ -73,15 +70,6 @@ def test_constraints_hold_their_fields(build):
     assert "G(3, 4)" in repr(learned)
     assert learned.to(torch.float32).G.dtype == torch.float32
     assert not hard.staged
-
-
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))])
-def test_copies_keep_the_values(build, copied):
-    sequence = ConstraintSequence(build.normal(0)(3, 4), full(1.0, 5, 3), by_stage=("g",))
-    for constraints in (LinearConstraints(**rows(build)), sequence):
-        twin = copied(constraints)
-        assert twin.by_stage == constraints.by_stage
-        assert all(torch.equal(v, twin.tensors()[k]) for k, v in constraints.tensors().items())
 
 
 def test_a_sequence_knows_its_stages(build):

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from difflcs import BackendNotFoundError, LCSMPCLayer, available_backends, register_backend
-from difflcs.errors import DTypeError, InvalidInputError, SolveWarning
+from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.mpc import kkt
 from difflcs.mpc.backends import Backend, IpoptBackend, base, get_backend, ipopt
 from tests.conformance.varied.generators import random_case
@@ -168,21 +168,6 @@ def test_by_way_of_the_inequality_it_is_the_same_problem(build, x0):
     assert float(other.complementarity().max()) <= 1e-9
     assert float((other.objective - one.objective).abs().max()) < 1e-3
     assert int(other.iterations.sum()) > int(one.iterations.sum())
-
-
-def test_a_limit_that_some_elements_meet_fails_the_others_only(build, x0):
-    full = make_layer(build, backend=IpoptBackend(workers=1))(x0)
-    limit = int(full.iterations.median())
-    layer = make_layer(build, backend=IpoptBackend(max_iter=limit, workers=1), on_failure="mask")
-    start = x0.clone().requires_grad_()
-    with pytest.warns(SolveWarning):
-        solution = layer(start)
-    done = solution.converged
-    assert 0 < int(done.sum()) < 9
-    torch.testing.assert_close(solution.u.detach()[done], full.u[done], rtol=1e-9, atol=1e-10)
-    solution.u.sum().backward()
-    assert float(start.grad[~done].abs().max()) == 0
-    assert float(start.grad[done].abs().amax(1).min()) > 0
 
 
 @pytest.mark.parametrize(

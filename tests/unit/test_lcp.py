@@ -22,9 +22,6 @@ def definite(n, seed, skew=0.5):
     return G @ G.T + 0.3 * torch.eye(n, dtype=torch.float64) + skew * (H - H.T)
 
 
-# --- values ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", ["lcp-plain", "lcp-degenerate", "lcp-graded", "lcp-p-matrix"])
 def test_exact_solution_equals_enumeration(build, kind):
     for seed in range(4):
@@ -46,9 +43,6 @@ def test_relaxed_scalar_has_its_closed_form():
     lam = solve_lcp(torch.full((1, 1), 3.0, dtype=torch.float64), q, relaxation=1e-3).lam
     root = (q * q + 4 * 3 * 1e-3).sqrt()
     torch.testing.assert_close(lam, torch.where(q > 0, 2e-3 / (q + root), (root - q) / 6), rtol=1e-12, atol=0)
-
-
-# --- gradients ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("relaxation", [0.0, 1e-3, 1.0])
@@ -89,9 +83,6 @@ def test_gradient_at_a_kink_is_the_one_sided_derivative_of_the_inactive_side(bui
     for i in (3, 4):  # one-sided difference quotients of the solution itself, exact since it is piecewise linear
         step = 1e-5 * torch.eye(5, dtype=torch.float64)[i]
         torch.testing.assert_close(found[:, i], (solve_lcp(F, q + step).lam - lam) / 1e-5, rtol=1e-6, atol=1e-8)
-
-
-# --- batches --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("relaxation", [0.0, 1e-5])
@@ -138,9 +129,6 @@ def test_an_empty_batch_gives_empty_results_and_zero_gradient(relaxation, batch)
     lam.sum().backward()
     assert torch.equal(F.grad, torch.zeros(4, 4, dtype=torch.float64))
     assert q.grad.shape == q.shape
-
-
-# --- failures -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("relaxation", [0.0, 1e-4])

@@ -236,15 +236,6 @@ def test_what_is_not_solved_is_not_chosen():
     assert bool((policy.decision.gains[failed] == -math.inf).all())
 
 
-def test_reset_forgets_the_journey():
-    policy = on_a_line()
-    policy.act([0.0, 0.51], [1.0])
-    policy.reset()
-    assert policy.decision is None
-    policy.act([0.0, -0.51], [1.0])
-    assert policy.decision.mode is Mode.PUSH
-
-
 # --- the loop, in the plane -------------------------------------------------------------------------------------------
 
 

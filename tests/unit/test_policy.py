@@ -98,64 +98,6 @@ def test_log_probability_is_that_of_the_unclipped_sample(mpc):
     assert bool((policy.get_dist(observations(200)).log_prob(clipped)[outside] != again[outside]).all())
 
 
-def test_a_guess_leads_back_to_the_rollouts_optimum(mpc):
-    """Re-solved from the plan, the ratio is one and the solver has nothing to do; the guess is really used."""
-    policy = LCSMPCPolicy(mpc, STD)
-    with torch.no_grad():
-        data = policy(observations(30))
-    warm = data.select("state", "goal")
-    warm["guess"] = data["plan"]
-    log_prob = policy.get_dist(warm).log_prob(data["action"])
-    torch.testing.assert_close(log_prob, data["action_log_prob"], rtol=0, atol=1e-9)
-    seen = []
-    mpc.register_forward_hook(lambda _, __, kwargs, out: seen.append(out.iterations.max()), with_kwargs=True)
-    policy.get_dist(warm)
-    policy.get_dist(observations(30))
-    assert seen[0] < seen[1]
-
-
-def test_gradients_are_those_of_finite_differences(mpc):
-    policy = LCSMPCPolicy(mpc, STD, covariance="full")
-    with torch.no_grad():
-        policy.gaussian.mixing.copy_(torch.tensor([[9.0, 9.0], [0.4, 9.0]]))  # only the entry below the diagonal counts
-        data = policy(observations(8))
-    tril = policy.gaussian.scale_tril().detach()
-    assert torch.equal(tril, tril.tril())
-
-    def log_prob():
-        warm = data.select("state", "goal")
-        warm["guess"] = data["plan"]
-        return policy.get_dist(warm).log_prob(data["action"]).sum()
-
-    log_prob().backward()
-    for parameter, index in [
-        (mpc.lcs.B, (0, 0)),
-        (mpc.lcs.A, (1, 0)),
-        (policy.gaussian.log_std, (1,)),
-        (policy.gaussian.mixing, (1, 0)),
-    ]:
-        values = []
-        for step in (1e-6, -1e-6):
-            with torch.no_grad():
-                parameter[index] += step
-                values.append(log_prob())
-                parameter[index] -= step
-        assert parameter.grad[index].item() == pytest.approx(float(values[0] - values[1]) / 2e-6, rel=1e-4, abs=1e-5)
-    assert policy.gaussian.mixing.grad[0, 1] == 0
-
-
-def test_failed_solves_are_marked_and_have_no_gradient(mpc):
-    policy = LCSMPCPolicy(mpc, STD)
-    policy.mpc.backend = type(mpc.backend)(max_iter=1)
-    with pytest.warns(UserWarning, match="not solved"):
-        data = policy(observations(20))
-    failed = ~data["converged"].squeeze(-1)
-    assert bool(failed.any())
-    assert bool((data["loc"].abs() <= U_MAX).all())
-    data["loc"][failed].sum().backward()
-    assert all(p.grad is None or not p.grad.any() for p in mpc.lcs.parameters())
-
-
 def test_what_is_learned(mpc):
     def learned(**options) -> set[str]:
         policy = LCSMPCPolicy(mpc, STD, **options)

@@ -127,21 +127,6 @@ def test_a_name_more_or_less_is_refused(path):
         check_state(state, make_state())
 
 
-@pytest.mark.parametrize(
-    ("path", "value"),
-    [
-        ("iteration", 7),
-        ("iteration", 0),
-        ("step_size", 0.5),
-        ("on", False),
-        ("learned.parameters.A", torch.ones(2, 3)),
-        ("random.noise.state.state", 2**127),
-    ],
-)
-def test_values_that_may_differ_do(path, value):
-    check_state(make_state(), changed(path, value))
-
-
 def test_episodes_are_any_number_of_rows_as_many_in_each():
     more = changed("episodes", {"state": torch.ones(9, 3, 2), "action": torch.ones(9, 2, 1)})
     check_state(make_state(), more)
