@@ -104,24 +104,6 @@ def test_a_guess_makes_one_pass(build):
     assert bool(solve(t, guess=wild).converged.all())
 
 
-def test_the_layer_of_one_size_is_built_once(build, monkeypatch):
-    import cvxpylayers.torch
-
-    built = []
-
-    class Counted(cvxpylayers.torch.CvxpyLayer):
-        def __init__(self, *arguments, **options):
-            built.append(options)
-            super().__init__(*arguments, **options)
-
-    monkeypatch.setattr(cvxpylayers.torch, "CvxpyLayer", Counted)
-    t = tensors(build, n_x=5, n_u=1)  # a size that no other test has
-    solve(t)
-    assert len(built) == 1
-    solve({**t, "x0": 2 * t["x0"][:2]}, RelaxedBackend(penalties=(3.0,)))
-    assert len(built) == 1
-
-
 # --- the gradient ---------------------------------------------------------------------------------------------------
 
 

@@ -186,25 +186,6 @@ def test_every_setting_says_what_it_is_and_has_bounds_where_it_is_a_number(kind)
 # --- the configuration of a training ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"method": "magic"}, "lcs-rl, violation"),
-        ({"method": None}, "method"),
-        ({"task": 3}, "task"),
-        ({"minutes": 0.0}, "minutes"),
-        ({"minutes": math.nan}, "minutes"),
-        ({"seed": -1}, "seed"),
-        ({"evaluate_goals": 0}, "evaluate_goals"),
-        ({"final_goals": -1}, "final_goals"),
-        ({"evaluate_at": (-1.0,)}, "evaluate_at"),
-    ],
-)
-def test_bad_settings_of_a_training_are_refused(change, message):
-    with pytest.raises(InvalidInputError, match=message):
-        TrainConfig(**change)
-
-
 def test_a_method_stands_for_its_name():
     assert TrainConfig(method="ppo") == TrainConfig(method=get_method("ppo")())  # pyright: ignore[reportArgumentType]
     assert TrainConfig().method == get_method(DEFAULT_METHOD)()
