@@ -105,12 +105,6 @@ def test_integers_stand_for_floats_and_none_where_it_is_declared():
     assert Outer(maybe=2**63 - 1, size=2**63 - 1).size == 2**63 - 1
 
 
-def test_settings_come_back_from_json():
-    own = Outer(inner=Inner(7, 0.25), pair=(0.3, 0.4), many=(1, 2), maybe=None, kind="b", flag=True, text="x", size=5)
-    assert from_json(json.loads(json.dumps(asdict(own))), Outer) == own
-    assert from_json(asdict(own), Outer) == own
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
