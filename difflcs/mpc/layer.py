@@ -41,6 +41,7 @@ class LCSMPCLayer(nn.Module):
     respect to the LCS, the cost, the bounds, the constraints, x0 and the goal by perturbation of the optimality
     conditions (`difflcs.mpc.kkt`). Everything is solved in float64 on the CPU; results come back in x0's dtype and on
     x0's device. What the layer is built with is the default of each call.
+    As a stochastic policy for reinforcement learning: `difflcs.rl.LCSMPCPolicy`.
 
     Args:
         lcs: an `LCSModel` or any other `LCSModule`, asked for its system at each call (parameters of an nn.Module
