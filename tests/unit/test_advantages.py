@@ -132,15 +132,6 @@ def test_actions_come_in_mirrored_pairs_the_one_taken_first():
     assert len(action.flatten(0, 2).unique(dim=0)) == 5 * 4 * 6
 
 
-def test_the_others_are_drawn_from_the_policy():
-    taken = gaussian(1).expand(20000)
-    with seeded((2,)):
-        offsets = mirrored_actions(taken, 4)["action"][:, 2] - taken["loc"]
-    factor = taken["scale_tril"][0]
-    torch.testing.assert_close(offsets.T.cov(), factor @ factor.mT, rtol=0.05, atol=0.03)
-    assert float(offsets.mean(0).abs().max()) < 0.05
-
-
 def test_advantages_are_those_of_the_formula():
     generator = torch.Generator().manual_seed(0)
     q = torch.randn(7, 5, 4, generator=generator, dtype=torch.float64)

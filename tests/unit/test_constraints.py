@@ -72,17 +72,6 @@ def test_constraints_hold_their_fields(build):
     assert not hard.staged
 
 
-def test_a_sequence_knows_its_stages(build):
-    n = build.normal(0)
-    sequence = ConstraintSequence(n(4, 3, 5), n(4, 3), n(3, 3, 2), full(1.0, 4, 3))
-    assert (sequence.horizon, sequence.n_c, sequence.n_x, sequence.n_u) == (3, 3, 5, 2)
-    assert sequence.staged == {"G_x", "G_u", "g", "price"}
-    moving = ConstraintSequence(n(3, 5), n(7, 4, 3), weight=2.0, by_stage=("g",))
-    assert moving.horizon == 3
-    assert moving.staged == {"g"}
-    assert torch.equal(moving.tensors()["price"], full(2.0, 3))
-
-
 BAD_ROWS = [
     ({"G": full(1.0, 4)}, ShapeError, r"G: expected a matrix \(\.\.\., n_c, n_x\), got \(4,\)"),
     ({"g": full(1.0, 2)}, ShapeError, r"g: expected shape \(\.\.\., n_c=3\), got \(2,\)"),

@@ -256,16 +256,6 @@ def recording(build, **options):
     return LCSMPCLayer(**options, backend=backend), backend
 
 
-def test_without_bounds_there_are_none(build, x0):
-    layer, backend = recording(build)
-    layer(x0)
-    assert torch.equal(backend.problem.u_min, torch.full((2,), -torch.inf).double())
-    assert torch.equal(backend.problem.u_max, torch.full((2,), torch.inf).double())
-    assert backend.problem.n_c == 0
-    layer(x0, u_max=1.0)
-    assert torch.equal(backend.problem.u_max, torch.ones(2).double())
-
-
 @pytest.mark.parametrize("name", ["lcs", "cost", "constraints", "bounds"])
 def test_what_a_call_is_given_replaces_the_layers_own(build, x0, name):
     n = build.normal(7)
