@@ -93,6 +93,12 @@ class Settings:
     """Decisions without progress after which the hand opens, and takes the object anew."""
     opening: int = 8
     """Decisions for which it opens."""
+    pace: float = 0.5
+    """Part of the published limit of actions that is used, as drops come from fast motion."""
+    brisk: int = 25
+    """Decisions after an opening for which all of the limit is used."""
+    spread: float = 0.3
+    """Standard deviation of the posture to which the hand opens from the second time on [rad]."""
 
 
 @dataclass
@@ -175,7 +181,8 @@ class HandPolicy:
             self.module, self.cost, s.horizon, -self.limit, self.limit, backend, s.relaxation, "mask"
         )
         self.goal, self.settings, self.guess, self.times = goal, settings, None, []
-        self.best, self.waited = np.inf, 0
+        self.best, self.waited, self.openings, self.brisk = np.inf, 0, 0, 0
+        self.random, self.posture = np.random.RandomState(0), np.array(JOINTS)
 
     def stalls(self, data: Any) -> bool:
         """Tell whether the object has not turned on for too long: then the hand opens for some decisions."""
@@ -185,20 +192,24 @@ class HandPolicy:
             self.best, self.waited = min(left, self.best), 0
         if self.waited > self.settings.patience:
             self.best, self.waited = np.inf, -self.settings.opening
+            self.openings, self.brisk = self.openings + 1, self.settings.brisk
+            spread = self.settings.spread * (self.openings > 1)
+            self.posture = np.array(JOINTS) + spread * self.random.randn(16)
         return self.waited < 0
 
     def act(self, data: Any) -> np.ndarray:
         """MuJoCo's ctrl for the next 0.1 s."""
         if self.stalls(data):
             self.guess = None
-            return data.qpos[:16] + np.clip(np.array(JOINTS) - data.qpos[:16], -self.limit, self.limit)
+            return data.qpos[:16] + np.clip(self.posture - data.qpos[:16], -self.limit, self.limit)
+        limit, self.brisk = self.limit * (1.0 if self.brisk > 0 else self.settings.pace), self.brisk - 1
         marks = [time.thread_time()]
         x = self.module.observe(data)
         system = self.module.params(x)
         marks.append(time.thread_time())
         cost = self.cost.at(x)
         marks.append(time.thread_time())
-        low, high = (bound.clamp(-self.limit, self.limit) for bound in self.module.action_bounds(x))
+        low, high = (bound.clamp(-limit, limit) for bound in self.module.action_bounds(x))
         with torch.no_grad():
             plan = self.mpc(x, lcs=system, cost=cost, guess=self.guess, u_min=low, u_max=high)
         marks.append(time.thread_time())
