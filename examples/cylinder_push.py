@@ -1,8 +1,8 @@
-"""Judo's `cylinder_push` by contact MPC: `python examples/cylinder_push.py --xml DIR/judo/models/xml/cylinder_push.xml`.
+"""Judo's `cylinder_push`, contact MPC: `python examples/cylinder_push.py --xml DIR/judo/models/xml/cylinder_push.xml`.
 
-A driven cylinder pushes another one, 50 cm wide and damped, to the origin; both begin anywhere on circles of 1 and 2 m.
-The model comes with the wheel of Judo (`pip install --target DIR --no-deps judo-rai`). There are 200 decisions of 0.1 s.
-The contact MPC asks from 16 places round the cylinder where a push is worth the most, and the pusher travels there.
+A driven cylinder pushes another one, 50 cm wide and damped, to the origin; they begin anywhere on circles of 1 and 2 m.
+The model is in the wheel of Judo (`pip install --target DIR --no-deps judo-rai`). There are 200 decisions of 0.1 s. The
+contact MPC tells from which of 16 places round the cylinder a push is worth the most, and the pusher travels there.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ from difflcs.planning import SamplingPolicy, SamplingSettings
 
 SECONDS, DECISIONS, REACH = 0.1, 200, 0.56  # of a step, of an episode; from centre to centre as they nearly touch [m]
 CLEAR, NEAR = 0.75, 0.8  # how far from the centre the pusher goes round, and where it counts as near [m]
+WEIGHT, EFFORT, FINAL = 0.02, 0.001, 30.0  # of the distance between the two, of the servos, and at the end
+SETTINGS = SamplingSettings(travel_price=0.005, switch_price=0.005, smallest_gain=0.005)
 
 
 @dataclass
@@ -97,10 +99,6 @@ def make_policy(model: Any) -> tuple[MujocoLCS, SamplingPolicy]:
     cost = GoalCost(Q, EFFORT * torch.eye(2, dtype=torch.float64), FINAL * Q, none, none)
     mpc = LCSMPCLayer(module, cost, 10, -1.0, 1.0, on_failure="mask", relaxation=1e-4)
     return module, SamplingPolicy(mpc, Places(), Travel(), SETTINGS)
-
-
-WEIGHT, EFFORT, FINAL = 0.1, 0.02, 10.0
-SETTINGS = SamplingSettings(travel_price=0.02)
 
 
 @torch.no_grad()
