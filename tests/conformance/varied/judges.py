@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.conformance.varied.generators import Case
+from tests.conformance.cases import Case
 
 SYSTEM = ("A", "B", "C", "d", "D", "E", "F", "c")
 
