@@ -56,8 +56,8 @@ class IpoptBackend(Backend):
         residual_tol: largest KKT residual that counts as converged.
         start: value of λ and s at a cold start. 0.05 takes fewer iterations than λ = s = 1 and finds better optima.
             The states start at x0: a rollout is a worse start where the system is unstable.
-        second_start: the same of a second cold start, with IPOPT's own first barrier, 0.1; the better plan is kept. None:
-            one start, in half the time; its plans on pushing models cost up to 1 % more than those of λ = s = 1.
+        second_start: the same of a second cold start, with IPOPT's own first barrier, 0.1; the better plan is kept.
+            None: one start, in half the time; its plans on pushing models cost up to 1 % more than those of λ = s = 1.
         mu_init: IPOPT's first barrier parameter at a cold start.
         mu_init_warm: the same with a guess.
         mu_strategy: IPOPT's: "monotone", or "adaptive": another way, whose optima are not better or worse in general;
