@@ -9,6 +9,7 @@ import importlib
 import importlib.util
 import json
 import os
+import statistics
 import sys
 import time
 from collections.abc import Callable
@@ -35,6 +36,22 @@ def cpu(work: Callable[[], object]) -> tuple[float, object]:
     return time.process_time() - start, result
 
 
+def closed_loop(rival, few: int, steps: int) -> dict:
+    """Execute the first actions of plans, with hard contact, for some steps: the cost of each problem, and times."""
+    from rivals.problem import execute
+
+    problem, costs, times = rival.problem, [], []
+    for i in range(few):
+        data, x, total = problem.only(i), problem.x0[i].copy(), 0.0
+        for _ in range(steps):
+            seconds, u = cpu(lambda i=i, x=x: rival.step(i, x))
+            cost, x = execute(data, x, u[None])
+            total += cost
+            times.append(seconds)
+        costs.append(total)
+    return {"costs": costs, "seconds": statistics.median(times)}
+
+
 def race(name: str, settings: dict, job: dict) -> dict:
     """Solve the first `few` problems of a file one by one for `seconds`; then all in one call, if possible."""
     import numpy as np
@@ -55,6 +72,8 @@ def race(name: str, settings: dict, job: dict) -> dict:
         rival.one(0)
         KEPT[key] = rival, time.process_time() - began
     rival, setup = KEPT[key]
+    if job.get("steps"):
+        return closed_loop(rival, job["few"], job["steps"])
     began = time.process_time()
     plans, solved, times = [], [], []
     for i in range(min(problem.count, job["few"])):
