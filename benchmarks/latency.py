@@ -7,10 +7,14 @@ Episode by episode, every way to plan takes its turn at the same problems, with 
 - layer: `LCSMPCLayer` without gradient, tensors in, tensors out;
 - shift: the warm start of the next call, `MPCSolution.shift`;
 - layer and gradient: the plan, and the gradient of its first action in everything that the layer learns and the state;
-- controller: `LCSMPCLayer.controller`, NumPy in and out, which shifts its plan itself.
+- controller: `LCSMPCLayer.controller`, NumPy in and out, which shifts its plan itself;
+- layer, cold: as the layer, but without a warm start;
+- PDDM, for the cube: its planner by the default settings, with networks of the sizes that it learns. They are drawn at
+  random: what a product costs does not depend on its numbers.
 
 Prints median and 99th percentile in CPU time, and the median as a ratio to that of the kernel. Times of a shared
-machine mean little, ratios more.
+machine mean little, ratios more. Then the price of a deadline: the cube's errors in closed loop by what `on_failure`
+does, and the share of steps not solved.
 """
 
 from __future__ import annotations
@@ -31,6 +35,8 @@ from difflcs import LCSModel, LCSMPCLayer, LCSParams, MPCSolution, QuadraticCost
 from difflcs.cli.bench import ACTION_LIMIT, machine, pushing_cost, save, states_and_goals
 from difflcs.errors import DegenerateWarning
 from difflcs.mpc.solution import Primal
+from difflcs.rl import Ensemble, get_method, get_task
+from difflcs.rl.learning.pddm import Planner
 from difflcs.systems import cart_pole_between_walls
 
 EPISODE = 20  # steps from one start to the next
@@ -40,7 +46,7 @@ EPISODE = 20  # steps from one start to the next
 class Options:
     """Latency of a call for one robot."""
 
-    episodes: int = 250
+    episodes: int = 100
     """Episodes of 20 warm calls of each way, for each problem."""
     warm_up: int = 5
     """Episodes before, which do not count."""
@@ -61,6 +67,7 @@ class Case:
     starts: Tensor
     goals: Tensor | None
     disturbance: float
+    rival: Planner | None = None
 
 
 def cart_pole(horizon: int, count: int, seed: int) -> Case:
@@ -79,7 +86,11 @@ def cube(horizon: int, count: int, seed: int) -> Case:
     """Push the cube with the model of the zoo, 1 mm of disturbance."""
     lcs = LCSModel.from_pretrained("trifinger-cube")
     mpc = LCSMPCLayer(lcs, pushing_cost(), horizon, -ACTION_LIMIT, ACTION_LIMIT, on_failure="mask")
-    return Case(mpc, lcs.params().detach(), *states_and_goals(count, seed), 1e-3)
+    task, settings = get_task("cube"), get_method("pddm")().pddm  # pyright: ignore[reportAttributeAccessIssue]
+    sizes = settings.ensemble.networks, settings.ensemble.width
+    ensemble = Ensemble(task.n_x, task.n_u, *sizes, torch.Generator().manual_seed(seed))
+    rival = Planner(ensemble, task.make_cost(), settings, *task.bounds)
+    return Case(mpc, lcs.params().detach(), *states_and_goals(count, seed), 1e-3, rival)
 
 
 CASES: dict[str, Callable[[int, int], Case]] = {
@@ -128,7 +139,10 @@ def measure(case: Case, o: Options) -> dict[str, dict[str, float]]:
         "shift": lambda step: step.plan.shift(),
         "layer and gradient": differentiate,
         "controller": lambda step: controller.step(*step.arrays),
+        "layer, cold": lambda step: mpc(*step.inputs),
     }
+    if (rival := case.rival) is not None:
+        ways["PDDM"] = lambda step: rival(*step.inputs)
     seconds: dict[str, list[float]] = {name: [] for name in ("kernel", *ways)}
     apart, unsolved, iterations, plan = 0.0, 0, [], None
     generator = torch.Generator().manual_seed(o.seed + 1)
@@ -160,6 +174,24 @@ def measure(case: Case, o: Options) -> dict[str, dict[str, float]]:
     return figures
 
 
+@torch.no_grad()
+def track(case: Case, seed: int, on_failure: str, time_limit: float | None) -> dict[str, float]:
+    """Close the loop by a controller with a deadline: sum of the cube's squared errors, share of steps not solved."""
+    controller, error, unsolved = case.mpc.controller(on_failure, time_limit), 0.0, 0
+    generator = torch.Generator().manual_seed(seed)
+    assert case.goals is not None
+    for x, goal in zip(case.starts, case.goals, strict=True):
+        controller.reset()
+        for _ in range(EPISODE):
+            u = torch.from_numpy(controller.step(x.numpy(), goal.numpy()))
+            assert controller.status is not None
+            unsolved += not controller.status.solved
+            noise = torch.randn(x.shape, generator=generator, dtype=torch.float64)
+            x = case.lcs.step(x, u).x_next + case.disturbance * noise
+            error += float((x[:3] - goal).square().sum())
+    return {"error": error, "unsolved": unsolved / (EPISODE * len(case.starts))}
+
+
 def main(o: Options) -> None:
     """Measure, print, write."""
     if o.smoke:
@@ -172,8 +204,12 @@ def main(o: Options) -> None:
         print(name)
         for way, row in results[name].items():
             print(f"  {way:20s}", "  ".join(f"{label} {value:.3g}" for label, value in row.items()))
+    case = cube(8, o.episodes, o.seed)
+    limits = ((on_failure, limit) for on_failure in ("hold", "unfinished") for limit in (None, 200e-6, 100e-6))
+    deadline = {f"{on_failure} {limit}": track(case, o.seed, on_failure, limit) for on_failure, limit in limits}
+    print("\n".join(f"{name}: {row}" for name, row in deadline.items()))
     options = {"calls": o.episodes * EPISODE, "episodes": o.episodes, "warm_up": o.warm_up, "seed": o.seed}
-    save(o.out, {"machine": machine(), "options": options, "results": results})
+    save(o.out, {"machine": machine(), "options": options, "results": results, "deadline": deadline})
 
 
 if __name__ == "__main__":

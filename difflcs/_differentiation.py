@@ -25,6 +25,9 @@ from difflcs.errors import DoubleBackwardError
 
 P = ParamSpec("P")
 R = TypeVar("R")
+Tensors = Sequence[Tensor]
+Gradients = Sequence[Tensor | None]
+"""None stands for zero."""
 
 
 # --- what is active -------------------------------------------------------------------------------------------------
@@ -107,18 +110,12 @@ class Solver(ABC):
     keeps: ClassVar[bool] = False
 
     @abstractmethod
-    def solve(self, tensors: Sequence[Tensor], transformed: bool) -> tuple[Tensor, ...]:
+    def solve(self, tensors: Tensors, transformed: bool) -> tuple[Tensor, ...]:
         """Compute the outputs. `transformed`: the numbers are unchecked, and nobody can warn later."""
 
     @abstractmethod
-    def pullback(
-        self,
-        tensors: Sequence[Tensor],
-        outputs: Sequence[Tensor],
-        grads: Sequence[Tensor | None],
-        needs: Sequence[bool],
-    ) -> Sequence[Tensor | None]:
-        """Compute a gradient for each of `tensors` that needs one, None for zero.
+    def pullback(self, tensors: Tensors, outputs: Tensors, grads: Gradients, needs: Sequence[bool]) -> Gradients:
+        """Compute a gradient for each of `tensors` that needs one.
 
         It is of the shape of the input; or has the batch in one dimension, and is summed to that shape by the caller.
         Under `torch.func.vmap` inputs that were shared in the solve may differ between elements.
@@ -126,7 +123,7 @@ class Solver(ABC):
         Args:
             tensors: the inputs.
             outputs: those of `solve`.
-            grads: of the differentiable outputs; None for zero.
+            grads: of the differentiable outputs.
             needs: which of the inputs need a gradient.
         """
 
@@ -144,7 +141,7 @@ def solve(solver: Solver, *tensors: Tensor) -> tuple[Tensor, ...]:
     return solver.solve(tensors, transformed=False)
 
 
-def _keep(ctx: Any, solver: Solver, tensors: Sequence[Tensor], outputs: Sequence[Tensor], kept: Iterable[Tensor]):
+def _keep(ctx: Any, solver: Solver, tensors: Tensors, outputs: Tensors, kept: Iterable[Tensor]):
     ctx.solver, ctx.count = solver, len(tensors)
     ctx.save_for_backward(*tensors, *kept)  # also so that autograd refuses inputs that were changed in place
     ctx.mark_non_differentiable(*outputs[solver.differentiable :])
@@ -190,13 +187,7 @@ class _Transformed(torch.autograd.Function):
         return outputs, (0,) * len(outputs)
 
 
-def pull_back(
-    solver: Solver,
-    tensors: Sequence[Tensor],
-    outputs: Sequence[Tensor],
-    grads: Sequence[Tensor | None],
-    needs: Sequence[bool],
-) -> Sequence[Tensor | None]:
+def pull_back(solver: Solver, tensors: Tensors, outputs: Tensors, grads: Gradients, needs: Sequence[bool]) -> Gradients:
     """Run a solver's pullback in the backward pass of an autograd function, under any transform."""
     legacy = torch._C._functorch.is_legacy_batchedtensor  # pyright: ignore[reportAttributeAccessIssue]
     batched = any([grad is not None and legacy(grad) for grad in grads])
@@ -238,13 +229,7 @@ class _Pullback(torch.autograd.Function):
 
 
 def _pull_back_many(
-    count: int,
-    dims: Sequence[int | None],
-    solver: Solver,
-    needs: Sequence[bool],
-    n: int,
-    m: int,
-    values: Sequence[Tensor | None],
+    count: int, dims: Sequence[int | None], solver: Solver, needs: Sequence[bool], n: int, m: int, values: Gradients
 ) -> tuple[Tensor, ...]:
     """Pull back `count` problems, or as many gradients of one; (count, …) each."""
     if solver.keeps and all(dim is None for dim in dims[n : n + m]):  # the solve has no such dimension
@@ -297,7 +282,7 @@ def _flatten(
     return flat, batch
 
 
-def _summed(solver: Solver, tensors: Sequence[Tensor], gradients: Sequence[Tensor | None]) -> list[Tensor | None]:
+def _summed(solver: Solver, tensors: Tensors, gradients: Gradients) -> list[Tensor | None]:
     """Sum gradients to the shapes of their inputs, over the batch where it shares an input."""
     summed = list(gradients)
     for i, (gradient, like) in enumerate(zip(gradients, tensors, strict=True)):

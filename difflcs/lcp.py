@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_number, check_same_device, check_tensor, takes_arrays
-from difflcs._differentiation import Solver, is_wrapped, runs_eagerly, solve
+from difflcs._differentiation import Gradients, Solver, Tensors, is_wrapped, runs_eagerly, solve
 from difflcs.errors import ShapeError, SolveWarning
 from difflcs.status import Status
 
@@ -137,7 +137,7 @@ class _Problems(Solver):
     ranks = (2, 1)
     differentiable = 2
 
-    def solve(self, tensors: Sequence[Tensor], transformed: bool) -> tuple[Tensor, ...]:
+    def solve(self, tensors: Tensors, transformed: bool) -> tuple[Tensor, ...]:
         F, q = tensors
         if transformed:
             check_tensor("q", q)
@@ -157,13 +157,7 @@ class _Problems(Solver):
             _warn_of_failures(status, stacklevel=2)
         return lam.to(q.device), w.to(q.device), status.to(q.device)
 
-    def pullback(
-        self,
-        tensors: Sequence[Tensor],
-        outputs: Sequence[Tensor],
-        grads: Sequence[Tensor | None],
-        needs: Sequence[bool],
-    ) -> Sequence[Tensor | None]:
+    def pullback(self, tensors: Tensors, outputs: Tensors, grads: Gradients, needs: Sequence[bool]) -> Gradients:
         (F, _), (lam, w, status) = tensors, outputs
         solved = (status == Status.CONVERGED).unsqueeze(-1)
         # The upstream gradient of a failed element is dropped, so that it cannot spread to the others.

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import broadcast_batch, check_choice, check_number, check_tensor, describe, is_array, takes_arrays
-from difflcs._differentiation import Solver, runs_eagerly, solve, transforms_active
+from difflcs._differentiation import Gradients, Solver, Tensors, runs_eagerly, solve, transforms_active
 from difflcs._native import TOLERANCES, _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.errors import DTypeError, GammaError, InvalidInputError, NotPositiveDefiniteError, SolveError
 from difflcs.lcp import MAX_ITER, solve_lcp_arrays
@@ -253,7 +253,7 @@ class _Transitions(Solver):
     def ranks(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         return (*_RANKS, *((0,) if self.gamma is None else (2, 2) if self.factored else ()))
 
-    def solve(self, tensors: Sequence[Tensor], transformed: bool) -> tuple[Tensor, ...]:
+    def solve(self, tensors: Tensors, transformed: bool) -> tuple[Tensor, ...]:
         arrays = self._arrays(tensors)
         x, c = arrays[8], arrays[7]
         count, n = len(x), c.shape[-1]
@@ -283,13 +283,7 @@ class _Transitions(Solver):
         value = torch.from_numpy(loss)
         return ((value.sum() / max(count, 1) if self.mean else value).to(tensors[8]),)
 
-    def pullback(
-        self,
-        tensors: Sequence[Tensor],
-        outputs: Sequence[Tensor],
-        grads: Sequence[Tensor | None],
-        needs: Sequence[bool],
-    ) -> Sequence[Tensor | None]:
+    def pullback(self, tensors: Tensors, outputs: Tensors, grads: Gradients, needs: Sequence[bool]) -> Gradients:
         # Under a transform, inputs that were shared in the solve may now differ between elements.
         arrays = self._arrays(tensors) if self.arrays is None else self.arrays
         (upstream,) = grads
@@ -305,7 +299,7 @@ class _Transitions(Solver):
         converted = [None if g is None else torch.from_numpy(g) for g in gradients]
         return converted if len(converted) == len(tensors) else [*converted, None]
 
-    def _arrays(self, tensors: Sequence[Tensor]) -> list[np.ndarray]:
+    def _arrays(self, tensors: Tensors) -> list[np.ndarray]:
         """Collect the inputs of the kernels."""
         arrays = [v.numpy(force=True) for v in tensors[:11]]
         return [*arrays, tensors[11].numpy(force=True) if self.gamma is None else np.array(self.gamma)]

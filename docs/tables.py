@@ -234,19 +234,6 @@ def latency(record: dict) -> str:
     return table(["", *robots], rows)
 
 
-def steps(record: dict) -> str:
-    """Times of a step of the controller in Python and in C [µs]."""
-    labels = {
-        "Python, `controller.step`": ("python", "step"),
-        "of it outside the solver": ("python", "rest"),
-        "C, `difflcs_step`": ("c", "step"),
-        "of it in the solver": ("c", "solver"),
-    }
-    names = ("p50", "p99", "largest")
-    rows = [[label, *(number(record[who][part][name]) for name in names)] for label, (who, part) in labels.items()]
-    return table(["", *names], rows)
-
-
 def deadlines(record: dict) -> str:
     """Squared errors of a closed loop with a deadline, and the share of steps that were not solved."""
     rows = []
@@ -258,30 +245,16 @@ def deadlines(record: dict) -> str:
 
 DECIDES = {
     "PDDM": "PDDM, 700 sequences in three networks",
-    "LCS-MPC": "LCS-MPC, `LCSMPCLayer`",
-    "controller": "LCS-MPC, [`layer.controller()`](robot.md)",
+    "layer, cold": "LCS-MPC, `LCSMPCLayer`, cold",
+    "controller": "LCS-MPC, [`layer.controller()`](robot.md), warm",
 }
 
 
 def decision(record: dict) -> str:
-    """Milliseconds of one decision, and those of PDDM as a multiple."""
-    spent = record["milliseconds"]
-    rows = [[label, f"{spent[k]:.2g} ms", f"{spent['PDDM'] / spent[k]:.0f}×"] for k, label in DECIDES.items()]
+    """Milliseconds of one decision on the cube, and those of PDDM as a multiple."""
+    spent = {way: row["p50 µs"] for way, row in record["results"]["zoo cube, H 8"].items() if way in DECIDES}
+    rows = [[label, f"{1e-3 * spent[k]:.2g} ms", f"{spent['PDDM'] / spent[k]:.0f}×"] for k, label in DECIDES.items()]
     return table(["one decision", "computing", "PDDM takes"], rows)
-
-
-def errors(record: dict) -> str:
-    """Predictions of one step by system and mode: error of each coordinate and how far it moved, time of a state."""
-    rows = []
-    for system, modes in record["results"].items():
-        for k, (mode, row) in enumerate(modes.items()):
-            cells = [
-                f"{name} {number(value['error'])} of {number(value['moved'])} {value['unit']}"
-                for name, value in row.items()
-                if isinstance(value, dict)
-            ]
-            rows.append(["" if k else system, mode, "; ".join(cells), duration(1e-3 * row["ms a state"])])
-    return table(["system", "model", "error of motion", "time of a state"], rows)
 
 
 def foreign(record: dict) -> str:
@@ -435,10 +408,7 @@ TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "optima": {"efforts": efforts},
     "scale": {"sizes": sizes, "weak": weak},
     "training_time": {"recipes": recipes},
-    "latency": {"ways": latency},
-    "controller": {"steps": steps, "deadlines": deadlines},
-    "decision": {"ways": decision},
-    "physics": {"errors": errors},
+    "latency": {"ways": latency, "deadlines": deadlines, "decision": decision},
     "objects": {"success": objects, "methods": methods},
     "physics_models": {"summary": summary, "models": foreign},
     "box_to_pose": {"success": success},

@@ -5,9 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 
-# With several workers of pytest-xdist at once, each takes its share of the cores: torch's number of threads is also
-# that of the kernels, of diffcp and of the processes that a test starts. Tests about threads say themselves how many
-# they want. It has to be said before NumPy and torch are loaded.
+# With several workers of pytest-xdist at once, the processes that a test starts take their share of the cores. It has
+# to be said before NumPy and torch are loaded.
 if workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):
     for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(variable, str(max(1, (os.cpu_count() or 1) // workers)))
@@ -18,6 +17,10 @@ import torch
 from torch import Tensor
 
 from difflcs import GoalCost, LCSModel, LCSParams, QuadraticCost
+
+# Threads cost more than they bring on problems as small as those of the tests; it is the number of the kernels', too.
+# Tests about threads say themselves how many they want.
+torch.set_num_threads(1)
 
 
 class Build:

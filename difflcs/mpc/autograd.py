@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from difflcs._checks import all_finite, check_tensor
-from difflcs._differentiation import Solver, refuse_tangents, solve, transforms_active
+from difflcs._differentiation import Gradients, Solver, Tensors, refuse_tangents, solve, transforms_active
 from difflcs.errors import DegenerateWarning
 from difflcs.mpc.backends.base import Backend, Result
 from difflcs.mpc.problem import MPCProblem
@@ -87,7 +87,7 @@ class MPCSolver(Solver):
         """Number of dimensions of each tensor behind those of the batch."""
         return tuple([self.inputs.rank(name) if name in RANKS else 2 for name in self.names])
 
-    def solve(self, tensors: Sequence[Tensor], transformed: bool) -> tuple[Tensor, ...]:
+    def solve(self, tensors: Tensors, transformed: bool) -> tuple[Tensor, ...]:
         """Solve; return x, u, lam, objective, mu, status, iterations, kkt_residual, solve_time and violation."""
         if transformed:
             leads = [tensor.shape[: tensor.ndim - rank] for tensor, rank in zip(tensors, self.ranks, strict=True)]
@@ -177,13 +177,7 @@ class MPCSolver(Solver):
             flat.append(value)
         return Primal(*flat)
 
-    def pullback(
-        self,
-        tensors: Sequence[Tensor],
-        outputs: Sequence[Tensor],
-        grads: Sequence[Tensor | None],
-        needs: Sequence[bool],
-    ) -> Sequence[Tensor | None]:
+    def pullback(self, tensors: Tensors, outputs: Tensors, grads: Gradients, needs: Sequence[bool]) -> Gradients:
         """Compute the gradients of the inputs from those of x, u, lam and the objective."""
         named = zip(self.names, tensors, needs, strict=True)
         wanted = {name: tensor for name, tensor, needed in named if needed and name in RANKS}
@@ -291,7 +285,7 @@ def _finite(vjp: Callable[[Tensor], dict[str, Tensor]], solved: Tensor, limit: f
     return total
 
 
-def _all_finite(values: Sequence[Tensor], limit: float) -> bool:
+def _all_finite(values: Tensors, limit: float) -> bool:
     if limit < torch.finfo(torch.float64).max:
         return all(bool((v.abs() <= limit).all()) for v in values)
     return all_finite(*values)

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from difflcs import LCSMPCLayer, LCSParams, QuadraticCost, Status, available_backends
-from difflcs.errors import DegenerateWarning, DoubleBackwardError, SolveWarning
+from difflcs.errors import DegenerateWarning, SolveWarning
 from difflcs.mpc import Primal
 from difflcs.mpc.backends import get_backend
 from tests.conformance import problems
@@ -409,15 +409,6 @@ def test_what_is_infinite_has_no_gradient(build, backend):
         assert bool(infinite.any())
         assert torch.equal(gradient[infinite], torch.zeros_like(gradient[infinite]))
         assert bool(torch.isfinite(gradient).all())
-
-
-@every_backend
-def test_double_backward_is_refused(build, backend):
-    problem = problems.contact(build)
-    x0 = problem.tensors["x0"].clone().requires_grad_()
-    sol = solve(problem, backend, tensors={**problem.tensors, "x0": x0})
-    with pytest.raises(DoubleBackwardError, match=r"first derivatives only.*create_graph=False"):
-        torch.autograd.grad(sol.u.sum(), x0, create_graph=True)
 
 
 # --- options --------------------------------------------------------------------------------------------------------

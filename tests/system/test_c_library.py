@@ -1,7 +1,5 @@
 """The C library from outside: built and installed without Python, found by CMake, and bit-equal to Python."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os
@@ -138,29 +136,6 @@ def test_the_example_measures_itself(exported, robot):
         [float(v) for v in re.findall(r"\d+\.\d+", line)] for line in text.splitlines()[1:] if "p50" in line
     )
     assert 0 < solver[0] <= whole[0] <= whole[1] <= whole[2]
-
-
-@pytest.mark.slow
-@needs_tools
-def test_a_damaged_file_is_an_error_in_words(exported, robot, tmp_path):
-    content = (exported / "controller.difflcs").read_bytes()
-    for damaged, message in ((content[:-9], "the file was cut"), (content[:-1] + b"!", "the file is damaged")):
-        (tmp_path / "c").write_bytes(damaged)
-        done = subprocess.run(
-            [robot, tmp_path / "c", exported / "trajectory.csv"],
-            capture_output=True,
-            text=True,
-            timeout=60,
-            env=BASELINE,
-        )
-        assert done.returncode == 1
-        assert message in done.stderr
-    unknown = {**BASELINE, "DIFFLCS_ISA": "of-tomorrow"}
-    done = subprocess.run(
-        [robot, exported / "controller.difflcs", "x"], capture_output=True, text=True, timeout=60, env=unknown
-    )
-    assert done.returncode == 1
-    assert "DIFFLCS_ISA=of-tomorrow is not available" in done.stderr
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """A package of somebody else brings a task: it is learned, evaluated and drawn by the common commands."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Push-T of gym-pusht from outside: the scoreboard, learning from random pushing, the film."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import math
@@ -17,7 +15,6 @@ from difflcs.physics import PDDrive
 ROOT = Path(__file__).resolve().parents[2]
 KEYS = {"success_rate", "ci_low", "ci_high", "episodes", "mean_steps", "milliseconds_per_step", "coverage"}
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 # Looked for, not imported: pygame warns while it is imported, and here a warning is an error.
 needs_gym_pusht = pytest.mark.skipif(
     importlib.util.find_spec("gym_pusht") is None, reason='needs gym-pusht: pip install "difflcs[scoreboard]"'
@@ -88,9 +85,6 @@ def test_the_film_is_a_gif(push_t, capsys, tmp_path):
     with Image.open(film) as picture:
         assert picture.n_frames > 20
         assert picture.info["duration"] == 100
-
-
-# --- without the environment ------------------------------------------------------------------------------------------
 
 
 def test_the_tee_is_that_of_the_environment(push_t):

@@ -1,7 +1,5 @@
 """The race in `benchmarks/`: what its rivals are given, who is missing, and how an answer is judged."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 
@@ -12,8 +10,6 @@ import torch
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 COUNT = 5
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture

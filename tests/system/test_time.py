@@ -1,7 +1,5 @@
 """Tests that measure time. `make test` runs them after all others, alone, so that nothing else slows them."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time

@@ -1,7 +1,5 @@
 """Models that ship with the package: names, cards, how they are added, and that they are as good as their cards say."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex
@@ -43,9 +41,6 @@ def make_run(path, *, method="lcs-rl", finished=True, evaluated=True, init=None,
     if finished:
         LCSModel(9, 6, 2, generator=torch.Generator().manual_seed(1)).save_pretrained(run.model)
     return run
-
-
-# --- what ships -------------------------------------------------------------------------------------------------------
 
 
 def test_the_cube_is_there_and_everything_is_small():
@@ -121,9 +116,6 @@ def test_evaluation_says_when_the_object_is_another(capsys, monkeypatch):
     assert f"its card: {100 * card.success_rate:.1f} % of {card.goals} goals" in captured.out
 
 
-# --- names ------------------------------------------------------------------------------------------------------------
-
-
 def test_a_path_that_exists_wins_over_a_name_but_not_over_the_prefix(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shipped = LCSModel.from_pretrained(CUBE)
@@ -154,9 +146,6 @@ def test_neither_the_library_nor_the_cards_import_the_training():
     )
     loaded = subprocess.check_output([sys.executable, "-c", code], text=True).split()
     assert not {"difflcs.rl", "safetensors", "gymnasium", "tyro"} & set(loaded)
-
-
-# --- adding -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_finished_run_becomes_a_model_with_its_card(tmp_path):
@@ -215,9 +204,6 @@ def test_the_command_on_a_card_gives_the_settings_back(monkeypatch):
     assert seen == [config]
 
 
-# --- command line -----------------------------------------------------------------------------------------------------
-
-
 def test_the_list(capsys):
     assert cli.main(["zoo"]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -234,19 +220,8 @@ def test_the_list(capsys):
 def test_a_training_starts_from_a_model_of_the_zoo(capsys, tmp_path):
     pytest.importorskip("mujoco")
     out = tmp_path / "run"
-    arguments = [
-        "train",
-        "--smoke",
-        "--minutes",
-        "0.1",
-        "--final-goals",
-        "0",
-        "--out",
-        str(out),
-        "--method",
-        "violation",
-    ]
-    assert cli.main([*arguments, "--init", f"zoo:{CUBE}"]) == 0
+    arguments = "train --smoke --minutes 0.1 --final-goals 0 --method violation".split()
+    assert cli.main([*arguments, "--out", str(out), "--init", f"zoo:{CUBE}"]) == 0
     assert json.loads((out / "config.json").read_text())["init"] == f"zoo:{CUBE}"
     assert cli.main(["train", "--out", str(out), "--resume"]) == 0
     assert cli.main(["evaluate", f"zoo:{CUBE}", "--smoke", "--action-support"]) == 2

@@ -1,7 +1,5 @@
 """A finger that pushes a block on a line: contact without a simulator, and a policy without a model."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import gymnasium

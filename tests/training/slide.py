@@ -1,7 +1,5 @@
 """A small pushing system that needs no simulator, and trainers on it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Any `LCSModule` in warm-up and PPO, and a context on its way from the environment to model, loss and critic."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -35,8 +33,6 @@ from difflcs.rl.rollout import contexts, make_empty_record, mpc_actions, transit
 from difflcs.rl.runs.checkpoint import load_checkpoint, save_checkpoint
 from tests.training import slide
 from tests.training.slide import parameters, recorded, same
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 STEPS = HeavyBlock.STEPS
 LOSS = ViolationLoss(gamma="auto", xi=0.1)
@@ -121,22 +117,6 @@ def make_trainer(lcs: Any, seed: int = 0, iterations: int = 4, kind: Any = Gains
 
 
 # --- learning ---------------------------------------------------------------------------------------------------------
-
-
-def test_the_warmup_finds_the_unknown_numbers():
-    """Known physics whose system depends on the context: three numbers, from wrong ones to the true ones."""
-
-    def numbers(lcs: Physics) -> np.ndarray:
-        return np.array([float(p.detach().exp()) for p in lcs.parameters()])
-
-    lcs = Physics(**OFF)
-    before, truth = numbers(lcs), numbers(Physics())
-    warmup = make_warmup(lcs, learning_rate_decay=0.998)
-    for _ in range(8):
-        warmup.step()
-    learned = numbers(lcs)
-    assert abs(before / truth - 1).min() > 0.4
-    np.testing.assert_allclose(learned, truth, rtol=0.1)
 
 
 def test_the_violation_loss_beside_ppo_gets_the_context():

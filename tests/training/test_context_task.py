@@ -1,7 +1,5 @@
 """A task with a context, by the common code of all trainings."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -28,8 +26,6 @@ from difflcs.rl import (
     train,
 )
 from difflcs.rl.rollout import append_context, contexts, transitions, uniform_actions
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 STEPS = HeavyBlock.STEPS
 OFF = {"damping": 2.0, "stiffness": 50.0, "added_mass": 0.6}
@@ -58,7 +54,9 @@ TASK = TaskSpec(
 )
 
 
-@pytest.mark.parametrize("method", method_names())
+@pytest.mark.parametrize(
+    "method", sorted({*method_names()} - {"violation", "ppo"})
+)  # lcs-rl is both, one after the other
 def test_every_method_trains_a_task_with_a_context(method, tmp_path):
     config = replace(TrainConfig(task="heavy-block", method=get_method(method)()).smoke(), minutes=0.6)
     run = train(config, tmp_path / "run", task=TASK)

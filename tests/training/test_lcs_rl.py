@@ -1,7 +1,5 @@
 """LCS-RL: the warm-up and the main phase as one trainer, on a small pushing system that needs no simulator."""
 
-from itertools import pairwise
-
 import pytest
 
 pytest.importorskip("torchrl")
@@ -23,8 +21,6 @@ from tests.training.slide import (
     same,
     small_settings,
 )
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def make_lcsrl(seed: int = 0, models: bool = False) -> LCSRL:
@@ -51,25 +47,6 @@ def make_lcsrl(seed: int = 0, models: bool = False) -> LCSRL:
         )
 
     return LCSRL(warmup, 8 * STEPS, make_main)
-
-
-def test_phases_follow_each_other():
-    trainer = make_lcsrl()
-    reports = [trainer.step() for _ in range(5)]
-    assert [type(report).__name__ for report in reports] == ["WarmupReport"] * 3 + ["PPOReport"] * 2
-    assert [report.iteration for report in reports] == [1, 2, 3, 4, 5]
-    assert [report.env_steps for report in reports] == [STEPS * n for n in (2, 5, 8, 8 + ROLLOUTS, 8 + 2 * ROLLOUTS)]
-
-
-def test_both_phases_train_the_same_model():
-    trainer, seen = make_lcsrl(), []
-    for _ in range(5):
-        assert trainer.current.learned is trainer.learned
-        assert trainer.current.policy is trainer.policy
-        trainer.step()
-        assert (trainer.iteration, trainer.episodes) == (trainer.current.iteration, trainer.current.episodes)
-        seen.append(parameters(trainer))
-    assert not any(same(a, b) for a, b in pairwise(seen))
 
 
 def test_episodes_of_both_phases_differ():

@@ -15,8 +15,6 @@ from difflcs.rl import EnsembleSettings, Epochs, ModelRollouts, ModelRolloutSett
 from difflcs.rl.learning.dynamics import Ensemble
 from difflcs.rl.learning.model_rollouts import ModelEnv
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 STEPS, N_X, N_U = 5, 2, 2
 SPACES = SimpleNamespace(
     single_observation_space=spaces.Dict(
@@ -147,25 +145,6 @@ def test_nothing_can_be_played_from_nothing():
     env = make_rollouts().env
     with pytest.raises(InvalidInputError, match="expected real episodes, got none"):
         env.reset(seed=0)
-
-
-def test_only_the_last_step_holds_the_penalty():
-    """What `outcome` is told of the end of an episode, and what of it is foreseen."""
-    count = 20
-    env = make_env(num_envs=count)
-    state, rewards = torch.from_numpy(env.reset(seed=8)[0]["state"]), []
-    states = [state]
-    for _ in range(STEPS):
-        observation, reward, _, _, info = env.step(np.zeros((count, N_U)))
-        rewards.append(reward + abs(states[-1][:, 0].numpy()))
-        states.append(torch.from_numpy(observation["state"]))
-    np.testing.assert_allclose(np.stack(rewards[:-1]), 0.0, atol=1e-12)
-    np.testing.assert_allclose(rewards[-1], -3.0 * ~info["success"], atol=1e-12)
-    assert 0 < info["success"].sum() < count
-    goals, still = torch.from_numpy(observation["goal"]), torch.zeros(count, STEPS, 1, N_U).double()
-    _, reward, _ = env.predict_alternatives(torch.stack(states[:-1], 1), still, goals)
-    dense = reward.squeeze(2) + torch.stack(states[:-1], 1)[..., 0].abs()
-    torch.testing.assert_close(dense, torch.from_numpy(np.stack(rewards, 1)))
 
 
 def test_foreseen_is_what_was_played():

@@ -14,8 +14,6 @@ from difflcs.rl.runs.evaluate import evaluate
 from difflcs.rl.settings import Epochs, Rollouts
 from tests.training.slide import STEPS, U_MAX, make_envs
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 NETWORKS = EnsembleSettings(networks=2, width=16, epochs=Epochs(20, 20, 16), learning_rate=1e-3)
 SMALL = PDDMSettings(rollouts=Rollouts(first=10, each=5), ensemble=NETWORKS, horizon=3, samples=80)
 
@@ -60,22 +58,6 @@ def test_ensemble_learns_a_linear_system_and_its_members_differ():
     error = (predicted - x_next).square().mean().sqrt()
     assert error < 0.15 * (x_next - x).std()
     assert not torch.equal(predicted[0], predicted[1])
-
-
-def test_a_falling_step_size_leaves_less_noise_in_the_networks():
-    draws = torch.Generator().manual_seed(0)
-    x, u = (torch.rand(400, 2, generator=draws, dtype=torch.float64) for _ in range(2))
-    truth = x + torch.sin(3 * u)
-    noisy = truth + 0.3 * torch.randn(400, 2, generator=draws, dtype=torch.float64)
-    errors = {}
-    for decay in (False, True):
-        generator = torch.Generator().manual_seed(1)
-        ensemble = Ensemble(2, 2, 3, 32, generator)
-        ensemble.fit(x, u, noisy, epochs=20, minibatch=50, learning_rate=0.03, generator=generator, decay=decay)
-        with torch.no_grad():
-            found = ensemble(*(v.float().expand(3, -1, -1) for v in (x, u)))
-        errors[decay] = float((found - truth).square().mean())
-    assert errors[True] < 0.8 * errors[False]
 
 
 @pytest.mark.parametrize(("n_x", "n_u", "networks", "width"), [(2, 1, 1, 15), (3, 2, 2, 16), (9, 6, 3, 31)])

@@ -1,7 +1,5 @@
 """Backend `batched`: threads, instruction sets, efforts, and large problems; more in tests/conformance."""
 
-from __future__ import annotations
-
 import inspect
 import os
 import subprocess
@@ -113,18 +111,6 @@ def test_options_out_of_range_are_refused(name):
 
 
 # --- starts -----------------------------------------------------------------------------------------------------------
-
-
-def test_restarts_are_seeded_and_hardly_ever_worse(build):
-    x0, goal = data(build, 60)
-    one, eight, again = (pushing(build, 8, restarts=n)(x0, goal) for n in (1, 8, 8))
-    other = pushing(build, 8, restarts=8, seed=1)(x0, goal)
-    # The first start is one of the eight, but given up early where another is ahead.
-    worse = eight.objective > one.objective * (1 + 1e-9)
-    assert int(worse.sum()) <= 2
-    assert bool((eight.objective < one.objective - 1e-3).any())
-    assert torch.equal(eight.u, again.u)
-    assert not torch.equal(eight.u, other.u)
 
 
 @pytest.mark.parametrize("n_lam", [5, 8])
@@ -249,26 +235,7 @@ def test_what_was_given_up_is_solved_where_all_else_fails():
     assert failed <= 26
 
 
-def test_one_start_is_enough_without_contact(build):
-    lcs = build.pushing(1, 5)
-    free = LCSParams(lcs.A, lcs.B, lcs.C[:, :0], lcs.d, lcs.D[:0], lcs.E[:0], lcs.F[:0, :0], lcs.c[:0])
-    one, other = (pushing(build, 0, lcs=free, effort=effort)(*data(build, 4)) for effort in ("fast", "best"))
-    assert torch.equal(one.u, other.u)
-    assert torch.equal(one.iterations, other.iterations)
-
-
 # --- large problems ---------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("n_x", "n_u", "n_lam", "horizon"), [(20, 13, 20, 20), (9, 6, 30, 10), (9, 6, 8, 40)])
-def test_large_random_problems_converge(n_x, n_u, n_lam, horizon):
-    """Models without any structure, in which contacts couple everything."""
-    generator = torch.Generator().manual_seed(0)
-    lcs = LCSModel(n_x, n_u, n_lam, init_scale=0.3, generator=generator).params().detach()
-    cost = GoalCost.reach(n_x, n_u, goal_weight=0.5, input_weight=0.05)
-    mpc = LCSMPCLayer(lcs, cost, horizon, -1.0, 1.0, backend=BatchedBackend(threads=1, effort="fast"))
-    plan = mpc(torch.randn(8, n_x, generator=generator, dtype=torch.float64), torch.zeros(n_x).double())
-    assert float(plan.iterations.double().mean()) < 90
 
 
 @pytest.mark.parametrize(("n_x", "n_u", "n_lam"), [(4, 2, 49), (40, 9, 6)])

@@ -189,15 +189,6 @@ def test_a_run_in_use_is_refused_until_its_process_dies(tmp_path, holder):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_lock_is_held_against_this_process_too(tmp_path):
-    with RunDirectory(tmp_path).locked():
-        with pytest.raises(InUseError), RunDirectory(tmp_path).locked():
-            pass
-        assert (tmp_path / ".lock").exists()
-    with RunDirectory(tmp_path).locked():
-        pass
-
-
 def test_a_lock_moves_with_its_directory(tmp_path):
     (tmp_path / "run").mkdir()
     with RunDirectory(tmp_path / "run").locked():

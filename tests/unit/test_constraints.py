@@ -1,10 +1,5 @@
 """StageBounds, LinearConstraints and ConstraintSequence: what they hold, and what they refuse."""
 
-from __future__ import annotations
-
-import copy
-import pickle
-
 import pytest
 import torch
 from torch import nn
@@ -75,26 +70,6 @@ def test_constraints_hold_their_fields(build):
     assert "G(3, 4)" in repr(learned)
     assert learned.to(torch.float32).G.dtype == torch.float32
     assert not hard.staged
-
-
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))])
-def test_copies_keep_the_values(build, copied):
-    sequence = ConstraintSequence(build.normal(0)(3, 4), full(1.0, 5, 3), by_stage=("g",))
-    for constraints in (LinearConstraints(**rows(build)), sequence):
-        twin = copied(constraints)
-        assert twin.by_stage == constraints.by_stage
-        assert all(torch.equal(v, twin.tensors()[k]) for k, v in constraints.tensors().items())
-
-
-def test_a_sequence_knows_its_stages(build):
-    n = build.normal(0)
-    sequence = ConstraintSequence(n(4, 3, 5), n(4, 3), n(3, 3, 2), full(1.0, 4, 3))
-    assert (sequence.horizon, sequence.n_c, sequence.n_x, sequence.n_u) == (3, 3, 5, 2)
-    assert sequence.staged == {"G_x", "G_u", "g", "price"}
-    moving = ConstraintSequence(n(3, 5), n(7, 4, 3), weight=2.0, by_stage=("g",))
-    assert moving.horizon == 3
-    assert moving.staged == {"g"}
-    assert torch.equal(moving.tensors()["price"], full(2.0, 3))
 
 
 BAD_ROWS = [

@@ -1,7 +1,5 @@
 """LCS-RL with physics inside: what a task tells of its physics, the loss, what is refused, and that it learns."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -20,8 +18,6 @@ from difflcs.rl.learning.trainer import configuration
 from difflcs.rl.methods import Work
 from difflcs.rl.methods.contact_lcs import known_physics
 from tests.conformance.toy import Guess, make_task
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 F64 = torch.float64
 SCALE = torch.tensor([0.05, 0.05, 1.0, 0.2, 0.2], dtype=F64)
@@ -76,9 +72,6 @@ def test_physics_is_found_by_both_losses(pushes, loss):
     assert found["drive_compliance"][0][0] == pytest.approx(0.5, abs=0.1)
 
 
-# --- what a task tells ------------------------------------------------------------------------------------------------
-
-
 def test_a_description_of_physics_is_checked():
     for wrong, error in (
         ({"make_system": 3}, DTypeError),
@@ -127,9 +120,6 @@ def test_what_was_learned_of_another_object_is_refused():
     broken = {**state, "change.friction": torch.full((1,), torch.nan, dtype=F64)}
     with pytest.raises(CheckpointError, match="expected finite"):
         method.rebuild(task(0.03), configuration(learned), broken, "here")
-
-
-# --- learning ---------------------------------------------------------------------------------------------------------
 
 
 def test_it_learns_how_a_point_slides():

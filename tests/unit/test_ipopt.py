@@ -1,7 +1,5 @@
 """Backend `ipopt`: worker processes, threads, forks, crashes and options; and the registry of the backends."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -15,7 +13,7 @@ import torch
 
 from difflcs import BackendNotFoundError, LCSMPCLayer, available_backends, register_backend
 from difflcs.cli.bench import pushing_cost, pushing_model, states_and_goals
-from difflcs.errors import DTypeError, InvalidInputError, SolveWarning
+from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.mpc import kkt
 from difflcs.mpc.backends import Backend, IpoptBackend, base, get_backend, ipopt
 from tests.conformance.varied.generators import random_case
@@ -180,21 +178,6 @@ def test_the_better_of_two_starts_is_kept():
         costs.append(layer(*states_and_goals(8, 1)).objective)
     assert float((costs[1] - costs[2]).abs().max()) > 1e-3
     torch.testing.assert_close(costs[0], torch.minimum(costs[1], costs[2]))
-
-
-def test_a_limit_that_some_elements_meet_fails_the_others_only(build, x0):
-    full = make_layer(build, backend=IpoptBackend(second_start=None, workers=1))(x0)
-    limit = int(full.iterations.median())
-    layer = make_layer(build, backend=IpoptBackend(second_start=None, max_iter=limit, workers=1), on_failure="mask")
-    start = x0.clone().requires_grad_()
-    with pytest.warns(SolveWarning):
-        solution = layer(start)
-    done = solution.converged
-    assert 0 < int(done.sum()) < 9
-    torch.testing.assert_close(solution.u.detach()[done], full.u[done], rtol=1e-9, atol=1e-10)
-    solution.u.sum().backward()
-    assert float(start.grad[~done].abs().max()) == 0
-    assert float(start.grad[done].abs().amax(1).min()) > 0
 
 
 @pytest.mark.parametrize(

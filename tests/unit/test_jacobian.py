@@ -1,7 +1,5 @@
 """The Jacobian of the MPC's action by what is learned of its system, forwards and backwards."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch.autograd.function import once_differentiable

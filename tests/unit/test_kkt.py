@@ -3,8 +3,6 @@
 Its gradients, `kkt.vjp`, are compared with differences of plans and with those of the kernels in tests/conformance.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -13,8 +11,6 @@ from difflcs.mpc import Primal, kkt
 from difflcs.mpc.backends import IpoptBackend
 from tests.conformance.varied.generators import random_case
 from tests.conformance.varied.judges import conditions, reduced_gradient
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def residual_of(problem, primal):

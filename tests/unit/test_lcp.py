@@ -1,10 +1,8 @@
 """solve_lcp: right on every P-matrix, differentiable, one element at a time.
 
-Signs, equations, complementarity and gradients of easy, degenerate, badly scaled, large and impossible LCPs, and that
-neighbours do not matter, are judged by the campaign in tests/conformance/hostile.
+Signs, equations, complementarity and gradients of easy, degenerate, badly scaled, large and impossible LCPs are judged
+by the campaign in tests/conformance/hostile.
 """
-
-from __future__ import annotations
 
 import itertools
 
@@ -22,9 +20,6 @@ def definite(n, seed, skew=0.5):
     generator = torch.Generator().manual_seed(seed)
     G, H = torch.randn(2, n, n, generator=generator, dtype=torch.float64)
     return G @ G.T + 0.3 * torch.eye(n, dtype=torch.float64) + skew * (H - H.T)
-
-
-# --- values ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", ["lcp-plain", "lcp-degenerate", "lcp-graded", "lcp-p-matrix"])
@@ -50,9 +45,6 @@ def test_relaxed_scalar_has_its_closed_form():
     torch.testing.assert_close(lam, torch.where(q > 0, 2e-3 / (q + root), (root - q) / 6), rtol=1e-12, atol=0)
 
 
-# --- gradients ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("relaxation", [0.0, 1e-3, 1.0])
 @pytest.mark.parametrize("shared", [True, False], ids=["shared", "per-element"])
 def test_gradcheck_in_F_and_q(build, relaxation, shared):
@@ -66,15 +58,6 @@ def test_gradcheck_in_F_and_q(build, relaxation, shared):
 
 def jacobian_q(F, q):
     return torch.autograd.functional.jacobian(lambda p: solve_lcp(F, p).lam, q)
-
-
-def test_gradient_at_q_zero_is_that_of_the_inactive_piece():
-    F = definite(4, 0).requires_grad_()
-    q = torch.zeros(4, dtype=torch.float64, requires_grad=True)
-    lam, w, _ = solve_lcp(F, q)
-    grad_F, grad_q = torch.autograd.grad((2 * lam + 3 * w).sum(), (F, q))
-    assert torch.equal(grad_q, torch.full((4,), 3.0, dtype=torch.float64))
-    assert torch.equal(grad_F, torch.zeros(4, 4, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -93,9 +76,6 @@ def test_gradient_at_a_kink_is_the_one_sided_derivative_of_the_inactive_side(bui
         torch.testing.assert_close(found[:, i], (solve_lcp(F, q + step).lam - lam) / 1e-5, rtol=1e-6, atol=1e-8)
 
 
-# --- batches --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("relaxation", [0.0, 1e-5])
 @pytest.mark.parametrize("n", [1, 9, 10, 16, 64])
 def test_batch_equals_loop_bitwise_whatever_the_threads(build, relaxation, n):
@@ -111,16 +91,6 @@ def test_batch_equals_loop_bitwise_whatever_the_threads(build, relaxation, n):
                 assert torch.equal(one.w, whole.w[i])
     finally:
         torch.set_num_threads(before)
-
-
-def test_float32_in_is_float32_out_solved_in_float64(build):
-    F, q = definite(5, 1).float().requires_grad_(), build.normal(1)(9, 5).float().requires_grad_()
-    solution = solve_lcp(F, q)
-    exact = solve_lcp(F.detach().double(), q.detach().double())
-    assert torch.equal(solution.lam, exact.lam.float())
-    assert torch.equal(solution.w, exact.w.float())
-    solution.lam.sum().backward()
-    assert F.grad.dtype == q.grad.dtype == torch.float32
 
 
 def test_leading_dimensions_broadcast_and_gradients_sum_over_them(build):
@@ -152,19 +122,6 @@ def test_an_empty_batch_gives_empty_results_and_zero_gradient(relaxation, batch)
     assert q.grad.shape == q.shape
 
 
-def test_memory_layout_does_not_matter_and_inputs_are_left_as_they_were(build):
-    F, q = definite(4, 0), build.normal(0)(10, 8)
-    kept, expected = (F.clone(), q.clone()), solve_lcp(F, q[:, ::2].contiguous()).lam
-    assert torch.equal(solve_lcp(F.T.contiguous().T, q[:, ::2]).lam, expected)
-    assert torch.equal(solve_lcp(F, q.T.contiguous().T[:, ::2]).lam, expected)
-    solve_lcp(F, q[:, :4], relaxation=1e-3)
-    assert torch.equal(F, kept[0])
-    assert torch.equal(q, kept[1])
-
-
-# --- failures -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("relaxation", [0.0, 1e-4])
 @pytest.mark.parametrize("n", [3, 40, 300])
 def test_what_the_time_does_not_suffice_for_is_max_iter(build, relaxation, n):
@@ -187,11 +144,13 @@ def test_an_element_that_is_not_solvable_is_reported_and_spoils_no_other(build, 
     clean = solve_lcp(clean_F, clean_q, relaxation)
     clean.lam.sum().backward()
     F[2], q[2] = -torch.eye(3), -1.0  # −λ − 1 ≥ 0 has no solution
+    F[4], q[4] = 1e300 * F[4], 1e305 * q[4]
+    F[5] = F[5] - F[5].T + 1e-12 * torch.eye(3)
     F.requires_grad_()
     q.requires_grad_()
-    with pytest.warns(SolveWarning, match=r"1 of 6 LCPs were not solved.*positive definite.*status"):
+    with pytest.warns(SolveWarning, match=r"2 of 6 LCPs were not solved.*positive definite.*status"):
         solution = solve_lcp(F, q, relaxation)
-    assert (solution.status != Status.CONVERGED).tolist() == [False, False, True, False, False, False]
+    assert (solution.status != Status.CONVERGED).tolist() == [False, False, True, False, True, False]
     assert bool(torch.isfinite(solution.lam).all())
     assert float(solution.lam.detach().min()) >= 0
     upstream = torch.ones_like(solution.lam)
@@ -199,7 +158,7 @@ def test_an_element_that_is_not_solvable_is_reported_and_spoils_no_other(build, 
     torch.autograd.backward((solution.lam, solution.w), (upstream, torch.where(upstream.isnan(), torch.nan, 0.0)))
     assert torch.equal(F.grad[2], torch.zeros(3, 3, dtype=torch.float64))
     assert torch.equal(q.grad[2], torch.zeros(3, dtype=torch.float64))
-    others = [0, 1, 3, 4, 5]
+    others = [0, 1, 3]
     assert torch.equal(solution.lam[others], clean.lam[others])
     assert torch.equal(F.grad[others], clean_F.grad[others])
     assert torch.equal(q.grad[others], clean_q.grad[others])

@@ -8,8 +8,6 @@ from difflcs.errors import CheckpointError
 from difflcs.rl.learning.mlp import MLPController
 from tests.training.slide import STEPS, U_MAX, features
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 BOUND = torch.full((1,), U_MAX, dtype=torch.float64)
 
 

@@ -1,13 +1,10 @@
 """The tables that Python and the kernels share: fields of a problem, and how a solve can end."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import runpy
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -17,7 +14,6 @@ from difflcs._native import _kernels
 from difflcs.lcs import SYSTEM, LCSParams, dimensions
 from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.status import solved
-from tests.conformance.varied.generators import random_case
 
 SOURCE = Path(difflcs.__file__).parent
 
@@ -41,31 +37,6 @@ def test_the_system_is_the_same_everywhere():
     violation = list(_kernels.violation_fields().items())
     assert violation[: len(SYSTEM)] == list(SYSTEM.items())
     assert violation[len(SYSTEM) :] == [("x", ("n_x",)), ("u", ("n_u",)), ("x_next", ("n_x",)), ("gamma", ())]
-
-
-@pytest.mark.parametrize("name", INPUTS)
-def test_the_kernels_name_the_field_that_does_not_fit(name):
-    problem = random_case(0, batch=1).problem()
-    arrays = {k: getattr(problem, k).numpy() for k in INPUTS}
-    arrays[name] = np.concatenate([arrays[name], arrays[name]])
-    H = problem.horizon
-    sizes = {"x": (1, H + 1, problem.n_x), "u": (1, H, problem.n_u), "lam": (1, H, problem.n_lam)}
-    solution = {k: np.zeros(size) for k, size in {**sizes, "mu": (1, H + 1, problem.n_c)}.items()}
-    upstream = {f"{k}_bar": np.zeros(size) for k, size in sizes.items()}
-    with pytest.raises(ValueError, match=r"wrong (shape|size)|inconsistent"):
-        _kernels.vjp_mpc(
-            inputs=list(arrays.values()),
-            horizon=H,
-            relaxation=1e-5,
-            barrier=0.0,
-            **solution,
-            **upstream,
-            objective_bar=np.zeros(1),
-            solved=np.ones(1, np.int8),
-            pivot=False,
-            threads=1,
-            gradients=[np.zeros_like(v) for v in arrays.values()],
-        )
 
 
 def test_the_parameters_of_ipopt_are_the_fields_and_the_two_numbers(build):

@@ -11,8 +11,6 @@ from difflcs.rl.learning.optim import NaturalGradient
 from difflcs.rl.learning.policy import make_actor
 from tests.training.slide import drawn, make_model, make_mpc
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 STD = 0.03
 
 
@@ -47,19 +45,6 @@ def test_a_step_is_the_natural_gradient_of_the_given_length():
     step = flat(parameters)
     torch.testing.assert_close(step / step.norm(), expected / expected.norm())
     assert float(step @ metric @ step) == pytest.approx(0.3**2)
-
-
-def test_it_does_not_depend_on_the_parametrisation():
-    """Without damping, scaled parameters take the same step in what the policy does."""
-    scale = torch.tensor([5.0, 0.1, 3.0], dtype=torch.float64)
-    moved = []
-    for factor in (torch.ones(3, dtype=torch.float64), scale):
-        parameters, optimiser = make()
-        optimiser.measure(JACOBIAN * factor)
-        backward(parameters, (torch.tensor([1.0, -2.0, 0.5]) * factor).tolist())
-        optimiser.step()
-        moved.append(flat(parameters) * factor)
-    torch.testing.assert_close(moved[0], moved[1])
 
 
 def test_gradients_and_metrics_are_averaged():

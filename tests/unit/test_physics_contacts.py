@@ -1,7 +1,5 @@
 """Contacts of many geoms and many states at once: those of each pair, and of each state, alone."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 
 import numpy as np
@@ -10,7 +8,7 @@ import torch
 
 mujoco = pytest.importorskip("mujoco")
 
-from difflcs.errors import ContactWarning, InvalidInputError  # noqa: E402
+from difflcs.errors import InvalidInputError  # noqa: E402
 from difflcs.physics.mujoco import MujocoLCS  # noqa: E402
 from difflcs.physics.mujoco.nominal import solve_soft  # noqa: E402
 
@@ -85,16 +83,6 @@ def test_threads_find_what_one_finds():
     for name in ("A", "B", "d"):
         each = torch.stack([getattr(s, name) for s in systems])
         torch.testing.assert_close(getattr(system, name), each, rtol=1e-5, atol=1e-5)
-
-
-def test_more_contacts_than_the_default_warn_once():
-    model = pile(("box",) * 5)
-    qpos = model.qpos0.reshape(-1, 7) + np.stack([np.arange(5) * 0.2, *np.zeros((6, 5))], -1)
-    qpos[:, 2] = 0.04
-    module = MujocoLCS(model, motion="dynamic")
-    with pytest.warns(ContactWarning, match="contacts=20"):
-        module.contacts(module.state.to_state(qpos.ravel()))
-    module.contacts(module.state.to_state(qpos.ravel()))
 
 
 @pytest.mark.parametrize("threads", [1, 2])

@@ -1,7 +1,5 @@
 """Limits, dry friction and equality constraints against MuJoCo: what rests, slides, stops, and what a system has."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -10,8 +8,6 @@ mujoco = pytest.importorskip("mujoco")
 
 from difflcs.errors import ContactWarning  # noqa: E402
 from difflcs.physics.mujoco import MujocoLCS  # noqa: E402
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def load(worldbody, rest=""):

@@ -1,7 +1,5 @@
 """Quasi-dynamic motion of MuJoCo models, contacts by groups and the reference of rotations that moves along."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -12,7 +10,6 @@ from difflcs import LCSModule  # noqa: E402
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError  # noqa: E402
 from difflcs.physics.mujoco import ContactGroup, MujocoLCS, MujocoState  # noqa: E402
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 BOX = '<body name="box" pos="{}"><freejoint/><geom name="block" type="box" size=".05 .03 .02" mass="{}"/></body>'
 
 

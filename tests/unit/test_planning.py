@@ -1,7 +1,5 @@
 """Sampling-based contact MPC: where to push, when to travel, and how the loop closes on a small planar system."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -12,8 +10,6 @@ from difflcs import GoalCost, LCSMPCLayer, LCSParams
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
 from difflcs.physics import PlanarPushing, box
 from difflcs.planning import DiscPlaces, Mode, PlanarTravel, SamplingPolicy, SamplingSettings, Workspace
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 F64 = torch.float64
 RADIUS = 0.1
@@ -128,14 +124,6 @@ def error(x, goal):
 # --- one step, on a line ----------------------------------------------------------------------------------------------
 
 
-def test_it_pushes_where_the_pusher_is_on_the_right_side():
-    policy = on_a_line()
-    u = policy.act([0.0, -0.51], [1.0])
-    assert policy.decision.mode is Mode.PUSH
-    assert not policy.decision.began
-    np.testing.assert_allclose(u, [0.2], atol=1e-4)
-
-
 def test_it_travels_where_the_pusher_is_on_the_wrong_side_and_pushes_from_there():
     policy, x = on_a_line(), tensor([0.0, 0.51])
     u = policy.act(x, [1.0])
@@ -157,14 +145,6 @@ def test_the_cost_of_standing_still_and_what_a_plan_saves_are_those_of_the_mpc(b
     assert decision.standing == pytest.approx(5 * 0.8**2)  # four stages and the last
     torch.testing.assert_close(decision.gains, decision.standing - decision.solution.objective)
     assert decision.gain == pytest.approx(float(decision.gains[0]) / decision.standing)
-
-
-def test_nothing_is_to_be_gained_at_the_goal():
-    policy = on_a_line()
-    u = policy.act([1.0, 0.49], [1.0])
-    assert policy.decision.mode is Mode.PUSH
-    assert abs(float(u[0])) < 0.02  # the relaxed contact pushes a little without touching
-    assert float(policy.decision.gains.max()) < 1e-6
 
 
 @pytest.mark.parametrize("right", [True, False])
@@ -246,15 +226,6 @@ def test_what_is_not_solved_is_not_chosen():
     failed = ~policy.decision.solution.converged
     assert bool(failed.any())
     assert bool((policy.decision.gains[failed] == -math.inf).all())
-
-
-def test_reset_forgets_the_journey():
-    policy = on_a_line()
-    policy.act([0.0, 0.51], [1.0])
-    policy.reset()
-    assert policy.decision is None
-    policy.act([0.0, -0.51], [1.0])
-    assert policy.decision.mode is Mode.PUSH
 
 
 # --- the loop, in the plane -------------------------------------------------------------------------------------------

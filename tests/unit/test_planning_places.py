@@ -1,7 +1,5 @@
 """Where end effectors could be, and how they get there without touching."""
 
-from __future__ import annotations
-
 import functools
 import math
 
@@ -14,8 +12,6 @@ from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics import Circle, PDDrive, PlanarPushing, Polygon, Union, box
 from difflcs.planning import DiscPlaces, LiftTravel, PlanarTravel, Workspace
 from difflcs.planning.outline import clearance, ring
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 F64 = torch.float64
 RADIUS = 0.15

@@ -56,15 +56,6 @@ def assert_as_fresh(layer, *inputs, **kwargs):
     assert_same(plan(layer, *inputs, **kwargs), plan(copy.deepcopy(layer), *inputs, **kwargs))
 
 
-@pytest.mark.parametrize(
-    ("state", "goal"), [((), (5,)), ((1,), (5,)), ((5,), ()), ((2, 1), (1, 3)), ((3,), (2, 1)), ((), (2, 3))]
-)
-def test_states_and_goals_broadcast_in_every_call(state, goal):
-    layer = make_layer()
-    for seed in range(3):
-        assert_as_fresh(layer, 0.3 * draw(*state, 4, seed=seed), 0.3 * draw(*goal, 2, seed=10 + seed))
-
-
 def transpose_data(p):
     p.data = p.data.T
 
@@ -112,7 +103,7 @@ TENSORS = {
 @pytest.mark.parametrize(
     ("make", "name", "change"),
     [(make, name, change) for make, names in TENSORS.items() for name in names for change in CHANGES
-     if (name, change) != ("lcs.action_support", "transposed")],  # lower bounds are no upper ones
+     if change == "one number" or name in ("lcs.A", "lcs.c", "cost.Q", "constraints.G", "u_max")],
 )  # fmt: skip
 def test_a_changed_number_is_noticed(make, name, change):
     layer, inputs = make()
@@ -274,18 +265,6 @@ def test_a_guess_is_checked_in_a_loop_too():
         plan(layer, X.tolist(), GOAL)
 
 
-def test_tensors_that_equalled_others_may_change_afterwards():
-    """What is kept has memory of its own."""
-    layer = make_layer()
-    params = layer.lcs.params().detach()
-    twin = LCSParams(**{name: value.clone() for name, value in params.tensors().items()})
-    expected = plan(layer, X, GOAL, lcs=params)
-    assert_same(plan(layer, X, GOAL, lcs=twin), expected)
-    for value in params.tensors().values():
-        value.mul_(0.5)
-    assert_same(plan(layer, X, GOAL, lcs=twin), expected)
-
-
 def test_what_a_caller_does_with_results_changes_nothing():
     layer = make_layer()
     guess = plan(layer, X, GOAL).shift()
@@ -314,6 +293,7 @@ def test_errors_are_those_of_a_first_call():
                     used(*inputs)
 
     refused(NonFiniteError, "^x0", lambda layer: None, X * torch.nan, GOAL)
+    refused(DTypeError, "^x0: expected a dense", lambda layer: None, X.to_sparse(), GOAL)
     refused(NonFiniteError, "^goal", lambda layer: None, X, GOAL * torch.inf)
     refused(NonFiniteError, "^A", lambda layer: layer.lcs.A.data.fill_(torch.nan), X, GOAL)
     refused(NonFiniteError, "^Q", lambda layer: layer.cost.Q.fill_(torch.nan), X, GOAL)

@@ -1,11 +1,9 @@
 """LCSParams and LCSSequence as records that behave like tensors, and what counts as an LCSModule."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
-from difflcs import LCSModel, LCSModule, LCSParams, LCSSequence, solve_lcp
+from difflcs import LCSModel, LCSParams, LCSSequence, solve_lcp
 from difflcs.errors import (
     BatchIndexError,
     DiffLCSError,
@@ -35,9 +33,6 @@ def assert_same(left, right):
         assert torch.equal(getattr(left, name), getattr(right, name)), name
 
 
-# --- like tensors ---------------------------------------------------------------------------------------------------
-
-
 def test_to_changes_the_dtype_of_every_field_and_keeps_the_gradient(build):
     model = build.model(seed=1)
     narrow = model.params().to(torch.float32)
@@ -47,14 +42,6 @@ def test_to_changes_the_dtype_of_every_field_and_keeps_the_gradient(build):
     params = build.params()
     assert params.to(torch.float64).A is params.A
     assert params.to("cpu", torch.float32, copy=True).A.dtype == torch.float32
-
-
-def test_a_sequence_goes_to_another_dtype_and_drops_its_gradient(build):
-    tensors = {k: v.requires_grad_() for k, v in sequence_tensors(build, batch=(2,)).items()}
-    sequence = LCSSequence(**tensors)
-    assert sequence.to(torch.float32).F.dtype == torch.float32
-    assert not any(v.requires_grad for v in sequence.detach().tensors().values())
-    assert list(sequence.tensors()) == NAMES
 
 
 @pytest.mark.parametrize("index", [2, -1, slice(1, 3), torch.tensor([3, 0]), [1, 1], torch.tensor([True, False] * 2)])
@@ -82,14 +69,6 @@ def test_broadcast_batches_are_indexed_as_if_they_were_expanded(build, index):
     assert found.A.shape == (4, 4)
 
 
-def test_the_gradient_of_an_indexed_system_arrives_at_its_place(build):
-    tensors = {k: v.requires_grad_() for k, v in build.lcs_tensors(batch=(3,)).items()}
-    x, u = build.normal(1)(4), build.normal(2)(2)
-    LCSParams(**tensors)[1].step(x, u).x_next.sum().backward()
-    assert float(tensors["A"].grad[1].abs().max()) > 0
-    assert float(tensors["A"].grad[[0, 2]].abs().max()) == 0
-
-
 def test_one_system_has_no_index(build, sequence):
     for record in (build.params(), sequence):
         message = r"expected an index of a batch dimension, got int 0 where every field is shared.*; build it from"
@@ -109,9 +88,6 @@ def test_an_index_that_is_none_of_the_batch_is_refused(build, index):
             record[index]
 
 
-# --- one step, many steps -------------------------------------------------------------------------------------------
-
-
 def test_a_step_broadcasts_systems_states_and_actions(build):
     params, n = build.params(batch=(3, 1)), build.normal(1)
     x, u = n(4), n(5, 2)
@@ -120,15 +96,6 @@ def test_a_step_broadcasts_systems_states_and_actions(build):
     assert lam.shape == (3, 5, 3)
     torch.testing.assert_close(x_next[2, 4], params[2, 0].step(x, u[4]).x_next)
     assert params.rollout(x, n(5, 7, 2)).shape == (3, 5, 8, 4)
-
-
-def test_a_model_and_its_params_predict_the_same(build):
-    model, n = build.model(seed=3), build.normal(6)
-    x, u = n(5, 4), 0.3 * n(5, 7, 2)
-    assert torch.equal(model(x, u[:, 0]).x_next, model.params().step(x, u[:, 0]).x_next)
-    assert torch.equal(model.rollout(x, u), model.params().rollout(x, u))
-    assert model.rollout(x[0], u[:, :0]).shape == (5, 1, 4)
-    assert model.rollout(x[:0], u[:0]).shape == (0, 8, 4)
 
 
 @pytest.mark.parametrize("batch", [(), (3,)])
@@ -146,20 +113,6 @@ def test_a_rollout_through_stages_takes_each_in_its_turn(build, batch):
     torch.testing.assert_close(sequence.next_state(xs[:, :5], u, lam), xs[:, 1:])
 
 
-# --- stages ---------------------------------------------------------------------------------------------------------
-
-
-def test_a_stack_has_its_systems_as_stages(build):
-    systems = [build.params(seed=s) for s in range(4)]
-    sequence = LCSSequence.stack(systems)
-    assert sequence.horizon == 4
-    assert sequence.batch_shape == ()
-    assert (sequence.n_x, sequence.n_u, sequence.n_lam) == (4, 2, 3)
-    for k, system in enumerate(systems):
-        assert_same(sequence.stage(k), system)
-    assert_same(sequence.stage(-1), systems[3])
-
-
 def test_a_stack_broadcasts_each_field_over_its_batch(build):
     shared, each = build.params(seed=1), build.params(seed=2, batch=(3,))
     mixed = LCSParams(**{**each.tensors(), "A": each.A[0]})
@@ -172,14 +125,6 @@ def test_a_stack_broadcasts_each_field_over_its_batch(build):
         assert_same(sequence[i].stage(1), mixed[i])
     assert sequence[1:].batch_shape == (2,)
     assert sequence[1:].horizon == 2
-
-
-def test_a_stack_passes_the_gradient_to_its_systems(build):
-    model = build.model(seed=3)
-    LCSSequence.stack([model.params(), build.params(seed=1)]).rollout(
-        build.normal(0)(20, 4), build.normal(1)(2, 2)
-    ).sum().backward()
-    assert all(float(p.grad.abs().max()) > 0 for p in model.parameters())
 
 
 def test_a_stack_refuses_what_does_not_fit(build):
@@ -236,33 +181,6 @@ def test_a_sequence_wants_one_action_a_stage(build, sequence):
         sequence.rollout(n(3, 4), n(2, 5, 2))
 
 
-@pytest.mark.parametrize("call", ["step", "rollout"])
-def test_states_and_actions_that_do_not_fit_are_named(build, call):
-    params, n = build.params(batch=(3,)), build.normal(0)
-    u = n(2) if call == "step" else n(6, 2)
-    function = getattr(params, call)
-    with pytest.raises(ShapeError, match=r"x0?: expected shape \(\.\.\., n_x=4\), got \(5,\)"):
-        function(n(5), u)
-    with pytest.raises(DTypeError, match=r"x0?: expected torch.float64 like the system, got .*float32.*; convert"):
-        function(n(4).float(), u)
-    with pytest.raises(ShapeError, match=r"batch dimensions \(2,\) do not fit the others.*system \(3,\)"):
-        function(n(2, 4), u)
-
-
-# --- without contacts -----------------------------------------------------------------------------------------------
-
-
-def test_a_system_without_contacts_is_linear(build):
-    n = build.normal(0)
-    params, x, u = build.params(n_lam=0), n(6, 4), n(6, 2)
-    x_next, lam = params.step(x, u)
-    assert lam.shape == (6, 0)
-    torch.testing.assert_close(x_next, x @ params.A.T + u @ params.B.T + params.d)
-    sequence = LCSSequence.stack([params] * 2)
-    assert sequence.rollout(x, u.expand(2, 6, 2).mT.mT.transpose(0, 1)).shape == (6, 3, 4)
-    assert build.params(n_lam=0, batch=(5,))[2].n_lam == 0
-
-
 def test_a_model_without_contacts_is_kept_and_learns(build, tmp_path):
     model, n = build.model(n_lam=0), build.normal(0)
     x, u = n(6, 4), n(6, 2)
@@ -287,32 +205,3 @@ def test_an_lcp_without_variables_is_solved(build):
         (lam.sum() + w.sum()).backward()
         assert q.grad is not None
     assert solve_lcp(F.expand(2, 1, 0, 0), q.detach()[0]).lam.shape == (2, 5, 0)
-
-
-# --- modules --------------------------------------------------------------------------------------------------------
-
-
-class Made(torch.nn.Module):
-    """A system that depends on the state, made without LCSModel."""
-
-    def __init__(self, params):
-        super().__init__()
-        self.base = params
-        self.n_x, self.n_u, self.n_lam = params.n_x, params.n_u, params.n_lam
-
-    def params(self, x=None, context=None):
-        return self.base
-
-
-def test_what_counts_as_a_module(build):
-    assert isinstance(build.model(), LCSModule)
-    assert isinstance(Made(build.params()), LCSModule)
-    assert not isinstance(build.params(), LCSModule)
-    assert not isinstance(torch.nn.Linear(2, 2), LCSModule)
-
-
-def test_a_model_takes_states_and_context_and_ignores_both(build):
-    model, n = build.model(), build.normal(0)
-    expected = model.params()
-    for found in (model.params(n(5, 4), n(5, 2)), model.params(x=n(4)), model.params(context=n(1))):
-        assert_same(found, expected)

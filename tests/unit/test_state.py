@@ -1,7 +1,5 @@
 """States as trees: flattened and put together again, compared, and taken back where they do not fit."""
 
-from __future__ import annotations
-
 import json
 import math
 from typing import Any
@@ -41,7 +39,7 @@ def same(one: Any, other: Any) -> bool:
     return type(one) is type(other) and one == other
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(TREES)
 def test_a_tree_comes_back(tree):
     tensors, rest = flatten(tree)
@@ -127,21 +125,6 @@ def test_a_name_more_or_less_is_refused(path):
         check_state(make_state(), state)
     with pytest.raises(CheckpointError, match=name):
         check_state(state, make_state())
-
-
-@pytest.mark.parametrize(
-    ("path", "value"),
-    [
-        ("iteration", 7),
-        ("iteration", 0),
-        ("step_size", 0.5),
-        ("on", False),
-        ("learned.parameters.A", torch.ones(2, 3)),
-        ("random.noise.state.state", 2**127),
-    ],
-)
-def test_values_that_may_differ_do(path, value):
-    check_state(make_state(), changed(path, value))
 
 
 def test_episodes_are_any_number_of_rows_as_many_in_each():

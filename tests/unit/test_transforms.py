@@ -1,7 +1,5 @@
 """solve_lcp, the losses, the layer and the records under torch.func, vectorised jacobians and torch.compile."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
@@ -47,18 +45,6 @@ def test_vmap_solves_what_a_loop_solves(lcps, relaxation, in_dims):
         one = solve_lcp(*(v if dim is None else v[i] for v, dim in zip(at, in_dims, strict=True)), relaxation)
         for value, expected in zip(found, one, strict=True):
             assert torch.equal(value[i], expected)
-
-
-@exact_and_relaxed
-def test_vmap_over_batches_that_broadcast_inside(lcps, relaxation):
-    F, q = lcps
-    every = vmap(lambda F: solve_lcp(F, q, relaxation).lam)(F)
-    assert every.shape == (COUNT, COUNT, 4)
-    nested = vmap(lambda F: vmap(lambda q: solve_lcp(F, q, relaxation).lam)(q))(F)
-    assert torch.equal(nested, every)
-    assert torch.equal(every[2], solve_lcp(F[2], q, relaxation).lam)
-    assert vmap(lambda F: solve_lcp(F, q[:0]).lam)(F).shape == (COUNT, 0, 4)
-    assert vmap(lambda q: solve_lcp(F[:, None], q).lam)(q).shape == (COUNT, COUNT, 1, 4)
 
 
 @exact_and_relaxed
@@ -230,19 +216,6 @@ def test_an_ensemble_of_models_is_mapped(build, data, gamma):
     found = vmap(lambda values: functional_call(loss, values, data))(stacked)
     expected = torch.stack([violation_loss(m, *data, gamma).detach() for m in models])
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-14)
-
-
-@pytest.mark.parametrize("reduction", ["mean", "none"])
-def test_batched_gradients_of_every_parameter_of_a_loss(build, data, reduction):
-    model = build.model(seed=3)
-    inputs = [*model.parameters(), *(v.requires_grad_() for v in data)]
-    loss = violation_loss(model, *data, reduction=reduction)
-    upstream = build.normal(1)(5, *loss.shape)
-    many = torch.autograd.grad(loss, inputs, upstream, is_grads_batched=True, retain_graph=True)
-    for k in range(5):
-        one = torch.autograd.grad(loss, inputs, upstream[k], retain_graph=True)
-        for left, right in zip(many, one, strict=True):
-            torch.testing.assert_close(left[k], right, rtol=1e-9, atol=1e-12)
 
 
 def test_what_vmap_hides_from_the_records_is_checked_by_the_loss(build, data):

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 
 from difflcs import Status
-from tests.conformance.hostile import forms, generators, rules, targets
+from tests.conformance.hostile import forms, generators, targets
 from tests.conformance.hostile.targets import Outcome
 
 
@@ -66,7 +66,7 @@ class Cell:
 
 _GENERATORS = {**generators.LCP_CLASSES, **generators.MPC_CLASSES, **generators.LOSS_CLASSES, **forms.FORM_CLASSES}
 _TARGETS = {
-    "lcp": {**targets.LCP_TARGETS, **rules.RULE_TARGETS},
+    "lcp": targets.LCP_TARGETS,
     "mpc": {**targets.MPC_TARGETS, **targets.SLOW_TARGETS},
     "loss": targets.LOSS_TARGETS,
     "form": forms.FORM_TARGETS,
@@ -79,7 +79,6 @@ CELLS = [
     *(Cell(p, "relaxed", 8, 0.005) for p in generators.MPC_CLASSES),
     *(Cell(p, t, 64, 0.25) for p in generators.LOSS_CLASSES for t in targets.LOSS_TARGETS),
     *(Cell(p, t, 24, 0.05) for p in forms.FORM_CLASSES for t in forms.FORM_TARGETS),
-    Cell("lcp-plain", "neighbours", 32, 0.2),
 ]
 
 
