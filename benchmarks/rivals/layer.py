@@ -9,7 +9,7 @@ import difflcs
 from difflcs import LCSMPCLayer, LCSParams, QuadraticCost
 from difflcs.mpc.backends import BatchedBackend, IpoptBackend
 from difflcs.mpc.backends.batched import Effort
-from difflcs.mpc.controller import Controller
+from difflcs.mpc.controller import MPCController
 from rivals.differentiable import TorchRival
 from rivals.problem import Problem
 
@@ -38,7 +38,7 @@ class Solver(TorchRival):
         self.relaxation = relaxation or problem.relaxation
         self.parts = [self._layer(i) for i in range(problem.count)]
         self.whole = self._layer(None)
-        self.controllers: dict[int, Controller] = {}
+        self.controllers: dict[int, MPCController] = {}
 
     def step(self, i: int, x: np.ndarray) -> np.ndarray:
         """Return the action of a warm controller."""

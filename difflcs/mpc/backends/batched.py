@@ -70,7 +70,8 @@ class BatchedBackend(Backend):
         max_iter: iteration limit of one solve. An element that fails is solved once more, cold and along a longer
             homotopy; and with row exchanges in the elimination of λ if it failed for lack of them.
         time_limit: seconds for one call, None for no limit. Elements not solved by then are MAX_ITER: those under way
-            keep their iterate, those not begun stay at the actions of the guess or zero, with x = x0 and λ = 0.
+            keep their best iterate, executed at the relaxation; those not begun stay at the actions of the guess or
+            zero, with x = x0 and λ = 0.
         seed: seed of the random starts, which are the same for every element.
         homotopy: λ·s at which a cold start begins, as a multiple of the relaxation; None: the square of the mean gap
             of the contacts, in the units in which F has a unit diagonal. A guess starts at the relaxation.
