@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).parent
 
@@ -29,7 +30,7 @@ def package() -> None:
     spec.loader.exec_module(module)
 
 
-def cpu(work: Callable[[], object]) -> tuple[float, object]:
+def cpu(work: Callable[[], Any]) -> tuple[float, Any]:
     """Do some work; return CPU seconds of all threads, and its result."""
     start = time.process_time()
     result = work()
