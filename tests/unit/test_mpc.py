@@ -395,6 +395,7 @@ def test_a_plan_is_drawn(layer, x0):
     assert torch.equal(torch.as_tensor(states.lines[2].get_ydata()), plan.x[1, :, 2].detach())
     assert len(actions.patches) == 3 * plan.u.shape[-1]  # each with two bounds
     assert len(forces.patches) == len(gaps.patches) == plan.lam.shape[-1]
+    assert states.figure._repr_png_().startswith(b"\x89PNG")  # what a notebook shows
     with pytest.raises(BatchIndexError, match=f"a batch of {len(x0)}"):
         plan.plot(len(x0))
 
