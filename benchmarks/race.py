@@ -21,6 +21,7 @@ import numpy as np
 import torch
 import tyro
 from race_global import global_gaps
+from race_hard import measure, tune
 from race_problems import small, with_contact, without_contact
 from rivals.problem import Problem
 
@@ -106,8 +107,10 @@ class Options:
     """Folder of the rivals' environments."""
     install: bool = False
     """Make these environments, from the package index, and end."""
-    parts: tuple[str, ...] = ("contact", "linear", "global")
+    parts: tuple[str, ...] = ("contact", "linear", "global", "planners")
     """Parts to run; the others stay as they are in the file."""
+    tune: float = 0.0
+    """CPU seconds in which settings of each planner are drawn for each family, on other seeds; then it ends."""
     out: Path = Path("benchmarks/results/race.json")
     """Path of the JSON output."""
     smoke: bool = False
@@ -448,6 +451,9 @@ def main(o: Options) -> None:
     if o.install:
         install(o.venvs)
         return
+    if o.tune:
+        tune(as_mpc, o.tune)
+        return
     if o.smoke:
         o.problems, o.batch, o.linear_batch, o.small_problems, o.seeds, o.rounds, o.nodes = 2, 3, 3, 1, 1, 1, 300
     torch.set_num_threads(1)
@@ -455,7 +461,8 @@ def main(o: Options) -> None:
     options = {name: getattr(o, name) for name in names}
     results = json.loads(o.out.read_text())["results"] if o.out.exists() else {}
     for name in o.parts:
-        results |= {"global": globally(o)} if name == "global" else dict(race(name, o))
+        alone = {"global": globally, "planners": lambda o: measure(as_mpc, o.problems, o.seeds, o.rounds)}
+        results |= {name: alone[name](o)} if name in alone else dict(race(name, o))
         save(o.out, {"machine": machine(), "options": options, "results": results})
 
 

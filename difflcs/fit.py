@@ -140,25 +140,29 @@ class FitReport:
         return "\n".join(lines)
 
     def plot(self) -> Figure:
-        """Draw the three tables side by side; needs matplotlib."""
+        """Draw the three tables; needs matplotlib."""
         require("matplotlib")
-        from matplotlib.figure import Figure
+        from matplotlib import rc_context
 
-        figure = Figure(figsize=(11, 3.2), layout="constrained")
-        states, forces, steps = figure.subplots(1, 3)
-        place = np.arange(len(self.error))
-        states.bar(place - 0.2, self.error.numpy(), 0.4, label="system")
-        states.bar(place + 0.2, self.linear.numpy(), 0.4, label="affine")
-        states.axhline(1, color="gray", lw=1, label="standing still")
-        states.set(xlabel="state", ylabel="error of a step, in parts of the step", xticks=place)
-        forces.bar(np.arange(len(self.acts)), 100 * self.acts.numpy())
-        forces.set(xlabel="force", ylabel="acts in [%] of the transitions", xticks=np.arange(len(self.acts)))
-        for column, name in enumerate(("system", "affine", "standing still")):
-            colour = {"color": "gray"} if column == 2 else {}
-            steps.plot(1 + np.arange(len(self.rollout)), self.rollout[:, column].numpy(), label=name, **colour)
-        steps.set(xlabel="steps", ylabel="error, in parts of the spread", ylim=(0, None))
-        states.legend()
-        steps.legend()
+        from difflcs._figure import FONT, PageFigure
+
+        with rc_context(FONT):
+            figure = PageFigure(6.5)
+            panels = figure.subplot_mosaic([["states", "forces"], ["steps", "steps"]])
+            states, forces, steps = panels["states"], panels["forces"], panels["steps"]
+            place = np.arange(len(self.error))
+            states.bar(place - 0.2, self.error.numpy(), 0.4, label="system")
+            states.bar(place + 0.2, self.linear.numpy(), 0.4, label="affine")
+            states.axhline(1, color="gray", lw=1)
+            states.set(title="error of a step (standing still: 1)", xlabel="state", xticks=place)
+            forces.bar(np.arange(len(self.acts)), 100 * self.acts.numpy())
+            forces.set(title="acts in [%] of the steps", xlabel="force", xticks=np.arange(len(self.acts)))
+            for column, name in enumerate(("system", "affine", "standing still")):
+                colour = ("C0", "C1", "gray")[column]
+                steps.plot(1 + np.arange(len(self.rollout)), self.rollout[:, column].numpy(), color=colour, label=name)
+            steps.set(title="error after some steps, in parts of the spread of the states", xlabel="steps")
+            steps.set_ylim(0, None)
+            steps.legend(frameon=False)
         return figure
 
 

@@ -418,7 +418,7 @@ def sequence_along(lcs: LCSModule, plan: Any, x0: Tensor | None = None, context:
 
     Args:
         lcs: the module. Where it has a method `context_along(x, u, context)`, that says the context of each stage, such
-            as a nominal control.
+            as a nominal control. Where it has one `states_along(x, u)`, that says all the states at once, or None.
         plan: an `MPCSolution`, or a `Primal` such as `solution.shift()`.
         x0: (..., n_x) states to begin at; None: those of the plan.
         context: (..., n_context) see `LCSModule.params`.
@@ -433,6 +433,12 @@ def sequence_along(lcs: LCSModule, plan: Any, x0: Tensor | None = None, context:
     u = plan.u.detach()
     x = (plan.x[..., 0, :] if x0 is None else x0).expand(*u.shape[:-2], lcs.n_x)
     context_along, systems = getattr(lcs, "context_along", None), []
+    states_along = getattr(lcs, "states_along", None)
+    if context_along is not None and states_along is not None and (states := states_along(x, u)) is not None:
+        states = torch.cat([x.unsqueeze(-2), states[..., 1:, :]], -2)
+        system = system_at(lcs, states, context_along(states, u, context)).tensors()
+        shapes = {name: value.shape[value.ndim - len(SYSTEM[name]) :] for name, value in system.items()}
+        return LCSSequence(**{name: v.expand(*states.shape[:-1], *shapes[name]) for name, v in system.items()})
     for k in range(u.shape[-2]):
         stage_context = context if context_along is None else context_along(x, u[..., k, :], context)
         system = system_at(lcs, x, stage_context)

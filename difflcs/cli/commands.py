@@ -19,7 +19,7 @@ from difflcs import zoo
 from difflcs._checks import did_you_mean
 from difflcs._optional import require
 from difflcs.cli.flags import errors_by_flag
-from difflcs.cli.models import Evaluate, Export, Render
+from difflcs.cli.models import Evaluate, Export, Plot, Render
 from difflcs.cli.train import Demo, Train, train_command
 from difflcs.errors import DiffLCSError, InvalidInputError
 
@@ -124,6 +124,7 @@ _COMMANDS: dict[str, Callable[..., Any]] = {
     "train": Train,
     "evaluate": Evaluate,
     "render": Render,
+    "plot": Plot,
     "export": Export,
     "demo": Demo,
     "zoo": Zoo,

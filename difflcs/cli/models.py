@@ -1,4 +1,4 @@
-"""The commands for learned models: `difflcs evaluate | render | export`."""
+"""The commands for learned models: `difflcs evaluate | render | plot | export`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from difflcs.mpc import LCSMPCLayer
 from difflcs.mpc.export import CONTROLLER, DESCRIPTION, export_controller
 from difflcs.rl import TrainedPolicy
 from difflcs.rl.runs.evaluate import evaluate
-from difflcs.rl.runs.figures import NoPictureError, record_video
+from difflcs.rl.runs.figures import NoPictureError, draw_policy, plot_learning_curve, record_video
 from difflcs.rl.runs.progress import bar
 from difflcs.rl.runs.training import EVALUATION_ENVS, load_action_support
 from difflcs.rl.tasks import TaskSpec, get_task
@@ -39,6 +39,8 @@ class Evaluate:
     """Print one JSON object instead of text."""
     action_support: bool = False
     """Keep the action bounds of the last episodes of a warm-up, instead of the task's full bounds."""
+    plot: Path | None = None
+    """Folder for pictures of the fit and of an episode, those of `difflcs plot`."""
     smoke: bool = False
     """Try a few goals only."""
 
@@ -65,6 +67,8 @@ class Evaluate:
         finally:
             envs.close()
         seconds = time.perf_counter() - start
+        if self.plot is not None:
+            draw_policy(learned.policy, task, self.plot, min(goals, EVALUATION_ENVS), self.seed)
         if self.json:
             record = {
                 **asdict(result),
@@ -138,6 +142,35 @@ class Render:
             return [task.example_goals[0]]
         names = ", ".join(f"{q.name} [{q.unit}]" for q in task.goal) or f"{size} numbers"
         raise InvalidInputError(f"goal: expected {names} for each goal of {task.name}, got {self.goal}; pass --goal")
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Pictures of a learned model: its learning curve, its fit, the contacts in an episode."""
+
+    model: Path
+    """Run directory, or zoo:NAME for one of the models that `difflcs zoo` lists."""
+    out: Path | None = None
+    """Folder for the pictures; by default the run, or the working directory for a model of the zoo."""
+    episodes: int = 20
+    """Episodes that the fit is judged by."""
+    seed: int = 0
+    """Seed of their goals and initial states; the first of them is drawn."""
+    smoke: bool = False
+    """Play two episodes only."""
+
+    def run(self) -> None:
+        """Run the command."""
+        learned = TrainedPolicy.open(self.model)
+        out = self.out or (Path() if learned.run is None else learned.run.path)
+        written = []
+        if learned.run is not None and (rows := learned.run.rows()):
+            written.append(out / "learning_curve.png")
+            plot_learning_curve(rows, written[0], f"{learned.task}, {learned.method}")
+        written += draw_policy(
+            learned.policy, get_task(learned.task), out, 2 if self.smoke else self.episodes, self.seed
+        )
+        print("\n".join(f"written: {path}" for path in written))
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Sequence
+from dataclasses import InitVar, dataclass, fields
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -65,7 +65,10 @@ class MPCSolution:
     kkt_residual: Tensor
     solve_time: Tensor
     violation: Tensor
-    problem: MPCProblem
+    of: InitVar[MPCProblem]
+
+    def __post_init__(self, of: MPCProblem) -> None:
+        self.__dict__["_problem"] = of
 
     def __repr__(self) -> str:
         tensors = {name: getattr(self, name) for name in ("x", "u", "lam", "mu")}
@@ -76,6 +79,11 @@ class MPCSolution:
             for name in ("objective", "kkt_residual", "violation"):
                 text += f"; {name} ≤ {float(getattr(self, name).detach().max()):.3g}"
         return text + ")"
+
+    @property
+    def problem(self) -> MPCProblem:
+        """The problem that was solved. It is no field, so that a TensorDict of the fields has the batch's shape."""
+        return self.__dict__["_problem"]
 
     @property
     def action(self) -> Tensor:
@@ -116,41 +124,48 @@ class MPCSolution:
             BatchIndexError: there is no such element.
             MissingDependencyError: matplotlib is not installed.
         """
-        require("matplotlib")
-        from matplotlib.figure import Figure
-
         count = self.status.numel()
         if not -count <= element < count:
             raise BatchIndexError(f"element: expected one of a batch of {count}, got {element}; choose another")
         x, u, lam = self._flat()
         gap = self.problem.steps().gap(*_by_step(x[:, :-1], u, lam)).transpose(0, 1)
-        figure = Figure(figsize=(9, 5.5), layout="constrained")
-        panels = figure.subplots(2, 2, sharex=True).flat
-        parts = {"states x": x, "actions u": u, "forces λ": lam, "gaps": gap}
-        for axes, (name, values) in zip(panels, parts.items(), strict=True):
-            rows = values[element].numpy()
-            for i, row in enumerate(rows.T):
-                # A state is at a stage; the rest holds from one stage to the next.
-                axes.plot(row, ".-", label=i) if values is x else axes.stairs(row, baseline=None, lw=1.5, label=i)
-            if values is u:
-                for bound in self.problem.bounds():
-                    edges = bound.expand(u.shape)[element].T.numpy()
-                    for i, row in enumerate(edges):
-                        if np.isfinite(row).all():
-                            axes.stairs(row, baseline=None, ls=":", color=f"C{i}")
-            axes.xaxis.get_major_locator().set_params(integer=True)
-            axes.set(title=name, xlabel="" if values is x or values is u else "stage")
-            if 0 < rows.shape[1] <= 10:
-                axes.legend(ncols=2, fontsize=8)
-        status = Status(int(self.status.flatten()[element])).name
-        figure.suptitle(f"{status}, cost {float(self.objective.detach().flatten()[element]):.4g}")
-        return figure
+        bounds = [bound.expand(u.shape)[element] for bound in self.problem.bounds()]
+        status, cost = Status(int(self.status.flatten()[element])).name, self.objective.detach().flatten()[element]
+        title = f"{status}, cost {float(cost):.4g}"
+        return draw_trajectory(x[element], u[element], lam[element], gap[element], bounds, title)
 
     def _flat(self) -> tuple[Tensor, Tensor, Tensor]:
         return tuple(  # pyright: ignore[reportReturnType]
             v.detach().to("cpu", torch.float64).reshape(self.status.numel(), *v.shape[-2:])
             for v in (self.x, self.u, self.lam)
         )
+
+
+def draw_trajectory(x: Tensor, u: Tensor, lam: Tensor, gap: Tensor, bounds: Sequence[Tensor], title: str) -> Figure:
+    """Draw states (T+1, n_x), actions (T, n_u) between bounds of their shape, forces and gaps (T, n_lam)."""
+    require("matplotlib")
+    from matplotlib import rc_context
+
+    from difflcs._figure import FONT, PageFigure
+
+    with rc_context(FONT):
+        figure = PageFigure(6.5)
+        panels = figure.subplots(2, 2, sharex=True).flat
+        parts = {"states x": x, "actions u": u, "forces λ": lam, "gaps": gap}
+        for axes, (name, values) in zip(panels, parts.items(), strict=True):
+            for i, row in enumerate(values.T.numpy()):
+                # A state is at a stage; the rest holds from one stage to the next.
+                axes.plot(row, ".-", label=i) if values is x else axes.stairs(row, baseline=None, lw=1.5, label=i)
+            for bound in bounds if values is u else ():
+                for i, row in enumerate(bound.T.numpy()):
+                    if np.isfinite(row).all():
+                        axes.stairs(row, baseline=None, ls=":", color=f"C{i}")
+            axes.xaxis.get_major_locator().set_params(integer=True)
+            axes.set(title=name, xlabel="" if values is x or values is u else "stage")
+            if 0 < values.shape[1] <= 10:
+                axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), handlelength=0.7, borderpad=0, frameon=False)
+        figure.suptitle(title)
+    return figure
 
 
 def largest(values: Tensor) -> Tensor:
@@ -176,9 +191,9 @@ def _flatten(solution: MPCSolution) -> tuple[list[Tensor], _Kept]:
 
 
 def _unflatten(tensors: Iterable[Tensor], kept: _Kept) -> MPCSolution:
-    return MPCSolution(*tensors, problem=kept.problem)
+    return MPCSolution(*tensors, of=kept.problem)
 
 
 # So that `torch.func.vmap(layer)(x0)` returns a solution.
-_TENSORS = tuple(f.name for f in fields(MPCSolution) if f.name != "problem")
+_TENSORS = tuple(f.name for f in fields(MPCSolution))
 register_pytree_node(MPCSolution, _flatten, _unflatten)

@@ -54,8 +54,8 @@ FORKS.set_forkserver_preload(["torch", "torchrl.data", "gymnasium", "mujoco", "c
 
 def run_code(code: list[str], folder: Path) -> None:
     """Run blocks in a process and a folder of their own: they may register what they want, and read nothing of ours."""
-    pytest.importorskip("gymnasium")
-    pytest.importorskip("torchrl")
+    for package in ("gymnasium", "torchrl", *(p for p in ("stable_baselines3", "optuna") if p in "".join(code))):
+        pytest.importorskip(package)
     script, said = folder / "page.py", folder / "said"
     head = f"import os\nos.chdir({str(folder)!r})\nos.dup2(os.open({str(said)!r}, os.O_CREAT | os.O_WRONLY), 2)\n"
     script.write_text(head + "import torch\n\ntorch.set_num_threads(1)\n" + "\n".join(code))

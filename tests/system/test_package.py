@@ -46,9 +46,6 @@ def imports(path):
                 yield f"{base}.{alias.name}", node not in inside
 
 
-# --- import ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def imported():
     """What a fresh process loads: with torch and NumPy, then by difflcs besides, then when solvers are asked for."""
@@ -93,9 +90,6 @@ print("same")
     )
 
 
-# --- names ----------------------------------------------------------------------------------------------------------
-
-
 def test_every_exported_name_exists_and_is_documented():
     assert sorted(set(difflcs.__all__)) == sorted(difflcs.__all__)
     for name in difflcs.__all__:
@@ -118,9 +112,6 @@ def test_status_names_are_those_of_the_design_and_give_advice():
     assert all(s.advice for s in status)
 
 
-# --- structure ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("path", sources("difflcs"), ids=lambda p: str(p.relative_to(ROOT)))
 def test_no_pickle_and_no_torch_save(path):
     for name, _ in imports(path):
@@ -131,27 +122,6 @@ def test_no_pickle_and_no_torch_save(path):
         if isinstance(node, ast.keyword) and node.arg == "allow_pickle":
             assert isinstance(node.value, ast.Constant)
             assert node.value.value is False
-
-
-def test_the_autograd_functions_are_in_one_file():
-    found = [
-        path.name
-        for path in sources("difflcs")
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.ClassDef) and any(ast.unparse(b) == "torch.autograd.Function" for b in node.bases)
-    ]
-    assert set(found) == {"_differentiation.py"}
-
-
-def test_the_layer_never_compares_names_of_backends():
-    text = (ROOT / "difflcs" / "mpc" / "layer.py").read_text()
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.Compare):
-            words = [n.value for n in ast.walk(node) if isinstance(n, ast.Constant) and isinstance(n.value, str)]
-            assert not set(words) & {"ipopt", "batched", "relaxed"}
-
-
-# --- README ---------------------------------------------------------------------------------------------------------
 
 
 def test_the_readmes_example_runs_and_prints_a_gradient(tmp_path):

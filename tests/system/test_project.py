@@ -23,9 +23,6 @@ def load(name: str):
     return yaml.safe_load((ROOT / name).read_text())
 
 
-# --- types ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_a_strict_user_sees_no_error_of_ours(tmp_path):
     """Pyright, strict, on a file that uses what is public, with the packages where pip would put them."""
@@ -59,9 +56,6 @@ def test_the_strict_user_uses_every_public_name():
     assert [name for name in difflcs.__all__ if not re.search(rf"\b{name}\b", text)] == []
 
 
-# --- addresses, citation, versions ------------------------------------------------------------------------------------
-
-
 def test_the_citation_names_the_version_and_the_addresses_of_the_project():
     citation = load("CITATION.cff")
     assert citation["version"] == difflcs.__version__
@@ -82,9 +76,6 @@ def test_the_changelog_begins_with_this_version():
     assert all(date != "unreleased" for version, date in versions if version == difflcs.__version__)
     assert difflcs.__version__ in dict(versions)
     assert [date for _, date in versions[1:] if date == "unreleased"] == []
-
-
-# --- building ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler")
@@ -113,9 +104,6 @@ def test_microsofts_compiler_is_refused_in_a_sentence(tmp_path):
 
 def test_the_source_distribution_leaves_nothing_out():
     assert PROJECT["tool"]["scikit-build"]["sdist"] == {"exclude": ["/runs"]}
-
-
-# --- workflows --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["tests", "docs", "wheels"])

@@ -87,9 +87,6 @@ def test_the_film_is_a_gif(push_t, capsys, tmp_path):
         assert picture.info["duration"] == 100
 
 
-# --- without the environment ------------------------------------------------------------------------------------------
-
-
 def test_the_tee_is_that_of_the_environment(push_t):
     system = push_t.tee_pushing()
     # Moments that pymunk gives: twice that of a bar of 120 × 30 about the middle of its upper edge, for a mass of 1.

@@ -113,17 +113,9 @@ def test_matrix_holds_every_unit_once_the_important_ones_first():
 
 def test_matrix_of_a_part():
     paper, one = units.PRESETS["paper"], units.PRESETS["paper"].with_amounts(1, None)
-    assert units.matrix(["transfer"], one, objects=["mug"], recipes=["ours"]) == [SCRATCH, CUBE, TRANSFER]
-    table = units.matrix(["table1"], one, objects=["banana", "mug"], methods=["violation"], recipes=["paper"])
-    assert table == [Unit(task, "violation", "paper", FIRST) for task in ("mug", "banana")]
     slow = units.matrix(["curves"], paper, methods=["pddm"])
     assert {(unit.method, unit.seed - FIRST) for unit in slow} == {("pddm", seed) for seed in range(5)}
     assert len(units.matrix(["curves"], paper.with_amounts(10, None), methods=["pddm"], recipes=["authors"])) == 10
-    curves = units.matrix(["curves"], one, recipes=["ours"])
-    assert [(unit.method, unit.recipe) for unit in curves] == [
-        ("lcs-rl", "ours"), ("violation", "ours"), ("pddm", "ours"),
-    ]  # fmt: skip
-    assert {unit.recipe for unit in units.matrix(["table1"], units.PRESETS["smoke"])} == {"ours"}
     masses = units.matrix(["masses"], one, objects=["mug"])
     assert masses == [Unit("mug", "lcs-rl", "paper", FIRST), Unit("mug", "lcs-rl", "light", FIRST)]
     assert [unit.spec.env_kwargs.get("object_mass") for unit in masses] == [None, 0.01]
@@ -455,39 +447,6 @@ def test_p_value_against_scipy():
     assert math.isnan(stats.p_value([1.0]))
 
 
-@pytest.mark.parametrize(("seeds", "low", "high"), [(3, 0.68, 0.84), (10, 0.84, 0.95)])
-def test_how_often_intervals_contain_the_true_mean(seeds, low, high):
-    """The page says three of four, and nine of ten."""
-    draws = np.random.default_rng(0).normal(50.0, 10.0, (400, seeds))
-    found = [stats.bootstrap([draw]) for draw in draws]
-    assert low < np.mean([estimate.low <= 50.0 <= estimate.high for estimate in found]) < high
-
-
-def test_differences_to_what_others_publish():
-    theirs = stats.published(50.0, 10.0, 10)
-    assert theirs.high - 50 == pytest.approx(2.262 * 10 / math.sqrt(10), rel=1e-3)
-    # Without uncertainty of one, the interval is that of the other; of two equal ones it is √2 times as wide.
-    exact, ours = stats.Estimate(50.0, 50.0, 50.0), stats.Estimate(60.0, 58.0, 61.0)
-    assert stats.apart(ours, exact) == pytest.approx((10.0, 8.0, 11.0))
-    assert stats.apart(exact, ours) == pytest.approx((-10.0, -11.0, -8.0))
-    assert stats.apart(theirs, theirs).high == pytest.approx(math.sqrt(2) * (theirs.high - 50))
-
-
-def test_words_say_what_the_intervals_say():
-    found = {
-        "mug": stats.Estimate(3.0, 1.0, 5.0), "can": stats.Estimate(-2.0, -3.0, -1.0),
-        "box": stats.Estimate(1.0, -1.0, 3.0), "wrench": stats.Estimate(9.0), "clamp": None,
-    }  # fmt: skip
-    told = "better on 1 (mug), worse on 1 (can), not to be told apart on 1 (box)"
-    assert report.verdict(found) == f"{told}, {report.UNTOLD}: wrench and clamp"
-    assert report.verdict({"mug": found["mug"], "cube": found["mug"]}) == "better on all 2"
-    assert report.verdict({"wrench": found["wrench"]}) == f"{report.UNTOLD}: wrench"
-    # What could not be compared is neither forgotten nor counted.
-    assert report.verdict({"mug": found["mug"], "clamp": None}) == f"better on 1 (mug), {report.UNTOLD}: clamp"
-    assert report.listed(["a", "b", "c"]) == "a, b and c"
-    assert report.listed([]) == "none"
-
-
 # --- results ----------------------------------------------------------------------------------------
 
 
@@ -521,36 +480,6 @@ def results(tmp_path):
         records.add(tmp_path, "paper", unit_rows(transfer, (30, 60, 70, 79 + shift)))
         records.add(tmp_path, "paper", unit_rows(Unit("cube", "pddm", "ours", seed), (0, 2, 2, 4), goals=50))
     return tmp_path
-
-
-def cells_of(path, task):
-    """The cells of the lines of a table that begin with an object."""
-    lines = [line for line in path.read_text().splitlines() if line.startswith(f"| {task}")]
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-
-
-def test_table1_shows_ours_beside_the_paper(results, capsys):
-    code, out, _ = run_script(table1.main, capsys, "--results", results)
-    assert code == 0
-    success, differences, deployed, other, *_, ways = cells_of(results / "table1.md", "mug")
-    assert success[1:5] == ["50.0 [40.0, 60.0]", "32.5 ± 8.4", "80.0 [70.0, 90.0]", "44.6 ± 3.9"]  # peak
-    assert success[5:] == ["20.0 [10.0, 30.0]", "10.0 ± 6.3", "80.0 [70.0, 90.0]", "44.6 ± 3.9"]  # final
-    assert differences[1:] == ["+30.0 [+30.0, +30.0]", "0.250", "+60.0 [+60.0, +60.0]", "0.250"]
-    assert deployed[3:] == ["+68.0 [+58.0, +78.0]", "0.250"]
-    assert ways[1:] == ["20.0 [10.0, 30.0]", "20.0 [20.0, 20.0]", "12.0 [12.0, 12.0]"]
-    assert other[1] == "20.0 [20.0, 20.0]"
-    assert "50.0 [40.0, 60.0]" in out
-    assert "32.5 $\\pm$ 8.4" in (results / "table1.tex").read_text()
-    assert cells_of(results / "table1.md", "banana")[0][1:3] == ["—", "28.4 ± 5.8"]  # no results yet: the paper alone
-    assert cells_of(results / "table1.md", "all six")[0][1:3] == ["—", "—"]
-    markdown = (results / "table1.md").read_text()
-    assert "Success on six objects, the paper's recipe" in markdown
-    assert "LCS-RL, our recipe: version 1, 3 seeds × 1000 goals (mug)" in markdown
-    assert "Computed: 12 trainings" in markdown  # mug only
-    assert "LCS-RL, our recipe, at the end against violation only, our recipe: better on 1 (mug), not" in markdown
-    assert "LCS-RL, our recipe, at the end against the paper's mean: better on 1 (mug), not compared" in markdown
-    deployed = "violation only, as Jin & Posa, in its support: better on 1 (mug), not compared"
-    assert f"LCS-RL, our recipe, at the end against {deployed}" in markdown
 
 
 def test_differences_are_of_whole_goals(tmp_path):
@@ -614,17 +543,6 @@ def test_only_what_can_be_compared_is(results):
         assert report.paired(a, other, "final") == []
     assert report.paired(a, records.select(rows, "cube", "violation", "ours"), "final") == []
     assert report.paired(a, None, "final") == []
-
-
-def test_results_round_trip(undisturbed, tmp_path):
-    rows = undisturbed[0][TRANSFER]
-    path = records.add(tmp_path, "smoke", rows)
-    pd.testing.assert_frame_equal(records.read(path), rows)
-    assert list(rows["at"]) == [0.2, 0.5]
-    assert set(rows.source) == {"stand_in"}
-    assert set(rows.key) == {undisturbed[1][TRANSFER].key}
-    assert set(rows.goals) == {TINY.goals}
-    assert (rows.minutes >= rows["at"]).all()
 
 
 def test_readme_is_filled_between_its_marks_only(tmp_path):

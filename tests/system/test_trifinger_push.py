@@ -150,24 +150,3 @@ def test_the_package_that_is_missing_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "trifinger_rl_datasets", None)
     with pytest.raises(MissingDependencyError, match=r"pip install trifinger-rl-datasets==1\.0\.3"):
         trifinger_rl.main(trifinger_rl.Options(policy="contact-mpc"))
-
-
-@pytest.mark.slow  # the simulator steps in real time on one core; nothing quicker shows that a torque moves the cube
-@pytest.mark.filterwarnings("ignore")
-def test_in_the_simulator_the_cube_goes_to_the_goal():
-    pytest.importorskip("trifinger_rl_datasets", reason="the simulator is not among the packages of this repository")
-    import gymnasium
-    from trifinger_push import PushPolicy
-
-    env = gymnasium.make(
-        "trifinger-cube-push-sim-expert-v0", disable_env_checker=True, visualization=False, flatten_obs=False
-    ).unwrapped
-    env.reset()
-    env.sim_env.platform.cube.set_state([0.0, 0.0, 0.0325], [0.0, 0.0, 0.0, 1.0])
-    env.sim_env.active_goal.position = np.array([-0.06, 0.05, 0.0325])
-    observation, _ = env.reset_fingers(500)
-    policy = PushPolicy(env.action_space, env.observation_space, 750)
-    policy.reset()
-    for _ in range(120):
-        observation, _, _, _, info = env.step(policy.get_action(observation))
-    assert info["has_achieved"]

@@ -32,9 +32,6 @@ def one_action(R=1.0, r=0.0, B=1.0, C=0.0, E=0.0, Q=0.0):
     return system, cost
 
 
-# --- the certificate ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("barrier", [0.0, 1e-2])
 @pytest.mark.parametrize("per_element", [False, True])
 def test_the_native_certificate_is_the_one_of_kkt(build, barrier, per_element):
@@ -80,9 +77,6 @@ def test_a_broken_element_has_a_large_residual():
         assert bool(torch.isfinite(value).all())
 
 
-# --- flat costs -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("backend", ["batched", "ipopt"])
 def test_an_action_without_cost_or_effect_is_degenerate_and_has_a_finite_gradient(backend):
     system, cost = one_action(Q=1.0)
@@ -103,9 +97,6 @@ def test_an_action_without_cost_or_effect_is_degenerate_and_has_a_finite_gradien
     single = QuadraticCost(cost.Q, matrix([1.0]), cost.Q_final)
     LCSMPCLayer(system, single, 3, -1.0, 1.0)(torch.tensor([[0.5], [-0.3]], dtype=F64)).u.square().sum().backward()
     torch.testing.assert_close(A.grad, alone.grad, rtol=1e-6, atol=1e-9)
-
-
-# --- autograd's own rules -------------------------------------------------------------------------------------------
 
 
 def differentiable(build, backend="batched"):
@@ -177,9 +168,6 @@ def test_nan_from_the_caller_goes_back_to_the_caller(build):
     plan = layer(inputs["x0"])
     (plan.x[:, -1] * torch.tensor([1.0, 1.0, torch.nan, 1.0, 1.0]).double()[:, None]).sum().backward()
     assert bool(torch.isnan(inputs["A"].grad).any())
-
-
-# --- time and threads -----------------------------------------------------------------------------------------------
 
 
 def test_a_thread_that_cannot_start_costs_speed_only():

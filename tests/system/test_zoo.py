@@ -43,9 +43,6 @@ def make_run(path, *, method="lcs-rl", finished=True, evaluated=True, init=None,
     return run
 
 
-# --- what ships -------------------------------------------------------------------------------------------------------
-
-
 def test_the_cube_is_there_and_everything_is_small():
     assert CUBE in zoo.names()
     assert list(zoo.names()) == sorted(zoo.names())
@@ -119,9 +116,6 @@ def test_evaluation_says_when_the_object_is_another(capsys, monkeypatch):
     assert f"its card: {100 * card.success_rate:.1f} % of {card.goals} goals" in captured.out
 
 
-# --- names ------------------------------------------------------------------------------------------------------------
-
-
 def test_a_path_that_exists_wins_over_a_name_but_not_over_the_prefix(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shipped = LCSModel.from_pretrained(CUBE)
@@ -152,9 +146,6 @@ def test_neither_the_library_nor_the_cards_import_the_training():
     )
     loaded = subprocess.check_output([sys.executable, "-c", code], text=True).split()
     assert not {"difflcs.rl", "safetensors", "gymnasium", "tyro"} & set(loaded)
-
-
-# --- adding -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_finished_run_becomes_a_model_with_its_card(tmp_path):
@@ -211,9 +202,6 @@ def test_the_command_on_a_card_gives_the_settings_back(monkeypatch):
     monkeypatch.setattr(cli_train, "train", lambda config, out, **_: seen.append(config) or RunDirectory(out))
     assert cli.main(words[1:]) == 0
     assert seen == [config]
-
-
-# --- command line -----------------------------------------------------------------------------------------------------
 
 
 def test_the_list(capsys):

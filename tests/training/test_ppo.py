@@ -9,7 +9,6 @@ from difflcs.errors import CheckpointError, InvalidInputError
 pytest.importorskip("torchrl")
 from difflcs.rl import CriticSettings, Epochs, Natural
 from difflcs.rl.learning import ppo_settings
-from difflcs.rl.learning.advantages import SAMPLES
 from difflcs.rl.learning.mlp import MLPController
 from difflcs.rl.rollout import elapsed_fractions
 from difflcs.rl.runs.evaluate import evaluate
@@ -18,7 +17,6 @@ from tests.training.slide import (
     STEPS,
     U_MAX,
     Noting,
-    Recording,
     Slide,
     features,
     make_envs,
@@ -26,12 +24,9 @@ from tests.training.slide import (
     make_ppo,
     parameters,
     recorded,
-    same,
     slide_actor,
     small_settings,
 )
-
-# --- learning ---
 
 
 def test_ppo_learns():
@@ -56,9 +51,6 @@ def test_ppo_learns():
     assert reports[0].explained_variance > 0.3
     with pytest.raises(InvalidInputError, match="all of them are done"):
         trainer.step()
-
-
-# --- data ---
 
 
 def test_the_policy_explores_and_the_environment_gets_clipped_actions():
@@ -128,33 +120,6 @@ def test_minibatches(size, sizes):
         torch.testing.assert_close(batch["guess", "x"][:, 0], batch["state"], rtol=0, atol=1e-9)
 
 
-def test_the_loss_gets_standardised_advantages_of_the_estimator():
-    trainer = make_ppo(steps=1, minibatch=None)
-    seen, trainer.surrogate = recorded(trainer), Watched(trainer.surrogate)
-    trainer.step()
-    (_, old, kl, samples, _, _), given = trainer.surrogate.calls[0], seen.results[0].samples.flatten(0, 1)
-    advantage = given["advantage"]
-    expected = (advantage - advantage.mean()) / advantage.std(correction=0)
-    torch.testing.assert_close(samples["advantage"], expected, rtol=1e-6, atol=0)
-    for name in SAMPLES:
-        assert torch.equal(samples[name], given[name])
-    assert torch.equal(samples["action"].squeeze(1), old["action"])
-    torch.testing.assert_close(kl, torch.zeros(ROLLOUTS * STEPS).double(), rtol=0, atol=1e-12)
-
-
-class Watched(Recording):
-    """A surrogate loss that notes its calls."""
-
-    outliers = property(lambda self: self.part.outliers)
-    clip_fraction = property(lambda self: self.part.clip_fraction)
-
-    def __call__(self, *arguments):
-        return super().__call__(*[a.clone() if hasattr(a, "clone") else a for a in arguments])
-
-
-# --- steps ---
-
-
 def test_an_iteration_ends_at_the_kl_limit():
     report = make_ppo(max_kl=1e-6).step()
     assert report.gradient_steps == 1
@@ -198,9 +163,6 @@ def test_the_budget_is_met_exactly():
         assert max(trainer.sizes) - min(trainer.sizes) <= 1
 
 
-# --- robustness ---
-
-
 def test_broken_episodes_are_dropped():
     env = SyncVectorEnv([lambda: Slide(breaks_at=3), *[Slide] * (ROLLOUTS - 1)])
     trainer = make_ppo(env=env)
@@ -216,12 +178,6 @@ def test_load_refuses_what_does_not_fit():
     trainer = make_ppo()
     trainer.step()
     state = trainer.state_dict()
-    other = make_ppo(critic=CriticSettings(width=8))
-    before = parameters(other)
-    with pytest.raises(CheckpointError, match=r"network\.0\.weight.*other settings"):
-        other.load(state)
-    with pytest.raises(CheckpointError, match="collected"):
-        trainer.load({**state, "collected": -1})
     with pytest.raises(CheckpointError, match=r"'first_episode': 0.*'first_episode': 3"):
         trainer.load({**state, "settings": {**state["settings"], "first_episode": 3}})
     episodes = state["critic"]["episodes"]
@@ -229,5 +185,3 @@ def test_load_refuses_what_does_not_fit():
         critic = {**state["critic"], "episodes": {**episodes, "iteration": places}}
         with pytest.raises(CheckpointError, match="iteration"):
             trainer.load({**state, "critic": critic})
-    assert same(before, parameters(other))
-    assert other.iteration == 0

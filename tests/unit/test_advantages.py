@@ -13,8 +13,6 @@ from tensordict import TensorDict
 from difflcs.errors import InvalidInputError
 from difflcs.rl import CriticSettings
 from difflcs.rl.learning.advantages import (
-    SAMPLES,
-    GAEAdvantages,
     MultiActionAdvantages,
     RewardScale,
     mirrored_actions,
@@ -26,9 +24,6 @@ from difflcs.rl.rollout import elapsed_fractions
 from difflcs.rl.seeding import seeded
 
 STEPS = 6
-
-
-# --- rewards ---
 
 
 @st.composite
@@ -72,9 +67,6 @@ def test_rewards_that_are_not_finite_are_refused(bad):
         RewardScale(3.0, 10.0, 0.1)(rewards, torch.ones(2, dtype=torch.bool))
 
 
-# --- GAE ---
-
-
 def make_critic(gamma: float = 0.9, zeta: float = 0.8) -> Critic:
     return Critic(CriticSettings(), 3, STEPS, gamma, zeta, (0, 5))
 
@@ -101,23 +93,6 @@ def test_advantages_are_the_papers():
     torch.testing.assert_close(returns(rewards, 0.9)[:, -1], rewards[:, -1])
 
 
-def test_gae_judges_the_actions_taken():
-    critic, inputs, rewards = make_critic(), some(5, STEPS + 1, 3), some(5, STEPS, seed=1)
-    taken = gaussian(5, STEPS)
-    taken["action_log_prob"] = some(5, STEPS, seed=2)
-    found = GAEAdvantages(critic)(TensorDict({"policy": taken}, [5]), inputs, rewards, (0,))
-    plain = critic.gae(inputs, rewards)
-    assert found.samples.batch_size == (5, STEPS, 1)
-    for name in SAMPLES:
-        assert torch.equal(found.samples[name].squeeze(2), taken[name])
-    assert torch.equal(found.samples["advantage"].flatten(2), plain.advantages.unsqueeze(-1))
-    assert torch.equal(found.values, plain.values)
-    assert torch.equal(found.rewards, rewards)  # as they are
-
-
-# --- many actions ---
-
-
 def gaussian(*shape: int, n_u: int = 3, seed: int = 0) -> TensorDict:
     """Samples of a Gaussian with a full covariance."""
     generator = torch.Generator().manual_seed(seed)
@@ -141,15 +116,6 @@ def test_actions_come_in_mirrored_pairs_the_one_taken_first():
     assert len(action.flatten(0, 2).unique(dim=0)) == 5 * 4 * 6
 
 
-def test_the_others_are_drawn_from_the_policy():
-    taken = gaussian(1).expand(20000)
-    with seeded((2,)):
-        offsets = mirrored_actions(taken, 4)["action"][:, 2] - taken["loc"]
-    factor = taken["scale_tril"][0]
-    torch.testing.assert_close(offsets.T.cov(), factor @ factor.mT, rtol=0.05, atol=0.03)
-    assert float(offsets.mean(0).abs().max()) < 0.05
-
-
 def test_advantages_are_those_of_the_formula():
     generator = torch.Generator().manual_seed(0)
     q = torch.randn(7, 5, 4, generator=generator, dtype=torch.float64)
@@ -165,9 +131,6 @@ def test_advantages_are_those_of_the_formula():
     torch.testing.assert_close(found, expected)
     immediate = multi_action_advantages(q, values, 0.9, 0.0)
     torch.testing.assert_close(immediate, q - q.mean(-1, keepdim=True))
-
-
-# --- in episodes whose alternatives are known ---
 
 
 BOUND = 0.5
@@ -231,22 +194,6 @@ def quality(estimator, episodes, action: torch.Tensor) -> torch.Tensor:
     return torch.stack(columns, 1)
 
 
-def test_the_action_taken_is_judged_by_what_it_led_to():
-    episodes, inputs, rewards, estimator, found = judged()
-    following = estimator.critic.values(inputs[:, 1:]).detach()
-    following[:, -1] = 0
-    advantage = found.samples["advantage"].squeeze(-1)
-    assert advantage.shape == (10, STEPS, 4)
-    torch.testing.assert_close(advantage.mean(-1), torch.zeros(10, STEPS).double(), rtol=0, atol=1e-12)
-    taken = quality(estimator, episodes, episodes["policy", "action"])
-    torch.testing.assert_close(taken, rewards + 0.9 * following, rtol=1e-5, atol=1e-6)
-    # Up to the mean over the four, which is the state's: with a pair of actions it is half of their difference.
-    episodes, _, _, estimator, found = judged(actions=2)
-    image = quality(estimator, episodes, found.samples["action"][:, :, 1])
-    expected = 0.5 * (taken - image)
-    torch.testing.assert_close(found.samples["advantage"][:, :, 0, 0], expected, rtol=1e-5, atol=1e-6)
-
-
 def test_all_actions_are_judged_and_corrected_by_later_values():
     """The formula, with q of each action computed on its own."""
     episodes, inputs, _, estimator, found = judged(zeta=0.7)
@@ -263,29 +210,3 @@ def test_rewards_to_fit_values_to_are_without_the_action_advantage():
     advantage = found.samples["advantage"][:, :, 0, 0]
     assert float(advantage.abs().max()) > 1e-3
     torch.testing.assert_close(found.rewards, rewards - advantage)
-
-
-def test_judged_actions_depend_on_the_key_alone():
-    episodes, inputs, rewards, estimator, found = judged()
-    torch.manual_seed(5)
-    again = estimator(episodes, inputs, rewards, (0, 6)).samples["action"]
-    assert torch.equal(again, found.samples["action"])
-    assert not torch.equal(estimator(episodes, inputs, rewards, (0, 7)).samples["action"], again)
-
-
-def test_the_gradient_has_less_noise_than_that_of_gae():
-    """In a known world, one step long: the same mean of the score times the advantage, a fraction of its variance."""
-    count, std = 20000, 0.4
-    mean, target = torch.zeros(count, 1).double(), 0.3
-    taken = TensorDict({"loc": mean, "scale_tril": torch.full((count, 1, 1), std).double()}, [count])
-    taken["action"] = mean + std * some(count, 1)
-    with seeded((4,)):
-        action = mirrored_actions(taken, 4)["action"].squeeze(-1)
-    q = -(action - target).square()
-    values = torch.full((count, 1), -(std**2 + target**2)).double()
-    advantage = multi_action_advantages(q.unsqueeze(1), values, 0.9, 0.0).squeeze(1)
-    many = (advantage * action / std**2).mean(1)  # the scores of a pair cancel, so that no baseline biases it
-    gae = (q[:, 0] - values[:, 0]) * action[:, 0] / std**2
-    for gradient in (gae, many):
-        assert float(gradient.mean()) == pytest.approx(2 * target, abs=4 * float(gradient.std()) / count**0.5)
-    assert float(many.std()) < 0.6 * float(gae.std())

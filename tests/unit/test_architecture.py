@@ -121,9 +121,6 @@ def packages_of(edges: dict[str, set[str]], package: str, other: str) -> dict[st
     }
 
 
-# --- the reader -------------------------------------------------------------------------------------------------------
-
-
 def test_the_graph_has_what_is_known_to_be_in_it():
     edges = graph(functions=False)
     assert "difflcs.errors" in edges["difflcs.lcs"]
@@ -134,23 +131,10 @@ def test_the_graph_has_what_is_known_to_be_in_it():
     assert "difflcs.rl.learning.critic" not in edges["difflcs.rl.learning.advantages"]
 
 
-def test_a_circle_would_be_found():
-    assert cycles({"a": {"b"}, "b": {"c"}, "c": set()}) == []
-    assert cycles({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == [["b", "c", "b"]]
-    code = "if TYPE_CHECKING:\n    import a\nelse:\n    import b\ndef f():\n    import c\n"
-    code += "try:\n    import d\nexcept ImportError:\n    import e\n"
-    found = {(node.names[0].name, top) for node, top in imports(ast.parse(code))}
-    assert found == {("b", True), ("c", False), ("d", True), ("e", True)}
-    assert ("a", True) in {(node.names[0].name, top) for node, top in imports(ast.parse(code), types=True)}
-
-
 def layer_of(module: str) -> int | None:
     """Index in `LAYERS`; None for helpers and the root."""
     below = module.removeprefix("difflcs.") + "."
     return next((i for i, names in enumerate(LAYERS) if any(below.startswith(f"{name}.") for name in names)), None)
-
-
-# --- what holds -------------------------------------------------------------------------------------------------------
 
 
 def test_no_circle_of_imports():

@@ -72,9 +72,6 @@ def test_physics_is_found_by_both_losses(pushes, loss):
     assert found["drive_compliance"][0][0] == pytest.approx(0.5, abs=0.1)
 
 
-# --- what a task tells ------------------------------------------------------------------------------------------------
-
-
 def test_a_description_of_physics_is_checked():
     for wrong, error in (
         ({"make_system": 3}, DTypeError),
@@ -123,9 +120,6 @@ def test_what_was_learned_of_another_object_is_refused():
     broken = {**state, "change.friction": torch.full((1,), torch.nan, dtype=F64)}
     with pytest.raises(CheckpointError, match="expected finite"):
         method.rebuild(task(0.03), configuration(learned), broken, "here")
-
-
-# --- learning ---------------------------------------------------------------------------------------------------------
 
 
 def test_it_learns_how_a_point_slides():

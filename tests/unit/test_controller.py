@@ -354,19 +354,6 @@ def test_the_fallback_is_inside_the_bounds_of_the_first_stage(build):
 # --- more than one ----------------------------------------------------------------------------------------------------
 
 
-def test_controllers_are_independent_and_a_reset_is_a_fresh_one(plain):
-    alone, one, two = plain.controller(), plain.controller(), plain.controller()
-    for x in states(6):
-        wanted = alone.step(x)
-        two.step(-x), two.step(NAN)
-        assert np.array_equal(one.step(x), wanted)
-    two.reset()
-    assert two.status is two.plan is None
-    fresh = plain.controller()
-    for x in states(6, seed=3):
-        assert np.array_equal(two.step(x), fresh.step(x))
-
-
 def test_actions_and_plans_are_the_callers(plain):
     controller, (x, y) = plain.controller(), states(2)
     u = controller.step(x)
@@ -405,23 +392,6 @@ def test_a_second_thread_is_refused(build):
 
 
 # --- arguments --------------------------------------------------------------------------------------------------------
-
-
-def test_arrays_of_every_kind(plain):
-    wanted = plain.controller().step(np.array([0.5, 0.25, -0.5, 0.125]))
-    wide = np.zeros((4, 3))
-    wide[:, 1] = [0.5, 0.25, -0.5, 0.125]
-    frozen = np.array([0.5, 0.25, -0.5, 0.125])
-    frozen.flags.writeable = False
-    for x in (
-        [0.5, 0.25, -0.5, 0.125],
-        np.array([0.5, 0.25, -0.5, 0.125], np.float32),
-        np.array([0.5, 0.25, -0.5, 0.125], ">f8"),
-        torch.tensor([0.5, 0.25, -0.5, 0.125], requires_grad=True),
-        wide[:, 1],
-        frozen,
-    ):
-        assert np.array_equal(plain.controller().step(x), wanted)
 
 
 @pytest.mark.parametrize(

@@ -166,11 +166,6 @@ def test_processes_decompose_a_mesh_once(stl, tmp_path):
     assert [entry.name for entry in (tmp_path / "cache").iterdir()] == ["parts"]
 
 
-def test_millimetres(stl):
-    box = trimesh.creation.box((60, 40, 30))
-    np.testing.assert_allclose(np.sort(make(stl(box), mesh_scale=0.001).object.solid.size), [0.03, 0.04, 0.06])
-
-
 @pytest.mark.parametrize(("pose", "height"), [("lying", 15), (0, 15), (2, 20), (4, 30), ("upright", 30)])
 def test_rest_poses_of_a_box(stl, pose, height):
     env = make(stl(trimesh.creation.box((0.04, 0.03, 0.06))), rest_pose=pose)
@@ -377,25 +372,6 @@ def test_the_pivot_turns_and_stays():
 
 
 # --- physics against the measured facts -----------------------------------------------------------
-
-
-@pytest.mark.parametrize(("kp", "force"), [(1000.0, 0.45), (2500.0, 1.07), (6000.0, 2.4)])
-def test_force_of_a_blocked_fingertip(kp, force):
-    """Against a cube that is too heavy to move, when the tip has come to rest there."""
-    env = TriFingerMoveCubeEnv(osc_kp=kp, object_mass=50.0, reset_noise=0.0, horizon=200)
-    env.reset(seed=0)
-    push = np.concatenate([-0.015 * OUTWARD[0], np.zeros(4)])
-    for _ in range(80):
-        env.step(push)
-    import mujoco
-
-    total = 0.0
-    for i in range(env.data.ncon):
-        if {int(g) for g in env.data.contact[i].geom} == {env.model.geom("object").id, env.model.geom("finger_0").id}:
-            wrench = np.zeros(6)
-            mujoco.mj_contactForce(env.model, env.data, i, wrench)
-            total += wrench[0]
-    assert total == pytest.approx(force, rel=0.11)
 
 
 def test_pulling_at_the_end_of_the_reach_stays_finite():

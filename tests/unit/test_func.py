@@ -35,9 +35,6 @@ def close(found, expected):
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-11, check_stride=False)
 
 
-# --- vmap -----------------------------------------------------------------------------------------------------------
-
-
 def test_vmap_is_a_batch(layer, x0):
     plain = layer(x0)
     close(vmap(lambda x: layer(x).u)(x0), plain.u)
@@ -47,16 +44,6 @@ def test_vmap_is_a_batch(layer, x0):
     close(vmap(vmap(lambda x: layer(x).u))(x0.reshape(2, 3, 4)), plain.u.reshape(2, 3, 3, 2))
     close(vmap(lambda x: layer(x).u, chunk_size=4)(x0), plain.u)
     close(vmap(lambda x: layer(x).u)(x0.reshape(2, 3, 4)), plain.u.reshape(2, 3, 3, 2))
-
-
-def test_vmap_returns_a_whole_solution(layer, x0):
-    plain, mapped = layer(x0), vmap(layer)(x0)
-    assert isinstance(mapped, MPCSolution)
-    for name in ("x", "u", "lam", "mu", "objective", "status", "iterations", "violation"):
-        close(getattr(mapped, name), getattr(plain, name))
-    assert mapped.complementarity().shape == (6,)
-    assert float(mapped.dynamics_residual().max()) < 1e-10
-    assert bool(mapped.converged.all())
 
 
 def test_vmap_over_systems_states_and_both(build, layer, x0, systems):
@@ -124,9 +111,6 @@ def test_failures_are_reported_inside(layer, x0):
     assert float(found[[0, 2]].detach().abs().amax(1).min()) > 0
 
 
-# --- gradients ------------------------------------------------------------------------------------------------------
-
-
 def test_grad_is_backward(layer, x0):
     leaf = x0.clone().requires_grad_()
 
@@ -144,16 +128,10 @@ def test_grad_is_backward(layer, x0):
     close(vmap(grad(loss), in_dims=1, out_dims=1)(x0.T), plain.T)
 
 
-# --- second derivatives ---------------------------------------------------------------------------------------------
-
-
 def test_a_gradient_inside_a_loss_is_refused_even_where_the_loss_is_linear(layer, x0):
     """The gradient of the objective does not move linearly with x0; a constant would be wrong in silence."""
     with pytest.raises(e.DoubleBackwardError):
         grad(lambda x: grad(lambda y: layer(y).objective)(x).sum())(x0[0])
-
-
-# --- what would be wrong in silence ----------------------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # torch's own, in forward mode
@@ -186,9 +164,6 @@ def test_a_plan_is_measured_by_the_system_it_was_planned_with(layer, x0):
         with torch.no_grad():
             for p, value in zip(layer.parameters(), saved, strict=True):
                 p.copy_(value)
-
-
-# --- torch.compile --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -22,9 +22,6 @@ def definite(n, seed, skew=0.5):
     return G @ G.T + 0.3 * torch.eye(n, dtype=torch.float64) + skew * (H - H.T)
 
 
-# --- values ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", ["lcp-plain", "lcp-degenerate", "lcp-graded", "lcp-p-matrix"])
 def test_exact_solution_equals_enumeration(build, kind):
     for seed in range(4):
@@ -48,9 +45,6 @@ def test_relaxed_scalar_has_its_closed_form():
     torch.testing.assert_close(lam, torch.where(q > 0, 2e-3 / (q + root), (root - q) / 6), rtol=1e-12, atol=0)
 
 
-# --- gradients ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("relaxation", [0.0, 1e-3, 1.0])
 @pytest.mark.parametrize("shared", [True, False], ids=["shared", "per-element"])
 def test_gradcheck_in_F_and_q(build, relaxation, shared):
@@ -64,15 +58,6 @@ def test_gradcheck_in_F_and_q(build, relaxation, shared):
 
 def jacobian_q(F, q):
     return torch.autograd.functional.jacobian(lambda p: solve_lcp(F, p).lam, q)
-
-
-def test_gradient_at_q_zero_is_that_of_the_inactive_piece():
-    F = definite(4, 0).requires_grad_()
-    q = torch.zeros(4, dtype=torch.float64, requires_grad=True)
-    lam, w, _ = solve_lcp(F, q)
-    grad_F, grad_q = torch.autograd.grad((2 * lam + 3 * w).sum(), (F, q))
-    assert torch.equal(grad_q, torch.full((4,), 3.0, dtype=torch.float64))
-    assert torch.equal(grad_F, torch.zeros(4, 4, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -89,9 +74,6 @@ def test_gradient_at_a_kink_is_the_one_sided_derivative_of_the_inactive_side(bui
     for i in (3, 4):  # one-sided difference quotients of the solution itself, exact since it is piecewise linear
         step = 1e-5 * torch.eye(5, dtype=torch.float64)[i]
         torch.testing.assert_close(found[:, i], (solve_lcp(F, q + step).lam - lam) / 1e-5, rtol=1e-6, atol=1e-8)
-
-
-# --- batches --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("relaxation", [0.0, 1e-5])
@@ -138,9 +120,6 @@ def test_an_empty_batch_gives_empty_results_and_zero_gradient(relaxation, batch)
     lam.sum().backward()
     assert torch.equal(F.grad, torch.zeros(4, 4, dtype=torch.float64))
     assert q.grad.shape == q.shape
-
-
-# --- failures -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("relaxation", [0.0, 1e-4])

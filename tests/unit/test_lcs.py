@@ -1,13 +1,11 @@
 """LCSParams and LCSModel: the equations, their gradients, and what a module must survive."""
 
 import copy
-import dataclasses
-import pickle
 
 import pytest
 import torch
 
-from difflcs import LCSModel, LCSParams
+from difflcs import LCSModel
 from difflcs.errors import (
     BoundsError,
     CheckpointError,
@@ -23,15 +21,6 @@ NAMES = ("A", "B", "C", "d", "D", "E", "G", "H", "c")
 @pytest.fixture
 def model(build):
     return build.model(seed=3)
-
-
-@pytest.fixture
-def data(build):
-    n = build.normal(5)
-    return n(6, 4), n(6, 2)
-
-
-# --- parametrisation ------------------------------------------------------------------------------------------------
 
 
 def test_a_new_model_has_the_documented_start():
@@ -52,28 +41,6 @@ def test_the_generator_alone_decides_the_start():
     assert torch.equal(first.A, second.A)
     assert torch.equal(first.H, second.H)
     assert not torch.equal(first.A, other.A)
-
-
-# --- modules --------------------------------------------------------------------------------------------------------
-
-
-def loaded(model):
-    other = LCSModel(4, 2, 3, stiffness=0.2)
-    other.load_state_dict(model.state_dict())
-    return other
-
-
-@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m)), loaded])
-def test_copies_pickles_and_state_dicts_are_the_same_model(model, data, copied):
-    twin, before = copied(model), model(*data).x_next.detach()
-    assert set(twin.state_dict()) == set(NAMES)
-    assert repr(twin) == repr(model) == "LCSModel(n_x=4, n_u=2, n_lam=3, stiffness=0.2)"
-    assert twin.config() == model.config()
-    assert torch.equal(twin(*data).x_next, before)
-    if copied is not copy.copy:  # no memory is shared
-        with torch.no_grad():
-            twin.A.add_(1.0)
-        assert torch.equal(model(*data).x_next, before)
 
 
 @pytest.mark.parametrize("stiffness", [None, 1e-3])
@@ -104,26 +71,6 @@ def test_from_params_refuses_a_batch_of_systems(build):
     with pytest.raises(ShapeError, match=r"no batch dimensions, got \(2,\)"):
         LCSModel.from_params(build.params(batch=(2,)))
 
-
-# --- LCSParams ------------------------------------------------------------------------------------------------------
-
-
-def test_params_are_a_frozen_record(build):
-    params = build.params()
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        params.A = params.A
-    assert (params.n_x, params.n_u, params.n_lam) == (4, 2, 3)
-    assert list(params.tensors()) == ["A", "B", "C", "d", "D", "E", "F", "c"]
-
-
-def test_params_batch_shape_broadcasts_the_fields(build):
-    tensors = build.lcs_tensors()
-    assert LCSParams(**tensors).batch_shape == ()
-    each = {**tensors, "d": tensors["d"].expand(5, 4), "F": tensors["F"].expand(2, 1, 3, 3)}
-    assert LCSParams(**each).batch_shape == (2, 5)
-
-
-# --- the actions that a model was fitted to -------------------------------------------------------------------------
 
 SUPPORT = torch.tensor([[-0.1, -0.2], [0.05, 0.3]], dtype=torch.float64)
 

@@ -63,6 +63,16 @@ def by_enumeration(params, x, u, x_next, gamma, xi):
 # --- one system per transition --------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("part", [0.05, 0.5, 0.99])
+@pytest.mark.parametrize("xi", [1e-3, 0.3])
+def test_each_transition_has_the_loss_of_its_own_system(each, data, part, xi):
+    gamma = part * float(sigma(each.F).min())
+    found = violation_loss(each, *data, gamma, xi, reduction="none")
+    expected = [by_enumeration(each[i], *(v[i] for v in data), gamma, xi) for i in range(COUNT)]
+    torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), rtol=1e-8, atol=1e-8)
+    assert float(found.min()) > 0.01
+
+
 @pytest.mark.parametrize("function", [violation_loss, prediction_loss])
 @pytest.mark.parametrize("own", [NAMES, ("A", "F"), ("C",), ("c", "d")], ids="-".join)
 def test_the_gradient_is_that_of_finite_differences_in_every_input(build, function, own):

@@ -71,9 +71,6 @@ def test_a_problem_alone_has_the_numbers_that_it_has_among_others(build, name):
                     assert getattr(alone, key)[0] == getattr(result, key)[i]
 
 
-# --- limits -----------------------------------------------------------------------------------------------------------
-
-
 def one_state_from(x0, growth, stage, least):
     """x₊ = growth x + u with |u| ≤ 1 over three steps, and x ≥ least asked for at one stage."""
     one = torch.ones(1, 1, dtype=torch.float64)
@@ -150,14 +147,3 @@ def test_limits_far_from_the_actions_that_they_act_through_are_met(weight, limit
     expected = {0.05: 12.038, 0.03: 13.954 if weight == 1e2 else 13.958}[limit]
     assert float(plan.objective) == pytest.approx(expected, abs=2e-3)
     assert int(plan.iterations) < 100
-
-
-def test_a_warm_start_takes_the_multipliers_along():
-    problem = random_case(2, 20).problem()
-    cold = BATCHED.solve(problem, None)
-    warm = BATCHED.solve(problem, cold.primal)
-    without = BATCHED.solve(problem, cold.primal._replace(mu=torch.zeros_like(cold.primal.mu)))
-    solved = cold.solved & warm.solved & without.solved
-    torch.testing.assert_close(warm.primal.u[solved], cold.primal.u[solved], rtol=0, atol=1e-7)
-    means = [float(r.iterations[solved].double().mean()) for r in (warm, without, cold)]
-    assert means[0] < 0.5 * means[1] <= means[2]

@@ -10,7 +10,6 @@ import torch
 
 mujoco = pytest.importorskip("mujoco")
 
-from difflcs import LCSModule  # noqa: E402
 from difflcs.errors import (  # noqa: E402
     ContactWarning,
     DTypeError,
@@ -354,50 +353,6 @@ def test_an_actuator_is_a_servo_only_by_an_affine_bias():
 # --- motion with velocities -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("relative", [True, False])
-def test_servos_and_velocity_actuators_are_mujocos(relative):
-    rest = '<actuator><position joint="px" kp="30" kv="2" gear="2"/><velocity joint="py" kv="5"/></actuator>'
-    model = load(PUSHER.format(tip=""), rest, 'integrator="RK4"')
-    module = MujocoLCS(model, motion="dynamic", relative=relative)
-    x, u = tensor(0.3, -0.1, 0.2, 0.1), tensor(0.05, 0.4)
-    ctrl = module.control(x, u)
-    torch.testing.assert_close(ctrl, tensor(0.65, 0.4) if relative else u)
-    after = np.concatenate(step(model, x[:2], x[2:], ctrl.numpy()))
-    np.testing.assert_allclose(module.params(x).step(x, u).x_next, after, atol=2e-3)
-    # Two steps: a relative action counts from where the joint is by then.
-    second = module.params(x).rollout(x, torch.stack([u, u]))[-1]
-    ctrl = module.control(torch.from_numpy(after), u)
-    again = np.concatenate(step(model, after[:2], after[2:], ctrl.numpy()))
-    np.testing.assert_allclose(second, again, atol=4e-3)
-
-
-LIMITED = {  # actuators, whether actions are relative, place, action
-    "a motor that cannot rest": ('<motor joint="px" ctrlrange="0.1 1"/>', True, 0.0, 0.5),
-    "a servo out of its range": ('<position joint="px" kp="50" kv="5" ctrlrange="-.1 .1"/>', True, 0.15, -0.08),
-    "a servo by its target": ('<position joint="px" kp="50" kv="5" ctrlrange=".2 .6"/>', False, 0.3, 0.4),
-    "a force on a tendon": (
-        '<position tendon="t" kp="100"/>'
-        '</actuator><tendon><fixed name="t" actuatorfrclimited="true" actuatorfrcrange="-5 5">'
-        '<joint joint="px" coef="1"/></fixed></tendon><actuator>',
-        True,
-        0.1,
-        0.12,
-    ),
-}
-
-
-@pytest.mark.parametrize("case", LIMITED)
-def test_an_actuator_acts_though_it_is_limited(case):
-    actuator, relative, place, action = LIMITED[case]
-    model = load(PUSHER.format(tip=""), f"<actuator>{actuator}</actuator>")
-    module = MujocoLCS(model, motion="dynamic", relative=relative, seconds=0.02)
-    x, u = tensor(place, 0.0, 0.0, 0.0), tensor(action)
-    after = np.concatenate(step(model, x[:2], x[2:], module.control(x, u).numpy(), 0.02))
-    assert abs(after[2]) > 0.02
-    np.testing.assert_allclose(module.params(x).step(x, u).x_next, after, rtol=0.05, atol=1e-3)
-    assert bool(model.actuator_ctrllimited[0]) == ("ctrlrange" in actuator)
-
-
 def test_forces_in_the_data_act_in_dynamic_motion_alone():
     model = load('<body><freejoint name="b"/><geom size=".05" mass="1"/></body>')
     data = mujoco.MjData(model)
@@ -414,37 +369,7 @@ def test_forces_in_the_data_act_in_dynamic_motion_alone():
     torch.testing.assert_close(MujocoLCS(pushed, data).params(x).step(x, u).x_next, without)
 
 
-def test_a_body_in_the_air_falls_and_turns():
-    model = load('<body><freejoint name="b"/><geom type="box" size=".1 .2 .3" mass="1"/></body>')
-    reference = np.array([0, 0, 0, 0.8, 0.6, 0, 0])
-    data = mujoco.MjData(model)
-    data.qpos[:] = reference
-    module = MujocoLCS(model, data, motion="dynamic", seconds=0.02, pairs=[])
-    qpos, qvel = np.array([1, 2, 3, *np.array([0.5, 0.5, 0.5, 0.5])]), np.array([0.3, 0.2, 1.0, 1.0, 2.0, -1.5])
-    x = module.state.to_state(qpos, qvel)
-    after = module.state.to_state(*step(model, qpos, qvel, 0.0, 0.02))
-    predicted = module.params(x).step(x, torch.zeros(0).double()).x_next
-    assert (after - x)[3:6].abs().max() > 0.03
-    torch.testing.assert_close(predicted, after, atol=2e-3, rtol=0)
-    torch.testing.assert_close(predicted[:3], after[:3], atol=2e-4, rtol=0)
-
-
 # --- as a module ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("motion", ["quasi-static", "dynamic"])
-def test_a_batch_is_its_elements(motion):
-    module = MujocoLCS(pushing(), motion=motion)
-    assert isinstance(module, LCSModule)
-    random = np.random.default_rng(0)
-    x = torch.from_numpy(random.uniform(-0.1, 0.1, (2, 3, module.n_x)))
-    system = module.params(x)
-    assert (system.n_x, system.n_u, system.n_lam) == (module.n_x, module.n_u, module.n_lam)
-    for i, j in itertools.product(range(2), range(3)):
-        one = module.params(x[i, j])
-        u = tensor(0.01, 0.02)
-        torch.testing.assert_close(one.step(x[i, j], u).x_next, system.step(x, u).x_next[i, j])
-        assert one.C.ndim == 2
 
 
 def test_single_precision_comes_back_single():

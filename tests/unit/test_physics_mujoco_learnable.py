@@ -8,6 +8,7 @@ import torch
 
 mujoco = pytest.importorskip("mujoco", reason="needs the extra [envs]")
 
+from difflcs import GoalCost, LCSMPCLayer  # noqa: E402
 from difflcs.errors import InvalidInputError  # noqa: E402
 from difflcs.physics.mujoco import LearnableMujocoLCS, MujocoLCS  # noqa: E402
 
@@ -77,13 +78,12 @@ def test_it_is_the_system_of_the_changed_model(motion, learn, change, changed):
     assert moved > 1e-4
 
 
-@pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize(("motion", "tolerance"), [("dynamic", 0.02), ("quasi-dynamic", 1e-4)])
-def test_gradients_are_slopes_of_the_matrices(motion, tolerance, seed):
+def test_gradients_are_slopes_of_the_matrices(motion, tolerance):
     learn = [("mass", "cube"), ("friction", "block"), ("size", "tip"), ("center_of_mass", "cube"), "gain", "compliance"]
     learned = LearnableMujocoLCS(scene(), learn=learn, motion=motion, **OPTIONS)
-    x, ctrl = states(learned.n_x, seed)[:1].requires_grad_(), torch.full((1,), 0.01, dtype=F64, requires_grad=True)
-    generator = torch.Generator().manual_seed(seed)
+    x, ctrl = states(learned.n_x, seed=1)[:1].requires_grad_(), torch.full((1,), 0.01, dtype=F64, requires_grad=True)
+    generator = torch.Generator().manual_seed(1)
     weights = {k: torch.randn(v.shape, generator=generator, dtype=F64) for k, v in learned.params(x).tensors().items()}
 
     def total(change, x, ctrl):
@@ -100,6 +100,20 @@ def test_gradients_are_slopes_of_the_matrices(motion, tolerance, seed):
             ends = torch.tensor([float(total(*at)) for at in moved], dtype=F64)
         slopes = ((ends[::2] - ends[1::2]) / 2e-4).reshape(gradient.shape)
         torch.testing.assert_close(gradient, slopes, rtol=tolerance, atol=1e-9 + tolerance * float(slopes.abs().max()))
+
+
+def test_a_plan_has_a_gradient():
+    learned = LearnableMujocoLCS(scene(), learn=["gain", ("mass", "cube")], motion="quasi-dynamic", **OPTIONS)
+    cost = GoalCost.reach(7, 1, goal_weight=(100.0,), input_weight=0.1)
+    mpc = LCSMPCLayer(learned, cost, 3, -0.1, 0.1)
+    x, goal = states(7)[:2], torch.tensor([0.05], dtype=F64)
+    mpc(x, goal).u.sum().backward()
+    ends = []
+    for sign in (1, -1):
+        with torch.no_grad():
+            learned.change.copy_(torch.tensor([2e-4 * sign, 0.0]))
+            ends.append(float(mpc(x, goal).u.sum()))
+    assert learned.change.grad[0] == pytest.approx((ends[0] - ends[1]) / 4e-4, rel=1e-2)
 
 
 def test_it_counts_rotations_from_where_things_are():

@@ -147,14 +147,6 @@ def test_the_cost_of_standing_still_and_what_a_plan_saves_are_those_of_the_mpc(b
     assert decision.gain == pytest.approx(float(decision.gains[0]) / decision.standing)
 
 
-def test_nothing_is_to_be_gained_at_the_goal():
-    policy = on_a_line()
-    u = policy.act([1.0, 0.49], [1.0])
-    assert policy.decision.mode is Mode.PUSH
-    assert abs(float(u[0])) < 0.02  # the relaxed contact pushes a little without touching
-    assert float(policy.decision.gains.max()) < 1e-6
-
-
 @pytest.mark.parametrize("right", [True, False])
 def test_a_place_that_is_not_allowed_is_not_chosen(right):
     policy = on_a_line(Sides(allowed=(right, False)))
@@ -234,15 +226,6 @@ def test_what_is_not_solved_is_not_chosen():
     failed = ~policy.decision.solution.converged
     assert bool(failed.any())
     assert bool((policy.decision.gains[failed] == -math.inf).all())
-
-
-def test_reset_forgets_the_journey():
-    policy = on_a_line()
-    policy.act([0.0, 0.51], [1.0])
-    policy.reset()
-    assert policy.decision is None
-    policy.act([0.0, -0.51], [1.0])
-    assert policy.decision.mode is Mode.PUSH
 
 
 # --- the loop, in the plane -------------------------------------------------------------------------------------------

@@ -13,11 +13,10 @@ from difflcs.errors import DTypeError, InvalidInputError
 
 pytest.importorskip("torchrl")
 from tensordict import TensorDict
-from torchrl.data import Unbounded
+from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from difflcs.rl.learning.mlp import MLPController
-from difflcs.rl.learning.policy import LCSMPCPolicy, MLPPolicy
+from difflcs.rl.learning.policy import LCSMPCPolicy
 
 U_MAX = 0.1
 STD = 0.02
@@ -37,29 +36,6 @@ def observations(*batch: int) -> TensorDict:
     return TensorDict({"state": state, "goal": goal}, batch)
 
 
-@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
-def test_keys_shapes_and_specs(mpc, batch):
-    policy = LCSMPCPolicy(mpc, STD)
-    assert policy.in_keys == ["state", "goal"]
-    data = policy(observations(*batch))
-    assert set(policy.out_keys) <= set(data.keys(True, True))
-    shapes = {key: tuple(data[key].shape[len(batch) :]) for key in data.keys(True, True)}
-    assert shapes == {
-        "state": (2,),
-        "goal": (1,),
-        "action": (2,),
-        "action_log_prob": (),
-        "loc": (2,),
-        "scale_tril": (2, 2),
-        "converged": (1,),
-        ("plan", "x"): (5, 2),
-        ("plan", "u"): (4, 2),
-        ("plan", "lam"): (4, 2),
-    }
-    assert policy.spec["action"] == Unbounded(torch.Size([2]), dtype=torch.float64)
-    assert bool(data["converged"].all())
-
-
 def test_mean_is_the_mpcs_action_and_noise_is_gaussian(mpc):
     policy = LCSMPCPolicy(mpc, torch.tensor([0.01, 0.03], dtype=torch.float64))
     one = observations()
@@ -74,6 +50,14 @@ def test_mean_is_the_mpcs_action_and_noise_is_gaussian(mpc):
     z = noise / policy.std
     expected = -0.5 * z.square().sum(-1) - policy.std.log().sum() - math.log(2 * math.pi)
     torch.testing.assert_close(many["action_log_prob"], expected)
+
+
+def test_a_layer_is_a_tensordict_module(mpc):
+    module = TensorDictModule(mpc, ["state", "goal"], ["plan"])
+    data = module(observations(5, 3))
+    assert torch.equal(data["plan", "u"], mpc(data["state"], data["goal"]).u)
+    data["plan", "objective"].sum().backward()
+    assert module.get_parameter("module.lcs.A").grad.abs().sum() > 0
 
 
 def test_deterministic_mode_is_the_mean(mpc):
@@ -96,64 +80,6 @@ def test_log_probability_is_that_of_the_unclipped_sample(mpc):
     torch.testing.assert_close(again, data["action_log_prob"])
     outside = ~inside
     assert bool((policy.get_dist(observations(200)).log_prob(clipped)[outside] != again[outside]).all())
-
-
-def test_a_guess_leads_back_to_the_rollouts_optimum(mpc):
-    """Re-solved from the plan, the ratio is one and the solver has nothing to do; the guess is really used."""
-    policy = LCSMPCPolicy(mpc, STD)
-    with torch.no_grad():
-        data = policy(observations(30))
-    warm = data.select("state", "goal")
-    warm["guess"] = data["plan"]
-    log_prob = policy.get_dist(warm).log_prob(data["action"])
-    torch.testing.assert_close(log_prob, data["action_log_prob"], rtol=0, atol=1e-9)
-    seen = []
-    mpc.register_forward_hook(lambda _, __, kwargs, out: seen.append(out.iterations.max()), with_kwargs=True)
-    policy.get_dist(warm)
-    policy.get_dist(observations(30))
-    assert seen[0] < seen[1]
-
-
-def test_gradients_are_those_of_finite_differences(mpc):
-    policy = LCSMPCPolicy(mpc, STD, covariance="full")
-    with torch.no_grad():
-        policy.gaussian.mixing.copy_(torch.tensor([[9.0, 9.0], [0.4, 9.0]]))  # only the entry below the diagonal counts
-        data = policy(observations(8))
-    tril = policy.gaussian.scale_tril().detach()
-    assert torch.equal(tril, tril.tril())
-
-    def log_prob():
-        warm = data.select("state", "goal")
-        warm["guess"] = data["plan"]
-        return policy.get_dist(warm).log_prob(data["action"]).sum()
-
-    log_prob().backward()
-    for parameter, index in [
-        (mpc.lcs.B, (0, 0)),
-        (mpc.lcs.A, (1, 0)),
-        (policy.gaussian.log_std, (1,)),
-        (policy.gaussian.mixing, (1, 0)),
-    ]:
-        values = []
-        for step in (1e-6, -1e-6):
-            with torch.no_grad():
-                parameter[index] += step
-                values.append(log_prob())
-                parameter[index] -= step
-        assert parameter.grad[index].item() == pytest.approx(float(values[0] - values[1]) / 2e-6, rel=1e-4, abs=1e-5)
-    assert policy.gaussian.mixing.grad[0, 1] == 0
-
-
-def test_failed_solves_are_marked_and_have_no_gradient(mpc):
-    policy = LCSMPCPolicy(mpc, STD)
-    policy.mpc.backend = type(mpc.backend)(max_iter=1)
-    with pytest.warns(UserWarning, match="not solved"):
-        data = policy(observations(20))
-    failed = ~data["converged"].squeeze(-1)
-    assert bool(failed.any())
-    assert bool((data["loc"].abs() <= U_MAX).all())
-    data["loc"][failed].sum().backward()
-    assert all(p.grad is None or not p.grad.any() for p in mpc.lcs.parameters())
 
 
 def test_what_is_learned(mpc):
@@ -213,22 +139,3 @@ def test_the_library_does_not_import_torchrl():
     code = "import sys, difflcs, difflcs.rl; print(*sys.modules)"
     loaded = subprocess.check_output([sys.executable, "-c", code], text=True).split()
     assert not {"torchrl", "tensordict"} & set(loaded)
-
-
-def test_a_network_instead_of_the_mpc():
-    high = torch.tensor([0.1, 0.2], dtype=torch.float64)
-    network = MLPController(
-        lambda state, goal, elapsed: torch.cat([state, goal, elapsed[..., None]], -1), 4, -high, high
-    )
-    policy = MLPPolicy(network, STD)
-    assert policy.in_keys == ["state", "goal", "elapsed"]
-    assert policy.learned is policy.controller is network
-    data = observations(500)
-    data["elapsed"] = torch.linspace(0, 1, 500, dtype=torch.float64)
-    policy(data)
-    torch.testing.assert_close(data["loc"], network.mean(data["state"], data["goal"], data["elapsed"]))
-    noise = (data["action"] - data["loc"]).detach()
-    torch.testing.assert_close(noise.std(0), policy.std, rtol=0.15, atol=0.0)
-    policy.get_dist(data.select(*policy.in_keys)).log_prob(data["action"].detach()).sum().backward()
-    assert all(bool(p.grad.any()) for p in network.parameters())
-    assert bool(policy.gaussian.log_std.grad.any())  # learned by default, as is usual for networks

@@ -265,18 +265,6 @@ def test_a_guess_is_checked_in_a_loop_too():
         plan(layer, X.tolist(), GOAL)
 
 
-def test_tensors_that_equalled_others_may_change_afterwards():
-    """What is kept has memory of its own."""
-    layer = make_layer()
-    params = layer.lcs.params().detach()
-    twin = LCSParams(**{name: value.clone() for name, value in params.tensors().items()})
-    expected = plan(layer, X, GOAL, lcs=params)
-    assert_same(plan(layer, X, GOAL, lcs=twin), expected)
-    for value in params.tensors().values():
-        value.mul_(0.5)
-    assert_same(plan(layer, X, GOAL, lcs=twin), expected)
-
-
 def test_what_a_caller_does_with_results_changes_nothing():
     layer = make_layer()
     guess = plan(layer, X, GOAL).shift()

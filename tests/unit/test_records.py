@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from difflcs import LCSModel, LCSModule, LCSParams, LCSSequence, solve_lcp
+from difflcs import LCSModel, LCSParams, LCSSequence, solve_lcp
 from difflcs.errors import (
     BatchIndexError,
     DiffLCSError,
@@ -31,9 +31,6 @@ def assert_same(left, right):
     assert type(left) is type(right)
     for name in NAMES:
         assert torch.equal(getattr(left, name), getattr(right, name)), name
-
-
-# --- like tensors ---------------------------------------------------------------------------------------------------
 
 
 def test_to_changes_the_dtype_of_every_field_and_keeps_the_gradient(build):
@@ -91,9 +88,6 @@ def test_an_index_that_is_none_of_the_batch_is_refused(build, index):
             record[index]
 
 
-# --- one step, many steps -------------------------------------------------------------------------------------------
-
-
 def test_a_step_broadcasts_systems_states_and_actions(build):
     params, n = build.params(batch=(3, 1)), build.normal(1)
     x, u = n(4), n(5, 2)
@@ -117,20 +111,6 @@ def test_a_rollout_through_stages_takes_each_in_its_turn(build, batch):
     # All stages at once are what each is.
     lam = torch.stack([solve_lcp(sequence.stage(k).F, sequence.stage(k).gap(xs[:, k], u[k])).lam for k in range(5)], 1)
     torch.testing.assert_close(sequence.next_state(xs[:, :5], u, lam), xs[:, 1:])
-
-
-# --- stages ---------------------------------------------------------------------------------------------------------
-
-
-def test_a_stack_has_its_systems_as_stages(build):
-    systems = [build.params(seed=s) for s in range(4)]
-    sequence = LCSSequence.stack(systems)
-    assert sequence.horizon == 4
-    assert sequence.batch_shape == ()
-    assert (sequence.n_x, sequence.n_u, sequence.n_lam) == (4, 2, 3)
-    for k, system in enumerate(systems):
-        assert_same(sequence.stage(k), system)
-    assert_same(sequence.stage(-1), systems[3])
 
 
 def test_a_stack_broadcasts_each_field_over_its_batch(build):
@@ -201,9 +181,6 @@ def test_a_sequence_wants_one_action_a_stage(build, sequence):
         sequence.rollout(n(3, 4), n(2, 5, 2))
 
 
-# --- without contacts -----------------------------------------------------------------------------------------------
-
-
 def test_a_model_without_contacts_is_kept_and_learns(build, tmp_path):
     model, n = build.model(n_lam=0), build.normal(0)
     x, u = n(6, 4), n(6, 2)
@@ -216,44 +193,3 @@ def test_a_model_without_contacts_is_kept_and_learns(build, tmp_path):
     assert torch.equal(again(x, u).x_next, model(x, u).x_next)
     assert torch.equal(LCSModel.from_params(model.params())(x, u).x_next, model(x, u).x_next)
     assert LCSModel.from_params(model.params(), stiffness=0.7).stiffness == 0.7
-
-
-def test_an_lcp_without_variables_is_solved(build):
-    F, q = torch.zeros(0, 0, dtype=torch.float64), torch.zeros(3, 5, 0, dtype=torch.float64)
-    for relaxation in (0.0, 1e-5):
-        lam, w, status = solve_lcp(F, q.requires_grad_(), relaxation)
-        assert lam.shape == w.shape == (3, 5, 0)
-        assert status.shape == (3, 5)
-        assert int(status.abs().max()) == 0
-        (lam.sum() + w.sum()).backward()
-        assert q.grad is not None
-    assert solve_lcp(F.expand(2, 1, 0, 0), q.detach()[0]).lam.shape == (2, 5, 0)
-
-
-# --- modules --------------------------------------------------------------------------------------------------------
-
-
-class Made(torch.nn.Module):
-    """A system that depends on the state, made without LCSModel."""
-
-    def __init__(self, params):
-        super().__init__()
-        self.base = params
-        self.n_x, self.n_u, self.n_lam = params.n_x, params.n_u, params.n_lam
-
-    def params(self, x=None, context=None):
-        return self.base
-
-
-def test_what_counts_as_a_module(build):
-    assert isinstance(build.model(), LCSModule)
-    assert isinstance(Made(build.params()), LCSModule)
-    assert not isinstance(build.params(), LCSModule)
-    assert not isinstance(torch.nn.Linear(2, 2), LCSModule)
-
-
-def test_a_model_takes_states_and_context_and_ignores_both(build):
-    model, n = build.model(), build.normal(0)
-    expected = model.params()
-    for found in (model.params(n(5, 4), n(5, 2)), model.params(x=n(4)), model.params(context=n(1))):
-        assert_same(found, expected)

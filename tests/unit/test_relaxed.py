@@ -6,10 +6,10 @@ import pickle
 import pytest
 import torch
 
-from difflcs import Status, available_backends
+from difflcs import Status
 from difflcs.errors import DTypeError, InvalidInputError, SolveWarning
 from difflcs.mpc import MPCProblem, Primal
-from difflcs.mpc.backends import RelaxedBackend, get_backend
+from difflcs.mpc.backends import RelaxedBackend
 from tests.conformance.problems import Problem, badly_scaled, contact, make
 from tests.conformance.problems import solve as solve_problem
 
@@ -32,12 +32,6 @@ def without_contact(build, **options):
 
 
 # --- the plan -------------------------------------------------------------------------------------------------------
-
-
-def test_it_is_registered_and_says_that_it_is_not_exact():
-    assert "relaxed" in available_backends()
-    assert get_backend("relaxed") == RelaxedBackend()
-    assert RelaxedBackend.exact is False
 
 
 @pytest.fixture
@@ -81,16 +75,6 @@ def test_without_contact_the_plan_is_the_exact_one(build):
         torch.testing.assert_close(mine.objective, exact.objective, rtol=1e-4, atol=1e-4)
 
 
-def test_a_huge_penalty_around_the_exact_plan_keeps_it(build):
-    """Linearised where it is satisfied, complementarity holds to first order; the exact plan is stationary."""
-    t = tensors(build, batch=8)
-    exact = solve(t, "batched")
-    mine = solve(t, RelaxedBackend(penalties=(1e4,)), guess=exact)
-    error = (mine.u - exact.u).abs().amax((1, 2))
-    assert float(error.median()) < 0.02 * 0.3
-    assert float(mine.complementarity().median()) < 1e-2
-
-
 def test_the_plan_does_not_depend_on_units(build):
     scaled = badly_scaled(build).tensors
     U, plain = scaled["u_max"] / 0.15, contact(build).tensors
@@ -112,24 +96,6 @@ def test_a_guess_makes_one_pass(build):
     assert solve(t, guess=first).iterations.tolist() == [1] * 4
     wild = Primal(*(1e3 * torch.ones_like(v.detach()) for v in (first.x, first.u, first.lam)))
     assert bool(solve(t, guess=wild).converged.all())
-
-
-def test_the_layer_of_one_size_is_built_once(build, monkeypatch):
-    import cvxpylayers.torch
-
-    built = []
-
-    class Counted(cvxpylayers.torch.CvxpyLayer):
-        def __init__(self, *arguments, **options):
-            built.append(options)
-            super().__init__(*arguments, **options)
-
-    monkeypatch.setattr(cvxpylayers.torch, "CvxpyLayer", Counted)
-    t = tensors(build, n_x=5, n_u=1)  # a size that no other test has
-    solve(t)
-    assert len(built) == 1
-    solve({**t, "x0": 2 * t["x0"][:2]}, RelaxedBackend(penalties=(3.0,)))
-    assert len(built) == 1
 
 
 # --- the gradient ---------------------------------------------------------------------------------------------------

@@ -13,10 +13,7 @@ from difflcs.rl.rollout import (
     make_empty_record,
     mpc_actions,
     noisy_actions,
-    transitions,
-    uniform_actions,
 )
-from difflcs.rl.seeding import episode_seeds
 from tests.training.pusher import STEPS, U_MAX, PusherEnv, Reach, make_envs, pusher
 
 
@@ -38,17 +35,6 @@ def test_collect_returns_what_happened():
     )
 
 
-def test_episodes_depend_on_their_seed_only():
-    together = collect(make_envs(4), mpc_actions(Reach()), [7, 8, 9], STEPS)
-    env = make_envs(2)
-    for _ in range(2):  # used environments start afresh
-        alone = [collect(env, mpc_actions(Reach()), [seed], STEPS) for seed in (7, 8, 9)]
-    assert torch.equal(together["state"], torch.cat([one["state"] for one in alone]))
-    assert torch.equal(together["goal"], torch.cat([one["goal"] for one in alone]))
-    assert len(set(episode_seeds(0, 0, 0, 50) + episode_seeds(0, 1, 0, 50) + episode_seeds(1, 0, 0, 50))) == 150
-    assert episode_seeds(0, 1, 3, 2) == episode_seeds(0, 1, 0, 5)[3:]
-
-
 def test_a_broken_simulation_is_counted_not_fatal():
     env = SyncVectorEnv([lambda: PusherEnv(breaks_at=4), PusherEnv])
     rollouts = collect(env, mpc_actions(Reach()), [1, 2], STEPS)
@@ -68,19 +54,6 @@ def test_same_step_autoreset_is_refused():
         collect(env, mpc_actions(Reach()), [1], STEPS)
     with pytest.raises(InvalidInputError, match="num_envs=1"):
         collect(make_envs(1), mpc_actions(Reach()), [1, 2], STEPS)
-
-
-def test_a_record_has_one_row_per_episode():
-    env = make_envs(2)
-    record = collect(env, uniform_actions(env, np.random.default_rng(0)), [1, 2], STEPS)
-    assert tuple(record.batch_size) == (2,)
-    assert set(record.keys()) == {"state", "action", "reward", "goal", "success", "stable", "failures", "errors"}
-    assert record["reward"].shape == (2, STEPS)
-    torch.testing.assert_close(record["reward"][:, -1], -record["errors", "position_error"])
-    x, u, x_next = transitions(record)
-    assert torch.equal(x[STEPS:], record["state"][1, :-1])
-    assert torch.equal(u[:STEPS], record["action"][0])
-    assert torch.equal(x_next[:STEPS], record["state"][0, 1:])
 
 
 def test_records_are_extended_by_stable_episodes_and_keep_the_newest():

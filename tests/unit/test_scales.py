@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from difflcs import LCSModel, LCSModule, LCSSequence, ScaledLCS, suggest_scales
+from difflcs import LCSModel, ScaledLCS, suggest_scales
 from difflcs.errors import CheckpointError, DeviceError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
 
 
@@ -15,9 +15,6 @@ def data(build):
     x_next = build.model(seed=3)(x, u).x_next.detach()
     size, origin = torch.tensor([300.0, 1e-3, 1.0, 40.0]).double(), torch.tensor([1e4, -2.0, 0.0, 7.0]).double()
     return x * size + origin, 1e-2 * u, x_next * size + origin
-
-
-# --- what is suggested ----------------------------------------------------------------------------------------------
 
 
 def test_states_and_actions_are_about_one_in_the_suggested_units(data):
@@ -58,20 +55,6 @@ def test_a_state_that_never_changes_and_an_action_that_is_never_used_keep_their_
     assert all(bool(torch.isfinite(v).all()) for v in scales.normalise(x, u, x_next))
 
 
-def test_leading_dimensions_dtypes_and_gradients_of_the_data_do_not_matter(data):
-    expected = suggest_scales(*data)
-    shaped = suggest_scales(*(v.reshape(4, 50, -1).requires_grad_() for v in data))
-    narrow = suggest_scales(*(v.float() for v in data))
-    for name in ("center", "state", "action"):
-        assert torch.equal(getattr(shaped, name), getattr(expected, name))
-        assert not getattr(shaped, name).requires_grad
-        torch.testing.assert_close(getattr(narrow, name), getattr(expected, name), rtol=1e-4, atol=1e-5)
-    assert expected.normalise(*(v.float() for v in data))[0].dtype == torch.float32
-
-
-# --- there and back -------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("batch", [(), (200,)])
 def test_a_system_that_is_brought_back_predicts_the_same_in_the_units_of_the_data(build, data, batch):
     scales = suggest_scales(*data)
@@ -83,27 +66,6 @@ def test_a_system_that_is_brought_back_predicts_the_same_in_the_units_of_the_dat
     torch.testing.assert_close(scales.states(found.x_next), expected.x_next, rtol=1e-7, atol=1e-7)
     torch.testing.assert_close(found.lam, expected.lam, rtol=1e-7, atol=1e-7)
     assert torch.equal(scales.params(inner).F, inner.F)
-
-
-def test_a_sequence_is_brought_back_stage_by_stage(build, data):
-    scales, systems = suggest_scales(*data), [build.params(seed=s) for s in range(3)]
-    sequence = scales.params(LCSSequence.stack(systems))
-    for k, system in enumerate(systems):
-        for name, value in scales.params(system).tensors().items():
-            torch.testing.assert_close(getattr(sequence.stage(k), name), value)
-
-
-def test_a_scaled_module_is_a_module_in_the_units_of_the_data(build, data):
-    scales, model = suggest_scales(*data), build.model(seed=3)
-    scaled = ScaledLCS(model, scales)
-    assert isinstance(scaled, LCSModule)
-    assert (scaled.n_x, scaled.n_u, scaled.n_lam) == (4, 2, 3)
-    found = scaled.params(data[0]).step(*data[:2]).x_next
-    expected = model(*scales.normalise(*data)[:2]).x_next
-    torch.testing.assert_close(scales.states(found), expected, rtol=1e-7, atol=1e-7)
-    found.sum().backward()
-    assert all(float(p.grad.abs().max()) > 0 for p in model.parameters())
-    assert list(scaled.parameters()) == list(model.parameters())
 
 
 def test_a_scaled_module_predicts_and_is_saved_with_its_scales(build, data, tmp_path):
@@ -136,9 +98,6 @@ def test_a_scaled_module_asks_with_states_in_its_own_units(build, data):
     torch.testing.assert_close(seen[0][0], scales.normalise(*data)[0])
     assert seen[0][1] is context
     assert seen[1] == (None, None)
-
-
-# --- bad input ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["x", "u", "x_next"])

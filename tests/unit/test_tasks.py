@@ -20,12 +20,6 @@ from tests.conformance.toy import STEPS, U_MAX, Slide, make_task
 TOY = make_task()
 
 
-def test_sizes_are_those_of_the_cost():
-    assert (TOY.n_x, TOY.n_u, TOY.n_goal, TOY.n_features) == (2, 1, 1, 4)
-    assert make_task(size=3).n_x == 3
-    assert TOY.steps_per_minute == 120
-
-
 def test_bounds_are_a_number_or_one_for_each_action():
     low, high = TOY.bounds
     assert (low.tolist(), high.tolist(), low.dtype) == ([-U_MAX], [U_MAX], torch.float64)
@@ -37,16 +31,6 @@ def test_bounds_are_a_number_or_one_for_each_action():
     assert (low.tolist(), high.tolist()) == ([-1.0, -2.0], [3.0, 3.0])
     low[0] = 9.0
     assert make_task().bounds[0].tolist() == [-U_MAX]
-
-
-def test_an_environment_of_a_callable():
-    env = TOY.make_env()
-    assert isinstance(env, Slide)
-    assert env.size == 2
-    envs = TOY.make_envs(3, threads=2)
-    assert envs.num_envs == 3
-    assert envs.metadata["autoreset_mode"].value == "NextStep"
-    envs.close()
 
 
 def test_an_environment_of_an_id():
@@ -111,13 +95,6 @@ def test_every_episode_of_a_film_begins_the_policy_anew(tmp_path):
     policy = Counted()
     record_video(Drawn(), policy, [(0.1,), (0.2,), (-0.1,)], tmp_path / "film.mp4", TOY)
     assert policy.steps == [STEPS] * 3
-
-
-def test_the_mpc_is_the_tasks():
-    policy = TOY.make_policy(LCSModel(2, 1, 1, init_scale=0.1), "batched")
-    assert (policy.horizon, policy.u_min.tolist(), policy.u_max.tolist()) == (3, [-U_MAX], [U_MAX])
-    assert policy.on_failure == "mask"
-    assert policy(torch.zeros(4, 2).double(), torch.ones(4, 1).double()).action.shape == (4, 1)
 
 
 def test_the_cost_of_the_mpc_may_be_asked_for(build):

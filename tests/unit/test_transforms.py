@@ -48,18 +48,6 @@ def test_vmap_solves_what_a_loop_solves(lcps, relaxation, in_dims):
 
 
 @exact_and_relaxed
-def test_vmap_over_batches_that_broadcast_inside(lcps, relaxation):
-    F, q = lcps
-    every = vmap(lambda F: solve_lcp(F, q, relaxation).lam)(F)
-    assert every.shape == (COUNT, COUNT, 4)
-    nested = vmap(lambda F: vmap(lambda q: solve_lcp(F, q, relaxation).lam)(q))(F)
-    assert torch.equal(nested, every)
-    assert torch.equal(every[2], solve_lcp(F[2], q, relaxation).lam)
-    assert vmap(lambda F: solve_lcp(F, q[:0]).lam)(F).shape == (COUNT, 0, 4)
-    assert vmap(lambda q: solve_lcp(F[:, None], q).lam)(q).shape == (COUNT, COUNT, 1, 4)
-
-
-@exact_and_relaxed
 def test_grad_is_the_gradient_of_backward(lcps, relaxation):
     F, q = lcps
 

@@ -43,9 +43,6 @@ def same(a, b) -> bool:
     return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
 
 
-# --- sizes of steps ---
-
-
 @pytest.mark.parametrize(("kl", "factor"), [(0.04, 1.5), (0.06, 1.0), (0.14, 1.0), (0.16, 1 / 1.5), (math.nan, 1.0)])
 def test_step_size_follows_the_kl(kl, factor):
     size = StepSize(0.06, target_kl=0.1, factor=1.5)
@@ -65,22 +62,12 @@ def test_step_size_grows_up_to_the_longest():
     assert beyond.value == pytest.approx(0.7 / 1.5)
 
 
-def test_a_factor_of_one_keeps_the_step_size():
-    size = StepSize(0.06, 0.1, 1.0)
-    for kl in (0.0, 7.0):
-        size.adapt(kl)
-    assert size.value == 0.06
-
-
 def test_no_natural_step_is_longer_than_the_kl_of_an_iteration():
     sizes = {kind: make(kind)[1].size for kind in ("natural", "adam")}
     assert sizes["natural"].value == Natural().step
     assert sizes["natural"].longest == pytest.approx(math.sqrt(2 * 0.1))
     assert sizes["adam"].value == ADAM.learning_rate
     assert sizes["adam"].longest == math.inf
-
-
-# --- steps ---
 
 
 @pytest.mark.parametrize("covariance", ["fixed", "diagonal", "full"])
@@ -147,9 +134,6 @@ def _tensors(state) -> list[torch.Tensor]:
     return list(flatten(state)[0].values())
 
 
-# --- the covariance ---
-
-
 @pytest.mark.parametrize("sign", [1, -1])
 def test_deviations_stay_within_their_limits(sign):
     actor, rule = make("adam", "diagonal", std_learning_rate=0.5)
@@ -157,17 +141,6 @@ def test_deviations_stay_within_their_limits(sign):
         rule.step(sign * loss_of(actor), 1.0)
         assert 0.01 - 1e-12 <= float(actor.std) <= 0.05 + 1e-12
     assert float(actor.std) == pytest.approx(0.01 if sign > 0 else 0.05)
-
-
-def test_a_fixed_covariance_stays():
-    actor, rule = make("adam")
-    assert rule.deviation.parameters == []
-    assert rule.deviation.state_dict() == {}
-    rule.step(loss_of(actor), 1.0)
-    assert float(actor.std) == pytest.approx(STD, rel=1e-15)
-
-
-# --- states ---
 
 
 @pytest.mark.parametrize("covariance", ["fixed", "full"])

@@ -15,18 +15,22 @@ many times as large.
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
+from difflcs.errors import InvalidInputError
+from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
+from difflcs.physics.mujoco.library import Places, library
 from difflcs.physics.mujoco.limits import Rows
-from difflcs.physics.mujoco.motion import DynamicStep, Steps, advance_step
-from difflcs.physics.mujoco.native import copy_taken, flags
-from difflcs.records import LCSParams
+from difflcs.physics.mujoco.motion import Dynamic, DynamicStep
+from difflcs.physics.mujoco.native import flags
+from difflcs.physics.mujoco.state import MujocoState
+from difflcs.records import LCSParams, advance
 
 Array = NDArray[np.float64]
 _WORSE = 0.25  # of all motion, by which contacts are worse than nothing where Δ counts wholly
@@ -36,42 +40,48 @@ class WholeStep:
     """MuJoCo's own steps, with all constraints.
 
     Args:
-        model: the model.
-        steps: its steps in one of ours.
+        motion: the motion, of a model whose flags are its own.
         limits: False if joints and tendons have none.
     """
 
-    def __init__(self, model: Any, steps: Steps, limits: bool):
-        self.model, self.steps = copy.copy(model), steps
-        self.model.opt.disableflags |= 0 if limits else flags("LIMIT")
-        self.data = mujoco.MjData(self.model)
+    def __init__(self, motion: Dynamic, limits: bool):
+        self.model = motion.model
+        self._native = motion.describe(motion.steps, 0 if limits else flags("LIMIT"))
 
-    def simulate(self, taken: Any, states: Array, ctrl: Array) -> Array:
-        """Return (ζ, ν) (n, 2 nv) after a step from states (n, nq + nv + na); NaN where MuJoCo warns or raises.
+    def simulate(self, places: Places, states: Array, ctrl: Array) -> Array:
+        """Return ζ, ν and the change of activation (n, 2 nv + na) after a step; NaN where MuJoCo warns or raises.
 
         Args:
-            taken: data with what is not in the states.
-            states: qpos, qvel and act.
+            places: with what is not in the states.
+            states: (n, nq + nv + na) qpos, qvel and act.
             ctrl: (n, nu) controls.
         """
-        model, data, nv = self.model, self.data, self.model.nv
-        after = np.full((len(states), 2 * nv), np.nan)
-        copy_taken(data, taken)
-        for i, state in enumerate(states):
-            data.qpos[:], data.qvel[:], data.act[:] = np.split(state, [model.nq, model.nq + nv])
-            data.ctrl[:], data.qacc_warmstart[:] = ctrl[i], 0.0
-            try:
-                for _ in range(self.steps.count):
-                    mujoco.mj_forwardSkip(model, data, 0, 1)
-                    advance_step(model, data, self.steps.integrator)
-            except mujoco.FatalError:  # the system stands without a correction
-                self.data = mujoco.MjData(model)
-                return after
-            if not data.warning.number.any():
-                mujoco.mj_differentiatePos(model, after[i, :nv], 1.0, state[: model.nq], data.qpos)
-                after[i, nv:] = data.qvel
-            data.warning.number[:] = 0
+        after = np.full((len(states), 2 * self.model.nv + self.model.na), np.nan)
+        native = places.take(len(states))
+        try:
+            places.check(_mujoco.simulate(library(), self._native, native, states, ctrl, after), len(states))
+        except InvalidInputError:  # the systems stand without a correction
+            after[:] = np.nan
         return after
+
+    def follow(self, places: Places, state: MujocoState, control: Any, x: Tensor, u: Tensor) -> Tensor | None:
+        """Follow states (..., H, n_x) from x (..., n_x), one before each of actions u (..., H, n_u).
+
+        None where MuJoCo warns or raises. `control` converts actions at states.
+        """
+        found, states = [x.detach()], state.flatten(x, np.zeros(0))
+        to = state.nq, state.nq + state.nv
+        for action in u.detach().unbind(-2)[:-1]:
+            ctrl = control(found[-1], action).double().cpu().reshape(len(states), -1).contiguous().numpy()
+            after = self.simulate(places, states, ctrl)
+            if not np.isfinite(after).all():
+                return None
+            for one, change in zip(states, after, strict=True):
+                mujoco.mj_integratePos(self.model, one[: to[0]], change[: state.nv], 1.0)
+            states[:, to[0] : to[1]] = after[:, state.nv : 2 * state.nv]
+            states[:, to[1] :] += after[:, 2 * state.nv :]
+            found.append(state.to_state(*np.split(states.reshape(*x.shape[:-1], -1), to, -1)).to(x))
+        return torch.stack(found, -2)
 
 
 def correct(
@@ -82,20 +92,20 @@ def correct(
     Args:
         system: the systems, in any batch dimensions.
         step: the motion without constraints.
-        after: (n, 2 nv) (ζ, ν) after MuJoCo's step; states with NaN stay as they are.
+        after: (n, 2 nv + na) after MuJoCo's step, see `WholeStep`; states with NaN stay as they are.
         tangent: of the states' rotations, see `MujocoState.tangent`.
         bound: (n, n_bounded) of dry friction, the last forces of the systems.
         rows: limits and dry friction.
     """
     x, nv, batch = step.x, step.place.shape[1], system.C.shape[:-2]
-    found = system.step(*(torch.from_numpy(v).reshape(*batch, v.shape[1]) for v in (x, step.idle)))
+    found = advance(system, *(torch.from_numpy(v).reshape(*batch, v.shape[1]) for v in (x, step.idle)))
     C, d, predicted, lam = (v.reshape(len(x), *v.shape[len(batch) :]).numpy() for v in (system.C, system.d, *found))
     n_bounded, lower = bound.shape[1], np.zeros_like(lam)
     n_contacts = lam.shape[1] - 2 * n_bounded - (n_limits := rows.gap.shape[1] - n_bounded)
     lower[:, n_contacts + n_limits :][:, :n_bounded] = -bound
     C, d, forces = C.copy(), d.copy(), lam + lower
     place = after[:, :nv] if tangent is None else np.linalg.solve(tangent, after[:, :nv, None])[:, :, 0]
-    change = np.concatenate([place, after[:, nv:] - x[:, nv : 2 * nv]], 1)
+    change = np.concatenate([place, after[:, nv : 2 * nv] - x[:, nv : 2 * nv]], 1)
     known = np.isfinite(change).all(1, keepdims=True)
     change = np.where(known, change, 0.0)
     wrong = np.where(known, x[:, : 2 * nv] + change - predicted[:, : 2 * nv], 0.0)
@@ -104,9 +114,9 @@ def correct(
 
     def size(moved: NDArray[Any]) -> Array:
         """Size (n, n_trees) of a change of velocity (n, 2 nv), by its energy."""
-        return np.sqrt(np.einsum("nv,nvt->nt", moved[:, nv : 2 * nv] ** 2, mass))
+        return np.sqrt((moved[:, None, nv : 2 * nv] ** 2 @ mass)[:, 0])
 
-    energy = np.einsum("nvj,nvt->ntj", (C[:, nv : 2 * nv] * forces[:, None]) ** 2, mass)
+    energy = mass.swapaxes(-1, -2) @ (C[:, nv : 2 * nv] * forces[:, None]) ** 2
     total = np.maximum(energy.sum(-1), 1e-20)
     free = predicted - (C @ forces[:, :, None])[:, :, 0] - x
     speed = np.concatenate([np.zeros_like(place), x[:, nv : 2 * nv]], 1)
@@ -120,4 +130,4 @@ def correct(
     C[:, : 2 * nv] += by_forces
     d[:, : 2 * nv] += (by_forces @ lower[:, :, None])[:, :, 0] + wrong * (counts - due)[:, both]
     C, d = (torch.from_numpy(v).reshape(*batch, *v.shape[1:]) for v in (C, d))
-    return LCSParams(system.A, system.B, C, d, system.D, system.E, system.F, system.c)
+    return LCSParams.of_checked({**system.tensors(), "C": C, "d": d})

@@ -33,7 +33,7 @@ from difflcs.physics.mujoco.equality import Equality
 from difflcs.physics.mujoco.groups import ContactGroup, ContactSelection
 from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import RowFinder, ScaledRows, scale
-from difflcs.physics.mujoco.motion import Dynamic, QuasiStatic
+from difflcs.physics.mujoco.motion import Dynamic, QuasiStatic, read_each
 from difflcs.physics.mujoco.native import TAKEN, flags, native
 from difflcs.physics.mujoco.nominal import Recovery, Situation, evaluate_nominal
 from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
@@ -162,7 +162,7 @@ class MujocoLCS:
         budgets: Any = self._selection.budgets if self._selection else contacts
         budgets = budgets if contacts is None or self._selection else check_positive_int("contacts", contacts)
         plain = motion == "dynamic" and pairs is None and friction is None
-        self._whole = WholeStep(model, self._motion.steps, limits != 0) if plain else None
+        self._whole = WholeStep(self._motion, limits != 0) if plain else None
         self._places = Places(model, self._data)
         self._finder = ContactFinder(model, self._data, self._places, pairs, distance, length, budgets, friction)
         model.opt.disableflags |= flags("EQUALITY", "FRICTIONLOSS", "LIMIT")
@@ -257,7 +257,7 @@ class MujocoLCS:
         )
         if step is not None and self._whole is not None and self.n_lam:
             idle = self.control(torch.from_numpy(read.x), torch.from_numpy(step.idle)).numpy()
-            after = self._whole.simulate(self._data, read.states, idle)
+            after = self._whole.simulate(self._places, read.states, idle)
             system = correct(system, step, after, read.tangent, rows.bound * self._give / self.length, found)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
 
@@ -268,6 +268,13 @@ class MujocoLCS:
     def context_along(self, x: Tensor, u: Tensor, context: Tensor | None = None) -> Tensor | None:
         """Return the nominal controls (..., nu) of actions u (..., n_u) at states x (..., n_x) of a plan."""
         return context if self._quasi_static else self.control(x, u)
+
+    def states_along(self, x: Tensor, u: Tensor) -> Tensor | None:
+        """Simulate the states (..., H, n_x) at which actions u (..., H, n_u) of a plan begin, from x (..., n_x).
+
+        None where MuJoCo's own steps are not those of the system, or have no finite numbers.
+        """
+        return None if self._whole is None else self._whole.follow(self._places, self.state, self.control, x, u)
 
     def contacts(self, x: Tensor) -> Contacts:
         """Compute the gaps and their derivatives at states x (..., n_x).
@@ -307,30 +314,19 @@ class MujocoLCS:
         return low, high
 
     def _read(self, x: Tensor, context: Tensor | None = None) -> _States:
-        qpos, qvel = self.state.to_mujoco(x)
-        batch, data = x.shape[:-1], self._data
-        n = batch.numel()
-        qpos, qvel = qpos.reshape(n, -1), qvel.reshape(n, -1)
+        states, batch = self.state.flatten(x, self._data.act), x.shape[:-1]
+        n, qpos = len(states), states[:, : self.state.nq]
         flat = x.detach().double().cpu().reshape(n, self.n_x).numpy()
-        act = flat[:, self.n_x - self.state.na :] if self.state.na else np.broadcast_to(data.act, (n, len(data.act)))
         ctrl = self._ctrl if context is None else self._actuators.nominal(context, batch).reshape(n, -1)
         ctrl, found = np.broadcast_to(ctrl, (n, self.n_u)), self._finder.find(qpos)
-        moved = self._read_motion(states := np.concatenate([qpos, qvel, act], -1), ctrl)
         tangent = self.state.tangent(flat[:, : self.state.nv])
-        return _States(batch, flat, states, qpos, tangent, found, moved)
+        return _States(batch, flat, states, qpos, tangent, found, self._read_motion(states, ctrl))
 
     def _read_motion(self, states: Any, ctrl: Any) -> Any:
         """Read the motion at states (n, nq + nv + na) of MuJoCo, with nominal controls (n, nu)."""
-        model, data, n = self._model, self._data, len(states)
         if isinstance(self._motion, Dynamic):
             return self._motion.read(self._places, states, ctrl)
-        moved = self._motion.allocate(n)
-        for i in range(n):
-            with native(model, data, f"in state {i} of {n}"):
-                data.qpos[:], data.qvel[:], data.act[:] = np.split(states[i], [model.nq, model.nq + model.nv])
-                mujoco.mj_fwdPosition(model, data)
-                self._motion.read(i, data, moved, ctrl[i])
-        return moved
+        return read_each(self._motion, self._model, self._data, states, ctrl)
 
     def _typical_response(self) -> float:
         """Compute how far a unit of force moves two bodies apart that may touch, the median over their pairs."""

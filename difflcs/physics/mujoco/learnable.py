@@ -185,6 +185,10 @@ class LearnableMujocoLCS(nn.Module):
         """See `MujocoLCS.action_bounds`; they carry no gradient."""
         return self.physics.action_bounds(x)
 
+    def states_along(self, x: Tensor, u: Tensor) -> Tensor | None:
+        """See `MujocoLCS.states_along`."""
+        return self.physics.states_along(x, u)
+
     def context_along(self, x: Tensor, u: Tensor, context: Tensor | None = None) -> Tensor | None:
         """See `MujocoLCS.context_along`."""
         return self.physics.context_along(x, u, context)

@@ -37,6 +37,7 @@ _FIELDS = (
     "qvel",
     "act",
     "ctrl",
+    "qacc_warmstart",
     "geom_xpos",
     "geom_xmat",
     "cdof",

@@ -170,7 +170,7 @@ class RowFinder:
         where = np.arange(n)[:, None]
         chosen = np.broadcast_to(np.arange(gap.shape[1]), gap.shape)
         if self.n_limits < gap.shape[1]:
-            gives = np.einsum("nki,nij,nkj->nk", normal, response, normal)
+            gives = give_way(normal, response)
             after = np.minimum(gap, gap + (normal @ place[:, :, None])[:, :, 0])
             self._warn_of_more(after)
             # What does not give way cannot act.
@@ -252,8 +252,8 @@ def scale(rows: Rows, gap: Array, part: Array | float, response: Array, give: fl
         give: how far contacts move by it.
         seconds: duration of the step [s], for bounds of impulses; 1 for those of forces.
     """
-    gives = np.einsum("nki,nij,nkj->nk", rows.normal, response, rows.normal)
-    least = 1e-9 * np.einsum("nki,nki->nk", rows.normal, rows.normal) * np.trace(response, axis1=-2, axis2=-1)[:, None]
+    gives = give_way(rows.normal, response)
+    least = 1e-9 * (rows.normal**2).sum(-1) * np.trace(response, axis1=-2, axis2=-1)[:, None]
     unit = np.where(gives > least, np.sqrt(give / np.where(gives > least, gives, 1.0)), 0.0) / part
     impulse = unit[:, :, None] * rows.normal
     of_friction = unit[:, unit.shape[1] - rows.n_friction :]
@@ -261,6 +261,11 @@ def scale(rows: Rows, gap: Array, part: Array | float, response: Array, give: fl
         seconds * rows.soft.bound[:, unit.shape[1] - rows.n_friction :] / np.where(of_friction > 0, of_friction, 1.0)
     )
     return ScaledRows(unit * part * gap, impulse * np.reshape(part, (*np.shape(part), 1)), impulse, bound, unit)
+
+
+def give_way(rows: Array, response: Array) -> Array:
+    """Compute how far a unit of force along each of rows (n, k, nv) moves it (n, k), by responses (n, nv, nv)."""
+    return ((rows @ response) * rows).sum(-1)
 
 
 class Followed(NamedTuple):
@@ -303,7 +308,7 @@ class Load(NamedTuple):
 def find_load(step: DynamicStep, rows: Array, bend: Array, after: Array, impulse: Array) -> Load:
     """Find the load of rows (n, k, nv) that impulses (n, k) along them bring to velocities `after` (n, k) in a step."""
     h, speed = step.seconds, (rows @ step.velocity[:, :, None])[:, :, 0]
-    mass, gives = (np.einsum("nki,nij,nkj->nk", rows, S, rows) for S in (step.inverse_mass, step.response))
+    mass, gives = (give_way(rows, S) for S in (step.inverse_mass, step.response))
     drag = np.maximum(mass / np.maximum(gives, 1e-12 * mass + 1e-300) - 1, 0.0) / h
     return Load(((after - gives * impulse) * (1 + h * drag) - speed) / h, drag, 2 * bend / h**2, mass)
 

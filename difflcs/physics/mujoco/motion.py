@@ -35,7 +35,7 @@ from difflcs.physics.complementarity import FreeMotion
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.actuators import Actuators
 from difflcs.physics.mujoco.library import Places, addresses, library
-from difflcs.physics.mujoco.native import flags
+from difflcs.physics.mujoco.native import flags, native
 
 Array = NDArray[np.float64]
 
@@ -123,6 +123,21 @@ class QuasiStatic:
         return FreeMotion(*tensors)
 
 
+def read_each(motion: Any, model: Any, data: Any, states: Array, ctrl: Array) -> Any:
+    """Read a motion of positions at states (n, nq + nv + na), one after the other, with nominal controls (n, nu).
+
+    Raises:
+        InvalidInputError: MuJoCo raised an error, or has counted a warning.
+    """
+    moved = motion.allocate(len(states))
+    for i, state in enumerate(states):
+        with native(model, data, f"in state {i} of {len(states)}"):
+            data.qpos[:], data.qvel[:], data.act[:] = np.split(state, [model.nq, model.nq + model.nv])
+            mujoco.mj_fwdPosition(model, data)
+            motion.read(i, data, moved, ctrl[i])
+    return moved
+
+
 class Dynamic:
     """Motion by all forces of MuJoCo except those of its constraints, linearised at each state.
 
@@ -175,7 +190,7 @@ class Dynamic:
         sizes = ((n_x,), (n_x - nv,), (n_x, n_x), (n_x, nu), (nv, nv), (nu,), (n_x,))
         arrays, ctrl = [np.zeros((n, *size)) for size in sizes], np.ascontiguousarray(ctrl)
         if steps not in self._native:
-            self._native[steps] = self._describe(steps)
+            self._native[steps] = self.describe(steps, self.flags)
         places.check(_mujoco.read_motion(library(), self._native[steps], places.take(n), states, ctrl, *arrays), n)
         return Linearised(*arrays, unstable=np.zeros(n, dtype=bool))
 
@@ -194,12 +209,17 @@ class Dynamic:
         found[found] = np.linalg.eigvals(rates[found]).real.min(-1, initial=0.0) < -most
         return found
 
-    def _describe(self, steps: Steps) -> _mujoco.Motion:
-        """Describe for the compiled part how the motion is simulated and linearised, and what balances actuators."""
+    def describe(self, steps: Steps, disabled: int) -> _mujoco.Motion:
+        """Describe for the compiled part how the motion is simulated and linearised, and what balances actuators.
+
+        Args:
+            steps: of the simulation.
+            disabled: flags of what it leaves out.
+        """
         model, actuators = self.model, self.actuators
         simulated, linearised = copy.copy(model), copy.copy(model)
         self._models += simulated, linearised
-        simulated.opt.disableflags |= self.flags
+        simulated.opt.disableflags |= disabled
         simulated.opt.timestep = self.seconds / steps.count
         simulated.opt.integrator = steps.integrator
         # With a time step of one second and no implicit part, the next velocity is ν + acceleration.
@@ -288,14 +308,6 @@ class Steps(NamedTuple):
 
     count: int
     integrator: int
-
-
-def advance_step(model: Any, data: Any, integrator: int) -> None:
-    """Integrate by a time step from `mj_forward`, without the checks of `mj_step`."""
-    if integrator == _RK4:
-        mujoco.mj_RungeKutta(model, data, 4)
-    else:
-        getattr(mujoco, _ADVANCE[integrator])(model, data)
 
 
 class Linearised(NamedTuple):

@@ -27,7 +27,7 @@ from difflcs.errors import ContactWarning
 from difflcs.physics.complementarity import Cone, count_forces
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.contacts import MujocoContacts
-from difflcs.physics.mujoco.limits import Rows, ScaledRows, find_load, follow, scale
+from difflcs.physics.mujoco.limits import Rows, ScaledRows, find_load, follow, give_way, scale
 from difflcs.physics.mujoco.motion import DynamicStep
 
 Array = NDArray[np.float64]
@@ -287,9 +287,7 @@ def _evaluate(at: Situation, at_once: Array) -> tuple[Nominal, Array]:
         # What robots touch may hold with another action than the nominal one.
         _, firmly = at.rays(contacts, settled, step.firm).forces(place, closed)
         slides &= _find_sliding(np.einsum("nktv,nv->nkt", contacts.tangent, firmly), contacts, place)
-    acceleration = (
-        np.einsum("nkv,nvw,nkw->nk", contacts.normal, step.inverse_mass, contacts.normal) * normal / step.seconds
-    )
+    acceleration = give_way(contacts.normal, step.inverse_mass) * normal / step.seconds
     speed = (contacts.normal @ step.velocity[:, :, None])[:, :, 0]
     gap = recovery.settled(contacts.gap, contacts.geom, acceleration, speed, step.seconds)
     contacts = contacts._replace(tangent=_turn_tangents(contacts.tangent, slide))
@@ -316,7 +314,7 @@ def _compute_creep(step: DynamicStep, contacts: MujocoContacts, recovery: Recove
         return np.zeros_like(forces)
     each = forces.reshape(*contacts.tangent.shape[:3], 2)
     friction, velocity = contacts.friction[:, :, None], step.velocity[:, None, None]
-    gives = ((contacts.tangent @ step.inverse_mass[:, None]) * contacts.tangent).sum(-1)
+    gives = give_way(contacts.tangent, step.inverse_mass[:, None])
     acceleration = gives * friction * (each[..., 0] - each[..., 1]) / step.seconds
     far = step.seconds * friction * recovery.crept(contacts.geom, acceleration, (contacts.tangent * velocity).sum(-1))
     return np.stack([far, -far], -1).reshape(forces.shape)
@@ -419,7 +417,9 @@ def _push(response: Array, rows: Array, forces: Array, by: Array) -> Array:
     # Contacts of one face are not independent.
     scale = np.trace(inner, axis1=-2, axis2=-1)[:, None, None]
     inner += np.eye(inner.shape[-1]) * np.where(scale > 0, 1e-9 * scale, 1.0)
-    return gives @ np.linalg.solve(inner, by)
+    if by.shape[-1] < gives.shape[1]:
+        return gives @ np.linalg.solve(inner, by)
+    return np.linalg.solve(inner.swapaxes(-1, -2), gives.swapaxes(-1, -2)).swapaxes(-1, -2) @ by
 
 
 def _turn_tangents(tangent: Array, slide: Array) -> Array:

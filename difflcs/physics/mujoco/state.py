@@ -157,6 +157,14 @@ class MujocoState:
             velocity = numbers[..., self.nv : 2 * self.nv]
         return qpos, velocity
 
+    def flatten(self, x: Tensor, act: Array) -> Array:
+        """Convert states (..., n_x) to MuJoCo's (n, nq + nv + na); of states without velocities `act` (na,) is that."""
+        (qpos, qvel), n = self.to_mujoco(x), x.shape[:-1].numel()
+        if self.na:
+            act = x.detach().double().cpu().numpy()[..., self.n_x - self.na :].reshape(n, self.na)
+        act = np.broadcast_to(act, (n, act.shape[-1]))
+        return np.concatenate([qpos.reshape(n, self.nq), qvel.reshape(n, self.nv), act], -1)
+
     def tangent(self, x: Array) -> Array | None:
         """T (..., nv, nv) of qvel = T ẋ, for positions x (..., nv); None for the identity, where nothing has turned.
 

@@ -1,9 +1,10 @@
-"""Figures of a run: its learning curve, and a video of its policy."""
+"""Figures of a run: its learning curve, the fit and the contacts of its model, and a video of its policy."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -13,10 +14,16 @@ import torch
 from difflcs._optional import require
 from difflcs._storage import write_atomically
 from difflcs.errors import DiffLCSError, InvalidInputError
-from difflcs.rl.rollout import CONTEXT, Policy, mpc_actions
+from difflcs.fit import Transitions, fit_report
+from difflcs.mpc import LCSMPCLayer
+from difflcs.mpc.solution import draw_trajectory
+from difflcs.records import LCSParams, LCSSequence, advance, system_at
+from difflcs.rl.rollout import CONTEXT, Policy, collect, mpc_actions
+from difflcs.rl.seeding import Stream, episode_seeds
 
 if TYPE_CHECKING:
     import gymnasium
+    from matplotlib.figure import Figure
 
     from difflcs.rl.tasks import TaskSpec
 
@@ -35,46 +42,97 @@ def plot_learning_curve(rows: Sequence[Mapping[str, str]], path: Path, title: st
         title: above the figure.
     """
     require("matplotlib")
-    from io import BytesIO
-
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    from matplotlib import rc_context
     from matplotlib.ticker import NullFormatter
 
-    figure = Figure(figsize=(7.0, 6.0), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-    figure.suptitle(title)
+    from difflcs._figure import FONT, PageFigure
 
-    x, success = _column(rows, "minutes", "success")
-    rolling = [success[max(0, i + 1 - _ROLLING) : i + 1].mean() for i in range(len(success))]
-    above.plot(x, 100 * np.array(rolling), color=_GREY, lw=1.5, label="training episodes (noisy, last 40)")
-    x, rate, low, high, goals = _column(rows, *_evaluation("minutes", "success_rate", "ci_low", "ci_high", "goals"))
-    if len(x):
-        spread = 100 * np.stack([rate - low, high - rate])
-        counts = f"{goals.min():.0f}" + (f" to {goals.max():.0f}" if goals.max() > goals.min() else "")
-        style = {"color": _BLUE, "marker": "o", "lw": 2, "capsize": 4}
-        above.errorbar(x, 100 * rate, spread, **style, label=f"evaluation on {counts} goals, 95 % interval")
-        for at, value, top in zip(x, rate, high, strict=True):
-            place = {"xytext": (0, 4), "textcoords": "offset points", "ha": "center", "va": "bottom"}
-            above.annotate(f"{100 * value:.0f} %", (at, 100 * top), **place, fontsize=9, color=_BLUE)
-    above.set(ylabel="success [%]", ylim=(0, 105))
-    above.legend(loc="lower right", frameon=False, fontsize=9)
+    with rc_context(FONT):
+        figure = PageFigure(6.5)
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+        figure.suptitle(title)
 
-    for name, color, label in (("loss", _ORANGE, "training"), ("held_out_loss", _BLUE, "held out")):
-        x, loss = _column(rows, "minutes", name)
-        below.semilogy(x, loss, color=color, lw=1.5, label=label)
-    low, high = np.log10(below.get_ylim())
-    below.set_ylim(10 ** np.floor(low), 10 ** np.ceil(high))  # whole decades, or the axis has one number
-    below.set(xlabel="data [min]", ylabel="violation loss")
-    below.yaxis.set_minor_formatter(NullFormatter())
-    below.legend(loc="lower right", frameon=False, fontsize=9)
-    for axes in (above, below):
-        axes.grid(alpha=0.25)
-        axes.spines[["top", "right"]].set_visible(False)
+        x, success = _column(rows, "minutes", "success")
+        rolling = [success[max(0, i + 1 - _ROLLING) : i + 1].mean() for i in range(len(success))]
+        above.plot(x, 100 * np.array(rolling), color=_GREY, lw=1.5, label="episodes of the training")
+        x, rate, low, high, goals = _column(rows, *_evaluation("minutes", "success_rate", "ci_low", "ci_high", "goals"))
+        if len(x):
+            spread = 100 * np.stack([rate - low, high - rate])
+            counts = f"{goals.min():.0f}" + (f" to {goals.max():.0f}" if goals.max() > goals.min() else "")
+            style = {"color": _BLUE, "marker": "o", "lw": 2, "capsize": 4}
+            above.errorbar(x, 100 * rate, spread, **style, label=f"evaluation on {counts} goals, 95 %")
+            for at, value, top in zip(x, rate, high, strict=True):
+                place = {"xytext": (0, 4), "textcoords": "offset points", "ha": "center", "va": "bottom"}
+                above.annotate(f"{100 * value:.0f} %", (at, 100 * top), **place, fontsize=10, color=_BLUE)
+        above.set(ylabel="success [%]", ylim=(0, 112), yticks=range(0, 101, 20))
+        above.legend(frameon=False)
 
+        lines = {"loss": (_ORANGE, "training"), "held_out_loss": (_BLUE, "held out")}
+        fitted = [row for row in rows if row.get("loss")]
+        for name, (color, label) in lines.items() if fitted else [("mean_return", (_ORANGE, "return"))]:
+            x, values = _column(rows, "minutes", name)
+            below.plot(x, values, color=color, lw=1.5, label=label)
+        below.set(xlabel="data [min]", ylabel="loss of the fit" if fitted else "return of an episode")
+        if fitted:
+            below.set_yscale("log")
+            low, high = np.log10(below.get_ylim())
+            below.set_ylim(10 ** np.floor(low), 10 ** np.ceil(high))  # whole decades, or the axis has one number
+            below.yaxis.set_minor_formatter(NullFormatter())
+            below.legend(frameon=False)
+        begun, _ = _column(rows, "minutes", "kl")
+        if fitted and len(begun):
+            for axes in (above, below):
+                axes.axvline(float(fitted[-1]["minutes"]), color=_GREY, ls="--")
+            text = {"xytext": (6, -6), "textcoords": "offset points", "va": "top", "color": "dimgrey"}
+            below.annotate("from here on PPO", (float(fitted[-1]["minutes"]), 10 ** np.ceil(high)), **text)
+        for axes in (above, below):
+            axes.grid(alpha=0.25)
+            axes.spines[["top", "right"]].set_visible(False)
+    _write(figure, path)
+
+
+def draw_policy(policy: Policy, task: TaskSpec, folder: Path, episodes: int = 20, seed: int = 0) -> list[Path]:
+    """Play noise-free episodes, and draw how well the model predicts them and the contacts in the first of them.
+
+    Args:
+        policy: of a task; nothing is drawn of one that plans without an LCS.
+        task: the task.
+        folder: where fit.png and episode.png are written, or replaced.
+        episodes: how many are played.
+        seed: of goals and initial states, as of an evaluation.
+
+    Returns:
+        Paths of the pictures.
+    """
+    if not isinstance(policy, LCSMPCLayer) or isinstance(policy.lcs, LCSSequence):
+        return []
+    envs = task.make_envs(episodes)
+    try:
+        seeds = episode_seeds(seed, Stream.EVALUATION, 0, episodes)
+        played = collect(envs, mpc_actions(policy), seeds, task.episode_steps)
+    finally:
+        envs.close()
+    data = Transitions.from_episodes(played["state"], played["action"])
+    context = [played[CONTEXT].repeat_interleave(task.episode_steps, 0)] if CONTEXT in played.keys() else [None]
+    _write(fit_report(policy.lcs, *data, context=context[0]).plot(), folder / "fit.png")
+
+    first = slice(task.episode_steps)
+    x, u, at = data.x[first], data.u[first], None if context[0] is None else context[0][first]
+    with torch.no_grad():
+        system = policy.lcs if isinstance(policy.lcs, LCSParams) else system_at(policy.lcs, x, at)
+        assert isinstance(system, LCSParams)  # or there was no report
+        lam = advance(system, x, u).lam
+        gap, bounds = system.gap(x, u, lam), [bound.expand(u.shape) for bound in policy.limits()]
+    errors = (f"{e.name.replace('_', ' ')} {float(played['errors', e.name][0]):.3g} {e.unit}" for e in task.errors)
+    title = f"{'reached' if played['success'][0] else 'missed'}; {', '.join(errors)}"
+    _write(draw_trajectory(played["state"][0], u, lam, gap, bounds, title), folder / "episode.png")
+    return [folder / "fit.png", folder / "episode.png"]
+
+
+def _write(figure: Figure, path: Path) -> None:
     buffer = BytesIO()
     figure.savefig(buffer, format="png")
+    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, buffer.getvalue())
 
 
@@ -84,7 +142,7 @@ def _evaluation(first: str, *names: str) -> list[str]:
 
 def _column(rows: Sequence[Mapping[str, str]], *names: str) -> tuple[np.ndarray, ...]:
     """Columns as arrays, of the rows that have a value in each of them."""
-    values = np.array([[float(row[n]) for n in names] for row in rows if all(row[n] != "" for n in names)])
+    values = np.array([[float(row[n]) for n in names] for row in rows if all(row.get(n) for n in names)])
     return tuple(values.reshape(-1, len(names)).T)
 
 

@@ -42,6 +42,14 @@ def read_motion(
     nominal: np.ndarray,
     reached: np.ndarray,
 ) -> tuple[int, int, str]: ...
+def simulate(
+    library: Library,
+    motion: Motion,
+    places: Sequence[Place],
+    state: np.ndarray,
+    ctrl: np.ndarray,
+    after: np.ndarray,
+) -> tuple[int, int, str]: ...
 def solve_soft(
     J: np.ndarray,
     R: np.ndarray,

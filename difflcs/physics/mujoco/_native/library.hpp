@@ -43,15 +43,19 @@ struct Library {
 struct Place {
   const void* model;
   void* data;
-  double *qpos, *qvel, *act, *ctrl, *geom_xpos, *ccd_tolerance;
+  double *qpos, *qvel, *act, *ctrl, *qacc_warmstart, *geom_xpos, *ccd_tolerance;
   const double *geom_xmat, *cdof, *subtree_com, *actuator_length, *qacc, *act_dot;
-  const int32_t* warnings;  // how often MuJoCo has warned, by kinds
-  int kinds, stride;        // of warnings, and from one to the next
+  int32_t* warnings;  // how often MuJoCo has warned, by kinds
+  int kinds, stride;  // of warnings, and from one to the next
 
   bool has_warned() const {
     for (int k = 0; k < kinds; k++)
       if (warnings[k * stride] != 0) return true;
     return false;
+  }
+
+  void forget_warnings() const {
+    for (int k = 0; k < kinds; k++) warnings[k * stride] = 0;
   }
 };
 

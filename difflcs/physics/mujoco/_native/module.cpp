@@ -108,6 +108,7 @@ Place make_place(const nb::dict& f) {
   p.qvel = at<double*>(f, "qvel");
   p.act = at<double*>(f, "act");
   p.ctrl = at<double*>(f, "ctrl");
+  p.qacc_warmstart = at<double*>(f, "qacc_warmstart");
   p.geom_xpos = at<double*>(f, "geom_xpos");
   p.ccd_tolerance = at<double*>(f, "ccd_tolerance");
   p.geom_xmat = at<const double*>(f, "geom_xmat");
@@ -116,7 +117,7 @@ Place make_place(const nb::dict& f) {
   p.actuator_length = at<const double*>(f, "actuator_length");
   p.qacc = at<const double*>(f, "qacc");
   p.act_dot = at<const double*>(f, "act_dot");
-  p.warnings = at<const int32_t*>(f, "warnings");
+  p.warnings = at<int32_t*>(f, "warnings");
   p.kinds = value<int>(f, "kinds");
   p.stride = value<int>(f, "stride");
   return p;
@@ -221,6 +222,21 @@ Outcome read_motion(const Library& library, const Motion& motion, const std::vec
   });
 }
 
+// Simulates steps from states (n, nq + nv + na) at controls (n, nu): ζ, ν and the change of activation (n, 2 nv + na)
+// after them, NaN where MuJoCo warns.
+Outcome simulate(const Library& library, const Motion& motion, const std::vector<const Place*>& places,
+                 Array<const double> state, Array<const double> ctrl, Array<double> after) {
+  const size_t n = state.shape(0), nu = motion.nu, size = motion.size();
+  check(state.size() == n * (motion.nq + motion.nv + motion.na) && ctrl.size() == n * nu && after.size() == n * size &&
+        !places.empty());
+  return at_places(library, places, n, [&](size_t p, int64_t i) {
+    double* into = after.data() + i * size;
+    Reader(library, motion, *places[p]).advance(state.data() + i * state.shape(1), ctrl.data() + i * nu, into);
+    if (places[p]->has_warned()) std::fill_n(into, size, std::nan(""));
+    places[p]->forget_warnings();
+  });
+}
+
 // Forces (n, m) between bounds on the rows J (n, m, nv), where R (n, nv, nv) is the motion by forces. Returns how many
 // problems are not solved.
 int64_t solve_soft(Array<const double> J, Array<const double> R, Array<const double> q, double compliance,
@@ -265,6 +281,8 @@ NB_MODULE(_mujoco, m) {
   m.def("read_motion", &read_motion, "library"_a, "motion"_a, "places"_a, "state"_a, "ctrl"_a, "middle"_a,
         "acceleration"_a, "A"_a, "B"_a, "inverse_mass"_a, "nominal"_a, "reached"_a,
         "Motion at many states. Returns where MuJoCo said an error or warned.");
+  m.def("simulate", &simulate, "library"_a, "motion"_a, "places"_a, "state"_a, "ctrl"_a, "after"_a,
+        "Steps from many states. Returns where MuJoCo said an error.");
   m.def("solve_soft", &solve_soft, "J"_a, "R"_a, "q"_a, "compliance"_a, "low"_a, "high"_a, "threads"_a, "force"_a,
         "Forces between bounds on soft rows. Returns how many problems are not solved.");
 }

@@ -63,6 +63,15 @@ class Reader {
     change(state, into.reached);
   }
 
+  // Write ζ, ν and the change of activation after the steps from a state at a control.
+  void advance(const double* state, const double* ctrl, double* after) const {
+    set(state);
+    std::copy_n(ctrl, motion_.nu, place_.ctrl);
+    std::fill_n(place_.qacc_warmstart, motion_.nv, 0.0);
+    simulate(motion_.steps);
+    change(state, after);
+  }
+
  private:
   void set(const double* state) const {
     std::copy_n(state, motion_.nq, place_.qpos);
