@@ -5,8 +5,6 @@ violation / limit: above 1 is a broken promise, and what is not a number counts 
 for results that were rounded to float32: one rounding of each term.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import nnls

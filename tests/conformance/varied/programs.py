@@ -3,8 +3,6 @@
 None of this calls the library's mathematics.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.optimize import linprog
 
