@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,7 @@ import torch
 import tyro
 from race_global import global_gaps
 from race_hard import measure, tune
-from race_problems import small, with_contact, without_contact
+from race_problems import RELAXATION, small, with_contact, without_contact
 from rivals.problem import Problem
 
 from difflcs import LCSMPCLayer, LCSParams, QuadraticCost
@@ -418,13 +418,16 @@ def globally(o: Options) -> dict[str, dict]:
     """Compare our plans on small problems with global optima with hard contact."""
     branch = Entry("branch and bound", "global_optimum", {"nodes": o.nodes}, "rivals", ("daqp",))
     backends = {
-        "`batched`": BatchedBackend(),
-        "`best`": BatchedBackend(effort="best"),
-        "`ipopt`": IpoptBackend(workers=1),
+        "`batched`": (BatchedBackend(), RELAXATION),
+        "`batched`, λ·s = 1e-7": (BatchedBackend(), 1e-7),
+        "`best`": (BatchedBackend(effort="best"), RELAXATION),
+        "`ipopt`": (IpoptBackend(workers=1), RELAXATION),
     }
     ours = {
-        name: lambda problem, backend=backend: backend.solve(as_mpc(problem), None).primal.u
-        for name, backend in backends.items()
+        name: lambda problem, backend=backend, at=at: (
+            backend.solve(replace(as_mpc(problem), relaxation=at), None).primal.u
+        )
+        for name, (backend, at) in backends.items()
     }
     with tempfile.TemporaryDirectory() as folder:
         (process,) = start((branch,), o.venvs, folder)
