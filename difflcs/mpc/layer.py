@@ -41,6 +41,7 @@ class LCSMPCLayer(nn.Module):
     respect to the LCS, the cost, the bounds, the constraints, x0 and the goal by perturbation of the optimality
     conditions (`difflcs.mpc.kkt`). Everything is solved in float64 on the CPU; results come back in x0's dtype and on
     x0's device. What the layer is built with is the default of each call.
+    As a stochastic policy for reinforcement learning: `difflcs.rl.LCSMPCPolicy`.
 
     Args:
         lcs: an `LCSModel` or any other `LCSModule`, asked for its system at each call (parameters of an nn.Module
@@ -238,15 +239,16 @@ class LCSMPCLayer(nn.Module):
         return MPCController(self.setup(), on_failure, time_limit)
 
     def _report(self, status: Tensor, needs_grad: bool) -> None:
-        degenerate = int((status == Status.DEGENERATE).sum())
-        failed = torch.nonzero(~solved(status)).squeeze(-1).tolist()
-        if degenerate and needs_grad:
+        if needs_grad and (degenerate := int((status == Status.DEGENERATE).sum())):
             warnings.warn(
                 f"{degenerate} of {len(status)} solutions are not classically differentiable (a weakly active bound or "
                 f"a singular reduced Hessian); their gradient is a regularised one. See MPCSolution.status",
                 DegenerateWarning,
                 stacklevel=_stacklevel(),
             )
+        if self._warned and self.on_failure == "mask":
+            return
+        failed = torch.nonzero(~solved(status)).squeeze(-1).tolist()
         if not failed:
             return
         codes = [int(status[i]) for i in failed]

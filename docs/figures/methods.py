@@ -2,7 +2,7 @@
 
 `python docs/figures/methods.py`
 
-On the left success over minutes of data on the cube, on the right at the end on all seven objects. What each method is
+Above success over minutes of data on the cube, below at the end on all seven objects. What each method is
 told stands in the legend.
 """
 
@@ -81,7 +81,7 @@ def draw_minutes(axes: Axes) -> None:
     axes.set_xlim(0, 30.5)
     axes.set_xlabel("minutes of data on the cube")
     axes.set_ylabel("goals reached [%]")
-    axes.legend(fontsize=8, frameon=False, loc="lower right")
+    axes.legend(fontsize=11, frameon=False, loc="lower right")
 
 
 def draw_objects(axes: Axes) -> None:
@@ -106,10 +106,11 @@ def draw_objects(axes: Axes) -> None:
 
 def main() -> None:
     """Draw it."""
-    fig, (left, right) = plt.subplots(1, 2, figsize=(10.5, 4.0), layout="constrained", width_ratios=[1.15, 1])
-    draw_minutes(left)
-    draw_objects(right)
-    for axes in (left, right):
+    plt.rcParams["font.size"] = 12  # legible on a phone
+    fig, (above, below) = plt.subplots(2, 1, figsize=(7.0, 7.0), layout="constrained", height_ratios=[1.15, 1])
+    draw_minutes(above)
+    draw_objects(below)
+    for axes in (above, below):
         axes.spines[["top", "right"]].set_visible(False)
     fig.savefig(HERE / "methods.png", dpi=150)
 

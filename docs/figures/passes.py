@@ -39,7 +39,8 @@ CASES = (
 
 def main() -> None:
     """Draw."""
-    figure, axes = plt.subplots(1, 2, figsize=(8, 3.4), layout="constrained")
+    plt.rcParams["font.size"] = 12  # legible on a phone
+    figure, axes = plt.subplots(1, 2, figsize=(7, 3.6), layout="constrained")
     for axis, (title, xml, options, (horizon, most, to), (stage, effort, final)) in zip(axes, CASES, strict=True):
         model = mujoco.MjModel.from_xml_string(xml)
         module = MujocoLCS(model, **options)
@@ -65,7 +66,7 @@ def main() -> None:
         axis.spines[["top", "right"]].set_visible(False)
     axes[0].set_ylabel("angle [rad]\nplanned (dotted), in MuJoCo")
     axes[0].legend(frameon=False)
-    figure.savefig(Path(__file__).with_name("passes.png"), dpi=110)
+    figure.savefig(Path(__file__).with_name("passes.png"), dpi=150)
 
 
 if __name__ == "__main__":

@@ -42,7 +42,8 @@ def main() -> None:
     """Draw."""
     goal = torch.linspace(0.0, 0.4, 400, dtype=torch.float64).unsqueeze(-1)
     x0 = tensor([[0.0, -0.05]])
-    figure, axes = plt.subplots(2, 1, figsize=(7, 5.5), sharex=True, layout="constrained")
+    plt.rcParams["font.size"] = 12  # legible on a phone
+    figure, axes = plt.subplots(2, 1, figsize=(7, 6), sharex=True, layout="constrained")
     for label, options in VARIANTS.items():
         mpc = LCSMPCLayer(
             SYSTEM, COST, horizon=4, u_min=-0.15, u_max=0.15, backend=BatchedBackend(restarts=16), **options
@@ -60,7 +61,7 @@ def main() -> None:
     for axis in axes:
         axis.spines[["top", "right"]].set_visible(False)
     path = Path(__file__).with_suffix(".png")
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=150)
     print(f"written to {path.name}")
 
 

@@ -64,7 +64,8 @@ def learn(data: Transitions, n_lam: int, xi: float | str, seed: int):
 def main() -> None:
     """Learn, print and draw."""
     torch.set_num_threads(1)
-    figure, axes = plt.subplots(1, 3, figsize=(9.5, 2.8), layout="constrained", sharey=True)
+    plt.rcParams["font.size"] = 12  # legible on a phone
+    figure, axes = plt.subplots(3, 1, figsize=(7, 8), layout="constrained", sharex=True)
     for axis, (title, system, starts, actions) in zip(axes, CASES, strict=True):
         found = {xi: [] for xi in (*WEIGHTS, FALLING)}
         for seed in range(SEEDS):
@@ -85,10 +86,10 @@ def main() -> None:
         axis.plot(places, [np.median(v) for v in found.values()], "_", color="tab:blue", ms=16, mew=2)
         axis.axhline(linear, color="tab:orange", label="affine, no contacts")
         labels = [f"{xi:g}" if isinstance(xi, float) else "falling" for xi in found]
-        axis.set(title=title, xlabel="ξ", xticks=places, yscale="log")
-        axis.set_xticklabels(labels, fontsize=8)
-    axes[0].set_ylabel("error of a step")
-    axes[0].legend(fontsize=8)
+        axis.set(title=title, ylabel="error of a step", yscale="log")
+        axis.set_xticks(places, labels)
+    axes[-1].set_xlabel("ξ")
+    axes[0].legend(frameon=False)
     figure.savefig(Path(__file__).with_suffix(".png"), dpi=150)
 
 

@@ -9,8 +9,6 @@ python -m tests.conformance.scenes --count 20000
 python -m tests.conformance.scenes --first 17 --count 1
 """
 
-from __future__ import annotations
-
 import argparse
 import copy
 import multiprocessing

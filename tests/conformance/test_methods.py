@@ -3,8 +3,6 @@
 The methods of the library and one that is registered here, on a task of one's own, by the common code.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
@@ -34,7 +32,7 @@ from difflcs.rl.runs.training import Reporter, TrainConfig, load_model, load_pol
 from difflcs.rl.tasks import register_task
 from tests.conformance.toy import STEPS, SearchMethod, make_task
 
-pytestmark = pytest.mark.usefixtures("one_thread", "registered")
+pytestmark = pytest.mark.usefixtures("registered")
 
 # The toy is no MuJoCo model; this method is contact-lcs besides, see tests/unit/test_contact_method.py.
 NAMES = (*(name for name in method_names() if name != MujocoMethod.name), SearchMethod.name)

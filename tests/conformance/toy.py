@@ -1,7 +1,5 @@
 """A task without contact and simulator that every method trains on in a second, and a method of ten lines."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial

@@ -96,18 +96,6 @@ def test_missing_extras_are_no_failure_and_say_what_to_install(versions):
     assert doctor.healthy(list(found.values()))
 
 
-def test_what_only_development_needs_is_looked_at_on_request(monkeypatch):
-    seen = []
-    with monkeypatch.context() as patch:
-        patch.setattr(doctor, "examine", lambda groups: seen.append(groups) or [])
-        assert [cli.main(["doctor", *words]) for words in ([], ["--dev"])] == [0, 0]
-    assert seen == [doctor.GROUPS, (*doctor.GROUPS, doctor.DEVELOPMENT)]
-    usual, more = (by_name(doctor.examine([group])) for group in ("extras", doctor.DEVELOPMENT))
-    assert set(usual) == {"rl", "envs", "viz", "relaxed", "scoreboard"}
-    assert {"docs", "dev"} <= set(more)
-    assert not set(usual) & set(more)
-
-
 @pytest.mark.parametrize(("version", "status"), [("0.1.5", "missing"), ("0.13.0+cpu", "ok")])
 def test_a_package_that_is_too_old_is_named(versions, version, status):
     """By numbers, not by letters: 0.13 is newer than 0.9."""

@@ -124,16 +124,6 @@ def test_no_pickle_and_no_torch_save(path):
             assert node.value.value is False
 
 
-def test_the_autograd_functions_are_in_one_file():
-    found = [
-        path.name
-        for path in sources("difflcs")
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.ClassDef) and any(ast.unparse(b) == "torch.autograd.Function" for b in node.bases)
-    ]
-    assert set(found) == {"_differentiation.py"}
-
-
 def test_the_readmes_example_runs_and_prints_a_gradient(tmp_path):
     readme = ROOT / "README.md"
     blocks = re.findall(r"```python\n(.*?)```", readme.read_text(), re.DOTALL)

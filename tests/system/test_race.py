@@ -68,7 +68,7 @@ def test_both_quadratic_programs_are_the_linear_mpc(race, pushing):
     wide = {"u_min": np.full(6, -9.0), "u_max": np.full(6, 9.0), "q": pushing.q[0], "q_final": pushing.q_final[0]}
     linear = dataclasses.replace(pushing, **none, **wide)
     dense = Condensed.of(linear)
-    z = np.linalg.solve(dense.H, -(dense.G @ linear.x0[1] + dense.h))
+    z = np.linalg.solve(dense.H, -dense.f @ dense.at(linear.x0[1]))
     P, q, A, b, where = sparse_program(linear)
     b[: linear.n_x] += linear.A @ linear.x0[1]
     zero = np.zeros((len(b), len(b)))

@@ -29,18 +29,9 @@ MIDDLE = math.sqrt(MASSES[0] * MASSES[1])
 
 
 def block(mass: Tensor, damping: Tensor, stiffness: Tensor, added_mass: Tensor) -> LCSParams:
-    """A block at p ≥ 0 that a force u pushes along a line, and a wall at p = 0 with a spring in front of it.
+    """Blocks of some masses (...) [kg] at p ≥ 0 that a force u pushes along a line; at p = 0 a wall with a spring.
 
     v₊ = v + h/M (u + λ − b v),  p₊ = p + h v₊,  0 ≤ λ ⊥ p₊ + λ/k ≥ 0,  M = mass + added mass.
-
-    Args:
-        mass: (...) [kg].
-        damping: b [N s/m], a number.
-        stiffness: k [N/m], a number.
-        added_mass: [kg], a number.
-
-    Returns:
-        Systems (...) with the state (p [m], v [m/s]), the action u [N] and λ [N]; n_x 2, n_u 1, n_lam 1.
     """
     mobility = DT / (mass + added_mass)
     zero, one = torch.zeros_like(mobility), torch.ones_like(mobility)

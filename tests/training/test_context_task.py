@@ -54,7 +54,9 @@ TASK = TaskSpec(
 )
 
 
-@pytest.mark.parametrize("method", method_names())
+@pytest.mark.parametrize(
+    "method", sorted({*method_names()} - {"violation", "ppo"})
+)  # lcs-rl is both, one after the other
 def test_every_method_trains_a_task_with_a_context(method, tmp_path):
     config = replace(TrainConfig(task="heavy-block", method=get_method(method)()).smoke(), minutes=0.6)
     run = train(config, tmp_path / "run", task=TASK)

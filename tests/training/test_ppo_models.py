@@ -9,7 +9,7 @@ from difflcs.errors import CheckpointError
 pytest.importorskip("torchrl")
 from difflcs.rl.rollout import collect, uniform_actions
 from difflcs.rl.runs.evaluate import evaluate
-from tests.training.slide import ROLLOUTS, STEPS, Noting, make_envs, make_models, make_ppo, parameters, recorded, same
+from tests.training.slide import ROLLOUTS, STEPS, Noting, make_envs, make_models, make_ppo, recorded
 
 
 def make_practising(seed: int = 0, first_epochs: int = 20, models: dict | None = None, **changes):
@@ -96,13 +96,6 @@ def test_the_value_network_learns_from_what_the_estimator_says(actions):
     torch.testing.assert_close(trainer.critic.history[1][1], estimate.rewards, rtol=0, atol=0)
     assert torch.equal(estimate.rewards, rewards) == (actions == 1)
     assert torch.equal(trainer.critic.history[2][1], seen[0].calls[1][2])
-
-
-def test_without_real_episodes_models_only_shorten_the_first_step():
-    alone, practising = make_ppo(), make_practising(models={"real_step": 1.0})
-    for trainer in (alone, practising):
-        trainer.step()
-    assert same(parameters(alone), parameters(practising))
 
 
 def test_a_state_without_models_is_refused():

@@ -81,14 +81,6 @@ def test_a_pretrained_model_skips_the_random_episodes():
     assert len(trainer.policy.bounds) == STEPS
 
 
-def test_buffer_keeps_the_newest():
-    trainer = make_trainer(buffer=4)
-    for _ in range(3):
-        trainer.step()
-    assert len(trainer.buffer) == 4
-    assert trainer.env_steps == (2 + 3 + 3) * STEPS
-
-
 def transitions(episodes: int, seed: int) -> list[torch.Tensor]:
     """States, actions and next states of uniformly random episodes."""
     envs = make_envs(episodes)

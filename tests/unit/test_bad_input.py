@@ -317,9 +317,6 @@ def test_layer_refuses_crossed_bounds_with_both_numbers(build, bounds):
     refuse(e.BoundsError, r"at index \(1, 1\)", layer(build), torch.zeros(2, 4).double(), u_min=one[0], u_max=one[1])
 
 
-# --- MPCProblem -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("change", "error", "match"),
     [

@@ -106,12 +106,6 @@ def test_a_mujoco_that_cannot_be_bound_to_is_refused(monkeypatch):
         TriFingerMoveCubeEnv()
 
 
-def test_rows_must_fit():
-    physics = TriFingerMoveCubeEnv().physics
-    with pytest.raises(ValueError, match="one row"):
-        native.step_lanes([physics.lane], np.zeros((2, 6)), np.zeros((1, 9)), np.zeros(1, bool), 1)
-
-
 def test_mujocos_stopwatches_run_again_after_a_step():
     """The compiled stepper does without them; who steps by hand has them as before."""
     env = TriFingerMoveCubeEnv()

@@ -196,7 +196,3 @@ def test_what_is_known_of_an_own_object_is_how_it_lies(tmp_path):
     task = trifinger_task("own", "TriFingerMoveObject-v0", MOVE, "Own.", (), **given)
     corners = np.concatenate([part.vertices.numpy() for part in task.physics.make_system().guess.shape.parts])
     np.testing.assert_allclose(np.ptp(corners, axis=0), [0.06, 0.08], atol=1e-6)
-
-
-def test_only_what_is_pushed_has_physics_of_pushing():
-    assert get_task("turn_cube").physics is None

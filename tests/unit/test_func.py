@@ -46,16 +46,6 @@ def test_vmap_is_a_batch(layer, x0):
     close(vmap(lambda x: layer(x).u)(x0.reshape(2, 3, 4)), plain.u.reshape(2, 3, 3, 2))
 
 
-def test_vmap_returns_a_whole_solution(layer, x0):
-    plain, mapped = layer(x0), vmap(layer)(x0)
-    assert isinstance(mapped, MPCSolution)
-    for name in ("x", "u", "lam", "mu", "objective", "status", "iterations", "violation"):
-        close(getattr(mapped, name), getattr(plain, name))
-    assert mapped.complementarity().shape == (6,)
-    assert float(mapped.dynamics_residual().max()) < 1e-10
-    assert bool(mapped.converged.all())
-
-
 def test_vmap_over_systems_states_and_both(build, layer, x0, systems):
     own = LCSMPCLayer(build.params(3), build.cost(3), 3, -0.15, 0.15, relaxation=1e-4)
 

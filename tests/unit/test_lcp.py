@@ -60,15 +60,6 @@ def jacobian_q(F, q):
     return torch.autograd.functional.jacobian(lambda p: solve_lcp(F, p).lam, q)
 
 
-def test_gradient_at_q_zero_is_that_of_the_inactive_piece():
-    F = definite(4, 0).requires_grad_()
-    q = torch.zeros(4, dtype=torch.float64, requires_grad=True)
-    lam, w, _ = solve_lcp(F, q)
-    grad_F, grad_q = torch.autograd.grad((2 * lam + 3 * w).sum(), (F, q))
-    assert torch.equal(grad_q, torch.full((4,), 3.0, dtype=torch.float64))
-    assert torch.equal(grad_F, torch.zeros(4, 4, dtype=torch.float64))
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_gradient_at_a_kink_is_the_one_sided_derivative_of_the_inactive_side(build, seed):
     """λ_i = w_i = 0 exactly, because row i of F does not see the active forces."""

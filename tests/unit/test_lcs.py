@@ -1,12 +1,11 @@
 """LCSParams and LCSModel: the equations, their gradients, and what a module must survive."""
 
 import copy
-import dataclasses
 
 import pytest
 import torch
 
-from difflcs import LCSModel, LCSParams
+from difflcs import LCSModel
 from difflcs.errors import (
     BoundsError,
     CheckpointError,
@@ -71,21 +70,6 @@ def test_from_params_refuses_a_stiffness_that_cannot_represent_F(build):
 def test_from_params_refuses_a_batch_of_systems(build):
     with pytest.raises(ShapeError, match=r"no batch dimensions, got \(2,\)"):
         LCSModel.from_params(build.params(batch=(2,)))
-
-
-def test_params_are_a_frozen_record(build):
-    params = build.params()
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        params.A = params.A
-    assert (params.n_x, params.n_u, params.n_lam) == (4, 2, 3)
-    assert list(params.tensors()) == ["A", "B", "C", "d", "D", "E", "F", "c"]
-
-
-def test_params_batch_shape_broadcasts_the_fields(build):
-    tensors = build.lcs_tensors()
-    assert LCSParams(**tensors).batch_shape == ()
-    each = {**tensors, "d": tensors["d"].expand(5, 4), "F": tensors["F"].expand(2, 1, 3, 3)}
-    assert LCSParams(**each).batch_shape == (2, 5)
 
 
 SUPPORT = torch.tensor([[-0.1, -0.2], [0.05, 0.3]], dtype=torch.float64)

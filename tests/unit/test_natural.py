@@ -47,19 +47,6 @@ def test_a_step_is_the_natural_gradient_of_the_given_length():
     assert float(step @ metric @ step) == pytest.approx(0.3**2)
 
 
-def test_it_does_not_depend_on_the_parametrisation():
-    """Without damping, scaled parameters take the same step in what the policy does."""
-    scale = torch.tensor([5.0, 0.1, 3.0], dtype=torch.float64)
-    moved = []
-    for factor in (torch.ones(3, dtype=torch.float64), scale):
-        parameters, optimiser = make()
-        optimiser.measure(JACOBIAN * factor)
-        backward(parameters, (torch.tensor([1.0, -2.0, 0.5]) * factor).tolist())
-        optimiser.step()
-        moved.append(flat(parameters) * factor)
-    torch.testing.assert_close(moved[0], moved[1])
-
-
 def test_gradients_and_metrics_are_averaged():
     parameters, optimiser = make(momentum=0.8)
     for gradient in ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]):

@@ -147,14 +147,6 @@ def test_the_cost_of_standing_still_and_what_a_plan_saves_are_those_of_the_mpc(b
     assert decision.gain == pytest.approx(float(decision.gains[0]) / decision.standing)
 
 
-def test_nothing_is_to_be_gained_at_the_goal():
-    policy = on_a_line()
-    u = policy.act([1.0, 0.49], [1.0])
-    assert policy.decision.mode is Mode.PUSH
-    assert abs(float(u[0])) < 0.02  # the relaxed contact pushes a little without touching
-    assert float(policy.decision.gains.max()) < 1e-6
-
-
 @pytest.mark.parametrize("right", [True, False])
 def test_a_place_that_is_not_allowed_is_not_chosen(right):
     policy = on_a_line(Sides(allowed=(right, False)))

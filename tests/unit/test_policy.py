@@ -13,11 +13,10 @@ from difflcs.errors import DTypeError, InvalidInputError
 
 pytest.importorskip("torchrl")
 from tensordict import TensorDict
-from torchrl.data import Unbounded
+from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from difflcs.rl.learning.mlp import MLPController
-from difflcs.rl.learning.policy import LCSMPCPolicy, MLPPolicy
+from difflcs.rl.learning.policy import LCSMPCPolicy
 
 U_MAX = 0.1
 STD = 0.02
@@ -37,29 +36,6 @@ def observations(*batch: int) -> TensorDict:
     return TensorDict({"state": state, "goal": goal}, batch)
 
 
-@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
-def test_keys_shapes_and_specs(mpc, batch):
-    policy = LCSMPCPolicy(mpc, STD)
-    assert policy.in_keys == ["state", "goal"]
-    data = policy(observations(*batch))
-    assert set(policy.out_keys) <= set(data.keys(True, True))
-    shapes = {key: tuple(data[key].shape[len(batch) :]) for key in data.keys(True, True)}
-    assert shapes == {
-        "state": (2,),
-        "goal": (1,),
-        "action": (2,),
-        "action_log_prob": (),
-        "loc": (2,),
-        "scale_tril": (2, 2),
-        "converged": (1,),
-        ("plan", "x"): (5, 2),
-        ("plan", "u"): (4, 2),
-        ("plan", "lam"): (4, 2),
-    }
-    assert policy.spec["action"] == Unbounded(torch.Size([2]), dtype=torch.float64)
-    assert bool(data["converged"].all())
-
-
 def test_mean_is_the_mpcs_action_and_noise_is_gaussian(mpc):
     policy = LCSMPCPolicy(mpc, torch.tensor([0.01, 0.03], dtype=torch.float64))
     one = observations()
@@ -74,6 +50,14 @@ def test_mean_is_the_mpcs_action_and_noise_is_gaussian(mpc):
     z = noise / policy.std
     expected = -0.5 * z.square().sum(-1) - policy.std.log().sum() - math.log(2 * math.pi)
     torch.testing.assert_close(many["action_log_prob"], expected)
+
+
+def test_a_layer_is_a_tensordict_module(mpc):
+    module = TensorDictModule(mpc, ["state", "goal"], ["plan"])
+    data = module(observations(5, 3))
+    assert torch.equal(data["plan", "u"], mpc(data["state"], data["goal"]).u)
+    data["plan", "objective"].sum().backward()
+    assert module.get_parameter("module.lcs.A").grad.abs().sum() > 0
 
 
 def test_deterministic_mode_is_the_mean(mpc):
@@ -155,22 +139,3 @@ def test_the_library_does_not_import_torchrl():
     code = "import sys, difflcs, difflcs.rl; print(*sys.modules)"
     loaded = subprocess.check_output([sys.executable, "-c", code], text=True).split()
     assert not {"torchrl", "tensordict"} & set(loaded)
-
-
-def test_a_network_instead_of_the_mpc():
-    high = torch.tensor([0.1, 0.2], dtype=torch.float64)
-    network = MLPController(
-        lambda state, goal, elapsed: torch.cat([state, goal, elapsed[..., None]], -1), 4, -high, high
-    )
-    policy = MLPPolicy(network, STD)
-    assert policy.in_keys == ["state", "goal", "elapsed"]
-    assert policy.learned is policy.controller is network
-    data = observations(500)
-    data["elapsed"] = torch.linspace(0, 1, 500, dtype=torch.float64)
-    policy(data)
-    torch.testing.assert_close(data["loc"], network.mean(data["state"], data["goal"], data["elapsed"]))
-    noise = (data["action"] - data["loc"]).detach()
-    torch.testing.assert_close(noise.std(0), policy.std, rtol=0.15, atol=0.0)
-    policy.get_dist(data.select(*policy.in_keys)).log_prob(data["action"].detach()).sum().backward()
-    assert all(bool(p.grad.any()) for p in network.parameters())
-    assert bool(policy.gaussian.log_std.grad.any())  # learned by default, as is usual for networks

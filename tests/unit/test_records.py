@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from difflcs import LCSModel, LCSModule, LCSParams, LCSSequence, solve_lcp
+from difflcs import LCSModel, LCSParams, LCSSequence, solve_lcp
 from difflcs.errors import (
     BatchIndexError,
     DiffLCSError,
@@ -193,34 +193,3 @@ def test_a_model_without_contacts_is_kept_and_learns(build, tmp_path):
     assert torch.equal(again(x, u).x_next, model(x, u).x_next)
     assert torch.equal(LCSModel.from_params(model.params())(x, u).x_next, model(x, u).x_next)
     assert LCSModel.from_params(model.params(), stiffness=0.7).stiffness == 0.7
-
-
-def test_an_lcp_without_variables_is_solved(build):
-    F, q = torch.zeros(0, 0, dtype=torch.float64), torch.zeros(3, 5, 0, dtype=torch.float64)
-    for relaxation in (0.0, 1e-5):
-        lam, w, status = solve_lcp(F, q.requires_grad_(), relaxation)
-        assert lam.shape == w.shape == (3, 5, 0)
-        assert status.shape == (3, 5)
-        assert int(status.abs().max()) == 0
-        (lam.sum() + w.sum()).backward()
-        assert q.grad is not None
-    assert solve_lcp(F.expand(2, 1, 0, 0), q.detach()[0]).lam.shape == (2, 5, 0)
-
-
-class Made(torch.nn.Module):
-    """A system that depends on the state, made without LCSModel."""
-
-    def __init__(self, params):
-        super().__init__()
-        self.base = params
-        self.n_x, self.n_u, self.n_lam = params.n_x, params.n_u, params.n_lam
-
-    def params(self, x=None, context=None):
-        return self.base
-
-
-def test_what_counts_as_a_module(build):
-    assert isinstance(build.model(), LCSModule)
-    assert isinstance(Made(build.params()), LCSModule)
-    assert not isinstance(build.params(), LCSModule)
-    assert not isinstance(torch.nn.Linear(2, 2), LCSModule)

@@ -6,10 +6,10 @@ import pickle
 import pytest
 import torch
 
-from difflcs import Status, available_backends
+from difflcs import Status
 from difflcs.errors import DTypeError, InvalidInputError, SolveWarning
 from difflcs.mpc import MPCProblem, Primal
-from difflcs.mpc.backends import RelaxedBackend, get_backend
+from difflcs.mpc.backends import RelaxedBackend
 from tests.conformance.problems import Problem, badly_scaled, contact, make
 from tests.conformance.problems import solve as solve_problem
 
@@ -32,12 +32,6 @@ def without_contact(build, **options):
 
 
 # --- the plan -------------------------------------------------------------------------------------------------------
-
-
-def test_it_is_registered_and_says_that_it_is_not_exact():
-    assert "relaxed" in available_backends()
-    assert get_backend("relaxed") == RelaxedBackend()
-    assert RelaxedBackend.exact is False
 
 
 @pytest.fixture
@@ -102,24 +96,6 @@ def test_a_guess_makes_one_pass(build):
     assert solve(t, guess=first).iterations.tolist() == [1] * 4
     wild = Primal(*(1e3 * torch.ones_like(v.detach()) for v in (first.x, first.u, first.lam)))
     assert bool(solve(t, guess=wild).converged.all())
-
-
-def test_the_layer_of_one_size_is_built_once(build, monkeypatch):
-    import cvxpylayers.torch
-
-    built = []
-
-    class Counted(cvxpylayers.torch.CvxpyLayer):
-        def __init__(self, *arguments, **options):
-            built.append(options)
-            super().__init__(*arguments, **options)
-
-    monkeypatch.setattr(cvxpylayers.torch, "CvxpyLayer", Counted)
-    t = tensors(build, n_x=5, n_u=1)  # a size that no other test has
-    solve(t)
-    assert len(built) == 1
-    solve({**t, "x0": 2 * t["x0"][:2]}, RelaxedBackend(penalties=(3.0,)))
-    assert len(built) == 1
 
 
 # --- the gradient ---------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from difflcs import LCSModel, LCSModule, ScaledLCS, suggest_scales
+from difflcs import LCSModel, ScaledLCS, suggest_scales
 from difflcs.errors import CheckpointError, DeviceError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
 
 
@@ -66,19 +66,6 @@ def test_a_system_that_is_brought_back_predicts_the_same_in_the_units_of_the_dat
     torch.testing.assert_close(scales.states(found.x_next), expected.x_next, rtol=1e-7, atol=1e-7)
     torch.testing.assert_close(found.lam, expected.lam, rtol=1e-7, atol=1e-7)
     assert torch.equal(scales.params(inner).F, inner.F)
-
-
-def test_a_scaled_module_is_a_module_in_the_units_of_the_data(build, data):
-    scales, model = suggest_scales(*data), build.model(seed=3)
-    scaled = ScaledLCS(model, scales)
-    assert isinstance(scaled, LCSModule)
-    assert (scaled.n_x, scaled.n_u, scaled.n_lam) == (4, 2, 3)
-    found = scaled.params(data[0]).step(*data[:2]).x_next
-    expected = model(*scales.normalise(*data)[:2]).x_next
-    torch.testing.assert_close(scales.states(found), expected, rtol=1e-7, atol=1e-7)
-    found.sum().backward()
-    assert all(float(p.grad.abs().max()) > 0 for p in model.parameters())
-    assert list(scaled.parameters()) == list(model.parameters())
 
 
 def test_a_scaled_module_predicts_and_is_saved_with_its_scales(build, data, tmp_path):

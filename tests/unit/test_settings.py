@@ -105,12 +105,6 @@ def test_integers_stand_for_floats_and_none_where_it_is_declared():
     assert Outer(maybe=2**63 - 1, size=2**63 - 1).size == 2**63 - 1
 
 
-def test_settings_come_back_from_json():
-    own = Outer(inner=Inner(7, 0.25), pair=(0.3, 0.4), many=(1, 2), maybe=None, kind="b", flag=True, text="x", size=5)
-    assert from_json(json.loads(json.dumps(asdict(own))), Outer) == own
-    assert from_json(asdict(own), Outer) == own
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -184,25 +178,6 @@ def test_every_setting_says_what_it_is_and_has_bounds_where_it_is_a_number(kind)
 
 
 # --- the configuration of a training ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"method": "magic"}, "lcs-rl, violation"),
-        ({"method": None}, "method"),
-        ({"task": 3}, "task"),
-        ({"minutes": 0.0}, "minutes"),
-        ({"minutes": math.nan}, "minutes"),
-        ({"seed": -1}, "seed"),
-        ({"evaluate_goals": 0}, "evaluate_goals"),
-        ({"final_goals": -1}, "final_goals"),
-        ({"evaluate_at": (-1.0,)}, "evaluate_at"),
-    ],
-)
-def test_bad_settings_of_a_training_are_refused(change, message):
-    with pytest.raises(InvalidInputError, match=message):
-        TrainConfig(**change)
 
 
 def test_a_method_stands_for_its_name():

@@ -20,12 +20,6 @@ from tests.conformance.toy import STEPS, U_MAX, Slide, make_task
 TOY = make_task()
 
 
-def test_sizes_are_those_of_the_cost():
-    assert (TOY.n_x, TOY.n_u, TOY.n_goal, TOY.n_features) == (2, 1, 1, 4)
-    assert make_task(size=3).n_x == 3
-    assert TOY.steps_per_minute == 120
-
-
 def test_bounds_are_a_number_or_one_for_each_action():
     low, high = TOY.bounds
     assert (low.tolist(), high.tolist(), low.dtype) == ([-U_MAX], [U_MAX], torch.float64)

@@ -30,8 +30,8 @@ class Result:
         kkt_residual: (batch,) see `difflcs.mpc.kkt.residual`; the largest float where it is infinite.
         solve_time: (batch,) seconds.
         linearisation: the factored optimality conditions for the gradient.
-        objective: (batch,) the cost of the CONVERGED plans, if the solver returns it; up to rounding it is
-            `MPCProblem.objective`.
+        objective: (batch,) the cost of the plans, `MPCProblem.objective` up to rounding, if the solver returns it; NaN
+            where it does not.
     """
 
     primal: Primal
