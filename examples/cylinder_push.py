@@ -24,8 +24,8 @@ from difflcs.planning import SamplingPolicy, SamplingSettings
 
 SECONDS, DECISIONS, REACH = 0.1, 200, 0.56  # of a step, of an episode; from centre to centre as they nearly touch [m]
 CLEAR, NEAR = 0.75, 0.8  # how far from the centre the pusher goes round, and where it counts as near [m]
-WEIGHT, EFFORT, FINAL = 0.02, 0.001, 30.0  # of the distance between the two, of the servos, and at the end
-SETTINGS = SamplingSettings(travel_price=0.005, switch_price=0.005, smallest_gain=0.005)
+WEIGHT, EFFORT, FINAL = 0.01, 0.0005, 30.0  # of the distance between the two, of the servos, and at the end
+SETTINGS = SamplingSettings(travel_price=0.001, switch_price=0.002, smallest_gain=0.002)
 
 
 @dataclass
