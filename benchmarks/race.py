@@ -59,7 +59,6 @@ PLAIN = {"bound_relax_factor": 0.0}
 TUNED = {"tol": 1e-6, "mu_init": 1e-4, "bound_relax_factor": 0.0}
 TUNED |= {"fast_step_computation": "yes", "mumps_pivot_order": 0}
 ADAPTIVE = {**TUNED, "mu_strategy": "adaptive"}
-LONG = {"tol": 1e-5, "mu_init": 1e-2, "max_iter": 1000}
 CONTACT = (
     Entry("difflcs `batched`", "layer"),
     Entry("difflcs `ipopt`", "layer", {"backend": "ipopt"}),

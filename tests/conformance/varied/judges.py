@@ -6,7 +6,7 @@ Stationarity is judged by the derivative of the Lagrangian along the trajectory,
 
 import numpy as np
 
-from tests.conformance.varied.generators import Case
+from tests.conformance.cases import Case
 
 SYSTEM = ("A", "B", "C", "d", "D", "E", "F", "c")
 

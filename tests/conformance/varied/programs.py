@@ -6,7 +6,7 @@ None of this calls the library's mathematics.
 import numpy as np
 from scipy.optimize import linprog
 
-from tests.conformance.varied.generators import Case
+from tests.conformance.cases import Case
 
 
 def condensed(case: Case, i: int):
