@@ -149,11 +149,12 @@ class MPCSolver(Solver):
 
     def _objective(self, result: Result) -> Tensor:
         """Compute the cost of the plans (batch,), unless the solver has returned it."""
-        known = result.objective
-        if known is not None and (result.all_converged or all_finite(known)):
-            return known
+        if result.objective is not None and result.costs_known:
+            return result.objective
         objective = self.problem.objective(result.primal.x, result.primal.u)
-        return objective if known is None else torch.where(known.isnan(), objective, known)
+        if result.objective is None:
+            return objective
+        return torch.where(result.status == int(Status.CONVERGED), result.objective, objective)
 
     def flat_guess(self, parts: Mapping[str, Tensor]) -> Primal | None:
         """Make a guess in the form that backends take; multipliers that it lacks are zero."""

@@ -30,8 +30,8 @@ class Result:
         kkt_residual: (batch,) see `difflcs.mpc.kkt.residual`; the largest float where it is infinite.
         solve_time: (batch,) seconds.
         linearisation: the factored optimality conditions for the gradient.
-        objective: (batch,) the cost of the plans, `MPCProblem.objective` up to rounding, if the solver returns it; NaN
-            where it does not.
+        objective: (batch,) the cost of the CONVERGED plans, if the solver returns it; up to rounding it is
+            `MPCProblem.objective`.
     """
 
     primal: Primal
@@ -46,6 +46,11 @@ class Result:
     def all_converged(self) -> bool:
         """Whether every plan is CONVERGED, so that callers can skip further checks."""
         return all_converged(self.status)
+
+    @functools.cached_property
+    def costs_known(self) -> bool:
+        """Whether `objective` is the cost of every plan."""
+        return self.objective is not None and self.all_converged
 
     @property
     def solved(self) -> Tensor:

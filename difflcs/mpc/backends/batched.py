@@ -159,9 +159,9 @@ class BatchedBackend(Backend):
                 self._make_finite(problem, result.primal, result.status)
             if problem.n_c:
                 self._confirm_infeasible(problem, result.primal, result.status, started)
-            cost, status = outputs["objective"], outputs["status"]  # the kernel's is that of the plan in these cases
-            known = (status == Status.CONVERGED) | ((status == Status.MAX_ITER) & (cost < _HUGE) & (problem.n_c == 0))
-            cost[~known] = np.nan
+            if problem.n_c == 0:  # also what ran out of time has the cost of its plan
+                known = (outputs["status"] == Status.CONVERGED) | (outputs["status"] == Status.MAX_ITER)
+                vars(result)["costs_known"] = bool((known & (outputs["objective"] < _HUGE)).all())
             np.minimum(outputs["residual"], _HUGE, out=outputs["residual"])
         return result
 
