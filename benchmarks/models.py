@@ -83,9 +83,10 @@ def _zoo(name: str) -> LCSParams:
     return LCSModel.from_pretrained(f"zoo:trifinger-{name}").params().detach()
 
 
-def _random(lcs: LCSParams, horizon: int, count: int, seed: int) -> Instance:
+def to_rest(lcs: LCSParams, horizon: int, count: int, seed: int, final: float = 1.0) -> Instance:
+    """Bring any model to rest; `final` is the weight of its last state."""
     eye = torch.eye(lcs.n_x, dtype=torch.float64)
-    cost = QuadraticCost(eye, 0.1 * torch.eye(lcs.n_u, dtype=torch.float64), 10 * eye)
+    cost = QuadraticCost(eye, 0.1 * torch.eye(lcs.n_u, dtype=torch.float64), final * eye)
     x0 = torch.randn(count, lcs.n_x, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     return Instance({"lcs": lcs, "cost": cost, "horizon": horizon, "u_min": -1.0, "u_max": 1.0}, (x0,))
 
@@ -98,12 +99,15 @@ def _cart_pole(horizon: int, dt: float, stiffness: float, count: int) -> Instanc
     return Instance({"lcs": lcs, "cost": cost, "horizon": horizon, "u_min": -10.0, "u_max": 10.0}, (x0,))
 
 
-def _chain(carts: int, horizon: int, dt: float, stiffness: float, count: int) -> Instance:
-    """Push the last cart 0.3 m further, through all others."""
-    cost = push_the_last_cart(carts, horizon)
-    x0 = cart_states(carts, count, carts + horizon)
-    lcs = chain_of_carts(carts, dt, stiffness)
+def chain(lcs: LCSParams, horizon: int, count: int, seed: int, others: float = 0.0) -> Instance:
+    """Push the last cart 0.3 m further, through all others; see `push_the_last_cart`."""
+    carts = lcs.n_x // 2
+    cost, x0 = push_the_last_cart(carts, horizon, others), cart_states(carts, count, seed)
     return Instance({"lcs": lcs, "cost": cost, "horizon": horizon, "u_min": -50.0, "u_max": 50.0}, (x0,))
+
+
+def _chain(carts: int, horizon: int, dt: float, stiffness: float, count: int) -> Instance:
+    return chain(chain_of_carts(carts, dt, stiffness), horizon, count, carts + horizon)
 
 
 OBJECTS = ("cube", "mug", "wrench", "banana")
@@ -113,7 +117,7 @@ FAMILIES: dict[str, Callable[[int], list[Instance]]] = {
     "pushing, n_lam 5": lambda count: [pushing(pushing_model(5, seed), count, seed) for seed in range(4)],
     "pushing, n_lam 8": lambda count: [pushing(pushing_model(8, seed), count, seed) for seed in range(4)],
     "zoo": lambda count: [pushing(_zoo(name), count, 10 + i) for i, name in enumerate(OBJECTS)],
-    "random, n_lam 5, H 10": lambda count: [_random(random_model(5, seed), 10, count, seed) for seed in range(4)],
+    "random, n_lam 5, H 10": lambda count: [to_rest(random_model(5, seed), 10, count, seed, 10.0) for seed in range(4)],
     "cart-pole, H 30": lambda count: [_cart_pole(30, 0.04, stiffness, count) for stiffness in (10.0, 100.0)],
     "cart-pole, H 50": lambda count: [_cart_pole(50, 0.02, stiffness, count) for stiffness in (10.0, 100.0)],
     "4 carts": lambda count: [_chain(4, 20, 0.05, 100.0, count), _chain(4, 10, 0.1, 1000.0, count)],

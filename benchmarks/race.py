@@ -14,14 +14,15 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 import tyro
 from race_global import global_gaps
-from race_problems import small, with_contact, without_contact
+from race_hard import measure, tune
+from race_problems import RELAXATION, small, with_contact, without_contact
 from rivals.problem import Problem
 
 from difflcs import LCSMPCLayer, LCSParams, QuadraticCost
@@ -58,7 +59,6 @@ PLAIN = {"bound_relax_factor": 0.0}
 TUNED = {"tol": 1e-6, "mu_init": 1e-4, "bound_relax_factor": 0.0}
 TUNED |= {"fast_step_computation": "yes", "mumps_pivot_order": 0}
 ADAPTIVE = {**TUNED, "mu_strategy": "adaptive"}
-LONG = {"tol": 1e-5, "mu_init": 1e-2, "max_iter": 1000}
 CONTACT = (
     Entry("difflcs `batched`", "layer"),
     Entry("difflcs `ipopt`", "layer", {"backend": "ipopt"}),
@@ -107,8 +107,10 @@ class Options:
     """Folder of the rivals' environments."""
     install: bool = False
     """Make these environments, from the package index, and end."""
-    parts: tuple[str, ...] = ("contact", "linear", "global")
+    parts: tuple[str, ...] = ("contact", "linear", "global", "planners")
     """Parts to run; the others stay as they are in the file."""
+    tune: float = 0.0
+    """CPU seconds in which settings of each planner are drawn for each family, on other seeds; then it ends."""
     out: Path = Path("benchmarks/results/race.json")
     """Path of the JSON output."""
     smoke: bool = False
@@ -416,13 +418,16 @@ def globally(o: Options) -> dict[str, dict]:
     """Compare our plans on small problems with global optima with hard contact."""
     branch = Entry("branch and bound", "global_optimum", {"nodes": o.nodes}, "rivals", ("daqp",))
     backends = {
-        "`batched`": BatchedBackend(),
-        "`best`": BatchedBackend(effort="best"),
-        "`ipopt`": IpoptBackend(workers=1),
+        "`batched`": (BatchedBackend(), RELAXATION),
+        "`batched`, λ·s = 1e-7": (BatchedBackend(), 1e-7),
+        "`best`": (BatchedBackend(effort="best"), RELAXATION),
+        "`ipopt`": (IpoptBackend(workers=1), RELAXATION),
     }
     ours = {
-        name: lambda problem, backend=backend: backend.solve(as_mpc(problem), None).primal.u
-        for name, backend in backends.items()
+        name: lambda problem, backend=backend, at=at: (
+            backend.solve(replace(as_mpc(problem), relaxation=at), None).primal.u
+        )
+        for name, (backend, at) in backends.items()
     }
     with tempfile.TemporaryDirectory() as folder:
         (process,) = start((branch,), o.venvs, folder)
@@ -449,6 +454,9 @@ def main(o: Options) -> None:
     if o.install:
         install(o.venvs)
         return
+    if o.tune:
+        tune(as_mpc, o.tune)
+        return
     if o.smoke:
         o.problems, o.batch, o.linear_batch, o.small_problems, o.seeds, o.rounds, o.nodes = 2, 3, 3, 1, 1, 1, 300
     torch.set_num_threads(1)
@@ -456,7 +464,8 @@ def main(o: Options) -> None:
     options = {name: getattr(o, name) for name in names}
     results = json.loads(o.out.read_text())["results"] if o.out.exists() else {}
     for name in o.parts:
-        results |= {"global": globally(o)} if name == "global" else dict(race(name, o))
+        alone = {"global": globally, "planners": lambda o: measure(as_mpc, o.problems, o.seeds, o.rounds)}
+        results |= {name: alone[name](o)} if name in alone else dict(race(name, o))
         save(o.out, {"machine": machine(), "options": options, "results": results})
 
 

@@ -60,9 +60,9 @@ def chain(count: int, carts: int, horizon: int, seed: int) -> Problem:
     return problem(chain_of_carts(carts), cost, x0, horizon, 50.0, seed)
 
 
-def with_contact(count: int, seeds: int) -> dict[str, list[Problem]]:
-    """Make the families of the race, one entry for each model or seed of initial states."""
-    every = range(seeds)
+def with_contact(count: int, seeds: int, first: int = 0) -> dict[str, list[Problem]]:
+    """Make the families of the race, one entry for each model or seed of initial states, from `first`."""
+    every = range(first, first + seeds)
     cube = LCSModel.from_pretrained("zoo:trifinger-cube").params().detach()
     families = {f"pushing, n_lam {n}": [pushing(pushing_model(n, s), count, s) for s in every] for n in (5, 8)}
     families["learned cube"] = [pushing(cube, count, 10 + s) for s in every]

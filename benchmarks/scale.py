@@ -23,17 +23,9 @@ from typing import Any
 
 import torch
 import tyro
-from models import (
-    Instance,
-    cart_states,
-    chain_of_carts,
-    push_the_last_cart,
-    pushing,
-    pushing_model,
-    random_model,
-)
+from models import Instance, chain, chain_of_carts, pushing, pushing_model, random_model, to_rest
 
-from difflcs import LCSMPCLayer, QuadraticCost
+from difflcs import LCSMPCLayer
 from difflcs.cli.bench import machine, save
 from difflcs.mpc.backends import Backend, BatchedBackend, IpoptBackend
 
@@ -64,18 +56,12 @@ class Options:
 
 def random_problem(n_x: int, n_lam: int, horizon: int, count: int, seed: int) -> Instance:
     """Make a random model, to be brought to rest."""
-    lcs = random_model(n_lam, seed, n_x, n_u=2 * n_x // 3)
-    eye = torch.eye(n_x, dtype=torch.float64)
-    cost = QuadraticCost(eye, 0.1 * torch.eye(lcs.n_u, dtype=torch.float64), eye)
-    x0 = torch.randn(count, n_x, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    return Instance({"lcs": lcs, "cost": cost, "horizon": horizon, "u_min": -1.0, "u_max": 1.0}, (x0,))
+    return to_rest(random_model(n_lam, seed, n_x, n_u=2 * n_x // 3), horizon, count, seed)
 
 
 def carts_problem(carts: int, horizon: int, count: int) -> Instance:
-    """Push the last cart 0.3 m further, through all others."""
-    cost = push_the_last_cart(carts, horizon, others=0.1)
-    layer = {"lcs": chain_of_carts(carts, dt=0.1), "cost": cost, "horizon": horizon, "u_min": -50.0, "u_max": 50.0}
-    return Instance(layer, (cart_states(carts, count, carts),))
+    """Make a chain of carts whose middle ones have a price, too."""
+    return chain(chain_of_carts(carts, dt=0.1), horizon, count, carts, others=0.1)
 
 
 @torch.no_grad()

@@ -143,10 +143,11 @@ class FitReport:
         """Draw the three tables; needs matplotlib."""
         require("matplotlib")
         from matplotlib import rc_context
-        from matplotlib.figure import Figure
 
-        with rc_context({"font.size": 12}):
-            figure = Figure(figsize=(7, 6.5), dpi=150, layout="constrained")
+        from difflcs._figure import FONT, PageFigure
+
+        with rc_context(FONT):
+            figure = PageFigure(6.5)
             panels = figure.subplot_mosaic([["states", "forces"], ["steps", "steps"]])
             states, forces, steps = panels["states"], panels["forces"], panels["steps"]
             place = np.arange(len(self.error))

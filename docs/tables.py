@@ -134,6 +134,26 @@ def hard(record: dict) -> str:
     return table(["problems", "proved", "time of the search", *names], rows)
 
 
+def planners(record: dict) -> str:
+    """Planners by families: time of a plan, and mean gap to the best plan of all under hard contact."""
+    families = record["results"]["planners"]
+    rows = [
+        [label, *(f"{duration(row[label]['seconds'])}, {percent(row[label]['gap'])}" for row in families.values())]
+        for label in next(iter(families.values()))
+    ]
+    return table(["", *families], rows)
+
+
+def loops(record: dict) -> str:
+    """Planners by families with closed loops: time of a step, and the cost in parts of ours."""
+    families = {name: row for name, row in record["results"]["planners"].items() if "step" in row["difflcs"]}
+    rows = [
+        [label, *(f"{duration(row[label]['step'])}, {row[label]['cost']:.2f}" for row in families.values())]
+        for label in next(iter(families.values()))
+    ]
+    return table(["", *families], rows)
+
+
 def versions(record: dict) -> str:
     """Who took part, and who did not."""
     lines, found = [], record["results"]
@@ -405,6 +425,7 @@ RACE: dict[str, Callable[[dict], str]] = {
 TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "race": RACE,
     "race_avx512": {"best": best("contact")},
+    "race_planners": {"plans": planners, "loops": loops},
     "optima": {"efforts": efforts},
     "scale": {"sizes": sizes, "weak": weak},
     "training_time": {"recipes": recipes},

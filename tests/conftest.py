@@ -156,12 +156,3 @@ def registries():
         for module, name in ((base, "REGISTRY"), (methods, "_REGISTRY"), (tasks, "_REGISTRY")):
             patch.setattr(module, name, dict(getattr(module, name)))
         yield
-
-
-@pytest.fixture
-def one_thread():
-    """Threads cost more than they bring on problems as small as those of the tests."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)

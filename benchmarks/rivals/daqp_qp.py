@@ -23,11 +23,11 @@ class Solver(Rival):
         self.condensed = c = Condensed.of(problem)
         self.model = daqp.Model()
         empty = np.zeros((0, len(c.low)))
-        self.model.setup(c.H, c.h.copy(), empty, c.high, c.low, np.zeros(len(c.low), np.int32))
+        self.model.setup(c.H, c.f[:, 0].copy(), empty, c.high, c.low, np.zeros(len(c.low), np.int32))
 
     def one(self, i: int) -> Answer:
         """Solve one program."""
         c = self.condensed
-        self.model.update(f=c.G @ self.problem.x0[i] + c.h)
+        self.model.update(f=c.f @ c.at(self.problem.x0[i]))
         z, _, flag, _ = self.model.solve()
         return Answer(np.array(z).reshape(1, self.problem.horizon, -1), np.array([flag >= 1]))

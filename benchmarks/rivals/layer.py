@@ -8,10 +8,10 @@ import torch
 import difflcs
 from difflcs import LCSMPCLayer, LCSParams, QuadraticCost
 from difflcs.mpc.backends import BatchedBackend, IpoptBackend
+from difflcs.mpc.backends.batched import Effort
+from difflcs.mpc.controller import MPCController
 from rivals.differentiable import TorchRival
 from rivals.problem import Problem
-
-BACKENDS = {"batched": BatchedBackend(threads=1), "ipopt": IpoptBackend(workers=1)}
 
 
 def version() -> str:
@@ -20,19 +20,31 @@ def version() -> str:
 
 
 class Solver(TorchRival):
-    """`LCSMPCLayer` on one thread.
+    """`LCSMPCLayer` on one thread; in a closed loop its controller, warm.
 
     Args:
         problem: what is to be solved.
         backend: "batched" or "ipopt".
+        relaxation: instead of the problem's.
+        effort: of `batched`.
     """
 
-    def __init__(self, problem: Problem, backend: str = "batched"):
+    def __init__(
+        self, problem: Problem, backend: str = "batched", relaxation: float | None = None, effort: Effort = "default"
+    ):
         super().__init__(problem)
         self.batches = self.differentiates = backend == "batched"
-        self.backend = BACKENDS[backend]
+        self.backend = BatchedBackend(effort=effort, threads=1) if self.batches else IpoptBackend(workers=1)
+        self.relaxation = relaxation or problem.relaxation
         self.parts = [self._layer(i) for i in range(problem.count)]
         self.whole = self._layer(None)
+        self.controllers: dict[int, MPCController] = {}
+
+    def step(self, i: int, x: np.ndarray) -> np.ndarray:
+        """Return the action of a warm controller."""
+        if i not in self.controllers:
+            self.controllers[i] = self.parts[i].controller()
+        return self.controllers[i].step(x)
 
     def _layer(self, i: int | None) -> LCSMPCLayer:
         def tensor(name: str) -> torch.Tensor:
@@ -43,7 +55,7 @@ class Solver(TorchRival):
         cost = QuadraticCost(**{name: tensor(name) for name in ("Q", "R", "Q_final", "q", "r", "q_final")})
         return LCSMPCLayer(
             lcs, cost, self.problem.horizon, tensor("u_min"), tensor("u_max"), backend=self.backend,
-            relaxation=self.problem.relaxation, on_failure="mask",
+            relaxation=self.relaxation, on_failure="mask",
         )  # fmt: skip
 
     def plan(self, x0: torch.Tensor, only: int | None = None) -> tuple[torch.Tensor, torch.Tensor]:

@@ -119,6 +119,11 @@ class Rival:
         """Plan for problem i, cold."""
         raise NotImplementedError
 
+    def step(self, i: int, x: np.ndarray) -> np.ndarray:
+        """Return the first action of problem i from another state, as a step of a closed loop."""
+        self.problem.x0[i] = x
+        return self.one(i).u[0, 0]
+
     def all(self) -> Answer:
         """Solve all problems in one call, cold."""
         raise NotImplementedError
@@ -130,33 +135,80 @@ class Rival:
 
 @dataclass
 class Condensed:
-    """A linear MPC as a quadratic program in the actions alone: min ½ zᵀHz + (G x0 + h)ᵀ z, z = (u_0, …, u_{H−1})."""
+    """An LCS-MPC in the actions and forces alone, z = (u_0, λ_0, u_1, …): min ½ zᵀHz + (f p)ᵀz + pᵀPp, s = S z + s0 p.
+
+    p = (1, x0), so that one condensation serves for all initial states.
+    """
 
     H: np.ndarray
-    G: np.ndarray
-    h: np.ndarray
+    f: np.ndarray
+    P: np.ndarray
+    S: np.ndarray
+    s0: np.ndarray
     low: np.ndarray
     high: np.ndarray
+    actions: np.ndarray
+    forces: np.ndarray
 
     @classmethod
-    def of(cls, problem: Problem) -> Condensed:
-        """Condense problems that differ in x0 alone."""
-        p, horizon, n_x, n_u = problem, problem.horizon, problem.n_x, problem.n_u
-        # x_k = M x0 + N z + n, stage by stage
-        M, N, n = np.eye(n_x), np.zeros((n_x, horizon * n_u)), np.zeros(n_x)
-        H, G, h = np.zeros((horizon * n_u,) * 2), np.zeros((horizon * n_u, n_x)), np.zeros(horizon * n_u)
+    def of(cls, problem: Problem, i: int = 0) -> Condensed:
+        """Condense problem i."""
+        p, horizon, n_x, n_u = problem.only(i), problem.horizon, problem.n_x, problem.n_u
+        step = n_u + problem.n_lam
+        size = horizon * step
+        # x_k = N z + n p, stage by stage
+        one, N, n = np.eye(1, 1 + n_x)[0], np.zeros((n_x, size)), np.eye(n_x, 1 + n_x, 1)
+        H, f, P, S, s0 = np.zeros((size, size)), np.zeros((size, 1 + n_x)), np.zeros((1 + n_x, 1 + n_x)), [], []
         for k in range(horizon + 1):
-            Q, q = (p.Q, p.q) if k < horizon else (p.Q_final, p.q_final)
-            H += N.T @ Q @ N
-            G += N.T @ Q @ M
-            h += N.T @ (Q @ n + q)
-            if k < horizon:
-                in_u = slice(k * n_u, (k + 1) * n_u)
-                H[in_u, in_u] += p.R
-                h[in_u] += p.r
-                M, N, n = p.A @ M, p.A @ N, p.A @ n + p.d
-                N[:, in_u] += p.B
-        return cls(0.5 * (H + H.T), G, h, np.tile(p.u_min, horizon), np.tile(p.u_max, horizon))
+            Q, q = (p["Q"], p["q"]) if k < horizon else (p["Q_final"], p["q_final"])
+            slope = Q @ n + np.outer(q, one)
+            H, f, P = H + N.T @ Q @ N, f + N.T @ slope, P + 0.5 * n.T @ Q @ n + np.outer(one, q @ n)
+            if k == horizon:
+                break
+            in_u, force = slice(k * step, k * step + n_u), slice(k * step + n_u, (k + 1) * step)
+            H[in_u, in_u] += p["R"]
+            f[in_u, 0] += p["r"]
+            row = p["D"] @ N
+            row[:, in_u] += p["E"]
+            row[:, force] += p["F"]
+            S.append(row)
+            s0.append(p["D"] @ n + np.outer(p["c"], one))
+            N, n = p["A"] @ N, p["A"] @ n + np.outer(p["d"], one)
+            N[:, in_u] += p["B"]
+            N[:, force] += p["C"]
+        stages = np.arange(size).reshape(horizon, step)
+        low, high = np.zeros(size), np.full(size, np.inf)
+        actions, forces = stages[:, :n_u].ravel(), stages[:, n_u:].ravel()
+        low[actions], high[actions] = np.tile(p["u_min"], horizon), np.tile(p["u_max"], horizon)
+        return cls(0.5 * (H + H.T), f, P, np.concatenate(S), np.concatenate(s0), low, high, actions, forces)
+
+    def at(self, x0: np.ndarray) -> np.ndarray:
+        """Return p for an initial state."""
+        return np.concatenate([[1.0], x0])
+
+
+def lcp(F: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Solve 0 ≤ λ ⊥ F λ + q ≥ 0 by Murty's least-index pivoting, which ends if F + Fᵀ ≻ 0."""
+    basic = np.zeros(len(q), bool)
+    for _ in range(4 ** len(q)):
+        lam = np.zeros(len(q))
+        lam[basic] = np.linalg.solve(F[np.ix_(basic, basic)], -q[basic])
+        wrong = np.where(basic, lam, F @ lam + q) < -1e-12
+        if not wrong.any():
+            return lam
+        first = int(np.argmax(wrong))
+        basic[first] = not basic[first]
+    raise RuntimeError("the LCP has no solution: F + Fᵀ is not positive definite")
+
+
+def execute(data: dict[str, np.ndarray], x0: np.ndarray, u: np.ndarray) -> tuple[float, np.ndarray]:
+    """Execute actions under hard contact, λ·s = 0: the cost of the stages, without the final one, and the end."""
+    x, total = x0, 0.0
+    for action in u:
+        lam = lcp(data["F"], data["D"] @ x + data["E"] @ action + data["c"])
+        total += 0.5 * x @ data["Q"] @ x + data["q"] @ x + 0.5 * action @ data["R"] @ action + data["r"] @ action
+        x = data["A"] @ x + data["B"] @ action + data["C"] @ lam + data["d"]
+    return float(total), x
 
 
 def sparse_program(problem: Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -29,7 +29,7 @@ class Solver(Rival):
         super().__init__(problem)
         c = Condensed.of(problem)
         n, n_u = len(c.low), problem.n_u
-        H, G, h = jnp.array(c.H), jnp.array(c.G), jnp.array(c.h)
+        H, G, h = jnp.array(c.H), jnp.array(c.f[:, 1:]), jnp.array(c.f[:, 0])
         none, nothing = jnp.zeros((0, n)), jnp.zeros(0)
         box = jnp.concatenate([jnp.eye(n), -jnp.eye(n)]), jnp.concatenate([jnp.array(c.high), -jnp.array(c.low)])
         weight = jnp.array(problem.weight)

@@ -9,10 +9,12 @@ import importlib
 import importlib.util
 import json
 import os
+import statistics
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).parent
 
@@ -28,11 +30,29 @@ def package() -> None:
     spec.loader.exec_module(module)
 
 
-def cpu(work: Callable[[], object]) -> tuple[float, object]:
+def cpu(work: Callable[[], Any]) -> tuple[float, Any]:
     """Do some work; return CPU seconds of all threads, and its result."""
     start = time.process_time()
     result = work()
     return time.process_time() - start, result
+
+
+def closed_loop(rival, few: int, steps: int) -> dict:
+    """Execute the first actions of plans, with hard contact, for some steps: the cost of each problem, and times."""
+    from rivals.problem import execute
+
+    problem, costs, times = rival.problem, [], []
+    for i in range(few):
+        data, x, total = problem.only(i), problem.x0[i].copy(), 0.0
+        start = x
+        for _ in range(steps):
+            seconds, u = cpu(lambda i=i, x=x: rival.step(i, x))
+            cost, x = execute(data, x, u[None])
+            total += cost
+            times.append(seconds)
+        problem.x0[i] = start
+        costs.append(total)
+    return {"costs": costs, "seconds": statistics.median(times)}
 
 
 def race(name: str, settings: dict, job: dict) -> dict:

@@ -379,9 +379,11 @@ void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
   std::fill_n(out.iterations, count, 0);
   const auto consider = [&](const MpcPlans& from, int64_t i, int64_t e, bool only_solved) {
     out.iterations[e] += from.iterations[i];
-    const bool better = solved(from.status[i]) && (!solved(out.status[e]) || from.objective[i] < out.objective[e]);
-    const bool some = out.status[e] == kUnreached && from.status[i] != kUnreached && !only_solved;
-    if (better || some) copy_plan(n, from, i, out, e);
+    const bool done = solved(from.status[i]);
+    if (from.status[i] == kUnreached || (only_solved && !done)) return;
+    const bool as_good = out.status[e] == kUnreached || done > solved(out.status[e]);
+    const bool less = done == solved(out.status[e]) && from.objective[i] < out.objective[e];
+    if (as_good || less) copy_plan(n, from, i, out, e);
   };
   const auto solve = [&](auto wanted) {
     int64_t kept = 0;
@@ -404,7 +406,7 @@ void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
     if (kept) run(jobs, o, runner);
     for (int64_t i = 0; i < kept; i++) consider(finished.plans(), i, origin[i] % count, false);
   };
-  solve([&](int64_t j) { return promising(batch, j, best[j % count]); });
+  if (!runner.stopped()) solve([&](int64_t j) { return promising(batch, j, best[j % count]); });
   // Some were solved before they were compared.
   for (int64_t j = 0; j < all; j++) consider(tried.plans(), j, j % count, true);
   if (!runner.stopped())

@@ -107,6 +107,17 @@ class Solver {
     return problem.cost(next);
   }
 
+  // Makes the trial the iterate.
+  void move(Mask which) {
+    const auto copy = [&](auto& to, const auto& from) {
+      for (int64_t i = 0; i < to.size(); i++) to.entries[i] = select(which, from.entries[i], to.entries[i]);
+    };
+    copy(at.u, next.u);
+    copy(at.x, next.x);
+    copy(at.lam, next.lam);
+    copy(at.s, next.s);
+  }
+
   // Armijo search along the feedback law. An accepted lane keeps its trial while the others shorten their step. Returns
   // the lanes that moved, `step` how far, and `gain`, the change of the cost in parts of what a quadratic model with
   // its minimum at the end of a full step promises.
@@ -132,17 +143,30 @@ class Solver {
       step = select(accepted, step, step * (search < 2 ? 0.5 : 0.25));
     }
     const Mask moved = accepted & ~frozen;
-    auto move = [&](auto& to, const auto& from) {
-      for (int64_t i = 0; i < to.size(); i++) to.entries[i] = select(moved, from.entries[i], to.entries[i]);
-    };
-    move(at.u, next.u);
-    move(at.x, next.x);
-    move(at.lam, next.lam);
-    move(at.s, next.s);
+    move(moved);
     for (int l = 0; l < kLanes; l++)
       if (moved[l]) progress.lane[l].gained = progress.J[l] - J_trial[l];
     progress.J = select(moved, J_trial, progress.J);
     return moved;
+  }
+
+  // Out of time: stores every plan as it is executed at the problem's relaxation, along the last feedback law where
+  // there is one, since the actions alone can lead an unstable plant elsewhere.
+  void leave_off(const MpcSolve& o, Mask idle) {
+    const Watch never{[](void*) { return false; }, nullptr};
+    Mask fresh;
+    for (int l = 0; l < kLanes; l++) fresh[l] = progress.lane[l].iterations == 0 ? -1 : 0;
+    progress.released = Mask{};
+    progress.eps = all(batch.relaxation);
+    problem.mu = all(batch.barrier) * problem.cost_unit[0];
+    if (any(fresh & ~idle)) rollout(fresh, never);
+    if (any(~fresh & ~idle)) {
+      trial(all(0), fresh | idle, fresh | idle, never);
+      move(~fresh & ~idle);
+    }
+    progress.J = problem.cost(at);
+    for (int l = 0; l < kLanes; l++)
+      if (!idle[l]) progress.store(o, l, Status::max_iter, problem.multiplier);
   }
 };
 
@@ -169,10 +193,7 @@ void Solver<T, S>::solve(const MpcSolve& o, int64_t* counter, Watch watch) {
       progress.J = select(progress.needs_rollout, rolled, progress.J);
     }
     if (watch.stop(watch.context)) {
-      // What has a trajectory is stored; what has none stays unreached.
-      for (int l = 0; l < kLanes; l++)
-        if (!idle[l] && !progress.needs_rollout[l] && !progress.released[l])
-          progress.store(o, l, Status::max_iter, problem.multiplier);
+      leave_off(o, idle);
       break;
     }
     if (any(progress.stale_cost)) progress.J = select(progress.stale_cost, problem.cost(at), progress.J);

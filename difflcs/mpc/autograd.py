@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -150,7 +149,7 @@ class MPCSolver(Solver):
 
     def _objective(self, result: Result) -> Tensor:
         """Compute the cost of the plans (batch,), unless the solver has returned it."""
-        if result.objective is not None and result.all_converged:
+        if result.objective is not None and result.costs_known:
             return result.objective
         objective = self.problem.objective(result.primal.x, result.primal.u)
         if result.objective is None:
@@ -226,13 +225,9 @@ def _within_range(result: Result, objective: Tensor, constant: Tensor, dtype: to
     The numbers of failed elements are clipped to its range.
     """
     total = objective + constant
-    if (
-        dtype == torch.float64
-        and result.all_converged
-        and (math.isfinite(total) if total.numel() == 1 else all_finite(total))
-    ):
-        return result, total
     largest = torch.finfo(dtype).max
+    if dtype == torch.float64 and _all_within(total, largest / 8) and _all_within(constant, largest / 8):
+        return result, total
     held = total.abs() <= largest
     if dtype != torch.float64:
         for value in result.primal:
@@ -248,6 +243,10 @@ def _within_range(result: Result, objective: Tensor, constant: Tensor, dtype: to
     finite = torch.nan_to_num(objective, nan=largest)
     objective = torch.where(failed, torch.maximum(torch.minimum(finite, room), -room), objective)
     return replace(result, primal=primal, status=status), objective + constant
+
+
+def _all_within(value: Tensor, limit: float) -> bool:
+    return abs(float(value)) <= limit if value.numel() == 1 else bool((value.abs() <= limit).all())
 
 
 def _inside(u: Tensor, problem: MPCProblem) -> Tensor:

@@ -239,15 +239,16 @@ class LCSMPCLayer(nn.Module):
         return MPCController(self.setup(), on_failure, time_limit)
 
     def _report(self, status: Tensor, needs_grad: bool) -> None:
-        degenerate = int((status == Status.DEGENERATE).sum())
-        failed = torch.nonzero(~solved(status)).squeeze(-1).tolist()
-        if degenerate and needs_grad:
+        if needs_grad and (degenerate := int((status == Status.DEGENERATE).sum())):
             warnings.warn(
                 f"{degenerate} of {len(status)} solutions are not classically differentiable (a weakly active bound or "
                 f"a singular reduced Hessian); their gradient is a regularised one. See MPCSolution.status",
                 DegenerateWarning,
                 stacklevel=_stacklevel(),
             )
+        if self._warned and self.on_failure == "mask":
+            return
+        failed = torch.nonzero(~solved(status)).squeeze(-1).tolist()
         if not failed:
             return
         codes = [int(status[i]) for i in failed]

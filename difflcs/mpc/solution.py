@@ -145,10 +145,11 @@ def draw_trajectory(x: Tensor, u: Tensor, lam: Tensor, gap: Tensor, bounds: Sequ
     """Draw states (T+1, n_x), actions (T, n_u) between bounds of their shape, forces and gaps (T, n_lam)."""
     require("matplotlib")
     from matplotlib import rc_context
-    from matplotlib.figure import Figure
 
-    with rc_context({"font.size": 12}):
-        figure = Figure(figsize=(7, 6.5), dpi=150, layout="constrained")
+    from difflcs._figure import FONT, PageFigure
+
+    with rc_context(FONT):
+        figure = PageFigure(6.5)
         panels = figure.subplots(2, 2, sharex=True).flat
         parts = {"states x": x, "actions u": u, "forces λ": lam, "gaps": gap}
         for axes, (name, values) in zip(panels, parts.items(), strict=True):

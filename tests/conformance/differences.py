@@ -1,7 +1,5 @@
 """Gradients of plans against central differences: the perturbed copies of a problem are one large batch."""
 
-from __future__ import annotations
-
 import itertools
 import warnings
 

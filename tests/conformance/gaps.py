@@ -8,8 +8,6 @@ python -m tests.conformance.gaps --count 10000 --fill
 python -m tests.conformance.gaps --first 17 --count 1
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import multiprocessing

@@ -3,8 +3,6 @@
 The judges are sums and products that are written out here. A new form of problem is one more function in `PROBLEMS`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 

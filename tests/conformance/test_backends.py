@@ -4,8 +4,6 @@ A new backend is tested here by being registered. One that declares `exact = Fal
 not promise: that its plan solves the problem as stated, in every form.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

@@ -1,7 +1,5 @@
 """A few hundred scenes of the campaign of gaps, and what two shapes alone do not show."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -13,8 +11,6 @@ mujoco = pytest.importorskip("mujoco")
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from difflcs.physics.mujoco import MujocoLCS  # noqa: E402
 from tests.conformance import gaps  # noqa: E402
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 CUBE = " ".join(f"{v:g}" for v in (0.05 * gaps.CUBE).ravel())
 MESHES = f'<asset><mesh name="cube" vertex="{CUBE}"/><mesh name="slab" vertex="{CUBE}" scale="6 6 1"/>'

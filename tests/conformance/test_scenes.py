@@ -1,7 +1,5 @@
 """A few hundred scenes of the campaign of random models."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -11,7 +9,6 @@ pytest.importorskip("mujoco")
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from tests.conformance import scenes
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 KNOWN = {126}  # a light link between limits, which another control than the nominal one throws about
 
 

@@ -1,7 +1,5 @@
 """What every task has in common: its numbers are those of its environment, whoever asks."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -14,8 +12,6 @@ from difflcs import LCSModel  # noqa: E402
 from difflcs.rl.rollout import collect, mpc_actions, uniform_actions  # noqa: E402
 from difflcs.rl.tasks import get_task, task_names  # noqa: E402
 from tests.conformance.toy import make_task  # noqa: E402
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 TASKS = {**{name: get_task(name) for name in task_names()}, "toy": make_task("conformance-toy")}
 

@@ -1,7 +1,5 @@
 """Plans at a vertex: no curvature decides them, and what is summed to their gradient cancels to rounding."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """A task without contact and simulator that every method trains on in a second, and a method of ten lines."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -55,12 +53,15 @@ class Slide(gymnasium.Env):
         return self._observe(), {"success": False, "position_error": self._error()}
 
     def step(self, action: np.ndarray):
-        before, self.state = self.state, self.state * ([1.0] + [0.5] * (self.size - 1))
-        self.state[0] += action[0]
+        before, self.state = self.state, self.move(action)
         self.steps += 1
         ended = self.steps == STEPS
         reward, success = outcome(before, action, self.state, self.goal, ended)
         return self._observe(), float(reward), False, ended, {"success": bool(success), "position_error": self._error()}
+
+    def move(self, action: np.ndarray) -> np.ndarray:
+        """Return the next state."""
+        return np.append(self.state[:1] + action, 0.5 * self.state[1:])
 
     def _error(self) -> float:
         return float(abs(self.state[0] - self.goal[0]))

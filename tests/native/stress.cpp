@@ -15,6 +15,7 @@
 #include <vector>
 
 #include "controller.hpp"
+#include "driver.hpp"
 #include "kernels.hpp"
 
 using namespace difflcs;
@@ -51,9 +52,25 @@ std::vector<double> lcp_matrices(int64_t count, int64_t n) {
   return F;
 }
 
-// A watch that never stops, and one that stops when it has been asked `context` times.
 const Watch kNever{[](void*) { return false; }, nullptr};
-bool counts_down(void* context) { return --*static_cast<int*>(context) < 0; }
+
+// Several threads, whose work is stopped when it has asked whether to stop so many times.
+struct Pool final : Runner {
+  const int threads;
+  std::atomic<int> left;
+  Pool(int threads, int left) : threads(threads), left(left) {}
+  static bool counts_down(void* context) { return --*static_cast<std::atomic<int>*>(context) < 0; }
+  void run(int64_t, int64_t workspace_bytes, bool to_the_end, Work work, void* context) override {
+    std::vector<std::thread> pool;
+    for (int t = 0; t < threads; t++)
+      pool.emplace_back([&] {
+        const Workspace workspace(workspace_bytes);
+        work(context, workspace.data, to_the_end ? kNever : Watch{counts_down, &left});
+      });
+    for (auto& t : pool) t.join();
+  }
+  bool stopped() const override { return left < 0; }
+};
 
 int failures = 0;
 void expect(bool ok, const char* what) {
@@ -106,75 +123,29 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
   }
   if (broken != 0) data[kx0][0] = broken;
   for (int i = 0; i < kInputs; i++) b.input[i] = data[i].data();
-  std::vector<double> x(count * (horizon + 1) * n_x), u(count * horizon * n_u), lam(count * horizon * n_lam);
+  std::vector<double> x(count * (horizon + 1) * n_x), u(count * horizon * n_u), lam(count * horizon * n_lam), mu(1);
   std::vector<double> objective(count), residual(count);
   std::vector<int8_t> status(count), fragile(count), all_solved(count, 1);
   std::vector<int32_t> iterations(count);
-  double no_multipliers;
-  MpcSolve o{};
-  const std::vector<MpcStart> cold(count, {true, false, 1.0, 1e-5}), warm(count, {false, false, 0.0, 1e-5});
-  std::vector<double> gained(count);
-  o.start = cold.data();
-  o.shrink = 0.3;
-  o.steps = 1;
-  o.tol = 1e-8;
-  o.max_iter = 100;
-  o.certified = 1e-6;
-  o.gained = gained.data();
-  o.x = x.data();
-  o.u = u.data();
-  o.lam = lam.data();
-  o.mu = &no_multipliers;
-  o.objective = objective.data();
-  o.residual = residual.data();
-  o.status = status.data();
-  o.fragile = fragile.data();
-  o.iterations = iterations.data();
-  for (int pass = 0; pass < 2; pass++) {  // cold, then from its own solution
-    int64_t next = 0;
-    std::vector<std::thread> pool;
-    for (int t = 0; t < threads; t++)
-      pool.emplace_back([&] {
-        const Workspace workspace(kernels().mpc_workspace(b));
-        kernels().mpc_solve(b, o, &next, workspace.data, kNever);
-      });
-    for (auto& t : pool) t.join();
-    if (broken != 0) break;
-    const auto u_start = u, lam_start = lam;
-    o.u_start = u_start.data();
-    o.lam_start = lam_start.data();
-    o.start = warm.data();
-    expect(std::count_if(status.begin(), status.end(), solved) * 10 >= count * 9,
-           "nine of ten MPC problems are solved");
-    if (pass == 0) {
-      next = 0;
-      const Workspace workspace(kernels().mpc_workspace(b));
-      int left = 7;  // stopped on the way
-      std::fill(status.begin(), status.end(), kUnreached);
-      kernels().mpc_solve(b, o, &next, workspace.data, {counts_down, &left});
-      for (const int8_t s : status)
-        expect(s >= kUnreached && s <= int8_t(Status::degenerate), "a status is written or is not");
-      u = u_start;
-      lam = lam_start;
+  const MpcPlans out{x.data(),        u.data(),      lam.data(),     mu.data(),        objective.data(),
+                     residual.data(), status.data(), fragile.data(), iterations.data()};
+  MpcDriver driver(kernels());
+  for (const int64_t starts : {1, 6}) {  // each cold, from its own solution, and stopped on the way
+    const MpcEffort effort{starts, 0, 0.3, 1e-8, 100, 1e-6, 0};
+    std::vector<double> u_start, lam_start;
+    for (const int left : {1 << 30, 1 << 30, 7}) {
+      Pool pool(threads, left);
+      const MpcGuess guess{u_start.empty() ? nullptr : u_start.data(), lam_start.empty() ? nullptr : lam_start.data(),
+                           u_start.empty() ? nullptr : mu.data()};
+      driver.solve(b, guess, effort, out, pool);
+      for (const int8_t s : status) expect(s >= 0 && s <= int8_t(Status::degenerate), "every problem has a status");
+      if (broken != 0) continue;
+      if (left > 7)
+        expect(std::count_if(status.begin(), status.end(), solved) * 10 >= count * 9,
+               "nine of ten MPC problems are solved");
+      u_start = u;
+      lam_start = lam;
     }
-    o.u_start = o.lam_start = nullptr;
-    o.start = cold.data();
-  }
-  {  // left to be compared after two steps, over other plans
-    const auto kept_x = x, kept_u = u, kept_lam = lam;
-    const auto kept_status = status;
-    const Workspace workspace(kernels().mpc_workspace(b));
-    int64_t next = 0;
-    std::vector<MpcStart> compared = cold;
-    for (auto& start : compared) start.explore = 2;
-    o.start = compared.data();
-    std::fill(status.begin(), status.end(), kUnreached);
-    kernels().mpc_solve(b, o, &next, workspace.data, kNever);
-    expect(std::count(status.begin(), status.end(), kUnreached) == 0, "what is left has a status");
-    x = kept_x;
-    u = kept_u;
-    lam = kept_lam;
-    status = kept_status;
   }
   MpcGradient g{};
   const auto x_bar = normal(x.size(), 1.0), u_bar = normal(u.size(), 1.0), lam_bar = normal(lam.size(), 1.0);
@@ -182,6 +153,7 @@ void mpc(int64_t n_x, int64_t n_u, int64_t n_lam, int64_t horizon, int64_t count
   g.x = x.data();
   g.u = u.data();
   g.lam = lam.data();
+  g.mu = mu.data();
   g.x_bar = x_bar.data();
   g.u_bar = u_bar.data();
   g.lam_bar = lam_bar.data();

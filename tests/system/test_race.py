@@ -1,6 +1,7 @@
 """The race in `benchmarks/`: what its rivals are given, who is missing, and how an answer is judged."""
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +69,7 @@ def test_both_quadratic_programs_are_the_linear_mpc(race, pushing):
     wide = {"u_min": np.full(6, -9.0), "u_max": np.full(6, 9.0), "q": pushing.q[0], "q_final": pushing.q_final[0]}
     linear = dataclasses.replace(pushing, **none, **wide)
     dense = Condensed.of(linear)
-    z = np.linalg.solve(dense.H, -(dense.G @ linear.x0[1] + dense.h))
+    z = np.linalg.solve(dense.H, -dense.f @ dense.at(linear.x0[1]))
     P, q, A, b, where = sparse_program(linear)
     b[: linear.n_x] += linear.A @ linear.x0[1]
     zero = np.zeros((len(b), len(b)))
@@ -87,3 +88,20 @@ def test_hard_cost_is_that_of_the_exact_contact(race, pushing):
     sharp = dataclasses.replace(mpc, relaxation=1e-12)
     torch.testing.assert_close(hard_cost(mpc, u), sharp.objective(sharp.rollout(u)[0], u), rtol=1e-5, atol=1e-6)
     assert float((hard_cost(mpc, u) - mpc.objective(mpc.rollout(u)[0], u)).abs().max()) > 0
+
+
+def test_planners_for_contact_come_near_the_best_plan(race):
+    import race_hard
+    from race_problems import cart_pole
+    from rivals.sampling import Solver
+
+    problem = cart_pole(2, horizon=10, seed=0)
+    mpc, tuned = race.as_mpc(problem), race_hard.json.loads(race_hard.TUNED.read_text())["cart-pole, H 10"]
+    best = race_hard.reference(problem, mpc)
+    for label, row in tuned.items():
+        if shutil.which("cc") or not label.startswith("C3+"):  # its iterations are compiled
+            solver = race_hard.MODULES[row["module"]].Solver(problem, **row["settings"])
+            u = np.concatenate([solver.one(i).u for i in range(2)])
+            assert (race_hard.objectives(problem, mpc, u) < (1.2 if "3 iter" in label else 1.02) * best).all(), label
+    costs = [Solver(problem).costs(problem.only(i), u[i : i + 1])[0] for i in range(2)]
+    np.testing.assert_allclose(costs + problem.constant, race_hard.objectives(problem, mpc, u), rtol=1e-9)

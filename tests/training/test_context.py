@@ -29,7 +29,7 @@ from difflcs.rl import (
     make_ppo,
 )
 from difflcs.rl.learning.ppo import PPO
-from difflcs.rl.rollout import contexts, make_empty_record, mpc_actions, transitions
+from difflcs.rl.rollout import mpc_actions
 from difflcs.rl.runs.checkpoint import load_checkpoint, save_checkpoint
 from tests.training import slide
 from tests.training.slide import parameters, recorded, same
@@ -132,19 +132,6 @@ def test_the_violation_loss_beside_ppo_gets_the_context():
 
 
 # --- the way of a context ---------------------------------------------------------------------------------------------
-
-
-def test_episodes_keep_their_context():
-    env = make_envs(3)
-    record = collect(env, mpc_actions(make_mpc(Physics())), [1, 2], STEPS)
-    first = [HeavyBlock().reset(seed=seed)[0]["context"] for seed in (1, 2)]
-    np.testing.assert_array_equal(record["context"], first)
-    flat = contexts(record)
-    assert flat is not None
-    assert torch.equal(flat, record["context"].repeat_interleave(STEPS, 0))
-    assert len(flat) == len(transitions(record)[0])
-    assert contexts(record.select("state", "action")) is None
-    assert make_empty_record(env, STEPS)["context"].shape == (0, 1)
 
 
 def test_each_part_of_ppo_sees_the_context_of_its_own_sample():

@@ -49,6 +49,14 @@ def make_lcsrl(seed: int = 0, models: bool = False) -> LCSRL:
     return LCSRL(warmup, 8 * STEPS, make_main)
 
 
+def test_phases_follow_each_other():
+    trainer = make_lcsrl()
+    reports = [trainer.step() for _ in range(5)]
+    assert [type(report).__name__ for report in reports] == ["WarmupReport"] * 3 + ["PPOReport"] * 2
+    assert [report.iteration for report in reports] == [1, 2, 3, 4, 5]
+    assert [report.env_steps for report in reports] == [STEPS * n for n in (2, 5, 8, 8 + ROLLOUTS, 8 + 2 * ROLLOUTS)]
+
+
 def test_episodes_of_both_phases_differ():
     """The main phase goes on in the stream of the warm-up, where that has ended."""
     trainer, seeds = make_lcsrl(), []

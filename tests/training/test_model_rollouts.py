@@ -93,27 +93,6 @@ def test_steps_are_those_of_the_drawn_networks():
     np.testing.assert_allclose(second, 0.01 * networks[:, 1:2].repeat(2, 1), atol=1e-6)
 
 
-def test_starts_and_goals_are_real_ones():
-    real = episodes()
-    observation, _ = make_env(num_envs=40).reset(seed=0)
-    starts = {tuple(row) for row in real["state"][:, 0].tolist()}
-    assert {tuple(row) for row in observation["state"].tolist()} <= starts
-    assert {row[0] for row in observation["goal"].tolist()} <= {row[0] for row in real["goal"].tolist()}
-    assert len({tuple(row) for row in observation["state"].tolist()}) > 3
-
-
-def test_an_episode_depends_on_its_seed_only():
-    def play(seeds):
-        env = make_env(num_envs=len(seeds))
-        seen = [env.reset(seed=seeds)[0]["state"]]
-        seen += [env.step(np.full((len(seeds), N_U), 0.05))[0]["state"] for _ in range(STEPS)]
-        return np.stack(seen, 1)
-
-    together, other = play([11, 12, 13]), play([13, 11])
-    np.testing.assert_array_equal(together[[2, 0]], other)
-    assert not np.array_equal(together[0], together[1])
-
-
 def test_episodes_end_together_and_begin_anew():
     env = make_env()
     env.reset(seed=1)

@@ -41,25 +41,6 @@ def test_pddm_learns_to_reach():
         trainer.step()
 
 
-def test_ensemble_learns_a_linear_system_and_its_members_differ():
-    generator = torch.Generator().manual_seed(0)
-    A = torch.tensor([[0.9, 0.2], [0.0, 1.1]], dtype=torch.float64)
-    x = 5 + 0.1 * torch.randn(400, 2, generator=generator, dtype=torch.float64)
-    u = 0.01 * torch.randn(400, 2, generator=generator, dtype=torch.float64)
-    x_next = x @ A.T + u
-    ensemble = Ensemble(2, 2, 3, 32, generator)
-    for weight in ensemble.weights:  # uniform, to both sides
-        torch.testing.assert_close(weight.abs().max(), torch.tensor(weight.shape[1] ** -0.5), rtol=0.1, atol=0)
-        assert weight.min() < -0.9 * weight.max()
-    loss = ensemble.fit(x, u, x_next, epochs=60, minibatch=50, learning_rate=1e-3, generator=generator)
-    assert loss < 0.02
-    with torch.no_grad():
-        predicted = ensemble(x.float().expand(3, -1, -1), u.float().expand(3, -1, -1))
-    error = (predicted - x_next).square().mean().sqrt()
-    assert error < 0.15 * (x_next - x).std()
-    assert not torch.equal(predicted[0], predicted[1])
-
-
 @pytest.mark.parametrize(("n_x", "n_u", "networks", "width"), [(2, 1, 1, 15), (3, 2, 2, 16), (9, 6, 3, 31)])
 def test_a_rollout_is_one_step_after_the_other(n_x, n_u, networks, width):
     draws = torch.Generator().manual_seed(0)

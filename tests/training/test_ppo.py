@@ -9,7 +9,6 @@ from difflcs.errors import CheckpointError, InvalidInputError
 pytest.importorskip("torchrl")
 from difflcs.rl import CriticSettings, Epochs, Natural
 from difflcs.rl.learning import ppo_settings
-from difflcs.rl.learning.advantages import SAMPLES
 from difflcs.rl.learning.mlp import MLPController
 from difflcs.rl.rollout import elapsed_fractions
 from difflcs.rl.runs.evaluate import evaluate
@@ -18,7 +17,6 @@ from tests.training.slide import (
     STEPS,
     U_MAX,
     Noting,
-    Recording,
     Slide,
     features,
     make_envs,
@@ -120,30 +118,6 @@ def test_minibatches(size, sizes):
     torch.testing.assert_close(states, data["state"].sort(0).values, rtol=0, atol=0)
     for batch in batches:  # a guess belongs to its state
         torch.testing.assert_close(batch["guess", "x"][:, 0], batch["state"], rtol=0, atol=1e-9)
-
-
-def test_the_loss_gets_standardised_advantages_of_the_estimator():
-    trainer = make_ppo(steps=1, minibatch=None)
-    seen, trainer.surrogate = recorded(trainer), Watched(trainer.surrogate)
-    trainer.step()
-    (_, old, kl, samples, _, _), given = trainer.surrogate.calls[0], seen.results[0].samples.flatten(0, 1)
-    advantage = given["advantage"]
-    expected = (advantage - advantage.mean()) / advantage.std(correction=0)
-    torch.testing.assert_close(samples["advantage"], expected, rtol=1e-6, atol=0)
-    for name in SAMPLES:
-        assert torch.equal(samples[name], given[name])
-    assert torch.equal(samples["action"].squeeze(1), old["action"])
-    torch.testing.assert_close(kl, torch.zeros(ROLLOUTS * STEPS).double(), rtol=0, atol=1e-12)
-
-
-class Watched(Recording):
-    """A surrogate loss that notes its calls."""
-
-    outliers = property(lambda self: self.part.outliers)
-    clip_fraction = property(lambda self: self.part.clip_fraction)
-
-    def __call__(self, *arguments):
-        return super().__call__(*[a.clone() if hasattr(a, "clone") else a for a in arguments])
 
 
 def test_an_iteration_ends_at_the_kl_limit():

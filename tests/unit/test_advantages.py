@@ -13,8 +13,6 @@ from tensordict import TensorDict
 from difflcs.errors import InvalidInputError
 from difflcs.rl import CriticSettings
 from difflcs.rl.learning.advantages import (
-    SAMPLES,
-    GAEAdvantages,
     MultiActionAdvantages,
     RewardScale,
     mirrored_actions,
@@ -93,20 +91,6 @@ def test_advantages_are_the_papers():
     assert not found.advantages.requires_grad
     torch.testing.assert_close(returns(rewards, 0.9)[:, 0], sum(0.9**k * rewards[:, k] for k in range(STEPS)))
     torch.testing.assert_close(returns(rewards, 0.9)[:, -1], rewards[:, -1])
-
-
-def test_gae_judges_the_actions_taken():
-    critic, inputs, rewards = make_critic(), some(5, STEPS + 1, 3), some(5, STEPS, seed=1)
-    taken = gaussian(5, STEPS)
-    taken["action_log_prob"] = some(5, STEPS, seed=2)
-    found = GAEAdvantages(critic)(TensorDict({"policy": taken}, [5]), inputs, rewards, (0,))
-    plain = critic.gae(inputs, rewards)
-    assert found.samples.batch_size == (5, STEPS, 1)
-    for name in SAMPLES:
-        assert torch.equal(found.samples[name].squeeze(2), taken[name])
-    assert torch.equal(found.samples["advantage"].flatten(2), plain.advantages.unsqueeze(-1))
-    assert torch.equal(found.values, plain.values)
-    assert torch.equal(found.rewards, rewards)  # as they are
 
 
 def gaussian(*shape: int, n_u: int = 3, seed: int = 0) -> TensorDict:

@@ -24,7 +24,7 @@ from difflcs import (
 )
 from difflcs import errors as e
 from difflcs._checks import check_tensor
-from difflcs.mpc import Primal
+from difflcs.mpc import MPCProblem, Primal
 from difflcs.mpc.backends import BatchedBackend
 
 NAN, INF = float("nan"), float("inf")
@@ -315,6 +315,37 @@ def test_layer_refuses_crossed_bounds_with_both_numbers(build, bounds):
     refuse(e.BoundsError, numbers, layer(build), torch.zeros(4).double(), u_min=low, u_max=high)
     one = torch.tensor([[-1.0, -1], [-1, low]]).double(), torch.tensor([[1.0, 1], [1, high]]).double()
     refuse(e.BoundsError, r"at index \(1, 1\)", layer(build), torch.zeros(2, 4).double(), u_min=one[0], u_max=one[1])
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "match"),
+    [
+        ({"horizon": 0}, e.InvalidInputError, "horizon: expected at least 1, got 0"),
+        ({"horizon": 1.0}, e.DTypeError, "horizon: expected an int"),
+        ({"relaxation": 0.0}, e.InvalidInputError, "relaxation: .*above 0, got 0"),
+        ({"x0": torch.zeros(4).double()}, e.ShapeError, "x0: expected"),
+        ({"E": torch.zeros(3, 3).double()}, e.ShapeError, r"E: expected \(3, 2\) or \(5, 3, 2\) or .*, got \(3, 3\)"),
+        (
+            {"E": torch.zeros(5, 3, 3, 2).double()},
+            e.ShapeError,
+            r"E: expected .* or \(5, 2, 3, 2\), got \(5, 3, 3, 2\)",
+        ),
+        ({"S": torch.zeros(2, 4).double()}, e.ShapeError, r"S: expected \(4, 2\) or .*, got \(2, 4\)"),
+        ({"g": torch.ones(3).double(), "G_x": torch.ones(2, 4).double()}, e.ShapeError, r"G_x: expected \(3, 4\) or"),
+        ({"g": torch.ones(1).double(), "price": -torch.ones(1).double()}, e.InvalidInputError, "price: .*got -1; "),
+        ({"u_min": torch.full((2,), INF).double()}, e.BoundsError, "u_min"),
+        ({"u_max": torch.full((2,), INF).double(), "barrier": 0.1}, e.BoundsError, "finite bounds with a barrier"),
+        ({"u_min": torch.ones(2).double()}, e.BoundsError, "u_min <= u_max, got 1.*0.1"),
+    ],
+)
+def test_problem_refuses(build, change, error, match):
+    limit = torch.full((2,), 0.1, dtype=torch.float64)
+    fields = {
+        **build.lcs_tensors(), **build.cost_tensors(), "u_min": -limit, "u_max": limit,
+        "x0": torch.zeros(5, 4, dtype=torch.float64), "horizon": 2, "relaxation": 1e-4,
+    }  # fmt: skip
+    MPCProblem(**fields)
+    refuse(error, match, lambda: MPCProblem(**{**fields, **change}))
 
 
 # --- the error tree -------------------------------------------------------------------------------------------------

@@ -50,6 +50,20 @@ def test_threads_change_nothing_not_even_summed_gradients(build):
         assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
 
 
+@pytest.mark.filterwarnings("ignore::difflcs.errors.SolveWarning")
+@pytest.mark.parametrize("effort", ["fast", "default"])
+@pytest.mark.parametrize("time_limit", [1e-9, 1e-4])
+def test_a_plan_out_of_time_is_executed_at_the_relaxation(build, effort, time_limit):
+    x0, goal = data(build, 1)
+    mpc = pushing(build, 5, effort=effort, time_limit=time_limit, on_failure="mask")
+    plan = mpc(x0, goal)
+    x, lam = plan.problem.rollout(plan.u)
+    torch.testing.assert_close(plan.x, x, rtol=1e-7, atol=1e-9)
+    torch.testing.assert_close(plan.lam, lam, rtol=1e-5, atol=1e-7)
+    cost = mpc.cost(goal, mpc.horizon).constant + plan.problem.objective(x, plan.u)
+    torch.testing.assert_close(plan.objective, cost, rtol=1e-7, atol=1e-9)
+
+
 # --- processors ------------------------------------------------------------------------------------------------------
 
 

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from torch import nn
 
 from difflcs import ConstraintSequence, LinearConstraints, StageBounds
 from difflcs.errors import BoundsError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
@@ -12,21 +11,6 @@ F64, INF, NAN = torch.float64, float("inf"), float("nan")
 
 def full(value, *shape):
     return torch.full(shape, value, dtype=F64)
-
-
-def test_stage_bounds_hold_numbers_tensors_and_nothing():
-    bounds = StageBounds(full(-0.1, 3, 2), 0.2)
-    assert (bounds.horizon, bounds.n_u) == (3, 2)
-    assert bounds.by_stage == {"u_min"}
-    assert torch.equal(bounds.u_max, full(0.2, 2))
-    open_above = StageBounds(u_min=nn.Parameter(full(-0.1, 5, 3, 2)))
-    assert torch.equal(open_above.u_max, full(INF, 2))
-    assert [name for name, _ in open_above.named_parameters()] == ["u_min"]
-    assert set(open_above.state_dict()) == {"u_min"}
-    each = StageBounds(full(-0.1, 4, 2), full(0.1, 3, 4, 2), by_stage=("u_min", "u_max"))
-    assert [tuple(v.shape) for v in each.by_steps()] == [(4, 2), (3, 4, 2)]
-    mixed = StageBounds(full(-0.1, 4, 2), full(0.1, 3, 2), by_stage=("u_min",))
-    assert [tuple(v.shape) for v in mixed.by_steps()] == [(4, 2), (3, 1, 2)]
 
 
 @pytest.mark.parametrize(
@@ -52,24 +36,6 @@ def test_stage_bounds_refuse(arguments, error, message):
 def rows(build, **changes):
     n = build.normal(0)
     return {"G": n(3, 4), "g": n(3), "E": n(3, 2), "weight": full(2.0, 3), **changes}
-
-
-def test_constraints_hold_their_fields(build):
-    hard = LinearConstraints(*list(rows(build).values())[:2])
-    assert (hard.n_c, hard.n_x, hard.n_u) == (3, 4, None)
-    for constraints in (hard, LinearConstraints(**rows(build, weight=1e300))):
-        assert torch.equal(constraints.tensors()["price"], full(INF, 3))
-    assert set(hard.tensors()) == {"G_x", "g", "price"}
-    assert set(hard.state_dict()) == {"G", "g"}
-    soft = LinearConstraints(**rows(build, weight=5.0))
-    assert soft.n_u == 2
-    assert torch.equal(soft.tensors()["price"], full(5.0, 3))
-    assert set(soft.tensors()) == {"G_x", "G_u", "g", "price"}
-    learned = LinearConstraints(**rows(build, g=nn.Parameter(full(1.0, 3))))
-    assert [name for name, _ in learned.named_parameters()] == ["g"]
-    assert "G(3, 4)" in repr(learned)
-    assert learned.to(torch.float32).G.dtype == torch.float32
-    assert not hard.staged
 
 
 BAD_ROWS = [

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -12,12 +13,12 @@ from difflcs import Scales, violation_loss
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
 from difflcs.lcp import solve_lcp
 from difflcs.physics import ContactLCS, PlanarPushing, PositionDrive, box
-from difflcs.rl import ContactMethod, PhysicsFit, PhysicsFitSettings, PhysicsSpec, evaluate, get_task
+from difflcs.rl import ContactMethod, MujocoMethod, PhysicsFit, PhysicsFitSettings, PhysicsSpec, evaluate, get_task
 from difflcs.rl.learning.physics_fit import physics_loss
 from difflcs.rl.learning.trainer import configuration
 from difflcs.rl.methods import Work
 from difflcs.rl.methods.contact_lcs import known_physics
-from tests.conformance.toy import Guess, make_task
+from tests.conformance.toy import Guess, Slide, make_task
 
 F64 = torch.float64
 SCALE = torch.tensor([0.05, 0.05, 1.0, 0.2, 0.2], dtype=F64)
@@ -141,6 +142,48 @@ def test_it_learns_how_a_point_slides():
         trainer.step()
     trainer.env.close()
     envs.close()
+
+
+RAIL = """<mujoco><option timestep=".01" gravity="0 0 0"/><worldbody><body>
+  <joint name="rail" type="slide" axis="1 0 0" damping=".5" frictionloss="{}"/><geom size=".1" mass="{}"/></body>
+  </worldbody><actuator><position joint="rail" kp="40" kv="6"/></actuator></mujoco>"""
+
+
+class Rail(Slide):
+    """The same task with a body on a rail, which a servo pulls against dry friction."""
+
+    def move(self, action):
+        mujoco = pytest.importorskip("mujoco")
+        model = mujoco.MjModel.from_xml_string(RAIL.format(0.8, 2.0))
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = self.state
+        data.ctrl[:] = self.state[:1] + action
+        mujoco.mj_step(model, data, 3)
+        return np.append(data.qpos, data.qvel)
+
+
+def guess_rail():
+    mujoco = pytest.importorskip("mujoco")
+    from difflcs.physics.mujoco import LearnableMujocoLCS
+
+    model = mujoco.MjModel.from_xml_string(RAIL.format(2.0, 1.0))
+    return LearnableMujocoLCS(model, learn=["mass", "frictionloss"], motion="dynamic", seconds=0.03)
+
+
+@pytest.mark.slow
+def test_a_mujoco_model_is_fitted_to_the_episodes_of_its_mpc():
+    physics = PhysicsSpec(make_system=guess_rail, scale=(0.01, 0.2), relaxation=1e-3)
+    task = make_task(env=Rail, physics=physics)
+    fit = PhysicsFitSettings(rollouts=4, noise=0.1, steps=25, learning_rate=0.1)
+    trainer = MujocoMethod(fit=fit).trainer(Work(task, 0, 8, task.make_envs))
+    for _ in range(2):
+        trainer.step()
+    found = trainer.learned.summary()
+    assert found["mass *"] == pytest.approx([2.0], rel=0.05)
+    assert found["frictionloss *"] == pytest.approx([0.4], rel=0.15)
+    trainer.env.close()
+    with pytest.raises(InvalidInputError, match="expected a PhysicsSpec that makes a LearnableMujocoLCS"):
+        MujocoMethod().trainer(Work(make_task(), 0, 8, make_task().make_envs))
 
 
 @pytest.mark.slow

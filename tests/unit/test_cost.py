@@ -1,6 +1,5 @@
 """QuadraticCost and GoalCost: their value, convexity and gradients."""
 
-import pickle
 import re
 
 import pytest
@@ -150,22 +149,6 @@ def by_stage(build, horizon=3, **more):
     each = [build.cost_tensors(k) for k in range(horizon)]
     fields = {name: torch.stack([t[name] for t in each]) for name in ("Q", "R", "q", "r")}
     return {**fields, **{k: each[0][k] for k in ("Q_final", "q_final")}, **more}
-
-
-def test_a_sequence_knows_its_stages(build):
-    cost = CostSequence(**by_stage(build))
-    assert cost.horizon == 3
-    assert (cost.n_x, cost.n_u) == (4, 2)
-    assert cost.by_stage == {"Q", "R", "q", "r"}
-    assert cost.fields()["Q"].shape == (3, 4, 4)
-    partly = CostSequence(**{**build.cost_tensors(0), "q": torch.zeros(5, 4).double()}, by_stage=("q",))
-    assert partly.horizon == 5
-    assert partly.by_stage == {"q"}
-    learned = CostSequence(**{**by_stage(build), "r": nn.Parameter(torch.zeros(3, 2).double())})
-    assert [name for name, _ in learned.named_parameters()] == ["r"]
-    twin = pickle.loads(pickle.dumps(cost))
-    assert twin.by_stage == cost.by_stage
-    assert torch.equal(twin.Q, cost.Q)
 
 
 @pytest.mark.parametrize(

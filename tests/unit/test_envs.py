@@ -14,6 +14,7 @@ mujoco = pytest.importorskip("mujoco", reason="the environments need the extra [
 
 
 import difflcs_envs  # noqa: E402
+from difflcs_envs.trifinger import kinematics  # noqa: E402
 from difflcs_envs.trifinger.env import TriFingerMoveCubeEnv  # noqa: E402
 from difflcs_envs.trifinger.model import FINGER_YAWS  # noqa: E402
 from difflcs_envs.trifinger.rendering import SceneRenderer, has_display, select_gl_backend  # noqa: E402
@@ -166,6 +167,18 @@ def test_mass_and_friction_reach_the_model():
     model = make(object_mass=0.05, object_friction=0.7).physics.model
     assert model.body("object").mass[0] == pytest.approx(0.05)
     assert model.geom("object").friction[0] == model.geom("table").friction[0] == 0.7
+
+
+def test_kinematics_agree_with_mujoco():
+    physics = make().physics
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        joints = np.array([0.0, -0.9, -1.3]) + rng.uniform(-0.4, 0.4, (3, 3))
+        physics.data.qpos[7:] = joints.ravel()
+        mujoco.mj_kinematics(physics.model, physics.data)
+        tips = kinematics.tip_positions(joints)
+        np.testing.assert_allclose(tips, physics.data.site_xpos, atol=1e-12)
+        np.testing.assert_allclose(kinematics.joint_angles(tips), joints, atol=1e-9)
 
 
 # --- input ----------------------------------------------------------------------------------------

@@ -82,6 +82,16 @@ def test_the_reward_is_minus_the_stage_cost_of_the_mpc(name):
     np.testing.assert_array_equal(success, arrays[1])
 
 
+def test_the_reward_has_a_gradient_in_state_and_action_and_is_mapped():
+    state, action, after, goal = random_tensors(7, get_task("cube"))
+    ends = torch.arange(7) % 2 == 0
+    mapped, expected = (judge(state, action, after, goal, ends) for judge in (torch.func.vmap(MOVE.judge), MOVE.judge))
+    torch.testing.assert_close(mapped[0], expected[0], rtol=1e-12, atol=1e-12)
+    assert torch.equal(mapped[1], expected[1])
+    inputs = (state.requires_grad_(), action.requires_grad_())
+    assert torch.autograd.gradcheck(lambda x, u: MOVE.judge(x, u, after, goal, True)[0], inputs)
+
+
 def test_a_full_turn_is_the_same_pose_for_arrays_and_tensors():
     state, action, after, goal = random_tensors(40, get_task("cube"))
     turned = after + 4 * torch.pi * (torch.arange(9) == 2)

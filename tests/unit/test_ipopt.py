@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from difflcs import BackendNotFoundError, LCSMPCLayer, available_backends, register_backend
+from difflcs.cli.bench import pushing_cost, pushing_model, states_and_goals
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.mpc import kkt
 from difflcs.mpc.backends import Backend, IpoptBackend, base, get_backend, ipopt
@@ -170,6 +171,15 @@ def test_by_way_of_the_inequality_it_is_the_same_problem(build, x0):
     assert int(other.iterations.sum()) > int(one.iterations.sum())
 
 
+def test_the_better_of_two_starts_is_kept():
+    costs = []
+    for options in ({}, {"second_start": None}, {"second_start": None, "start": 1.0, "mu_init": 0.1}):
+        layer = LCSMPCLayer(pushing_model(8, 1), pushing_cost(), 5, -0.015, 0.015, IpoptBackend(workers=1, **options))
+        costs.append(layer(*states_and_goals(8, 1)).objective)
+    assert float((costs[1] - costs[2]).abs().max()) > 1e-3
+    torch.testing.assert_close(costs[0], torch.minimum(costs[1], costs[2]))
+
+
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
@@ -177,6 +187,7 @@ def test_by_way_of_the_inequality_it_is_the_same_problem(build, x0):
         ({"max_iter": 2.5}, DTypeError, "max_iter: expected an int, got float 2.5"),
         ({"workers": 0}, InvalidInputError, "workers: expected at least 1, got 0"),
         ({"start": -1.0}, InvalidInputError, "start: .*got -1"),
+        ({"second_start": 0.0}, InvalidInputError, "second_start: .*got 0"),
         ({"mu_init": float("nan")}, InvalidInputError, "mu_init: .*got nan"),
         ({"mu_strategy": "fast"}, InvalidInputError, "mu_strategy: expected one of 'adaptive', 'monotone', got 'fast'"),
         ({"contact": "hard"}, InvalidInputError, "contact: expected one of 'equation', 'inequality', got 'hard'"),

@@ -36,18 +36,6 @@ def test_neighbours_and_threads_change_no_bit_of_a_loss(build, n_lam):
     assert all(torch.equal(left, right) for left, right in zip(*gradients, strict=True))
 
 
-def test_layout_and_shape_of_the_data_do_not_matter(build, model):
-    n = build.normal(1)
-    x, u, x_next = n(4, 6).mT, n(6, 2), n(6, 8)[:, ::2]
-    expected = violation_loss(model, x.contiguous(), u.contiguous(), x_next.contiguous())
-    assert torch.equal(violation_loss(model, x, u, x_next), expected)
-    assert torch.equal(violation_loss(model, x, u, x_next, reduction="none")[2],
-                       violation_loss(model, x[2], u[2], x_next[2]))  # fmt: skip
-    with torch.no_grad():
-        model.A.set_(model.A.t().contiguous().t())
-    assert torch.equal(violation_loss(model, x, u, x_next), expected)
-
-
 def test_reduction(model, data):
     each = violation_loss(model, *data, reduction="none")
     assert each.shape == (8,)

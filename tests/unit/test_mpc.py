@@ -111,16 +111,6 @@ def test_leading_dimensions_of_states_and_systems_broadcast_and_are_kept(build, 
 # --- warm start -----------------------------------------------------------------------------------------------------
 
 
-def test_shift_drops_the_first_step_and_repeats_the_last(layer, x0):
-    solution = layer(x0)
-    guess = solution.shift()
-    for name in ("x", "u", "lam"):
-        old, new = getattr(solution, name).detach(), getattr(guess, name)
-        assert torch.equal(new[:, :-1], old[:, 1:])
-        assert torch.equal(new[:, -1], old[:, -1])
-        assert not new.requires_grad
-
-
 def test_a_guess_has_no_gradient_and_changes_none(layer, x0):
     guess = layer(x0)
     layer(x0).action.sum().backward()
@@ -270,18 +260,6 @@ def test_what_a_call_is_given_replaces_the_layers_own(build, x0, name):
     assert torch.equal(layer(x0).u, LCSMPCLayer(**first, **options)(x0).u)
 
 
-def test_one_plain_bound_of_a_call_replaces_that_of_the_stages(build, x0):
-    bounds = StageBounds(torch.full((3, 2), -0.1).double(), torch.full((3, 2), 0.2).double())
-    layer, backend = recording(build, bounds=bounds)
-    layer(x0, u_max=0.5)
-    assert torch.equal(backend.problem.u_min[0], bounds.u_min)
-    assert torch.equal(backend.problem.u_max, torch.full((2,), 0.5).double())
-    each = torch.linspace(0.1, 0.6, 6).double()[:, None].expand(6, 2)
-    layer(x0, u_max=each)
-    assert torch.equal(backend.problem.u_max, each)
-    assert not backend.problem.by_stage("u_max")
-
-
 # --- modules that say the system ------------------------------------------------------------------------------------
 
 
@@ -417,6 +395,7 @@ def test_a_plan_is_drawn(layer, x0):
     assert torch.equal(torch.as_tensor(states.lines[2].get_ydata()), plan.x[1, :, 2].detach())
     assert len(actions.patches) == 3 * plan.u.shape[-1]  # each with two bounds
     assert len(forces.patches) == len(gaps.patches) == plan.lam.shape[-1]
+    assert states.figure._repr_png_().startswith(b"\x89PNG")  # what a notebook shows
     with pytest.raises(BatchIndexError, match=f"a batch of {len(x0)}"):
         plan.plot(len(x0))
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import difflcs
-from difflcs import LCSMPCLayer, QuadraticCost, Status
+from difflcs import Status
 from difflcs._native import _kernels
 from difflcs.lcs import SYSTEM, LCSParams, dimensions
 from difflcs.mpc.problem import INPUTS, MPCProblem
@@ -37,22 +37,6 @@ def test_the_system_is_the_same_everywhere():
     violation = list(_kernels.violation_fields().items())
     assert violation[: len(SYSTEM)] == list(SYSTEM.items())
     assert violation[len(SYSTEM) :] == [("x", ("n_x",)), ("u", ("n_u",)), ("x_next", ("n_x",)), ("gamma", ())]
-
-
-def test_the_parameters_of_ipopt_are_the_fields_and_the_two_numbers(build):
-    ipopt = pytest.importorskip("difflcs.mpc.backends.ipopt")
-    eye = torch.eye(9, dtype=torch.float64)
-    mpc = LCSMPCLayer(build.pushing(0, 5), QuadraticCost(eye, eye[:6, :6], eye), 2, -1.0, 1.0)
-    problem = mpc(torch.zeros(1, 9, dtype=torch.float64)).problem
-    table = ipopt.parameters(problem)
-    assert [name for name, *_ in table] == [*INPUTS, "relaxation", "barrier"]
-    sizes = {name: size for name, *size in table}
-    assert sizes["E"] == [5, 6, 1]
-    assert sizes["g"] == [0, 1, 1]
-    by_stage = {"E": problem.E.expand(1, 2, 5, 6), "g": torch.ones(1, 3, 4).double(), "G_x": torch.ones(4, 9).double()}
-    by_stage |= {"G_u": torch.ones(4, 6).double(), "price": torch.ones(1, 4).double()}
-    sizes = {name: size for name, *size in ipopt.parameters(dataclasses.replace(problem, **by_stage))}
-    assert (sizes["E"], sizes["G_x"], sizes["g"], sizes["price"]) == ([5, 6, 2], [4, 9, 1], [4, 1, 3], [4, 1, 1])
 
 
 def test_the_codes_are_those_of_the_kernels():

@@ -8,7 +8,7 @@ import torch
 
 mujoco = pytest.importorskip("mujoco")
 
-from difflcs.errors import InvalidInputError  # noqa: E402
+from difflcs.errors import ContactWarning, InvalidInputError  # noqa: E402
 from difflcs.physics.mujoco import MujocoLCS  # noqa: E402
 from difflcs.physics.mujoco.nominal import solve_soft  # noqa: E402
 
@@ -118,3 +118,31 @@ def test_soft_forces_are_clipped_by_their_bounds(m, nv):
         slack = gap + np.einsum("nmi,nij,nkj,nk->nm", rows, response, rows, force)
         least, most = (0.0, np.inf) if low is None else (low, most)
         np.testing.assert_allclose(force, np.clip(-slack / 1e-3, least, most), rtol=0, atol=1e-7 * np.abs(force).max())
+
+
+SPINNING = """<mujoco><option timestep=".002" cone="elliptic"/>
+  <default><geom condim="{}" friction=".3 .002 .0001"/></default><worldbody><geom type="plane" size="1 1 .1"/>
+  <body pos="0 0 .03"><freejoint/><geom type="ellipsoid" size=".08 .08 .03" mass="1"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("cone", ["anitescu", "stewart-trinkle"])
+@pytest.mark.parametrize("rate", [3.0, -3.0, 0.05])
+def test_torsional_friction_stops_a_spin_by_the_law_of_coulomb(cone, rate):
+    model = mujoco.MjModel.from_xml_string(SPINNING.format(4))
+    data, h = mujoco.MjData(model), 0.02
+    mujoco.mj_step(model, data, 500)
+    data.qvel[5] = rate
+    turned = []
+    for torsion in (True, False):
+        module = MujocoLCS(model, data, motion="dynamic", seconds=h, cone=cone, torsion=torsion)
+        turned.append(float(module.params(x := module.observe(data)).step(x, torch.zeros(0).double()).x_next[11]))
+    mujoco.mj_step(model, data, 10)
+    lost = 0.002 * 9.81 * h / model.body_inertia[1, 2]
+    after, near = rate - np.sign(rate) * min(lost, abs(rate)), 0.1 if abs(rate) > lost else 0.25  # it creeps to rest
+    assert [*turned, data.qvel[5]] == pytest.approx([after, rate, after], abs=near * lost)
+
+
+def test_rolling_friction_is_left_out_with_a_warning():
+    with pytest.warns(ContactWarning, match=r"rolling friction \(condim 6\).*up to 0.0001.*condim 4"):
+        module = MujocoLCS(mujoco.MjModel.from_xml_string(SPINNING.format(6)), motion="dynamic")
+    assert module.n_lam == 6

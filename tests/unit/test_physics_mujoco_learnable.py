@@ -14,7 +14,7 @@ from difflcs.physics.mujoco import LearnableMujocoLCS, MujocoLCS  # noqa: E402
 
 F64 = torch.float64
 VALUES = {"mass": 0.4, "inertia": 4e-4, "com": 0.004, "friction": 0.5, "size": 0.05, "offset": 0.0, "tip": 0.02}
-VALUES |= {"kp": 50.0, "kv": 2.0, "damping": 0.3, "armature": 0.01, "stiffness": 3.0}
+VALUES |= {"kp": 50.0, "kv": 2.0, "damping": 0.3, "armature": 0.01, "stiffness": 3.0, "loss": 0.2, "torsion": 0.01}
 OPTIONS = {"seconds": 0.02, "length": 0.05, "contacts": 6}
 
 
@@ -30,8 +30,8 @@ def scene(**changed):
       </body>
       <body name="finger" pos="-.075 0 .06">
         <joint name="push" type="slide" axis="1 0 0" damping="{v["damping"]}" armature="{v["armature"]}"
-          stiffness="{v["stiffness"]}"/>
-        <geom name="tip" type="capsule" size="{v["tip"]} {v["tip"]}" mass=".1" friction=".1"/>
+          stiffness="{v["stiffness"]}" frictionloss="{v["loss"]}"/>
+        <geom name="tip" type="capsule" size="{v["tip"]} {v["tip"]}" mass=".1" condim="4" friction=".1 {v["torsion"]}"/>
       </body>
     </worldbody><actuator><position name="servo" joint="push" kp="{v["kp"]}" kv="{v["kv"]}"/></actuator></mujoco>""")
 
@@ -59,6 +59,8 @@ def states(n_x, seed=0):
         (("damping", "push"), [-1.0], {"damping": 0.3 * math.exp(-1)}),
         (("armature", "push"), [0.7], {"armature": 0.01 * math.exp(0.7)}),
         ("stiffness", [0.7], {"stiffness": 3 * math.exp(0.7)}),
+        ("frictionloss", [0.7], {"loss": 0.2 * math.exp(0.7)}),
+        (("torsional_friction", "tip"), [0.7], {"torsion": 0.01 * math.exp(0.7)}),
         ("compliance", [0.7], {}),
     ],
     ids=str,

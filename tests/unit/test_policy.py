@@ -13,6 +13,7 @@ from difflcs.errors import DTypeError, InvalidInputError
 
 pytest.importorskip("torchrl")
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from difflcs.rl.learning.policy import LCSMPCPolicy
@@ -49,6 +50,14 @@ def test_mean_is_the_mpcs_action_and_noise_is_gaussian(mpc):
     z = noise / policy.std
     expected = -0.5 * z.square().sum(-1) - policy.std.log().sum() - math.log(2 * math.pi)
     torch.testing.assert_close(many["action_log_prob"], expected)
+
+
+def test_a_layer_is_a_tensordict_module(mpc):
+    module = TensorDictModule(mpc, ["state", "goal"], ["plan"])
+    data = module(observations(5, 3))
+    assert torch.equal(data["plan", "u"], mpc(data["state"], data["goal"]).u)
+    data["plan", "objective"].sum().backward()
+    assert module.get_parameter("module.lcs.A").grad.abs().sum() > 0
 
 
 def test_deterministic_mode_is_the_mean(mpc):

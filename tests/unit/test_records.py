@@ -193,15 +193,3 @@ def test_a_model_without_contacts_is_kept_and_learns(build, tmp_path):
     assert torch.equal(again(x, u).x_next, model(x, u).x_next)
     assert torch.equal(LCSModel.from_params(model.params())(x, u).x_next, model(x, u).x_next)
     assert LCSModel.from_params(model.params(), stiffness=0.7).stiffness == 0.7
-
-
-def test_an_lcp_without_variables_is_solved(build):
-    F, q = torch.zeros(0, 0, dtype=torch.float64), torch.zeros(3, 5, 0, dtype=torch.float64)
-    for relaxation in (0.0, 1e-5):
-        lam, w, status = solve_lcp(F, q.requires_grad_(), relaxation)
-        assert lam.shape == w.shape == (3, 5, 0)
-        assert status.shape == (3, 5)
-        assert int(status.abs().max()) == 0
-        (lam.sum() + w.sum()).backward()
-        assert q.grad is not None
-    assert solve_lcp(F.expand(2, 1, 0, 0), q.detach()[0]).lam.shape == (2, 5, 0)

@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from difflcs import LCSMPCLayer, QuadraticCost
 from difflcs.errors import InvalidInputError
 from difflcs.systems import block_along_wall, cart_pole_between_walls
 
@@ -84,23 +83,6 @@ def test_block_slides_steadily_along_the_wall():
 def test_block_has_one_solution_for_every_friction(friction: float, angle: float):
     F = block_along_wall(friction=friction, face_angle=angle).F  # LCSParams refuses it otherwise
     assert float(torch.linalg.eigvalsh(F + F.mT)[0]) > 0
-
-
-def test_gradients_of_the_physical_parameters():
-    """Next state and planned action by the mass of the pole and the wall's stiffness, against finite differences."""
-    x = tensor(0.05, 0.15, 0.0, 0.5)
-
-    def next_state(mass: torch.Tensor, k: torch.Tensor) -> torch.Tensor:
-        return cart_pole_between_walls(pole_mass=mass, wall_stiffness=k).step(x, tensor(0.3))[0]
-
-    def action(mass: torch.Tensor, k: torch.Tensor) -> torch.Tensor:
-        cost = QuadraticCost(torch.eye(4).double(), torch.eye(1).double(), 10 * torch.eye(4).double())
-        params = cart_pole_between_walls(pole_mass=mass, wall_stiffness=k)
-        return LCSMPCLayer(params, cost, horizon=5, u_min=-5.0, u_max=5.0)(x).action
-
-    values = (tensor(0.1)[0].requires_grad_(), tensor(10.0)[0].requires_grad_())
-    assert torch.autograd.gradcheck(next_state, values)
-    assert torch.autograd.gradcheck(action, values, eps=1e-5, atol=1e-5, rtol=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,11 @@ class Result:
         """Whether every plan is CONVERGED, so that callers can skip further checks."""
         return all_converged(self.status)
 
+    @functools.cached_property
+    def costs_known(self) -> bool:
+        """Whether `objective` is the cost of every plan."""
+        return self.objective is not None and self.all_converged
+
     @property
     def solved(self) -> Tensor:
         """(batch,) bool: the trajectory can be used (CONVERGED or DEGENERATE)."""

@@ -36,6 +36,7 @@ class BatchedResult(Result):
     fragile: Tensor | None = None
 
 
+_HUGE = np.finfo(np.float64).max  # the objective of an element that was not begun
 _FLAT = (1e-2, 1e-6)  # weights of actions beside a price of one: they make the plan of least violations unique
 
 
@@ -69,7 +70,8 @@ class BatchedBackend(Backend):
         max_iter: iteration limit of one solve. An element that fails is solved once more, cold and along a longer
             homotopy; and with row exchanges in the elimination of λ if it failed for lack of them.
         time_limit: seconds for one call, None for no limit. Elements not solved by then are MAX_ITER: those under way
-            keep their iterate, those not begun stay at the actions of the guess or zero, with x = x0 and λ = 0.
+            keep their best iterate, executed at the relaxation; those not begun stay at the actions of the guess or
+            zero, with x = x0 and λ = 0.
         seed: seed of the random starts, which are the same for every element.
         homotopy: λ·s at which a cold start begins, as a multiple of the relaxation; None: the square of the mean gap
             of the contacts, in the units in which F has a unit diagonal. A guess starts at the relaxation.
@@ -147,14 +149,20 @@ class BatchedBackend(Backend):
             tol=self.tol,
             max_iter=self.max_iter,
             certified=kkt.CERTIFIED,
-            time_limit=self.time_limit or np.inf,
+            time_limit=np.inf if self.time_limit is None else self.time_limit - (time.perf_counter() - started),
             threads=self._threads(),
             **outputs,  # pyright: ignore[reportArgumentType]
         )
         seconds.fill((time.perf_counter() - started) / max(batch, 1))
         if not result.all_converged:
-            self._make_presentable(problem, result.primal, result.status, started)
-            result.kkt_residual.clamp_max_(torch.finfo(torch.float64).max)
+            if not all(np.isfinite(outputs[name]).all() for name in ("x", "u", "lam", "mu")):
+                self._make_finite(problem, result.primal, result.status)
+            if problem.n_c:
+                self._confirm_infeasible(problem, result.primal, result.status, started)
+            if problem.n_c == 0:  # also what ran out of time has the cost of its plan
+                known = (outputs["status"] == Status.CONVERGED) | (outputs["status"] == Status.MAX_ITER)
+                vars(result)["costs_known"] = bool((known & (outputs["objective"] < _HUGE)).all())
+            np.minimum(outputs["residual"], _HUGE, out=outputs["residual"])
         return result
 
     def starts(self, problem: MPCProblem, guessed: bool) -> int:
@@ -206,19 +214,20 @@ class BatchedBackend(Backend):
     def _threads(self) -> int:
         return self.threads or torch.get_num_threads()
 
-    def _make_presentable(self, problem: MPCProblem, primal: Primal, status: Tensor, started: float) -> None:
-        """Give failed elements finite numbers inside the bounds, and confirm those that are infeasible."""
+    def _make_finite(self, problem: MPCProblem, primal: Primal, status: Tensor) -> None:
+        """Give failed elements finite numbers inside the bounds."""
         failed = torch.nonzero(~solved(status)).squeeze(-1)
-        if len(failed):
-            part = problem.select(failed)
-            primal.u[failed] = part.clip(torch.nan_to_num(primal.u[failed], posinf=0.0, neginf=0.0))
-            for value in (primal.x, primal.lam, primal.mu):
-                value[failed] = torch.nan_to_num(value[failed])
-            refused = failed[status[failed] == int(Status.INFEASIBLE)]
-            if len(refused):
-                part, plans = problem.select(refused), Primal(*(value[refused] for value in primal))
-                sure = kkt.certainly_missed(part, plans) & self._impossible(part, started)
-                status[refused[~sure]] = int(Status.NUMERICAL)
+        primal.u[failed] = problem.select(failed).clip(torch.nan_to_num(primal.u[failed], posinf=0.0, neginf=0.0))
+        for value in (primal.x, primal.lam, primal.mu):
+            value[failed] = torch.nan_to_num(value[failed])
+
+    def _confirm_infeasible(self, problem: MPCProblem, primal: Primal, status: Tensor, started: float) -> None:
+        """Make elements NUMERICAL that are called infeasible and need not be."""
+        refused = torch.nonzero(status == int(Status.INFEASIBLE)).squeeze(-1)
+        if len(refused):
+            part, plans = problem.select(refused), Primal(*(value[refused] for value in primal))
+            sure = kkt.certainly_missed(part, plans) & self._impossible(part, started)
+            status[refused[~sure]] = int(Status.NUMERICAL)
 
     def _impossible(self, problem: MPCProblem, started: float) -> Tensor:
         """Return which elements (batch,) miss a hard constraint at any cost, by a solve for the least violations."""

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING, ClassVar
 
@@ -56,6 +56,8 @@ class IpoptBackend(Backend):
         residual_tol: largest KKT residual that counts as converged.
         start: value of λ and s at a cold start. 0.05 takes fewer iterations than λ = s = 1 and finds better optima.
             The states start at x0: a rollout is a worse start where the system is unstable.
+        second_start: the same of a second cold start, with IPOPT's own first barrier, 0.1; the better plan is kept.
+            None: one start, in half the time; its plans on pushing models cost up to 1 % more than those of λ = s = 1.
         mu_init: IPOPT's first barrier parameter at a cold start.
         mu_init_warm: the same with a guess.
         mu_strategy: IPOPT's: "monotone", or "adaptive": another way, whose optima are not better or worse in general;
@@ -73,6 +75,7 @@ class IpoptBackend(Backend):
     workers: int | None = None
     residual_tol: float = 1e-6
     start: float = 0.05
+    second_start: float | None = 1.0
     mu_init: float = 1e-4
     mu_init_warm: float = 1e-6
     mu_strategy: str = "monotone"
@@ -84,15 +87,14 @@ class IpoptBackend(Backend):
         check_threads(self.workers, "workers")
         for name in ("tol", "residual_tol", "start", "mu_init", "mu_init_warm"):
             check_number(name, getattr(self, name), strict=True)
+        if self.second_start is not None:
+            check_number("second_start", self.second_start, strict=True)
         check_choice("mu_strategy", self.mu_strategy, ("adaptive", "monotone"))
         check_choice("contact", self.contact, ("equation", "inequality"))
 
     def solve(self, problem: MPCProblem, guess: Primal | None) -> Result:
         """Solve every element; a failure, even a crash of a worker, stays with its element."""
-        if guess is None and self.contact == "inequality" and problem.n_lam:
-            run = self._by_inequality(problem)
-        else:
-            run = self._run(problem, guess, warm=guess is not None)
+        run = self._cold(problem) if guess is None else self._run(problem, guess, warm=True)
         if problem.n_c and bool(torch.isinf(problem.price).any()):
             failed = torch.nonzero(run.status != Status.CONVERGED).squeeze(-1)
             if len(failed):
@@ -106,6 +108,22 @@ class IpoptBackend(Backend):
             for whole, part in zip(primal, polished, strict=True):
                 whole[index] = part
         return certify(problem, primal, run.status, run.iterations, run.seconds, self.residual_tol)
+
+    def _cold(self, problem: MPCProblem) -> _Run:
+        """Solve from both starts; keep the better plan, and the sum of iterations and seconds."""
+        inequality = self.contact == "inequality" and problem.n_lam > 0
+        run = self._by_inequality(problem) if inequality else self._run(problem, None, warm=False)
+        if self.second_start is None or problem.n_lam == 0:
+            return run
+        other = replace(self, start=self.second_start, mu_init=_MU_INIT)._run(problem, None, warm=False)
+        spent = run.iterations + other.iterations, run.seconds + other.seconds
+        cost, second = (
+            torch.where(r.status == Status.CONVERGED, problem.objective(r.x, r.u), torch.inf) for r in (run, other)
+        )
+        better = torch.nonzero(second < cost).squeeze(-1)
+        run.replace(better, other.select(better))
+        run.iterations, run.seconds = spent
+        return run
 
     def _by_inequality(self, problem: MPCProblem) -> _Run:
         """Solve with λ·s ≤ ε, then with the equation from those actions; cold if that fails."""
@@ -217,6 +235,7 @@ class IpoptBackend(Backend):
         return Chunk(*(np.ascontiguousarray(v.numpy()) for v in arrays))
 
 
+_MU_INIT = 0.1  # IPOPT's own
 # Violation, in parts of a row's unit, up to which a problem is tried again from the plan with the least violation: at
 # the boundary of feasibility IPOPT's violation is accurate to the square root of its tolerance.
 _NEARLY = 1e-3

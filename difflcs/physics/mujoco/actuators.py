@@ -67,7 +67,7 @@ class Actuators:
         limited &= not model.opt.disableflags & flags("CLAMPCTRL")
         self.range = np.where(limited, model.actuator_ctrlrange.T, [[-np.inf], [np.inf]])
         self.range[:, dynamics == _MUSCLE] = np.clip(self.range[:, dynamics == _MUSCLE], 0.0, 1.0)
-        plain = fixed & (dynamics == _NONE) & (affine & (self.dof >= 0) | (model.actuator_biastype == _UNBIASED))
+        plain = fixed & (affine & (self.dof >= 0) | (model.actuator_biastype == _UNBIASED))
         self._force = np.where(plain, self._force_limits(model, joint), [[-np.inf], [np.inf]])
         self._exact = np.flatnonzero(dynamics == _EXACT)
         self.activated = np.repeat(np.arange(model.nu), model.actuator_actnum)

@@ -104,12 +104,14 @@ class ContactFinder:
         contacts: how many a state has, in all or of each budget, of which a pair belongs to one; None: what the shapes
             of the pairs can have, at most `MOST_CONTACTS`, with a `ContactWarning` where more touch.
         friction: coefficient of all; None: that of the geoms.
+        torsion: False to leave out torsional friction.
 
     Attributes:
         axis: normal (3,) of the plane in which everything moves, or None.
         pairs: numbers of the geoms that may touch, those of the first and those of the second of each pair.
         n_contacts: number of contacts of every state.
-        n_tangents: of each contact.
+        n_tangents: of each contact; the third, where there is torsional friction, is the spin about the normal times
+            the radius at which sliding friction would hold it back as much.
         rough: (n_contacts,) False for those of budgets without friction, where there is some.
     """
 
@@ -123,11 +125,12 @@ class ContactFinder:
         length: float,
         contacts: int | Sequence[Budget] | None,
         friction: float | None,
+        torsion: bool,
     ):
         self.model, self.data, self.distance = model, data, distance
         self._warn_within = _NEAR * length if contacts is None else -np.inf
         self.axis = plane_of_motion(model, data)
-        self.friction = _friction(model, friction)
+        self.friction = _coefficients(model, 0) if friction is None else np.full((model.ngeom, model.ngeom), friction)
         self.allowed = _may_touch(model) if pairs is None else _listed(model, pairs)
         self._drop_floors()
         _check_contacts(model, self.allowed, friction)
@@ -138,6 +141,10 @@ class ContactFinder:
         budgets = [Budget(self.allowed, contacts, distance)] if isinstance(contacts, int) else list(contacts)
         self.n_contacts = sum(budget.contacts for budget in budgets)
         self.n_tangents = (1 if self.axis is not None else 2) if (self.friction[first, second] > 0).any() else 0
+        self._spin = _coefficients(model, 1) / np.where(self.friction > 0, self.friction, np.inf)
+        if torsion and self.n_tangents == 2:
+            self.n_tangents += bool(self._spin[first, second].any())
+            _warn_of_rolling(model, _coefficients(model, 2)[first, second])
         rough = [budget.friction or not self.n_tangents for budget in budgets]
         self.rough = np.repeat(rough, [budget.contacts for budget in budgets])
         model.opt.ccd_iterations = _ITERATIONS
@@ -192,7 +199,7 @@ class ContactFinder:
             "solids": [describe_solid(model, int(geom)) for geom in solids],
             "geoms": np.stack([first, second], -1).astype(np.int64),
             "flags": np.stack([formula, boxes, meet], -1),
-            "numbers": np.stack([size, self.friction[first, second] * rough], -1),
+            "numbers": np.stack([size, self.friction[first, second] * rough, self._spin[first, second]], -1),
             "groups": groups,
         }
         return _mujoco.Scene(fields)
@@ -260,22 +267,33 @@ def plane_of_motion(model: Any, data: Any) -> Array | None:
     return axis.copy() if parallel.all() and (np.abs(slides @ axis) < 1e-9).all() else None
 
 
-def _friction(model: Any, friction: float | None) -> Array:
-    """Return the coefficients (ngeom, ngeom): that of the geom of higher priority, else the larger, as MuJoCo does."""
-    n = model.ngeom
-    if friction is not None:
-        return np.full((n, n), friction)
-    first, second = model.geom_priority[:, None], model.geom_priority[None]
+def _coefficients(model: Any, kind: int) -> Array:
+    """Return the coefficients (ngeom, ngeom) of sliding (0), torsional (1) or rolling friction (2).
+
+    That of the geom of higher priority, else the larger, as MuJoCo does; zero where condim has no such friction.
+    """
+    first, second, dimensions = model.geom_priority[:, None], model.geom_priority[None], (2, 4, 6)[kind]
 
     def of_pair(values: Any) -> Any:
         larger = np.maximum(values[:, None], values[None])
         return np.where(first == second, larger, np.where(first > second, values[:, None], values[None]))
 
-    table = np.where(of_pair(model.geom_condim) > 1, of_pair(model.geom_friction[:, 0]), 0.0)
+    table = np.where(of_pair(model.geom_condim) >= dimensions, of_pair(model.geom_friction[:, kind]), 0.0)
     for k in range(model.npair):
         a, b = model.pair_geom1[k], model.pair_geom2[k]
-        table[a, b] = table[b, a] = model.pair_friction[k, 0] if model.pair_dim[k] > 1 else 0.0
+        table[a, b] = table[b, a] = model.pair_friction[k, (0, 2, 3)[kind]] * (model.pair_dim[k] >= dimensions)
     return table
+
+
+def _warn_of_rolling(model: Any, rolling: Array) -> None:
+    """Warn if pairs that may touch have coefficients of rolling friction."""
+    if rolling.any():
+        warnings.warn(
+            f"expected no rolling friction (condim 6), got coefficients of up to {rolling.max():g}; it is left out, so "
+            f"that what rolls goes on rolling: give these geoms and pairs condim 4 if this does not matter",
+            ContactWarning,
+            stacklevel=4,
+        )
 
 
 def _check_contacts(model: Any, allowed: NDArray[np.bool_], friction: float | None) -> None:

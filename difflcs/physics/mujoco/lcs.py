@@ -65,9 +65,9 @@ class MujocoLCS:
     joints and tendons are one-sided constraints; their dry friction (`frictionloss`), which quasi-static motion does
     without, is a bounded force; active equality constraints are part of the motion. All are as soft as MuJoCo's.
 
-    Not in the system: margins of geoms, torsional and rolling friction. Refused: adhesion, delay, sleep, height fields
-    and signed distance fields that may touch something, friction that override sets or that is not the same in all
-    directions; in quasi-static motion disabled actuators. The matrices carry no gradient of the state.
+    Not in the system: margins of geoms, and with a `ContactWarning` rolling friction. Refused: adhesion, delay, sleep,
+    height fields and signed distance fields that may touch something, friction that override sets or that is not the
+    same in all directions; in quasi-static motion disabled actuators. The matrices carry no gradient of the state.
 
     An object keeps one private copy of the model and its data, so use it from one thread at a time.
 
@@ -85,6 +85,7 @@ class MujocoLCS:
         pairs: geoms, by name or number, or bodies with all their geoms, that may touch; None: as the model says
             (contype, conaffinity, pairs, excludes; none where contacts or constraints are disabled).
         friction: coefficient μ of all contacts; None: that of the geoms, as MuJoCo combines them.
+        torsion: False to leave out the torsional friction of contacts with condim 4 or 6, two forces more for each.
         compliance: how far a contact gives way, in parts of how far the same force moves the two bodies apart (the
             median over all pairs), > 0. It makes F + Fᵀ ≻ 0.
         cone: model of friction, see `difflcs.physics.complementarity`.
@@ -117,6 +118,7 @@ class MujocoLCS:
         distance: float | None = None,
         pairs: Pairs | None = None,
         friction: float | None = None,
+        torsion: bool = True,
         compliance: float = 0.02,
         cone: Cone = "anitescu",
         mobility: Literal["inertia", "damping"] | ArrayLike = "inertia",
@@ -164,7 +166,8 @@ class MujocoLCS:
         plain = motion == "dynamic" and pairs is None and friction is None
         self._whole = WholeStep(self._motion, limits != 0) if plain else None
         self._places = Places(model, self._data)
-        self._finder = ContactFinder(model, self._data, self._places, pairs, distance, length, budgets, friction)
+        frictions = friction, torsion
+        self._finder = ContactFinder(model, self._data, self._places, pairs, distance, length, budgets, *frictions)
         model.opt.disableflags |= flags("EQUALITY", "FRICTIONLOSS", "LIMIT")
         with native(model, self._data, "in the state of data"):
             self._give = self._typical_response()

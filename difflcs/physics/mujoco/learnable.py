@@ -50,12 +50,14 @@ _KINDS = {
     "inertia": _Kind("body", (("body_inertia", _ALL),)),
     "center_of_mass": _Kind("body", (("body_ipos", _ALL),), offset=True),
     "friction": _Kind("geom", (("geom_friction", slice(0, 1)),)),
+    "torsional_friction": _Kind("geom", (("geom_friction", slice(1, 2)),)),
     "pair_friction": _Kind("pair", (("pair_friction", slice(0, 2)),)),
     "size": _Kind("geom", (("geom_size", _ALL),)),
     "offset": _Kind("geom", (("geom_pos", _ALL),), offset=True),
     "gain": _Kind("actuator", (("actuator_gainprm", _ALL), ("actuator_biasprm", _ALL))),
     "servo_damping": _Kind("actuator", (("actuator_biasprm", slice(2, 3)),)),
     "damping": _Kind("joint", (("dof_damping", slice(0, 1)),)),
+    "frictionloss": _Kind("joint", (("dof_frictionloss", slice(0, 1)),)),
     "armature": _Kind("joint", (("dof_armature", slice(0, 1)),)),
     "stiffness": _Kind("joint", (("jnt_stiffness", slice(0, 1)),)),
     "compliance": _Kind("", ()),
@@ -89,10 +91,11 @@ class LearnableMujocoLCS(nn.Module):
         model: the MuJoCo model.
         data: see `MujocoLCS`.
         learn: what to learn, each a kind or a pair (kind, name). Of bodies: `mass` (and inertia with it), `inertia`,
-            `center_of_mass` (3). Of geoms, by their name or that of their body: `friction`, `size` (each size of one
-            geom, one factor of several; without its mass), `offset` (3). Of a `<pair>`: `pair_friction`. Of actuators:
-            `gain`, of a servo its damping with it, and `servo_damping`. Of joints: `damping`, `armature`, `stiffness`.
-            Besides, `compliance`. Without a name, or with "*", one factor is for all that have some.
+            `center_of_mass` (3). Of geoms, by their name or that of their body: `friction`, `torsional_friction`,
+            `size` (each size of one geom, one factor of several; without its mass), `offset` (3). Of a `<pair>`:
+            `pair_friction`. Of actuators: `gain`, of a servo its damping with it, and `servo_damping`. Of joints:
+            `damping`, `frictionloss`, `armature`, `stiffness`. Besides, `compliance`. Without a name, or with "*", one
+            factor is for all that have some.
         **options: those of `MujocoLCS`.
 
     Attributes:

@@ -423,10 +423,15 @@ def _push(response: Array, rows: Array, forces: Array, by: Array) -> Array:
 
 
 def _turn_tangents(tangent: Array, slide: Array) -> Array:
-    """Turn the first of two tangents (n, n_contacts, n_tangents, nv) along the slide: there the cone is exact."""
-    if tangent.shape[2] < 2:
+    """Turn the first of tangents (n, n_contacts, n_tangents, nv) along the slide: there the cone is exact."""
+    count = tangent.shape[2]
+    if count < 2:
         return tangent
     far = np.linalg.norm(slide, axis=-1, keepdims=True)
-    along = np.where(far > 1e-9, slide / np.maximum(far, 1e-9), [1.0, 0.0])
-    across = np.stack([-along[..., 1], along[..., 0]], -1)
-    return np.stack([along, across], -2) @ tangent
+    along = np.where(far > 1e-9, slide / np.maximum(far, 1e-9), np.eye(count)[0])
+    if count == 2:
+        turned = np.stack([along, np.stack([-along[..., 1], along[..., 0]], -1)], -2)
+    else:  # a reflection that takes the first one there, or to the other side
+        normal = along + np.where(along[..., :1] < 0, -1.0, 1.0) * np.eye(count)[0]
+        turned = 2 * normal[..., None] * normal[..., None, :] / (normal**2).sum(-1)[..., None, None] - np.eye(count)
+    return turned @ tangent

@@ -19,24 +19,19 @@ from difflcs._checks import check_positive_int
 from difflcs.cost import CostModule, GoalCost, cost_at
 from difflcs.errors import InvalidInputError
 from difflcs.rl.learning.dynamics import Ensemble, EnsembleSettings
-from difflcs.rl.learning.state import State
-from difflcs.rl.learning.trainer import AfterStep, Trainer
+from difflcs.rl.learning.trainer import AfterStep, EpisodeTrainer
 from difflcs.rl.rollout import (
     CONTEXT,
     PolicyOutput,
     action_bounds,
     append_context,
     append_episodes,
-    collect,
-    episodes_from_state,
-    episodes_to_state,
     has_context,
-    make_empty_record,
     mpc_actions,
     observed_transitions,
     uniform_actions,
 )
-from difflcs.rl.seeding import Stream, episode_seeds, generator, number
+from difflcs.rl.seeding import Stream, generator, number
 from difflcs.rl.settings import Epochs, Rollouts, Settings, bounded, group
 
 if TYPE_CHECKING:
@@ -172,7 +167,7 @@ class PDDMReport:
     learn_seconds: float
 
 
-class PDDM(Trainer):
+class PDDM(EpisodeTrainer):
     """Trainer of the PDDM baseline, see `Trainer`.
 
     Args:
@@ -196,18 +191,14 @@ class PDDM(Trainer):
     ):
         total_episodes = check_positive_int("total_episodes", total_episodes)
         needed = min(max(settings.rollouts.first, settings.rollouts.each), total_episodes)
-        if env.num_envs < needed:
-            raise InvalidInputError(f"env: expected at least {needed} environments, got {env.num_envs}")
         sizes = (settings.ensemble.networks, settings.ensemble.width)
         seed = check_positive_int("seed", seed, minimum=0)
         space: Any = env.single_observation_space
         n_seen = cost.n_x + (space[CONTEXT].shape[0] if has_context(env) else 0)
         self.ensemble = Ensemble(n_seen, cost.n_u, *sizes, generator(seed, Stream.FIT, 0, 0))
         planner = Planner(self.ensemble, cost, settings, *action_bounds(env))
-        super().__init__(self.ensemble, planner, seed, episode_steps)
-        self.env, self.settings, self.total_episodes = env, settings, total_episodes
-        self.buffer = make_empty_record(env, episode_steps)
-        """All episodes."""
+        super().__init__(self.ensemble, planner, seed, episode_steps, env, needed)
+        self.settings, self.total_episodes = settings, total_episodes
 
     def step(self, after_step: AfterStep | None = None) -> PDDMReport:
         """One iteration: collect, then fit the ensemble to all data."""
@@ -217,14 +208,11 @@ class PDDM(Trainer):
         if count < 1:
             raise InvalidInputError(f"step: expected at most {self.total_episodes} episodes, all of them are done")
         start = time.perf_counter()
-        seeds = episode_seeds(self.seed, Stream.TRAINING, self.episodes, count)
         if first:
             act = uniform_actions(self.env, np.random.default_rng((self.seed, Stream.ACTION)))
         else:
             act = mpc_actions(self.policy, seed=number(self.seed, Stream.PLAN, self.iteration, 0))
-        report = None if after_step is None else lambda: after_step(count)
-        episodes = collect(self.env, act, seeds, self.episode_steps, report)
-        self.episodes += count
+        episodes = self.collect(act, count, after_step)
         self.buffer = append_episodes(self.buffer, episodes)
         collected = time.perf_counter()
         if not settings.keep_networks:
@@ -246,12 +234,3 @@ class PDDM(Trainer):
             collect_seconds=collected - start,
             learn_seconds=time.perf_counter() - collected,
         )
-
-    def state_dict(self) -> dict[str, Any]:
-        """See `Trainer`."""
-        return {**super().state_dict(), "episodes": episodes_to_state(self.buffer)}
-
-    def load_state_dict(self, state: State) -> None:
-        """See `Trainer`."""
-        super().load_state_dict(state)
-        self.buffer = episodes_from_state(state["episodes"])

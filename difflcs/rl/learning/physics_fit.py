@@ -20,21 +20,16 @@ from difflcs.lcp import solve_lcp
 from difflcs.losses import violation_loss
 from difflcs.records import LCSModule, LCSParams, system_at
 from difflcs.rl.learning.checks import check_depends, check_module
-from difflcs.rl.learning.state import State
-from difflcs.rl.learning.trainer import AfterStep, Trainer
+from difflcs.rl.learning.trainer import AfterStep, EpisodeTrainer
 from difflcs.rl.rollout import (
     Policy,
     append_episodes,
-    collect,
     contexts,
-    episodes_from_state,
-    episodes_to_state,
-    make_empty_record,
     mpc_actions,
     noisy_actions,
     transitions,
 )
-from difflcs.rl.seeding import Stream, episode_seeds
+from difflcs.rl.seeding import Stream
 from difflcs.rl.settings import MOST_ENVS, Settings, bounded
 
 if TYPE_CHECKING:
@@ -133,7 +128,7 @@ class PhysicsFitReport:
     learn_seconds: float
 
 
-class PhysicsFit(Trainer):
+class PhysicsFit(EpisodeTrainer):
     """Trainer that alternates noisy episodes of the MPC with a fit to all of them, see `Trainer`.
 
     Args:
@@ -164,13 +159,10 @@ class PhysicsFit(Trainer):
         total_episodes: int,
         episode_steps: int,
     ):
-        super().__init__(check_module(lcs, env), policy, seed, episode_steps)
-        if env.num_envs < min(settings.rollouts, total_episodes):
-            raise InvalidInputError(f"env: expected at least {settings.rollouts} environments, got {env.num_envs}")
-        self.lcs, self.env, self.settings = lcs, env, settings
+        needed = min(settings.rollouts, total_episodes)
+        super().__init__(check_module(lcs, env), policy, seed, episode_steps, env, needed)
+        self.lcs, self.settings = lcs, settings
         self.scale, self.relaxation, self.total_episodes = scale, relaxation, total_episodes
-        self.buffer = make_empty_record(env, episode_steps)
-        """All episodes."""
 
     def step(self, after_step: AfterStep | None = None) -> PhysicsFitReport:
         """One iteration: collect, then fit.
@@ -182,12 +174,9 @@ class PhysicsFit(Trainer):
         count = min(self.settings.rollouts, self.total_episodes - self.episodes)
         if count < 1:
             raise InvalidInputError(f"step: expected at most {self.total_episodes} episodes, all of them are done")
-        seeds = episode_seeds(self.seed, Stream.TRAINING, self.episodes, count)
         noise = np.random.default_rng((self.seed, Stream.ACTION, self.iteration))
         act = noisy_actions(mpc_actions(self.policy), self.settings.noise, noise)
-        report = None if after_step is None else lambda: after_step(count)
-        episodes = collect(self.env, act, seeds, self.episode_steps, report)
-        self.episodes += count
+        episodes = self.collect(act, count, after_step)
         self.buffer = append_episodes(self.buffer, episodes)
         collected = time.perf_counter()
         losses = self._fit()
@@ -218,12 +207,3 @@ class PhysicsFit(Trainer):
                 adam.step()
             losses.append(float(loss.detach()))
         return losses
-
-    def state_dict(self) -> dict[str, Any]:
-        """See `Trainer`."""
-        return {**super().state_dict(), "episodes": episodes_to_state(self.buffer)}
-
-    def load_state_dict(self, state: State) -> None:
-        """See `Trainer`."""
-        super().load_state_dict(state)
-        self.buffer = episodes_from_state(state["episodes"])

@@ -5,16 +5,22 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from torch import Tensor
 
 from difflcs import _storage
 from difflcs._checks import check_positive_int
 from difflcs._modules import plain_state, untouched
+from difflcs.errors import InvalidInputError
 from difflcs.lcs import LCSModel
 from difflcs.rl.learning.state import State, restore
-from difflcs.rl.rollout import Policy
+from difflcs.rl.rollout import Act, Policy, collect, episodes_from_state, episodes_to_state, make_empty_record
+from difflcs.rl.seeding import Stream, episode_seeds
+
+if TYPE_CHECKING:
+    from gymnasium.vector import VectorEnv
+    from tensordict import TensorDict
 
 AfterStep = Callable[[int], object]
 """Called after every step of the environments with the number of episodes that were stepped, for progress bars."""
@@ -83,6 +89,46 @@ class Trainer(ABC):
             CheckpointError: it does not fit the settings or the model; nothing is changed.
         """
         restore(self, state)
+
+
+class EpisodeTrainer(Trainer):
+    """Base of trainers that collect episodes and learn from those that they keep.
+
+    Args:
+        learned, policy, seed, episode_steps: see `Trainer`.
+        env: as many environments in lockstep as an iteration has episodes, or more.
+        episodes: most episodes of an iteration.
+
+    Raises:
+        InvalidInputError: too few environments.
+    """
+
+    def __init__(
+        self, learned: TrainableModel, policy: Policy, seed: int, episode_steps: int, env: VectorEnv, episodes: int
+    ):
+        super().__init__(learned, policy, seed, episode_steps)
+        if env.num_envs < episodes:
+            raise InvalidInputError(f"env: expected at least {episodes} environments, got {env.num_envs}")
+        self.env = env
+        self.buffer = make_empty_record(env, episode_steps)
+        """Episodes to learn from."""
+
+    def collect(self, act: Act, count: int, after_step: AfterStep | None) -> TensorDict:
+        """Collect the next episodes of the training."""
+        seeds = episode_seeds(self.seed, Stream.TRAINING, self.episodes, count)
+        report = None if after_step is None else lambda: after_step(count)
+        episodes = collect(self.env, act, seeds, self.episode_steps, report)
+        self.episodes += count
+        return episodes
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Trainer`."""
+        return {**super().state_dict(), "episodes": episodes_to_state(self.buffer)}
+
+    def load_state_dict(self, state: State) -> None:
+        """See `Trainer`."""
+        super().load_state_dict(state)
+        self.buffer = episodes_from_state(state["episodes"])
 
 
 def learned_state(learned: TrainableModel) -> dict[str, Any]:

@@ -10,28 +10,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from difflcs.errors import InvalidInputError
 from difflcs.lcs import LCSModel
 from difflcs.losses import violation_loss
 from difflcs.records import LCSModule
 from difflcs.rl.learning.checks import check_depends, check_module
 from difflcs.rl.learning.state import State
-from difflcs.rl.learning.trainer import AfterStep, Trainer
+from difflcs.rl.learning.trainer import AfterStep, EpisodeTrainer
 from difflcs.rl.rollout import (
     Policy,
     action_bounds,
     append_episodes,
-    collect,
     contexts,
-    episodes_from_state,
-    episodes_to_state,
-    make_empty_record,
     mpc_actions,
     noisy_actions,
     transitions,
     uniform_actions,
 )
-from difflcs.rl.seeding import Stream, episode_seeds
+from difflcs.rl.seeding import Stream
 from difflcs.rl.settings import Adam, Epochs, Rollouts, Settings, ViolationLoss, bounded, group
 
 if TYPE_CHECKING:
@@ -193,7 +188,7 @@ class WarmupReport:
     learn_seconds: float
 
 
-class Warmup(Trainer):
+class Warmup(EpisodeTrainer):
     """The warm-up phase, see `Trainer`.
 
     Args:
@@ -222,14 +217,10 @@ class Warmup(Trainer):
         episode_steps: int = 20,
         pretrained: bool = False,
     ):
-        super().__init__(check_module(lcs, env), policy, seed, episode_steps)
         needed = max(settings.rollouts.first, settings.rollouts.each)
-        if env.num_envs < needed:
-            raise InvalidInputError(f"env: expected at least {needed} environments, got {env.num_envs}")
-        self.lcs, self.env, self.settings, self.pretrained = lcs, env, settings, pretrained
+        super().__init__(check_module(lcs, env), policy, seed, episode_steps, env, needed)
+        self.lcs, self.settings, self.pretrained = lcs, settings, pretrained
         self.low, self.high = action_bounds(env)
-        self.buffer = make_empty_record(env, episode_steps)
-        """Newest episodes."""
         self.bounds = (self.low, self.high)
         """Action bounds of the last collected episodes."""
         if isinstance(lcs, LCSModel):
@@ -268,7 +259,6 @@ class Warmup(Trainer):
         settings = self.settings
         random = self.iteration == 0 and not self.pretrained
         count = settings.rollouts.first if random else settings.rollouts.each
-        seeds = episode_seeds(self.seed, Stream.TRAINING, self.episodes, count)
         if random:
             act = uniform_actions(self.env, self._actions)
         else:
@@ -276,16 +266,13 @@ class Warmup(Trainer):
                 scale = settings.action_support * settings.action_support_growth ** (self.iteration - 1)
                 self.bounds = action_support(self.buffer["action"], scale, self.low, self.high)
             act = noisy_actions(mpc_actions(self.policy, *self.bounds), settings.noise, self._actions)
-        self.episodes += count
-        report = None if after_step is None else lambda: after_step(count)
-        return collect(self.env, act, seeds, self.episode_steps, report)
+        return self.collect(act, count, after_step)
 
     def state_dict(self) -> dict[str, Any]:
         """See `Trainer`."""
         generators = {"actions": self._actions, "minibatches": self._minibatches}
         return {
             **super().state_dict(),
-            "episodes": episodes_to_state(self.buffer),
             "bounds": {"low": self.bounds[0], "high": self.bounds[1]},
             "random": {name: generator.bit_generator.state for name, generator in generators.items()},
         }
@@ -294,7 +281,6 @@ class Warmup(Trainer):
         """See `Trainer`."""
         super().load_state_dict(state)
         self._actions, self._minibatches = (_generator(state["random"][k]) for k in ("actions", "minibatches"))
-        self.buffer = episodes_from_state(state["episodes"])
         self.bounds = (state["bounds"]["low"], state["bounds"]["high"])
 
 

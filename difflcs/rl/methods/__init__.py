@@ -11,6 +11,7 @@ from difflcs.rl.methods.base import (
 )
 from difflcs.rl.methods.contact_lcs import ContactMethod
 from difflcs.rl.methods.lcs_rl import LCSRLMethod
+from difflcs.rl.methods.mujoco_lcs import MujocoMethod
 from difflcs.rl.methods.pddm import PDDMMethod
 from difflcs.rl.methods.ppo import PPOMethod
 from difflcs.rl.methods.ppo_mlp import PPOMLPMethod
@@ -22,6 +23,7 @@ __all__ = [
     "LCSMethod",
     "LCSRLMethod",
     "Method",
+    "MujocoMethod",
     "PDDMMethod",
     "PPOMLPMethod",
     "PPOMethod",
@@ -36,5 +38,5 @@ __all__ = [
 DEFAULT_METHOD = LCSRLMethod.name
 """The method of `difflcs train` without `--method`."""
 
-for _method in (LCSRLMethod, ViolationMethod, PPOMethod, PPOMLPMethod, PDDMMethod, ContactMethod):
+for _method in (LCSRLMethod, ViolationMethod, PPOMethod, PPOMLPMethod, PDDMMethod, ContactMethod, MujocoMethod):
     register_method(_method)

@@ -43,11 +43,12 @@ def plot_learning_curve(rows: Sequence[Mapping[str, str]], path: Path, title: st
     """
     require("matplotlib")
     from matplotlib import rc_context
-    from matplotlib.figure import Figure
     from matplotlib.ticker import NullFormatter
 
-    with rc_context({"font.size": 12}):
-        figure = Figure(figsize=(7.0, 6.5), dpi=150, layout="constrained")
+    from difflcs._figure import FONT, PageFigure
+
+    with rc_context(FONT):
+        figure = PageFigure(6.5)
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
         figure.suptitle(title)
 

@@ -5,13 +5,12 @@ violation / limit: above 1 is a broken promise, and what is not a number counts 
 for results that were rounded to float32: one rounding of each term.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 
-from tests.conformance.hostile.generators import LCP, MPC, Loss
+from tests.conformance.cases import Case
+from tests.conformance.hostile.generators import LCP, Loss
 
 Ratios = dict[str, np.ndarray]
 
@@ -86,7 +85,7 @@ def judge_lcp(problem: LCP, lam: np.ndarray, w: np.ndarray, relaxation: float, s
 # ---- MPC ------------------------------------------------------------------------------------------------------------
 
 
-def bounds_in(problem: MPC, dtype) -> tuple[np.ndarray, np.ndarray]:
+def bounds_in(problem: Case, dtype) -> tuple[np.ndarray, np.ndarray]:
     """Bounds (count, 1, n_u) rounded inwards to the caller's dtype, as float64; their neighbours where that crosses."""
     a = problem.full()
     low, high = a["u_min"].astype(float), a["u_max"].astype(float)
@@ -102,7 +101,7 @@ def bounds_in(problem: MPC, dtype) -> tuple[np.ndarray, np.ndarray]:
 
 
 def judge_mpc(
-    problem: MPC, x: np.ndarray, u: np.ndarray, lam: np.ndarray, objective: np.ndarray, dtype=np.float64
+    problem: Case, x: np.ndarray, u: np.ndarray, lam: np.ndarray, objective: np.ndarray, dtype=np.float64
 ) -> Ratios:
     """Promises of a solution whose status is CONVERGED or DEGENERATE.
 
@@ -157,7 +156,7 @@ def affine(a: dict, names: str, x, u, lam) -> tuple[np.ndarray, np.ndarray]:
     return value, sum((_mv(np.abs(M), np.abs(v)) for M, v in pairs), np.abs(constant))
 
 
-def cost_of(problem: MPC, a: dict, x, u, low, high) -> tuple[np.ndarray, np.ndarray]:
+def cost_of(problem: Case, a: dict, x, u, low, high) -> tuple[np.ndarray, np.ndarray]:
     """Cost of a trajectory and the sum of the sizes of its terms, (count,)."""
 
     def quadratic(Q, v):
@@ -175,7 +174,7 @@ def cost_of(problem: MPC, a: dict, x, u, low, high) -> tuple[np.ndarray, np.ndar
     return total, terms
 
 
-def stationarity(problem: MPC, a: dict, x, u, lam, s, s_terms, low, high, rounding: float) -> np.ndarray:
+def stationarity(problem: Case, a: dict, x, u, lam, s, s_terms, low, high, rounding: float) -> np.ndarray:
     """The projected step against the reduced gradient, in units of the width, over its limit."""
     g, terms, noise = reduced_gradient(a, x, u, lam, s, s_terms, rounding)
     width = np.broadcast_to(high - low, u.shape)
@@ -250,7 +249,7 @@ def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     return out[..., 0] if vector else out
 
 
-def _vertex(problem: MPC, u, low, high, rounding: float) -> np.ndarray:
+def _vertex(problem: Case, u, low, high, rounding: float) -> np.ndarray:
     if problem.answer is None or problem.barrier > 0:
         return np.zeros(len(u))
     known = np.isfinite(problem.answer)
@@ -260,7 +259,7 @@ def _vertex(problem: MPC, u, low, high, rounding: float) -> np.ndarray:
 
 
 def judge_relaxed_program(
-    problem: MPC, x: np.ndarray, u: np.ndarray, lam: np.ndarray, objective: np.ndarray, dtype=np.float64
+    problem: Case, x: np.ndarray, u: np.ndarray, lam: np.ndarray, objective: np.ndarray, dtype=np.float64
 ) -> Ratios:
     """Promises of backend `relaxed`, whose convex program keeps dynamics, bounds and signs, but not λ∘s = ε."""
     with np.errstate(all="ignore"):

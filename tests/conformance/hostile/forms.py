@@ -6,78 +6,58 @@ The batches come from `tests.conformance.varied`, each element with inputs of it
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
 from numpy.random import Generator
 
-from difflcs import LCSMPCLayer, Status
+from difflcs import Status
 from difflcs.errors import DiffLCSError
-from difflcs.mpc.problem import INPUTS
-from tests.conformance import problems
+from tests.conformance.cases import Case, rank
 from tests.conformance.hostile import checks
-from tests.conformance.hostile.targets import REFUSED, Outcome, quiet, refused_one_by_one
+from tests.conformance.hostile.targets import REFUSED, Outcome, layer_of, leaves_of, quiet, refused_one_by_one
 from tests.conformance.varied import programs
-from tests.conformance.varied.generators import RANKS, Case, random_case
+from tests.conformance.varied.generators import random_case
 from tests.conformance.varied.judges import conditions, objective, rows
 
-SYSTEM, ROWS = ("A", "B", "C", "d", "D", "E", "F", "c"), ("G_x", "G_u", "g", "price")
-NAMES = {"G_x": "G", "G_u": "E_rows", "price": "weight"}  # in `problems`
+ROWS = ("G_x", "G_u", "g", "price")
 INF = np.inf
 
 
-@dataclass(frozen=True)
-class Form:
-    """A batch of problems, and which elements are impossible or possible for sure."""
-
-    case: Case
-    impossible: np.ndarray
-    possible: np.ndarray
-
-    @property
-    def count(self) -> int:
-        """Number of problems."""
-        return self.case.batch
-
-    def select(self, index) -> Form:
-        """Some of them."""
-        arrays = {k: v[index] for k, v in self.case.arrays.items()}
-        return Form(replace(self.case, arrays=arrays, witness=None), self.impossible[index], self.possible[index])
-
-    def with_(self, **arrays) -> Form:
-        """Other inputs: nothing is known about what is possible."""
-        never = np.zeros(self.count, bool)
-        return Form(replace(self.case, arrays={**self.case.arrays, **arrays}), never, never)
+def _spoilt(case: Case, **arrays) -> Case:
+    """Other inputs: nothing is known about what is possible."""
+    never = np.zeros(case.count, bool)
+    return replace(case.changed(**arrays), impossible=never, possible=never)
 
 
-def plain(rng: Generator, count: int, small: bool = False) -> Form:
+def plain(rng: Generator, count: int, small: bool = False) -> Case:
     """Nothing hostile: any size, form and constraint."""
     return _form(rng, count)
 
 
-def _form(rng: Generator, count: int, need_rows: bool = False, **options) -> Form:
+def _form(rng: Generator, count: int, need_rows: bool = False, **options) -> Case:
     while True:
         case = random_case(int(rng.integers(1 << 30)), count, **options)
         if case.horizon <= 12 and ("g" in case.arrays or not need_rows):
             break
     known = np.full(count, case.witness is not None or "g" not in case.arrays)
-    return Form(replace(case.own(), witness=None), np.zeros(count, bool), known)
+    return replace(case.each(), witness=None, impossible=np.zeros(count, bool), possible=known)
 
 
-def _staged_rows(rng: Generator, count: int) -> tuple[Form, dict[str, np.ndarray]]:
+def _staged_rows(rng: Generator, count: int) -> tuple[Case, dict[str, np.ndarray]]:
     """A form whose rows are all given by stage."""
     form = _form(rng, count, need_rows=True)
     arrays = {}
     for name in ROWS:
-        value, stages = form.case.arrays[name], form.case.horizon + (name != "G_u")
-        if value.ndim == RANKS[name] + 1:
+        value, stages = form.arrays[name], form.horizon + (name != "G_u")
+        if value.ndim == rank(name) + 1:
             value = np.repeat(value[:, None], stages, 1)
         arrays[name] = value.copy()
     return form, arrays
 
 
-def zero_rows(rng: Generator, count: int, small: bool = False) -> Form:
+def zero_rows(rng: Generator, count: int, small: bool = False) -> Case:
     """Rows of zeros: 0 ≤ g says nothing, 0 ≤ −g is impossible, and costs price·g where it is soft."""
     form, a = _staged_rows(rng, count)
     j = int(rng.integers(a["g"].shape[-1]))
@@ -86,11 +66,11 @@ def zero_rows(rng: Generator, count: int, small: bool = False) -> Form:
     a["g"][..., j] = rng.choice([0.0, 1e-3, 1.0, INF], (count, 1))
     bad = rng.random(count) < 0.3
     a["g"][bad, -1, j] = -1e-2
-    done = form.with_(**a)
+    done = _spoilt(form, **a)
     return replace(done, impossible=bad & np.isinf(a["price"][:, -1, j]))
 
 
-def opposite_rows(rng: Generator, count: int, small: bool = False) -> Form:
+def opposite_rows(rng: Generator, count: int, small: bool = False) -> Case:
     """Rows twice, rows with both signs (an equation), and rows that contradict each other by 1e-9 … 1."""
     form, a = _staged_rows(rng, count)
     kind, gap = rng.integers(0, 3, count), 10.0 ** rng.uniform(-9, 0, count)
@@ -98,74 +78,74 @@ def opposite_rows(rng: Generator, count: int, small: bool = False) -> Form:
     shift = np.where(kind == 2, gap, 0.0)[:, None, None]
     twice = {k: np.concatenate([v, sign[..., None] * v if k in ("G_x", "G_u") else v], 2) for k, v in a.items()}
     second = np.where(np.isinf(a["g"]), INF, sign * a["g"] - shift)
-    return form.with_(**{**twice, "g": np.concatenate([a["g"], second], 2)})
+    return _spoilt(form, **{**twice, "g": np.concatenate([a["g"], second], 2)})
 
 
-def prices(rng: Generator, count: int, small: bool = False) -> Form:
+def prices(rng: Generator, count: int, small: bool = False) -> Case:
     """Prices of 1e-300, 1e-30, 1e30, 1e300 and hard ones beside each other."""
     form, a = _staged_rows(rng, count)
-    return form.with_(price=rng.choice([1e-300, 1e-30, 1.0, 1e8, 1e30, 1e300, INF], a["price"].shape))
+    return _spoilt(form, price=rng.choice([1e-300, 1e-30, 1.0, 1e8, 1e30, 1e300, INF], a["price"].shape))
 
 
-def limits(rng: Generator, count: int, small: bool = False) -> Form:
+def limits(rng: Generator, count: int, small: bool = False) -> Case:
     """Limits of ±1e300, ±1e30 and none beside each other."""
     form, a = _staged_rows(rng, count)
     spoilt = rng.random(a["g"].shape) < 0.2
-    return form.with_(g=np.where(spoilt, rng.choice([1e300, -1e300, 1e30, -1e30, INF, 0.0], spoilt.shape), a["g"]))
+    return _spoilt(form, g=np.where(spoilt, rng.choice([1e300, -1e300, 1e30, -1e30, INF, 0.0], spoilt.shape), a["g"]))
 
 
-def first_stage(rng: Generator, count: int, small: bool = False) -> Form:
+def first_stage(rng: Generator, count: int, small: bool = False) -> Case:
     """Constraints at stage 0 alone, about x0 and the first actions: met or not whatever follows."""
     form, a = _staged_rows(rng, count)
     a["g"][:, 1:] = INF
-    there = np.einsum("bij,bj->bi", a["G_x"][:, 0], form.case.arrays["x0"])
+    there = np.einsum("bij,bj->bi", a["G_x"][:, 0], form.arrays["x0"])
     a["g"][:, 0] = there + rng.choice([-1.0, -1e-8, 0.0, 1e-8, 1.0], there.shape)
     blind = rng.random() < 0.5
     if blind:
         a["G_u"][:] = 0.0
-    done = form.with_(**a)
+    done = _spoilt(form, **a)
     beyond = (there - a["g"][:, 0] > 1e-2) & np.isinf(a["price"][:, 0])
     return replace(done, impossible=beyond.any(1) if blind else np.zeros(count, bool))
 
 
-def not_numbers(rng: Generator, count: int, small: bool = False) -> Form:
+def not_numbers(rng: Generator, count: int, small: bool = False) -> Case:
     """NaN or −∞ in one input of some elements, ∞ where none is allowed: to be refused before anything is solved."""
     form = _form(rng, count)
-    arrays = {k: v.copy() for k, v in form.case.arrays.items()}
+    arrays = {k: v.copy() for k, v in form.arrays.items()}
     name = str(rng.choice([k for k, v in arrays.items() if v[0].size]))
     chosen = rng.random(count) < 0.3
     value = np.nan if name in ("u_min", "u_max", "g", "price") else rng.choice([np.nan, INF, -INF])
     flat = arrays[name].reshape(count, -1)
     flat[chosen, rng.integers(flat.shape[1])] = value
-    return form.with_(**{name: flat.reshape(arrays[name].shape)})
+    return _spoilt(form, **{name: flat.reshape(arrays[name].shape)})
 
 
-def extreme(rng: Generator, count: int, small: bool = False) -> Form:
+def extreme(rng: Generator, count: int, small: bool = False) -> Case:
     """One input times 1e±(50 … 300) in some elements."""
     form = _form(rng, count)
-    name = str(rng.choice(list(form.case.arrays)))
-    value = form.case.arrays[name].copy()
+    name = str(rng.choice(list(form.arrays)))
+    value = form.arrays[name].copy()
     factor = 10.0 ** (rng.uniform(50, 300) * rng.choice([-1, 1]))
     chosen = rng.random(count) < 0.5
     with np.errstate(over="ignore"):
         value[chosen] = value[chosen] * factor
     if name == "price":
         value = np.maximum(value, 1e-300)
-    return form.with_(**{name: value})
+    return _spoilt(form, **{name: value})
 
 
-def no_contact(rng: Generator, count: int, small: bool = False) -> Form:
+def no_contact(rng: Generator, count: int, small: bool = False) -> Case:
     """n_lam = 0: a quadratic program, of which INFEASIBLE must be true."""
     return _form(rng, count, n_lam=0)
 
 
-def vertex(rng: Generator, count: int, small: bool = False) -> Form:
+def vertex(rng: Generator, count: int, small: bool = False) -> Case:
     """Hardly curved: linear programs, R = 0, soft absolute values, R of 1e-10 … 1e-4; limits at zero; n_lam = 0.
 
     What is summed to the gradient cancels to rounding at a vertex, and states at rest are rounding.
     """
     form = _form(rng, count, need_rows=True, n_lam=0)
-    a = {k: v.copy() for k, v in form.case.arrays.items()}
+    a = {k: v.copy() for k, v in form.arrays.items()}
     for name in ("Q", "R", "S", "Q_final"):
         a[name] *= 0.0
     for name in ("q", "r", "q_final"):
@@ -182,30 +162,10 @@ def vertex(rng: Generator, count: int, small: bool = False) -> Form:
         a["price"] = np.tile(10.0 ** rng.uniform(-2, 1, a["price"].shape), 2)
     elif kind == 3:
         a["R"] += 10.0 ** rng.uniform(-10, -4) * np.eye(a["R"].shape[-1])
-    return replace(form, case=replace(form.case, arrays=a))
+    return form.changed(**a)
 
 
-def layer_of(form: Form, leaves: dict[str, torch.Tensor], backend="batched") -> LCSMPCLayer:
-    """The layer of a form, through the public records."""
-    horizon = form.case.horizon
-    staged = frozenset(NAMES.get(k, k) for k, v in leaves.items() if v.ndim == RANKS[k] + 2)
-    tensors = {NAMES.get(k, k): v for k, v in leaves.items()}
-    if staged & set(SYSTEM):  # then all of the system is given by stage
-        for k in set(SYSTEM) - staged:
-            tensors[k] = leaves[k].unsqueeze(1).expand(-1, horizon, *leaves[k].shape[1:])
-        staged |= set(SYSTEM)
-    options = {"backend": backend, "relaxation": form.case.relaxation, "on_failure": "mask"}
-    return problems.layer_of(tensors, staged, horizon, **options)
-
-
-def leaves_of(form: Form) -> dict[str, torch.Tensor]:
-    """Every input as a tensor that requires a gradient."""
-    return {
-        k: torch.from_numpy(np.array(form.case.arrays[k])).requires_grad_() for k in INPUTS if k in form.case.arrays
-    }
-
-
-def _solve(form: Form, backend: str, warm: bool) -> Outcome:
+def _solve(form: Case, backend: str, warm: bool) -> Outcome:
     leaves = leaves_of(form)
     with quiet(), np.errstate(all="ignore"):
         layer = layer_of(form, leaves, backend)
@@ -230,17 +190,17 @@ def _solve(form: Form, backend: str, warm: bool) -> Outcome:
 LIMITS = {"start": 0.0, "sign": 0.0, "price": 0.0, "bounds": 0.0}
 
 
-def _judge(form: Form, status, x, u, lam, mu, cost, violation) -> checks.Ratios:
+def _judge(form: Case, status, x, u, lam, mu, cost, violation) -> checks.Ratios:
     count, solved = form.count, (status == Status.CONVERGED) | (status == Status.DEGENERATE)
     found: checks.Ratios = {}
 
     def put(name: str, i: int, ratio: float) -> None:
         found.setdefault(name, np.zeros(count))[i] = np.inf if np.isnan(ratio) else ratio
 
-    case = form.case
+    case = form
     if "price" in case.arrays:  # from 1e300 on a constraint is hard, see `Constraints`
         price = case.arrays["price"]
-        case = replace(case, arrays=case.arrays | {"price": np.where(price >= 1e300, INF, price)})
+        case = case.changed(price=np.where(price >= 1e300, INF, price))
     for i in range(count):
         low, high = (np.stack([case.at(k, i, n) for n in range(case.horizon)]) for k in ("u_min", "u_max"))
         put("bounds", i, 0.0 if ((u[i] >= low) & (u[i] <= high)).all() else np.inf)
@@ -280,20 +240,20 @@ def _size(case: Case, i: int, x, u) -> float:
     return float(objective(absolute, i, np.abs(x), np.abs(u)) + fines)
 
 
-def form_target(backend: str = "batched", warm: bool = False) -> Callable[[Form, Generator, bool], Outcome]:
+def form_target(backend: str = "batched", warm: bool = False) -> Callable[[Case, Generator, bool], Outcome]:
     """Solve, differentiate and judge."""
 
-    def target(form: Form, rng: Generator, gradients: bool) -> Outcome:
+    def target(form: Case, rng: Generator, gradients: bool) -> Outcome:
         return refused_one_by_one(lambda part: _solve(part, backend, warm), form)
 
     return target
 
 
-def untouched(form: Form, rng: Generator, gradients: bool) -> Outcome:
+def untouched(form: Case, rng: Generator, gradients: bool) -> Outcome:
     """What becomes of some elements leaves the others as they are, bit for bit, gradients of x0 included."""
     spoilt = np.zeros(form.count, bool)
     spoilt[rng.permutation(form.count)[: max(1, form.count // 3)]] = True
-    arrays = {k: v.copy() for k, v in form.case.arrays.items()}
+    arrays = {k: v.copy() for k, v in form.arrays.items()}
     kind = rng.integers(4)
     with np.errstate(over="ignore"):
         if kind == 0 and "g" in arrays:
@@ -305,11 +265,11 @@ def untouched(form: Form, rng: Generator, gradients: bool) -> Outcome:
         else:
             arrays["B"][spoilt] *= 1e200
     both = []
-    for case in (form.case, replace(form.case, arrays=arrays)):
-        leaves = leaves_of(Form(case, form.impossible, form.possible))
+    for case in (form, form.changed(**arrays)):
+        leaves = leaves_of(case)
         with quiet(), np.errstate(all="ignore"):
             try:
-                plan = layer_of(Form(case, form.impossible, form.possible), leaves)(leaves["x0"])
+                plan = layer_of(case, leaves)(leaves["x0"])
             except DiffLCSError:
                 return Outcome(np.full(form.count, REFUSED), {"untouched": np.zeros(form.count)})
             (plan.u.sum() + plan.objective.sum()).backward()
@@ -320,7 +280,7 @@ def untouched(form: Form, rng: Generator, gradients: bool) -> Outcome:
     return Outcome(both[0][4].astype(int), {"untouched": np.where(changed & ~spoilt, np.inf, 0.0)})
 
 
-FORM_CLASSES: dict[str, Callable[..., Form]] = {
+FORM_CLASSES: dict[str, Callable[..., Case]] = {
     "form-plain": plain,
     "form-no-contact": no_contact,
     "form-zero-rows": zero_rows,

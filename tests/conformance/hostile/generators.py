@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.random import Generator
 
-MATRICES = ("A", "B", "C", "D", "E", "F", "Q", "R", "Q_final")
-VECTORS = ("d", "c", "q", "r", "q_final", "u_min", "u_max")
+from tests.conformance.cases import Case
+
+MATRICES = ("A", "B", "C", "D", "E", "F", "Q", "R", "Q_final")  # of the plain problem
 SHAPES = [(4, 2, 3), (9, 6, 5), (9, 6, 8), (1, 1, 1), (2, 3, 1), (3, 1, 4), (7, 3, 11), (5, 4, 2), (2, 1, 6)]
 SMALL = [(4, 2, 3), (1, 1, 1), (3, 2, 2)]
 
@@ -39,53 +40,6 @@ class LCP:
     def cast(self, dtype) -> LCP:
         with np.errstate(over="ignore", under="ignore"):
             return LCP(self.F.astype(dtype), self.q.astype(dtype))
-
-
-@dataclass(frozen=True)
-class MPC:
-    """A batch of LCS-MPC problems.
-
-    Attributes:
-        arrays: the inputs by name; x0 (count, n_x), any other one shared or with the batch in front.
-        horizon: H.
-        relaxation: λ·s.
-        barrier: weight of the barrier.
-        numbers: u_min and u_max of all actions as Python floats, if the caller gives them so.
-        answer: (count, H, n_u) actions known beforehand, NaN where not; only of classes that are linear programs.
-    """
-
-    arrays: dict[str, np.ndarray]
-    horizon: int
-    relaxation: float = 1e-5
-    barrier: float = 0.0
-    numbers: tuple[float, float] | None = None
-    answer: np.ndarray | None = None
-
-    @property
-    def count(self) -> int:
-        return len(self.arrays["x0"])
-
-    def shared(self, name: str) -> bool:
-        return self.arrays[name].ndim == (2 if name in (*MATRICES, "x0") else 1)
-
-    def select(self, index) -> MPC:
-        arrays = {k: v if k != "x0" and self.shared(k) else v[index] for k, v in self.arrays.items()}
-        return replace(self, arrays=arrays, answer=None if self.answer is None else self.answer[index])
-
-    def each(self) -> MPC:
-        """The same problems, each with every matrix of its own."""
-        return replace(self, arrays={k: np.array(v) for k, v in self.full().items()}, numbers=None)
-
-    def full(self) -> dict[str, np.ndarray]:
-        """Every array with the batch in front."""
-        return {
-            k: v if k == "x0" or not self.shared(k) else np.broadcast_to(v, (self.count, *v.shape))
-            for k, v in self.arrays.items()
-        }
-
-    def cast(self, dtype) -> MPC:
-        with np.errstate(over="ignore", under="ignore"):
-            return replace(self, arrays={k: v.astype(dtype) for k, v in self.arrays.items()})
 
 
 @dataclass(frozen=True)
@@ -240,7 +194,7 @@ def lcp_not_definite(rng: Generator, count: int, small: bool = False) -> LCP:
 # ---- MPC ------------------------------------------------------------------------------------------------------------
 
 
-def _mpc(rng: Generator, count: int, small: bool, horizon: int | None = None) -> MPC:
+def _mpc(rng: Generator, count: int, small: bool, horizon: int | None = None) -> Case:
     """A healthy problem: stable system, contacts that open and close, definite cost, |u| ≤ 0.05 … 1."""
     n_x, n_u, n_lam = (SMALL if small else SHAPES)[rng.integers(len(SMALL if small else SHAPES))]
     if horizon is None:
@@ -267,40 +221,36 @@ def _mpc(rng: Generator, count: int, small: bool, horizon: int | None = None) ->
         "u_max": wide * rng.uniform(0.5, 1, (*lead, n_u)),
         "x0": 0.3 * normal((count, n_x)),
     }
-    return MPC(arrays, horizon, relaxation=float(rng.choice([1e-5, 1e-5, 1e-3, 1e-6])))
+    return Case(arrays, horizon, relaxation=float(rng.choice([1e-5, 1e-5, 1e-3, 1e-6])))
 
 
-def _with(problem: MPC, **arrays) -> MPC:
-    return replace(problem, arrays={**problem.arrays, **arrays})
-
-
-def mpc_plain(rng: Generator, count: int, small: bool = False) -> MPC:
+def mpc_plain(rng: Generator, count: int, small: bool = False) -> Case:
     """Nothing hostile: nine shapes, (9, 6, 8) and odd ones, H 1 to 20, shared or per element."""
     return _mpc(rng, count, small)
 
 
-def skew_mpc(epsilon: float) -> Callable[..., MPC]:
-    def mpc_skew(rng: Generator, count: int, small: bool = False) -> MPC:
+def skew_mpc(epsilon: float) -> Callable[..., Case]:
+    def mpc_skew(rng: Generator, count: int, small: bool = False) -> Case:
         problem = _mpc(rng, count, small, horizon=int(rng.integers(1, 6)))
         K = rng.standard_normal(problem.arrays["F"].shape)
-        return _with(problem, F=K - K.swapaxes(-1, -2) + epsilon * np.eye(K.shape[-1]))
+        return problem.changed(F=K - K.swapaxes(-1, -2) + epsilon * np.eye(K.shape[-1]))
 
     mpc_skew.__doc__ = f"The plain problem with F = K − Kᵀ + {epsilon:g}·I: forces up to 1/ε times the gaps."
     return mpc_skew
 
 
-def mpc_stiff(rng: Generator, count: int, small: bool = False) -> MPC:
+def mpc_stiff(rng: Generator, count: int, small: bool = False) -> Case:
     """F nearly singular (low rank + 1e-2 … 1e-10) or graded (diagonal 1e-8 … 1e8)."""
     problem = _mpc(rng, count, small, horizon=int(rng.integers(1, 6)))
     F = problem.arrays["F"]
     if rng.random() < 0.5:
         G = rng.standard_normal((*F.shape[:-1], max(1, F.shape[-1] // 2)))
-        return _with(problem, F=G @ G.swapaxes(-1, -2) + power(rng, -10, -2, 1) * np.eye(F.shape[-1]))
+        return problem.changed(F=G @ G.swapaxes(-1, -2) + power(rng, -10, -2, 1) * np.eye(F.shape[-1]))
     S = power(rng, -4, 4, *F.shape[:-1])
-    return _with(problem, F=S[..., :, None] * F * S[..., None, :])
+    return problem.changed(F=S[..., :, None] * F * S[..., None, :])
 
 
-def _linear_answer(problem: MPC) -> np.ndarray:
+def _linear_answer(problem: Case) -> np.ndarray:
     """The vertex of a cost that is linear in u and does not see λ (C = 0); NaN where the slope is 1e-6 of its terms."""
     a = problem.full()
     p, size = a["q_final"], np.abs(a["q_final"])
@@ -315,31 +265,31 @@ def _linear_answer(problem: MPC) -> np.ndarray:
     return np.stack(steps[::-1], 1)
 
 
-def _linear_cost(problem: MPC, rng: Generator) -> MPC:
+def _linear_cost(problem: Case, rng: Generator) -> Case:
     a = problem.arrays
     new = {name: np.zeros_like(a[name]) for name in ("Q", "R", "Q_final")}
     for name in ("q", "r", "q_final"):
         new[name] = rng.standard_normal(a[name].shape)
-    return _with(problem, **new)
+    return problem.changed(**new)
 
 
-def mpc_flat(rng: Generator, count: int, small: bool = False) -> MPC:
+def mpc_flat(rng: Generator, count: int, small: bool = False) -> Case:
     """Q = R = Q_final = 0, linear terms of size 1, no effect of λ on the states: a linear program, known vertex."""
     problem = _linear_cost(_mpc(rng, count, small), rng)
-    problem = _with(problem, C=np.zeros_like(problem.arrays["C"]))
+    problem = problem.changed(C=np.zeros_like(problem.arrays["C"]))
     if rng.random() < 0.5:
         zero = {k: np.zeros_like(problem.arrays[k]) for k in ("q", "q_final")}
-        problem = _with(problem, **zero)
-    problem = _with(problem, D=np.zeros_like(problem.arrays["D"]), E=np.zeros_like(problem.arrays["E"]))
+        problem = problem.changed(**zero)
+    problem = problem.changed(D=np.zeros_like(problem.arrays["D"]), E=np.zeros_like(problem.arrays["E"]))
     return replace(problem, answer=_linear_answer(problem))
 
 
-def mpc_flat_contact(rng: Generator, count: int, small: bool = False) -> MPC:
+def mpc_flat_contact(rng: Generator, count: int, small: bool = False) -> Case:
     """Q = R = Q_final = 0 with contacts in the loop: the only curvature is that of λ."""
     return _linear_cost(_mpc(rng, count, small), rng)
 
 
-def mpc_flat_tiny(rng: Generator, count: int, small: bool = False) -> MPC:
+def mpc_flat_tiny(rng: Generator, count: int, small: bool = False) -> Case:
     """R, Q, Q_final of 1e-12 … 1e-4 beside linear terms of 1e-6 … 1, |u| ≤ 0.05: curvature that says nothing."""
     problem = _linear_cost(_mpc(rng, count, small), rng)
     a = problem.arrays
@@ -347,10 +297,10 @@ def mpc_flat_tiny(rng: Generator, count: int, small: bool = False) -> MPC:
     new = {k: curvature * definite(rng, *a[k].shape, skew=0) for k in ("Q", "R", "Q_final")}
     new |= {k: linear * a[k] for k in ("q", "r", "q_final")}
     new |= {"u_min": np.full_like(a["u_min"], -0.05), "u_max": np.full_like(a["u_max"], 0.05)}
-    return _with(problem, **new)
+    return problem.changed(**new)
 
 
-def mpc_no_effect(rng: Generator, count: int, small: bool = False) -> MPC:
+def mpc_no_effect(rng: Generator, count: int, small: bool = False) -> Case:
     """One action without cost or effect (its part of B, E, R zero) in half of the elements, or with a linear cost."""
     problem = _mpc(rng, count, small).each()
     B, E, R, r = (problem.arrays[k] for k in ("B", "E", "R", "r"))
@@ -368,36 +318,36 @@ def mpc_no_effect(rng: Generator, count: int, small: bool = False) -> MPC:
     return problem
 
 
-def mpc_unstable(rng: Generator, count: int, small: bool = False) -> MPC:
+def mpc_unstable(rng: Generator, count: int, small: bool = False) -> Case:
     """A = a·I + noise with a = 1.5 … 1e3 and H up to 60: states up to 1e180, past float32 and past float64."""
     horizon = int(rng.integers(2, 4)) if small else int(rng.choice([3, 5, 8, 14, 20, 40, 60]))
     problem = _mpc(rng, count, small, horizon=horizon)
     a = rng.choice([1.5, 3.0, 10.0, 100.0, 1000.0])
     A = problem.arrays["A"]
-    return _with(
-        problem, A=a * np.eye(A.shape[-1]) + (0.05 * rng.standard_normal(A.shape) if rng.random() < 0.5 else 0)
+    return problem.changed(
+        A=a * np.eye(A.shape[-1]) + (0.05 * rng.standard_normal(A.shape) if rng.random() < 0.5 else 0)
     )
 
 
-def mpc_number_bounds(rng: Generator, count: int, small: bool = False) -> MPC:
+def mpc_number_bounds(rng: Generator, count: int, small: bool = False) -> Case:
     """Bounds as Python floats that no float32 holds (0.3, 0.1, 1/3, 0.7), most actions pressed against them."""
     problem = _mpc(rng, count, small)
     a = problem.arrays
     bounds = (-float(rng.choice([0.1, 0.3, 1 / 3])), float(rng.choice([0.3, 0.1, 0.7])))
     new = {"u_min": np.full(a["u_min"].shape[-1], bounds[0]), "u_max": np.full(a["u_max"].shape[-1], bounds[1])}
-    return replace(_with(problem, r=20 * a["r"], **new), numbers=bounds)
+    return replace(problem.changed(r=20 * a["r"], **new), numbers=bounds)
 
 
-def mpc_touching(rng: Generator, count: int, small: bool = False) -> MPC:
+def mpc_touching(rng: Generator, count: int, small: bool = False) -> Case:
     """Bounds that touch, and ranges of 1e-12, 1e-6, 1 and 1e8 [action units] beside each other, off the origin."""
     problem = _mpc(rng, count, small)
     a = problem.arrays
     centre = rng.standard_normal(a["u_min"].shape)
     width = rng.choice([0.0, 1e-12, 1e-6, 1.0, 1e8], a["u_min"].shape)
-    return _with(problem, u_min=centre - 0.5 * width, u_max=centre + 0.5 * width)
+    return problem.changed(u_min=centre - 0.5 * width, u_max=centre + 0.5 * width)
 
 
-def mpc_units(rng: Generator, count: int, small: bool = False) -> MPC:
+def mpc_units(rng: Generator, count: int, small: bool = False) -> Case:
     """A plain problem in other units: states of 1e6, actions of 1e-6, forces of 1e3, or mixed 1e-6 … 1e6 by component.
 
     λ·s keeps its unit, so that the relaxation stays as it is; the answer is that of the plain problem in these units.
@@ -410,8 +360,7 @@ def mpc_units(rng: Generator, count: int, small: bool = False) -> MPC:
     else:
         x, u, f = power(rng, -6, 6, n_x), power(rng, -6, 6, n_u), power(rng, -3, 3, n_lam)
     column = x[:, None]
-    return _with(
-        problem,
+    return problem.changed(
         A=column * a["A"] / x,
         B=column * a["B"] / u,
         C=column * a["C"] / f,
@@ -432,28 +381,28 @@ def mpc_units(rng: Generator, count: int, small: bool = False) -> MPC:
     )
 
 
-def mpc_cost_scale(rng: Generator, count: int, small: bool = False) -> MPC:
+def mpc_cost_scale(rng: Generator, count: int, small: bool = False) -> Case:
     """The whole cost times 1e-8 … 1e8: the same plans."""
     problem = _mpc(rng, count, small)
     factor = float(power(rng, -8, 8, 1)[0])
     names = ("Q", "R", "Q_final", "q", "r", "q_final")
-    return _with(problem, **{k: factor * problem.arrays[k] for k in names})
+    return problem.changed(**{k: factor * problem.arrays[k] for k in names})
 
 
-def mpc_extreme(rng: Generator, count: int, small: bool = False) -> MPC:
+def mpc_extreme(rng: Generator, count: int, small: bool = False) -> Case:
     """One input, or the whole cost, times 1e±(50 … 300): past what float64 holds in products. Refusing is right."""
     problem = _mpc(rng, count, small)
     factor = float(power(rng, 50, 300, 1)[0] ** rng.choice([-1.0, 1.0]))
     name = str(rng.choice([*MATRICES, "d", "c", "q", "r", "q_final", "x0", "cost"]))
     names = ("Q", "R", "Q_final", "q", "r", "q_final") if name == "cost" else (name,)
-    return _with(problem, **{k: factor * problem.arrays[k] for k in names})
+    return problem.changed(**{k: factor * problem.arrays[k] for k in names})
 
 
-def mpc_stuck(rng: Generator, count: int, small: bool = False) -> MPC:
+def mpc_stuck(rng: Generator, count: int, small: bool = False) -> Case:
     """Exact zeros: x0, d, c, q, r, q_final zero, contacts that just touch; the origin is a point of symmetry."""
     problem = _mpc(rng, count, small)
     names = [k for k in ("d", "c", "q", "r", "q_final", "x0") if rng.random() < 0.8]
-    return _with(problem, **{k: np.zeros_like(problem.arrays[k]) for k in names})
+    return problem.changed(**{k: np.zeros_like(problem.arrays[k]) for k in names})
 
 
 # ---- violation loss -------------------------------------------------------------------------------------------------
@@ -516,7 +465,7 @@ LCP_CLASSES: dict[str, Callable[..., LCP]] = {
     "lcp-large": lcp_large,
     "lcp-not-definite": lcp_not_definite,
 }
-MPC_CLASSES: dict[str, Callable[..., MPC]] = {
+MPC_CLASSES: dict[str, Callable[..., Case]] = {
     "mpc-plain": mpc_plain,
     **{f"mpc-skew-1e-{k}": skew_mpc(10.0**-k) for k in (2, 4, 6, 8)},
     "mpc-stiff": mpc_stiff,

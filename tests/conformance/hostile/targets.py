@@ -15,14 +15,15 @@ from difflcs import LCSModel, LCSMPCLayer, Status, solve_lcp, violation_loss
 from difflcs.errors import DiffLCSError, DiffLCSWarning
 from difflcs.mpc import Primal
 from difflcs.mpc.backends import IpoptBackend
+from difflcs.mpc.problem import INPUTS
 from tests.conformance import problems
+from tests.conformance.cases import Case, rank
 from tests.conformance.hostile import checks
-from tests.conformance.hostile.generators import LCP, MPC, Loss
+from tests.conformance.hostile.generators import LCP, Loss
 
 REFUSED = -1  # in place of a status: a typed error
 SYSTEM = ("A", "B", "C", "d", "D", "E", "F", "c")
-COST = ("Q", "R", "Q_final", "q", "r", "q_final")
-INPUTS = (*SYSTEM, *COST, "u_min", "u_max", "x0")
+NAMES = {"G_x": "G", "G_u": "E_rows", "price": "weight"}  # in `problems`
 
 
 @dataclass
@@ -205,18 +206,26 @@ def _compare(terms: np.ndarray, difference, step: float, of_terms: float = 1e-7)
 # ---- LCSMPCLayer ----------------------------------------------------------------------------------------------------
 
 
-def layer_of(problem: MPC, leaves: dict[str, torch.Tensor], backend="batched") -> LCSMPCLayer:
-    low, high = problem.numbers or (leaves["u_min"], leaves["u_max"])
+def layer_of(problem: Case, leaves: dict[str, torch.Tensor], backend="batched") -> LCSMPCLayer:
+    """The layer of problems, through the public records."""
+    tensors = {NAMES.get(k, k): v for k, v in leaves.items()}
+    staged = frozenset(NAMES.get(k, k) for k, v in leaves.items() if v.ndim == rank(k) + 2)
+    if staged & set(SYSTEM):  # then all of the system is given by stage
+        for k in set(SYSTEM) - staged:
+            tensors[k] = leaves[k].unsqueeze(1).expand(-1, problem.horizon, *leaves[k].shape[1:])
+        staged |= set(SYSTEM)
+    if problem.numbers:
+        tensors["u_min"], tensors["u_max"] = problem.numbers
     options = {"relaxation": problem.relaxation, "barrier": problem.barrier, "on_failure": "mask"}
-    tensors = {**leaves, "u_min": low, "u_max": high}
-    return problems.layer_of(tensors, frozenset(), problem.horizon, backend=backend, **options)
+    return problems.layer_of(tensors, staged, problem.horizon, backend=backend, **options)
 
 
-def leaves_of(problem: MPC) -> dict[str, torch.Tensor]:
-    return {k: torch.from_numpy(np.array(problem.arrays[k])).requires_grad_() for k in INPUTS}
+def leaves_of(problem: Case) -> dict[str, torch.Tensor]:
+    """Every input as a tensor that requires a gradient."""
+    return {k: torch.from_numpy(np.array(problem.arrays[k])).requires_grad_() for k in INPUTS if k in problem.arrays}
 
 
-def _mpc(problem: MPC, dtype, backend, guess, judge) -> Outcome:
+def _mpc(problem: Case, dtype, backend, guess, judge) -> Outcome:
     leaves = leaves_of(problem)
     with quiet():
         layer = layer_of(problem, leaves, backend)
@@ -231,7 +240,7 @@ def _mpc(problem: MPC, dtype, backend, guess, judge) -> Outcome:
     for name, leaf in leaves.items():
         if leaf.grad is None:
             continue
-        if name != "x0" and problem.shared(name):
+        if problem.shared(name):
             shared_bad |= not bool(torch.isfinite(leaf.grad).all())
         else:
             gradient = np.maximum(gradient, checks.finite(leaf.grad.numpy()))
@@ -244,17 +253,17 @@ def _mpc(problem: MPC, dtype, backend, guess, judge) -> Outcome:
     return outcome
 
 
-def cold(problem: MPC, layer: LCSMPCLayer, x0: torch.Tensor):
+def cold(problem: Case, layer: LCSMPCLayer, x0: torch.Tensor):
     return None
 
 
-def shift(problem: MPC, layer: LCSMPCLayer, x0: torch.Tensor):
+def shift(problem: Case, layer: LCSMPCLayer, x0: torch.Tensor):
     """Its own plan, one step later."""
     with torch.no_grad():
         return layer(x0).shift()
 
 
-def opposite(problem: MPC, layer: LCSMPCLayer, x0: torch.Tensor):
+def opposite(problem: Case, layer: LCSMPCLayer, x0: torch.Tensor):
     """The vertex opposite to its own plan, and λ with the roles of λ and s exchanged."""
     with torch.no_grad():
         plan = layer(x0)
@@ -263,7 +272,7 @@ def opposite(problem: MPC, layer: LCSMPCLayer, x0: torch.Tensor):
     return Primal(plan.x, u, (problem.relaxation / plan.lam.clamp_min(1e-30)).clamp_max(1e30))
 
 
-def interior(problem: MPC, layer: LCSMPCLayer, x0: torch.Tensor):
+def interior(problem: Case, layer: LCSMPCLayer, x0: torch.Tensor):
     """Actions in the middle of their ranges."""
     with torch.no_grad():
         plan = layer(x0)
@@ -274,10 +283,10 @@ def interior(problem: MPC, layer: LCSMPCLayer, x0: torch.Tensor):
 
 def mpc_target(
     guess=cold, dtype=np.float64, barrier: float = 0.0, backend="batched", judge=checks.judge_mpc
-) -> Callable[[MPC, Generator, bool], Outcome]:
+) -> Callable[[Case, Generator, bool], Outcome]:
     """`barrier` is a part of the cost of the plain problems, which is of size 1."""
 
-    def target(problem: MPC, rng: Generator, gradients: bool) -> Outcome:
+    def target(problem: Case, rng: Generator, gradients: bool) -> Outcome:
         if barrier > 0:
             open_ = np.broadcast_to(problem.arrays["u_max"] - problem.arrays["u_min"], problem.full()["u_min"].shape)
             keep = (open_ > 0).all(-1)  # a barrier needs a range
@@ -305,7 +314,7 @@ def mpc_target(
     return target
 
 
-def _castable(problem: MPC, dtype) -> MPC:
+def _castable(problem: Case, dtype) -> Case:
     if dtype == np.float64:
         return problem
     small = problem.cast(dtype)
@@ -315,7 +324,7 @@ def _castable(problem: MPC, dtype) -> MPC:
     return replace(small, arrays=finite)
 
 
-def _mpc_differences(problem: MPC, backend, rng: Generator) -> tuple[np.ndarray, int]:
+def _mpc_differences(problem: Case, backend, rng: Generator) -> tuple[np.ndarray, int]:
     """Directional derivatives against central differences of re-solves that start from the solution.
 
     Matrices of the cost and F go along D M D with D = I + step·diag, which keeps them definite; bounds by a part of
@@ -325,7 +334,7 @@ def _mpc_differences(problem: MPC, backend, rng: Generator) -> tuple[np.ndarray,
     a = problem.arrays
     draws = {k: rng.standard_normal(v.shape[:2] if k in ("Q", "R", "Q_final", "F") else v.shape) for k, v in a.items()}
 
-    def moved(step: float) -> MPC:
+    def moved(step: float) -> Case:
         new = {}
         for k, v in a.items():
             if k in ("Q", "R", "Q_final", "F"):

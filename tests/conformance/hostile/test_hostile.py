@@ -1,7 +1,5 @@
 """The quick tier of the campaign: every class over every target, nothing wrong in silence, and not by refusing."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -60,7 +58,7 @@ FLOORS = {
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("cell", PARAMETERS)
-def test_nothing_is_wrong_in_silence(cell, one_thread):
+def test_nothing_is_wrong_in_silence(cell):
     if cell.target == "relaxed":
         pytest.importorskip("cvxpylayers")
     if cell.problems.startswith("mpc-skew"):  # what is refused there was tried three times
@@ -72,7 +70,7 @@ def test_nothing_is_wrong_in_silence(cell, one_thread):
 
 
 @pytest.mark.parametrize(("problems", "chunks"), [("form-plain", 24), ("form-no-contact", 12)])
-def test_every_form_and_size_is_solved(problems, chunks, one_thread):
+def test_every_form_and_size_is_solved(problems, chunks):
     """Each chunk has sizes and a form of its own: four elements of many rather than many of one."""
     cell, total = replace(next(c for c in campaign.CELLS if c.name == f"{problems}/batched"), size=4), None
     for number in range(chunks):
@@ -89,7 +87,7 @@ def test_a_chunk_depends_on_class_seed_and_number_alone():
     assert a.arrays["x0"].shape != c.arrays["x0"].shape or (a.arrays["x0"] != c.arrays["x0"]).any()
 
 
-def test_elements_whose_sweep_must_exchange_rows_change_no_gradient_of_others(one_thread, monkeypatch):
+def test_elements_whose_sweep_must_exchange_rows_change_no_gradient_of_others(monkeypatch):
     """At a nearly skew F the sweep of the gradients is done a second time, of these elements alone."""
     problem, rng = next(c for c in campaign.CELLS if c.name == "mpc-plain/batched").chunk(0, 0)
     F, bad = problem.arrays["F"].copy(), np.arange(problem.count) % 2 == 0
@@ -124,7 +122,7 @@ def test_every_generator_says_what_is_hostile():
         assert generator.__doc__
 
 
-def test_the_judges_see_a_wrong_answer(one_thread):
+def test_the_judges_see_a_wrong_answer():
     """Each condition, broken by hand, is seen: a judge that accepts everything proves nothing."""
     cell = next(c for c in campaign.CELLS if c.name == "mpc-cost-scale/batched")
     problem, _ = cell.chunk(1, 0)

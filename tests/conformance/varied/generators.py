@@ -1,7 +1,4 @@
-"""Random LCS-MPC problems of every form, one seeded batch of equal shape each. NumPy only, but for the free plan.
-
-A case holds the arrays by the names of `MPCProblem`, each shared, per element, by stage, or both.
-"""
+"""Random LCS-MPC problems of every form, one seeded batch of equal shape each. NumPy only, but for the free plan."""
 
 from __future__ import annotations
 
@@ -12,54 +9,10 @@ import torch
 from numpy.random import Generator
 
 from difflcs.mpc.backends import BatchedBackend
-from difflcs.mpc.problem import INPUTS, STAGES, MPCProblem
+from difflcs.mpc.problem import STAGES
+from tests.conformance.cases import Case
 
 INF = np.inf
-RANKS = {name: len(shape) for name, shape in INPUTS.items()}
-
-
-@dataclass(frozen=True)
-class Case:
-    """A batch of problems.
-
-    Attributes:
-        arrays: inputs by name.
-        horizon: H.
-        relaxation: λ·s.
-        witness: (batch, H, n_u) actions that are known to meet the bounds and every constraint; None without.
-    """
-
-    arrays: dict[str, np.ndarray]
-    horizon: int
-    relaxation: float
-    witness: np.ndarray | None = None
-
-    @property
-    def batch(self) -> int:
-        """Number of problems."""
-        return len(self.arrays["x0"])
-
-    def problem(self) -> MPCProblem:
-        """The batch as the backends take it."""
-        tensors = {k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in self.arrays.items()}
-        return MPCProblem(**tensors, horizon=self.horizon, relaxation=self.relaxation)
-
-    def own(self) -> Case:
-        """The same with every input given per element."""
-        arrays = {}
-        for name, value in self.arrays.items():
-            if name != "x0" and value.ndim == RANKS[name]:
-                value = np.broadcast_to(value, (self.batch, *value.shape))
-            arrays[name] = np.array(np.broadcast_to(value, (self.batch, *value.shape[1:])))
-        return replace(self, arrays=arrays)
-
-    def at(self, name: str, i: int, k: int) -> np.ndarray:
-        """One input of element i at stage k."""
-        value = self.arrays[name]
-        if name != "x0" and value.ndim == RANKS[name]:
-            return value
-        value = value[i if len(value) > 1 else 0]
-        return value[k] if value.ndim > RANKS[name] else value
 
 
 def random_case(seed: int, batch: int = 8, n_lam: int | None = None, bounds: bool = True, rows: bool = True) -> Case:
@@ -131,7 +84,7 @@ class _Form:
 def _constrained(case: Case, rng: Generator, form: _Form) -> Case:
     """Rows that the plan without them violates. Two thirds of the cases keep a plan that is known to meet them."""
     n_x, n_u = case.arrays["B"].shape[-2:]
-    n_c, batch, horizon = int(rng.integers(1, 5)), case.batch, case.horizon
+    n_c, batch, horizon = int(rng.integers(1, 5)), case.count, case.horizon
     G_x = rng.standard_normal((n_c, n_x)) * (rng.random((n_c, 1)) < 0.9)
     G_u = 0.5 * rng.standard_normal((n_c, n_u)) * ((rng.random((n_c, 1)) < 0.5) | ~G_x.any(1, keepdims=True))
     price = np.where(rng.random(n_c) < 0.5, INF, np.exp(rng.uniform(-4, 2, n_c)))

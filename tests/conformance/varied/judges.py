@@ -4,11 +4,9 @@ Stationarity is judged by the derivative of the Lagrangian along the trajectory,
 `difflcs.mpc.kkt` goes backwards by costates.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
-from tests.conformance.varied.generators import Case
+from tests.conformance.cases import Case
 
 SYSTEM = ("A", "B", "C", "d", "D", "E", "F", "c")
 

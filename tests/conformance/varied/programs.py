@@ -3,12 +3,10 @@
 None of this calls the library's mathematics.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.optimize import linprog
 
-from tests.conformance.varied.generators import Case
+from tests.conformance.cases import Case
 
 
 def condensed(case: Case, i: int):

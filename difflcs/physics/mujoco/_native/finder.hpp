@@ -32,7 +32,7 @@ struct Geom {
 struct Pair {
   int first, second;
   bool formula, boxes, faces;
-  double size, friction;
+  double size, friction, spin;  // of spinning about the normal, the radius at which friction acts as in sliding
 };
 
 // Pairs that share a number of contacts.
@@ -318,6 +318,13 @@ class Finder {
     return rate;
   }
 
+  // How the second body spins about the normal of the contact, as the first one sees it.
+  double spin(const Contact& c, int v) const {
+    const auto moves = [&](int geom) { return scene_.geoms[geom].moves[v] ? 1 : 0; };
+    const Pair& pair = scene_.pairs[c.pair];
+    return (moves(pair.second) - moves(pair.first)) * dot(c.normal, load(place_.cdof + 6 * v));
+  }
+
   // A normal that nothing can move along is that of a body resting on what is outside the plane of motion.
   bool moves(const Contact& c) const {
     for (int v = 0; v < scene_.nv; v++)
@@ -345,7 +352,8 @@ class Finder {
     into.geom[2 * slot + 1] = pair.second;
     for (int v = 0; v < nv; v++) {
       into.normal[slot * nv + v] = rate(c, c.normal, v);
-      for (int t = 0; t < count; t++) into.tangent[(slot * count + t) * nv + v] = rate(c, tangent[t], v);
+      for (int t = 0; t < std::min(count, 2); t++) into.tangent[(slot * count + t) * nv + v] = rate(c, tangent[t], v);
+      if (count > 2) into.tangent[(slot * count + 2) * nv + v] = pair.spin * spin(c, v);
     }
   }
 

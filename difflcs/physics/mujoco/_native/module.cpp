@@ -93,7 +93,7 @@ Scene make_scene(const nb::dict& f) {
     const int64_t* of = geoms.data() + 2 * p;
     const bool* flag = flags.data() + 3 * p;
     s.pairs.push_back({static_cast<int>(of[0]), static_cast<int>(of[1]), flag[0], flag[1], flag[2],
-                       numbers.data()[2 * p], numbers.data()[2 * p + 1]});
+                       numbers.data()[3 * p], numbers.data()[3 * p + 1], numbers.data()[3 * p + 2]});
   }
   for (const auto& [begin, end, count, distance] : value<std::vector<std::tuple<int, int, int, double>>>(f, "groups"))
     s.groups.push_back({begin, end, count, distance});

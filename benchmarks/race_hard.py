@@ -1,0 +1,172 @@
+"""Planners that are made for contact, beside ours, judged under hard contact: single plans and closed loops."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from race_global import hard_cost
+from race_problems import with_contact
+from rivals import admm, layer, sampling
+from rivals.problem import Problem
+from rivals.run import closed_loop, cpu
+
+from difflcs.mpc.backends import BatchedBackend
+from difflcs.mpc.problem import MPCProblem
+
+TUNED = Path(__file__).parent / "rivals" / "tuned.json"
+ITERATIONS = (3, 10, 30, 100)  # of C3+
+LOOPS = ("pushing, n_lam 5", "pushing, n_lam 8", "cart-pole, H 10", "cart-pole, H 30", "chain of 4, H 10")
+STEPS = 25
+OTHER_SEEDS = 1000
+MODULES: dict[str, Any] = {"layer": layer, "admm": admm, "sampling": sampling}
+OURS: dict[str, dict[str, Any]] = {
+    "difflcs": {},
+    'difflcs `"fast"`': {"effort": "fast"},
+    "difflcs, 1e-7": {"relaxation": 1e-7},
+    'difflcs `"fast"`, 1e-7': {"effort": "fast", "relaxation": 1e-7},
+}
+# Closed loops of C3+ and sampling are cold in each step, as theirs are; ours is the warm controller.
+Draw = Callable[[np.random.Generator], dict[str, Any]]
+
+
+def draws() -> dict[str, tuple[str, Draw]]:
+    """List the rivals whose settings are tuned: module, and how random settings are drawn."""
+
+    def consensus(iterations: int, **fixed: str) -> Draw:
+        def draw(random: np.random.Generator) -> dict[str, Any]:
+            growth = float(random.choice([1.0, 1.0, 1.05, 1.1, 1.2, 1.5, 2.0][: 7 if iterations <= 30 else 4]))
+            weight, gap, action, prefer = (
+                float(10 ** random.uniform(*v)) for v in [(-3, 3.5), (-2, 2), (-3, 2), (-1, 2)]
+            )
+            return {
+                **fixed,
+                "iterations": iterations,
+                "weight": weight,
+                "growth": growth,
+                "gap": gap,
+                "action": action,
+                "prefer": prefer,
+            }
+
+        return draw
+
+    def sampled(method: str, rollouts: int) -> Draw:
+        def draw(random: np.random.Generator) -> dict[str, Any]:
+            iterations = int(random.choice([4, 8, 16, 32]))
+            keep = float(random.uniform(0.02, 0.3)) if method == "cem" else float(10 ** random.uniform(-2, 0))
+            spread, hold = float(10 ** random.uniform(-1, 0.3)), int(random.choice([1, 2, 3, 5, 10]))
+            return {
+                "method": method,
+                "samples": rollouts // iterations,
+                "iterations": iterations,
+                "spread": spread,
+                "hold": hold,
+                "keep": keep,
+            }
+
+        return draw
+
+    rivals = {f"C3+, {n} iterations": ("admm", consensus(n)) for n in ITERATIONS}
+    rivals["C3, 10 iterations"] = ("admm", consensus(10, project="lcp"))
+    return rivals | {f"{m.upper()}, 1024 rollouts": ("sampling", sampled(m, 1024)) for m in ("cem", "mppi")}
+
+
+def objectives(problem: Problem, mpc: MPCProblem, u: np.ndarray) -> np.ndarray:
+    """Compute the objectives of executing actions with λ·s = 0, their constant included."""
+    return hard_cost(mpc, mpc.clip(torch.from_numpy(np.nan_to_num(u)))).numpy() + problem.constant
+
+
+def reference(problem: Problem, mpc: MPCProblem) -> np.ndarray:
+    """Compute the hard objectives of our plans from many starts at two relaxations: the better ones."""
+    plans = (BatchedBackend(restarts=32, max_iter=600).solve(mpc, None), BatchedBackend(effort="best").solve(mpc, None))
+    return np.minimum(*(objectives(problem, mpc, result.primal.u.numpy()) for result in plans))
+
+
+def tune(as_mpc: Callable[[Problem], MPCProblem], seconds: float) -> None:
+    """Draw settings of each rival for each family on other seeds, for some seconds; write the best."""
+    tuned: dict[str, dict[str, dict]] = {}
+    for family, problems in with_contact(3, 2, OTHER_SEEDS).items():
+        known = [reference(p, as_mpc(p)) for p in problems]
+        for label, (module, draw) in draws().items():
+            random, least, until = np.random.default_rng(0), np.inf, time.process_time() + seconds
+            while time.process_time() < until:
+                settings, gaps = draw(random), []
+                for p, best in zip(problems, known, strict=True):
+                    solver = MODULES[module].Solver(p, **settings)
+                    u = np.concatenate([solver.one(i).u for i in range(p.count)])
+                    gaps.append(np.minimum(objectives(p, as_mpc(p), u) / best - 1, 3.0))
+                if np.mean(gaps) < least:
+                    least = float(np.mean(gaps))
+                    tuned.setdefault(family, {})[label] = {"module": module, "settings": settings}
+            print(f"{family:20s} {label:22s} gap {100 * least:.3g} %", flush=True)
+    TUNED.write_text(json.dumps(tuned, indent=1) + "\n")
+
+
+def measure(
+    as_mpc: Callable[[Problem], MPCProblem], problems: int, seeds: int, rounds: int
+) -> dict[str, dict[str, dict]]:
+    """Measure every planner on the families of the race.
+
+    Args:
+        as_mpc: function from a problem to an `MPCProblem`.
+        problems: of each model.
+        seeds: models of a family.
+        rounds: how often everybody solves everything, taking turns; the shortest time of each problem counts.
+
+    Returns:
+        family → label → median seconds of a plan, mean and worst gap to the best plan of all under hard contact; and in
+        families with closed loops seconds of a step, and the cost of all loops in parts of that of the first planner.
+    """
+    tuned, families = json.loads(TUNED.read_text()), {}
+    for family, members in with_contact(problems, seeds).items():
+        rivals = {label: (row["module"], row["settings"]) for label, row in tuned[family].items()}
+        fresh = {"C3+, 10 iterations, new system": ("admm", {**rivals["C3+, 10 iterations"][1], "new": True})}
+        planners = {label: ("layer", settings) for label, settings in OURS.items()} | rivals | fresh
+        table = {label: {"times": [], "gaps": [], "steps": [], "costs": []} for label in planners}
+        for problem in members:
+            mpc, found = as_mpc(problem), {}
+            solvers = {
+                label: MODULES[module].Solver(problem, **settings) for label, (module, settings) in planners.items()
+            }
+            times = {label: np.full(problems, np.inf) for label in planners}
+            for _ in range(rounds + 1):  # the first is set-up
+                for label, solver in solvers.items():
+                    solved = [cpu(lambda i=i, solver=solver: solver.one(i)) for i in range(problems)]
+                    times[label] = np.minimum(times[label], [seconds for seconds, _ in solved])
+                    found[label] = objectives(problem, mpc, np.concatenate([answer.u for _, answer in solved]))
+            best = np.minimum(np.min([*found.values()], axis=0), reference(problem, mpc))
+            for label, row in table.items():
+                row["times"] += list(times[label])
+                row["gaps"] += list(found[label] / best - 1)
+            q, Q = np.broadcast_to(problem.q, (problems, problem.n_x)), problem.Q
+            least = 0.5 * ((q @ np.linalg.pinv(Q)) * q).sum(1)  # makes the cost of a stage a sum of squares
+            for label, solver in solvers.items() if family in LOOPS else ():
+                loop = closed_loop(solver, problems, STEPS)
+                table[label]["steps"].append(loop["seconds"])
+                table[label]["costs"] += list(np.array(loop["costs"]) + STEPS * least)
+        first = np.sum(table["difflcs"]["costs"])
+        families[family] = {
+            label: {
+                "seconds": float(np.median(row["times"])),
+                "gap": float(np.mean(row["gaps"])),
+                "worst": float(np.max(row["gaps"])),
+            }
+            | (
+                {"step": float(np.mean(row["steps"])), "cost": float(np.sum(row["costs"]) / first)}
+                if row["steps"]
+                else {}
+            )
+            for label, row in table.items()
+        }
+        for label, row in families[family].items():
+            print(
+                f"{family:20s} {label:32s} " + "  ".join(f"{name} {value:.4g}" for name, value in row.items()),
+                flush=True,
+            )
+    return families

@@ -1,0 +1,36 @@
+"""The method mujoco-lcs: LCS-RL with the physics of a MuJoCo model, whose uncertain numbers are fitted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from difflcs._checks import describe
+from difflcs.errors import InvalidInputError
+from difflcs.rl.learning.trainer import Trainer
+from difflcs.rl.methods.base import Work
+from difflcs.rl.methods.contact_lcs import ContactMethod, known_physics
+
+
+@dataclass(frozen=True)
+class MujocoMethod(ContactMethod):
+    """LCS-RL with a MuJoCo model inside: masses, friction or drives are fitted to the MPC's own episodes, then PPO."""
+
+    name: ClassVar[str] = "mujoco-lcs"
+    summary: ClassVar[str] = "a MuJoCo model whose uncertain numbers are fitted, then PPO through the MPC"
+
+    def trainer(self, work: Work) -> Trainer:
+        """See `Method`.
+
+        Raises:
+            InvalidInputError: the task has no MuJoCo model that can be learned.
+        """
+        from difflcs.physics.mujoco import LearnableMujocoLCS  # MuJoCo need not be installed
+
+        system = known_physics(work.task).make_system()
+        if not isinstance(system, LearnableMujocoLCS):
+            raise InvalidInputError(
+                f"task: expected a PhysicsSpec that makes a LearnableMujocoLCS for {self.name}, got "
+                f"{describe(system)}; use contact-lcs for other physics"
+            )
+        return super().trainer(work)
