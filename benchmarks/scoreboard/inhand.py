@@ -155,6 +155,7 @@ class HandPolicy:
             model,
             data,
             motion="quasi-dynamic",
+            torsion=False,  # the settings were chosen without it
             contacts=[
                 ContactGroup(("obj", "palm"), s.palm),
                 *(ContactGroup([("obj", f"{f}_{link}") for link in LINKS], s.finger) for f in FINGERS),
