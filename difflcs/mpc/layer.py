@@ -28,6 +28,7 @@ from difflcs.mpc.setup import (
     check_cost,
     check_stage_bounds,
     check_system,
+    is_local,
 )
 from difflcs.mpc.solution import MPCSolution, Primal
 from difflcs.records import LCSParams, LCSSequence
@@ -65,11 +66,12 @@ class LCSMPCLayer(nn.Module):
             zero gradient; with a barrier it keeps a small distance and a gradient. The objective includes the barrier.
             Sensible weights are 1e-3 to 1e-1 of the objective; far smaller ones make the problem stiff.
         passes: how often a call solves, where the system of a module depends on the state: each pass after the first
-            plans with the module linearised along the actions of the pass before (`difflcs.sequence_along`), warm. The
+            plans with the module linearised along the actions of the pass before (`difflcs.sequence_along`), and with
+            a cost module that says `local = True`, such as `MujocoCost`, asked at the states of that plan, warm. The
             plan, its status and its gradient are those of the last pass, whose systems count as those of x0 do in a
             single one; they are not compared, as objectives of two systems do not say which plan is better. Two see
             what contacts become on the way; more converge where steps are small beside what they change, else they may
-            come and go. Matrices are solved once.
+            come and go. Matrices with a cost that is no such module are solved once.
 
     Raises:
         InvalidInputError and its kinds: an argument does not fit.
@@ -211,7 +213,8 @@ class LCSMPCLayer(nn.Module):
         if self.training and self.training_relaxation is not None:
             setup = setup._replace(relaxation=self.training_relaxation)
         call = Call(x0, goal, reference, guess, u_min, u_max, bounds, lcs, cost, constraints, context)
-        if not isinstance(self.lcs if lcs is None else lcs, LCSParams | LCSSequence):
+        plain = isinstance(self.lcs if lcs is None else lcs, LCSParams | LCSSequence)
+        if not plain or is_local(self.cost if cost is None else cost):
             for _ in range(self.passes - 1):
                 with torch.no_grad():
                     x, u, lam, _, mu, *_ = self._repeat.solve_call(setup, call)[1]

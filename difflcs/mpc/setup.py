@@ -98,7 +98,7 @@ class Call(NamedTuple):
     """Arguments of a call of a layer; the names are those of `LCSMPCLayer.forward`.
 
     Attributes:
-        along: the plan along which a module returns its system; None: at x0.
+        along: the plan along which modules return system and cost; None: at x0.
     """
 
     x0: Tensor
@@ -115,6 +115,44 @@ class Call(NamedTuple):
     along: Primal | None = None
 
 
+def is_local(cost: Cost) -> bool:
+    """Tell whether a cost is a module to ask at each state of a plan, see `CostModule`."""
+    return not isinstance(cost, PLAIN_COSTS) and getattr(cost, "local", False) is True
+
+
+def cost_along(
+    cost: CostModule, along: Primal, x0: Tensor, goal: Tensor | None, context: Tensor | None
+) -> QuadraticCost | CostSequence:
+    """Ask a cost module at each state of a plan: stages have the cost of their states, the end that of the last.
+
+    Raises:
+        DTypeError: the module returns another cost than a `QuadraticCost`.
+    """
+    horizon = along.u.shape[-2]
+    x = along.x.detach()
+    x = torch.cat([x0.expand(x[..., 0, :].shape).unsqueeze(-2), x[..., 1:, :]], -2)
+    found = cost_at(cost, x, *(None if value is None else value.unsqueeze(-2) for value in (goal, context)))
+    if not isinstance(found, QuadraticCost):
+        raise DTypeError(
+            f"cost: expected QuadraticCost from {type(cost).__name__}.at along a plan, got {describe(found)}; return "
+            f"one, or set its attribute local = False"
+        )
+    fields, by_stage = {}, []
+    for name, value in found.tensors().items():
+        dim = value.ndim - 1 - RANKS.get(name, 0)  # of the states
+        if dim < 0 or value.shape[dim] == 1:
+            fields[name] = value if dim < 0 else value.squeeze(dim)
+        elif name in ("Q_final", "q_final", "constant"):
+            fields[name] = value.select(dim, horizon)
+        else:
+            fields[name] = value.narrow(dim, 0, horizon)
+            by_stage.append(name)
+    if (stage := fields.pop("constant_stage", None)) is not None:
+        fields["constant"] = fields["constant"] + (stage.sum(-1) if "constant_stage" in by_stage else horizon * stage)
+    by_stage = [name for name in by_stage if name != "constant_stage"]
+    return CostSequence(**fields, by_stage=by_stage, check=False) if by_stage else QuadraticCost(**fields, check=False)
+
+
 def gather(setup: Setup, call: Call) -> Inputs:
     """Gather the tensors that a call plans with.
 
@@ -127,7 +165,7 @@ def gather(setup: Setup, call: Call) -> Inputs:
     cost = setup.cost if call.cost is None else check_cost(call.cost)
     check_context(call.context, system, cost)
     inputs.add_system(system, call.x0, call.context, call.along)
-    inputs.add_cost(cost, call.x0, call.goal, call.reference, call.context)
+    inputs.add_cost(cost, call.x0, call.goal, call.reference, call.context, call.along)
     bounds = setup.bounds
     if call.bounds is not None:
         bounds = check_stage_bounds(call.bounds, u_min=call.u_min, u_max=call.u_max)
@@ -261,7 +299,13 @@ class Inputs:
         self.tensors.update(system.tensors())
 
     def add_cost(
-        self, cost: Cost, x0: Tensor, goal: Tensor | None, reference: Tensor | None, context: Tensor | None
+        self,
+        cost: Cost,
+        x0: Tensor,
+        goal: Tensor | None,
+        reference: Tensor | None,
+        context: Tensor | None,
+        along: Primal | None = None,
     ) -> None:
         """Add the weights, at a goal or along a reference if the cost has one; a module is asked for them."""
         if not isinstance(cost, PLAIN_COSTS):
@@ -270,7 +314,10 @@ class Inputs:
                     f"reference: expected a goal with {type(cost).__name__}, got a reference; return a CostSequence "
                     f"from its method at, or use a GoalCost"
                 )
-            cost, goal = cost_at(cost, x0, goal, context), None
+            if along is None or not is_local(cost):
+                cost, goal = cost_at(cost, x0, goal, context), None
+            else:
+                cost, goal = cost_along(cost, along, x0, goal, context), None
         self.check_sizes("cost", n_x=cost.n_x, n_u=cost.n_u)
         if isinstance(cost, GoalCost):
             if goal is None and reference is None:

@@ -9,7 +9,7 @@ from difflcs.physics import ContactLCS, PlanarPushing, PositionDrive, box
 
 mujoco = pytest.importorskip("mujoco")
 
-from difflcs.physics.mujoco import MujocoLCS  # noqa: E402
+from difflcs.physics.mujoco import Effort, MujocoCost, MujocoLCS, Position  # noqa: E402
 
 DOOR = """<mujoco><option timestep=".002" integrator="implicitfast"/><worldbody>
   <body><joint name="angle" type="hinge" axis="0 0 1" damping=".5"/>
@@ -21,6 +21,11 @@ DOOR = """<mujoco><option timestep=".002" integrator="implicitfast"/><worldbody>
 PENDULUM = """<mujoco><option timestep=".005" integrator="RK4"/><worldbody><body>
   <joint name="q" axis="0 1 0" damping=".02"/><geom pos="0 0 -.5" size=".05" mass=".7"/></body></worldbody>
   <actuator><motor joint="q"/></actuator></mujoco>"""
+
+ARM = """<mujoco><worldbody><body><joint name="a" axis="0 1 0"/><geom type="capsule" size=".02" fromto="0 0 0 .3 0 0"/>
+  <body pos=".3 0 0"><joint name="b" axis="0 1 0"/><geom type="capsule" size=".02" fromto="0 0 0 .3 0 0"/>
+    <site name="tip" pos=".3 0 0"/></body></body></worldbody>
+  <actuator><position joint="a" kp="100"/><position joint="b" kp="100"/></actuator></mujoco>"""
 
 
 def vector(*values):
@@ -84,6 +89,26 @@ def test_a_pendulum_is_turned_upright_in_several_passes(passes, wrong):
     torch.testing.assert_close(  # the plan's actions are the nominal controls of dynamic motion
         along.stage(0).d, module.params(plan.x[0], module.control(plan.x[0], plan.u[0])).d
     )
+
+
+@pytest.mark.parametrize("constant", [False, True])
+def test_an_arm_reaches_as_far_as_a_cost_along_the_plan_says(constant):
+    """Where the tip is depends on the joints through sines, of which one pass knows the tangents at the beginning."""
+    module, x, goal = MujocoLCS(model := mujoco.MjModel.from_xml_string(ARM)), vector(0.1, 0.2), vector(0.2, 0.0, -0.35)
+    cost, errors = MujocoCost(module, [Position("tip", weight=0.1, weight_final=100.0), Effort(0.1)]), []
+    for passes in (1, 8):
+        mpc = LCSMPCLayer(module.params(x) if constant else module, cost, 6, -0.4, 0.4, passes=passes)
+        plan = mpc(x.expand(2, 2), torch.stack([goal, goal]))
+        data, away = mujoco.MjData(model), []
+        for state in plan.x[1]:
+            data.qpos[:] = state.numpy()
+            mujoco.mj_forward(model, data)
+            away.append((vector(*data.site("tip").xpos) - goal).square().sum())
+        errors.append(float(away[-1].sqrt()))
+    assert errors[0] > 0.2  # m
+    assert errors[1] < 0.002
+    squares = 0.1 * (sum(away[:-1]) + plan.u[1].square().sum()) + 100 * away[-1]  # the plan's cost is that of the arm
+    torch.testing.assert_close(plan.objective[1], squares, rtol=1e-3, atol=1e-6)
 
 
 def test_gradients_of_several_passes_are_those_of_the_last():

@@ -144,10 +144,13 @@ class MujocoCost(TensorFields):
         n_goal: size of the goal of a call. In the order of the terms, it has 3 numbers for each `Position` without a
             goal of its own, 4 for each `Orientation`, one for each joint of a `Posture`.
         constant: whether the cost is the same at all states.
+        local: True; with several passes it is linearised along the plan, see `CostModule`.
 
     Raises:
         InvalidInputError and its kinds: a term does not fit the model.
     """
+
+    local = True
 
     def __init__(self, module: MujocoLCS, terms: Sequence[Term]):
         super().__init__()
