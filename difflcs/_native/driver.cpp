@@ -381,9 +381,10 @@ void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
     out.iterations[e] += from.iterations[i];
     const bool done = solved(from.status[i]);
     if (from.status[i] == kUnreached || (only_solved && !done)) return;
-    const bool as_good = out.status[e] == kUnreached || done > solved(out.status[e]);
-    const bool less = done == solved(out.status[e]) && from.objective[i] < out.objective[e];
-    if (as_good || less) copy_plan(n, from, i, out, e);
+    const bool better = out.status[e] == kUnreached || done > solved(out.status[e]);
+    // Of those not solved the first says why, unless another is a better plan of the same kind.
+    const bool alike = done ? solved(out.status[e]) : from.status[i] == out.status[e];
+    if (better || (alike && from.objective[i] < out.objective[e])) copy_plan(n, from, i, out, e);
   };
   const auto solve = [&](auto wanted) {
     int64_t kept = 0;
