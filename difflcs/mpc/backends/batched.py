@@ -159,7 +159,7 @@ class BatchedBackend(Backend):
                 self._make_finite(problem, result.primal, result.status)
             if problem.n_c:
                 self._confirm_infeasible(problem, result.primal, result.status, started)
-            if problem.n_c == 0:  # also what ran out of time has the cost of its plan
+            else:  # also what ran out of time has the cost of its plan
                 known = (outputs["status"] == Status.CONVERGED) | (outputs["status"] == Status.MAX_ITER)
                 vars(result)["costs_known"] = bool((known & (outputs["objective"] < _HUGE)).all())
             np.minimum(outputs["residual"], _HUGE, out=outputs["residual"])

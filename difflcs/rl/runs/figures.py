@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -113,11 +112,11 @@ def draw_policy(policy: Policy, task: TaskSpec, folder: Path, episodes: int = 20
     finally:
         envs.close()
     data = Transitions.from_episodes(played["state"], played["action"])
-    context = [played[CONTEXT].repeat_interleave(task.episode_steps, 0)] if CONTEXT in played.keys() else [None]
-    _write(fit_report(policy.lcs, *data, context=context[0]).plot(), folder / "fit.png")
+    context = played[CONTEXT].repeat_interleave(task.episode_steps, 0) if CONTEXT in played.keys() else None
+    _write(fit_report(policy.lcs, *data, context=context).plot(), folder / "fit.png")
 
     first = slice(task.episode_steps)
-    x, u, at = data.x[first], data.u[first], None if context[0] is None else context[0][first]
+    x, u, at = data.x[first], data.u[first], None if context is None else context[first]
     with torch.no_grad():
         system = policy.lcs if isinstance(policy.lcs, LCSParams) else system_at(policy.lcs, x, at)
         assert isinstance(system, LCSParams)  # or there was no report
@@ -130,10 +129,10 @@ def draw_policy(policy: Policy, task: TaskSpec, folder: Path, episodes: int = 20
 
 
 def _write(figure: Figure, path: Path) -> None:
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png")
+    from difflcs._figure import to_png
+
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, buffer.getvalue())
+    write_atomically(path, to_png(figure))
 
 
 def _evaluation(first: str, *names: str) -> list[str]:
