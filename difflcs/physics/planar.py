@@ -69,10 +69,9 @@ class Drive(ABC):
         The last instant is its end. By default the discs go evenly.
         """
         step = self.step()
-        part = (torch.arange(1, _INSTANTS + 1, dtype=step.b.dtype) / _INSTANTS).reshape(-1, *[1] * step.A.ndim)
-        none = torch.eye(step.A.shape[-1], dtype=step.A.dtype)
-        part_b = part.squeeze(-1)
-        return DriveStep(none + part * (step.A - none), part_b * step.b, part_b * step.response)
+        rest = DriveStep(torch.eye(self.order, dtype=step.A.dtype), step.b.new_zeros(()), step.b.new_zeros(()))
+        parts = [i / _INSTANTS for i in range(1, _INSTANTS + 1)]
+        return DriveStep(*(torch.stack([a + p * (b - a) for p in parts]) for a, b in zip(rest, step, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
