@@ -20,7 +20,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from difflcs import GoalCost, LCSMPCLayer
+from difflcs import Animation, GoalCost, LCSMPCLayer
 from difflcs.errors import MissingDependencyError
 from difflcs.physics import PDDrive, PlanarPushing, Polygon, Union, box
 from difflcs.physics.complementarity import Contacts
@@ -264,9 +264,7 @@ def main(o: Options) -> None:
         frames += [picture(env, policy, verdict)] * 6
         print(f"seed {seed}: {verdict}")
     env.close()
-    palette = frames[0].quantize(64, dither=0)
-    small = [frame.quantize(palette=palette, dither=0) for frame in frames]
-    small[0].save(o.out, save_all=True, append_images=small[1:], duration=100, loop=0, optimize=True)
+    Animation(frames, fps=10).save(o.out)
     print(f"written: {o.out}")
 
 
