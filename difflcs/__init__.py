@@ -2,6 +2,7 @@
 
 import logging
 
+from difflcs.animation import Animation
 from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds
 from difflcs.cost import CostModule, CostSequence, GoalCost, QuadraticCost
 from difflcs.errors import BackendNotFoundError, DiffLCSError, SolveError
@@ -21,6 +22,7 @@ logging.getLogger(__name__).addHandler(logging.NullHandler())  # silent unless a
 __version__ = "0.2.0"
 
 __all__ = [
+    "Animation",
     "BackendNotFoundError",
     "ConstraintSequence",
     "CostModule",

@@ -30,9 +30,12 @@ struct Certificate {
   Vec *row, *row_terms, *row_missed;  // values of the constraints; of each the largest over the stages
   Mask* rows;
 
-  explicit Certificate(const MpcBatch& b) : batch(b), n(b) {}
+  const bool shared;  // the matrices are loaded once, for all problems
 
-  void layout(Arena& arena) {
+  explicit Certificate(const MpcBatch& b) : batch(b), n(b), shared(load_once<T>(b)) {}
+
+  // `kept`: the memory has the shared matrices already.
+  void layout(Arena& arena, bool kept) {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nc = n.c(), h = n.h;
     for (int i = 0; i < kInputs; i++) {
       const Field& field = kMpcFields[i];
@@ -53,8 +56,7 @@ struct Certificate {
     arena.take(largest_action, nu);
     arena.take(moved, nc > 0 ? (h + 1) * nx : 0);
     arena.take_all(nc, row_terms, row_missed);
-    if constexpr (kShared<T>)
-      if (arena.memory) load_matrices(0, 0);
+    if (arena.memory && shared && !kept) load_matrices(0, 0);
   }
 
   template <class Entry>
@@ -170,7 +172,7 @@ struct Certificate {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nc = n.c(), h = n.h;
     for (int l = 0; l < kLanes; l++) {
       const int64_t e = elements[l < count ? l : 0];
-      if constexpr (!kShared<T>) load_matrices(e, l);
+      if (!shared) load_matrices(e, l);
       for (int i = 0; i < kInputs; i++)
         if (kMpcFields[i].columns == Size::one) load(vector[i], i, e, l);
       load(x, o.x + e * (h + 1) * nx, (h + 1) * nx, l);

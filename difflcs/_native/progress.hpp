@@ -82,7 +82,7 @@ struct Progress {
   void layout(Arena& arena) {
     at.layout(arena, n);
     arena.take(gap, n.l());
-    certificate.layout(arena);
+    certificate.layout(arena, problem.kept);
   }
 
   // After the first step of the lanes that were released: the scale of their problems says where the homotopy starts.

@@ -123,7 +123,7 @@ class Riccati {
     }
     terminal(at.x[n.h], kAdjoint ? upstream.x[n.h] : nullptr);
     for (int64_t k = n.h - 1; k >= 0; k--) {
-      const StageData<T, S> data = problem.stage(k);
+      const StageData<T, S>& data = problem.stage(k);
       const Value<S> next = value(k + 1);
       const Stage<S> stage = linearisation.at(k, at.lam[k], at.s[k], next.p, newton.regularisation);
       constraints(k, data, at.x[k], at.u[k]);

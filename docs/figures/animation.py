@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
-from difflcs import LCSModel
+from difflcs import Animation, LCSModel
 from difflcs.rl.tasks import get_task
 
 PATH = Path(__file__).parent / "push.gif"
@@ -35,11 +35,7 @@ def main() -> None:
             ImageDraw.Draw(frame).text((12, 8), task.say(info), fill=(20, 20, 30), font_size=28)
             frames.append(frame)
         frames += [frames[-1]] * 5
-    # Of several frames: the colours of the first alone would lack those of the cube on its goal.
-    sample = Image.fromarray(np.concatenate([np.asarray(frame) for frame in frames[:: len(frames) // 8]]))
-    palette = sample.quantize(256, dither=Image.Dither.NONE)
-    small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    small[0].save(PATH, save_all=True, append_images=small[1:], duration=FRAME_MILLISECONDS, loop=0, optimize=True)
+    Animation(frames, 1000 / FRAME_MILLISECONDS, colors=256).save(PATH)
     print(f"{PATH.name}: {PATH.stat().st_size / 1000:.0f} kB, {len(frames)} frames")
 
 

@@ -87,6 +87,8 @@ def test_is_committed_with_its_outputs(path: Path):
     outputs = [output for cell in code(notebook) for output in cell.outputs]
     assert any("image/png" in output.get("data", {}) for output in outputs)
     assert not [output for output in outputs if output.output_type == "error" or output.get("name") == "stderr"]
+    # A GIF vanishes where the notebook becomes a page.
+    assert not [output for output in outputs if "image/gif" in output.get("data", {})]
     found = PRIVATE.search(said(notebook)) or PRIVATE.search("\n".join(cell.source for cell in notebook.cells))
     assert found is None, found
 
