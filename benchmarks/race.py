@@ -71,6 +71,9 @@ CONTACT = (
         "casadi_nlp",
         {"name": "fatrop", "start": 0.1, "options": {"tol": 1e-5, "mu_init": 1e-2, "max_iter": 1000}},
     ),
+    Entry("Uno, interior point", "casadi_nlp", {"name": "uno", "start": 0.1, "options": {"preset": "ipopt"}}),
+    Entry("Uno, SQP", "casadi_nlp", {"name": "uno", "start": 0.1, "options": {"preset": "filtersqp"}}),
+    Entry("SLEQP", "casadi_nlp", {"name": "sleqp", "start": 0.1}),
 )
 LINEAR = (
     Entry("difflcs `batched`", "layer"),
