@@ -77,6 +77,7 @@ CONTACT = (
 )
 LINEAR = (
     Entry("difflcs `batched`", "layer"),
+    Entry("difflcs controller, cold", "layer", {"backend": "controller"}),
     Entry("DAQP", "daqp_qp", {}, "rivals", ("daqp",)),
     Entry("acados (HPIPM)", "acados_ocp", {}, "acados", ("comma-deps-acados", "numpy")),
     Entry("Clarabel", "clarabel_qp", {}, "rivals", ("clarabel", "scipy")),
