@@ -57,7 +57,7 @@ class Solver(Rival):
             over = np.maximum(sides @ v + limits + z / bound, 0.0)
             slope = H @ v + f + 2 * weight * pairs.T @ gap + 2 * bound * sides.T @ over
             value = 0.5 * v @ H @ v + f @ v + weight * gap @ gap + bound * over @ over
-            return value, slope, over
+            return float(value), slope, over
 
         for _ in range(self.outer):
             known, factor = np.inf, (None, None)
