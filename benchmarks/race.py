@@ -71,9 +71,13 @@ CONTACT = (
         "casadi_nlp",
         {"name": "fatrop", "start": 0.1, "options": {"tol": 1e-5, "mu_init": 1e-2, "max_iter": 1000}},
     ),
+    Entry("Uno, interior point", "casadi_nlp", {"name": "uno", "start": 0.1, "options": {"preset": "ipopt"}}),
+    Entry("Uno, SQP", "casadi_nlp", {"name": "uno", "start": 0.1, "options": {"preset": "filtersqp"}}),
+    Entry("SLEQP", "casadi_nlp", {"name": "sleqp", "start": 0.1}),
 )
 LINEAR = (
     Entry("difflcs `batched`", "layer"),
+    Entry("difflcs controller, cold", "layer", {"backend": "controller"}),
     Entry("DAQP", "daqp_qp", {}, "rivals", ("daqp",)),
     Entry("acados (HPIPM)", "acados_ocp", {}, "acados", ("comma-deps-acados", "numpy")),
     Entry("Clarabel", "clarabel_qp", {}, "rivals", ("clarabel", "scipy")),

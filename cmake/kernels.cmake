@@ -3,6 +3,8 @@
 set(DIFFLCS_NATIVE ${CMAKE_CURRENT_LIST_DIR}/../difflcs/_native)
 set(DIFFLCS_ISAS "all" CACHE STRING
     "instruction sets to compile beside the baseline: all, none, or a list of avx2 and avx512; here: the widest of this CPU alone")
+set(DIFFLCS_SIZES "" CACHE STRING
+    "n_x,n_u,n_lam of each size of problem that gets code of its own beside the paper's, for example 4,1,2 or 4,1,2,13,3,8")
 
 include(CheckCXXSourceRuns)
 
@@ -73,6 +75,9 @@ function(difflcs_add_instruction_set target isa lanes)
   endif()
   set_target_properties(${name} PROPERTIES POSITION_INDEPENDENT_CODE ON)
   target_compile_definitions(${name} PRIVATE DIFFLCS_ISA=${isa} DIFFLCS_LANES=${lanes})
+  if(DIFFLCS_SIZES)
+    target_compile_definitions(${name} PRIVATE DIFFLCS_SIZES=${DIFFLCS_SIZES})
+  endif()
   target_compile_options(${name} PRIVATE -fno-math-errno -Wno-psabi ${ARGN})
   target_sources(${target} PRIVATE $<TARGET_OBJECTS:${name}>)
   set_property(TARGET ${target} APPEND PROPERTY DIFFLCS_OBJECTS $<TARGET_OBJECTS:${name}>)

@@ -135,12 +135,12 @@ class PushTPolicy:
     def __init__(self, system: PlanarPushing | None = None, delay: int = 0):
         self.system, self.delay = Rigid.of(tee_pushing() if system is None else system), delay
         shape = self.system.shape
-        workspace = Workspace((0.0, 0.0), (SIDE, SIDE), step=0.6)
+        workspace = Workspace((0.0, 0.0), (SIDE, SIDE), step=1.2)
         cost = GoalCost.reach(7, 2, goal_weight=(1.0, 1.0, 0.3), goal_weight_final=(4.0, 4.0, 1.2), input_weight=0.01)
         self.sampling = SamplingPolicy(
-            LCSMPCLayer(self.system, cost, 10, relaxation=1e-5, on_failure="mask"),
-            DiscPlaces(shape, RADIUS, gap=0.02, reach=0.12, workspace=workspace, margin=0.2),
-            PlanarTravel(shape, RADIUS, step=1.2, clearance=0.08, tolerance=0.08),
+            LCSMPCLayer(self.system, cost, 6, relaxation=1e-5, on_failure="mask"),
+            DiscPlaces(shape, RADIUS, 32, gap=0.02, reach=0.2, workspace=workspace, margin=0.2),
+            PlanarTravel(shape, RADIUS, SIDE, drive=DRIVE, clearance=0.08, tolerance=0.12, workspace=workspace),
             SamplingSettings(keep=0.6, smallest_gain=0.02, switch_price=0.02, travel_price=0.04),
             bounds=workspace.bounds,
             angles=(2,),

@@ -1,4 +1,4 @@
-"""CasADi with IPOPT or FATROP, as one would write it by hand. The backend `ipopt` of difflcs is in `layer.py`."""
+"""CasADi with one of its solvers, as one would write it by hand. The backend `ipopt` of difflcs is in `layer.py`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,14 @@ from rivals.problem import Answer, Problem, Rival
 
 
 def version() -> str:
-    """Return the version of CasADi, which ships both."""
+    """Return the version of CasADi, which ships them."""
     return f"casadi {casadi.__version__}"
+
+
+_ALWAYS = {
+    "ipopt": {"print_level": 0, "max_iter": 500, "sb": "yes"},
+    "fatrop": {"print_level": 0, "max_iter": 500},
+}
 
 
 class Solver(Rival):
@@ -19,7 +25,7 @@ class Solver(Rival):
 
     Args:
         problem: what is to be solved.
-        name: "ipopt" or "fatrop".
+        name: "ipopt", "fatrop", "uno" or "sleqp".
         start: λ and s to start from.
         options: the solver's.
     """
@@ -31,7 +37,7 @@ class Solver(Rival):
         settings = {"print_time": False, "error_on_fail": False, "calc_lam_p": False}
         if self.staged:
             settings |= {"structure_detection": "auto", "equality": p.equality, "expand": True}
-        own = {"print_level": 0, "max_iter": 500} | ({} if self.staged else {"sb": "yes"}) | (options or {})
+        own = _ALWAYS.get(name, {}) | (options or {})
         settings |= {f"{name}.{option}": value for option, value in own.items()}
         self.solver = casadi.nlpsol("mpc", name, {"x": p.z, "p": p.p, "f": p.f, "g": p.g}, settings)
 
@@ -41,6 +47,9 @@ class Solver(Rival):
         start, parameters = p.begin(self.problem, i), p.parameters(self.problem, i)
         if self.staged:
             start[: self.problem.n_x] = self.problem.x0[i]
-        solution = self.solver(x0=start, p=parameters, lbx=p.low, ubx=p.high, lbg=p.least, ubg=p.most)
+        try:
+            solution = self.solver(x0=start, p=parameters, lbx=p.low, ubx=p.high, lbg=p.least, ubg=p.most)
+        except RuntimeError:  # SLEQP stops in the middle of some problems
+            return Answer(start[p.actions][None], np.array([False]))
         z = np.asarray(solution["x"]).ravel()
         return Answer(z[p.actions][None], np.array([bool(self.solver.stats()["success"])]))

@@ -186,7 +186,7 @@ class Adjoint {
     const int64_t nx = n.x(), nl = n.l(), nw = n.w();
     const Stage<S> stage = riccati.stage(k);
     const Value<S> next = riccati.value(k + 1);
-    const StageData<T, S> data = problem.stage(k);
+    const StageData<T, S>& data = problem.stage(k);
     const auto C = data.C;
     const auto F = data.F;
     const Vec *y = stage.y, *lam = at.lam[k];

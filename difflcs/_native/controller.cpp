@@ -86,6 +86,7 @@ Controller::Controller(const void* bytes, size_t size)
   guess_lam_ = Numbers(h * nl);
   guess_mu_ = Numbers((h + 1) * nc);
   batch_.count = 1;
+  batch_.version = 1;
   batch_.n_x = nx;
   batch_.n_u = nu;
   batch_.n_lam = nl;
@@ -142,7 +143,9 @@ void Controller::aim(const double* targets, bool follow) {
   const int64_t stages = follow ? h : 1;
   for (int64_t k = 0; k < stages; k++) multiply(data_.goal_to_q, targets + k * ng, nx, ng, q_.get() + k * nx);
   multiply(data_.goal_to_q_final, last, nx, ng, q_final_.get());
-  batch_.step[kq] = follow && h > 1 ? nx : 0;
+  const int64_t step = follow && h > 1 ? nx : 0;
+  if (step != batch_.step[kq]) batch_.version++;
+  batch_.step[kq] = step;
   double tracked = 0;
   for (int64_t k = 0; k < stages; k++) tracked += quadratic(data_.goal_stage, targets + k * ng, ng);
   tracked *= double(follow ? 1 : h);
@@ -238,6 +241,7 @@ void Controller::set_fallback(Fallback kind, const double* action) {
 void Controller::set_inputs(Input first, int count, const double* const* values) {
   for (int i = 0; i < count; i++) std::copy_n(values[i], data_.field[first + i].count(), data_.field[first + i].get());
   set_flags(batch_, data_.field[kS].count(), data_.field[ku_min].count(), data_.field[ku_max].count());
+  batch_.version++;
 }
 
 }  // namespace difflcs

@@ -79,7 +79,7 @@ class Controller {
   const Kernels& kernels_;
   ControllerData data_;
   MpcDriver driver_;
-  MpcBatch batch_{};
+  MpcBatch batch_{};  // its version is that of the matrices and of the fields given by stage
   Numbers x0_, q_, q_final_, workspace_, fallback_action_;
   Trace found_;
   Numbers next_u_, guess_u_, guess_lam_, guess_mu_;

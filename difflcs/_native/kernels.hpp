@@ -49,6 +49,9 @@ struct MpcBatch {
   bool crossed;    // S is not zero
   bool unbounded;  // some bound of an action is infinite
   bool pivot;      // eliminate with row exchanges: slower, for F whose skew part dominates
+  // A workspace keeps what it has made of the shared matrices for other calls with the same number: another one is due
+  // where a matrix changes, or which fields are given by stage. 0: it keeps nothing.
+  int64_t version;
 
   // Field `which` of a problem at stage k.
   const double* at(int which, int64_t problem, int64_t k = 0) const {

@@ -74,10 +74,10 @@ class Linearisation {
   Stage<S> at(int64_t k, const Vec* lam, const Vec* s, const Vec* p, Vec damping) {
     const int64_t nx = n.x(), nl = n.l(), nw = n.w();
     const Stage<S> stage = this->stage(k);
-    const StageData<T, S> data = problem.stage(k);
+    const StageData<T, S>& data = problem.stage(k);
     const auto F = data.F;
     const auto C = data.C;
-    const LowRank low_rank = problem.low_rank[k];
+    const LowRank& low_rank = problem.low_rank[k];
     const bool short_cut = kLanes == 1 && kL == 0 && !kept && low_rank;
     for (int64_t i = 0; i < nl; i++) {
       stage.size[i] = 1.0 / (lam[i] + s[i]);

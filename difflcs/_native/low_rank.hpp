@@ -27,21 +27,21 @@ class LowRank {
   int64_t n, most;  // W has room for so many columns; none where this is not looked for
   Stages<Matrix<Vec, 0, 0>> columns, rows;
   Steps<Vec> rests;
-  Steps<int64_t> ranks;
+  Steps<LowRank> systems;  // each of them
   // Of the system in use: its numbers, 1 / (a + b rest), b, W scaled by b / (a + b rest), I + W^T that as factors.
   Matrix<Vec, 0, 0> W, W_t, scaled;
   Vec *rest, *inverse, *b, *capacitance, *left, *right;
   int64_t rank = 0;
 
  public:
-  void layout(Arena& arena, int64_t systems, int64_t forces, bool wanted) {
+  void layout(Arena& arena, int64_t count, int64_t forces, bool wanted) {
     n = forces;
     most = kLanes == 1 && wanted && n >= kLowRankFrom ? n / 2 / kRows * kRows : 0;
     if (most == 0) return;
-    arena.take(columns, systems, n, most);
-    arena.take(rows, systems, most, n);
-    arena.take(rests, systems, n);
-    arena.take(ranks, systems, 1);
+    arena.take(columns, count, n, most);
+    arena.take(rows, count, most, n);
+    arena.take(rests, count, n);
+    arena.take(systems, count, 1);
     arena.take(scaled, n, most);
     arena.take(capacitance, most * most);
     arena.take_all(n, inverse, b);
@@ -49,11 +49,7 @@ class LowRank {
   }
 
   // That of stage k.
-  LowRank operator[](int64_t k) const {
-    LowRank one = *this;
-    if (most > 0) one.take(k, ranks[k][0]);
-    return one;
-  }
+  const LowRank& operator[](int64_t k) const { return most > 0 ? *systems[k] : *this; }
 
   // Whether F is of this kind.
   explicit operator bool() const { return rank > 0; }
@@ -62,9 +58,10 @@ class LowRank {
   template <class Square, class Wide>
   void find(int64_t k, const Square& F, const Wide& C) const {
     if (most == 0) return;
-    LowRank one = *this;
+    LowRank& one = *systems[k];
+    one = *this;
     one.take(k, most);
-    ranks[k][0] = one.describe(F, C) ? one.rank : 0;
+    one.take(k, one.describe(F, C) ? one.rank : 0);
   }
 
   // Row i of the matrix has a_i and b_i.

@@ -75,9 +75,11 @@ struct StageData {
   }
 
   void next_state(const Vec* x, const Vec* u, const Vec* lam, Vec* out) const {
-    const auto A = this->A();
-    const auto B = this->B();
-    for (int64_t i = 0; i < A.rows; i++) out[i] = d[i] + A.row(i) * x + B.row(i) * u + C.row(i) * lam;
+    const auto store = [&](int64_t i, Vec sum) { out[i] = sum; };
+    const auto so_far = [&](int64_t i) { return out[i]; };
+    multiply(A(), x, [&](int64_t i) { return d[i]; }, store);
+    multiply(B(), u, so_far, store);
+    multiply(C, lam, so_far, store);
   }
 
   // Row i of G_x x + G_u u - g; the last stage has no actions.
@@ -119,6 +121,8 @@ struct ProblemData {
   const MpcBatch& batch;
   const AnySizes n;
   const bool caller_units;                               // of the cost: the adjoint differentiates it as it is
+  const bool shared;                                     // the matrices are loaded once, for all problems
+  bool kept = false;                                     // the memory has them already
   Stages<Matrix<T, 0, 0>> AB, C, DE, F, Q, R, cross, G;  // [A B], [D E], S, [G_x G_u]
   Matrix<T, 0, 0> Q_final;
   // lam = scale * lam', s = s' / scale, chosen so that F' has a unit diagonal: contacts in any units converge alike. C,
@@ -142,9 +146,10 @@ struct ProblemData {
   void (ProblemData::*load_rows)(int64_t element, int lane);  // `load_sized_rows` with the sizes that are known
 
   ProblemData(const MpcBatch& b, bool caller_units)
-      : batch(b), n(b), caller_units(caller_units), mu(all(b.barrier)), rho(all(1)) {}
+      : batch(b), n(b), caller_units(caller_units), shared(load_once<T>(b)), mu(all(b.barrier)), rho(all(1)) {}
 
   void layout(Arena& arena) {
+    int64_t* version = arena.take<int64_t>(1);
     const int64_t nx = n.x(), nu = n.u(), nl = n.l(), nw = n.w(), nc = n.c(), h = n.h;
     const int64_t systems = by_stage(kA, kB, kC, kD, kE, kF) ? h : 1, costs = by_stage(kQ, kR, kS) ? h : 1;
     const int64_t bounds = by_stage(ku_min, ku_max) ? h : 1;
@@ -175,8 +180,11 @@ struct ProblemData {
     arena.take_all(nx, q_final, x0);
     arena.take(multiplier, h + 1, nc);
     arena.take(reach, nc);
-    if constexpr (kShared<T>)
-      if (arena.memory) load_matrices(0, 0);
+    if (!arena.memory) return;
+    const int64_t mine = shared && !caller_units && !batch.pivot ? batch.version * 16 + kLanes : 0;
+    kept = batch.version > 0 && mine > 0 && *version == mine;
+    *version = mine;
+    if (shared && !kept) load_matrices(0, 0);
   }
 
   template <class S = AnySizes>
@@ -194,6 +202,9 @@ struct ProblemData {
     data.price = price[n.h];
     return data;
   }
+
+  // Whether the optimum is that of a quadratic program with bounds on the actions alone.
+  bool linear() const { return n.l() == 0 && n.c() == 0 && batch.barrier == 0; }
 
   template <class... Inputs>
   bool by_stage(Inputs... which) const {
@@ -290,7 +301,7 @@ struct ProblemData {
 
   // Puts problem `e` into a lane.
   void load(int64_t e, int lane) {
-    if constexpr (!kShared<T>) load_matrices(e, lane);
+    if (!shared) load_matrices(e, lane);
     auto vector = [&](const Steps<Vec>& to, Input which, double unit = 1.0) {
       for (int64_t k = 0; k < to.count; k++) {
         const double* from = input(which, e, k);
@@ -410,7 +421,8 @@ struct ProblemData {
   Vec plain_cost(const Trajectory<S>& at) const {
     auto quadratic = [](const auto& W, const Vec* linear, const Vec* z) {
       Vec total = all(0);
-      for (int64_t i = 0; i < W.rows; i++) total += z[i] * (0.5 * (all(0) + W.row(i) * z) + linear[i]);
+      const auto add = [&](int64_t i, Vec sum) { total += z[i] * (0.5 * sum + linear[i]); };
+      multiply(W, z, [](int64_t) { return all(0); }, add);
       return total;
     };
     Vec total = quadratic(Matrix<T, S::kX, S::kX>(Q_final), q_final, at.x[n.h]);
@@ -431,12 +443,19 @@ struct ProblemData {
 template <class T, class S>
 struct Problem : ProblemData<T> {
   const S n;
+  StageData<T, S>* stages;
 
   Problem(const MpcBatch& b, bool caller_units) : ProblemData<T>(b, caller_units), n(b) {
     this->load_rows = &ProblemData<T>::template load_sized_rows<S>;
   }
 
-  StageData<T, S> stage(int64_t k) const { return ProblemData<T>::template stage<S>(k); }
+  void layout(Arena& arena) {
+    ProblemData<T>::layout(arena);
+    arena.take(stages, n.h);
+    for (int64_t k = 0; k < n.h && arena.memory; k++) stages[k] = ProblemData<T>::template stage<S>(k);
+  }
+
+  const StageData<T, S>& stage(int64_t k) const { return stages[k]; }
   StageData<T, S> last() const { return ProblemData<T>::template last<S>(); }
   Matrix<T, 0, S::kW> G(int64_t k) const { return ProblemData<T>::G[k]; }
   Matrix<T, S::kX, S::kX> Q_final() const { return ProblemData<T>::Q_final; }

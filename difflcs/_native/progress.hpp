@@ -82,7 +82,7 @@ struct Progress {
   void layout(Arena& arena) {
     at.layout(arena, n);
     arena.take(gap, n.l());
-    certificate.layout(arena);
+    certificate.layout(arena, problem.kept);
   }
 
   // After the first step of the lanes that were released: the scale of their problems says where the homotopy starts.
@@ -98,7 +98,7 @@ struct Progress {
       const double mean = count ? sum[l] / double(count) : 0;
       put(&eps, 0, l, first_relaxation(o.start[e], mean));
       lane[l].iterations++;
-      needs_rollout[l] = -1;
+      if (!problem.linear()) needs_rollout[l] = -1;
     }
     released &= ~which;
   }

@@ -34,7 +34,7 @@ inline void lcp_slack(int64_t n, const T* F, const Vec* q, const Vector& lam, Ve
 template <class T, int64_t N, bool kMayPivot>
 class RelaxedLcp {
   const Elimination<kMayPivot> lu;
-  const LowRank low_rank;
+  const LowRank* const low_rank;
   const int64_t given;
   const Matrix<const T, N, N> F;
   const Vec* const q;
@@ -49,9 +49,9 @@ class RelaxedLcp {
  public:
   static int64_t scratch(int64_t n) { return n * n + 7 * n; }
 
-  // `memory`: scratch(n) numbers; `exchanged`: n row numbers; `low_rank`: of F.
+  // `memory`: scratch(n) numbers; `exchanged`: n row numbers; `low_rank`: of F, or null.
   DIFFLCS_INLINE RelaxedLcp(int64_t n, const T* F, const Vec* q, Vec* memory, Mask* exchanged, bool pivot = false,
-                            const LowRank& low_rank = {})
+                            const LowRank* low_rank = nullptr)
       : lu{pivot},
         low_rank(low_rank),
         given(n),
@@ -131,11 +131,13 @@ class RelaxedLcp {
   }
 
  private:
+  bool short_cut() const { return kMayPivot && kLanes == 1 && low_rank && *low_rank; }
+
   // w, root and the squared norm of g at `next`.
   DIFFLCS_INLINE Vec evaluate(Vec eps4) {
     const int64_t n = size();
     Vec sum = all(0);
-    if (kMayPivot && kLanes == 1 && low_rank)  // F is symmetric: by columns, for several rows at a time
+    if (short_cut())  // F is symmetric: by columns, for several rows at a time
       by_columns(0, n, [&](int64_t i, auto kind) {
         auto t = read<decltype(kind)>(q, i);
         for (int64_t j = 0; j < n; j++) t += next[j] * read<decltype(kind)>(F[j], i);
@@ -171,13 +173,13 @@ class RelaxedLcp {
   // lanes that are not `done`. The generalised Jacobian of g is diag(a) + diag(b) F, a = 1 - ratio and b = 1 + ratio.
   DIFFLCS_INLINE void advance(Vec eps4, Mask done, int trials) {
     const int64_t n = size();
-    const bool short_cut = kMayPivot && kLanes == 1 && low_rank;
+    const bool short_cut = this->short_cut();
     DIFFLCS_UNROLL
     for (int64_t i = 0; i < n; i++) {
       const Vec ratio = (lam[i] - w[i]) / root[i], b = 1.0 + ratio;
       step[i] = root[i] - lam[i] - w[i];
       if (short_cut) {
-        low_rank.weigh(i, 1.0 - ratio, b);
+        low_rank->weigh(i, 1.0 - ratio, b);
         continue;
       }
       DIFFLCS_UNROLL
@@ -185,8 +187,8 @@ class RelaxedLcp {
       jacobian[i * n + i] += 1.0 - ratio;
     }
     if (short_cut) {
-      low_rank.factor();
-      low_rank.solve(&step[0]);
+      low_rank->factor();
+      low_rank->solve(&step[0]);
     } else {
       lu.factor(n, jacobian, rows);
       lu.solve(n, jacobian, rows, step);

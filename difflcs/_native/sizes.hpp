@@ -11,7 +11,7 @@ namespace {
 
 constexpr double kTiny = 1e-300;
 
-// Whether all problems share their matrices: the type of an entry says it, where there are several lanes.
+// Whether the type of an entry says that all problems share their matrices; with one lane it does not.
 template <class T>
 constexpr bool kShared = std::is_same_v<T, double> && kLanes > 1;
 
@@ -34,6 +34,12 @@ inline bool shared_matrices(const MpcBatch& b) {
   bool shared = true;
   for (int i = 0; i < kInputs; i++) shared = shared && (kMpcFields[i].columns == Size::one || b.stride[i] == 0);
   return shared;
+}
+
+// Whether matrices are loaded once for all problems.
+template <class T>
+bool load_once(const MpcBatch& b) {
+  return kLanes > 1 ? kShared<T> : shared_matrices(b);
 }
 
 // R_jj + B_j' Q B_j of each action at each stage: its curvature by the next state's weights Q alone, in one lane.

@@ -58,7 +58,7 @@ class Solver {
   // lam and s of one stage, from the guess in `lam`; lanes in `skip` keep both.
   void contacts(int64_t k, const StageData<T, S>& data, const Vec* x, const Vec* u, Vec* lam, Vec* s, Mask skip) {
     data.gap(x, u, progress.gap);
-    Lcp(n.l(), data.F.entries, progress.gap, newton, rows, batch.pivot, problem.low_rank[k])
+    Lcp(n.l(), data.F.entries, progress.gap, newton, rows, batch.pivot, &problem.low_rank[k])
         .solve(lam, s, progress.eps, skip);
   }
 
@@ -66,7 +66,7 @@ class Solver {
   Vec rollout(Mask wanted, Watch watch) {
     for (int64_t i = 0; i < n.x(); i++) at.x(0, i) = problem.x0[i];
     for (int64_t k = 0; k < n.h && !halted(watch); k++) {
-      const StageData<T, S> data = problem.stage(k);
+      const StageData<T, S>& data = problem.stage(k);
       contacts(k, data, at.x[k], at.u[k], at.lam[k], at.s[k], ~wanted | progress.released);
       data.next_state(at.x[k], at.u[k], at.lam[k], at.x[k + 1]);
     }
@@ -79,7 +79,7 @@ class Solver {
     const int64_t nx = n.x(), nu = n.u(), nl = n.l();
     for (int64_t i = 0; i < nx; i++) next.x(0, i) = problem.x0[i];
     for (int64_t k = 0; k < n.h && !halted(watch); k++) {
-      const StageData<T, S> data = problem.stage(k);
+      const StageData<T, S>& data = problem.stage(k);
       const Matrix<Vec, S::kU, S::kX> K = riccati.feedback[k];
       for (int64_t j = 0; j < nu; j++) {
         const Vec from = at.u(k, j);

@@ -1,4 +1,5 @@
-// Variants of the MPC solver and its adjoint: compile-time sizes for the paper's tasks, matrices shared or per element.
+// Variants of the MPC solver and its adjoint: compile-time sizes for the paper's tasks and for those of DIFFLCS_SIZES
+// (cmake/kernels.cmake), matrices shared or per element.
 #pragma once
 #include "lanes.hpp"
 #include "sizes.hpp"
@@ -14,16 +15,22 @@ struct Variant {
 // That which fits every problem. With one problem at a time all numbers are plain.
 using Widest = Variant<std::conditional_t<kLanes == 1, double, Vec>, AnySizes>;
 
-// Calls f with the variant for matrices with entries T that fits.
-template <class T, class Function>
+// n_x, n_u and n_lam of each size that has code of its own.
+#ifndef DIFFLCS_SIZES
+#define DIFFLCS_SIZES
+#endif
+constexpr int kOwn[] = {9, 6, 5, 9, 6, 8, DIFFLCS_SIZES};
+constexpr int kOwnCount = int(sizeof(kOwn) / sizeof(int)) / 3;
+
+// Calls f with the variant for matrices with entries T that fits: that of size number i, or of a later one.
+template <class T, int i = 0, class Function>
 void dispatch_sizes(const MpcBatch& b, Function f) {
-  const bool paper = b.n_x == 9 && b.n_u == 6;
-  if (paper && b.n_lam == 5)
-    f(Variant<T, Sizes<9, 6, 5>>());
-  else if (paper && b.n_lam == 8)
-    f(Variant<T, Sizes<9, 6, 8>>());
-  else
+  if constexpr (i == kOwnCount)
     f(Variant<T, AnySizes>());
+  else if (b.n_x == kOwn[3 * i] && b.n_u == kOwn[3 * i + 1] && b.n_lam == kOwn[3 * i + 2])
+    f(Variant<T, Sizes<kOwn[3 * i], kOwn[3 * i + 1], kOwn[3 * i + 2]>>());
+  else
+    dispatch_sizes<T, i + 1>(b, f);
 }
 
 // Calls f with the variant that fits.

@@ -33,6 +33,9 @@ from difflcs.records import LCSParams
 __all__ = ["Drive", "ForceDrive", "Inertia", "PDDrive", "PlanarPushing", "PositionDrive", "to_body"]
 
 
+_INSTANTS = 8  # of a step, in `Drive.course`
+
+
 class DriveStep(NamedTuple):
     """Motion of the discs in one step, by coordinate: (position, velocity)₊ = A (position, velocity) + b u.
 
@@ -59,6 +62,16 @@ class Drive(ABC):
     @abstractmethod
     def step(self) -> DriveStep:
         """Return one step."""
+
+    def course(self) -> DriveStep:
+        """Return the motion from the begin of a step until each of some instants of it, (n_instants, …) in every field.
+
+        The last instant is its end. By default the discs go evenly.
+        """
+        step = self.step()
+        rest = DriveStep(torch.eye(self.order, dtype=step.A.dtype), step.b.new_zeros(()), step.b.new_zeros(()))
+        parts = [i / _INSTANTS for i in range(1, _INSTANTS + 1)]
+        return DriveStep(*(torch.stack([a + p * (b - a) for p in parts]) for a, b in zip(rest, step, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +124,14 @@ class PDDrive(Drive):
 
     def step(self) -> DriveStep:
         """See `Drive`."""
+        return self._until(self.substeps)
+
+    def course(self) -> DriveStep:
+        """See `Drive`: after each substep."""
+        each = [self._until(substeps) for substeps in range(1, self.substeps + 1)]
+        return DriveStep(*(torch.stack(values) for values in zip(*each, strict=True)))
+
+    def _until(self, substeps: int) -> DriveStep:
         kp, kv, h = _number("stiffness", self.stiffness), _number("damping", self.damping), self.substep
         one, zero = torch.ones_like(kp), torch.zeros_like(kp)
         # (p, v, target)₊ = M (p, v, target), for one substep.
@@ -122,7 +143,7 @@ class PDDrive(Drive):
             ],
             -2,
         )
-        M = torch.linalg.matrix_power(M, self.substeps)
+        M = torch.linalg.matrix_power(M, substeps)
         # target = p + u, and p moves with the target where both are shifted.
         return DriveStep(M[..., :2, :2] + _first_column(M[..., :2, 2]), M[..., :2, 2], torch.zeros_like(M[..., :2, 2]))
 

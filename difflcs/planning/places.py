@@ -79,6 +79,10 @@ class Workspace:
         low, high = (discs.new_tensor(corner).repeat(self.n_discs) - discs for corner in (self.low, self.high))
         return low.clamp(-self.step, 0.0), high.clamp(0.0, self.step)
 
+    def clamp(self, points: Tensor) -> Tensor:
+        """Move points (..., 2) that are outside to the border."""
+        return torch.minimum(torch.maximum(points, points.new_tensor(self.low)), points.new_tensor(self.high))
+
     def contains(self, points: Tensor, margin: float = 0.0) -> Tensor:
         """Return a mask (...), True for points (..., 2) that are inside and `margin` away from the border [length]."""
         low, high = points.new_tensor(self.low) + margin, points.new_tensor(self.high) - margin

@@ -152,16 +152,14 @@ def card(name: str) -> ModelCard:
 
 
 def table(cards: Sequence[ModelCard]) -> str:
-    """Format one line per model."""
-    head = ("name", "method", "data", "success", "interval", "goals", "object")
+    """Format one line per model, for a terminal of 80 columns."""
+    head = ("name", "method", "data", "success", "object")
     rows = [
         (
             c.name,
             c.method,
             f"{c.minutes:g} min",
-            f"{100 * c.success_rate:.1f} %",
-            f"{100 * c.ci_low:.1f} to {100 * c.ci_high:.1f}",
-            str(c.goals),
+            f"{100 * c.success_rate:.1f} % of {c.goals}",
             c.object_source.replace("_", " "),
         )
         for c in cards

@@ -10,6 +10,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from difflcs import LCSModel, LCSParams, Transitions, fit_report, suggest_scales, violation_loss
 from difflcs.systems import block_along_wall, cart_pole_between_walls
@@ -88,6 +89,9 @@ def main() -> None:
         labels = [f"{xi:g}" if isinstance(xi, float) else "falling" for xi in found]
         axis.set(title=title, ylabel="error of a step", yscale="log")
         axis.set_xticks(places, labels)
+        axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axis.yaxis.set_minor_formatter(NullFormatter())
     axes[-1].set_xlabel("ξ")
     axes[0].legend(frameon=False)
     figure.savefig(Path(__file__).with_suffix(".png"), dpi=150)

@@ -398,13 +398,23 @@ def test_a_body_turns_about_its_centre_of_mass():
 
 def test_the_pd_drive_is_its_own_simulation():
     drive, target = PDDrive(100.0, 20.0, 0.01, 10), 0.3
-    step = drive.step()
+    step, course = drive.step(), drive.course()
     p, v = 0.1, 0.5
     got = step.A @ tensor([p, v]) + step.b * (target - p)
-    for _ in range(10):
+    places = course.A @ tensor([p, v]) + course.b * (target - p)
+    for i in range(10):
         v += (100 * (target - p) - 20 * v) * 0.01
         p += v * 0.01
+        torch.testing.assert_close(places[i], tensor([p, v]))
     torch.testing.assert_close(got, tensor([p, v]))
+
+
+@pytest.mark.parametrize(
+    "drive", [PositionDrive(0.8, 0.1), PositionDrive(torch.rand(2, 2).double()), ForceDrive(2.0, 0.1)]
+)
+def test_the_course_of_a_drive_ends_where_its_step_does(drive):
+    for end, step in zip(drive.course(), drive.step(), strict=True):
+        torch.testing.assert_close(end[-1], step)
 
 
 def test_what_a_drive_gives_way_and_what_the_body_moves():

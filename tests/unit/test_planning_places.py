@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics import Circle, PDDrive, PlanarPushing, Polygon, Union, box
+from difflcs.physics.planar import to_body
 from difflcs.planning import DiscPlaces, LiftTravel, PlanarTravel, Workspace
-from difflcs.planning.outline import clearance, ring
+from difflcs.planning.outline import DistanceGrid, clearance, ring
 
 F64 = torch.float64
 RADIUS = 0.15
@@ -154,6 +155,38 @@ def test_a_disc_gets_round_every_shape_without_touching_it(seed, name):
         assert float(PlanarPushing(shape, 0.1).contacts(on_the_way).gap.min()) > -1e-3
         x = on_the_way[-1]
     assert travel.arrived(x, target)
+
+
+def test_distances_on_a_grid_are_those_of_the_shape_but_for_a_part_of_its_cells():
+    grid = DistanceGrid(TEE, 0.3)
+    points = 1.2 * (2 * torch.rand(2000, 2, dtype=F64, generator=torch.Generator().manual_seed(0)) - 1)
+    assert float((grid.distance(points) - clearance(TEE, points)).abs().max()) < 0.3 * 2.6 / 160
+    assert float(grid.distance(tensor([50.0, 0.0]))) <= 50.0 - 0.6
+
+
+@pytest.mark.parametrize("stiffness", [40.0, 100.0])
+def test_a_disc_goes_round_as_fast_as_its_drive_lets_it_and_touches_nothing(stiffness):
+    drive = PDDrive(stiffness, damping=20.0, substep=0.01, substeps=10)
+    travel = PlanarTravel(TEE, RADIUS, 5.0, drive=drive, clearance=0.08, workspace=Workspace((-2, -2), (2, 2), step=1))
+    places = DiscPlaces(TEE, RADIUS, 40, gap=0.02)
+    x = tensor([0.1, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0])
+    states = places.states(x, places.sample(x))
+    steps = []
+    for first in range(0, 40, 8):
+        at, target = states[first], states[(first + 20) % 40]
+        for step in range(30):
+            if travel.arrived(at, target):
+                steps.append(step)
+                break
+            to = at[3:5] + travel.action(at, target)
+            assert bool((to.abs() <= 2 + 1e-12).all())
+            for _ in range(drive.substeps):
+                at = at.clone()
+                at[5:] += drive.substep * (drive.stiffness * (to - at[3:5]) - drive.damping * at[5:])
+                at[3:5] += drive.substep * at[5:]
+                assert float(clearance(TEE, to_body(at, at[None, 3:5]))) > RADIUS + 0.005
+    assert len(steps) == 5
+    assert max(steps) <= 9
 
 
 def test_a_disc_goes_straight_where_it_can():

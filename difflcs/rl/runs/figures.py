@@ -97,7 +97,7 @@ def draw_policy(policy: Policy, task: TaskSpec, folder: Path, episodes: int = 20
         policy: of a task; nothing is drawn of one that plans without an LCS.
         task: the task.
         folder: where fit.png and episode.png are written, or replaced.
-        episodes: how many are played.
+        episodes: how many are played; the fit is judged on half of them, and an affine system learns from the others.
         seed: of goals and initial states, as of an evaluation.
 
     Returns:
@@ -113,7 +113,11 @@ def draw_policy(policy: Policy, task: TaskSpec, folder: Path, episodes: int = 20
         envs.close()
     data = Transitions.from_episodes(played["state"], played["action"])
     context = played[CONTEXT].repeat_interleave(task.episode_steps, 0) if CONTEXT in played.keys() else None
-    _write(fit_report(policy.lcs, *data, context=context).plot(), folder / "fit.png")
+    judged = (episodes + 1) // 2 * task.episode_steps  # the affine system beside the model is fitted to the others
+    train = [value[judged:] for value in data] if episodes > 1 else None
+    here = None if context is None else context[:judged]
+    report = fit_report(policy.lcs, *(value[:judged] for value in data), train=train, context=here)
+    _write(report.plot(), folder / "fit.png")
 
     first = slice(task.episode_steps)
     x, u, at = data.x[first], data.u[first], None if context is None else context[first]
