@@ -17,6 +17,11 @@ def drawn(seed, count, mean=0.0, failing=0):
     return values
 
 
+def make(failure):
+    """A line that is handed out, and another one that learns."""
+    return Incumbent(lambda *_, **__: None, nn.Linear(1, 1), nn.Linear(1, 1), failure, 1)  # pyright: ignore
+
+
 def test_a_better_policy_passes_and_what_is_as_good_rarely_does():
     assert is_better(drawn(0, 30), drawn(1, 30, failing=15), 5.0)
     assert not is_better(drawn(0, 30, failing=15), drawn(1, 30), 5.0)
@@ -38,14 +43,15 @@ def test_starts_are_judged_by_what_was_expected_of_them():
     starts = torch.cat([torch.zeros(30, 1), torch.ones(30, 1)]).double()
     easy, hard = starts[:30], starts[30:]
     for own, gain, passes in ((hard, -1.0, False), (easy, 1.0, True)):
-        incumbent, other = Incumbent(nn.Linear(1, 1), 1.0, 1), easy if own is hard else hard
-        model = nn.Linear(1, 1).state_dict()
+        incumbent, other = make(1.0), easy if own is hard else hard
+        model = incumbent.learner.state_dict()
 
         def values(inputs):
             return -9 * inputs.squeeze(-1)
 
-        assert not incumbent.challenge(model, own, values(own) + drawn(0, 30), values)  # its own episodes
-        assert incumbent.challenge(model, other, values(other) + drawn(1, 30, gain), values) is passes
+        incumbent.begin()
+        assert not incumbent.challenge(own, values(own) + drawn(0, 30), values)  # its own episodes
+        assert incumbent.challenge(other, values(other) + drawn(1, 30, gain), values) is passes
         same = all(torch.equal(value, incumbent.learned.state_dict()[name]) for name, value in model.items())
         assert same is passes
 
@@ -54,15 +60,14 @@ def test_several_iterations_count_together_and_its_state_goes_on():
     def values(inputs):
         return torch.zeros(len(inputs), dtype=F64)
 
-    def make():
-        return Incumbent(nn.Linear(1, 1), 5.0, 1)
-
-    incumbent, starts, outcomes = make(), torch.zeros(30, 1, dtype=F64), []
-    incumbent.challenge({}, starts, drawn(0, 30, failing=4), values)
+    incumbent, starts, outcomes = make(5.0), torch.zeros(30, 1, dtype=F64), []
+    incumbent.challenge(starts, drawn(0, 30, failing=4), values)
     for k in range(ITERATIONS):
-        copied = make()
+        copied = make(5.0)
         copied.load_state_dict(incumbent.state_dict())
-        arguments = (nn.Linear(1, 1).state_dict(), starts, drawn(k + 1, 30), values)
+        arguments = (starts, drawn(k + 1, 30), values)
+        for one in (incumbent, copied):
+            one.begin()
         outcomes.append(incumbent.challenge(*arguments))
         assert copied.challenge(*arguments) is outcomes[-1]
         assert len(copied) == len(incumbent)

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from difflcs.rl.learning.state import State, copy_state
 from difflcs.rl.learning.trainer import TrainableModel
+from difflcs.rl.rollout import Policy
 
 ITERATIONS = 3
 """Newest iterations whose episodes count for a policy: the newest alone, the newest two, or three."""
@@ -47,13 +48,16 @@ class Incumbent:
     """The best model so far, and the episodes that tell how good it is.
 
     Args:
-        learned: the model, changed in place when another one takes its place.
+        policy: acts by it.
+        learned: the model, changed in place when the learner's takes its place.
+        learner: the model that is trained, of the same class.
         failure: what a failed episode costs, in the scaled rewards that PPO learns from.
         n_inputs: inputs of the value network.
     """
 
-    def __init__(self, learned: TrainableModel, failure: float, n_inputs: int):
-        self.learned, self.failure = learned, failure
+    def __init__(self, policy: Policy, learned: TrainableModel, learner: TrainableModel, failure: float, n_inputs: int):
+        self.policy, self.learned, self.learner, self.failure = policy, learned, learner, failure
+        self._playing: State = {}
         none = (torch.zeros(0, n_inputs, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
         self.own: tuple[Tensor, Tensor] = none
         """Its episodes: inputs of the value network at their starts (N, n_inputs), returns (N,)."""
@@ -64,11 +68,14 @@ class Incumbent:
         """Episodes of its own: none before the first call of `challenge`."""
         return len(self.own[1])
 
-    def challenge(self, model: State, starts: Tensor, returns: Tensor, values: Callable[[Tensor], Tensor]) -> bool:
-        """Let a model take its place if it did better. The first episodes are its own.
+    def begin(self) -> None:
+        """Remember the learner as it is: it plays now."""
+        self._playing = copy_state(self.learner.state_dict())
+
+    def challenge(self, starts: Tensor, returns: Tensor, values: Callable[[Tensor], Tensor]) -> bool:
+        """Let the model that has played take its place if it did better. The first episodes are its own.
 
         Args:
-            model: state of the model that played.
             starts: (N, n_inputs) inputs of the value network at the start of its episodes.
             returns: (N,) sums of scaled rewards.
             values: the value network.
@@ -84,20 +91,22 @@ class Incumbent:
         for count in range(1, len(self.others) + 1):
             newest = _join(self.others[-count:])
             if is_better(newest[1] - values(newest[0]), own, self.failure):
-                self.learned.load_state_dict(copy_state(model))
+                self.learned.load_state_dict(self._playing)
                 self.own, self.others = newest, []
                 return True
         return False
 
     def state_dict(self) -> dict[str, Any]:
-        """All episodes, one iteration after another; its own are number 0."""
+        """The learner's parameters, and all episodes, one iteration after another; its own are number 0."""
         parts = [self.own, *self.others]
         numbers = [torch.full((len(returns),), k) for k, (_, returns) in enumerate(parts)]
         starts, returns = _join(parts)
-        return {"episodes": {"starts": starts, "returns": returns, "iteration": torch.cat(numbers)}}
+        episodes = {"starts": starts, "returns": returns, "iteration": torch.cat(numbers)}
+        return {"learner": dict(self.learner.state_dict()), "episodes": episodes}
 
     def load_state_dict(self, state: State) -> None:
         """Go on from what `state_dict` gave."""
+        self.learner.load_state_dict(state["learner"])
         episodes = state["episodes"]
         number = episodes["iteration"]
         count = int(number.max()) + 1 if len(number) else 1

@@ -24,10 +24,10 @@ from difflcs.rl.learning.critic import Critic
 from difflcs.rl.learning.incumbent import Incumbent
 from difflcs.rl.learning.model_rollouts import ModelRollouts
 from difflcs.rl.learning.optim import UpdateRule
-from difflcs.rl.learning.state import State, copy_state
+from difflcs.rl.learning.state import State
 from difflcs.rl.learning.surrogate import Surrogate, gaussian_kl, trimmed_mean
 from difflcs.rl.learning.trainer import AfterStep, Trainer
-from difflcs.rl.rollout import CONTEXT, Policy, collect, elapsed_fractions
+from difflcs.rl.rollout import CONTEXT, collect, elapsed_fractions
 from difflcs.rl.seeding import Stream, episode_seeds, numbers, seeded
 from difflcs.rl.tasks import Features, compute_features
 
@@ -138,10 +138,7 @@ class PPO(Trainer):
         final_step: factor on all steps, falling linearly from 1 to this.
         models: plays episodes in networks besides those of the robot; None: real ones alone, as in the paper.
         practice: source of model rollouts, if there are models.
-        incumbent: holds another model than the actor, which it replaces by what the actor has learned when that is
-            better; then `learned` and `policy` are the incumbent's. The first episodes on the robot are those of the
-            start. None: the actor's own are handed out.
-        policy: acts by the model of the incumbent.
+        incumbent: holds the model to hand out, not the actor's; the first episodes are those of the start.
 
     Raises:
         InvalidInputError: an argument does not fit.
@@ -168,7 +165,6 @@ class PPO(Trainer):
         models: ModelRollouts | None = None,
         practice: Source | None = None,
         incumbent: Incumbent | None = None,
-        policy: Policy | None = None,
     ):
         learned = check_learned(actor.learned, robot.env)
         if total_episodes <= first_episode:
@@ -179,11 +175,10 @@ class PPO(Trainer):
         remaining = total_episodes - first_episode
         if robot.env.num_envs < min(rollouts, remaining):
             raise InvalidInputError(f"env: expected at least {rollouts} environments, got {robot.env.num_envs}")
-        best = learned if incumbent is None else incumbent.learned
-        super().__init__(best, policy or actor.controller, seed, episode_steps)
+        best = (learned, actor.controller) if incumbent is None else (incumbent.learned, incumbent.policy)
+        super().__init__(*best, seed, episode_steps)
         self.actor, self.robot, self.critic, self.surrogate, self.update = actor, robot, critic, surrogate, update
-        self.scale, self.features = scale, features
-        self.max_kl, self.final_step = max_kl, final_step
+        self.scale, self.features, self.max_kl, self.final_step = scale, features, max_kl, final_step
         self.models, self.practice, self.incumbent = models, practice, incumbent
         self.first_episode, self.first_iteration = first_episode, first_iteration
         self.episodes, self.iteration = first_episode, first_iteration
@@ -219,7 +214,8 @@ class PPO(Trainer):
         model_success, model_loss = self._train_on_models(scale)
         model_seconds = time.perf_counter() - start
 
-        playing = copy_state(self.actor.learned.state_dict())
+        if self.incumbent is not None:
+            self.incumbent.begin()
         count = self.sizes[done]
         seeds = episode_seeds(self.seed, Stream.TRAINING, self.episodes, count)
         self.episodes += count
@@ -231,9 +227,8 @@ class PPO(Trainer):
             self.update.size.value = step_size  # it follows the model rollouts alone
         episodes, improvement = outcome.episodes, outcome.improvement
         self.remember(episodes)
-        accepted = True
-        if self.incumbent is not None:
-            accepted = self.incumbent.challenge(playing, outcome.starts, outcome.returns, self.critic.values)
+        kept = self.incumbent
+        accepted = kept is None or kept.challenge(outcome.starts, outcome.returns, self.critic.values)
         self.iteration += 1
         return PPOReport(
             iteration=self.iteration,
@@ -266,10 +261,9 @@ class PPO(Trainer):
         Both are None if there are no models, or if they have no real episode yet.
         """
         models = self.models
-        if models is None or self.practice is None or not (len(models) and models.settings.iterations):
+        unknown = self.incumbent is not None and not len(self.incumbent)
+        if unknown or models is None or self.practice is None or not (len(models) and models.settings.iterations):
             return None, None
-        if self.incumbent is not None and not len(self.incumbent):
-            return None, None  # the first episodes are the start's
         settings = models.settings
         loss, success = models.fit(), 0.0
         for k in range(1, settings.iterations + 1):
@@ -398,12 +392,10 @@ class PPO(Trainer):
 
     def state_dict(self) -> dict[str, Any]:
         """See `Trainer`."""
-        parts = {}
-        if self.incumbent is not None:
-            parts = {"learner": dict(self.actor.learned.state_dict()), "incumbent": self.incumbent.state_dict()}
+        kept = {} if self.incumbent is None else {"incumbent": self.incumbent.state_dict()}
         return {
             **super().state_dict(),
-            **parts,
+            **kept,
             "settings": {"first_episode": self.first_episode, "first_iteration": self.first_iteration},
             "covariance": {"log_std": self.actor.gaussian.log_std, "mixing": self.actor.gaussian.mixing},
             "critic": self.critic.state_dict(),
@@ -423,7 +415,6 @@ class PPO(Trainer):
         if self.models is not None:
             self.models.load_state_dict(state["models"])
         if self.incumbent is not None:
-            self.actor.learned.load_state_dict(state["learner"])
             self.incumbent.load_state_dict(state["incumbent"])
 
 

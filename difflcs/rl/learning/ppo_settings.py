@@ -160,7 +160,8 @@ def make_ppo(
         )
     incumbent = None
     if best is not None:
-        incumbent = Incumbent(check_learned(best.lcs, env), settings.reward_scale * failure_penalty, len(example))
+        models_of = (check_learned(best.lcs, env), check_learned(actor.learned, env))
+        incumbent = Incumbent(best, *models_of, settings.reward_scale * failure_penalty, len(example))
     betas = settings.adam.betas
     deviation = Deviation(actor, settings.std_learning_rate, betas, settings.std_range)
     return PPO(
@@ -182,7 +183,6 @@ def make_ppo(
         models=models,
         practice=practice,
         incumbent=incumbent,
-        policy=best,
     )
 
 

@@ -40,5 +40,14 @@ __all__ = [
 DEFAULT_METHOD = LCSRLMethod.name
 """The method of `difflcs train` without `--method`."""
 
-for _method in (LCSRLMethod, ViolationMethod, PPOMethod, ImproveMethod, PPOMLPMethod, PDDMMethod, ContactMethod, MujocoMethod):
+for _method in (
+    LCSRLMethod,
+    ViolationMethod,
+    PPOMethod,
+    ImproveMethod,
+    PPOMLPMethod,
+    PDDMMethod,
+    ContactMethod,
+    MujocoMethod,
+):
     register_method(_method)
