@@ -41,7 +41,7 @@ try:
         from gym_pushany.envs.pushany_env import OBJECT_NAME_LIST, PushAnyEnv, pymunk_to_shapely
 except ImportError as error:
     raise MissingDependencyError(
-        f"expected the package gym-pushany, not installed ({error}); run: pip install gym-pushany"
+        f"expected the package gym-pushany, not installed ({error}); run: pip install gym-pushany==0.1.13"
     ) from error
 
 INSIDE = shapely.box(7, 7, 504, 504)
