@@ -72,7 +72,7 @@ def test_the_scoreboard_of_shapes_prints_its_keys_and_knows_turns_that_mean_the_
     for name, turns in shapes.items():
         env = pushany.StateEnv(object_name=name)
         env.reset(seed=0)
-        assert pushany.count_turns(pushany.pushing(env.block)[0].shape) == turns
+        assert pushany.count_turns(env.block, pushany.pushing(env.block)[1]) == turns
     seeds = pushany.find_seeds(pushany.Options(3, obstacles=2))
     for seed in seeds:
         env.reset(seed=seed)
