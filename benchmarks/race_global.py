@@ -1,4 +1,4 @@
-"""How far plans with relaxed contact are from the global optimum with hard contact, on small problems."""
+"""Gaps of plans with relaxed contact to the global optimum with hard contact, on small problems."""
 
 from __future__ import annotations
 

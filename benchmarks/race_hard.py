@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from race_global import hard_cost
 from race_problems import with_contact
-from rivals import admm, layer, sampling
+from rivals import admm, impact, layer, sampling
 from rivals.problem import Problem
 from rivals.run import closed_loop, cpu
 
@@ -24,7 +24,7 @@ ITERATIONS = (3, 10, 30, 100)  # of C3+
 LOOPS = ("pushing, n_lam 5", "pushing, n_lam 8", "cart-pole, H 10", "cart-pole, H 30", "chain of 4, H 10")
 STEPS = 25
 OTHER_SEEDS = 1000
-MODULES: dict[str, Any] = {"layer": layer, "admm": admm, "sampling": sampling}
+MODULES: dict[str, Any] = {"layer": layer, "admm": admm, "impact": impact, "sampling": sampling}
 OURS: dict[str, dict[str, Any]] = {
     "difflcs": {},
     'difflcs `"fast"`': {"effort": "fast"},
@@ -72,8 +72,22 @@ def draws() -> dict[str, tuple[str, Draw]]:
 
         return draw
 
+    def lagrangian(random: np.random.Generator) -> dict[str, Any]:
+        weight, bound, settle = (float(10 ** random.uniform(*v)) for v in [(-2, 3.5), (-1, 4), (-4, -2)])
+        growth, progress = float(random.choice([1.05, 1.2, 1.5, 2.0, 5.0])), float(random.choice([0.5, 0.9]))
+        inner = int(random.choice([5, 10, 50]))
+        return {
+            "weight": weight,
+            "bound": bound,
+            "growth": growth,
+            "progress": progress,
+            "inner": inner,
+            "settle": settle,
+        }
+
     rivals = {f"C3+, {n} iterations": ("admm", consensus(n)) for n in ITERATIONS}
     rivals["C3, 10 iterations"] = ("admm", consensus(10, project="lcp"))
+    rivals["IMPACT-like"] = ("impact", lagrangian)
     return rivals | {f"{m.upper()}, 1024 rollouts": ("sampling", sampled(m, 1024)) for m in ("cem", "mppi")}
 
 

@@ -113,33 +113,34 @@ class Rigid(PlanarPushing):
         return cls(**{field.name: getattr(system, field.name) for field in fields(system)})
 
 
-class PushTPolicy:
-    """Sampling-based contact MPC for gym-pusht: its observation of obs_type="state" to its action.
-
-        policy = PushTPolicy()
-        observation, _ = env.reset(seed=0)
-        policy.reset()
-        ...
-        observation, *_ = env.step(policy.act(observation))
+class DiscPolicy:
+    """Sampling-based contact MPC for a disc that pushes a body on the square: an observation to the disc's target.
 
     The velocity of the disc, which the observation lacks, comes from the drive, as the past actions are known.
 
     Args:
-        system: the system of the MPC, with state and action as in `tee_pushing`, the default.
+        system: the system of the MPC, with state and action as in `tee_pushing`; its shape is about the centre of its
+            area.
+        center: (2,) this centre, from the origin whose pose is observed.
+        goal: (3,) of the origin [px, px, rad].
         delay: steps by which actions come late. The plan begins at the state that the system predicts for then.
+        turns: turns of the body about its centre that cover it, which all mean the same.
 
     Attributes:
         sampling: the policy inside, with its `decision`.
     """
 
-    def __init__(self, system: PlanarPushing | None = None, delay: int = 0):
-        self.system, self.delay = Rigid.of(tee_pushing() if system is None else system), delay
+    def __init__(
+        self, system: PlanarPushing, center: ArrayLike, goal: ArrayLike = GOAL, *, delay: int = 0, turns: int = 1
+    ):
+        self.system, self.delay, self._period = Rigid.of(system), delay, 2 * math.pi / turns
+        self.center, self.goal = np.asarray(center), goal
         shape = self.system.shape
         workspace = Workspace((0.0, 0.0), (SIDE, SIDE), step=1.2)
         cost = GoalCost.reach(7, 2, goal_weight=(1.0, 1.0, 0.3), goal_weight_final=(4.0, 4.0, 1.2), input_weight=0.01)
         self.sampling = SamplingPolicy(
             LCSMPCLayer(self.system, cost, 6, relaxation=1e-5, on_failure="mask"),
-            DiscPlaces(shape, RADIUS, 32, gap=0.02, reach=0.2, workspace=workspace, margin=0.2),
+            DiscPlaces(shape, RADIUS, 32, gap=0.02, reach=0.2, workspace=workspace, margin=0.02),
             PlanarTravel(shape, RADIUS, SIDE, drive=DRIVE, clearance=0.08, tolerance=0.12, workspace=workspace),
             SamplingSettings(keep=0.6, smallest_gain=0.02, switch_price=0.02, travel_price=0.04),
             bounds=workspace.bounds,
@@ -159,19 +160,21 @@ class PushTPolicy:
         """Compute an action.
 
         Args:
-            observation: (5,) x, y of the disc, x, y [px] and angle [rad] of the T's origin.
+            observation: (5,) x, y of the disc, x, y [px] and angle [rad] of the body's origin.
 
         Returns:
             (2,) the target of the disc [px].
         """
         seen = np.asarray(observation, np.float64)
         disc = seen[:2] / PIXELS
-        state = np.concatenate([from_origin(seen[2:]), disc, self._velocity])
+        state = np.concatenate([from_origin(seen[2:], self.center), disc, self._velocity])
         if self.delay and not self._under_way:
             self._under_way.extend([disc] * self.delay)
         for target in self._under_way:
             state = self._predict(state, target)
-        target = np.clip(state[3:5] + self.sampling.act(state, from_origin(GOAL)), 0.0, SIDE)
+        goal = from_origin(self.goal, self.center)
+        goal[2] += self._period * np.round((state[2] - goal[2]) / self._period)
+        target = np.clip(state[3:5] + self.sampling.act(state, goal), 0.0, SIDE)
         self._under_way.append(target)
         self._velocity = self._keeps * self._velocity + self._gives * (self._under_way.popleft() - disc)
         return target * PIXELS
@@ -183,15 +186,33 @@ class PushTPolicy:
             return self.system.params(x).step(x, u).x_next.numpy()
 
 
-def from_origin(pose: ArrayLike) -> NDArray[np.float64]:
-    """Convert the pose (3,) of the T's origin in pixels to that of the centre of its area in units of length."""
+class PushTPolicy(DiscPolicy):
+    """The policy for gym-pusht: its observation of obs_type="state" to its action.
+
+        policy = PushTPolicy()
+        observation, _ = env.reset(seed=0)
+        policy.reset()
+        ...
+        observation, *_ = env.step(policy.act(observation))
+
+    Args:
+        system: see `DiscPolicy`; `tee_pushing()` by default.
+        delay: likewise.
+    """
+
+    def __init__(self, system: PlanarPushing | None = None, delay: int = 0):
+        super().__init__(tee_pushing() if system is None else system, _CENTER, delay=delay)
+
+
+def from_origin(pose: ArrayLike, center: ArrayLike = _CENTER) -> NDArray[np.float64]:
+    """Convert the pose (3,) of the body's origin in pixels to that of the centre of its area in units of length."""
     x, y, yaw = np.asarray(pose, np.float64)
     cos, sin = math.cos(yaw), math.sin(yaw)
-    cx, cy = _CENTER.tolist()
+    cx, cy = np.asarray(center).tolist()
     return np.array([x / PIXELS + cos * cx - sin * cy, y / PIXELS + sin * cx + cos * cy, yaw])
 
 
-def picture(env: Any, policy: PushTPolicy, text: str = "", size: int = 340) -> Image.Image:
+def picture(env: Any, policy: DiscPolicy, text: str = "", size: int = 340) -> Image.Image:
     """The environment as it draws itself, and on top what the policy decided last.
 
     Places where the disc could be are dots, the greener the more a push from there would gain; that to which it

@@ -11,7 +11,7 @@ from difflcs.mpc.backends import BatchedBackend, IpoptBackend
 from difflcs.mpc.backends.batched import Effort
 from difflcs.mpc.controller import MPCController
 from rivals.differentiable import TorchRival
-from rivals.problem import Problem
+from rivals.problem import Answer, Problem
 
 
 def version() -> str:
@@ -24,7 +24,7 @@ class Solver(TorchRival):
 
     Args:
         problem: what is to be solved.
-        backend: "batched" or "ipopt".
+        backend: "batched", "ipopt", or "controller", which plans from a state of its own system, NumPy in and out.
         relaxation: instead of the problem's.
         effort: of `batched`.
     """
@@ -34,11 +34,24 @@ class Solver(TorchRival):
     ):
         super().__init__(problem)
         self.batches = self.differentiates = backend == "batched"
-        self.backend = BatchedBackend(effort=effort, threads=1) if self.batches else IpoptBackend(workers=1)
+        self.alone = backend == "controller"
+        self.backend = IpoptBackend(workers=1) if backend == "ipopt" else BatchedBackend(effort=effort, threads=1)
         self.relaxation = relaxation or problem.relaxation
         self.parts = [self._layer(i) for i in range(problem.count)]
         self.whole = self._layer(None)
         self.controllers: dict[int, MPCController] = {}
+
+    def one(self, i: int) -> Answer:
+        """Solve one problem in one call."""
+        if not self.alone:
+            return super().one(i)
+        if not self.controllers:
+            self.controllers[0] = self.whole.controller()
+        controller = self.controllers[0]
+        controller.reset()
+        controller.step(self.problem.x0[i])
+        assert controller.plan is not None
+        return Answer(controller.plan.u[None], np.array([controller.plan.status.solved]))
 
     def step(self, i: int, x: np.ndarray) -> np.ndarray:
         """Return the action of a warm controller."""

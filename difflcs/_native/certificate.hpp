@@ -18,9 +18,9 @@ struct Certificate {
   const AnySizes n;
   Steps<T> matrix[kInputs];    // in the caller's units: matrices here,
   Steps<Vec> vector[kInputs];  // vectors here
-  Steps<T> rest;
+  Steps<T> rest, transposed_A, transposed_Q;
   // Of the current stage.
-  T *A, *B, *C, *D, *E, *F, *Q, *R, *cross, *G_x, *G_u;
+  T *A, *B, *C, *D, *E, *F, *Q, *R, *cross, *G_x, *G_u, *A_t, *Q_t;
   Vec *d, *c, *q, *r, *lo, *hi;
   Vec *x, *u, *lam, *mu, *gap, *s, *p, *pn, *y, *rho, *error, *N, *largest_action;
   // Sizes of all states, and at one stage of the costates and of rho's response to them (conditions.py: `sizes`); terms
@@ -46,6 +46,8 @@ struct Certificate {
         arena.take(matrix[i], stages, extent(batch, field));
     }
     arena.take(rest, h, nu);
+    arena.take(transposed_A, matrix[kA].count, nx * nx);
+    arena.take(transposed_Q, matrix[kQ].count, nx * nx);
     arena.take_all((h + 1) * nx, x, x_size);
     arena.take(u, h * nu);
     arena.take_all(h * nl, lam, gap);
@@ -71,6 +73,13 @@ struct Certificate {
   void load_matrices(int64_t e, int lane) {
     for (int i = 0; i < kInputs; i++)
       if (kMpcFields[i].columns != Size::one) load(matrix[i], i, e, lane);
+    const auto transpose = [&](const Steps<T>& from, const Steps<T>& to) {
+      for (int64_t k = 0; k < from.count; k++)
+        for (int64_t i = 0; i < n.x() * n.x(); i++)
+          put(to[k], i % n.x() * n.x() + i / n.x(), lane, lane_of(from[k][i], lane));
+    };
+    transpose(matrix[kA], transposed_A);
+    transpose(matrix[kQ], transposed_Q);
     const bool alike = matrix[kB].count == 1 && matrix[kQ].count == 1 && matrix[kR].count == 1;
     const auto entries = [&](Input which) { return [this, which](int64_t k) { return matrix[which][k]; }; };
     curvature_at_rest(n, entries(kB), n.u(), entries(kQ), matrix[kQ_final][0], entries(kR), alike, rest, lane);
@@ -81,6 +90,8 @@ struct Certificate {
     G_x = matrix[kG_x][k];
     if (k == n.h) return;
     A = matrix[kA][k];
+    A_t = transposed_A[k];
+    Q_t = transposed_Q[k];
     B = matrix[kB][k];
     C = matrix[kC][k];
     D = matrix[kD][k];
@@ -105,14 +116,17 @@ struct Certificate {
     poison += 0.0 * violation;
   }
   // A sum, and the sum of the sizes of its terms.
-  struct Sum {
-    Vec value, terms;
-    void add(Vec term) {
+  template <class V>
+  struct SumOf {
+    V value, terms;
+    void add(V term) {
       value += term;
       terms += abs(term);
     }
     Vec relative() const { return abs(value) / select(terms > 0, terms, all(1)); }
   };
+
+  using Sum = SumOf<Vec>;
 
   // Stationarity in lam, C' p + s o y + F' rho = 0 with rho = y o lam: writes what is missing into `error`, returns it
   // in parts of the terms.
@@ -240,25 +254,34 @@ struct Certificate {
         g.terms = max(g.terms, kCancelled * whole);
         action(k, j, uk[j], g);
       }
-      for (int64_t i = 0; i < nx; i++) {
-        Sum sum{q[i], abs(q[i])};
-        Vec along = all(0), through = all(0);
+      by_columns(0, nx, [&](int64_t i, auto kind) {
+        using V = decltype(kind);
+        const V first = read<V>(q, i);
+        SumOf<V> sum{first, abs(first)};
+        V along{}, through{};
         for (int64_t j = 0; j < nx; j++) {
-          sum.value += Q[i * nx + j] * xk[j];
-          sum.terms += abs(Q[i * nx + j] * size[j]);
-          sum.add(A[j * nx + i] * p[j]);
-          along += abs(A[j * nx + i] * p_size[j]);
+          const auto a = read<V>(A + j * nx, i), weight = read<V>(Q_t + j * nx, i);
+          sum.value += weight * xk[j];
+          sum.terms += abs(weight * size[j]);
+          sum.add(a * p[j]);
+          along += abs(a * p_size[j]);
         }
         for (int64_t j = 0; j < nl; j++) {
-          sum.add(D[j * nx + i] * rho[j]);
-          through += abs(D[j * nx + i] * rho_terms[j]);
+          const auto slope = read<V>(D + j * nx, i);
+          sum.add(slope * rho[j]);
+          through += abs(slope * rho_terms[j]);
         }
-        if (batch.crossed)
-          for (int64_t j = 0; j < nu; j++) sum.add(cross[i * nu + j] * uk[j]);
-        for (int64_t m = 0; m < nc; m++) sum.add(G_x[m * nx + i] * mk[m]);
+        for (int64_t m = 0; m < nc; m++) sum.add(read<V>(G_x + m * nx, i) * mk[m]);
+        write<V>(pn, i, sum.value);
+        write<V>(terms, i, sum.terms);
+        write<V>(grown, i, max(along, through));
+      });
+      for (int64_t i = 0; i < nx; i++) {
+        Sum sum{pn[i], terms[i]};
+        for (int64_t j = 0; j < nu && batch.crossed; j++) sum.add(cross[i * nu + j] * uk[j]);
         pn[i] = sum.value;
         terms[i] = sum.terms;
-        grown[i] = max(max(sum.terms, p_size[i]), kFurther * max(along, through));
+        grown[i] = max(max(sum.terms, p_size[i]), kFurther * grown[i]);
       }
       for (int64_t i = 0; i < nx; i++) {
         p[i] = pn[i];
@@ -286,18 +309,28 @@ struct Certificate {
       enter(k);
       const Vec *xk = x + k * nx, *uk = u + k * nu, *lk = lam + k * nl, *next = x + (k + 1) * nx;
       const Vec* size = x_size + k * nx;
-      for (int64_t i = 0; i < nx; i++) {
-        Sum sum{d[i], abs(d[i])};
-        Vec along = all(0), wide = all(0);
+      by_columns(0, nx, [&](int64_t i, auto kind) {
+        using V = decltype(kind);
+        const V first = read<V>(d, i);
+        SumOf<V> sum{first, abs(first)};
+        V along{};
         for (int64_t j = 0; j < nx; j++) {
-          sum.add(A[i * nx + j] * xk[j]);
-          along += abs(A[i * nx + j] * size[j]);
+          const auto a = read<V>(A_t + j * nx, i);
+          sum.add(a * xk[j]);
+          along += abs(a * size[j]);
         }
+        write<V>(pn, i, sum.value);
+        write<V>(terms, i, sum.terms);
+        write<V>(grown, i, along);
+      });
+      for (int64_t i = 0; i < nx; i++) {
+        Sum sum{pn[i], terms[i]};
+        Vec wide = all(0);
         for (int64_t j = 0; j < nu; j++) sum.add(B[i * nu + j] * uk[j]);
         for (int64_t j = 0; j < nu && n.c() > 0; j++) wide += abs(B[i * nu + j] * width(k, j));
         if (n.c() > 0) moved[(k + 1) * nx + i] = wide;
         for (int64_t j = 0; j < nl; j++) sum.add(C[i * nl + j] * lk[j]);
-        x_size[(k + 1) * nx + i] = max(max(sum.terms, size[i]), kFurther * along);
+        x_size[(k + 1) * nx + i] = max(max(sum.terms, size[i]), kFurther * grown[i]);
         sum.value -= next[i];
         met(sum.relative());
       }

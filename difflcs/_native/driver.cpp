@@ -150,6 +150,7 @@ MpcStart at_target(const MpcBatch& b) { return {false, false, 0.0, b.relaxation}
 double comparison(const MpcBatch& b) { return std::max(b.relaxation, std::min(kSoft, kSofter * b.relaxation)); }
 
 MpcStart beginning(const Start& s, const MpcBatch& b, const MpcEffort& effort) {
+  if (b.n_lam == 0 && b.barrier == 0) return {s.released, false, 0.0, b.relaxation};  // nothing is relaxed
   return {s.released, s.gauss_newton, effort.homotopy > 0 ? 0.0 : s.first,
           comparison(b) * std::max(effort.homotopy, 1.0)};
 }

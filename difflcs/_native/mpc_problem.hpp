@@ -75,9 +75,11 @@ struct StageData {
   }
 
   void next_state(const Vec* x, const Vec* u, const Vec* lam, Vec* out) const {
-    const auto A = this->A();
-    const auto B = this->B();
-    for (int64_t i = 0; i < A.rows; i++) out[i] = d[i] + A.row(i) * x + B.row(i) * u + C.row(i) * lam;
+    const auto store = [&](int64_t i, Vec sum) { out[i] = sum; };
+    const auto so_far = [&](int64_t i) { return out[i]; };
+    multiply(A(), x, [&](int64_t i) { return d[i]; }, store);
+    multiply(B(), u, so_far, store);
+    multiply(C, lam, so_far, store);
   }
 
   // Row i of G_x x + G_u u - g; the last stage has no actions.
@@ -200,6 +202,9 @@ struct ProblemData {
     data.price = price[n.h];
     return data;
   }
+
+  // Whether the optimum is that of a quadratic program with bounds on the actions alone.
+  bool linear() const { return n.l() == 0 && n.c() == 0 && batch.barrier == 0; }
 
   template <class... Inputs>
   bool by_stage(Inputs... which) const {
@@ -416,7 +421,8 @@ struct ProblemData {
   Vec plain_cost(const Trajectory<S>& at) const {
     auto quadratic = [](const auto& W, const Vec* linear, const Vec* z) {
       Vec total = all(0);
-      for (int64_t i = 0; i < W.rows; i++) total += z[i] * (0.5 * (all(0) + W.row(i) * z) + linear[i]);
+      const auto add = [&](int64_t i, Vec sum) { total += z[i] * (0.5 * sum + linear[i]); };
+      multiply(W, z, [](int64_t) { return all(0); }, add);
       return total;
     };
     Vec total = quadratic(Matrix<T, S::kX, S::kX>(Q_final), q_final, at.x[n.h]);

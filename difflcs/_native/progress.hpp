@@ -98,7 +98,7 @@ struct Progress {
       const double mean = count ? sum[l] / double(count) : 0;
       put(&eps, 0, l, first_relaxation(o.start[e], mean));
       lane[l].iterations++;
-      needs_rollout[l] = -1;
+      if (!problem.linear()) needs_rollout[l] = -1;
     }
     released &= ~which;
   }

@@ -16,6 +16,9 @@ constexpr double kFlat = 1e-3;
 // Damping of the actions beside that of the contacts, in units of each action's own curvature: what bends the cost is
 // damped where it bends, the actions only lest nothing is.
 constexpr double kActionDamping = 0.01;
+// Where the problem is linear, an action whose own price is above this part of its curvature is not flat: Newton's step
+// is exact.
+constexpr double kPriced = 1e-8;
 
 // How the solver's step is taken.
 struct Newton {
@@ -49,10 +52,17 @@ class Riccati {
   static constexpr int64_t kX = S::kX, kU = S::kU, kW = S::kW, kLaw = kX ? kX + 1 : 0;
   const Problem<T, S>& problem;
   const S n;
+  // Without contacts and constraints the Hessian depends on the active bounds alone, so that a stage keeps what it has
+  // until they change there or later in the horizon.
+  const bool keeps;
   Linearisation<T, S> linearisation;
   Stages<Matrix<Vec, kX, kX>> P;
   Matrix<Vec, 0, kX> p, v;
-  Matrix<Vec, kW, kW> H;
+  Stages<Matrix<Vec, kW, kW>> hessians;
+  Stages<Matrix<Vec, kU, kU>> factors;
+  Matrix<Mask, 0, kU> held;  // the active actions of each stage that keeps H, L and its law
+  bool* known;               // which stages do
+  Matrix<Vec, kW, kW> H;     // of the current stage
   Matrix<Vec, kX, kW> PA;
   Matrix<Vec, kU, kU> H_uu, L;
   Matrix<Vec, kU, kLaw> law;
@@ -71,18 +81,22 @@ class Riccati {
   // Of each constraint: its multiplier, and what it adds to the curvature along its row. The adjoint is given both.
   Matrix<Vec, 0, 0> force, stiffness;
 
-  explicit Riccati(const Problem<T, S>& problem) : problem(problem), n(problem.n), linearisation(problem, kAdjoint) {}
+  explicit Riccati(const Problem<T, S>& problem)
+      : problem(problem), n(problem.n), keeps(!kAdjoint && problem.linear()), linearisation(problem, kAdjoint || keeps) {}
 
   void layout(Arena& arena) {
-    const int64_t nx = n.x(), nu = n.u(), nw = n.w(), h = n.h, values = kAdjoint ? h + 1 : 2;
+    const int64_t nx = n.x(), nu = n.u(), nw = n.w(), h = n.h, values = kAdjoint || keeps ? h + 1 : 2;
     linearisation.layout(arena);
     arena.take(P, values, nx, nx);
     arena.take(p, values, nx);
     arena.take(v, values, nx);
-    arena.take(H, nw, nw);
+    arena.take(hessians, keeps ? h : 1, nw, nw);
+    arena.take(factors, keeps ? h : 1, nu, nu);
+    arena.take(held, keeps ? h : 0, nu);
+    arena.take(known, keeps ? h : 0);
+    for (int64_t k = 0; k < h && keeps && arena.memory && !problem.kept; k++) known[k] = false;
     arena.take(PA, nx, nw);
     arena.take(H_uu, nu, nu);
-    arena.take(L, nu, nu);
     arena.take(law, nu, nx + 1);
     arena.take(linear, nw);
     arena.take_all(nu, flat, active, toward, share);
@@ -101,9 +115,9 @@ class Riccati {
 
   Stage<S> stage(int64_t k) const { return linearisation.stage(k); }
 
-  // The adjoint keeps all of them, the solver this stage's and the next's.
+  // All of them, or this stage's and the next's.
   Value<S> value(int64_t k) const {
-    const int64_t at = kAdjoint ? k : k % 2;
+    const int64_t at = kAdjoint || keeps ? k : k % 2;
     return {P[at], p[at], v[at]};
   }
 
@@ -122,18 +136,32 @@ class Riccati {
       for (int64_t k = 0; k < n.h; k++) largest_action[j] = max(largest_action[j], abs(at.u(k, j)));
     }
     terminal(at.x[n.h], kAdjoint ? upstream.x[n.h] : nullptr);
+    const bool undamped = keeps && !any(newton.regularisation > 0);
+    bool same = undamped && problem.shared;  // P of the next stage is the one that this stage knows
     for (int64_t k = n.h - 1; k >= 0; k--) {
       const StageData<T, S>& data = problem.stage(k);
       const Value<S> next = value(k + 1);
-      const Stage<S> stage = linearisation.at(k, at.lam[k], at.s[k], next.p, newton.regularisation);
+      same = same && known[k];
+      H = hessians[keeps ? k : 0];
+      L = factors[keeps ? k : 0];
+      const Stage<S> stage =
+          same ? linearisation.stage(k) : linearisation.at(k, at.lam[k], at.s[k], next.p, newton.regularisation);
       constraints(k, data, at.x[k], at.u[k]);
-      stage_hessian(k, data, stage, next.P);
+      if (!same) stage_hessian(k, data, stage, next.P);
       const Vec* lam_bar = kAdjoint ? upstream.lam[k] : nullptr;
       actions(k, data, stage, next, at.x[k], at.u[k], kAdjoint ? upstream.u[k] : nullptr, lam_bar);
       states(k, data, stage, next, at.x[k], at.u[k], kAdjoint ? upstream.x[k] : nullptr, lam_bar);
-      factor(data);
+      if (!kAdjoint && any(newton.gauss_newton)) linearisation.drop(newton.gauss_newton);
+      action_hessian(data);
+      bool sound = undamped;
+      if (!same || !holds(k)) sound = !any(factor(data)) && sound;
       if (!kAdjoint) step_within_bounds(k, data, at.u[k]);
-      feedback_law(k);
+      same = same && sound && holds(k);
+      if (same)
+        linear_value(k);
+      else
+        feedback_law(k);
+      if (keeps) keep(k, sound);
     }
     for (int64_t i = 0; i < n.c(); i++)
       result.violated = max(result.violated, row_violation[i] / select(row_terms[i] > 0, row_terms[i], all(1)));
@@ -285,6 +313,7 @@ class Riccati {
       if (barrier > 0) part = select(projected > 0, part, all(0));
       result.stationary = max(result.stationary, part);
       flat[j] = (kFlat + flat_damping) * across;
+      if (keeps) flat[j] = select(data.R(j, j) > kPriced * abs(H(nx + j, nx + j)), all(0), flat[j]);
       const Vec least = 1e-10 * reference * per_width;
       const Vec curved = max(H(nx + j, nx + j) + linearisation.curvature(nx + j, nx + j), max(least, all(kTiny)));
       const Vec step = g / curved;
@@ -318,15 +347,34 @@ class Riccati {
   void states(int64_t k, const StageData<T, S>& data, const Stage<S>& stage, const Value<S>& next, const Vec* x,
               const Vec* u, const Vec* x_bar, const Vec* lam_bar) {
     Vec* p = value(k).p;
-    for (int64_t i = 0; i < n.x(); i++) {
-      Vec t = data.q[i] + data.Q.row(i) * x;
-      if (problem.batch.crossed) t = t + data.cross.row(i) * u;
-      if (n.c() > 0) result.cost_gradient += abs(t);
-      for (int64_t r = 0; r < n.c(); r++) t += data.G(r, i) * force(k, r);
-      Vec l = (kAdjoint ? -x_bar[i] : t) + stage.A_hat.column(i) * next.v;
-      if (kAdjoint) l = l - stage.K_lam.column(i) * lam_bar;
-      p[i] = t + stage.A_hat.column(i) * next.p;
-      linear[i] = l;
+    multiply(data.Q, x, [&](int64_t i) { return data.q[i]; }, [&](int64_t i, Vec t) { p[i] = t; });
+    for (int64_t i = 0; i < n.x() && (problem.batch.crossed || n.c() > 0); i++) {
+      if (problem.batch.crossed) p[i] = p[i] + data.cross.row(i) * u;
+      if (n.c() > 0) result.cost_gradient += abs(p[i]);
+      for (int64_t r = 0; r < n.c(); r++) p[i] += data.G(r, i) * force(k, r);
+    }
+    by_columns(0, n.x(), [&](int64_t i, auto kind) {
+      using V = decltype(kind);
+      const V t = read<V>(p, i);
+      V l = (kAdjoint ? -read<V>(x_bar, i) : t) + stage.A_hat.template column<V>(i) * next.v;
+      if (kAdjoint) l = l - stage.K_lam.template column<V>(i) * lam_bar;
+      write<V>(p, i, t + stage.A_hat.template column<V>(i) * next.p);
+      write<V>(linear, i, l);
+    });
+  }
+
+  // Whether the active actions of stage k are those that its law is for.
+  bool holds(int64_t k) const {
+    Mask differs = Mask{};
+    for (int64_t j = 0; j < n.u(); j++) differs |= (active[j] & ~held(k, j)) | (held(k, j) & ~active[j]);
+    return !any(differs);
+  }
+
+  void keep(int64_t k, bool sound) {
+    known[k] = sound;
+    for (int64_t j = 0; j < n.u(); j++) {
+      held(k, j) = active[j];
+      known[k] = known[k] && !any(flat[j] > 0);
     }
   }
 
@@ -336,24 +384,34 @@ class Riccati {
     return max(data.R(j, j) + 1e-6 * abs(H(nx + j, nx + j)), all(kTiny));
   }
 
-  // Cholesky of H_uu + Y_uu + regularisation with identity rows for active actions. An indefinite block first drops
-  // what is negative in Y at this stage, then has its pivots lifted; lanes that are `keep_curvature` lift them at once.
-  void factor(const StageData<T, S>& data) {
-    const int64_t nx = n.x(), nu = n.u();
-    if (!kAdjoint && any(newton.gauss_newton)) linearisation.drop(newton.gauss_newton);
-    for (int attempt = 0; attempt < 2; attempt++) {
-      for (int64_t i = 0; i < nu; i++) {
-        by_columns(0, i + 1, [&](int64_t j, auto kind) {
-          using V = decltype(kind);
-          write<V>(H_uu[i], j, read<V>(H[nx + i], nx + j) + linearisation.template curvature<V>(nx + i, nx + j));
-        });
-        if (!kAdjoint) H_uu(i, i) += kActionDamping * newton.regularisation * action_scale(data, i) + flat[i];
-      }
-      const Mask failed = cholesky(data, attempt == 0);
-      if (kAdjoint) result.weak |= failed;
-      if (kAdjoint || !any(failed) || attempt == 1) break;
-      linearisation.make_convex(failed & ~newton.keep_curvature);
+  // H_uu + Y_uu + regularisation.
+  void action_hessian(const StageData<T, S>& data) {
+    const int64_t nx = n.x();
+    for (int64_t i = 0; i < n.u(); i++) {
+      by_columns(0, i + 1, [&](int64_t j, auto kind) {
+        using V = decltype(kind);
+        write<V>(H_uu[i], j, read<V>(H[nx + i], nx + j) + linearisation.template curvature<V>(nx + i, nx + j));
+      });
+      if (!kAdjoint) H_uu(i, i) += kActionDamping * newton.regularisation * action_scale(data, i) + flat[i];
     }
+  }
+
+  // Cholesky of that with identity rows for active actions. An indefinite block first drops what is negative in Y at
+  // this stage, then has its pivots lifted; lanes that are `keep_curvature` lift them at once. Returns where a pivot
+  // was lifted or is singular.
+  Mask factor(const StageData<T, S>& data) {
+    const Mask weak = result.weak;
+    result.weak = Mask{};
+    Mask failed = cholesky(data, true);
+    if (kAdjoint) result.weak |= failed;
+    if (!kAdjoint && any(failed)) {
+      linearisation.make_convex(failed & ~newton.keep_curvature);
+      action_hessian(data);
+      failed |= cholesky(data, false);
+    }
+    const Mask poor = failed | result.weak;
+    result.weak |= weak;
+    return poor;
   }
 
   // The factor L of H_uu, with reciprocal pivots on the diagonal. Returns where a pivot was lifted.
@@ -429,6 +487,16 @@ class Riccati {
     }
   }
 
+  // The linear term of the value function, from the feedforward.
+  void linear_value(int64_t k) {
+    by_columns(0, k > 0 ? n.x() : 0, [&](int64_t i, auto kind) {
+      using V = decltype(kind);
+      V v = read<V>(linear, i);
+      for (int64_t j = 0; j < n.u(); j++) v += read<V>(H[n.x() + j], i) * feedforward(k, j);
+      write<V>(value(k).v, i, v);
+    });
+  }
+
   // Feedback -H_uu^-1 H_ux, rows of active actions zero, and the value function of stage k; in the adjoint the
   // feedforward too, -H_uu^-1 linear_u, which the solver has from `step_within_bounds`.
   void feedback_law(int64_t k) {
@@ -461,13 +529,9 @@ class Riccati {
           write<V>(here.P[i], j, read<V>(H[i], j) - law.column(i) * law.template column<V>(j));
         });
         for (int64_t j = 0; j < i; j++) here.P(j, i) = here.P(i, j);
-        Vec v = linear[i];
-        if (kAdjoint)
-          v = v - law.column(i) * law.column(nx);
-        else
-          for (int64_t j = 0; j < nu; j++) v += H(nx + j, i) * feedforward(k, j);
-        here.v[i] = v;
+        if (kAdjoint) here.v[i] = linear[i] - law.column(i) * law.column(nx);
       }
+      if (!kAdjoint) linear_value(k);
     }
     for (int64_t i = nu - 1; i >= 0; i--)
       by_columns(first, columns, [&](int64_t j, auto kind) {

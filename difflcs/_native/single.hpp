@@ -54,5 +54,9 @@ static inline Two& operator*=(Two& a, Vec b) { return a *= b.lane; }
 static inline Four& operator*=(Four& a, Vec b) { return a *= b.lane; }
 static inline Two zero_where(Mask m, Two a) { return m.lane ? Two{} : a; }
 static inline Four zero_where(Mask m, Four a) { return m.lane ? Four{} : a; }
+static inline Two abs(Two a) { return (Two)((decltype(a < a))a & INT64_MAX); }
+static inline Four abs(Four a) { return (Four)((decltype(a < a))a & INT64_MAX); }
+static inline Two max(Two a, Two b) { return a > b ? a : b; }
+static inline Four max(Four a, Four b) { return a > b ? a : b; }
 
 }  // namespace difflcs::DIFFLCS_ISA

@@ -351,7 +351,8 @@ def is_inside(to: Tensor, side: Tensor) -> Tensor:
     """
     x, y = to.unbind(-1)
     width, height = side.unbind(-1)
-    spans = (y < 0) != (y < height)
+    below = y < 0  # of each corner, the same for both of its sides: else rounding could count a corner once
+    spans = below != below.roll(-1, -1)
     # x of the point against that of the side at its height, both multiplied by the side's height.
     left = x * height.abs() < y * width * height.sign()
     return ((spans & left).sum(-1) % 2).bool()

@@ -39,6 +39,8 @@ from difflcs.planning.travel import Travel
 
 __all__ = ["Decision", "Mode", "SamplingPolicy", "SamplingSettings"]
 
+_IDLE = 3  # pushes in succession that have changed nothing, after which the robot looks for another place
+
 Bounds = Callable[[Tensor], tuple[Tensor, Tensor]]
 """States (n, n_x) → u_min and u_max (n, n_u), where the bounds of an action depend on the state."""
 
@@ -167,7 +169,8 @@ class SamplingPolicy:
         self._steps = 0
         self._last: Tensor | None = None
         self._barred: list[Tensor] = []
-        self._reference = 0.0
+        self._reference = self._stood = 0.0
+        self._idle = 0
 
     @property
     def decision(self) -> Decision | None:
@@ -234,6 +237,7 @@ class SamplingPolicy:
         scores = torch.cat([gains[:1], gains[1:] - scale * price])
         best, here = float(scores.max()), float(gains[0])
         pushes = self.places.near(state) and here > settings.smallest_gain * scale and here >= settings.keep * best
+        pushes = pushes and self._moves(standing)
         chosen = 0 if stay or pushes else self._choose(states, scores, standing)
         self._place, self._steps = (places[chosen - 1].clone(), 0) if chosen else (None, 0)
         target = states[chosen] if chosen else None
@@ -243,6 +247,15 @@ class SamplingPolicy:
         if target is not None:
             return self.travel.action(state, target).numpy()
         return solution.action[0].numpy()
+
+    def _moves(self, standing: float) -> bool:
+        """Return False if a few pushes in succession have not changed the cost of standing still."""
+        pushed = self._decision is not None and self._decision.mode is Mode.PUSH
+        same = abs(standing - self._stood) <= self.settings.smallest_gain * self._stood
+        self._idle = self._idle + 1 if pushed and same else 0
+        if not same:
+            self._stood = standing
+        return self._idle < _IDLE
 
     def _choose(self, states: Tensor, scores: Tensor, standing: float) -> int:
         """Choose the row of the place to go to; 0 where none is worth the way. Barred places get a score of −∞."""

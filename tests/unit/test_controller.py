@@ -99,6 +99,19 @@ def test_its_plans_are_those_of_the_layer_bit_for_bit_also_from_a_file(build, tm
             assert plan.fallback is plan.late is False
 
 
+def test_what_is_kept_without_contact_fits_every_set_of_active_bounds(build):
+    mpc = LCSMPCLayer(build.params(0, n_lam=0), build.cost(0), H, -0.3, 0.3)
+    controller, active = mpc.controller(), set()
+    for x in 20 * states(12):
+        controller.reset()
+        controller.step(x)
+        plan = controller.plan
+        assert np.array_equal(plan.u, mpc(torch.from_numpy(x)).u.detach().numpy())
+        assert plan.status.solved
+        active.add((np.abs(plan.u) == 0.3).tobytes())
+    assert len(active) > 3
+
+
 def test_goals_and_references(reaching):
     controller, solution = reaching.controller(), None
     rng = np.random.default_rng(1)

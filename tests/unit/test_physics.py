@@ -427,6 +427,12 @@ def test_what_a_drive_gives_way_and_what_the_body_moves():
     torch.testing.assert_close(after, tensor([force, 0.0, 0.0, -0.04 + gain * command - give * force, 0.0]))
 
 
+def test_a_point_beside_a_corner_that_is_off_by_rounding_is_not_inside():
+    y = torch.linspace(-3e-17, 3e-17, 61, dtype=F64)
+    shape = box(-0.48, -0.27, -0.855, -1.4685489743719004e-17)
+    assert not bool(shape.contains(torch.stack([torch.full_like(y, -1.2), y], -1)).any())
+
+
 def test_only_the_nearest_parts_touch():
     parts = tuple(box(a, a + 0.02, -0.01, 0.01) for a in (-0.05, -0.01, 0.03))
     both = [PlanarPushing(Union(parts), 0.005, 2, friction=0.4, nearest=n) for n in (None, 1)]

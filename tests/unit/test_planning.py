@@ -187,6 +187,15 @@ def test_a_place_from_which_nothing_moved_is_left_for_the_next_best():
     assert targets == [-0.51, -0.53]
 
 
+def test_where_pushes_move_nothing_the_robot_looks_for_another_place():
+    policy, modes = on_a_line(), []
+    for _ in range(7):  # a push from here promises much, but the block is stuck
+        policy.act([0.0, -0.51], [1.0])
+        modes.append(policy.decision.mode)
+    assert modes[:3] == [Mode.PUSH] * 3
+    assert Mode.TRAVEL in modes[3:]
+
+
 def test_what_was_barred_is_open_again_when_the_cost_has_changed():
     policy = on_a_line()
     policy.act([0.0, 0.51], [1.0])

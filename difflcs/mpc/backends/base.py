@@ -44,12 +44,12 @@ class Result:
 
     @functools.cached_property
     def all_converged(self) -> bool:
-        """Whether every plan is CONVERGED, so that callers can skip further checks."""
+        """True if every plan is CONVERGED, so that callers can skip further checks."""
         return all_converged(self.status)
 
     @functools.cached_property
     def costs_known(self) -> bool:
-        """Whether `objective` is the cost of every plan."""
+        """True if `objective` is the cost of every plan."""
         return self.objective is not None and self.all_converged
 
     @property

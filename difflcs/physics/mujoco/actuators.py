@@ -142,7 +142,7 @@ class Actuators:
         return low, high
 
     def places(self, x: Array) -> tuple[Array, Array]:
-        """How far joints of servos may go (..., nu) from positions that x begins with, to stay within their range."""
+        """Compute how far joints of servos may go (..., nu) within their range, from positions that x begins with."""
         moves = np.where(self.servo & (self.gear != 0), self.gear, 1.0)
         low, high = np.sort([(end + self.offset - self._length(x)) / moves for end in self.range], axis=0)
         return np.where(self.servo, low, -np.inf), np.where(self.servo, high, np.inf)

@@ -224,7 +224,7 @@ class MujocoCost(TensorFields):
         return [] if goal is None else [check_tensor("goal", goal, [("n_goal", self.n_goal)])]
 
     def _wanted(self, of: Any, goal: Any, turns: Any) -> Any:
-        """What all rows (..., rows) are to be, where frames have the orientations `turns` (..., frames, 4)."""
+        """Compute the targets of all rows (..., rows), where frames have the orientations `turns` (..., frames, 4)."""
         parts, start = [of.zeros(0)], 0
         for row in self._rows:
             if row.goal is None:

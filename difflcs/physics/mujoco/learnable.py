@@ -296,7 +296,7 @@ class _Matrices(Solver):
         ranks = [len(dims) for dims in SYSTEM.values()]
 
         def moved(i: int, j: int, step: float) -> Tensor:
-            """How far a step of number j of input i moves the matrices, along the gradient, for each state."""
+            """Compute how far a step of number j of input i moves the matrices, along the gradient, for each state."""
             changed = list(plain)
             changed[i] = plain[i].clone()
             changed[i][..., j] += step

@@ -113,7 +113,7 @@ class Place:
 
 
 class Places:
-    """Where states are computed: the caller's model and data, and as many copies as there are threads.
+    """Memory in which states are computed: the caller's model and data, and as many copies as there are threads.
 
     Args:
         model: a private copy, which does not change any more.

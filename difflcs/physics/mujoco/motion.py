@@ -411,7 +411,7 @@ class DynamicStep(NamedTuple):
         return FreeMotion(*(torch.from_numpy(v) for v in (A_x, to_x @ control, d, response)))
 
     def effect(self, tangent: Array | None, normal: Array, impulse: Array) -> Array:
-        """What forces do to the next state (n, n_x, k): ζ moves by h S `normal` (n, k, nv), ν by S `impulse`."""
+        """Compute what forces add to the next state (n, n_x, k): ζ gets h S `normal` (n, k, nv), ν S `impulse`."""
         h, (n, n_x), nv = self.seconds, self.x.shape, self.place.shape[1]
         place, velocity = (self.response @ rows.swapaxes(-1, -2) for rows in (h * normal, impulse))
         still = np.zeros((n, n_x - 2 * nv, normal.shape[1]))

@@ -106,7 +106,7 @@ class Recovery:
 
 
 class Situation(NamedTuple):
-    """What acts in a step from n states.
+    """Forces and constraints that act in a step from n states.
 
     Attributes:
         step: the motion without contact.

@@ -53,7 +53,7 @@ class WarmupSettings(Settings):
     action_support_growth: float = bounded(1.03, above=0)
     """Factor on action_support per iteration: nearly the full bounds after 6 minutes on the cube."""
     keep_support: bool = False
-    """Whether the learned `LCSModel` keeps the last of these bounds, within which its MPC plans from then on."""
+    """The learned `LCSModel` keeps the last of these bounds, within which its MPC plans from then on."""
     adam: Adam = group(Adam, learning_rate=1e-2, betas=(0.9, 0.9))
     """Adam, which is reset in every training call."""
     learning_rate_decay: float = bounded(0.99, above=0)

@@ -1,4 +1,4 @@
-"""What the compiled stepper's operational-space control of the three fingertips (Khatib 1987) reads and writes.
+"""Inputs and outputs of the compiled stepper's operational-space control of the three fingertips (Khatib 1987).
 
 The task acceleration of a tip is a = kp (target - tip) - kd v with kd = 2 sqrt(kp), critically damped. The control law
 is tau = J^T Lambda a + bias with Lambda = (J M^-1 J^T)^-1. The mass matrix is block diagonal over the fingers and each

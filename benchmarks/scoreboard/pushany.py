@@ -1,0 +1,201 @@
+"""Every shape of gym-pushany by sampling-based contact MPC: `python benchmarks/scoreboard/pushany.py --episodes 50`.
+
+The environment (gym-pushany 0.1.13, after Push-T) is as its author publishes it: 21 shapes, its own starts, goals and
+success flag (more than 95 % of the goal covered), 300 steps of 0.1 s, and up to four other bodies in the way, which can
+be pushed, too. Only its pictures are not drawn. The policy is that of examples/push_t.py, with the outline, mass and
+moment of the body, the outlines of what is in the way, the goal and the true state.
+
+The environment's seed draws the goal and how many bodies are in the way: those seeds are played that draw
+`--obstacles`. It may draw a goal that lies across its walls. These are played, and count like others; the success
+without them is printed beside (`inside`, and the number of goals that are).
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import sys
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import shapely
+import torch
+import tyro
+from numpy.typing import NDArray
+from pusht import STEPS, Episode, Variant, play
+from shapely import affinity
+from successes import success_figures
+
+from difflcs.errors import InvalidInputError, MissingDependencyError
+from difflcs.physics import PlanarPushing, Polygon, Union
+
+sys.path.append(str(Path(__file__).resolve().parents[2] / "examples"))
+from push_t import PIXELS, DiscPolicy, tee_pushing
+
+try:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of pygame, about pkg_resources
+        from gym_pushany.envs.pushany_env import (  # pyright: ignore[reportMissingImports]
+            OBJECT_NAME_LIST,
+            PushAnyEnv,
+            pymunk_to_shapely,
+        )
+except ImportError as error:
+    raise MissingDependencyError(
+        f"expected the package gym-pushany, not installed ({error}); run: pip install gym-pushany==0.1.13"
+    ) from error
+
+INSIDE = shapely.box(7, 7, 504, 504)
+"""The plane inside the walls [px]."""
+ALIKE = 0.99
+"""Part of the area that a turn must cover for a pose to count as the same."""
+
+
+class StateEnv(PushAnyEnv):
+    """The environment with a state as its observation: place of the disc and pose of the body, as gym-pusht has it."""
+
+    def get_obs(self) -> NDArray[np.float64]:
+        """Return x, y of the disc, x, y and angle of the body's origin (5,) [px, rad]."""
+        return np.array([*self.agent.position, *self.block.position, self.block.angle])
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        """Begin an episode; the seed is that of the goal and of the start."""
+        self.seed(seed)
+        self.obstacles = []
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> Any:
+        """Take a step; the information has the coverage."""
+        observation, _, success, truncated, info = super().step(action)
+        return observation, 0.0, success, truncated, {**info, "coverage": self._calculate_coverage()}
+
+    @property
+    def goal_inside(self) -> bool:
+        """True if a body on the goal would be inside the walls."""
+        goal = pymunk_to_shapely(self._get_goal_pose_body(self.goal_pose), self.block.shapes)
+        return bool(shapely.within(goal.envelope, INSIDE))
+
+
+def pushing(body: Any) -> tuple[PlanarPushing, NDArray[np.float64]]:
+    """Make the system of a body of pymunk, about the centre of its area, and the place of this centre [length]."""
+    parts = [np.array(shape.get_vertices()) / PIXELS for shape in body.shapes]
+    center = Union(tuple(Polygon(torch.from_numpy(part)) for part in parts)).centroid
+    shape = Union(tuple(Polygon(torch.from_numpy(part) - center) for part in parts))
+    mass = torch.tensor(tuple(body.center_of_gravity), dtype=torch.float64) / PIXELS - center
+    gyration = (body.moment / body.mass) ** 0.5 / PIXELS
+    return tee_pushing(shape=shape, center_of_mass=mass, gyration=gyration, nearest=2), center.numpy()
+
+
+def count_turns(body: Any, center: NDArray[np.float64]) -> int:
+    """Count the turns of a body of pymunk about a centre [length] that cover it."""
+    whole = shapely.unary_union([shapely.Polygon(shape.get_vertices()) for shape in body.shapes])
+
+    def covered(n: int) -> float:
+        turned = affinity.rotate(whole, 360 / n, origin=tuple(PIXELS * center))
+        return turned.intersection(whole).area / whole.area
+
+    return max(n for n in range(1, 13) if covered(n) > ALIKE)
+
+
+class PushAnyPolicy(DiscPolicy):
+    """The policy for a shape of the environment, which it asks for the goal."""
+
+    def __init__(self, env: StateEnv):
+        self.env = env
+        env.reset(seed=0)
+        system, center = pushing(env.block)
+        super().__init__(system, center, turns=count_turns(env.block, center))
+
+    def reset(self) -> None:
+        """Start an episode."""
+        super().reset()
+        self.goal = self.env.goal_pose
+
+
+@dataclass
+class Options:
+    """Shapes of gym-pushany by sampling-based contact MPC."""
+
+    episodes: int = 50
+    """Episodes of each shape."""
+    seed: int = 0
+    """The first seed that may be played."""
+    obstacles: int = 0
+    """Bodies in the way, 0 to 4."""
+    shape: str = "all"
+    """One of the shapes, or "all"."""
+    json: bool = False
+    """Print a line of JSON: of all shapes together, and with `--shape` of one."""
+    smoke: bool = False
+    """Two shapes, an episode of a few steps each."""
+
+
+def find_seeds(o: Options) -> list[int]:
+    """Find the seeds that draw this number of bodies in the way."""
+    drawn = (s for s in itertools.count(o.seed) if np.random.RandomState(s).randint(0, 5) == o.obstacles)
+    return list(itertools.islice(drawn, o.episodes))
+
+
+class Played(NamedTuple):
+    """An episode, and whether a body on its goal would be inside the walls."""
+
+    episode: Episode
+    inside: bool
+
+
+def measure(name: str, o: Options) -> list[Played]:
+    """Play the episodes of a shape."""
+    env = StateEnv(object_name=name)
+    policy, limit = PushAnyPolicy(env), 5 if o.smoke else STEPS
+    return [Played(play(env, policy, seed, Variant(), limit), env.goal_inside) for seed in find_seeds(o)]
+
+
+def figures(played: list[Played]) -> dict[str, Any]:
+    """Compute the figures of episodes."""
+    success, steps, _, milliseconds, _ = np.array([one.episode for one in played], float).T
+    inside = [one.episode.success for one in played if one.inside]
+    return {
+        **success_figures(success),
+        "mean_steps": float(steps.mean()),
+        "milliseconds_per_step": float(milliseconds.sum() / steps.sum()),
+        "inside": float(np.mean(inside)) if inside else None,
+        "goals_inside": len(inside),
+    }
+
+
+def main(o: Options) -> None:
+    """Run the episodes, print the figures of each shape and of all."""
+    if o.shape not in (*OBJECT_NAME_LIST, "all") or not 0 <= o.obstacles <= 4:
+        shapes = ", ".join(OBJECT_NAME_LIST)
+        raise InvalidInputError(f"expected 0 to 4 obstacles and a shape of {shapes} or all, got {o}")
+    names = OBJECT_NAME_LIST if o.shape == "all" else [o.shape]
+    if o.smoke:
+        names, o.episodes = names[:2], 1
+    torch.set_num_threads(1)
+    everything: list[Played] = []
+    for name in names:
+        played = measure(name, o)
+        everything += played
+        if not o.json:
+            report(name, figures(played))
+    if o.json:
+        print(json.dumps({"shape": o.shape, "obstacles": o.obstacles, **figures(everything)}))
+    else:
+        report("together", figures(everything))
+
+
+def report(name: str, f: dict[str, Any]) -> None:
+    """Print the figures of a shape."""
+    inside = "" if f["inside"] is None else f", {100 * f['inside']:.1f} % of {f['goals_inside']} with a goal inside"
+    print(
+        f"{name}: {100 * f['success_rate']:.1f} % of {f['episodes']} ({100 * f['ci_low']:.1f} to "
+        f"{100 * f['ci_high']:.1f}){inside}; {f['mean_steps']:.1f} steps, {f['milliseconds_per_step']:.1f} ms a step",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
