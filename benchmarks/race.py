@@ -113,6 +113,8 @@ class Options:
     """Make these environments, from the package index, and end."""
     parts: tuple[str, ...] = ("contact", "linear", "global", "planners")
     """Parts to run; the others stay as they are in the file."""
+    only: tuple[str, ...] = ()
+    """Labels of those who take part with contact and without; everybody if none is named."""
     tune: float = 0.0
     """CPU seconds in which settings of each planner are drawn for each family, on other seeds; then it ends."""
     out: Path = Path("benchmarks/results/race.json")
@@ -398,7 +400,7 @@ def best_rival(families: dict[str, dict]) -> dict[str, dict]:
 
 def race(name: str, o: Options) -> Iterator[tuple[str, object]]:
     """Run one part of the race; return its entries of the JSON."""
-    entries = CONTACT if name == "contact" else LINEAR
+    entries = tuple(e for e in (CONTACT if name == "contact" else LINEAR) if not o.only or e.label in o.only)
     batch, make = (o.batch, with_contact) if name == "contact" else (o.linear_batch, without_contact)
     problems = make(max(batch, o.problems), o.seeds)
     with tempfile.TemporaryDirectory() as folder:

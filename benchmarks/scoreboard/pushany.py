@@ -22,11 +22,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
-import shapely.affinity
 import torch
 import tyro
 from numpy.typing import NDArray
 from pusht import STEPS, Episode, Variant, play
+from shapely import affinity
 from successes import success_figures
 
 from difflcs.errors import InvalidInputError, MissingDependencyError
@@ -38,10 +38,14 @@ from push_t import PIXELS, DiscPolicy, tee_pushing
 try:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of pygame, about pkg_resources
-        from gym_pushany.envs.pushany_env import OBJECT_NAME_LIST, PushAnyEnv, pymunk_to_shapely
+        from gym_pushany.envs.pushany_env import (  # pyright: ignore[reportMissingImports]
+            OBJECT_NAME_LIST,
+            PushAnyEnv,
+            pymunk_to_shapely,
+        )
 except ImportError as error:
     raise MissingDependencyError(
-        f"expected the package gym-pushany, not installed ({error}); run: pip install gym-pushany"
+        f"expected the package gym-pushany, not installed ({error}); run: pip install gym-pushany==0.1.13"
     ) from error
 
 INSIDE = shapely.box(7, 7, 504, 504)
@@ -75,27 +79,22 @@ class StateEnv(PushAnyEnv):
         return bool(shapely.within(goal.envelope, INSIDE))
 
 
-def outline(body: Any) -> Union:
-    """Make the shape of a body of pymunk about its origin, in units of length."""
-    return Union(tuple(Polygon(np.array(shape.get_vertices()) / PIXELS) for shape in body.shapes))
-
-
 def pushing(body: Any) -> tuple[PlanarPushing, NDArray[np.float64]]:
-    """Make the system of a body, about the centre of its area, and the place of this centre."""
-    shape = outline(body)
-    center = shape.centroid
-    shape = Union(tuple(Polygon(part.vertices - center) for part in shape.parts))
+    """Make the system of a body of pymunk, about the centre of its area, and the place of this centre [length]."""
+    parts = [np.array(shape.get_vertices()) / PIXELS for shape in body.shapes]
+    center = Union(tuple(Polygon(torch.from_numpy(part)) for part in parts)).centroid
+    shape = Union(tuple(Polygon(torch.from_numpy(part) - center) for part in parts))
     mass = torch.tensor(tuple(body.center_of_gravity), dtype=torch.float64) / PIXELS - center
     gyration = (body.moment / body.mass) ** 0.5 / PIXELS
     return tee_pushing(shape=shape, center_of_mass=mass, gyration=gyration, nearest=2), center.numpy()
 
 
-def count_turns(shape: Union) -> int:
-    """Count the turns of a shape about its centre that cover it."""
-    whole = shapely.unary_union([shapely.Polygon(part.vertices.numpy()) for part in shape.parts])
+def count_turns(body: Any, center: NDArray[np.float64]) -> int:
+    """Count the turns of a body of pymunk about a centre [length] that cover it."""
+    whole = shapely.unary_union([shapely.Polygon(shape.get_vertices()) for shape in body.shapes])
 
     def covered(n: int) -> float:
-        turned = shapely.affinity.rotate(whole, 360 / n, origin=(0, 0))
+        turned = affinity.rotate(whole, 360 / n, origin=tuple(PIXELS * center))
         return turned.intersection(whole).area / whole.area
 
     return max(n for n in range(1, 13) if covered(n) > ALIKE)
@@ -108,7 +107,7 @@ class PushAnyPolicy(DiscPolicy):
         self.env = env
         env.reset(seed=0)
         system, center = pushing(env.block)
-        super().__init__(system, center, turns=count_turns(system.shape))
+        super().__init__(system, center, turns=count_turns(env.block, center))
 
     def reset(self) -> None:
         """Start an episode."""

@@ -24,6 +24,7 @@ from difflcs.rl.learning.trainer import Trainer
 from difflcs.rl.learning.warmup import Warmup, WarmupSettings, action_support, fit
 from difflcs.rl.methods import (
     ContactMethod,
+    ImproveMethod,
     LCSMethod,
     LCSRLMethod,
     Method,
@@ -59,6 +60,7 @@ __all__ = [
     "EnsembleSettings",
     "Epochs",
     "Evaluation",
+    "ImproveMethod",
     "LCSMPCPolicy",
     "LCSMethod",
     "LCSRLMethod",

@@ -1,4 +1,4 @@
-"""Push-T of gym-pusht from outside: the scoreboard, learning from random pushing, the film."""
+"""Push-T of gym-pusht from outside: the scoreboard, learning from random pushing, the film; shapes of gym-pushany."""
 
 import importlib.util
 import json
@@ -59,6 +59,24 @@ def test_the_scoreboard_prints_its_keys_and_goes_on_where_it_was(board, capsys, 
     assert line_of(capsys) == first
     with pytest.raises(ValueError, match="name another file"):
         play(seed=5)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("gym_pushany") is None, reason="needs gym-pushany: pip install it")
+@pytest.mark.slow  # plays
+def test_the_scoreboard_of_shapes_prints_its_keys_and_knows_turns_that_mean_the_same(board, capsys):
+    import pushany
+
+    pushany.main(pushany.Options(json=True, smoke=True, obstacles=2))
+    assert set(line_of(capsys)) >= KEYS - {"coverage"}
+    shapes = {"t": 1, "0": 2, "4": 1, "5": 2, "rectangle": 2, "reg7": 7}
+    for name, turns in shapes.items():
+        env = pushany.StateEnv(object_name=name)
+        env.reset(seed=0)
+        assert pushany.count_turns(env.block, pushany.pushing(env.block)[1]) == turns
+    seeds = pushany.find_seeds(pushany.Options(3, obstacles=2))
+    for seed in seeds:
+        env.reset(seed=seed)
+        assert len(env.obstacles) == 2
 
 
 def test_a_variant_that_is_none_is_refused(board):

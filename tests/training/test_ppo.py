@@ -20,10 +20,13 @@ from tests.training.slide import (
     Slide,
     features,
     make_envs,
+    make_model,
     make_models,
+    make_mpc,
     make_ppo,
     parameters,
     recorded,
+    same,
     slide_actor,
     small_settings,
 )
@@ -51,6 +54,24 @@ def test_ppo_learns():
     assert reports[0].explained_variance > 0.3
     with pytest.raises(InvalidInputError, match="all of them are done"):
         trainer.step()
+
+
+def test_a_start_is_replaced_by_what_is_better_and_by_nothing_else():
+    """What is handed out is the start, then what played when it was accepted; the learner goes its own way."""
+    settings = small_settings(rollouts=40, steps=10, std=0.04, target_kl=0.2, max_kl=0.6)
+    trainer = ppo_settings.make_ppo(
+        slide_actor(settings), make_envs(40), settings, 0, features=features, total_episodes=200, episode_steps=STEPS,
+        failure_penalty=10.0, best=make_mpc(make_model()),
+    )  # fmt: skip
+    expected, accepted = parameters(trainer), []
+    while not trainer.done:
+        playing = [value.clone() for value in trainer.actor.learned.state_dict().values()]
+        accepted.append(trainer.step().accepted)
+        expected = playing if accepted[-1] else expected
+        assert same(parameters(trainer), expected)
+        assert not same(list(trainer.actor.learned.state_dict().values()), playing)
+    assert not accepted[0]
+    assert any(accepted)
 
 
 def test_the_policy_explores_and_the_environment_gets_clipped_actions():

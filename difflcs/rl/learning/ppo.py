@@ -21,6 +21,7 @@ from difflcs.errors import InvalidInputError
 from difflcs.rl.learning.advantages import Advantages, RewardScale, returns
 from difflcs.rl.learning.checks import check_learned
 from difflcs.rl.learning.critic import Critic
+from difflcs.rl.learning.incumbent import Incumbent
 from difflcs.rl.learning.model_rollouts import ModelRollouts
 from difflcs.rl.learning.optim import UpdateRule
 from difflcs.rl.learning.state import State
@@ -63,6 +64,7 @@ class PPOReport:
         gradient_seconds: wall time of gradients and steps.
         value_seconds: wall time of advantages and value network.
         model_seconds: wall time of all model rollouts: the ensemble's training, episodes, solves, gradients.
+        accepted: 1 if its policy is handed out: always, but where a better one stays (0), see `Incumbent`.
     """
 
     iteration: int
@@ -86,6 +88,7 @@ class PPOReport:
     gradient_seconds: float
     value_seconds: float
     model_seconds: float
+    accepted: int
 
 
 # --- the parts --------------------------------------------------------------------------------------------------------
@@ -135,6 +138,7 @@ class PPO(Trainer):
         final_step: factor on all steps, falling linearly from 1 to this.
         models: plays episodes in networks besides those of the robot; None: real ones alone, as in the paper.
         practice: source of model rollouts, if there are models.
+        incumbent: holds the model to hand out, not the actor's; the first episodes are those of the start.
 
     Raises:
         InvalidInputError: an argument does not fit.
@@ -160,6 +164,7 @@ class PPO(Trainer):
         final_step: float = 0.3,
         models: ModelRollouts | None = None,
         practice: Source | None = None,
+        incumbent: Incumbent | None = None,
     ):
         learned = check_learned(actor.learned, robot.env)
         if total_episodes <= first_episode:
@@ -170,11 +175,11 @@ class PPO(Trainer):
         remaining = total_episodes - first_episode
         if robot.env.num_envs < min(rollouts, remaining):
             raise InvalidInputError(f"env: expected at least {rollouts} environments, got {robot.env.num_envs}")
-        super().__init__(learned, actor.controller, seed, episode_steps)
+        best = (learned, actor.controller) if incumbent is None else (incumbent.learned, incumbent.policy)
+        super().__init__(*best, seed, episode_steps)
         self.actor, self.robot, self.critic, self.surrogate, self.update = actor, robot, critic, surrogate, update
-        self.scale, self.features = scale, features
-        self.max_kl, self.final_step = max_kl, final_step
-        self.models, self.practice = models, practice
+        self.scale, self.features, self.max_kl, self.final_step = scale, features, max_kl, final_step
+        self.models, self.practice, self.incumbent = models, practice, incumbent
         self.first_episode, self.first_iteration = first_episode, first_iteration
         self.episodes, self.iteration = first_episode, first_iteration
         # As many iterations as `rollouts` asks for, all of the same size up to one episode.
@@ -209,6 +214,8 @@ class PPO(Trainer):
         model_success, model_loss = self._train_on_models(scale)
         model_seconds = time.perf_counter() - start
 
+        if self.incumbent is not None:
+            self.incumbent.begin()
         count = self.sizes[done]
         seeds = episode_seeds(self.seed, Stream.TRAINING, self.episodes, count)
         self.episodes += count
@@ -220,6 +227,8 @@ class PPO(Trainer):
             self.update.size.value = step_size  # it follows the model rollouts alone
         episodes, improvement = outcome.episodes, outcome.improvement
         self.remember(episodes)
+        kept = self.incumbent
+        accepted = kept is None or kept.challenge(outcome.starts, outcome.returns, self.critic.values)
         self.iteration += 1
         return PPOReport(
             iteration=self.iteration,
@@ -243,6 +252,7 @@ class PPO(Trainer):
             gradient_seconds=improvement.gradient_seconds,
             value_seconds=outcome.value_seconds,
             model_seconds=model_seconds,
+            accepted=int(accepted),
         )
 
     def _train_on_models(self, scale: float) -> tuple[float | None, float | None]:
@@ -251,7 +261,8 @@ class PPO(Trainer):
         Both are None if there are no models, or if they have no real episode yet.
         """
         models = self.models
-        if models is None or self.practice is None or not (len(models) and models.settings.iterations):
+        unknown = self.incumbent is not None and not len(self.incumbent)
+        if unknown or models is None or self.practice is None or not (len(models) and models.settings.iterations):
             return None, None
         settings = models.settings
         loss, success = models.fit(), 0.0
@@ -294,6 +305,8 @@ class PPO(Trainer):
         return _Outcome(
             episodes=episodes,
             improvement=improvement,
+            starts=inputs[:, 0],
+            returns=rewards.sum(1),
             mean_return=float(rewards.sum(1).mean()) / self.scale.factor,
             explained_variance=1 - float(unexplained),
             physics_seconds=physics_seconds,
@@ -379,8 +392,10 @@ class PPO(Trainer):
 
     def state_dict(self) -> dict[str, Any]:
         """See `Trainer`."""
+        kept = {} if self.incumbent is None else {"incumbent": self.incumbent.state_dict()}
         return {
             **super().state_dict(),
+            **kept,
             "settings": {"first_episode": self.first_episode, "first_iteration": self.first_iteration},
             "covariance": {"log_std": self.actor.gaussian.log_std, "mixing": self.actor.gaussian.mixing},
             "critic": self.critic.state_dict(),
@@ -399,6 +414,8 @@ class PPO(Trainer):
         self.update.load_state_dict(state["update"])
         if self.models is not None:
             self.models.load_state_dict(state["models"])
+        if self.incumbent is not None:
+            self.incumbent.load_state_dict(state["incumbent"])
 
 
 @dataclass
@@ -421,6 +438,8 @@ class _Outcome:
 
     episodes: TensorDict
     improvement: _Improvement
+    starts: Tensor
+    returns: Tensor
     mean_return: float
     explained_variance: float
     physics_seconds: float

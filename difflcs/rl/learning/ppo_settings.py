@@ -11,7 +11,9 @@ import torch
 from difflcs.errors import InvalidInputError
 from difflcs.records import LCSModule, LCSParams, LCSSequence
 from difflcs.rl.learning.advantages import GAEAdvantages, MultiActionAdvantages, RewardScale
+from difflcs.rl.learning.checks import check_learned
 from difflcs.rl.learning.critic import Critic, CriticSettings
+from difflcs.rl.learning.incumbent import Incumbent
 from difflcs.rl.learning.model_rollouts import ModelRollouts
 from difflcs.rl.learning.optim import AdamUpdate, Natural, NaturalUpdate, UpdateRule
 from difflcs.rl.learning.optim.update import Deviation
@@ -25,6 +27,7 @@ from difflcs.rl.tasks import Features
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
 
+    from difflcs.mpc import LCSMPCLayer
     from difflcs.rl.learning.policy import GaussianPolicy
 
 
@@ -99,6 +102,7 @@ def make_ppo(
     first_iteration: int = 0,
     failure_penalty: float = 0.0,
     models: ModelRollouts | None = None,
+    best: LCSMPCLayer | None = None,
 ) -> PPO:
     """Make PPO from its settings.
 
@@ -115,6 +119,8 @@ def make_ppo(
         failure_penalty: part of the last reward of a failed episode, see `TaskSpec`.
         models: plays episodes in networks besides those of the robot; None: real ones alone, as in the paper. Pass
             the episodes of a warm-up to `PPO.remember`.
+        best: a policy with a copy of the actor's model, which is handed out in its place and takes over what the actor
+            learns only when that is better, see `Incumbent`. None: the actor's own, better or worse.
 
     Raises:
         InvalidInputError: an argument does not fit.
@@ -152,6 +158,10 @@ def make_ppo(
             settings.minibatch,
             rollouts.value_epochs,
         )
+    incumbent = None
+    if best is not None:
+        models_of = (check_learned(best.lcs, env), check_learned(actor.learned, env))
+        incumbent = Incumbent(best, *models_of, settings.reward_scale * failure_penalty, len(example))
     betas = settings.adam.betas
     deviation = Deviation(actor, settings.std_learning_rate, betas, settings.std_range)
     return PPO(
@@ -172,6 +182,7 @@ def make_ppo(
         final_step=settings.final_step,
         models=models,
         practice=practice,
+        incumbent=incumbent,
     )
 
 

@@ -10,6 +10,7 @@ from difflcs.rl.methods.base import (
     register_method,
 )
 from difflcs.rl.methods.contact_lcs import ContactMethod
+from difflcs.rl.methods.improve import ImproveMethod
 from difflcs.rl.methods.lcs_rl import LCSRLMethod
 from difflcs.rl.methods.mujoco_lcs import MujocoMethod
 from difflcs.rl.methods.pddm import PDDMMethod
@@ -20,6 +21,7 @@ from difflcs.rl.methods.violation import ViolationMethod
 __all__ = [
     "DEFAULT_METHOD",
     "ContactMethod",
+    "ImproveMethod",
     "LCSMethod",
     "LCSRLMethod",
     "Method",
@@ -38,5 +40,14 @@ __all__ = [
 DEFAULT_METHOD = LCSRLMethod.name
 """The method of `difflcs train` without `--method`."""
 
-for _method in (LCSRLMethod, ViolationMethod, PPOMethod, PPOMLPMethod, PDDMMethod, ContactMethod, MujocoMethod):
+for _method in (
+    LCSRLMethod,
+    ViolationMethod,
+    PPOMethod,
+    ImproveMethod,
+    PPOMLPMethod,
+    PDDMMethod,
+    ContactMethod,
+    MujocoMethod,
+):
     register_method(_method)

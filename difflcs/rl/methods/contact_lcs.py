@@ -38,11 +38,13 @@ class ContactMethod(Method):
     """Settings of PPO."""
     models: ModelRolloutSettings = group(ModelRolloutSettings)
     """Settings of the model rollouts of PPO."""
+    keep_best: bool = True
+    """Whether what PPO learns replaces the policy so far only where it is better in the robot's own episodes."""
     backend: str = "batched"
     """MPC solver: batched, or ipopt, the reference."""
 
     name: ClassVar[str] = "contact-lcs"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     summary: ClassVar[str] = "known contacts whose physics is fitted, then PPO through the MPC; told the outline"
     reports: ClassVar[tuple[type, ...]] = (PhysicsFitReport, PPOReport)
     kind: ClassVar[str] = "physics"
@@ -75,7 +77,9 @@ class ContactMethod(Method):
         return LCSRL(
             fit,
             count * task.episode_steps,
-            lambda episodes, iterations: main_phase(work, policy, self.ppo, self.models, episodes, iterations),
+            lambda episodes, iterations: main_phase(
+                work, policy, self.ppo, self.models, episodes, iterations, self.keep_best
+            ),
         )
 
     def rebuild(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 from difflcs.mpc import LCSMPCLayer
@@ -29,8 +30,12 @@ def main_phase(
     models: ModelRolloutSettings | None,
     first_episode: int = 0,
     first_iteration: int = 0,
+    keep_best: bool = False,
 ) -> PPO:
-    """Make PPO from its settings, to continue after earlier episodes and iterations."""
+    """Make PPO from its settings, to continue after earlier episodes and iterations.
+
+    With `keep_best` it moves a copy of the controller, which itself changes only for the better, see `Incumbent`.
+    """
     # Here and not above: TorchRL takes seconds to import, which `difflcs --help` should not wait for.
     from difflcs.rl.learning.policy import make_actor
 
@@ -40,7 +45,7 @@ def main_phase(
     if models is not None and models.iterations:
         rollouts = ModelRollouts(envs, task.outcome, models, work.seed, task.episode_steps)
     return make_ppo(
-        make_actor(controller, settings.std, settings.covariance),
+        make_actor(copy.deepcopy(controller) if keep_best else controller, settings.std, settings.covariance),
         envs,
         settings,
         work.seed,
@@ -51,6 +56,7 @@ def main_phase(
         first_iteration=first_iteration,
         failure_penalty=task.failure_penalty,
         models=rollouts,
+        best=controller if keep_best and isinstance(controller, LCSMPCLayer) else None,
     )
 
 

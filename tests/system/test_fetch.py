@@ -1,0 +1,37 @@
+"""The scoreboard of gymnasium-robotics' Fetch tasks, on what needs no third-party model."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture
+def fetch(monkeypatch):
+    pytest.importorskip("mujoco")
+    pytest.importorskip("tyro")
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "benchmarks" / "scoreboard"))
+    import fetch
+
+    return fetch
+
+
+def test_a_puck_that_is_hit_slides_as_far_as_friction_lets_it(fetch):
+    geoms = SimpleNamespace(friction=np.array([0.1])), SimpleNamespace(friction=np.array([0.05]))
+    model = SimpleNamespace(
+        eq_solref=np.array([[0.02, 1.0]]),
+        body=lambda name: SimpleNamespace(geomadr=[1]),
+        geom=lambda of: geoms[of if of == 1 else 0],
+    )
+    system = fetch.sliding_system(model)
+    x = system.A.new_zeros(5)
+    x[4] = 0.8
+    x[:3] = -1.0  # the gripper is far
+    for k in range(system.horizon):
+        x = system.stage(k).step(x, x.new_zeros(1)).x_next
+    seen = np.zeros(25)
+    seen[14] = 0.8 * fetch.SECONDS
+    assert x[3] == pytest.approx(0.8**2 / (2 * 9.81 * 0.1), abs=2e-3)
+    assert fetch.place_of_rest(seen, 0.1)[0] == pytest.approx(0.8**2 / (2 * 9.81 * 0.1))
+    assert abs(x[4]) < 1e-3

@@ -1,0 +1,75 @@
+"""A policy is replaced only by what did better, as far as few episodes can tell."""
+
+import pytest
+import torch
+from torch import nn
+
+pytest.importorskip("torchrl")
+from difflcs.rl.learning.incumbent import ITERATIONS, Incumbent, is_better
+
+F64 = torch.float64
+
+
+def drawn(seed, count, mean=0.0, failing=0):
+    """Returns around a mean, some of them with the cost of a failure, which is 5."""
+    values = mean + 0.1 * torch.randn(count, generator=torch.Generator().manual_seed(seed), dtype=F64)
+    values[:failing] -= 5
+    return values
+
+
+def make(failure):
+    """A line that is handed out, and another one that learns."""
+    return Incumbent(lambda *_, **__: None, nn.Linear(1, 1), nn.Linear(1, 1), failure, 1)  # pyright: ignore
+
+
+def test_a_better_policy_passes_and_what_is_as_good_rarely_does():
+    assert is_better(drawn(0, 30), drawn(1, 30, failing=15), 5.0)
+    assert not is_better(drawn(0, 30, failing=15), drawn(1, 30), 5.0)
+    passed = sum(is_better(drawn(k, 30), drawn(1000 + k, 30), 0.0) for k in range(400))
+    assert 4 < passed < 40  # 5 %
+    assert not is_better(drawn(0, 1, mean=9.0), drawn(1, 30), 0.0)  # one episode tells nothing
+
+
+def test_a_failure_that_was_not_seen_counts():
+    """A small gain in all of 30 episodes is no proof against rare failures; in 3000 it is."""
+    few, many = (is_better(drawn(0, count, mean=0.1), drawn(1, count), 2.0) for count in (30, 3000))
+    assert not few
+    assert many
+    assert is_better(drawn(0, 30, mean=0.1), drawn(1, 30), 0.0)
+
+
+def test_starts_are_judged_by_what_was_expected_of_them():
+    """A worse policy that had easier goals does not pass, a better one that had harder ones does."""
+    starts = torch.cat([torch.zeros(30, 1), torch.ones(30, 1)]).double()
+    easy, hard = starts[:30], starts[30:]
+    for own, gain, passes in ((hard, -1.0, False), (easy, 1.0, True)):
+        incumbent, other = make(1.0), easy if own is hard else hard
+        model = incumbent.learner.state_dict()
+
+        def values(inputs):
+            return -9 * inputs.squeeze(-1)
+
+        incumbent.begin()
+        assert not incumbent.challenge(own, values(own) + drawn(0, 30), values)  # its own episodes
+        assert incumbent.challenge(other, values(other) + drawn(1, 30, gain), values) is passes
+        same = all(torch.equal(value, incumbent.learned.state_dict()[name]) for name, value in model.items())
+        assert same is passes
+
+
+def test_several_iterations_count_together_and_its_state_goes_on():
+    def values(inputs):
+        return torch.zeros(len(inputs), dtype=F64)
+
+    incumbent, starts, outcomes = make(5.0), torch.zeros(30, 1, dtype=F64), []
+    incumbent.challenge(starts, drawn(0, 30, failing=4), values)
+    for k in range(ITERATIONS):
+        copied = make(5.0)
+        copied.load_state_dict(incumbent.state_dict())
+        arguments = (starts, drawn(k + 1, 30), values)
+        for one in (incumbent, copied):
+            one.begin()
+        outcomes.append(incumbent.challenge(*arguments))
+        assert copied.challenge(*arguments) is outcomes[-1]
+        assert len(copied) == len(incumbent)
+    assert not outcomes[0]
+    assert any(outcomes)
