@@ -3,7 +3,7 @@
 The environment (gym-pushany 0.1.13, after Push-T) is as its author publishes it: 21 shapes, its own starts, goals and
 success flag (more than 95 % of the goal covered), 300 steps of 0.1 s, and up to four other bodies in the way, which can
 be pushed, too. Only its pictures are not drawn. The policy is that of examples/push_t.py, with the outline, mass and
-moment of the body, the outlines of what is in the way, the goal and the true state.
+moment of the body, the goal and the true state. It is not told what is in the way.
 
 The environment's seed draws the goal and how many bodies are in the way: those seeds are played that draw
 `--obstacles`. It may draw a goal that lies across its walls. These are played, and count like others; the success
