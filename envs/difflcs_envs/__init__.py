@@ -1,4 +1,4 @@
-"""Gymnasium environments for contact-rich manipulation: the TriFinger robot of LCS-RL (Bui & Posa).
+"""Gymnasium environments for contact-rich manipulation: the TriFinger robot of LCS-RL (Bui & Posa), and a hand.
 
 Importing this package registers its environments:
 
@@ -33,6 +33,7 @@ __all__ = [
 ]
 
 _ENTRY_POINTS = {
+    "HandTurnObject-v0": ("hand.env:HandTurnObjectEnv", "hand.env:turn_object"),
     "TriFingerMoveCube-v0": ("trifinger.env:TriFingerMoveCubeEnv", "vector:move_cube"),
     "TriFingerMoveObject-v0": ("trifinger.env:TriFingerMoveObjectEnv", "vector:move_object"),
     "TriFingerTurnCube-v0": ("trifinger.env:TriFingerTurnCubeEnv", "vector:turn_cube"),

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["MOVE", "TURN", "MoveTask"]
+__all__ = ["MOVE", "TURN", "MoveTask", "library_of"]
 
 ACTION_SIZE = 6  # x, y of three tips
 ACTION_LIMIT = 0.015  # [m] per component and step
@@ -65,7 +65,7 @@ class MoveTask:
 
     def errors(self, state: Array, goal: Array) -> tuple[Array, Array]:
         """Distance [m] and smallest angle [rad, 0 to pi] between the object's pose and the goal's."""
-        distance = _library(state).hypot(state[..., 0] - goal[..., 0], state[..., 1] - goal[..., 1])
+        distance = library_of(state).hypot(state[..., 0] - goal[..., 0], state[..., 1] - goal[..., 1])
         turn = state[..., 2] - goal[..., 2]
         # A full turn brings the object back to the same pose.
         return distance, abs((turn + np.pi) % (2 * np.pi) - np.pi)
@@ -96,7 +96,7 @@ class MoveTask:
         """
         position = state[..., :2]
         # Sums over one axis, so that a batch gives the same bits as its elements.
-        arms = state[..., 3:] - _library(state).concatenate([position] * 3, axis=-1)
+        arms = state[..., 3:] - library_of(state).concatenate([position] * 3, axis=-1)
         shift = position - goal[..., :2]
         turn = state[..., 2] - goal[..., 2]
         return {
@@ -121,7 +121,7 @@ class MoveTask:
         Returns:
             The reward, and info: the pose info of the next state and every term of the reward.
         """
-        library = _library(state)
+        library = library_of(state)
         info = self.pose_info(next_state, goal)
         terms = self.dense_reward_terms(state, action, goal)
         failed = library.asarray(ended) & ~info["success"]
@@ -138,7 +138,7 @@ class MoveTask:
         return reward, info["success"]
 
 
-def _library(array: Array) -> Any:
+def library_of(array: Array) -> Any:
     """Return PyTorch for its tensors, else NumPy. Nothing is imported: a tensor implies that PyTorch is."""
     torch = sys.modules.get("torch")
     return torch if torch is not None and isinstance(array, torch.Tensor) else np

@@ -1,0 +1,1 @@
+"""A hand of four fingers that turns an object on its palm, simulated by MuJoCo."""
