@@ -7,7 +7,7 @@ environment is imported here, and no simulation.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from difflcs.cost import GoalCost
 from difflcs.rl.tasks import PhysicsSpec, Quantity, TaskSpec, register_task
+from difflcs_envs.hand import task as hand
 from difflcs_envs.trifinger.arguments import checked_task
 from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE, EPISODE_STEPS, MOVE, TURN, MoveTask
 from difflcs_envs.ycb import YCB
@@ -25,6 +26,10 @@ __all__ = [
     "contact_cost",
     "contact_system",
     "describe",
+    "hand_cost",
+    "hand_features",
+    "hand_system",
+    "hand_task",
     "pushing_cost",
     "pushing_features",
     "register_tasks",
@@ -35,6 +40,8 @@ STATE_SIZE = 9  # object x, y [m], yaw [rad], then x, y [m] of three fingertips
 STEP_SECONDS = 0.1
 HORIZON = 8  # steps that the MPC plans ahead
 MOVE_GOALS = ((0.04, 0.03, 0.3), (-0.04, 0.03, -0.3), (0.0, -0.05, 0.4), (0.05, -0.02, 0.0))  # [m, m, rad] to show
+HAND_GOAL = (-0.02, 0.0, 0.036, 0.5**0.5, 0.0, 0.0, 0.5**0.5)  # a cube in the middle of the palm, a quarter turn on
+HAND_GUESS = {"object_mass": 3.0, "friction": 0.5, "servo_gain": 0.5}  # factors by which `hand_unknown` is told wrong
 TURN_GOALS = ((0.0, 0.0, 0.8), (0.0, 0.0, -0.8), (0.0, 0.0, 1.4), (0.0, 0.0, -0.3))
 
 
@@ -226,8 +233,152 @@ def trifinger_task(
     )
 
 
+def hand_system(model: Any, learn: Sequence[str | tuple[str, str]] = ()) -> Any:
+    """Make the system of the hand: at rest after each step, its servos give way, and each finger has contacts to spare.
+
+    Args:
+        model: MuJoCo's model, `difflcs_envs.hand.model.build_model`.
+        learn: What is uncertain in it, see `LearnableMujocoLCS`; nothing: a `MujocoLCS` as the model is.
+    """
+    from difflcs.physics.mujoco import ContactGroup, LearnableMujocoLCS, MujocoLCS
+    from difflcs_envs.hand.model import FINGERS, LINKS
+
+    options: dict[str, Any] = {
+        "motion": "quasi-dynamic",
+        "contacts": [
+            ContactGroup(("object", "palm"), 3),
+            *(ContactGroup([("object", f"{finger}_{link}") for link in LINKS], 2) for finger in FINGERS),
+            ContactGroup(None, 4, friction=False, distance=0.006),  # fingers with each other
+        ],
+        "distance": 0.03,
+        "torsion": False,
+        "compliance": 0.1,
+        "length": 0.02,
+    }
+    return LearnableMujocoLCS(model, learn=learn, **options) if learn else MujocoLCS(model, **options)
+
+
+def hand_cost(system: Any) -> Any:
+    """Make the cost of the hand: the object at its goal at the end of a plan, and on the way fingertips near it.
+
+    Args:
+        system: A `MujocoLCS`, whose rotations count from where those of the cost do.
+
+    Returns:
+        A `MujocoCost` of goals (place [m], quaternion w, x, y, z).
+    """
+    from difflcs.physics.mujoco import Distance, Effort, MujocoCost, Orientation, Position
+    from difflcs_envs.hand.model import FINGERS
+
+    return MujocoCost(
+        system,
+        [
+            Position("body:object", weight=0.0, weight_final=1000.0),
+            Orientation("body:object", weight=0.0, weight_final=18.75, reach=1.6),
+            *(Distance("body:object", f"site:{finger}_tip", weight=1.0, weight_final=0.0) for finger in FINGERS),
+            Effort(0.2),
+        ],
+    )
+
+
+class HandCost:
+    """`hand_cost` of an object, made when it is first asked for: MuJoCo is not imported to know its sizes."""
+
+    n_x, n_u, n_goal, local = hand.STATE_SIZE, hand.ACTION_SIZE, hand.GOAL_SIZE, True
+
+    def __init__(self, name: str):
+        self._name, self._cost = name, None
+
+    def at(self, x: Tensor, goal: Tensor | None = None, context: Tensor | None = None) -> Any:
+        """See `CostModule`."""
+        if self._cost is None:
+            from difflcs_envs.hand.model import build_model
+
+            self._cost = hand_cost(hand_system(build_model(self._name)))
+        return self._cost.at(x, goal, context)
+
+
+def hand_features(state: Tensor, goal: Tensor, elapsed: Tensor) -> Tensor:
+    """Compute the inputs of the value network of the hand, scaled to about one.
+
+    Args:
+        state: (..., 22).
+        goal: (..., 7).
+        elapsed: (...) fraction of the episode that has passed.
+
+    Returns:
+        (..., 29): joints, place of the object from its goal, its quaternion and that of the goal with the sign of the
+        other, squared sine of half the angle between them, time.
+    """
+    turned, aim = hand.rotation_to_quaternion(state[..., 19:]), goal[..., 3:]
+    along = (turned * aim).sum(-1, keepdim=True)
+    sign = torch.where(along < 0, -1.0, 1.0)
+    apart = ((state[..., 16:19] - goal[..., :3]) / 0.02).clamp(-10, 10)
+    return torch.cat(
+        [state[..., :16], apart, turned, sign * aim, 1 - along * along, (2 * elapsed - 1).unsqueeze(-1)], -1
+    )
+
+
+def hand_task(name: str, summary: str, guess: Mapping[str, float] | None = None, **env_kwargs: Any) -> TaskSpec:
+    """Make one task of turning an object in the hand.
+
+    Args:
+        name: Name of the task.
+        summary: The task in one sentence.
+        guess: Factors of `object_mass`, `friction` and `servo_gain` by which the physics that it is told is wrong.
+        **env_kwargs: Arguments of the environment.
+    """
+    thing = env_kwargs.get("object", "cube")
+    known = {"object_mass": 0.1, "friction": 0.5, "servo_gain": 1.0} | env_kwargs
+    numbers = [known[key] * (guess or {}).get(key, 1.0) for key in ("object_mass", "friction", "servo_gain")]
+
+    def make_system() -> Any:
+        from difflcs_envs.hand.model import build_model
+
+        return hand_system(build_model(thing, *numbers), [("mass", "object"), "friction", "gain"])
+
+    judge = replace(hand.TURN_OBJECT, sparse_penalty=env_kwargs.get("sparse_penalty", hand.TURN_OBJECT.sparse_penalty))
+    return TaskSpec(
+        name=name,
+        summary=summary,
+        env="difflcs_envs:difflcs/HandTurnObject-v0",
+        env_kwargs=env_kwargs,
+        make_cost=functools.partial(HandCost, thing),
+        u_min=-hand.ACTION_LIMIT,
+        u_max=hand.ACTION_LIMIT,
+        horizon=4,
+        relaxation=1e-3,
+        episode_steps=env_kwargs.get("horizon", hand.EPISODE_STEPS),
+        step_seconds=STEP_SECONDS,
+        features=hand_features,
+        outcome=judge.judge,
+        failure_penalty=judge.sparse_penalty,
+        goal=tuple(Quantity(axis, "m") for axis in "xyz") + tuple(Quantity(f"q{axis}", "1") for axis in "wxyz"),
+        errors=(Quantity("position_error", "m"), Quantity("angle_error", "rad")),
+        picture={"width": 640, "height": 480},
+        example_goals=(HAND_GOAL,),
+        describe=describe_hand,
+        requires=("mujoco",),
+        physics=PhysicsSpec(
+            make_system=make_system,
+            scale=(*[0.1] * 16, *[0.01] * 3, *[0.2] * 3),
+            told="MuJoCo's model of the hand and its object, with guesses of mass, friction and gain of the servos",
+        ),
+    )
+
+
+def describe_hand(env: Any) -> dict[str, Any]:
+    """Describe what is in the hand of an environment or a vector, wrapped or not."""
+    inner = env.unwrapped
+    return (inner.envs[0].unwrapped if hasattr(inner, "envs") else inner).describe()
+
+
 def register_tasks() -> None:
     """Make the tasks known to `difflcs`, which calls this itself where this package is installed."""
+    register_task(hand_task("hand", "Turn a cube in a hand of four fingers by a quarter."))
+    register_task(
+        hand_task("hand_unknown", "Turn a cube in the hand, with mass, friction and servos guessed wrong.", HAND_GUESS)
+    )
     register_task(
         trifinger_task("cube", "TriFingerMoveCube-v0", MOVE, "Push a cube of 6 cm to a position and yaw.", MOVE_GOALS)
     )

@@ -29,13 +29,13 @@ from difflcs_envs.trifinger.rendering import SceneRenderer, select_gl_backend
 select_gl_backend()  # before the first import of MuJoCo
 try:
     import gymnasium
+    import mujoco
     from gymnasium.error import ResetNeeded
     from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-    import mujoco
+    from difflcs_envs.hand.model import GOAL_HEIGHT, OBJECTS, PALM_TOP, POSTURE, SUBSTEPS, TIMESTEP, build_model
 except ImportError as error:
     raise MissingDependencyError((error.name or "").partition(".")[0]) from error
-from difflcs_envs.hand.model import GOAL_HEIGHT, OBJECTS, PALM_TOP, POSTURE, SUBSTEPS, TIMESTEP, build_model
 
 __all__ = ["HandTurnObjectEnv", "turn_object"]
 
@@ -101,7 +101,7 @@ class HandTurnObjectEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     ## Starting state
 
     The fingers are open round the object, which lies on the palm: its place is normally distributed by 5 mm, its yaw
-    uniform in ±90°. The goal is `turn` away in yaw, to either side, in the middle of the palm. `reset` takes the options
+    uniform in ±90°. The goal is `turn` away in yaw, to either side, in the middle of the palm. `reset` takes options:
 
     - `goal`: (7,) a goal in the goal space, of any rotation;
     - `state`: (22,) a state to start from, at rest.
@@ -182,7 +182,12 @@ class HandTurnObjectEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         """Describe the object, in JSON types, for records of results."""
         model = self.model
         mass, friction = float(model.body("object").mass[0]), float(model.geom("object").friction[0])
-        return {"name": self.object, "mass": mass, "friction": friction, "servo_gain": float(model.actuator_gainprm[0, 0])}
+        return {
+            "name": self.object,
+            "mass": mass,
+            "friction": friction,
+            "servo_gain": float(model.actuator_gainprm[0, 0]),
+        }
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -204,7 +209,9 @@ class HandTurnObjectEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         super().reset(seed=seed)
         goal, state = options.pop("goal", None), options.pop("state", None)
         if options:
-            raise ValueError(f"Expected the options 'goal' and 'state', got also {sorted(options, key=str)}. Remove them.")
+            raise ValueError(
+                f"Expected the options 'goal' and 'state', got also {sorted(options, key=str)}. Remove them."
+            )
         # Always the same draws, so that an option passed now does not change the episodes after it.
         place = PLACE + PLACE_NOISE * self.np_random.standard_normal(2)
         yaw, side = self.np_random.uniform(-YAW_NOISE, YAW_NOISE), self.np_random.choice([-1.0, 1.0])
@@ -243,7 +250,9 @@ class HandTurnObjectEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             gymnasium.error.ResetNeeded: No episode is running.
         """
         if self._steps is None:
-            raise ResetNeeded("Expected a running episode, but it has ended or never began. Call reset() before step().")
+            raise ResetNeeded(
+                "Expected a running episode, but it has ended or never began. Call reset() before step()."
+            )
         requested = checked_array("action", action, ACTION_SIZE, "targets of the servos from the joints in rad")
         executed, before = requested.clip(-ACTION_LIMIT, ACTION_LIMIT), self._state
         self.data.ctrl[:] = before[:16] + executed
@@ -293,7 +302,10 @@ class HandTurnObjectEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     def _checked(self, name: str, value: Any, size: int, meaning: str) -> np.ndarray:
         array, space = checked_array(f"options['{name}']", value, size, meaning), self.observation_space[name]  # pyright: ignore
         if array not in space:
-            raise ValueError(f"Expected options['{name}'] within {space}, got {array.tolist()}. Choose smaller numbers.")
+            raise ValueError(
+                f"Expected options['{name}'] within observation_space['{name}'], got {array.tolist()}. "
+                "Choose smaller numbers."
+            )
         return array
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-__all__ = ["FINGERS", "OBJECTS", "POSTURE", "build_model"]
+__all__ = ["FINGERS", "LINKS", "OBJECTS", "POSTURE", "build_model"]
 
 TIMESTEP, SUBSTEPS = 0.002, 50  # [s], and of them in one action of 0.1 s
 JOINT_DAMPING = 0.1  # [N m s/rad]
@@ -27,9 +27,9 @@ ARENA_BYTES = 1024 * 1024
 FINGERS = ("index", "middle", "ring", "thumb")
 POSTURE = (0.125, 1.13, 1.45, 1.24, -0.02, 0.445, 1.17, 1.5, -0.459, 1.54, 1.11, 1.23, 0.638, 1.85, 1.5, 1.26)
 """Joint angles at the start [rad]: index, middle, ring finger, thumb, each from its base."""
-_LINKS = ("base", "proximal", "medial", "distal")
+LINKS = ("base", "proximal", "medial", "distal")
 _FINGER = (  # place of each joint in the link before [m], its axis, range [rad], end of its capsule [m] and radius [m]
-    ((0, 0, 0), (0, 0, 1), (-0.47, 0.47), (0, 0, 0.0164), 0.0125),
+    ((0, 0, 0), (0, 0, 1), (-0.47, 0.47), (0, 0, 0.0164), 0.0095),
     ((0, 0, 0.0164), (0, 1, 0), (-0.196, 1.61), (0, 0, 0.054), 0.0115),
     ((0, 0, 0.054), (0, 1, 0), (-0.174, 1.709), (0, 0, 0.0384), 0.011),
     ((0, 0, 0.0384), (0, 1, 0), (-0.227, 1.618), (0, 0, 0.0267), TIP_RADIUS),
@@ -48,7 +48,9 @@ _MOUNTS = {  # place [m] and orientation of the fingers on the hand
 }
 
 _GEOM = mujoco.mjtGeom
-_HOUSE = 0.025 * np.array([[x, y, z] for x in (-1, 1) for y in (-0.8, 0.8) for z in (-1, 0.3)] + [[-1, 0, 1], [1, 0, 1]])
+_HOUSE = 0.025 * np.array(
+    [[x, y, z] for x in (-1, 1) for y in (-0.8, 0.8) for z in (-1, 0.3)] + [[-1, 0, 1], [1, 0, 1]]
+)
 _ANGLES = np.arange(6) * np.pi / 3
 _NUT = np.array([[0.03 * np.cos(a), 0.03 * np.sin(a), z] for a in _ANGLES for z in (-0.02, 0.02)])
 OBJECTS: dict[str, tuple[Any, Any, float]] = {  # shape, its sizes or vertices [m], height of its centre on a plane [m]
@@ -121,15 +123,13 @@ def _add_hand(spec: Any, friction: float, servo_gain: float) -> None:
     for finger, (place, quat) in _MOUNTS.items():
         links = _THUMB if finger == "thumb" else _FINGER
         body, frame = palm, {"pos": place, "quat": quat}
-        for link, (pos, axis, limits, end, radius) in zip(_LINKS, links, strict=True):
+        for link, (pos, axis, limits, end, radius) in zip(LINKS, links, strict=True):
             name = f"{finger}_{link}"
-            body = body.add_body(name=name, **(frame if link == "base" else {"pos": pos}))
+            body = body.add_body(name=name, gravcomp=1.0, **(frame if link == "base" else {"pos": pos}))
             body.add_joint(name=name, axis=axis, range=limits, damping=(JOINT_DAMPING, 0, 0))
             color = TIP_COLOR if link == "distal" else LINK_COLOR
             line = (0, 0, 0, *end)
-            body.add_geom(
-                name=name, type=_GEOM.mjGEOM_CAPSULE, fromto=line, size=(radius, 0, 0), rgba=color, **touch
-            )
+            body.add_geom(name=name, type=_GEOM.mjGEOM_CAPSULE, fromto=line, size=(radius, 0, 0), rgba=color, **touch)
             gain = {"gainprm": [servo_gain] + [0] * 9, "biasprm": [0, -servo_gain] + [0] * 8}
             spec.add_actuator(
                 name=name,
@@ -141,7 +141,7 @@ def _add_hand(spec: Any, friction: float, servo_gain: float) -> None:
                 **gain,
             )
         body.add_site(name=f"{finger}_tip", pos=links[-1][3], size=(0.001,) * 3, group=4)
-        for link in _LINKS[:2]:  # capsules that overlap near the joints
+        for link in LINKS[:2]:  # capsules that overlap near the joints
             spec.add_exclude(bodyname1="palm", bodyname2=f"{finger}_{link}")
         spec.add_exclude(bodyname1=f"{finger}_base", bodyname2=f"{finger}_medial")
 

@@ -1,0 +1,124 @@
+"""An object is turned in the hand, through the physics of the hand's own model: `python examples/hand_turn.py`.
+
+`difflcs/HandTurnObject-v0` is a hand of four fingers that faces up, with an object on its palm. At each decision
+`HandPolicy` linearises its MuJoCo model where hand and object are, in quasi-dynamic motion, and solves a contact MPC of
+four steps. Nothing is learned: it is given the model and the state. `--wrong` gives it another model.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+import tyro
+
+import difflcs_envs
+from difflcs import LCSMPCLayer
+from difflcs.errors import ContactWarning
+from difflcs.mpc.backends import BatchedBackend
+from difflcs.status import solved
+from difflcs_envs.hand.model import OBJECTS, build_model
+from difflcs_envs.tasks import hand_cost, hand_system
+
+
+class HandPolicy:
+    """Contact MPC that is linearised where hand and object are; it opens the hand where nothing goes on.
+
+    Args:
+        model: MuJoCo's model of hand and object.
+        pace: part of the action's limit that it uses, as what moves fast is thrown.
+        patience: decisions without progress after which it opens the hand.
+    """
+
+    def __init__(self, model: Any, pace: float = 0.5, patience: int = 25):
+        self.system, self.limit, self.patience = hand_system(model), 0.1 * pace, patience
+        cost = hand_cost(self.system)
+        self.mpc = LCSMPCLayer(
+            self.system, cost, 4, -self.limit, self.limit, BatchedBackend(effort="fast", threads=1), 1e-3, "mask"
+        )
+        self.posture, self.guess, self.best, self.waited, self.openings = None, None, np.inf, 0, 0
+        self.random = np.random.default_rng(0)
+
+    def act(self, data: Any, goal: np.ndarray) -> np.ndarray:
+        """Return by how much the targets of the servos are from the joints [rad], for 0.1 s."""
+        if self.posture is None:
+            self.posture = data.qpos[:16].copy()
+        left = 2 * np.arccos(min(1.0, abs(float(data.qpos[-4:] @ goal[3:]))))
+        self.waited += 1
+        if self.waited > 0 and left < max(self.best - 0.05, 0.35):  # turned on by 3°, or almost there
+            self.best, self.waited = min(left, self.best), 0
+        if self.waited > self.patience:
+            self.best, self.waited, self.openings = np.inf, -8, self.openings + 1  # it opens for 8 decisions
+            self.target = self.posture + 0.3 * (self.openings > 1) * self.random.standard_normal(16)
+        if self.waited < 0:
+            self.guess = None
+            return np.clip(self.target - data.qpos[:16], -0.1, 0.1)
+        x = self.system.observe(data)  # rotations count from here
+        with torch.no_grad():
+            plan = self.mpc(x, torch.from_numpy(goal), guess=self.guess)
+        self.guess = plan.shift() if bool(solved(plan.status)) else None
+        return plan.action.numpy()
+
+
+@dataclass
+class Options:
+    """Turn objects in the hand."""
+
+    objects: str = ",".join(OBJECTS)
+    """Names with commas."""
+    episodes: int = 10
+    """Episodes of each object."""
+    seed: int = 5000
+    """Seed of the first of them."""
+    mass: float = 1.0
+    friction: float = 1.0
+    gain: float = 1.0
+    """Factors of mass, friction and servo gain in the model that it plans with."""
+    steps: int = 300
+    """Most decisions of an episode; it ends after 21 in a row at the goal, or when the object is dropped."""
+    pace: float = 0.5
+    patience: int = 25
+
+
+def play(env: Any, policy: HandPolicy, seed: int) -> tuple[dict[str, Any], int]:
+    """One episode until the object was held at its goal or dropped: the last info, and how many decisions."""
+    observation, info = env.reset(seed=seed)
+    for step in range(env.unwrapped.horizon):
+        observation, _, _, _, info = env.step(policy.act(env.unwrapped.data, observation["goal"]))
+        if info["held"] == 21 or info["dropped"]:
+            return info, step + 1
+    return info, step + 1
+
+
+def main(o: Options) -> None:
+    """Play."""
+    difflcs_envs.register_envs()
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore", ContactWarning)
+    good = count = 0
+    for name in o.objects.split(","):
+        env = gymnasium.make("difflcs/HandTurnObject-v0", object=name, horizon=o.steps)
+        model = build_model(name, 0.1 * o.mass, 0.5 * o.friction, o.gain)
+        steps, results, start = [], [], time.process_time()
+        for seed in range(o.seed, o.seed + o.episodes):
+            info, length = play(env, HandPolicy(model, o.pace, o.patience), seed)
+            results.append("+" if info["held"] == 21 else "d" if info["dropped"] else "-")
+            steps.append(length)
+        seconds = (time.process_time() - start) / sum(steps)
+        won = results.count("+")
+        good, count = good + won, count + len(results)
+        print(
+            f"{name:10} {won}/{len(results)} {''.join(results)}, {np.mean(steps):.0f} decisions, "
+            f"{1e3 * seconds:.1f} ms each",
+            flush=True,
+        )
+    print(f"all {good}/{count}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

@@ -1,0 +1,160 @@
+"""The hand that turns objects: what lies on the palm, what the numbers mean, and its physics as a system."""
+
+import copy
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+gymnasium = pytest.importorskip("gymnasium", reason="the environments need the extra [envs]")
+mujoco = pytest.importorskip("mujoco", reason="the environments need the extra [envs]")
+
+from gymnasium.envs.mujoco.utils import check_mujoco_reset_state  # noqa: E402
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+
+import difflcs_envs  # noqa: E402, F401
+from difflcs.rl.tasks import get_task  # noqa: E402
+from difflcs_envs.hand.env import HandTurnObjectEnv, continued_rotation  # noqa: E402
+from difflcs_envs.hand.model import OBJECTS, PALM_TOP  # noqa: E402
+from difflcs_envs.hand.task import TURN_OBJECT, rotation_to_quaternion  # noqa: E402
+from difflcs_envs.tasks import hand_cost, hand_system  # noqa: E402
+
+ID = "difflcs/HandTurnObject-v0"
+
+
+def make(name="cube", **arguments):
+    return gymnasium.make(ID, object=name, **arguments).unwrapped
+
+
+def test_checkers():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(make("house"), skip_render_check=True)
+        check_mujoco_reset_state(make())
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_the_object_rests_on_the_palm_within_open_fingers(name):
+    env = make(name, object_mass=0.07, friction=0.4, servo_gain=2.0)
+    before, _ = env.reset(seed=0)
+    for _ in range(10):
+        after, *_, info = env.step(np.zeros(16))
+    assert not info["dropped"]
+    moved = np.abs(after["state"] - before["state"])
+    assert moved[:16].max() < 0.2  # targets relative to joints that sag a little in each step
+    assert moved[16:19].max() < 5e-3
+    assert after["state"][18] == pytest.approx(PALM_TOP + OBJECTS[name][2], abs=2e-3)
+    assert min(contact.dist for contact in env.data.contact) > -2e-3
+    assert env.describe() == {"name": name, "mass": pytest.approx(0.07), "friction": 0.4, "servo_gain": 2.0}
+
+
+def test_the_goal_is_a_quarter_turn_away_to_either_side():
+    env = make()
+    turns = []
+    for seed in range(20):
+        observation, info = env.reset(seed=seed)
+        assert info["angle_error"] == pytest.approx(np.pi / 2)
+        w, _, _, z = observation["goal"][3:]
+        turns.append(np.remainder(2 * np.arctan2(z, w) - observation["state"][21] + np.pi, 2 * np.pi) - np.pi)
+    np.testing.assert_allclose(np.unique(np.round(turns, 9)), [-np.pi / 2, np.pi / 2])
+
+
+def test_success_is_within_23_degrees_and_not_dropped():
+    env, state = make(horizon=2), np.zeros(22)
+    env.reset(seed=0)
+    for yaw, height, success in ((0.40, 0.05, True), (0.41, 0.05, False), (0.0, 0.004, False)):
+        state[18], state[21] = height, yaw
+        options = {"state": state, "goal": [0, 0, 0.05, 1, 0, 0, 0]}
+        observation, info = env.reset(options=options)
+        np.testing.assert_array_equal(observation["state"], state)
+        assert (info["success"], info["held"], info["angle_error"]) == (success, success, pytest.approx(yaw))
+
+
+def test_rotations_are_those_of_mujoco_and_continue_through_half_a_turn():
+    rng, before = np.random.default_rng(0), np.zeros(3)
+    axis = rng.standard_normal(3)
+    axis /= np.linalg.norm(axis)
+    for angle in np.linspace(0.0, 1.5 * np.pi - 0.01, 40):
+        quaternion = np.zeros(4)
+        mujoco.mju_axisAngle2Quat(quaternion, axis, angle)
+        before = continued_rotation(quaternion, before)
+        np.testing.assert_allclose(before, angle * axis, atol=1e-7)
+        np.testing.assert_allclose(rotation_to_quaternion(before), quaternion, atol=1e-7)
+    mujoco.mju_axisAngle2Quat(quaternion, axis, 1.5 * np.pi + 0.1)
+    np.testing.assert_allclose(continued_rotation(quaternion, before), (0.1 - 0.5 * np.pi) * axis, atol=1e-7)
+
+
+def test_the_reward_has_a_gradient():
+    env = make()
+    state, goal = (torch.from_numpy(env.reset(seed=0)[0][name]) for name in ("state", "goal"))
+    state.requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: TURN_OBJECT.judge(x, torch.zeros(16).double(), x, goal, False)[0], state)
+
+
+@pytest.mark.parametrize(
+    "clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deepcopy", "pickle"]
+)
+def test_copies_continue_the_episode(clone):
+    env, rng = make("nut"), np.random.default_rng(0)
+    env.reset(seed=2)
+    for _ in range(5):
+        env.step(rng.uniform(-0.1, 0.1, 16))
+    other, action = clone(env), rng.uniform(-0.2, 0.2, 16)
+    one, two = env.step(action), other.step(action)
+    np.testing.assert_array_equal(one[0]["state"], two[0]["state"])
+    assert one[1:4] == two[1:4]
+    assert one[4]["clipped"]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"object": "cup"},
+        {"object_mass": 0.0},
+        {"friction": -1},
+        {"servo_gain": 0},
+        {"turn": 4},
+        {"render_mode": "human"},
+    ],
+)
+def test_bad_arguments(arguments):
+    with pytest.raises(ValueError, match=r"Expected .*got"):
+        HandTurnObjectEnv(**arguments)
+
+
+@pytest.mark.parametrize(
+    "options", [{"goal": [0, 0, 0]}, {"goal": np.zeros(7)}, {"state": np.full(22, 7.0)}, {"yaw": 1.0}, [1]]
+)
+def test_bad_options(options):
+    env = make()
+    with pytest.raises(ValueError, match=r"Expected .*got"):
+        env.reset(options=options)
+
+
+def test_the_system_predicts_open_joints_and_the_cost_is_zero_at_the_goal():
+    """Fingers that touch nothing go as the system says; where the object is at its goal, the turn costs nothing."""
+    env = make()
+    state = np.array([*[0.0, 0.3, 0.3, 0.3] * 3, 0.8, 0.6, 0.3, 0.3, 0.0, 0.0, 0.3, 0.0, 0.0, 1.0])
+    observation, _ = env.reset(options={"state": state})
+    system = hand_system(env.model)
+    x, u = system.observe(env.data), torch.full((16,), -0.05, dtype=torch.float64)
+    u[[0, 4, 8, 12]] = 0.02
+    predicted = system.params(x).step(x, u).x_next
+    after, *_ = env.step(u.numpy())
+    assert np.abs(predicted[:16].numpy() - after["state"][:16]).max() < 0.01
+    pose = np.concatenate([observation["state"][16:19], rotation_to_quaternion(observation["state"][19:])])
+    cost = hand_cost(system).at(x, torch.from_numpy(pose))
+    final = x @ cost.Q_final @ x / 2 + cost.q_final @ x + cost.constant
+    assert float(final) == pytest.approx(0, abs=1e-9)
+
+
+def test_the_unknown_hand_is_told_wrong():
+    right, wrong = (get_task(name).physics.make_system().mujoco_model() for name in ("hand", "hand_unknown"))
+    for found, factor in (
+        (wrong.body("object").mass / right.body("object").mass, 3.0),
+        (wrong.geom("object").friction[0] / right.geom("object").friction[0], 0.5),
+        (wrong.actuator_gainprm[:, 0] / right.actuator_gainprm[:, 0], 0.5),
+    ):
+        np.testing.assert_allclose(found, factor)
