@@ -2,7 +2,8 @@
 
 `difflcs/HandTurnObject-v0` is a hand of four fingers that faces up, with an object on its palm. At each decision
 `HandPolicy` linearises its MuJoCo model where hand and object are, in quasi-dynamic motion, and solves a contact MPC of
-four steps. Nothing is learned: it is given the model and the state. `--wrong` gives it another model.
+four steps. Nothing is learned: it is given the model and the state. `--mass 3` and the like tell it a wrong model.
+`--out hand.gif` makes a film.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import time
 import warnings
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -18,7 +20,7 @@ import torch
 import tyro
 
 import difflcs_envs
-from difflcs import LCSMPCLayer
+from difflcs import Animation, LCSMPCLayer
 from difflcs.errors import ContactWarning
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.status import solved
@@ -81,15 +83,17 @@ class Options:
     """Factors of mass, friction and servo gain in the model that it plans with."""
     steps: int = 300
     """Most decisions of an episode; it ends after 21 in a row at the goal, or when the object is dropped."""
-    pace: float = 0.5
-    patience: int = 25
+    out: Path | None = None
+    """Where a film at twice the speed goes, .gif or .png; without it none is made."""
 
 
-def play(env: Any, policy: HandPolicy, seed: int) -> tuple[dict[str, Any], int]:
-    """One episode until the object was held at its goal or dropped: the last info, and how many decisions."""
+def play(env: Any, policy: HandPolicy, seed: int, frames: list[np.ndarray]) -> tuple[dict[str, Any], int]:
+    """Play an episode until the object was held at its goal or dropped: the last info, and how many decisions."""
     observation, info = env.reset(seed=seed)
     for step in range(env.unwrapped.horizon):
         observation, _, _, _, info = env.step(policy.act(env.unwrapped.data, observation["goal"]))
+        if env.render_mode:
+            frames.append(env.render())
         if info["held"] == 21 or info["dropped"]:
             return info, step + 1
     return info, step + 1
@@ -100,13 +104,14 @@ def main(o: Options) -> None:
     difflcs_envs.register_envs()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", ContactWarning)
-    good = count = 0
+    good, count, frames = 0, 0, []
+    mode = None if o.out is None else "rgb_array"
     for name in o.objects.split(","):
-        env = gymnasium.make("difflcs/HandTurnObject-v0", object=name, horizon=o.steps)
+        env = gymnasium.make("difflcs/HandTurnObject-v0", object=name, horizon=o.steps, render_mode=mode)
         model = build_model(name, 0.1 * o.mass, 0.5 * o.friction, o.gain)
         steps, results, start = [], [], time.process_time()
         for seed in range(o.seed, o.seed + o.episodes):
-            info, length = play(env, HandPolicy(model, o.pace, o.patience), seed)
+            info, length = play(env, HandPolicy(model), seed, frames)
             results.append("+" if info["held"] == 21 else "d" if info["dropped"] else "-")
             steps.append(length)
         seconds = (time.process_time() - start) / sum(steps)
@@ -117,7 +122,11 @@ def main(o: Options) -> None:
             f"{1e3 * seconds:.1f} ms each",
             flush=True,
         )
+        env.close()
     print(f"all {good}/{count}")
+    if o.out is not None:
+        Animation(frames[::2], fps=10).save(o.out)
+        print(f"written: {o.out}")
 
 
 if __name__ == "__main__":
