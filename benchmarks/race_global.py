@@ -58,11 +58,7 @@ def global_gaps(
         gaps = {name: np.array(values) for name, values in table["gaps"].items()}
         table["seconds"] = float(np.mean(table["seconds"]))
         table["gaps"] = {
-            name: {
-                "mean": float(v.mean()),
-                "worst": float(v.max()),
-                "within 0.1 %": float((v <= 1e-3).mean()),
-            }
+            name: {"mean": float(v.mean()), "worst": float(v.max()), "within 0.1 %": float((v <= 1e-3).mean())}
             for name, v in gaps.items()
         }
         shown = "  ".join(

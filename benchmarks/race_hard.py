@@ -44,15 +44,8 @@ def draws() -> dict[str, tuple[str, Draw]]:
             weight, gap, action, prefer = (
                 float(10 ** random.uniform(*v)) for v in [(-3, 3.5), (-2, 2), (-3, 2), (-1, 2)]
             )
-            return {
-                **fixed,
-                "iterations": iterations,
-                "weight": weight,
-                "growth": growth,
-                "gap": gap,
-                "action": action,
-                "prefer": prefer,
-            }
+            numbers = {"weight": weight, "growth": growth, "gap": gap, "action": action, "prefer": prefer}
+            return {**fixed, "iterations": iterations, **numbers}
 
         return draw
 
@@ -61,14 +54,8 @@ def draws() -> dict[str, tuple[str, Draw]]:
             iterations = int(random.choice([4, 8, 16, 32]))
             keep = float(random.uniform(0.02, 0.3)) if method == "cem" else float(10 ** random.uniform(-2, 0))
             spread, hold = float(10 ** random.uniform(-1, 0.3)), int(random.choice([1, 2, 3, 5, 10]))
-            return {
-                "method": method,
-                "samples": rollouts // iterations,
-                "iterations": iterations,
-                "spread": spread,
-                "hold": hold,
-                "keep": keep,
-            }
+            how = {"method": method, "samples": rollouts // iterations, "iterations": iterations}
+            return {**how, "spread": spread, "hold": hold, "keep": keep}
 
         return draw
 

@@ -14,10 +14,7 @@ def version() -> str:
     return f"casadi {casadi.__version__}"
 
 
-_ALWAYS = {
-    "ipopt": {"print_level": 0, "max_iter": 500, "sb": "yes"},
-    "fatrop": {"print_level": 0, "max_iter": 500},
-}
+_ALWAYS = {"ipopt": {"print_level": 0, "max_iter": 500, "sb": "yes"}, "fatrop": {"print_level": 0, "max_iter": 500}}
 
 
 class Solver(Rival):

@@ -273,12 +273,7 @@ class PPO(Trainer):
         return success, loss
 
     def _iterate(
-        self,
-        source: Source,
-        seeds: list[int],
-        part: tuple[int, ...],
-        scale: float,
-        after_step: AfterStep | None = None,
+        self, source: Source, seeds: list[int], part: tuple[int, ...], scale: float, after_step: AfterStep | None = None
     ) -> _Outcome:
         """Collect an episode for each seed, judge the actions, improve the policy, fit the value network.
 

@@ -1,14 +1,6 @@
 """Methods of learning, one file each. Other packages register theirs by `register_method`."""
 
-from difflcs.rl.methods.base import (
-    LCSMethod,
-    Method,
-    Work,
-    check_fits,
-    get_method,
-    method_names,
-    register_method,
-)
+from difflcs.rl.methods.base import LCSMethod, Method, Work, check_fits, get_method, method_names, register_method
 from difflcs.rl.methods.contact_lcs import ContactMethod
 from difflcs.rl.methods.improve import ImproveMethod
 from difflcs.rl.methods.lcs_rl import LCSRLMethod

@@ -70,11 +70,7 @@ OBJECT_COLORS = (0.98, 0.72, 0.20), (0.20, 0.45, 0.75)
 
 
 def build_model(
-    name: str,
-    mass: float = 0.1,
-    friction: float = 0.5,
-    servo_gain: float = 1.0,
-    picture: tuple[int, int] = (640, 480),
+    name: str, mass: float = 0.1, friction: float = 0.5, servo_gain: float = 1.0, picture: tuple[int, int] = (640, 480)
 ) -> Any:
     """Build the model: `qpos` has 16 joints, the place of the object and its quaternion; a mocap body shows the goal.
 
