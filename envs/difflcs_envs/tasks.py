@@ -330,12 +330,12 @@ def hand_task(name: str, summary: str, guess: Mapping[str, float] | None = None,
     """
     thing = env_kwargs.get("object", "cube")
     known = {"object_mass": 0.1, "friction": 0.5, "servo_gain": 1.0} | env_kwargs
-    numbers = [known[key] * (guess or {}).get(key, 1.0) for key in ("object_mass", "friction", "servo_gain")]
+    mass, friction, gain = (known[k] * (guess or {}).get(k, 1.0) for k in ("object_mass", "friction", "servo_gain"))
 
     def make_system() -> Any:
         from difflcs_envs.hand.model import build_model
 
-        return hand_system(build_model(thing, *numbers), [("mass", "object"), "friction", "gain"])
+        return hand_system(build_model(thing, mass, friction, gain), [("mass", "object"), "friction", "gain"])
 
     judge = replace(hand.TURN_OBJECT, sparse_penalty=env_kwargs.get("sparse_penalty", hand.TURN_OBJECT.sparse_penalty))
     return TaskSpec(

@@ -258,7 +258,7 @@ class HandTurnObjectEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         self.data.ctrl[:] = before[:16] + executed
         mujoco.mj_step(self.model, self.data, SUBSTEPS)
         after = np.concatenate([self.data.qpos[:19], continued_rotation(self.data.qpos[19:], before[19:])])
-        stable = not any(warning.number for warning in self.data.warning) and after in self.observation_space["state"]
+        stable = not any(warning.number for warning in self.data.warning) and after in self.observation_space["state"]  # pyright: ignore
         self._state = after if stable else before.copy()
         self._steps += 1
         truncated = self._steps >= self.horizon or not stable
