@@ -26,11 +26,7 @@ CONTROLLER, DESCRIPTION = "controller.difflcs", "controller.json"
 
 
 def export_controller(
-    mpc: LCSMPCLayer,
-    out: str | os.PathLike[str],
-    *,
-    step_seconds: float = 0.0,
-    about: Mapping[str, Any] | None = None,
+    mpc: LCSMPCLayer, out: str | os.PathLike[str], *, step_seconds: float = 0.0, about: Mapping[str, Any] | None = None
 ) -> Path:
     """Write the controller of a layer for the C library: system, cost, bounds, constraints, options of the solver.
 

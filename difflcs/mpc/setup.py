@@ -451,10 +451,7 @@ class Inputs:
 
 
 def check_guess(
-    guess: MPCSolution | Primal | None,
-    batch: tuple[int, ...],
-    horizon: int,
-    sizes: Mapping[str, int],
+    guess: MPCSolution | Primal | None, batch: tuple[int, ...], horizon: int, sizes: Mapping[str, int]
 ) -> dict[str, Tensor]:
     """Check a guess and return its parts, "guess.x" and so on; mu only if it has some."""
     if guess is None:

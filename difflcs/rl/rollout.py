@@ -125,11 +125,7 @@ def noisy_actions(act: Act, std: float, rng: np.random.Generator) -> Act:
 
 
 def collect(
-    env: VectorEnv,
-    act: Act,
-    seeds: Sequence[int],
-    episode_steps: int,
-    after_step: Callable[[], object] | None = None,
+    env: VectorEnv, act: Act, seeds: Sequence[int], episode_steps: int, after_step: Callable[[], object] | None = None
 ) -> TensorDict:
     """Run one episode per seed, in lockstep.
 

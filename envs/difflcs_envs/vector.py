@@ -20,12 +20,7 @@ from gymnasium.vector.utils import batch_space
 from difflcs_envs.errors import PhysicsWarning
 from difflcs_envs.trifinger.arguments import checked_options
 from difflcs_envs.trifinger.base import UNSTABLE
-from difflcs_envs.trifinger.env import (
-    TriFingerEnv,
-    TriFingerMoveCubeEnv,
-    TriFingerMoveObjectEnv,
-    TriFingerTurnCubeEnv,
-)
+from difflcs_envs.trifinger.env import TriFingerEnv, TriFingerMoveCubeEnv, TriFingerMoveObjectEnv, TriFingerTurnCubeEnv
 from difflcs_envs.trifinger.physics import CONTROL_PERIOD, STATE_SIZE, step_all
 from difflcs_envs.trifinger.spaces import ACTION_MEANING, continued
 from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE, GOAL_SIZE
@@ -97,10 +92,7 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
     # --- Gymnasium --------------------------------------------------------------------------------
 
     def reset(
-        self,
-        *,
-        seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Start an episode in every environment.
 
@@ -162,11 +154,7 @@ class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray
         truncated = ~fresh & ((self._steps >= self.envs[0].horizon) | unstable)
 
         rewards, info = self.envs[0].task.outcome(before, executed, self._states, self._goals, truncated)
-        info |= {
-            "executed_action": executed,
-            "clipped": (executed != requested).any(axis=1),
-            "physics_error": unstable,
-        }
+        info |= {"executed_action": executed, "clipped": (executed != requested).any(axis=1), "physics_error": unstable}
         if fresh.any():
             rewards = np.where(fresh, 0.0, rewards)
         infos = self._masked(info, np.ones(self.num_envs, dtype=bool), only=~fresh)

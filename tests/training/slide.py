@@ -12,14 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from difflcs import GoalCost, LCSModel, LCSModule, LCSMPCLayer
-from difflcs.rl import (
-    CriticSettings,
-    EnsembleSettings,
-    Epochs,
-    ModelRollouts,
-    ModelRolloutSettings,
-    PPOSettings,
-)
+from difflcs.rl import CriticSettings, EnsembleSettings, Epochs, ModelRollouts, ModelRolloutSettings, PPOSettings
 from difflcs.rl.learning import ppo_settings
 from difflcs.rl.learning.optim import UpdateRule
 from difflcs.rl.learning.policy import GaussianPolicy, make_actor

@@ -16,18 +16,7 @@ from tests.training.heavy_block import FORCE, HeavyBlock, Physics, make_mpc
 pytest.importorskip("torchrl")
 from tensordict import TensorDict
 
-from difflcs.rl import (
-    Adam,
-    Epochs,
-    Rollouts,
-    ViolationLoss,
-    Warmup,
-    WarmupSettings,
-    collect,
-    fit,
-    make_actor,
-    make_ppo,
-)
+from difflcs.rl import Adam, Epochs, Rollouts, ViolationLoss, Warmup, WarmupSettings, collect, fit, make_actor, make_ppo
 from difflcs.rl.learning.ppo import PPO
 from difflcs.rl.rollout import mpc_actions
 from difflcs.rl.runs.checkpoint import load_checkpoint, save_checkpoint

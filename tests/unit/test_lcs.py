@@ -6,14 +6,7 @@ import pytest
 import torch
 
 from difflcs import LCSModel
-from difflcs.errors import (
-    BoundsError,
-    CheckpointError,
-    DTypeError,
-    InvalidInputError,
-    NonFiniteError,
-    ShapeError,
-)
+from difflcs.errors import BoundsError, CheckpointError, DTypeError, InvalidInputError, NonFiniteError, ShapeError
 
 NAMES = ("A", "B", "C", "d", "D", "E", "G", "H", "c")
 

@@ -51,12 +51,7 @@ RESTING = {  # bodies, the rest of the model, control, number of free bodies
     "slope": (tilted(20, 0.5, (0.05, CUBE)), "", 0.0, 1),
     "slope across": (tilted(20, 0.5, (0.05, CUBE + ' euler="0 0 30"')), "", 0.0, 1),
     "cylinder on a slope": (tilted(25, 0.7, (0.03, 'type="cylinder" size=".05 .03" mass=".1"')), "", 0.0, 1),
-    "box on a tilted box": (
-        tilted(15, 0.6, (0.05, CUBE), (0.13, 'type="box" size=".04 .04 .03"')),
-        "",
-        0.0,
-        2,
-    ),
+    "box on a tilted box": (tilted(15, 0.6, (0.05, CUBE), (0.13, 'type="box" size=".04 .04 .03"')), "", 0.0, 2),
     "pinch": (PINCH, SERVOS, 0.01, 1),
     "wall": (WALL, MOTOR, 3.0, 1),
     "link on a box": (LINK, "", 0.0, 1),

@@ -7,13 +7,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from difflcs import solve_lcp
 from difflcs.errors import InvalidInputError
-from difflcs.rl.rollout import (
-    append_episodes,
-    collect,
-    make_empty_record,
-    mpc_actions,
-    noisy_actions,
-)
+from difflcs.rl.rollout import append_episodes, collect, make_empty_record, mpc_actions, noisy_actions
 from tests.training.pusher import STEPS, U_MAX, PusherEnv, Reach, make_envs, pusher
 
 

@@ -42,10 +42,7 @@ def test_the_defaults_of_a_group_can_be_others():
     assert Inner().count == 3
 
 
-@pytest.mark.parametrize(
-    "values",
-    [{"count": 1}, {"count": 9}, {"share": 1e-9}, {"share": 0.999}],
-)
+@pytest.mark.parametrize("values", [{"count": 1}, {"count": 9}, {"share": 1e-9}, {"share": 0.999}])
 def test_bounds_that_are_reached(values):
     assert asdict(Inner(**values)).items() >= values.items()
 

@@ -17,15 +17,7 @@ from torch import Tensor
 
 from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor, describe
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError
-from difflcs.physics.complementarity import (
-    Bounded,
-    Cone,
-    Contacts,
-    FreeMotion,
-    Unilateral,
-    contact_lcs,
-    count_forces,
-)
+from difflcs.physics.complementarity import Bounded, Cone, Contacts, FreeMotion, Unilateral, contact_lcs, count_forces
 from difflcs.physics.mujoco.actuators import DYNAMICS, Actuators, disabled_actuators
 from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, Pairs, typical_radius
 from difflcs.physics.mujoco.correction import WholeStep, correct

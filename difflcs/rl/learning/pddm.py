@@ -49,11 +49,7 @@ class PDDMSettings(Settings):
     rollouts: Rollouts = group(Rollouts, first=20, each=20)
     """Episodes per iteration."""
     ensemble: EnsembleSettings = group(
-        EnsembleSettings,
-        networks=3,
-        width=250,
-        epochs=Epochs(first=40, each=40, minibatch=512),
-        learning_rate=1e-3,
+        EnsembleSettings, networks=3, width=250, epochs=Epochs(first=40, each=40, minibatch=512), learning_rate=1e-3
     )
     """Settings of the networks."""
     horizon: int = bounded(7, minimum=1, maximum=1000)

@@ -21,14 +21,7 @@ from difflcs.losses import violation_loss
 from difflcs.records import LCSModule, LCSParams, system_at
 from difflcs.rl.learning.checks import check_depends, check_module
 from difflcs.rl.learning.trainer import AfterStep, EpisodeTrainer
-from difflcs.rl.rollout import (
-    Policy,
-    append_episodes,
-    contexts,
-    mpc_actions,
-    noisy_actions,
-    transitions,
-)
+from difflcs.rl.rollout import Policy, append_episodes, contexts, mpc_actions, noisy_actions, transitions
 from difflcs.rl.seeding import Stream
 from difflcs.rl.settings import MOST_ENVS, Settings, bounded
 

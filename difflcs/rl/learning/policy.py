@@ -328,12 +328,7 @@ class MLPPolicy(GaussianPolicy):
         InvalidInputError and its kinds: an argument does not fit.
     """
 
-    def __init__(
-        self,
-        network: MLPController,
-        std: float | Tensor = 0.005,
-        covariance: str = "diagonal",
-    ):
+    def __init__(self, network: MLPController, std: float | Tensor = 0.005, covariance: str = "diagonal"):
         super().__init__(MLPGaussian(network, _std(std, len(network.u_min)), covariance))
 
     gaussian: MLPGaussian

@@ -59,12 +59,7 @@ LYING, UPRIGHT = "lying", "upright"
 
 # Convex decomposition. Remeshing (preprocess) inflates by 0.6 to 1.4 mm and a vertex limit (decimate) tilts what
 # should lie flat. Fewer tree searches than the default (150): half of the time, parts as close to the mesh.
-COACD_SETTINGS: dict[str, Any] = {
-    "preprocess_mode": "off",
-    "decimate": False,
-    "mcts_iterations": 60,
-    "seed": 0,
-}
+COACD_SETTINGS: dict[str, Any] = {"preprocess_mode": "off", "decimate": False, "mcts_iterations": 60, "seed": 0}
 SOLID_ENOUGH = 0.95  # a mesh that fills its convex hull to this part is taken as convex
 DEFAULT_PARTS = 8  # most convex parts of a mesh that is not
 DEFAULT_CONCAVITY = 0.1  # CoACD's threshold; 0.05 takes the mug 30 s instead of 8 s and gains nothing at 6 parts

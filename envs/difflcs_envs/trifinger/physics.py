@@ -12,14 +12,7 @@ import mujoco
 import numpy as np
 
 from difflcs_envs.trifinger import kinematics
-from difflcs_envs.trifinger.model import (
-    NUM_FINGERS,
-    PIVOT_RANGE,
-    SUBSTEPS,
-    TIMESTEP,
-    SceneObject,
-    build_spec,
-)
+from difflcs_envs.trifinger.model import NUM_FINGERS, PIVOT_RANGE, SUBSTEPS, TIMESTEP, SceneObject, build_spec
 from difflcs_envs.trifinger.native import make_lane, step_lanes
 from difflcs_envs.trifinger.osc import SINGULAR_DAMPING, SINGULAR_DETERMINANT, controller_fields
 
