@@ -58,7 +58,7 @@ def trajectory(policy: Policy) -> tuple[np.ndarray, dict[int, np.ndarray], bool]
 
     It is to the first evaluation goal that is far enough away and reached, or the last one tried.
     """
-    from difflcs_envs.trifinger.rendering import SceneRenderer
+    from difflcs_envs.rendering import SceneRenderer
 
     env: Any = get_task("cube").make_env(width=SIZE[0], height=SIZE[1]).unwrapped
     renderer, scene, pictures, reached = SceneRenderer(env.model, *SIZE), np.zeros(0), {}, False

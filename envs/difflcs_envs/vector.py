@@ -17,8 +17,8 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from difflcs_envs.checks import checked_options
 from difflcs_envs.errors import PhysicsWarning
-from difflcs_envs.trifinger.arguments import checked_options
 from difflcs_envs.trifinger.base import UNSTABLE
 from difflcs_envs.trifinger.env import TriFingerEnv, TriFingerMoveCubeEnv, TriFingerMoveObjectEnv, TriFingerTurnCubeEnv
 from difflcs_envs.trifinger.physics import CONTROL_PERIOD, STATE_SIZE, step_all

@@ -674,7 +674,7 @@ def test_the_task_is_drawn(undisturbed, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(fig_task, "TRIES", 4)  # the model has learned nothing
 
     try:
-        from difflcs_envs.trifinger.rendering import _make_gl_context
+        from difflcs_envs.rendering import _make_gl_context
 
         _make_gl_context(64, 64).free()
     except RenderingError as error:

@@ -14,10 +14,10 @@ mujoco = pytest.importorskip("mujoco", reason="the environments need the extra [
 
 
 import difflcs_envs  # noqa: E402
+from difflcs_envs.rendering import SceneRenderer, has_display, select_gl_backend  # noqa: E402
 from difflcs_envs.trifinger import kinematics  # noqa: E402
 from difflcs_envs.trifinger.env import TriFingerMoveCubeEnv  # noqa: E402
 from difflcs_envs.trifinger.model import FINGER_YAWS  # noqa: E402
-from difflcs_envs.trifinger.rendering import SceneRenderer, has_display, select_gl_backend  # noqa: E402
 
 OUTWARD = np.stack([-np.sin(FINGER_YAWS), np.cos(FINGER_YAWS)], axis=1)  # (3, 2)
 REST = np.zeros(6)

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import functools
 import math
-import warnings
 from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
 
-from difflcs_envs.errors import MissingDependencyError, PhysicsWarning
+from difflcs_envs.checks import checked_array, checked_integer, checked_number
+from difflcs_envs.errors import MissingDependencyError
 from difflcs_envs.hand.task import (
     ACTION_LIMIT,
     ACTION_SIZE,
@@ -21,18 +21,18 @@ from difflcs_envs.hand.task import (
     GOAL_SIZE,
     STATE_SIZE,
     TURN_OBJECT,
+    TurnTask,
     rotation_to_quaternion,
 )
-from difflcs_envs.trifinger.arguments import checked_array, checked_integer, checked_number, checked_options
-from difflcs_envs.trifinger.rendering import SceneRenderer, select_gl_backend
+from difflcs_envs.rendering import select_gl_backend
 
 select_gl_backend()  # before the first import of MuJoCo
 try:
     import gymnasium
     import mujoco
-    from gymnasium.error import ResetNeeded
     from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+    from difflcs_envs.goal_env import GoalEnv
     from difflcs_envs.hand.model import GOAL_HEIGHT, OBJECTS, PALM_TOP, POSTURE, SUBSTEPS, TIMESTEP, build_model
 except ImportError as error:
     raise MissingDependencyError((error.name or "").partition(".")[0]) from error
@@ -48,7 +48,7 @@ STATE_MEANING = "16 joints [rad], place [m] and rotation vector [rad] of the obj
 GOAL_MEANING = "place [m] and quaternion w, x, y, z of the goal"
 
 
-class HandTurnObjectEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
+class HandTurnObjectEnv(GoalEnv):
     """A hand of four fingers turns an object on its palm.
 
     ## Description
@@ -132,6 +132,9 @@ class HandTurnObjectEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": round(1 / STEP_SECONDS)}
+    action_limit, action_meaning = ACTION_LIMIT, "targets of the servos from the joints in rad"
+    unstable = "The simulation became unstable. The episode is truncated."
+    task: TurnTask
 
     def __init__(
         self,
@@ -169,9 +172,7 @@ class HandTurnObjectEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         box = functools.partial(gymnasium.spaces.Box, dtype=np.float64)
         self.action_space = box(-ACTION_LIMIT, ACTION_LIMIT, (ACTION_SIZE,))
         self.observation_space = gymnasium.spaces.Dict(goal=box(-goal_high, goal_high), state=box(-high, high))  # pyright: ignore
-        self._renderer: SceneRenderer | None = None
         self._state, self._goal, self._held = np.zeros(STATE_SIZE), np.zeros(GOAL_SIZE), 0
-        self._steps: int | None = None  # steps made in this episode; None: reset is needed
 
     @property
     def dt(self) -> float:
@@ -205,13 +206,7 @@ class HandTurnObjectEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             OptionsError: The options are no dictionary.
             ValueError: An option is unknown, or has numbers that do not fit.
         """
-        options = checked_options(options)
-        super().reset(seed=seed)
-        goal, state = options.pop("goal", None), options.pop("state", None)
-        if options:
-            raise ValueError(
-                f"Expected the options 'goal' and 'state', got also {sorted(options, key=str)}. Remove them."
-            )
+        goal, state = self._begin(seed, options)
         # Always the same draws, so that an option passed now does not change the episodes after it.
         place = PLACE + PLACE_NOISE * self.np_random.standard_normal(2)
         yaw, side = self.np_random.uniform(-YAW_NOISE, YAW_NOISE), self.np_random.choice([-1.0, 1.0])
@@ -232,46 +227,19 @@ class HandTurnObjectEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         self.data.mocap_pos[0] = (*self._goal[:2], GOAL_HEIGHT)
         self.data.mocap_quat[0] = self._goal[3:]
         mujoco.mj_forward(self.model, self.data)
-        info = self.task.pose_info(self._state, self._goal)
+        info = self._pose_info()
         self._steps, self._held = 0, int(info["success"])
-        return self._observation(), {name: value.item() for name, value in info.items()} | {"held": self._held}
+        return self._observation(), info | {"held": self._held}
 
-    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """Hold targets of the servos for 0.1 s.
-
-        Args:
-            action: Targets from where the joints are [rad], (16,).
-
-        Returns:
-            Observation, reward, terminated (always False), truncated, info.
-
-        Raises:
-            ValueError: The action has the wrong shape or is not finite.
-            gymnasium.error.ResetNeeded: No episode is running.
-        """
-        if self._steps is None:
-            raise ResetNeeded(
-                "Expected a running episode, but it has ended or never began. Call reset() before step()."
-            )
-        requested = checked_array("action", action, ACTION_SIZE, "targets of the servos from the joints in rad")
-        executed, before = requested.clip(-ACTION_LIMIT, ACTION_LIMIT), self._state
-        self.data.ctrl[:] = before[:16] + executed
+    def _simulate(self, action: np.ndarray) -> np.ndarray | None:
+        self.data.ctrl[:] = self._state[:16] + action
         mujoco.mj_step(self.model, self.data, SUBSTEPS)
-        after = np.concatenate([self.data.qpos[:19], continued_rotation(self.data.qpos[19:], before[19:])])
-        stable = not any(warning.number for warning in self.data.warning) and after in self.observation_space["state"]  # pyright: ignore
-        self._state = after if stable else before.copy()
-        self._steps += 1
-        truncated = self._steps >= self.horizon or not stable
-        reward, outcome = self.task.outcome(before, executed, self._state, self._goal, truncated)
-        info: dict[str, Any] = {name: value.item() for name, value in outcome.items()}
-        self._held = self._held + 1 if info["success"] else 0
-        clipped = bool((executed != requested).any())
-        info |= {"held": self._held, "executed_action": executed, "clipped": clipped, "physics_error": not stable}
-        if truncated:
-            self._steps = None
-        if not stable:
-            warnings.warn("The simulation became unstable. The episode is truncated.", PhysicsWarning, stacklevel=2)
-        return self._observation(), float(reward), False, truncated, info
+        after = np.concatenate([self.data.qpos[:19], continued_rotation(self.data.qpos[19:], self._state[19:])])
+        stable = not any(warning.number for warning in self.data.warning)
+        return after if stable and after in self.observation_space["state"] else None  # pyright: ignore
+
+    def _stepped(self, info: dict[str, Any]) -> None:
+        info["held"] = self._held = self._held + 1 if info["success"] else 0
 
     def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Draw the scene, uint8 (height, width, 3); None without render mode.
@@ -280,18 +248,6 @@ class HandTurnObjectEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             RenderingError: Nothing can be drawn on this machine. The message says what to install.
         """
         return None if self.render_mode is None else self.picture()
-
-    def picture(self, camera: str = "front") -> np.ndarray:
-        """Draw the scene from "front" or "top", whatever the render mode."""
-        if self._renderer is None:
-            self._renderer = SceneRenderer(self.model, self.width, self.height)
-        return self._renderer.render(self.data, camera)
-
-    def close(self) -> None:
-        """Free the renderer. May be called again."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_renderer": None}  # OpenGL stays behind

@@ -7,15 +7,13 @@ tensors, and return the like.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from difflcs_envs.trifinger.task import library_of
+from difflcs_envs.goal_task import Array, GoalTask, library_of
 
 __all__ = ["TURN_OBJECT", "TurnTask", "rotation_to_quaternion"]
 
-Array = Any
 ACTION_LIMIT, ACTION_SIZE = 0.1, 16  # [rad], joint servos
 GOAL_SIZE, STATE_SIZE = 7, 22
 EPISODE_STEPS = 100
@@ -23,7 +21,7 @@ LOST = 0.005  # [m] height of the object's centre below which it is no longer on
 
 
 @dataclass(frozen=True)
-class TurnTask:
+class TurnTask(GoalTask):
     """Bring an object that lies in the hand to an orientation, near a place.
 
     Attributes:
@@ -57,39 +55,14 @@ class TurnTask:
         along = (rotation_to_quaternion(state[..., 19:]) * goal[..., 3:]).sum(-1)
         return 1 - along * along
 
-    def outcome(
-        self, state: Array, action: Array, next_state: Array, goal: Array, ended: Array | bool
-    ) -> tuple[Array, dict[str, Array]]:
-        """Judge one step.
-
-        Args:
-            state: The state in which the action was taken.
-            action: The executed action [rad].
-            next_state: The state after it.
-            goal: The goal.
-            ended: Whether the episode ends with this step; one for all, or of the batch shape.
-
-        Returns:
-            The reward, and info: the pose info of the next state and every term of the reward.
-        """
-        library, info = library_of(state), self.pose_info(next_state, goal)
+    def dense_reward_terms(self, state: Array, action: Array, goal: Array) -> dict[str, Array]:
+        """`reward_turn`, `reward_place` and `reward_action`, see `GoalTask`."""
         shift = state[..., 16:19] - goal[..., :3]
-        failed = library.asarray(ended) & ~info["success"]
-        zero = library.zeros_like(info["angle_error"], dtype=library.float64)
-        terms = {
+        return {
             "reward_turn": -self.turn_weight * self.squared_sine(state, goal),
             "reward_place": -self.place_weight * (shift * shift).sum(-1),
             "reward_action": -self.action_weight * (action * action).sum(-1),
-            "reward_completion": library.where(failed, -self.sparse_penalty, zero),
         }
-        return sum(terms.values(), start=zero), info | terms
-
-    def judge(
-        self, state: Array, action: Array, next_state: Array, goal: Array, ended: Array | bool
-    ) -> tuple[Array, Array]:
-        """Reward and success of one step, see `outcome`."""
-        reward, info = self.outcome(state, action, next_state, goal, ended)
-        return reward, info["success"]
 
 
 def rotation_to_quaternion(rotation: Array) -> Array:

@@ -5,27 +5,22 @@ from __future__ import annotations
 import copy
 import math
 import time
-import warnings
 from collections.abc import Mapping
 from typing import Any, ClassVar, Self, TypedDict
 
 import numpy as np
 
-from difflcs_envs.errors import MissingDependencyError, PhysicsWarning, RenderingError
-from difflcs_envs.trifinger.arguments import (
-    checked_array,
-    checked_integer,
-    checked_number,
-    checked_options,
-    checked_task,
-)
-from difflcs_envs.trifinger.rendering import SceneRenderer, SceneViewer, has_display, select_gl_backend
-from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE, EPISODE_STEPS, GOAL_SIZE, MoveTask
+from difflcs_envs.checks import checked_array, checked_integer, checked_number
+from difflcs_envs.errors import MissingDependencyError, RenderingError
+from difflcs_envs.rendering import SceneViewer, has_display, select_gl_backend
+from difflcs_envs.trifinger.arguments import checked_task
+from difflcs_envs.trifinger.task import ACTION_LIMIT, EPISODE_STEPS, GOAL_SIZE, MoveTask
 
 select_gl_backend()  # before the first import of MuJoCo
 try:
     import gymnasium
-    from gymnasium.error import ResetNeeded
+
+    from difflcs_envs.goal_env import GoalEnv
 except ImportError as error:
     raise MissingDependencyError("gymnasium") from error
 try:
@@ -79,7 +74,7 @@ class CommonArguments(TypedDict, total=False):
     height: int
 
 
-class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
+class TriFingerEnv(GoalEnv):
     """Base class of the TriFinger tasks, which are documented below; make one of those.
 
     Attributes:
@@ -93,6 +88,8 @@ class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         "render_modes": ["rgb_array", "human"] if has_display() else ["rgb_array"],
         "render_fps": round(1 / CONTROL_PERIOD),
     }
+    action_limit, action_meaning, unstable = ACTION_LIMIT, ACTION_MEANING, UNSTABLE
+    task: MoveTask
 
     def __init__(
         self,
@@ -135,12 +132,10 @@ class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
 
         self.physics = self._make_physics()
         self.physics.check_fit()
-        self._renderer: SceneRenderer | None = None
         self._viewer: SceneViewer | None = None
         self._last_frame_time = 0.0
         self._state = np.zeros(STATE_SIZE)
         self._goal = np.zeros(GOAL_SIZE)
-        self._steps: int | None = None  # steps made in this episode; None: reset is needed
 
     def _make_physics(self, model: Any = None) -> TriFingerPhysics:
         return TriFingerPhysics(self.object, self.osc_kp, (self.width, self.height), model)
@@ -187,13 +182,7 @@ class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             OptionsError: The options are no dictionary.
             ValueError: An option is unknown, has the wrong shape, or is outside what the robot and the task allow.
         """
-        options = checked_options(options)
-        super().reset(seed=seed)
-        goal, state = options.pop("goal", None), options.pop("state", None)
-        if options:
-            raise ValueError(
-                f"Expected only the options 'goal' and 'state', got also {sorted(options, key=str)}. Remove them."
-            )
+        goal, state = self._begin(seed, options)
         # Always the same draws, so that an option passed now does not change the episodes after it.
         joint_noise = self.np_random.uniform(-JOINT_NOISE, JOINT_NOISE, (3, 3))
         pose_noise = self.np_random.uniform(-1.0, 1.0, 3) * (POSITION_NOISE, POSITION_NOISE, YAW_NOISE)
@@ -226,43 +215,13 @@ class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             self.render()
         return self._observation(), self._pose_info()
 
-    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """Move the fingertips for 0.1 s.
+    def _simulate(self, action: np.ndarray) -> np.ndarray | None:
+        after = self.physics.step(action)
+        return None if after is None else continued(self._state, after)
 
-        Args:
-            action: Displacements of the fingertips [m], (6,).
-
-        Returns:
-            Observation, reward, terminated (always False), truncated, info.
-
-        Raises:
-            ValueError: The action has the wrong shape or is not finite.
-            gymnasium.error.ResetNeeded: No episode is running.
-        """
-        if self._steps is None:
-            raise ResetNeeded(
-                "Expected a running episode, but it has ended or never began. Call reset() before step()."
-            )
-        requested = checked_array("action", action, ACTION_SIZE, ACTION_MEANING)
-        executed = requested.clip(-ACTION_LIMIT, ACTION_LIMIT)
-        before, after = self._state, self.physics.step(executed)
-        stable = after is not None
-        self._state = continued(before, after) if stable else before.copy()
-        self._steps += 1
-        truncated = self._steps >= self.horizon or not stable
-
-        reward, outcome = self.task.outcome(before, executed, self._state, self._goal, truncated)
-        info: dict[str, Any] = {name: value.item() for name, value in outcome.items()}
-        info["executed_action"] = executed
-        info["clipped"] = bool((executed != requested).any())
-        info["physics_error"] = not stable
-        if truncated:
-            self._steps = None
-        if not stable:
-            warnings.warn(UNSTABLE, PhysicsWarning, stacklevel=2)
+    def _stepped(self, info: dict[str, Any]) -> None:
         if self.render_mode == "human":
             self.render()
-        return self._observation(), float(reward), False, truncated, info
 
     def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Draw the scene, the goal as an outline.
@@ -289,27 +248,9 @@ class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             return None
         return self.picture()
 
-    def picture(self, camera: str = "front") -> np.ndarray:
-        """Draw the scene off screen, whatever the render mode.
-
-        Args:
-            camera: "front", or "top", which hides the hand but for its lower links.
-
-        Returns:
-            A new picture, uint8 (height, width, 3).
-
-        Raises:
-            RenderingError: No OpenGL on this machine. The message says what to install.
-        """
-        if self._renderer is None:
-            self._renderer = SceneRenderer(self.physics.model, self.width, self.height)
-        return self._renderer.render(self.physics.data, camera)
-
     def close(self) -> None:
         """Free the renderer and the window. May be called again."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        super().close()
         if self._viewer is not None:
             self._viewer.close()
             self._viewer = None
@@ -346,6 +287,3 @@ class TriFingerEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             left = 0 if self._steps is None else self.horizon - self._steps
             observation["time_to_go"] = np.array([left * CONTROL_PERIOD])
         return observation
-
-    def _pose_info(self) -> dict[str, Any]:
-        return {name: value.item() for name, value in self.task.pose_info(self._state, self._goal).items()}

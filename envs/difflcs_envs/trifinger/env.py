@@ -6,7 +6,7 @@ import os
 from dataclasses import replace
 from typing import Unpack
 
-from difflcs_envs.trifinger.arguments import checked_integer, checked_number
+from difflcs_envs.checks import checked_integer, checked_number
 from difflcs_envs.trifinger.base import CommonArguments, TriFingerEnv
 from difflcs_envs.trifinger.model import CubeObject
 from difflcs_envs.trifinger.objects import make_object

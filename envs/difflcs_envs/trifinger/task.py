@@ -6,25 +6,22 @@ state or a step takes NumPy arrays or PyTorch tensors and returns the like; with
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-__all__ = ["MOVE", "TURN", "MoveTask", "library_of"]
+from difflcs_envs.goal_task import Array, GoalTask, library_of
+
+__all__ = ["MOVE", "TURN", "MoveTask"]
 
 ACTION_SIZE = 6  # x, y of three tips
 ACTION_LIMIT = 0.015  # [m] per component and step
 GOAL_SIZE = 3  # x, y, yaw
 EPISODE_STEPS = 20
 
-Array = Any
-"""A NumPy array, or a PyTorch tensor, which this file does not import."""
-
 
 @dataclass(frozen=True)
-class MoveTask:
+class MoveTask(GoalTask):
     """Bring the object's pose (x, y, yaw) to the goal's.
 
     Attributes:
@@ -105,43 +102,6 @@ class MoveTask:
             "reward_yaw": -self.yaw_weight * turn * turn,
             "reward_action": -self.action_weight * (action * action).sum(axis=-1),
         }
-
-    def outcome(
-        self, state: Array, action: Array, next_state: Array, goal: Array, ended: Array | bool
-    ) -> tuple[Array, dict[str, Array]]:
-        """Judge one step.
-
-        Args:
-            state: The state in which the action was taken.
-            action: The executed action [m].
-            next_state: The state after it.
-            goal: The goal.
-            ended: Whether the episode ends with this step; one for all, or of the batch shape.
-
-        Returns:
-            The reward, and info: the pose info of the next state and every term of the reward.
-        """
-        library = library_of(state)
-        info = self.pose_info(next_state, goal)
-        terms = self.dense_reward_terms(state, action, goal)
-        failed = library.asarray(ended) & ~info["success"]
-        # Rewards have 64 bits. PyTorch would make a number of 32 bits of two Python floats.
-        zero = library.zeros_like(info["position_error"], dtype=library.float64)
-        terms["reward_completion"] = library.where(failed, -self.sparse_penalty, zero)
-        return sum(terms.values(), start=zero), info | terms
-
-    def judge(
-        self, state: Array, action: Array, next_state: Array, goal: Array, ended: Array | bool
-    ) -> tuple[Array, Array]:
-        """Reward and success of one step, see `outcome`."""
-        reward, info = self.outcome(state, action, next_state, goal, ended)
-        return reward, info["success"]
-
-
-def library_of(array: Array) -> Any:
-    """Return PyTorch for its tensors, else NumPy. Nothing is imported: a tensor implies that PyTorch is."""
-    torch = sys.modules.get("torch")
-    return torch if torch is not None and isinstance(array, torch.Tensor) else np
 
 
 MOVE = MoveTask()
