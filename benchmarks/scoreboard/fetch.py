@@ -28,7 +28,7 @@ import mujoco
 import numpy as np
 import torch
 import tyro
-from successes import success_figures
+from successes import success_figures, success_text
 
 from difflcs import GoalCost, LCSMPCLayer, LCSParams, LCSSequence
 from difflcs.physics import PlanarPushing, box
@@ -280,6 +280,7 @@ def main(o: Options) -> None:
     env = make_env(o.task)
     policy = (PushPolicy if o.task == "push" else SlidePolicy)(env.unwrapped.model)
     episodes = np.array([play(env, policy, seed) for seed in range(o.seed, o.seed + o.episodes)])
+    env.close()
     success, first, away, seconds = episodes.T
     figures = {
         **success_figures(success),
@@ -292,11 +293,9 @@ def main(o: Options) -> None:
         print(json.dumps({"task": o.task, **figures}))
         return
     print(
-        f"{o.task}: {100 * figures['success_rate']:.1f} % of {len(episodes)} ({100 * figures['ci_low']:.1f} to "
-        f"{100 * figures['ci_high']:.1f}), at the goal after {first.mean():.1f} steps, {figures['final_mm']:.0f} mm "
+        f"{o.task}: {success_text(figures)}, at the goal after {first.mean():.1f} steps, {figures['final_mm']:.0f} mm "
         f"from it at the end, {figures['milliseconds_per_step']:.1f} ms a step; failed: {figures['failed']}"
     )
-    env.close()
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ import mujoco
 import numpy as np
 import torch
 import tyro
-from successes import success_figures
+from successes import success_figures, success_text
 
 from difflcs import LCSMPCLayer
 from difflcs.cli.bench import machine, save
@@ -333,8 +333,7 @@ def report(o: Options, name: str, episodes: list[dict[str, Any]]) -> None:
         print(json.dumps({"object": name, **found}), flush=True)
         return
     print(
-        f"{name}: {100 * found['success_rate']:.1f} % of {found['episodes']} ({100 * found['ci_low']:.1f} to "
-        f"{100 * found['ci_high']:.1f}), {found['dropped']} dropped, {found['mean_goals']:.2f} goals, "
+        f"{name}: {success_text(found)}, {found['dropped']} dropped, {found['mean_goals']:.2f} goals, "
         f"{found['mean_steps']:.0f} steps, {found['position_mm']:.0f} mm, {found['angle_deg']:.0f}°, "
         f"ms {found['milliseconds_per_step']}, p99 {found['milliseconds_p99']:.0f}",
         flush=True,

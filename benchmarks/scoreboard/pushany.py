@@ -27,7 +27,7 @@ import tyro
 from numpy.typing import NDArray
 from pusht import STEPS, Episode, Variant, play
 from shapely import affinity
-from successes import success_figures
+from successes import success_figures, success_text
 
 from difflcs.errors import InvalidInputError, MissingDependencyError
 from difflcs.physics import PlanarPushing, Polygon, Union
@@ -191,8 +191,7 @@ def report(name: str, f: dict[str, Any]) -> None:
     """Print the figures of a shape."""
     inside = "" if f["inside"] is None else f", {100 * f['inside']:.1f} % of {f['goals_inside']} with a goal inside"
     print(
-        f"{name}: {100 * f['success_rate']:.1f} % of {f['episodes']} ({100 * f['ci_low']:.1f} to "
-        f"{100 * f['ci_high']:.1f}){inside}; {f['mean_steps']:.1f} steps, {f['milliseconds_per_step']:.1f} ms a step",
+        f"{name}: {success_text(f)}{inside}; {f['mean_steps']:.1f} steps, {f['milliseconds_per_step']:.1f} ms a step",
         flush=True,
     )
 

@@ -30,7 +30,7 @@ import torch
 import tyro
 from learn_pusht import learn
 from push_t import CENTER_OF_MASS, GYRATION, PIXELS, STEPS, PushTPolicy, make_env, tee, tee_pushing
-from successes import success_figures
+from successes import success_figures, success_text
 
 from difflcs.cli.bench import machine, save
 from difflcs.errors import InvalidInputError
@@ -164,8 +164,7 @@ def main(o: Options) -> None:
             print(json.dumps({"variant": name, **figures}))
             continue
         print(
-            f"{name}: {100 * figures['success_rate']:.1f} % of {figures['episodes']} ({100 * figures['ci_low']:.1f} to "
-            f"{100 * figures['ci_high']:.1f}), {figures['mean_steps']:.1f} steps, coverage {figures['coverage']:.3f}, "
+            f"{name}: {success_text(figures)}, {figures['mean_steps']:.1f} steps, coverage {figures['coverage']:.3f}, "
             f"{figures['milliseconds_per_step']:.1f} ms a step"
         )
     env.close()
