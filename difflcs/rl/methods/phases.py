@@ -44,8 +44,9 @@ def main_phase(
     rollouts = None
     if models is not None and models.iterations:
         rollouts = ModelRollouts(envs, task.outcome, models, work.seed, task.episode_steps)
+    best = controller if keep_best and isinstance(controller, LCSMPCLayer) else None
     return make_ppo(
-        make_actor(copy.deepcopy(controller) if keep_best else controller, settings.std, settings.covariance),
+        make_actor(controller if best is None else copy.deepcopy(best), settings.std, settings.covariance),
         envs,
         settings,
         work.seed,
@@ -56,7 +57,7 @@ def main_phase(
         first_iteration=first_iteration,
         failure_penalty=task.failure_penalty,
         models=rollouts,
-        best=controller if keep_best and isinstance(controller, LCSMPCLayer) else None,
+        best=best,
     )
 
 
