@@ -146,9 +146,8 @@ def sliding_system(model: Any, looks: int = 4, coarse: int = 11) -> LCSSequence:
 def _sliding_stage(model: Any, rate: float, h: float, decides: bool = False, touches: bool = True) -> LCSParams:
     """Make one stage of `sliding_system`, of h seconds."""
     decay, brake = np.exp(-rate * h), 9.81 * friction_with_table(model) * h
-    spring = decay * np.array(
-        [[1 + rate * h, h], [-(rate**2) * h, 1 - rate * h]]
-    )  # of the gripper around the mocap body
+    # Of the gripper around the mocap body.
+    spring = decay * np.array([[1 + rate * h, h], [-(rate**2) * h, 1 - rate * h]])
     A, B, C = np.eye(5), np.zeros((5, 1)), np.zeros((5, 2))
     toward = np.array([1.0, 0.0]) - spring[:, 0]
     A[:2, :2] = spring
@@ -156,7 +155,6 @@ def _sliding_stage(model: Any, rate: float, h: float, decides: bool = False, tou
     if decides:
         A[:3, 0] += A[:3, 2]
         A[:3, 2], B[:3, 0] = 0.0, REACH * np.array([*toward, 1.0])
-        A[2, 0] = 1.0
     A[3, 4] = h
     C[3:], d = [[h, h / 2], [1.0, 1.0]], np.array([0.0, 0.0, 0.0, -h * brake / 2, -brake])
     gap, speed = np.array([-1.0, 0.0, 0.0, 1.0, 0.0]) / h, np.eye(5)[4]
