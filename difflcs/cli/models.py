@@ -27,10 +27,10 @@ _SMOKE_GOALS = 4
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Success rate of a learned model, without noise, with its 95 % interval."""
+    """Success rate of a learned model, or of known physics, without noise, with its 95 % interval."""
 
     model: Path
-    """Run directory, or zoo:NAME for one of the models that `difflcs zoo` lists."""
+    """Run directory, zoo:NAME of a model that `difflcs zoo` lists, or a task whose physics is known."""
     goals: int = 1000
     """Random goals, one episode each."""
     seed: int = 0
@@ -102,14 +102,14 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Render:
-    """Video of a learned model at work, one episode per goal."""
+    """Video of a learned model, or of known physics, at work, one episode per goal."""
 
     model: Path
-    """Run directory, or zoo:NAME for one of the models that `difflcs zoo` lists."""
+    """Run directory, zoo:NAME of a model that `difflcs zoo` lists, or a task whose physics is known."""
     goal: tuple[float, ...] | None = None
     """Goals, one after another, each with the numbers that the task wants; by default an example of the task."""
     out: Path = Path("video.mp4")
-    """Video to write, an MP4."""
+    """Video to write, an MP4 or a GIF."""
     force: bool = False
     """Replace the video if there is one."""
     seed: int = 0
@@ -119,8 +119,8 @@ class Render:
 
     def run(self) -> None:
         """Run the command."""
-        if self.out.suffix.lower() != ".mp4" or self.out.is_dir():
-            raise InvalidInputError(f"out: expected the name of an MP4 file, got {self.out}; pass --out video.mp4")
+        if self.out.suffix.lower() not in (".mp4", ".gif") or self.out.is_dir():
+            raise InvalidInputError(f"out: expected the name of an MP4 or GIF, got {self.out}; pass --out video.mp4")
         if self.out.exists() and not self.force:
             raise InvalidInputError(
                 f"out: expected a new file, got {self.out}, which exists; pass --force to replace it, or another --out"

@@ -148,7 +148,8 @@ def run_of(out: Path) -> SimpleNamespace:
         (["render", "zoo:trifinger-cube", "--goal"], "expected x [m], y [m], yaw [rad] for each goal"),
         (["render", "zoo:trifinger-cube", "--goal", "0.1"], "expected x [m], y [m], yaw [rad] for each goal"),
         (["train", "--method", "magic"], "expected one of lcs-rl, violation"),
-        (["render", "zoo:trifinger-cube", "--out", "video.gif"], "MP4"),
+        (["render", "zoo:trifinger-cube", "--out", "video.avi"], "MP4"),
+        (["evaluate", "turn_cube"], "expected a task with known physics"),
         (["bench", "--repeats", "0"], "repeats"),
         (["evaluate", "nowhere"], "difflcs train"),
         (["render", "nowhere"], "difflcs train"),
@@ -456,6 +457,8 @@ def test_render(capsys, finished, tmp_path):
     assert video.read_bytes() == before
     assert run(capsys, "render", "zoo:trifinger-cube", "--smoke", "--out", video, "--force")[0] == 0
     assert video.read_bytes() != before
+    assert "reached" in run(capsys, "render", "cube", "--out", tmp_path / "cube.gif")[1]  # nothing is learned
+    assert (tmp_path / "cube.gif").read_bytes()[:4] == b"GIF8"
     file = tmp_path / "file"
     file.write_text("no folder")
     code, _, err = run(capsys, "render", finished, "--smoke", "--out", file / "video.mp4")

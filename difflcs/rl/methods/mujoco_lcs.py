@@ -7,14 +7,19 @@ from typing import ClassVar
 
 from difflcs._checks import describe
 from difflcs.errors import InvalidInputError
+from difflcs.rl.learning.physics_fit import PhysicsFitSettings
 from difflcs.rl.learning.trainer import Trainer
 from difflcs.rl.methods.base import Work
 from difflcs.rl.methods.contact_lcs import ContactMethod, known_physics
+from difflcs.rl.settings import group
 
 
 @dataclass(frozen=True)
 class MujocoMethod(ContactMethod):
     """LCS-RL with a MuJoCo model inside: masses, friction or drives are fitted to the MPC's own episodes, then PPO."""
+
+    fit: PhysicsFitSettings = group(PhysicsFitSettings, rollouts=4, learning_rate=0.05, batch=200)
+    """Settings of the fit."""
 
     name: ClassVar[str] = "mujoco-lcs"
     summary: ClassVar[str] = "a MuJoCo model whose uncertain numbers are fitted, then PPO through the MPC"

@@ -161,7 +161,7 @@ def record_video(
     task: TaskSpec,
     seed: int = 0,
 ) -> list[bool]:
-    """Play one noise-free episode per goal into an MP4, in real time, with the task's caption above.
+    """Play one noise-free episode per goal into an MP4 or GIF, in real time, with the task's caption above.
 
     Args:
         env: one environment of the task with render_mode="rgb_array".
@@ -188,11 +188,14 @@ def record_video(
             low, high = space.low.tolist(), space.high.tolist()
             raise InvalidInputError(f"goal: expected {low} <= goal <= {high}, got {goal.tolist()}")
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.tmp.mp4")
+    kind, seconds = path.suffix.lower(), task.step_seconds
+    gif = {"duration": 1000 * seconds, "loop": 0}
+    options = gif if kind == ".gif" else {"fps": max(1, round(1 / seconds)), "quality": 8}
+    temporary = path.with_name(f".{path.stem}.tmp{kind}")
     reached: list[bool] = []
     temporary.touch()  # says here whether it can be written, where the message is not one of ffmpeg
     try:
-        with cast(Any, imageio.get_writer)(temporary, fps=max(1, round(1 / task.step_seconds)), quality=8) as video:
+        with cast(Any, imageio.get_writer)(temporary, **options) as video:
             for number, goal in enumerate(chosen, 1):
                 act = mpc_actions(policy)  # which begins anew, as in an evaluation
                 observation, info = env.reset(seed=seed + number, options={"goal": goal})

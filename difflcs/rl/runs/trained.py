@@ -1,4 +1,4 @@
-"""Trained policies, from a run directory or from the zoo."""
+"""Trained policies, from a run directory or from the zoo, and those that known physics makes without a training."""
 
 from __future__ import annotations
 
@@ -8,21 +8,22 @@ from pathlib import Path
 from typing import Any
 
 from difflcs import _storage, zoo
-from difflcs.rl.methods import get_method
+from difflcs.rl.methods import ContactMethod, get_method
+from difflcs.rl.methods.contact_lcs import known_physics
 from difflcs.rl.rollout import Policy
 from difflcs.rl.runs.checkpoint import RunDirectory
 from difflcs.rl.runs.training import load_policy, stored_config
-from difflcs.rl.tasks import get_task
+from difflcs.rl.tasks import get_task, task_names
 
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """The policy that a run has learned, or that of a model of the zoo, and where it comes from.
+    """The policy that a run has learned, that of a model of the zoo or of known physics, and where it comes from.
 
     Attributes:
-        name: the run directory, or "zoo:NAME".
+        name: the run directory, "zoo:NAME", or the task.
         task: what it was trained for.
-        method: name of the method.
+        method: name of the method; "known physics" if nothing is learned.
         backend: MPC solver; None without one.
         policy: from states and goals to plans.
         finished: True if its training is.
@@ -46,12 +47,18 @@ class TrainedPolicy:
         """Load a trained policy.
 
         Args:
-            source: run directory, or "zoo:NAME".
+            source: run directory, or "zoo:NAME"; or the name of a task, for the MPC with the physics that is known of
+                it (`PhysicsSpec`), as it is before a training.
 
         Raises:
             CheckpointError: there is none, or it cannot be used.
+            InvalidInputError: nothing is known of the physics of the task.
         """
         name = str(source)
+        if name in task_names() and not Path(name).exists():
+            task, method = get_task(name), ContactMethod()
+            policy = method.policy(task, known_physics(task).make_system())
+            return cls(name, name, "known physics", method.solver, policy, True, None)
         if name.startswith(zoo.PREFIX):
             known = zoo.card(name)
             task = get_task(known.task)
