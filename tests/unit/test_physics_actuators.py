@@ -1,12 +1,14 @@
 """Actuators with activation and with limits of control and force, beside MuJoCo's own steps."""
 
+import numpy as np
 import pytest
 import torch
 
 from difflcs import LCSMPCLayer, QuadraticCost
+from difflcs.errors import InvalidInputError
 
 mujoco = pytest.importorskip("mujoco")
-from difflcs.physics.mujoco import MujocoLCS  # noqa: E402
+from difflcs.physics.mujoco import MujocoLCS, drive_mocap  # noqa: E402
 
 SLIDE = """<mujoco><option timestep=".002" integrator="{0}" gravity="0 0 0"/><worldbody><body>
     <joint name="a" type="slide" axis="1 0 0" damping="2" {2}/><geom size=".1" mass="1"/></body></worldbody>
@@ -104,3 +106,25 @@ def test_what_mocap_moves_is_where_the_data_have_it():
     module.observe(data)
     for given in (module, MujocoLCS(model, data, motion="dynamic")):
         assert given.contacts(given.state.to_state(data.qpos, data.qvel)).gap.item() == pytest.approx(0.3)
+
+
+def test_a_plan_with_driven_mocap_bodies_knows_how_they_push_and_pull():
+    spec = mujoco.MjSpec.from_string("""<mujoco><worldbody><geom type="plane" size="1 1 .1"/>
+      <body name="hand" mocap="true" pos="-.1 0 .02" quat="1 0 0 1"><geom size=".03"/></body>
+      <body name="cart"><joint type="slide" axis="1 0 0" damping="1"/><geom size=".05" mass=".2"/></body>
+      <body name="grip" mocap="true" pos="0 .3 .3"/>
+      <body name="arm" pos="0 .3 .3"><joint type="slide" axis="1 0 0"/><geom size=".02" mass=".1"/></body>
+      </worldbody><equality><weld body1="arm" body2="grip"/></equality></mujoco>""")
+    jump, driven = spec.compile(), drive_mocap(spec).compile()
+    before, data = mujoco.MjData(jump), mujoco.MjData(driven)
+    module = MujocoLCS(driven, motion="dynamic", seconds=0.05, distance=0.1)
+    x, u = module.observe(data), torch.tensor([0.04, 0.0, 0.0, 0.01, 0.0, 0.0], dtype=torch.float64)
+    before.mocap_pos[:] += u.numpy().reshape(2, 3)
+    mujoco.mj_step(jump, before, 25)
+    planned = module.state.to_mujoco(module.params(x).step(x, u).x_next)[0]
+    np.testing.assert_allclose(planned[[3, 7]], before.qpos, atol=1.5e-3)  # of hand, cart, grip, arm
+    data.ctrl[:] = module.control(x, 0 * u)
+    mujoco.mj_step(driven, data, 25)  # stays, as gravity does not act on it
+    np.testing.assert_allclose(data.qpos, module.state.to_mujoco(x)[0], atol=1e-6)
+    with pytest.raises(InvalidInputError, match="mocap"):
+        drive_mocap(mujoco.MjSpec.from_string("<mujoco/>"))

@@ -13,6 +13,7 @@ from difflcs.physics.mujoco.cost import Distance, Effort, MujocoCost, Orientatio
 from difflcs.physics.mujoco.groups import ContactGroup
 from difflcs.physics.mujoco.lcs import MujocoLCS, lcs_from_mujoco
 from difflcs.physics.mujoco.learnable import LearnableMujocoLCS
+from difflcs.physics.mujoco.mocap import drive_mocap
 from difflcs.physics.mujoco.state import MujocoState
 
 __all__ = [
@@ -27,5 +28,6 @@ __all__ = [
     "Position",
     "Posture",
     "Velocity",
+    "drive_mocap",
     "lcs_from_mujoco",
 ]
