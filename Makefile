@@ -20,6 +20,12 @@ help:
 	@echo "make coverage, make mutants   how much of the library the quick tests run, and notice"
 	@echo "make clean  remove .venv and build products"
 
+# The torch of PyPI for Linux has gigabytes for NVIDIA's GPUs. Where there is none, uv finds the build for processors; else
+# pip takes what it finds.
+CPU_TORCH := [ "$$(uname)" != Linux ] || command -v nvidia-smi >/dev/null || { \
+  $(BIN)/python -m pip install --quiet --disable-pip-version-check uv && UV_HTTP_TIMEOUT=10 \
+  $(BIN)/uv pip install --quiet --python $(BIN)/python --torch-backend cpu -c constraints.txt torch; } 2>/dev/null || true
+
 # .ready: everything that developers need, with the kernels for every CPU. .demo: what the demo needs, a quarter of the
 # packages, with the kernels for the CPU that is here, which compile in half the time.
 SOURCES := pyproject.toml constraints.txt CMakeLists.txt cmake/kernels.cmake \
@@ -32,6 +38,7 @@ $(VENV)/.ready $(VENV)/.demo: $(SOURCES)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "difflcs needs Python 3.11 or newer, got $$($(PYTHON) --version); try make PYTHON=python3.11"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
+	@$(CPU_TORCH)
 	SKBUILD_CMAKE_DEFINE=DIFFLCS_ISAS=$(ISAS) \
 	  $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e ".[$(EXTRAS)]"
 	@touch $@
