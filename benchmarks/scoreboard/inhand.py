@@ -64,6 +64,7 @@ OBJECTS = {  # place of the start [m], its height, and the target place, as publ
 JOINTS = (0.125, 1.13, 1.45, 1.24, -0.02, 0.445, 1.17, 1.5, -0.459, 1.54, 1.11, 1.23, 0.638, 1.85, 1.5, 1.26)
 FINGERS, LINKS = ("ff", "mf", "rf", "th"), ("base", "proximal", "medial", "distal", "tip")
 COLUMNS = "object", "seed", "success", "dropped", "steps", "position_mm", "angle_deg", "goals"
+PARTS = "system", "cost", "solve", "rehearsal"
 LIMIT, HELD, SUBSTEPS, LOST, SECONDS = 500, 21, 50, 0.005, 0.1
 
 
@@ -102,6 +103,12 @@ class Settings:
     """Part of the published limit of actions that is used, as drops come from fast motion."""
     spread: float = 0.3
     """Standard deviation of the posture to which the hand opens from the second time on [rad]."""
+    paces: tuple[float, ...] = ()
+    """Factors by which the planned action is tried in MuJoCo, the fastest first; none to execute it untried."""
+    slack: float = 0.02
+    """Cost by which a faster action may end worse than the best."""
+    substep: float = 0.002
+    """Of MuJoCo where actions are tried [s]."""
 
 
 @dataclass
@@ -167,6 +174,9 @@ class HandPolicy:
 
     def __init__(self, model: Any, data: Any, place: np.ndarray, goal: np.ndarray, settings: Settings):
         s = settings
+        self.trial, self.place = copy.copy(model), place
+        self.trial.opt.timestep = s.substep
+        self.tried = mujoco.MjData(self.trial)
         model = copy.copy(model)
         model.body_inertia[model.body("obj").id] *= s.inertia
         self.limit = 0.1 if model.body("obj").mass[0] < 0.05 else 0.2
@@ -237,9 +247,32 @@ class HandPolicy:
         with torch.no_grad():
             plan = self.mpc(x, lcs=system, cost=cost, guess=self.guess, u_min=low, u_max=high)
         marks.append(time.thread_time())
-        self.times.append(1e3 * np.diff(marks))
         self.guess = plan.shift() if bool(solved(plan.status)) else None
-        return self.module.control(x, plan.action).numpy()
+        ctrl = self.module.control(x, plan.action).numpy()
+        if self.settings.paces:
+            ctrl = self.rehearse(data, ctrl)
+        marks.append(time.thread_time())
+        self.times.append(1e3 * np.diff(marks))
+        return ctrl
+
+    def rehearse(self, data: Any, ctrl: np.ndarray) -> np.ndarray:
+        """Try a step at several paces in MuJoCo: the fastest of those that end about as well as the best."""
+        s, joints = self.settings, data.qpos[:16]
+        whole = mujoco.mjtState.mjSTATE_INTEGRATION
+        now = np.empty(mujoco.mj_stateSize(self.trial, whole))
+        mujoco.mj_getState(self.trial, data, now, whole)
+        steps = [np.clip(pace * (ctrl - joints), -self.limit, self.limit) for pace in s.paces]
+        ends = []
+        for step in steps:
+            mujoco.mj_setState(self.trial, self.tried, now, whole)
+            self.tried.ctrl[:] = joints + step
+            mujoco.mj_step(self.trial, self.tried, round(SECONDS / s.substep))
+            left = 2 * np.arccos(min(1.0, abs(float(self.tried.qpos[-4:] @ self.goal))))
+            near = min(left, s.reach)
+            apart = self.tried.qpos[-7:-4] - self.place
+            ends.append(s.place * apart @ apart + s.turn * near * (2 * left - near))
+        best = min(ends)
+        return joints + next(step for step, end in zip(steps, ends, strict=True) if end <= best + s.slack)
 
 
 def play(o: Options, name: str, seed: int) -> dict[str, Any]:
@@ -288,7 +321,9 @@ def figures(episodes: list[dict[str, Any]]) -> dict[str, Any]:
         "mean_goals": float(np.mean([e["goals"] for e in episodes])),
         "position_mm": float(np.median([e["position_mm"] for e in good])),
         "angle_deg": float(np.median([e["angle_deg"] for e in good])),
-        "milliseconds_per_step": dict(zip(("system", "cost", "solve"), parts.round(2).tolist(), strict=True)),
+        "milliseconds_per_step": dict(
+            zip(("system", "cost", "solve", "rehearsal"), parts.round(2).tolist(), strict=True)
+        ),
         "milliseconds_p99": float(np.percentile(np.concatenate([e["all_milliseconds"] for e in episodes]), 99)),
     }
 

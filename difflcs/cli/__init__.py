@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if words[:1] == ["doctor"]:  # it is there to say such things
             from difflcs.cli import doctor
 
-            return doctor.main("--json" in words, "--dev" in words)
+            return doctor.main("--json" in words)
         print(f"difflcs: {error}", file=sys.stderr)
         return 2
     return commands.run(words)

@@ -110,14 +110,12 @@ class Doctor:
 
     json: bool = False
     """Print one JSON object instead of text."""
-    dev: bool = False
-    """Also look at what only development of difflcs needs."""
 
     def run(self) -> int:
         """Run the command."""
         from difflcs.cli import doctor
 
-        return doctor.main(self.json, self.dev)
+        return doctor.main(self.json)
 
 
 _COMMANDS: dict[str, Callable[..., Any]] = {

@@ -1,6 +1,6 @@
 """Report on the installation: solvers, instruction set, extras, rendering, meshes.
 
-`difflcs doctor [--json] [--dev]`, or `python -m difflcs doctor`. Failures are reported, never raised. Simulation and
+`difflcs doctor [--json]`, or `python -m difflcs doctor`. Failures are reported, never raised. Simulation and
 OpenGL are tried in separate processes, which may crash.
 """
 
@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from itertools import groupby
@@ -31,8 +31,6 @@ from difflcs.errors import BackendNotFoundError, DiffLCSError
 
 GROUPS = ("library", "solvers", "machine", "extras", "environments")
 """Groups of checks for users, in the order of the report."""
-DEVELOPMENT = "development"
-"""One more group: the extras that a checkout needs for its tests, pages, notebooks and tables."""
 TIMEOUT = 120.0
 """Seconds that a separate process may take; the first picture in software takes some."""
 
@@ -116,15 +114,14 @@ def examine(groups: Sequence[str] = GROUPS) -> list[Check]:
     """Run the checks; takes some seconds.
 
     Args:
-        groups: groups to check, of `GROUPS` and `DEVELOPMENT`.
+        groups: groups to check, of `GROUPS`.
     """
     look = {
         "library": lambda: [_check("library", name, work, core=True) for name, work in _LIBRARY.items()],
         "solvers": _solvers,
         "machine": lambda: [_check("machine", name, work) for name, work in _MACHINE.items()],
-        "extras": lambda: _extras("extras", _EXTRAS),
+        "extras": lambda: [_check("extras", name, lambda name=name: _extra(name)) for name in _EXTRAS],
         "environments": _environments,
-        DEVELOPMENT: lambda: _extras(DEVELOPMENT, _development()),
     }
     return [check for group in groups for check in look[group]()]
 
@@ -262,16 +259,6 @@ def _devices() -> str:
     return f"cpu and {gpus}; tensors there are accepted and returned, the solvers run on the CPU"
 
 
-def _extras(group: str, names: Iterable[str]) -> list[Check]:
-    return [_check(group, name, lambda name=name: _extra(name)) for name in names]
-
-
-def _development() -> list[str]:
-    """Return the extras that are not for users, from the metadata of the package."""
-    known = metadata.metadata("difflcs").get_all("Provides-Extra") or ()
-    return [name for name in known if name not in (*_EXTRAS, "all")]
-
-
 def _extra(name: str) -> str:
     """Check the packages of an extra, which the metadata of the package lists."""
     wanted = [line for line in metadata.requires("difflcs") or () if re.search(rf"extra == ['\"]{name}['\"]", line)]
@@ -289,9 +276,8 @@ def _extra(name: str) -> str:
         else:
             present.append(f"{package} {version}")
     if lacking:
-        purpose = f"for {_EXTRAS[name]}: " if name in _EXTRAS else ""
-        raise _MissingError(f"{purpose}without {', '.join(lacking)}", f'pip install "difflcs[{name}]"')
-    return f"{_EXTRAS[name]}: {', '.join(present)}" if name in _EXTRAS else ", ".join(present)
+        raise _MissingError(f"for {_EXTRAS[name]}: without {', '.join(lacking)}", f'pip install "difflcs[{name}]"')
+    return f"{_EXTRAS[name]}: {', '.join(present)}"
 
 
 def _version(package: str) -> str | None:
@@ -373,21 +359,20 @@ _LIBRARY: dict[str, Callable[[], str]] = {
 _MACHINE: dict[str, Callable[[], str]] = {"threads": _threads, "devices": _devices}
 
 
-def main(as_object: bool = False, development: bool = False) -> int:
+def main(as_object: bool = False) -> int:
     """Run the checks and print the report.
 
     Args:
         as_object: print JSON instead of text.
-        development: also check the extras that only development needs.
 
     Returns:
         Exit code: 0 if the library works, 1 if not.
     """
-    checks = examine((*GROUPS, DEVELOPMENT) if development else GROUPS)
+    checks = examine()
     width = min(120, shutil.get_terminal_size().columns)
     print(as_json(checks) if as_object else as_text(checks, width))
     return 0 if healthy(checks) else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main("--json" in sys.argv[1:], "--dev" in sys.argv[1:]))
+    sys.exit(main("--json" in sys.argv[1:]))

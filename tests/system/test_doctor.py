@@ -60,7 +60,7 @@ def test_the_environments_are_tried(checks):
 
 
 def test_text_and_json(checks, capsys, monkeypatch):
-    monkeypatch.setattr(doctor, "examine", lambda groups: checks)
+    monkeypatch.setattr(doctor, "examine", lambda: checks)
     monkeypatch.setenv("COLUMNS", "80")
     assert cli.main(["doctor"]) == 0
     text = capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""A sphere pushes a box to poses in the plane, in MuJoCo: `python benchmarks/box_to_pose.py [--goals 200]`.
+"""A sphere pushes a box to poses in the plane, in MuJoCo: `python examples/box_to_pose.py [--goals 200]`.
 
 A free box of 14 by 10 cm lies on a floor with friction; a sphere of 1.5 cm is held at half its height by two position
 servos. Both are simulated in space, at 500 Hz. Goals are up to 20 cm and half a turn away, and the sphere always starts

@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(autouse=True)
-def _benchmarks(monkeypatch):
+def _examples(monkeypatch):
     pytest.importorskip("tyro")
     pytest.importorskip("mujoco")
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.syspath_prepend(str(EXAMPLES))
 
 
 def test_a_box_is_pushed_to_poses_from_the_wrong_side():
