@@ -2,8 +2,9 @@
 
 `difflcs/HandTurnObject-v0` is a hand of four fingers that faces up, with an object on its palm. At each decision
 `HandPolicy` linearises its MuJoCo model where hand and object are, in quasi-dynamic motion, and solves a contact MPC of
-four steps. Nothing is learned: it is given the model and the state. `--mass 3` and the like tell it a wrong model.
-`--out hand.gif` makes a film.
+four steps. Nothing is learned: it is given the model and the state. `--mass 3` and the like tell it a wrong model, and
+`--run DIRECTORY` one that was learned by `difflcs train --method mujoco-lcs --task hand_unknown`. `--out hand.gif`
+makes a film.
 """
 
 from __future__ import annotations
@@ -23,9 +24,10 @@ import difflcs_envs
 from difflcs import Animation, LCSMPCLayer
 from difflcs.errors import ContactWarning
 from difflcs.mpc.backends import BatchedBackend
+from difflcs.rl import TrainedPolicy
 from difflcs.status import solved
 from difflcs_envs.hand.model import OBJECTS, build_model
-from difflcs_envs.tasks import hand_cost, hand_system
+from difflcs_envs.tasks import HAND_GUESS, hand_cost, hand_system
 
 
 class HandPolicy:
@@ -81,10 +83,19 @@ class Options:
     friction: float = 1.0
     gain: float = 1.0
     """Factors of mass, friction and servo gain in the model that it plans with."""
+    run: Path | None = None
+    """Run of `mujoco-lcs` on `hand_unknown`, whose factors are these three instead."""
     steps: int = 300
     """Most decisions of an episode; it ends after 21 in a row at the goal, or when the object is dropped."""
     out: Path | None = None
     """Where a film at twice the speed goes, .gif or .png; without it none is made."""
+
+
+def learned_factors(run: Path) -> tuple[float, ...]:
+    """Factors of mass, friction and servo gain that a run has learned, of the true ones."""
+    policy: Any = TrainedPolicy.open(run).policy
+    guesses = (HAND_GUESS[name] for name in ("object_mass", "friction", "servo_gain"))
+    return tuple(guess * change for guess, (change,) in zip(guesses, policy.lcs.summary().values(), strict=True))
 
 
 def play(env: Any, policy: HandPolicy, seed: int, frames: list[np.ndarray]) -> tuple[dict[str, Any], int]:
@@ -106,9 +117,11 @@ def main(o: Options) -> None:
     warnings.simplefilter("ignore", ContactWarning)
     good, count, frames = 0, 0, []
     mode = None if o.out is None else "rgb_array"
+    mass, friction, gain = (o.mass, o.friction, o.gain) if o.run is None else learned_factors(o.run)
+    print(f"planned with mass x {mass:.3g}, friction x {friction:.3g}, servo gain x {gain:.3g}")
     for name in o.objects.split(","):
         env = gymnasium.make("difflcs/HandTurnObject-v0", object=name, horizon=o.steps, render_mode=mode)
-        model = build_model(name, 0.1 * o.mass, 0.5 * o.friction, o.gain)
+        model = build_model(name, 0.1 * mass, 0.5 * friction, gain)
         steps, results, start = [], [], time.process_time()
         for seed in range(o.seed, o.seed + o.episodes):
             info, length = play(env, HandPolicy(model), seed, frames)
