@@ -2,12 +2,11 @@
 
 from difflcs.planning.places import DiscPlaces, Places, Workspace
 from difflcs.planning.sampling import Decision, Mode, SamplingPolicy, SamplingSettings
-from difflcs.planning.travel import LiftTravel, PlanarTravel, Travel
+from difflcs.planning.travel import PlanarTravel, Travel
 
 __all__ = [
     "Decision",
     "DiscPlaces",
-    "LiftTravel",
     "Mode",
     "Places",
     "PlanarTravel",

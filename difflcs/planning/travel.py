@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from difflcs._checks import check_number, check_positive_int
-from difflcs.errors import ShapeError
 from difflcs.physics.planar import Drive, PositionDrive, to_body
 from difflcs.physics.shapes import Shape
 from difflcs.planning.outline import DistanceGrid, ring
 from difflcs.planning.places import Workspace, from_body
 
-__all__ = ["LiftTravel", "PlanarTravel", "Travel"]
+__all__ = ["PlanarTravel", "Travel"]
 
 _WAYPOINTS = 56
 _POINTS = 10  # of the way, that are compared for the end of a step
@@ -207,60 +205,3 @@ def _along(way: Tensor, longest: float, points: int) -> tuple[Tensor, Tensor]:
     side = (torch.searchsorted(lengths, at) - 1).clamp(0, len(way) - 2)
     part = (at - lengths[side]) / (lengths[side + 1] - lengths[side]).clamp_min(1e-12)
     return at, torch.lerp(way[side], way[side + 1], part.unsqueeze(-1))
-
-
-class LiftTravel:
-    """End effectors in space are lifted off, carried over the body, and lowered.
-
-    Actions are relative, and have three components for each end effector. They rise to `height` before they go
-    sideways, and go down only above their target.
-
-    Args:
-        height: z at which nothing is in the way [length].
-        step: how far an end effector is sent in a step [length], > 0.
-        effectors: for each end effector the indices of its x, y and z in the state.
-        tolerance: distance to the target at which it has arrived, and to a corner of the way at which it turns
-            [length], > 0.
-
-    Raises:
-        InvalidInputError and its kinds: an argument does not fit.
-    """
-
-    def __init__(self, height: float, step: float, effectors: Sequence[Sequence[int]], tolerance: float):
-        self.height = check_number("height", height, minimum=-math.inf)
-        self.step = check_number("step", step, strict=True)
-        self.tolerance = check_number("tolerance", tolerance, strict=True)
-        self._effectors = torch.tensor([list(of) for of in effectors], dtype=torch.long)
-        if self._effectors.ndim != 2 or self._effectors.shape[1] != 3:
-            raise ShapeError(
-                f"effectors: expected three indices for each end effector, got shape {tuple(self._effectors.shape)}; "
-                f"give those of x, y and z"
-            )
-
-    def distance(self, x: Tensor, states: Tensor) -> Tensor:
-        """See `Travel`: up, over and down, of the one that has farthest to go; 0 for one that stays."""
-        here, there = x[self._effectors], states[:, self._effectors]
-        aside = (there - here)[..., :2].norm(dim=-1)
-        up_and_down = (self.height - here[..., 2]).clamp_min(0) + (self.height - there[..., 2]).clamp_min(0)
-        goes = (there - here).norm(dim=-1) > self.tolerance
-        return torch.where(goes, aside + up_and_down, 0.0).amax(-1)
-
-    def action(self, x: Tensor, target: Tensor) -> Tensor:
-        """See `Travel`."""
-        moves = []
-        for here, there in zip(x[self._effectors], target[self._effectors], strict=True):
-            aside = float((there - here)[:2].norm())
-            above = here.new_tensor([float(here[0]), float(here[1]), self.height])
-            if aside <= self.tolerance:
-                goal = there
-            elif float(here[2]) < self.height - self.tolerance:
-                goal = above
-            else:
-                goal = torch.cat([there[:2], above[2:]])
-            move = goal - here
-            moves.append(move * min(1.0, self.step / max(float(move.norm()), 1e-12)))
-        return torch.cat(moves)
-
-    def arrived(self, x: Tensor, target: Tensor) -> bool:
-        """See `Travel`."""
-        return bool((target - x)[self._effectors].norm(dim=-1).max() < self.tolerance)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from difflcs.errors import InvalidInputError, ShapeError
 from difflcs.physics import Circle, PDDrive, PlanarPushing, Polygon, Union, box
 from difflcs.physics.planar import to_body
-from difflcs.planning import DiscPlaces, LiftTravel, PlanarTravel, Workspace
+from difflcs.planning import DiscPlaces, PlanarTravel, Workspace
 from difflcs.planning.outline import DistanceGrid, clearance, ring
 
 F64 = torch.float64
@@ -203,28 +203,3 @@ def test_the_way_round_stays_in_the_workspace():
     walled = PlanarTravel(shape, 0.1, 0.2, workspace=Workspace((-1.0, -1.0), (1.0, 0.55), step=0.2))
     assert float(free.action(x, target)[1]) > 0
     assert float(walled.action(x, target)[1]) < 0
-
-
-def test_what_is_lifted_goes_aside_only_above():
-    travel = LiftTravel(0.3, 0.05, [[0, 1, 2], [3, 4, 5]], tolerance=0.01)
-    x, target = tensor([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]), tensor([0.2, 0.1, 0.02, 1.0, 0.0, 0.0])
-    torch.testing.assert_close(
-        travel.distance(x, torch.stack([target, x])), tensor([0.3 + 0.28 + math.hypot(0.2, 0.1), 0.0])
-    )
-    heights = []
-    for _ in range(60):
-        if travel.arrived(x, target):
-            break
-        u = travel.action(x, target)
-        assert float(u[:3].norm()) <= 0.05 + 1e-12
-        if float(u[:2].norm()) > 0.02:
-            heights.append(float(x[2]))
-        x = x + u
-    assert travel.arrived(x, target)
-    assert min(heights) > 0.28
-    torch.testing.assert_close(x[3:], target[3:])
-
-
-def test_an_end_effector_in_space_has_three_coordinates():
-    with pytest.raises(ShapeError, match="effectors"):
-        LiftTravel(0.3, 0.05, [[0, 1]], tolerance=0.01)

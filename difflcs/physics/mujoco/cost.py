@@ -116,6 +116,7 @@ class Effort:
 Term = Position | Orientation | Distance | Posture | Velocity | Effort
 _NO_ROTATION = np.array([1.0, 0.0, 0.0, 0.0])
 _ROUNDING = 1e-13  # of the largest curvature, added to all, as AᵀWA is positive semi-definite up to rounding
+_DAMPING, _STEPS, _TURN_STEP = 1e-4, 40, 0.3  # of inverse kinematics: part of the largest curvature; the most; [rad]
 
 
 class MujocoCost(TensorFields):
@@ -208,6 +209,43 @@ class MujocoCost(TensorFields):
         if x.dtype is not torch.float64 or not x.is_cpu:
             tensors = {name: value.to(x.device, x.dtype) for name, value in tensors.items()}
         return QuadraticCost.of_checked(tensors)
+
+    def reach(
+        self, x: Tensor, goal: Tensor | None = None, *, joints: Sequence[str] | None = None, margin: float = 0.0
+    ) -> Tensor:
+        """Inverse kinematics: states (..., n_x) near x (..., n_x) in which joints make the cost of stages small.
+
+        Gauss–Newton, damped, within the ranges of the joints. What it finds may be a local minimum.
+
+        Args:
+            x: where it begins.
+            goal: (..., n_goal), as for `at`.
+            joints: names of the slides and hinges that move; None: all of the model.
+            margin: how far they stay from the ends of their ranges [m, rad].
+
+        Raises:
+            InvalidInputError and its kinds: an argument does not fit.
+        """
+        columns, model, x = self._scene.dofs("joints", joints), self._scene._model, x.clone()
+        numbers = model.dof_jntid[columns]
+        limited, turns = model.jnt_limited[numbers, None], model.jnt_type[numbers] == int(mujoco.mjtJoint.mjJNT_HINGE)
+        low, high = torch.from_numpy(
+            np.where(limited, model.jnt_range[numbers] + [margin, -margin], [-np.inf, np.inf])
+        ).T
+        most = torch.from_numpy(np.where(turns, _TURN_STEP, np.inf))
+        for _ in range(_STEPS):
+            near, at = self.at(x, goal), x[..., columns]
+            slope = ((near.Q @ x.unsqueeze(-1)).squeeze(-1) + near.q)[..., columns]
+            curve = near.Q[..., columns, :][..., columns]
+            free = (~((at <= low) & (slope > 0) | (at >= high) & (slope < 0))).to(x)
+            damping = _DAMPING * curve.diagonal(dim1=-2, dim2=-1).amax(-1, keepdim=True) + _ROUNDING
+            curve = curve * free.unsqueeze(-1) * free.unsqueeze(-2) + torch.diag_embed(damping + 1 - free)
+            step = -torch.linalg.solve(curve, free * slope)
+            step *= (most / step.abs()).amin(-1, keepdim=True).clamp(max=1.0)
+            x[..., columns] = (at + step).clamp(low, high)
+            if float(step.abs().max()) < 1e-4:
+                break
+        return x
 
     def _check_goal(self, goal: Tensor | None) -> list[Tensor]:
         """The goal of a call, if there is to be one."""
@@ -325,7 +363,7 @@ class _Scene:
             return _Row(about, _TURN, 3, [self._frame(about, term.of)], 4, term.goal, reach).checked()
         if not isinstance(term, Posture | Velocity):
             raise DTypeError(f"{about}: expected Position, Orientation, … or Effort, got {describe(term)}; build one")
-        columns = self._dofs(about, term.joints, turning=isinstance(term, Velocity))
+        columns = self.dofs(about, term.joints, turning=isinstance(term, Velocity))
         size, state = len(columns), self._module.state
         if isinstance(term, Posture):
             return _Row(about, _COORDINATE, size, columns, size, term.goal).checked()
@@ -349,7 +387,7 @@ class _Scene:
         everything = [(int(_FRAMES[k][0]), i) for k in kinds for i in range(getattr(self._model, f"n{k}"))]
         raise _unknown(about, " or ".join(kinds), (mujoco.mj_id2name(self._model, *one) for one in everything), name)
 
-    def _dofs(self, about: str, names: Sequence[str] | None, turning: bool) -> list[int]:
+    def dofs(self, about: str, names: Sequence[str] | None, turning: bool = False) -> list[int]:
         """Find the degrees of freedom of joints; `turning`: also of free joints and balls."""
         model, state = self._model, self._module.state
         ends = [*map(int, model.jnt_dofadr), state.nv]

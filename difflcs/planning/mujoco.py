@@ -1,0 +1,255 @@
+"""Places round a body of any MuJoCo model, and ways of end effectors that are on slides or at the end of an arm.
+
+Needs the extra `envs`. MuJoCo's kinematics say where end effectors are, and the gaps of the `MujocoLCS` itself what is
+free of collisions: what may not touch there is not in the way.
+"""
+
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from difflcs._checks import check_number, check_positive_int
+from difflcs.errors import InvalidInputError
+from difflcs.physics.mujoco import MujocoCost, MujocoLCS, Position
+
+__all__ = ["BodyPlaces", "BodyTravel"]
+
+_SINGLE = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
+_LEAST = 0.3  # of the clearance, that must be left on the way
+_COAST = 2.0  # steps in which a robot that is no longer driven comes to rest, about
+_POINTS = 8  # of a straight way, at which gaps are asked for
+
+
+class BodyPlaces:
+    """End effectors of a MuJoCo model round a body of any shape, on slides or at the end of arms.
+
+    A place is where the end effectors are, in coordinates of the body. From all sides an end effector comes straight
+    towards the middle of the body, until only the gap is left. Each in turn goes to each place while the others stay.
+    Their joints follow by inverse kinematics, within their ranges; how an end effector is turned there is left open.
+
+    Args:
+        module: the system, whose contacts say what is in the way.
+        body: name of the body that is pushed.
+        effectors: names of the end effectors, bodies, sites or geoms; the geoms of these bodies push.
+        n_places: at equal angles, for each end effector and each height.
+        gap: between an end effector at a place and the body [m]; None: a tenth of `module.length`.
+        reach: largest gap at which pushing is considered [m]; None: `module.length`.
+        height: of places above the middle of the body [m]; None: as high as the end effector is.
+
+    Raises:
+        InvalidInputError and its kinds: an argument does not fit.
+    """
+
+    def __init__(
+        self,
+        module: MujocoLCS,
+        body: str,
+        effectors: Sequence[str],
+        n_places: int = 16,
+        *,
+        gap: float | None = None,
+        reach: float | None = None,
+        height: float | None = None,
+    ):
+        self._cost = MujocoCost(module, [Position(name) for name in effectors])
+        self.module, self.n_places = module, check_positive_int("n_places", n_places)
+        self.gap = 0.1 * module.length if gap is None else check_number("gap", gap, strict=True)
+        self.reach = module.length if reach is None else check_number("reach", reach)
+        self.height, model = height, module._model
+        self._model, self._data, self._axis = model, mujoco.MjData(model), module._finder.axis
+        frames = self._cost._scene.frames
+        carriers = [i if kind == "body" else int(getattr(model, f"{kind}_bodyid")[i]) for kind, i in frames]
+        self._body = mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_BODY), body)
+        of, pairs = model.geom_bodyid, np.stack(module._finder.pairs, -1)
+        pairs = np.concatenate([pairs, pairs[:, ::-1]])
+        self._pairs = [pairs[(of[pairs] == [tip, self._body]).all(-1)] for tip in carriers]
+        pushed, moved = _dofs_above(model, max(self._body, 0)), set().union(*(_dofs_above(model, t) for t in carriers))
+        own = [j for j in range(model.njnt) if model.jnt_type[j] in _SINGLE and model.jnt_dofadr[j] in moved - pushed]
+        self.joints = [model.joint(j).name or f"joint{j}" for j in own]
+        self._columns, self._pushed = [int(model.jnt_dofadr[j]) for j in own], sorted(pushed - moved)
+        if not own or not all(map(len, self._pairs)):
+            raise InvalidInputError(
+                f"effectors: expected bodies that slides or hinges of their own move, and that may touch the body "
+                f"{body!r:.100}, got {list(effectors)}; name such, and let the module's `pairs` have them"
+            )
+
+    def sample(self, x: Tensor) -> Tensor:
+        """See `Places`: (n, 3 · n_effectors) in coordinates of the body."""
+        points = torch.cat([self.ring(x, k, self.gap) for k in range(len(self._pairs))])
+        place, turn = self._pose(x)
+        return ((points - place) @ turn).flatten(1)
+
+    def states(self, x: Tensor, places: Tensor) -> Tensor:
+        """See `Places`."""
+        place, turn = self._pose(x)
+        return self.at(x, places.unflatten(-1, (-1, 3)) @ turn.mT + place)
+
+    def allowed(self, states: Tensor) -> Tensor:
+        """See `Places`."""
+        return self.gaps(states) > 0
+
+    def near(self, x: Tensor) -> bool:
+        """See `Places`."""
+        return bool(self.gaps(x, self._pushed) < self.reach)
+
+    def points(self, x: Tensor) -> Tensor:
+        """Compute where the end effectors are (..., n_effectors, 3) at states x (..., n_x) [m]."""
+        A, offset, _ = map(torch.as_tensor, self._cost._scene.read(x, self._cost._rows))
+        return ((A @ x.unsqueeze(-1)).squeeze(-1) + offset).unflatten(-1, (-1, 3))
+
+    def at(self, x: Tensor, points: Tensor) -> Tensor:
+        """Find states (n, n_x) at rest near x (n_x,) with end effectors at points (n, n_effectors, 3), or near."""
+        states, nv = x.repeat(len(points), 1), self.module.state.nv
+        states[:, nv : 2 * nv] = 0.0
+        return self._cost.reach(states, points.flatten(1), joints=self.joints)
+
+    def gaps(self, states: Tensor, of: Sequence[int] | None = None) -> Tensor:
+        """Return the smallest gap (...) of the robot at states (..., n_x) [m], with what these columns move, if any."""
+        qpos = self.module.state.to_mujoco(states)[0]
+        contacts = self.module._finder.find(qpos.reshape(-1, qpos.shape[-1]))
+        counts = (contacts.normal[..., self._columns] != 0).any(-1)
+        if of is not None:
+            counts &= (contacts.normal[..., of] != 0).any(-1)
+        return torch.from_numpy(np.where(counts, contacts.gap, np.inf).min(-1)).reshape(states.shape[:-1])
+
+    def ring(self, x: Tensor, effector: int, gap: float) -> Tensor:
+        """Return points (n, n_effectors, 3), one of which goes round the body at a gap, at a state x (n_x,)."""
+        turn, points = self._pose(x)[1].numpy(), self.points(x)
+        tip, data, model, pairs = points[effector].numpy(), self._data, self._model, self._pairs[effector]
+        middle, start = data.xipos[self._body].copy(), data.geom_xpos.copy()
+        axis = np.array([0.0, 0.0, 1.0]) if self._axis is None else self._axis
+        first = turn[:, np.abs(axis @ turn).argmin()]
+        first = (first - (first @ axis) * axis) / np.linalg.norm(first - (first @ axis) * axis)
+        given = self.height if self._axis is None else None
+        middle += axis * ((tip - middle) @ axis if given is None else given)
+        far, found = 2 * model.stat.extent + gap, []
+        for angle in np.arange(self.n_places) * (2 * np.pi / self.n_places):
+            out, away, left = np.cos(angle) * first + np.sin(angle) * np.cross(axis, first), far, math.inf
+            while away > 0 and left > 0.01 * gap:
+                data.geom_xpos[pairs[:, 0]] = start[pairs[:, 0]] + middle + away * out - tip
+                left = min(mujoco.mj_geomDistance(model, data, a, b, far, None) for a, b in pairs) - gap
+                away -= left
+            if away > 0:
+                found.append(middle + away * out)
+        rows = points.repeat(len(found), 1, 1)
+        rows[:, effector] = torch.from_numpy(np.array(found).reshape(-1, 3))
+        return rows
+
+    def _pose(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute the place (3,) and orientation (3, 3) of the body at a state x (n_x,)."""
+        self._data.qpos[:] = self.module.state.to_mujoco(x)[0]
+        mujoco.mj_kinematics(self._model, self._data)
+        place, turn = self._data.xpos[self._body], self._data.xmat[self._body].reshape(3, 3)
+        return torch.from_numpy(place.copy()), torch.from_numpy(turn.copy())
+
+
+def _dofs_above(model: Any, body: int) -> set[int]:
+    """Return the degrees of freedom that move a body."""
+    own = model.body_dofadr[body] + np.arange(model.body_dofnum[body])
+    return {*map(int, own)} | (_dofs_above(model, model.body_parentid[body]) if body > 0 else set())
+
+
+class BodyTravel:
+    """Ways of the end effectors of `BodyPlaces`: straight, round the body, or over it, the shortest that is free.
+
+    Ways are straight lines in the coordinates of the joints, between points round the body and above it. Free is what
+    leaves a gap everywhere, of the module's contacts of the robot. The action is that by which the joints come nearest
+    to the next corner, by the module's own motion, seen from where they will have come to rest.
+
+    Args:
+        places: of the same end effectors.
+        clearance: gap at corners of a way [m]; None: three times that of places. On the way it is at least .3 of it,
+            or as much as at its ends.
+        over: height above the middle of the body at which there is a way over it [m]; None: there is none.
+        tolerance: distance to the target at which an end effector has arrived [m]; None: the gap of places.
+        step: largest |u| of each action; None: what `module.action_bounds` say.
+
+    Raises:
+        InvalidInputError and its kinds: an argument does not fit.
+    """
+
+    def __init__(
+        self,
+        places: BodyPlaces,
+        *,
+        clearance: float | None = None,
+        over: float | None = None,
+        tolerance: float | None = None,
+        step: float | None = None,
+    ):
+        self.places, self.over = places, None if over is None else check_number("over", over)
+        self.clearance = 3 * places.gap if clearance is None else check_number("clearance", clearance, strict=True)
+        self.tolerance = places.gap if tolerance is None else check_number("tolerance", tolerance, strict=True)
+        self.step = math.inf if step is None else check_number("step", step, strict=True)
+
+    def distance(self, x: Tensor, states: Tensor) -> Tensor:
+        """See `Travel`: the straight distance of the end effector that has farthest to go."""
+        return (self.places.points(states) - self.places.points(x)).norm(dim=-1).amax(-1)
+
+    def arrived(self, x: Tensor, target: Tensor) -> bool:
+        """See `Travel`."""
+        return bool(self.distance(x, target) < self.tolerance)
+
+    def action(self, x: Tensor, target: Tensor) -> Tensor:
+        """See `Travel`."""
+        return self._drive(x, self._corner(x, target)[self.places._columns])
+
+    def _corner(self, x: Tensor, target: Tensor) -> Tensor:
+        """Return the state (n_x,) at the next corner of the way to a target (n_x,)."""
+        places = self.places
+        if bool(self._free(x[None], target[None])[0]):
+            return target
+        here, there = places.points(torch.stack([x, target]))
+        goes = int((there - here).norm(dim=-1).argmax())
+        corners = places.ring(x, goes, self.clearance)
+        legs = [(i, i % len(corners) + 1) for i in range(1, len(corners) + 1)]
+        if self.over is not None:
+            above = torch.stack([here, here])
+            above[:, goes, :2] = torch.stack([here, there])[:, goes, :2]
+            above[:, goes, 2] = float(places._data.xipos[places._body, 2]) + self.over
+            corners, legs = torch.cat([corners, above]), [*legs, (len(corners) + 1, len(corners) + 2)]
+        nodes = torch.cat([x[None], places.at(x, corners), target[None]])
+        end, points = len(nodes) - 1, places.points(nodes)
+        first, second = torch.tensor([*legs, *((i, j) for i in range(1, end) for j in (0, end))]).T
+        leg = (points[first] - points[second]).norm(dim=-1).amax(-1)
+        leg = torch.where(self._free(nodes[first], nodes[second]), leg, math.inf)
+        lengths = torch.full((end + 1, end + 1), math.inf, dtype=x.dtype)
+        lengths[first, second] = lengths[second, first] = leg
+        left = torch.where(torch.arange(end + 1) == end, 0.0, lengths[end])
+        for _ in range(end):
+            left = torch.minimum(left, (lengths + left).amin(1))
+        by = lengths[0] + left
+        if not bool(by.isfinite().any()):  # the nearest corner leads away from the body
+            by[1:end] = (points[1:end] - here).norm(dim=-1).amax(-1)
+        return nodes[by.argmin()]
+
+    def _free(self, starts: Tensor, ends: Tensor) -> Tensor:
+        """Return a mask (n,) of the straight ways from states (n, n_x) to others on which nothing touches."""
+        t = torch.linspace(0.0, 1.0, _POINTS, dtype=starts.dtype)[:, None, None]
+        states, columns = starts.repeat(_POINTS, 1, 1), self.places._columns
+        states[..., columns] = torch.lerp(starts[:, columns], ends[:, columns], t)
+        gap = self.places.gaps(states)
+        return (gap >= torch.minimum(gap[0], gap[-1]).clamp(max=_LEAST * self.clearance) - 1e-9).all(0)
+
+    def _drive(self, x: Tensor, goal: Tensor) -> Tensor:
+        """Return the action (n_u,) that brings the joints to rest nearest to a goal (n_joints,), as far as it may."""
+        module, columns = self.places.module, self.places._columns
+        system, rest = module.params(x), torch.eye(module.n_x, dtype=x.dtype)[columns]
+        if module.state.velocities:
+            rest[range(len(columns)), [module.state.nv + c for c in columns]] = _COAST * module.seconds
+        ends = torch.stack([x[columns], goal]) - rest @ (system.A @ x + system.d)
+        stay, go = torch.linalg.lstsq(rest @ system.B, ends.mT).solution.mT
+        low, high = (bound.clamp(-self.step, self.step) for bound in module.action_bounds(x))
+        room = torch.where(go > stay, high - stay, low - stay) / (go - stay)
+        part = room[(go - stay).abs() > 1e-12].clamp(0.0, 1.0)
+        return (stay + part.amin() * (go - stay) if len(part) else stay).clamp(low, high)

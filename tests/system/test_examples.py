@@ -1,0 +1,59 @@
+"""The examples, on few episodes; that of Judo's cylinder_push on a model like Judo's."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+BODY = """<body name="{0}"><joint name="{0}_x" damping="4" type="slide" axis="1 0 0"/>
+  <joint name="{0}_y" damping="4" type="slide" axis="0 1 0"/>
+  <geom name="{0}" type="cylinder" size=".25 .1" mass="1" friction=".01"/></body>"""
+MODEL = f"""<mujoco><option timestep=".02"/><worldbody>{BODY.format("pusher")}{BODY.format("cart")}</worldbody>
+  <actuator><position joint="pusher_x" kp="10" ctrlrange="-10 10"/>
+  <position joint="pusher_y" kp="10" ctrlrange="-10 10"/>
+</actuator></mujoco>"""
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(autouse=True)
+def _examples(monkeypatch):
+    pytest.importorskip("mujoco")
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "examples"))
+
+
+def test_the_cylinder_comes_to_the_origin(capsys, tmp_path):
+    import cylinder_push
+
+    (tmp_path / "model.xml").write_text(MODEL)
+    cylinder_push.main(cylinder_push.Options(tmp_path / "model.xml", episodes=1, seed=100))
+    assert float(capsys.readouterr().out.split("worst ")[1].split(" cm")[0]) < 3
+
+
+def test_a_box_is_pushed_to_poses_from_the_wrong_side():
+    import box_to_pose
+
+    policy, module = box_to_pose.make_policy()
+    episodes = [box_to_pose.play(2000 + k, policy, module) for k in range(20)]
+    assert sum(episode.success for episode in episodes) >= 19
+    assert np.mean([episode.steps for episode in episodes]) < 45
+    assert min(episode.steps for episode in episodes) > 0
+
+
+def test_a_cylinder_is_turned_in_a_hand_and_filmed(capsys, tmp_path):
+    import hand_turn
+
+    hand_turn.main(hand_turn.Options("cylinder", episodes=2, seed=100, out=tmp_path / "hand.gif"))
+    assert "all 2/2" in capsys.readouterr().out
+    assert (tmp_path / "hand.gif").stat().st_size > 10_000
+
+
+def test_the_arm_of_pusher_does_better_than_nothing(capsys, monkeypatch):
+    import pusher
+
+    monkeypatch.setattr(pusher, "STEPS", 40)
+    means = []
+    for still in (False, True):
+        pusher.main(pusher.Options(episodes=2, seed=100, still=still))
+        means.append(float(capsys.readouterr().out.split("mean return ")[1].split(" ")[0]))
+    assert means[0] > means[1]

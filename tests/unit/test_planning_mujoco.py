@@ -1,0 +1,54 @@
+"""Places and ways of end effectors of MuJoCo models: on slides, and at the end of an arm."""
+
+import mujoco
+import pytest
+import torch
+
+from difflcs.errors import InvalidInputError
+from difflcs.physics.mujoco import MujocoLCS
+from difflcs.planning.mujoco import BodyPlaces, BodyTravel
+
+WORLD = """<mujoco><compiler angle="radian"/><worldbody>
+  <body name="box" pos=".35 0 .05"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/>
+    <joint axis="0 0 1"/><geom type="box" size=".05 .03 .05"/><geom type="box" pos="0 .05 0" size=".02 .04 .05"/>
+  </body>{}</worldbody><actuator>{}</actuator></mujoco>"""
+SLIDES = """<body name="tip" pos="0 0 .05"><joint name="a" type="slide" axis="1 0 0" range="-.5 .5"/>
+  <joint name="b" type="slide" axis="0 1 0"/><geom type="sphere" size=".015"/></body>"""
+ARM = """<body pos="0 0 .35"><joint name="a" axis="0 0 1" range="-3 3"/><joint name="b" axis="0 1 0" range="-2 2"/>
+  <geom type="capsule" fromto="0 0 0 .35 0 0" size=".02"/><body pos=".35 0 0"><joint name="c" axis="0 1 0"/>
+    <geom type="capsule" fromto="0 0 0 .35 0 0" size=".012"/><body pos=".35 0 0"><joint name="d" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 .2 0 0" size=".01"/><site name="tip" pos=".2 0 0"/></body></body></body>"""
+
+
+@pytest.mark.parametrize(("robot", "start"), [(SLIDES, (0.2, 0.0)), (ARM, (0.6, -0.6, 1.2, 0.97))])
+def test_places_are_at_the_gap_and_ways_lead_round_the_body_or_over_it_and_touch_nothing(robot, start):
+    servos = "".join(f'<position joint="{joint}" kp="100"/>' for joint in "abcd"[: len(start)])
+    data = mujoco.MjData(model := mujoco.MjModel.from_xml_string(WORLD.format(robot, servos)))
+    data.qpos[:] = [0.05, 0.1, 0.7, *start]
+    module = MujocoLCS(model, data)
+    places = BodyPlaces(module, "box", ["tip"], 12, gap=0.005, height=0.0)
+    travel = BodyTravel(places, clearance=0.03, over=0.12, step=0.2)
+    x = module.observe(data)
+    states = places.states(x, places.sample(x))
+    assert len(states) == 12
+    torch.testing.assert_close(states[:, :3], x[:3].expand(12, 3))
+    assert float(states[:, 3].max()) <= (0.5 if robot is SLIDES else 3.0)
+    states = states[places.allowed(states)]
+    assert 6 <= len(states)
+    assert float(places.gaps(states).max()) < 0.0052
+    assert robot is ARM or float(places.gaps(states).min()) > 0.0048  # a finger that leans is nearer than its tip
+    assert all(places.near(state) for state in states)
+    assert not places.near(x)
+    x, target = states[0], states[len(states) // 2]
+    assert not travel.arrived(x, target)
+    for _ in range(40):
+        u = travel.action(x, target)
+        assert float(u.abs().max()) <= 0.2 + 1e-12
+        for _ in range(5):
+            x = torch.cat([x[:3], x[3:] + u / 5])
+            assert float(places.gaps(x)) > 0
+        if travel.arrived(x, target):
+            break
+    assert travel.arrived(x, target)
+    with pytest.raises(InvalidInputError, match="effectors: expected"):
+        BodyPlaces(module, "box", ["box"])
