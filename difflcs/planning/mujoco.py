@@ -111,7 +111,7 @@ class BodyPlaces:
         """Find states (n, n_x) at rest near x (n_x,) with end effectors at points (n, n_effectors, 3), or near."""
         states, nv = x.repeat(len(points), 1), self.module.state.nv
         states[:, nv : 2 * nv] = 0.0
-        return self._cost.reach(states, points.flatten(1), joints=self.joints)
+        return self._cost.reach(states, points.flatten(1), self.joints)
 
     def gaps(self, states: Tensor, of: Sequence[int] | None = None) -> Tensor:
         """Return the smallest gap (...) of the robot at states (..., n_x) [m], with what these columns move, if any."""
@@ -149,8 +149,7 @@ class BodyPlaces:
         """Compute the place (3,) and orientation (3, 3) of the body at a state x (n_x,)."""
         self._data.qpos[:] = self.module.state.to_mujoco(x)[0]
         mujoco.mj_kinematics(self._model, self._data)
-        place, turn = self._data.xpos[self._body], self._data.xmat[self._body].reshape(3, 3)
-        return torch.from_numpy(place.copy()), torch.from_numpy(turn.copy())
+        return torch.tensor(self._data.xpos[self._body]), torch.tensor(self._data.xmat[self._body]).reshape(3, 3)
 
 
 def _dofs_above(model: Any, body: int) -> set[int]:
@@ -162,9 +161,8 @@ def _dofs_above(model: Any, body: int) -> set[int]:
 class BodyTravel:
     """Ways of the end effectors of `BodyPlaces`: straight, round the body, or over it, the shortest that is free.
 
-    Ways are straight lines in the coordinates of the joints, between points round the body and above it. Free is what
-    leaves a gap everywhere, of the module's contacts of the robot. The action is that by which the joints come nearest
-    to the next corner, by the module's own motion, seen from where they will have come to rest.
+    Ways are straight in the coordinates of the joints, between corners round the body and above it, and free where the
+    robot's gaps stay open. The action is that after which the joints come to rest nearest to the next corner.
 
     Args:
         places: of the same end effectors.
@@ -210,8 +208,7 @@ class BodyTravel:
         if bool(self._free(x[None], target[None])[0]):
             return target
         here, there = places.points(torch.stack([x, target]))
-        goes = int((there - here).norm(dim=-1).argmax())
-        corners = places.ring(x, goes, self.clearance)
+        corners = places.ring(x, goes := int((there - here).norm(dim=-1).argmax()), self.clearance)
         legs = [(i, i % len(corners) + 1) for i in range(1, len(corners) + 1)]
         if self.over is not None:
             above = torch.stack([here, here])
@@ -223,7 +220,7 @@ class BodyTravel:
         first, second = torch.tensor([*legs, *((i, j) for i in range(1, end) for j in (0, end))]).T
         leg = (points[first] - points[second]).norm(dim=-1).amax(-1)
         leg = torch.where(self._free(nodes[first], nodes[second]), leg, math.inf)
-        lengths = torch.full((end + 1, end + 1), math.inf, dtype=x.dtype)
+        lengths = x.new_full((end + 1, end + 1), math.inf)
         lengths[first, second] = lengths[second, first] = leg
         left = torch.where(torch.arange(end + 1) == end, 0.0, lengths[end])
         for _ in range(end):

@@ -10,8 +10,7 @@ BODY = """<body name="{0}"><joint name="{0}_x" damping="4" type="slide" axis="1 
   <geom name="{0}" type="cylinder" size=".25 .1" mass="1" friction=".01"/></body>"""
 MODEL = f"""<mujoco><option timestep=".02"/><worldbody>{BODY.format("pusher")}{BODY.format("cart")}</worldbody>
   <actuator><position joint="pusher_x" kp="10" ctrlrange="-10 10"/>
-  <position joint="pusher_y" kp="10" ctrlrange="-10 10"/>
-</actuator></mujoco>"""
+  <position joint="pusher_y" kp="10" ctrlrange="-10 10"/></actuator></mujoco>"""
 
 pytestmark = pytest.mark.slow
 

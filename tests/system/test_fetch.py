@@ -7,17 +7,10 @@ import numpy as np
 import pytest
 
 
-@pytest.fixture
-def fetch(monkeypatch):
-    pytest.importorskip("mujoco")
-    pytest.importorskip("tyro")
-    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "benchmarks" / "scoreboard"))
-    import fetch
+def test_a_puck_that_is_hit_slides_as_far_as_friction_lets_it(monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "examples"))
+    import fetch_policies as fetch
 
-    return fetch
-
-
-def test_a_puck_that_is_hit_slides_as_far_as_friction_lets_it(fetch):
     geoms = SimpleNamespace(friction=np.array([0.1])), SimpleNamespace(friction=np.array([0.05]))
     model = SimpleNamespace(
         eq_solref=np.array([[0.02, 1.0]]),

@@ -210,9 +210,7 @@ class MujocoCost(TensorFields):
             tensors = {name: value.to(x.device, x.dtype) for name, value in tensors.items()}
         return QuadraticCost.of_checked(tensors)
 
-    def reach(
-        self, x: Tensor, goal: Tensor | None = None, *, joints: Sequence[str] | None = None, margin: float = 0.0
-    ) -> Tensor:
+    def reach(self, x: Tensor, goal: Tensor | None, joints: Sequence[str], margin: float = 0.0) -> Tensor:
         """Inverse kinematics: states (..., n_x) near x (..., n_x) in which joints make the cost of stages small.
 
         Gauss–Newton, damped, within the ranges of the joints. What it finds may be a local minimum.
@@ -220,7 +218,7 @@ class MujocoCost(TensorFields):
         Args:
             x: where it begins.
             goal: (..., n_goal), as for `at`.
-            joints: names of the slides and hinges that move; None: all of the model.
+            joints: names of the slides and hinges that move.
             margin: how far they stay from the ends of their ranges [m, rad].
 
         Raises:
