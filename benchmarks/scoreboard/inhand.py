@@ -65,7 +65,7 @@ JOINTS = (0.125, 1.13, 1.45, 1.24, -0.02, 0.445, 1.17, 1.5, -0.459, 1.54, 1.11, 
 FINGERS, LINKS = ("ff", "mf", "rf", "th"), ("base", "proximal", "medial", "distal", "tip")
 COLUMNS = "object", "seed", "success", "dropped", "steps", "position_mm", "angle_deg", "goals"
 PARTS = "system", "cost", "solve", "rehearsal"
-LIMIT, HELD, SUBSTEPS, LOST, SECONDS = 500, 21, 50, 0.005, 0.1
+LIMIT, HELD, SUBSTEPS, LOST, SECONDS, TRIALS = 500, 21, 50, 0.005, 0.1, 20
 
 
 @dataclass(frozen=True)
@@ -73,12 +73,6 @@ class Settings:
     """Of the controller, the same for all objects."""
 
     horizon: int = 4
-    palm: int = 3
-    """Contacts of the object with the palm."""
-    finger: int = 2
-    """Contacts of the object with each finger."""
-    fingers: int = 4
-    """Contacts of fingers with each other."""
     friction: float = 0.5
     inertia: float = 5.0
     """Factor of the inertia of rotation."""
@@ -86,8 +80,6 @@ class Settings:
     relaxation: float = 1e-3
     place: float = 4000.0
     """So high against `turn` and `reach` that the object is not turned off the palm."""
-    height: float = 1.0
-    """Factor of `place` for the vertical."""
     turn: float = 18.75
     reach: float = 0.5
     """Angle up to which a goal that is farther away pulls harder [rad]."""
@@ -104,11 +96,9 @@ class Settings:
     spread: float = 0.3
     """Standard deviation of the posture to which the hand opens from the second time on [rad]."""
     paces: tuple[float, ...] = ()
-    """Factors by which the planned action is tried in MuJoCo, the fastest first; none to execute it untried."""
+    """Factors by which the planned step is tried in MuJoCo, the fastest first; none: it is executed untried."""
     slack: float = 0.02
-    """Cost by which a faster action may end worse than the best."""
-    substep: float = 0.002
-    """Of MuJoCo where actions are tried [s]."""
+    """Cost by which a faster step may end worse than the best."""
 
 
 @dataclass
@@ -174,10 +164,9 @@ class HandPolicy:
 
     def __init__(self, model: Any, data: Any, place: np.ndarray, goal: np.ndarray, settings: Settings):
         s = settings
-        self.trial, self.place = copy.copy(model), place
-        self.trial.opt.timestep = s.substep
-        self.tried = mujoco.MjData(self.trial)
-        model = copy.copy(model)
+        self.twin, self.place, model = copy.copy(model), place, copy.copy(model)
+        self.twin.opt.timestep = SECONDS / TRIALS
+        self.tried = mujoco.MjData(self.twin)
         model.body_inertia[model.body("obj").id] *= s.inertia
         self.limit = 0.1 if model.body("obj").mass[0] < 0.05 else 0.2
         self.module = MujocoLCS(
@@ -186,9 +175,9 @@ class HandPolicy:
             motion="quasi-dynamic",
             torsion=False,  # the settings were chosen without it
             contacts=[
-                ContactGroup(("obj", "palm"), s.palm),
-                *(ContactGroup([("obj", f"{f}_{link}") for link in LINKS], s.finger) for f in FINGERS),
-                ContactGroup(None, s.fingers, friction=False, distance=0.006),
+                ContactGroup(("obj", "palm"), 3),
+                *(ContactGroup([("obj", f"{f}_{link}") for link in LINKS], 2) for f in FINGERS),
+                ContactGroup(None, 4, friction=False, distance=0.006),
             ],
             distance=0.03,
             friction=s.friction,
@@ -196,11 +185,10 @@ class HandPolicy:
             length=0.02,
         )
         tips = [Distance("obj", f"ftp_{i}", weight=s.near, weight_final=0.0) for i in range(4)]
-        place_weight = [s.place, s.place, s.place * s.height]
         self.cost = MujocoCost(
             self.module,
             [
-                Position("body:obj", place, weight=0.0, weight_final=place_weight),
+                Position("body:obj", place, weight=0.0, weight_final=s.place),
                 Orientation("body:obj", weight=0.0, weight_final=s.turn, reach=s.reach),
                 *tips,
                 Effort(s.effort),
@@ -256,23 +244,18 @@ class HandPolicy:
         return ctrl
 
     def rehearse(self, data: Any, ctrl: np.ndarray) -> np.ndarray:
-        """Try a step at several paces in MuJoCo: the fastest of those that end about as well as the best."""
-        s, joints = self.settings, data.qpos[:16]
-        whole = mujoco.mjtState.mjSTATE_INTEGRATION
-        now = np.empty(mujoco.mj_stateSize(self.trial, whole))
-        mujoco.mj_getState(self.trial, data, now, whole)
+        """Try a step at several paces in MuJoCo: the fastest that ends about as well as the best."""
+        s, joints, ends = self.settings, data.qpos[:16], []
         steps = [np.clip(pace * (ctrl - joints), -self.limit, self.limit) for pace in s.paces]
-        ends = []
         for step in steps:
-            mujoco.mj_setState(self.trial, self.tried, now, whole)
+            mujoco.mj_copyState(self.twin, data, self.tried, mujoco.mjtState.mjSTATE_INTEGRATION)
             self.tried.ctrl[:] = joints + step
-            mujoco.mj_step(self.trial, self.tried, round(SECONDS / s.substep))
+            mujoco.mj_step(self.twin, self.tried, TRIALS)
+            apart = self.tried.qpos[-7:-4] - self.place
             left = 2 * np.arccos(min(1.0, abs(float(self.tried.qpos[-4:] @ self.goal))))
             near = min(left, s.reach)
-            apart = self.tried.qpos[-7:-4] - self.place
             ends.append(s.place * apart @ apart + s.turn * near * (2 * left - near))
-        best = min(ends)
-        return joints + next(step for step, end in zip(steps, ends, strict=True) if end <= best + s.slack)
+        return joints + next(step for step, end in zip(steps, ends, strict=True) if end <= min(ends) + s.slack)
 
 
 def play(o: Options, name: str, seed: int) -> dict[str, Any]:
@@ -321,9 +304,7 @@ def figures(episodes: list[dict[str, Any]]) -> dict[str, Any]:
         "mean_goals": float(np.mean([e["goals"] for e in episodes])),
         "position_mm": float(np.median([e["position_mm"] for e in good])),
         "angle_deg": float(np.median([e["angle_deg"] for e in good])),
-        "milliseconds_per_step": dict(
-            zip(("system", "cost", "solve", "rehearsal"), parts.round(2).tolist(), strict=True)
-        ),
+        "milliseconds_per_step": dict(zip(PARTS, parts.round(2).tolist(), strict=True)),
         "milliseconds_p99": float(np.percentile(np.concatenate([e["all_milliseconds"] for e in episodes]), 99)),
     }
 

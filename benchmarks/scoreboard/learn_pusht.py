@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -153,18 +152,14 @@ def corners(physics: PlanarPushing) -> list[float]:
     return (PIXELS * (learned - true)[outside]).norm(dim=1).tolist()
 
 
-@dataclass
-class Options:
-    """Push-T learned from random pushing."""
+def main(seed: int = 0) -> None:
+    """Learn Push-T from random pushing, and print.
 
-    seed: int = 0
-    """Of the pushing and of the wrong values."""
-
-
-def main(o: Options) -> None:
-    """Learn and print."""
+    Args:
+        seed: of the pushing and of the wrong values.
+    """
     torch.set_num_threads(1)
-    result = learn(make_env(), o.seed)
+    result = learn(make_env(), seed)
     print(f"{result.seconds:.1f} s of CPU time to learn from two minutes of random pushing")
     print(f"violation loss {result.loss[0]:.2e} before, {result.loss[1]:.2e} after")
     true = {"center_of_mass": list(CENTER_OF_MASS), "gyration": GYRATION, "friction": [0.0]}
@@ -176,4 +171,4 @@ def main(o: Options) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    tyro.cli(main)

@@ -48,10 +48,8 @@ except ImportError as error:
         f"expected the package gym-pushany, not installed ({error}); run: pip install gym-pushany==0.1.13"
     ) from error
 
-INSIDE = shapely.box(7, 7, 504, 504)
-"""The plane inside the walls [px]."""
-ALIKE = 0.99
-"""Part of the area that a turn must cover for a pose to count as the same."""
+INSIDE = shapely.box(7, 7, 504, 504)  # the plane inside the walls [px]
+ALIKE = 0.99  # part of the area that a turn must cover for a pose to count as the same
 
 
 class StateEnv(PushAnyEnv):
@@ -146,13 +144,6 @@ class Played(NamedTuple):
     inside: bool
 
 
-def measure(name: str, o: Options) -> list[Played]:
-    """Play the episodes of a shape."""
-    env = StateEnv(object_name=name)
-    policy, limit = PushAnyPolicy(env), 5 if o.smoke else STEPS
-    return [Played(play(env, policy, seed, Variant(), limit), env.goal_inside) for seed in find_seeds(o)]
-
-
 def figures(played: list[Played]) -> dict[str, Any]:
     """Compute the figures of episodes."""
     success, steps, _, milliseconds, _ = np.array([one.episode for one in played], float).T
@@ -177,7 +168,9 @@ def main(o: Options) -> None:
     torch.set_num_threads(1)
     everything: list[Played] = []
     for name in names:
-        played = measure(name, o)
+        env = StateEnv(object_name=name)
+        policy, limit = PushAnyPolicy(env), 5 if o.smoke else STEPS
+        played = [Played(play(env, policy, seed, Variant(), limit), env.goal_inside) for seed in find_seeds(o)]
         everything += played
         if not o.json:
             report(name, figures(played))
