@@ -13,9 +13,10 @@ at most 0.1 rad, 0.2 rad for objects of 100 g, from where the joints are, and ho
 Beyond the papers, `--axes any` turns by 30° to 90° about any axis, `--seconds 60` gives the next goal where one is
 reached, until the object falls or the time is over, and `--tilt 30` inclines the hand. They can be combined.
 
-The controller knows model and state. It has one set of settings for all objects, chosen with seeds of 1000 to 1014;
-final figures are of seeds 5000 and up. Times are CPU times of one core. With `--out FILE` episodes that are in the file
-are not played again: after a change of the controller begin another file.
+The controller knows model and state, and tries each planned step in MuJoCo, at several paces, before it is executed.
+It has one set of settings for all objects, chosen with seeds from 1000 to 1024; final figures are of seeds 5000 and up.
+Times are CPU times of one core. With `--out FILE` episodes that are in the file are not played again: after a change of
+the controller begin another file.
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ class Settings:
     """Part of the published limit of actions that is used, as drops come from fast motion."""
     spread: float = 0.3
     """Standard deviation of the posture to which the hand opens from the second time on [rad]."""
-    paces: tuple[float, ...] = ()
+    paces: tuple[float, ...] = (2.0, 1.0, 0.5)
     """Factors by which the planned step is tried in MuJoCo, the fastest first; none: it is executed untried."""
     slack: float = 0.02
     """Cost by which a faster step may end worse than the best."""
