@@ -1,0 +1,107 @@
+"""Numbers of a MuJoCo model, found again from two minutes of motion: `python examples/identify_mujoco.py --xml FILE`.
+
+The model in the file is the truth. A guess has some of its numbers wrong by the factor `--wrong`, in turn too large and
+too small. The truth moves by random controls; `LearnableMujocoLCS` with the violation loss brings the guess back.
+Without `--xml` two models of Gymnasium are tried: the arm of Pusher, and the half-cheetah, which runs in a plane.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import torch
+import tyro
+from torch import Tensor
+
+from difflcs import violation_loss
+from difflcs.errors import ContactWarning
+from difflcs.physics.mujoco import LearnableMujocoLCS
+
+GYMNASIUM = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+
+
+@dataclass
+class Options:
+    """Find numbers of a MuJoCo model again."""
+
+    xml: Path | None = None
+    """Model; without it two are tried."""
+    learn: tuple[str, ...] = ()
+    """What is wrong in the guess: kinds of `LearnableMujocoLCS`, or kind:name; with --xml."""
+    wrong: float = 2.0
+    """Factor by which each is wrong, in turn too large and too small."""
+    seconds: float = 120.0
+    """Of motion."""
+    step: float = 0.02
+    """Of a transition [s]."""
+    steps: int = 150
+    """Steps of Adam, each on `batch` transitions drawn at random."""
+    batch: int = 200
+    seed: int = 0
+
+
+def gather(model: Any, module: LearnableMujocoLCS, o: Options) -> list[Tensor]:
+    """Move the model by controls that change every 10 steps: states, actions and next states, (n, …) each."""
+    random, data = np.random.default_rng(o.seed), mujoco.MjData(model)
+    before, after, controls = [], [], []
+    low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
+    for k in range(round(o.seconds / o.step)):
+        if k % 50 == 0:
+            mujoco.mj_resetData(model, data)
+        if k % 10 == 0:
+            data.ctrl[:] = random.uniform(low, high)
+        controls.append(data.ctrl.copy())
+        before.append([data.qpos.copy(), data.qvel.copy()])
+        mujoco.mj_step(model, data, round(o.step / model.opt.timestep))
+        after.append([data.qpos.copy(), data.qvel.copy()])
+    x, x_next = (module.state.to_state(*map(np.stack, zip(*rows, strict=True))) for rows in (before, after))
+    ctrl = torch.from_numpy(np.stack(controls))
+    return [x, ctrl - module.physics.control(x, torch.zeros_like(ctrl)), x_next]
+
+
+def identify(name: str, model: Any, learn: list[Any], o: Options) -> None:
+    """Fit one model, and print the factors that are left."""
+    module = LearnableMujocoLCS(model, learn=learn, motion="dynamic", seconds=o.step)
+    signs = torch.tensor([s for s, _ in zip(itertools.cycle([1.0, -1.0]), module.change, strict=False)])
+    with torch.no_grad():
+        module.change.copy_(signs * np.log(o.wrong))
+    x, u, x_next = gather(model, module, o)
+    adam = torch.optim.Adam(module.parameters(), 0.1)
+    slower = torch.optim.lr_scheduler.ExponentialLR(adam, 0.03 ** (1 / o.steps))
+    draw, begun = torch.Generator().manual_seed(o.seed), time.process_time()
+    for _ in range(o.steps):
+        some = torch.randint(len(x), (o.batch,), generator=draw)
+        losses = violation_loss(module, x[some], u[some], x_next[some], "auto", o.step, reduction="none")
+        adam.zero_grad()
+        (losses / losses.detach().median()).log1p().mean().backward()
+        adam.step()
+        slower.step()
+    print(f"{name}: {len(x)} transitions, {time.process_time() - begun:.0f} s")
+    for what, sign, left in zip(learn, signs, module.change.detach().exp(), strict=True):
+        print(f"  {what}: guessed × {o.wrong ** float(sign):.2f}, found × {left:.3f}")
+
+
+def main(o: Options) -> None:
+    """Identify."""
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore", ContactWarning)
+    if o.xml is not None:
+        learn = [tuple(what.split(":", 1)) if ":" in what else what for what in o.learn]
+        identify(o.xml.stem, mujoco.MjModel.from_xml_path(str(o.xml)), learn, o)
+        return
+    arm = mujoco.MjModel.from_xml_path(str(GYMNASIUM / "pusher_v5.xml"))
+    identify("arm", arm, [("mass", "r_upper_arm_link"), ("mass", "r_forearm_link"), "damping", "armature"], o)
+    cheetah = mujoco.MjModel.from_xml_path(str(GYMNASIUM / "half_cheetah.xml"))
+    identify("half-cheetah", cheetah, [("mass", "torso"), "stiffness", "damping"], o)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
