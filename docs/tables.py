@@ -425,7 +425,6 @@ RACE: dict[str, Callable[[dict], str]] = {
 TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "race": RACE,
     "race_avx512": {"best": best("contact")},
-    "race_linear": {"linear": times("linear")},
     "race_planners": {"plans": planners, "loops": loops},
     "optima": {"efforts": efforts},
     "scale": {"sizes": sizes, "weak": weak},
