@@ -4,6 +4,8 @@ A disc of radius 15 px pushes a T, made of two boxes of 30 by 120 and 30 by 90 p
 action is the target of the disc's PD controller, for ten substeps of 0.01 s. The disc is kinematic: nothing pushes it
 back. Velocities are damped away in each substep, so the T moves only while it is pushed. Friction between disc and T is
 zero: what the environment sets is an attribute that pymunk does not read. Lengths here are in units of 100 px.
+
+With `--adapt` it finds the scale of the outline while it pushes, as with `--scale 0.8`, where it is told a wrong one.
 """
 
 from __future__ import annotations
@@ -17,14 +19,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from context_filter import ContextFilter
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from difflcs import Animation, GoalCost, LCSMPCLayer
 from difflcs.errors import MissingDependencyError
-from difflcs.physics import PDDrive, PlanarPushing, Polygon, Union, box
+from difflcs.physics import PDDrive, PlanarPushing, Polygon, PositionDrive, Union, box
 from difflcs.physics.complementarity import Contacts
-from difflcs.planning import Decision, DiscPlaces, Mode, PlanarTravel, SamplingPolicy, SamplingSettings, Workspace
+from difflcs.physics.planar import to_body
+from difflcs.physics.shapes import Distance, Moments, Shape
+from difflcs.planning import (
+    Decision,
+    DiscPlaces,
+    Mode,
+    PlanarTravel,
+    SamplingPolicy,
+    SamplingSettings,
+    Workspace,
+)
+from difflcs.records import LCSParams
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -53,6 +67,12 @@ GREEN, GREY, BLUE = (0, 158, 115), (150, 150, 150), (0, 114, 178)
 def tee(scale: float = 1.0) -> Union:
     """Make the T in coordinates about the centre of its area, scaled about it by `scale`."""
     return Union(tuple(Polygon(scale * (part.vertices - _CENTER)) for part in _BOXES))
+
+
+def _scaled(shape: Shape, scale: float) -> Union:
+    """Scale a union of polygons about its origin."""
+    assert isinstance(shape, Union)
+    return Union(tuple(Polygon(scale * part.vertices) for part in shape.parts if isinstance(part, Polygon)))
 
 
 def tee_pushing(**changes: Any) -> PlanarPushing:
@@ -113,6 +133,71 @@ class Rigid(PlanarPushing):
         return cls(**{field.name: getattr(system, field.name) for field in fields(system)})
 
 
+class Scaled(Shape):
+    """A shape at several scales about its origin, one for each row of a batch of points (n, ..., 2).
+
+    Args:
+        shape: at scale 1.
+        scales: (n,).
+    """
+
+    def __init__(self, shape: Shape, scales: Tensor):
+        self.shape, self.scales = shape, scales
+
+    @property
+    def n_parts(self) -> int:
+        """See `Shape`."""
+        return self.shape.n_parts
+
+    def distance(self, points: Tensor) -> Distance:
+        """See `Shape`."""
+        scale = self.scales.reshape(-1, *[1] * (points.ndim - 1))
+        distance, normal, point = self.shape.distance(points / scale)
+        return Distance(scale * distance, normal, scale.unsqueeze(-1) * point)
+
+    def moments(self) -> Moments:
+        """Of scale 1."""
+        return self.shape.moments()
+
+    @property
+    def radius(self) -> float:
+        """Of the largest."""
+        return float(self.scales.max()) * self.shape.radius
+
+
+class AnyScale:
+    """A pushed body of unknown scale, its context: an `LCSModule` of which each row has an outline of its own.
+
+    The disc follows its action exactly, as afterwards one knows where it was.
+
+    Args:
+        system: with the outline at scale 1.
+    """
+
+    def __init__(self, system: PlanarPushing):
+        self.system = system.replace(drive=PositionDrive())
+        self.n_x, self.n_u, self.n_lam = self.system.n_x, self.system.n_u, self.system.n_lam
+
+    def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
+        """The systems at states x (n, 5) for scales (n, 1)."""
+        assert context is not None
+        return self.system.replace(shape=Scaled(self.system.shape, context[:, 0])).params(x)
+
+
+SCALES = torch.exp(torch.arange(-12, 13, dtype=torch.float64) * 0.025)
+"""Scales of the told outline that `DiscPolicy(adapt=True)` compares: from 0.74 to 1.35."""
+PARTS = 5
+"""Parts of a step in which the motion of the disc is followed."""
+SCALE_TOLD = len(SCALES) // 2
+"""Index of the scale that was told."""
+SPREAD, RELATIVE, MOST = 0.01, 0.2, 8.0
+"""Settings of its `ContextFilter`: predictions are off by 1 px and a fifth of the motion; no step counts for more."""
+SURE = 3.0
+"""Log-likelihood ratio with which another scale replaces that of the plan."""
+STILL = 0.002
+"""Largest motion of a body at rest, in units of length and rad."""
+
+
 class DiscPolicy:
     """Sampling-based contact MPC for a disc that pushes a body on the square: an observation to the disc's target.
 
@@ -125,35 +210,65 @@ class DiscPolicy:
         goal: (3,) of the origin [px, px, rad].
         delay: steps by which actions come late. The plan begins at the state that the system predicts for then.
         turns: turns of the body about its centre that cover it, which all mean the same.
+        adapt: find the scale of the outline from the motion seen, anew in each episode.
 
     Attributes:
         sampling: the policy inside, with its `decision`.
+        adapts: as `adapt` says.
+        hypothesis: index of the scale in `SCALES` with which it plans.
     """
 
     def __init__(
-        self, system: PlanarPushing, center: ArrayLike, goal: ArrayLike = GOAL, *, delay: int = 0, turns: int = 1
+        self,
+        system: PlanarPushing,
+        center: ArrayLike,
+        goal: ArrayLike = GOAL,
+        *,
+        delay: int = 0,
+        turns: int = 1,
+        adapt: bool = False,
     ):
-        self.system, self.delay, self._period = Rigid.of(system), delay, 2 * math.pi / turns
+        self.told, self.delay, self._period = system, delay, 2 * math.pi / turns
         self.center, self.goal = np.asarray(center), goal
-        shape = self.system.shape
+        self._filter = ContextFilter(AnyScale(system), SCALES.unsqueeze(-1), SPREAD, relative=RELATIVE, most=MOST)
+        self.adapts = adapt
+        self._policies: dict[int, tuple[Rigid, SamplingPolicy]] = {}
+        step = DRIVE.step()
+        self._keeps, self._gives = float(step.A[1, 1]), float(step.b[1])
+        self._course = DRIVE.course()
+        self._use(SCALE_TOLD)
+        self.reset()
+
+    def _use(self, hypothesis: int) -> None:
+        """Plan with one of the scales."""
+        self.hypothesis = hypothesis
+        if hypothesis not in self._policies:
+            shape = _scaled(self.told.shape, float(SCALES[hypothesis])) if hypothesis != SCALE_TOLD else self.told.shape
+            self._policies[hypothesis] = self._plan(Rigid.of(self.told.replace(shape=shape)))
+        self.system, self.sampling = self._policies[hypothesis]
+        self.sampling.reset()
+
+    @staticmethod
+    def _plan(system: Rigid) -> tuple[Rigid, SamplingPolicy]:
+        """Make the policy for a system."""
+        shape = system.shape
         workspace = Workspace((0.0, 0.0), (SIDE, SIDE), step=1.2)
         cost = GoalCost.reach(7, 2, goal_weight=(1.0, 1.0, 0.3), goal_weight_final=(4.0, 4.0, 1.2), input_weight=0.01)
-        self.sampling = SamplingPolicy(
-            LCSMPCLayer(self.system, cost, 6, relaxation=1e-5, on_failure="mask"),
+        return system, SamplingPolicy(
+            LCSMPCLayer(system, cost, 6, relaxation=1e-5, on_failure="mask"),
             DiscPlaces(shape, RADIUS, 32, gap=0.02, reach=0.2, workspace=workspace, margin=0.02),
             PlanarTravel(shape, RADIUS, SIDE, drive=DRIVE, clearance=0.08, tolerance=0.12, workspace=workspace),
             SamplingSettings(keep=0.6, smallest_gain=0.02, switch_price=0.02, travel_price=0.04),
             bounds=workspace.bounds,
             angles=(2,),
         )
-        step = DRIVE.step()
-        self._keeps, self._gives = float(step.A[1, 1]), float(step.b[1])
-        self.reset()
 
     def reset(self) -> None:
         """Start an episode."""
-        self.sampling.reset()
+        self._filter.reset()
+        self._use(SCALE_TOLD)
         self._velocity = np.zeros(2)
+        self._before: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self._under_way: deque[NDArray[np.float64]] = deque()
 
     def act(self, observation: ArrayLike) -> NDArray[np.float64]:
@@ -168,6 +283,9 @@ class DiscPolicy:
         seen = np.asarray(observation, np.float64)
         disc = seen[:2] / PIXELS
         state = np.concatenate([from_origin(seen[2:], self.center), disc, self._velocity])
+        if self.adapts:
+            self._adapt(state)
+        state_seen = state
         if self.delay and not self._under_way:
             self._under_way.extend([disc] * self.delay)
         for target in self._under_way:
@@ -176,8 +294,36 @@ class DiscPolicy:
         goal[2] += self._period * np.round((state[2] - goal[2]) / self._period)
         target = np.clip(state[3:5] + self.sampling.act(state, goal), 0.0, SIDE)
         self._under_way.append(target)
-        self._velocity = self._keeps * self._velocity + self._gives * (self._under_way.popleft() - disc)
+        sent = self._under_way.popleft() - disc
+        self._before = state_seen, sent
+        self._velocity = self._keeps * self._velocity + self._gives * sent
         return target * PIXELS
+
+    def _adapt(self, state: NDArray[np.float64]) -> None:
+        """Learn from the last step, and change the scale where another explains the motion clearly better."""
+        if self._before is None:
+            return
+        before, sent = self._before
+        x, x_next = torch.from_numpy(before[:5]), torch.from_numpy(state[:5])
+        way = torch.from_numpy(self._way(before[5:], sent))
+        largest = Scaled(self.told.shape, SCALES[-1:])
+        near = (largest.distance(to_body(x, x[3:] + way).unsqueeze(0)).distance[0] < RADIUS).any(-1)
+        moved = float((x_next - x)[:3].abs().max()) >= STILL
+        if not moved and not bool(near.any()):
+            return  # all scales predict that nothing moves
+        first = int(near.to(torch.int8).argmax())  # 0 if none is near
+        way = torch.cat([torch.zeros(1, 2, dtype=way.dtype), way])[first:]
+        touching = torch.cat([x[:3], x[3:] + way[0]])
+        self._filter.update(touching, way.diff(dim=0), x_next)
+        likely = self._filter.log_likelihood
+        if float(likely[self.hypothesis]) < -SURE:
+            self._use(int(likely.argmax()))
+
+    def _way(self, velocity: NDArray[np.float64], sent: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far the disc has come after each part of a step (PARTS, 2)."""
+        every = self._course.b.shape[0] // PARTS
+        A, b = self._course.A[every - 1 :: every].numpy(), self._course.b[every - 1 :: every].numpy()
+        return A[:, 0, 1:] * velocity + b[:, :1] * sent
 
     def _predict(self, state: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
         """Predict the state one step later."""
@@ -200,8 +346,8 @@ class PushTPolicy(DiscPolicy):
         delay: likewise.
     """
 
-    def __init__(self, system: PlanarPushing | None = None, delay: int = 0):
-        super().__init__(tee_pushing() if system is None else system, _CENTER, delay=delay)
+    def __init__(self, system: PlanarPushing | None = None, delay: int = 0, *, adapt: bool = False):
+        super().__init__(tee_pushing() if system is None else system, _CENTER, delay=delay, adapt=adapt)
 
 
 def from_origin(pose: ArrayLike, center: ArrayLike = _CENTER) -> NDArray[np.float64]:
@@ -266,11 +412,16 @@ class Options:
     """Of the first episode; the next have the next."""
     episodes: int = 4
     """How many are played, one after another."""
+    scale: float = 1.0
+    """Of the outline that the policy is told."""
+    adapt: bool = False
+    """Find the scale while it runs, anew in each episode."""
 
 
 def main(o: Options) -> None:
     """Play, and write the film at ten frames a second: real time."""
-    env, policy, frames = make_env(render_mode="rgb_array"), PushTPolicy(), []
+    system = tee_pushing(shape=tee(o.scale))
+    env, policy, frames = make_env(render_mode="rgb_array"), PushTPolicy(system, adapt=o.adapt), []
     for seed in range(o.seed, o.seed + o.episodes):
         observation, info = env.reset(seed=seed)
         policy.reset()

@@ -82,6 +82,8 @@ class Options:
     """Seed of the first episode."""
     variant: str = "known"
     """One of the variants, or "all"."""
+    adapt: bool = False
+    """Find the scale of the outline while it runs, anew in each episode."""
     json: bool = False
     """Print a line of JSON for each variant."""
     out: Path | None = None
@@ -131,11 +133,13 @@ def play(env: Any, policy: PushTPolicy, seed: int, variant: Variant, limit: int 
 def measure(variant: Variant, o: Options, env: Any) -> dict[str, float]:
     """Compute the figures of a variant."""
     policy, limit = variant.policy(o.seed), 5 if o.smoke else STEPS
+    policy.adapts = o.adapt
     episodes = [play(env, policy, o.seed + i, variant, limit) for i in range(o.episodes)]
     success, steps, coverage, milliseconds, longest = np.array(episodes, float).T
     return {
         **success_figures(success),
         "mean_steps": float(steps.mean()),
+        "worst_steps": float(steps.max()),
         "milliseconds_per_step": float(milliseconds.sum() / steps.sum()),
         "coverage": float(coverage.mean()),
         "longest_milliseconds": float(np.percentile(longest, 99)),
@@ -149,7 +153,10 @@ def main(o: Options) -> None:
     if o.smoke:
         o.episodes = min(o.episodes, 2)
     torch.set_num_threads(1)
-    env, asked = make_env(), {"episodes": o.episodes, "seed": o.seed, "smoke": o.smoke}
+    env, asked = (
+        make_env(),
+        {"episodes": o.episodes, "seed": o.seed, "smoke": o.smoke, **({"adapt": True} if o.adapt else {})},
+    )
     record = {"machine": machine(), "options": asked, "results": {}}
     if o.out is not None and o.out.exists():
         record = json.loads(o.out.read_text())

@@ -42,6 +42,20 @@ def line_of(capsys):
     return json.loads(capsys.readouterr().out.splitlines()[-1])
 
 
+def test_the_filter_finds_the_scale_by_pushing_and_learns_nothing_away_from_the_body(push_t):
+    scales = torch.tensor([[0.8], [1.0], [1.25]], dtype=torch.float64)
+    lcs = push_t.AnyScale(push_t.tee_pushing())
+    seen = push_t.ContextFilter(lcs, scales, 0.01)
+    x, down = torch.tensor([[0.0, 0.0, 0.0, 0.0, -1.5]], dtype=torch.float64), torch.tensor([[0.0, 0.25]]).double()
+    for step in range(4):
+        x_next = lcs.params(x, scales[2:]).step(x, down).x_next
+        seen.update(x[0], down[0], x_next[0])
+        x = x_next
+        if step == 0:
+            torch.testing.assert_close(seen.probabilities, torch.full_like(seen.probabilities, 1 / 3))
+    torch.testing.assert_close(seen.mean, scales[2], atol=1e-2, rtol=0.0)
+
+
 @needs_gym_pusht
 @pytest.mark.slow  # plays
 def test_the_scoreboard_prints_its_keys_and_goes_on_where_it_was(board, capsys, tmp_path, monkeypatch):
