@@ -63,9 +63,9 @@ def said(notebook: nbformat.NotebookNode) -> str:
     return "\n".join(parts)
 
 
-def test_there_are_nine_in_order():
+def test_there_are_ten_in_order():
     assert [path.stem[:3] for path in NOTEBOOKS] == [f"{i:02d}_" for i in range(1, len(NOTEBOOKS) + 1)]
-    assert len(NOTEBOOKS) >= 9
+    assert len(NOTEBOOKS) >= 10
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
