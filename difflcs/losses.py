@@ -24,7 +24,6 @@ _GAMMA_LEAST = TOLERANCES["gamma_least"]
 # γ = "auto", in parts of its bound: at the bound itself the inner QP is singular wherever C is. A thousandth below it
 # the smallest eigenvalue of F + Fᵀ − γI is a thousandth of that of F + Fᵀ.
 _AUTO = 0.999
-_NEAR = 1e-8  # weight of a proximal step in an inner QP of unit diagonal
 # Dimensions of A, B, C, d, D, E, F, c, x, u, x_next.
 _RANKS = (*map(len, SYSTEM.values()), 1, 1, 1)
 
@@ -389,11 +388,9 @@ def minimise_over_orthant(Q: np.ndarray, q: np.ndarray, max_iter: int = 500) -> 
 def _solved(Q: np.ndarray, q: np.ndarray) -> np.ndarray:
     z, _, status = solve_lcp_arrays(Q, q)
     failed = np.flatnonzero(status != Status.CONVERGED)
-    if len(failed):  # perhaps by rounding only: then a proximal step from there is solved, and hardly moves it
-        before, near = z[failed], Q[failed] if Q.ndim == 3 else Q
-        z[failed], _, status[failed] = solve_lcp_arrays(near + _NEAR * np.eye(Q.shape[-1]), q[failed] - _NEAR * before)
-        moved = np.abs(z[failed] - before).max(-1) > 1e-4 * np.abs(before).max(-1)
-        status[failed[moved]] = Status.NUMERICAL
+    if len(failed):  # by rounding, mostly: a proximal step from there takes the value to ½·1e-8·‖z − z₋‖² of its least
+        near = (Q[failed] if Q.ndim == 3 else Q) + 1e-8 * np.eye(Q.shape[-1])
+        z[failed], _, status[failed] = solve_lcp_arrays(near, q[failed] - 1e-8 * z[failed])
         failed = np.flatnonzero(status != Status.CONVERGED)
     if len(failed):
         raise SolveError(

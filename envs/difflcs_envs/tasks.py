@@ -169,7 +169,7 @@ def describe(env: Any) -> dict[str, Any]:
     """Describe the object of an environment or a vector, wrapped or not: name, source of its shape, mass, ..."""
     inner = env.unwrapped
     single = inner.envs[0].unwrapped if hasattr(inner, "envs") else inner
-    return single.object.describe()
+    return (single if hasattr(single, "describe") else single.object).describe()
 
 
 def contact_physics(env_kwargs: Mapping[str, Any]) -> PhysicsSpec:
@@ -357,7 +357,7 @@ def hand_task(name: str, summary: str, guess: Mapping[str, float] | None = None,
         errors=(Quantity("position_error", "m"), Quantity("angle_error", "rad")),
         picture={"width": 640, "height": 480},
         example_goals=(HAND_GOAL,),
-        describe=describe_hand,
+        describe=describe,
         requires=("mujoco",),
         physics=PhysicsSpec(
             make_system=make_system,
@@ -365,12 +365,6 @@ def hand_task(name: str, summary: str, guess: Mapping[str, float] | None = None,
             told="MuJoCo's model of the hand and its object, with guesses of mass, friction and gain of the servos",
         ),
     )
-
-
-def describe_hand(env: Any) -> dict[str, Any]:
-    """Describe what is in the hand of an environment or a vector, wrapped or not."""
-    inner = env.unwrapped
-    return (inner.envs[0].unwrapped if hasattr(inner, "envs") else inner).describe()
 
 
 def register_tasks() -> None:

@@ -145,14 +145,12 @@ def run_of(out: Path) -> SimpleNamespace:
         (["train", "--init", "zoo:teapot"], "trifinger-cube"),
         (["evaluate", "zoo:trifinger-cube", "--goals", "0"], "goals"),
         (["evaluate", "zoo:trifinger-cube", "--seed", "-1"], "seed"),
-        (["render", "zoo:trifinger-cube", "--goal"], "expected x [m], y [m], yaw [rad] for each goal"),
         (["render", "zoo:trifinger-cube", "--goal", "0.1"], "expected x [m], y [m], yaw [rad] for each goal"),
         (["train", "--method", "magic"], "expected one of lcs-rl, violation"),
         (["render", "zoo:trifinger-cube", "--out", "video.avi"], "MP4"),
         (["evaluate", "turn_cube"], "expected a task with known physics"),
         (["bench", "--repeats", "0"], "repeats"),
         (["evaluate", "nowhere"], "difflcs train"),
-        (["render", "nowhere"], "difflcs train"),
     ],
 )
 def test_mistakes_get_one_clean_message(capsys, tmp_path, arguments, message):

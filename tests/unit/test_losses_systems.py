@@ -1,7 +1,6 @@
 """The losses with systems other than one LCSModel: LCSParams, one per transition, modules; and gamma="auto"."""
 
 import itertools
-from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from difflcs.errors import (
     NonFiniteError,
     NotPositiveDefiniteError,
     ShapeError,
-    SolveError,
 )
 
 NAMES = ("A", "B", "C", "d", "D", "E", "F", "c")
@@ -171,13 +169,11 @@ def test_the_inner_problem_is_solved_at_auto_gamma_where_it_is_nearly_singular(b
         torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("off", [1e-9, 0.1])
-def test_an_inner_problem_that_rounding_keeps_from_its_end_is_solved_and_no_other(monkeypatch, off):
+def test_an_inner_problem_that_was_given_up_on_is_solved_by_a_proximal_step(monkeypatch):
     Q, q, solve = np.array([[1.0, 0.5], [0.5, 1.0]]), np.array([[-0.5, 3.0]]), losses.solve_lcp_arrays
-    stuck = [(np.array([[0.5 + off, 0.0]]), None, np.array([Status.MAX_ITER]))]
+    stuck = [(np.array([[0.6, 0.0]]), None, np.array([Status.MAX_ITER]))]
     monkeypatch.setattr(losses, "solve_lcp_arrays", lambda *problem: stuck.pop() if stuck else solve(*problem))
-    with pytest.raises(SolveError, match="1 of 1") if off > 0.01 else nullcontext():
-        np.testing.assert_allclose(losses.minimise_over_orthant(Q, q), [[0.5, 0.0]], atol=1e-8)
+    np.testing.assert_allclose(losses.minimise_over_orthant(Q, q), [[0.5, 0.0]], atol=1e-8)
 
 
 @pytest.mark.parametrize("gamma", ["Auto", "0.1", None, True, torch.tensor(0.1)])

@@ -194,10 +194,9 @@ class PhysicsFit(EpisodeTrainer):
         adam = torch.optim.Adam(learned, self.settings.learning_rate)
         data, context, losses = transitions(self.buffer), contexts(self.buffer), []
         random = np.random.default_rng((self.seed, Stream.MINIBATCH, self.iteration))
-        count = len(data[0])
-        size = min(self.settings.batch or count, count)
+        size = min(self.settings.batch or len(data[0]), len(data[0]))
         for _ in range(self.settings.steps):
-            chosen = torch.from_numpy(np.sort(random.choice(count, size, replace=False)))
+            chosen = torch.from_numpy(np.sort(random.choice(len(data[0]), size, replace=False)))
             x, u, x_next = (part[chosen] for part in data)
             known = None if context is None else context[chosen]
             loss = physics_loss(self.lcs, x, u, x_next, self.scale, self.settings, self.relaxation, known)

@@ -181,13 +181,11 @@ class HandTurnObjectEnv(GoalEnv):
 
     def describe(self) -> dict[str, Any]:
         """Describe the object, in JSON types, for records of results."""
-        model = self.model
-        mass, friction = float(model.body("object").mass[0]), float(model.geom("object").friction[0])
         return {
             "name": self.object,
-            "mass": mass,
-            "friction": friction,
-            "servo_gain": float(model.actuator_gainprm[0, 0]),
+            "mass": float(self.model.body("object").mass[0]),
+            "friction": float(self.model.geom("object").friction[0]),
+            "servo_gain": float(self.model.actuator_gainprm[0, 0]),
         }
 
     def reset(
