@@ -19,7 +19,7 @@ from difflcs.status import Status
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())  # silent unless a program asks for it
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 __all__ = [
     "Animation",
