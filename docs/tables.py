@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable
+from pathlib import Path
 
 import numpy as np
 
+RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
+EXPERT = "trifinger_rl_example.example.TorchPushPolicy"
 NOT_RUN = "This part of the race has not been run."
 
 
@@ -421,6 +425,52 @@ RACE: dict[str, Callable[[dict], str]] = {
     "machine": machine,
 }
 
+JUDO = {"contact-mpc": "contact MPC", "cem": "CEM", "mppi": "MPPI", "ps": "predictive sampling"}
+
+
+def interval(row: dict) -> str:
+    """Success rate and its interval of 95 %."""
+    return f"{100 * row['success_rate']:.1f} % ({100 * row['ci_low']:.1f} to {100 * row['ci_high']:.1f})"
+
+
+def cylinder(record: dict) -> str:
+    """Judo's cylinder_push: ours and Judo's planners."""
+    rows = []
+    for name, row in record["results"].items():
+        planner, _, rollouts = name.partition(", ")
+        label = JUDO[planner] + (f", {rollouts}" if rollouts else "")
+        away = f"{row['median_cm']:.2f} cm, {row['worst_cm']:.2f} cm"
+        cpu = f"{row['cpu_ms_per_second']:.0f} ms, {row['machine']['instruction set'].upper()}"
+        rows.append([label, interval(row), f"{row['episodes']}", away, cpu])
+    head = ["planner", "within 2 cm", "episodes", "end, median and worst", "CPU time for a second"]
+    return table(head, rows)
+
+
+def scoreboards(record: dict) -> str:
+    """All that others set and of which a record is kept; rows of others are written by hand in the page."""
+    results = {
+        name: json.loads((RESULTS / f"{name}.json").read_text())["results"] for name in ("inhand", "trifinger_rl")
+    }
+    push, hand = record["results"]["known"], results["inhand"]["all"]
+    expert, ours = (results["trifinger_rl"][name] for name in (EXPERT, "contact-mpc"))
+    rows = [
+        [
+            "[Push-T](planning.md#push-t)",
+            interval(push),
+            f"{push['episodes']}",
+            "64.2 %, Diffusion Policy, from pictures",
+        ],
+        ["[in the hand](scoreboard_inhand.md)", interval(hand), f"{hand['episodes']}", "155 of 170 (91.2 %), IMPACT"],
+        [
+            "[trifinger-rl push](scoreboard_trifinger.md)",
+            interval(ours),
+            f"{ours['episodes']}",
+            f"{interval(expert)}, the authors' expert, measured here",
+        ],
+    ]
+    return table(["benchmark", "success", "episodes", "published, or of others"], rows)
+
+
 # Record → part → table.
 TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "race": RACE,
@@ -433,5 +483,6 @@ TABLES: dict[str, dict[str, Callable[[dict], str]]] = {
     "objects": {"success": objects, "methods": methods},
     "physics_models": {"summary": summary, "models": foreign},
     "box_to_pose": {"success": success},
-    "pusht": {"variants": pusht, "published": published},
+    "pusht": {"variants": pusht, "published": published, "scoreboards": scoreboards},
+    "cylinder_push": {"planners": cylinder},
 }

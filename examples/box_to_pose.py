@@ -23,14 +23,16 @@ import mujoco
 import numpy as np
 import torch
 import tyro
+from torch import Tensor
 
 from difflcs import GoalCost, LCSMPCLayer
 from difflcs.cli.bench import machine, save
+from difflcs.physics import box
 from difflcs.physics.mujoco import MujocoLCS
-from difflcs.planning import SamplingPolicy, SamplingSettings
-from difflcs.planning.mujoco import BodyPlaces, BodyTravel
+from difflcs.planning import DiscPlaces, PlanarTravel, SamplingPolicy, SamplingSettings
 from difflcs.rl import wilson_interval
 
+HALF, RADIUS = (0.07, 0.05), 0.015  # of the box's sides and of the sphere [m]
 STEPS, SUBSTEPS = 150, 50
 NEAR, ALIGNED = 0.01, 0.1  # [m, rad]
 
@@ -64,6 +66,15 @@ class Options:
     """Two goals only."""
 
 
+class Faces(DiscPlaces):
+    """Places beside the faces of the box: at a corner, one half plane says little of what a push does."""
+
+    def sample(self, x: Tensor) -> Tensor:
+        """Sample places; see `Places`."""
+        ring = super().sample(x)
+        return ring[(ring.abs() < 0.85 * ring.new_tensor(HALF)).any(-1)]
+
+
 def make_policy() -> tuple[SamplingPolicy, MujocoLCS]:
     """Make the policy and the system that it plans with: state (x, y, yaw of the box; x, y of the sphere)."""
     module = MujocoLCS(mujoco.MjModel.from_xml_string(WORLD.format(joints=PLANE)))
@@ -71,9 +82,10 @@ def make_policy() -> tuple[SamplingPolicy, MujocoLCS]:
     final = tuple(4 * w for w in weight)
     cost = GoalCost.reach(5, 2, goal_weight=weight, goal_weight_final=final, input_weight=3.0)
     mpc = LCSMPCLayer(module, cost, 10, -0.03, 0.03, relaxation=1e-5, on_failure="mask")
-    places = BodyPlaces(module, "box", ["pusher"], 32, gap=0.0015, reach=0.015)
-    travel = BodyTravel(places, clearance=0.0075, tolerance=0.004, step=0.06)
-    return SamplingPolicy(mpc, places, travel, SamplingSettings(travel_price=0.2), angles=(2,)), module
+    shape = box(-HALF[0], HALF[0], -HALF[1], HALF[1])
+    travel = PlanarTravel(shape, RADIUS, step=0.06, tolerance=0.004)
+    settings = SamplingSettings(travel_price=0.2)
+    return SamplingPolicy(mpc, Faces(shape, RADIUS, 64), travel, settings, angles=(2,)), module
 
 
 class Episode(NamedTuple):

@@ -83,17 +83,27 @@ class ForkWays:
 
     def __init__(self, model: Any, module: MujocoLCS):
         self.model, self.data, self.n_x = model, mujoco.MjData(model), module.n_x
-        self.joints = [model.joint(j).name for j in range(JOINTS)]
-        arm = Posture(self.joints, goal=[0.0] * JOINTS, weight=0.05)
+        arm = Posture([model.joint(j).name for j in range(JOINTS)], goal=[0.0] * JOINTS, weight=0.05)
         terms = [Position("palm", weight=100.0), Orientation("tips_arm", weight=[1.0, 0.2, 0.5]), arm]
         self.cost = MujocoCost(module, terms)
+        self.low, self.high = np.add(model.jnt_range[:JOINTS].T, [[0.03], [-0.03]])
 
     def reach(self, q: np.ndarray, point: np.ndarray, yaw: float) -> np.ndarray:
         """Find joint angles (7,) near q, within the limits, with the palm at a point and the fork at a yaw."""
         goal = torch.tensor([*point, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)], dtype=torch.float64)
         x = torch.zeros(self.n_x, dtype=torch.float64)
-        x[:JOINTS] = torch.from_numpy(q)
-        return self.cost.reach(x, goal, self.joints, margin=0.03)[:JOINTS].numpy()
+        for _ in range(40):  # Gauss–Newton
+            x[:JOINTS] = torch.from_numpy(q)
+            near = self.cost.at(x, goal)
+            slope, curve = ((near.Q @ x + near.q)[:JOINTS]).numpy(), near.Q[:JOINTS, :JOINTS].numpy()
+            free = ~((q <= self.low) & (slope > 0) | (q >= self.high) & (slope < 0))
+            step = np.zeros(JOINTS)
+            step[free] = -np.linalg.solve(curve[np.ix_(free, free)] + 0.01 * np.eye(free.sum()), slope[free])
+            longest = abs(step).max()
+            q = np.clip(q + step * min(1.0, 0.3 / longest), self.low, self.high)
+            if longest < 1e-3:
+                break
+        return q
 
     def postures(self, start: np.ndarray, goal: np.ndarray, yaw: float, above: bool) -> Iterator[np.ndarray]:
         """Joint angles from the place of the object (3,) to the goal; `above`: the fork is lowered on the object."""
