@@ -389,8 +389,10 @@ def _solved(Q: np.ndarray, q: np.ndarray) -> np.ndarray:
     z, _, status = solve_lcp_arrays(Q, q)
     failed = np.flatnonzero(status != Status.CONVERGED)
     if len(failed):  # by rounding, mostly: a proximal step from there takes the value to ½·1e-8·‖z − z₋‖² of its least
-        near = (Q[failed] if Q.ndim == 3 else Q) + 1e-8 * np.eye(Q.shape[-1])
-        z[failed], _, status[failed] = solve_lcp_arrays(near, q[failed] - 1e-8 * z[failed])
+        near, before = (Q[failed] if Q.ndim == 3 else Q) + 1e-8 * np.eye(Q.shape[-1]), z[failed]
+        z[failed], _, status[failed] = solve_lcp_arrays(near, q[failed] - 1e-8 * before)
+        far = ~(np.abs(z[failed] - before).max(-1) <= 1e4 * np.abs(q[failed]).max(-1))  # residuals above 1e-4 of q
+        status[failed[far]] = Status.NUMERICAL
         failed = np.flatnonzero(status != Status.CONVERGED)
     if len(failed):
         raise SolveError(
