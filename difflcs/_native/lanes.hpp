@@ -12,7 +12,7 @@ constexpr bool kSizedPerElement = kLanes > 1;
 #endif
 }  // namespace difflcs::DIFFLCS_ISA
 #if DIFFLCS_LANES == 1
-#include "single.hpp"
+#include "single_lane.hpp"
 #else
 namespace difflcs::DIFFLCS_ISA {
 

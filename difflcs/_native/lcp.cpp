@@ -2,7 +2,7 @@
 // reads like the solver of a single problem, and a lane's result never depends on its neighbours.
 #include "kernels.hpp"
 #include "lanes.hpp"
-#include "lcp_one.hpp"
+#include "lcp_single.hpp"
 #include "lu.hpp"
 #include "matrix.hpp"
 #include "relaxed_lcp.hpp"
@@ -234,7 +234,7 @@ void lcp_solve(const LcpBatch& batch, int64_t begin, int64_t end, void* memory, 
   for (int64_t e = begin; e < end; e++) {
     if (solved(batch.status[e])) continue;
     if (!watch.stop(watch.context))
-      lcp_one(batch, e, memory, watch);
+      lcp_single(batch, e, memory, watch);
     else if (batch.status[e] != kUnreached)
       batch.status[e] = static_cast<int8_t>(Status::max_iter);
   }

@@ -55,7 +55,7 @@ def test_the_native_adjoint_equals_the_reference(build, name):
 
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_a_problem_alone_has_the_numbers_that_it_has_among_others(build, name):
-    """Alone it is solved by other code, see difflcs/_native/single.hpp."""
+    """Alone it is solved by other code, see difflcs/_native/single_lane.hpp."""
     problem = PROBLEMS[name](build)
     for backend in (BATCHED, replace(BATCHED, max_iter=2, restarts=1)):  # the second is not finished
         cold = backend.solve(problem, None)

@@ -300,7 +300,7 @@ struct LcpOne {
   }
 };
 
-inline void lcp_one(const LcpBatch& batch, int64_t e, void* scratch, Watch watch) {
+inline void lcp_single(const LcpBatch& batch, int64_t e, void* scratch, Watch watch) {
   LcpOne p(batch, e, scratch, watch);
   for (int64_t i = 0; i < p.n; i++) p.path[i] = p.gap[i] = p.relaxation > 1 ? __builtin_sqrt(p.relaxation) : 1.0;
   Status status = Status::converged;
