@@ -56,3 +56,19 @@ def test_the_arm_of_pusher_does_better_than_nothing(capsys, monkeypatch):
         pusher.main(pusher.Options(episodes=2, seed=100, still=still))
         means.append(float(capsys.readouterr().out.split("mean return ")[1].split(" ")[0]))
     assert means[0] > means[1]
+
+
+def test_a_value_is_found_again_from_its_returns_and_mixed_into_a_cost():
+    import terminal_value as t
+    import torch
+
+    state, goal = (0.1 * torch.randn(400, n, dtype=torch.float64) for n in (9, 3))
+    features, cost = t.pushing_features(), t.get_task("cube").make_cost()
+    wanted = [torch.tensor([[3.0, -1.0], [-1.0, 2.0]]).double(), torch.tensor([[0.5]]).double()]
+    value = t.with_value(cost, features, wanted, 1.0)
+    returns = value(goal, horizon=0)
+    returns = 0.5 * ((state @ value.Q_final) * state).sum(-1) + (returns.q_final * state).sum(-1) + returns.constant
+    weights, explained = t.fit_value(features, state, goal, returns)
+    assert explained > 0.999
+    torch.testing.assert_close(weights, wanted, rtol=1e-2, atol=1e-2)
+    torch.testing.assert_close(t.with_value(cost, features, wanted, 0.0)(goal, 2).tensors(), cost(goal, 2).tensors())
