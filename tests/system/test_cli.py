@@ -150,6 +150,23 @@ def run_of(out: Path) -> SimpleNamespace:
         (["render", "zoo:trifinger-cube", "--out", "video.avi"], "MP4"),
         (["evaluate", "turn_cube"], "expected a task with known physics"),
         (["bench", "--repeats", "0"], "repeats"),
+        (["train", "--warmup.noise", "-1"], "--warmup.noise: expected a finite 0 <= noise, got -1.0; change it\n"),
+        (["train", "--ppo.std", "0"], "--ppo.std: expected a finite 0 < std, got 0.0; change it\n"),
+        (
+            ["train", "--warmup.adam.betas", "0.9", "2"],
+            "--warmup.adam.betas: expected a finite 0 <= betas < 1, got 2.0",
+        ),
+        (["train", "--n-lam", "0"], "--n-lam: expected a finite 1 <= n_lam <= 1000, got 0; change it\n"),
+        (
+            ["train", "--method", "violation", "--minutes", "1", "--evaluate-at", "0.5", "7", "8"],
+            "evaluate_at: expected minutes of data up to the 1 of the training, got 7, 8; leave them out, or raise",
+        ),
+        (["trian"], "did you mean train"),
+        (["train", "--method", "lcsrl"], "did you mean lcs-rl"),
+        (["train", "--task", "cubes"], "did you mean cube"),
+        (["train", "--backend", "batchd"], "did you mean batched"),
+        (["evaluate", "zoo:trifinger-cub"], "did you mean trifinger-cube"),
+        (["zoo", "trifingercube"], "did you mean trifinger-cube"),
         (["evaluate", "nowhere"], "difflcs train"),
     ],
 )
@@ -161,7 +178,9 @@ def test_mistakes_get_one_clean_message(capsys, tmp_path, arguments, message):
     assert code == 2
     assert err.startswith("difflcs: ")
     assert message in err
-    assert "Traceback" not in err + out
+    assert not out
+    assert "Traceback" not in err
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_model_in_single_precision_is_refused_before_anything_is_written(capsys, tmp_path):
@@ -170,36 +189,6 @@ def test_a_model_in_single_precision_is_refused_before_anything_is_written(capsy
     assert code == 2
     assert "init: expected a model with n_x=9, n_u=6, float64, as task cube needs, got n_x=9, n_u=6, float32" in err
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--warmup.noise -1", "--warmup.noise: expected a finite 0 <= noise, got -1.0; change it"),
-        ("--ppo.std 0", "--ppo.std: expected a finite 0 < std, got 0.0; change it"),
-        ("--warmup.adam.betas 0.9 2", "--warmup.adam.betas: expected a finite 0 <= betas < 1, got 2.0; change it"),
-        ("--n-lam 0", "--n-lam: expected a finite 1 <= n_lam <= 1000, got 0; change it"),
-    ],
-)
-def test_bad_settings_are_named_as_one_writes_them(capsys, words, message):
-    assert run(capsys, "train", *words.split()) == (2, "", f"difflcs: {message}\n")
-
-
-@pytest.mark.parametrize(
-    ("words", "near"),
-    [
-        ("trian", "train"),
-        ("train --method lcsrl", "lcs-rl"),
-        ("train --task cubes", "cube"),
-        ("train --backend batchd", "batched"),
-        ("evaluate zoo:trifinger-cub", "trifinger-cube"),
-        ("zoo trifingercube", "trifinger-cube"),
-    ],
-)
-def test_a_slip_gets_a_suggestion(capsys, words, near):
-    code, _, err = run(capsys, *words.split())
-    assert code == 2
-    assert f"did you mean {near}" in err
 
 
 @pytest.mark.parametrize("words", ["train --help", "zoo", "nonsense"])
@@ -254,17 +243,6 @@ def test_a_long_evaluation_shows_lines_without_a_terminal(capsys, monkeypatch):
     assert json.loads(out)["goals"] == 4
     assert err.splitlines()[0] == "evaluating: 4 of 80 steps"
     assert err.splitlines()[-1] == "evaluating: 80 of 80 steps"
-
-
-def test_evaluations_after_the_end_are_refused(capsys, tmp_path):
-    short = ["train", "--method", "violation", "--minutes", 1, "--out", tmp_path / "run"]
-    code, _, err = run(capsys, *short, "--evaluate-at", 0.5, 7, 8)
-    assert (code, err) == (
-        2,
-        "difflcs: evaluate_at: expected minutes of data up to the 1 of the training, got 7, 8; leave them out, or "
-        "raise minutes\n",
-    )
-    assert not (tmp_path / "run").exists()
 
 
 def test_a_missing_package_names_the_line_that_installs_it(capsys, monkeypatch):
