@@ -27,7 +27,7 @@ _SMOKE_GOALS = 4
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Success rate of a learned model, or of known physics, without noise, with its 95 % interval."""
+    """Success rate, without noise, of a learned model or of known physics."""
 
     model: Path
     """Run directory, zoo:NAME of a model that `difflcs zoo` lists, or a task whose physics is known."""
