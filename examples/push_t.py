@@ -344,6 +344,7 @@ class PushTPolicy(DiscPolicy):
     Args:
         system: see `DiscPolicy`; `tee_pushing()` by default.
         delay: likewise.
+        adapt: likewise.
     """
 
     def __init__(self, system: PlanarPushing | None = None, delay: int = 0, *, adapt: bool = False):
