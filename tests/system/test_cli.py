@@ -145,21 +145,26 @@ def run_of(out: Path) -> SimpleNamespace:
         (["train", "--init", "zoo:teapot"], "trifinger-cube"),
         (["evaluate", "zoo:trifinger-cube", "--goals", "0"], "goals"),
         (["evaluate", "zoo:trifinger-cube", "--seed", "-1"], "seed"),
+        (["render", "zoo:trifinger-cube", "--goal"], "expected x [m], y [m], yaw [rad] for each goal"),
         (["render", "zoo:trifinger-cube", "--goal", "0.1"], "expected x [m], y [m], yaw [rad] for each goal"),
         (["train", "--method", "magic"], "expected one of lcs-rl, violation"),
         (["render", "zoo:trifinger-cube", "--out", "video.avi"], "MP4"),
         (["evaluate", "turn_cube"], "expected a task with known physics"),
         (["bench", "--repeats", "0"], "repeats"),
-        (["train", "--warmup.noise", "-1"], "--warmup.noise: expected a finite 0 <= noise, got -1.0; change it\n"),
-        (["train", "--ppo.std", "0"], "--ppo.std: expected a finite 0 < std, got 0.0; change it\n"),
+        (
+            ["train", "--warmup.noise", "-1"],
+            "difflcs: --warmup.noise: expected a finite 0 <= noise, got -1.0; change it\n",
+        ),
+        (["train", "--ppo.std", "0"], "difflcs: --ppo.std: expected a finite 0 < std, got 0.0; change it\n"),
         (
             ["train", "--warmup.adam.betas", "0.9", "2"],
-            "--warmup.adam.betas: expected a finite 0 <= betas < 1, got 2.0",
+            "difflcs: --warmup.adam.betas: expected a finite 0 <= betas < 1, got 2.0; change it\n",
         ),
-        (["train", "--n-lam", "0"], "--n-lam: expected a finite 1 <= n_lam <= 1000, got 0; change it\n"),
+        (["train", "--n-lam", "0"], "difflcs: --n-lam: expected a finite 1 <= n_lam <= 1000, got 0; change it\n"),
         (
             ["train", "--method", "violation", "--minutes", "1", "--evaluate-at", "0.5", "7", "8"],
-            "evaluate_at: expected minutes of data up to the 1 of the training, got 7, 8; leave them out, or raise",
+            "difflcs: evaluate_at: expected minutes of data up to the 1 of the training, got 7, 8; leave them out, or "
+            "raise minutes\n",
         ),
         (["trian"], "did you mean train"),
         (["train", "--method", "lcsrl"], "did you mean lcs-rl"),
@@ -168,6 +173,7 @@ def run_of(out: Path) -> SimpleNamespace:
         (["evaluate", "zoo:trifinger-cub"], "did you mean trifinger-cube"),
         (["zoo", "trifingercube"], "did you mean trifinger-cube"),
         (["evaluate", "nowhere"], "difflcs train"),
+        (["render", "nowhere"], "difflcs train"),
     ],
 )
 def test_mistakes_get_one_clean_message(capsys, tmp_path, arguments, message):
