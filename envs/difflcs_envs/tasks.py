@@ -168,8 +168,7 @@ def caption(info: Mapping[str, Any]) -> str:
 def describe(env: Any) -> dict[str, Any]:
     """Describe the object of an environment or a vector, wrapped or not: name, source of its shape, mass, ..."""
     inner = env.unwrapped
-    single = inner.envs[0].unwrapped if hasattr(inner, "envs") else inner
-    return (single if hasattr(single, "describe") else single.object).describe()
+    return (inner.envs[0].unwrapped if hasattr(inner, "envs") else inner).describe()
 
 
 def contact_physics(env_kwargs: Mapping[str, Any]) -> PhysicsSpec:

@@ -140,6 +140,10 @@ class TriFingerEnv(GoalEnv):
     def _make_physics(self, model: Any = None) -> TriFingerPhysics:
         return TriFingerPhysics(self.object, self.osc_kp, (self.width, self.height), model)
 
+    def describe(self) -> dict[str, Any]:
+        """Describe the object, in JSON types, for records of results."""
+        return self.object.describe()
+
     def sibling(self) -> Self:
         """Make another environment with the same settings, on the same MuJoCo model (building one takes long)."""
         other = copy.copy(self)
