@@ -207,9 +207,13 @@ class HandPolicy:
         """Turn the object to this quaternion from now on."""
         self.goal, self.best, self.waited = goal, np.inf, 0
 
+    def angle(self, data: Any) -> float:
+        """Angle by which the object is still to be turned [rad]."""
+        return 2 * np.arccos(min(1.0, abs(float(data.qpos[-4:] @ self.goal))))
+
     def stalls(self, data: Any) -> bool:
         """Tell whether the object has not turned on for too long: then the hand opens for some decisions."""
-        left = 2 * np.arccos(min(1.0, abs(float(data.qpos[-4:] @ self.goal))))
+        left = self.angle(data)
         self.waited += 1
         if self.waited > 0 and left < max(self.best - 0.05, 0.35):  # turned on by 3°, or almost there
             self.best, self.waited = min(left, self.best), 0
@@ -253,7 +257,7 @@ class HandPolicy:
             self.tried.ctrl[:] = joints + step
             mujoco.mj_step(self.twin, self.tried, TRIALS)
             apart = self.tried.qpos[-7:-4] - self.place
-            left = 2 * np.arccos(min(1.0, abs(float(self.tried.qpos[-4:] @ self.goal))))
+            left = self.angle(self.tried)
             near = min(left, s.reach)
             ends.append(s.place * apart @ apart + s.turn * near * (2 * left - near))
         return joints + next(step for step, end in zip(steps, ends, strict=True) if end <= min(ends) + s.slack)
