@@ -57,8 +57,8 @@ LENGTH = 0.1
 """Unit of length of the policy [m]."""
 RADIUS = 0.15
 """Of the disc."""
-SIDE = 6.0
-"""Side of the square that starts and goals are in. The disc may go a unit beyond it."""
+APART = 0.4
+"""Least distance between bodies as they start, between goals, and of the disc from bodies."""
 HEIGHT = 0.4
 """Of the bodies."""
 NEAR, ALIGNED, STILL = 0.15, 0.1, 0.05
@@ -276,16 +276,19 @@ class BodyPaths:
     Args:
         table: with all bodies.
         moved: number of the body.
+        side: of the square that it should stay in.
     """
 
-    CELLS, TURNS = 24, 16
-    """Steps of the grid along each side, and in a turn."""
+    CELL, TURNS = 0.25, 16
+    """Step of the grid, and steps in a turn."""
     GYRATION = 0.4
     """Length of a rad."""
+    AHEAD = 0.5
+    """Least way to a subgoal."""
 
-    def __init__(self, table: Table, moved: int):
+    def __init__(self, table: Table, moved: int, side: float):
         self.table, self.moved = table, moved
-        axis = torch.linspace(0.0, SIDE, self.CELLS + 1, dtype=torch.float64)
+        axis = torch.arange(0.0, side + 1e-9, self.CELL, dtype=torch.float64)
         yaw = torch.arange(self.TURNS, dtype=torch.float64) * (2 * math.pi / self.TURNS)
         self.nodes = torch.stack(torch.meshgrid(axis, axis, yaw, indexing="ij"), -1)
         self._key: tuple[Tensor, Tensor] | None = None
@@ -310,10 +313,8 @@ class BodyPaths:
         path = self._path(start, goal)
         if path is None:
             return None
-        for pose in reversed(path):
-            if self.free(start, pose, 0.15):
-                return pose
-        return path[min(1, len(path) - 1)]
+        ahead = [pose for pose in path if float(self._difference(pose - start)) > self.AHEAD]
+        return next((pose for pose in reversed(ahead) if self.free(start, pose, 0.08)), ahead[0] if ahead else goal)
 
     def _path(self, start: Tensor, goal: Tensor) -> list[Tensor] | None:
         """Find the poses from start to goal."""
@@ -344,7 +345,6 @@ class BodyPaths:
         valid = gap > 0.08
         price = 1.0 + 4.0 * np.clip(0.45 - gap, 0.0, None)
         index = np.arange(gap.size).reshape(gap.shape)
-        cell = SIDE / self.CELLS
         rows, columns, lengths = [], [], []
         turn = self.GYRATION * 2 * math.pi / self.TURNS
         for dx, dy, dt in itertools.product((-1, 0, 1), repeat=3):
@@ -356,7 +356,7 @@ class BodyPaths:
             a, b = a.ravel(), b.ravel()
             both = valid.ravel()[a] & valid.ravel()[b]
             a, b = a[both], b[both]
-            length = math.sqrt(cell**2 * (dx * dx + dy * dy) + (turn * dt) ** 2)
+            length = math.sqrt(self.CELL**2 * (dx * dx + dy * dy) + (turn * dt) ** 2)
             rows.append(a)
             columns.append(b)
             lengths.append(length * np.maximum(price.ravel()[a], price.ravel()[b]))
@@ -374,16 +374,17 @@ class SeveralPolicy:
     Args:
         names: of the bodies, in `BODIES`.
         goals: (n, 3) their poses.
+        side: of the square that bodies should stay in.
     """
 
-    def __init__(self, names: list[str], goals: Array):
-        self.names = names
+    def __init__(self, names: list[str], goals: Array, side: float):
+        self.names, self.side = names, side
         self.table = table = Table([BODIES[name] for name in names])
         self.goals = torch.from_numpy(goals)
-        workspace = Workspace((-1.0, -1.0), (SIDE + 1.0, SIDE + 1.0), step=PUSH)
+        workspace = Workspace((-1.0, -1.0), (side + 1.0, side + 1.0), step=PUSH)
         cost = GoalCost.reach(5, 2, goal_weight=(1.0, 1.0, 0.3), goal_weight_final=(4.0, 4.0, 1.2), input_weight=0.05)
         settings = SamplingSettings(keep=0.6, smallest_gain=0.02, switch_price=0.02, travel_price=0.04)
-        self.paths = [BodyPaths(table, i) for i in range(len(names))]
+        self.paths = [BodyPaths(table, i, side) for i in range(len(names))]
         self.travel = travel = TableTravel(table, workspace)
         self.policies = []
         for i, body in enumerate(table.bodies):
@@ -507,37 +508,39 @@ class Task:
         starts: (n, 3) poses.
         goals: (n, 3) poses.
         disc: (2,) place.
+        side: of the square that starts and goals are in. The disc may go a unit beyond it.
     """
 
     names: list[str]
     starts: Array
     goals: Array
     disc: Array
+    side: float
 
     def alone(self, i: int) -> Task:
         """Return the same with one body only."""
         one = slice(i, i + 1)
-        return Task(self.names[one], self.starts[one], self.goals[one], self.disc)
+        return Task(self.names[one], self.starts[one], self.goals[one], self.disc, self.side)
 
 
-def draw_task(seed: int, bodies: int) -> Task:
-    """Draw a task: starts are 6 cm apart from one another and from the disc, and so are goals from one another."""
+def draw_task(seed: int, bodies: int, side: float) -> Task:
+    """Draw a task: which bodies, their starts and goals in a square, and where the disc is."""
     random = np.random.default_rng(seed)
     names = [str(name) for name in random.permutation(list(SHAPES))[:bodies]]
     table = Table([BODIES[name] for name in names])
 
     def poses() -> Tensor:
         while True:
-            drawn = random.uniform([0.9, 0.9, -math.pi], [SIDE - 0.9, SIDE - 0.9, math.pi], (bodies, 3))
+            drawn = random.uniform([0.9, 0.9, -math.pi], [side - 0.9, side - 0.9, math.pi], (bodies, 3))
             table.poses = torch.from_numpy(drawn)
-            if all(float(table.body_gap(i, table.poses[i])) > 0.6 for i in range(bodies)):
+            if all(float(table.body_gap(i, table.poses[i])) > APART for i in range(bodies)):
                 return table.poses
 
     goals, starts = poses(), poses()  # the table has the starts
     while True:
-        disc = random.uniform(0.0, SIDE, 2)
-        if float(table.gap(torch.from_numpy(disc))) > 0.6:
-            return Task(names, starts.numpy(), goals.numpy(), disc)
+        disc = random.uniform(0.0, side, 2)
+        if float(table.gap(torch.from_numpy(disc))) > APART:
+            return Task(names, starts.numpy(), goals.numpy(), disc, side)
 
 
 class Scene:
@@ -635,7 +638,7 @@ class Played:
 
 def play(task: Task, watch: Any = None) -> Played:
     """Play a task; `watch(scene, policy)` is called after each decision."""
-    scene, policy, seconds = Scene(task), SeveralPolicy(task.names, task.goals), 0.0
+    scene, policy, seconds = Scene(task), SeveralPolicy(task.names, task.goals, task.side), 0.0
     limit = LIMIT * len(task.names)
     for step in range(limit + 1):
         if scene.solved(task.goals):
@@ -654,7 +657,7 @@ def picture(scene: Scene, policy: SeveralPolicy, text: str, size: int = 340) -> 
     from PIL import Image, ImageDraw
 
     fine = 2 * size
-    scale, low = fine / (SIDE + 1.0), -0.5
+    scale, low = fine / (policy.side + 2.0), -1.0
     frame = Image.new("RGB", (fine, fine), "white")
     draw = ImageDraw.Draw(frame)
 
@@ -701,6 +704,8 @@ class Options:
 
     bodies: int = 2
     """2 or 3."""
+    side: float = 60.0
+    """Of the square that starts and goals are in [cm]."""
     episodes: int = 100
     seed: int = 0
     """Of the first episode; the next have the next."""
@@ -744,7 +749,7 @@ def main(o: Options) -> None:
         raise InvalidInputError(f"bodies: expected 1 to {len(SHAPES)}, got {o.bodies}; there are so many shapes")
     torch.set_num_threads(1)
     if o.gif is not None:
-        film(draw_task(o.seed, o.bodies), o.gif)
+        film(draw_task(o.seed, o.bodies, o.side / (100 * LENGTH)), o.gif)
         return
     out = o.out
     lines = out.read_text().splitlines() if out is not None and out.exists() else []
@@ -753,7 +758,7 @@ def main(o: Options) -> None:
     for seed in seeds:
         if seed in done:
             continue
-        task = draw_task(seed, o.bodies)
+        task = draw_task(seed, o.bodies, o.side / (100 * LENGTH))
         together = play(task)
         alone = [asdict(play(task.alone(i))) for i in range(o.bodies)]
         done[seed] = {"seed": seed, **asdict(together), "alone": alone}
@@ -766,7 +771,7 @@ def main(o: Options) -> None:
             print(f"seed {seed}: {verdict} in {together.steps} steps; alone {steps}", flush=True)
     result = figures([done[seed] for seed in seeds], o.bodies)
     if o.json:
-        print(json.dumps({"bodies": o.bodies, "seed": o.seed, **result, "machine": machine()}))
+        print(json.dumps({"bodies": o.bodies, "side": o.side, "seed": o.seed, **result, "machine": machine()}))
     else:
         for name, value in result.items():
             print(f"{name:24s} {value:.4g}")
