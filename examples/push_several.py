@@ -73,6 +73,8 @@ GRIP = 0.3
 """Friction between disc and bodies."""
 MARGIN = 0.08
 """Between a moving body and others in a plan."""
+LENIENT = 0.03
+"""By how much less it may be after each step in which no plan gains anything."""
 COLORS = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167))
 """Of the bodies in a film."""
 Array = NDArray[np.float64]
@@ -163,11 +165,14 @@ class Watchful(LCSMPCLayer):
         table: with all bodies.
         moved: number of the body.
         options: of `LCSMPCLayer`.
+
+    Attributes:
+        lenience: by how much less a plan may leave [length].
     """
 
     def __init__(self, table: Table, moved: int, *options: Any, **more: Any):
         super().__init__(*options, **more)
-        self.table, self.moved = table, moved
+        self.table, self.moved, self.lenience = table, moved, 0.0
 
     def forward(self, x0: Tensor, *args: Any, **options: Any) -> MPCSolution:
         """See `LCSMPCLayer`."""
@@ -178,7 +183,8 @@ class Watchful(LCSMPCLayer):
         body = self.table.body_gap(self.moved, plans[..., :3]).amin(-1)
         disc = self.table.gap(plans[..., 3:5], but=self.moved).amin(-1) - RADIUS
         now = float(self.table.body_gap(self.moved, x0[0, :3]))
-        lack = torch.maximum(min(MARGIN, now) - 0.01 - body, -disc).clamp_min(0.0)
+        lack = torch.maximum(min(MARGIN, now) - 0.01 - body, -disc) - self.lenience
+        lack = lack.clamp_min(0.0)
         refused = lack > lack[solution.converged].amin() if bool(solution.converged.any()) else lack > 0
         return replace(solution, status=solution.status.masked_fill(refused, Status.INFEASIBLE), of=solution.problem)
 
@@ -400,9 +406,18 @@ class SeveralPolicy:
         before = self.scheduler.active
         active, target = self.scheduler.choose(torch.from_numpy(disc))
         policy = self.policies[active]
+        mpc = policy.mpc
+        assert isinstance(mpc, Watchful)
         if active != before:
             policy.reset()
-        return policy.act(np.concatenate([poses[active], disc]), target)
+            mpc.lenience = 0.0
+        u = policy.act(np.concatenate([poses[active], disc]), target)
+        decision = policy.decision
+        assert decision is not None
+        if decision.mode is Mode.PUSH:
+            blocked = not decision.gain > policy.settings.smallest_gain
+            mpc.lenience = mpc.lenience + LENIENT if blocked else max(0.0, mpc.lenience - LENIENT)
+        return u
 
 
 class Scheduler:
