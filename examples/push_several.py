@@ -104,7 +104,7 @@ class Body:
     Attributes:
         outline: (n, 2) points along it, at most .15 apart.
         grid: distances to it.
-        ring: (24, 2) waypoints of a disc round it.
+        ring: (14, 2) waypoints of a disc round it.
     """
 
     def __init__(self, shape: Union):
@@ -118,7 +118,7 @@ class Body:
         points = torch.cat(points)
         self.outline = points[shape.distance(points).distance.amin(-1) > -1e-6]
         self.grid = DistanceGrid(shape, 1.0)
-        self.ring = ring(shape, RADIUS + 0.1, 24)
+        self.ring = ring(shape, RADIUS + 0.1, 14)
 
 
 BODIES = {name: Body(shape) for name, shape in SHAPES.items()}
@@ -232,13 +232,15 @@ class TableTravel:
         """Find the corners (2,) of the shortest way of the disc, and its end."""
         self._survey()
         ends = torch.stack([start, end])
-        if bool(self._in_sight(ends[:1], ends[1:])):
+        if bool(self._in_sight(start, end)):
             return [end]
         nodes = torch.cat([self._nodes, ends])
         count = len(nodes)
         lengths = torch.full((count, count), math.inf, dtype=nodes.dtype)
         lengths[:-2, :-2] = self._between
-        legs = torch.where(self._in_sight(ends, self._nodes), torch.cdist(ends, self._nodes), math.inf)
+        legs = torch.where(
+            self._in_sight(ends[:, None], self._nodes.expand(2, -1, -1)), torch.cdist(ends, self._nodes), math.inf
+        )
         for i in range(2):
             if not bool(legs[i].isfinite().any()):
                 nearest = (self._nodes - ends[i]).norm(dim=-1)
@@ -263,15 +265,18 @@ class TableTravel:
         nodes = torch.cat([from_body(p, body.ring) for p, body in zip(poses, self.table.bodies, strict=True)])
         fit = (self.table.gap(nodes) > RADIUS + 0.04) & self.workspace.contains(nodes)
         self._nodes = nodes[fit]
-        seen = self._in_sight(self._nodes, self._nodes)
-        self._between = torch.where(seen & seen.T, torch.cdist(self._nodes, self._nodes), math.inf)
+        self._between = torch.full((len(self._nodes),) * 2, math.inf, dtype=nodes.dtype)
+        i, j = torch.triu_indices(*self._between.shape, offset=1)
+        seen = self._in_sight(self._nodes[i], self._nodes[j])
+        lengths = (self._nodes[j] - self._nodes[i]).norm(dim=-1)
+        self._between[i, j] = self._between[j, i] = torch.where(seen, lengths, math.inf)
 
     def _in_sight(self, starts: Tensor, ends: Tensor) -> Tensor:
-        """Return a mask (n, m) of the ends (m, 2) to which the disc can go straight from the starts (n, 2)."""
-        way = ends[None] - starts[:, None]
-        count = 2 + math.ceil(float(way.norm(dim=-1).max()) / 0.12)
+        """Return a mask (...) of the ends (..., 2) to which the disc can go straight from the starts (..., 2)."""
+        way = ends - starts
+        count = 2 + math.ceil(float(way.norm(dim=-1).max()) / 0.2)
         t = torch.linspace(0.0, 1.0, count, dtype=way.dtype)[:, None]
-        gap = self.table.gap(starts[:, None, None] + t * way[:, :, None]) - RADIUS
+        gap = self.table.gap(starts[..., None, :] + t * way[..., None, :]) - RADIUS
         least = torch.minimum(gap[..., :1], gap[..., -1:]).clamp(max=0.03)
         return (gap >= least - 1e-9).all(-1)
 
@@ -719,7 +724,7 @@ class Options:
 
     bodies: int = 2
     """2 or 3."""
-    side: float = 60.0
+    side: float = 50.0
     """Of the square that starts and goals are in [cm]."""
     episodes: int = 100
     seed: int = 0
@@ -732,16 +737,15 @@ class Options:
     """Film the first episode instead."""
 
 
-def figures(played: list[dict[str, Any]], bodies: int) -> dict[str, Any]:
-    """Compute the figures of episodes.
+def figures(played: list[Played], alone: list[Played], bodies: int) -> dict[str, Any]:
+    """Compute the figures of episodes, and of each of their bodies alone.
 
     `mean_alone` is the mean of the steps in which a body comes to its goal with the others absent, from the same start
     and place of the disc. An episode is a success if it is solved within twice `bodies` times as many steps.
     """
-    steps = np.array([one["steps"] for one in played])
-    solved = np.array([one["success"] for one in played])
-    alone = [one for episode in played for one in episode["alone"]]
-    mean_alone = float(np.mean([one["steps"] for one in alone]))
+    steps = np.array([one.steps for one in played])
+    solved = np.array([one.success for one in played])
+    mean_alone = float(np.mean([one.steps for one in alone]))
     within = solved & (steps <= 2 * bodies * mean_alone)
     low, high = wilson_interval(int(within.sum()), len(within))
     return {
@@ -753,8 +757,8 @@ def figures(played: list[dict[str, Any]], bodies: int) -> dict[str, Any]:
         "mean_steps": float(steps.mean()),
         "longest": int(steps.max()),
         "mean_alone": mean_alone,
-        "solved_alone": float(np.mean([one["success"] for one in alone])),
-        "milliseconds_per_step": 1e3 * sum(one["seconds"] for one in played) / max(int(steps.sum()), 1),
+        "solved_alone": float(np.mean([one.success for one in alone])),
+        "milliseconds_per_step": 1e3 * sum(one.seconds for one in played) / max(int(steps.sum()), 1),
     }
 
 
@@ -768,23 +772,27 @@ def main(o: Options) -> None:
         return
     out = o.out
     lines = out.read_text().splitlines() if out is not None and out.exists() else []
-    done: dict[int, dict[str, Any]] = {record["seed"]: record for record in map(json.loads, lines)}
+    done: dict[tuple[int, int | None], Played] = {}
+    for record in map(json.loads, lines):
+        done[record.pop("seed"), record.pop("body")] = Played(**record)
     seeds = range(o.seed, o.seed + o.episodes)
-    for seed in seeds:
-        if seed in done:
+    alone = itertools.product(seeds, range(o.bodies))
+    for key in [*((seed, None) for seed in seeds), *alone]:
+        if key in done:
             continue
+        seed, body = key
         task = draw_task(seed, o.bodies, o.side / (100 * LENGTH))
-        together = play(task)
-        alone = [asdict(play(task.alone(i))) for i in range(o.bodies)]
-        done[seed] = {"seed": seed, **asdict(together), "alone": alone}
+        done[key] = played = play(task if body is None else task.alone(body))
         if out is not None:
             with out.open("a") as file:
-                file.write(json.dumps(done[seed]) + "\n")
+                file.write(json.dumps({"seed": seed, "body": body, **asdict(played)}) + "\n")
         if not o.json:
-            verdict = "solved" if together.success else "not solved"
-            steps = ", ".join(f"{name} {one['steps']}" for name, one in zip(task.names, alone, strict=True))
-            print(f"seed {seed}: {verdict} in {together.steps} steps; alone {steps}", flush=True)
-    result = figures([done[seed] for seed in seeds], o.bodies)
+            names = task.names if body is None else [task.names[body]]
+            verdict = "solved" if played.success else "not solved"
+            print(f"seed {seed}, {', '.join(names)}: {verdict} in {played.steps} steps", flush=True)
+    together = [done[seed, None] for seed in seeds]
+    each = [done[seed, body] for seed in seeds for body in range(o.bodies)]
+    result = figures(together, each, o.bodies)
     if o.json:
         print(json.dumps({"bodies": o.bodies, "side": o.side, "seed": o.seed, **result, "machine": machine()}))
     else:
