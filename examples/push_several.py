@@ -211,8 +211,16 @@ class TableTravel:
         self._poses: Tensor | None = None
 
     def distance(self, x: Tensor, states: Tensor) -> Tensor:
-        """See `Travel`: straight."""
-        return (states[:, 3:5] - x[3:5]).norm(dim=-1)
+        """See `Travel`: the length of the way; where none is found, as far as the farthest waypoint and straight."""
+        self._survey()
+        start, ends = x[3:5], states[:, 3:5]
+        length = torch.from_numpy(self._from(start)[0][:-1])
+        legs = torch.where(self._in_sight(self._nodes[:, None], ends), torch.cdist(self._nodes, ends), math.inf)
+        straight = (ends - start).norm(dim=-1)
+        length = torch.minimum(
+            torch.where(self._in_sight(start, ends), straight, math.inf), (length[:, None] + legs).amin(0)
+        )
+        return torch.where(length.isfinite(), length, 5.0 + straight)
 
     def arrived(self, x: Tensor, target: Tensor) -> bool:
         """See `Travel`."""
@@ -231,30 +239,33 @@ class TableTravel:
     def way(self, start: Tensor, end: Tensor) -> list[Tensor]:
         """Find the corners (2,) of the shortest way of the disc, and its end."""
         self._survey()
-        ends = torch.stack([start, end])
         if bool(self._in_sight(start, end)):
             return [end]
-        nodes = torch.cat([self._nodes, ends])
-        count = len(nodes)
-        lengths = torch.full((count, count), math.inf, dtype=nodes.dtype)
-        lengths[:-2, :-2] = self._between
-        legs = torch.where(
-            self._in_sight(ends[:, None], self._nodes.expand(2, -1, -1)), torch.cdist(ends, self._nodes), math.inf
-        )
-        for i in range(2):
-            if not bool(legs[i].isfinite().any()):
-                nearest = (self._nodes - ends[i]).norm(dim=-1)
-                legs[i, nearest.argmin()] = nearest.min()
-        lengths[-2:, :-2], lengths[:-2, -2:] = legs, legs.T
-        graph = torch.where(lengths.isfinite(), lengths, 0.0).numpy()
-        length, before = dijkstra(csr_array(graph), indices=count - 2, return_predecessors=True)
-        if not np.isfinite(length[-1]):
-            return [end]
-        way, at = [], count - 1
-        while at != count - 2:
-            way.append(nodes[at])
+        length, before = self._from(start)
+        legs = self._legs(end)
+        at = int((torch.from_numpy(length[:-1]) + legs).argmin())
+        way = [end]
+        while 0 <= at < len(self._nodes):
+            way.append(self._nodes[at])
             at = int(before[at])
         return way[::-1]
+
+    def _from(self, start: Tensor) -> tuple[Array, Array]:
+        """Compute the lengths of ways from a point to all waypoints and, last, itself; and what comes before each."""
+        count = len(self._nodes)
+        lengths = torch.full((count + 1, count + 1), math.inf, dtype=start.dtype)
+        lengths[:-1, :-1] = self._between
+        lengths[-1, :-1] = self._legs(start)
+        graph = csr_array(torch.where(lengths.isfinite(), lengths, 0.0).numpy())
+        return dijkstra(graph, indices=count, return_predecessors=True)
+
+    def _legs(self, point: Tensor) -> Tensor:
+        """Return the lengths of straight ways (n,) between a point and the waypoints, ∞ where something is between."""
+        lengths = (self._nodes - point).norm(dim=-1)
+        seen = self._in_sight(point, self._nodes)
+        if not bool(seen.any()):  # as in a corner: the nearest leads out
+            seen[lengths.argmin()] = True
+        return torch.where(seen, lengths, math.inf)
 
     def _survey(self) -> None:
         """Place waypoints anew where a body has moved."""
@@ -436,6 +447,8 @@ class Scheduler:
     PATIENCE = 40
     MARGIN = 0.03
     """Between a body on its goal and others as they lie."""
+    CLEAR = 0.8
+    """Between a body that went aside and others, and goals of others, if there is room."""
 
     def __init__(self, table: Table, paths: list[BodyPaths], goals: Tensor):
         self.table, self.paths, self.goals = table, paths, goals
@@ -459,7 +472,7 @@ class Scheduler:
             if error < 0.95 * self._best:
                 self._best, self._since = error, 0
             self._since += 1
-            arrived = error < (0.8 if self.aside is None else 3.0)
+            arrived = error < 0.8 if self.aside is None else self._away(i)
             stuck = self._since > self.PATIENCE
             self._failed[i] += stuck
             if arrived or stuck:
@@ -473,6 +486,11 @@ class Scheduler:
         else:
             goal = self.goals[i]
         return i, self.subgoal(i, goal)
+
+    def _away(self, i: int) -> bool:
+        """Return True if body i is where it should go aside, turned in any way."""
+        assert self.aside is not None
+        return float((self.aside - self.table.poses[i])[:2].norm()) < 0.3
 
     def subgoal(self, i: int, goal: Tensor) -> Tensor:
         """Return where a body is pushed on the way to its goal."""
@@ -513,8 +531,10 @@ class Scheduler:
         poses[:, 2] = self.table.poses[j, 2]
         goals = Table(self.table.bodies)
         goals.poses = self.goals
-        clear = (self.table.body_gap(j, poses) > 0.45) & (goals.body_gap(j, poses) > 0.35)
-        distance = (poses - self.table.poses[j])[:, :2].norm(dim=-1) + torch.where(clear, 0.0, math.inf)
+        free, useful = self.table.body_gap(j, poses), goals.body_gap(j, poses)
+        price = 2.0 * (self.CLEAR - torch.minimum(free, useful)).clamp_min(0.0)
+        price += torch.where((free > 0.4) & (useful > 0.3), 0.0, math.inf)
+        distance = (poses - self.table.poses[j])[:, :2].norm(dim=-1) + price
         best = int(distance.argmin())
         return poses[best] if math.isfinite(float(distance[best])) else None
 
