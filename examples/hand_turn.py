@@ -92,10 +92,10 @@ class Options:
 
 
 def learned_factors(run: Path) -> tuple[float, ...]:
-    """Factors of mass, friction and servo gain that a run has learned, of the true ones."""
+    """Factors of mass, friction and servo gain that a run has learned, of the true ones; not the compliance."""
     policy: Any = TrainedPolicy.open(run).policy
     guesses = (HAND_GUESS[name] for name in ("object_mass", "friction", "servo_gain"))
-    return tuple(guess * change for guess, (change,) in zip(guesses, policy.lcs.summary().values(), strict=True))
+    return tuple(guess * change for guess, (change,) in zip(guesses, policy.lcs.summary().values(), strict=False))
 
 
 def play(env: Any, policy: HandPolicy, seed: int, frames: list[np.ndarray]) -> tuple[dict[str, Any], int]:

@@ -334,7 +334,8 @@ def hand_task(name: str, summary: str, guess: Mapping[str, float] | None = None,
     def make_system() -> Any:
         from difflcs_envs.hand.model import build_model
 
-        return hand_system(build_model(thing, mass, friction, gain), [("mass", "object"), "friction", "gain"])
+        uncertain = [("mass", "object"), "friction", "gain", "compliance"]  # the last is chosen for plans, not measured
+        return hand_system(build_model(thing, mass, friction, gain), uncertain)
 
     judge = replace(hand.TURN_OBJECT, sparse_penalty=env_kwargs.get("sparse_penalty", hand.TURN_OBJECT.sparse_penalty))
     return TaskSpec(

@@ -58,10 +58,12 @@ def test_the_prediction_loss_is_the_error_of_the_motion_that_the_mpc_plans_with(
     torch.testing.assert_close(found, 0.5 * error.square().sum(1).mean())
 
 
-@pytest.mark.parametrize("loss", ["violation", "prediction"])
-def test_physics_is_found_by_both_losses(pushes, loss):
+@pytest.mark.parametrize(("loss", "explained"), [("violation", None), ("prediction", None), ("violation", 0.3)])
+def test_physics_is_found_by_both_losses(pushes, loss, explained):
     lcs, x, u, x_next = pushes
-    settings = PhysicsFitSettings(loss=loss)
+    if explained:  # of the others some are as no system has them
+        x_next[::10] = x[::10]
+    settings = PhysicsFitSettings(loss=loss, explained=explained)
     adam = torch.optim.Adam(lcs.parameters(), 0.05)
     for _ in range(150):
         adam.zero_grad()

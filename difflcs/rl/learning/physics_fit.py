@@ -47,8 +47,13 @@ class PhysicsFitSettings(Settings):
     """Transitions of a step, drawn anew for each; None: all. A system of MuJoCo takes 5 to 10 ms for each of them."""
     learning_rate: float = bounded(0.02, above=0)
     """Step size of Adam, which begins anew in each iteration."""
+    last_rate: float = bounded(1.0, above=0, maximum=1)
+    """Part of it that is left at the end of an iteration, which it falls to linearly."""
     loss: Literal["violation", "prediction"] = "violation"
     """The violation loss, or the squared error of the next state through the relaxed contacts."""
+    explained: float | None = bounded(None, above=0, maximum=1)
+    """Share of transitions that count by their loss, the others by its logarithm, as impacts should not decide; None:
+    all count by their loss."""
 
 
 def physics_loss(
@@ -74,13 +79,19 @@ def physics_loss(
         context: (N, n_context) or None.
 
     Returns:
-        Scalar: half of the mean squared error in units of `scale`, or the mean violation loss in these units.
+        Scalar: half of the mean squared error in units of `scale`, or the mean violation loss in these units. With
+        `explained` a mean between the geometric and the arithmetic one.
     """
     system: Any = system_at(lcs, x, context)
     if settings.loss == "violation":
-        return violation_loss(_in_units(system, scale), x / scale, u, x_next / scale, "auto", _XI)
-    lam = solve_lcp(system.F, system.gap(x, u), relaxation=relaxation).lam
-    return 0.5 * ((system.next_state(x, u, lam) - x_next) / scale).square().sum(-1).mean()
+        losses = violation_loss(_in_units(system, scale), x / scale, u, x_next / scale, "auto", _XI, reduction="none")
+    else:
+        lam = solve_lcp(system.F, system.gap(x, u), relaxation=relaxation).lam
+        losses = 0.5 * ((system.next_state(x, u, lam) - x_next) / scale).square().sum(-1)
+    if settings.explained is None:
+        return losses.mean()
+    usual = losses.detach().quantile(settings.explained).clamp(min=1e-12)
+    return usual * (losses / usual).log1p().mean().expm1()
 
 
 def _in_units(system: LCSParams, scale: Tensor) -> LCSParams:
@@ -192,6 +203,7 @@ class PhysicsFit(EpisodeTrainer):
         module: Any = self.lcs
         learned = [p for p in module.parameters() if p.requires_grad]
         adam = torch.optim.Adam(learned, self.settings.learning_rate)
+        slower = torch.optim.lr_scheduler.LinearLR(adam, 1.0, self.settings.last_rate, self.settings.steps)
         data, context, losses = transitions(self.buffer), contexts(self.buffer), []
         random = np.random.default_rng((self.seed, Stream.MINIBATCH, self.iteration))
         size = min(self.settings.batch or len(data[0]), len(data[0]))
@@ -205,5 +217,6 @@ class PhysicsFit(EpisodeTrainer):
             loss.backward()
             if all(bool(torch.isfinite(p.grad).all()) for p in learned if p.grad is not None):
                 adam.step()
+            slower.step()
             losses.append(float(loss.detach()))
         return losses

@@ -18,7 +18,9 @@ from difflcs.rl.settings import group
 class MujocoMethod(ContactMethod):
     """LCS-RL with a MuJoCo model inside: masses, friction or drives are fitted to the MPC's own episodes, then PPO."""
 
-    fit: PhysicsFitSettings = group(PhysicsFitSettings, rollouts=4, learning_rate=0.05, batch=200)
+    fit: PhysicsFitSettings = group(
+        PhysicsFitSettings, rollouts=4, learning_rate=0.1, last_rate=0.1, batch=50, explained=0.3
+    )
     """Settings of the fit."""
 
     name: ClassVar[str] = "mujoco-lcs"
