@@ -47,8 +47,22 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     _steps: int | None = None  # steps made in this episode; None: reset is needed
     _renderer: SceneRenderer | None = None
 
-    def _begin(self, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, Any]:
-        """Seed, and return the options `goal` and `state` of a reset, None where they are not given."""
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: Seed of the random generator; None goes on with the current one.
+            options: May hold `goal` and `state`, see the class.
+
+        Returns:
+            Observation and info.
+
+        Raises:
+            OptionsError: The options are no dictionary.
+            ValueError: An option is unknown, has the wrong shape, or is outside what the robot and the task allow.
+        """
         options = checked_options(options)
         super().reset(seed=seed)
         goal, state = options.pop("goal", None), options.pop("state", None)
@@ -56,7 +70,10 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             raise ValueError(
                 f"Expected only the options 'goal' and 'state', got also {sorted(options, key=str)}. Remove them."
             )
-        return goal, state
+        self._steps = None  # an option that is refused below leaves no episode to step
+        info = self._start(goal, state)
+        self._steps = 0
+        return self._observation(), info
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Execute an action for 0.1 s.
@@ -94,6 +111,13 @@ class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             warnings.warn(self.unstable, PhysicsWarning, stacklevel=2)
         self._stepped(info)
         return self._observation(), float(reward), False, truncated, info
+
+    @abstractmethod
+    def _start(self, goal: Any, state: Any) -> dict[str, Any]:
+        """Start at a goal and in a state, None where they are not given; return the info.
+
+        It makes the same draws always, so that an option passed now does not change the episodes after it.
+        """
 
     @abstractmethod
     def _simulate(self, action: np.ndarray) -> np.ndarray | None:

@@ -188,28 +188,10 @@ class HandTurnObjectEnv(GoalEnv):
             "servo_gain": float(self.model.actuator_gainprm[0, 0]),
         }
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Start an episode.
-
-        Args:
-            seed: Seed of the random generator; None goes on with the current one.
-            options: May hold `goal` (7,) and `state` (22,), see the class.
-
-        Returns:
-            Observation and info.
-
-        Raises:
-            OptionsError: The options are no dictionary.
-            ValueError: An option is unknown, or has numbers that do not fit.
-        """
-        goal, state = self._begin(seed, options)
-        # Always the same draws, so that an option passed now does not change the episodes after it.
+    def _start(self, goal: Any, state: Any) -> dict[str, Any]:
         place = PLACE + PLACE_NOISE * self.np_random.standard_normal(2)
         yaw, side = self.np_random.uniform(-YAW_NOISE, YAW_NOISE), self.np_random.choice([-1.0, 1.0])
         height = PALM_TOP + OBJECTS[self.object][2]
-        self._steps = None
         if state is None:
             state = np.concatenate([POSTURE, place, [height + CLEARANCE, 0.0, 0.0, yaw]])
         if goal is None:
@@ -226,8 +208,8 @@ class HandTurnObjectEnv(GoalEnv):
         self.data.mocap_quat[0] = self._goal[3:]
         mujoco.mj_forward(self.model, self.data)
         info = self._pose_info()
-        self._steps, self._held = 0, int(info["success"])
-        return self._observation(), info | {"held": self._held}
+        self._held = int(info["success"])
+        return info | {"held": self._held}
 
     def _simulate(self, action: np.ndarray) -> np.ndarray | None:
         self.data.ctrl[:] = self._state[:16] + action

@@ -170,29 +170,10 @@ class TriFingerEnv(GoalEnv):
 
     # --- Gymnasium --------------------------------------------------------------------------------
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Start an episode.
-
-        Args:
-            seed: Seed of the random generator; None goes on with the current one.
-            options: May hold `goal` (3,) and `state` (9,), see the class.
-
-        Returns:
-            Observation and info.
-
-        Raises:
-            OptionsError: The options are no dictionary.
-            ValueError: An option is unknown, has the wrong shape, or is outside what the robot and the task allow.
-        """
-        goal, state = self._begin(seed, options)
-        # Always the same draws, so that an option passed now does not change the episodes after it.
+    def _start(self, goal: Any, state: Any) -> dict[str, Any]:
         joint_noise = self.np_random.uniform(-JOINT_NOISE, JOINT_NOISE, (3, 3))
         pose_noise = self.np_random.uniform(-1.0, 1.0, 3) * (POSITION_NOISE, POSITION_NOISE, YAW_NOISE)
         random_goal = self.task.sample_goal(self.np_random)
-
-        self._steps = None  # an option that is refused below leaves no episode to step
         if goal is None:
             self._goal = random_goal
         else:
@@ -214,10 +195,9 @@ class TriFingerEnv(GoalEnv):
         self.physics.set_goal(self._goal)
         self._state = self.physics.state()
         self._state[2] = unwrap(self._state[2], float(pose[2]))
-        self._steps = 0
         if self.render_mode == "human":
             self.render()
-        return self._observation(), self._pose_info()
+        return self._pose_info()
 
     def _simulate(self, action: np.ndarray) -> np.ndarray | None:
         after = self.physics.step(action)
