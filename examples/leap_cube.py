@@ -63,7 +63,7 @@ class Settings:
     """Factor of the inertia of rotation of the cube."""
     compliance: float = 0.1
     relaxation: float = 1e-3
-    solver: str = "fast"
+    solver: Literal["fast", "default", "best"] = "fast"
     paces: tuple[float, ...] = (1.5, 1.0, 0.5, 0.0)
     """Factors by which the planned step is tried, the fastest first; none: it is executed untried."""
     ahead: int = 1
@@ -318,15 +318,17 @@ def main(o: Options) -> None:
     """Play, print, record."""
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", ContactWarning)
-    make_task, rows = load_judo(o.judo), []
-    lines = o.out.read_text().splitlines() if o.out is not None and o.out.exists() else []
+    make_task = load_judo(o.judo)
+    rows: list[dict[str, Any]] = []
+    out = o.out
+    lines = out.read_text().splitlines() if out is not None and out.exists() else []
     same = {"policy": o.policy, "rollouts": o.rollouts, "rate": o.rate, "seconds": o.seconds}
     known = {row["seed"]: row for row in map(json.loads, lines) if same.items() <= row.items()}
     for seed in range(o.seed, o.seed + o.episodes):
         if seed not in known:
             known[seed] = play(make_task, o, seed)
-            if o.out is not None:
-                with o.out.open("a") as file:
+            if out is not None:
+                with out.open("a") as file:
                     file.write(json.dumps(known[seed]) + "\n")
         rows.append(row := known[seed])
         print(f"seed {seed}: {row['goals']} goals, {row['drops']} drops, {row['cpu_seconds']:.1f} s of CPU", flush=True)

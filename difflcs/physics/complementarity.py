@@ -29,7 +29,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from difflcs._checks import check_choice, check_number, check_tensor
+from difflcs._checks import broadcast_batch, check_choice, check_number, check_tensor
 from difflcs._differentiation import is_wrapped, runs_eagerly
 from difflcs._linalg import matvec
 from difflcs.errors import FrictionWarning, InvalidInputError, ShapeError
@@ -249,7 +249,7 @@ def _bound(system: _Rows, lower: Tensor, upper: Tensor) -> _Rows:
 
 def _join(dim: int, *parts: Tensor) -> Tensor:
     """Concatenate vectors (dim −1) or rows of matrices (dim −2), whose batch dimensions broadcast."""
-    batch = torch.broadcast_shapes(*(part.shape[:dim] for part in parts))
+    batch = broadcast_batch([("part", part.shape[:dim]) for part in parts])
     return torch.cat([part.expand(*batch, *part.shape[dim:]) for part in parts], dim)
 
 
