@@ -14,6 +14,15 @@ def rank(name: str) -> int:
     return 2 if name in MATRICES else 1
 
 
+def in_units(t, x, u, f):
+    """Inputs in other units: numbers of states are x (n_x,) times as large, of actions u, of forces f. λ·s stays."""
+    matrices = {"A": (x, x), "B": (x, u), "C": (x, f), "D": (1 / f, x), "E": (1 / f, u), "F": (1 / f, f)}
+    matrices |= {"Q": (1 / x, x), "R": (1 / u, u), "Q_final": (1 / x, x)}
+    vectors = {"d": x, "c": 1 / f, "q": 1 / x, "r": 1 / u, "q_final": 1 / x, "u_min": u, "u_max": u, "x0": x}
+    changed = {name: row[:, None] * t[name] / column for name, (row, column) in matrices.items()}
+    return {**changed, **{name: size * t[name] for name, size in vectors.items()}}
+
+
 @dataclass(frozen=True)
 class Case:
     """A batch of problems.
@@ -75,13 +84,20 @@ class Case:
         """The same with other inputs."""
         return replace(self, arrays={**self.arrays, **arrays})
 
+    def stages(self, name: str, i: int) -> np.ndarray:
+        """One input of element i at every stage, or (1, ...) where all stages have the same."""
+        value = self.arrays[name]
+        own = value if self.shared(name) else value[i if len(value) > 1 else 0]
+        return own if own.ndim > rank(name) else own[None]
+
+    def element(self, i: int) -> dict[str, np.ndarray]:
+        """All inputs of element i, see `stages`."""
+        return {name: self.stages(name, i) for name in self.arrays}
+
     def at(self, name: str, i: int, k: int) -> np.ndarray:
         """One input of element i at stage k."""
-        value = self.arrays[name]
-        if self.shared(name):
-            return value
-        value = value[i if len(value) > 1 else 0]
-        return value[k] if value.ndim > rank(name) else value
+        value = self.stages(name, i)
+        return value[k if len(value) > 1 else 0]
 
     def problem(self):
         """The batch as the backends take it."""

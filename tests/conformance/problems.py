@@ -1,6 +1,6 @@
 """Problems that every backend solves, in the terms of the public interface, and what their plans are judged by.
 
-The judges are sums and products that are written out here. A new form of problem is one more function in `PROBLEMS`.
+A new form of problem is one more function in `PROBLEMS`.
 """
 
 import dataclasses
@@ -20,10 +20,12 @@ from difflcs import (
     StageBounds,
     solve_lcp,
 )
+from tests.conformance import judges
+from tests.conformance.cases import in_units, rank
+from tests.conformance.judges import affine, mul
 
 LCS, COST = ("A", "B", "C", "d", "D", "E", "F", "c"), ("Q", "R", "S", "Q_final", "q", "r", "q_final")
-BOUNDS, ROWS = ("u_min", "u_max"), ("G", "g", "E_rows", "weight")
-MATRICES = ("A", "B", "C", "D", "E", "F", "Q", "R", "S", "Q_final", "G", "E_rows")
+BOUNDS, ROWS = ("u_min", "u_max"), {"G_x": "G", "g": "g", "G_u": "E", "price": "weight"}  # their names in the records
 STAGED = (*LCS, "Q", "R", "S", "q", "r", *BOUNDS, *ROWS)  # all but Q_final, q_final, x0
 HORIZON, INF = 3, float("inf")
 
@@ -43,10 +45,10 @@ class Problem:
         return len(self.tensors["x0"])
 
     def own(self, name):
-        return (2 if name in MATRICES else 1) + (name in self.staged)
+        return rank(name) + (name in self.staged)
 
     def stages(self, name):
-        return self.horizon + (name in ("G", "g", "weight"))
+        return self.horizon + (name in ("G_x", "g", "price"))
 
     def shared(self, name):
         return self.tensors[name].ndim == self.own(name)
@@ -61,12 +63,12 @@ class Problem:
         return {k: v if self.shared(k) else v[i : i + 1] for k, v in self.tensors.items()}
 
     def full(self):
-        """Every input of every element at every stage (batch, stages, …); x0 and what is final without stages."""
-        each, found = self.each().tensors, {"S": torch.zeros(()).double(), "u_min": -INF, "u_max": INF}
+        """Every input of every element at every stage (batch, stages, …); x0 without stages."""
+        each, found = self.each().tensors, {"u_min": -INF, "u_max": INF}
         for k, v in each.items():
-            found[k] = v.unsqueeze(1) if k in STAGED and k not in self.staged else v
-        if "G" in each:
-            found.setdefault("weight", torch.full_like(found["g"], INF))
+            found[k] = v if k == "x0" or k in self.staged else v.unsqueeze(1)
+        if "g" in each:
+            found.setdefault("price", torch.full_like(found["g"], INF))
         return found
 
     def changed(self, **tensors):
@@ -97,9 +99,9 @@ def layer_of(t, staged, horizon, asked=False, **options):
     cost = kind(**weights, check=False, **({"by_stage": by_stage} if by_stage else {}))
     limits, by_stage = {k: t[k] for k in BOUNDS if k in t}, tuple(staged & set(BOUNDS))
     options |= {"bounds": StageBounds(**limits, by_stage=by_stage)} if by_stage else limits
-    if "G" in t:
-        rows = {"G": t["G"], "g": t["g"], "E": t.get("E_rows"), "weight": t.get("weight")}
-        by_stage = tuple(name.removesuffix("_rows") for name in staged & set(ROWS))
+    if "g" in t:
+        rows = {name: t.get(key) for key, name in ROWS.items()}
+        by_stage = tuple(ROWS[key] for key in staged & set(ROWS))
         options["constraints"] = (
             ConstraintSequence(**rows, by_stage=by_stage) if by_stage else LinearConstraints(**rows)
         )
@@ -115,53 +117,31 @@ def solve(problem, backend, guess=None, tensors=None, **options):
 # --- judges -----------------------------------------------------------------------------------------------------------
 
 
-def mul(M, v):
-    return (M @ v.unsqueeze(-1)).squeeze(-1)
-
-
-def predicted(t, x, u, lam):
-    """Next states of full inputs, and the slack of every contact."""
-    x = x[:, :-1]
-    slack = mul(t["D"], x) + mul(t["E"], u) + mul(t["F"], lam) + t["c"]
-    return mul(t["A"], x) + mul(t["B"], u) + mul(t["C"], lam) + t["d"], slack
-
-
 def rollout(problem, t, u):
     """States of actions by the public record, relaxed as the plan is."""
     states = [t["x0"]]
     for k in range(problem.horizon):
-        A, B, C, d, D, E, F, c = (t[name][:, k if name in problem.staged else 0] for name in LCS)
-        x = states[-1]
-        lam = solve_lcp(F, mul(D, x) + mul(E, u[:, k]) + c, relaxation=problem.relaxation).lam
-        states.append(mul(A, x) + mul(B, u[:, k]) + mul(C, lam) + d)
+        now = {name: t[name][:, k if name in problem.staged else 0] for name in LCS}
+        D, E, F, c = (now[name] for name in "DEFc")
+        lam = solve_lcp(F, mul(D, states[-1]) + mul(E, u[:, k]) + c, relaxation=problem.relaxation).lam
+        states.append(affine(now, "ABCd", states[-1], u[:, k], lam))
     return torch.stack(states, 1)
-
-
-def rows(t, x, u):
-    """G x + E u − g of every stage (batch, H+1, n_c)."""
-    value = mul(t["G"], x) - t["g"]
-    if "E_rows" in t:
-        value = value + torch.nn.functional.pad(mul(t["E_rows"], u), (0, 0, 0, 1))
-    return value
 
 
 def cost(problem, t, x, u):
     """The objective of each trajectory without the price of violations."""
-    now, last = x[:, :-1], x[:, -1]
-    stages = (now * (0.5 * mul(t["Q"], now) + t["q"])).sum((1, 2)) + (u * (0.5 * mul(t["R"], u) + t["r"])).sum((1, 2))
-    if "S" in problem.tensors:
-        stages = stages + (now * mul(t["S"], u)).sum((1, 2))
+    total = judges.cost(t, x, u)
     if problem.barrier:
-        stages = stages - problem.barrier * ((u - t["u_min"]).log() + (t["u_max"] - u).log()).sum((1, 2))
-    return stages + (last * (0.5 * mul(t["Q_final"], last) + t["q_final"])).sum(1)
+        total = total - problem.barrier * ((u - t["u_min"]).log() + (t["u_max"] - u).log()).sum((1, 2))
+    return total
 
 
 def fines(problem, t, x, u, most=INF):
     """The price of violations; hard rows, and what is dearer, cost `most`, or nothing where that is infinite."""
-    if "G" not in problem.tensors:
+    if "g" not in problem.tensors:
         return torch.zeros(problem.batch).double()
-    price = t["weight"].clamp_max(most)
-    return (torch.where(price < INF, price, 0.0) * rows(t, x, u).clamp_min(0.0)).sum((1, 2))
+    price = t["price"].clamp_max(most)
+    return (torch.where(price < INF, price, 0.0) * judges.rows(t, x, u).clamp_min(0.0)).sum((1, 2))
 
 
 # --- the problems -----------------------------------------------------------------------------------------------------
@@ -237,17 +217,10 @@ def far_start(build):
 
 
 def badly_scaled(build):
-    """`contact` in other units of state, action, row of the LCP and force; see the test that compares the two."""
+    """`contact` in other units of state, action and force; see the test that compares the two."""
     t = contact(build).tensors
-    X, U, S = (torch.tensor(v, dtype=torch.float64) for v in ([1e3, 1e-2, 1.0, 1e-3], [1e-2, 10.0], [1e2, 1e-2, 3.0]))
-    changed = {
-        "A": X[:, None] * t["A"] / X, "B": X[:, None] * t["B"] / U, "C": X[:, None] * t["C"] * S, "d": X * t["d"],
-        "D": S[:, None] * t["D"] / X, "E": S[:, None] * t["E"] / U, "F": S[:, None] * t["F"] * S, "c": S * t["c"],
-        "Q": t["Q"] / X / X[:, None], "R": t["R"] / U / U[:, None], "Q_final": t["Q_final"] / X / X[:, None],
-        "q": t["q"] / X, "r": t["r"] / U, "q_final": t["q_final"] / X,
-        "u_min": U * t["u_min"], "u_max": U * t["u_max"], "x0": X * t["x0"],
-    }  # fmt: skip
-    return Problem(changed)
+    x, u, f = (torch.tensor(v, dtype=torch.float64) for v in ([1e3, 1e-2, 1.0, 1e-3], [1e-2, 10.0], [1e-2, 1e2, 1 / 3]))
+    return Problem(in_units(t, x, u, f))
 
 
 def horizon_one(build):
@@ -317,7 +290,7 @@ def with_rows(build, problem, weight=None, margin=0.01):
     value[:, :-1] += free.u @ E.mT
     g = value.amax(1).quantile(0.5, 0) - margin
     g[0] = torch.maximum(g[0], value[:, 0, 0].max() + 0.01)  # the first row is about x0 alone at the first stage
-    return problem.changed(G=G, g=g, E_rows=E, **({} if weight is None else {"weight": torch.tensor(weight).double()}))
+    return problem.changed(G_x=G, g=g, G_u=E, **({} if weight is None else {"price": torch.tensor(weight).double()}))
 
 
 def hard(build):
@@ -341,7 +314,7 @@ def terminal(build):
     problem = with_rows(build, make(build, seed=13, bound=0.4))
     g = torch.full((HORIZON + 1, 2), INF, dtype=torch.float64)
     free = solve(problem.without(ROWS), "ipopt")
-    g[-1, 0] = (free.x[:, -1] @ problem.tensors["G"][0]).median() - 0.01
+    g[-1, 0] = (free.x[:, -1] @ problem.tensors["G_x"][0]).median() - 0.01
     return dataclasses.replace(problem.changed(g=g), staged=problem.staged | {"g"})
 
 
@@ -350,7 +323,7 @@ def everything(build):
         S=0.1 * build.normal(9)(4, 4, 2), u_max=torch.tensor([INF, 0.3]).double()
     )
     problem = vary(build, problem, (*LCS, "Q", "R", "S", "q", "r", "u_min"))
-    return vary(build, with_rows(build, problem, [0.5, 0.5]), ("G", "E_rows", "g"))
+    return vary(build, with_rows(build, problem, [0.5, 0.5]), ("G_x", "G_u", "g"))
 
 
 # Of the public system, cost and bounds alone; the others are for exact backends.

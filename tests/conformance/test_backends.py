@@ -16,7 +16,7 @@ from difflcs import LCSMPCLayer, LCSParams, QuadraticCost, Status, available_bac
 from difflcs.errors import DegenerateWarning, SolveWarning
 from difflcs.mpc import Primal
 from difflcs.mpc.backends import get_backend
-from tests.conformance import problems
+from tests.conformance import judges, problems
 from tests.conformance.differences import compare, moves, weigh
 from tests.conformance.problems import BOUNDS, COST, HORIZON, INF, LCS, PROBLEMS, STAGED, make, solve
 
@@ -93,7 +93,7 @@ def test_plans_are_solved_and_keep_dynamics_complementarity_and_bounds(solutions
     assert sol.mu.shape == (problem.batch, problem.horizon + 1, n_c)
     assert sol.violation.shape == (problem.batch,)
     assert not sol.mu.requires_grad
-    following, slack = problems.predicted(t, sol.x, sol.u, sol.lam)
+    following, slack = (judges.affine(t, names, sol.x[:, :-1], sol.u, sol.lam) for names in ("ABCd", "DEFc"))
     assert float(((sol.x[:, 1:] - following).abs() / (1 + sol.x.abs().amax(1, keepdim=True))).max()) < 1e-8
     assert bool((sol.lam > 0).all() and (slack > 0).all())
     torch.testing.assert_close(sol.lam * slack, torch.full_like(slack, problem.relaxation), rtol=0, atol=1e-8)
@@ -115,12 +115,12 @@ def test_the_objective_is_the_sum_of_its_terms_and_no_plan_nearby_is_better(buil
     u = sol.u.clone().requires_grad_()
     x = problems.rollout(problem, t, u)
     value = problems.cost(problem, t, x, u).sum()
-    if "G" in t:
-        value = value + torch.where(sol.mu > 0, sol.mu * problems.rows(t, x, u), 0.0).sum()
+    if "g" in t:
+        value = value + torch.where(sol.mu > 0, sol.mu * judges.rows(t, x, u), 0.0).sum()
     (gradient,) = torch.autograd.grad(value, u)
     assert float((sol.u - (sol.u - gradient).clamp(t["u_min"], t["u_max"])).abs().max()) < 1e-5
 
-    n, dear = build.normal(31), 2 * float(sol.mu.max()) + 1 if "G" in t else INF
+    n, dear = build.normal(31), 2 * float(sol.mu.max()) + 1 if "g" in t else INF
     low, high = (torch.as_tensor(t[k]).expand_as(sol.u) for k in BOUNDS)
     inside = 1e-9 * (high - low) if problem.barrier else 0.0
     for step in (1e-3, 1e-2):
@@ -137,7 +137,7 @@ def test_the_objective_is_the_sum_of_its_terms_and_no_plan_nearby_is_better(buil
 def test_constraints_hold_or_are_paid_for(solutions, name, backend):
     problem, sol = solutions(name, backend)
     t, mu = problem.full(), sol.mu
-    value, price = problems.rows(t, sol.x, sol.u), t["weight"].expand(mu.shape)
+    value, price = judges.rows(t, sol.x, sol.u), t["price"].expand(mu.shape)
     torch.testing.assert_close(sol.violation, value.amax((1, 2)).clamp_min(0.0), rtol=0, atol=1e-9)
     assert float(value[price == INF].max() if (price == INF).any() else 0.0) <= 1e-7
     assert bool((mu >= 0).all() and (mu <= price * (1 + 1e-12)).all())
@@ -169,19 +169,19 @@ def test_without_contact_and_bounds_the_plan_is_riccatis(build, name, backend):
     sol, t = solve(problem, backend), problem.full()
     assert sol.lam.shape == (4, HORIZON, 0)
     at = {k: (lambda j, k=k: t[k][:, j if k in problem.staged else 0]) for k in "ABdQRSqr"}
-    P, p, gains = t["Q_final"], t["q_final"], []
+    P, p, gains = t["Q_final"][:, 0], t["q_final"][:, 0], []
     for k in reversed(range(HORIZON)):
         A, B, d, Q, R, S, q, r = (at[key](k) for key in "ABdQRSqr")
-        H, M, h = R + B.mT @ P @ B, S + A.mT @ P @ B, r + problems.mul(B.mT, p + problems.mul(P, d))
+        H, M, h = R + B.mT @ P @ B, S + A.mT @ P @ B, r + judges.mul(B.mT, p + judges.mul(P, d))
         K, f = -torch.linalg.solve(H, M.mT), -torch.linalg.solve(H, h)
-        p = q + problems.mul(A.mT, p + problems.mul(P, d)) + problems.mul(M, f)
+        p = q + judges.mul(A.mT, p + judges.mul(P, d)) + judges.mul(M, f)
         P = Q + A.mT @ P @ A + M @ K
         gains.insert(0, (K, f))
     x = t["x0"]
     for k, (K, f) in enumerate(gains):
-        u = problems.mul(K, x) + f
+        u = judges.mul(K, x) + f
         torch.testing.assert_close(sol.u[:, k], u, rtol=1e-7, atol=1e-9)
-        x = problems.mul(at["A"](k), x) + problems.mul(at["B"](k), u) + at["d"](k)
+        x = judges.mul(at["A"](k), x) + judges.mul(at["B"](k), u) + at["d"](k)
     torch.testing.assert_close(sol.x[:, -1], x, rtol=1e-7, atol=1e-9)
 
 
@@ -310,14 +310,14 @@ def test_a_cost_that_is_asked_for_counts_as_one_that_is_given(solutions, name):
 def test_a_price_above_the_multiplier_makes_a_soft_constraint_hard(build, backend):
     problem = problems.hard(build)
     plan = solve(problem, backend)
-    dear = {**problem.tensors, "weight": torch.full((2,), 3 * float(plan.mu.max()), dtype=torch.float64)}
+    dear = {**problem.tensors, "price": torch.full((2,), 3 * float(plan.mu.max()), dtype=torch.float64)}
     # From the same local optimum: another program may lead a cold start to another one.
     soft_plan = solve(problem, backend, guess=plan, tensors=dear)
     torch.testing.assert_close(soft_plan.u, plan.u, rtol=1e-5, atol=1e-6)
-    cheap = {**problem.tensors, "weight": torch.full((2,), 0.2 * float(plan.mu.max()), dtype=torch.float64)}
+    cheap = {**problem.tensors, "price": torch.full((2,), 0.2 * float(plan.mu.max()), dtype=torch.float64)}
     cheap_plan = solve(problem, backend, tensors=cheap)
     assert float(cheap_plan.violation.max()) > 1e-4
-    assert float(cheap_plan.mu.max()) == pytest.approx(float(cheap["weight"][0]), rel=1e-9)
+    assert float(cheap_plan.mu.max()) == pytest.approx(float(cheap["price"][0]), rel=1e-9)
 
 
 @every_exact
@@ -335,7 +335,7 @@ def test_an_infeasible_element_is_a_status_and_spoils_no_other(build, backend):
     problem = problems.hard(build).each()
     t = dict(problem.tensors)
     bad = t["g"].clone()
-    bad[2, 0] = (t["G"][2, 0] * t["x0"][2]).sum() - 0.3  # the first state violates it by 0.3, whatever follows
+    bad[2, 0] = (t["G_x"][2, 0] * t["x0"][2]).sum() - 0.3  # the first state violates it by 0.3, whatever follows
     x0 = t["x0"].clone().requires_grad_()
     with pytest.warns(SolveWarning, match="1 of 4 .*1 INFEASIBLE"):
         sol = solve(problem, backend, tensors={**t, "g": bad, "x0": x0}, on_failure="mask")
@@ -398,7 +398,7 @@ def test_gradients_of_shared_inputs_are_sums_of_those_of_the_elements(build, sol
 
 @every_exact
 def test_what_is_infinite_has_no_gradient(build, backend):
-    for name, key in (("half_open", "u_max"), ("terminal", "g"), ("soft_and_hard", "weight")):
+    for name, key in (("half_open", "u_max"), ("terminal", "g"), ("soft_and_hard", "price")):
         problem = PROBLEMS[name](build)
         leaf = problem.tensors[key].clone().requires_grad_()
         sol = solve(problem, backend, tensors={**problem.tensors, key: leaf})

@@ -9,8 +9,10 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 
+from tests.conformance import judges
 from tests.conformance.cases import Case
 from tests.conformance.hostile.generators import LCP, Loss
+from tests.conformance.judges import mul
 
 Ratios = dict[str, np.ndarray]
 
@@ -34,13 +36,6 @@ def finite(*values: np.ndarray) -> np.ndarray:
     return np.where(bad, np.inf, 0.0)
 
 
-def _mv(M: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """M (count, i, j) or (i, j) times v (count, j) or (count, steps, j)."""
-    spec = "bkj" if v.ndim == 3 else "bj"
-    matrix = "bij" if M.ndim == 3 else "ij"
-    return np.einsum(f"{matrix},{spec}->{spec[:-1]}i", M, v)
-
-
 def _t(M: np.ndarray) -> np.ndarray:
     return M.swapaxes(-1, -2)
 
@@ -58,8 +53,8 @@ def judge_lcp(problem: LCP, lam: np.ndarray, w: np.ndarray, relaxation: float, s
     """
     with np.errstate(all="ignore"):
         F, q = problem.F, problem.q
-        terms = np.abs(q) + _mv(np.abs(F), lam)
-        error = np.abs(w - (_mv(F, lam) + q))
+        terms = np.abs(q) + mul(np.abs(F), lam)
+        error = np.abs(w - (mul(F, lam) + q))
         rounding = np.zeros_like(terms)
         if single:  # of w, of every λ; below 1e-38 float32 has fewer digits
             rounding = SINGLE * (terms + np.abs(w)) + 2e-45 * (1 + np.abs(F).sum(-1))
@@ -120,7 +115,6 @@ def judge_mpc(
         low, high = bounds_in(problem, dtype)
         now, after = x[:, :-1], x[:, 1:]
         predicted, next_terms = affine(a, "ABCd", now, u, lam)
-        step = after - predicted
         s, s_terms = affine(a, "DEFc", now, u, lam)
         cost, cost_terms = cost_of(problem, a, x, u, low, high)
         relaxation = problem.relaxation
@@ -137,7 +131,7 @@ def judge_mpc(
             "start": np.where((x[:, 0] == a["x0"]).all(-1), 0.0, np.inf),
             "bounds": np.where(((u >= low) & (u <= high)).all((1, 2)), 0.0, np.inf),
             "sign of lam": np.where((lam > 0).all((1, 2)), 0.0, np.inf),
-            "dynamics": _ratio(np.abs(step), 1e-6 * next_terms + least),
+            "dynamics": _ratio(np.abs(after - predicted), 1e-6 * next_terms + least),
             "complementarity": _ratio(
                 np.abs(lam * s - relaxation),
                 (1e-6 + rounding) * relaxation + (1e-13 + 2 * rounding) * lam * s_terms + tiny,
@@ -149,25 +143,20 @@ def judge_mpc(
 
 
 def affine(a: dict, names: str, x, u, lam) -> tuple[np.ndarray, np.ndarray]:
-    """Left x + middle u + right λ + constant by four names, and the sum of the sizes of its terms."""
-    matrices, constant = [a[k] for k in names[:3]], a[names[3]][:, None]
-    pairs = list(zip(matrices, (x, u, lam), strict=True))
-    value = sum((_mv(M, v) for M, v in pairs), constant)
-    return value, sum((_mv(np.abs(M), np.abs(v)) for M, v in pairs), np.abs(constant))
+    """Left x + middle u + right λ + constant by four names, the same at all stages, and the sizes of its terms."""
+    t = by_stage(a)
+    return judges.affine(t, names, x, u, lam), judges.affine(judges.absolute(t), names, abs(x), abs(u), abs(lam))
+
+
+def by_stage(a: dict) -> dict:
+    """Inputs of elements with a dimension of stages after the batch."""
+    return {k: v[:, None] for k, v in a.items()}
 
 
 def cost_of(problem: Case, a: dict, x, u, low, high) -> tuple[np.ndarray, np.ndarray]:
     """Cost of a trajectory and the sum of the sizes of its terms, (count,)."""
-
-    def quadratic(Q, v):
-        return (v * _mv(Q, v)).sum((1, 2)), (np.abs(v) * _mv(np.abs(Q), np.abs(v))).sum((1, 2))
-
-    total, terms = np.zeros(len(x)), np.zeros(len(x))
-    for name, linear, v in (("Q", "q", x[:, :-1]), ("R", "r", u), ("Q_final", "q_final", x[:, -1:])):
-        value, size = quadratic(a[name], v)
-        total, terms = total + 0.5 * value, terms + 0.5 * size
-        product = v * a[linear][:, None]
-        total, terms = total + product.sum((1, 2)), terms + np.abs(product).sum((1, 2))
+    t = by_stage(a)
+    total, terms = judges.cost(t, x, u), judges.cost(judges.absolute(t), abs(x), abs(u))
     if problem.barrier > 0:
         logs = problem.barrier * (np.log(u - low) + np.log(high - u))
         total, terms = total - logs.sum((1, 2)), terms + np.abs(logs).sum((1, 2))
@@ -206,26 +195,26 @@ def reduced_gradient(
     """
     size = {k: np.abs(v) for k, v in a.items()}
     b = lam / (lam + s)
-    p = _mv(a["Q_final"], x[:, -1]) + a["q_final"]
-    p_noise = rounding * (_mv(size["Q_final"], np.abs(x[:, -1])) + size["q_final"])
+    p = mul(a["Q_final"], x[:, -1]) + a["q_final"]
+    p_noise = rounding * (mul(size["Q_final"], np.abs(x[:, -1])) + size["q_final"])
     steps = []
     for k in reversed(range(u.shape[1])):
         matrix = b[:, k, :, None] * _t(a["F"]) + np.eye(lam.shape[-1]) * (s / (lam + s))[:, k, :, None]
-        rho = _solve(matrix, -b[:, k] * _mv(_t(a["C"]), p))
-        g = _mv(a["R"], u[:, k]) + a["r"] + _mv(_t(a["B"]), p) + _mv(_t(a["E"]), rho)
-        terms = _mv(size["R"], np.abs(u[:, k])) + size["r"]
-        terms = terms + _mv(_t(size["B"]), np.abs(p)) + _mv(_t(size["E"]), np.abs(rho))
+        rho = _solve(matrix, -b[:, k] * mul(_t(a["C"]), p))
+        g = mul(a["R"], u[:, k]) + a["r"] + mul(_t(a["B"]), p) + mul(_t(a["E"]), rho)
+        terms = mul(size["R"], np.abs(u[:, k])) + size["r"]
+        terms = terms + mul(_t(size["B"]), np.abs(p)) + mul(_t(size["E"]), np.abs(rho))
         noise, rho_noise = np.zeros_like(g), np.zeros_like(rho)
         if rounding:
             inverse = np.abs(_solve(matrix, np.broadcast_to(np.eye(rho.shape[-1]), matrix.shape)))
-            moved = _mv(_t(size["C"]), p_noise + rounding * np.abs(p))
+            moved = mul(_t(size["C"]), p_noise + rounding * np.abs(p))
             moved = moved + np.abs(rho) / lam[:, k] * rounding * (s_terms[:, k] + np.abs(s[:, k]))
-            rho_noise = _mv(inverse, b[:, k] * moved) + rounding * np.abs(rho)
-            noise = _mv(_t(size["B"]), p_noise) + _mv(_t(size["E"]), rho_noise) + 2 * rounding * terms
+            rho_noise = mul(inverse, b[:, k] * moved) + rounding * np.abs(rho)
+            noise = mul(_t(size["B"]), p_noise) + mul(_t(size["E"]), rho_noise) + 2 * rounding * terms
         steps.append((g, terms, noise))
-        p_noise = _mv(_t(size["A"]), p_noise + rounding * np.abs(p)) + _mv(_t(size["D"]), rho_noise)
-        p_noise = p_noise + rounding * (_mv(size["Q"], np.abs(x[:, k])) + size["q"])
-        p = _mv(a["Q"], x[:, k]) + a["q"] + _mv(_t(a["A"]), p) + _mv(_t(a["D"]), rho)
+        p_noise = mul(_t(size["A"]), p_noise + rounding * np.abs(p)) + mul(_t(size["D"]), rho_noise)
+        p_noise = p_noise + rounding * (mul(size["Q"], np.abs(x[:, k])) + size["q"])
+        p = mul(a["Q"], x[:, k]) + a["q"] + mul(_t(a["A"]), p) + mul(_t(a["D"]), rho)
     g, terms, noise = (np.stack(v[::-1], 1) for v in zip(*steps, strict=True))
     return g, terms, noise
 

@@ -14,12 +14,13 @@ from numpy.random import Generator
 
 from difflcs import Status
 from difflcs.errors import DiffLCSError
+from tests.conformance import judges
 from tests.conformance.cases import Case, rank
 from tests.conformance.hostile import checks
 from tests.conformance.hostile.targets import REFUSED, Outcome, layer_of, leaves_of, quiet, refused_one_by_one
 from tests.conformance.varied import programs
 from tests.conformance.varied.generators import random_case
-from tests.conformance.varied.judges import conditions, objective, rows
+from tests.conformance.varied.judges import conditions
 
 ROWS = ("G_x", "G_u", "g", "price")
 INF = np.inf
@@ -218,9 +219,8 @@ def _judge(form: Case, status, x, u, lam, mu, cost, violation) -> checks.Ratios:
         for name, value in parts.items():
             limit = LIMITS.get(name, 2e-6)
             put(name, i, value / limit if limit else (0.0 if value <= 0 else np.inf))
-        mine = objective(case, i, x[i], u[i])
-        put("objective", i, abs(mine - cost[i]) / (1e-8 * (1 + _size(case, i, x[i], u[i]))))
-        c, size = rows(case, i, x[i], u[i])
+        mine, mine_size, c, size = _cost(case, i, x[i], u[i])
+        put("objective", i, abs(mine - cost[i]) / (1e-8 * (1 + mine_size)))
         worst = np.maximum(np.where(np.isfinite(c), c, 0.0), 0.0).max(initial=0.0)
         room = 1e-9 * (1e-9 + np.where(np.isfinite(size), size, 0.0).max(initial=0.0))
         put("violation", i, abs(worst - violation[i]) / room)
@@ -229,15 +229,18 @@ def _judge(form: Case, status, x, u, lam, mu, cost, violation) -> checks.Ratios:
     return found
 
 
-def _size(case: Case, i: int, x, u) -> float:
-    """The sum of the sizes of the terms of the cost."""
-    sizes = {k: np.abs(v) for k, v in case.arrays.items()}
-    c, terms = rows(case, i, x, u)
-    price = np.stack([case.at("price", i, k) for k in range(len(x))]) if "price" in sizes else np.zeros_like(c)
+def _cost(case: Case, i: int, x, u) -> tuple[float, float, np.ndarray, np.ndarray]:
+    """The cost with the price of violations of soft rows, the rows, and the sums of the sizes of the terms of both."""
+    t = case.element(i)
+    given, sizes = (t, x, u), (judges.absolute(t), abs(x), abs(u))
+    total, size = (float(judges.cost(*terms)) for terms in (given, sizes))
+    if "g" not in t:
+        return total, size, np.zeros(0), np.zeros(0)
+    c, terms = judges.rows(*given), judges.rows(*sizes)
+    price, over = np.where(np.isfinite(t["price"]), t["price"], 0.0), np.maximum(c, 0.0)
     # A price of 1e30 makes 1e14 of the rounding of a row that is held.
-    fines = np.where(np.isfinite(price) & np.isfinite(c), price * (np.maximum(c, 0) + 1e-6 * terms), 0.0).sum()
-    absolute = replace(case, arrays={k: v for k, v in sizes.items() if k not in ROWS})
-    return float(objective(absolute, i, np.abs(x), np.abs(u)) + fines)
+    fines = np.where(np.isfinite(c), price * (over + 1e-6 * terms), 0.0).sum()
+    return total + (price * over).sum(), size + fines, c, terms
 
 
 def form_target(backend: str = "batched", warm: bool = False) -> Callable[[Case, Generator, bool], Outcome]:

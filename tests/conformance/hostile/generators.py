@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.random import Generator
 
-from tests.conformance.cases import Case
+from tests.conformance.cases import Case, in_units
 
 MATRICES = ("A", "B", "C", "D", "E", "F", "Q", "R", "Q_final")  # of the plain problem
 SHAPES = [(4, 2, 3), (9, 6, 5), (9, 6, 8), (1, 1, 1), (2, 3, 1), (3, 1, 4), (7, 3, 11), (5, 4, 2), (2, 1, 6)]
@@ -359,26 +359,7 @@ def mpc_units(rng: Generator, count: int, small: bool = False) -> Case:
         x, u, f = np.full(n_x, 1e6), np.full(n_u, 1e-6), np.full(n_lam, 1e3)
     else:
         x, u, f = power(rng, -6, 6, n_x), power(rng, -6, 6, n_u), power(rng, -3, 3, n_lam)
-    column = x[:, None]
-    return problem.changed(
-        A=column * a["A"] / x,
-        B=column * a["B"] / u,
-        C=column * a["C"] / f,
-        d=x * a["d"],
-        D=a["D"] / f[:, None] / x,
-        E=a["E"] / f[:, None] / u,
-        F=a["F"] / f[:, None] / f,
-        c=a["c"] / f,
-        Q=a["Q"] / column / x,
-        R=a["R"] / u[:, None] / u,
-        Q_final=a["Q_final"] / column / x,
-        q=a["q"] / x,
-        r=a["r"] / u,
-        q_final=a["q_final"] / x,
-        u_min=a["u_min"] * u,
-        u_max=a["u_max"] * u,
-        x0=a["x0"] * x,
-    )
+    return problem.changed(**in_units(a, x, u, f))
 
 
 def mpc_cost_scale(rng: Generator, count: int, small: bool = False) -> Case:

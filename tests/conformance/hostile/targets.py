@@ -23,7 +23,6 @@ from tests.conformance.hostile.generators import LCP, Loss
 
 REFUSED = -1  # in place of a status: a typed error
 SYSTEM = ("A", "B", "C", "d", "D", "E", "F", "c")
-NAMES = {"G_x": "G", "G_u": "E_rows", "price": "weight"}  # in `problems`
 
 
 @dataclass
@@ -208,8 +207,7 @@ def _compare(terms: np.ndarray, difference, step: float, of_terms: float = 1e-7)
 
 def layer_of(problem: Case, leaves: dict[str, torch.Tensor], backend="batched") -> LCSMPCLayer:
     """The layer of problems, through the public records."""
-    tensors = {NAMES.get(k, k): v for k, v in leaves.items()}
-    staged = frozenset(NAMES.get(k, k) for k, v in leaves.items() if v.ndim == rank(k) + 2)
+    tensors, staged = dict(leaves), frozenset(k for k, v in leaves.items() if v.ndim == rank(k) + 2)
     if staged & set(SYSTEM):  # then all of the system is given by stage
         for k in set(SYSTEM) - staged:
             tensors[k] = leaves[k].unsqueeze(1).expand(-1, problem.horizon, *leaves[k].shape[1:])

@@ -7,35 +7,24 @@ Stationarity is judged by the derivative of the Lagrangian along the trajectory,
 import numpy as np
 
 from tests.conformance.cases import Case
+from tests.conformance.judges import absolute, affine, mul, rows
 
 SYSTEM = ("A", "B", "C", "d", "D", "E", "F", "c")
 
 
 def conditions(case: Case, i: int, x, u, lam, mu) -> dict[str, float]:
     """Largest violation of each condition of element i, in parts of the sizes of the terms that make it up."""
-    H, X = len(u), largest_states(case, i, x, u, lam)
-    dynamics = complementarity = sign = 0.0
-    for k in range(H):
-        A, B, C, d, D, E, F, c = (case.at(name, i, k) for name in SYSTEM)
-        predicted = A @ x[k] + B @ u[k] + C @ lam[k] + d
-        terms = abs(A) @ abs(x[k]) + abs(B) @ abs(u[k]) + abs(C) @ abs(lam[k]) + abs(d)
-        dynamics = max(dynamics, _part(x[k + 1] - predicted, terms))
-        s = D @ x[k] + E @ u[k] + F @ lam[k] + c
-        if len(s):
-            s_terms = abs(D) @ abs(x[k]) + abs(E) @ abs(u[k]) + abs(F) @ abs(lam[k]) + abs(c)
-            complementarity = max(
-                complementarity, _part(lam[k] * s - case.relaxation, case.relaxation + 1e-7 * lam[k] * s_terms)
-            )
-            sign = max(sign, float((lam[k] <= 0).any()))
-    low, high = (np.stack([case.at(name, i, k) for k in range(H)]) for name in ("u_min", "u_max"))
-    c, size = rows(case, i, x, u)
-    price = np.stack([case.at("price", i, k) for k in range(H + 1)]) if "price" in case.arrays else np.zeros((H + 1, 0))
-    if (
-        c.size
-    ):  # a row whose terms are rounding is met to a part of what its states are made of, and of its actions' range
+    t, now = case.element(i), x[:-1]
+    predicted, s = (affine(t, names, now, u, lam) for names in ("ABCd", "DEFc"))
+    x_terms, s_terms = (affine(absolute(t), names, abs(now), abs(u), abs(lam)) for names in ("ABCd", "DEFc"))
+    X = largest_states(case, i, x, u, lam)
+    low, high = (np.broadcast_to(t[name], u.shape) for name in ("u_min", "u_max"))
+    c = size = price = np.zeros((len(x), 0))
+    if "g" in t:  # a row whose terms are rounding is met to a part of its states' terms and of its actions' range
+        c, size, price = rows(t, x, u), rows(absolute(t), abs(x), abs(u)), np.broadcast_to(t["price"], mu.shape)
         efforts = np.maximum(abs(u), 1e-3 * np.where(np.isfinite(high - low), high - low, abs(u)))
-        size = np.maximum(size, 1e-3 * np.stack([abs(case.at("G_x", i, k)) @ X for k in range(H + 1)]))
-        size[:-1] = np.maximum(size[:-1], [1e-3 * abs(case.at("G_u", i, k)) @ efforts[k] for k in range(H)])
+        size = np.maximum(size, 1e-3 * mul(abs(t["G_x"]), X))
+        size[:-1] = np.maximum(size[:-1], 1e-3 * mul(abs(t["G_u"]), efforts))
     unit = np.where(np.isfinite(c), size, 0.0).max(0, initial=0.0)
     unit = np.where(unit > 0, unit, 1.0)
     off = np.where(mu <= 0, np.maximum(c, 0), np.where(mu >= price, np.maximum(-c, 0), abs(c)))
@@ -44,10 +33,10 @@ def conditions(case: Case, i: int, x, u, lam, mu) -> dict[str, float]:
     # A bound that is so near that the step to it is rounding is met.
     near = np.where(gradient > 0, u - low, high - u) <= 1e-6 * np.where(np.isfinite(high - low), high - low, 1 + abs(u))
     return {
-        "start": float(abs(x[0] - case.arrays["x0"][i]).max()),
-        "dynamics": dynamics,
-        "complementarity": complementarity,
-        "sign": sign,
+        "start": float(abs(x[0] - t["x0"]).max()),
+        "dynamics": _part(x[1:] - predicted, x_terms),
+        "complementarity": _part(lam * s - case.relaxation, case.relaxation + 1e-7 * lam * s_terms),
+        "sign": float((lam <= 0).any()),
         "bounds": float(np.maximum(low - u, u - high).clip(0).max()),
         "rows": float((off / unit).max(initial=0.0)),
         "price": float(((mu < 0) | (mu > price)).any()),
@@ -57,42 +46,8 @@ def conditions(case: Case, i: int, x, u, lam, mu) -> dict[str, float]:
 
 def largest_states(case: Case, i: int, x, u, lam) -> np.ndarray:
     """Σ|terms| of each state, the largest over the stages: what is left of them where they cancel is rounding."""
-    sizes = [abs(x[0])]
-    for k in range(len(u)):
-        A, B, C, d = (abs(case.at(name, i, k)) for name in "ABCd")
-        sizes.append(A @ abs(x[k]) + B @ abs(u[k]) + C @ abs(lam[k]) + d)
-    return np.max(sizes, 0)
-
-
-def rows(case: Case, i: int, x, u) -> tuple[np.ndarray, np.ndarray]:
-    """G_x x + G_u u − g of element i, (H+1, n_c), and the sizes of its terms."""
-    if "g" not in case.arrays:
-        return np.zeros((len(x), 0)), np.zeros((len(x), 0))
-    values, sizes = [], []
-    for k in range(len(x)):
-        G, g = case.at("G_x", i, k), case.at("g", i, k)
-        value, size = G @ x[k] - g, abs(G) @ abs(x[k]) + abs(g)
-        if k < len(u):
-            E = case.at("G_u", i, k)
-            value, size = value + E @ u[k], size + abs(E) @ abs(u[k])
-        values.append(value)
-        sizes.append(size)
-    return np.stack(values), np.stack(sizes)
-
-
-def objective(case: Case, i: int, x, u) -> float:
-    """The cost with the price of violations of soft rows."""
-    total = 0.0
-    for k in range(len(u)):
-        Q, R, S, q, r = (case.at(name, i, k) for name in ("Q", "R", "S", "q", "r"))
-        total += x[k] @ (0.5 * Q @ x[k] + q + S @ u[k]) + u[k] @ (0.5 * R @ u[k] + r)
-    total += x[-1] @ (0.5 * case.at("Q_final", i, 0) @ x[-1] + case.at("q_final", i, 0))
-    c, _ = rows(case, i, x, u)
-    for k in range(len(x)):
-        for j in range(c.shape[1]):
-            price = case.at("price", i, k)[j]
-            total += price * max(c[k, j], 0.0) if np.isfinite(price) else 0.0
-    return float(total)
+    terms = affine(absolute(case.element(i)), "ABCd", abs(x[:-1]), abs(u), abs(lam))
+    return np.maximum(abs(x[0]), terms.max(0))
 
 
 def reduced_gradient(case: Case, i: int, x, u, lam, mu) -> tuple[np.ndarray, np.ndarray]:
