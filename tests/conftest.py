@@ -144,6 +144,15 @@ def build() -> type[Build]:
     return Build
 
 
+@pytest.fixture(scope="module")
+def stand_ins(tmp_path_factory):
+    """No test sees the user's meshes: objects of the YCB set are stand-ins, whose parts are computed once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DIFFLCS_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "difflcs-cache"))
+        patch.delenv("DIFFLCS_YCB_DIR", raising=False)
+        yield
+
+
 @pytest.fixture(scope="module", autouse=True)
 def registries():
     """What a file registers is gone after it: no other file finds it, in whatever order a process runs them."""

@@ -16,13 +16,7 @@ from tests.conformance.toy import make_task  # noqa: E402
 TASKS = {**{name: get_task(name) for name in task_names()}, "toy": make_task("conformance-toy")}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def stand_ins(tmp_path_factory):
-    """No test sees the user's meshes: objects of the YCB set are stand-ins."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("DIFFLCS_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "difflcs-cache"))
-        patch.delenv("DIFFLCS_YCB_DIR", raising=False)
-        yield
+pytestmark = pytest.mark.usefixtures("stand_ins")
 
 
 @pytest.fixture(scope="module", params=TASKS)

@@ -9,7 +9,7 @@ from functools import reduce
 
 import pytest
 import torch
-from safetensors.torch import load_file, save, save_file
+from safetensors.torch import load_file, save
 
 from difflcs import LCSModel, _storage, zoo
 from difflcs.errors import CheckpointError
@@ -75,12 +75,23 @@ RECORDS = {
 
 @pytest.fixture(params=RECORDS)
 def record(request, tmp_path):
-    """A record on disk, and what loads it."""
+    """A record on disk, what loads it, its description, and what writes another one with checksums that fit."""
     make, load = RECORDS[request.param]
     path = tmp_path / "000001"
     make(path)
     load(path)
-    return path, load
+    header = json.loads((path / "config.json").read_text())
+
+    def rewrite(changed, tensors=None):
+        if "sha256" in header["config"] and isinstance(changed.get("config"), dict):
+            content = {k: v for k, v in changed["config"].items() if k != "sha256"}
+            digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+            changed = {**changed, "config": {**content, "sha256": digest}}
+        write(path / "config.json", changed)
+        tensors = load_file(path / "model.safetensors") if tensors is None else tensors
+        (path / "model.safetensors").write_bytes(save(tensors, metadata={"sha256": _storage.digest(changed, tensors)}))
+
+    return path, load, header, rewrite
 
 
 def paths_of(value, path=()):
@@ -101,18 +112,6 @@ def put(document, path, value):
         part = part[key]
     part[path[-1]] = value
     return copy
-
-
-def signed(path, header):
-    """Write a description, and give the tensors a checksum that fits it."""
-    tensors = load_file(path / "model.safetensors")
-    write(path / "config.json", header)
-    (path / "model.safetensors").write_bytes(save(tensors, metadata={"sha256": _storage.digest(header, tensors)}))
-
-
-def digest(content):
-    """The checksum of a checkpoint's description."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def loads_or_refuses(load, *arguments):
@@ -206,61 +205,49 @@ def test_the_name_of_the_latest_checkpoint(tmp_path, name):
 
 
 def test_any_value_in_any_field(record):
-    path, load = record
-    header = json.loads((path / "config.json").read_text())
+    path, load, header, rewrite = record
     for place in paths_of(header):
         for value in VALUES:
             changed = put(header, place, value)
             if isinstance(changed, dict) and place[:2] != ("config", "sha256"):
-                if "sha256" in header["config"] and isinstance(changed.get("config"), dict):
-                    content = {k: v for k, v in changed["config"].items() if k != "sha256"}
-                    changed["config"]["sha256"] = digest(content)
-                signed(path, changed)
+                rewrite(changed)
             else:
                 write(path / "config.json", changed)
             loads_or_refuses(load, path)
 
 
 def test_sizes_are_compared_before_anything_is_made(record):
-    path, load = record
-    header = json.loads((path / "config.json").read_text())
+    path, load, header, rewrite = record
     sizes = {"n_x", "n_u", "n_lam", "width", "networks", "n_features"}
     for place in [p for p in paths_of(header) if sizes & set(p[-1:])]:
         for size in (10**5, 10**9, 10**18):
-            changed = put(header, place, size)
-            if "sha256" in header["config"]:
-                content = {k: v for k, v in changed["config"].items() if k != "sha256"}
-                changed["config"]["sha256"] = digest(content)
-            signed(path, changed)
+            rewrite(put(header, place, size))
             with pytest.raises(CheckpointError, match="expected"):
                 load(path)
 
 
 @pytest.mark.parametrize("name", ["float16", "bfloat16", "int64", "bool", "complex64", "float8_e5m2"])
 def test_tensors_of_another_type(record, name):
-    path, load = record
-    header = json.loads((path / "config.json").read_text())
-    tensors = {k: v.to(getattr(torch, name)) for k, v in load_file(path / "model.safetensors").items()}
-    save_file(tensors, path / "model.safetensors", metadata={"sha256": _storage.digest(header, tensors)})
+    path, load, header, rewrite = record
+    rewrite(header, {k: v.to(getattr(torch, name)) for k, v in load_file(path / "model.safetensors").items()})
     with pytest.raises(CheckpointError):
         load(path)
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
 def test_tensors_that_are_not_finite(record, value):
-    path, load = record
-    header = json.loads((path / "config.json").read_text())
+    path, load, header, rewrite = record
     tensors = load_file(path / "model.safetensors")
     for tensor in tensors.values():
         tensor.view(-1)[0] = value
-    save_file(tensors, path / "model.safetensors", metadata={"sha256": _storage.digest(header, tensors)})
+    rewrite(header, tensors)
     with pytest.raises(CheckpointError, match="finite"):
         load(path)
 
 
 def test_random_damage(record):
     """Seeded: flipped bits, cuts, runs of random bytes, pieces swapped. The header of the tensors gets half of it."""
-    path, load = record
+    path, load, *_ = record
     rng = random.Random(0)
     for name in ("config.json", "model.safetensors"):
         whole = (path / name).read_bytes()

@@ -57,13 +57,7 @@ TIMES = ["machine", "train_seconds", "evaluation_seconds", "finished"]
 """Columns in which two results of the same unit may differ."""
 
 
-@pytest.fixture(scope="module", autouse=True)
-def stand_ins(tmp_path_factory):
-    """No meshes, whatever this machine has: the same objects everywhere."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.delenv("DIFFLCS_YCB_DIR", raising=False)
-        patch.setenv("DIFFLCS_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
-        yield
+pytestmark = pytest.mark.usefixtures("stand_ins")
 
 
 def quietly(terminal=False):

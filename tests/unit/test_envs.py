@@ -14,6 +14,7 @@ mujoco = pytest.importorskip("mujoco", reason="the environments need the extra [
 
 
 import difflcs_envs  # noqa: E402
+from difflcs_envs.hand.env import HandTurnObjectEnv  # noqa: E402
 from difflcs_envs.rendering import SceneRenderer, has_display, select_gl_backend  # noqa: E402
 from difflcs_envs.trifinger import kinematics  # noqa: E402
 from difflcs_envs.trifinger.env import TriFingerMoveCubeEnv  # noqa: E402
@@ -132,15 +133,21 @@ def test_given_goal_leaves_later_episodes_alone():
 @pytest.mark.parametrize(
     "clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deepcopy", "pickle"]
 )
-def test_copies_continue_the_episode(clone):
-    env = make(osc_kp=2500.0, reset_noise=0.05)
-    rng = np.random.default_rng(0)
+@pytest.mark.parametrize(
+    ("kind", "arguments", "size", "limit"),
+    [
+        (TriFingerMoveCubeEnv, {"osc_kp": 2500.0, "reset_noise": 0.05}, 6, 0.015),
+        (HandTurnObjectEnv, {"object": "nut"}, 16, 0.2),
+    ],
+)
+def test_copies_continue_the_episode(kind, arguments, size, limit, clone):
+    env, rng = kind(**arguments), np.random.default_rng(0)
     env.reset(seed=2)
     for _ in range(7):
-        env.step(rng.uniform(-0.015, 0.015, 6))
+        env.step(rng.uniform(-limit, limit, size))
     twin = clone(env)
     for _ in range(13):
-        action = rng.uniform(-0.015, 0.015, 6)
+        action = rng.uniform(-limit, limit, size)
         a, b = env.step(action), twin.step(action)
         np.testing.assert_array_equal(a[0]["state"], b[0]["state"])
         assert a[1:4] == b[1:4]

@@ -1,8 +1,5 @@
 """The hand that turns objects: what lies on the palm, what the numbers mean, and its physics as a system."""
 
-import copy
-import pickle
-
 import numpy as np
 import pytest
 import torch
@@ -88,21 +85,6 @@ def test_the_reward_has_a_gradient():
     state, goal = (torch.from_numpy(env.reset(seed=0)[0][name]) for name in ("state", "goal"))
     state.requires_grad_()
     assert torch.autograd.gradcheck(lambda x: TURN_OBJECT.judge(x, torch.zeros(16).double(), x, goal, False)[0], state)
-
-
-@pytest.mark.parametrize(
-    "clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deepcopy", "pickle"]
-)
-def test_copies_continue_the_episode(clone):
-    env, rng = make("nut"), np.random.default_rng(0)
-    env.reset(seed=2)
-    for _ in range(5):
-        env.step(rng.uniform(-0.1, 0.1, 16))
-    other, action = clone(env), rng.uniform(-0.2, 0.2, 16)
-    one, two = env.step(action), other.step(action)
-    np.testing.assert_array_equal(one[0]["state"], two[0]["state"])
-    assert one[1:4] == two[1:4]
-    assert one[4]["clipped"]
 
 
 BAD = {"object": "cup", "object_mass": 0.0, "friction": -1, "servo_gain": 0, "turn": 4, "render_mode": "human"}

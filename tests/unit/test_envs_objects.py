@@ -32,11 +32,7 @@ OUTWARD = np.stack([-np.sin(FINGER_YAWS), np.cos(FINGER_YAWS)], axis=1)
 REST = np.zeros(6)
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path_factory, monkeypatch):
-    """No test sees the user's meshes; the parts are computed once."""
-    monkeypatch.setenv("DIFFLCS_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "difflcs-cache"))
-    monkeypatch.delenv("DIFFLCS_YCB_DIR", raising=False)
+pytestmark = pytest.mark.usefixtures("stand_ins")
 
 
 def make(name="mug", **arguments):

@@ -19,11 +19,7 @@ NAMES = ("cube", "turn_cube", *YCB)
 FEW = ("cube", "turn_cube", "mug")
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path_factory, monkeypatch):
-    """No test sees the user's meshes."""
-    monkeypatch.setenv("DIFFLCS_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "difflcs-cache"))
-    monkeypatch.delenv("DIFFLCS_YCB_DIR", raising=False)
+pytestmark = pytest.mark.usefixtures("stand_ins")
 
 
 @pytest.mark.slow
