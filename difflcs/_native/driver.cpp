@@ -56,6 +56,29 @@ constexpr int64_t kAloneForces = 40, kAlone = 48;
 // Elements are searched in chunks, so that the memory for all starts stays small.
 constexpr int64_t kJobs = 8192, kChunk = 64;
 
+// A variation of a plan: the actions of its first half, its second half, or all, some stages later, so many times as
+// large, and with noise, in parts of their range.
+struct Variation {
+  enum { all, begin, end } part;
+  int64_t later;
+  double scale, noise;
+};
+
+// Local search round the best plan of the starts. Two rounds try these, half of them each. Where contacts are made and
+// broken, an optimum next to a plan touches a stage earlier or later, or harder; random starts rarely find that.
+constexpr Variation kVariations[] = {
+    {Variation::all, 1, 1, 0},    {Variation::all, -1, 1, 0},  {Variation::all, 2, 1, 0},
+    {Variation::begin, 1, 1, 0},  {Variation::end, 1, 1, 0},   {Variation::end, -1, 1, 0},
+    {Variation::all, 0, 1.5, 0},  {Variation::all, 0, 1, 0.5}, {Variation::all, -2, 1, 0},
+    {Variation::begin, -1, 1, 0}, {Variation::all, 4, 1, 0},   {Variation::end, 2, 1, 0},
+    {Variation::end, 0, 1.5, 0},  {Variation::all, 0, 0.5, 0}, {Variation::all, 0, 1, 0.25},
+    {Variation::all, 0, 1, 1}};
+constexpr int64_t kKinds = 16, kVaried = 8;
+// With fewer starts than kVaried there is no local search. It ends when all variations in turn have not made the cost
+// smaller by the part kGain.
+constexpr double kGain = 1e-3;
+constexpr int64_t kMostRounds = 16;
+
 // A number in [0, 1) for every triple: splitmix64.
 double uniform(uint64_t seed, int64_t start, int64_t position) {
   uint64_t z = seed * 0x9e3779b97f4a7c15u + uint64_t(start) * 0xbf58476d1ce4e5b9u + uint64_t(position);
@@ -204,6 +227,8 @@ void MpcDriver::reserve(const MpcBatch& batch, int64_t starts) {
   tried.resize(batch, jobs);
   finished.resize(batch, jobs);
   best.reserve(batch.count);
+  live.reserve(batch.count);
+  idle.reserve(batch.count);
   origin.reserve(jobs);
 }
 
@@ -366,6 +391,36 @@ void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
   }
 
   finish(batch, guess, effort, to, runner, first, count);
+  improve(batch, effort, to, runner, first, count);
+}
+
+// Solves those jobs to the end that are wanted. Returns their number: they are the first of `finished`, and `origin`
+// says which jobs they were.
+template <class Wanted>
+int64_t MpcDriver::solve_tried(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, Wanted wanted) {
+  const Sizes n(batch);
+  const int64_t all = int64_t(tried.element.size());
+  finished.resize(batch, all);
+  origin.resize(all);
+  int64_t kept = 0;
+  for (int64_t j = 0; j < all; j++) {
+    if (tried.status[j] == kUnreached || !wanted(j)) continue;
+    copy_plan(n, tried.plans(), j, finished.plans(), kept);
+    origin[kept] = j;
+    finished.element[kept] = tried.element[j];
+    finished.start[kept] = at_target(batch);
+    kept++;
+  }
+  MpcBatch jobs = batch;
+  jobs.count = kept;
+  jobs.element = finished.element.data();
+  MpcSolve o = solver_options(effort, finished.plans());
+  o.u_start = o.u;
+  o.lam_start = o.lam;
+  o.mu_start = o.mu;
+  o.start = finished.start.data();
+  if (kept) run(jobs, o, runner);
+  return kept;
 }
 
 // Solves the jobs to the end that may still become the best of their element. A start whose last step gained less than
@@ -374,8 +429,6 @@ void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
                        Runner& runner, int64_t first, int64_t count) {
   const Sizes n(batch);
   const int64_t all = effort.starts * count;
-  finished.resize(batch, all);
-  origin.resize(all);
   std::fill_n(out.status, count, kUnreached);
   std::fill_n(out.iterations, count, 0);
   const auto consider = [&](const MpcPlans& from, int64_t i, int64_t e, bool only_solved) {
@@ -387,32 +440,19 @@ void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
     const bool alike = done ? solved(out.status[e]) : from.status[i] == out.status[e];
     if (better || (alike && from.objective[i] < out.objective[e])) copy_plan(n, from, i, out, e);
   };
+  const auto promises = [&](int64_t j) {
+    const int64_t b = best[j % count];
+    return j == b || promising(batch, j, tried.u.data() + b * n.u, tried.objective[b]);
+  };
   const auto solve = [&](auto wanted) {
-    int64_t kept = 0;
-    for (int64_t j = 0; j < all; j++) {
-      if (tried.status[j] == kUnreached || !wanted(j)) continue;
-      copy_plan(n, tried.plans(), j, finished.plans(), kept);
-      origin[kept] = j;
-      finished.element[kept] = tried.element[j];
-      finished.start[kept] = at_target(batch);
-      kept++;
-    }
-    MpcBatch jobs = batch;
-    jobs.count = kept;
-    jobs.element = finished.element.data();
-    MpcSolve o = solver_options(effort, finished.plans());
-    o.u_start = o.u;
-    o.lam_start = o.lam;
-    o.mu_start = o.mu;
-    o.start = finished.start.data();
-    if (kept) run(jobs, o, runner);
+    const int64_t kept = solve_tried(batch, effort, runner, wanted);
     for (int64_t i = 0; i < kept; i++) consider(finished.plans(), i, origin[i] % count, false);
   };
-  if (!runner.stopped()) solve([&](int64_t j) { return promising(batch, j, best[j % count]); });
+  if (!runner.stopped()) solve(promises);
   // Some were solved before they were compared.
   for (int64_t j = 0; j < all; j++) consider(tried.plans(), j, j % count, true);
   if (!runner.stopped())
-    solve([&](int64_t j) { return !solved(out.status[j % count]) && !promising(batch, j, best[j % count]); });
+    solve([&](int64_t j) { return !solved(out.status[j % count]) && !promises(j); });
   for (int64_t e = 0; e < count; e++) {
     if (out.status[e] != kUnreached) continue;
     if (best[e] >= 0) {  // out of time after its starts were compared
@@ -426,17 +466,72 @@ void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
   }
 }
 
-bool MpcDriver::promising(const MpcBatch& batch, int64_t job, int64_t best) const {
-  if (job == best) return true;
-  if (!(tried.objective[job] - tried.gained[job] <= tried.objective[best])) return false;
+// Whether a job may become better than a plan, and does not approach the same one.
+bool MpcDriver::promising(const MpcBatch& batch, int64_t job, const double* u, double objective) const {
+  if (!(tried.objective[job] - tried.gained[job] <= objective)) return false;
   const Sizes n(batch);
   for (int64_t i = 0; i < n.u; i++) {
     const Bound bound(batch, tried.element[job], i);
-    const double here = tried.u[job * n.u + i], there = tried.u[best * n.u + i];
-    const double range = bound.finite() ? bound.high - bound.low : 1.0 + std::abs(there);
-    if (std::abs(here - there) > kSame * range) return true;
+    const double here = tried.u[job * n.u + i];
+    const double range = bound.finite() ? bound.high - bound.low : 1.0 + std::abs(u[i]);
+    if (std::abs(here - u[i]) > kSame * range) return true;
   }
   return false;
+}
+
+// Sets the first actions of a job to those of a plan, varied.
+void MpcDriver::vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kind, const double* plan, int64_t job) {
+  const Variation& v = kVariations[kind % kKinds];
+  const int64_t begin = v.part == Variation::end ? batch.horizon / 2 : 0;
+  const int64_t end = v.part == Variation::begin ? batch.horizon / 2 : batch.horizon;
+  for (int64_t i = 0; i < batch.horizon * batch.n_u; i++) {
+    const Bound bound(batch, tried.element[job], i);
+    const int64_t k = i / batch.n_u, j = i % batch.n_u;
+    const bool varied = begin <= k && k < end;
+    const int64_t from = varied ? std::min(std::max(k + v.later, begin), end - 1) : k;
+    const double action = (varied ? v.scale : 1.0) * plan[from * batch.n_u + j];
+    const double range = bound.finite() ? bound.high - bound.low : 1.0 + std::abs(action);
+    tried.u[job * batch.horizon * batch.n_u + i] =
+        bound.clip(action + v.noise * range * (2.0 * uniform(effort.seed, -1 - kind, i) - 1.0));
+  }
+}
+
+// Varies the plans of elements [first, first + count), and keeps what is better, until that gains nothing.
+void MpcDriver::improve(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner,
+                        int64_t first, int64_t count) {
+  const Sizes n(batch);
+  const int64_t patience = kKinds / kVaried;
+  idle.assign(count, 0);
+  live.clear();
+  for (int64_t e = 0; e < count; e++)
+    if (effort.starts >= kVaried && solved(out.status[e])) live.push_back(e);
+  for (int64_t round = 0; round < kMostRounds && !live.empty() && !runner.stopped(); round++) {
+    // Job v * elements + i is variation v of the plan of the i-th element that is not done.
+    const int64_t elements = int64_t(live.size()), all = kVaried * elements;
+    tried.resize(batch, all);
+    std::fill(tried.status.begin(), tried.status.end(), kUnreached);
+    std::fill(tried.iterations.begin(), tried.iterations.end(), 0);
+    for (int64_t j = 0; j < all; j++) {
+      const int64_t e = live[j % elements];
+      tried.element[j] = batch.element ? batch.element[first + e] : first + e;
+      tried.start[j] = {false, false, 0.0, comparison(batch)};
+      tried.start[j].explore = kExploreFar;
+      vary(batch, effort, kVaried * round + j / elements, out.u + e * n.u, j);
+    }
+    explore(batch, effort, runner, 0, all, false);
+    const int64_t kept = solve_tried(batch, effort, runner, [&](int64_t j) {
+      const int64_t e = live[j % elements];
+      return promising(batch, j, out.u + e * n.u, out.objective[e]);
+    });
+    for (int64_t i = 0; i < kept; i++) {
+      const int64_t e = live[origin[i] % elements];
+      out.iterations[e] += finished.iterations[i];
+      if (!solved(finished.status[i]) || !(finished.objective[i] < out.objective[e])) continue;
+      if (finished.objective[i] < out.objective[e] - kGain * std::abs(out.objective[e])) idle[e] = -1;
+      copy_plan(n, finished.plans(), i, out, e);
+    }
+    live.erase(std::remove_if(live.begin(), live.end(), [&](int64_t e) { return ++idle[e] >= patience; }), live.end());
+  }
 }
 
 // Solves the elements that failed (one in a thousand) once more, from no action along a longer homotopy; then, if

@@ -79,12 +79,18 @@ class MpcDriver {
   void begin(const MpcBatch& batch, const MpcEffort& effort, int64_t start, int64_t job, int64_t best);
   void finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
               Runner& runner, int64_t first, int64_t count);
-  bool promising(const MpcBatch& batch, int64_t job, int64_t best) const;
+  template <class Wanted>
+  int64_t solve_tried(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, Wanted wanted);
+  bool promising(const MpcBatch& batch, int64_t job, const double* u, double objective) const;
+  void vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kind, const double* plan, int64_t job);
+  void improve(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, int64_t first,
+               int64_t count);
   void retry_failed(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner, bool pivot);
 
   const Kernels& kernels;
   Store tried, finished;
   std::vector<int64_t> best;    // of the jobs tried for each element
+  std::vector<int64_t> live, idle;  // elements that are still searched, and for how many rounds without gain
   std::vector<int64_t> origin;  // the job, or the element, that each of some problems comes from
 };
 

@@ -43,7 +43,7 @@ def test_threads_change_nothing_not_even_summed_gradients(build):
     found = []
     for threads in (1, 2, 5):
         model.zero_grad()
-        plan = pushing(build, 5, lcs=model, threads=threads)(x0, goal)
+        plan = pushing(build, 5, lcs=model, threads=threads, effort="best")(x0, goal)
         plan.action.square().sum().backward()
         found.append([plan.u.detach(), *(p.grad.clone() for p in model.parameters())])
     for other in found[1:]:
@@ -139,7 +139,7 @@ def test_more_effort_finds_better_optima(build, n_lam):
     gap = {effort: float(torch.stack(means).mean()) for effort, means in gaps.items()}
     assert gap["best"] <= gap["default"] <= gap["fast"]
     assert gap["default"] < 0.8 * gap["fast"]
-    assert gap["best"] < 0.003
+    assert gap["best"] < 0.001
 
 
 def test_an_unstable_plant_starts_from_its_feedback_law():
@@ -231,6 +231,7 @@ def test_plans_of_many_contacts_get_more_starts():
     assert starts(5, 8, guessed=True) == [1, 1, 16]
     assert starts(20, 5, guessed=False) == [1, 16, 64]
     assert starts(20, 5, guessed=True) == [1, 1, 64]
+    assert starts(40, 1, guessed=False) == [1, 16, 64]
     assert starts(20, 5, guessed=True, restarts=5) == starts(5, 5, guessed=False, restarts=5) == [5]
 
 

@@ -20,9 +20,9 @@ from difflcs.status import Status, solved
 
 Effort = Literal["fast", "default", "best"]
 _STARTS: dict[str, int] = {"fast": 1, "default": 4, "best": 16}
-# Plans that can make many contacts, horizon × n_lam, have many optima: on a row of ten carts four starts miss the best
-# plan by 2.5 % on average, sixteen by less than 0.1 % (benchmarks/optima.py).
-_MANY_CONTACTS, _MORE_STARTS = 100, 4
+# Plans that can make many contacts, horizon × n_lam, or are long, have many optima: on a row of ten carts four starts
+# miss the best plan by 2.5 % on average, sixteen by less than 0.1 % (benchmarks/optima.py).
+_MANY_CONTACTS, _LONG_HORIZON, _MORE_STARTS = 100, 40, 4
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,8 @@ class BatchedBackend(Backend):
     which find contacts that are far; random pulses, a push and a brake of each action. Starts are compared after a few
     steps at the relaxation, and only those that may still win are solved to the end. The starts of an element lie side
     by side in the lanes of a vector, so that one problem with four starts takes less than twice as long as with one; a
-    batch pays for each.
+    batch pays for each. From eight starts on a local search follows: the best plan is varied, above all a stage or more
+    earlier or later, until that finds nothing better.
 
     Every trajectory is judged after the solve by `difflcs.mpc.kkt.residual`, recomputed from the numbers that are
     returned (`difflcs/_native/certificate.hpp`); one that claims to be solved and is not becomes NUMERICAL. Ctrl-C ends
@@ -62,9 +63,9 @@ class BatchedBackend(Backend):
 
     Attributes:
         effort: "fast", one start; "default", four; "best", sixteen; the last two four times as many where horizon ×
-            n_lam is 100 or more, as such plans have many optima. A guess is the first start, and the only one but for
-            "best". Without contact (n_lam = 0) one start is enough.
-        restarts: number of starts, whatever the effort; None: that of the effort.
+            n_lam is 100 or more, or the horizon 40, as such plans have many optima. A guess is the first start, and the
+            only one but for "best". Without contact (n_lam = 0) one start is enough.
+        restarts: number of starts, whatever the effort; None: that of the effort. From eight on with a local search.
         tol: projected gradient dJ/du at which a problem is solved, or 1e-12 of the terms that sum to it if that is
             more. It must also be below 1e-7 of its scale, see `difflcs.mpc.kkt.residual`.
         max_iter: iteration limit of one solve. An element that fails is solved once more, cold and along a longer
@@ -171,7 +172,7 @@ class BatchedBackend(Backend):
             return self.restarts
         if self.effort == "fast" or (guessed and self.effort != "best"):
             return 1  # a guess is taken to be near the optimum that is wanted
-        many = problem.horizon * problem.n_lam >= _MANY_CONTACTS
+        many = problem.horizon * problem.n_lam >= _MANY_CONTACTS or problem.horizon >= _LONG_HORIZON
         return _STARTS[self.effort] * (_MORE_STARTS if many else 1)
 
     def vjp(
