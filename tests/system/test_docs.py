@@ -253,14 +253,3 @@ def test_a_page_that_is_out_of_date_is_found(generated):
     page = (DOCS / "settings.md").read_text()
     stale = page.replace("| `--seed` |", "| `--sead` |")
     assert page == generated.refresh(stale) != stale
-
-
-def test_the_site_builds(tmp_path):
-    pytest.importorskip("sphinx")
-    pytest.importorskip("myst_nb")
-    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-E", "-b", "html"]
-    done = subprocess.run(
-        [*command, "-d", tmp_path / "trees", DOCS, tmp_path / "site"],
-        capture_output=True, text=True, timeout=900, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-3000:]

@@ -92,7 +92,8 @@ def _constrained(case: Case, rng: Generator, form: _Form) -> Case:
     arrays["price"] = form.scale("price", price)
     arrays["g"] = np.zeros(n_c)
     problem = replace(case, arrays=arrays).problem()
-    free = BatchedBackend(threads=1).solve(case.problem(), None).primal
+    # Of a plant that runs away a thousand iterations from each start would take a minute.
+    free = BatchedBackend(threads=1, max_iter=200).solve(case.problem(), None).primal
     known = rng.random() < 0.67
     noise = torch.from_numpy(rng.standard_normal((batch, horizon, n_u)))
     u = problem.clip(free.u + 0.3 * (0.1 + free.u.abs().mean()) * noise) if known else free.u
