@@ -15,6 +15,7 @@ import pytest
 from difflcs import LCSModel, LCSMPCLayer, cli
 from difflcs.errors import InvalidInputError
 from difflcs.mpc import MPCController
+from difflcs.mpc.backends import BatchedBackend
 from difflcs.mpc.export import export_controller
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -121,10 +122,12 @@ def test_the_example_closes_the_loop_bit_equal_to_python(exported, robot):
 
 @pytest.mark.slow
 @needs_tools
-def test_what_the_header_promises(exported, project):
-    folder = project("tests/native/c")
-    for kind in ("difflcs", "difflcs_static"):
-        assert call(folder / f"contract_{kind}", exported / "controller.difflcs") == "all holds\n"
+def test_what_the_header_promises(exported, project, build, tmp_path):
+    folder, searching = project("tests/native/c"), BatchedBackend(effort="best")
+    mpc = LCSMPCLayer(LCSModel.from_pretrained(MODEL), build.paper_cost(), 8, -0.015, 0.015, backend=searching)
+    mpc.controller().save(tmp_path / "best.difflcs")
+    for kind, file in (("difflcs", exported / "controller.difflcs"), ("difflcs_static", tmp_path / "best.difflcs")):
+        assert call(folder / f"contract_{kind}", file) == "all holds\n"
 
 
 @pytest.mark.slow
