@@ -73,11 +73,10 @@ constexpr Variation kVariations[] = {
     {Variation::begin, -1, 1, 0}, {Variation::all, 4, 1, 0},   {Variation::end, 2, 1, 0},
     {Variation::end, 0, 1.5, 0},  {Variation::all, 0, 0.5, 0}, {Variation::all, 0, 1, 0.25},
     {Variation::all, 0, 1, 1}};
-constexpr int64_t kKinds = 16, kVaried = 8;
+constexpr int64_t kKinds = 16, kVaried = 8, kMostRounds = 16;
 // With fewer starts than kVaried there is no local search. It ends when all variations in turn have not made the cost
 // smaller by the part kGain.
 constexpr double kGain = 1e-3;
-constexpr int64_t kMostRounds = 16;
 
 // A number in [0, 1) for every triple: splitmix64.
 double uniform(uint64_t seed, int64_t start, int64_t position) {
