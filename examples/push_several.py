@@ -104,7 +104,7 @@ class Body:
     Attributes:
         outline: (n, 2) points along it, at most .15 apart.
         grid: distances to it.
-        ring: (14, 2) waypoints of a disc round it.
+        ring: (20, 2) waypoints of a disc round it.
     """
 
     def __init__(self, shape: Union):
@@ -118,7 +118,7 @@ class Body:
         points = torch.cat(points)
         self.outline = points[shape.distance(points).distance.amin(-1) > -1e-6]
         self.grid = DistanceGrid(shape, 1.0)
-        self.ring = ring(shape, RADIUS + 0.1, 14)
+        self.ring = ring(shape, RADIUS + 0.1, 20)
 
 
 BODIES = {name: Body(shape) for name, shape in SHAPES.items()}
@@ -275,7 +275,7 @@ class TableTravel:
         self._poses = poses.clone()
         nodes = torch.cat([from_body(p, body.ring) for p, body in zip(poses, self.table.bodies, strict=True)])
         fit = (self.table.gap(nodes) > RADIUS + 0.04) & self.workspace.contains(nodes)
-        self._nodes = nodes[fit]
+        self._nodes = nodes[fit] if int(fit.sum()) > 1 else nodes
         self._between = torch.full((len(self._nodes),) * 2, math.inf, dtype=nodes.dtype)
         i, j = torch.triu_indices(*self._between.shape, offset=1)
         seen = self._in_sight(self._nodes[i], self._nodes[j])
