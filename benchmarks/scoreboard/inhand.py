@@ -6,17 +6,17 @@ DIR has to contain; or set DIFFLCS_INHAND_DIR. An object lies on the palm, its p
 yaw uniform in ±90°; the goal is 90° of yaw away, to either side. A decision moves the targets of 16 joint servos by
 at most 0.1 rad, 0.2 rad for objects of 100 g, from where the joints are, and holds them for 50 steps of 2 ms.
 
-- Success: 1 − (q·goal)² < 0.04, which is 23°, after each of 21 decisions in a row. With `--position`
-  the object has to be within 2 cm of its target place as well.
+- Success: 1 − (q·goal)² < 0.04, which is 23°, after each of 21 decisions in a row.
 - Failure: 500 decisions, or the object's centre below 5 mm.
+- An object is placed if it is within 2 cm of its target place as well: of a success at its end, or with `--position`,
+  which plays on for it, in 21 decisions in a row.
 
 Beyond the papers, `--axes any` turns by 30° to 90° about any axis, `--seconds 60` gives the next goal where one is
 reached, until the object falls or the time is over, and `--tilt 30` inclines the hand. They can be combined.
 
-The controller knows model and state, and tries each planned step in MuJoCo, at several paces, before it is executed.
-It has one set of settings for all objects, chosen with seeds from 1000 to 1024; final figures are of seeds 5000 and up.
-Times are CPU times of one core. With `--out FILE` episodes that are in the file are not played again: after a change of
-the controller begin another file.
+The controller knows model and state, and tries each step in MuJoCo before it is executed. It has one set of settings,
+chosen with seeds below 1034; final figures are of seeds 5000 and up. Times are CPU times of one core. With `--out FILE`
+episodes that are in the file are not played again: after a change of the controller begin another file.
 """
 
 from __future__ import annotations
@@ -64,16 +64,16 @@ OBJECTS = {  # place of the start [m], its height, and the target place, as publ
 }
 JOINTS = (0.125, 1.13, 1.45, 1.24, -0.02, 0.445, 1.17, 1.5, -0.459, 1.54, 1.11, 1.23, 0.638, 1.85, 1.5, 1.26)
 FINGERS, LINKS = ("ff", "mf", "rf", "th"), ("base", "proximal", "medial", "distal", "tip")
-COLUMNS = "object", "seed", "success", "dropped", "steps", "position_mm", "angle_deg", "goals"
+COLUMNS = "object", "seed", "success", "placed", "dropped", "steps", "position_mm", "angle_deg", "goals"
 PARTS = "system", "cost", "solve", "rehearsal"
-LIMIT, HELD, SUBSTEPS, LOST, SECONDS, TRIALS = 500, 21, 50, 0.005, 0.1, 20
+LIMIT, HELD, SUBSTEPS, LOST, SECONDS, TRIALS, OPENING = 500, 21, 50, 0.005, 0.1, 20, 8
 
 
 @dataclass(frozen=True)
 class Settings:
     """Of the controller, the same for all objects."""
 
-    horizon: int = 4
+    horizon: int = 3
     friction: float = 0.5
     inertia: float = 5.0
     """Factor of the inertia of rotation."""
@@ -87,19 +87,16 @@ class Settings:
     near: float = 1.0
     """Weight of the distances of object and fingertips."""
     effort: float = 0.2
-    solver: str = "fast"
     patience: int = 25
     """Decisions without progress after which the hand opens, and takes the object anew."""
-    opening: int = 8
-    """Decisions for which it opens."""
     pace: float = 0.5
     """Part of the published limit of actions that is used, as drops come from fast motion."""
-    spread: float = 0.3
-    """Standard deviation of the posture to which the hand opens from the second time on [rad]."""
-    paces: tuple[float, ...] = (2.0, 1.0, 0.5)
+    paces: tuple[float, ...] = (2.0, 0.7)
     """Factors by which the planned step is tried in MuJoCo, the fastest first; none: it is executed untried."""
     slack: float = 0.02
     """Cost by which a faster step may end worse than the best."""
+    worse: float = 4.0
+    """Cost by which all have to end worse than now for the hand to try to stay as it is as well."""
 
 
 @dataclass
@@ -115,7 +112,7 @@ class Options:
     seed: int = 0
     """Seed of the first episode."""
     position: bool = False
-    """Success needs the position as well, within 2 cm."""
+    """Play on until the object is in its place as well, within 2 cm."""
     axes: Literal["vertical", "any"] = "vertical"
     """Goals are turns of ±90° about the vertical, or of 30° to 90° about any axis, both uniform."""
     seconds: float | None = None
@@ -169,6 +166,7 @@ class HandPolicy:
         self.twin.opt.timestep = SECONDS / TRIALS
         self.tried = mujoco.MjData(self.twin)
         model.body_inertia[model.body("obj").id] *= s.inertia
+        mujoco.mj_setConst(model, mujoco.MjData(model))  # simple bodies have it twice
         self.limit = 0.1 if model.body("obj").mass[0] < 0.05 else 0.2
         self.module = MujocoLCS(
             model,
@@ -185,22 +183,19 @@ class HandPolicy:
             compliance=s.compliance,
             length=0.02,
         )
-        tips = [Distance("obj", f"ftp_{i}", weight=s.near, weight_final=0.0) for i in range(4)]
         self.cost = MujocoCost(
             self.module,
             [
                 Position("body:obj", place, weight=0.0, weight_final=s.place),
                 Orientation("body:obj", weight=0.0, weight_final=s.turn, reach=s.reach),
-                *tips,
+                *(Distance("obj", f"ftp_{i}", weight=s.near, weight_final=0.0) for i in range(4)),
                 Effort(s.effort),
             ],
         )
-        backend = BatchedBackend(effort=s.solver, threads=1)
-        self.mpc = LCSMPCLayer(
-            self.module, self.cost, s.horizon, -self.limit, self.limit, backend, s.relaxation, "mask"
-        )
-        self.settings, self.guess, self.times, self.openings = settings, None, [], 0
-        self.random, self.posture = np.random.RandomState(0), np.array(JOINTS)
+        solver, far = BatchedBackend(effort="fast", threads=1), self.limit
+        self.mpc = LCSMPCLayer(self.module, self.cost, s.horizon, -far, far, solver, s.relaxation, "mask")
+        self.settings, self.guess, self.times = settings, None, []
+        self.random, self.posture, self.ctrl = np.random.RandomState(0), None, data.qpos[:16].copy()
         self.aim(goal)
 
     def aim(self, goal: np.ndarray) -> None:
@@ -212,23 +207,28 @@ class HandPolicy:
         return 2 * np.arccos(min(1.0, abs(float(data.qpos[-4:] @ self.goal))))
 
     def stalls(self, data: Any) -> bool:
-        """Tell whether the object has not turned on for too long: then the hand opens for some decisions."""
-        left = self.angle(data)
+        """Tell whether the object has not come nearer for too long: then the hand opens for some decisions."""
+        left = self.angle(data) + 20 * float(np.linalg.norm(data.qpos[-7:-4] - self.place))
         self.waited += 1
-        if self.waited > 0 and left < max(self.best - 0.05, 0.35):  # turned on by 3°, or almost there
+        if self.waited > 0 and left < max(self.best - 0.05, 0.5):  # by 3° or 2.5 mm, or it is almost there
             self.best, self.waited = min(left, self.best), 0
         if self.waited > self.settings.patience:
-            self.best, self.waited = np.inf, -self.settings.opening
-            self.openings += 1
-            spread = self.settings.spread * (self.openings > 1)
-            self.posture = np.array(JOINTS) + spread * self.random.randn(16)
+            self.best, self.waited = np.inf, -OPENING
+            self.posture = self.draw(0.0 if self.posture is None else 0.3)
         return self.waited < 0
+
+    def draw(self, spread: float) -> np.ndarray:
+        """Draw the posture to which the hand opens [rad]."""
+        return np.array(JOINTS) + spread * self.random.randn(16)
 
     def act(self, data: Any) -> np.ndarray:
         """MuJoCo's ctrl for the next 0.1 s."""
         if self.stalls(data):
             self.guess = None
-            return data.qpos[:16] + np.clip(self.posture - data.qpos[:16], -self.limit, self.limit)
+            last, ctrl = self.ctrl, self.rehearse(data, self.posture, (1.0,))
+            if ctrl is last:  # to open in this way does harm
+                self.posture = self.draw(0.3)
+            return ctrl
         limit = self.limit * self.settings.pace
         marks = [time.thread_time()]
         x = self.module.observe(data)
@@ -241,26 +241,34 @@ class HandPolicy:
             plan = self.mpc(x, lcs=system, cost=cost, guess=self.guess, u_min=low, u_max=high)
         marks.append(time.thread_time())
         self.guess = plan.shift() if bool(solved(plan.status)) else None
-        ctrl = self.module.control(x, plan.action).numpy()
-        if self.settings.paces:
-            ctrl = self.rehearse(data, ctrl)
+        ctrl = self.rehearse(data, self.module.control(x, plan.action).numpy(), self.settings.paces)
         marks.append(time.thread_time())
         self.times.append(1e3 * np.diff(marks))
         return ctrl
 
-    def rehearse(self, data: Any, ctrl: np.ndarray) -> np.ndarray:
-        """Try a step at several paces in MuJoCo: the fastest that ends about as well as the best."""
-        s, joints, ends = self.settings, data.qpos[:16], []
-        steps = [np.clip(pace * (ctrl - joints), -self.limit, self.limit) for pace in s.paces]
-        for step in steps:
-            mujoco.mj_copyState(self.twin, data, self.tried, mujoco.mjtState.mjSTATE_INTEGRATION)
-            self.tried.ctrl[:] = joints + step
-            mujoco.mj_step(self.twin, self.tried, TRIALS)
-            apart = self.tried.qpos[-7:-4] - self.place
-            left = self.angle(self.tried)
-            near = min(left, s.reach)
-            ends.append(s.place * apart @ apart + s.turn * near * (2 * left - near))
-        return joints + next(step for step, end in zip(steps, ends, strict=True) if end <= min(ends) + s.slack)
+    def rehearse(self, data: Any, ctrl: np.ndarray, paces: tuple[float, ...]) -> np.ndarray:
+        """Try a step at several paces in MuJoCo: the fastest that ends about as well as the best, or none."""
+        s, joints = self.settings, data.qpos[:16]
+        tries = [joints + np.clip(pace * (ctrl - joints), -self.limit, self.limit) for pace in paces or (1.0,)]
+        ends = [self.simulate(data, tried) for tried in tries] if s.paces else [0.0]
+        if s.paces and min(ends) > self.miss(data) + s.worse:
+            tries.append(self.ctrl)
+            ends.append(self.simulate(data, self.ctrl))
+        self.ctrl = next(tried for tried, end in zip(tries, ends, strict=True) if end <= min(ends) + s.slack)
+        return self.ctrl
+
+    def simulate(self, data: Any, ctrl: np.ndarray) -> float:
+        """Return the cost at the end of a step."""
+        mujoco.mj_copyState(self.twin, data, self.tried, mujoco.mjtState.mjSTATE_INTEGRATION)
+        self.tried.ctrl[:] = ctrl
+        mujoco.mj_step(self.twin, self.tried, TRIALS)
+        return self.miss(self.tried)
+
+    def miss(self, data: Any) -> float:
+        """Cost of the object's place, where it is 0.1 s later if nothing stops it, and of its orientation."""
+        s, left = self.settings, self.angle(data)
+        apart, near = data.qpos[-7:-4] + SECONDS * data.qvel[-6:-3] - self.place, min(left, s.reach)
+        return s.place * apart @ apart + s.turn * near * (2 * left - near)
 
 
 def play(o: Options, name: str, seed: int) -> dict[str, Any]:
@@ -272,25 +280,29 @@ def play(o: Options, name: str, seed: int) -> dict[str, Any]:
     if o.axes == "any":
         goal = next_goal(random, o.axes, goal, data.qpos[-4:])
     limit = LIMIT if o.seconds is None else round(o.seconds / SECONDS)
-    policy, held, goals, lost, steps = HandPolicy(model, data, place, goal, o.settings), 0, 0, False, 0
+    policy, held, goals, lost, steps = HandPolicy(model, data, place, goal, o.settings), np.zeros(2), 0, False, 0
+    turned = None  # after so many decisions
     while (goals == 0 or o.seconds is not None) and not lost and steps < limit:
         data.ctrl[:] = policy.act(data)
         mujoco.mj_step(model, data, SUBSTEPS)
         wrong = 1 - float(data.qpos[-4:] @ goal) ** 2
         apart = float(np.linalg.norm(data.qpos[-7:-4] - place))
-        held = held + 1 if wrong < 0.04 and (apart < 0.02 or not o.position) else 0
+        held = (held + 1) * (wrong < 0.04) * [1, apart < 0.02]  # by the angle, and with the place
         lost, steps = bool(data.qpos[-5] < LOST), steps + 1
-        if held == HELD and not lost:
-            goals, held = goals + 1, 0
+        if turned is None and held[0] == HELD and not lost:
+            turned = steps
+        if held[int(o.position)] == HELD and not lost:
+            goals, held = goals + 1, np.zeros(2)
             goal = next_goal(random, o.axes, goal, data.qpos[-4:])
             policy.aim(goal)
     return {
         "object": name,
         "seed": seed,
-        "success": goals > 0,
+        "success": turned is not None,
+        "placed": goals > 0 and apart < 0.02,
         "goals": goals,
         "dropped": lost,
-        "steps": steps,
+        "steps": turned or steps,
         "position_mm": 1e3 * apart,
         "angle_deg": 2 * np.degrees(np.arcsin(np.sqrt(np.clip(wrong, 0, 1)))),
         "milliseconds": np.mean(policy.times, 0).tolist(),
@@ -301,9 +313,10 @@ def play(o: Options, name: str, seed: int) -> dict[str, Any]:
 def figures(episodes: list[dict[str, Any]]) -> dict[str, Any]:
     """Figures of episodes; place, angle and steps are medians and means of successful ones."""
     good = [e for e in episodes if e["success"]] or episodes
-    parts = np.average([e["milliseconds"] for e in episodes], 0, [e["steps"] for e in episodes])
+    parts = np.average([e["milliseconds"] for e in episodes], 0, [len(e["all_milliseconds"]) for e in episodes])
     return {
         **success_figures(np.array([e["success"] for e in episodes], float)),
+        "placed": sum(e["placed"] for e in episodes),
         "dropped": sum(e["dropped"] for e in episodes),
         "mean_steps": float(np.mean([e["steps"] for e in good])),
         "mean_goals": float(np.mean([e["goals"] for e in episodes])),
@@ -327,38 +340,22 @@ def main(o: Options) -> None:
     warnings.simplefilter("ignore", ContactWarning)
     lines = o.out.read_text().splitlines() if o.out is not None and o.out.exists() else []
     known = {(e["object"], e["seed"]): e for e in map(json.loads, lines)}
-    for name in names:
-        for seed in range(o.seed, o.seed + o.episodes):
-            if (name, seed) not in known:
-                known[name, seed] = play(o, name, seed)
+    results, keys = {}, []
+    for name in [*names, "all"]:
+        keys = [(n, o.seed + i) for n in names for i in range(o.episodes) if name in (n, "all")]
+        for key in keys:
+            if key not in known:
+                known[key] = play(o, *key)
                 if o.out is not None:
                     with o.out.open("a") as file:
-                        file.write(json.dumps(known[name, seed]) + "\n")
-        report(o, name, [known[name, seed] for seed in range(o.seed, o.seed + o.episodes)])
-    rows = [known[name, o.seed + i] for name in names for i in range(o.episodes)]
-    report(o, "all", rows)
+                        file.write(json.dumps(known[key]) + "\n")
+        results[name] = found = figures([known[key] for key in keys])
+        text = ", ".join(f"{key} {value:.4g}" for key, value in found.items() if isinstance(value, (int, float)))
+        print(json.dumps({"object": name, **found}) if o.json else f"{name}: {success_text(found)}; {text}", flush=True)
     if o.results is not None:
-        groups = {"all": rows, **{name: [e for e in rows if e["object"] == name] for name in names}}
-        record = {"machine": machine(), "seed": o.seed, "position": o.position, "axes": o.axes}
-        record |= {"seconds": o.seconds, "tilt": o.tilt, "settings": asdict(o.settings)}
-        record["results"] = {name: figures(group) for name, group in groups.items()}
-        record["columns"] = list(COLUMNS)
-        record["rows"] = [[e[key] for key in COLUMNS] for e in rows]
-        save(o.results, record)
-
-
-def report(o: Options, name: str, episodes: list[dict[str, Any]]) -> None:
-    """Print the figures of some episodes."""
-    found = figures(episodes)
-    if o.json:
-        print(json.dumps({"object": name, **found}), flush=True)
-        return
-    print(
-        f"{name}: {success_text(found)}, {found['dropped']} dropped, {found['mean_goals']:.2f} goals, "
-        f"{found['mean_steps']:.0f} steps, {found['position_mm']:.0f} mm, {found['angle_deg']:.0f}°, "
-        f"ms {found['milliseconds_per_step']}, p99 {found['milliseconds_p99']:.0f}",
-        flush=True,
-    )
+        asked = {key: getattr(o, key) for key in ("seed", "position", "axes", "seconds", "tilt")}
+        record = {"machine": machine(), **asked, "settings": asdict(o.settings), "results": results}
+        save(o.results, {**record, "columns": COLUMNS, "rows": [[known[key][c] for c in COLUMNS] for key in keys]})
 
 
 if __name__ == "__main__":
