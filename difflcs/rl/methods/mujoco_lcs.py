@@ -24,6 +24,7 @@ class MujocoMethod(ContactMethod):
     """Settings of the fit."""
 
     name: ClassVar[str] = "mujoco-lcs"
+    version: ClassVar[int] = 3
     summary: ClassVar[str] = "a MuJoCo model whose uncertain numbers are fitted, then PPO through the MPC"
 
     def trainer(self, work: Work) -> Trainer:
