@@ -229,11 +229,10 @@ class TableTravel:
     def action(self, x: Tensor, target: Tensor) -> Tensor:
         """See `Travel`."""
         way = self.way(x[3:5], target[3:5])
-        room = TRAVEL
         for point in way:
             step = point - x[3:5]
             if float(step.norm()) > 0.05 or point is way[-1]:
-                return step * min(1.0, room / max(float(step.norm()), 1e-9))
+                return step * min(1.0, TRAVEL / max(float(step.norm()), 1e-9))
         raise AssertionError("a way has an end")
 
     def way(self, start: Tensor, end: Tensor) -> list[Tensor]:
@@ -292,6 +291,11 @@ class TableTravel:
         return (gap >= least - 1e-9).all(-1)
 
 
+def _shortest(turns: Tensor) -> Tensor:
+    """Return the same turns within half a turn to either side [rad]."""
+    return torch.remainder(turns + math.pi, 2 * math.pi) - math.pi
+
+
 class BodyPaths:
     """Paths of poses of one body to a goal, round the others as they lie: Dijkstra's on a grid of poses.
 
@@ -317,8 +321,7 @@ class BodyPaths:
 
     def free(self, start: Tensor, end: Tensor, margin: float) -> bool:
         """Return True if the straight motion between two poses (3,) keeps a margin, or what its ends have."""
-        turn = torch.remainder(end - start + math.pi, 2 * math.pi)[2] - math.pi
-        way = torch.cat([(end - start)[:2], turn.reshape(1)])
+        way = torch.cat([(end - start)[:2], _shortest(end - start)[2:]])
         count = 2 + math.ceil(float(way.abs().max()) / 0.1)
         poses = start + torch.linspace(0.0, 1.0, count, dtype=way.dtype)[:, None] * way
         gap = self.table.body_gap(self.moved, poses)
@@ -358,8 +361,8 @@ class BodyPaths:
         return [*path, goal]
 
     def _difference(self, difference: Tensor) -> Tensor:
-        turn = torch.remainder(difference[..., 2] + math.pi, 2 * math.pi) - math.pi
-        return (difference[..., :2].square().sum(-1) + (self.GYRATION * turn).square()).sqrt()
+        turn = self.GYRATION * _shortest(difference[..., 2])
+        return (difference[..., :2].square().sum(-1) + turn.square()).sqrt()
 
     def _plan(self, goal: Tensor) -> None:
         """Compute the way to the goal from all poses of the grid."""
@@ -457,9 +460,9 @@ class Scheduler:
         self._best, self._since = math.inf, 0
         self._failed = [0] * len(goals)
 
-    def error(self, i: int, goal: Tensor | None = None) -> float:
-        """Return how far a body is from its goal, as a multiple of the tolerance."""
-        difference = (self.goals[i] if goal is None else goal) - self.table.poses[i]
+    def error(self, i: int, goal: Tensor) -> float:
+        """Return how far a body is from a goal, as a multiple of the tolerance."""
+        difference = goal - self.table.poses[i]
         turn = math.remainder(float(difference[2]), 2 * math.pi)
         return max(float(difference[:2].norm()) / NEAR, abs(turn) / ALIGNED)
 
@@ -467,8 +470,7 @@ class Scheduler:
         """Choose the body, and the pose it should go to (3,)."""
         i = self.active
         if i is not None:
-            goal = self.goals[i] if self.aside is None else self.aside
-            error = self.error(i, goal)
+            error = self.error(i, self._target(i))
             if error < 0.95 * self._best:
                 self._best, self._since = error, 0
             self._since += 1
@@ -481,11 +483,11 @@ class Scheduler:
             i = self._next(disc)
             self._best, self._since = math.inf, 0
             self.active = i
-        if self.aside is not None:
-            goal = self.aside
-        else:
-            goal = self.goals[i]
-        return i, self.subgoal(i, goal)
+        return i, self.subgoal(i, self._target(i))
+
+    def _target(self, i: int) -> Tensor:
+        """Return where the active body goes in the end: to its goal, or aside."""
+        return self.goals[i] if self.aside is None else self.aside
 
     def _away(self, i: int) -> bool:
         """Return True if body i is where it should go aside, turned in any way."""
@@ -500,9 +502,9 @@ class Scheduler:
     def _next(self, disc: Tensor) -> int:
         """Choose the next body; sets `aside`, where it goes if not to its goal."""
         self.aside = None
-        todo = [i for i in range(len(self.goals)) if self.error(i) > 0.8]
+        todo = [i for i in range(len(self.goals)) if self.error(i, self.goals[i]) > 0.8]
         if not todo:
-            return max(range(len(self.goals)), key=self.error)
+            return max(range(len(self.goals)), key=lambda i: self.error(i, self.goals[i]))
         price = {i: float((self.table.poses[i, :2] - disc).norm()) + 10.0 * self._failed[i] for i in todo}
         free = [i for i in todo if float(self.table.body_gap(i, self.goals[i])) > self.MARGIN]
         free = [i for i in free if len(self.goals) == 1 or self.paths[i].subgoal(self.goals[i]) is not None]
