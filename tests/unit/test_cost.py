@@ -8,14 +8,13 @@ from torch import nn
 
 from difflcs import CostSequence, GoalCost, QuadraticCost
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
+from tests.conformance import judges
 
 
-def evaluate(cost, x, u):
-    """The stage and final sums of a QuadraticCost, written out; x (H+1, n_x), u (H, n_u)."""
-    total = float(cost.constant)
-    for k in range(len(u)):
-        total += float(0.5 * x[k] @ cost.Q @ x[k] + cost.q @ x[k] + 0.5 * u[k] @ cost.R @ u[k] + cost.r @ u[k])
-    return total + float(0.5 * x[-1] @ cost.Q_final @ x[-1] + cost.q_final @ x[-1])
+def evaluate(cost, x, u, i=...):
+    """The objective of a cost, or of element i of a sequence of linear terms, written out; x (H+1, n_x), u (H, n_u)."""
+    terms = {name: value[i] if name in ("q", "q_final") else value for name, value in cost.fields().items()}
+    return float(judges.cost(terms, x, u) + cost.constant[i])
 
 
 def paper(x, u, goal):
@@ -195,11 +194,7 @@ def test_following_a_reference_is_tracking_each_goal(build):
         expected = sum(float(cost.stage(x[k], u[k], reference[i, k])) for k in range(5))
         final = cost(reference[i, -1], horizon=0)
         expected += float(0.5 * x[-1] @ final.Q_final @ x[-1] + final.q_final @ x[-1] + final.constant)
-        value = float(followed.constant[i])
-        for k in range(5):
-            value += float(0.5 * x[k] @ followed.Q @ x[k] + followed.q[i, k] @ x[k] + 0.5 * u[k] @ followed.R @ u[k])
-        value += float(0.5 * x[-1] @ followed.Q_final @ x[-1] + followed.q_final[i] @ x[-1])
-        assert value == pytest.approx(expected, rel=1e-12)
+        assert evaluate(followed, x, u, i) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("shape", [(3,), (1, 3), (6, 2)])

@@ -10,6 +10,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 from difflcs.mpc.backends import BatchedBackend
+from tests.conformance import judges
 from tests.conformance.hostile import campaign, checks, forms, generators, targets
 from tests.conformance.varied.generators import random_case
 from tests.conformance.varied.judges import conditions
@@ -189,10 +190,9 @@ def test_the_adjoint_of_the_judge_is_the_derivative_of_the_cost():
     def trajectory(u):
         x, lam = [a["x0"]], []
         for k in range(problem.horizon):
-            gap = np.einsum("bij,bj->bi", a["D"], x[-1]) + np.einsum("bij,bj->bi", a["E"], u[:, k]) + a["c"]
+            gap = judges.affine(a, "DEFc", x[-1], u[:, k], np.zeros_like(a["c"]))
             lam.append(np.stack([_force(F, g, problem.relaxation) for F, g in zip(a["F"], gap, strict=True)]))
-            moved = ((a["A"], x[-1]), (a["B"], u[:, k]), (a["C"], lam[-1]))
-            x.append(sum(np.einsum("bij,bj->bi", M, v) for M, v in moved) + a["d"])
+            x.append(judges.affine(a, "ABCd", x[-1], u[:, k], lam[-1]))
         return np.stack(x, 1), np.stack(lam, 1)
 
     def cost(u):
