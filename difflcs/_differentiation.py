@@ -18,6 +18,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar, ParamSpec, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -271,7 +272,7 @@ def _flatten(
         whole = None if value is None else value.unsqueeze(0) if dim is None else value.movedim(dim, 0)
         front.append(whole)
         leads.append(() if whole is None else whole.shape[1 : whole.ndim - rank])
-    batch, flat = torch.broadcast_shapes(*leads), []
+    batch, flat = torch.Size(np.broadcast_shapes(*leads)), []
     for value, whole, dim, lead in zip(values, front, dims, leads, strict=True):
         if whole is None or (share and dim is None and not lead):
             flat.append(value)
@@ -290,7 +291,7 @@ def _summed(solver: Solver, tensors: Tensors, gradients: Gradients) -> list[Tens
             continue
         if gradient.numel() != like.numel():
             leads = [tensor.shape[: tensor.ndim - rank] for tensor, rank in zip(tensors, solver.ranks, strict=True)]
-            batch, lead, shape = torch.broadcast_shapes(*leads), leads[i], like.shape[len(leads[i]) :]
+            batch, lead, shape = np.broadcast_shapes(*leads), leads[i], like.shape[len(leads[i]) :]
             ones = [1] * (len(batch) - len(lead))
             gradient = gradient.reshape((*batch, *shape)).sum_to_size((*ones, *lead, *shape))
         summed[i] = gradient.reshape(like.shape)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Protocol, Self, runtime_checkable
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -89,8 +90,8 @@ class _Quadratic(TensorFields):
             staged = not self.by_stage or name in self.by_stage
             blocks.append(value if staged else value.unsqueeze(-3))
         try:
-            batch = torch.broadcast_shapes(*(block.shape[:-2] for block in blocks))
-        except RuntimeError:
+            batch = np.broadcast_shapes(*(block.shape[:-2] for block in blocks))
+        except ValueError:
             shapes = ", ".join(f"{name} {tuple(fields[name].shape)}" for name in ("Q", "S", "R"))
             raise ShapeError(f"S: expected batch dimensions that fit those of Q and R, got {shapes}") from None
         Q, S, R = (block.expand(*batch, *block.shape[-2:]) for block in blocks)

@@ -91,7 +91,7 @@ class MPCSolver(Solver):
         """Solve; return x, u, lam, objective, mu, status, iterations, kkt_residual, solve_time and violation."""
         if transformed:
             leads = [tensor.shape[: tensor.ndim - rank] for tensor, rank in zip(tensors, self.ranks, strict=True)]
-            self.batch = torch.broadcast_shapes(*leads)
+            self.batch = torch.Size(np.broadcast_shapes(*leads))
         named = dict(zip(self.names, tensors, strict=True))
         guess = {name: named.pop(name) for name in self.names if name not in RANKS}
         values = self.inputs.numbers(named, self.batch, unseen=transformed, copy=self.needs_grad)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -304,7 +305,7 @@ def barrier_curvature(problem: MPCProblem, u: Tensor) -> Tensor:
 
 
 def _join(left: Tensor, right: Tensor) -> Tensor:
-    batch = torch.broadcast_shapes(left.shape[:-2], right.shape[:-2])
+    batch = np.broadcast_shapes(left.shape[:-2], right.shape[:-2])
     return torch.cat([left.expand(*batch, *left.shape[-2:]), right.expand(*batch, *right.shape[-2:])], -1)
 
 

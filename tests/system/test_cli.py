@@ -1,6 +1,7 @@
 """The command line, from outside."""
 
 import contextlib
+import errno
 import importlib.util
 import io
 import json
@@ -19,7 +20,7 @@ from typing import Any
 import pytest
 import torch
 
-from difflcs import LCSModel, __main__, cli
+from difflcs import LCSModel, __main__, _storage, cli
 from difflcs.cli import train as cli_train
 from difflcs.rl.methods import LCSRLMethod, get_method, method_names
 from difflcs.rl.runs import progress
@@ -492,3 +493,42 @@ def test_one_training_at_a_time_in_a_run(capsys, tmp_path, monkeypatch, words):
     assert ("in use" in err) == (words != ["--smoke"])
     assert not (path / ".lock").exists()
     assert run(capsys, "train", "--out", path, "--resume")[0] == 0  # finished: nothing to lock
+
+
+# --- disks ------------------------------------------------------------------------------------------------------------
+
+
+def learned(path: Path) -> list[tuple[str, bytes]]:
+    """The final model and the last checkpoint, byte for byte."""
+    last = max(path.glob("checkpoints/0*"))
+    files = [path / "model/model.safetensors", last / "model.safetensors", last / "config.json"]
+    return [(str(file.relative_to(path)), file.read_bytes()) for file in files]
+
+
+def test_a_folder_that_cannot_be_written_is_reported_first(capsys, tmp_path):
+    (tmp_path / "file").touch()
+    code, _, err = run(capsys, "train", "--smoke", "--out", tmp_path / "file/run")
+    assert code == 2
+    assert "another --out" in err
+
+
+def test_a_full_disk_leaves_the_last_checkpoint(capsys, tmp_path, monkeypatch):
+    whole, path = tmp_path / "whole", tmp_path / "run"
+    assert run(capsys, "train", "--smoke", "--method", "ppo", "--out", whole)[0] == 0
+    write, left = _storage.write_atomically, [5]  # config.json, then three files per checkpoint
+
+    def full(*arguments):
+        left[0] -= 1
+        if left[0] < 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(_storage, "write_atomically", full)
+        code, _, err = run(capsys, "train", "--smoke", "--method", "ppo", "--out", path)
+    assert code == 2
+    assert "No space left" in err
+    assert "--resume" in err
+    assert json.loads((path / "checkpoints/latest.json").read_text()) == {"checkpoint": "000000"}
+    assert run(capsys, "train", "--out", path, "--resume")[0] == 0
+    assert learned(path) == learned(whole)

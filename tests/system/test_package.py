@@ -27,25 +27,6 @@ def sources(folder):
     return sorted((ROOT / folder).rglob("*.py"))
 
 
-def imports(path):
-    """Modules a file imports, absolute, wherever in the file; (name, whether at import time)."""
-    tree = ast.parse(path.read_text(), str(path))
-    package = ".".join(path.relative_to(ROOT).with_suffix("").parts[:-1])
-    inside = {n for f in ast.walk(tree) if isinstance(f, ast.FunctionDef | ast.AsyncFunctionDef) for n in ast.walk(f)}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            for alias in node.names:
-                yield alias.name, node not in inside
-        elif isinstance(node, ast.ImportFrom):
-            base = node.module or ""
-            if node.level:
-                parts = package.split(".")[: len(package.split(".")) - node.level + 1]
-                base = ".".join([*parts, base]).strip(".")
-            yield base, node not in inside
-            for alias in node.names:
-                yield f"{base}.{alias.name}", node not in inside
-
-
 @pytest.fixture(scope="module")
 def imported():
     """What a fresh process loads: with torch and NumPy, then by difflcs besides, then when solvers are asked for."""
@@ -105,23 +86,10 @@ def test_the_version_is_one_and_the_same():
     assert re.fullmatch(r"\d+\.\d+\.\d+.*", difflcs.__version__)
 
 
-def test_status_names_are_those_of_the_design_and_give_advice():
-    status = difflcs.Status
-    assert [s.name for s in status] == ["CONVERGED", "MAX_ITER", "INFEASIBLE", "NUMERICAL", "DEGENERATE"]
-    assert [s.name for s in status if s.solved] == ["CONVERGED", "DEGENERATE"]
-    assert all(s.advice for s in status)
-
-
-@pytest.mark.parametrize("path", sources("difflcs"), ids=lambda p: str(p.relative_to(ROOT)))
-def test_no_pickle_and_no_torch_save(path):
-    for name, _ in imports(path):
-        assert name.split(".")[0] not in ("pickle", "cloudpickle", "dill", "joblib", "shelve", "marshal")
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "torch":
-            assert node.attr not in ("save", "load")
-        if isinstance(node, ast.keyword) and node.arg == "allow_pickle":
-            assert isinstance(node.value, ast.Constant)
-            assert node.value.value is False
+def test_no_pickle_and_no_torch_save():
+    unsafe = r"^\s*(import|from) (pickle|cloudpickle|dill|joblib|shelve|marshal)\b|\btorch\.(save|load)\("
+    unsafe += r"|allow_pickle=(?!False)"
+    assert [path for path in sources("difflcs") if re.search(unsafe, path.read_text(), re.MULTILINE)] == []
 
 
 def test_the_readmes_example_runs_and_prints_a_gradient(tmp_path):

@@ -102,10 +102,6 @@ def test_microsofts_compiler_is_refused_in_a_sentence(tmp_path):
     assert "Windows Subsystem for Linux" in said
 
 
-def test_the_source_distribution_leaves_nothing_out():
-    assert PROJECT["tool"]["scikit-build"]["sdist"] == {"exclude": ["/runs"]}
-
-
 @pytest.mark.parametrize("name", ["tests", "docs", "wheels"])
 def test_a_workflow_calls_what_exists(name):
     workflow = load(f".github/workflows/{name}.yml")

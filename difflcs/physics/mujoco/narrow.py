@@ -87,15 +87,18 @@ def _polygons(model: Any, mesh: int) -> tuple[list[Array], Array]:
     corners_of = np.searchsorted(np.sort(hull.vertices), hull.simplices)
     vertices = hull.points[np.sort(hull.vertices)]
     one, two = (vertices[corners_of[:, k]] - vertices[corners_of[:, 0]] for k in (1, 2))
+    order, first = np.argsort(corners_of, axis=None), np.zeros(len(vertices) + 1, dtype=int)
+    first[1:] = np.bincount(corners_of.ravel()).cumsum()  # order[first[v] : first[v + 1]] // 3: triangles at a vertex
+    across = np.stack(perpendicular(hull.equations[:, :3]), -1)
     size, left, faces, outward = np.ptp(vertices, axis=0).max(), np.ones(len(one), dtype=bool), [], []
     for k in np.argsort(-np.linalg.norm(cross(one, two), axis=-1)):
         if not left[k]:
             continue
         normal = hull.equations[k, :3]
         flat = np.abs(vertices @ normal + hull.equations[k, 3]) < 1e-6 * size
-        left &= ~flat[corners_of].all(-1)
-        across = np.stack(perpendicular(normal), -1)
-        at = (vertices[flat] - vertices[flat].mean(0)) @ across
+        near = np.concatenate([order[first[v] : first[v + 1]] for v in np.flatnonzero(flat)]) // 3
+        left[near] &= ~flat[corners_of[near]].all(-1)
+        at = (vertices[flat] - vertices[flat].mean(0)) @ across[k]
         faces.append(vertices[flat][np.argsort(np.arctan2(at[:, 1], at[:, 0]))])
         outward.append(normal)
     return faces, np.array(outward)
