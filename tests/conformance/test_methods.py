@@ -1,14 +1,11 @@
 """What every method has in common: it trains, goes on after any crash, refuses what is not its own, and repeats itself.
 
-The methods of the library and one that is registered here, on a task of one's own, by the common code.
+The methods of the library on a task of one's own, by the common code; a method of one's own is in docs/contributing.md.
 """
 
-import contextlib
-import io
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, fields, is_dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -30,21 +27,20 @@ from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, save_check
 from difflcs.rl.runs.evaluate import evaluate
 from difflcs.rl.runs.training import Reporter, TrainConfig, load_model, load_policy, stored_config, sum_seconds, train
 from difflcs.rl.tasks import register_task
-from tests.conformance.toy import STEPS, SearchMethod, make_task
+from tests.conformance.toy import STEPS, make_task
 
 pytestmark = pytest.mark.usefixtures("registered")
 
 # The toy is no MuJoCo model; this method is contact-lcs besides, see tests/unit/test_contact_method.py.
-NAMES = (*(name for name in method_names() if name != MujocoMethod.name), SearchMethod.name)
+NAMES = tuple(name for name in method_names() if name != MujocoMethod.name)
 TOY = make_task()
 LARGER = make_task(size=3)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def registered(registries) -> None:
-    """A task and a method for this file alone."""
+    """A task for this file alone."""
     register_task(TOY)
-    register_method(SearchMethod)
 
 
 SLOW = [method.name for method in map(get_method, method_names()) if PPOReport in method.reports]
@@ -57,8 +53,9 @@ def name(request) -> str:
 
 
 def make_config(name: str, **changes: Any) -> TrainConfig:
-    kind = SearchMethod if name == SearchMethod.name else get_method(name)
-    return replace(TrainConfig(task="toy", method=kind(), final_goals=4, evaluate_goals=3).smoke(), **changes)
+    return replace(
+        TrainConfig(task="toy", method=get_method(name)(), final_goals=4, evaluate_goals=3).smoke(), **changes
+    )
 
 
 def same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
@@ -240,8 +237,7 @@ def test_foreign_checkpoints_are_refused_and_change_nothing(name, make_trainer, 
     foreign = {other: load_checkpoint(finished(other).checkpoints) for other in NAMES if other != name}
     larger = make_trainer(name, task=LARGER)
     larger.step()
-    if name != SearchMethod.name:  # its state has no sizes
-        foreign["of other sizes"] = copy_state(larger.state_dict())
+    foreign["of other sizes"] = copy_state(larger.state_dict())
     foreign["nothing"] = {}
     for source, state in foreign.items():
         with pytest.raises(CheckpointError, match="expected"):
@@ -325,8 +321,6 @@ def test_only_what_learned_a_model_gives_one(name, finished):
 
 
 def test_what_was_learned_of_other_sizes_is_refused(name, finished):
-    if name == SearchMethod.name:
-        pytest.skip("this method learns one number, which fits a task of any size")
     with pytest.raises(CheckpointError, match="expected"):
         load_policy(finished(name), LARGER)
 
@@ -395,7 +389,7 @@ def test_lcs_rl_needs_more_data_than_its_warmup():
     get_method("lcs-rl")().check(3.5)
 
 
-@pytest.mark.parametrize("method", [None, 3, Method, type("Nameless", (SearchMethod,), {"name": None})])
+@pytest.mark.parametrize("method", [None, 3, Method, type("Nameless", (get_method("violation"),), {"name": None})])
 def test_what_is_no_method_is_not_registered(method):
     before = method_names()
     with pytest.raises(DTypeError, match="subclass of Method"):
@@ -410,42 +404,16 @@ def test_an_unknown_method_gets_the_names_there_are():
         TrainConfig(method="magic")
 
 
-# --- a method of one's own, by the command line -----------------------------------------------------------------------
-
-
-def printed(*words: str) -> str:
-    with contextlib.redirect_stdout(io.StringIO()) as text, pytest.raises(SystemExit):
-        cli.main(["train", *words, "--help"])
-    return text.getvalue()
-
-
-def test_its_settings_show_with_it_only(monkeypatch):
-    monkeypatch.setenv("COLUMNS", "120")
-    assert "--spread FLOAT" in printed("--method", "search")
-    assert "--n-lam" not in printed("--method", "search")
-    for other in method_names():
-        assert ("--spread" in printed("--method", other)) == (other == "search")
-    assert SearchMethod.summary in " ".join(printed().replace("│", " ").split())
+# --- a task of one's own, by the command line -------------------------------------------------------------------------
 
 
 def test_the_commands_know_it(capsys, tmp_path):
     out = tmp_path / "run"
-    words = ["train", "--task", "toy", "--method", "search", "--spread", "0.25", "--smoke", "--out", str(out)]
+    words = ["train", "--task", "toy", "--method", "violation", "--n-lam", "2", "--smoke", "--out", str(out)]
     assert cli.main(words) == 0
     assert cli.main(["train", "--out", str(out), "--resume"]) == 0
-    assert stored_config(RunDirectory.open(out)).method == SearchMethod(spread=0.25)
+    assert load_model(out).n_lam == 2
     capsys.readouterr()
     assert cli.main(["evaluate", str(out), "--goals", "5", "--json"]) == 0
     record = json.loads(capsys.readouterr().out)
-    assert (record["method"], record["task"], record["backend"], record["goals"]) == ("search", "toy", None, 5)
-    with contextlib.suppress(SystemExit):
-        assert cli.main(["train", "--method", "search", "--spread", "-1", "--out", str(tmp_path / "no")]) == 2
-    told = capsys.readouterr()
-    assert "spread" in told.out + told.err
-    assert not (tmp_path / "no").exists()
-
-
-def test_it_learns(tmp_path):
-    run = train(make_config("search", minutes=20.0), Path(tmp_path / "run"), task=TOY)
-    errors = [float(row["best_error"]) for row in run.rows() if row["best_error"]]
-    assert errors[-1] < 0.5 * errors[0]
+    assert (record["method"], record["task"], record["backend"], record["goals"]) == ("violation", "toy", "batched", 5)

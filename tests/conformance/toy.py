@@ -1,25 +1,15 @@
-"""A task without contact and simulator that every method trains on in a second, and a method of ten lines."""
+"""A task without contact and simulator that every method trains on in a second."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
-from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
 from difflcs import GoalCost, LCSParams
-from difflcs.errors import CheckpointError
-from difflcs.rl.learning.trainer import AfterStep, Trainer
-from difflcs.rl.methods import Method, Work
-from difflcs.rl.rollout import PolicyOutput, collect, mpc_actions
-from difflcs.rl.seeding import Stream, episode_seeds, generator
-from difflcs.rl.settings import bounded
 from difflcs.rl.tasks import PhysicsSpec, Quantity, TaskSpec
 
 STEPS = 5
@@ -119,97 +109,3 @@ def make_task(name: str = "toy", size: int = 2, **changes: Any) -> TaskSpec:
         "physics": PhysicsSpec(make_system=partial(Guess, size), scale=(1.0,) * size, relaxation=1e-3),
     }
     return TaskSpec(**{**values, **changes})
-
-
-# --- a method ---------------------------------------------------------------------------------------------------------
-
-
-class Gain(nn.Module):
-    """u = gain · (goal − x), within the bounds."""
-
-    def __init__(self, gain: float):
-        super().__init__()
-        self.gain = nn.Parameter(torch.tensor([gain], dtype=torch.float64), requires_grad=False)
-
-    def forward(
-        self, x0: Tensor, goal: Tensor, *, u_min: Tensor | None = None, u_max: Tensor | None = None
-    ) -> PolicyOutput:
-        action = (self.gain * (goal - x0[:, :1])).clamp(-U_MAX, U_MAX)
-        return PolicyOutput(action, torch.ones(len(x0), dtype=torch.bool))
-
-    def config(self) -> dict[str, Any]:
-        return {"size": 1}
-
-    def save_pretrained(self, directory: Path) -> None:
-        from difflcs import _storage
-
-        _storage.save_record(directory, "gain", self.config(), self.state_dict())
-
-
-@dataclass(frozen=True)
-class SearchReport:
-    iteration: int
-    env_steps: int
-    best_error: float
-
-
-class Search(Trainer):
-    """Keeps a random gain if it ends nearer to the goals."""
-
-    def __init__(self, env: VectorEnv, episodes: int, spread: float, seed: int, episode_steps: int):
-        gain = Gain(0.1)
-        super().__init__(gain, gain, seed, episode_steps)
-        self.gain, self.env, self.count, self.spread = gain, env, episodes, spread
-        self.best = 1e9
-
-    def step(self, after_step: AfterStep | None = None) -> SearchReport:
-        before = self.gain.gain.clone()
-        draw = torch.randn(1, generator=generator(self.seed, Stream.NOISE, self.iteration), dtype=torch.float64)
-        self.gain.gain += self.spread * draw
-        seeds = episode_seeds(self.seed, Stream.TRAINING, self.episodes, self.count)
-        report = None if after_step is None else lambda: after_step(self.count)
-        record = collect(self.env, mpc_actions(self.policy), seeds, self.episode_steps, report)
-        error = float(record["errors", "position_error"].mean())
-        if error < self.best:
-            self.best = error
-        else:
-            self.gain.gain.copy_(before)
-        self.iteration, self.episodes = self.iteration + 1, self.episodes + self.count
-        return SearchReport(self.iteration, self.env_steps, self.best)
-
-    def state_dict(self) -> dict[str, Any]:
-        return {**super().state_dict(), "best": self.best}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        super().load_state_dict(state)
-        self.best = state["best"]
-
-
-@dataclass(frozen=True)
-class SearchMethod(Method):
-    """Random search for the gain of a proportional controller."""
-
-    spread: float = bounded(0.5, above=0)
-    """Standard deviation of a change of the gain."""
-    tries: int = bounded(4, minimum=1, maximum=100)
-    """Episodes that a gain is judged by."""
-
-    name: ClassVar[str] = "search"
-    version: ClassVar[int] = 1
-    summary: ClassVar[str] = "random search for the gain of a proportional controller"
-    reports: ClassVar[tuple[type, ...]] = (SearchReport,)
-    kind: ClassVar[str] = "gain"
-
-    def trainer(self, work: Work) -> Search:
-        return Search(work.make_envs(self.tries), self.tries, self.spread, work.seed, work.task.episode_steps)
-
-    def rebuild(self, task: TaskSpec, config: Mapping[str, object], tensors: Mapping[str, Tensor], source: str) -> Gain:
-        if config != {"size": 1} or set(tensors) != {"gain"} or tensors["gain"].shape != (1,):
-            raise CheckpointError(f"{source}: expected a gain, got {sorted(tensors)}")
-        return Gain(float(tensors["gain"]))
-
-    def policy(self, task: TaskSpec, learned: Gain) -> Gain:
-        return learned
-
-    def smoke(self) -> Self:
-        return self

@@ -11,13 +11,10 @@ import pytest
 import torch
 
 from difflcs import (
-    ConstraintSequence,
-    CostSequence,
     GoalCost,
     LCSMPCLayer,
     LCSParams,
     LCSSequence,
-    LinearConstraints,
     QuadraticCost,
     SolveError,
     StageBounds,
@@ -27,16 +24,13 @@ from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, NonFi
 from difflcs.mpc import MPCController
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.mpc.export import export_controller
+from tests.conformance.problems import PROBLEMS, layer_of
 
 H = 5
 
 
 def states(count, n_x=4, seed=0):
     return 0.1 * np.random.default_rng(seed).normal(size=(count, n_x))
-
-
-def eye(n):
-    return torch.eye(n, dtype=torch.float64)
 
 
 @pytest.fixture
@@ -49,54 +43,32 @@ def reaching(build):
     return LCSMPCLayer(build.params(0), GoalCost.reach(4, 2, (10.0, 10.0), 20.0 * np.ones(2), 1.0), H, -0.3, 0.3)
 
 
-def layers(build):
-    """Layers of every kind, by name."""
-    n = build.normal(7)
-    params, cost, weights = build.params(0), build.cost(0), build.cost_tensors(0)
-    stages = LCSSequence.stack([build.params(k) for k in range(H)])
-    weights_by_stage = {**weights, "q": 0.1 * n(H, 4), "Q": weights["Q"].expand(H, 4, 4) * torch.rand(H, 1, 1)}
-    changing = StageBounds(-0.2 - torch.rand(H, 2).double(), 0.2 + torch.rand(H, 2).double())
-    row = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
-    limit = torch.full((H + 1, 1), torch.inf, dtype=torch.float64)
-    limit[-1] = 0.02
-    return {
-        "plain": LCSMPCLayer(params, cost, H, -0.3, 0.3),
-        "one step": LCSMPCLayer(params, cost, 1, -0.3, 0.3),
-        "model": LCSMPCLayer(build.model(3), cost, H, -0.3, 0.3),
-        "by stage": LCSMPCLayer(stages, CostSequence(**weights_by_stage, by_stage=("q", "Q")), H, bounds=changing),
-        "cross": LCSMPCLayer(params, QuadraticCost(**weights, S=0.05 * n(4, 2), constant=torch.tensor(2.0)), H, -0.3),
-        "no contacts": LCSMPCLayer(build.params(0, n_lam=0), cost, H, -0.3, 0.3),
-        "barrier": LCSMPCLayer(params, cost, H, -0.3, 0.3, barrier=0.01),
-        "hard": LCSMPCLayer(params, cost, H, -0.5, 0.5, constraints=LinearConstraints(row, limit[-1] + 1)),
-        "soft": LCSMPCLayer(params, cost, H, -0.5, 0.5, constraints=LinearConstraints(row, limit[-1], weight=0.3)),
-        "at the end": LCSMPCLayer(
-            params, cost, H, -0.5, 0.5, constraints=ConstraintSequence(row, limit, weight=0.3, by_stage=("g",))
-        ),
-    }
-
-
 # --- the same plans ---------------------------------------------------------------------------------------------------
 
 
-def test_its_plans_are_those_of_the_layer_bit_for_bit_also_from_a_file(build, tmp_path):
-    for kind, mpc in layers(build).items():
-        mpc.controller().save(tmp_path / "c")
-        controller, solution = mpc.controller(), None
-        loaded = MPCController.load(tmp_path / "c", on_failure="zero", time_limit=60.0)
-        assert repr(loaded) == repr(controller).replace("time_limit=None", "time_limit=60.0")
-        loaded.save(tmp_path / "again")
-        assert (tmp_path / "again").read_bytes() == (tmp_path / "c").read_bytes(), kind
-        for x in states(5):
-            solution = mpc(torch.from_numpy(x), guess=None if solution is None else solution.shift())
-            u, plan = controller.step(x), controller.plan
-            assert np.array_equal(loaded.step(x), u), kind
-            for name in ("x", "u", "lam", "mu"):
-                assert np.array_equal(getattr(plan, name), getattr(solution, name).detach().numpy()), (kind, name)
-            assert np.array_equal(u, solution.action.detach().numpy())
-            assert controller.status.solved
-            assert (plan.iterations, plan.kkt_residual) == (int(solution.iterations), float(solution.kkt_residual))
-            assert plan.objective == pytest.approx(float(solution.objective.detach()), rel=1e-12)
-            assert plan.fallback is plan.late is False
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_its_plans_are_those_of_the_layer_bit_for_bit_also_from_a_file(build, name, tmp_path):
+    problem, solution = PROBLEMS[name](build), None
+    options = {"relaxation": problem.relaxation, "barrier": problem.barrier}
+    mpc = layer_of(problem.element(0), problem.staged, problem.horizon, **options)
+    mpc.controller().save(tmp_path / "c")
+    controller = mpc.controller()
+    loaded = MPCController.load(tmp_path / "c", on_failure="zero", time_limit=60.0)
+    assert repr(loaded) == repr(controller).replace("time_limit=None", "time_limit=60.0")
+    loaded.save(tmp_path / "again")
+    assert (tmp_path / "again").read_bytes() == (tmp_path / "c").read_bytes()
+    for x in problem.tensors["x0"][:4]:
+        solution = mpc(x, guess=None if solution is None else solution.shift())
+        u, plan = controller.step(x.numpy()), controller.plan
+        assert np.array_equal(loaded.step(x.numpy()), u)
+        for field in ("x", "u", "lam", "mu"):
+            found, expected = getattr(plan, field), getattr(solution, field).detach().numpy()
+            assert np.array_equal(found, expected.reshape(found.shape)), field
+        assert np.array_equal(u, plan.u[0])
+        assert controller.status.solved
+        assert (plan.iterations, plan.kkt_residual) == (int(solution.iterations), float(solution.kkt_residual))
+        assert plan.objective == pytest.approx(float(solution.objective.detach()), rel=1e-12)
+        assert plan.fallback is plan.late is False
 
 
 def test_what_is_kept_without_contact_fits_every_set_of_active_bounds(build):
