@@ -1,15 +1,19 @@
 """Policies of FetchPush and FetchSlide by contact MPC; `benchmarks/scoreboard/fetch.py` plays them.
 
-They are given the environment's observation and what its MJCF says: sizes, friction, stiffness of the weld. Nothing is
-learned, nothing is simulated. They plan with contact LCSs: of a block that two closed fingers, taken for a disc, push
-about a plane, and of a gripper that hits a puck, which slides on until friction stops it. Settings were chosen with
-seeds from 1000 on.
+They are given the environment's observation and its MJCF: sizes, friction, stiffness of the weld. Nothing is learned.
+They plan with contact LCSs: of a block that two closed fingers, taken for a disc, push about a plane, and of a gripper
+that hits a puck, which slides on until friction stops it. The hit is tried beforehand in a copy of the scene in MuJoCo.
+Settings were chosen with seeds from 1000 to 1219.
 """
+
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
 import torch
 
@@ -17,16 +21,19 @@ from difflcs import GoalCost, LCSMPCLayer, LCSParams, LCSSequence
 from difflcs.physics import PlanarPushing, box
 from difflcs.planning import DiscPlaces, PlanarTravel, SamplingPolicy, SamplingSettings
 
+STEPS = 50  # of an episode
 SECONDS, REACH = 0.04, 0.05  # of a step [s]; how far an action of 1 moves the mocap body [m]
 STRIDE = 0.0325  # how far the gripper goes in each step at an action of 1 [m]
 NEAR = 0.015  # from the goal, where the gripper stops [m]
 FROM_REST = 0.0297  # how far it goes in a step from rest [m]
 EFFORT, SOON = 1e-3, 5e-4  # weights of the actions, and of every stage, in parts of the final one
 GAP, LEAD, LAG = 0.03, 0.022, 0.055  # run-up; lead of the fingers [m], in parts of the way, as they give way along y
-ABOVE, CLEAR, PRESSED = 0.468, 0.46, 0.4575  # heights: over the puck, clear of it, in touch with it [m]
+ABOVE, CLEAR, PRESSED, SLIPPED = 0.468, 0.46, 0.4575, 0.452  # heights: over the puck, clear of it, on it, beside it [m]
 LAND, PRESS, PULL = -0.4, -0.2, 0.9  # actions: down onto the puck, and pressing and dragging
 REACHED, HIT = 1.2, 1.12  # x up to which the puck is dragged to the goal, and where it is hit otherwise [m]
 CLOSE, STILL, ASIDE = 0.012, 0.06, 0.012  # end of a drag [m], [m/s]; how far off its centre a hit may be [m]
+TRIALS, PLAYS, ENOUGH = 60, 3, 0.01  # hits tried, how often each, and the miss that is small enough [m]
+BACK, FACE, SHAKE = 4, 0.014, 1e-4  # run-ups tried; how far off its centre the puck is hit, and laid anew [m]
 HEIGHT = 0.425  # of the gripper's site above the floor, fingers just above the table [m]
 
 
@@ -43,10 +50,11 @@ def friction_with_table(model: Any) -> float:
     return float(max(model.geom("object0").friction[0], table.friction[0]))
 
 
-def place_of_rest(seen: np.ndarray, friction: float) -> np.ndarray:
-    """Return where an object that slides on the table comes to rest (2,), if nothing pushes it: v² / 2 μ g ahead."""
-    velocity = (seen[14:16] + seen[20:22]) / SECONDS  # the environment gives ways in a step, relative to the gripper
-    return seen[3:5] + velocity * np.linalg.norm(velocity) / (2 * 9.81 * friction)
+def place_of_rest(place: np.ndarray, velocity: np.ndarray, friction: float, seconds: float = np.inf) -> np.ndarray:
+    """Return where an object that slides on the table is after so many seconds (2,), if nothing pushes it."""
+    speed, brake = float(np.linalg.norm(velocity[:2])), 9.81 * friction
+    t = min(seconds, speed / brake)
+    return place[:2] + velocity[:2] * (t - t**2 * brake / max(2 * speed, 1e-9))
 
 
 class PushPolicy:
@@ -75,7 +83,8 @@ class PushPolicy:
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """The action (4,) of the environment."""
         seen, goal = observation["observation"], observation["desired_goal"]
-        rest = place_of_rest(seen, self.friction)
+        moves = (seen[14:17] + seen[20:23]) / SECONDS  # the environment gives ways in a step, relative to the gripper
+        rest = place_of_rest(seen[3:6], moves, self.friction)
         if np.linalg.norm(rest - goal[:2]) < NEAR:
             return np.zeros(4)
         x = np.array([*rest, seen[13], *seen[:2]])
@@ -122,16 +131,94 @@ def _sliding_stage(model: Any, rate: float, h: float, decides: bool = False, tou
     return LCSParams(*map(torch.from_numpy, (A, B, C, d, D, E, F, c)))
 
 
+class Twin:
+    """A copy of the scene in MuJoCo, set to what is observed, in which a hit is tried before it is made.
+
+    Args:
+        model: of the environment.
+        posture: of all joints (nq,), in which the arm begins every episode.
+    """
+
+    def __init__(self, model: Any, posture: np.ndarray):
+        self.model, self.data, self.posture = model, mujoco.MjData(model), posture
+        self.link, self.site = model.body("robot0:gripper_link").id, model.site("robot0:grip").id
+        puck = model.joint("object0:joint")
+        self.q, self.v = int(puck.qposadr[0]), int(puck.dofadr[0])
+        self.fingers = [int(model.joint(f"robot0:{side}_gripper_finger_joint").qposadr[0]) for side in "lr"]
+        self.jacobian, self.kind = np.zeros((3, model.nv)), mujoco.mjtState.mjSTATE_INTEGRATION
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:] = self.posture
+
+    def observe(self, seen: np.ndarray) -> None:
+        """Set puck and gripper to an observation (25,); the arm's joints follow by the least change."""
+        model, data, velocity = self.model, self.data, seen[20:23] / SECONDS  # of the gripper
+        turn, spin = data.qpos[self.q + 3 :][:4], data.qvel[self.v + 3 :][:3]
+        data.qpos[self.q :][:3], data.qvel[self.v :][:3] = seen[3:6], seen[14:17] / SECONDS + velocity
+        mujoco.mju_euler2Quat(turn, seen[11:14], "xyz")
+        mujoco.mju_rotVecQuat(spin, seen[17:20] / SECONDS, turn * [1.0, -1.0, -1.0, -1.0])  # in the puck's frame
+        mujoco.mj_forward(model, data)
+        mujoco.mj_jacSite(model, data, self.jacobian, None, self.site)
+        soft = self.jacobian / model.dof_damping  # the joints of the base are damped so much that they stand
+        inverse = soft.T @ np.linalg.inv(self.jacobian @ soft.T)
+        mujoco.mj_integratePos(model, data.qpos, inverse @ (seen[:3] - data.site_xpos[self.site]), 1.0)
+        data.qvel += inverse @ (velocity - self.jacobian @ data.qvel)
+        mujoco.mj_forward(model, data)
+
+    def step(self, action: np.ndarray) -> None:
+        """Play an action as the environment does."""
+        data = self.data
+        data.mocap_pos[0] = data.xpos[self.link] + REACH * action[:3]
+        data.mocap_quat[0] = data.xquat[self.link] + [1.0, 0.0, 1.0, 0.0]
+        mujoco.mj_step(self.model, data, round(SECONDS / self.model.opt.timestep))
+        data.qpos[self.fingers] = 0.0
+        mujoco.mj_forward(self.model, data)
+
+    def places(self) -> tuple[np.ndarray, ...]:
+        """Place [m] and velocity [m/s] of the gripper, and those of the puck."""
+        data = self.data
+        mujoco.mj_jacSite(self.model, data, self.jacobian, None, self.site)
+        puck = data.qpos[self.q :][:3].copy(), data.qvel[self.v :][:3].copy()
+        return data.site_xpos[self.site].copy(), self.jacobian @ data.qvel, *puck
+
+    def state(self) -> np.ndarray:
+        """State to which `set_state` returns."""
+        state = np.zeros(mujoco.mj_stateSize(self.model, self.kind))
+        mujoco.mj_getState(self.model, self.data, state, self.kind)
+        return state
+
+    def set_state(self, state: np.ndarray, shift: np.ndarray) -> None:
+        """Return to a state, in which the puck is laid aside by `shift` (2,) [m]."""
+        mujoco.mj_setState(self.model, self.data, state, self.kind)
+        self.data.qpos[self.q :][:2] += shift
+        mujoco.mj_forward(self.model, self.data)
+
+
+class Hit(NamedTuple):
+    """How the puck is hit: steps of run-up more, part of the way that is asked of the MPC, way off its centre [m]."""
+
+    back: int = 0
+    part: float = 1.0
+    aside: float = 0.0
+
+
 class SlidePolicy:
     """Contact MPC of a puck that slides on, behind a goal that the arm cannot reach.
 
     The closed fingers press on the puck from above, and drag it: to the goal, or onto the line along which they will
-    hit it, with their flat front. They go behind it, and the MPC says how to hit it so that it stops at the goal.
+    hit it, with their flat front. They go behind it, and the MPC says how to hit it so that it stops at the goal. How
+    much of the way is asked of it, the run-up and the way off the puck's centre are those that do best in the twin.
+
+    Args:
+        model: of the environment.
+        posture: of all joints (nq,), in which the arm begins every episode.
     """
 
-    def __init__(self, model: Any):
+    def __init__(self, model: Any, posture: np.ndarray):
         self.half, self.radius = fingers(model), float(model.geom("object0").size[0])
-        self.friction = friction_with_table(model)
+        self.friction, self.twin = friction_with_table(model), Twin(model, posture)
         self.carry = SECONDS * np.exp(-SECONDS / model.eq_solref[0, 0])
         system = sliding_system(model)
         final = torch.zeros(5, 5, dtype=torch.float64)
@@ -142,14 +229,23 @@ class SlidePolicy:
 
     def reset(self) -> None:
         """Begin an episode."""
-        self.act_now = self.mount
+        self.twin.reset()
+        self.act_now, self.left, self.how, self.random = self.mount, STEPS, Hit(), np.random.RandomState(0)
 
     def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """The action (4,) of the environment."""
-        self.seen, self.goal = observation["observation"], observation["desired_goal"]
-        self.gripper, self.puck, self.speed = self.seen[:3], self.seen[3:6], self.seen[20:23] / SECONDS
-        self.moves = self.seen[14:17] / SECONDS + self.speed
-        return np.append(np.clip(self.act_now(), -1.0, 1.0), 0.0)
+        self.goal = observation["desired_goal"]
+        self.twin.observe(observation["observation"])
+        self.look()
+        action = np.append(np.clip(self.act_now(), -1.0, 1.0), 0.0)
+        self.twin.step(action)
+        self.left -= 1
+        return action
+
+    def look(self) -> None:
+        """Read places [m] and velocities [m/s] of gripper and puck off the twin."""
+        self.gripper, self.speed, self.puck, self.moves = self.twin.places()
+        self.gap = self.puck[0] - self.radius - self.half[0] - self.gripper[0]
 
     def go(self, xy: Any, z: float) -> np.ndarray:
         """The action (3,) after which the gripper is at a place, if that is not too far."""
@@ -157,57 +253,101 @@ class SlidePolicy:
 
     def mount(self) -> np.ndarray:
         """Go above the puck, and press on it, off its centre by what the fingers will give way along y."""
+        if self.arrived():
+            return self.act_on(self.leave if self.goal[0] < REACHED else self.go_behind)
         ahead = float(np.clip(LAG * (self.target()[1] - self.puck[1]), -LEAD, LEAD))
         apart = (self.puck - self.gripper)[:2] - [0.0, ahead]
         away = float(np.linalg.norm(apart))
-        if away < 0.012 and self.gripper[2] < PRESSED:
-            self.act_now = self.drag
-            return self.drag()
-        if away < 0.012:
+        if away < 0.012 and SLIPPED <= self.gripper[2] < PRESSED:
+            return self.act_on(self.drag)
+        if away < 0.012 and self.gripper[2] >= SLIPPED:
             return np.array([*self.go(self.gripper[:2] + apart, 0.0)[:2], LAND])
         high = self.gripper[2] > CLEAR
         held = 1.0 if high else max(0.0, 1.0 - 0.07 / away)  # no nearer than 7 cm before it is above
         return self.go(self.gripper[:2] + held * apart, ABOVE)
 
+    def act_on(self, act: Any) -> np.ndarray:
+        """Go on with another of the ways to act."""
+        self.act_now = act
+        return act()
+
     def target(self) -> np.ndarray:
         """Where the puck is dragged (2,): to the goal, or to the line along which it is hit."""
         return self.goal[:2] if self.goal[0] < REACHED else np.array([max(HIT, self.puck[0]), self.goal[1]])
 
+    def arrived(self) -> bool:
+        """Tell whether the puck stands where it is dragged to."""
+        return bool(np.abs(self.target() - self.puck[:2]).max() < CLOSE and np.abs(self.moves[:2]).max() < STILL)
+
     def drag(self) -> np.ndarray:
-        """Press on the puck, and drag it."""
-        if np.linalg.norm((self.puck - self.gripper)[:2]) > 0.03:
-            self.act_now = self.mount
-            return self.mount()
-        left = self.target() - self.puck[:2]
-        move = self.go(self.gripper[:2] + left, 0.0)
-        if np.abs(left).max() < CLOSE and np.abs(self.moves[:2]).max() < STILL:
-            if self.goal[0] < REACHED:
-                return np.array([0.0, 0.0, PRESS])
-            self.act_now = self.go_behind
-            return self.go_behind()
+        """Press on the puck, and drag it, while the fingers do not slip off."""
+        if self.arrived() or np.linalg.norm((self.puck - self.gripper)[:2]) > 0.03 or self.gripper[2] < SLIPPED:
+            return self.act_on(self.mount)
+        move = self.go(self.gripper[:2] + self.target() - self.puck[:2], 0.0)
         return np.array([*np.clip(move[:2], -PULL, PULL), PRESS])
+
+    def leave(self) -> np.ndarray:
+        """Rise from the puck at its goal."""
+        if np.abs(self.target() - self.puck[:2]).max() > 2 * CLOSE:
+            return self.act_on(self.mount)
+        return self.go(self.gripper[:2], ABOVE)
 
     def go_behind(self) -> np.ndarray:
         """Rise, and go down behind the puck."""
         behind = self.puck[0] - self.radius - self.half[0]
         if self.gripper[0] < behind and self.gripper[2] < HEIGHT + 0.015:
-            self.act_now = self.hit
-            return self.hit()
+            self.rehearse()
+            return self.act_on(self.hit)
         high = self.gripper[2] < CLEAR and self.gripper[0] > behind
         back = behind - GAP
         x, y = self.gripper[:2] if high else (back, self.puck[1])
         return self.go((x, y), ABOVE if self.gripper[0] > behind + 0.01 else HEIGHT)
 
+    def rehearse(self) -> None:
+        """Try hits in the twin, and take the one after which the puck ends nearest to its goal, in the worse play."""
+        state, least, best, over = self.twin.state(), np.inf, Hit(), 0.0
+        for trial in range(TRIALS):
+            hit = best
+            if trial > 0:  # ask for less by as much as the best one goes too far; at every other trial anywhere else
+                part = best.part - over / (self.goal[0] - self.puck[0]) + 0.03 * self.random.randn()
+                back, aside = best.back, best.aside + 0.002 * self.random.randn()
+                if trial % 2:
+                    back, aside = self.random.randint(BACK), self.random.uniform(-FACE, FACE)
+                hit = Hit(back, float(np.clip(part, 0.5, 1.5)), aside)
+            misses = []
+            while len(misses) < PLAYS and np.linalg.norm(misses[-1:]) < least:
+                self.twin.set_state(state, len(misses) * SHAKE * self.random.randn(2))
+                misses.append(self.play(hit))
+            away = np.linalg.norm(misses, axis=1)
+            if away.max() < least:
+                least, best, over = away.max(), hit, misses[int(away.argmax())][0]
+            if least < ENOUGH:
+                break
+        self.twin.set_state(state, np.zeros(2))
+        self.look()
+        self.how = best
+
+    def play(self, how: Hit) -> np.ndarray:
+        """Play a hit in the twin: how far beyond the goal the puck is at the end of the episode (2,) [m]."""
+        self.how, left = how, self.left
+        self.look()
+        while left > 0 and not (self.gap > 0.005 and self.moves[0] > max(self.speed[0], 0.0) + 0.05):  # it is hit
+            self.twin.step(np.append(np.clip(self.hit(), -1.0, 1.0), 0.0))
+            self.look()
+            left -= 1
+        return place_of_rest(self.puck, self.moves, self.friction, left * SECONDS) - self.goal[:2]
+
     def hit(self) -> np.ndarray:
         """Hit the puck along x, by contact MPC."""
-        left = self.goal[0] - self.puck[0]
-        left *= np.interp(left, [0.35, 0.5], [0.87, 1.0])  # soft contacts give more; what is short is hit again
-        rest = place_of_rest(self.seen, self.friction)
-        if self.goal[0] - rest[0] < NEAR:
+        off = np.clip(self.goal[1] - self.puck[1], -ASIDE, ASIDE) + self.how.aside
+        aside = self.go((0.0, self.puck[1] + off), HEIGHT)[1:]
+        if self.how.back > 0:
+            self.how = self.how._replace(back=self.how.back - 1)
+            return np.array([-1.0, *aside])
+        if self.goal[0] - place_of_rest(self.puck, self.moves, self.friction)[0] < NEAR:
             return self.go(self.gripper[:2], HEIGHT)
-        gap = self.puck[0] - self.radius - self.half[0] - self.gripper[0]
-        front = -max(gap, 0.0)  # contacts are soft; what is pressed together does not spring apart
+        left = self.how.part * (self.goal[0] - self.puck[0])
+        front = -max(self.gap, 0.0)  # contacts are soft; what is pressed together does not spring apart
         x = torch.tensor([front, self.speed[0], front, 0.0, self.moves[0]], dtype=torch.float64)
-        self.plan = self.mpc(x, torch.tensor([left], dtype=torch.float64))
-        aside = self.go((0.0, self.puck[1] + np.clip(self.goal[1] - self.puck[1], -ASIDE, ASIDE)), HEIGHT)
-        return np.array([float(self.plan.action[0]), *aside[1:]])
+        plan = self.mpc(x, torch.tensor([left], dtype=torch.float64))
+        return np.array([float(plan.action[0]), *aside])

@@ -29,9 +29,7 @@ import tyro
 from successes import success_figures, success_text
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "examples"))
-from fetch_policies import PushPolicy, SlidePolicy
-
-STEPS = 50  # of an episode
+from fetch_policies import STEPS, PushPolicy, SlidePolicy
 
 
 @dataclass
@@ -80,7 +78,8 @@ def main(o: Options) -> None:
     """Play the episodes, print the figures."""
     torch.set_num_threads(1)
     env = make_env(o.task)
-    policy = (PushPolicy if o.task == "push" else SlidePolicy)(env.unwrapped.model)
+    model, posture = env.unwrapped.model, env.unwrapped.initial_qpos
+    policy = PushPolicy(model) if o.task == "push" else SlidePolicy(model, posture)
     episodes = np.array([play(env, policy, seed) for seed in range(o.seed, o.seed + o.episodes)])
     env.close()
     success, first, away, seconds = episodes.T

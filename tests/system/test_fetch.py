@@ -23,8 +23,8 @@ def test_a_puck_that_is_hit_slides_as_far_as_friction_lets_it(monkeypatch):
     x[:3] = -1.0  # the gripper is far
     for k in range(system.horizon):
         x = system.stage(k).step(x, x.new_zeros(1)).x_next
-    seen = np.zeros(25)
-    seen[14] = 0.8 * fetch.SECONDS
+    start, velocity = np.zeros(3), np.array([0.8, 0.0, 0.0])
     assert x[3] == pytest.approx(0.8**2 / (2 * 9.81 * 0.1), abs=2e-3)
-    assert fetch.place_of_rest(seen, 0.1)[0] == pytest.approx(0.8**2 / (2 * 9.81 * 0.1))
+    assert fetch.place_of_rest(start, velocity, 0.1)[0] == pytest.approx(0.8**2 / (2 * 9.81 * 0.1))
+    assert fetch.place_of_rest(start, velocity, 0.1, 0.2)[0] == pytest.approx(0.16 - 0.2**2 * 0.981 / 2)
     assert abs(x[4]) < 1e-3
