@@ -194,6 +194,8 @@ def measure(model: Any, o: Options, contacts: int | None = None) -> dict[str, An
     more = [int(found[1]) for w in said if (found := re.search(r"pass contacts=(\d+)", str(w.message)))]
     if more and contacts is None:
         return measure(model, o, max(more))
+    for w in said:
+        warnings.warn(w.message, stacklevel=1)
     predicted = system.step(x, actions - zeros).x_next[:, nv : 2 * nv].numpy()
     errors: dict[str, dict[str, list[float]]] = {kind: {"lcs": [], "fd": []} for kind in ("free", "contact", "limit")}
     for i, state in enumerate(states):

@@ -9,11 +9,9 @@ pytest.importorskip("mujoco")
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from tests.conformance import scenes
 
-KNOWN = {126}  # a light link between limits, which another control than the nominal one throws about
-
 
 @pytest.mark.parametrize("first", range(0, 240, 40))
 def test_a_step_of_a_random_scene_is_like_mujocos_or_says_why_not(first):
     judged = {seed: scenes.judge(seed) for seed in range(first, first + 40)}
-    assert not {seed: j for seed, j in judged.items() if j and j.wrong() and seed not in KNOWN}
+    assert not {seed: j for seed, j in judged.items() if j and j.wrong()}
     assert sum(j is not None and j.outcome == "made" for j in judged.values()) >= 5

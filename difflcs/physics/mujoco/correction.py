@@ -15,6 +15,7 @@ many times as large.
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import mujoco
@@ -23,7 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from difflcs.errors import InvalidInputError
+from difflcs.errors import ContactWarning, InvalidInputError
 from difflcs.physics.mujoco._native import _mujoco  # pyright: ignore[reportMissingModuleSource]
 from difflcs.physics.mujoco.library import Places, library
 from difflcs.physics.mujoco.limits import Rows
@@ -33,6 +34,8 @@ from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams, advance
 
 Array = NDArray[np.float64]
+_FAR, _SMALL = 0.3, 0.1  # of the motion and what forces do to a tree, and to all: an error that is worth a warning
+_STILL = 1e-3  # [m/s, rad/s], a speed that is none
 _WORSE = 0.25  # of all motion, by which contacts are worse than nothing where Δ counts wholly
 
 
@@ -123,6 +126,9 @@ def correct(
     worse = (size(wrong) - size(change)) / (_WORSE * (size(speed) + size(free)) + 1e-9)
     share = energy[:, :, :n_contacts].sum(-1) / total
     counts = 1 - share * (1 - np.clip(worse, 0.0, 1.0))
+    moves = size(speed) + size(change)
+    least = np.maximum(_FAR * (moves + size(free)), _SMALL * (moves + size(free)).sum(1, keepdims=True))
+    _warn_of_wrong(size(wrong) > np.maximum(moves, least) + _STILL * np.sqrt(mass.sum(1)))
     due = (1 - share) * np.minimum(1.0, np.sqrt(total) / np.maximum(size(wrong), 1e-15))
     part = energy / np.where(forces != 0, forces, 1.0)[:, None] / total[:, :, None]
     both = np.concatenate([tree, tree])
@@ -131,3 +137,15 @@ def correct(
     d[:, : 2 * nv] += (by_forces @ lower[:, :, None])[:, :, 0] + wrong * (counts - due)[:, both]
     C, d = (torch.from_numpy(v).reshape(*batch, *v.shape[1:]) for v in (C, d))
     return LCSParams.of_checked({**system.tensors(), "C": C, "d": d})
+
+
+def _warn_of_wrong(wrong: NDArray[np.bool_]) -> None:
+    """Warn of states where the correction is more than the motion of a tree of bodies (n, n_trees)."""
+    if wrong.any():
+        warnings.warn(
+            f"expected a system as near to MuJoCo's own step as standing still is, got one that only its correction "
+            f"brings there in {wrong.any(1).sum()} of {len(wrong)} states, so that it may be far off with other "
+            f"actions: take fewer seconds, or a nominal control (ctrl) near the actions",
+            ContactWarning,
+            stacklevel=4,
+        )
