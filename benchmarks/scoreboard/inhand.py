@@ -41,7 +41,6 @@ from difflcs.cli.bench import machine, save
 from difflcs.errors import ContactWarning, InvalidInputError
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.physics.mujoco import ContactGroup, Distance, Effort, MujocoCost, MujocoLCS, Orientation, Position
-from difflcs.status import solved
 
 OBJECTS = {  # place of the start [m], its height, and the target place, as published
     "airplane": ((-0.03, -0.01), 0.03, (-0.02, -0.01, 0.03)),
@@ -65,7 +64,7 @@ OBJECTS = {  # place of the start [m], its height, and the target place, as publ
 JOINTS = (0.125, 1.13, 1.45, 1.24, -0.02, 0.445, 1.17, 1.5, -0.459, 1.54, 1.11, 1.23, 0.638, 1.85, 1.5, 1.26)
 FINGERS, LINKS = ("ff", "mf", "rf", "th"), ("base", "proximal", "medial", "distal", "tip")
 COLUMNS = "object", "seed", "success", "placed", "dropped", "steps", "position_mm", "angle_deg", "goals"
-PARTS = "system", "cost", "solve", "rehearsal"
+PARTS = "plan", "rehearsal"
 LIMIT, HELD, SUBSTEPS, LOST, SECONDS, TRIALS, OPENING = 500, 21, 50, 0.005, 0.1, 20, 8
 
 
@@ -183,7 +182,7 @@ class HandPolicy:
             compliance=s.compliance,
             length=0.02,
         )
-        self.cost = MujocoCost(
+        cost = MujocoCost(
             self.module,
             [
                 Position("body:obj", place, weight=0.0, weight_final=s.place),
@@ -192,9 +191,9 @@ class HandPolicy:
                 Effort(s.effort),
             ],
         )
-        solver, far = BatchedBackend(effort="fast", threads=1), self.limit
-        self.mpc = LCSMPCLayer(self.module, self.cost, s.horizon, -far, far, solver, s.relaxation, "mask")
-        self.settings, self.guess, self.times = settings, None, []
+        solver, far = BatchedBackend(effort="fast", threads=1), s.pace * self.limit
+        self.mpc = LCSMPCLayer(self.module, cost, s.horizon, -far, far, solver, s.relaxation).controller()
+        self.settings, self.times = settings, []
         self.random, self.posture, self.ctrl = np.random.RandomState(0), None, data.qpos[:16].copy()
         self.aim(goal)
 
@@ -224,24 +223,16 @@ class HandPolicy:
     def act(self, data: Any) -> np.ndarray:
         """MuJoCo's ctrl for the next 0.1 s."""
         if self.stalls(data):
-            self.guess = None
+            self.mpc.reset()
             last, ctrl = self.ctrl, self.rehearse(data, self.posture, (1.0,))
             if ctrl is last:  # to open in this way does harm
                 self.posture = self.draw(0.3)
             return ctrl
-        limit = self.limit * self.settings.pace
         marks = [time.thread_time()]
         x = self.module.observe(data)
-        system = self.module.params(x)
+        action = torch.from_numpy(self.mpc.step(x, self.goal))  # which asks module and cost
         marks.append(time.thread_time())
-        cost = self.cost.at(x, torch.from_numpy(self.goal))
-        marks.append(time.thread_time())
-        low, high = (bound.clamp(-limit, limit) for bound in self.module.action_bounds(x))
-        with torch.no_grad():
-            plan = self.mpc(x, lcs=system, cost=cost, guess=self.guess, u_min=low, u_max=high)
-        marks.append(time.thread_time())
-        self.guess = plan.shift() if bool(solved(plan.status)) else None
-        ctrl = self.rehearse(data, self.module.control(x, plan.action).numpy(), self.settings.paces)
+        ctrl = self.rehearse(data, self.module.control(x, action).numpy(), self.settings.paces)
         marks.append(time.thread_time())
         self.times.append(1e3 * np.diff(marks))
         return ctrl
