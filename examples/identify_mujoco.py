@@ -28,6 +28,7 @@ from difflcs import violation_loss
 from difflcs.errors import ContactWarning
 from difflcs.physics.mujoco import LearnableMujocoLCS
 
+OF_CONTACTS = ("friction", "size", "offset", "compliance")  # what only contacts tell
 GYMNASIUM = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
 
@@ -77,6 +78,10 @@ def identify(name: str, model: Any, learn: list[Any], o: Options) -> None:
     with torch.no_grad():
         module.change.copy_(signs * np.log(o.wrong))
     x, u, x_next = gather(model, module, o)
+    if not any((what if isinstance(what, str) else what[0]) in OF_CONTACTS for what in learn):
+        # A system explains impacts badly, and they say nothing of what is to be learned.
+        free = [(module.physics.contacts(state).gap > 0).all(-1) for state in (x, x_next)]
+        x, u, x_next = (rows[free[0] & free[1]] for rows in (x, u, x_next))
     adam = torch.optim.Adam(module.parameters(), 0.1)
     slower = torch.optim.lr_scheduler.ExponentialLR(adam, 0.03 ** (1 / o.steps))
     draw, begun = torch.Generator().manual_seed(o.seed), time.process_time()
@@ -87,7 +92,7 @@ def identify(name: str, model: Any, learn: list[Any], o: Options) -> None:
         (losses / losses.detach().median()).log1p().mean().backward()
         adam.step()
         slower.step()
-    print(f"{name}: {len(x)} transitions, {time.process_time() - begun:.0f} s")
+    print(f"{name}: {len(x)} transitions used, {time.process_time() - begun:.0f} s")
     for what, sign, left in zip(learn, signs, module.change.detach().exp(), strict=True):
         print(f"  {what}: guessed × {o.wrong ** float(sign):.2f}, found × {left:.3f}")
 

@@ -48,6 +48,8 @@ constexpr double kLonger = 1000.0;
 // that may win are then solved at the problem's own. Almost hard contact has more optima, and its kinks keep a plan
 // where it begins.
 constexpr double kSoft = 1e-5, kSofter = 1000.0;
+// By this part of the best cost a start may lie behind there, and still win at the problem's own relaxation.
+constexpr double kBehind = 0.3;
 // An iteration with row exchanges takes ten times as long, and helps early if at all.
 constexpr int64_t kMaxIterPivot = 60;
 // From this number of forces, or of states and actions, on problems are solved one by one: the matrices of several side
@@ -467,7 +469,8 @@ void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
 
 // Whether a job may become better than a plan, and does not approach the same one.
 bool MpcDriver::promising(const MpcBatch& batch, int64_t job, const double* u, double objective) const {
-  if (!(tried.objective[job] - tried.gained[job] <= objective)) return false;
+  const double behind = comparison(batch) > batch.relaxation ? kBehind * std::abs(objective) : 0.0;
+  if (!(tried.objective[job] - tried.gained[job] <= objective + behind)) return false;
   const Sizes n(batch);
   for (int64_t i = 0; i < n.u; i++) {
     const Bound bound(batch, tried.element[job], i);
