@@ -17,15 +17,16 @@ def make_practising(seed: int = 0, first_epochs: int = 20, models: dict | None =
 
 
 @pytest.mark.parametrize(
-    ("iterations", "remembered", "expected"),
+    ("iterations", "last", "remembered", "expected"),
     [
-        (2, False, [0, 2, 2, 2]),  # none before the first real episodes
-        (2, True, [2, 2, 2, 2]),  # but where those of a warm-up are known
-        (0, True, [0, 0, 0, 0]),
+        (2, 0, False, [0, 2, 2, 2]),  # none before the first real episodes
+        (2, 0, True, [2, 2, 2, 2]),  # but where those of a warm-up are known
+        (2, 3, True, [2, 2, 2, 8]),  # and three times as many after the last
+        (0, 3, True, [0, 0, 0, 0]),
     ],
 )
-def test_iterations_on_model_rollouts_come_before_each_real_one(iterations, remembered, expected):
-    trainer, counts = make_practising(models={"iterations": iterations}), []
+def test_iterations_on_model_rollouts_come_before_each_real_one(iterations, last, remembered, expected):
+    trainer, counts = make_practising(models={"iterations": iterations, "last": last}), []
     if remembered:
         trainer.remember(
             collect(make_envs(3), uniform_actions(make_envs(3), np.random.default_rng(0)), [1, 2, 3], STEPS)

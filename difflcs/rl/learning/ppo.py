@@ -57,7 +57,7 @@ class PPOReport:
         explained_variance: of the returns by the value network, before it saw them.
         solver_failures: MPC solves that did not converge, while collecting and while learning.
         unstable: episodes dropped because the simulation broke down.
-        model_success: share of the last model rollouts before it that ended at the goal; None without any.
+        model_success: share of its last model rollouts that ended at the goal; None without any.
         model_loss: error of the ensemble that they were played in, in the last pass of its training.
         physics_seconds: wall time of the environment.
         solve_seconds: wall time of the MPC.
@@ -200,7 +200,8 @@ class PPO(Trainer):
     def step(self, after_step: AfterStep | None = None) -> PPOReport:
         """One iteration: collect, estimate advantages, improve the policy, fit the value network.
 
-        Iterations on model rollouts come first, if there are models with real episodes.
+        Iterations on model rollouts come first, if there are models with real episodes. More of them follow the last
+        real episodes where the settings say so, unless only what the robot has tried may be handed out.
 
         Raises:
             InvalidInputError: rewards that are not finite, or no episode with a stable simulation.
@@ -220,16 +221,20 @@ class PPO(Trainer):
         seeds = episode_seeds(self.seed, Stream.TRAINING, self.episodes, count)
         self.episodes += count
         std, step_size = float(self.actor.std.mean()), self.update.size.value
-        if self.models is None:
-            outcome = self._iterate(self.robot, seeds, (), scale, after_step)
-        else:
-            outcome = self._iterate(self.robot, seeds, (), self.models.settings.real_step * scale, after_step)
+        real_scale = scale if self.models is None else self.models.settings.real_step * scale
+        outcome = self._iterate(self.robot, seeds, (), real_scale, after_step)
+        if self.models is not None:
             self.update.size.value = step_size  # it follows the model rollouts alone
         episodes, improvement = outcome.episodes, outcome.improvement
         self.remember(episodes)
         kept = self.incumbent
         accepted = kept is None or kept.challenge(outcome.starts, outcome.returns, self.critic.values)
         self.iteration += 1
+        if self.done and self.models is not None and kept is None:
+            start = time.perf_counter()
+            for k in range(self.models.settings.last):
+                model_success, model_loss = self._train_on_models(scale, 1 + k * self.models.settings.iterations)
+            model_seconds += time.perf_counter() - start
         return PPOReport(
             iteration=self.iteration,
             env_steps=self.env_steps,
@@ -255,10 +260,10 @@ class PPO(Trainer):
             accepted=int(accepted),
         )
 
-    def _train_on_models(self, scale: float) -> tuple[float | None, float | None]:
+    def _train_on_models(self, scale: float, first: int = 1) -> tuple[float | None, float | None]:
         """Run the iterations on model rollouts; return the success of the last ones and the loss of the ensemble.
 
-        Both are None if there are no models, or if they have no real episode yet.
+        Iterations are numbered from `first`. Both are None if there are no models, or no real episodes in them yet.
         """
         models = self.models
         unknown = self.incumbent is not None and not len(self.incumbent)
@@ -266,7 +271,7 @@ class PPO(Trainer):
             return None, None
         settings = models.settings
         loss, success = models.fit(), 0.0
-        for k in range(1, settings.iterations + 1):
+        for k in range(first, first + settings.iterations):
             seeds = numbers(settings.rollouts, self.seed, Stream.MODEL_ROLLOUT, self.iteration, k)
             episodes = self._iterate(self.practice, seeds, (k,), scale).episodes
             success = float(episodes["success"].double().mean())
