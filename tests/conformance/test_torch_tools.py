@@ -53,6 +53,14 @@ def of_each(function, **options):
     return lambda lcs: [function(lcs, name, **options) for name in CHANGED] and lcs
 
 
+def averaged(lcs):
+    ema = AveragedModel(of_each(parametrizations.weight_norm)(lcs), avg_fn=lambda old, new, _: 0.3 * old + 0.7 * new)
+    for _ in range(2):
+        stir(lcs)
+        ema.update_parameters(lcs)
+    return ema.module
+
+
 TOOLS = {
     "none": lambda lcs: lcs,
     "parametrize": of_each(enlarge),
@@ -63,6 +71,7 @@ TOOLS = {
     "prune twice": lambda lcs: of_each(prune.random_unstructured, amount=0.2)(TOOLS["prune"](lcs)),
     "old weight_norm": of_each(utils.weight_norm),
     "old spectral_norm": of_each(utils.spectral_norm),
+    "averaged": averaged,
 }
 
 

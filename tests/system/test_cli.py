@@ -9,8 +9,10 @@ import logging
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -495,7 +497,7 @@ def test_one_training_at_a_time_in_a_run(capsys, tmp_path, monkeypatch, words):
     assert run(capsys, "train", "--out", path, "--resume")[0] == 0  # finished: nothing to lock
 
 
-# --- disks ------------------------------------------------------------------------------------------------------------
+# --- killed, and disks ------------------------------------------------------------------------------------------------
 
 
 def learned(path: Path) -> list[tuple[str, bytes]]:
@@ -503,6 +505,28 @@ def learned(path: Path) -> list[tuple[str, bytes]]:
     last = max(path.glob("checkpoints/0*"))
     files = [path / "model/model.safetensors", last / "model.safetensors", last / "config.json"]
     return [(str(file.relative_to(path)), file.read_bytes()) for file in files]
+
+
+def test_resume_after_kill_9(capsys, tmp_path):
+    """Killed in the warm-up, resumed, killed in the main phase, resumed."""
+    options = ["--method", "lcs-rl", "--minutes", "1.5", "--warmup-minutes", "0.4", "--ppo.rollouts", "7"]
+    options += "--ppo.steps 2 --warmup.epochs.first 20 --models.rollouts 20 --models.iterations 2".split()
+    options += ["--final-goals", "0", "--evaluate-at"]
+    through, killed = tmp_path / "through", tmp_path / "killed"
+    for resume, until in ((False, 1), (True, 4)):
+        command = [sys.executable, "-m", "difflcs", "train", *options, "--out", str(killed)]
+        process = subprocess.Popen(
+            [*command, *["--resume"] * resume], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        deadline = time.monotonic() + 120
+        while not (killed / f"checkpoints/{until:06d}").exists() and time.monotonic() < deadline:
+            time.sleep(0.005)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        assert not (killed / "model").exists()
+    assert run(capsys, "train", "--out", killed, "--resume")[0] == 0
+    assert run(capsys, "train", *options, "--out", through)[0] == 0
+    assert learned(through) == learned(killed)
 
 
 def test_a_folder_that_cannot_be_written_is_reported_first(capsys, tmp_path):

@@ -237,6 +237,28 @@ def test_tensors_that_are_not_finite(record, value):
         load(path)
 
 
+def test_random_damage(record):
+    """Seeded: flipped bits, cuts, runs of random bytes, pieces swapped. The header of the tensors gets half of it."""
+    path, load, *_ = record
+    rng = random.Random(0)
+    for name in ("config.json", "model.safetensors"):
+        whole = (path / name).read_bytes()
+        for _ in range(150):
+            data = bytearray(whole)
+            end = len(data) if rng.random() < 0.5 else min(len(data), 300)
+            for _ in range(rng.choice((1, 1, 4, 40))):
+                data[rng.randrange(end)] = rng.randrange(256)
+            kind = rng.randrange(4)
+            if kind == 1:
+                del data[rng.randrange(len(data)) :]
+            elif kind == 2:
+                data[rng.randrange(end) : rng.randrange(end)] = rng.randbytes(rng.randrange(64))
+            (path / name).write_bytes(data)
+            loads_or_refuses(load, path)
+        (path / name).write_bytes(whole)
+    load(path)
+
+
 # --- settings of a run ------------------------------------------------------------------------------------------------
 
 

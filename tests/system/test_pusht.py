@@ -4,7 +4,9 @@ import importlib.util
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
@@ -139,6 +141,14 @@ def test_a_policy_for_push_t_sends_the_disc_to_places_in_the_plane(push_t):
     assert target.shape == (2,)
     assert ((target >= 0) & (target <= 512)).all()
     assert policy.sampling.decision.mode == "travel"
+
+
+def test_a_picture_shows_what_was_decided(push_t):
+    pytest.importorskip("PIL")
+    env, policy = SimpleNamespace(render=lambda: np.zeros((96, 96, 3), np.uint8)), push_t.PushTPolicy()
+    plain = push_t.picture(env, policy)
+    policy.act([400.0, 400.0, 256.0, 256.0, 0.0])
+    assert push_t.picture(env, policy) != plain
 
 
 def test_actions_that_come_late_are_planned_from_where_things_will_be(push_t):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
@@ -77,6 +78,16 @@ def test_both_quadratic_programs_are_the_linear_mpc(race, pushing):
     found = race.BatchedBackend().solve(race.as_mpc(linear), None)
     assert bool(found.solved.all())
     np.testing.assert_allclose(found.primal.u[1].flatten(), z, rtol=0, atol=1e-7)
+
+
+def test_hard_cost_is_that_of_the_exact_contact(race, pushing):
+    from race_global import hard_cost
+
+    mpc = race.as_mpc(pushing)
+    u = mpc.clip(0.01 * torch.ones(COUNT, mpc.horizon, mpc.n_u, dtype=torch.float64))
+    sharp = dataclasses.replace(mpc, relaxation=1e-12)
+    torch.testing.assert_close(hard_cost(mpc, u), sharp.objective(sharp.rollout(u)[0], u), rtol=1e-5, atol=1e-6)
+    assert float((hard_cost(mpc, u) - mpc.objective(mpc.rollout(u)[0], u)).abs().max()) > 0
 
 
 def test_planners_for_contact_come_near_the_best_plan(race):

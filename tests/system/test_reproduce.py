@@ -105,6 +105,23 @@ def test_matrix_holds_every_unit_once_the_important_ones_first():
     assert [unit.seed for unit in table] == sorted(unit.seed for unit in table)
 
 
+def test_matrix_of_a_part():
+    paper, one = units.PRESETS["paper"], units.PRESETS["paper"].with_amounts(1, None)
+    slow = units.matrix(["curves"], paper, methods=["pddm"])
+    assert {(unit.method, unit.seed - FIRST) for unit in slow} == {("pddm", seed) for seed in range(5)}
+    assert len(units.matrix(["curves"], paper.with_amounts(10, None), methods=["pddm"], recipes=["authors"])) == 10
+    masses = units.matrix(["masses"], one, objects=["mug"])
+    assert masses == [Unit("mug", "lcs-rl", "paper", FIRST), Unit("mug", "lcs-rl", "light", FIRST)]
+    assert [unit.spec.env_kwargs.get("object_mass") for unit in masses] == [None, 0.01]
+    ablations = units.matrix(["ablations"], paper)
+    assert {unit.task for unit in ablations} == set(units.ABLATION_TASKS)
+    assert {unit.seed for unit in ablations} == set(range(FIRST, FIRST + units.ABLATION_SEEDS))
+    # In each of them one part is missing: all differ from each other.
+    configs = [units.config_of(unit, paper).method for unit in ablations if unit.task == "cube" and unit.seed == FIRST]
+    tasks = [unit.changes.task for unit in ablations if unit.task == "cube" and unit.seed == FIRST]
+    assert len({repr(pair) for pair in zip(configs, tasks, strict=True)}) == len(units.ABLATED) + 1
+
+
 def test_config_is_the_default_recipe_but_for_what_the_unit_says():
     default = {name: get_method(name)() for name in units.METHODS}
     for method in ("violation", "lcs-rl"):
@@ -363,6 +380,17 @@ def test_what_is_stale_or_foreign_is_not_taken_for_a_result(tmp_path, monkeypatc
     assert job.result() is None
 
 
+def test_ctrl_c_says_how_to_go_on(monkeypatch, tmp_path, capsys):
+    def interrupt(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(runs, "compute", interrupt)
+    monkeypatch.setattr(runs, "connect", lambda *arguments: contextlib.nullcontext())
+    code, _, err = run_script(run_runs, capsys, "--methods", "pddm", "--work", tmp_path, "--results", tmp_path)
+    assert code == 130
+    assert "the same command goes on" in err
+
+
 def test_a_script_computes_and_draws(local, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(runs, "connect", lambda workers: contextlib.nullcontext(local))
     options = ["--rerun", "--preset", "smoke", "--objects", "mug", "--methods", "violation"]
@@ -459,6 +487,18 @@ def test_differences_are_of_whole_goals(tmp_path):
     assert stats.p_value(report.paired(*pair, "final")) == 1.0
 
 
+def test_stand_ins_are_a_table_of_their_own(results, capsys):
+    before = records.path_of(results, "paper").read_bytes()
+    unit = Unit("banana", "lcs-rl", "ours", FIRST)
+    path = records.add(results, "paper", unit_rows(unit, (1, 2, 3, 99), source="stand_in"))
+    assert path.name == "paper-stand-in.csv"
+    assert records.path_of(results, "paper").read_bytes() == before
+    assert run_script(table1.main, capsys, "--results", results)[0] == 0
+    assert "99.0" not in (results / "table1.md").read_text()
+    assert "99.0" in (results / "table1-stand-in.md").read_text()
+    assert "STAND-INS" in (results / "table1-stand-in.md").read_text()
+
+
 def test_nothing_is_mixed_or_replaced_silently(results, capsys):
     unit = Unit("mug", "lcs-rl", "ours", 0)
     # Other numbers of goals stand beside each other; the larger amount is shown, and what is left out is said.
@@ -497,6 +537,17 @@ def test_only_what_can_be_compared_is(results):
         assert report.paired(a, other, "final") == []
     assert report.paired(a, records.select(rows, "cube", "violation", "ours"), "final") == []
     assert report.paired(a, None, "final") == []
+
+
+def test_readme_is_filled_between_its_marks_only(tmp_path):
+    readme = tmp_path / "README.md"
+    readme.write_text("before\n<!-- results: table1 -->\nold\n<!-- end -->\nafter\n")
+    report.update_readme("table1", "new\n", readme)
+    report.update_readme("table1-quick", "quick\n", readme)
+    assert readme.read_text() == "before\n<!-- results: table1 -->\n\nnew\n\n<!-- end -->\nafter\n"
+    readme.write_text("<!-- results: table1 -->\nold\n")
+    with pytest.raises(CheckpointError, match="put it back"):
+        report.update_readme("table1", "new\n", readme)
 
 
 def test_the_tracked_readme_and_tables_are_those_of_the_tracked_results(tmp_path, monkeypatch, capsys):

@@ -100,6 +100,49 @@ def test_the_system_of_a_finger_is_that_of_the_plane_and_stays_what_it_is():
     torch.testing.assert_close(after[5:], torch.stack([x[5] - 0.1, x[6]]))
 
 
+def test_a_face_that_was_refused_is_not_offered_until_later():
+    from trifinger_push.cube import UNIT
+    from trifinger_push.places import FingerPlaces
+
+    places, x = FingerPlaces(), state([0.0, 0.0, 0.0], [0.1, 0.0, 0.1], 0.0)
+    before = places.sample(x)
+    face = before[before[:, 0] == 0][0]
+    tip = np.array([*(face[1:].numpy() * UNIT), 0.022])
+    places.refuse(np.array([0.0, 0.0, 0.0, *tip, 0.0]), steps=10)
+    assert not places.near(state([0.0, 0.0, 0.0], tip, 0.0))
+    after = places.sample(x)
+    assert len(after) < len(before)
+    assert not (after == face).all(1).any()
+    places.now = 10
+    assert len(places.sample(x)) == len(before)
+
+
+def test_a_tip_goes_straight_where_it_can_and_over_the_cube_where_it_must():
+    from trifinger_push.cube import UNIT
+    from trifinger_push.places import OVER, FingerTravel
+
+    travel, pose = FingerTravel(), [0.0, 0.0, 0.0]
+    target = state(pose, [-0.055, 0.0, 0.022], 0.0)
+    travel.tips = np.array([[-0.09, 0.02, 0.1]] * 3)
+    straight = travel.action(target, target).numpy() * UNIT
+    np.testing.assert_allclose(travel.tips[0] + straight, [-0.055, 0.0, 0.022], atol=1e-9)
+    travel.tips = np.array([[0.09, 0.0, 0.1]] * 3)
+    over = travel.tips[0] + travel.action(target, target).numpy() * UNIT
+    np.testing.assert_allclose(over, [-0.055, 0.0, OVER], atol=1e-9)
+    travel.tips = np.array([[0.05, 0.0, 0.02]] * 3)  # beside the far face: up, and away from it
+    lifted = travel.tips[0] + travel.action(target, target).numpy() * UNIT
+    assert lifted[0] > 0.05
+    assert lifted[2] == pytest.approx(OVER)
+    states = torch.stack([target, target])
+    states[:, 6] = torch.tensor([0.0, 1.0])
+    travel.tips = np.array([[0.09, 0.0, 0.1], [-0.09, 0.02, 0.1], [0.0, 0.1, 0.1]])
+    far, near = travel.distance(target, states).tolist()
+    assert far > near
+    assert travel.arrived(states[0], target)
+    assert not travel.arrived(states[1], target)  # another finger
+    assert not travel.arrived(state(pose, [-0.055, 0.02, 0.022], 0.0), target)
+
+
 def test_the_package_that_is_missing_is_named(monkeypatch):
     pytest.importorskip("tyro")
     import trifinger_rl

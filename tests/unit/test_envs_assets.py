@@ -5,6 +5,7 @@ import gzip
 import http.server
 import io
 import json
+import random
 import signal
 import socket
 import subprocess
@@ -284,6 +285,20 @@ def test_a_bomb_is_refused(server, tmp_path, monkeypatch):
     with pytest.raises(AssetError, match="at most 1000 files of 1 MB"):
         fetch(server, tmp_path)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_damaged_archives(server, tmp_path):
+    """Seeded: of the compressed stream, and of the tar inside it."""
+    rng = random.Random(0)
+    whole = archive({MESH: box_stl(), "004_sugar_box/readme.txt": b"x" * 600})
+    for i in range(120):
+        data = bytearray(whole if i % 2 else gzip.decompress(whole))
+        for _ in range(rng.choice((1, 3, 30))):
+            data[rng.randrange(min(len(data), rng.choice((512, 10_000))))] = rng.randrange(256)
+        server.content = bytes(data) if i % 2 else gzip.compress(bytes(data), 1)
+        with contextlib.suppress(AssetError):
+            fetch(server, tmp_path / str(i))
+        assert {path.name for path in (tmp_path / str(i)).glob(".*")} <= {".lock"}
 
 
 @pytest.mark.parametrize(

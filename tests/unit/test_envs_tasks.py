@@ -1,5 +1,6 @@
 """What the environments publish to the library: every number of a task is that of its environment."""
 
+import json
 import subprocess
 import sys
 
@@ -15,6 +16,7 @@ from difflcs_envs.tasks import MOVE, caption, contact_cost, pushing_cost, trifin
 from difflcs_envs.ycb import YCB  # noqa: E402
 
 NAMES = ("cube", "turn_cube", *YCB)
+FEW = ("cube", "turn_cube", "mug")
 
 
 pytestmark = pytest.mark.usefixtures("stand_ins")
@@ -104,6 +106,20 @@ def test_the_outcome_of_a_step_needs_no_torch():
         "assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("name", FEW)
+def test_what_is_pushed_can_be_described_through_wrappers_and_vectors(name):
+    task = get_task(name)
+    env = task.make_env()
+    expected = env.unwrapped.object.describe()
+    assert expected["mass"] > 0
+    assert json.loads(json.dumps(expected)) == expected
+    vectors = [task.make_envs(2), gymnasium.vector.SyncVectorEnv([task.make_env] * 2)]
+    wrapped = gymnasium.wrappers.vector.RecordEpisodeStatistics(task.make_envs(2))
+    for one in (env, env.unwrapped, *vectors, wrapped):
+        assert task.describe(one) == expected
+        one.close()
 
 
 # --- what is known of the physics -------------------------------------------------------------------------------------
