@@ -72,18 +72,11 @@ docs: $(VENV)/.ready
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .ruff_cache
 
-# The kernels under address, undefined-behaviour and thread sanitizers, on every instruction set this CPU has.
-SANITIZERS := address,undefined thread
+# The kernels under address, undefined-behaviour and thread sanitizers, on every instruction set of this CPU.
 .PHONY: sanitize
-sanitize:
-	@for s in $(SANITIZERS); do \
-	  cmake -S tests/native -B build/sanitize-$$s -DSANITIZER=$$s -DCMAKE_BUILD_TYPE=None > /dev/null && \
-	  cmake --build build/sanitize-$$s --parallel 2 > /dev/null && \
-	  for isa in baseline $$(grep -o -m1 -w avx2 /proc/cpuinfo 2>/dev/null) \
-	    $$(grep -q avx512dq /proc/cpuinfo 2>/dev/null && echo avx512); do \
-	    echo "$$s:"; DIFFLCS_ISA=$$isa build/sanitize-$$s/stress || exit 1; \
-	  done || exit 1; \
-	done
+sanitize: $(VENV)/.ready
+	tests/native/sanitize.sh address,undefined
+	tests/native/sanitize.sh thread
 
 # The lines that the quick tests do not run (build/coverage/index.html); and whether a test notices when a line is wrong:
 # MUTANTS small faults below FROM, drawn with SEED, put into the working tree one after the other. Minutes for each.

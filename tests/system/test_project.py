@@ -78,17 +78,6 @@ def test_the_changelog_begins_with_this_version():
     assert [date for _, date in versions[1:] if date == "unreleased"] == []
 
 
-@pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler")
-def test_the_stress_program_of_the_sanitizers_fits_the_kernels():
-    """`make sanitize` takes minutes, so nobody notices at once when a struct has changed."""
-    options = ["-std=c++17", "-fsyntax-only", "-I", ROOT / "difflcs" / "_native"]
-    done = subprocess.run(
-        ["c++", *options, ROOT / "tests" / "native" / "stress.cpp"],
-        capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-
-
 @pytest.mark.skipif(shutil.which("cmake") is None, reason="needs cmake")
 def test_microsofts_compiler_is_refused_in_a_sentence(tmp_path):
     # What CMake would have found out about the compiler, said in advance.
