@@ -138,16 +138,26 @@ def run_of(out: Path) -> SimpleNamespace:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["train", "--task", "cubes"], "expected one of "),
         (["train", "--method", "lcs-rl", "--minutes", "3"], "--minutes 30"),
         (["train", "--method", "pddm", "--init", "nowhere"], "init: expected none"),
+        (["train", "--backend", "magic", "--smoke"], "magic"),
         (["train", "--minutes", "-1"], "minutes"),
         (["train", "--resume"], "difflcs train"),
         (["train", "--init", "nowhere"], "nowhere"),
+        (["train", "--init", "zoo:teapot"], "trifinger-cube"),
         (["evaluate", "zoo:trifinger-cube", "--goals", "0"], "goals"),
+        (["evaluate", "zoo:trifinger-cube", "--seed", "-1"], "seed"),
+        (["render", "zoo:trifinger-cube", "--goal"], "expected x [m], y [m], yaw [rad] for each goal"),
         (["render", "zoo:trifinger-cube", "--goal", "0.1"], "expected x [m], y [m], yaw [rad] for each goal"),
+        (["train", "--method", "magic"], "expected one of lcs-rl, violation"),
         (["render", "zoo:trifinger-cube", "--out", "video.avi"], "MP4"),
         (["evaluate", "turn_cube"], "expected a task with known physics"),
         (["bench", "--repeats", "0"], "repeats"),
+        (
+            ["train", "--warmup.noise", "-1"],
+            "difflcs: --warmup.noise: expected a finite 0 <= noise, got -1.0; change it\n",
+        ),
         (["train", "--ppo.std", "0"], "difflcs: --ppo.std: expected a finite 0 < std, got 0.0; change it\n"),
         (
             ["train", "--warmup.adam.betas", "0.9", "2"],
@@ -166,6 +176,7 @@ def run_of(out: Path) -> SimpleNamespace:
         (["evaluate", "zoo:trifinger-cub"], "did you mean trifinger-cube"),
         (["zoo", "trifingercube"], "did you mean trifinger-cube"),
         (["evaluate", "nowhere"], "difflcs train"),
+        (["render", "nowhere"], "difflcs train"),
     ],
 )
 def test_mistakes_get_one_clean_message(capsys, tmp_path, arguments, message):

@@ -17,6 +17,11 @@ NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 BYTES = 1_000_000
 # What a reader's machine does not have, and what must not be published.
 PRIVATE = re.compile(r"/work\b|/tmp\b|/home/|/root\b|/Users/|site-packages|Traceback|Warning: |[A-Z]:\\\\")
+# As long as no package index has the library, it comes from the checkout that the notebook lies in.
+INSTALL = re.compile(
+    r"# From a checkout .*\ntry:\n    import difflcs  # noqa: F401\nexcept ImportError:\n"
+    r'    %pip install --quiet "\.\.\[([a-z,]+)\]"$'
+)
 SECONDS = 300  # of one cell; a notebook takes about five on a free machine
 
 
@@ -86,3 +91,18 @@ def test_is_committed_with_its_outputs(path: Path):
     assert not [output for output in outputs if "image/gif" in output.get("data", {})]
     found = PRIVATE.search(said(notebook)) or PRIVATE.search("\n".join(cell.source for cell in notebook.cells))
     assert found is None, found
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_has_the_form(path: Path):
+    notebook = read(path)
+    assert re.match(rf"# {int(path.stem[:2])} · \w", notebook.cells[0].source)
+    assert INSTALL.match(code(notebook)[0].source)
+    assert 'SMOKE = os.environ.get("SMOKE") == "1"' in code(notebook)[1].source
+    *_, last_text, last_code = notebook.cells
+    headings = re.findall(r"^## (.+)$", last_text.source, re.MULTILINE)
+    assert headings[-1] == "Use it in your own project"
+    assert last_code.cell_type == "code"
+    assert re.match(r"import |from ", last_code.source), "the last cell can be copied as it is"
+    assert notebook.metadata.kernelspec.name == "python3"
+    assert all(re.fullmatch(r"[a-z][a-z0-9-]*", cell.id) for cell in notebook.cells), "stable ids, small diffs"

@@ -164,6 +164,18 @@ def test_a_finished_run_becomes_a_model_with_its_card(tmp_path):
     assert violation.name == "trifinger-mug-violation"
 
 
+def test_nothing_is_overwritten_without_force(tmp_path):
+    root = tmp_path / "zoo"
+    run = make_run(tmp_path / "run").path
+    adding.add(run, root=root)
+    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    with pytest.raises(CheckpointError, match="--force"):
+        adding.add(run, root=root)
+    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+    other = make_run(tmp_path / "other", n_lam=4).path
+    assert adding.add(other, root=root, force=True).settings["settings"]["n_lam"] == 4
+
+
 @pytest.mark.parametrize(
     ("settings", "message"), [({"finished": False}, "--resume"), ({"evaluated": False}, "--final-goals 1000")]
 )
