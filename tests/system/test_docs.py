@@ -232,13 +232,6 @@ def test_every_error_is_in_the_reference(generated):
             assert re.search(rf":: difflcs[\w.]*\.{node.name}$", reference, re.MULTILINE), node.name
 
 
-def test_pages_named_by_errors_exist():
-    errors = importlib.import_module("difflcs.errors")
-    pages = {getattr(value, "page", None) for value in vars(errors).values()} - {None}
-    for page in pages:
-        assert (ROOT / page).exists(), page
-
-
 def test_the_generated_parts_of_pages_are_up_to_date():
     """In a process of its own, since tests register tasks and methods. Mend it by `python docs/generated.py`."""
     pytest.importorskip("tyro")

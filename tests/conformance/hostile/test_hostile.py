@@ -64,6 +64,8 @@ def test_nothing_is_wrong_in_silence(cell):
         pytest.importorskip("cvxpylayers")
     if cell.problems.startswith("mpc-skew"):  # what is refused there was tried three times
         cell = replace(cell, size=min(cell.size, 32))
+    if cell.problems == "form-zero-rows":  # half a second for each
+        cell = replace(cell, size=8)
     record = campaign.run_chunk(cell, seed=0, number=0)
     assert record.silent == 0, f"{record.by_check}, reproduce: {campaign.reproduction(record)}"
     floor = FLOORS.get(cell.problems, 0.0)
