@@ -107,6 +107,20 @@ def test_what_moves_against_constraints_goes_as_in_mujoco(name):
     assert np.median(parts) < 0.2
 
 
+@pytest.mark.parametrize("force", [-2.0, -1.0, 1.0, 2.0])
+def test_friction_holds_against_another_action_than_the_nominal_one(force):
+    """The nominal one has no force, so that friction, about the vertical, has little to do."""
+    upright = hinge('frictionloss="3"').replace('axis="0 1 0"', 'axis="0 0 1"')
+    data = mujoco.MjData(model := load(upright, MOTOR))
+    data.qvel[0] = 0.01
+    module = MujocoLCS(model, data, motion="dynamic", seconds=0.02)
+    x = module.state.to_state(data.qpos, data.qvel)
+    data.ctrl[:] = force
+    after = module.params(x).step(x, torch.from_numpy(data.ctrl)).x_next
+    mujoco.mj_step(model, data, 20)
+    assert float((after - module.state.to_state(data.qpos, data.qvel))[1].abs()) < 0.03
+
+
 @pytest.mark.parametrize("motion", ["quasi-static", "quasi-dynamic"])
 def test_what_has_no_velocity_keeps_to_an_equality_constraint(motion):
     model = load(

@@ -129,8 +129,12 @@ def correct(
     moves = size(speed) + size(change)
     least = np.maximum(_FAR * (moves + size(free)), _SMALL * (moves + size(free)).sum(1, keepdims=True))
     _warn_of_wrong(size(wrong) > np.maximum(moves, least) + _STILL * np.sqrt(mass.sum(1)))
-    due = (1 - share) * np.minimum(1.0, np.sqrt(total) / np.maximum(size(wrong), 1e-15))
-    part = energy / np.where(forces != 0, forces, 1.0)[:, None] / total[:, :, None]
+    # Dry friction far below its bound is whatever holds: the difference does not grow with it.
+    of_friction = slice(n_contacts + n_limits, n_contacts + n_limits + n_bounded)
+    energy[:, :, of_friction] *= np.abs(forces[:, None, of_friction]) / np.maximum(bound, 1e-300)[:, None]
+    grow = energy.sum(-1)
+    due = (1 - share) * np.minimum(1.0, np.sqrt(total) / np.maximum(size(wrong), 1e-15)) * grow / total
+    part = energy / np.where(forces != 0, forces, 1.0)[:, None] / np.maximum(grow, 1e-20)[:, :, None]
     both = np.concatenate([tree, tree])
     by_forces = (wrong * due[:, both])[:, :, None] * part[:, both]
     C[:, : 2 * nv] += by_forces
