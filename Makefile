@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Many tests start Python anew. Where images turn its bytecode off, each start compiles all of torch and MuJoCo again.
+export PYTHONDONTWRITEBYTECODE :=
 
 # One worker per core; a file stays in one worker, which computes its shared fixtures once; long files come first.
 PARALLEL := -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
