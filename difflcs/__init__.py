@@ -8,12 +8,12 @@ from difflcs.cost import CostModule, CostSequence, GoalCost, QuadraticCost
 from difflcs.errors import BackendNotFoundError, DiffLCSError, SolveError
 from difflcs.fit import FitReport, Transitions, fit_report
 from difflcs.lcp import LCPSolution, solve_lcp
-from difflcs.lcs import LCSModel, LCSModule, LCSParams, LCSSequence
+from difflcs.lcs import LCSModel
 from difflcs.losses import prediction_loss, violation_loss
 from difflcs.mpc.backends import available_backends, register_backend
 from difflcs.mpc.layer import LCSMPCLayer
 from difflcs.mpc.solution import MPCSolution
-from difflcs.records import sequence_along
+from difflcs.records import LCSModule, LCSParams, LCSSequence, sequence_along
 from difflcs.scales import ScaledLCS, Scales, suggest_scales
 from difflcs.status import Status
 

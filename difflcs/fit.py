@@ -20,8 +20,6 @@ from difflcs.records import SYSTEM, LCSModule, LCSParams, advance, check_inputs,
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["FitReport", "Transitions", "fit_report"]
-
 
 class Transitions(NamedTuple):
     """Transitions of a system, those of one episode one after the other; made to be unpacked into a loss.

@@ -26,29 +26,7 @@ from difflcs._modules import fresh, plain_state, untouched
 from difflcs._recall import Recall
 from difflcs.constraints import check_bounds
 from difflcs.errors import BoundsError, CheckpointError, DTypeError, InvalidInputError, ShapeError
-from difflcs.records import (
-    SYSTEM,
-    LCSModule,
-    LCSParams,
-    LCSPrediction,
-    LCSSequence,
-    SystemMatrices,
-    advance,
-    check_inputs,
-    check_sequence,
-    dimensions,
-)
-
-__all__ = [
-    "SYSTEM",
-    "LCSModel",
-    "LCSModule",
-    "LCSParams",
-    "LCSPrediction",
-    "LCSSequence",
-    "SystemMatrices",
-    "dimensions",
-]
+from difflcs.records import SYSTEM, LCSParams, LCSPrediction, advance, check_inputs, check_sequence
 
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
 

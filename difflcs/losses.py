@@ -15,8 +15,8 @@ from difflcs._differentiation import Gradients, Solver, Tensors, runs_eagerly, s
 from difflcs._native import TOLERANCES, _kernels  # pyright: ignore[reportMissingModuleSource]
 from difflcs.errors import DTypeError, GammaError, InvalidInputError, NotPositiveDefiniteError, SolveError
 from difflcs.lcp import MAX_ITER, solve_lcp_arrays
-from difflcs.lcs import SYSTEM, LCSModel, LCSModule, LCSParams, is_plain
-from difflcs.records import system_at
+from difflcs.lcs import LCSModel, is_plain
+from difflcs.records import SYSTEM, LCSModule, LCSParams, system_at
 from difflcs.status import Status
 
 # Least γ σ_min(F + Fᵀ), in parts of n_lam times the largest squared column of F.

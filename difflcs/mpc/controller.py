@@ -22,7 +22,6 @@ from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSourc
 from difflcs.constraints import check_bounds
 from difflcs.cost import GoalCost
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError, NonFiniteError, ShapeError, SolveError
-from difflcs.lcs import SYSTEM, LCSParams, LCSSequence
 from difflcs.mpc.controller_file import (
     check_constant,
     constant_setup,
@@ -32,6 +31,7 @@ from difflcs.mpc.controller_file import (
     numbers_of_one,
 )
 from difflcs.mpc.setup import PLAIN_COSTS, Bound, Call, Cost, Inputs, Setup, System, gather
+from difflcs.records import SYSTEM, LCSParams, LCSSequence
 from difflcs.status import Status
 
 _FALLBACKS = {"hold": 0, "zero": 1, "unfinished": 3, "raise": 0}

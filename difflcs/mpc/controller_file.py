@@ -15,12 +15,12 @@ import torch
 from difflcs._checks import check_number, check_positive_int, describe
 from difflcs.cost import CostSequence, GoalCost, QuadraticCost, cost_at
 from difflcs.errors import InvalidInputError, ShapeError
-from difflcs.lcs import LCSModel, LCSParams, LCSSequence
+from difflcs.lcs import LCSModel
 from difflcs.mpc import kkt
 from difflcs.mpc.backends import BatchedBackend
 from difflcs.mpc.problem import INPUTS, MPCProblem
 from difflcs.mpc.setup import PLAIN_COSTS, Call, Inputs, Setup, gather
-from difflcs.records import system_at
+from difflcs.records import LCSParams, LCSSequence, system_at
 from difflcs.scales import ScaledLCS
 
 MAGIC = b"\x89LCS\r\n\x1a\n"

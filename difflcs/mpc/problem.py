@@ -17,7 +17,7 @@ from difflcs._native import _kernels  # pyright: ignore[reportMissingModuleSourc
 from difflcs.constraints import check_bounds, check_prices
 from difflcs.errors import ShapeError
 from difflcs.lcp import solve_lcp_arrays
-from difflcs.lcs import SystemMatrices, dimensions
+from difflcs.records import SystemMatrices, dimensions
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,11 @@ from difflcs._modules import untouched
 from difflcs._recall import Snapshot, comparable
 from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds
 from difflcs.cost import CostSequence, GoalCost, QuadraticCost
-from difflcs.lcs import LCSModel, LCSParams, LCSSequence
+from difflcs.lcs import LCSModel
 from difflcs.mpc.autograd import MPCSolver, solve_call
 from difflcs.mpc.setup import GUESS, Call, Setup, check_guess
 from difflcs.mpc.solution import MPCSolution, Primal
+from difflcs.records import LCSParams, LCSSequence
 
 _RECORDS = (LCSParams, LCSSequence)
 # Modules that depend on their tensors alone. A subclass may depend on anything.

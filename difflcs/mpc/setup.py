@@ -23,11 +23,10 @@ from difflcs._fields import check_not_nan
 from difflcs.constraints import ConstraintSequence, LinearConstraints, StageBounds, as_bound, check_bounds
 from difflcs.cost import CostModule, CostSequence, GoalCost, QuadraticCost, cost_at
 from difflcs.errors import BoundsError, DTypeError, ShapeError
-from difflcs.lcs import SYSTEM, LCSModule, LCSParams, LCSSequence
 from difflcs.mpc.backends.base import Backend
 from difflcs.mpc.problem import INPUTS, MAY_BE_INFINITE
 from difflcs.mpc.solution import MPCSolution, Primal
-from difflcs.records import sequence_along, system_at
+from difflcs.records import SYSTEM, LCSModule, LCSParams, LCSSequence, sequence_along, system_at
 
 RANKS = {**{name: len(dims) for name, dims in INPUTS.items()}, "constant": 0}
 """Number of dimensions of each input of a call behind those of the batch and of the stages."""

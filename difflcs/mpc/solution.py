@@ -21,8 +21,6 @@ from difflcs.status import Status, solved
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["MPCSolution", "Primal", "Status"]
-
 
 class Primal(NamedTuple):
     """A trajectory: x (..., H+1, n_x), u (..., H, n_u), lam (..., H, n_lam). Usable as a guess.

@@ -35,8 +35,6 @@ from difflcs._linalg import matvec
 from difflcs.errors import FrictionWarning, InvalidInputError, ShapeError
 from difflcs.records import LCSParams
 
-__all__ = ["Bounded", "Cone", "Contacts", "FreeMotion", "Unilateral", "contact_lcs", "count_forces"]
-
 Cone = Literal["anitescu", "stewart-trinkle"]
 
 

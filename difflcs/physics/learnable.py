@@ -17,8 +17,6 @@ from difflcs.physics.planar import PlanarPushing, PositionDrive
 from difflcs.physics.shapes import Circle, Polygon, Shape, Union
 from difflcs.records import LCSParams
 
-__all__ = ["LEARNABLE", "ContactLCS"]
-
 LEARNABLE = ("center_of_mass", "gyration", "friction", "compliance", "radius", "gain", "drive_compliance", "outline")
 """The quantities that a `ContactLCS` can learn."""
 

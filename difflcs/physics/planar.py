@@ -30,9 +30,6 @@ from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, contact_
 from difflcs.physics.shapes import Distance, Shape
 from difflcs.records import LCSParams
 
-__all__ = ["Drive", "ForceDrive", "Inertia", "PDDrive", "PlanarPushing", "PositionDrive", "to_body"]
-
-
 _INSTANTS = 8  # of a step, in `Drive.course`
 
 

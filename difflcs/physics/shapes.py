@@ -23,8 +23,6 @@ from difflcs._differentiation import transforms_active
 from difflcs._recall import Recall
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 
-__all__ = ["Circle", "Distance", "Polygon", "Shape", "Union", "box"]
-
 _ROWS = 256  # sides that are compared with all others at a time, so that memory grows with their number alone
 
 

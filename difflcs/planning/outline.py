@@ -11,8 +11,6 @@ from difflcs._checks import check_number, check_positive_int
 from difflcs.errors import InvalidInputError
 from difflcs.physics.shapes import Shape, is_inside, shoelace
 
-__all__ = ["DistanceGrid", "clearance", "ring"]
-
 _CELLS = 160
 
 

@@ -16,8 +16,6 @@ from difflcs.physics.planar import to_body
 from difflcs.physics.shapes import Shape
 from difflcs.planning.outline import clearance, ring
 
-__all__ = ["DiscPlaces", "Places", "Workspace", "from_body"]
-
 
 class Places(Protocol):
     """Candidate places of the end effectors. A place is a row of numbers that moves with the body."""

@@ -37,8 +37,6 @@ from difflcs.mpc.solution import MPCSolution
 from difflcs.planning.places import Places
 from difflcs.planning.travel import Travel
 
-__all__ = ["Decision", "Mode", "SamplingPolicy", "SamplingSettings"]
-
 _IDLE = 3  # pushes in succession that have changed nothing, after which the robot looks for another place
 
 Bounds = Callable[[Tensor], tuple[Tensor, Tensor]]

@@ -14,8 +14,6 @@ from difflcs.physics.shapes import Shape
 from difflcs.planning.outline import DistanceGrid, ring
 from difflcs.planning.places import Workspace, from_body
 
-__all__ = ["PlanarTravel", "Travel"]
-
 _WAYPOINTS = 56
 _POINTS = 10  # of the way, that are compared for the end of a step
 _LEAST = 0.3  # of the clearance, that must be left on the way

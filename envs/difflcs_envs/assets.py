@@ -28,8 +28,6 @@ from typing import BinaryIO
 from difflcs_envs.errors import AssetError, MeshError, MissingDependencyError
 from difflcs_envs.ycb import YCB, YcbObject
 
-__all__ = ["YCB_DIR_VARIABLE", "YCB_URL", "download", "find_ycb_mesh", "ycb_download_directory"]
-
 YCB_URL = "https://ycb-benchmarks.s3.amazonaws.com/data/google/{code}_google_16k.tgz"
 YCB_DIR_VARIABLE = "DIFFLCS_YCB_DIR"
 TIMEOUT = 30.0  # [s] without a byte

@@ -14,8 +14,6 @@ import numpy as np
 
 from difflcs_envs.errors import OptionsError
 
-__all__ = ["checked_array", "checked_integer", "checked_number", "checked_options"]
-
 
 def checked_array(name: str, value: Any, size: int, meaning: str) -> np.ndarray:
     """Return a finite float64 array of shape (size,), or raise a ValueError."""

@@ -2,17 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = [
-    "INSTALL_HINT",
-    "AssetError",
-    "DifflcsEnvsError",
-    "MeshError",
-    "MissingDependencyError",
-    "OptionsError",
-    "PhysicsWarning",
-    "RenderingError",
-]
-
 INSTALL_HINT = 'pip install "difflcs[envs]"'
 
 

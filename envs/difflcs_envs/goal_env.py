@@ -19,8 +19,6 @@ try:
 except ImportError as error:
     raise MissingDependencyError("gymnasium") from error
 
-__all__ = ["GoalEnv"]
-
 
 class GoalEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     """An environment whose actions, within ± a limit, lead from a state nearer to a goal.

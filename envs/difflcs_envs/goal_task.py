@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Array", "GoalTask", "library_of"]
-
 Array = Any
 """A NumPy array, or a PyTorch tensor, which this file does not import."""
 

@@ -14,8 +14,6 @@ import numpy as np
 
 from difflcs_envs.errors import RenderingError
 
-__all__ = ["SceneRenderer", "SceneViewer", "has_display", "select_gl_backend"]
-
 _APT_LINE = "apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"
 _BACKENDS = {"", *"enable enabled on true 1 disable disabled off false 0 glfw glx egl osmesa wgl cgl".split()}
 _APT_LINE_OSMESA = "apt-get install libosmesa6"

@@ -21,21 +21,6 @@ from difflcs_envs.trifinger.arguments import checked_task
 from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE, EPISODE_STEPS, MOVE, TURN, MoveTask
 from difflcs_envs.ycb import YCB
 
-__all__ = [
-    "caption",
-    "contact_cost",
-    "contact_system",
-    "describe",
-    "hand_cost",
-    "hand_features",
-    "hand_system",
-    "hand_task",
-    "pushing_cost",
-    "pushing_features",
-    "register_tasks",
-    "trifinger_task",
-]
-
 STATE_SIZE = 9  # object x, y [m], yaw [rad], then x, y [m] of three fingertips
 STEP_SECONDS = 0.1
 HORIZON = 8  # steps that the MPC plans ahead

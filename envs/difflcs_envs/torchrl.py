@@ -15,8 +15,6 @@ from difflcs_envs.errors import MissingDependencyError
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
-__all__ = ["make_env"]
-
 
 def make_env(task: str = "cube", num_envs: int | None = None, **arguments: Any) -> EnvBase:
     """Make a TorchRL environment with `state` (9,), `goal` (3,) and `time_to_go` (1,) [s] in its observation.

@@ -19,13 +19,11 @@ from gymnasium.vector.utils import batch_space
 
 from difflcs_envs.checks import checked_options
 from difflcs_envs.errors import PhysicsWarning
-from difflcs_envs.trifinger.base import UNSTABLE
-from difflcs_envs.trifinger.env import TriFingerEnv, TriFingerMoveCubeEnv, TriFingerMoveObjectEnv, TriFingerTurnCubeEnv
+from difflcs_envs.trifinger.base import UNSTABLE, TriFingerEnv
+from difflcs_envs.trifinger.env import TriFingerMoveCubeEnv, TriFingerMoveObjectEnv, TriFingerTurnCubeEnv
 from difflcs_envs.trifinger.physics import CONTROL_PERIOD, STATE_SIZE, step_all
 from difflcs_envs.trifinger.spaces import ACTION_MEANING, continued
 from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE, GOAL_SIZE
-
-__all__ = ["TriFingerVectorEnv", "move_cube", "move_object", "turn_cube"]
 
 
 class TriFingerVectorEnv(VectorEnv[dict[str, np.ndarray], np.ndarray, np.ndarray]):

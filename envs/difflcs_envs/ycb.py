@@ -13,8 +13,6 @@ from types import MappingProxyType
 
 import numpy as np
 
-__all__ = ["YCB", "Primitive", "YcbObject"]
-
 
 @dataclass(frozen=True)
 class Primitive:

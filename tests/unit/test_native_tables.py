@@ -11,8 +11,8 @@ import torch
 import difflcs
 from difflcs import Status
 from difflcs._native import _kernels
-from difflcs.lcs import SYSTEM, LCSParams, dimensions
 from difflcs.mpc.problem import INPUTS, MPCProblem
+from difflcs.records import SYSTEM, LCSParams, dimensions
 from difflcs.status import solved
 
 SOURCE = Path(difflcs.__file__).parent

@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 
 from trifinger_push.fingers import N_FINGERS, STEP
 
-__all__ = ["TipControl", "TipReference"]
-
 Array = NDArray[np.float64]
 
 URDF = Path(str(robot_properties_fingers.__file__)).parent / "urdf" / "pro" / "trifingerpro.urdf"

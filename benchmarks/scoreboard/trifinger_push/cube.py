@@ -18,8 +18,6 @@ from difflcs.physics import PlanarPushing, box
 from difflcs.physics.complementarity import Cone
 from trifinger_push.fingers import STEP, planar_turn
 
-__all__ = ["HALF", "HEIGHT", "TIP_RADIUS", "UNIT", "CubeEstimator", "box_distance", "planar_pose", "pushing"]
-
 Array = NDArray[np.float64]
 
 HALF = 0.0325

@@ -10,8 +10,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LINKS", "N_FINGERS", "STEP", "inverse", "planar_turn"]
-
 Array = NDArray[np.float64]
 
 N_FINGERS = 3

@@ -16,8 +16,6 @@ from difflcs.records import LCSParams
 from trifinger_push.cube import HALF, HEIGHT, TIP_RADIUS, UNIT, box_distance, pushing
 from trifinger_push.fingers import N_FINGERS, inverse, planar_turn
 
-__all__ = ["FINGER", "PUSH_HEIGHT", "FingerPlaces", "FingerTravel", "OneFinger", "lift"]
-
 Array = NDArray[np.float64]
 
 POSE, TIP, FINGER = slice(0, 3), slice(3, 6), 6

@@ -17,8 +17,6 @@ from trifinger_push.cube import HEIGHT, UNIT, CubeEstimator
 from trifinger_push.fingers import N_FINGERS, STEP
 from trifinger_push.places import FINGER, PUSH_HEIGHT, FingerPlaces, FingerTravel, OneFinger, lift
 
-__all__ = ["PushPolicy"]
-
 Array = NDArray[np.float64]
 
 FRICTION = 0.5

@@ -22,8 +22,6 @@ from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeE
 from difflcs.physics.mujoco.lcs import MujocoLCS
 from difflcs.physics.mujoco.state import cross
 
-__all__ = ["Distance", "Effort", "MujocoCost", "Orientation", "Position", "Posture", "Velocity"]
-
 Weight = float | Sequence[float] | Tensor
 
 

@@ -12,8 +12,6 @@ from difflcs._checks import check_number, check_positive_int, describe
 from difflcs.errors import InvalidInputError
 from difflcs.physics.mujoco.contacts import Budget, find_geoms
 
-__all__ = ["ContactGroup", "ContactSelection"]
-
 Array = NDArray[np.float64]
 
 

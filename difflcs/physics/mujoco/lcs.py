@@ -32,8 +32,6 @@ from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
 from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams, LCSSequence, sequence_along
 
-__all__ = ["Motion", "MujocoLCS", "lcs_from_mujoco"]
-
 Motion = Literal["quasi-static", "quasi-dynamic", "dynamic"]
 _SLEEP = int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0))  # of MuJoCo 3.4 and later
 

@@ -25,8 +25,6 @@ from difflcs.physics.mujoco.native import flags
 from difflcs.physics.mujoco.quasi_dynamic import BIASES, GAINS
 from difflcs.records import SYSTEM, LCSParams
 
-__all__ = ["LearnableMujocoLCS"]
-
 Array = NDArray[np.float64]
 
 

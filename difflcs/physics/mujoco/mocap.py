@@ -13,8 +13,6 @@ import numpy as np
 from difflcs._checks import describe
 from difflcs.errors import DTypeError, InvalidInputError
 
-__all__ = ["drive_mocap"]
-
 _HEAVIER = 1e3  # than all that may pull or push
 
 

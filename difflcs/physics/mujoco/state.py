@@ -21,8 +21,6 @@ from torch import Tensor
 from difflcs._checks import check_tensor, describe
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
 
-__all__ = ["MujocoState"]
-
 Array = NDArray[np.float64]
 _SUFFIXES = {
     int(mujoco.mjtJoint.mjJNT_FREE): ("_x", "_y", "_z", "_rx", "_ry", "_rz"),

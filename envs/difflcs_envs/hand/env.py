@@ -37,8 +37,6 @@ try:
 except ImportError as error:
     raise MissingDependencyError((error.name or "").partition(".")[0]) from error
 
-__all__ = ["HandTurnObjectEnv", "turn_object"]
-
 STEP_SECONDS = SUBSTEPS * TIMESTEP
 PLACE = (-0.02, 0.0)  # [m] of the object on the palm
 PLACE_NOISE, YAW_NOISE = 0.005, math.pi / 2  # [m] standard deviation, [rad] to either side

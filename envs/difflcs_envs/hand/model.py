@@ -14,8 +14,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-__all__ = ["FINGERS", "LINKS", "OBJECTS", "POSTURE", "build_model"]
-
 TIMESTEP, SUBSTEPS = 0.002, 50  # [s], and of them in one action of 0.1 s
 JOINT_DAMPING = 0.1  # [N m s/rad]
 DENSITY = 800.0  # [kg/m^3] of the links

@@ -12,8 +12,6 @@ import numpy as np
 
 from difflcs_envs.goal_task import Array, GoalTask, library_of
 
-__all__ = ["TURN_OBJECT", "TurnTask", "rotation_to_quaternion"]
-
 ACTION_LIMIT, ACTION_SIZE = 0.1, 16  # [rad], joint servos
 GOAL_SIZE, STATE_SIZE = 7, 22
 EPISODE_STEPS = 100

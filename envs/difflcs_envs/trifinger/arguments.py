@@ -8,8 +8,6 @@ from dataclasses import replace
 from difflcs_envs.checks import checked_number
 from difflcs_envs.trifinger.task import MoveTask
 
-__all__ = ["checked_task"]
-
 REWARD_TERMS = ("tips", "position", "yaw", "action")
 
 

@@ -40,8 +40,6 @@ except ImportError as error:
         raise
     raise MissingDependencyError("mujoco") from error
 
-__all__ = ["CommonArguments", "TriFingerEnv"]
-
 UNSTABLE = (
     "The simulation became unstable (not finite, or out of the workspace). The episode is truncated at the last finite "
     "state. A smaller osc_kp or a heavier object makes this less likely."

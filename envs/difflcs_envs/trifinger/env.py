@@ -13,8 +13,6 @@ from difflcs_envs.trifinger.objects import make_object
 from difflcs_envs.trifinger.task import MOVE, TURN
 from difflcs_envs.ycb import YCB
 
-__all__ = ["TriFingerEnv", "TriFingerMoveCubeEnv", "TriFingerMoveObjectEnv", "TriFingerTurnCubeEnv"]
-
 TURN_CUBE_EDGE = 0.07  # [m] of the turning task (Jin & Posa 2024)
 
 

@@ -20,8 +20,6 @@ from difflcs_envs.trifinger.model import (
     MOUNT_RADIUS,
 )
 
-__all__ = ["joint_angles", "tip_positions"]
-
 # Rows: the axes of each finger frame in the world, (3 fingers, 3 axes, 3).
 FINGER_AXES = np.array([[[np.cos(a), np.sin(a), 0.0], [-np.sin(a), np.cos(a), 0.0], [0, 0, 1]] for a in FINGER_YAWS])
 MOUNTS = MOUNT_RADIUS * FINGER_AXES[:, 1] + [0.0, 0.0, MOUNT_HEIGHT]  # (3, 3) [m]

@@ -20,18 +20,6 @@ from difflcs_envs.errors import MeshError, MissingDependencyError
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = [
-    "LYING",
-    "UPRIGHT",
-    "RestPose",
-    "Solid",
-    "cache_directory",
-    "check_extent",
-    "load_mesh",
-    "make_solid",
-    "rest_poses",
-]
-
 CACHE_VARIABLE = "DIFFLCS_CACHE_DIR"
 
 # A mesh outside these bounds is most likely in other units, or nothing that the fingers can push.

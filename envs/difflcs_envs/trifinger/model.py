@@ -20,8 +20,6 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 
-__all__ = ["CubeObject", "SceneObject", "build_spec", "tip_height_for"]
-
 NUM_FINGERS = 3
 JOINTS_PER_FINGER = 3
 

@@ -22,8 +22,6 @@ import numpy as np
 
 from difflcs_envs._native import _stepper as stepper  # pyright: ignore[reportMissingModuleSource]
 
-__all__ = ["make_lane", "step_lanes"]
-
 _FUNCTIONS = ("mj_step1", "mj_step2", "mj_kinematics", "mj_getState")
 
 

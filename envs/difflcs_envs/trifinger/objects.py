@@ -23,8 +23,6 @@ from difflcs_envs.trifinger.meshes import LYING, Solid, check_extent, load_mesh,
 from difflcs_envs.trifinger.model import COLLISION_GROUP, GOAL_MARGIN, tip_height_for
 from difflcs_envs.ycb import YCB, YcbObject
 
-__all__ = ["MESH_SUFFIXES", "MeshObject", "StandInObject", "make_object"]
-
 DEFAULT_MASS = 0.05  # [kg] of YCB objects and meshes. The paper gives none; a tip pushes with 0.45 N at osc_kp 1000.
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf", ".dae", ".3mf")
 COLORS = {

@@ -21,8 +21,6 @@ import numpy as np
 
 from difflcs_envs.trifinger.model import JOINTS_PER_FINGER, NUM_FINGERS
 
-__all__ = ["controller_fields"]
-
 # |det J| is 6.1e-3 m^3 in the home posture. Below the limit (knee within 0.06 rad of straight: the tip is less than
 # 0.2 mm from the end of its reach) J^-1 gives way to a damped inverse, so that torques stay bounded.
 SINGULAR_DETERMINANT = 5e-4  # [m^3]

@@ -16,8 +16,6 @@ from difflcs_envs.trifinger.model import NUM_FINGERS, PIVOT_RANGE, SUBSTEPS, TIM
 from difflcs_envs.trifinger.native import make_lane, step_lanes
 from difflcs_envs.trifinger.osc import SINGULAR_DAMPING, SINGULAR_DETERMINANT, controller_fields
 
-__all__ = ["TriFingerPhysics", "step_all"]
-
 STATE_SIZE = 3 + 2 * NUM_FINGERS
 CONTROL_PERIOD = TIMESTEP * SUBSTEPS  # [s] one action
 # The posture before the tips go down to their height; reset noise acts on its joints.

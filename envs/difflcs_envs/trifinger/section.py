@@ -11,8 +11,6 @@ from difflcs_envs.trifinger.objects import MeshObject, StandInObject
 if TYPE_CHECKING:
     from difflcs_envs.trifinger.model import SceneObject
 
-__all__ = ["cross_section"]
-
 BAND = 0.004  # [m] about the height of the tips: a tip is a sphere, and touches what is a little above or below too
 COARSE = 1e-4  # [m] corners that stand out by less are left out
 LEAST_SIDE = 1e-3  # [m] parts smaller than this are left out

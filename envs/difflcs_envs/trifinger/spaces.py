@@ -10,8 +10,6 @@ from gymnasium import spaces
 from difflcs_envs.trifinger.physics import STATE_SIZE, WORKSPACE_RADIUS
 from difflcs_envs.trifinger.task import ACTION_LIMIT, ACTION_SIZE
 
-__all__ = ["continued", "make_action_space", "make_observation_space", "unwrap"]
-
 ACTION_MEANING = "[tip 0 x, y, tip 1 x, y, tip 2 x, y] in m"
 STATE_MEANING = "[object x, y, yaw, tip 0 x, y, tip 1 x, y, tip 2 x, y] in m and rad"
 GOAL_MEANING = "[x, y, yaw] of the goal in m, m, rad"

@@ -12,8 +12,6 @@ import numpy as np
 
 from difflcs_envs.goal_task import Array, GoalTask, library_of
 
-__all__ = ["MOVE", "TURN", "MoveTask"]
-
 ACTION_SIZE = 6  # x, y of three tips
 ACTION_LIMIT = 0.015  # [m] per component and step
 GOAL_SIZE = 3  # x, y, yaw
