@@ -3,14 +3,14 @@
 import sys
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import torch
 
-mujoco = pytest.importorskip("mujoco")
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from difflcs.physics.mujoco import MujocoLCS  # noqa: E402
-from tests.conformance import gaps  # noqa: E402
+from difflcs.physics.mujoco import MujocoLCS
+from tests.conformance import gaps
 
 CUBE = " ".join(f"{v:g}" for v in (0.05 * gaps.CUBE).ravel())
 MESHES = f'<asset><mesh name="cube" vertex="{CUBE}"/><mesh name="slab" vertex="{CUBE}" scale="6 6 1"/>'

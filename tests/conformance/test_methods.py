@@ -13,9 +13,6 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("torchrl", reason="needs the extra [rl]")
-pytest.importorskip("tyro", reason="needs the extra [rl]")
-
 from difflcs import LCSModel, cli
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
 from difflcs.rl.learning.ppo import PPOReport

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("mujoco")
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from tests.conformance import scenes
 

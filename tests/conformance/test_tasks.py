@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-gymnasium = pytest.importorskip("gymnasium", reason="needs the extra [rl]")
-
-from difflcs import LCSModel  # noqa: E402
-from difflcs.rl.rollout import collect, mpc_actions, uniform_actions  # noqa: E402
-from difflcs.rl.tasks import get_task, task_names  # noqa: E402
-from tests.conformance.toy import make_task  # noqa: E402
+from difflcs import LCSModel
+from difflcs.rl.rollout import collect, mpc_actions, uniform_actions
+from difflcs.rl.tasks import get_task, task_names
+from tests.conformance.toy import make_task
 
 TASKS = {**{name: get_task(name) for name in task_names()}, "toy": make_task("conformance-toy")}
 
@@ -21,10 +19,7 @@ pytestmark = pytest.mark.usefixtures("stand_ins")
 
 @pytest.fixture(scope="module", params=TASKS)
 def task(request, stand_ins):
-    spec = TASKS[request.param]
-    for package in spec.requires:
-        pytest.importorskip(package)
-    return spec
+    return TASKS[request.param]
 
 
 @pytest.fixture(scope="module")

@@ -121,7 +121,6 @@ def plans(solution):
 
 
 def policy_of(lcs):
-    pytest.importorskip("torchrl")
     from difflcs.rl.learning.policy import LCSMPCPolicy
 
     return LCSMPCPolicy(layer(lcs), std=0.5)
@@ -274,7 +273,6 @@ def test_parts_of_a_module_that_are_never_called(tool):
 
 
 def test_what_a_training_keeps_can_be_read(tmp_path):
-    pytest.importorskip("torchrl")
     from difflcs.rl.learning import dynamics, mlp, trainer
 
     state = trainer.learned_state(make("prune"))

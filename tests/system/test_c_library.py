@@ -40,7 +40,6 @@ def call(*command, **kwargs):
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
     """The cube's controller, and a trajectory of states and goals that it saw."""
-    pytest.importorskip("mujoco")
     folder = tmp_path_factory.mktemp("export")
     assert cli.main(["export", MODEL, "--out", str(folder)]) == 0
     rng = np.random.default_rng(0)
@@ -181,7 +180,6 @@ def test_the_exported_controller_is_that_of_the_model(exported):
 
 
 def test_a_controller_stays_within_the_action_support_of_its_model(tmp_path):
-    pytest.importorskip("mujoco")
     assert cli.main(["export", "zoo:trifinger-cube", "--out", str(tmp_path / "out")]) == 0
     described = json.loads((tmp_path / "out" / "controller.json").read_text())
     low, high = LCSModel.from_pretrained("trifinger-cube").action_support.tolist()  # within the ±15 mm of the task

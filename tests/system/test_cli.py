@@ -39,7 +39,6 @@ def run(capsys, *arguments) -> tuple[int, str, str]:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """A finished smoke run."""
-    pytest.importorskip("mujoco")
     path = tmp_path_factory.mktemp("cli") / "run"
     assert cli.main(["train", "--method", "violation", "--smoke", "--out", str(path)]) == 0
     return path
@@ -180,7 +179,6 @@ def run_of(out: Path) -> SimpleNamespace:
     ],
 )
 def test_mistakes_get_one_clean_message(capsys, tmp_path, arguments, message):
-    pytest.importorskip("mujoco")
     if arguments[0] == "train":
         arguments = [*arguments, "--out", tmp_path / "run"]
     code, out, err = run(capsys, *arguments)
@@ -423,7 +421,6 @@ def test_an_interrupted_training_says_how_to_go_on(capsys, finished, tmp_path, m
 
 
 def test_render(capsys, finished, tmp_path):
-    pytest.importorskip("imageio_ffmpeg")
     video = tmp_path / "new" / "video.mp4"
     code, out, err = run(capsys, "render", finished, "--goal", 0.04, 0.03, 0.3, "--out", video)
     if "OpenGL" in err:
@@ -461,7 +458,6 @@ def test_pictures_of_a_model(capsys, tmp_path, finished):
 
 
 def test_demo(capsys, tmp_path):
-    pytest.importorskip("mujoco")
     for attempt in range(2):  # the second continues, that is, only draws again
         code, out, _ = run(capsys, "demo", "--smoke", "--out", tmp_path / "demo")
         assert code == 0
@@ -473,7 +469,6 @@ def test_demo(capsys, tmp_path):
 
 @pytest.mark.parametrize("words", [["--resume"], ["--force", "--smoke"], ["--smoke"]])
 def test_one_training_at_a_time_in_a_run(capsys, tmp_path, monkeypatch, words):
-    pytest.importorskip("mujoco")
     path = tmp_path / "run"
     arguments = ["train", "--method", "violation", "--smoke", "--minutes", 0.1, "--final-goals", 0, "--out", path]
     seen = []

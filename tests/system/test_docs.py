@@ -47,16 +47,13 @@ def generated():
     return module
 
 
-FORKS = multiprocessing.get_context(
-    "forkserver"
-)  # of a process that has imported what takes seconds, and nothing of us
+# Forks of a process that has imported what takes seconds, and nothing of us.
+FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(["torch", "torchrl.data", "gymnasium", "mujoco", "casadi"])
 
 
 def run_code(code: list[str], folder: Path) -> None:
     """Run blocks in a process and a folder of their own: they may register what they want, and read nothing of ours."""
-    for package in ("gymnasium", "torchrl", *(p for p in ("stable_baselines3", "optuna") if p in "".join(code))):
-        pytest.importorskip(package)
     script, said = folder / "page.py", folder / "said"
     head = f"import os\nos.chdir({str(folder)!r})\nos.dup2(os.open({str(said)!r}, os.O_CREAT | os.O_WRONLY), 2)\n"
     script.write_text(head + "import torch\n\ntorch.set_num_threads(1)\n" + "\n".join(code))
@@ -75,8 +72,6 @@ def test_the_python_of_a_page_runs(page, tmp_path):
 
 @pytest.mark.parametrize("what", ["backend", "task", "method"])
 def test_what_is_added_by_a_page_works_by_itself(what, tmp_path):
-    if what == "method":
-        pytest.importorskip("mujoco")
     (section,) = re.findall(rf"^## Add a {what}\n(.*?)(?=^## )", CONTRIBUTING.read_text(), re.MULTILINE | re.DOTALL)
     (code,) = [code for kind, code in FENCE.findall(section) if kind == "python"]
     run_code([code], tmp_path)
@@ -140,7 +135,6 @@ def test_code_fits_the_page():
 @pytest.fixture
 def parse(monkeypatch):
     """What the command line says against words after `difflcs`, and nothing that it would do."""
-    pytest.importorskip("tyro")
     from difflcs import cli
     from difflcs.cli import commands
 
@@ -189,7 +183,6 @@ def test_the_commands_of_a_page_exist(page, parse):
 
 
 def test_the_quick_settings_are_those_that_were_measured(monkeypatch):
-    pytest.importorskip("torchrl")
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     import objects
 
@@ -234,8 +227,6 @@ def test_every_error_is_in_the_reference(generated):
 
 def test_the_generated_parts_of_pages_are_up_to_date():
     """In a process of its own, since tests register tasks and methods. Mend it by `python docs/generated.py`."""
-    pytest.importorskip("tyro")
-    pytest.importorskip("mujoco")
     command = [sys.executable, DOCS / "generated.py", "--check"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout + done.stderr[-2000:]

@@ -52,7 +52,6 @@ def test_this_machine(checks):
 
 
 def test_the_environments_are_tried(checks):
-    pytest.importorskip("mujoco")
     found = by_name(checks)
     assert found["simulation"].status == "ok"
     assert found["YCB meshes"].status in ("ok", "missing")
@@ -115,7 +114,8 @@ def test_a_package_that_is_too_old_is_named(versions, version, status):
 )
 def test_meshes(tmp_path, monkeypatch, lacking, chosen, status, words):
     """In the folder that the user has chosen, or where downloads go."""
-    ycb = pytest.importorskip("difflcs_envs.ycb")
+    from difflcs_envs import ycb
+
     folder = tmp_path if chosen else tmp_path / "ycb"
     for name in set(ycb.YCB) - set(lacking):
         mesh = folder / ycb.YCB[name].code / "google_16k" / "nontextured.stl"
@@ -133,7 +133,6 @@ def test_meshes(tmp_path, monkeypatch, lacking, chosen, status, words):
 
 @pytest.mark.parametrize("code", ["import os; os.abort()", "import time; time.sleep(60)"])
 def test_a_crash_or_a_hang_in_the_other_process_is_reported(tmp_path, monkeypatch, code):
-    pytest.importorskip("mujoco")
     (tmp_path / "gymnasium.py").write_text(code)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(doctor, "TIMEOUT", 0.5 if "sleep" in code else 60.0)

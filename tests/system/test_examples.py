@@ -17,7 +17,6 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(autouse=True)
 def _examples(monkeypatch):
-    pytest.importorskip("mujoco")
     monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "examples"))
 
 

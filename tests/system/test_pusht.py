@@ -15,11 +15,6 @@ from difflcs.physics import PDDrive
 ROOT = Path(__file__).resolve().parents[2]
 KEYS = {"success_rate", "ci_low", "ci_high", "episodes", "mean_steps", "milliseconds_per_step", "coverage"}
 
-# Looked for, not imported: pygame warns while it is imported, and here a warning is an error.
-needs_gym_pusht = pytest.mark.skipif(
-    importlib.util.find_spec("gym_pusht") is None, reason='needs gym-pusht: pip install "difflcs[scoreboard]"'
-)
-
 
 @pytest.fixture
 def push_t(monkeypatch):
@@ -31,7 +26,6 @@ def push_t(monkeypatch):
 
 @pytest.fixture
 def board(monkeypatch):
-    pytest.importorskip("tyro")
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks" / "scoreboard"))
     import pusht
 
@@ -56,7 +50,6 @@ def test_the_filter_finds_the_scale_by_pushing_and_learns_nothing_away_from_the_
     torch.testing.assert_close(seen.mean, scales[2], atol=1e-2, rtol=0.0)
 
 
-@needs_gym_pusht
 @pytest.mark.slow  # plays
 def test_the_scoreboard_prints_its_keys_and_goes_on_where_it_was(board, capsys, tmp_path, monkeypatch):
     out = tmp_path / "pusht.json"
@@ -98,7 +91,6 @@ def test_a_variant_that_is_none_is_refused(board):
         board.main(board.Options(variant="wrong"))
 
 
-@needs_gym_pusht
 @pytest.mark.slow  # plays and learns
 def test_random_pushing_teaches_the_radius_of_gyration(board):
     found = board.learn(board.make_env(), seed=0, steps=300, iterations=60)
@@ -107,10 +99,10 @@ def test_random_pushing_teaches_the_radius_of_gyration(board):
     assert found.loss[1] < 0.3 * found.loss[0]
 
 
-@needs_gym_pusht
 @pytest.mark.slow  # plays an episode
 def test_the_film_is_a_gif(push_t, capsys, tmp_path):
-    Image = pytest.importorskip("PIL.Image")
+    from PIL import Image
+
     film = tmp_path / "push_t.gif"
     push_t.main(push_t.Options(film, seed=3, episodes=1))
     assert "seed 3: solved" in capsys.readouterr().out
@@ -144,7 +136,6 @@ def test_a_policy_for_push_t_sends_the_disc_to_places_in_the_plane(push_t):
 
 
 def test_a_picture_shows_what_was_decided(push_t):
-    pytest.importorskip("PIL")
     env, policy = SimpleNamespace(render=lambda: np.zeros((96, 96, 3), np.uint8)), push_t.PushTPolicy()
     plain = push_t.picture(env, policy)
     policy.act([400.0, 400.0, 256.0, 256.0, 0.0])

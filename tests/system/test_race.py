@@ -15,8 +15,6 @@ COUNT = 5
 
 @pytest.fixture
 def race(monkeypatch):
-    pytest.importorskip("tyro")
-    pytest.importorskip("mujoco")
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     import race
 

@@ -17,35 +17,34 @@ import pandas as pd
 import pytest
 import torch
 
-for package in ("distributed", "matplotlib", "mujoco", "pandas", "rich", "scipy", "tensorboard", "tyro"):
-    pytest.importorskip(package, reason="the extra [reproduce] is not installed")
 FOLDER = Path(__file__).parents[2] / "reproduce"
 sys.path.insert(0, str(FOLDER))
 
-import ablations  # noqa: E402
-import dask  # noqa: E402
-import deployment  # noqa: E402
-import distributed  # noqa: E402
-import fig_learning_curves  # noqa: E402
-import fig_task  # noqa: E402
-import fig_transfer  # noqa: E402
-import masses  # noqa: E402
-import recipes  # noqa: E402
-import records  # noqa: E402
-import report  # noqa: E402
-import robustness  # noqa: E402
-import runs  # noqa: E402
-import small_models  # noqa: E402
-import stats  # noqa: E402
-import table1  # noqa: E402
-import units  # noqa: E402
-import worker  # noqa: E402
-from rich.console import Console  # noqa: E402
-from rich.progress import Progress  # noqa: E402
-from units import OBJECTS, Preset, Unit  # noqa: E402
+# ruff: noqa: E402
+import ablations
+import dask
+import deployment
+import distributed
+import fig_learning_curves
+import fig_task
+import fig_transfer
+import masses
+import recipes
+import records
+import report
+import robustness
+import runs
+import small_models
+import stats
+import table1
+import units
+import worker
+from rich.console import Console
+from rich.progress import Progress
+from units import OBJECTS, Preset, Unit
 
-from difflcs.errors import CheckpointError, InvalidInputError  # noqa: E402
-from difflcs.rl import TrainConfig, TrainedPolicy, evaluate, get_method, get_task  # noqa: E402
+from difflcs.errors import CheckpointError, InvalidInputError
+from difflcs.rl import TrainConfig, TrainedPolicy, evaluate, get_method, get_task
 
 TINY = Preset("smoke", seeds=1, goals=2, final_goals=2, evaluate_at=(0.2, 0.5), smoke=True)
 FIRST = units.FIRST_SEED

@@ -144,7 +144,6 @@ def test_a_tip_goes_straight_where_it_can_and_over_the_cube_where_it_must():
 
 
 def test_the_package_that_is_missing_is_named(monkeypatch):
-    pytest.importorskip("tyro")
     import trifinger_rl
 
     monkeypatch.setitem(sys.modules, "trifinger_rl_datasets", None)

@@ -80,7 +80,6 @@ def test_every_model_fits_its_card(name):
 @pytest.mark.parametrize("name", zoo.names())
 def test_the_command_of_a_card_trains_that_very_model(monkeypatch, name):
     """What is a default today was one when it was trained, and the command says the rest."""
-    pytest.importorskip("tyro")
     card, seen = zoo.card(name), []
     monkeypatch.setattr(cli_train, "train", lambda config, out, **_: seen.append(config) or RunDirectory(out))
     assert cli.main(shlex.split(card.command)[1:]) == 0
@@ -90,7 +89,6 @@ def test_the_command_of_a_card_trains_that_very_model(monkeypatch, name):
 
 @pytest.mark.parametrize("name", [n for n in zoo.names() if zoo.card(n).object_source == "built_in"])
 def test_evaluation_finds_what_the_card_says(capsys, name):
-    pytest.importorskip("mujoco")
     assert cli.main(["evaluate", f"zoo:{name}", "--goals", "40", "--json"]) == 0
     captured = capsys.readouterr()
     found = json.loads(captured.out)
@@ -103,7 +101,6 @@ def test_evaluation_finds_what_the_card_says(capsys, name):
 
 
 def test_evaluation_says_when_the_object_is_another(capsys, monkeypatch):
-    pytest.importorskip("mujoco")
     card = zoo.card(CUBE)
     monkeypatch.setattr(zoo, "card", lambda _: replace(card, object={**card.object, "source": "ycb_mesh"}))
     assert cli.main(["evaluate", f"zoo:{CUBE}", "--smoke"]) == 0
@@ -187,7 +184,6 @@ def test_what_cannot_be_added(tmp_path, capsys, settings, message):
 
 
 def test_the_command_on_a_card_gives_the_settings_back(monkeypatch):
-    pytest.importorskip("tyro")
     usual = PPOMethod()
     method = replace(
         usual,
@@ -218,7 +214,6 @@ def test_the_list(capsys):
 
 
 def test_a_training_starts_from_a_model_of_the_zoo(capsys, tmp_path):
-    pytest.importorskip("mujoco")
     out = tmp_path / "run"
     arguments = "train --smoke --minutes 0.1 --final-goals 0 --method violation".split()
     assert cli.main([*arguments, "--out", str(out), "--init", f"zoo:{CUBE}"]) == 0

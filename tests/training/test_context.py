@@ -7,20 +7,17 @@ import pytest
 import torch
 from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
+from tensordict import TensorDict
 from torch import nn
 
 from difflcs import LCSModel, LCSParams, LCSSequence
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
-from tests.training.heavy_block import FORCE, HeavyBlock, Physics, make_mpc
-
-pytest.importorskip("torchrl")
-from tensordict import TensorDict
-
 from difflcs.rl import Adam, Epochs, Rollouts, ViolationLoss, Warmup, WarmupSettings, collect, fit, make_actor, make_ppo
 from difflcs.rl.learning.ppo import PPO
 from difflcs.rl.rollout import mpc_actions
 from difflcs.rl.runs.checkpoint import load_checkpoint, save_checkpoint
 from tests.training import slide
+from tests.training.heavy_block import FORCE, HeavyBlock, Physics, make_mpc
 from tests.training.slide import parameters, recorded, same
 
 STEPS = HeavyBlock.STEPS

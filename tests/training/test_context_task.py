@@ -7,9 +7,6 @@ import pytest
 import torch
 
 from difflcs import GoalCost
-from tests.training.heavy_block import FORCE, HeavyBlock, Physics
-
-pytest.importorskip("torchrl")
 from difflcs.rl import (
     EnsembleSettings,
     Epochs,
@@ -26,6 +23,7 @@ from difflcs.rl import (
     train,
 )
 from difflcs.rl.rollout import append_context, contexts, transitions, uniform_actions
+from tests.training.heavy_block import FORCE, HeavyBlock, Physics
 
 STEPS = HeavyBlock.STEPS
 OFF = {"damping": 2.0, "stiffness": 50.0, "added_mass": 0.6}

@@ -1,8 +1,5 @@
 """LCS-RL: the warm-up and the main phase as one trainer, on a small pushing system that needs no simulator."""
 
-import pytest
-
-pytest.importorskip("torchrl")
 from difflcs.rl import LCSRL, Epochs, Rollouts, Warmup, WarmupSettings
 from difflcs.rl.learning import ppo_settings
 from difflcs.rl.learning.policy import make_actor

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-
-pytest.importorskip("torchrl")
 from tensordict import TensorDict
 
 from difflcs.errors import InvalidInputError

@@ -5,8 +5,6 @@ import torch
 from gymnasium.vector import SyncVectorEnv
 
 from difflcs.errors import CheckpointError, InvalidInputError
-
-pytest.importorskip("torchrl")
 from difflcs.rl import CriticSettings, Epochs, Natural
 from difflcs.rl.learning import ppo_settings
 from difflcs.rl.learning.mlp import MLPController

@@ -5,8 +5,6 @@ import pytest
 import torch
 
 from difflcs.errors import CheckpointError
-
-pytest.importorskip("torchrl")
 from difflcs.rl.rollout import collect, uniform_actions
 from difflcs.rl.runs.evaluate import evaluate
 from tests.training.slide import ROLLOUTS, STEPS, Noting, make_envs, make_models, make_ppo, recorded

@@ -5,10 +5,8 @@ import pytest
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from torch.distributions import MultivariateNormal
-
-pytest.importorskip("torchrl")
 from tensordict import TensorDict
+from torch.distributions import MultivariateNormal
 
 from difflcs.errors import InvalidInputError
 from difflcs.rl import CriticSettings

@@ -4,11 +4,11 @@ import io
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from difflcs import Animation
 from difflcs.errors import InvalidInputError
 
-Image = pytest.importorskip("PIL.Image")
 FRAMES = [np.full((6, 8, 3), shade, np.uint8) for shade in (0, 90, 250)]
 
 
@@ -21,7 +21,8 @@ def test_a_notebook_is_given_an_animated_png():
 
 
 def test_a_drawn_figure_is_saved_by_its_ending_and_closed(tmp_path):
-    pyplot = pytest.importorskip("matplotlib.pyplot")
+    from matplotlib import pyplot
+
     figure, axes = pyplot.subplots(figsize=(1, 1))
     film = Animation.draw(figure, lambda i: axes.plot([0, i]), 4, fps=5)
     assert not pyplot.fignum_exists(figure.number)

@@ -6,9 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("gymnasium", reason="needs the extra [rl]")
-pytest.importorskip("tensordict", reason="needs the extra [rl]")
-
 from difflcs import Scales, violation_loss
 from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
 from difflcs.lcp import solve_lcp
@@ -155,7 +152,8 @@ class Rail(Slide):
     """The same task with a body on a rail, which a servo pulls against dry friction."""
 
     def move(self, action):
-        mujoco = pytest.importorskip("mujoco")
+        import mujoco
+
         model = mujoco.MjModel.from_xml_string(RAIL.format(0.8, 2.0))
         data = mujoco.MjData(model)
         data.qpos[:], data.qvel[:] = self.state
@@ -165,7 +163,8 @@ class Rail(Slide):
 
 
 def guess_rail():
-    mujoco = pytest.importorskip("mujoco")
+    import mujoco
+
     from difflcs.physics.mujoco import LearnableMujocoLCS
 
     model = mujoco.MjModel.from_xml_string(RAIL.format(2.0, 1.0))
@@ -190,7 +189,6 @@ def test_a_mujoco_model_is_fitted_to_the_episodes_of_its_mpc():
 
 @pytest.mark.slow
 def test_the_cube_is_pushed_before_anything_is_learned_and_after():
-    pytest.importorskip("mujoco", reason="the environments need the extra [envs]")
     task = get_task("cube")
     envs = task.make_envs(20)
     trainer = ContactMethod(fit=PhysicsFitSettings(rollouts=10, steps=30)).trainer(Work(task, 0, 10, task.make_envs))

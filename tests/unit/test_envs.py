@@ -6,19 +6,17 @@ import pickle
 import subprocess
 import sys
 
+import gymnasium
+import mujoco
 import numpy as np
 import pytest
 
-gymnasium = pytest.importorskip("gymnasium", reason="the environments need the extra [envs]")
-mujoco = pytest.importorskip("mujoco", reason="the environments need the extra [envs]")
-
-
-import difflcs_envs  # noqa: E402
-from difflcs_envs.hand.env import HandTurnObjectEnv  # noqa: E402
-from difflcs_envs.rendering import SceneRenderer, has_display, select_gl_backend  # noqa: E402
-from difflcs_envs.trifinger import kinematics  # noqa: E402
-from difflcs_envs.trifinger.env import TriFingerMoveCubeEnv  # noqa: E402
-from difflcs_envs.trifinger.model import FINGER_YAWS  # noqa: E402
+import difflcs_envs
+from difflcs_envs.hand.env import HandTurnObjectEnv
+from difflcs_envs.rendering import SceneRenderer, has_display, select_gl_backend
+from difflcs_envs.trifinger import kinematics
+from difflcs_envs.trifinger.env import TriFingerMoveCubeEnv
+from difflcs_envs.trifinger.model import FINGER_YAWS
 
 OUTWARD = np.stack([-np.sin(FINGER_YAWS), np.cos(FINGER_YAWS)], axis=1)  # (3, 2)
 REST = np.zeros(6)

@@ -15,13 +15,11 @@ import threading
 import time
 
 import pytest
+import trimesh
 
-trimesh = pytest.importorskip("trimesh", reason="the environments need the extra [envs]")
-pytest.importorskip("mujoco", reason="the environments need the extra [envs]")
-
-from difflcs_envs import AssetError, MeshError, MissingDependencyError, assets  # noqa: E402
-from difflcs_envs.trifinger.objects import make_object  # noqa: E402
-from difflcs_envs.ycb import YCB  # noqa: E402
+from difflcs_envs import AssetError, MeshError, MissingDependencyError, assets
+from difflcs_envs.trifinger.objects import make_object
+from difflcs_envs.ycb import YCB
 
 MESH = "004_sugar_box/google_16k/nontextured.stl"
 ARCHIVE = "004_sugar_box_google_16k.tgz"

@@ -1,21 +1,19 @@
 """The hand that turns objects: what lies on the palm, what the numbers mean, and its physics as a system."""
 
+import gymnasium
+import mujoco
 import numpy as np
 import pytest
 import torch
+from gymnasium.envs.mujoco.utils import check_mujoco_reset_state
+from gymnasium.utils.env_checker import check_env
 
-gymnasium = pytest.importorskip("gymnasium", reason="the environments need the extra [envs]")
-mujoco = pytest.importorskip("mujoco", reason="the environments need the extra [envs]")
-
-from gymnasium.envs.mujoco.utils import check_mujoco_reset_state  # noqa: E402
-from gymnasium.utils.env_checker import check_env  # noqa: E402
-
-import difflcs_envs  # noqa: E402, F401
-from difflcs.rl.tasks import get_task  # noqa: E402
-from difflcs_envs.hand.env import HandTurnObjectEnv, continued_rotation  # noqa: E402
-from difflcs_envs.hand.model import OBJECTS, PALM_TOP  # noqa: E402
-from difflcs_envs.hand.task import TURN_OBJECT, rotation_to_quaternion  # noqa: E402
-from difflcs_envs.tasks import hand_cost, hand_system  # noqa: E402
+import difflcs_envs  # noqa: F401
+from difflcs.rl.tasks import get_task
+from difflcs_envs.hand.env import HandTurnObjectEnv, continued_rotation
+from difflcs_envs.hand.model import OBJECTS, PALM_TOP
+from difflcs_envs.hand.task import TURN_OBJECT, rotation_to_quaternion
+from difflcs_envs.tasks import hand_cost, hand_system
 
 ID = "difflcs/HandTurnObject-v0"
 

@@ -1,11 +1,8 @@
 """The compiled stepper against MuJoCo stepped by hand, with torques by its own Jacobians and mass matrix."""
 
+import mujoco
 import numpy as np
 import pytest
-
-pytest.importorskip("mujoco", reason="the environments need the extra [envs]")
-
-import mujoco
 
 import difflcs_envs
 from difflcs_envs.trifinger import native, osc

@@ -9,24 +9,21 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import coacd
 import numpy as np
 import pytest
+import trimesh
 
-gymnasium = pytest.importorskip("gymnasium", reason="the environments need the extra [envs]")
-trimesh = pytest.importorskip("trimesh", reason="the environments need the extra [envs]")
-coacd = pytest.importorskip("coacd", reason="the environments need the extra [envs]")
-pytest.importorskip("mujoco", reason="the environments need the extra [envs]")
-
-from difflcs_envs import MeshError  # noqa: E402
-from difflcs_envs.trifinger import meshes  # noqa: E402
-from difflcs_envs.trifinger.env import (  # noqa: E402
+from difflcs_envs import MeshError
+from difflcs_envs.trifinger import meshes
+from difflcs_envs.trifinger.env import (
     TriFingerMoveCubeEnv,
     TriFingerMoveObjectEnv,
     TriFingerTurnCubeEnv,
 )
-from difflcs_envs.trifinger.model import FINGER_YAWS  # noqa: E402
-from difflcs_envs.trifinger.section import cross_section  # noqa: E402
-from difflcs_envs.ycb import YCB  # noqa: E402
+from difflcs_envs.trifinger.model import FINGER_YAWS
+from difflcs_envs.trifinger.section import cross_section
+from difflcs_envs.ycb import YCB
 
 OUTWARD = np.stack([-np.sin(FINGER_YAWS), np.cos(FINGER_YAWS)], axis=1)
 REST = np.zeros(6)

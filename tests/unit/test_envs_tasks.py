@@ -4,16 +4,14 @@ import json
 import subprocess
 import sys
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
 
-gymnasium = pytest.importorskip("gymnasium", reason="the environments need the extra [envs]")
-pytest.importorskip("mujoco", reason="the environments need the extra [envs]")
-
-from difflcs.rl.tasks import get_task, task_names  # noqa: E402
-from difflcs_envs.tasks import MOVE, caption, contact_cost, pushing_cost, trifinger_task  # noqa: E402
-from difflcs_envs.ycb import YCB  # noqa: E402
+from difflcs.rl.tasks import get_task, task_names
+from difflcs_envs.tasks import MOVE, caption, contact_cost, pushing_cost, trifinger_task
+from difflcs_envs.ycb import YCB
 
 NAMES = ("cube", "turn_cube", *YCB)
 FEW = ("cube", "turn_cube", "mug")
@@ -185,7 +183,8 @@ def test_a_task_judges_as_its_environment_does():
 
 
 def test_what_is_known_of_an_own_object_is_how_it_lies(tmp_path):
-    trimesh = pytest.importorskip("trimesh", reason="meshes need the extra [envs]")
+    import trimesh
+
     path = tmp_path / "box.stl"
     trimesh.creation.box((60, 80, 160)).export(path)
     given = {"object": str(path), "mesh_scale": 0.001, "rest_pose": "upright"}

@@ -4,18 +4,15 @@ import multiprocessing
 import pickle
 import warnings
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.mujoco.utils import check_mujoco_reset_state
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
 
-gymnasium = pytest.importorskip("gymnasium", reason="the environments need the extra [envs]")
-pytest.importorskip("mujoco", reason="the environments need the extra [envs]")
-
-from gymnasium.envs.mujoco.utils import check_mujoco_reset_state  # noqa: E402
-from gymnasium.utils.env_checker import check_env  # noqa: E402
-from gymnasium.vector import AutoresetMode  # noqa: E402
-
-import difflcs_envs  # noqa: E402
-from difflcs_envs.vector import TriFingerVectorEnv, move_cube  # noqa: E402
+import difflcs_envs
+from difflcs_envs.vector import TriFingerVectorEnv, move_cube
 
 CUBE, OBJECT, TURN = (f"difflcs/TriFinger{name}-v0" for name in ("MoveCube", "MoveObject", "TurnCube"))
 OBJECT_ARGUMENTS = {"object": "clamp", "object_source": "stand_in"}
@@ -192,7 +189,8 @@ def test_bad_actions(actions):
 
 def test_another_library_learns_a_little():
     """Stable-Baselines3 where it is installed."""
-    sb3 = pytest.importorskip("stable_baselines3")
+    import stable_baselines3 as sb3
+
     env = gymnasium.wrappers.FlattenObservation(gymnasium.make(CUBE))
     sb3.PPO("MlpPolicy", env, n_steps=40, batch_size=20, n_epochs=1, device="cpu").learn(40)
 
@@ -201,7 +199,8 @@ def test_another_library_learns_a_little():
 @pytest.mark.parametrize("num_envs", [None, 3])
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_torchrl(task, arguments, num_envs):
-    torchrl_envs = pytest.importorskip("torchrl.envs", reason="needs the extra [rl]")
+    from torchrl import envs as torchrl_envs
+
     from difflcs_envs.torchrl import make_env
 
     env = make_env(task, num_envs=num_envs, **arguments)

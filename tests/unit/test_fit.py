@@ -30,7 +30,6 @@ def test_the_system_that_made_the_data_has_no_error_and_needs_every_contact():
         assert report.rollout[:15, 0].max() < 1e-9
         assert report.rollout[15].isnan().all()  # no episode has 16 steps
     assert "acts in" in str(report)
-    pytest.importorskip("matplotlib")
     assert len(report.plot().axes) == 3
 
 

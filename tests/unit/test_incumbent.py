@@ -1,10 +1,8 @@
 """A policy is replaced only by what did better, as far as few episodes can tell."""
 
-import pytest
 import torch
 from torch import nn
 
-pytest.importorskip("torchrl")
 from difflcs.rl.learning.incumbent import ITERATIONS, Incumbent, is_better
 
 F64 = torch.float64

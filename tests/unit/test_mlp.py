@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-pytest.importorskip("torchrl")
 from difflcs.errors import CheckpointError
 from difflcs.rl.learning.mlp import MLPController
 from tests.training.slide import STEPS, U_MAX, features

@@ -389,7 +389,6 @@ def test_a_plan_and_a_system_print_their_shapes_and_how_the_plan_ended(build, la
 
 
 def test_a_plan_is_drawn(layer, x0):
-    pytest.importorskip("matplotlib")
     plan = layer(x0)
     states, actions, forces, gaps = plan.plot(1).axes
     assert torch.equal(torch.as_tensor(states.lines[2].get_ydata()), plan.x[1, :, 2].detach())

@@ -5,7 +5,6 @@ import pytest
 import torch
 from torch import nn
 
-pytest.importorskip("torchrl")
 from difflcs.errors import InvalidInputError
 from difflcs.rl.learning.optim import NaturalGradient
 from difflcs.rl.learning.policy import make_actor

@@ -1,14 +1,13 @@
 """Actuators with activation and with limits of control and force, beside MuJoCo's own steps."""
 
+import mujoco
 import numpy as np
 import pytest
 import torch
 
 from difflcs import LCSMPCLayer, QuadraticCost
 from difflcs.errors import InvalidInputError
-
-mujoco = pytest.importorskip("mujoco")
-from difflcs.physics.mujoco import MujocoLCS, drive_mocap  # noqa: E402
+from difflcs.physics.mujoco import MujocoLCS, drive_mocap
 
 SLIDE = """<mujoco><option timestep=".002" integrator="{0}" gravity="0 0 0"/><worldbody><body>
     <joint name="a" type="slide" axis="1 0 0" damping="2" {2}/><geom size=".1" mass="1"/></body></worldbody>

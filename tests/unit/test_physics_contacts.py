@@ -2,15 +2,14 @@
 
 from contextlib import suppress
 
+import mujoco
 import numpy as np
 import pytest
 import torch
 
-mujoco = pytest.importorskip("mujoco")
-
-from difflcs.errors import ContactWarning, InvalidInputError  # noqa: E402
-from difflcs.physics.mujoco import MujocoLCS  # noqa: E402
-from difflcs.physics.mujoco.nominal import solve_soft  # noqa: E402
+from difflcs.errors import ContactWarning, InvalidInputError
+from difflcs.physics.mujoco import MujocoLCS
+from difflcs.physics.mujoco.nominal import solve_soft
 
 KINDS = ("box", "box", "capsule", "cylinder", "ellipsoid", "mesh")
 CUBE = " ".join(f"{x} {y} {z}" for x in (-0.04, 0.04) for y in (-0.03, 0.05) for z in (-0.02, 0.03))

@@ -1,13 +1,12 @@
 """Limits, dry friction and equality constraints against MuJoCo: what rests, slides, stops, and what a system has."""
 
+import mujoco
 import numpy as np
 import pytest
 import torch
 
-mujoco = pytest.importorskip("mujoco")
-
-from difflcs.errors import ContactWarning  # noqa: E402
-from difflcs.physics.mujoco import MujocoLCS  # noqa: E402
+from difflcs.errors import ContactWarning
+from difflcs.physics.mujoco import MujocoLCS
 
 
 def load(worldbody, rest=""):

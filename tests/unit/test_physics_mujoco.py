@@ -4,13 +4,12 @@ import importlib
 import itertools
 import sys
 
+import mujoco
 import numpy as np
 import pytest
 import torch
 
-mujoco = pytest.importorskip("mujoco")
-
-from difflcs.errors import (  # noqa: E402
+from difflcs.errors import (
     ContactWarning,
     DTypeError,
     InvalidInputError,
@@ -18,8 +17,8 @@ from difflcs.errors import (  # noqa: E402
     NonFiniteError,
     ShapeError,
 )
-from difflcs.physics import PlanarPushing, box  # noqa: E402
-from difflcs.physics.mujoco import MujocoLCS, MujocoState, lcs_from_mujoco  # noqa: E402
+from difflcs.physics import PlanarPushing, box
+from difflcs.physics.mujoco import MujocoLCS, MujocoState, lcs_from_mujoco
 
 SHAPES = {
     "sphere": 'type="sphere" size=".03"',

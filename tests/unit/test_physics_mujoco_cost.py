@@ -1,14 +1,13 @@
 """`difflcs.physics.mujoco.cost`: squares of places and rotations, against MuJoCo's own kinematics."""
 
+import mujoco
 import numpy as np
 import pytest
 import torch
 
-mujoco = pytest.importorskip("mujoco")
-
-from difflcs import CostModule, LCSMPCLayer  # noqa: E402
-from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError  # noqa: E402
-from difflcs.physics.mujoco import (  # noqa: E402
+from difflcs import CostModule, LCSMPCLayer
+from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
+from difflcs.physics.mujoco import (
     Distance,
     Effort,
     MujocoCost,

@@ -2,15 +2,14 @@
 
 import math
 
+import mujoco
 import numpy as np
 import pytest
 import torch
 
-mujoco = pytest.importorskip("mujoco", reason="needs the extra [envs]")
-
-from difflcs import GoalCost, LCSMPCLayer  # noqa: E402
-from difflcs.errors import InvalidInputError  # noqa: E402
-from difflcs.physics.mujoco import LearnableMujocoLCS, MujocoLCS  # noqa: E402
+from difflcs import GoalCost, LCSMPCLayer
+from difflcs.errors import InvalidInputError
+from difflcs.physics.mujoco import LearnableMujocoLCS, MujocoLCS
 
 F64 = torch.float64
 VALUES = {"mass": 0.4, "inertia": 4e-4, "com": 0.004, "friction": 0.5, "size": 0.05, "offset": 0.0, "tip": 0.02}

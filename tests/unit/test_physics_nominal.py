@@ -3,15 +3,14 @@
 import copy
 import math
 
+import mujoco
 import numpy as np
 import pytest
 import torch
 
-mujoco = pytest.importorskip("mujoco")
-
-from difflcs import GoalCost, LCSMPCLayer, Status  # noqa: E402
-from difflcs.errors import InvalidInputError  # noqa: E402
-from difflcs.physics.mujoco import MujocoLCS  # noqa: E402
+from difflcs import GoalCost, LCSMPCLayer, Status
+from difflcs.errors import InvalidInputError
+from difflcs.physics.mujoco import MujocoLCS
 
 SECONDS = (0.002, 0.02, 0.1)
 FIRM = '<option timestep=".001" cone="elliptic" impratio="100"/>'  # friction that hardly creeps; by default it does

@@ -1,14 +1,13 @@
 """Quasi-dynamic motion of MuJoCo models, contacts by groups and the reference of rotations that moves along."""
 
+import mujoco
 import numpy as np
 import pytest
 import torch
 
-mujoco = pytest.importorskip("mujoco")
-
-from difflcs import LCSModule  # noqa: E402
-from difflcs.errors import DTypeError, InvalidInputError, ShapeError  # noqa: E402
-from difflcs.physics.mujoco import ContactGroup, MujocoLCS, MujocoState  # noqa: E402
+from difflcs import LCSModule
+from difflcs.errors import DTypeError, InvalidInputError, ShapeError
+from difflcs.physics.mujoco import ContactGroup, MujocoLCS, MujocoState
 
 BOX = '<body name="box" pos="{}"><freejoint/><geom name="block" type="box" size=".05 .03 .02" mass="{}"/></body>'
 

@@ -7,15 +7,12 @@ import sys
 
 import pytest
 import torch
-
-from difflcs import GoalCost, LCSModel, LCSMPCLayer
-from difflcs.errors import DTypeError, InvalidInputError
-
-pytest.importorskip("torchrl")
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from difflcs import GoalCost, LCSModel, LCSMPCLayer
+from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.rl.learning.policy import LCSMPCPolicy
 
 U_MAX = 0.1
@@ -115,7 +112,6 @@ def test_bad_arguments(mpc, arguments, error, message):
 @pytest.mark.filterwarnings("ignore:The env passed to Collector is missing transforms")  # of TorchRL 0.14 to 0.15
 def test_the_example_trains_in_plain_torchrl():
     """The docstring's example is run: TorchRL's Collector, GAE, loss and optimiser, and our environment and policy."""
-    pytest.importorskip("mujoco")
     found = {"torch": torch}
     before = LCSModel(9, 6, 8).state_dict()
     with torch.random.fork_rng():

@@ -6,8 +6,6 @@ import pytest
 import torch
 
 from difflcs.errors import InvalidInputError
-
-pytest.importorskip("torchrl")
 from difflcs.rl.learning import ppo_settings
 from difflcs.rl.learning.mlp import MLPController
 from difflcs.rl.learning.policy import make_actor

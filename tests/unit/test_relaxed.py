@@ -13,10 +13,6 @@ from difflcs.mpc.backends import RelaxedBackend
 from tests.conformance.problems import Problem, badly_scaled, contact, make
 from tests.conformance.problems import solve as solve_problem
 
-pytestmark = pytest.mark.skipif(
-    bool(RelaxedBackend.missing()), reason="cvxpy and cvxpylayers are not installed: pip install 'difflcs[relaxed]'"
-)
-
 
 def tensors(build, **options):
     return make(build, **{"batch": 4, **options}).tensors

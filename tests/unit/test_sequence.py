@@ -1,15 +1,13 @@
 """A module linearised along a plan, and a layer that plans in several passes."""
 
+import mujoco
 import pytest
 import torch
 
 from difflcs import GoalCost, LCSMPCLayer, LCSParams, LCSSequence, QuadraticCost, sequence_along
 from difflcs.errors import DTypeError, InvalidInputError
 from difflcs.physics import ContactLCS, PlanarPushing, PositionDrive, box
-
-mujoco = pytest.importorskip("mujoco")
-
-from difflcs.physics.mujoco import Effort, MujocoCost, MujocoLCS, Position  # noqa: E402
+from difflcs.physics.mujoco import Effort, MujocoCost, MujocoLCS, Position
 
 DOOR = """<mujoco><option timestep=".002" integrator="implicitfast"/><worldbody>
   <body><joint name="angle" type="hinge" axis="0 0 1" damping=".5"/>

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from torch.distributions import MultivariateNormal
-
-pytest.importorskip("torchrl")
 from tensordict import TensorDict
+from torch.distributions import MultivariateNormal
 
 from difflcs import violation_loss
 from difflcs.rl import ViolationLoss

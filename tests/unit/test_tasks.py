@@ -74,8 +74,6 @@ def test_an_environment_that_would_clip_what_is_planned_is_refused(change, messa
 
 
 def test_every_episode_of_a_film_begins_the_policy_anew(tmp_path):
-    pytest.importorskip("imageio_ffmpeg", reason="films need the extra [viz]")
-    pytest.importorskip("PIL", reason="films need the extra [viz]")
 
     class Drawn(Slide):
         def render(self):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("torchrl")
 from difflcs.errors import CheckpointError
 from difflcs.rl import Adam, Natural
 from difflcs.rl.learning.optim import AdamUpdate, NaturalUpdate, StepSize

@@ -60,8 +60,6 @@ FLOORS = {
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("cell", PARAMETERS)
 def test_nothing_is_wrong_in_silence(cell):
-    if cell.target == "relaxed":
-        pytest.importorskip("cvxpylayers")
     if cell.problems.startswith("mpc-skew"):  # what is refused there was tried three times
         cell = replace(cell, size=min(cell.size, 32))
     if cell.problems == "form-zero-rows":  # half a second for each
