@@ -94,7 +94,7 @@ class Transitions(NamedTuple):
                 f"split one long episode by hand"
             )
         drawn = np.random.default_rng(seed).permutation(count)[: min(max(1, round(share * count)), count - 1)]
-        test = torch.isin(number, torch.as_tensor(drawn))
+        test = torch.isin(number, torch.as_tensor(drawn, device=number.device))
         return Transitions(*(v[~test] for v in self)), Transitions(*(v[test] for v in self))
 
 
@@ -225,7 +225,8 @@ def fit_report(
             without.append(((guess - x_next) / step).square().sum(1) - squared)
         gain = torch.stack(without, 1) if without else x.new_zeros(len(x), 0)
         base = squared.mean().clamp_min(1e-300)
-        linear, ends, rows, rollout = _affine(solution, x, u), _continues(x, x_next), torch.arange(len(x)), []
+        linear, ends, rollout = _affine(solution, x, u), _continues(x, x_next), []
+        rows = torch.arange(len(x), device=x.device)
         predictions = [prediction.x_next, linear, x]
         for h in range(horizon):
             if h:

@@ -101,7 +101,7 @@ class ContactLCS(nn.Module):
     @property
     def physics(self) -> PlanarPushing:
         """The current physics, differentiable in the learned parameters."""
-        guess, change = self.guess, fresh(self.change, self.learn)
+        guess, change = self.guess, {name: v.cpu() for name, v in fresh(self.change, self.learn).items()}
         length = guess.length or 1.0
         values: dict[str, Any] = {name: getattr(guess, name) for name in ("center_of_mass", "gyration", "length")}
         values |= {

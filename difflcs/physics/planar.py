@@ -306,6 +306,8 @@ class PlanarPushing:
                 "x: expected states (..., n_x), as contacts depend on where things are, got None; pass x"
             )
         check_tensor("x", x, [("n_x", self.n_x)])
+        if not x.is_cpu:  # computed there, as plans are
+            return self.params(x.cpu(), context).to(x.device)
         friction = 0.0 if self.frictionless else self._by_contact(self.friction)
         contacts, free, compliance = self.contacts(x), self._free_motion(x), self._by_contact(self.compliance)
         if self.inertia is not None:

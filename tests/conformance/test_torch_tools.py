@@ -20,6 +20,8 @@ from difflcs import (
     LCSParams,
     LinearConstraints,
     StageBounds,
+    Transitions,
+    fit_report,
     prediction_loss,
     solve_lcp,
     suggest_scales,
@@ -336,3 +338,35 @@ def test_autocast_changes_no_number(entry, tool, dtype):
         outputs = function(model, *data)
         found = value_and_gradient(outputs, of) if tool == "none" else None  # steps back through a tool are torch's
     torch.testing.assert_close(found or value_and_gradient(outputs, of), expected)
+
+
+gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU that torch can use")
+
+
+@gpu
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+@pytest.mark.parametrize("entry", ENTRIES | MORE)
+def test_on_a_gpu_values_and_gradients_are_those_of_the_cpu(entry, dtype):
+    model, function, data = make(dtype=dtype), (ENTRIES | MORE)[entry], [v.to(dtype) for v in DATA]
+    expected = value_and_gradient(function(model, *data), list(model.parameters()))
+    model.cuda()
+    with torch.device("cuda"):
+        outputs = function(model, *(v.cuda() for v in data))
+    found = value_and_gradient(outputs, list(model.parameters()))
+    assert all(v.is_cuda for v in (*outputs, *found))
+    torch.testing.assert_close([v.cpu() for v in found], expected)
+
+
+@gpu
+def test_on_a_gpu_physics_and_reports_are_those_of_the_cpu():
+    x = torch.tensor([0.0, 0.0, 0.3, -0.13, 0.0, 0.01, 0.13]).double() + 0.01 * draw(20, 7)
+    u, learned = 0.01 * draw(20, 4), ("friction", "gain", "outline")
+    physics = PlanarPushing(Circle(0.1), 0.02, n_discs=2, friction=0.5)
+    found = []
+    for to in (lambda v: v, lambda v: v.cuda()):
+        lcs, *rows = map(to, (ContactLCS(physics, learned), x, u, x + 0.01))
+        report, (left, _) = fit_report(lcs, *rows), Transitions(*rows).split(0.5)
+        loss = violation_loss(lcs, *left, "auto")
+        found.append([loss, report.gain, *torch.autograd.grad(loss, list(lcs.parameters()))])
+    assert all(v.is_cuda for v in found[1])
+    torch.testing.assert_close([v.cpu() for v in found[1]], found[0])
