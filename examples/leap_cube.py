@@ -8,7 +8,8 @@ With `--policy mppi`, `cem` or `ps` Judo's own planner plays the same episodes, 
 task: 32 rollouts of 1 s, 20 decisions a second, for which the simulator waits. `--rollouts` and `--rate` change that.
 
 Our policy is a contact MPC: a quasi-dynamic system and a cost in task space, both linearised where hand and cube are,
-ten times a second. The step that it plans is tried at several paces in the model with which Judo plans. No data.
+ten times a second. Its plan at several paces, what is left of the last way, and a few variations of the best of these
+are rehearsed for half a second in the model with which Judo plans, in steps of 5 ms; the best one is begun. No data.
 
 Times are CPU times. With `--out FILE` episodes that are in the file are not played again.
 """
@@ -23,6 +24,7 @@ import json
 import sys
 import time
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,6 +34,7 @@ import mujoco
 import numpy as np
 import torch
 import tyro
+from mujoco import rollout
 
 from difflcs import LCSMPCLayer
 from difflcs.errors import ContactWarning
@@ -64,11 +67,18 @@ class Settings:
     compliance: float = 0.1
     relaxation: float = 1e-3
     solver: Literal["fast", "default", "best"] = "fast"
-    paces: tuple[float, ...] = (1.5, 1.0, 0.5, 0.0)
-    """Factors by which the planned step is tried, the fastest first; none: it is executed untried."""
-    ahead: int = 1
-    """Steps of the plan that are tried."""
-    slack: float = 0.02
+    paces: tuple[float, ...] = (1.5, 1.0, 0.5)
+    """Factors by which the planned actions are rehearsed; none: rehearsed is only what varies the last way."""
+    ahead: int = 5
+    """Decisions that a rehearsal looks ahead; after the plan's last the servos' targets stay."""
+    samples: tuple[int, ...] = (4, 2)
+    """Variations of the best way so far that are rehearsed, round by round."""
+    noise: float = 0.3
+    """Standard deviation of the servos' targets in a variation [rad]."""
+    step: float = 0.005
+    """Time step of the rehearsal [s]; with 10 ms, as Judo plans, cube and hand are elsewhere after half a second."""
+    reached: float = 0.38
+    """Angle within which a rehearsal has reached the goal and turns no further [rad]."""
     patience: int = 25
     opening: int = 8
     spread: float = 0.3
@@ -149,9 +159,9 @@ class HandPolicy:
 
     def __init__(self, model: Any, data: Any, settings: Settings):
         s = settings
-        self.twin, self.tried, self.seconds = model, mujoco.MjData(model), s.seconds
-        self.trials = round(s.seconds / model.opt.timestep)
-        model = copy.copy(model)
+        self.twin, self.seconds, model = copy.copy(model), s.seconds, copy.copy(model)
+        self.twin.opt.timestep, self.twin.opt.cone = s.step, mujoco.mjtCone.mjCONE_PYRAMIDAL
+        self.tried, self.rollout = mujoco.MjData(self.twin), rollout.Rollout(nthread=0)
         model.body_inertia[model.body("cube").id] *= s.inertia
         self.module = MujocoLCS(
             model,
@@ -180,6 +190,7 @@ class HandPolicy:
         )
         self.range = model.actuator_ctrlrange.T
         self.settings, self.guess, self.goal, self.openings = s, None, np.zeros(4), 0
+        self.way = np.tile(data.ctrl, (s.ahead, 1))
         self.random, self.home = np.random.RandomState(0), np.array(data.qpos[7:])
 
     def angle(self, data: Any) -> float:
@@ -200,36 +211,62 @@ class HandPolicy:
 
     def act(self, data: Any, goal: np.ndarray) -> np.ndarray:
         """MuJoCo's ctrl until the next decision."""
-        s = self.settings
         if (goal != self.goal).any():
             self.goal, self.best, self.waited, self.guess = goal.copy(), np.inf, 0, None
         if self.stalls(data):
-            self.guess = None
-            return np.clip(self.posture, *self.range)
+            self.guess, self.way = None, np.tile(np.clip(self.posture, *self.range), (len(self.way), 1))
+        else:
+            rest = np.vstack([self.way[1:], self.way[-1:]])
+            self.way = self.rehearse(data, np.array([*self.plan(data), rest]))
+        return self.way[0]
+
+    def plan(self, data: Any) -> Iterator[np.ndarray]:
+        """Yield the servos' targets (ahead, 16) of the plan at each pace."""
+        s = self.settings
+        if not s.paces:
+            return
         x = self.module.observe(data)
         system, cost = self.module.params(x), self.cost.at(x, torch.from_numpy(self.goal))
         low, high = (bound.clamp(-s.limit, s.limit) for bound in self.module.action_bounds(x))
         with torch.no_grad():
             plan = self.mpc(x, lcs=system, cost=cost, guess=self.guess, u_min=low, u_max=high)
         self.guess = plan.shift() if bool(solved(plan.status)) else None
-        if not s.paces:
-            return self.module.control(x, plan.action).numpy()
-        return self.rehearse(data, plan.u[: s.ahead].numpy())
-
-    def rehearse(self, data: Any, actions: np.ndarray) -> np.ndarray:
-        """Try steps at several paces: the first control of the fastest that ends about as well as the best."""
-        s, ends, ctrls = self.settings, [], []
+        steps = np.minimum(np.arange(s.ahead), s.horizon - 1)
         for pace in s.paces:
-            mujoco.mj_copyState(self.twin, data, self.tried, mujoco.mjtState.mjSTATE_INTEGRATION)
-            for k, u in enumerate(actions):
-                self.tried.ctrl[:] = np.clip(self.tried.qpos[7:] + pace * u, *self.range)
-                if k == 0:
-                    ctrls.append(self.tried.ctrl.copy())
-                mujoco.mj_step(self.twin, self.tried, self.trials)
-            apart, left = self.tried.qpos[:3] - s.place, self.angle(self.tried)
-            near = min(left, s.reach)
-            ends.append(s.place_weight * apart @ apart + s.turn_weight * near * (2 * left - near))
-        return next(ctrl for ctrl, end in zip(ctrls, ends, strict=True) if end <= min(ends) + s.slack)
+            yield np.clip(self.module.control(plan.x[:-1], pace * plan.u).numpy()[steps], *self.range)
+
+    def rehearse(self, data: Any, ways: np.ndarray) -> np.ndarray:
+        """Return the best of these ways (n, ahead, 16) and of their variations."""
+        ends = self.simulate(data, ways)
+        best, least = ways[ends.argmin()], ends.min()
+        for n in self.settings.samples:
+            ways = np.clip(best + self.draw(n), *self.range)
+            ends = self.simulate(data, ways)
+            if ends.min() < least:
+                best, least = ways[ends.argmin()], ends.min()
+        return best
+
+    def draw(self, n: int) -> np.ndarray:
+        """Draw changes of the targets (n, ahead, 16): drawn at beginning, middle and end, linear in between."""
+        s = self.settings
+        begin, middle, end = s.noise * self.random.randn(3, n, 1, 16)
+        part = np.linspace(-1, 1, s.ahead)[:, None]
+        return middle + np.where(part < 0, -part * (begin - middle), part * (end - middle))
+
+    def simulate(self, data: Any, ways: np.ndarray) -> np.ndarray:
+        """Return the costs (n,) of ways (n, ahead, 16): their mean over time and that of the end."""
+        s, full = self.settings, mujoco.mjtState.mjSTATE_FULLPHYSICS
+        start = np.zeros((len(ways), mujoco.mj_stateSize(self.twin, full)))
+        mujoco.mj_getState(self.twin, data, start[0], full)
+        start[:] = start[0]
+        states, _ = self.rollout.rollout(self.twin, [self.tried], start, ways.repeat(round(s.seconds / s.step), axis=1))
+        cube = np.asarray(states)[:, :, 1:8]  # after the time
+        apart = np.square(cube[:, :, :3] - s.place).sum(-1)
+        left = 2 * np.arccos(np.minimum(1.0, np.abs(cube[:, :, 3:] @ self.goal)))
+        near = np.minimum(left, s.reach)
+        on = np.cumsum(left < s.reached, axis=1) == 0  # until the goal is reached
+        costs = s.place_weight * apart + s.turn_weight * on * near * (2 * left - near)
+        return costs.mean(1) + costs[:, -1]
 
 
 class Ours:
@@ -251,7 +288,6 @@ class Judo:
 
     def __init__(self, task: Any, o: Options):
         from judo.controller import controller
-        from mujoco import rollout
 
         self.controller, self.due = controller.make_controller("leap_cube", o.policy), 0.0
         if o.rollouts is not None:
