@@ -9,9 +9,6 @@ contact, or where a joint or tendon is at its limit in this step. Beside them ar
 steps with the nominal control, linearised at each by `mjd_transitionFD`, contacts included.
 """
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import importlib.util

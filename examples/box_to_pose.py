@@ -8,9 +8,6 @@ the same model (`difflcs.physics.mujoco`), with the box on joints in the plane. 
 and the true state.
 """
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import math

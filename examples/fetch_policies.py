@@ -6,9 +6,6 @@ that hits a puck, which slides on until friction stops it. The hit is tried befo
 Settings were chosen with seeds from 1000 to 1219.
 """
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 from typing import Any, NamedTuple

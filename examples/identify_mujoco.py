@@ -5,9 +5,6 @@ too small. The truth moves by random controls; `LearnableMujocoLCS` with the vio
 Without `--xml` two models of Gymnasium are tried: the arm of Pusher, and the half-cheetah, which runs in a plane.
 """
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import itertools

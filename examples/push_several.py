@@ -16,9 +16,6 @@ The policy moves one body at a time by sampling-based contact MPC (`difflcs.plan
 Lengths in the policy are in units of 10 cm.
 """
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import itertools

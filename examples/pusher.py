@@ -11,9 +11,6 @@ MuJoCo for the whole episode before it begins, and contact MPC improves it then 
 Settings were chosen with seeds below 1000. Times are CPU times of one core.
 """
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import itertools

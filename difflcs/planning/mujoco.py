@@ -4,9 +4,6 @@ Needs the extra `envs`. MuJoCo's kinematics say where end effectors are, and the
 free of collisions: what may not touch there is not in the way.
 """
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import math

@@ -1,8 +1,5 @@
 """Pictures of a MuJoCo scene, with or without a screen, and the interactive viewer."""
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import ctypes.util
@@ -57,7 +54,7 @@ def _make_gl_context(width: int, height: int) -> Any:
         elif backend == "osmesa":
             from mujoco.osmesa import GLContext
         else:
-            from mujoco import GLContext  # pyright: ignore[reportAttributeAccessIssue]
+            from mujoco import GLContext
         context = GLContext(width, height)
         context.make_current()
     except Exception as error:  # OpenGL raises many types: ImportError, AttributeError, GLError, RuntimeError

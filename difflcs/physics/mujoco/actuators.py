@@ -1,8 +1,5 @@
 """Actuators of a MuJoCo model: servos, activation, and limits of control and force."""
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 from typing import Any

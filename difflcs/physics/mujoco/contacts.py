@@ -5,9 +5,6 @@ all others where `mj_geomDistance` says that they are nearest. Here is said whic
 and how many contacts there are.
 """
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import warnings

@@ -10,9 +10,6 @@ where they do worse than nothing, and goes to d: a grip many times as firm as at
 many times as large.
 """
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import warnings

@@ -1,8 +1,5 @@
 """MujocoCost: quadratic costs of where bodies, sites and geoms of a MuJoCo model are, linearised at each state."""
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -1,8 +1,5 @@
 """MujocoLCS: the linear complementarity system of a MuJoCo model at each state."""
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import copy

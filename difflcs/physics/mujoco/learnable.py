@@ -1,8 +1,5 @@
 """LearnableMujocoLCS: the physics of a MuJoCo model with numbers of the model that are learned."""
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import copy

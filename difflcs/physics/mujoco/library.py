@@ -1,8 +1,5 @@
 """Addresses of MuJoCo's functions and fields, for the compiled part in `_native`, which knows no header of MuJoCo."""
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import copy

@@ -10,9 +10,6 @@ its part after a being a force within the bounds. Followed through a step this s
 far friction creeps, when in the step the force acts, and whether it does so all the time.
 """
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import warnings

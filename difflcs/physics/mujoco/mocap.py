@@ -1,8 +1,5 @@
 """Mocap bodies as inputs: joints and servos in place of what moves them from outside."""
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 from typing import Any

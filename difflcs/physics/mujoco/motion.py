@@ -16,9 +16,6 @@ symmetric matrix that resists motion (its positive eigenvalues, in the metric of
 state and for every step, also where Coriolis forces or an unstable equilibrium would make an implicit step indefinite.
 """
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import copy

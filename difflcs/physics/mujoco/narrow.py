@@ -1,8 +1,5 @@
 """Shapes of geoms: those between which MuJoCo's contacts are exact, and the faces of those that have some."""
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 from typing import Any

@@ -1,8 +1,5 @@
 """MuJoCo's errors, and the warnings that it only counts, as exceptions of this library; bits of its flags."""
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 from collections.abc import Iterator

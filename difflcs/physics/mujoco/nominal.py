@@ -10,9 +10,6 @@ but as slowly as MuJoCo's soft friction lets it. Nor does a contact open that on
 contacts do under their load.
 """
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import warnings

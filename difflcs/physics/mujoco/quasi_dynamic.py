@@ -20,9 +20,6 @@ K_abs has no servos whose actions count from where they are. Springs count by th
 and how gravity changes with x is left out.
 """
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 from typing import Any, NamedTuple

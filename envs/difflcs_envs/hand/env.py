@@ -1,8 +1,5 @@
 """The hand as a Gymnasium environment: turn an object on the palm."""
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import functools

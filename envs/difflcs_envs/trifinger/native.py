@@ -4,9 +4,6 @@ Nothing depends on MuJoCo's headers: functions are looked up by name in the libr
 fields by the addresses of their NumPy views.
 """
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import ctypes

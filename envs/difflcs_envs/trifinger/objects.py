@@ -5,9 +5,6 @@ The YCB meshes (Calli et al., IEEE RAM 2015) do not ship with this package. They
 capsules with the size, the mass and the resting height of the object takes its place; `source` says which it is.
 """
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 from dataclasses import dataclass

@@ -11,9 +11,6 @@ J^T (J J^T + lambda^2 I)^-1 with lambda^2 = SINGULAR_DAMPING^2 (1 - (det J / SIN
 and Hanafusa 1986: it vanishes at the edge of the singular region, so the torque is continuous there.
 """
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import mujoco

@@ -1,8 +1,5 @@
 """The simulated robot and object, without any task: reset, step, read-out, save and restore."""
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import math
