@@ -16,7 +16,7 @@ import functools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, ClassVar, ParamSpec, TypeVar
+from typing import Any, ClassVar, NoReturn, ParamSpec, TypeVar
 
 import numpy as np
 import torch
@@ -62,10 +62,14 @@ def refuse_tangents(tensors: Iterable[Tensor]) -> None:
     """
     unpack = torch.autograd.forward_ad.unpack_dual
     if forward_mode_active() and any(unpack(tensor).tangent is not None for tensor in tensors):
-        raise NotImplementedError(
-            "expected reverse mode, got inputs with a tangent, but the layer has no forward-mode derivatives; use "
-            "backward, torch.func.grad or jacrev, or torch.autograd.functional.jacobian without strategy='forward-mode'"
-        )
+        _refuse_forward_mode()
+
+
+def _refuse_forward_mode() -> NoReturn:
+    raise NotImplementedError(
+        "expected reverse mode, got inputs with a tangent, but the layer has no forward-mode derivatives; use "
+        "backward, torch.func.grad or jacrev, or torch.autograd.functional.jacobian without strategy='forward-mode'"
+    )
 
 
 def runs_eagerly(function: Callable[P, R]) -> Callable[P, R]:
@@ -73,11 +77,19 @@ def runs_eagerly(function: Callable[P, R]) -> Callable[P, R]:
 
     `torch.compile` breaks the graph there. `torch.compiler.disable` at import would import the compiler, which takes
     seconds. `torch.autocast` is off inside.
+
+    Raises:
+        NotImplementedError: the call is traced by something else, such as `torch.export`.
     """
 
     @functools.wraps(function)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
         if torch.compiler.is_compiling():
+            if not torch.compiler.is_dynamo_compiling():
+                raise NotImplementedError(
+                    "expected eager code or torch.compile, got torch.export or the like, whose graph cannot hold a "
+                    "solver; for C there is layer.controller().save(path)"
+                )
             return torch.compiler.disable(wrapper)(*args, **kwargs)  # pyright: ignore[reportCallIssue]
         if torch._C._is_any_autocast_enabled():
             with torch._C._DisableAutocast():
@@ -138,6 +150,7 @@ def solve(solver: Solver, *tensors: Tensor) -> tuple[Tensor, ...]:
     if transforms_active():
         return _Transformed.apply(solver, *tensors)[:-1]  # pyright: ignore[reportReturnType, reportOptionalSubscript]
     if forward_mode_active() or (torch.is_grad_enabled() and any([tensor.requires_grad for tensor in tensors])):
+        tensors = tuple([v.clone() if v.is_inference() else v for v in tensors])  # others cannot be saved for backward
         return _Eager.apply(solver, *tensors)  # pyright: ignore[reportReturnType]
     return solver.solve(tensors, transformed=False)
 
@@ -179,6 +192,10 @@ class _Transformed(torch.autograd.Function):
         _keep(ctx, inputs[0], inputs[1:], output, output[-1:] if inputs[0].keeps else output[:-1])
 
     backward = _Eager.backward
+
+    @staticmethod
+    def jvp(ctx, *tangents: Tensor | None) -> NoReturn:
+        _refuse_forward_mode()
 
     @staticmethod
     def vmap(info, in_dims: tuple, solver: Solver, *tensors: Tensor):

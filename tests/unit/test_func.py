@@ -5,7 +5,7 @@ import warnings
 import pytest
 import torch
 from torch.autograd.functional import jacobian
-from torch.func import grad, vmap
+from torch.func import grad, jvp, vmap
 
 from difflcs import LCSMPCLayer, LCSParams, MPCSolution, Status
 from difflcs import errors as e
@@ -148,6 +148,22 @@ def test_forward_mode_is_refused_whatever_requires_a_gradient(layer, x0, learnab
         assert mpc(x0).converged.all()  # without a tangent there is nothing to lose
     with pytest.raises(NotImplementedError, match="forward"):
         jacobian(lambda x: mpc(x).u, x0, strategy="forward-mode", vectorize=True)
+    with pytest.raises(NotImplementedError, match="no forward-mode derivatives"):
+        jvp(lambda x: mpc(x).u, (x0,), (x0,))
+
+
+def test_a_graph_that_cannot_hold_a_solver_is_refused(layer, x0):
+    with pytest.raises(NotImplementedError, match=r"got torch\.export or the like"):
+        torch.export.export(layer, (x0,), strict=False)
+
+
+def test_what_was_made_in_inference_mode_serves_where_gradients_are_recorded(layer, x0):
+    with torch.inference_mode():
+        states, guess = x0.clone(), layer(x0)
+    found, expected = layer(states, guess=guess).u, layer(x0, guess=layer(x0)).u
+    close(
+        *(torch.autograd.grad(u.square().sum(), list(layer.parameters()), allow_unused=True) for u in (found, expected))
+    )
 
 
 def test_a_plan_is_measured_by_the_system_it_was_planned_with(layer, x0):
