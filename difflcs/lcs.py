@@ -113,6 +113,8 @@ class LCSModel(PredictiveModule):
         ShapeError, NonFiniteError, BoundsError: an invalid action support.
     """
 
+    kind = "LCSModel"
+    """What a file of it says that it is."""
     parameter_names = ("A", "B", "C", "d", "D", "E", "G", "H", "c")
 
     def __init__(
@@ -294,7 +296,7 @@ class LCSModel(PredictiveModule):
 
         For a model that `torch.nn.utils` has parametrised, pruned or normalised, the resulting matrices are written.
         """
-        _storage.save_record(Path(directory), "LCSModel", self.config(), plain_state(self))
+        _storage.save_record(Path(directory), self.kind, self.config(), plain_state(self))
 
     @classmethod
     def from_pretrained(cls, source: str | os.PathLike[str]) -> LCSModel:
@@ -311,7 +313,7 @@ class LCSModel(PredictiveModule):
         from difflcs import zoo  # handles files only, and few users need it
 
         directory = zoo.resolve(source)
-        config, tensors = _storage.load_record(directory, "LCSModel")
+        config, tensors = _storage.load_record(directory, cls.kind)
         return cls.from_config(config, tensors, str(directory))
 
 

@@ -6,6 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from difflcs.physics.complementarity import Bounded, Contacts, FreeMotion, Unilateral, contact_lcs
+from difflcs.physics.frame import BodyFrameLCS
 from difflcs.physics.learnable import ContactLCS
 from difflcs.physics.planar import ForceDrive, Inertia, PDDrive, PlanarPushing, PositionDrive
 from difflcs.physics.shapes import Circle, Distance, Polygon, Shape, Union, box
@@ -16,6 +17,7 @@ if TYPE_CHECKING:  # for type checkers; MuJoCo is an extra, imported by the firs
     from difflcs.physics.mujoco import lcs_from_mujoco as lcs_from_mujoco
 
 __all__ = [
+    "BodyFrameLCS",
     "Bounded",
     "Circle",
     "ContactLCS",

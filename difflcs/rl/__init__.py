@@ -24,6 +24,7 @@ from difflcs.rl.learning.trainer import Trainer
 from difflcs.rl.learning.warmup import Warmup, WarmupSettings, action_support, fit
 from difflcs.rl.methods import (
     ContactMethod,
+    FrameMethod,
     ImproveMethod,
     LCSMethod,
     LCSRLMethod,
@@ -60,6 +61,7 @@ __all__ = [
     "EnsembleSettings",
     "Epochs",
     "Evaluation",
+    "FrameMethod",
     "ImproveMethod",
     "LCSMPCPolicy",
     "LCSMethod",

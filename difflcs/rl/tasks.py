@@ -157,6 +157,8 @@ class TaskSpec:
         threaded: the vector environment takes the argument `threads`.
         model_name: what its models are called in the zoo; None: as the task.
         physics: what is known of its physics, for methods that start from it; None: nothing.
+        planar: the state is the pose (x, y [m], yaw [rad]) of a body on a plane, and after it points (x, y) of the
+            plane; actions are vectors in it; and all moves alike wherever the body is, as `BodyFrameLCS` has it.
 
     Raises:
         InvalidInputError: a value does not fit.
@@ -188,6 +190,7 @@ class TaskSpec:
     threaded: bool = False
     model_name: str | None = None
     physics: PhysicsSpec | None = None
+    planar: bool = False
 
     def __post_init__(self) -> None:
         make_plain(self)

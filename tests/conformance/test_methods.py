@@ -18,7 +18,7 @@ from difflcs.errors import CheckpointError, DTypeError, InvalidInputError
 from difflcs.rl.learning.ppo import PPOReport
 from difflcs.rl.learning.state import copy_state, flatten, unflatten
 from difflcs.rl.learning.trainer import Trainer
-from difflcs.rl.methods import Method, MujocoMethod, Work, get_method, method_names, register_method
+from difflcs.rl.methods import FrameMethod, Method, MujocoMethod, Work, get_method, method_names, register_method
 from difflcs.rl.runs import training
 from difflcs.rl.runs.checkpoint import RunDirectory, load_checkpoint, save_checkpoint
 from difflcs.rl.runs.evaluate import evaluate
@@ -28,8 +28,9 @@ from tests.conformance.toy import STEPS, make_task
 
 pytestmark = pytest.mark.usefixtures("registered")
 
-# The toy is no MuJoCo model; this method is contact-lcs besides, see tests/unit/test_contact_method.py.
-NAMES = tuple(name for name in method_names() if name != MujocoMethod.name)
+# The toy is no MuJoCo model and no plane; these methods are contact-lcs and lcs-rl besides, see
+# tests/unit/test_contact_method.py and test_body_frame.py.
+NAMES = tuple(name for name in method_names() if name not in (MujocoMethod.name, FrameMethod.name))
 TOY = make_task()
 LARGER = make_task(size=3)
 

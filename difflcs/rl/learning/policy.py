@@ -289,7 +289,7 @@ class LCSMPCPolicy(GaussianPolicy):
             InvalidInputError, DTypeError: the LCS has none, or is no `torch.nn.Module`.
         """
         lcs = check_module(self.mpc.lcs, name="actor")
-        if not is_plain(lcs):
+        if not (is_plain(lcs) or getattr(lcs, "batched", False)):
             state, goal = _entries(data, self.in_keys)
             with ignore_solver_warnings():
                 jacobian = system_jacobian(self.mpc, state, goal, _guess(data), data.get(CONTEXT, None))

@@ -2,6 +2,7 @@
 
 from difflcs.rl.methods.base import LCSMethod, Method, Work, check_fits, get_method, method_names, register_method
 from difflcs.rl.methods.contact_lcs import ContactMethod
+from difflcs.rl.methods.frame_lcs import FrameMethod
 from difflcs.rl.methods.improve import ImproveMethod
 from difflcs.rl.methods.lcs_rl import LCSRLMethod
 from difflcs.rl.methods.mujoco_lcs import MujocoMethod
@@ -13,6 +14,7 @@ from difflcs.rl.methods.violation import ViolationMethod
 __all__ = [
     "DEFAULT_METHOD",
     "ContactMethod",
+    "FrameMethod",
     "ImproveMethod",
     "LCSMethod",
     "LCSRLMethod",
@@ -40,6 +42,7 @@ for _method in (
     PPOMLPMethod,
     PDDMMethod,
     ContactMethod,
+    FrameMethod,
     MujocoMethod,
 ):
     register_method(_method)
