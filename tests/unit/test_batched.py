@@ -222,8 +222,8 @@ def test_nearly_every_problem_is_solved(build, kind):
 
 
 def test_plans_of_many_contacts_get_more_starts():
-    def starts(horizon, n_lam, guessed, **options):
-        problem = SimpleNamespace(horizon=horizon, n_lam=n_lam)
+    def starts(horizon, n_lam, guessed, n_u=6, **options):
+        problem = SimpleNamespace(horizon=horizon, n_lam=n_lam, n_u=n_u)
         efforts = [options] if options else [{"effort": effort} for effort in ("fast", "default", "best")]
         return [BatchedBackend(**one).starts(problem, guessed) for one in efforts]
 
@@ -231,7 +231,8 @@ def test_plans_of_many_contacts_get_more_starts():
     assert starts(5, 8, guessed=True) == [1, 1, 16]
     assert starts(20, 5, guessed=False) == [1, 16, 64]
     assert starts(20, 5, guessed=True) == [1, 1, 64]
-    assert starts(40, 1, guessed=False) == [1, 16, 64]
+    assert starts(40, 1, guessed=False) == starts(10, 5, guessed=False, n_u=1) == [1, 16, 64]
+    assert starts(10, 5, guessed=False, n_u=2) == [1, 4, 16]
     assert starts(20, 5, guessed=True, restarts=5) == starts(5, 5, guessed=False, restarts=5) == [5]
 
 

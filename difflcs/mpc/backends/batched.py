@@ -20,9 +20,9 @@ from difflcs.status import Status, solved
 
 Effort = Literal["fast", "default", "best"]
 _STARTS: dict[str, int] = {"fast": 1, "default": 4, "best": 16}
-# Plans that can make many contacts, horizon × n_lam, or are long, have many optima: on a row of ten carts four starts
-# miss the best plan by 2.5 % on average, sixteen by less than 0.1 % (benchmarks/optima.py).
-_MANY_CONTACTS, _LONG_HORIZON, _MORE_STARTS = 100, 40, 4
+# Plans that can make many contacts, horizon × n_lam, in all or for each action, or are long, have many optima: with four
+# starts the worst of them costs 2.7 times the best on a row of four carts, and 45 % more on a cart-pole, H 30.
+_MANY_CONTACTS, _MANY_PER_ACTION, _LONG_HORIZON, _MORE_STARTS = 100, 30, 40, 4
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ class BatchedBackend(Backend):
 
     Attributes:
         effort: "fast", one start; "default", four; "best", sixteen; the last two four times as many where horizon ×
-            n_lam is 100 or more, or the horizon 40, as such plans have many optima. A guess is the first start, and the
-            only one but for "best". Without contact (n_lam = 0) one start is enough.
+            n_lam is 100 or more, or 30 times n_u, or the horizon 40, as such plans have many optima. A guess is the
+            first start, and the only one but for "best". Without contact (n_lam = 0) one start is enough.
         restarts: number of starts, whatever the effort; None: that of the effort. From eight on with a local search.
         tol: projected gradient dJ/du at which a problem is solved, or 1e-12 of the terms that sum to it if that is
             more. It must also be below 1e-7 of its scale, see `difflcs.mpc.kkt.residual`.
@@ -172,7 +172,8 @@ class BatchedBackend(Backend):
             return self.restarts
         if self.effort == "fast" or (guessed and self.effort != "best"):
             return 1  # a guess is taken to be near the optimum that is wanted
-        many = problem.horizon * problem.n_lam >= _MANY_CONTACTS or problem.horizon >= _LONG_HORIZON
+        contacts = problem.horizon * problem.n_lam
+        many = contacts >= min(_MANY_CONTACTS, _MANY_PER_ACTION * problem.n_u) or problem.horizon >= _LONG_HORIZON
         return _STARTS[self.effort] * (_MORE_STARTS if many else 1)
 
     def vjp(
