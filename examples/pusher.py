@@ -333,7 +333,7 @@ def main(o: Options) -> None:
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", ContactWarning)  # torsional friction is left out, and torques that limits stop
     env = gymnasium.make("Pusher-v5")
-    model, data = env.unwrapped.model, env.unwrapped.data
+    model, data = env.unwrapped.model, env.unwrapped.data  # pyright: ignore[reportAttributeAccessIssue]
     if not o.soft:
         harden(model)
     policy, returns, finals, seconds, before = PusherPolicy(model, press=o.soft), [], [], [], []

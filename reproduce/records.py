@@ -9,6 +9,7 @@ one version and one key, see `select`.
 
 from collections.abc import Hashable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -82,12 +83,12 @@ class Cell:
     left_out: int
     """Trainings of other versions or settings, which are not in it."""
 
-    @property
+    @cached_property
     def first(self) -> Any:
         """One row, for the columns that all have in common: task, version, object."""
         return self.rows.iloc[0]
 
-    @property
+    @cached_property
     def scores(self) -> Any:
         """Success [%] by seed (rows) and minutes of data (columns), a DataFrame.
 

@@ -665,6 +665,7 @@ def test_the_task_is_drawn(undisturbed, tmp_path, monkeypatch, capsys):
     from difflcs_envs import RenderingError
 
     monkeypatch.setattr(fig_task, "TRIES", 4)  # the model has learned nothing
+    monkeypatch.setattr(fig_task, "SIZE", (320, 240))
 
     try:
         from difflcs_envs.rendering import _make_gl_context
