@@ -120,6 +120,19 @@ class Bounded(NamedTuple):
 _DRAG = 1e-3  # part of a way that the drag of a bounded force gives back
 
 
+def given_states(x: Tensor | None) -> Tensor:
+    """Return x; a system without a state has no contacts.
+
+    Raises:
+        InvalidInputError: no states.
+    """
+    if x is None:
+        raise InvalidInputError(
+            "x: expected states (..., n_x), as contacts depend on where things are, got None; pass x"
+        )
+    return x
+
+
 def count_forces(
     n_contacts: int, n_tangents: int, cone: Cone = "anitescu", n_unilateral: int = 0, n_bounded: int = 0
 ) -> int:

@@ -26,7 +26,7 @@ from torch import Tensor
 from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor, describe
 from difflcs._differentiation import runs_eagerly
 from difflcs.errors import DTypeError, InvalidInputError, ShapeError
-from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, contact_lcs, count_forces
+from difflcs.physics.complementarity import Cone, Contacts, FreeMotion, contact_lcs, count_forces, given_states
 from difflcs.physics.shapes import Distance, Shape
 from difflcs.records import LCSParams
 
@@ -301,11 +301,7 @@ class PlanarPushing:
         Raises:
             InvalidInputError and its kinds: no state, or of another size.
         """
-        if x is None:
-            raise InvalidInputError(
-                "x: expected states (..., n_x), as contacts depend on where things are, got None; pass x"
-            )
-        check_tensor("x", x, [("n_x", self.n_x)])
+        check_tensor("x", x := given_states(x), [("n_x", self.n_x)])
         if not x.is_cpu:  # computed there, as plans are
             return self.params(x.cpu(), context).to(x.device)
         friction = 0.0 if self.frictionless else self._by_contact(self.friction)

@@ -1,5 +1,7 @@
 """LearnableMujocoLCS: it is the system of the changed model, and its gradients are slopes."""
 
+import copy
+import io
 import math
 
 import mujoco
@@ -146,3 +148,34 @@ def test_what_cannot_be_learned_is_refused(learn, message):
         LearnableMujocoLCS(scene(), learn=learn, motion="dynamic")
     with pytest.raises(InvalidInputError, match="no friction="):
         LearnableMujocoLCS(scene(), learn=["friction"], friction=0.3)
+
+
+def saved(value):
+    torch.save(value, file := io.BytesIO())
+    return torch.load(io.BytesIO(file.getvalue()), weights_only=False)
+
+
+@pytest.mark.parametrize("motion", ["dynamic", "quasi-dynamic"])
+@pytest.mark.parametrize("again", [copy.deepcopy, saved])
+def test_a_copy_is_the_same_system_and_knows_nothing_of_the_first_one(motion, again):
+    module = LearnableMujocoLCS(scene(), learn=["friction"], motion=motion, **OPTIONS)
+    with torch.no_grad():
+        module.change.add_(0.1)
+    data = mujoco.MjData(scene())
+    data.qpos[:], data.xfrc_applied[:, 0] = [0.01, 0, 0.05, 1, 0.1, 0, 0, 0.001], 0.3
+    for system in (module, module.physics):
+        x = system.observe(data) + 0.001
+        other = again(system)
+        expected = system.params(x).tensors()
+        torch.testing.assert_close(other.params(x).tensors(), expected, rtol=0, atol=0)
+        other.observe(mujoco.MjData(scene()))
+        torch.testing.assert_close(system.params(x).tensors(), expected, rtol=0, atol=0)
+
+
+def test_transforms_of_torch_func_map_what_is_learned_and_are_refused_by_fixed_physics():
+    module = LearnableMujocoLCS(scene(), learn=["mass"], motion="dynamic", **OPTIONS)
+    x = states(module.n_x)
+    torch.testing.assert_close(torch.vmap(lambda v: module.params(v).A)(x), module.params(x).A)
+    for ask in (module.physics.params, module.action_bounds):
+        with pytest.raises(InvalidInputError, match="inside a transform"):
+            torch.vmap(ask)(x)

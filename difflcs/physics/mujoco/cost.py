@@ -152,6 +152,10 @@ class MujocoCost(TensorFields):
         super().__init__()
         if not isinstance(module, MujocoLCS):
             raise DTypeError(f"module: expected a MujocoLCS, got {describe(module)}; pass the one of the system")
+        if not isinstance(terms, Sequence) or not terms:
+            raise DTypeError(
+                f"terms: expected a list of Position, Orientation, …, got {describe(terms)}; give one at least"
+            )
         self.n_x, self.n_u = module.n_x, module.n_u
         self._scene = _Scene(module)
         rows = [self._scene.bind(f"terms[{k}] {type(term).__name__}", term) for k, term in enumerate(terms)]
@@ -389,7 +393,10 @@ class _Scene:
             for j in range(model.njnt)
             if turning or ends[j + 1] - ends[j] == 1
         }
-        for name in (names := list(known) if names is None else [names] if isinstance(names, str) else names):
+        names = list(known) if names is None else [names] if isinstance(names, str) else names
+        if not isinstance(names, Sequence):
+            raise DTypeError(f"{about}: expected names of joints, got {describe(names)}; list them, or leave them out")
+        for name in names:
             if name not in known:
                 raise _unknown(about, "joint" if turning else "slide or hinge", known, name)
         return [dof for name in names for dof in known[name]]

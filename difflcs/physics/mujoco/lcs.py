@@ -14,7 +14,16 @@ from torch import Tensor
 
 from difflcs._checks import check_choice, check_number, check_positive_int, check_tensor, describe
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError
-from difflcs.physics.complementarity import Bounded, Cone, Contacts, FreeMotion, Unilateral, contact_lcs, count_forces
+from difflcs.physics.complementarity import (
+    Bounded,
+    Cone,
+    Contacts,
+    FreeMotion,
+    Unilateral,
+    contact_lcs,
+    count_forces,
+    given_states,
+)
 from difflcs.physics.mujoco.actuators import DYNAMICS, Actuators, disabled_actuators
 from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, Pairs, typical_radius
 from difflcs.physics.mujoco.correction import WholeStep, correct
@@ -23,7 +32,7 @@ from difflcs.physics.mujoco.groups import ContactGroup, ContactSelection
 from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import RowFinder, ScaledRows, scale
 from difflcs.physics.mujoco.motion import Dynamic, QuasiStatic, read_each
-from difflcs.physics.mujoco.native import TAKEN, flags, native
+from difflcs.physics.mujoco.native import TAKEN, check_readable, flags, native, taken
 from difflcs.physics.mujoco.nominal import Recovery, Situation, evaluate_nominal
 from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
 from difflcs.physics.mujoco.state import MujocoState
@@ -114,21 +123,19 @@ class MujocoLCS:
         length: float | None = None,
         limits: int | None = None,
     ):
-        check_choice("motion", motion, ("quasi-static", "quasi-dynamic", "dynamic"))
+        options = {name: value for name, value in locals().items() if name not in ("self", "model", "data")}
+        _check_options(motion, cone, mobility, friction)
         _check_model(model, data, motion)
-        check_choice("cone", cone, ("anitescu", "stewart-trinkle"))
-        if isinstance(mobility, str):
-            check_choice("mobility", mobility, ("inertia", "damping"))
         self.motion, self.seconds = motion, check_number("seconds", seconds, strict=True)
         self.cone: Cone = cone
         self.compliance = check_number("compliance", compliance, strict=True)
-        if friction is not None:
-            check_number("friction", friction)
         model = copy.copy(model)
+        disabled = int(model.opt.disableflags)
         model.opt.disableflags |= flags("AUTORESET")  # it would lose what data says; see native
         self._model, self._data = model, mujoco.MjData(model)
         if data is not None:
             _take(self._data, data)
+        self._given = disabled, taken(self._data), options
         with native(model, self._data, "in the state of data"):
             mujoco.mj_fwdPosition(model, self._data)
         self._equality = Equality(model, self._data)
@@ -158,6 +165,10 @@ class MujocoLCS:
         model.opt.disableflags |= flags("EQUALITY", "FRICTIONLOSS", "LIMIT")
         with native(model, self._data, "in the state of data"):
             self._give = self._typical_response()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy is built again, as what is compiled holds addresses."""
+        return _rebuild, (copy.copy(self._model), *self._given, taken(self._data), self.state)
 
     @property
     def n_x(self) -> int:
@@ -208,11 +219,7 @@ class MujocoLCS:
         Raises:
             InvalidInputError and its kinds: no state, or of another size.
         """
-        if x is None:
-            raise InvalidInputError(
-                "x: expected states (..., n_x), as contacts depend on where things are, got None; pass x"
-            )
-        read = self._read(x, context)
+        read = self._read(x := given_states(x), context)
         contacts, rest, step, rough = read.dof_contacts, None, None, self._finder.rough
         if isinstance(self._motion, Dynamic):
             step = self._equality.hold(self._motion, read.moved, read.x, read.qpos)
@@ -294,6 +301,7 @@ class MujocoLCS:
             x: (..., n_x) states.
         """
         check_tensor("x", x, [("n_x", self.n_x)])
+        check_readable(x)
         numbers = x.detach().double().cpu().numpy()
         if self._quasi_static:
             bounds = self._actuators.places(numbers)
@@ -413,6 +421,15 @@ def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: A
     return module.params(module.state.to_state(data.qpos, data.qvel, data.act) if x is None else x)
 
 
+def _check_options(motion: Motion, cone: Cone, mobility: Any, friction: float | None) -> None:
+    check_choice("motion", motion, ("quasi-static", "quasi-dynamic", "dynamic"))
+    check_choice("cone", cone, ("anitescu", "stewart-trinkle"))
+    if isinstance(mobility, str):
+        check_choice("mobility", mobility, ("inertia", "damping"))
+    if friction is not None:
+        check_number("friction", friction)
+
+
 def _check_model(model: Any, data: Any, motion: Motion) -> None:
     if not isinstance(model, mujoco.MjModel):
         raise DTypeError(f"model: expected a mujoco.MjModel, got {describe(model)}; load one with MjModel")
@@ -422,7 +439,7 @@ def _check_model(model: Any, data: Any, motion: Motion) -> None:
         raise InvalidInputError(f"data: expected nq={model.nq} of the model, got {len(data.qpos)}; pass MjData(model)")
     dynamics, plugins = np.array(model.actuator_dyntype), np.array(model.actuator_plugin)
     refused = {
-        "joints: nothing in it moves": not model.nv,
+        "joints, as nothing moves without": not model.nv,
         "one control for each actuator, not those of <pid> and <orientation>": getattr(model, "nactuator", model.nu)
         != model.nu,
         "activation by an integrator, a filter, a muscle or a callback, not by <dcmotor>, <pid> or a plugin": bool(
@@ -458,6 +475,16 @@ def _median_apart(model: Any, data: Any, response: Any, pairs: Any, dimensions: 
             "without actuators, and a mobility above 0"
         )
     return float(np.median(apart)) if len(apart) else 1.0
+
+
+def _rebuild(model: Any, disabled: int, first: Any, options: dict[str, Any], now: Any, state: MujocoState) -> MujocoLCS:
+    model.opt.disableflags = disabled
+    data = mujoco.MjData(model)
+    _take(data, first)
+    module = MujocoLCS(model, data, **options)
+    _take(module._data, now)
+    module.state = state
+    return module
 
 
 def _take(into: Any, data: Any) -> None:

@@ -202,7 +202,7 @@ class LearnableMujocoLCS(nn.Module):
             return self.physics.params(x, context)  # which says what is missing
         change = fresh(self, ("change",)).change
         given = (change, x) if context is None else (change, x, context)
-        return LCSParams(*solve(_Matrices(self, x.dtype), *given))
+        return LCSParams(*solve(_Matrices(self, x.dtype, len(given)), *given))
 
     def summary(self) -> dict[str, list[float]]:
         """Return what is learned: factors of the model's values, or offsets in its units of length."""
@@ -257,10 +257,10 @@ class _Matrices(Solver):
     """Parameters (n,), states (..., n_x) and perhaps nominal controls (..., nu) → the matrices of the systems."""
 
     name, differentiable, keeps = "LearnableMujocoLCS", len(SYSTEM), True
-    ranks = (1, 1, 1)
 
-    def __init__(self, learnable: LearnableMujocoLCS, dtype: torch.dtype):
+    def __init__(self, learnable: LearnableMujocoLCS, dtype: torch.dtype, inputs: int):
         self.learnable, self.dtype = learnable, dtype
+        self.ranks = (1,) * inputs  # pyright: ignore[reportAttributeAccessIssue]
 
     def solve(self, tensors: Sequence[Tensor], transformed: bool) -> tuple[Tensor, ...]:
         """See `Solver`."""

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
+import numpy as np
+from torch import Tensor
 
+from difflcs._differentiation import is_wrapped
 from difflcs.errors import InvalidInputError
 
 TAKEN = ("qpos", "ctrl", "act", "mocap_pos", "mocap_quat", "eq_active", "qfrc_applied", "xfrc_applied")
@@ -31,9 +35,27 @@ _WARNINGS = {
 }
 
 
+def check_readable(x: Tensor) -> None:
+    """Refuse states inside `torch.func.vmap` and the like, whose numbers nobody can read.
+
+    Raises:
+        InvalidInputError: they are.
+    """
+    if is_wrapped(x):
+        raise InvalidInputError(
+            "x: expected states whose numbers can be read, got some inside a transform of torch.func; pass batches "
+            "(..., n_x), and differentiate by backward"
+        )
+
+
 def flags(*names: str) -> int:
     """Return the bits of `disableflags` with these names, such as CONTACT."""
     return sum(int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in names)
+
+
+def taken(data: Any) -> SimpleNamespace:
+    """Copy the fields of a caller's data that are used."""
+    return SimpleNamespace(**{name: np.array(getattr(data, name)) for name in TAKEN})
 
 
 def copy_taken(into: Any, data: Any) -> None:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from difflcs._checks import check_tensor, describe
 from difflcs.errors import DTypeError, InvalidInputError, NonFiniteError, ShapeError
+from difflcs.physics.mujoco.native import check_readable
 
 Array = NDArray[np.float64]
 _SUFFIXES = {
@@ -142,6 +143,7 @@ class MujocoState:
             DTypeError, ShapeError, NonFiniteError: not such states.
         """
         check_tensor("x", x, [("n_x", self.n_x)])
+        check_readable(x)
         numbers = x.detach().double().cpu().numpy()
         qpos = self._references(numbers.shape[:-1]).copy()
         qpos[..., self._of_qpos] = numbers[..., self._of_state]
