@@ -20,8 +20,8 @@ from difflcs.status import Status, solved
 
 Effort = Literal["fast", "default", "best"]
 _STARTS: dict[str, int] = {"fast": 1, "default": 4, "best": 16}
-# Plans that can make many contacts, horizon × n_lam, in all or for each action, or are long, have many optima: with four
-# starts the worst of them costs 2.7 times the best on a row of four carts, and 45 % more on a cart-pole, H 30.
+# Plans that can make many contacts, horizon × n_lam, in all or for each action, or are long, have many optima: with
+# four starts the worst of them costs 2.7 times the best on a row of four carts, and 45 % more on a cart-pole, H 30.
 _MANY_CONTACTS, _MANY_PER_ACTION, _LONG_HORIZON, _MORE_STARTS = 100, 30, 40, 4
 
 
