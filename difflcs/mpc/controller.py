@@ -153,6 +153,15 @@ class MPCController:
         self._native.set_fallback(self._fallback, self._action)
         self._native.set_time_limit(self._time_limit or 0.0)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy begins anew, without the last plan."""
+        return {**vars(self), "_native": None, "_status": None, "_overridden": False}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        if self._content:
+            self._load()
+
     @classmethod
     def load(
         cls, path: str | os.PathLike[str], on_failure: OnFailure = "hold", time_limit: float | None = None

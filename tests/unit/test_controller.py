@@ -1,6 +1,8 @@
 """The controller of one robot: the same plans as the layer's, an action for every step, files that are checked."""
 
 import contextlib
+import copy
+import pickle
 import struct
 import threading
 import zlib
@@ -69,6 +71,22 @@ def test_its_plans_are_those_of_the_layer_bit_for_bit_also_from_a_file(build, na
         assert (plan.iterations, plan.kkt_residual) == (int(solution.iterations), float(solution.kkt_residual))
         assert plan.objective == pytest.approx(float(solution.objective.detach()), rel=1e-12)
         assert plan.fallback is plan.late is False
+
+
+@pytest.mark.parametrize("again", [copy.deepcopy, lambda c: pickle.loads(pickle.dumps(c))], ids=["copied", "pickled"])
+def test_a_copy_begins_anew_and_leaves_the_first_as_it_is(build, reaching, again):
+    goal, other = np.array([0.05, -0.05]), build.params(1)
+    modules = LCSMPCLayer(build.params(0), build.AskedCost(reaching.cost), H, -0.3, 0.3)
+    for mpc in (reaching, modules):
+        first, twin, fresh = mpc.controller("zero"), mpc.controller("zero"), mpc.controller("zero")
+        for x in states(3):
+            for each in (first, twin):
+                each.step(x, goal, lcs=other)
+        copied = again(first)
+        assert copied.status is None
+        for x in states(3, seed=1):
+            assert np.array_equal(copied.step(x, goal), fresh.step(x, goal))
+            assert np.array_equal(first.step(x, goal), twin.step(x, goal))
 
 
 def test_what_is_kept_without_contact_fits_every_set_of_active_bounds(build):
