@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from models import Instance, chain_of_carts, push_the_last_cart, uniform
+from models import Instance, chain_of_carts, make, push_the_last_cart, uniform
 from torch import Tensor
 
 from difflcs import LCSParams, QuadraticCost
@@ -49,7 +49,7 @@ def reach(lcs: LCSParams, goal: list[float], weight: list[float], horizon: int, 
     R = 0.01 / limit**2 * torch.eye(lcs.n_u, dtype=torch.float64)
     missed = 0.5 * (horizon + 10) * aim @ Q @ aim
     cost = QuadraticCost(Q, R, 10 * Q, q=-Q @ aim, q_final=-10 * Q @ aim, constant=missed)
-    return Instance({"lcs": lcs, "cost": cost, "horizon": horizon, "u_min": -limit, "u_max": limit}, (x0,))
+    return make(lcs, cost, horizon, limit, x0)
 
 
 def pendulum(count: int, horizon: int) -> Instance:
@@ -97,8 +97,7 @@ def hopper(count: int, horizon: int) -> Instance:
 def two_carts(count: int, horizon: int) -> Instance:
     """The first of two carts hits the second, which is to stop 0.3 m further, with a weak drive."""
     x0 = uniform([0.3, 0.1, 0.5, 0.2], count, horizon)
-    layer = {"lcs": chain_of_carts(2), "cost": push_the_last_cart(2, horizon), "horizon": horizon}
-    return Instance({**layer, "u_min": -2.0, "u_max": 2.0}, (x0,))
+    return make(chain_of_carts(2), push_the_last_cart(2, horizon), horizon, 2.0, x0)
 
 
 FAMILIES = {

@@ -49,17 +49,17 @@ def push_the_last_cart(carts: int, horizon: int, others: float = 0.0) -> Quadrat
     return QuadraticCost(Q, _diagonal(1e-4), 10 * Q, q=q, q_final=10 * q, constant=missed)
 
 
-def cart_states(carts: int, count: int, seed: int) -> Tensor:
-    """Draw states of a chain of carts, some of which touch or overlap."""
-    return uniform([0.3] * carts + [0.5] * carts, count, seed)
-
-
 @dataclass(frozen=True)
 class Instance:
     """A batch of problems: arguments of `LCSMPCLayer` and of its call."""
 
     layer: dict[str, Any]
     call: tuple[Tensor, ...]
+
+
+def make(lcs: LCSParams, cost: Any, horizon: int, limit: float, *call: Tensor) -> Instance:
+    """Make an instance with actions between −limit and limit."""
+    return Instance({"lcs": lcs, "cost": cost, "horizon": horizon, "u_min": -limit, "u_max": limit}, call)
 
 
 def uniform(size: list[float], count: int, seed: int) -> Tensor:
@@ -75,8 +75,7 @@ def _diagonal(*weights: float) -> Tensor:
 
 def pushing(lcs: LCSParams, count: int, seed: int, horizon: int = 5) -> Instance:
     """Make the task of the cube: its cost, and actions of 15 mm."""
-    layer = {"lcs": lcs, "cost": pushing_cost(), "horizon": horizon, "u_min": -ACTION_LIMIT, "u_max": ACTION_LIMIT}
-    return Instance(layer, states_and_goals(count, seed))
+    return make(lcs, pushing_cost(), horizon, ACTION_LIMIT, *states_and_goals(count, seed))
 
 
 def _zoo(name: str) -> LCSParams:
@@ -88,7 +87,7 @@ def to_rest(lcs: LCSParams, horizon: int, count: int, seed: int, final: float = 
     eye = torch.eye(lcs.n_x, dtype=torch.float64)
     cost = QuadraticCost(eye, 0.1 * torch.eye(lcs.n_u, dtype=torch.float64), final * eye)
     x0 = torch.randn(count, lcs.n_x, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    return Instance({"lcs": lcs, "cost": cost, "horizon": horizon, "u_min": -1.0, "u_max": 1.0}, (x0,))
+    return make(lcs, cost, horizon, 1.0, x0)
 
 
 def _cart_pole(horizon: int, dt: float, stiffness: float, count: int) -> Instance:
@@ -96,14 +95,14 @@ def _cart_pole(horizon: int, dt: float, stiffness: float, count: int) -> Instanc
     lcs = cart_pole_between_walls(dt=dt, wall_stiffness=stiffness)
     cost = QuadraticCost(_diagonal(1, 1, 0.1, 0.1), _diagonal(0.01), _diagonal(100, 100, 1, 1))
     x0 = uniform([0.02, 0.05, 0.1, 0.3], count, horizon)
-    return Instance({"lcs": lcs, "cost": cost, "horizon": horizon, "u_min": -10.0, "u_max": 10.0}, (x0,))
+    return make(lcs, cost, horizon, 10.0, x0)
 
 
 def chain(lcs: LCSParams, horizon: int, count: int, seed: int, others: float = 0.0) -> Instance:
     """Push the last cart 0.3 m further, through all others; see `push_the_last_cart`."""
     carts = lcs.n_x // 2
-    cost, x0 = push_the_last_cart(carts, horizon, others), cart_states(carts, count, seed)
-    return Instance({"lcs": lcs, "cost": cost, "horizon": horizon, "u_min": -50.0, "u_max": 50.0}, (x0,))
+    x0 = uniform([0.3] * carts + [0.5] * carts, count, seed)  # some touch or overlap
+    return make(lcs, push_the_last_cart(carts, horizon, others), horizon, 50.0, x0)
 
 
 def _chain(carts: int, horizon: int, dt: float, stiffness: float, count: int) -> Instance:

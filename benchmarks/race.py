@@ -324,7 +324,6 @@ def run(problem: Problem, processes: list[Process], o: Options, folder: str) -> 
         j, n = judged[label], len(outcome["times"])
         gap = (j.objective - reference[:n]) / reference[:n]
         rows[label] = {
-            "setup": outcome["setup"],
             "seconds": float(np.mean(outcome["times"])),
             "times": [float(t) for t in outcome["times"]],
             "solved": int(j.solved.sum()),
@@ -366,7 +365,6 @@ def summary(entries: list[dict[str, dict]]) -> dict[str, dict]:
             "mean gap": float(gaps.mean()) if len(gaps) else None,
             "near": float((gaps <= EQUAL).mean()) if len(gaps) else None,
             "gradient error": float(np.median(errors)) if len(errors) else None,
-            "setup": geometric([row["setup"] for row in rows]),
         }
         for name in ("batch", "with_gradient"):
             if name in rows[0]:

@@ -7,27 +7,22 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from models import (
-    ACTION_LIMIT,
-    cart_states,
-    chain_of_carts,
-    push_the_last_cart,
-    pushing_model,
-    states_and_goals,
-    uniform,
-)
+from models import Instance, chain_of_carts, make, pushing_model, uniform
+from models import chain as chain_instance
+from models import pushing as pushing_instance
 from rivals.problem import Problem
 
 from difflcs import LCSModel, LCSParams, QuadraticCost
-from difflcs.cli.bench import pushing_cost
 from difflcs.systems import block_along_wall, cart_pole_between_walls
 
 RELAXATION = 1e-5
 STATES = 77  # what is added to a seed for the states, so that they are not drawn as the models are
 
 
-def problem(lcs: LCSParams, cost: QuadraticCost, x0: torch.Tensor, horizon: int, limit: float, seed: int) -> Problem:
-    """Make the arrays of a problem, as the rivals take them."""
+def problem(instance: Instance, seed: int) -> Problem:
+    """Make the arrays of an instance, as the rivals take them."""
+    (x0, *goal), (lcs, cost, horizon, _, limit) = instance.call, instance.layer.values()
+    cost = cost(*goal, horizon) if goal else cost
     arrays = {name: value.detach().double().numpy() for name, value in lcs.tensors().items()}
     arrays |= {n: getattr(cost, n).detach().double().numpy() for n in ("Q", "R", "Q_final", "q", "r", "q_final")}
     bound = np.full(lcs.n_u, limit)
@@ -41,8 +36,7 @@ def problem(lcs: LCSParams, cost: QuadraticCost, x0: torch.Tensor, horizon: int,
 
 def pushing(lcs: LCSParams, count: int, seed: int, horizon: int = 5) -> Problem:
     """Make a hand around an object, with a goal for each problem."""
-    x0, goal = states_and_goals(count, seed)
-    return problem(lcs, pushing_cost()(goal, horizon), x0, horizon, ACTION_LIMIT, seed)
+    return problem(pushing_instance(lcs, count, seed, horizon), seed)
 
 
 def cart_pole(count: int, horizon: int, seed: int) -> Problem:
@@ -50,14 +44,12 @@ def cart_pole(count: int, horizon: int, seed: int) -> Problem:
     weight = torch.diag(torch.tensor([1.0, 10.0, 0.1, 0.1], dtype=torch.float64))
     cost = QuadraticCost(Q=weight, R=0.01 * torch.eye(1, dtype=torch.float64), Q_final=10 * weight)
     x0 = uniform([0.3, 0.4, 1.0, 2.0], count, seed + STATES)
-    return problem(cart_pole_between_walls(), cost, x0, horizon, 20.0, seed)
+    return problem(make(cart_pole_between_walls(), cost, horizon, 20.0, x0), seed)
 
 
 def chain(count: int, carts: int, horizon: int, seed: int) -> Problem:
     """Push the last cart 0.3 m further, through all others, with up to 50 N."""
-    cost = push_the_last_cart(carts, horizon)
-    x0 = cart_states(carts, count, seed + STATES)
-    return problem(chain_of_carts(carts), cost, x0, horizon, 50.0, seed)
+    return problem(chain_instance(chain_of_carts(carts), horizon, count, seed + STATES), seed)
 
 
 def with_contact(count: int, seeds: int, first: int = 0) -> dict[str, list[Problem]]:
@@ -114,4 +106,4 @@ def block(count: int, horizon: int, seed: int) -> Problem:
     x0 = uniform([0.02, 0.01, 0.02, 0.02], count, seed + STATES)
     x0[:, 1] = x0[:, 1].abs()
     x0[:, 2] -= 0.04
-    return problem(block_along_wall(), cost, x0, horizon, 0.05, seed)
+    return problem(make(block_along_wall(), cost, horizon, 0.05, x0), seed)

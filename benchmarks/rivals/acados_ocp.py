@@ -6,7 +6,6 @@ import ctypes
 import os
 import sys
 import tempfile
-from importlib.metadata import version as version_of
 
 import acados
 import numpy as np
@@ -23,13 +22,10 @@ from acados_template import AcadosModel, AcadosOcp, AcadosOcpSolver  # noqa: E40
 from rivals.problem import Answer, Problem, Rival  # noqa: E402
 
 
-def version() -> str:
-    """Return the version of the wheel that ships acados."""
-    return f"comma-deps-acados {version_of('comma-deps-acados')}"
-
-
 class Solver(Rival):
     """SQP_RTI with partial condensing and HPIPM."""
+
+    packages = ("comma-deps-acados",)
 
     def __init__(self, problem: Problem):
         super().__init__(problem)

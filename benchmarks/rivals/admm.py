@@ -17,11 +17,6 @@ import numpy as np
 from rivals.problem import Answer, Condensed, Problem, Rival
 
 
-def version() -> str:
-    """Return whose method it is."""
-    return "own, after DAIRLab/c3"
-
-
 @functools.cache
 def compiled() -> ctypes.CDLL:
     """Compile the iterations; -ffast-math itself would have the whole process flush small numbers to zero."""
@@ -43,6 +38,8 @@ class Solver(Rival):
         project: "pairs", C3+: λ and gap of each pair; "lcp", C3 with its projection by simulation: λ follows from x, u.
         new: whether factors are computed at each call, as for a new system.
     """
+
+    origin = "own, after DAIRLab/c3"
 
     def __init__(
         self, problem: Problem, iterations: int, weight: float, growth: float = 1.0, gap: float = 1.0,

@@ -8,12 +8,6 @@ import numpy as np
 from rivals.nlp import Program
 from rivals.problem import Answer, Problem, Rival
 
-
-def version() -> str:
-    """Return the version of CasADi, which ships them."""
-    return f"casadi {casadi.__version__}"
-
-
 _ALWAYS = {"ipopt": {"print_level": 0, "max_iter": 500, "sb": "yes"}, "fatrop": {"print_level": 0, "max_iter": 500}}
 
 
@@ -26,6 +20,8 @@ class Solver(Rival):
         start: λ and s to start from.
         options: the solver's.
     """
+
+    packages = ("casadi",)
 
     def __init__(self, problem: Problem, name: str = "ipopt", start: float = 1.0, options: dict | None = None):
         super().__init__(problem)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.metadata import version as version_of
-
 import clarabel
 import numpy as np
 from scipy import sparse
@@ -11,13 +9,10 @@ from scipy import sparse
 from rivals.problem import Answer, Problem, Rival, sparse_program
 
 
-def version() -> str:
-    """Return the version of Clarabel."""
-    return f"clarabel {version_of('clarabel')}"
-
-
 class Solver(Rival):
     """Clarabel's solver with data that is updated; the structure is set-up."""
+
+    packages = ("clarabel",)
 
     def __init__(self, problem: Problem):
         super().__init__(problem)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.metadata import version as version_of
-
 import cvxpy as cp
 import numpy as np
 import torch
@@ -17,13 +15,10 @@ PLAIN = {"solve_method": "Clarabel"}
 EXACT = {**PLAIN, "mode": "dense"}
 
 
-def version() -> str:
-    """Return the versions of cvxpylayers and cvxpy."""
-    return f"cvxpylayers {version_of('cvxpylayers')}, cvxpy {cp.__version__}"
-
-
 class Solver(TorchRival):
     """The program over actions and states with x0 as its parameter."""
+
+    packages = ("cvxpylayers", "cvxpy")
 
     def __init__(self, problem: Problem):
         super().__init__(problem)

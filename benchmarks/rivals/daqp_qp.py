@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from importlib.metadata import version as version_of
-
 import daqp
 import numpy as np
 
 from rivals.problem import Answer, Condensed, Problem, Rival
 
 
-def version() -> str:
-    """Return the version of DAQP."""
-    return f"daqp {version_of('daqp')}"
-
-
 class Solver(Rival):
     """Its workspace: the factors of the Hessian are set-up, a new linear term and a solve are timed."""
+
+    packages = ("daqp",)
 
     def __init__(self, problem: Problem):
         super().__init__(problem)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-from importlib.metadata import version as version_of
 
 import daqp
 import numpy as np
@@ -12,11 +11,6 @@ from rivals.problem import Answer, Condensed, Problem, Rival, execute
 
 FREE, NO_FORCE, CLOSED = 0, 1, 2
 EQUALITY = 5  # DAQP's word for a constraint that holds with equality
-
-
-def version() -> str:
-    """Return the version of DAQP."""
-    return f"daqp {version_of('daqp')}"
 
 
 class Solver(Rival):
@@ -30,6 +24,8 @@ class Solver(Rival):
         nodes: quadratic programs before it gives up.
         gap: relative distance of the bounds at which it has proved the optimum.
     """
+
+    packages = ("daqp",)
 
     def __init__(self, problem: Problem, nodes: int = 20_000, gap: float = 1e-6):
         super().__init__(problem)

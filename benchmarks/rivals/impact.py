@@ -11,11 +11,6 @@ import numpy as np
 from rivals.problem import Answer, Condensed, Problem, Rival
 
 
-def version() -> str:
-    """Return whose method it is."""
-    return "own, after the paper"
-
-
 class Solver(Rival):
     """Outer iterations with multipliers and growing penalties, from zero, until all violations are below `tolerance`.
 
@@ -28,6 +23,8 @@ class Solver(Rival):
         outer: iterations with multipliers, at most.
         tolerance: of forces, gaps, their products and bounds.
     """
+
+    origin = "own, after the paper"
 
     def __init__(
         self, problem: Problem, weight: float, bound: float, growth: float = 1.2, progress: float = 0.5,

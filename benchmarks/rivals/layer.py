@@ -14,11 +14,6 @@ from rivals.differentiable import TorchRival
 from rivals.problem import Answer, Problem
 
 
-def version() -> str:
-    """Return the version of difflcs."""
-    return f"difflcs {difflcs.__version__}"
-
-
 class Solver(TorchRival):
     """`LCSMPCLayer` on one thread; in a closed loop its controller, warm.
 
@@ -28,6 +23,8 @@ class Solver(TorchRival):
         relaxation: instead of the problem's.
         effort: of `batched`.
     """
+
+    origin = f"difflcs {difflcs.__version__}"
 
     def __init__(
         self, problem: Problem, backend: str = "batched", relaxation: float | None = None, effort: Effort = "default"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.metadata import version as version_of
-
 import numpy as np
 import torch
 from mpc import mpc
@@ -12,13 +10,10 @@ from rivals.differentiable import TorchRival
 from rivals.problem import Problem
 
 
-def version() -> str:
-    """Return the version of the package mpc."""
-    return f"mpc {version_of('mpc')}"
-
-
 class Solver(TorchRival):
     """Its `MPC` with a linear system, in float64."""
+
+    packages = ("mpc",)
 
     def __init__(self, problem: Problem):
         super().__init__(problem)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from importlib import metadata
 
 import numpy as np
 
@@ -105,15 +106,24 @@ class Rival:
     """A solver with its settings. The work of `__init__` and of the first call is set-up, which no time includes.
 
     Attributes:
+        packages: those that it calls.
+        origin: where a method without packages is from.
         batches: whether one call for many problems is more than a loop.
         differentiates: whether it computes gradients.
     """
 
+    packages: tuple[str, ...] = ()
+    origin = "own"
     batches = False
     differentiates = False
 
     def __init__(self, problem: Problem):
         self.problem = problem
+
+    @classmethod
+    def version(cls) -> str:
+        """List its packages with their versions, or say where it is from."""
+        return ", ".join(f"{name} {metadata.version(name)}" for name in cls.packages) or cls.origin
 
     def one(self, i: int) -> Answer:
         """Plan for problem i, cold."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.metadata import version as version_of
-
 import jax
 
 jax.config.update("jax_enable_x64", True)
@@ -15,14 +13,10 @@ import qpax  # noqa: E402
 from rivals.problem import Answer, Condensed, Problem, Rival  # noqa: E402
 
 
-def version() -> str:
-    """Return the versions of qpax and JAX."""
-    return f"qpax {version_of('qpax')}, jax {jax.__version__}"
-
-
 class Solver(Rival):
     """`solve_qp` for plans and `solve_qp_primal` for gradients, compiled, mapped over the batch."""
 
+    packages = ("qpax", "jax")
     batches = differentiates = True
 
     def __init__(self, problem: Problem):

@@ -8,11 +8,6 @@ from difflcs.lcp import solve_lcp_arrays
 from rivals.problem import Answer, Problem, Rival
 
 
-def version() -> str:
-    """Return whose method it is."""
-    return "own"
-
-
 class Solver(Rival):
     """Gaussian actions around a mean, which starts at zero; the best sequence of all is the plan.
 
