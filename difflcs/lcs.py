@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any, Self, TypeGuard
 
 import torch
 from torch import Tensor, nn
@@ -249,7 +249,7 @@ class LCSModel(PredictiveModule):
         }
 
     @classmethod
-    def from_config(cls, config: Mapping[str, object], tensors: Mapping[str, Tensor], source: str) -> LCSModel:
+    def from_config(cls, config: Mapping[str, object], tensors: Mapping[str, Tensor], source: str) -> Self:
         """Build a model from `config()` and a state dict; `source` names them in the error messages."""
         wanted = {"n_x", "n_u", "n_lam", "stiffness", "learn_c", "dtype"}
         if set(config) != wanted:
@@ -299,7 +299,7 @@ class LCSModel(PredictiveModule):
         _storage.save_record(Path(directory), self.kind, self.config(), plain_state(self))
 
     @classmethod
-    def from_pretrained(cls, source: str | os.PathLike[str]) -> LCSModel:
+    def from_pretrained(cls, source: str | os.PathLike[str]) -> Self:
         """Read a model that ships with the package, or one that `save_pretrained` wrote.
 
         Args:

@@ -34,9 +34,8 @@ class BodyFrameLCS(LCSModel):
         n_x: number of states, 3 + 2 for each point, at least one.
         n_u: number of actions, 2 for each vector.
         n_lam: number of complementarity variables.
-        stiffness: see `LCSModel`, as all that follows.
-        **options: `init_scale`, `learn_c`, `generator`, `dtype`, `action_support`. The offset c should be learned: the
-            distance at which a point touches the body is in it.
+        stiffness: see `LCSModel`.
+        **options: see `LCSModel`. The distance at which a point touches the body is in c, which should be learned.
 
     Raises:
         InvalidInputError: sizes that are no pose and points, or no vectors; and as for `LCSModel`.
@@ -75,7 +74,7 @@ class BodyFrameLCS(LCSModel):
             InvalidInputError: no states.
         """
         if x is None:
-            raise InvalidInputError("x: expected the states at which the system is asked for, got None; pass them")
+            raise InvalidInputError("x: expected the states of the system, got None; pass them")
         check_tensor("x", x, [("n_x", self.n_x)])
         if self._forward_pre_hooks:
             fresh(self, self.parameter_names)

@@ -1,14 +1,14 @@
-"""An LCS in the frame of a body: the symmetry that it has, its matrices, its files, and the method that learns it."""
+"""An LCS in the frame of a body: its matrices, its Jacobian, its files, and the method that learns it."""
 
-from functools import partial
+from dataclasses import replace
+from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 pytest.importorskip("torchrl", reason="needs the extra [rl]")
+pytest.importorskip("mujoco", reason="needs the extra [envs]")
 
-from gymnasium import spaces
 from tensordict import TensorDict
 
 from difflcs import GoalCost, LCSModel, LCSMPCLayer
@@ -16,7 +16,6 @@ from difflcs.errors import CheckpointError, InvalidInputError
 from difflcs.physics import BodyFrameLCS
 from difflcs.rl import FrameMethod, LCSMPCPolicy, TrainConfig, load_policy, train
 from difflcs.rl.learning.jacobian import system_jacobian
-from tests.conformance.toy import U_MAX, Slide, make_task
 
 
 @pytest.fixture
@@ -27,29 +26,9 @@ def lcs(build):
     return model
 
 
-def rotation(angle):
-    cos, sin = np.cos(angle), np.sin(angle)
-    return torch.tensor([[cos, -sin], [sin, cos]])
-
-
-def move(x, angle, shift):
-    """States of a body and two points, all turned about the origin and then shifted."""
-    turned = [v @ rotation(angle).mT + shift for v in (x[..., :2], x[..., 3:5], x[..., 5:])]
-    return torch.cat([turned[0], x[..., 2:3] + angle, *turned[1:]], -1)
-
-
-def test_a_push_has_the_same_effect_wherever_the_body_is(lcs, build):
-    x, u = build.normal(0)(20, 7), build.normal(1)(20, 4)
-    angle, shift = 2.1, torch.tensor([0.4, -0.7], dtype=torch.float64)
-    turned = torch.cat([v @ rotation(angle).mT for v in u.split(2, -1)], -1)
-    there = lcs(move(x, angle, shift), turned)
-    torch.testing.assert_close(there.x_next, move(lcs(x, u).x_next, angle, shift))
-    torch.testing.assert_close(there.lam, lcs(x, u).lam)
-
-
 def test_it_is_what_its_docstring_says(lcs, build):
     x, u = build.normal(0)(7), build.normal(1)(4)
-    turn = rotation(float(x[2]))
+    turn = torch.linalg.matrix_exp(x[2] * torch.tensor([[0.0, -1.0], [1.0, 0.0]], dtype=torch.float64))
     z, v = ((p.view(2, 2) @ turn).flatten() for p in (x[3:] - x[:2].repeat(2), u))
     found = lcs(x, u)
     change = lcs.A @ z + lcs.B @ v + lcs.C @ found.lam + lcs.d
@@ -77,35 +56,17 @@ def test_files_and_sizes(lcs, tmp_path, build):
     for sizes in ((3, 2), (6, 2), (7, 3)):
         with pytest.raises(InvalidInputError, match="for each point"):
             BodyFrameLCS(*sizes, 2)
-    with pytest.raises(InvalidInputError, match="x: expected the states"):
+    with pytest.raises(InvalidInputError, match="x: expected the states of the system"):
         lcs.params()
-
-
-class Plane(Slide):
-    """A body that goes as told, and a point."""
-
-    def __init__(self):
-        super().__init__(5)
-        self.action_space = spaces.Box(-U_MAX, U_MAX, (2,), np.float64)
-
-    def move(self, action):
-        return self.state + np.array([*action, 0, 0, 0])
-
-
-PLANE = make_task(
-    env=Plane,
-    env_kwargs={},
-    make_cost=partial(GoalCost.reach, 5, 2, goal_weight=(5.0,), input_weight=0.1),
-    planar=True,
-)
 
 
 @pytest.mark.slow
 def test_it_is_trained_with_and_without_ppo(tmp_path):
     for minutes, phases in ((0.2, 1), (0.6, 2)):
-        config = TrainConfig(task="toy", method=FrameMethod().smoke(), minutes=minutes, final_goals=3)
-        run = train(config, tmp_path / str(phases), task=PLANE)
+        config = TrainConfig(task="cube", method=FrameMethod().smoke(), minutes=minutes, final_goals=3)
+        run = train(config, tmp_path / str(phases))
         assert any(row["kl"] for row in run.rows()) == (phases == 2)
-        assert isinstance(load_policy(run, PLANE).lcs, BodyFrameLCS)
-    with pytest.raises(InvalidInputError, match="a planar task for frame-lcs, got toy"):
-        train(config, tmp_path / "other", task=make_task())
+        policy: Any = load_policy(run)
+        assert isinstance(policy.lcs, BodyFrameLCS)
+    with pytest.raises(InvalidInputError, match="a planar task for frame-lcs, got turn_cube"):
+        train(replace(config, task="turn_cube"), tmp_path / "other")

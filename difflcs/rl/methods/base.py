@@ -127,6 +127,8 @@ class LCSMethod(Method):
 
     kind: ClassVar[str] = "LCSModel"
     takes_init: ClassVar[bool] = True
+    model: ClassVar[type[LCSModel]] = LCSModel
+    learn_c: ClassVar[bool] = False
 
     @property
     def solver(self) -> str:
@@ -141,7 +143,7 @@ class LCSMethod(Method):
         self, task: TaskSpec, config: Mapping[str, object], tensors: Mapping[str, Tensor], source: str
     ) -> LCSModule:
         """See `Method`."""
-        lcs = LCSModel.from_config(config, tensors, source)
+        lcs = self.model.from_config(config, tensors, source)
         check_fits(lcs, task, source, CheckpointError)
         return lcs
 
@@ -153,13 +155,13 @@ class LCSMethod(Method):
         """Make the model to start from. Override it, with `kind` and `rebuild`, to learn a module of your own."""
         if work.init is not None:
             return work.init
-        return LCSModel(
+        return self.model(
             work.task.n_x,
             work.task.n_u,
             self.n_lam,
             self.stiffness,
             init_scale=self.init_scale,
-            learn_c=False,
+            learn_c=self.learn_c,
             generator=torch.Generator().manual_seed(work.seed),
         )
 

@@ -10,6 +10,7 @@ from difflcs.rl.learning.model_rollouts import ModelRolloutSettings
 from difflcs.rl.learning.phases import LCSRL
 from difflcs.rl.learning.ppo import PPOReport
 from difflcs.rl.learning.ppo_settings import PPOSettings
+from difflcs.rl.learning.trainer import Trainer
 from difflcs.rl.learning.warmup import WarmupReport, WarmupSettings
 from difflcs.rl.methods.base import LCSMethod, Work
 from difflcs.rl.methods.phases import main_phase, short_main, short_models, short_warmup, warmup_phase
@@ -33,6 +34,7 @@ class LCSRLMethod(LCSMethod):
     version: ClassVar[int] = 2
     summary: ClassVar[str] = "the warm-up (Algorithm 1), and then PPO through the MPC (Algorithm 2)"
     reports: ClassVar[tuple[type, ...]] = (WarmupReport, PPOReport)
+    keep_best: ClassVar[bool] = False
 
     def check(self, minutes: float) -> None:
         """See `Method`."""
@@ -43,14 +45,14 @@ class LCSRLMethod(LCSMethod):
                 f"{minutes:g}; pass --minutes 30, or --method violation for a warm-up alone"
             )
 
-    def trainer(self, work: Work) -> LCSRL:
+    def trainer(self, work: Work) -> Trainer:
         """See `Method`."""
         lcs = self.initial(work)
         policy = self.policy(work.task, lcs)
         return LCSRL(
             warmup_phase(work, lcs, policy, self.warmup),
             round(self.warmup_minutes * work.task.steps_per_minute),
-            lambda episodes, iterations: main_phase(work, policy, self.ppo, self.models, episodes, iterations),
+            lambda *begun: main_phase(work, policy, self.ppo, self.models, *begun, keep_best=self.keep_best),
         )
 
     def smoke(self) -> Self:
