@@ -85,15 +85,9 @@ def test_instability_is_noticed(field, index, value, tmp_path, monkeypatch):
     np.testing.assert_array_equal(observation["state"], before)
     env.reset(seed=0)
     assert not env.step(np.zeros(6))[4]["physics_error"]
-
-
-def test_instability_in_the_first_step_is_noticed(tmp_path, monkeypatch):
-    """MuJoCo resets its clock to where it was; only the warning tells."""
-    monkeypatch.chdir(tmp_path)
-    env = TriFingerMoveCubeEnv()
     env.reset(seed=0)
-    env.data.qvel[0] = np.nan
-    with pytest.warns(difflcs_envs.PhysicsWarning):
+    getattr(env.data, field)[index] = value
+    with pytest.warns(difflcs_envs.PhysicsWarning):  # in the first step MuJoCo resets its clock to where it was
         assert env.step(np.zeros(6))[4]["physics_error"]
 
 

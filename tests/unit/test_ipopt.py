@@ -186,6 +186,7 @@ def test_the_better_of_two_starts_is_kept():
         ({"tol": 0.0}, InvalidInputError, "tol: .*above 0, got 0"),
         ({"max_iter": 2.5}, DTypeError, "max_iter: expected an int, got float 2.5"),
         ({"workers": 0}, InvalidInputError, "workers: expected at least 1, got 0"),
+        ({"workers": 2**31}, InvalidInputError, "workers: expected at most"),
         ({"start": -1.0}, InvalidInputError, "start: .*got -1"),
         ({"second_start": 0.0}, InvalidInputError, "second_start: .*got 0"),
         ({"mu_init": float("nan")}, InvalidInputError, "mu_init: .*got nan"),

@@ -54,6 +54,20 @@ def test_the_native_adjoint_equals_the_reference(build, name):
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
+def test_the_native_residual_is_that_of_kkt(build, name):
+    """Of plans that are far from a solution, where it is no rounding, and at a solution below its limit."""
+    problem = PROBLEMS[name](build)
+    rough = BatchedBackend(max_iter=1, effort="fast", homotopy=1.0, shrink=1e-3).solve(problem, None)
+    far = rough.status == Status.MAX_ITER
+    residual = kkt.residual(problem, rough.primal, kkt.multipliers(problem, rough.primal))
+    torch.testing.assert_close(rough.kkt_residual[far], residual[far], rtol=1e-6, atol=0)
+    assert int(far.sum()) >= 5
+    assert float(residual[far].min()) > kkt.CERTIFIED
+    solved = BATCHED.solve(problem, None)
+    assert float(solved.kkt_residual[solved.solved].max()) <= kkt.CERTIFIED
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
 def test_a_problem_alone_has_the_numbers_that_it_has_among_others(build, name):
     """Alone it is solved by other code, see difflcs/_native/single_lane.hpp."""
     problem = PROBLEMS[name](build)
