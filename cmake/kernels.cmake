@@ -10,7 +10,7 @@ include(CheckCXXSourceRuns)
 
 function(difflcs_add_kernels target)
   target_include_directories(${target} PRIVATE ${DIFFLCS_NATIVE})
-  set(sources ${DIFFLCS_NATIVE}/driver.cpp ${DIFFLCS_NATIVE}/controller.cpp ${DIFFLCS_NATIVE}/controller_file.cpp)
+  set(sources ${DIFFLCS_NATIVE}/search.cpp ${DIFFLCS_NATIVE}/controller.cpp ${DIFFLCS_NATIVE}/controller_file.cpp)
   target_sources(${target} PRIVATE ${DIFFLCS_NATIVE}/dispatch.cpp ${sources})
   # So that they compute the same in Python and in C, whatever else differs between the two builds.
   set_source_files_properties(${sources} PROPERTIES COMPILE_OPTIONS

@@ -73,7 +73,7 @@ void shift(const Numbers& from, int64_t rows, Numbers& to) {
 Controller::Controller(const void* bytes, size_t size)
     : kernels_(kernels_for(1)),
       data_(read_controller(bytes, size)),
-      driver_(kernels_),
+      search_(kernels_),
       time_limit_(std::numeric_limits<double>::infinity()) {
   const int64_t nx = data_.n_x, nu = data_.n_u, nl = data_.n_lam, nc = data_.n_c, h = data_.horizon;
   x0_ = Numbers(nx);
@@ -107,7 +107,7 @@ Controller::Controller(const void* bytes, size_t size)
     batch_.step[kq] = h > 1 ? nx : 0;
     needed = std::max(needed, kernels_.mpc_workspace(batch_));
   }
-  driver_.reserve(batch_, std::max(data_.starts, data_.starts_guessed));
+  search_.reserve(batch_, std::max(data_.starts, data_.starts_guessed));
   workspace_ = Numbers(needed / int64_t(sizeof(double)) + 1);
 }
 
@@ -169,11 +169,11 @@ void Controller::solve(Clock::time_point begun) {
   if (time_limit_ < 1e9) ends = begun + std::chrono::nanoseconds(int64_t(1e9 * std::max(time_limit_, 0.0)));
   Alone runner(workspace_.get(), ends);
   const auto started = Clock::now();
-  driver_.solve(batch_, guess, effort, out, runner);
+  search_.solve(batch_, guess, effort, out, runner);
   outcome_.solve_seconds = seconds_since(started);
   outcome_.late = runner.stopped();
   outcome_.status = Status(status);
-  // The driver marks a problem that was not begun in time.
+  // The search marks a problem that was not begun in time.
   const bool begun_at_all = outcome_.objective != std::numeric_limits<double>::max();
   if (begun_at_all) outcome_.objective += data_.constant + goal_constant_;
   for (double* value : {&outcome_.objective, &outcome_.residual})

@@ -6,8 +6,8 @@
 #include <cstdint>
 
 #include "controller_file.hpp"
-#include "driver.hpp"
 #include "kernels.hpp"
+#include "search.hpp"
 
 namespace difflcs {
 
@@ -78,7 +78,7 @@ class Controller {
 
   const Kernels& kernels_;
   ControllerData data_;
-  MpcDriver driver_;
+  MpcSearch search_;
   MpcBatch batch_{};  // its version is that of the matrices and of the fields given by stage
   Numbers x0_, q_, q_final_, workspace_, fallback_action_;
   Trace found_;

@@ -24,8 +24,8 @@
 #include <vector>
 
 #include "bind_controller.hpp"
-#include "driver.hpp"
 #include "kernels.hpp"
+#include "search.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -241,7 +241,7 @@ bool solve_mpc(Inputs inputs, int64_t horizon, double relaxation, double barrier
   const difflcs::MpcPlans out{x.data(),        u.data(),      lam.data(),     mu.data(),        objective.data(),
                               residual.data(), status.data(), fragile.data(), iterations.data()};
   Threads runner(threads, time_limit);
-  difflcs::MpcDriver(difflcs::kernels_for(b.count * starts)).solve(b, guess, effort, out, runner);
+  difflcs::MpcSearch(difflcs::kernels_for(b.count * starts)).solve(b, guess, effort, out, runner);
   return std::all_of(status.data(), status.data() + b.count,
                      [](int8_t code) { return code == int8_t(difflcs::Status::converged); });
 }

@@ -10,7 +10,7 @@ namespace difflcs {
 
 // Effort of the search.
 struct MpcEffort {
-  int64_t starts;   // at least one; driver.cpp states their sequence. A guess is the first of them.
+  int64_t starts;   // at least one; search.cpp states their sequence. A guess is the first of them.
   double homotopy;  // first relaxation as a multiple of the problem's; 0: from the problem's scale
   double shrink;    // factor of the homotopy
   double tol;       // on the projected gradient
@@ -46,9 +46,9 @@ struct Runner {
 // `high` numbers, are finite.
 void set_flags(MpcBatch& batch, int64_t S, int64_t low, int64_t high);
 
-class MpcDriver {
+class MpcSearch {
  public:
-  explicit MpcDriver(const Kernels& kernels) : kernels(kernels) {}
+  explicit MpcSearch(const Kernels& kernels) : kernels(kernels) {}
 
   // Allocates all memory that a batch of this size can need: afterwards `solve` allocates nothing.
   void reserve(const MpcBatch& batch, int64_t starts);

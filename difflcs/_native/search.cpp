@@ -1,4 +1,4 @@
-#include "driver.hpp"
+#include "search.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -204,7 +204,7 @@ void set_flags(MpcBatch& b, int64_t S, int64_t low, int64_t high) {
       any(ku_min, low, [](double v) { return v < -kHuge; }) || any(ku_max, high, [](double v) { return v > kHuge; });
 }
 
-void MpcDriver::Store::resize(const MpcBatch& batch, int64_t count) {
+void MpcSearch::Store::resize(const MpcBatch& batch, int64_t count) {
   const Sizes n(batch);
   x.resize(count * n.x);
   u.resize(count * n.u);
@@ -218,12 +218,12 @@ void MpcDriver::Store::resize(const MpcBatch& batch, int64_t count) {
   start.resize(count);
 }
 
-MpcPlans MpcDriver::Store::plans() {
+MpcPlans MpcSearch::Store::plans() {
   return {x.data(),        u.data(),      lam.data(),     mu.data(),        objective.data(),
           residual.data(), status.data(), fragile.data(), iterations.data()};
 }
 
-void MpcDriver::reserve(const MpcBatch& batch, int64_t starts) {
+void MpcSearch::reserve(const MpcBatch& batch, int64_t starts) {
   const int64_t jobs = starts * batch.count;
   tried.resize(batch, jobs);
   finished.resize(batch, jobs);
@@ -234,7 +234,7 @@ void MpcDriver::reserve(const MpcBatch& batch, int64_t starts) {
 }
 
 // Calls the kernel for every problem of a batch.
-void MpcDriver::run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner) const {
+void MpcSearch::run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner) const {
   std::fill_n(solve.status, batch.count, kUnreached);
   std::fill_n(solve.iterations, batch.count, 0);
   Solving context{kernels, batch, solve, 0};
@@ -250,7 +250,7 @@ void MpcDriver::run(const MpcBatch& batch, const MpcSolve& solve, Runner& runner
 }
 
 // Marks solved problems whose constraints make them degenerate.
-void MpcDriver::judge_constraints(const MpcBatch& batch, const MpcSolve& results, Runner& runner) const {
+void MpcSearch::judge_constraints(const MpcBatch& batch, const MpcSolve& results, Runner& runner) const {
   Solving context{kernels, batch, results, 0};
   runner.run(
       batch.count, kernels.mpc_workspace(batch), true,
@@ -263,13 +263,13 @@ void MpcDriver::judge_constraints(const MpcBatch& batch, const MpcSolve& results
       &context);
 }
 
-void MpcDriver::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& asked, const MpcPlans& out,
+void MpcSearch::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& asked, const MpcPlans& out,
                       Runner& runner) {
   if (batch.count == 0) return;
   MpcEffort effort = asked;
   if (batch.n_lam == 0) effort.starts = 1;  // without contact there is one optimum
   const bool once = effort.starts == 1 && (batch.n_lam == 0 || comparison(batch) == batch.relaxation);
-  const auto way = once ? &MpcDriver::solve_once : &MpcDriver::search;
+  const auto way = once ? &MpcSearch::solve_once : &MpcSearch::search;
   const int64_t chunk = std::max(kChunk, kJobs / effort.starts);
   for (int64_t first = 0; first < batch.count; first += chunk)
     (this->*way)(batch, guess, effort, out, runner, first, std::min(chunk, batch.count - first));
@@ -279,7 +279,7 @@ void MpcDriver::solve(const MpcBatch& batch, const MpcGuess& guess, const MpcEff
 }
 
 // Sets the first actions of a job: the best plan of its element so far is that of job `best`.
-void MpcDriver::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start, int64_t job, int64_t best) {
+void MpcSearch::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start, int64_t job, int64_t best) {
   const Sizes n(b);
   const Start s = start_of(start);
   tried.start[job] = beginning(s, b, effort);
@@ -304,7 +304,7 @@ void MpcDriver::begin(const MpcBatch& b, const MpcEffort& effort, int64_t start,
 }
 
 // Runs jobs [first, first + count) to the point where starts are compared.
-void MpcDriver::explore(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, int64_t first, int64_t count,
+void MpcSearch::explore(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, int64_t first, int64_t count,
                         bool guessed) {
   const Sizes n(batch);
   MpcBatch jobs = batch;
@@ -325,7 +325,7 @@ void MpcDriver::explore(const MpcBatch& batch, const MpcEffort& effort, Runner& 
 }
 
 // Solves elements [first, first + count) from one start.
-void MpcDriver::solve_once(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
+void MpcSearch::solve_once(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
                            Runner& runner, int64_t first, int64_t count) {
   const Sizes n(batch);
   const MpcPlans to = shifted(batch, out, first);
@@ -349,7 +349,7 @@ void MpcDriver::solve_once(const MpcBatch& batch, const MpcGuess& guess, const M
 }
 
 // Solves them from several starts and keeps the best plan.
-void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
+void MpcSearch::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
                        Runner& runner, int64_t first, int64_t count) {
   const Sizes n(batch);
   const bool guessed = guess.u, whole = guess.lam;  // by actions alone, or by forces too
@@ -398,7 +398,7 @@ void MpcDriver::search(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
 // Solves those jobs to the end that are wanted. Returns their number: they are the first of `finished`, and `origin`
 // says which jobs they were.
 template <class Wanted>
-int64_t MpcDriver::solve_tried(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, Wanted wanted) {
+int64_t MpcSearch::solve_tried(const MpcBatch& batch, const MpcEffort& effort, Runner& runner, Wanted wanted) {
   const Sizes n(batch);
   const int64_t all = int64_t(tried.element.size());
   finished.resize(batch, all);
@@ -426,7 +426,7 @@ int64_t MpcDriver::solve_tried(const MpcBatch& batch, const MpcEffort& effort, R
 
 // Solves the jobs to the end that may still become the best of their element. A start whose last step gained less than
 // it lies behind, or that approaches the same plan, is given up, unless all others of its element fail.
-void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
+void MpcSearch::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEffort& effort, const MpcPlans& out,
                        Runner& runner, int64_t first, int64_t count) {
   const Sizes n(batch);
   const int64_t all = effort.starts * count;
@@ -468,7 +468,7 @@ void MpcDriver::finish(const MpcBatch& batch, const MpcGuess& guess, const MpcEf
 }
 
 // Whether a job may become better than a plan, and does not approach the same one.
-bool MpcDriver::promising(const MpcBatch& batch, int64_t job, const double* u, double objective) const {
+bool MpcSearch::promising(const MpcBatch& batch, int64_t job, const double* u, double objective) const {
   const double behind = comparison(batch) > batch.relaxation ? kBehind * std::abs(objective) : 0.0;
   if (!(tried.objective[job] - tried.gained[job] <= objective + behind)) return false;
   const Sizes n(batch);
@@ -482,7 +482,7 @@ bool MpcDriver::promising(const MpcBatch& batch, int64_t job, const double* u, d
 }
 
 // Sets the first actions of a job to those of a plan, varied.
-void MpcDriver::vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kind, const double* plan, int64_t job) {
+void MpcSearch::vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kind, const double* plan, int64_t job) {
   const Variation& v = kVariations[kind % kKinds];
   const int64_t begin = v.part == Variation::end ? batch.horizon / 2 : 0;
   const int64_t end = v.part == Variation::begin ? batch.horizon / 2 : batch.horizon;
@@ -499,7 +499,7 @@ void MpcDriver::vary(const MpcBatch& batch, const MpcEffort& effort, int64_t kin
 }
 
 // Varies the plans of elements [first, first + count), and keeps what is better, until that gains nothing.
-void MpcDriver::improve(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner,
+void MpcSearch::improve(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner,
                         int64_t first, int64_t count) {
   const Sizes n(batch);
   const int64_t patience = kKinds / kVaried;
@@ -538,7 +538,7 @@ void MpcDriver::improve(const MpcBatch& batch, const MpcEffort& effort, const Mp
 
 // Solves the elements that failed (one in a thousand) once more, from no action along a longer homotopy; then, if
 // the numbers broke down rather than the iterations ran out, with row exchanges in the elimination of the forces.
-void MpcDriver::retry_failed(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner,
+void MpcSearch::retry_failed(const MpcBatch& batch, const MpcEffort& effort, const MpcPlans& out, Runner& runner,
                              bool pivot) {
   const Sizes n(batch);
   origin.clear();
