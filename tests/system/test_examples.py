@@ -46,6 +46,17 @@ def test_a_cylinder_is_turned_in_a_hand_and_filmed(capsys, tmp_path):
     assert (tmp_path / "hand.gif").stat().st_size > 10_000
 
 
+def test_three_fingers_find_out_how_large_the_cube_is(capsys):
+    import trifinger_context
+
+    reached = []
+    for adapt in (False, True):
+        trifinger_context.main(trifinger_context.Options(side=3.0, adapt=adapt, goals=24, seed=100))
+        reached.append(int(capsys.readouterr().out.split(" of ")[0]))
+    assert reached[0] <= 4
+    assert reached[1] >= 22
+
+
 def test_the_arm_of_pusher_does_better_than_nothing(capsys, monkeypatch):
     import pusher
 
