@@ -1,20 +1,27 @@
 """Which of several systems is it? A filter that answers from the motion seen, while the robot works.
 
-Each hypothesis is a context of one `LCSModule`: a scale of the outline, a friction, a drive, or all of them. After each
-step all hypotheses predict the step in one batch, and each is credited with the log-likelihood of what was seen: the
-Bayes filter of a quantity that is constant, or forgotten slowly. It needs no gradient and no excitation: where all
-predict the same, as on a way without contact, nothing is learned and nothing is lost.
+A hypothesis is a context of a model: a scale of the outline, a friction, a drive, or several of them. After each step
+all hypotheses predict the step in one batch, and each is credited with the log-likelihood of what was seen: the Bayes
+filter of a quantity that is constant, or forgotten slowly. It needs no gradient and no excitation: where all predict
+the same, as on a way without contact, nothing is learned and nothing is lost.
 """
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from difflcs.errors import InvalidInputError
-from difflcs.records import LCSModule, LCSParams
 
 __all__ = ["ContextFilter"]
+
+Array = NDArray[Any]
+Predict = Callable[[Array, Array, Array], Array]
+"""A state (n_x,), an action and contexts (n, n_context) → the next state by each of them (n, n_x)."""
 
 
 class ContextFilter:
@@ -24,13 +31,16 @@ class ContextFilter:
     has moved; no step counts for more than `most` nats, as a model is sometimes wrong altogether.
 
     Args:
-        lcs: its `params(x, context)` returns the systems of a batch of states (n, n_x) and contexts (n, n_context).
+        predict: what each hypothesis says of a step, all in one batch.
         contexts: (n, n_context) hypotheses, all equally likely at first.
         spread: (n_x,) of the state's components, or one number for all [units of the state], > 0; ∞ for what is not to
             be compared.
         relative: part of the motion by which predictions are off, ≥ 0.
         most: largest log-likelihood ratio of a step, > 0.
         forgetting: factor of all log-likelihoods at each step, in (0, 1]: 1 for what is constant.
+        hopeless: a hypothesis is no longer asked once the best is so many nats ahead of it, > 0; it loses `most` in
+            each step. ∞: all are always asked.
+        angles: components of the state that are angles [rad], whose differences are taken the shorter way round.
 
     Attributes:
         log_likelihood: (n,) of each hypothesis; the best has 0.
@@ -41,58 +51,71 @@ class ContextFilter:
 
     def __init__(
         self,
-        lcs: LCSModule,
-        contexts: Tensor,
-        spread: float | Tensor,
+        predict: Predict,
+        contexts: ArrayLike,
+        spread: ArrayLike,
         *,
         relative: float = 0.0,
         most: float = 8.0,
         forgetting: float = 1.0,
+        hopeless: float = math.inf,
+        angles: Sequence[int] = (),
     ):
-        self.lcs, self.contexts = lcs, contexts
-        self.spread = torch.as_tensor(spread, dtype=torch.float64)
-        if not bool((self.spread > 0).all()):
+        self.predict, self.contexts, self.angles = predict, np.asarray(contexts), list(angles)
+        self.spread = np.asarray(spread, np.float64)
+        if not (self.spread > 0).all():
             raise InvalidInputError(
                 f"spread: expected numbers above 0, got {self.spread.tolist()}; give an error's size"
             )
-        if relative < 0 or most <= 0 or not 0 < forgetting <= 1:
+        if relative < 0 or most <= 0 or not 0 < forgetting <= 1 or not hopeless > 0:
             raise InvalidInputError(
-                f"expected relative >= 0, most > 0 and forgetting in (0, 1], got {relative:g}, {most:g} and "
-                f"{forgetting:g}; see the docstring"
+                f"expected relative >= 0, most > 0, forgetting in (0, 1] and hopeless > 0, got {relative:g}, {most:g}, "
+                f"{forgetting:g} and {hopeless:g}; see the docstring"
             )
-        self.relative, self.most, self.forgetting = relative, most, forgetting
+        self.relative, self.most, self.forgetting, self.hopeless = relative, most, forgetting, hopeless
         self.reset()
 
     def reset(self) -> None:
         """Forget all that was seen."""
-        self.log_likelihood = torch.zeros(len(self.contexts), dtype=torch.float64)
+        self.log_likelihood = np.zeros(len(self.contexts))
 
-    @torch.no_grad()
-    def update(self, x: Tensor, u: Tensor, x_next: Tensor) -> None:
+    def update(self, x: Array, u: Array, x_next: Array) -> None:
         """Learn from one transition.
 
         Args:
-            x: (n_x,) the state before.
-            u: (n_u,) the action; or (T, n_u), the actions of T parts of the step, each with the system where it begins.
+            x: (n_x,) the state before, or more, if `predict` needs more than it predicts.
+            u: the action, as `predict` takes it.
             x_next: (n_x,) the state after.
         """
-        state = x.expand(len(self.contexts), -1)
-        for part in torch.atleast_2d(u):
-            systems = self.lcs.params(state, self.contexts)
-            assert isinstance(systems, LCSParams)
-            state = systems.step(state, part.expand(len(state), -1)).x_next
-        spread = self.spread + self.relative * (x_next - x).abs()
-        loss = 0.5 * ((state - x_next) / spread).square().sum(-1)
-        loss = (loss - loss.min()).clamp_max(self.most)
+        asked = np.flatnonzero(self.log_likelihood > -self.hopeless)
+        if len(asked) == 1 and self.forgetting == 1:
+            return  # it is known
+        error = self._difference(self.predict(x, u, self.contexts[asked]), x_next)
+        error /= self.spread + self.relative * np.abs(self._difference(x_next, x[: len(x_next)]))
+        losses = 0.5 * (error**2).sum(-1)
+        loss = np.full(len(self.contexts), self.most)
+        loss[asked] = np.minimum(losses - losses.min(), self.most)
         self.log_likelihood = self.forgetting * self.log_likelihood - loss
         self.log_likelihood -= self.log_likelihood.max()
 
-    @property
-    def probabilities(self) -> Tensor:
-        """(n,) of the hypotheses."""
-        return self.log_likelihood.softmax(0)
+    def _difference(self, a: Array, b: Array) -> Array:
+        difference = a - b
+        for i in self.angles:
+            difference[..., i] = (difference[..., i] + math.pi) % (2 * math.pi) - math.pi
+        return difference
 
     @property
-    def mean(self) -> Tensor:
+    def best(self) -> int:
+        """Index of the most likely hypothesis."""
+        return int(self.log_likelihood.argmax())
+
+    @property
+    def probabilities(self) -> Array:
+        """(n,) of the hypotheses."""
+        likelihood = np.exp(self.log_likelihood)
+        return likelihood / likelihood.sum()
+
+    @property
+    def mean(self) -> Array:
         """(n_context,) expected context."""
         return self.probabilities @ self.contexts

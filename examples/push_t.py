@@ -5,30 +5,32 @@ action is the target of the disc's PD controller, for ten substeps of 0.01 s. Th
 back. Velocities are damped away in each substep, so the T moves only while it is pushed. Friction between disc and T is
 zero: what the environment sets is an attribute that pymunk does not read. Lengths here are in units of 100 px.
 
-With `--adapt` it finds the scale of the outline while it pushes, as with `--scale 0.8`, where it is told a wrong one.
+With `--adapt` it finds the scale of the outline, friction and the stiffness of the drive while it pushes, as with
+`--scale 0.8`, where it is told a wrong outline.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
 from collections import deque
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from context_filter import ContextFilter
+from disc_contact import DiscContact
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from difflcs import Animation, GoalCost, LCSMPCLayer
 from difflcs.errors import MissingDependencyError
-from difflcs.physics import PDDrive, PlanarPushing, Polygon, PositionDrive, Union, box
+from difflcs.physics import PDDrive, PlanarPushing, Polygon, Union, box
 from difflcs.physics.complementarity import Contacts
-from difflcs.physics.planar import to_body
-from difflcs.physics.shapes import Distance, Moments, Shape
+from difflcs.physics.shapes import Shape
 from difflcs.planning import (
     Decision,
     DiscPlaces,
@@ -38,10 +40,11 @@ from difflcs.planning import (
     SamplingSettings,
     Workspace,
 )
-from difflcs.records import LCSParams
 
 if TYPE_CHECKING:
     from PIL import Image
+
+Array = NDArray[np.float64]
 
 PIXELS = 100.0
 """Pixels in a unit of length."""
@@ -133,69 +136,17 @@ class Rigid(PlanarPushing):
         return cls(**{field.name: getattr(system, field.name) for field in fields(system)})
 
 
-class Scaled(Shape):
-    """A shape at several scales about its origin, one for each row of a batch of points (n, ..., 2).
-
-    Args:
-        shape: at scale 1.
-        scales: (n,).
-    """
-
-    def __init__(self, shape: Shape, scales: Tensor):
-        self.shape, self.scales = shape, scales
-
-    @property
-    def n_parts(self) -> int:
-        """See `Shape`."""
-        return self.shape.n_parts
-
-    def distance(self, points: Tensor) -> Distance:
-        """See `Shape`."""
-        scale = self.scales.reshape(-1, *[1] * (points.ndim - 1))
-        distance, normal, point = self.shape.distance(points / scale)
-        return Distance(scale * distance, normal, scale.unsqueeze(-1) * point)
-
-    def moments(self) -> Moments:
-        """Of scale 1."""
-        return self.shape.moments()
-
-    @property
-    def radius(self) -> float:
-        """Of the largest."""
-        return float(self.scales.max()) * self.shape.radius
-
-
-class AnyScale:
-    """A pushed body of unknown scale, its context: an `LCSModule` of which each row has an outline of its own.
-
-    The disc follows its action exactly, as afterwards one knows where it was.
-
-    Args:
-        system: with the outline at scale 1.
-    """
-
-    def __init__(self, system: PlanarPushing):
-        self.system = system.replace(drive=PositionDrive())
-        self.n_x, self.n_u, self.n_lam = self.system.n_x, self.system.n_u, self.system.n_lam
-
-    def params(self, x: Tensor | None = None, context: Tensor | None = None) -> LCSParams:
-        """The systems at states x (n, 5) for scales (n, 1)."""
-        assert context is not None
-        return self.system.replace(shape=Scaled(self.system.shape, context[:, 0])).params(x)
-
-
-SCALES = torch.exp(torch.arange(-12, 13, dtype=torch.float64) * 0.025)
+SCALES = np.exp(0.025 * np.arange(-12, 13))
 """Scales of the told outline that `DiscPolicy(adapt=True)` compares: from 0.74 to 1.35."""
-PARTS = 5
-"""Parts of a step in which the motion of the disc is followed."""
-SCALE_TOLD = len(SCALES) // 2
-"""Index of the scale that was told."""
-SPREAD, RELATIVE, MOST = 0.01, 0.2, 8.0
-"""Settings of its `ContextFilter`: predictions are off by 1 px and a fifth of the motion; no step counts for more."""
+FRICTIONS = (0.0, 0.2, 0.5)
+"""Frictions between disc and body, likewise."""
+STIFFNESSES = SCALES**2
+"""Stiffnesses of the drive, as multiples of what was told."""
+SPREAD, RELATIVE, MOST, HOPELESS = 0.01, 0.05, 8.0, 10.0
+"""Settings of its filters: predictions are off by 1 px and 5 % of the motion; no step counts for more than 8 nats, and
+what is 10 nats behind is given up."""
 SURE = 3.0
-"""Log-likelihood ratio with which another scale replaces that of the plan."""
-STILL = 0.002
-"""Largest motion of a body at rest, in units of length and rad."""
+"""Log-likelihood ratio with which another hypothesis replaces that of the plan."""
 
 
 class DiscPolicy:
@@ -210,12 +161,14 @@ class DiscPolicy:
         goal: (3,) of the origin [px, px, rad].
         delay: steps by which actions come late. The plan begins at the state that the system predicts for then.
         turns: turns of the body about its centre that cover it, which all mean the same.
-        adapt: find the scale of the outline from the motion seen, anew in each episode.
+        beyond: how far the disc may go beyond the square [length].
+        adapt: find the scale of the outline, friction and the stiffness of the drive from the motion seen, anew in each
+            episode.
 
     Attributes:
         sampling: the policy inside, with its `decision`.
         adapts: as `adapt` says.
-        hypothesis: index of the scale in `SCALES` with which it plans.
+        found: scale of the outline, friction, and factor of the stiffness, with which it plans.
     """
 
     def __init__(
@@ -226,38 +179,58 @@ class DiscPolicy:
         *,
         delay: int = 0,
         turns: int = 1,
+        beyond: float = 0.0,
         adapt: bool = False,
     ):
+        self.low, self.high = -beyond, SIDE + beyond
         self.told, self.delay, self._period = system, delay, 2 * math.pi / turns
         self.center, self.goal = np.asarray(center), goal
-        self._filter = ContextFilter(AnyScale(system), SCALES.unsqueeze(-1), SPREAD, relative=RELATIVE, most=MOST)
         self.adapts = adapt
-        self._policies: dict[int, tuple[Rigid, SamplingPolicy]] = {}
-        step = DRIVE.step()
-        self._keeps, self._gives = float(step.A[1, 1]), float(step.b[1])
-        self._course = DRIVE.course()
-        self._use(SCALE_TOLD)
+        self._contact = DiscContact(system)
+        hypotheses = np.array(list(itertools.product(SCALES, FRICTIONS)))
+        self._bodies = ContextFilter(
+            self._contact, hypotheses, SPREAD, relative=RELATIVE, most=MOST, hopeless=HOPELESS, angles=(2,)
+        )
+        assert isinstance(system.drive, PDDrive)
+        self._drives = [replace(system.drive, stiffness=factor * system.drive.stiffness) for factor in STIFFNESSES]
+        steps = [drive.step() for drive in self._drives]
+        self._A, self._b = (torch.stack(values).numpy() for values in zip(*[(s.A, s.b) for s in steps], strict=True))
+        every = np.arange(len(STIFFNESSES))[:, None]
+        self._motions = ContextFilter(
+            self._predict_disc, every, SPREAD, relative=RELATIVE, most=MOST, hopeless=HOPELESS
+        )
+        friction = float(torch.as_tensor(system.friction).reshape(-1)[0])
+        self._told = int(np.abs(hypotheses - [1.0, friction]).sum(-1).argmin()), len(STIFFNESSES) // 2
+        self._policies: dict[tuple[int, int], tuple[Rigid, SamplingPolicy]] = {}
         self.reset()
 
-    def _use(self, hypothesis: int) -> None:
-        """Plan with one of the scales."""
-        self.hypothesis = hypothesis
-        if hypothesis not in self._policies:
-            shape = _scaled(self.told.shape, float(SCALES[hypothesis])) if hypothesis != SCALE_TOLD else self.told.shape
-            self._policies[hypothesis] = self._plan(Rigid.of(self.told.replace(shape=shape)))
-        self.system, self.sampling = self._policies[hypothesis]
+    def _use(self, body: int, drive: int) -> None:
+        """Plan with one of the hypotheses of each filter."""
+        self._hypothesis = body, drive
+        scale, friction = self._bodies.contexts[body].tolist()
+        self.found = scale, friction, float(STIFFNESSES[drive])
+        self._contact.drive = self._drives[drive]
+        if self._hypothesis not in self._policies:
+            system = self.told
+            if self._hypothesis != self._told:
+                system = system.replace(
+                    shape=_scaled(system.shape, scale),
+                    friction=torch.tensor(friction, dtype=torch.float64) if friction else 0.0,
+                    drive=self._drives[drive],
+                )
+            self._policies[self._hypothesis] = self._plan(Rigid.of(system))
+        self.system, self.sampling = self._policies[self._hypothesis]
         self.sampling.reset()
 
-    @staticmethod
-    def _plan(system: Rigid) -> tuple[Rigid, SamplingPolicy]:
+    def _plan(self, system: Rigid) -> tuple[Rigid, SamplingPolicy]:
         """Make the policy for a system."""
         shape = system.shape
-        workspace = Workspace((0.0, 0.0), (SIDE, SIDE), step=1.2)
+        workspace = Workspace((self.low, self.low), (self.high, self.high), step=1.2)
         cost = GoalCost.reach(7, 2, goal_weight=(1.0, 1.0, 0.3), goal_weight_final=(4.0, 4.0, 1.2), input_weight=0.01)
         return system, SamplingPolicy(
             LCSMPCLayer(system, cost, 6, relaxation=1e-5, on_failure="mask"),
             DiscPlaces(shape, RADIUS, 32, gap=0.02, reach=0.2, workspace=workspace, margin=0.02),
-            PlanarTravel(shape, RADIUS, SIDE, drive=DRIVE, clearance=0.08, tolerance=0.12, workspace=workspace),
+            PlanarTravel(shape, RADIUS, SIDE, drive=system.drive, clearance=0.08, tolerance=0.12, workspace=workspace),
             SamplingSettings(keep=0.6, smallest_gain=0.02, switch_price=0.02, travel_price=0.04),
             bounds=workspace.bounds,
             angles=(2,),
@@ -265,13 +238,14 @@ class DiscPolicy:
 
     def reset(self) -> None:
         """Start an episode."""
-        self._filter.reset()
-        self._use(SCALE_TOLD)
-        self._velocity = np.zeros(2)
-        self._before: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
-        self._under_way: deque[NDArray[np.float64]] = deque()
+        self._bodies.reset()
+        self._motions.reset()
+        self._use(*self._told)
+        self._velocities = np.zeros((len(STIFFNESSES), 2))  # of the disc, by each drive
+        self._before: tuple[Array, Array, Array] | None = None
+        self._under_way: deque[Array] = deque()
 
-    def act(self, observation: ArrayLike) -> NDArray[np.float64]:
+    def act(self, observation: ArrayLike) -> Array:
         """Compute an action.
 
         Args:
@@ -282,50 +256,46 @@ class DiscPolicy:
         """
         seen = np.asarray(observation, np.float64)
         disc = seen[:2] / PIXELS
-        state = np.concatenate([from_origin(seen[2:], self.center), disc, self._velocity])
+        place = np.concatenate([from_origin(seen[2:], self.center), disc])
         if self.adapts:
-            self._adapt(state)
-        state_seen = state
+            self._adapt(place)
+        state = np.concatenate([place, self._velocities[self._hypothesis[1]]])
         if self.delay and not self._under_way:
             self._under_way.extend([disc] * self.delay)
         for target in self._under_way:
             state = self._predict(state, target)
         goal = from_origin(self.goal, self.center)
         goal[2] += self._period * np.round((state[2] - goal[2]) / self._period)
-        target = np.clip(state[3:5] + self.sampling.act(state, goal), 0.0, SIDE)
+        target = np.clip(state[3:5] + self.sampling.act(state, goal), self.low, self.high)
         self._under_way.append(target)
         sent = self._under_way.popleft() - disc
-        self._before = state_seen, sent
-        self._velocity = self._keeps * self._velocity + self._gives * sent
+        self._before = place, self._velocities, sent
+        self._velocities = self._velocities * self._A[:, 1, 1:] + self._b[:, 1:] * sent
         return target * PIXELS
 
-    def _adapt(self, state: NDArray[np.float64]) -> None:
-        """Learn from the last step, and change the scale where another explains the motion clearly better."""
+    def _predict_disc(self, place: Array, sent: Array, drives: NDArray[Any]) -> Array:
+        """Predict the place of the disc (n, 2) by some drives (n, 1), with the velocity that each of them gave it."""
+        assert self._before is not None
+        each = drives[:, 0]
+        return place + self._A[each, 0, 1:] * self._before[1][each] + self._b[each, :1] * sent
+
+    def _adapt(self, place: Array) -> None:
+        """Learn from the last step, and plan with other hypotheses where they explain the motion clearly better."""
         if self._before is None:
             return
-        before, sent = self._before
-        x, x_next = torch.from_numpy(before[:5]), torch.from_numpy(state[:5])
-        way = torch.from_numpy(self._way(before[5:], sent))
-        largest = Scaled(self.told.shape, SCALES[-1:])
-        near = (largest.distance(to_body(x, x[3:] + way).unsqueeze(0)).distance[0] < RADIUS).any(-1)
-        moved = float((x_next - x)[:3].abs().max()) >= STILL
-        if not moved and not bool(near.any()):
-            return  # all scales predict that nothing moves
-        first = int(near.to(torch.int8).argmax())  # 0 if none is near
-        way = torch.cat([torch.zeros(1, 2, dtype=way.dtype), way])[first:]
-        touching = torch.cat([x[:3], x[3:] + way[0]])
-        self._filter.update(touching, way.diff(dim=0), x_next)
-        likely = self._filter.log_likelihood
-        if float(likely[self.hypothesis]) < -SURE:
-            self._use(int(likely.argmax()))
+        before, velocities, sent = self._before
+        self._motions.update(before[3:], sent, place[3:])
+        body, drive = self._hypothesis
+        if float(self._motions.log_likelihood[drive]) < -SURE:
+            drive = self._motions.best
+            self._contact.drive = self._drives[drive]
+        self._bodies.update(np.concatenate([before, velocities[drive]]), sent, place[:3])
+        if float(self._bodies.log_likelihood[body]) < -SURE:
+            body = self._bodies.best
+        if (body, drive) != self._hypothesis:
+            self._use(body, drive)
 
-    def _way(self, velocity: NDArray[np.float64], sent: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how far the disc has come after each part of a step (PARTS, 2)."""
-        every = self._course.b.shape[0] // PARTS
-        A, b = self._course.A[every - 1 :: every].numpy(), self._course.b[every - 1 :: every].numpy()
-        return A[:, 0, 1:] * velocity + b[:, :1] * sent
-
-    def _predict(self, state: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _predict(self, state: Array, target: Array) -> Array:
         """Predict the state one step later."""
         with torch.no_grad():
             x, u = torch.from_numpy(state), torch.from_numpy(target - state[3:5])
@@ -351,7 +321,7 @@ class PushTPolicy(DiscPolicy):
         super().__init__(tee_pushing() if system is None else system, _CENTER, delay=delay, adapt=adapt)
 
 
-def from_origin(pose: ArrayLike, center: ArrayLike = _CENTER) -> NDArray[np.float64]:
+def from_origin(pose: ArrayLike, center: ArrayLike = _CENTER) -> Array:
     """Convert the pose (3,) of the body's origin in pixels to that of the centre of its area in units of length."""
     x, y, yaw = np.asarray(pose, np.float64)
     cos, sin = math.cos(yaw), math.sin(yaw)
@@ -416,7 +386,7 @@ class Options:
     scale: float = 1.0
     """Of the outline that the policy is told."""
     adapt: bool = False
-    """Find the scale while it runs, anew in each episode."""
+    """Find scale, friction and drive while it runs, anew in each episode."""
 
 
 def main(o: Options) -> None:

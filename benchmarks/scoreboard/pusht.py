@@ -8,6 +8,7 @@ and, by variant:
 - learned: what is learned from two minutes of random pushing, see `learn_pusht.py`;
 - inertia, friction, outline: one of them wrong by 20 %, the outline also by 10 % (friction, which is zero, is taken for
   0.2); centre of mass: off by 12 px, a fifth of half the T's width;
+- drive: stiffness wrong by 20 %; rough: disc and T have a friction of 0.5, and it is told 0;
 - noise: every coordinate observed with a standard deviation of 2 px, the angle with that of 2 px at the T's radius of
   gyration;
 - delay: actions come one step late, and the plan begins where the system predicts that it will be.
@@ -21,7 +22,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +30,7 @@ import numpy as np
 import torch
 import tyro
 from learn_pusht import learn
-from push_t import CENTER_OF_MASS, GYRATION, PIXELS, STEPS, PushTPolicy, make_env, tee, tee_pushing
+from push_t import CENTER_OF_MASS, DRIVE, GYRATION, PIXELS, STEPS, PushTPolicy, make_env, tee, tee_pushing
 from successes import success_figures, success_text
 
 from difflcs.cli.bench import machine, save
@@ -44,11 +45,13 @@ class Variant:
         policy: makes it; its argument is the seed.
         noise: standard deviation of every observed coordinate [px].
         delay: steps by which its actions come late.
+        friction: of disc and T in the environment, which has none.
     """
 
     policy: Callable[[int], PushTPolicy] = lambda seed: PushTPolicy()
     noise: float = 0.0
     delay: int = 0
+    friction: float = 0.0
 
 
 def told(**changes: Any) -> Variant:
@@ -62,6 +65,9 @@ VARIANTS = {
     "inertia -20 %": told(gyration=GYRATION * 0.8**0.5),
     "inertia +20 %": told(gyration=GYRATION * 1.2**0.5),
     "centre of mass": told(center_of_mass=(0.0, CENTER_OF_MASS[1] + 0.12)),
+    "drive -20 %": told(drive=replace(DRIVE, stiffness=80.0)),
+    "drive +20 %": told(drive=replace(DRIVE, stiffness=120.0)),
+    "rough": Variant(friction=0.5),
     "friction 0.2": told(friction=torch.tensor(0.2, dtype=torch.float64)),
     "outline -20 %": told(shape=tee(0.8)),
     "outline -10 %": told(shape=tee(0.9)),
@@ -83,7 +89,7 @@ class Options:
     variant: str = "known"
     """One of the variants, or "all"."""
     adapt: bool = False
-    """Find the scale of the outline while it runs, anew in each episode."""
+    """Find scale of the outline, friction and drive while it runs, anew in each episode."""
     json: bool = False
     """Print a line of JSON for each variant."""
     out: Path | None = None
@@ -115,6 +121,9 @@ def play(env: Any, policy: PushTPolicy, seed: int, variant: Variant, limit: int 
     noise = np.random.default_rng([seed, 2])
     spread = variant.noise * np.array([1.0, 1.0, 1.0, 1.0, 1.0 / (GYRATION * PIXELS)])
     observation, _ = env.reset(seed=seed)
+    if variant.friction:
+        for shape in env.unwrapped.agent.shapes | env.unwrapped.block.shapes:
+            shape.friction = variant.friction**0.5  # pymunk multiplies both
     policy.reset()
     late = [observation[:2].copy()] * variant.delay
     times, best, success = [], 0.0, False

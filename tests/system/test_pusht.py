@@ -36,18 +36,49 @@ def line_of(capsys):
     return json.loads(capsys.readouterr().out.splitlines()[-1])
 
 
-def test_the_filter_finds_the_scale_by_pushing_and_learns_nothing_away_from_the_body(push_t):
-    scales = torch.tensor([[0.8], [1.0], [1.25]], dtype=torch.float64)
-    lcs = push_t.AnyScale(push_t.tee_pushing())
-    seen = push_t.ContextFilter(lcs, scales, 0.01)
-    x, down = torch.tensor([[0.0, 0.0, 0.0, 0.0, -1.5]], dtype=torch.float64), torch.tensor([[0.0, 0.25]]).double()
-    for step in range(4):
-        x_next = lcs.params(x, scales[2:]).step(x, down).x_next
-        seen.update(x[0], down[0], x_next[0])
-        x = x_next
-        if step == 0:
-            torch.testing.assert_close(seen.probabilities, torch.full_like(seen.probabilities, 1 / 3))
-    torch.testing.assert_close(seen.mean, scales[2], atol=1e-2, rtol=0.0)
+def test_a_step_of_the_disc_is_predicted_as_the_environment_makes_it_and_tells_scale_and_friction(push_t):
+    hypotheses = [[0.8, 0.0], [1.0, 0.0], [1.0, 0.5], [1.25, 0.0]]
+    predict = push_t.DiscContact(push_t.tee_pushing())
+    seen = push_t.ContextFilter(predict, hypotheses, 0.01, hopeless=10.0, angles=(2,))
+    # From below, left of the middle: the disc is away, then pushes, and the body turns beyond half a turn.
+    x = np.array([0.0, 0.0, math.pi - 0.01, -0.3, 1.5, 0.0, 0.0])
+    truth = np.array(hypotheses[2:3])
+    for step in range(6):
+        sent = np.array([0.05, -0.6 if step else 0.0])
+        x_next = predict(x, sent, truth)[0]
+        seen.update(x, sent, x_next)
+        if not step:
+            np.testing.assert_allclose(seen.probabilities, 0.25)
+        A, b, _ = push_t.DRIVE.step()
+        disc = A.numpy() @ x[3:].reshape(2, 2) + np.outer(b.numpy(), sent)
+        x_next[2] = (x_next[2] + math.pi) % (2 * math.pi) - math.pi
+        x = np.concatenate([x_next, disc.ravel()])
+    assert seen.best == 2
+    np.testing.assert_allclose(seen.mean, [1.0, 0.5], atol=1e-2)
+
+
+@needs_gym_pusht
+@pytest.mark.slow  # plays
+def test_predictions_are_those_of_pymunk(push_t, board):
+    env, policy, errors = push_t.make_env(), push_t.PushTPolicy(), []
+    observation, _ = env.reset(seed=1000)
+    for shape in env.unwrapped.agent.shapes | env.unwrapped.block.shapes:
+        shape.friction = 0.3**0.5
+    for _ in range(25):
+        velocity = np.array(env.unwrapped.agent.velocity) / push_t.PIXELS
+        target = policy.act(observation)
+        x = np.concatenate([push_t.from_origin(observation[2:]), observation[:2] / push_t.PIXELS, velocity])
+        observation, *_ = env.step(target)
+        predicted = push_t.DiscContact(policy.told)(x, target / push_t.PIXELS - x[3:5], np.array([[1.0, 0.3]]))[0]
+        happened = push_t.from_origin(observation[2:])
+        error = predicted - happened
+        error[2] = (error[2] + math.pi) % (2 * math.pi) - math.pi
+        moved = np.abs(happened[:2] - x[:2]).max()
+        if moved > 0.02:
+            errors.append(np.abs(error).max())
+    assert len(errors) > 5
+    assert np.median(errors) < 1e-6
+    assert max(errors) < 0.02  # where pymunk's own iterations have not converged
 
 
 @pytest.mark.slow  # plays
@@ -84,6 +115,9 @@ def test_the_scoreboard_of_shapes_prints_its_keys_and_knows_turns_that_mean_the_
     for seed in seeds:
         env.reset(seed=seed)
         assert len(env.obstacles) == 2
+    for pose, reached in (([256, 256, 1.0], True), ([60, 256, 0.0], True), ([20, 256, 0.0], False)):
+        env.goal_pose = np.array(pose)
+        assert env.within_reach is reached
 
 
 def test_a_variant_that_is_none_is_refused(board):
