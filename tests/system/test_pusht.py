@@ -57,7 +57,6 @@ def test_a_step_of_the_disc_is_predicted_as_the_environment_makes_it_and_tells_s
     np.testing.assert_allclose(seen.mean, [1.0, 0.5], atol=1e-2)
 
 
-@needs_gym_pusht
 @pytest.mark.slow  # plays
 def test_predictions_are_those_of_pymunk(push_t, board):
     env, policy, errors = push_t.make_env(), push_t.PushTPolicy(), []
