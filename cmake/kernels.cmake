@@ -70,8 +70,10 @@ function(difflcs_add_instruction_set target isa lanes)
   set(name ${target}_${isa})
   add_library(${name} OBJECT ${DIFFLCS_NATIVE}/mpc.cpp)
   if(lanes GREATER 1)
-    target_sources(${name} PRIVATE ${DIFFLCS_NATIVE}/mpc_adjoint.cpp ${DIFFLCS_NATIVE}/lcp.cpp
-                   ${DIFFLCS_NATIVE}/violation.cpp)
+    target_sources(${name} PRIVATE ${DIFFLCS_NATIVE}/mpc_adjoint.cpp)
+    if(NOT DIFFLCS_C_LIBRARY)  # which has controllers alone
+      target_sources(${name} PRIVATE ${DIFFLCS_NATIVE}/lcp.cpp ${DIFFLCS_NATIVE}/violation.cpp)
+    endif()
   endif()
   set_target_properties(${name} PROPERTIES POSITION_INDEPENDENT_CODE ON)
   target_compile_definitions(${name} PRIVATE DIFFLCS_ISA=${isa} DIFFLCS_LANES=${lanes})

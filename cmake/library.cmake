@@ -7,6 +7,7 @@ include(CMakePackageConfigHelpers)
 file(STRINGS difflcs/__init__.py DIFFLCS_VERSION REGEX "^__version__ = ")
 string(REGEX REPLACE "^__version__ = \"([0-9.]+).*" "\\1" DIFFLCS_VERSION "${DIFFLCS_VERSION}")
 
+add_compile_definitions(DIFFLCS_C_LIBRARY)
 add_library(difflcs_static STATIC ${DIFFLCS_NATIVE}/difflcs_c.cpp)
 difflcs_add_kernels(difflcs_static)
 set_target_properties(difflcs_static PROPERTIES POSITION_INDEPENDENT_CODE ON)

@@ -115,16 +115,22 @@ struct ViolationBatch {
 // The kernels of one instruction set: KERNEL(result, name, parameters). A new kernel is one more line here, and a
 // definition in the namespace DIFFLCS_ISA of a file that cmake/kernels.cmake compiles. A workspace is aligned to 64
 // bytes. Problems [begin, end): no others are read or written.
-#define DIFFLCS_KERNELS(KERNEL)                                                                                        \
+#define DIFFLCS_CONTROLLER_KERNELS(KERNEL)                                                                             \
   /* Size of a workspace in bytes. */                                                                                  \
-  KERNEL(int64_t, lcp_workspace, (int64_t n))                                                                          \
-  KERNEL(void, lcp_solve, (const LcpBatch& batch, int64_t begin, int64_t end, void* workspace, Watch watch))           \
   KERNEL(int64_t, mpc_workspace, (const MpcBatch& batch))                                                              \
   /* Takes problems from the shared counter `next` until none is left, and certifies them. */                          \
   KERNEL(void, mpc_solve, (const MpcBatch& batch, const MpcSolve& solve, int64_t* next, void* workspace, Watch watch)) \
   /* Marks the solved elements whose constraints make them degenerate. */                                              \
   KERNEL(void, mpc_constraints,                                                                                        \
-         (const MpcBatch& batch, const MpcSolve& solve, int64_t begin, int64_t end, void* workspace, Watch watch))     \
+         (const MpcBatch& batch, const MpcSolve& solve, int64_t begin, int64_t end, void* workspace, Watch watch))
+
+#ifdef DIFFLCS_C_LIBRARY  // which has controllers alone
+#define DIFFLCS_KERNELS DIFFLCS_CONTROLLER_KERNELS
+#else
+#define DIFFLCS_KERNELS(KERNEL)                                                                                        \
+  DIFFLCS_CONTROLLER_KERNELS(KERNEL)                                                                                   \
+  KERNEL(int64_t, lcp_workspace, (int64_t n))                                                                          \
+  KERNEL(void, lcp_solve, (const LcpBatch& batch, int64_t begin, int64_t end, void* workspace, Watch watch))           \
   /* Gradients of elements that are block number `block`. */                                                           \
   KERNEL(void, mpc_vjp,                                                                                                \
          (const MpcBatch& batch, const MpcGradient& gradient, int64_t begin, int64_t end, int64_t block,               \
@@ -141,6 +147,7 @@ struct ViolationBatch {
   KERNEL(void, violation_gradient,                                                                                     \
          (const ViolationBatch& batch, const double* z, const double* upstream,                                        \
           double* const gradient[kViolationInputs], void* workspace))
+#endif
 
 struct Kernels {
   const char* isa;

@@ -26,6 +26,7 @@ void mpc_constraints(const MpcBatch& batch, const MpcSolve& solve, int64_t begin
   });
 }
 
+#ifndef DIFFLCS_C_LIBRARY
 void mpc_vjp(const MpcBatch& batch, const MpcGradient& gradient, int64_t begin, int64_t end, int64_t block,
              void* workspace, Watch watch) {
   dispatch(batch, [&](auto variant) {
@@ -33,5 +34,6 @@ void mpc_vjp(const MpcBatch& batch, const MpcGradient& gradient, int64_t begin, 
     Adjoint<typename V::T, typename V::S>(batch, workspace).vjp(gradient, begin, end, block, watch);
   });
 }
+#endif
 
 }  // namespace difflcs::DIFFLCS_ISA
