@@ -53,7 +53,7 @@ class DiscContact:
         self._lengths = np.abs(sides)
         self._along = sides / self._lengths
         self._center = complex(*np.asarray(system.center_of_mass).tolist())
-        self._turns = float(system.gyration) ** -2
+        self._turns = float(torch.as_tensor(system.gyration)) ** -2
         self._radius = float(torch.as_tensor(system.radius).reshape(-1)[0])
         self.drive = system.drive
         self._close = (1 - _LEFT**self.drive.substep) / self.drive.substep
@@ -81,7 +81,7 @@ class DiscContact:
             motion, spin = self._motion(origin, yaw, place, velocity, scale, friction)
             center, yaw = origin + self._center * np.exp(1j * yaw), yaw + self.drive.substep * spin
             origin = center + self.drive.substep * motion - self._center * np.exp(1j * yaw)
-        return np.stack([origin.real, origin.imag, yaw], -1)
+        return np.stack([np.real(origin), np.imag(origin), yaw], -1)
 
     def _course(self, place: complex, velocity: complex, sent: complex) -> tuple[Array, Array]:
         """Compute places and velocities of the disc at the begin of each substep (substeps,)."""
@@ -122,7 +122,7 @@ class DiscContact:
         return gives.velocity + closes.velocity, gives.spin + closes.spin
 
     def _row(self, direction: Array, arm: Array) -> _Row:
-        torque = (np.conj(arm) * direction).imag
+        torque = np.imag(np.conj(arm) * direction)
         return _Row(direction, torque, 1.0 + self._turns * torque**2)
 
     def _nearest(self, points: Array) -> tuple[Array, Array, Array]:
@@ -157,14 +157,14 @@ class _Motion:
 
     def add(self, row: _Row, velocity: complex | Array, total: Array, low: Array | float, high: Array | float) -> None:
         """Add the impulses against a direction by which bodies move as fast along it, as far as totals are allowed."""
-        speed = (np.conj(row.direction) * (self.velocity - velocity)).real + row.torque * self.spin
+        speed = np.real(np.conj(row.direction) * (self.velocity - velocity)) + row.torque * self.spin
         more = np.clip(total + speed / row.mobility, low, high) - total
         total += more
         self._give(row, more)
 
     def press(self, push: _Row, rub: _Row, velocity: complex, friction: Array, limit: Array) -> None:
         """Add the impulses of one contact to bodies at rest: it sticks where friction suffices, else it slides."""
-        speed, slip = -(np.conj(push.direction) * velocity).real, -(np.conj(rub.direction) * velocity).real
+        speed, slip = (-np.real(np.conj(row.direction) * velocity) for row in (push, rub))
         both = self.turns * push.torque * rub.torque
         sticks = (push.mobility * slip - both * speed) / (push.mobility * rub.mobility - both**2)
         most = np.copysign(friction, sticks)
