@@ -127,25 +127,25 @@ struct ViolationBatch {
 #ifdef DIFFLCS_C_LIBRARY  // which has controllers alone
 #define DIFFLCS_KERNELS DIFFLCS_CONTROLLER_KERNELS
 #else
-#define DIFFLCS_KERNELS(KERNEL)                                                                                        \
-  DIFFLCS_CONTROLLER_KERNELS(KERNEL)                                                                                   \
-  KERNEL(int64_t, lcp_workspace, (int64_t n))                                                                          \
-  KERNEL(void, lcp_solve, (const LcpBatch& batch, int64_t begin, int64_t end, void* workspace, Watch watch))           \
-  /* Gradients of elements that are block number `block`. */                                                           \
-  KERNEL(void, mpc_vjp,                                                                                                \
-         (const MpcBatch& batch, const MpcGradient& gradient, int64_t begin, int64_t end, int64_t block,               \
-          void* workspace, Watch watch))                                                                               \
-  KERNEL(int64_t, violation_workspace, (const ViolationBatch& batch))                                                  \
-  /* r and e at z = 0, and the QP min z'Qz / 2 + q'z over z >= 0: Q (2 n_lam, 2 n_lam), of each transition where */    \
-  /* the system is not shared, and q (count, 2 n_lam). Returns whether they are finite, F + F^T - gamma I is */        \
-  /* positive definite and Q is so by a margin, and gamma is not too small for double precision. */                    \
-  KERNEL(bool, violation_qp, (const ViolationBatch& batch, double* Q, double* q, void* workspace))                     \
-  /* r, e and loss (count,) at z (count, 2 n_lam), from r and e at z = 0. Returns the first transition whose e has */  \
-  /* no digits that count, or -1. */                                                                                   \
-  KERNEL(int64_t, violation_value, (const ViolationBatch& batch, const double* z, double* loss, void* workspace))      \
-  /* Gradients of sum(upstream * loss) with z held; those of x, u and x_next only where they are not null. */          \
-  KERNEL(void, violation_gradient,                                                                                     \
-         (const ViolationBatch& batch, const double* z, const double* upstream,                                        \
+#define DIFFLCS_KERNELS(KERNEL)                                                                                       \
+  DIFFLCS_CONTROLLER_KERNELS(KERNEL)                                                                                  \
+  KERNEL(int64_t, lcp_workspace, (int64_t n))                                                                         \
+  KERNEL(void, lcp_solve, (const LcpBatch& batch, int64_t begin, int64_t end, void* workspace, Watch watch))          \
+  /* Gradients of elements that are block number `block`. */                                                          \
+  KERNEL(void, mpc_vjp,                                                                                               \
+         (const MpcBatch& batch, const MpcGradient& gradient, int64_t begin, int64_t end, int64_t block,              \
+          void* workspace, Watch watch))                                                                              \
+  KERNEL(int64_t, violation_workspace, (const ViolationBatch& batch))                                                 \
+  /* r and e at z = 0, and the QP min z'Qz / 2 + q'z over z >= 0: Q (2 n_lam, 2 n_lam), of each transition where */   \
+  /* the system is not shared, and q (count, 2 n_lam). Returns whether they are finite, F + F^T - gamma I is */       \
+  /* positive definite and Q is so by a margin, and gamma is not too small for double precision. */                   \
+  KERNEL(bool, violation_qp, (const ViolationBatch& batch, double* Q, double* q, void* workspace))                    \
+  /* r, e and loss (count,) at z (count, 2 n_lam), from r and e at z = 0. Returns the first transition whose e has */ \
+  /* no digits that count, or -1. */                                                                                  \
+  KERNEL(int64_t, violation_value, (const ViolationBatch& batch, const double* z, double* loss, void* workspace))     \
+  /* Gradients of sum(upstream * loss) with z held; those of x, u and x_next only where they are not null. */         \
+  KERNEL(void, violation_gradient,                                                                                    \
+         (const ViolationBatch& batch, const double* z, const double* upstream,                                       \
           double* const gradient[kViolationInputs], void* workspace))
 #endif
 
