@@ -458,6 +458,7 @@ def unit_rows(unit, values, source="ycb_mesh", goals=1000, **changes):
 @pytest.fixture
 def results(tmp_path):
     """Results of three seeds: violation-only peaks at 6 minutes with 40, 50, 60 %, LCS-RL ends with 70, 80, 90 %."""
+    rows = []
     for seed in range(3):
         shift = 10 * seed
         for task in ("cube", "mug"):
@@ -466,12 +467,11 @@ def results(tmp_path):
                 (Unit(task, "lcs-rl", "ours", seed), (0, 40 + shift, 50 + shift, 70 + shift)),
                 (Unit(task, "violation", "paper", seed), (0, 20, 20, 20)),
             ):
-                records.add(tmp_path, "paper", unit_rows(unit, values))
-        prior = unit_rows(Unit("mug", "violation", "jin-posa", seed), (0, 0, 0, 12), protocol="support")
-        records.add(tmp_path, "paper", prior)
-        transfer = Unit("mug", "ppo", "ours", seed, "cube")
-        records.add(tmp_path, "paper", unit_rows(transfer, (30, 60, 70, 79 + shift)))
-        records.add(tmp_path, "paper", unit_rows(Unit("cube", "pddm", "ours", seed), (0, 2, 2, 4), goals=50))
+                rows.append(unit_rows(unit, values))
+        rows.append(unit_rows(Unit("mug", "violation", "jin-posa", seed), (0, 0, 0, 12), protocol="support"))
+        rows.append(unit_rows(Unit("mug", "ppo", "ours", seed, "cube"), (30, 60, 70, 79 + shift)))
+        rows.append(unit_rows(Unit("cube", "pddm", "ours", seed), (0, 2, 2, 4), goals=50))
+    records.write(records.path_of(tmp_path, "paper"), pd.concat(rows))
     return tmp_path
 
 
