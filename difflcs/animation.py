@@ -19,13 +19,13 @@ _KINDS = {".gif": "GIF", ".png": "PNG"}
 
 
 class Animation:
-    """Frames shown one after another, over and over.
+    """Animation that plays its frames in a loop.
 
-    As the last line of a notebook's cell it plays, also in the notebook's HTML and on code hosts: its picture is an
-    animated PNG, which browsers play wherever they show a PNG.
+    As the last line of a notebook cell it plays, also in the notebook's HTML and on code hosts, because its picture is
+    an animated PNG.
 
     Args:
-        frames: arrays (height, width, 3) of uint8, such as `env.render()` returns, or pictures of Pillow; one size.
+        frames: arrays (height, width, 3) of uint8, such as `env.render()` returns, or Pillow images; all of one size.
         fps: frames a second.
         colors: size of the palette that all frames share, at most 256; fewer make smaller files.
         dither: mix colours that the palette lacks from dots of others; makes larger files.
@@ -69,7 +69,7 @@ class Animation:
         return cls(drawn, fps, **options)
 
     def save(self, path: str | Path) -> None:
-        """Write a file, a GIF or an animated PNG by its ending.
+        """Write a GIF or an animated PNG, by the ending of the file's name.
 
         Raises:
             InvalidInputError: the name ends in neither .gif nor .png.

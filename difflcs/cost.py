@@ -214,10 +214,9 @@ class CostModule(Protocol):
     """Interface of modules that return the cost near some states: the counterpart of `LCSModule`.
 
     A layer calls it at each call, a controller at each step. If it is a `torch.nn.Module`, its parameters belong to the
-    layer. `isinstance(value, CostModule)` checks for the method alone. A module whose cost is the same at all
-    states may say so by an attribute `constant = True`: then it can be exported. One whose cost is a model of a
-    function of the state, near the states where it is asked, says `local = True`: then `LCSMPCLayer(passes=2)` asks it
-    at each state of a plan.
+    layer. `isinstance(value, CostModule)` checks for the method alone. A module whose cost is the same at all states
+    may have an attribute `constant = True`; then it can be exported. One whose cost approximates a function of the
+    state near the states passed has `local = True`; then `LCSMPCLayer(passes=2)` asks it at each state of a plan.
     """
 
     def at(self, x: Tensor, goal: Tensor | None = None, context: Tensor | None = None) -> QuadraticCost | CostSequence:

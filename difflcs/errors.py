@@ -13,7 +13,7 @@ class DiffLCSError(Exception):
     """Base class of every error difflcs raises on purpose.
 
     Attributes:
-        see: reference for the end of the message, which every installation has: a Python expression or a command.
+        see: where to read more, named at the end of the message: a Python expression or a command of any installation.
     """
 
     see: ClassVar[str | None] = None

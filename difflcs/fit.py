@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Transitions(NamedTuple):
-    """Transitions of a system, those of one episode one after the other; made to be unpacked into a loss.
+    """Transitions of a system, in order within each episode; can be unpacked into a loss.
 
     Attributes:
         x: (N, n_x) states.
@@ -102,14 +102,14 @@ class Transitions(NamedTuple):
 class FitReport:
     """Errors of a system's predictions on transitions, by state, by contact and by number of steps.
 
-    Errors are root mean squares. Those of single states are in parts of `step`: what standing still has is 1.
+    Errors are root mean squares. Those of single states are fractions of `step`: standing still has 1.
 
     Attributes:
         step: (n_x,) how far each state moves in a step [its unit].
         error: (n_x,) of one step of the system.
         linear: (n_x,) of an affine system by least squares, which has no contacts.
         acts: (n_lam,) share of the transitions in which a force is larger than its gap.
-        without: (n_lam,) factor by which the error grows, all states together, if this force is taken away.
+        without: (n_lam,) factor by which the error of all states together grows if this force is removed.
         gain: (N, n_lam) how much more squared error each transition has without a force: the data that it explains.
         rollout: (H, 3) error after 1 to H steps of the system, of the affine system and of standing still, in parts of
             the spread of the states; NaN where no episode is that long.

@@ -144,8 +144,8 @@ def suggest_scales(x: Tensor, u: Tensor, x_next: Tensor) -> Scales:
 class ScaledLCS(PredictiveModule):
     """An `LCSModule` that was learned in units of `Scales`, for states and actions in the units of the data.
 
-    Its parameters are those of the module within, so that a layer that takes it goes on learning in these units. It
-    predicts in the units of the data: `forward` and `rollout` are those of `LCSModel`.
+    Its parameters are those of the module within, so a layer around it learns in the units of `Scales`. It predicts in
+    the units of the data: `forward` and `rollout` are those of `LCSModel`.
     """
 
     def __init__(self, lcs: LCSModule, scales: Scales):

@@ -54,24 +54,24 @@ class LCSMPCLayer(nn.Module):
             if an nn.Parameter. None: no bound.
         u_max: upper bound, likewise.
         backend: name of a registered backend, or an instance with options.
-        relaxation: λ·s of the relaxed complementarity, > 0, at which plan and gradient are. 1e-7 is nearly hard
-            contact; with training_relaxation=1e-5 gradients stay smooth in training.
+        relaxation: product λ·s of the relaxed complementarity of plan and gradient, > 0. 1e-7 is nearly hard contact;
+            with training_relaxation=1e-5 gradients stay smooth in training.
         on_failure: "raise" a `SolveError` when an element is not solved, or "mask" it: finite numbers inside the
             bounds, zero gradient, one `SolveWarning` per layer.
         bounds: `StageBounds`, instead of u_min and u_max.
         constraints: `LinearConstraints` or a `ConstraintSequence`, hard or soft.
-        training_relaxation: relaxation in training mode (`layer.train()`), if another; `layer.eval()` returns to
+        training_relaxation: relaxation in training mode (`layer.train()`), if it differs; `layer.eval()` returns to
             `relaxation`. A larger one gives smoother gradients across contacts.
         barrier: weight of a logarithmic barrier of the action bounds [cost units]; 0 for none. An action at a bound has
             zero gradient; with a barrier it keeps a small distance and a gradient. The objective includes the barrier.
             Sensible weights are 1e-3 to 1e-1 of the objective; far smaller ones make the problem stiff.
-        passes: how often a call solves, where the system of a module depends on the state: each pass after the first
-            plans with the module linearised along the actions of the pass before (`difflcs.sequence_along`), and with
-            a cost module that says `local = True`, such as `MujocoCost`, asked at the states of that plan, warm. The
-            plan, its status and its gradient are those of the last pass, whose systems count as those of x0 do in a
-            single one; they are not compared, as objectives of two systems do not say which plan is better. Two see
-            what contacts become on the way; more converge where steps are small beside what they change, else they may
-            come and go. Matrices with a cost that is no such module are solved once.
+        passes: number of solves in a call, where the system of a module depends on the state. Each pass after the first
+            is warm-started and plans with the module linearised along the actions of the pass before
+            (`difflcs.sequence_along`); a cost module with `local = True`, such as `MujocoCost`, is asked at the states
+            of that plan. Plan, status and gradient are those of the last pass, whose systems are treated as that of x0
+            is in a single pass. Passes are not compared, as objectives of two systems do not say which plan is better.
+            Two see how contacts change on the way; more converge where each changes little, otherwise plans may
+            alternate. Matrices with a cost that is no such module are solved once.
 
     Raises:
         InvalidInputError and its kinds: an argument does not fit.

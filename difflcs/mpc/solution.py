@@ -36,21 +36,21 @@ class Primal(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class MPCSolution:
-    """Solutions of a batch of MPC problems; they certify themselves.
+    """Solutions of a batch of MPC problems, each with its certificate.
 
     Attributes:
         x: (..., H+1, n_x) planned states, x[..., 0, :] = x0. Differentiable, as u, lam and objective.
         u: (..., H, n_u) planned actions.
         lam: (..., H, n_lam) complementarity variables.
-        mu: (..., H+1, n_c) multipliers of the constraints: what a unit more of g would save. Detached.
+        mu: (..., H+1, n_c) multipliers of the constraints: the cost that one more unit of g would save. Detached.
         objective: (...) cost of the plan.
         status: (...) `Status` as int8.
         iterations: (...) iterations of the solver, int32.
-        kkt_residual: (...) largest violation of the optimality conditions by the numbers above, without units; at
-            most 1e-6 where an exact backend has solved the plan. See `difflcs.mpc.kkt.residual`.
+        kkt_residual: (...) largest violation of the optimality conditions by the numbers above, dimensionless; at most
+            1e-6 where an exact backend has solved the plan. See `difflcs.mpc.kkt.residual`.
         solve_time: (...) seconds spent on each problem.
-        violation: (...) largest violation of a constraint over the stages, soft ones too [its units]; 0 without any. Of
-            an INFEASIBLE problem it is what remains at a plan that violates as little as can be.
+        violation: (...) largest violation of a constraint over the stages, soft ones too [its units]; 0 without any.
+            For an INFEASIBLE problem it is what remains at a plan that violates as little as possible.
     """
 
     x: Tensor
@@ -80,7 +80,7 @@ class MPCSolution:
 
     @property
     def problem(self) -> MPCProblem:
-        """The problem that was solved. It is no field, so that a TensorDict of the fields has the batch's shape."""
+        """The problem that was solved. It is not a field, so that a TensorDict of the fields has the batch's shape."""
         return self.__dict__["_problem"]
 
     @property

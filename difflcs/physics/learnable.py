@@ -27,8 +27,8 @@ class ContactLCS(nn.Module):
     It is an `LCSModule`. Its system follows the state: contacts are where the shapes are. So it is learned from little
     data, by `violation_loss` or `prediction_loss` from transitions, or through an `LCSMPCLayer` by PPO.
 
-    All parameters are without units and of one scale, so that one learning rate serves: logarithms of positive
-    quantities, and distances in parts of `length`. They start at zero, at the physics that was passed.
+    All parameters are dimensionless and of one scale, so that one learning rate suffices: logarithms of positive
+    quantities, and distances as fractions of `length`. They start at zero, at the physics that was passed.
 
     Args:
         physics: the known or guessed physics.

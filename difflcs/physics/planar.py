@@ -73,13 +73,13 @@ class Drive(ABC):
 
 @dataclass(frozen=True, eq=False)
 class PositionDrive(Drive):
-    """A disc goes where it is told, as far as what it meets lets it: p₊ = p + gain · u + compliance · force.
+    """A disc that goes where it is told, as far as contact lets it: p₊ = p + gain · u + compliance · force.
 
     A controller that holds a place is a spring. With none of its compliance in the model, a plan believes that a disc
     moves on while it presses on a body that is blocked, and two discs squeeze a body between them.
 
     Attributes:
-        gain: part of the commanded increment that it makes in a step; a number, (2,) or (n_discs, 2).
+        gain: fraction of the commanded increment that it moves in a step; a number, (2,) or (n_discs, 2).
         compliance: by how far a unit of force pushes it back, ≥ 0, 0 for a disc that nothing stops; a number, (2,),
             (n_discs, 1) or (n_discs, 2) [length per force, as the mobility of the body is 1 in quasi-static motion].
     """
@@ -101,7 +101,7 @@ class PositionDrive(Drive):
 
 @dataclass(frozen=True, eq=False)
 class PDDrive(Drive):
-    """A disc is led by a PD controller to a place relative to where it is: u = target − p; nothing pushes it back.
+    """A disc driven by a PD controller to a target relative to where it is, u = target − p; contact does not stop it.
 
     In each of `substeps` of `substep` seconds: v ← v + (stiffness · (target − p) − damping · v) · substep, then
     p ← p + v · substep, with the target held.

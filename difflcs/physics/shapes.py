@@ -90,8 +90,8 @@ class Polygon(Shape):
     """A simple polygon, convex or not.
 
     Attributes:
-        vertices: (n, 2) corners in order, counterclockwise; clockwise ones are reversed. Numbers, or a tensor, of which
-            the polygon has a copy, but for one that requires a gradient: this is the tensor itself, as it is given.
+        vertices: (n, 2) corners in order, counterclockwise; clockwise ones are reversed. Numbers, or a tensor, which is
+            copied unless it requires a gradient.
 
     Raises:
         ShapeError, InvalidInputError: not at least three corners, no area, two corners at one place in succession, or

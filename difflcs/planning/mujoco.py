@@ -1,4 +1,4 @@
-"""Places round a body of any MuJoCo model, and ways of end effectors that are on slides or at the end of an arm.
+"""Places round a body of any MuJoCo model, and paths of end effectors that are on slides or at the end of an arm.
 
 Needs the extra `envs`. MuJoCo's kinematics say where end effectors are, and the gaps of the `MujocoLCS` itself what is
 free of collisions: what may not touch there is not in the way.
@@ -32,7 +32,7 @@ class BodyPlaces:
 
     A place is where the end effectors are, in coordinates of the body. From all sides an end effector comes straight
     towards the middle of the body, until only the gap is left. Each in turn goes to each place while the others stay.
-    Their joints follow by inverse kinematics, within their ranges; how an end effector is turned there is left open.
+    Their joints follow by inverse kinematics, within their ranges; the orientation of an end effector is left open.
 
     Args:
         module: the system, whose contacts say what is in the way.
@@ -156,10 +156,10 @@ def _dofs_above(model: Any, body: int) -> set[int]:
 
 
 class BodyTravel:
-    """Ways of the end effectors of `BodyPlaces`: straight, round the body, or over it, the shortest that is free.
+    """Paths of the end effectors of `BodyPlaces`: straight, round the body, or over it, the shortest that is free.
 
-    Ways are straight in the coordinates of the joints, between corners round the body and above it, and free where the
-    robot's gaps stay open. The action is that after which the joints come to rest nearest to the next corner.
+    Paths are straight in joint coordinates between corners round the body and above it, and free where the robot's gaps
+    stay open. The action is that after which the joints come to rest nearest to the next corner.
 
     Args:
         places: of the same end effectors.

@@ -45,7 +45,7 @@ class Workspace:
         low: (x, y) of its lower corner [length].
         high: (x, y) of its upper corner.
         step: largest |u| of each component [length], > 0.
-        n_discs: discs, whose places are x[3 : 3 + 2 · n_discs] as in `difflcs.physics.PlanarPushing`.
+        n_discs: number of discs, whose places are x[3 : 3 + 2 · n_discs] as in `difflcs.physics.PlanarPushing`.
 
     Raises:
         InvalidInputError and its kinds: a value does not fit.

@@ -52,11 +52,11 @@ class Mode(enum.StrEnum):
 
 @dataclass(frozen=True)
 class SamplingSettings:
-    """Settings of the choice between pushing and travelling. Gains and prices are parts of the cost of standing still.
+    """Choice between pushing and travelling. Gains and prices are fractions of the cost of standing still.
 
     Attributes:
-        keep: it goes on pushing while the gain here is at least this part of the best score, in [0, 1]: hysteresis.
-        smallest_gain: with a smaller gain here the robot looks for another place.
+        keep: the robot goes on pushing while its gain is at least this fraction of the best score, in [0, 1].
+        smallest_gain: with a smaller gain at its place the robot looks for another one.
         switch_price: price of any journey.
         travel_price: price of a journey by its length [1/length].
         patience: steps after which a journey ends wherever it is.
@@ -82,8 +82,8 @@ class SamplingSettings:
 class Decision:
     """Decision of the policy in one step, with the numbers behind it.
 
-    Row 0 is where the robot is, the others are the places. While it travels nothing is compared: then what follows
-    `target` is that of the step in which the journey began.
+    Row 0 is where the robot is, the others are the places. While it travels nothing is compared: the attributes after
+    `target` are then those of the step in which the journey began.
 
     Attributes:
         mode: push or travel.
@@ -92,7 +92,7 @@ class Decision:
         target: (n_x,) state to which it travels, with the body where it is now; None where it pushes.
         states: (1 + n_places, n_x) the states that were compared.
         gains: (1 + n_places,) saving of each plan; −∞ where the place is not allowed or its problem was not solved.
-        scores: (1 + n_places,) gains less the price of the way; −∞ also where a place was barred.
+        scores: (1 + n_places,) gains minus the price of the path; −∞ also where a place was barred.
         standing: cost of standing still where the robot is.
         solution: the plans of all states.
     """
@@ -109,7 +109,7 @@ class Decision:
 
     @property
     def gain(self) -> float:
-        """Gain where the robot is, as a part of the cost of standing still."""
+        """Gain where the robot is, as a fraction of the cost of standing still."""
         return float(self.gains[0]) / max(self.standing, 1e-300)
 
 
@@ -121,8 +121,8 @@ class SamplingPolicy:
         while ...:
             u = policy.act(x, goal)
 
-    It keeps its mode from step to step: one policy for each robot, and `reset` at the begin of an episode. An action
-    must be relative to the robot: with u = 0 it stands still.
+    It keeps its mode from step to step: use one policy for each robot, and `reset` at the start of an episode. An
+    action must be relative to the robot: with u = 0 it stands still.
 
     Args:
         mpc: a layer around any `LCSModule`, which is asked for the system at a batch of states (1 + n_places, n_x);
@@ -131,8 +131,8 @@ class SamplingPolicy:
         travel: how they get there, see `Travel`.
         settings: when to push and when to travel.
         bounds: bounds of the actions at some states, instead of the layer's; `Workspace.bounds`, for example.
-        angles: components of the goal that are angles [rad]; the state has each at the same index. Of all turns that
-            mean the same, that next to the state is the goal.
+        angles: components of the goal that are angles [rad]; the state has each at the same index. Of all equivalent
+            angles, the one nearest to the state is the goal.
 
     Raises:
         InvalidInputError and its kinds: an argument does not fit.
@@ -161,7 +161,7 @@ class SamplingPolicy:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the mode, as at the begin of an episode."""
+        """Forget the mode, as at the start of an episode."""
         self._decision: Decision | None = None
         self._place: Tensor | None = None
         self._steps = 0

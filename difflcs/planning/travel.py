@@ -1,4 +1,4 @@
-"""Ways of end effectors to another place without touching the body."""
+"""Paths of end effectors to another place without touching the body."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SPEED, _TOUCH = 0.02, 1e3  # prices of a speed at the end [length per speed] an
 
 
 class Travel(Protocol):
-    """A way from a state to another that differs from it in the end effectors alone."""
+    """A path from a state to another that differs from it only in the end effectors."""
 
     def distance(self, x: Tensor, states: Tensor) -> Tensor:
         """Length (n,) of the way from x (n_x,) to each of the states (n, n_x), or an estimate of it."""
@@ -37,11 +37,11 @@ class Travel(Protocol):
 
 
 class PlanarTravel:
-    """Discs on a plane go round the shape of the body, as fast as their drive lets them.
+    """Travel of discs on a plane round the shape of the body, as fast as their drive allows.
 
-    The way is the shortest by straight lines over waypoints on a curve round the body, inside the workspace if there is
-    one. A drive is linear: the action by which a disc ends a step at a given point is known, and so is its course. Of
-    many points of the way for the end of this step, and for that of the next, a disc is sent to those by which it comes
+    The path is the shortest one of straight lines between waypoints on a curve round the body, inside the workspace if
+    there is one. A drive is linear: the action that takes a disc to a given point in one step is known, and so is its
+    course. Of many points on the path, for the end of this step and of the next, a disc is sent to those that bring it
     farthest without touching the body. Actions are relative, as in `difflcs.physics.PlanarPushing`. Discs ignore each
     other.
 

@@ -86,7 +86,7 @@ class PhysicsSpec:
     Attributes:
         make_system: makes the `LCSModule`, a torch.nn.Module with the numbers as they are guessed, such as a
             `difflcs.physics.ContactLCS`. Called when it is needed: nothing is simulated at import.
-        scale: (n_x,) how much of each state counts alike in a fit [unit of the state].
+        scale: (n_x,) sizes of errors of the states that count alike in a fit [unit of the state].
         make_cost: makes the cost that an MPC with this system plans with; None: that of the task. What is a good plan
             in a few steps depends on what the system knows; the rewards stay those of the task.
         horizon: steps that it plans ahead; None: that of the task.
@@ -95,7 +95,7 @@ class PhysicsSpec:
 
     Raises:
         InvalidInputError: a number does not fit.
-        DTypeError: something else where a function is wanted.
+        DTypeError: a value that is no function where one is expected.
     """
 
     make_system: Callable[[], Any]
@@ -126,10 +126,10 @@ class TaskSpec:
     Attributes:
         name: what it is called, on the command line too.
         summary: what is to be done, in one sentence.
-        env: Gymnasium id, with its module ("my_package:Push-v0") if that registers it, or what makes one environment
-            from keyword arguments. Observations Dict(state=Box(n_x), goal=Box(n_goal)), actions Box(n_u), all float64;
-            episodes of fixed length that end by truncation; `success` in every step's info; a goal can be chosen by
-            `reset(options={"goal": …})`; everything random comes from the seed of `reset`.
+        env: Gymnasium id, with its module ("my_package:Push-v0") if that registers it, or a function that makes one
+            environment from keyword arguments. Observations Dict(state=Box(n_x), goal=Box(n_goal)), actions Box(n_u),
+            all float64; episodes of fixed length that end by truncation; `success` in every step's info; a goal can be
+            chosen by `reset(options={"goal": …})`; everything random comes from the seed of `reset`.
         env_kwargs: keyword arguments of the environment.
         make_cost: makes the cost of the MPC, whose sizes are those of the task: a `GoalCost`, or a `CostModule` with
             n_x, n_u and n_goal, such as a `MujocoCost`.
@@ -143,13 +143,12 @@ class TaskSpec:
         outcome: reward and success of a transition, the environment's own; a function as `Outcome` says.
         n_context: size of the context, such as the mass of a block, that the environment gives in its observations
             Dict(state, goal, context=Box(n_context)), the same for a whole episode; 0: it gives none.
-        failure_penalty: what that reward has lost in the last step of an episode without success. Nothing is subtracted
-            here: PPO must know how much of that one reward is no cost of a step, see `RewardScale`.
+        failure_penalty: penalty within that reward in the last step of an episode without success. Nothing is
+            subtracted here: PPO must know how much of that one reward is not the cost of a step, see `RewardScale`.
         goal: names and units of the components of a goal.
-        errors: names and units of what remains to the goal, as the environment's info calls them: with `_error` at the
-            end.
-        caption: the info of a step → what a picture says of it; None: the errors.
-        picture: keyword arguments that the environment takes for pictures to be looked at, such as their size.
+        errors: names and units of the errors in the environment's info; the names end in `_error`.
+        caption: the info of a step → the caption of its picture; None: the errors.
+        picture: keyword arguments of the environment for pictures to be looked at, such as their size.
         example_goals: goals to show what was learned, the best one first.
         describe: environment (single or vector) → what decides whether results can be compared, in JSON types, such as
             the object and its mass. A resumed run must find the same.
@@ -158,11 +157,11 @@ class TaskSpec:
         model_name: what its models are called in the zoo; None: as the task.
         physics: what is known of its physics, for methods that start from it; None: nothing.
         planar: the state is the pose (x, y [m], yaw [rad]) of a body on a plane, and after it points (x, y) of the
-            plane; actions are vectors in it; and all moves alike wherever the body is, as `BodyFrameLCS` has it.
+            plane; actions are vectors in it; and motion is the same wherever the body is, as for `BodyFrameLCS`.
 
     Raises:
         InvalidInputError: a value does not fit.
-        DTypeError: something else where a function is wanted.
+        DTypeError: a value that is no function where one is expected.
     """
 
     name: str

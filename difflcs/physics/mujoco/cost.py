@@ -39,7 +39,7 @@ class Position(_Squares):
     """Σ wᵢ (pᵢ − goalᵢ)² of the position p of a body, site or geom [m²].
 
     Attributes:
-        of: its name. Where several have it, the body, then the site; "site:name" and "geom:name" say which.
+        of: its name. If several have it, the body is meant, then the site; "site:name" and "geom:name" say which.
         goal: (3,) in the world [m]; None: that of each call.
     """
 
@@ -51,13 +51,13 @@ class Position(_Squares):
 class Orientation(_Squares):
     """Σ wᵢ rᵢ² of the rotation vector r from the orientation of a body, site or geom to a goal [rad²].
 
-    r is the logarithm of the rotation that is left, in coordinates of the thing, and near the state where the cost is
-    asked for it changes as the thing turns.
+    r is the logarithm of the remaining rotation, in coordinates of the object; near the state where the cost is
+    linearised it is taken to change as the object turns.
 
     Attributes:
         of: its name, as for `Position`.
         goal: (4,) quaternion w, x, y, z of any length; None: that of each call.
-        reach: angle [rad] from which on a goal that is farther away pulls no harder; None: there is none.
+        reach: angle [rad] beyond which a goal pulls no harder; None: no limit.
     """
 
     of: str
@@ -133,7 +133,7 @@ class MujocoCost(TensorFields):
 
     Args:
         module: the `MujocoLCS` whose states these are, also after the reference of its rotations has moved.
-        terms: what costs.
+        terms: the terms of the cost.
 
     Attributes:
         n_x, n_u: sizes of the module.

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 class ContactGroup(NamedTuple):
-    """So many contacts of these geoms, the nearest.
+    """A number of contacts of some geoms, the nearest ones.
 
     Attributes:
         of: geoms by name or number, or bodies with all their geoms: contacts in which one of them takes part; a pair of

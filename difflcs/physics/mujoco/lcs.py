@@ -82,13 +82,13 @@ class MujocoLCS:
             (contype, conaffinity, pairs, excludes; none where contacts or constraints are disabled).
         friction: coefficient μ of all contacts; None: that of the geoms, as MuJoCo combines them.
         torsion: False to leave out the torsional friction of contacts with condim 4 or 6, two forces more for each.
-        compliance: how far a contact gives way, in parts of how far the same force moves the two bodies apart (the
+        compliance: how far a contact gives way, as a fraction of how far the same force moves the two bodies apart (the
             median over all pairs), > 0. It makes F + Fᵀ ≻ 0.
         cone: model of friction, see `difflcs.physics.complementarity`.
         mobility: of a quasi-static motion: "inertia" (the inverse of the mass matrix), "damping" (of the joints'
             damping), or what a unit of force on each degree of freedom does, (nv,) or (nv, nv). Only ratios matter, as
             `compliance` is in parts of it. A body that cannot move along a degree of freedom has 0 there.
-        relative: True if the actions of `position` actuators on joints count from where these are.
+        relative: True if the actions of `position` actuators on joints are relative to where these are.
         ctrl: (nu,) nominal control of a dynamic motion, MuJoCo's `ctrl`; `params(x, context)` takes one for each
             state. None: that at which servos have no force where the state is, and for other actuators that of `data`.
         length: unit of gaps for the relaxation of the MPC, see `contact_lcs` [m]; None: the median radius of the

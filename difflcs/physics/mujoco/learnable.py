@@ -73,14 +73,14 @@ class _Entry(NamedTuple):
 
 
 class LearnableMujocoLCS(nn.Module):
-    """A MuJoCo model whose numbers are learned: an `LCSModule` as `MujocoLCS`, from wherever it errs.
+    """A MuJoCo model whose numbers are learned; an `LCSModule` like `MujocoLCS`.
 
     Learn it by `violation_loss` or `prediction_loss` from transitions, or through an `LCSMPCLayer` by PPO. The matrices
-    are differentiable in the parameters, in the states and in the nominal controls: by differences of systems of
-    changed models, two for each number, all states at once. Where one of the two has other contacts, the other counts.
+    are differentiable in the parameters, in the states and in the nominal controls: by central differences, two systems
+    of changed models for each number, all states at once. Where contacts differ on one side, only the other counts.
 
-    The parameters are one vector without units: logarithms of factors, and offsets in parts of `length`. They start at
-    zero, at the model that was passed.
+    The parameters are one dimensionless vector: logarithms of factors, and offsets as fractions of `length`. They start
+    at zero, at the model that was passed.
 
     Args:
         model: the MuJoCo model.

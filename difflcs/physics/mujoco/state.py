@@ -33,9 +33,9 @@ class MujocoState:
 
     The coordinate of a slide or a hinge is its `qpos`. A free joint has its position and the rotation vector from its
     orientation in `reference`, a ball the rotation vector alone: below half a turn each orientation has one, and at a
-    whole turn the coordinates are singular, so that `tangent` refuses. So give a reference near which things happen.
-    `follow` moves the reference along: numbers of before then count from another orientation.
-    Quaternions are read as MuJoCo does: of any length, and of zeros as no rotation.
+    whole turn the coordinates are singular, so that `tangent` refuses. So give a reference near the motion. `follow`
+    moves the reference along: states from before then refer to another orientation. Quaternions are read as MuJoCo
+    does: of any length, and of zeros as no rotation.
 
     Args:
         model: the MuJoCo model.

@@ -154,7 +154,7 @@ class Ensemble(nn.Module):
         generator: torch.Generator,
         decay: bool = False,
     ) -> float:
-        """Fit every network to all transitions (N, ·), in orders of their own, from the weights that they have.
+        """Fit every network to all transitions (N, ·), each in its own order, from its present weights.
 
         Args:
             x: (N, n_x) states.

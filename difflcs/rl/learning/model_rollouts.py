@@ -45,7 +45,7 @@ class ModelRolloutSettings(Settings):
     iterations: int = bounded(5, minimum=0)
     """Iterations of PPO on model rollouts before each one on real episodes; 0: none, as in the paper."""
     last: int = bounded(0, minimum=0)
-    """Times that as many follow the last real episodes, so that these teach too; for trainings of few minutes."""
+    """How many times as many follow the last real episodes, so that these teach too; for trainings of few minutes."""
     rollouts: int = bounded(120, minimum=1, maximum=MOST_ENVS)
     """Model rollouts per iteration."""
     steps: int = bounded(12, minimum=1)

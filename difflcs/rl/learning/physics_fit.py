@@ -1,4 +1,4 @@
-"""Fit of a physics with known contacts to the episodes of its own MPC.
+"""Fit of known physics to the episodes of its own MPC.
 
 A task with known physics (`PhysicsSpec`) has a controller that works before anything is learned.
 Its episodes, with some noise, are the data; the few numbers of the physics are fitted to all of them, and the next
@@ -35,7 +35,7 @@ _XI = 0.02
 
 @dataclass(frozen=True)
 class PhysicsFitSettings(Settings):
-    """Settings of the fit of a physics."""
+    """Settings of the fit of known physics."""
 
     rollouts: int = bounded(15, minimum=1, maximum=MOST_ENVS)
     """Episodes per iteration."""
@@ -44,16 +44,16 @@ class PhysicsFitSettings(Settings):
     steps: int = bounded(60, minimum=1)
     """Steps of Adam per iteration, on the data of the whole training."""
     batch: int | None = bounded(None, minimum=1)
-    """Transitions of a step, drawn anew for each; None: all. A system of MuJoCo takes 5 to 10 ms for each of them."""
+    """Transitions per step, drawn anew for each; None: all. A MuJoCo system takes 5 to 10 ms per transition."""
     learning_rate: float = bounded(0.02, above=0)
     """Step size of Adam, which begins anew in each iteration."""
     last_rate: float = bounded(1.0, above=0, maximum=1)
-    """Part of it that is left at the end of an iteration, which it falls to linearly."""
+    """Fraction of it at the end of an iteration, to which it falls linearly."""
     loss: Literal["violation", "prediction"] = "violation"
     """The violation loss, or the squared error of the next state through the relaxed contacts."""
     explained: float | None = bounded(None, above=0, maximum=1)
-    """Share of transitions that count by their loss, the others by its logarithm, as impacts should not decide; None:
-    all count by their loss."""
+    """Share of transitions that count by their loss, the others by its logarithm, so that impacts do not dominate;
+    None: all count by their loss."""
 
 
 def physics_loss(

@@ -117,7 +117,7 @@ class Source:
 
 
 class PPO(Trainer):
-    """The main phase, see `Trainer`; `make_ppo` puts one together.
+    """The main phase, see `Trainer`; `make_ppo` builds one.
 
     Args:
         actor: the policy, from `difflcs.rl.make_actor`; its model is trained in place: an `LCSModel`, any other
@@ -136,9 +136,9 @@ class PPO(Trainer):
         first_iteration: iterations done before.
         max_kl: KL divergence at which an iteration ends early.
         final_step: factor on all steps, falling linearly from 1 to this.
-        models: plays episodes in networks besides those of the robot; None: real ones alone, as in the paper.
+        models: plays episodes in networks, besides the robot's own; None: real episodes alone, as in the paper.
         practice: source of model rollouts, if there are models.
-        incumbent: holds the model to hand out, not the actor's; the first episodes are those of the start.
+        incumbent: holds the model to hand out, in place of the actor's; the first episodes are those of the start.
 
     Raises:
         InvalidInputError: an argument does not fit.

@@ -34,8 +34,8 @@ class Evaluation:
         successes: goals reached.
         goals: goals tried, one episode each.
         seed: what the goals and initial states were drawn from.
-        median_errors: name → median over the goals of what remains after the last step, of each error that the
-            environment reports, in its units.
+        median_errors: name → median over the goals of each error that the environment reports after the last step, in
+            its units.
         solver_failures: MPC solves that did not converge.
         solves: MPC solves.
         unstable: episodes in which the simulation broke down; they count as failures.

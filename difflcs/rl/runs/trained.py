@@ -26,7 +26,7 @@ class TrainedPolicy:
         method: name of the method; "known physics" if nothing is learned.
         backend: MPC solver; None without one.
         policy: from states and goals to plans.
-        finished: True if its training is.
+        finished: True if its training has finished.
         object: description of what it was trained on, by the environment; None if there is none.
         run: the run, if it is one.
         card: the card, if it is a model of the zoo.

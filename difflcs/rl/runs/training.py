@@ -57,7 +57,7 @@ class TrainConfig(Settings):
     evaluation_seed: int = bounded(0, minimum=0)
     """Seed of the evaluation goals, the same for every evaluation of the run."""
     method: Method = field(default_factory=LCSRLMethod)
-    """The method of learning, with the settings of that method; its name is its default instance."""
+    """The method of learning with its settings; a name stands for the method with its default settings."""
 
     def __post_init__(self) -> None:
         if isinstance(self.method, str):
