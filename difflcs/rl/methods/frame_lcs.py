@@ -25,7 +25,6 @@ class FrameMethod(LCSRLMethod):
     takes_init: ClassVar[bool] = False
     model: ClassVar[type[LCSModel]] = BodyFrameLCS
     learn_c: ClassVar[bool] = True
-    keep_best: ClassVar[bool] = True
 
     def check(self, minutes: float) -> None:
         """See `Method`: the warm-up alone will do."""

@@ -34,7 +34,6 @@ class LCSRLMethod(LCSMethod):
     version: ClassVar[int] = 2
     summary: ClassVar[str] = "the warm-up (Algorithm 1), and then PPO through the MPC (Algorithm 2)"
     reports: ClassVar[tuple[type, ...]] = (WarmupReport, PPOReport)
-    keep_best: ClassVar[bool] = False
 
     def check(self, minutes: float) -> None:
         """See `Method`."""
@@ -52,7 +51,7 @@ class LCSRLMethod(LCSMethod):
         return LCSRL(
             warmup_phase(work, lcs, policy, self.warmup),
             round(self.warmup_minutes * work.task.steps_per_minute),
-            lambda *begun: main_phase(work, policy, self.ppo, self.models, *begun, keep_best=self.keep_best),
+            lambda *begun: main_phase(work, policy, self.ppo, self.models, *begun),
         )
 
     def smoke(self) -> Self:
