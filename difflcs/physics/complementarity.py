@@ -103,7 +103,7 @@ class Bounded(NamedTuple):
     a drag, chosen so that it gives back at most a thousandth of the way s.
 
     Attributes:
-        offset: (..., n_bounded) zero for friction; what it lets creep in a step comes off.
+        offset: (..., n_bounded) zero for friction, less what may creep in a step.
         slide: (..., n_bounded, n_x) derivative of the way with respect to the state.
         lower: (..., n_bounded) least force along `slide`.
         upper: (..., n_bounded) largest force, at least `lower`.

@@ -76,7 +76,7 @@ class PositionDrive(Drive):
     """A disc that goes where it is told, as far as contact lets it: p₊ = p + gain · u + compliance · force.
 
     A controller that holds a place is a spring. With none of its compliance in the model, a plan believes that a disc
-    moves on while it presses on a body that is blocked, and two discs squeeze a body between them.
+    moves on while it presses on a body that is blocked, and that two discs can go on squeezing a body between them.
 
     Attributes:
         gain: fraction of the commanded increment that it moves in a step; a number, (2,) or (n_discs, 2).

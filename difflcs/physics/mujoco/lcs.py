@@ -54,8 +54,8 @@ class MujocoLCS:
       says what contacts do where friction depends on it: which hold and which slide. What rests in MuJoCo rests here,
       at the depth that its soft contacts have.
 
-    What a joint cannot move falls out of the Jacobians. Where all joints move in one plane, friction has one tangent,
-    in this plane, and contacts across it, such as those of a floor below, are left out.
+    Directions in which no joint can move are not in the Jacobians. Where all joints move in one plane, friction has
+    one tangent, in this plane, and contacts across it, such as those of a floor below, are left out.
 
     Limits of actuators are bounds of the actions, see `action_bounds`, and activation is part of the state. Limits of
     joints and tendons are one-sided constraints; their dry friction (`frictionloss`), which quasi-static motion does
