@@ -146,9 +146,12 @@ class Linearisation {
   // sum_m bend_m dz_m dz_m'. It knows of a contact's kink only next to it. Damping adds what bounds a kink that lies
   // lam + s away: |y| / (2 (lam + s)) is the curvature of the parabola that touches y |z| / 2 and lies above it, so
   // that with a damping of one a contact that opens or closes on the way costs no more than the model says.
-  template <class V = Vec>
-  V curvature(int64_t i, int64_t j) const {
-    return V{} + weighted.column(i) * slopes.template column<V>(j);
+  Vec curvature(int64_t i, int64_t j) const { return Vec{} + weighted.column(i) * slopes.column(j); }
+
+  // Calls store(i, j, Y_ij) for the rows [from, to) and the columns [begin, end(i)), see `products`.
+  template <class End, class Store>
+  void curvatures(int64_t from, int64_t to, int64_t begin, End end, Store store) const {
+    products(weighted, slopes, from, to, begin, end, [](int64_t, int64_t, auto zero) { return zero; }, store);
   }
 
   // Drops Y (Gauss-Newton).

@@ -14,11 +14,13 @@ namespace {
 
 // The least number of forces for which this is faster.
 constexpr int64_t kLowRankFrom = 24;
-// F has a unit diagonal: entries of F - diag(rest) - W W^T up to the first number are rounding, and entries of rest
-// from the second on are large enough to divide by.
-constexpr double kLowRankRounding = 2e-14, kLeastRest = 1e-6;
+// F has a unit diagonal: what is left of it up to the first number is rounding, F - diag(rest) - W W^T up to the second
+// may be, and entries of rest from the third on are large enough to divide by.
+constexpr double kLowRankRounding = 2e-14, kRoundingInSum = 1e-12, kLeastRest = 1e-6;
 // Part of a force's direction that has to lie across the rows of C if its rest is read from that.
 constexpr double kAcross = 0.01;
+// The least part that is tried of what is left where nothing else tells the rest.
+constexpr double kMostParts = 1024;
 // Part of a row of C by which it has to differ from those before it to count.
 constexpr double kAnotherRow = 1e-10;
 
@@ -151,7 +153,7 @@ class LowRank {
       left[i] += rest[i];
       for (int64_t j = 0; j < n; j++) worst = max(worst, abs(left[j]));
     }
-    return !any(worst > kLowRankRounding);
+    return !any(worst > kRoundingInSum);
   }
 
   // The rest of each row, from what F does across the rows of C; where nothing of a force is across, `b` is zero.
@@ -201,7 +203,7 @@ class LowRank {
   }
 
   // W by Cholesky's method with pivots, first those of the rows whose rest is known. The others have as much rest as
-  // leaves what they share diagonally dominant.
+  // leaves what they share diagonally dominant, or where that is too little, positive definite.
   template <class Square>
   bool decompose(const Square& F) {
     Vec* remains = inverse;
@@ -229,18 +231,52 @@ class LowRank {
       }
     };
     if (!eliminate(false)) return false;
-    W.columns = {rank};
-    for (int64_t i = 0; i < n; i++) {
-      if (any(b[i] > 0)) continue;
-      rest[i] = remains[i];
-      for (int64_t j = 0; j < n; j++)
-        if (j != i && !any(b[j] > 0)) rest[i] -= abs(F(i, j) - (all(0) + W.row(i) * W[j]));
-      if (any(rest[i] < kLeastRest)) return false;
-    }
+    if (!share_rest(F, remains)) return false;
     for (int64_t i = 0; i < n; i++) remains[i] = select(b[i] > 0, remains[i], remains[i] - rest[i]);
     if (!eliminate(true)) return false;
     for (int64_t i = 0; i < n; i++) rest[i] += remains[i];
     return true;
+  }
+
+  // The rest of the rows where it is not known: at most what remains of each.
+  template <class Square>
+  bool share_rest(const Square& F, const Vec* remains) {
+    W.columns = {rank};
+    int64_t* const unknown = reinterpret_cast<int64_t*>(left);
+    int64_t count = 0;
+    for (int64_t i = 0; i < n; i++)
+      if (!any(b[i] > 0)) unknown[count++] = i;
+    if (count > most) return false;
+    const auto shared = [&](int64_t i, int64_t j) {
+      return F(unknown[i], unknown[j]) - (all(0) + W.row(unknown[i]) * W[unknown[j]]);
+    };
+    bool dominant = true;
+    for (int64_t i = 0; i < count; i++) {
+      const Vec own = remains[unknown[i]];
+      if (any(own < kLeastRest)) return false;
+      right[i] = all(0);  // what it shares, in parts of its own
+      for (int64_t j = 0; j < count; j++)
+        if (j != i) right[i] += abs(shared(i, j));
+      rest[unknown[i]] = own - right[i];
+      dominant = dominant && !any(rest[unknown[i]] < kLeastRest);
+      right[i] = right[i] / own;
+    }
+    auto L = scaled;  // by rows, Cholesky's factor of what they share
+    for (double part = 1; !dominant && part <= kMostParts; part *= 2) {
+      dominant = true;
+      for (int64_t i = 0; i < count && dominant; i++) {
+        const Vec own = remains[unknown[i]];
+        rest[unknown[i]] = own / (1.0 + part * right[i]);
+        for (int64_t j = 0; j <= i; j++) {
+          Vec sum = i == j ? own - rest[unknown[i]] : shared(i, j);
+          for (int64_t m = 0; m < j; m++) sum -= L(i, m) * L(j, m);
+          if (i == j)
+            dominant = !any((rest[unknown[i]] < kLeastRest) | ((sum <= 0) & (right[i] > 0)));
+          L(i, j) = i == j ? sqrt(max(sum, all(0))) : select(L(j, j) > 0, sum / L(j, j), all(0));
+        }
+      }
+    }
+    return dominant;
   }
 };
 

@@ -150,6 +150,60 @@ DIFFLCS_INLINE void multiply(Matrix<T, R, C, D> matrix, const W& vector, First f
   }
 }
 
+// to = first + matrix^T vector, several columns at a time, none of which waits for the sum of another.
+template <class M, class W>
+DIFFLCS_INLINE void multiply_columns(const M& matrix, const W& vector, const Vec* first, Vec* to) {
+  int64_t i = 0;
+#if DIFFLCS_LANES == 1
+  constexpr int kSums = 4;
+  for (; i + 4 * kSums <= matrix.columns; i += 4 * kSums) {
+    Four sum[kSums];
+    for (int s = 0; s < kSums; s++) sum[s] = read<Four>(first, i + 4 * s);
+    for (int64_t j = 0; j < matrix.rows; j++)
+      for (int s = 0; s < kSums; s++) sum[s] += vector[j] * read<Four>(matrix[j], i + 4 * s);
+    for (int s = 0; s < kSums; s++) write<Four>(to, i + 4 * s, sum[s]);
+  }
+#endif
+  by_columns(i, matrix.columns, [&](int64_t i, auto kind) {
+    using V = decltype(kind);
+    auto sum = read<V>(first, i);
+    for (int64_t j = 0; j < matrix.rows; j++) sum += vector[j] * read<V>(matrix[j], i);
+    write<V>(to, i, sum);
+  });
+}
+
+// Calls store(i, j, first(i, j, V{}) + x.column(i) * y.column(j)) for the rows [from, to) and the columns
+// [begin, end(i)), as many at a time as V holds. `end` does not fall with i. Of one problem alone four rows are summed
+// side by side, so that no sum waits for itself.
+template <class X, class Y, class End, class First, class Store>
+DIFFLCS_INLINE void products(const X& x, const Y& y, int64_t from, int64_t to, int64_t begin, End end, First first,
+                             Store store) {
+  const auto row = [&](int64_t i, int64_t j) {
+    by_columns(j, end(i), [&](int64_t j, auto kind) {
+      using V = decltype(kind);
+      store(i, j, V(first(i, j, V{}) + x.column(i) * y.template column<V>(j)));
+    });
+  };
+  int64_t i = from;
+#if DIFFLCS_LANES == 1
+  constexpr int kRows = 4;
+  for (; i + kRows <= to; i += kRows) {
+    int64_t j = begin;
+    for (; j + 4 <= end(i); j += 4) {
+      Four sum[kRows];
+      for (int r = 0; r < kRows; r++) sum[r] = first(i + r, j, Four{});
+      for (int64_t m = 0; m < y.rows; m++) {
+        const Four other = read<Four>(y[m], j);
+        for (int r = 0; r < kRows; r++) sum[r] += x(m, i + r) * other;
+      }
+      for (int r = 0; r < kRows; r++) store(i + r, j, sum[r]);
+    }
+    for (int r = 0; r < kRows; r++) row(i + r, j);
+  }
+#endif
+  for (; i < to; i++) row(i, begin);
+}
+
 // Matrices of one size, one per stage, or one for all stages.
 template <class M>
 struct Stages {

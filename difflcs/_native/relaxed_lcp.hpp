@@ -138,11 +138,7 @@ class RelaxedLcp {
     const int64_t n = size();
     Vec sum = all(0);
     if (short_cut())  // F is symmetric: by columns, for several rows at a time
-      by_columns(0, n, [&](int64_t i, auto kind) {
-        auto t = read<decltype(kind)>(q, i);
-        for (int64_t j = 0; j < n; j++) t += next[j] * read<decltype(kind)>(F[j], i);
-        write<decltype(kind)>(&w_next[0], i, t);
-      });
+      multiply_columns(F, next, q, &w_next[0]);
     else
       multiply(F, next, [&](int64_t i) { return q[i]; }, [&](int64_t i, Vec t) { w_next[i] = t; });
     DIFFLCS_UNROLL

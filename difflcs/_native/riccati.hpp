@@ -387,13 +387,14 @@ class Riccati {
   // H_uu + Y_uu + regularisation.
   void action_hessian(const StageData<T, S>& data) {
     const int64_t nx = n.x();
-    for (int64_t i = 0; i < n.u(); i++) {
-      by_columns(0, i + 1, [&](int64_t j, auto kind) {
-        using V = decltype(kind);
-        write<V>(H_uu[i], j, read<V>(H[nx + i], nx + j) + linearisation.template curvature<V>(nx + i, nx + j));
-      });
-      if (!kAdjoint) H_uu(i, i) += kActionDamping * newton.regularisation * action_scale(data, i) + flat[i];
-    }
+    linearisation.curvatures(
+        nx, n.w(), nx, [](int64_t i) { return i + 1; },
+        [&](int64_t i, int64_t j, auto Y) {
+          using V = decltype(Y);
+          write<V>(H_uu[i - nx], j - nx, read<V>(H[i], j) + Y);
+        });
+    for (int64_t i = 0; i < n.u() && !kAdjoint; i++)
+      H_uu(i, i) += kActionDamping * newton.regularisation * action_scale(data, i) + flat[i];
   }
 
   // Cholesky of that with identity rows for active actions. An indefinite block first drops what is negative in Y at
@@ -501,11 +502,12 @@ class Riccati {
   // feedforward too, -H_uu^-1 linear_u, which the solver has from `step_within_bounds`.
   void feedback_law(int64_t k) {
     const int64_t nx = n.x(), nu = n.u(), nw = n.w(), first = k == 0 ? nx : 0, columns = kAdjoint ? nx + 1 : nx;
-    for (int64_t i = 0; i < nw; i++)
-      by_columns(first, i < nx ? i + 1 : nx, [&](int64_t j, auto kind) {
-        using V = decltype(kind);
-        write<V>(H[i], j, read<V>(H[i], j) + linearisation.template curvature<V>(i, j));
-      });
+    linearisation.curvatures(
+        0, nw, first, [&](int64_t i) { return i < nx ? i + 1 : nx; },
+        [&](int64_t i, int64_t j, auto Y) {
+          using V = decltype(Y);
+          write<V>(H[i], j, read<V>(H[i], j) + Y);
+        });
     for (int64_t i = 0; i < nu; i++) {
       by_columns(0, nx, [&](int64_t j, auto kind) {
         using V = decltype(kind);
