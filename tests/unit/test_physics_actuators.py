@@ -56,6 +56,26 @@ def test_a_muscle_and_what_it_activates_are_right_at_its_nominal_control():
     assert abs(true[2] - 0.2) > 0.1
 
 
+@pytest.mark.parametrize("ctrl", [0.0, 0.4, 1.0])
+@pytest.mark.parametrize("kind", ['damper kv="400" ctrlrange="0 1"', 'muscle force="900" lengthrange="-1 1"'])
+def test_what_is_not_linear_in_the_control_stays_near_over_its_range(kind, ctrl):
+    """The tangent at 0 would turn a fast slide round, by many times its speed."""
+    model = load(f'<{kind} joint="a"/>', integrator="implicitfast")
+    act = [0.3] if "muscle" in kind else []
+    ends = [both(model, 0.0, 1.0, act, u, ctrl=ctrl) for u in (0.0, ctrl, 1.0)]
+    torch.testing.assert_close(*ends[1], rtol=0, atol=1e-3)
+    moved = max(abs(float(true[1]) - 1.0) for _, true in ends)
+    assert max(abs(float(ours[1] - true[1])) for ours, true in ends) < 0.65 * moved
+
+
+def test_a_drive_with_activation_overcomes_the_friction_that_holds():
+    model = load('<cylinder joint="a" timeconst=".003" area="60"/>', 'frictionloss="20"')
+    for u in (0.2, 1.0):
+        after, true = both(model, 0.0, 0.0, [0.0], u)
+        assert abs(float(after[1] - true[1])) < 0.25 * (0.1 + float(true[1]))
+    assert float(true[1]) > 0.5
+
+
 LIMITED = {
     "forcerange": ('<position joint="a" kp="5000" kv="100" forcerange="-4 4"/>', ""),
     "actuatorfrcrange": ('<position joint="a" kp="5000" kv="100"/>', 'actuatorfrcrange="-4 4"'),

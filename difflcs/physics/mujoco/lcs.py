@@ -318,7 +318,11 @@ class MujocoLCS:
         ctrl = self._ctrl if context is None else self._actuators.nominal(context, batch).reshape(n, -1)
         ctrl, found = np.broadcast_to(ctrl, (n, self.n_u)), self._finder.find(qpos)
         tangent = self.state.tangent(flat[:, : self.state.nv])
-        return _States(batch, flat, states, qpos, tangent, found, self._read_motion(states, ctrl))
+        moved = self._read_motion(states, ctrl)
+        if isinstance(self._motion, Dynamic) and self._actuators.curved.size:
+            idle = self.control(torch.from_numpy(flat), torch.from_numpy(moved.nominal)).numpy()
+            moved = self._motion.find_secants(moved, self._places, states, idle)
+        return _States(batch, flat, states, qpos, tangent, found, moved)
 
     def _read_motion(self, states: Any, ctrl: Any) -> Any:
         """Read the motion at states (n, nq + nv + na) of MuJoCo, with nominal controls (n, nu)."""

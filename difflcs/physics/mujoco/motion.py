@@ -181,6 +181,30 @@ class Dynamic:
         self.actuators.even_out(read.nominal, activation, read.A, read.B)
         return read
 
+    def find_secants(self, read: Linearised, places: Places, states: Array, ctrl: Array) -> Linearised:
+        """Add what actuators do whose force is not linear in the control: lines nearest to both ends of their ranges.
+
+        Args:
+            read: the motion at n states.
+            places: as for `read`.
+            states: (n, nq + nv + na).
+            ctrl: (n, nu) nominal controls, none of them NaN.
+        """
+        secants = np.zeros((*read.reached.shape, len(self.actuators.curved)))
+        for k, i in enumerate(self.actuators.curved):
+            ends = self.actuators.range[:, i, None] - ctrl[:, i]
+            for end in ends:
+                other, after = ctrl.copy(), np.empty_like(read.reached)
+                other[:, i] += end
+                for steps, some in ((self.simulated, ~read.unstable), (self.finer, read.unstable)):
+                    if some.any():
+                        part = after[some]
+                        taken = places.take(len(part)), states[some], other[some], part
+                        places.check(_mujoco.simulate(library(), self._native[steps], *taken), len(part))
+                        after[some] = part
+                secants[:, :, k] += (after - read.reached) * (end / (ends**2).sum(0))[:, None]
+        return read._replace(secant=secants)
+
     def _read(self, steps: Steps, places: Places, states: Array, ctrl: Array) -> Linearised:
         n, nv, nu = len(states), self.model.nv, self.model.nu
         n_x = 2 * nv + self.model.na
@@ -189,7 +213,7 @@ class Dynamic:
         if steps not in self._native:
             self._native[steps] = self.describe(steps, self.flags)
         places.check(_mujoco.read_motion(library(), self._native[steps], places.take(n), states, ctrl, *arrays), n)
-        return Linearised(*arrays, unstable=np.zeros(n, dtype=bool))
+        return Linearised(*arrays, np.zeros(n, dtype=bool), np.zeros((n, n_x, 0)))
 
     def _find_unstable(self, read: Linearised) -> NDArray[np.bool_]:
         """Find the states (n,) at which steps without constraints overshoot, each farther than the last."""
@@ -261,8 +285,23 @@ class Dynamic:
             for part in (slice(nv), slice(nv, 2 * nv)):
                 more[:, part] = (inverse_mass @ mass @ more[:, part, None])[:, :, 0]
         step[:, :, -1] += more
+        if read.secant.size:
+            self._bend(step, implicit, simulated, read.secant, None if equality is None else inverse_mass @ mass)
         place, delayed = _reached(step, velocity)[:, :nv], (implicit - step)[:, : 2 * nv]
         return DynamicStep(self, x, step, delayed, response, inverse_mass, place, read.nominal)
+
+    def _bend(self, step: Array, implicit: Array, simulated: Array, secant: Array, held: Array | None) -> None:
+        """Give steps the columns of secants, (n, nv, nv) `held` by equality constraints."""
+        nv, columns = self.model.nv, self.actuators.curved + step.shape[1]
+        more = secant - simulated[:, :, columns]
+        more = np.where(np.isfinite(more) & (np.abs(more) < _BEYOND), more, 0.0)
+        if held is not None:
+            for part in (slice(nv), slice(nv, 2 * nv)):
+                more[:, part] = held @ more[:, part]
+        tangent = step[:, :, columns]
+        step[:, :, columns] = tangent + more
+        kept = (tangent * (tangent + more)).sum(1) / np.maximum((tangent * tangent).sum(1), 1e-300)
+        implicit[:, :, columns] *= np.clip(kept, 0.0, 1.0)[:, None]
 
     def _steps(self, mass: Array, forces: Array, damping: Array, steps: Steps) -> Array:
         """The state after the step as a matrix (n, n_x, n_x + nu + 1) of it, u − ū and 1; `forces` is that of rates.
@@ -290,13 +329,19 @@ class Dynamic:
 
     def _implicit(self, resists: Array, forces: Array) -> Array:
         """Compute the same by one implicit step, which keeps (n, nv, nv) `resists` = S M of the change in velocity."""
-        nv, h = self.model.nv, self.seconds
+        nv, na, h = self.model.nv, self.model.na, self.seconds
         one, activation = h * forces[:, :nv], h * forces[:, nv:]
+        if na:  # which follows the action in this step, and drives in the mean of it
+            decay = h * -np.diagonal(forces[:, nv:, 2 * nv : 2 * nv + na], axis1=1, axis2=2)
+            decay = np.where(np.abs(decay) < 1e-4, 1e-4, decay)
+            after = -np.expm1(-decay) / decay
+            one += one[:, :, 2 * nv : 2 * nv + na] @ (((1 - after) / decay)[:, :, None] * activation)
+            activation *= after[:, :, None]
         one[:, :, nv : 2 * nv] = np.eye(nv)
         velocity = resists @ one
         place = h * velocity
         place[:, :, :nv] += np.eye(nv)
-        activation[:, :, 2 * nv : 2 * nv + self.model.na] += np.eye(self.model.na)
+        activation[:, :, 2 * nv : 2 * nv + na] += np.eye(na)
         return np.concatenate([place, velocity, activation], 1)
 
 
@@ -320,6 +365,7 @@ class Linearised(NamedTuple):
         nominal: (n, nu) action at which this is.
         reached: (n, n_x) where the nominal control leads in a step.
         unstable: (n,) True where this is in finer steps, as the model's are unstable.
+        secant: (n, n_x, k) what a unit of control brings about by `Actuators.curved`; k = 0: as linearised.
     """
 
     middle: Array
@@ -330,6 +376,7 @@ class Linearised(NamedTuple):
     nominal: Array
     reached: Array
     unstable: NDArray[np.bool_]
+    secant: Array
 
 
 class DynamicStep(NamedTuple):
