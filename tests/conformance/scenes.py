@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 import torch
 
-from difflcs.errors import DiffLCSError
+from difflcs.errors import ContactWarning, DiffLCSError
 from difflcs.physics.mujoco import MujocoLCS
 
 TOLERANCE = 0.5  # of the speed before and of what forces do to it, what an impact within the step may cost
@@ -239,7 +239,8 @@ def judge(seed: int) -> Judged | None:
         return None
     error, nothing = norm(after - true), norm(before - true)
     names = ",".join(sorted({mujoco.mjtConstraint(k).name.removeprefix("mjCNSTR_").split("_")[0] for k in kinds}))
-    return Judged(names or "free", "warned" if said else "made", error, nothing, scale)
+    warned = any(issubclass(w.category, ContactWarning) for w in said)
+    return Judged(names or "free", "warned" if warned else "made", error, nothing, scale)
 
 
 def table(judged: list[Judged]) -> str:

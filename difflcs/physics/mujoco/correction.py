@@ -31,7 +31,8 @@ from difflcs.physics.mujoco.state import MujocoState
 from difflcs.records import LCSParams, advance
 
 Array = NDArray[np.float64]
-_FAR, _SMALL = 0.3, 0.1  # of the motion and what forces do to a tree, and to all: an error that is worth a warning
+_FAR, _SMALL = 0.3, 0.1  # of the motion and what forces do to a tree, and to all: an error that is worth a look
+_FARTHER = 0.25  # of the speed before and of what forces do, by which an error is more than that of standing still
 _STILL = 1e-3  # [m/s, rad/s], a speed that is none
 _WORSE = 0.25  # of all motion, by which contacts are worse than nothing where Δ counts wholly
 
@@ -86,8 +87,8 @@ class WholeStep:
 
 def correct(
     system: LCSParams, step: DynamicStep, after: Array, tangent: Array | None, bound: Array, rows: Rows
-) -> LCSParams:
-    """Correct C and d of systems at n states.
+) -> tuple[LCSParams, NDArray[np.bool_]]:
+    """Correct C and d of systems at n states; return them, and those (n,) where more is corrected than moves.
 
     Args:
         system: the systems, in any batch dimensions.
@@ -125,7 +126,7 @@ def correct(
     counts = 1 - share * (1 - np.clip(worse, 0.0, 1.0))
     moves = size(speed) + size(change)
     least = np.maximum(_FAR * (moves + size(free)), _SMALL * (moves + size(free)).sum(1, keepdims=True))
-    _warn_of_wrong(size(wrong) > np.maximum(moves, least) + _STILL * np.sqrt(mass.sum(1)))
+    doubtful = (size(wrong) > np.maximum(moves, least) + _STILL * np.sqrt(mass.sum(1))).any(1)
     # Dry friction far below its bound is whatever holds: the difference does not grow with it.
     of_friction = slice(n_contacts + n_limits, n_contacts + n_limits + n_bounded)
     energy[:, :, of_friction] *= np.abs(forces[:, None, of_friction]) / np.maximum(bound, 1e-300)[:, None]
@@ -137,16 +138,33 @@ def correct(
     C[:, : 2 * nv] += by_forces
     d[:, : 2 * nv] += (by_forces @ lower[:, :, None])[:, :, 0] + wrong * (counts - due)[:, both]
     C, d = (torch.from_numpy(v).reshape(*batch, *v.shape[1:]) for v in (C, d))
-    return LCSParams.of_checked({**system.tensors(), "C": C, "d": d})
+    return LCSParams.of_checked({**system.tensors(), "C": C, "d": d}), doubtful
 
 
-def _warn_of_wrong(wrong: NDArray[np.bool_]) -> None:
-    """Warn of states where the correction is more than the motion of a tree of bodies (n, n_trees)."""
+def warn_of_wrong(predicted: Array, after: Array, free: Array, before: Array, inverse_mass: Array, model: Any) -> None:
+    """Warn where velocities are farther from MuJoCo's than those before the step, with some actions.
+
+    They are (m, n, nv) of m actions at n states, MuJoCo's `after` and without constraints `free` where they are finite,
+    and (n, nv) `before`; inverse_mass is (n, nv, nv).
+    """
+    mass = np.linalg.inv(inverse_mass)
+
+    def size(moved: Array) -> Array:
+        return np.sqrt(np.maximum((moved * (mass @ moved[..., None])[..., 0]).sum(-1), 0.0))
+
+    off, alone = predicted - after, np.nan_to_num(size(free - before), nan=0.0, posinf=0.0)
+    due = size(before) + np.maximum(alone, _SMALL * alone.max(0))
+    most = size(after - before) + _FARTHER * due + _STILL * np.sqrt(np.trace(mass, axis1=1, axis2=2))
+    wrong = (size(off) > most).any(0)
     if wrong.any():
+        worst = np.unravel_index(np.nanargmax(size(off) - most), most.shape)
+        dof = int(np.argmax(np.abs(off[worst] * (mass[worst[1]] @ off[worst]))))
+        joint = model.joint(model.dof_jntid[dof])
         warnings.warn(
-            f"expected a system as near to MuJoCo's own step as standing still is, got one that only its correction "
-            f"brings there in {wrong.any(1).sum()} of {len(wrong)} states, so that it may be far off with other "
-            f"actions: take fewer seconds, or a nominal control (ctrl) near the actions",
+            f"expected a system as near to MuJoCo's own step as standing still is, also at the ends of the ranges of "
+            f"its actions and half way there, got one that is farther off with such an action in {wrong.sum()} of "
+            f"{len(wrong)} states, most of all joint {joint.name or joint.id!r}: take fewer seconds, or a nominal "
+            f"control (ctrl) near the actions",
             ContactWarning,
             stacklevel=4,
         )

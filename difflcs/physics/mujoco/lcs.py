@@ -26,18 +26,19 @@ from difflcs.physics.complementarity import (
 )
 from difflcs.physics.mujoco.actuators import DYNAMICS, Actuators, disabled_actuators
 from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, Pairs, typical_radius
-from difflcs.physics.mujoco.correction import WholeStep, correct
+from difflcs.physics.mujoco.correction import WholeStep, correct, warn_of_wrong
 from difflcs.physics.mujoco.equality import Equality
 from difflcs.physics.mujoco.groups import ContactGroup, ContactSelection
 from difflcs.physics.mujoco.library import Places
 from difflcs.physics.mujoco.limits import RowFinder, ScaledRows, scale
-from difflcs.physics.mujoco.motion import Dynamic, QuasiStatic, read_each
+from difflcs.physics.mujoco.motion import Dynamic, DynamicStep, QuasiStatic, read_each
 from difflcs.physics.mujoco.native import TAKEN, check_readable, flags, native, taken
 from difflcs.physics.mujoco.nominal import Recovery, Situation, evaluate_nominal
 from difflcs.physics.mujoco.quasi_dynamic import QuasiDynamic
 from difflcs.physics.mujoco.state import MujocoState
-from difflcs.records import LCSParams, LCSSequence, sequence_along
+from difflcs.records import LCSParams, LCSSequence, advance, sequence_along
 
+_TRIED = 8  # states at which actions are tried, of the first that a module is asked for
 Motion = Literal["quasi-static", "quasi-dynamic", "dynamic"]
 _SLEEP = int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0))  # of MuJoCo 3.4 and later
 
@@ -98,6 +99,7 @@ class MujocoLCS:
 
     Attributes:
         state: `MujocoState`, which says what each number of the state is.
+        tried: True if a dynamic motion has compared the ends of its actions with MuJoCo, as the first call does.
 
     Raises:
         InvalidInputError and its kinds: an argument does not fit, or the model has what is refused.
@@ -158,7 +160,7 @@ class MujocoLCS:
         budgets: Any = self._selection.budgets if self._selection else contacts
         budgets = budgets if contacts is None or self._selection else check_positive_int("contacts", contacts)
         plain = motion == "dynamic" and pairs is None and friction is None
-        self._whole = WholeStep(self._motion, limits != 0) if plain else None
+        self._whole, self.tried = WholeStep(self._motion, limits != 0) if plain else None, False
         self._places = Places(model, self._data)
         frictions = friction, torsion
         self._finder = ContactFinder(model, self._data, self._places, pairs, distance, length, budgets, *frictions)
@@ -221,6 +223,7 @@ class MujocoLCS:
         """
         read = self._read(x := given_states(x), context)
         contacts, rest, step, rough = read.dof_contacts, None, None, self._finder.rough
+        doubtful = np.zeros(len(read.x), dtype=bool)
         if isinstance(self._motion, Dynamic):
             step = self._equality.hold(self._motion, read.moved, read.x, read.qpos)
             found = self._rows.find(read.qpos, step.place, step.response, read.moved.middle[:, : self.state.nv])
@@ -255,7 +258,13 @@ class MujocoLCS:
         if step is not None and self._whole is not None and self.n_lam:
             idle = self.control(torch.from_numpy(read.x), torch.from_numpy(step.idle)).numpy()
             after = self._whole.simulate(self._places, read.states, idle)
-            system = correct(system, step, after, read.tangent, rows.bound * self._give / self.length, found)
+            rubs = rows.bound * self._give / self.length
+            system, doubtful = correct(system, step, after, read.tangent, rubs, found)
+        if step is not None and self._whole is not None and self.n_u:
+            if self._actuators.curved.size or not self.tried:
+                doubtful[:_TRIED], self.tried = True, True
+            if doubtful.any():
+                self._try_actions(system, read, step, np.flatnonzero(doubtful))
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
 
     def sequence(self, plan: Any, x: Tensor | None = None) -> LCSSequence:
@@ -310,6 +319,23 @@ class MujocoLCS:
             bounds = self._actuators.bounds(numbers, speed, self._yields, self._relative)
         low, high = (torch.from_numpy(v).to(x) for v in bounds)
         return low, high
+
+    def _try_actions(self, system: LCSParams, read: _States, step: DynamicStep, some: Any) -> None:
+        """Warn where systems of `some` states are far off at the ends of the ranges of actions, or half way there."""
+        assert self._whole is not None
+        x, idle = (torch.from_numpy(v[some]) for v in (read.x, step.idle))
+        ends = torch.from_numpy(self._actuators.range)[:, None] - self.control(x, torch.zeros_like(idle))
+        near = idle + torch.tensor([-1.0, 1.0])[:, None, None]
+        ends = torch.where(ends.isfinite(), ends, near).clamp(*self.action_bounds(x))
+        u = torch.cat([ends, 0.5 * (ends + idle)])
+        ctrl, nv = self.control(x.expand(4, *x.shape), u).reshape(-1, self.n_u).numpy(), self.state.nv
+        states, unstable = np.tile(read.states[some], (4, 1)), np.tile(read.moved.unstable[some], 4)
+        after = self._whole.simulate(self._places, states, ctrl)
+        free = self._motion.simulate(self._places, states, ctrl, unstable)
+        flat = {k: v.reshape(len(read.x), *v.shape[len(read.batch) :])[some] for k, v in system.tensors().items()}
+        predicted = advance(LCSParams.of_checked(flat), x.expand(4, *x.shape), u).x_next.numpy()
+        at, to, alone = (v.reshape(4, *x.shape)[..., nv : 2 * nv] for v in (predicted, after, free))
+        warn_of_wrong(at, to, alone, step.velocity[some], step.inverse_mass[some], self._model)
 
     def _read(self, x: Tensor, context: Tensor | None = None) -> _States:
         states, batch = self.state.flatten(x, self._data.act), x.shape[:-1]

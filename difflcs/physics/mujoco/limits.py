@@ -325,7 +325,8 @@ def follow(gap: Array, speed: Array, load: Load, soft: Softness, seconds: float,
     count = min(count, _MOST_STEPS)
     h, limit = seconds / count, np.isinf(soft.bound)
     free, drag, turn, mass = load
-    lower, upper, slower = np.where(limit, 0.0, -mass * soft.bound), mass * soft.bound, 1 + h * drag
+    upper, slower = np.maximum(mass, 1e-300) * soft.bound, 1 + h * drag
+    lower = np.where(limit, 0.0, -upper)
     r, v, held, holds = gap.copy(), speed.copy(), np.ones_like(limit), np.ones_like(limit)
     way = np.zeros((2, *gap.shape))  # by the force, and by the load
     rate, total = np.zeros_like(way), np.zeros_like(gap)

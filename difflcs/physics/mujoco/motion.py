@@ -182,28 +182,28 @@ class Dynamic:
         return read
 
     def find_secants(self, read: Linearised, places: Places, states: Array, ctrl: Array) -> Linearised:
-        """Add what actuators do whose force is not linear in the control: lines nearest to both ends of their ranges.
-
-        Args:
-            read: the motion at n states.
-            places: as for `read`.
-            states: (n, nq + nv + na).
-            ctrl: (n, nu) nominal controls, none of them NaN.
-        """
+        """Add lines nearest to both ends of ranges, for actuators whose force is not linear in `ctrl` (n, nu)."""
         secants = np.zeros((*read.reached.shape, len(self.actuators.curved)))
         for k, i in enumerate(self.actuators.curved):
             ends = self.actuators.range[:, i, None] - ctrl[:, i]
             for end in ends:
-                other, after = ctrl.copy(), np.empty_like(read.reached)
+                other = ctrl.copy()
                 other[:, i] += end
-                for steps, some in ((self.simulated, ~read.unstable), (self.finer, read.unstable)):
-                    if some.any():
-                        part = after[some]
-                        taken = places.take(len(part)), states[some], other[some], part
-                        places.check(_mujoco.simulate(library(), self._native[steps], *taken), len(part))
-                        after[some] = part
-                secants[:, :, k] += (after - read.reached) * (end / (ends**2).sum(0))[:, None]
+                after = self.simulate(places, states, other, read.unstable)
+                with np.errstate(over="ignore", invalid="ignore"):
+                    secants[:, :, k] += (after - read.reached) * (end / (ends**2).sum(0))[:, None]
         return read._replace(secant=secants)
+
+    def simulate(self, places: Places, states: Array, ctrl: Array, unstable: NDArray[np.bool_]) -> Array:
+        """Return ζ, ν and the change of activation (n, n_x) after a step at controls (n, nu), see `read`."""
+        after = np.empty((len(states), 2 * self.model.nv + self.model.na))
+        for steps, some in ((self.simulated, ~unstable), (self.finer, unstable)):
+            if some.any():
+                part = after[some]
+                taken = places.take(len(part)), states[some], ctrl[some], part
+                places.check(_mujoco.simulate(library(), self._native[steps], *taken), len(part))
+                after[some] = part
+        return after
 
     def _read(self, steps: Steps, places: Places, states: Array, ctrl: Array) -> Linearised:
         n, nv, nu = len(states), self.model.nv, self.model.nu
@@ -213,7 +213,7 @@ class Dynamic:
         if steps not in self._native:
             self._native[steps] = self.describe(steps, self.flags)
         places.check(_mujoco.read_motion(library(), self._native[steps], places.take(n), states, ctrl, *arrays), n)
-        return Linearised(*arrays, np.zeros(n, dtype=bool), np.zeros((n, n_x, 0)))
+        return Linearised(*arrays, unstable=np.zeros(n, dtype=bool), secant=np.zeros((n, n_x, 0)))
 
     def _find_unstable(self, read: Linearised) -> NDArray[np.bool_]:
         """Find the states (n,) at which steps without constraints overshoot, each farther than the last."""
@@ -279,29 +279,19 @@ class Dynamic:
         if (some := read.unstable).any():
             slow = -mass[some] @ rates[some, :nv, nv : 2 * nv]
             simulated[some], step[some] = (self._steps(mass[some], of[some], slow, self.finer) for of in (free, forces))
-        more = read.reached - _reached(simulated, velocity)
+        curved = self.actuators.curved[: read.secant.shape[2]] + n_x
+        more = (read.reached - _reached(simulated, velocity))[:, :, None]
+        more = np.concatenate([read.secant - simulated[:, :, curved], more], -1)
         more = np.where((np.abs(more).max(1) < _BEYOND)[:, None], more, 0.0)
         if equality is not None:
             for part in (slice(nv), slice(nv, 2 * nv)):
-                more[:, part] = (inverse_mass @ mass @ more[:, part, None])[:, :, 0]
-        step[:, :, -1] += more
-        if read.secant.size:
-            self._bend(step, implicit, simulated, read.secant, None if equality is None else inverse_mass @ mass)
+                more[:, part] = inverse_mass @ mass @ more[:, part]
+        tangent = step[:, :, curved]
+        step[:, :, [*curved, -1]] += more
+        kept = (tangent * step[:, :, curved]).sum(1) / np.maximum((tangent * tangent).sum(1), 1e-300)
+        implicit[:, :, curved] *= np.clip(kept, 0.0, 1.0)[:, None]
         place, delayed = _reached(step, velocity)[:, :nv], (implicit - step)[:, : 2 * nv]
         return DynamicStep(self, x, step, delayed, response, inverse_mass, place, read.nominal)
-
-    def _bend(self, step: Array, implicit: Array, simulated: Array, secant: Array, held: Array | None) -> None:
-        """Give steps the columns of secants, (n, nv, nv) `held` by equality constraints."""
-        nv, columns = self.model.nv, self.actuators.curved + step.shape[1]
-        more = secant - simulated[:, :, columns]
-        more = np.where(np.isfinite(more) & (np.abs(more) < _BEYOND), more, 0.0)
-        if held is not None:
-            for part in (slice(nv), slice(nv, 2 * nv)):
-                more[:, part] = held @ more[:, part]
-        tangent = step[:, :, columns]
-        step[:, :, columns] = tangent + more
-        kept = (tangent * (tangent + more)).sum(1) / np.maximum((tangent * tangent).sum(1), 1e-300)
-        implicit[:, :, columns] *= np.clip(kept, 0.0, 1.0)[:, None]
 
     def _steps(self, mass: Array, forces: Array, damping: Array, steps: Steps) -> Array:
         """The state after the step as a matrix (n, n_x, n_x + nu + 1) of it, u − ū and 1; `forces` is that of rates.
