@@ -10,12 +10,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from difflcs._checks import broadcast_batch, check_tensor
-from difflcs.errors import InvalidInputError, ShapeError
+from difflcs._checks import broadcast_batch, check_tensor, describe
+from difflcs.errors import DTypeError, InvalidInputError, ShapeError
 from difflcs.physics.mujoco.native import flags
 
 Array = NDArray[np.float64]
 
+_SLEEP = int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0))  # of MuJoCo 3.4 and later
 _JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _SCALAR = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 _FIXED, _UNBIASED, _AFFINE = (
@@ -204,3 +205,35 @@ def disabled_actuators(model: Any) -> NDArray[np.bool_]:
     groups = model.actuator_group
     disabled = (groups >= 0) & (groups < 31) & (model.opt.disableactuator >> groups.clip(0, 30) & 1 > 0)
     return disabled | bool(model.opt.disableflags & flags("ACTUATION"))
+
+
+def check_model(model: Any, data: Any, motion: str) -> None:
+    """Check that a model and its data are such as a motion has."""
+    if not isinstance(model, mujoco.MjModel):
+        raise DTypeError(f"model: expected a mujoco.MjModel, got {describe(model)}; load one with MjModel")
+    if data is not None and not isinstance(data, mujoco.MjData):
+        raise DTypeError(f"data: expected a mujoco.MjData, got {describe(data)}; pass mujoco.MjData(model)")
+    if data is not None and len(data.qpos) != model.nq:
+        raise InvalidInputError(f"data: expected nq={model.nq} of the model, got {len(data.qpos)}; pass MjData(model)")
+    dynamics, plugins = np.array(model.actuator_dyntype), np.array(model.actuator_plugin)
+    refused = {
+        "joints, as nothing moves without": not model.nv,
+        "one control for each actuator, not those of <pid> and <orientation>": getattr(model, "nactuator", model.nu)
+        != model.nu,
+        "activation by an integrator, a filter, a muscle or a callback, not by <dcmotor>, <pid> or a plugin": bool(
+            (~np.isin(dynamics, DYNAMICS) & (model.actuator_actnum > 0) | (plugins >= 0)).any()
+        ),
+        "no <adhesion>, whose force depends on what is in contact": bool(
+            (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)).any()
+        ),
+        "rigid bodies, no <flex>": bool(model.nflex),
+        "no delay of actuators and sensors (delay, nsample), which would need their past as states": bool(
+            getattr(model, "nhistory", 0)
+        ),
+        'no <flag sleep="enable"/>, as what sleeps does not follow its forces': bool(model.opt.enableflags & _SLEEP),
+        "actuators that are not disabled (actuatorgroupdisable, <flag actuation/>) in quasi-static motion, which moves "
+        "what they drive": motion == "quasi-static" and bool(disabled_actuators(model).any()),
+    }
+    for wanted, present in refused.items():
+        if present:
+            raise InvalidInputError(f"model: expected {wanted}, got something else; change the model")

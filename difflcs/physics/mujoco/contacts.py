@@ -377,3 +377,19 @@ def typical_radius(model: Any) -> float:
     touches = moves & ((model.geom_contype | model.geom_conaffinity) != 0)
     chosen = size[touches] if touches.any() else size[moves]
     return float(np.median(chosen)) if len(chosen) else 1.0
+
+
+def median_apart(model: Any, data: Any, response: Any, pairs: Any, dimensions: int) -> float:
+    """Compute how far a unit of force moves two geoms of a pair apart, the median, for the response of the joints."""
+    jacobian, gives = np.empty((3, model.nv)), np.empty(model.ngeom)
+    for geom in range(model.ngeom):
+        mujoco.mj_jacGeom(model, data, jacobian, None, geom)
+        gives[geom] = np.trace(jacobian @ response @ jacobian.T) / dimensions
+    first, second = pairs
+    apart = (gives[first] + gives[second])[gives[first] + gives[second] > 0]
+    if len(first) and not len(apart):
+        raise InvalidInputError(
+            "model: expected something that contact forces can move, got nothing; what is pushed needs joints "
+            "without actuators, and a mobility above 0"
+        )
+    return float(np.median(apart)) if len(apart) else 1.0

@@ -24,8 +24,8 @@ from difflcs.physics.complementarity import (
     count_forces,
     given_states,
 )
-from difflcs.physics.mujoco.actuators import DYNAMICS, Actuators, disabled_actuators
-from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, Pairs, typical_radius
+from difflcs.physics.mujoco.actuators import Actuators, check_model
+from difflcs.physics.mujoco.contacts import ContactFinder, MujocoContacts, Pairs, median_apart, typical_radius
 from difflcs.physics.mujoco.correction import WholeStep, correct, warn_of_wrong
 from difflcs.physics.mujoco.equality import Equality
 from difflcs.physics.mujoco.groups import ContactGroup, ContactSelection
@@ -40,7 +40,6 @@ from difflcs.records import LCSParams, LCSSequence, advance, sequence_along
 
 _TRIED = 8  # states at which actions are tried, of the first that a module is asked for
 Motion = Literal["quasi-static", "quasi-dynamic", "dynamic"]
-_SLEEP = int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0))  # of MuJoCo 3.4 and later
 
 
 class MujocoLCS:
@@ -99,7 +98,6 @@ class MujocoLCS:
 
     Attributes:
         state: `MujocoState`, which says what each number of the state is.
-        tried: True if a dynamic motion has compared the ends of its actions with MuJoCo, as the first call does.
 
     Raises:
         InvalidInputError and its kinds: an argument does not fit, or the model has what is refused.
@@ -127,7 +125,7 @@ class MujocoLCS:
     ):
         options = {name: value for name, value in locals().items() if name not in ("self", "model", "data")}
         _check_options(motion, cone, mobility, friction)
-        _check_model(model, data, motion)
+        check_model(model, data, motion)
         self.motion, self.seconds = motion, check_number("seconds", seconds, strict=True)
         self.cone: Cone = cone
         self.compliance = check_number("compliance", compliance, strict=True)
@@ -162,8 +160,9 @@ class MujocoLCS:
         plain = motion == "dynamic" and pairs is None and friction is None
         self._whole, self.tried = WholeStep(self._motion, limits != 0) if plain else None, False
         self._places = Places(model, self._data)
-        frictions = friction, torsion
-        self._finder = ContactFinder(model, self._data, self._places, pairs, distance, length, budgets, *frictions)
+        self._finder = ContactFinder(
+            model, self._data, self._places, pairs, distance, length, budgets, friction, torsion
+        )
         model.opt.disableflags |= flags("EQUALITY", "FRICTIONLOSS", "LIMIT")
         with native(model, self._data, "in the state of data"):
             self._give = self._typical_response()
@@ -223,7 +222,6 @@ class MujocoLCS:
         """
         read = self._read(x := given_states(x), context)
         contacts, rest, step, rough = read.dof_contacts, None, None, self._finder.rough
-        doubtful = np.zeros(len(read.x), dtype=bool)
         if isinstance(self._motion, Dynamic):
             step = self._equality.hold(self._motion, read.moved, read.x, read.qpos)
             found = self._rows.find(read.qpos, step.place, step.response, read.moved.middle[:, : self.state.nv])
@@ -259,12 +257,8 @@ class MujocoLCS:
             idle = self.control(torch.from_numpy(read.x), torch.from_numpy(step.idle)).numpy()
             after = self._whole.simulate(self._places, read.states, idle)
             rubs = rows.bound * self._give / self.length
-            system, doubtful = correct(system, step, after, read.tangent, rubs, found)
-        if step is not None and self._whole is not None and self.n_u:
-            if self._actuators.curved.size or not self.tried:
-                doubtful[:_TRIED], self.tried = True, True
-            if doubtful.any():
-                self._try_actions(system, read, step, np.flatnonzero(doubtful))
+            system, read.doubtful[:] = correct(system, step, after, read.tangent, rubs, found)
+        _try_actions(self, system, read, step)
         return system if x.dtype == torch.float64 and x.is_cpu else system.to(device=x.device, dtype=x.dtype)
 
     def sequence(self, plan: Any, x: Tensor | None = None) -> LCSSequence:
@@ -320,23 +314,6 @@ class MujocoLCS:
         low, high = (torch.from_numpy(v).to(x) for v in bounds)
         return low, high
 
-    def _try_actions(self, system: LCSParams, read: _States, step: DynamicStep, some: Any) -> None:
-        """Warn where systems of `some` states are far off at the ends of the ranges of actions, or half way there."""
-        assert self._whole is not None
-        x, idle = (torch.from_numpy(v[some]) for v in (read.x, step.idle))
-        ends = torch.from_numpy(self._actuators.range)[:, None] - self.control(x, torch.zeros_like(idle))
-        near = idle + torch.tensor([-1.0, 1.0])[:, None, None]
-        ends = torch.where(ends.isfinite(), ends, near).clamp(*self.action_bounds(x))
-        u = torch.cat([ends, 0.5 * (ends + idle)])
-        ctrl, nv = self.control(x.expand(4, *x.shape), u).reshape(-1, self.n_u).numpy(), self.state.nv
-        states, unstable = np.tile(read.states[some], (4, 1)), np.tile(read.moved.unstable[some], 4)
-        after = self._whole.simulate(self._places, states, ctrl)
-        free = self._motion.simulate(self._places, states, ctrl, unstable)
-        flat = {k: v.reshape(len(read.x), *v.shape[len(read.batch) :])[some] for k, v in system.tensors().items()}
-        predicted = advance(LCSParams.of_checked(flat), x.expand(4, *x.shape), u).x_next.numpy()
-        at, to, alone = (v.reshape(4, *x.shape)[..., nv : 2 * nv] for v in (predicted, after, free))
-        warn_of_wrong(at, to, alone, step.velocity[some], step.inverse_mass[some], self._model)
-
     def _read(self, x: Tensor, context: Tensor | None = None) -> _States:
         states, batch = self.state.flatten(x, self._data.act), x.shape[:-1]
         n, qpos = len(states), states[:, : self.state.nq]
@@ -344,11 +321,8 @@ class MujocoLCS:
         ctrl = self._ctrl if context is None else self._actuators.nominal(context, batch).reshape(n, -1)
         ctrl, found = np.broadcast_to(ctrl, (n, self.n_u)), self._finder.find(qpos)
         tangent = self.state.tangent(flat[:, : self.state.nv])
-        moved = self._read_motion(states, ctrl)
-        if isinstance(self._motion, Dynamic) and self._actuators.curved.size:
-            idle = self.control(torch.from_numpy(flat), torch.from_numpy(moved.nominal)).numpy()
-            moved = self._motion.find_secants(moved, self._places, states, idle)
-        return _States(batch, flat, states, qpos, tangent, found, moved)
+        moved = _find_secants(self, self._read_motion(states, ctrl), flat, states)
+        return _States(batch, flat, states, qpos, tangent, found, moved, np.zeros(n, dtype=bool))
 
     def _read_motion(self, states: Any, ctrl: Any) -> Any:
         """Read the motion at states (n, nq + nv + na) of MuJoCo, with nominal controls (n, nu)."""
@@ -369,7 +343,7 @@ class MujocoLCS:
             response = self.seconds * impulse
             self._yields = self._actuators.yields(self.seconds * response, response)
         pairs = self._finder.pairs if self._selection is None else self._selection.main(self._finder.pairs)
-        return _median_apart(model, data, response, pairs, 3 if self._finder.axis is None else 2)
+        return median_apart(model, data, response, pairs, 3 if self._finder.axis is None else 2)
 
 
 class _States(NamedTuple):
@@ -383,6 +357,7 @@ class _States(NamedTuple):
         tangent: of their rotations, see `MujocoState.tangent`.
         dof_contacts: contacts.
         moved: buffers of the motion.
+        doubtful: (n,) True where actions are to be tried.
     """
 
     batch: torch.Size
@@ -392,6 +367,7 @@ class _States(NamedTuple):
     tangent: Any
     dof_contacts: MujocoContacts
     moved: Any
+    doubtful: Any
 
     def batched(self, value: Any) -> Tensor:
         """Convert an array (n, ...) to a tensor with the batch dimensions."""
@@ -428,6 +404,38 @@ class _States(NamedTuple):
         return self.batched(np.concatenate([rows, np.zeros((*rows.shape[:-1], still))], -1))
 
 
+def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicStep | None) -> None:
+    """Warn where systems are far off at the ends of the ranges of actions, or half way there."""
+    if step is None or of._whole is None or not of.n_u:
+        return
+    if of._actuators.curved.size or not of.tried:
+        read.doubtful[:_TRIED], of.tried = True, True
+    some = np.flatnonzero(read.doubtful)
+    if not some.size:
+        return
+    x, idle = (torch.from_numpy(v[some]) for v in (read.x, step.idle))
+    ends = torch.from_numpy(of._actuators.range)[:, None] - of.control(x, torch.zeros_like(idle))
+    near = idle + torch.tensor([-1.0, 1.0])[:, None, None]
+    ends = torch.where(ends.isfinite(), ends, near).clamp(*of.action_bounds(x))
+    u = torch.cat([ends, 0.5 * (ends + idle)])
+    ctrl, nv = of.control(x.expand(4, *x.shape), u).reshape(-1, of.n_u).numpy(), of.state.nv
+    states, unstable = np.tile(read.states[some], (4, 1)), np.tile(read.moved.unstable[some], 4)
+    after = of._whole.simulate(of._places, states, ctrl)
+    free = of._motion.simulate(of._places, states, ctrl, unstable)
+    flat = {k: v.reshape(len(read.x), *v.shape[len(read.batch) :])[some] for k, v in system.tensors().items()}
+    predicted = advance(LCSParams.of_checked(flat), x.expand(4, *x.shape), u).x_next.numpy()
+    at, to, alone = (v.reshape(4, *x.shape)[..., nv : 2 * nv] for v in (predicted, after, free))
+    warn_of_wrong(at, to, alone, step.velocity[some], step.inverse_mass[some], of._model)
+
+
+def _find_secants(of: MujocoLCS, moved: Any, x: Any, states: Any) -> Any:
+    """Add those of actuators whose force is not linear in the control, in dynamic motion."""
+    if not isinstance(of._motion, Dynamic) or not of._actuators.curved.size:
+        return moved
+    idle = of.control(torch.from_numpy(x), torch.from_numpy(moved.nominal)).numpy()
+    return of._motion.find_secants(moved, of._places, states, idle)
+
+
 def lcs_from_mujoco(model: Any, data: Any, x: Tensor | None = None, **options: Any) -> LCSParams:
     """Compute the linear complementarity system of a MuJoCo model, linearised at one state or at many.
 
@@ -458,53 +466,6 @@ def _check_options(motion: Motion, cone: Cone, mobility: Any, friction: float | 
         check_choice("mobility", mobility, ("inertia", "damping"))
     if friction is not None:
         check_number("friction", friction)
-
-
-def _check_model(model: Any, data: Any, motion: Motion) -> None:
-    if not isinstance(model, mujoco.MjModel):
-        raise DTypeError(f"model: expected a mujoco.MjModel, got {describe(model)}; load one with MjModel")
-    if data is not None and not isinstance(data, mujoco.MjData):
-        raise DTypeError(f"data: expected a mujoco.MjData, got {describe(data)}; pass mujoco.MjData(model)")
-    if data is not None and len(data.qpos) != model.nq:
-        raise InvalidInputError(f"data: expected nq={model.nq} of the model, got {len(data.qpos)}; pass MjData(model)")
-    dynamics, plugins = np.array(model.actuator_dyntype), np.array(model.actuator_plugin)
-    refused = {
-        "joints, as nothing moves without": not model.nv,
-        "one control for each actuator, not those of <pid> and <orientation>": getattr(model, "nactuator", model.nu)
-        != model.nu,
-        "activation by an integrator, a filter, a muscle or a callback, not by <dcmotor>, <pid> or a plugin": bool(
-            (~np.isin(dynamics, DYNAMICS) & (model.actuator_actnum > 0) | (plugins >= 0)).any()
-        ),
-        "no <adhesion>, whose force depends on what is in contact": bool(
-            (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_BODY)).any()
-        ),
-        "rigid bodies, no <flex>": bool(model.nflex),
-        "no delay of actuators and sensors (delay, nsample), which would need their past as states": bool(
-            getattr(model, "nhistory", 0)
-        ),
-        'no <flag sleep="enable"/>, as what sleeps does not follow its forces': bool(model.opt.enableflags & _SLEEP),
-        "actuators that are not disabled (actuatorgroupdisable, <flag actuation/>) in quasi-static motion, which moves "
-        "what they drive": motion == "quasi-static" and bool(disabled_actuators(model).any()),
-    }
-    for wanted, present in refused.items():
-        if present:
-            raise InvalidInputError(f"model: expected {wanted}, got something else; change the model")
-
-
-def _median_apart(model: Any, data: Any, response: Any, pairs: Any, dimensions: int) -> float:
-    """Compute how far a unit of force moves two geoms of a pair apart, the median, for the response of the joints."""
-    jacobian, gives = np.empty((3, model.nv)), np.empty(model.ngeom)
-    for geom in range(model.ngeom):
-        mujoco.mj_jacGeom(model, data, jacobian, None, geom)
-        gives[geom] = np.trace(jacobian @ response @ jacobian.T) / dimensions
-    first, second = pairs
-    apart = (gives[first] + gives[second])[gives[first] + gives[second] > 0]
-    if len(first) and not len(apart):
-        raise InvalidInputError(
-            "model: expected something that contact forces can move, got nothing; what is pushed needs joints "
-            "without actuators, and a mobility above 0"
-        )
-    return float(np.median(apart)) if len(apart) else 1.0
 
 
 def _rebuild(model: Any, disabled: int, first: Any, options: dict[str, Any], now: Any, state: MujocoState) -> MujocoLCS:
