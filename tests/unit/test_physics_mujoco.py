@@ -378,7 +378,6 @@ def test_single_precision_comes_back_single():
     torch.testing.assert_close(module.params(x).C.double(), module.params(x.double()).C)
 
 
-@pytest.mark.filterwarnings("ignore:expected a system as near:difflcs.errors.ContactWarning")  # a metre away
 def test_the_system_at_the_state_of_the_data():
     model = pushing()
     data = mujoco.MjData(model)
@@ -552,7 +551,6 @@ def test_what_is_refused_for_its_contacts_is_accepted_without_them():
         assert MujocoLCS(pushing(SERVOS + rest), pairs=[]).n_lam == 0
 
 
-@pytest.mark.filterwarnings("ignore:expected a system as near:difflcs.errors.ContactWarning")  # a metre away
 def test_equality_constraints_that_the_data_switches_off_do_nothing():
     model = pushing(SERVOS + '<equality><joint joint1="px" joint2="py"/></equality>')
     x, off = tensor(*[0.1] * 10), data_of(model, eq_active=0)

@@ -413,7 +413,7 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicS
         return
     x, idle = (torch.from_numpy(v[some]) for v in (read.x, step.idle))
     ends = torch.from_numpy(of._actuators.range)[:, None] - of.control(x, torch.zeros_like(idle))
-    near = idle + torch.tensor([-1.0, 1.0])[:, None, None]
+    near = idle + torch.from_numpy(of._actuators.usual)[:, None]
     ends = torch.where(ends.isfinite(), ends, near).clamp(*of.action_bounds(x))
     u = torch.cat([ends, 0.5 * (ends + idle)])
     ctrl, nv = of.control(x.expand(4, *x.shape), u).reshape(-1, of.n_u).numpy(), of.state.nv
