@@ -8,8 +8,7 @@ one version and one key, see `select`.
 """
 
 from collections.abc import Hashable
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -83,21 +82,18 @@ class Cell:
     left_out: int
     """Trainings of other versions or settings, which are not in it."""
 
-    @cached_property
-    def first(self) -> Any:
-        """One row, for the columns that all have in common: task, version, object."""
-        return self.rows.iloc[0]
+    first: Any = field(init=False)
+    """One row, for the columns that all have in common: task, version, object."""
+    scores: Any = field(init=False)
+    """Success [%] by seed (rows) and minutes of data (columns), a DataFrame.
 
-    @cached_property
-    def scores(self) -> Any:
-        """Success [%] by seed (rows) and minutes of data (columns), a DataFrame.
+    It is of whole goals, where a file has six decimals: equal differences of seeds have to be equal.
+    """
 
-        It is of whole goals, where a file has six decimals: equal differences of seeds have to be equal.
-        """
-        reached = (self.rows.success * self.rows.goals).round()
-        return self.rows.assign(percent=100 * reached / self.rows.goals).pivot(
-            index="seed", columns="at", values="percent"
-        )
+    def __post_init__(self) -> None:
+        percent = 100 * (self.rows.success * self.rows.goals).round() / self.rows.goals
+        scores = self.rows.assign(percent=percent).pivot(index="seed", columns="at", values="percent")
+        vars(self).update(first=self.rows.iloc[0], scores=scores)
 
     @property
     def seeds(self) -> str:
