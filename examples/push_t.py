@@ -72,7 +72,7 @@ def tee(scale: float = 1.0) -> Union:
     return Union(tuple(Polygon(scale * (part.vertices - _CENTER)) for part in _BOXES))
 
 
-def _scaled(shape: Shape, scale: float) -> Union:
+def scaled(shape: Shape, scale: float) -> Union:
     """Scale a union of polygons about its origin."""
     assert isinstance(shape, Union)
     return Union(tuple(Polygon(scale * part.vertices) for part in shape.parts if isinstance(part, Polygon)))
@@ -214,7 +214,7 @@ class DiscPolicy:
             system = self.told
             if self._hypothesis != self._told:
                 system = system.replace(
-                    shape=_scaled(system.shape, scale),
+                    shape=scaled(system.shape, scale),
                     friction=torch.tensor(friction, dtype=torch.float64) if friction else 0.0,
                     drive=self._drives[drive],
                 )

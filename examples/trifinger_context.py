@@ -16,15 +16,16 @@ from dataclasses import dataclass
 import gymnasium
 import torch
 import tyro
+from push_t import scaled
 from torch import Tensor
 
-import difflcs_envs  # noqa: F401 - registers the environment
 from difflcs import LCSMPCLayer, LCSParams
-from difflcs.physics import ContactLCS, PlanarPushing, Polygon, Shape, Union
+from difflcs.physics import ContactLCS, PlanarPushing
 from difflcs.rl import TrainedPolicy, wilson_interval
 from difflcs.rl.rollout import ignore_solver_warnings
+from difflcs_envs.trifinger.task import EPISODE_STEPS
 
-SIDE, STEPS = 6.0, 20  # the cube [cm]; an episode
+SIDE = 6.0  # of the cube [cm]
 SIDES, FRICTIONS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5), (1 / 3, 1.0, 3.0)  # in parts of the truth
 SPREAD, RELATIVE, MOST = 0.002, 0.3, 3.0
 """Predictions are off by 2 mm and 30 % of how far the cube moves; no step counts for more than 3 nats."""
@@ -52,14 +53,6 @@ class Options:
     """Print the figures as JSON."""
 
 
-def enlarge(shape: Shape, factor: float) -> Shape:
-    """Enlarge polygons about the middle of the body."""
-    if isinstance(shape, Union):
-        return Union(tuple(enlarge(part, factor) for part in shape.parts))
-    assert isinstance(shape, Polygon)
-    return Polygon(factor * shape.corners)
-
-
 class Hypotheses:
     """Physics of a cube of several sides and frictions, and how well each explains what each of n robots has seen.
 
@@ -75,7 +68,7 @@ class Hypotheses:
         assert physics.gyration is not None
         self.systems = [
             physics.replace(
-                shape=enlarge(physics.shape, side),
+                shape=scaled(physics.shape, side),
                 gyration=side * physics.gyration,
                 friction=friction * physics.friction,
             )
@@ -114,7 +107,7 @@ def main(o: Options) -> None:
     hypotheses = Hypotheses(policy.lcs.physics, told, others if o.adapt else [], o.goals)
     envs = gymnasium.make_vec("difflcs/TriFingerMoveCube-v0", num_envs=o.goals, vectorization_mode="vector_entry_point")
     observed, guess, info = envs.reset(seed=o.seed)[0], None, {}
-    for _ in range(STEPS):
+    for _ in range(EPISODE_STEPS):
         x, goal = (torch.as_tensor(observed[name], dtype=torch.float64).clone() for name in ("state", "goal"))
         with ignore_solver_warnings():
             plan = policy(x, goal, lcs=hypotheses.best(x), guess=guess)

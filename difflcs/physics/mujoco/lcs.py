@@ -158,7 +158,7 @@ class MujocoLCS:
         budgets: Any = self._selection.budgets if self._selection else contacts
         budgets = budgets if contacts is None or self._selection else check_positive_int("contacts", contacts)
         plain = motion == "dynamic" and pairs is None and friction is None
-        self._whole, self.tried = WholeStep(self._motion, limits != 0) if plain else None, False
+        self._whole, self._tried = WholeStep(self._motion, limits != 0) if plain else None, False
         self._places, frictions = Places(model, self._data), (friction, torsion)
         self._finder = ContactFinder(model, self._data, self._places, pairs, distance, length, budgets, *frictions)
         model.opt.disableflags |= flags("EQUALITY", "FRICTIONLOSS", "LIMIT")
@@ -406,8 +406,8 @@ def _try_actions(of: MujocoLCS, system: LCSParams, read: _States, step: DynamicS
     """Warn where systems are far off at the ends of the ranges of actions, or half way there."""
     if step is None or of._whole is None or not of.n_u:
         return
-    if of._actuators.curved.size or not of.tried:
-        read.doubtful[:_TRIED], of.tried = True, True
+    if of._actuators.curved.size or not of._tried:
+        read.doubtful[:_TRIED], of._tried = True, True
     some = np.flatnonzero(read.doubtful)
     if not some.size:
         return

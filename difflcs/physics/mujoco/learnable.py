@@ -248,7 +248,7 @@ class LearnableMujocoLCS(nn.Module):
         compliance = self._options["compliance"] * factors.get("compliance", 1.0)
         built = MujocoLCS(self._changed(change), self._data, **{**self._options, "compliance": compliance})
         built.state = self.state
-        built.tried = True  # with the first module
+        built._tried = True  # with the first module
         if keep:
             self._built = key, built
         return built
