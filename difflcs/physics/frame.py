@@ -10,7 +10,6 @@ from difflcs._differentiation import runs_eagerly
 from difflcs._modules import fresh
 from difflcs.errors import InvalidInputError
 from difflcs.lcs import LCSModel
-from difflcs.physics.complementarity import given_states
 from difflcs.records import LCSParams
 
 __all__ = ["BodyFrameLCS"]
@@ -74,7 +73,9 @@ class BodyFrameLCS(LCSModel):
         Raises:
             InvalidInputError: no states.
         """
-        check_tensor("x", x := given_states(x), [("n_x", self.n_x)])
+        if x is None:
+            raise InvalidInputError("x: expected the states of the system, got None; pass them")
+        check_tensor("x", x, [("n_x", self.n_x)])
         if self._forward_pre_hooks:
             fresh(self, self.parameter_names)
         cos, sin = x[..., 2].cos(), x[..., 2].sin()
