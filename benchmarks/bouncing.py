@@ -1,7 +1,5 @@
 """Systems that bounce, whose plans have many optima: walls, a box, a paddle, an edge, a leg."""
 
-from __future__ import annotations
-
 import torch
 from models import Instance, chain_of_carts, make, push_the_last_cart, uniform
 from torch import Tensor

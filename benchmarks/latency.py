@@ -17,8 +17,6 @@ machine mean little, ratios more. Then the price of a deadline: the cube's error
 does, and the share of steps not solved.
 """
 
-from __future__ import annotations
-
 import time
 import warnings
 from collections.abc import Callable

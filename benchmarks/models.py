@@ -1,7 +1,5 @@
 """Problems the benchmarks solve: synthetic pushing models, random ones, the zoo, a cart-pole, carts."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

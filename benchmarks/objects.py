@@ -9,8 +9,6 @@ to the file.
 without physics nothing. With `DIFFLCS_YCB_DIR` the objects have their scanned meshes; `object` says which shape it was.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Iterator

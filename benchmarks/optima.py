@@ -6,8 +6,6 @@ within 0.1 % of it, what failed, and the CPU time as a ratio to one start: of al
 few one by one, whose starts lie side by side in the lanes of a vector. Written as JSON too.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ contact, or where a joint or tendon is at its limit in this step. Beside them ar
 steps with the nominal control, linearised at each by `mjd_transitionFD`, contacts included.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import time

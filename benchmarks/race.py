@@ -6,8 +6,6 @@ those of executing a rival's own actions in the LCS; the reference is the best o
 random starts. Written as JSON, from which the page's tables are rendered when the site is built.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Gaps of plans with relaxed contact to the global optimum with hard contact, on small problems."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Planners that are made for contact, beside ours, judged under hard contact: single plans and closed loops."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable

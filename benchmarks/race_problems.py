@@ -1,7 +1,5 @@
 """The problems of the race: with contact, without, and small enough for a global optimum."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -12,8 +12,6 @@ Printed per size: the share of problems solved, iterations of one start on avera
 CPU time per problem. Written as JSON too.
 """
 
-from __future__ import annotations
-
 import time
 import warnings
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Entry of the command line as a program, also of `python -m difflcs`, with complete output and exit codes."""
 
-from __future__ import annotations
-
 import os
 import select
 import sys

@@ -1,7 +1,5 @@
 """Argument checks shared by the whole library: expected, got, remedy."""
 
-from __future__ import annotations
-
 import difflib
 import functools
 import math

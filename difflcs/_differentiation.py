@@ -10,8 +10,6 @@ with plain tensors only, whatever transform is active:
   older vmap that accepts no rules; there the batched gradients are unwrapped by hand.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from abc import ABC, abstractmethod

@@ -1,7 +1,5 @@
 """Base of modules that hold the tensors of a problem, each constant over the horizon or one per stage."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable
 
 import torch

@@ -1,7 +1,5 @@
 """A figure as wide as a page, legible on a phone; imported where something is drawn, as matplotlib may be missing."""
 
-from __future__ import annotations
-
 from io import BytesIO
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Products of a matrix that is shared by the batch (rows, columns), or one per element (batch, rows, columns)."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

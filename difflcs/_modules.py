@@ -5,8 +5,6 @@ and `spectral_norm` of old, keep an attribute in the place of a parameter. A hoo
 called, so code that uses another method of a module has to run the hooks first.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from typing import Any, TypeVar
 

@@ -1,7 +1,5 @@
 """Optional packages: one clear error instead of a traceback."""
 
-from __future__ import annotations
-
 import importlib.util
 from importlib import metadata
 

@@ -6,8 +6,6 @@ enough: `tensor.data.mul_(2)`, a NumPy array that shares the memory and `vector_
 costs less than 1 µs for a matrix of a robot's size.
 """
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Sequence
 from typing import Generic, TypeVar

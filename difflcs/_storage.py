@@ -3,8 +3,6 @@
 Any file that cannot be used raises a `CheckpointError`. Sizes are checked before anything is read.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Bounds of the actions by stage, and linear constraints of states and actions."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 
 import torch

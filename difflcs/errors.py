@@ -3,8 +3,6 @@
 Every message says what was expected, what came, and how to mend it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Batched, differentiable linear complementarity problems."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Losses that fit an LCS to observed transitions."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal

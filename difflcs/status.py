@@ -1,7 +1,5 @@
 """Status codes of the solvers."""
 
-from __future__ import annotations
-
 from enum import IntEnum
 
 from torch import Tensor

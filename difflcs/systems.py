@@ -10,8 +10,6 @@ F = (effect of the forces on the gaps) + compliance is symmetric positive defini
 Every argument is a number or a tensor of one element; the matrices are differentiable in the tensors.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -4,8 +4,6 @@ The run has to be one that learned a system for an MPC and was evaluated at its 
 task has for models, with the method behind it unless that is the default one. No part of the wheel.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import shlex

@@ -3,8 +3,6 @@
 Names and labels of all of them are here, so that a change of the paper's recipe is one change in one place.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial

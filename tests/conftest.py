@@ -1,7 +1,5 @@
 """Shared builders of small models, as fixtures; and how many threads the tests may use."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """acados: optimal control in generated C with the solver HPIPM; n_lam = 0, where one step of SQP is the answer."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sys

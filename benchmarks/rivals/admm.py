@@ -4,8 +4,6 @@ Written after the papers and the code of DAIRLab/c3. States are eliminated, and 
 projection, too, where theirs solve a quadratic program with bounds in each iteration: faster for the same cost.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import subprocess

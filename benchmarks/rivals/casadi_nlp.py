@@ -1,7 +1,5 @@
 """CasADi with one of its solvers, as one would write it by hand. The backend `ipopt` of difflcs is in `layer.py`."""
 
-from __future__ import annotations
-
 import casadi
 import numpy as np
 

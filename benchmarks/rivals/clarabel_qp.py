@@ -1,7 +1,5 @@
 """Clarabel: an interior-point method, for the sparse program over actions and states; n_lam = 0."""
 
-from __future__ import annotations
-
 import clarabel
 import numpy as np
 from scipy import sparse

@@ -1,7 +1,5 @@
 """cvxpylayers: a convex program as a PyTorch layer; n_lam = 0."""
 
-from __future__ import annotations
-
 import cvxpy as cp
 import numpy as np
 import torch

@@ -1,7 +1,5 @@
 """DAQP: a dual active-set method, for the dense program in the actions alone; n_lam = 0."""
 
-from __future__ import annotations
-
 import daqp
 import numpy as np
 

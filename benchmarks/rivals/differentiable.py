@@ -1,7 +1,5 @@
 """Base of the rivals in PyTorch: one call for a batch, with or without gradients."""
 
-from __future__ import annotations
-
 import torch
 
 from rivals.problem import Answer, Problem, Rival

@@ -1,7 +1,5 @@
 """The global optimum with hard contact, λ·s = 0, by branch and bound over the modes with DAQP's quadratic programs."""
 
-from __future__ import annotations
-
 import heapq
 
 import daqp

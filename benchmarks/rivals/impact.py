@@ -4,8 +4,6 @@ Forces and gaps each have a slack; each pair of slacks is projected onto "one of
 with Newton steps of a smooth problem. States are eliminated. Written after the paper, without its code.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from rivals.problem import Answer, Condensed, Problem, Rival

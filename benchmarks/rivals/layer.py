@@ -1,7 +1,5 @@
 """difflcs itself: its layer, tensors in and tensors out, all checks and certificates included."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

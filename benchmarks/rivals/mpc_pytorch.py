@@ -1,7 +1,5 @@
 """mpc.pytorch (Amos et al.): differentiable box-constrained iLQR in PyTorch; n_lam = 0."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from mpc import mpc

@@ -1,7 +1,5 @@
 """qpax: a differentiable interior-point method in JAX, for the dense program in the actions alone; n_lam = 0."""
 
-from __future__ import annotations
-
 import jax
 
 jax.config.update("jax_enable_x64", True)

@@ -3,8 +3,6 @@
 Started by `race.py` in the environment that has the rival's packages: `python -P run.py RIVAL '{"setting": …}'`.
 """
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import json

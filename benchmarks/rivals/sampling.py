@@ -1,7 +1,5 @@
 """Sampling MPC on the same LCS under hard contact: CEM (Rubinstein 1999) and MPPI (Williams et al. 2017)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from difflcs.lcp import solve_lcp_arrays

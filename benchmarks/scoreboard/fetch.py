@@ -11,8 +11,6 @@ Figures are those of seeds 5000 and up, times CPU times of the policy. It needs 
 # What needs gymnasium-robotics is imported where it is used; MuJoCo is a compiled module without type stubs.
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 
-from __future__ import annotations
-
 import json
 import sys
 import time

@@ -19,8 +19,6 @@ chosen with seeds below 1034; final figures are of seeds 5000 and up. Times are 
 episodes that are in the file are not played again: after a change of the controller begin another file.
 """
 
-from __future__ import annotations
-
 import copy
 import json
 import os

@@ -5,8 +5,6 @@ goal, no reward, no demonstration. A `ContactLCS` that begins with a wrong centr
 and outline is fitted to the transitions by the violation loss.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from pathlib import Path

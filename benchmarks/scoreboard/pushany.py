@@ -13,8 +13,6 @@ inside the walls covers more than 95 % of the goal, it is out of reach; the succ
 (`within_reach`, and the number of goals that are).
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import sys

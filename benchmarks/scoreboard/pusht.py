@@ -17,8 +17,6 @@ Times are CPU times of the policy, on one core. With `--out FILE`, variants that
 again: after a change of the policy begin another file. `--variant all` plays all.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable

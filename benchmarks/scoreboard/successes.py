@@ -1,7 +1,5 @@
 """Success figures that every scoreboard reports."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

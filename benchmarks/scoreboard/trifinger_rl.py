@@ -15,8 +15,6 @@ The reward of a step is sech²(15 d), with d [m] the distance of the cube's cent
 Times are CPU times of the policy. The record of a policy is written after each episode.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -3,8 +3,6 @@
 Tasks and methods are known by their registries only.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 

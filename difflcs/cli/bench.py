@@ -1,7 +1,5 @@
 """Speed of the MPC layer on this machine, against IPOPT in the same run: `difflcs bench`."""
 
-from __future__ import annotations
-
 import json
 import platform
 import time

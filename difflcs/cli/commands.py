@@ -1,7 +1,5 @@
 """The table of all commands, and the small ones themselves: `difflcs zoo | assets | bench | doctor`."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

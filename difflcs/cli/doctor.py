@@ -4,8 +4,6 @@
 OpenGL are tried in separate processes, which may crash.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import platform

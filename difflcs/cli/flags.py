@@ -1,7 +1,5 @@
 """Flags among the words of the command line, and errors that name flags."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import re

@@ -1,7 +1,5 @@
 """The commands for learned models: `difflcs evaluate | render | plot | export`."""
 
-from __future__ import annotations
-
 import json
 import sys
 import time

@@ -1,7 +1,5 @@
 """The commands for training: `difflcs train`, whose flags are the settings of its method, and `difflcs demo`."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, make_dataclass

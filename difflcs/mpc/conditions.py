@@ -3,8 +3,6 @@
 The derivation stands in `difflcs.mpc.kkt`, which offers the names of this file.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

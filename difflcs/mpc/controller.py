@@ -3,8 +3,6 @@
 The work is done by the C++ class of `difflcs/_native/controller.hpp`, the same as in the C library.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from dataclasses import dataclass

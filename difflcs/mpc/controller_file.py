@@ -3,8 +3,6 @@
 `difflcs/_native/controller_file.hpp` documents its bytes.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """Export of a controller for a robot without Python: its file, and a description of the numbers in it."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from pathlib import Path

@@ -59,8 +59,6 @@ A logarithmic barrier −μ Σ log(u − u_min) + log(u_max − u) adds −μ/(u
 to R; no bound is then active, and the bounds get their gradients from these terms.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

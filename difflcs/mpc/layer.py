@@ -1,7 +1,5 @@
 """PyTorch layer of the LCS-MPC: it checks a call, has a backend solve it, and wraps the solution."""
 
-from __future__ import annotations
-
 import sys
 import warnings
 

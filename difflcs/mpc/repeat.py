@@ -9,8 +9,6 @@ solve. Without this memory 180 µs would remain if checks and conversions took n
 make F and the cost of a goal have to be torch's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, TypeGuard
 

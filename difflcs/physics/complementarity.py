@@ -21,8 +21,6 @@ within the step, so that friction is right at every step of a plan. Two models o
   `FrictionWarning` says so; use Anitescu's model there.
 """
 
-from __future__ import annotations
-
 import warnings
 from typing import Literal, NamedTuple
 

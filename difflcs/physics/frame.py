@@ -1,7 +1,5 @@
 """An LCS in the frame of a body on a plane: what it learns at one pose of the body holds at all of them."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """ContactLCS: contact physics whose numbers are learned."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any

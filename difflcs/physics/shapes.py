@@ -7,8 +7,6 @@ A `Union` keeps its parts apart, so that each is a contact of its own: a corner 
 sides. A polygon need not be convex; its nearest point is one contact.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ Needs the extra `envs`. MuJoCo's kinematics say where end effectors are, and the
 free of collisions: what may not touch there is not in the way.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Distances to a shape on a grid, and closed curves at a constant distance round it."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Candidate places of the end effectors, in coordinates of the body, and the corresponding states."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol

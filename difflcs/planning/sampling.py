@@ -17,8 +17,6 @@ the horizon. A place is judged as if the robot were there already. The body is a
 and several end effectors are assumed not to collide with each other on the way.
 """
 
-from __future__ import annotations
-
 import enum
 import math
 import warnings

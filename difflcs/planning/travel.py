@@ -1,7 +1,5 @@
 """Paths of end effectors to another place without touching the body."""
 
-from __future__ import annotations
-
 import math
 from typing import Protocol
 

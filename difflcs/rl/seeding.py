@@ -3,8 +3,6 @@
 So nothing depends on the order in which numbers are drawn, and the global generators stay as they were.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import IntEnum

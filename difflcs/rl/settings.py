@@ -9,8 +9,6 @@ One validator reads types and bounds; one reader rebuilds a configuration from J
 is defined there.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping

@@ -9,8 +9,6 @@
 A maintainer adds a finished run by `python reproduce/add_to_zoo.py RUN` in a checkout of the repository.
 """
 
-from __future__ import annotations
-
 import difflib
 import os
 from collections.abc import Mapping, Sequence

@@ -9,8 +9,6 @@ or, in one line, `gymnasium.make("difflcs_envs:difflcs/TriFingerMoveCube-v0")`. 
 environment is made.
 """
 
-from __future__ import annotations
-
 from difflcs_envs.errors import (
     AssetError,
     DifflcsEnvsError,

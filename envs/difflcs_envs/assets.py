@@ -6,8 +6,6 @@ renamed in one step. One process at a time works in a folder; the others wait. T
 limited; beyond that they raise an `AssetError`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import gzip
 import hashlib

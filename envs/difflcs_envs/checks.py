@@ -3,8 +3,6 @@
 Every complaint is a ValueError that says what was expected, what came, and what to do.
 """
 
-from __future__ import annotations
-
 import math
 import numbers
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Errors and warnings of the environments. Only `tasks.py` in this package imports `difflcs`."""
 
-from __future__ import annotations
-
 INSTALL_HINT = 'pip install "difflcs[envs]"'
 
 

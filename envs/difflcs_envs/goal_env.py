@@ -1,7 +1,5 @@
 """Base class of environments with goals: what of Gymnasium's reset, step and render is the same for every robot."""
 
-from __future__ import annotations
-
 import warnings
 from abc import abstractmethod
 from typing import Any, ClassVar

@@ -4,8 +4,6 @@ What judges a state or a step takes NumPy arrays or PyTorch tensors with any lea
 like; with tensors, rewards can be differentiated.
 """
 
-from __future__ import annotations
-
 import sys
 from abc import ABC, abstractmethod
 from typing import Any

@@ -1,7 +1,5 @@
 """Pictures of a MuJoCo scene, with or without a screen, and the interactive viewer."""
 
-from __future__ import annotations
-
 import ctypes.util
 import os
 import sys

@@ -4,8 +4,6 @@ The one file of this package that imports `difflcs`, which finds it by the entry
 environment is imported here, and no simulation.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -4,8 +4,6 @@
 single environment with the same seed and actions does, bit for bit.
 """
 
-from __future__ import annotations
-
 import functools
 import os
 import warnings

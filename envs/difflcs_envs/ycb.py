@@ -4,8 +4,6 @@ Masses: object table of the YCB Object and Model Set (Calli et al., IEEE Robotic
 and resting heights: measured on its google_16k meshes lying in their lowest rest pose, longest horizontal side along x.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

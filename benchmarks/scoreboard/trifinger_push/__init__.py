@@ -9,8 +9,6 @@
 - policy.py: `PushPolicy`, all of it together
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 

@@ -10,8 +10,6 @@ of each tip, with the gains that put both poles of a double integrator with held
 it, τ = M J⁻¹ a + bias + what the damping of the robot's safety layer takes away + Jᵀ f. The term of dJ/dt is left out.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

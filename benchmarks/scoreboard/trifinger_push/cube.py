@@ -4,8 +4,6 @@ The camera's pose is 90 to 190 ms old, a new one comes ten times a second. Since
 measured at every step: the same contact physics that the plan uses is stepped from the old pose along their way.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from itertools import pairwise
 from typing import Any

@@ -5,8 +5,6 @@ bend it in the plane that the first has turned. All lengths are those of trifing
 others are turned about the vertical by ∓120°.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

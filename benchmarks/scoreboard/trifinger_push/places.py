@@ -3,8 +3,6 @@
 State of the plan: x, y, yaw of the cube; x, y, z of the tip that pushes; which finger it is. Lengths in `UNIT`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

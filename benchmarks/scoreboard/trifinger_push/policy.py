@@ -1,7 +1,5 @@
 """The policy: sampling-based contact MPC for one tip at a time, and torques that make the tips follow it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

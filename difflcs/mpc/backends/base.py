@@ -1,7 +1,5 @@
 """Interface that every solver backend implements, and the registry of backends."""
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 from abc import ABC, abstractmethod

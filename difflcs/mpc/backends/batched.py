@@ -1,7 +1,5 @@
 """Backend `batched`: difflcs's own solver, thousands of problems side by side on the CPU."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal

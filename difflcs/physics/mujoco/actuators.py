@@ -1,7 +1,5 @@
 """Actuators of a MuJoCo model: servos, activation, and limits of control and force."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import mujoco

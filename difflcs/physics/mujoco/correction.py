@@ -10,8 +10,6 @@ where they do worse than nothing, and goes to d: a grip many times as firm as at
 many times as large.
 """
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 

@@ -5,8 +5,6 @@ motion by M ν̇ = τ the mass Eᵀ E/R, the damping Eᵀ b E/R and the stiffnes
 response S, 1 − S Eᵀ (E S Eᵀ)⁺ E projects the motion, and what forces do to it, to where they hold.
 """
 
-from __future__ import annotations
-
 import copy
 from typing import Any, NamedTuple
 

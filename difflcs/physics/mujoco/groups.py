@@ -1,7 +1,5 @@
 """Budgets of contacts by groups: how many contacts of which geoms a system has, and whether they have friction."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """LearnableMujocoLCS: the physics of a MuJoCo model with numbers of the model that are learned."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Addresses of MuJoCo's functions and fields, for the compiled part in `_native`, which knows no header of MuJoCo."""
 
-from __future__ import annotations
-
 import copy
 import ctypes
 import functools

@@ -1,7 +1,5 @@
 """Mocap bodies as inputs: joints and servos in place of what moves them from outside."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import mujoco

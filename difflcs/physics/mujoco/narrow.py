@@ -1,7 +1,5 @@
 """Shapes of geoms: those between which MuJoCo's contacts are exact, and the faces of those that have some."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import mujoco

@@ -1,7 +1,5 @@
 """MuJoCo's errors, and the warnings that it only counts, as exceptions of this library; bits of its flags."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace

@@ -20,8 +20,6 @@ K_abs has no servos whose actions count from where they are. Springs count by th
 and how gravity changes with x is left out.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import mujoco

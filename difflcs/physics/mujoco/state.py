@@ -5,8 +5,6 @@ state has the rotation vector r ∈ R³ from a reference orientation q̄ instead
 as `mj_integratePos` does. All else is `qpos` itself.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import mujoco

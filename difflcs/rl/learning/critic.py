@@ -1,7 +1,5 @@
 """The value network of PPO, and its fit to the newest episodes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

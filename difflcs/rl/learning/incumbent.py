@@ -11,8 +11,6 @@ incumbent only if its newest episodes had higher returns, by a one-sided test wi
 All of these episodes are collected for learning anyway, so the test costs no time on the robot.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

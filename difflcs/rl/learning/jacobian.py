@@ -1,7 +1,5 @@
 """Jacobian of the MPC's action with respect to the parameters of its system, for any `LCSModule`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

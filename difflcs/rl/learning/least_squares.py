@@ -4,8 +4,6 @@ Of a step on networks this small, autograd and its bookkeeping take longer than 
 ensemble of four with two hidden layers of 128, 4 times for a value network of 64.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -3,8 +3,6 @@
 They write "loc", "scale_tril", "action" and "action_log_prob", and are what `difflcs.rl.PPO` trains.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

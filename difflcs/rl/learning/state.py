@@ -7,8 +7,6 @@ Two names in a tree have a meaning: below "settings" everything must be equal, a
 data, any number of rows, as many in each.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any, Protocol

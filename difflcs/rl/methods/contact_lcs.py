@@ -1,7 +1,5 @@
 """The method contact-lcs: LCS-RL with known contacts, whose physics is fitted."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The method frame-lcs: LCS-RL with a model that is learned in the frame of the body."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """The method improve: PPO from a model that works already, replaced only by what is better."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """The method lcs-rl: the warm-up, and then PPO through the MPC."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 

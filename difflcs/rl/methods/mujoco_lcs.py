@@ -1,7 +1,5 @@
 """The method mujoco-lcs: LCS-RL with the physics of a MuJoCo model, whose uncertain numbers are fitted."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

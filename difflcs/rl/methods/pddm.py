@@ -1,7 +1,5 @@
 """The method pddm: networks that predict, and a planner that samples actions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self

@@ -1,7 +1,5 @@
 """The phases that several methods share, and short versions of their settings for smoke tests."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 

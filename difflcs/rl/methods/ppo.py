@@ -1,7 +1,5 @@
 """The method ppo: PPO through the MPC, without a warm-up."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 

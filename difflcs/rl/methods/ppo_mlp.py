@@ -1,7 +1,5 @@
 """The method ppo-mlp: the same PPO with a network as its policy."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self

@@ -1,7 +1,5 @@
 """The method violation: the warm-up alone."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 

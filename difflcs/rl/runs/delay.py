@@ -1,7 +1,5 @@
 """Actions that come late, as on a robot whose planning takes time; and planning from where it will be by then."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """The hand as a Gymnasium environment: turn an object on the palm."""
 
-from __future__ import annotations
-
 import functools
 import math
 from dataclasses import replace

@@ -4,8 +4,6 @@ The places of the joints and their ranges are those of the Allegro hand (Wonik R
 capsules here. The palm is the body frame of the hand turned so that its fingers point along +x and its face up.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import mujoco

@@ -4,8 +4,6 @@ Functions take states (..., 22), actions (..., 16) and goals (..., 7) of any bat
 tensors, and return the like.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

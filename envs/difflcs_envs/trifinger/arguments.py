@@ -1,7 +1,5 @@
 """Checks of the numbers of a TriFinger task."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Base class of the TriFinger environments: Gymnasium's reset, step and render around the simulation."""
 
-from __future__ import annotations
-
 import copy
 import math
 import time

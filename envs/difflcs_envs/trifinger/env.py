@@ -1,7 +1,5 @@
 """The TriFinger tasks as Gymnasium environments: move a cube, move an object, turn a cube."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from typing import Unpack

@@ -8,8 +8,6 @@ joint 0 turns about y. With theta = -q1 and phi = q2 - q1 the angles of the two 
 where h > 0 is the depth of the tip below the mount within that plane.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from difflcs_envs.trifinger.model import (

@@ -9,8 +9,6 @@ Jin & Posa (2024) and Bui & Posa (LCS-RL). Every finger has its own frame at its
     joint 2  about +x, LINK_LENGTH below, middle link     (bends the knee)
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Protocol
 

@@ -4,8 +4,6 @@ Nothing depends on MuJoCo's headers: functions are looked up by name in the libr
 fields by the addresses of their NumPy views.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import os

@@ -5,8 +5,6 @@ The YCB meshes (Calli et al., IEEE RAM 2015) do not ship with this package. They
 capsules with the size, the mass and the resting height of the object takes its place; `source` says which it is.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

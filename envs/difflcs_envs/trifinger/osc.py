@@ -11,8 +11,6 @@ J^T (J J^T + lambda^2 I)^-1 with lambda^2 = SINGULAR_DAMPING^2 (1 - (det J / SIN
 and Hanafusa 1986: it vanishes at the edge of the singular region, so the torque is continuous there.
 """
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 

@@ -1,7 +1,5 @@
 """The simulated robot and object, without any task: reset, step, read-out, save and restore."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

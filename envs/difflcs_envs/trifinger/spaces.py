@@ -1,7 +1,5 @@
 """Actions and observations of the TriFinger environments: sizes, units and limits."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

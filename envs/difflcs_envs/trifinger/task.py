@@ -4,8 +4,6 @@ All functions take states (..., 9), actions (..., 6) and goals (..., 3) with any
 state or a step takes NumPy arrays or PyTorch tensors and returns the like; with tensors, rewards can be differentiated.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,8 +3,6 @@
 The batches come from `tests.conformance.varied`, each element with inputs of its own, and are then spoilt.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

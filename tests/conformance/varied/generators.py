@@ -1,7 +1,5 @@
 """Random LCS-MPC problems of every form, one seeded batch of equal shape each. NumPy only, but for the free plan."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 Amari, "Natural gradient works efficiently in learning", 1998; Kakade, "A natural policy gradient", 2001.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
