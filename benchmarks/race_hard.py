@@ -33,8 +33,13 @@ OURS: dict[str, dict[str, Any]] = {
 Draw = Callable[[np.random.Generator], dict[str, Any]]
 
 
-def draws() -> dict[str, tuple[str, Draw]]:
-    """List the rivals whose settings are tuned: module, and how random settings are drawn."""
+def draws(rollouts: int = 1024, simulated: tuple[int, ...] = ()) -> dict[str, tuple[str, Draw]]:
+    """List the rivals whose settings are tuned: module, and how random settings are drawn.
+
+    Args:
+        rollouts: of sampling on the LCS.
+        simulated: numbers of rollouts of sampling in MuJoCo.
+    """
 
     def consensus(iterations: int, **fixed: str) -> Draw:
         def draw(random: np.random.Generator) -> dict[str, Any]:
@@ -47,9 +52,10 @@ def draws() -> dict[str, tuple[str, Draw]]:
 
         return draw
 
-    def sampled(method: str, rollouts: int) -> Draw:
+    def sampled(methods: tuple[str, ...], rollouts: int) -> Draw:
         def draw(random: np.random.Generator) -> dict[str, Any]:
-            iterations = int(random.choice([4, 8, 16, 32]))
+            iterations = int(random.choice([n for n in (1, 2, 4, 8, 16, 32) if rollouts // n >= 4]))
+            method = str(random.choice(methods))
             keep = float(random.uniform(0.02, 0.3)) if method == "cem" else float(10 ** random.uniform(-2, 0))
             spread, hold = float(10 ** random.uniform(-1, 0.3)), int(random.choice([1, 2, 3, 5, 10]))
             how = {"method": method, "samples": rollouts // iterations, "iterations": iterations}
@@ -60,20 +66,16 @@ def draws() -> dict[str, tuple[str, Draw]]:
     def lagrangian(random: np.random.Generator) -> dict[str, Any]:
         weight, bound, settle = (float(10 ** random.uniform(*v)) for v in [(-2, 3.5), (-1, 4), (-4, -2)])
         growth, progress = float(random.choice([1.05, 1.2, 1.5, 2.0, 5.0])), float(random.choice([0.5, 0.9]))
-        inner = int(random.choice([5, 10, 50]))
-        return {
-            "weight": weight,
-            "bound": bound,
-            "growth": growth,
-            "progress": progress,
-            "inner": inner,
-            "settle": settle,
-        }
+        numbers = {"weight": weight, "bound": bound, "growth": growth, "progress": progress}
+        return {**numbers, "inner": int(random.choice([5, 10, 50])), "settle": settle}
 
     rivals = {f"C3+, {n} iterations": ("admm", consensus(n)) for n in ITERATIONS}
     rivals["C3, 10 iterations"] = ("admm", consensus(10, project="lcp"))
+    rivals["C3, 10 iterations, exact"] = ("admm", consensus(10, project="exact"))
     rivals["IMPACT-like"] = ("impact", lagrangian)
-    return rivals | {f"{m.upper()}, 1024 rollouts": ("sampling", sampled(m, 1024)) for m in ("cem", "mppi")}
+    rivals |= {f"{m.upper()}, {rollouts} rollouts": ("sampling", sampled((m,), rollouts)) for m in ("cem", "mppi")}
+    tries = {f"sampling in MuJoCo, {n} rollouts": ("simulated", sampled(("cem", "mppi"), n)) for n in simulated}
+    return rivals | tries
 
 
 def objectives(problem: Problem, mpc: MPCProblem, u: np.ndarray) -> np.ndarray:

@@ -32,6 +32,7 @@ from difflcs.rl import wilson_interval
 HALF, RADIUS = (0.07, 0.05), 0.015  # of the box's sides and of the sphere [m]
 STEPS, SUBSTEPS = 150, 50
 NEAR, ALIGNED = 0.01, 0.1  # [m, rad]
+WEIGHT, FINAL, EFFORT = (100.0, 100.0, 0.36), (400.0, 400.0, 1.44), 3.0  # of the pose: 0.1 rad as much as 6 mm
 
 WORLD = """
 <mujoco><option timestep="0.002" integrator="implicitfast" cone="elliptic"/>
@@ -75,9 +76,7 @@ class Faces(DiscPlaces):
 def make_policy() -> tuple[SamplingPolicy, MujocoLCS]:
     """Make the policy and the system that it plans with: state (x, y, yaw of the box; x, y of the sphere)."""
     module = MujocoLCS(mujoco.MjModel.from_xml_string(WORLD.format(joints=PLANE)))
-    weight = (100.0, 100.0, 0.36)  # 0.1 rad as much as 6 mm
-    final = tuple(4 * w for w in weight)
-    cost = GoalCost.reach(5, 2, goal_weight=weight, goal_weight_final=final, input_weight=3.0)
+    cost = GoalCost.reach(5, 2, goal_weight=WEIGHT, goal_weight_final=FINAL, input_weight=EFFORT)
     mpc = LCSMPCLayer(module, cost, 10, -0.03, 0.03, relaxation=1e-5, on_failure="mask")
     shape = box(-HALF[0], HALF[0], -HALF[1], HALF[1])
     travel = PlanarTravel(shape, RADIUS, step=0.06, tolerance=0.004)

@@ -7,7 +7,7 @@ from rivals.problem import Answer, Problem, Rival
 
 
 class Solver(Rival):
-    """Gaussian actions around a mean, which starts at zero; the best sequence of all is the plan.
+    """Gaussian actions around a mean; the best sequence of all is the plan.
 
     Args:
         problem: what is to be solved; its relaxation plays no part.
@@ -17,6 +17,9 @@ class Solver(Rival):
         hold: steps for which an action is held.
         keep: "cem": part of the samples that make the next mean and spread; "mppi": temperature, in standard deviations
             of the cost.
+
+    Attributes:
+        guess: (count, horizon, n_u) where the mean starts; None: at zero.
     """
 
     def __init__(
@@ -26,26 +29,35 @@ class Solver(Rival):
         super().__init__(problem)
         self.cem, self.samples, self.iterations, self.spread = method == "cem", samples, iterations, spread
         self.hold, self.keep = hold, keep
+        self.guess: np.ndarray | None = None
+        self.random = np.random.default_rng(0)
+
+    def states(self, data: dict[str, np.ndarray], u: np.ndarray) -> np.ndarray:
+        """Execute action sequences u (m, horizon, n_u): states (m, horizon + 1, n_x)."""
+        x = [np.broadcast_to(data["x0"], (len(u), len(data["x0"])))]
+        for action in u.swapaxes(0, 1):
+            lam = solve_lcp_arrays(data["F"], x[-1] @ data["D"].T + action @ data["E"].T + data["c"], 0.0)[0]
+            x.append(x[-1] @ data["A"].T + action @ data["B"].T + lam @ data["C"].T + data["d"])
+        return np.stack(x, 1)
 
     def costs(self, data: dict[str, np.ndarray], u: np.ndarray) -> np.ndarray:
         """Compute the cost (m,) of executing action sequences u (m, horizon, n_u)."""
-        x, total = np.broadcast_to(data["x0"], (len(u), len(data["x0"]))), np.zeros(len(u))
-        for action in u.swapaxes(0, 1):
-            total += (x @ (0.5 * data["Q"]) * x).sum(1) + x @ data["q"]
-            total += (action @ (0.5 * data["R"]) * action).sum(1) + action @ data["r"]
-            lam = solve_lcp_arrays(data["F"], x @ data["D"].T + action @ data["E"].T + data["c"], 0.0)[0]
-            x = x @ data["A"].T + action @ data["B"].T + lam @ data["C"].T + data["d"]
-        return total + (x @ (0.5 * data["Q_final"]) * x).sum(1) + x @ data["q_final"]
+        x, total = self.states(data, u), np.zeros(len(u))
+        for value, Q, q in ((x[:, :-1], "Q", "q"), (u, "R", "r"), (x[:, -1:], "Q_final", "q_final")):
+            total += ((value @ (0.5 * data[Q]) * value).sum(-1) + value @ data[q]).sum(-1)
+        return total
 
     def one(self, i: int) -> Answer:
         """Sample, and move the mean to what costs little."""
-        p, data, random = self.problem, self.problem.only(i), np.random.default_rng(i)
+        p, data = self.problem, self.problem.only(i)
         low, high = data["u_min"], data["u_max"]
         knots = -(-p.horizon // self.hold)
         mean, spread = np.zeros((knots, p.n_u)), self.spread * 0.5 * (high - low) * np.ones((knots, p.n_u))
+        if self.guess is not None:
+            mean = self.guess[i, :: self.hold]
         least, best = np.inf, mean
         for _ in range(self.iterations):
-            u = np.clip(mean + spread * random.standard_normal((self.samples, knots, p.n_u)), low, high)
+            u = np.clip(mean + spread * self.random.standard_normal((self.samples, knots, p.n_u)), low, high)
             u[0] = mean
             cost = self.costs(data, u.repeat(self.hold, 1)[:, : p.horizon])
             order = np.argsort(cost)
